@@ -1,0 +1,71 @@
+"""Cars joined by springs: the first follows a path, the last is driven."""
+
+import casadi as ca
+
+from servoctl import spec as sv
+from servoctl.errors import SpecificationError
+
+
+def cars(N=2, masses=None, stiffnesses=None, gaps=None, by="actuators"):
+    """N cars in a row, joined by springs; car 1 moves from 0.5 to 2.5 m in 2 s.
+
+    Driven through N - 1 springs, the force depends on the path's derivatives up to order 2N: the path is of class
+    C^6, or C^2N for more than three cars.
+
+    Parameters
+    ----------
+    N : int
+        Number of cars, at least 2.
+    masses : sequence of N floats, optional
+        [kg]; default 1 each, 2 for the last.
+    stiffnesses : sequence of N - 1 floats, optional
+        Of the spring between cars i and i + 1 [N/m]; default 1 each.
+    gaps : sequence of N - 1 floats, optional
+        Rest distances x_i - x_(i+1) [m]; default 0.5 each.
+    by : {"actuators", "ideal"}
+        The actuator "force" [N] on the last car, or an ideal reaction, which acts on the first one. The same program,
+        other motions.
+
+    Returns
+    -------
+    Mechanism, Program
+
+    Raises
+    ------
+    SpecificationError
+        If there are fewer than two cars, or a list has a wrong length.
+    """
+    if N < 2:
+        raise SpecificationError(
+            f"{N} car was asked for.", "The force passes through a spring.", "N = 2.", "Ask for at least two cars."
+        )
+    masses = _per_car("masses", masses, [1.0] * (N - 1) + [2.0])
+    stiffnesses = _per_car("stiffnesses", stiffnesses, [1.0] * (N - 1))
+    gaps = _per_car("gaps", gaps, [0.5] * (N - 1))
+    cars_from_1 = range(1, N + 1)
+    p = sv.parameters(
+        **{f"m{i}": m for i, m in zip(cars_from_1, masses)},  # kg
+        **{f"k{i}": k for i, k in zip(cars_from_1, stiffnesses)},  # N/m
+        **{f"gap{i}": gap for i, gap in zip(cars_from_1, gaps)},  # m
+    )
+    q = sv.coordinates(" ".join(f"x{i}" for i in cars_from_1))  # m, each
+    x, m, k, gap = tuple(q), p.symbols[:N], p.symbols[N : 2 * N - 1], p.symbols[2 * N - 1 :]
+    stretch = ca.vertcat(*(x[i] - x[i + 1] - gap[i] for i in range(N - 1)))
+    path = sv.paths.rest_to_rest(q.t, 0.5, 2.5, duration=2.0, smoothness=max(6, 2 * N))
+    mechanism = sv.Mechanism(
+        q,
+        gibbs=sum(sv.particle(q, m[i], x[i]) for i in range(N)),
+        potential=ca.dot(ca.vertcat(*k), stretch**2) / 2,
+        actuators={"force": x[-1]},
+        parameters=p,
+    )
+    return mechanism, sv.Program({"car 1": x[0] - path}, by=by)
+
+
+def _per_car(what, given, default):
+    values = default if given is None else list(given)
+    if len(values) != len(default):
+        raise SpecificationError(
+            f"{len(values)} {what} were given.", f"This row of cars has {len(default)}.", do="Give one each."
+        )
+    return values

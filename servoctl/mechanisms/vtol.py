@@ -1,0 +1,59 @@
+"""A planar vertical take-off aircraft with tilted thrusters."""
+
+from math import radians
+
+import casadi as ca
+
+from servoctl import spec as sv
+from servoctl.errors import unknown
+
+POINTS = ("flat", "centre")
+
+
+def vtol(point="flat"):
+    """A point of the aircraft moves from (0, 0) to (5, 2) m in 4 s, by two thrusters.
+
+    Parameters
+    ----------
+    point : {"flat", "centre"}
+        "flat": the point J sin(tilt) / (M (l cos(tilt) + h sin(tilt))) above the centre of mass, whose motion
+        determines everything. "centre": the centre of mass itself; the internal dynamics are then unstable.
+
+    Returns
+    -------
+    Mechanism, Program
+        Realised by the actuators "u1", "u2" [N], the thrusts at the wing tips.
+
+    Raises
+    ------
+    NameUnknown
+        If the point is named otherwise.
+
+    Notes
+    -----
+    The usual benchmark form: the tilt turns the difference of the thrusts sideways, and the factor cos(tilt) of
+    their sum is left out.
+    """
+    if point not in POINTS:
+        raise unknown(point, POINTS, "point of the aircraft")
+    p = sv.parameters(M=50.0, J=25.0, l=1.0, h=0.1, tilt=radians(5.0), g=9.81)  # kg, kg m^2, m, m, rad, m/s^2
+    q = sv.coordinates("x z theta")  # m, m (up), rad
+    x, z, theta = q
+    across = ca.vertcat(ca.cos(theta), ca.sin(theta))
+    along = ca.vertcat(-ca.sin(theta), ca.cos(theta))
+    arm = p.l * ca.cos(p.tilt) + p.h * ca.sin(p.tilt)
+
+    height = 0 if point == "centre" else p.J * ca.sin(p.tilt) / (p.M * arm)
+    followed = ca.vertcat(x, z) + height * along
+    path = sv.paths.rest_to_rest(q.t, start=(0.0, 0.0), end=(5.0, 2.0), duration=4.0, smoothness=4)
+    mechanism = sv.Mechanism(
+        q,
+        gibbs=sv.rigid_body(q, p.M, (0, 0, p.J), position=(x, z), rates=(0, 0, q.d(1)[2])),
+        potential=p.M * p.g * z,
+        actuators={
+            "u1": ca.vertcat(along + ca.sin(p.tilt) * across, arm),
+            "u2": ca.vertcat(along - ca.sin(p.tilt) * across, -arm),
+        },
+        parameters=p,
+    )
+    return mechanism, sv.Program({"X": followed[0] - path[0], "Z": followed[1] - path[1]}, by="actuators")

@@ -1,0 +1,327 @@
+"""A function of (t, x, p) seen through numpy: single points, grids, Runge-Kutta, and Newton along a path.
+
+Nothing is compiled before it pays. Where there is no compiler, CasADi's evaluation runs the same algorithms and the
+results differ by rounding only.
+"""
+
+import ctypes
+import functools
+
+import casadi as ca
+import numpy as np
+
+from servoctl.errors import SpecificationError, unknown
+from servoctl.model import compiler, emit
+from servoctl.model.interpreted import Interpreter, Workspace
+
+# Compiling takes 0.1 s or more, as long as 10^4 and more evaluations by CasADi. A consistent start makes tens of calls,
+# the signals of a short plan are a grid of a hundred points; an integration makes thousands.
+SCALAR_CALLS = 50
+GRID_POINTS = 200
+
+_OUTPUTS_PER_STATE = {"rk4": 1, "newton": 2}
+
+
+def compiled(f, name, loops=()):
+    """Make a compiled function of an SX function.
+
+    Parameters
+    ----------
+    f : casadi.Function
+        SX function of t (scalar), x (n_x), p (n_p), all dense, with one dense column output y (n_y).
+    name : str
+        A C identifier.
+    loops : sequence of {"rk4", "newton"}
+        The loops that will be called.
+
+    Returns
+    -------
+    Compiled
+
+    Raises
+    ------
+    SpecificationError
+        If f has another shape than this, or too few outputs for a loop; at the first evaluation, if f contains an
+        operation that is not elementary.
+    NameUnknown
+        If a loop is none of the above.
+    """
+    columns = [*(f.sparsity_in(i) for i in range(f.n_in())), *(f.sparsity_out(i) for i in range(f.n_out()))]
+    if (not f.is_a("SXFunction") or f.has_free() or (f.n_in(), f.n_out()) != (3, 1) or f.numel_in(0) != 1
+            or not all(column.is_dense() and column.size2() == 1 for column in columns)):
+        raise SpecificationError(f"{name!r} is to be compiled from {f}",
+                                 "A compiled function takes columns t, x, p to one dense column, without free symbols",
+                                 "The nearest is an SX function of this form",
+                                 "Concatenate and densify the outputs; expand() an MX function", name=name)
+    if not (name.isascii() and name.isidentifier()):
+        raise SpecificationError(f"A compiled function is named {name!r}", "Its name is a C identifier",
+                                 do="Use letters, digits and underscores", name=name)
+    for loop in loops:
+        if loop not in emit.LOOPS:
+            raise unknown(loop, emit.LOOPS, "loop")
+        needed = _OUTPUTS_PER_STATE[loop] * f.numel_in(1)
+        if f.numel_out(0) < needed:
+            raise SpecificationError(f"{name!r} has {f.numel_out(0)} outputs for {f.numel_in(1)} states",
+                                     f"{loop} needs the first {needed} outputs",
+                                     do="Add the outputs or leave the loop out", name=name, loop=loop)
+    return Compiled(f, name, tuple(loops))
+
+
+class Compiled:
+    """A function y = f(t, x, p), compiled as soon as it pays; made by `compiled`.
+
+    It may be called, and its loops run, from several threads at once. It pickles, and is loaded from the cache or
+    compiled again where it is unpickled.
+
+    Attributes
+    ----------
+    name : str
+        Its name.
+    n_x, n_p, n_y : int
+        Numbers of states, parameters and outputs.
+    loops : tuple of str
+        The loops it can run.
+    """
+
+    def __init__(self, f, name, loops):
+        self.name, self.loops = name, loops
+        self.n_x, self.n_p, self.n_y = f.numel_in(1), f.numel_in(2), f.numel_out(0)
+        self._f = f
+        self._x_shape, self._p_shape = (self.n_x,), (self.n_p,)
+        self._evaluator = Interpreter(f)
+        self._settled, self._text, self._calls, self._points = False, None, 0, 0
+
+    def __reduce__(self):
+        return _restored, (self._f.serialize(), self.name, self.loops)
+
+    def __repr__(self):
+        how = "compiled" if self.backend == "c" else "evaluated by CasADi"
+        return f"{self.name}: y[{self.n_y}] of t, x[{self.n_x}], p[{self.n_p}]; {self.operations} operations, {how}"
+
+    @functools.cached_property
+    def operations(self):
+        """Number of arithmetic operations of one evaluation."""
+        return emit.operations(self._f)
+
+    @property
+    def backend(self):
+        """``"c"`` once calls run the compiled library, ``"casadi"`` while CasADi evaluates them."""
+        return self._evaluator.backend
+
+    def __call__(self, t, x, p):
+        """Evaluate at one point.
+
+        Parameters
+        ----------
+        t : float
+            Time [s].
+        x : (n_x,) array
+            State, SI.
+        p : (n_p,) array
+            Parameters, SI.
+
+        Returns
+        -------
+        (n_y,) array
+            The outputs, a new array at each call.
+
+        Raises
+        ------
+        SpecificationError
+            If x or p has another shape.
+        """
+        if not self._settled:
+            self._calls += 1
+            self._settle(self._calls > SCALAR_CALLS)
+        if getattr(x, "shape", None) != self._x_shape:
+            x = self._array("x", x, self._x_shape)
+        if getattr(p, "shape", None) != self._p_shape:
+            p = self._array("p", p, self._p_shape)
+        row_t, row_x, row_p, row_y, run = self._evaluator.workspace.row
+        row_t[0] = t
+        row_x[:] = x
+        row_p[:] = p
+        run()
+        return row_y.copy()
+
+    def grid(self, t, x, p):
+        """Evaluate at N points.
+
+        Parameters
+        ----------
+        t : float or (N,) array
+            Times [s].
+        x : (n_x, N) array
+            One state per column, SI.
+        p : (n_p,) or (n_p, N) array
+            Parameters, SI; a matrix has a column per point.
+
+        Returns
+        -------
+        (n_y, N) array
+            The outputs.
+
+        Raises
+        ------
+        SpecificationError
+            If the shapes disagree.
+        """
+        n = np.shape(x)[-1] if np.ndim(x) == 2 else np.size(t)
+        x = self._array("x", x, (self.n_x, n))
+        t = self._array("t", np.broadcast_to(t, (n,)) if np.ndim(t) == 0 else t, (n,))
+        p = self._array("p", p, (self.n_p, n) if np.ndim(p) == 2 else self._p_shape)
+        self._points += n
+        self._settle(self._points > GRID_POINTS)
+        y = np.empty((self.n_y, n))
+        self._evaluator.grid(t, x, p, y)
+        return y
+
+    def rk4(self, t0, x0, h, n_steps, p, every=1):
+        """Integrate dx/dt, the first n_x outputs, by the classical Runge-Kutta method of order 4.
+
+        Step k starts at t0 + k h. The run ends early, with what was computed, at a state that is not finite.
+
+        Parameters
+        ----------
+        t0 : float
+            Start [s].
+        x0 : (n_x,) array
+            State at t0, SI.
+        h : float
+            Step [s]; negative runs backwards.
+        n_steps : int
+            Number of steps.
+        p : (n_p,) array
+            Parameters, SI.
+        every : int
+            Number of steps between logged points; the start and the end are always logged.
+
+        Returns
+        -------
+        t : (N,) array
+            Logged times [s].
+        x : (n_x, N) array
+            States there.
+        guards : (n_y - n_x, N) array
+            The other outputs there.
+
+        Raises
+        ------
+        SpecificationError
+            If the loop was not asked for, a shape is another, or a count is out of range.
+        """
+        self._settle_loop("rk4")
+        x0, p = self._array("x0", x0, self._x_shape), self._array("p", p, self._p_shape)
+        if n_steps < 0 or every < 1:
+            raise SpecificationError(f"rk4 is to take {n_steps} steps and log every {every}",
+                                     "n_steps is at least 0 and every at least 1", n_steps=n_steps, every=every)
+        log = np.append(np.arange(0, n_steps, every), n_steps)
+        states, guards = np.empty((self.n_x, log.size)), np.empty((self.n_y - self.n_x, log.size))
+        n = 1 + self._evaluator.rk4(float(t0), x0, float(h), int(n_steps), int(every), p, states, guards)
+        return t0 + log[:n] * h, states[:, :n], guards[:, :n]
+
+    def newton(self, t, x0, p, tol=1e-13, max_iter=30):
+        """Solve delta = 0 at each time in order; the outputs are the Newton step delta (n_x), dx/dt (n_x) and others.
+
+        A point is predicted from the last one by its rate and corrected until every |delta_i| <= tol (1 + |x_i|), then
+        once more where that still reduces delta. Where the correction fails the step in time is halved, up to 20 times.
+
+        Parameters
+        ----------
+        t : (N,) array
+            Times [s].
+        x0 : (n_x,) array
+            Start of the iteration at t[0], SI.
+        p : (n_p,) array
+            Parameters, SI.
+        tol : float
+            Tolerance relative to 1 + |x_i|.
+        max_iter : int
+            Corrections per point.
+
+        Returns
+        -------
+        x : (n_x, M) array
+            Solutions at the first M times, all N unless the iteration failed at t[M].
+        y : (n_y, M) array
+            Outputs there.
+        iterations : int
+            Number of evaluations made.
+
+        Raises
+        ------
+        SpecificationError
+            If the loop was not asked for or a shape is another.
+        """
+        self._settle_loop("newton")
+        t = self._array("t", t, (np.size(t),))
+        x0, p = self._array("x0", x0, self._x_shape), self._array("p", p, self._p_shape)
+        x, y = np.empty((self.n_x, t.size)), np.empty((self.n_y, t.size))
+        n, iterations = self._evaluator.newton(t, x0, p, float(tol), int(max_iter), x, y)
+        return x[:, :n], y[:, :n], iterations
+
+    def _settle_loop(self, loop):
+        if loop not in self.loops:
+            raise SpecificationError(f"{self.name!r} was asked for its loop {loop}",
+                                     f"It was made with the loops {', '.join(self.loops) or '(none)'}",
+                                     do=f"Make it with loops=({loop!r},)", name=self.name, loop=loop)
+        self._settle(build=True)
+
+    def _settle(self, build):
+        """Move from CasADi to the library: at the first call if one is at hand, later if it is to be built."""
+        if self._settled or (self._text is not None and not build):
+            return
+        symbol = f"servoctl_{self.name}"
+        text = self._text or emit.emit(self._f, symbol, self.loops)
+        library = compiler.library(text, build)
+        if library is not None:
+            self._evaluator = _Library(library, symbol, self.n_x, self.n_p, self.n_y)
+        self._settled = build or library is not None
+        self._text = None if self._settled else text
+
+    def _array(self, what, value, shape):
+        array = np.ascontiguousarray(value, dtype=float)
+        if array.shape != shape:
+            raise SpecificationError(f"{what} of {self.name!r} has the shape {array.shape}", f"Its shape is {shape}",
+                                     name=self.name, shape=array.shape, expected=shape)
+        return array
+
+
+def _restored(serialized, name, loops):
+    return Compiled(ca.Function.deserialize(serialized), name, loops)
+
+
+class _Library:
+    """Evaluation by the compiled library."""
+
+    backend = "c"
+
+    def __init__(self, library, symbol, n_x, n_p, n_y):
+        self._grid, self._point = library[f"{symbol}_grid"], library[f"{symbol}_point"]
+        self._grid.restype = self._point.restype = None
+        self._library, self._symbol = library, symbol
+        self.workspace = Workspace(n_x, n_p, n_y, self._connect)
+
+    def _connect(self, row, parts):
+        return functools.partial(self._point, _pointer(row)), row
+
+    def grid(self, t, x, p, y):
+        self._grid(ctypes.c_int64(t.size), *map(_pointer, (t, x, p)), ctypes.c_int64(p.ndim == 2), _pointer(y))
+
+    def rk4(self, t0, x0, h, n_steps, every, p, states, guards):
+        run = self._library[f"{self._symbol}_rk4"]
+        run.restype = ctypes.c_int64
+        return run(ctypes.c_double(t0), _pointer(x0), ctypes.c_double(h), ctypes.c_int64(n_steps),
+                   ctypes.c_int64(every), _pointer(p), ctypes.c_int64(states.shape[1]), _pointer(states),
+                   _pointer(guards))
+
+    def newton(self, t, x0, p, tol, max_iter, x, y):
+        run, count = self._library[f"{self._symbol}_newton"], ctypes.c_int64()
+        run.restype = ctypes.c_int64
+        n = run(ctypes.c_int64(t.size), *map(_pointer, (t, x0, p)), ctypes.c_double(tol), ctypes.c_int64(max_iter),
+                _pointer(x), _pointer(y), ctypes.byref(count))
+        return n, count.value
+
+
+def _pointer(array):
+    return ctypes.c_void_p(array.ctypes.data)

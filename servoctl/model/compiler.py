@@ -1,0 +1,181 @@
+"""C text becomes a loaded library: compiled by the system's compiler, kept on disk by content.
+
+A library is kept under the user's cache directory (``SERVOCTL_CACHE``, else ``XDG_CACHE_HOME``, else the platform's
+place) under the hash of the C text, the flags, the compiler and the processor. The compiler is ``SERVOCTL_COMPILER``,
+else ``CC``, else the first of cc, gcc and clang; ``SERVOCTL_COMPILER=none`` compiles nothing. Without a compiler, or
+where it fails, one warning per process says so and the caller goes on without.
+
+The flags keep the values of IEEE arithmetic with one exception: a product and a sum may be contracted to one fused
+operation, which rounds once instead of twice.
+"""
+
+import ctypes
+import functools
+import hashlib
+import os
+import platform
+import shlex
+import shutil
+import subprocess
+import sys
+import tempfile
+import threading
+import warnings
+from pathlib import Path
+
+# -O1 compiles fastest, and straight-line code runs within a quarter of what -O2 or -O3 make of it.
+FLAGS = ("-O1", "-fPIC", "-shared", "-w", "-fno-math-errno")
+_DIGEST = hashlib.sha256().digest_size
+
+_loaded = {}  # key -> ctypes.CDLL, or None where it could not be built
+_locks = {}  # key -> lock: no two threads compile the same text
+_guard = threading.Lock()
+_warned = False
+
+
+class _CompilerFailed(Exception):
+    """The compiler refused the text."""
+
+
+def library(text, build=True):
+    """Load the library of a C translation unit, compiling it if it is not at hand.
+
+    Parameters
+    ----------
+    text : str
+        C text.
+    build : bool
+        Whether to compile if the library is neither loaded nor kept on disk.
+
+    Returns
+    -------
+    ctypes.CDLL or None
+        None if there is none and it was not to be built, or could not be (which warns, once per process).
+    """
+    found = _compiler(*(os.environ.get(name) for name in ("SERVOCTL_COMPILER", "CC", "PATH")))
+    if found is None:
+        return _without("No C compiler was found, or SERVOCTL_COMPILER is none") if build else None
+    command, identity = found
+    parts = (text, *FLAGS, *_optional_flags(), identity, platform.machine(), _processor())
+    key = hashlib.sha256("\0".join(parts).encode()).hexdigest()
+    with _guard:
+        lock = _locks.setdefault(key, threading.Lock())
+    with lock:
+        if key not in _loaded:
+            kept = _open_kept(cache_directory() / f"{key}.so")
+            if kept is None and not build:
+                return None
+            _loaded[key] = kept or _build(text, f"{key}.so", command)
+        return _loaded[key]
+
+
+def cache_directory():
+    """Directory where compiled libraries are kept.
+
+    Returns
+    -------
+    pathlib.Path
+        ``SERVOCTL_CACHE`` if set, else ``servoctl`` under the user's cache directory; it need not exist.
+    """
+    if chosen := os.environ.get("SERVOCTL_CACHE"):
+        return Path(chosen).expanduser().absolute()
+    if base := os.environ.get("XDG_CACHE_HOME"):
+        return Path(base).absolute() / "servoctl"
+    if sys.platform == "darwin":
+        return Path.home() / "Library" / "Caches" / "servoctl"
+    if sys.platform == "win32":
+        return Path(os.environ.get("LOCALAPPDATA", Path.home())) / "servoctl" / "Cache"
+    return Path.home() / ".cache" / "servoctl"
+
+
+@functools.cache
+def _compiler(chosen, cc, path):
+    """Command of the compiler and what identifies it: its file's place, time and size (its version takes longer)."""
+    if chosen == "none":
+        return None
+    for candidate in (chosen, cc, "cc", "gcc", "clang"):
+        command = shlex.split(candidate or "")
+        if command and (program := shutil.which(command[0], path=path)):
+            files = [os.path.realpath(found) for word in command if (found := shutil.which(word, path=path))]
+            stats = [(file, os.stat(file).st_mtime_ns, os.stat(file).st_size) for file in files]
+            return (os.path.abspath(program), *command[1:]), repr((command, stats))
+    return None
+
+
+@functools.cache
+def _processor():
+    """The processor's model and features, empty where the system does not tell."""
+    telling = ("vendor_id", "cpu family", "model", "stepping", "flags", "Features", "CPU ")
+    try:
+        with open("/proc/cpuinfo", encoding="utf-8", errors="replace") as lines:
+            first = iter(lambda: lines.readline().rstrip("\n"), "")
+            return "\n".join(line for line in first if line.startswith(telling))
+    except OSError:
+        return ""
+
+
+def _optional_flags():
+    """Flags left out if the compiler refuses them; code for this very processor only where the key can name it."""
+    return ("-fno-semantic-interposition", *(("-march=native",) if _processor() else ()))
+
+
+@functools.cache
+def _scratch():
+    return tempfile.TemporaryDirectory(prefix="servoctl-")
+
+
+def _build(text, file_name, command):
+    """Compile into the cache, or into a temporary directory where the cache cannot be used."""
+    try:
+        try:
+            return _compile(text, cache_directory() / file_name, command)
+        except OSError:
+            return _compile(text, Path(_scratch().name) / file_name, command)
+    except (OSError, _CompilerFailed) as error:
+        return _without(f"{' '.join(command)} failed: {error}")
+
+
+def _compile(text, target, command):
+    target.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+    handle, temporary = tempfile.mkstemp(dir=target.parent, suffix=".tmp")
+    os.close(handle)
+    try:
+        for flags in ((*FLAGS, *_optional_flags()), FLAGS):
+            done = subprocess.run([*command, *flags, "-x", "c", "-", "-o", temporary, "-lm"], input=text, text=True,
+                                  capture_output=True, cwd=target.parent, check=False)
+            if done.returncode == 0:
+                break
+        else:
+            raise _CompilerFailed("; ".join(done.stderr.strip().splitlines()[:2]) or f"status {done.returncode}")
+        with open(temporary, "r+b") as file:
+            digest = hashlib.sha256(file.read()).digest()
+            file.write(digest)
+        os.replace(temporary, target)
+    finally:
+        Path(temporary).unlink(missing_ok=True)
+    return _open(target)
+
+
+def _open_kept(path):
+    """The library kept at a path, or None if there is none that is whole."""
+    try:
+        return _open(path)
+    except OSError:
+        return None
+
+
+def _open(path):
+    """Load a library whose last bytes are the digest of the others: loading a truncated one can end the process."""
+    content = path.read_bytes()
+    if hashlib.sha256(content[:-_DIGEST]).digest() != content[-_DIGEST:]:
+        raise OSError(f"{path} is damaged")
+    return ctypes.CDLL(str(path))
+
+
+def _without(reason):
+    global _warned
+    if not _warned:
+        _warned = True
+        warnings.warn(f"{reason}. CasADi evaluates the models instead: the same results, 10 to 100 times "
+                      "slower in simulation. Install gcc or clang, or name a compiler in CC.",
+                      RuntimeWarning, stacklevel=2)

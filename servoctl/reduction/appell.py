@@ -1,0 +1,203 @@
+"""Eq. (3.18): the balance on the virtual displacements on which the unknown reaction does no work.
+
+The reaction is B μ. With the quasi-coordinates split into dependent ones D and independent ones I,
+A = ∂γ_D/∂γ_I = -B_D⁻ᵀ B_Iᵀ and T = [A; 1] spans ker Bᵀ; the rows of Tᵀ r = 0 are (3.18) as printed when B = Gᵀ.
+"""
+
+from dataclasses import dataclass
+
+import casadi as ca
+import numpy as np
+
+from servoctl.errors import NotRealisable, SpecificationError, unknown
+from servoctl.reduction.elimination import eliminate
+from servoctl.reduction.ranks import clean, decide, decide_all
+from servoctl.reduction.rows import gradient
+
+LONGEST_SEARCH = 2  # times n: no relative degree exceeds the number of plant states
+
+
+@dataclass(frozen=True)
+class Realisation:
+    """Who supplies the reaction B μ, and the choice of dependent coordinates that goes with it.
+
+    Attributes
+    ----------
+    B : (n, b) SX
+        Directions of the reaction: those of the program first, material ones last.
+    actuation : (m, k) SX or None
+        u = actuation · (first k multipliers); None for an ideal program.
+    dependent, independent : tuple of int
+        Indices of the quasi-coordinates.
+    numbers : (b, n, N) array
+        Bᵀ at the points where the split was chosen.
+    """
+
+    B: ca.SX
+    actuation: object
+    dependent: tuple
+    independent: tuple
+    numbers: np.ndarray
+
+    def dynamics(self, balance):
+        """Tᵀ r, one SX scalar per independent coordinate, and the pivots divided by."""
+        transposed = self.B.T
+        a, pivots = eliminate(
+            transposed[:, list(self.dependent)],
+            -transposed[:, list(self.independent)],
+            self.numbers[:, list(self.dependent)],
+        )
+        rows = balance[list(self.independent)] + a.T @ balance[list(self.dependent)]
+        return ca.vertsplit(rows), [p for p in pivots if ca.symvar(p)]
+
+    def multipliers(self, balance):
+        """μ with B_D μ = r_D, (b,) SX: they come for free, none was introduced."""
+        rows = list(self.dependent)
+        return eliminate(self.B[rows, :], balance[rows], self.numbers[:, rows].swapaxes(0, 1))[0]
+
+
+def realisation(mechanism, program, constraints, points):
+    """Who realises the program, from its leading gradients and the mechanism's actuators.
+
+    Parameters
+    ----------
+    mechanism : Mechanism
+    program : Program
+    constraints : list of Row
+        Program rows and material rows, the latter of full row rank.
+    points : Points
+        On the manifold of the constraints.
+
+    Returns
+    -------
+    Realisation
+
+    Raises
+    ------
+    NotRealisable
+        If there are fewer actuators than residuals, or they cannot move them.
+    """
+    q = mechanism.q
+    leading = {kind: [gradient(q, row) for row in constraints if row.kind == kind] for kind in ("program", "material")}
+    material = [g.T for g in leading["material"]]
+    if program.by == "ideal":
+        directions, actuation = [g.T for g in leading["program"]], None
+    else:
+        direction, actuation = _actuator_directions(mechanism, program, constraints, points)
+        directions = [direction]
+    B = ca.horzcat(*directions, *material)
+    numbers, sizes = points.matrix(B.T)
+    rank, best = decide_all(numbers, sizes)
+    if rank.rank < B.shape[1]:
+        raise NotRealisable(
+            f"The directions of the actuators {', '.join(mechanism.actuators)} and of the material constraints are "
+            f"dependent (rank {rank.rank} of {B.shape[1]}).",
+            "Each actuator needs a direction of its own.",
+            do="Remove an actuator or a constraint.",
+        )
+    dependent = tuple(sorted(rank.columns))
+    independent = tuple(i for i in range(q.n) if i not in dependent)
+    cleaned = clean(numbers, sizes)
+    regular = [p for p in range(numbers.shape[2]) if decide(cleaned[:, list(dependent), p]).rank == len(cleaned)]
+    return Realisation(B, actuation, dependent, independent, cleaned[:, :, regular or [best]])
+
+
+def _actuator_directions(mechanism, program, constraints, points):
+    """E, or E W⁻¹Pᵀ where there are more actuators than residuals."""
+    q = mechanism.q
+    k, m = len(program.residuals), len(mechanism.actuators)
+    material = [row for row in constraints if row.kind == "material"]
+    both = ca.horzcat(mechanism.E, *(gradient(q, row).T for row in material))
+    rank = decide_all(*points.matrix(both.T))[0].rank if both.shape[1] else 0
+    free = rank - len(material)
+    if k > free:
+        raise NotRealisable(
+            f"The program has {k} residuals ({', '.join(program.residuals)}) and the mechanism {free} independent "
+            f"actuators ({', '.join(mechanism.actuators) or 'none'}).",
+            "There are at least as many independent actuators as residuals.",
+            nearest=f"{free} residuals, or by='ideal'." if free else "by='ideal'.",
+            do="Add actuators or remove residuals.",
+            residuals=list(program.residuals),
+            actuators=list(mechanism.actuators),
+        )
+    unknown_weights = [w for w in program.weights if w not in mechanism.actuators]
+    if unknown_weights:
+        raise unknown(unknown_weights[0], mechanism.actuators, "actuator")
+    if k == m:
+        return mechanism.E, ca.SX.eye(m)
+    inverse_weights = ca.diag(ca.vertcat(*(1 / ca.SX(program.weights.get(name, 1.0)) for name in mechanism.actuators)))
+    P = decoupling(mechanism, [row for row in constraints if row.kind == "program"], material, points)
+    rank_P = decide_all(*points.matrix(P))[0].rank
+    if rank_P < k:
+        raise NotRealisable(
+            f"The decoupling matrix has rank {rank_P} for {k} residuals and {m} actuators.",
+            "A pointwise least norm of redundant actuation needs a decoupling matrix of full row rank.",
+            nearest=f"Exactly {k} actuators: then hidden constraints are found.",
+            do="Leave out actuators, or choose other outputs.",
+            rank=rank_P,
+        )
+    actuation = inverse_weights @ P.T
+    return mechanism.E @ actuation, actuation
+
+
+def decoupling(mechanism, rows, material, points):
+    """P = ∂φ^(r)/∂u (k, m): each residual differentiated along the plant until the actuation appears.
+
+    For relative degree 2 P = G N E with N = M⁻¹, or T_m(T_mᵀMT_m)⁻¹T_mᵀ beside material rows.
+    """
+    q = mechanism.q
+    acceleration = ca.vertcat(*q.gamma(2))
+    rest = ca.substitute(mechanism.balance, acceleration, ca.SX.zeros(q.n))
+    second = ca.vertcat(*(q.derivatives([row.expression], 2 - row.order)[-1][0] for row in material))
+    second = ca.substitute(second, acceleration, ca.SX.zeros(q.n)) if material else ca.SX(0, 1)
+    moves = plant_accelerations(mechanism, material, mechanism.E, ca.SX.zeros(len(material), mechanism.E.shape[1]), points)
+    drift = plant_accelerations(mechanism, material, -rest, -second, points)
+    result = []
+    for row in rows:
+        expression = q.derivatives([row.expression], max(0, 2 - row.order))[-1][0] if row.order < 2 else row.expression
+        level = max(row.order, 2)
+        for _ in range(LONGEST_SEARCH * q.n):
+            coefficients = ca.jacobian(expression, ca.vertcat(*q.gamma(level))) @ moves
+            if np.any(clean(*points.matrix(coefficients))) or level > 2:
+                break
+            expression = q.derivatives([ca.substitute(expression, acceleration, drift)], 1)[-1][0]
+        result.append(coefficients)
+    return ca.cse(ca.vertcat(*result))
+
+
+def _saddle(mechanism, material):
+    """[M G_mᵀ; G_m 0]."""
+    n, k = mechanism.q.n, len(material)
+    G = ca.vertcat(*(gradient(mechanism.q, row) for row in material)) if material else ca.SX(0, n)
+    return ca.vertcat(ca.horzcat(mechanism.mass, G.T), ca.horzcat(G, ca.SX.zeros(k, k)))
+
+
+def plant_accelerations(mechanism, material, forces, second, points):
+    """γ'' of the plant: the upper part of [M G_mᵀ; G_m 0] [γ''; -λ] = [forces; second], (n, columns) SX."""
+    matrix = _saddle(mechanism, material)
+    numbers = clean(*points.matrix(matrix))
+    return eliminate(matrix, ca.vertcat(forces, second), numbers)[0][: mechanism.q.n, :]
+
+
+def require_inertia(mechanism, material, points):
+    """Refuse an inertia matrix that is singular on the displacements that material constraints allow.
+
+    Raises
+    ------
+    SpecificationError
+        Naming the coordinates of the direction without inertia.
+    """
+    q, n = mechanism.q, mechanism.q.n
+    values, sizes = points.matrix(_saddle(mechanism, material))
+    rank, best = decide_all(values, sizes)
+    if rank.rank < len(values):
+        cleaned = clean(values, sizes)[:, :, best].astype(float)
+        null = np.linalg.svd(cleaned)[2][-1][:n]
+        names = [q.jet_names(1)[i] for i in np.flatnonzero(np.abs(null) > 1e-6 * np.abs(null).max())]
+        raise SpecificationError(
+            f"The mass matrix is singular: a direction of {', '.join(names)} has no inertia.",
+            "M = ∂²S/∂γ''² is positive definite on the displacements that material constraints allow.",
+            nearest="A small mass or inertia there, or one coordinate less.",
+            do="Check the masses and inertias and their default numbers.",
+            names=names,
+        )

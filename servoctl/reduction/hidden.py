@@ -1,0 +1,211 @@
+"""Hidden constraints by linear combination (Tan, Nedialkov & Pryce after Pryce's signature method).
+
+While the leading matrix L of the rows is singular on their manifold, w with wᵀL = 0 gives the combination
+χ = Σ w_a D^(o - o_a) ψ_a of lower order, which replaces one row; the sum of the orders falls at every step.
+"""
+
+from dataclasses import replace
+
+import casadi as ca
+import numpy as np
+
+from servoctl.errors import InconsistentStart, NotRealisable, SingularProgram, SpecificationError
+from servoctl.reduction.elimination import eliminate
+from servoctl.reduction.ranks import NOISE, RESOLVED, clean, decide, decide_all
+from servoctl.reduction.rows import Row, dependence, gradient, leading, merge_uses, sample_rows, settle
+
+
+def complete(q, rows, context, starts=None):
+    """Replace rows by hidden constraints until their leading matrix has full row rank.
+
+    Parameters
+    ----------
+    q : Coordinates
+    rows : list of Row
+        At most n; each with its settled order.
+    context : Context
+    starts : Points, optional
+        Where to look for points.
+
+    Returns
+    -------
+    rows : list of Row
+    rank : Rank
+        Of the final leading matrix, with its margins.
+    points : Points
+        On the final manifold.
+    guards : list of (str, SX)
+        Pivots by which the combinations divide.
+
+    Raises
+    ------
+    SpecificationError
+        If constraints depend on each other or contradict each other.
+    NotRealisable
+        If the dependence involves the mechanism's dynamics.
+    SingularProgram
+        If a row's gradient vanishes on its own solutions, or a rank cannot be told.
+    InconsistentStart
+        If no state satisfies the rows.
+    """
+    rows, guards, points = list(rows), [], starts
+    while True:
+        level = max([row.order for row in rows], default=0)
+        points = sample_rows(q, rows, level, context, starts=points)
+        if not len(points.t):
+            _refuse_contradiction(q, rows, context)
+        numbers, sizes = leading(q, rows, points)
+        rank, best = decide_all(numbers, sizes)
+        if not rank.clear:
+            raise _ill_conditioned(rows, rank)
+        if rank.rank == len(rows):
+            return rows, rank, points, guards
+        same = [p for p in range(numbers.shape[2]) if decide(numbers[:, :, p]).rank == rank.rank]
+        rows, new_guards = _step(q, rows, numbers[:, :, same], context, points)
+        guards += new_guards
+
+
+def _step(q, rows, numbers, context, starts=None):
+    """One replacement: the rows with a hidden constraint in the place of one of them."""
+    order = sorted(range(len(rows)), key=lambda a: (rows[a].kind == "dynamics", rows[a].order, a))
+    support, weights = dependence(q, [rows[a] for a in order], numbers[order])
+    support = [order[i] for i in support]
+    top = max(rows[a].order for a in support)
+    candidates = [(rows[a].kind == "dynamics", w, a) for a, w in zip(support, weights, strict=True) if rows[a].order == top]
+    b = max(candidates)[2]
+    _require_affine(rows, support, top)
+    others = [a for a in support if a != b]
+    chi, pivots = _combine(q, rows, b, others, top, numbers)
+    names = [_derivative_name(rows[a], top - rows[a].order) for a in others]
+    story = f"{rows[b].name} with {', '.join(names)}" if names else rows[b].name
+    rest = [row for a, row in enumerate(rows) if a != b]
+    uses = merge_uses(*((rows[a].uses, top - rows[a].order) for a in support))
+    candidate = replace(rows[b], expression=chi, order=top, uses=uses)
+    new, points = settle(q, candidate, rest, context, starts)
+    if new is None:
+        raise _no_state(rest)
+    if new.order >= top:
+        raise _vanishing_gradient(rows[b])
+    kinds = {rows[a].kind for a in support}
+    if new.order < 0:
+        raise _dependent(new, points, [rows[a].name for a in support], kinds, story)
+    new = replace(new, name=rows[b].name, kind=rows[b].kind, story=story)
+    return [new if a == b else row for a, row in enumerate(rows)], [(f"combination of {story}", p) for p in pivots]
+
+
+def _combine(q, rows, b, others, top, numbers):
+    """χ = ψ_b + Σ w_a D^(top - o_a) ψ_a with the w that cancels the leading gradient of row b."""
+    chi = q.derivatives([rows[b].expression], top - rows[b].order)[-1][0]
+    if not others:
+        return chi, []
+    columns = sorted(decide(numbers[others, :, 0]).columns)
+    matrix = ca.vertcat(*(gradient(q, rows[a]) for a in others))[:, columns].T
+    target = -gradient(q, rows[b])[:, columns].T
+    w, pivots = eliminate(matrix, target, numbers[others][:, columns].swapaxes(0, 1))
+    for a, weight in zip(others, w.elements(), strict=True):
+        chi = chi + weight * q.derivatives([rows[a].expression], top - rows[a].order)[-1][0]
+    return ca.cse(chi), [p for p in pivots if ca.symvar(p)]
+
+
+def _derivative_name(row, k):
+    return row.name if k == 0 else f"D{'' if k == 1 else k}({row.name})"
+
+
+def _require_affine(rows, support, top):
+    bent = [rows[a].name for a in support if rows[a].order == top and not rows[a].affine]
+    if bent:
+        raise SpecificationError(
+            f"The residual {bent[0]!r} is not linear in its highest derivative and depends on other rows there.",
+            "Hidden constraints are found among rows that are linear in their highest derivatives.",
+            nearest=f"The time derivative of {bent[0]!r}, which is linear in its highest derivative.",
+            do="Give that derivative as the residual and hold the residual itself at the start.",
+            rows=bent,
+        )
+
+
+def _vanishing_gradient(row):
+    return SingularProgram(
+        f"The gradient of row {row.name!r} vanishes on its own solutions.",
+        "A constraint is regular: a squared one, like φ² = 0, says nothing about the directions in which φ grows.",
+        nearest=f"A form of {row.name!r} that changes sign where it is crossed.",
+        do="State the residual that was squared, not its square.",
+        row=row.name,
+    )
+
+
+def _dependent(row, points, names, kinds, story):
+    values, sizes = points.evaluate([row.expression])
+    zero = not np.any(clean(values, sizes))
+    what = ", ".join(names)
+    if "dynamics" in kinds:
+        program = [n for n in names if n != row.name] or names
+        return NotRealisable(
+            f"The actuation never reaches the program: the combination {story} "
+            + ("vanishes identically." if zero else "depends on nothing but t and is not zero."),
+            "Every residual needs an actuator that moves it.",
+            nearest="Residuals of coordinates that the actuators move.",
+            do=f"Change the actuators or the rows {', '.join(program)}.",
+            rows=names,
+        )
+    if zero:
+        return SpecificationError(
+            f"The constraints {what} are dependent: the combination {story} vanishes identically.",
+            "Constraints are independent of each other.",
+            do=f"Leave out one of {what}.",
+            rows=names,
+        )
+    return SpecificationError(
+        f"The constraints {what} contradict each other: the combination {story} depends on nothing but t and is not zero.",
+        "Constraints have a common solution.",
+        do=f"Correct one of {what}.",
+        rows=names,
+    )
+
+
+def _refuse_contradiction(q, rows, context):
+    """No point satisfies all rows: look for the contradiction among them, and raise."""
+    level = max(row.order for row in rows)
+    points = sample_rows(q, [], level, context)
+    numbers, sizes = leading(q, rows, points)
+    rank, _ = decide_all(numbers, sizes)
+    if rank.clear and rank.rank < len(rows):
+        same = [p for p in range(numbers.shape[2]) if decide(numbers[:, :, p]).rank == rank.rank]
+        _step(q, rows, numbers[:, :, same], context)
+    raise _no_state(rows)
+
+
+def _no_state(rows):
+    return InconsistentStart(
+        f"No state was found that satisfies {', '.join(sorted({row.name for row in rows}))} with their derivatives.",
+        "Constraints have a common solution near the guess.",
+        do="Give derive a guess={...} near the motion, or correct the constraints.",
+        rows=[row.name for row in rows],
+    )
+
+
+def _ill_conditioned(rows, rank):
+    return SingularProgram(
+        f"Whether the rows {', '.join(row.name for row in rows)} are independent cannot be told in double precision: "
+        f"the smallest pivot that counts is {rank.kept:.2e}, the largest that does not {rank.dropped:.2e}.",
+        f"An equilibrated pivot is zero (below {NOISE:.0e}) or resolved (above {RESOLVED:.0e}).",
+        do="Move the parameters away from the singular case, or state the singular case exactly.",
+        kept=rank.kept,
+        dropped=rank.dropped,
+    )
+
+
+def as_rows(q, named, kind, context):
+    """Rows of named residuals with their true orders."""
+    rows = []
+    for name, expression in named.items():
+        uses = {name: 0} if kind == "program" else {}
+        row, _ = settle(q, Row(expression, max(q.order(expression), 0), name, kind, uses=uses), [], context)
+        if row.order < 0:
+            raise SpecificationError(
+                f"The residual {name!r} depends on no coordinate.",
+                "A constraint restricts the motion.",
+                do="Use the symbols of the mechanism's coordinates.",
+                name=name,
+            )
+        rows.append(row)
+    return rows

@@ -1,0 +1,238 @@
+"""Where paths switch, and how smooth residuals are there, found from the expressions themselves."""
+
+from dataclasses import dataclass
+from math import factorial
+
+import casadi as ca
+import numpy as np
+
+from servoctl.errors import SpecificationError
+from servoctl.spec.taylor import Series, Tape
+
+MOST_BRANCHES = 24  # affine pieces that are followed through one operation
+JUMP = 1e-6  # of the largest value that a derivative takes along the path
+
+
+@dataclass(frozen=True)
+class Knots:
+    """Instants at which residuals switch between smooth pieces.
+
+    Attributes
+    ----------
+    times : tuple of float
+        Ascending [s].
+    classes : dict of str to list of (float, int)
+        For each residual the instants at which it is not smooth, with the class C^k that it has there.
+    """
+
+    times: tuple
+    classes: dict
+
+
+class Switches:
+    """The switches of residuals that depend on nothing but t and parameters.
+
+    Parameters
+    ----------
+    q : Coordinates
+    residuals : dict of str to SX
+    parameters : tuple of SX
+    """
+
+    def __init__(self, q, residuals, parameters):
+        self.q, self.residuals = q, residuals
+        expressions = list(residuals.values())
+        self.symbols = ca.symvar(ca.vertcat(*expressions))
+        self.tape = Tape(self.symbols, expressions)
+        self.parameters = [p.element_hash() for p in parameters]
+        depends = []
+        for node in self.tape.nodes:
+            if node.kind == "input":
+                place = q.where(self.symbols[node.data])
+                depends.append({"p" if place is None else "t" if place[0] == "t" else "jets"})
+            else:
+                depends.append(set().union(*(depends[a] for a in node.args)) if node.args else set())
+        self.timed = []
+        for a, b in self.tape.switches:
+            both = depends[a] | (depends[b] if b is not None else set())
+            if "t" in both and "jets" not in both:
+                self.timed.append((a, b))
+
+    def __bool__(self):
+        return bool(self.timed)
+
+    def times(self, values, span=None):
+        """Instants at which a switch changes sides, ascending.
+
+        Parameters
+        ----------
+        values : (n_p,) array
+        span : (t0, t1), optional
+            Also look there for switches that are not affine in t.
+        """
+        if not self.timed:
+            return []
+        pieces = self._affine(values)
+        found = set()
+        for a, b in self.timed:
+            for c0, c1 in pieces[a] or ():
+                for d0, d1 in (pieces[b] or ()) if b is not None else ((0.0, 0.0),):
+                    if c1 != d1:
+                        found.add((d0 - c0) / (c1 - d1))
+        window = [*found, *(span or ())]
+        if window and max(window) > min(window):
+            found |= self._scan(values, min(window), max(window), found)
+        times = sorted(found)
+        width = max(times[-1] - times[0], 1e-9) if times else 1.0
+        return [t for i, t in enumerate(times) if i == 0 or t - times[i - 1] > 1e-9 * width]
+
+    def _affine(self, values):
+        """For each node the affine pieces (c0, c1) that it may take, or None where one is not affine."""
+        pieces = []
+        for node in self.tape.nodes:
+            pieces.append(self._pieces(node, pieces, values))
+        return pieces
+
+    def _pieces(self, node, pieces, values):
+        if node.kind == "input":
+            place = self.q.where(self.symbols[node.data])
+            if place is None:
+                index = self.parameters.index(self.symbols[node.data].element_hash())
+                return ((float(values[index]), 0.0),)
+            return ((0.0, 1.0),) if place[0] == "t" else None
+        if node.kind == "const":
+            return ((float(node.data), 0.0),)
+        args = [pieces[a] for a in node.args]
+        if any(a is None for a in args) or node.kind not in _PIECE:
+            return None
+        if node.kind in ("fmin", "fmax"):
+            result = {*args[0], *args[1]}
+        else:
+            options = [(a,) for a in args[0]] if len(args) == 1 else [(a, b) for a in args[0] for b in args[1]]
+            result = {_PIECE[node.kind](node.data, *o) for o in options}
+        result = tuple(r for r in result if r is not None)
+        return result if 0 < len(result) <= MOST_BRANCHES else None
+
+    def _scan(self, values, t0, t1, known):
+        def sides(t):
+            c = self._run(np.atleast_1d(t), values, 1).c
+            return [np.broadcast_to(c[a][0] - (c[b][0] if b is not None else 0.0), np.shape(t)) for a, b in self.timed]
+
+        grid = np.linspace(t0, t1, 801)
+        found = set()
+        for s, g in enumerate(sides(grid)):
+            for i in np.flatnonzero(np.sign(g[:-1]) * np.sign(g[1:]) < 0):
+                low, high = grid[i], grid[i + 1]
+                if any(low <= k <= high for k in known):
+                    continue
+                for _ in range(60):
+                    middle = (low + high) / 2
+                    low, high = (middle, high) if np.sign(sides(middle)[s]) == np.sign(g[i]) else (low, middle)
+                found.add(float((low + high) / 2))
+        return found
+
+    def _run(self, t, values, depth):
+        t = np.asarray(t, dtype=np.longdouble)
+        inputs = []
+        for i, s in enumerate(self.symbols):
+            place = self.q.where(s)
+            if place is None:
+                first = np.longdouble(values[self.parameters.index(s.element_hash())])
+            elif place[0] == "t":
+                first = t
+            else:
+                first = np.longdouble(0.3 + 0.1 * ((7 * i) % 10))
+            inputs.append([first, *(float(k == 1 and place is not None and place[0] == "t") for k in range(1, depth))])
+        series = Series(self.tape, inputs)
+        with np.errstate(all="ignore"):
+            for _ in range(depth):
+                series.advance()
+        return series
+
+    def classes(self, values, needs, times):
+        """The class of each residual at each switching instant.
+
+        Parameters
+        ----------
+        needs : dict of str to int
+            Derivatives that are used of each residual; higher ones are not looked at.
+
+        Returns
+        -------
+        dict of str to list of (time, class)
+            Instants at which a derivative of order <= need jumps; the class is that order less one.
+        """
+        if not times:
+            return {}
+        top = max(needs.values(), default=0)
+        extra = 4
+        width = max(times[-1] - times[0], 1e-6)
+        h = 1e-4 * min([width, *np.diff(times)])
+        depth = top + extra + 1
+        t = np.array([*(x - h for x in times), *(x + h for x in times), *np.linspace(times[0], times[-1], 203)[1:-1]])
+        series = self._run(t, values, depth)
+        result = {}
+        for name, c in zip(self.residuals, series.outputs, strict=True):
+            c = np.array([np.broadcast_to(x, t.shape) for x in c])
+            for i, when in enumerate(times):
+                left = _shift(c[:, i], h)
+                right = _shift(c[:, len(times) + i], -h)
+                for k in range(needs.get(name, 0) + 1):
+                    scale = np.abs(c[k]).max()
+                    if abs(left[k] - right[k]) > JUMP * scale and scale > 0:
+                        result.setdefault(name, []).append((when, k - 1))
+                        break
+        return result
+
+
+def _shift(c, h):
+    """Taylor coefficients about a point h away."""
+    n = len(c)
+    return [
+        sum(c[j] * float(factorial(j) // (factorial(k) * factorial(j - k))) * h ** (j - k) for j in range(k, n))
+        for k in range(n)
+    ]
+
+
+def _times(_, a, b):
+    return (a[0] * b[0], a[0] * b[1] + a[1] * b[0]) if a[1] * b[1] == 0 else None
+
+
+_PIECE = {
+    "add": lambda _, a, b: (a[0] + b[0], a[1] + b[1]),
+    "sub": lambda _, a, b: (a[0] - b[0], a[1] - b[1]),
+    "mul": _times,
+    "div": lambda _, a, b: (a[0] / b[0], a[1] / b[0]) if b[1] == 0 and b[0] != 0 else None,
+    "neg": lambda _, a: (-a[0], -a[1]),
+    "scale": lambda data, a: (data * a[0], data * a[1]),
+    "copy": lambda _, a: a,
+    "fmin": None,
+    "fmax": None,
+}
+
+
+def require_smooth(switches, values, needs, span=None):
+    """The knots of a program, after refusing a path that is not smooth enough.
+
+    Raises
+    ------
+    SpecificationError
+        "needs C^4, has C^2 at t = 3.0".
+    """
+    times = switches.times(values, span)
+    classes = switches.classes(values, needs, times)
+    for name, found in classes.items():
+        when, k = min(found, key=lambda pair: pair[1])
+        if k < needs.get(name, 0):
+            has = f"C^{k}" if k >= 0 else "a jump"
+            raise SpecificationError(
+                f"The path in {name!r} needs C^{needs[name]}, has {has} at t = {when:.6g}.",
+                f"The actuation holds the {needs[name]}. derivative of {name!r}, which must be continuous.",
+                nearest=f"A path of smoothness {needs[name]}.",
+                do=f"Give sv.paths.rest_to_rest(..., smoothness={needs[name]}), or a spline of that class.",
+                name=name,
+                needs=needs[name],
+                has=k,
+                t=when,
+            )
+    return Knots(tuple(times), classes)

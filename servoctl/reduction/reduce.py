@@ -1,0 +1,177 @@
+"""From a mechanism and a program to the rows that determine the motion and its actuation."""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import casadi as ca
+
+from servoctl.errors import SpecificationError, unknown
+from servoctl.reduction.appell import Realisation, realisation, require_inertia
+from servoctl.reduction.hidden import as_rows, complete
+from servoctl.reduction.knots import Knots, Switches, require_smooth
+from servoctl.reduction.manifold import Context, Points
+from servoctl.reduction.ranks import Rank
+from servoctl.reduction.rows import Row, gradient, merge_uses, sample_rows, settle
+from servoctl.spec.mechanism import Mechanism, require_known
+from servoctl.spec.program import Program
+
+
+@dataclass(frozen=True)
+class Reduction:
+    """The rows ψ_a = 0 of a motion, hidden constraints among them, and where the actuation comes from.
+
+    Attributes
+    ----------
+    mechanism : Mechanism
+    program : Program
+    rows : tuple of Row
+        n rows, program rows first, then material ones, then those of (3.18).
+    realisation : Realisation
+    rank : Rank
+        Of the leading matrix of the rows, with its margins.
+    points : Points
+        Seeded points on the manifold of the rows and their derivatives.
+    guards : tuple of (str, SX)
+        Pivots by which the rows divide.
+    knots : Knots
+    switches : Switches
+    context : Context
+    given : dict of str to Row
+        The designer's residuals and the material constraints as they were given.
+    """
+
+    mechanism: Mechanism
+    program: Program
+    rows: tuple
+    realisation: Realisation
+    rank: Rank
+    points: Points
+    guards: tuple
+    knots: Knots
+    switches: Switches
+    context: Context
+    given: dict
+
+    @property
+    def top(self):
+        """The common order s̄ to which every row is raised: 2 or more, and more than that of a bent row."""
+        return max([2, *(row.order + (not row.affine) for row in self.rows)])
+
+    @property
+    def free(self):
+        """The number of free initial values, Σ o_a."""
+        return sum(row.order for row in self.rows)
+
+    @property
+    def needs(self):
+        """Derivatives of each residual that the actuation holds."""
+        return needs(self.rows)
+
+    @property
+    def hidden(self):
+        """The rows that are hidden constraints."""
+        return tuple(row for row in self.rows if row.story)
+
+    @cached_property
+    def leading(self):
+        """The leading matrix L, (n, n) SX."""
+        return ca.cse(ca.vertcat(*(gradient(self.mechanism.q, row) for row in self.rows)))
+
+    @cached_property
+    def multipliers(self):
+        """Multipliers of the reaction, program first, (b,) SX of t, q, γ', γ''."""
+        return self.realisation.multipliers(self.mechanism.balance)
+
+    @cached_property
+    def actuation(self):
+        """Required actuation u (m,) SX, or for an ideal program the reaction of the program, (n,) SX."""
+        k = len(self.program.residuals)
+        own = self.multipliers[:k]
+        if self.program.by == "actuators":
+            return ca.cse(self.realisation.actuation @ own)
+        return ca.cse(self.realisation.B[:, :k] @ own)
+
+
+def needs(rows):
+    """Derivatives of each residual that stand in γ'' and so in the actuation."""
+    return merge_uses(*((row.uses, max(0, 2 - row.order)) for row in rows))
+
+
+def reduce(mechanism, program, guess=None, near=None):
+    """Derive the rows of a motion: eq. (3.18), hidden constraints, ranks on the manifold.
+
+    Parameters
+    ----------
+    mechanism : Mechanism
+    program : Program
+    guess : dict of str to float, optional
+        Values of coordinates or derivatives about which points of the manifold are looked for.
+    near : (t, guess, values), optional
+        A state of a motion with its parameters: pivots are chosen for it.
+
+    Returns
+    -------
+    Reduction
+
+    Raises
+    ------
+    SpecificationError, NotRealisable, SingularProgram, InconsistentStart
+        See `hidden.complete` and `appell.realisation`.
+    """
+    q = mechanism.q
+    for name, expression in program.residuals.items():
+        require_known(expression, mechanism, f"the residual {name!r}")
+    twice = [name for name in program.residuals if name in mechanism.constraints]
+    if twice:
+        raise SpecificationError(
+            f"{twice[0]!r} names a residual and a material constraint.", "Each has a name of its own.", do="Rename one."
+        )
+    switches = Switches(q, {**program.residuals, **mechanism.constraints}, mechanism.parameters.symbols)
+    context = _context(mechanism, switches, guess, near)
+    given = as_rows(q, program.residuals, "program", context) + as_rows(q, mechanism.constraints, "material", context)
+    program_rows = [row for row in given if row.kind == "program"]
+    material, _, points, guards = complete(q, [row for row in given if row.kind == "material"], context)
+    require_inertia(mechanism, material, points)
+    if program.by == "ideal":
+        constraints, _, points, guards = complete(q, [*program_rows, *material], context)
+    else:
+        constraints = [*program_rows, *material]
+        points = _points_for(q, constraints, points, context)
+    split = realisation(mechanism, program, constraints, points)
+    expressions, pivots = split.dynamics(mechanism.balance)
+    guards = [*guards, *((f"choice of dependent coordinates {i + 1}", p) for i, p in enumerate(pivots))]
+    names = q.names if q.plain else q.velocity_names
+    dynamics = []
+    for i, e in zip(split.independent, expressions, strict=True):
+        row, _ = settle(q, Row(e, max(q.order(e), 0), f"balance of {names[i]}", "dynamics"), [], context)
+        dynamics.append(row)
+    rows, rank, points, more = complete(q, [*constraints, *dynamics], context, points)
+    knots = require_smooth(switches, context.values, needs(rows))
+    return Reduction(
+        mechanism, program, tuple(rows), split, rank, points, tuple([*guards, *more]), knots, switches, context,
+        {row.name: row for row in given},
+    )  # fmt: skip
+
+
+def _context(mechanism, switches, guess, near):
+    values = mechanism.parameters.values()
+    if near is not None:
+        t, guess, values = near
+        return Context(mechanism.parameters.symbols, values, (t, t), guess, spread=1e-4)
+    q = mechanism.q
+    known = [*q.names, *(name for k in range(1, 8) for name in q.jet_names(k))]
+    for name in guess or {}:
+        if name not in known:
+            raise unknown(name, known, "coordinate or derivative")
+    times = switches.times(values)
+    window = (0.1, 1.1)
+    if len(times) > 1:
+        width = times[-1] - times[0]
+        window = (times[0] + 0.07 * width, times[-1] - 0.07 * width)
+    return Context(mechanism.parameters.symbols, values, window, guess or {})
+
+
+def _points_for(q, constraints, points, context):
+    """Points on the manifold of all constraints, or on that of the material ones where there are none."""
+    found = sample_rows(q, constraints, max([2, *(row.order for row in constraints)]), context)
+    return found if len(found.t) else points

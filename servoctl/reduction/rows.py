@@ -1,0 +1,211 @@
+"""The rows ψ_a = 0 that determine the motion, their orders and leading gradients."""
+
+from dataclasses import dataclass, field, replace
+
+import casadi as ca
+import numpy as np
+
+from servoctl.reduction.elimination import eliminate
+from servoctl.reduction.manifold import sample
+from servoctl.reduction.ranks import ENTRY, clean, combination, decide, equilibrate
+
+DEPENDENT = 1e-11  # what may be left of a row after the combination of others, both equilibrated
+
+
+@dataclass(frozen=True)
+class Row:
+    """One scalar equation ψ(t, q, γ', ..., γ^(order)) = 0.
+
+    Attributes
+    ----------
+    expression : SX scalar
+    order : int
+        Highest level on which it depends on the manifold; 0 for q alone, -1 for neither q nor a jet.
+    name : str
+    kind : {"program", "material", "dynamics"}
+        Where it came from.
+    affine : bool
+        Whether it is affine in γ^(order).
+    story : str
+        What was done to it, if it is a hidden constraint.
+    uses : dict of str to int
+        How often each program residual stands differentiated in it.
+    """
+
+    expression: ca.SX
+    order: int
+    name: str
+    kind: str
+    affine: bool = True
+    story: str = ""
+    uses: dict = field(default_factory=dict)
+
+
+def merge_uses(*parts):
+    """The highest number of differentiations of each residual among (uses, extra differentiations) pairs."""
+    total = {}
+    for uses, extra in parts:
+        for name, count in uses.items():
+            total[name] = max(total.get(name, 0), count + extra)
+    return total
+
+
+def gradient(q, row, level=None):
+    """∂ψ/∂γ^(level), (1, n) SX; for level 0 ∂ψ/∂q · V. Default: the row's own order, its leading gradient."""
+    level = row.order if level is None else level
+    if level == 0:
+        return ca.jacobian(row.expression, ca.vertcat(*q)) @ q.V
+    return ca.jacobian(row.expression, ca.vertcat(*q.gamma(level)))
+
+
+def sample_rows(q, rows, level, context, **options):
+    """Points on the manifold of rows and their derivatives up to a level (see `manifold.sample`)."""
+    return sample(q, [(row.expression, row.order) for row in rows], level, context, **options)
+
+
+def leading(q, rows, points):
+    """The cleaned leading matrix L at points, (rows, n, N), and the sizes of its entries."""
+    values, sizes = points.matrix(ca.vertcat(*(gradient(q, row) for row in rows)))
+    return clean(values, sizes), sizes
+
+
+def settle(q, row, others, context, starts=None):
+    """Find the order on which a row depends on the manifold of the others, and free it of false symbols.
+
+    From its highest symbol downwards: jets on which the row does not depend there are set to zero; jets that
+    the other rows determine are replaced by what those rows say.
+
+    Parameters
+    ----------
+    q : Coordinates
+    row : Row
+        Its `order` is an upper bound.
+    others : list of Row
+    starts : Points, optional
+        Where to look for points.
+
+    Returns
+    -------
+    Row
+        With its true order (-1 for none), or `None` if no point satisfies the others.
+    points : Points
+    """
+    level = max([row.order, q.order(row.expression), 0, *(other.order for other in others)])
+    points = sample_rows(q, others, level, context, starts=starts)
+    if not len(points.t):
+        return None, points
+    for j in range(q.order(row.expression), -1, -1):
+        values, sizes = points.matrix(gradient(q, replace(row, order=j)))
+        values = clean(values, sizes)[0]
+        if np.any(values):
+            lower = [other for other in others if other.order < j or (other.order == j and other.affine and j > 0)]
+            replaced = _replace(q, row, j, values, lower, points)
+            if replaced is None:
+                return replace(row, order=j, affine=_affine(q, row.expression, j, points)), points
+            row = replaced
+        elif j > 0:
+            row = _drop(q, row, q.gamma(j), points)
+    if q.order(row.expression) == 0 and not np.any(clean(*points.matrix(gradient(q, replace(row, order=0))))):
+        return replace(row, order=-1), points
+    return replace(row, order=max(q.order(row.expression), -1)), points
+
+
+def _drop(q, row, symbols, points):
+    """The row with jets on which it does not depend set to zero; unchanged if its value would change."""
+    expression = ca.substitute(row.expression, ca.vertcat(*symbols), ca.SX.zeros(len(symbols)))
+    values, sizes = points.evaluate([expression, row.expression])
+    same = np.abs(values[0] - values[1]) <= ENTRY * (sizes[0] + sizes[1])
+    return replace(row, expression=expression) if np.all(same) else row
+
+
+def _affine(q, expression, j, points):
+    if j == 0:
+        return True
+    jets = ca.vertcat(*q.gamma(j))
+    second = ca.jacobian(ca.vec(ca.jacobian(expression, jets)), jets)
+    if not second.nnz():
+        return True
+    values, sizes = points.evaluate(second.nonzeros())
+    return not np.any(clean(values, sizes))
+
+
+def _replace(q, row, j, values, lower, points):
+    """The row with γ^(j) replaced by what the lower rows say, or None where they do not determine it."""
+    if not lower:
+        return None
+    numbers, _ = leading(q, lower, points)
+    support = set()
+    for p in range(values.shape[1]):
+        c, left = combination(numbers[:, :, p], values[:, p])
+        if left > DEPENDENT:
+            return None
+        support |= set(np.flatnonzero(np.abs(c * np.abs(numbers[:, :, p]).max(axis=1).astype(float)) > 1e-12))
+    chosen = _independent([lower[a] for a in sorted(support)], numbers[sorted(support)])
+    if any(other.order == j and not other.affine for other, _ in chosen):
+        return None
+    rows, numbers = [other for other, _ in chosen], np.array([n for _, n in chosen])
+    columns = sorted(decide(numbers[:, :, 0]).columns)
+    jets = q.gamma(j)
+    zero = ca.SX.zeros(len(jets))
+    raised = ca.vertcat(*(q.derivatives([other.expression], j - other.order)[-1][0] for other in rows))
+    rest = ca.substitute(raised, ca.vertcat(*jets), zero)
+    matrix = ca.vertcat(*(gradient(q, other) for other in rows))[:, columns]
+    solution, _ = eliminate(matrix, -rest, numbers[:, columns])
+    full = ca.SX.zeros(len(jets))
+    full[columns] = solution
+    uses = merge_uses((row.uses, 0), *((other.uses, j - other.order) for other in rows))
+    return replace(row, expression=ca.cse(ca.substitute(row.expression, ca.vertcat(*jets), full)), uses=uses)
+
+
+def _independent(rows, numbers):
+    """A largest independent subset of rows, with their numbers."""
+    kept = []
+    for row, number in zip(rows, numbers, strict=True):
+        trial = [*kept, (row, number)]
+        if decide(np.array([n[:, 0] for _, n in trial])).rank == len(trial):
+            kept = trial
+    return kept
+
+
+def dependence(q, rows, numbers):
+    """One dependent row and the combination of others that gives its leading gradient.
+
+    Rows are taken in the order given; the first that depends on those before it is reported.
+
+    Parameters
+    ----------
+    numbers : (rows, n, N) array
+        The leading matrix at points of the same rank.
+
+    Returns
+    -------
+    support : list of int
+        Indices of the rows of the combination, the dependent one last.
+    weights : (len(support),) array
+        Equilibrated size of each row's coefficient, smallest over the points; 1 for the dependent row.
+    """
+    scaled = np.stack([equilibrate(numbers[:, :, p])[0] for p in range(numbers.shape[2])], axis=2)
+    basis = []
+    for b in range(len(rows)):
+        coefficients, left = [], []
+        for p in range(scaled.shape[2]):
+            c, rest = _plain_combination(scaled[basis, :, p], scaled[b, :, p])
+            coefficients.append(np.abs(c))
+            left.append(rest)
+        if max(left) > DEPENDENT:
+            basis.append(b)
+            continue
+        size = np.array(coefficients)
+        support = [a for i, a in enumerate(basis) if size[:, i].max(initial=0.0) > 1e-9]
+        weights = [size[:, i].min(initial=np.inf) for i, a in enumerate(basis) if a in support]
+        return [*support, b], np.array([*weights, 1.0])
+    return [], np.array([])
+
+
+def _plain_combination(rows, target):
+    c, residual = np.zeros(len(rows)), target.copy()
+    for _ in range(3):
+        if len(rows):
+            c = c + np.linalg.lstsq(rows.T.astype(float), residual.astype(float), rcond=1e-12)[0]
+            residual = target - c.astype(np.longdouble) @ rows
+    return c, float(np.abs(residual).max(initial=0.0))

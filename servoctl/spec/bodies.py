@@ -1,0 +1,120 @@
+"""Gibbs-Appell functions of particles (3.8) and rigid bodies (3.11)."""
+
+import casadi as ca
+
+from servoctl.errors import SpecificationError
+from servoctl.spec.coordinates import column
+
+
+def particle(q, mass, position):
+    """The Gibbs-Appell function of a particle, S = m a·a / 2 (3.8).
+
+    Parameters
+    ----------
+    q : Coordinates
+    mass : SX or float
+        [kg]
+    position : SX scalar, column or sequence
+        Cartesian position in an inertial frame [m], one to three entries; a function of q and t.
+
+    Returns
+    -------
+    SX scalar
+        [N m/s^2]
+
+    Raises
+    ------
+    SpecificationError
+        If the position is no expression or depends on velocities.
+    """
+    acceleration = _acceleration(q, position, "the particle's position")
+    return mass * ca.dot(acceleration, acceleration) / 2
+
+
+def rigid_body(q, mass, inertia, position=None, rotation=None, rates=None):
+    """The Gibbs-Appell function of a rigid body (3.11), about its centre of mass or a fixed point.
+
+    S = m a·a/2 + α·Jα/2 + α·(ω × Jω), with ω, α and J in the body's axes.
+
+    Parameters
+    ----------
+    q : Coordinates
+    mass : SX or float
+        [kg]; 0 or `position=None` for a body that turns about a fixed point.
+    inertia : (3, 3) or (3,) SX or sequence
+        Inertia matrix, or its diagonal, about the centre of mass (or the fixed point), body axes [kg m^2].
+    position : (2,) or (3,) SX or sequence, optional
+        Position of the centre of mass in an inertial frame [m].
+    rotation : (3, 3) SX, optional
+        Rotation matrix R(q, t) from body to inertial axes; the body rates are taken from RᵀR'.
+    rates : (3,) SX or sequence, optional
+        Body rates ω [rad/s], as expressions of the velocities; give this or `rotation`.
+
+    Returns
+    -------
+    SX scalar
+
+    Raises
+    ------
+    SpecificationError
+        If neither or both of `rotation` and `rates` are given, or a shape is wrong.
+    """
+    if (rotation is None) == (rates is None):
+        raise SpecificationError(
+            "rigid_body was given " + ("neither" if rates is None else "both") + " of rotation and rates.",
+            "The body's rates come from one of them.",
+            do="Give rotation=R(q) or rates=ω(q, q').",
+        )
+    omega = body_rates(q, rotation) if rates is None else ca.vertcat(*column(rates, "rates", 3))
+    alpha = q.dt(omega)
+    moment = _inertia(inertia) @ omega
+    spin = ca.dot(alpha, _inertia(inertia) @ alpha) / 2 + ca.dot(alpha, ca.cross(omega, moment))
+    if position is None:
+        return spin
+    return particle(q, mass, position) + spin
+
+
+def body_rates(q, rotation):
+    """Body rates ω [rad/s] of a rotation matrix R from body to inertial axes: RᵀR' is the cross product by ω.
+
+    Parameters
+    ----------
+    q : Coordinates
+    rotation : (3, 3) SX
+
+    Returns
+    -------
+    (3,) SX
+    """
+    rotation = ca.SX(rotation)
+    if rotation.shape != (3, 3):
+        raise SpecificationError(
+            f"The rotation has the shape {rotation.shape}.", "A rotation matrix is 3 by 3.", do="Give R(q), (3, 3)."
+        )
+    spin = rotation.T @ ca.reshape(q.dt(ca.vec(rotation)), 3, 3)
+    return ca.vertcat(spin[2, 1] - spin[1, 2], spin[0, 2] - spin[2, 0], spin[1, 0] - spin[0, 1]) / 2
+
+
+def _acceleration(q, position, what):
+    position = ca.vertcat(*column(position, what))
+    if q.order(position) > 0:
+        raise SpecificationError(
+            f"{what.capitalize()} depends on velocities.",
+            "A position is a function of the coordinates and t.",
+            do="Give the position; velocities and accelerations are derived.",
+        )
+    return q.dt(position, 2)
+
+
+def _inertia(inertia):
+    if isinstance(inertia, (list, tuple)):
+        nested = isinstance(inertia[0], (list, tuple))
+        inertia = ca.vertcat(*(ca.horzcat(*row) for row in inertia)) if nested else ca.vertcat(*inertia)
+    inertia = ca.SX(inertia)
+    if inertia.shape == (3, 1):
+        return ca.diag(inertia)
+    if inertia.shape == (3, 3):
+        return inertia
+    raise SpecificationError(
+        f"The inertia has the shape {inertia.shape}.", "It is (3, 3), or (3,) for a diagonal one.", do="Give J."
+    )

@@ -1,0 +1,327 @@
+"""Generalised coordinates, quasi-velocities and their jets, and the total derivative (3.1)."""
+
+import casadi as ca
+
+from servoctl.errors import SpecificationError
+from servoctl.spec.taylor import Series, Tape, _is_zero
+
+
+def column(value, what, size=None):
+    """A list of SX scalars from a scalar, a sequence, or an SX column.
+
+    Raises
+    ------
+    SpecificationError
+        If the value is no CasADi expression or number, holds NaN, or has another length than `size`.
+    """
+    try:
+        if isinstance(value, (list, tuple)):
+            value = ca.vertcat(*value) if value else ca.SX(0, 1)
+        flat = ca.densify(ca.vec(ca.SX(value)))
+        items = flat.elements()
+    except Exception as error:  # CasADi raises several types here, none of which helps the designer
+        raise SpecificationError(
+            f"{what} is a {type(value).__name__}, not an expression.",
+            "Specifications are CasADi SX expressions of the coordinates, parameters and t, or numbers.",
+            do="Build it from the symbols with CasADi's own functions (ca.sin, ca.sqrt, ca.vertcat, ...).",
+            what=what,
+        ) from error
+    if size is not None and len(items) != size:
+        raise SpecificationError(
+            f"{what} has {len(items)} entries.", f"It needs {size}.", do="Give one entry each.", what=what
+        )
+    if any(leaf_is_nan(item) for item in items):
+        raise SpecificationError(
+            f"{what} holds NaN.",
+            "Functions of math and most of numpy turn symbols into NaN without a word.",
+            nearest="ca.sin instead of math.sin, ca.norm_2 instead of np.linalg.norm.",
+            do="Use CasADi's functions on symbols.",
+            what=what,
+        )
+    return items
+
+
+def leaf_is_nan(expression):
+    """Whether a constant NaN stands anywhere in an SX scalar."""
+    f = ca.Function("f", [], [expression], {"allow_free": True})
+    constants = (f.instruction_constant(k) for k in range(f.n_instructions()) if f.instruction_id(k) == ca.OP_CONST)
+    return any(c != c for c in constants)
+
+
+class Coordinates:
+    """Generalised coordinates q, quasi-velocities w with q' = V w + h (3.1), and jets of any order.
+
+    Made by `coordinates`. Iterating gives the coordinates' symbols. Jets are created when first asked for.
+
+    Attributes
+    ----------
+    names : tuple of str
+        The coordinates' names.
+    t : SX
+        The time [s].
+    """
+
+    def __init__(self, names):
+        self.names = names
+        self.nq = len(names)
+        self.t = ca.SX.sym("t")
+        self._q = tuple(ca.SX.sym(name) for name in names)
+        self._w = {}
+        self._index = {self.t.element_hash(): ("t", 0, 0)}
+        self._index |= {s.element_hash(): ("q", 0, i) for i, s in enumerate(self._q)}
+        self.velocity_names = tuple(f"d{name}" for name in names)
+        self.V, self.h, self.invariants = ca.SX.eye(self.nq), ca.SX.zeros(self.nq), {}
+        self.plain = True
+
+    def __iter__(self):
+        return iter(self._q)
+
+    def __len__(self):
+        return self.nq
+
+    @property
+    def n(self):
+        """The number of quasi-velocities."""
+        return len(self.velocity_names)
+
+    def __repr__(self):
+        frame = "" if self.plain else f", quasi-velocities {' '.join(self.velocity_names)}"
+        return f"Coordinates({' '.join(self.names)}{frame})"
+
+    def with_quasi_velocities(self, names, V, h=None, invariants=None):
+        """The same coordinates, moved by quasi-velocities w of one's own: q' = V w + h (3.1).
+
+        Parameters
+        ----------
+        names : str
+            Names of the n quasi-velocities, separated by blanks.
+        V : (nq, n) SX or nested lists
+            May be rectangular (a quaternion with body rates: nq = n + 1); of full column rank.
+        h : (nq,) SX or sequence, optional
+            Velocity of the coordinates at w = 0; may depend on t. Default 0.
+        invariants : dict of str to SX, optional
+            For nq > n: functions of q that the kinematics keep at zero, e.g. {"unit": dot(e, e) - 1}.
+
+        Returns
+        -------
+        Coordinates
+            A new value with the same symbols for q and t.
+
+        Raises
+        ------
+        SpecificationError
+            If sizes disagree or a name is taken.
+        """
+        names = _split(names, "quasi-velocities")
+        if isinstance(V, (list, tuple)):
+            V = ca.vertcat(*(ca.horzcat(*row) if isinstance(row, (list, tuple)) else ca.SX(row) for row in V))
+        V = ca.SX(V)
+        if V.shape != (self.nq, len(names)):
+            raise SpecificationError(
+                f"V has the shape {V.shape}.",
+                f"q' = V w + h with {self.nq} coordinates and {len(names)} quasi-velocities.",
+                f"A shape ({self.nq}, {len(names)}).",
+                "Give one row per coordinate and one column per quasi-velocity.",
+            )
+        other = Coordinates(self.names)
+        other.t, other._q, other.plain = self.t, self._q, False
+        other._index = {key: value for key, value in self._index.items() if value[0] != "w"}
+        other.V = V
+        other.h = ca.vertcat(*column([0.0] * self.nq if h is None else h, "h", self.nq))
+        other.velocity_names = names
+        other.invariants = {k: column(v, f"invariant {k!r}", 1)[0] for k, v in (invariants or {}).items()}
+        _refuse_clash([*self.names, *(jet_name(n, j, plain=False) for n in names for j in range(1, 4))])
+        for what, expression in (("V", V), ("h", other.h)):
+            for s in ca.symvar(expression):
+                if (self.where(s) or ("",))[0] == "w":
+                    raise SpecificationError(
+                        f"{what} depends on {s.name()}.", "V and h are functions of q and t (3.1).", do="Remove it."
+                    )
+        return other
+
+    def w(self, k=0):
+        """Symbols of the k-th derivative of the quasi-velocities, γ^(k+1): a tuple of n SX scalars."""
+        return self.gamma(k + 1)
+
+    def gamma(self, k):
+        """Symbols of γ^(k), k >= 1: a tuple of n SX scalars. γ' are the quasi-velocities."""
+        if k not in self._w:
+            base = self.names if self.plain else self.velocity_names
+            symbols = tuple(ca.SX.sym(jet_name(name, k, self.plain)) for name in base)
+            self._w[k] = symbols
+            self._index |= {s.element_hash(): ("w", k, i) for i, s in enumerate(symbols)}
+        return self._w[k]
+
+    def jet_names(self, k):
+        """Names of γ^(k), k >= 1, or of q for k = 0."""
+        if k == 0:
+            return self.names
+        base = self.names if self.plain else self.velocity_names
+        return tuple(jet_name(name, k, self.plain) for name in base)
+
+    def d(self, k=1):
+        """The k-th time derivatives of the coordinates: a tuple of nq SX scalars.
+
+        Without quasi-velocities of one's own these are symbols; with them, expressions of w and its derivatives.
+        """
+        if not isinstance(k, int) or k < 0:
+            raise SpecificationError(
+                f"q.d({k!r}) was asked for.", "An order is a whole number, at least 0.", do="Write q.d(1)."
+            )
+        if k == 0:
+            return self._q
+        if self.plain:
+            return self.gamma(k)
+        return tuple(self.derivatives(self._q, k)[k])
+
+    def dt(self, expression, k=1):
+        """The k-th total time derivative of an expression of t, q and the jets.
+
+        Parameters
+        ----------
+        expression : SX
+            Scalar or column.
+        k : int
+            Order, at least 0.
+
+        Returns
+        -------
+        SX of the same shape
+        """
+        items = column(expression, "the expression")
+        result = ca.vertcat(*self.derivatives(items, k)[k])
+        return ca.reshape(result, *expression.shape) if isinstance(expression, ca.SX) else result
+
+    def where(self, symbol):
+        """What a symbol is: ("t", 0, 0), ("q", 0, i), ("w", k, i) for γ_i^(k), or None."""
+        return self._index.get(symbol.element_hash())
+
+    def order(self, expression):
+        """The highest k for which γ^(k) stands in an expression (0 for q alone, -1 for neither)."""
+        found = [self.where(s) for s in ca.symvar(ca.SX(expression))]
+        return max([-1, *(w[1] for w in found if w is not None and w[0] in "qw")])
+
+    def derivatives(self, expressions, k):
+        """Total derivatives of orders 0 to k by one propagation of Taylor series.
+
+        Parameters
+        ----------
+        expressions : sequence of SX scalars
+        k : int
+
+        Returns
+        -------
+        list of k + 1 lists of SX scalars
+        """
+        expressions = [ca.SX(e) for e in expressions]
+        if k == 0:
+            return [expressions]
+        symbols = ca.symvar(ca.vertcat(*expressions)) if expressions else []
+        places = [self.where(s) for s in symbols]
+        if any(p and p[0] == "q" for p in places) and not self.plain:
+            symbols = _union(symbols, ca.symvar(ca.vertcat(ca.vec(self.V), self.h)), self._q, self.gamma(1))
+            places = [self.where(s) for s in symbols]
+        series = self._series(symbols, places, expressions, k)
+        factor, result = 1.0, []
+        for j in range(k + 1):
+            factor *= max(j, 1)
+            result.append([_as_sx(c[j]) * factor for c in series.outputs[: len(expressions)]])
+        return result
+
+    def _series(self, symbols, places, expressions, k):
+        moving = [] if self.plain else (self.V @ ca.vertcat(*self.gamma(1)) + self.h).elements()
+        needs_q = any(p and p[0] == "q" for p in places)
+        tape = Tape(symbols, [*expressions, *(moving if needs_q else [])])
+        inputs = [[] for _ in symbols]
+        series = Series(tape, inputs)
+        factorial = 1.0
+        for j in range(k + 1):
+            factorial *= max(j, 1)
+            for i, (symbol, place) in enumerate(zip(symbols, places, strict=True)):
+                inputs[i].append(self._coefficient(symbol, place, j, factorial, series, len(expressions)))
+            series.advance()
+        return series
+
+    def _coefficient(self, symbol, place, j, factorial, series, n_expressions):
+        if place is None:
+            return symbol if j == 0 else 0.0
+        kind, level, i = place
+        if kind == "t":
+            return symbol if j == 0 else float(j == 1)
+        if kind == "w":
+            return self.gamma(level + j)[i] / factorial
+        if j == 0:
+            return symbol
+        if self.plain:
+            return self.gamma(j)[i] / factorial
+        velocity = series.outputs[n_expressions + i][j - 1]
+        return 0.0 if _is_zero(velocity) else velocity / j
+
+
+def _as_sx(c):
+    return c if isinstance(c, ca.SX) else ca.SX(c)
+
+
+def _union(*groups):
+    seen = {}
+    for group in groups:
+        for s in group:
+            seen.setdefault(s.element_hash(), s)
+    return list(seen.values())
+
+
+def jet_name(name, k, plain=True):
+    """The name of a jet: theta, dtheta, d2theta for coordinates; u, du, d2u for quasi-velocities (k = 1, 2, 3)."""
+    order = k if plain else k - 1
+    return name if order == 0 else f"d{name}" if order == 1 else f"d{order}{name}"
+
+
+def _split(names, what):
+    if not isinstance(names, str) or not names.split():
+        raise SpecificationError(
+            f"The names of the {what} are {names!r}.", "They are one text of names separated by blanks.",
+            do='Write, for example, "x y theta".',
+        )  # fmt: skip
+    names = tuple(names.split())
+    for name in names:
+        if not name.isidentifier() or name == "t":
+            raise SpecificationError(
+                f"{name!r} was given as a name.", "A name is a Python identifier other than t.", do="Rename it."
+            )
+    _refuse_clash(names)
+    return names
+
+
+def _refuse_clash(names):
+    twice = sorted({n for n in names if list(names).count(n) > 1})
+    jets = {jet_name(n, k): n for n in names for k in range(1, 10)}
+    clash = twice or [n for n in names if n in jets]
+    if clash:
+        why = "it is given twice" if twice else f"it is also the name of a derivative of {jets[clash[0]]!r}"
+        raise SpecificationError(
+            f"The name {clash[0]!r} clashes: {why}.",
+            "Every coordinate, quasi-velocity and derivative has a name of its own (theta, dtheta, d2theta, ...).",
+            do="Rename one of them.",
+            name=clash[0],
+        )
+
+
+def coordinates(names):
+    """Generalised coordinates by name, with jets of any order on demand.
+
+    Parameters
+    ----------
+    names : str
+        Names separated by blanks, e.g. "x l theta".
+
+    Returns
+    -------
+    Coordinates
+        Iterable of the coordinates' symbols (SX scalars); `.t` is the time [s].
+
+    Raises
+    ------
+    SpecificationError
+        If a name is no identifier, is `t`, stands twice, or is also a derivative's name.
+    """
+    return Coordinates(_split(names, "coordinates"))

@@ -1,0 +1,324 @@
+"""The mechanism: its balance r = ∂S/∂γ'' - Γ, its actuators and its material constraints."""
+
+from functools import cached_property
+
+import casadi as ca
+import numpy as np
+
+from servoctl.errors import SpecificationError, unknown
+from servoctl.spec.coordinates import Coordinates, column
+from servoctl.spec.parameters import Parameters
+from servoctl.spec.taylor import Tape, evaluate
+
+_SEED = 20021  # of the random points at which identities are tested
+
+
+class Mechanism:
+    """A mechanism under given forces, actuators and material constraints.
+
+    Main arguments
+
+    Parameters
+    ----------
+    q : Coordinates
+    gibbs : SX, optional
+        Gibbs-Appell function S(t, q, γ', γ''), at most quadratic in γ'' (sums of `particle`, `rigid_body`, or one's own).
+    potential : SX, optional
+        Potential energy U(q, t) [J]; gives Γ = -Vᵀ ∂U/∂q.
+    actuators : dict of str to SX or sequence, optional
+        Each by the displacement it works on (a scalar function of q [m or rad]; input in N or N m), or by a
+        generalised direction (a sequence or column of n entries; always a sequence where n = 1).
+    parameters : Parameters, optional
+
+    Other arguments
+
+    kinetic : SX, optional
+        Kinetic energy T(q, γ') [J], for Lagrange's equations. With `gibbs` as well, both must give the same balance.
+    balance : (n,) SX, optional
+        The balance itself, r(t, q, γ', γ''), without `forces` and `potential`: inverse dynamics from elsewhere.
+    forces : dict of str to SX, or (n,) SX, optional
+        Generalised forces by coordinate (or quasi-velocity) name.
+    constraints : dict of str to SX, optional
+        Material constraints, of order 0, 1 or 2: realised by nature, ideally.
+    outputs : dict of str to SX, optional
+        Named outputs, expressions of t, q and jets.
+
+    Raises
+    ------
+    SpecificationError
+        If an expression names a symbol that is no coordinate, parameter or t; if S is not quadratic in γ''; if S
+        and T disagree; if there is nothing to take the balance from.
+    NameUnknown
+        If a force names no coordinate.
+    """
+
+    def __init__(
+        self,
+        q,
+        gibbs=None,
+        potential=None,
+        actuators=None,
+        parameters=None,
+        *,
+        kinetic=None,
+        balance=None,
+        forces=None,
+        constraints=None,
+        outputs=None,
+    ):
+        if not isinstance(q, Coordinates):
+            raise SpecificationError(
+                f"The first argument is a {type(q).__name__}.",
+                "A mechanism starts from its coordinates.",
+                do='Write Mechanism(sv.coordinates("x y"), ...).',
+            )
+        self.q = q
+        self.parameters = Parameters({}) if parameters is None else parameters
+        if not isinstance(self.parameters, Parameters):
+            raise SpecificationError(
+                f"parameters is a {type(parameters).__name__}.",
+                "Parameters are symbols with default numbers.",
+                do="Make them by sv.parameters(m=1.0, ...).",
+            )
+        self._gibbs = self._scalar(gibbs, "the Gibbs function")
+        self._kinetic = self._scalar(kinetic, "the kinetic energy")
+        self._given = None if balance is None else self._column(balance, "the balance", q.n)
+        self.potential = ca.SX(0) if potential is None else self._scalar(potential, "the potential")
+        self.forces = self._forces(forces)
+        self.actuators = tuple(actuators or {})
+        self.E = self._directions(actuators or {})
+        self.constraints = self._named(constraints, "constraint")
+        self.outputs = self._named(outputs, "output")
+        self._refuse_orders()
+        self._refuse_names()
+        self._check_balance()
+
+    def __repr__(self):
+        lines = [f"Mechanism: {' '.join(self.q.names)}"]
+        if not self.q.plain:
+            lines.append(f"  quasi-velocities {' '.join(self.q.velocity_names)}")
+        for what, names in (
+            ("actuators", self.actuators),
+            ("material constraints", self.constraints),
+            ("outputs", self.outputs),
+        ):
+            if names:
+                lines.append(f"  {what}: {', '.join(names)}")
+        lines.append(f"  {self.parameters!r}"[:118])
+        return "\n".join(lines)
+
+    @cached_property
+    def balance(self):
+        """r = ∂S/∂γ'' - Γ without actuation, (n,) SX in units of generalised force."""
+        if self._given is not None:
+            inertial = self._given
+        elif self._gibbs is not None:
+            inertial = ca.gradient(self._gibbs, ca.vertcat(*self.q.gamma(2)))
+        else:
+            inertial = self._lagrange()
+        return ca.cse(inertial - self.forces + self.q.V.T @ ca.gradient(self.potential, ca.vertcat(*self.q)))
+
+    @cached_property
+    def mass(self):
+        """The inertia matrix M = ∂r/∂γ'', (n, n) SX."""
+        return ca.jacobian(self.balance, ca.vertcat(*self.q.gamma(2)))
+
+    @cached_property
+    def energy(self):
+        """Kinetic plus potential energy [J], SX; the kinetic energy is T where given, else wᵀMw/2."""
+        w = ca.vertcat(*self.q.gamma(1))
+        kinetic = ca.dot(w, self.mass @ w) / 2 if self._kinetic is None else self._kinetic
+        return kinetic + self.potential
+
+    def _lagrange(self):
+        """Vᵀ(d/dt ∂T/∂q' - ∂T/∂q), T continued to all q' by w = V⁺(q' - h)."""
+        q = self.q
+        w, v = ca.vertcat(*q.gamma(1)), ca.SX.sym("v", q.nq)
+        if q.plain:
+            momentum = ca.gradient(self._kinetic, w)
+            slope = ca.gradient(self._kinetic, ca.vertcat(*q))
+        else:
+            d, lt, p = ca.ldl(q.V.T @ q.V)
+            left = ca.ldl_solve(q.V.T @ (v - q.h), d, lt, p)
+            continued = ca.substitute(self._kinetic, w, left)
+            back = q.V @ w + q.h
+            momentum = ca.substitute(ca.gradient(continued, v), v, back)
+            slope = ca.substitute(ca.gradient(continued, ca.vertcat(*q)), v, back)
+        return q.V.T @ (q.dt(momentum) - slope)
+
+    def _check_balance(self):
+        if self._gibbs is None and self._kinetic is None and self._given is None:
+            raise SpecificationError(
+                "Neither a Gibbs function nor a kinetic energy nor a balance was given.",
+                "A mechanism's inertia comes from one of them.",
+                do="Give gibbs=sv.particle(...) + ..., kinetic=T or balance=r.",
+            )
+        if self._kinetic is not None and self._gibbs is None and not self.q.plain and self.q.n < self.q.nq:
+            self._refuse_nonholonomic_frame()
+        acceleration = ca.vertcat(*self.q.gamma(2))
+        curvature = ca.jacobian(ca.vec(self.mass), acceleration)
+        if curvature.nnz() and not self.is_zero(curvature.nonzeros()):
+            raise SpecificationError(
+                "The Gibbs function is not quadratic in the accelerations." if self._gibbs is not None
+                else "The balance is not linear in the accelerations.",
+                "S = Σ m a·a/2 is quadratic in γ'', so that ∂S/∂γ'' is linear (3.8).",
+                nearest="S built by sv.particle and sv.rigid_body.",
+                do="Check the powers of the second derivatives.",
+            )  # fmt: skip
+        if self._gibbs is not None and self._kinetic is not None:
+            difference = ca.gradient(self._gibbs, acceleration) - self._lagrange()
+            wrong = [n for n, d in zip(self.q.jet_names(2), difference.elements(), strict=True) if not self.is_zero([d])]
+            if wrong:
+                raise SpecificationError(
+                    f"The Gibbs function and the kinetic energy give different balances in {', '.join(wrong)}.",
+                    "Both describe the same inertia: ∂S/∂γ'' = Vᵀ(d/dt ∂T/∂q' - ∂T/∂q).",
+                    do="Correct one of them, or give only one.",
+                    components=wrong,
+                )
+
+    def _refuse_nonholonomic_frame(self):
+        q = ca.vertcat(*self.q)
+        columns = ca.horzsplit(self.q.V)
+        brackets = [
+            ca.jacobian(b, q) @ a - ca.jacobian(a, q) @ b for i, a in enumerate(columns) for b in columns[i + 1 :]
+        ]
+        items = [*ca.vec(self.q.V).elements(), *(x for b in brackets for x in b.elements())]
+        values, _ = self.at_random(items)
+        for point in values.T:
+            v = point[: self.q.V.numel()].reshape(self.q.n, self.q.nq).T
+            rest = point[self.q.V.numel() :].reshape(-1, self.q.nq).T
+            outside = rest - v @ np.linalg.lstsq(v, rest, rcond=None)[0]
+            if np.abs(outside).max(initial=0.0) > 1e-9 * max(1.0, np.abs(rest).max(initial=0.0)):
+                raise SpecificationError(
+                    "A kinetic energy was given in quasi-velocities whose frame V is not integrable.",
+                    "Lagrange's equations do not hold for velocities restricted by nonholonomic constraints.",
+                    nearest="A Gibbs function, which holds in any quasi-velocities (3.10).",
+                    do="Give gibbs=..., or all velocities and the constraints as material constraints.",
+                )
+
+    def is_zero(self, items):
+        """Whether expressions vanish at seeded random points, to rounding in the size of their terms."""
+        values, sizes = self.at_random(items)
+        return bool(np.all(np.abs(values) <= 1e-12 * sizes))
+
+    def at_random(self, items):
+        """Values and sizes of expressions at four seeded random points of t, jets and parameters."""
+        symbols = ca.symvar(ca.vertcat(*items)) if len(items) else []
+        points = np.random.default_rng(_SEED).uniform(0.3, 1.3, (len(symbols), 4)).astype(np.longdouble)
+        for i, s in enumerate(symbols):
+            if self.q.where(s) is None:
+                points[i] *= self.parameters.defaults.get(s.name(), 1.0)
+        return evaluate(Tape(symbols, items), points)
+
+    def _scalar(self, value, what):
+        return None if value is None else self._known(column(value, what, 1)[0], what)
+
+    def _column(self, value, what, size):
+        return self._known(ca.vertcat(*column(value, what, size)), what)
+
+    def _named(self, values, what):
+        return {name: self._scalar(v, f"{what} {name!r}") for name, v in (values or {}).items()}
+
+    def _known(self, expression, what):
+        require_known(expression, self, what)
+        return expression
+
+    def _forces(self, forces):
+        if forces is None:
+            return ca.SX.zeros(self.q.n)
+        if not isinstance(forces, dict):
+            return self._column(forces, "the forces", self.q.n)
+        names = list(self.q.names if self.q.plain else self.q.velocity_names)
+        total = ca.SX.zeros(self.q.n)
+        for name, value in forces.items():
+            if name not in names:
+                raise unknown(name, names, "coordinate" if self.q.plain else "quasi-velocity")
+            total[names.index(name)] += self._scalar(value, f"the force on {name!r}")
+        return total
+
+    def _directions(self, actuators):
+        columns = []
+        for name, value in actuators.items():
+            what = f"actuator {name!r}"
+            items = column(value, what)
+            direction = isinstance(value, (list, tuple, np.ndarray)) or len(items) > 1
+            if direction:
+                columns.append(self._column(items, what, self.q.n))
+                continue
+            displacement = self._scalar(items[0], what)
+            gradient = self.q.V.T @ ca.gradient(displacement, ca.vertcat(*self.q))
+            if gradient.nnz() == 0:
+                raise SpecificationError(
+                    f"The displacement of actuator {name!r} depends on no coordinate.",
+                    "An actuator is given by the displacement it works on, or by a direction of n entries.",
+                    do="Give a function of q, or a sequence.",
+                    name=name,
+                )
+            columns.append(gradient)
+        result = ca.horzcat(*columns) if columns else ca.SX(self.q.n, 0)
+        if self.q.order(result) > 0:
+            raise SpecificationError(
+                "An actuator's displacement or direction depends on velocities.",
+                "E is a function of q and t.",
+                do="Give positions.",
+            )
+        return result
+
+    def _refuse_orders(self):
+        for what, items, limit in (
+            ("The potential", {"": self.potential}, 0),
+            ("The kinetic energy", {"": self._kinetic}, 1),
+            ("The Gibbs function", {"": self._gibbs}, 2),
+            ("The balance", {"": self._given}, 2),
+            ("The forces", {"": self.forces}, 2),
+            ("The material constraint", self.constraints, 2),
+        ):
+            for name, expression in items.items():
+                if expression is not None and self.q.order(expression) > limit:
+                    raise SpecificationError(
+                        f"{what}{f' {name!r}' if name else ''} has order {self.q.order(expression)} in the jets.",
+                        f"Its order is at most {limit}.",
+                        do="Lower derivatives only; constraints of higher order are program constraints.",
+                    )
+
+    def _refuse_names(self):
+        taken = [*self.q.names, *(n for k in range(1, 4) for n in self.q.jet_names(k)), "t"]
+        seen = dict.fromkeys(taken, "a coordinate or derivative")
+        for what, names in (
+            ("a parameter", self.parameters.names),
+            ("an actuator", self.actuators),
+            ("an output", self.outputs),
+        ):
+            for name in names:
+                if name in seen:
+                    raise SpecificationError(
+                        f"The name {name!r} is given to {what} and to {seen[name]}.",
+                        "Everything in a result has one name.",
+                        do="Rename one of them.",
+                        name=name,
+                    )
+                seen[name] = what
+
+
+def require_known(expression, mechanism, what):
+    """Refuse a symbol that is no coordinate, jet, parameter or t of the mechanism.
+
+    Raises
+    ------
+    SpecificationError
+    """
+    q, known = mechanism.q, {s.element_hash() for s in mechanism.parameters.symbols}
+    for s in ca.symvar(expression):
+        if q.where(s) is None and s.element_hash() not in known:
+            names = ["t", *q.names, *q.jet_names(1), *q.jet_names(2), *mechanism.parameters.names]
+            hint = unknown(s.name(), names, "symbol")
+            same = s.name() in names
+            raise SpecificationError(
+                f"{what} depends on the symbol {s.name()!r}"
+                + (", which has the name of a known symbol but is another one." if same else "."),
+                "Symbols are the coordinates, their derivatives, the parameters and t.",
+                nearest=hint.details.get("nearest", ""),
+                do="Use the symbols of sv.coordinates and pass parameters=sv.parameters(...) to the mechanism.",
+                name=s.name(),
+            )
+

@@ -1,0 +1,102 @@
+"""Parameters: symbols in the equations, numbers at run time."""
+
+import math
+
+import casadi as ca
+import numpy as np
+
+from servoctl.errors import SpecificationError, unknown
+
+
+class Parameters:
+    """Named parameters, made by `parameters`; `p.m` is a symbol, `p.defaults["m"]` its number.
+
+    Attributes
+    ----------
+    defaults : dict of str to float
+    """
+
+    def __init__(self, values):
+        self.defaults = dict(values)
+        self._symbols = {name: ca.SX.sym(name) for name in values}
+
+    def __getattr__(self, name):
+        symbols = self.__dict__.get("_symbols", {})
+        if name in symbols:
+            return symbols[name]
+        if name.startswith("_"):
+            raise AttributeError(name)
+        raise unknown(name, list(symbols), "parameter")
+
+    def __repr__(self):
+        return "Parameters(" + ", ".join(f"{k}={v:g}" for k, v in self.defaults.items()) + ")"
+
+    @property
+    def names(self):
+        """The names, in the order given."""
+        return tuple(self.defaults)
+
+    @property
+    def symbols(self):
+        """The symbols, in the order of `names`."""
+        return tuple(self._symbols.values())
+
+    def values(self, changes=None):
+        """The numbers in the order of `names`, some of them changed.
+
+        Parameters
+        ----------
+        changes : dict of str to float, optional
+
+        Returns
+        -------
+        (n_p,) array
+
+        Raises
+        ------
+        NameUnknown
+            For a name that is no parameter.
+        SpecificationError
+            For a value that is no finite number.
+        """
+        numbers = dict(self.defaults)
+        for name, value in (changes or {}).items():
+            if name not in numbers:
+                raise unknown(name, list(numbers), "parameter")
+            numbers[name] = _number(name, value)
+        return np.array(list(numbers.values()), dtype=float)
+
+
+def _number(name, value):
+    try:
+        number = float(value)
+    except (TypeError, ValueError):
+        number = math.nan
+    if not math.isfinite(number):
+        raise SpecificationError(
+            f"The parameter {name!r} is {value!r}.", "A parameter is a finite number.", do="Give a number.", name=name
+        )
+    return number
+
+
+def parameters(**values):
+    """Parameters with their default numbers, e.g. `parameters(m=1.0, g=9.81)`.
+
+    Parameters
+    ----------
+    **values : float
+        Name and default, SI. They stay symbolic in every derivation and are given numbers at run time.
+
+    Returns
+    -------
+    Parameters
+
+    Raises
+    ------
+    SpecificationError
+        If a value is no finite number or a name would hide an attribute.
+    """
+    for name in values:
+        if name in ("t", "names", "values", "symbols", "defaults"):
+            raise SpecificationError(f"A parameter is named {name!r}.", "This name is taken.", do="Rename it.")
+    return Parameters({name: _number(name, value) for name, value in values.items()})

@@ -1,0 +1,411 @@
+"""Target trajectories: CasADi expressions of a time, or of a time law, for the residuals of a program.
+
+Geometry and timing are separate. Every function takes as its first argument either the time symbol `q.t` or
+another scalar path, the *time law*::
+
+    s = rest_to_rest(q.t, 0.0, 1.0, duration=6.0, smoothness=4)       # when: from 0 to 1 in 6 s
+    path = circle(2 * ca.pi * s, centre=(0.0, 1.0), radius=0.5)       # where: one turn
+
+Pieces are joined by `fmin`, `fmax` and comparisons of the time alone, so that a derivative of any order is
+right on whichever side of a knot these are evaluated. A path of class C^k has k continuous derivatives; the
+docstrings tell k for each function of a smooth first argument. A path along a time law has the lower class.
+"""
+
+import math
+import operator
+
+import casadi as ca
+import numpy as np
+
+from servoctl.errors import SpecificationError, unknown
+from servoctl.spec.coordinates import column
+
+
+def rest_to_rest(t, start, end, duration, smoothness=4, t_start=0.0):
+    """Move from rest to rest along the polynomial of degree 2k + 1 whose first k derivatives vanish at both ends.
+
+    Of class C^k, k = `smoothness`. With sigma = (t - t_start)/duration clipped to [0, 1], the path is
+    start + (end - start) S(sigma), where S(sigma) = I_sigma(k + 1, k + 1) is the regularised incomplete beta
+    function (for k = 4 and 6 the polynomials S9 and S13), written as
+    S = 1/2 + (sigma - 1/2) sum_(j=0..k) binomial(2j, j) (sigma (1 - sigma))^j,
+    which has no large terms of opposite sign: for k up to 20 the value and its derivatives are exact to 1e-14 of
+    their largest magnitude, alike at both ends. It minimises the integral of the square of derivative k + 1.
+
+    Parameters
+    ----------
+    t : SX or float
+        Time [s], or a time law.
+    start, end : float, SX, or sequence (n,) of them
+        The path before `t_start` and after `t_start + duration`.
+    duration : float or SX
+        Time taken [s], positive.
+    smoothness : int, optional
+        Class k >= 0 of the path. A crane, or two cars and a spring, need 4.
+    t_start : float or SX, optional
+        Time of departure [s].
+
+    Returns
+    -------
+    SX
+        Scalar, or (n, 1) column.
+
+    Raises
+    ------
+    SpecificationError
+        If start and end differ in size, the duration is not positive, the smoothness is no integer >= 0,
+        or a number is not finite.
+    """
+    t, t_start = _scalar(t, "t"), _scalar(t_start, "t_start")
+    sigma = ca.fmin(ca.fmax((t - t_start) / _positive(duration, "duration"), 0), 1)
+    return line(_step(sigma, _smoothness(smoothness)), start, end)
+
+
+def trapezoid(t, distance, duration, ramp, smoothness=4, t_start=0.0):
+    """Cover a distance at a constant speed that is reached, and left, along smooth ramps: a time law.
+
+    Of class C^k, k = `smoothness`: during the first and last `ramp` seconds the speed rises and falls along
+    the polynomial of `rest_to_rest` of class k - 1. The cruising speed is distance/(duration - ramp). Starts at
+    0 and holds `distance` afterwards.
+
+    Parameters
+    ----------
+    t : SX or float
+        Time [s], or a time law.
+    distance : float or SX
+        Where the law ends: an arc length [m], an angle [rad], or 1 for a line.
+    duration : float or SX
+        Time taken [s], positive.
+    ramp : float or SX
+        Length of each ramp [s], positive, at most half the duration.
+    smoothness : int, optional
+        Class k >= 1 of the law.
+    t_start : float or SX, optional
+        Time of departure [s].
+
+    Returns
+    -------
+    SX
+        Scalar.
+
+    Raises
+    ------
+    SpecificationError
+        If duration or ramp is not positive, the ramps do not fit in the duration, the smoothness is no
+        integer >= 1, or a number is not finite.
+    """
+    t, t_start, distance = _scalar(t, "t"), _scalar(t_start, "t_start"), _scalar(distance, "distance")
+    duration, ramp = _positive(duration, "duration"), _positive(ramp, "ramp")
+    k = _smoothness(smoothness, least=1)
+    if (2 * ramp > duration).is_one():
+        raise SpecificationError(
+            f"Two ramps of {ramp} s do not fit in a duration of {duration} s",
+            "A trapezoid speeds up, cruises and slows down within its duration",
+            f"The longest ramp is {float(duration) / 2:g} s",
+            "Shorten the ramp or lengthen the duration",
+            ramp=float(ramp),
+            duration=float(duration),
+        )
+    t_end = t_start + duration
+    t = ca.fmin(t, t_end)
+    begun = ca.fmax(t - t_start, 0) / ramp
+    ending = ca.fmax(t - (t_end - ramp), 0) / ramp
+    rising = ca.fmin(begun, 1)
+    ramps_covered = _integral_of_step(rising, k - 1) + (begun - rising) - _integral_of_step(ending, k - 1)
+    return distance / (duration - ramp) * ramp * ramps_covered
+
+
+def line(s, start, end):
+    """Go along a straight line, from `start` at s = 0 to `end` at s = 1; of the class of its time law `s`.
+
+    Parameters
+    ----------
+    s : SX or float
+        Time law, dimensionless; the line goes on for s outside [0, 1].
+    start, end : float, SX, or sequence (n,) of them
+        The ends.
+
+    Returns
+    -------
+    SX
+        Scalar, or (n, 1) column.
+
+    Raises
+    ------
+    SpecificationError
+        If start and end differ in size or a number is not finite.
+    """
+    s, start, end = _scalar(s, "s"), _column(start, "start"), _column(end, "end")
+    _same_size(start=start, end=end)
+    return start + s * (end - start)
+
+
+def circle(angle, centre, radius, axes=None):
+    """Go around a circle: centre + radius (cos(angle) e1 + sin(angle) e2); of the class of `angle`.
+
+    Parameters
+    ----------
+    angle : SX or float
+        Any expression of time [rad].
+    centre : sequence (2,) or (3,) of float or SX
+        The centre [m].
+    radius : float or SX
+        The radius [m], positive.
+    axes : pair of sequences like `centre`, optional
+        Orthonormal e1 (where the angle is zero) and e2 (where it is pi/2) that span the circle's plane; in
+        the plane (1, 0) and (0, 1) unless given.
+
+    Returns
+    -------
+    SX
+        (2, 1) or (3, 1) column.
+
+    Raises
+    ------
+    SpecificationError
+        If the radius is not positive, the centre has neither 2 nor 3 entries, or 3 without axes, or the axes
+        differ from it in size or are not orthonormal.
+    """
+    angle, radius, centre = _scalar(angle, "angle"), _positive(radius, "radius"), _column(centre, "centre")
+    n = centre.numel()
+    if n not in (2, 3) or (n == 3 and axes is None):
+        raise SpecificationError(
+            f"The circle's centre has {n} entries and axes are {'not ' if axes is None else ''}given",
+            "A circle lies in the plane (2 entries), or in space (3) in the plane that two axes span",
+            "axes=((1, 0, 0), (0, 1, 0)) is the horizontal plane where the third entry is vertical",
+            "Give a centre with 2 entries, or one with 3 and the axes",
+            size=n,
+        )
+    e1, e2 = _orthonormal(((1, 0), (0, 1)) if axes is None else axes, centre)
+    return centre + radius * (ca.cos(angle) * e1 + ca.sin(angle) * e2)
+
+
+def spline(t, times, points, smoothness=2, ends="rest"):
+    """Pass through via points at given times along a spline.
+
+    With `ends="rest"` the spline has degree 2k + 1, k = `smoothness`, and its first k derivatives vanish at both
+    ends, which it holds before the first and after the last time: of class C^k everywhere (C^2k at the via
+    points between). It minimises the integral of the square of derivative k + 1; two points give `rest_to_rest`.
+    With `ends="natural"` it has the least odd degree 2m + 1 > k, is of class C^2m >= C^k everywhere, its
+    derivatives m + 1 to 2m vanish at both ends, and its first and last polynomials go on outside: for geometry
+    along a time law, or a plan that starts in motion.
+
+    A high smoothness over very uneven times overshoots between the points: choose times in proportion to
+    the distances between them.
+
+    Parameters
+    ----------
+    t : SX or float
+        Time [s], or a time law.
+    times : (n,) array
+        Strictly increasing times [s] (values of the time law), n >= 2.
+    points : (n,) or (n, dim) array
+        The via points, SI.
+    smoothness : int, optional
+        Class k >= 0 of the path.
+    ends : {"rest", "natural"}, optional
+        What happens at the ends.
+
+    Returns
+    -------
+    SX
+        Scalar, or (dim, 1) column.
+
+    Raises
+    ------
+    SpecificationError
+        If times do not increase strictly, shapes disagree, a number is not finite, the smoothness is no
+        integer >= 0, or the points are too few or too unevenly timed for it.
+    NameUnknown
+        If `ends` is neither "rest" nor "natural".
+    """
+    if ends not in ("rest", "natural"):
+        raise unknown(ends, ("rest", "natural"), "spline end")
+    t, k = _scalar(t, "t"), _smoothness(smoothness)
+    times, points = _via_points(times, points)
+    m = k if ends == "rest" else (k + 1) // 2
+    vanishing = range(1, m + 1) if ends == "rest" else range(m + 1, 2 * m + 1)
+    if ends == "natural" and len(times) <= m:
+        raise SpecificationError(
+            f"A natural spline of smoothness {k} is given {len(times)} points",
+            f"Its degree is {2 * m + 1}, and {m + 1} points or more determine it",
+            f"smoothness = {2 * (len(times) - 1)}", "Give more points, a lower smoothness, or ends='rest'",
+            points=len(times), smoothness=k,
+        )  # fmt: skip
+    pieces = _spline_pieces(times, points, 2 * m + 1, vanishing)
+    if ends == "rest":
+        t = ca.fmin(ca.fmax(t, times[0]), times[-1])
+    begun = ca.vertcat(1, *(t >= knot for knot in times[1:-1]), 0)
+    inside = begun[:-1] - begun[1:]
+    middle, half = (times[:-1] + times[1:]) / 2, (times[1:] - times[:-1]) / 2
+    tau = (t - ca.dot(inside, middle)) * ca.dot(inside, 1 / half)
+    value = ca.SX(points.shape[1], 1)
+    for coefficients in pieces[::-1]:
+        value = value * tau + ca.mtimes(ca.DM(coefficients.T), inside)
+    return value
+
+
+def _step(sigma, k):
+    """Regularised incomplete beta function I_sigma(k + 1, k + 1): 0 to 1, k derivatives zero at both ends."""
+    binomials = ca.SX([math.comb(2 * j, j) for j in range(k, -1, -1)])
+    return 0.5 + (sigma - 0.5) * ca.polyval(binomials, sigma * (1 - sigma))
+
+
+def _integral_of_step(sigma, k):
+    """Integral of `_step` from 0 to sigma: (sigma - sum_(j=0..k) Catalan_j (sigma (1 - sigma))^(j+1))/2."""
+    catalan = ca.SX([math.comb(2 * j, j) // (j + 1) for j in range(k, -1, -1)] + [0])
+    return (sigma - ca.polyval(catalan, sigma * (1 - sigma))) / 2
+
+
+def _spline_pieces(times, points, degree, vanishing):
+    """Coefficients (degree + 1, n - 1, dim) of the spline's polynomials, each in its own time from -1 to 1.
+
+    About the middle of its piece a polynomial's coefficients stay of the size of its values.
+    """
+    from scipy.interpolate import make_interp_spline
+
+    x = (times - times[0]) / (times[-1] - times[0]) * (len(times) - 1)
+    middle, half = (x[:-1] + x[1:]) / 2, (x[1:] - x[:-1]) / 2
+    conditions = [(order, np.zeros(points.shape[1])) for order in vanishing]
+    try:
+        curve = make_interp_spline(x, points, k=degree, bc_type=(conditions, conditions) if conditions else None)
+        taylor = [curve(middle, nu=order) / math.factorial(order) for order in range(degree + 1)]
+    except (ValueError, np.linalg.LinAlgError):  # intervals so uneven that its equations are singular
+        taylor = [np.full((len(half), points.shape[1]), np.nan)] * (degree + 1)
+    pieces = np.array([c * half[:, None] ** order for order, c in enumerate(taylor)])
+    starts, stops = pieces[::2].sum(axis=0) - pieces[1::2].sum(axis=0), pieces.sum(axis=0)
+    miss = max(np.abs(starts - points[:-1]).max(), np.abs(stops - points[1:]).max())
+    if not miss <= 1e-9 * np.abs(points).max():
+        ratio = half.max() / half.min()
+        raise SpecificationError(
+            f"The spline of degree {degree} misses its points by {miss:.1e}; its longest interval is {ratio:.3g} times "
+            "its shortest",
+            "A spline passes through its points, within 1e-9 of the largest",
+            "Intervals in proportion to the distances between the points, or a lower smoothness",
+            "Change the times or the smoothness",
+            degree=degree,
+            miss=miss,
+            ratio=ratio,
+        )
+    return pieces
+
+
+def _via_points(times, points):
+    """Return the times (n,) and points (n, dim) of a spline as arrays of numbers."""
+    try:
+        times, points = np.asarray(times, dtype=float), np.asarray(points, dtype=float)
+        finite = np.isfinite(times).all() and np.isfinite(points).all()
+    except (TypeError, ValueError, RuntimeError):
+        finite = False
+    if not finite:
+        raise SpecificationError(
+            "The spline's times or points hold something other than finite numbers",
+            "Via points are numbers, not expressions, in arrays of shapes (n,) and (n,) or (n, dim)",
+            "A line or rest_to_rest takes expressions",
+            "Give finite numbers, and as many entries in each point",
+            times=times,
+            points=points,
+        )
+    if times.ndim != 1 or len(times) < 2 or points.ndim not in (1, 2) or len(points) != len(times) or not points.size:
+        raise SpecificationError(
+            f"The spline's times have shape {times.shape} and its points {points.shape}",
+            "There are n >= 2 times, and one point for each",
+            "(n,) times and (n,) or (n, dim) points",
+            "Give one point for each time; points in rows, their entries in columns",
+            times=times.shape,
+            points=points.shape,
+        )
+    falls = np.flatnonzero(np.diff(times) <= 0)
+    if falls.size:
+        i = int(falls[0])
+        raise SpecificationError(
+            f"The spline's times {i} and {i + 1} are {times[i]:g} and {times[i + 1]:g}",
+            "Times increase strictly", f"A time {i + 1} later than {times[i]:g}",
+            "Sort the points by time and drop repeated times", index=i + 1,
+        )  # fmt: skip
+    return times, points.reshape(len(times), -1)
+
+
+def _column(value, what):
+    """Return an SX column of expressions and finite numbers."""
+    items = column(value, what)
+    shape = getattr(value, "shape", ())
+    if not items or (len(shape) == 2 and 1 not in shape):
+        raise SpecificationError(
+            f"{what} has the shape {shape or (0,)}", "A point of a path is a number or a vector of one entry or more",
+            "(0.0, 1.0)", "Give one point", what=what, shape=shape,
+        )  # fmt: skip
+    if any(item.is_constant() and not math.isfinite(float(item)) for item in items):
+        raise SpecificationError(
+            f"A number that is not finite stands in {what}", "A path is made of finite numbers and expressions",
+            "Any finite number", "Look where the number comes from: often a division by zero", what=what,
+        )  # fmt: skip
+    return ca.vertcat(*items)
+
+
+def _scalar(value, what):
+    """Return an SX scalar: an expression, or a finite number."""
+    value = _column(value, what)
+    if value.numel() != 1:
+        raise SpecificationError(
+            f"{what} has {value.numel()} entries", f"A path is an expression of one scalar {what}",
+            "The time symbol q.t, a scalar path, a parameter or a number",
+            "Give one; to tabulate a path, make a casadi.Function of it", what=what, size=value.numel(),
+        )  # fmt: skip
+    return value
+
+
+def _positive(value, what):
+    """Return an SX scalar that is an expression, or a number greater than zero."""
+    value = _scalar(value, what)
+    if value.is_constant() and float(value) <= 0:
+        raise SpecificationError(
+            f"{what} = {value}", f"The {what} of a path is positive", f"{what} = {abs(float(value)) or 1.0:g}",
+            f"Give a {what} greater than zero", what=what, value=float(value),
+        )  # fmt: skip
+    return value
+
+
+def _smoothness(k, least=0):
+    """Return the k of a class C^k as an int."""
+    try:
+        order = operator.index(k)
+    except TypeError:
+        order = None
+    if order is None or order < least or isinstance(k, bool):
+        is_number = isinstance(k, (int, float)) and math.isfinite(k)
+        raise SpecificationError(
+            f"smoothness = {k!r}",
+            f"The smoothness is the k of class C^k, an integer of at least {least}",
+            f"smoothness = {max(least, math.ceil(k)) if is_number else 4}",
+            "Give as many continuous derivatives as the program needs of its path",
+            smoothness=k,
+        )
+    return order
+
+
+def _orthonormal(axes, centre):
+    """Return two unit vectors at right angles, of the size of `centre`."""
+    if not isinstance(axes, (list, tuple, np.ndarray)) or len(axes) != 2:
+        raise SpecificationError(
+            f"The circle's axes are {axes!r}", "Two orthonormal vectors span its plane",
+            "axes=((1, 0, 0), (0, 1, 0))", "Give a pair of vectors", axes=axes,
+        )  # fmt: skip
+    e1, e2 = (_column(axis, f"axes[{i}]") for i, axis in enumerate(axes))
+    _same_size(centre=centre, **{"axes[0]": e1, "axes[1]": e2})
+    gram = ca.vertcat(ca.dot(e1, e1) - 1, ca.dot(e1, e2), ca.dot(e2, e2) - 1)
+    if gram.is_constant() and np.abs(np.array(ca.DM(gram))).max() > 1e-9:
+        raise SpecificationError(
+            f"The circle's axes are {axes!r}", "They are unit vectors at right angles",
+            "e1/|e1|, then e2 less its part along e1, divided by its length", "Give orthonormal axes", axes=axes,
+        )  # fmt: skip
+    return e1, e2
+
+
+def _same_size(**columns):
+    sizes = {name: c.numel() for name, c in columns.items()}
+    if len(set(sizes.values())) > 1:
+        raise SpecificationError(
+            "Sizes differ: " + ", ".join(f"{name} has {n}" for name, n in sizes.items()),
+            "They are vectors of the same space", f"{max(sizes.values())} entries each",
+            "Give as many entries in each", **sizes,
+        )  # fmt: skip

@@ -1,0 +1,82 @@
+"""Program (servo) constraints of any order."""
+
+import casadi as ca
+import numpy as np
+
+from servoctl.errors import SpecificationError
+from servoctl.spec.coordinates import column
+
+REALISATIONS = ("ideal", "actuators")
+
+
+class Program:
+    """Program constraints: named residuals of any, mixed order, and who realises them.
+
+    Parameters
+    ----------
+    residuals : dict of str to SX scalar
+        φ_i(t, q, γ', ..., γ^(s_i)), to be kept at zero.
+    by : {"ideal", "actuators"}
+        "ideal": an ideal reaction, which does no work on the virtual displacements that the program's leading
+        matrix allows (eq. (3.18) as printed; for residuals nonlinear in velocities or of order >= 2 this
+        generalised Chetaev rule is a postulate). "actuators": the mechanism's own actuators.
+    weights : dict of str to float or SX, optional
+        Weights W of the actuators, for programs with fewer residuals than actuators: the actuation has least
+        uᵀWu. Default 1 each, in the actuators' own units.
+
+    Raises
+    ------
+    SpecificationError
+        If there is no residual, one is no scalar expression, or `by` is another word.
+    """
+
+    def __init__(self, residuals, by="actuators", weights=None):
+        if not isinstance(residuals, dict) or not residuals:
+            raise SpecificationError(
+                f"The program's residuals are {residuals!r}.",
+                "A program names at least one residual.",
+                do='Write {"X": expression, ...}.',
+            )
+        if by not in REALISATIONS:
+            raise SpecificationError(
+                f"by={by!r} was given.",
+                "A program is realised by 'ideal' reactions or by the mechanism's 'actuators'.",
+                nearest="'actuators'" if str(by).startswith("a") else "'ideal'",
+                do="Choose one.",
+            )
+        if weights is not None and by != "actuators":
+            raise SpecificationError(
+                "Weights were given for an ideal program.", "Weights choose among actuators.", do="Remove them."
+            )
+        self.residuals = {name: _residual(name, value) for name, value in residuals.items()}
+        self.by = by
+        self.weights = dict(weights or {})
+
+    @property
+    def names(self):
+        """The residuals' names."""
+        return tuple(self.residuals)
+
+    def __repr__(self):
+        return f"Program({', '.join(self.residuals)}; by {self.by})"
+
+
+def _residual(name, value):
+    if isinstance(value, (bool, str)) or (isinstance(value, np.ndarray) and value.dtype != object):
+        value = [value]
+    items = column(value, f"residual {name!r}")
+    if len(items) != 1:
+        raise SpecificationError(
+            f"The residual {name!r} has {len(items)} entries.",
+            "A residual is a scalar.",
+            do="Give each component a name of its own.",
+            name=name,
+        )
+    if not ca.symvar(items[0]):
+        raise SpecificationError(
+            f"The residual {name!r} is the number {items[0]}.",
+            "A residual is an expression of the coordinates, their derivatives and t.",
+            do="Write what is to be kept at zero.",
+            name=name,
+        )
+    return items[0]
