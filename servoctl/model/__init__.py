@@ -1,0 +1,1 @@
+"""Expressions become functions on numbers: emitted as C, compiled, cached; the seam between CasADi and NumPy."""

@@ -133,14 +133,12 @@ class Compiled:
         if not self._settled:
             self._calls += 1
             self._settle(self._calls > SCALAR_CALLS)
-        if getattr(x, "shape", None) != self._x_shape:
-            x = self._array("x", x, self._x_shape)
-        if getattr(p, "shape", None) != self._p_shape:
-            p = self._array("p", p, self._p_shape)
         row_t, row_x, row_p, row_y, run = self._evaluator.workspace.row
         row_t[0] = t
-        row_x[:] = x
-        row_p[:] = p
+        try:
+            row_x[:], row_p[:] = x, p
+        except (TypeError, ValueError):  # not arrays of floats of the right shapes
+            row_x[:], row_p[:] = self._array("x", x, self._x_shape), self._array("p", p, self._p_shape)
         run()
         return row_y.copy()
 

@@ -14,7 +14,7 @@ from servoctl.errors import SpecificationError, unknown
 
 CHUNK = 350  # statements per C function: compile time is least, and flat, between 250 and 500
 BISECTIONS = 20  # halvings of one time step in newton: a millionth of it is a lost solution, not a long step
-ROUNDING = 4 * 2.0**-52  # a Newton correction this small relative to 1 + |x| cannot be reduced by another
+ROUNDING = 2.0**-52  # a Newton correction this small relative to 1 + |x| cannot be reduced by another
 
 _LIBM_1 = ("sqrt exp log expm1 log1p sin cos tan asin acos atan sinh cosh tanh asinh acosh atanh "
            "fabs floor ceil erf").split()
@@ -52,21 +52,22 @@ static inline V v_if_else_zero(V a, V b) { return a ? b : 0; }
 
 _ERFINV = """\
 
-/* Rational start by range, then two Newton steps on erf. */
+/* As CasADi evaluates it: rational approximations, and two Newton steps on erf except below -0.7. */
 static V v_erfinv(V a)
 {
     const V size = fabs(a);
     V r, z;
     if (!(size < 1)) return size == 1 ? copysign(INFINITY, a) : NAN;
-    if (size < 0.7) {
+    if (a < 0.7 && a >= -0.7) {
         z = a * a;
         r = a * (((-0.140543331 * z + 0.914624893) * z - 1.645349621) * z + 0.886226899)
-            / ((((0.012229801 * z - 0.329097515) * z + 1.442710462) * z - 2.118377725) * z + 1.0);
+            / ((((-0.329097515 * z + 0.012229801) * z + 1.442710462) * z - 2.118377725) * z + 1.0);
     } else {
         z = sqrt(-log((1.0 - size) / 2.0));
-        r = copysign((((1.641345311 * z + 3.429567803) * z - 1.624906493) * z - 1.970840454)
-                     / ((1.637067800 * z + 3.543889200) * z + 1.0), a);
+        r = (((1.641345311 * z + 3.429567803) * z - 1.624906493) * z - 1.970840454)
+            / ((1.637067800 * z + 3.543889200) * z + 1.0);
     }
+    if (a < -0.7) return -r;
     for (int k = 0; k < 2; k++) r = r - (erf(r) - a) / (2.0 / sqrt(3.14159265358979323846) * exp(-r * r));
     return r;
 }

@@ -58,9 +58,9 @@ def complete(q, rows, context, starts=None):
         rank, best = decide_all(numbers, sizes)
         if not rank.clear:
             raise _ill_conditioned(rows, rank)
-        if rank.rank == len(rows):
-            return rows, rank, points, guards
         same = [p for p in range(numbers.shape[2]) if decide(numbers[:, :, p]).rank == rank.rank]
+        if rank.rank == len(rows):
+            return rows, rank, points.take(same), guards
         rows, new_guards = _step(q, rows, numbers[:, :, same], context, points)
         guards += new_guards
 

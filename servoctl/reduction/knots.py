@@ -115,8 +115,8 @@ class Switches:
 
     def _scan(self, values, t0, t1, known):
         def sides(t):
-            c = self._run(np.atleast_1d(t), values, 1).c
-            return [np.broadcast_to(c[a][0] - (c[b][0] if b is not None else 0.0), np.shape(t)) for a, b in self.timed]
+            c = self._run(t, values, 1).c
+            return [np.broadcast_to(c[a][0] - (c[b][0] if b is not None else 0.0), t.shape) for a, b in self.timed]
 
         grid = np.linspace(t0, t1, 801)
         found = set()
@@ -127,7 +127,7 @@ class Switches:
                     continue
                 for _ in range(60):
                     middle = (low + high) / 2
-                    low, high = (middle, high) if np.sign(sides(middle)[s]) == np.sign(g[i]) else (low, middle)
+                    low, high = (middle, high) if np.sign(sides(np.array([middle]))[s][0]) == np.sign(g[i]) else (low, middle)
                 found.add(float((low + high) / 2))
         return found
 

@@ -98,17 +98,23 @@ class Flow:
         Highest level K of the jets.
     points : Points
         Only its parameters and their values are used here.
+    signals : dict, optional
+        Taylor coefficients of further symbols along the motion, by element hash: lists of (N,) arrays.
+    real : type
+        Of the Jacobian; double precision is enough for Newton's method.
     """
 
-    def __init__(self, q, rows, level, points):
-        self.q, self.level, self.points = q, level, points
+    def __init__(self, q, rows, level, points, signals=None, real=float):
+        self.q, self.level, self.points, self.signals, self.real = q, level, points, signals or {}, real
         self.equations = [(a, i) for a, (_, order) in enumerate(rows) for i in range(level - order + 1)]
+        self.levels = np.array([rows[a][1] + i for a, i in self.equations], dtype=int)
         self.groups = []
         for order in sorted({order for _, order in rows if order <= level}):
             members = [a for a, (_, o) in enumerate(rows) if o == order]
             expressions = [rows[a][0] for a in members]
             parts = [ca.jacobian(ca.vertcat(*expressions), ca.vertcat(*q.gamma(m) if m else q)) for m in range(order + 1)]
             self.groups.append(self._tape(members, order, expressions, parts))
+        self.bare = [self._tape(m, order, [rows[a][0] for a in m], []) for m, order, *_ in self.groups]
         if not q.plain:
             moving = q.V @ ca.vertcat(*q.gamma(1)) + q.h
             self.motion = self._tape([], 0, moving.elements(), [ca.jacobian(moving, ca.vertcat(*q)), q.V])
@@ -118,14 +124,17 @@ class Flow:
         symbols = ca.symvar(ca.vertcat(*outputs))
         return members, order, Tape(symbols, outputs), symbols, [p.shape for p in parts]
 
-    def __call__(self, t, z):
-        """Coefficients (n_equations, N) and Jacobian (n_equations, nz, N) at times t (N,) and jets z (nz, N)."""
+    def __call__(self, t, z, slopes=True):
+        """Coefficients (n_equations, N) and Jacobian (n_equations, nz, N) at times t (N,) and jets z (nz, N).
+
+        Without `slopes` the Jacobian is None.
+        """
         n_points = z.shape[1]
-        q_series, q_map = self._kinematics(t, z)
+        q_series, q_map = self._kinematics(t, z, slopes)
         place = {equation: e for e, equation in enumerate(self.equations)}
         residual = np.zeros((len(self.equations), n_points), dtype=REAL)
-        jacobian = np.zeros((len(self.equations), len(z), n_points))
-        for members, order, tape, symbols, shapes in self.groups:
+        jacobian = np.zeros((len(self.equations), len(z), n_points), dtype=self.real) if slopes else None
+        for members, order, tape, symbols, shapes in self.groups if slopes else self.bare:
             depth = self.level - order
             coefficients = self._run(tape, symbols, t, z, q_series, depth)
             offset = len(members)
@@ -136,17 +145,23 @@ class Flow:
                 offset += size
             for r, a in enumerate(members):
                 for i in range(depth + 1):
-                    e = place[a, i]
-                    residual[e] = coefficients[r, i]
-                    jacobian[e] = self._linear(blocks, r, i, q_map, len(z), n_points)
+                    residual[place[a, i]] = coefficients[r, i]
+                    if slopes:
+                        jacobian[place[a, i]] = self._linear(blocks, r, i, q_map, len(z), n_points)
         return residual, jacobian
 
+    def series(self, expressions, t, z, depth):
+        """Taylor coefficients of expressions along a motion, (len, depth + 1, N)."""
+        q_series, _ = self._kinematics(t, z, False)
+        symbols = ca.symvar(ca.vertcat(*expressions))
+        return self._run(Tape(symbols, list(expressions)), symbols, t, z, q_series, depth)
+
     def _linear(self, blocks, r, i, q_map, nz, n_points):
-        row = np.zeros((nz, n_points))
+        row = np.zeros((nz, n_points), dtype=self.real)
         nq, n = self.q.nq, self.q.n
         for m, block in enumerate(blocks):
             for l in range(i + 1):
-                part = block[:, r, i - l].astype(float)
+                part = block[:, r, i - l].astype(self.real)
                 if m == 0:
                     row += np.einsum("jp,jzp->zp", part, q_map[l])
                 elif l + m <= self.level:
@@ -154,15 +169,17 @@ class Flow:
                     row[start : start + n] += part * (factorial(l + m) / factorial(l))
         return row
 
-    def _kinematics(self, t, z):
-        """Taylor coefficients of q, and the derivative of each in z."""
+    def _kinematics(self, t, z, slopes):
+        """Taylor coefficients of q and, with `slopes`, the derivative of each in z."""
         nq, n, n_points = self.q.nq, self.q.n, z.shape[1]
-        first = np.zeros((nq, len(z), n_points))
+        if self.q.plain and not slopes:
+            return [z[:nq], *(z[nq + k * n : nq + (k + 1) * n] for k in range(self.level))], None
+        first = np.zeros((nq, len(z), n_points), dtype=self.real)
         first[np.arange(nq), np.arange(nq)] = 1.0
         series, maps = [z[:nq]], [first]
         if self.q.plain:
             for k in range(1, self.level + 1):
-                step = np.zeros((nq, len(z), n_points))
+                step = np.zeros((nq, len(z), n_points), dtype=self.real)
                 start = nq + (k - 1) * n
                 step[np.arange(nq), start + np.arange(nq)] = 1.0
                 series.append(z[start : start + n])
@@ -171,8 +188,8 @@ class Flow:
         _, _, tape, symbols, _ = self.motion
         for k in range(self.level):
             c = self._run(tape, symbols, t, z, series, k)
-            slope = c[nq : nq + nq * nq].reshape(nq, nq, k + 1, n_points).astype(float)
-            frame = c[nq + nq * nq :].reshape(n, nq, k + 1, n_points).astype(float)
+            slope = c[nq : nq + nq * nq].reshape(nq, nq, k + 1, n_points).astype(self.real)
+            frame = c[nq + nq * nq :].reshape(n, nq, k + 1, n_points).astype(self.real)
             series.append(c[:nq, k] / (k + 1))
             step = np.zeros_like(first)
             for l in range(k + 1):
@@ -197,6 +214,8 @@ class Flow:
 
     def _input(self, symbol, k, t, z, q_series):
         place = self.q.where(symbol)
+        if place is None and symbol.element_hash() in self.signals:
+            return self.signals[symbol.element_hash()][k]
         if place is None:
             return np.full(z.shape[1], self.points._parameter(symbol), dtype=REAL) if k == 0 else 0.0
         kind, level, i = place
@@ -210,8 +229,8 @@ class Flow:
         return z[start + i] * (factorial(level + k) / factorial(k))
 
 
-def solve(flow, t, z, iterations=80):
-    """Move jets onto the manifold of a flow's rows by damped Gauss-Newton with least steps.
+def solve(flow, t, z, iterations=60):
+    """Move jets onto the manifold of a flow's rows: level by level, then by damped Gauss-Newton on all levels.
 
     Parameters
     ----------
@@ -226,42 +245,75 @@ def solve(flow, t, z, iterations=80):
         Largest residual left, each relative to the size of its gradient times that of the jets.
     """
     z, t = np.array(z, dtype=REAL), np.asarray(t, dtype=REAL)
+    if not len(flow.equations):
+        return z, np.zeros(len(t), dtype=REAL)
+    for level in range(flow.level + 1):
+        z = _solve_level(flow, t, z, level)
     residual, jacobian = flow(t, z)
     norm = _norms(residual, jacobian, z)
-    active = np.ones(len(t), dtype=bool)
+    active = np.flatnonzero(norm > 1e-30)
     for _ in range(iterations):
-        if not active.any() or not len(residual):
+        if not len(active):
             break
-        step = np.zeros_like(z)
-        for p in np.flatnonzero(active):
-            step[:, p] = _least_step(jacobian[:, :, p], residual[:, p])
-        longest = np.max(np.abs(step) / (1.0 + np.abs(z)), axis=0).astype(float)
-        damping = np.where(active, 1.0 / np.maximum(1.0, longest), 0.0)
-        for _ in range(12):
-            trial = z + damping * step
-            new_residual, new_jacobian = flow(t, trial)
-            new_norm = _norms(new_residual, new_jacobian, trial)
-            worse = active & ~(new_norm < norm) & (damping > 0)
-            if not worse.any():
-                break
-            damping = np.where(worse, damping / 4, damping)
-        better = active & (new_norm < norm)
-        z[:, better] = trial[:, better]
-        active = better & (new_norm > 1e-30)
-        residual, jacobian, norm = (
-            np.where(better, new_residual, residual),
-            np.where(better, new_jacobian, jacobian),
-            np.where(better, new_norm, norm),
-        )
+        start, scale = z[:, active], _scales(jacobian[:, :, active], z[:, active])
+        step = np.array([_least_step(jacobian[:, :, p], residual[:, p]) for p in active]).T
+        trial, better = _search(flow, t[active], start, step, scale, residual[:, active])
+        active, trial = active[better], trial[:, better]
+        if not len(active):
+            break
+        z[:, active] = trial
+        residual[:, active], jacobian[:, :, active] = flow(t[active], trial)
+        norm[active] = _norms(residual[:, active], jacobian[:, :, active], trial)
+        active = active[norm[active] > 1e-30]
     return z, norm
 
 
-def _norms(residual, jacobian, z):
-    if not len(residual):
-        return np.zeros(z.shape[1])
+def _search(flow, t, z, step, scale, residual):
+    """The longest of a sequence of shortened steps that lessens the residual, point by point."""
+    longest = np.max(np.abs(step) / (1.0 + np.abs(z)), axis=0)
+    damping, before = 1.0 / np.maximum(1.0, longest), np.max(np.abs(residual) / scale, axis=0)
+    trial, open_ = z + damping * step, np.arange(len(t))
+    better = np.zeros(len(t), dtype=bool)
+    for _ in range(12):
+        new, _ = flow(t[open_], trial[:, open_], slopes=False)
+        with np.errstate(all="ignore"):
+            good = np.max(np.abs(new) / scale[:, open_], axis=0) < before[open_]
+        better[open_[good]] = True
+        open_ = open_[~good]
+        if not len(open_):
+            break
+        damping[open_] /= 4
+        trial[:, open_] = z[:, open_] + damping[open_] * step[:, open_]
+    return trial, better
+
+
+def _solve_level(flow, t, z, level):
+    """Newton's method for γ^(level) alone, lower jets fixed: exact in a step where the rows are affine there."""
+    rows = np.flatnonzero(flow.levels == level)
+    nq, n = flow.q.nq, flow.q.n
+    columns = slice(0, nq) if level == 0 else slice(nq + (level - 1) * n, nq + level * n)
+    if not len(rows):
+        return z
+    for _ in range(8 if level == 0 else 2):
+        residual, jacobian = flow(t, z)
+        steps = [_least_step(jacobian[rows][:, columns, p], residual[rows, p]) for p in range(len(t))]
+        step = np.array(steps).T
+        longest = np.max(np.abs(step) / (1.0 + np.abs(z[columns])), axis=0)
+        z[columns] += step / np.maximum(1.0, longest) if level == 0 else step
+        if np.all(np.abs(step) <= 1e-17 * (1.0 + np.abs(z[columns]))):
+            break
+    return z
+
+
+def _scales(jacobian, z):
+    """Size of each residual's gradient times that of the jets, (equations, N)."""
     scale = np.sqrt((jacobian**2 * (1.0 + np.abs(z.astype(float))) ** 2).sum(axis=1))
+    return np.where(scale > 0, scale, 1.0)
+
+
+def _norms(residual, jacobian, z):
     with np.errstate(all="ignore"):
-        norm = np.max(np.abs(residual) / np.where(scale > 0, scale, 1.0), axis=0).astype(REAL)
+        norm = np.max(np.abs(residual) / _scales(jacobian, z), axis=0).astype(REAL)
     return np.where(np.isfinite(norm), norm, np.inf)
 
 

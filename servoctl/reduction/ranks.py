@@ -67,12 +67,14 @@ def equilibrate(matrix):
     return a, rows, columns
 
 
-def decide(matrix):
+def decide(matrix, resolved=RESOLVED):
     """The rank of one matrix, by equilibration and complete pivoting.
 
     Parameters
     ----------
     matrix : (m, n) array, entries cleaned
+    resolved : float
+        Pivots above it count.
 
     Returns
     -------
@@ -91,7 +93,7 @@ def decide(matrix):
         pivots.append(float(np.abs(a[k, k])))
         a[k + 1 :, k:] -= np.outer(a[k + 1 :, k] / a[k, k], a[k, k:])
         a[k + 1 :, k] = 0.0
-    rank = next((k for k, p in enumerate(pivots) if p <= RESOLVED), len(pivots))
+    rank = next((k for k, p in enumerate(pivots) if p <= resolved), len(pivots))
     kept = min(pivots[:rank], default=np.inf)
     return Rank(rank, kept, max(pivots[rank:], default=0.0), tuple(rows[:rank]), tuple(columns[:rank]))
 
@@ -146,3 +148,38 @@ def combination(rows, target):
         residual = scaled[-1]
     left = float(np.abs(residual).max(initial=0.0)) / max(float(np.abs(b).max(initial=0.0)), 1e-300)
     return c * (row_factors[:-1] / row_factors[-1]).astype(float), left
+
+
+def solve_clean(matrix, right):
+    """Solve A X = B in extended precision, with every difference that is rounding in its terms set to zero.
+
+    What vanishes in exact arithmetic is then zero in the solution.
+
+    Parameters
+    ----------
+    matrix : (n, n) array
+    right : (n, m) array
+
+    Returns
+    -------
+    (n, m) array
+    """
+    a, row_factors, column_factors = equilibrate(matrix)
+    b = np.asarray(right, dtype=np.longdouble) * row_factors[:, None]
+    n = len(a)
+    for k in range(n):
+        pivot = k + int(np.argmax(np.abs(a[k:, k])))
+        a[[k, pivot]], b[[k, pivot]] = a[[pivot, k]], b[[pivot, k]]
+        factor = a[k + 1 :, k] / a[k, k]
+        a[k + 1 :, k:] = _difference(a[k + 1 :, k:], np.outer(factor, a[k, k:]))
+        b[k + 1 :] = _difference(b[k + 1 :], np.outer(factor, b[k]))
+    for k in reversed(range(n)):
+        b[k] /= a[k, k]
+        b[:k] = _difference(b[:k], np.outer(a[:k, k], b[k]))
+    return b * column_factors[:, None]
+
+
+def _difference(a, b):
+    """a - b, zero where it is rounding."""
+    result = a - b
+    return np.where(np.abs(result) <= ENTRY * (np.abs(a) + np.abs(b)), 0.0, result)

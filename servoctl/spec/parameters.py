@@ -89,7 +89,7 @@ def parameters(**values):
 
     Returns
     -------
-    Parameters
+    p : Parameters
 
     Raises
     ------

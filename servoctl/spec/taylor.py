@@ -340,8 +340,8 @@ class Series:
     def _constant_power(a, y, exponent, k):
         if k == 0:
             return a[0] ** exponent
-        total = _dot((((exponent * (k - j) - j) / k) * a[k - j], y[j]) for j in range(k) if not _is_zero(a[k - j]))
-        return 0.0 if _is_zero(total) else total / a[0]
+        total = _dot(((exponent * (k - j) - j) * a[k - j], y[j]) for j in range(k) if not _is_zero(a[k - j]))
+        return 0.0 if _is_zero(total) else total / (k * a[0])
 
     def _quadrature(self, node, k):
         name, slopes = node.data
@@ -350,8 +350,8 @@ class Series:
         total = 0.0
         for argument, slope in zip(node.args, slopes, strict=True):
             a, g = self.c[argument], self.c[slope]
-            total = _plus(total, _dot(((j / k) * a[j], g[k - j]) for j in range(1, k + 1) if not _is_zero(a[j])))
-        return total
+            total = _plus(total, _dot((j * a[j], g[k - j]) for j in range(1, k + 1) if not _is_zero(a[j])))
+        return total if k == 1 or _is_zero(total) else total / k
 
 
 def evaluate(tape, inputs):

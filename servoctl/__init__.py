@@ -1,0 +1,69 @@
+"""servoctl: program (servo) constraints of any order become reduced dynamics, required actuation and a motion.
+
+A specification flows one way: Mechanism and Program, by `derive`, become a Model; `simulate` makes it a Run;
+`verify` proves the run against the full mechanism.
+"""
+
+from servoctl import spec
+from servoctl.errors import (
+    InconsistentStart,
+    IntegrationStopped,
+    LimitExceeded,
+    NameUnknown,
+    NotRealisable,
+    ServoError,
+    SingularProgram,
+    SpecificationError,
+    UnstableInternalDynamics,
+)
+from servoctl.model.model import Model, derive
+from servoctl.simulation.drift import poles, project
+from servoctl.simulation.run import Run, load
+from servoctl.simulation.simulate import simulate
+from servoctl.simulation.verify import Verification, verify
+from servoctl.spec import (
+    Coordinates,
+    Mechanism,
+    Parameters,
+    Program,
+    body_rates,
+    coordinates,
+    parameters,
+    particle,
+    paths,
+    rigid_body,
+)
+
+__version__ = "0.1.0"
+
+__all__ = [
+    "Coordinates",
+    "InconsistentStart",
+    "IntegrationStopped",
+    "LimitExceeded",
+    "Mechanism",
+    "Model",
+    "NameUnknown",
+    "NotRealisable",
+    "Parameters",
+    "Program",
+    "Run",
+    "ServoError",
+    "SingularProgram",
+    "SpecificationError",
+    "UnstableInternalDynamics",
+    "Verification",
+    "body_rates",
+    "coordinates",
+    "derive",
+    "load",
+    "parameters",
+    "particle",
+    "paths",
+    "poles",
+    "project",
+    "rigid_body",
+    "simulate",
+    "spec",
+    "verify",
+]

@@ -1,0 +1,257 @@
+"""The functions of a motion as SX expressions: each is built only when it is asked for."""
+
+from functools import cached_property
+
+import casadi as ca
+
+from servoctl.errors import SpecificationError
+from servoctl.reduction.appell import plant_accelerations
+from servoctl.reduction.elimination import eliminate
+from servoctl.reduction.ranks import clean
+from servoctl.reduction.rows import gradient
+
+
+class Equations:
+    """Expressions of a reduction, in the state X = (q, γ', ..., γ^(s̄-1)) and the jets Z = (X, γ^(s̄)).
+
+    Parameters
+    ----------
+    reduction : Reduction
+    """
+
+    def __init__(self, reduction):
+        self.r = reduction
+        self.q = reduction.mechanism.q
+        self.top = reduction.top
+        self.state = ca.vertcat(*self.q, *(s for k in range(1, self.top) for s in self.q.gamma(k)))
+        self.jets = ca.vertcat(self.state, *self.q.gamma(self.top))
+        self.parameters = ca.vertcat(*reduction.mechanism.parameters.symbols)
+        self.raised = [self.top - row.order for row in reduction.rows]
+        self.coefficients = [
+            [ca.SX.sym(f"c{a}_{j}") for j in range(count)] for a, count in enumerate(self.raised)
+        ]  # of the error dynamics of each row
+
+    @cached_property
+    def levels(self):
+        """For each row its total derivatives of orders 0 .. s̄ - o_a."""
+        return [
+            [level[0] for level in self.q.derivatives([row.expression], count)]
+            for row, count in zip(self.r.rows, self.raised, strict=True)
+        ]
+
+    def function(self, name, x, outputs, extra=None):
+        """An SX function of (t, x, p) with one dense column."""
+        p = self.parameters if extra is None else ca.vertcat(self.parameters, extra)
+        y = ca.densify(ca.cse(ca.vertcat(*outputs)))
+        return ca.Function(name, [self.q.t, x, p], [y], ["t", "x", "p"], ["y"])
+
+    def _solve(self, right):
+        """L⁻¹ right and the pivots of L."""
+        values, sizes = self.r.points.matrix(self.r.leading)
+        return eliminate(self.r.leading, right, clean(values, sizes))
+
+    @cached_property
+    def guards(self):
+        """Pivots that a motion must not let vanish: a list of (name, SX)."""
+        _, pivots = self._solve(ca.SX(self.q.n, 0))
+        found = [*self.r.guards, *((f"leading matrix {i + 1}", p) for i, p in enumerate(pivots))]
+        return [(name, g) for name, g in found if any(self.q.where(s) is not None for s in ca.symvar(g))]
+
+    def rates(self, top):
+        """X' for given γ^(s̄)."""
+        moving = self.q.V @ ca.vertcat(*self.q.gamma(1)) + self.q.h
+        return ca.vertcat(moving, *(s for k in range(2, self.top) for s in self.q.gamma(k)), top)
+
+    def ode(self, poles=False):
+        """Outputs (X', guards): L γ^(s̄) = -(rest), or with the error dynamics Π(D - λ)ψ = 0 in place of D^ρψ = 0."""
+        top = ca.vertcat(*self.q.gamma(self.top))
+        zero = ca.SX.zeros(self.q.n)
+        rest = []
+        for a, level in enumerate(self.levels):
+            row = ca.substitute(level[-1], top, zero)
+            if poles:
+                row += sum(c * e for c, e in zip(self.coefficients[a], level[:-1], strict=True))
+            rest.append(row)
+        solution, _ = self._solve(-ca.vertcat(*rest))
+        extra = ca.vertcat(*(c for row in self.coefficients for c in row)) if poles else None
+        name = "ode_poles" if poles else "ode"
+        return self.function(name, self.state, [self.rates(solution), *(g for _, g in self.guards)], extra)
+
+    def path(self):
+        """For flat programs: a Newton step for q, then q', γ', γ'' and the guards, as functions of (t, q).
+
+        Outputs are (δq, q', γ', γ'', guards).
+        """
+        q, n = self.q, self.q.n
+        zero = ca.SX.zeros(n)
+        w, dw = ca.vertcat(*q.gamma(1)), ca.vertcat(*q.gamma(2))
+        first = ca.vertcat(*(level[1] for level in self.levels))
+        second = ca.vertcat(*(level[2] for level in self.levels))
+        velocity, _ = self._solve(-ca.substitute(first, w, zero))
+        acceleration, _ = self._solve(-ca.substitute(second, dw, zero))
+        acceleration = ca.substitute(acceleration, w, velocity)
+        rates = q.V @ velocity + q.h
+        guards = [ca.substitute(g, ca.vertcat(w, dw), ca.vertcat(velocity, acceleration)) for _, g in self.guards]
+        return self.function("path", ca.vertcat(*q), [self._newton(), rates, velocity, acceleration, *guards])
+
+    def _newton(self):
+        q = self.q
+        residual = ca.vertcat(*(row.expression for row in self.r.rows))
+        if q.nq == q.n:
+            return q.V @ self._solve(-residual)[0]
+        if len(q.invariants) != q.nq - q.n:
+            raise SpecificationError(
+                f"{q.nq} coordinates are moved by {q.n} quasi-velocities, with {len(q.invariants)} invariants.",
+                f"A flat program is solved for all coordinates, which takes {q.nq - q.n} invariants of the kinematics.",
+                nearest='with_quasi_velocities(..., invariants={"unit": ca.dot(e, e) - 1}).',
+                do="Name them, or choose an integrating method.",
+            )
+        residual = ca.vertcat(residual, *q.invariants.values())
+        matrix = ca.jacobian(residual, ca.vertcat(*q))
+        values, sizes = self.r.points.matrix(matrix)
+        return eliminate(matrix, -residual, clean(values, sizes))[0]
+
+    @cached_property
+    def invariant_rows(self):
+        """(level, name, SX): what the state satisfies, ψ_a^(j) for j < s̄ - o_a and the kinematics' own invariants."""
+        found = [(0, name, e) for name, e in self.q.invariants.items()]
+        for row, level in zip(self.r.rows, self.levels, strict=True):
+            found += [(row.order + j, _level_name(row.name, j), e) for j, e in enumerate(level[:-1])]
+        return sorted(found, key=lambda item: item[0])
+
+    def invariants(self):
+        """Outputs (values, Jacobian in X column by column) of the invariants."""
+        values = ca.vertcat(*(e for _, _, e in self.invariant_rows))
+        return self.function("invariants", self.state, [values, ca.vec(ca.densify(ca.jacobian(values, self.state)))])
+
+    def metric(self):
+        """The inertia matrix M, column by column, at the state."""
+        mass = ca.substitute(self.r.mechanism.mass, ca.vertcat(*self.q.gamma(2)), ca.SX.zeros(self.q.n))
+        frame = ca.vec(ca.densify(self.q.V))
+        return self.function("metric", self.state, [ca.vec(ca.densify(mass)), frame])
+
+    def matrices(self):
+        """L and Bᵀ, column by column, and which rows they have: what must keep its rank."""
+        L, B = self.r.leading, self.r.realisation.B.T
+        return self.function("matrices", self.state, [ca.vec(ca.densify(L)), ca.vec(ca.densify(B))])
+
+    def plant(self):
+        """(q', γ'') of the full mechanism as a function of (t, [q; γ'; inputs]); inputs drive it as they do the program."""
+        r, q = self.r, self.q
+        mechanism, acceleration = r.mechanism, ca.vertcat(*q.gamma(2))
+        zero = ca.SX.zeros(q.n)
+        inputs = ca.SX.sym("input", r.actuation.shape[0])
+        driven = mechanism.E @ inputs if r.program.by == "actuators" else inputs
+        material = [row for row in r.given.values() if row.kind == "material"]
+        second = [q.derivatives([row.expression], 2 - row.order)[-1][0] for row in material]
+        second = ca.substitute(ca.vertcat(*second), acceleration, zero) if material else ca.SX(0, 1)
+        force = driven - ca.substitute(mechanism.balance, acceleration, zero)
+        solution = plant_accelerations(mechanism, material, force, -second, r.points)
+        x = ca.vertcat(*q, *q.gamma(1), inputs)
+        return self.function("plant", x, [q.V @ ca.vertcat(*q.gamma(1)) + q.h, solution])
+
+    def multiplier_form(self):
+        """Matrix and right side, column by column, of [M -B; C 0] [γ''; μ]: the form with multipliers."""
+        r, q = self.r, self.q
+        acceleration, zero = ca.vertcat(*q.gamma(2)), ca.SX.zeros(q.n)
+        rows = [row for row in r.given.values() if row.order <= 1 or (row.order == 2 and row.affine)]
+        second = ca.vertcat(*(q.derivatives([row.expression], 2 - row.order)[-1][0] for row in rows))
+        B = r.realisation.B
+        C = ca.jacobian(second, acceleration) if rows else ca.SX(0, q.n)
+        matrix = ca.vertcat(ca.horzcat(r.mechanism.mass, -B), ca.horzcat(C, ca.SX.zeros(len(rows), B.shape[1])))
+        right = -ca.substitute(ca.vertcat(r.mechanism.balance, second), acceleration, zero)
+        return self.function("multiplier_form", self.jets, [right, ca.vec(ca.densify(matrix))])
+
+    def signals(self, kind):
+        """A group of named signals as a function of (t, Z, p): names and function."""
+        names, expressions = getattr(self, f"_{kind}")()
+        return names, self.function(kind, self.jets, expressions)
+
+    def _actuation(self):
+        return list(self.r.mechanism.actuators), [self.r.actuation]
+
+    def _reaction(self):
+        names = self.q.names if self.q.plain else self.q.velocity_names
+        return [f"reaction_{name}" for name in names], [self.r.actuation]
+
+    def _multipliers(self):
+        names = [*self.r.program.residuals, *self.r.mechanism.constraints]
+        own = self.r.multipliers
+        if self.r.program.by == "actuators":
+            names, own = [*self.r.mechanism.constraints], own[len(self.r.program.residuals) :]
+        return [f"multiplier_{name}" for name in names], [own]
+
+    def _outputs(self):
+        return list(self.r.mechanism.outputs), list(self.r.mechanism.outputs.values())
+
+    def _energy(self):
+        return ["energy"], [self.r.mechanism.energy]
+
+    def _inputs(self):
+        """What drives the plant: the actuation, or an ideal program's reaction."""
+        return ["inputs"], [self.r.actuation]
+
+    def _all_multipliers(self):
+        """All multipliers μ of the reaction B μ."""
+        return ["all_multipliers"], [self.r.multipliers]
+
+    def _power(self):
+        """dE/dt, the power of all forces without a potential, the size of its terms, and whether dE/dt follows from M."""
+        r, q = self.r, self.q
+        w = ca.vertcat(*q.gamma(1))
+        rate = q.dt(r.mechanism.energy)
+        force = r.mechanism.forces + r.realisation.B @ r.multipliers
+        law = rate - ca.dot(w, r.mechanism.balance + r.mechanism.forces)
+        return ["rate", "work", "size", "law"], [rate, ca.dot(w, force), ca.dot(ca.fabs(w), ca.fabs(force)), law]
+
+    def _reach(self):
+        """An ideal program's reaction and the directions that actuators and material constraints have."""
+        k = len(self.r.program.residuals)
+        directions = ca.horzcat(self.r.mechanism.E, self.r.realisation.B[:, k:])
+        return ["reach"], [self.r.actuation, ca.vec(ca.densify(directions))]
+
+    def _balance(self):
+        names = self.q.names if self.q.plain else self.q.velocity_names
+        return [f"balance_{name}" for name in names], [self.r.mechanism.balance]
+
+    def _coordinate_rates(self):
+        names = [f"d{name}" for name in self.q.names] + [f"d2{name}" for name in self.q.names]
+        return names, [*self.q.d(1), *self.q.d(2)]
+
+    def _residuals(self):
+        """Given residuals, material constraints and hidden rows at every level that the jets reach."""
+        names, expressions = [], []
+        for name, row in self.residual_rows.items():
+            levels = self.q.derivatives([row.expression], max(0, self.top - row.order))
+            names += [(name, j) for j in range(len(levels))]
+            expressions += [level[0] for level in levels]
+        return names, expressions
+
+    @property
+    def residual_rows(self):
+        """Rows whose residuals a run reports, by name."""
+        hidden = {f"hidden: {row.name}": row for row in self.r.rows if row.story}
+        return {**self.r.given, **hidden}
+
+
+def _level_name(name, j):
+    return name if j == 0 else f"D{'' if j == 1 else j}({name})"
+
+
+def leading_names(reduction):
+    """Names of the rows of L, then of Bᵀ."""
+    constraints = [row for row in reduction.rows if row.kind != "dynamics"]
+    program = [row.name for row in constraints if row.kind == "program"]
+    material = [row.name for row in constraints if row.kind == "material"]
+    own = program if reduction.program.by == "ideal" else list(reduction.mechanism.actuators)[: len(program)]
+    return [row.name for row in reduction.rows], [*own, *material]
+
+
+def gradient_jets(reduction, name):
+    """Names of the jets on which the leading gradient of a row depends."""
+    q = reduction.mechanism.q
+    for row in (*reduction.rows, *reduction.given.values()):
+        if row.name == name:
+            places = [q.where(s) for s in ca.symvar(gradient(q, row))]
+            return [q.jet_names(level)[i] for kind, level, i in filter(None, places) if kind != "t"]
+    return []

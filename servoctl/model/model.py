@@ -1,0 +1,338 @@
+"""The model: a reduction as functions on numbers, built when they are asked for."""
+
+from functools import cached_property
+
+import numpy as np
+
+from servoctl.errors import SpecificationError, unknown
+from servoctl.model.compiled import compiled
+from servoctl.model.equations import Equations, gradient_jets, leading_names
+from servoctl.reduction.knots import require_smooth
+from servoctl.reduction.reduce import reduce
+from servoctl.reduction.structure import structure
+
+SIGNALS = (
+    "actuation", "reaction", "multipliers", "outputs", "energy", "balance", "coordinate_rates", "residuals",
+    "inputs", "all_multipliers", "power", "reach",
+)  # fmt: skip
+
+
+def derive(mechanism, program, guess=None):
+    """Derive reduced dynamics and required actuation from a mechanism and its program (3.18).
+
+    Parameters
+    ----------
+    mechanism : Mechanism
+    program : Program
+    guess : dict of str to float, optional
+        Values of coordinates or derivatives near the motion; points of the constraint manifold, at which ranks
+        are decided, are looked for about them. Seldom needed.
+
+    Returns
+    -------
+    Model
+
+    Raises
+    ------
+    SpecificationError
+        For constraints that depend on or contradict each other, an unknown symbol, a path that is not smooth
+        enough, a singular mass matrix.
+    NotRealisable
+        If the actuators cannot realise the program.
+    SingularProgram
+        If a residual's gradient vanishes on its own solutions, or a rank cannot be told.
+    InconsistentStart
+        If no state satisfies the constraints.
+    """
+    return Model(reduce(mechanism, program, guess))
+
+
+class Model:
+    """Reduced dynamics and required actuation of a program; made by `derive`.
+
+    Functions are derived and compiled when they are first used.
+
+    Attributes
+    ----------
+    reduction : Reduction
+    parameters : (n_p,) array
+        Values of the parameters.
+    state_names : tuple of str
+        Names of the state X = (q, γ', ..., γ^(s̄-1)).
+    jet_names : tuple of str
+        Names of the jets Z = (X, γ^(s̄)).
+    """
+
+    def __init__(self, reduction, values=None, knots=None, shared=None):
+        q = reduction.mechanism.q
+        self.reduction = reduction
+        self.parameters = reduction.mechanism.parameters.values() if values is None else values
+        self._knots = reduction.knots if knots is None else knots
+        self.state_names = tuple(name for k in range(reduction.top) for name in q.jet_names(k))
+        self.jet_names = (*self.state_names, *q.jet_names(reduction.top))
+        self._functions = {} if shared is None else shared
+
+    def with_parameters(self, **changes):
+        """The same model with other numbers; nothing is derived or compiled again.
+
+        Raises
+        ------
+        NameUnknown
+            For a name that is no parameter.
+        SpecificationError
+            For a value that is no finite number, or a path that is not smooth enough with it.
+        """
+        r = self.reduction
+        current = dict(zip(r.mechanism.parameters.names, self.parameters.tolist(), strict=True))
+        for name in changes:
+            if name not in current:
+                raise unknown(name, list(current), "parameter")
+        values = r.mechanism.parameters.values({**current, **changes})
+        return Model(r, values, require_smooth(r.switches, values, r.needs), self._functions)
+
+    def near(self, t, jets):
+        """The same motion with pivots chosen for a state; decisions are made again from the specification.
+
+        Parameters
+        ----------
+        t : float
+            [s]
+        jets : (n_z,) array
+
+        Returns
+        -------
+        Model
+        """
+        guess = dict(zip(self.jet_names, map(float, jets), strict=True))
+        r = reduce(self.reduction.mechanism, self.reduction.program, near=(float(t), guess, self.parameters))
+        if [row.order for row in r.rows] != [row.order for row in self.reduction.rows] and r.free != self.free:
+            raise SpecificationError(
+                f"Near t = {t:.6g} s the program has {r.free} free initial values, elsewhere {self.free}.",
+                "A motion keeps its number of free initial values.",
+                do="Treat the two regimes as two models.",
+            )
+        return Model(r, self.parameters, self._knots)
+
+    @property
+    def free(self):
+        """The number of free initial values, Σ o_a: the dimension of the internal dynamics."""
+        return self.reduction.free
+
+    @property
+    def flat(self):
+        """Whether the program determines the motion completely: nothing is left to integrate."""
+        return self.free == 0
+
+    @property
+    def n(self):
+        """The number of quasi-velocities."""
+        return self.reduction.mechanism.q.n
+
+    @property
+    def nq(self):
+        """The number of coordinates."""
+        return self.reduction.mechanism.q.nq
+
+    @property
+    def coordinate_names(self):
+        """Names of the coordinates."""
+        return self.reduction.mechanism.q.names
+
+    @property
+    def actuators(self):
+        """Names of the mechanism's actuators."""
+        return self.reduction.mechanism.actuators
+
+    @property
+    def ideal(self):
+        """Whether an ideal reaction realises the program, and not the actuators."""
+        return self.reduction.program.by == "ideal"
+
+    @property
+    def outputs(self):
+        """Names of the mechanism's outputs."""
+        return tuple(self.reduction.mechanism.outputs)
+
+    @property
+    def residual_names(self):
+        """Names of the rows whose residuals a run reports."""
+        return tuple(self._equations.residual_rows)
+
+    @property
+    def knots(self):
+        """Instants [s] at which paths switch between smooth pieces."""
+        return self._knots.times
+
+    def require_smooth(self, span):
+        """Refuse a path that is not smooth enough within a time span, and return its knots there.
+
+        Raises
+        ------
+        SpecificationError
+        """
+        r = self.reduction
+        return require_smooth(r.switches, self.parameters, r.needs, span).times if r.switches else ()
+
+    @property
+    def raised(self):
+        """How often each row is differentiated to the common order s̄: {row name: ρ}."""
+        return {row.name: self.reduction.top - row.order for row in self.reduction.rows}
+
+    @cached_property
+    def _equations(self):
+        shared = self._functions
+        if "equations" not in shared:
+            shared["equations"] = Equations(self.reduction)
+        return shared["equations"]
+
+    def function(self, name):
+        """One of the model's compiled functions of (t, x, p), built at first use.
+
+        Parameters
+        ----------
+        name : {"ode", "ode_poles", "path", "invariants", "metric", "matrices", "plant", "multiplier_form"}
+
+        Returns
+        -------
+        Compiled
+        """
+        if name not in self._functions:
+            build = {
+                "ode": lambda e: (e.ode(), ("rk4",)),
+                "ode_poles": lambda e: (e.ode(poles=True), ("rk4",)),
+                "path": lambda e: (e.path(), ("newton",)),
+                "invariants": lambda e: (e.invariants(), ()),
+                "metric": lambda e: (e.metric(), ()),
+                "matrices": lambda e: (e.matrices(), ()),
+                "plant": lambda e: (e.plant(), ()),
+                "multiplier_form": lambda e: (e.multiplier_form(), ()),
+            }
+            if name not in build:
+                raise unknown(name, list(build), "function")
+            f, loops = build[name](self._equations)
+            self._functions[name] = compiled(f, name, loops)
+        return self._functions[name]
+
+    def signals(self, kind):
+        """Names of a group of signals and the compiled function (t, Z, p) that computes them.
+
+        Parameters
+        ----------
+        kind : str
+            One of `SIGNALS`.
+        """
+        key = f"signals {kind}"
+        if key not in self._functions:
+            names, f = self._equations.signals(kind)
+            self._functions[key] = (names, compiled(f, kind))
+        return self._functions[key]
+
+    @cached_property
+    def signal_groups(self):
+        """Names of all signals beside the jets, each with the group that computes it."""
+        mechanism, program = self.reduction.mechanism, self.reduction.program
+        names = mechanism.q.names if mechanism.q.plain else mechanism.q.velocity_names
+        groups = dict.fromkeys(mechanism.outputs, "outputs") | {"energy": "energy"}
+        if program.by == "actuators":
+            groups = dict.fromkeys(mechanism.actuators, "actuation") | groups
+        else:
+            groups |= dict.fromkeys((f"reaction_{name}" for name in names), "reaction")
+            groups |= dict.fromkeys((f"multiplier_{name}" for name in program.residuals), "multipliers")
+        groups |= dict.fromkeys((f"multiplier_{name}" for name in mechanism.constraints), "multipliers")
+        if not mechanism.q.plain:
+            groups |= dict.fromkeys((f"{d}{name}" for d in ("d", "d2") for name in mechanism.q.names), "coordinate_rates")
+        return groups
+
+    def invariant_names(self):
+        """(level, name) of each invariant of the state, in the order of the function "invariants"."""
+        return [(level, name) for level, name, _ in self._equations.invariant_rows]
+
+    def pole_rows(self):
+        """(row name, number of coefficients) of the error dynamics, in the order of the pole inputs."""
+        e = self._equations
+        return [(row.name, count) for row, count in zip(self.reduction.rows, e.raised, strict=True)]
+
+    def multiplier_form(self, t, jets):
+        """[M -B; C 0] and right sides of the form with multipliers: (rows, columns, N) and (rows, N) arrays."""
+        y = self.function("multiplier_form").grid(t, jets, self.parameters)
+        columns = self.n + self.reduction.realisation.B.shape[1]
+        rows = len(y) // (columns + 1)
+        return y[rows:].reshape(columns, rows, -1).swapaxes(0, 1), y[:rows]
+
+    def guard_names(self):
+        """Names of the pivots logged by "ode" and "path"."""
+        return [name for name, _ in self._equations.guards]
+
+    def guard_sizes(self):
+        """Largest size of each pivot at the points where they were chosen, (n_g,) array."""
+        values, _ = self.reduction.points.evaluate([g for _, g in self._equations.guards])
+        return np.abs(values).max(axis=1, initial=0.0).astype(float)
+
+    def leading_names(self):
+        """Names of the rows of the two matrices whose ranks carry the motion."""
+        return leading_names(self.reduction)
+
+    def gradient_jets(self, row):
+        """Names of the jets on which a row's leading gradient depends."""
+        return gradient_jets(self.reduction, row)
+
+    def operations(self):
+        """Operations of each function that has been built so far, by name."""
+        found = {name: f for name, f in self._functions.items() if hasattr(f, "operations")}
+        found |= {f.name: f for key, (_, f) in self._signal_functions()}
+        return {name: f.operations for name, f in found.items()}
+
+    def _signal_functions(self):
+        return [(key, value) for key, value in self._functions.items() if key.startswith("signals ")]
+
+    def start(self, t=0.0, guess=None, **held):
+        """A consistent state: held values fixed, the rest solved from every invariant at every level.
+
+        Parameters
+        ----------
+        t : float
+            Time of the start [s].
+        guess : dict of str to float, optional
+            Where free values come from, and where the solution is looked for; other values are as near zero as the
+            invariants allow.
+        **held : float
+            Values of coordinates and derivatives to be kept exactly.
+
+        Returns
+        -------
+        State
+
+        Raises
+        ------
+        NameUnknown
+            For a name that is no state.
+        InconsistentStart
+            If a held value contradicts an invariant, or no consistent state is found.
+        """
+        from servoctl.model.start import consistent
+
+        return consistent(self, float(t), held, guess or {})
+
+    def structure(self, t=None, jets=None):
+        """Index, relative degrees, zeros at infinity and essential orders (see `reduction.structure`).
+
+        Parameters
+        ----------
+        t : (N,) array, optional
+            Times [s] along a motion; by default at seeded points of the manifold.
+        jets : (n_z, N) array, optional
+
+        Returns
+        -------
+        Structure
+        """
+        if t is None:
+            if "structure" not in self._functions:
+                self._functions["structure"] = structure(self.reduction)
+            return self._functions["structure"]
+        return structure(self.reduction, np.atleast_1d(t), np.asarray(jets), self.parameters)
+
+    def __repr__(self):
+        from servoctl.model.report import describe
+
+        return describe(self)

@@ -1,0 +1,77 @@
+"""What was done to a specification, in at most twelve lines."""
+
+WIDTH = 118
+
+
+def describe(model):
+    """The report that `print(model)` shows.
+
+    Parameters
+    ----------
+    model : Model
+
+    Returns
+    -------
+    str
+        At most twelve lines.
+    """
+    r = model.reduction
+    lines = [
+        f"Model: {' '.join(r.mechanism.q.names)}; program {', '.join(r.program.residuals)} by {_by(r)}",
+        f"  {_raised(r)}",
+        f"  {_hidden(r)}; {model.free} free initial value{'s' * (model.free != 1)}"
+        + (" (flat: nothing is integrated)" if model.flat else ""),
+        f"  {_rule(r)}",
+    ]
+    structure = model.structure()
+    if structure.index is not None:
+        zeros = ", ".join(map(str, structure.zeros_at_infinity))
+        lines.append(f"  index {structure.index}; zeros at infinity of order {zeros}; {structure.realisation} realisation")
+    if any(not row.affine for row in r.rows):
+        bent = ", ".join(row.name for row in r.rows if not row.affine)
+        lines.append(f"  {bent}: not linear in the highest derivative, differentiated once more")
+    lines.append(f"  margins: smallest pivot kept {r.rank.kept:.1e}, largest dropped {r.rank.dropped:.1e}")
+    if model.knots:
+        lines.append(f"  paths switch at t = {', '.join(f'{k:g}' for k in model.knots[:8])} s")
+    lines.append(f"  {_functions(model)}")
+    return "\n".join(line if len(line) <= WIDTH else line[: WIDTH - 3] + "..." for line in lines)
+
+
+def _by(r):
+    return "an ideal reaction" if r.program.by == "ideal" else f"actuators {', '.join(r.mechanism.actuators)}"
+
+
+def _raised(r):
+    """How often the residuals are differentiated until the accelerations appear: 'X, Z differentiated 2x each'."""
+    groups = {}
+    for name, row in r.given.items():
+        groups.setdefault((max(0, r.top - row.order), row.order), []).append(name)
+    parts = []
+    for (count, order), names in groups.items():
+        times = f"differentiated {count}x" + (" each" if len(names) > 1 else "") if count else "not differentiated"
+        parts.append(f"{', '.join(names)} (order {order}) {times}")
+    return "; ".join(parts)
+
+
+def _hidden(r):
+    if not r.hidden:
+        return "no hidden constraint"
+    stories = "; ".join(row.story for row in r.hidden)
+    return f"{len(r.hidden)} hidden constraint{'s' * (len(r.hidden) != 1)} ({stories})"
+
+
+def _rule(r):
+    names = r.mechanism.q.names if r.mechanism.q.plain else r.mechanism.q.velocity_names
+    dependent = ", ".join(names[i] for i in r.realisation.dependent) or "none"
+    if r.program.by == "actuators":
+        return f"(3.18) with T from ker Eᵀ; dependent: {dependent}; the actuators decide, no rule for the reaction is assumed"
+    bent = any(row.order >= 2 or (row.order == 1 and not row.affine) for row in r.given.values() if row.kind == "program")
+    rule = "the generalised Chetaev rule, a postulate at this order" if bent else "d'Alembert's principle"
+    return f"(3.18) with T from ker G; dependent: {dependent}; under {rule}"
+
+
+def _functions(model):
+    built = model.operations()
+    if not built:
+        return "operations: no function built yet"
+    return "operations: " + ", ".join(f"{name} {count}" for name, count in built.items())

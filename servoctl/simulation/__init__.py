@@ -1,0 +1,1 @@
+"""Motions of a model: integrators, drift, runs and their proofs."""

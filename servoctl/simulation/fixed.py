@@ -1,0 +1,147 @@
+"""The compiled fixed-step Runge-Kutta method of order 4."""
+
+import numpy as np
+
+from servoctl.errors import IntegrationStopped
+from servoctl.simulation.drift import Poles, Project, Projector
+from servoctl.simulation.motion import Motion, breakpoints, interruptible
+from servoctl.simulation.watch import DEGRADED, NEGLIGIBLE, Watch
+
+CHUNK = 2000  # steps per call of the compiled loop
+
+
+def fixed_step(model, drift, t0, x0, t1, step, knots, progress):
+    """Integrate with steps of at most `step`, ending at every knot.
+
+    Parameters
+    ----------
+    model : Model
+    drift : None, Poles or Project
+    t0, t1, step : float
+        [s]
+    x0 : (n_x,) array
+    knots : sequence of float
+    progress : callable
+
+    Returns
+    -------
+    Motion
+        Every step is a sample.
+    """
+    motion = Motion()
+    with interruptible(motion):
+        integration = _Fixed(model, drift, motion, progress)
+        integration.watch = Watch(model, t0, x0)
+        integration.start(t0, x0)
+        cuts = breakpoints((t0, t1), knots)
+        x = x0
+        for a, b in zip(cuts[:-1], cuts[1:], strict=True):
+            count = max(1, int(np.ceil(abs(b - a) / step * (1 - 1e-12))))
+            x = integration.piece(a, x, (b - a) / count, count)
+            if motion.stop is not None:
+                break
+    return motion
+
+
+class _Fixed:
+    def __init__(self, model, drift, motion, progress):
+        self.drift, self.motion, self.progress = drift, motion, progress
+        self._use(model)
+
+    def _use(self, model):
+        self.model = model
+        stabilised = isinstance(self.drift, Poles)
+        self.f = model.function("ode_poles" if stabilised else "ode")
+        self.p = np.append(model.parameters, self.drift.coefficients(model)) if stabilised else model.parameters
+        self.projector = Projector(model) if isinstance(self.drift, Project) else None
+
+    def start(self, t, x):
+        if self.watch.bad_choice(self.f(t, x, self.p), self.f.n_x):
+            self._repivot(t, x)
+
+    def _repivot(self, t, x):
+        top = np.nan_to_num(self.f(t, x, self.p)[self.f.n_x - self.model.n : self.f.n_x])
+        self._use(self.model.near(t, np.append(x, top)))
+        self.watch = Watch(self.model, t, x)
+        self.motion.count(pivot_changes=1)
+
+    def piece(self, a, x, h, count):
+        """`count` steps of h from t = a; returns the last state."""
+        n_x, n, done = self.f.n_x, self.model.n, 0
+        chunk = CHUNK if self.projector is None else self.drift.every
+        last = None
+        while done < count:
+            steps = min(chunk, count - done)
+            t, states, guards = self.f.rk4(a + done * h, x, h, steps, self.p)
+            t = a + (done + np.arange(states.shape[1])) * h
+            good, why, repivot = self._check(t, states, guards, last)
+            short = good < steps
+            states, t = states[:, : good + 1], t[: good + 1]
+            if self.projector is not None and good:
+                states[:, -1] = self.projector(t[-1], states[:, -1])
+                self.motion.count(projections=1)
+            top = self.f.grid(t, states, self.p)[n_x - n : n_x]
+            self.motion.add(self.model, t, states, top)
+            self.motion.count(steps=good, nfev=4 * good)
+            last = guards[:, : good + 1][:, -3:]
+            x, done = states[:, -1].copy(), done + good
+            self.progress(t[-1])
+            if repivot:
+                self._repivot(t[-1], x)
+                last = None
+            elif short:
+                self._stop(t[-1], x, h, why)
+                break
+        return x
+
+    def _check(self, t, states, guards, before):
+        """How many steps stand, why no more, and whether pivots must be chosen anew there."""
+        total = states.shape[1] - 1
+        track = guards if before is None else np.concatenate([before[:, :-1], guards], axis=1)
+        offset = track.shape[1] - guards.shape[1]
+        if not guards.shape[0]:
+            return total, "", False
+        relative = self.watch.relative(track)
+        events = []
+        for i in range(len(relative)):
+            r = relative[i]
+            events += [(k, "a pivot changes its sign") for k in np.flatnonzero(np.sign(r[:-1]) * np.sign(r[1:]) < 0)]
+            size = np.abs(r)
+            inner = np.flatnonzero((size[1:-1] < size[:-2]) & (size[1:-1] <= size[2:]) & (size[1:-1] < DEGRADED)) + 1
+            events += [(k, "a pivot bounces off zero") for k in inner if self._bounces(size[k], t, states, k - offset)]
+            events += [(k, "a pivot has vanished") for k in np.flatnonzero(size < NEGLIGIBLE)]
+            weak = np.flatnonzero(size[offset:] < DEGRADED)[:1]
+            for k in weak:
+                if self.watch.chart_only(size[k + offset], t[k], states[:, k]):
+                    events.append((k + offset, "repivot"))
+        events = [(max(k - offset, 0), why) for k, why in events]
+        if not events:
+            return total, "", False
+        k, why = min(events)
+        if why == "repivot":
+            return k, "", k > 0 or before is not None
+        if self._measure(t, states, k) > DEGRADED and self._measure(t, states, k + 1) > DEGRADED:
+            return k, "", True
+        return k, why, False
+
+    def _bounces(self, size, t, states, k):
+        k = max(k, 0)
+        return size < self.watch.bounce(t[k], states[:, k])
+
+    def _measure(self, t, states, k):
+        k = min(k, len(t) - 1)
+        return self.watch.rank_measure(t[k], states[:, k])
+
+    def _stop(self, t, x, h, why):
+        if why:
+            self.motion.stop = self.watch.singular(t, x, why)
+        elif self.watch.rank_measure(t, x) < 0.1:
+            self.motion.stop = self.watch.singular(t, x, "the state is no longer finite")
+        else:
+            self.motion.stop = IntegrationStopped(
+                f"RK4 with steps of {abs(h):.3g} s has no finite state after t = {t:.7g} s.",
+                "Explicit methods are stable for steps below about 2.8 over the largest eigenvalue.",
+                nearest=f"The motion before t = {t:.6g} s, which is kept.",
+                do="Take a smaller step, slower poles, or an adaptive method.",
+                t=float(t),
+            )

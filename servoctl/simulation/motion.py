@@ -1,0 +1,102 @@
+"""What every integrator shares: pieces of a motion, progress, and where a pivot vanishes."""
+
+import contextlib
+import sys
+import time
+from dataclasses import dataclass, field
+
+import numpy as np
+
+PATIENCE = 1.0  # s before a progress bar appears
+
+
+@dataclass
+class Motion:
+    """A motion while it is being computed: samples of the state, and the model variant that holds in each piece."""
+
+    counters: dict = field(default_factory=dict)
+    pieces: list = field(default_factory=list)
+    stop: object = None
+    interrupted: bool = False
+
+    def add(self, model, t, x, top):
+        """Append samples t (N,), X (n_x, N) and γ^(s̄) (n, N) computed with one variant of the model."""
+        if len(t):
+            self.pieces.append((model, np.asarray(t), np.asarray(x), np.asarray(top)))
+
+    def count(self, **numbers):
+        """Add to counters."""
+        for name, number in numbers.items():
+            self.counters[name] = self.counters.get(name, 0) + int(number)
+
+    def samples(self):
+        """All samples, an instant that two pieces share once.
+
+        Returns
+        -------
+        t : (N,) array
+        z : (n_z, N) array
+        variants : list of (first, last + 1, model)
+            Which variant of the model holds for which samples.
+        """
+        t = np.concatenate([piece[1] for piece in self.pieces])
+        z = np.concatenate([np.vstack([piece[2], piece[3]]) for piece in self.pieces], axis=1)
+        keep = np.append(True, np.diff(t) != 0)
+        owner = np.repeat(np.arange(len(self.pieces)), [len(piece[1]) for piece in self.pieces])[keep]
+        variants = []
+        for i, number in enumerate(owner):
+            model = self.pieces[number][0]
+            if variants and variants[-1][2] is model:
+                variants[-1] = (variants[-1][0], i + 1, model)
+            else:
+                variants.append((i, i + 1, model))
+        return t[keep], z[:, keep], variants
+
+
+class Progress:
+    """A progress bar over time that appears when the work takes long; `wanted` None means: on a terminal."""
+
+    def __init__(self, span, wanted):
+        self.t0, self.total = span[0], abs(span[1] - span[0])
+        self.wanted = sys.stderr.isatty() if wanted is None else wanted
+        self.since, self.bar, self.done = time.monotonic(), None, 0.0
+
+    def __call__(self, t):
+        if not self.wanted:
+            return
+        if self.bar is None:
+            if time.monotonic() - self.since < PATIENCE:
+                return
+            from tqdm import tqdm
+
+            self.bar = tqdm(total=self.total, unit="s", desc="simulate", bar_format="{l_bar}{bar}| {n:.3g}/{total:.3g} s")
+        self.bar.update(abs(t - self.t0) - self.done)
+        self.done = abs(t - self.t0)
+
+    def close(self):
+        """Remove the bar."""
+        if self.bar is not None:
+            self.bar.close()
+
+
+@contextlib.contextmanager
+def interruptible(motion):
+    """Ctrl-C ends the work and keeps what was computed."""
+    try:
+        yield
+    except KeyboardInterrupt:
+        motion.interrupted = True
+
+
+def breakpoints(span, knots):
+    """The span cut at the knots inside it, in the direction of integration."""
+    t0, t1 = span
+    low, high = min(span), max(span)
+    margin = 1e-12 * max(1.0, abs(low), abs(high))
+    inside = [k for k in knots if low + margin < k < high - margin]
+    return [t0, *(inside if t1 >= t0 else reversed(inside)), t1]
+
+
+def sign_change(before, after):
+    """Indices of guards that change their sign between two samples."""
+    return np.flatnonzero(np.sign(before) * np.sign(after) < 0)

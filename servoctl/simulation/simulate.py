@@ -1,0 +1,206 @@
+"""From a model and a start to a run."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from servoctl.errors import SpecificationError, unknown
+from servoctl.simulation.adaptive import METHODS, ONE_STEP, Adaptive
+from servoctl.simulation.algebraic import algebraic
+from servoctl.simulation.drift import Project, as_drift
+from servoctl.simulation.fixed import fixed_step
+from servoctl.simulation.motion import Progress
+from servoctl.simulation.run import Run
+
+SAMPLES = 1001  # of a run unless t_eval says otherwise: smooth curves, and extrema refined to rounding
+ALL_METHODS = ("algebraic", "RK4", *METHODS)
+
+
+def simulate(
+    model, start, t_span, method=None, *, drift=None, rtol=1e-9, atol=1e-11, step=None, t_eval=None, progress=None
+):
+    """Simulate the motion that a program prescribes.
+
+    Main arguments
+
+    Parameters
+    ----------
+    model : Model
+    start : State or (n_x,) array
+        From `model.start`.
+    t_span : (t0, t1)
+        [s]; t1 < t0 runs backwards.
+    method : {"algebraic", "RK4", "DOP853", "RK45", "RK23", "Radau", "BDF", "LSODA"}, optional
+        Default: "algebraic" where the program determines the motion completely (Σ o_a = 0: a Newton solve at each
+        instant, no integration), else "DOP853". "RK4" is the compiled fixed-step method.
+    drift : None, "project", float, `project(...)` or `poles(...)`, optional
+        Treatment of constraint drift; a number is the time constant of the error dynamics [s].
+
+    Other arguments
+
+    rtol, atol : float
+        Tolerances of adaptive methods. The defaults keep residuals near 1e-9 over tens of seconds.
+    step : float, optional
+        Step of "RK4" [s]; default (t1 - t0)/2000, shortened so that steps end at the knots of paths.
+    t_eval : (N,) array, optional
+        Times of the samples [s], within t_span. Default: 1001 equal intervals and the knots (all steps for "RK4").
+    progress : bool, optional
+        Show a progress bar; default: on a terminal, for work of more than a second.
+
+    Returns
+    -------
+    Run
+        Ctrl-C returns what was computed, with `success` False.
+
+    Raises
+    ------
+    SingularProgram, IntegrationStopped
+        Where the motion ends; `.run` holds what was computed.
+    SpecificationError
+        For arguments that do not go together, or a path that is not smooth enough.
+    """
+    t0, t1 = _span(t_span)
+    method = _method(model, method)
+    drift = _drift(drift, method)
+    _refuse_idle(method, step)
+    x0 = _state(model, start, t0)
+    knots = model.require_smooth((min(t0, t1), max(t0, t1)))
+    times = _times(t0, t1, t_eval, knots)
+    bar = Progress((t0, t1), progress)
+    try:
+        if method == "algebraic":
+            motion = algebraic(model, t0, x0, times, bar)
+        elif method == "RK4":
+            motion = fixed_step(model, drift, t0, x0, t1, _step(step, t0, t1), knots, bar)
+        else:
+            motion = Adaptive(model, method, drift, rtol, atol, bar).run(t0, x0, t1, times, knots)
+    finally:
+        bar.close()
+    return _finish(model, motion, method, drift, knots, (t0, x0, t1), None if t_eval is None else times)
+
+
+def _finish(model, motion, method, drift, knots, span, wanted):
+    if not motion.pieces:
+        motion.add(model, [span[0]], span[1][:, None], np.full((model.n, 1), np.nan))
+    t, jets, variants = motion.samples()
+    last = f"t = {t[-1]:.7g} s"
+    if motion.stop is not None:
+        status, message = -1, f"stopped: {str(motion.stop).split('. ')[0]}"
+    elif motion.interrupted:
+        status, message = 1, f"interrupted at {last} of {span[2]:g} s; what was computed is kept"
+    else:
+        status, message = 0, "finished"
+    run = Run(
+        t, jets, model.jet_names, model, method, str(drift or ""), motion.counters, status == 0, status, message, knots,
+        tuple(variants),
+    )  # fmt: skip
+    if wanted is not None and method == "RK4":
+        run = _resample(run, wanted)
+    if motion.stop is not None:
+        motion.stop.run = run
+        raise motion.stop
+    return run
+
+
+def _resample(run, times):
+    low, high = min(run.t[0], run.t[-1]), max(run.t[0], run.t[-1])
+    times = times[(times >= low) & (times <= high)]
+    owner = [run.variant(int(np.argmin(np.abs(run.t - t)))) for t in times]
+    variants = tuple((i, i + 1, model) for i, model in enumerate(owner)) if len(run.variants) > 1 else run.variants[:1]
+    variants = tuple((0, len(times), v[2]) for v in variants) if len(variants) == 1 else variants
+    return replace(run, t=times, jets=np.array([run.at(t) for t in times]).T, variants=variants)
+
+
+def _span(t_span):
+    try:
+        t0, t1 = map(float, t_span)
+    except (TypeError, ValueError):
+        t0 = t1 = np.nan
+    if not (np.isfinite(t0) and np.isfinite(t1)) or t0 == t1:
+        raise SpecificationError(
+            f"t_span={t_span!r} was given.", "A span is two different finite times.", do="Give (0.0, 2.0)."
+        )
+    return t0, t1
+
+
+def _method(model, method):
+    if method is None:
+        return "algebraic" if model.flat else "DOP853"
+    if method not in ALL_METHODS:
+        raise unknown(method, ALL_METHODS, "method")
+    if method == "algebraic" and not model.flat:
+        raise SpecificationError(
+            "method='algebraic' was given.",
+            f"The program leaves {model.free} initial values free: an internal dynamics remains to be integrated.",
+            nearest="'DOP853'.",
+            do="Leave the method out.",
+            free=model.free,
+        )
+    return method
+
+
+def _drift(drift, method):
+    drift = as_drift(drift)
+    if drift is not None and method == "algebraic":
+        raise SpecificationError(
+            f"drift={drift} was given with method='algebraic'.",
+            "Where every instant is solved for itself nothing drifts.",
+            nearest="drift=None, or an integrating method such as 'DOP853'.",
+            do="Leave one of them out.",
+        )
+    if isinstance(drift, Project) and method in METHODS and method not in ONE_STEP:
+        raise SpecificationError(
+            f"drift={drift} was given with method={method!r}.",
+            "A multistep method carries past states, which projection would contradict.",
+            nearest=f"One of {', '.join(('RK4', *ONE_STEP))}, or poles.",
+            do="Change one of them.",
+        )
+    return drift
+
+
+def _refuse_idle(method, step):
+    if step is not None and method != "RK4":
+        raise SpecificationError(
+            f"step={step!r} was given with method={method!r}.",
+            "Only the fixed-step method has a step.",
+            nearest="rtol and atol, or method='RK4'.",
+            do="Leave step out.",
+        )
+
+
+def _state(model, start, t0):
+    values = np.asarray(getattr(start, "values", start), dtype=float)
+    if values.shape != (len(model.state_names),) or not np.all(np.isfinite(values)):
+        raise SpecificationError(
+            f"The start has the shape {values.shape}.",
+            f"A state of this model has {len(model.state_names)} finite entries: {', '.join(model.state_names)}.",
+            do="Make it by model.start(...).",
+        )
+    t = getattr(start, "t", t0)
+    if abs(t - t0) > 1e-12 * max(1.0, abs(t0)):
+        raise SpecificationError(
+            f"The start is consistent at t = {t:g} s, the span begins at {t0:g} s.",
+            "A start satisfies the constraints at the first instant.",
+            do=f"Use model.start(t={t0:g}, ...).",
+        )
+    return values
+
+
+def _times(t0, t1, t_eval, knots):
+    if t_eval is None:
+        times = np.union1d(np.linspace(t0, t1, SAMPLES), [k for k in knots if min(t0, t1) < k < max(t0, t1)])
+    else:
+        times = np.unique(np.asarray(t_eval, dtype=float))
+        if not times.size or times[0] < min(t0, t1) - 1e-12 or times[-1] > max(t0, t1) + 1e-12:
+            raise SpecificationError(
+                "t_eval lies outside t_span or is empty.", "Samples are taken within the span.", do="Extend t_span."
+            )
+    return times if t1 > t0 else times[::-1]
+
+
+def _step(step, t0, t1):
+    if step is None:
+        return abs(t1 - t0) / 2000
+    if not (isinstance(step, (int, float)) and np.isfinite(step) and step > 0):
+        raise SpecificationError(f"step={step!r} was given.", "A step is a positive number of seconds.", do="Give 1e-3.")
+    return float(step)

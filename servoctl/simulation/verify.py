@@ -1,0 +1,223 @@
+"""The proof: the full mechanism, under the required actuation, does what the reduced model says."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+ACCELERATION = 1e-9  # relative error of the mechanism's accelerations that passes
+SEGMENT = 1e-6  # relative error of the state after a restarted segment that passes
+POWER = 1e-8  # relative error of the power balance that passes
+RESIDUAL = 1e-6  # residual, relative to the size of the jets in its units, that passes
+ENERGY = 1e-5  # relative error of the energy against the power integrated over samples by splines that passes
+FORM = 1e-9  # relative disagreement of (3.18) with the multiplier form that passes
+
+
+@dataclass(frozen=True)
+class Verification:
+    """Errors of a run against the full mechanism; every number is relative unless its name says residual.
+
+    Attributes
+    ----------
+    numbers : dict of str to float
+        "acceleration": largest error of γ'' of the mechanism under the actuation, pointwise;
+        "segments": largest error of the state after restarted segments;
+        "power": largest error of dE/dt = Σ force·velocity; "energy": of its integral over the samples;
+        "multiplier form": largest disagreement of (3.18) with the form that has multipliers;
+        "outside": part of an ideal reaction that the mechanism's actuators cannot give;
+        "residual NAME": largest residual at any level.
+    failures : tuple of str
+        Numbers that exceed their limit.
+    notes : tuple of str
+        What could not be checked, and why.
+    """
+
+    numbers: dict
+    failures: tuple = ()
+    notes: tuple = ()
+    limits: dict = field(default_factory=dict)
+
+    @property
+    def passed(self):
+        """Whether every number is within its limit."""
+        return not self.failures
+
+    def __repr__(self):
+        residuals = {k: v for k, v in self.numbers.items() if k.startswith("residual ")}
+        worst = max(residuals, key=residuals.get, default=None)
+        words = {
+            "acceleration": "accelerations of the full mechanism under the actuation",
+            "segments": "states after restarted segments of the full mechanism",
+            "power": "power balance dE/dt = sum of force times velocity",
+            "energy": "energy against the integrated power",
+            "multiplier form": "(3.18) against the form with multipliers",
+            "outside": "part of the ideal reaction outside the actuators' reach",
+        }
+        lines = [f"Verification: {'passed' if self.passed else 'FAILED: ' + ', '.join(self.failures)}"]
+        lines += [f"  {words[key]}: {self.numbers[key]:.1e}" for key in words if key in self.numbers]
+        if worst:
+            lines.append(f"  largest residual at any level: {residuals[worst]:.1e} ({worst.removeprefix('residual ')})")
+        lines += [f"  {note}" for note in self.notes]
+        return "\n".join(lines[:12])
+
+
+def verify(model, run, segments=20):
+    """Check a run against the full mechanism, not the reduced model.
+
+    The mechanism's accelerations under the required actuation are compared with the run's at every sample; the
+    mechanism is integrated in segments restarted from the run, no longer than the fastest unstable time constant;
+    residuals are taken at every level; dE/dt is compared with the power of all forces; and (3.18) with the form
+    that has multipliers.
+
+    Parameters
+    ----------
+    model : Model
+    run : Run
+        Of this model.
+    segments : int
+        Number of restarted segments.
+
+    Returns
+    -------
+    Verification
+    """
+    plant = model.function("plant")
+    good = np.all(np.isfinite(run.jets), axis=0)
+    t, jets, p = run.t[good], run.jets[:, good], model.parameters
+    n, nq = model.n, model.nq
+    acceleration = jets[nq + n : nq + 2 * n]
+    u = run.signals("inputs")[1][:, good]
+    state = np.vstack([jets[: nq + n], u])
+    out = plant.grid(t, state, p)
+    scale = _scale(acceleration, out[nq : nq + n])
+    numbers = {"acceleration": float(np.max(np.abs(out[nq : nq + n] - acceleration).max(axis=0) / scale))}
+    notes = []
+    numbers["segments"] = _segments(model, run, np.flatnonzero(good), u, segments)
+    rate, work, size, law = run.signals("power")[1][:, good]
+    largest = max(np.abs(size).max(), np.abs(rate).max(), 1e-300)
+    if np.abs(law).max() < 1e-9 * largest:
+        numbers["power"] = float(np.abs(rate - work).max() / largest)
+        numbers["energy"] = _energy(run, good, work)
+    else:
+        notes.append("power balance: not applicable, the inertia terms depend on time or on more than wᵀMw/2")
+    numbers["multiplier form"] = _multiplier_form(model, run, good)
+    if model.ideal and model.actuators:
+        numbers["outside"] = _outside(model, run, good)
+    for name in run.residual:
+        numbers[f"residual {name}"] = _relative_residual(model, run, name, good)
+    limits = {"acceleration": ACCELERATION, "segments": SEGMENT, "power": POWER, "energy": ENERGY, "multiplier form": FORM}
+    limits |= {key: RESIDUAL for key in numbers if key.startswith("residual ")}
+    failures = tuple(key for key, limit in limits.items() if not numbers.get(key, 0.0) <= limit)
+    return Verification(numbers, failures, tuple(notes), limits)
+
+
+def _energy(run, good, work):
+    """Largest difference of the energy from its start and the integrated power, relative to the energy's range."""
+    from scipy.interpolate import CubicSpline
+
+    t, energy = run.t[good], run["energy"][good]
+    if len(t) < 4:
+        return 0.0
+    order = np.argsort(t)
+    gained = CubicSpline(t[order], work[order]).antiderivative()(t)
+    scale = max(np.ptp(energy), np.ptp(gained), 1e-3 * np.abs(energy).max(), 1e-12)
+    return float(np.abs((energy - energy[0]) - (gained - gained[0])).max() / scale)
+
+
+def _scale(a, b):
+    size = np.maximum(np.abs(a).max(axis=0), np.abs(b).max(axis=0))
+    return np.maximum(size, 1e-3 * size.max(initial=0.0) + 1e-300)
+
+
+def _relative_residual(model, run, name, good):
+    """Largest residual over levels, each level relative to the largest jet of its order (at least 1)."""
+    residual = np.abs(run.residual[name][:, good])
+    return float((residual / (1.0 + np.abs(run.jets[:, good]).max(axis=0))).max(initial=0.0))
+
+
+def _segments(model, run, good, u, count):
+    """Largest relative error of the mechanism's state after segments restarted from the run."""
+    from scipy.integrate import solve_ivp
+
+    n, nq, p, plant = model.n, model.nq, model.parameters, model.function("plant")
+    t, states = run.t[good], run.jets[: nq + n, good]
+    if len(t) < 3:
+        return 0.0
+    size = np.abs(states).max(axis=1) + 1e-3 * np.abs(states).max() + 1e-12
+    worst = 0.0
+    for i in np.unique(np.linspace(0, len(t) - 2, count).astype(int)):
+        stop = _segment_end(model, run, good, i, u[:, i])
+        inputs = run.variant(good[i]).signals("inputs")[1]
+
+        def rates(s, x, inputs=inputs):
+            return plant(s, np.concatenate([x, inputs(s, run.at(s), p)]), p)[: nq + n]
+
+        found = solve_ivp(rates, (t[i], t[stop]), states[:, i], method="DOP853", rtol=1e-11, atol=1e-13 * size)
+        worst = max(worst, float(np.max(np.abs(found.y[:, -1] - states[:, stop]) / size)))
+    return worst
+
+
+def _segment_end(model, run, good, i, u):
+    """Up to five samples on, within the fastest unstable time constant, one variant and one piece of the paths."""
+    t = run.t[good]
+    x = run.jets[: model.nq + model.n, good[i]]
+    limit = 1.0 / max(_fastest_unstable(model, model.function("plant"), t[i], x, u), 1e-12)
+    stop = i + 1
+    while (
+        stop < min(len(t) - 1, i + 5)
+        and abs(t[stop + 1] - t[i]) <= limit
+        and run.variant(good[stop + 1]) is run.variant(good[i])
+        and not any(min(t[i], t[stop + 1]) < k < max(t[i], t[stop + 1]) for k in run.knots)
+    ):
+        stop += 1
+    return stop
+
+
+def _fastest_unstable(model, plant, t, x, u):
+    """The largest real part of the mechanism's linearised open-loop eigenvalues, by central differences."""
+    m, step = len(x), 1e-6 * (1.0 + np.abs(x))
+    columns = []
+    for i in range(m):
+        shift = np.zeros(m)
+        shift[i] = step[i]
+        ends = [plant(t, np.concatenate([x + sign * shift, u]), model.parameters)[:m] for sign in (1.0, -1.0)]
+        columns.append((ends[0] - ends[1]) / (2 * step[i]))
+    matrix = np.array(columns).T
+    return float(np.linalg.eigvals(matrix).real.max()) if np.all(np.isfinite(matrix)) else np.inf
+
+
+def _multiplier_form(model, run, good):
+    """How far (γ'', μ) are from solving [M -B; C 0] [γ''; μ] = ..., and from its solution where that is unique.
+
+    Hidden rows make the matrix singular: then the equations must hold, and nothing is solved.
+    """
+    n, nq, worst = model.n, model.nq, 0.0
+    multipliers = run.signals("all_multipliers")[1]
+    accelerations = run.jets[nq + n : nq + 2 * n]
+    size = np.abs(accelerations[:, good]).max()
+    for first, end, variant in run.variants or ((0, len(run.t), model),):
+        matrices, rights = variant.multiplier_form(run.t[first:end], run.jets[:, first:end])
+        for k in np.flatnonzero(good[first:end]):
+            given = np.concatenate([accelerations[:, first + k], multipliers[:, first + k]])
+            a, b = matrices[..., k], rights[:, k]
+            terms = np.abs(a) @ np.abs(given) + np.abs(b)
+            worst = max(worst, float(np.max(np.abs(a @ given - b) / np.where(terms > 0, terms, 1.0))))
+            if not model.reduction.hidden and a.shape[0] == a.shape[1]:
+                rows = np.maximum(np.abs(a).max(axis=1), 1e-300)[:, None]
+                columns = np.maximum(np.abs(a / rows).max(axis=0), 1e-300)
+                solution = np.linalg.solve(a / rows / columns, b / rows[:, 0]) / columns
+                scale = max(np.abs(given[:n]).max(), 1e-3 * size, 1e-300)
+                worst = max(worst, float(np.abs(solution[:n] - given[:n]).max() / scale))
+    return worst
+
+
+def _outside(model, run, good):
+    """Largest part of the ideal reaction outside the actuators' directions, relative to the reaction."""
+    values = run.signals("reach")[1][:, good]
+    n, m = model.n, (len(values) - model.n) // model.n
+    worst = 0.0
+    largest = max(np.abs(values[:n]).max(), 1e-300)
+    for k in range(values.shape[1]):
+        reaction, E = values[:n, k], values[n:, k].reshape(m, n).T
+        outside = reaction - E @ np.linalg.lstsq(E, reaction, rcond=None)[0]
+        worst = max(worst, float(np.abs(outside).max()) / largest)
+    return worst

@@ -1,0 +1,51 @@
+"""Models that are derived once for all tests, and numbers from expressions."""
+
+import casadi as ca
+import numpy as np
+import pytest
+
+from servoctl.mechanisms import gallery
+from servoctl.model.model import derive
+
+
+@pytest.fixture(scope="session")
+def gallery_model():
+    """A function from a gallery name to its model, derived at the first call."""
+    models = {}
+
+    def model(name):
+        if name not in models:
+            models[name] = derive(*gallery[name].build())
+        return models[name]
+
+    return model
+
+
+def numbers(expressions, values):
+    """Values (n,) of SX expressions for a dict from symbol names to numbers."""
+    expressions = ca.densify(ca.vertcat(*expressions))
+    symbols = ca.symvar(expressions)
+    return np.array(ca.Function("f", symbols, [expressions]).call([values[s.name()] for s in symbols])[0]).ravel()
+
+
+def at_random(q, parameters=None, seed=0, low=0.3, high=1.2, level=4):
+    """Numbers by name for t, the jets up to a level and the parameters."""
+    names = ["t", *(name for k in range(level + 1) for name in q.jet_names(k))]
+    values = dict(zip(names, np.random.default_rng(seed).uniform(low, high, len(names)), strict=True))
+    return values | ({} if parameters is None else parameters.defaults)
+
+
+def motion(model, t=0.0, guess=None, **held):
+    """A consistent state at t with its next derivatives: the jets Z, (n_z,)."""
+    state = model.start(t, guess=guess, **held)
+    if model.flat and model.reduction.top == 2:
+        y = model.function("path")(t, state.values[: model.nq], model.parameters)
+        return np.concatenate([state.values, y[model.nq + model.nq + model.n :][: model.n]])
+    rates = model.function("ode")(t, state.values, model.parameters)
+    return np.concatenate([state.values, rates[len(state.values) - model.n : len(state.values)]])
+
+
+def signal(model, kind, t, jets):
+    """A group of signals by name at one instant."""
+    names, function = model.signals(kind)
+    return dict(zip(names, function(t, jets, model.parameters), strict=True))

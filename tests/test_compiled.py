@@ -1,0 +1,364 @@
+"""Compiled functions: emitted C against CasADi's evaluation, loops against numpy and closed forms."""
+
+import copy
+import ctypes
+import itertools
+import pickle
+import threading
+
+import casadi as ca
+import numpy as np
+import pytest
+
+from servoctl.errors import NameUnknown, SpecificationError
+from servoctl.model import compiler, emit
+from servoctl.model.compiled import GRID_POINTS, compiled
+
+T, X2, P1 = ca.SX.sym("t"), ca.SX.sym("x", 2), ca.SX.sym("p", 1)
+BACKENDS = ("c", "casadi")
+
+
+@pytest.fixture(scope="module")
+def cache(tmp_path_factory):
+    return tmp_path_factory.mktemp("cache")
+
+
+@pytest.fixture(autouse=True)
+def own_cache(cache, monkeypatch):
+    """A cache of this module's own: its tests share compiled libraries among themselves only."""
+    monkeypatch.setenv("SERVOCTL_CACHE", str(cache))
+
+
+@pytest.fixture(params=BACKENDS)
+def backend(request, monkeypatch):
+    if request.param == "casadi":
+        monkeypatch.setenv("SERVOCTL_COMPILER", "none")
+        monkeypatch.setattr(compiler, "_warned", True)
+    return request.param
+
+
+def function(*outputs, x=X2, p=P1):
+    return ca.Function("f", [T, x, p], [ca.vertcat(*outputs)])
+
+
+def pendulum(loops=()):
+    return compiled(function(X2[1], -P1 * ca.sin(X2[0]) + ca.cos(T), X2[0] ** 2 + T), "pendulum", loops)
+
+
+def random_function(n):
+    """About n operations, values near 1, long and short lives."""
+    rng = np.random.default_rng(3)
+    values = [T, *ca.vertsplit(X2), P1]
+    while len(values) < n:
+        a, b = (values[max(0, len(values) - 1 - int(rng.exponential(life)))] for life in (40, 300))
+        values.append([a + 0.3 * b, a * b / (1 + a * a), ca.sin(a) - b, ca.cos(b) * a, ca.sqrt(1 + a * a) - b / 3,
+                       ca.tanh(a - b)][rng.integers(6)])
+    return function(*values[-20:], *values[4::400])
+
+
+# --- the emitted operations
+
+
+UNARY = ("neg sq twice inv sqrt exp log expm1 log1p sin cos tan asin acos atan sinh cosh tanh asinh acosh atanh fabs "
+         "floor ceil sign not erf erfinv").split()
+BINARY = ("add sub mul div pow fmin fmax fmod remainder atan2 copysign hypot lt le eq ne and or if_else_zero").split()
+CONSTANTS = (np.inf, -np.inf, np.nan, -3.25, 0.1, 1 / 3, 5e-324, -1.7976931348623157e308, 6.02214076e23)
+EDGES = (0.0, -0.0, 1.0, -1.0, 0.5, -0.5, 0.7, -0.7, 2.0, -2.0, 3.0, np.inf, -np.inf, np.nan, 1e-308, 5e-324, 1e308,
+         -1e308, 1e-8, 1 - 2**-53, 2**-53 - 1, 1 + 2**-52, 1e5, 700.0, -750.0)
+
+
+def test_every_operation_equals_casadi():
+    a, b = X2[0], X2[1]
+    expressions = [*(ca.SX.unary(getattr(ca, f"OP_{name.upper()}"), a) for name in UNARY),
+                   *(ca.SX.binary(getattr(ca, f"OP_{name.upper()}"), a, b) for name in BINARY),
+                   *(ca.SX.binary(ca.OP_CONSTPOW, a, c) for c in (2.5, -1.5, 0.5, 3, -2, 1 / 3)),
+                   *(a + c for c in CONSTANTS), *CONSTANTS, T, a, P1]
+    f = function(*expressions)
+    emitted = {f.instruction_id(k) for k in range(f.n_instructions())}
+    assert {getattr(ca, f"OP_{name.upper()}") for name in (*UNARY, *BINARY, "constpow")} <= emitted
+    rng = np.random.default_rng(0)
+    x = np.hstack([np.array(list(itertools.product(EDGES, EDGES))).T, rng.normal(size=(2, 1000)),
+                   1e3 * rng.normal(size=(2, 500)), rng.uniform(-1, 1, (2, 500))])
+    n = x.shape[1]
+    reference = np.asarray(f.map(n)(np.full((1, n), 2.5), x, np.full((1, n), 1.5)))
+    model = compiled(f, "operations")
+    y = model.grid(2.5, x, [1.5])
+    assert model.backend == "c"
+    for row, expected, expression in zip(y, reference, expressions, strict=True):
+        np.testing.assert_array_equal(np.isnan(row), np.isnan(expected), err_msg=str(expression))
+        np.testing.assert_array_max_ulp(row, expected, maxulp=2)
+
+
+def test_constants_are_exact():
+    model = compiled(function(*CONSTANTS), "constants")
+    y = model.grid(0.0, np.zeros((2, GRID_POINTS + 1)), [0.0])
+    assert model.backend == "c"
+    np.testing.assert_array_equal(y[:, -1], CONSTANTS)
+
+
+def test_chunks_equal_one_function_and_casadi_to_the_last_bit(monkeypatch):
+    monkeypatch.setenv("CC", "cc -ffp-contract=off")
+    f = random_function(2600)
+    assert emit.operations(f) > 5000
+    row = np.concatenate([[0.3, 0.5, -0.7, 1.1], np.zeros(f.numel_out())])
+    results = []
+    for chunk in (100, emit.CHUNK, 10**9):
+        text = emit.emit(f, "f", chunk=chunk)
+        assert ("V w[" in text) == (chunk < 10**9)
+        compiler.library(text)["f_point"](ctypes.c_void_p(row.ctypes.data))
+        results.append(row[4:].copy())
+    expected = np.asarray(f(0.3, [0.5, -0.7], 1.1)).ravel()
+    for result in results:
+        np.testing.assert_array_equal(result, expected)
+
+
+def test_the_work_vector_uses_its_places_again():
+    text = emit.emit(random_function(2000), "f", chunk=100)
+    places = int(text.split("V w[")[1].split("]")[0])
+    assert places < text.count("    w[") / 2
+
+
+def test_operations_counts_arithmetic_only():
+    a, b = X2[0], X2[1]
+    assert emit.operations(function(a, 3.0, T)) == 0
+    assert emit.operations(function(a * b + ca.sin(T) - 2.0 * P1, b)) == 5
+
+
+def test_text_depends_on_content_only():
+    f = random_function(500)
+    again = ca.Function.deserialize(f.serialize())
+    assert emit.emit(f, "f", ("rk4",)) == emit.emit(again, "f", ("rk4",))
+
+
+def test_an_operation_without_c_is_named():
+    model = compiled(function(X2[0].printme(X2[1])), "talkative")
+    with pytest.raises(SpecificationError, match="OP_PRINTME"):
+        model(0.0, [0.0, 0.0], [0.0])
+
+
+# --- points and grids
+
+
+def test_point_and_grid_agree_in_both_backends(backend):
+    model = pendulum()
+    rng = np.random.default_rng(1)
+    n = GRID_POINTS + 1
+    t, x, p = rng.normal(size=n), rng.normal(size=(2, n)), rng.normal(size=(1, n))
+    expected = np.array([x[1], -p[0] * np.sin(x[0]) + np.cos(t), x[0] ** 2 + t])
+    np.testing.assert_allclose(model.grid(t, x, p), expected, rtol=1e-15, atol=1e-15)
+    assert model.backend == backend
+    np.testing.assert_allclose(model.grid(t, x, p[:, 0])[0], expected[0])
+    np.testing.assert_allclose(model.grid(0.5, x, p)[2], x[0] ** 2 + 0.5)
+    columns = np.array([model(t[k], x[:, k], p[:, k]) for k in range(5)]).T
+    np.testing.assert_allclose(columns, expected[:, :5], rtol=1e-15, atol=1e-15)
+    np.testing.assert_array_equal(model(1, [1, 2], [3]), model(1.0, np.array([1.0, 2.0]), np.array([3.0])))
+
+
+def test_each_call_returns_its_own_array(backend):
+    model = pendulum()
+    first = model(0.0, np.array([0.1, 0.2]), np.array([1.0]))
+    kept = first.copy()
+    model(1.0, np.array([3.0, 4.0]), np.array([1.0]))
+    np.testing.assert_array_equal(first, kept)
+
+
+def test_empty_state_and_parameters(backend):
+    model = compiled(function(T**2, 1.0, x=ca.SX.sym("x", 0), p=ca.SX.sym("p", 0)), "of_time")
+    assert model.n_x == model.n_p == 0
+    np.testing.assert_array_equal(model(3.0, [], []), [9.0, 1.0])
+    t = np.linspace(0, 1, GRID_POINTS + 1)
+    np.testing.assert_array_equal(model.grid(t, np.empty((0, t.size)), []), [t**2, np.ones(t.size)])
+    assert model.backend == backend
+
+
+def test_threads_do_not_share_memory(backend):
+    model = pendulum(("rk4",))
+    model.rk4(0.0, [0.0, 0.0], 0.1, 1, [1.0])
+    wrong = []
+
+    def work(k):
+        x, p = np.array([k, -k], dtype=float), np.array([2.0])
+        expected = [-k, -2 * np.sin(k) + np.cos(k), k * k + k]
+        wrong.extend(y for _ in range(2000) if not np.allclose(y := model(float(k), x, p), expected, rtol=1e-14))
+
+    threads = [threading.Thread(target=work, args=(k,)) for k in range(4)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert model.backend == backend
+    assert not wrong
+
+
+@pytest.mark.parametrize("call", [
+    lambda m: m(0.0, [1.0], [1.0]), lambda m: m(0.0, [[1.0], [2.0]], [1.0]), lambda m: m(0.0, [1.0, 2.0], []),
+    lambda m: m.grid([0.0, 1.0], np.zeros((2, 3)), [1.0]), lambda m: m.grid(0.0, np.zeros((3, 2)), [1.0]),
+    lambda m: m.grid(0.0, np.zeros((2, 3)), np.zeros((1, 2))), lambda m: m.rk4(0.0, [1.0], 0.1, 5, [1.0]),
+    lambda m: m.rk4(0.0, [1.0, 0.0], 0.1, -1, [1.0]), lambda m: m.rk4(0.0, [1.0, 0.0], 0.1, 5, [1.0], every=0),
+    lambda m: m.newton([0.0], [1.0, 0.0], [1.0]),
+])
+def test_wrong_arguments_are_refused(call):
+    with pytest.raises(SpecificationError):
+        call(pendulum(("rk4",)))
+
+
+@pytest.mark.parametrize("make", [
+    lambda: compiled(ca.Function("f", [T, X2], [X2]), "f"),
+    lambda: compiled(ca.Function("f", [T, X2, P1], [X2.T]), "f"),
+    lambda: compiled(ca.Function("f", [T, X2, P1], [ca.SX(2, 1)]), "f"),
+    lambda: compiled(function(X2), "not a name"),
+    lambda: compiled(function(X2[0]), "f", ("rk4",)),
+    lambda: compiled(function(X2), "f", ("newton",)),
+])
+def test_wrong_functions_are_refused(make):
+    with pytest.raises(SpecificationError):
+        make()
+
+
+def test_an_unknown_loop_is_named():
+    with pytest.raises(NameUnknown, match="'rk4'"):
+        compiled(function(X2), "f", ("rk5",))
+    with pytest.raises(NameUnknown, match="'newton'"):
+        emit.emit(function(X2), "f", ("newtons",))
+
+
+# --- Runge-Kutta
+
+
+def numpy_rk4(t, x, h, n, p):
+    def rate(t, x):
+        return np.array([x[1], -p * np.sin(x[0]) + np.cos(t)])
+    states = [x]
+    for k in range(n):
+        tk = t + k * h
+        k1 = rate(tk, x)
+        k2 = rate(tk + h / 2, x + h / 2 * k1)
+        k3 = rate(tk + h / 2, x + h / 2 * k2)
+        k4 = rate(tk + h, x + h * k3)
+        x = x + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
+        states.append(x)
+    return np.array(states).T
+
+
+def test_rk4_equals_a_numpy_loop(backend):
+    model = pendulum(("rk4",))
+    expected = numpy_rk4(0.2, np.array([0.5, -0.1]), 0.01, 300, 9.81)
+    t, x, guards = model.rk4(0.2, [0.5, -0.1], 0.01, 300, [9.81])
+    assert model.backend == backend
+    np.testing.assert_allclose(x, expected, rtol=0, atol=1e-13)
+    np.testing.assert_array_equal(t, 0.2 + 0.01 * np.arange(301))
+    np.testing.assert_allclose(guards, [x[0] ** 2 + t], rtol=0, atol=1e-14)
+
+
+@pytest.mark.parametrize(("n", "every", "logged"), [(10, 3, [0, 3, 6, 9, 10]), (9, 3, [0, 3, 6, 9]), (2, 5, [0, 2]),
+                                                    (0, 1, [0])])
+def test_rk4_logs_the_start_every_few_steps_and_the_end(backend, n, every, logged):
+    model = pendulum(("rk4",))
+    t, x, guards = model.rk4(1.0, [0.3, 0.0], 0.1, n, [2.0], every=every)
+    t_all, x_all, guards_all = model.rk4(1.0, [0.3, 0.0], 0.1, n, [2.0])
+    np.testing.assert_array_equal(t, t_all[logged])
+    np.testing.assert_array_equal(x, x_all[:, logged])
+    np.testing.assert_array_equal(guards, guards_all[:, logged])
+
+
+def test_rk4_has_order_4():
+    model = pendulum(("rk4",))
+    steps = 2 ** np.arange(5, 10)
+    fine = model.rk4(0.0, [1.0, 0.0], 2.0 / 2**14, 2**14, [4.0], every=2**14)[1][:, -1]
+    errors = [np.abs(model.rk4(0.0, [1.0, 0.0], 2.0 / n, n, [4.0])[1][:, -1] - fine).max() for n in steps]
+    order = -np.polyfit(np.log(steps), np.log(errors), 1)[0]
+    assert abs(order - 4.0) < 0.1
+
+
+def test_rk4_ends_at_the_last_finite_state(backend):
+    model = compiled(function(X2[0] ** 2, 1.0), "escape", ("rk4",))
+    t, x, guards = model.rk4(0.0, [1.0, 0.0], 0.01, 1000, [0.0])
+    assert 1.0 < t[-1] < 1.2
+    assert np.isfinite(x).all() and x.shape == (2, t.size) and guards.shape == (0, t.size)
+    t, x, _ = model.rk4(0.0, [1.0, 0.0], 0.01, 1000, [0.0], every=50)
+    assert t[-1] == 1.0 and np.isfinite(x).all()
+    assert model.rk4(0.0, [np.nan, 0.0], 0.01, 1000, [0.0])[1].shape == (2, 0)
+
+
+# --- Newton along a path
+
+
+def newton_model(residual, x, name, *others):
+    jacobian = ca.jacobian(residual, x)
+    delta, rate = -ca.solve(jacobian, residual), -ca.solve(jacobian, ca.jacobian(residual, T))
+    return compiled(function(delta, rate, *others, x=x), name, ("newton",))
+
+
+def test_newton_on_a_cubic(backend):
+    x = ca.SX.sym("x")
+    model = newton_model(x**3 + P1 * x - ca.sin(T), x, "cubic", x**2)
+    t = np.linspace(0, 10, 501)
+    solution, y, iterations = model.newton(t, [0.3], [3.0])
+    assert model.backend == backend
+    expected = 2 * np.sinh(np.arcsinh(np.sin(t) / 2) / 3)
+    np.testing.assert_allclose(solution[0], expected, rtol=0, atol=4e-16)
+    np.testing.assert_allclose(y[1], np.cos(t) / (3 * expected**2 + 3), rtol=1e-14, atol=1e-14)
+    np.testing.assert_allclose(y[2], expected**2, rtol=1e-14, atol=1e-15)
+    assert iterations <= 4 * t.size
+
+
+def test_newton_on_three_equations(backend):
+    x = ca.SX.sym("x", 3)
+    path = ca.vertcat(ca.cos(T), 2 + ca.sin(2 * T), ca.exp(-T))
+
+    def mixed(v):
+        return ca.vertcat(v[0] + v[1] ** 2, v[1] * v[2] - v[0], v[2] + v[0] * v[1] / 5)
+
+    model = newton_model(mixed(x) - mixed(path), x, "three")
+    t = np.linspace(0, 2, 101)
+    solution, y, _ = model.newton(t, [1.1, 1.9, 0.9], [0.0])
+    np.testing.assert_allclose(solution, [np.cos(t), 2 + np.sin(2 * t), np.exp(-t)], rtol=0, atol=1e-14)
+    np.testing.assert_allclose(y[3:], [-np.sin(t), 2 * np.cos(2 * t), -np.exp(-t)], rtol=0, atol=1e-12)
+
+
+def test_newton_halves_a_step_that_is_too_long(backend):
+    x = ca.SX.sym("x")
+    model = newton_model(ca.atan(x - 50 * ca.sin(T)), x, "narrow")       # Newton converges within 1.39 of the root only
+    t = np.arange(0.0, 6.0, 0.5)
+    solution, _, iterations = model.newton(t, [0.1], [0.0])
+    np.testing.assert_allclose(solution[0], 50 * np.sin(t), rtol=0, atol=1e-13)
+    assert iterations > 10 * t.size
+
+
+def test_newton_keeps_what_it_solved_where_the_solution_ends(backend):
+    x = ca.SX.sym("x")
+    model = newton_model(x**2 - (1 - T), x, "fold")
+    t = np.linspace(0, 2, 41)
+    solution, y, _ = model.newton(t, [0.9], [0.0])
+    solved = int(np.sum(t < 1 - 1e-9))
+    assert solution.shape[1] in (solved, solved + 1) and y.shape == (2, solution.shape[1])
+    np.testing.assert_allclose(solution[0, :solved], np.sqrt(1 - t[:solved]), rtol=1e-14)
+    assert model.newton(t, [np.nan], [0.0])[0].shape == (1, 0)
+    assert model.newton(t, [1e9], [0.0], max_iter=3)[0].shape == (1, 0)
+
+
+def test_both_backends_count_the_same_iterations(monkeypatch):
+    x = ca.SX.sym("x")
+    t = np.arange(0.0, 6.0, 0.5)
+    results = []
+    for chosen in ("", "none"):
+        monkeypatch.setenv("SERVOCTL_COMPILER", chosen)
+        monkeypatch.setattr(compiler, "_warned", True)
+        model = newton_model(ca.atan(x - 50 * ca.sin(T)), x, "narrow")
+        results.append((model.newton(t, [0.1], [0.0])[2], model.backend))
+    (in_c, _), (in_python, _) = results
+    assert [backend for _, backend in results] == ["c", "casadi"]
+    assert abs(in_c - in_python) <= 0.02 * in_c
+
+
+# --- moving elsewhere
+
+
+def test_pickles_and_copies(backend):
+    model = pendulum(("rk4",))
+    t, x, guards = model.rk4(0.0, [0.1, 0.0], 0.1, 5, [1.0])
+    for other in (pickle.loads(pickle.dumps(model)), copy.deepcopy(model)):
+        assert (other.name, other.loops, other.n_x, other.n_p, other.n_y) == ("pendulum", ("rk4",), 2, 1, 3)
+        np.testing.assert_array_equal(other.rk4(0.0, [0.1, 0.0], 0.1, 5, [1.0])[1], x)
+        assert other.backend == backend
+        assert repr(other) == repr(model)
