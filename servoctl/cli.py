@@ -95,13 +95,14 @@ def _assignment(text):
 def _mapping(pairs, option):
     found = {}
     for name, value in pairs:
-        if found.setdefault(name, value) != value:
+        if name in found:
             raise SpecificationError(
-                f"{option} {name}={found[name]:g} and {option} {name}={value:g} were given.",
+                f"{option} {name} was given twice: {found[name]:g} and {value:g}.",
                 "A name has one value.",
                 do="Leave one of them out.",
                 name=name,
             )
+        found[name] = value
     return found
 
 
@@ -159,8 +160,8 @@ def _earlier_report(folder):
         raise ServoError(
             f"{folder} has no report.txt that can be read: {getattr(error, 'strerror', None) or error}.",
             "The folder of a run holds the report that the run printed.",
-            nearest="A gallery name, or a .py file that defines scene().",
-            do="Give the folder that servoctl run wrote, by default servoctl-runs/NAME.",
+            nearest="By default it is servoctl-runs/NAME.",
+            do="Give the folder that servoctl run wrote, a gallery name, or a .py file that defines scene().",
             folder=str(folder),
         ) from error
 
@@ -181,10 +182,11 @@ def _compute(args, name, scene, folder):
     import servoctl as sv
 
     report = Report()
-    model = _with_parameters(sv.derive(*scene.build()), _mapping(args.set, "--set"))
-    report.say(model)
     span = tuple(args.t_span or scene.t_span)
-    start = _start(model, scene, span[0], _mapping(args.hold, "--hold"), _mapping(args.guess, "--guess"))
+    changes, held, guess = (_mapping(getattr(args, name), f"--{name}") for name in ("set", "hold", "guess"))
+    model = _with_parameters(sv.derive(*scene.build()), changes)
+    report.say(model)
+    start = _start(model, scene, span[0], held, guess)
     report.say(start)
     run = _simulate(model, start, span, _options(args, span), report)
     folder.write(lambda path: run.save(path / "run.npz"))
@@ -244,14 +246,14 @@ def _simulate(model, start, span, options, report):
 
     try:
         run = sv.simulate(model, start, span, **options)
+        report.say(run)
+        return run
     except ServoError as error:
         if error.run is None:
             raise
-        run = error.run
-        if str(error) not in repr(run):
-            report.say(f"{type(error).__name__}: {error}")
-    report.say(run)
-    return run
+        report.say(error.run)
+        report.say(f"{type(error).__name__}: {error}")
+        return error.run
 
 
 def _verify(model, run, report):

@@ -15,6 +15,7 @@ STYLES = ("-", "--", ":", "-.")
 WIDTH = 10.0  # inches: 1000 px at matplotlib's 100 dpi
 FLOOR = 1e-18  # of residuals on a logarithmic scale, so that exact zeros are seen
 BINS = 100  # of time, in each of which a residual is drawn by its greatest magnitude: rounding stays a band
+LAST, UNBOUNDED = 0.01, 10.0  # a signal that grows tenfold in the last hundredth of a stopped run leaves the frame
 NEGLIGIBLE = 1e-9  # variation relative to the largest value of the same unit: rounding, not filled with it
 
 
@@ -42,12 +43,12 @@ def path(run, x=None, y=None, ax=None, units=None):
         If there is no such signal.
     """
     if x is None and y is None and len(_coordinates(run)) == 1:
-        ax = signals(run, _coordinates(run), ax or _panels(1, 4.0)[0], units)
-        _end(run, [ax])
-        return ax
-    if x is None or y is None:
-        first, second = _plane(run)
-        x, y = (x or first if y != first else x or second), (y or second if x != second else y or first)
+        return signals(run, _coordinates(run), _panels(1, 4.2)[0] if ax is None else ax, units)
+    first, second = _plane(run)
+    if x is None:
+        x = first if y != first else second
+    if y is None:
+        y = second if x != second else first
     units = units or {}
     across, up = run[x], run[y]
     ax = _panels(1, 6.0)[0] if ax is None else ax
@@ -252,7 +253,8 @@ def _plane(run):
         if found:
             groups.setdefault((found[2].islower(), found[1], found[3]), []).append(name)
     planes = sorted((group for group in groups.items() if len(group[1]) > 1), key=lambda group: group[0][0])
-    return (planes[0][1] if planes else [*coordinates, *run.names])[:2]
+    names = planes[0][1] if planes else list(dict.fromkeys([*coordinates, *run.names]))
+    return names[0], names[min(1, len(names) - 1)]
 
 
 def _unit(name, units):
@@ -303,7 +305,7 @@ def _over_time(run, groups, ax, units, extrema=False):
             style = STYLES[i // len(COLOURS) % len(STYLES)]
             label = _label([name], units if mixed else {})
             panel.plot(run.t, run[name], style, color=COLOURS[i % len(COLOURS)], label=label)
-        _frame(panel, [run[name] for name in group], max(largest[_unit(name, units)] for name in group))
+        _frame(panel, run, group, max(largest[_unit(name, units)] for name in group))
         panel.set_ylabel(_label(group, units))
         panel.grid(alpha=0.3)
         if len(group) > 1:
@@ -327,14 +329,21 @@ def _largest(run, names, units):
     return found
 
 
-def _frame(ax, curves, largest):
-    """Keep variation that is mere rounding from filling the panel."""
-    values = np.concatenate(curves)
+def _frame(ax, run, names, largest):
+    """Keep rounding from filling the panel, and what grows without bound before a stop from flattening the rest."""
+    values = np.concatenate([run[name] for name in names])
     values = values[np.isfinite(values)]
     least = NEGLIGIBLE * largest
     if values.size and np.ptp(values) < least:
         middle = (values.min() + values.max()) / 2
         ax.set_ylim(middle - max(least, abs(middle) / 10), middle + max(least, abs(middle) / 10))
+    if run.success or len(run.t) < 3:
+        return
+    before = np.abs(run.t[-1] - run.t) > LAST * abs(run.t[-1] - run.t[0])
+    early = np.concatenate([run[name][before] for name in names])
+    early = early[np.isfinite(early)]
+    if early.size and np.ptp(values) > UNBOUNDED * np.ptp(early) > 0:
+        ax.set_ylim(early.min() - np.ptp(early) / 2, early.max() + np.ptp(early) / 2)
 
 
 def _extrema(run, name, units):

@@ -70,10 +70,11 @@ class Folder:
                 pass
         except OSError as error:
             self.leave()
+            reason = "it is a file" if path.is_file() else error.strerror or error
             raise ServoError(
-                f"The folder {path} cannot be written: {error.strerror or error}.",
+                f"The folder {path} cannot be written: {reason}.",
                 "A run leaves its numbers and figures in a folder.",
-                nearest=f"{Path('servoctl-runs', name)} here, or {Path(tempfile.gettempdir(), name)}.",
+                nearest=f"The default is {Path('servoctl-runs', name)} in the current folder.",
                 do="Give another folder by --out. Nothing has been computed yet.",
                 folder=str(path),
             ) from error

@@ -58,7 +58,7 @@ def _from_file(path):
         raise SpecificationError(
             f"There is no file {path}.",
             "A scene is a name of the gallery or a Python file.",
-            nearest=f"{path.parent / match}." if match else "",
+            nearest=f"The nearest is {path.parent / match}." if match else "",
             do="Check the path, or see servoctl list.",
             file=str(path),
         )
@@ -101,7 +101,7 @@ def _reported(path, action):
         raise SpecificationError(
             f"{path} raised {last}, in line {line}: {text}",
             "A scene's file is imported, and its scene() is called.",
-            do="Correct the file; python shows the whole traceback.",
+            do="Correct the file; run by python, it shows the whole traceback.",
             file=str(path),
             line=line,
             exception=last,
