@@ -47,23 +47,39 @@ def compiled(f, name, loops=()):
         If a loop is none of the above.
     """
     columns = [*(f.sparsity_in(i) for i in range(f.n_in())), *(f.sparsity_out(i) for i in range(f.n_out()))]
-    if (not f.is_a("SXFunction") or f.has_free() or (f.n_in(), f.n_out()) != (3, 1) or f.numel_in(0) != 1
-            or not all(column.is_dense() and column.size2() == 1 for column in columns)):
-        raise SpecificationError(f"{name!r} is to be compiled from {f}",
-                                 "A compiled function takes columns t, x, p to one dense column, without free symbols",
-                                 "The nearest is an SX function of this form",
-                                 "Concatenate and densify the outputs; expand() an MX function", name=name)
+    if (
+        not f.is_a("SXFunction")
+        or f.has_free()
+        or (f.n_in(), f.n_out()) != (3, 1)
+        or f.numel_in(0) != 1
+        or not all(column.is_dense() and column.size2() == 1 for column in columns)
+    ):
+        raise SpecificationError(
+            f"{name!r} is to be compiled from {f}",
+            "A compiled function takes columns t, x, p to one dense column, without free symbols",
+            "The nearest is an SX function of this form",
+            "Concatenate and densify the outputs; expand() an MX function",
+            name=name,
+        )
     if not (name.isascii() and name.isidentifier()):
-        raise SpecificationError(f"A compiled function is named {name!r}", "Its name is a C identifier",
-                                 do="Use letters, digits and underscores", name=name)
+        raise SpecificationError(
+            f"A compiled function is named {name!r}",
+            "Its name is a C identifier",
+            do="Use letters, digits and underscores",
+            name=name,
+        )
     for loop in loops:
         if loop not in emit.LOOPS:
             raise unknown(loop, emit.LOOPS, "loop")
         needed = _OUTPUTS_PER_STATE[loop] * f.numel_in(1)
         if f.numel_out(0) < needed:
-            raise SpecificationError(f"{name!r} has {f.numel_out(0)} outputs for {f.numel_in(1)} states",
-                                     f"{loop} needs the first {needed} outputs",
-                                     do="Add the outputs or leave the loop out", name=name, loop=loop)
+            raise SpecificationError(
+                f"{name!r} has {f.numel_out(0)} outputs for {f.numel_in(1)} states",
+                f"{loop} needs the first {needed} outputs",
+                do="Add the outputs or leave the loop out",
+                name=name,
+                loop=loop,
+            )
     return Compiled(f, name, tuple(loops))
 
 
@@ -211,8 +227,12 @@ class Compiled:
         self._settle_loop("rk4")
         x0, p = self._array("x0", x0, self._x_shape), self._array("p", p, self._p_shape)
         if n_steps < 0 or every < 1:
-            raise SpecificationError(f"rk4 is to take {n_steps} steps and log every {every}",
-                                     "n_steps is at least 0 and every at least 1", n_steps=n_steps, every=every)
+            raise SpecificationError(
+                f"rk4 is to take {n_steps} steps and log every {every}",
+                "n_steps is at least 0 and every at least 1",
+                n_steps=n_steps,
+                every=every,
+            )
         log = np.append(np.arange(0, n_steps, every), n_steps)
         states, guards = np.empty((self.n_x, log.size)), np.empty((self.n_y - self.n_x, log.size))
         n = 1 + self._evaluator.rk4(float(t0), x0, float(h), int(n_steps), int(every), p, states, guards)
@@ -260,9 +280,13 @@ class Compiled:
 
     def _settle_loop(self, loop):
         if loop not in self.loops:
-            raise SpecificationError(f"{self.name!r} was asked for its loop {loop}",
-                                     f"It was made with the loops {', '.join(self.loops) or '(none)'}",
-                                     do=f"Make it with loops=({loop!r},)", name=self.name, loop=loop)
+            raise SpecificationError(
+                f"{self.name!r} was asked for its loop {loop}",
+                f"It was made with the loops {', '.join(self.loops) or '(none)'}",
+                do=f"Make it with loops=({loop!r},)",
+                name=self.name,
+                loop=loop,
+            )
         self._settle(build=True)
 
     def _settle(self, build):
@@ -280,8 +304,13 @@ class Compiled:
     def _array(self, what, value, shape):
         array = np.ascontiguousarray(value, dtype=float)
         if array.shape != shape:
-            raise SpecificationError(f"{what} of {self.name!r} has the shape {array.shape}", f"Its shape is {shape}",
-                                     name=self.name, shape=array.shape, expected=shape)
+            raise SpecificationError(
+                f"{what} of {self.name!r} has the shape {array.shape}",
+                f"Its shape is {shape}",
+                name=self.name,
+                shape=array.shape,
+                expected=shape,
+            )
         return array
 
 
@@ -309,15 +338,30 @@ class _Library:
     def rk4(self, t0, x0, h, n_steps, every, p, states, guards):
         run = self._library[f"{self._symbol}_rk4"]
         run.restype = ctypes.c_int64
-        return run(ctypes.c_double(t0), _pointer(x0), ctypes.c_double(h), ctypes.c_int64(n_steps),
-                   ctypes.c_int64(every), _pointer(p), ctypes.c_int64(states.shape[1]), _pointer(states),
-                   _pointer(guards))
+        return run(
+            ctypes.c_double(t0),
+            _pointer(x0),
+            ctypes.c_double(h),
+            ctypes.c_int64(n_steps),
+            ctypes.c_int64(every),
+            _pointer(p),
+            ctypes.c_int64(states.shape[1]),
+            _pointer(states),
+            _pointer(guards),
+        )
 
     def newton(self, t, x0, p, tol, max_iter, x, y):
         run, count = self._library[f"{self._symbol}_newton"], ctypes.c_int64()
         run.restype = ctypes.c_int64
-        n = run(ctypes.c_int64(t.size), *map(_pointer, (t, x0, p)), ctypes.c_double(tol), ctypes.c_int64(max_iter),
-                _pointer(x), _pointer(y), ctypes.byref(count))
+        n = run(
+            ctypes.c_int64(t.size),
+            *map(_pointer, (t, x0, p)),
+            ctypes.c_double(tol),
+            ctypes.c_int64(max_iter),
+            _pointer(x),
+            _pointer(y),
+            ctypes.byref(count),
+        )
         return n, count.value
 
 

@@ -141,8 +141,14 @@ def _compile(text, target, command):
     os.close(handle)
     try:
         for flags in ((*FLAGS, *_optional_flags()), FLAGS):
-            done = subprocess.run([*command, *flags, "-x", "c", "-", "-o", temporary, "-lm"], input=text, text=True,
-                                  capture_output=True, cwd=target.parent, check=False)
+            done = subprocess.run(
+                [*command, *flags, "-x", "c", "-", "-o", temporary, "-lm"],
+                input=text,
+                text=True,
+                capture_output=True,
+                cwd=target.parent,
+                check=False,
+            )
             if done.returncode == 0:
                 break
         else:
@@ -176,6 +182,9 @@ def _without(reason):
     global _warned
     if not _warned:
         _warned = True
-        warnings.warn(f"{reason}. CasADi evaluates the models instead: the same results, 10 to 100 times "
-                      "slower in simulation. Install gcc or clang, or name a compiler in CC.",
-                      RuntimeWarning, stacklevel=2)
+        warnings.warn(
+            f"{reason}. CasADi evaluates the models instead: the same results, 10 to 100 times "
+            "slower in simulation. Install gcc or clang, or name a compiler in CC.",
+            RuntimeWarning,
+            stacklevel=2,
+        )

@@ -5,6 +5,7 @@ statements are written for a number type ``V`` through ``K(constant)`` and ``v_s
 any type for which these are defined. A long function is cut into chunks, and the values that outlive a chunk are kept
 in memory: compilers need more than linear time for one long function.
 """
+
 import math
 from itertools import chain
 
@@ -16,15 +17,23 @@ CHUNK = 350  # statements per C function: compile time is least, and flat, betwe
 BISECTIONS = 20  # halvings of one time step in newton: a millionth of it is a lost solution, not a long step
 ROUNDING = 2.0**-52  # a Newton correction this small relative to 1 + |x| cannot be reduced by another
 
-_LIBM_1 = ("sqrt exp log expm1 log1p sin cos tan asin acos atan sinh cosh tanh asinh acosh atanh "
-           "fabs floor ceil erf").split()
+_LIBM_1 = (
+    "sqrt exp log expm1 log1p sin cos tan asin acos atan sinh cosh tanh asinh acosh atanh fabs floor ceil erf"
+).split()
 _LIBM_2 = "pow fmin fmax fmod remainder atan2 copysign hypot".split()
 _OWN_1 = "sign not erfinv".split()
 _OWN_2 = "lt le eq ne and or if_else_zero".split()
 
 _TEMPLATES = {
-    ca.OP_ADD: "{0} + {1}", ca.OP_SUB: "{0} - {1}", ca.OP_MUL: "{0} * {1}", ca.OP_DIV: "{0} / {1}", ca.OP_NEG: "-{0}",
-    ca.OP_SQ: "{0} * {0}", ca.OP_TWICE: "K(2.0) * {0}", ca.OP_INV: "K(1.0) / {0}", ca.OP_CONSTPOW: "v_pow({0}, {1})",
+    ca.OP_ADD: "{0} + {1}",
+    ca.OP_SUB: "{0} - {1}",
+    ca.OP_MUL: "{0} * {1}",
+    ca.OP_DIV: "{0} / {1}",
+    ca.OP_NEG: "-{0}",
+    ca.OP_SQ: "{0} * {0}",
+    ca.OP_TWICE: "K(2.0) * {0}",
+    ca.OP_INV: "K(1.0) / {0}",
+    ca.OP_CONSTPOW: "v_pow({0}, {1})",
     **{getattr(ca, f"OP_{name.upper()}"): f"v_{name}({{0}})" for name in (*_LIBM_1, *_OWN_1)},
     **{getattr(ca, f"OP_{name.upper()}"): f"v_{name}({{0}}, {{1}})" for name in (*_LIBM_2, *_OWN_2)},
 }
@@ -32,13 +41,16 @@ _COPIES = {ca.OP_ASSIGN, ca.OP_LIFT}  # the first operand, unchanged
 _NOT_ARITHMETIC = {ca.OP_CONST, ca.OP_INPUT, ca.OP_OUTPUT, *_COPIES}
 _INPUTS = ("t", "x[{}]", "p[{}]")
 
-_PRELUDE = """\
+_PRELUDE = (
+    """\
 #include <math.h>
 #include <stdint.h>
 
 typedef double V;
 #define K(constant) (constant)
-""" + "".join(f"#define v_{name} {name}\n" for name in (*_LIBM_1, *_LIBM_2)) + """
+"""
+    + "".join(f"#define v_{name} {name}\n" for name in (*_LIBM_1, *_LIBM_2))
+    + """
 static inline V v_sign(V a) { return a < 0 ? -1 : a > 0 ? 1 : a; }
 static inline V v_not(V a) { return !a; }
 static inline V v_lt(V a, V b) { return a < b; }
@@ -49,6 +61,7 @@ static inline V v_and(V a, V b) { return a && b; }
 static inline V v_or(V a, V b) { return a || b; }
 static inline V v_if_else_zero(V a, V b) { return a ? b : 0; }
 """
+)
 
 _ERFINV = """\
 
@@ -256,11 +269,17 @@ def emit(f, name, loops=(), chunk=CHUNK):
         if loop not in LOOPS:
             raise unknown(loop, LOOPS, "loop")
     statements = _statements(f)
-    chunks = [statements[k:k + chunk] for k in range(0, len(statements), chunk)]
+    chunks = [statements[k : k + chunk] for k in range(0, len(statements), chunk)]
     body = _single(name, statements) if len(chunks) <= 1 else _chunked(name, chunks)
     drivers = "".join((_GRID, *(LOOPS[loop] for loop in LOOPS if loop in loops)))
-    for key, value in {"N_X": f.numel_in(1), "N_P": f.numel_in(2), "N_Y": f.numel_out(0), "BISECTIONS": BISECTIONS,
-                       "ROUNDING": repr(ROUNDING), "NAME": name}.items():
+    for key, value in {
+        "N_X": f.numel_in(1),
+        "N_P": f.numel_in(2),
+        "N_Y": f.numel_out(0),
+        "BISECTIONS": BISECTIONS,
+        "ROUNDING": repr(ROUNDING),
+        "NAME": name,
+    }.items():
         drivers = drivers.replace(key, str(value))
     return _PRELUDE + (_ERFINV if "v_erfinv" in body else "") + body + drivers
 
@@ -293,8 +312,11 @@ def _statements(f):
         else:
             raise SpecificationError(
                 f"the function {f.name()} contains the operation {_operation_name(operation)}",
-                "only scalar arithmetic can be compiled", nearest="the elementary functions of CasADi's SX",
-                do="write the expression with these, or expand() the function called", operation=operation)
+                "only scalar arithmetic can be compiled",
+                nearest="the elementary functions of CasADi's SX",
+                do="write the expression with these, or expand() the function called",
+                operation=operation,
+            )
     return statements
 
 
@@ -325,16 +347,20 @@ def _single(name, statements):
 def _chunked(name, chunks):
     home = {target: here for here, chunk in enumerate(chunks) for target, _, _ in chunk if target is not None}
     slots, n_slots = _slots(chunks, home)
-    functions = (f"\nstatic __attribute__((noinline)) void {name}_{here}({_SIGNATURE}, V *restrict w)\n{{\n"
-                 f"{_lines(chunk, slots, home, here)}}}\n" for here, chunk in enumerate(chunks))
+    functions = (
+        f"\nstatic __attribute__((noinline)) void {name}_{here}({_SIGNATURE}, V *restrict w)\n{{\n"
+        f"{_lines(chunk, slots, home, here)}}}\n"
+        for here, chunk in enumerate(chunks)
+    )
     calls = (f"    {name}_{here}(t, x, p, y, w);\n" for here in range(len(chunks)))
     return "".join(chain(functions, [f"\nvoid {name}({_SIGNATURE})\n{{\n    V w[{n_slots + 1}];\n"], calls, ["}\n"]))
 
 
 def _slots(chunks, home):
     """Where each value that outlives its chunk is kept; a place is used again after the last chunk that reads it."""
-    last = {v: here for here, chunk in enumerate(chunks) for _, _, operands in chunk for v in operands
-            if isinstance(v, int)}
+    last = {
+        v: here for here, chunk in enumerate(chunks) for _, _, operands in chunk for v in operands if isinstance(v, int)
+    }
     expiring, free, slots, n_slots = [[] for _ in chunks], [], {}, 0
     for here, chunk in enumerate(chunks):
         free += expiring[here - 1] if here else []

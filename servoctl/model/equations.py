@@ -136,7 +136,7 @@ class Equations:
         return self.function("matrices", self.state, [ca.vec(ca.densify(L)), ca.vec(ca.densify(B))])
 
     def plant(self):
-        """(q', γ'') of the full mechanism as a function of (t, [q; γ'; inputs]); inputs drive it as they do the program."""
+        """(q', γ'') of the full mechanism under the inputs that realise the program, as a function of (t, [q; γ'; inputs])."""
         r, q = self.r, self.q
         mechanism, acceleration = r.mechanism, ca.vertcat(*q.gamma(2))
         zero = ca.SX.zeros(q.n)
@@ -196,7 +196,7 @@ class Equations:
         return ["all_multipliers"], [self.r.multipliers]
 
     def _power(self):
-        """dE/dt, the power of all forces without a potential, the size of its terms, and whether dE/dt follows from M."""
+        """dE/dt, the power of forces without a potential, the size of its terms, and what dE/dt owes to explicit time."""
         r, q = self.r, self.q
         w = ca.vertcat(*q.gamma(1))
         rate = q.dt(r.mechanism.energy)

@@ -91,7 +91,7 @@ class _Newton:
     def _at(self, t, x):
         self.count += 1
         y = self._value(t, x, self._p)
-        delta = y[:self._n_x]
+        delta = y[: self._n_x]
         finite = np.isfinite(x).all() and np.isfinite(delta).all()
         return y, delta, np.max(np.abs(delta) / (1 + np.abs(x)), initial=0.0) if finite else np.inf
 
@@ -119,7 +119,7 @@ class _Newton:
         t, done, pieces = a, 0, 1
         while done < pieces:
             following = b if done + 1 == pieces else a + (b - a) * ((done + 1) / pieces)
-            point = self.correct(following, x + (following - t) * y[self._n_x:2 * self._n_x])
+            point = self.correct(following, x + (following - t) * y[self._n_x : 2 * self._n_x])
             if point is not None:
                 (x, y), t, done = point, following, done + 1
                 while pieces > 1 and done % 2 == 0:

@@ -240,7 +240,9 @@ class Model:
             groups |= dict.fromkeys((f"multiplier_{name}" for name in program.residuals), "multipliers")
         groups |= dict.fromkeys((f"multiplier_{name}" for name in mechanism.constraints), "multipliers")
         if not mechanism.q.plain:
-            groups |= dict.fromkeys((f"{d}{name}" for d in ("d", "d2") for name in mechanism.q.names), "coordinate_rates")
+            groups |= dict.fromkeys(
+                (f"{d}{name}" for d in ("d", "d2") for name in mechanism.q.names), "coordinate_rates"
+            )
         return groups
 
     def invariant_names(self):

@@ -26,7 +26,9 @@ def describe(model):
     structure = model.structure()
     if structure.index is not None:
         zeros = ", ".join(map(str, structure.zeros_at_infinity))
-        lines.append(f"  index {structure.index}; zeros at infinity of order {zeros}; {structure.realisation} realisation")
+        lines.append(
+            f"  index {structure.index}; zeros at infinity of order {zeros}; {structure.realisation} realisation"
+        )
     if any(not row.affine for row in r.rows):
         bent = ", ".join(row.name for row in r.rows if not row.affine)
         lines.append(f"  {bent}: not linear in the highest derivative, differentiated once more")
@@ -64,8 +66,10 @@ def _rule(r):
     names = r.mechanism.q.names if r.mechanism.q.plain else r.mechanism.q.velocity_names
     dependent = ", ".join(names[i] for i in r.realisation.dependent) or "none"
     if r.program.by == "actuators":
-        return f"(3.18) with T from ker Eᵀ; dependent: {dependent}; the actuators decide, no rule for the reaction is assumed"
-    bent = any(row.order >= 2 or (row.order == 1 and not row.affine) for row in r.given.values() if row.kind == "program")
+        return f"(3.18) with T from ker Eᵀ; dependent: {dependent}; no rule for the reaction is assumed"
+    bent = any(
+        row.order >= 2 or (row.order == 1 and not row.affine) for row in r.given.values() if row.kind == "program"
+    )
     rule = "the generalised Chetaev rule, a postulate at this order" if bent else "d'Alembert's principle"
     return f"(3.18) with T from ker G; dependent: {dependent}; under {rule}"
 

@@ -150,7 +150,9 @@ def decoupling(mechanism, rows, material, points):
     rest = ca.substitute(mechanism.balance, acceleration, ca.SX.zeros(q.n))
     second = ca.vertcat(*(q.derivatives([row.expression], 2 - row.order)[-1][0] for row in material))
     second = ca.substitute(second, acceleration, ca.SX.zeros(q.n)) if material else ca.SX(0, 1)
-    moves = plant_accelerations(mechanism, material, mechanism.E, ca.SX.zeros(len(material), mechanism.E.shape[1]), points)
+    moves = plant_accelerations(
+        mechanism, material, mechanism.E, ca.SX.zeros(len(material), mechanism.E.shape[1]), points
+    )
     drift = plant_accelerations(mechanism, material, -rest, -second, points)
     result = []
     for row in rows:

@@ -71,7 +71,9 @@ def _step(q, rows, numbers, context, starts=None):
     support, weights = dependence(q, [rows[a] for a in order], numbers[order])
     support = [order[i] for i in support]
     top = max(rows[a].order for a in support)
-    candidates = [(rows[a].kind == "dynamics", w, a) for a, w in zip(support, weights, strict=True) if rows[a].order == top]
+    candidates = [
+        (rows[a].kind == "dynamics", w, a) for a, w in zip(support, weights, strict=True) if rows[a].order == top
+    ]
     b = max(candidates)[2]
     _require_affine(rows, support, top)
     others = [a for a in support if a != b]
@@ -155,7 +157,7 @@ def _dependent(row, points, names, kinds, story):
             rows=names,
         )
     return SpecificationError(
-        f"The constraints {what} contradict each other: the combination {story} depends on nothing but t and is not zero.",
+        f"The constraints {what} contradict each other: the combination {story} depends on t alone and is not zero.",
         "Constraints have a common solution.",
         do=f"Correct one of {what}.",
         rows=names,

@@ -127,7 +127,9 @@ class Switches:
                     continue
                 for _ in range(60):
                     middle = (low + high) / 2
-                    low, high = (middle, high) if np.sign(sides(np.array([middle]))[s][0]) == np.sign(g[i]) else (low, middle)
+                    low, high = (
+                        (middle, high) if np.sign(sides(np.array([middle]))[s][0]) == np.sign(g[i]) else (low, middle)
+                    )
                 found.add(float((low + high) / 2))
         return found
 

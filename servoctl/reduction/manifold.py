@@ -112,7 +112,9 @@ class Flow:
         for order in sorted({order for _, order in rows if order <= level}):
             members = [a for a, (_, o) in enumerate(rows) if o == order]
             expressions = [rows[a][0] for a in members]
-            parts = [ca.jacobian(ca.vertcat(*expressions), ca.vertcat(*q.gamma(m) if m else q)) for m in range(order + 1)]
+            parts = [
+                ca.jacobian(ca.vertcat(*expressions), ca.vertcat(*q.gamma(m) if m else q)) for m in range(order + 1)
+            ]
             self.groups.append(self._tape(members, order, expressions, parts))
         self.bare = [self._tape(m, order, [rows[a][0] for a in m], []) for m, order, *_ in self.groups]
         if not q.plain:

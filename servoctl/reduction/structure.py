@@ -119,9 +119,11 @@ def structure(reduction, t=None, jets=None, values=None):
     points = reduction.points if t is None else _points(reduction, t, jets, values)
     locals_ = _locals(reduction, points)
     typical = _most_common(locals_)
-    rank_P = typical.decoupling_rank if max(typical.relative_degree) <= 2 else sum(
-        r <= 2 for r in typical.relative_degree
-    ) and typical.decoupling_rank
+    rank_P = (
+        typical.decoupling_rank
+        if max(typical.relative_degree) <= 2
+        else sum(r <= 2 for r in typical.relative_degree) and typical.decoupling_rank
+    )
     kind = "orthogonal" if rank_P == len(names) else "tangential" if rank_P == 0 else "mixed"
     margin = min(local.margin for local in locals_)
     at = tuple(zip(np.asarray(points.t, dtype=float).tolist(), locals_, strict=True))
@@ -189,7 +191,7 @@ def _at_depth(reduction, points, depth):
 
 
 def _input_jacobian(reduction, points, z, depth):
-    """J and the sizes of its entries: (k, N+1, k, N+1, points), residual i's coefficient j by input a's coefficient l."""
+    """J and the sizes of its entries, (k, N+1, k, N+1, points): coefficient j of residual i by coefficient l of input a."""
     mechanism, q = reduction.mechanism, reduction.mechanism.q
     k, level, n_points = len(reduction.program.residuals), depth + 2, len(points.t)
     B = reduction.realisation.B
@@ -201,7 +203,11 @@ def _input_jacobian(reduction, points, z, depth):
     u, b = series[: B.shape[1]], series[B.shape[1] :].reshape(B.shape[1], q.n, depth + 1, n_points)
     signals = {s.element_hash(): [u[i, j] for j in range(depth + 1)] for i, s in enumerate(inputs.elements())}
     balance = (mechanism.balance - B @ inputs).elements()
-    rows = [*((e, 2) for e in balance), *((r.expression, r.order) for r in material), *((r.expression, r.order) for r in program)]
+    rows = [
+        *((e, 2) for e in balance),
+        *((r.expression, r.order) for r in material),
+        *((r.expression, r.order) for r in program),
+    ]
     flow = Flow(q, rows, level, points, signals, real=np.longdouble)
     _, jacobian = flow(points.t, z)
     columns = slice(q.nq + q.n, None)

@@ -138,7 +138,9 @@ class Adaptive:
         longer = [*history[-2:], *relative]
         for k in range(1, len(longer) - 1):
             middle = np.abs(longer[k])
-            low = np.flatnonzero((middle < np.abs(longer[k - 1])) & (middle <= np.abs(longer[k + 1])) & (middle < DEGRADED))
+            low = np.flatnonzero(
+                (middle < np.abs(longer[k - 1])) & (middle <= np.abs(longer[k + 1])) & (middle < DEGRADED)
+            )
             for i in low:
                 where, value = self._minimum(i, instants, dense, old[0], t)
                 if value < self.watch.bounce(where, dense(where)):

@@ -21,7 +21,11 @@ class Poles:
     values: object
 
     def __str__(self):
-        return f"poles at {-1 / self.values:g} 1/s" if isinstance(self.values, float) else f"poles of {', '.join(self.values)}"
+        return (
+            f"poles at {-1 / self.values:g} 1/s"
+            if isinstance(self.values, float)
+            else f"poles of {', '.join(self.values)}"
+        )
 
     def coefficients(self, model):
         """The coefficients c_0 .. c_(ρ-1) of each row's error dynamics, in the order of the model's pole inputs."""
@@ -163,7 +167,9 @@ class Projector:
         if len(rows):
             try:
                 root = np.linalg.cholesky(mass)
-                step = np.linalg.solve(root.T, np.linalg.lstsq(np.linalg.solve(root, rows.T).T, -values[own], rcond=None)[0])
+                step = np.linalg.solve(
+                    root.T, np.linalg.lstsq(np.linalg.solve(root, rows.T).T, -values[own], rcond=None)[0]
+                )
             except np.linalg.LinAlgError:  # masses that vanish where material constraints hold
                 step = np.linalg.lstsq(rows, -values[own], rcond=None)[0]
             change += frame @ step if level == 0 else step

@@ -62,6 +62,7 @@ class Progress:
         self.since, self.bar, self.done = time.monotonic(), None, 0.0
 
     def __call__(self, t):
+        """Show that the work has come to t [s]."""
         if not self.wanted:
             return
         if self.bar is None:
@@ -69,7 +70,9 @@ class Progress:
                 return
             from tqdm import tqdm
 
-            self.bar = tqdm(total=self.total, unit="s", desc="simulate", bar_format="{l_bar}{bar}| {n:.3g}/{total:.3g} s")
+            self.bar = tqdm(
+                total=self.total, unit="s", desc="simulate", bar_format="{l_bar}{bar}| {n:.3g}/{total:.3g} s"
+            )
         self.bar.update(abs(t - self.t0) - self.done)
         self.done = abs(t - self.t0)
 

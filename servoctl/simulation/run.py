@@ -10,6 +10,7 @@ from servoctl.errors import ServoError, SpecificationError, unknown
 
 STENCIL = 9  # samples of the polynomial through which an extremum is refined: error of order h^9
 FORMAT = 1
+TOLD = ("method", "drift", "counters", "success", "status", "message", "knots")  # what a file keeps besides arrays
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,11 +97,8 @@ class Run:
         -------
         (nq + n,) array
         """
-        if self.model is None:
-            raise SpecificationError(
-                "A loaded run knows its samples only.", "Interpolation needs the model.", do="Take a column of run.jets."
-            )
-        return self.at(t)[: self.model.nq + self.model.n]
+        jets = self.at(t)
+        return jets[: self.model.nq + self.model.n]
 
     def at(self, t):
         """The jets Z at an instant (n_z,), between samples by Hermite interpolation of all derivatives.
@@ -115,6 +113,12 @@ class Run:
             raise SpecificationError(
                 f"t = {t:g} s was asked for.", f"The run covers {low:g} to {high:g} s.", do="Ask for a time within."
             )
+        if self.model is None:
+            raise SpecificationError(
+                "A loaded run knows its samples only.",
+                "Interpolation needs the model.",
+                do="Take a column of run.jets.",
+            )
         i = int(np.argmin(np.abs(self.t - t)))
         if abs(self.t[i] - t) < 1e-13 * max(1.0, high - low) or len(self.t) == 1:
             return self.jets[:, i].copy()
@@ -126,18 +130,16 @@ class Run:
         from scipy.interpolate import BPoly
 
         model, ends = self.model, [self.t[i], self.t[j]]
-        nq, n = (model.nq, model.n) if model is not None else (len(self.jets), len(self.jets))
+        nq, n = model.nq, model.n
         top = (len(self.jets) - nq) // n
         levels = [self.jets[nq + k * n : nq + (k + 1) * n, [i, j]] for k in range(top)]
-        rates = levels if nq == n and "dq" not in self.stored and self._plain() else self._coordinate_rates([i, j])
+        plain = "coordinate_rates" not in model.signal_groups.values()
+        rates = levels if plain else self._coordinate_rates([i, j])
         q = BPoly.from_derivatives(ends, np.stack([self.jets[:nq, [i, j]], *rates], axis=1).transpose(2, 1, 0))
-        w = BPoly.from_derivatives(ends, np.stack(levels, axis=1).transpose(2, 1, 0))
-        if self._plain():
+        if plain:
             return np.concatenate([q(t, nu=k) for k in range(top + 1)])
+        w = BPoly.from_derivatives(ends, np.stack(levels, axis=1).transpose(2, 1, 0))
         return np.concatenate([q(t), *(w(t, nu=k) for k in range(top))])
-
-    def _plain(self):
-        return self.model is None or not any(kind == "coordinate_rates" for kind in self.model.signal_groups.values())
 
     def _coordinate_rates(self, columns):
         _, f = self.model.signals("coordinate_rates")
@@ -162,7 +164,11 @@ class Run:
     def _refined(self, values, sign):
         k = int(np.argmax(sign * values))
         best = (float(self.t[k]), float(values[k]))
-        edges = [self.t[0], *[x for x in self.knots if min(self.t[0], self.t[-1]) < x < max(self.t[0], self.t[-1])], self.t[-1]]
+        edges = [
+            self.t[0],
+            *[x for x in self.knots if min(self.t[0], self.t[-1]) < x < max(self.t[0], self.t[-1])],
+            self.t[-1],
+        ]
         for a, b in zip(edges[:-1], edges[1:], strict=True):
             inside = np.flatnonzero((self.t >= min(a, b)) & (self.t <= max(a, b)))
             if k not in inside or len(inside) < 4:
@@ -202,11 +208,8 @@ class Run:
         path = Path(path)
         path = path if path.suffix == ".npz" else path.with_name(path.name + ".npz")
         signals = {name: self[name] for name in self.names if name not in self.jet_names}
-        meta = {
-            "format": FORMAT, "jet_names": self.jet_names, "signals": list(signals), "residuals": list(self.residual),
-            "method": self.method, "drift": self.drift, "counters": self.counters, "success": self.success,
-            "status": self.status, "message": self.message, "knots": list(self.knots),
-        }  # fmt: skip
+        meta = {name: getattr(self, name) for name in TOLD} | {"format": FORMAT, "jet_names": self.jet_names}
+        meta |= {"signals": list(signals), "residuals": list(self.residual)}
         arrays = {f"signal_{i}": value for i, value in enumerate(signals.values())}
         arrays |= {f"residual_{i}": self.residual[name] for i, name in enumerate(self.residual)}
         try:
@@ -311,11 +314,12 @@ def load(path):
             meta = json.loads(str(data["meta"]))
             signals = {name: data[f"signal_{i}"] for i, name in enumerate(meta["signals"])}
             residuals = {name: data[f"residual_{i}"] for i, name in enumerate(meta["residuals"])}
-            return Run(
-                data["t"], data["jets"], tuple(meta["jet_names"]), None, meta["method"], meta["drift"], meta["counters"],
-                meta["success"], meta["status"], meta["message"], tuple(meta["knots"]), (), signals, residuals,
-            )  # fmt: skip
+            told = {name: meta[name] for name in TOLD} | {"knots": tuple(meta["knots"])}
+            names = tuple(meta["jet_names"])
+            return Run(data["t"], data["jets"], names, stored=signals, stored_residual=residuals, **told)
     except (OSError, KeyError, ValueError) as error:
         raise ServoError(
-            f"{path} cannot be read as a run: {error}.", "A run is an npz file written by Run.save.", do="Check the path."
+            f"{path} cannot be read as a run: {error}.",
+            "A run is an npz file written by Run.save.",
+            do="Check the path.",
         ) from error

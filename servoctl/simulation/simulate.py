@@ -202,5 +202,7 @@ def _step(step, t0, t1):
     if step is None:
         return abs(t1 - t0) / 2000
     if not (isinstance(step, (int, float)) and np.isfinite(step) and step > 0):
-        raise SpecificationError(f"step={step!r} was given.", "A step is a positive number of seconds.", do="Give 1e-3.")
+        raise SpecificationError(
+            f"step={step!r} was given.", "A step is a positive number of seconds.", do="Give 1e-3."
+        )
     return float(step)

@@ -108,7 +108,13 @@ def verify(model, run, segments=20):
         numbers[f"residual {name}"] = _relative_residual(model, run, name, good)
     if not run.success:
         notes.append("the run did not reach its end: next to a singularity errors grow")
-    limits = {"acceleration": ACCELERATION if model.reduction.top == 2 else INTEGRATED, "segments": SEGMENT, "power": POWER, "energy": ENERGY, "multiplier form": FORM}
+    limits = {
+        "acceleration": ACCELERATION if model.reduction.top == 2 else INTEGRATED,
+        "segments": SEGMENT,
+        "power": POWER,
+        "energy": ENERGY,
+        "multiplier form": FORM,
+    }
     limits |= {key: RESIDUAL for key in numbers if key.startswith("residual ")}
     failures = tuple(key for key, limit in limits.items() if not numbers.get(key, 0.0) <= limit)
     return Verification(numbers, failures, tuple(notes), limits)

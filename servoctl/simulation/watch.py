@@ -50,7 +50,7 @@ class Watch:
         return np.array(result)
 
     def rank_measure(self, t, x):
-        """The smallest equilibrated singular value of L and of B, relative to the best so far: the lesser of the two."""
+        """The smallest equilibrated singular value of L or of B, relative to the best so far."""
         self.largest = np.maximum(self.largest, np.abs(x))
         now = self._smallest(self._matrices(t, x))
         self.best = np.maximum(self.best, now)

@@ -22,7 +22,7 @@ class Mechanism:
     ----------
     q : Coordinates
     gibbs : SX, optional
-        Gibbs-Appell function S(t, q, γ', γ''), at most quadratic in γ'' (sums of `particle`, `rigid_body`, or one's own).
+        Gibbs-Appell function S(t, q, γ', γ''), at most quadratic in γ'' (`particle`, `rigid_body`, or one's own).
     potential : SX, optional
         Potential energy U(q, t) [J]; gives Γ = -Vᵀ ∂U/∂q.
     actuators : dict of str to SX or sequence, optional
@@ -167,7 +167,9 @@ class Mechanism:
             )  # fmt: skip
         if self._gibbs is not None and self._kinetic is not None:
             difference = ca.gradient(self._gibbs, acceleration) - self._lagrange()
-            wrong = [n for n, d in zip(self.q.jet_names(2), difference.elements(), strict=True) if not self.is_zero([d])]
+            wrong = [
+                n for n, d in zip(self.q.jet_names(2), difference.elements(), strict=True) if not self.is_zero([d])
+            ]
             if wrong:
                 raise SpecificationError(
                     f"The Gibbs function and the kinetic energy give different balances in {', '.join(wrong)}.",
@@ -321,4 +323,3 @@ def require_known(expression, mechanism, what):
                 do="Use the symbols of sv.coordinates and pass parameters=sv.parameters(...) to the mechanism.",
                 name=s.name(),
             )
-

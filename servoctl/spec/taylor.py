@@ -117,7 +117,11 @@ class Tape:
     def _read(self, function):
         work = {}
         for k in range(function.n_instructions()):
-            op, inputs, outputs = function.instruction_id(k), function.instruction_input(k), function.instruction_output(k)
+            op, inputs, outputs = (
+                function.instruction_id(k),
+                function.instruction_input(k),
+                function.instruction_output(k),
+            )
             if op == ca.OP_INPUT:
                 work[outputs[0]] = self.inputs[inputs[1]]
             elif op == ca.OP_OUTPUT:
