@@ -21,10 +21,13 @@ def main(argv=None):
     -------
     int
         0 done; 1 the motion stopped early, its verification failed, or files went to another folder than asked; 2 an
-        error, explained on stderr; 130 interrupted before there was a motion.
+        error, explained on stderr; 130 interrupted.
     """
     args = _parser().parse_args(argv)
     args.command_line = list(sys.argv[1:] if argv is None else argv)
+    for stream in (sys.stdout, sys.stderr):
+        if hasattr(stream, "reconfigure"):
+            stream.reconfigure(errors="replace")  # a terminal without Greek letters is no reason to lose a run
     try:
         return args.command(args)
     except ServoError as error:

@@ -15,7 +15,7 @@ STYLES = ("-", "--", ":", "-.")
 WIDTH = 10.0  # inches: 1000 px at matplotlib's 100 dpi
 FLOOR = 1e-18  # of residuals on a logarithmic scale, so that exact zeros are seen
 BINS = 100  # of time, in each of which a residual is drawn by its greatest magnitude: rounding stays a band
-LAST, UNBOUNDED = 0.01, 10.0  # a signal that grows tenfold in the last hundredth of a stopped run leaves the frame
+LAST, UNBOUNDED = 0.01, 2.0  # a signal that doubles its range in the last hundredth of a stopped run leaves the frame
 NEGLIGIBLE = 1e-9  # variation relative to the largest value of the same unit: rounding, not filled with it
 
 
@@ -333,10 +333,9 @@ def _frame(ax, run, names, largest):
     """Keep rounding from filling the panel, and what grows without bound before a stop from flattening the rest."""
     values = np.concatenate([run[name] for name in names])
     values = values[np.isfinite(values)]
-    least = NEGLIGIBLE * largest
-    if values.size and np.ptp(values) < least:
+    if values.size and np.ptp(values) < NEGLIGIBLE * largest:
         middle = (values.min() + values.max()) / 2
-        ax.set_ylim(middle - max(least, abs(middle) / 10), middle + max(least, abs(middle) / 10))
+        ax.set_ylim(middle - largest / 10, middle + largest / 10)
     if run.success or len(run.t) < 3:
         return
     before = np.abs(run.t[-1] - run.t) > LAST * abs(run.t[-1] - run.t[0])
@@ -350,8 +349,8 @@ def _extrema(run, name, units):
     if not np.all(np.isfinite(run[name])):
         return f"{name}: not finite at some instants"
     unit = _unit(name, units)
-    (t_low, low), (t_high, high) = run.extrema(name)
-    return f"{name}: {low:.6g} {unit} (t = {t_low:.4g} s) to {high:.6g} {unit} (t = {t_high:.4g} s)".replace("  ", " ")
+    low, high = (f"{value + 0.0:.6g} {unit}".strip() + f" (t = {t:.4g} s)" for t, value in run.extrema(name))
+    return f"{name}: {low} to {high}"
 
 
 def _instants(run, axes):

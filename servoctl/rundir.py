@@ -29,7 +29,7 @@ class Report:
         try:
             print(self.texts[-1], flush=True)
         except BrokenPipeError:  # a reader that left, such as head, does not end the computation
-            sys.stdout = open(os.devnull, "w")  # noqa: SIM115
+            sys.stdout = open(os.devnull, "w")
 
 
 def complain(*texts):

@@ -1,14 +1,17 @@
 """Figures of a run: what is drawn where, by default and by name, and that they can be read."""
 
+import os
 import struct
 import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
 from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
 
+import servoctl
 from servoctl import plots
 from servoctl.errors import NameUnknown, ServoError, SpecificationError
 from servoctl.simulation.run import Run
@@ -133,7 +136,8 @@ def test_axes_must_be_as_many_as_panels(run):
 
 
 def test_colours_are_for_every_colour_vision(run):
-    assert [to_hex(line.get_color()).upper() for line in lines(plots.signals(run, units=UNITS)[0])] == ["#0072B2", "#D55E00"]
+    drawn = lines(plots.signals(run, units=UNITS)[0])
+    assert [to_hex(line.get_color()).upper() for line in drawn] == ["#0072B2", "#D55E00"]
 
 
 def test_many_signals_are_told_apart():
@@ -146,8 +150,7 @@ def test_rounding_does_not_fill_a_panel(run):
     run.stored["winch"] = 1e-14 * np.sin(9 * T)
     run.stored["hoist"] = 981.0 + 1e-12 * np.sin(9 * T)
     axes = plots.actuation(run, names=["trolley", "winch", "hoist"], units=UNITS | {"winch": "N", "hoist": "N"})
-    assert np.ptp(axes[1].get_ylim()) > 1e-8
-    assert np.ptp(axes[2].get_ylim()) > 10.0
+    assert all(np.ptp(ax.get_ylim()) > 100.0 for ax in axes[1:])
 
 
 def test_coordinates_moved_by_quasi_velocities_are_recognised():
@@ -210,12 +213,9 @@ def test_residuals_tell_constraints_by_colour_and_levels_by_style(run):
 
 
 def test_residuals_of_one_level_and_of_high_levels():
-    labels = [
-        [text.get_text() for text in plots.residuals(a_run(residual={"c": np.full((n, len(T)), 1e-9)})).get_legend().get_texts()]
-        for n in (1, 6)
-    ]
-    assert labels[0] == ["c"]
-    assert labels[1][-2:] == ["4th derivative", "5th derivative"]
+    for levels, expected in ((1, ["c"]), (6, ["3rd derivative", "4th derivative", "5th derivative"])):
+        ax = plots.residuals(a_run(residual={"c": np.full((levels, len(T)), 1e-9)}))
+        assert [text.get_text() for text in ax.get_legend().get_texts()][-3:] == expected
 
 
 def test_a_given_axes_is_used(run):
@@ -251,8 +251,8 @@ def test_figures_without_actuation_and_residuals(tmp_path):
 
 
 def test_a_run_of_one_sample_is_drawn(tmp_path):
-    run = Run(np.zeros(1), np.ones((2, 1)), ("x", "dx"), stored={"f": np.ones(1)}, stored_residual={"X": np.zeros((2, 1))},
-              success=False, status=-1)  # fmt: skip
+    signals, rows = {"f": np.ones(1)}, {"X": np.zeros((2, 1))}
+    run = Run(np.zeros(1), np.ones((2, 1)), ("x", "dx"), success=False, status=-1, stored=signals, stored_residual=rows)
     assert len(plots.save_figures(run, tmp_path)) == 4
 
 
@@ -273,4 +273,5 @@ t = np.linspace(0, 1, 9)
 plots.save_figures(servoctl.Run(t, np.array([t, t]), ("x", "y")), {str(tmp_path)!r})
 assert "matplotlib.pyplot" not in sys.modules
 """
-    subprocess.run([sys.executable, "-c", script], check=True)
+    path = os.pathsep.join([str(Path(servoctl.__file__).parents[1]), os.environ.get("PYTHONPATH", "")])
+    subprocess.run([sys.executable, "-c", script], check=True, env={**os.environ, "PYTHONPATH": path})

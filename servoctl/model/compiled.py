@@ -19,10 +19,10 @@ from servoctl.model.interpreted import Interpreter, Workspace
 SCALAR_CALLS = 50
 GRID_POINTS = 200
 
-_OUTPUTS_PER_STATE = {"rk4": 1, "newton": 2}
+_OUTPUTS_PER_STATE = {"rk4": 1, "newton": 2, "taylor": 1}
 
 
-def compiled(f, name, loops=()):
+def compiled(f, name, loops=(), project=None):
     """Make a compiled function of an SX function.
 
     Parameters
@@ -31,8 +31,10 @@ def compiled(f, name, loops=()):
         SX function of t (scalar), x (n_x), p (n_p), all dense, with one dense column output y (n_y).
     name : str
         A C identifier.
-    loops : sequence of {"rk4", "newton"}
+    loops : sequence of {"rk4", "newton", "taylor"}
         The loops that will be called.
+    project : casadi.Function, optional
+        Change of x that restores invariants, of the same inputs (t, x, p); loops may call it after their steps.
 
     Returns
     -------
@@ -80,7 +82,7 @@ def compiled(f, name, loops=()):
                 name=name,
                 loop=loop,
             )
-    return Compiled(f, name, tuple(loops))
+    return Compiled(f, name, tuple(loops), project)
 
 
 class Compiled:
@@ -99,16 +101,17 @@ class Compiled:
         The loops it can run.
     """
 
-    def __init__(self, f, name, loops):
-        self.name, self.loops = name, loops
+    def __init__(self, f, name, loops, project=None):
+        self.name, self.loops, self._project = name, loops, project
         self.n_x, self.n_p, self.n_y = f.numel_in(1), f.numel_in(2), f.numel_out(0)
         self._f = f
         self._x_shape, self._p_shape = (self.n_x,), (self.n_p,)
-        self._evaluator = Interpreter(f)
+        self._evaluator = Interpreter(f, project)
         self._settled, self._text, self._calls, self._points = False, None, 0, 0
 
     def __reduce__(self):
-        return _restored, (self._f.serialize(), self.name, self.loops)
+        project = self._project and self._project.serialize()
+        return _restored, (self._f.serialize(), self.name, self.loops, project)
 
     def __repr__(self):
         how = "compiled" if self.backend == "c" else "evaluated by CasADi"
@@ -278,6 +281,51 @@ class Compiled:
         n, iterations = self._evaluator.newton(t, x0, p, float(tol), int(max_iter), x, y)
         return x[:, :n], y[:, :n], iterations
 
+    def taylor(self, t0, x0, t1, p, shape, rtol, atol, max_steps, project_every=0):
+        """Steps of the Taylor method; the outputs are coefficients of q (unless plain) and γ by index, then guards.
+
+        A step is as long as its last two terms stay below the tolerance at every level of the state.
+
+        Parameters
+        ----------
+        t0, t1 : float
+            Start and end [s].
+        x0 : (n_x,) array
+            State at t0, SI.
+        p : (n_p,) array
+            Parameters, SI.
+        shape : (nq, n, top, last, plain)
+            Numbers of coordinates and quasi-velocities, the order s̄, the highest index of coefficients, and whether
+            q' = γ'.
+        rtol, atol : float
+            Tolerance of each level of the state relative to its largest entry, and absolute.
+        max_steps : int
+            Number of steps at most.
+        project_every : int
+            Steps between projections; 0 for none.
+
+        Returns
+        -------
+        t : (S + 1,) array
+            Starts of the steps, and where the last one ended [s]; short of t1 where a step vanishes.
+        x : (n_x, S + 1) array
+            States there, SI.
+        y : (n_y, S) array
+            Outputs at the starts.
+
+        Raises
+        ------
+        SpecificationError
+            If the loop was not asked for or a shape is another.
+        """
+        self._settle_loop("taylor")
+        x0, p = self._array("x0", x0, self._x_shape), self._array("p", p, self._p_shape)
+        t = np.empty(max_steps + 1)
+        x, y = np.empty((max_steps + 1, self.n_x)), np.empty((max_steps + 1, self.n_y))
+        every = project_every if self._project is not None else 0
+        n = self._evaluator.taylor(float(t0), x0, float(t1), p, shape, rtol, atol, every, max_steps, t, x, y)
+        return t[: n + 1], x[: n + 1].T, y[:n].T
+
     def _settle_loop(self, loop):
         if loop not in self.loops:
             raise SpecificationError(
@@ -294,7 +342,7 @@ class Compiled:
         if self._settled or (self._text is not None and not build):
             return
         symbol = f"servoctl_{self.name}"
-        text = self._text or emit.emit(self._f, symbol, self.loops)
+        text = self._text or emit.emit(self._f, symbol, self.loops, project=self._project)
         library = compiler.library(text, build)
         if library is not None:
             self._evaluator = _Library(library, symbol, self.n_x, self.n_p, self.n_y)
@@ -314,8 +362,9 @@ class Compiled:
         return array
 
 
-def _restored(serialized, name, loops):
-    return Compiled(ca.Function.deserialize(serialized), name, loops)
+def _restored(serialized, name, loops, project):
+    project = project and ca.Function.deserialize(project)
+    return Compiled(ca.Function.deserialize(serialized), name, loops, project)
 
 
 class _Library:
@@ -349,6 +398,13 @@ class _Library:
             _pointer(states),
             _pointer(guards),
         )
+
+    def taylor(self, t0, x0, t1, p, shape, rtol, atol, every, max_steps, t, x, y):
+        run = self._library[f"{self._symbol}_taylor"]
+        run.restype = ctypes.c_int64
+        return run(ctypes.c_double(t0), _pointer(x0), ctypes.c_double(t1), _pointer(p), *map(ctypes.c_int64, shape),
+                   ctypes.c_double(rtol), ctypes.c_double(atol), ctypes.c_int64(every), ctypes.c_int64(max_steps),
+                   _pointer(t), _pointer(x), _pointer(y))
 
     def newton(self, t, x0, p, tol, max_iter, x, y):
         run, count = self._library[f"{self._symbol}_newton"], ctypes.c_int64()

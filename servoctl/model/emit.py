@@ -217,7 +217,98 @@ int64_t NAME_newton(int64_t n, const double *t, const double *x0, const double *
 }
 """
 
-LOOPS = {"rk4": _RK4, "newton": _NEWTON}
+_TAYLOR = """
+/* The jet of level j a time h after the expansion: sum over k of k!/(k - j)! c_[k] h^(k - j); c holds `size` numbers for
+   each k = 1 .. last, `now` the value itself for j = 0. */
+static void NAME_jet(const double *c, int64_t size, int64_t last, int64_t j, const double *now, double h, double *jet)
+{
+    for (int64_t i = 0; i < size; i++) {
+        double sum = 0;
+        for (int64_t k = last; k >= (j ? j : 1); k--) {
+            double falling = 1;
+            for (int64_t m = 0; m < j; m++) falling *= (double)(k - m);
+            sum = sum * h + falling * c[(k - 1) * size + i];
+        }
+        jet[i] = j ? sum : now[i] + sum * h;
+    }
+}
+
+static double NAME_largest(const double *v, int64_t n)
+{
+    double largest = 0;
+    for (int64_t i = 0; i < n; i++) if (!(fabs(v[i]) <= largest)) largest = fabs(v[i]);
+    return largest;
+}
+
+/* The step whose last two terms stay below the tolerance at every level of the state. */
+static double NAME_length(const double *x, const double *c, int64_t nq, int64_t n, int64_t top, int64_t last,
+                          double rtol, double atol)
+{
+    double h = INFINITY;
+    for (int64_t j = 0; j < top; j++) {
+        const double scale = atol + rtol * (j ? NAME_largest(x + nq + (j - 1) * n, n) : NAME_largest(x, nq));
+        for (int64_t k = last - 1; k <= last; k++) {
+            double falling = 1;
+            for (int64_t m = 0; m < j; m++) falling *= (double)(k - m);
+            const double term = falling * NAME_largest(c + (k - 1) * n, n);
+            if (!isfinite(term)) return 0;
+            if (term > 0) h = fmin(h, pow(scale / term, 1.0 / (double)(k - j)));
+        }
+    }
+    return h;
+}
+
+/* Steps of the Taylor method towards t1. y holds the coefficients of q (unless plain), those of gamma, and guards. The
+   logs hold a row for each step: its start, its state, its coefficients and guards; one row more for the end. Returns
+   the number of steps, at most max_steps; fewer without reaching t1 where a step vanishes or is not finite. */
+int64_t NAME_taylor(double t0, const double *x0, double t1, const double *p, int64_t nq, int64_t n, int64_t top,
+                    int64_t last, int64_t plain, double rtol, double atol, int64_t project_every, int64_t max_steps,
+                    double *t_log, double *x_log, double *y_log)
+{
+    double x[NAME_nx + 1], y[NAME_ny + 1], d[NAME_nx + 1], t = t0;
+    for (int64_t i = 0; i < NAME_nx; i++) x[i] = x0[i];
+    for (int64_t step = 0; ; step++) {
+        t_log[step] = t;
+        for (int64_t i = 0; i < NAME_nx; i++) x_log[step * NAME_nx + i] = x[i];
+        if (step == max_steps || t == t1) return step;
+        NAME(t, x, p, y);
+        for (int64_t i = 0; i < NAME_ny; i++) y_log[step * NAME_ny + i] = y[i];
+        const double *c = y + (plain ? 0 : nq * last);
+        double h = NAME_length(x, c, nq, n, top, last, rtol, atol);
+        if (!plain) h = fmin(h, NAME_length(x, y, nq, nq, 1, last, rtol, atol));
+        if (!(h > 1e-13 * (1 + fabs(t)))) return step;
+        const int ends = h >= fabs(t1 - t) * (1 - 1e-12);
+        const double signed_h = ends ? t1 - t : t1 > t ? h : -h;
+        NAME_jet(y, nq, last, 0, x, signed_h, d);
+        for (int64_t j = 1; j < top; j++) NAME_jet(c, n, last, j, x, signed_h, d + nq + (j - 1) * n);
+        for (int64_t i = 0; i < NAME_nx; i++) x[i] = d[i];
+        t = ends ? t1 : t + signed_h;
+        for (int64_t i = 0; i < NAME_nx; i++) if (!isfinite(x[i])) return step;
+        if (project_every && (step + 1) % project_every == 0) NAME_PROJECT(t, x, p);
+    }
+}
+"""
+
+_PROJECTION = """
+/* Newton's iteration of the projection onto the invariants, level by level within each correction. */
+static void NAME_restore(double t, double *x, const double *p)
+{
+    double d[NAME_nx + 1];
+    for (int64_t iteration = 0; iteration < 6; iteration++) {
+        double largest = 0;
+        NAME_project(t, x, p, d);
+        for (int64_t i = 0; i < NAME_nx; i++) {
+            const double e = fabs(d[i]) / (1 + fabs(x[i]));
+            if (!isfinite(e)) return;
+            if (e > largest) largest = e;
+        }
+        for (int64_t i = 0; i < NAME_nx; i++) x[i] += d[i];
+        if (largest <= ROUNDING) return;
+    }
+}
+"""
+
+LOOPS = {"rk4": _RK4, "newton": _NEWTON, "taylor": _TAYLOR}
 
 
 def operations(f):
@@ -236,7 +327,7 @@ def operations(f):
     return sum(f.instruction_id(k) not in _NOT_ARITHMETIC for k in range(f.n_instructions()))
 
 
-def emit(f, name, loops=(), chunk=CHUNK):
+def emit(f, name, loops=(), chunk=CHUNK, project=None):
     """C translation unit of a function and of the loops over it.
 
     It defines ``void name(double t, const double *x, const double *p, double *y)`` (``y`` overlaps no input),
@@ -252,6 +343,8 @@ def emit(f, name, loops=(), chunk=CHUNK):
         Drivers to append.
     chunk : int
         Largest number of statements in one C function.
+    project : casadi.Function, optional
+        Change of x (n_x) that restores invariants, of the same inputs; loops may call it after their steps.
 
     Returns
     -------
@@ -268,10 +361,11 @@ def emit(f, name, loops=(), chunk=CHUNK):
     for loop in loops:
         if loop not in LOOPS:
             raise unknown(loop, LOOPS, "loop")
-    statements = _statements(f)
-    chunks = [statements[k : k + chunk] for k in range(0, len(statements), chunk)]
-    body = _single(name, statements) if len(chunks) <= 1 else _chunked(name, chunks)
-    drivers = "".join((_GRID, *(LOOPS[loop] for loop in LOOPS if loop in loops)))
+    body = _function(f, name, chunk)
+    if project is not None:
+        body += _function(project, f"{name}_project", chunk)
+    drivers = "".join((_GRID, _PROJECTION if project else "", *(LOOPS[loop] for loop in LOOPS if loop in loops)))
+    drivers = drivers.replace("NAME_PROJECT(t, x, p)", "NAME_restore(t, x, p)" if project else "(void)0")
     for key, value in {
         "N_X": f.numel_in(1),
         "N_P": f.numel_in(2),
@@ -282,6 +376,13 @@ def emit(f, name, loops=(), chunk=CHUNK):
     }.items():
         drivers = drivers.replace(key, str(value))
     return _PRELUDE + (_ERFINV if "v_erfinv" in body else "") + body + drivers
+
+
+def _function(f, name, chunk):
+    """The text of one C function, in chunks where it is long."""
+    statements = _statements(f)
+    chunks = [statements[k : k + chunk] for k in range(0, len(statements), chunk)]
+    return _single(name, statements) if len(chunks) <= 1 else _chunked(name, chunks)
 
 
 def _literal(value):

@@ -5,6 +5,7 @@ from functools import cached_property
 import casadi as ca
 
 from servoctl.errors import SpecificationError
+from servoctl.model.emit import operations
 from servoctl.reduction.appell import plant_accelerations
 from servoctl.reduction.elimination import eliminate
 from servoctl.reduction.ranks import clean
@@ -38,6 +39,11 @@ class Equations:
             [level[0] for level in self.q.derivatives([row.expression], count)]
             for row, count in zip(self.r.rows, self.raised, strict=True)
         ]
+
+    @cached_property
+    def row_operations(self):
+        """Operations of the rows ψ themselves."""
+        return operations(self.function("rows", self.jets, [row.expression for row in self.r.rows]))
 
     def function(self, name, x, outputs, extra=None):
         """An SX function of (t, x, p) with one dense column."""
@@ -129,6 +135,33 @@ class Equations:
         mass = ca.substitute(self.r.mechanism.mass, ca.vertcat(*self.q.gamma(2)), ca.SX.zeros(self.q.n))
         frame = ca.vec(ca.densify(self.q.V))
         return self.function("metric", self.state, [ca.vec(ca.densify(mass)), frame])
+
+    def project(self):
+        """The least change of the state in the metric M (δq = V δγ) that restores the invariants, level by level."""
+        r, q, changes = self.r, self.q, []
+        mass = r.mechanism.mass
+        for level in range(self.top):
+            rows = [a for a, row in enumerate(r.rows) if row.order <= level]
+            values = ca.vertcat(*(self.levels[a][level - r.rows[a].order] for a in rows))
+            change = ca.SX.zeros(q.n)
+            if rows:
+                J = ca.vertcat(*(gradient(q, r.rows[a]) for a in rows))
+                saddle = ca.vertcat(ca.horzcat(mass, J.T), ca.horzcat(J, ca.SX.zeros(len(rows), len(rows))))
+                numbers = clean(*r.points.matrix(saddle))
+                change = eliminate(saddle, ca.vertcat(ca.SX.zeros(q.n), -values), numbers)[0][: q.n]
+            if level == 0 and not q.plain:
+                change = q.V @ change + self._restore_kinematics()
+            changes.append(change)
+        return self.function("project", self.state, changes, ca.SX.sym("t_branch"))  # as "taylor", beside which it runs
+
+    def _restore_kinematics(self):
+        """The least change of q that restores the kinematics' own invariants."""
+        q = self.q
+        if not q.invariants:
+            return ca.SX.zeros(q.nq)
+        c = ca.vertcat(*q.invariants.values())
+        J = ca.jacobian(c, ca.vertcat(*q))
+        return J.T @ eliminate(J @ J.T, -c, clean(*self.r.points.matrix(J @ J.T)))[0]
 
     def matrices(self):
         """L and Bᵀ, column by column, and which rows they have: what must keep its rank."""

@@ -27,8 +27,8 @@ class Interpreter:
 
     backend = "casadi"
 
-    def __init__(self, f):
-        self._f, self._n_x = f, f.numel_in(1)
+    def __init__(self, f, project=None):
+        self._f, self._n_x, self._project = f, f.numel_in(1), project
         self.workspace = Workspace(self._n_x, f.numel_in(2), f.numel_out(0), self._connect)
 
     def _connect(self, row, parts):
@@ -69,6 +69,42 @@ class Interpreter:
                 x = x + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
         return column - 1
 
+    @np.errstate(all="ignore")
+    def taylor(self, t0, x0, t1, p, shape, rtol, atol, every, max_steps, t, x, y):
+        """Fill the rows of t, x and y as `Compiled.taylor` says; return the number of steps."""
+        nq, n, top, last, plain = shape
+        now, state = t0, x0
+        for step in range(max_steps + 1):
+            t[step], x[step] = now, state
+            if step == max_steps or now == t1:
+                return step
+            y[step] = self._value(now, state, p)
+            own = y[step, : nq * last].reshape(last, nq)
+            c = own if plain else y[step, nq * last : (nq + n) * last].reshape(last, n)
+            h = step_length(state, c, (nq, n, top), rtol, atol)
+            h = h if plain else min(h, step_length(state, own, (nq, nq, 1), rtol, atol))
+            if not h > 1e-13 * (1 + abs(now)):
+                return step
+            ends = h >= abs(t1 - now) * (1 - 1e-12)
+            h = t1 - now if ends else np.copysign(h, t1 - now)
+            parts = [state[:nq] + jet(own, 0, h), *(jet(c, j, h) for j in range(1, top))]
+            state, now = np.concatenate(parts), t1 if ends else now + h
+            if not np.isfinite(state).all():
+                return step
+            if every and (step + 1) % every == 0:
+                state = self._restore(now, state, p)
+        return max_steps
+
+    def _restore(self, t, x, p):
+        for _ in range(6):
+            d = np.asarray(self._project(t, x, p)).ravel()
+            if not np.isfinite(d).all():
+                return x
+            largest, x = np.max(np.abs(d) / (1 + np.abs(x)), initial=0.0), x + d
+            if largest <= emit.ROUNDING:
+                break
+        return x
+
     def newton(self, t, x0, p, tol, max_iter, x, y):
         """Fill the columns of x and y as `Compiled.newton` says; return the points solved and the evaluations made."""
         solve = _Newton(self._value, p, self._n_x, tol, max_iter)
@@ -79,6 +115,32 @@ class Interpreter:
                 return k, solve.count
             x[:, k], y[:, k] = point
         return t.size, solve.count
+
+
+def jet(c, j, h):
+    """What Taylor coefficients c (last, n) of index 1 .. last add to the j-th derivative a time h later, (n,)."""
+    k = np.arange(1, len(c) + 1)
+    falling = np.prod([k - m for m in range(j)], axis=0) if j else np.ones(len(c))
+    total = np.zeros(c.shape[1])
+    for i in reversed(range(max(j, 1) - 1, len(c))):
+        total = total * h + falling[i] * c[i]
+    return total if j else total * h
+
+
+def step_length(x, c, shape, rtol, atol):
+    """The step whose last two terms stay below the tolerance at every level of the state."""
+    nq, n, top = shape
+    h, last = np.inf, len(c)
+    for j in range(top):
+        level = x[:nq] if j == 0 else x[nq + (j - 1) * n : nq + j * n]
+        scale = atol + rtol * np.max(np.abs(level), initial=0.0)
+        for k in (last - 1, last):
+            term = np.prod([k - m for m in range(j)]) * np.max(np.abs(c[k - 1]), initial=0.0)
+            if not np.isfinite(term):
+                return 0.0
+            if term > 0:
+                h = min(h, (scale / term) ** (1.0 / (k - j)))
+    return h
 
 
 class _Newton:

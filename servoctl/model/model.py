@@ -7,6 +7,7 @@ import numpy as np
 from servoctl.errors import SpecificationError, unknown
 from servoctl.model.compiled import compiled
 from servoctl.model.equations import Equations, gradient_jets, leading_names
+from servoctl.model.series import taylor_coefficients
 from servoctl.reduction.knots import require_smooth
 from servoctl.reduction.reduce import reduce
 from servoctl.reduction.structure import structure
@@ -71,6 +72,14 @@ class Model:
         self.state_names = tuple(name for k in range(reduction.top) for name in q.jet_names(k))
         self.jet_names = (*self.state_names, *q.jet_names(reduction.top))
         self._functions = {} if shared is None else shared
+
+    def names_to(self, size):
+        """Names of the first `size` jets, beyond γ^(s̄) where asked for."""
+        q, names, k = self.reduction.mechanism.q, list(self.jet_names), self.reduction.top
+        while len(names) < size:
+            k += 1
+            names += q.jet_names(k)
+        return tuple(names[:size])
 
     def with_parameters(self, **changes):
         """The same model with other numbers; nothing is derived or compiled again.
@@ -213,6 +222,26 @@ class Model:
             self._functions[name] = compiled(f, name, loops)
         return self._functions[name]
 
+    def taylor(self, last):
+        """The compiled Taylor coefficients with index up to `last`, and the shape that its loop takes.
+
+        Parameters
+        ----------
+        last : int
+            Highest index κ of the coefficients γ_[κ].
+
+        Returns
+        -------
+        Compiled
+        (nq, n, top, last, plain)
+        """
+        e, q = self._equations, self.reduction.mechanism.q
+        key = f"taylor {last}"
+        if key not in self._functions:
+            f = taylor_coefficients(e, last)
+            self._functions[key] = compiled(f, f"taylor_{last}", ("taylor",), project=e.project())
+        return self._functions[key], (q.nq, q.n, e.top, last, int(q.plain))
+
     def signals(self, kind):
         """Names of a group of signals and the compiled function (t, Z, p) that computes them.
 
@@ -277,6 +306,10 @@ class Model:
     def gradient_jets(self, row):
         """Names of the jets on which a row's leading gradient depends."""
         return gradient_jets(self.reduction, row)
+
+    def row_operations(self):
+        """Operations of the rows ψ themselves, before anything is differentiated or compiled."""
+        return self._equations.row_operations
 
     def operations(self):
         """Operations of each function that has been built so far, by name."""

@@ -75,7 +75,5 @@ def _rule(r):
 
 
 def _functions(model):
-    built = model.operations()
-    if not built:
-        return "operations: no function built yet"
+    built = {"rows of the motion": model.row_operations(), **model.operations()}
     return "operations: " + ", ".join(f"{name} {count}" for name, count in built.items())

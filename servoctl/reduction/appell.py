@@ -41,6 +41,8 @@ class Realisation:
 
     def dynamics(self, balance):
         """Tᵀ r, one SX scalar per independent coordinate, and the pivots divided by."""
+        if not self.independent:
+            return [], []
         transposed = self.B.T
         a, pivots = eliminate(
             transposed[:, list(self.dependent)],

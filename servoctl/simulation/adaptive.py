@@ -5,7 +5,7 @@ import numpy as np
 from servoctl.errors import IntegrationStopped
 from servoctl.simulation.drift import Poles, Project, Projector
 from servoctl.simulation.motion import Motion, breakpoints, interruptible, sign_change
-from servoctl.simulation.watch import DEGRADED, NEGLIGIBLE, Watch
+from servoctl.simulation.watch import DEGRADED, NEGLIGIBLE, VANISHING, Watch
 
 METHODS = ("RK23", "RK45", "DOP853", "Radau", "BDF", "LSODA")
 ONE_STEP = ("RK23", "RK45", "DOP853", "Radau")
@@ -195,8 +195,9 @@ class Adaptive:
             )
 
     def _last(self, t, x):
-        """Record the last state that stands, whatever was asked for."""
-        self.motion.add(self.model, [t], x[:, None], self._top(t, x)[:, None])
+        """Record the last state that stands, whatever was asked for; not so near a singularity that γ^(s̄) is lost."""
+        if self.watch.rank_measure(t, x) > VANISHING:
+            self.motion.add(self.model, [t], x[:, None], self._top(t, x)[:, None])
 
     def _sample(self, t, dense, x):
         """Record the samples that are pending up to t."""

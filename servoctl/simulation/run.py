@@ -73,7 +73,7 @@ class Run:
         parts = []
         for first, end, model in self.variants or ((0, len(self.t), self.model),):
             names, f = model.signals(kind)
-            parts.append(f.grid(self.t[first:end], self.jets[:, first:end], model.parameters))
+            parts.append(f.grid(self.t[first:end], self.jets[: f.n_x, first:end], model.parameters))
         return names, np.concatenate(parts, axis=1)
 
     def variant(self, i):
@@ -143,7 +143,7 @@ class Run:
 
     def _coordinate_rates(self, columns):
         _, f = self.model.signals("coordinate_rates")
-        values = f.grid(self.t[columns], self.jets[:, columns], self.model.parameters)
+        values = f.grid(self.t[columns], self.jets[: f.n_x, columns], self.model.parameters)
         return [values[: self.model.nq], values[self.model.nq :]]
 
     def extrema(self, name):

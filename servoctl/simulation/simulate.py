@@ -7,17 +7,30 @@ import numpy as np
 from servoctl.errors import SpecificationError, unknown
 from servoctl.simulation.adaptive import METHODS, ONE_STEP, Adaptive
 from servoctl.simulation.algebraic import algebraic
-from servoctl.simulation.drift import Project, as_drift
+from servoctl.simulation.drift import Poles, Project, as_drift
 from servoctl.simulation.fixed import fixed_step
 from servoctl.simulation.motion import Progress
 from servoctl.simulation.run import Run
+from servoctl.simulation.series import SeriesMethod
 
 SAMPLES = 1001  # of a run unless t_eval says otherwise: smooth curves, and extrema refined to rounding
-ALL_METHODS = ("algebraic", "RK4", *METHODS)
+ALL_METHODS = ("algebraic", "Taylor", "RK4", *METHODS)
 
 
 def simulate(
-    model, start, t_span, method=None, *, drift=None, rtol=1e-9, atol=1e-11, step=None, t_eval=None, progress=None
+    model,
+    start,
+    t_span,
+    method=None,
+    *,
+    drift=None,
+    rtol=1e-9,
+    atol=1e-11,
+    step=None,
+    t_eval=None,
+    order=None,
+    jets=None,
+    progress=None,
 ):
     """Simulate the motion that a program prescribes.
 
@@ -30,9 +43,10 @@ def simulate(
         From `model.start`.
     t_span : (t0, t1)
         [s]; t1 < t0 runs backwards.
-    method : {"algebraic", "RK4", "DOP853", "RK45", "RK23", "Radau", "BDF", "LSODA"}, optional
+    method : {"algebraic", "Taylor", "RK4", "DOP853", "RK45", "RK23", "Radau", "BDF", "LSODA"}, optional
         Default: "algebraic" where the program determines the motion completely (Σ o_a = 0: a Newton solve at each
-        instant, no integration), else "DOP853". "RK4" is the compiled fixed-step method.
+        instant, no integration), else "DOP853". "Taylor" takes compiled series steps of high order, the most accurate
+        method; "RK4" is the compiled fixed-step method; the others are scipy's.
     drift : None, "project", float, `project(...)` or `poles(...)`, optional
         Treatment of constraint drift; a number is the time constant of the error dynamics [s].
 
@@ -44,6 +58,10 @@ def simulate(
         Step of "RK4" [s]; default (t1 - t0)/2000, shortened so that steps end at the knots of paths.
     t_eval : (N,) array, optional
         Times of the samples [s], within t_span. Default: 1001 equal intervals and the knots (all steps for "RK4").
+    order : int, optional
+        Order of "Taylor"; default: that of least work for rtol.
+    jets : int, optional
+        Highest derivative in the samples, for "Taylor": `run["d4theta"]`; default s̄.
     progress : bool, optional
         Show a progress bar; default: on a terminal, for work of more than a second.
 
@@ -62,7 +80,7 @@ def simulate(
     t0, t1 = _span(t_span)
     method = _method(model, method)
     drift = _drift(drift, method)
-    _refuse_idle(method, step)
+    _refuse_idle(method, step, order, jets)
     x0 = _state(model, start, t0)
     knots = model.require_smooth((min(t0, t1), max(t0, t1)))
     times = _times(t0, t1, t_eval, knots)
@@ -70,6 +88,8 @@ def simulate(
     try:
         if method == "algebraic":
             motion = algebraic(model, t0, x0, times, bar)
+        elif method == "Taylor":
+            motion = SeriesMethod(model, drift, rtol, atol, order, jets or 0, bar).run(t0, x0, t1, times, knots)
         elif method == "RK4":
             motion = fixed_step(model, drift, t0, x0, t1, _step(step, t0, t1), knots, bar)
         else:
@@ -91,7 +111,7 @@ def _finish(model, motion, method, drift, knots, span, wanted):
     else:
         status, message = 0, "finished"
     run = Run(
-        t, jets, model.jet_names, model, method, str(drift or ""), motion.counters, status == 0, status, message, knots,
+        t, jets, model.names_to(jets.shape[0]), model, method, str(drift or ""), motion.counters, status == 0, status, message, knots,
         tuple(variants),
     )  # fmt: skip
     if wanted is not None and method == "RK4":
@@ -148,6 +168,13 @@ def _drift(drift, method):
             nearest="drift=None, or an integrating method such as 'DOP853'.",
             do="Leave one of them out.",
         )
+    if isinstance(drift, Poles) and method == "Taylor":
+        raise SpecificationError(
+            f"drift={drift} was given with method='Taylor'.",
+            "The series are those of the undisturbed rows; error dynamics would need series of their own.",
+            nearest="drift='project', which keeps residuals at rounding.",
+            do="Project, or take another method.",
+        )
     if isinstance(drift, Project) and method in METHODS and method not in ONE_STEP:
         raise SpecificationError(
             f"drift={drift} was given with method={method!r}.",
@@ -158,14 +185,21 @@ def _drift(drift, method):
     return drift
 
 
-def _refuse_idle(method, step):
-    if step is not None and method != "RK4":
-        raise SpecificationError(
-            f"step={step!r} was given with method={method!r}.",
-            "Only the fixed-step method has a step.",
-            nearest="rtol and atol, or method='RK4'.",
-            do="Leave step out.",
-        )
+def _refuse_idle(method, step, order, jets):
+    """Refuse options that the method would not use: nothing asked for is ignored."""
+    for name, value, users in (("step", step, ("RK4",)), ("order", order, ("Taylor",)), ("jets", jets, ("Taylor",))):
+        if value is not None and method not in users:
+            raise SpecificationError(
+                f"{name}={value!r} was given with method={method!r}.",
+                f"Only {' and '.join(users)} use it.",
+                nearest=f"method={users[0]!r}.",
+                do=f"Leave {name} out.",
+            )
+    for name, value, low in (("order", order, 2), ("jets", jets, 1)):
+        if value is not None and not (isinstance(value, int) and low <= value <= 40):
+            raise SpecificationError(
+                f"{name}={value!r} was given.", f"It is a whole number from {low} to 40.", do="Give 12."
+            )
 
 
 def _state(model, start, t0):

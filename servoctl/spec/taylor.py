@@ -249,18 +249,29 @@ def _plus(a, b):
     return b if _is_zero(a) else a if _is_zero(b) else a + b
 
 
+def _inner_first(k):
+    """Indices 0..k of a product's terms, those with a coefficient k last: what precedes is known before it."""
+    return (*range(1, k), *sorted({0, k}))
+
+
 class Series:
     """A tape run on truncated power series, one coefficient at a time.
 
     `inputs[i]` is the list of coefficients of input i; before `advance()` computes coefficient k, each
-    must hold at least k + 1 entries. `outputs[i]` are the coefficients of output i so far.
+    must hold at least k + 1 entries. `outputs[i]` are the coefficients of output i so far. Branches are taken by
+    coefficient 0 of what is compared; `decided` may give other values for nodes, at which to take them.
     """
 
-    def __init__(self, tape, inputs):
+    def __init__(self, tape, inputs, decided=None):
         self.tape = tape
         self.inputs = inputs
         self.c = [[] for _ in tape.nodes]
         self.k = 0
+        self.decided = decided or {}
+
+    def _first(self, node):
+        """The value of a node by which branches are taken."""
+        return self.decided[node] if node in self.decided else self.c[node][0]
 
     @property
     def outputs(self):
@@ -298,7 +309,7 @@ class Series:
         if kind == "quad":
             return self._quadrature(node, k)
         if kind == "constant":
-            return apply(node.data, *(c[j][0] for j in node.args)) if k == 0 else 0.0
+            return apply(node.data, *(self._first(j) for j in node.args)) if k == 0 else 0.0
         a = c[node.args[0]]
         if kind == "neg":
             return 0.0 if _is_zero(a[k]) else -a[k]
@@ -317,28 +328,31 @@ class Series:
         if kind == "power":
             return self._constant_power(a, c[i], node.data, k)
         if kind == "fabs":
-            return select(a[0] >= 0, a[k], -a[k])
+            return select(self._first(node.args[0]) >= 0, a[k], -a[k])
         b = c[node.args[1]]
         if kind == "add":
             return _plus(a[k], b[k])
         if kind == "sub":
             return a[k] if _is_zero(b[k]) else _plus(a[k], -1.0 * b[k]) if _is_zero(a[k]) else a[k] - b[k]
         if kind == "mul":
-            return _dot((a[j], b[k - j]) for j in range(k + 1))
+            return _dot((a[j], b[k - j]) for j in _inner_first(k))
         if kind == "div":
             y = c[i]
-            rest = _plus(a[k], -1.0 * _dot((y[j], b[k - j]) for j in range(k)))
+            rest = _plus(a[k], -1.0 * _dot((y[j], b[k - j]) for j in (*range(1, k), *range(min(k, 1)))))
             return 0.0 if _is_zero(rest) else rest / b[0]
         if kind == "gate":
             return 0.0 if _is_zero(b[k]) else select(a[0] != 0, b[k], 0.0)
-        return select(a[0] <= b[0], *((a[k], b[k]) if kind == "fmin" else (b[k], a[k])))
+        first = self._first(node.args[0]) <= self._first(node.args[1])
+        return select(first, *((a[k], b[k]) if kind == "fmin" else (b[k], a[k])))
 
     @staticmethod
     def _square(a, k):
-        half = 2.0 * _dot((a[j], a[k - j]) for j in range((k + 1) // 2))
-        if k % 2 or _is_zero(a[k // 2]):
-            return half
-        return _plus(half, a[k // 2] * a[k // 2])
+        if k == 0:
+            return 0.0 if _is_zero(a[0]) else a[0] * a[0]
+        inner = 2.0 * _dot((a[j], a[k - j]) for j in range(1, (k + 1) // 2))
+        if k % 2 == 0 and not _is_zero(a[k // 2]):
+            inner = _plus(inner, a[k // 2] * a[k // 2])
+        return _plus(inner, 2.0 * _dot([(a[0], a[k])]))
 
     @staticmethod
     def _constant_power(a, y, exponent, k):

@@ -1,0 +1,370 @@
+"""The command line: what it leaves, what it says, and that nothing computed is lost."""
+
+import json
+import os
+import platform
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+
+import servoctl
+from servoctl.cli import main
+from servoctl.errors import IntegrationStopped
+from servoctl.mechanisms import gallery
+from servoctl.rundir import FILES
+
+FALL = '''"""A mass in a plane follows a path in x, and falls."""
+import servoctl as sv
+
+START = {"y": 0.0, "dy": 0.0}
+T_SPAN = (0.0, 1.0)
+UNITS = {"x": "m", "y": "m", "push": "N"}
+
+
+def scene():
+    p = sv.parameters(m=2.0, g=9.81)
+    q = sv.coordinates("x y")
+    x, y = q
+    S = sv.particle(q, p.m, x) + sv.particle(q, p.m, y)
+    path = sv.paths.rest_to_rest(q.t, 0.0, 1.0, duration=1.0, smoothness=2)
+    mechanism = sv.Mechanism(q, gibbs=S, potential=p.m * p.g * y, actuators={"push": x}, parameters=p)
+    return mechanism, sv.Program({"X": x - path})
+'''
+
+
+@pytest.fixture(autouse=True)
+def here(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", list(sys.path))
+    return tmp_path
+
+
+@pytest.fixture
+def fall(here):
+    (here / "fall.py").write_text(FALL)
+    return "fall.py"
+
+
+def process(*command):
+    """A process of its own, from any folder, whether servoctl is installed or not."""
+    path = os.pathsep.join([str(Path(servoctl.__file__).parents[1]), os.environ.get("PYTHONPATH", "")])
+    environment = {**os.environ, "PYTHONPATH": path}
+    return subprocess.run(command, check=True, capture_output=True, text=True, env=environment)
+
+
+def summary(folder):
+    return json.loads((folder / "summary.json").read_text(encoding="utf-8"))
+
+
+def words(text):
+    """The text without its line breaks."""
+    return " ".join(text.split())
+
+
+# --- the main job
+
+
+def test_run_leaves_numbers_figures_and_the_report(here, capsys):
+    assert main(["run", "overhead-crane"]) == 0
+    folder = here / "servoctl-runs" / "overhead-crane"
+    assert {f.name for f in folder.iterdir()} == set(FILES)
+    printed = capsys.readouterr().out
+    report = (folder / "report.txt").read_text(encoding="utf-8")
+    assert printed.startswith(report)
+    assert all(word in report for word in ("Model: x l theta", "State at t = 0 s", "Run: ", "Verification: passed"))
+    run = servoctl.load(folder / "run.npz")
+    assert run.success and run.t[-1] == 8.0
+
+    facts = summary(folder)
+    assert facts["scene"] == {
+        "name": "overhead-crane", "given": "overhead-crane", "description": gallery["overhead-crane"].description
+    }  # fmt: skip
+    assert facts["command"] == ["run", "overhead-crane"]
+    assert facts["parameters"] == {"m_trolley": 10.0, "m_hoist": 5.0, "m_load": 100.0, "g": 9.81}
+    assert (facts["t_span"], facts["method"], facts["free_initial_values"]) == ([0.0, 8.0], "algebraic", 0)
+    assert facts["structure"]["index"] == 5
+    assert facts["start"]["values"]["l"] == 4.0
+    assert facts["extrema"]["trolley"]["min"]["value"] == pytest.approx(-137.991607, abs=1e-6)
+    assert facts["extrema"]["trolley"]["max"]["t"] == pytest.approx(1.868, abs=1e-3)
+    assert facts["extrema"]["hoist"]["max"]["value"] == pytest.approx(-935.793762, abs=1e-6)
+    assert facts["extrema"]["tension"]["min"]["value"] == pytest.approx(938.008880, abs=1e-6)
+    assert set(facts["residuals"]) >= {"X", "Z"} and facts["residuals"]["X"]["worst"] < 1e-9
+    assert facts["verification"]["passed"] and facts["verification"]["numbers"]["acceleration"] < 1e-9
+    assert facts["versions"]["servoctl"] == servoctl.__version__
+    assert facts["versions"]["python"] == platform.python_version()
+    assert set(facts["versions"]) == {"servoctl", "casadi", "numpy", "scipy", "python"}
+
+
+def test_a_motion_that_stops_is_kept_drawn_and_explained(here, capsys):
+    assert main(["run", "appell-hamel-squared", "--out", "squared"]) == 1
+    out, err = capsys.readouterr()
+    assert "SingularProgram: The program is singular at t = 0.698" in words(out) and "'speed'" in out
+    assert "Verification: left out" in out
+    assert "ended early, at t = 0.698" in err
+    assert {f.name for f in (here / "squared").iterdir()} == set(FILES)
+    run = servoctl.load(here / "squared" / "run.npz")
+    assert not run.success and 0.69 < run.t[-1] < 0.7
+    assert summary(here / "squared")["status"] == -1
+    assert "SingularProgram" in (here / "squared" / "report.txt").read_text(encoding="utf-8")
+
+
+# --- a user's file
+
+
+def test_run_of_a_users_file(here, fall, capsys):
+    assert main(["run", fall, "--set", "m=3", "--hold", "dy=1.5", "--no-figures"]) == 0
+    folder = here / "servoctl-runs" / "fall"
+    assert {f.name for f in folder.iterdir()} == {"run.npz", "summary.json", "report.txt"}
+    facts = summary(folder)
+    assert facts["scene"]["description"] == "A mass in a plane follows a path in x, and falls."
+    assert facts["parameters"] == {"m": 3.0, "g": 9.81}
+    assert facts["start"]["values"]["dy"] == 1.5 and facts["start"]["held"] == ["y", "dy"]
+    assert servoctl.load(folder / "run.npz")["y"][-1] == pytest.approx(1.5 - 9.81 / 2, abs=1e-9)
+
+
+def test_a_guess_frees_what_the_scene_holds(here, fall):
+    assert main(["run", fall, "--guess", "y=0.5", "--no-figures", "--no-verify"]) == 0
+    start = summary(here / "servoctl-runs" / "fall")["start"]
+    assert start["held"] == ["dy"] and start["free"] == ["y"] and start["values"]["y"] == 0.5
+
+
+def test_a_file_may_import_its_neighbours(here, fall, capsys):
+    (here / "sub").mkdir()
+    (here / "sub" / "masses_of_fall.py").write_text("m = 4.0\n")
+    (here / "sub" / "other.py").write_text("import masses_of_fall\n" + FALL.replace("m=2.0", "m=masses_of_fall.m"))
+    assert main(["report", "sub/other.py"]) == 0
+    assert "m=4" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("text", "facts"),
+    [
+        ("x = 1\n\ny = 1 / 0\n", ["broken.py raised ZeroDivisionError: division by zero", "in line 3: y = 1 / 0"]),
+        ("def scene(:\n    pass\n", ["raised SyntaxError", "in line 1: def scene(:"]),
+        ("import no_such_module\n", ["ModuleNotFoundError: No module named 'no_such_module'", "in line 1"]),
+        ("import sys\nsys.exit(3)\n", ["raised SystemExit: 3", "in line 2"]),
+        ("def scene():\n    return none\n", ["NameError: name 'none' is not defined", "in line 2: return none"]),
+        ("def scen():\n    pass\n", ["broken.py defines no scene()", "The file defines scen()", "Define scene()"]),
+        ("scene = 3\n", ["broken.py defines no scene()"]),
+        ("def scene():\n    return 1\n", ["scene() of broken.py returned int", "return mechanism, program"]),
+        ("def scene():\n    return 'a', 2\n", ["returned (str, int)", "a Mechanism and a Program"]),
+        ("START = {'x': 'a'}\ndef scene():\n    pass\n", ["START = {'x': 'a'}", 'the form {"theta": 0.1}']),
+        ("T_SPAN = 2.0\ndef scene():\n    pass\n", ["T_SPAN = 2.0", "(0.0, 2.0)"]),
+        ("UNITS = ['m']\ndef scene():\n    pass\n", ["UNITS = ['m']"]),
+        ("import servoctl as sv\ndef scene():\n    return sv.Program({}), 1\n",
+         ["at least one residual", "Raised in broken.py, line 3: return sv.Program({}), 1"]),
+    ],
+)  # fmt: skip
+def test_faults_in_a_users_file(here, capsys, text, facts):
+    (here / "broken.py").write_text(text)
+    assert main(["run", "broken.py"]) == 2
+    out, err = capsys.readouterr()
+    assert out == "" and "Traceback" not in err
+    assert all(fact in words(err) for fact in facts)
+    assert not (here / "servoctl-runs").exists()
+
+
+# --- bad input
+
+
+@pytest.mark.parametrize(
+    ("arguments", "facts"),
+    [
+        ("run overhed-crane", ["NameUnknown", "No scene is named 'overhed-crane'", "nearest is 'overhead-crane'"]),
+        ("report overhead_crane", ["nearest is 'overhead-crane'"]),
+        ("run fall", ["There is a file fall.py"]),
+        ("run fal.py", ["There is no file fal.py", "The nearest is fall.py"]),
+        ("run missing/fall.py", ["There is no file missing/fall.py"]),
+        ("run notes.txt", ["notes.txt exists", "ends in .py"]),
+        ("report empty", ["empty has no report.txt"]),
+        ("run fall.py --set mm=3", ["No parameter is named 'mm'", "nearest is 'm'"]),
+        ("run fall.py --set m=nan", ["'m' is nan"]),
+        ("run fall.py --set m=3 --set m=4", ["--set m was given twice: 3 and 4"]),
+        ("run fall.py --hold ddy=3", ["No state is named 'ddy'", "nearest is 'dy'"]),
+        ("run fall.py --hold t=3", ["No state is named 't'"]),
+        ("run fall.py --guess z=3", ["No state is named 'z'"]),
+        ("run fall.py --hold y=3 --guess y=2", ["y is both held and guessed"]),
+        ("run fall.py --method Euler", ["No method is named 'Euler'"]),
+        ("run fall.py --step 0.1", ["step=0.1"]),
+        ("run fall.py --t-span 1 1", ["(1.0, 1.0)"]),
+    ],
+)
+def test_errors_are_told_without_a_traceback(here, fall, capsys, arguments, facts):
+    (here / "notes.txt").write_text("")
+    (here / "empty").mkdir()
+    assert main(arguments.split()) == 2
+    err = capsys.readouterr().err
+    assert all(fact in words(err) for fact in facts)
+    assert "Traceback" not in err and max(map(len, err.splitlines())) <= 120
+    assert not (here / "servoctl-runs").exists()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "fact"),
+    [
+        ("run fall.py --hold x", "'x' is not NAME=VALUE"),
+        ("run fall.py --set =3", "'=3' is not NAME=VALUE"),
+        ("run --hold y=1 fall.py", "the scene's name comes before such options"),
+        ("run fall.py --drift much", "'much' is not none, project or a time constant"),
+        ("run fall.py --samples 1", "'1' is not a whole number of at least 2"),
+        ("walk", "invalid choice: 'walk'"),
+        ("", "required: command"),
+    ],
+)
+def test_arguments_that_cannot_be_read(capsys, arguments, fact):
+    with pytest.raises(SystemExit) as stop:
+        main(arguments.split())
+    assert stop.value.code == 2 and fact in capsys.readouterr().err
+
+
+# --- the folder
+
+
+@pytest.mark.parametrize("out", ["taken", "taken/deeper"])
+def test_a_folder_that_cannot_be_written_is_told_before_computing(here, fall, capsys, monkeypatch, out):
+    (here / "taken").write_text("a file")
+    monkeypatch.setattr(servoctl, "derive", lambda *_: pytest.fail("computed first"))
+    assert main(["run", fall, "--out", out]) == 2
+    err = words(capsys.readouterr().err)
+    assert f"The folder {out} cannot be written" in err and "Nothing has been computed yet" in err
+
+
+@pytest.mark.parametrize("when", ["simulate", "verify"])
+def test_a_folder_that_is_lost_while_computing_loses_nothing(here, fall, capsys, monkeypatch, when):
+    compute = getattr(servoctl, when)
+    monkeypatch.setattr("tempfile.tempdir", str(here / "temporary"))
+    (here / "temporary").mkdir()
+
+    def losing(*args, **rest):
+        shutil.rmtree(here / "lost")
+        (here / "lost").write_text("a file")
+        return compute(*args, **rest)
+
+    monkeypatch.setattr(servoctl, when, losing)
+    assert main(["run", fall, "--out", "lost", "--no-figures"]) == 1
+    (kept,) = (here / "temporary").iterdir()
+    assert {f.name for f in kept.iterdir()} == {"run.npz", "summary.json", "report.txt"}
+    assert f"it is written to {kept} instead" in words(capsys.readouterr().err)
+    assert servoctl.load(kept / "run.npz").success
+
+
+def test_nowhere_to_write_is_an_error_not_a_traceback(here, fall, capsys, monkeypatch):
+    def full(*_):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(servoctl.Run, "save", full)
+    assert main(["run", fall, "--no-verify"]) == 2
+    out, err = capsys.readouterr()
+    assert "Run: " in out and "cannot be written, either" in words(err)
+
+
+def test_files_of_an_earlier_run_are_replaced_and_others_kept(here, fall):
+    assert main(["run", fall, "--out", "kept", "--no-verify"]) == 0
+    (here / "kept" / "notes.md").write_text("mine")
+    assert main(["run", fall, "--out", "kept", "--no-verify", "--no-figures"]) == 0
+    assert {f.name for f in (here / "kept").iterdir()} == {"run.npz", "summary.json", "report.txt", "notes.md"}
+
+
+# --- options, interruption, verification
+
+
+def test_options_reach_the_simulation(fall, monkeypatch):
+    given = {}
+
+    def simulate(model, start, span, **options):
+        given.update(options, span=span, t=start.t)
+        raise IntegrationStopped("enough")
+
+    monkeypatch.setattr(servoctl, "simulate", simulate)
+    line = "--t-span 0.5 1.0 --method RK4 --step 1e-3 --drift project --rtol 1e-6 --atol 1e-7 --samples 6"
+    assert main(["run", fall, *line.split()]) == 2
+    assert given["t_eval"] == pytest.approx([0.5, 0.6, 0.7, 0.8, 0.9, 1.0]) and given["t_eval"][-1] == 1.0
+    del given["t_eval"]
+    expected = {"method": "RK4", "step": 1e-3, "drift": "project", "rtol": 1e-6, "atol": 1e-7}
+    assert given == {**expected, "span": (0.5, 1.0), "t": 0.5}
+    given.clear()
+    assert main(["run", fall, "--drift", "0.1"]) == 2
+    assert given == {"drift": 0.1, "span": (0.0, 1.0), "t": 0.0}
+
+
+def interrupt(*_, **__):
+    raise KeyboardInterrupt
+
+
+def test_an_interruption_before_the_motion(here, fall, capsys, monkeypatch):
+    monkeypatch.setattr(servoctl, "derive", interrupt)
+    assert main(["run", fall]) == 130
+    assert "Interrupted" in capsys.readouterr().err
+    assert not (here / "servoctl-runs").exists()
+
+
+def test_an_interrupted_verification_keeps_the_run(here, fall, capsys, monkeypatch):
+    monkeypatch.setattr(servoctl, "verify", interrupt)
+    assert main(["run", fall, "--no-figures"]) == 1
+    assert "Verification: interrupted" in capsys.readouterr().out
+    assert summary(here / "servoctl-runs" / "fall")["verification"] is None
+
+
+def test_a_failed_verification_is_seen_in_the_exit_code(here, fall, monkeypatch):
+    failed = SimpleNamespace(passed=False, numbers={"acceleration": float("nan")})
+    monkeypatch.setattr(servoctl, "verify", lambda *_: failed)
+    assert main(["run", fall, "--no-figures"]) == 1
+    told = summary(here / "servoctl-runs" / "fall")["verification"]
+    assert told == {"passed": False, "numbers": {"acceleration": None}}
+
+
+# --- the other commands
+
+
+def test_list_names_every_scene(capsys):
+    assert main(["list"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert [line.split("  ")[0].strip() for line in lines] == list(gallery)
+    assert all(line.endswith(scene.description) for line, scene in zip(lines, gallery.values(), strict=True))
+
+
+def test_report_of_a_specification_simulates_nothing(here, fall, capsys, monkeypatch):
+    monkeypatch.setattr(servoctl, "simulate", lambda *_, **__: pytest.fail("simulated"))
+    assert main(["report", fall]) == 0
+    out = capsys.readouterr().out
+    assert all(word in out for word in ("Mechanism: x y", "Model: x y", "Structure: index 3"))
+    assert not (here / "servoctl-runs").exists()
+
+
+def test_report_of_an_earlier_run(here, fall, capsys):
+    assert main(["run", fall, "--no-verify", "--no-figures"]) == 0
+    printed = capsys.readouterr().out
+    assert main(["report", "servoctl-runs/fall"]) == 0
+    again = capsys.readouterr().out
+    assert "Run: " in again and printed.startswith(again)
+
+
+def test_the_version_and_a_quick_help():
+    script = """
+import sys
+from servoctl.cli import main
+try:
+    main(["--help"])
+except SystemExit as stop:
+    assert stop.code == 0
+slow = [name for name in ("matplotlib", "scipy.integrate", "control", "servoctl.mechanisms") if name in sys.modules]
+assert not slow, slow
+"""
+    helped = process(sys.executable, "-c", script)
+    assert all(word in helped.stdout for word in ("list", "report", "run", "scene()"))
+    told = process(sys.executable, "-m", "servoctl", "--version")
+    assert told.stdout == f"servoctl {servoctl.__version__}\n"
+
+
+def test_a_terminal_without_greek_letters(here, fall, monkeypatch):
+    monkeypatch.setenv("PYTHONIOENCODING", "ascii")
+    assert "T from ker E?" in process(sys.executable, "-m", "servoctl", "report", fall).stdout
+
+
+def test_a_reader_that_leaves_does_not_end_the_computation(here, fall):
+    process("sh", "-c", f"{sys.executable} -m servoctl run {fall} --no-verify --no-figures | true")
+    assert {f.name for f in (here / "servoctl-runs" / "fall").iterdir()} == {"run.npz", "summary.json", "report.txt"}

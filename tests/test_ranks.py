@@ -1,0 +1,161 @@
+"""Ranks decided independently of units, and sparse symbolic elimination with pivots chosen numerically."""
+
+import casadi as ca
+import numpy as np
+import pytest
+from conftest import numbers
+
+from servoctl.errors import SingularProgram
+from servoctl.reduction.elimination import eliminate
+from servoctl.reduction.ranks import clean, combination, decide, decide_all, equilibrate
+
+LONG = np.longdouble
+
+
+def of_rank(rng, m, n, r):
+    return (rng.integers(-4, 5, (m, r)) @ rng.integers(-4, 5, (r, n))).astype(LONG)
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_rank_decisions_do_not_depend_on_units(seed):
+    rng = np.random.default_rng(seed)
+    m, n = rng.integers(2, 7, 2)
+    r = int(rng.integers(1, min(m, n) + 1))
+    a = of_rank(rng, m, n, r)
+    true = np.linalg.matrix_rank(a.astype(float))
+    plain = decide(a)
+    assert plain.rank == true and plain.clear and len(plain.rows) == len(plain.columns) == true
+    block = a[np.ix_(plain.rows, plain.columns)].astype(float)
+    assert np.linalg.matrix_rank(block) == true
+    for _ in range(4):
+        rows, columns = (LONG(10) ** rng.integers(-9, 10, k).astype(LONG) for k in (m, n))
+        scaled = decide(rows[:, None] * a * columns[None, :])
+        assert scaled.rank == true and scaled.clear
+        assert scaled.kept > 1e-4 and scaled.dropped < 1e-17
+
+
+def test_rank_margins_are_reported():
+    assert decide(np.zeros((2, 3))).rank == 0
+    assert decide(np.zeros((2, 3))).kept == np.inf and decide(np.zeros((2, 3))).dropped == 0.0
+    assert decide(np.zeros((0, 3))).rank == 0 and decide(np.zeros((0, 3))).clear
+    near = decide(np.array([[1.0, 1.0], [1.0, 1.0 + 1e-6]], dtype=LONG))
+    assert near.rank == 2 and near.clear and near.kept == pytest.approx(1e-6, rel=1e-3)
+    between = decide(np.array([[1.0, 1.0], [1.0, 1.0 + 1e-13]], dtype=LONG))
+    assert between.rank == 1 and not between.clear and between.dropped == pytest.approx(1e-13, rel=1e-2)
+    exact = decide(np.array([[1.0, 2.0], [3.0, 6.0]], dtype=LONG))
+    assert exact.rank == 1 and exact.clear and exact.dropped < 1e-18
+    assert decide(np.diag([1.0, 1e-30])).rank == 2
+
+
+def test_equilibration_brings_entries_near_one_and_returns_its_factors():
+    a = np.array([[1e9, 1e-3, 0.0], [1e3, 1e-9, 0.0], [0.0, 0.0, 0.0]])
+    scaled, rows, columns = equilibrate(a)
+    assert np.abs(scaled[:2, :2]).max() == pytest.approx(1.0, rel=0.05)
+    assert (rows[:, None] * a * columns[None, :]).astype(float) == pytest.approx(scaled.astype(float), rel=1e-14)
+    assert np.all(np.isfinite(scaled))
+
+
+def test_entries_below_the_size_of_their_terms_are_zero():
+    values, sizes = np.array([1e-14, 1e-10, -3.0, 1e-20]), np.array([1.0, 1.0, 3.0, 1e-20])
+    assert list(clean(values, sizes)) == [0.0, 1e-10, -3.0, 1e-20]
+
+
+def test_the_generic_rank_is_the_highest_over_the_points():
+    values = np.zeros((2, 2, 3))
+    values[:, :, 0] = [[1, 0], [0, 0]]
+    values[:, :, 1] = [[1, 1], [1, 2]]
+    values[:, :, 2] = [[1, 0], [0, 1]]
+    rank, best = decide_all(values, np.abs(values))
+    assert rank.rank == 2 and best == 2
+    assert rank.kept == pytest.approx(0.5, rel=0.3)
+
+
+def test_a_combination_is_found_whatever_the_units():
+    rng = np.random.default_rng(11)
+    rows = rng.integers(-4, 5, (3, 5)).astype(LONG)
+    c = np.array([2.0, -3.0, 0.5])
+    for scale in (1.0, 1e9, 1e-9):
+        found, left = combination(rows * scale, c @ rows)
+        assert found * scale == pytest.approx(c, rel=1e-12) and left < 1e-15
+    _, left = combination(rows[:2], rows[2])
+    assert left > 1e-3
+    assert combination(np.zeros((0, 5)), rows[0])[1] == pytest.approx(1.0)
+
+
+# elimination ---------------------------------------------------------------------------------------------------------
+
+
+def symbolic(name, pattern):
+    """A matrix of symbols where the pattern is true."""
+    rows = [[ca.SX.sym(f"{name}{i}_{j}") if yes else ca.SX(0) for j, yes in enumerate(row)] for i, row in enumerate(pattern)]
+    return ca.vertcat(*(ca.horzcat(*row) for row in rows))
+
+
+PATTERNS = {
+    "dense": lambda n, rng: np.ones((n, n), dtype=bool),
+    "sparse": lambda n, rng: (rng.uniform(size=(n, n)) < 0.25) | np.eye(n, dtype=bool)[rng.permutation(n)],
+    "permuted": lambda n, rng: np.eye(n, dtype=bool)[rng.permutation(n)],
+    "arrow": lambda n, rng: np.eye(n, dtype=bool) | (np.arange(n) == n - 1) | (np.arange(n) == n - 1)[:, None],
+}
+
+
+@pytest.mark.parametrize("kind", PATTERNS)
+@pytest.mark.parametrize("n", [1, 2, 5, 9])
+def test_elimination_equals_numpy(kind, n):
+    rng = np.random.default_rng(40 + n)
+    pattern = PATTERNS[kind](n, rng)
+    A, B = symbolic("a", pattern), symbolic("b", np.ones((n, 2)))
+    chosen = rng.uniform(0.5, 2.0, (n, n, 3)) * rng.choice([-1.0, 1.0], (n, n, 3)) * pattern[:, :, None]
+    solution, pivots = eliminate(A, B, chosen)
+    assert solution.shape == (n, 2) and len(pivots) == n
+    for k in range(3):  # near the points of the pivots, where the choice is good
+        a, b = chosen[:, :, k] * rng.uniform(0.97, 1.03, (n, n)), rng.normal(size=(n, 2))
+        values = {f"a{i}_{j}": a[i, j] for i in range(n) for j in range(n)}
+        values |= {f"b{i}_{j}": b[i, j] for i in range(n) for j in range(2)}
+        exact = np.linalg.solve(a, b)
+        found = numbers([ca.vec(solution)], values).reshape(2, n).T
+        assert found == pytest.approx(exact, rel=1e-9, abs=1e-10 * np.abs(exact).max())
+        assert abs(np.prod(numbers(pivots, values))) == pytest.approx(abs(np.linalg.det(a)), rel=1e-9)
+
+
+def test_elimination_follows_the_numerical_structure():
+    """An entry that is zero by its value alone, like cos 2x + 2 sin² x - 1, costs nothing and is no pivot."""
+    x = ca.SX.sym("x")
+    false_entry = ca.cos(2 * x) + 2 * ca.sin(x) ** 2 - 1
+    A = ca.vertcat(ca.horzcat(false_entry, 2), ca.horzcat(3 + x, 1))
+    solution, pivots = eliminate(A, ca.SX([4, 5]), np.array([[[0.0], [2.0]], [[3.5], [1.0]]]))
+    assert numbers([solution], {"x": 0.7}) == pytest.approx([3 / 3.7, 2.0], rel=1e-15)
+    assert sorted(numbers(pivots, {"x": 0.7})) == pytest.approx([2.0, 3.7])
+
+
+def test_elimination_does_not_depend_on_units():
+    rng = np.random.default_rng(3)
+    a, b = rng.normal(size=(5, 5, 2)), rng.normal(size=5)
+    A, B = symbolic("a", np.ones((5, 5))), symbolic("b", np.ones((5, 1)))
+    rows, columns = 10.0 ** rng.integers(-9, 10, 5), 10.0 ** rng.integers(-9, 10, 5)
+    for r, c in ((np.ones(5), np.ones(5)), (rows, columns)):
+        scaled = r[:, None, None] * a * c[None, :, None]
+        solution, _ = eliminate(A, B, scaled)
+        values = {f"a{i}_{j}": scaled[i, j, 0] for i in range(5) for j in range(5)} | {f"b{i}_0": r[i] * b[i] for i in range(5)}
+        assert c * numbers([solution], values) == pytest.approx(np.linalg.solve(a[:, :, 0], b), rel=1e-9)
+
+
+def test_a_pivot_that_vanishes_at_one_of_the_points_is_not_taken():
+    A, B = symbolic("a", np.ones((2, 2))), symbolic("b", np.ones((2, 1)))
+    chosen = np.stack([[[5.0, 1.0], [1.0, 1.0]], [[0.0, 1.0], [1.0, 1.0]]], axis=2)
+    _, pivots = eliminate(A, B, chosen)
+    for k in range(2):
+        values = {f"a{i}_{j}": chosen[i, j, k] for i in range(2) for j in range(2)}
+        assert min(abs(numbers(pivots, values))) > 0.5
+
+
+def test_elimination_without_right_hand_sides_returns_the_pivots():
+    A = symbolic("a", np.eye(3))
+    solution, pivots = eliminate(A, ca.SX(3, 0), np.eye(3)[:, :, None])
+    assert solution.shape == (3, 0) and len(pivots) == 3
+
+
+@pytest.mark.parametrize("matrix", [[[1.0, 2.0], [2.0, 4.0]], [[0.0, 0.0], [1.0, 1.0]], [[0.0, 1.0], [0.0, 1.0]]])
+def test_elimination_of_a_singular_matrix_is_refused(matrix):
+    with pytest.raises(SingularProgram, match="singular"):
+        eliminate(symbolic("a", np.ones((2, 2))), ca.SX([1, 1]), np.array(matrix)[:, :, None])

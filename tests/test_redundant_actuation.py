@@ -1,0 +1,191 @@
+"""More actuators than residuals: the least weighted norm, against numpy's constrained minimum."""
+
+import casadi as ca
+import numpy as np
+import pytest
+from conftest import motion, numbers, signal
+
+from servoctl import spec as sv
+from servoctl.errors import NameUnknown, NotRealisable, SpecificationError
+from servoctl.mechanisms import overhead_crane
+from servoctl.model.model import derive
+
+THRUSTERS = {
+    "fore": (0.3, (0.4, 0.1)), "aft": (2.8, (-0.5, 0.2)), "port": (1.5, (0.0, 0.6)), "bow": (-1.2, (0.5, -0.1)),
+}  # fmt: skip
+
+
+def ship(count, keys, weights=None, first_order=(), constraints=None):
+    """A planar body with thrusters fixed to it; some of X, Y and heading follow sines."""
+    q = sv.coordinates("x y psi")
+    (x, y, psi), (dx, _, dpsi) = q, q.d(1)
+    turn = ca.vertcat(ca.horzcat(ca.cos(psi), -ca.sin(psi)), ca.horzcat(ca.sin(psi), ca.cos(psi)))
+    actuators = {}
+    for name, (angle, place) in list(THRUSTERS.items())[:count]:
+        force, arm = turn @ ca.SX([np.cos(angle), np.sin(angle)]), turn @ ca.SX(place)
+        actuators[name] = ca.vertcat(force, arm[0] * force[1] - arm[1] * force[0])
+    mechanism = sv.Mechanism(
+        q,
+        gibbs=sv.rigid_body(q, 2.0, (0, 0, 0.3), position=(x, y), rates=(0, 0, dpsi)),
+        forces={"x": -0.4 * dx, "psi": -0.2 * dpsi * ca.fabs(dpsi)},
+        actuators=actuators,
+        constraints=constraints(q) if constraints else None,
+    )
+    targets = {"X": x - ca.sin(q.t), "Y": y - 0.5 * ca.cos(q.t), "heading": psi - 0.3 * ca.sin(2 * q.t)}
+    residuals = {key: q.dt(targets[key]) if key in first_order else targets[key] for key in keys}
+    return mechanism, sv.Program(residuals, weights=weights)
+
+
+def constrained_minimum(mechanism, program, z, t, weights):
+    """γ'' and the least uᵀWu with φ'' = 0 and material constraints: the KKT system in (γ'', u, λ; μ), by numpy."""
+    q, n, m = mechanism.q, mechanism.q.n, len(mechanism.actuators)
+    values = dict(zip([name for k in range(3) for name in q.jet_names(k)], z, strict=True)) | {"t": t}
+    at_zero = values | dict.fromkeys(q.jet_names(2), 0.0)
+    acceleration = ca.vertcat(*q.gamma(2))
+
+    def matrix(e):
+        return numbers([ca.vec(ca.densify(e))], values).reshape(e.shape[::-1]).T
+
+    def second(named):
+        if not named:
+            return np.zeros((0, n)), np.zeros(0)
+        e = ca.vertcat(*(q.dt(e, 2 - max(q.order(e), 0)) for e in named.values()))
+        return matrix(ca.jacobian(e, acceleration)), numbers([e], at_zero)
+
+    (G, c), (G_m, c_m) = second(program.residuals), second(mechanism.constraints)
+    mass, E, rest = matrix(mechanism.mass), matrix(mechanism.E), numbers([mechanism.balance], at_zero)
+    k_m = len(G_m)
+    A = np.block([[mass, -E, -G_m.T], [G, np.zeros((len(G), m + k_m))], [G_m, np.zeros((k_m, m + k_m))]])
+    H = np.zeros((n + m + k_m,) * 2)
+    H[n : n + m, n : n + m] = np.diag(weights)
+    kkt = np.block([[H, A.T], [A, np.zeros((len(A), len(A)))]])
+    solution = np.linalg.solve(kkt, np.concatenate([np.zeros(len(H)), -rest, -c, -c_m]))
+    return solution[:n], solution[n : n + m]
+
+
+def assert_least(mechanism, program, weights, t=0.8, free=None):
+    model = derive(mechanism, program)
+    z = motion(model, t, **(free or {}))
+    found = signal(model, "actuation", t, z)
+    w = [(weights or {}).get(name, 1.0) for name in found]
+    acceleration, u = constrained_minimum(mechanism, program, z, t, w)
+    assert list(found.values()) == pytest.approx(u, rel=1e-12, abs=1e-12 * np.abs(u).max())
+    assert z[-3:] == pytest.approx(acceleration, rel=1e-11, abs=1e-11)
+    return model
+
+
+@pytest.mark.parametrize("weights", [None, {"fore": 3.0, "port": 0.2}])
+@pytest.mark.parametrize(
+    ("count", "keys", "first_order", "free"),
+    [
+        (3, ("X", "Y"), (), {"psi": 0.5, "dpsi": -0.3}),
+        (4, ("X", "Y"), (), {"psi": 0.5, "dpsi": -0.3}),
+        (4, ("X", "Y", "heading"), (), {}),
+        (4, ("heading",), (), {"x": 0.1, "y": 0.4, "dx": 0.3, "dy": 0.2}),
+        (3, ("X", "heading"), ("X",), {"x": 0.1, "y": 0.4, "dy": 0.2}),
+        (4, ("X", "Y", "heading"), ("Y", "heading"), {"y": 0.1, "psi": 0.4}),
+    ],
+)
+def test_redundant_actuators_share_by_least_weighted_norm(count, keys, first_order, free, weights):
+    model = assert_least(*ship(count, keys, weights, first_order), weights, free=free)
+    assert model.free == 2 * (3 - len(keys)) + len(first_order) == len(free)
+
+
+@pytest.mark.parametrize("weights", [None, {"aft": 5.0}])
+def test_redundant_actuators_beside_a_material_constraint(weights):
+    def edge(q):
+        (_, _, psi), (dx, dy, _) = q, q.d(1)
+        return {"edge": dx * ca.sin(psi) - dy * ca.cos(psi)}
+
+    model = assert_least(*ship(3, ("X",), weights, constraints=edge), weights, free={"psi": 0.4, "dpsi": 0.3, "y": 0.1})
+    assert model.free == 3
+
+
+def test_weights_may_be_expressions_of_parameters():
+    p = sv.parameters(w=4.0)
+    q = sv.coordinates("x")
+    (x,) = q
+    mechanism = sv.Mechanism(q, gibbs=sv.particle(q, 2.0, x), actuators={"a": x, "b": 3 * x}, parameters=p)
+    model = derive(mechanism, sv.Program({"X": x - ca.sin(q.t)}, weights={"b": p.w}))
+    for w, m in ((4.0, model), (9.0, model.with_parameters(w=9.0))):
+        u = signal(m, "actuation", 0.7, motion(m, 0.7))
+        assert u["a"] + 3 * u["b"] == pytest.approx(-2 * np.sin(0.7), rel=1e-12)
+        assert u["b"] / u["a"] == pytest.approx(3 / w, rel=1e-12)
+
+
+def test_weights_of_inertia_with_all_coordinates_driven_are_the_ideal_case():
+    """W = M⁻¹ with E = 1: u is the ideal reaction."""
+    q = sv.coordinates("x y")
+    (x, y), (dx, dy) = q, q.d(1)
+    S = sv.particle(q, 2.0, x) + sv.particle(q, 5.0, y)
+    mechanism = sv.Mechanism(q, gibbs=S, potential=9.81 * y, actuators={"a": (1, 0), "b": (0, 1)})
+    speed = {"speed": dx**2 + dy**2 - 25}
+    driven = derive(mechanism, sv.Program(speed, weights={"a": 1 / 2, "b": 1 / 5}))
+    ideal = derive(mechanism, sv.Program(speed, by="ideal"))
+    z = [motion(model, 0.0, x=0.0, y=0.0, dx=3.0, guess={"dy": 4.0}) for model in (driven, ideal)]
+    assert z[0] == pytest.approx(z[1], rel=1e-12)
+    u, reaction = signal(driven, "actuation", 0.0, z[0]), signal(ideal, "reaction", 0.0, z[1])
+    assert list(u.values()) == pytest.approx(list(reaction.values()), rel=1e-12)
+
+
+def test_redundant_actuators_that_reach_the_program_late():
+    """Two cars pull a third through springs: P = ∂φ^(4)/∂u = (k2/m2, k3/m3)/m1, and u = W⁻¹Pᵀμ."""
+    q = sv.coordinates("x1 x2 x3")
+    x1, x2, x3 = q
+    S = sv.particle(q, 1.0, x1) + sv.particle(q, 2.0, x2) + sv.particle(q, 1.5, x3)
+    U = (1.0 * (x1 - x2) ** 2 + 3.0 * (x1 - x3) ** 2) / 2
+    mechanism = sv.Mechanism(q, gibbs=S, potential=U, actuators={"two": x2, "three": x3})
+    model = derive(mechanism, sv.Program({"X": x1 - ca.sin(q.t)}, weights={"three": 4.0}))
+    assert model.free == 2 and model.reduction.needs == {"X": 4}
+    t = 0.6
+    jets = motion(model, t, x2=0.3, dx2=-0.2)
+    u, z = signal(model, "actuation", t, jets), dict(zip(model.jet_names, jets, strict=True))
+    P = np.array([1.0 / 2.0, 3.0 / 1.5])
+    assert u["three"] / u["two"] == pytest.approx(P[1] / 4.0 / P[0], rel=1e-12)
+    assert 2.0 * z["d2x2"] + 1.0 * (z["x2"] - z["x1"]) == pytest.approx(u["two"], abs=1e-11)
+    assert 1.5 * z["d2x3"] + 3.0 * (z["x3"] - z["x1"]) == pytest.approx(u["three"], abs=1e-11)
+    assert (z["x1"], z["d2x1"]) == pytest.approx((np.sin(t), -np.sin(t)), abs=1e-12)
+    assert -4.0 * z["d2x1"] + z["d2x2"] + 3.0 * z["d2x3"] == pytest.approx(np.sin(t), abs=1e-11)  # x1 to the fourth
+
+
+def test_an_actuator_that_reaches_the_program_later_than_another_rests():
+    """Cars 1-2-3 in a row, driven at 2 and at 3: the fourth derivative of the first holds the force on the second only."""
+    q = sv.coordinates("x1 x2 x3")
+    x1, x2, x3 = q
+    S = sv.particle(q, 1.0, x1) + sv.particle(q, 2.0, x2) + sv.particle(q, 1.5, x3)
+    U = (1.0 * (x1 - x2) ** 2 + 3.0 * (x2 - x3) ** 2) / 2
+    mechanism = sv.Mechanism(q, gibbs=S, potential=U, actuators={"near": x2, "far": x3})
+    model = derive(mechanism, sv.Program({"X": x1 - ca.sin(q.t)}))
+    jets = motion(model, 0.6, x3=0.3, dx3=-0.2)
+    u = signal(model, "actuation", 0.6, jets)
+    assert u["far"] == pytest.approx(0, abs=1e-12) and abs(u["near"]) > 0.1
+
+
+def test_redundant_actuators_without_full_decoupling_are_refused():
+    """A crane with two trolley drives: its decoupling matrix has rank 1 for 2 residuals."""
+    mechanism, program = overhead_crane()
+    x, l, _ = mechanism.q
+    doubled = sv.Mechanism(
+        mechanism.q,
+        balance=mechanism.balance,
+        parameters=mechanism.parameters,
+        actuators={"one": x, "two": 2 * x, "hoist": l},
+    )
+    with pytest.raises(NotRealisable, match="decoupling matrix has rank 1") as caught:
+        derive(doubled, program)
+    assert caught.value.details["rank"] == 1
+
+
+def test_weights_that_name_no_actuator_show_the_nearest():
+    mechanism, program = ship(3, ("X", "Y"))
+    with pytest.raises(NameUnknown, match="'fore'") as caught:
+        derive(mechanism, sv.Program(program.residuals, weights={"for": 2.0}))
+    assert caught.value.details["match"] == "fore"
+
+
+@pytest.mark.parametrize("weight", [0.0, -1.0, np.nan, np.inf, "heavy", None, 1j, [1.0, 2.0]])
+def test_weights_that_are_not_positive_numbers_are_refused(weight):
+    """uᵀWu has a least value for W > 0 only."""
+    mechanism, program = ship(3, ("X", "Y"))
+    with pytest.raises(SpecificationError, match="fore"):
+        derive(mechanism, sv.Program(program.residuals, weights={"fore": weight}))
