@@ -13,9 +13,11 @@ import pytest
 from servoctl.errors import NameUnknown, SpecificationError
 from servoctl.model import compiler, emit
 from servoctl.model.compiled import GRID_POINTS, compiled
+from servoctl.simulation.tableaus import tableau
 
 T, X2, P1 = ca.SX.sym("t"), ca.SX.sym("x", 2), ca.SX.sym("p", 1)
 BACKENDS = ("c", "casadi")
+RK4 = tableau("RK4")
 
 
 @pytest.fixture(scope="module")
@@ -127,7 +129,7 @@ def test_operations_counts_arithmetic_only():
 def test_text_depends_on_content_only():
     f = random_function(500)
     again = ca.Function.deserialize(f.serialize())
-    assert emit.emit(f, "f", ("rk4",)) == emit.emit(again, "f", ("rk4",))
+    assert emit.emit(f, "f", ("rk",)) == emit.emit(again, "f", ("rk",))
 
 
 def test_an_operation_without_c_is_named():
@@ -172,8 +174,8 @@ def test_empty_state_and_parameters(backend):
 
 
 def test_threads_do_not_share_memory(backend):
-    model = pendulum(("rk4",))
-    model.rk4(0.0, [0.0, 0.0], 0.1, 1, [1.0])
+    model = pendulum(("rk",))
+    model.rk(0.0, [0.0, 0.0], 0.1, 1, [1.0], RK4)
     wrong = []
 
     def work(k):
@@ -193,13 +195,13 @@ def test_threads_do_not_share_memory(backend):
 @pytest.mark.parametrize("call", [
     lambda m: m(0.0, [1.0], [1.0]), lambda m: m(0.0, [[1.0], [2.0]], [1.0]), lambda m: m(0.0, [1.0, 2.0], []),
     lambda m: m.grid([0.0, 1.0], np.zeros((2, 3)), [1.0]), lambda m: m.grid(0.0, np.zeros((3, 2)), [1.0]),
-    lambda m: m.grid(0.0, np.zeros((2, 3)), np.zeros((1, 2))), lambda m: m.rk4(0.0, [1.0], 0.1, 5, [1.0]),
-    lambda m: m.rk4(0.0, [1.0, 0.0], 0.1, -1, [1.0]), lambda m: m.rk4(0.0, [1.0, 0.0], 0.1, 5, [1.0], every=0),
+    lambda m: m.grid(0.0, np.zeros((2, 3)), np.zeros((1, 2))), lambda m: m.rk(0.0, [1.0], 0.1, 5, [1.0], RK4),
+    lambda m: m.rk(0.0, [1.0, 0.0], 0.1, -1, [1.0], RK4), lambda m: m.rk(0.0, [1.0, 0.0], 0.1, 5, [1.0], RK4, every=0),
     lambda m: m.newton([0.0], [1.0, 0.0], [1.0]),
 ])
 def test_wrong_arguments_are_refused(call):
     with pytest.raises(SpecificationError):
-        call(pendulum(("rk4",)))
+        call(pendulum(("rk",)))
 
 
 @pytest.mark.parametrize("make", [
@@ -207,7 +209,7 @@ def test_wrong_arguments_are_refused(call):
     lambda: compiled(ca.Function("f", [T, X2, P1], [X2.T]), "f"),
     lambda: compiled(ca.Function("f", [T, X2, P1], [ca.SX(2, 1)]), "f"),
     lambda: compiled(function(X2), "not a name"),
-    lambda: compiled(function(X2[0]), "f", ("rk4",)),
+    lambda: compiled(function(X2[0]), "f", ("rk",)),
     lambda: compiled(function(X2), "f", ("newton",)),
 ])
 def test_wrong_functions_are_refused(make):
@@ -216,7 +218,7 @@ def test_wrong_functions_are_refused(make):
 
 
 def test_an_unknown_loop_is_named():
-    with pytest.raises(NameUnknown, match="'rk4'"):
+    with pytest.raises(NameUnknown, match="'rk'"):
         compiled(function(X2), "f", ("rk5",))
     with pytest.raises(NameUnknown, match="'newton'"):
         emit.emit(function(X2), "f", ("newtons",))
@@ -240,10 +242,10 @@ def numpy_rk4(t, x, h, n, p):
     return np.array(states).T
 
 
-def test_rk4_equals_a_numpy_loop(backend):
-    model = pendulum(("rk4",))
+def test_rk_equals_a_numpy_loop(backend):
+    model = pendulum(("rk",))
     expected = numpy_rk4(0.2, np.array([0.5, -0.1]), 0.01, 300, 9.81)
-    t, x, guards = model.rk4(0.2, [0.5, -0.1], 0.01, 300, [9.81])
+    t, x, guards = model.rk(0.2, [0.5, -0.1], 0.01, 300, [9.81], RK4)
     assert model.backend == backend
     np.testing.assert_allclose(x, expected, rtol=0, atol=1e-13)
     np.testing.assert_array_equal(t, 0.2 + 0.01 * np.arange(301))
@@ -252,32 +254,32 @@ def test_rk4_equals_a_numpy_loop(backend):
 
 @pytest.mark.parametrize(("n", "every", "logged"), [(10, 3, [0, 3, 6, 9, 10]), (9, 3, [0, 3, 6, 9]), (2, 5, [0, 2]),
                                                     (0, 1, [0])])
-def test_rk4_logs_the_start_every_few_steps_and_the_end(backend, n, every, logged):
-    model = pendulum(("rk4",))
-    t, x, guards = model.rk4(1.0, [0.3, 0.0], 0.1, n, [2.0], every=every)
-    t_all, x_all, guards_all = model.rk4(1.0, [0.3, 0.0], 0.1, n, [2.0])
+def test_rk_logs_the_start_every_few_steps_and_the_end(backend, n, every, logged):
+    model = pendulum(("rk",))
+    t, x, guards = model.rk(1.0, [0.3, 0.0], 0.1, n, [2.0], RK4, every=every)
+    t_all, x_all, guards_all = model.rk(1.0, [0.3, 0.0], 0.1, n, [2.0], RK4)
     np.testing.assert_array_equal(t, t_all[logged])
     np.testing.assert_array_equal(x, x_all[:, logged])
     np.testing.assert_array_equal(guards, guards_all[:, logged])
 
 
-def test_rk4_has_order_4():
-    model = pendulum(("rk4",))
+def test_rk_has_order_4():
+    model = pendulum(("rk",))
     steps = 2 ** np.arange(5, 10)
-    fine = model.rk4(0.0, [1.0, 0.0], 2.0 / 2**14, 2**14, [4.0], every=2**14)[1][:, -1]
-    errors = [np.abs(model.rk4(0.0, [1.0, 0.0], 2.0 / n, n, [4.0])[1][:, -1] - fine).max() for n in steps]
+    fine = model.rk(0.0, [1.0, 0.0], 2.0 / 2**14, 2**14, [4.0], RK4, every=2**14)[1][:, -1]
+    errors = [np.abs(model.rk(0.0, [1.0, 0.0], 2.0 / n, n, [4.0], RK4)[1][:, -1] - fine).max() for n in steps]
     order = -np.polyfit(np.log(steps), np.log(errors), 1)[0]
     assert abs(order - 4.0) < 0.1
 
 
-def test_rk4_ends_at_the_last_finite_state(backend):
-    model = compiled(function(X2[0] ** 2, 1.0), "escape", ("rk4",))
-    t, x, guards = model.rk4(0.0, [1.0, 0.0], 0.01, 1000, [0.0])
+def test_rk_ends_at_the_last_finite_state(backend):
+    model = compiled(function(X2[0] ** 2, 1.0), "escape", ("rk",))
+    t, x, guards = model.rk(0.0, [1.0, 0.0], 0.01, 1000, [0.0], RK4)
     assert 1.0 < t[-1] < 1.2
     assert np.isfinite(x).all() and x.shape == (2, t.size) and guards.shape == (0, t.size)
-    t, x, _ = model.rk4(0.0, [1.0, 0.0], 0.01, 1000, [0.0], every=50)
+    t, x, _ = model.rk(0.0, [1.0, 0.0], 0.01, 1000, [0.0], RK4, every=50)
     assert t[-1] == 1.0 and np.isfinite(x).all()
-    assert model.rk4(0.0, [np.nan, 0.0], 0.01, 1000, [0.0])[1].shape == (2, 0)
+    assert model.rk(0.0, [np.nan, 0.0], 0.01, 1000, [0.0], RK4)[1].shape == (2, 0)
 
 
 # --- Newton along a path
@@ -355,10 +357,10 @@ def test_both_backends_count_the_same_iterations(monkeypatch):
 
 
 def test_pickles_and_copies(backend):
-    model = pendulum(("rk4",))
-    t, x, guards = model.rk4(0.0, [0.1, 0.0], 0.1, 5, [1.0])
+    model = pendulum(("rk",))
+    t, x, guards = model.rk(0.0, [0.1, 0.0], 0.1, 5, [1.0], RK4)
     for other in (pickle.loads(pickle.dumps(model)), copy.deepcopy(model)):
-        assert (other.name, other.loops, other.n_x, other.n_p, other.n_y) == ("pendulum", ("rk4",), 2, 1, 3)
-        np.testing.assert_array_equal(other.rk4(0.0, [0.1, 0.0], 0.1, 5, [1.0])[1], x)
+        assert (other.name, other.loops, other.n_x, other.n_p, other.n_y) == ("pendulum", ("rk",), 2, 1, 3)
+        np.testing.assert_array_equal(other.rk(0.0, [0.1, 0.0], 0.1, 5, [1.0], RK4)[1], x)
         assert other.backend == backend
         assert repr(other) == repr(model)

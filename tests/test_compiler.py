@@ -6,7 +6,7 @@ import warnings
 import casadi as ca
 import numpy as np
 import pytest
-from test_compiled import P1, X2, T, function, numpy_rk4, pendulum
+from test_compiled import P1, RK4, X2, T, function, numpy_rk4, pendulum
 
 from servoctl.model import compiler
 from servoctl.model.compiled import GRID_POINTS, SCALAR_CALLS, compiled
@@ -28,7 +28,7 @@ def new_process(monkeypatch):
 
 
 def test_nothing_is_compiled_before_it_pays(fresh):
-    model = pendulum(("rk4",))
+    model = pendulum(("rk",))
     for _ in range(SCALAR_CALLS):
         model(0.0, [0.1, 0.2], [1.0])
     model.grid(0.0, np.zeros((2, GRID_POINTS)), [1.0])
@@ -39,20 +39,20 @@ def test_nothing_is_compiled_before_it_pays(fresh):
 
 
 @pytest.mark.parametrize("use", [lambda m: m.grid(0.0, np.zeros((2, GRID_POINTS + 1)), [1.0]),
-                                 lambda m: m.rk4(0.0, [0.0, 0.0], 0.1, 1, [1.0])])
+                                 lambda m: m.rk(0.0, [0.0, 0.0], 0.1, 1, [1.0], RK4)])
 def test_a_long_grid_or_a_loop_compiles_at_once(fresh, use):
-    model = pendulum(("rk4",))
+    model = pendulum(("rk",))
     use(model)
     assert len(fresh) == 1 and model.backend == "c"
 
 
 def test_a_kept_library_is_loaded_and_not_compiled(fresh, monkeypatch):
-    pendulum(("rk4",)).rk4(0.0, [0.0, 0.0], 0.1, 1, [1.0])
-    again = pendulum(("rk4",))
+    pendulum(("rk",)).rk(0.0, [0.0, 0.0], 0.1, 1, [1.0], RK4)
+    again = pendulum(("rk",))
     again(0.0, [0.0, 0.0], [1.0])
     assert again.backend == "c"
     new_process(monkeypatch)
-    in_new_process = pendulum(("rk4",))
+    in_new_process = pendulum(("rk",))
     in_new_process(0.0, [0.0, 0.0], [1.0])
     assert in_new_process.backend == "c"
     assert len(fresh) == 1
@@ -61,14 +61,14 @@ def test_a_kept_library_is_loaded_and_not_compiled(fresh, monkeypatch):
 @pytest.mark.parametrize("damage", [lambda data: b"", lambda data: b"not a library", lambda data: data[:-1000],
                                     lambda data: data[:3000] + b"?" + data[3001:]])
 def test_a_damaged_library_is_built_again(fresh, monkeypatch, damage):
-    pendulum(("rk4",)).rk4(0.0, [0.0, 0.0], 0.1, 1, [1.0])
+    pendulum(("rk",)).rk(0.0, [0.0, 0.0], 0.1, 1, [1.0], RK4)
     kept, = compiler.cache_directory().iterdir()
     whole = kept.read_bytes()
     kept.unlink()
     kept.write_bytes(damage(whole))
     new_process(monkeypatch)
-    model = pendulum(("rk4",))
-    model.rk4(0.0, [0.0, 0.0], 0.1, 1, [1.0])
+    model = pendulum(("rk",))
+    model.rk(0.0, [0.0, 0.0], 0.1, 1, [1.0], RK4)
     assert model.backend == "c" and len(fresh) == 2
     assert len(kept.read_bytes()) == len(whole)
 
@@ -78,8 +78,8 @@ def test_an_unusable_cache_is_replaced_by_a_temporary_directory(fresh, tmp_path,
     monkeypatch.setenv("SERVOCTL_CACHE", str(tmp_path / "file" / "cache"))
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        model = pendulum(("rk4",))
-        model.rk4(0.0, [0.0, 0.0], 0.1, 1, [1.0])
+        model = pendulum(("rk",))
+        model.rk(0.0, [0.0, 0.0], 0.1, 1, [1.0], RK4)
     assert model.backend == "c" and len(fresh) == 1
 
 
@@ -87,7 +87,7 @@ def test_the_working_directory_is_untouched(fresh, tmp_path, monkeypatch):
     (tmp_path / "here").mkdir()
     monkeypatch.chdir(tmp_path / "here")
     monkeypatch.setenv("SERVOCTL_CACHE", "../relative")
-    pendulum(("rk4",)).rk4(0.0, [0.0, 0.0], 0.1, 1, [1.0])
+    pendulum(("rk",)).rk(0.0, [0.0, 0.0], 0.1, 1, [1.0], RK4)
     assert len(fresh) == 1
     assert not list((tmp_path / "here").iterdir())
     assert [file.suffix for file in (tmp_path / "relative").iterdir()] == [".so"]
@@ -107,8 +107,8 @@ def test_without_a_compiler_one_warning_and_the_same_results(fresh, monkeypatch,
     monkeypatch.setenv(name, value)
     with pytest.warns(RuntimeWarning, match="compiler|failed") as caught:
         for k in range(3):
-            model = compiled(function(X2[1], -P1 * ca.sin(X2[0]) + ca.cos(T)), f"pendulum_{k}", ("rk4",))
-            np.testing.assert_allclose(model.rk4(0.0, [0.1, 0.0], 0.1, 5, [1.0])[1], expected, atol=1e-15)
+            model = compiled(function(X2[1], -P1 * ca.sin(X2[0]) + ca.cos(T)), f"pendulum_{k}", ("rk",))
+            np.testing.assert_allclose(model.rk(0.0, [0.1, 0.0], 0.1, 5, [1.0], RK4)[1], expected, atol=1e-15)
             assert model.backend == "casadi"
     assert len(caught) == 1
 
@@ -118,6 +118,6 @@ def test_a_compiler_that_refuses_native_code_still_compiles(fresh, tmp_path, mon
     script.write_text('#!/bin/sh\ncase "$*" in *-march=native*) exit 1;; esac\nexec cc "$@"\n')
     script.chmod(0o755)
     monkeypatch.setenv("CC", str(script))
-    model = pendulum(("rk4",))
-    model.rk4(0.0, [0.1, 0.0], 0.1, 5, [1.0])
+    model = pendulum(("rk",))
+    model.rk(0.0, [0.1, 0.0], 0.1, 5, [1.0], RK4)
     assert model.backend == "c" and fresh[-1][0] == str(script)

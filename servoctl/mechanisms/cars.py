@@ -44,9 +44,9 @@ def cars(N=2, masses=None, stiffnesses=None, gaps=None, by="actuators"):
     gaps = _per_car("gaps", gaps, [0.5] * (N - 1))
     cars_from_1 = range(1, N + 1)
     p = sv.parameters(
-        **{f"m{i}": m for i, m in zip(cars_from_1, masses)},  # kg
-        **{f"k{i}": k for i, k in zip(cars_from_1, stiffnesses)},  # N/m
-        **{f"gap{i}": gap for i, gap in zip(cars_from_1, gaps)},  # m
+        **{f"m{i}": m for i, m in zip(cars_from_1, masses, strict=True)},  # kg
+        **{f"k{i}": k for i, k in zip(cars_from_1, stiffnesses, strict=False)},  # N/m
+        **{f"gap{i}": gap for i, gap in zip(cars_from_1, gaps, strict=False)},  # m
     )
     q = sv.coordinates(" ".join(f"x{i}" for i in cars_from_1))  # m, each
     x, m, k, gap = tuple(q), p.symbols[:N], p.symbols[N : 2 * N - 1], p.symbols[2 * N - 1 :]

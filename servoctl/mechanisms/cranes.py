@@ -82,7 +82,7 @@ def winch_crane(coordinates="relative"):
 
 
 def crane_3d(coordinates="relative"):
-    """A bridge, a trolley on it and a hoist lift the load from 5 to 3 m below along a quarter turn of radius 3 m, in 6 s.
+    """A bridge, a trolley on it and a hoist lift the load from 5 to 3 m below along a quarter turn of 3 m, in 6 s.
 
     Parameters
     ----------

@@ -19,7 +19,7 @@ from servoctl.model.interpreted import Interpreter, Workspace
 SCALAR_CALLS = 50
 GRID_POINTS = 200
 
-_OUTPUTS_PER_STATE = {"rk4": 1, "newton": 2, "taylor": 1}
+_OUTPUTS_PER_STATE = {"rk": 1, "newton": 2, "taylor": 1}
 
 
 def compiled(f, name, loops=(), project=None):
@@ -31,7 +31,7 @@ def compiled(f, name, loops=(), project=None):
         SX function of t (scalar), x (n_x), p (n_p), all dense, with one dense column output y (n_y).
     name : str
         A C identifier.
-    loops : sequence of {"rk4", "newton", "taylor"}
+    loops : sequence of {"rk", "newton", "taylor"}
         The loops that will be called.
     project : casadi.Function, optional
         Change of x that restores invariants, of the same inputs (t, x, p); loops may call it after their steps.
@@ -193,8 +193,8 @@ class Compiled:
         self._evaluator.grid(t, x, p, y)
         return y
 
-    def rk4(self, t0, x0, h, n_steps, p, every=1):
-        """Integrate dx/dt, the first n_x outputs, by the classical Runge-Kutta method of order 4.
+    def rk(self, t0, x0, h, n_steps, p, tableau, every=1, project_every=0):
+        """Integrate dx/dt, the first n_x outputs, by explicit Runge-Kutta steps.
 
         Step k starts at t0 + k h. The run ends early, with what was computed, at a state that is not finite.
 
@@ -210,8 +210,12 @@ class Compiled:
             Number of steps.
         p : (n_p,) array
             Parameters, SI.
+        tableau : (a, b, c)
+            Of s stages: (s, s) array, strictly lower triangular, (s,) and (s,) arrays.
         every : int
             Number of steps between logged points; the start and the end are always logged.
+        project_every : int
+            Steps between projections; 0 for none.
 
         Returns
         -------
@@ -227,18 +231,20 @@ class Compiled:
         SpecificationError
             If the loop was not asked for, a shape is another, or a count is out of range.
         """
-        self._settle_loop("rk4")
+        self._settle_loop("rk")
         x0, p = self._array("x0", x0, self._x_shape), self._array("p", p, self._p_shape)
         if n_steps < 0 or every < 1:
             raise SpecificationError(
-                f"rk4 is to take {n_steps} steps and log every {every}",
+                f"rk is to take {n_steps} steps and log every {every}",
                 "n_steps is at least 0 and every at least 1",
                 n_steps=n_steps,
                 every=every,
             )
+        tableau = tuple(np.ascontiguousarray(part, dtype=float) for part in tableau)
         log = np.append(np.arange(0, n_steps, every), n_steps)
         states, guards = np.empty((self.n_x, log.size)), np.empty((self.n_y - self.n_x, log.size))
-        n = 1 + self._evaluator.rk4(float(t0), x0, float(h), int(n_steps), int(every), p, states, guards)
+        counts = (int(n_steps), int(every), int(project_every) if self._project is not None else 0)
+        n = 1 + self._evaluator.rk(float(t0), x0, float(h), counts, p, tableau, states, guards)
         return t0 + log[:n] * h, states[:, :n], guards[:, :n]
 
     def newton(self, t, x0, p, tol=1e-13, max_iter=30):
@@ -384,16 +390,17 @@ class _Library:
     def grid(self, t, x, p, y):
         self._grid(ctypes.c_int64(t.size), *map(_pointer, (t, x, p)), ctypes.c_int64(p.ndim == 2), _pointer(y))
 
-    def rk4(self, t0, x0, h, n_steps, every, p, states, guards):
-        run = self._library[f"{self._symbol}_rk4"]
+    def rk(self, t0, x0, h, counts, p, tableau, states, guards):
+        run = self._library[f"{self._symbol}_rk"]
         run.restype = ctypes.c_int64
         return run(
             ctypes.c_double(t0),
             _pointer(x0),
             ctypes.c_double(h),
-            ctypes.c_int64(n_steps),
-            ctypes.c_int64(every),
+            *map(ctypes.c_int64, counts),
             _pointer(p),
+            ctypes.c_int64(len(tableau[1])),
+            *map(_pointer, tableau),
             ctypes.c_int64(states.shape[1]),
             _pointer(states),
             _pointer(guards),
@@ -402,9 +409,20 @@ class _Library:
     def taylor(self, t0, x0, t1, p, shape, rtol, atol, every, max_steps, t, x, y):
         run = self._library[f"{self._symbol}_taylor"]
         run.restype = ctypes.c_int64
-        return run(ctypes.c_double(t0), _pointer(x0), ctypes.c_double(t1), _pointer(p), *map(ctypes.c_int64, shape),
-                   ctypes.c_double(rtol), ctypes.c_double(atol), ctypes.c_int64(every), ctypes.c_int64(max_steps),
-                   _pointer(t), _pointer(x), _pointer(y))
+        return run(
+            ctypes.c_double(t0),
+            _pointer(x0),
+            ctypes.c_double(t1),
+            _pointer(p),
+            *map(ctypes.c_int64, shape),
+            ctypes.c_double(rtol),
+            ctypes.c_double(atol),
+            ctypes.c_int64(every),
+            ctypes.c_int64(max_steps),
+            _pointer(t),
+            _pointer(x),
+            _pointer(y),
+        )
 
     def newton(self, t, x0, p, tol, max_iter, x, y):
         run, count = self._library[f"{self._symbol}_newton"], ctypes.c_int64()

@@ -110,33 +110,42 @@ void NAME_grid(int64_t n, const double *t, const double *x, const double *p, int
 }
 """
 
-_RK4 = """
-/* Classical Runge-Kutta on the first n_x outputs; the others are logged beside the state. The logs hold n_log columns.
-   Returns the index of the last column written: a state that is not finite ends the run. */
-int64_t NAME_rk4(double t0, const double *x0, double h, int64_t n_steps, int64_t every, const double *p,
-                 int64_t n_log, double *x_log, double *guard_log)
+_RK = """
+/* Explicit Runge-Kutta steps on the first n_x outputs by a tableau of s stages; the other outputs are logged beside the
+   state. The logs hold n_log columns. Returns the index of the last column written: a state that is not finite ends the
+   run. */
+int64_t NAME_rk(double t0, const double *x0, double h, int64_t n_steps, int64_t every, int64_t project_every,
+                const double *p, int64_t s, const double *a, const double *b, const double *c, int64_t n_log,
+                double *x_log, double *guard_log)
 {
-    double x[NAME_nx + 1], z[NAME_nx + 1], k1[NAME_ny + 1], k2[NAME_ny + 1], k3[NAME_ny + 1], k4[NAME_ny + 1];
+    double x[NAME_nx + 1], z[NAME_nx + 1], k[s][NAME_ny + 1];
     int64_t column = 0, due = 1;
     for (int64_t i = 0; i < NAME_nx; i++) x[i] = x0[i];
-    for (int64_t k = 0; ; k++) {
-        const double t = t0 + (double)k * h, middle = t0 + ((double)k + 0.5) * h, end = t0 + (double)(k + 1) * h;
+    for (int64_t step = 0; ; step++) {
         for (int64_t i = 0; i < NAME_nx; i++) if (!isfinite(x[i])) return column - 1;
-        NAME(t, x, p, k1);
-        if (--due == 0 || k == n_steps) {
+        NAME(t0 + (double)step * h, x, p, k[0]);
+        if (--due == 0 || step == n_steps) {
             for (int64_t i = 0; i < NAME_nx; i++) x_log[i * n_log + column] = x[i];
-            for (int64_t i = NAME_nx; i < NAME_ny; i++) guard_log[(i - NAME_nx) * n_log + column] = k1[i];
+            for (int64_t i = NAME_nx; i < NAME_ny; i++) guard_log[(i - NAME_nx) * n_log + column] = k[0][i];
             column++;
             due = every;
         }
-        if (k == n_steps) return column - 1;
-        for (int64_t i = 0; i < NAME_nx; i++) z[i] = x[i] + h / 2 * k1[i];
-        NAME(middle, z, p, k2);
-        for (int64_t i = 0; i < NAME_nx; i++) z[i] = x[i] + h / 2 * k2[i];
-        NAME(middle, z, p, k3);
-        for (int64_t i = 0; i < NAME_nx; i++) z[i] = x[i] + h * k3[i];
-        NAME(end, z, p, k4);
-        for (int64_t i = 0; i < NAME_nx; i++) x[i] += h / 6 * (k1[i] + 2 * k2[i] + 2 * k3[i] + k4[i]);
+        if (step == n_steps) return column - 1;
+        for (int64_t j = 1; j < s; j++) {
+            for (int64_t i = 0; i < NAME_nx; i++) z[i] = 0;
+            for (int64_t m = 0; m < j; m++) {
+                const double weight = a[j * s + m];
+                if (weight != 0) for (int64_t i = 0; i < NAME_nx; i++) z[i] += weight * k[m][i];
+            }
+            for (int64_t i = 0; i < NAME_nx; i++) z[i] = x[i] + h * z[i];
+            NAME(t0 + ((double)step + c[j]) * h, z, p, k[j]);
+        }
+        for (int64_t i = 0; i < NAME_nx; i++) z[i] = 0;
+        for (int64_t m = 0; m < s; m++) {
+            if (b[m] != 0) for (int64_t i = 0; i < NAME_nx; i++) z[i] += b[m] * k[m][i];
+        }
+        for (int64_t i = 0; i < NAME_nx; i++) x[i] += h * z[i];
+        if (project_every && (step + 1) % project_every == 0) NAME_PROJECT(t0 + (double)(step + 1) * h, x, p);
     }
 }
 """
@@ -218,8 +227,8 @@ int64_t NAME_newton(int64_t n, const double *t, const double *x0, const double *
 """
 
 _TAYLOR = """
-/* The jet of level j a time h after the expansion: sum over k of k!/(k - j)! c_[k] h^(k - j); c holds `size` numbers for
-   each k = 1 .. last, `now` the value itself for j = 0. */
+/* The jet of level j a time h after the expansion: sum over k of k!/(k - j)! c_[k] h^(k - j); c holds `size` numbers
+   for each k = 1 .. last, `now` the value itself for j = 0. */
 static void NAME_jet(const double *c, int64_t size, int64_t last, int64_t j, const double *now, double h, double *jet)
 {
     for (int64_t i = 0; i < size; i++) {
@@ -308,7 +317,7 @@ static void NAME_restore(double t, double *x, const double *p)
 }
 """
 
-LOOPS = {"rk4": _RK4, "newton": _NEWTON, "taylor": _TAYLOR}
+LOOPS = {"rk": _RK, "newton": _NEWTON, "taylor": _TAYLOR}
 
 
 def operations(f):
@@ -331,7 +340,7 @@ def emit(f, name, loops=(), chunk=CHUNK, project=None):
     """C translation unit of a function and of the loops over it.
 
     It defines ``void name(double t, const double *x, const double *p, double *y)`` (``y`` overlaps no input),
-    ``name_point``, ``name_grid`` and a ``name_rk4`` or ``name_newton`` for each loop asked for.
+    ``name_point``, ``name_grid`` and a ``name_LOOP`` for each loop asked for.
 
     Parameters
     ----------
@@ -339,7 +348,7 @@ def emit(f, name, loops=(), chunk=CHUNK, project=None):
         SX function of t (scalar), x (n_x), p (n_p) with one dense column output y (n_y).
     name : str
         A C identifier, the prefix of every external symbol.
-    loops : sequence of {"rk4", "newton"}
+    loops : sequence of {"rk", "newton", "taylor"}
         Drivers to append.
     chunk : int
         Largest number of statements in one C function.
@@ -365,7 +374,7 @@ def emit(f, name, loops=(), chunk=CHUNK, project=None):
     if project is not None:
         body += _function(project, f"{name}_project", chunk)
     drivers = "".join((_GRID, _PROJECTION if project else "", *(LOOPS[loop] for loop in LOOPS if loop in loops)))
-    drivers = drivers.replace("NAME_PROJECT(t, x, p)", "NAME_restore(t, x, p)" if project else "(void)0")
+    drivers = drivers.replace("NAME_PROJECT(", "NAME_restore(" if project else "(void)(")
     for key, value in {
         "N_X": f.numel_in(1),
         "N_P": f.numel_in(2),

@@ -152,7 +152,7 @@ class Equations:
             if level == 0 and not q.plain:
                 change = q.V @ change + self._restore_kinematics()
             changes.append(change)
-        return self.function("project", self.state, changes, ca.SX.sym("t_branch"))  # as "taylor", beside which it runs
+        return self.function("project", self.state, changes)
 
     def _restore_kinematics(self):
         """The least change of q that restores the kinematics' own invariants."""
@@ -169,7 +169,7 @@ class Equations:
         return self.function("matrices", self.state, [ca.vec(ca.densify(L)), ca.vec(ca.densify(B))])
 
     def plant(self):
-        """(q', γ'') of the full mechanism under the inputs that realise the program, as a function of (t, [q; γ'; inputs])."""
+        """(q', γ'') of the full mechanism as a function of (t, [q; γ'; inputs]), the inputs those of the program."""
         r, q = self.r, self.q
         mechanism, acceleration = r.mechanism, ca.vertcat(*q.gamma(2))
         zero = ca.SX.zeros(q.n)
@@ -229,7 +229,7 @@ class Equations:
         return ["all_multipliers"], [self.r.multipliers]
 
     def _power(self):
-        """dE/dt, the power of forces without a potential, the size of its terms, and what dE/dt owes to explicit time."""
+        """dE/dt, the power of forces without a potential, the size of its terms, what dE/dt owes to explicit time."""
         r, q = self.r, self.q
         w = ca.vertcat(*q.gamma(1))
         rate = q.dt(r.mechanism.energy)

@@ -51,22 +51,25 @@ class Interpreter:
             y[:, k] = self._value(t_k, x[:, k], p[:, k] if p.ndim == 2 else p)
 
     @np.errstate(all="ignore")
-    def rk4(self, t0, x0, h, n_steps, every, p, states, guards):
-        """Fill the columns of states and guards as `Compiled.rk4` says; return the index of the last one filled."""
+    def rk(self, t0, x0, h, counts, p, tableau, states, guards):
+        """Fill the columns of states and guards as `Compiled.rk` says; return the index of the last one filled."""
+        (n_steps, every, project_every), (a, b, c) = counts, tableau
         x, column, n_x = x0, 0, self._n_x
-        for k in range(n_steps + 1):
+        for step in range(n_steps + 1):
             if not np.isfinite(x).all():
                 break
-            y = self._value(t0 + k * h, x, p)
-            if k % every == 0 or k == n_steps:
+            y = self._value(t0 + step * h, x, p)
+            if step % every == 0 or step == n_steps:
                 states[:, column], guards[:, column] = x, y[n_x:]
                 column += 1
-            if k < n_steps:
-                middle, k1 = t0 + (k + 0.5) * h, y[:n_x]
-                k2 = self._value(middle, x + h / 2 * k1, p)[:n_x]
-                k3 = self._value(middle, x + h / 2 * k2, p)[:n_x]
-                k4 = self._value(t0 + (k + 1) * h, x + h * k3, p)[:n_x]
-                x = x + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
+            if step < n_steps:
+                k = [y[:n_x]]
+                for j in range(1, len(b)):
+                    z = x + h * (a[j, :j] @ np.array(k))
+                    k.append(self._value(t0 + (step + c[j]) * h, z, p)[:n_x])
+                x = x + h * (b @ np.array(k))
+                if project_every and (step + 1) % project_every == 0:
+                    x = self._restore(t0 + (step + 1) * h, x, p)
         return column - 1
 
     @np.errstate(all="ignore")
@@ -97,7 +100,7 @@ class Interpreter:
 
     def _restore(self, t, x, p):
         for _ in range(6):
-            d = np.asarray(self._project(t, x, p)).ravel()
+            d = np.asarray(self._project(t, x, p[: self._project.numel_in(2)])).ravel()
             if not np.isfinite(d).all():
                 return x
             largest, x = np.max(np.abs(d) / (1 + np.abs(x)), initial=0.0), x + d

@@ -199,7 +199,8 @@ class Model:
 
         Parameters
         ----------
-        name : {"ode", "ode_poles", "path", "invariants", "metric", "matrices", "plant", "multiplier_form"}
+        name : {"ode", "ode_projected", "ode_poles", "path", "invariants", "metric", "matrices", "plant",
+            "multiplier_form"}
 
         Returns
         -------
@@ -207,8 +208,9 @@ class Model:
         """
         if name not in self._functions:
             build = {
-                "ode": lambda e: (e.ode(), ("rk4",)),
-                "ode_poles": lambda e: (e.ode(poles=True), ("rk4",)),
+                "ode": lambda e: (e.ode(), ("rk",)),
+                "ode_projected": lambda e: (e.ode(), ("rk",), e.project()),
+                "ode_poles": lambda e: (e.ode(poles=True), ("rk",)),
                 "path": lambda e: (e.path(), ("newton",)),
                 "invariants": lambda e: (e.invariants(), ()),
                 "metric": lambda e: (e.metric(), ()),
@@ -218,8 +220,8 @@ class Model:
             }
             if name not in build:
                 raise unknown(name, list(build), "function")
-            f, loops = build[name](self._equations)
-            self._functions[name] = compiled(f, name, loops)
+            f, *options = build[name](self._equations)
+            self._functions[name] = compiled(f, name, *options)
         return self._functions[name]
 
     def taylor(self, last):

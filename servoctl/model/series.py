@@ -106,7 +106,8 @@ def taylor_coefficients(equations, last):
     Returns
     -------
     casadi.Function
-        Of (t, X, p) with the instant by which paths take their branches appended to p; outputs q_[1], ..., q_[last] (left out where q' = γ'), γ_[1], ..., γ_[last], guards.
+        Of (t, X, p) with the instant by which paths take their branches appended to p; outputs q_[1], ..., q_[last]
+        (left out where q' = γ'), γ_[1], ..., γ_[last], guards.
     """
     r, q = equations.r, equations.q
     motion = _Motion(equations)

@@ -191,7 +191,7 @@ def _at_depth(reduction, points, depth):
 
 
 def _input_jacobian(reduction, points, z, depth):
-    """J and the sizes of its entries, (k, N+1, k, N+1, points): coefficient j of residual i by coefficient l of input a."""
+    """J and the sizes of its entries, (k, N+1, k, N+1, points): coefficient j of row i by coefficient l of input a."""
     mechanism, q = reduction.mechanism, reduction.mechanism.q
     k, level, n_points = len(reduction.program.residuals), depth + 2, len(points.t)
     B = reduction.realisation.B

@@ -1,25 +1,30 @@
-"""The compiled fixed-step Runge-Kutta method of order 4."""
+"""Compiled explicit Runge-Kutta methods of fixed step."""
 
 import numpy as np
 
 from servoctl.errors import IntegrationStopped
-from servoctl.simulation.drift import Poles, Project, Projector
+from servoctl.simulation.drift import Poles, Project
 from servoctl.simulation.motion import Motion, breakpoints, interruptible
+from servoctl.simulation.tableaus import tableau
 from servoctl.simulation.watch import DEGRADED, NEGLIGIBLE, Watch
 
 CHUNK = 2000  # steps per call of the compiled loop
 
 
-def fixed_step(model, drift, t0, x0, t1, step, knots, progress):
+def fixed_step(model, method, drift, span, x0, step, knots, progress):
     """Integrate with steps of at most `step`, ending at every knot.
 
     Parameters
     ----------
     model : Model
+    method : str
+        One of `tableaus.ORDERS`.
     drift : None, Poles or Project
-    t0, t1, step : float
+    span : (t0, t1)
         [s]
     x0 : (n_x,) array
+    step : float
+        [s]
     knots : sequence of float
     progress : callable
 
@@ -30,10 +35,10 @@ def fixed_step(model, drift, t0, x0, t1, step, knots, progress):
     """
     motion = Motion()
     with interruptible(motion):
-        integration = _Fixed(model, drift, motion, progress)
-        integration.watch = Watch(model, t0, x0)
-        integration.start(t0, x0)
-        cuts = breakpoints((t0, t1), knots)
+        integration = _Fixed(model, method, drift, motion, progress)
+        integration.watch = Watch(model, span[0], x0)
+        integration.start(span[0], x0)
+        cuts = breakpoints(span, knots)
         x = x0
         for a, b in zip(cuts[:-1], cuts[1:], strict=True):
             count = max(1, int(np.ceil(abs(b - a) / step * (1 - 1e-12))))
@@ -44,16 +49,17 @@ def fixed_step(model, drift, t0, x0, t1, step, knots, progress):
 
 
 class _Fixed:
-    def __init__(self, model, drift, motion, progress):
-        self.drift, self.motion, self.progress = drift, motion, progress
+    def __init__(self, model, method, drift, motion, progress):
+        self.method, self.drift, self.motion, self.progress = method, drift, motion, progress
+        self.tableau = tableau(method)
+        self.every = drift.every if isinstance(drift, Project) else 0
         self._use(model)
 
     def _use(self, model):
         self.model = model
         stabilised = isinstance(self.drift, Poles)
-        self.f = model.function("ode_poles" if stabilised else "ode")
+        self.f = model.function("ode_poles" if stabilised else "ode_projected" if self.every else "ode")
         self.p = np.append(model.parameters, self.drift.coefficients(model)) if stabilised else model.parameters
-        self.projector = Projector(model) if isinstance(self.drift, Project) else None
 
     def start(self, t, x):
         if self.watch.bad_choice(self.f(t, x, self.p), self.f.n_x):
@@ -68,21 +74,19 @@ class _Fixed:
     def piece(self, a, x, h, count):
         """`count` steps of h from t = a; returns the last state."""
         n_x, n, done = self.f.n_x, self.model.n, 0
-        chunk = CHUNK if self.projector is None else self.drift.every
+        chunk = CHUNK - CHUNK % self.every if 0 < self.every < CHUNK else self.every or CHUNK
         last = None
         while done < count:
             steps = min(chunk, count - done)
-            t, states, guards = self.f.rk4(a + done * h, x, h, steps, self.p)
+            t, states, guards = self.f.rk(a + done * h, x, h, steps, self.p, self.tableau, 1, self.every)
             t = a + (done + np.arange(states.shape[1])) * h
             good, why, repivot = self._check(t, states, guards, last)
             short = good < steps
             states, t = states[:, : good + 1], t[: good + 1]
-            if self.projector is not None and good:
-                states[:, -1] = self.projector(t[-1], states[:, -1])
-                self.motion.count(projections=1)
             top = self.f.grid(t, states, self.p)[n_x - n : n_x]
             self.motion.add(self.model, t, states, top)
-            self.motion.count(steps=good, nfev=4 * good)
+            projections = good // self.every if self.every else 0
+            self.motion.count(steps=good, nfev=len(self.tableau[1]) * good, projections=projections)
             last = guards[:, : good + 1][:, -3:]
             x, done = states[:, -1].copy(), done + good
             self.progress(t[-1])
@@ -139,7 +143,7 @@ class _Fixed:
             self.motion.stop = self.watch.singular(t, x, "the state is no longer finite")
         else:
             self.motion.stop = IntegrationStopped(
-                f"RK4 with steps of {abs(h):.3g} s has no finite state after t = {t:.7g} s.",
+                f"{self.method} with steps of {abs(h):.3g} s has no finite state after t = {t:.7g} s.",
                 "Explicit methods are stable for steps below about 2.8 over the largest eigenvalue.",
                 nearest=f"The motion before t = {t:.6g} s, which is kept.",
                 do="Take a smaller step, slower poles, or an adaptive method.",

@@ -113,7 +113,8 @@ class SeriesMethod:
         return np.concatenate([*rows, *(_level(c, j, h) for j in range(1, top + 1))])
 
     def _state(self, t, states, y, when):
-        k = min(int(np.searchsorted(np.sign(t[-1] - t[0]) * t, np.sign(t[-1] - t[0]) * when, "right")) - 1, y.shape[1] - 1)
+        direction = np.sign(t[-1] - t[0])
+        k = min(int(np.searchsorted(direction * t, direction * when, "right")) - 1, y.shape[1] - 1)
         return self._jets(states[:, k], y[:, k], np.array([when - t[k]]), self.top - 1)[:, 0]
 
     def _check(self, t, states, y):

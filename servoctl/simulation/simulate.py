@@ -12,9 +12,10 @@ from servoctl.simulation.fixed import fixed_step
 from servoctl.simulation.motion import Progress
 from servoctl.simulation.run import Run
 from servoctl.simulation.series import SeriesMethod
+from servoctl.simulation.tableaus import ORDERS
 
 SAMPLES = 1001  # of a run unless t_eval says otherwise: smooth curves, and extrema refined to rounding
-ALL_METHODS = ("algebraic", "Taylor", "RK4", *METHODS)
+ALL_METHODS = ("algebraic", "Taylor", *ORDERS, *METHODS)
 
 
 def simulate(
@@ -43,10 +44,10 @@ def simulate(
         From `model.start`.
     t_span : (t0, t1)
         [s]; t1 < t0 runs backwards.
-    method : {"algebraic", "Taylor", "RK4", "DOP853", "RK45", "RK23", "Radau", "BDF", "LSODA"}, optional
+    method : {"algebraic", "Taylor", "RK1", ..., "RK8", "DOP853", "RK45", "RK23", "Radau", "BDF", "LSODA"}
         Default: "algebraic" where the program determines the motion completely (Σ o_a = 0: a Newton solve at each
         instant, no integration), else "DOP853". "Taylor" takes compiled series steps of high order, the most accurate
-        method; "RK4" is the compiled fixed-step method; the others are scipy's.
+        method; "RK1", "RK2", "RK4", "RK5" and "RK8" are compiled with a fixed step; the others are scipy's.
     drift : None, "project", float, `project(...)` or `poles(...)`, optional
         Treatment of constraint drift; a number is the time constant of the error dynamics [s].
 
@@ -55,9 +56,9 @@ def simulate(
     rtol, atol : float
         Tolerances of adaptive methods. The defaults keep residuals near 1e-9 over tens of seconds.
     step : float, optional
-        Step of "RK4" [s]; default (t1 - t0)/2000, shortened so that steps end at the knots of paths.
+        Step of the fixed-step methods [s]; default (t1 - t0)/2000, shortened so that steps end at the knots of paths.
     t_eval : (N,) array, optional
-        Times of the samples [s], within t_span. Default: 1001 equal intervals and the knots (all steps for "RK4").
+        Times of the samples [s], within t_span. Default: 1001 instants and the knots; all steps of fixed-step methods.
     order : int, optional
         Order of "Taylor"; default: that of least work for rtol.
     jets : int, optional
@@ -90,8 +91,8 @@ def simulate(
             motion = algebraic(model, t0, x0, times, bar)
         elif method == "Taylor":
             motion = SeriesMethod(model, drift, rtol, atol, order, jets or 0, bar).run(t0, x0, t1, times, knots)
-        elif method == "RK4":
-            motion = fixed_step(model, drift, t0, x0, t1, _step(step, t0, t1), knots, bar)
+        elif method in ORDERS:
+            motion = fixed_step(model, method, drift, (t0, t1), x0, _step(step, t0, t1), knots, bar)
         else:
             motion = Adaptive(model, method, drift, rtol, atol, bar).run(t0, x0, t1, times, knots)
     finally:
@@ -110,11 +111,10 @@ def _finish(model, motion, method, drift, knots, span, wanted):
         status, message = 1, f"interrupted at {last} of {span[2]:g} s; what was computed is kept"
     else:
         status, message = 0, "finished"
-    run = Run(
-        t, jets, model.names_to(jets.shape[0]), model, method, str(drift or ""), motion.counters, status == 0, status, message, knots,
-        tuple(variants),
-    )  # fmt: skip
-    if wanted is not None and method == "RK4":
+    told = {"method": method, "drift": str(drift or ""), "counters": motion.counters, "knots": knots}
+    told |= {"success": status == 0, "status": status, "message": message, "variants": tuple(variants)}
+    run = Run(t, jets, model.names_to(len(jets)), model, **told)
+    if wanted is not None and method in ORDERS:
         run = _resample(run, wanted)
     if motion.stop is not None:
         motion.stop.run = run
@@ -187,7 +187,8 @@ def _drift(drift, method):
 
 def _refuse_idle(method, step, order, jets):
     """Refuse options that the method would not use: nothing asked for is ignored."""
-    for name, value, users in (("step", step, ("RK4",)), ("order", order, ("Taylor",)), ("jets", jets, ("Taylor",))):
+    series = ("Taylor",)
+    for name, value, users in (("step", step, tuple(ORDERS)), ("order", order, series), ("jets", jets, series)):
         if value is not None and method not in users:
             raise SpecificationError(
                 f"{name}={value!r} was given with method={method!r}.",
