@@ -36,13 +36,17 @@ def at_random(q, parameters=None, seed=0, low=0.3, high=1.2, level=4):
 
 
 def motion(model, t=0.0, guess=None, **held):
-    """A consistent state at t with its next derivatives: the jets Z, (n_z,)."""
+    """A consistent state at t with its next derivatives: the jets Z, (n_z,); pivots chosen again where they vanish."""
     state = model.start(t, guess=guess, **held)
     if model.flat and model.reduction.top == 2:
         y = model.function("path")(t, state.values[: model.nq], model.parameters)
-        return np.concatenate([state.values, y[model.nq + model.nq + model.n :][: model.n]])
-    rates = model.function("ode")(t, state.values, model.parameters)
-    return np.concatenate([state.values, rates[len(state.values) - model.n : len(state.values)]])
+        return np.concatenate([state.values, y[2 * model.nq + model.n :][: model.n]])
+    n_x = len(state.values)
+    rates = model.function("ode")(t, state.values, model.parameters)[:n_x]
+    if not np.all(np.isfinite(rates)):
+        near = model.near(t, np.append(state.values, np.zeros(model.n)))
+        rates = near.function("ode")(t, state.values, model.parameters)[:n_x]
+    return np.append(state.values, rates[-model.n :])
 
 
 def signal(model, kind, t, jets):

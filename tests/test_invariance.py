@@ -262,8 +262,6 @@ def test_masses_that_become_zero_at_run_time_are_refused(gallery_model):
 def test_a_model_near_a_state_is_the_same_model(name, gallery_model):
     """Pivots chosen again for one state of the motion: same orders, same accelerations, same actuation."""
     model, scene, t = gallery_model(name), gallery[name], 0.3
-    if name in ("crane-3d", "crane-3d-redundant"):
-        t = 2.0
     jets = motion(model, t, guess=scene.guess, **scene.start)
     near = model.near(t, jets)
     assert orders(near) == orders(model)

@@ -28,6 +28,16 @@ def move(t, smoothness=4, t_start=0.0, duration=2.0):
     return sv.paths.rest_to_rest(t, 0, 1, duration, smoothness=smoothness, t_start=t_start)
 
 
+def rate(path, t, k, smoothness):
+    """The k-th derivative of a path, by Taylor arithmetic: of class C^(smoothness - k)."""
+    q = sv.coordinates("x")
+    return ca.substitute(q.dt(path(q.t, smoothness), k), q.t, t)
+
+
+def S9(s):
+    return 126 * s**5 - 420 * s**6 + 540 * s**7 - 315 * s**8 + 70 * s**9
+
+
 VIA = ([0.5, 1.5, 2.0, 4.0], [0.0, 1.0, 0.5, 2.0])
 SMOOTH = {
     "rest_to_rest": (lambda t, p: move(t), [0, 2]),
@@ -48,6 +58,10 @@ SMOOTH = {
         lambda t, p: move(sv.paths.trapezoid(t, 1, 4.0, 1.0, smoothness=4), duration=0.5, t_start=0.25),
         [0, 1, 1.25, 2.75, 3, 4],
     ),
+    "held at its end": (lambda t, p: ca.if_else(t < 2, S9(t / 2), 1), [2]),
+    "held at its end by fmin": (lambda t, p: S9(ca.fmin(t / 2, 1)), [2]),
+    "differentiated": (lambda t, p: rate(move, t, 1, 5), [0, 2]),
+    "differentiated twice": (lambda t, p: rate(move, t, 2, 6), [0, 2]),
     "three in one": (
         lambda t, p: sv.paths.spline(move(move(t), duration=1.0), [0, 0.5, 1], [0, 2, 1], 4, "natural"), [0, 1, 2]
     ),
@@ -82,6 +96,7 @@ ROUGH = {
     "natural spline 2": (lambda t, p: sv.paths.spline(t, *VIA, smoothness=2, ends="natural"), 2, 1.5),
     "if_else": (lambda t, p: ca.if_else(t < 3, 0, (t - 3) ** 3), 2, 3.0),
     "fabs": (lambda t, p: ca.fabs(t - 1) ** 3, 2, 1.0),
+    "differentiated": (lambda t, p: rate(move, t, 2, 4), 2, 0.0),
     "a jump": (lambda t, p: ca.if_else(t < 3, 0, 1), -1, 3.0),
     "a small jump": (lambda t, p: move(t) + 1e-4 * (t > 1), -1, 1.0),
     "the roughest of two": (lambda t, p: move(t) + ca.fmax(t - 1.5, 0) ** 2 + ca.fmax(t - 1, 0) ** 4, 1, 1.5),

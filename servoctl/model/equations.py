@@ -83,6 +83,17 @@ class Equations:
         name = "ode_poles" if poles else "ode"
         return self.function(name, self.state, [self.rates(solution), *(g for _, g in self.guards)], extra)
 
+    def ode_jacobian(self, poles=False):
+        """∂X'/∂X, column by column, with the inputs of `ode`."""
+        f = self.ode(poles)
+        p = ca.SX.sym("p", f.numel_in(2))
+        rates = f(self.q.t, self.state, p)[: self.state.numel()]
+        return ca.Function(
+            f"{f.name()}_jacobian",
+            [self.q.t, self.state, p],
+            [ca.densify(ca.cse(ca.vec(ca.densify(ca.jacobian(rates, self.state)))))],
+        )
+
     def path(self):
         """For flat programs: a Newton step for q, then q', γ', γ'' and the guards, as functions of (t, q).
 

@@ -199,8 +199,9 @@ class Model:
 
         Parameters
         ----------
-        name : {"ode", "ode_projected", "ode_poles", "path", "invariants", "metric", "matrices", "plant",
-            "multiplier_form"}
+        name : str
+            "ode", "ode_projected", "ode_poles", "ode_jacobian", "ode_poles_jacobian", "path", "invariants", "metric",
+            "matrices", "plant" or "multiplier_form".
 
         Returns
         -------
@@ -211,12 +212,14 @@ class Model:
                 "ode": lambda e: (e.ode(), ("rk",)),
                 "ode_projected": lambda e: (e.ode(), ("rk",), e.project()),
                 "ode_poles": lambda e: (e.ode(poles=True), ("rk",)),
+                "ode_jacobian": lambda e: (e.ode_jacobian(),),
+                "ode_poles_jacobian": lambda e: (e.ode_jacobian(poles=True),),
                 "path": lambda e: (e.path(), ("newton",)),
-                "invariants": lambda e: (e.invariants(), ()),
-                "metric": lambda e: (e.metric(), ()),
-                "matrices": lambda e: (e.matrices(), ()),
-                "plant": lambda e: (e.plant(), ()),
-                "multiplier_form": lambda e: (e.multiplier_form(), ()),
+                "invariants": lambda e: (e.invariants(),),
+                "metric": lambda e: (e.metric(),),
+                "matrices": lambda e: (e.matrices(),),
+                "plant": lambda e: (e.plant(),),
+                "multiplier_form": lambda e: (e.multiplier_form(),),
             }
             if name not in build:
                 raise unknown(name, list(build), "function")

@@ -9,6 +9,7 @@ from servoctl.simulation.watch import DEGRADED, NEGLIGIBLE, VANISHING, Watch
 
 METHODS = ("RK23", "RK45", "DOP853", "Radau", "BDF", "LSODA")
 ONE_STEP = ("RK23", "RK45", "DOP853", "Radau")
+IMPLICIT = ("Radau", "BDF")
 INSIDE = (0.25, 0.5, 0.75, 1.0)  # of a step: where pivots are looked at
 
 
@@ -37,6 +38,8 @@ class Adaptive:
         self.f = model.function("ode_poles" if stabilised else "ode")
         self.p = np.append(model.parameters, self.drift.coefficients(model)) if stabilised else model.parameters
         self.n_x = self.f.n_x
+        name = "ode_poles_jacobian" if stabilised else "ode_jacobian"
+        self.slopes = model.function(name) if self.method in IMPLICIT else None
         self.projector = Projector(model) if isinstance(self.drift, Project) else None
 
     def run(self, t0, x0, t1, t_eval, knots):
@@ -61,10 +64,14 @@ class Adaptive:
     def _rates(self, t, x):
         return self.f(t, x, self.p)[: self.n_x]
 
+    def _jacobian(self, t, x):
+        return self.slopes(t, x, self.p).reshape(self.n_x, self.n_x).T
+
     def _solver(self, a, x, b):
         import scipy.integrate
 
-        return getattr(scipy.integrate, self.method)(self._rates, a, x, b, rtol=self.rtol, atol=self.atol)
+        exact = {} if self.slopes is None else {"jac": self._jacobian}
+        return getattr(scipy.integrate, self.method)(self._rates, a, x, b, rtol=self.rtol, atol=self.atol, **exact)
 
     def _piece(self, a, x, b):
         solver = self._solver(a, x, b)

@@ -122,14 +122,19 @@ class SeriesMethod:
         steps = y.shape[1]
         if not steps or y.shape[0] == self.n_c:
             return steps, None, "", False
-        for k in range(steps):
+        ends = np.column_stack([y[self.n_c :], self.f(t[-1], states[:, -1], self.p)[self.n_c :]])
+        track = np.abs(self.watch.relative(ends))
+        suspicious = np.any(np.sign(ends[:, :-1]) * np.sign(ends[:, 1:]) < 0, axis=0)
+        suspicious |= np.any((track[:, :-1] < DEGRADED) | (track[:, 1:] < DEGRADED), axis=0)
+        for k in np.flatnonzero(suspicious):
             inside = t[k] + INSIDE * (t[k + 1] - t[k])
             between = self._jets(states[:, k], y[:, k], inside - t[k], self.top - 1)
-            guards = [y[self.n_c :, k], *(self.f(s, between[:, i], self.p)[self.n_c :] for i, s in enumerate(inside))]
-            after = self.f(t[k + 1], states[:, k + 1], self.p)[self.n_c :]
-            track = self.watch.relative(np.array([*guards, after]).T)
-            instants = [t[k], *inside, t[k + 1]]
-            found = self._vanishing(track, instants, k, t, states, y)
+            middle = [self.f(s, between[:, i], self.p)[self.n_c :] for i, s in enumerate(inside)]
+            found = self._vanishing(
+                self.watch.relative(np.array([ends[:, k], *middle, ends[:, k + 1]]).T),
+                [t[k], *inside, t[k + 1]],
+                *(k, t, states, y),
+            )
             if found is not None:
                 return found
         return steps, None, "", False
@@ -144,7 +149,7 @@ class SeriesMethod:
                 where = self._root(i, instants[j], instants[j + 1], t, states, y)
             at = self._state(t, states, y, where)
             if self.watch.rank_measure(where, at) > DEGRADED:
-                return k, None, "", k > 0 or self.motion.counters.get("pivot_changes", 0) < 1000
+                return k, None, "", True
             return k, where, "a pivot changes its sign" if len(changed) else "a pivot has vanished", False
         lowest = np.abs(track[:, -1])
         if lowest.min(initial=1.0) < DEGRADED and self.watch.chart_only(lowest.min(), t[k + 1], states[:, k + 1]):
