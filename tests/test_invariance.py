@@ -1,4 +1,4 @@
-"""The same motion from other words: names, order, units, quasi-velocities, equivalent constraints; numbers at run time."""
+"""The same motion in other words: names, order, units, quasi-velocities, equivalent constraints; other numbers."""
 
 import casadi as ca
 import numpy as np
@@ -7,10 +7,19 @@ from conftest import motion, signal
 
 from servoctl import spec as sv
 from servoctl.errors import ServoError
-from servoctl.mechanisms import crane_3d, gallery, mass_on_car, overhead_crane, winch_crane
+from servoctl.mechanisms import gallery, mass_on_car, overhead_crane, winch_crane
 from servoctl.model.model import derive
 
 TIMES = (0.7, 2.0, 4.4)
+STARTS = {  # off the places where the gallery's starts have a pivot that vanishes
+    "spiral": ({"x": 0.0, "y": 0.0, "dx": 0.8, "dy": 0.6, "d2y": 0.1}, {}),
+    "constant-speed": ({"x": 0.0, "y": 0.0, "dy": -3.0}, {"dx": 4.0}),
+}
+
+
+def start_of(name):
+    """Held values and guess for a start of a gallery scene."""
+    return STARTS.get(name, (gallery[name].start, gallery[name].guess))
 
 
 def orders(model):
@@ -83,9 +92,8 @@ def test_scaled_specifications_get_the_same_report():
     reports = []
     for options in ({}, {"unit": 1e3}, {"unit": 1e-3}, {"residuals": lambda q, X, Z: {"X": 1e6 * X, "Z": Z}}):
         r = derive(*crane(**options)).reduction
-        reports.append(
-            (orders(derive(*crane(**options))), [row.story for row in r.hidden], r.needs, r.top, r.realisation.dependent)
-        )
+        stories = [(row.name, row.order, row.story) for row in r.rows]
+        reports.append((stories, r.needs, r.top, r.realisation.dependent, len(r.guards)))
     assert all(report == reports[0] for report in reports)
 
 
@@ -107,8 +115,10 @@ def test_a_second_derivative_is_two_orders_higher():
     assert model.free == 4 and model.reduction.needs == {"X": 2, "Z": 2}
 
 
-@pytest.mark.parametrize("scale", [1e6, 1e-6, -1.0])
-@pytest.mark.parametrize("name", ["appell-hamel", "spiral", "constant-speed", "mass-on-car", "vtol", "crane-3d-redundant"])
+@pytest.mark.parametrize("scale", [1e6, -1e-6])
+@pytest.mark.parametrize(
+    "name", ["appell-hamel", "spiral", "constant-speed", "mass-on-car", "vtol", "winch-crane-redundant"]
+)
 def test_scaled_constraints_leave_the_gallery_as_it_is(name, scale, gallery_model):
     mechanism, program = gallery[name].build()
     first, *rest = program.residuals
@@ -117,8 +127,8 @@ def test_scaled_constraints_leave_the_gallery_as_it_is(name, scale, gallery_mode
     assert orders(model) == orders(plain)
     assert model.reduction.needs == plain.reduction.needs
     assert model.reduction.realisation.dependent == plain.reduction.realisation.dependent
-    start, t = gallery[name].start, 0.3 if name == "vtol" else 0.0
-    jets = [motion(m, t, guess=gallery[name].guess, **start) for m in (model, plain)]
+    (held, guess), t = start_of(name), 0.3
+    jets = [motion(m, t, guess=guess, **held) for m in (model, plain)]
     assert jets[0] == pytest.approx(jets[1], rel=1e-9, abs=1e-9)
     kind = "actuation" if program.by == "actuators" else "reaction"
     u = [list(signal(m, kind, t, jets[0]).values()) for m in (model, plain)]
@@ -258,11 +268,11 @@ def test_masses_that_become_zero_at_run_time_are_refused(gallery_model):
         motion(model, 1.0, q2=0.1, dq2=0.0)
 
 
-@pytest.mark.parametrize("name", gallery)
+@pytest.mark.parametrize("name", [name for name in gallery if name != "crane-3d"])  # the slowest
 def test_a_model_near_a_state_is_the_same_model(name, gallery_model):
     """Pivots chosen again for one state of the motion: same orders, same accelerations, same actuation."""
-    model, scene, t = gallery_model(name), gallery[name], 0.3
-    jets = motion(model, t, guess=scene.guess, **scene.start)
+    (held, guess), model, t = start_of(name), gallery_model(name), 0.3
+    jets = motion(model, t, guess=guess, **held)
     near = model.near(t, jets)
     assert orders(near) == orders(model)
     kind = "actuation" if model.reduction.program.by == "actuators" else "reaction"
@@ -273,6 +283,12 @@ def test_a_model_near_a_state_is_the_same_model(name, gallery_model):
     assert rates[0] == pytest.approx(rates[1], rel=1e-7, abs=1e-7)
 
 
-def test_crane_3d_is_what_the_gallery_says():
-    mechanism, program = crane_3d()
-    assert mechanism.actuators == ("bridge", "trolley", "hoist") and program.names == ("X", "Y", "Z")
+@pytest.mark.parametrize("name", STARTS)
+def test_a_start_where_a_pivot_vanishes_gets_pivots_of_its_own(name, gallery_model):
+    model, scene = gallery_model(name), gallery[name]
+    state = model.start(0.0, guess=scene.guess, **scene.start)
+    near = model.near(0.0, np.append(state.values, np.zeros(model.n)))
+    rates = near.function("ode")(0.0, state.values, model.parameters)[: len(state.values)]
+    assert np.all(np.isfinite(rates))
+    reaction = signal(near, "reaction", 0.0, np.append(state.values, rates[-model.n :]))
+    assert np.all(np.isfinite(list(reaction.values())))

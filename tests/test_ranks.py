@@ -87,8 +87,9 @@ def test_a_combination_is_found_whatever_the_units():
 
 def symbolic(name, pattern):
     """A matrix of symbols where the pattern is true."""
-    rows = [[ca.SX.sym(f"{name}{i}_{j}") if yes else ca.SX(0) for j, yes in enumerate(row)] for i, row in enumerate(pattern)]
-    return ca.vertcat(*(ca.horzcat(*row) for row in rows))
+    m, n = pattern.shape
+    entries = [[ca.SX.sym(f"{name}{i}_{j}") if pattern[i, j] else ca.SX(0) for j in range(n)] for i in range(m)]
+    return ca.vertcat(*(ca.horzcat(*row) for row in entries))
 
 
 PATTERNS = {
@@ -136,7 +137,8 @@ def test_elimination_does_not_depend_on_units():
     for r, c in ((np.ones(5), np.ones(5)), (rows, columns)):
         scaled = r[:, None, None] * a * c[None, :, None]
         solution, _ = eliminate(A, B, scaled)
-        values = {f"a{i}_{j}": scaled[i, j, 0] for i in range(5) for j in range(5)} | {f"b{i}_0": r[i] * b[i] for i in range(5)}
+        values = {f"a{i}_{j}": scaled[i, j, 0] for i in range(5) for j in range(5)}
+        values |= {f"b{i}_0": r[i] * b[i] for i in range(5)}
         assert c * numbers([solution], values) == pytest.approx(np.linalg.solve(a[:, :, 0], b), rel=1e-9)
 
 

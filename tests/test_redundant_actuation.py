@@ -149,7 +149,7 @@ def test_redundant_actuators_that_reach_the_program_late():
 
 
 def test_an_actuator_that_reaches_the_program_later_than_another_rests():
-    """Cars 1-2-3 in a row, driven at 2 and at 3: the fourth derivative of the first holds the force on the second only."""
+    """Cars 1-2-3 in a row, driven at 2 and 3: the fourth derivative of the first holds the force on the second only."""
     q = sv.coordinates("x1 x2 x3")
     x1, x2, x3 = q
     S = sv.particle(q, 1.0, x1) + sv.particle(q, 2.0, x2) + sv.particle(q, 1.5, x3)

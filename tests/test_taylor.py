@@ -306,13 +306,12 @@ def test_high_orders_are_finite_and_right():
     expression = q.dt(curvature(q), 12)
     values = jets_at_random(q, 14, np.random.default_rng(3))
     found = numbers([expression], values)[0]
-    x, y = ([mpmath.mpf(values[name]) / factorial(k) for k, name in enumerate(names)] for names in (
-        [q.jet_names(k)[0] for k in range(15)], [q.jet_names(k)[1] for k in range(15)]
-    ))  # fmt: skip
+    jets = [[mpmath.mpf(values[q.jet_names(k)[i]]) for k in range(15)] for i in range(2)]
 
     def kappa(t):
-        dx, dy = (mpmath.polyval([k * c[k] for k in range(14, 0, -1)], t) for c in (x, y))
-        ddx, ddy = (mpmath.polyval([k * (k - 1) * c[k] for k in range(14, 1, -1)], t) for c in (x, y))
+        (dx, ddx), (dy, ddy) = (
+            (sum(c[k] * t ** (k - j) / factorial(k - j) for k in range(j, 15)) for j in (1, 2)) for c in jets
+        )
         return (dx * ddy - dy * ddx) / (dx**2 + dy**2) ** mpmath.mpf(1.5)
 
     with mpmath.workdps(80):

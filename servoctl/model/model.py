@@ -97,7 +97,7 @@ class Model:
             if name not in current:
                 raise unknown(name, list(current), "parameter")
         values = r.mechanism.parameters.values({**current, **changes})
-        return Model(r, values, require_smooth(r.switches, values, r.needs), self._functions)
+        return Model(r, values, require_smooth(r.switches, values, r.smoothness), self._functions)
 
     def near(self, t, jets):
         """The same motion with pivots chosen for a state; decisions are made again from the specification.
@@ -180,7 +180,7 @@ class Model:
         SpecificationError
         """
         r = self.reduction
-        return require_smooth(r.switches, self.parameters, r.needs, span).times if r.switches else ()
+        return require_smooth(r.switches, self.parameters, r.smoothness, span).times if r.switches else ()
 
     @property
     def raised(self):

@@ -11,8 +11,11 @@ import numpy as np
 
 from servoctl.errors import InconsistentStart, NotRealisable, SingularProgram, SpecificationError
 from servoctl.reduction.elimination import eliminate
+from servoctl.reduction.manifold import Flow, solve
 from servoctl.reduction.ranks import NOISE, RESOLVED, clean, decide, decide_all
 from servoctl.reduction.rows import Row, dependence, gradient, leading, merge_uses, sample_rows, settle
+
+VANISHED = 1e-5  # of a row's gradient at random points: what is left of it on its solutions, if it is a square
 
 
 def complete(q, rows, context, starts=None):
@@ -200,8 +203,8 @@ def as_rows(q, named, kind, context):
     """Rows of named residuals with their true orders."""
     rows = []
     for name, expression in named.items():
-        uses = {name: 0} if kind == "program" else {}
-        row, _ = settle(q, Row(expression, max(q.order(expression), 0), name, kind, uses=uses), [], context)
+        row = Row(expression, max(q.order(expression), 0), name, kind, uses={name: 0})
+        row, _ = settle(q, row, [], context)
         if row.order < 0:
             raise SpecificationError(
                 f"The residual {name!r} depends on no coordinate.",
@@ -209,5 +212,20 @@ def as_rows(q, named, kind, context):
                 do="Use the symbols of the mechanism's coordinates.",
                 name=name,
             )
+        _refuse_square(q, row, context)
         rows.append(row)
     return rows
+
+
+def _refuse_square(q, row, context):
+    """Refuse a residual whose gradient vanishes where the residual does: φ² = 0 and its like."""
+    start = sample_rows(q, [], row.order, context)
+    flow = Flow(q, [(row.expression, row.order)], row.order, start)
+    z, residual = solve(flow, start.t, start.z, iterations=40)
+    sizes = []
+    for jets in (start.z, z):
+        values, _ = replace(start, z=jets).matrix(gradient(q, row))
+        sizes.append(np.abs(values).max(axis=(0, 1)))
+    solved = residual < 1e-3
+    if solved.any() and np.all(sizes[1][solved] < VANISHED * sizes[0][solved]):
+        raise _vanishing_gradient(row)

@@ -10,7 +10,9 @@ from servoctl.errors import SpecificationError
 from servoctl.spec.taylor import Series, Tape
 
 MOST_BRANCHES = 24  # affine pieces that are followed through one operation
-JUMP = 1e-6  # of the largest value that a derivative takes along the path
+JUMP = 1e-6  # of the largest value that a derivative takes nearby
+AROUND = np.setdiff1d(np.linspace(-1.0, 1.0, 41), [0.0])  # where a derivative's size is taken, of the neighbourhood
+EXTRA = 4  # coefficients beyond those needed, by which series are shifted to the instant itself
 
 
 @dataclass(frozen=True)
@@ -102,6 +104,11 @@ class Switches:
             return ((0.0, 1.0),) if place[0] == "t" else None
         if node.kind == "const":
             return ((float(node.data), 0.0),)
+        if node.kind == "constant":
+            return ((0.0, 0.0), (1.0, 0.0))
+        if node.kind == "gate":
+            taken = pieces[node.args[1]]
+            return taken and tuple({(0.0, 0.0), *taken})
         args = [pieces[a] for a in node.args]
         if any(a is None for a in args) or node.kind not in _PIECE:
             return None
@@ -121,15 +128,14 @@ class Switches:
         grid = np.linspace(t0, t1, 801)
         found = set()
         for s, g in enumerate(sides(grid)):
-            for i in np.flatnonzero(np.sign(g[:-1]) * np.sign(g[1:]) < 0):
-                low, high = grid[i], grid[i + 1]
-                if any(low <= k <= high for k in known):
+            told = np.flatnonzero(g != 0)
+            for i, j in zip(told[:-1], told[1:], strict=True):
+                low, high = grid[i], grid[j]
+                if g[i] * g[j] > 0 or any(low <= k <= high for k in known):
                     continue
                 for _ in range(60):
                     middle = (low + high) / 2
-                    low, high = (
-                        (middle, high) if np.sign(sides(np.array([middle]))[s][0]) == np.sign(g[i]) else (low, middle)
-                    )
+                    low, high = (middle, high) if sides(np.array([middle]))[s][0] * g[i] > 0 else (low, middle)
                 found.add(float((low + high) / 2))
         return found
 
@@ -166,25 +172,29 @@ class Switches:
         """
         if not times:
             return {}
-        top = max(needs.values(), default=0)
-        extra = 4
-        width = max(times[-1] - times[0], 1e-6)
-        h = 1e-4 * min([width, *np.diff(times)])
-        depth = top + extra + 1
-        t = np.array([*(x - h for x in times), *(x + h for x in times), *np.linspace(times[0], times[-1], 203)[1:-1]])
-        series = self._run(t, values, depth)
+        near = np.array([_neighbourhood(times, i) for i in range(len(times))])
+        steps = [1e-4 * near, 1e-7 * near]
+        t = np.concatenate([*(times + x for h in steps for x in (-h, h)), *(times + near * x for x in AROUND)])
+        series = self._run(t, values, max(needs.values(), default=0) + EXTRA + 1)
         result = {}
         for name, c in zip(self.residuals, series.outputs, strict=True):
-            c = np.array([np.broadcast_to(x, t.shape) for x in c])
+            c = np.array([np.broadcast_to(x, t.shape) for x in c]).reshape(len(c), -1, len(times))
             for i, when in enumerate(times):
-                left = _shift(c[:, i], h)
-                right = _shift(c[:, len(times) + i], -h)
-                for k in range(needs.get(name, 0) + 1):
-                    scale = np.abs(c[k]).max()
-                    if abs(left[k] - right[k]) > JUMP * scale and scale > 0:
+                far, close = (
+                    np.subtract(_shift(c[:, 2 * s, i], h[i]), _shift(c[:, 2 * s + 1, i], -h[i]))
+                    for s, h in enumerate(steps)
+                )
+                for k in range(needs.get(name, -1) + 1):
+                    if abs(close[k]) > max(JUMP * np.abs(c[k, :, i]).max(), 0.5 * abs(far[k])):
                         result.setdefault(name, []).append((when, k - 1))
                         break
         return result
+
+
+def _neighbourhood(times, i):
+    """How far to look on either side of an instant: to half the way to the nearest other, or 1 s."""
+    distances = [abs(times[j] - times[i]) for j in (i - 1, i + 1) if 0 <= j < len(times)]
+    return 0.5 * min(distances) if distances else 0.5
 
 
 def _shift(c, h):

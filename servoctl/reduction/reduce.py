@@ -5,12 +5,12 @@ from functools import cached_property
 
 import casadi as ca
 
-from servoctl.errors import SpecificationError, unknown
+from servoctl.errors import NotRealisable, SpecificationError, unknown
 from servoctl.reduction.appell import Realisation, realisation, require_inertia
 from servoctl.reduction.hidden import as_rows, complete
 from servoctl.reduction.knots import Knots, Switches, require_smooth
 from servoctl.reduction.manifold import Context, Points
-from servoctl.reduction.ranks import Rank
+from servoctl.reduction.ranks import Rank, decide_all
 from servoctl.reduction.rows import Row, gradient, merge_uses, sample_rows, settle
 from servoctl.spec.mechanism import Mechanism, require_known
 from servoctl.spec.program import Program
@@ -65,7 +65,12 @@ class Reduction:
     @property
     def needs(self):
         """Derivatives of each residual that the actuation holds."""
-        return needs(self.rows)
+        return {name: count for name, count in needs(self.rows).items() if name in self.program.residuals}
+
+    @property
+    def smoothness(self):
+        """The class that each residual, material constraint and force needs in time."""
+        return smoothness(self.switches, self.rows)
 
     @property
     def hidden(self):
@@ -92,9 +97,30 @@ class Reduction:
         return ca.cse(self.realisation.B[:, :k] @ own)
 
 
+FORCE = "the force on"  # names in the balance, in refusals of forces that jump
+
+
 def needs(rows):
-    """Derivatives of each residual that stand in γ'' and so in the actuation."""
+    """Derivatives of each residual, and of the given forces, that stand in γ'' and so in the actuation."""
     return merge_uses(*((row.uses, max(0, 2 - row.order)) for row in rows))
+
+
+def smoothness(switches, rows):
+    """The class in time that each expression of the switches needs; a force that no derivative is taken of may jump."""
+    found = needs(rows)
+    forces = found.get(FORCE, 0)
+    if forces:
+        found |= dict.fromkeys((name for name in switches.residuals if name.startswith(FORCE)), forces)
+    return found
+
+
+def _idle(row, program):
+    return NotRealisable(
+        f"The {row.name} vanishes identically on the displacements that {', '.join(program.residuals)} allow.",
+        "Eq. (3.18) determines the motion beside the program.",
+        do="State another program: this one leaves the motion open.",
+        rows=[row.name, *program.residuals],
+    )
 
 
 def reduce(mechanism, program, guess=None, near=None):
@@ -126,7 +152,9 @@ def reduce(mechanism, program, guess=None, near=None):
         raise SpecificationError(
             f"{twice[0]!r} names a residual and a material constraint.", "Each has a name of its own.", do="Rename one."
         )
-    switches = Switches(q, {**program.residuals, **mechanism.constraints}, mechanism.parameters.symbols)
+    names = q.names if q.plain else q.velocity_names
+    forces = {f"{FORCE} {name}": r for name, r in zip(names, mechanism.balance.elements(), strict=True)}
+    switches = Switches(q, {**program.residuals, **mechanism.constraints, **forces}, mechanism.parameters.symbols)
     context = _context(mechanism, switches, guess, near)
     given = as_rows(q, program.residuals, "program", context) + as_rows(q, mechanism.constraints, "material", context)
     program_rows = [row for row in given if row.kind == "program"]
@@ -137,16 +165,20 @@ def reduce(mechanism, program, guess=None, near=None):
     else:
         constraints = [*program_rows, *material]
         points = _points_for(q, constraints, points, context)
+        if decide_all(*points.matrix(ca.vertcat(*(gradient(q, row) for row in constraints))))[0].rank < len(constraints):
+            complete(q, constraints, context, points)
     split = realisation(mechanism, program, constraints, points)
     expressions, pivots = split.dynamics(mechanism.balance)
     guards = [*guards, *((f"choice of dependent coordinates {i + 1}", p) for i, p in enumerate(pivots))]
-    names = q.names if q.plain else q.velocity_names
     dynamics = []
     for i, e in zip(split.independent, expressions, strict=True):
-        row, _ = settle(q, Row(e, max(q.order(e), 0), f"balance of {names[i]}", "dynamics"), [], context)
+        row = Row(e, max(q.order(e), 0), f"balance of {names[i]}", "dynamics", uses={FORCE: 0})
+        row, _ = settle(q, row, [], context)
+        if row.order < 0:
+            raise _idle(row, program)
         dynamics.append(row)
     rows, rank, points, more = complete(q, [*constraints, *dynamics], context, points)
-    knots = require_smooth(switches, context.values, needs(rows))
+    knots = require_smooth(switches, context.values, smoothness(switches, rows))
     return Reduction(
         mechanism, program, tuple(rows), split, rank, points, tuple([*guards, *more]), knots, switches, context,
         {row.name: row for row in given},
@@ -165,7 +197,9 @@ def _context(mechanism, switches, guess, near):
             raise unknown(name, known, "coordinate or derivative")
     times = switches.times(values)
     window = (0.1, 1.1)
-    if len(times) > 1:
+    if len(times) == 1:
+        window = (times[0] - 1.0, times[0] + 1.0)
+    elif times:
         width = times[-1] - times[0]
         window = (times[0] + 0.07 * width, times[-1] - 0.07 * width)
     return Context(mechanism.parameters.symbols, values, window, guess or {})

@@ -96,7 +96,12 @@ def body_rates(q, rotation):
 
 
 def _acceleration(q, position, what):
-    position = ca.vertcat(*column(position, what))
+    entries = column(position, what)
+    if not 1 <= len(entries) <= 3:
+        raise SpecificationError(
+            f"{what.capitalize()} has {len(entries)} entries.", "A position has one to three.", do="Give x, y, z."
+        )
+    position = ca.vertcat(*entries)
     if q.order(position) > 0:
         raise SpecificationError(
             f"{what.capitalize()} depends on velocities.",

@@ -1,5 +1,7 @@
 """Generalised coordinates, quasi-velocities and their jets, and the total derivative (3.1)."""
 
+from numbers import Integral
+
 import casadi as ca
 
 from servoctl.errors import SpecificationError
@@ -130,7 +132,7 @@ class Coordinates:
         other.h = ca.vertcat(*column([0.0] * self.nq if h is None else h, "h", self.nq))
         other.velocity_names = names
         other.invariants = {k: column(v, f"invariant {k!r}", 1)[0] for k, v in (invariants or {}).items()}
-        _refuse_clash([*self.names, *(jet_name(n, j, plain=False) for n in names for j in range(1, 4))])
+        _refuse_clash([*self.names, *names])
         for what, expression in (("V", V), ("h", other.h)):
             for s in ca.symvar(expression):
                 if (self.where(s) or ("",))[0] == "w":
@@ -141,7 +143,7 @@ class Coordinates:
 
     def w(self, k=0):
         """Symbols of the k-th derivative of the quasi-velocities, γ^(k+1): a tuple of n SX scalars."""
-        return self.gamma(k + 1)
+        return self.gamma(_order(k) + 1)
 
     def gamma(self, k):
         """Symbols of γ^(k), k >= 1: a tuple of n SX scalars. γ' are the quasi-velocities."""
@@ -164,11 +166,7 @@ class Coordinates:
 
         Without quasi-velocities of one's own these are symbols; with them, expressions of w and its derivatives.
         """
-        if not isinstance(k, int) or k < 0:
-            raise SpecificationError(
-                f"q.d({k!r}) was asked for.", "An order is a whole number, at least 0.", do="Write q.d(1)."
-            )
-        if k == 0:
+        if _order(k) == 0:
             return self._q
         if self.plain:
             return self.gamma(k)
@@ -189,7 +187,7 @@ class Coordinates:
         SX of the same shape
         """
         items = column(expression, "the expression")
-        result = ca.vertcat(*self.derivatives(items, k)[k])
+        result = ca.vertcat(*self.derivatives(items, _order(k))[k])
         return ca.reshape(result, *expression.shape) if isinstance(expression, ca.SX) else result
 
     def where(self, symbol):
@@ -258,6 +256,16 @@ class Coordinates:
         return 0.0 if _is_zero(velocity) else velocity / j
 
 
+def _order(k):
+    if isinstance(k, bool) or not isinstance(k, Integral) or k < 0:
+        raise SpecificationError(
+            f"A derivative of order {k!r} was asked for.",
+            "An order is a whole number, at least 0.",
+            do="Write q.d(1), q.w(1) or q.dt(expression, 2).",
+        )
+    return int(k)
+
+
 def _as_sx(c):
     return c if isinstance(c, ca.SX) else ca.SX(c)
 
@@ -293,17 +301,25 @@ def _split(names, what):
 
 
 def _refuse_clash(names):
-    twice = sorted({n for n in names if list(names).count(n) > 1})
-    jets = {jet_name(n, k): n for n in names for k in range(1, 10)}
-    clash = twice or [n for n in names if n in jets]
-    if clash:
-        why = "it is given twice" if twice else f"it is also the name of a derivative of {jets[clash[0]]!r}"
-        raise SpecificationError(
-            f"The name {clash[0]!r} clashes: {why}.",
-            "Every coordinate, quasi-velocity and derivative has a name of its own (theta, dtheta, d2theta, ...).",
-            do="Rename one of them.",
-            name=clash[0],
-        )
+    """Refuse names of which one stands twice, or is the name of a derivative of another."""
+    owner = {}
+    for name in names:
+        if name in owner:
+            why = "it is given twice" if owner[name] == name else f"it is also a derivative of {owner[name]!r}"
+            raise _clash(name, why)
+        owner |= {jet_name(name, k): name for k in range(10)}
+    for name in names:
+        if owner[name] != name:
+            raise _clash(name, f"it is also a derivative of {owner[name]!r}")
+
+
+def _clash(name, why):
+    return SpecificationError(
+        f"The name {name!r} clashes: {why}.",
+        "Every coordinate, quasi-velocity and derivative has a name of its own (theta, dtheta, d2theta, ...).",
+        do="Rename one of them.",
+        name=name,
+    )
 
 
 def coordinates(names):

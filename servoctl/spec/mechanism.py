@@ -186,7 +186,7 @@ class Mechanism:
         ]
         items = [*ca.vec(self.q.V).elements(), *(x for b in brackets for x in b.elements())]
         values, _ = self.at_random(items)
-        for point in values.T:
+        for point in values.T.astype(float):
             v = point[: self.q.V.numel()].reshape(self.q.n, self.q.nq).T
             rest = point[self.q.V.numel() :].reshape(-1, self.q.nq).T
             outside = rest - v @ np.linalg.lstsq(v, rest, rcond=None)[0]
@@ -248,23 +248,26 @@ class Mechanism:
                 columns.append(self._column(items, what, self.q.n))
                 continue
             displacement = self._scalar(items[0], what)
-            gradient = self.q.V.T @ ca.gradient(displacement, ca.vertcat(*self.q))
-            if gradient.nnz() == 0:
+            if self.q.order(displacement) < 0:
                 raise SpecificationError(
                     f"The displacement of actuator {name!r} depends on no coordinate.",
                     "An actuator is given by the displacement it works on, or by a direction of n entries.",
                     do="Give a function of q, or a sequence.",
                     name=name,
                 )
-            columns.append(gradient)
+            columns.append(self.q.V.T @ ca.gradient(displacement, ca.vertcat(*self.q)))
+            self._refuse_velocities(displacement)
         result = ca.horzcat(*columns) if columns else ca.SX(self.q.n, 0)
-        if self.q.order(result) > 0:
+        self._refuse_velocities(result)
+        return result
+
+    def _refuse_velocities(self, expression):
+        if self.q.order(expression) > 0:
             raise SpecificationError(
                 "An actuator's displacement or direction depends on velocities.",
                 "E is a function of q and t.",
                 do="Give positions.",
             )
-        return result
 
     def _refuse_orders(self):
         for what, items, limit in (

@@ -70,7 +70,7 @@ class Parameters:
 def _number(name, value):
     try:
         number = float(value)
-    except (TypeError, ValueError):
+    except Exception:  # CasADi raises its own types for symbols
         number = math.nan
     if not math.isfinite(number):
         raise SpecificationError(

@@ -50,7 +50,7 @@ class Program:
             )
         self.residuals = {name: _residual(name, value) for name, value in residuals.items()}
         self.by = by
-        self.weights = dict(weights or {})
+        self.weights = {name: _weight(name, value) for name, value in (weights or {}).items()}
 
     @property
     def names(self):
@@ -80,3 +80,23 @@ def _residual(name, value):
             name=name,
         )
     return items[0]
+
+
+def _weight(name, value):
+    if isinstance(value, ca.SX):
+        items = column(value, f"the weight of {name!r}", 1)
+        if ca.symvar(items[0]):
+            return items[0]
+    try:
+        number = np.nan if isinstance(value, (str, bytes)) else float(value)
+    except Exception:  # CasADi raises its own types for symbols
+        number = np.nan
+    if not (np.isfinite(number) and number > 0):
+        raise SpecificationError(
+            f"The weight of {name!r} is {value!r}.",
+            "The actuation of least uᵀWu exists for positive weights.",
+            nearest="1.0, the default.",
+            do="Give a positive number or an expression.",
+            name=name,
+        )
+    return number

@@ -20,6 +20,7 @@ _NUMPY = {
     "asin": np.arcsin, "acos": np.arccos, "atan": np.arctan, "sinh": np.sinh, "cosh": np.cosh,
     "tanh": np.tanh, "asinh": np.arcsinh, "acosh": np.arccosh, "atanh": np.arctanh, "expm1": np.expm1,
     "log1p": np.log1p, "sign": np.sign, "fabs": np.abs, "atan2": np.arctan2,
+    "power": np.power,
     "lt": lambda a, b: 1.0 * (a < b), "le": lambda a, b: 1.0 * (a <= b),
     "eq": lambda a, b: 1.0 * (a == b), "ne": lambda a, b: 1.0 * (a != b),
     "logic_and": lambda a, b: 1.0 * ((a != 0) & (b != 0)), "logic_or": lambda a, b: 1.0 * ((a != 0) | (b != 0)),
@@ -172,8 +173,12 @@ class Tape:
     def _power(self, base, exponent):
         node = self.nodes[exponent]
         if node.kind != "const":
-            return self._function("exp", self._add("mul", exponent, self._function("log", base)))
+            return self._symbolic_power(base, exponent)
         c = node.data
+        if not math.isfinite(c):
+            raise SpecificationError(
+                f"The expression raises to the power {c}.", "An exponent is finite.", do="Check the expression."
+            )
         if c != int(c) or abs(c) > 64:
             return self._add("power", base, data=c)
         result, square, n = None, base, abs(int(c))
@@ -186,6 +191,15 @@ class Tape:
         one = self._add("const", data=1.0)
         result = one if result is None else result
         return self._add("div", one, result) if c < 0 else result
+
+    def _symbolic_power(self, base, exponent):
+        """y = a^b with y' = (b y/a) a' + (y ln a) b'; the logarithm does not enter where b does not change."""
+        n = len(self.nodes)
+        y = self._add("quad", base, exponent, data=None)
+        by_base = self._add("div", self._add("mul", exponent, y), base)
+        by_exponent = self._add("mul", y, self._function("log", base))
+        self.nodes[n] = Node("quad", (base, exponent), ("power", (by_base, by_exponent)))
+        return y
 
     def _function(self, name, a):
         if (name, a) in self._pairs:
@@ -359,7 +373,10 @@ class Series:
         if k == 0:
             return a[0] ** exponent
         total = _dot(((exponent * (k - j) - j) * a[k - j], y[j]) for j in range(k) if not _is_zero(a[k - j]))
-        return 0.0 if _is_zero(total) else total / (k * a[0])
+        if _is_zero(total):
+            return 0.0
+        vanishes = a[0] if k < exponent else sum(apply("fabs", c) for c in a)  # the power of a zero is zero
+        return select(vanishes == 0, 0.0, total / (k * a[0]))
 
     def _quadrature(self, node, k):
         name, slopes = node.data
@@ -405,7 +422,7 @@ def _size(node, i, v, size):
     if kind in ("input", "const", "constant"):
         return size[i]
     if kind == "quad":
-        return np.abs(v[i]) + sum(np.abs(v[g]) * size[j] for j, g in zip(a, node.data[1], strict=True))
+        return np.abs(v[i]) + sum(np.abs(np.nan_to_num(v[g])) * size[j] for j, g in zip(a, node.data[1], strict=True))
     if kind in ("neg", "copy", "fabs"):
         return size[a[0]]
     if kind == "scale":

@@ -1,0 +1,234 @@
+"""The public surface: names, documentation, short reprs, layering, import cost, sizes."""
+
+import ast
+import inspect
+import re
+import subprocess
+import sys
+from pathlib import Path
+from types import ModuleType
+
+import casadi as ca
+import pytest
+
+import servoctl as sv
+from servoctl.mechanisms import gallery
+
+PACKAGE = Path(sv.__file__).parent
+FILES = sorted(PACKAGE.rglob("*.py"))
+ENTRIES = ("__init__.py", "__main__.py")  # of the package itself: they gather the rest
+
+LAYERS = (
+    "errors", "spec", "reduction", "model", "simulation", "control", "study", "mechanisms", "plots", "interop",
+    "scenes", "rundir", "cli",
+)  # fmt: skip
+BEHIND_THE_SEAM = ("simulation", "control", "study", "plots", "interop", "scenes", "rundir", "cli")
+LATE = ("scipy", "matplotlib", "control", "tqdm", "xarray", "adam", "dask")
+MOST_LINES, MOST_IN_A_FUNCTION, MOST_IN_A_REPR = 450, 80, 12
+
+
+def relative(path):
+    return path.relative_to(PACKAGE).as_posix()
+
+
+def layer(path):
+    return path.relative_to(PACKAGE).parts[0].removesuffix(".py")
+
+
+def imports(path):
+    """Modules that a file imports anywhere, `from servoctl import spec` as servoctl.spec."""
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f"{relative(path)} imports relatively"
+            if node.module == "servoctl":
+                yield from (f"servoctl.{alias.name}" for alias in node.names)
+            else:
+                yield node.module
+
+
+own_files = pytest.mark.parametrize("path", FILES, ids=relative)
+layered = pytest.mark.parametrize("path", [f for f in FILES if relative(f) not in ENTRIES], ids=relative)
+
+
+# names and documentation ---------------------------------------------------------------------------------------------
+
+
+def test_public_names_exist_once_and_in_order():
+    assert sv.__all__ == sorted(set(sv.__all__))
+    assert all(hasattr(sv, name) for name in sv.__all__)
+
+
+def public():
+    """(name, object) of all functions, classes, methods and properties that `servoctl.__all__` leads to."""
+    for name in sv.__all__:
+        thing = getattr(sv, name)
+        if isinstance(thing, ModuleType):
+            names = getattr(thing, "__all__", [n for n in vars(thing) if not n.startswith("_")])
+            inside = [(n, getattr(thing, n)) for n in names]
+            functions = [(n, f) for n, f in inside if callable(f) and f.__module__.startswith("servoctl.")]
+            yield from ((f"{name}.{n}", f) for n, f in functions)
+        else:
+            yield name, thing
+        if inspect.isclass(thing):
+            for n, member in vars(thing).items():
+                if not n.startswith("_") and (callable(member) or isinstance(member, property)):
+                    yield f"{name}.{n}", member
+
+
+PUBLIC = dict(public())
+
+
+@pytest.mark.parametrize("name", PUBLIC)
+def test_a_public_name_is_documented(name):
+    text = inspect.getdoc(PUBLIC[name])
+    assert text
+    first = text.split("\n\n")[0]
+    assert first.endswith((".", ":")) and first[0] == first[0].upper() or first[0] in "qwrγφ"
+
+
+def documented(text):
+    """Names in front of ' : ' and names alone on their line, in a numpydoc docstring; `a, b : float` has two."""
+    names = set()
+    for line in text.splitlines():
+        found = re.match(r"(\*{0,2}\w+(?:, \*{0,2}\w+)*)(?: : |$)", line)
+        if found:
+            names |= {n.strip().lstrip("*") for n in found[1].split(",")}
+    return names
+
+
+def parameters(thing):
+    """Parameter names that a user may pass: none of a class that the toolkit alone makes."""
+    if isinstance(thing, property):
+        return []
+    text = inspect.getdoc(thing) or ""
+    if inspect.isclass(thing) and re.search(r"made by `", text, re.IGNORECASE):
+        return []
+    names = inspect.signature(thing).parameters
+    return [n for n in names if n not in ("self", "cls") and not n.startswith("_")]
+
+
+@pytest.mark.parametrize("name", PUBLIC)
+def test_every_parameter_is_documented(name):
+    thing = PUBLIC[name]
+    wanted = parameters(thing)
+    text = inspect.getdoc(thing) or ""
+    short = wanted == ["k"] and "k-th" in text  # q.d(k), q.w(k): one line says it all
+    missing = [] if short else [n for n in wanted if n not in documented(text)]
+    assert not missing, f"{name} does not document {', '.join(missing)}"
+
+
+# reprs ---------------------------------------------------------------------------------------------------------------
+
+
+def short(value):
+    lines = repr(value).splitlines()
+    assert 1 <= len(lines) <= MOST_IN_A_REPR
+    assert all(line.strip() for line in lines)
+    assert not re.search(r"\bSX\b|object at 0x|@\d+=", repr(value)), "no expressions and no addresses"
+    return True
+
+
+@pytest.mark.parametrize("name", gallery)
+def test_specifications_print_in_twelve_lines(name):
+    mechanism, program = gallery[name].build()
+    assert short(mechanism) and short(program) and short(mechanism.q) and short(mechanism.parameters)
+
+
+@pytest.mark.parametrize("name", ["appell-hamel", "crane-3d", "three-cars", "vtol-centre", "constant-speed-horizontal"])
+def test_models_runs_and_verifications_print_in_twelve_lines(name, gallery_model):
+    scene, model = gallery[name], gallery_model(name)
+    start = model.start(**scene.start, guess=scene.guess)
+    run = sv.simulate(model, start, (0.0, 0.1), t_eval=[0.0, 0.02, 0.04, 0.06, 0.08, 0.1])
+    assert short(start) and short(run) and short(sv.verify(model, run, segments=1))
+    assert short(model) and short(model.structure()) and short(model.reduction.rank)
+    assert short(model.reduction.realisation) and short(model.reduction)
+
+
+def test_a_large_specification_prints_in_twelve_lines():
+    q = sv.coordinates(" ".join(f"x{i}" for i in range(60)))
+    p = sv.parameters(**{f"m{i}": 1.0 + i for i in range(60)})
+    S = sum(sv.particle(q, m, x) for m, x in zip(p.symbols, q, strict=True))
+    mechanism = sv.Mechanism(
+        q, gibbs=S, parameters=p,
+        actuators={f"motor{i}": x for i, x in enumerate(q)},
+        constraints={f"tie{i}": a - b for i, (a, b) in enumerate(zip(list(q)[:20], list(q)[20:], strict=False))},
+        outputs={f"output{i}": x for i, x in enumerate(q)},
+    )  # fmt: skip
+    program = sv.Program({f"residual{i}": x - ca.sin(q.t) for i, x in enumerate(q)})
+    for value in (q, p, mechanism, program):
+        assert short(value)
+
+
+@pytest.mark.parametrize("value", [sv.project(), sv.poles(0.1), sv.poles({"X": (-1.0, -2.0)}), gallery["vtol"]])
+def test_small_values_print_in_twelve_lines(value):
+    assert short(value)
+    assert short(str(value))
+
+
+# layers and imports --------------------------------------------------------------------------------------------------
+
+
+@layered
+def test_a_module_belongs_to_a_layer(path):
+    assert layer(path) in LAYERS
+
+
+@layered
+def test_imports_point_towards_the_specification(path):
+    here = LAYERS.index(layer(path))
+    for module in imports(path):
+        parts = module.split(".")
+        if parts == ["servoctl"]:
+            assert layer(path) in ("cli", "rundir"), "only the shell imports the whole package"
+        elif parts[0] == "servoctl" and parts[1] in LAYERS:
+            assert LAYERS.index(parts[1]) <= here, f"{relative(path)} imports {module}"
+            if layer(path) == "mechanisms":
+                assert parts[1] in ("errors", "spec", "mechanisms")
+            if parts[1] == "mechanisms":
+                assert layer(path) in ("mechanisms", "scenes", "cli"), f"{relative(path)} imports the gallery"
+
+
+@layered
+def test_casadi_stays_on_its_side_of_the_seam(path):
+    roots = {module.split(".")[0] for module in imports(path)}
+    if layer(path) in BEHIND_THE_SEAM:
+        assert "casadi" not in roots
+
+
+@own_files
+def test_optional_and_heavy_packages_are_imported_where_they_are_used(path):
+    top = [node for node in ast.parse(path.read_text()).body if isinstance(node, ast.Import | ast.ImportFrom)]
+    names = [a.name for node in top if isinstance(node, ast.Import) for a in node.names]
+    names += [node.module for node in top if isinstance(node, ast.ImportFrom)]
+    assert not {name.split(".")[0] for name in names} & set(LATE)
+
+
+def test_importing_servoctl_loads_no_heavy_package():
+    program = f"import sys, servoctl; print([name for name in {LATE!r} if name in sys.modules])"
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, cwd=PACKAGE.parent, check=True)
+    assert done.stdout.strip() == "[]"
+
+
+# sizes ---------------------------------------------------------------------------------------------------------------
+
+
+@own_files
+def test_a_file_stays_readable(path):
+    text = path.read_text()
+    assert len(text.splitlines()) <= MOST_LINES
+    tree = ast.parse(text)
+    for node in ast.walk(tree):
+        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
+            length = node.end_lineno - node.lineno + 1
+            assert length <= MOST_IN_A_FUNCTION, f"{relative(path)}: {node.name} has {length} lines"
+
+
+@own_files
+def test_nothing_is_left_open(path):
+    assert not re.search(r"\b(TODO|FIXME|XXX|NotImplementedError)\b", path.read_text())
+
+
+def test_type_information_is_announced():
+    assert (PACKAGE / "py.typed").exists()
