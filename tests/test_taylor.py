@@ -1,6 +1,5 @@
 """Taylor arithmetic: total derivatives against nested differentiation and mpmath, sizes of terms, cost, refusals."""
 
-import time
 from math import factorial
 
 import casadi as ca
@@ -310,7 +309,7 @@ def test_high_orders_are_finite_and_right():
 
     def kappa(t):
         (dx, ddx), (dy, ddy) = (
-            (sum(c[k] * t ** (k - j) / factorial(k - j) for k in range(j, 15)) for j in (1, 2)) for c in jets
+            [sum(c[k] * t ** (k - j) / factorial(k - j) for k in range(j, 15)) for j in (1, 2)] for c in jets
         )
         return (dx * ddy - dy * ddx) / (dx**2 + dy**2) ** mpmath.mpf(1.5)
 
@@ -371,12 +370,10 @@ def test_infinite_exponents_do_not_leak_an_overflow(exponent):
         pass
 
 
-def test_order_60_takes_no_time_worth_speaking_of():
-    """Polynomial cost: a motion of sixty derivatives is derived at all."""
+def test_order_40_is_derived_at_all():
+    """x = e^t to its fortieth derivative: D^40 log(x) = 0 from terms of size 39!."""
     q = coordinates("x")
     (x,) = q
-    start = time.perf_counter()
-    expression = q.dt(ca.sin(x) / (1 + x**2), 60)
-    values = {name: 1.0 / factorial(k) for k in range(61) for name in q.jet_names(k)}
-    assert np.isfinite(numbers([expression], values)[0])
-    assert time.perf_counter() - start < 60
+    values = {name: 1.0 for k in range(41) for name in q.jet_names(k)}
+    assert abs(numbers([q.dt(ca.log(x), 40)], values)[0]) < 1e-13 * factorial(39)
+    assert operations(q.dt(ca.log(x), 40)) < 40**2 * 2

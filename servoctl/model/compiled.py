@@ -13,6 +13,7 @@ import numpy as np
 from servoctl.errors import SpecificationError, unknown
 from servoctl.model import compiler, emit
 from servoctl.model.interpreted import Interpreter, Workspace
+from servoctl.model.loops import LOOPS
 
 # Compiling takes 0.1 s or more, as long as 10^4 and more evaluations by CasADi. A consistent start makes tens of calls,
 # the signals of a short plan are a grid of a hundred points; an integration makes thousands.
@@ -71,8 +72,8 @@ def compiled(f, name, loops=(), project=None):
             name=name,
         )
     for loop in loops:
-        if loop not in emit.LOOPS:
-            raise unknown(loop, emit.LOOPS, "loop")
+        if loop not in LOOPS:
+            raise unknown(loop, LOOPS, "loop")
         needed = _OUTPUTS_PER_STATE[loop] * f.numel_in(1)
         if f.numel_out(0) < needed:
             raise SpecificationError(

@@ -4,7 +4,7 @@ import threading
 
 import numpy as np
 
-from servoctl.model import emit
+from servoctl.model.loops import BISECTIONS, ROUNDING
 
 _guard = threading.Lock()
 
@@ -104,7 +104,7 @@ class Interpreter:
             if not np.isfinite(d).all():
                 return x
             largest, x = np.max(np.abs(d) / (1 + np.abs(x)), initial=0.0), x + d
-            if largest <= emit.ROUNDING:
+            if largest <= ROUNDING:
                 break
         return x
 
@@ -172,7 +172,7 @@ class _Newton:
             x = x + delta
         else:
             return None
-        if defect > emit.ROUNDING:
+        if defect > ROUNDING:
             y_next, _, defect_next = self._at(t, x + delta)
             if defect_next < defect:
                 return x + delta, y_next
@@ -189,7 +189,7 @@ class _Newton:
                 (x, y), t, done = point, following, done + 1
                 while pieces > 1 and done % 2 == 0:
                     done, pieces = done // 2, pieces // 2
-            elif pieces == 2**emit.BISECTIONS:
+            elif pieces == 2**BISECTIONS:
                 return None
             else:
                 done, pieces = 2 * done, 2 * pieces

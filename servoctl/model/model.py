@@ -9,8 +9,9 @@ from servoctl.model.compiled import compiled
 from servoctl.model.equations import Equations, gradient_jets, leading_names
 from servoctl.model.series import taylor_coefficients
 from servoctl.reduction.knots import require_smooth
-from servoctl.reduction.reduce import reduce
+from servoctl.reduction.reduce import holds, reduce
 from servoctl.reduction.structure import structure
+from servoctl.spec.parameters import finite
 
 SIGNALS = (
     "actuation", "reaction", "multipliers", "outputs", "energy", "balance", "coordinate_rates", "residuals",
@@ -82,7 +83,18 @@ class Model:
         return tuple(names[:size])
 
     def with_parameters(self, **changes):
-        """The same model with other numbers; nothing is derived or compiled again.
+        """The same model with other numbers.
+
+        Nothing is derived or compiled again, unless what was zero or of low rank at the old numbers no longer is.
+
+        Parameters
+        ----------
+        **changes : float
+            Parameters by name, SI.
+
+        Returns
+        -------
+        Model
 
         Raises
         ------
@@ -97,6 +109,8 @@ class Model:
             if name not in current:
                 raise unknown(name, list(current), "parameter")
         values = r.mechanism.parameters.values({**current, **changes})
+        if not holds(r, values):
+            return Model(reduce(r.mechanism, r.program, r.context.guess, values=values), values)
         return Model(r, values, require_smooth(r.switches, values, r.smoothness), self._functions)
 
     def near(self, t, jets):
@@ -113,7 +127,7 @@ class Model:
         Model
         """
         guess = dict(zip(self.jet_names, map(float, jets), strict=True))
-        r = reduce(self.reduction.mechanism, self.reduction.program, near=(float(t), guess, self.parameters))
+        r = reduce(self.reduction.mechanism, self.reduction.program, near=(float(t), guess), values=self.parameters)
         if [row.order for row in r.rows] != [row.order for row in self.reduction.rows] and r.free != self.free:
             raise SpecificationError(
                 f"Near t = {t:.6g} s the program has {r.free} free initial values, elsewhere {self.free}.",
@@ -289,7 +303,19 @@ class Model:
         return [(row.name, count) for row, count in zip(self.reduction.rows, e.raised, strict=True)]
 
     def multiplier_form(self, t, jets):
-        """[M -B; C 0] and right sides of the form with multipliers: (rows, columns, N) and (rows, N) arrays."""
+        """[M -B; C 0] and right sides of the form with multipliers.
+
+        Parameters
+        ----------
+        t : (N,) array
+            [s]
+        jets : (n_z, N) array
+
+        Returns
+        -------
+        matrix : (rows, columns, N) array
+        right : (rows, N) array
+        """
         y = self.function("multiplier_form").grid(t, jets, self.parameters)
         columns = self.n + self.reduction.realisation.B.shape[1]
         rows = len(y) // (columns + 1)
@@ -325,7 +351,7 @@ class Model:
     def _signal_functions(self):
         return [(key, value) for key, value in self._functions.items() if key.startswith("signals ")]
 
-    def start(self, t=0.0, guess=None, **held):
+    def start(self, /, t=0.0, guess=None, **held):
         """A consistent state: held values fixed, the rest solved from every invariant at every level.
 
         Parameters
@@ -351,7 +377,7 @@ class Model:
         """
         from servoctl.model.start import consistent
 
-        return consistent(self, float(t), held, guess or {})
+        return consistent(self, finite("t", t, "time"), held, guess)
 
     def structure(self, t=None, jets=None):
         """Index, relative degrees, zeros at infinity and essential orders (see `reduction.structure`).

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from servoctl.errors import InconsistentStart, SpecificationError, unknown
+from servoctl.spec.parameters import finite
 
 TOLERANCE = 1e-10  # of a residual relative to its gradient times the state; Newton reaches rounding
 GUESSED = 1e3  # weight of a guessed value against one that is merely to stay near zero
@@ -73,14 +74,15 @@ class _Invariants:
 def consistent(model, t, held, guess):
     """See `Model.start`."""
     names = model.state_names
-    for name in (*held, *guess):
-        if name not in names:
-            raise unknown(name, names, "state")
+    if not isinstance(guess or {}, dict):
+        raise SpecificationError(
+            f"guess={guess!r} was given.", "A guess names states and values.", do='Write {"x": 1.0}.'
+        )
+    given = {name: finite(name, value) for name, value in {**(guess or {}), **held}.items() if _known(name, names)}
     reference, weights = np.zeros(len(names)), np.ones(len(names))
-    for values, weight in ((guess, GUESSED), (held, 1.0)):
-        for name, value in values.items():
-            reference[names.index(name)] = _finite(name, value)
-            weights[names.index(name)] = weight
+    for name, value in given.items():
+        reference[names.index(name)] = value
+        weights[names.index(name)] = 1.0 if name in held else GUESSED
     movable = np.array([name not in held for name in names])
     invariants = _Invariants(model, t)
     if not np.all(np.isfinite(invariants(reference)[0])):  # a pivot of the model vanishes there
@@ -88,17 +90,26 @@ def consistent(model, t, held, guess):
     x, residual = _best(invariants, reference, weights, movable)
     if not residual < TOLERANCE:
         _refuse(invariants, reference, weights, held, names, x)
-    return State(t, x, names, tuple(held), _free(invariants, x, movable, names, guess), residual)
+    free = _free(invariants, x, movable, names, given)
+    x, residual = _at_guess(invariants, x, residual, reference, weights, movable, names, free, given)
+    return State(t, x, names, tuple(held), free, residual)
 
 
-def _finite(name, value):
-    try:
-        number = float(value)
-    except (TypeError, ValueError):
-        number = np.nan
-    if not np.isfinite(number):
-        raise SpecificationError(f"{name} = {value!r} was given.", "A start is made of finite numbers.", do="Give one.")
-    return number
+def _known(name, names):
+    if name not in names:
+        raise unknown(name, names, "state")
+    return True
+
+
+def _at_guess(invariants, x, residual, reference, weights, movable, names, free, given):
+    """The start with free values exactly as guessed, where that is consistent."""
+    guessed = np.array([name in free and name in given for name in names])
+    if not guessed.any():
+        return x, residual
+    start = np.where(guessed, reference, x)
+    moved = _settle(invariants, start, weights, movable & ~guessed)
+    left = np.abs(invariants.scaled(moved)).max(initial=0.0)
+    return (moved, float(left)) if left < TOLERANCE else (x, residual)
 
 
 def _best(invariants, reference, weights, movable, tries=6):

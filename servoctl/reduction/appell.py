@@ -39,6 +39,9 @@ class Realisation:
     independent: tuple
     numbers: np.ndarray
 
+    def __repr__(self):
+        return f"Realisation({self.B.shape[1]} directions, dependent coordinates {self.dependent})"
+
     def dynamics(self, balance):
         """Tᵀ r, one SX scalar per independent coordinate, and the pivots divided by."""
         if not self.independent:

@@ -39,6 +39,9 @@ class Points:
     values: np.ndarray
     residual: np.ndarray
 
+    def __repr__(self):
+        return f"Points({len(self.t)} points, jets up to order {self.level})"
+
     @property
     def level(self):
         """The highest level K of the jets."""

@@ -1,18 +1,20 @@
 """From a mechanism and a program to the rows that determine the motion and its actuation."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import casadi as ca
+import numpy as np
 
 from servoctl.errors import NotRealisable, SpecificationError, unknown
 from servoctl.reduction.appell import Realisation, realisation, require_inertia
 from servoctl.reduction.hidden import as_rows, complete
 from servoctl.reduction.knots import Knots, Switches, require_smooth
 from servoctl.reduction.manifold import Context, Points
-from servoctl.reduction.ranks import Rank, decide_all
+from servoctl.reduction.ranks import Rank, clean, decide, decide_all
 from servoctl.reduction.rows import Row, gradient, merge_uses, sample_rows, settle
 from servoctl.spec.mechanism import Mechanism, require_known
+from servoctl.spec.parameters import finite
 from servoctl.spec.program import Program
 
 
@@ -51,6 +53,10 @@ class Reduction:
     switches: Switches
     context: Context
     given: dict
+
+    def __repr__(self):
+        rows = ", ".join(f"{row.name} {row.order}" for row in self.rows)
+        return f"Reduction(rows and orders: {rows}; {self.free} free initial values)"
 
     @property
     def top(self):
@@ -97,6 +103,7 @@ class Reduction:
         return ca.cse(self.realisation.B[:, :k] @ own)
 
 
+HELD = 1e-9  # of the size of its terms: what may be left of a residual at points where the rows hold
 FORCE = "the force on"  # names in the balance, in refusals of forces that jump
 
 
@@ -123,7 +130,7 @@ def _idle(row, program):
     )
 
 
-def reduce(mechanism, program, guess=None, near=None):
+def reduce(mechanism, program, guess=None, near=None, values=None):
     """Derive the rows of a motion: eq. (3.18), hidden constraints, ranks on the manifold.
 
     Parameters
@@ -132,8 +139,10 @@ def reduce(mechanism, program, guess=None, near=None):
     program : Program
     guess : dict of str to float, optional
         Values of coordinates or derivatives about which points of the manifold are looked for.
-    near : (t, guess, values), optional
-        A state of a motion with its parameters: pivots are chosen for it.
+    near : (t, jets), optional
+        An instant and a dict of jets: pivots are chosen there.
+    values : (n_p,) array, optional
+        Parameters at which ranks are decided; default: the mechanism's own.
 
     Returns
     -------
@@ -145,28 +154,13 @@ def reduce(mechanism, program, guess=None, near=None):
         See `hidden.complete` and `appell.realisation`.
     """
     q = mechanism.q
-    for name, expression in program.residuals.items():
-        require_known(expression, mechanism, f"the residual {name!r}")
-    twice = [name for name in program.residuals if name in mechanism.constraints]
-    if twice:
-        raise SpecificationError(
-            f"{twice[0]!r} names a residual and a material constraint.", "Each has a name of its own.", do="Rename one."
-        )
+    _check(mechanism, program, guess)
     names = q.names if q.plain else q.velocity_names
     forces = {f"{FORCE} {name}": r for name, r in zip(names, mechanism.balance.elements(), strict=True)}
     switches = Switches(q, {**program.residuals, **mechanism.constraints, **forces}, mechanism.parameters.symbols)
-    context = _context(mechanism, switches, guess, near)
+    context = _context(mechanism, switches, guess, near, values)
     given = as_rows(q, program.residuals, "program", context) + as_rows(q, mechanism.constraints, "material", context)
-    program_rows = [row for row in given if row.kind == "program"]
-    material, _, points, guards = complete(q, [row for row in given if row.kind == "material"], context)
-    require_inertia(mechanism, material, points)
-    if program.by == "ideal":
-        constraints, _, points, guards = complete(q, [*program_rows, *material], context)
-    else:
-        constraints = [*program_rows, *material]
-        points = _points_for(q, constraints, points, context)
-        if decide_all(*points.matrix(ca.vertcat(*(gradient(q, row) for row in constraints))))[0].rank < len(constraints):
-            complete(q, constraints, context, points)
+    constraints, points, guards = _constraints(mechanism, program, given, context)
     split = realisation(mechanism, program, constraints, points)
     expressions, pivots = split.dynamics(mechanism.balance)
     guards = [*guards, *((f"choice of dependent coordinates {i + 1}", p) for i, p in enumerate(pivots))]
@@ -179,22 +173,103 @@ def reduce(mechanism, program, guess=None, near=None):
         dynamics.append(row)
     rows, rank, points, more = complete(q, [*constraints, *dynamics], context, points)
     knots = require_smooth(switches, context.values, smoothness(switches, rows))
-    return Reduction(
-        mechanism, program, tuple(rows), split, rank, points, tuple([*guards, *more]), knots, switches, context,
-        {row.name: row for row in given},
-    )  # fmt: skip
+    by_name = {row.name: row for row in given}
+    found = Reduction(
+        mechanism, program, tuple(rows), split, rank, points, (*guards, *more), knots, switches, context, by_name
+    )
+    _require_outputs(found)
+    return found
 
 
-def _context(mechanism, switches, guess, near):
-    values = mechanism.parameters.values()
-    if near is not None:
-        t, guess, values = near
-        return Context(mechanism.parameters.symbols, values, (t, t), guess, spread=1e-4)
+def holds(reduction, values):
+    """Whether a reduction, which was decided at its own parameters, is right at others as well.
+
+    At points that satisfy its rows with these parameters, the given residuals and the balance must hold, too; every
+    entry that was found to be zero must still be, and every rank must be kept.
+
+    Parameters
+    ----------
+    reduction : Reduction
+    values : (n_p,) array
+
+    Returns
+    -------
+    bool
+    """
+    q, r = reduction.mechanism.q, reduction
+    context = replace(r.context, values=values)
+    points = sample_rows(q, r.rows, r.top, context, starts=r.points)
+    if not len(points.t):
+        return False
+    for matrix, before in ((r.leading, r.points), (r.realisation.B.T, r.points)):
+        old, new = (clean(*p.matrix(matrix)) for p in (before, points))
+        if np.any(np.any(new, axis=2) & ~np.any(old, axis=2)) or decide(new[:, :, 0]).rank < len(new):
+            return False
+    left = [q.derivatives([row.expression], max(0, r.top - row.order)) for row in r.given.values()]
+    left = [level[0] for levels in left for level in levels]
+    free = r.mechanism.balance - r.realisation.B @ r.multipliers
+    found, sizes = points.evaluate([*left, *free.elements()])
+    return bool(np.all(np.abs(found) <= HELD * np.maximum(sizes, 1e-300)))
+
+
+def _check(mechanism, program, guess):
     q = mechanism.q
+    for name, expression in program.residuals.items():
+        require_known(expression, mechanism, f"the residual {name!r}")
+    for name, weight in program.weights.items():
+        require_known(ca.SX(weight), mechanism, f"the weight of {name!r}")
+    twice = [name for name in program.residuals if name in mechanism.constraints]
+    if twice:
+        raise SpecificationError(
+            f"{twice[0]!r} names a residual and a material constraint.", "Each has a name of its own.", do="Rename one."
+        )
+    if not isinstance(guess or {}, dict):
+        raise SpecificationError(
+            f"guess={guess!r} was given.", "A guess names coordinates and values.", do='Write {"x": 1.0}.'
+        )
     known = [*q.names, *(name for k in range(1, 8) for name in q.jet_names(k))]
-    for name in guess or {}:
+    for name, value in (guess or {}).items():
         if name not in known:
             raise unknown(name, known, "coordinate or derivative")
+        finite(name, value)
+
+
+def _constraints(mechanism, program, given, context):
+    """Program and material rows, the latter of full rank, ideal ones together; points on them; pivots divided by."""
+    q = mechanism.q
+    program_rows = [row for row in given if row.kind == "program"]
+    material, _, points, guards = complete(q, [row for row in given if row.kind == "material"], context)
+    require_inertia(mechanism, material, points)
+    if program.by == "ideal":
+        constraints, _, points, guards = complete(q, [*program_rows, *material], context)
+        return constraints, points, guards
+    constraints = [*program_rows, *material]
+    points = _points_for(q, constraints, points, context)
+    G = ca.vertcat(*(gradient(q, row) for row in constraints))
+    if decide_all(*points.matrix(G))[0].rank < len(constraints):
+        complete(q, constraints, context, points)
+    return constraints, points, guards
+
+
+def _require_outputs(reduction):
+    """Refuse an output of higher order than the jets of a motion."""
+    q, top = reduction.mechanism.q, reduction.top
+    for name, expression in reduction.mechanism.outputs.items():
+        if q.order(expression) > top:
+            raise SpecificationError(
+                f"The output {name!r} has order {q.order(expression)}.",
+                f"A motion of this program has jets up to order {top}.",
+                nearest='simulate(..., method="Taylor", jets=...) for derivatives of any order.',
+                do="Give an output of lower order, and take its derivatives from such a run.",
+                name=name,
+            )
+
+
+def _context(mechanism, switches, guess, near, values):
+    values = mechanism.parameters.values() if values is None else np.asarray(values, dtype=float)
+    if near is not None:
+        t, guess = near
+        return Context(mechanism.parameters.symbols, values, (t, t), guess, spread=1e-4)
     times = switches.times(values)
     window = (0.1, 1.1)
     if len(times) == 1:

@@ -40,6 +40,9 @@ class Row:
     story: str = ""
     uses: dict = field(default_factory=dict)
 
+    def __repr__(self):
+        return f"Row({self.name}: {self.kind}, order {self.order}{', ' + self.story if self.story else ''})"
+
 
 def merge_uses(*parts):
     """The highest number of differentiations of each residual among (uses, extra differentiations) pairs."""

@@ -69,7 +69,13 @@ class Run:
         return self.stored[name]
 
     def signals(self, kind):
-        """Names and (n, N) values of one of the model's groups of signals."""
+        """Names and (n, N) values of one of the model's groups of signals.
+
+        Parameters
+        ----------
+        kind : str
+            One of `servoctl.model.model.SIGNALS`.
+        """
         parts = []
         for first, end, model in self.variants or ((0, len(self.t), self.model),):
             names, f = model.signals(kind)
@@ -102,6 +108,11 @@ class Run:
 
     def at(self, t):
         """The jets Z at an instant (n_z,), between samples by Hermite interpolation of all derivatives.
+
+        Parameters
+        ----------
+        t : float
+            Within the run [s].
 
         Raises
         ------

@@ -33,6 +33,8 @@ class Verification:
         Numbers that exceed their limit.
     notes : tuple of str
         What could not be checked, and why.
+    limits : dict of str to float
+        The largest value of each number that passes.
     """
 
     numbers: dict

@@ -292,9 +292,11 @@ def _split(names, what):
         )  # fmt: skip
     names = tuple(names.split())
     for name in names:
-        if not name.isidentifier() or name == "t":
+        if not name.isidentifier() or name in ("t", "guess"):
             raise SpecificationError(
-                f"{name!r} was given as a name.", "A name is a Python identifier other than t.", do="Rename it."
+                f"{name!r} was given as a name.",
+                "A name is a Python identifier other than t and guess, which are arguments of a start.",
+                do="Rename it.",
             )
     _refuse_clash(names)
     return names

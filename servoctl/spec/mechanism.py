@@ -199,12 +199,26 @@ class Mechanism:
                 )
 
     def is_zero(self, items):
-        """Whether expressions vanish at seeded random points, to rounding in the size of their terms."""
+        """Whether expressions vanish at seeded random points, to rounding in the size of their terms.
+
+        Parameters
+        ----------
+        items : sequence of SX scalars
+        """
         values, sizes = self.at_random(items)
         return bool(np.all(np.abs(values) <= 1e-12 * sizes))
 
     def at_random(self, items):
-        """Values and sizes of expressions at four seeded random points of t, jets and parameters."""
+        """Values and sizes of expressions at four seeded random points of t, jets and parameters.
+
+        Parameters
+        ----------
+        items : sequence of SX scalars
+
+        Returns
+        -------
+        values, sizes : (len(items), 4) arrays
+        """
         symbols = ca.symvar(ca.vertcat(*items)) if len(items) else []
         points = np.random.default_rng(_SEED).uniform(0.3, 1.3, (len(symbols), 4)).astype(np.longdouble)
         for i, s in enumerate(symbols):
@@ -322,7 +336,7 @@ def require_known(expression, mechanism, what):
                 f"{what} depends on the symbol {s.name()!r}"
                 + (", which has the name of a known symbol but is another one." if same else "."),
                 "Symbols are the coordinates, their derivatives, the parameters and t.",
-                nearest=hint.details.get("nearest", ""),
+                nearest=f"{hint.details['match']!r}." if hint.details.get("match") else "",
                 do="Use the symbols of sv.coordinates and pass parameters=sv.parameters(...) to the mechanism.",
                 name=s.name(),
             )

@@ -63,18 +63,25 @@ class Parameters:
         for name, value in (changes or {}).items():
             if name not in numbers:
                 raise unknown(name, list(numbers), "parameter")
-            numbers[name] = _number(name, value)
+            numbers[name] = finite(name, value, "parameter")
         return np.array(list(numbers.values()), dtype=float)
 
 
-def _number(name, value):
+def finite(name, value, what="value"):
+    """A finite float from a number.
+
+    Raises
+    ------
+    SpecificationError
+        Naming what was given.
+    """
     try:
-        number = float(value)
+        number = math.nan if isinstance(value, (str, bytes, complex)) else float(value)
     except Exception:  # CasADi raises its own types for symbols
         number = math.nan
     if not math.isfinite(number):
         raise SpecificationError(
-            f"The parameter {name!r} is {value!r}.", "A parameter is a finite number.", do="Give a number.", name=name
+            f"The {what} {name!r} is {value!r}.", f"A {what} is a finite number.", do="Give a number.", name=name
         )
     return number
 
@@ -99,4 +106,4 @@ def parameters(**values):
     for name in values:
         if name in ("t", "names", "values", "symbols", "defaults"):
             raise SpecificationError(f"A parameter is named {name!r}.", "This name is taken.", do="Rename it.")
-    return Parameters({name: _number(name, value) for name, value in values.items()})
+    return Parameters({name: finite(name, value, "parameter") for name, value in values.items()})

@@ -1,0 +1,272 @@
+"""Motions that end where a program is singular, motions that must not, and pivots that change on the way."""
+
+import casadi as ca
+import closed_forms as cf
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+import servoctl as sv
+from servoctl.mechanisms import gallery
+
+ADAPTIVE = ("RK23", "RK45", "DOP853", "Radau", "BDF", "LSODA", "Taylor")
+FIXED = ("RK1", "RK2", "RK4", "RK5", "RK8")
+METHODS = (*ADAPTIVE, *FIXED)
+MULTISTEP = ("BDF", "LSODA")  # carry past states, so that projection is refused
+ZERO = {"x": 0.0, "y": 0.0, "phi": 0.0, "theta": 0.0, "dtheta": 2.0}
+BACKWARDS_STOPS = 1.6956635129  # s: where the wheel stops when it starts with φ' = -1
+REFERENCE = {"rtol": 1e-13, "atol": 1e-14, "method": "DOP853", "dense_output": True}
+
+
+def tolerances(method, rtol=1e-8, step=1e-3):
+    return {"step": step} if method in FIXED else {"rtol": rtol, "atol": 1e-2 * rtol}
+
+
+def drifts(method):
+    return (None,) if method in MULTISTEP else (None, "project")
+
+
+def cases(*values):
+    return [(method, drift, value) for method in METHODS for drift in drifts(method) for value in values]
+
+
+@pytest.fixture(scope="module")
+def squared(gallery_model):
+    return gallery_model("appell-hamel-squared")
+
+
+@pytest.fixture(scope="module")
+def on_the_right_branch(squared):
+    return squared.start(guess={"dx": 0.5}, dphi=1.0, **ZERO)
+
+
+def stopped(model, start, t_span, **options):
+    """The error by which a simulation ends."""
+    with pytest.raises(sv.SingularProgram) as caught:
+        sv.simulate(model, start, t_span, **options)
+    return caught.value
+
+
+# the squared Appell-Hamel program ------------------------------------------------------------------------------------
+
+
+def assert_told(error, at, within):
+    """The error tells when the wheel stops, the row, φ' = 0 and a direction, and keeps the motion on the right branch."""
+    assert abs(error.details["t"] - at) < within
+    assert "speed" in error.details["rows"] and "'speed'" in str(error)
+    assert "dphi" in error.details["zero"] and "dphi = 0" in str(error)
+    assert error.details["measure"] < 0.03 and error.details["direction"]
+    run = error.run
+    assert not run.success and run.status == -1 and "speed" in run.message
+    assert at - within - 0.1 < run.t[-1] <= error.details["t"] + 1e-9
+    forward = run["dx"] * np.cos(run["theta"]) + run["dy"] * np.sin(run["theta"])
+    assert np.all(np.isfinite(run.jets))
+    before = run.t < at - 0.01
+    assert np.all(np.sign(forward[before]) == np.sign(run["dphi"][before]))
+    assert np.abs(forward - 0.5 * run["dphi"])[before].max() < 0.05
+
+
+@pytest.mark.parametrize("rtol", [1e-6, 1e-8, 1e-10])
+@pytest.mark.parametrize(("method", "drift"), [(m, d) for m in ADAPTIVE for d in drifts(m)])
+def test_adaptive_methods_stop_when_the_wheel_stops(method, drift, rtol, squared, on_the_right_branch):
+    error = stopped(squared, on_the_right_branch, (0.0, 2.0), method=method, drift=drift, rtol=rtol)
+    assert_told(error, cf.WHEEL_STOPS, 1e-3)
+
+
+@pytest.mark.parametrize("step", [1e-2, 3e-3, 1e-3, 1e-4])
+@pytest.mark.parametrize("drift", [None, "project"])
+def test_rk4_stops_when_the_wheel_stops(drift, step, squared, on_the_right_branch):
+    error = stopped(squared, on_the_right_branch, (0.0, 2.0), method="RK4", drift=drift, step=step)
+    assert_told(error, cf.WHEEL_STOPS, max(1e-3, step))
+
+
+@pytest.mark.parametrize("method", ["RK2", "RK5", "RK8"])
+def test_other_fixed_step_methods_stop_when_the_wheel_stops(method, squared, on_the_right_branch):
+    error = stopped(squared, on_the_right_branch, (0.0, 2.0), method=method, step=1e-3)
+    assert_told(error, cf.WHEEL_STOPS, 1e-3)
+
+
+@pytest.mark.parametrize("method", ["DOP853", "Radau", "RK4"])
+def test_error_dynamics_do_not_carry_a_motion_through(method, squared, on_the_right_branch):
+    error = stopped(squared, on_the_right_branch, (0.0, 2.0), method=method, drift=0.1, **tolerances(method))
+    assert_told(error, cf.WHEEL_STOPS, 2e-3)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_the_linear_program_passes(method, gallery_model):
+    model = gallery_model("appell-hamel")
+    run = sv.simulate(model, model.start(dphi=1.0, **ZERO), (0.0, 2.0), method=method, **tolerances(method))
+    within = 5e-2 if method == "RK1" else 1e-6
+    assert run.success and run.t[-1] == 2.0
+    assert run["dphi"][-1] == pytest.approx(cf.APPELL_HAMEL_STATES[2.0][5], abs=within)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_a_wheel_that_starts_backwards_stops_later(method, squared):
+    start = squared.start(guess={"dx": -0.5}, dphi=-1.0, **ZERO)
+    run = sv.simulate(squared, start, (0.0, 1.0), method=method, **tolerances(method))
+    assert run.success
+    error = stopped(squared, start, (0.0, 2.5), method=method, **tolerances(method))
+    assert_told(error, BACKWARDS_STOPS, 5e-3 if method == "RK1" else 1e-3)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_a_fast_wheel_does_not_stop(method, squared):
+    start = squared.start(guess={"dx": 7.5}, dphi=15.0, **ZERO)
+    run = sv.simulate(squared, start, (0.0, 2.0), method=method, **tolerances(method))
+    reference = cf.appell_hamel(run.t[[-1]], dphi=15.0)
+    assert run.success
+    assert run["dphi"][-1] == pytest.approx(reference["dphi"][0], abs=0.1 if method == "RK1" else 1e-5)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_a_start_where_the_wheel_stands_is_refused(method, squared):
+    with pytest.raises(sv.ServoError, match="dphi") as caught:
+        start = squared.start(guess={"dx": 0.0}, dphi=0.0, **ZERO)
+        sv.simulate(squared, start, (0.0, 0.5), method=method, **tolerances(method))
+    assert isinstance(caught.value, sv.SingularProgram)
+    assert "speed" in str(caught.value)
+
+
+# constant speed ------------------------------------------------------------------------------------------------------
+
+
+def test_constant_speed_follows_its_closed_form(gallery_model):
+    model, scene = gallery_model("constant-speed"), gallery["constant-speed"]
+    start = model.start(**scene.start, guess=scene.guess)
+    run = sv.simulate(model, start, (0.0, 1.0), rtol=1e-12, atol=1e-13)
+    reference = cf.constant_speed(run.t)
+    for name in ("x", "y", "dx", "dy"):
+        assert np.max(np.abs(run[name] - reference[name])) < 1e-9
+    assert np.max(np.abs(np.hypot(run["dx"], run["dy"]) - 5.0)) < 1e-9
+
+
+@pytest.mark.parametrize(("method", "drift", "rtol"), cases(1e-8))
+def test_a_horizontal_force_ends_with_the_fall(method, drift, rtol, gallery_model):
+    model, scene = gallery_model("constant-speed-horizontal"), gallery["constant-speed-horizontal"]
+    start = model.start(**scene.start, guess=scene.guess)
+    error = stopped(model, start, (0.0, 1.0), method=method, drift=drift, **tolerances(method, rtol))
+    within = 5e-3 if method == "RK1" else 2e-3 if method in FIXED else 1e-3
+    assert abs(error.details["t"] - 5.0 / cf.GRAVITY) < within
+    assert "dx" in error.details["zero"] and "dx = 0" in str(error) and "speed" in str(error)
+    run = error.run
+    early = run.t < 0.45
+    assert run.t[-1] > 0.45 and run["thrust"][-1] < 2 * run["thrust"][early].min() < 0
+    if method != "RK1":
+        assert run["thrust"][early] == pytest.approx(cf.constant_speed_horizontal(run.t[early])["thrust"], rel=1e-4)
+
+
+# no false alarms -----------------------------------------------------------------------------------------------------
+
+SINGULAR = ("appell-hamel-squared", "constant-speed-horizontal")
+
+
+@pytest.mark.parametrize("method", ["RK45", "DOP853", "Radau", "BDF", "LSODA", "Taylor", "RK4"])
+@pytest.mark.parametrize("name", [name for name in gallery if name not in SINGULAR])
+def test_no_false_alarm(name, method, gallery_model):
+    model, scene = gallery_model(name), gallery[name]
+    start = model.start(**scene.start, guess=scene.guess)
+    t0, t1 = scene.t_span
+    span = (t0, t1 if method in ("DOP853", "Taylor", "RK4") else t0 + 0.2 * (t1 - t0))
+    step = {"step": (t1 - t0) / 500} if method == "RK4" else {"rtol": 1e-6, "atol": 1e-8}
+    order = {"order": 8} if method == "Taylor" else {}
+    run = sv.simulate(model, start, span, method=method, t_eval=np.linspace(*span, 11), **step, **order)
+    assert run.success and run.t[-1] == span[1]
+    assert np.all(np.isfinite(run.jets))
+
+
+# pivots that change --------------------------------------------------------------------------------------------------
+
+
+def on_a_circle(kind):
+    """A particle kept on the unit circle, by its equation or by its curvature."""
+    p, q = sv.parameters(m=2.0), sv.coordinates("x y")
+    (x, y), (dx, dy), (ddx, ddy) = q, q.d(1), q.d(2)
+    residual = {
+        "equation": x**2 + y**2 - 1,
+        "curvature": (dx * ddy - dy * ddx) / (dx**2 + dy**2) ** 1.5 - 1,
+    }[kind]
+    mechanism = sv.Mechanism(q, gibbs=sv.particle(q, p.m, ca.vertcat(x, y)), parameters=p)
+    return sv.derive(mechanism, sv.Program({"circle": residual}, by="ideal"))
+
+
+def pendulum_on_a_cart():
+    """A pendulum in Cartesian coordinates, its rod a material constraint, on a cart that is held."""
+    p, q = sv.parameters(M=2.0, m=1.0, l=1.0, g=9.81), sv.coordinates("s x y")
+    s, x, y = q
+    mechanism = sv.Mechanism(
+        q,
+        gibbs=sv.particle(q, p.M, s) + sv.particle(q, p.m, ca.vertcat(x, y)),
+        potential=p.m * p.g * y,
+        actuators={"force": s},
+        constraints={"rod": (x - s) ** 2 + y**2 - p.l**2},
+        parameters=p,
+    )
+    return sv.derive(mechanism, sv.Program({"cart": s}))
+
+
+def driven_pendulum():
+    """A pendulum turned at a constant rate by a torque; every instant of a turn needs other pivots."""
+    p, q = sv.parameters(m=1.0, l=1.0, g=9.81, rate=2.0), sv.coordinates("x y")
+    (x, y), (dx, dy) = q, q.d(1)
+    mechanism = sv.Mechanism(
+        q,
+        gibbs=sv.particle(q, p.m, ca.vertcat(x, y)),
+        potential=p.m * p.g * y,
+        actuators={"torque": ca.vertcat(-y, x) / p.l**2},
+        constraints={"rod": x**2 + y**2 - p.l**2},
+        parameters=p,
+    )
+    return sv.derive(mechanism, sv.Program({"turn": x * dy - y * dx - p.rate * p.l**2}))
+
+
+@pytest.fixture(scope="module")
+def derived():
+    """Models of this module by name, each derived once."""
+    models = {}
+
+    def model(make, *arguments):
+        if (make, arguments) not in models:
+            models[make, arguments] = make(*arguments)
+        return models[make, arguments]
+
+    return model
+
+
+def precise(method):
+    return {"step": 2e-3} if method in FIXED else {"rtol": 1e-11, "atol": 1e-13}
+
+
+@pytest.mark.parametrize("method", ["DOP853", "Radau", "BDF", "LSODA", "Taylor", "RK4", "RK8"])
+@pytest.mark.parametrize("kind", ["equation", "curvature"])
+def test_a_particle_goes_round_and_round(kind, method, derived):
+    model = derived(on_a_circle, kind)
+    start = model.start(x=1.0, y=0.0, dx=0.0, dy=1.0)
+    run = sv.simulate(model, start, (0.0, 20.0), method=method, drift=drifts(method)[-1], **precise(method))
+    assert run.success and run.counters["pivot_changes"] >= 6
+    error = np.hypot(run["x"] - np.cos(run.t), run["y"] - np.sin(run.t)).max()
+    assert error < (1e-6 if method == "BDF" else 1e-8)
+
+
+@pytest.mark.parametrize("method", ["DOP853", "Radau", "LSODA", "Taylor", "RK4"])
+def test_a_pendulum_goes_over_the_top(method, derived):
+    model = derived(pendulum_on_a_cart)
+    start = model.start(s=0.0, ds=0.0, x=0.0, y=-1.0, dx=7.0)
+    run = sv.simulate(model, start, (0.0, 3.0), method=method, drift=drifts(method)[-1], **precise(method))
+    angle = solve_ivp(lambda t, z: [z[1], -9.81 * np.cos(z[0])], (0.0, 3.0), [-np.pi / 2, 7.0], **REFERENCE).sol(run.t)[0]
+    assert angle[-1] > angle[0] + 2 * np.pi
+    assert run.counters["pivot_changes"] >= 4
+    assert np.hypot(run["x"] - np.cos(angle), run["y"] - np.sin(angle)).max() < 1e-7
+    tension = 2 * run["multiplier_rod"] * -1.0  # the rod's reaction is 2 μ (x, y)
+    assert np.abs(tension).max() == pytest.approx(9.81 + 49.0, rel=1e-4)
+    assert np.abs(run["force"]).max() < 80.0 and sv.verify(model, run, segments=4).numbers["acceleration"] < 1e-9
+
+
+@pytest.mark.parametrize("method", ["DOP853", "Radau", "LSODA", "Taylor", "RK4"])
+def test_a_driven_pendulum_turns_by_more_than_360_degrees(method, derived):
+    model = derived(driven_pendulum)
+    start = model.start(x=1.0, y=0.0)
+    run = sv.simulate(model, start, (0.0, 4.0), method=method, drift=drifts(method)[-1], **precise(method))
+    assert run.success and run.counters["pivot_changes"] >= 3
+    assert np.hypot(run["x"] - np.cos(2 * run.t), run["y"] - np.sin(2 * run.t)).max() < 1e-8
+    assert run["torque"] == pytest.approx(9.81 * np.cos(2 * run.t), abs=1e-6)
