@@ -32,6 +32,7 @@ class ServoError(ValueError):
     """
 
     def __init__(self, given, rule="", nearest="", do="", **details):
+        nearest = nearest and f"Nearest: {nearest}"
         parts = (" ".join(str(part).split()) for part in (given, rule, nearest, do))
         super().__init__(" ".join(part if part[-1] in ".!?" else part + "." for part in parts if part))
         self.details = details

@@ -54,7 +54,7 @@ def test_fewer_actuators_than_constraints():
 def test_no_actuators_at_all():
     q, mechanism = plane(actuators=None)
     program = sv.Program({"east": next(iter(q)) - ca.sin(q.t)})
-    refused(NotRealisable, ["1 residuals", "east", "none"], lambda: derive(mechanism, program))
+    refused(NotRealisable, ["1 residual", "east", "none"], lambda: derive(mechanism, program))
 
 
 @pytest.mark.parametrize("power", [3, 4])

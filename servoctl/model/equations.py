@@ -269,6 +269,9 @@ class Equations:
             levels = self.q.derivatives([row.expression], max(0, self.top - row.order))
             names += [(name, j) for j in range(len(levels))]
             expressions += [level[0] for level in levels]
+        for name, expression in self.q.invariants.items():
+            names.append((name, 0))
+            expressions.append(expression)
         return names, expressions
 
     @property

@@ -179,7 +179,7 @@ class Model:
     @property
     def residual_names(self):
         """Names of the rows whose residuals a run reports."""
-        return tuple(self._equations.residual_rows)
+        return (*self._equations.residual_rows, *self.reduction.mechanism.q.invariants)
 
     @property
     def knots(self):

@@ -4,7 +4,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from servoctl.errors import InconsistentStart, SpecificationError, unknown
+from servoctl.errors import InconsistentStart, ServoError, unknown
+from servoctl.spec.coordinates import mapping
 from servoctl.spec.parameters import finite
 
 TOLERANCE = 1e-10  # of a residual relative to its gradient times the state; Newton reaches rounding
@@ -74,20 +75,25 @@ class _Invariants:
 def consistent(model, t, held, guess):
     """See `Model.start`."""
     names = model.state_names
-    if not isinstance(guess or {}, dict):
-        raise SpecificationError(
-            f"guess={guess!r} was given.", "A guess names states and values.", do='Write {"x": 1.0}.'
-        )
-    given = {name: finite(name, value) for name, value in {**(guess or {}), **held}.items() if _known(name, names)}
+    both = {**mapping(guess, "The guesses"), **held}
+    given = {name: finite(name, value) for name, value in both.items() if _known(name, names)}
     reference, weights = np.zeros(len(names)), np.ones(len(names))
     for name, value in given.items():
         reference[names.index(name)] = value
         weights[names.index(name)] = 1.0 if name in held else GUESSED
     movable = np.array([name not in held for name in names])
     invariants = _Invariants(model, t)
-    if not np.all(np.isfinite(invariants(reference)[0])):  # a pivot of the model vanishes there
-        invariants = _Invariants(model.near(t, np.append(reference, np.zeros(model.n))), t)
     x, residual = _best(invariants, reference, weights, movable)
+    for at in (reference, x):
+        if residual < TOLERANCE:
+            break
+        try:  # a pivot of the model may vanish there
+            other = _Invariants(model.near(t, np.append(at, np.zeros(model.n))), t)
+        except ServoError:
+            continue
+        y, left = _best(other, reference, weights, movable)
+        if left < residual or not np.isfinite(residual):
+            invariants, x, residual = other, y, left
     if not residual < TOLERANCE:
         _refuse(invariants, reference, weights, held, names, x)
     free = _free(invariants, x, movable, names, given)

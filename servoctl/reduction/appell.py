@@ -117,7 +117,8 @@ def _actuator_directions(mechanism, program, constraints, points):
     free = rank - len(material)
     if k > free:
         raise NotRealisable(
-            f"The program has {k} residuals ({', '.join(program.residuals)}) and the mechanism {free} independent "
+            f"The program has {k} residual{'s' * (k != 1)} ({', '.join(program.residuals)}) and the mechanism {free} "
+            "independent "
             f"actuators ({', '.join(mechanism.actuators) or 'none'}).",
             "There are at least as many independent actuators as residuals.",
             nearest=f"{free} residuals, or by='ideal'." if free else "by='ideal'.",

@@ -239,7 +239,7 @@ def require_smooth(switches, values, needs, span=None):
             has = f"C^{k}" if k >= 0 else "a jump"
             raise SpecificationError(
                 f"The path in {name!r} needs C^{needs[name]}, has {has} at t = {when:.6g}.",
-                f"The actuation holds the {needs[name]}. derivative of {name!r}, which must be continuous.",
+                f"The actuation holds derivative {needs[name]} of {name!r}, which must be continuous.",
                 nearest=f"A path of smoothness {needs[name]}.",
                 do=f"Give sv.paths.rest_to_rest(..., smoothness={needs[name]}), or a spline of that class.",
                 name=name,

@@ -312,7 +312,8 @@ def _solve_level(flow, t, z, level):
 
 def _scales(jacobian, z):
     """Size of each residual's gradient times that of the jets, (equations, N)."""
-    scale = np.sqrt((jacobian**2 * (1.0 + np.abs(z.astype(float))) ** 2).sum(axis=1))
+    with np.errstate(all="ignore"):
+        scale = np.sqrt((jacobian**2 * (1.0 + np.abs(z.astype(float))) ** 2).sum(axis=1))
     return np.where(scale > 0, scale, 1.0)
 
 

@@ -13,6 +13,7 @@ from servoctl.reduction.knots import Knots, Switches, require_smooth
 from servoctl.reduction.manifold import Context, Points
 from servoctl.reduction.ranks import Rank, clean, decide, decide_all
 from servoctl.reduction.rows import Row, gradient, merge_uses, sample_rows, settle
+from servoctl.spec.coordinates import mapping
 from servoctl.spec.mechanism import Mechanism, require_known
 from servoctl.spec.parameters import finite
 from servoctl.spec.program import Program
@@ -103,6 +104,7 @@ class Reduction:
         return ca.cse(self.realisation.B[:, :k] @ own)
 
 
+NEARBY = 0.01  # s about an instant for which pivots are chosen: at the instant alone, accidents look like laws
 HELD = 1e-9  # of the size of its terms: what may be left of a residual at points where the rows hold
 FORCE = "the force on"  # names in the balance, in refusals of forces that jump
 
@@ -153,8 +155,8 @@ def reduce(mechanism, program, guess=None, near=None, values=None):
     SpecificationError, NotRealisable, SingularProgram, InconsistentStart
         See `hidden.complete` and `appell.realisation`.
     """
-    q = mechanism.q
     _check(mechanism, program, guess)
+    q = mechanism.q
     names = q.names if q.plain else q.velocity_names
     forces = {f"{FORCE} {name}": r for name, r in zip(names, mechanism.balance.elements(), strict=True)}
     switches = Switches(q, {**program.residuals, **mechanism.constraints, **forces}, mechanism.parameters.symbols)
@@ -213,6 +215,13 @@ def holds(reduction, values):
 
 
 def _check(mechanism, program, guess):
+    for value, kind in ((mechanism, Mechanism), (program, Program)):
+        if not isinstance(value, kind):
+            raise SpecificationError(
+                f"A {type(value).__name__} was given in the place of a {kind.__name__}.",
+                "A model is derived from a mechanism and a program, in this order.",
+                do="Write sv.derive(mechanism, program).",
+            )
     q = mechanism.q
     for name, expression in program.residuals.items():
         require_known(expression, mechanism, f"the residual {name!r}")
@@ -223,12 +232,8 @@ def _check(mechanism, program, guess):
         raise SpecificationError(
             f"{twice[0]!r} names a residual and a material constraint.", "Each has a name of its own.", do="Rename one."
         )
-    if not isinstance(guess or {}, dict):
-        raise SpecificationError(
-            f"guess={guess!r} was given.", "A guess names coordinates and values.", do='Write {"x": 1.0}.'
-        )
     known = [*q.names, *(name for k in range(1, 8) for name in q.jet_names(k))]
-    for name, value in (guess or {}).items():
+    for name, value in mapping(guess, "The guesses").items():
         if name not in known:
             raise unknown(name, known, "coordinate or derivative")
         finite(name, value)
@@ -269,7 +274,7 @@ def _context(mechanism, switches, guess, near, values):
     values = mechanism.parameters.values() if values is None else np.asarray(values, dtype=float)
     if near is not None:
         t, guess = near
-        return Context(mechanism.parameters.symbols, values, (t, t), guess, spread=1e-4)
+        return Context(mechanism.parameters.symbols, values, (t - NEARBY, t + NEARBY), guess, spread=1e-3)
     times = switches.times(values)
     window = (0.1, 1.1)
     if len(times) == 1:

@@ -144,7 +144,7 @@ def _replace(q, row, j, values, lower, points):
             return None
         support |= set(np.flatnonzero(np.abs(c * np.abs(numbers[:, :, p]).max(axis=1).astype(float)) > 1e-12))
     chosen = _independent([lower[a] for a in sorted(support)], numbers[sorted(support)])
-    if any(other.order == j and not other.affine for other, _ in chosen):
+    if not chosen or any(other.order == j and not other.affine for other, _ in chosen):
         return None
     rows, numbers = [other for other, _ in chosen], np.array([n for _, n in chosen])
     columns = sorted(decide(numbers[:, :, 0]).columns)

@@ -16,6 +16,7 @@ from servoctl.reduction.ranks import decide, solve_clean
 
 ZERO = 1e-12  # of the size of its terms: below this an entry of J is zero
 INDEPENDENT = 1e-7  # equilibrated pivots of J above this count
+AT_REST = 1e-13  # of the largest jet: below this a jet is zero, not small
 DEPTHS = (2, 4, 6, 8, 12, 16, 24, 32)  # N that are tried until all zeros at infinity are found
 
 
@@ -73,6 +74,8 @@ class Structure:
 
     def __repr__(self):
         k = len(self.residuals)
+        if self.index is None and not self.zeros_at_infinity:
+            return "Structure: not computed, index and relative degrees are those of residuals of order 0, 1 or 2"
         vector = "a vector relative degree exists" if self.decoupling_rank == k else "no vector relative degree"
         pairs = ", ".join(f"{name} {r}" for name, r in zip(self.residuals, self.relative_degree, strict=True))
         essential = ", ".join(f"{name} {r}" for name, r in zip(self.residuals, self.essential_orders, strict=False))
@@ -86,8 +89,8 @@ class Structure:
         if not self.uniform:
             other = [(t, a) for t, a in self.at if replace(a, margin=0.0) != replace(self._typical(), margin=0.0)]
             lines.append(
-                f"  it differs at {len(other)} of {len(self.at)} instants, first t = {other[0][0]:.4g} s: "
-                f"zeros at infinity {other[0][1].zeros_at_infinity}"
+                f"  it differs at {len(other)} of {len(self.at)} instants, first t = {other[0][0]:.4g} s: relative "
+                f"degrees {other[0][1].relative_degree}, zeros at infinity {other[0][1].zeros_at_infinity}"
             )
         return "\n".join(lines)
 
@@ -178,7 +181,8 @@ def _at_depth(reduction, points, depth):
     shared = min(len(z), len(points.z))
     z[:shared] = points.z[:shared]
     flow = Flow(q, [(row.expression, row.order) for row in reduction.rows], level, points)
-    z, residual = solve(flow, points.t, z)
+    z, _ = solve(flow, points.t, z)
+    z[np.abs(z) < AT_REST * np.maximum(1.0, np.abs(z).max(axis=0))] = 0.0
     J, sizes = _input_jacobian(reduction, points, z, depth)
     result = []
     for p in range(len(points.t)):

@@ -89,16 +89,19 @@ class Adaptive:
             steps += 1
             dense = solver.dense_output()
             if self._watched(history, old, solver.t, dense):
-                self._last(*old)
-                break
+                other = self.watch.other_choice(old[0], np.append(old[1], self._top(*old)), *self._suspect[:2])
+                if other is None:
+                    self.motion.stop = self.watch.singular(*self._suspect)
+                    self._last(*old)
+                    break
+                self._count(solver)
+                solver, history = self._change(other, *old, b)
+                continue
             if self._must_repivot:
                 self._count(solver)
-                self._use(self.model.near(solver.t, np.append(solver.y, self._top(solver.t, solver.y))))
-                self.motion.count(pivot_changes=1)
-                self._sample(solver.t, dense, solver.y)
-                solver, history = self._solver(solver.t, solver.y, b), []
-                self.watch.reference = None
-                history.append(self._guards(solver.t, solver.y))
+                t, x = solver.t, solver.y
+                self._sample(t, dense, x)
+                solver, history = self._change(self.model.near(t, np.append(x, self._top(t, x))), t, x, b)
                 continue
             if self.projector is not None and (steps % self.drift.every == 0 or solver.status == "finished"):
                 solver.y = self.projector(solver.t, solver.y)
@@ -110,6 +113,13 @@ class Adaptive:
         self._count(solver)
         self.motion.count(steps=steps)
         return solver.y
+
+    def _change(self, model, t, x, b):
+        """Go on with another variant of the model from a state; its solver and the history of its pivots."""
+        self._use(model)
+        self.watch = Watch(model, t, x)
+        self.motion.count(pivot_changes=1)
+        return self._solver(t, x, b), [self._guards(t, x)]
 
     def _count(self, solver):
         self.motion.count(nfev=solver.nfev, njev=solver.njev, nlu=solver.nlu)
@@ -151,7 +161,7 @@ class Adaptive:
             for i in low:
                 where, value = self._minimum(i, instants, dense, old[0], t)
                 if value < self.watch.bounce(where, dense(where)):
-                    return self._candidate(i, where, dense, "a pivot bounces off zero")
+                    return self._candidate(i, where, dense, "a pivot touches zero")
         worst = int(np.argmin(np.abs(relative[-1])))
         if abs(relative[-1, worst]) < NEGLIGIBLE:
             return self._candidate(worst, t, dense, "a pivot has vanished")
@@ -185,7 +195,7 @@ class Adaptive:
         if self.watch.chart_only(0.0, t, x) and self.watch.rank_measure(t, x) > DEGRADED:
             self._must_repivot = True
             return False
-        self.motion.stop = self.watch.singular(t, x, why)
+        self._suspect = (t, x, why)
         return True
 
     def _failed(self, t, x, message):

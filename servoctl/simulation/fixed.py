@@ -112,10 +112,10 @@ class _Fixed:
             events += [(k, "a pivot changes its sign") for k in np.flatnonzero(np.sign(r[:-1]) * np.sign(r[1:]) < 0)]
             size = np.abs(r)
             inner = np.flatnonzero((size[1:-1] < size[:-2]) & (size[1:-1] <= size[2:]) & (size[1:-1] < DEGRADED)) + 1
-            events += [(k, "a pivot bounces off zero") for k in inner if self._bounces(size[k], t, states, k - offset)]
+            events += [(k, "a pivot touches zero") for k in inner if self._bounces(size[k], t, states, k - offset)]
             events += [(k, "a pivot has vanished") for k in np.flatnonzero(size < NEGLIGIBLE)]
-            weak = np.flatnonzero(size[offset:] < DEGRADED)[:1]
-            for k in weak:
+            weak = np.flatnonzero(size[offset:] < DEGRADED)
+            for k in weak[weak > 0][:1]:
                 if self.watch.chart_only(size[k + offset], t[k], states[:, k]):
                     events.append((k + offset, "repivot"))
         events = [(max(k - offset, 0), why) for k, why in events]
@@ -126,7 +126,11 @@ class _Fixed:
             return k, "", k > 0 or before is not None
         if self._measure(t, states, k) > DEGRADED and self._measure(t, states, k + 1) > DEGRADED:
             return k, "", True
-        return k, why, False
+        j = max(k - 1, 0)
+        top = self.f(t[j], states[:, j], self.p)[self.f.n_x - self.model.n : self.f.n_x]
+        at = min(k, len(t) - 1)
+        other = self.watch.other_choice(t[j], np.append(states[:, j], top), t[at], states[:, at])
+        return (j, "", True) if other is not None and j > 0 else (k, why, False)
 
     def _bounces(self, size, t, states, k):
         k = max(k, 0)

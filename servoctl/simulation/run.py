@@ -283,6 +283,9 @@ class _Residuals(Mapping):
     def __init__(self, run):
         self._run = run
 
+    def __repr__(self):
+        return f"Residuals({', '.join(self._names())})"
+
     def _names(self):
         return list(self._run.stored_residual) if self._run.model is None else list(self._run.model.residual_names)
 

@@ -148,7 +148,8 @@ class SeriesMethod:
             if len(changed):
                 where = self._root(i, instants[j], instants[j + 1], t, states, y)
             at = self._state(t, states, y, where)
-            if self.watch.rank_measure(where, at) > DEGRADED:
+            before = np.append(states[:, k], np.zeros(self.n))
+            if self.watch.rank_measure(where, at) > DEGRADED or self.watch.other_choice(t[k], before, where, at):
                 return k, None, "", True
             return k, where, "a pivot changes its sign" if len(changed) else "a pivot has vanished", False
         lowest = np.abs(track[:, -1])

@@ -204,7 +204,10 @@ def _refuse_idle(method, step, order, jets):
 
 
 def _state(model, start, t0):
-    values = np.asarray(getattr(start, "values", start), dtype=float)
+    try:
+        values = np.asarray(start if isinstance(start, dict) else getattr(start, "values", start), dtype=float)
+    except (TypeError, ValueError):
+        values = np.zeros(0)
     if values.shape != (len(model.state_names),) or not np.all(np.isfinite(values)):
         raise SpecificationError(
             f"The start has the shape {values.shape}.",

@@ -4,6 +4,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from servoctl.errors import SpecificationError
+
 LIMITS = {
     "acceleration": 1e-9,
     "segments": 1e-6,  # adaptive integration at 1e-11 of a motion that is interpolated between samples
@@ -12,7 +14,7 @@ LIMITS = {
     "multiplier form": 1e-9,
     "residual": 1e-6,
 }
-INTEGRATED = 1e-6  # for what holds to rounding only where γ'' is not itself integrated: residuals of order above 2
+INTEGRATED = 1e-6  # for what drift disturbs: where γ'' is itself integrated, or hidden rows are
 
 
 @dataclass(frozen=True)
@@ -86,9 +88,16 @@ def verify(model, run, segments=20):
     -------
     Verification
     """
+    if getattr(run, "model", None) is None or not hasattr(model, "reduction"):
+        raise SpecificationError(
+            f"verify was given a {type(model).__name__} and a {type(run).__name__} "
+            + ("without its model." if hasattr(run, "jets") else "."),
+            "A run is verified with the model that made it; a loaded run has none.",
+            do="Write sv.verify(model, run), or simulate again.",
+        )
     good = np.flatnonzero(np.all(np.isfinite(run.jets), axis=0))
     numbers, limits, notes = {}, dict(LIMITS), []
-    if model.reduction.top > 2:
+    if model.reduction.top > 2 or (model.reduction.hidden and not model.flat):
         limits |= dict.fromkeys(("acceleration", "power", "multiplier form"), INTEGRATED)
     inputs = run.signals("inputs")[1][:, good]
     numbers["acceleration"] = _acceleration(model, run, good, inputs)

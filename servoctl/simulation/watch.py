@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from servoctl.errors import SingularProgram
+from servoctl.errors import ServoError, SingularProgram
 
 DEGRADED = 0.02  # of its reference: a pivot below this is chosen anew, if the matrix itself is better than that
 HELPS = 5.0  # by how much the matrix must be better
@@ -57,15 +57,17 @@ class Watch:
         return float(np.min(now / np.where(self.best > 0, self.best, 1.0)))
 
     def relative(self, guards):
-        """Pivots (n_g, ...) relative to the largest size that each has had; references are updated."""
+        """Pivots (n_g,) or (n_g, N) relative to the largest size that each has had until then."""
         guards = np.asarray(guards)
         if not guards.size:
             return guards
         sizes = np.abs(guards.reshape(len(guards), -1))
-        largest = np.nanmax(np.where(np.isfinite(sizes), sizes, 0.0), axis=1, initial=0.0)
-        self.reference = largest if self.reference is None else np.maximum(self.reference, largest)
-        scale = np.where(self.reference > 0, self.reference, 1.0)
-        return guards / scale.reshape(-1, *(1,) * (guards.ndim - 1))
+        sizes = np.where(np.isfinite(sizes), sizes, 0.0)
+        if self.reference is not None:
+            sizes[:, 0] = np.maximum(sizes[:, 0], self.reference)
+        largest = np.maximum.accumulate(sizes, axis=1)
+        self.reference = largest[:, -1]
+        return guards / np.where(largest > 0, largest, 1.0).reshape(guards.shape)
 
     def residual(self, t, x):
         """Largest residual of the invariants, relative to their gradients at the start."""
@@ -87,6 +89,31 @@ class Watch:
         reference = self.model.guard_sizes()
         weakest = (np.abs(outputs[n_x:]) / np.where(reference > 0, reference, 1.0)).min(initial=1.0)
         return bool(weakest < DEGRADED and self.best.min() > HELPS * weakest)
+
+    def other_choice(self, t, jets, later, state):
+        """The model with pivots and rows chosen anew at an instant, if that keeps its rank at a later state, else None.
+
+        Parameters
+        ----------
+        t : float
+            Before the pivot vanishes [s].
+        jets : (n_z,) array
+            Jets there.
+        later : float
+            Where the pivot vanishes [s].
+        state : (n_x,) array
+            State there.
+
+        Returns
+        -------
+        Model or None
+        """
+        try:
+            other = self.model.near(t, np.nan_to_num(jets))
+            watch = Watch(other, t, jets[: len(state)])
+        except ServoError:
+            return None
+        return other if watch.best.min() > 0 and watch.rank_measure(later, state) > DEGRADED else None
 
     def singular(self, t, x, why):
         """The error that tells where, which row, and which jets are zero there."""

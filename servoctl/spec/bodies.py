@@ -3,7 +3,7 @@
 import casadi as ca
 
 from servoctl.errors import SpecificationError
-from servoctl.spec.coordinates import column
+from servoctl.spec.coordinates import Coordinates, column, matrix
 
 
 def particle(q, mass, position):
@@ -28,6 +28,7 @@ def particle(q, mass, position):
         If the position is no expression or depends on velocities.
     """
     acceleration = _acceleration(q, position, "the particle's position")
+    (mass,) = column(mass, "the mass", 1)
     return mass * ca.dot(acceleration, acceleration) / 2
 
 
@@ -65,6 +66,7 @@ def rigid_body(q, mass, inertia, position=None, rotation=None, rates=None):
             "The body's rates come from one of them.",
             do="Give rotation=R(q) or rates=ω(q, q').",
         )
+    _require_coordinates(q)
     omega = body_rates(q, rotation) if rates is None else ca.vertcat(*column(rates, "rates", 3))
     alpha = q.dt(omega)
     moment = _inertia(inertia) @ omega
@@ -86,7 +88,8 @@ def body_rates(q, rotation):
     -------
     (3,) SX
     """
-    rotation = ca.SX(rotation)
+    _require_coordinates(q)
+    rotation = matrix(rotation, "the rotation")
     if rotation.shape != (3, 3):
         raise SpecificationError(
             f"The rotation has the shape {rotation.shape}.", "A rotation matrix is 3 by 3.", do="Give R(q), (3, 3)."
@@ -96,6 +99,7 @@ def body_rates(q, rotation):
 
 
 def _acceleration(q, position, what):
+    _require_coordinates(q)
     entries = column(position, what)
     if not 1 <= len(entries) <= 3:
         raise SpecificationError(
@@ -111,12 +115,16 @@ def _acceleration(q, position, what):
     return q.dt(position, 2)
 
 
+def _require_coordinates(q):
+    if not isinstance(q, Coordinates):
+        raise SpecificationError(
+            f"q is a {type(q).__name__}.", "Bodies are described in coordinates.", do='Pass sv.coordinates("x y").'
+        )
+
+
 def _inertia(inertia):
-    if isinstance(inertia, (list, tuple)):
-        nested = isinstance(inertia[0], (list, tuple))
-        inertia = ca.vertcat(*(ca.horzcat(*row) for row in inertia)) if nested else ca.vertcat(*inertia)
-    inertia = ca.SX(inertia)
-    if inertia.shape == (3, 1):
+    inertia = matrix(inertia, "the inertia")
+    if inertia.shape in ((3, 1), (1, 3)):
         return ca.diag(inertia)
     if inertia.shape == (3, 3):
         return inertia

@@ -1,5 +1,6 @@
 """Generalised coordinates, quasi-velocities and their jets, and the total derivative (3.1)."""
 
+from math import isfinite
 from numbers import Integral
 
 import casadi as ca
@@ -32,9 +33,9 @@ def column(value, what, size=None):
         raise SpecificationError(
             f"{what} has {len(items)} entries.", f"It needs {size}.", do="Give one entry each.", what=what
         )
-    if any(leaf_is_nan(item) for item in items):
+    if any(holds_no_number(item) for item in items):
         raise SpecificationError(
-            f"{what} holds NaN.",
+            f"{what} holds NaN or infinity.",
             "Functions of math and most of numpy turn symbols into NaN without a word.",
             nearest="ca.sin instead of math.sin, ca.norm_2 instead of np.linalg.norm.",
             do="Use CasADi's functions on symbols.",
@@ -43,11 +44,54 @@ def column(value, what, size=None):
     return items
 
 
-def leaf_is_nan(expression):
-    """Whether a constant NaN stands anywhere in an SX scalar."""
+def matrix(value, what):
+    """An SX matrix from a number, an SX matrix, an array, or nested sequences of scalars.
+
+    Raises
+    ------
+    SpecificationError
+        If it is none of these, is ragged, or holds NaN or infinity.
+    """
+    try:
+        if isinstance(value, (list, tuple)):
+            value = ca.vertcat(*(ca.horzcat(*row) if isinstance(row, (list, tuple)) else ca.SX(row) for row in value))
+        result = ca.SX(value)
+    except Exception as error:  # CasADi raises several types here
+        raise SpecificationError(
+            f"{what} is {value!r}.",
+            "It is a matrix of numbers and expressions.",
+            do="Give rows of equal length.",
+            what=what,
+        ) from error
+    column(ca.vec(result), what)
+    return result
+
+
+def mapping(value, what):
+    """A dict with text for keys, from a dict or None.
+
+    Raises
+    ------
+    SpecificationError
+    """
+    if value is None:
+        return {}
+    if not isinstance(value, dict) or not all(isinstance(key, str) for key in value):
+        raise SpecificationError(
+            f"{what} were given as {value!r}."[:200],
+            "They go by name.",
+            nearest='{"name": expression}.',
+            do="Give a dict with text for keys.",
+            what=what,
+        )
+    return value
+
+
+def holds_no_number(expression):
+    """Whether a constant NaN or infinity stands anywhere in an SX scalar."""
     f = ca.Function("f", [], [expression], {"allow_free": True})
     constants = (f.instruction_constant(k) for k in range(f.n_instructions()) if f.instruction_id(k) == ca.OP_CONST)
-    return any(c != c for c in constants)
+    return any(not isfinite(c) for c in constants)
 
 
 class Coordinates:
@@ -115,9 +159,7 @@ class Coordinates:
             If sizes disagree or a name is taken.
         """
         names = _split(names, "quasi-velocities")
-        if isinstance(V, (list, tuple)):
-            V = ca.vertcat(*(ca.horzcat(*row) if isinstance(row, (list, tuple)) else ca.SX(row) for row in V))
-        V = ca.SX(V)
+        V = matrix(V, "V")
         if V.shape != (self.nq, len(names)):
             raise SpecificationError(
                 f"V has the shape {V.shape}.",
@@ -131,7 +173,9 @@ class Coordinates:
         other.V = V
         other.h = ca.vertcat(*column([0.0] * self.nq if h is None else h, "h", self.nq))
         other.velocity_names = names
-        other.invariants = {k: column(v, f"invariant {k!r}", 1)[0] for k, v in (invariants or {}).items()}
+        other.invariants = {
+            k: column(v, f"invariant {k!r}", 1)[0] for k, v in mapping(invariants, "The invariants").items()
+        }
         _refuse_clash([*self.names, *names])
         for what, expression in (("V", V), ("h", other.h)):
             for s in ca.symvar(expression):
@@ -196,7 +240,9 @@ class Coordinates:
 
     def order(self, expression):
         """The highest k for which γ^(k) stands in an expression (0 for q alone, -1 for neither)."""
-        found = [self.where(s) for s in ca.symvar(ca.SX(expression))]
+        items = ca.vec(expression).elements() if isinstance(expression, ca.SX) else column(expression, "the expression")
+        symbols = ca.symvar(ca.vertcat(*items)) if items else []
+        found = [self.where(s) for s in symbols]
         return max([-1, *(w[1] for w in found if w is not None and w[0] in "qw")])
 
     def derivatives(self, expressions, k):

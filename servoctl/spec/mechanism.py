@@ -6,7 +6,7 @@ import casadi as ca
 import numpy as np
 
 from servoctl.errors import SpecificationError, unknown
-from servoctl.spec.coordinates import Coordinates, column
+from servoctl.spec.coordinates import Coordinates, column, mapping
 from servoctl.spec.parameters import Parameters
 from servoctl.spec.taylor import Tape, evaluate
 
@@ -85,7 +85,7 @@ class Mechanism:
         self._given = None if balance is None else self._column(balance, "the balance", q.n)
         self.potential = ca.SX(0) if potential is None else self._scalar(potential, "the potential")
         self.forces = self._forces(forces)
-        self.actuators = tuple(actuators or {})
+        self.actuators = tuple(mapping(actuators, "The actuators"))
         self.E = self._directions(actuators or {})
         self.constraints = self._named(constraints, "constraint")
         self.outputs = self._named(outputs, "output")
@@ -233,7 +233,8 @@ class Mechanism:
         return self._known(ca.vertcat(*column(value, what, size)), what)
 
     def _named(self, values, what):
-        return {name: self._scalar(v, f"{what} {name!r}") for name, v in (values or {}).items()}
+        named = mapping(values, f"The {what}s").items()
+        return {name: self._known(column(v, f"{what} {name!r}", 1)[0], f"{what} {name!r}") for name, v in named}
 
     def _known(self, expression, what):
         require_known(expression, self, what)
@@ -249,7 +250,7 @@ class Mechanism:
         for name, value in forces.items():
             if name not in names:
                 raise unknown(name, names, "coordinate" if self.q.plain else "quasi-velocity")
-            total[names.index(name)] += self._scalar(value, f"the force on {name!r}")
+            total[names.index(name)] += self._known(column(value, f"the force on {name!r}", 1)[0], "a force")
         return total
 
     def _directions(self, actuators):
@@ -257,6 +258,8 @@ class Mechanism:
         for name, value in actuators.items():
             what = f"actuator {name!r}"
             items = column(value, what)
+            if not items:
+                raise SpecificationError(f"{what} is empty.", "It has a displacement or a direction.", do="Give one.")
             direction = isinstance(value, (list, tuple, np.ndarray)) or len(items) > 1
             if direction:
                 columns.append(self._column(items, what, self.q.n))

@@ -60,6 +60,8 @@ class Parameters:
             For a value that is no finite number.
         """
         numbers = dict(self.defaults)
+        if changes is not None and not isinstance(changes, dict):
+            raise SpecificationError(f"Changes are {changes!r}.", "Parameters change by name.", do="Give a dict.")
         for name, value in (changes or {}).items():
             if name not in numbers:
                 raise unknown(name, list(numbers), "parameter")

@@ -4,7 +4,7 @@ import casadi as ca
 import numpy as np
 
 from servoctl.errors import SpecificationError
-from servoctl.spec.coordinates import column
+from servoctl.spec.coordinates import column, mapping
 
 REALISATIONS = ("ideal", "actuators")
 
@@ -37,20 +37,21 @@ class Program:
                 "A program names at least one residual.",
                 do='Write {"X": expression, ...}.',
             )
-        if by not in REALISATIONS:
+        if not isinstance(by, str) or by not in REALISATIONS:
             raise SpecificationError(
                 f"by={by!r} was given.",
                 "A program is realised by 'ideal' reactions or by the mechanism's 'actuators'.",
                 nearest="'actuators'" if str(by).startswith("a") else "'ideal'",
                 do="Choose one.",
             )
+        mapping(residuals, "The residuals")
         if weights is not None and by != "actuators":
             raise SpecificationError(
                 "Weights were given for an ideal program.", "Weights choose among actuators.", do="Remove them."
             )
         self.residuals = {name: _residual(name, value) for name, value in residuals.items()}
         self.by = by
-        self.weights = {name: _weight(name, value) for name, value in (weights or {}).items()}
+        self.weights = {name: _weight(name, value) for name, value in mapping(weights, "The weights").items()}
 
     @property
     def names(self):

@@ -1,0 +1,203 @@
+"""Ratios against peers in one run: rounds interleaved, answers compared, medians of ratios.
+
+A machine's speed drifts by a factor of two over minutes, so seconds from two runs cannot be compared. Here each peer is
+timed next to us in every round (ours, peer, ours, peer, ...), and what is reported is the median over rounds of peer
+time / our time. An answer that is wrong fails its row, whatever its speed.
+"""
+
+import gc
+import importlib.util
+import math
+import os
+import platform
+import statistics
+import subprocess
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from importlib import metadata
+
+SAMPLE = 0.02  # s: a sample repeats a call until it takes this long
+WORTH = 5  # calls by which settings are compared in `fastest`
+
+
+@dataclass(frozen=True)
+class Missing:
+    """A peer that is not timed, and why."""
+
+    why: str
+
+
+@dataclass(frozen=True)
+class Timed:
+    """What a callable returns that has taken its own time, in another process for instance."""
+
+    seconds: float
+    answer: object
+
+
+@dataclass(frozen=True)
+class Row:
+    """One comparison.
+
+    Parameters
+    ----------
+    title : str
+    ours : callable
+        Takes nothing, returns an answer or `Timed`.
+    peers : dict of str to callable or Missing
+    error : callable
+        The error of an answer, a number; NaN is an error too.
+    within : float
+        Largest error with which an answer counts as right.
+    bars : dict of str to float
+        Least ratio peer / ours that is aimed at, by peer; a peer without one is reported only.
+    looser : dict of str to float
+        Largest errors of peers that cannot come as near as `within`.
+    """
+
+    title: str
+    ours: Callable
+    peers: dict
+    error: Callable
+    within: float
+    bars: dict = field(default_factory=dict)
+    looser: dict = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Limit:
+    """One number with an upper bound: a count, or the median of samples.
+
+    Parameters
+    ----------
+    title : str
+    value : callable
+        Takes the number of rounds, returns the samples.
+    bound : float
+    unit : str
+    """
+
+    title: str
+    value: Callable
+    bound: float
+    unit: str = ""
+
+
+def installed(*modules):
+    """Whether these can be imported."""
+    return all(importlib.util.find_spec(module) for module in modules)
+
+
+def fastest(make, settings, error, within):
+    """The fastest of `make(*setting)` among the settings whose answers are within an error, or `Missing`."""
+    found = []
+    for setting in settings:
+        call = make(*setting)
+        if error(_answer(call())) <= within:
+            found.append((min(_sample(call, 1) for _ in range(WORTH)), call))
+    return min(found, key=lambda item: item[0])[1] if found else Missing(f"no setting reaches {within:.0e}")
+
+
+def measure(row, rounds):
+    """Measure a `Row` or a `Limit`.
+
+    Returns
+    -------
+    dict
+        "title", "rounds" and "lines", one for each peer (or for the limit).
+    """
+    lines = _limit(row, rounds) if isinstance(row, Limit) else _ratios(row, rounds)
+    return {"title": row.title, "rounds": rounds, "lines": lines}
+
+
+def _limit(row, rounds):
+    samples = row.value(rounds)
+    value = statistics.median(samples)
+    low, high = _quartiles(samples)
+    return [{"value": value, "low": low, "high": high, "unit": row.unit, "bar": row.bound, "met": value <= row.bound}]
+
+
+def _ratios(row, rounds):
+    calls = {"": row.ours} | {name: call for name, call in row.peers.items() if not isinstance(call, Missing)}
+    errors, numbers = {}, {}
+    for name, call in calls.items():  # the warm-up, and the answers
+        errors[name] = float(row.error(_answer(call())))
+        numbers[name] = max(1, math.ceil(SAMPLE / max(_sample(call, 1), 1e-9)))
+    times = {name: ([], []) for name in calls if name}
+    gc.disable()
+    try:
+        for _ in range(rounds):
+            for name, (ours, theirs) in times.items():
+                ours.append(_sample(calls[""], numbers[""]))
+                theirs.append(_sample(calls[name], numbers[name]))
+    finally:
+        gc.enable()
+    return [_line(row, name, errors, times.get(name)) for name in row.peers]
+
+
+def _line(row, name, errors, times):
+    line = {"peer": name, "bar": row.bars.get(name)}
+    if times is None:
+        return line | {"missing": row.peers[name].why, "met": None}
+    ratios = [b / a for a, b in zip(*times, strict=True)]
+    ratio, (low, high) = statistics.median(ratios), _quartiles(ratios)
+    ours, theirs = map(statistics.median, times)
+    right = errors[""] <= row.within and errors[name] <= row.looser.get(name, row.within)
+    line |= {"ratio": ratio, "low": low, "high": high, "seconds": theirs, "our_seconds": ours}
+    line |= {"error": errors[name], "our_error": errors[""], "agree": right}
+    return line | {"met": right and (line["bar"] is None or ratio >= line["bar"])}
+
+
+def _answer(result):
+    return result.answer if isinstance(result, Timed) else result
+
+
+def _sample(call, number):
+    start = time.perf_counter()
+    for _ in range(number):
+        result = call()
+    seconds = (time.perf_counter() - start) / number
+    return result.seconds if isinstance(result, Timed) else seconds
+
+
+def _quartiles(samples):
+    if len(samples) < 2:
+        return samples[0], samples[0]
+    first, _, third = statistics.quantiles(samples, n=4, method="inclusive")
+    return first, third
+
+
+def machine():
+    """What the numbers were measured on: processor, cores, system, compiler and versions."""
+    names = ("servoctl", "casadi", "numpy", "scipy", "heyoka")
+    versions = {name: metadata.version(name) for name in names if installed(name) and _distributed(name)}
+    return {
+        "processor": _processor(),
+        "cores": os.cpu_count(),
+        "system": f"{platform.system()} {platform.machine()}",
+        "compiler": _first_line("gcc", "--version"),
+        "versions": {"python": platform.python_version()} | versions,
+    }
+
+
+def _distributed(name):
+    try:
+        return bool(metadata.version(name))
+    except metadata.PackageNotFoundError:
+        return False
+
+
+def _processor():
+    try:
+        with open("/proc/cpuinfo", encoding="utf-8") as lines:
+            return next(line.split(":", 1)[1].strip() for line in lines if line.startswith("model name"))
+    except (OSError, StopIteration):
+        return platform.processor()
+
+
+def _first_line(*command):
+    try:
+        return subprocess.run(command, capture_output=True, text=True, check=True).stdout.splitlines()[0]
+    except (OSError, subprocess.CalledProcessError):
+        return "none"
