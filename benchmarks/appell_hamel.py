@@ -58,7 +58,7 @@ def constrained():
 
 @cache
 def rolling():
-    """Model and start of the same with rolling in the quasi-velocities (z', phi', theta'); the string is the program."""
+    """The same with rolling in the quasi-velocities (z', phi', theta'); the string alone is a program."""
     p = sv.parameters(**P)
     q = sv.coordinates("x y z phi theta")
     _, _, z, phi, theta = q
@@ -124,8 +124,8 @@ def scipy_odeint(rtol):
 
 
 def multiplier_rates():
-    """q'' from [M -J'; J 0] (q'', multipliers) = (Q, -J' q'), in place."""
-    matrix, right, out = np.zeros((8, 8)), np.zeros(8), np.empty(10)
+    """q'' from [M -J^T; J 0] (q'', multipliers) = (Q, -dJ/dt q'), with only the entries that change written anew."""
+    matrix, right = np.zeros((8, 8)), np.zeros(8)
     matrix[range(5), range(5)] = P["m"], P["m"], P["m"], P["I_y"] + P["a"] ** 2 * P["M"], P["I_x"]
     matrix[[5, 6, 7], [0, 1, 2]], matrix[[0, 1, 2], [5, 6, 7]] = 1.0, -1.0
     matrix[7, 3], matrix[3, 7] = P["b"], -P["b"]
@@ -139,8 +139,7 @@ def multiplier_rates():
         matrix[3:5, 5:7] = (a * c, a * s), (-rho * s, rho * c)
         right[5] = -(a * dphi * s * dtheta + rho * dtheta * dtheta * c)
         right[6] = a * dphi * c * dtheta - rho * dtheta * dtheta * s
-        out[:5], out[5:] = x[5:], np.linalg.solve(matrix, right)[:5]
-        return out
+        return np.concatenate([x[5:], np.linalg.solve(matrix, right)[:5]])
 
     return f
 
@@ -237,7 +236,9 @@ def ladder(coarse, fine, per_decade=2):
 
 
 def heyoka_peer(tolerances, within):
-    return fastest(heyoka_taylor, tolerances, error, within) if installed("heyoka") else Missing("heyoka is not installed")
+    if not installed("heyoka"):
+        return Missing("heyoka is not installed")
+    return fastest(heyoka_taylor, tolerances, error, within)
 
 
 def coarse_peers():

@@ -1,7 +1,7 @@
 """The inverse of a crane with a winch, 3,001 points: the actuation with which the load follows its path.
 
-Blajer's data: the load goes from (0, 4) to (5, 1) m in 3 s, Z down, along a straight line, by the polynomial of degree 9.
-A closed form of the actuation exists; errors are relative to its largest entry, the force and the torque each by its own.
+Blajer's data: the load goes from (0, 4) to (5, 1) m in 3 s, Z down, on a straight line, by the polynomial of degree 9.
+The actuation has a closed form; errors of the force and of the torque are relative to the largest size of each.
 """
 
 from functools import cache, partial
@@ -62,8 +62,7 @@ def truth():
     """The closed form at TIMES in extended precision, by the same steps with a path from the definition."""
     t = TIMES.astype(np.longdouble) / np.longdouble(T)
     s = [sum((np.longdouble(c) * t**j for j, c in enumerate(S9.deriv(k).coef)), 0 * t) / T**k for k in range(5)]
-    p = [(FIRST if k == 0 else 0)[:, None] + np.outer(LAST - FIRST, s[k]) if k == 0 else np.outer(LAST - FIRST, s[k])
-         for k in range(5)]  # fmt: skip
+    p = [np.outer(LAST - FIRST, s[k]) + (FIRST[:, None] if k == 0 else 0.0) for k in range(5)]
     pull = [np.array([-p[2][0], G - p[2][1]]), -p[3], -p[4]]
     angle = [np.arctan2(pull[0][0], pull[0][1])]
     size2, turn = (pull[0] ** 2).sum(axis=0), pull[1][0] * pull[0][1] - pull[0][0] * pull[1][1]
@@ -127,7 +126,7 @@ def simulated():
     return call
 
 
-# backward Euler on the servo DAE of index 5, projected to index 3 (Blajer and Kolodziejczyk 2004) -----------------------
+# backward Euler on the servo DAE of index 5, projected to index 3 (Blajer and Kolodziejczyk 2004) ----------------
 
 
 def load_path(t, k=0):

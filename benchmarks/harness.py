@@ -1,8 +1,7 @@
 """Ratios against peers in one run: rounds interleaved, answers compared, medians of ratios.
 
-A machine's speed drifts by a factor of two over minutes, so seconds from two runs cannot be compared. Here each peer is
-timed next to us in every round (ours, peer, ours, peer, ...), and what is reported is the median over rounds of peer
-time / our time. An answer that is wrong fails its row, whatever its speed.
+A machine's speed drifts, so seconds from two runs cannot be compared. Here each peer is timed next to us in every round
+(ours, peer, ours, peer, ...), and reported is the median over rounds of peer time / our time. A wrong answer fails.
 """
 
 import gc
@@ -17,8 +16,10 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from importlib import metadata
 
-SAMPLE = 0.02  # s: a sample repeats a call until it takes this long
-WORTH = 5  # calls by which settings are compared in `fastest`
+import servoctl
+
+SAMPLE = 0.02  # s: a sample repeats a call for as long as this
+TRIALS, TRIAL = 7, 0.001  # samples, and their length [s], by which `fastest` compares settings
 
 
 @dataclass(frozen=True)
@@ -30,7 +31,7 @@ class Missing:
 
 @dataclass(frozen=True)
 class Timed:
-    """What a callable returns that has taken its own time, in another process for instance."""
+    """What a callable returns that has taken its own time, as in another process."""
 
     seconds: float
     answer: object
@@ -95,17 +96,14 @@ def fastest(make, settings, error, within):
     for setting in settings:
         call = make(*setting)
         if error(_answer(call())) <= within:
-            found.append((min(_sample(call, 1) for _ in range(WORTH)), call))
+            found.append((min(_sample(call, _number(call, TRIAL)) for _ in range(TRIALS)), call))
     return min(found, key=lambda item: item[0])[1] if found else Missing(f"no setting reaches {within:.0e}")
 
 
 def measure(row, rounds):
     """Measure a `Row` or a `Limit`.
 
-    Returns
-    -------
-    dict
-        "title", "rounds" and "lines", one for each peer (or for the limit).
+    Returns a dict with "title", "rounds" and "lines", one for each peer (or for the limit).
     """
     lines = _limit(row, rounds) if isinstance(row, Limit) else _ratios(row, rounds)
     return {"title": row.title, "rounds": rounds, "lines": lines}
@@ -119,11 +117,13 @@ def _limit(row, rounds):
 
 
 def _ratios(row, rounds):
+    if isinstance(row.ours, Missing):
+        return [{"peer": name, "bar": row.bars.get(name), "missing": row.ours.why, "met": None} for name in row.peers]
     calls = {"": row.ours} | {name: call for name, call in row.peers.items() if not isinstance(call, Missing)}
     errors, numbers = {}, {}
     for name, call in calls.items():  # the warm-up, and the answers
         errors[name] = float(row.error(_answer(call())))
-        numbers[name] = max(1, math.ceil(SAMPLE / max(_sample(call, 1), 1e-9)))
+        numbers[name] = _number(call, SAMPLE)
     times = {name: ([], []) for name in calls if name}
     gc.disable()
     try:
@@ -153,6 +153,11 @@ def _answer(result):
     return result.answer if isinstance(result, Timed) else result
 
 
+def _number(call, seconds):
+    """Of calls that take this long."""
+    return max(1, math.ceil(seconds / max(_sample(call, 1), 1e-9)))
+
+
 def _sample(call, number):
     start = time.perf_counter()
     for _ in range(number):
@@ -170,22 +175,14 @@ def _quartiles(samples):
 
 def machine():
     """What the numbers were measured on: processor, cores, system, compiler and versions."""
-    names = ("servoctl", "casadi", "numpy", "scipy", "heyoka")
-    versions = {name: metadata.version(name) for name in names if installed(name) and _distributed(name)}
+    versions = {name: metadata.version(name) for name in ("casadi", "numpy", "scipy", "heyoka") if installed(name)}
     return {
         "processor": _processor(),
         "cores": os.cpu_count(),
         "system": f"{platform.system()} {platform.machine()}",
         "compiler": _first_line("gcc", "--version"),
-        "versions": {"python": platform.python_version()} | versions,
+        "versions": {"servoctl": servoctl.__version__, "python": platform.python_version()} | versions,
     }
-
-
-def _distributed(name):
-    try:
-        return bool(metadata.version(name))
-    except metadata.PackageNotFoundError:
-        return False
 
 
 def _processor():

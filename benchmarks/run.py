@@ -19,7 +19,8 @@ BEGIN, END = "<!-- results -->\n", "<!-- end of results -->\n"
 
 def number(value, unit=""):
     if unit == "s":
-        return f"{value:.2f} s" if value >= 0.1 else f"{value * 1e3:.1f} ms" if value >= 1e-4 else f"{value * 1e6:.2g} µs"
+        scale, name = next(((s, n) for s, n in ((1.0, "s"), (1e3, "ms")) if value * s >= 0.1), (1e6, "µs"))
+        return f"{number(value * scale)} {name}"
     return f"{value:.3g}" if value < 1000 else f"{value:.0f}"
 
 

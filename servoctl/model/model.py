@@ -330,6 +330,16 @@ class Model:
         values, _ = self.reduction.points.evaluate([g for _, g in self._equations.guards])
         return np.abs(values).max(axis=1, initial=0.0).astype(float)
 
+    def column_sizes(self):
+        """Largest entry of each column of L and of Bᵀ at the points where ranks were decided: two (n,) arrays."""
+        r = self.reduction
+        sizes = (np.abs(r.points.matrix(m)[0]) for m in (r.leading, r.realisation.B.T))
+        return [m.max(axis=(0, 2), initial=0.0).astype(float) for m in sizes]
+
+    def row_stories(self):
+        """What was done to each row, by name; empty for rows as they were given."""
+        return {row.name: row.story for row in self.reduction.rows}
+
     def leading_names(self):
         """Names of the rows of the two matrices whose ranks carry the motion."""
         return leading_names(self.reduction)

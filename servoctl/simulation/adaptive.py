@@ -1,8 +1,10 @@
 """scipy's adaptive methods on compiled right-hand sides, with the watch on rank and projection."""
 
+import contextlib
+
 import numpy as np
 
-from servoctl.errors import IntegrationStopped
+from servoctl.errors import IntegrationStopped, ServoError
 from servoctl.simulation.drift import Poles, Project, Projector
 from servoctl.simulation.motion import Motion, breakpoints, interruptible, sign_change
 from servoctl.simulation.watch import DEGRADED, NEGLIGIBLE, VANISHING, Watch
@@ -10,6 +12,7 @@ from servoctl.simulation.watch import DEGRADED, NEGLIGIBLE, VANISHING, Watch
 METHODS = ("RK23", "RK45", "DOP853", "Radau", "BDF", "LSODA")
 ONE_STEP = ("RK23", "RK45", "DOP853", "Radau")
 IMPLICIT = ("Radau", "BDF")
+LINGERS = 5.0  # times the way to its crossing that a sunk pivot may stay at zero
 INSIDE = (0.25, 0.5, 0.75, 1.0)  # of a step: where pivots are looked at
 
 
@@ -54,11 +57,11 @@ class Adaptive:
             self._choose_pivots(t0, x0)
             x, cuts = x0, breakpoints((t0, t1), knots)
             for a, b in zip(cuts[:-1], cuts[1:], strict=True):
+                if self.motion.stop is not None:
+                    break
                 inside = t_eval[(t_eval >= min(a, b)) & (t_eval <= max(a, b))]
                 self.pending = list(inside if b >= a else inside[::-1])
                 x = self._piece(a, x, b)
-                if self.motion.stop is not None:
-                    break
         return self.motion
 
     def _rates(self, t, x):
@@ -74,7 +77,7 @@ class Adaptive:
         return getattr(scipy.integrate, self.method)(self._rates, a, x, b, rtol=self.rtol, atol=self.atol, **exact)
 
     def _piece(self, a, x, b):
-        solver = self._solver(a, x, b)
+        solver, self._sunk = self._solver(a, x, b), None
         self._sample(a, None, x)
         history = [self._guards(a, x)]
         steps = 0
@@ -117,7 +120,7 @@ class Adaptive:
     def _change(self, model, t, x, b):
         """Go on with another variant of the model from a state; its solver and the history of its pivots."""
         self._use(model)
-        self.watch = Watch(model, t, x)
+        self.watch = Watch(model, t, x, self.watch)
         self.motion.count(pivot_changes=1)
         return self._solver(t, x, b), [self._guards(t, x)]
 
@@ -134,9 +137,11 @@ class Adaptive:
         """At the start: choose pivots anew where the model's own are far worse than its matrices."""
         y = self.f(t, x, self.p)
         if self.watch.bad_choice(y, self.n_x):
-            self._use(self.model.near(t, np.append(x, np.nan_to_num(y[self.n_x - self.model.n : self.n_x]))))
+            with contextlib.suppress(ServoError):
+                self._use(self.model.near(t, np.append(x, np.nan_to_num(y[self.n_x - self.model.n : self.n_x]))))
             self.watch = Watch(self.model, t, x)
             self.motion.count(pivot_changes=1)
+            self.motion.stop = self.watch.refuse_start(t, x, self.f(t, x, self.p))
 
     def _watched(self, history, old, t, dense):
         """Look at the pivots along the last step; True where the program is singular."""
@@ -165,11 +170,31 @@ class Adaptive:
         worst = int(np.argmin(np.abs(relative[-1])))
         if abs(relative[-1, worst]) < NEGLIGIBLE:
             return self._candidate(worst, t, dense, "a pivot has vanished")
+        if self._lingers(worst, instants[-2:], np.abs(relative[-2:, worst]), dense):
+            return True
         if abs(relative[-1, worst]) < DEGRADED and self.watch.chart_only(relative[-1, worst], t, dense(t)):
             self._must_repivot = True
         history.extend(relative)
         del history[:-2]
         return False
+
+    def _lingers(self, i, instants, sizes, dense):
+        """Whether a pivot has sunk into what the residual hides, should have crossed zero, and stays there."""
+        t, x = instants[1], dense(instants[1])
+        if sizes[1] >= DEGRADED or sizes[1] > self.watch.bounce(t, x):
+            self._sunk = None
+            return False
+        if self._sunk is None:
+            slope = (sizes[0] - sizes[1]) / abs(t - instants[0])
+            ahead = sizes[1] / slope if slope > 0 else 0.0
+            self._sunk = (t + np.copysign(ahead, t - instants[0]), ahead, x)
+        crossing, ahead, at = self._sunk
+        if abs(t - crossing) < LINGERS * ahead or (t - crossing) * (t - instants[0]) < 0:
+            return False
+        if self.watch.chart_only(sizes[1], t, x):
+            return False
+        self._suspect = (crossing, at, "a pivot stays at zero")
+        return True
 
     def _pivot(self, i, t, dense):
         return self.f(t, dense(t), self.p)[self.n_x + i]

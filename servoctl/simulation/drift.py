@@ -47,7 +47,7 @@ class Poles:
                     row=name,
                     count=count,
                 )
-            polynomial = np.poly(poles)
+            polynomial = np.atleast_1d(np.poly(poles))
             if np.abs(polynomial.imag).max(initial=0.0) > 1e-9 * np.abs(polynomial).max():
                 raise SpecificationError(
                     f"The poles of {name!r} are not in conjugate pairs.", "Error dynamics are real.", do="Pair them."

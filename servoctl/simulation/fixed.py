@@ -1,8 +1,10 @@
 """Compiled explicit Runge-Kutta methods of fixed step."""
 
+import contextlib
+
 import numpy as np
 
-from servoctl.errors import IntegrationStopped
+from servoctl.errors import IntegrationStopped, ServoError
 from servoctl.simulation.drift import Poles, Project
 from servoctl.simulation.motion import Motion, breakpoints, interruptible
 from servoctl.simulation.tableaus import tableau
@@ -41,10 +43,10 @@ def fixed_step(model, method, drift, span, x0, step, knots, progress):
         cuts = breakpoints(span, knots)
         x = x0
         for a, b in zip(cuts[:-1], cuts[1:], strict=True):
-            count = max(1, int(np.ceil(abs(b - a) / step * (1 - 1e-12))))
-            x = integration.piece(a, x, (b - a) / count, count)
             if motion.stop is not None:
                 break
+            count = max(1, int(np.ceil(abs(b - a) / step * (1 - 1e-12))))
+            x = integration.piece(a, x, (b - a) / count, count)
     return motion
 
 
@@ -63,12 +65,14 @@ class _Fixed:
 
     def start(self, t, x):
         if self.watch.bad_choice(self.f(t, x, self.p), self.f.n_x):
-            self._repivot(t, x)
+            with contextlib.suppress(ServoError):
+                self._repivot(t, x)
+            self.motion.stop = self.watch.refuse_start(t, x, self.f(t, x, self.p))
 
     def _repivot(self, t, x):
         top = np.nan_to_num(self.f(t, x, self.p)[self.f.n_x - self.model.n : self.f.n_x])
         self._use(self.model.near(t, np.append(x, top)))
-        self.watch = Watch(self.model, t, x)
+        self.watch = Watch(self.model, t, x, self.watch)
         self.motion.count(pivot_changes=1)
 
     def piece(self, a, x, h, count):
@@ -126,11 +130,21 @@ class _Fixed:
             return k, "", k > 0 or before is not None
         if self._measure(t, states, k) > DEGRADED and self._measure(t, states, k + 1) > DEGRADED:
             return k, "", True
+        self._locate(k, t, states, guards)
         j = max(k - 1, 0)
         top = self.f(t[j], states[:, j], self.p)[self.f.n_x - self.model.n : self.f.n_x]
         at = min(k, len(t) - 1)
         other = self.watch.other_choice(t[j], np.append(states[:, j], top), t[at], states[:, at])
         return (j, "", True) if other is not None and j > 0 else (k, why, False)
+
+    def _locate(self, k, t, states, guards):
+        """Where a pivot vanishes between samples k and k + 1, by linear interpolation; else sample k."""
+        self._suspect = (t[k], states[:, k])
+        if k + 1 < len(t):
+            for a, b in guards[:, [k, k + 1]]:
+                if a * b < 0:
+                    f = abs(a) / (abs(a) + abs(b))
+                    self._suspect = (t[k] + f * (t[k + 1] - t[k]), (1 - f) * states[:, k] + f * states[:, k + 1])
 
     def _bounces(self, size, t, states, k):
         k = max(k, 0)
@@ -142,7 +156,7 @@ class _Fixed:
 
     def _stop(self, t, x, h, why):
         if why:
-            self.motion.stop = self.watch.singular(t, x, why)
+            self.motion.stop = self.watch.singular(*self._suspect, why)
         elif self.watch.rank_measure(t, x) < 0.1:
             self.motion.stop = self.watch.singular(t, x, "the state is no longer finite")
         else:

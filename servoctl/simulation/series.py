@@ -1,10 +1,11 @@
 """The Taylor method: compiled series steps, dense output from the coefficients, jets of any order."""
 
+import contextlib
 from math import factorial
 
 import numpy as np
 
-from servoctl.errors import IntegrationStopped
+from servoctl.errors import IntegrationStopped, ServoError
 from servoctl.simulation.drift import Project
 from servoctl.simulation.motion import Motion, breakpoints, interruptible
 from servoctl.simulation.watch import DEGRADED, NEGLIGIBLE, Watch
@@ -57,10 +58,10 @@ class SeriesMethod:
             x, cuts = x0, breakpoints((t0, t1), knots)
             self._start(t0, x0, (cuts[0] + cuts[1]) / 2)
             for a, b in zip(cuts[:-1], cuts[1:], strict=True):
-                inside = (t_eval >= min(a, b)) & (t_eval <= max(a, b))
-                x = self._piece(a, x, b, t_eval[inside])
                 if self.motion.stop is not None:
                     break
+                inside = (t_eval >= min(a, b)) & (t_eval <= max(a, b))
+                x = self._piece(a, x, b, t_eval[inside])
         return self.motion
 
     def _start(self, t, x, after):
@@ -68,11 +69,13 @@ class SeriesMethod:
         y = self.f(t, x, self.p)
         first = np.append(x, y[self.n_c :])
         if not np.all(np.isfinite(y)) or self.watch.bad_choice(first, len(x)):
-            self._repivot(t, x)
+            with contextlib.suppress(ServoError):
+                self._repivot(t, x)
+            self.motion.stop = self.watch.refuse_start(t, x, self.f(t, x, self.p))
 
     def _repivot(self, t, x):
         self._use(self.model.near(t, np.append(x, np.zeros(self.n))))
-        self.watch = Watch(self.model, t, x)
+        self.watch = Watch(self.model, t, x, self.watch)
         self.motion.count(pivot_changes=1)
 
     def _piece(self, a, x, b, pending):

@@ -19,21 +19,43 @@ class Watch:
     t : float
     x : (n_x,) array
         Where references are taken; they grow along the motion.
+    before : Watch, optional
+        The watch on the variant that this one replaces: its references are kept for columns and for the rows that
+        both have, so that a row whose gradient has nearly vanished does not look new.
     """
 
-    def __init__(self, model, t, x):
+    def __init__(self, model, t, x, before=None):
         self.model = model
         self.f, self.invariants = model.function("matrices"), model.function("invariants")
         self.l_names, self.b_names = model.leading_names()
         self.reference = None
         matrices = [np.nan_to_num(m, nan=0.0, posinf=0.0, neginf=0.0) for m in self._matrices(t, x)]
-        self.columns = [np.maximum(np.abs(m).max(axis=0, initial=0.0), 1e-300) for m in matrices]
+        self.columns = [
+            np.where(now > 0, now, np.where(usual > 0, usual, 1.0))
+            for now, usual in zip(
+                (np.abs(m).max(axis=0, initial=0.0) for m in matrices), model.column_sizes(), strict=True
+            )
+        ]
+        if before is not None:
+            self.columns = before.columns
         self.rows = [np.linalg.norm(m / c, axis=1) for m, c in zip(matrices, self.columns, strict=True)]
+        self.stories = [model.row_stories(), {}]
         self.largest = np.abs(np.asarray(x, dtype=float))
         self.best = self._smallest(matrices)
+        if before is not None:
+            self._inherit(before, matrices)
         self.m = len(model.invariant_names())
         jacobian = self.invariants(t, x, model.parameters)[self.m :].reshape(len(x), self.m).T
         self.gradients = np.maximum(np.sqrt((jacobian**2 * (1.0 + np.abs(x)) ** 2).sum(axis=1)), 1e-300)
+
+    def _inherit(self, before, matrices):
+        for i, names in enumerate((self.l_names, self.b_names)):
+            old = dict(zip((before.l_names, before.b_names)[i], before.rows[i], strict=True))
+            for j, name in enumerate(names):
+                if name in old and self.stories[i].get(name) == before.stories[i].get(name):
+                    self.rows[i][j] = old[name]
+        self.largest = np.maximum(self.largest, before.largest)
+        self.best = np.maximum(self._smallest(matrices), before.best)
 
     def _matrices(self, t, x):
         n = self.model.n
@@ -82,6 +104,10 @@ class Watch:
         """Whether a degraded pivot is only a bad choice: the matrices themselves are far better."""
         return self.rank_measure(t, x) > HELPS * max(abs(relative), NEGLIGIBLE)
 
+    def refuse_start(self, t, x, outputs):
+        """The error of a start at which the accelerations are not finite with any choice of pivots, or None."""
+        return None if np.all(np.isfinite(outputs)) else self.singular(t, x, "the accelerations are not finite there")
+
     def bad_choice(self, outputs, n_x):
         """Whether the outputs of a right-hand side at the start show pivots far worse than the matrices."""
         if not np.all(np.isfinite(outputs)):
@@ -110,10 +136,10 @@ class Watch:
         """
         try:
             other = self.model.near(t, np.nan_to_num(jets))
-            watch = Watch(other, t, jets[: len(state)])
+            watch = Watch(other, t, jets[: len(state)], self)
         except ServoError:
             return None
-        return other if watch.best.min() > 0 and watch.rank_measure(later, state) > DEGRADED else None
+        return other if watch.rank_measure(later, state) > DEGRADED else None
 
     def singular(self, t, x, why):
         """The error that tells where, which row, and which jets are zero there."""
@@ -122,7 +148,7 @@ class Watch:
         lost, zero, names = [], [], (self.l_names, self.b_names)
         for m, c, r, rows in zip(matrices, self.columns, self.rows, names, strict=True):
             norms = np.linalg.norm(m / c, axis=1)
-            lost += [name for name, a, b in zip(rows, norms, r, strict=True) if a < VANISHING * b and name not in lost]
+            lost += [name for name, a, b in zip(rows, norms, r, strict=True) if a <= VANISHING * b and name not in lost]
         state = dict(zip(self.model.state_names, zip(x, self.largest, strict=True), strict=True))
         for row in lost or dict.fromkeys([*self.l_names, *self.b_names]):
             for name in self.model.gradient_jets(row):
@@ -131,7 +157,12 @@ class Watch:
                     zero.append(name)
         direction = self._null_direction(matrices)
         where = f", where {' and '.join(f'{name} = 0' for name in zero)}" if zero else ""
-        what = f"the gradient of row {', '.join(map(repr, lost))} vanishes" if lost else "its rows lose their rank"
+        dependent = [] if lost else self._dependent_rows(matrices[0])
+        what = (
+            f"the gradient of row {', '.join(map(repr, lost))} vanishes"
+            if lost
+            else f"the rows {', '.join(map(repr, dependent))} lose their rank"
+        )
         return SingularProgram(
             f"The program is singular at t = {t:.7g} s: {what}{where}; {why}.",
             f"The smallest equilibrated singular value is {measure:.1e} of its best along the motion; in the direction "
@@ -141,10 +172,20 @@ class Watch:
             "or plan around this state.",
             t=float(t),
             measure=measure,
-            rows=lost,
+            rows=lost or dependent,
             zero=zero,
             direction=direction,
         )
+
+    def _dependent_rows(self, leading):
+        """Names of the rows of L that depend on each other: its left null vector."""
+        if not np.all(np.isfinite(leading)):
+            return list(self.l_names)
+        scaled = leading / self.columns[0]
+        norms = np.linalg.norm(scaled, axis=1)[:, None]
+        scaled = scaled / np.where(norms > 0, norms, 1.0)
+        weights = np.abs(np.linalg.svd(scaled)[0][:, -1])
+        return [self.l_names[j] for j in np.flatnonzero(weights > 0.1 * weights.max())]
 
     def _null_direction(self, matrices):
         """Names of the accelerations that the rows leave open: the right null vector of L."""
