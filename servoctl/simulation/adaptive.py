@@ -93,7 +93,7 @@ class Adaptive:
             dense = solver.dense_output()
             if self._watched(history, old, solver.t, dense):
                 other = self.watch.other_choice(old[0], np.append(old[1], self._top(*old)), *self._suspect[:2])
-                if other is None:
+                if other is None or not self.motion.changes_pivots(old[0]):
                     self.motion.stop = self.watch.singular(*self._suspect)
                     self._last(*old)
                     break
@@ -165,7 +165,7 @@ class Adaptive:
             )
             for i in low:
                 where, value = self._minimum(i, instants, dense, old[0], t)
-                if value < self.watch.bounce(where, dense(where)):
+                if self.watch.hidden_zero(value, where, dense(where)):
                     return self._candidate(i, where, dense, "a pivot touches zero")
         worst = int(np.argmin(np.abs(relative[-1])))
         if abs(relative[-1, worst]) < NEGLIGIBLE:
@@ -181,7 +181,7 @@ class Adaptive:
     def _lingers(self, i, instants, sizes, dense):
         """Whether a pivot has sunk into what the residual hides, should have crossed zero, and stays there."""
         t, x = instants[1], dense(instants[1])
-        if sizes[1] >= DEGRADED or sizes[1] > self.watch.bounce(t, x):
+        if sizes[1] >= DEGRADED or not self.watch.hidden_zero(sizes[1], t, x):
             self._sunk = None
             return False
         if self._sunk is None:

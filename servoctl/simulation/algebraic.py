@@ -48,6 +48,9 @@ def algebraic(model, t0, x0, times, progress):
                 q, previous = x[:, stand - 1], guards[:, max(stand - 2, 0) : stand]
                 done += stand
                 progress(block[stand - 1])
+            if repivot and not motion.changes_pivots(float(block[min(stand, len(block) - 1)])):
+                motion.stop = watch.singular(*_last(times, block, state, stand, why), "no choice of pivots leads on")
+                break
             if repivot:
                 at = min(stand, state.shape[1] - 1)
                 model = model.near(block[at], np.append(state[:, at], top[:, at]))

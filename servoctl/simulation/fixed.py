@@ -77,6 +77,7 @@ class _Fixed:
 
     def piece(self, a, x, h, count):
         """`count` steps of h from t = a; returns the last state."""
+        self._suspect = (a, x)
         n_x, n, done = self.f.n_x, self.model.n, 0
         chunk = CHUNK - CHUNK % self.every if 0 < self.every < CHUNK else self.every or CHUNK
         last = None
@@ -94,9 +95,12 @@ class _Fixed:
             last = guards[:, : good + 1][:, -3:]
             x, done = states[:, -1].copy(), done + good
             self.progress(t[-1])
-            if repivot:
+            if repivot and self.motion.changes_pivots(t[-1]):
                 self._repivot(t[-1], x)
                 last = None
+            elif repivot:
+                self.motion.stop = self.watch.singular(t[-1], x, "no choice of pivots leads on")
+                break
             elif short:
                 self._stop(t[-1], x, h, why)
                 break
@@ -148,7 +152,7 @@ class _Fixed:
 
     def _bounces(self, size, t, states, k):
         k = max(k, 0)
-        return size < self.watch.bounce(t[k], states[:, k])
+        return self.watch.hidden_zero(size, t[k], states[:, k])
 
     def _measure(self, t, states, k):
         k = min(k, len(t) - 1)

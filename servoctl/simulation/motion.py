@@ -18,11 +18,18 @@ class Motion:
     pieces: list = field(default_factory=list)
     stop: object = None
     interrupted: bool = False
+    changed: set = field(default_factory=set)
 
     def add(self, model, t, x, top):
         """Append samples t (N,), X (n_x, N) and γ^(s̄) (n, N) computed with one variant of the model."""
         if len(t):
             self.pieces.append((model, np.asarray(t), np.asarray(x), np.asarray(top)))
+
+    def changes_pivots(self, t):
+        """Note a change of pivots at t; False where one was made at the same instant before: it did not help."""
+        again = t in self.changed
+        self.changed.add(t)
+        return not again
 
     def count(self, **numbers):
         """Add to counters."""

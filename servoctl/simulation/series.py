@@ -89,7 +89,9 @@ class SeriesMethod:
             pending = self._sample(t[: stand + 1], states, y, pending, end)
             a, x = t[stand], states[:, stand].copy()
             self.progress(a)
-            if repivot:
+            if repivot and not self.motion.changes_pivots(a):
+                self.motion.stop = self.watch.singular(a, x, "no choice of pivots leads on")
+            elif repivot:
                 self._repivot(a, x)
             elif why:
                 at = self._state(t, states, y, where)

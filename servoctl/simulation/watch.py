@@ -41,7 +41,7 @@ class Watch:
         self.rows = [np.linalg.norm(m / c, axis=1) for m, c in zip(matrices, self.columns, strict=True)]
         self.stories = [model.row_stories(), {}]
         self.largest = np.abs(np.asarray(x, dtype=float))
-        self.best = self._smallest(matrices)
+        self.best, self.lift = self._smallest(matrices), 1.0
         if before is not None:
             self._inherit(before, matrices)
         self.m = len(model.invariant_names())
@@ -55,7 +55,9 @@ class Watch:
                 if name in old and self.stories[i].get(name) == before.stories[i].get(name):
                     self.rows[i][j] = old[name]
         self.largest = np.maximum(self.largest, before.largest)
-        self.best = np.maximum(self._smallest(matrices), before.best)
+        now = self._smallest(matrices)
+        self.best = np.maximum(now, before.best)
+        self.lift = 1.0 / max(float(np.min(now / np.where(self.best > 0, self.best, 1.0))), DEGRADED)
 
     def _matrices(self, t, x):
         n = self.model.n
@@ -85,7 +87,9 @@ class Watch:
             return guards
         sizes = np.abs(guards.reshape(len(guards), -1))
         sizes = np.where(np.isfinite(sizes), sizes, 0.0)
-        if self.reference is not None:
+        if self.reference is None:
+            sizes[:, 0] *= self.lift
+        else:
             sizes[:, 0] = np.maximum(sizes[:, 0], self.reference)
         largest = np.maximum.accumulate(sizes, axis=1)
         self.reference = largest[:, -1]
@@ -96,9 +100,9 @@ class Watch:
         value = self.invariants(t, x, self.model.parameters)[: self.m]
         return float(np.abs(value / self.gradients).max(initial=0.0))
 
-    def bounce(self, t, x):
-        """Below this a local minimum of a relative pivot is a zero that the residual hides."""
-        return max(NEGLIGIBLE, 10.0 * np.sqrt(self.residual(t, x)))
+    def hidden_zero(self, relative, t, x):
+        """Whether a relative pivot, or the matrices themselves, are so small that the residual hides a zero."""
+        return min(relative, self.rank_measure(t, x)) < max(NEGLIGIBLE, 10.0 * np.sqrt(self.residual(t, x)))
 
     def chart_only(self, relative, t, x):
         """Whether a degraded pivot is only a bad choice: the matrices themselves are far better."""

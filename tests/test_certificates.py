@@ -1,0 +1,136 @@
+"""Certificates that the motion of every mechanism under every program passes, whatever method and drift treatment."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import servoctl as sv
+from servoctl.mechanisms import gallery
+
+STOPS = {"appell-hamel-squared": 0.6983110523, "constant-speed-horizontal": 5.0 / 9.81}  # s: the others reach their end
+FLAT = (
+    "overhead-crane", "overhead-crane-redundant", "winch-crane", "winch-crane-redundant", "crane-3d",
+    "crane-3d-redundant", "two-cars", "three-cars", "vtol",
+)  # fmt: skip
+METHODS = [  # what integration leaves in hidden rows shows in the accelerations: tolerances are tight
+    ("DOP853", None), ("DOP853", "project"), ("DOP853", 0.1), ("RK4", None), ("RK4", "project"), ("RK4", 0.1),
+]  # fmt: skip
+CASES = [
+    *((name, *method) for name in gallery for method in METHODS),
+    *((name, "algebraic", None) for name in FLAT),
+    *((name, "Taylor", "project") for name in ("appell-hamel", "two-cars", "passive-arm", "constant-speed")),
+]
+
+
+@pytest.fixture(scope="module")
+def scene_run(gallery_model):
+    """A function from a scene, a method and a drift treatment to the model and the run, or what came before its stop."""
+    runs = {}
+
+    def run(name, method=None, drift=None):
+        if (name, method, drift) not in runs:
+            runs[name, method, drift] = _simulated(gallery_model(name), gallery[name], method, drift)
+        return runs[name, method, drift]
+
+    return run
+
+
+def _simulated(model, scene, method, drift):
+    t0, t1 = scene.t_span
+    start = model.start(**scene.start, guess=scene.guess)
+    if method == "RK4":
+        options = {"step": (t1 - t0) / 4000}
+    elif method in ("DOP853", "Taylor"):
+        options = {"rtol": 1e-12, "atol": 1e-13, "t_eval": np.linspace(t0, t1, 101)}
+    else:
+        options = {"t_eval": np.linspace(t0, t1, 101)} if method else {}
+    try:
+        return model, sv.simulate(model, start, scene.t_span, method=method, drift=drift, **options)
+    except sv.SingularProgram as error:
+        return model, error.run
+
+
+def null_space(matrix):
+    """An orthonormal basis of the kernel of a matrix of full row rank, rows of any units."""
+    rows = matrix / np.maximum(np.linalg.norm(matrix, axis=1), 1e-300)[:, None]
+    return np.linalg.svd(rows)[2][len(matrix) :].T
+
+
+def worst_of_3_18(run):
+    """Largest |Tᵀr| relative to the largest |r|, T from the kernel of the reaction's directions, at 60 samples."""
+    worst, balance = 0.0, run.signals("balance")[1]
+    for k in np.unique(np.linspace(0, len(run.t) - 1, 60).astype(int)):
+        model = run.variant(k)
+        n, jets = model.n, run.jets[:, k]
+        x = jets[: len(model.state_names)]
+        matrices = model.function("matrices")(run.t[k], x, model.parameters)
+        rows = len(model.leading_names()[0])
+        T = null_space(matrices[rows * n :].reshape(n, -1).T)
+        worst = max(worst, np.abs(T.T @ balance[:, k]).max(initial=0.0))
+    return worst / np.abs(balance).max()
+
+
+@pytest.mark.parametrize(("name", "method", "drift"), CASES)
+def test_motions_pass(name, method, drift, scene_run):
+    model, run = scene_run(name, method, drift)
+    proof = sv.verify(model, run, segments=3)
+    if name in STOPS:
+        assert STOPS[name] - 0.05 < run.t[-1] < STOPS[name] + 1e-2 and not run.success
+        early = run.t < STOPS[name] - 0.02
+        proof = sv.verify(model, replace(run, t=run.t[early], jets=run.jets[:, early], variants=(), stored={}), segments=3)
+    else:
+        assert run.success
+    by_poles = method == "RK4" and drift is not None and drift != "project"
+    assert proof.numbers["acceleration"] <= (1e-6 if by_poles else 1e-9)
+    assert proof.numbers["multiplier form"] <= (1e-6 if by_poles else 1e-9)
+    assert proof.passed or by_poles
+    assert worst_of_3_18(run) <= (1e-6 if by_poles else 1e-9)
+
+
+@pytest.mark.parametrize("name", [name for name in gallery if name not in STOPS])
+def test_default_runs_pass_in_twenty_restarted_segments(name, scene_run):
+    model, run = scene_run(name)
+    proof = sv.verify(model, run)
+    assert proof.passed and run.success, proof
+    assert proof.numbers["segments"] < 1e-6
+    assert "power" in proof.numbers and proof.numbers["power"] < 1e-8
+    assert len(repr(proof).splitlines()) <= 12 and "passed" in repr(proof)
+
+
+@pytest.mark.parametrize("name", STOPS)
+def test_runs_that_stop_are_told(name, scene_run):
+    model, run = scene_run(name)
+    proof = sv.verify(model, run, segments=3)
+    assert proof.numbers["acceleration"] <= 1e-9
+    assert any("did not reach its end" in note for note in proof.notes)
+
+
+@pytest.mark.parametrize("name", ["appell-hamel", "overhead-crane", "winch-crane-redundant", "two-cars-ideal"])
+def test_certificates_have_teeth(name, scene_run):
+    model, run = scene_run(name)
+    k = len(run.t) // 3
+    bent = run.jets.copy()
+    bent[model.nq + model.n, k] += 1e-6 * np.abs(bent[model.nq + model.n :]).max()  # an acceleration, at one sample
+    proof = sv.verify(model, replace(run, jets=bent, stored={}, stored_residual={}), segments=3)
+    assert not proof.passed
+    assert ("multiplier form" if model.ideal else "acceleration") in proof.failures
+    assert "FAILED" in repr(proof)
+
+
+def test_a_drifted_state_fails(scene_run):
+    model, run = scene_run("appell-hamel")
+    moved = run.jets.copy()
+    moved[2] += 1e-3  # z off the string
+    proof = sv.verify(model, replace(run, jets=moved, stored={}, stored_residual={}), segments=3)
+    assert "residual string" in proof.failures
+
+
+@pytest.mark.parametrize("name", ["two-cars-ideal", "appell-hamel", "constant-speed"])
+def test_what_actuators_cannot_give_of_an_ideal_reaction_is_told(name, scene_run):
+    model, run = scene_run(name)
+    proof = sv.verify(model, run, segments=3)
+    if model.actuators:
+        assert proof.numbers["outside"] > 0.1  # the reaction of the program is not in the actuators' reach
+    else:
+        assert "outside" not in proof.numbers
