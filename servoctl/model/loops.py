@@ -169,19 +169,21 @@ static double NAME_largest(const double *v, int64_t n)
     return largest;
 }
 
-/* The step whose last two terms stay below the tolerance at every level of the state. */
+/* The step at which the last term stays below the tolerance at every level of the state, the terms taken to grow as the
+   fastest of the upper half do: single coefficients may vanish. */
 static double NAME_length(const double *x, const double *c, int64_t nq, int64_t n, int64_t top, int64_t last,
                           double rtol, double atol)
 {
     double h = INFINITY;
     for (int64_t j = 0; j < top; j++) {
-        const double scale = atol + rtol * (j ? NAME_largest(x + nq + (j - 1) * n, n) : NAME_largest(x, nq));
-        for (int64_t k = last - 1; k <= last; k++) {
+        const double size = j ? NAME_largest(x + nq + (j - 1) * n, n) : NAME_largest(x, nq);
+        const double scale = atol + rtol * size, reach = pow(rtol, 1.0 / (double)(last - j));
+        for (int64_t k = last / 2 > j ? last / 2 : j + 1; k <= last; k++) {
             double falling = 1;
             for (int64_t m = 0; m < j; m++) falling *= (double)(k - m);
             const double term = falling * NAME_largest(c + (k - 1) * n, n);
             if (!isfinite(term)) return 0;
-            if (term > 0) h = fmin(h, pow(scale / term, 1.0 / (double)(k - j)));
+            if (term > 0) h = fmin(h, reach * pow(scale / rtol / term, 1.0 / (double)(k - j)));
         }
     }
     return h;

@@ -19,8 +19,7 @@ def describe(model):
     lines = [
         f"Model: {' '.join(r.mechanism.q.names)}; program {', '.join(r.program.residuals)} by {_by(r)}",
         f"  {_raised(r)}",
-        f"  {_hidden(r)}; {model.free} free initial value{'s' * (model.free != 1)}"
-        + (" (flat: nothing is integrated)" if model.flat else ""),
+        *_hidden_and_free(model),
         f"  {_rule(r)}",
     ]
     structure = model.structure()
@@ -55,11 +54,17 @@ def _raised(r):
     return "; ".join(parts)
 
 
-def _hidden(r):
+def _hidden_and_free(model):
+    """Hidden constraints and free initial values, on one line where there is room."""
+    r = model.reduction
+    free = f"{model.free} free initial value{'s' * (model.free != 1)}"
+    free += " (flat: nothing is integrated)" if model.flat else ""
     if not r.hidden:
-        return "no hidden constraint"
+        return [f"  no hidden constraint; {free}"]
+    count = f"{len(r.hidden)} hidden constraint{'s' * (len(r.hidden) != 1)}"
     stories = "; ".join(row.story for row in r.hidden)
-    return f"{len(r.hidden)} hidden constraint{'s' * (len(r.hidden) != 1)} ({stories})"
+    line = f"  {count} ({stories}); {free}"
+    return [line] if len(line) <= WIDTH else [f"  {count}; {free}", f"    {stories}"]
 
 
 def _rule(r):

@@ -224,8 +224,7 @@ class Adaptive:
         return True
 
     def _failed(self, t, x, message):
-        measure = self.watch.rank_measure(t, x)
-        if measure < 0.1:
+        if self.watch.lost(t, x):
             self.motion.stop = self.watch.singular(t, x, "the step of the integrator shrinks to nothing")
         else:
             self.motion.stop = IntegrationStopped(

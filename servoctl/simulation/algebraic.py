@@ -103,7 +103,7 @@ def _last(times, block, state, stand, why):
 
 
 def _stopped(watch, t, x, why):
-    if why or watch.rank_measure(t, x) < 0.1:
+    if why or watch.lost(t, x):
         return watch.singular(t, x, why or "Newton's method finds no solution beyond")
     return IntegrationStopped(
         f"The program has no solution that Newton's method finds after t = {t:.7g} s.",

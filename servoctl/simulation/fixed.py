@@ -161,7 +161,7 @@ class _Fixed:
     def _stop(self, t, x, h, why):
         if why:
             self.motion.stop = self.watch.singular(*self._suspect, why)
-        elif self.watch.rank_measure(t, x) < 0.1:
+        elif self.watch.lost(t, x):
             self.motion.stop = self.watch.singular(t, x, "the state is no longer finite")
         else:
             self.motion.stop = IntegrationStopped(

@@ -183,7 +183,7 @@ class SeriesMethod:
         return pending[~due]
 
     def _stopped(self, t, x):
-        if self.watch.rank_measure(t, x) < 0.1:
+        if self.watch.lost(t, x):
             self.motion.stop = self.watch.singular(t, x, "the radius of convergence shrinks to nothing")
         else:
             self.motion.stop = IntegrationStopped(

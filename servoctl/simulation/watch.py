@@ -7,6 +7,7 @@ from servoctl.errors import ServoError, SingularProgram
 DEGRADED = 0.02  # of its reference: a pivot below this is chosen anew, if the matrix itself is better than that
 HELPS = 5.0  # by how much the matrix must be better
 NEGLIGIBLE = 1e-7  # of its reference: a pivot below this is zero
+HOPELESS = 1e-9  # an equilibrated singular value below this leaves no digits
 VANISHING = 0.03  # of its reference: a row whose gradient is below this has lost it
 
 
@@ -99,6 +100,10 @@ class Watch:
         """Largest residual of the invariants, relative to their gradients at the start."""
         value = self.invariants(t, x, self.model.parameters)[: self.m]
         return float(np.abs(value / self.gradients).max(initial=0.0))
+
+    def lost(self, t, x):
+        """Whether rank, not the integrator, is what fails at a state where no step succeeds."""
+        return self.rank_measure(t, x) < 0.1 or float(self.best.min()) < HOPELESS
 
     def hidden_zero(self, relative, t, x):
         """Whether a relative pivot, or the matrices themselves, are so small that the residual hides a zero."""

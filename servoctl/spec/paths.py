@@ -334,11 +334,6 @@ def _column(value, what):
             f"{what} has the shape {shape or (0,)}", "A point of a path is a number or a vector of one entry or more",
             "(0.0, 1.0)", "Give one point", what=what, shape=shape,
         )  # fmt: skip
-    if any(item.is_constant() and not math.isfinite(float(item)) for item in items):
-        raise SpecificationError(
-            f"A number that is not finite stands in {what}", "A path is made of finite numbers and expressions",
-            "Any finite number", "Look where the number comes from: often a division by zero", what=what,
-        )  # fmt: skip
     return ca.vertcat(*items)
 
 
