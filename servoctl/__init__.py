@@ -4,7 +4,7 @@ A specification flows one way: Mechanism and Program, by `derive`, become a Mode
 `verify` proves the run against the full mechanism.
 """
 
-from servoctl import spec
+from servoctl import plots, spec
 from servoctl.errors import (
     InconsistentStart,
     IntegrationStopped,
@@ -60,6 +60,7 @@ __all__ = [
     "parameters",
     "particle",
     "paths",
+    "plots",
     "poles",
     "project",
     "rigid_body",

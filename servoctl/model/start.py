@@ -82,23 +82,32 @@ def consistent(model, t, held, guess):
         reference[names.index(name)] = value
         weights[names.index(name)] = 1.0 if name in held else GUESSED
     movable = np.array([name not in held for name in names])
-    invariants = _Invariants(model, t)
-    x, residual = _best(invariants, reference, weights, movable)
-    for at in (reference, x):
-        if residual < TOLERANCE:
-            break
-        try:  # a pivot of the model may vanish there
-            other = _Invariants(model.near(t, np.append(at, np.zeros(model.n))), t)
-        except ServoError:
-            continue
-        y, left = _best(other, reference, weights, movable)
-        if left < residual or not np.isfinite(residual):
-            invariants, x, residual = other, y, left
+    invariants, x, residual = _solve(model, t, reference, weights, movable)
     if not residual < TOLERANCE:
         _refuse(invariants, reference, weights, held, names, x)
     free = _free(invariants, x, movable, names, given)
     x, residual = _at_guess(invariants, x, residual, reference, weights, movable, names, free, given)
     return State(t, x, names, tuple(held), free, residual)
+
+
+def _solve(model, t, reference, weights, movable):
+    """The start by the model's own choice of pivots, or by one made at the reference or near what was found."""
+    invariants = _Invariants(model, t)
+    finite_there = np.all(np.isfinite(invariants(reference)[0]))
+    x, residual = _best(invariants, reference, weights, movable) if finite_there else (reference, np.inf)
+    for at in (reference, None):
+        if residual < TOLERANCE:
+            break
+        if at is None and not finite_there:
+            x, residual = _best(invariants, reference, weights, movable)
+        try:  # a pivot of the model may vanish there
+            other = _Invariants(model.near(t, np.append(x if at is None else at, np.zeros(model.n))), t)
+        except ServoError:
+            continue
+        y, left = _best(other, reference, weights, movable)
+        if left < residual or not np.isfinite(residual):
+            invariants, x, residual = other, y, left
+    return invariants, x, residual
 
 
 def _known(name, names):
