@@ -195,7 +195,8 @@ def mixed(q, residuals):
     names, e = list(residuals), list(residuals.values())
     if len(e) == 1:
         return {names[0]: e[0] * (2 + ca.sin(q.d(0)[0]))}
-    turned = [e[0] * ca.cos(q.d(0)[-1]) + e[1] * ca.sin(q.d(0)[-1]), e[1] * ca.cos(q.d(0)[-1]) - e[0] * ca.sin(q.d(0)[-1])]
+    sine, cosine = ca.sin(q.d(0)[-1]), ca.cos(q.d(0)[-1])
+    turned = [e[0] * cosine + e[1] * sine, e[1] * cosine - e[0] * sine]
     return dict(zip(names, [*turned, *e[2:]], strict=True))
 
 
@@ -223,7 +224,10 @@ def differentiated(which):
 
 @pytest.mark.parametrize(
     ("name", "which"),
-    [("crane", "X"), ("crane", "Z"), ("appell_hamel", "x_c"), ("appell_hamel", "string"), ("mass_on_car", "z"), ("spiral", "curvature")],
+    [
+        ("crane", "X"), ("crane", "Z"), ("appell_hamel", "x_c"), ("appell_hamel", "string"), ("mass_on_car", "z"),
+        ("spiral", "curvature"),
+    ],
 )  # fmt: skip
 def test_a_differentiated_constraint_has_one_more_free_initial_value(name, which):
     system = SYSTEMS[name](Words(residuals=differentiated(which)))

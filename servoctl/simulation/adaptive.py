@@ -60,7 +60,7 @@ class Adaptive:
                 if self.motion.stop is not None:
                     break
                 inside = t_eval[(t_eval >= min(a, b)) & (t_eval <= max(a, b))]
-                self.pending = list(inside if b >= a else inside[::-1])
+                self.pending, self.forward = list(inside), b >= a
                 x = self._piece(a, x, b)
         return self.motion
 
@@ -243,8 +243,7 @@ class Adaptive:
     def _sample(self, t, dense, x):
         """Record the samples that are pending up to t."""
         times, states = [], []
-        forward = not self.pending or self.pending[-1] >= self.pending[0]
-        while self.pending and (self.pending[0] <= t if forward else self.pending[0] >= t):
+        while self.pending and (self.pending[0] <= t if self.forward else self.pending[0] >= t):
             s = self.pending.pop(0)
             y = x if s == t and x is not None else dense(s)
             if self.projector is not None and (x is None or s != t):
