@@ -4,7 +4,6 @@ Nothing is compiled before it pays. Where there is no compiler, CasADi's evaluat
 results differ by rounding only.
 """
 
-import ctypes
 import functools
 
 import casadi as ca
@@ -12,8 +11,9 @@ import numpy as np
 
 from servoctl.errors import SpecificationError, unknown
 from servoctl.model import compiler, emit
-from servoctl.model.interpreted import Interpreter, Workspace
+from servoctl.model.interpreted import Interpreter
 from servoctl.model.loops import LOOPS
+from servoctl.model.native import Library
 
 # Compiling takes 0.1 s or more, as long as 10^4 and more evaluations by CasADi. A consistent start makes tens of calls,
 # the signals of a short plan are a grid of a hundred points; an integration makes thousands.
@@ -23,7 +23,7 @@ GRID_POINTS = 200
 _OUTPUTS_PER_STATE = {"rk": 1, "newton": 2, "taylor": 1}
 
 
-def compiled(f, name, loops=(), project=None):
+def compiled(f, name, loops=(), project=None, others=None, drivers=""):
     """Make a compiled function of an SX function.
 
     Parameters
@@ -36,6 +36,10 @@ def compiled(f, name, loops=(), project=None):
         The loops that will be called.
     project : casadi.Function, optional
         Change of x that restores invariants, of the same inputs (t, x, p); loops may call it after their steps.
+    others : dict of str to casadi.Function, optional
+        Further functions of the same form in the same library, found by `Compiled.native`.
+    drivers : str
+        C text of further loops, with the placeholders of `loops`.
 
     Returns
     -------
@@ -83,7 +87,7 @@ def compiled(f, name, loops=(), project=None):
                 name=name,
                 loop=loop,
             )
-    return Compiled(f, name, tuple(loops), project)
+    return Compiled(f, name, tuple(loops), project, others, drivers)
 
 
 class Compiled:
@@ -102,8 +106,9 @@ class Compiled:
         The loops it can run.
     """
 
-    def __init__(self, f, name, loops, project=None):
+    def __init__(self, f, name, loops, project=None, others=None, drivers=""):
         self.name, self.loops, self._project = name, loops, project
+        self._others, self._drivers = others or {}, drivers
         self.n_x, self.n_p, self.n_y = f.numel_in(1), f.numel_in(2), f.numel_out(0)
         self._f = f
         self._x_shape, self._p_shape = (self.n_x,), (self.n_p,)
@@ -112,7 +117,8 @@ class Compiled:
 
     def __reduce__(self):
         project = self._project and self._project.serialize()
-        return _restored, (self._f.serialize(), self.name, self.loops, project)
+        others = {key: f.serialize() for key, f in self._others.items()}
+        return _restored, (self._f.serialize(), self.name, self.loops, project, others, self._drivers)
 
     def __repr__(self):
         how = "compiled" if self.backend == "c" else "evaluated by CasADi"
@@ -333,6 +339,17 @@ class Compiled:
         n = self._evaluator.taylor(float(t0), x0, float(t1), p, shape, rtol, atol, every, max_steps, t, x, y)
         return t[: n + 1], x[: n + 1].T, y[:n].T
 
+    def native(self, suffix):
+        """The C function ``..._suffix`` of the library, built if need be; None without a compiler.
+
+        Parameters
+        ----------
+        suffix : str
+            "point", "grid", a key of `others`, or a function that `drivers` defines.
+        """
+        self._settle(build=True)
+        return self._evaluator.native(suffix)
+
     def _settle_loop(self, loop):
         if loop not in self.loops:
             raise SpecificationError(
@@ -349,10 +366,12 @@ class Compiled:
         if self._settled or (self._text is not None and not build):
             return
         symbol = f"servoctl_{self.name}"
-        text = self._text or emit.emit(self._f, symbol, self.loops, project=self._project)
+        text = self._text or emit.emit(
+            self._f, symbol, self.loops, project=self._project, others=self._others, drivers=self._drivers
+        )
         library = compiler.library(text, build)
         if library is not None:
-            self._evaluator = _Library(library, symbol, self.n_x, self.n_p, self.n_y)
+            self._evaluator = Library(library, symbol, self.n_x, self.n_p, self.n_y)
         self._settled = build or library is not None
         self._text = None if self._settled else text
 
@@ -369,76 +388,7 @@ class Compiled:
         return array
 
 
-def _restored(serialized, name, loops, project):
+def _restored(serialized, name, loops, project, others, drivers):
     project = project and ca.Function.deserialize(project)
-    return Compiled(ca.Function.deserialize(serialized), name, loops, project)
-
-
-class _Library:
-    """Evaluation by the compiled library."""
-
-    backend = "c"
-
-    def __init__(self, library, symbol, n_x, n_p, n_y):
-        self._grid, self._point = library[f"{symbol}_grid"], library[f"{symbol}_point"]
-        self._grid.restype = self._point.restype = None
-        self._library, self._symbol = library, symbol
-        self.workspace = Workspace(n_x, n_p, n_y, self._connect)
-
-    def _connect(self, row, parts):
-        return functools.partial(self._point, _pointer(row)), row
-
-    def grid(self, t, x, p, y):
-        self._grid(ctypes.c_int64(t.size), *map(_pointer, (t, x, p)), ctypes.c_int64(p.ndim == 2), _pointer(y))
-
-    def rk(self, t0, x0, h, counts, p, tableau, states, guards):
-        run = self._library[f"{self._symbol}_rk"]
-        run.restype = ctypes.c_int64
-        return run(
-            ctypes.c_double(t0),
-            _pointer(x0),
-            ctypes.c_double(h),
-            *map(ctypes.c_int64, counts),
-            _pointer(p),
-            ctypes.c_int64(len(tableau[1])),
-            *map(_pointer, tableau),
-            ctypes.c_int64(states.shape[1]),
-            _pointer(states),
-            _pointer(guards),
-        )
-
-    def taylor(self, t0, x0, t1, p, shape, rtol, atol, every, max_steps, t, x, y):
-        run = self._library[f"{self._symbol}_taylor"]
-        run.restype = ctypes.c_int64
-        return run(
-            ctypes.c_double(t0),
-            _pointer(x0),
-            ctypes.c_double(t1),
-            _pointer(p),
-            *map(ctypes.c_int64, shape),
-            ctypes.c_double(rtol),
-            ctypes.c_double(atol),
-            ctypes.c_int64(every),
-            ctypes.c_int64(max_steps),
-            _pointer(t),
-            _pointer(x),
-            _pointer(y),
-        )
-
-    def newton(self, t, x0, p, tol, max_iter, x, y):
-        run, count = self._library[f"{self._symbol}_newton"], ctypes.c_int64()
-        run.restype = ctypes.c_int64
-        n = run(
-            ctypes.c_int64(t.size),
-            *map(_pointer, (t, x0, p)),
-            ctypes.c_double(tol),
-            ctypes.c_int64(max_iter),
-            _pointer(x),
-            _pointer(y),
-            ctypes.byref(count),
-        )
-        return n, count.value
-
-
-def _pointer(array):
-    return ctypes.c_void_p(array.ctypes.data)
+    others = {key: ca.Function.deserialize(f) for key, f in others.items()}
+    return Compiled(ca.Function.deserialize(serialized), name, loops, project, others, drivers)

@@ -104,7 +104,7 @@ def operations(f):
     return sum(f.instruction_id(k) not in _NOT_ARITHMETIC for k in range(f.n_instructions()))
 
 
-def emit(f, name, loops=(), chunk=CHUNK, project=None):
+def emit(f, name, loops=(), chunk=CHUNK, project=None, others=None, drivers=""):
     """C translation unit of a function and of the loops over it.
 
     It defines ``void name(double t, const double *x, const double *p, double *y)`` (``y`` overlaps no input),
@@ -122,6 +122,10 @@ def emit(f, name, loops=(), chunk=CHUNK, project=None):
         Largest number of statements in one C function.
     project : casadi.Function, optional
         Change of x (n_x) that restores invariants, of the same inputs; loops may call it after their steps.
+    others : dict of str to casadi.Function, optional
+        Further SX functions of this form (their sizes may differ), which become ``name_KEY``.
+    drivers : str
+        C text to append, with the placeholders of the loops.
 
     Returns
     -------
@@ -141,8 +145,10 @@ def emit(f, name, loops=(), chunk=CHUNK, project=None):
     body = _function(f, name, chunk)
     if project is not None:
         body += _function(project, f"{name}_project", chunk)
+    for key, other in (others or {}).items():
+        body += _function(other, f"{name}_{key}", chunk)
     wanted = [text for loop, text in LOOPS.items() if loop in loops]
-    drivers = "".join((GRID, PROJECTION if project else "", *wanted))
+    drivers = "".join((GRID, PROJECTION if project else "", *wanted, drivers))
     drivers = drivers.replace("NAME_PROJECT(", "NAME_restore(" if project else "(void)(")
     for key, value in {
         "N_X": f.numel_in(1),

@@ -45,6 +45,9 @@ class Interpreter:
         run()
         return row_y.copy()
 
+    def native(self, suffix):
+        """None: there is no library."""
+
     def grid(self, t, x, p, y):
         """Fill y (n_y, N) with the outputs at t (N,) and the columns of x, and of p if that is a matrix."""
         for k, t_k in enumerate(t):
