@@ -1,0 +1,80 @@
+"""Calls into a compiled library through ctypes."""
+
+import ctypes
+import functools
+
+from servoctl.model.interpreted import Workspace
+
+
+class Library:
+    """Evaluation by a compiled library."""
+
+    backend = "c"
+
+    def __init__(self, library, symbol, n_x, n_p, n_y):
+        self._grid, self._point = library[f"{symbol}_grid"], library[f"{symbol}_point"]
+        self._grid.restype = self._point.restype = None
+        self._library, self._symbol = library, symbol
+        self.workspace = Workspace(n_x, n_p, n_y, self._connect)
+
+    def _connect(self, row, parts):
+        return functools.partial(self._point, pointer(row)), row
+
+    def native(self, suffix):
+        return self._library[f"{self._symbol}_{suffix}"]
+
+    def grid(self, t, x, p, y):
+        self._grid(ctypes.c_int64(t.size), *map(pointer, (t, x, p)), ctypes.c_int64(p.ndim == 2), pointer(y))
+
+    def rk(self, t0, x0, h, counts, p, tableau, states, guards):
+        run = self._library[f"{self._symbol}_rk"]
+        run.restype = ctypes.c_int64
+        return run(
+            ctypes.c_double(t0),
+            pointer(x0),
+            ctypes.c_double(h),
+            *map(ctypes.c_int64, counts),
+            pointer(p),
+            ctypes.c_int64(len(tableau[1])),
+            *map(pointer, tableau),
+            ctypes.c_int64(states.shape[1]),
+            pointer(states),
+            pointer(guards),
+        )
+
+    def taylor(self, t0, x0, t1, p, shape, rtol, atol, every, max_steps, t, x, y):
+        run = self._library[f"{self._symbol}_taylor"]
+        run.restype = ctypes.c_int64
+        return run(
+            ctypes.c_double(t0),
+            pointer(x0),
+            ctypes.c_double(t1),
+            pointer(p),
+            *map(ctypes.c_int64, shape),
+            ctypes.c_double(rtol),
+            ctypes.c_double(atol),
+            ctypes.c_int64(every),
+            ctypes.c_int64(max_steps),
+            pointer(t),
+            pointer(x),
+            pointer(y),
+        )
+
+    def newton(self, t, x0, p, tol, max_iter, x, y):
+        run, count = self._library[f"{self._symbol}_newton"], ctypes.c_int64()
+        run.restype = ctypes.c_int64
+        n = run(
+            ctypes.c_int64(t.size),
+            *map(pointer, (t, x0, p)),
+            ctypes.c_double(tol),
+            ctypes.c_int64(max_iter),
+            pointer(x),
+            pointer(y),
+            ctypes.byref(count),
+        )
+        return n, count.value
+
+
+def pointer(array):
+    """The address of an array's first number."""
+    return ctypes.c_void_p(array.ctypes.data)
