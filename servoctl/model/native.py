@@ -21,12 +21,15 @@ class Library:
         return functools.partial(self._point, pointer(row)), row
 
     def native(self, suffix):
+        """The C function of this suffix."""
         return self._library[f"{self._symbol}_{suffix}"]
 
     def grid(self, t, x, p, y):
+        """As `Compiled.grid` says."""
         self._grid(ctypes.c_int64(t.size), *map(pointer, (t, x, p)), ctypes.c_int64(p.ndim == 2), pointer(y))
 
     def rk(self, t0, x0, h, counts, p, tableau, states, guards):
+        """As `Compiled.rk` says."""
         run = self._library[f"{self._symbol}_rk"]
         run.restype = ctypes.c_int64
         return run(
@@ -43,6 +46,7 @@ class Library:
         )
 
     def taylor(self, t0, x0, t1, p, shape, rtol, atol, every, max_steps, t, x, y):
+        """As `Compiled.taylor` says."""
         run = self._library[f"{self._symbol}_taylor"]
         run.restype = ctypes.c_int64
         return run(
@@ -61,6 +65,7 @@ class Library:
         )
 
     def newton(self, t, x0, p, tol, max_iter, x, y):
+        """As `Compiled.newton` says."""
         run, count = self._library[f"{self._symbol}_newton"], ctypes.c_int64()
         run.restype = ctypes.c_int64
         n = run(
