@@ -21,7 +21,9 @@ from servoctl.mechanisms.cranes import crane_3d, overhead_crane, winch_crane
 from servoctl.mechanisms.mass_on_car import mass_on_car
 from servoctl.mechanisms.passive_arm import passive_arm
 from servoctl.mechanisms.spirals import spiral
+from servoctl.mechanisms.two_links import pendubot, two_link_arm
 from servoctl.mechanisms.vtol import vtol
+from servoctl.mechanisms.wheeled_robot import wheeled_robot
 
 __all__ = [
     "Scene",
@@ -33,8 +35,11 @@ __all__ = [
     "mass_on_car",
     "overhead_crane",
     "passive_arm",
+    "pendubot",
     "spiral",
+    "two_link_arm",
     "vtol",
+    "wheeled_robot",
     "winch_crane",
 ]
 
@@ -205,5 +210,27 @@ gallery = {
         start={"theta": 0.0, "dtheta": 0.0},
         t_span=(0.0, 1.0),
         units=_units("x z [m] theta [rad] u1 u2 [N]"),
+    ),
+    "two-link-arm": Scene(
+        two_link_arm,
+        "The end point of an arm with two driven joints moves along a line, in gravity.",
+        guess={"q1": -0.4, "q2": 1.5},
+        t_span=(0.0, 2.0),
+        units=_units("q1 q2 [rad] shoulder elbow [N m] X_end Y_end [m]"),
+    ),
+    "pendubot": Scene(
+        pendubot,
+        "The shoulder of a two-link arm swings it up by 90 degrees; the elbow is passive.",
+        start={"q2": 0.0, "dq2": 0.0},
+        t_span=(0.0, 3.0),
+        units=_units("q1 q2 [rad] shoulder [N m] X_end Y_end [m]"),
+    ),
+    "wheeled-robot": Scene(
+        wheeled_robot,
+        "A wheeled robot turns by 90 degrees at constant speed; the rate of its path's curvature is programmed.",
+        start={"x": 0.0, "y": 0.0, "psi": 0.0, "r": 0.0},
+        guess={"v": 1.0},
+        t_span=(0.0, 5.0),
+        units=_units("x y [m] psi [rad] drive [N] steer [N m] curvature [1/m]"),
     ),
 }

@@ -1,0 +1,44 @@
+"""A wheeled robot whose path is programmed by the rate at which its curvature changes."""
+
+import casadi as ca
+
+from servoctl import spec as sv
+
+
+def wheeled_robot(turn=90.0, speed=1.0, duration=4.0):
+    """At constant speed, the curvature κ = r/v of the path grows and falls: dκ/dt = c sin(2πt/T), a smooth turn.
+
+    The wheels do not slip sideways: the quasi-velocities are the speed v and the yaw rate r. The program has the
+    orders 1 and 2. The turn takes the time T, the heading changes by the angle given, and the robot goes straight on.
+
+    Parameters
+    ----------
+    turn : float
+        Change of the heading [degrees].
+    speed : float
+        [m/s]
+    duration : float
+        T [s]
+
+    Returns
+    -------
+    Mechanism, Program
+        Realised by the actuators "drive" [N] and "steer" [N m].
+    """
+    p = sv.parameters(m=20.0, J=1.5, speed=speed)  # kg, kg m^2, m/s
+    xy = sv.coordinates("x y psi")  # m, m, rad
+    psi = list(xy)[2]
+    q = xy.with_quasi_velocities("v r", [[ca.cos(psi), 0], [ca.sin(psi), 0], [0, 1]])  # m/s, rad/s
+    x, y, _ = q
+    v, r = q.w()
+
+    c = turn * ca.pi / 180 * 2 * ca.pi / (speed * duration**2)  # 1/(m s): heading change = c v T^2/(2π)
+    rate = ca.if_else(q.t < duration, c * ca.sin(2 * ca.pi * q.t / duration), 0)
+    mechanism = sv.Mechanism(
+        q,
+        gibbs=sv.rigid_body(q, p.m, (0, 0, p.J), position=(x, y), rates=(0, 0, r)),
+        actuators={"drive": (1, 0), "steer": (0, 1)},
+        outputs={"curvature": r / v},
+        parameters=p,
+    )
+    return mechanism, sv.Program({"speed": v - p.speed, "clothoid": q.dt(r / v) - rate}, by="actuators")
