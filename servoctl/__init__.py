@@ -5,6 +5,7 @@ A specification flows one way: Mechanism and Program, by `derive`, become a Mode
 """
 
 from servoctl import plots, spec
+from servoctl.control.time_law import TimeLaw, fastest
 from servoctl.errors import (
     InconsistentStart,
     IntegrationStopped,
@@ -51,11 +52,13 @@ __all__ = [
     "ServoError",
     "SingularProgram",
     "SpecificationError",
+    "TimeLaw",
     "UnstableInternalDynamics",
     "Verification",
     "body_rates",
     "coordinates",
     "derive",
+    "fastest",
     "load",
     "parameters",
     "particle",

@@ -58,6 +58,51 @@ class Program:
         """The residuals' names."""
         return tuple(self.residuals)
 
+    def slowed(self, q, factor, at=0.0):
+        """The program of the same motion along a slower time: q_s(t) = q(at + (t - at)/σ).
+
+        Residuals are written for the slowed jets, φ(at + (t - at)/σ, q, σγ', σ²γ'', ...) = 0: paths and rates alike
+        take σ times as long.
+
+        Parameters
+        ----------
+        q : Coordinates
+            Those of the mechanism.
+        factor : float
+            σ > 0; below 1 the motion is quicker.
+        at : float
+            The instant that stays where it is [s].
+
+        Returns
+        -------
+        Program
+
+        Raises
+        ------
+        SpecificationError
+            If the factor is not positive, or the kinematics q' = V w + h depend on time or drift by h.
+        """
+        sigma = _number(factor)
+        if not sigma > 0:
+            raise SpecificationError(
+                f"A program was to be slowed by the factor {factor!r}.",
+                "The factor is a positive number: 2.0 takes twice as long.",
+                do="Give a number above zero.",
+                factor=factor,
+            )
+        if not q.plain and (not q.h.is_zero() or ca.depends_on(q.V, q.t)):
+            raise SpecificationError(
+                "The kinematics q' = V w + h depend on time or drift by h.",
+                "Another time law would change them as well as the program.",
+                do="Write the slower program yourself.",
+            )
+        symbols, values = [q.t], [at + (q.t - at) / sigma]
+        for k in range(1, max(map(q.order, self.residuals.values())) + 1):
+            symbols += q.gamma(k)
+            values += [sigma**k * s for s in q.gamma(k)]
+        slower = ca.substitute(list(self.residuals.values()), symbols, values)
+        return Program(dict(zip(self.residuals, slower, strict=True)), self.by, self.weights or None)
+
     def __repr__(self):
         return f"Program({', '.join(self.residuals)}; by {self.by})"
 
@@ -88,11 +133,8 @@ def _weight(name, value):
         items = column(value, f"the weight of {name!r}", 1)
         if ca.symvar(items[0]):
             return items[0]
-    try:
-        number = np.nan if isinstance(value, (str, bytes)) else float(value)
-    except Exception:  # CasADi raises its own types for symbols
-        number = np.nan
-    if not (np.isfinite(number) and number > 0):
+    number = _number(value)
+    if not number > 0:
         raise SpecificationError(
             f"The weight of {name!r} is {value!r}.",
             "The actuation of least uᵀWu exists for positive weights.",
@@ -101,3 +143,12 @@ def _weight(name, value):
             name=name,
         )
     return number
+
+
+def _number(value):
+    """A finite number, or NaN for what is none."""
+    try:
+        number = np.nan if isinstance(value, (str, bytes)) else float(value)
+    except Exception:  # CasADi raises its own types for symbols
+        number = np.nan
+    return number if np.isfinite(number) else np.nan

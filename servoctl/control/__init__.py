@@ -1,0 +1,1 @@
+"""Laws, the sampled closed loop, limits."""

@@ -1,0 +1,163 @@
+"""The fastest time law of a program that its actuators can follow."""
+
+import functools
+from dataclasses import dataclass
+
+import numpy as np
+
+from servoctl.errors import InconsistentStart, IntegrationStopped, LimitExceeded, SingularProgram, SpecificationError
+from servoctl.model.model import derive
+from servoctl.simulation.run import Run
+from servoctl.simulation.simulate import simulate
+
+REACH = 12  # doublings of the time, in which a motion becomes as good as static, or halvings
+INSIDE = 1e-6  # of a limit: how far below it the fastest time law stays
+
+
+@dataclass(frozen=True, eq=False)
+class TimeLaw:
+    """A program slowed, or quickened, to where its first limit is reached; made by `fastest`.
+
+    Attributes
+    ----------
+    factor : float
+        How many times as long as given the motion takes.
+    program : Program
+        The program with this time law.
+    plan : Run
+        Its motion; every limit holds.
+    binding : (str, str, float)
+        The signal that reaches its limit, which side ("lower" or "upper"), and when [s].
+    """
+
+    factor: float
+    program: object
+    plan: Run
+    binding: tuple
+
+    def __repr__(self):
+        name, side, t = self.binding
+        how = "slowed" if self.factor > 1 else "quickened"
+        return (
+            f"TimeLaw: {how} by the factor {self.factor:.6g}; {name} reaches its {side} limit at t = {t:.5g} s\n"
+            f"  the motion takes {self.plan.t[0]:g} .. {self.plan.t[-1]:.6g} s"
+        )
+
+
+def fastest(mechanism, program, limits, t_span, start=None, guess=None, parameters=None):
+    """The fastest time law q(t0 + (t - t0)/σ) under which signals keep their limits, found by solving for σ.
+
+    The motion's geometry stays; speeds go with 1/σ, accelerations with 1/σ². What a limit leaves beside static loads
+    decides. Where several σ reach a limit the one next to the given time law, σ = 1, is found.
+
+    Parameters
+    ----------
+    mechanism : Mechanism
+    program : Program
+    limits : dict of str to (float, float) or float
+        Lower and upper limit of actuators and outputs by name; one number is symmetric. `None` leaves a side open.
+    t_span : (t0, t1)
+        Of the program as given [s].
+    start, guess : dict of str to float, optional
+        As for `Model.start`, for the program as given; derivatives that are held are slowed with the motion.
+    parameters : dict of str to float, optional
+        Other numbers for the mechanism's parameters.
+
+    Returns
+    -------
+    TimeLaw
+
+    Raises
+    ------
+    LimitExceeded
+        If the motion exceeds a limit however slow it is.
+    SpecificationError
+        For limits that are no interval.
+    NameUnknown
+        For a limit on something that is no signal of the plan.
+    """
+    from scipy.optimize import brentq
+
+    limits = {name: _interval(name, value) for name, value in dict(limits).items()}
+    t0, t1 = map(float, t_span)
+
+    @functools.cache
+    def attempt(factor):
+        """(worst excess, binding, program, plan) of a time law; an infinite excess where there is no motion."""
+        slower = program.slowed(mechanism.q, factor, at=t0)
+        try:
+            model = derive(mechanism, slower, guess)
+            model = model.with_parameters(**parameters) if parameters else model
+            held = {name: value / factor ** _level(model, name) for name, value in (start or {}).items()}
+            plan = simulate(model, model.start(t0, guess=guess, **held), (t0, t0 + (t1 - t0) * factor))
+        except (SingularProgram, InconsistentStart, IntegrationStopped):
+            return np.inf, ("", "", t0), slower, None
+        return *_worst(plan, limits), slower, plan
+
+    quick, slow = _bracket(attempt)
+    factor = brentq(lambda sigma: min(attempt(sigma)[0], 1.0) + INSIDE, quick, slow, rtol=INSIDE / 10)
+    _, binding, slower, plan = attempt(factor)
+    return TimeLaw(factor, slower, plan, binding)
+
+
+def _bracket(attempt):
+    """A factor at which a limit is exceeded, and the double of it, at which all are kept."""
+    factor = 1.0
+    step = 2.0 if attempt(factor)[0] > -INSIDE else 0.5
+    for _ in range(REACH):
+        before, factor = factor, factor * step
+        if (attempt(factor)[0] > -INSIDE) != (step > 1):
+            return min(before, factor), max(before, factor)
+    _refuse(attempt(factor), factor, step)
+
+
+def _worst(plan, limits):
+    """Largest excess over the limits, relative to their size, and where it is."""
+    found = []
+    for name, (low, high) in limits.items():
+        size = max(abs(v) for v in (low, high) if np.isfinite(v))
+        (t_low, least), (t_high, most) = plan.extrema(name)
+        found += [((low - least) / size, (name, "lower", t_low)), ((most - high) / size, (name, "upper", t_high))]
+    return max(found)
+
+
+def _level(model, name):
+    """Order of the derivative that a name stands for."""
+    nq, n = model.nq, model.n
+    return 0 if name not in model.jet_names[nq:] else 1 + (model.jet_names.index(name) - nq) // n
+
+
+def _interval(name, value):
+    try:
+        low, high = (-abs(value), abs(value)) if np.isscalar(value) else value
+        low = -np.inf if low is None else float(low)
+        high = np.inf if high is None else float(high)
+    except (TypeError, ValueError):
+        low = high = np.nan
+    if not low < high or not (np.isfinite(low) or np.isfinite(high)):
+        raise SpecificationError(
+            f"The limit of {name!r} is {value!r}.",
+            "A limit is an interval (lower, upper), or one number for both sides; None leaves a side open.",
+            do="Give (-100.0, 100.0).",
+            name=name,
+        )
+    return low, high
+
+
+def _refuse(last, factor, step):
+    excess, (name, side, t), _, plan = last
+    if step < 1:
+        raise SpecificationError(
+            f"No limit is reached even {1 / factor:g} times as fast as given.",
+            "A fastest time law is decided by a limit.",
+            do="Give limits of the actuators that the motion uses.",
+        )
+    reached = "no motion exists" if plan is None else f"{name} still exceeds its {side} limit at t = {t:.5g} s"
+    raise LimitExceeded(
+        f"{factor:g} times slower, {reached}.",
+        "Slowing reduces what accelerations ask for, not static loads.",
+        nearest="" if plan is None else f"{name} within {' .. '.join(f'{v:.6g}' for _, v in plan.extrema(name))}.",
+        do="Give limits that hold the mechanism at rest, or another path.",
+        name=name,
+        factor=factor,
+    )

@@ -1,0 +1,65 @@
+"""Programs slowed in time: the same path, and the fastest time law that limits allow."""
+
+import numpy as np
+import pytest
+from scipy.optimize import brentq
+
+import servoctl as sv
+from servoctl.mechanisms import cars, gallery, overhead_crane, wheeled_robot
+
+S13 = np.polynomial.Polynomial([0] * 7 + [1716, -9009, 20020, -24024, 16380, -6006, 924])
+
+
+def largest_force(factor):
+    """Of two cars (theory: F = 2y'''' + 3y'') when the path of 2 s takes `factor` times as long."""
+    s, T = np.linspace(0, 1, 200_001), 2 * factor
+    return np.max(2 * 2 * S13.deriv(4)(s) / T**4 + 3 * 2 * S13.deriv(2)(s) / T**2)
+
+
+@pytest.mark.parametrize("limit", [200.0, 3000.0])
+def test_two_cars_take_the_time_that_their_closed_form_takes(limit):
+    law = sv.fastest(*cars(), {"force": limit}, (0.0, 2.0))
+    assert law.factor == pytest.approx(brentq(lambda s: largest_force(s) - limit, 0.3, 3.0), rel=2e-6)
+    assert limit * (1 - 3e-6) < np.abs(law.plan["force"]).max() * 1.0001 and law.binding[0] == "force"
+    assert all(abs(value) <= limit for _, value in law.plan.extrema("force"))
+    assert sv.verify(law.plan.model, law.plan).passed
+
+
+def test_slowed_rates_and_curvatures_leave_the_path_where_it_is():
+    """A program of orders 1 and 2: residuals are written for the slowed jets."""
+    mechanism, program = wheeled_robot()
+    scene = gallery["wheeled-robot"]
+    runs = []
+    for factor in (1.0, 2.5):
+        model = sv.derive(mechanism, program.slowed(mechanism.q, factor))
+        start = model.start(**scene.start, guess={"v": 1.0 / factor})
+        times = np.linspace(0.0, 5.0 * factor, 101)
+        runs.append(sv.simulate(model, start, (0.0, times[-1]), t_eval=times))
+    for name in ("x", "y", "psi"):
+        assert np.abs(runs[0][name] - runs[1][name]).max() < 1e-7
+    assert np.abs(runs[0]["v"] - 2.5 * runs[1]["v"]).max() < 1e-9
+    assert np.abs(runs[0]["steer"] - 2.5**2 * runs[1]["steer"]).max() < 1e-6
+
+
+def test_held_velocities_are_slowed_too():
+    law = sv.fastest(
+        *wheeled_robot(), {"steer": 0.5}, (0.0, 5.0), start=gallery["wheeled-robot"].start, guess={"v": 1.0}
+    )
+    assert law.factor == pytest.approx((0.925275 / 0.5) ** 0.5, rel=1e-4)
+
+
+def test_static_loads_beyond_the_limits_are_refused_with_the_numbers():
+    with pytest.raises(sv.LimitExceeded, match="hoist still exceeds its lower limit.*-981 .. -981"):
+        sv.fastest(*overhead_crane(), {"hoist": (-900.0, 0.0)}, (0.0, 6.0), guess={"l": 4.0})
+
+
+def test_bad_input():
+    mechanism, program = cars()
+    for factor in (0.0, -1.0, "fast", np.nan):
+        with pytest.raises(sv.SpecificationError, match="positive number"):
+            program.slowed(mechanism.q, factor)
+    for limit in ((1.0, -1.0), (None, None), "1..2", np.nan):
+        with pytest.raises(sv.SpecificationError, match="interval"):
+            sv.fastest(mechanism, program, {"force": limit}, (0.0, 2.0))
+    with pytest.raises(sv.NameUnknown, match="force"):
+        sv.fastest(mechanism, program, {"forse": 1.0}, (0.0, 2.0))
