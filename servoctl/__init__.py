@@ -19,6 +19,7 @@ from servoctl.errors import (
 )
 from servoctl.model.model import Model, derive
 from servoctl.simulation.drift import poles, project
+from servoctl.simulation.internal import InternalDynamics, internal_dynamics
 from servoctl.simulation.run import Run, load
 from servoctl.simulation.simulate import simulate
 from servoctl.simulation.verify import Verification, verify
@@ -40,6 +41,7 @@ __version__ = "0.1.0"
 __all__ = [
     "Coordinates",
     "InconsistentStart",
+    "InternalDynamics",
     "IntegrationStopped",
     "LimitExceeded",
     "Mechanism",
@@ -59,6 +61,7 @@ __all__ = [
     "coordinates",
     "derive",
     "fastest",
+    "internal_dynamics",
     "load",
     "parameters",
     "particle",
