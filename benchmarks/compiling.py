@@ -14,6 +14,7 @@ from servoctl.model.emit import emit, operations
 from servoctl.model.series import taylor_coefficients
 
 LAST = 48  # index of Taylor coefficients at which the function has 24,000 operations
+CALL, BUFFER = "casadi Function.__call__ of compiled code", "casadi FunctionBuffer of compiled code"
 COLUMN, ARRAYS = (ctypes.c_double, *3 * [ctypes.c_void_p]), (*4 * [ctypes.c_void_p], ctypes.c_int)
 
 
@@ -48,8 +49,8 @@ def compile_long():
     )  # fmt: skip
 
 
-def call_once():
-    """One evaluation of X' from Python, arrays to array."""
+def call_once(arrays):
+    """One evaluation of X' from Python: with its arguments in place, or from arrays to a new array."""
     model, start = appell_hamel.constrained()
     f, x, p = model.function("ode"), start.values, model.parameters
     for _ in range(100):
@@ -70,14 +71,33 @@ def call_once():
         return y.copy()
 
     through_buffer.needs = buffer, plain  # the trigger does not keep them alive
-    peers = {
-        "casadi Function.__call__ of compiled code": lambda: plain(0.0, x, p).full().ravel(),
-        "casadi FunctionBuffer of compiled code": through_buffer,
-    }
-    bars = {"casadi Function.__call__ of compiled code": 100}
+
+    def error(values):
+        return np.abs(np.ravel(values) - exact).max()
+
+    if arrays:
+        peers = {CALL: lambda: plain(0.0, x, p).full().ravel(), BUFFER: through_buffer}
+        return Row(
+            "One evaluation from Python, Appell-Hamel right-hand side, from arrays to a new array",
+            lambda: f(0.0, x, p), peers, error, 1e-12,
+        )  # fmt: skip
+    *places, out, run = f.buffer()
+    for place, value in zip(places, (0.0, x, p), strict=True):
+        place[:] = value
+
+    def in_place():
+        run()
+        return out
+
+    def triggered():
+        trigger()
+        return y
+
+    triggered.needs = through_buffer
+    peers = {CALL: lambda: plain(0.0, x, p), BUFFER: triggered}
     return Row(
-        "One evaluation from Python, Appell-Hamel right-hand side", lambda: f(0.0, x, p), peers,
-        lambda values: np.abs(values - exact).max(), 1e-12, bars,
+        "One evaluation from Python, Appell-Hamel right-hand side, arguments and result in place",
+        in_place, peers, error, 1e-12, {CALL: 100},
     )  # fmt: skip
 
 
@@ -101,7 +121,8 @@ def taylor_growth(rounds):
 
 ROWS = {
     "compile": compile_long,
-    "call": call_once,
+    "call": partial(call_once, arrays=False),
+    "call-arrays": partial(call_once, arrays=True),
     "derivatives": partial(
         Limit, "Operations of the k-th total derivative of a curvature: k = 16 / k = 8", total_derivative, 4.0
     ),

@@ -175,7 +175,8 @@ def _quartiles(samples):
 
 def machine():
     """What the numbers were measured on: processor, cores, system, compiler and versions."""
-    versions = {name: metadata.version(name) for name in ("casadi", "numpy", "scipy", "heyoka") if installed(name)}
+    modules = {name: name for name in ("casadi", "numpy", "scipy", "heyoka", "sympy")} | {"pin": "pinocchio"}
+    versions = {name: metadata.version(name) for name, module in modules.items() if installed(module)}
     return {
         "processor": _processor(),
         "cores": os.cpu_count(),

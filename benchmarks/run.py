@@ -6,12 +6,14 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 import appell_hamel
+import arms
 import compiling
 import crane
+import derivation
 import harness
 import process
 
-ROWS = appell_hamel.ROWS | crane.ROWS | compiling.ROWS | process.ROWS
+ROWS = appell_hamel.ROWS | crane.ROWS | arms.ROWS | derivation.ROWS | compiling.ROWS | process.ROWS
 HERE = Path(__file__).parent
 RESULTS, README = HERE / "results.json", HERE / "README.md"
 BEGIN, END = "<!-- results -->\n", "<!-- end of results -->\n"

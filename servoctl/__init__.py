@@ -5,7 +5,16 @@ A specification flows one way: Mechanism and Program, by `derive`, become a Mode
 """
 
 from servoctl import plots, spec
+from servoctl.control import disturbances
+from servoctl.control.close import close
+from servoctl.control.closed import Closed
+from servoctl.control.computed import computed
+from servoctl.control.law import Controller, Law
+from servoctl.control.limits import LimitReport, limit_report, limited
+from servoctl.control.lqr import lqr
+from servoctl.control.observer import output_feedback
 from servoctl.control.time_law import TimeLaw, fastest
+from servoctl.control.tracking import feedforward, pd
 from servoctl.errors import (
     InconsistentStart,
     IntegrationStopped,
@@ -17,7 +26,9 @@ from servoctl.errors import (
     SpecificationError,
     UnstableInternalDynamics,
 )
+from servoctl.model.export import export_c
 from servoctl.model.model import Model, derive
+from servoctl.model.plant import Plant, plant
 from servoctl.simulation.drift import poles, project
 from servoctl.simulation.internal import InternalDynamics, internal_dynamics
 from servoctl.simulation.run import Run, load
@@ -35,42 +46,80 @@ from servoctl.spec import (
     paths,
     rigid_body,
 )
+from servoctl.study.cases import grid, monte_carlo
+from servoctl.study.dae import DaeComparison, dae_comparison
+from servoctl.study.formulation import FormulationCost, formulation_cost
+from servoctl.study.front import TradeOff
+from servoctl.study.stability import StabilityMap, stability
+from servoctl.study.study import Study, load_study
+from servoctl.study.sweep import merge, sweep
+from servoctl.study.tradeoff import tradeoff
 
 __version__ = "0.1.0"
 
 __all__ = [
+    "Closed",
+    "Controller",
     "Coordinates",
+    "DaeComparison",
+    "FormulationCost",
     "InconsistentStart",
-    "InternalDynamics",
     "IntegrationStopped",
+    "InternalDynamics",
+    "Law",
     "LimitExceeded",
+    "LimitReport",
     "Mechanism",
     "Model",
     "NameUnknown",
     "NotRealisable",
     "Parameters",
+    "Plant",
     "Program",
     "Run",
     "ServoError",
     "SingularProgram",
     "SpecificationError",
+    "StabilityMap",
+    "Study",
     "TimeLaw",
+    "TradeOff",
     "UnstableInternalDynamics",
     "Verification",
     "body_rates",
+    "close",
+    "computed",
     "coordinates",
+    "dae_comparison",
     "derive",
+    "disturbances",
+    "export_c",
     "fastest",
+    "feedforward",
+    "formulation_cost",
+    "grid",
     "internal_dynamics",
+    "limit_report",
+    "limited",
     "load",
+    "load_study",
+    "lqr",
+    "merge",
+    "monte_carlo",
+    "output_feedback",
     "parameters",
     "particle",
     "paths",
+    "pd",
+    "plant",
     "plots",
     "poles",
     "project",
     "rigid_body",
     "simulate",
     "spec",
+    "stability",
+    "sweep",
+    "tradeoff",
     "verify",
 ]

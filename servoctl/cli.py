@@ -1,12 +1,14 @@
-"""The command line: `servoctl list`, `run`, `report`."""
+"""The command line: `servoctl list`, `run`, `report`, `tradeoff`, and those in commands.py."""
 
 import argparse
 import json
 import sys
 from pathlib import Path
 
+from servoctl import commands as further
 from servoctl.errors import ServoError, SpecificationError, unknown
-from servoctl.rundir import FILES, Folder, Report, complain, summary, versions
+from servoctl.options import assignment, mapping
+from servoctl.rundir import FILES, Folder, Report, complain, plain, summary, versions
 
 
 def main(argv=None):
@@ -56,24 +58,47 @@ def _parser():
     run.add_argument("scene", metavar="NAME_OR_FILE", help="a gallery name, or a .py file that defines scene()")
     run.set_defaults(command=_run)
     _run_options(run)
+    trade = commands.add_parser("tradeoff", help="measure what each method and treatment of drift costs and reaches")
+    trade.add_argument("scene", metavar="NAME_OR_FILE", help="a gallery name, or a .py file that defines scene()")
+    trade.set_defaults(command=_tradeoff)
+    _tradeoff_options(trade)
+    further.add(commands)
     return parser
 
 
 def _run_options(run):
-    pairs = {"type": _assignment, "nargs": "+", "action": "extend", "default": [], "metavar": "NAME=VALUE"}
+    pairs = {"type": assignment, "nargs": "+", "action": "extend", "default": [], "metavar": "NAME=VALUE"}
     run.add_argument("--out", metavar="DIR", help="folder; files of an earlier run in it are replaced")
     run.add_argument("--t-span", type=float, nargs=2, metavar=("T0", "T1"), help="[s]; default: the scene's")
     run.add_argument("--hold", **pairs, help="values that the start keeps, beside the scene's own")
     run.add_argument("--guess", **pairs, help="where the rest of the start is looked for; frees what the scene holds")
     run.add_argument("--set", **pairs, help="parameters")
+    run.add_argument("--accuracy", type=float, metavar="E", help="error of the motion, in place of method and settings")
     run.add_argument("--method", help="algebraic, RK4, DOP853, Radau, ...; default: by the model")
     run.add_argument("--step", type=float, metavar="H", help="step of RK4 [s]")
-    run.add_argument("--drift", type=_drift, metavar="D", help="none, project, or a time constant [s]")
+    run.add_argument("--drift", type=_drift, metavar="D", help="none, project, minimal, or a time constant [s]")
     run.add_argument("--rtol", type=float, help="relative tolerance")
     run.add_argument("--atol", type=float, help="absolute tolerance")
     run.add_argument("--samples", type=_samples, metavar="N", help="equally spaced samples of the run")
     run.add_argument("--no-verify", action="store_true", help="leave out the check against the full mechanism")
     run.add_argument("--no-figures", action="store_true", help="leave out the figures")
+
+
+def _tradeoff_options(trade):
+    pairs = {"type": assignment, "nargs": "+", "action": "extend", "default": [], "metavar": "NAME=VALUE"}
+    trade.add_argument("--out", metavar="DIR", help="folder; default servoctl-runs/NAME-tradeoff")
+    trade.add_argument("--t-span", type=float, nargs=2, metavar=("T0", "T1"), help="[s]; default: the scene's")
+    trade.add_argument("--hold", **pairs, help="values that the start keeps, beside the scene's own")
+    trade.add_argument("--guess", **pairs, help="where the rest of the start is looked for")
+    trade.add_argument("--set", **pairs, help="parameters")
+    trade.add_argument("--method", nargs="+", metavar="METHOD", help="which are measured; default: most")
+    trade.add_argument(
+        "--drift", type=_drift, nargs="+", metavar="D", help="none, project, minimal, a time constant [s]"
+    )
+    trade.add_argument("--limit", type=float, metavar="S", help="seconds that one run may take; default 0.3")
+    wanted = trade.add_mutually_exclusive_group()
+    wanted.add_argument("--error", type=float, metavar="E", help="recommend the fastest within this error")
+    wanted.add_argument("--seconds", type=float, metavar="S", help="recommend the most accurate within this time")
 
 
 class _Version(argparse.Action):
@@ -82,40 +107,13 @@ class _Version(argparse.Action):
         parser.exit()
 
 
-def _assignment(text):
-    name, _, value = text.partition("=")
-    try:
-        number = float(value)
-    except ValueError:
-        number = None
-    if not name.strip() or number is None:
-        raise argparse.ArgumentTypeError(
-            f"{text!r} is not NAME=VALUE with a number, such as theta=0.1; the scene's name comes before such options"
-        )
-    return name.strip(), number
-
-
-def _mapping(pairs, option):
-    found = {}
-    for name, value in pairs:
-        if name in found:
-            raise SpecificationError(
-                f"{option} {name} was given twice: {found[name]:g} and {value:g}.",
-                "A name has one value.",
-                do="Leave one of them out.",
-                name=name,
-            )
-        found[name] = value
-    return found
-
-
 def _drift(text):
-    if text in ("none", "project"):
+    if text in ("none", "project", "minimal"):
         return None if text == "none" else text
     try:
         return float(text)
     except ValueError:
-        raise argparse.ArgumentTypeError(f"{text!r} is not none, project or a time constant in seconds") from None
+        raise argparse.ArgumentTypeError(f"{text!r} is not none, project, minimal or a time constant [s]") from None
 
 
 def _samples(text):
@@ -186,7 +184,7 @@ def _compute(args, name, scene, folder):
 
     report = Report()
     span = tuple(args.t_span or scene.t_span)
-    changes, held, guess = (_mapping(getattr(args, name), f"--{name}") for name in ("set", "hold", "guess"))
+    changes, held, guess = (mapping(getattr(args, name), f"--{name}") for name in ("set", "hold", "guess"))
     model = _with_parameters(sv.derive(*scene.build()), changes)
     report.say(model)
     start = _start(model, scene, span[0], held, guess)
@@ -235,7 +233,7 @@ def _start(model, scene, t0, hold, guess):
 
 def _options(args, span):
     """Arguments of `simulate` that were given."""
-    names = ("method", "step", "drift", "rtol", "atol")
+    names = ("accuracy", "method", "step", "drift", "rtol", "atol")
     options = {name: getattr(args, name) for name in names if getattr(args, name) is not None}
     if args.samples:
         options["t_eval"] = [span[0] + (span[1] - span[0]) * i / (args.samples - 1) for i in range(args.samples)]
@@ -273,3 +271,53 @@ def _verify(model, run, report):
         return None
     report.say(verification)
     return verification
+
+
+def _tradeoff(args):
+    from servoctl.scenes import find_scene
+
+    name, scene = find_scene(args.scene)
+    folder = Folder(Path(args.out) if args.out else Path("servoctl-runs", f"{name}-tradeoff"), name)
+    try:
+        return _measure(args, name, scene, folder)
+    finally:
+        folder.leave()
+
+
+def _measure(args, name, scene, folder):
+    """Derive, measure, save, draw, recommend, in this order; returns the exit code."""
+    import servoctl as sv
+
+    report = Report()
+    span = tuple(args.t_span or scene.t_span)
+    changes, held, guess = (mapping(getattr(args, name), f"--{name}") for name in ("set", "hold", "guess"))
+    model = _with_parameters(sv.derive(*scene.build()), changes)
+    report.say(model)
+    start = _start(model, scene, span[0], held, guess)
+    report.say(start)
+    limit = {} if args.limit is None else {"seconds": args.limit}
+    study = sv.tradeoff(model, start, span, methods=args.method, drift=args.drift, **limit)
+    report.say(study)
+    folder.write(lambda path: study.save(path / "tradeoff.npz"))
+    folder.write(lambda path: study.csv(path / "tradeoff.csv"))
+    figure = study.plot(title=name).figure
+    folder.write(lambda path: figure.savefig(path / "tradeoff.png", dpi=100))
+    try:
+        best = _recommended(study, args, report)
+    finally:  # what was measured is kept where nothing reaches what was asked
+        folder.write(lambda path: (path / "report.txt").write_text("\n".join(report.texts), encoding="utf-8"))
+    facts = {"scene": {"name": name, "given": args.scene}, "command": args.command_line, **study.meta}
+    facts |= {"recommended": best, "pareto": study.pareto().rows()}
+    text = json.dumps(plain(facts), indent=2, allow_nan=False, ensure_ascii=False) + "\n"
+    folder.write(lambda path: (path / "summary.json").write_text(text, encoding="utf-8"))
+    print(f"tradeoff.npz, tradeoff.csv, tradeoff.png, report.txt, summary.json in {folder.path}")
+    return 1 if folder.moved else 0
+
+
+def _recommended(study, args, report):
+    if args.error is None and args.seconds is None:
+        return None
+    best = study.recommend(error=args.error, seconds=args.seconds)
+    options = ", ".join(f"{key}={value!r}" for key, value in best.items())
+    report.say(f"Recommended: {options}; error {best.row['error']:.1e} in {best.row['seconds']:.2g} s")
+    return dict(best)

@@ -168,6 +168,36 @@ def residuals(run, ax=None):
     return ax
 
 
+def sweep(study, names=None, against=None, units=None):
+    """Draw results of a sweep: histograms with percentiles, and each over a parameter.
+
+    Parameters
+    ----------
+    study : Study
+        From `sweep` or `merge`.
+    names : sequence of str, optional
+        Columns; default: the first four results that vary.
+    against : str, optional
+        Column across; default: for each result the parameter with the largest rank correlation.
+    units : dict of str to str, optional
+        Unit of each column, by name.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+
+    Raises
+    ------
+    NameUnknown
+        If there is no such column.
+    SpecificationError
+        If no result varies.
+    """
+    from servoctl.study.sweep_figure import draw
+
+    return draw(study, names, against, units)
+
+
 def save_figures(run, folder, units=None, title=""):
     """Write path.png, coordinates.png, actuation.png and residuals.png, each 1000 px wide.
 

@@ -151,7 +151,7 @@ def summary(run, start, verification):
     model = run.model
     residuals = {name: [_worst(level) for level in run.residual[name].tolist()] for name in run.residual}
     checked = verification is not None
-    return _plain({
+    return plain({
         "versions": versions(),
         "parameters": dict(zip(model.reduction.mechanism.parameters.names, model.parameters, strict=True)),
         "method": run.method,
@@ -201,14 +201,14 @@ def _extrema(run, name):
     return {"min": {"t": low[0], "value": low[1]}, "max": {"t": high[0], "value": high[1]}}
 
 
-def _plain(value):
+def plain(value):
     """Numbers, texts, lists and dicts of them; what is not finite becomes None."""
     if isinstance(value, dict):
-        return {str(key): _plain(item) for key, item in value.items()}
+        return {str(key): plain(item) for key, item in value.items()}
     if isinstance(value, (list, tuple)):
-        return [_plain(item) for item in value]
+        return [plain(item) for item in value]
     if hasattr(value, "tolist"):
-        return _plain(value.tolist())
+        return plain(value.tolist())
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 

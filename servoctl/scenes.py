@@ -1,5 +1,6 @@
 """A scene by name: from the gallery, or from a user's file."""
 
+import functools
 import importlib.util
 import math
 import sys
@@ -49,9 +50,7 @@ def find_scene(given):
     raise error
 
 
-def _from_file(path):
-    from servoctl.mechanisms import Scene
-
+def _module(path):
     if not path.is_file():
         others = [p.name for p in path.parent.glob("*.py")]
         match = unknown(path.name, others, "file").details["match"]
@@ -62,7 +61,13 @@ def _from_file(path):
             do="Check the path, or see servoctl list.",
             file=str(path),
         )
-    module = _reported(path, lambda: _import(path))
+    return _reported(path, lambda: _import(path))
+
+
+def _from_file(path):
+    from servoctl.mechanisms import Scene
+
+    module = _module(path)
     scene = getattr(module, "scene", None)
     if not callable(scene):
         raise SpecificationError(
@@ -74,6 +79,42 @@ def _from_file(path):
         )
     description = next(iter((module.__doc__ or "").strip().splitlines()), f"The scene of {path.name}.")
     return Scene(lambda: _built(path, scene), description, **_settings(path, module))
+
+
+def stamp(given):
+    """What tells a scene from another one, and a file from what it was before it was changed: to be cached by."""
+    path = Path(given)
+    return (str(path.resolve()), path.stat().st_mtime_ns) if path.is_file() else given
+
+
+def own_case(given):
+    """The function `case` that a user's file defines for sweeps; None where there is none.
+
+    Parameters
+    ----------
+    given : str
+        A name of the gallery, or the path of a .py file.
+
+    Returns
+    -------
+    callable or None
+
+    Raises
+    ------
+    SpecificationError
+        If the file is missing or raises.
+    """
+    from servoctl.mechanisms import gallery
+
+    path = Path(given)
+    if given in gallery or path.suffix != ".py":
+        return None
+    return getattr(_kept(path, stamp(given)), "case", None)
+
+
+@functools.cache
+def _kept(path, _):
+    return _module(path)
 
 
 def _import(path):

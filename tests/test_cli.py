@@ -209,7 +209,7 @@ def test_errors_are_told_without_a_traceback(here, fall, capsys, arguments, fact
         ("run fall.py --hold x", "'x' is not NAME=VALUE"),
         ("run fall.py --set =3", "'=3' is not NAME=VALUE"),
         ("run --hold y=1 fall.py", "the scene's name comes before such options"),
-        ("run fall.py --drift much", "'much' is not none, project or a time constant"),
+        ("run fall.py --drift much", "'much' is not none, project, minimal or a time constant"),
         ("run fall.py --samples 1", "'1' is not a whole number of at least 2"),
         ("walk", "invalid choice: 'walk'"),
         ("", "required: command"),

@@ -12,7 +12,7 @@ import pytest
 
 from servoctl.errors import NameUnknown, SpecificationError
 from servoctl.model import compiler, emit
-from servoctl.model.compiled import GRID_POINTS, compiled
+from servoctl.model.compiled import compiled, compiling_at_once
 from servoctl.simulation.tableaus import tableau
 
 T, X2, P1 = ca.SX.sym("t"), ca.SX.sym("x", 2), ca.SX.sym("p", 1)
@@ -36,7 +36,8 @@ def backend(request, monkeypatch):
     if request.param == "casadi":
         monkeypatch.setenv("SERVOCTL_COMPILER", "none")
         monkeypatch.setattr(compiler, "_warned", True)
-    return request.param
+    with compiling_at_once():
+        yield request.param
 
 
 def function(*outputs, x=X2, p=P1):
@@ -84,16 +85,20 @@ def test_every_operation_equals_casadi():
     n = x.shape[1]
     reference = np.asarray(f.map(n)(np.full((1, n), 2.5), x, np.full((1, n), 1.5)))
     model = compiled(f, "operations")
-    y = model.grid(2.5, x, [1.5])
+    with compiling_at_once():
+        y = model.grid(2.5, x, [1.5])
     assert model.backend == "c"
-    for row, expected, expression in zip(y, reference, expressions, strict=True):
-        np.testing.assert_array_equal(np.isnan(row), np.isnan(expected), err_msg=str(expression))
-        np.testing.assert_array_max_ulp(row, expected, maxulp=2)
+    alone = np.array([model(2.5, column, [1.5]) for column in x.T]).T
+    for values in (y, alone):
+        for row, expected, expression in zip(values, reference, expressions, strict=True):
+            np.testing.assert_array_equal(np.isnan(row), np.isnan(expected), err_msg=str(expression))
+            np.testing.assert_array_max_ulp(row, expected, maxulp=2)
 
 
 def test_constants_are_exact():
     model = compiled(function(*CONSTANTS), "constants")
-    y = model.grid(0.0, np.zeros((2, GRID_POINTS + 1)), [0.0])
+    with compiling_at_once():
+        y = model.grid(0.0, np.zeros((2, 20)), [0.0])
     assert model.backend == "c"
     np.testing.assert_array_equal(y[:, -1], CONSTANTS)
 
@@ -144,7 +149,7 @@ def test_an_operation_without_c_is_named():
 def test_point_and_grid_agree_in_both_backends(backend):
     model = pendulum()
     rng = np.random.default_rng(1)
-    n = GRID_POINTS + 1
+    n = 201
     t, x, p = rng.normal(size=n), rng.normal(size=(2, n)), rng.normal(size=(1, n))
     expected = np.array([x[1], -p[0] * np.sin(x[0]) + np.cos(t), x[0] ** 2 + t])
     np.testing.assert_allclose(model.grid(t, x, p), expected, rtol=1e-15, atol=1e-15)
@@ -164,11 +169,22 @@ def test_each_call_returns_its_own_array(backend):
     np.testing.assert_array_equal(first, kept)
 
 
+def test_a_buffer_is_written_called_and_read(backend):
+    model = pendulum()
+    t, x, p, y, call = model.buffer()
+    for now in (0.0, 0.4):
+        t[0], x[:], p[:] = now, (0.3, -0.2), 2.0
+        call()
+        kept = y.copy()
+        np.testing.assert_array_equal(kept, model(now, [0.3, -0.2], [2.0]))
+    assert model.backend == backend
+
+
 def test_empty_state_and_parameters(backend):
     model = compiled(function(T**2, 1.0, x=ca.SX.sym("x", 0), p=ca.SX.sym("p", 0)), "of_time")
     assert model.n_x == model.n_p == 0
     np.testing.assert_array_equal(model(3.0, [], []), [9.0, 1.0])
-    t = np.linspace(0, 1, GRID_POINTS + 1)
+    t = np.linspace(0, 1, 201)
     np.testing.assert_array_equal(model.grid(t, np.empty((0, t.size)), []), [t**2, np.ones(t.size)])
     assert model.backend == backend
 
@@ -347,7 +363,8 @@ def test_both_backends_count_the_same_iterations(monkeypatch):
         monkeypatch.setenv("SERVOCTL_COMPILER", chosen)
         monkeypatch.setattr(compiler, "_warned", True)
         model = newton_model(ca.atan(x - 50 * ca.sin(T)), x, "narrow")
-        results.append((model.newton(t, [0.1], [0.0])[2], model.backend))
+        with compiling_at_once():
+            results.append((model.newton(t, [0.1], [0.0])[2], model.backend))
     (in_c, _), (in_python, _) = results
     assert [backend for _, backend in results] == ["c", "casadi"]
     assert abs(in_c - in_python) <= 0.02 * in_c

@@ -9,7 +9,7 @@ import pytest
 from test_compiled import P1, RK4, X2, T, function, numpy_rk4, pendulum
 
 from servoctl.model import compiler
-from servoctl.model.compiled import GRID_POINTS, SCALAR_CALLS, compiled
+from servoctl.model.compiled import GRID_POINTS, SCALAR_CALLS, SOLVED, compiled
 
 
 @pytest.fixture
@@ -20,6 +20,11 @@ def fresh(tmp_path, monkeypatch):
     commands, run = [], subprocess.run
     monkeypatch.setattr(subprocess, "run", lambda command, **rest: commands.append(command) or run(command, **rest))
     return commands
+
+
+def pendulum_with_loops():
+    """Rates of a pendulum; as a Newton step they vanish at once where it hangs."""
+    return compiled(function(X2[1], -P1 * ca.sin(X2[0]), 0, 0), "hanging", ("rk", "newton"))
 
 
 def new_process(monkeypatch):
@@ -39,10 +44,20 @@ def test_nothing_is_compiled_before_it_pays(fresh):
 
 
 @pytest.mark.parametrize("use", [lambda m: m.grid(0.0, np.zeros((2, GRID_POINTS + 1)), [1.0]),
-                                 lambda m: m.rk(0.0, [0.0, 0.0], 0.1, 1, [1.0], RK4)])
-def test_a_long_grid_or_a_loop_compiles_at_once(fresh, use):
-    model = pendulum(("rk",))
+                                 lambda m: m.rk(0.0, [0.0, 0.0], 0.1, 1, [1.0], RK4),
+                                 lambda m: m.newton(np.zeros(GRID_POINTS), [0.0, 0.0], [1.0])])
+def test_a_long_grid_a_long_path_or_an_integration_compiles_at_once(fresh, use):
+    model = pendulum_with_loops()
     use(model)
+    assert len(fresh) == 1 and model.backend == "c"
+
+
+def test_a_short_path_is_solved_without_compiling(fresh):
+    model = pendulum_with_loops()
+    points = GRID_POINTS // SOLVED
+    model.newton(np.zeros(points), [0.0, 0.0], [1.0])
+    assert not fresh and model.backend == "casadi"
+    model.newton(np.zeros(1), [0.0, 0.0], [1.0])
     assert len(fresh) == 1 and model.backend == "c"
 
 

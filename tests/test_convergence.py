@@ -215,7 +215,7 @@ def test_poles_cost_accuracy_at_low_order_and_save_it_at_high_order(rho, without
 
 def test_poles_beyond_the_stability_of_rk4_diverge():
     assert tracking_error(2, sv.poles({"x": [-40.0] * 2})) < 1e-3  # |λ h| = 2 < 2.785
-    with np.errstate(all="ignore"):
+    with np.errstate(all="ignore"), pytest.warns(RuntimeWarning, match="largest stable step is 0.04642 s"):
         try:
             error = tracking_error(2, sv.poles({"x": [-60.0] * 2}))
         except sv.IntegrationStopped:

@@ -64,6 +64,9 @@ GALLERY = {
     "passive-arm": ([0, 2], {"angle": 2}),
     "vtol": ([0, 0, 0], {"X": 4, "Z": 4}),
     "vtol-centre": ([0, 0, 2], {"X": 2, "Z": 2}),
+    "two-link-arm": ([0, 0], {"X": 2, "Y": 2}),
+    "pendubot": ([0, 2], {"angle": 2}),
+    "wheeled-robot": ([1, 2], {"speed": 1, "clothoid": 0}),
 }
 
 

@@ -254,6 +254,15 @@ def test_a_particle_goes_round_and_round(kind, method, derived):
     assert error < (1e-6 if method == "BDF" else 1e-8)
 
 
+def test_long_steps_change_pivots_on_the_way_back_too(derived):
+    model = derived(on_a_circle, "equation")
+    x, y = np.cos(20.0), np.sin(20.0)
+    start = model.start(t=20.0, x=x, y=y, dx=-y, dy=x)
+    run = sv.simulate(model, start, (20.0, 0.0), method="Taylor", drift="project", order=20, rtol=1e-11, atol=1e-13)
+    assert run.success and run.counters["steps"] < 30 and run.counters["pivot_changes"] >= 6
+    assert np.hypot(run["x"] - np.cos(run.t), run["y"] - np.sin(run.t)).max() < 1e-9
+
+
 @pytest.mark.parametrize("method", ["DOP853", "Radau", "LSODA", "Taylor", "RK4"])
 def test_a_pendulum_goes_over_the_top(method, derived):
     model = derived(pendulum_on_a_cart)

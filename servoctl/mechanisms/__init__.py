@@ -18,6 +18,7 @@ from servoctl.mechanisms.appell_hamel import appell_hamel
 from servoctl.mechanisms.cars import cars
 from servoctl.mechanisms.constant_speed import constant_speed
 from servoctl.mechanisms.cranes import crane_3d, overhead_crane, winch_crane
+from servoctl.mechanisms.links import planar_arm, spatial_arm
 from servoctl.mechanisms.mass_on_car import mass_on_car
 from servoctl.mechanisms.passive_arm import passive_arm
 from servoctl.mechanisms.spirals import spiral
@@ -36,6 +37,8 @@ __all__ = [
     "overhead_crane",
     "passive_arm",
     "pendubot",
+    "planar_arm",
+    "spatial_arm",
     "spiral",
     "two_link_arm",
     "vtol",

@@ -4,6 +4,8 @@ Nothing is compiled before it pays. Where there is no compiler, CasADi's evaluat
 results differ by rounding only.
 """
 
+import contextlib
+import contextvars
 import functools
 
 import casadi as ca
@@ -11,19 +13,31 @@ import numpy as np
 
 from servoctl.errors import SpecificationError, unknown
 from servoctl.model import compiler, emit
-from servoctl.model.interpreted import Interpreter
+from servoctl.model.interpreted import Interpreter, restored
 from servoctl.model.loops import LOOPS
 from servoctl.model.native import Library
 
-# Compiling takes 0.1 s or more, as long as 10^4 and more evaluations by CasADi. A consistent start makes tens of calls,
-# the signals of a short plan are a grid of a hundred points; an integration makes thousands.
+# Compiling takes 0.1 s or more. A consistent start makes tens of calls, an integration thousands; a grid costs CasADi
+# some 3 us per point, and a point of a path, solved by Newton's iteration in Python, as much as SOLVED of them.
 SCALAR_CALLS = 50
-GRID_POINTS = 200
+GRID_POINTS = 20_000
+SOLVED = 5
 
+_AT_ONCE = contextvars.ContextVar("compiling at once", default=False)
 _OUTPUTS_PER_STATE = {"rk": 1, "newton": 2, "taylor": 1}
 
 
-def compiled(f, name, loops=(), project=None, others=None, drivers=""):
+@contextlib.contextmanager
+def compiling_at_once():
+    """Compile at the first call: results then do not depend, in their last bits, on how often a function was called."""
+    token = _AT_ONCE.set(True)
+    try:
+        yield
+    finally:
+        _AT_ONCE.reset(token)
+
+
+def compiled(f, name, loops=(), project=None, others=None, drivers="", sizes=None):
     """Make a compiled function of an SX function.
 
     Parameters
@@ -40,6 +54,9 @@ def compiled(f, name, loops=(), project=None, others=None, drivers=""):
         Further functions of the same form in the same library, found by `Compiled.native`.
     drivers : str
         C text of further loops, with the placeholders of `loops`.
+    sizes : dict of str to int, optional
+        Constants that loops and drivers take; "taylor" takes the numbers of coordinates "nq" and quasi-velocities "n",
+        the order s̄ as "top", the highest index of coefficients "last", and whether q' = γ' as "plain".
 
     Returns
     -------
@@ -87,7 +104,7 @@ def compiled(f, name, loops=(), project=None, others=None, drivers=""):
                 name=name,
                 loop=loop,
             )
-    return Compiled(f, name, tuple(loops), project, others, drivers)
+    return Compiled(f, name, tuple(loops), project, others, drivers, sizes)
 
 
 class Compiled:
@@ -106,19 +123,19 @@ class Compiled:
         The loops it can run.
     """
 
-    def __init__(self, f, name, loops, project=None, others=None, drivers=""):
+    def __init__(self, f, name, loops, project=None, others=None, drivers="", sizes=None):
         self.name, self.loops, self._project = name, loops, project
-        self._others, self._drivers = others or {}, drivers
+        self._others, self._drivers, self._sizes = others or {}, drivers, sizes or {}
         self.n_x, self.n_p, self.n_y = f.numel_in(1), f.numel_in(2), f.numel_out(0)
         self._f = f
         self._x_shape, self._p_shape = (self.n_x,), (self.n_p,)
-        self._evaluator = Interpreter(f, project)
+        self._evaluator = Interpreter(f, project, self._sizes)
         self._settled, self._text, self._calls, self._points = False, None, 0, 0
 
     def __reduce__(self):
         project = self._project and self._project.serialize()
         others = {key: f.serialize() for key, f in self._others.items()}
-        return _restored, (self._f.serialize(), self.name, self.loops, project, others, self._drivers)
+        return _restored, (self._f.serialize(), self.name, self.loops, project, others, self._drivers, self._sizes)
 
     def __repr__(self):
         how = "compiled" if self.backend == "c" else "evaluated by CasADi"
@@ -158,15 +175,24 @@ class Compiled:
         """
         if not self._settled:
             self._calls += 1
-            self._settle(self._calls > SCALAR_CALLS)
-        row_t, row_x, row_p, row_y, run = self._evaluator.workspace.row
-        row_t[0] = t
-        try:
-            row_x[:], row_p[:] = x, p
-        except (TypeError, ValueError):  # not arrays of floats of the right shapes
-            row_x[:], row_p[:] = self._array("x", x, self._x_shape), self._array("p", p, self._p_shape)
+            self._settle(self._calls > SCALAR_CALLS or _AT_ONCE.get())
+        row_y, run = self._place(t, x, p)
         run()
         return row_y.copy()
+
+    def buffer(self):
+        """Arrays to write and read, and a call without arguments: for loops in Python over single evaluations.
+
+        They belong to the calling thread, and any other evaluation by it writes to them.
+
+        Returns
+        -------
+        t, x, p, y : (1,), (n_x,), (n_p,), (n_y,) arrays
+        call : callable
+            Computes y from what t, x and p hold.
+        """
+        self._settle(build=True)
+        return self._evaluator.workspace.buffer
 
     def grid(self, t, x, p):
         """Evaluate at N points.
@@ -195,7 +221,7 @@ class Compiled:
         t = self._array("t", np.broadcast_to(t, (n,)) if np.ndim(t) == 0 else t, (n,))
         p = self._array("p", p, (self.n_p, n) if np.ndim(p) == 2 else self._p_shape)
         self._points += n
-        self._settle(self._points > GRID_POINTS)
+        self._settle(self._points > GRID_POINTS or _AT_ONCE.get())
         y = np.empty((self.n_y, n))
         self._evaluator.grid(t, x, p, y)
         return y
@@ -259,6 +285,8 @@ class Compiled:
 
         A point is predicted from the last one by its rate and corrected until every |delta_i| <= tol (1 + |x_i|), then
         once more where that still reduces delta. Where the correction fails the step in time is halved, up to 20 times.
+        Once compiled, eight points are predicted at once, by Hermite's interpolation from three before, and corrected
+        together; where that prediction is off by more than 1e-3 they are solved one by one.
 
         Parameters
         ----------
@@ -287,14 +315,15 @@ class Compiled:
         SpecificationError
             If the loop was not asked for or a shape is another.
         """
-        self._settle_loop("newton")
+        self._points += SOLVED * np.size(t)
+        self._settle_loop("newton", self._points > GRID_POINTS or _AT_ONCE.get())
         t = self._array("t", t, (np.size(t),))
         x0, p = self._array("x0", x0, self._x_shape), self._array("p", p, self._p_shape)
         x, y = np.empty((self.n_x, t.size)), np.empty((self.n_y, t.size))
         n, iterations = self._evaluator.newton(t, x0, p, float(tol), int(max_iter), x, y)
         return x[:, :n], y[:, :n], iterations
 
-    def taylor(self, t0, x0, t1, p, shape, rtol, atol, max_steps, project_every=0):
+    def taylor(self, t0, x0, t1, p, rtol, atol, max_steps, project_every=0):
         """Steps of the Taylor method; the outputs are coefficients of q (unless plain) and γ by index, then guards.
 
         A step is as long as its last term stays below the tolerance at every level of the state.
@@ -307,9 +336,6 @@ class Compiled:
             State at t0, SI.
         p : (n_p,) array
             Parameters, SI.
-        shape : (nq, n, top, last, plain)
-            Numbers of coordinates and quasi-velocities, the order s̄, the highest index of coefficients, and whether
-            q' = γ'.
         rtol, atol : float
             Tolerance of each level of the state relative to its largest entry, and absolute.
         max_steps : int
@@ -332,12 +358,22 @@ class Compiled:
             If the loop was not asked for or a shape is another.
         """
         self._settle_loop("taylor")
-        x0, p = self._array("x0", x0, self._x_shape), self._array("p", p, self._p_shape)
-        t = np.empty(max_steps + 1)
-        x, y = np.empty((max_steps + 1, self.n_x)), np.empty((max_steps + 1, self.n_y))
+        self._place(t0, x0, p)
         every = project_every if self._project is not None else 0
-        n = self._evaluator.taylor(float(t0), x0, float(t1), p, shape, rtol, atol, every, max_steps, t, x, y)
-        return t[: n + 1], x[: n + 1].T, y[:n].T
+        log = self._evaluator.taylor(t1, rtol, atol, every, max_steps)
+        return log[:, 0], log[:, 1 : 1 + self.n_x].T, log[:-1, 1 + self.n_x :].T
+
+    def restore(self, t, x, p):
+        """The state (n_x,) with its invariants restored by `project`, evaluated by CasADi; x where there is none.
+
+        Parameters
+        ----------
+        t : float
+            [s]
+        x : (n_x,) array
+        p : (n_p,) array
+        """
+        return x if self._project is None else restored(self._project, t, x, p)
 
     def native(self, suffix):
         """The C function ``..._suffix`` of the library, built if need be; None without a compiler.
@@ -350,7 +386,7 @@ class Compiled:
         self._settle(build=True)
         return self._evaluator.native(suffix)
 
-    def _settle_loop(self, loop):
+    def _settle_loop(self, loop, build=True):
         if loop not in self.loops:
             raise SpecificationError(
                 f"{self.name!r} was asked for its loop {loop}",
@@ -359,21 +395,30 @@ class Compiled:
                 name=self.name,
                 loop=loop,
             )
-        self._settle(build=True)
+        self._settle(build)
 
     def _settle(self, build):
         """Move from CasADi to the library: at the first call if one is at hand, later if it is to be built."""
         if self._settled or (self._text is not None and not build):
             return
         symbol = f"servoctl_{self.name}"
-        text = self._text or emit.emit(
-            self._f, symbol, self.loops, project=self._project, others=self._others, drivers=self._drivers
-        )
-        library = compiler.library(text, build)
+        parts = {"others": self._others, "drivers": self._drivers, "sizes": self._sizes}
+        text = self._text or emit.emit(self._f, symbol, self.loops, project=self._project, **parts)
+        library = compiler.library(text, build, "-O3" if {"newton", "taylor"} & {*self.loops} else "-O1")
         if library is not None:
             self._evaluator = Library(library, symbol, self.n_x, self.n_p, self.n_y)
         self._settled = build or library is not None
         self._text = None if self._settled else text
+
+    def _place(self, t, x, p):
+        """Put t, x and p where the evaluator reads them; where it writes y, and its call."""
+        row_t, row_x, row_p, row_y, run = self._evaluator.workspace.row
+        row_t[0] = t
+        try:
+            row_x[:], row_p[:] = x, p
+        except (TypeError, ValueError):  # not arrays of floats of the right shapes
+            row_x[:], row_p[:] = self._array("x", x, self._x_shape), self._array("p", p, self._p_shape)
+        return row_y, run
 
     def _array(self, what, value, shape):
         array = np.ascontiguousarray(value, dtype=float)
@@ -388,7 +433,7 @@ class Compiled:
         return array
 
 
-def _restored(serialized, name, loops, project, others, drivers):
+def _restored(serialized, name, loops, project, others, drivers, sizes):
     project = project and ca.Function.deserialize(project)
     others = {key: ca.Function.deserialize(f) for key, f in others.items()}
-    return Compiled(ca.Function.deserialize(serialized), name, loops, project, others, drivers)
+    return Compiled(ca.Function.deserialize(serialized), name, loops, project, others, drivers, sizes)

@@ -6,7 +6,7 @@ else ``CC``, else the first of cc, gcc and clang; ``SERVOCTL_COMPILER=none`` com
 where it fails, one warning per process says so and the caller goes on without.
 
 The flags keep the values of IEEE arithmetic with one exception: a product and a sum may be contracted to one fused
-operation, which rounds once instead of twice.
+operation, which rounds once instead of twice. (Which C text is compiled is told in `emit`.)
 """
 
 import ctypes
@@ -23,8 +23,7 @@ import threading
 import warnings
 from pathlib import Path
 
-# -O1 compiles fastest, and straight-line code runs within a quarter of what -O2 or -O3 make of it.
-FLAGS = ("-O1", "-fPIC", "-shared", "-w", "-fno-math-errno")
+FLAGS = ("-fPIC", "-shared", "-w", "-fno-math-errno")
 _DIGEST = hashlib.sha256().digest_size
 
 _loaded = {}  # key -> ctypes.CDLL, or None where it could not be built
@@ -37,7 +36,7 @@ class _CompilerFailed(Exception):
     """The compiler refused the text."""
 
 
-def library(text, build=True):
+def library(text, build=True, level="-O1"):
     """Load the library of a C translation unit, compiling it if it is not at hand.
 
     Parameters
@@ -46,6 +45,8 @@ def library(text, build=True):
         C text.
     build : bool
         Whether to compile if the library is neither loaded nor kept on disk.
+    level : str
+        Of optimisation: "-O1" compiles fastest, and straight-line code runs within a quarter of what "-O3" makes of it.
 
     Returns
     -------
@@ -56,7 +57,7 @@ def library(text, build=True):
     if found is None:
         return _without("No C compiler was found, or SERVOCTL_COMPILER is none") if build else None
     command, identity = found
-    parts = (text, *FLAGS, *_optional_flags(), identity, platform.machine(), _processor())
+    parts = (text, level, *FLAGS, *_optional_flags(), identity, platform.machine(), _processor())
     key = hashlib.sha256("\0".join(parts).encode()).hexdigest()
     with _guard:
         lock = _locks.setdefault(key, threading.Lock())
@@ -65,8 +66,14 @@ def library(text, build=True):
             kept = _open_kept(cache_directory() / f"{key}.so")
             if kept is None and not build:
                 return None
-            _loaded[key] = kept or _build(text, f"{key}.so", command)
+            _loaded[key] = kept or _build(text, level, f"{key}.so", command)
         return _loaded[key]
+
+
+def compiler():
+    """Command of the C compiler that is used, None where there is none."""
+    found = _compiler(*(os.environ.get(name) for name in ("SERVOCTL_COMPILER", "CC", "PATH")))
+    return " ".join(found[0]) if found else None
 
 
 def cache_directory():
@@ -124,25 +131,25 @@ def _scratch():
     return tempfile.TemporaryDirectory(prefix="servoctl-")
 
 
-def _build(text, file_name, command):
+def _build(text, level, file_name, command):
     """Compile into the cache, or into a temporary directory where the cache cannot be used."""
     try:
         try:
-            return _compile(text, cache_directory() / file_name, command)
+            return _compile(text, level, cache_directory() / file_name, command)
         except OSError:
-            return _compile(text, Path(_scratch().name) / file_name, command)
+            return _compile(text, level, Path(_scratch().name) / file_name, command)
     except (OSError, _CompilerFailed) as error:
         return _without(f"{' '.join(command)} failed: {error}")
 
 
-def _compile(text, target, command):
+def _compile(text, level, target, command):
     target.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
     handle, temporary = tempfile.mkstemp(dir=target.parent, suffix=".tmp")
     os.close(handle)
     try:
         for flags in ((*FLAGS, *_optional_flags()), FLAGS):
             done = subprocess.run(
-                [*command, *flags, "-x", "c", "-", "-o", temporary, "-lm"],
+                [*command, level, *flags, "-x", "c", "-", "-o", temporary, "-lm"],
                 input=text,
                 text=True,
                 capture_output=True,

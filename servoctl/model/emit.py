@@ -3,18 +3,23 @@
 The function is a ``casadi.Function`` with inputs t (scalar), x (n_x), p (n_p) and one dense column output y (n_y). Its
 statements are written for a number type ``V`` through ``K(constant)`` and ``v_sin(a)``, so that the same text serves
 any type for which these are defined. A long function is cut into chunks, and the values that outlive a chunk are kept
-in memory: compilers need more than linear time for one long function.
+in memory: compilers need more than linear time for one long function. Where several values are divided by one, as by a
+pivot, its reciprocal multiplies them, which rounds twice instead of once: a division takes as long as eight products.
 """
 
 import math
-from itertools import chain
+import re
+from collections import Counter
+from itertools import chain, count
 
 import casadi as ca
 
 from servoctl.errors import SpecificationError, unknown
-from servoctl.model.loops import BISECTIONS, GRID, LOOPS, PROJECTION, ROUNDING
+from servoctl.model.loops import BISECTIONS, GRID, LOOPS, NEAR, PROJECTION, QUADRATIC, ROUNDING, lanes
 
 CHUNK = 350  # statements per C function: compile time is least, and flat, between 250 and 500
+WIDE = 3000  # operations: up to here a function is emitted for eight points at once as well
+SHARED = 3  # divisions by the same value: from here on its reciprocal is taken once, and multiplied with
 
 _LIBM_1 = (
     "sqrt exp log expm1 log1p sin cos tan asin acos atan sinh cosh tanh asinh acosh atanh fabs floor ceil erf"
@@ -22,6 +27,8 @@ _LIBM_1 = (
 _LIBM_2 = "pow fmin fmax fmod remainder atan2 copysign hypot".split()
 _OWN_1 = "sign not erfinv".split()
 _OWN_2 = "lt le eq ne and or if_else_zero".split()
+_OPERATIONS = {name: ("a", name) for name in _LIBM_1} | {name: ("ab", name) for name in _LIBM_2}
+_OPERATIONS |= {name: ("a", None) for name in _OWN_1} | {name: ("ab", None) for name in _OWN_2}
 
 _TEMPLATES = {
     ca.OP_ADD: "{0} + {1}",
@@ -104,7 +111,7 @@ def operations(f):
     return sum(f.instruction_id(k) not in _NOT_ARITHMETIC for k in range(f.n_instructions()))
 
 
-def emit(f, name, loops=(), chunk=CHUNK, project=None, others=None, drivers=""):
+def emit(f, name, loops=(), chunk=CHUNK, project=None, others=None, drivers="", sizes=None):
     """C translation unit of a function and of the loops over it.
 
     It defines ``void name(double t, const double *x, const double *p, double *y)`` (``y`` overlaps no input),
@@ -126,6 +133,8 @@ def emit(f, name, loops=(), chunk=CHUNK, project=None, others=None, drivers=""):
         Further SX functions of this form (their sizes may differ), which become ``name_KEY``.
     drivers : str
         C text to append, with the placeholders of the loops.
+    sizes : dict of str to int, optional
+        Constants ``name_KEY`` for the loops and drivers.
 
     Returns
     -------
@@ -147,8 +156,16 @@ def emit(f, name, loops=(), chunk=CHUNK, project=None, others=None, drivers=""):
         body += _function(project, f"{name}_project", chunk)
     for key, other in (others or {}).items():
         body += _function(other, f"{name}_{key}", chunk)
+    wide = operations(f) <= WIDE
+    if wide:
+        copies = _function(f, f"{name}_wide", chunk)
+        if "newton" in loops:
+            copies += _function(_first(f, f.numel_in(1)), f"{name}_wide_step", chunk)
+        body += lanes(copies, _OPERATIONS)
     wanted = [text for loop, text in LOOPS.items() if loop in loops]
-    drivers = "".join((GRID, PROJECTION if project else "", *wanted, drivers))
+    constants = f"#define NAME_wide_lanes {int(wide)}\n"
+    constants += "".join(f"enum {{ NAME_{key} = {value} }};\n" for key, value in (sizes or {}).items())
+    drivers = "".join((constants, GRID, PROJECTION if project else "", *wanted, drivers))
     drivers = drivers.replace("NAME_PROJECT(", "NAME_restore(" if project else "(void)(")
     for key, value in {
         "N_X": f.numel_in(1),
@@ -156,20 +173,29 @@ def emit(f, name, loops=(), chunk=CHUNK, project=None, others=None, drivers=""):
         "N_Y": f.numel_out(0),
         "BISECTIONS": BISECTIONS,
         "ROUNDING": repr(ROUNDING),
+        "QUADRATIC": repr(QUADRATIC),
+        "NEAR": repr(NEAR),
         "NAME": name,
     }.items():
         drivers = drivers.replace(key, str(value))
     return _PRELUDE + (_ERFINV if "v_erfinv" in body else "") + body + drivers
 
 
+def _first(f, n):
+    """The function of the first n outputs alone."""
+    inputs = f.sx_in()
+    return ca.Function(f.name(), inputs, [f(*inputs)[:n]])
+
+
 def _function(f, name, chunk):
     """The text of one C function, in chunks where it is long."""
-    statements = _statements(f)
+    statements = _with_reciprocals(_statements(f))
     chunks = [statements[k : k + chunk] for k in range(0, len(statements), chunk)]
     return _single(name, statements) if len(chunks) <= 1 else _chunked(name, chunks)
 
 
-def _literal(value):
+def literal(value):
+    """A number as C text, exactly."""
     if math.isnan(value):
         return "K(NAN)"
     if math.isinf(value):
@@ -185,7 +211,7 @@ def _statements(f):
         if operation == ca.OP_INPUT:
             register[target[0]] = _INPUTS[source[0]].format(source[1])
         elif operation == ca.OP_CONST:
-            register[target[0]] = _literal(f.instruction_constant(k))
+            register[target[0]] = literal(f.instruction_constant(k))
         elif operation == ca.OP_OUTPUT:
             statements.append((None, f"y[{target[1]}] = {{0}}", (register[source[0]],)))
         elif operation in _COPIES:
@@ -203,6 +229,24 @@ def _statements(f):
                 operation=operation,
             )
     return statements
+
+
+def _with_reciprocals(statements):
+    """The statements with one reciprocal for all divisions by the same value, where these are `SHARED` or more."""
+    division, product = _TEMPLATES[ca.OP_DIV], _TEMPLATES[ca.OP_MUL]
+    divisors = Counter(operands[1] for _, template, operands in statements if template == division)
+    new = count(len(statements))
+    reciprocal = {v: next(new) for v, n in divisors.items() if n >= SHARED and isinstance(v, int)}
+    found, made = [], set()
+    for target, template, operands in statements:
+        if template == division and operands[1] in reciprocal:
+            a, b = operands
+            if b not in made:
+                made.add(b)
+                found.append((reciprocal[b], _TEMPLATES[ca.OP_INV], (b,)))
+            template, operands = product, (a, reciprocal[b])
+        found.append((target, template, operands))
+    return found
 
 
 def _operation_name(operation):
@@ -255,3 +299,30 @@ def _slots(chunks, home):
                 n_slots = max(n_slots, slots[target] + 1)
                 expiring[last[target]].append(slots[target])
     return slots, n_slots
+
+
+def portable(f, name):
+    """C99 text of one static function, without attributes and warnings, for a file that begins with `prelude`.
+
+    Parameters
+    ----------
+    f : casadi.Function
+        As `emit` takes it.
+    name : str
+        A C identifier.
+
+    Returns
+    -------
+    str
+    """
+    text = _function(f, name, CHUNK).replace("__attribute__((noinline)) ", "")
+    for begin, used in ((f"{_SIGNATURE})\n{{\n", "txpy"), (f"{_SIGNATURE}, V *restrict w)\n{{\n", "txpyw")):
+        text = text.replace(begin, f"{begin}    {' '.join(f'(void){argument};' for argument in used)}\n")
+    return text.replace(f"\nvoid {name}(", f"\nstatic void {name}(")
+
+
+def prelude(text):
+    """The beginning of a C file: of the definitions that `portable` functions need those that occur in the text."""
+    lines = (_PRELUDE + (_ERFINV if "v_erfinv" in text else "")).splitlines(keepends=True)
+    names = ((line, re.match(r"(?:#define|static inline V) (v_\w+)", line)) for line in lines)
+    return "".join(line for line, name in names if name is None or re.search(rf"\b{name[1]}\b", text))

@@ -5,6 +5,7 @@ from functools import cached_property
 import casadi as ca
 
 from servoctl.errors import SpecificationError
+from servoctl.model import saddle
 from servoctl.model.emit import operations
 from servoctl.reduction.appell import plant_accelerations
 from servoctl.reduction.elimination import eliminate
@@ -56,10 +57,36 @@ class Equations:
         values, sizes = self.r.points.matrix(self.r.leading)
         return eliminate(self.r.leading, right, clean(values, sizes))
 
+    @property
+    def sparse(self):
+        """Whether γ^(s̄) is taken from the sparse elimination of [M -B; G 0], and not from the rows of (3.18)."""
+        return self.q.n > saddle.FEW and saddle.applies(self.r)
+
+    @cached_property
+    def saddle(self):
+        """γ'', μ and the pivots of [M -B; G 0]."""
+        return saddle.solve(self)
+
+    def rest(self, rows, poles=False):
+        """What is left of some rows, raised to order s̄, without γ^(s̄); with their error dynamics if `poles`."""
+        top, zero = ca.vertcat(*self.q.gamma(self.top)), ca.SX.zeros(self.q.n)
+        found = []
+        for a in rows:
+            *lower, highest = self.levels[a]
+            row = ca.substitute(highest, top, zero)
+            if poles:
+                row += sum(c * e for c, e in zip(self.coefficients[a], lower, strict=True))
+            found.append(row)
+        return found
+
+    def dense(self, poles=False):
+        """γ^(s̄) from the rows, L γ^(s̄) = -rest."""
+        return self._solve(-ca.vertcat(*self.rest(range(len(self.levels)), poles)))[0]
+
     @cached_property
     def guards(self):
         """Pivots that a motion must not let vanish: a list of (name, SX)."""
-        _, pivots = self._solve(ca.SX(self.q.n, 0))
+        pivots = self.saddle[2] if self.sparse else self._solve(ca.SX(self.q.n, 0))[1]
         found = [*self.r.guards, *((f"leading matrix {i + 1}", p) for i, p in enumerate(pivots))]
         return [(name, g) for name, g in found if any(self.q.where(s) is not None for s in ca.symvar(g))]
 
@@ -70,15 +97,10 @@ class Equations:
 
     def ode(self, poles=False):
         """Outputs (X', guards): L γ^(s̄) = -(rest), or with the error dynamics Π(D - λ)ψ = 0 in place of D^ρψ = 0."""
-        top = ca.vertcat(*self.q.gamma(self.top))
-        zero = ca.SX.zeros(self.q.n)
-        rest = []
-        for a, level in enumerate(self.levels):
-            row = ca.substitute(level[-1], top, zero)
-            if poles:
-                row += sum(c * e for c, e in zip(self.coefficients[a], level[:-1], strict=True))
-            rest.append(row)
-        solution, _ = self._solve(-ca.vertcat(*rest))
+        if self.sparse:
+            solution = saddle.solve(self, poles)[0] if poles else self.saddle[0]
+        else:
+            solution = self.dense(poles)
         extra = ca.vertcat(*(c for row in self.coefficients for c in row)) if poles else None
         name = "ode_poles" if poles else "ode"
         return self.function(name, self.state, [self.rates(solution), *(g for _, g in self.guards)], extra)

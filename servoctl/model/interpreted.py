@@ -19,7 +19,16 @@ class Workspace(threading.local):
         row = np.zeros(1 + n_x + n_p + n_y)
         parts = np.split(row, np.cumsum([1, n_x, n_p]))
         run, self.kept = connect(row, parts)
-        self.row = (*map(memoryview, parts[:3]), parts[3], run)
+        self.row, self.buffer = (*map(memoryview, parts[:3]), parts[3], run), (*parts, run)
+        self.start, self.address = row[: 1 + n_x + n_p], row.ctypes.data
+        self._log = np.empty((0, 0)), 0
+
+    def log(self, rows, columns):
+        """Memory for a log, used again by the next, and its address."""
+        if len(self._log[0]) < rows:
+            log = np.empty((rows, columns))
+            self._log = log, log.ctypes.data
+        return self._log
 
 
 class Interpreter:
@@ -27,8 +36,8 @@ class Interpreter:
 
     backend = "casadi"
 
-    def __init__(self, f, project=None):
-        self._f, self._n_x, self._project = f, f.numel_in(1), project
+    def __init__(self, f, project=None, sizes=None):
+        self._f, self._n_x, self._project, self._sizes = f, f.numel_in(1), project, sizes
         self.workspace = Workspace(self._n_x, f.numel_in(2), f.numel_out(0), self._connect)
 
     def _connect(self, row, parts):
@@ -76,40 +85,35 @@ class Interpreter:
         return column - 1
 
     @np.errstate(all="ignore")
-    def taylor(self, t0, x0, t1, p, shape, rtol, atol, every, max_steps, t, x, y):
-        """Fill the rows of t, x and y as `Compiled.taylor` says; return the number of steps."""
-        nq, n, top, last, plain = shape
-        now, state = t0, x0
-        for step in range(max_steps + 1):
-            t[step], x[step] = now, state
-            if step == max_steps or now == t1:
-                return step
-            y[step] = self._value(now, state, p)
-            own = y[step, : nq * last].reshape(last, nq)
-            c = own if plain else y[step, nq * last : (nq + n) * last].reshape(last, n)
-            h = step_length(state, c, (nq, n, top), rtol, atol)
-            h = h if plain else min(h, step_length(state, own, (nq, nq, 1), rtol, atol))
-            if not h > 1e-13 * (1 + abs(now)):
-                return step
-            ends = h >= abs(t1 - now) * (1 - 1e-12)
-            h = t1 - now if ends else np.copysign(h, t1 - now)
-            parts = [state[:nq] + jet(own, 0, h), *(jet(c, j, h) for j in range(1, top))]
-            state, now = np.concatenate(parts), t1 if ends else now + h
-            if not np.isfinite(state).all():
-                return step
-            if every and (step + 1) % every == 0:
-                state = self._restore(now, state, p)
-        return max_steps
+    def taylor(self, t1, rtol, atol, every, max_steps):
+        """Rows (t, x, y) of the steps from the start in the workspace, as `Compiled.taylor` says."""
+        nq, n, top, last, plain = (self._sizes[key] for key in ("nq", "n", "top", "last", "plain"))
+        start, n_x = self.workspace.start.copy(), self._n_x
+        t, x, p, rows = start[0], start[1 : 1 + n_x], start[1 + n_x :], []
+        while True:
+            end = np.concatenate([[t], x, np.zeros(len(self.workspace.row[3]))])
+            if len(rows) == max_steps or t == t1:
+                break
+            y = self._value(t, x, p)
+            own = y[: nq * last].reshape(last, nq)
+            c = own if plain else y[nq * last : (nq + n) * last].reshape(last, n)
+            h = step_length(x, c, (nq, n, top), rtol, atol)
+            h = h if plain else min(h, step_length(x, own, (nq, nq, 1), rtol, atol))
+            if not h > 1e-13 * (1 + abs(t)):
+                break
+            ends = h >= abs(t1 - t) * (1 - 1e-12)
+            h = t1 - t if ends else np.copysign(h, t1 - t)
+            following = np.concatenate([x[:nq] + jet(own, 0, h), *(jet(c, j, h) for j in range(1, top))])
+            if not np.isfinite(following).all():
+                break
+            rows.append(np.concatenate([[t], x, y]))
+            t, x = t1 if ends else t + h, following
+            if every and len(rows) % every == 0:
+                x = self._restore(t, x, p)
+        return np.array([*rows, end])
 
     def _restore(self, t, x, p):
-        for _ in range(6):
-            d = np.asarray(self._project(t, x, p[: self._project.numel_in(2)])).ravel()
-            if not np.isfinite(d).all():
-                return x
-            largest, x = np.max(np.abs(d) / (1 + np.abs(x)), initial=0.0), x + d
-            if largest <= ROUNDING:
-                break
-        return x
+        return restored(self._project, t, x, p)
 
     def newton(self, t, x0, p, tol, max_iter, x, y):
         """Fill the columns of x and y as `Compiled.newton` says; return the points solved and the evaluations made."""
@@ -121,6 +125,18 @@ class Interpreter:
                 return k, solve.count
             x[:, k], y[:, k] = point
         return t.size, solve.count
+
+
+def restored(project, t, x, p):
+    """The state after Newton's iteration of a projection onto its invariants, as the emitted loops do it."""
+    for _ in range(6):
+        d = np.asarray(project(t, x, p[: project.numel_in(2)])).ravel()
+        if not np.isfinite(d).all():
+            return x
+        largest, x = np.max(np.abs(d) / (1 + np.abs(x)), initial=0.0), x + d
+        if largest <= ROUNDING:
+            break
+    return x
 
 
 def jet(c, j, h):

@@ -7,7 +7,12 @@ import numpy as np
 from servoctl.errors import SpecificationError, unknown
 from servoctl.model.compiled import compiled
 from servoctl.model.equations import Equations, gradient_jets, leading_names
+from servoctl.model.formulations import FORMULATIONS
+from servoctl.model.implicit import implicit
+from servoctl.model.saddle import accelerations
 from servoctl.model.series import taylor_coefficients
+from servoctl.model.servo_dae import SERVO_DAE
+from servoctl.model.sundials import Sundials
 from servoctl.reduction.knots import require_smooth
 from servoctl.reduction.reduce import holds, reduce
 from servoctl.reduction.structure import structure
@@ -73,6 +78,7 @@ class Model:
         self.state_names = tuple(name for k in range(reduction.top) for name in q.jet_names(k))
         self.jet_names = (*self.state_names, *q.jet_names(reduction.top))
         self._functions = {} if shared is None else shared
+        self._knots_within = {}  # span: knots
 
     def names_to(self, size):
         """Names of the first `size` jets, beyond γ^(s̄) where asked for."""
@@ -157,6 +163,11 @@ class Model:
         return self.reduction.mechanism.q.nq
 
     @property
+    def plain(self):
+        """Whether the coordinates' rates are the quasi-velocities, q' = γ'."""
+        return self.reduction.mechanism.q.plain
+
+    @property
     def coordinate_names(self):
         """Names of the coordinates."""
         return self.reduction.mechanism.q.names
@@ -194,7 +205,9 @@ class Model:
         SpecificationError
         """
         r = self.reduction
-        return require_smooth(r.switches, self.parameters, r.smoothness, span).times if r.switches else ()
+        if r.switches and span not in self._knots_within:
+            self._knots_within[span] = require_smooth(r.switches, self.parameters, r.smoothness, span).times
+        return self._knots_within.get(span, ())
 
     @property
     def raised(self):
@@ -215,7 +228,8 @@ class Model:
         ----------
         name : str
             "ode", "ode_projected", "ode_poles", "ode_jacobian", "ode_poles_jacobian", "path", "invariants", "metric",
-            "matrices", "plant" or "multiplier_form".
+            "matrices", "plant", "multiplier_form", "accelerations", or one of
+            `servo_dae.SERVO_DAE` and `formulations.FORMULATIONS`.
 
         Returns
         -------
@@ -234,6 +248,9 @@ class Model:
                 "matrices": lambda e: (e.matrices(),),
                 "plant": lambda e: (e.plant(),),
                 "multiplier_form": lambda e: (e.multiplier_form(),),
+                "accelerations": lambda e: (accelerations(e),),
+                **SERVO_DAE,
+                **FORMULATIONS,
             }
             if name not in build:
                 raise unknown(name, list(build), "function")
@@ -242,7 +259,7 @@ class Model:
         return self._functions[name]
 
     def taylor(self, last):
-        """The compiled Taylor coefficients with index up to `last`, and the shape that its loop takes.
+        """The compiled Taylor coefficients with index up to `last`, with their loop.
 
         Parameters
         ----------
@@ -252,14 +269,31 @@ class Model:
         Returns
         -------
         Compiled
-        (nq, n, top, last, plain)
         """
         e, q = self._equations, self.reduction.mechanism.q
         key = f"taylor {last}"
         if key not in self._functions:
+            sizes = {"nq": q.nq, "n": q.n, "top": e.top, "last": last, "plain": int(q.plain)}
             f = taylor_coefficients(e, last)
-            self._functions[key] = compiled(f, f"taylor_{last}", ("taylor",), project=e.project())
-        return self._functions[key], (q.nq, q.n, e.top, last, int(q.plain))
+            self._functions[key] = compiled(f, f"taylor_{last}", ("taylor",), project=e.project(), sizes=sizes)
+        return self._functions[key]
+
+    def integrator(self, name, poles=False):
+        """An integrator that solves equations in its steps, with error dynamics if `poles`.
+
+        Parameters
+        ----------
+        name : {"RadauIIA", "CVODES", "IDAS"}
+        poles : bool
+
+        Returns
+        -------
+        Implicit or Sundials
+        """
+        key = f"{name} with poles" if poles else name
+        if key not in self._functions:
+            self._functions[key] = (implicit if name == "RadauIIA" else Sundials)(self._equations, name, poles)
+        return self._functions[key]
 
     def signals(self, kind):
         """Names of a group of signals and the compiled function (t, Z, p) that computes them.
@@ -325,11 +359,13 @@ class Model:
         """Names of the pivots logged by "ode" and "path"."""
         return [name for name, _ in self._equations.guards]
 
+    @cached_property
     def guard_sizes(self):
         """Largest size of each pivot at the points where they were chosen, (n_g,) array."""
         values, _ = self.reduction.points.evaluate([g for _, g in self._equations.guards])
         return np.abs(values).max(axis=1, initial=0.0).astype(float)
 
+    @cached_property
     def column_sizes(self):
         """Largest entry of each column of L and of Bᵀ at the points where ranks were decided: two (n,) arrays."""
         r = self.reduction

@@ -15,6 +15,7 @@ class Library:
         self._grid, self._point = library[f"{symbol}_grid"], library[f"{symbol}_point"]
         self._grid.restype = self._point.restype = None
         self._library, self._symbol = library, symbol
+        self._columns = 1 + n_x + n_y
         self.workspace = Workspace(n_x, n_p, n_y, self._connect)
 
     def _connect(self, row, parts):
@@ -45,24 +46,19 @@ class Library:
             pointer(guards),
         )
 
-    def taylor(self, t0, x0, t1, p, shape, rtol, atol, every, max_steps, t, x, y):
-        """As `Compiled.taylor` says."""
-        run = self._library[f"{self._symbol}_taylor"]
+    def taylor(self, t1, rtol, atol, every, max_steps):
+        """Rows (t, x, y) of the steps from the start in the workspace, as `Compiled.taylor` says."""
+        workspace = self.workspace
+        log, address = workspace.log(max_steps + 1, self._columns)
+        steps = self._taylor(workspace.address, t1, rtol, atol, every, max_steps, address)
+        return log[: steps + 1].copy()
+
+    @functools.cached_property
+    def _taylor(self):
+        run = self.native("taylor")
         run.restype = ctypes.c_int64
-        return run(
-            ctypes.c_double(t0),
-            pointer(x0),
-            ctypes.c_double(t1),
-            pointer(p),
-            *map(ctypes.c_int64, shape),
-            ctypes.c_double(rtol),
-            ctypes.c_double(atol),
-            ctypes.c_int64(every),
-            ctypes.c_int64(max_steps),
-            pointer(t),
-            pointer(x),
-            pointer(y),
-        )
+        run.argtypes = (ctypes.c_void_p, *3 * [ctypes.c_double], *2 * [ctypes.c_int64], ctypes.c_void_p)
+        return run
 
     def newton(self, t, x0, p, tol, max_iter, x, y):
         """As `Compiled.newton` says."""

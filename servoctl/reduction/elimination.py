@@ -37,26 +37,99 @@ def eliminate(matrix, right, numbers):
         If A is singular at a point.
     """
     n, m = matrix.shape[0], right.shape[1]
-    scaled = np.stack([equilibrate(numbers[:, :, i])[0] for i in range(numbers.shape[2])], axis=2).astype(float)
-    rows = [{j: (matrix[i, j], scaled[i, j]) for j in range(n) if np.any(scaled[i, j])} for i in range(n)]
-    rhs = [[right[i, j] for j in range(m)] for i in range(n)]
-    open_rows, order, pivots = set(range(n)), [], []
-    for _ in range(n):
-        i, j = _pivot(rows, open_rows)
-        open_rows.remove(i)
-        order.append((i, j))
-        pivot, number = rows[i][j]
-        pivots.append(pivot)
-        for r in open_rows:
-            if j in rows[r]:
-                _subtract(rows[r], rhs[r], rows[i], rhs[i], j, pivot, number)
-    solution = [None] * n
+    system = _System(matrix, right, numbers)
+    order = [system.step() for _ in range(n)]
+    solution, rows, rhs = [None] * n, system.rows, system.rhs
     for i, j in reversed(order):
-        pivot = rows[i][j][0]
-        solution[j] = [
-            _back(rhs[i][k], [(a, solution[c][k]) for c, (a, _) in rows[i].items() if c != j], pivot) for k in range(m)
-        ]
+        others = [(a, solution[c]) for c, (a, _) in rows[i].items() if c != j]
+        solution[j] = [_back(rhs[i][k], [(a, x[k]) for a, x in others], rows[i][j][0]) for k in range(m)]
+    pivots = [rows[i][j][0] for i, j in order]
     return ca.vertcat(*(ca.horzcat(*row) for row in solution)) if m else ca.SX(n, 0), pivots
+
+
+class _System:
+    """Rows that are still to be eliminated, with what the choice of pivots needs to know of them.
+
+    Attributes
+    ----------
+    rows : list of dict
+        For each row its entries by column, an SX scalar and its numbers.
+    rhs : list of lists of SX
+    """
+
+    def __init__(self, matrix, right, numbers):
+        n, m = matrix.shape[0], right.shape[1]
+        scaled = np.stack([equilibrate(numbers[:, :, i])[0] for i in range(numbers.shape[2])], axis=2).astype(float)
+        present = [np.flatnonzero(row).tolist() for row in np.any(scaled, axis=2)]
+        self.rows = [{j: (matrix[i, j], scaled[i, j]) for j in present[i]} for i in range(n)]
+        self.rhs = [[right[i, j] for j in range(m)] for i in range(n)]
+        self.open = dict.fromkeys(range(n))
+        self.members = [{} for _ in range(n)]  # of each column: open rows that have an entry there
+        for i, row in enumerate(self.rows):
+            for j in row:
+                self.members[j][i] = None
+        self.candidates = [self._large(row) for row in self.rows]
+
+    @staticmethod
+    def _large(row):
+        """Columns whose entries may be pivots, with their sizes."""
+        if not row:
+            return []
+        sizes = np.abs([number for _, number in row.values()]).min(axis=1).tolist()
+        least = THRESHOLD * max(sizes)
+        return [(j, size) for j, size in zip(row, sizes, strict=True) if size >= least and size > 0.0]
+
+    def step(self):
+        """Eliminate by the pivot with the least fill-in, and return its row and column."""
+        i, j = self._pivot()
+        row = self.rows[i]
+        del self.open[i]
+        for c in row:
+            del self.members[c][i]
+        for r in self.members[j]:
+            self._subtract(r, row, self.rhs[i], j)
+            self.candidates[r] = self._large(self.rows[r])
+        self.members[j] = {}
+        return i, j
+
+    def _pivot(self):
+        best, found = None, None
+        for i in self.open:
+            fill = len(self.rows[i]) - 1
+            for j, size in self.candidates[i]:
+                key = (fill * (len(self.members[j]) - 1), -size)
+                if best is None or key < best:
+                    best, found = key, (i, j)
+        if found is None:
+            raise SingularProgram(
+                "A system of equations is singular at the points where its pivots are chosen.",
+                "Pivots are chosen where the equations have full rank.",
+                do="Give derive a guess near the motion.",
+            )
+        return found
+
+    def _subtract(self, r, pivot_row, pivot_right, j):
+        row, right, (pivot, number) = self.rows[r], self.rhs[r], pivot_row[j]
+        entry, entry_number = row.pop(j)
+        factor, factor_number = entry / pivot, entry_number / number
+        for c, (a, a_number) in pivot_row.items():
+            if c == j:
+                continue
+            old, old_number = row.get(c, (_ZERO, 0.0))
+            change = factor_number * a_number
+            new = old_number - change
+            if (np.abs(new) <= ENTRY * (np.abs(old_number) + np.abs(change))).all():
+                if row.pop(c, None) is not None:
+                    del self.members[c][r]
+            else:
+                row[c] = (old - factor * a, new)
+                self.members[c][r] = None
+        for k, b in enumerate(pivot_right):
+            if not b.is_zero():
+                right[k] = right[k] - factor * b
+
+
+_ZERO = ca.SX(0)
 
 
 def _back(value, terms, pivot):
@@ -64,46 +137,3 @@ def _back(value, terms, pivot):
         if not x.is_zero():
             value = value - a * x
     return value if value.is_zero() else value / pivot
-
-
-def _subtract(row, right, pivot_row, pivot_right, j, pivot, number):
-    entry, entry_number = row.pop(j)
-    factor, factor_number = entry / pivot, entry_number / number
-    for c, (a, a_number) in pivot_row.items():
-        if c == j:
-            continue
-        old, old_number = row.get(c, (ca.SX(0), 0.0 * a_number))
-        new = old_number - factor_number * a_number
-        if np.all(np.abs(new) <= ENTRY * (np.abs(old_number) + np.abs(factor_number * a_number))):
-            row.pop(c, None)
-        else:
-            row[c] = (old - factor * a, new)
-    for k, b in enumerate(pivot_right):
-        if not b.is_zero():
-            right[k] = right[k] - factor * b
-
-
-def _pivot(rows, open_rows):
-    counts = {}
-    for i in open_rows:
-        for j in rows[i]:
-            counts[j] = counts.get(j, 0) + 1
-    best, found = None, None
-    for i in sorted(open_rows):
-        if not rows[i]:
-            continue
-        sizes = {j: np.min(np.abs(v)) for j, (_, v) in rows[i].items()}
-        largest = max(sizes.values())
-        for j, size in sizes.items():
-            if size < THRESHOLD * largest or size == 0.0:
-                continue
-            key = ((len(rows[i]) - 1) * (counts[j] - 1), -size)
-            if best is None or key < best:
-                best, found = key, (i, j)
-    if found is None:
-        raise SingularProgram(
-            "A system of equations is singular at the points where its pivots are chosen.",
-            "Pivots are chosen where the equations have full rank.",
-            do="Give derive a guess near the motion.",
-        )
-    return found

@@ -11,7 +11,8 @@ import numpy as np
 
 from servoctl.errors import InconsistentStart, NotRealisable, SingularProgram, SpecificationError
 from servoctl.reduction.elimination import eliminate
-from servoctl.reduction.manifold import Flow, solve
+from servoctl.reduction.flow import Flow
+from servoctl.reduction.manifold import solve
 from servoctl.reduction.ranks import NOISE, RESOLVED, clean, decide, decide_all
 from servoctl.reduction.rows import Row, dependence, gradient, leading, merge_uses, sample_rows, settle
 
@@ -218,7 +219,12 @@ def as_rows(q, named, kind, context):
 
 
 def _refuse_square(q, row, context):
-    """Refuse a residual whose gradient vanishes where the residual does: φ² = 0 and its like."""
+    """Refuse a residual whose gradient vanishes where the residual does: φ² = 0 and its like.
+
+    A gradient without the highest jets is as large on the solutions, which determine these alone, as elsewhere.
+    """
+    if row.order > 0 and q.order(gradient(q, row)) < row.order:
+        return
     start = sample_rows(q, [], row.order, context)
     flow = Flow(q, [(row.expression, row.order)], row.order, start)
     z, residual = solve(flow, start.t, start.z, iterations=40)

@@ -11,7 +11,8 @@ from dataclasses import dataclass, replace
 import casadi as ca
 import numpy as np
 
-from servoctl.reduction.manifold import Flow, solve
+from servoctl.reduction.flow import Flow
+from servoctl.reduction.manifold import solve
 from servoctl.reduction.ranks import decide, solve_clean
 
 ZERO = 1e-12  # of the size of its terms: below this an entry of J is zero

@@ -5,7 +5,8 @@ import contextlib
 import numpy as np
 
 from servoctl.errors import IntegrationStopped, ServoError
-from servoctl.simulation.drift import Poles, Project, Projector
+from servoctl.simulation.drift import Minimal, Poles, Project, Projector
+from servoctl.simulation.minimal import MinimalSolver, Sizes
 from servoctl.simulation.motion import Motion, breakpoints, interruptible, sign_change
 from servoctl.simulation.watch import DEGRADED, NEGLIGIBLE, VANISHING, Watch
 
@@ -24,7 +25,7 @@ class Adaptive:
     model : Model
     method : str
         One of `METHODS`.
-    drift : None, Poles or Project
+    drift : None, Poles, Project or Minimal
     rtol, atol : float
     progress : callable
     """
@@ -33,6 +34,7 @@ class Adaptive:
         self.method, self.drift = method, drift
         self.rtol, self.atol, self.progress = rtol, atol, progress
         self.motion = Motion()
+        self.sizes = Sizes(model) if isinstance(drift, Minimal) else None
         self._use(model)
 
     def _use(self, model):
@@ -73,8 +75,11 @@ class Adaptive:
     def _solver(self, a, x, b):
         import scipy.integrate
 
+        method, tolerances = getattr(scipy.integrate, self.method), {"rtol": self.rtol, "atol": self.atol}
+        if isinstance(self.drift, Minimal):
+            return MinimalSolver(method, self.model, self.sizes, a, x, b, tolerances, self.slopes is not None)
         exact = {} if self.slopes is None else {"jac": self._jacobian}
-        return getattr(scipy.integrate, self.method)(self._rates, a, x, b, rtol=self.rtol, atol=self.atol, **exact)
+        return method(self._rates, a, x, b, **tolerances, **exact)
 
     def _piece(self, a, x, b):
         solver, self._sunk = self._solver(a, x, b), None
@@ -126,6 +131,9 @@ class Adaptive:
 
     def _count(self, solver):
         self.motion.count(nfev=solver.nfev, njev=solver.njev, nlu=solver.nlu)
+        if isinstance(solver, MinimalSolver):
+            self.motion.counters["integrated"] = len(solver.chart.free)
+            self.motion.count(coordinate_changes=solver.changes)
 
     def _guards(self, t, x):
         return self.watch.relative(self.f(t, x, self.p)[self.n_x :])
@@ -139,7 +147,7 @@ class Adaptive:
         if self.watch.bad_choice(y, self.n_x):
             with contextlib.suppress(ServoError):
                 self._use(self.model.near(t, np.append(x, np.nan_to_num(y[self.n_x - self.model.n : self.n_x]))))
-            self.watch = Watch(self.model, t, x)
+            self.watch = Watch(self.model, t, x, self.watch)
             self.motion.count(pivot_changes=1)
             self.motion.stop = self.watch.refuse_start(t, x, self.f(t, x, self.p))
 

@@ -1,4 +1,4 @@
-"""Treatments of constraint drift: error dynamics by poles, or projection."""
+"""Treatments of constraint drift: error dynamics by poles, projection, or minimal coordinates."""
 
 from dataclasses import dataclass
 
@@ -66,6 +66,14 @@ class Project:
         return "projected after every step" if self.every == 1 else f"projected after every {self.every} steps"
 
 
+@dataclass(frozen=True)
+class Minimal:
+    """Only as many values as the program leaves free are integrated, the others solved from the constraints."""
+
+    def __str__(self):
+        return "minimal coordinates"
+
+
 def poles(values):
     """Error dynamics against drift, for `simulate(..., drift=...)`.
 
@@ -116,15 +124,17 @@ def project(every=1):
 
 
 def as_drift(value):
-    """The treatment that a designer's `drift=` means: None, "project", a time constant, or a value."""
-    if value is None or isinstance(value, (Poles, Project)):
+    """The treatment that a designer's `drift=` means: None, "project", "minimal", a time constant, or a value."""
+    if value is None or isinstance(value, (Poles, Project, Minimal)):
         return value
     if isinstance(value, str):
         if value == "none":
             return None
         if value == "project":
             return Project()
-        raise unknown(value, ["none", "project", "a time constant [s]"], "drift treatment")
+        if value == "minimal":
+            return Minimal()
+        raise unknown(value, ["none", "project", "minimal", "a time constant [s]"], "drift treatment")
     return poles(value)
 
 

@@ -1,16 +1,21 @@
 """Compiled explicit Runge-Kutta methods of fixed step."""
 
 import contextlib
+from itertools import pairwise
 
 import numpy as np
 
 from servoctl.errors import IntegrationStopped, ServoError
-from servoctl.simulation.drift import Poles, Project
+from servoctl.simulation.bounds import row_poles, warn_fast_poles
+from servoctl.simulation.drift import Minimal, Poles, Project
+from servoctl.simulation.minimal import Chart, Sizes
 from servoctl.simulation.motion import Motion, breakpoints, interruptible
 from servoctl.simulation.tableaus import tableau
 from servoctl.simulation.watch import DEGRADED, NEGLIGIBLE, Watch
 
 CHUNK = 2000  # steps per call of the compiled loop
+SLOW_CHUNK = 100  # of the loop in Python
+NEAR = 0.3  # of its reference: below this the least size of a pivot is looked for within a step
 
 
 def fixed_step(model, method, drift, span, x0, step, knots, progress):
@@ -21,7 +26,7 @@ def fixed_step(model, method, drift, span, x0, step, knots, progress):
     model : Model
     method : str
         One of `tableaus.ORDERS`.
-    drift : None, Poles or Project
+    drift : None, Poles, Project or Minimal
     span : (t0, t1)
         [s]
     x0 : (n_x,) array
@@ -41,11 +46,13 @@ def fixed_step(model, method, drift, span, x0, step, knots, progress):
         integration.watch = Watch(model, span[0], x0)
         integration.start(span[0], x0)
         cuts = breakpoints(span, knots)
+        pieces = [(a, b, max(1, int(np.ceil(abs(b - a) / step * (1 - 1e-12))))) for a, b in pairwise(cuts)]
+        if isinstance(drift, Poles):
+            warn_fast_poles(method, row_poles(drift, model), max(abs(b - a) / count for a, b, count in pieces))
         x = x0
-        for a, b in zip(cuts[:-1], cuts[1:], strict=True):
+        for a, b, count in pieces:
             if motion.stop is not None:
                 break
-            count = max(1, int(np.ceil(abs(b - a) / step * (1 - 1e-12))))
             x = integration.piece(a, x, (b - a) / count, count)
     return motion
 
@@ -55,6 +62,7 @@ class _Fixed:
         self.method, self.drift, self.motion, self.progress = method, drift, motion, progress
         self.tableau = tableau(method)
         self.every = drift.every if isinstance(drift, Project) else 0
+        self.sizes = Sizes(model) if isinstance(drift, Minimal) else None
         self._use(model)
 
     def _use(self, model):
@@ -80,10 +88,11 @@ class _Fixed:
         self._suspect = (a, x)
         n_x, n, done = self.f.n_x, self.model.n, 0
         chunk = CHUNK - CHUNK % self.every if 0 < self.every < CHUNK else self.every or CHUNK
+        chunk = SLOW_CHUNK if isinstance(self.drift, Minimal) else chunk
         last = None
         while done < count:
             steps = min(chunk, count - done)
-            t, states, guards = self.f.rk(a + done * h, x, h, steps, self.p, self.tableau, 1, self.every)
+            states, guards = self._steps(a + done * h, x, h, steps)
             t = a + (done + np.arange(states.shape[1])) * h
             good, why, repivot = self._check(t, states, guards, last)
             short = good < steps
@@ -92,6 +101,8 @@ class _Fixed:
             self.motion.add(self.model, t, states, top)
             projections = good // self.every if self.every else 0
             self.motion.count(steps=good, nfev=len(self.tableau[1]) * good, projections=projections)
+            if isinstance(self.drift, Minimal):
+                self.motion.count(coordinate_changes=self._changed[:good].sum())
             last = guards[:, : good + 1][:, -3:]
             x, done = states[:, -1].copy(), done + good
             self.progress(t[-1])
@@ -105,6 +116,15 @@ class _Fixed:
                 self._stop(t[-1], x, h, why)
                 break
         return x
+
+    def _steps(self, t, x, h, count):
+        """States (n_x, N + 1) of `count` steps and the pivots there; fewer where no state is finite."""
+        if not isinstance(self.drift, Minimal):
+            return self.f.rk(t, x, h, count, self.p, self.tableau, 1, self.every)[1:]
+        chart = Chart(self.model, self.sizes, t, x)
+        states, self._changed = chart.steps(t, x, h, count, self.tableau)
+        self.motion.counters["integrated"] = len(chart.free)
+        return states, self.f.grid(t + np.arange(states.shape[1]) * h, states, self.p)[self.f.n_x :]
 
     def _check(self, t, states, guards, before):
         """How many steps stand, why no more, and whether pivots must be chosen anew there."""
@@ -127,6 +147,10 @@ class _Fixed:
                 if self.watch.chart_only(size[k + offset], t[k], states[:, k]):
                     events.append((k + offset, "repivot"))
         events = [(max(k - offset, 0), why) for k, why in events]
+        touched = self._touched(np.abs(relative[:, offset:]), t, states)
+        if touched is not None and touched[0] <= min(events, default=(total,))[0] + 1:
+            self._suspect = touched[1:]
+            return touched[0], "a pivot touches zero", False
         if not events:
             return total, "", False
         k, why = min(events)
@@ -149,6 +173,25 @@ class _Fixed:
                 if a * b < 0:
                     f = abs(a) / (abs(a) + abs(b))
                     self._suspect = (t[k] + f * (t[k + 1] - t[k]), (1 - f) * states[:, k] + f * states[:, k + 1])
+
+    def _touched(self, sizes, t, states):
+        """The last sample before the program is singular within a step, with t and X there, or None.
+
+        Where the constraints are exact, a pivot that touches zero leaves no residual to be seen by: its least size is
+        looked for within the steps.
+        """
+        if not isinstance(self.drift, Minimal) or len(t) < 2:
+            return None
+        padded = np.pad(sizes, ((0, 0), (1, 1)), constant_values=np.inf)
+        low = (sizes < NEAR) & (sizes <= padded[:, :-2]) & (sizes <= padded[:, 2:])
+        for k, i in np.argwhere(low.T):
+            first, last = max(k - 1, 0), min(k + 1, len(t) - 1)
+            chart = Chart(self.model, self.sizes, t[first], states[:, first])
+            at, x, size = chart.weakest(t[first], states[:, first], t[last] - t[first], self.tableau, i)
+            hidden = self.watch.hidden_zero(size / self.watch.reference[i], at, x)
+            if hidden and self.watch.rank_measure(at, x) < DEGRADED:
+                return first, at, x
+        return None
 
     def _bounces(self, size, t, states, k):
         k = max(k, 0)

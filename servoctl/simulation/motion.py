@@ -61,15 +61,22 @@ class Motion:
 
 
 class Progress:
-    """A progress bar over time that appears when the work takes long; `wanted` None means: on a terminal."""
+    """A progress bar over time that appears when the work takes long.
+
+    `wanted` None means: on a terminal; a function is called with the time instead.
+    """
 
     def __init__(self, span, wanted):
         self.t0, self.total = span[0], abs(span[1] - span[0])
+        self.told = wanted if callable(wanted) else None
         self.wanted = sys.stderr.isatty() if wanted is None else wanted
         self.since, self.bar, self.done = time.monotonic(), None, 0.0
 
     def __call__(self, t):
         """Show that the work has come to t [s]."""
+        if self.told is not None:
+            self.told(t)
+            return
         if not self.wanted:
             return
         if self.bar is None:

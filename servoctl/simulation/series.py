@@ -16,8 +16,12 @@ LOWEST, HIGHEST = 4, 24  # orders: below, steps are too short; above, compiling 
 
 
 def order_for(rtol):
-    """The order of least work for a tolerance, 1 - ln(rtol)/2 (Jorba and Zou 2005)."""
-    return int(np.clip(np.ceil(1.0 - 0.5 * np.log(rtol)), LOWEST, HIGHEST))
+    """The order of least work for a tolerance: 1 - ln(rtol)/2 (Jorba and Zou 2005), and four more.
+
+    Their order counts operations as quadratic in it; here a step also has work that does not grow, and compiled
+    operations of higher order wait less for each other.
+    """
+    return int(np.clip(np.ceil(5.0 - 0.5 * np.log(rtol)), LOWEST, HIGHEST))
 
 
 class SeriesMethod:
@@ -46,9 +50,8 @@ class SeriesMethod:
     def _use(self, model):
         self.model = model
         last = max(self.order + model.reduction.top - 1, self.jets + 1)
-        self.f, self.shape = model.taylor(last)
-        _, self.n, self.top, self.last, self.plain = self.shape
-        self.nq = model.nq
+        self.f = model.taylor(last)
+        self.nq, self.n, self.top, self.last, self.plain = model.nq, model.n, model.reduction.top, last, model.plain
         self.n_c = (0 if self.plain else self.nq * last) + self.n * last
 
     def run(self, t0, x0, t1, t_eval, knots):
@@ -81,13 +84,16 @@ class SeriesMethod:
     def _piece(self, a, x, b, pending):
         self.p = np.append(self.model.parameters, (a + b) / 2)  # paths take the branches of this piece
         while a != b and self.motion.stop is None:
-            t, states, y = self.f.taylor(a, x, b, self.p, self.shape, self.rtol, self.atol, CHUNK, self.every)
+            t, states, y = self.f.taylor(a, x, b, self.p, self.rtol, self.atol, CHUNK, self.every)
             steps = len(t) - 1
             stand, where, why, repivot = self._check(t, states, y)
             self.motion.count(steps=stand, nfev=stand)
             end = t[stand] if where is None else where
-            pending = self._sample(t[: stand + 1], states, y, pending, end)
-            a, x = t[stand], states[:, stand].copy()
+            pending = self._sample(t, states, y, pending, end)
+            if repivot and where is not None:
+                a, x = where, self._state(t, states, y, where)
+            else:
+                a, x = t[stand], states[:, stand].copy()
             self.progress(a)
             if repivot and not self.motion.changes_pivots(a):
                 self.motion.stop = self.watch.singular(a, x, "no choice of pivots leads on")
@@ -123,7 +129,7 @@ class SeriesMethod:
         return self._jets(states[:, k], y[:, k], np.array([when - t[k]]), self.top - 1)[:, 0]
 
     def _check(self, t, states, y):
-        """Steps that stand, where a pivot vanishes, why, and whether pivots must be chosen anew after those steps."""
+        """Whole steps that stand, where the next one is left, why, and whether other pivots lead on from there."""
         steps = y.shape[1]
         if not steps or y.shape[0] == self.n_c:
             return steps, None, "", False
@@ -153,9 +159,10 @@ class SeriesMethod:
             if len(changed):
                 where = self._root(i, instants[j], instants[j + 1], t, states, y)
             at = self._state(t, states, y, where)
-            before = np.append(states[:, k], np.zeros(self.n))
-            if self.watch.rank_measure(where, at) > DEGRADED or self.watch.other_choice(t[k], before, where, at):
-                return k, None, "", True
+            until = instants[j if len(changed) else max(j - 1, 0)]
+            before = np.append(self._state(t, states, y, until), np.zeros(self.n))
+            if self.watch.rank_measure(where, at) > DEGRADED or self.watch.other_choice(until, before, where, at):
+                return k, until, "", True
             return k, where, "a pivot changes its sign" if len(changed) else "a pivot has vanished", False
         lowest = np.abs(track[:, -1])
         if lowest.min(initial=1.0) < DEGRADED and self.watch.chart_only(lowest.min(), t[k + 1], states[:, k + 1]):
@@ -169,6 +176,8 @@ class SeriesMethod:
 
     def _sample(self, t, states, y, pending, end):
         """Record pending samples up to `end`; those that remain."""
+        if not y.shape[1]:
+            return pending
         direction = 1.0 if t[-1] >= t[0] else -1.0
         due = direction * pending <= direction * end
         times = pending[due]

@@ -4,18 +4,23 @@ from dataclasses import replace
 
 import numpy as np
 
-from servoctl.errors import SpecificationError, unknown
+from servoctl.errors import InconsistentStart, SpecificationError, unknown
 from servoctl.simulation.adaptive import METHODS, ONE_STEP, Adaptive
 from servoctl.simulation.algebraic import algebraic
-from servoctl.simulation.drift import Poles, Project, as_drift
+from servoctl.simulation.drift import Minimal, Poles, Project, as_drift
 from servoctl.simulation.fixed import fixed_step
+from servoctl.simulation.implicit import RADAU_ORDERS, RadauMethod
+from servoctl.simulation.minimal import require_minimal
 from servoctl.simulation.motion import Progress
+from servoctl.simulation.rule import accurate
 from servoctl.simulation.run import Run
 from servoctl.simulation.series import SeriesMethod
+from servoctl.simulation.sundials import MULTISTEP, SundialsMethod
 from servoctl.simulation.tableaus import ORDERS
 
 SAMPLES = 1001  # of a run unless t_eval says otherwise: smooth curves, and extrema refined to rounding
-ALL_METHODS = ("algebraic", "Taylor", *ORDERS, *METHODS)
+OFF = 1e-5  # of a start: residuals relative to their gradients times the state, above which it is no start
+ALL_METHODS = ("algebraic", "Taylor", "RadauIIA", *ORDERS, *METHODS, *MULTISTEP)
 
 
 def simulate(
@@ -25,8 +30,9 @@ def simulate(
     method=None,
     *,
     drift=None,
-    rtol=1e-9,
-    atol=1e-11,
+    accuracy=None,
+    rtol=None,
+    atol=None,
     step=None,
     t_eval=None,
     order=None,
@@ -44,27 +50,33 @@ def simulate(
         From `model.start`.
     t_span : (t0, t1)
         [s]; t1 < t0 runs backwards.
-    method : {"algebraic", "Taylor", "RK1", ..., "RK8", "DOP853", "RK45", "RK23", "Radau", "BDF", "LSODA"}
+    method : {"algebraic", "Taylor", "RadauIIA", "RK1", ..., "RK8", "DOP853", ..., "Radau", ..., "CVODES", "IDAS"}
         Default: "algebraic" where the program determines the motion completely (Σ o_a = 0: a Newton solve at each
-        instant, no integration), else "DOP853". "Taylor" takes compiled series steps of high order, the most accurate
-        method; "RK1", "RK2", "RK4", "RK5" and "RK8" are compiled with a fixed step; the others are scipy's.
-    drift : None, "project", float, `project(...)` or `poles(...)`, optional
-        Treatment of constraint drift; a number is the time constant of the error dynamics [s].
+        instant, no integration), else "DOP853". "Taylor" takes compiled series steps, the most accurate; "RadauIIA"
+        compiled implicit ones, for stiff scenes; "RK1" to "RK8" are compiled with a fixed step; "CVODES" and "IDAS"
+        are those of SUNDIALS, IDAS on the rows before elimination; the others are scipy's.
+    drift : None, "project", "minimal", float, `project(...)` or `poles(...)`, optional
+        Treatment of constraint drift; a number is the time constant of the error dynamics [s]. "minimal" integrates
+        as many values as the program leaves free and solves the others: exact, in Python, at many times the cost.
+    accuracy : float, optional
+        Largest error of the motion, relative to each component's size, in place of method, drift and settings: they
+        follow from it (`servoctl.simulation.rule`), and the error is measured.
 
     Other arguments
 
     rtol, atol : float
-        Tolerances of adaptive methods. The defaults keep residuals near 1e-9 over tens of seconds.
+        Tolerances of adaptive methods. The defaults, 1e-9 and 1e-11, keep residuals near 1e-9 over tens of seconds.
     step : float, optional
         Step of the fixed-step methods [s]; default (t1 - t0)/2000, shortened so that steps end at the knots of paths.
+        "RadauIIA" takes fixed steps if it is given.
     t_eval : (N,) array, optional
         Times of the samples [s], within t_span. Default: 1001 instants and the knots; all steps of fixed-step methods.
     order : int, optional
-        Order of "Taylor"; default: that of least work for rtol.
+        Order of "Taylor", or of "RadauIIA" (5, 9 or 13); default: that of least work for rtol.
     jets : int, optional
         Highest derivative in the samples, for "Taylor": `run["d4theta"]`; default s̄.
-    progress : bool, optional
-        Show a progress bar; default: on a terminal, for work of more than a second.
+    progress : bool or callable, optional
+        Show a bar; default: on a terminal, after a second. Or a function of the time reached [s], which may raise.
 
     Returns
     -------
@@ -75,22 +87,42 @@ def simulate(
     ------
     SingularProgram, IntegrationStopped
         Where the motion ends; `.run` holds what was computed.
+    LimitExceeded
+        Where the accuracy is out of reach.
+    InconsistentStart
+        For a start off the constraints, unless the treatment of drift leads back.
     SpecificationError
         For arguments that do not go together, or a path that is not smooth enough.
     """
-    t0, t1 = _span(t_span)
+    if accuracy is not None:
+        _alone(accuracy, method=method, drift=drift, rtol=rtol, atol=atol, step=step, order=order)
+        same = {"t_eval": t_eval, "jets": jets, "progress": progress}
+        return accurate(lambda **options: simulate(model, start, t_span, **options, **same), model, accuracy)
+    return _simulated(model, start, as_span(t_span), method, drift, rtol, atol, step, t_eval, order, jets, progress)
+
+
+def _simulated(model, start, span, method, drift, rtol, atol, step, t_eval, order, jets, progress):
+    t0, t1 = span
     method = _method(model, method)
-    drift = _drift(drift, method)
-    _refuse_idle(method, step, order, jets)
+    drift = _drift(model, drift, method)
+    _refuse_idle(method, step, order, jets, rtol, atol)
     x0 = _state(model, start, t0)
+    if method != "algebraic" and (drift is None or isinstance(drift, Minimal)):
+        _require_consistent(model, t0, x0)
     knots = model.require_smooth((min(t0, t1), max(t0, t1)))
     times = _times(t0, t1, t_eval, knots)
+    rtol, atol = 1e-9 if rtol is None else rtol, 1e-11 if atol is None else atol
     bar = Progress((t0, t1), progress)
     try:
         if method == "algebraic":
             motion = algebraic(model, t0, x0, times, bar)
         elif method == "Taylor":
             motion = SeriesMethod(model, drift, rtol, atol, order, jets or 0, bar).run(t0, x0, t1, times, knots)
+        elif method == "RadauIIA":
+            fixed = None if step is None else _step(step, t0, t1)
+            motion = RadauMethod(model, drift, rtol, atol, order, fixed, bar).run(t0, x0, t1, times, knots)
+        elif method in MULTISTEP:
+            motion = SundialsMethod(model, method, drift, rtol, atol, t1 - t0, bar).run(t0, x0, t1, times, knots)
         elif method in ORDERS:
             motion = fixed_step(model, method, drift, (t0, t1), x0, _step(step, t0, t1), knots, bar)
         else:
@@ -131,7 +163,8 @@ def _resample(run, times):
     return replace(run, t=times, jets=np.array([run.at(t) for t in times]).T, variants=variants)
 
 
-def _span(t_span):
+def as_span(t_span):
+    """A span of time as two different finite numbers [s]."""
     try:
         t0, t1 = map(float, t_span)
     except (TypeError, ValueError):
@@ -159,9 +192,11 @@ def _method(model, method):
     return method
 
 
-def _drift(drift, method):
+def _drift(model, drift, method):
     drift = as_drift(drift)
-    if drift is not None and method == "algebraic":
+    if isinstance(drift, Minimal):
+        require_minimal(model, method, (*ORDERS, *ONE_STEP))
+    elif drift is not None and method == "algebraic":
         raise SpecificationError(
             f"drift={drift} was given with method='algebraic'.",
             "Where every instant is solved for itself nothing drifts.",
@@ -175,7 +210,7 @@ def _drift(drift, method):
             nearest="drift='project', which keeps residuals at rounding.",
             do="Project, or take another method.",
         )
-    if isinstance(drift, Project) and method in METHODS and method not in ONE_STEP:
+    if isinstance(drift, Project) and method in (*METHODS, *MULTISTEP) and method not in ONE_STEP:
         raise SpecificationError(
             f"drift={drift} was given with method={method!r}.",
             "A multistep method carries past states, which projection would contradict.",
@@ -185,10 +220,25 @@ def _drift(drift, method):
     return drift
 
 
-def _refuse_idle(method, step, order, jets):
+def _alone(accuracy, **given):
+    """Refuse what the rule for an accuracy chooses itself."""
+    given = {name: value for name, value in given.items() if value is not None}
+    if given:
+        raise SpecificationError(
+            f"accuracy={accuracy!r} was given with {', '.join(f'{name}={value!r}' for name, value in given.items())}.",
+            "An accuracy determines the method, its setting and the treatment of drift.",
+            nearest="sv.tradeoff measures what each method reaches.",
+            do="Leave one of them out.",
+            **given,
+        )
+
+
+def _refuse_idle(method, step, order, jets, rtol, atol):
     """Refuse options that the method would not use: nothing asked for is ignored."""
-    series = ("Taylor",)
-    for name, value, users in (("step", step, tuple(ORDERS)), ("order", order, series), ("jets", jets, series)):
+    orders = ("Taylor", "RadauIIA")
+    adaptive = tuple(name for name in ALL_METHODS if name not in ("algebraic", *ORDERS))
+    used = [("step", step, (*ORDERS, "RadauIIA")), ("order", order, orders), ("jets", jets, orders[:1])]
+    for name, value, users in (*used, ("rtol", rtol, adaptive), ("atol", atol, adaptive)):
         if value is not None and method not in users:
             raise SpecificationError(
                 f"{name}={value!r} was given with method={method!r}.",
@@ -196,6 +246,12 @@ def _refuse_idle(method, step, order, jets):
                 nearest=f"method={users[0]!r}.",
                 do=f"Leave {name} out.",
             )
+    if method == "RadauIIA" and order is not None and order not in RADAU_ORDERS:
+        raise SpecificationError(
+            f"order={order!r} was given with method='RadauIIA'.",
+            f"It has the orders {', '.join(map(str, RADAU_ORDERS))}.",
+            do="Give one of them, or leave order out.",
+        )
     for name, value, low in (("order", order, 2), ("jets", jets, 1)):
         if value is not None and not (isinstance(value, int) and low <= value <= 40):
             raise SpecificationError(
@@ -222,6 +278,25 @@ def _state(model, start, t0):
             do=f"Use model.start(t={t0:g}, ...).",
         )
     return values
+
+
+def _require_consistent(model, t, x):
+    """Refuse a start off the constraints: without a treatment that leads back, the whole motion would be off."""
+    names = [name for _, name in model.invariant_names()]
+    y = model.function("invariants")(t, x, model.parameters)
+    values, slopes = y[: len(names)], y[len(names) :].reshape(len(x), len(names)).T
+    sizes = np.sqrt((slopes**2 * (1.0 + np.abs(x)) ** 2).sum(axis=1))
+    off = np.nan_to_num(np.abs(values) / np.where(sizes > 0, sizes, 1.0))
+    if off.max(initial=0.0) > OFF:
+        worst = int(np.argmax(off))
+        raise InconsistentStart(
+            f"The start leaves the residual {values[worst]:.3g} of {names[worst]!r}.",
+            "A start satisfies every constraint at every level; what is off at the start stays off.",
+            nearest="drift='project', which moves it onto the constraints; error dynamics lead back, too.",
+            do="Make it by model.start(guess={...}).",
+            invariant=names[worst],
+            residual=float(values[worst]),
+        )
 
 
 def _times(t0, t1, t_eval, knots):

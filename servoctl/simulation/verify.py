@@ -59,6 +59,11 @@ class Verification:
             "energy": "energy against the integrated power",
             "multiplier form": "(3.18) against the form with multipliers",
             "outside": "part of the ideal reaction outside the actuators' reach",
+            "loop power": "energy gained less the work of all forces",
+            "loop power halved": "the same with steps half as long",
+            "loop constraints": "material constraints, values and rates",
+            "loop limits": "inputs beyond their limits",
+            "loop repeated": "states of the loop when it is run again",
         }
         lines = [f"Verification: {'passed' if self.passed else 'FAILED: ' + ', '.join(self.failures)}"]
         lines += [f"  {words[key]}: {self.numbers[key]:.1e}" for key in words if key in self.numbers]
@@ -68,7 +73,7 @@ class Verification:
         return "\n".join(lines[:12])
 
 
-def verify(model, run, segments=20):
+def verify(model, run=None, segments=20):
     """Check a run against the full mechanism, not the reduced model.
 
     The mechanism's accelerations under the required actuation are compared with the run's at every sample; the
@@ -76,11 +81,14 @@ def verify(model, run, segments=20):
     residuals are taken at every level; dE/dt is compared with the power of all forces; and (3.18) with the form
     that has multipliers.
 
+    A closed loop is verified alone, `verify(closed)`: its energy against the work of inputs, disturbances and
+    friction, at two lengths of step; material constraints; limits.
+
     Parameters
     ----------
-    model : Model
+    model : Model or Closed
     run : Run
-        Of this model.
+        Of this model; none for a closed loop.
     segments : int
         Number of restarted segments.
 
@@ -88,6 +96,8 @@ def verify(model, run, segments=20):
     -------
     Verification
     """
+    if run is None and hasattr(model, "loop"):
+        return model.verify()
     if getattr(run, "model", None) is None or not hasattr(model, "reduction"):
         raise SpecificationError(
             f"verify was given a {type(model).__name__} and a {type(run).__name__} "

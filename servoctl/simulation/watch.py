@@ -34,7 +34,7 @@ class Watch:
         self.columns = [
             np.where(now > 0, now, np.where(usual > 0, usual, 1.0))
             for now, usual in zip(
-                (np.abs(m).max(axis=0, initial=0.0) for m in matrices), model.column_sizes(), strict=True
+                (np.abs(m).max(axis=0, initial=0.0) for m in matrices), model.column_sizes, strict=True
             )
         ]
         if before is not None:
@@ -121,7 +121,7 @@ class Watch:
         """Whether the outputs of a right-hand side at the start show pivots far worse than the matrices."""
         if not np.all(np.isfinite(outputs)):
             return True
-        reference = self.model.guard_sizes()
+        reference = self.model.guard_sizes
         weakest = (np.abs(outputs[n_x:]) / np.where(reference > 0, reference, 1.0)).min(initial=1.0)
         return bool(weakest < DEGRADED and self.best.min() > HELPS * weakest)
 

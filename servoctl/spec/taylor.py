@@ -263,9 +263,9 @@ def _plus(a, b):
     return b if _is_zero(a) else a if _is_zero(b) else a + b
 
 
-def _inner_first(k):
-    """Indices 0..k of a product's terms, those with a coefficient k last: what precedes is known before it."""
-    return (*range(1, k), *sorted({0, k}))
+def _inner_first(k, first=0):
+    """Indices first..k of a product's terms, those with the latest coefficients last: the others are known earlier."""
+    return sorted(range(first, k + 1), key=lambda j: max(j, k - j))
 
 
 class Series:
@@ -352,7 +352,7 @@ class Series:
             return _dot((a[j], b[k - j]) for j in _inner_first(k))
         if kind == "div":
             y = c[i]
-            rest = _plus(a[k], -1.0 * _dot((y[j], b[k - j]) for j in (*range(1, k), *range(min(k, 1)))))
+            rest = _plus(a[k], -1.0 * _dot((y[j], b[k - j]) for j in _inner_first(k) if j < k))
             return 0.0 if _is_zero(rest) else rest / b[0]
         if kind == "gate":
             return 0.0 if _is_zero(b[k]) else select(a[0] != 0, b[k], 0.0)
@@ -363,10 +363,8 @@ class Series:
     def _square(a, k):
         if k == 0:
             return 0.0 if _is_zero(a[0]) else a[0] * a[0]
-        inner = 2.0 * _dot((a[j], a[k - j]) for j in range(1, (k + 1) // 2))
-        if k % 2 == 0 and not _is_zero(a[k // 2]):
-            inner = _plus(inner, a[k // 2] * a[k // 2])
-        return _plus(inner, 2.0 * _dot([(a[0], a[k])]))
+        inner = a[k // 2] * a[k // 2] if k % 2 == 0 and not _is_zero(a[k // 2]) else 0.0
+        return _plus(inner, 2.0 * _dot((a[j], a[k - j]) for j in reversed(range((k + 1) // 2))))
 
     @staticmethod
     def _constant_power(a, y, exponent, k):
@@ -385,7 +383,7 @@ class Series:
         total = 0.0
         for argument, slope in zip(node.args, slopes, strict=True):
             a, g = self.c[argument], self.c[slope]
-            total = _plus(total, _dot((j * a[j], g[k - j]) for j in range(1, k + 1) if not _is_zero(a[j])))
+            total = _plus(total, _dot((j * a[j], g[k - j]) for j in _inner_first(k, 1) if not _is_zero(a[j])))
         return total if k == 1 or _is_zero(total) else total / k
 
 

@@ -1,0 +1,165 @@
+"""Computed actuation: exact linearisation of the program on the measured state, with error dynamics by poles."""
+
+import numpy as np
+
+from servoctl.control.law import Law
+from servoctl.control.tracking import positive, require_plan
+from servoctl.errors import SpecificationError, UnstableInternalDynamics, unknown
+from servoctl.model.linearising import linearise
+from servoctl.simulation.bounds import sampled_bound
+from servoctl.simulation.internal import internal_dynamics
+
+TIME_CONSTANT = 0.25  # s: a rise in about a second where several poles coincide, as cranes and arms of human size need
+
+
+def computed(plan, plant, rate=100.0, poles=None, delay=0):
+    """The actuation that the plant's own equations ask for at the measured state, with error dynamics by poles.
+
+    Each residual obeys Π(D - λ_i) φ = 0 as long as the machine is the plant: φ is differentiated along the plant until
+    the inputs decouple, through dynamic extension where their decoupling matrix has no full rank. Between samples the
+    inputs are held.
+
+    Parameters
+    ----------
+    plan : Run
+        Ranks are decided about its states.
+    plant : Plant
+        What the controller believes of the machine, of the plan's mechanism.
+    rate : float
+        Samples per second [Hz].
+    poles : float or dict of str to sequence of complex, optional
+        One time constant T [s] (all poles at -1/T), default 0.25 s, or the poles [1/s] of each residual, as many as its
+        relative degree with the extension (`law.info["orders"]`).
+    delay : int
+        Samples by which the loop will be late; the poles are checked for it.
+
+    Returns
+    -------
+    Law
+
+    Raises
+    ------
+    UnstableInternalDynamics
+        If what the program leaves free is unstable along the plan: linearisation would hide it, not stabilise it.
+    SpecificationError
+        If the sampled error dynamics are unstable with these poles at this rate, or poles are of another number.
+    NotRealisable
+        If a residual depends on no input.
+    """
+    rate = positive("rate", rate)
+    require_plan(plan, plant)
+    _require_stable(plan)
+    found = linearise(plan, plant)
+    poles = _poles(poles, found.orders)
+    for name, values in poles.items():
+        _require_slow(name, values, rate, delay)
+    coefficients = [np.poly(values).real[:0:-1] for values in poles.values() if len(values)]
+    row = np.concatenate([plant.parameters, [1.0 / rate], *coefficients])
+    count = len(found.memory_names)
+    idle = np.array([plan[name][0] for name in plant.inputs])
+    facts = {"orders": found.orders, "relative degree": found.relative_degree, "poles": poles}
+    facts["error dynamics"] = ", ".join(f"{name} of order {order}" for name, order in found.orders.items())
+    return Law(
+        "computed", plant.state_names, plant.inputs, rate, float(plan.t[0]), found.step, row[:, None],
+        np.zeros(count), found.memory_names, (), idle, plan, facts,
+    )  # fmt: skip
+
+
+def _require_stable(plan):
+    internal = internal_dynamics(plan.model, plan)
+    if internal.verdict == "unstable" and internal.growth > 2.0:
+        worst = float(internal.eigenvalues.real.max())
+        raise UnstableInternalDynamics(
+            f"The program leaves {len(internal.names)} states free ({', '.join(internal.names)}), with an eigenvalue "
+            f"of {worst:.6g} 1/s along the plan.",
+            "Exact linearisation makes them unobservable and does not stabilise them.",
+            nearest="lqr(plan, plant, rate=...), which stabilises the whole state about the plan.",
+            do="Use it, or choose another output.",
+            eigenvalue=worst,
+            states=internal.names,
+        )
+
+
+def _poles(poles, orders):
+    """Poles of each residual by name."""
+    if poles is None or np.ndim(poles) == 0 and not isinstance(poles, dict):
+        constant = TIME_CONSTANT if poles is None else positive("poles", poles)
+        return {name: np.full(order, -1.0 / constant) for name, order in orders.items()}
+    if not isinstance(poles, dict):
+        raise SpecificationError(
+            f"poles={poles!r} was given.",
+            "Poles are one time constant, or go by residual.",
+            nearest="{" + ", ".join(f"{name!r}: {order} poles" for name, order in orders.items()) + "}.",
+            do="Give a dict.",
+        )
+    for name in poles:
+        if name not in orders:
+            raise unknown(name, orders, "residual")
+    found = {}
+    for name, order in orders.items():
+        values = np.atleast_1d(poles.get(name, ())).astype(complex)
+        if values.shape != (order,) or not np.isfinite(values).all() or np.abs(np.poly(values).imag).max() > 1e-9:
+            raise SpecificationError(
+                f"The poles of {name!r} are {poles.get(name)!r}.",
+                f"Its error dynamics have order {order}: as many poles, complex ones in conjugate pairs.",
+                nearest=f"{[-4.0] * order}.",
+                do="Give them.",
+                name=name,
+                order=order,
+            )
+        found[name] = values
+    return found
+
+
+def _require_slow(name, poles, rate, delay):
+    """Refuse poles whose error dynamics are unstable under a zero-order hold."""
+    order = len(poles)
+    radius = sampled_radius(poles, rate, delay) if order else 0.0
+    if not radius < 1.0:
+        fastest, bound = float(np.abs(poles).max()), sampled_bound(order, delay)
+        late = f" with {delay} samples of delay" if delay else ""
+        raise SpecificationError(
+            f"The fastest pole of {name!r}, {fastest:.4g} 1/s, is sampled at {rate:g} Hz{late}: |p| Ts = "
+            f"{fastest / rate:.4g}, and the held feedback multiplies errors by {radius:.4g} each sample.",
+            f"{order} equal poles -p are stable under a zero-order hold{late} for p Ts < {bound:.4f}.",
+            nearest=f"Poles slower than {bound * rate:.4g} 1/s, or a rate above {fastest / bound:.4g} Hz.",
+            do="Change one of them.",
+            name=name,
+            bound=bound,
+            radius=radius,
+        )
+
+
+def sampled_radius(poles, rate, delay=0):
+    """The largest factor per sample of a chain of integrators whose poles are placed by held feedback.
+
+    Parameters
+    ----------
+    poles : (ρ,) array of complex
+        [1/s]
+    rate : float
+        [Hz]
+    delay : int
+        Samples.
+
+    Returns
+    -------
+    float
+    """
+    from math import factorial
+
+    order, h = len(poles), 1.0 / rate
+    n = order + delay
+    A = np.zeros((n, n))
+    for i in range(order):
+        for j in range(i, order):
+            A[i, j] = h ** (j - i) / factorial(j - i)
+    B = np.array([h ** (order - i) / factorial(order - i) for i in range(order)])
+    K = np.poly(poles).real[:0:-1]
+    if delay:
+        A[:order, order] = B
+        A[range(order, n - 1), range(order + 1, n)] = 1.0
+        A[n - 1, :order] = -K
+    else:
+        A -= np.outer(B, K)
+    return float(np.abs(np.linalg.eigvals(A)).max(initial=0.0))

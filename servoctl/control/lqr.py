@@ -1,0 +1,272 @@
+"""LQR about a plan: time-varying by the discrete Riccati equation along it, or frozen at each instant."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from servoctl.control.tracking import Reference, affine, discretised, spectral_radii
+from servoctl.errors import ServoError, SpecificationError, unknown
+from servoctl.model.laws import Residuals
+from servoctl.spec.parameters import finite
+
+MARGINAL = 1 + 1e-6  # spectral radius of what may stay out of reach: it neither falls nor grows
+DOUBLINGS, CONVERGED = 60, 1e-12  # of the horizon of the Riccati equation; its last relative change
+Q_POSITION, Q_VELOCITY, R_INPUT, Q_INTEGRAL = 1e3, 1e2, 1e-3, 1e4
+
+
+def lqr(plan, plant, rate=100.0, Q=None, R=None, integral=None, varying=True):
+    """The plan's actuation with linear-quadratic feedback about the plan, sampled.
+
+    The plant is linearised along the plan in the middle of each sample and discretised exactly under the zero-order
+    hold. The gains minimise Σ δxᵀQ δx + δuᵀR δu + zᵀQ_i z over the samples: backwards along the plan from the steady
+    solution at its end, or steady at each sample as if the plant were frozen there.
+
+    Parameters
+    ----------
+    plan : Run
+        With its model, by="actuators".
+    plant : Plant
+        What the controller believes of the machine, without transport delay.
+    rate : float
+        Samples per second [Hz].
+    Q : float, dict of str to float, or (n_x,) or (n_x, n_x) array, optional
+        Weights of the states, by name for those that differ from the defaults: 1e3 for coordinates, 1e2 for
+        velocities, 0 for lagged inputs; an error of 3 cm costs as much as 0.1 m/s or 0.1 rad/s, and, with R,
+        as much as 30 N: right for machines of metres and kilonewtons.
+    R : float, dict of str to float, or (m,) or (m, m) array, optional
+        Weights of the inputs; default 1e-3.
+    integral : bool, float, dict of str to float, or (k,) array, optional
+        Weights of the integrals of the program's residuals, by residual: removes the error that a constant mismatch or
+        disturbance leaves. True: 1e4 each, so that an error of 3 mm that lasts for 1 s costs as much as 1 cm of error.
+        Default: none.
+    varying : bool
+        False: frozen-time gains.
+
+    Returns
+    -------
+    Law
+        Its info holds "gains" (N, m, n_x + k), the spectral radii of the sampled error dynamics, Q, R.
+
+    Raises
+    ------
+    NameUnknown
+        For a weight of no state, input or residual, or where plan and plant have other names.
+    SpecificationError
+        For weights of a wrong shape, or not (semi)definite.
+    ServoError
+        If an unstable mode is not reached by the inputs or not seen by the weights; with frozen-time gains, a marginal
+        one, too.
+    """
+    if plant.delay:
+        raise SpecificationError(
+            f"The plant has a transport delay of {max(plant.delay.values()):g} s.",
+            "The gains are those of a plant without delay.",
+            nearest="sv.plant(mechanism) for the design, and the plant with its delay in sv.close.",
+            do="Design for the plant without delay, and close the loop with it.",
+        )
+    reference = Reference(plan, plant, rate)
+    q = plant.mechanism.q
+    default = np.zeros(plant.n_x)
+    default[: q.nq + q.n] = [Q_POSITION] * q.nq + [Q_VELOCITY] * q.n
+    Q = weights(Q, default, plant.state_names, "state", "Q")
+    R = weights(R, np.full(len(plant.inputs), R_INPUT), plant.inputs, "actuator", "R", positive=True)
+    residuals, Q_i = _integrals(integral, plan, plant)
+    A, B = discretised(*reference.linearised(), reference.period)
+    if residuals:
+        A, B, Q = _with_integrals(A, B, Q, residuals, Q_i, reference)
+    basis = tangents(reference, 0 if residuals is None else len(Q_i))
+    K = _varying(A, B, Q, R, basis) if varying else steady(A, B, Q, R, basis)[0]
+    radii = spectral_radii(_reduced(A - B @ K, basis))
+    facts = {
+        "largest spectral radius along the plan": float(radii.max()),
+        "spectral radius at its end": float(radii[-1]),
+        "gains": K, "Q": Q, "R": R, "integrated": residuals.names if residuals else (),
+    }  # fmt: skip
+    n_x = plant.n_x
+    how = f"lqr, {'time-varying' if varying else 'frozen-time'}" + (", with integrals" if residuals else "")
+    law = affine(how, reference, K[:, :, :n_x], K[:, :, n_x:], residuals)
+    return replace(law, info=facts)
+
+
+def _with_integrals(A, B, Q, residuals, Q_i, reference):
+    """The plant with z+ = z + Ts φ, φ = C δx among its states."""
+    (count, n, m), k = B.shape, len(Q_i)
+    both, inputs, weight = np.zeros((count, n + k, n + k)), np.zeros((count, n + k, m)), np.zeros((n + k, n + k))
+    both[:, :n, :n], inputs[:, :n], weight[:n, :n], weight[n:, n:] = A, B, Q, Q_i
+    both[:, n:, :n] = reference.period * residuals.jacobian(reference.t, reference.x)
+    both[:, n:, n:] = np.eye(k)
+    return both, inputs, weight
+
+
+def tangents(reference, extra=0):
+    """Orthonormal bases of the states that material constraints allow, at each sample and the next; None without any.
+
+    Returns
+    -------
+    (N, n, r) array or None
+    """
+    plant = reference.plant
+    if not plant.constrained:
+        return None
+    y = plant.function("constraints_jacobian").grid(reference.t, reference.x, plant.p())
+    J = y.reshape(plant.n_x, -1, len(reference.t)).transpose(2, 1, 0)
+    rank = int(np.linalg.matrix_rank(J[0], tol=1e-9 * np.abs(J[0]).max()))
+    T = np.linalg.svd(J)[2][:, rank:].transpose(0, 2, 1)
+    n, r = T.shape[1:]
+    found = np.zeros((len(T), n + extra, r + extra))
+    found[:, :n, :r], found[:, n:, r:] = T, np.eye(extra)
+    return found
+
+
+def _reduced(A, basis):
+    """TᵀAT: error dynamics on the states that material constraints allow."""
+    return A if basis is None else basis.swapaxes(1, 2) @ A @ basis
+
+
+def steady(A, B, Q, R, basis):
+    """K of the steady Riccati equation at each sample and the last P, on the tangent space where there is one.
+
+    By the structure-preserving doubling algorithm (Chu, Fan, Lin, Wang 2004) at all samples at once: step k gives the
+    solution of a horizon of 2^k samples.
+
+    Parameters
+    ----------
+    A, B : (N, n, n), (N, n, m) arrays
+    Q, R : (n, n), (m, m) arrays
+    basis : (N, n, r) array or None
+        Of the tangent spaces.
+
+    Returns
+    -------
+    K : (N, m, n) array
+    P : (n, n) array
+
+    Raises
+    ------
+    ServoError
+        If there is no stabilising solution.
+    """
+    T = np.eye(A.shape[1])[None] if basis is None else basis
+    left = T.swapaxes(1, 2)
+    A, B, eye = left @ A @ T, left @ B, np.eye(T.shape[2])
+    a, G, P = A, B @ np.linalg.solve(R, B.swapaxes(1, 2)), np.broadcast_to(left @ Q @ T, A.shape)
+    with np.errstate(all="ignore"):
+        for _ in range(DOUBLINGS):
+            before, half = P, np.linalg.inv(eye + G @ P)
+            a, G, P = a @ half @ a, G + a @ half @ G @ a.swapaxes(1, 2), P + a.swapaxes(1, 2) @ P @ half @ a
+            change = np.abs(P - before).max() / np.abs(P).max()
+            if not change > CONVERGED:
+                break
+        K = np.linalg.solve(R + B.swapaxes(1, 2) @ P @ B, B.swapaxes(1, 2) @ P @ A)
+    radii = spectral_radii(A - B @ K) if change <= CONVERGED else np.full(1, np.inf)
+    if not radii.max() < 1:
+        raise ServoError(
+            "The steady Riccati equation has no stabilising solution.",
+            "Each unstable or marginal mode is reached by the inputs and seen by the weights.",
+            nearest="Weights on all states; fewer integrals than inputs; another set of actuators.",
+            do="Check which modes the actuators reach.",
+            radius=float(radii.max()),
+        )
+    return K @ left, T[-1] @ P[-1] @ T[-1].T
+
+
+def _varying(A, B, Q, R, basis):
+    """The Riccati equation backwards along the plan, from the steady solution at its end, whose gains then hold.
+
+    Where there is none, as for a spin that no input reaches, from a horizon beyond the end that is as long as the plan.
+    """
+    count = len(A)
+    K = np.empty((count, B.shape[2], A.shape[1]))
+    try:
+        K[-1:], P = steady(A[-1:], B[-1:], Q, R, None if basis is None else basis[-1:])
+    except ServoError:
+        P = Q
+        for _ in range(count):
+            K[-1], P = _riccati(A[-1], B[-1], Q, R, P)
+        last = _reduced(A[-1:] - B[-1:] @ K[-1:], None if basis is None else basis[-1:])
+        if not spectral_radii(last)[0] < MARGINAL:
+            raise
+    for k in range(count - 2, -1, -1):
+        K[k], P = _riccati(A[k], B[k], Q, R, P)
+    return K
+
+
+def _riccati(A, B, Q, R, P):
+    """The gain of one sample, and the cost P one sample earlier."""
+    PB = P @ B
+    K = np.linalg.solve(R + B.T @ PB, PB.T @ A)
+    P = Q + A.T @ P @ (A - B @ K)
+    return K, (P + P.T) / 2
+
+
+def weights(given, default, names, what, symbol, positive=False):
+    """A weight matrix from a number, numbers by name, a diagonal or a matrix.
+
+    Parameters
+    ----------
+    given : float, dict, or array, optional
+    default : (n,) array
+    names : sequence of str
+    what : str
+        What the names stand for.
+    symbol : str
+        Q or R, for messages.
+    positive : bool
+        Whether it must be definite, not only semidefinite.
+
+    Returns
+    -------
+    (n, n) array
+
+    Raises
+    ------
+    NameUnknown
+    SpecificationError
+    """
+    n, found = len(names), np.array(default, dtype=float)
+    if isinstance(given, dict):
+        for name, value in given.items():
+            if name not in names:
+                raise unknown(name, names, what)
+            found[list(names).index(name)] = finite(name, value, "weight")
+    elif given is not None:
+        try:
+            found = np.asarray(given, dtype=float)
+        except (TypeError, ValueError):
+            found = np.empty(())
+            given = None
+        found = np.full(n, float(found)) if found.ndim == 0 and given is not None else found
+    matrix = np.diag(found) if found.shape == (n,) else found
+    if matrix.shape != (n, n):
+        raise SpecificationError(
+            f"{symbol} has the shape {found.shape}.",
+            f"It is a number, {n} numbers or an ({n}, {n}) matrix, for {', '.join(names)}; or numbers by name.",
+            do="Give one weight each.",
+            shape=found.shape,
+        )
+    symmetric = np.isfinite(matrix).all() and np.allclose(matrix, matrix.T, rtol=1e-9, atol=0)
+    least = np.linalg.eigvalsh(matrix).min(initial=np.inf) if symmetric else -np.inf
+    scale = np.abs(matrix).max(initial=0.0) if symmetric else 1.0
+    if least < (1e-14 if positive else -1e-12) * max(scale, 1e-300):
+        raise SpecificationError(
+            f"{symbol} is {np.array2string(np.asarray(given), threshold=9)}.",
+            f"It is symmetric and positive {'definite' if positive else 'semidefinite'}.",
+            do="Give positive weights.",
+        )
+    return matrix
+
+
+def _integrals(integral, plan, plant):
+    """Which residuals are integrated, and their weights; (None, None) without any."""
+    if integral is None or integral is False or (isinstance(integral, dict) and not integral):
+        return None, None
+    residuals = Residuals(plan.model, plant, tuple(integral) if isinstance(integral, dict) else None)
+    if not residuals.names:
+        raise SpecificationError(
+            "The program has no residual of order 0 or 1.",
+            "A residual that is fed back is a function of the state (q, γ').",
+            do="Leave out integral.",
+        )
+    given = None if integral is True else integral
+    names = residuals.names
+    return residuals, weights(given, np.full(len(names), Q_INTEGRAL), names, "residual", "integral", positive=True)

@@ -1,0 +1,367 @@
+"""Laws from a plan: its actuation alone, or with proportional and derivative feedback of the actuated displacements."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from servoctl.control.law import Law
+from servoctl.errors import NotRealisable, ServoError, SpecificationError, unknown
+from servoctl.model.laws import affine_law
+from servoctl.spec.coordinates import mapping
+from servoctl.spec.parameters import finite
+
+UNSTABLE = 1e-9  # beyond 1: spectral radii that count as unstable
+SCALED, TERMS = 0.5, 16  # norm of a matrix whose exponential is summed; 0.5^17/17! is 2e-20
+GAUSS = np.polynomial.legendre.leggauss(3)
+
+
+def feedforward(plan, plant, rate=100.0, held="middle"):
+    """The plan's actuation, held over each sample; no feedback.
+
+    An actuator's lag T is inverted, u + T du/dt, and its transport delay is met by commanding earlier.
+
+    Parameters
+    ----------
+    plan : Run
+        With its model, by="actuators".
+    plant : Plant
+        What the controller believes of the machine.
+    rate : float
+        Samples per second [Hz]; default 100, a usual rate of industrial drives.
+    held : {"middle", "mean"}
+        The actuation in the middle of the sample (default: the error of the hold is then of second order in the
+        period), or its mean over the sample.
+
+    Returns
+    -------
+    Law
+    """
+    reference = Reference(plan, plant, rate)
+    table = reference.inputs(held)
+    return Law(
+        "feedforward", (), plant.inputs, reference.rate, reference.t[0], affine_law((), len(plant.inputs), False),
+        table, idle=reference.idle, plan=plan,
+    )  # fmt: skip
+
+
+def pd(plan, plant, rate=100.0, kp=None, kd=None):
+    """The plan's actuation, and feedback of each actuator's own displacement and speed about the plan.
+
+    u_a = u_plan - kp_a e_a - kd_a de_a/dt with e_a = E_aᵀ(γ - γ_plan): the error of the displacement that the actuator
+    works on.
+
+    Parameters
+    ----------
+    plan : Run
+    plant : Plant
+        What the controller believes of the machine.
+    rate : float
+        Samples per second [Hz].
+    kp, kd : dict of str to float
+        Gains by actuator: input per displacement and per speed.
+
+    Returns
+    -------
+    Law
+        Its info holds the largest spectral radius of the sampled error dynamics along the plan.
+
+    Raises
+    ------
+    NameUnknown
+        For a gain of no actuator.
+    ServoError
+        If the rate is too low for the gains: the last sample's error dynamics are unstable, and were not at a higher
+        rate.
+    """
+    kp, kd = (_gains(gains, plant, what) for gains, what in ((kp, "kp"), (kd, "kd")))
+    reference = Reference(plan, plant, rate)
+    q, n_x, m = plant.mechanism.q, plant.n_x, len(plant.inputs)
+    nq, n = len(q.names), len(plant.disturbable)
+    p = plant.p(reference.middle_input)
+    both = plant.function("directions").grid(reference.t, reference.x, p)
+    E, V = both[: n * m].reshape(m, n, -1).transpose(2, 0, 1), both[n * m :].reshape(n, nq, -1).transpose(2, 1, 0)
+    K = np.zeros((len(reference.t), m, n_x))
+    K[:, :, :nq] = kp[:, None] * (E @ np.linalg.pinv(V))
+    K[:, :, nq : nq + n] = kd[:, None] * E
+    law = affine(f"pd, kp {_named(kp, plant)}, kd {_named(kd, plant)}", reference, K)
+    A, B = discretised(*reference.linearised(), 1.0 / reference.rate)
+    radius = spectral_radii(A - B @ K)
+    _refuse_slow_rate(reference, K, radius[-1])
+    return replace(law, info={"largest spectral radius along the plan": float(radius.max())})
+
+
+class Reference:
+    """A plan at the instants of sampling: states, inputs, linearisations; refused where plan and plant do not fit.
+
+    Attributes
+    ----------
+    rate : float
+        [Hz]
+    t : (N,) array
+        t_k = t0 + k/rate within the plan [s].
+    x : (n_x, N) array
+        The plant's states there.
+    middle : (N,) array
+        Middles of the samples, no later than the plan's end [s].
+    middle_x, middle_input : (n_x, N), (m, N) arrays
+        States and plan's actuation there.
+    idle : (m,) array
+        The plan's first actuation.
+    """
+
+    def __init__(self, plan, plant, rate):
+        self.plan, self.plant, self.rate = plan, plant, positive("rate", rate)
+        require_plan(plan, plant)
+        period = 1.0 / self.rate
+        count = int(np.floor((plan.t[-1] - plan.t[0]) * self.rate * (1 + 1e-12) + 1e-9))
+        self.t = plan.t[0] + np.arange(count + 1) * period
+        self.period, self.end = period, plan.t[-1]
+        self.x = self._states(self.t)
+        self.middle = np.minimum(self.t + period / 2, self.end)
+        self.middle_x, self.middle_input = self._states(self.middle), self._actuation(self.middle)
+        self.idle = self._actuation(self.t[:1])[:, 0]
+
+    def _actuation(self, t):
+        run = resampled(self.plan, np.minimum(t, self.end))
+        return np.array([run[name] for name in self.plant.inputs]).reshape(len(self.plant.inputs), len(t))
+
+    def _states(self, t):
+        run, plant = resampled(self.plan, np.minimum(t, self.end)), self.plant
+        return np.array([run[name] for name in plant.state_names])  # a lagged input follows the plan's
+
+    def inputs(self, held="middle"):
+        """The command of each sample, (m, N): the plan's actuation, with lag and transport delay inverted."""
+        if held not in ("middle", "mean"):
+            raise unknown(held, ("middle", "mean"), "choice of the held value")
+        return np.array([self._command(a, name, held) for a, name in enumerate(self.plant.inputs)])
+
+    def _command(self, a, name, held):
+        later = self.t + self.plant.delay.get(name, 0.0)
+        if held == "middle":
+            u = self._actuation(later + self.period / 2)[a]
+        else:
+            nodes, weights = GAUSS
+            parts = (self._actuation(later + self.period * (1 + s) / 2)[a] for s in nodes)
+            u = sum(w / 2 * part for w, part in zip(weights, parts, strict=True))
+        if name in self.plant.lag:
+            u = (
+                u
+                + self.plant.lag[name]
+                * (self._actuation(later + self.period)[a] - self._actuation(later)[a])
+                * self.rate
+            )
+        return u
+
+    def linearised(self):
+        """A (N, n_x, n_x) and B (N, n_x, m) of the plant in the middle of each sample."""
+        return self.plant.linearised(self.middle, self.middle_x, self.middle_input)
+
+
+def affine(name, reference, K, K_i=None, residuals=None, **facts):
+    """The law u = u_ff - K (x - x_ref) - K_i z of gains along a reference.
+
+    Parameters
+    ----------
+    name : str
+    reference : Reference
+    K : (N, m, n_x) array
+        Gains; states whose gains all vanish are not measured.
+    K_i : (N, m, n_z) array, optional
+    residuals : Residuals, optional
+        What is integrated in z.
+    **facts
+        For the law's info.
+
+    Returns
+    -------
+    Law
+    """
+    plant, names = reference.plant, residuals.names if residuals else ()
+    used = np.any(K != 0, axis=(0, 1))
+    needed = set(residuals.measures) if residuals else set()
+    measures = tuple(n for n, u in zip(plant.state_names, used, strict=True) if u or n in needed)
+    where = [plant.state_names.index(name) for name in measures]
+    parts = [reference.inputs(), reference.x[where], K[:, :, where].reshape(len(K), -1).T]
+    if residuals:
+        parts.append(K_i.reshape(len(K_i), -1).T)
+        parts.append(np.tile(np.append(reference.period, residuals.parameters)[:, None], len(reference.t)))
+    step = affine_law(measures, len(plant.inputs), residuals=residuals)
+    return Law(
+        name, measures, plant.inputs, reference.rate, reference.t[0], step, np.vstack(parts),
+        np.zeros(len(names)), tuple(f"integral of {n}" for n in names), (), reference.idle, reference.plan, facts,
+    )  # fmt: skip
+
+
+def require_plan(plan, plant):
+    """Refuse a plan that is none, or that names what the plant lacks."""
+    model = getattr(plan, "model", None)
+    if model is None or not hasattr(plan, "jets"):
+        raise SpecificationError(
+            f"A {type(plan).__name__}{' without its model' if hasattr(plan, 'jets') else ''} was given as plan.",
+            "A law is made from a run of sv.simulate, which interpolates between its samples.",
+            do="Simulate the plan here; a loaded run has no model.",
+        )
+    if len(plan.t) < 2 or plan.t[-1] <= plan.t[0] or not np.isfinite(plan.jets).all():
+        raise SpecificationError(
+            f"The plan has {len(plan.t)} samples from t = {plan.t[0]:g} to {plan.t[-1]:g} s.",
+            "A plan that is followed goes forward in time, through finite states.",
+            do="Simulate it over (t0, t1) with t1 > t0.",
+        )
+    if model.ideal:
+        raise NotRealisable(
+            "The plan is realised by an ideal reaction.",
+            "A law commands actuators.",
+            nearest='Program(..., by="actuators").',
+            do="Derive the program for the actuators, and simulate that plan.",
+        )
+    own = plan.jet_names[: model.nq + model.n]
+    for given, valid, what in (
+        (own, plant.state_names, "state of the plant"),
+        (model.actuators, plant.inputs, "actuator of the plant"),
+        (plant.state_names[: plant.n_x - len(plant.lag)], own, "state of the plan"),
+        (plant.inputs, model.actuators, "actuator of the plan"),
+    ):
+        for name in given:
+            if name not in valid:
+                raise unknown(name, valid, what)
+
+
+def resampled(plan, times):
+    """The plan at other instants, between its samples by Hermite interpolation of all derivatives.
+
+    Parameters
+    ----------
+    plan : Run
+    times : (N,) array
+        In increasing order, within the plan [s].
+
+    Returns
+    -------
+    Run
+    """
+    model, t = plan.model, plan.t
+    nq, n = model.nq, model.n
+    top = (len(plan.jets) - nq) // n
+    i = np.clip(np.searchsorted(t, times, side="right") - 1, 0, len(t) - 2)
+    place = (i, t[i + 1] - t[i], times)
+    levels = [plan.jets[nq + k * n : nq + (k + 1) * n] for k in range(top)]
+    if model.reduction.mechanism.q.plain:
+        jets = _hermite(t, [plan.jets[:nq], *levels], *place)
+    else:
+        rates = plan.signals("coordinate_rates")[1]
+        jets = [*_hermite(t, [plan.jets[:nq], rates[:nq], rates[nq:]], *place)[:1], *_hermite(t, levels, *place)]
+    edges = [0, *(np.searchsorted(times, t[first]) for first, _, _ in plan.variants[1:]), len(times)]
+    variants = tuple((a, b, v[2]) for a, b, v in zip(edges[:-1], edges[1:], plan.variants, strict=False) if b > a)
+    return replace(plan, t=times, jets=np.vstack(jets), variants=variants, stored={}, stored_residual={})
+
+
+def _hermite(t, derivatives, i, h, times):
+    """Values and derivatives at times of the polynomials that match all derivatives at the ends of their intervals.
+
+    Parameters
+    ----------
+    t : (N,) array
+    derivatives : list of (n, N) arrays
+        Of orders 0, 1, ..., r.
+    i, h : (M,) arrays
+        Interval of each instant, and its length.
+    times : (M,) array
+
+    Returns
+    -------
+    list of (n, M) arrays
+    """
+    from math import factorial, perm
+
+    r, s = len(derivatives), (times - t[i]) / h
+    low = [d[:, i] * h**k / factorial(k) for k, d in enumerate(derivatives)]
+    matrix = np.array([[perm(j, k) for j in range(r, 2 * r)] for k in range(r)], dtype=float)
+    ends = [d[:, i + 1] * h**k for k, d in enumerate(derivatives)]
+    missing = [end - sum(perm(j, k) * low[j] for j in range(k, r)) for k, end in enumerate(ends)]
+    high = np.einsum("jk,knm->jnm", np.linalg.inv(matrix), np.array(missing))
+    c = [*low, *high]
+    return [sum(perm(j, k) * c[j] * s ** (j - k) for j in range(k, 2 * r)) / h**k for k in range(r)]
+
+
+def discretised(A, B, period):
+    """Exact discretisation under a zero-order hold: exp([A B; 0 0] Ts).
+
+    Parameters
+    ----------
+    A, B : (N, n, n), (N, n, m) arrays
+    period : float
+        [s]
+
+    Returns
+    -------
+    (N, n, n), (N, n, m) arrays
+    """
+    n, m = B.shape[1:]
+    both = np.zeros((len(A), n + m, n + m))
+    both[:, :n, :n], both[:, :n, n:] = A * period, B * period
+    exact = exponentials(both)
+    return exact[:, :n, :n], exact[:, :n, n:]
+
+
+def exponentials(matrices):
+    """exp of each matrix, (N, n, n): its Taylor series to rounding, scaled and squared, for all at once."""
+    norm = np.abs(matrices).sum(axis=2).max(initial=0.0)
+    squarings = max(0, int(np.ceil(np.log2(max(norm, 1e-300) / SCALED))))
+    scaled, eye = matrices / 2**squarings, np.eye(matrices.shape[1])
+    found = eye
+    for k in range(TERMS, 0, -1):
+        found = eye + scaled @ found / k
+    for _ in range(squarings):
+        found = found @ found
+    return found
+
+
+def spectral_radii(matrices):
+    """Largest absolute eigenvalue of each matrix, (N,)."""
+    return np.abs(np.linalg.eigvals(matrices)).max(axis=-1, initial=0.0)
+
+
+def positive(name, value):
+    """A positive finite number.
+
+    Raises
+    ------
+    SpecificationError
+    """
+    number = finite(name, value)
+    if number <= 0:
+        raise SpecificationError(f"{name} = {number:g} was given.", f"The {name} is positive.", do="Change it.")
+    return number
+
+
+def _gains(gains, plant, what):
+    found = np.zeros(len(plant.inputs))
+    for name, value in mapping(gains, f"The gains {what}").items():
+        if name not in plant.inputs:
+            raise unknown(name, plant.inputs, "actuator")
+        if np.ndim(value) != 0:
+            raise SpecificationError(
+                f"The gain {what} of {name!r} has the shape {np.shape(value)}.",
+                "Each actuator has one number.",
+                do=f"Write {what}={{{name!r}: 100.0}}.",
+            )
+        found[plant.inputs.index(name)] = finite(name, value, f"gain {what}")
+    return found
+
+
+def _named(gains, plant):
+    return " ".join(f"{name}={k:g}" for name, k in zip(plant.inputs, gains, strict=True) if k) or "none"
+
+
+def _refuse_slow_rate(reference, K, radius):
+    """Refuse gains that are unstable at their rate, at the plan's end, where they were not at ten times that."""
+    A, B = (part[-1:] for part in reference.linearised())
+    fast, fast_input = discretised(A, B, 0.1 / reference.rate)
+    if radius > 1 + UNSTABLE and spectral_radii(fast - fast_input @ K[-1:])[0] < radius**0.1 - UNSTABLE:
+        raise ServoError(
+            f"Sampled at {reference.rate:g} Hz, errors grow by the factor {radius:.4g} per sample at the plan's end.",
+            "Under a zero-order hold ρ equal poles -p are stable for p·Ts < 1, 0.6752, 0.5111, 0.4116: ρ = 2 to 5.",
+            nearest="A higher rate, or lower gains.",
+            do="Choose gains for poles well below the rate.",
+            radius=float(radius),
+        )

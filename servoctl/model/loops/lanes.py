@@ -1,0 +1,108 @@
+"""Eight points at once, as C text: the vector type W with the functions that emitted statements call.
+
+A function is emitted a second time, with ``V``, ``K`` and ``v_sin`` in their meanings for W. sin and cos are those of
+fdlibm, after a reduction by three parts of pi/2; what has no formula here is taken lane by lane. Values differ from the
+scalar ones by rounding.
+"""
+
+import re
+
+LANES = 8
+
+_TYPES = """
+typedef double W __attribute__((vector_size(64)));
+typedef int64_t I __attribute__((vector_size(64)));
+typedef double U __attribute__((vector_size(64), aligned(8), may_alias));
+#define EIGHT(c) ((W){(c), (c), (c), (c), (c), (c), (c), (c)})
+
+#define INLINE static inline __attribute__((always_inline))
+
+INLINE W w_select(I mask, W a, W b) { return (W)((mask & (I)a) | (~mask & (I)b)); }
+INLINE W w_truth(I mask) { return (W)(mask & (I)EIGHT(1.0)); }
+"""
+
+_OWN = {
+    "fabs": "(W)((I)a & 0x7fffffffffffffffLL)",
+    "sign": "w_select(a < 0, EIGHT(-1.0), w_select(a > 0, EIGHT(1.0), a))",
+    "not": "w_truth(a == 0)",
+    "lt": "w_truth(a < b)",
+    "le": "w_truth(a <= b)",
+    "eq": "w_truth(a == b)",
+    "ne": "w_truth(a != b)",
+    "and": "w_truth((a != 0) & (b != 0))",
+    "or": "w_truth((a != 0) | (b != 0))",
+    "if_else_zero": "(W)((a != 0) & (I)b)",
+    "fmin": "w_select((a <= b) | (b != b), a, b)",
+    "fmax": "w_select((a >= b) | (b != b), a, b)",
+}
+
+_SINCOS = """
+/* sin(a + turns pi/2), for lanes that are finite and not large. */
+INLINE W w_turned(W a, int64_t turns)
+{
+    const W n_shifted = a * 0.63661977236758134308 + 6755399441055744.0, n = n_shifted - 6755399441055744.0;
+    const W near = (a - n * 1.57079632673412561417e+00) - n * 6.07710050630396597660e-11;
+    const W r = near - n * 2.02226624879595063154e-21;
+    const W z = r * r, half = 0.5 * z, w = 1.0 - half;
+    const W s = w_select(r == 0, r, r + z * r * (-1.66666666666666324348e-01 + z * (8.33333333332248946124e-03
+        + z * (-1.98412698298579493134e-04 + z * (2.75573137070700676789e-06 + z * (-2.50507602534068634195e-08
+        + z * 1.58969099521155010221e-10))))));
+    const W c = w + (((1.0 - w) - half) + z * z * (4.16666666666666019037e-02 + z * (-1.38888888888741095749e-03
+        + z * (2.48015872894767294178e-05 + z * (-2.75573143513906633035e-07 + z * (2.08757232129817482790e-09
+        + z * -1.13596475577881948265e-11))))));
+    const I quadrant = (I)n_shifted + turns;
+    const W value = w_select((quadrant & 1) != 0, c, s);
+    return (W)((I)value ^ ((quadrant & 2) << 62));
+}
+
+INLINE int w_moderate(W a)
+{
+    const I beyond = ~((W)((I)a & 0x7fffffffffffffffLL) < 1e5);
+    int64_t any = 0;
+    for (int i = 0; i < 8; i++) any |= beyond[i];
+    return !any;
+}
+"""
+
+_MEANING = "#define V W\n#undef K\n#define K(constant) EIGHT(constant)\n"
+_MEANT = "#undef V\n#undef K\n#define K(constant) (constant)\n"
+
+
+def _by_lane(name, arguments):
+    places = ", ".join(f"{a}[i]" for a in arguments)
+    return f"    W r;\n    for (int i = 0; i < 8; i++) r[i] = v_{name}({places});\n    return r;\n"
+
+
+def _defined(name, arguments):
+    """The C function of one operation."""
+    head = f"INLINE W w_{name}({', '.join(f'W {a}' for a in arguments)})\n{{\n"
+    if name in _OWN:
+        return f"{head}    return {_OWN[name]};\n}}\n"
+    if name in ("sin", "cos"):
+        head += f"    if (w_moderate(a)) return w_turned(a, {int(name == 'cos')});\n"
+    return f"{head}{_by_lane(name, arguments)}}}\n"
+
+
+def lanes(text, operations):
+    """C text of a function for eight points at once.
+
+    Parameters
+    ----------
+    text : str
+        Of the function, under its new name, in terms of V, K and operations v_NAME.
+    operations : dict of str to (arguments, scalar)
+        For each NAME its arguments, "a" or "ab", and the C function for which v_NAME is a macro, or None.
+
+    Returns
+    -------
+    str
+    """
+    used = {name: operations[name] for name in sorted(set(re.findall(r"\bv_(\w+)\(", text)))}
+    functions = "".join(_defined(name, arguments) for name, (arguments, _) in used.items())
+    begin = "".join(f"#undef v_{name}\n#define v_{name} w_{name}\n" for name in used)
+    end = "".join(
+        f"#undef v_{name}\n" + (f"#define v_{name} {scalar}\n" if scalar else "") for name, (_, scalar) in used.items()
+    )
+    return "".join(
+        (_TYPES, _SINCOS if used.keys() & {"sin", "cos"} else "", functions, begin, _MEANING, text, end, _MEANT)
+    )

@@ -1,0 +1,83 @@
+"""Accelerations and multipliers together: one sparse elimination of the balance and the constraints.
+
+The balance M γ'' + c = B μ and the constraints G γ'' + d = 0 form the matrix [M -B; G 0]. Eliminated by T first it is
+(3.18); pivots chosen by Markowitz counts over all of it keep the sparsity of many bodies, and the operations grow with
+their number. No multiplier is introduced numerically: γ'' is an expression of the state either way.
+"""
+
+import casadi as ca
+
+from servoctl.errors import SpecificationError
+from servoctl.model.emit import operations
+from servoctl.reduction.elimination import eliminate
+from servoctl.reduction.ranks import clean
+from servoctl.reduction.rows import gradient
+
+FEW = 8  # quasi-velocities: up to here (3.18) takes about as few operations
+
+
+def applies(reduction):
+    """Whether γ'' follows from the balance and the constraints as they are: s̄ = 2, no row of (3.18) differentiated.
+
+    Parameters
+    ----------
+    reduction : Reduction
+
+    Returns
+    -------
+    bool
+    """
+    own = [row for row in reduction.rows if row.kind == "dynamics"]
+    return reduction.top == 2 and all(row.order == 2 and not row.story for row in own)
+
+
+def solve(equations, poles=False):
+    """γ'', the multipliers μ, and the pivots divided by.
+
+    Parameters
+    ----------
+    equations : Equations
+    poles : bool
+        With the error dynamics of the constraints.
+
+    Returns
+    -------
+    accelerations : (n,) SX
+    multipliers : (b,) SX
+    pivots : list of SX scalars
+    """
+    r, q = equations.r, equations.q
+    constraints = [a for a, row in enumerate(r.rows) if row.kind != "dynamics"]
+    B, size = r.realisation.B, len(constraints)
+    G = ca.vertcat(*(gradient(q, r.rows[a]) for a in constraints))
+    matrix = ca.vertcat(ca.horzcat(r.mechanism.mass, -B), ca.horzcat(G, ca.SX(size, B.shape[1])))
+    acceleration = ca.vertcat(*q.gamma(2))
+    rest = ca.substitute(r.mechanism.balance, acceleration, ca.SX.zeros(q.n))
+    right = -ca.vertcat(rest, *equations.rest(constraints, poles))
+    solution, pivots = eliminate(matrix, right, clean(*r.points.matrix(matrix)))
+    return solution[: q.n], solution[q.n :], pivots
+
+
+def accelerations(equations):
+    """Outputs (γ'', μ) at a state: by (3.18) or by the sparse elimination, whichever takes fewer operations.
+
+    Raises
+    ------
+    SpecificationError
+        If the motion needs the balance differentiated, or has an order above 2.
+    """
+    r, q = equations.r, equations.q
+    if not applies(r):
+        raise SpecificationError(
+            f"The accelerations of a motion of order {r.top} with {len(r.hidden)} hidden constraints were asked for.",
+            "Accelerations and multipliers follow from a state (q, γ') where the program needs no derivative of the "
+            "balance and its residuals have orders up to 2.",
+            do="Simulate it; a run has both.",
+        )
+    sparse = equations.function("accelerations", equations.state, equations.saddle[:2])
+    if equations.sparse:
+        return sparse
+    solution, acceleration = equations.dense(), ca.vertcat(*q.gamma(2))
+    multipliers = ca.substitute(r.multipliers, acceleration, solution)
+    dense = equations.function("accelerations", equations.state, [solution, multipliers])
+    return min(sparse, dense, key=operations)

@@ -1,0 +1,338 @@
+"""Minimal coordinates: only as many values are integrated as the program leaves free, the others are solved.
+
+At level j the invariants ψ_a^(j-o_a) = 0 of all rows of order o_a <= j determine as many components of γ^(j) (at level
+0, with the kinematics' own invariants, of q) as there are rows; the others, Σ o_a in all, are integrated. Which ones is
+chosen by pivoted QR, and anew when the choice degrades. Nothing is left to drift.
+"""
+
+import numpy as np
+
+from servoctl.errors import IntegrationStopped, SpecificationError
+from servoctl.reduction.ranks import equilibrate
+
+REACH = 2.0  # times as fast as the integrated values may the solved ones move before the choice is made anew
+BETTER = 2.0  # by how much another choice must be slower
+ITERATIONS, HALVINGS = 12, 40
+CONVERGED = 1e-10  # relative: the Newton step after which the next is below rounding
+ROUNDING = 1e-7  # relative: steps below this that shrink no more are rounding
+
+
+class Sizes:
+    """Usual sizes of the entries of X, and factors that make the columns of the invariants' Jacobian comparable.
+
+    They come from the points where ranks were decided, which lie about the guess in all directions: at one state a
+    column may vanish by chance.
+
+    Parameters
+    ----------
+    model : Model
+        As it was derived: the points of its variants lie near one state.
+
+    Attributes
+    ----------
+    columns, usual : (n_x,) arrays
+    """
+
+    def __init__(self, model):
+        top, points = model.reduction.top, model.reduction.points
+        x = np.vstack([points.jet(k) for k in range(top)]).astype(float)
+        m = len(model.invariant_names())
+        y = model.function("invariants").grid(np.asarray(points.t, dtype=float), x, model.parameters)[m:]
+        slopes = np.nan_to_num(np.abs(y)).max(axis=1).reshape(len(x), m).T
+        self.columns, self.usual = np.ones(len(x)), np.ones(len(x))
+        for rows, columns in levels(model):
+            scale = equilibrate(slopes[np.ix_(rows, columns)])[2].astype(float)
+            self.columns[columns] = scale
+            self.usual[columns] = scale * (np.abs(x[columns]).max(axis=1) / scale).max()
+
+
+def levels(model):
+    """Indices of the invariants and of the entries of X at each level."""
+    rows = np.array([level for level, _ in model.invariant_names()], dtype=int)
+    entries = np.repeat(np.arange(model.reduction.top), [model.nq, *[model.n] * (model.reduction.top - 1)])
+    return [(np.flatnonzero(rows == j), np.flatnonzero(entries == j)) for j in range(model.reduction.top)]
+
+
+class Chart:
+    """The entries of the state X that are integrated, and the others as functions of them.
+
+    Parameters
+    ----------
+    model : Model
+    sizes : Sizes
+    t : float
+    x : (n_x,) array
+        The state where the entries are chosen first.
+
+    Attributes
+    ----------
+    free, solved : (n,) arrays of int
+        Indices of the integrated and of the solved entries.
+    """
+
+    def __init__(self, model, sizes, t, x):
+        self.ode, self.p = model.function("ode"), model.parameters
+        self._invariants, self._model = model.function("invariants"), model
+        self.n_x, self.m = len(model.state_names), len(model.invariant_names())
+        self.blocks, self.columns, self.usual = levels(model), sizes.columns, sizes.usual
+        self.choose(t, x)
+
+    def invariants(self, t, x):
+        """Values (m,) and Jacobian (m, n_x) of the invariants, columns and rows scaled."""
+        y = self._invariants(t, x, self.p)
+        jacobian = y[self.m :].reshape(self.n_x, self.m).T * self.columns
+        rows = np.abs(jacobian).max(axis=1, initial=0.0)
+        rows = np.where(rows > 0, rows, 1.0)
+        return y[: self.m] / rows, jacobian / rows[:, None]
+
+    def choose(self, t, x):
+        """Choose the entries to be integrated: those that pivoted QR leaves over at each level."""
+        from scipy.linalg import qr
+
+        _, jacobian = self.invariants(t, x)
+        solved = [
+            columns[qr(jacobian[np.ix_(rows, columns)], mode="r", pivoting=True)[1][: len(rows)]]
+            for rows, columns in self.blocks
+            if len(rows)
+        ]
+        self.solved = np.sort(np.concatenate([*solved, np.zeros(0, dtype=int)])).astype(int)
+        self.free = np.setdiff1d(np.arange(self.n_x), self.solved)
+        self.sign = np.linalg.slogdet(jacobian[:, self.solved])[0]
+
+    def reach(self, t, x):
+        """How many times as fast as the integrated values the solved ones move, at most, at their own level."""
+        _, jacobian = self.invariants(t, x)
+        largest = 0.0
+        for rows, columns in self.blocks:
+            solved, free = (np.intersect1d(columns, which) for which in (self.solved, self.free))
+            if len(rows) and len(free):
+                try:
+                    slopes = np.linalg.solve(jacobian[np.ix_(rows, solved)], jacobian[np.ix_(rows, free)])
+                except np.linalg.LinAlgError:
+                    return np.inf
+                largest = max(largest, float(np.abs(slopes).max()))
+        return largest
+
+    def improved(self, t, x):
+        """Choose anew where the choice has degraded and another is better; whether it was changed."""
+        before = self.reach(t, x)
+        if before <= REACH:
+            return False
+        old = self.free, self.solved, self.sign
+        self.choose(t, x)
+        if self.reach(t, x) * BETTER < before:
+            return True
+        self.free, self.solved, self.sign = old
+        return False
+
+    def lift(self, t, y, near):
+        """The state X with the integrated values y, by Newton's method from a state near by; nan where it fails."""
+        x = np.array(near, dtype=float)
+        x[self.free] = y
+        columns, last = self.columns[self.solved], np.inf
+        for _ in range(ITERATIONS):
+            values, jacobian = self.invariants(t, x)
+            matrix = jacobian[:, self.solved]
+            try:
+                step = np.linalg.solve(matrix, -values)
+            except np.linalg.LinAlgError:
+                break
+            x[self.solved] += columns * step
+            size = np.abs(columns * step / np.maximum(np.abs(x), self.usual)[self.solved]).max(initial=0.0)
+            if not np.isfinite(size):
+                break
+            if size <= CONVERGED or 0.3 * last < size <= ROUNDING:
+                return x if np.linalg.slogdet(matrix)[0] == self.sign else np.full(self.n_x, np.nan)
+            last = size
+        return np.full(self.n_x, np.nan)
+
+    def rates(self, t, x):
+        """y' at a state."""
+        return self.ode(t, x, self.p)[self.free]
+
+    def jacobian(self, t, x):
+        """∂y'/∂y at a state: ∂X'/∂X along the invariants."""
+        slopes = self._model.function("ode_jacobian")(t, x, self.p).reshape(self.n_x, self.n_x).T
+        _, rows = self.invariants(t, x)
+        tangent = np.zeros((self.n_x, len(self.free)))
+        tangent[self.free, np.arange(len(self.free))] = 1.0
+        moved = np.linalg.solve(rows[:, self.solved], rows[:, self.free] / self.columns[self.free])
+        tangent[self.solved] = -self.columns[self.solved, None] * moved
+        return slopes[self.free] @ tangent
+
+    def weakest(self, t, x, span, tableau, pivot):
+        """Where a pivot is least within a span from a state: t, X and its size there, zero where X ends to exist.
+
+        Parameters
+        ----------
+        t, x, span : float, (n_x,) array, float
+        tableau : tuple
+        pivot : int
+            Its place among those that "ode" logs.
+        """
+        from scipy.optimize import minimize_scalar
+
+        def state(part):
+            return self._step(t, x, part * span, *tableau)
+
+        def size(part):
+            return np.nan_to_num(abs(self.ode(t + part * span, state(part), self.p)[self.n_x + pivot]))
+
+        found = minimize_scalar(size, bounds=(0.0, 1.0), method="bounded", options={"xatol": 1e-12})
+        part = found.x
+        if not np.all(np.isfinite(state(part))):
+            part, beyond = 0.0, found.x
+            while beyond - part > 1e-12:
+                middle = (part + beyond) / 2
+                part, beyond = (middle, beyond) if np.all(np.isfinite(state(middle))) else (part, middle)
+        return t + part * span, state(part), found.fun
+
+    def steps(self, t0, x, h, count, tableau):
+        """Explicit Runge-Kutta steps, fewer than `count` where no state is found.
+
+        Returns
+        -------
+        states : (n_x, N + 1) array
+        changed : (N,) array of bool
+            Before which steps the choice was changed.
+        """
+        x = self.lift(t0, x[self.free], x)
+        states, changed = [x], []
+        for i in range(count):
+            t = t0 + i * h
+            change = self.improved(t, x)
+            x = self._step(t, x, h, *tableau)
+            if not np.all(np.isfinite(x)):
+                break
+            states.append(x)
+            changed.append(change)
+        return np.array(states).T, np.array(changed, dtype=bool)
+
+    def _step(self, t, x, h, a, b, c):
+        y, slopes, near = x[self.free], np.zeros((len(b), len(self.free))), x
+        for i in range(len(b)):
+            near = self.lift(t + c[i] * h, y + h * (a[i, :i] @ slopes[:i]), near)
+            slopes[i] = self.rates(t + c[i] * h, near)
+        return self.lift(t + h, y + h * (b @ slopes), near)
+
+
+class MinimalSolver:
+    """One of scipy's one-step methods on minimal coordinates, with the states X that the other solvers have.
+
+    Parameters
+    ----------
+    method : type
+        Of a scipy.integrate.OdeSolver.
+    model : Model
+    sizes : Sizes
+    t, x, bound : float, (n_x,) array, float
+        As of the method itself.
+    options : dict
+        Tolerances.
+    implicit : bool
+        Whether the method takes a Jacobian.
+    """
+
+    def __init__(self, method, model, sizes, t, x, bound, options, implicit):
+        self.method, self.bound, self.options, self.implicit = method, bound, options, implicit
+        self.chart, self.changes, self.done = Chart(model, sizes, t, x), 0, np.zeros(3, dtype=int)
+        self.t, self.y = t, self.chart.lift(t, x[self.chart.free], x)
+        self._start()
+
+    def _start(self, **first):
+        chart = self.chart
+        exact = {"jac": lambda t, y: chart.jacobian(t, self._lift(t, y))} if self.implicit else {}
+        options = {**self.options, **exact, **first}
+        self.solver = self.method(self._rates, self.t, self.y[chart.free], self.bound, **options)
+
+    def _lift(self, t, y):
+        return self.chart.lift(t, y, self.y)
+
+    def _rates(self, t, y):
+        return self.chart.rates(t, self._lift(t, y))
+
+    @property
+    def status(self):
+        """Of the method."""
+        return self.solver.status
+
+    @property
+    def work(self):
+        """(nfev, njev, nlu) over all choices of coordinates."""
+        return self.done + (self.solver.nfev, self.solver.njev, self.solver.nlu)
+
+    nfev, njev, nlu = (property(lambda self, i=i: self.work[i]) for i in range(3))
+
+    def step(self):
+        """One step of the method, before it a change of coordinates where that is due; half as long where X is lost."""
+        if self.chart.improved(self.t, self.y):
+            self.done, self.changes = self.work, self.changes + 1
+            self._start()
+        for _ in range(HALVINGS):
+            message = self.solver.step()
+            if self.solver.status == "failed":
+                break
+            self._dense, length = self.solver.dense_output(), self.solver.t - self.t
+            middle = self._lift(self.t + length / 2, self._dense(self.t + length / 2))
+            if np.all(np.isfinite(middle)):
+                self._before = self.t, self.y
+                self.t, self.y = self.solver.t, self.chart.lift(self.solver.t, self.solver.y, middle)
+                break
+            self.done = self.work
+            self._start(first_step=abs(length) / 2)
+        return message
+
+    def dense_output(self):
+        """X as a function of time within the last step."""
+        inner, (t0, x0), t1, x1 = self._dense, self._before, self.t, self.y
+        slope = (x1 - x0) / (t1 - t0) if t1 != t0 else np.zeros_like(x1)
+        return lambda s: self._between(s, inner(s), x0 + (s - t0) * slope)
+
+    def _between(self, t, y, near):
+        x = self.chart.lift(t, y, near)
+        if not np.all(np.isfinite(x)):
+            raise IntegrationStopped(
+                f"The constraints have no solution that Newton's method finds at t = {t:.7g} s, within a step.",
+                "The values that are not integrated are solved from the constraints.",
+                nearest="drift='project', which solves nothing inside a step.",
+                do="Tighten rtol, or project.",
+                t=float(t),
+            )
+        return x
+
+
+def require_minimal(model, method, methods):
+    """Refuse minimal coordinates with a method that cannot take them.
+
+    Parameters
+    ----------
+    model : Model
+    method : str
+    methods : sequence of str
+        Those that can.
+
+    Raises
+    ------
+    SpecificationError
+    """
+    given = f"drift='minimal' was given with method={method!r}"
+    if model.flat and method != "algebraic":
+        raise SpecificationError(
+            f"{given} for a program that determines the motion completely.",
+            "Without free initial values nothing is left to integrate: each instant is a Newton solve.",
+            nearest="method='algebraic'.",
+            do="Leave the method out.",
+            free=0,
+        )
+    if method not in ("algebraic", *methods):
+        why = (
+            "The choice of coordinates changes along the motion, which past states and loops outside would not notice."
+        )
+        if method == "Taylor":
+            why = "The series give every jet from the rows themselves: nothing is solved for the remaining ones."
+        raise SpecificationError(
+            f"{given}.",
+            why,
+            nearest=f"One of {', '.join(methods)}; or drift='project'.",
+            do="Change one of them.",
+        )

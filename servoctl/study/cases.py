@@ -1,0 +1,200 @@
+"""Cases of a sweep: grids, random draws, tables of columns; plain dicts of parameters."""
+
+import itertools
+import math
+from collections.abc import Mapping
+
+from servoctl.errors import SpecificationError
+
+DRAWS, CASES = 0, 1  # first spawn key: random numbers of the parameters, and those that a case draws for itself
+RESERVED = ("case", "error", "message", "facts", "rng")
+
+
+def grid(**values):
+    """All combinations of values: the last name varies fastest.
+
+    Parameters
+    ----------
+    **values : sequence of float
+        Values of each parameter by name, SI; a single number is kept fixed.
+
+    Returns
+    -------
+    list of dict
+
+    Raises
+    ------
+    SpecificationError
+        For an empty sequence.
+    """
+    columns = {name: _column(name, value) for name, value in values.items()}
+    return [dict(zip(columns, row, strict=True)) for row in itertools.product(*columns.values())]
+
+
+def monte_carlo(n, /, *, seed, **distributions):
+    """Random cases; case i depends on the seed and on i alone, so that more cases begin with the same ones.
+
+    Parameters
+    ----------
+    n : int
+        Number of cases.
+    seed : int
+        Of the random numbers.
+    **distributions : number, callable or frozen distribution of scipy.stats
+        By parameter: a number is kept fixed, `rng -> number` is called with a numpy Generator, and a distribution is
+        drawn from. Each name has a stream of its own: one more name changes none of the others.
+
+    Returns
+    -------
+    list of dict
+
+    Raises
+    ------
+    SpecificationError
+        If n or the seed is no whole number, or a distribution is none of the above.
+    """
+    n, seed = whole("n", n), whole("seed", seed)
+    draws = {name: _draw(name, distribution) for name, distribution in distributions.items()}
+    return [{name: draw(generator(seed, DRAWS, i, name)) for name, draw in draws.items()} for i in range(n)]
+
+
+def generator(seed, kind, index, name=""):
+    """The numpy Generator of one case, whatever cases come before it and wherever they run.
+
+    Parameters
+    ----------
+    seed : int
+    kind : int
+        `DRAWS` or `CASES`.
+    index : int
+        Of the case.
+    name : str
+        Of the parameter that is drawn.
+
+    Returns
+    -------
+    numpy.random.Generator
+    """
+    import numpy as np
+
+    return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(kind, index, *name.encode())))
+
+
+def as_cases(cases):
+    """Cases in the order given, each a dict of plain values.
+
+    Parameters
+    ----------
+    cases : sequence of dict, or dict of sequences
+        One dict of parameters per case, or one column per parameter.
+
+    Returns
+    -------
+    list of dict
+        With values of Python's own kinds.
+
+    Raises
+    ------
+    SpecificationError
+        For no case, columns of different lengths, cases of different names, a value that is no number or text.
+    """
+    if isinstance(cases, Mapping):
+        columns = {name: _column(name, values) for name, values in cases.items()}
+        lengths = {name: len(column) for name, column in columns.items()}
+        if len(set(lengths.values())) > 1:
+            raise SpecificationError(
+                f"The columns of the cases have the lengths {', '.join(f'{n}: {k}' for n, k in lengths.items())}.",
+                "A dict of columns has one value per case in each.",
+                nearest="grid(...) gives all combinations.",
+                do="Give columns of one length, or a grid.",
+                lengths=lengths,
+            )
+        cases = [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]
+    found = [_case(i, case) for i, case in enumerate(cases)]
+    if not found:
+        raise SpecificationError(
+            "There is no case.", "A sweep needs at least one.", nearest="grid(m=[1.0, 2.0]) has two.", do="Add cases."
+        )
+    for i, case in enumerate(found):
+        if set(case) != set(found[0]):
+            raise SpecificationError(
+                f"Case {i} has the parameters {', '.join(case)}, case 0 {', '.join(found[0])}.",
+                "All cases of a sweep have the same parameters, so that they form one table.",
+                do="Give every case every parameter.",
+                case=i,
+            )
+    return found
+
+
+def whole(name, value):
+    """A whole number that is not negative, or an error that names it."""
+    try:
+        number = int(value)
+    except (TypeError, ValueError, OverflowError):
+        number = -1
+    if number < 0 or number != value:
+        raise SpecificationError(
+            f"{name} is {value!r}.", f"{name} is a whole number, 0 or more.", do=f"Give such a {name}.", value=value
+        )
+    return number
+
+
+def plain(value):
+    """A number, text or truth value of Python's own kinds, or None."""
+    value = value.item() if getattr(value, "ndim", None) == 0 else value
+    return value if isinstance(value, (bool, int, float, str)) else None
+
+
+def _case(i, case):
+    if not isinstance(case, Mapping):
+        raise SpecificationError(
+            f"Case {i} is {case!r}.", "A case is a dict of parameters.", nearest='{"m_load": 100.0}.', case=i
+        )
+    found = {}
+    for name, value in case.items():
+        if not isinstance(name, str) or not name.isidentifier() or name in RESERVED:
+            raise SpecificationError(
+                f"Case {i} has a parameter named {name!r}.",
+                f"A parameter's name is a word, and none of {', '.join(RESERVED)}.",
+                do="Choose another name.",
+                name=name,
+            )
+        found[name] = plain(value)
+        if found[name] is None or (isinstance(found[name], float) and not math.isfinite(found[name])):
+            raise SpecificationError(
+                f"Parameter {name} of case {i} is {value!r}.",
+                "A parameter is a finite number, a text, or True or False: it stands in one cell of a table.",
+                do="Give an index or a name, and look up what it stands for inside the case.",
+                name=name,
+                case=i,
+            )
+    return found
+
+
+def _column(name, values):
+    if isinstance(values, str) or not hasattr(values, "__iter__"):
+        return [values]
+    column = list(values)
+    if not column:
+        raise SpecificationError(
+            f"{name} has no values.", "Each parameter of a grid or table has at least one.", do="Add some.", name=name
+        )
+    return column
+
+
+def _draw(name, distribution):
+    if plain(distribution) is not None:
+        return lambda rng: distribution
+    if hasattr(distribution, "rvs"):
+        return lambda rng: plain(distribution.rvs(random_state=rng))
+    if hasattr(distribution, "sample"):
+        return lambda rng: plain(distribution.sample(rng=rng))
+    if callable(distribution):
+        return distribution
+    raise SpecificationError(
+        f"The distribution of {name} is {distribution!r}.",
+        "A distribution is a number, a function of a random generator, or a frozen distribution of scipy.stats.",
+        nearest="lambda rng: rng.normal(100.0, 5.0).",
+        do="Give one of these.",
+        name=name,
+    )

@@ -1,0 +1,231 @@
+"""Backward Euler and BDF2 on the servo DAE itself, the comparison that the literature makes."""
+
+from time import perf_counter
+
+import numpy as np
+
+from servoctl.errors import SpecificationError, unknown
+from servoctl.simulation.simulate import simulate
+from servoctl.study.study import Study, machine
+
+FORMS = {"servo": "servo_dae", "projected": "servo_dae_projected"}
+METHODS = {"BE": 1, "BDF2": 2}
+MOST_ITERATIONS, CLOSE = 15, 1e-6  # of Newton's method; what its last change of q may be relative to 1 + |q|
+LAYER = 10  # steps at the start that are left out: formulas of order p need index + p of them to forget it
+TRUNCATED, ROUNDED = 3.0, 3.0  # a step belongs to a branch of the error where it is that much above the minimum
+
+
+class DaeComparison(Study):
+    """Errors of implicit steps on the servo DAE over the step; made by `dae_comparison`.
+
+    Columns: form, method, step [s], steps, motion and force (relative errors), iterations (of Newton's method, per
+    step), seconds, message (empty unless the iteration failed).
+    """
+
+    def best(self, form, method="BE"):
+        """The step with the least error of the force, and the slopes on both sides of it.
+
+        Parameters
+        ----------
+        form : {"servo", "projected"}
+        method : {"BE", "BDF2"}
+
+        Returns
+        -------
+        dict of str to float
+            "step" [s], "force" and "motion" (errors measured there); "order" p and "rounding" r of the fit
+            C hᵖ + ε/hʳ, and "fitted_step" [s], which minimises it. NaN where the steps do not reach that far.
+
+        Raises
+        ------
+        NameUnknown
+            If there is no such row.
+        """
+        for name, value in (("form", form), ("method", method)):
+            if value not in self[name]:
+                raise unknown(value, dict.fromkeys(self[name].tolist()), name)
+        own = self.where(form=form, method=method)
+        own = own.take(np.flatnonzero(np.isfinite(own["force"])))
+        if not len(own):
+            return dict.fromkeys(("step", "force", "motion", "order", "rounding", "fitted_step"), np.nan)
+        h, error = own["step"], own["force"]
+        i = int(np.argmin(error))
+        p, C = _branch(h, error, (h > h[i]) & (error > TRUNCATED * error[i]) & (error < 0.3))
+        slope, rounding = _branch(h, error, (h < h[i]) & (error > ROUNDED * error[i]))
+        r = -slope
+        least = (r * rounding / (p * C)) ** (1 / (p + r)) if p > 0 and r > 0 else np.nan
+        found = {"step": h[i], "force": error[i], "motion": own["motion"][i]}
+        return {k: float(v) for k, v in (found | {"order": p, "rounding": r, "fitted_step": least}).items()}
+
+    def plot(self):
+        """Draw the errors of motion and force over the step.
+
+        Returns
+        -------
+        matplotlib.figure.Figure
+        """
+        from matplotlib.figure import Figure
+
+        figure = Figure(figsize=(10.0, 4.2), layout="constrained")
+        for ax, name in zip(figure.subplots(1, 2, sharex=True), ("motion", "force"), strict=True):
+            for colour, form in zip(("#0072B2", "#D55E00"), FORMS, strict=True):
+                for mark, method in zip(("o-", "s--"), METHODS, strict=True):
+                    own = self.where(form=form, method=method)
+                    if len(own):
+                        label = f"{method}, {form} form" + (" (index as it is)" if form == "servo" else "")
+                        ax.loglog(own["step"], own[name], mark, color=colour, markersize=4, label=label)
+            ax.set(xlabel="step h [s]", ylabel=f"relative error of the {name}")
+            ax.grid(alpha=0.3)
+        figure.axes[0].legend(fontsize=9)
+        return figure
+
+
+def dae_comparison(model, start, t_span, steps=None, forms=tuple(FORMS), methods=tuple(METHODS)):
+    """Integrate the servo DAE by implicit steps of fixed length, and compare with the model's own solution.
+
+    Parameters
+    ----------
+    model : Model
+    start : State or (n_x,) array
+        From `model.start`.
+    t_span : (t0, t1)
+        [s]
+    steps : sequence of float, optional
+        Steps [s], each rounded so that a whole number of them fills the span. Default: a twentieth of the span,
+        halved eleven times.
+    forms : sequence of {"servo", "projected"}
+        The servo DAE as it stands, and Blajer's projected form of lower index.
+    methods : sequence of {"BE", "BDF2"}
+        Backward Euler, and the two-step formula of order 2 begun by it.
+
+    Returns
+    -------
+    DaeComparison
+
+    Raises
+    ------
+    NameUnknown
+        For another form or method.
+    SpecificationError
+        If a step is not positive, or the program holds derivatives above velocities.
+
+    Notes
+    -----
+    Each step is solved by Newton's method with the exact Jacobian until rounding stops it. The constraint is met to
+    rounding ε, and each of the r differentiations that the force needs divides by h: its error is C hᵖ + ε/hʳ, with a
+    step of least error that no tolerance improves.
+    """
+    for names, known, what in ((forms, FORMS, "form"), (methods, METHODS, "method")):
+        for name in names:
+            if name not in known:
+                raise unknown(name, known, what)
+    t0, t1 = t_span
+    steps = (t1 - t0) / 20.0 / 2.0 ** np.arange(12) if steps is None else np.atleast_1d(np.asarray(steps, dtype=float))
+    if not np.all(steps * (t1 - t0) > 0):
+        raise SpecificationError(
+            f"steps={steps.tolist()} were given over {t0:g} .. {t1:g} s.",
+            "Steps are positive and lead from the start to the end.",
+            do="Give [0.1, 0.01].",
+        )
+    rows = []
+    for step in steps:
+        count = max(2, round((t1 - t0) / step))
+        t = np.linspace(t0, t1, count + 1)
+        reference, first = _reference(model, start, t)
+        for form in forms:
+            for method in methods:
+                rows.append({"form": form, "method": method, **_integrated(model, form, method, t, reference, first)})
+    columns = {name: [row[name] for row in rows] for name in rows[0]}
+    meta = {"t_span": [float(t0), float(t1)], "index": str(model.structure().index), "machine": machine()}
+    study = DaeComparison("daecomparison", columns, meta)
+    meta["best"] = {f"{form} {method}": study.best(form, method) for form in forms for method in methods}
+    parts = (f"{name}: h = {b['step']:.2g} s, error {b['force']:.1e}" for name, b in meta["best"].items())
+    meta["message"] = "least error of the force: " + "; ".join(parts)
+    return study
+
+
+def _reference(model, start, t):
+    """(q, γ', μ) of the model's own solution, (nq + n + b, N), and all jets at its start."""
+    options = {} if model.flat else {"method": "Taylor", "drift": "project", "rtol": 1e-13, "atol": 1e-14}
+    run = simulate(model, start, (t[0], t[-1]), t_eval=t, progress=False, **options)
+    columns = np.searchsorted(run.t, t - 1e-12 * (t[-1] - t[0]))
+    forces = run.signals("all_multipliers")[1]
+    return np.vstack([run.jets[: model.nq + model.n], forces])[:, columns], run.jets[: len(model.jet_names), columns[0]]
+
+
+def _integrated(model, form, method, t, reference, first):
+    f = model.function(FORMS[form])
+    rates = np.zeros(model.nq + model.n)
+    if not np.all(np.isfinite(f(t[0], reference[:, 0], np.concatenate([model.parameters, [1.0], rates])))):
+        f = model.near(t[0], first).function(FORMS[form])  # pivots of the projection vanish at the start
+    began = perf_counter()
+    z, iterations = _march(f, model, METHODS[method], t, reference[:, 0])
+    seconds = perf_counter() - began
+    nq, moving = model.nq, model.nq + model.n
+    k = moving + len(model.reduction.program.residuals)
+    done = z.shape[1]
+    failed = done < len(t)
+    after = slice(min(LAYER, (len(t) - 1) // 2), done)
+    errors = np.abs(z - reference[:, :done])[:, after]
+    sizes = np.abs(reference).max(axis=1)
+
+    def relative(part):
+        worst = errors[part].max(axis=1, initial=0.0)
+        return np.nan if failed else float((worst / np.where(sizes[part] > 0, sizes[part], 1.0)).max())
+
+    return {
+        "step": float(t[1] - t[0]),
+        "steps": len(t) - 1,
+        "motion": relative(slice(0, nq)),
+        "force": relative(slice(moving, k)),
+        "iterations": iterations / max(done - 1, 1),
+        "seconds": seconds,
+        "message": f"Newton's method fails at t = {t[done]:.4g} s" if failed else "",
+    }
+
+
+def _march(f, model, order, t, z0):
+    """States (N, M) at the first M times, all of them unless an iteration fails, and the iterations made."""
+    moving, h = model.nq + model.n, t[1] - t[0]
+    past, z, total = [z0], [z0], 0
+    for k in range(1, len(t)):
+        if order == 1 or k == 1:
+            weights = (1.0, -1.0)
+        else:
+            weights = (1.5, -2.0, 0.5)
+        history = sum(w * x[:moving] for w, x in zip(weights[1:], reversed(past), strict=False)) / h
+        p = np.concatenate([model.parameters, [weights[0] / h], history])
+        found, iterations = _newton(f, t[k], z[-1], p, model.nq)
+        total += iterations
+        if found is None:
+            break
+        z.append(found)
+        past = [*past[-1:], found]
+    return np.array(z).T, total
+
+
+def _newton(f, t, z, p, nq):
+    """The solution from a guess, or None, and the iterations made: until the change of q no longer shrinks."""
+    n, last = len(z), np.inf
+    for iteration in range(1, MOST_ITERATIONS + 1):
+        y = f(t, z, p)
+        try:
+            change = np.linalg.solve(y[n:].reshape(n, n).T, y[:n])
+        except np.linalg.LinAlgError:
+            return None, iteration
+        z = z - change
+        size = (np.abs(change[:nq]) / (1.0 + np.abs(z[:nq]))).max()
+        if not np.isfinite(size):
+            return None, iteration
+        if size <= 1e-15 or (iteration > 2 and size > last / 2 and size < CLOSE):
+            return z, iteration
+        last = size
+    return (z if last < CLOSE else None), MOST_ITERATIONS
+
+
+def _branch(h, error, own):
+    """Slope and factor of error = factor · h^slope on some of the points; NaN for fewer than two."""
+    if own.sum() < 2:
+        return np.nan, np.nan
+    slope, logarithm = np.polyfit(np.log(h[own]), np.log(error[own]), 1)
+    return slope, np.exp(logarithm)

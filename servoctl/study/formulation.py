@@ -1,0 +1,146 @@
+"""What a formulation costs: (3.18), which needs no multipliers, against the equations with them."""
+
+from time import perf_counter
+
+import numpy as np
+
+from servoctl.errors import SpecificationError, unknown
+from servoctl.model.model import derive
+from servoctl.study.study import Study, machine
+
+NAMES = {
+    "eliminated": "(3.18)",
+    "sparse": "multipliers, sparse elimination",
+    "qr": "multipliers, dense QR (ca.solve)",
+    "assembly": "multipliers, dense LU (LAPACK)",
+}
+POINTS, REPEATED = 300, 5  # states at which accelerations are evaluated, and how often: the least time counts
+FEW = 20  # states where nothing is timed: not enough to compile for
+SEED = 3
+
+
+class FormulationCost(Study):
+    """Operations and time of one evaluation of the accelerations; made by `formulation_cost`.
+
+    Columns: n, k, formulation, operations (of γ''), with_forces (of γ'' and the multipliers), microseconds (of γ'', in
+    a loop; NaN where it was not timed), difference (of γ'' from the first formulation, relative).
+    """
+
+    def table(self):
+        """The operations as a table in Markdown: one line for each n and k, a column for each formulation.
+
+        Returns
+        -------
+        str
+        """
+        names = list(dict.fromkeys(self["formulation"].tolist()))
+        lines = ["| n | k | " + " | ".join(names) + " |", "|---" * (2 + len(names)) + "|"]
+        for n, k in dict.fromkeys(zip(self["n"].tolist(), self["k"].tolist(), strict=True)):
+            own = self.where(n=n, k=k)
+            cells = [f"{row['operations']:,} / {row['with_forces']:,}" for row in own.rows()]
+            lines.append(f"| {n} | {k} | " + " | ".join(cells) + " |")
+        return "\n".join(lines)
+
+    def plot(self):
+        """Draw operations and times over n, for the largest k of each.
+
+        Returns
+        -------
+        matplotlib.figure.Figure
+        """
+        from matplotlib.figure import Figure
+
+        figure = Figure(figsize=(10.0, 4.2), layout="constrained")
+        largest = {int(n): int(self.where(n=n)["k"].max()) for n in np.unique(self["n"])}
+        keep = [i for i, (n, k) in enumerate(zip(self["n"], self["k"], strict=True)) if k == largest[int(n)]]
+        own = self.take(keep)
+        labels = {"operations": "operations for γ''", "microseconds": "time of one evaluation [µs]"}
+        for ax, name in zip(figure.subplots(1, 2, sharex=True), labels, strict=True):
+            for i, how in enumerate(dict.fromkeys(own["formulation"].tolist())):
+                part = own.where(formulation=how)
+                ax.loglog(part["n"], part[name], "osDv"[i % 4] + "-", label=how)
+            ax.set(xlabel="n, with the most constraints k", ylabel=labels[name])
+            ax.grid(alpha=0.3)
+        figure.axes[0].legend(fontsize=9)
+        return figure
+
+
+def formulation_cost(build, cases, formulations=tuple(NAMES), timed=True):
+    """Count and time the accelerations of the same mechanisms in every formulation.
+
+    Parameters
+    ----------
+    build : callable
+        build(n, k) returns (Mechanism, Program); n and k are the family's own sizes.
+    cases : sequence of (n, k)
+    formulations : sequence of {"eliminated", "sparse", "qr", "assembly"}
+        (3.18), and the equations with multipliers by sparse symbolic elimination, by CasADi's `solve`, and assembled
+        for LAPACK. The first is the one others are compared with.
+    timed : bool
+        Whether to compile and time them; operations are counted without.
+
+    Returns
+    -------
+    FormulationCost
+
+    Raises
+    ------
+    SpecificationError
+        If there is no case, or the accelerations of one do not follow from its state.
+    NameUnknown
+        For another formulation.
+
+    Notes
+    -----
+    Operations are those of the compiled functions, the same on every machine. Of the dense LU they are those of the
+    assembly and 2N³/3 + 2N² of the solution for N accelerations and multipliers.
+    """
+    for how in formulations:
+        if how not in NAMES:
+            raise unknown(how, NAMES, "formulation")
+    cases = [(int(n), int(k)) for n, k in cases]
+    if not cases:
+        raise SpecificationError("No case was given.", "A study has at least one row.", do="Give [(4, 2)].")
+    rows = [row for n, k in cases for row in _measured(n, k, derive(*build(n, k)), formulations, timed)]
+    columns = {name: [row[name] for row in rows] for name in rows[0]}
+    return FormulationCost("formulationcost", columns, {"points": POINTS, "machine": machine()})
+
+
+def _measured(n, k, model, formulations, timed):
+    rng = np.random.default_rng(SEED)
+    points = POINTS if timed else FEW
+    t, x = np.zeros(points), rng.uniform(0.2, 1.2, (len(model.state_names), points))
+    first, rows = None, []
+    for how in formulations:
+        f = model.function(f"formulation_{how}")
+        if how == "assembly":
+            size = model.n + model.reduction.realisation.B.shape[1]
+            count = f.operations + round(2 * size**3 / 3 + 2 * size**2)
+            counts = (count, count)
+        else:
+            counts = (f.operations, model.function(f"formulation_{how}_forces").operations)
+
+        def evaluate(f=f, dense=how == "assembly"):
+            y = f.grid(t, x, model.parameters)
+            return _solved(y, model.n) if dense else y
+
+        found = evaluate()
+        seconds = min(_seconds(evaluate) for _ in range(REPEATED)) if timed else np.nan
+        first = found if first is None else first
+        difference = np.abs(found - first).max() / np.abs(first).max()
+        told = {"operations": counts[0], "with_forces": counts[1], "microseconds": 1e6 * seconds / points}
+        rows.append({"n": n, "k": k, "formulation": NAMES[how], **told, "difference": float(difference)})
+    return rows
+
+
+def _seconds(evaluate):
+    began = perf_counter()
+    evaluate()
+    return perf_counter() - began
+
+
+def _solved(y, n):
+    """γ'' from assembled systems, one after another as a simulation would."""
+    size = round((np.sqrt(1 + 4 * len(y)) - 1) / 2)
+    matrices, right = y[: size * size].T.reshape(-1, size, size).swapaxes(1, 2), y[size * size :].T
+    return np.array([np.linalg.solve(a, b) for a, b in zip(matrices, right, strict=True)]).T[:n]

@@ -1,0 +1,213 @@
+"""What a measured trade tells: the Pareto front, a recommendation, a work-precision plot."""
+
+import numpy as np
+
+from servoctl.errors import LimitExceeded, SpecificationError, unknown
+from servoctl.simulation.drift import project
+from servoctl.study.study import Study, table
+
+COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000", "#8C6D31", "#7F7F7F", "#5E3C99")
+DRIFTS = {"none": ("-", "o"), "project": ("--", "s"), "minimal": (":", "^")}  # others are time constants of poles
+POLES = ("-.", "D")
+SHOWN = 7
+
+
+class Recommendation(dict):
+    """Arguments of `simulate`, and in `row` what was measured with them; made by `TradeOff.recommend`.
+
+    `sv.simulate(model, x0, t_span, **study.recommend(error=1e-6))`
+    """
+
+    def __init__(self, options, row):
+        super().__init__(options)
+        self.row = row
+
+
+class TradeOff(Study):
+    """Errors and costs of methods, settings and treatments of drift on one motion; made by `tradeoff`.
+
+    Columns: method; drift ("none", "project", "minimal", or the time constant of the poles in s); setting ("rtol" or
+    "step") and its value; error of the motion: the largest deviation from the reference over all instants and
+    components of the state, each relative to its largest magnitude (at least 1e-3 of the largest of its level);
+    actuation: the same of the required forces and moments; residual: the largest of any constraint at any level, in
+    its unit; energy: energy gained less the work done along the reference, relative to the largest energy; power:
+    dE/dt less the power of all forces, relative (NaN where it does not apply); evaluations of the right-hand side, or
+    of the series, or Newton steps; steps; seconds: the shortest call after a warm-up; resolved: whether the error
+    exceeds the reference's own uncertainty; failure: why there is no number.
+    """
+
+    COLUMNS = (
+        "method", "drift", "setting", "value", "error", "actuation", "residual", "energy", "power", "evaluations",
+        "steps", "seconds", "resolved", "failure",
+    )  # fmt: skip
+
+    @property
+    def uncertainty(self):
+        """How far the reference and the method that verified it agree on the motion."""
+        return self.meta["reference"]["error"]
+
+    def pareto(self, cost="seconds"):
+        """The rows that no other beats in both error and cost, from cheap to accurate.
+
+        Errors below the reference's uncertainty count as equal to it.
+
+        Parameters
+        ----------
+        cost : {"seconds", "evaluations", "steps"}
+
+        Returns
+        -------
+        TradeOff
+        """
+        good, error = self._good(), self._told()
+        front, best = [], np.inf
+        for i in good[np.lexsort((error[good], self.column(_cost(cost))[good]))]:
+            if error[i] < best:
+                front.append(i)
+                best = error[i]
+        return self.take(front)
+
+    def recommend(self, *, error=None, seconds=None):
+        """What to give to `simulate`: the fastest within an error, or the most accurate within a time.
+
+        Parameters
+        ----------
+        error : float, optional
+            Largest error of the motion, relative.
+        seconds : float, optional
+            Longest time of a call [s], on the machine that measured.
+
+        Returns
+        -------
+        Recommendation
+            A dict of arguments; `.row` has what was measured.
+
+        Raises
+        ------
+        SpecificationError
+            Unless one of the two is given.
+        LimitExceeded
+            Where nothing reaches it; the nearest that does is told.
+        """
+        if (error is None) == (seconds is None):
+            raise SpecificationError(
+                f"error={error!r} and seconds={seconds!r} were given.",
+                "A recommendation answers one question: the fastest within an error, or the best within a time.",
+                do="Give recommend(error=1e-6) or recommend(seconds=1e-3).",
+            )
+        asked, limit = ("error", error) if seconds is None else ("seconds", seconds)
+        front = self.pareto()
+        reached = front._told() if asked == "error" else front["seconds"]
+        within = np.flatnonzero(reached <= limit)
+        if not len(within):
+            raise self._out_of_reach(asked, limit, front)
+        row = front.rows()[within[0] if asked == "error" else within[-1]]
+        return Recommendation(_arguments(row), row)
+
+    def _out_of_reach(self, asked, limit, front):
+        nearest = "none: every run failed, see the column failure"
+        if len(front):
+            row = front.rows()[-1 if asked == "error" else 0]
+            best = max(row["error"], self.uncertainty)
+            nearest = f"{_name(row)}: error {best:.2g} in {row['seconds']:.2g} s"
+        rule = f"The reference is itself certain to {self.uncertainty:.1g} only" if asked == "error" else ""
+        return LimitExceeded(
+            f"{asked}={limit:g} was asked for, which no setting that was measured reaches.",
+            rule or "A recommendation is one of the settings that were measured.",
+            nearest=nearest,
+            do=f"Ask for more {asked}, or measure other methods and settings by tradeoff(...).",
+            asked=limit,
+            uncertainty=self.uncertainty,
+        )
+
+    def plot(self, ax=None, cost="seconds", title=""):
+        """Draw the work-precision diagram: error of the motion over cost, a line for each method and treatment.
+
+        Parameters
+        ----------
+        ax : Axes, optional
+        cost : {"seconds", "evaluations", "steps"}
+        title : str
+
+        Returns
+        -------
+        Axes
+        """
+        from matplotlib.figure import Figure
+        from matplotlib.lines import Line2D
+
+        ax = Figure(figsize=(8.0, 5.0), layout="constrained").subplots() if ax is None else ax
+        good, told, across = self._good(), self._told(), self.column(_cost(cost))
+        methods = [str(m) for m in dict.fromkeys(self["method"][good].tolist())]
+        drifts = list(dict.fromkeys(self["drift"][good].tolist()))
+        colours = {method: COLOURS[i % len(COLOURS)] for i, method in enumerate(methods)}
+        for method in methods:
+            for drift in drifts:
+                own = [i for i in good if self["method"][i] == method and self["drift"][i] == drift]
+                line, mark = DRIFTS.get(drift, POLES)
+                ax.plot(across[own], told[own], line, marker=mark, color=colours[method], markersize=4, linewidth=1.1)
+        front = self.pareto(cost)
+        ax.plot(front[cost], front._told(), color="#BBBBBB", linewidth=6, zorder=0, solid_capstyle="round")
+        ax.scatter(front[cost], front._told(), s=60, color="#BBBBBB", zorder=0)
+        low = max(self.uncertainty, 1e-17)
+        ax.axhspan(low / 10, low, color="#EEEEEE", zorder=-1)
+        ax.set(xscale="log", yscale="log", xlabel=f"{cost} [s]" if cost == "seconds" else cost)
+        ax.set(ylabel="error of the motion, relative", title=title)
+        ax.set_ylim(low / 10, min(3.0, max(10 * told[good].max(initial=low), 100 * low)))
+        ax.grid(True, which="major", color="#DDDDDD", linewidth=0.6)
+        keys = [Line2D([], [], color=colour, label=method) for method, colour in colours.items()]
+        for drift in drifts:
+            line, mark = DRIFTS.get(drift, POLES)
+            label = {"none": "as it drifts", "project": "projected", "minimal": "minimal coordinates"}
+            keys.append(
+                Line2D([], [], color="#555555", linestyle=line, marker=mark, markersize=4,
+                       label=label.get(drift, f"poles at -1/({drift} s)"))
+            )  # fmt: skip
+        keys.append(Line2D([], [], color="#BBBBBB", linewidth=6, label="Pareto front"))
+        keys.append(Line2D([], [], color="#EEEEEE", linewidth=6, label="below the reference's\nown uncertainty"))
+        ax.legend(handles=keys, loc="center left", bbox_to_anchor=(1.01, 0.5), frameon=False, fontsize=8)
+        return ax
+
+    def _good(self):
+        return np.flatnonzero(np.isfinite(self["error"]) & np.isfinite(self["seconds"]))
+
+    def _told(self):
+        """Errors, where smaller than the reference's uncertainty that uncertainty."""
+        return np.maximum(self["error"], self.uncertainty)
+
+    def __repr__(self):
+        t0, t1 = self.meta["t_span"]
+        reference, where = self.meta["reference"], self.meta["machine"]
+        front = self.pareto()
+        shown = np.unique(np.linspace(0, len(front) - 1, min(SHOWN, len(front))).round().astype(int))
+        lines = [
+            f"Trade-off: {len(self)} rows, {len(self) - len(self._good())} without numbers; t = {t0:g} .. {t1:g} s",
+            f"  reference: {reference['method']}; {reference['verified by']} agrees to {reference['error']:.1e}, "
+            f"actuation to {reference['actuation']:.1e}",
+            f"  on {where['processor']}, {where['cores']} cores, compiler {where['compiler']}",
+            f"  fastest for each error, {len(shown)} of {len(front)}:" if len(front) else "  every run failed",
+        ]
+        names = ("method", "drift", "setting", "value", "error", "actuation", "evaluations", "seconds")
+        return "\n".join([*lines, *table(front.take(shown), names, SHOWN)])
+
+
+def _arguments(row):
+    """The arguments of `simulate` that a row was measured with."""
+    options, drift = {"method": row["method"]}, row["drift"]
+    if drift != "none":
+        word, _, every = drift.partition(" ")
+        options["drift"] = project(int(every)) if every else word if word in DRIFTS else float(drift)
+    if row["method"] != "algebraic":
+        options[row["setting"]] = row["value"]
+    return options | ({"atol": row["value"] / 100} if row["setting"] == "rtol" else {})
+
+
+def _name(row):
+    return ", ".join([row["method"], f"drift {row['drift']}", f"{row['setting']} {row['value']:g}"])
+
+
+def _cost(name):
+    costs = ("seconds", "evaluations", "steps")
+    if name not in costs:
+        raise unknown(name, costs, "cost")
+    return name

@@ -1,0 +1,314 @@
+"""The measured trade: what each method, setting and treatment of drift costs and reaches on one's own motion."""
+
+import itertools
+import sys
+import time
+import warnings
+
+import numpy as np
+
+from servoctl.errors import LimitExceeded, ServoError, SpecificationError, unknown
+from servoctl.model.compiled import compiling_at_once
+from servoctl.simulation.drift import Minimal, Poles, Project, as_drift
+from servoctl.simulation.rule import motion_error, relative_error
+from servoctl.simulation.simulate import ALL_METHODS, as_span, simulate
+from servoctl.simulation.tableaus import ORDERS
+from servoctl.study.front import TradeOff
+from servoctl.study.study import machine
+
+METHODS = tuple(name for name in ALL_METHODS if name not in ("RK1", "RK2", "RK23"))  # those need too many steps
+TOLERANCES = (1e-3, 1e-5, 1e-7, 1e-9, 1e-11, 1e-13)
+STEPS = tuple(5 * 4**k for k in range(7))  # of a fixed length, in the span
+SAMPLES, COMPARED = 51, 201  # instants that adaptive methods give, and at most so many of any run are compared
+DENSE = 1001  # instants of the reference over which its power is integrated
+TIMED, ENOUGH = 3, 0.3  # calls timed after a warm-up, unless they take this part of `seconds` together
+PATIENCE = 1.0  # s before a progress bar appears
+TIME_CONSTANT = 50  # of the default poles, in the span
+
+
+def tradeoff(model, x0, t_span, methods=None, drift=None, *, rtol=TOLERANCES, step=None, seconds=0.3, progress=None):
+    """Measure error and cost of methods, settings and treatments of drift on one motion.
+
+    The reference is made here: the Taylor method of order 16 at a tolerance of 1e-15, or Newton's method at each
+    instant where nothing is integrated. A second method verifies it; their disagreement is the reference's own
+    uncertainty, and smaller errors than that are marked as not resolved.
+
+    Main arguments
+
+    Parameters
+    ----------
+    model : Model
+    x0 : State or (n_x,) array
+        From `model.start`.
+    t_span : (t0, t1)
+        [s]
+    methods : sequence of str, optional
+        Of those that `simulate` has; default: all but "RK1", "RK2" and "RK23".
+    drift : sequence, optional
+        Treatments as `simulate` takes them; default: None, "project", "minimal" and poles at -50/(t1 - t0).
+
+    Other arguments
+
+    rtol : sequence of float
+        Tolerances of the adaptive methods; atol is a hundredth.
+    step : sequence of float, optional
+        Steps of the methods of fixed step, and spacings of the instants of "algebraic" [s]; default: (t1 - t0)/5,
+        and each next one a quarter of the one before, down to (t1 - t0)/20,480.
+    seconds : float
+        That one run may take. One that takes longer is ended, and finer settings are skipped; their rows say so.
+    progress : bool, optional
+        Show a progress bar; default: on a terminal, for work of more than a second.
+
+    Returns
+    -------
+    TradeOff
+
+    Raises
+    ------
+    ServoError
+        Where the reference cannot be had, such as SingularProgram where the motion ends.
+    SpecificationError
+        For settings that are none.
+    """
+    t0, t1 = as_span(t_span)
+    settings = {"rtol": _positive("rtol", rtol)}
+    settings["step"] = _positive("step", [abs(t1 - t0) / n for n in STEPS] if step is None else step)
+    limit = _positive("seconds", [seconds])[0]
+    drifts = (None, "project", "minimal", abs(t1 - t0) / TIME_CONSTANT) if drift is None else drift
+    combinations = _combinations(model, methods, [drifts] if isinstance(drifts, (str, float)) else drifts)
+    total = sum(len(settings[_kind(method)]) for method, _ in combinations)
+    with compiling_at_once(), _bar(total, progress) as bar, warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)  # of steps outside the stable range: the rows have what they do
+        reference = Reference(model, x0, (t0, t1), limit)
+        rows = []
+        for method, treatment in combinations:
+            for row in _ladder(reference, method, treatment, settings[_kind(method)], limit):
+                rows.append(row)
+                bar.update()
+    columns = {name: [row.get(name) for row in rows] for name in TradeOff.COLUMNS}
+    told = {"t_span": [t0, t1], "seconds": limit, "reference": reference.told, "machine": machine()}
+    return TradeOff("tradeoff", columns, {**told, "measured": time.strftime("%Y-%m-%d")})
+
+
+class Reference:
+    """The motion against which others are measured, at any instants.
+
+    Parameters
+    ----------
+    model : Model
+    x0 : State or (n_x,) array
+    t_span : (t0, t1)
+        [s]
+    seconds : float
+        That one run may take; the verification may take ten times as long.
+
+    Attributes
+    ----------
+    told : dict
+        The two methods, and how far they agree on motion and actuation.
+    """
+
+    def __init__(self, model, x0, t_span, seconds):
+        self.model, self.start, self.span, self._known = model, x0, t_span, {}
+        self.knots = [k for k in model.require_smooth((min(t_span), max(t_span))) if min(t_span) < k < max(t_span)]
+        self.times = np.union1d(np.linspace(*t_span, SAMPLES), self.knots)
+        own = {"method": "Taylor", "drift": "project", "rtol": 1e-15, "atol": 1e-15, "order": 16}
+        checks = [{"method": "DOP853", "drift": "project", "rtol": 3e-14, "atol": 1e-15}]
+        checks += [{"method": "Taylor", "drift": "project", "rtol": 1e-14, "atol": 1e-14, "order": 12}]
+        self.options, checks = ({"method": "algebraic"}, checks[::-1]) if model.flat else (own, checks)
+        self.told = self._verified(checks, seconds)
+
+    def _verified(self, checks, seconds):
+        """The agreement with the first other method that comes to the end in time."""
+        exact = self.at(self.times)
+        dense = np.union1d(np.linspace(*self.span, DENSE), self.knots)
+        for options in checks:
+            late = Deadline(10 * seconds)
+            try:
+                run = simulate(self.model, self.start, self.span, t_eval=self.times, progress=late, **options)
+            except ServoError as error:
+                failure = error
+                continue
+            return {
+                "method": _said(self.options),
+                "verified by": _said(options),
+                "error": motion_error(self.model, run.jets, exact.jets),
+                "actuation": relative_error(actuation(run), actuation(exact)),
+                "energy": _energy_balance(self.at(dense), self.knots),
+            }
+        raise failure
+
+    def at(self, times):
+        """The run with samples at these times (N,) [s]."""
+        key = times.tobytes()
+        if key not in self._known:
+            self._known[key] = simulate(self.model, self.start, self.span, t_eval=times, **self.options)
+        return self._known[key]
+
+
+class Deadline:
+    """What `simulate` takes as progress to end a run that takes more than some seconds from its first step on."""
+
+    def __init__(self, seconds):
+        self.seconds, self.since = seconds, None
+
+    def __call__(self, t):
+        """Raise LimitExceeded where the time is over."""
+        now = time.perf_counter()
+        self.since = self.since or now
+        if now - self.since > self.seconds:
+            raise LimitExceeded(f"More than {self.seconds:g} s: ended at t = {t:.4g} s", seconds=self.seconds, t=t)
+
+
+def actuation(run):
+    """Forces and moments that realise the program, of actuators or of the ideal reaction, (n, N)."""
+    return run.signals("inputs")[1]
+
+
+# --- one run
+
+
+def _ladder(reference, method, treatment, settings, seconds):
+    """A row for each setting, from coarse to fine, until finer ones are too slow or cannot be told from exact."""
+    over, name = "", _kind(method)
+    for value in sorted(settings, reverse=True):
+        row = {"method": method, "drift": _label(treatment), "setting": name, "value": value, "failure": over}
+        if not over:
+            try:
+                row |= _measured(reference, _options(method, treatment, value), seconds)
+                if not row["resolved"]:
+                    over = f"skipped: {name} = {value:g} reaches what the reference is certain to"
+                elif row["seconds"] > seconds:
+                    over = f"skipped: {name} = {value:g} took {row['seconds']:.2g} s, more than {seconds:g} s"
+            except SpecificationError as error:  # no setting makes sense of this combination: one row says so
+                yield row | {"value": np.nan, "failure": str(error)}
+                return
+            except ServoError as error:
+                row["failure"] = f"{type(error).__name__}: {error}"
+                if "seconds" in error.details:
+                    over = f"skipped: {name} = {value:g} took more than {seconds:g} s"
+        yield row
+
+
+def _measured(reference, options, seconds):
+    """Errors, counts and time of one setting."""
+    model, (t0, t1) = reference.model, reference.span
+    if options["method"] == "algebraic":
+        instants = np.linspace(t0, t1, 1 + round(abs(t1 - t0) / options.pop("step")))
+        options["t_eval"] = np.union1d(instants, reference.knots)
+    elif "step" not in options:
+        options["t_eval"] = reference.times
+
+    def once():
+        return simulate(model, reference.start, reference.span, progress=Deadline(seconds), **options)
+
+    run, timed = once(), []
+    for _ in range(TIMED):
+        since = time.perf_counter()
+        once()
+        timed.append(time.perf_counter() - since)
+        if sum(timed) > ENOUGH * seconds:
+            break
+    return _errors(reference, run) | {
+        "evaluations": run.counters.get("nfev", run.counters.get("iterations", 0)),
+        "steps": run.counters.get("steps", len(run.t)),
+        "seconds": min(timed),
+    }
+
+
+def _errors(reference, run):
+    some = np.unique(np.linspace(0, len(run.t) - 1, COMPARED).round().astype(int))
+    exact = reference.at(np.sort(run.t[some]))
+    error = motion_error(reference.model, run.jets[:, some], exact.jets)
+    rate, work, size, law = run.signals("power")[1]
+    largest = max(np.abs(size).max(), np.abs(rate).max(), 1e-300)
+    lawful = np.abs(law).max() < 1e-9 * largest
+    energy, exact_energy = run["energy"][some], exact["energy"]
+    drifted = np.abs((energy - energy[0]) - (exact_energy - exact_energy[0])).max()
+    return {
+        "error": error,
+        "actuation": relative_error(actuation(run)[:, some], actuation(exact)),
+        "residual": max((float(np.abs(levels).max(initial=0.0)) for levels in run.residual.values()), default=0.0),
+        "energy": float(drifted / max(np.abs(exact_energy).max(), 1e-300)),
+        "power": float(np.abs(rate - work).max() / largest) if lawful else np.nan,
+        "resolved": bool(error >= reference.told["error"]),
+    }
+
+
+def _energy_balance(run, knots):
+    """Largest difference of the energy gained and the work of all forces, relative to the energy (splines)."""
+    from scipy.interpolate import make_interp_spline
+
+    order = np.argsort(run.t)
+    t, work, energy = run.t[order], run.signals("power")[1][1][order], run["energy"][order]
+    gained, cuts = [0.0], [t[0], *knots, t[-1]]
+    for a, b in itertools.pairwise(cuts):
+        own = (t >= a) & (t <= b)
+        if own.sum() < 2:
+            return np.nan
+        spline = make_interp_spline(t[own], work[own], k=min(9, (own.sum() - 1) // 2 * 2 - 1 or 1))
+        gained += list(gained[-1] + spline.antiderivative()(t[own])[1:])
+    return float(np.abs(energy - energy[0] - gained).max() / max(np.abs(energy).max(), 1e-300))
+
+
+# --- what is asked
+
+
+def _combinations(model, methods, drifts):
+    """Pairs of method and treatment; default methods are those that the model can have."""
+    if methods is None:
+        methods = METHODS if model.flat else [name for name in METHODS if name != "algebraic"]
+    methods = [methods] if isinstance(methods, str) else list(methods)
+    for method in methods:
+        if method not in ALL_METHODS:
+            raise unknown(method, ALL_METHODS, "method")
+    treatments = [as_drift(value) for value in drifts]
+    for value in treatments:
+        if isinstance(value, Poles) and not isinstance(value.values, float):
+            raise SpecificationError(
+                "Poles by row were given.", "A row of the study tells its drift in a word.", do="Give a time constant."
+            )
+    pairs = [(m, d) for m in methods for d in treatments if m != "algebraic"]
+    return [*((m, None) for m in methods if m == "algebraic"), *pairs]
+
+
+def _kind(method):
+    return "step" if method in ("algebraic", *ORDERS) else "rtol"
+
+
+def _options(method, treatment, value):
+    setting = {"rtol": value, "atol": value / 100} if _kind(method) == "rtol" else {"step": value}
+    return {"method": method, **({"drift": treatment} if treatment is not None else {}), **setting}
+
+
+def _label(treatment):
+    """A word for a treatment from which `TradeOff.recommend` makes it again."""
+    if isinstance(treatment, Poles):
+        return f"{treatment.values:g}"
+    if isinstance(treatment, Project):
+        return "project" if treatment.every == 1 else f"project {treatment.every}"
+    return "minimal" if isinstance(treatment, Minimal) else "none"
+
+
+def _said(options):
+    order = f" of order {options['order']}" if "order" in options else ""
+    return f"{options['method']}{order}" + (f" at {options['rtol']:g}" if "rtol" in options else "")
+
+
+def _positive(name, given):
+    try:
+        values = [float(value) for value in np.atleast_1d(given)]
+    except (TypeError, ValueError):
+        values = []
+    if not values or not all(np.isfinite(value) and value > 0 for value in values):
+        raise SpecificationError(
+            f"{name} was given as {given!r}.", "It is a positive number, or several.", do=f"Leave {name} out."
+        )
+    return values
+
+
+def _bar(total, wanted):
+    from tqdm import tqdm
+
+    wanted = sys.stderr.isatty() if wanted is None else wanted
+    return tqdm(total=total, desc="tradeoff", unit="run", delay=PATIENCE, disable=not wanted)

@@ -1,0 +1,132 @@
+"""simulate(..., accuracy=...): the error of the motion against an independent method, and what is refused."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import servoctl as sv
+from servoctl.cli import main
+from servoctl.errors import LimitExceeded, SpecificationError
+from servoctl.mechanisms import gallery
+from servoctl.simulation import rule
+
+INTEGRATED = ("appell-hamel", "two-cars-ideal", "mass-on-car", "passive-arm", "pendubot", "wheeled-robot")
+ASKED = [*((name, accuracy) for name in INTEGRATED for accuracy in (1e-4, 1e-6, 1e-9)), ("spiral", 1e-6)]
+SOLVED = ("overhead-crane", "winch-crane-redundant", "three-cars", "vtol")
+
+
+@pytest.fixture(scope="module")
+def independent(gallery_model):
+    """A function from a gallery name to a motion by scipy's DOP853 on the reduced rates, without servoctl's loops."""
+    found = {}
+
+    def motion(name):
+        if name not in found:
+            model, scene = gallery_model(name), gallery[name]
+            start = model.start(t=scene.t_span[0], guess=scene.guess, **scene.start)
+            run = sv.simulate(model, start, scene.t_span, "DOP853", rtol=3e-14, atol=1e-15, t_eval=times(scene))
+            found[name] = (model, start, run)
+        return found[name]
+
+    return motion
+
+
+def times(scene):
+    return np.linspace(*scene.t_span, 41)
+
+
+@pytest.mark.parametrize("name, accuracy", ASKED)
+def test_the_motion_is_as_accurate_as_asked(name, accuracy, independent):
+    model, start, exact = independent(name)
+    run = sv.simulate(model, start, gallery[name].t_span, accuracy=accuracy, t_eval=times(gallery[name]))
+    assert run.method == "Taylor" and "two tolerances agree" in run.message
+    assert rule.motion_error(model, run.jets, exact.jets) <= accuracy
+    coarse = sv.simulate(model, start, gallery[name].t_span, "RK23", rtol=1e-2, atol=1e-2, t_eval=times(gallery[name]))
+    assert rule.motion_error(model, coarse.jets, exact.jets) > 1e-9  # the measure tells a coarse motion
+
+
+@pytest.mark.parametrize("name", SOLVED)
+def test_what_is_not_integrated_is_exact_at_every_instant(name, independent):
+    model, start, exact = independent(name)
+    run = sv.simulate(model, start, gallery[name].t_span, accuracy=1e-9, t_eval=times(gallery[name]))
+    assert run.method == "algebraic"
+    assert rule.motion_error(model, run.jets, exact.jets) <= 1e-9
+
+
+def test_the_error_is_relative_to_each_component_and_its_level(gallery_model):
+    model = gallery_model("overhead-crane")  # x l theta, dx dl dtheta
+    reference = np.array([[10.0, 5.0], [1e-6, 0.0], [1.0, 1.0], [0.0, 0.0], [0.0, 0.0], [0.0, 0.0], *[[7.0, 7.0]] * 3])
+    for row, size in ((0, 10.0), (1, 1e-2), (2, 1.0), (3, 1.0)):
+        jets = reference.copy()
+        jets[row, 1] += 1e-3 * size
+        assert rule.motion_error(model, jets, reference) == pytest.approx(1e-3)
+    jets = reference.copy()
+    jets[6:] = 0.0  # accelerations are no part of the state
+    assert rule.motion_error(model, jets, reference) == 0.0
+
+
+def test_jets_and_samples_go_with_an_accuracy(gallery_model):
+    model, scene = gallery_model("appell-hamel"), gallery["appell-hamel"]
+    run = sv.simulate(
+        model, model.start(guess=scene.guess, **scene.start), (0.0, 0.5), accuracy=1e-6, jets=4, t_eval=[0.5]
+    )
+    assert run.t.tolist() == [0.5] and np.isfinite(run["d4theta"]).all()
+
+
+@pytest.mark.parametrize(
+    "given",
+    [{"method": "RK4"}, {"rtol": 1e-9}, {"atol": 1e-9}, {"step": 1e-3}, {"order": 8}, {"drift": "project"}],
+    ids=str,
+)
+def test_an_accuracy_leaves_nothing_else_to_choose(given, gallery_model):
+    model, scene = gallery_model("appell-hamel"), gallery["appell-hamel"]
+    start = model.start(guess=scene.guess, **scene.start)
+    with pytest.raises(SpecificationError, match=f"accuracy=1e-06 was given with {next(iter(given))}="):
+        sv.simulate(model, start, (0.0, 1.0), accuracy=1e-6, **given)
+
+
+@pytest.mark.parametrize("accuracy", [0.0, -1e-6, 1e-16, 1.0, np.nan, "fine", [1e-6]], ids=str)
+def test_an_accuracy_is_a_small_number(accuracy, gallery_model):
+    model, scene = gallery_model("appell-hamel"), gallery["appell-hamel"]
+    start = model.start(guess=scene.guess, **scene.start)
+    with pytest.raises(SpecificationError, match="accuracy.*1e-13 to 0.1"):
+        sv.simulate(model, start, (0.0, 1.0), accuracy=accuracy)
+
+
+@pytest.mark.parametrize("given", [{"rtol": 1e-6}, {"atol": 1e-6}], ids=str)
+@pytest.mark.parametrize("method", ["RK4", "RK8"])
+def test_a_tolerance_is_refused_where_it_is_not_used(method, given, gallery_model):
+    model, scene = gallery_model("appell-hamel"), gallery["appell-hamel"]
+    start = model.start(guess=scene.guess, **scene.start)
+    with pytest.raises(SpecificationError, match=f"{next(iter(given))}=.*was given with method='{method}'"):
+        sv.simulate(model, start, (0.0, 1.0), method, **given)
+
+
+def test_where_rounding_hides_the_motion_the_accuracy_is_refused(gallery_model):
+    model, scene = gallery_model("appell-hamel"), gallery["appell-hamel"]
+    start = model.start(guess=scene.guess, **scene.start)
+    random, asked = np.random.default_rng(3), []
+
+    def spoilt(**options):
+        asked.append(options["rtol"])
+        run = sv.simulate(model, start, (0.0, 0.5), t_eval=[0.0, 0.5], **options)
+        return replace(run, jets=run.jets * (1.0 + 1e-6 * random.standard_normal(run.jets.shape)))
+
+    with pytest.raises(LimitExceeded, match="accuracy=1e-09 was asked for.*two tolerances agree to") as error:
+        rule.accurate(spoilt, model, 1e-9)
+    assert asked == sorted(asked, reverse=True) and asked[-1] == rule.FINEST and len(set(asked)) == len(asked)
+    assert 1e-8 < error.value.details["reached"] < 1e-5 and error.value.run is not None
+
+
+def test_the_command_passes_the_accuracy_on(tmp_path, monkeypatch):
+    given = {}
+
+    def simulate(model, start, span, **options):
+        given.update(options)
+        raise LimitExceeded("enough")
+
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sv, "simulate", simulate)
+    assert main(["run", "appell-hamel", "--accuracy", "1e-6"]) == 2
+    assert given == {"accuracy": 1e-6}

@@ -1,0 +1,137 @@
+"""Bounds of steps and of sampled feedback: the table of the theory, simulated loops, measured divergence."""
+
+import warnings
+from math import comb, factorial
+
+import casadi as ca
+import numpy as np
+import pytest
+
+import servoctl as sv
+from servoctl.simulation import bounds
+from servoctl.simulation.tableaus import ORDERS
+
+
+@pytest.mark.parametrize(
+    ("delay", "table"),
+    [(0, {1: 2.0, 2: 1.0, 3: 0.6752, 4: 0.5111, 5: 0.4116}), (1, {1: 1.0, 2: 0.4262, 3: 0.2703, 4: 0.1979, 5: 0.1561})],
+)
+def test_sampled_bounds_are_those_of_the_table(delay, table):
+    found = {rho: bounds.sampled_bound(rho, delay) for rho in table}
+    assert found == pytest.approx(table, abs=5.1e-5)
+
+
+def sampled_loop(rho, delay, p):
+    """Spectral radius of the chain of integrators under held state feedback, h = 1, from its matrices."""
+    A = np.array([[1.0 / factorial(j - i) if j >= i else 0.0 for j in range(rho)] for i in range(rho)])
+    B = np.array([1.0 / factorial(rho - i) for i in range(rho)])
+    K = np.array([comb(rho, k) * p ** (rho - k) for k in range(rho)])
+    F = np.zeros((rho * (delay + 1),) * 2)
+    F[:rho, :rho] = A
+    F[:rho, rho * delay :] -= np.outer(B, K)
+    F[rho:, :-rho] += np.eye(rho * delay) if delay else 0.0
+    return np.abs(np.linalg.eigvals(F)).max()
+
+
+@pytest.mark.parametrize("delay", [0, 1, 2, 5])
+@pytest.mark.parametrize("rho", [1, 2, 3, 4, 6])
+def test_a_sampled_loop_is_stable_below_the_bound_and_unstable_above(rho, delay):
+    bound = bounds.sampled_bound(rho, delay)
+    assert sampled_loop(rho, delay, 0.999 * bound) < 1 < sampled_loop(rho, delay, 1.001 * bound)
+
+
+@pytest.mark.parametrize("given", [{"rho": 0}, {"rho": 2.0}, {"rho": 13}, {"rho": 2, "delay": -1}])
+def test_a_bound_of_something_else_is_refused(given):
+    with pytest.raises(sv.SpecificationError, match="whole number"):
+        bounds.sampled_bound(**given)
+
+
+REAL_LIMITS = {"RK1": 2.0, "RK2": 2.0, "RK4": 2.785293563405, "RK5": 3.306567892635, "RK23": 2.512745326618}
+
+
+@pytest.mark.parametrize("method", REAL_LIMITS)
+def test_real_limits_are_the_known_ones(method):
+    assert bounds.largest_explicit(method) == pytest.approx(REAL_LIMITS[method], rel=1e-11)
+
+
+def test_imaginary_limits_are_the_known_ones():
+    limits = {method: bounds.largest_explicit(method, None, np.pi / 2) for method in ("RK1", "RK2", "RK23", "RK4")}
+    assert limits == pytest.approx({"RK1": 0.0, "RK2": 0.0, "RK23": np.sqrt(3), "RK4": np.sqrt(8)}, abs=1e-9)
+
+
+@pytest.mark.parametrize("direction", [np.pi, 0.75 * np.pi, 0.5 * np.pi])
+def test_no_step_of_radau_amplifies_what_decays(direction):
+    assert bounds.largest_explicit("Radau", None, direction) == np.inf
+    for order in (1, 5, 9, 13):
+        assert bounds.largest_explicit("RadauIIA", order, direction) == np.inf
+
+
+def test_radau_has_its_known_fraction():
+    above, below = bounds.stability_function("Radau")
+    assert above == pytest.approx([1, 2 / 5, 1 / 20])
+    assert below == pytest.approx([1, -3 / 5, 3 / 20, -1 / 60])
+
+
+@pytest.mark.parametrize("method", [*ORDERS, "Taylor", "RadauIIA"])
+def test_the_stability_function_is_the_exponential_to_the_order(method):
+    order = {"Taylor": 9, "RadauIIA": 9}.get(method)
+    above, below = bounds.stability_function(method, order)
+    order = order or ORDERS[method]
+    exponential = np.array([1 / factorial(k) for k in range(order + 2)])
+    product = np.convolve(exponential, below)[: order + 2]
+    difference = np.abs(product - np.pad(above, (0, 20))[: order + 2])
+    assert difference[: order + 1].max() < 1e-14
+    assert difference[order + 1] > 1e-12  # and no further
+
+
+def test_multistep_methods_and_idle_orders_are_refused():
+    with pytest.raises(sv.NameUnknown, match="BDF"):
+        bounds.stability_function("BDF")
+    with pytest.raises(sv.SpecificationError, match="order"):
+        bounds.stability_function("Taylor")
+    for given in (("RK4", 4), ("RadauIIA", 4), ("RadauIIA", None), ("Taylor", 0)):
+        with pytest.raises(sv.SpecificationError, match="order"):
+            bounds.stability_function(*given)
+
+
+@pytest.fixture(scope="module")
+def sine():
+    """A particle whose program is x = sin t, raised twice."""
+    q = sv.coordinates("x")
+    (x,) = q
+    mechanism = sv.Mechanism(q, gibbs=sv.particle(q, 1.0, x))
+    return sv.derive(mechanism, sv.Program({"X": x - ca.sin(q.t)}, by="ideal"))
+
+
+def sine_error(model, pole, method="RK4"):
+    run = sv.simulate(model, model.start(), (0.0, 100.0), method, step=0.05, drift=1 / pole)
+    return np.abs(run["x"] - np.sin(run.t)).max()
+
+
+@pytest.mark.filterwarnings("ignore:Steps of:RuntimeWarning")
+@pytest.mark.parametrize("method", ORDERS)
+def test_poles_diverge_in_simulation_where_the_bound_says(sine, method):
+    fastest = bounds.largest_explicit(method) / 0.05
+    assert sine_error(sine, 0.98 * fastest, method) < 1.0
+    assert not sine_error(sine, 1.02 * fastest, method) < 1e6
+
+
+def test_a_choice_beyond_the_bound_is_warned_about_with_its_number(sine):
+    with pytest.warns(RuntimeWarning, match=r"'X'.*-60 1/s.*\|λ\|h = 3 exceeds 2.785.*0.04642 s") as caught:
+        assert sine_error(sine, 60.0) > 1e6
+    assert caught[0].filename == __file__
+
+
+def test_complex_poles_are_judged_in_their_own_direction(sine):
+    pair = {"X": [-20 + 45j, -20 - 45j]}  # |λ|h = 2.46, where the limit along this ray is 2.79
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        sv.simulate(sine, sine.start(), (0.0, 1.0), "RK4", step=0.05, drift=sv.poles(pair))
+    with pytest.warns(RuntimeWarning, match="RK2"):
+        sv.simulate(sine, sine.start(), (0.0, 1.0), "RK2", step=0.05, drift=sv.poles(pair))
+
+
+def test_no_choice_within_the_bound_is_warned_about(sine):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert sine_error(sine, 55.0) < 1.0

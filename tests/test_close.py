@@ -1,0 +1,392 @@
+"""The sampled closed loop: sampling, hold, delays, limits, noise; feedforward and PD; bad input."""
+
+import pickle
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import servoctl as sv
+from servoctl.mechanisms import gallery
+
+CRANE, CRANE_PROGRAM = gallery["overhead-crane"].build()
+
+
+def point_mass(m=2.0):
+    p = sv.parameters(m=m)
+    q = sv.coordinates("x")
+    (x,) = q
+    path = sv.paths.rest_to_rest(q.t, 0.0, 1.0, duration=1.0, smoothness=3)
+    mechanism = sv.Mechanism(q, gibbs=sv.particle(q, p.m, x), actuators={"force": x}, parameters=p)
+    return mechanism, sv.Program({"X": x - path}, by="actuators")
+
+
+POINT, POINT_PROGRAM = point_mass()
+ROPE = gallery["overhead-crane-redundant"].build()[0]
+
+
+@pytest.fixture(scope="module")
+def crane_plan():
+    model = sv.derive(CRANE, CRANE_PROGRAM)
+    return sv.simulate(model, model.start(guess={"l": 4.0}), (0.0, 8.0))
+
+
+@pytest.fixture(scope="module")
+def point_plan():
+    model = sv.derive(POINT, POINT_PROGRAM)
+    return sv.simulate(model, model.start(), (0.0, 2.0))
+
+
+# the loop against a recursion -----------------------------------------------------------------------------------------
+
+
+def recursion(gain, x, rate, count, m=2.0, delay=0, late=0.0, low=-np.inf, high=np.inf, change=np.inf, d=0.0, **y):
+    """The sampled loop of a point mass under u = -gain·y, exactly: states (2, count + 1), inputs (count + 1,)."""
+    h, noise, quantum = 1.0 / rate, y.get("noise", np.zeros((count + 1, 2))), y.get("quantum")
+    states, commands, inputs = [np.array(x, dtype=float)], [], []
+    for k in range(count + 1):
+        measured = states[-1] + noise[k]
+        measured = measured if quantum is None else quantum * np.rint(measured / quantum)
+        commands.append(-gain @ measured)
+        u = np.clip(commands[k - delay] if k >= delay else 0.0, low, high)
+        before = inputs[-1] if inputs else 0.0
+        inputs.append(np.clip(u, before - change, before + change))
+        arriving = [(inputs[-2] if len(inputs) > 1 else 0.0, late), (inputs[-1], h - late)]
+        if k < count:
+            position, speed = states[-1]
+            for u, span in arriving:
+                a = (u + d) / m
+                position, speed = position + speed * span + a * span**2 / 2, speed + a * span
+            states.append(np.array([position, speed]))
+    return np.array(states).T, np.array(inputs)
+
+
+LOOPS = {
+    "plain": ({}, {}, {}),
+    "delay of two samples": ({}, {"delay": 2}, {"delay": 2}),
+    "limits": ({"limits": {"force": (-3.0, 5.0)}}, {}, {"low": -3.0, "high": 5.0}),
+    "limits of rate": ({"rate_limits": {"force": 40.0}}, {}, {"change": 2.0}),
+    "both": (
+        {"limits": {"force": 3.0}, "rate_limits": {"force": 40.0}}, {"delay": 1},
+        {"low": -3.0, "high": 3.0, "change": 2.0, "delay": 1},
+    ),
+    "transport delay": ({"delay": 0.02}, {"substeps": 5}, {"late": 0.02}),
+    "constant force": ({}, {"disturbance": {"x": 1.5}}, {"d": 1.5}),
+    "quantisation": ({}, {"quantisation": {"x": 0.01, "dx": 0.02}}, {"quantum": np.array([0.01, 0.02])}),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("what", LOOPS)
+def test_a_loop_is_what_its_recursion_says(what):
+    of_plant, of_loop, of_recursion = LOOPS[what]
+    gain = np.array([20.0, 9.0])
+    run = sv.close(
+        sv.plant(POINT, **of_plant),
+        lambda t, y: [-gain @ [y["x"], y["dx"]]],
+        [1.0, 0.5],
+        (0.0, 3.0),
+        rate=20.0,
+        **of_loop,
+    )
+    states, inputs = recursion(gain, [1.0, 0.5], 20.0, 60, **of_recursion)
+    assert run.states == pytest.approx(states, abs=1e-12)
+    assert run["force"] == pytest.approx(inputs, abs=1e-11)
+    assert sv.verify(run).passed
+
+
+def test_noise_is_what_was_added_and_seeded():
+    law = lambda t, y: [-20.0 * y["x"] - 9.0 * y["dx"]]  # noqa: E731
+    runs = [
+        sv.close(sv.plant(POINT), law, [1.0, 0.0], (0.0, 100.0), rate=20.0, noise={"x": 0.01}, seed=seed)
+        for seed in (5, 5, 6)
+    ]
+    added = runs[0].measured["x"] - runs[0]["x"]
+    assert np.array_equal(runs[0].states, runs[1].states) and not np.array_equal(runs[0].states, runs[2].states)
+    assert added.std() == pytest.approx(0.01, rel=0.05)
+    assert abs(np.corrcoef(added[1:], added[:-1])[0, 1]) < 0.06
+    assert np.array_equal(runs[0].measured["dx"], runs[0]["dx"])
+
+
+def test_a_lag_follows_its_command_exponentially():
+    plant = sv.plant(POINT, lag={"force": 0.1})
+    run = sv.close(plant, lambda t, y: [4.0], [0.0, 0.0], (0.0, 1.0), rate=50.0, substeps=4)
+    assert run["force"] == pytest.approx(4.0 * (1 - np.exp(-run.t / 0.1)), abs=1e-6)
+    assert run.input["force"] == pytest.approx(4.0)
+
+
+def test_the_active_limit_is_named():
+    plant = sv.plant(POINT, limits={"force": (-3.0, 5.0)}, rate_limits={"force": 40.0})
+    asked = {0: 1.0, 1: 9.0, 2: 9.0, 3: 9.0, 4: 4.0, 5: 4.0, 6: -9.0, 7: -9.0, 8: -9.0, 9: -9.0, 10: -9.0}
+    run = sv.close(plant, lambda t, y: [asked[round(20 * t)]], [0.0, 0.0], (0.0, 0.5), rate=20.0)
+    assert run["force"].tolist() == pytest.approx([1.0, 3.0, 5.0, 5.0, 4.0, 4.0, 2.0, 0.0, -2.0, -3.0, -3.0])
+    assert run.active["force"].tolist() == [0, 2, 1, 1, 0, 0, -2, -2, -2, -1, -1]
+    assert "limited during 72.7 %" in repr(run)
+    assert run.command["force"].tolist() == pytest.approx(list(asked.values()))
+
+
+# sampled poles --------------------------------------------------------------------------------------------------------
+
+
+def grows(product, delay):
+    """Whether the point mass under two poles at -p, sampled with p·h = product, goes astray."""
+    p, m = 1.0, 2.0
+    law = lambda t, y: [-m * (p**2 * y["x"] + 2 * p * y["dx"])]  # noqa: E731
+    run = sv.close(sv.plant(POINT), law, [1.0, 0.0], (0.0, 400 * product), rate=1 / product, delay=delay, substeps=1)
+    size = np.abs(run.states).max(axis=0)
+    return size[-50:].max() > size[150:200].max()
+
+
+@pytest.mark.parametrize(("delay", "limit"), [(0, 1.0), (1, 0.4262)])
+def test_pole_placement_goes_unstable_where_the_period_is_too_long(delay, limit):
+    low, high = 0.5 * limit, 1.5 * limit
+    assert not grows(low, delay) and grows(high, delay)
+    for _ in range(8):
+        middle = (low + high) / 2
+        low, high = (low, middle) if grows(middle, delay) else (middle, high)
+    assert low == pytest.approx(limit, rel=0.02)
+
+
+@pytest.mark.parametrize(("product", "refused"), [(0.98, False), (1.02, True)])
+def test_gains_too_fast_for_their_rate_are_refused(point_plan, product, refused):
+    p = 20.0
+    gains = {"kp": {"force": 2.0 * p**2}, "kd": {"force": 2.0 * 2 * p}}
+    if refused:
+        with pytest.raises(sv.ServoError, match=r"per sample.*0\.6752"):
+            sv.pd(point_plan, sv.plant(POINT), rate=p / product, **gains)
+    else:
+        law = sv.pd(point_plan, sv.plant(POINT), rate=p / product, **gains)
+        assert law.info["largest spectral radius along the plan"] < 1.0
+
+
+# laws from a plan -----------------------------------------------------------------------------------------------------
+
+
+def worst(run):
+    return max(np.abs(run.residual[name][0]).max() for name in ("X", "Z"))
+
+
+def test_a_held_feedforward_takes_the_middle_of_the_sample(crane_plan):
+    plant, x0 = sv.plant(CRANE), crane_plan.state(0.0)
+    middle, mean = (sv.feedforward(crane_plan, plant, 50.0, held=held) for held in ("middle", "mean"))
+    start = replace(middle, table=np.array([np.interp(middle.t0 + np.arange(401) / 50.0, crane_plan.t, crane_plan[a])
+                                            for a in middle.inputs]))  # fmt: skip
+    errors = {name: worst(sv.close(plant, law, x0, (0.0, 6.0))) for name, law in
+              (("middle", middle), ("mean", mean), ("start", start))}  # fmt: skip
+    assert 20 < errors["start"] / errors["middle"] < 2000
+    assert errors["start"] > 20 * errors["mean"]
+    finer = worst(sv.close(plant, sv.feedforward(crane_plan, plant, 100.0), x0, (0.0, 6.0)))
+    assert errors["middle"] / finer == pytest.approx(4.0, rel=0.1), "of second order in the period"
+
+
+@pytest.mark.parametrize("actuator", [{"lag": {"trolley": 0.1, "hoist": 0.05}}, {"delay": {"trolley": 0.03}}])
+def test_feedforward_meets_lag_and_transport_delay(crane_plan, actuator):
+    plant, x0 = sv.plant(CRANE, **actuator), crane_plan.state(0.0)
+    knowing = worst(sv.close(plant, sv.feedforward(crane_plan, plant), x0, (0.0, 6.0)))
+    ignorant = worst(sv.close(plant, sv.feedforward(crane_plan, sv.plant(CRANE)), x0, (0.0, 6.0)))
+    assert knowing < 1e-3 and ignorant > 50 * knowing
+
+
+def test_pd_brings_the_actuated_displacements_back(crane_plan):
+    plant = sv.plant(CRANE)
+    law = sv.pd(crane_plan, plant, kp={"trolley": 2000.0, "hoist": 5000.0}, kd={"trolley": 800.0, "hoist": 1500.0})
+    assert law.measures == ("x", "l", "dx", "dl")
+    x = crane_plan.state(0.0) + [0.05, 0.02, 0.0, 0.1, 0.0, 0.0]
+    u = law(0.0, dict(zip(plant.state_names, x, strict=True)))
+    ahead = sv.feedforward(crane_plan, plant)(0.0, {})
+    assert u - ahead == pytest.approx([-2000.0 * 0.05 - 800.0 * 0.1, -5000.0 * 0.02], rel=1e-9)
+    run = sv.close(sv.plant(CRANE, m_load=115.0), law, crane_plan.state(0.0), (0.0, 8.0))
+    assert np.abs(run.error["x"]).max() < 0.05 and np.abs(run.error["l"]).max() < 0.05
+
+
+def test_a_law_with_memory_is_started(crane_plan):
+    plant = sv.plant(CRANE)
+    law = sv.lqr(crane_plan, plant, integral=True)
+    with pytest.raises(sv.SpecificationError, match="law.start"):
+        law(0.0, crane_plan.state(0.0))
+    run = sv.close(sv.plant(CRANE, m_load=115.0), law, crane_plan.state(0.0), (0.0, 1.0))
+    controller = law.start()
+    by_hand = [controller(t, run.measurements[:, k]) for k, t in enumerate(run.t)]
+    assert np.transpose(by_hand) == pytest.approx(run.commands, rel=1e-12)
+    assert controller.memory == pytest.approx(
+        run.memory[:, -1] + 0.01 * np.array([run.residual[n][0, -1] for n in "XZ"])
+    )
+
+
+# three ways to run a loop ---------------------------------------------------------------------------------------------
+
+
+def conditions(plan):
+    plant = sv.plant(
+        CRANE, m_load=115.0, limits={"trolley": 140.0}, rate_limits={"hoist": 3000.0}, lag={"trolley": 0.02},
+        delay={"hoist": 0.02},
+    )  # fmt: skip
+    gust = sv.disturbances.gust(60.0, 0.5, 1.0, rise=0.1)
+    options = {
+        "delay": 1,
+        "noise": {"x": 1e-3},
+        "seed": 3,
+        "disturbance": {"theta": gust, "x": lambda t: 2.0 * (t > 0.3)},
+    }
+    return plant, plan.state(0.0), (0.0, 1.5), options
+
+
+def test_a_law_called_back_in_python_gives_the_same_loop(crane_plan):
+    plant, x0, span, options = conditions(crane_plan)
+    law = sv.lqr(crane_plan, sv.plant(CRANE), integral=True)
+    called_back = replace(law, step=lambda t, x, row: law.step(t, x, row))
+    a, b = (sv.close(plant, each, x0, span, **options) for each in (law, called_back))
+    assert b.states == pytest.approx(a.states, rel=1e-13, abs=1e-13)
+    assert b.memory == pytest.approx(a.memory, rel=1e-13, abs=1e-15)
+
+
+def test_the_loop_without_a_compiler_is_the_same(crane_plan, monkeypatch):
+    plant, x0, span, options = conditions(crane_plan)
+    law = sv.lqr(crane_plan, sv.plant(CRANE), integral=True)
+    a = sv.close(plant, law, x0, span, **options)
+    monkeypatch.setattr(type(plant.function("ode")), "native", lambda self, suffix: None)
+    b = sv.close(plant, law, x0, span, **options)
+    assert b.states == pytest.approx(a.states, rel=1e-9, abs=1e-11)
+    assert b.inputs == pytest.approx(a.inputs, rel=1e-9, abs=1e-9)
+    assert [v.tolist() for v in b.active.values()] == [v.tolist() for v in a.active.values()]
+
+
+class Counting:
+    """A law with a memory of its own: its start forgets."""
+
+    def start(self):
+        calls = iter(range(10**6))
+        return lambda t, y: {"force": -5.0 * y["x"] - 0.01 * next(calls)}
+
+
+def test_a_law_of_ones_own_is_started_anew_in_each_run():
+    a, b = (sv.close(sv.plant(POINT), Counting(), [1.0, 0.0], (0.0, 1.0), rate=50.0) for _ in range(2))
+    assert np.array_equal(a.states, b.states) and sv.verify(a).passed
+
+
+# the balance ----------------------------------------------------------------------------------------------------------
+
+
+def test_the_energy_is_the_work_of_all_forces(crane_plan):
+    plant, x0, span, options = conditions(crane_plan)
+    proof = sv.verify(sv.close(plant, sv.lqr(crane_plan, sv.plant(CRANE)), x0, span, **options))
+    assert proof.passed and proof.numbers["loop power"] < 1e-6 and proof.numbers["loop limits"] == 0.0
+
+
+def test_a_balance_that_does_not_close_is_found(crane_plan):
+    plant, x0, span, options = conditions(crane_plan)
+    run = sv.close(plant, sv.lqr(crane_plan, sv.plant(CRANE)), x0, span, **options)
+    lighter = replace(run, plant=sv.plant(CRANE, m_load=114.0, lag={"trolley": 0.02}))
+    assert "loop power halved" in sv.verify(lighter).failures, "energy of 114 kg, motion of 115 kg"
+    calm = replace(run, conditions=replace(run.conditions, disturbance={"theta": 1.0, "x": 0.0}))
+    assert sv.verify(calm).failures == ("loop repeated",)
+    assert "loop limits" in sv.verify(replace(run, inputs=1.2 * run.inputs)).failures
+
+
+# bad input ------------------------------------------------------------------------------------------------------------
+
+LAW = lambda t, y: [0.0]  # noqa: E731
+
+
+def close(plant=None, law=LAW, x0=(0.0, 0.0), span=(0.0, 1.0), rate=20.0, **options):
+    return sv.close(sv.plant(POINT) if plant is None else plant, law, x0, span, rate=rate, **options)
+
+
+BAD = {
+    "no plant": (lambda: close(plant=POINT), sv.SpecificationError, "sv.plant"),
+    "no law": (lambda: close(law=3.0), sv.SpecificationError, "law"),
+    "no rate": (lambda: close(rate=None), sv.SpecificationError, "once per sample"),
+    "negative rate": (lambda: close(rate=-5.0), sv.SpecificationError, "positive"),
+    "time that is no sample": (lambda: close(span=(0.0, 1.01)), sv.SpecificationError, "20.2.*20"),
+    "time backwards": (lambda: close(span=(1.0, 0.0)), sv.SpecificationError, "later"),
+    "half a delay": (lambda: close(delay=0.5), sv.SpecificationError, "whole number of samples"),
+    "negative delay": (lambda: close(delay=-1), sv.SpecificationError, "at least 0"),
+    "half a step": (lambda: close(substeps=1.5), sv.SpecificationError, "steps per sample"),
+    "no step": (lambda: close(substeps=0), sv.SpecificationError, "at least one step"),
+    "transport between steps": (
+        lambda: close(plant=sv.plant(POINT, delay=0.02), substeps=1), sv.SpecificationError, "Rates of 50 Hz",
+    ),
+    "noise on nothing": (lambda: close(noise={"y": 0.1}), sv.NameUnknown, "x, dx"),
+    "negative noise": (lambda: close(noise={"x": -0.1}), sv.SpecificationError, "not negative"),
+    "seed of nothing": (lambda: close(seed=3), sv.SpecificationError, "without noise"),
+    "odd seed": (lambda: close(noise={"x": 0.1}, seed=0.5), sv.SpecificationError, "whole number"),
+    "quantised nothing": (lambda: close(quantisation={"y": 0.1}), sv.NameUnknown, "x, dx"),
+    "disturbance of nothing": (lambda: close(disturbance={"dx": LAW}), sv.NameUnknown, "generalised force"),
+    "disturbance of text": (lambda: close(disturbance={"x": "gust"}), sv.SpecificationError, "finite number"),
+    "disturbance of NaN": (lambda: close(disturbance={"x": lambda t: np.nan * t}), sv.SpecificationError, "not finite"),
+    "disturbance of lists": (lambda: close(disturbance={"x": lambda t: [1, 2]}), sv.SpecificationError, "not give a number"),
+    "start off the rope": (
+        lambda: close(plant=sv.plant(ROPE), law=lambda t, y: [0.0, 0.0], x0=[0.0, 4.0, 1.0, 4.0, 0.0, 0.0, 0.0, 0.0]),
+        sv.InconsistentStart, "rope is 1 at the start",
+    ),
+    "start of NaN": (lambda: close(x0=[np.nan, 0.0]), sv.SpecificationError, "2 finite numbers"),
+    "law of two inputs": (lambda: close(law=lambda t, y: [0.0, 1.0]), sv.SpecificationError, "1 numbers: force"),
+    "law of an odd name": (lambda: close(law=lambda t, y: {"forc": 0.0}), sv.NameUnknown, "force"),
+    "law of NaN": (lambda: close(law=lambda t, y: [np.nan if t > 0.52 else 0.0]), sv.ServoError, "t = 0.55 s"),
+    "law that fails": (lambda: close(law=lambda t, y: [y["z"]]), KeyError, "z"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("what", BAD)
+def test_bad_input_is_refused_by_name(what):
+    call, kind, fact = BAD[what]
+    with pytest.raises(kind, match=fact):
+        call()
+
+
+def test_what_was_computed_before_a_law_failed_is_kept():
+    with pytest.raises(sv.ServoError) as caught:
+        close(law=lambda t, y: [np.nan if t > 0.52 else 1.0])
+    assert caught.value.run.t[-1] == pytest.approx(0.5) and not caught.value.run.success
+
+
+def test_a_loop_that_diverges_stops_with_its_motion():
+    with pytest.raises(sv.IntegrationStopped, match="finite state") as caught:
+        close(
+            plant=sv.plant(POINT, forces={"x": 1e6 * next(iter(POINT.q))}), x0=(1.0, 1.0), span=(0.0, 50.0), substeps=1
+        )
+    assert np.isfinite(caught.value.run.states).all() and len(caught.value.run.t) > 1
+
+
+def test_laws_refuse_plans_and_plants_that_do_not_fit(point_plan, crane_plan, tmp_path):
+    with pytest.raises(sv.NameUnknown, match="state of the plant"):
+        sv.feedforward(point_plan, sv.plant(gallery["two-cars"].build()[0]))
+    with pytest.raises(sv.SpecificationError, match="loaded run"):
+        sv.feedforward(sv.load(point_plan.save(tmp_path / "plan")), sv.plant(POINT))
+    with pytest.raises(sv.SpecificationError, match="designed for"):
+        sv.close(sv.plant(POINT), sv.feedforward(point_plan, sv.plant(POINT)), [0, 0], (0.0, 1.0), rate=50.0)
+    with pytest.raises(sv.SpecificationError, match="samples"):
+        sv.close(sv.plant(POINT), sv.feedforward(point_plan, sv.plant(POINT)), [0, 0], (0.005, 1.005))
+    with pytest.raises(sv.SpecificationError, match="one number"):
+        sv.pd(point_plan, sv.plant(POINT), kp={"force": [1.0, 2.0]})
+    with pytest.raises(sv.NameUnknown, match="force"):
+        sv.pd(point_plan, sv.plant(POINT), kp={"forc": 1.0})
+    with pytest.raises(sv.NameUnknown, match="middle"):
+        sv.feedforward(point_plan, sv.plant(POINT), held="start")
+    with pytest.raises(sv.NameUnknown, match="actuator of the plant|state of the plant"):
+        sv.close(sv.plant(POINT), sv.feedforward(crane_plan, sv.plant(CRANE)), [0, 0], (0.0, 1.0))
+
+
+def test_an_ideal_plan_is_no_command():
+    mechanism, program = gallery["two-cars-ideal"].build()
+    model = sv.derive(mechanism, program)
+    plan = sv.simulate(model, model.start(guess={"x2": 0.0}), (0.0, 0.1))
+    with pytest.raises(sv.NotRealisable, match="ideal reaction"):
+        sv.feedforward(plan, sv.plant(mechanism))
+
+
+def test_a_closed_run_is_saved_and_loaded(crane_plan, tmp_path):
+    plant, x0, span, options = conditions(crane_plan)
+    run = sv.close(plant, sv.lqr(crane_plan, sv.plant(CRANE), integral=True), x0, span, **options)
+    back = sv.load(run.save(tmp_path / "closed"))
+    for name in ("theta", "trolley", "d2theta", "tension"):
+        assert np.array_equal(back[name], run[name])
+    assert np.array_equal(back["command hoist"], run.command["hoist"])
+    assert np.array_equal(back["measured x"], run.measured["x"])
+    assert np.array_equal(back.residual["X"], run.residual["X"])
+    sent = pickle.loads(pickle.dumps(run))  # as a worker returns it
+    assert np.array_equal(sent["trolley"], run["trolley"]) and np.array_equal(sent.residual["Z"], run.residual["Z"])
+    assert len(repr(run).splitlines()) <= 12 and len(repr(run.law).splitlines()) <= 12
+    with pytest.raises(sv.NameUnknown, match="theta"):
+        run["thetta"]
+    with pytest.raises(sv.SpecificationError, match="samples every"):
+        run.state(0.005)

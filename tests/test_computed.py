@@ -1,0 +1,150 @@
+"""Computed actuation: exact linearisation, dynamic extension, sampled poles, refusals."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import servoctl as sv
+from servoctl.control.computed import sampled_radius
+from servoctl.mechanisms import cars, gallery, mass_on_car, vtol
+from servoctl.simulation.bounds import sampled_bound
+
+ORDERS = {  # zeros at infinity of the program's outputs (theory), which exact linearisation reaches
+    "two-link-arm": (2, 2),
+    "mass-on-car": (2,),
+    "mass-on-car-absolute": (2,),
+    "two-cars": (4,),
+    "three-cars": (6,),
+    "overhead-crane": (4, 4),
+    "crane-3d": (4, 4, 4),
+    "vtol": (4, 4),
+    "wheeled-robot": (1, 0),
+    "pendubot": (2,),
+}
+
+
+def planned(name):
+    scene = gallery[name]
+    model = sv.derive(*scene.build())
+    return sv.simulate(model, model.start(**scene.start, guess=scene.guess), scene.t_span), scene
+
+
+@pytest.fixture(scope="module")
+def crane():
+    return planned("overhead-crane")[0]
+
+
+@pytest.mark.parametrize("name", ORDERS)
+def test_on_the_plan_the_law_asks_for_the_plans_actuation(name):
+    plan, _ = planned(name)
+    plant = sv.plant(plan.model.reduction.mechanism)
+    law = sv.computed(plan, plant, rate=1000.0)
+    assert tuple(law.info["orders"].values()) == ORDERS[name]
+    size = max(np.abs(plan[actuator]).max() for actuator in law.inputs)
+    for k in range(0, len(plan.t), 97):
+        y = np.append(plan.state(plan.t[k]), law.memory)
+        u = law.step(plan.t[k], y, law.table[:, 0])[: len(law.inputs)]
+        assert u == pytest.approx([plan[actuator][k] for actuator in law.inputs], abs=3e-8 * max(size, 1.0))
+
+
+def test_residuals_decay_as_the_poles_say():
+    """Two joints: each residual obeys φ'' + 2φ'/T + φ/T² = 0 from any start, up to the hold at 2 kHz."""
+    plan, _ = planned("two-link-arm")
+    plant, T = sv.plant(plan.model.reduction.mechanism), 0.1
+    law = sv.computed(plan, plant, rate=2000.0, poles=T)
+    start = plan.state(0.0) + [0.02, -0.03, 0.0, 0.0]
+    run = sv.close(plant, law, start, (0.0, 2.0))
+    for name in ("X", "Y"):
+        e, de = run.residual[name][:, 0]
+        expected = (e + (de + e / T) * run.t) * np.exp(-run.t / T)
+        assert np.abs(run.residual[name][0] - expected).max() < 0.01 * abs(e)
+        assert abs(run.residual[name][0][-1]) < 1e-3 * abs(e)  # the hold of a moving path leaves 3e-6 m
+
+
+def test_the_crane_follows_by_dynamic_extension(crane):
+    """Hidden rows: the law keeps two derivatives of one residual; on the nominal machine errors of the start decay."""
+    plant = sv.plant(crane.model.reduction.mechanism)
+    law = sv.computed(crane, plant, rate=200.0)
+    assert len(law.memory) == 2 and set(law.info["relative degree"].values()) == {2}
+    run = sv.close(plant, law, crane.state(0.0) + np.array([0.05, -0.02, 0.01, 0, 0, 0]), (0.0, 8.0))
+    error = np.hypot(run.residual["X"][0], run.residual["Z"][0])
+    assert error[0] > 0.03 and error[-1] < 1e-5
+
+
+def test_unstable_internal_dynamics_are_refused_with_a_pointer():
+    model = sv.derive(*vtol("centre"))
+    plan = sv.simulate(model, model.start(theta=0.0, dtheta=0.0), (0.0, 0.5))
+    with pytest.raises(sv.UnstableInternalDynamics, match="15.*lqr"):
+        sv.computed(plan, sv.plant(model.reduction.mechanism))
+
+
+# sampled poles ---------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("delay", [0, 1])
+@pytest.mark.parametrize("rho", [2, 3, 4, 5])
+def test_the_radius_of_held_feedback_reaches_one_at_the_bound(rho, delay):
+    bound = sampled_bound(rho, delay)
+    assert sampled_radius([-0.999 * bound] * rho, 1.0, delay) < 1 < sampled_radius([-1.001 * bound] * rho, 1.0, delay)
+
+
+def point_mass():
+    p = sv.parameters(m=2.0)
+    q = sv.coordinates("x")
+    (x,) = q
+    path = sv.paths.rest_to_rest(q.t, 0.0, 1.0, duration=1.0, smoothness=4)
+    mechanism = sv.Mechanism(q, gibbs=sv.particle(q, p.m, x), actuators={"force": x}, parameters=p)
+    return mechanism, sv.Program({"x_path": x - path})
+
+
+LOOPS = {  # name: (mechanism and program, held at the start, lag of the actuator [s], rate [Hz])
+    2: (point_mass, {}, {}, 100.0),
+    3: (lambda: mass_on_car(0.0, 1.0), {"s": 0.0}, {}, 400.0),
+    4: (cars, {}, {}, 50.0),
+    5: (cars, {}, {"force": 0.2}, 500.0),
+}
+
+
+@pytest.mark.parametrize("delay", [0, 1])
+@pytest.mark.parametrize("rho", LOOPS)
+def test_loops_turn_unstable_where_the_bound_says_within_two_per_cent(rho, delay):
+    build, held, lag, rate = LOOPS[rho]
+    mechanism, program = build()
+    model = sv.derive(mechanism, program)
+    plan = sv.simulate(model, model.start(**held), (0.0, 8.0))
+    plant = sv.plant(mechanism, lag=lag)
+    law = sv.computed(plan, plant, rate=rate, poles=10.0)
+    (name,) = law.info["orders"]
+    assert law.info["orders"][name] == rho
+    grows = []
+    for share in (0.98, 1.02):
+        pole = share * sampled_bound(rho, delay) * rate
+        table = law.table.copy()
+        table[-rho:, 0] = np.poly([-pole] * rho)[:0:-1]
+        start = np.append(plan.state(7.0), [plan["force"][-1]] * len(lag))
+        start[0] += 1e-3
+        run = sv.close(plant, replace(law, table=table), start, (7.0, 7.0 + 1600 / rate), delay=delay)
+        error = np.abs(run.residual[name][0])
+        grows.append(error[-200:].max() > error[600:800].max())
+    assert grows == [False, True]
+
+
+@pytest.mark.parametrize("delay", [0, 1])
+def test_poles_too_fast_for_the_rate_are_refused_with_the_number(crane, delay):
+    plant = sv.plant(crane.model.reduction.mechanism)
+    bound = sampled_bound(4, delay)
+    with pytest.raises(sv.SpecificationError, match=f"p Ts < {bound:.4f}.*[Pp]oles slower than {bound * 50:.4g}"):
+        sv.computed(crane, plant, rate=50.0, poles=1 / (1.01 * bound * 50), delay=delay)
+    sv.computed(crane, plant, rate=50.0, poles=1 / (0.99 * bound * 50), delay=delay)
+
+
+def test_bad_input(crane):
+    plant = sv.plant(crane.model.reduction.mechanism)
+    for poles in ({"X": [-1.0, -1.0]}, {"X": [-1 + 1j] * 4, "Z": [-1.0] * 4}, [-1.0] * 4):
+        with pytest.raises(sv.SpecificationError, match="poles"):
+            sv.computed(crane, plant, poles=poles)
+    with pytest.raises(sv.NameUnknown, match="'X'"):
+        sv.computed(crane, plant, poles={"x": [-1.0] * 4})
+    with pytest.raises(sv.SpecificationError, match="two mechanisms"):
+        sv.computed(crane, sv.plant(gallery["overhead-crane"].build()[0]))

@@ -1,0 +1,135 @@
+"""Eight points at once: the vector functions against extended precision, blocks of Newton's iteration against points."""
+
+import casadi as ca
+import mpmath
+import numpy as np
+import pytest
+from test_compiled import P1, X2, T, function, newton_model
+
+from servoctl.model import emit
+from servoctl.model.compiled import compiled, compiling_at_once
+from servoctl.model.emit import SHARED, WIDE
+
+TINY, LAST_SMALL = 1e-300, np.nextafter(1e5, 0)
+
+
+@pytest.fixture(autouse=True)
+def at_once():
+    with compiling_at_once():
+        yield
+
+
+def points(model, t, x, p):
+    """Outputs (n_y, N) point by point."""
+    return np.array([model(now, column, p) for now, column in zip(t, x.T, strict=True)]).T
+
+
+def test_sine_and_cosine_of_eight_points_are_within_two_units():
+    rng = np.random.default_rng(2)
+    turns = np.arange(-60, 61) * np.pi / 2
+    a = np.concatenate([rng.uniform(-10, 10, 200), rng.uniform(-1e5, 1e5, 100), turns, np.nextafter(turns, 99),
+                        63661 * np.pi / 2 + np.linspace(-1e-9, 1e-9, 5), [0.0, -0.0, TINY, -TINY, LAST_SMALL, 1e-5]])
+    y = compiled(function(ca.sin(X2[0]), ca.cos(X2[0])), "circular").grid(0.0, np.vstack([a, a]), [0.0])
+    with mpmath.workdps(40):
+        exact = np.array([[float(f(mpmath.mpf(v))) for v in a] for f in (mpmath.sin, mpmath.cos)])
+    np.testing.assert_array_max_ulp(y, exact, maxulp=2)
+    np.testing.assert_array_equal(np.signbit(y[0, -6:-4]), [False, True])
+
+
+def test_arguments_that_are_large_or_not_finite_do_not_disturb_other_points():
+    a = np.array([0.3, np.nan, 1e300, np.inf, 0.3, -1e6, 1e5, 2.0])
+    y = compiled(function(ca.sin(X2[0])), "large").grid(0.0, np.vstack([a, a]), [0.0])
+    with np.errstate(invalid="ignore"):
+        np.testing.assert_allclose(y[0], np.sin(a), rtol=4e-16, atol=0)
+
+
+@pytest.mark.parametrize("n", [1, 7, 8, 9, 15, 16, 300])
+def test_a_grid_of_any_length_equals_points(n):
+    x, rng = X2, np.random.default_rng(n)
+    model = compiled(function(x[0] / (1 + x[1] ** 2) + T, ca.sin(P1 * x[0]) ** 2, ca.fmax(x[0], x[1])), "any")
+    t, x = rng.normal(size=n), rng.normal(size=(2, n))
+    np.testing.assert_allclose(model.grid(t, x, [3.0]), points(model, t, x, [3.0]), rtol=1e-15, atol=1e-16)
+    p = rng.normal(size=(1, n))
+    each = np.array([model(*at) for at in zip(t, x.T, p.T, strict=True)]).T
+    np.testing.assert_allclose(model.grid(t, x, p), each, rtol=1e-15, atol=1e-16)
+
+
+def test_a_point_does_not_depend_on_its_place_in_a_grid():
+    model = compiled(function(ca.sin(X2[0]) * ca.exp(X2[1])), "place")
+    x = np.tile([[0.7], [0.2]], 21)
+    assert len(set(model.grid(0.0, x, [0.0])[0].tolist())) == 1
+
+
+def test_shared_divisors_are_inverted_once():
+    x = ca.SX.sym("x", SHARED + 1)
+    divisor = 1 + x[SHARED] ** 2
+    for n in (SHARED - 1, SHARED):
+        f = function(*(x[i] / divisor for i in range(n)), x=x)
+        scalar = emit.emit(f, "f").split("typedef double W")[0]
+        assert scalar.count(" / ") == (1 if n >= SHARED else n)
+
+
+def test_long_functions_have_no_copy_for_eight_points():
+    value = X2[0]
+    for _ in range(WIDE + 1):
+        value = ca.sin(value)
+    assert "typedef double W" not in emit.emit(function(value), "long")
+
+
+# --- Newton's iteration, block by block
+
+
+def kepler():
+    x = ca.SX.sym("x", 2)
+    return newton_model(ca.vertcat(x[0] - P1 * ca.sin(x[0]) - T, x[1] * ca.cos(x[0]) - 1 / 2), x, "kepler", x[0] * x[1])
+
+
+SCATTERED = np.sort(np.append(0, np.random.default_rng(5).uniform(0, 1, 200)))
+
+
+@pytest.mark.parametrize("t", [np.linspace(0, 1, 500), np.linspace(1, 0, 300), SCATTERED])
+def test_blocks_equal_points(t):
+    model = kepler()
+    x0 = [1.2, 1.4] if t[0] else [0.0, 0.5]
+    x, y, iterations = model.newton(t, x0, [0.4])
+    assert x.shape[1] == t.size and model.backend == "c"
+    at = x0
+    for k, now in enumerate(t):
+        alone, rest, _ = model.newton([now], at, [0.4])
+        at = alone[:, 0]
+        np.testing.assert_allclose(x[:, k], at, rtol=0, atol=4e-16 * (1 + np.abs(at).max()))
+        np.testing.assert_allclose(y[2:, k], rest[2:, 0], rtol=1e-14, atol=1e-14)
+    np.testing.assert_allclose(x[0] - 0.4 * np.sin(x[0]), t, rtol=0, atol=5e-16)
+
+
+def test_blocks_need_fewer_evaluations_than_points():
+    t = np.linspace(0, 1, 801)
+    model = kepler()
+    assert model.newton(t, [0.0, 0.5], [0.4])[2] <= 2.1 * t.size
+
+
+@pytest.mark.parametrize("last", range(60, 69))
+def test_a_block_ends_where_its_solution_ends(last):
+    x = ca.SX.sym("x")
+    model = newton_model(x**2 - (1 - T), x, "fold_in_block")
+    t = np.append(np.linspace(0, 0.6, last), np.linspace(1.01, 1.6, 30))
+    solution, y, _ = model.newton(t, [0.9], [0.0])
+    assert solution.shape[1] == y.shape[1] == last
+    np.testing.assert_allclose(solution[0], np.sqrt(1 - t[:last]), rtol=1e-14)
+
+
+def test_a_kink_within_a_block_is_followed():
+    x = ca.SX.sym("x")
+    path = ca.fabs(T - 0.5)
+    model = newton_model(x + x**3 - path - path**3, x, "kink")
+    for t in (np.linspace(0, 1, 200), np.linspace(0, 1, 23)):
+        solution, _, _ = model.newton(t, [0.5], [0.0])
+        np.testing.assert_allclose(solution[0], np.abs(t - 0.5), rtol=0, atol=1e-15)
+
+
+def test_far_predictions_are_not_trusted():
+    x = ca.SX.sym("x")
+    model = newton_model(ca.sin(x - 40 * ca.sin(7 * T)), x, "many_roots")  # a root every pi
+    t = np.linspace(0, 2, 2001)
+    solution, _, _ = model.newton(t, [0.0], [0.0])
+    np.testing.assert_allclose(solution[0], 40 * np.sin(7 * t), rtol=0, atol=1e-13)

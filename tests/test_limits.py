@@ -1,0 +1,169 @@
+"""Laws under limits: every limit holds, residuals give way as asked, and the report says which."""
+
+import numpy as np
+import pytest
+
+import servoctl as sv
+from servoctl.mechanisms import cars, overhead_crane, two_link_arm
+
+
+def planned(build, span, **guess):
+    mechanism, program = build()
+    model = sv.derive(mechanism, program)
+    return sv.simulate(model, model.start(guess=guess), span), mechanism
+
+
+@pytest.fixture(scope="module")
+def crane():
+    return planned(overhead_crane, (0.0, 8.0), l=4.0)
+
+
+@pytest.fixture(scope="module")
+def arm():
+    return planned(two_link_arm, (0.0, 2.0), q1=-0.4, q2=1.5)
+
+
+def error(run):
+    return np.hypot(run.residual["X"][0], run.residual["Z"][0])
+
+
+@pytest.mark.parametrize("limits", [{"trolley": 100.0}, {"hoist": (-1000.0, 0.0)}])
+def test_a_plan_beyond_its_actuators_stays_bounded_and_the_report_says_why(crane, limits):
+    plan, mechanism = crane
+    nominal, machine = sv.plant(mechanism), sv.plant(mechanism, limits=limits)
+    base = sv.lqr(plan, nominal, integral=True)
+    runs = [sv.close(machine, law, plan.state(0.0), (0.0, 8.0)) for law in (base, sv.limited(base, machine))]
+    (name,) = limits
+    low, high = machine.limits[name]
+    for run in runs:
+        assert low <= run[name].min() and run[name].max() <= high
+    clipped, allocated = map(error, runs)
+    assert allocated.max() < 0.8 * clipped.max() < 2.0 and allocated[-1] < 0.2
+    report = sv.limit_report(runs[1])
+    assert {row[0] for row in report.rows} == {"X", "Z"} and report.limits[name] > 0.3
+    assert report.overload[:3] == (name, *plan.extrema(name)[0])
+
+
+def test_the_report_solves_for_the_factor_that_would_keep_the_limits(crane):
+    plan, mechanism = crane
+    machine = sv.plant(mechanism, limits={"trolley": 100.0})
+    law = sv.limited(sv.lqr(plan, sv.plant(mechanism)), machine)
+    run = sv.close(machine, law, plan.state(0.0), (0.0, 2.0))
+    report = sv.limit_report(run, {"t_span": (0.0, 6.0), "guess": {"l": 4.0}})
+    model = sv.derive(mechanism, plan.model.reduction.program.slowed(mechanism.q, report.slower))
+    slower = sv.simulate(model, model.start(guess={"l": 4.0}), (0.0, 6.0 * report.slower))
+    assert max(abs(value) for _, value in slower.extrema("trolley")) == pytest.approx(100.0, rel=1e-5)
+    assert f"factor {report.slower:.5g}" in repr(report)
+
+
+def test_within_the_limits_nothing_changes(crane):
+    plan, mechanism = crane
+    machine = sv.plant(mechanism, limits={"trolley": 200.0}, rate_limits={"hoist": 1e5})
+    base = sv.lqr(plan, machine)
+    runs = [sv.close(machine, law, plan.state(0.0), (0.0, 8.0)) for law in (base, sv.limited(base, machine))]
+    assert np.array_equal(runs[0].states, runs[1].states)
+    assert not sv.limit_report(runs[1]).rows and not sv.limit_report(runs[1]).limits
+
+
+def test_rate_limits_hold_from_sample_to_sample(crane):
+    plan, mechanism = crane
+    machine = sv.plant(mechanism, rate_limits={"trolley": 150.0})
+    law = sv.limited(sv.lqr(plan, sv.plant(mechanism), integral=True), machine)
+    run = sv.close(machine, law, plan.state(0.0) + [0.05, 0, 0, 0, 0, 0], (0.0, 8.0))
+    assert np.abs(np.diff(run["trolley"])).max() <= 1.5 * (1 + 1e-12)
+    assert "trolley" in sv.limit_report(run).limits
+
+
+@pytest.mark.parametrize("solver", ["daqp", "qrqp"])
+def test_the_allocation_is_the_least_of_its_cost(arm, solver):
+    """Against a search over the admissible inputs, at one sample."""
+    plan, mechanism = arm
+    machine = sv.plant(mechanism, limits={"shoulder": (0.0, 20.0), "elbow": 3.0})
+    law = sv.limited(sv.computed(plan, sv.plant(mechanism), rate=200.0), machine, solver=solver)
+    y = plan.state(0.4) + [0.02, 0.03, 0.1, -0.2]
+    x, row = np.concatenate([y, law.memory]), law.row(0.4)
+    u = law.step(0.4, x, row)[:2]
+    wanted = law.step.law.step(0.4, y, law.step.law.table[:, 0])[:2]
+    assert wanted[0] > 20.0
+    H = row[-4:].reshape(2, 2)
+    grid = np.array(np.meshgrid(np.linspace(0, 20, 401), np.linspace(-3, 3, 401))).reshape(2, -1)
+    costs = np.einsum("in,ij,jn->n", grid - wanted[:, None], H, grid - wanted[:, None])
+    own = (u - wanted) @ H @ (u - wanted)
+    assert own <= costs.min() * (1 + 1e-9) and own >= costs.min() * 0.999
+
+
+@pytest.mark.parametrize(
+    "limits, spared",
+    [({"shoulder": (0.0, 29.0), "elbow": 10.0}, "X"), ({"shoulder": 40.0, "elbow": (-2.5, 10.0)}, "Y")],
+)
+def test_priority_decides_which_residual_gives_way(arm, limits, spared):
+    plan, mechanism = arm
+    machine = sv.plant(mechanism, limits=limits)
+    base = sv.computed(plan, sv.plant(mechanism), rate=200.0)
+    other = "Y" if spared == "X" else "X"
+    worst = []
+    for asked in ({"priority": [spared, other]}, {}, {"priority": [other, spared]}):
+        run = sv.close(machine, sv.limited(base, machine, **asked), plan.state(0.0), (0.0, 2.0))
+        worst.append(np.abs(run.residual[spared][0]).max())
+        for name, (low, high) in machine.limits.items():
+            assert low <= run[name].min() and run[name].max() <= high
+    assert worst == sorted(worst) and worst[2] > 1.002 * worst[0]
+
+
+def test_a_rope_that_cannot_push(crane):
+    """A load that starts high falls as fast as the rope lets it: without the bound the law would push."""
+    plan, mechanism = crane
+    machine = sv.plant(mechanism, limits={"hoist": (-3000.0, 3000.0)})
+    base = sv.lqr(plan, machine)
+    start = plan.state(0.0) - np.array([0.0, 2.0, 0, 0, 0, 0])
+    free, kept = (
+        sv.close(machine, law, start, (0.0, 4.0))
+        for law in (base, sv.limited(base, machine, bounds={"tension": (0.0, None)}))
+    )
+    assert free["tension"].min() < -100.0
+    assert kept["tension"].min() > -1e-6 * 1000.0
+    assert "tension" in sv.limit_report(kept).limits
+    assert error(kept)[-1] < 0.2
+
+
+def test_limits_and_bounds_that_exclude_each_other_stop_with_both_named(crane):
+    plan, mechanism = crane
+    machine = sv.plant(mechanism, limits={"hoist": (-100.0, 0.0)})
+    law = sv.limited(sv.lqr(plan, sv.plant(mechanism)), machine, bounds={"tension": (500.0, None)})
+    with pytest.raises(sv.LimitExceeded, match="At t = .*hoist -100 .. 0.*tension 500"):
+        sv.close(machine, law, plan.state(0.0), (0.0, 1.0))
+
+
+def test_an_estimator_is_told_what_was_applied(crane):
+    plan, mechanism = crane
+    machine = sv.plant(mechanism, limits={"trolley": 120.0})
+    nominal = sv.plant(mechanism)
+    observed = sv.output_feedback(sv.lqr(plan, nominal, integral=True), nominal, {"x": 1e-3, "l": 1e-3, "theta": 1e-3})
+    runs = [sv.close(machine, law, plan.state(0.0), (0.0, 8.0)) for law in (observed, sv.limited(observed, machine))]
+    assert error(runs[1]).max() < error(runs[0]).max()
+
+
+def test_bad_input(crane):
+    plan, mechanism = crane
+    law, machine = sv.lqr(plan, sv.plant(mechanism)), sv.plant(mechanism, limits={"trolley": 100.0})
+    with pytest.raises(sv.SpecificationError, match="no limits"):
+        sv.limited(law, sv.plant(mechanism))
+    with pytest.raises(sv.NameUnknown, match="tension"):
+        sv.limited(law, machine, bounds={"tensoin": (0.0, None)})
+    with pytest.raises(sv.NameUnknown, match="residual"):
+        sv.limited(law, machine, priority=["Y"])
+    with pytest.raises(sv.NameUnknown, match="daqp"):
+        sv.limited(law, machine, solver="dapq")
+    for options in ({"weights": {"X": 1.0}, "priority": ["X"]}, {"weights": {"X": 0.0}}, {"horizon": 0.0}):
+        with pytest.raises(sv.SpecificationError):
+            sv.limited(law, machine, **options)
+    with pytest.raises(sv.SpecificationError, match="not limited"):
+        sv.limit_report(sv.close(machine, law, plan.state(0.0), (0.0, 0.1)))
+
+
+def test_single_input_plans_are_only_clipped():
+    plan, mechanism = planned(cars, (0.0, 2.0))
+    machine = sv.plant(mechanism, limits={"force": 250.0})
+    base = sv.computed(plan, sv.plant(mechanism), rate=200.0)
+    runs = [sv.close(machine, law, plan.state(0.0), (0.0, 4.0)) for law in (base, sv.limited(base, machine))]
+    assert np.abs(runs[0].states - runs[1].states).max() < 1e-9

@@ -1,0 +1,235 @@
+"""LQR about a plan: Riccati equation, discretisation, weights, and the crane of the design."""
+
+import numpy as np
+import pytest
+
+import servoctl as sv
+from servoctl.control.lqr import weights
+from servoctl.control.tracking import Reference, discretised, exponentials
+from servoctl.mechanisms import gallery
+
+CRANE, CRANE_PROGRAM = gallery["overhead-crane"].build()
+GUST = {"theta": sv.disturbances.gust(60.0, 2.0, 2.5)}
+WEIGHTS = {"Q": [1e3] * 3 + [1e2] * 3, "R": 1e-3}
+
+
+@pytest.fixture(scope="module")
+def plan():
+    model = sv.derive(CRANE, CRANE_PROGRAM)
+    return sv.simulate(model, model.start(guess={"l": 4.0}), (0.0, 8.0))
+
+
+def load_error(run):
+    return np.hypot(run.residual["X"][0], run.residual["Z"][0])
+
+
+def heavier(plan, law):
+    """Error of a load that is 15 % heavier than planned, in a gust: worst, at 6 s, at 8 s [m]."""
+    run = sv.close(sv.plant(CRANE, m_load=115.0), law, plan.state(0.0), (0.0, 8.0), disturbance=GUST)
+    assert sv.verify(run).passed
+    error = load_error(run)
+    return error.max(), error[np.searchsorted(run.t, 6.0 - 1e-9)], error[-1]
+
+
+# the crane of the design: theory.md, section 6 ------------------------------------------------------------------------
+
+
+def test_feedforward_alone_loses_the_heavier_load(plan):
+    assert heavier(plan, sv.feedforward(plan, sv.plant(CRANE)))[1] == pytest.approx(22.4, rel=0.01)
+
+
+@pytest.mark.parametrize("varying", [True, False])
+def test_lqr_keeps_the_heavier_load_near_its_path(plan, varying):
+    _, at_6, _ = heavier(plan, sv.lqr(plan, sv.plant(CRANE), varying=varying, **WEIGHTS))
+    assert 0.140 <= at_6 <= 0.160
+
+
+@pytest.mark.parametrize("varying", [True, False])
+def test_the_integral_of_the_program_takes_it_back(plan, varying):
+    law = sv.lqr(plan, sv.plant(CRANE), integral=1e4, varying=varying, **WEIGHTS)
+    worst, at_6, at_8 = heavier(plan, law)
+    assert worst <= 0.060 and at_6 <= 0.010 and at_8 <= 0.003
+    assert law.memory_names == ("integral of X", "integral of Z")
+
+
+def test_defaults_are_the_weights_of_the_design(plan):
+    plain = sv.lqr(plan, sv.plant(CRANE), integral=True)
+    said = sv.lqr(plan, sv.plant(CRANE), integral={"X": 1e4, "Z": 1e4}, **WEIGHTS)
+    named = sv.lqr(plan, sv.plant(CRANE), Q={"theta": 1e3}, R={"hoist": 1e-3}, integral=[1e4, 1e4])
+    assert np.array_equal(plain.table, said.table) and np.array_equal(plain.table, named.table)
+
+
+def test_a_plant_as_planned_follows_its_plan(plan):
+    run = sv.close(sv.plant(CRANE), sv.lqr(plan, sv.plant(CRANE)), plan.state(0.0), (0.0, 8.0))
+    assert load_error(run).max() < 1e-4
+    assert np.abs(run.error["theta"]).max() < 1e-4
+
+
+def test_redundant_coordinates_give_a_law_as_well(plan):
+    mechanism, program = gallery["overhead-crane-redundant"].build()
+    model = sv.derive(mechanism, program)
+    redundant = sv.simulate(model, model.start(guess=gallery["overhead-crane-redundant"].guess), (0.0, 8.0))
+    for varying in (True, False):
+        law = sv.lqr(redundant, sv.plant(mechanism), integral=True, varying=varying)
+        run = sv.close(sv.plant(mechanism, m_load=115.0), law, redundant.state(0.0), (0.0, 8.0))
+        assert load_error(run).max() < 0.060 and load_error(run)[-1] < 1e-3
+        assert np.abs(run.residual["rope"]).max() < 1e-12 and sv.verify(run).passed
+
+
+# gains ----------------------------------------------------------------------------------------------------------------
+
+
+def test_the_discretisation_of_a_double_integrator_is_exact():
+    A, B = np.array([[[0.0, 1.0], [0.0, 0.0]]]), np.array([[[0.0], [0.5]]])
+    Ad, Bd = discretised(A, B, 0.2)
+    assert Ad[0] == pytest.approx(np.array([[1.0, 0.2], [0.0, 1.0]]))
+    assert Bd[0, :, 0] == pytest.approx([0.5 * 0.2**2 / 2, 0.5 * 0.2])
+
+
+def test_exponentials_are_those_of_scipy():
+    from scipy.linalg import expm
+
+    matrices = np.random.default_rng(1).uniform(-1, 1, (5, 6, 6)) * np.array([1e-3, 0.1, 1.0, 5.0, 20.0])[:, None, None]
+    for found, wanted in zip(exponentials(matrices), expm(matrices), strict=True):
+        assert found == pytest.approx(wanted, rel=1e-11, abs=1e-12 * np.abs(wanted).max())
+
+
+def at_sample(plan, plant, k, rate=100.0):
+    reference = Reference(plan, plant, rate)
+    A, B = discretised(*reference.linearised(), 1 / rate)
+    return A[k], B[k]
+
+
+def test_frozen_gains_are_those_of_python_control(plan):
+    import control
+
+    plant = sv.plant(CRANE)
+    law = sv.lqr(plan, plant, varying=False, **WEIGHTS)
+    for k in (0, 250, 700):
+        K, _, poles = control.dlqr(*at_sample(plan, plant, k), np.diag(WEIGHTS["Q"]), 1e-3 * np.eye(2))
+        assert law.info["gains"][k] == pytest.approx(K, rel=1e-6, abs=1e-6 * np.abs(K).max())
+        assert np.abs(poles).max() < 1
+
+
+def test_varying_gains_minimise_the_cost_along_the_plan(plan):
+    """The Riccati gains against the least cost of all inputs over a short horizon, by least squares."""
+    from scipy.linalg import solve_discrete_are
+
+    plant, Q, R, first = sv.plant(CRANE), np.diag(WEIGHTS["Q"]), 1e-3 * np.eye(2), 780
+    law = sv.lqr(plan, plant, **WEIGHTS)
+    A, B = discretised(*Reference(plan, plant, 100.0).linearised(), 0.01)
+    P = solve_discrete_are(A[-1], B[-1], Q, R)
+    x0 = np.array([0.1, -0.05, 0.02, 0.3, -0.1, 0.2])
+    count = len(A) - first
+    free, forced = [np.eye(6)], [np.zeros((6, 2 * count))]
+    for k in range(count):
+        step = np.zeros((6, 2 * count))
+        step[:, 2 * k : 2 * k + 2] = B[first + k]
+        free.append(A[first + k] @ free[-1])
+        forced.append(A[first + k] @ forced[-1] + step)
+    roots = [np.linalg.cholesky(Q).T] * count + [np.linalg.cholesky(P).T]
+    left = np.vstack([*(w @ f for w, f in zip(roots, forced, strict=True)), np.sqrt(1e-3) * np.eye(2 * count)])
+    right = np.concatenate([*(w @ f @ x0 for w, f in zip(roots, free, strict=True)), np.zeros(2 * count)])
+    best = np.linalg.lstsq(left, -right, rcond=None)[0]
+    assert -law.info["gains"][first] @ x0 == pytest.approx(best[:2], rel=1e-7)
+
+
+def test_both_kinds_agree_where_the_plan_rests(plan):
+    varying, frozen = (sv.lqr(plan, sv.plant(CRANE), integral=True, varying=v).info["gains"] for v in (True, False))
+    assert varying[-1] == pytest.approx(frozen[-1], rel=1e-7, abs=1e-6)
+    assert varying[-100] == pytest.approx(frozen[-100], rel=1e-6, abs=1e-5)
+    assert np.abs(varying[300] - frozen[300]).max() > 1e-3 * np.abs(frozen[300]).max()
+
+
+def test_a_lag_is_part_of_the_design(plan):
+    slow = sv.plant(CRANE, lag={"trolley": 0.2})
+    knowing = sv.close(slow, sv.lqr(plan, slow), plan.state(0.0), (0.0, 8.0))
+    assert "trolley" in knowing.law.measures
+    assert load_error(knowing).max() < 5e-3
+    assert knowing.law.info["largest spectral radius along the plan"] < 1.0
+
+
+def test_the_law_says_what_it_is(plan):
+    law = sv.lqr(plan, sv.plant(CRANE), integral={"Z": 1e4})
+    assert law.memory_names == ("integral of Z",) and len(law.memory) == 1
+    for fact in ("time-varying", "100 Hz", "spectral radius", "trolley, hoist"):
+        assert fact in repr(law)
+    assert law.info["largest spectral radius along the plan"] < 1.0
+
+
+# weights and refusals -------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("given", "wanted"),
+    [(None, [1.0, 2.0]), (3.0, [3.0, 3.0]), ({"b": 5}, [1.0, 5.0]), ([4.0, 6.0], [4.0, 6.0])],
+)
+def test_weights_are_numbers_names_or_arrays(given, wanted):
+    assert weights(given, [1.0, 2.0], ("a", "b"), "state", "Q") == pytest.approx(np.diag(wanted))
+    full = np.array([[2.0, 1.0], [1.0, 2.0]])
+    assert weights(full, [1.0, 2.0], ("a", "b"), "state", "Q") == pytest.approx(full)
+
+
+def two_masses(stiffness):
+    """Two masses of which only one is driven: the other, on a spring, is out of reach."""
+    p = sv.parameters(m=1.0)
+    q = sv.coordinates("x y")
+    x, y = q
+    mechanism = sv.Mechanism(
+        q,
+        gibbs=sv.particle(q, p.m, x) + sv.particle(q, p.m, y),
+        potential=stiffness * y**2 / 2,
+        actuators={"force": x},
+        parameters=p,
+    )
+    program = sv.Program({"X": x - sv.paths.rest_to_rest(q.t, 0.0, 1.0, duration=1.0, smoothness=3)})
+    model = sv.derive(mechanism, program)
+    return sv.simulate(model, model.start(y=0.0, dy=0.0), (0.0, 1.0)), sv.plant(mechanism)
+
+
+def test_what_is_out_of_reach_and_does_not_grow_is_left_alone():
+    plan, plant = two_masses(4.0)
+    law = sv.lqr(plan, plant)
+    assert np.abs(law.info["gains"][:, :, [1, 3]]).max() < 1e-9
+    assert law.info["spectral radius at its end"] == pytest.approx(1.0, abs=1e-9)
+    run = sv.close(plant, law, plan.state(0.0) + [0.1, 0.0, 0.0, 0.0], (0.0, 1.0))
+    assert abs(run.error["x"][-1]) < 0.02
+    with pytest.raises(sv.ServoError, match="reached"):
+        sv.lqr(plan, plant, varying=False)
+
+
+BAD = {
+    "Q of five": (lambda p, m: sv.lqr(p, m, Q=[1.0] * 5), sv.SpecificationError, r"\(5,\)"),
+    "Q of text": (lambda p, m: sv.lqr(p, m, Q="large"), sv.SpecificationError, "shape"),
+    "Q of no state": (lambda p, m: sv.lqr(p, m, Q={"thet": 1.0}), sv.NameUnknown, "theta"),
+    "negative Q": (lambda p, m: sv.lqr(p, m, Q={"x": -1.0}), sv.SpecificationError, "semidefinite"),
+    "odd Q": (lambda p, m: sv.lqr(p, m, Q=np.triu(np.ones((6, 6)))), sv.SpecificationError, "symmetric"),
+    "R of zero": (lambda p, m: sv.lqr(p, m, R=0.0), sv.SpecificationError, "definite"),
+    "R of three": (lambda p, m: sv.lqr(p, m, R=np.eye(3)), sv.SpecificationError, r"\(3, 3\)"),
+    "R of NaN": (lambda p, m: sv.lqr(p, m, R=np.nan), sv.SpecificationError, "definite"),
+    "integral of nothing": (lambda p, m: sv.lqr(p, m, integral={"Y": 1.0}), sv.NameUnknown, "X, Z"),
+    "integral of three": (lambda p, m: sv.lqr(p, m, integral=[1.0] * 3), sv.SpecificationError, "X, Z"),
+    "rate of zero": (lambda p, m: sv.lqr(p, m, rate=0.0), sv.SpecificationError, "positive"),
+    "plant of a delay": (lambda p, m: sv.lqr(p, sv.plant(CRANE, delay=0.02)), sv.SpecificationError, "transport delay"),
+    "no plan": (lambda p, m: sv.lqr(m, m), sv.SpecificationError, "Plant was given as plan"),
+    "out of reach": (lambda p, m: sv.lqr(*two_masses(-4.0)), sv.ServoError, "reached"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("what", BAD)
+def test_bad_input_is_refused_by_name(plan, what):
+    call, kind, fact = BAD[what]
+    with pytest.raises(kind, match=fact):
+        call(plan, sv.plant(CRANE))
+
+
+def test_a_residual_of_accelerations_is_not_fed_back():
+    q = sv.coordinates("x")
+    (x,) = q
+    mechanism = sv.Mechanism(q, gibbs=sv.particle(q, 1.0, x), actuators={"force": x})
+    model = sv.derive(mechanism, sv.Program({"A": q.d(2)[0] - 1.0}))
+    plan = sv.simulate(model, model.start(x=0.0, dx=0.0), (0.0, 1.0))
+    with pytest.raises(sv.SpecificationError, match="order 2|order 0 or 1"):
+        sv.lqr(plan, sv.plant(mechanism), integral=True)
+    with pytest.raises(sv.SpecificationError, match="order 2"):
+        sv.lqr(plan, sv.plant(mechanism), integral={"A": 1.0})

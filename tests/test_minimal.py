@@ -1,0 +1,228 @@
+"""Minimal coordinates: as many values are integrated as the program leaves free, and nothing drifts."""
+
+import sys
+from pathlib import Path
+
+import casadi as ca
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+import servoctl as sv
+from servoctl.simulation.minimal import Chart, Sizes
+
+SCENES = (
+    "appell-hamel", "constant-speed", "mass-on-car", "mass-on-car-absolute", "passive-arm", "spiral", "two-cars-ideal",
+)  # fmt: skip
+APPELL_HAMEL = {
+    0.5: (0.0319727678, 0.2954591857, -0.0653856446, 0.3269282232, 0.9061260409, 0.2941642246, 1.6888475537),
+    1.0: (-0.1974199455, 0.3336476801, -0.0577323796, 0.2886618981, 1.7454659644, -0.4458690776, 1.7226077945),
+    2.0: (0.0937497219, -0.2692972364, 0.1619778260, -0.8098891302, 3.9504768171, -1.6103273411, 3.0406014808),
+}  # x, y, z, phi, theta, dphi, dtheta
+PRECISE = {"rtol": 1e-11, "atol": 1e-13}
+SETTINGS = {
+    "RK45": PRECISE, "DOP853": PRECISE, "Radau": PRECISE, "RK23": {"rtol": 1e-8, "atol": 1e-10},
+    "RK4": {"step": 2e-3}, "RK5": {"step": 1e-2}, "RK8": {"step": 2.5e-2},
+}  # fmt: skip
+ROUNDING = 1e-11
+
+
+def worst_residual(run):
+    """Over all rows, levels and samples."""
+    return max(float(np.abs(run.residual[name]).max()) for name in run.residual)
+
+
+@pytest.fixture(scope="module")
+def wheel(gallery_model):
+    model = gallery_model("appell-hamel")
+    return model, model.start(x=0.0, y=0.0, z=0.0, phi=0.0, theta=0.0, dphi=1.0, dtheta=2.0)
+
+
+@pytest.mark.parametrize("method", SETTINGS)
+def test_appell_hamel_in_six_values(method, wheel):
+    model, start = wheel
+    run = sv.simulate(model, start, (0.0, 2.0), method=method, drift="minimal", **SETTINGS[method])
+    assert run.drift == "minimal coordinates" and run.counters["integrated"] == 6
+    names = ("x", "y", "z", "phi", "theta", "dphi", "dtheta")
+    for t, state in APPELL_HAMEL.items():
+        found = [dict(zip(run.jet_names, run.at(t), strict=True))[name] for name in names]
+        assert found == pytest.approx(state, abs=2e-7 if method == "RK23" else 2e-9)
+    assert worst_residual(run) < 1e-14
+
+
+@pytest.mark.parametrize("method", ["DOP853", "RK4"])
+def test_nothing_drifts_in_20_seconds(method, wheel):
+    model, start = wheel
+    options = {"step": 2e-2} if method == "RK4" else {"rtol": 1e-6, "atol": 1e-8}
+    plain = sv.simulate(model, start, (0.0, 20.0), method=method, **options)
+    minimal = sv.simulate(model, start, (0.0, 20.0), method=method, drift="minimal", **options)
+    assert worst_residual(minimal) < ROUNDING < 1e-2 * worst_residual(plain)
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_as_many_values_are_integrated_as_are_free(name, gallery_model):
+    from servoctl.mechanisms import gallery
+
+    scene, model = gallery[name], gallery_model(name)
+    start, t1 = model.start(**scene.start, guess=scene.guess), min(scene.t_span[1], 2.0)
+    run = sv.simulate(model, start, (0.0, t1), method="DOP853", drift="minimal", **PRECISE)
+    assert run.counters["integrated"] == model.free < len(model.state_names)
+    assert worst_residual(run) < ROUNDING
+    reference = sv.simulate(model, start, (0.0, t1), method="Taylor", drift="project", rtol=1e-13, atol=1e-15)
+    scale = np.abs(reference.jets).max(axis=1, keepdims=True) + 1.0
+    assert np.abs((run.jets - reference.jets) / scale).max() < 1e-7
+
+
+def test_absolute_coordinates_need_the_same_force(gallery_model):
+    forces = {}
+    rest = {"mass-on-car": {"s": 0.0, "ds": 0.0}, "mass-on-car-absolute": {"y_m": 0.0, "dy_m": 0.0}}
+    for name, held in rest.items():
+        model = gallery_model(name)
+        run = sv.simulate(model, model.start(**held), (0.0, 5.0), drift="minimal", **PRECISE)
+        assert run.counters["integrated"] == 2
+        forces[name] = run["force"]
+    one, other = forces.values()
+    assert np.abs(one).max() > 1.0 and other == pytest.approx(one, abs=1e-8)
+
+
+# local charts --------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def satellite():
+    sys.path.insert(0, str(Path(__file__).parents[1] / "examples"))
+    try:
+        import quaternion
+    finally:
+        sys.path.pop(0)
+    return sv.derive(quaternion.mechanism, quaternion.program)
+
+
+@pytest.mark.parametrize("method", ["DOP853", "RK4", "Radau"])
+def test_a_unit_quaternion_has_a_local_chart(method, satellite):
+    start = satellite.start(w3=0.5, guess={"e0": 1.0})
+    run = sv.simulate(
+        satellite,
+        start,
+        (0.0, 10.0),
+        method=method,
+        drift="minimal",
+        **({"step": 1e-2} if method == "RK4" else PRECISE),
+    )
+    assert run.counters["integrated"] == satellite.free == 2
+    assert (
+        run.counters["coordinate_changes"] + run.counters["pivot_changes"] >= 1
+    )  # the spin turns by 5 rad, the quaternion by half of that
+    assert worst_residual(run) < ROUNDING
+    assert np.ptp(run["w3"]) < 1e-8
+    angle = np.pi / 3 * np.polyval([6.0, -15.0, 10.0, 0.0, 0.0, 0.0], run.t / 10.0)
+    axis = 2 * (run["e1"] * run["e3"] + run["e0"] * run["e2"])
+    assert axis == pytest.approx(np.sin(angle), abs=ROUNDING)
+
+
+def pendulum(metre=1.0):
+    """A pendulum in x and y with its rod of 1 m as a material constraint, in another unit of length."""
+    p = sv.parameters(m=1.0, g=9.81 * metre, length=metre)
+    q = sv.coordinates("s x y")  # s: a cart of its own, driven along a path
+    s, x, y = q
+    mechanism = sv.Mechanism(
+        q,
+        gibbs=sv.particle(q, p.m, (x, y)) + sv.particle(q, 2.0, (s,)),
+        potential=p.m * p.g * y,
+        actuators={"force": s},
+        constraints={"rod": x**2 + y**2 - p.length**2},
+        parameters=p,
+    )
+    return sv.derive(mechanism, sv.Program({"cart": s - 0.1 * metre * ca.sin(q.t)}), guess={"y": -metre})
+
+
+@pytest.mark.parametrize(
+    ("method", "metre"),
+    [("DOP853", 1.0), ("RK45", 1.0), ("Radau", 1.0), ("RK8", 1.0), ("DOP853", 1e3), ("DOP853", 1e-3)],
+)
+def test_a_turning_pendulum_changes_its_coordinates(method, metre):
+    model = pendulum(metre)
+    start = model.start(x=0.0, y=-metre, dx=7.0 * metre)
+    options = {"step": 1e-2} if method == "RK8" else {"rtol": 1e-11, "atol": 1e-13 * metre}
+    run = sv.simulate(model, start, (0.0, 3.0), method=method, drift="minimal", **options)
+    swing = solve_ivp(
+        lambda t, z: [z[1], -9.81 * np.cos(z[0])], (0.0, 3.0), [-np.pi / 2, 7.0], method="DOP853", rtol=1e-13, atol=1e-14,
+        dense_output=True,
+    )  # fmt: skip
+    angle = swing.sol(run.t)[0]
+    assert angle[-1] > angle[0] + 2 * np.pi  # it goes over the top
+    assert run.counters["integrated"] == model.free == 2
+    assert 8 <= run.counters["coordinate_changes"] <= 12  # x for y and back: twice a turn each
+    error = np.hypot(run["x"] / metre - np.cos(angle), run["y"] / metre - np.sin(angle)).max()
+    assert error < 2e-6 if method == "RK8" else error < 2e-8
+    assert np.abs(np.hypot(run["x"], run["y"]) / metre - 1.0).max() < 1e-14
+
+
+def test_a_chart_has_the_exact_jacobian():
+    model = pendulum()
+    x = model.start(x=0.6, y=-0.8, guess={"dx": 2.0}).values
+    chart = Chart(model, Sizes(model), 0.0, x)
+    y, step = x[chart.free], 1e-6
+    assert chart.lift(0.0, y, x) == pytest.approx(x, abs=1e-15)
+    columns = []
+    for k in range(len(y)):
+        ahead, behind = (chart.rates(0.0, chart.lift(0.0, y + s * step * np.eye(len(y))[k], x)) for s in (1, -1))
+        columns.append((ahead - behind) / (2 * step))
+    assert np.abs(np.array(columns)).max() > 1.0
+    assert chart.jacobian(0.0, x) == pytest.approx(np.array(columns).T, abs=1e-7)
+
+
+def test_time_runs_backwards(wheel):
+    model, start = wheel
+    there = sv.simulate(model, start, (0.0, 2.0), drift="minimal", **PRECISE)
+    n_x = len(model.state_names)
+    back = sv.simulate(model, there.jets[:n_x, -1], (2.0, 0.0), drift="minimal", **PRECISE)
+    assert back.jets[:n_x, -1] == pytest.approx(start.values, abs=1e-8)
+
+
+# where it does not go ------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("method", ["RK23", "RK45", "DOP853", "Radau", "RK4", "RK8"])
+def test_exact_constraints_do_not_carry_a_motion_through_a_singularity(method, gallery_model):
+    model = gallery_model("appell-hamel-squared")
+    start = model.start(guess={"dx": 0.5}, x=0.0, y=0.0, phi=0.0, theta=0.0, dphi=1.0, dtheta=2.0)
+    options = {"step": 1e-2} if method in ("RK4", "RK8") else {"rtol": 1e-8, "atol": 1e-10}
+    with pytest.raises(sv.SingularProgram) as caught:
+        sv.simulate(model, start, (0.0, 2.0), method=method, drift="minimal", **options)
+    error = caught.value
+    assert abs(error.details["t"] - 0.6983110523) < 5e-3
+    assert "speed" in error.details["rows"] and "dphi" in error.details["zero"]
+    assert np.all(np.diff(error.run.t) > 0) and error.run.t[-1] <= error.details["t"]
+    forward = error.run["dx"] * np.cos(error.run["theta"]) + error.run["dy"] * np.sin(error.run["theta"])
+    assert forward == pytest.approx(0.5 * error.run["dphi"], abs=1e-5)
+
+
+@pytest.mark.parametrize("method", [None, "algebraic"])
+def test_a_flat_program_leaves_nothing_to_integrate(method, gallery_model):
+    model = gallery_model("overhead-crane")
+    run = sv.simulate(model, model.start(), (0.0, 6.0), method=method, drift="minimal")
+    assert run.method == "algebraic" and run.drift == "minimal coordinates" and "integrated" not in run.counters
+    plain = sv.simulate(model, model.start(), (0.0, 6.0))
+    assert np.array_equal(run.jets, plain.jets)
+
+
+def test_a_flat_program_is_not_integrated_in_minimal_coordinates(gallery_model):
+    model = gallery_model("overhead-crane")
+    with pytest.raises(sv.SpecificationError, match="nothing is left to integrate") as caught:
+        sv.simulate(model, model.start(), (0.0, 6.0), method="DOP853", drift="minimal")
+    assert "algebraic" in str(caught.value) and caught.value.details["free"] == 0
+
+
+@pytest.mark.parametrize(("method", "why"), [("Taylor", "series"), ("BDF", "past states"), ("LSODA", "past states")])
+def test_methods_that_cannot_are_refused(method, why, wheel):
+    model, start = wheel
+    with pytest.raises(sv.SpecificationError, match=why) as caught:
+        sv.simulate(model, start, (0.0, 1.0), method=method, drift="minimal")
+    assert "RK4" in str(caught.value) and "DOP853" in str(caught.value) and "project" in str(caught.value)
+
+
+def test_an_unknown_treatment_shows_the_nearest(wheel):
+    model, start = wheel
+    with pytest.raises(sv.NameUnknown, match="minimal"):
+        sv.simulate(model, start, (0.0, 1.0), drift="minimum")

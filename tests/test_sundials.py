@@ -1,0 +1,96 @@
+"""CVODES and IDAS through CasADi: tabulated states, the form before elimination, reversed time, knots, stops, refusals."""
+
+import casadi as ca
+import closed_forms as cf
+import numpy as np
+import pytest
+
+import servoctl as sv
+
+STATE = ("x", "y", "z", "phi", "theta", "dphi", "dtheta")
+ZERO = {"x": 0.0, "y": 0.0, "phi": 0.0, "theta": 0.0}
+METHODS = ("CVODES", "IDAS")
+TIGHT = {"rtol": 1e-11, "atol": 1e-13}
+
+pytestmark = pytest.mark.parametrize("method", METHODS)
+
+
+@pytest.fixture(scope="module")
+def model(gallery_model):
+    return gallery_model("appell-hamel")
+
+
+@pytest.fixture(scope="module")
+def start(model):
+    return model.start(dphi=1.0, dtheta=2.0, **ZERO)
+
+
+@pytest.mark.parametrize("drift", [None, 0.5])
+def test_tabulated_states(method, drift, model, start):
+    run = sv.simulate(model, start, (0.0, 2.0), method=method, drift=drift, t_eval=[0.5, 1.0, 2.0], **TIGHT)
+    for k, values in enumerate(cf.APPELL_HAMEL_STATES.values()):
+        np.testing.assert_allclose([run[name][k] for name in STATE], values, rtol=0, atol=1e-8)
+    assert run.t.tolist() == [0.5, 1.0, 2.0] and run.counters["steps"] > 50
+
+
+def test_error_follows_the_tolerance(method, model, start):
+    errors = []
+    for rtol in (1e-5, 1e-7, 1e-9):
+        run = sv.simulate(model, start, (0.0, 2.0), method=method, rtol=rtol, atol=rtol / 100)
+        reference = cf.appell_hamel(run.t)
+        errors.append(max(np.abs(run[name] - reference[name]).max() for name in STATE))
+    assert errors == sorted(errors, reverse=True) and errors[0] > 100 * errors[-1] and errors[-1] < 1e-6
+
+
+@pytest.mark.parametrize("drift", [None, 0.5])
+def test_idas_knows_nothing_of_the_elimination(method, drift, model):
+    """Its equations are the rows themselves: L γ^(s̄) + rest, which vanishes at what the elimination finds."""
+    parts = model.integrator(method, drift is not None).parts
+    assert ("alg" in parts) == (method == "IDAS")
+    if method == "IDAS":
+        assert parts["z"].numel() == parts["alg"].numel() == model.n
+
+
+def test_backwards(method, model, start):
+    n = len(start.values)
+    there = sv.simulate(model, start, (0.0, 2.0), method=method, **TIGHT)
+    back = sv.simulate(model, there.jets[:n, -1], (2.0, 0.0), method=method, **TIGHT)
+    assert np.all(np.diff(back.t) < 0)
+    assert np.abs(back.jets[:n, -1] - start.values).max() < 1e-8
+
+
+def test_knots(method, gallery_model):
+    model = gallery_model("two-cars-ideal")
+    start = model.start(x2=0.0, dx2=0.0)
+    run = sv.simulate(model, start, (0.0, 3.0), method=method, **TIGHT)
+    reference = sv.simulate(model, start, (0.0, 3.0), method="Taylor", rtol=1e-13, atol=1e-15)
+    assert set(model.knots) & set(run.t[1:-1])
+    assert np.abs(run.jets[:4] - reference.jets[:4]).max() < 1e-8
+
+
+def test_stops_when_the_wheel_stops(method, gallery_model):
+    squared = gallery_model("appell-hamel-squared")
+    at = squared.start(guess={"dx": 0.5}, dphi=1.0, dtheta=2.0, **ZERO)
+    with pytest.raises(sv.SingularProgram) as caught:
+        sv.simulate(squared, at, (0.0, 1.0), method=method)
+    assert abs(caught.value.details["t"] - cf.WHEEL_STOPS) < 1e-3
+    assert "speed" in caught.value.details["rows"]
+    assert 0.6 < caught.value.run.t[-1] <= caught.value.details["t"]
+
+
+def test_failure_keeps_what_was_computed(method):
+    q = sv.coordinates("x y")
+    x, y = q
+    mechanism = sv.Mechanism(q, gibbs=sv.particle(q, 1.0, ca.vertcat(x, y)))
+    escaping = sv.derive(mechanism, sv.Program({"growth": q.d(1)[0] - x**2}, by="ideal"))
+    with pytest.raises(sv.IntegrationStopped) as caught:
+        sv.simulate(escaping, escaping.start(x=1.0, y=0.0, dy=0.0), (0.0, 1.2), method=method, rtol=1e-6, atol=1e-8)
+    run = caught.value.run
+    assert 0.9 < run.t[-1] < 1.01
+    early = run.t < 0.9
+    np.testing.assert_allclose(run["x"][early], 1 / (1 - run.t[early]), rtol=1e-3)
+
+
+def test_projection_is_refused_with_the_reason(method, model, start):
+    with pytest.raises(sv.SpecificationError, match="multistep"):
+        sv.simulate(model, start, (0.0, 1.0), method=method, drift="project")

@@ -1,0 +1,485 @@
+"""Sweeps: the same table whoever computes it, no failure and no finished work lost; cases, shards, checkpoints."""
+
+import functools
+import json
+import math
+import multiprocessing
+import os
+import pickle
+import re
+import signal
+import sys
+from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import servoctl as sv
+from servoctl.cli import main
+from servoctl.errors import NameUnknown, ServoError, SpecificationError
+from servoctl.mechanisms import overhead_crane
+from servoctl.study.sweep import TOLD
+
+LOADS = {"m_load": lambda rng: rng.normal(115.0, 5.0)}
+
+
+@functools.cache
+def design():
+    """Crane, plan and law, once in each process."""
+    mechanism, program = overhead_crane()
+    model = sv.derive(mechanism, program)
+    plan = sv.simulate(model, model.start(guess={"l": 4.0}), (0.0, 8.0), progress=False)
+    return mechanism, plan, sv.lqr(plan, sv.plant(mechanism), rate=100.0)
+
+
+def crane_loop(m_load, rng):
+    mechanism, plan, law = design()
+    plant, seed = sv.plant(mechanism, m_load=m_load), int(rng.integers(2**31))
+    return sv.close(plant, law, plan.state(0.0), (0.0, 1.0), noise={"theta": 1e-3}, seed=seed)
+
+
+def halves(m):
+    return {"half": m / 2}
+
+
+def picky(m):
+    if m == 2:
+        raise SpecificationError("m is 2.", "It is not.", m=m)
+    if m == 3:
+        sys.exit("over")
+    return {"r": math.nan if m == 4 else float(m), "word": "even" if m % 2 == 0 else "odd"}
+
+
+def deadly(m):
+    if m == 5:
+        os._exit(1)
+    return {"r": m}
+
+
+def same(a, b):
+    """Whether two studies are equal bit for bit."""
+    assert list(a.columns) == list(b.columns)
+    return all(a[name].dtype == b[name].dtype and a[name].tobytes() == b[name].tobytes() for name in a.columns)
+
+
+def spawned(workers):
+    return ProcessPoolExecutor(workers, mp_context=multiprocessing.get_context("spawn"))
+
+
+# whoever computes ----------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def loops():
+    return sv.sweep(crane_loop, sv.monte_carlo(8, seed=1, **LOADS), seed=2)
+
+
+def test_closed_loops_in_this_process(loops):
+    assert loops.meta["message"] == "8 of 8 cases finished"
+    assert len(np.unique(loops["X_worst"])) == 8
+    direct = crane_loop(loops["m_load"][3], np.random.default_rng(np.random.SeedSequence(2, spawn_key=(1, 3))))
+    assert loops["trolley_max"][3] == direct["trolley"].max()
+    assert loops["X_last"][3] == abs(direct.residual["X"][0][-1])
+
+
+def test_processes_give_the_same_bits(loops):
+    with spawned(2) as pool:
+        assert same(loops, sv.sweep(crane_loop, sv.monte_carlo(8, seed=1, **LOADS), seed=2, executor=pool))
+
+
+def test_threads_give_the_same_bits(loops):
+    with ThreadPoolExecutor(2) as pool:
+        assert same(loops, sv.sweep(crane_loop, sv.monte_carlo(8, seed=1, **LOADS), seed=2, executor=pool))
+
+
+def test_dask_gives_the_same_bits(loops):
+    from dask.distributed import Client, LocalCluster
+
+    with LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None) as cluster, Client(cluster) as client:
+        executor = client.get_executor()
+        assert same(loops, sv.sweep(crane_loop, sv.monte_carlo(8, seed=1, **LOADS), seed=2, executor=executor))
+
+
+def test_shards_merge_to_the_whole(loops):
+    parts = [sv.sweep(crane_loop, sv.monte_carlo(8, seed=1, **LOADS), seed=2, shard=(i, 3)) for i in (2, 3, 1)]
+    assert [part["case"].tolist() for part in parts] == [[1, 4, 7], [2, 5], [0, 3, 6]]
+    assert parts[0].meta["message"] == "3 of 3 cases finished"
+    whole = sv.merge(parts)
+    assert same(loops, whole) and whole.meta["message"] == "8 of 8 cases finished"
+    assert sv.merge(parts[:2]).meta["message"] == "5 of 8 cases finished"
+
+
+def test_the_script_of_the_docs_runs(tmp_path, monkeypatch, capsys):
+    """With threads in place of its processes, which the tests above start."""
+    text = (Path(__file__).parents[1] / "docs" / "sweeps.md").read_text()
+    (tmp_path / "loops.py").write_text(re.search(r"```python\n(.*?)\n\nstudy", text, re.S)[1] + "\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    script = re.search(r"```py\n(.*?)```", text, re.S)[1]
+    for processes, threads in (
+        ("import ProcessPoolExecutor", "import ThreadPoolExecutor as ProcessPoolExecutor"),
+        ("(2, mp_context=spawn)", "(2)"),
+        ("n_workers=2,", "n_workers=1, processes=False,"),
+    ):
+        assert processes in script
+        script = script.replace(processes, threads)
+    exec(compile(script, "sweeps.md", "exec"), {"__name__": "__main__"})
+    assert capsys.readouterr().out == "True\n"
+
+
+# cases ---------------------------------------------------------------------------------------------------------------
+
+
+def test_a_grid_has_all_combinations_the_last_name_fastest():
+    assert sv.grid(a=[1, 2], b=[3, 4], c=5) == [
+        {"a": 1, "b": 3, "c": 5}, {"a": 1, "b": 4, "c": 5}, {"a": 2, "b": 3, "c": 5}, {"a": 2, "b": 4, "c": 5},
+    ]  # fmt: skip
+
+
+def test_random_cases_depend_on_seed_index_and_name_alone():
+    few = sv.monte_carlo(5, seed=1, **LOADS)
+    assert sv.monte_carlo(9, seed=1, **LOADS)[:5] == few
+    assert [case["m_load"] for case in sv.monte_carlo(5, seed=1, l=lambda rng: rng.random(), **LOADS)] == [
+        case["m_load"] for case in few
+    ]
+    assert sv.monte_carlo(5, seed=2, **LOADS) != few
+    assert len({case["m_load"] for case in few}) == 5
+
+
+def test_distributions_of_scipy_are_drawn_from():
+    from scipy import stats
+
+    frozen, new = stats.norm(100.0, 5.0), stats.Normal(mu=100.0, sigma=5.0)
+    cases = sv.monte_carlo(400, seed=1, a=frozen, b=new, c=7.0)
+    for name in "ab":
+        values = np.array([case[name] for case in cases])
+        assert abs(values.mean() - 100.0) < 4 * 5.0 / 20 and abs(values.std() - 5.0) < 4 * 5.0 / np.sqrt(800)
+    assert {case["c"] for case in cases} == {7.0}
+
+
+def test_columns_are_cases_as_well():
+    assert same(sv.sweep(halves, {"m": np.array([1.0, 3.0])}), sv.sweep(halves, [{"m": 1.0}, {"m": 3.0}]))
+
+
+@pytest.mark.parametrize(
+    ("cases", "text"),
+    [
+        ([], "There is no case"),
+        ({"m": [1, 2], "l": [1]}, "lengths m: 2, l: 1"),
+        ([{"m": 1}, {"l": 1}], "Case 1 has the parameters l, case 0 m"),
+        ([{"m": [1, 2]}], "Parameter m of case 0"),
+        ([{"m": math.inf}], "Parameter m of case 0 is inf"),
+        ([3], "Case 0 is 3"),
+        ([{"error": 1}], "parameter named 'error'"),
+        ([{"l": 1}], r"halves\(m\): missing a required argument: 'm'"),
+    ],
+)
+def test_cases_that_form_no_table_are_refused(cases, text):
+    with pytest.raises(SpecificationError, match=text):
+        sv.sweep(halves, cases)
+
+
+@pytest.mark.parametrize(
+    ("call", "text"),
+    [
+        (lambda: sv.grid(m=[]), "m has no values"),
+        (lambda: sv.monte_carlo(-1, seed=1), "n is -1"),
+        (lambda: sv.monte_carlo(2, seed=None), "seed is None"),
+        (lambda: sv.monte_carlo(2, seed=1, m=[1, 2]), "distribution of m"),
+        (lambda: sv.sweep(halves, sv.grid(m=1), seed=1), "no parameter rng"),
+        (lambda: sv.sweep(crane_loop, sv.grid(m_load=100)), "No seed was given"),
+        (lambda: sv.sweep(halves, sv.grid(m=1), shard=(3, 2)), r"shard = \(3, 2\)"),
+        (lambda: sv.sweep(3, sv.grid(m=1)), "The case is 3"),
+        (lambda: sv.merge([]), "0 studies"),
+        (lambda: sv.merge([sv.sweep(halves, sv.grid(m=i)) for i in (1, 2)]), "2 different sweeps"),
+    ],
+)
+def test_what_cannot_be_swept_is_refused(call, text):
+    with pytest.raises(SpecificationError, match=text):
+        call()
+
+
+def test_a_function_that_processes_cannot_receive_is_refused_before_anything_runs():
+    with spawned(1) as pool, pytest.raises(SpecificationError, match="cannot be sent to another process"):
+        sv.sweep(lambda m: {"r": m}, sv.grid(m=[1]), executor=pool)
+
+
+# failures ------------------------------------------------------------------------------------------------------------
+
+
+def test_failures_are_rows_with_their_facts():
+    study = sv.sweep(picky, sv.grid(m=[1, 2, 3, 4]))
+    assert study["error"].tolist() == ["", "SpecificationError", "SystemExit", ""]
+    assert study["message"].tolist() == ["", "m is 2. It is not.", "over", ""]
+    assert json.loads(study["facts"][1]) == {"m": 2}
+    assert study["word"].tolist() == ["odd", "", "", "even"]
+    assert study["r"][0] == 1.0 and np.isnan(study["r"][1:]).all()
+    assert study.meta["message"] == "2 of 4 cases finished, 2 failed"
+
+
+@pytest.mark.parametrize("result", [[1.0], {"r": [1.0]}, {"m": 1.0}, {"error": 1.0}, None])
+def test_results_that_fit_no_table_are_failures(result):
+    row = sv.sweep(lambda m: result, sv.grid(m=[1])).rows()[0]
+    assert row["error"] == "SpecificationError" and "returned" in row["message"]
+
+
+def test_a_pool_that_dies_leaves_what_was_finished(tmp_path):
+    kept = tmp_path / "kept.jsonl"
+    with spawned(1) as pool:
+        study = sv.sweep(deadly, sv.grid(m=range(12)), executor=pool, checkpoint=kept)
+    done = study["case"][study["error"] == ""].tolist()
+    assert len(study) == 12 and done == [0, 1, 2, 3, 4] and study.meta["lost"] == list(range(5, 12))
+    assert set(study["error"][5:]) == {"BrokenProcessPool"}
+    assert "did not finish this case" in study["message"][7]
+    assert "7 not finished by the executor" in study.meta["message"]
+    assert len(kept.read_text().splitlines()) == 1 + len(done), "what was lost is computed again"
+
+
+def test_a_pool_that_dies_at_once_is_an_error():
+    with spawned(1) as pool, pytest.raises(ServoError, match="finished none of 2 cases. BrokenProcessPool"):
+        sv.sweep(deadly, sv.grid(m=[5, 5]), executor=pool)
+
+
+def test_a_pool_that_was_shut_down_is_an_error():
+    with ThreadPoolExecutor(1) as pool:
+        pass
+    with pytest.raises(ServoError, match="finished none of 1 cases. RuntimeError.*shutdown"):
+        sv.sweep(halves, sv.grid(m=[1]), executor=pool)
+
+
+def test_ctrl_c_returns_what_is_done():
+    def interrupted(m):
+        if m == 3:
+            raise KeyboardInterrupt
+        return {"r": m}
+
+    study = sv.sweep(interrupted, sv.grid(m=range(6)))
+    assert study["r"].tolist() == [0, 1, 2] and study.meta["interrupted"]
+    assert study.meta["message"] == "3 of 6 cases finished, interrupted: what was computed is kept"
+
+
+def test_a_case_that_swallows_ctrl_c_is_not_finished():
+    def swallowing(m):
+        try:
+            signal.raise_signal(signal.SIGINT) if m == 3 else None
+        except KeyboardInterrupt:
+            return {"r": -1.0}
+        return {"r": float(m)}
+
+    before = signal.getsignal(signal.SIGINT)
+    study = sv.sweep(swallowing, sv.grid(m=range(6)))
+    assert study["r"].tolist() == [0.0, 1.0, 2.0] and study.meta["interrupted"]
+    assert signal.getsignal(signal.SIGINT) is before
+
+
+# checkpoints ---------------------------------------------------------------------------------------------------------
+
+
+class Counting:
+    """A case that counts its calls and may end by Ctrl-C."""
+
+    def __init__(self, stop=None):
+        self.called, self.stop = [], stop
+
+    def __call__(self, m, rng):
+        if m == self.stop:
+            raise KeyboardInterrupt
+        self.called.append(m)
+        return {"r": rng.normal(), "gap": math.nan}
+
+
+def test_a_sweep_goes_on_where_its_checkpoint_ends(tmp_path):
+    kept, cases = tmp_path / "folder" / "kept.jsonl", sv.grid(m=range(6))
+    whole = sv.sweep(Counting(), cases, seed=1)
+    assert len(sv.sweep(Counting(stop=4), cases, seed=1, checkpoint=kept)) == 4
+    text = kept.read_text()
+    kept.write_text(text[:-9])  # the last line was cut off when the machine lost its power
+    again = Counting()
+    assert same(whole, sv.sweep(again, cases, seed=1, checkpoint=kept))
+    assert again.called == [3, 4, 5]
+    assert same(whole, sv.sweep(Counting(stop=0), cases, seed=1, checkpoint=kept)), "nothing is computed"
+
+
+def test_a_failure_is_not_tried_again(tmp_path):
+    first = sv.sweep(picky, sv.grid(m=[1, 2]), checkpoint=tmp_path / "kept")
+    assert same(first, sv.sweep(picky, sv.grid(m=[1, 2]), checkpoint=tmp_path / "kept"))
+    assert len((tmp_path / "kept").read_text().splitlines()) == 3
+
+
+@pytest.mark.parametrize(
+    ("case", "cases", "seed"),
+    [(Counting(), {"m": [1, 3]}, 1), (Counting(), {"m": [1, 2]}, 2), (lambda m, rng: {}, {"m": [1, 2]}, 1)],
+    ids=["cases", "seed", "function"],
+)
+def test_the_checkpoint_of_another_sweep_is_refused(tmp_path, case, cases, seed):
+    kept = tmp_path / "kept"
+    sv.sweep(Counting(), {"m": [1, 2]}, seed=1, checkpoint=kept)
+    text = kept.read_text()
+    with pytest.raises(SpecificationError, match="other cases, another seed or another case function"):
+        sv.sweep(case, cases, seed=seed, checkpoint=kept)
+    assert kept.read_text() == text
+
+
+@pytest.mark.parametrize("text", ["hello\n", "[]\n", "{}\n"])
+def test_a_file_that_is_no_checkpoint_is_left_alone(tmp_path, text):
+    (tmp_path / "notes").write_text(text)
+    with pytest.raises(SpecificationError, match="no checkpoint"):
+        sv.sweep(halves, {"m": [1]}, checkpoint=tmp_path / "notes")
+    assert (tmp_path / "notes").read_text() == text
+
+
+def test_a_checkpoint_that_cannot_be_opened_is_told(tmp_path):
+    with pytest.raises(ServoError, match="cannot be opened"):
+        sv.sweep(halves, {"m": [1]}, checkpoint=tmp_path)
+
+
+# tables and figures --------------------------------------------------------------------------------------------------
+
+
+def test_a_run_gives_extrema_final_values_and_its_residual(gallery_model):
+    model = gallery_model("overhead-crane")
+    run = sv.simulate(model, model.start(guess={"l": 4.0}), (0.0, 8.0), progress=False)
+    row = sv.sweep(lambda m: run, {"m": [1]}).rows()[0]
+    assert [name for name in row if name not in TOLD][2:] == [
+        f"{name}_{what}" for name in ("trolley", "hoist", "tension") for what in ("min", "max", "end")
+    ] + ["residual", "t_end"]
+    assert row["trolley_max"] == run["trolley"].max() and row["tension_end"] == run["tension"][-1]
+    assert row["residual"] == max(np.abs(run.residual[name]).max() for name in run.residual) and row["t_end"] == 8.0
+
+
+def test_a_study_is_saved_loaded_and_given_to_xarray(tmp_path):
+    import xarray
+
+    study = sv.sweep(picky, sv.grid(m=[1, 2, 3, 4]))
+    loaded = sv.load_study(study.save(tmp_path / "study"))
+    assert same(study, loaded) and loaded.meta == study.meta
+    assert same(sv.merge([loaded]), study)
+    study.to_xarray().to_netcdf(tmp_path / "study.nc")
+    with xarray.open_dataset(tmp_path / "study.nc") as data:
+        assert np.array_equal(data["r"], study["r"], equal_nan=True)
+        assert data["error"].values.tolist() == study["error"].tolist()
+        assert data.attrs["message"] == study.meta["message"]
+
+
+def test_the_figure_shows_percentiles_dependence_and_failures():
+    def case(a, b):
+        if a > 1.95:
+            raise ValueError
+        return {"r": 10 * a + b, "still": 1.0}
+
+    study = sv.sweep(case, sv.monte_carlo(200, seed=1, a=lambda r: r.uniform(0, 2), b=lambda r: r.uniform(0, 2)))
+    figure = sv.plots.sweep(study, units={"r": "N"})
+    histogram, scatter = figure.axes
+    assert (histogram.get_xlabel(), scatter.get_xlabel(), scatter.get_ylabel()) == ("r [N]", "a", "r [N]")
+    lines = [line.get_xdata()[0] for line in histogram.get_lines()]
+    finished = study["r"][study["error"] == ""]
+    assert np.allclose(lines, np.percentile(finished, [5, 50, 95]))
+    assert sum(patch.get_height() for patch in histogram.patches) == len(finished)
+    failed = len(study) - len(finished)
+    assert failed and scatter.get_legend().get_texts()[0].get_text() == f"{failed} without result"
+    assert sv.plots.sweep(study, ["r"], "b").axes[1].get_xlabel() == "b"
+    with pytest.raises(NameUnknown):
+        sv.plots.sweep(study, ["rr"])
+    with pytest.raises(SpecificationError, match="no result varies"):
+        sv.plots.sweep(study.take([0, 1]), [])
+
+
+def test_a_sweep_of_functions_pickles_by_name():
+    assert pickle.loads(pickle.dumps(halves)) is halves
+
+
+# the command ---------------------------------------------------------------------------------------------------------
+
+
+OWN = '''"""Half of a number, and a random one."""
+def case(m, rng):
+    if m == 4:
+        raise ValueError("four")
+    return {"half": m / 2, "random": rng.normal()}
+'''
+
+
+@pytest.fixture
+def here(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", list(sys.path))
+    (tmp_path / "own.py").write_text(OWN)
+    return tmp_path
+
+
+def test_the_command_varies_parameters_of_a_scene(here, capsys):
+    assert main(["sweep", "two-cars", "--vary", "m1=1:2:3", "--vary", "k1=1,2", "--out", "out"]) == 0
+    study = sv.load_study("out/sweep.npz")
+    assert study["m1"].tolist() == [1.0, 1.0, 1.5, 1.5, 2.0, 2.0] and study["k1"].tolist() == [1.0, 2.0] * 3
+    assert sorted(p.name for p in Path("out").iterdir()) == [f"sweep.{s}" for s in ("csv", "json", "npz", "png")]
+    assert "6 of 6 cases finished" in capsys.readouterr().out
+    assert json.loads(Path("out/sweep.json").read_text())["parameters"] == ["m1", "k1"]
+
+
+def test_shards_of_the_command_merge_to_the_table_of_one_process(here):
+    own = ["sweep", "own.py", "--vary", "m=1:5:5", "--monte-carlo", "2", "--seed", "3"]
+    assert main([*own, "--out", "whole"]) == 1, "case 4 fails"
+    assert [main([*own, "--shard", f"{i}/2", "--out", "parts"]) for i in (1, 2)] == [1, 1]
+    assert main(["sweep", "--merge", "parts", "--out", "merged"]) == 1
+    whole = sv.load_study("whole/sweep.npz")
+    assert same(whole, sv.load_study("merged/sweep.npz"))
+    assert len(whole) == 10 and (whole["error"] != "").tolist() == [False] * 6 + [True] * 2 + [False] * 2
+
+
+def test_the_command_on_two_processes_gives_the_same_bits(here):
+    own = ["sweep", "own.py", "--vary", "m=1,2,3", "--monte-carlo", "2", "--seed", "3"]
+    assert main([*own, "--out", "one"]) == main([*own, "--workers", "2", "--out", "two"]) == 0
+    assert same(sv.load_study("one/sweep.npz"), sv.load_study("two/sweep.npz"))
+
+
+def test_the_command_resumes_and_does_not_throw_work_away(here, capsys):
+    own = ["sweep", "own.py", "--vary", "m=1,2,3", "--monte-carlo", "1", "--seed", "3", "--out", "out"]
+    text = OWN.replace("if m == 4:", 'if m == 3 and not __import__("os").path.exists("go"):')
+    (here / "own.py").write_text(text.replace('ValueError("four")', "KeyboardInterrupt"))
+    assert main(own) == 1
+    assert "interrupted" in capsys.readouterr().out and Path("out/sweep.jsonl").exists()
+    assert main(own) == 2
+    assert "--resume" in capsys.readouterr().err
+    (here / "go").write_text("")
+    assert main([*own, "--resume"]) == 0
+    assert sv.load_study("out/sweep.npz").meta["message"] == "3 of 3 cases finished"
+    assert not Path("out/sweep.jsonl").exists()
+
+
+@pytest.mark.parametrize(
+    ("options", "text"),
+    [
+        (["two-cars"], "Neither --vary nor --monte-carlo"),
+        (["two-cars", "--vary", "mm=1,2"], "No parameter or state is named 'mm'"),
+        (["two-cars", "--monte-carlo", "2", "--draw", "m1=normal:1:0.1"], "There is no --seed"),
+        (["two-cars", "--vary", "m1=1,2", "--seed", "1"], "nothing is random"),
+        (["two-cars", "--draw", "m1=normal:1:0.1", "--seed", "1"], "without --monte-carlo"),
+        (["two-cars", "--vary", "m1=1", "--draw", "m1=normal:1:1", "--monte-carlo", "2"], "m1 is both varied and drawn"),
+        (["two-cars", "--vary", "m1=1,2", "--vary", "m1=3"], "--vary m1 was given twice"),
+        (["own.py", "--vary", "m=1,2", "--method", "RK4"], "by its own case"),
+        (["own.py", "--vary", "k=1,2", "--seed", "1"], "missing a required argument: 'm'"),
+        (["none.py", "--vary", "m=1,2"], "There is no file none.py"),
+        (["--merge", "nowhere"], "There are no shards in nowhere"),
+        ([], "was given no scene"),
+    ],
+)  # fmt: skip
+def test_the_command_refuses(here, capsys, options, text):
+    assert main(["sweep", *options, "--out", "out"]) == 2
+    assert re.search(text, " ".join(capsys.readouterr().err.split()))
+    assert not Path("out").exists(), "no folder is left"
+
+
+@pytest.mark.parametrize(
+    "options", [["--vary", "m=1:2"], ["--vary", "m"], ["--draw", "m=gauss:1:2"], ["--shard", "3/2"], ["--workers", "0"]]
+)
+def test_values_of_another_form_are_refused_by_the_parser(here, capsys, options):
+    with pytest.raises(SystemExit):
+        main(["sweep", "two-cars", *options])
+    assert "argument" in capsys.readouterr().err
+
+
+def test_export_c_writes_two_files(here, capsys):
+    assert main(["export-c", "two-cars", "--out", "c", "--set", "k1=2"]) == 0
+    assert sorted(p.name for p in Path("c").iterdir()) == ["two_cars.c", "two_cars.h"]
+    assert "two_cars.c, two_cars.h in c" in capsys.readouterr().out
+    assert main(["export-c", "two-cars", "--out", "c", "--name", "int"]) == 2

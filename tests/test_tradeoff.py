@@ -1,0 +1,261 @@
+"""The measured trade: every candidate has its row, the numbers are those of a run, and the advice follows from them."""
+
+import csv
+import json
+
+import numpy as np
+import pytest
+
+import servoctl as sv
+from servoctl.cli import main
+from servoctl.errors import LimitExceeded, NameUnknown, ServoError, SingularProgram, SpecificationError
+from servoctl.mechanisms import gallery
+from servoctl.simulation.rule import motion_error
+from servoctl.study.front import TradeOff
+from servoctl.study.study import Study, load_study
+
+SPAN = (0.0, 1.0)
+METHODS = ("Taylor", "DOP853", "RK4", "BDF")
+DRIFTS = (None, "project", 0.05)
+TOLERANCES, STEPS = (1e-3, 1e-6, 1e-9), (0.1, 0.025, 0.005)
+
+
+@pytest.fixture(scope="module")
+def scene(gallery_model):
+    model, scene = gallery_model("appell-hamel"), gallery["appell-hamel"]
+    return model, model.start(guess=scene.guess, **scene.start)
+
+
+@pytest.fixture(scope="module")
+def study(scene):
+    return sv.tradeoff(*scene, SPAN, METHODS, DRIFTS, rtol=TOLERANCES, step=STEPS, seconds=20.0)
+
+
+def synthetic(errors, seconds, uncertainty=1e-12, **changes):
+    n = len(errors)
+    columns = {name: [np.nan] * n for name in TradeOff.COLUMNS}
+    columns |= {"method": ["Taylor"] * n, "drift": ["project"] * n, "setting": ["rtol"] * n, "failure": [""] * n}
+    columns |= {"error": errors, "seconds": seconds, "value": [10.0**-k for k in range(n)], **changes}
+    reference = {"method": "a", "verified by": "b", "error": uncertainty, "actuation": 0.0}
+    machine = {"processor": "p", "cores": 1, "compiler": "cc"}
+    return TradeOff("tradeoff", columns, {"t_span": [0.0, 1.0], "reference": reference, "machine": machine})
+
+
+# --- rows
+
+
+def test_each_candidate_has_a_row(study):
+    for method in METHODS:
+        for drift in ("none", "project", "0.05"):
+            rows = study.where(method=method, drift=drift).rows()
+            if (method, drift) in (("BDF", "project"), ("Taylor", "0.05")):
+                assert len(rows) == 1 and "was given with method" in rows[0]["failure"]
+            else:
+                assert [row["value"] for row in rows] == list(STEPS if method == "RK4" else TOLERANCES)
+    measured = study.take(np.flatnonzero(study["failure"] == ""))
+    for name in ("error", "actuation", "residual", "energy", "power", "evaluations", "seconds"):
+        assert np.all(np.isfinite(measured[name])), name
+
+
+@pytest.mark.parametrize("drift, method, step", [("none", "RK4", 0.1), ("project", "RK4", 0.025)])
+def test_the_numbers_are_those_of_the_run(drift, method, step, study, scene):
+    model, start = scene
+    row = study.where(method=method, drift=drift, value=step).rows()[0]
+    run = sv.simulate(model, start, SPAN, method, drift=drift, step=step)
+    exact = sv.simulate(model, start, SPAN, "DOP853", rtol=3e-14, atol=1e-15, t_eval=run.t)
+    assert row["error"] == pytest.approx(motion_error(model, run.jets, exact.jets), rel=1e-3)
+    assert row["residual"] == max(np.abs(run.residual[name]).max() for name in run.residual)
+    assert row["evaluations"] == run.counters["nfev"] and row["steps"] == run.counters["steps"]
+    force, wanted = run.signals("inputs")[1], exact.signals("inputs")[1]
+    size = np.abs(wanted).max(axis=1, keepdims=True)
+    size = np.maximum(size, 1e-3 * size.max())
+    assert row["actuation"] == pytest.approx((np.abs(force - wanted) / size).max(), rel=1e-3)
+    assert row["energy"] == pytest.approx(np.abs(np.ptp(run["energy"]) / exact["energy"].max()), rel=0.5, abs=1e-12)
+
+
+def test_finer_settings_have_smaller_errors(study):
+    for method in METHODS:
+        errors = study.where(method=method, drift="none")["error"]
+        assert np.all(np.diff(errors[np.isfinite(errors)]) < 0)
+
+
+def test_the_reference_is_verified_by_another_method(study):
+    reference = study.meta["reference"]
+    assert reference["method"].startswith("Taylor") and reference["verified by"].startswith("DOP853")
+    assert 0 < reference["error"] < 1e-11 and reference["actuation"] < 1e-11 and reference["energy"] < 1e-11
+    assert np.array_equal(study["resolved"] == 1, study["error"] >= reference["error"])
+
+
+def test_the_machine_is_recorded(study):
+    machine = study.meta["machine"]
+    assert machine["cores"] >= 1 and machine["processor"] and machine["compiler"]
+    assert set(machine["versions"]) == {"servoctl", "python", "casadi", "numpy", "scipy"}
+
+
+def test_slow_candidates_are_skipped_and_say_so(scene):
+    slow = sv.tradeoff(*scene, SPAN, ["RK4", "DOP853"], [None], rtol=TOLERANCES, step=STEPS, seconds=1e-9)
+    assert len(slow) == 6
+    fixed, adaptive = slow.where(method="RK4").rows(), slow.where(method="DOP853").rows()
+    assert fixed[0]["failure"] == "" and all(r["failure"].startswith("skipped: step = 0.1 took") for r in fixed[1:])
+    assert "More than 1e-09 s: ended at t =" in adaptive[0]["failure"]
+    assert all("skipped: rtol = 0.001 took more than" in row["failure"] for row in adaptive[1:])
+
+
+def test_a_program_without_free_values_is_solved(gallery_model):
+    model, scene = gallery_model("overhead-crane"), gallery["overhead-crane"]
+    start = model.start(guess=scene.guess)
+    crane = sv.tradeoff(
+        model, start, (0.0, 8.0), ["algebraic", "Taylor", "RK4"], [None, "project"], rtol=[1e-3, 1e-6], step=[0.1]
+    )
+    assert crane.meta["reference"]["method"] == "algebraic" and crane.uncertainty < 1e-12
+    solved = crane.where(method="algebraic")
+    assert len(solved) == 1 and solved["error"][0] <= 1e-12 and solved["actuation"][0] <= 1e-11
+    assert crane.where(method="RK4", drift="none")["error"][0] > 1e-9
+    assert crane.recommend(error=1e-12) == {"method": "algebraic"}
+
+
+# --- advice
+
+
+def test_the_front_is_what_nothing_beats(study):
+    front = study.pareto()
+    told = np.maximum(study["error"], study.uncertainty)
+    good = np.isfinite(told)
+    wanted = [
+        i for i in np.flatnonzero(good)
+        if not np.any(good & (told <= told[i]) & (study["seconds"] <= study["seconds"][i])
+                      & ((told < told[i]) | (study["seconds"] < study["seconds"][i])))
+    ]  # fmt: skip
+    assert sorted(front["seconds"]) == sorted(study["seconds"][wanted])
+    assert np.all(np.diff(front["seconds"]) > 0)
+    assert study.pareto("evaluations")["method"][0] == "Taylor"
+
+
+def test_a_recommendation_is_kept(study, scene):
+    best = study.recommend(error=1e-6)
+    assert best.row["error"] <= 1e-6
+    run = sv.simulate(*scene, SPAN, **best)
+    exact = sv.simulate(*scene, SPAN, "DOP853", rtol=3e-14, atol=1e-15, t_eval=run.t)
+    assert motion_error(scene[0], run.jets, exact.jets) <= 2e-6
+    assert study.recommend(seconds=1e3).row["error"] == study.pareto()["error"][-1]
+
+
+def test_the_fastest_within_an_error_and_the_best_within_a_time():
+    made = synthetic([1e-2, 1e-6, 1e-9, np.nan, 1e-15], [1e-3, 2e-3, 5e-3, np.nan, 1.0])
+    assert made.recommend(error=1e-5) == {"method": "Taylor", "drift": "project", "rtol": 0.1, "atol": 1e-3}
+    assert made.recommend(seconds=6e-3)["rtol"] == 0.01
+    assert made.recommend(error=1e-12)["rtol"] == 1e-4
+    with pytest.raises(LimitExceeded, match="error=1e-14.*certain to 1e-12 only.*error 1e-12 in 1 s"):
+        made.recommend(error=1e-14)  # what lies below the reference's uncertainty is not known
+    with pytest.raises(LimitExceeded, match="seconds=1e-05 was asked.*rtol 1: error 0.01 in 0.001 s"):
+        made.recommend(seconds=1e-5)
+    with pytest.raises(LimitExceeded, match="every run failed"):
+        synthetic([np.nan], [np.nan]).recommend(error=1.0)
+    for given in ({}, {"error": 1e-3, "seconds": 1.0}):
+        with pytest.raises(SpecificationError, match="one question"):
+            made.recommend(**given)
+
+
+@pytest.mark.parametrize("drift", ["none", "project", "project 5", "0.05", "minimal"])
+def test_a_recommended_treatment_is_the_measured_one(drift):
+    options = synthetic([1e-6], [1.0], drift=[drift]).recommend(error=1e-3)
+    wanted = {"none": None, "project 5": sv.project(5), "0.05": 0.05}.get(drift, drift)
+    assert options.get("drift") == wanted
+
+
+# --- the table
+
+
+def test_a_study_is_read_back(study, tmp_path):
+    again = load_study(study.save(tmp_path / "trade"))
+    assert type(again) is TradeOff and again.meta == study.meta and repr(again) == repr(study)
+    for name in study.columns:
+        np.testing.assert_array_equal(again[name], study[name])
+    with open(study.csv(tmp_path / "trade.csv"), newline="", encoding="utf-8") as file:
+        rows = list(csv.DictReader(file))
+    assert len(rows) == len(study) and list(rows[0]) == list(TradeOff.COLUMNS)
+    assert [float(row["error"]) for row in rows[:3]] == study["error"][:3].tolist()
+
+
+def test_a_study_prints_in_twelve_lines(study):
+    lines = repr(study).splitlines()
+    assert 5 <= len(lines) <= 12 and max(map(len, lines)) <= 120
+    assert "Taylor of order 16 at 1e-15; DOP853 at 3e-14 agrees to" in lines[1]
+    assert len(repr(synthetic([10.0**-k for k in range(20)], np.arange(1.0, 21.0))).splitlines()) <= 12
+
+
+def test_a_table_has_even_columns(tmp_path):
+    table = Study("any", {"a": [1, None, 3.5], "b": ["x", None, "z"]})
+    assert table.where(b="z").rows() == [{"a": 3.5, "b": "z"}] and np.isnan(table["a"][1]) and table["b"][1] == ""
+    with pytest.raises(SpecificationError, match="lengths"):
+        Study("any", {"a": [1], "b": [1, 2]})
+    with pytest.raises(NameUnknown, match="No column is named 'c'"):
+        table.column("c")
+    with pytest.raises(ServoError, match="cannot be read as a study"):
+        load_study(tmp_path / "none.npz")
+    (tmp_path / "file").write_text("")
+    with pytest.raises(ServoError, match="cannot be written"):
+        table.csv(tmp_path / "file" / "a.csv")
+
+
+@pytest.mark.parametrize("cost", ["seconds", "evaluations"])
+def test_the_plot_draws_every_number(cost, study):
+    ax = study.plot(cost=cost, title="trade")
+    drawn = [line for line in ax.lines if line.get_marker() not in ("None", "", None)]
+    assert sum(len(line.get_xdata()) for line in drawn) == np.isfinite(study["error"]).sum()
+    assert ax.get_xscale() == ax.get_yscale() == "log" and cost in ax.get_xlabel() and ax.get_title() == "trade"
+    texts = [text.get_text() for text in ax.get_legend().get_texts()]
+    assert {"Taylor", "DOP853", "RK4", "BDF", "projected", "poles at -1/(0.05 s)", "Pareto front"} <= set(texts)
+    with pytest.raises(NameUnknown):
+        study.plot(cost="money")
+
+
+# --- what is refused
+
+
+@pytest.mark.parametrize(
+    "given, error, text",
+    [
+        ({"methods": ["RK3"]}, NameUnknown, "No method is named 'RK3'"),
+        ({"rtol": [1e-3, -1.0]}, SpecificationError, "rtol was given as"),
+        ({"step": "fine"}, SpecificationError, "step was given as 'fine'"),
+        ({"seconds": 0.0}, SpecificationError, "seconds was given as"),
+        ({"drift": ["often"]}, NameUnknown, "drift treatment"),
+        ({"drift": [sv.poles({"x_c": [-1.0]})]}, SpecificationError, "time constant"),
+        ({"t_span": (0.0, 0.0)}, SpecificationError, "two different finite times"),
+        ({"t_span": 3.0}, SpecificationError, "two different finite times"),
+    ],
+)
+def test_bad_input(given, error, text, scene):
+    with pytest.raises(error, match=text):
+        sv.tradeoff(*scene, given.pop("t_span", SPAN), **given)
+
+
+def test_without_a_reference_there_is_no_trade(gallery_model):
+    model, scene = gallery_model("appell-hamel-squared"), gallery["appell-hamel-squared"]
+    with pytest.raises(SingularProgram, match="0.698"):
+        sv.tradeoff(model, model.start(guess=scene.guess, **scene.start), (0.0, 1.0), ["RK4"], [None])
+
+
+# --- the command
+
+
+def test_the_command_leaves_table_figure_and_advice(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    line = "tradeoff appell-hamel --t-span 0 0.5 --method Taylor RK4 --drift none --set b=0.21"
+    assert main([*line.split(), "--error", "1e-6"]) == 0
+    folder = tmp_path / "servoctl-runs" / "appell-hamel-tradeoff"
+    names = {"tradeoff.npz", "tradeoff.csv", "tradeoff.png", "summary.json", "report.txt"}
+    assert {path.name for path in folder.iterdir()} == names
+    facts = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
+    assert facts["t_span"] == [0.0, 0.5] and facts["recommended"]["method"] in ("Taylor", "RK4")
+    assert "Recommended: method=" in capsys.readouterr().out
+    assert set(load_study(folder / "tradeoff.npz")["method"]) == {"Taylor", "RK4"}
+
+
+def test_the_command_keeps_what_was_measured_where_nothing_reaches_it(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    line = "tradeoff appell-hamel --t-span 0 0.5 --method RK4 --drift none --out here --seconds 1e-9"
+    assert main(line.split()) == 2
+    assert "seconds=1e-09 was asked for" in capsys.readouterr().err
+    assert (tmp_path / "here" / "tradeoff.csv").exists() and (tmp_path / "here" / "report.txt").exists()
