@@ -4,7 +4,7 @@ A specification flows one way: Mechanism and Program, by `derive`, become a Mode
 `verify` proves the run against the full mechanism.
 """
 
-from servoctl import plots, spec
+from servoctl import interop, plots, spec
 from servoctl.control import disturbances
 from servoctl.control.close import close
 from servoctl.control.closed import Closed
@@ -99,6 +99,7 @@ __all__ = [
     "formulation_cost",
     "grid",
     "internal_dynamics",
+    "interop",
     "limit_report",
     "limited",
     "load",

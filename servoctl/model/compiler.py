@@ -121,6 +121,11 @@ def _processor():
         return ""
 
 
+def features():
+    """Features of the processor that code is compiled for, as words; empty where the system does not tell."""
+    return frozenset(_processor().split())
+
+
 def _optional_flags():
     """Flags left out if the compiler refuses them; code for this very processor only where the key can name it."""
     return ("-fno-semantic-interposition", *(("-march=native",) if _processor() else ()))

@@ -187,9 +187,9 @@ def _first(f, n):
     return ca.Function(f.name(), inputs, [f(*inputs)[:n]])
 
 
-def _function(f, name, chunk):
+def _function(f, name, chunk, shared=SHARED):
     """The text of one C function, in chunks where it is long."""
-    statements = _with_reciprocals(_statements(f))
+    statements = _with_reciprocals(_statements(f), shared)
     chunks = [statements[k : k + chunk] for k in range(0, len(statements), chunk)]
     return _single(name, statements) if len(chunks) <= 1 else _chunked(name, chunks)
 
@@ -231,12 +231,12 @@ def _statements(f):
     return statements
 
 
-def _with_reciprocals(statements):
-    """The statements with one reciprocal for all divisions by the same value, where these are `SHARED` or more."""
+def _with_reciprocals(statements, shared):
+    """The statements with one reciprocal for all divisions by the same value, where these are `shared` or more."""
     division, product = _TEMPLATES[ca.OP_DIV], _TEMPLATES[ca.OP_MUL]
     divisors = Counter(operands[1] for _, template, operands in statements if template == division)
     new = count(len(statements))
-    reciprocal = {v: next(new) for v, n in divisors.items() if n >= SHARED and isinstance(v, int)}
+    reciprocal = {v: next(new) for v, n in divisors.items() if n >= shared and isinstance(v, int)}
     found, made = [], set()
     for target, template, operands in statements:
         if template == division and operands[1] in reciprocal:
@@ -301,7 +301,7 @@ def _slots(chunks, home):
     return slots, n_slots
 
 
-def portable(f, name):
+def portable(f, name, shared=SHARED):
     """C99 text of one static function, without attributes and warnings, for a file that begins with `prelude`.
 
     Parameters
@@ -310,15 +310,22 @@ def portable(f, name):
         As `emit` takes it.
     name : str
         A C identifier.
+    shared : int
+        So many divisions by the same value take its reciprocal.
 
     Returns
     -------
     str
     """
-    text = _function(f, name, CHUNK).replace("__attribute__((noinline)) ", "")
+    text = _function(f, name, CHUNK, shared).replace("__attribute__((noinline)) ", "")
     for begin, used in ((f"{_SIGNATURE})\n{{\n", "txpy"), (f"{_SIGNATURE}, V *restrict w)\n{{\n", "txpyw")):
         text = text.replace(begin, f"{begin}    {' '.join(f'(void){argument};' for argument in used)}\n")
     return text.replace(f"\nvoid {name}(", f"\nstatic void {name}(")
+
+
+def several(text, n):
+    """`portable` functions and loops over them, in terms of V and K, for n points at once."""
+    return lanes(text, _OPERATIONS, n)
 
 
 def prelude(text):

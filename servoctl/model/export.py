@@ -189,7 +189,7 @@ def _of_law(law):
     for (int i = 0; i < {nz}; i++) z[i] = @_z0[i];
 """
     step = f"""
-    double x[{ny + nz}], all[{f.numel_out(0)}];
+    double x[{max(ny + nz, 1)}] = {{0}}, all[{f.numel_out(0)}];
     double k = floor((t - ({float(law.t0)!r})) * {float(law.rate)!r} + 0.5);
     k = k > 0 ? k : 0;
     k = k < {last} ? k : {last};

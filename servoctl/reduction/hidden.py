@@ -79,6 +79,24 @@ def _step(q, rows, numbers, context, starts=None):
         (rows[a].kind == "dynamics", w, a) for a, w in zip(support, weights, strict=True) if rows[a].order == top
     ]
     b = max(candidates)[2]
+    rest = [row for a, row in enumerate(rows) if a != b]
+    new, points, pivots, story = _combination(q, rows, b, support, top, numbers, context, starts)
+    if new.order >= top:
+        support, numbers = _about(q, rows, b, context)
+        if not support:
+            raise _vanishing_gradient(rows[b])
+        new, points, pivots, story = _combination(q, rows, b, support, top, numbers, context)
+        if new.order >= top:
+            raise _vanishing_gradient(rows[b])
+    kinds = {rows[a].kind for a in support}
+    if new.order < 0:
+        raise _dependent(new, points, [rows[a].name for a in support], kinds, story)
+    new = replace(new, name=rows[b].name, kind=rows[b].kind, story=story)
+    return [new if a == b else row for a, row in enumerate(rows)], [(f"combination of {story}", p) for p in pivots]
+
+
+def _combination(q, rows, b, support, top, numbers, context, starts=None):
+    """Row b combined with the others of a support, settled on the manifold of all other rows."""
     _require_affine(rows, support, top)
     others = [a for a in support if a != b]
     chi, pivots = _combine(q, rows, b, others, top, numbers)
@@ -90,13 +108,21 @@ def _step(q, rows, numbers, context, starts=None):
     new, points = settle(q, candidate, rest, context, starts)
     if new is None:
         raise _no_state(rest)
-    if new.order >= top:
-        raise _vanishing_gradient(rows[b])
-    kinds = {rows[a].kind for a in support}
-    if new.order < 0:
-        raise _dependent(new, points, [rows[a].name for a in support], kinds, story)
-    new = replace(new, name=rows[b].name, kind=rows[b].kind, story=story)
-    return [new if a == b else row for a, row in enumerate(rows)], [(f"combination of {story}", p) for p in pivots]
+    return new, points, pivots, story
+
+
+def _about(q, rows, b, context):
+    """The rows that give row b's leading gradient at states of the others, where b itself need not hold, with L there.
+
+    On the manifold of all rows coefficients may vanish that do not vanish about it: a load that is lifted straight up
+    never swings, and only about its motion is it seen that the combination forbids swinging.
+    """
+    order = [*(a for a in range(len(rows)) if a != b and rows[a].order <= rows[b].order), b]
+    rest = [row for a, row in enumerate(rows) if a != b]
+    points = sample_rows(q, rest, max(row.order for row in rows), context)
+    numbers, _ = leading(q, rows, points)
+    support, _ = dependence(q, [rows[a] for a in order], numbers[order])
+    return ([order[i] for i in support] if support and support[-1] == len(order) - 1 else []), numbers
 
 
 def _combine(q, rows, b, others, top, numbers):

@@ -118,9 +118,14 @@ def project(every=1):
     -------
     Project
     """
-    if not isinstance(every, int) or every < 1:
+    if not is_whole(every) or every < 1:
         raise SpecificationError(f"every={every!r} was given.", "It is a whole number, at least 1.", do="Give 1.")
-    return Project(every)
+    return Project(int(every))
+
+
+def is_whole(value):
+    """Whether a value is a whole number, Python's or NumPy's; True and False are none."""
+    return isinstance(value, (int, np.integer)) and not isinstance(value, bool)
 
 
 def as_drift(value):

@@ -7,7 +7,7 @@ import numpy as np
 from servoctl.errors import InconsistentStart, SpecificationError, unknown
 from servoctl.simulation.adaptive import METHODS, ONE_STEP, Adaptive
 from servoctl.simulation.algebraic import algebraic
-from servoctl.simulation.drift import Minimal, Poles, Project, as_drift
+from servoctl.simulation.drift import Minimal, Poles, Project, as_drift, is_whole
 from servoctl.simulation.fixed import fixed_step
 from servoctl.simulation.implicit import RADAU_ORDERS, RadauMethod
 from servoctl.simulation.minimal import require_minimal
@@ -19,6 +19,7 @@ from servoctl.simulation.sundials import MULTISTEP, SundialsMethod
 from servoctl.simulation.tableaus import ORDERS
 
 SAMPLES = 1001  # of a run unless t_eval says otherwise: smooth curves, and extrema refined to rounding
+MOST_STEPS = 10**8  # of fixed length: more would fill the memory with samples
 OFF = 1e-5  # of a start: residuals relative to their gradients times the state, above which it is no start
 ALL_METHODS = ("algebraic", "Taylor", "RadauIIA", *ORDERS, *METHODS, *MULTISTEP)
 
@@ -111,7 +112,7 @@ def _simulated(model, start, span, method, drift, rtol, atol, step, t_eval, orde
         _require_consistent(model, t0, x0)
     knots = model.require_smooth((min(t0, t1), max(t0, t1)))
     times = _times(t0, t1, t_eval, knots)
-    rtol, atol = 1e-9 if rtol is None else rtol, 1e-11 if atol is None else atol
+    rtol, atol = _tolerance("rtol", rtol, 1e-9), _tolerance("atol", atol, 1e-11)
     bar = Progress((t0, t1), progress)
     try:
         if method == "algebraic":
@@ -253,7 +254,7 @@ def _refuse_idle(method, step, order, jets, rtol, atol):
             do="Give one of them, or leave order out.",
         )
     for name, value, low in (("order", order, 2), ("jets", jets, 1)):
-        if value is not None and not (isinstance(value, int) and low <= value <= 40):
+        if value is not None and not (is_whole(value) and low <= value <= 40):
             raise SpecificationError(
                 f"{name}={value!r} was given.", f"It is a whole number from {low} to 40.", do="Give 12."
             )
@@ -303,7 +304,14 @@ def _times(t0, t1, t_eval, knots):
     if t_eval is None:
         times = np.union1d(np.linspace(t0, t1, SAMPLES), [k for k in knots if min(t0, t1) < k < max(t0, t1)])
     else:
-        times = np.unique(np.asarray(t_eval, dtype=float))
+        try:
+            times = np.unique(np.asarray(t_eval, dtype=float))
+        except (TypeError, ValueError):
+            times = np.array([np.nan])
+        if not np.all(np.isfinite(times)):
+            raise SpecificationError(
+                f"t_eval={t_eval!r} was given.", "It is a sequence of finite times [s].", do="Give [0.0, 0.5, 1.0]."
+            )
         if not times.size or times[0] < min(t0, t1) - 1e-12 or times[-1] > max(t0, t1) + 1e-12:
             raise SpecificationError(
                 "t_eval lies outside t_span or is empty.", "Samples are taken within the span.", do="Extend t_span."
@@ -314,8 +322,31 @@ def _times(t0, t1, t_eval, knots):
 def _step(step, t0, t1):
     if step is None:
         return abs(t1 - t0) / 2000
-    if not (isinstance(step, (int, float)) and np.isfinite(step) and step > 0):
+    if not (is_number(step) and step > 0):
         raise SpecificationError(
             f"step={step!r} was given.", "A step is a positive number of seconds.", do="Give 1e-3."
         )
+    if abs(t1 - t0) > MOST_STEPS * step:
+        raise SpecificationError(
+            f"step={step!r} was given for a span of {abs(t1 - t0):g} s.",
+            f"At most {MOST_STEPS:,} steps fit into memory, each of them a sample.",
+            nearest=f"step={abs(t1 - t0) / MOST_STEPS:.2g}.",
+            do="Take a longer step, an adaptive method, or several spans.",
+            step=float(step),
+        )
     return float(step)
+
+
+def _tolerance(name, value, usual):
+    if value is None:
+        return usual
+    if not (is_number(value) and 0 < value <= 1):
+        raise SpecificationError(
+            f"{name}={value!r} was given.", "A tolerance is a positive number, at most 1.", do=f"Give {usual:g}."
+        )
+    return float(value)
+
+
+def is_number(value):
+    """Whether a value is a finite number, Python's or NumPy's; True and False are none."""
+    return isinstance(value, (int, float, np.integer, np.floating)) and not isinstance(value, bool) and np.isfinite(value)

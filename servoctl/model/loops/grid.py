@@ -15,7 +15,7 @@ void NAME_grid(int64_t n, const double *t, const double *x, const double *p, int
 #if NAME_wide_lanes
     if (n >= 8) {
         W xs[NAME_nx + 1], ps[NAME_np + 1], ys[NAME_ny + 1];
-        for (int64_t i = 0; !p_varies && i < NAME_np; i++) ps[i] = EIGHT(p[i]);
+        for (int64_t i = 0; !p_varies && i < NAME_np; i++) ps[i] = ALL(p[i]);
         for (int64_t k = 0; k < n; k += 8) {
             k = k + 8 > n ? n - 8 : k;
             for (int64_t i = 0; i < NAME_nx; i++) xs[i] = *(const U *)(x + i * n + k);

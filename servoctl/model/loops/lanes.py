@@ -1,4 +1,4 @@
-"""Eight points at once, as C text: the vector type W with the functions that emitted statements call.
+"""Several points at once, as C text: the vector type W with the functions that emitted statements call.
 
 A function is emitted a second time, with ``V``, ``K`` and ``v_sin`` in their meanings for W. sin and cos are those of
 fdlibm, after a reduction by three parts of pi/2; what has no formula here is taken lane by lane. Values differ from the
@@ -10,20 +10,29 @@ import re
 LANES = 8
 
 _TYPES = """
-typedef double W __attribute__((vector_size(64)));
-typedef int64_t I __attribute__((vector_size(64)));
-typedef double U __attribute__((vector_size(64), aligned(8), may_alias));
-#define EIGHT(c) ((W){(c), (c), (c), (c), (c), (c), (c), (c)})
+enum { W_LANES = COUNT };
+typedef double W __attribute__((vector_size(8 * COUNT)));
+typedef int64_t I __attribute__((vector_size(8 * COUNT)));
+typedef int8_t M __attribute__((vector_size(COUNT)));
+typedef double U __attribute__((vector_size(8 * COUNT), aligned(8), may_alias));
+#define ALL(c) ((W){SAME})
 
 #define INLINE static inline __attribute__((always_inline))
 
 INLINE W w_select(I mask, W a, W b) { return (W)((mask & (I)a) | (~mask & (I)b)); }
-INLINE W w_truth(I mask) { return (W)(mask & (I)EIGHT(1.0)); }
+INLINE int w_any(I mask)
+{
+    const M bytes = __builtin_convertvector(mask, M);
+    int64_t word = 0;
+    __builtin_memcpy(&word, &bytes, W_LANES);
+    return word != 0;
+}
+INLINE W w_truth(I mask) { return (W)(mask & (I)ALL(1.0)); }
 """
 
 _OWN = {
     "fabs": "(W)((I)a & 0x7fffffffffffffffLL)",
-    "sign": "w_select(a < 0, EIGHT(-1.0), w_select(a > 0, EIGHT(1.0), a))",
+    "sign": "w_select(a < 0, ALL(-1.0), w_select(a > 0, ALL(1.0), a))",
     "not": "w_truth(a == 0)",
     "lt": "w_truth(a < b)",
     "le": "w_truth(a <= b)",
@@ -55,22 +64,16 @@ INLINE W w_turned(W a, int64_t turns)
     return (W)((I)value ^ ((quadrant & 2) << 62));
 }
 
-INLINE int w_moderate(W a)
-{
-    const I beyond = ~((W)((I)a & 0x7fffffffffffffffLL) < 1e5);
-    int64_t any = 0;
-    for (int i = 0; i < 8; i++) any |= beyond[i];
-    return !any;
-}
+INLINE int w_moderate(W a) { return !w_any(~((W)((I)a & 0x7fffffffffffffffLL) < 1e5)); }
 """
 
-_MEANING = "#define V W\n#undef K\n#define K(constant) EIGHT(constant)\n"
+_MEANING = "#define V W\n#undef K\n#define K(constant) ALL(constant)\n"
 _MEANT = "#undef V\n#undef K\n#define K(constant) (constant)\n"
 
 
 def _by_lane(name, arguments):
     places = ", ".join(f"{a}[i]" for a in arguments)
-    return f"    W r;\n    for (int i = 0; i < 8; i++) r[i] = v_{name}({places});\n    return r;\n"
+    return f"    W r;\n    for (int i = 0; i < W_LANES; i++) r[i] = v_{name}({places});\n    return r;\n"
 
 
 def _defined(name, arguments):
@@ -83,8 +86,8 @@ def _defined(name, arguments):
     return f"{head}{_by_lane(name, arguments)}}}\n"
 
 
-def lanes(text, operations):
-    """C text of a function for eight points at once.
+def lanes(text, operations, n=LANES):
+    """C text of a function for several points at once.
 
     Parameters
     ----------
@@ -92,6 +95,8 @@ def lanes(text, operations):
         Of the function, under its new name, in terms of V, K and operations v_NAME.
     operations : dict of str to (arguments, scalar)
         For each NAME its arguments, "a" or "ab", and the C function for which v_NAME is a macro, or None.
+    n : int
+        Number of points: a power of two.
 
     Returns
     -------
@@ -103,6 +108,7 @@ def lanes(text, operations):
     end = "".join(
         f"#undef v_{name}\n" + (f"#define v_{name} {scalar}\n" if scalar else "") for name, (_, scalar) in used.items()
     )
+    types = _TYPES.replace("COUNT", str(n)).replace("SAME", ", ".join(n * ["(c)"]))
     return "".join(
-        (_TYPES, _SINCOS if used.keys() & {"sin", "cos"} else "", functions, begin, _MEANING, text, end, _MEANT)
+        (types, _SINCOS if used.keys() & {"sin", "cos"} else "", functions, begin, _MEANING, text, end, _MEANT)
     )

@@ -73,7 +73,7 @@ static inline void NAME_weights(W t, double node, double other, double another, 
 static inline double NAME_wide_defect(const W *x, const W *y)
 {
     double defect = 0;
-    W largest = EIGHT(0.0);
+    W largest = ALL(0.0);
     for (int64_t i = 0; i < NAME_nx; i++) {
         const W size = (W)((I)x[i] & INT64_MAX), e = (W)((I)y[i] & INT64_MAX) / (1.0 + size);
         largest = w_select((e <= largest) | (largest != largest), largest, e);
@@ -97,7 +97,7 @@ static int NAME_block(int64_t n, int64_t k, const double *t, const W *p, double 
     for (int64_t m = 0; m < 3; m++)
         NAME_weights(now, t[nodes[m]], t[nodes[(m + 1) % 3]], t[nodes[(m + 2) % 3]], value + m, rate + m);
     for (int64_t i = 0; i < NAME_nx; i++) {
-        x[i] = EIGHT(0.0);
+        x[i] = ALL(0.0);
         for (int64_t m = 0; m < 3; m++)
             x[i] += value[m] * x_log[i * n + nodes[m]] + rate[m] * y_log[(NAME_nx + i) * n + nodes[m]];
     }
@@ -127,7 +127,7 @@ int64_t NAME_newton(int64_t n, const double *t, const double *x0, const double *
     for (int64_t i = 0; i < NAME_nx; i++) x[i] = x0[i];
 #if NAME_wide_lanes
     W wide_p[NAME_np + 1];
-    for (int64_t i = 0; i < NAME_np; i++) wide_p[i] = EIGHT(p[i]);
+    for (int64_t i = 0; i < NAME_np; i++) wide_p[i] = ALL(p[i]);
 #endif
     for (int64_t k = 0; k < n; k++) {
 #if NAME_wide_lanes

@@ -1,0 +1,47 @@
+"""Names of signals in python-control, and the loop of a plant and a law by them."""
+
+from servoctl.errors import SpecificationError, unknown
+
+
+def output_names(plant):
+    """Outputs of a plant: states as signals, and the mechanism's outputs."""
+    return [*signal_names(plant.state_names, plant.inputs), *plant.mechanism.outputs]
+
+
+def signal_names(names, inputs):
+    """Names of states as signals: a lagged actuator is told from its input."""
+    return [f"lagged {name}" if name in inputs else name for name in names]
+
+
+def force_indices(plant, disturbed):
+    """Where generalised forces stand among the plant's disturbances."""
+    for name in disturbed:
+        if name not in plant.disturbable:
+            raise unknown(name, plant.disturbable, "generalised force")
+    return [plant.disturbable.index(name) for name in disturbed]
+
+
+def connected(system, law_system, plant, law, name):
+    """The loop of a plant's system and a law's, nonlinear or linear."""
+    import control
+
+    measured = signal_names(law.measures, law.inputs)
+    wires = [[f"plant.{a}", f"law.{a}"] for a in law.inputs] + [[f"law.{y}", f"plant.{y}"] for y in measured]
+    disturbances, outputs = [f"disturbance {force}" for force in plant.disturbable], output_names(plant)
+    return control.interconnect(
+        [system, law_system], wires, name=name,
+        inplist=[*(f"plant.{d}" for d in disturbances), *(f"law.{y}" for y in measured)],
+        inputs=[*disturbances, *(f"noise {y}" for y in measured)],
+        outlist=[*(f"plant.{y}" for y in outputs), *(f"law.{a}" for a in law.inputs)],
+        outputs=[*outputs, *(f"command {a}" for a in law.inputs)],
+    )  # fmt: skip
+
+
+def stranger(thing):
+    """The error for what is no model, plant, law or loop."""
+    return SpecificationError(
+        f"A {type(thing).__name__} was given.",
+        "Systems of python-control are made of a Model, a Plant, a Law or the Closed of sv.close.",
+        nearest="run.model, of a plan." if hasattr(thing, "jets") else "",
+        do="Give one of these.",
+    )

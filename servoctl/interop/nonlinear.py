@@ -1,0 +1,237 @@
+"""Nonlinear systems of python-control, by name."""
+
+import math
+
+import numpy as np
+
+from servoctl.control.close import limits, steps
+from servoctl.control.closed import Closed
+from servoctl.control.law import Law
+from servoctl.control.tracking import positive
+from servoctl.errors import ServoError, SpecificationError
+from servoctl.interop.names import connected, force_indices, output_names, signal_names, stranger
+from servoctl.model.model import Model
+from servoctl.model.plant import Plant
+
+SUBSTEPS = 10  # Runge-Kutta steps per sample: 1 ms at 100 Hz
+
+
+def nlsys(thing, *, rate=None, substeps=None, disturbed=(), name=None):
+    """A model, plant, law or closed loop as a `control.NonlinearIOSystem`.
+
+    A model has no inputs: its states follow the program; its outputs are the states, the required actuation (or
+    reaction) and the mechanism's outputs. A plant's inputs are its actuators, its outputs the states and the
+    mechanism's outputs. A law is sampled (dt = 1/rate) from the measurement to the actuators. A closed loop is the
+    `control.interconnect` of its sampled plant and its law; its inputs are "disturbance NAME" of each generalised force
+    and "noise NAME" of each measured state, its outputs those of the plant and "command NAME".
+
+    Parameters
+    ----------
+    thing : Model, Plant, Law or Closed
+    rate : float, optional
+        Of a plant only: samples per second [Hz]. It is then a system in discrete time, whose inputs are held over each
+        sample; python-control interconnects a law with no other. Limits of rate and transport delays need it: past
+        inputs are then further states.
+    substeps : int, optional
+        Of a sampled plant: Runge-Kutta steps of order 4 per sample; default 10.
+    disturbed : sequence of str
+        Of a plant: generalised forces with an input "disturbance NAME" of their own.
+    name : str, optional
+        Of the system; default "model", "plant", "law" or "loop".
+
+    Returns
+    -------
+    control.NonlinearIOSystem
+        The mechanism's parameters are its `params`, by name.
+
+    Raises
+    ------
+    SpecificationError
+        For what is none of these, options that it does not have, limits of rate or delays in continuous time.
+    NameUnknown
+        For a disturbance on no generalised force.
+    """
+    if not isinstance(thing, Plant) and (rate is not None or substeps is not None or disturbed):
+        raise SpecificationError(
+            f"rate, substeps or disturbed was given for a {type(thing).__name__}.",
+            "They are those of a plant; laws and loops have their own rate, models are continuous.",
+            do="Leave them out.",
+        )
+    if isinstance(thing, Plant):
+        return _plant(thing, name or "plant", disturbed, rate, substeps)
+    if isinstance(thing, Model):
+        return _model(thing, name or "model")
+    if isinstance(thing, Law):
+        return _law(thing, name or "law")
+    if isinstance(thing, Closed):
+        return _closed(thing, name or "loop")
+    raise stranger(thing)
+
+
+def start(closed):
+    """The state in which the system of a closed loop starts, for X0 of python-control: plant, past inputs, memory.
+
+    Parameters
+    ----------
+    closed : Closed
+
+    Returns
+    -------
+    (n,) array
+    """
+    loop = closed.loop
+    return np.concatenate([loop.x0, np.tile(loop.idle, sum(_pasts(closed.plant, loop))), loop.z0])
+
+
+def _model(model, name):
+    import control
+
+    n, n_x, p = model.n, len(model.state_names), model.parameters
+    groups = [model.signals("reaction" if model.ideal else "actuation"), model.signals("outputs")]
+    names = [name for group, _ in groups for name in group]
+    ode, symbols = model.function("ode"), model.reduction.mechanism.parameters.names
+
+    def rates(t, x, _, params):
+        y = ode(t, x, _numbers(p, symbols, params))[:n_x]
+        if not np.isfinite(y).all():
+            raise ServoError(
+                f"The reduced dynamics is not finite at t = {t:.6g} s.",
+                "A model has the pivots of its derivation; they may vanish along a motion.",
+                nearest="sv.simulate, which chooses others there.",
+                do="Take model.near(t, jets), or stay away from there.",
+                t=float(t),
+            )
+        return y
+
+    def outputs(t, x, u, params):
+        z, numbers = np.append(x, rates(t, x, u, params)[-n:]), _numbers(p, symbols, params)
+        return np.concatenate([x, *(f(t, z, numbers) for group, f in groups if group)])
+
+    return control.nlsys(
+        rates, outputs, name=name, inputs=0, states=model.state_names, outputs=[*model.state_names, *names],
+        params=dict(zip(symbols, p.tolist(), strict=True)),
+    )  # fmt: skip
+
+
+def _numbers(p, symbols, params):
+    """The parameters p with those that python-control passes on by name."""
+    return np.append([params[name] for name in symbols], p[len(symbols) :])
+
+
+def _plant(plant, name, disturbed, rate, substeps, delay=0):
+    import control
+
+    forces = force_indices(plant, disturbed)
+    period = None if rate is None else 1.0 / positive("rate", rate)
+    if period is None and (plant.rate_limits or plant.delay or substeps is not None):
+        what = "limits of rate" if plant.rate_limits else "transport delay" if plant.delay else "substeps"
+        raise SpecificationError(
+            f"A plant with {what} is to be a system in continuous time.",
+            "Limits of rate, transport delays and substeps belong to inputs that are sampled and held.",
+            nearest="interop.nlsys(plant, rate=100.0).",
+            do="Give the rate.",
+        )
+    inputs = [*plant.inputs, *(f"disturbance {force}" for force in disturbed)]
+    m, n_x, symbols = len(plant.inputs), plant.n_x, plant.mechanism.parameters.names
+    ode, low_high = plant.function("ode"), limits(plant, 1.0)[:2]
+
+    def numbers(u, params):
+        d = np.zeros(len(plant.disturbable))
+        d[forces] = u[m:]
+        applied = u[:m] if low_high[0] is None else np.clip(u[:m], *low_high)
+        return np.concatenate([_numbers(plant.parameters, symbols, params), applied, d])
+
+    def rates(t, x, u, params):
+        return ode(t, x, numbers(u, params))
+
+    def outputs(t, x, u, params):
+        return np.append(x[:n_x], plant.function("outputs")(t, x[:n_x], numbers(u, params)))
+
+    states, update = list(plant.state_names), rates
+    if period is not None:
+        held = _Held(plant, period, SUBSTEPS if substeps is None else substeps, delay)
+        states += held.names
+
+        def update(t, x, u, params):
+            return held(t, x, u, lambda inputs: numbers(np.append(inputs, u[m:]), params))
+
+    return control.nlsys(
+        update, outputs, name=name, inputs=inputs, states=states, outputs=output_names(plant), dt=period or 0,
+        params=dict(zip(symbols, plant.parameters.tolist(), strict=False)),
+    )  # fmt: skip
+
+
+class _Held:
+    """A plant over one sample, with what stands before it in a loop; the state is [x; past commands; past inputs]."""
+
+    def __init__(self, plant, period, substeps, delay):
+        self.plant, self.delay, self.m = plant, delay, len(plant.inputs)
+        at_rest = np.zeros(self.m)
+        self.substeps, late = steps(plant, period, substeps, 0.0, np.zeros(plant.n_x), at_rest)
+        self.late = np.zeros(self.m, dtype=int) if late is None else late
+        self.h = period / self.substeps
+        self.low, self.high, self.change = limits(plant, period)
+        self.past = _past_inputs(plant, self.late, self.substeps)
+        kinds = (("command of", delay), ("input to", self.past))
+        self.names = [f"{a} {name} {k} ago" for a, n in kinds for k in range(1, n + 1) for name in plant.inputs]
+
+    def __call__(self, t, state, u, numbers):
+        m, n_x = self.m, self.plant.n_x
+        x, queues = state[:n_x].copy(), state[n_x:].reshape(-1, m)
+        commands, inputs = np.vstack([u[None, :m], queues[: self.delay]]), queues[self.delay :]
+        asked = commands[self.delay]
+        if self.low is not None:
+            asked = np.clip(asked, self.low, self.high)
+        if self.change is not None:
+            asked = np.clip(asked, inputs[0] - self.change, inputs[0] + self.change)
+        inputs = np.vstack([asked[None], inputs])
+        ode, h = self.plant.function("ode"), self.h
+        for s in range(self.substeps):
+            sent = -((s - self.late) // self.substeps)
+            p, now = numbers(inputs[sent, range(m)]), t + s * h
+            k1 = ode(now, x, p)
+            k2 = ode(now + h / 2, x + h / 2 * k1, p)
+            k3 = ode(now + h / 2, x + h / 2 * k2, p)
+            k4 = ode(now + h, x + h * k3, p)
+            x = ode.restore(now + h, x + h / 6 * (k1 + 2 * (k2 + k3) + k4), p)
+        return np.concatenate([x, commands[: self.delay].ravel(), inputs[: self.past].ravel()])
+
+
+def _past_inputs(plant, late, substeps):
+    """Samples by which applied inputs are remembered."""
+    return max(math.ceil(np.max(late, initial=0) / substeps), 1 if plant.rate_limits else 0)
+
+
+def _pasts(plant, loop):
+    return loop.delay, _past_inputs(plant, 0 if loop.transport is None else loop.transport, loop.substeps)
+
+
+def _law(law, name, quantum=None):
+    import control
+
+    if hasattr(getattr(law.step, "_given", None), "start"):
+        raise SpecificationError(
+            f"The law {law.name!r} keeps its memory to itself.",
+            "python-control asks for outputs and states apart, more than once per sample.",
+            nearest="A Law, whose memory is a state.",
+            do="Run it by sv.close, or write it as a control.nlsys.",
+        )
+    m, n_z = len(law.inputs), len(law.memory)
+
+    def answer(t, z, y):
+        if quantum is not None:
+            y = np.where(quantum > 0, quantum * np.rint(y / np.where(quantum > 0, quantum, 1.0)), y)
+        return np.asarray(law.step(t, np.append(y, z), law.row(t)), dtype=float)
+
+    return control.nlsys(
+        (lambda t, z, y, _: answer(t, z, y)[m : m + n_z]) if n_z else None,
+        lambda t, z, y, _: answer(t, z, y)[:m],
+        name=name, inputs=signal_names(law.measures, law.inputs), outputs=law.inputs, states=law.memory_names or None,
+        dt=law.period,
+    )  # fmt: skip
+
+
+def _closed(closed, name):
+    plant, loop = closed.plant, closed.loop
+    own = _plant(plant, "plant", plant.disturbable, 1.0 / loop.period, loop.substeps, loop.delay)
+    return connected(own, _law(closed.law, "law", loop.quantum), plant, closed.law, name)

@@ -1,0 +1,108 @@
+"""Units from micrometres to megametres, orders up to 16, poles from far too slow to far too fast."""
+
+import casadi as ca
+import closed_forms as cf
+import numpy as np
+import pytest
+
+import servoctl as sv
+from servoctl.mechanisms import spiral
+
+UNITS = (1e-6, 1e6)  # units per metre: megametres to micrometres
+LENGTHS = {"a": 1, "b": 1, "rho": 1, "g": 1, "I_x": 2, "I_y": 2}  # of the Appell-Hamel mechanism, by power of length
+
+
+@pytest.mark.parametrize("unit", UNITS)
+@pytest.mark.parametrize(
+    ("method", "drift"), [("DOP853", "project"), ("DOP853", "minimal"), ("Taylor", "project"), ("RK4", None)]
+)
+def test_appell_hamel_in_any_unit(method, drift, unit, gallery_model):
+    model = gallery_model("appell-hamel")
+    names = model.reduction.mechanism.parameters.names
+    numbers = dict(zip(names, model.parameters.tolist(), strict=True))
+    scaled = model.with_parameters(**{name: numbers[name] * unit**power for name, power in LENGTHS.items()})
+    start = scaled.start(x=0.0, y=0.0, z=0.0, phi=0.0, theta=0.0, dphi=1.0, dtheta=2.0)
+    options = {"step": 1e-3} if method == "RK4" else {"rtol": 1e-12, "atol": 1e-14 * min(unit, 1.0)}
+    run = sv.simulate(scaled, start, (0.0, 2.0), method=method, drift=drift, t_eval=[1.0, 2.0], **options)
+    reference = cf.appell_hamel(run.t)
+    for name in ("x", "y", "z"):
+        assert run[name] / unit == pytest.approx(reference[name], abs=1e-9)
+    for name in ("phi", "theta", "dphi", "dtheta"):
+        assert run[name] == pytest.approx(reference[name], abs=1e-9)
+
+
+def crane(unit):
+    """The overhead crane with lengths in 1/unit metres."""
+    p = sv.parameters(m_trolley=10.0, m_hoist=5.0, m_load=100.0, g=9.81 * unit)
+    q = sv.coordinates("x l theta")
+    x, l, theta = q
+    load = ca.vertcat(x + l * ca.sin(theta), l * ca.cos(theta))
+    path = sv.paths.rest_to_rest(q.t, (0.0, 4.0 * unit), (5.0 * unit, 2.0 * unit), duration=6.0, smoothness=4)
+    mechanism = sv.Mechanism(
+        q,
+        gibbs=sv.particle(q, p.m_trolley, x) + sv.particle(q, p.m_hoist, l) + sv.particle(q, p.m_load, load),
+        potential=-p.m_load * p.g * load[1],
+        actuators={"trolley": x, "hoist": l},
+        parameters=p,
+    )
+    return sv.derive(mechanism, sv.Program({"X": load[0] - path[0], "Z": load[1] - path[1]}), guess={"l": 4.0 * unit})
+
+
+@pytest.mark.parametrize("unit", UNITS)
+def test_a_crane_in_any_unit(unit):
+    model = crane(unit)
+    assert model.flat and model.structure().index == 5
+    run = sv.simulate(model, model.start(guess={"l": 4.0 * unit}), (0.0, 6.0), t_eval=np.linspace(0.0, 6.0, 61))
+    reference = cf.overhead_crane(run.t)
+    assert run["theta"] == pytest.approx(reference["theta"], abs=1e-10)
+    for name in ("trolley", "hoist"):
+        assert run[name] / unit == pytest.approx(reference[name], abs=1e-9 * np.abs(reference[name]).max())
+
+
+# orders --------------------------------------------------------------------------------------------------------------
+
+
+def test_a_spiral_of_order_16():
+    model = sv.derive(*spiral(16))
+    straight = {f"d{k}{axis}": 0.0 for k in range(2, 16) for axis in "xy"}
+    start = model.start(x=0.0, y=0.0, dx=1.0, dy=0.0, guess=straight)
+    assert model.free == 18
+    run = sv.simulate(model, start, (0.0, 2.0), rtol=1e-7, atol=1e-9, t_eval=np.linspace(0, 2, 9))
+    reference = cf.spiral(run.t, 16)
+    for name in ("x", "y", "dx", "dy"):
+        assert np.abs(run[name] - reference[name]).max() < 1e-7
+
+
+# poles ---------------------------------------------------------------------------------------------------------------
+
+STEP = 1e-2  # s
+
+
+@pytest.mark.parametrize("speed", [0.01, 0.1, 1.0, 2.5])
+def test_poles_within_the_stability_of_rk4_keep_the_motion(speed, gallery_model):
+    model = gallery_model("appell-hamel")
+    start = model.start(x=0.0, y=0.0, z=0.0, phi=0.0, theta=0.0, dphi=1.0, dtheta=2.0)
+    run = sv.simulate(model, start, (0.0, 2.0), method="RK4", step=STEP, drift=sv.poles(STEP / speed))
+    assert np.abs(run["theta"] - cf.appell_hamel(run.t)["theta"]).max() < 1e-6
+    assert np.abs(run.residual["string"][0]).max() < 1e-6
+
+
+@pytest.mark.filterwarnings("ignore")  # the warning is another test's
+@pytest.mark.parametrize("speed", [3.0, 10.0, 1e2, 1e4])
+def test_poles_beyond_it_are_told(speed, gallery_model):
+    model = gallery_model("appell-hamel")
+    start = model.start(x=0.0, y=0.0, z=0.0, phi=0.0, theta=0.0, dphi=1.0, dtheta=2.0)
+    with pytest.raises(sv.ServoError) as caught:
+        sv.simulate(model, start, (0.0, 10.0), method="RK4", step=STEP, drift=sv.poles(STEP / speed))
+    assert "poles" in str(caught.value)
+
+
+@pytest.mark.parametrize("speed", [1e2, 1e4])
+def test_an_implicit_method_bears_any_poles(speed, gallery_model):
+    model = gallery_model("appell-hamel")
+    start = model.start(x=0.0, y=0.0, z=0.0, phi=0.0, theta=0.0, dphi=1.0, dtheta=2.0)
+    run = sv.simulate(
+        model, start, (0.0, 2.0), method="Radau", drift=sv.poles(STEP / speed), rtol=1e-8, atol=1e-10, t_eval=[1.0, 2.0]
+    )
+    assert run["theta"] == pytest.approx(cf.appell_hamel(run.t)["theta"], abs=1e-6)
+    assert np.abs(run.residual["string"][0]).max() < 1e-12

@@ -1,0 +1,119 @@
+"""Laws as C: each kind compiled without a warning and run in a loop of its own against Python, to 1e-12."""
+
+import ctypes
+import re
+import shlex
+import subprocess
+
+import numpy as np
+import pytest
+
+import servoctl as sv
+from servoctl.errors import SpecificationError
+from servoctl.mechanisms import gallery
+from servoctl.model.compiler import compiler
+
+STRICT = ("-std=c99", "-O1", "-Wall", "-Wextra", "-pedantic", "-Werror")
+CRANE, PROGRAM = gallery["overhead-crane"].build()
+SENSORS = {"x": 1e-3, "l": 1e-3, "theta": 1e-3}
+
+LAWS = {
+    "feedforward": lambda plan, plant: sv.feedforward(plan, plant),
+    "pd": lambda plan, plant: sv.pd(
+        plan, plant, kp={"trolley": 500.0, "hoist": 900.0}, kd={"trolley": 300.0, "hoist": 300.0}
+    ),
+    "lqr": lambda plan, plant: sv.lqr(plan, plant),
+    "lqr with integral": lambda plan, plant: sv.lqr(plan, plant, integral=True),
+    "frozen-time lqr": lambda plan, plant: sv.lqr(plan, plant, varying=False),
+    "computed": lambda plan, plant: sv.computed(plan, plant),
+    "output feedback": lambda plan, plant: sv.output_feedback(sv.lqr(plan, plant), plant, SENSORS),
+    "output feedback with integral": lambda plan, plant: sv.output_feedback(
+        sv.lqr(plan, plant, integral={"X": 1e4}), plant, SENSORS
+    ),
+    "lqr of a lagged plant": lambda plan, _: sv.lqr(plan, sv.plant(CRANE, lag={"trolley": 0.05})),
+}
+MEMORY = {
+    "lqr with integral": 2, "computed": 2, "output feedback": 6, "output feedback with integral": 7
+}  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def plan():
+    model = sv.derive(CRANE, PROGRAM)
+    return sv.simulate(model, model.start(guess={"l": 4.0}), (0.0, 8.0))
+
+
+def library(law, folder):
+    source, header = sv.export_c(law, folder, name="loop")
+    shared = source.with_suffix(".so")
+    command = [*shlex.split(compiler()), *STRICT, "-fPIC", "-shared", str(source), "-o", str(shared), "-lm"]
+    done = subprocess.run(command, capture_output=True, text=True)
+    assert (done.returncode, done.stderr) == (0, "")
+    return ctypes.CDLL(str(shared)), header.read_text()
+
+
+class InC:
+    """An exported law as the user's own law of `close`: started anew by `start`."""
+
+    def __init__(self, law, folder):
+        self.law, (self.c, self.header) = law, library(law, folder)
+
+    def start(self):
+        z, u = np.full(max(len(self.law.memory), 1), np.nan), np.empty(len(self.law.inputs))
+        self.c.loop_start(z.ctypes.data_as(ctypes.c_void_p))
+        self.memory = [z[: len(self.law.memory)].copy()]
+
+        def step(t, measurement):
+            y = np.array([measurement[name] for name in self.law.measures] or [0.0])
+            self.c.loop_step(ctypes.c_double(t), *(a.ctypes.data_as(ctypes.c_void_p) for a in (y, z, u)))
+            self.memory.append(z[: len(self.law.memory)].copy())
+            return u.copy()
+
+        return step
+
+
+def close_to(found, expected):
+    return np.abs(found - expected).max(initial=0.0) <= 1e-12 * (1 + np.abs(expected).max(initial=0.0))
+
+
+@pytest.mark.parametrize("name", LAWS)
+def test_a_law_in_c_answers_what_it_answered_in_the_loop(name, plan, tmp_path):
+    law = LAWS[name](plan, sv.plant(CRANE))
+    machine = sv.plant(CRANE, m_load=115.0, lag={"trolley": 0.05} if "lagged" in name else None)
+    span = (0.0, 4.0) if name in ("feedforward", "pd") else (0.0, 9.0)  # beyond the table, where its last row holds
+    noise = {measure: 1e-3 for measure in law.measures}
+    run = sv.close(machine, law, plan.state(0.0), span, noise=noise or None)
+    assert len(law.memory) == MEMORY.get(name, 0)
+    ours = InC(law, tmp_path)
+    step = ours.start()
+    measured = [dict(zip(law.measures, y, strict=True)) for y in run.measurements.T]
+    commands = np.array([step(t, y) for t, y in zip(run.t, measured, strict=True)]).T
+    assert close_to(commands, run.commands)
+    assert close_to(np.array(ours.memory[:-1]).T, run.memory)
+
+
+@pytest.mark.parametrize("name", ["lqr with integral", "computed"])
+def test_a_loop_closed_by_the_c_file_is_the_loop_of_the_law(name, plan, tmp_path):
+    law = LAWS[name](plan, sv.plant(CRANE))
+    given = (plan.state(0.0), (0.0, 4.0))
+    run = sv.close(sv.plant(CRANE, m_load=110.0), law, *given)
+    ours = sv.close(sv.plant(CRANE, m_load=110.0), InC(law, tmp_path), *given, rate=100.0, plan=plan)
+    assert np.abs(ours.states - run.states).max() < 1e-10 and np.abs(run.states - plan.state(0.0)[:, None]).max() > 1
+
+
+def test_the_table_is_a_constant_and_indices_have_names(plan, tmp_path):
+    law = sv.lqr(plan, sv.plant(CRANE), integral=True)
+    _, header = library(law, tmp_path)
+    source = (tmp_path / "loop.c").read_text()
+    for name in law.measures:
+        assert re.search(rf"LOOP_Y_{name} = {law.measures.index(name)}\b", header)
+    assert "LOOP_Z_integral_of_X" in header and "LOOP_U_hoist" in header
+    size = int(re.search(r"static const double \w*table\[(\d+)\]", source)[1])
+    assert set(re.findall(r"#include (\S+)", source)) == {'"loop.h"', "<math.h>", "<stdint.h>"}
+    assert size == law.table.size and "malloc" not in source
+
+
+def test_a_law_that_allocates_in_python_is_refused(plan, tmp_path):
+    machine = sv.plant(CRANE, limits={"trolley": 120.0})
+    with pytest.raises(SpecificationError, match="written in Python has no expressions"):
+        sv.export_c(sv.limited(sv.lqr(plan, sv.plant(CRANE)), machine), tmp_path)
