@@ -1,5 +1,6 @@
 """The examples run, and their numbers are those of closed forms and of independent integrations."""
 
+import re
 import runpy
 from pathlib import Path
 
@@ -99,3 +100,99 @@ def test_quaternion(numbers):
     assert found["free"] == 2
     assert found["spin change"] < 1e-12
     assert found["unit error"] < 1e-14
+
+
+# closed loops ----------------------------------------------------------------------------------------------------------
+
+LOST = 15.0 * 9.81  # N: the weight that the crane's laws do not know of
+PATH_END, END = "at 6 s [mm]", "at the end [mm]"
+
+
+def test_closed_loop_crane_falls_under_feedforward_alone(numbers):
+    found = numbers("closed_loop_crane")
+    assert found[f"feedforward: {PATH_END}"] == pytest.approx(22.4e3, rel=0.01)
+    for what, t in ((PATH_END, 6.0), (END, 8.0)):  # hoist and load, 120 kg, under the weight that nothing carries
+        assert found[f"feedforward: {what}"] == pytest.approx(1e3 * LOST / 120.0 * t**2 / 2, rel=0.02)
+
+
+def test_closed_loop_crane_deflects_as_each_law_is_stiff(numbers):
+    """What remains without an integral: weight over gain; for computed, 6 T² of the acceleration that is wrong."""
+    found = numbers("closed_loop_crane")
+    assert found[f"PD: {END}"] == pytest.approx(1e3 * LOST / 8000.0, rel=0.03)
+    assert found[f"LQR: {END}"] == pytest.approx(1e3 * LOST / 1000.0, rel=0.03)
+    for T in (0.25, 0.06):
+        assert found[f"computed, {T} s: {END}"] == pytest.approx(1e3 * 6 * T**2 * LOST / 105.0, rel=0.002)
+
+
+def test_closed_loop_crane_comes_back_where_the_law_integrates_or_knows(numbers):
+    found = numbers("closed_loop_crane")
+    assert 140.0 <= found[f"LQR: {PATH_END}"] <= 160.0
+    for name, worst, at_6, end in (
+        ("LQR with integral", 60.0, 10.0, 3.0),
+        ("output feedback", 60.0, 10.0, 3.0),
+        ("limited", 60.0, 25.0, 5.0),
+        ("computed, 0.25 s, load known", 20.0, 1.0, 0.03),
+    ):
+        errors = [found[f"{name}: {what}"] for what in ("worst [mm]", PATH_END, END)]
+        assert np.all(np.array(errors) <= [worst, at_6, end]), name
+    assert found["limited: trolley [N]"] <= 150.0 < found["LQR with integral: trolley [N]"]
+
+
+def test_closed_loop_crane_with_noise_and_delay(numbers):
+    """Little worse than without; but poles of 1/0.06 s turn the noise into a hundred times the plan's force."""
+    found = numbers("closed_loop_crane")
+    for name in ("PD", "computed, 0.25 s", "LQR", "LQR with integral", "output feedback"):
+        quiet, noisy = (found[f"{before}{name}: worst [mm]"] for before in ("", "noise, "))
+        assert noisy == pytest.approx(quiet, rel=0.03)
+        assert found[f"noise, {name}: {END}"] <= found[f"{name}: {END}"] + 1.0
+    assert found["noise, limited: trolley [N]"] <= 150.0 and found["noise, limited: worst [mm]"] < 80.0
+    assert found["noise, computed, 0.06 s: trolley [N]"] > 100 * found["feedforward: trolley [N]"]
+    assert found["noise, LQR with integral: trolley [N]"] < 400.0
+
+
+def test_closed_loop_crane_with_a_weak_trolley(numbers):
+    """The plan asks for 138 N of 100: bounded by allocation, and slowed to 80 N it runs without slack."""
+    found = numbers("closed_loop_crane")
+    assert found["the plan asks [N]"] == pytest.approx(-137.991607, abs=1e-5)
+    for name in ("overloaded, clipped", "overloaded, limited", "slowed"):
+        assert found[f"{name}: trolley [N]"] <= 100.0
+    assert found[f"overloaded, limited: {END}"] < 0.5 * found[f"overloaded, clipped: {END}"]
+    assert found["overloaded, limited: worst [mm]"] < 2000.0
+    assert (137.99 / 80.0) ** 0.5 == pytest.approx(found["reserve factor"], rel=0.02)  # accelerations go with 1/σ²
+    assert found["slowed: residuals that gave way"] == 0
+    assert found["slowed: worst [mm]"] < 60.0 and found[f"slowed: {END}"] < 0.1
+
+
+MACHINES = {  # at most: worst and last error (m, rad); feedforward alone is worse by at least this factor
+    "two cars": (0.02, 1e-3, 10),
+    "mass on car": (4e-3, 1e-3, 50),
+    "3-D crane": (0.08, 0.015, 100),
+    "wheeled robot": (0.11, 0.015, 10),
+    "two-link arm": (4e-3, 1e-3, 100),
+    "pendubot": (0.21, 5e-3, 20),
+}
+
+
+@pytest.mark.parametrize("name", MACHINES)
+def test_closed_loops_stay_near_their_plans(numbers, name):
+    found, (worst, last, factor) = numbers("closed_loops"), MACHINES[name]
+    assert found[f"{name}: worst"] < worst and found[f"{name}: last"] < last
+    assert found[f"{name}: feedforward worst"] > factor * found[f"{name}: worst"]
+
+
+def test_closed_loops_show_what_computed_actuation_cannot_do(numbers):
+    """A curvature says nothing of the place; and the upright pendubot's eigenvalue is that of its linearisation."""
+    found = numbers("closed_loops")
+    assert found["wheeled robot: computed last"] > 5 * found["wheeled robot: worst"]
+    inertia, torque, damping = 0.07 + 3.0 * 0.25**2, 3.0 * 9.81 * 0.25, 0.05  # of the second link about the elbow
+    assert found["pendubot: eigenvalue"] == pytest.approx(max(np.roots([inertia, damping, -torque])), rel=1e-4)
+
+
+def test_the_table_of_other_machines_is_what_the_example_says(numbers):
+    found, page = numbers("closed_loops"), (EXAMPLES.parent / "docs" / "closed_loop.md").read_text()
+    rows = re.findall(r"^\| ([^|]+) \| [^|]+ \| ([\d.]+) \| ([\d.]+) \| ([\d.]+) \|$", page, re.M)
+    assert [row[0] for row in rows] == list(MACHINES)
+    for name, *cells in rows:
+        for cell, what in zip(cells, ("worst", "last", "feedforward worst"), strict=True):
+            digits = len(cell.partition(".")[2])
+            assert cell == f"{found[f'{name}: {what}']:.{digits}f}"

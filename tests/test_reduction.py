@@ -387,7 +387,7 @@ def test_a_load_lifted_straight_up_hides_the_constraint_that_it_does_not_swing()
     for t in (0.0, 0.7, 1.9):
         jets = motion(model, t, guess={"l": 3.0})
         named = dict(zip(model.jet_names, jets, strict=True))
-        assert named["theta"] == 0.0
+        assert abs(named["theta"]) < 1e-15
         force = signal(model, "actuation", t, jets)
         assert force["trolley"] == pytest.approx(0.0, abs=1e-9)
         assert force["hoist"] == pytest.approx(105.0 * named["d2l"] - 100.0 * 9.81, abs=1e-9)
