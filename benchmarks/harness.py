@@ -175,7 +175,8 @@ def _quartiles(samples):
 
 def machine():
     """What the numbers were measured on: processor, cores, system, compiler and versions."""
-    modules = {name: name for name in ("casadi", "numpy", "scipy", "heyoka", "sympy")} | {"pin": "pinocchio"}
+    names = ("casadi", "numpy", "scipy", "heyoka", "sympy", "control", "mujoco", "numba")
+    modules = {name: name for name in names} | {"pin": "pinocchio"}
     versions = {name: metadata.version(name) for name, module in modules.items() if installed(module)}
     return {
         "processor": _processor(),

@@ -11,9 +11,12 @@ import compiling
 import crane
 import derivation
 import harness
+import loop
+import monte_carlo
 import process
 
-ROWS = appell_hamel.ROWS | crane.ROWS | arms.ROWS | derivation.ROWS | compiling.ROWS | process.ROWS
+GROUPS = (appell_hamel, crane, arms, loop, monte_carlo, derivation, compiling, process)
+ROWS = {name: row for group in GROUPS for name, row in group.ROWS.items()}
 HERE = Path(__file__).parent
 RESULTS, README = HERE / "results.json", HERE / "README.md"
 BEGIN, END = "<!-- results -->\n", "<!-- end of results -->\n"

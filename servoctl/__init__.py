@@ -46,6 +46,7 @@ from servoctl.spec import (
     paths,
     rigid_body,
 )
+from servoctl.study.batch import Batch, close_many
 from servoctl.study.cases import grid, monte_carlo
 from servoctl.study.dae import DaeComparison, dae_comparison
 from servoctl.study.formulation import FormulationCost, formulation_cost
@@ -58,6 +59,7 @@ from servoctl.study.tradeoff import tradeoff
 __version__ = "0.1.0"
 
 __all__ = [
+    "Batch",
     "Closed",
     "Controller",
     "Coordinates",
@@ -88,6 +90,7 @@ __all__ = [
     "Verification",
     "body_rates",
     "close",
+    "close_many",
     "computed",
     "coordinates",
     "dae_comparison",

@@ -6,9 +6,10 @@ import sys
 from pathlib import Path
 
 from servoctl import commands as further
+from servoctl import loops
 from servoctl.errors import ServoError, SpecificationError, unknown
 from servoctl.options import assignment, mapping
-from servoctl.rundir import FILES, Folder, Report, complain, plain, summary, versions
+from servoctl.rundir import FILES, LOOP_FILES, Folder, Report, complain, plain, summary, versions
 
 
 def main(argv=None):
@@ -82,6 +83,7 @@ def _run_options(run):
     run.add_argument("--samples", type=_samples, metavar="N", help="equally spaced samples of the run")
     run.add_argument("--no-verify", action="store_true", help="leave out the check against the full mechanism")
     run.add_argument("--no-figures", action="store_true", help="leave out the figures")
+    loops.add(run)
 
 
 def _tradeoff_options(trade):
@@ -179,21 +181,26 @@ def _run(args):
 
 
 def _compute(args, name, scene, folder):
-    """Derive, simulate, save, verify and draw, in this order; returns the exit code."""
+    """Derive, simulate, save, verify, close the loop and draw, in this order; returns the exit code."""
     import servoctl as sv
 
     report = Report()
     span = tuple(args.t_span or scene.t_span)
     changes, held, guess = (mapping(getattr(args, name), f"--{name}") for name in ("set", "hold", "guess"))
     model = _with_parameters(sv.derive(*scene.build()), changes)
+    loops.require(args, model)
     report.say(model)
     start = _start(model, scene, span[0], held, guess)
     report.say(start)
     run = _simulate(model, start, span, _options(args, span), report)
     folder.write(lambda path: run.save(path / "run.npz"))
     verification = None if args.no_verify else _verify(model, run, report)
+    closed, done = loops.closed_loop(args, model, run, report)
+    if closed is not None:
+        folder.write(lambda path: closed.save(path / "closed_loop.npz"))
     about = {"name": name, "given": args.scene, "description": scene.description}
     facts = {"scene": about, "command": args.command_line, "t_span": span, **summary(run, start, verification)}
+    facts |= {"closed_loop": loops.facts(closed)}
     text = json.dumps(facts, indent=2, allow_nan=False, ensure_ascii=False)
     folder.write(lambda path: (path / "summary.json").write_text(text + "\n", encoding="utf-8"))
     folder.write(lambda path: (path / "report.txt").write_text("\n".join(report.texts), encoding="utf-8"))
@@ -201,11 +208,13 @@ def _compute(args, name, scene, folder):
         from servoctl.plots import save_figures
 
         folder.write(lambda path: save_figures(run, path, units=scene.units, title=name))
-    print(f"{', '.join(f for f in FILES if (folder.path / f).exists())} in {folder.path}")
+        if closed is not None:
+            folder.write(lambda path: loops.save_figure(closed, path, scene.units, name))
+    print(f"{', '.join(f for f in (*FILES, *LOOP_FILES) if (folder.path / f).exists())} in {folder.path}")
     if not run.success:
         complain(f"The motion ended early, at t = {run.t[-1]:.6g} s; what was computed is kept.")
     verified = args.no_verify or (verification is not None and verification.passed)
-    return 0 if run.success and verified and not folder.moved else 1
+    return 0 if run.success and verified and done and not folder.moved else 1
 
 
 def _with_parameters(model, changes):
@@ -311,7 +320,7 @@ def _measure(args, name, scene, folder):
     text = json.dumps(plain(facts), indent=2, allow_nan=False, ensure_ascii=False) + "\n"
     folder.write(lambda path: (path / "summary.json").write_text(text, encoding="utf-8"))
     print(f"tradeoff.npz, tradeoff.csv, tradeoff.png, report.txt, summary.json in {folder.path}")
-    return 1 if folder.moved else 0
+    return 1 if folder.moved or study.meta["message"] else 0
 
 
 def _recommended(study, args, report):

@@ -198,6 +198,29 @@ def sweep(study, names=None, against=None, units=None):
     return draw(study, names, against, units)
 
 
+def closed(run, units=None):
+    """Draw a closed loop: the program's residuals, coordinates less those of the plan, inputs with plan and limits.
+
+    Parameters
+    ----------
+    run : Closed
+    units : dict of str to str, optional
+        Unit of each coordinate and actuator, by name.
+
+    Returns
+    -------
+    (n,) array of Axes
+
+    Raises
+    ------
+    SpecificationError
+        If the loop ended before its first sample.
+    """
+    from servoctl.control.closed_figure import draw
+
+    return draw(run, units or {})
+
+
 def save_figures(run, folder, units=None, title=""):
     """Write path.png, coordinates.png, actuation.png and residuals.png, each 1000 px wide.
 

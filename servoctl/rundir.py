@@ -11,6 +11,7 @@ from servoctl.errors import ServoError
 
 WIDTH = 120  # columns of what is printed
 FILES = ("run.npz", "summary.json", "report.txt", "path.png", "coordinates.png", "actuation.png", "residuals.png")
+LOOP_FILES = ("closed_loop.npz", "closed_loop.png")
 
 
 class Report:
@@ -94,7 +95,7 @@ class Folder:
         """
         try:
             if not self._done:
-                for name in FILES:
+                for name in (*FILES, *LOOP_FILES):
                     (self.path / name).unlink(missing_ok=True)
             action(self.path)
         except (OSError, ServoError) as error:

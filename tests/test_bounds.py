@@ -1,5 +1,6 @@
 """Bounds of steps and of sampled feedback: the table of the theory, simulated loops, measured divergence."""
 
+import re
 import warnings
 from math import comb, factorial
 
@@ -8,6 +9,7 @@ import numpy as np
 import pytest
 
 import servoctl as sv
+from servoctl.mechanisms import mass_on_car
 from servoctl.simulation import bounds
 from servoctl.simulation.tableaus import ORDERS
 
@@ -134,4 +136,38 @@ def test_complex_poles_are_judged_in_their_own_direction(sine):
 def test_no_choice_within_the_bound_is_warned_about(sine):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
+        assert sine_error(sine, 45.0) < 1e-2
+        warnings.filterwarnings("ignore", "Steps of .* do not resolve")  # dx is off by 28 times its size
         assert sine_error(sine, 55.0) < 1.0
+
+
+@pytest.mark.parametrize(("method", "step"), [("RK1", 0.1), ("RK4", 0.05), ("RK8", 0.1), ("RK4", 0.02)])
+def test_steps_too_long_for_the_internal_dynamics_are_warned_about(method, step):
+    model = sv.derive(*mass_on_car(damping=1000.0))
+    start = model.start(s=0.0, ds=0.0)
+    largest = sv.stability(model, sv.simulate(model, start, (0.0, 1.0), method="RadauIIA")).largest_step(method)
+    with pytest.warns(RuntimeWarning, match=f"Steps of {step:g} s by {method} do not resolve the motion") as caught:
+        sv.simulate(model, start, (0.0, 1.0), method=method, step=step)
+    told = float(re.search(r"largest stable step there is about (\S+) s", str(caught[0].message))[1])
+    assert told == pytest.approx(largest, rel=0.05)
+    assert caught[0].filename == __file__
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        sv.simulate(model, start, (0.0, 1.0), method=method, step=0.9 * largest)
+
+
+def test_steps_over_a_singularity_are_warned_about():
+    """A point on a circle follows x = t, which ends at t = 1 s; long explicit steps jump over that."""
+    q = sv.coordinates("s x y")
+    s, x, y = q
+    mechanism = sv.Mechanism(
+        q,
+        gibbs=sv.particle(q, 1.0, (x, y)) + sv.particle(q, 2.0, (s,)),
+        actuators={"pull": x},
+        constraints={"circle": x**2 + y**2 - 1.0},
+    )
+    model = sv.derive(mechanism, sv.Program({"path": x - q.t}), guess={"y": -1.0})
+    start = model.start(s=0.0, ds=1.0, guess={"y": -1.0})
+    for drift in (None, 0.5, "project"):
+        with pytest.warns(RuntimeWarning, match="do not resolve the motion"):
+            sv.simulate(model, start, (0.0, 1.5), method="RK4", step=0.3, drift=drift)

@@ -15,7 +15,7 @@ import servoctl
 from servoctl.cli import main
 from servoctl.errors import IntegrationStopped
 from servoctl.mechanisms import gallery
-from servoctl.rundir import FILES
+from servoctl.rundir import FILES, LOOP_FILES
 
 FALL = '''"""A mass in a plane follows a path in x, and falls."""
 import servoctl as sv
@@ -71,7 +71,7 @@ def words(text):
 def test_run_leaves_numbers_figures_and_the_report(here, capsys):
     assert main(["run", "overhead-crane"]) == 0
     folder = here / "servoctl-runs" / "overhead-crane"
-    assert {f.name for f in folder.iterdir()} == set(FILES)
+    assert {f.name for f in folder.iterdir()} == {*FILES, *LOOP_FILES}
     printed = capsys.readouterr().out
     report = (folder / "report.txt").read_text(encoding="utf-8")
     assert printed.startswith(report)
@@ -118,7 +118,7 @@ def test_a_motion_that_stops_is_kept_drawn_and_explained(here, capsys):
 def test_run_of_a_users_file(here, fall, capsys):
     assert main(["run", fall, "--set", "m=3", "--hold", "dy=1.5", "--no-figures"]) == 0
     folder = here / "servoctl-runs" / "fall"
-    assert {f.name for f in folder.iterdir()} == {"run.npz", "summary.json", "report.txt"}
+    assert {f.name for f in folder.iterdir()} == {"run.npz", "closed_loop.npz", "summary.json", "report.txt"}
     facts = summary(folder)
     assert facts["scene"]["description"] == "A mass in a plane follows a path in x, and falls."
     assert facts["parameters"] == {"m": 3.0, "g": 9.81}
@@ -247,7 +247,7 @@ def test_a_folder_that_is_lost_while_computing_loses_nothing(here, fall, capsys,
     monkeypatch.setattr(servoctl, when, losing)
     assert main(["run", fall, "--out", "lost", "--no-figures"]) == 1
     (kept,) = (here / "temporary").iterdir()
-    assert {f.name for f in kept.iterdir()} == {"run.npz", "summary.json", "report.txt"}
+    assert {f.name for f in kept.iterdir()} == {"run.npz", "closed_loop.npz", "summary.json", "report.txt"}
     assert f"it is written to {kept} instead" in words(capsys.readouterr().err)
     assert servoctl.load(kept / "run.npz").success
 
@@ -266,7 +266,9 @@ def test_files_of_an_earlier_run_are_replaced_and_others_kept(here, fall):
     assert main(["run", fall, "--out", "kept", "--no-verify"]) == 0
     (here / "kept" / "notes.md").write_text("mine")
     assert main(["run", fall, "--out", "kept", "--no-verify", "--no-figures"]) == 0
-    assert {f.name for f in (here / "kept").iterdir()} == {"run.npz", "summary.json", "report.txt", "notes.md"}
+    assert {f.name for f in (here / "kept").iterdir()} == {
+        "run.npz", "closed_loop.npz", "summary.json", "report.txt", "notes.md"
+    }  # fmt: skip
 
 
 # --- options, interruption, verification
@@ -367,4 +369,9 @@ def test_a_terminal_without_greek_letters(here, fall, monkeypatch):
 
 def test_a_reader_that_leaves_does_not_end_the_computation(here, fall):
     process("sh", "-c", f"{sys.executable} -m servoctl run {fall} --no-verify --no-figures | true")
-    assert {f.name for f in (here / "servoctl-runs" / "fall").iterdir()} == {"run.npz", "summary.json", "report.txt"}
+    assert {f.name for f in (here / "servoctl-runs" / "fall").iterdir()} == {
+        "run.npz",
+        "closed_loop.npz",
+        "summary.json",
+        "report.txt",
+    }

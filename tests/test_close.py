@@ -3,6 +3,7 @@
 import pickle
 from dataclasses import replace
 
+import casadi as ca
 import numpy as np
 import pytest
 
@@ -272,6 +273,21 @@ def test_the_energy_is_the_work_of_all_forces(crane_plan):
     assert proof.passed and proof.numbers["loop power"] < 1e-6 and proof.numbers["loop limits"] == 0.0
 
 
+def test_the_balance_knows_what_it_applies_to():
+    """A free swing has no power at all; a belt that moves a mass does work that no actuator did."""
+    x0 = {"x": 0.0, "l": 4.0, "theta": 0.3, "dx": 0.0, "dl": 0.0, "dtheta": 0.0}
+    rigid = sv.close(sv.plant(CRANE), lambda t, y: [0.0, 0.0], x0, (0.0, 0.5), rate=100.0, substeps=10)
+    proof = sv.verify(rigid)
+    assert proof.passed and proof.numbers["loop power"] < 1e-6
+    q = sv.coordinates("x y")
+    belt = {"belt": q.d(1)[1] - 0.5 * ca.cos(q.t)}
+    mechanism = sv.Mechanism(q, gibbs=sv.particle(q, 1.0, list(q)), actuators={"force": [1, 0]}, constraints=belt)
+    run = sv.close(sv.plant(mechanism), lambda t, y: [0.1], [0.0, 0.0, 0.0, 0.5], (0.0, 3.0), rate=100.0)
+    proof = sv.verify(run)
+    assert run["y"] == pytest.approx(0.5 * np.sin(run.t), abs=1e-9)
+    assert proof.passed and "constraint 'belt' moves by itself" in proof.notes[0] and "loop power" not in proof.numbers
+
+
 def test_a_balance_that_does_not_close_is_found(crane_plan):
     plant, x0, span, options = conditions(crane_plan)
     run = sv.close(plant, sv.lqr(crane_plan, sv.plant(CRANE)), x0, span, **options)
@@ -285,6 +301,11 @@ def test_a_balance_that_does_not_close_is_found(crane_plan):
 # bad input ------------------------------------------------------------------------------------------------------------
 
 LAW = lambda t, y: [0.0]  # noqa: E731
+
+
+class Idle:
+    def start(self):
+        return 3
 
 
 def close(plant=None, law=LAW, x0=(0.0, 0.0), span=(0.0, 1.0), rate=20.0, **options):
@@ -322,6 +343,18 @@ BAD = {
     "law of two inputs": (lambda: close(law=lambda t, y: [0.0, 1.0]), sv.SpecificationError, "1 numbers: force"),
     "law of an odd name": (lambda: close(law=lambda t, y: {"forc": 0.0}), sv.NameUnknown, "force"),
     "law of NaN": (lambda: close(law=lambda t, y: [np.nan if t > 0.52 else 0.0]), sv.ServoError, "t = 0.55 s"),
+    "law that is a class": (lambda: close(law=Counting), sv.SpecificationError, "A type was given as law"),
+    "law that starts nothing": (lambda: close(law=Idle()), sv.SpecificationError, "gave a int"),
+    "plan of no model": (lambda: close(plan=3.0), sv.SpecificationError, "given as plan"),
+    "seed of text": (lambda: close(noise={"x": 0.1}, seed=""), sv.SpecificationError, "whole number"),
+    "seed of no noise": (lambda: close(noise={}, seed=1), sv.SpecificationError, "without noise"),
+    "lag far below the period": (
+        lambda: close(plant=sv.plant(POINT, lag={"force": 1e-6})), sv.SpecificationError, "1e.06 1/s.*substeps=1000000",
+    ),
+    "force without a slope": (
+        lambda: close(plant=sv.plant(POINT, forces={"x": -ca.sqrt(ca.fabs(POINT.q.d(1)[0]))})),
+        sv.SpecificationError, "not finite.*substeps=10",
+    ),
     "law that fails": (lambda: close(law=lambda t, y: [y["z"]]), KeyError, "z"),
 }  # fmt: skip
 
@@ -337,6 +370,12 @@ def test_what_was_computed_before_a_law_failed_is_kept():
     with pytest.raises(sv.ServoError) as caught:
         close(law=lambda t, y: [np.nan if t > 0.52 else 1.0])
     assert caught.value.run.t[-1] == pytest.approx(0.5) and not caught.value.run.success
+    with pytest.raises(KeyError) as caught:
+        close(law=lambda t, y: [y["z"] if t > 0.52 else 1.0])
+    assert caught.value.run.t[-1] == pytest.approx(0.5) and "raised KeyError" in caught.value.run.message
+    with pytest.raises(sv.ServoError) as caught:
+        close(law=lambda t, y: [np.nan])
+    assert "no samples" in repr(caught.value.run.to_run()) and "0 samples" in repr(caught.value.run)
 
 
 def test_a_loop_that_diverges_stops_with_its_motion():
@@ -356,6 +395,18 @@ def test_laws_refuse_plans_and_plants_that_do_not_fit(point_plan, crane_plan, tm
         sv.close(sv.plant(POINT), sv.feedforward(point_plan, sv.plant(POINT)), [0, 0], (0.0, 1.0), rate=50.0)
     with pytest.raises(sv.SpecificationError, match="samples"):
         sv.close(sv.plant(POINT), sv.feedforward(point_plan, sv.plant(POINT)), [0, 0], (0.005, 1.005))
+    with pytest.raises(sv.SpecificationError, match="lasts 2 s, and is sampled every 10 s"):
+        sv.feedforward(point_plan, sv.plant(POINT), rate=0.1)
+    law = sv.pd(point_plan, sv.plant(POINT), kp={"force": 100.0}, kd={"force": 20.0})
+    for wrong in ({"table": law.table[:2]}, {"memory": np.zeros(1)}, {"measures": ()}, {"idle": np.zeros(2)}):
+        with pytest.raises(sv.SpecificationError, match="belong to the step"):
+            replace(law, **wrong)
+    rough = sv.plant(POINT, forces={"x": -ca.sqrt(ca.fabs(POINT.q.d(1)[0]))})
+    with pytest.raises(sv.ServoError, match="not finite at t = .*smooth"):
+        sv.pd(point_plan, rough, kp={"force": 100.0})
+    for make in (sv.feedforward, sv.pd, sv.lqr, sv.computed):
+        with pytest.raises(sv.SpecificationError, match="in the place of a Plant"):
+            make(point_plan, POINT)
     with pytest.raises(sv.SpecificationError, match="one number"):
         sv.pd(point_plan, sv.plant(POINT), kp={"force": [1.0, 2.0]})
     with pytest.raises(sv.NameUnknown, match="force"):

@@ -42,9 +42,11 @@ def test_on_the_plan_the_law_asks_for_the_plans_actuation(name):
     law = sv.computed(plan, plant, rate=1000.0)
     assert tuple(law.info["orders"].values()) == ORDERS[name]
     size = max(np.abs(plan[actuator]).max() for actuator in law.inputs)
+    row, first = law.table[:, 0].copy(), len(plant.parameters) + 1
+    row[first : first + len(law.inputs)] = 0.0  # what is added for the middle of the sample
     for k in range(0, len(plan.t), 97):
         y = np.append(plan.state(plan.t[k]), law.memory)
-        u = law.step(plan.t[k], y, law.table[:, 0])[: len(law.inputs)]
+        u = law.step(plan.t[k], y, row)[: len(law.inputs)]
         assert u == pytest.approx([plan[actuator][k] for actuator in law.inputs], abs=3e-8 * max(size, 1.0))
 
 
@@ -70,6 +72,15 @@ def test_the_crane_follows_by_dynamic_extension(crane):
     run = sv.close(plant, law, crane.state(0.0) + np.array([0.05, -0.02, 0.01, 0, 0, 0]), (0.0, 8.0))
     error = np.hypot(run.residual["X"][0], run.residual["Z"][0])
     assert error[0] > 0.03 and error[-1] < 1e-5
+
+
+def test_the_hold_of_a_moving_path_costs_an_error_of_second_order(crane):
+    plant = sv.plant(crane.model.reduction.mechanism)
+    worst = []
+    for rate in (50.0, 100.0):
+        run = sv.close(plant, sv.computed(crane, plant, rate=rate), crane.state(0.0), (0.0, 6.0))
+        worst.append(np.hypot(run.residual["X"][0], run.residual["Z"][0]).max())
+    assert worst[0] / worst[1] == pytest.approx(4.0, rel=0.1) and worst[1] < 1e-4
 
 
 def test_unstable_internal_dynamics_are_refused_with_a_pointer():
@@ -121,7 +132,7 @@ def test_loops_turn_unstable_where_the_bound_says_within_two_per_cent(rho, delay
     for share in (0.98, 1.02):
         pole = share * sampled_bound(rho, delay) * rate
         table = law.table.copy()
-        table[-rho:, 0] = np.poly([-pole] * rho)[:0:-1]
+        table[-rho:] = np.poly([-pole] * rho)[:0:-1, None]
         start = np.append(plan.state(7.0), [plan["force"][-1]] * len(lag))
         start[0] += 1e-3
         run = sv.close(plant, replace(law, table=table), start, (7.0, 7.0 + 1600 / rate), delay=delay)
@@ -144,6 +155,15 @@ def test_bad_input(crane):
     for poles in ({"X": [-1.0, -1.0]}, {"X": [-1 + 1j] * 4, "Z": [-1.0] * 4}, [-1.0] * 4):
         with pytest.raises(sv.SpecificationError, match="poles"):
             sv.computed(crane, plant, poles=poles)
+    with pytest.raises(sv.SpecificationError, match="order 4"):
+        sv.computed(crane, plant, poles={"X": "fast", "Z": [-1.0] * 4})
+    with pytest.raises(sv.SpecificationError, match="negative real part"):
+        sv.computed(crane, plant, poles={"X": [1.0] * 4, "Z": [-1.0] * 4})
+    for delay in (0.5, -1, "one", True):
+        with pytest.raises(sv.SpecificationError, match="whole number of samples"):
+            sv.computed(crane, plant, delay=delay)
+    with pytest.raises(sv.SpecificationError, match="transport delay of 0.05 s"):
+        sv.computed(crane, sv.plant(plant.mechanism, delay=0.05))
     with pytest.raises(sv.NameUnknown, match="'X'"):
         sv.computed(crane, plant, poles={"x": [-1.0] * 4})
     with pytest.raises(sv.SpecificationError, match="two mechanisms"):

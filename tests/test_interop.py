@@ -9,7 +9,7 @@ from scipy.optimize import brentq
 
 import servoctl as sv
 from servoctl import interop
-from servoctl.control.tracking import discretised
+from servoctl.control.sampling import discretised
 from servoctl.errors import NameUnknown, ServoError, SpecificationError
 from servoctl.mechanisms import gallery, mass_on_car
 
@@ -140,7 +140,7 @@ def test_parameters_go_by_name_at_run_time(plan):
 
 def test_limits_of_magnitude_hold_in_continuous_time():
     machine = sv.plant(CRANE, limits={"trolley": 5.0})
-    x, system = np.array([0.1, 3.0, 0.2, 0.3, -0.1, 0.4]), interop.nlsys(machine, disturbed=("theta",))
+    x, system = np.array([0.1, 3.0, 0.2, 0.3, -0.1, 0.4]), interop.nlsys(machine, disturbed="theta")
     assert system.input_labels == ["trolley", "hoist", "disturbance theta"]
     found = system.dynamics(0.0, x, np.array([20.0, -900.0, 7.0]))
     assert np.array_equal(found, machine.rates(0.0, x, [5.0, -900.0], [0.0, 0.0, 7.0]))
@@ -210,6 +210,36 @@ def test_margins_of_an_lqr_loop_at_the_end_of_the_plan(car_plan):
     magnitude = control.frequency_response(gain, w[::400]).magnitude
     assert np.abs(magnitude / np.abs(L(w[::400])) - 1).max() < 1e-9
     assert 45 < pm and sm > 0.5  # LQR: at least 60 degrees in continuous time
+
+
+def test_forbidden_directions_are_poles_at_zero_at_rest(plan):
+    hanging = {"trolley": 0.0, "hoist": -981.0}
+    crane = interop.linearise(sv.plant(CRANE), 0.0, plan.state(0.0), hanging)
+    model = sv.derive(*gallery["overhead-crane-redundant"].build())
+    start = model.start(guess={"l": 4.0}).values
+    rope = interop.linearise(sv.plant(ROPE), 0.0, start[: 2 * model.n], hanging)
+    assert rope.nstates == crane.nstates + 2
+    moving = [[p for p in np.sort_complex(system.poles()) if abs(p) > 1e-3] for system in (crane, rope)]
+    assert len(moving[0]) == 2 and np.allclose(*moving)
+    assert np.linalg.matrix_rank(control.ctrb(rope.A, rope.B), tol=1e-9) == crane.nstates
+
+
+@pytest.mark.parametrize("actuator", ["trolley", "hoist"])
+def test_margins_of_one_loop_of_the_crane_with_the_other_closed(plan, actuator):
+    plant, t, rate = sv.plant(CRANE), 4.0, 100.0
+    law = sv.lqr(plan, plant, rate=rate)
+    (own,), (fed,) = interop.along(plant, plan, [t], rate=rate), interop.along(law, plan, [t])
+    w = np.geomspace(0.1, 0.99 * np.pi * rate, 4000)
+    _, pm, _, _, wgc, _ = control.stability_margins(control.frd(interop.loop_gain(own, fed, actuator), w))
+    K, i = law.info["gains"][round(t * rate)], law.inputs.index(actuator)
+    zeta = np.exp(1j * w / rate)[:, None, None]
+    both = K @ np.linalg.solve(zeta * np.eye(6) - own.A, own.B + 0j)  # L of both loops
+    j = 1 - i
+    L = both[:, i, i] - both[:, i, j] * both[:, j, i] / (1 + both[:, j, j])
+    crossings = np.flatnonzero(np.diff(np.sign(np.abs(L) - 1)))
+    phases = np.abs(np.angle(-L[crossings], deg=True))
+    assert pm == pytest.approx(phases.min(), abs=0.2) and pm > 45
+    assert wgc == pytest.approx(w[crossings[np.argmin(phases)]], rel=3e-3)
 
 
 def test_poles_of_the_closed_loop_are_those_of_the_gains(plan):
@@ -284,6 +314,14 @@ def test_output_feedback_and_computed_laws_are_linearised(car_plan, plan):
         (lambda c: interop.nlsys(sv.plant(CRANE, rate_limits={"hoist": 9.0})), SpecificationError, "limits of rate"),
         (lambda c: interop.nlsys(c["late"], rate=33.0), SpecificationError, "whole number of integration steps"),
         (lambda c: interop.nlsys(sv.plant(CRANE), disturbed=["thet"]), NameUnknown, "nearest is 'theta'"),
+        (lambda c: interop.start(c["plan"]), SpecificationError, "A start belongs to the Closed"),
+        (lambda c: interop.linearise(sv.plant(CRANE), 0.0), SpecificationError, "has 6 finite numbers"),
+        (lambda c: interop.linearise(sv.plant(CRANE), 0.0, SUDDEN, [1.0]), SpecificationError, "1 inputs were given"),
+        (lambda c: interop.linearise(sv.plant(CRANE), 0.0, SUDDEN, {"hoist": 1.0}), NameUnknown, "'trolley'"),
+        (lambda c: list(interop.along(sv.plant(CRANE), c["plan"], [9.0])), SpecificationError, "within the run: 0 to 8"),
+        (lambda c: interop.loop_gain(interop.linearise(sv.plant(CRANE), 0.0, SUDDEN), interop.linearise(c["law"], 0.0),
+                                     "trolley"), SpecificationError, "dt = 0 s, the law 0.02 s.*rate=50"),
+        (lambda c: interop.loop_gain(sv.plant(CRANE), c["law"], "trolley"), SpecificationError, "two linear systems"),
         (lambda c: interop.linearise(c["late"], 0.0, SUDDEN), SpecificationError, "transport delay of 0.05 s"),
         (lambda c: interop.linearise(c["law"], 0.0, rate=3.0), SpecificationError, "rate was given for a Law"),
         (lambda c: interop.linearise(c["law"], 0.003), SpecificationError, "sampled at 50 Hz"),

@@ -83,7 +83,7 @@ def test_the_allocation_is_the_least_of_its_cost(arm, solver):
     y = plan.state(0.4) + [0.02, 0.03, 0.1, -0.2]
     x, row = np.concatenate([y, law.memory]), law.row(0.4)
     u = law.step(0.4, x, row)[:2]
-    wanted = law.step.law.step(0.4, y, law.step.law.table[:, 0])[:2]
+    wanted = law.step.law.step(0.4, y, law.step.law.row(0.4))[:2]
     assert wanted[0] > 20.0
     H = row[-4:].reshape(2, 2)
     grid = np.array(np.meshgrid(np.linspace(0, 20, 401), np.linspace(-3, 3, 401))).reshape(2, -1)
@@ -134,6 +134,39 @@ def test_limits_and_bounds_that_exclude_each_other_stop_with_both_named(crane):
         sv.close(machine, law, plan.state(0.0), (0.0, 1.0))
 
 
+class Failing:
+    """A law that meets an impossible bound after a while."""
+
+    def start(self):
+        def law(t, y):
+            if t > 0.255:
+                raise sv.LimitExceeded(f"At t = {t:g} s it is too much.")
+            return {"trolley": 0.0, "hoist": -981.0}
+
+        return law
+
+
+def test_the_motion_before_a_limit_that_cannot_be_kept_is_in_the_error(crane, monkeypatch):
+    plan, mechanism = crane
+    plant = sv.plant(mechanism)
+    for compiled in (True, False):
+        if not compiled:
+            monkeypatch.setattr(type(plant.function("ode")), "native", lambda self, suffix: None)
+        with pytest.raises(sv.LimitExceeded) as caught:
+            sv.close(plant, Failing(), plan.state(0.0), (0.0, 1.0), rate=100.0)
+        run = caught.value.run
+        assert run.t[-1] == pytest.approx(0.25) and not run.success and "raised LimitExceeded" in repr(run)
+
+
+def test_a_first_actuation_beyond_the_limits_starts_at_the_limit(crane):
+    """The plan starts with -981 N of a hoist that gives 900, and changes slowly."""
+    plan, mechanism = crane
+    machine = sv.plant(mechanism, limits={"hoist": (-900.0, 0.0)}, rate_limits={"hoist": 1000.0})
+    law = sv.limited(sv.lqr(plan, sv.plant(mechanism)), machine)
+    run = sv.close(machine, law, plan.state(0.0), (0.0, 0.5))
+    assert run["hoist"] == pytest.approx(-900.0) and run.memory[-1, 0] == -900.0
+
+
 def test_an_estimator_is_told_what_was_applied(crane):
     plan, mechanism = crane
     machine = sv.plant(mechanism, limits={"trolley": 120.0})
@@ -157,6 +190,24 @@ def test_bad_input(crane):
     for options in ({"weights": {"X": 1.0}, "priority": ["X"]}, {"weights": {"X": 0.0}}, {"horizon": 0.0}):
         with pytest.raises(sv.SpecificationError):
             sv.limited(law, machine, **options)
+    for priority in ("X", 3, ["X", "X"]):
+        with pytest.raises(sv.SpecificationError, match="each once"):
+            sv.limited(law, machine, priority=priority)
+    with pytest.raises(sv.SpecificationError, match="do not keep|does not keep|not keep them yet"):
+        sv.limited(sv.limited(law, machine), machine)
+    with pytest.raises(sv.SpecificationError, match="function was given"):
+        sv.limited(lambda t, y: [0.0, 0.0], machine)
+    slow = sv.plant(mechanism, limits={"trolley": 100.0}, lag={"trolley": 0.1, "hoist": 0.1})
+    with pytest.raises(sv.SpecificationError, match="'tension' at once: trolley, hoist lag"):
+        sv.limited(sv.lqr(plan, slow), slow, bounds={"tension": (0.0, None)})
+    with pytest.raises(sv.NameUnknown, match="'trolley'"):
+        sv.limited(sv.lqr(plan, slow), machine)
+    with pytest.raises(sv.SpecificationError, match="not limited"):
+        sv.limit_report(plan)
+    run = sv.close(machine, sv.limited(law, machine), plan.state(0.0), (0.0, 0.1))
+    for scene in ({}, "crane", {"t_span": (0.0, 6.0), "gues": {"l": 4.0}}):
+        with pytest.raises(sv.SpecificationError, match="guess, parameters, start, t_span"):
+            sv.limit_report(run, scene)
     with pytest.raises(sv.SpecificationError, match="not limited"):
         sv.limit_report(sv.close(machine, law, plan.state(0.0), (0.0, 0.1)))
 

@@ -5,7 +5,8 @@ import pytest
 
 import servoctl as sv
 from servoctl.control.lqr import weights
-from servoctl.control.tracking import Reference, discretised, exponentials
+from servoctl.control.sampling import discretised, exponentials
+from servoctl.control.tracking import Reference
 from servoctl.mechanisms import gallery
 
 CRANE, CRANE_PROGRAM = gallery["overhead-crane"].build()
@@ -211,6 +212,7 @@ BAD = {
     "integral of three": (lambda p, m: sv.lqr(p, m, integral=[1.0] * 3), sv.SpecificationError, "X, Z"),
     "rate of zero": (lambda p, m: sv.lqr(p, m, rate=0.0), sv.SpecificationError, "positive"),
     "plant of a delay": (lambda p, m: sv.lqr(p, sv.plant(CRANE, delay=0.02)), sv.SpecificationError, "transport delay"),
+    "varying of text": (lambda p, m: sv.lqr(p, m, varying="frozen"), sv.SpecificationError, "True, or are frozen"),
     "no plan": (lambda p, m: sv.lqr(m, m), sv.SpecificationError, "Plant was given as plan"),
     "out of reach": (lambda p, m: sv.lqr(*two_masses(-4.0)), sv.ServoError, "reached"),
 }  # fmt: skip

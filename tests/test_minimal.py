@@ -226,3 +226,16 @@ def test_an_unknown_treatment_shows_the_nearest(wheel):
     model, start = wheel
     with pytest.raises(sv.NameUnknown, match="minimal"):
         sv.simulate(model, start, (0.0, 1.0), drift="minimum")
+
+
+def test_a_state_that_is_lost_ends_the_motion(wheel, monkeypatch):
+    model, start = wheel
+    lift = Chart.lift
+
+    def lost(self, t, y, near):
+        return np.full(self.n_x, np.nan) if 0.5 < t < 0.6 else lift(self, t, y, near)
+
+    monkeypatch.setattr(Chart, "lift", lost)
+    with pytest.raises(sv.IntegrationStopped, match="no solution|finite|step size") as caught:
+        sv.simulate(model, start, (0.0, 1.0), method="DOP853", drift="minimal")
+    assert 0.3 < caught.value.run.t[-1] <= 0.5 + 1e-9

@@ -4,7 +4,9 @@ import numpy as np
 import pytest
 
 import servoctl as sv
-from servoctl.mechanisms import overhead_crane, two_link_arm
+from servoctl.control.sampling import discretised
+from servoctl.control.tracking import Reference
+from servoctl.mechanisms import gallery, overhead_crane, two_link_arm
 
 GUST = {"theta": lambda t: 60.0 * (2.0 < t < 2.5)}
 SENSORS = {"x": 1e-3, "l": 1e-3, "theta": 1e-3}
@@ -57,12 +59,89 @@ def test_noisier_sensors_are_trusted_less(crane):
     assert radii == sorted(radii) and radii[-1] < 1
 
 
+class Differencing:
+    """Feedback of velocities that are differences of the measured coordinates."""
+
+    def __init__(self, law, names):
+        self.law, self.names = law, names
+
+    def start(self):
+        controller, before = self.law.start(), {}
+
+        def law(t, y):
+            for name in self.names:
+                y[f"d{name}"] = (y[name] - before.get(name, y[name])) * self.law.rate
+                before[name] = y[name]
+            return controller(t, y)
+
+        return law
+
+
 def test_noise_costs_less_than_differencing_would(crane):
     plan, nominal, machine = crane
-    law = sv.output_feedback(sv.lqr(plan, nominal, integral=True), nominal, SENSORS)
-    run = sv.close(machine, law, plan.state(0.0), (0.0, 8.0), noise=SENSORS, seed=3)
-    quiet = sv.close(machine, law, plan.state(0.0), (0.0, 8.0))
-    assert 0 < np.abs(worst(run) - worst(quiet)).max() < 5e-3
+    law = sv.lqr(plan, nominal, integral=True)
+    costs = []
+    for given in (sv.output_feedback(law, nominal, SENSORS), Differencing(law, SENSORS)):
+        noisy, quiet = (
+            sv.close(machine, given, plan.state(0.0), (0.0, 8.0), rate=100.0, noise=noise, seed=seed, plan=plan)
+            for noise, seed in ((SENSORS, 3), (None, None))
+        )
+        costs.append(np.std(noisy.commands - quiet.commands, axis=1))
+        assert np.abs(worst(noisy) - worst(quiet)).max() < 5e-3
+    assert np.all(2 * costs[0] < costs[1]), "the actuators are spared"
+
+
+def test_gains_are_those_of_python_control_and_of_the_recursion(crane):
+    import control
+
+    plan, nominal, _ = crane
+    A, _ = discretised(*Reference(plan, nominal, 100.0).linearised(), 0.01)
+    C, W, V = np.eye(6)[:3], np.diag([1e-8] * 3 + [1e-2] * 3), 1e-6 * np.eye(3)
+    L = gains(sv.output_feedback(sv.lqr(plan, nominal), nominal, SENSORS), 6, 3)
+    predictor, P, _ = control.dlqe(A[0], np.eye(6), C, W, V)
+    assert A[0] @ L[0] == pytest.approx(predictor, rel=1e-9, abs=1e-12)
+    for k in range(400):
+        K = P @ C.T @ np.linalg.inv(C @ P @ C.T + V)
+        assert L[k] == pytest.approx(K, rel=1e-7, abs=1e-10)
+        P = A[k] @ (np.eye(6) - K @ C) @ P @ (np.eye(6) - K @ C).T @ A[k].T + A[k] @ K @ V @ K.T @ A[k].T + W
+
+
+def gains(law, n_x, n_y):
+    """L of each sample, from the law's table [u_ff; x_ref; K; L; A; B]."""
+    m = len(law.inputs)
+    first = m + n_x + m * n_x
+    return law.table[first : first + n_x * n_y].T.reshape(-1, n_x, n_y)
+
+
+def test_a_filter_on_constrained_states_is_that_of_their_tangent_spaces():
+    """The rope as a material constraint: against a covariance in all coordinates, projected at each sample."""
+    scene = gallery["overhead-crane-redundant"]
+    mechanism, program = scene.build()
+    model = sv.derive(mechanism, program)
+    plan, plant = sv.simulate(model, model.start(guess=scene.guess), (0.0, 4.0)), sv.plant(mechanism)
+    sensors = {"x": 1e-3, "X": 1e-3, "Z": 1e-3}
+    law = sv.output_feedback(sv.lqr(plan, plant), plant, sensors)
+    reference = Reference(plan, plant, 100.0)
+    A, _ = discretised(*reference.linearised(), 0.01)
+    J = (
+        plant.function("constraints_jacobian")
+        .grid(reference.t, reference.x, plant.p())
+        .reshape(8, 2, -1)
+        .transpose(2, 1, 0)
+    )
+    project = np.eye(8) - np.linalg.pinv(J) @ J
+    C, W, V = np.eye(8)[[0, 2, 3]], np.diag([1e-8] * 4 + [1e-2] * 4), 1e-6 * np.eye(3)
+    P = project[0] @ W @ project[0]
+    for _ in range(5000):  # steady at the start
+        K = P @ C.T @ np.linalg.inv(C @ P @ C.T + V)
+        P = project[0] @ (A[0] @ (P - K @ C @ P) @ A[0].T + W) @ project[0]
+    for k, L in enumerate(gains(law, 8, 3)[:300]):
+        K = P @ C.T @ np.linalg.inv(C @ P @ C.T + V)
+        assert L == pytest.approx(K, rel=1e-6, abs=1e-8)
+        P = project[k + 1] @ (A[k] @ (P - K @ C @ P) @ A[k].T + W) @ project[k + 1]
+    assert law.info["spectral radius of the filter"] < 1.0
+    run = sv.close(plant, law, plan.state(0.0), (0.0, 4.0), noise=sensors, seed=1)
+    assert np.abs(np.einsum("kij,jk->ki", J, run.memory)).max() < 1e-12 and worst(run).max() < 0.01
 
 
 def test_bad_input(crane):
@@ -75,6 +154,14 @@ def test_bad_input(crane):
             sv.output_feedback(law, nominal, noise)
     with pytest.raises(sv.SpecificationError, match="lqr"):
         sv.output_feedback(sv.feedforward(plan, nominal), nominal, SENSORS)
+    with pytest.raises(sv.SpecificationError, match="LQR"):
+        sv.output_feedback(sv.output_feedback(law, nominal, SENSORS), nominal, SENSORS)
+    slow = sv.plant(nominal.mechanism, lag={"trolley": 0.05})
+    for pair in ((law, slow), (sv.lqr(plan, slow), nominal)):
+        with pytest.raises(sv.SpecificationError, match="same plant, lagging"):
+            sv.output_feedback(*pair, SENSORS)
+    with pytest.raises(sv.SpecificationError, match="transport delay"):
+        sv.output_feedback(law, sv.plant(nominal.mechanism, delay=0.05), SENSORS)
     with pytest.raises(sv.ServoError, match="seen by the measured"):
         sv.output_feedback(law, nominal, {"dx": 1e-3})
 

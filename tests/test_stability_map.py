@@ -36,6 +36,7 @@ def test_internal_eigenvalues_are_those_of_the_closed_form(stiff):
     assert np.abs(found.rates.imag).max() == 0.0
 
 
+@pytest.mark.filterwarnings("ignore:Steps of:RuntimeWarning")
 @pytest.mark.parametrize("drift", [None, "project", 0.5])
 @pytest.mark.parametrize("method", ["RK1", "RK4", "RK8"])
 def test_simulations_diverge_where_the_map_says(stiff, method, drift):

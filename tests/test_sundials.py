@@ -1,5 +1,9 @@
 """CVODES and IDAS through CasADi: tabulated states, the form before elimination, reversed time, knots, stops, refusals."""
 
+import os
+import signal
+import threading
+
 import casadi as ca
 import closed_forms as cf
 import numpy as np
@@ -94,3 +98,11 @@ def test_failure_keeps_what_was_computed(method):
 def test_projection_is_refused_with_the_reason(method, model, start):
     with pytest.raises(sv.SpecificationError, match="multistep"):
         sv.simulate(model, start, (0.0, 1.0), method=method, drift="project")
+
+
+def test_ctrl_c_is_no_failure_of_the_integrator(method, model, start):
+    sv.simulate(model, start, (0.0, 0.1), method=method)  # compiled
+    threading.Timer(0.3, lambda: os.kill(os.getpid(), signal.SIGINT)).start()
+    run = sv.simulate(model, start, (0.0, 3000.0), method=method, **TIGHT)  # tens of seconds
+    assert run.status == 1 and not run.success and "interrupted" in run.message
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler

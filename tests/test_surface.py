@@ -20,7 +20,7 @@ ENTRIES = ("__init__.py", "__main__.py")  # of the package itself: they gather t
 
 LAYERS = (
     "errors", "spec", "reduction", "model", "simulation", "control", "study", "mechanisms", "plots", "interop",
-    "scenes", "rundir", "options", "commands", "cli",
+    "scenes", "rundir", "options", "commands", "loops", "cli",
 )  # fmt: skip
 BEHIND_THE_SEAM = (
     "simulation",
@@ -32,6 +32,7 @@ BEHIND_THE_SEAM = (
     "rundir",
     "options",
     "commands",
+    "loops",
     "cli",
 )
 LATE = ("scipy", "matplotlib", "control", "tqdm", "xarray", "adam", "dask")

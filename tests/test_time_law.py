@@ -1,5 +1,6 @@
 """Programs slowed in time: the same path, and the fastest time law that limits allow."""
 
+import casadi as ca
 import numpy as np
 import pytest
 from scipy.optimize import brentq
@@ -48,6 +49,39 @@ def test_held_velocities_are_slowed_too():
     assert law.factor == pytest.approx((0.925275 / 0.5) ** 0.5, rel=1e-4)
 
 
+def test_a_limit_at_zero_is_a_limit():
+    """A rope lifts a mass and does not push: the path's largest deceleration is g."""
+    q = sv.coordinates("z")
+    (z,) = q
+    mechanism = sv.Mechanism(q, gibbs=sv.particle(q, 3.0, z), potential=3.0 * 9.81 * z, actuators={"rope": z})
+    program = sv.Program({"Z": z - sv.paths.rest_to_rest(q.t, 0.0, 1.0, duration=2.0, smoothness=3)})
+    law = sv.fastest(mechanism, program, {"rope": (0.0, None)}, (0.0, 2.0))
+    model = sv.derive(mechanism, program)
+    (_, least), _ = sv.simulate(model, model.start(), (0.0, 2.0)).extrema("d2z")
+    assert law.factor == pytest.approx(np.sqrt(-least / 9.81), rel=1e-5)
+    assert law.binding[:2] == ("rope", "lower") and 0.0 <= law.plan.extrema("rope")[0][1] < 1e-3
+
+
+def test_motions_that_cease_to_exist_before_a_limit_are_no_fastest_ones(monkeypatch):
+    def simulated(model, start, span):
+        if span[1] < 1.5:
+            raise sv.IntegrationStopped("No motion is quicker than 1.5 s.")
+        return sv.simulate(model, start, span)
+
+    monkeypatch.setattr("servoctl.control.time_law.simulate", simulated)
+    with pytest.raises(sv.LimitExceeded, match=r"below the factor 0\.75, before it reaches a limit"):
+        sv.fastest(*cars(), {"force": 3000.0}, (0.0, 2.0))
+
+
+def test_weights_of_actuators_are_slowed_as_well():
+    q = sv.coordinates("x")
+    (x,), (dx,) = q, q.d(1)
+    program = sv.Program({"X": x - q.t}, weights={"push": 1.0 + q.t + dx**2, "pull": 2.0})
+    slower = program.slowed(q, 2.0, at=1.0)
+    at = ca.Function("at", [q.t, dx], [slower.weights["push"]])
+    assert float(at(3.0, 0.5)) == pytest.approx(1.0 + 2.0 + 1.0) and float(ca.SX(slower.weights["pull"])) == 2.0
+
+
 def test_static_loads_beyond_the_limits_are_refused_with_the_numbers():
     with pytest.raises(sv.LimitExceeded, match="hoist still exceeds its lower limit.*-981 .. -981"):
         sv.fastest(*overhead_crane(), {"hoist": (-900.0, 0.0)}, (0.0, 6.0), guess={"l": 4.0})
@@ -58,6 +92,14 @@ def test_bad_input():
     for factor in (0.0, -1.0, "fast", np.nan):
         with pytest.raises(sv.SpecificationError, match="positive number"):
             program.slowed(mechanism.q, factor)
+    for at in ("now", None, np.nan):
+        with pytest.raises(sv.SpecificationError, match="finite number"):
+            program.slowed(mechanism.q, 2.0, at=at)
+    for limits, span in (({}, (0.0, 2.0)), (5.0, (0.0, 2.0)), ({"force": 200.0}, (2.0, 0.0))):
+        with pytest.raises(sv.SpecificationError, match="limits|later t1"):
+            sv.fastest(mechanism, program, limits, span)
+    with pytest.raises(sv.SpecificationError, match="str was given as program"):
+        sv.fastest(mechanism, "cars", {"force": 200.0}, (0.0, 2.0))
     for limit in ((1.0, -1.0), (None, None), "1..2", np.nan):
         with pytest.raises(sv.SpecificationError, match="interval"):
             sv.fastest(mechanism, program, {"force": limit}, (0.0, 2.0))

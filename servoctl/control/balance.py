@@ -30,10 +30,10 @@ def balance(closed):
     """
     plant, numbers, notes = closed.plant, {}, []
     limits = {"loop power": LARGEST, "loop constraints": HELD, "loop limits": WITHIN, "loop repeated": 1e-9}
-    defect, repeated, law_terms = _defect(closed, 1)
+    defect, repeated = _defect(closed, 1)
     numbers["loop repeated"] = repeated
-    if law_terms > 1e-9:
-        notes.append("power balance: not applicable, the inertia terms depend on time or on more than wᵀMw/2")
+    if plant.equations.unbalanced:
+        notes.append(f"power balance: not applicable, {plant.equations.unbalanced}")
     elif repeated <= limits["loop repeated"]:
         numbers["loop power"] = defect
         numbers["loop power halved"] = _defect(closed, 2)[0]
@@ -55,8 +55,6 @@ def _defect(closed, finer):
     defect : float
     repeated : float
         Largest difference of the states from those of the run, relative to their sizes.
-    law_terms : float
-        What dE/dt owes to neither force nor potential, relative to the power.
     """
     plant, loop = closed.plant, closed.loop
     substeps = loop.substeps * finer
@@ -71,17 +69,15 @@ def _defect(closed, finer):
     begin(closed.law)
     status, x, *_ = run_loop(plant.function("ode_power"), closed.law.step, again)
     if status != FINISHED:
-        return np.inf, np.inf, 0.0
+        return np.inf, np.inf
     states, work = x[:, :-1].T, x[:, -1]
     p = plant.p(closed._arriving, closed._disturbances)
-    energy, driven, disturbing, other, law = plant.function("power").grid(closed.t, states, p)
-    powers = np.abs([driven, disturbing, other]).sum(axis=0).max()
+    energy = plant.function("power").grid(closed.t, states, p)[0]
     scale = max(np.ptp(energy), np.ptp(work), 1e-6 * np.abs(energy).max(), 1e-12)
     size = np.abs(closed.states).max(axis=1, keepdims=True) + 1e-9
     return (
         float(np.abs(energy - energy[0] - work).max() / scale),
         float((np.abs(states - closed.states) / size).max()),
-        float(np.abs(law).max() / max(powers, 1e-12)),
     )
 
 

@@ -7,10 +7,9 @@ import numpy as np
 from servoctl.control.closed import Closed
 from servoctl.control.disturbances import require_seed, sampled
 from servoctl.control.law import ON_SAMPLE, Law
-from servoctl.control.tracking import Reference, positive
+from servoctl.control.tracking import Reference, positive, require_plan, require_plant
 from servoctl.errors import InconsistentStart, IntegrationStopped, ServoError, SpecificationError, unknown
-from servoctl.model.closed import FINISHED, STATE_LOST, Loop, run_loop
-from servoctl.model.plant import Plant
+from servoctl.model.closed import FINISHED, LAW_LOST, STATE_LOST, Loop, run_loop
 from servoctl.spec.coordinates import mapping
 from servoctl.spec.parameters import finite
 
@@ -75,26 +74,25 @@ def close(
     SpecificationError
         For times that are not whole samples or steps, and for values that make no sense.
     ServoError
-        If the law answers with NaN.
+        If the law answers with NaN. What a law raises itself is passed on, with the motion before in its `run`.
     InconsistentStart
         If material constraints do not hold at the start.
     IntegrationStopped
         If the state is no longer finite; what was computed is in `run`.
     """
-    if not isinstance(plant, Plant):
-        raise SpecificationError(
-            f"A {type(plant).__name__} was given in the place of a Plant.", "A loop is closed around a plant.",
-            nearest="sv.plant(mechanism).", do="Make the plant of the mechanism.",
-        )  # fmt: skip
-    t_span = _span(t_span)
+    require_plant(plant)
+    t_span = span(t_span)
     law = _as_law(law, plant, rate, t_span[0], plan)
-    _require_names(law, plant)
-    if noise is None and seed is not None:
+    require_names(law, plant)
+    if plan is not None:
+        require_plan(plan, plant)
+    if not noise and seed is not None:
         raise SpecificationError("A seed was given without noise.", "The seed is that of the noise.", do="Remove it.")
     given = (disturbance, noise, quantisation)
     names = ("The disturbances", "The noise", "The quantisation")
     conditions = Conditions(
-        *(dict(mapping(values, what)) for values, what in zip(given, names, strict=True)), seed or 0
+        *(dict(mapping(values, what)) for values, what in zip(given, names, strict=True)),
+        0 if seed is None else require_seed(seed),
     )
     loop = prepared(plant, law, x0, t_span, whole(delay, "delay", "samples"), conditions, substeps)
     return finish(plant, law, loop, conditions, law.plan if plan is None else plan)
@@ -126,7 +124,7 @@ def prepared(plant, law, x0, t_span, delay, conditions, substeps):
         measured=np.array([plant.state_names.index(name) for name in law.measures], dtype=np.int64),
         disturbed=np.array([_index(name, plant.disturbable, "generalised force") for name in forces], dtype=np.int64),
         idle=idle, disturbance=disturbed(forces, t0, law.period / substeps, samples * substeps),
-        noise=noisy(conditions.noise, law.measures, samples + 1, require_seed(conditions.seed)),
+        noise=noisy(conditions.noise, law.measures, samples + 1, conditions.seed),
         quantum=_by_measure(conditions.quantisation, law.measures, "quantisation"),
         low=low, high=high, change=change, transport=transport,
     )  # fmt: skip
@@ -160,16 +158,20 @@ def finish(plant, law, loop, conditions, plan):
     t = loop.t0 + np.arange(len(x)) * loop.period
     m, n_y, n_z = loop.n_u, len(law.measures), len(law.memory)
     end = loop.t0 + len(x) * loop.period
-    message = {FINISHED: "finished", STATE_LOST: f"the state is not finite at t = {end:.6g} s"}.get(
-        status, f"the law's answer is not finite at t = {end:.6g} s"
-    )
+    message = {
+        FINISHED: "finished",
+        STATE_LOST: f"the state is not finite at t = {end:.6g} s",
+        LAW_LOST: f"the law's answer is not finite at t = {end:.6g} s",
+    }.get(status, f"the law raised {type(status).__name__} at t = {end:.6g} s")
     run = Closed(
         t, x.T, inputs.T, law_y[:, :m].T, law_x[: len(x), :n_y].T, law_x[: len(x), n_y:].T, law_y[:, m + n_z :].T,
         plant, law, plan, loop, conditions, status == FINISHED, 0 if status == FINISHED else -1, message,
     )  # fmt: skip
     if status == FINISHED:
         return run
-    if status == STATE_LOST:
+    if isinstance(status, BaseException):
+        error = status
+    elif status == STATE_LOST:
         error = IntegrationStopped(
             f"The closed loop has no finite state at t = {end:.6g} s.",
             "An unstable loop grows until its numbers end; integration steps that are too long do the same.",
@@ -227,13 +229,11 @@ def steps(plant, period, substeps, t0, x0, u0):
     Raises
     ------
     SpecificationError
-        If a transport delay is no whole number of steps.
+        If a transport delay is no whole number of steps, or the start does not tell how many steps are needed.
     """
     delays = np.array([plant.delay.get(name, 0.0) for name in plant.inputs])
     if substeps is None:
-        A, _ = plant.linearised(t0, x0[:, None], u0[:, None])
-        fastest = np.abs(np.linalg.eigvals(A[0])).max(initial=0.0) if np.isfinite(A).all() else 0.0
-        least = min(max(1, int(np.ceil(fastest * period / RESOLVED))), MOST_SUBSTEPS)
+        least = _resolving(plant, period, t0, x0, u0)
         fitting = (n for n in range(least, MOST_SUBSTEPS + 1) if _fits(delays * n / period))
         substeps = next(fitting, least)
     substeps = whole(substeps, "substeps", "steps per sample")
@@ -255,6 +255,24 @@ def steps(plant, period, substeps, t0, x0, u0):
             name=name,
         )
     return substeps, np.rint(late).astype(np.int64)
+
+
+def _resolving(plant, period, t0, x0, u0):
+    """The least number of steps per sample for the fastest eigenvalue at the start."""
+    A, _ = plant.linearised(t0, x0[:, None], u0[:, None])
+    fastest = np.abs(np.linalg.eigvals(A[0])).max(initial=0.0) if np.isfinite(A).all() else np.inf
+    least = fastest * period / RESOLVED
+    if not least <= MOST_SUBSTEPS:
+        raise SpecificationError(
+            f"The plant's linearisation at the start has eigenvalues of up to {fastest:.4g} 1/s, at {1 / period:g} Hz."
+            if fastest < np.inf
+            else "The plant's linearisation at the start is not finite.",
+            f"Without substeps a sample is divided into at most {MOST_SUBSTEPS} steps, each resolving these.",
+            nearest=f"substeps={least:.0f}." if fastest < np.inf else "substeps=10.",
+            do="Give substeps, or leave out a lag or a stiffness that fast.",
+            eigenvalue=float(fastest),
+        )
+    return max(1, int(np.ceil(least)))
 
 
 def _fits(numbers):
@@ -294,7 +312,8 @@ def _index(name, names, what):
     return names.index(name)
 
 
-def _span(t_span):
+def span(t_span, what="A loop runs"):
+    """The interval (t0, t1), t1 > t0 [s]."""
     try:
         t0, t1 = (finite("t_span", t, "time") for t in t_span)
     except TypeError:
@@ -305,7 +324,7 @@ def _span(t_span):
         t0, t1 = 0.0, -1.0
     if t1 <= t0:
         raise SpecificationError(
-            f"t_span={t_span!r} was given.", "A loop runs from t0 to a later t1 [s].", "(0.0, 8.0).", "Change it."
+            f"t_span={t_span!r} was given.", f"{what} from t0 to a later t1 [s].", "(0.0, 8.0).", "Change it."
         )
     return t0, t1
 
@@ -321,7 +340,7 @@ def _as_law(law, plant, rate, t0, plan):
                 do="Design the law for this rate.",
             )
         return law
-    if not callable(law) and not hasattr(law, "start"):
+    if isinstance(law, type) or not callable(law) and not hasattr(law, "start"):
         raise SpecificationError(
             f"A {type(law).__name__} was given as law.",
             "A law is made by sv.lqr and others, or is a function law(t, measurement) -> inputs.",
@@ -347,6 +366,13 @@ class _Function:
     def begin(self):
         """Start the law where it has a memory of its own."""
         self._law = self._given.start() if hasattr(self._given, "start") else self._given
+        if not callable(self._law):
+            raise SpecificationError(
+                f"The law {self._name!r} was started, and gave a {type(self._law).__name__}.",
+                "A law's start gives the function that answers.",
+                nearest="return lambda t, y: {...}.",
+                do="Return it from start.",
+            )
 
     def __call__(self, t, x, _row):
         inputs = self._plant.inputs
@@ -370,7 +396,8 @@ class _Function:
         return found
 
 
-def _require_names(law, plant):
+def require_names(law, plant):
+    """Refuse a law that measures or commands what the plant lacks."""
     for name in law.measures:
         _index(name, plant.state_names, "state of the plant")
     for name in law.inputs:

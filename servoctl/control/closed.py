@@ -264,7 +264,7 @@ class Closed:
         if worst:
             told = (f"{name} {worst[name].max():.3g}, {worst[name][-1]:.3g}" for name in shown)
             lines.append(f"  residuals, at worst and at the end: {'; '.join(told)}")
-        if self.plan is not None and self.t[-1] > self.plan.t[-1] * (1 + 1e-9):
+        if self.plan is not None and self.t[-1] > self.plan.t[-1] + 1e-6 * loop.period:
             lines.append(f"  the plan ends at t = {self.plan.t[-1]:g} s: its last row is held")
         for name in self.plant.inputs[:5]:
             share = np.mean(self.active[name] != NONE)

@@ -3,7 +3,7 @@
 import numpy as np
 
 from servoctl.control.law import Law
-from servoctl.control.tracking import positive, require_plan
+from servoctl.control.tracking import Reference, positive, refuse_transport, require_plan
 from servoctl.errors import SpecificationError, UnstableInternalDynamics, unknown
 from servoctl.model.linearising import linearise
 from servoctl.simulation.bounds import sampled_bound
@@ -17,14 +17,14 @@ def computed(plan, plant, rate=100.0, poles=None, delay=0):
 
     Each residual obeys Π(D - λ_i) φ = 0 as long as the machine is the plant: φ is differentiated along the plant until
     the inputs decouple, through dynamic extension where their decoupling matrix has no full rank. Between samples the
-    inputs are held.
+    inputs are held: by how much the plan's actuation changes until the middle of each sample is added.
 
     Parameters
     ----------
     plan : Run
         Ranks are decided about its states.
     plant : Plant
-        What the controller believes of the machine, of the plan's mechanism.
+        What the controller believes of the machine, of the plan's mechanism, without transport delay.
     rate : float
         Samples per second [Hz].
     poles : float or dict of str to sequence of complex, optional
@@ -48,19 +48,26 @@ def computed(plan, plant, rate=100.0, poles=None, delay=0):
     """
     rate = positive("rate", rate)
     require_plan(plan, plant)
+    refuse_transport(plant, "The linearisation is")
+    if isinstance(delay, bool) or not isinstance(delay, (int, np.integer)) or delay < 0:
+        raise SpecificationError(
+            f"delay={delay!r} was given.", "A delay is a whole number of samples, at least 0.", do="Give one."
+        )
     _require_stable(plan)
     found = linearise(plan, plant)
     poles = _poles(poles, found.orders)
     for name, values in poles.items():
         _require_slow(name, values, rate, delay)
     coefficients = [np.poly(values).real[:0:-1] for values in poles.values() if len(values)]
-    row = np.concatenate([plant.parameters, [1.0 / rate], *coefficients])
-    count = len(found.memory_names)
+    reference, count = Reference(plan, plant, rate), len(found.memory_names)
+    ahead = reference.ahead()
+    rows = ([plant.parameters, [1.0 / rate], u, *coefficients] for u in ahead.T)
+    table = np.column_stack([np.concatenate(row) for row in rows])
     idle = np.array([plan[name][0] for name in plant.inputs])
     facts = {"orders": found.orders, "relative degree": found.relative_degree, "poles": poles}
     facts["error dynamics"] = ", ".join(f"{name} of order {order}" for name, order in found.orders.items())
     return Law(
-        "computed", plant.state_names, plant.inputs, rate, float(plan.t[0]), found.step, row[:, None],
+        "computed", plant.state_names, plant.inputs, rate, float(plan.t[0]), found.step, table,
         np.zeros(count), found.memory_names, (), idle, plan, facts,
     )  # fmt: skip
 
@@ -97,8 +104,11 @@ def _poles(poles, orders):
             raise unknown(name, orders, "residual")
     found = {}
     for name, order in orders.items():
-        values = np.atleast_1d(poles.get(name, ())).astype(complex)
-        if values.shape != (order,) or not np.isfinite(values).all() or np.abs(np.poly(values).imag).max() > 1e-9:
+        try:
+            values = np.atleast_1d(poles.get(name, ())).astype(complex)
+        except (TypeError, ValueError):
+            values = np.full(order, np.nan)
+        if values.shape != (order,) or not np.isfinite(values).all() or not _paired(values):
             raise SpecificationError(
                 f"The poles of {name!r} are {poles.get(name)!r}.",
                 f"Its error dynamics have order {order}: as many poles, complex ones in conjugate pairs.",
@@ -111,9 +121,22 @@ def _poles(poles, orders):
     return found
 
 
+def _paired(poles):
+    """Whether complex poles come in conjugate pairs."""
+    return np.allclose(np.sort_complex(poles), np.sort_complex(poles.conj()), rtol=1e-9, atol=0)
+
+
 def _require_slow(name, poles, rate, delay):
     """Refuse poles whose error dynamics are unstable under a zero-order hold."""
     order = len(poles)
+    if np.any(poles.real >= 0):
+        raise SpecificationError(
+            f"The poles of {name!r} are {poles}.",
+            "Error dynamics decay where each pole has a negative real part.",
+            nearest=f"{[-4.0] * order}.",
+            do="Change the sign.",
+            name=name,
+        )
     radius = sampled_radius(poles, rate, delay) if order else 0.0
     if not radius < 1.0:
         fastest, bound = float(np.abs(poles).max()), sampled_bound(order, delay)

@@ -6,6 +6,7 @@ import numpy as np
 
 from servoctl.errors import SpecificationError, unknown
 
+_SIZES = ("n_x", "n_p", "n_y")  # of a compiled step: what it takes, its row, what it gives
 ON_SAMPLE = 1e-6  # of a period: how far from an instant of sampling a law may be asked
 
 
@@ -69,6 +70,15 @@ class Law:
             )
         idle = np.zeros(len(self.inputs)) if self.idle is None else np.asarray(self.idle, dtype=float)
         object.__setattr__(self, "idle", idle)
+        given = (len(self.measures) + len(self.memory), table.shape[0], self.n_out, idle.size)
+        wanted = (*(getattr(self.step, size, n) for size, n in zip(_SIZES, given, strict=False)), len(self.inputs))
+        if given != wanted:
+            raise SpecificationError(
+                f"The law {self.name!r} has {given[0]} measurements and memories, rows of {given[1]} numbers, "
+                f"{given[2]} answers and {given[3]} idle inputs.",
+                f"Its step takes {wanted[0]} and rows of {wanted[1]}, gives {wanted[2]}; its inputs are {wanted[3]}.",
+                do="Give measures, memory, table, signals and idle that belong to the step.",
+            )
 
     @property
     def period(self):

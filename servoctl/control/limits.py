@@ -4,8 +4,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from servoctl.control.law import Law
 from servoctl.control.lqr import Q_POSITION, R_INPUT, steady, tangents
-from servoctl.control.tracking import Reference, discretised, positive
+from servoctl.control.sampling import discretised
+from servoctl.control.tracking import Reference, positive, require_plant
 from servoctl.errors import LimitExceeded, SpecificationError, unknown
 from servoctl.model.allocation import Effects, SmallQP
 from servoctl.model.laws import Residuals
@@ -16,6 +18,7 @@ HORIZON = 0.5  # s
 FALLING = 1e-4  # of weights, from one residual to the next by priority
 UNSEEN = 1e-6  # weight of each state beside those of residuals: states that no residual sees stay where they are
 MET = 1e-7  # of an input's range: how near its limit an input has met it
+SCENE = frozenset(("t_span", "start", "guess", "parameters"))  # what `fastest` takes beside program and limits
 GIVEN_WAY = 1e-6  # of a residual's largest effect: a slack that counts
 
 
@@ -61,6 +64,7 @@ def limited(law, plant, *, bounds=None, weights=None, priority=None, horizon=HOR
     LimitExceeded
         During the loop, where no inputs keep limits and bounds together; it names them.
     """
+    _require_law(law, plant)
     bounds = {name: _interval(name, value) for name, value in mapping(bounds, "The bounds").items()}
     if not (plant.limits or plant.rate_limits or bounds):
         raise SpecificationError(
@@ -69,16 +73,11 @@ def limited(law, plant, *, bounds=None, weights=None, priority=None, horizon=HOR
             nearest='sv.plant(mechanism, limits={"trolley": 150.0}).',
             do="Give the plant its limits.",
         )
-    if law.plan is None:
-        raise SpecificationError(
-            f"The law {law.name!r} has no plan.",
-            "Slack is given to the residuals of a plan's program.",
-            do="Make the law from a plan.",
-        )
     for name in bounds:
         if name not in plant.mechanism.outputs:
             raise unknown(name, plant.mechanism.outputs, "output of the mechanism")
     effects = Effects(plant, {name: plant.mechanism.outputs[name] for name in bounds})
+    _require_at_once(effects, plant, bounds)
     reference = Reference(law.plan, plant, law.rate)
     names, D, at_once = _predicted(reference, positive("horizon", horizon))
     count, sizes = D.shape[0], _sizes(law.plan, plant)
@@ -86,6 +85,7 @@ def limited(law, plant, *, bounds=None, weights=None, priority=None, horizon=HOR
     held = np.repeat(law.table, count, axis=1) if law.table.shape[1] == 1 else law.table
     signals = (*(f"slack {n}" for n in names), *(f"limit {n}" for n in plant.inputs))
     signals += tuple(f"bound {n}" for n in bounds)
+    low, high = _magnitudes(plant)
     memory_names = (*law.memory_names, *(f"last {name}" for name in plant.inputs))
     step = _Allocation(law, plant, effects, sizes, tuple(bounds.values()), len(names), solver)
     how = f"by priority {' > '.join(priority)}" if priority else "by weight"
@@ -94,11 +94,51 @@ def limited(law, plant, *, bounds=None, weights=None, priority=None, horizon=HOR
         name=f"{law.name}, limited {how}",
         step=step,
         table=np.vstack([held, reference.x, D.reshape(count, -1).T, H.reshape(count, -1).T]),
-        memory=np.concatenate([law.memory, law.idle]),
+        memory=np.concatenate([law.memory, np.clip(law.idle, low, high)]),
         memory_names=memory_names,
         signals=(*law.signals, *signals),
         info=law.info | {"slack of": names, "limited plant": plant, "slack sizes": np.abs(D).max(axis=0) @ sizes},
     )
+
+
+def _require_law(law, plant):
+    """Refuse what is no law of a plan, or measures what the plant lacks."""
+    require_plant(plant)
+    if not isinstance(law, Law) or "slack of" in law.info:
+        raise SpecificationError(
+            f"A {type(law).__name__} was given as law." if not isinstance(law, Law) else f"{law.name!r} was given.",
+            "Limits are kept around a law that does not keep them yet.",
+            nearest="sv.lqr(plan, plant).",
+            do="Give a law made from a plan, and all bounds and weights at once.",
+        )
+    if law.plan is None:
+        raise SpecificationError(
+            f"The law {law.name!r} has no plan.",
+            "Slack is given to the residuals of a plan's program.",
+            do="Make the law from a plan.",
+        )
+    for name in law.measures:
+        if name not in plant.state_names:
+            raise unknown(name, plant.state_names, "state of the plant")
+
+
+def _magnitudes(plant):
+    """Lower and upper limits of the inputs, infinite where the plant has none."""
+    return np.array([plant.limits.get(name, (-np.inf, np.inf)) for name in plant.inputs]).T
+
+
+def _require_at_once(effects, plant, bounds):
+    """Refuse bounds of what no input changes at once, as behind lagging actuators."""
+    for name in bounds:
+        if not effects.acts(name):
+            raise SpecificationError(
+                f"No input changes {name!r} at once"
+                + (f": {', '.join(plant.lagged)} lag behind their commands." if plant.lag else "."),
+                "A bound is kept by the inputs of the same sample.",
+                nearest="The bound, with a plant without lag.",
+                do="Leave the bound out, or design with actuators that act at once.",
+                name=name,
+            )
 
 
 def _predicted(reference, horizon):
@@ -151,9 +191,7 @@ class _Allocation:
     def __init__(self, law, plant, effects, sizes, bounds, k, solver):
         self.law, self.plant, self.effects, self.sizes = law, plant, effects, sizes
         m, self.k = len(plant.inputs), k
-        self.low, self.high = (
-            np.array([plant.limits.get(name, (-np.inf, np.inf))[side] for name in plant.inputs]) for side in (0, 1)
-        )
+        self.low, self.high = _magnitudes(plant)
         self.change = np.array([plant.rate_limits.get(name, np.inf) for name in plant.inputs]) * law.period
         self.bounds = np.array(bounds).reshape(-1, 2)
         self.where = [plant.state_names.index(name) for name in law.measures]
@@ -217,6 +255,13 @@ class _Allocation:
 def _weights(names, weights, priority):
     """The residuals' weights, (k,)."""
     weights = mapping(weights, "The weights")
+    if isinstance(priority, str) or not np.iterable(priority or ()) or len({*(priority or ())}) < len(priority or ()):
+        raise SpecificationError(
+            f"priority={priority!r} was given.",
+            "A priority is a sequence of residuals, each once, the most important first.",
+            nearest=f"{list(names)}.",
+            do="Give it.",
+        )
     if weights and priority:
         raise SpecificationError(
             "Weights and a priority were given.", "Slack goes by one of them.", do="Leave one of them out."
@@ -316,12 +361,20 @@ def limit_report(run, scene=None):
     SpecificationError
         If the law is not limited.
     """
-    if "slack of" not in run.law.info:
+    law = getattr(run, "law", None)
+    if "slack of" not in getattr(law, "info", {}):
         raise SpecificationError(
-            f"The law {run.law.name!r} is not limited.",
+            f"The law {getattr(law, 'name', None)!r} is not limited.",
             "The report reads the slacks of an allocation.",
             nearest="sv.limited(law, plant).",
             do="Close the loop with it.",
+        )
+    if scene is not None and not (isinstance(scene, dict) and "t_span" in scene and SCENE.issuperset(scene)):
+        raise SpecificationError(
+            f"scene={scene!r} was given."[:200],
+            f"A scene has the span of the program as given, and what sv.fastest takes: {', '.join(sorted(SCENE))}.",
+            nearest='{"t_span": (0.0, 6.0), "guess": {"l": 4.0}}.',
+            do="Give such a dict.",
         )
     names, plant, sizes = (run.law.info[key] for key in ("slack of", "limited plant", "slack sizes"))
     rows = []

@@ -4,7 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from servoctl.control.tracking import Reference, affine, discretised, spectral_radii
+from servoctl.control.sampling import discretised, spectral_radii
+from servoctl.control.tracking import Reference, affine, refuse_transport
 from servoctl.errors import ServoError, SpecificationError, unknown
 from servoctl.model.laws import Residuals
 from servoctl.spec.parameters import finite
@@ -45,7 +46,8 @@ def lqr(plan, plant, rate=100.0, Q=None, R=None, integral=None, varying=True):
     Returns
     -------
     Law
-        Its info holds "gains" (N, m, n_x + k), the spectral radii of the sampled error dynamics, Q, R.
+        Its info holds "gains" (N, m, n_x + k) on "states" and integrals, the spectral radii of the sampled error
+        dynamics, Q, R.
 
     Raises
     ------
@@ -57,14 +59,12 @@ def lqr(plan, plant, rate=100.0, Q=None, R=None, integral=None, varying=True):
         If an unstable mode is not reached by the inputs or not seen by the weights; with frozen-time gains, a marginal
         one, too.
     """
-    if plant.delay:
+    if not isinstance(varying, (bool, np.bool_)):
         raise SpecificationError(
-            f"The plant has a transport delay of {max(plant.delay.values()):g} s.",
-            "The gains are those of a plant without delay.",
-            nearest="sv.plant(mechanism) for the design, and the plant with its delay in sv.close.",
-            do="Design for the plant without delay, and close the loop with it.",
+            f"varying={varying!r} was given.", "Gains vary along the plan, True, or are frozen, False.", do="Give one."
         )
     reference = Reference(plan, plant, rate)
+    refuse_transport(plant, "The design is")
     q = plant.mechanism.q
     default = np.zeros(plant.n_x)
     default[: q.nq + q.n] = [Q_POSITION] * q.nq + [Q_VELOCITY] * q.n
@@ -80,7 +80,7 @@ def lqr(plan, plant, rate=100.0, Q=None, R=None, integral=None, varying=True):
     facts = {
         "largest spectral radius along the plan": float(radii.max()),
         "spectral radius at its end": float(radii[-1]),
-        "gains": K, "Q": Q, "R": R, "integrated": residuals.names if residuals else (),
+        "gains": K, "Q": Q, "R": R, "integrated": residuals.names if residuals else (), "states": plant.state_names,
     }  # fmt: skip
     n_x = plant.n_x
     how = f"lqr, {'time-varying' if varying else 'frozen-time'}" + (", with integrals" if residuals else "")
@@ -99,7 +99,7 @@ def _with_integrals(A, B, Q, residuals, Q_i, reference):
 
 
 def tangents(reference, extra=0):
-    """Orthonormal bases of the states that material constraints allow, at each sample and the next; None without any.
+    """Orthonormal bases of the states that material constraints allow, at each sample; None without any.
 
     Returns
     -------

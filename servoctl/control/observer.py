@@ -4,7 +4,8 @@ import numpy as np
 
 from servoctl.control.law import Law
 from servoctl.control.lqr import tangents, weights
-from servoctl.control.tracking import Reference, discretised, spectral_radii
+from servoctl.control.sampling import discretised, spectral_radii
+from servoctl.control.tracking import Reference, refuse_transport, require_plant
 from servoctl.errors import ServoError, SpecificationError, unknown
 from servoctl.model.laws import Residuals, estimating_law
 from servoctl.spec.coordinates import mapping
@@ -47,23 +48,18 @@ def output_feedback(law, plant, noise, process=None):
     ServoError
         If the measured states do not tell the others: a mode that they do not see does not decay.
     """
-    if "gains" not in law.info:
-        raise SpecificationError(
-            f"The law {law.name!r} has no gains on the state.",
-            "Output feedback puts an estimate in the place of the state.",
-            nearest="lqr(plan, plant, ...).",
-            do="Give the law that lqr made.",
-        )
+    _require_lqr(law, plant)
     measured, deviations = _measured(noise, plant)
     reference = Reference(law.plan, plant, law.rate)
-    A, B = discretised(*reference.linearised(), reference.period)
+    basis = tangents(reference)
+    A, B = _onto(basis, *discretised(*reference.linearised(), reference.period))
     n_x, n = plant.n_x, len(plant.disturbable)
     default = np.zeros(n_x)
     default[: n_x - len(plant.lag)] = POSITION_NOISE**2
     default[n_x - len(plant.lag) - n : n_x - len(plant.lag)] = VELOCITY_NOISE**2
     W = weights(process, default, plant.state_names, "state", "process") * reference.period
     where = [plant.state_names.index(name) for name in measured]
-    L = _filter(A, np.eye(n_x)[where], W, np.diag(deviations**2), tangents(reference))
+    L = _filter(A, np.eye(n_x)[where], W, np.diag(deviations**2), basis)
     names = law.info["integrated"]
     residuals = Residuals(law.plan.model, plant, names) if names else None
     K = law.info["gains"]
@@ -76,6 +72,7 @@ def output_feedback(law, plant, noise, process=None):
     step = estimating_law(plant.state_names, where, len(plant.inputs), residuals)
     memory_names = (*(f"estimated error of {name}" for name in plant.state_names), *law.memory_names)
     errors = A @ (np.eye(n_x) - L @ np.eye(n_x)[where])
+    errors = errors if basis is None else basis.swapaxes(1, 2) @ errors @ basis
     told = np.concatenate([B, np.zeros((count, len(names), B.shape[2]))], axis=1)
     facts = law.info | {"measured": measured, "memory from input": told}
     facts["spectral radius of the filter"] = float(spectral_radii(errors).max())
@@ -83,6 +80,34 @@ def output_feedback(law, plant, noise, process=None):
         f"{law.name}, output feedback", measured, plant.inputs, law.rate, law.t0, step, np.vstack(table),
         np.zeros(n_x + len(names)), memory_names, (), law.idle, law.plan, facts,
     )  # fmt: skip
+
+
+def _require_lqr(law, plant):
+    """Refuse a law that has no gains on the states of this plant."""
+    require_plant(plant)
+    info = getattr(law, "info", {})
+    if "gains" not in info or "measured" in info or "slack of" in info:
+        raise SpecificationError(
+            f"The law {getattr(law, 'name', law)!r} is no LQR's on the state.",
+            "Output feedback puts an estimate in the place of the state.",
+            nearest="lqr(plan, plant, ...).",
+            do="Give the law that lqr made.",
+        )
+    if law.info["states"] != plant.state_names:
+        raise SpecificationError(
+            f"The law has gains on {', '.join(law.info['states'])}.",
+            f"The plant has the states {', '.join(plant.state_names)}.",
+            do="Make law and estimator for the same plant, lagging actuators included.",
+        )
+    refuse_transport(plant, "The prediction is")
+
+
+def _onto(basis, A, B):
+    """A and B followed by the projection onto what material constraints allow at the next sample."""
+    if basis is None:
+        return A, B
+    T = basis[np.minimum(np.arange(len(A)) + 1, len(A) - 1)]
+    return T @ (T.swapaxes(1, 2) @ A), T @ (T.swapaxes(1, 2) @ B)
 
 
 def _measured(noise, plant):
@@ -109,14 +134,15 @@ def _measured(noise, plant):
 
 
 def _filter(A, C, W, V, basis):
-    """Gains L (N, n_x, n_y) of the filter along the plan."""
+    """Gains L (N, n_x, n_y) of the filter along the plan, the covariance in the basis of each sample."""
     from scipy.linalg import solve_discrete_are
 
     count, n_x = len(A), A.shape[1]
     T = np.broadcast_to(np.eye(n_x), (count, n_x, n_x)) if basis is None else basis
-    reduced, seen = T.swapaxes(1, 2) @ A @ T, C @ T
+    after = T[np.minimum(np.arange(count) + 1, count - 1)]
+    moved, seen, gathered = after.swapaxes(1, 2) @ A @ T, C @ T, after.swapaxes(1, 2) @ W @ after
     try:
-        P = solve_discrete_are(reduced[0].T, seen[0].T, T[0].T @ W @ T[0], V)
+        P = solve_discrete_are((T[0].T @ A[0] @ T[0]).T, seen[0].T, T[0].T @ W @ T[0], V)
     except (np.linalg.LinAlgError, ValueError) as error:
         raise ServoError(
             f"The filter's Riccati equation has no stabilising solution ({error}).",
@@ -130,6 +156,6 @@ def _filter(A, C, W, V, basis):
         gain = np.linalg.solve(S, seen[k] @ P).T
         L[k] = T[k] @ gain
         corrected = P - gain @ seen[k] @ P
-        P = reduced[k] @ corrected @ reduced[k].T + T[k].T @ W @ T[k]
+        P = moved[k] @ corrected @ moved[k].T + gathered[k]
         P = (P + P.T) / 2
     return L

@@ -5,13 +5,17 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from servoctl.control.close import span
 from servoctl.errors import InconsistentStart, IntegrationStopped, LimitExceeded, SingularProgram, SpecificationError
 from servoctl.model.model import derive
 from servoctl.simulation.run import Run
 from servoctl.simulation.simulate import simulate
+from servoctl.spec.coordinates import mapping
+from servoctl.spec.program import Program
 
 REACH = 12  # doublings of the time, in which a motion becomes as good as static, or halvings
 INSIDE = 1e-6  # of a limit: how far below it the fastest time law stays
+NEAR = 1e-4  # of a limit: how near the fastest time law comes to it, unless motions cease to exist before
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,16 +74,24 @@ def fastest(mechanism, program, limits, t_span, start=None, guess=None, paramete
     Raises
     ------
     LimitExceeded
-        If the motion exceeds a limit however slow it is.
+        If the motion exceeds a limit however slow it is, or does not exist any more where it would reach one.
     SpecificationError
-        For limits that are no interval.
+        For limits that are no interval, and a time that does not go forward.
     NameUnknown
         For a limit on something that is no signal of the plan.
     """
     from scipy.optimize import brentq
 
-    limits = {name: _interval(name, value) for name, value in dict(limits).items()}
-    t0, t1 = map(float, t_span)
+    limits = {name: _interval(name, value) for name, value in mapping(limits, "The limits").items()}
+    if not limits:
+        raise SpecificationError(
+            "No limits were given.", "A fastest time law is decided by a limit.", do='Give {"trolley": 100.0}.'
+        )
+    if not isinstance(program, Program):
+        raise SpecificationError(
+            f"A {type(program).__name__} was given as program.", "A program is slowed.", do="Give a Program."
+        )
+    t0, t1 = span(t_span, "A program is slowed")
 
     @functools.cache
     def attempt(factor):
@@ -96,7 +108,15 @@ def fastest(mechanism, program, limits, t_span, start=None, guess=None, paramete
 
     quick, slow = _bracket(attempt)
     factor = brentq(lambda sigma: min(attempt(sigma)[0], 1.0) + INSIDE, quick, slow, rtol=INSIDE / 10)
-    _, binding, slower, plan = attempt(factor)
+    excess, binding, slower, plan = attempt(factor)
+    if not abs(excess) < NEAR:
+        raise LimitExceeded(
+            f"No motion exists below the factor {factor:.6g}, before it reaches a limit.",
+            "A fastest time law is decided by a limit that is reached.",
+            nearest=f"Limits that are reached between the factors {factor:.6g} and {slow:g}.",
+            do="Give tighter limits, or slow the program by a factor of your own (Program.slowed).",
+            factor=factor,
+        )
     return TimeLaw(factor, slower, plan, binding)
 
 
@@ -115,8 +135,8 @@ def _worst(plan, limits):
     """Largest excess over the limits, relative to their size, and where it is."""
     found = []
     for name, (low, high) in limits.items():
-        size = max(abs(v) for v in (low, high) if np.isfinite(v))
         (t_low, least), (t_high, most) = plan.extrema(name)
+        size = max(abs(v) for v in (low, high) if np.isfinite(v)) or max(abs(least), abs(most)) or 1.0
         found += [((low - least) / size, (name, "lower", t_low)), ((most - high) / size, (name, "upper", t_high))]
     return max(found)
 

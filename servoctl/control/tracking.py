@@ -5,13 +5,14 @@ from dataclasses import replace
 import numpy as np
 
 from servoctl.control.law import Law
+from servoctl.control.sampling import sampled_radii
 from servoctl.errors import NotRealisable, ServoError, SpecificationError, unknown
 from servoctl.model.laws import affine_law
+from servoctl.model.plant import Plant
 from servoctl.spec.coordinates import mapping
 from servoctl.spec.parameters import finite
 
 UNSTABLE = 1e-9  # beyond 1: spectral radii that count as unstable
-SCALED, TERMS = 0.5, 16  # norm of a matrix whose exponential is summed; 0.5^17/17! is 2e-20
 GAUSS = np.polynomial.legendre.leggauss(3)
 
 
@@ -73,8 +74,8 @@ def pd(plan, plant, rate=100.0, kp=None, kd=None):
         If the rate is too low for the gains: the last sample's error dynamics are unstable, and were not at a higher
         rate.
     """
-    kp, kd = (_gains(gains, plant, what) for gains, what in ((kp, "kp"), (kd, "kd")))
     reference = Reference(plan, plant, rate)
+    kp, kd = (_gains(gains, plant, what) for gains, what in ((kp, "kp"), (kd, "kd")))
     q, n_x, m = plant.mechanism.q, plant.n_x, len(plant.inputs)
     nq, n = len(q.names), len(plant.disturbable)
     p = plant.p(reference.middle_input)
@@ -84,9 +85,9 @@ def pd(plan, plant, rate=100.0, kp=None, kd=None):
     K[:, :, :nq] = kp[:, None] * (E @ np.linalg.pinv(V))
     K[:, :, nq : nq + n] = kd[:, None] * E
     law = affine(f"pd, kp {_named(kp, plant)}, kd {_named(kd, plant)}", reference, K)
-    A, B = discretised(*reference.linearised(), 1.0 / reference.rate)
-    radius = spectral_radii(A - B @ K)
-    _refuse_slow_rate(reference, K, radius[-1])
+    A, B = reference.linearised()
+    radius = sampled_radii(A, B, K, reference.period, _transport(plant))
+    _refuse_slow_rate(reference, A[-1:], B[-1:], K[-1:], radius[-1])
     return replace(law, info={"largest spectral radius along the plan": float(radius.max())})
 
 
@@ -114,6 +115,13 @@ class Reference:
         require_plan(plan, plant)
         period = 1.0 / self.rate
         count = int(np.floor((plan.t[-1] - plan.t[0]) * self.rate * (1 + 1e-12) + 1e-9))
+        if count < 1:
+            raise SpecificationError(
+                f"The plan lasts {plan.t[-1] - plan.t[0]:g} s, and is sampled every {period:g} s.",
+                "A plan that is followed is at least one sample long.",
+                nearest=f"rate={1 / (plan.t[-1] - plan.t[0]):.4g}.",
+                do="Raise the rate, or simulate a longer plan.",
+            )
         self.t = plan.t[0] + np.arange(count + 1) * period
         self.period, self.end = period, plan.t[-1]
         self.x = self._states(self.t)
@@ -135,10 +143,17 @@ class Reference:
             raise unknown(held, ("middle", "mean"), "choice of the held value")
         return np.array([self._command(a, name, held) for a, name in enumerate(self.plant.inputs)])
 
+    def ahead(self):
+        """By how much the command in the middle of each sample exceeds that at its start, (m, N); at last 0."""
+        start = np.array([self._command(a, name, "start") for a, name in enumerate(self.plant.inputs)])
+        found = self.inputs() - start
+        found[:, -1] = 0.0
+        return found
+
     def _command(self, a, name, held):
         later = self.t + self.plant.delay.get(name, 0.0)
-        if held == "middle":
-            u = self._actuation(later + self.period / 2)[a]
+        if held in ("start", "middle"):
+            u = self._actuation(later + self.period / 2 * (held == "middle"))[a]
         else:
             nodes, weights = GAUSS
             parts = (self._actuation(later + self.period * (1 + s) / 2)[a] for s in nodes)
@@ -154,7 +169,17 @@ class Reference:
 
     def linearised(self):
         """A (N, n_x, n_x) and B (N, n_x, m) of the plant in the middle of each sample."""
-        return self.plant.linearised(self.middle, self.middle_x, self.middle_input)
+        A, B = self.plant.linearised(self.middle, self.middle_x, self.middle_input)
+        lost = ~(np.isfinite(A).all(axis=(1, 2)) & np.isfinite(B).all(axis=(1, 2)))
+        if lost.any():
+            raise ServoError(
+                f"The plant's linearisation is not finite at t = {self.middle[lost][0]:.6g} s of the plan.",
+                "Laws of linear feedback are designed where forces have finite slopes.",
+                nearest="A force that is smooth, such as tanh(v/0.01) for sign(v).",
+                do="Smooth the force in the plant of the design, and close the loop with the other.",
+                t=float(self.middle[lost][0]),
+            )
+        return A, B
 
 
 def affine(name, reference, K, K_i=None, residuals=None, **facts):
@@ -192,8 +217,31 @@ def affine(name, reference, K, K_i=None, residuals=None, **facts):
     )  # fmt: skip
 
 
+def require_plant(plant):
+    """Refuse what is no plant."""
+    if not isinstance(plant, Plant):
+        raise SpecificationError(
+            f"A {type(plant).__name__} was given in the place of a Plant.",
+            "Laws are designed for a plant, and a loop is closed around one.",
+            nearest="sv.plant(mechanism).",
+            do="Make the plant of the mechanism.",
+        )
+
+
+def refuse_transport(plant, what):
+    """Refuse a transport delay where a law's design knows none."""
+    if plant.delay:
+        raise SpecificationError(
+            f"The plant has a transport delay of {max(plant.delay.values()):g} s.",
+            f"{what} that of a plant without delay.",
+            nearest="sv.plant(mechanism) for the design, and the plant with its delay in sv.close.",
+            do="Design for the plant without delay, and close the loop with it.",
+        )
+
+
 def require_plan(plan, plant):
     """Refuse a plan that is none, or that names what the plant lacks."""
+    require_plant(plant)
     model = getattr(plan, "model", None)
     if model is None or not hasattr(plan, "jets"):
         raise SpecificationError(
@@ -283,44 +331,6 @@ def _hermite(t, derivatives, i, h, times):
     return [sum(perm(j, k) * c[j] * s ** (j - k) for j in range(k, 2 * r)) / h**k for k in range(r)]
 
 
-def discretised(A, B, period):
-    """Exact discretisation under a zero-order hold: exp([A B; 0 0] Ts).
-
-    Parameters
-    ----------
-    A, B : (N, n, n), (N, n, m) arrays
-    period : float
-        [s]
-
-    Returns
-    -------
-    (N, n, n), (N, n, m) arrays
-    """
-    n, m = B.shape[1:]
-    both = np.zeros((len(A), n + m, n + m))
-    both[:, :n, :n], both[:, :n, n:] = A * period, B * period
-    exact = exponentials(both)
-    return exact[:, :n, :n], exact[:, :n, n:]
-
-
-def exponentials(matrices):
-    """exp of each matrix, (N, n, n): its Taylor series to rounding, scaled and squared, for all at once."""
-    norm = np.abs(matrices).sum(axis=2).max(initial=0.0)
-    squarings = max(0, int(np.ceil(np.log2(max(norm, 1e-300) / SCALED))))
-    scaled, eye = matrices / 2**squarings, np.eye(matrices.shape[1])
-    found = eye
-    for k in range(TERMS, 0, -1):
-        found = eye + scaled @ found / k
-    for _ in range(squarings):
-        found = found @ found
-    return found
-
-
-def spectral_radii(matrices):
-    """Largest absolute eigenvalue of each matrix, (N,)."""
-    return np.abs(np.linalg.eigvals(matrices)).max(axis=-1, initial=0.0)
-
-
 def positive(name, value):
     """A positive finite number.
 
@@ -353,11 +363,25 @@ def _named(gains, plant):
     return " ".join(f"{name}={k:g}" for name, k in zip(plant.inputs, gains, strict=True) if k) or "none"
 
 
-def _refuse_slow_rate(reference, K, radius):
-    """Refuse gains that are unstable at their rate, at the plan's end, where they were not at ten times that."""
-    A, B = (part[-1:] for part in reference.linearised())
-    fast, fast_input = discretised(A, B, 0.1 / reference.rate)
-    if radius > 1 + UNSTABLE and spectral_radii(fast - fast_input @ K[-1:])[0] < radius**0.1 - UNSTABLE:
+def _transport(plant):
+    return np.array([plant.delay.get(name, 0.0) for name in plant.inputs])
+
+
+def _refuse_slow_rate(reference, A, B, K, radius):
+    """Refuse gains that are unstable as sampled and delayed, at the plan's end, where they were not otherwise."""
+    delays = _transport(reference.plant)
+    if radius <= 1 + UNSTABLE:
+        return
+    if sampled_radii(A, B, K, reference.period, 0 * delays)[0] <= 1 + UNSTABLE:
+        raise ServoError(
+            f"With the transport delay of {delays.max():g} s errors grow by the factor {radius:.4g} per sample at the "
+            "plan's end.",
+            "A delay of d samples lowers the bound of poles: p·Ts < 0.4262 for ρ = 2 and d = 1.",
+            nearest="Lower gains.",
+            do="Choose gains for poles well below one over the delay.",
+            radius=float(radius),
+        )
+    if sampled_radii(A, B, K, 0.1 * reference.period, 0 * delays)[0] < radius**0.1 - UNSTABLE:
         raise ServoError(
             f"Sampled at {reference.rate:g} Hz, errors grow by the factor {radius:.4g} per sample at the plan's end.",
             "Under a zero-order hold ρ equal poles -p are stable for p·Ts < 1, 0.6752, 0.5111, 0.4116: ρ = 2 to 5.",

@@ -5,9 +5,10 @@ import numpy as np
 from servoctl.control.close import whole
 from servoctl.control.closed import Closed
 from servoctl.control.law import Law, as_measurement
-from servoctl.control.tracking import discretised, positive, resampled
+from servoctl.control.sampling import discretised
+from servoctl.control.tracking import positive, resampled
 from servoctl.errors import SpecificationError, unknown
-from servoctl.interop.names import connected, force_indices, output_names, signal_names, stranger
+from servoctl.interop.names import connected, force_names, output_names, signal_names, stranger
 from servoctl.model.jacobians import differentiable, jacobian
 from servoctl.model.model import Model
 from servoctl.model.plant import Plant
@@ -76,13 +77,19 @@ def along(thing, run, times=None, **options):
     run : Run or Closed
         Gives states, inputs or measurements, by name.
     times : (N,) array, optional
-        [s]; of a law instants of sampling, of a closed loop its samples. Default: all samples of the run.
+        [s], in increasing order within the run; of a law instants of sampling, of a closed loop its samples. Default:
+        all samples of the run.
     **options
         rate, disturbed, name: of `linearise`.
 
     Yields
     ------
     control.StateSpace
+
+    Raises
+    ------
+    SpecificationError
+        For times outside the run, and as `linearise`.
     """
     times = run.t if times is None else np.atleast_1d(np.asarray(times, dtype=float))
     if isinstance(run, Closed):
@@ -91,6 +98,7 @@ def along(thing, run, times=None, **options):
         values = {name: run[name][picked] for name in run.names}
         values |= {f"input {name}": value[picked] for name, value in run.input.items()}
     else:
+        _require_within(run, times)
         values = resampled(run, times)
     for k, t in enumerate(times):
         if isinstance(thing, Plant):
@@ -105,11 +113,22 @@ def along(thing, run, times=None, **options):
             raise stranger(thing)
 
 
+def _require_within(run, times):
+    room = 1e-9 * (run.t[-1] - run.t[0])
+    if np.any(np.diff(times) < 0) or times[0] < run.t[0] - room or times[-1] > run.t[-1] + room:
+        raise SpecificationError(
+            f"Times from {times[0]:g} to {times[-1]:g} s were given.",
+            f"They increase, within the run: {run.t[0]:g} to {run.t[-1]:g} s.",
+            do="Give such times.",
+        )
+
+
 def loop_gain(plant, law, at):
-    """The loop's gain L at one actuator, all other loops closed: what `control.stability_margins` takes.
+    """The loop's gain L at one actuator, all other loops closed.
 
     With the loop cut where the law's command enters the plant, L is minus the gain from there back to the command:
-    1 + L = 0 at the closed loop's poles.
+    1 + L = 0 at the closed loop's poles. Margins are those of `control.stability_margins(control.frd(L, w))`: of a
+    StateSpace python-control takes them from polynomials, which lose all digits for more than a few states.
 
     Parameters
     ----------
@@ -127,9 +146,21 @@ def loop_gain(plant, law, at):
     ------
     NameUnknown
         If the law has no such actuator.
+    SpecificationError
+        For what is no linear system, or different sampling.
     """
     import control
 
+    for system in (plant, law):
+        if not isinstance(system, control.StateSpace):
+            raise stranger(system, "A loop gain is that of two linear systems, from interop.linearise.")
+    if plant.dt != law.dt:
+        raise SpecificationError(
+            f"The plant has dt = {plant.dt:g} s, the law {law.dt:g} s.",
+            "A sampled law is closed around a plant that is sampled alike.",
+            nearest=f"interop.linearise(plant, t, x, u, rate={1 / law.dt:g}).",
+            do="Linearise the plant with the law's rate.",
+        )
     if at not in law.output_labels:
         raise unknown(at, law.output_labels, "actuator")
     plant, law = _renamed(plant, "plant"), _renamed(law, "law")
@@ -151,8 +182,8 @@ def _linear_plant(plant, t, x, u, rate, disturbed, name):
             nearest="sv.plant without delay, and a delay of sv.close or a control.pade in series.",
             do="Linearise the plant without delay.",
         )
-    forces, m, n_x = force_indices(plant, disturbed), len(plant.inputs), plant.n_x
-    u = np.zeros(m) if u is None else as_measurement(u, plant.inputs)
+    (disturbed, forces), m, n_x = force_names(plant, disturbed), len(plant.inputs), plant.n_x
+    u = np.zeros(m) if u is None else _inputs(u, plant)
     at_rest = [0.0] * (n_x - len(plant.lag)) + [u[plant.inputs.index(name)] for name in plant.lagged]
     x = np.where(np.isnan(x), at_rest, x)
     p, at_u = plant.p(u), len(plant.parameters)
@@ -168,6 +199,22 @@ def _linear_plant(plant, t, x, u, rate, disturbed, name):
         A, B, C, D, dt=0 if rate is None else 1.0 / rate, name=name, states=plant.state_names,
         inputs=[*plant.inputs, *(f"disturbance {force}" for force in disturbed)], outputs=output_names(plant),
     )  # fmt: skip
+
+
+def _inputs(u, plant):
+    """Inputs in the order of the actuators, (m,)."""
+    if isinstance(u, dict):
+        for name in (*u, *plant.inputs):
+            if name not in u or name not in plant.inputs:
+                raise unknown(name, plant.inputs if name in u else u, "input")
+        u = [u[name] for name in plant.inputs]
+    found = np.asarray(u, dtype=float).ravel()
+    if found.shape != (len(plant.inputs),):
+        raise SpecificationError(
+            f"{found.size} inputs were given.", f"The plant has {len(plant.inputs)}: {', '.join(plant.inputs)}.",
+            do="Give them in this order, or as a dict.",
+        )  # fmt: skip
+    return found
 
 
 def _linear_law(law, t, x, memory, name):

@@ -2,6 +2,8 @@
 
 from servoctl.errors import SpecificationError, unknown
 
+RULE = "Systems of python-control are made of a Model, a Plant, a Law or the Closed of sv.close."
+
 
 def output_names(plant):
     """Outputs of a plant: states as signals, and the mechanism's outputs."""
@@ -13,12 +15,13 @@ def signal_names(names, inputs):
     return [f"lagged {name}" if name in inputs else name for name in names]
 
 
-def force_indices(plant, disturbed):
-    """Where generalised forces stand among the plant's disturbances."""
-    for name in disturbed:
+def force_names(plant, disturbed):
+    """Generalised forces that are inputs, by one name or several, and where they stand among the disturbances."""
+    names = (disturbed,) if isinstance(disturbed, str) else tuple(disturbed)
+    for name in names:
         if name not in plant.disturbable:
             raise unknown(name, plant.disturbable, "generalised force")
-    return [plant.disturbable.index(name) for name in disturbed]
+    return names, [plant.disturbable.index(name) for name in names]
 
 
 def connected(system, law_system, plant, law, name):
@@ -37,11 +40,7 @@ def connected(system, law_system, plant, law, name):
     )  # fmt: skip
 
 
-def stranger(thing):
+def stranger(thing, rule=RULE):
     """The error for what is no model, plant, law or loop."""
-    return SpecificationError(
-        f"A {type(thing).__name__} was given.",
-        "Systems of python-control are made of a Model, a Plant, a Law or the Closed of sv.close.",
-        nearest="run.model, of a plan." if hasattr(thing, "jets") else "",
-        do="Give one of these.",
-    )
+    nearest = "run.model, of a plan." if hasattr(thing, "jets") else ""
+    return SpecificationError(f"A {type(thing).__name__} was given.", rule, nearest=nearest, do="Give one of these.")

@@ -9,7 +9,7 @@ from servoctl.control.closed import Closed
 from servoctl.control.law import Law
 from servoctl.control.tracking import positive
 from servoctl.errors import ServoError, SpecificationError
-from servoctl.interop.names import connected, force_indices, output_names, signal_names, stranger
+from servoctl.interop.names import connected, force_names, output_names, signal_names, stranger
 from servoctl.model.model import Model
 from servoctl.model.plant import Plant
 
@@ -78,7 +78,14 @@ def start(closed):
     Returns
     -------
     (n,) array
+
+    Raises
+    ------
+    SpecificationError
+        For what is no closed loop.
     """
+    if not isinstance(closed, Closed):
+        raise stranger(closed, "A start belongs to the Closed of sv.close.")
     loop = closed.loop
     return np.concatenate([loop.x0, np.tile(loop.idle, sum(_pasts(closed.plant, loop))), loop.z0])
 
@@ -121,7 +128,7 @@ def _numbers(p, symbols, params):
 def _plant(plant, name, disturbed, rate, substeps, delay=0):
     import control
 
-    forces = force_indices(plant, disturbed)
+    disturbed, forces = force_names(plant, disturbed)
     period = None if rate is None else 1.0 / positive("rate", rate)
     if period is None and (plant.rate_limits or plant.delay or substeps is not None):
         what = "limits of rate" if plant.rate_limits else "transport delay" if plant.delay else "substeps"

@@ -40,10 +40,15 @@ class Effects:
                 nearest="Forces of constraint and accelerations, which are affine.",
                 do="Bound another output.",
             )
+        self._acting = [bool(slopes[i, :].nnz()) for i in range(len(self.names))]
         still = ca.substitute(values, e.u, ca.SX.zeros(e.u.numel()))
         numbers = e.p[: e.p.numel() - e.u.numel() - e.q.n]
         parts = ca.densify(ca.cse(ca.vertcat(still, ca.vec(ca.densify(slopes)))))
         self._function = compiled(ca.Function("effects", [e.q.t, e.state, numbers], [parts]), "effects")
+
+    def acts(self, name):
+        """Whether an input changes this expression at once."""
+        return self._acting[self.names.index(name)]
 
     def __call__(self, t, x):
         """c (j,) and O (j, m) at a state.

@@ -4,7 +4,7 @@ import ctypes
 import os
 import re
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import casadi as ca
 import numpy as np
@@ -16,7 +16,6 @@ from servoctl.model.loops.batch import BATCH
 from servoctl.model.native import pointer
 
 INLINED = 600  # operations: up to here the plant's rates are written into each stage of a step
-GROUPS = 2  # vectors of cases that one core takes in turn, stage by stage: one waits while the other is computed
 PER_THREAD = 8  # tasks: so that threads end at about the same time
 
 
@@ -50,17 +49,21 @@ class Unit:
     inputs: tuple
     residuals: object
     n_y: int
+    _libraries: dict = field(default_factory=dict, repr=False)
 
     @property
     def names(self):
-        """Names of what is gathered and may be traced."""
+        """Names of what is gathered and may be traced; "input a" where the actuator a is itself a state."""
+        inputs = (f"input {name}" if name in self.states else name for name in self.inputs)
         residuals = self.residuals.names if self.residuals else ()
-        return (*self.states, *self.inputs, *(f"residual {name}" for name in residuals))
+        return (*self.states, *inputs, *(f"residual {name}" for name in residuals))
 
     def library(self, n):
         """The C function of n lanes; None without a compiler."""
-        found = compiler.library(emit.prelude(self.text) + emit.several(self.text, n), level="-O3")
-        return None if found is None else found.batch
+        if n not in self._libraries:
+            text = emit.prelude(self.text) + emit.several(self.text, n)
+            self._libraries[n] = compiler.library(text, level="-O3")
+        return self._libraries[n] and self._libraries[n].batch
 
 
 def unit(plant, law, disturbed, residuals=None):
@@ -123,7 +126,7 @@ def _derived(plant, law, disturbed, residuals):
     text = "\n".join(
         [
             f"\nenum {{ {', '.join(f'{name} = {value}' for name, value in sizes.items())} }};",
-            f"#define GROUPS {GROUPS}\n#define INVARIANTS {int(project is not None)}\n#define SMALL {ROUNDING!r}",
+            f"#define INVARIANTS {int(project is not None)}\n#define SMALL {ROUNDING!r}",
             f"static const int measured[] = {{ {where} }};",
             *(text for _, text in functions),
             BATCH,
@@ -223,16 +226,16 @@ def run_batch(unit, loop, constants, x0, scale, noise=None, traced=(), every=1, 
     native = unit.library(n)
     if native is None:
         return None
-    count, width, size = x0.shape[1], GROUPS * n, len(unit.names)
-    blocks, samples = -(-count // width), np.arange(loop.samples + 1)
-    columns = np.minimum(np.arange(blocks * width), count - 1)
-    found = np.empty((2 + 3 * size, blocks * width))
-    trace = np.empty((loop.samples // every + 1 if len(traced) else 0, len(traced), blocks * width))
+    count, size = x0.shape[1], len(unit.names)
+    blocks, samples = -(-count // n), np.arange(loop.samples + 1)
+    columns = np.minimum(np.arange(blocks * n), count - 1)
+    found = np.empty((2 + 3 * size, blocks * n))
+    trace = np.empty((loop.samples // every + 1 if len(traced) else 0, len(traced), blocks * n))
     late = 0 if loop.transport is None else int(np.max(loop.transport)) // loop.substeps + 1
     depth = 1 + max(loop.delay, late)
     given = {
         "samples": loop.samples, "substeps": loop.substeps, "delay": loop.delay, "depth": depth, "every": every,
-        "n_traced": len(traced), "columns": blocks * width, "t0": loop.t0, "period": loop.period, "found": found,
+        "n_traced": len(traced), "columns": blocks * n, "t0": loop.t0, "period": loop.period, "found": found,
         "trace": trace, "traced": np.array(traced, dtype=np.int64), "transport": loop.transport,
         "constants": constants[:, columns], "x0": x0[:, columns], "scale": scale[:, columns],
         "table": _common(unit, loop, samples),
@@ -247,10 +250,10 @@ def run_batch(unit, loop, constants, x0, scale, noise=None, traced=(), every=1, 
     native.restype = None
 
     def run(first, last):
-        own = None if noise is None else np.empty((last - first, loop.samples + 1, unit.n_y, width))
-        for case in range(first * width, last * width) if noise is not None else ():
-            own[case // width - first, :, :, case % width] = noise(columns[case])
-        scratch = np.empty(2 * depth * loop.n_u * width + 1)
+        own = None if noise is None else np.empty((last - first, loop.samples + 1, unit.n_y, n))
+        for case in range(first * n, last * n) if noise is not None else ():
+            own[case // n - first, :, :, case % n] = noise(columns[case])
+        scratch = np.empty(2 * depth * loop.n_u * n + 1)
         native(
             ctypes.byref(arguments), ctypes.c_int64(first), ctypes.c_int64(last),
             None if own is None else pointer(own), pointer(scratch),

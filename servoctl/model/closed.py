@@ -189,13 +189,14 @@ def run_loop(ode, law, loop):
     ode : Compiled
         Of the plant, made with `DRIVER`.
     law : Compiled or callable
-        (t, [y; z], row) -> [u; z+; further signals]; what a callable raises is raised here.
+        (t, [y; z], row) -> [u; z+; further signals].
     loop : Loop
 
     Returns
     -------
-    status : int
-        FINISHED; STATE_LOST or LAW_LOST where the state or the law's answer is not finite at the next sample.
+    status : int or BaseException
+        FINISHED; STATE_LOST or LAW_LOST where the state or the law's answer is not finite at the next sample; or what
+        the law raised there.
     x : (N, n_x) array
         States at the samples completed.
     law_x : (N, n_y + n_z) array
@@ -241,9 +242,7 @@ def _native(native, law, loop, logs):
         setattr(a, name, pointer(log))
     native.restype = ctypes.c_int64
     done = native(ctypes.cast(step, ctypes.c_void_p), ctypes.byref(a))
-    if failures:
-        raise failures[0]
-    return done, a.status
+    return done, failures[0] if failures else a.status
 
 
 def _called_back(law, loop, logs, failures):
@@ -281,7 +280,10 @@ def _interpreted(ode, law, c, x_log, law_x, law_y, inputs):
             steps = np.where(c.quantum > 0, c.quantum, 1.0)
             y = np.where(c.quantum > 0, c.quantum * np.rint(y / steps), y)
         law_x[k, :n_y] = y
-        law_y[k] = law(t, law_x[k].copy(), c.table[min(c.first + k, len(c.table) - 1)])
+        try:
+            law_y[k] = law(t, law_x[k].copy(), c.table[min(c.first + k, len(c.table) - 1)])
+        except BaseException as error:  # as in C: the motion before is kept
+            return k, error
         if not np.isfinite(law_y[k, : n_u + n_z]).all():
             return k, LAW_LOST
         u = law_y[k - c.delay, :n_u] if k >= c.delay else c.idle

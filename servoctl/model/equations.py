@@ -11,6 +11,7 @@ from servoctl.reduction.appell import plant_accelerations
 from servoctl.reduction.elimination import eliminate
 from servoctl.reduction.ranks import clean
 from servoctl.reduction.rows import gradient
+from servoctl.spec.coordinates import jet_name
 
 
 class Equations:
@@ -228,10 +229,25 @@ class Equations:
         right = -ca.substitute(ca.vertcat(r.mechanism.balance, second), acceleration, zero)
         return self.function("multiplier_form", self.jets, [right, ca.vec(ca.densify(matrix))])
 
-    def signals(self, kind):
-        """A group of named signals as a function of (t, Z, p): names and function."""
+    def signals(self, kind, rate=0):
+        """A group of named signals, or their `rate`-th derivatives in time, as a function of (t, Z, p).
+
+        A derivative is a function of the jets up to the highest that it holds, which may lie above s̄.
+
+        Returns
+        -------
+        names : list of str
+        function : casadi.Function
+        """
         names, expressions = getattr(self, f"_{kind}")()
-        return names, self.function(kind, self.jets, expressions)
+        if not rate:
+            return names, self.function(kind, self.jets, expressions)
+        expressions = self.q.derivatives(ca.vertcat(*expressions).elements(), rate)[rate]
+        places = filter(None, map(self.q.where, ca.symvar(ca.vertcat(*expressions))))
+        highest = max((level for of, level, _ in places if of not in ("t", "q")), default=0)
+        above = (s for k in range(self.top + 1, highest + 1) for s in self.q.gamma(k))
+        names = [jet_name(name, rate) for name in names]
+        return names, self.function(f"{kind}_rate{rate}", ca.vertcat(self.jets, *above), expressions)
 
     def _actuation(self):
         return list(self.r.mechanism.actuators), [self.r.actuation]

@@ -34,7 +34,8 @@ class Linearisation:
     memory_names : tuple of str
         What the law keeps: derivatives of residuals that integrators prescribe.
     step : Compiled
-        (t, [x; ξ], row) -> [u; ξ+] with row = [plant's numbers; Ts; coefficients of the error dynamics].
+        (t, [x; ξ], row) -> [u; ξ+] with row = [plant's numbers; Ts; what is added to u; coefficients of the error
+        dynamics].
     """
 
     orders: dict
@@ -241,9 +242,10 @@ class _Extension:
         square = D if D.shape[0] == D.shape[1] else D @ D.T
         solved = eliminate(square, wanted, clean(*self.values(square, beside=False)))[0]
         self._substitute(self.v, solved if square is D else D.T @ solved)
-        period = ca.SX.sym("Ts")
-        row = ca.vertcat(self.numbers, period, *c)
-        step = law_step("computed", self.t, ca.vertcat(self.x, self.xi), row, [self.u, self._memory(period)])
+        period, ahead = ca.SX.sym("Ts"), ca.SX.sym("ahead", self.u.numel())
+        row = ca.vertcat(self.numbers, period, ahead, *c)
+        out = [self.u + ahead, self._memory(period)]
+        step = law_step("computed", self.t, ca.vertcat(self.x, self.xi), row, out)
         orders = dict(zip(self.names, counts, strict=True))
         return Linearisation(orders, self.relative_degree, tuple(self.memory_names), step)
 

@@ -228,8 +228,7 @@ class Model:
         ----------
         name : str
             "ode", "ode_projected", "ode_poles", "ode_jacobian", "ode_poles_jacobian", "path", "invariants", "metric",
-            "matrices", "plant", "multiplier_form", "accelerations", or one of
-            `servo_dae.SERVO_DAE` and `formulations.FORMULATIONS`.
+            "matrices", "plant", "multiplier_form", "accelerations", or one of `SERVO_DAE` and `FORMULATIONS`.
 
         Returns
         -------
@@ -295,18 +294,19 @@ class Model:
             self._functions[key] = (implicit if name == "RadauIIA" else Sundials)(self._equations, name, poles)
         return self._functions[key]
 
-    def signals(self, kind):
-        """Names of a group of signals and the compiled function (t, Z, p) that computes them.
+    def signals(self, kind, rate=0):
+        """Names of a group of signals and the compiled function (t, Z, p) of them, or of their `rate`-th derivatives.
 
         Parameters
         ----------
         kind : str
             One of `SIGNALS`.
+        rate : int
         """
-        key = f"signals {kind}"
+        key = f"signals {kind}{rate or ''}"
         if key not in self._functions:
-            names, f = self._equations.signals(kind)
-            self._functions[key] = (names, compiled(f, kind))
+            names, f = self._equations.signals(kind, rate)
+            self._functions[key] = (names, compiled(f, f.name()))
         return self._functions[key]
 
     @cached_property

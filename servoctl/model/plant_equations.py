@@ -100,11 +100,21 @@ class PlantEquations:
         return ca.vertcat(ca.dot(w, self.mechanism.E @ self.force), ca.dot(w, self.d), ca.dot(w, other))
 
     def power(self):
-        """Energy, the three powers, and what dE/dt owes to neither force nor potential (explicit time)."""
+        """Energy and the three powers."""
+        return self.function("power", [self.mechanism.energy, self._powers])
+
+    @cached_property
+    def unbalanced(self):
+        """Why dE/dt is not the power of inputs, disturbances and other forces; "" where it is."""
         q, m = self.q, self.mechanism
-        law = q.dt(m.energy) - ca.dot(self.velocity, m.balance + m.forces)
-        law = ca.substitute(law, ca.vertcat(*q.gamma(2)), self.acceleration)
-        return self.function("power", [m.energy, self._powers, law])
+        inertial = q.dt(m.energy) - ca.dot(self.velocity, m.balance + m.forces)
+        if not m.is_zero([inertial]):
+            return "the inertia terms depend on time or on more than wᵀMw/2"
+        for row in self._material[0]:
+            rate = q.derivatives([row.expression], 1 - row.order)[-1][0]
+            if not m.is_zero([rate - ca.jtimes(rate, self.velocity, self.velocity)]):  # its reaction does work
+                return f"the material constraint {row.name!r} moves by itself"
+        return ""
 
     def jacobian(self):
         """∂x'/∂x and ∂x'/∂u, column by column."""

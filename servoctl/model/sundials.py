@@ -2,11 +2,13 @@
 
 import contextlib
 import io
+import signal
+import threading
 
 import casadi as ca
 import numpy as np
 
-MOST_STEPS = 2000  # between two instants of the grid
+MOST_STEPS = 20_000  # between two instants of the grid
 SOLVERS = {"CVODES": "cvodes", "IDAS": "idas"}
 COUNTS = {"steps": "nsteps", "nfev": "nfevals", "nlu": "nlinsetups"}
 
@@ -27,6 +29,25 @@ def rows_unsolved(equations, poles=False):
             row += sum(c * lower for c, lower in zip(e.coefficients[a], level[:-1], strict=True))
         residual.append(row)
     return ca.vertcat(*e.q.gamma(e.top)), ca.vertcat(*residual)
+
+
+@contextlib.contextmanager
+def _interrupts():
+    """A list that is no longer empty once Ctrl-C was pressed, which CasADi turns into a failure of the integrator."""
+    pressed, before = [], signal.getsignal(signal.SIGINT)
+    if threading.current_thread() is not threading.main_thread() or not callable(before):
+        yield pressed
+        return
+
+    def note(number, frame):
+        pressed.append(number)
+        raise KeyboardInterrupt
+
+    signal.signal(signal.SIGINT, note)
+    try:
+        yield pressed
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 class Sundials:
@@ -100,11 +121,14 @@ class Sundials:
 
     def _to(self, grid, given, options):
         """States at the instants of a grid, None where the integrator fails."""
+        pressed = []
         try:
             integrator, self.counts = ca.integrator("motion", self.solver, self.parts, 0.0, grid[1:], options), {}
-            with contextlib.redirect_stderr(io.StringIO()):  # SUNDIALS tells what the caller says
+            with _interrupts() as pressed, contextlib.redirect_stderr(io.StringIO()):  # SUNDIALS tells what callers say
                 found = np.array(integrator(**given)["xf"])
-        except RuntimeError:
+        except RuntimeError as error:
+            if pressed:
+                raise KeyboardInterrupt from error
             return None
         told = integrator.stats()
         self.counts = {name: int(told[key]) for name, key in COUNTS.items() if key in told}

@@ -236,6 +236,33 @@ def warn_fast_poles(method, poles, step):
         )
 
 
+def warn_unresolved(method, step, t, difference, rate):
+    """Warn that steps do not resolve a motion, with the largest stable step where that is what fails.
+
+    Parameters
+    ----------
+    method : str
+        A fixed-step method.
+    step : float
+        [s]
+    t : float
+        Where one step was compared with two of half its length [s].
+    difference : float
+        Of the two, relative to the size of the state.
+    rate : float
+        The fastest rate |λ| of the motion there [1/s]; NaN where it is not known.
+    """
+    limit = largest_explicit(method) / rate
+    stable = f" The largest stable step there is about {limit:.2g} s." if limit < step else ""
+    warnings.warn(
+        f"Steps of {step:.4g} s by {method} do not resolve the motion: at t = {t:.6g} s one step and two of half its "
+        f"length differ by {difference:.2g} of the size of the state.{stable} Take shorter steps, 'RadauIIA' or "
+        "accuracy=1e-6.",
+        RuntimeWarning,
+        stacklevel=_outside(),
+    )
+
+
 def _outside():
     """The stacklevel, in the calling function, of the first caller outside the package."""
     level, frame = 1, sys._getframe(1)

@@ -94,7 +94,7 @@ def poles(values):
     if isinstance(values, dict):
         return Poles(dict(values))
     try:
-        constant = float(values)
+        constant = np.nan if isinstance(values, bool) else float(values)
     except (TypeError, ValueError):
         constant = np.nan
     if not (np.isfinite(constant) and constant > 0):

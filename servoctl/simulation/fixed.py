@@ -6,15 +6,18 @@ from itertools import pairwise
 import numpy as np
 
 from servoctl.errors import IntegrationStopped, ServoError
-from servoctl.simulation.bounds import row_poles, warn_fast_poles
+from servoctl.simulation.bounds import row_poles, warn_fast_poles, warn_unresolved
 from servoctl.simulation.drift import Minimal, Poles, Project
 from servoctl.simulation.minimal import Chart, Sizes
 from servoctl.simulation.motion import Motion, breakpoints, interruptible
+from servoctl.simulation.rule import component_sizes, state_levels
 from servoctl.simulation.tableaus import tableau
 from servoctl.simulation.watch import DEGRADED, NEGLIGIBLE, Watch
 
 CHUNK = 2000  # steps per call of the compiled loop
 SLOW_CHUNK = 100  # of the loop in Python
+UNRESOLVED = 0.1  # of the state's size: what a step and two half steps differ by where they are too long
+POWERS, NUDGE = 6, 1e-6  # of the power iteration for the fastest rate: its length, and relative size of a deviation
 NEAR = 0.3  # of its reference: below this the least size of a pivot is looked for within a step
 
 
@@ -54,6 +57,8 @@ def fixed_step(model, method, drift, span, x0, step, knots, progress):
             if motion.stop is not None:
                 break
             x = integration.piece(a, x, (b - a) / count, count)
+        if motion.stop is None:
+            integration.look_back()
     return motion
 
 
@@ -116,6 +121,33 @@ class _Fixed:
                 self._stop(t[-1], x, h, why)
                 break
         return x
+
+    def look_back(self):
+        """Warn where a step and two half steps have little in common: of the last ones, the end and the fastest."""
+        model, t, states, _ = self.motion.pieces[-1]
+        if len(t) < 2:
+            return
+        size = component_sizes(states, state_levels(model))
+        with np.errstate(all="ignore"):
+            fastest = int(np.argmax((np.abs(np.diff(states)) / size[:, None]).max(axis=0)))
+            for k in dict.fromkeys((len(t) - 2, fastest)):
+                x, step = states[:, k], t[k + 1] - t[k]
+                halves = self._steps(t[k], x, step / 2, 2)[0]
+                lost = halves.shape[1] < 3
+                change = np.full(len(x), np.inf) if lost else (states[:, k + 1] - halves[:, -1]) / size
+                difference = float(np.abs(change).max())
+                if not difference <= UNRESOLVED:
+                    warn_unresolved(self.method, abs(step), t[k], difference, self._fastest_rate(t[k], x, change, size))
+                    return
+
+    def _fastest_rate(self, t, x, direction, size):
+        """|λ| of the mode that dominates in a direction, by power iteration; NaN where it is not finite."""
+        rate = np.nan
+        for _ in range(POWERS):
+            direction = NUDGE * direction / np.abs(direction).max()
+            ahead = self.f(t, x + size * direction, self.p)[: len(x)] - self.f(t, x, self.p)[: len(x)]
+            direction, rate = ahead / size, float(np.abs(ahead / size).max() / NUDGE)
+        return rate
 
     def _steps(self, t, x, h, count):
         """States (n_x, N + 1) of `count` steps and the pivots there; fewer where no state is finite."""

@@ -236,6 +236,7 @@ class MinimalSolver:
     def __init__(self, method, model, sizes, t, x, bound, options, implicit):
         self.method, self.bound, self.options, self.implicit = method, bound, options, implicit
         self.chart, self.changes, self.done = Chart(model, sizes, t, x), 0, np.zeros(3, dtype=int)
+        self.lost = False
         self.t, self.y = t, self.chart.lift(t, x[self.chart.free], x)
         self._start()
 
@@ -253,8 +254,8 @@ class MinimalSolver:
 
     @property
     def status(self):
-        """Of the method."""
-        return self.solver.status
+        """Of the method; "failed" where no state is found after however short a step."""
+        return "failed" if self.lost else self.solver.status
 
     @property
     def work(self):
@@ -280,6 +281,8 @@ class MinimalSolver:
                 break
             self.done = self.work
             self._start(first_step=abs(length) / 2)
+        else:
+            self.lost, message = True, "the constraints have no solution that Newton's method finds"
         return message
 
     def dense_output(self):

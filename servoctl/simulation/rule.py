@@ -38,13 +38,24 @@ def relative_error(values, reference, levels=None):
     """
     if not np.size(reference):
         return 0.0
-    size = np.abs(reference).max(axis=1)
-    levels = np.zeros(len(size), dtype=int) if levels is None else levels
+    levels = np.zeros(len(reference), dtype=int) if levels is None else levels
+    return float((np.abs(values - reference) / component_sizes(reference, levels)[:, None]).max())
+
+
+def component_sizes(values, levels):
+    """The size of each component (n,) of values (n, N), as `relative_error` takes it."""
+    size = np.abs(values).max(axis=1)
     for level in np.unique(levels):
         own = levels == level
         size[own] = np.maximum(size[own], FLOOR * size[own].max())
     size[size == 0] = 1.0
-    return float((np.abs(values - reference) / size[:, None]).max())
+    return size
+
+
+def state_levels(model):
+    """Level of each entry of the state X: 0 for q, k for γ^(k); (n_x,) array of int."""
+    n_x, nq, n = len(model.state_names), model.nq, model.n
+    return np.append(np.zeros(nq, dtype=int), 1 + np.arange(n_x - nq) // n)
 
 
 def motion_error(model, jets, reference):
@@ -60,9 +71,8 @@ def motion_error(model, jets, reference):
     -------
     float
     """
-    n_x, nq, n = len(model.state_names), model.nq, model.n
-    levels = np.append(np.zeros(nq, dtype=int), 1 + np.arange(n_x - nq) // n)
-    return relative_error(jets[:n_x], reference[:n_x], levels)
+    n_x = len(model.state_names)
+    return relative_error(jets[:n_x], reference[:n_x], state_levels(model))
 
 
 def options_for(model, accuracy):

@@ -1,6 +1,7 @@
 """A run: what a simulation computed, by name."""
 
 import json
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
@@ -17,8 +18,9 @@ TOLD = ("method", "drift", "counters", "success", "status", "message", "knots") 
 class Run:
     """A motion with its actuation and its residuals; made by `simulate`, `close` or `load`.
 
-    `run["theta"]`, `run["dtheta"]`, `run["trolley"]` are (N,) arrays, SI; `run.residual["X"]` is (levels, N): the
-    residual and its derivatives.
+    `run["theta"]`, `run["dtheta"]`, `run["trolley"]` are (N,) arrays, SI, and so are the derivatives in time of an
+    actuation, output or energy, `run["dtrolley"]`, `run["d2trolley"]`, where the jets reach: `simulate(...,
+    method="Taylor", jets=3)`. `run.residual["X"]` is (levels, N): the residual and its derivatives.
 
     Attributes
     ----------
@@ -62,23 +64,42 @@ class Run:
         if name in self.jet_names:
             return self.jets[self.jet_names.index(name)]
         if name not in self.stored:
-            if self.model is None or name not in self.model.signal_groups:
+            groups = self.model.signal_groups if self.model is not None else {}
+            rate, base = (0, name) if name in groups else _split(name)
+            if base not in groups:
                 raise unknown(name, self.names, "signal")
-            names, values = self.signals(self.model.signal_groups[name])
+            names, values = self.signals(groups[base], rate)
             self.stored.update(zip(names, values, strict=True))
         return self.stored[name]
 
-    def signals(self, kind):
-        """Names and (n, N) values of one of the model's groups of signals.
+    def signals(self, kind, rate=0):
+        """Names and (n, N) values of one of the model's groups of signals, or of their derivatives in time.
 
         Parameters
         ----------
         kind : str
             One of `servoctl.model.model.SIGNALS`.
+        rate : int
+            Order of the derivative. It may need jets above s̄.
+
+        Raises
+        ------
+        SpecificationError
+            If the run does not hold the jets that the derivative needs.
         """
         parts = []
         for first, end, model in self.variants or ((0, len(self.t), self.model),):
-            names, f = model.signals(kind)
+            names, f = model.signals(kind, rate)
+            if f.n_x > len(self.jets):
+                highest = (f.n_x - model.nq) // model.n
+                raise SpecificationError(
+                    f"{', '.join(names)} {'was' if len(names) == 1 else 'were'} asked for of a run with jets up to "
+                    f"order {(len(self.jets) - model.nq) // model.n}.",
+                    f"These derivatives in time follow from jets up to order {highest}.",
+                    nearest=f"simulate(..., method='Taylor', jets={highest}).",
+                    do="Simulate so.",
+                    jets=highest,
+                )
             parts.append(f.grid(self.t[first:end], self.jets[: f.n_x, first:end], model.parameters))
         return names, np.concatenate(parts, axis=1)
 
@@ -257,6 +278,8 @@ class Run:
         return xarray.Dataset(data, coords={"t": self.t}, attrs=attributes)
 
     def __repr__(self):
+        if not len(self.t):
+            return f"Run: no samples; {self.message}"
         worst = {name: float(np.abs(self.residual[name]).max(initial=0.0)) for name in self.residual}
         shown = sorted(worst, key=worst.get, reverse=True)[:4]
         lines = [
@@ -275,6 +298,12 @@ class Run:
 
     def _outputs(self):
         return list(self.model.outputs) if self.model is not None else []
+
+
+def _split(name):
+    """The order k >= 1 and the rest of a name d..., d2..., d3...; 0 and the name itself where it is none."""
+    found = re.fullmatch(r"d([2-9]|[1-9]\d+)?(\D.*)", name) if isinstance(name, str) else None
+    return (int(found[1] or 1), found[2]) if found else (0, name)
 
 
 class _Residuals(Mapping):

@@ -7,6 +7,7 @@ import numpy as np
 from servoctl.errors import InconsistentStart, SpecificationError, unknown
 from servoctl.simulation.adaptive import METHODS, ONE_STEP, Adaptive
 from servoctl.simulation.algebraic import algebraic
+from servoctl.simulation.bounds import row_poles
 from servoctl.simulation.drift import Minimal, Poles, Project, as_drift, is_whole
 from servoctl.simulation.fixed import fixed_step
 from servoctl.simulation.implicit import RADAU_ORDERS, RadauMethod
@@ -75,7 +76,8 @@ def simulate(
     order : int, optional
         Order of "Taylor", or of "RadauIIA" (5, 9 or 13); default: that of least work for rtol.
     jets : int, optional
-        Highest derivative in the samples, for "Taylor": `run["d4theta"]`; default s̄.
+        Highest derivative in the samples, for "Taylor": `run["d4theta"]`; default s̄. With more than s̄ rates of the
+        actuation follow: `run["dtrolley"]`.
     progress : bool or callable, optional
         Show a bar; default: on a terminal, after a second. Or a function of the time reached [s], which may raise.
 
@@ -106,6 +108,8 @@ def _simulated(model, start, span, method, drift, rtol, atol, step, t_eval, orde
     t0, t1 = span
     method = _method(model, method)
     drift = _drift(model, drift, method)
+    if isinstance(drift, Poles) and t1 < t0:
+        _require_decay(model, drift)
     _refuse_idle(method, step, order, jets, rtol, atol)
     x0 = _state(model, start, t0)
     if method != "algebraic" and (drift is None or isinstance(drift, Minimal)):
@@ -219,6 +223,20 @@ def _drift(model, drift, method):
             do="Change one of them.",
         )
     return drift
+
+
+def _require_decay(model, drift):
+    """Refuse poles that amplify where time runs backwards."""
+    drift.coefficients(model)  # refuses poles that do not fit the rows
+    for row, values in row_poles(drift, model).items():
+        if np.any(np.real(values) < 0):
+            raise SpecificationError(
+                f"drift={drift} was given with a span that runs backwards: {row!r} has poles {values.tolist()} 1/s.",
+                "Error dynamics that decay forward in time grow backward, as e^(|t|/T).",
+                nearest="drift='project'; or poles by row with positive real parts.",
+                do="Change one of them.",
+                row=row,
+            )
 
 
 def _alone(accuracy, **given):
@@ -349,4 +367,5 @@ def _tolerance(name, value, usual):
 
 def is_number(value):
     """Whether a value is a finite number, Python's or NumPy's; True and False are none."""
-    return isinstance(value, (int, float, np.integer, np.floating)) and not isinstance(value, bool) and np.isfinite(value)
+    numbers = (int, float, np.integer, np.floating)
+    return isinstance(value, numbers) and not isinstance(value, bool) and bool(np.isfinite(value))

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from servoctl.errors import IntegrationStopped
+from servoctl.model.sundials import MOST_STEPS
 from servoctl.simulation.drift import Poles
 from servoctl.simulation.implicit import InBulk
 
@@ -78,9 +79,9 @@ class SundialsMethod(InBulk):
             self.motion.stop = self.watch.singular(t, x, "the integrator finds no further step")
             return
         self.motion.stop = IntegrationStopped(
-            f"{self.method} stopped at t = {t:.7g} s: it finds no further step.",
+            f"{self.method} stopped at t = {t:.7g} s: no step succeeds, or {MOST_STEPS:,} reach no further sample.",
             "A motion is integrated as far as its solution exists and steps can be solved.",
             nearest=f"The motion before t = {t:.6g} s, which is kept.",
-            do="Loosen rtol, take 'RadauIIA', or see whether the motion escapes.",
+            do="Loosen rtol, give more t_eval, take 'RadauIIA', or see whether the motion escapes.",
             t=float(t),
         )

@@ -82,7 +82,7 @@ class Program:
         SpecificationError
             If the factor is not positive, or the kinematics q' = V w + h depend on time or drift by h.
         """
-        sigma = _number(factor)
+        sigma, instant = _number(factor), _number(at)
         if not sigma > 0:
             raise SpecificationError(
                 f"A program was to be slowed by the factor {factor!r}.",
@@ -90,18 +90,24 @@ class Program:
                 do="Give a number above zero.",
                 factor=factor,
             )
+        if np.isnan(instant):
+            raise SpecificationError(
+                f"at={at!r} was given.", "The instant that stays where it is is a finite number.", do="Give one [s]."
+            )
         if not q.plain and (not q.h.is_zero() or ca.depends_on(q.V, q.t)):
             raise SpecificationError(
                 "The kinematics q' = V w + h depend on time or drift by h.",
                 "Another time law would change them as well as the program.",
                 do="Write the slower program yourself.",
             )
-        symbols, values = [q.t], [at + (q.t - at) / sigma]
-        for k in range(1, max(map(q.order, self.residuals.values())) + 1):
+        symbols, values = [q.t], [instant + (q.t - instant) / sigma]
+        own = {name: ca.SX(value) for name, value in self.weights.items()}
+        for k in range(1, max(map(q.order, (*self.residuals.values(), *own.values()))) + 1):
             symbols += q.gamma(k)
             values += [sigma**k * s for s in q.gamma(k)]
-        slower = ca.substitute(list(self.residuals.values()), symbols, values)
-        return Program(dict(zip(self.residuals, slower, strict=True)), self.by, self.weights or None)
+        slower = iter(ca.substitute([*self.residuals.values(), *own.values()], symbols, values))
+        residuals = {name: next(slower) for name in self.residuals}
+        return Program(residuals, self.by, {name: next(slower) for name in own} or None)
 
     def __repr__(self):
         return f"Program({', '.join(self.residuals)}; by {self.by})"

@@ -5,12 +5,13 @@ from time import perf_counter
 import numpy as np
 
 from servoctl.errors import SpecificationError, unknown
-from servoctl.simulation.simulate import simulate
+from servoctl.simulation.simulate import as_span, simulate
 from servoctl.study.study import Study, machine
 
 FORMS = {"servo": "servo_dae", "projected": "servo_dae_projected"}
 METHODS = {"BE": 1, "BDF2": 2}
 MOST_ITERATIONS, CLOSE = 15, 1e-6  # of Newton's method; what its last change of q may be relative to 1 + |q|
+MOST_STEPS = 10**7  # each is a Newton iteration in Python
 LAYER = 10  # steps at the start that are left out: formulas of order p need index + p of them to forget it
 TRUNCATED, ROUNDED = 3.0, 3.0  # a step belongs to a branch of the error where it is that much above the minimum
 
@@ -119,13 +120,13 @@ def dae_comparison(model, start, t_span, steps=None, forms=tuple(FORMS), methods
         for name in names:
             if name not in known:
                 raise unknown(name, known, what)
-    t0, t1 = t_span
-    steps = (t1 - t0) / 20.0 / 2.0 ** np.arange(12) if steps is None else np.atleast_1d(np.asarray(steps, dtype=float))
-    if not np.all(steps * (t1 - t0) > 0):
+    t0, t1 = as_span(t_span)
+    steps = _steps(t0, t1, steps)
+    if not (len(forms) and len(methods)):
         raise SpecificationError(
-            f"steps={steps.tolist()} were given over {t0:g} .. {t1:g} s.",
-            "Steps are positive and lead from the start to the end.",
-            do="Give [0.1, 0.01].",
+            f"forms={forms!r} and methods={methods!r} were given.",
+            "A comparison has at least one of each.",
+            do="Leave them out to compare all.",
         )
     rows = []
     for step in steps:
@@ -142,6 +143,31 @@ def dae_comparison(model, start, t_span, steps=None, forms=tuple(FORMS), methods
     parts = (f"{name}: h = {b['step']:.2g} s, error {b['force']:.1e}" for name, b in meta["best"].items())
     meta["message"] = "least error of the force: " + "; ".join(parts)
     return study
+
+
+def _steps(t0, t1, steps):
+    """Steps as an array of positive lengths, the default ones where none are given."""
+    if t1 < t0:
+        raise SpecificationError(
+            f"t_span=({t0:g}, {t1:g}) was given.",
+            "The comparison runs forward: its formulas damp what they compute in the direction of time.",
+            nearest=f"({t1:g}, {t0:g}).",
+            do="Start at the earlier time.",
+        )
+    if steps is None:
+        return (t1 - t0) / 20.0 / 2.0 ** np.arange(12)
+    try:
+        found = np.atleast_1d(np.asarray(steps, dtype=float)).ravel()
+    except (TypeError, ValueError):
+        found = np.zeros(0)
+    if not len(found) or not np.all((found > (t1 - t0) / MOST_STEPS) & (found <= t1 - t0)):
+        raise SpecificationError(
+            f"steps={steps!r} were given over {t0:g} .. {t1:g} s.",
+            f"Steps are positive, no longer than the span, and no more than {MOST_STEPS:,} fill it.",
+            nearest=f"[{(t1 - t0) / 20:g}, {(t1 - t0) / 200:g}].",
+            do="Give such steps, or leave them out.",
+        )
+    return found
 
 
 def _reference(model, start, t):

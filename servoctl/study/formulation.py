@@ -98,10 +98,17 @@ def formulation_cost(build, cases, formulations=tuple(NAMES), timed=True):
     for how in formulations:
         if how not in NAMES:
             raise unknown(how, NAMES, "formulation")
-    cases = [(int(n), int(k)) for n, k in cases]
-    if not cases:
-        raise SpecificationError("No case was given.", "A study has at least one row.", do="Give [(4, 2)].")
-    rows = [row for n, k in cases for row in _measured(n, k, derive(*build(n, k)), formulations, timed)]
+    try:
+        pairs = [(int(n), int(k)) for n, k in cases]
+    except (TypeError, ValueError):
+        pairs = []
+    if not (pairs and len(formulations)):
+        raise SpecificationError(
+            f"cases={cases!r} and formulations={formulations!r} were given.",
+            "A study has at least one pair (n, k) of whole numbers, and one formulation.",
+            do="Give [(4, 2)].",
+        )
+    rows = [row for n, k in pairs for row in _measured(n, k, derive(*build(n, k)), formulations, timed)]
     columns = {name: [row[name] for row in rows] for name in rows[0]}
     return FormulationCost("formulationcost", columns, {"points": POINTS, "machine": machine()})
 

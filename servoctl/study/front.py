@@ -4,6 +4,7 @@ import numpy as np
 
 from servoctl.errors import LimitExceeded, SpecificationError, unknown
 from servoctl.simulation.drift import project
+from servoctl.simulation.simulate import is_number
 from servoctl.study.study import Study, table
 
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000", "#8C6D31", "#7F7F7F", "#5E3C99")
@@ -32,7 +33,8 @@ class TradeOff(Study):
     actuation: the same of the required forces and moments; residual: the largest of any constraint at any level, in
     its unit; energy: energy gained less the work done along the reference, relative to the largest energy; power:
     dE/dt less the power of all forces, relative (NaN where it does not apply); evaluations of the right-hand side, or
-    of the series, or Newton steps; steps; seconds: the shortest call after a warm-up; resolved: whether the error
+    of the series, or Newton steps; steps; seconds: the shortest call after a warm-up, with 51 samples by methods that
+    find their steps (more samples take longer), and one at each instant or step by the others; resolved: whether the error
     exceeds the reference's own uncertainty; failure: why there is no number.
     """
 
@@ -96,6 +98,10 @@ class TradeOff(Study):
                 do="Give recommend(error=1e-6) or recommend(seconds=1e-3).",
             )
         asked, limit = ("error", error) if seconds is None else ("seconds", seconds)
+        if not (is_number(limit) and limit > 0):
+            raise SpecificationError(
+                f"{asked}={limit!r} was given.", f"{asked} is a positive number.", do="Give 1e-6.", asked=limit
+            )
         front = self.pareto()
         reached = front._told() if asked == "error" else front["seconds"]
         within = np.flatnonzero(reached <= limit)
@@ -181,7 +187,8 @@ class TradeOff(Study):
         front = self.pareto()
         shown = np.unique(np.linspace(0, len(front) - 1, min(SHOWN, len(front))).round().astype(int))
         lines = [
-            f"Trade-off: {len(self)} rows, {len(self) - len(self._good())} without numbers; t = {t0:g} .. {t1:g} s",
+            f"Trade-off: {len(self)} rows, {len(self) - len(self._good())} without numbers; t = {t0:g} .. {t1:g} s"
+            + ("; interrupted" if self.meta.get("message") else ""),
             f"  reference: {reference['method']}; {reference['verified by']} agrees to {reference['error']:.1e}, "
             f"actuation to {reference['actuation']:.1e}",
             f"  on {where['processor']}, {where['cores']} cores, compiler {where['compiler']}",

@@ -80,6 +80,10 @@ class StabilityMap:
         (N,) or (K, N) array
             max |R(hλ)| / max(1, |e^hλ|): a step is not blamed for what the motion does itself.
         """
+        if not np.all(np.asarray(step) > 0):
+            raise SpecificationError(
+                f"step={step!r} was given.", "A step is a positive number of seconds, or several.", do="Give 1e-3."
+            )
         z = np.multiply.outer(step, self.eigenvalues(drift))
         if order is None:
             order = {"Taylor": self.order, "RadauIIA": RADAU_ORDER}.get(method)
@@ -212,9 +216,10 @@ def stability(model, run, order=12):
     its manifold turns. Far from the imaginary axis, where steps become unstable, that is little.
     """
     n_x = len(model.state_names)
-    if tuple(run.jet_names[:n_x]) != tuple(model.state_names) or len(run.t) < 2:
+    names = tuple(getattr(run, "jet_names", ()))[:n_x]
+    if names != tuple(model.state_names) or len(run.t) < 2:
         raise SpecificationError(
-            f"The run has {len(run.t)} samples of {', '.join(run.jet_names[:n_x])}.",
+            f"The run has {len(run.t)} samples of {', '.join(names)}." if names else f"run={run!r} was given.",
             f"The plan is a motion of the model, whose state is {', '.join(model.state_names)}.",
             do="Give the run that simulate(model, ...) returned.",
         )

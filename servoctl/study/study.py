@@ -1,6 +1,7 @@
 """A study: a table by column names, failures among its rows, with what it was made from and on which machine."""
 
 import csv
+import functools
 import json
 import os
 import platform
@@ -248,7 +249,7 @@ def machine():
     """What numbers are measured on: processor, cores, system, compiler and versions, as a dict of plain values."""
     from servoctl import __version__
 
-    versions = {name: metadata.version(name) for name in ("casadi", "numpy", "scipy")}
+    versions = {name: _version(name) for name in ("casadi", "numpy", "scipy")}
     return {
         "processor": _processor(),
         "cores": os.cpu_count(),
@@ -256,6 +257,11 @@ def machine():
         "compiler": compiler() or "none: loops are interpreted",
         "versions": {"servoctl": __version__, "python": platform.python_version()} | versions,
     }
+
+
+@functools.cache
+def _version(package):
+    return metadata.version(package)
 
 
 def _processor():

@@ -62,6 +62,7 @@ def tradeoff(model, x0, t_span, methods=None, drift=None, *, rtol=TOLERANCES, st
     Returns
     -------
     TradeOff
+        Ctrl-C returns the rows measured so far; `meta["message"]` says so.
 
     Raises
     ------
@@ -75,18 +76,21 @@ def tradeoff(model, x0, t_span, methods=None, drift=None, *, rtol=TOLERANCES, st
     settings["step"] = _positive("step", [abs(t1 - t0) / n for n in STEPS] if step is None else step)
     limit = _positive("seconds", [seconds])[0]
     drifts = (None, "project", "minimal", abs(t1 - t0) / TIME_CONSTANT) if drift is None else drift
-    combinations = _combinations(model, methods, [drifts] if isinstance(drifts, (str, float)) else drifts)
+    combinations = _combinations(model, methods, drifts if isinstance(drifts, (list, tuple)) else [drifts])
     total = sum(len(settings[_kind(method)]) for method, _ in combinations)
     with compiling_at_once(), _bar(total, progress) as bar, warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)  # of steps outside the stable range: the rows have what they do
-        reference = Reference(model, x0, (t0, t1), limit)
-        rows = []
-        for method, treatment in combinations:
-            for row in _ladder(reference, method, treatment, settings[_kind(method)], limit):
-                rows.append(row)
-                bar.update()
+        reference, rows, interrupted = Reference(model, x0, (t0, t1), limit), [], False
+        try:
+            for method, treatment in combinations:
+                for row in _ladder(reference, method, treatment, settings[_kind(method)], limit):
+                    rows.append(row)
+                    bar.update()
+        except KeyboardInterrupt:
+            interrupted = True
     columns = {name: [row.get(name) for row in rows] for name in TradeOff.COLUMNS}
     told = {"t_span": [t0, t1], "seconds": limit, "reference": reference.told, "machine": machine()}
+    told["message"] = "interrupted" if interrupted else ""
     return TradeOff("tradeoff", columns, {**told, "measured": time.strftime("%Y-%m-%d")})
 
 
@@ -125,7 +129,7 @@ class Reference:
         for options in checks:
             late = Deadline(10 * seconds)
             try:
-                run = simulate(self.model, self.start, self.span, t_eval=self.times, progress=late, **options)
+                run = _whole(simulate(self.model, self.start, self.span, t_eval=self.times, progress=late, **options))
             except ServoError as error:
                 failure = error
                 continue
@@ -142,7 +146,7 @@ class Reference:
         """The run with samples at these times (N,) [s]."""
         key = times.tobytes()
         if key not in self._known:
-            self._known[key] = simulate(self.model, self.start, self.span, t_eval=times, **self.options)
+            self._known[key] = _whole(simulate(self.model, self.start, self.span, t_eval=times, **self.options))
         return self._known[key]
 
 
@@ -158,6 +162,13 @@ class Deadline:
         self.since = self.since or now
         if now - self.since > self.seconds:
             raise LimitExceeded(f"More than {self.seconds:g} s: ended at t = {t:.4g} s", seconds=self.seconds, t=t)
+
+
+def _whole(run):
+    """A run to its end; one that Ctrl-C ended is no measurement, and ends the study."""
+    if not run.success:
+        raise KeyboardInterrupt
+    return run
 
 
 def actuation(run):
@@ -200,7 +211,7 @@ def _measured(reference, options, seconds):
         options["t_eval"] = reference.times
 
     def once():
-        return simulate(model, reference.start, reference.span, progress=Deadline(seconds), **options)
+        return _whole(simulate(model, reference.start, reference.span, progress=Deadline(seconds), **options))
 
     run, timed = once(), []
     for _ in range(TIMED):
@@ -258,7 +269,7 @@ def _combinations(model, methods, drifts):
     """Pairs of method and treatment; default methods are those that the model can have."""
     if methods is None:
         methods = METHODS if model.flat else [name for name in METHODS if name != "algebraic"]
-    methods = [methods] if isinstance(methods, str) else list(methods)
+    methods = list(methods) if isinstance(methods, (list, tuple)) else [methods]
     for method in methods:
         if method not in ALL_METHODS:
             raise unknown(method, ALL_METHODS, "method")
@@ -269,7 +280,15 @@ def _combinations(model, methods, drifts):
                 "Poles by row were given.", "A row of the study tells its drift in a word.", do="Give a time constant."
             )
     pairs = [(m, d) for m in methods for d in treatments if m != "algebraic"]
-    return [*((m, None) for m in methods if m == "algebraic"), *pairs]
+    pairs = [*((m, None) for m in methods if m == "algebraic"), *pairs]
+    if not pairs:
+        raise SpecificationError(
+            f"methods={methods!r} and drift={drifts!r} were given.",
+            "A study measures at least one method with one treatment of drift.",
+            nearest="drift=[None].",
+            do="Leave both out to measure most.",
+        )
+    return pairs
 
 
 def _kind(method):

@@ -87,7 +87,7 @@ INLINE void sample(const Batch *c, int64_t k, int64_t at, const double *noise, C
     const int64_t here = k % c->depth;
     V *x = s->x, *u = s->u, *y = s->y;
     for (int i = 0; i < NY; i++) y[i] = x[measured[i]];
-    if (noise) for (int i = 0; i < NY; i++) y[i] += load(noise + (k * NY + i) * GROUPS * W_LANES);
+    if (noise) for (int i = 0; i < NY; i++) y[i] += load(noise + (k * NY + i) * W_LANES);
     if (c->quantum) for (int i = 0; i < NY; i++) {
         const double q = c->quantum[i];
         if (q > 0) y[i] = q * rounded(y[i] / q);
@@ -139,28 +139,19 @@ INLINE void stage(double t, const double *d, const V *x, Cases *s, V *k)
     rates(K(t), x, s->p, k);
 }
 
-/* One Runge-Kutta step of order 4, stage by stage in all groups: a group's stage waits for its last one, another's does
-   not. d holds the disturbances at the step's start, middle and end. */
+/* One Runge-Kutta step of order 4; d holds the disturbances at its start, middle and end. */
 INLINE void advance(double t, double h, const double *d, Cases *s)
 {
-    V k1[GROUPS][NX + 1], k2[GROUPS][NX + 1], k3[GROUPS][NX + 1], k4[GROUPS][NX + 1], z[GROUPS][NX + 1];
+    V k1[NX + 1], k2[NX + 1], k3[NX + 1], k4[NX + 1], z[NX + 1], *x = s->x;
     const double half = h / 2, sixth = h / 6;
-    for (int g = 0; g < GROUPS; g++) {
-        stage(t, d, s[g].x, s + g, k1[g]);
-        for (int i = 0; i < NX; i++) z[g][i] = s[g].x[i] + half * k1[g][i];
-    }
-    for (int g = 0; g < GROUPS; g++) {
-        stage(t + half, d + ND, z[g], s + g, k2[g]);
-        for (int i = 0; i < NX; i++) z[g][i] = s[g].x[i] + half * k2[g][i];
-    }
-    for (int g = 0; g < GROUPS; g++) {
-        stage(t + half, d + ND, z[g], s + g, k3[g]);
-        for (int i = 0; i < NX; i++) z[g][i] = s[g].x[i] + h * k3[g][i];
-    }
-    for (int g = 0; g < GROUPS; g++) {
-        stage(t + h, d + 2 * ND, z[g], s + g, k4[g]);
-        for (int i = 0; i < NX; i++) s[g].x[i] += sixth * (k1[g][i] + 2.0 * (k2[g][i] + k3[g][i]) + k4[g][i]);
-    }
+    stage(t, d, x, s, k1);
+    for (int i = 0; i < NX; i++) z[i] = x[i] + half * k1[i];
+    stage(t + half, d + ND, z, s, k2);
+    for (int i = 0; i < NX; i++) z[i] = x[i] + half * k2[i];
+    stage(t + half, d + ND, z, s, k3);
+    for (int i = 0; i < NX; i++) z[i] = x[i] + h * k3[i];
+    stage(t + h, d + 2 * ND, z, s, k4);
+    for (int i = 0; i < NX; i++) x[i] += sixth * (k1[i] + 2.0 * (k2[i] + k3[i]) + k4[i]);
 }
 
 INLINE void end(const Batch *c, int64_t at, const Cases *s)
@@ -178,30 +169,29 @@ INLINE void end(const Batch *c, int64_t at, const Cases *s)
 /* The loops of one block; the last commands and inputs, as many as the delays need, are in scratch. */
 static void block(const Batch *c, int64_t at, const double *noise, double *scratch)
 {
-    Cases s[GROUPS];
+    Cases s;
     const double h = c->period / (double)c->substeps;
-    for (int g = 0; g < GROUPS; g++) begin(c, at + g * W_LANES, scratch + g * 2 * c->depth * NU * W_LANES, s + g);
+    begin(c, at, scratch, &s);
     for (int64_t k = 0; ; k++) {
-        for (int g = 0; g < GROUPS; g++) sample(c, k, at + g * W_LANES, noise ? noise + g * W_LANES : 0, s + g);
+        sample(c, k, at, noise, &s);
         if (k == c->samples) break;
         for (int64_t i = 0; i < c->substeps; i++) {
             const double t = c->t0 + (double)k * c->period + (double)i * h;
             const int64_t step = k * c->substeps + i;
-            if (c->transport) for (int g = 0; g < GROUPS; g++) transported(c, step, s + g);
-            advance(t, h, c->disturbance + 3 * step * ND, s);
+            if (c->transport) transported(c, step, &s);
+            advance(t, h, c->disturbance + 3 * step * ND, &s);
 #if INVARIANTS
-            for (int g = 0; g < GROUPS; g++) restore(K(t + h), s[g].x, s[g].constants);
+            restore(K(t + h), s.x, s.constants);
 #endif
         }
     }
-    for (int g = 0; g < GROUPS; g++) end(c, at + g * W_LANES, s + g);
+    end(c, at, &s);
 }
 
 void batch(const Batch *c, int64_t first, int64_t last, const double *noise, double *scratch)
 {
-    const int64_t width = GROUPS * W_LANES;
     for (int64_t b = first; b < last; b++) {
-        block(c, b * width, noise ? noise + (b - first) * (c->samples + 1) * NY * width : 0, scratch);
+        block(c, b * W_LANES, noise ? noise + (b - first) * (c->samples + 1) * NY * W_LANES : 0, scratch);
     }
 }
 """

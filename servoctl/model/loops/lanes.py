@@ -78,12 +78,14 @@ def _by_lane(name, arguments):
 
 def _defined(name, arguments):
     """The C function of one operation."""
-    head = f"INLINE W w_{name}({', '.join(f'W {a}' for a in arguments)})\n{{\n"
+    head = f"W w_{name}({', '.join(f'W {a}' for a in arguments)})\n{{\n"
     if name in _OWN:
-        return f"{head}    return {_OWN[name]};\n}}\n"
-    if name in ("sin", "cos"):
-        head += f"    if (w_moderate(a)) return w_turned(a, {int(name == 'cos')});\n"
-    return f"{head}{_by_lane(name, arguments)}}}\n"
+        return f"INLINE {head}    return {_OWN[name]};\n}}\n"
+    if name in ("sin", "cos"):  # the value is made before the question, so that compilers make common parts once
+        far = f"static __attribute__((noinline, cold)) W w_far_{name}(W a)\n{{\n{_by_lane(name, arguments)}}}\n"
+        value = f"    const W r = w_turned(a, {int(name == 'cos')});\n    return w_moderate(a) ? r : w_far_{name}(a);\n"
+        return f"{far}INLINE {head}{value}}}\n"
+    return f"INLINE {head}{_by_lane(name, arguments)}}}\n"
 
 
 def lanes(text, operations, n=LANES):

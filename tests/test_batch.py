@@ -1,0 +1,255 @@
+"""Many closed loops at once: each equals `close` of its numbers, on any number of lanes and threads."""
+
+from dataclasses import replace
+
+import casadi as ca
+import mpmath
+import numpy as np
+import pytest
+
+import servoctl as sv
+from servoctl.mechanisms import gallery
+from servoctl.model import batch, compiler, emit
+
+CRANE, PROGRAM = gallery["overhead-crane"].build()
+N = 32
+GUST = sv.disturbances.gust(1.0, 1.0, 1.5)
+
+
+@pytest.fixture(scope="module")
+def plan():
+    model = sv.derive(CRANE, PROGRAM)
+    return sv.simulate(model, model.start(guess={"l": 4.0}), (0.0, 8.0))
+
+
+@pytest.fixture(scope="module")
+def cases():
+    rng = np.random.default_rng(1)
+    return {
+        "m_load": rng.uniform(85.0, 115.0, N), "damping x": rng.uniform(0.0, 10.0, N),
+        "theta": rng.uniform(-0.05, 0.05, N), "wind": rng.uniform(0.0, 60.0, N),
+    }  # fmt: skip
+
+
+def relative(found, values):
+    """Difference relative to the largest value of each signal."""
+    return np.abs(np.asarray(found) - np.asarray(values)).max() / max(np.abs(values).max(), 1e-300)
+
+
+def alone(plant, law, plan, cases, i, seed=None, **given):
+    """One case by `close`."""
+    x0 = dict(zip(CRANE.q.names + CRANE.q.jet_names(1), plan.state(0.0), strict=True)) | {"theta": cases["theta"][i]}
+    changed = {"m_load": cases["m_load"][i]}
+    own = sv.plant(
+        CRANE, damping={"x": cases["damping x"][i]}, limits=plant.limits, rate_limits=plant.rate_limits, lag=plant.lag,
+        delay=plant.delay, **changed,
+    )  # fmt: skip
+    wind = sv.disturbances.gust(cases["wind"][i], 1.0, 1.5)
+    return sv.close(own, law, x0, disturbance={"x": wind}, seed=seed, **given)
+
+
+LOOPS = {
+    "plain": ({}, {}),
+    "noise, delay and limits": (
+        {"limits": {"trolley": 120.0}, "rate_limits": {"hoist": 2e4}}, {"noise": {"theta": 1e-4, "x": 1e-4}, "delay": 2}
+    ),
+    "lag, transport and quantisation": (
+        {"lag": {"hoist": 0.01}, "delay": {"trolley": 0.011}}, {"quantisation": {"l": 1e-4}}
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("what", LOOPS)
+def test_each_case_equals_the_loop_alone(plan, cases, what):
+    of_plant, of_loop = LOOPS[what]
+    plant = sv.plant(CRANE, damping={"x": 5.0}, **of_plant)
+    law = sv.lqr(plan, replace(plant, delay={}), rate=200.0, integral=True)
+    given = {"t_span": (0.0, 4.0), "substeps": 5, **of_loop}
+    seeded = {"seed": 3} if "noise" in of_loop else {}
+    many = sv.close_many(
+        plant, law, plan.state(0.0), cases=cases, disturbance={"x": GUST}, scale={"x": "wind"},
+        record=("theta", "trolley", "residual X"), every=10, **given, **seeded,
+    )  # fmt: skip
+    assert len(many) == N and not np.any(many["error"] != "")
+    limited = False
+    for i in range(N):
+        run = alone(plant, law, plan, cases, i, int(many["seed"][i]) if seeded else None, **given)
+        limited |= bool(np.any(run.active["trolley"]))
+        signals = {name: run[name] for name in plant.state_names}
+        signals |= {f"input {name}" if name in signals else name: run.input[name] for name in plant.inputs}
+        signals |= {f"residual {name}": run.residual[name][0] for name in ("X", "Z")}
+        for name, values in signals.items():
+            size = np.abs(values).max()
+            numbers = [many[f"max |{name}|"][i], many[f"rms {name}"][i], many[f"final {name}"][i]]
+            assert np.abs(np.array(numbers) - [size, np.sqrt(np.mean(values**2)), values[-1]]).max() <= 1e-12 * max(
+                size, 1
+            )
+        for name, trace in many.trace.items():
+            assert relative(trace[:, i], signals[name][::10]) < 1e-10
+    assert limited == ("limits" in of_plant)
+    assert many.t == pytest.approx(run.t[::10])
+
+
+def test_lanes_and_threads_do_not_change_a_case(plan, cases, monkeypatch):
+    plant = sv.plant(CRANE, damping={"x": 5.0})
+    law = sv.lqr(plan, plant, rate=100.0)
+    given = {"noise": {"theta": 1e-3}, "seed": 7, "disturbance": {"x": GUST}, "scale": {"x": "wind"}, "substeps": 2}
+    few = {name: values[:5] for name, values in cases.items()}
+
+    def results(cases, **options):
+        study = sv.close_many(plant, law, plan.state(0.0), (0.0, 2.0), cases, **given, **options).study
+        return np.array([study[name] for name in study.columns if name not in ("error", "message", "case")])
+
+    everything = results(cases, threads=1)
+    assert np.array_equal(results(cases, threads=3), everything)
+    assert np.array_equal(results(few), everything[:, :5])
+    for n in (1, 4, 8):
+        monkeypatch.setattr(batch, "lanes", lambda n=n: n)
+        assert results(cases) == pytest.approx(everything, rel=1e-12, abs=1e-14)
+
+
+def test_without_a_compiler_the_loops_are_closed_one_by_one(plan, cases, monkeypatch):
+    plant = sv.plant(CRANE, damping={"x": 5.0})
+    law = sv.lqr(plan, plant, rate=100.0)
+    few = {name: values[:3] for name, values in cases.items()}
+    arguments = (plant, law, plan.state(0.0), (0.0, 0.5), few)
+    given = {"noise": {"theta": 1e-3}, "seed": 7, "disturbance": {"x": GUST}, "scale": {"x": "wind"}, "record": ("x",)}
+    there = sv.close_many(*arguments, **given)
+    monkeypatch.setattr(batch.Unit, "library", lambda self, n: None)
+    alone = sv.close_many(*arguments, **given)
+    assert list(alone.study.columns) == list(there.study.columns)
+    assert alone.trace["x"] == pytest.approx(there.trace["x"], rel=1e-12)
+    for name in alone.study.columns:
+        if name not in ("error", "message"):
+            assert alone[name] == pytest.approx(there[name], rel=1e-11, abs=1e-13), name
+
+
+def test_cases_keep_their_seeds_when_there_are_more(plan):
+    plant = sv.plant(CRANE)
+    law = sv.feedforward(plan, plant, rate=50.0)
+    pd = sv.pd(plan, plant, rate=50.0, kp={"trolley": 100.0, "hoist": 100.0}, kd={"trolley": 50.0, "hoist": 50.0})
+    seeds = [
+        sv.close_many(plant, pd, plan.state(0.0), (0.0, 0.1), {"m_load": np.full(n, 100.0)}, noise={"x": 1e-3}, seed=4)[
+            "seed"
+        ]
+        for n in (3, 9)
+    ]
+    assert np.array_equal(seeds[0], seeds[1][:3]) and len(set(seeds[1])) == 9
+    study = sv.sweep(lambda m, rng: {"first": float(rng.integers(2**31))}, {"m": [1.0, 2.0, 3.0]}, seed=4)
+    assert np.array_equal(study["first"], seeds[0])
+    with pytest.raises(sv.NameUnknown):
+        sv.close_many(plant, law, plan.state(0.0), (0.0, 0.1), {"m_load": [100.0]}, noise={"x": 1e-3})
+
+
+def test_a_loop_that_diverges_is_a_row_and_disturbs_no_other(plan):
+    plant = sv.plant(CRANE, damping={"x": 1.0})
+    law = sv.lqr(plan, plant, rate=100.0)
+    damping = np.full(9, 1.0)
+    damping[4] = 1e5  # steps of 10 ms are far too long for it
+    many = sv.close_many(plant, law, plan.state(0.0), (0.0, 8.0), {"damping x": damping}, substeps=1)
+    with pytest.raises(sv.IntegrationStopped) as caught:
+        sv.close(sv.plant(CRANE, damping={"x": 1e5}), law, plan.state(0.0), (0.0, 8.0), substeps=1)
+    assert many["error"].tolist() == [""] * 4 + ["IntegrationStopped"] + [""] * 4
+    assert f"t = {caught.value.details['t']:.6g} s" in many["message"][4]
+    assert np.isnan(many["final x"][4]) and np.ptp(np.delete(many["final x"], 4)) == 0
+
+
+@pytest.mark.parametrize("name", ["overhead-crane-redundant", "wheeled-robot"])
+def test_material_constraints_are_held(name):
+    mechanism, program = gallery[name].build()
+    model = sv.derive(mechanism, program)
+    scene = gallery[name]
+    plan = sv.simulate(model, model.start(guess=scene.guess, **scene.start), (0.0, 1.0))
+    plant = sv.plant(mechanism)
+    law = sv.lqr(plan, plant, rate=100.0)
+    parameter = next(n for n in mechanism.parameters.names if n.startswith("m"))
+    values = mechanism.parameters.defaults[parameter] * np.linspace(0.9, 1.1, 9)
+    many = sv.close_many(plant, law, plan.state(0.0), (0.0, 1.0), {parameter: values}, substeps=2)
+    for i in (0, 8):
+        own = sv.plant(mechanism, **{parameter: values[i]})
+        run = sv.close(own, law, plan.state(0.0), (0.0, 1.0), substeps=2)
+        for row, state in zip(run.states, plant.state_names, strict=True):
+            assert many[f"max |{state}|"][i] == pytest.approx(np.abs(row).max(), rel=1e-11, abs=1e-13)
+
+
+def test_the_steps_are_those_of_the_case_that_needs_most(plan):
+    plant = sv.plant(CRANE, damping={"x": 5.0})
+    law = sv.feedforward(plan, plant, rate=50.0)
+    many = sv.close_many(plant, law, plan.state(0.0), (0.0, 0.1), {"damping x": [1.0, 900.0]})
+    alone = [
+        sv.close(sv.plant(CRANE, damping={"x": c}), law, plan.state(0.0), (0.0, 0.1)).loop.substeps
+        for c in (1.0, 900.0)
+    ]
+    assert alone[0] < alone[1] == many.study.meta["substeps"]
+
+
+@pytest.mark.skipif(compiler.compiler() is None, reason="needs a compiler")
+@pytest.mark.parametrize("n", [1, 4, 8])
+def test_sine_and_cosine_of_the_lanes_are_within_two_units(n):
+    import ctypes
+
+    rng = np.random.default_rng(4)
+    near = np.arange(-40, 41) * np.pi / 2
+    a = np.concatenate(
+        [rng.uniform(-1e5, 1e5, 400), rng.uniform(-4, 4, 200), near, np.nextafter(near, 1e9), [1e5, -3e7, 1e22, 0.0]]
+    )
+    a = np.resize(a, -(-len(a) // 8) * 8)
+    x = ca.SX.sym("x", 1)
+    f = ca.Function("f", [ca.SX.sym("t"), x, ca.SX(0, 1)], [ca.vertcat(ca.sin(x), ca.cos(x))])
+    text = emit.portable(f, "circular") + (
+        "void all(int64_t n, const double *a, double *y)\n{\n    for (int64_t k = 0; k < n; k += W_LANES) {\n"
+        "        V v[2], w = *(const U *)(a + k);\n        circular(w, &w, &w, v);\n"
+        "        *(U *)(y + k) = v[0];\n        *(U *)(y + n + k) = v[1];\n    }\n}\n"
+    )
+    library = compiler.library(emit.prelude(text) + emit.several(text, n), level="-O3")
+    y = np.empty((2, len(a)))
+    library.all(ctypes.c_int64(len(a)), *(ctypes.c_void_p(array.ctypes.data) for array in (a, y)))
+    with mpmath.workdps(60):
+        exact = np.array([[float(f(mpmath.mpf(float(v)))) for v in a] for f in (mpmath.sin, mpmath.cos)])
+    np.testing.assert_array_max_ulp(y, exact, maxulp=2)
+
+
+# bad input ------------------------------------------------------------------------------------------------------------
+
+
+def test_laws_in_python_are_sent_to_sweep(plan):
+    plant = sv.plant(CRANE, limits={"trolley": 100.0})
+    limited = sv.limited(sv.lqr(plan, plant, rate=50.0), plant)
+    for law in (lambda t, y: [0.0, 0.0], limited):
+        with pytest.raises(sv.SpecificationError, match="sweep"):
+            sv.close_many(plant, law, plan.state(0.0), (0.0, 1.0), {"m_load": [100.0]})
+
+
+BAD = {
+    "unknown column": ({"mload": [1.0]}, {}, "m_load"),
+    "other lengths": ({"m_load": [1.0, 2.0], "theta": [0.0]}, {}, "columns of finite numbers"),
+    "not finite": ({"m_load": [np.nan]}, {}, "columns of finite numbers"),
+    "no case": ({}, {}, "columns of finite numbers"),
+    "scale of no disturbance": ({"m_load": [1.0]}, {"scale": {"x": "m_load"}}, "disturbance"),
+    "scale without its column": ({"m_load": [1.0]}, {"scale": {"x": "w"}, "disturbance": {"x": 1.0}}, "column of the cases"),
+    "trace of nothing": ({"m_load": [100.0]}, {"record": ("thet",)}, "theta"),
+    "every": ({"m_load": [100.0]}, {"every": 0}, "at least 1"),
+    "seed without noise": ({"m_load": [100.0]}, {"seed": 1}, "without noise"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("what", BAD)
+def test_bad_input_is_refused(plan, what):
+    cases, given, told = BAD[what]
+    plant = sv.plant(CRANE)
+    law = sv.lqr(plan, plant, rate=50.0)
+    with pytest.raises(sv.ServoError, match=told):
+        sv.close_many(plant, law, plan.state(0.0), (0.0, 0.2), cases, **given)
+
+
+def test_starts_off_the_constraints_are_refused():
+    mechanism, program = gallery["overhead-crane-redundant"].build()
+    scene = gallery["overhead-crane-redundant"]
+    model = sv.derive(mechanism, program)
+    plan = sv.simulate(model, model.start(guess=scene.guess, **scene.start), (0.0, 1.0))
+    plant = sv.plant(mechanism)
+    law = sv.lqr(plan, plant, rate=100.0)
+    name = plant.state_names[0]
+    start = plan.state(0.0)[0]
+    with pytest.raises(sv.InconsistentStart, match="case 1"):
+        sv.close_many(plant, law, plan.state(0.0), (0.0, 0.1), {name: [start, start + 0.1]})

@@ -1,0 +1,120 @@
+"""Options of simulations and studies that make no sense: each is refused with what is wrong, before anything runs."""
+
+import numpy as np
+import pytest
+
+import servoctl as sv
+from servoctl.mechanisms import gallery
+from servoctl.mechanisms.guided_arm import guided_arm
+from servoctl.study import tradeoff as module
+from servoctl.study.formulation import formulation_cost
+
+ADAPTIVE = ("Taylor", "RadauIIA", "DOP853", "Radau", "LSODA", "CVODES", "IDAS")
+SPAN = (0.0, 0.2)
+
+
+@pytest.fixture(scope="module")
+def scene(gallery_model):
+    model, scene = gallery_model("appell-hamel"), gallery["appell-hamel"]
+    return model, model.start(guess=scene.guess, **scene.start)
+
+
+def refused(what, make):
+    with pytest.raises(sv.SpecificationError) as caught:
+        make()
+    assert what in str(caught.value) and " Give " in f" {caught.value}" or "Take" in str(caught.value), caught.value
+
+
+@pytest.mark.parametrize("method", ADAPTIVE)
+@pytest.mark.parametrize("name", ["rtol", "atol"])
+def test_tolerances(method, name, scene):
+    for value in (0.0, -1e-6, np.nan, np.inf, 2.0, "1e-6", [1e-6], True):
+        refused(f"{name}=", lambda value=value: sv.simulate(*scene, SPAN, method=method, **{name: value}))
+
+
+@pytest.mark.parametrize("method", ["RK4", "RadauIIA"])
+def test_steps(method, scene):
+    for value in (0, -1, np.nan, np.inf, "a", True, 1e-320, 1e-10):
+        refused("step=", lambda value=value: sv.simulate(*scene, SPAN, method=method, step=value))
+    run = sv.simulate(*scene, SPAN, method=method, step=np.float32(0.05))
+    assert run.success and run.counters["steps"] == 4
+
+
+@pytest.mark.parametrize("times", ["a", ["a"], [np.nan, 0.1], [0.0, np.inf], [None], {"t": 1}])
+def test_times_of_samples(times, scene):
+    refused("t_eval=", lambda: sv.simulate(*scene, SPAN, t_eval=times))
+
+
+def test_whole_numbers(scene):
+    for options in ({"order": True}, {"order": 5.0}, {"order": "a"}, {"jets": True}, {"jets": 2.5}):
+        refused(next(iter(options)), lambda options=options: sv.simulate(*scene, SPAN, method="Taylor", **options))
+    run = sv.simulate(*scene, SPAN, method="Taylor", order=np.int64(8), jets=np.int64(3), t_eval=[0.0, 0.2])
+    assert "d3theta" in run.names
+    for every in (True, 0, 1.0):
+        refused("every", lambda every=every: sv.project(every))
+    refused("True", lambda: sv.poles(True))
+
+
+def test_what_a_study_is_asked_for(scene):
+    for options in ({"methods": []}, {"drift": []}):
+        refused_study = {"methods": ["RK4"], "drift": [None]} | options
+        with pytest.raises(sv.SpecificationError, match="at least one method"):
+            sv.tradeoff(*scene, SPAN, **refused_study)
+    study = sv.tradeoff(*scene, SPAN, "RK4", sv.project(2), step=0.1, seconds=20.0)
+    assert study["drift"].tolist() == ["project 2"]
+    for options in ({"error": 0}, {"error": "a"}, {"seconds": -1.0}, {"error": np.nan}):
+        refused(next(iter(options)), lambda options=options: study.recommend(**options))
+
+
+def test_ctrl_c_ends_a_study_and_keeps_its_rows(scene, monkeypatch):
+    real = module.simulate
+
+    def interrupted(*given, **options):
+        if options.get("step") == 0.02:
+
+            def stop(t):
+                raise KeyboardInterrupt
+
+            options["progress"] = stop
+        return real(*given, **options)
+
+    monkeypatch.setattr(module, "simulate", interrupted)
+    study = sv.tradeoff(*scene, SPAN, ["RK4", "RK8"], [None], step=[0.1, 0.05, 0.02], seconds=20.0)
+    assert study.rows()[0]["method"] == "RK4" and study["value"].tolist() == [0.1, 0.05]
+    assert np.all(np.isfinite(study["error"])) and study.meta["message"] == "interrupted"
+    assert "interrupted" in repr(study).splitlines()[0]
+
+
+def test_what_comparisons_are_asked_for(gallery_model):
+    model = gallery_model("two-cars")
+    start = model.start()
+    for options in ({"steps": "a"}, {"steps": []}, {"steps": [np.nan]}, {"steps": [1e-300]}, {"steps": [2.0]}):
+        refused("steps=", lambda options=options: sv.dae_comparison(model, start, (0.0, 1.0), **options))
+    refused("t_span=", lambda: sv.dae_comparison(model, start, (0.0,)))
+    with pytest.raises(sv.SpecificationError, match="runs forward"):
+        sv.dae_comparison(model, model.start(t=1.0), (1.0, 0.0), steps=[0.1])
+    with pytest.raises(sv.SpecificationError, match="at least one of each"):
+        sv.dae_comparison(model, start, (0.0, 1.0), forms=[])
+    for cases in ([], [3], [("a", 1)]):
+        refused("cases=", lambda cases=cases: formulation_cost(guided_arm, cases))
+
+
+def test_what_a_stability_map_is_asked_for(scene):
+    model, start = scene
+    with pytest.raises(sv.SpecificationError, match="run=None"):
+        sv.stability(model, None)
+    found = sv.stability(model, sv.simulate(model, start, SPAN, method="RK4", step=0.01))
+    for step in (0.0, -1.0, np.nan, [0.1, 0.0]):
+        refused("step=", lambda step=step: found.radius("RK4", step))
+
+
+@pytest.mark.parametrize("method", ["RK4", "DOP853", "RadauIIA", "CVODES"])
+def test_error_dynamics_backwards_in_time(method, scene):
+    model, start = scene
+    end = sv.simulate(model, start, SPAN, method="Taylor", drift="project", rtol=1e-13, atol=1e-15)
+    there = end.jets[: len(start.values), -1]
+    with pytest.raises(sv.SpecificationError, match="grow backward.*'project'"):
+        sv.simulate(model, there, SPAN[::-1], method=method, drift=0.05)
+    growing = sv.poles({row: [20.0] * count for row, count in model.raised.items() if count})
+    back = sv.simulate(model, there, SPAN[::-1], method=method, drift=growing)
+    assert back.jets[: len(there), -1] == pytest.approx(start.values, abs=1e-7)
