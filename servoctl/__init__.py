@@ -29,6 +29,7 @@ from servoctl.errors import (
 from servoctl.model.export import export_c
 from servoctl.model.model import Model, derive
 from servoctl.model.plant import Plant, plant
+from servoctl.simulation.bounds import sampled_bound
 from servoctl.simulation.drift import poles, project
 from servoctl.simulation.internal import InternalDynamics, internal_dynamics
 from servoctl.simulation.run import Run, load
@@ -120,6 +121,7 @@ __all__ = [
     "poles",
     "project",
     "rigid_body",
+    "sampled_bound",
     "simulate",
     "spec",
     "stability",

@@ -441,3 +441,13 @@ def test_a_closed_run_is_saved_and_loaded(crane_plan, tmp_path):
         run["thetta"]
     with pytest.raises(sv.SpecificationError, match="samples every"):
         run.state(0.005)
+
+
+def test_a_loop_that_starts_mid_plan_waits_with_the_plans_present_actuation(crane_plan):
+    """The inputs before the first command arrives: those of the plan at the loop's start, not at its own."""
+    nominal = sv.plant(CRANE)
+    law = sv.feedforward(crane_plan, nominal)
+    run = sv.close(nominal, law, crane_plan.state(3.0), (3.0, 3.5), delay=4)
+    k = int(np.argmin(np.abs(crane_plan.t - 3.0)))
+    assert crane_plan.t[k] == pytest.approx(3.0, abs=1e-12)
+    assert run["trolley"][:4] == pytest.approx(np.full(4, crane_plan["trolley"][k]), rel=1e-9)

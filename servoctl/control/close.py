@@ -7,7 +7,7 @@ import numpy as np
 from servoctl.control.closed import Closed
 from servoctl.control.disturbances import require_seed, sampled
 from servoctl.control.law import ON_SAMPLE, Law
-from servoctl.control.tracking import Reference, positive, require_plan, require_plant
+from servoctl.control.tracking import Reference, positive, require_plan, require_plant, resampled
 from servoctl.errors import InconsistentStart, IntegrationStopped, ServoError, SpecificationError, unknown
 from servoctl.model.closed import FINISHED, LAW_LOST, STATE_LOST, Loop, run_loop
 from servoctl.spec.coordinates import mapping
@@ -46,8 +46,8 @@ def close(
     rate : float, optional
         Samples per second [Hz]; needed for a function, a Law has its own.
     delay : int
-        Samples from the measurement to the input. Until the first command arrives the inputs are the law's `idle`: the
-        plan's first actuation, or 0 without a plan.
+        Samples from the measurement to the input. Until the first command arrives the inputs are the plan's actuation
+        at the start, or the law's `idle` without a plan.
     noise : dict of str to float, optional
         Standard deviation of normally distributed noise by measured state.
     seed : int, optional
@@ -114,7 +114,8 @@ def prepared(plant, law, x0, t_span, delay, conditions, substeps):
     samples = whole((t1 - t0) * law.rate, f"t_span of {t1 - t0:g} s at {law.rate:g} Hz", "samples")
     first = whole((t0 - law.t0) * law.rate, f"A start at {t0:g} s of a law from {law.t0:g} s on", "samples")
     low, high, change = limits(plant, law.period)
-    idle = law.idle if low is None else np.clip(law.idle, low, high)
+    idle = _idle(law, t0)
+    idle = idle if low is None else np.clip(idle, low, high)
     x0 = _start(plant, t0, x0, idle)
     substeps, transport = steps(plant, law.period, substeps, t0, x0, idle)
     forces = conditions.disturbance
@@ -128,6 +129,15 @@ def prepared(plant, law, x0, t_span, delay, conditions, substeps):
         quantum=_by_measure(conditions.quantisation, law.measures, "quantisation"),
         low=low, high=high, change=change, transport=transport,
     )  # fmt: skip
+
+
+def _idle(law, t0):
+    """Inputs before the first command arrives: the law's own, or what its plan asks for where it starts later."""
+    plan = law.plan
+    if plan is None or getattr(plan, "model", None) is None or not plan.t[0] < t0:
+        return law.idle
+    now = resampled(plan, np.array([min(t0, plan.t[-1])]))
+    return np.array([now[name][0] for name in law.inputs])
 
 
 def _start(plant, t0, x0, idle):

@@ -1,6 +1,6 @@
 """Rows along a motion: their Taylor coefficients, and how these answer to the coefficients of the jets."""
 
-from functools import cached_property
+from copy import copy
 from math import factorial
 
 import casadi as ca
@@ -34,7 +34,7 @@ class Flow:
         self.equations = [(a, i) for a, (_, order) in enumerate(rows) for i in range(level - order + 1)]
         self.levels = np.array([rows[a][1] + i for a, i in self.equations], dtype=int)
         self.first = np.cumsum([0, *(max(level - order + 1, 0) for _, order in rows)])
-        self.rows, self._leading = rows, {}
+        self.rows, self._made = rows, {}  # tapes, read when they are first needed
         self.members = {
             order: np.array([a for a, (_, o) in enumerate(rows) if o == order], dtype=int)
             for order in sorted({order for _, order in rows if order <= level})
@@ -44,15 +44,25 @@ class Flow:
             parts = [ca.densify(ca.jacobian(moving, ca.vertcat(*q))), ca.densify(q.V)]
             self.motion = self._tape([], 0, moving.elements(), parts)
 
-    @cached_property
+    def at(self, points):
+        """The same rows with the parameters of other points; what was read of the rows is shared."""
+        flow = copy(self)
+        flow.points = points
+        return flow
+
+    @property
     def groups(self):
         """For each order its rows with their gradients in q and all jets."""
-        return [self._group(order, range(order + 1)) for order in self.members]
+        if "groups" not in self._made:
+            self._made["groups"] = [self._group(order, range(order + 1)) for order in self.members]
+        return self._made["groups"]
 
-    @cached_property
+    @property
     def bare(self):
         """For each order its rows alone."""
-        return [self._group(order, []) for order in self.members]
+        if "bare" not in self._made:
+            self._made["bare"] = [self._group(order, []) for order in self.members]
+        return self._made["bare"]
 
     def _group(self, order, levels):
         expressions = [self.rows[a][0] for a in self.members[order]]
@@ -63,14 +73,14 @@ class Flow:
     def leading(self, order, level):
         """Rows of an order with their gradients in γ^(order), or in q itself for level 0."""
         in_q = order == 0 and (level == 0 or self.q.plain)
-        if (order, in_q) not in self._leading:
+        if (order, in_q) not in self._made:
             group = self._group(order, [order])
             if order == 0 and not in_q:
                 expressions = [self.rows[a][0] for a in self.members[0]]
                 slopes = ca.jacobian(ca.vertcat(*expressions), ca.vertcat(*self.q)) @ self.q.V
                 group = self._tape(self.members[0], 0, expressions, [slopes])
-            self._leading[order, in_q] = group
-        return self._leading[order, in_q]
+            self._made[order, in_q] = group
+        return self._made[order, in_q]
 
     def _tape(self, members, order, expressions, parts):
         """A group's residuals and the nonzero entries of their gradients, with the places of these."""

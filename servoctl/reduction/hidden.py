@@ -13,8 +13,8 @@ from servoctl.errors import InconsistentStart, NotRealisable, SingularProgram, S
 from servoctl.reduction.elimination import eliminate
 from servoctl.reduction.flow import Flow
 from servoctl.reduction.manifold import solve
-from servoctl.reduction.ranks import NOISE, RESOLVED, clean, decide, decide_all
-from servoctl.reduction.rows import Row, dependence, gradient, leading, merge_uses, sample_rows, settle
+from servoctl.reduction.ranks import NOISE, RESOLVED, clean, decide, decide_all, decide_each, generic
+from servoctl.reduction.rows import Row, dependence, gradient, leading, merge_uses, sample_rows, settle, settle_alone
 
 VANISHED = 1e-5  # of a row's gradient at random points: what is left of it on its solutions, if it is a square
 
@@ -59,10 +59,11 @@ def complete(q, rows, context, starts=None):
         if not len(points.t):
             _refuse_contradiction(q, rows, context)
         numbers, sizes = leading(q, rows, points)
-        rank, best = decide_all(numbers, sizes)
+        ranks = decide_each(numbers, sizes)
+        rank, _ = generic(ranks)
         if not rank.clear:
             raise _ill_conditioned(rows, rank)
-        same = [p for p in range(numbers.shape[2]) if decide(numbers[:, :, p]).rank == rank.rank]
+        same = [p for p, own in enumerate(ranks) if own.rank == rank.rank]
         if rank.rank == len(rows):
             return rows, rank, points.take(same), guards
         rows, new_guards = _step(q, rows, numbers[:, :, same], context, points)
@@ -79,7 +80,6 @@ def _step(q, rows, numbers, context, starts=None):
         (rows[a].kind == "dynamics", w, a) for a, w in zip(support, weights, strict=True) if rows[a].order == top
     ]
     b = max(candidates)[2]
-    rest = [row for a, row in enumerate(rows) if a != b]
     new, points, pivots, story = _combination(q, rows, b, support, top, numbers, context, starts)
     if new.order >= top:
         support, numbers = _about(q, rows, b, context)
@@ -228,29 +228,34 @@ def _ill_conditioned(rows, rank):
 
 def as_rows(q, named, kind, context):
     """Rows of named residuals with their true orders."""
-    rows = []
-    for name, expression in named.items():
-        row = Row(expression, max(q.order(expression), 0), name, kind, uses={name: 0})
-        row, _ = settle(q, row, [], context)
+    given = [Row(e, max(q.order(e), 0), name, kind, uses={name: 0}) for name, e in named.items()]
+    settled = settle_alone(q, given, context)
+    for row, slopes in settled:
         if row.order < 0:
             raise SpecificationError(
-                f"The residual {name!r} depends on no coordinate.",
+                f"The residual {row.name!r} depends on no coordinate.",
                 "A constraint restricts the motion.",
                 do="Use the symbols of the mechanism's coordinates.",
-                name=name,
+                name=row.name,
             )
-        _refuse_square(q, row, context)
-        rows.append(row)
-    return rows
+        _refuse_square(q, row, context, slopes)
+    return [row for row, _ in settled]
 
 
-def _refuse_square(q, row, context):
+def _refuse_square(q, row, context, slopes=None):
     """Refuse a residual whose gradient vanishes where the residual does: φ² = 0 and its like.
 
-    A gradient without the highest jets is as large on the solutions, which determine these alone, as elsewhere.
+    A gradient without the highest jets is as large on the solutions, which determine these alone, as elsewhere; and
+    so is an entry that holds no coordinate. `slopes` are the values of the gradient at the points, where known.
     """
-    if row.order > 0 and q.order(gradient(q, row)) < row.order:
+    own = gradient(q, row)
+    if row.order > 0 and q.order(own) < row.order:
         return
+    if slopes is not None:
+        sizes, columns = np.abs(slopes), own.sparsity().get_triplet()[1]
+        clear = np.all(sizes > VANISHED * sizes.max(axis=0), axis=1)
+        if any(clear[i] and q.order(e) < 0 for i, e in zip(columns, own.nonzeros(), strict=True)):
+            return
     start = sample_rows(q, [], row.order, context)
     flow = Flow(q, [(row.expression, row.order)], row.order, start)
     z, residual = solve(flow, start.t, start.z, iterations=40)

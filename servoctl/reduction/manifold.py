@@ -19,6 +19,15 @@ ROUNDED_STEP = 1e-15  # a step from below this is worth one trial: shorter ones 
 WELL_CONDITIONED = 1e-3  # Cholesky pivots of A Aᵀ with unit diagonal above it: Newton's steps need no singular values
 
 
+class Scalars:
+    """SX scalars that are evaluated at several sets of points: read once."""
+
+    def __init__(self, expressions):
+        expressions = list(expressions)
+        self.symbols = ca.symvar(ca.vertcat(*expressions)) if expressions else []
+        self.tape = Tape(self.symbols, expressions)
+
+
 @dataclass(frozen=True)
 class Points:
     """Points in jet space.
@@ -61,22 +70,26 @@ class Points:
 
     def evaluate(self, expressions):
         """Values and sizes of SX scalars at the points: two arrays (len, N)."""
-        expressions = list(expressions)
-        symbols = ca.symvar(ca.vertcat(*expressions)) if expressions else []
-        if not expressions:
-            return np.zeros((0, len(self.t))), np.zeros((0, len(self.t)))
-        inputs = np.empty((len(symbols), len(self.t)), dtype=REAL)
-        for i, symbol in enumerate(symbols):
+        return self.run(Scalars(expressions))
+
+    def run(self, scalars):
+        """Values and sizes of `Scalars` at the points: two arrays (len, N)."""
+        inputs = np.empty((len(scalars.symbols), len(self.t)), dtype=REAL)
+        for i, symbol in enumerate(scalars.symbols):
             inputs[i] = self._input(symbol)
-        return evaluate(Tape(symbols, expressions), inputs)
+        return evaluate(scalars.tape, inputs)
 
     def matrix(self, expression):
         """Values and sizes of an SX matrix at the points: two arrays (rows, columns, N)."""
         expression = ca.SX(expression)
-        rows, columns = expression.sparsity().get_triplet()
-        found = np.zeros((2, *expression.shape, len(self.t)), dtype=REAL)
-        found[:, rows, columns] = self.evaluate(expression.nonzeros())
-        return found[0], found[1]
+        return self.placed(expression.sparsity(), *self.evaluate(expression.nonzeros()))
+
+    def placed(self, sparsity, *nonzeros):
+        """Arrays (rows, columns, N) from their nonzero entries (nnz, N)."""
+        rows, columns = sparsity.get_triplet()
+        found = np.zeros((len(nonzeros), *sparsity.shape, len(self.t)), dtype=REAL)
+        found[:, rows, columns] = nonzeros
+        return tuple(found)
 
     def _input(self, symbol):
         place = self.q.where(symbol)
@@ -88,6 +101,11 @@ class Points:
     def _parameter(self, symbol):
         hashes = [p.element_hash() for p in self.parameters]
         return self.values[hashes.index(symbol.element_hash())]
+
+    def joined(self, other):
+        """These points and others of the same jets."""
+        t, z = np.append(self.t, other.t), np.hstack([self.z, other.z])
+        return Points(self.q, t, z, self.parameters, self.values, np.append(self.residual, other.residual))
 
     def take(self, keep):
         """Some of the points."""
@@ -129,8 +147,7 @@ def solve(flow, t, z, iterations=60):
         active, start, residual, scale = active[rough], start[:, rough], residual[:, rough], scale[:, rough]
         if not len(active):
             break
-        columns = zip(np.flatnonzero(rough), residual.T, strict=True)
-        step = np.array([_least_step(jacobian[:, :, p], r) for p, r in columns]).T
+        step = _least_steps(jacobian[:, :, rough], residual)
         trial, better = _search(flow, t[active], start, step, scale, residual)
         active = active[better]
         z[:, active] = trial[:, better]
@@ -167,7 +184,7 @@ def _solve_level(flow, t, z, level, scales):
     for _ in range((8 if level == 0 else 2) if len(rows) else 0):
         residual, slopes = flow.at_level(t, z, level)
         residual, slopes = residual[rows], slopes[rows]
-        step = np.array([_least_step(slopes[:, :, p], residual[:, p]) for p in range(len(t))]).T
+        step = _least_steps(slopes, residual)
         longest = np.max(np.abs(step) / (1.0 + np.abs(z[columns])), axis=0)
         z[columns] += step / np.maximum(1.0, longest) if level == 0 else step
         scales[rows] = _scales(slopes, z[columns])
@@ -188,6 +205,22 @@ def _norms(residual, scales):
     return np.where(np.isfinite(norm), norm, np.inf)
 
 
+def _least_steps(jacobian, residual):
+    """Steps of least length to where the linearised residual vanishes, (nz, N)."""
+    a = np.moveaxis(jacobian, 2, 0)
+    scale = np.sqrt((a**2).sum(axis=2))
+    scale[~(scale > 0)] = 1.0
+    a, b = a / scale[:, :, None], (residual.T / scale).astype(float)
+    if np.all(np.isfinite(a)) and np.all(np.isfinite(b)):
+        gram = a @ a.swapaxes(1, 2)
+        try:
+            if np.linalg.cholesky(gram).diagonal(axis1=1, axis2=2).min(initial=np.inf) > WELL_CONDITIONED:
+                return -(a.swapaxes(1, 2) @ np.linalg.solve(gram, b[:, :, None]))[:, :, 0].T.astype(REAL)
+        except np.linalg.LinAlgError:
+            pass
+    return np.array([_least_step(jacobian[:, :, p], residual[:, p]) for p in range(residual.shape[1])]).T
+
+
 def _least_step(jacobian, residual):
     scale = np.sqrt((jacobian**2).sum(axis=1))
     scale = np.where(scale > 0, scale, 1.0)
@@ -204,7 +237,7 @@ def _least_step(jacobian, residual):
     return -np.linalg.lstsq(a, b, rcond=1e-11)[0].astype(REAL)
 
 
-def sample(q, rows, level, context, starts=None, count=5, seed=1907):
+def sample(q, rows, level, context, starts=None, flow=None, count=5, seed=1907):
     """Seeded random points that satisfy rows and their derivatives up to a level.
 
     Parameters
@@ -217,6 +250,8 @@ def sample(q, rows, level, context, starts=None, count=5, seed=1907):
         Parameters and their values, the window of times, the guess.
     starts : Points, optional
         Earlier points: their jets are starts, beside random ones.
+    flow : Flow, optional
+        Of the same rows and level, from an earlier call.
     count : int
         Points to look for.
 
@@ -242,11 +277,14 @@ def sample(q, rows, level, context, starts=None, count=5, seed=1907):
             t[i] = starts.t[i % len(starts.t)]
             z[:shared, i] = starts.z[:shared, i % len(starts.t)] + (i // len(starts.t)) * 0.1 * z[:shared, i]
     empty = Points(q, t, z.astype(REAL), context.parameters, context.values, np.zeros(count_tried))
-    flow = Flow(q, rows, level, empty)
-    z, residual = solve(flow, t, z)
-    found = Points(q, t, z, context.parameters, context.values, residual.astype(float))
-    good = np.flatnonzero(residual < 1e-13)
-    return found.take(good[:count])
+    flow = flow.at(empty) if flow else Flow(q, rows, level, empty)
+    found = []
+    for some in (slice(count), slice(count, None)):  # the second half is needed where one of the first failed
+        if sum(len(part.t) for part in found) < count:
+            solved, residual = solve(flow, t[some], z[:, some])
+            part = Points(q, t[some], solved, context.parameters, context.values, residual.astype(float))
+            found.append(part.take(np.flatnonzero(residual < 1e-13)))
+    return found[0] if len(found) == 1 else found[0].joined(found[1]).take(slice(count))
 
 
 @dataclass(frozen=True)

@@ -113,7 +113,16 @@ def decide_all(values, sizes):
     index : int
         The point with the largest smallest kept pivot.
     """
-    ranks = [decide(clean(values[:, :, i], sizes[:, :, i])) for i in range(values.shape[2])]
+    return generic(decide_each(values, sizes))
+
+
+def decide_each(values, sizes):
+    """The rank at each point, of values (m, n, N) with sizes of the same shape: a list of Rank."""
+    return [decide(clean(values[:, :, i], sizes[:, :, i])) for i in range(values.shape[2])]
+
+
+def generic(ranks):
+    """What `decide_all` returns, from the ranks at each point."""
     top = max(r.rank for r in ranks)
     best = max((i for i, r in enumerate(ranks) if r.rank == top), key=lambda i: ranks[i].kept)
     same = [r for r in ranks if r.rank == top]

@@ -8,11 +8,12 @@ import numpy as np
 
 from servoctl.errors import NotRealisable, SpecificationError, unknown
 from servoctl.reduction.appell import Realisation, realisation, require_inertia
+from servoctl.reduction.flow import Flow
 from servoctl.reduction.hidden import as_rows, complete
 from servoctl.reduction.knots import Knots, Switches, require_smooth
-from servoctl.reduction.manifold import Context, Points
+from servoctl.reduction.manifold import Context, Points, Scalars
 from servoctl.reduction.ranks import Rank, clean, decide, decide_all
-from servoctl.reduction.rows import Row, gradient, merge_uses, sample_rows, settle
+from servoctl.reduction.rows import Row, gradient, merge_uses, sample_rows, settle_alone
 from servoctl.spec.coordinates import mapping
 from servoctl.spec.mechanism import Mechanism, require_known
 from servoctl.spec.parameters import finite
@@ -88,6 +89,25 @@ class Reduction:
     def leading(self):
         """The leading matrix L, (n, n) SX."""
         return ca.cse(ca.vertcat(*(gradient(self.mechanism.q, row) for row in self.rows)))
+
+    @cached_property
+    def conditions(self):
+        """What `holds` looks at: L, Bᵀ, and then the residuals with their derivatives, and the balance."""
+        q, own = self.mechanism.q, self.realisation.B
+        levels = (q.derivatives([row.expression], max(0, self.top - row.order)) for row in self.given.values())
+        left = [level[0] for found in levels for level in found]
+        free = self.mechanism.balance - own @ self.multipliers
+        return Scalars([*self.leading.nonzeros(), *own.T.nonzeros(), *left, *free.elements()])
+
+    @cached_property
+    def decided(self):
+        """Values and sizes of the conditions at the points of the reduction."""
+        return self.points.run(self.conditions)
+
+    @cached_property
+    def flow(self):
+        """The rows along a motion, as `holds` puts points on their manifold."""
+        return Flow(self.mechanism.q, [(row.expression, row.order) for row in self.rows], self.top, self.points)
 
     @cached_property
     def multipliers(self):
@@ -166,13 +186,14 @@ def reduce(mechanism, program, guess=None, near=None, values=None):
     split = realisation(mechanism, program, constraints, points)
     expressions, pivots = split.dynamics(mechanism.balance)
     guards = [*guards, *((f"choice of dependent coordinates {i + 1}", p) for i, p in enumerate(pivots))]
-    dynamics = []
-    for i, e in zip(split.independent, expressions, strict=True):
-        row = Row(e, max(q.order(e), 0), f"balance of {names[i]}", "dynamics", uses={FORCE: 0})
-        row, _ = settle(q, row, [], context)
+    dynamics = [
+        Row(e, max(q.order(e), 0), f"balance of {names[i]}", "dynamics", uses={FORCE: 0})
+        for i, e in zip(split.independent, expressions, strict=True)
+    ]
+    dynamics = [row for row, _ in settle_alone(q, dynamics, context)]
+    for row in dynamics:
         if row.order < 0:
             raise _idle(row, program)
-        dynamics.append(row)
     rows, rank, points, more = complete(q, [*constraints, *dynamics], context, points)
     knots = require_smooth(switches, context.values, smoothness(switches, rows))
     by_name = {row.name: row for row in given}
@@ -200,17 +221,20 @@ def holds(reduction, values):
     """
     q, r = reduction.mechanism.q, reduction
     context = replace(r.context, values=values)
-    points = sample_rows(q, r.rows, r.top, context, starts=r.points)
+    points = sample_rows(q, r.rows, r.top, context, starts=r.points, flow=r.flow)
     if not len(points.t):
         return False
-    for matrix, before in ((r.leading, r.points), (r.realisation.B.T, r.points)):
-        old, new = (clean(*p.matrix(matrix)) for p in (before, points))
+    after, start = points.run(r.conditions), 0
+    for sparsity in (r.leading.sparsity(), r.realisation.B.T.sparsity()):
+        entries = slice(start, start + sparsity.nnz())
+        old, new = (
+            clean(*p.placed(sparsity, *(part[entries] for part in found)))
+            for p, found in ((r.points, r.decided), (points, after))
+        )
         if np.any(np.any(new, axis=2) & ~np.any(old, axis=2)) or decide(new[:, :, 0]).rank < len(new):
             return False
-    left = [q.derivatives([row.expression], max(0, r.top - row.order)) for row in r.given.values()]
-    left = [level[0] for levels in left for level in levels]
-    free = r.mechanism.balance - r.realisation.B @ r.multipliers
-    found, sizes = points.evaluate([*left, *free.elements()])
+        start = entries.stop
+    found, sizes = (part[start:] for part in after)
     return bool(np.all(np.abs(found) <= HELD * np.maximum(sizes, 1e-300)))
 
 

@@ -72,6 +72,30 @@ def leading(q, rows, points):
     return clean(values, sizes), sizes
 
 
+def settle_alone(q, rows, context):
+    """Each row settled without others (see `settle`), most of them by one look at all leading gradients.
+
+    Returns
+    -------
+    list of (Row, (n, N) array or None)
+        With the values of its leading gradient at the points, where this look was enough.
+    """
+    levels = [max(row.order, q.order(row.expression), 0) for row in rows]
+    found = [None] * len(rows)
+    for level in set(levels):
+        members = [a for a, own in enumerate(levels) if own == level and q.order(rows[a].expression) == level]
+        if not members:
+            continue
+        points = sample_rows(q, [], level, context)
+        gradients = [gradient(q, replace(rows[a], order=level)) for a in members]
+        values = clean(*points.matrix(ca.vertcat(*gradients)))
+        for a, slopes, numbers in zip(members, gradients, values, strict=True):
+            if np.any(numbers):
+                affine = q.order(slopes) < level or _affine(q, rows[a].expression, level, points)
+                found[a] = replace(rows[a], order=level, affine=affine), numbers
+    return [pair or (settle(q, row, [], context)[0], None) for pair, row in zip(found, rows, strict=True)]
+
+
 def settle(q, row, others, context, starts=None):
     """Find the order on which a row depends on the manifold of the others, and free it of false symbols.
 

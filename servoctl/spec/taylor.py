@@ -8,52 +8,16 @@ coefficient k of f is f^(k)/k!.
 """
 
 import math
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import casadi as ca
 import numpy as np
 
 from servoctl.errors import SpecificationError
-
-_NUMPY = {
-    "sin": np.sin, "cos": np.cos, "tan": np.tan, "exp": np.exp, "log": np.log, "sqrt": np.sqrt,
-    "asin": np.arcsin, "acos": np.arccos, "atan": np.arctan, "sinh": np.sinh, "cosh": np.cosh,
-    "tanh": np.tanh, "asinh": np.arcsinh, "acosh": np.arccosh, "atanh": np.arctanh, "expm1": np.expm1,
-    "log1p": np.log1p, "sign": np.sign, "fabs": np.abs, "atan2": np.arctan2,
-    "power": np.power,
-    "lt": lambda a, b: 1.0 * (a < b), "le": lambda a, b: 1.0 * (a <= b),
-    "eq": lambda a, b: 1.0 * (a == b), "ne": lambda a, b: 1.0 * (a != b),
-    "logic_and": lambda a, b: 1.0 * ((a != 0) & (b != 0)), "logic_or": lambda a, b: 1.0 * ((a != 0) | (b != 0)),
-    "logic_not": lambda a: 1.0 * (a == 0),
-}  # fmt: skip
-_CASADI = {name: getattr(ca, name) for name in _NUMPY} | {"erf": ca.erf}
+from servoctl.spec.elementary import apply, select
 
 
-def _np_erf(x):
-    from scipy.special import erf
-
-    return erf(np.asarray(x, dtype=float))
-
-
-_NUMPY["erf"] = _np_erf
-
-
-def apply(name, *args):
-    """The function `name` on SX expressions or on numbers and arrays, whichever is given."""
-    if any(isinstance(a, ca.SX) for a in args):
-        return _CASADI[name](*args)
-    return _NUMPY[name](*args)
-
-
-def select(condition, yes, no):
-    """`yes` where `condition` is not zero, else `no`; works on SX expressions and on arrays."""
-    if any(isinstance(a, ca.SX) for a in (condition, yes, no)):
-        return ca.if_else(condition, yes, no)
-    return np.where(condition, yes, no)
-
-
-@dataclass(frozen=True)
-class Node:
+class Node(NamedTuple):
     """One primitive operation: `kind`, the nodes it takes, and a constant or a function's name."""
 
     kind: str
@@ -62,10 +26,8 @@ class Node:
 
 
 # y' = sum of g * a' with y_0 = f(a_0): each function with such a rule is one "quadrature" node
-_BINARY = {
-    ca.OP_ADD: "add", ca.OP_SUB: "sub", ca.OP_MUL: "mul", ca.OP_DIV: "div", ca.OP_FMIN: "fmin", ca.OP_FMAX: "fmax",
-    ca.OP_IF_ELSE_ZERO: "gate",
-}  # fmt: skip
+_BINARY = {ca.OP_FMIN: "fmin", ca.OP_FMAX: "fmax", ca.OP_IF_ELSE_ZERO: "gate"}
+_PLAIN = {ca.OP_ADD: "add", ca.OP_SUB: "sub", ca.OP_MUL: "mul", ca.OP_DIV: "div"}  # of two, without a branch
 _UNARY = {ca.OP_NEG: "neg", ca.OP_SQ: "sq", ca.OP_SQRT: "sqrt", ca.OP_FABS: "fabs", ca.OP_ASSIGN: "copy"}
 _CONSTANT = {
     ca.OP_LT: "lt", ca.OP_LE: "le", ca.OP_EQ: "eq", ca.OP_NE: "ne", ca.OP_AND: "logic_and", ca.OP_OR: "logic_or",
@@ -116,21 +78,23 @@ class Tape:
         return len(self.nodes) - 1
 
     def _read(self, function):
-        work = {}
+        work, nodes = {}, self.nodes
+        read, taken, made = function.instruction_id, function.instruction_input, function.instruction_output
         for k in range(function.n_instructions()):
-            op, inputs, outputs = (
-                function.instruction_id(k),
-                function.instruction_input(k),
-                function.instruction_output(k),
-            )
-            if op == ca.OP_INPUT:
-                work[outputs[0]] = self.inputs[inputs[1]]
-            elif op == ca.OP_OUTPUT:
-                self.outputs[outputs[1]] = work[inputs[0]]
+            op, inputs = read(k), taken(k)
+            if op == ca.OP_OUTPUT:
+                self.outputs[made(k)[1]] = work[inputs[0]]
+                continue
+            place = made(k)[0]
+            if op in _PLAIN:
+                nodes.append(Node(_PLAIN[op], (work[inputs[0]], work[inputs[1]])))
+                work[place] = len(nodes) - 1
+            elif op == ca.OP_INPUT:
+                work[place] = self.inputs[inputs[1]]
             elif op == ca.OP_CONST:
-                work[outputs[0]] = self._add("const", data=function.instruction_constant(k))
+                work[place] = self._add("const", data=function.instruction_constant(k))
             else:
-                work[outputs[0]] = self._operation(op, [work[i] for i in inputs])
+                work[place] = self._operation(op, [work[i] for i in inputs])
         zero = None
         for i, node in enumerate(self.outputs):
             if node is None:
@@ -247,7 +211,10 @@ class Tape:
 
 
 def _is_zero(c):
-    return isinstance(c, (int, float)) and c == 0
+    return c.__class__ in _NUMBERS and c == 0
+
+
+_NUMBERS = (float, int)
 
 
 def _dot(pairs):
@@ -295,9 +262,35 @@ class Series:
     def advance(self):
         """Compute the next coefficient of every node."""
         k, c = self.k, self.c
-        for i, node in enumerate(self.tape.nodes):
-            c[i].append(self._coefficient(node, i, k))
+        if k == 0:
+            self._start()
+        else:
+            for i, node in enumerate(self.tape.nodes):
+                c[i].append(self._coefficient(node, i, k))
         self.k += 1
+
+    def _start(self):
+        """Coefficient 0 of every node: its value, without the recurrences."""
+        c, inputs = self.c, self.inputs
+        for i, (kind, args, data) in enumerate(self.tape.nodes):
+            if kind == "mul":
+                a, b = c[args[0]][0], c[args[1]][0]
+                value = 0.0 if _is_zero(a) or _is_zero(b) else a * b
+            elif kind == "add":
+                value = _plus(c[args[0]][0], c[args[1]][0])
+            elif kind == "sub":
+                a, b = c[args[0]][0], c[args[1]][0]
+                value = a if _is_zero(b) else -1.0 * b if _is_zero(a) else a - b
+            elif kind == "neg":
+                a = c[args[0]][0]
+                value = 0.0 if _is_zero(a) else -a
+            elif kind == "input":
+                value = inputs[data][0]
+            elif kind == "const":
+                value = data
+            else:
+                value = self._coefficient(self.tape.nodes[i], i, 0)
+            c[i].append(value)
 
     def replace_last(self, coefficients):
         """Recompute the last coefficient after the inputs' last coefficients changed.
@@ -408,17 +401,24 @@ def evaluate(tape, inputs):
     series = Series(tape, [[row] for row in inputs])
     with np.errstate(all="ignore"):
         series.advance()
-        v = [np.broadcast_to(np.asarray(c[0], dtype=inputs.dtype), inputs.shape[1:]) for c in series.c]
-        size = [np.abs(x) for x in v]
-        for i, node in enumerate(tape.nodes):
-            size[i] = _size(node, i, v, size)
-    return np.array([v[i] for i in tape.outputs]), np.array([size[i] for i in tape.outputs])
+        v = [c[0] for c in series.c]
+        size = [abs(x) for x in v]
+        for i, (kind, args, _) in enumerate(tape.nodes):
+            if kind == "mul":
+                a, b = args
+                size[i] = abs(v[a]) * size[b] + size[a] * abs(v[b])
+            elif kind in ("add", "sub"):
+                size[i] = size[args[0]] + size[args[1]]
+            elif kind not in ("input", "const", "constant"):
+                size[i] = _size(tape.nodes[i], i, v, size)
+    result = np.empty((2, len(tape.outputs), *inputs.shape[1:]), dtype=inputs.dtype)
+    for row, output in enumerate(tape.outputs):
+        result[0, row], result[1, row] = v[output], size[output]
+    return result[0], result[1]
 
 
 def _size(node, i, v, size):
     kind, a = node.kind, node.args
-    if kind in ("input", "const", "constant"):
-        return size[i]
     if kind == "quad":
         return np.abs(v[i]) + sum(np.abs(np.nan_to_num(v[g])) * size[j] for j, g in zip(a, node.data[1], strict=True))
     if kind in ("neg", "copy", "fabs"):
@@ -430,10 +430,6 @@ def _size(node, i, v, size):
     if kind in ("sqrt", "power"):
         exponent = 0.5 if kind == "sqrt" else node.data
         return np.abs(v[i]) * (1.0 + abs(exponent) * size[a[0]] / np.maximum(np.abs(v[a[0]]), np.finfo(float).tiny))
-    if kind in ("add", "sub"):
-        return size[a[0]] + size[a[1]]
-    if kind == "mul":
-        return np.abs(v[a[0]]) * size[a[1]] + size[a[0]] * np.abs(v[a[1]])
     if kind == "div":
         return (size[a[0]] + np.abs(v[i]) * size[a[1]]) / np.abs(v[a[1]])
     if kind == "gate":

@@ -34,8 +34,8 @@ class TradeOff(Study):
     its unit; energy: energy gained less the work done along the reference, relative to the largest energy; power:
     dE/dt less the power of all forces, relative (NaN where it does not apply); evaluations of the right-hand side, or
     of the series, or Newton steps; steps; seconds: the shortest call after a warm-up, with 51 samples by methods that
-    find their steps (more samples take longer), and one at each instant or step by the others; resolved: whether the error
-    exceeds the reference's own uncertainty; failure: why there is no number.
+    find their steps (more samples take longer), and one at each instant or step by the others; resolved: whether the
+    error exceeds the reference's own uncertainty; failure: why there is no number.
     """
 
     COLUMNS = (

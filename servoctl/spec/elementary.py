@@ -1,0 +1,40 @@
+"""Elementary functions of SX expressions or of arrays, whichever is given."""
+
+import casadi as ca
+import numpy as np
+
+_NUMPY = {
+    "sin": np.sin, "cos": np.cos, "tan": np.tan, "exp": np.exp, "log": np.log, "sqrt": np.sqrt,
+    "asin": np.arcsin, "acos": np.arccos, "atan": np.arctan, "sinh": np.sinh, "cosh": np.cosh,
+    "tanh": np.tanh, "asinh": np.arcsinh, "acosh": np.arccosh, "atanh": np.arctanh, "expm1": np.expm1,
+    "log1p": np.log1p, "sign": np.sign, "fabs": np.abs, "atan2": np.arctan2,
+    "power": np.power,
+    "lt": lambda a, b: 1.0 * (a < b), "le": lambda a, b: 1.0 * (a <= b),
+    "eq": lambda a, b: 1.0 * (a == b), "ne": lambda a, b: 1.0 * (a != b),
+    "logic_and": lambda a, b: 1.0 * ((a != 0) & (b != 0)), "logic_or": lambda a, b: 1.0 * ((a != 0) | (b != 0)),
+    "logic_not": lambda a: 1.0 * (a == 0),
+}  # fmt: skip
+_CASADI = {name: getattr(ca, name) for name in _NUMPY} | {"erf": ca.erf}
+
+
+def _np_erf(x):
+    from scipy.special import erf
+
+    return erf(np.asarray(x, dtype=float))
+
+
+_NUMPY["erf"] = _np_erf
+
+
+def apply(name, *args):
+    """The function `name` on SX expressions or on numbers and arrays, whichever is given."""
+    if any(isinstance(a, ca.SX) for a in args):
+        return _CASADI[name](*args)
+    return _NUMPY[name](*args)
+
+
+def select(condition, yes, no):
+    """`yes` where `condition` is not zero, else `no`; works on SX expressions and on arrays."""
+    if any(isinstance(a, ca.SX) for a in (condition, yes, no)):
+        return ca.if_else(condition, yes, no)
+    return np.where(condition, yes, no)
