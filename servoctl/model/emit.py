@@ -19,7 +19,7 @@ from servoctl.model.loops import BISECTIONS, GRID, LOOPS, NEAR, PROJECTION, QUAD
 
 CHUNK = 350  # statements per C function: compile time is least, and flat, between 250 and 500
 WIDE = 3000  # operations: up to here a function is emitted for eight points at once as well
-SHARED = 3  # divisions by the same value: from here on its reciprocal is taken once, and multiplied with
+SHARED = 2  # divisions by the same value: from here on its reciprocal is taken once, and multiplied with
 
 _LIBM_1 = (
     "sqrt exp log expm1 log1p sin cos tan asin acos atan sinh cosh tanh asinh acosh atanh fabs floor ceil erf"
