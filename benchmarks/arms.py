@@ -4,7 +4,6 @@ Pinocchio solves the same with a contact of the end point. We get the bodies wit
 joint angles, whichever is faster; their rates agree in all joints.
 """
 
-import ctypes
 from functools import cache, partial
 
 import numpy as np
@@ -76,15 +75,17 @@ def ours(n, spatial, in_place, coordinates):
     f, p = arm(n, spatial, coordinates)
     q, v = state(n)
     x = np.concatenate([q, v]) if coordinates == "joints" else bodies_state(n, spatial, q, v)
-    point = f.native("point")
-    row = np.concatenate([[0.0], x, p, np.zeros(f.n_y)])
-    y, address = row[-f.n_y :], ctypes.c_void_p(row.ctypes.data)
+    t, row_x, row_p, y, run = f.buffer()
 
     def call():
-        point(address)
+        run()
         return y
 
-    return call if in_place else lambda: f(0.0, x, p)
+    def plain():
+        return f(0.0, x, p)
+
+    t[0], row_x[:], row_p[:] = 0.0, x, p
+    return call if in_place else plain
 
 
 # peers ---------------------------------------------------------------------------------------------------------------

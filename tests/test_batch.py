@@ -124,6 +124,36 @@ def test_without_a_compiler_the_loops_are_closed_one_by_one(plan, cases, monkeyp
             assert alone[name] == pytest.approx(there[name], rel=1e-11, abs=1e-13), name
 
 
+LAWS = {
+    "feedforward": lambda plan, plant: sv.feedforward(plan, plant, rate=100.0),
+    "pd": lambda plan, plant: sv.pd(plan, plant, 100.0, {"trolley": 90.0, "hoist": 200.0}, {"trolley": 90.0, "hoist": 90.0}),
+    "computed": lambda plan, plant: sv.computed(plan, plant, rate=100.0),
+    "estimating": lambda plan, plant: sv.output_feedback(sv.lqr(plan, plant, 100.0), plant, {"x": 1e-3, "l": 1e-3, "theta": 1e-3}),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", LAWS)
+def test_laws_of_the_toolkit(plan, name):
+    plant = sv.plant(CRANE)
+    law = LAWS[name](plan, plant)
+    loads = np.linspace(90.0, 110.0, 9)
+    many = sv.close_many(plant, law, plan.state(0.0), (0.0, 1.0), {"m_load": loads}, substeps=2)
+    for i in (0, 8):
+        run = sv.close(sv.plant(CRANE, m_load=loads[i]), law, plan.state(0.0), (0.0, 1.0), substeps=2)
+        for state, row in zip(plant.state_names, run.states, strict=True):
+            assert many[f"final {state}"][i] == pytest.approx(row[-1], rel=1e-10, abs=1e-12)
+
+
+def test_a_long_plant_is_called_not_written_into_the_steps(plan, cases, monkeypatch):
+    plant = sv.plant(CRANE, damping={"x": 5.0})
+    arguments = (plan.state(0.0), (0.0, 1.0), {"m_load": cases["m_load"]})
+    short, long = [], []
+    for inlined, kept in ((batch.INLINED, short), (0, long)):
+        monkeypatch.setattr(batch, "INLINED", inlined)
+        kept += [sv.close_many(plant, sv.lqr(plan, plant, rate=100.0), *arguments)["max |theta|"]]
+    assert long[0] == pytest.approx(short[0], rel=1e-13)
+
+
 def test_cases_keep_their_seeds_when_there_are_more(plan):
     plant = sv.plant(CRANE)
     law = sv.feedforward(plan, plant, rate=50.0)

@@ -257,6 +257,7 @@ def test_nowhere_to_write_is_an_error_not_a_traceback(here, fall, capsys, monkey
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(servoctl.Run, "save", full)
+    monkeypatch.setattr("tempfile.tempdir", str(here))
     assert main(["run", fall, "--no-verify"]) == 2
     out, err = capsys.readouterr()
     assert "Run: " in out and "cannot be written, either" in words(err)

@@ -204,7 +204,7 @@ def test_a_flat_program_leaves_nothing_to_integrate(method, gallery_model):
     run = sv.simulate(model, model.start(), (0.0, 6.0), method=method, drift="minimal")
     assert run.method == "algebraic" and run.drift == "minimal coordinates" and "integrated" not in run.counters
     plain = sv.simulate(model, model.start(), (0.0, 6.0))
-    assert np.array_equal(run.jets, plain.jets)
+    assert run.jets == pytest.approx(plain.jets, rel=1e-12, abs=1e-14)  # of CasADi, or of compiled code
 
 
 def test_a_flat_program_is_not_integrated_in_minimal_coordinates(gallery_model):

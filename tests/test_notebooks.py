@@ -31,9 +31,10 @@ def test_there_are_notebooks():
 
 
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
-def test_a_notebook_runs_and_its_numbers_hold(path):
+def test_a_notebook_runs_and_its_numbers_hold(path, tmp_path):
     notebook = nbformat.read(path, as_version=4)
-    manager = AsyncKernelManager(kernel_name="python3", kernel_spec_manager=ThisInterpreter())
+    connection = {"connection_file": str(tmp_path / "kernel.json")}
+    manager = AsyncKernelManager(kernel_name="python3", kernel_spec_manager=ThisInterpreter(), **connection)
     folder = {"metadata": {"path": str(path.parent)}}
     client = NotebookClient(notebook, km=manager, timeout=300, resources=folder)
     paths = os.pathsep.join([str(ROOT), *filter(None, [os.environ.get("PYTHONPATH")])])

@@ -52,7 +52,8 @@ def settled(text):
 
 
 @pages
-def test_python_blocks_execute_and_print_what_is_shown(page):
+def test_python_blocks_execute_and_print_what_is_shown(page, tmp_path, monkeypatch):
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
     shown, printed, names = blocks(page, "text"), io.StringIO(), {}
     with contextlib.redirect_stdout(printed):
         for block in blocks(page, "python"):

@@ -100,7 +100,15 @@ def test_projection_is_refused_with_the_reason(method, model, start):
         sv.simulate(model, start, (0.0, 1.0), method=method, drift="project")
 
 
-def test_ctrl_c_is_no_failure_of_the_integrator(method, model, start):
+@pytest.fixture
+def interruptible():
+    """SIGINT raises KeyboardInterrupt, also where the shell started the tests in the background."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
+def test_ctrl_c_is_no_failure_of_the_integrator(method, model, start, interruptible):
     sv.simulate(model, start, (0.0, 0.1), method=method)  # compiled
     threading.Timer(0.3, lambda: os.kill(os.getpid(), signal.SIGINT)).start()
     run = sv.simulate(model, start, (0.0, 3000.0), method=method, **TIGHT)  # tens of seconds

@@ -15,8 +15,8 @@ from servoctl.model.loops import ROUNDING
 from servoctl.model.loops.batch import BATCH
 from servoctl.model.native import pointer
 
-INLINED = 600  # operations: up to here the plant's rates are written into each stage of a step
-PER_THREAD = 8  # tasks: so that threads end at about the same time
+INLINED = 300  # operations: up to here the plant's rates are written into each stage of a step, for two vectors in turn
+PER_THREAD = 16  # tasks: so that threads end at about the same time
 
 
 def lanes():
@@ -115,7 +115,7 @@ def _derived(plant, law, disturbed, residuals):
     }  # fmt: skip
     functions = [
         _function("numbers", t, constants, ca.SX(0, 1), ca.vertcat(w_values, v_values)),
-        _inlined(_function("rates", t, x, ca.vertcat(w, p[n_c : n_c + n_u], forces[list(disturbed)]), rates)),
+        _of_two(_function("rates", t, x, ca.vertcat(w, p[n_c : n_c + n_u], forces[list(disturbed)]), rates)),
         _of_common(_function("law", t_k, y, common, command)),
         _of_common(_function("told", t_k, ca.vertcat(x, v), s, phi)),
     ]
@@ -144,13 +144,18 @@ def _apart(expression, symbols):
 
 def _function(name, t, x, p, value):
     f = ca.Function(name, [t, x, p], [ca.densify(ca.cse(value))])
-    return f, emit.portable(f, name, shared=2)
+    return f, emit.portable(f, name)
 
 
-def _inlined(function):
+def _of_two(function):
+    """A function for two vectors of cases, statement by statement: one waits for its last while the other goes on."""
     f, text = function
-    short = emit.operations(f) <= INLINED
-    return f, text.replace("static void rates(", "INLINE void rates(") if short else text
+    statements = text.split(")\n{\n", 1)[1]
+    if emit.operations(f) > INLINED:
+        return f, f"{text}\n{_TWO}{{\n    rates(t, x, p, y);\n    rates(t, x2, p2, y2);\n}}\n"
+    lines = [line for line in statements.splitlines() if line.startswith(("    const V a", "    y["))]
+    twice = (part for line in lines for part in (line, _ARGUMENT.sub("2", _VALUE.sub("b", line))))
+    return f, "\n".join([f"{_TWO}{{", *twice, "}", ""])
 
 
 def _of_common(function):
@@ -158,6 +163,12 @@ def _of_common(function):
     f, text = function
     return f, re.sub(r"\bp\[(\d+)\]", r"K(p[\1])", text).replace("const V *restrict p", "const double *restrict p")
 
+
+_TWO = """
+INLINE void rates_of_two(const V t, const V *restrict x, const V *restrict p, V *restrict y,
+                         const V *restrict x2, const V *restrict p2, V *restrict y2)
+"""
+_VALUE, _ARGUMENT = re.compile(r"\ba(?=\d)"), re.compile(r"(?<=\b[xpy])(?=\[)")
 
 _COUNTS = "samples substeps delay depth every n_traced columns".split()
 _WHOLE = ("transport", "traced")
@@ -226,16 +237,16 @@ def run_batch(unit, loop, constants, x0, scale, noise=None, traced=(), every=1, 
     native = unit.library(n)
     if native is None:
         return None
-    count, size = x0.shape[1], len(unit.names)
-    blocks, samples = -(-count // n), np.arange(loop.samples + 1)
-    columns = np.minimum(np.arange(blocks * n), count - 1)
-    found = np.empty((2 + 3 * size, blocks * n))
-    trace = np.empty((loop.samples // every + 1 if len(traced) else 0, len(traced), blocks * n))
+    count, width, size = x0.shape[1], 2 * n, len(unit.names)
+    blocks, samples = -(-count // width), np.arange(loop.samples + 1)
+    columns = np.minimum(np.arange(blocks * width), count - 1)
+    found = np.empty((2 + 3 * size, blocks * width))
+    trace = np.empty((loop.samples // every + 1 if len(traced) else 0, len(traced), blocks * width))
     late = 0 if loop.transport is None else int(np.max(loop.transport)) // loop.substeps + 1
     depth = 1 + max(loop.delay, late)
     given = {
         "samples": loop.samples, "substeps": loop.substeps, "delay": loop.delay, "depth": depth, "every": every,
-        "n_traced": len(traced), "columns": blocks * n, "t0": loop.t0, "period": loop.period, "found": found,
+        "n_traced": len(traced), "columns": blocks * width, "t0": loop.t0, "period": loop.period, "found": found,
         "trace": trace, "traced": np.array(traced, dtype=np.int64), "transport": loop.transport,
         "constants": constants[:, columns], "x0": x0[:, columns], "scale": scale[:, columns],
         "table": _common(unit, loop, samples),
@@ -250,10 +261,10 @@ def run_batch(unit, loop, constants, x0, scale, noise=None, traced=(), every=1, 
     native.restype = None
 
     def run(first, last):
-        own = None if noise is None else np.empty((last - first, loop.samples + 1, unit.n_y, n))
-        for case in range(first * n, last * n) if noise is not None else ():
-            own[case // n - first, :, :, case % n] = noise(columns[case])
-        scratch = np.empty(2 * depth * loop.n_u * n + 1)
+        own = None if noise is None else np.empty((last - first, loop.samples + 1, unit.n_y, width))
+        for case in range(first * width, last * width) if noise is not None else ():
+            own[case // width - first, :, :, case % width] = noise(columns[case])
+        scratch = np.empty(2 * depth * loop.n_u * width + 1)
         native(
             ctypes.byref(arguments), ctypes.c_int64(first), ctypes.c_int64(last),
             None if own is None else pointer(own), pointer(scratch),

@@ -52,7 +52,8 @@ static void NAME_limit(const NAME_loop *c, const double *command, const double *
 
 /* One Runge-Kutta step of order 4, with the rates written into it; d holds the disturbances at its start, middle and
    end. */
-static __attribute__((flatten)) void NAME_rk4(const NAME_loop *c, double t, double h, const double *d, double *x, double *p)
+__attribute__((flatten))
+static void NAME_rk4(const NAME_loop *c, double t, double h, const double *d, double *x, double *p)
 {
     double k1[NAME_nx + 1], k2[NAME_nx + 1], k3[NAME_nx + 1], k4[NAME_nx + 1], z[NAME_nx + 1];
     double *pd = p + c->at_u + c->n_u;

@@ -127,7 +127,7 @@ class Compiled:
         self.name, self.loops, self._project = name, loops, project
         self._others, self._drivers, self._sizes = others or {}, drivers, sizes or {}
         self.n_x, self.n_p, self.n_y = f.numel_in(1), f.numel_in(2), f.numel_out(0)
-        self._f = f
+        self._f, self._symbol = f, f"servoctl_{name}"
         self._x_shape, self._p_shape = (self.n_x,), (self.n_p,)
         self._evaluator = Interpreter(f, project, self._sizes)
         self._settled, self._text, self._calls, self._points = False, None, 0, 0
@@ -149,7 +149,7 @@ class Compiled:
     @property
     def backend(self):
         """``"c"`` once calls run the compiled library, ``"casadi"`` while CasADi evaluates them."""
-        return self._evaluator.backend
+        return self.__dict__.get("_lanes", self._evaluator).backend
 
     def __call__(self, t, x, p):
         """Evaluate at one point.
@@ -221,9 +221,9 @@ class Compiled:
         t = self._array("t", np.broadcast_to(t, (n,)) if np.ndim(t) == 0 else t, (n,))
         p = self._array("p", p, (self.n_p, n) if np.ndim(p) == 2 else self._p_shape)
         self._points += n
-        self._settle(self._points > GRID_POINTS or _AT_ONCE.get())
+        self._settle(build=False)
         y = np.empty((self.n_y, n))
-        self._evaluator.grid(t, x, p, y)
+        (self._lanes if self._points > GRID_POINTS or _AT_ONCE.get() else self._evaluator).grid(t, x, p, y)
         return y
 
     def rk(self, t0, x0, h, n_steps, p, tableau, every=1, project_every=0):
@@ -401,14 +401,24 @@ class Compiled:
         """Move from CasADi to the library: at the first call if one is at hand, later if it is to be built."""
         if self._settled or (self._text is not None and not build):
             return
-        symbol = f"servoctl_{self.name}"
-        parts = {"others": self._others, "drivers": self._drivers, "sizes": self._sizes}
-        text = self._text or emit.emit(self._f, symbol, self.loops, project=self._project, **parts)
+        parts = {"project": self._project, "others": self._others, "drivers": self._drivers, "sizes": self._sizes}
+        parts["wide"] = "newton" in self.loops
+        text = self._text or emit.emit(self._f, self._symbol, self.loops, **parts)
         library = compiler.library(text, build, "-O3" if {"newton", "taylor"} & {*self.loops} else "-O1")
         if library is not None:
-            self._evaluator = Library(library, symbol, self.n_x, self.n_p, self.n_y)
+            self._evaluator = Library(library, self._symbol, self.n_x, self.n_p, self.n_y)
         self._settled = build or library is not None
         self._text = None if self._settled else text
+
+    @functools.cached_property
+    def _lanes(self):
+        """What evaluates long grids: a library of its own, as twice the code takes twice the time to compile."""
+        if "newton" not in self.loops:
+            library = compiler.library(emit.emit(self._f, self._symbol), level="-O1")
+            if library is not None:
+                return Library(library, self._symbol, self.n_x, self.n_p, self.n_y)
+        self._settle(build=True)
+        return self._evaluator
 
     def _place(self, t, x, p):
         """Put t, x and p where the evaluator reads them; where it writes y, and its call."""

@@ -92,6 +92,27 @@ static V v_erfinv(V a)
 }
 """
 
+_AS_CASADI = """
+
+int NAME_casadi(const double **arg, double **res, long long *iw, double *w, int mem)
+{
+    NAME(*arg[0], arg[1], arg[2], res[0]);
+    return 0;
+}
+long long NAME_casadi_n_in(void) { return 3; }
+long long NAME_casadi_n_out(void) { return 1; }
+const long long *NAME_casadi_sparsity_in(long long i)
+{
+    static const long long dense[3][3] = {{1, 1, 1}, {N_X, 1, 1}, {N_P, 1, 1}};
+    return dense[i];
+}
+const long long *NAME_casadi_sparsity_out(long long i)
+{
+    static const long long dense[3] = {N_Y, 1, 1};
+    return dense;
+}
+"""
+
 _SIGNATURE = "const V t, const V *restrict x, const V *restrict p, V *restrict y"
 
 
@@ -111,11 +132,11 @@ def operations(f):
     return sum(f.instruction_id(k) not in _NOT_ARITHMETIC for k in range(f.n_instructions()))
 
 
-def emit(f, name, loops=(), chunk=CHUNK, project=None, others=None, drivers="", sizes=None):
+def emit(f, name, loops=(), chunk=CHUNK, project=None, others=None, drivers="", sizes=None, wide=True):
     """C translation unit of a function and of the loops over it.
 
     It defines ``void name(double t, const double *x, const double *p, double *y)`` (``y`` overlaps no input),
-    ``name_point``, ``name_grid`` and a ``name_LOOP`` for each loop asked for.
+    ``name_point``, ``name_grid``, ``name_casadi``, which CasADi can call, and a ``name_LOOP`` for each loop asked for.
 
     Parameters
     ----------
@@ -135,6 +156,8 @@ def emit(f, name, loops=(), chunk=CHUNK, project=None, others=None, drivers="", 
         C text to append, with the placeholders of the loops.
     sizes : dict of str to int, optional
         Constants ``name_KEY`` for the loops and drivers.
+    wide : bool
+        Whether grids, and Newton's method, may take eight points at once, by a second copy of f.
 
     Returns
     -------
@@ -156,7 +179,7 @@ def emit(f, name, loops=(), chunk=CHUNK, project=None, others=None, drivers="", 
         body += _function(project, f"{name}_project", chunk)
     for key, other in (others or {}).items():
         body += _function(other, f"{name}_{key}", chunk)
-    wide = operations(f) <= WIDE
+    wide = wide and operations(f) <= WIDE
     if wide:
         copies = _function(f, f"{name}_wide", chunk)
         if "newton" in loops:
@@ -165,7 +188,7 @@ def emit(f, name, loops=(), chunk=CHUNK, project=None, others=None, drivers="", 
     wanted = [text for loop, text in LOOPS.items() if loop in loops]
     constants = f"#define NAME_wide_lanes {int(wide)}\n"
     constants += "".join(f"enum {{ NAME_{key} = {value} }};\n" for key, value in (sizes or {}).items())
-    drivers = "".join((constants, GRID, PROJECTION if project else "", *wanted, drivers))
+    drivers = "".join((constants, _AS_CASADI, GRID, PROJECTION if project else "", *wanted, drivers))
     drivers = drivers.replace("NAME_PROJECT(", "NAME_restore(" if project else "(void)(")
     for key, value in {
         "N_X": f.numel_in(1),
@@ -187,9 +210,9 @@ def _first(f, n):
     return ca.Function(f.name(), inputs, [f(*inputs)[:n]])
 
 
-def _function(f, name, chunk, shared=SHARED):
+def _function(f, name, chunk):
     """The text of one C function, in chunks where it is long."""
-    statements = _with_reciprocals(_statements(f), shared)
+    statements = _with_reciprocals(_statements(f))
     chunks = [statements[k : k + chunk] for k in range(0, len(statements), chunk)]
     return _single(name, statements) if len(chunks) <= 1 else _chunked(name, chunks)
 
@@ -231,12 +254,12 @@ def _statements(f):
     return statements
 
 
-def _with_reciprocals(statements, shared):
-    """The statements with one reciprocal for all divisions by the same value, where these are `shared` or more."""
+def _with_reciprocals(statements):
+    """The statements with one reciprocal for all divisions by the same value, where these are `SHARED` or more."""
     division, product = _TEMPLATES[ca.OP_DIV], _TEMPLATES[ca.OP_MUL]
     divisors = Counter(operands[1] for _, template, operands in statements if template == division)
     new = count(len(statements))
-    reciprocal = {v: next(new) for v, n in divisors.items() if n >= shared and isinstance(v, int)}
+    reciprocal = {v: next(new) for v, n in divisors.items() if n >= SHARED and isinstance(v, int)}
     found, made = [], set()
     for target, template, operands in statements:
         if template == division and operands[1] in reciprocal:
@@ -301,7 +324,7 @@ def _slots(chunks, home):
     return slots, n_slots
 
 
-def portable(f, name, shared=SHARED):
+def portable(f, name):
     """C99 text of one static function, without attributes and warnings, for a file that begins with `prelude`.
 
     Parameters
@@ -310,14 +333,12 @@ def portable(f, name, shared=SHARED):
         As `emit` takes it.
     name : str
         A C identifier.
-    shared : int
-        So many divisions by the same value take its reciprocal.
 
     Returns
     -------
     str
     """
-    text = _function(f, name, CHUNK, shared).replace("__attribute__((noinline)) ", "")
+    text = _function(f, name, CHUNK).replace("__attribute__((noinline)) ", "")
     for begin, used in ((f"{_SIGNATURE})\n{{\n", "txpy"), (f"{_SIGNATURE}, V *restrict w)\n{{\n", "txpyw")):
         text = text.replace(begin, f"{begin}    {' '.join(f'(void){argument};' for argument in used)}\n")
     return text.replace(f"\nvoid {name}(", f"\nstatic void {name}(")

@@ -31,6 +31,16 @@ class Workspace(threading.local):
         return self._log
 
 
+def connected(f, parts):
+    """The call of a CasADi function on arrays t, x, p, y, and what must be kept as long as it may be called."""
+    with _guard:
+        buffer, run = f.buffer()
+    for i, part in enumerate(parts[:3]):
+        buffer.set_arg(i, memoryview(part))
+    buffer.set_res(0, memoryview(parts[3]))
+    return run, buffer
+
+
 class Interpreter:
     """Evaluation by CasADi, with the loops of `emit` in Python."""
 
@@ -41,12 +51,7 @@ class Interpreter:
         self.workspace = Workspace(self._n_x, f.numel_in(2), f.numel_out(0), self._connect)
 
     def _connect(self, row, parts):
-        with _guard:
-            buffer, run = self._f.buffer()
-        for i, part in enumerate(parts[:3]):
-            buffer.set_arg(i, memoryview(part))
-        buffer.set_res(0, memoryview(parts[3]))
-        return run, buffer
+        return connected(self._f, parts)
 
     def _value(self, t, x, p):
         row_t, row_x, row_p, row_y, run = self.workspace.row

@@ -61,9 +61,8 @@ def close_many(
 ):  # fmt: skip
     """Run closed loops of one plant and one law with other numbers in each: what `close` does, thousands of times.
 
-    The loops run in compiled code, several in the lanes of each processor core's vectors, on threads; without a
-    compiler they are closed one after the other. Each case equals `close` of its numbers to rounding, and does not
-    depend on which cases run beside it, or on how many threads.
+    The loops run in compiled code, in the lanes of vectors and on threads; without a compiler one after the other. Each
+    equals `close` of its numbers to rounding, and depends neither on the cases beside it nor on threads.
 
     Main arguments
 
@@ -120,40 +119,20 @@ def close_many(
         If material constraints do not hold at the start of a case.
     """
     _require(plant, law)
-    plan = law.plan if plan is None else plan
-    columns = _columns(cases)
-    if noise is None and seed is not None:
-        raise SpecificationError("A seed was given without noise.", "The seed is that of the noise.", do="Remove it.")
-    given = {"disturbances": disturbance, "noise": noise, "quantisation": quantisation}
-    conditions = Conditions(*(dict(mapping(values, f"The {what}")) for what, values in given.items()))
-    span_, late = span(t_span), whole(delay, "delay", "samples")
-    loop = prepared(plant, law, x0, span_, late, conditions, substeps)
-    constants, starts, factors = _numbers(plant, columns, loop, conditions.disturbance, mapping(scale, "The scales"))
-    _require_consistent(plant, loop.t0, constants, starts)
-    if substeps is None:
-        substeps = _most_steps(plant, law, loop, constants, starts)
-        loop = loop if substeps == loop.substeps else prepared(plant, law, x0, span_, late, conditions, substeps)
-    residuals = None if plan is None else Residuals(plan.model, plant)
-    if residuals is not None and not residuals.names:
-        residuals = None
-    derived = unit(plant, law, tuple(loop.disturbed.tolist()), residuals)
-    for name in record:
-        if name not in derived.names:
-            raise unknown(name, derived.names, "signal")
-    every, threads = _count("every", every), threads if threads is None else _count("threads", threads)
-    seeds = None
-    if conditions.noise:
-        seed = require_seed(seed or 0)
-        seeds = [int(generator(seed, CASES, i).integers(SEEDS)) for i in range(starts.shape[1])]
+    plan, columns = law.plan if plan is None else plan, _columns(cases)
+    conditions = _conditions(disturbance, noise, quantisation, seed)
+    arguments = (plant, law, x0, span(t_span), whole(delay, "delay", "samples"), conditions)
+    loop, numbers = _prepared(arguments, substeps, columns, mapping(scale, "The scales"))
+    derived = _unit(plant, law, plan, loop)
+    traced, every = [_index(name, derived.names) for name in record], _count("every", every)
+    seeds = _seeds(conditions, len(columns[next(iter(columns))]))
     own_noise = seeds and (lambda case: noisy(conditions.noise, law.measures, loop.samples + 1, seeds[case]))
-    traced = [derived.names.index(name) for name in record]
-    found = run_batch(derived, loop, constants, starts, factors, own_noise, traced, every, threads)
+    threads = threads if threads is None else _count("threads", threads)
+    found = run_batch(derived, loop, *numbers, own_noise, traced, every, threads)
     if found is None:
-        found = _one_by_one(
-            plant, law, loop, constants, starts, factors, conditions, seeds, plan, derived, traced, every
-        )
-    meta = {"law": law.name, "t_span": list(span_), "rate": law.rate, "substeps": loop.substeps, "delay": loop.delay}
-    study = _study(columns, seeds, derived.names, found, meta | {"machine": machine()})
+        found = _one_by_one(plant, law, plan, derived, loop, numbers, conditions, seeds, traced, every)
+    meta = {"law": law.name, "rate": law.rate, "substeps": loop.substeps, "delay": loop.delay, "machine": machine()}
+    study = _study(columns, seeds, derived.names, found, {"t_span": list(span(t_span))} | meta)
     t = loop.t0 + np.arange(len(found.trace)) * every * loop.period
     return Batch(study, t, dict(zip(record, np.moveaxis(found.trace, 1, 0), strict=True)))
 
@@ -161,14 +140,46 @@ def close_many(
 def _require(plant, law):
     require_plant(plant)
     if not isinstance(law, Law) or not isinstance(law.step, Compiled):
-        what = f"the law {law.name!r}" if isinstance(law, Law) else f"a {type(law).__name__}"
+        what = f"The law {law.name!r}" if isinstance(law, Law) else f"A {type(law).__name__}"
         raise SpecificationError(
-            f"{what} was given, which answers in Python.".capitalize(),
+            f"{what} was given, which answers in Python.",
             "Loops run side by side in compiled code, laws among it.",
             nearest="sv.sweep(case, cases), whose cases may close any loop.",
             do="Use it, or a law of the toolkit without allocation.",
         )
     require_names(law, plant)
+
+
+def _conditions(disturbance, noise, quantisation, seed):
+    if not noise and seed is not None:
+        raise SpecificationError("A seed was given without noise.", "The seed is that of the noise.", do="Remove it.")
+    given = {"disturbances": disturbance, "noise": noise, "quantisation": quantisation}
+    by_name = (dict(mapping(values, f"The {what}")) for what, values in given.items())
+    return Conditions(*by_name, 0 if seed is None else require_seed(seed))
+
+
+def _prepared(arguments, substeps, columns, scale):
+    """What the loops have in common, and their own parameters, starts and factors of disturbances."""
+    plant, law, *_, conditions = arguments
+    loop = prepared(*arguments, substeps)
+    numbers = _numbers(plant, columns, loop, conditions.disturbance, scale)
+    _require_consistent(plant, loop.t0, *numbers[:2])
+    if substeps is None:
+        substeps = _most_steps(plant, law, loop, *numbers[:2])
+        loop = loop if substeps == loop.substeps else prepared(*arguments, substeps)
+    return loop, numbers
+
+
+def _unit(plant, law, plan, loop):
+    residuals = None if plan is None else Residuals(plan.model, plant)
+    return unit(plant, law, tuple(loop.disturbed.tolist()), residuals if residuals and residuals.names else None)
+
+
+def _seeds(conditions, n):
+    """The seed of each case's noise; None without noise."""
+    if not conditions.noise:
+        return None
+    return [int(generator(conditions.seed, CASES, i).integers(SEEDS)) for i in range(n)]
 
 
 def _columns(cases):
@@ -245,6 +256,12 @@ def _most_steps(plant, law, loop, constants, starts):
     return max(loop.substeps, steps(slowest, law.period, None, loop.t0, starts[:, case], loop.idle)[0])
 
 
+def _index(name, names):
+    if name not in names:
+        raise unknown(name, names, "signal")
+    return names.index(name)
+
+
 def _count(name, value):
     number = whole(value, name, "")
     if number < 1:
@@ -252,8 +269,9 @@ def _count(name, value):
     return number
 
 
-def _one_by_one(plant, law, loop, constants, starts, factors, conditions, seeds, plan, derived, traced, every):
+def _one_by_one(plant, law, plan, derived, loop, numbers, conditions, seeds, traced, every):
     """The same by `close`, where there is no compiler."""
+    constants, starts, factors = numbers
     n, size = starts.shape[1], len(derived.names)
     lost = np.full((2, n), np.inf)
     found = np.full((3, size, n), np.nan)

@@ -87,7 +87,7 @@ INLINE void sample(const Batch *c, int64_t k, int64_t at, const double *noise, C
     const int64_t here = k % c->depth;
     V *x = s->x, *u = s->u, *y = s->y;
     for (int i = 0; i < NY; i++) y[i] = x[measured[i]];
-    if (noise) for (int i = 0; i < NY; i++) y[i] += load(noise + (k * NY + i) * W_LANES);
+    if (noise) for (int i = 0; i < NY; i++) y[i] += load(noise + (k * NY + i) * 2 * W_LANES);
     if (c->quantum) for (int i = 0; i < NY; i++) {
         const double q = c->quantum[i];
         if (q > 0) y[i] = q * rounded(y[i] / q);
@@ -132,26 +132,33 @@ INLINE void transported(const Batch *c, int64_t step, Cases *s)
     }
 }
 
-/* x' at one stage of a step, with its disturbances d. */
-INLINE void stage(double t, const double *d, const V *x, Cases *s, V *k)
+/* x' of both vectors at one stage of a step, with its disturbances d. */
+INLINE void stage(double t, const double *d, const V *x, const V *x2, Cases *s, V k[2][NX + 1])
 {
-    for (int i = 0; i < ND; i++) s->p[NW + NU + i] = d[i] * s->scale[i];
-    rates(K(t), x, s->p, k);
+    for (int i = 0; i < ND; i++) for (int g = 0; g < 2; g++) s[g].p[NW + NU + i] = d[i] * s[g].scale[i];
+    rates_of_two(K(t), x, s[0].p, k[0], x2, s[1].p, k[1]);
+}
+
+INLINE void onward(const Cases *s, double h, V k[2][NX + 1], V z[2][NX + 1])
+{
+    for (int i = 0; i < NX; i++) for (int g = 0; g < 2; g++) z[g][i] = s[g].x[i] + h * k[g][i];
 }
 
 /* One Runge-Kutta step of order 4; d holds the disturbances at its start, middle and end. */
 INLINE void advance(double t, double h, const double *d, Cases *s)
 {
-    V k1[NX + 1], k2[NX + 1], k3[NX + 1], k4[NX + 1], z[NX + 1], *x = s->x;
+    V k1[2][NX + 1], k2[2][NX + 1], k3[2][NX + 1], k4[2][NX + 1], z[2][NX + 1];
     const double half = h / 2, sixth = h / 6;
-    stage(t, d, x, s, k1);
-    for (int i = 0; i < NX; i++) z[i] = x[i] + half * k1[i];
-    stage(t + half, d + ND, z, s, k2);
-    for (int i = 0; i < NX; i++) z[i] = x[i] + half * k2[i];
-    stage(t + half, d + ND, z, s, k3);
-    for (int i = 0; i < NX; i++) z[i] = x[i] + h * k3[i];
-    stage(t + h, d + 2 * ND, z, s, k4);
-    for (int i = 0; i < NX; i++) x[i] += sixth * (k1[i] + 2.0 * (k2[i] + k3[i]) + k4[i]);
+    stage(t, d, s[0].x, s[1].x, s, k1);
+    onward(s, half, k1, z);
+    stage(t + half, d + ND, z[0], z[1], s, k2);
+    onward(s, half, k2, z);
+    stage(t + half, d + ND, z[0], z[1], s, k3);
+    onward(s, h, k3, z);
+    stage(t + h, d + 2 * ND, z[0], z[1], s, k4);
+    for (int i = 0; i < NX; i++) for (int g = 0; g < 2; g++) {
+        s[g].x[i] += sixth * (k1[g][i] + 2.0 * (k2[g][i] + k3[g][i]) + k4[g][i]);
+    }
 }
 
 INLINE void end(const Batch *c, int64_t at, const Cases *s)
@@ -166,32 +173,34 @@ INLINE void end(const Batch *c, int64_t at, const Cases *s)
     }
 }
 
-/* The loops of one block; the last commands and inputs, as many as the delays need, are in scratch. */
+/* The loops of one block, two vectors of cases; the last commands and inputs, as many as the delays need, are in
+   scratch. */
 static void block(const Batch *c, int64_t at, const double *noise, double *scratch)
 {
-    Cases s;
+    Cases s[2];
     const double h = c->period / (double)c->substeps;
-    begin(c, at, scratch, &s);
+    for (int g = 0; g < 2; g++) begin(c, at + g * W_LANES, scratch + g * 2 * c->depth * NU * W_LANES, s + g);
     for (int64_t k = 0; ; k++) {
-        sample(c, k, at, noise, &s);
+        for (int g = 0; g < 2; g++) sample(c, k, at + g * W_LANES, noise ? noise + g * W_LANES : 0, s + g);
         if (k == c->samples) break;
         for (int64_t i = 0; i < c->substeps; i++) {
             const double t = c->t0 + (double)k * c->period + (double)i * h;
             const int64_t step = k * c->substeps + i;
-            if (c->transport) transported(c, step, &s);
-            advance(t, h, c->disturbance + 3 * step * ND, &s);
+            if (c->transport) for (int g = 0; g < 2; g++) transported(c, step, s + g);
+            advance(t, h, c->disturbance + 3 * step * ND, s);
 #if INVARIANTS
-            restore(K(t + h), s.x, s.constants);
+            for (int g = 0; g < 2; g++) restore(K(t + h), s[g].x, s[g].constants);
 #endif
         }
     }
-    end(c, at, &s);
+    for (int g = 0; g < 2; g++) end(c, at + g * W_LANES, s + g);
 }
 
 void batch(const Batch *c, int64_t first, int64_t last, const double *noise, double *scratch)
 {
+    const int64_t width = 2 * W_LANES;
     for (int64_t b = first; b < last; b++) {
-        block(c, b * W_LANES, noise ? noise + (b - first) * (c->samples + 1) * NY * W_LANES : 0, scratch);
+        block(c, b * width, noise ? noise + (b - first) * (c->samples + 1) * NY * width : 0, scratch);
     }
 }
 """

@@ -8,6 +8,7 @@ scalar ones by rounding.
 import re
 
 LANES = 8
+FAR = 1e5  # beyond it sin and cos are those of the C library
 
 _TYPES = """
 enum { W_LANES = COUNT };
@@ -64,7 +65,7 @@ INLINE W w_turned(W a, int64_t turns)
     return (W)((I)value ^ ((quadrant & 2) << 62));
 }
 
-INLINE int w_moderate(W a) { return !w_any(~((W)((I)a & 0x7fffffffffffffffLL) < 1e5)); }
+INLINE int w_moderate(W a) { return !w_any(~((W)((I)a & 0x7fffffffffffffffLL) < FAR)); }
 """
 
 _MEANING = "#define V W\n#undef K\n#define K(constant) ALL(constant)\n"
@@ -82,8 +83,11 @@ def _defined(name, arguments):
     if name in _OWN:
         return f"INLINE {head}    return {_OWN[name]};\n}}\n"
     if name in ("sin", "cos"):  # the value is made before the question, so that compilers make common parts once
-        far = f"static __attribute__((noinline, cold)) W w_far_{name}(W a)\n{{\n{_by_lane(name, arguments)}}}\n"
-        value = f"    const W r = w_turned(a, {int(name == 'cos')});\n    return w_moderate(a) ? r : w_far_{name}(a);\n"
+        lane = f"    for (int i = 0; i < W_LANES; i++) if (!(fabs(a[i]) < FAR)) r[i] = v_{name}(a[i]);\n    return r;\n"
+        far = f"static __attribute__((noinline, cold)) W w_far_{name}(W a, W r)\n{{\n{lane}}}\n"
+        value = (
+            f"    const W r = w_turned(a, {int(name == 'cos')});\n    return w_moderate(a) ? r : w_far_{name}(a, r);\n"
+        )
         return f"{far}INLINE {head}{value}}}\n"
     return f"INLINE {head}{_by_lane(name, arguments)}}}\n"
 
@@ -110,7 +114,7 @@ def lanes(text, operations, n=LANES):
     end = "".join(
         f"#undef v_{name}\n" + (f"#define v_{name} {scalar}\n" if scalar else "") for name, (_, scalar) in used.items()
     )
-    types = _TYPES.replace("COUNT", str(n)).replace("SAME", ", ".join(n * ["(c)"]))
+    types = f"#define FAR {FAR}" + _TYPES.replace("COUNT", str(n)).replace("SAME", ", ".join(n * ["(c)"]))
     return "".join(
         (types, _SINCOS if used.keys() & {"sin", "cos"} else "", functions, begin, _MEANING, text, end, _MEANT)
     )
