@@ -32,8 +32,8 @@ IMPORT = "import json, time; a = time.perf_counter(); import servoctl; print(jso
 
 
 def fresh(code, cache):
-    """Run in a new process, with its own directory for compiled code; what it says it took, and its answer."""
-    environment = os.environ | {"SERVOCTL_CACHE": cache, "PYTHONPATH": str(ROOT)}
+    """Run in a new process, with its own directory for what is kept; what it says it took, and its answer."""
+    environment = os.environ | {"SERVOCTL_CACHE": cache, "SERVOCTL_MEMO": "", "PYTHONPATH": str(ROOT)}
     done = subprocess.run(
         [sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True, cwd=cache
     )

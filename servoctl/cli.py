@@ -8,7 +8,7 @@ from pathlib import Path
 from servoctl import commands as further
 from servoctl import loops
 from servoctl.errors import ServoError, SpecificationError, unknown
-from servoctl.options import assignment, mapping
+from servoctl.options import assignment, mapping, positive
 from servoctl.rundir import FILES, LOOP_FILES, Folder, Report, complain, plain, summary, versions
 
 
@@ -97,10 +97,10 @@ def _tradeoff_options(trade):
     trade.add_argument(
         "--drift", type=_drift, nargs="+", metavar="D", help="none, project, minimal, a time constant [s]"
     )
-    trade.add_argument("--limit", type=float, metavar="S", help="seconds that one run may take; default 0.3")
+    trade.add_argument("--limit", type=positive, metavar="S", help="seconds that one run may take; default 0.3")
     wanted = trade.add_mutually_exclusive_group()
-    wanted.add_argument("--error", type=float, metavar="E", help="recommend the fastest within this error")
-    wanted.add_argument("--seconds", type=float, metavar="S", help="recommend the most accurate within this time")
+    wanted.add_argument("--error", type=positive, metavar="E", help="recommend the fastest within this error")
+    wanted.add_argument("--seconds", type=positive, metavar="S", help="recommend the most accurate within this time")
 
 
 class _Version(argparse.Action):
@@ -328,5 +328,6 @@ def _recommended(study, args, report):
         return None
     best = study.recommend(error=args.error, seconds=args.seconds)
     options = ", ".join(f"{key}={value!r}" for key, value in best.items())
-    report.say(f"Recommended: {options}; error {best.row['error']:.1e} in {best.row['seconds']:.2g} s")
+    error = max(best.row["error"], study.uncertainty)
+    report.say(f"Recommended: {options}; error at most {error:.1e} in {best.row['seconds']:.2g} s")
     return dict(best)

@@ -8,7 +8,7 @@ from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 
 from servoctl.errors import ServoError, SpecificationError, unknown
-from servoctl.options import assignment, count, draw, drawn, mapping, shard, variation
+from servoctl.options import assignment, count, draw, drawn, given, mapping, shard, variation, whole
 from servoctl.rundir import Folder, Report, complain
 
 
@@ -32,10 +32,10 @@ def add(commands):
     )
     sweep.add_argument("--monte-carlo", type=count, metavar="N", help="N random cases, of each combination")
     sweep.add_argument("--draw", type=draw, metavar="NAME=normal:MEAN:STD", **many, help="what is random in them")
-    sweep.add_argument("--seed", type=int, help="of everything random")
+    sweep.add_argument("--seed", type=whole, help="of everything random")
     sweep.add_argument("--t-span", type=float, nargs=2, metavar=("T0", "T1"), help="[s]; default: the scene's")
     sweep.add_argument("--method", help="algebraic, RK4, DOP853, Radau, ...; default: by the model")
-    sweep.add_argument("--workers", type=count, default=1, metavar="N", help="processes; default: this one alone")
+    sweep.add_argument("--workers", type=count, metavar="N", help="processes; default: this one alone")
     sweep.add_argument("--shard", type=shard, metavar="I/N", help="only part I of N, for several machines")
     sweep.add_argument("--resume", action="store_true", help="go on where an interrupted sweep ended")
     sweep.add_argument("--out", metavar="DIR", help="folder; default servoctl-runs/NAME-sweep")
@@ -48,6 +48,9 @@ def add(commands):
     export.add_argument("--set", type=assignment, metavar="NAME=VALUE", **many, help="parameters")
     export.set_defaults(command=_export_c)
 
+
+# what computes, and has no place beside --merge
+COMPUTING = ("vary", "monte_carlo", "draw", "seed", "t_span", "method", "workers", "shard", "resume")
 
 # --- export-c
 
@@ -72,6 +75,7 @@ def _sweep(args):
     import servoctl as sv
 
     if args.merge:
+        _require_alone(args)
         study = sv.merge(sv.load_study(path) for path in _shards(args.merge))
         name = Path(args.merge[0]).name
     elif args.scene is None:
@@ -89,6 +93,16 @@ def _sweep(args):
         return _leave(study, folder, _stem(args), _units(args.scene))
     finally:
         folder.leave()
+
+
+def _require_alone(args):
+    surplus = given(args, COMPUTING)
+    if surplus:
+        raise SpecificationError(
+            f"{', '.join(surplus)} was given with --merge.",
+            "Merging joins what was computed, and computes nothing.",
+            do="Leave one of them out.",
+        )
 
 
 def _folder(args, merged):
@@ -111,11 +125,12 @@ def _computed(args, folder):
 
     cases, case = _cases(args), _case(args)
     random = "rng" in inspect.signature(case).parameters
-    if (random or args.monte_carlo is not None) != (args.seed is not None):
+    surplus = [] if random or args.draw else given(args, ("seed", "monte_carlo"))
+    if surplus or (random or args.draw) and args.seed is None:
         raise SpecificationError(
-            f"--seed {args.seed} was given, and nothing is random." if args.seed is not None else "There is no --seed.",
+            f"{', '.join(surplus)} was given, and nothing is random." if surplus else "There is no --seed.",
             "Random cases, and a case(..., rng) that draws numbers, are repeated exactly from a seed.",
-            do="Leave it out." if args.seed is not None else "Give one, such as --seed 1.",
+            do="Leave it out, or give --draw." if surplus else "Give one, such as --seed 1.",
         )
     checkpoint = folder.path / f"{_stem(args)}.jsonl"
     if checkpoint.exists() and not args.resume:
@@ -127,7 +142,7 @@ def _computed(args, folder):
             checkpoint=str(checkpoint),
         )
     options = {"seed": args.seed if random else None, "checkpoint": checkpoint, "shard": args.shard}
-    if args.workers == 1:
+    if args.workers in (None, 1):
         study = sv.sweep(case, cases, **options)
     else:
         with ProcessPoolExecutor(args.workers, mp_context=multiprocessing.get_context("spawn")) as pool:
@@ -177,7 +192,7 @@ def _case(args):
             do="Leave them out, or use them inside of case().",
         )
     draws = "rng" in inspect.signature(own).parameters
-    require_fitting(own, {name: None for name, _ in (*args.vary, *args.draw)}, args.seed if draws else None)
+    require_fitting(own, {name: None for name, _ in (*args.vary, *args.draw)}, 0 if draws else None)
     return functools.partial(own_random_case if draws else own_plain_case, args.scene)
 
 
@@ -279,16 +294,18 @@ def _leave(study, folder, stem, units):
         folder.write(lambda path: figure.savefig(path / f"{stem}.png"))
         written.append(f"{stem}.png")
     print(f"{', '.join(written)} in {folder.path}")
-    return 1 if len(failures) or study.meta["interrupted"] or folder.moved else 0
+    whole = study.meta["shard"] is not None or len(study) == study.meta["count"]
+    return 0 if whole and not (len(failures) or study.meta["interrupted"] or folder.moved) else 1
 
 
 def _shards(folders):
-    found = [path for folder in folders for path in sorted(Path(folder).glob("sweep-*-of-*.npz"))]
-    if not found:
+    found = {folder: sorted(Path(folder).glob("sweep-*-of-*.npz")) for folder in folders}
+    empty = [folder for folder, paths in found.items() if not paths]
+    if empty:
         raise ServoError(
-            f"There are no shards in {', '.join(folders)}.",
+            f"There are no shards in {', '.join(empty)}.",
             "A shard is a file sweep-I-of-N.npz, written by servoctl sweep --shard I/N.",
             do="Name the folders given by --out.",
-            folders=list(folders),
+            folders=empty,
         )
-    return found
+    return [path for paths in found.values() for path in paths]

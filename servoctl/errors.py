@@ -95,7 +95,7 @@ def unknown(name, valid, what):
     return NameUnknown(
         f"No {what} is named {name!r}",
         f"The names are: {', '.join(valid)}" if valid else f"There is no {what} at all",
-        f"The nearest is {nearest!r}" if nearest else "",
+        repr(nearest) if nearest else "",
         "Use one of these names" if valid else f"Leave the {what} out",
         name=name,
         valid=valid,

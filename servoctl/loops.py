@@ -4,7 +4,7 @@ import argparse
 import math
 
 from servoctl.errors import ServoError, SpecificationError, unknown
-from servoctl.options import assignment, count, mapping
+from servoctl.options import assignment, given, mapping, positive, whole
 
 LAWS = ("lqr", "computed", "feedforward")
 GIVEN = ("machine", "law", "integral", "rate", "delay", "noise", "seed", "limit")
@@ -25,10 +25,10 @@ def add(parser):
     )
     loop.add_argument("--law", choices=LAWS, help="default: lqr, about the plan")
     loop.add_argument("--integral", action="store_true", help="LQR: integrals of the residuals, too")
-    loop.add_argument("--rate", type=float, metavar="HZ", help=f"samples per second; default {RATE:g}")
-    loop.add_argument("--delay", type=count, metavar="N", help="samples from the measurement to the input")
+    loop.add_argument("--rate", type=positive, metavar="HZ", help=f"samples per second; default {RATE:g}")
+    loop.add_argument("--delay", type=whole, metavar="N", help="samples from the measurement to the input")
     loop.add_argument("--noise", type=assignment, metavar="NAME=STD", **many, help="of measured states")
-    loop.add_argument("--seed", type=int, help="of the noise")
+    loop.add_argument("--seed", type=whole, help="of the noise")
     loop.add_argument("--limit", type=_limit, metavar="NAME=LOW:HIGH", **many, help="of actuators; or NAME=SIZE")
     loop.add_argument("--no-loop", action="store_true", help="leave out the closed loop")
 
@@ -57,7 +57,7 @@ def require(args, model):
     ------
     SpecificationError, NameUnknown
     """
-    options = [f"--{name}" for name in GIVEN if getattr(args, name) not in (None, False, [])]
+    options = given(args, GIVEN)
     clashes = {
         "--no-loop": options if args.no_loop else [],
         "--law " + (args.law or ""): ["--integral"] if args.integral and args.law not in (None, "lqr") else [],
@@ -101,7 +101,7 @@ def closed_loop(args, model, plan, report):
     """
     if args.no_loop:
         return None, True
-    asked = any(getattr(args, name) not in (None, False, []) for name in GIVEN)
+    asked = bool(given(args, GIVEN))
     if model.ideal or not plan.success:
         why = "a law commands actuators, not an ideal reaction" if model.ideal else "the motion ended early"
         report.say(f"Closed loop: left out, as {why}.")

@@ -1,6 +1,7 @@
 """Values on the command line: NAME=VALUE, ranges, draws, shards."""
 
 import argparse
+import math
 
 from servoctl.errors import SpecificationError
 
@@ -13,8 +14,8 @@ def assignment(text):
     try:
         number = float(value)
     except ValueError:
-        number = None
-    if not name.strip() or number is None:
+        number = math.nan
+    if not name.strip() or not math.isfinite(number):
         raise argparse.ArgumentTypeError(
             f"{text!r} is not NAME=VALUE with a number, such as theta=0.1; the scene's name comes before such options"
         )
@@ -114,3 +115,37 @@ def count(text):
     if not (text.isdecimal() and int(text) >= 1):
         raise argparse.ArgumentTypeError(f"{text!r} is not a whole number of at least 1")
     return int(text)
+
+
+def whole(text):
+    """A whole number of at least 0."""
+    if not text.isdecimal():
+        raise argparse.ArgumentTypeError(f"{text!r} is not a whole number of at least 0")
+    return int(text)
+
+
+def positive(text):
+    """A positive number."""
+    try:
+        number = float(text)
+    except ValueError:
+        number = math.nan
+    if not 0 < number < math.inf:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a positive number")
+    return number
+
+
+def given(args, names):
+    """Those of these options that were given, as they are written: 0 is given, too.
+
+    Parameters
+    ----------
+    args : argparse.Namespace
+    names : sequence of str
+
+    Returns
+    -------
+    list of str
+    """
+    values = {f"--{name.replace('_', '-')}": getattr(args, name) for name in names}
+    return [option for option, value in values.items() if value is not None and value is not False and value != []]

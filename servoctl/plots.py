@@ -17,6 +17,7 @@ FLOOR = 1e-18  # of residuals on a logarithmic scale, so that exact zeros are se
 BINS = 100  # of time, in each of which a residual is drawn by its greatest magnitude: rounding stays a band
 LAST, UNBOUNDED = 0.01, 2.0  # a signal that doubles its range in the last hundredth of a stopped run leaves the frame
 NEGLIGIBLE = 1e-9  # variation relative to the largest value of the same unit: rounding, not filled with it
+ROUNDING = 1e-14  # magnitude relative to the largest value of any unit, in SI: rounding, too
 
 
 def path(run, x=None, y=None, ax=None, units=None):
@@ -214,7 +215,7 @@ def closed(run, units=None):
     Raises
     ------
     SpecificationError
-        If the loop ended before its first sample.
+        If the loop ended before its first sample, or it is no closed loop.
     """
     from servoctl.control.closed_figure import draw
 
@@ -358,7 +359,8 @@ def _over_time(run, groups, ax, units, extrema=False):
             style = STYLES[i // len(COLOURS) % len(STYLES)]
             label = _label([name], units if mixed else {})
             panel.plot(run.t, run[name], style, color=COLOURS[i % len(COLOURS)], label=label)
-        _frame(panel, run, group, max(largest[_unit(name, units)] for name in group))
+        of_unit = max(largest[_unit(name, units)] for name in group)
+        _frame(panel, run, group, max(largest.values()) if of_unit < ROUNDING * max(largest.values()) else of_unit)
         panel.set_ylabel(_label(group, units))
         panel.grid(alpha=0.3)
         if len(group) > 1:

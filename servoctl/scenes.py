@@ -57,7 +57,7 @@ def _module(path):
         raise SpecificationError(
             f"There is no file {path}.",
             "A scene is a name of the gallery or a Python file.",
-            nearest=f"The nearest is {path.parent / match}." if match else "",
+            nearest=f"{path.parent / match}." if match else "",
             do="Check the path, or see servoctl list.",
             file=str(path),
         )

@@ -1,11 +1,27 @@
 """Models that are derived once for all tests, and numbers from expressions."""
 
+import os
+
 import casadi as ca
 import numpy as np
 import pytest
 
 from servoctl.mechanisms import gallery
+from servoctl.model import compiler
+from servoctl.model.compiled import compiling_at_once
 from servoctl.model.model import derive
+
+os.environ["SERVOCTL_MEMO"] = "none"  # tests derive themselves what they test
+
+
+@pytest.fixture(params=("c", "casadi"))
+def backend(request, monkeypatch):
+    """Compiled code at the first call, and CasADi where there is no compiler."""
+    if request.param == "casadi":
+        monkeypatch.setenv("SERVOCTL_COMPILER", "none")
+        monkeypatch.setattr(compiler, "_warned", True)
+    with compiling_at_once():
+        yield request.param
 
 
 @pytest.fixture(scope="session")

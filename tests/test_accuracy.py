@@ -94,6 +94,12 @@ def test_an_accuracy_is_a_small_number(accuracy, gallery_model):
         sv.simulate(model, start, (0.0, 1.0), accuracy=accuracy)
 
 
+def test_an_accuracy_may_be_a_number_of_numpy(gallery_model):
+    model, scene = gallery_model("appell-hamel"), gallery["appell-hamel"]
+    start = model.start(guess=scene.guess, **scene.start)
+    assert "two tolerances agree" in sv.simulate(model, start, (0.0, 0.2), accuracy=np.float32(1e-6)).message
+
+
 @pytest.mark.parametrize("given", [{"rtol": 1e-6}, {"atol": 1e-6}], ids=str)
 @pytest.mark.parametrize("method", ["RK4", "RK8"])
 def test_a_tolerance_is_refused_where_it_is_not_used(method, given, gallery_model):

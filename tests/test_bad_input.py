@@ -325,7 +325,7 @@ def test_numbers_of_a_start_that_are_none(value, how):
 )
 def test_unknown_names_show_the_nearest(make, match):
     model = derive(*overhead_crane())
-    error = refused(NameUnknown, [f"nearest is {match!r}"], lambda: make(model))
+    error = refused(NameUnknown, [f"Nearest: {match!r}"], lambda: make(model))
     assert error.details["match"] == match and error.details["name"] != match
     assert set(error.details) == {"name", "valid", "match"}
 

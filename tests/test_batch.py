@@ -255,10 +255,13 @@ BAD = {
     "other lengths": ({"m_load": [1.0, 2.0], "theta": [0.0]}, {}, "columns of finite numbers"),
     "not finite": ({"m_load": [np.nan]}, {}, "columns of finite numbers"),
     "no case": ({}, {}, "columns of finite numbers"),
+    "empty columns": ({"m_load": []}, {}, "columns of finite numbers"),
+    "every without traces": ({"m_load": [100.0]}, {"every": 5}, "none to thin out"),
+    "a name alone": ({"m_load": [100.0]}, {"record": "theta"}, "one by one"),
     "scale of no disturbance": ({"m_load": [1.0]}, {"scale": {"x": "m_load"}}, "disturbance"),
     "scale without its column": ({"m_load": [1.0]}, {"scale": {"x": "w"}, "disturbance": {"x": 1.0}}, "column of the cases"),
     "trace of nothing": ({"m_load": [100.0]}, {"record": ("thet",)}, "theta"),
-    "every": ({"m_load": [100.0]}, {"every": 0}, "at least 1"),
+    "every": ({"m_load": [100.0]}, {"record": ("theta",), "every": 0}, "at least 1"),
     "seed without noise": ({"m_load": [100.0]}, {"seed": 1}, "without noise"),
 }  # fmt: skip
 

@@ -136,12 +136,13 @@ def test_a_loop_that_is_lost_is_kept_to_its_last_finite_sample(here, capsys):
 @pytest.mark.parametrize(
     ("options", "facts"),
     [
-        ("--machine m_lod=115", ["No parameter is named 'm_lod'", "nearest is 'm_load'"]),
-        ("--noise thet=1", ["No state of the mechanism is named 'thet'", "nearest is 'theta'"]),
-        ("--limit troley=100", ["No actuator is named 'troley'", "nearest is 'trolley'"]),
+        ("--machine m_lod=115", ["No parameter is named 'm_lod'", "Nearest: 'm_load'"]),
+        ("--noise thet=1", ["No state of the mechanism is named 'thet'", "Nearest: 'theta'"]),
+        ("--limit troley=100", ["No actuator is named 'troley'", "Nearest: 'trolley'"]),
         ("--no-loop --rate 50 --integral", ["--integral, --rate was given with --no-loop"]),
         ("--law computed --integral", ["--integral was given with --law computed"]),
-        ("--seed 3", ["--seed was given with no --noise"]),
+        ("--no-loop --delay 1 --machine m_load=0", ["--machine, --delay was given with --no-loop"]),
+        ("--seed 0", ["--seed was given with no --noise"]),
         ("--machine m_load=1 m_load=2", ["--machine m_load was given twice"]),
     ],
 )
@@ -150,6 +151,16 @@ def test_options_that_make_no_sense_are_refused_before_the_motion(here, capsys, 
     assert main(["run", "overhead-crane", *options.split()]) == 2
     err = words(capsys.readouterr().err)
     assert all(fact in err for fact in facts) and not (here / "servoctl-runs").exists()
+
+
+@pytest.mark.parametrize(
+    "options",
+    ["--rate 0", "--rate -5", "--rate nan", "--seed -1", "--delay -1", "--noise x=nan", "--machine m_load=inf"],
+)
+def test_numbers_that_make_no_sense_are_refused_by_the_parser(capsys, options):
+    with pytest.raises(SystemExit):
+        main(["run", "overhead-crane", *options.split()])
+    assert f"argument {options.split()[0]}: " in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("limit", ["trolley", "trolley=0", "trolley=3:1", "trolley=a:b", "=4", "trolley=1:2:3"])

@@ -147,7 +147,7 @@ def test_pole_placement_goes_unstable_where_the_period_is_too_long(delay, limit)
     assert low == pytest.approx(limit, rel=0.02)
 
 
-@pytest.mark.parametrize(("product", "refused"), [(0.98, False), (1.02, True)])
+@pytest.mark.parametrize(("product", "refused"), [(0.98, False), (1.02, True), (30.0, True)])
 def test_gains_too_fast_for_their_rate_are_refused(point_plan, product, refused):
     p = 20.0
     gains = {"kp": {"force": 2.0 * p**2}, "kd": {"force": 2.0 * 2 * p}}
@@ -386,6 +386,32 @@ def test_a_loop_that_diverges_stops_with_its_motion():
     assert np.isfinite(caught.value.run.states).all() and len(caught.value.run.t) > 1
 
 
+def handmade(step=lambda t, x, row: [-x[0], -981.0], **other):
+    inputs = tuple(CRANE.actuators)
+    return replace(sv.Law("own", ("x",), inputs, 100.0, 0.0, step, np.zeros((1, 3))), **other)
+
+
+@pytest.mark.parametrize("answer", [[1.0], [1.0, 2.0, 3.0], None, "ab"])
+def test_a_handmade_law_that_answers_otherwise_is_refused(crane_plan, answer):
+    law = handmade(lambda t, x, row: answer)
+    for ask in (lambda: law(0.0, [0.0]), lambda: sv.close(sv.plant(CRANE), law, crane_plan.state(0.0), (0.0, 0.1))):
+        with pytest.raises(sv.SpecificationError, match=r"t = 0 s\. It answers 2 numbers"):
+            ask()
+
+
+@pytest.mark.parametrize("measurement", ["a", None, {"x": None}, [0.0, 1.0]])
+def test_what_is_no_measurement_is_refused(measurement):
+    with pytest.raises(sv.SpecificationError, match="The law measures 1: x"):
+        handmade()(0.0, measurement)
+
+
+def test_a_law_is_asked_at_times_and_has_a_rate():
+    with pytest.raises(sv.SpecificationError, match="'t' is nan"):
+        handmade()(np.nan, [0.0])
+    with pytest.raises(sv.SpecificationError, match="rate of 0 Hz"):
+        handmade(rate=0.0)
+
+
 def test_laws_refuse_plans_and_plants_that_do_not_fit(point_plan, crane_plan, tmp_path):
     with pytest.raises(sv.NameUnknown, match="state of the plant"):
         sv.feedforward(point_plan, sv.plant(gallery["two-cars"].build()[0]))
@@ -450,4 +476,6 @@ def test_a_loop_that_starts_mid_plan_waits_with_the_plans_present_actuation(cran
     run = sv.close(nominal, law, crane_plan.state(3.0), (3.0, 3.5), delay=4)
     k = int(np.argmin(np.abs(crane_plan.t - 3.0)))
     assert crane_plan.t[k] == pytest.approx(3.0, abs=1e-12)
-    assert run["trolley"][:4] == pytest.approx(np.full(4, crane_plan["trolley"][k]), rel=1e-9)
+    own = sv.close(nominal, law.start(), crane_plan.state(3.0), (3.0, 3.5), rate=100.0, delay=4, plan=crane_plan)
+    for loop in (run, own):
+        assert loop["trolley"][:4] == pytest.approx(np.full(4, crane_plan["trolley"][k]), rel=1e-9)

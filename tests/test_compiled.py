@@ -16,7 +16,6 @@ from servoctl.model.compiled import compiled, compiling_at_once
 from servoctl.simulation.tableaus import tableau
 
 T, X2, P1 = ca.SX.sym("t"), ca.SX.sym("x", 2), ca.SX.sym("p", 1)
-BACKENDS = ("c", "casadi")
 RK4 = tableau("RK4")
 
 
@@ -29,15 +28,6 @@ def cache(tmp_path_factory):
 def own_cache(cache, monkeypatch):
     """A cache of this module's own: its tests share compiled libraries among themselves only."""
     monkeypatch.setenv("SERVOCTL_CACHE", str(cache))
-
-
-@pytest.fixture(params=BACKENDS)
-def backend(request, monkeypatch):
-    if request.param == "casadi":
-        monkeypatch.setenv("SERVOCTL_COMPILER", "none")
-        monkeypatch.setattr(compiler, "_warned", True)
-    with compiling_at_once():
-        yield request.param
 
 
 def function(*outputs, x=X2, p=P1):

@@ -83,6 +83,17 @@ def test_the_hold_of_a_moving_path_costs_an_error_of_second_order(crane):
     assert worst[0] / worst[1] == pytest.approx(4.0, rel=0.1) and worst[1] < 1e-4
 
 
+def test_behind_a_lagging_actuator_the_hold_costs_an_error_of_second_order_too():
+    """What is added until the middle of a sample is that of the command u + T du/dt, not of u alone."""
+    plan, _ = planned("two-cars")
+    plant = sv.plant(plan.model.reduction.mechanism, lag={"force": 0.2})
+    start, worst = np.append(plan.state(0.0), plan["force"][0]), []
+    for rate in (200.0, 400.0):
+        run = sv.close(plant, sv.computed(plan, plant, rate=rate, poles=0.2), start, (0.0, 2.0))
+        worst.append(np.abs(run.residual["car 1"][0]).max())
+    assert worst[0] / worst[1] == pytest.approx(4.0, rel=0.1) and worst[1] < 1e-5
+
+
 def test_unstable_internal_dynamics_are_refused_with_a_pointer():
     model = sv.derive(*vtol("centre"))
     plan = sv.simulate(model, model.start(theta=0.0, dtheta=0.0), (0.0, 0.5))

@@ -50,7 +50,7 @@ def test_unknown_shows_the_nearest_name_and_all_names(name, nearest):
     assert isinstance(error, errors.NameUnknown)
     assert repr(name) in str(error) and "x, theta, m" in str(error) and "coordinate" in str(error)
     assert error.details == {"name": name, "valid": ("x", "theta", "m"), "match": nearest}
-    assert nearest is None or f"nearest is {nearest!r}" in str(error)
+    assert nearest is None or f"Nearest: {nearest!r}" in str(error)
 
 
 def test_unknown_prefers_the_first_of_names_that_differ_by_case():

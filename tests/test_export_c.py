@@ -223,7 +223,7 @@ def test_identifiers_read_like_names(name, word):
     assert identifier(name) == word
 
 
-@pytest.mark.parametrize("name", ["int", "2cranes", "over head", "", "kränchen"])
+@pytest.mark.parametrize("name", ["int", "2cranes", "over head", "", "kränchen", 5])
 def test_a_name_that_c_does_not_take_is_refused(name, gallery_model, tmp_path):
     with pytest.raises(SpecificationError, match="begins every function") as caught:
         export_c(gallery_model("two-cars"), tmp_path, name=name)
@@ -234,6 +234,11 @@ def test_a_name_that_c_does_not_take_is_refused(name, gallery_model, tmp_path):
 def test_what_has_no_expressions_is_refused(tmp_path):
     with pytest.raises(SpecificationError, match="from a Model or a Law"):
         export_c(lambda t, y: 0.0, tmp_path)
+
+
+def test_a_start_is_one_of_the_model(gallery_model, tmp_path):
+    with pytest.raises(SpecificationError, match="A float was given as start.*model.start"):
+        export_c(gallery_model("two-cars"), tmp_path, start=0.0)
 
 
 def test_a_start_for_a_law_is_refused(gallery_model, tmp_path):

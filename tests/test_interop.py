@@ -313,7 +313,7 @@ def test_output_feedback_and_computed_laws_are_linearised(car_plan, plan):
         (lambda c: interop.nlsys(sv.plant(CRANE), substeps=3), SpecificationError, "substeps is to be"),
         (lambda c: interop.nlsys(sv.plant(CRANE, rate_limits={"hoist": 9.0})), SpecificationError, "limits of rate"),
         (lambda c: interop.nlsys(c["late"], rate=33.0), SpecificationError, "whole number of integration steps"),
-        (lambda c: interop.nlsys(sv.plant(CRANE), disturbed=["thet"]), NameUnknown, "nearest is 'theta'"),
+        (lambda c: interop.nlsys(sv.plant(CRANE), disturbed=["thet"]), NameUnknown, "Nearest: 'theta'"),
         (lambda c: interop.start(c["plan"]), SpecificationError, "A start belongs to the Closed"),
         (lambda c: interop.linearise(sv.plant(CRANE), 0.0), SpecificationError, "has 6 finite numbers"),
         (lambda c: interop.linearise(sv.plant(CRANE), 0.0, SUDDEN, [1.0]), SpecificationError, "1 inputs were given"),
@@ -328,8 +328,11 @@ def test_output_feedback_and_computed_laws_are_linearised(car_plan, plan):
         (lambda c: interop.linearise(c["law"], 0.0, memory=[1.0]), SpecificationError, "remembers 0 numbers"),
         (lambda c: interop.linearise(c["plan"].model, 0.0, [1.0]), SpecificationError, "has 6 numbers: x, l"),
         (lambda c: list(interop.along(3, c["plan"], [0.0])), SpecificationError, "A int was given"),
+        (lambda c: list(interop.along(c["law"], c["plan"], [])), SpecificationError, "No times"),
+        (lambda c: interop.linearise(sv.plant(CRANE), "now", SUDDEN), SpecificationError, "'t' is 'now'"),
+        (lambda c: c["law"].row(np.nan), SpecificationError, "'t' is nan"),
         (lambda c: interop.loop_gain(interop.linearise(sv.plant(CRANE), 0.0, SUDDEN, rate=50.0),
-                                     interop.linearise(c["law"], 0.0), "troley"), NameUnknown, "nearest is 'trolley'"),
+                                     interop.linearise(c["law"], 0.0), "troley"), NameUnknown, "Nearest: 'trolley'"),
     ],
 )  # fmt: skip
 def test_what_is_refused(plan, action, error, text):

@@ -88,37 +88,38 @@ SCATTERED = np.sort(np.append(0, np.random.default_rng(5).uniform(0, 1, 200)))
 
 
 @pytest.mark.parametrize("t", [np.linspace(0, 1, 500), np.linspace(1, 0, 300), SCATTERED])
-def test_blocks_equal_points(t):
+def test_blocks_equal_points(t, backend):
     model = kepler()
     x0 = [1.2, 1.4] if t[0] else [0.0, 0.5]
     x, y, iterations = model.newton(t, x0, [0.4])
-    assert x.shape[1] == t.size and model.backend == "c"
+    assert x.shape[1] == t.size and model.backend == backend
     at = x0
     for k, now in enumerate(t):
         alone, rest, _ = model.newton([now], at, [0.4])
         at = alone[:, 0]
-        np.testing.assert_allclose(x[:, k], at, rtol=0, atol=4e-16 * (1 + np.abs(at).max()))
+        np.testing.assert_allclose(x[:, k], at, rtol=0, atol=5e-16 * (1 + np.abs(at).max()))
         np.testing.assert_allclose(y[2:, k], rest[2:, 0], rtol=1e-14, atol=1e-14)
     np.testing.assert_allclose(x[0] - 0.4 * np.sin(x[0]), t, rtol=0, atol=5e-16)
 
 
-def test_blocks_need_fewer_evaluations_than_points():
+def test_blocks_need_fewer_evaluations_than_points(backend):
     t = np.linspace(0, 1, 801)
     model = kepler()
-    assert model.newton(t, [0.0, 0.5], [0.4])[2] <= 2.1 * t.size
+    apart = model.newton(t[::114], [0.0, 0.5], [0.4])[2] / t[::114].size
+    assert model.newton(t, [0.0, 0.5], [0.4])[2] <= {"c": 2.1, "casadi": 3.0}[backend] * t.size < apart * t.size
 
 
-@pytest.mark.parametrize("last", range(60, 69))
-def test_a_block_ends_where_its_solution_ends(last):
+@pytest.mark.parametrize("last", range(190, 199))
+def test_a_block_ends_where_its_solution_ends(last, backend):
     x = ca.SX.sym("x")
     model = newton_model(x**2 - (1 - T), x, "fold_in_block")
-    t = np.append(np.linspace(0, 0.6, last), np.linspace(1.01, 1.6, 30))
+    t = np.append(np.linspace(0, 0.6, last), np.linspace(1.01, 1.6, 150))
     solution, y, _ = model.newton(t, [0.9], [0.0])
     assert solution.shape[1] == y.shape[1] == last
     np.testing.assert_allclose(solution[0], np.sqrt(1 - t[:last]), rtol=1e-14)
 
 
-def test_a_kink_within_a_block_is_followed():
+def test_a_kink_within_a_block_is_followed(backend):
     x = ca.SX.sym("x")
     path = ca.fabs(T - 0.5)
     model = newton_model(x + x**3 - path - path**3, x, "kink")
@@ -127,7 +128,7 @@ def test_a_kink_within_a_block_is_followed():
         np.testing.assert_allclose(solution[0], np.abs(t - 0.5), rtol=0, atol=1e-15)
 
 
-def test_far_predictions_are_not_trusted():
+def test_far_predictions_are_not_trusted(backend):
     x = ca.SX.sym("x")
     model = newton_model(ca.sin(x - 40 * ca.sin(7 * T)), x, "many_roots")  # a root every pi
     t = np.linspace(0, 2, 2001)

@@ -231,5 +231,5 @@ def test_bad_input_is_refused_with_the_facts(make, facts):
 
 
 def test_unknown_spline_end_shows_the_nearest():
-    with pytest.raises(NameUnknown, match="nearest is 'natural'"):
+    with pytest.raises(NameUnknown, match="Nearest: 'natural'"):
         paths.spline(T, [0, 1], [0, 1], ends="naturl")

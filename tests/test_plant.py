@@ -131,6 +131,7 @@ BAD = {
     "infinite parameter": (lambda: sv.plant(RELATIVE, m_load=np.inf), sv.SpecificationError, "finite"),
     "limit of no actuator": (lambda: sv.plant(RELATIVE, limits={"troley": 5.0}), sv.NameUnknown, "trolley"),
     "limits reversed": (lambda: sv.plant(RELATIVE, limits={"trolley": (5.0, -5.0)}), sv.SpecificationError, "low < high"),
+    "limit open on both sides": (lambda: sv.plant(RELATIVE, limits={"trolley": (None, np.inf)}), sv.SpecificationError, "pair"),
     "limit of text": (lambda: sv.plant(RELATIVE, limits={"trolley": "five"}), sv.SpecificationError, "pair"),
     "negative rate": (lambda: sv.plant(RELATIVE, rate_limits={"trolley": -1.0}), sv.SpecificationError, "positive"),
     "negative lag": (lambda: sv.plant(RELATIVE, lag={"trolley": -1.0}), sv.SpecificationError, "positive"),
@@ -158,6 +159,11 @@ def test_bad_input_is_refused_by_name(what):
     call, kind, fact = BAD[what]
     with pytest.raises(kind, match=fact):
         call()
+
+
+def test_a_limit_is_an_interval_whose_sides_may_be_open():
+    given = {"trolley": (None, 5), "hoist": 7}
+    assert sv.plant(RELATIVE, limits=given).limits == {"trolley": (-np.inf, 5.0), "hoist": (-7.0, 7.0)}
 
 
 def test_a_gust_rises_and_falls_as_half_a_cosine():

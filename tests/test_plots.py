@@ -101,8 +101,13 @@ def test_flat_paths_keep_their_scales_apart(run):
     assert plots.path(run, "x", "far", units={"x": "m", "far": "m"}).get_aspect() == "auto"
 
 
+def test_an_open_run_is_no_closed_loop(run):
+    with pytest.raises(SpecificationError, match="A Run was given.*sv.close"):
+        plots.closed(run)
+
+
 def test_an_unknown_name_is_refused_with_the_nearest(run):
-    with pytest.raises(NameUnknown, match="nearest is 'theta'"):
+    with pytest.raises(NameUnknown, match="Nearest: 'theta'"):
         plots.path(run, "x", "thetta")
 
 
@@ -151,6 +156,15 @@ def test_rounding_does_not_fill_a_panel(run):
     run.stored["hoist"] = 981.0 + 1e-12 * np.sin(9 * T)
     axes = plots.actuation(run, names=["trolley", "winch", "hoist"], units=UNITS | {"winch": "N", "hoist": "N"})
     assert all(np.ptp(ax.get_ylim()) > 100.0 for ax in axes[1:])
+
+
+def test_rounding_that_is_alone_of_its_unit_does_not_fill_a_panel(run):
+    run.stored["drive"], run.stored["steer"] = 1e-15 * np.sin(9 * T), np.sin(T)
+    run.stored["small"] = 1e-9 * np.sin(9 * T)
+    units = {"drive": "N", "steer": "N m", "small": "m"}
+    axes = plots.actuation(run, names=["drive", "steer", "small"], units=units)
+    assert np.ptp(axes[0].get_ylim()) == pytest.approx(0.2 * np.sin(T).max(), rel=0.1)
+    assert np.ptp(axes[2].get_ylim()) < 1e-8
 
 
 def test_coordinates_moved_by_quasi_velocities_are_recognised():

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 import servoctl as sv
+from servoctl.mechanisms import gallery
 
 STATE = ("x", "y", "z", "phi", "theta", "dphi", "dtheta")
 ZERO = {"x": 0.0, "y": 0.0, "phi": 0.0, "theta": 0.0}
@@ -70,6 +71,17 @@ def test_knots(method, gallery_model):
     reference = sv.simulate(model, start, (0.0, 3.0), method="Taylor", rtol=1e-13, atol=1e-15)
     assert set(model.knots) & set(run.t[1:-1])
     assert np.abs(run.jets[:4] - reference.jets[:4]).max() < 1e-8
+
+
+@pytest.mark.parametrize("scene", ["overhead-crane", "three-cars", "pendubot"])
+def test_steep_starts(method, scene, gallery_model):
+    """Accelerations that leave rest along a path of high order are no obstacle to the first step."""
+    model, scene = gallery_model(scene), gallery[scene]
+    start = model.start(**scene.start, guess=scene.guess)
+    run = sv.simulate(model, start, scene.t_span, method=method)
+    reference = sv.simulate(model, start, scene.t_span, method="Taylor", rtol=1e-13, atol=1e-15, t_eval=run.t)
+    sizes = 1.0 + np.abs(reference.jets).max(axis=1, keepdims=True)
+    assert run.success and (np.abs(run.jets - reference.jets) / sizes)[: len(start.values)].max() < 1e-6
 
 
 def test_stops_when_the_wheel_stops(method, gallery_model):

@@ -186,11 +186,16 @@ def test_cases_that_form_no_table_are_refused(cases, text):
         (lambda: sv.monte_carlo(-1, seed=1), "n is -1"),
         (lambda: sv.monte_carlo(2, seed=None), "seed is None"),
         (lambda: sv.monte_carlo(2, seed=1, m=[1, 2]), "distribution of m"),
+        (lambda: sv.monte_carlo(2, seed=1, m=lambda rng: rng.normal(1.0, -1.0)), "m cannot be drawn: scale < 0"),
+        (lambda: sv.sweep(halves, sv.grid(m=1), executor=2), "executor=2"),
+        (lambda: sv.sweep(halves, sv.grid(m=1), executor=ThreadPoolExecutor), "executor that is open"),
+        (lambda: sv.sweep(halves, sv.grid(m=1), shard=(1.5, 2)), r"shard = \(1.5, 2\)"),
         (lambda: sv.sweep(halves, sv.grid(m=1), seed=1), "no parameter rng"),
         (lambda: sv.sweep(crane_loop, sv.grid(m_load=100)), "No seed was given"),
         (lambda: sv.sweep(halves, sv.grid(m=1), shard=(3, 2)), r"shard = \(3, 2\)"),
         (lambda: sv.sweep(3, sv.grid(m=1)), "The case is 3"),
         (lambda: sv.merge([]), "0 studies"),
+        (lambda: sv.merge([3]), "1 studies"),
         (lambda: sv.merge([sv.sweep(halves, sv.grid(m=i)) for i in (1, 2)]), "2 different sweeps"),
     ],
 )
@@ -421,6 +426,10 @@ def test_shards_of_the_command_merge_to_the_table_of_one_process(here):
     assert main([*own, "--out", "whole"]) == 1, "case 4 fails"
     assert [main([*own, "--shard", f"{i}/2", "--out", "parts"]) for i in (1, 2)] == [1, 1]
     assert main(["sweep", "--merge", "parts", "--out", "merged"]) == 1
+    assert main(["sweep", "--merge", "parts", "nowhere"]) == 2, "no part is missed silently"
+    for path in Path("parts").glob("sweep-2-of-2.*"):
+        path.unlink()
+    assert main(["sweep", "--merge", "parts", "--out", "half"]) == 1 and len(sv.load_study("half/sweep.npz")) == 5
     whole = sv.load_study("whole/sweep.npz")
     assert same(whole, sv.load_study("merged/sweep.npz"))
     assert len(whole) == 10 and (whole["error"] != "").tolist() == [False] * 6 + [True] * 2 + [False] * 2
@@ -460,6 +469,10 @@ def test_the_command_resumes_and_does_not_throw_work_away(here, capsys):
         (["own.py", "--vary", "k=1,2", "--seed", "1"], "missing a required argument: 'm'"),
         (["none.py", "--vary", "m=1,2"], "There is no file none.py"),
         (["--merge", "nowhere"], "There are no shards in nowhere"),
+        (["--merge", "nowhere", "--vary", "m=1", "--seed", "0", "--workers", "1"], "--vary, --seed, --workers was given"),
+        (["own.py", "--vary", "m=1,2"], "There is no --seed"),
+        (["two-cars", "--monte-carlo", "2"], "--monte-carlo was given, and nothing is random"),
+        (["two-cars", "--monte-carlo", "2", "--draw", "m1=normal:1:-1", "--seed", "1"], "m1 cannot be drawn: scale < 0"),
         ([], "was given no scene"),
     ],
 )  # fmt: skip

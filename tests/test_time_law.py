@@ -98,8 +98,12 @@ def test_bad_input():
     for limits, span in (({}, (0.0, 2.0)), (5.0, (0.0, 2.0)), ({"force": 200.0}, (2.0, 0.0))):
         with pytest.raises(sv.SpecificationError, match="limits|later t1"):
             sv.fastest(mechanism, program, limits, span)
-    with pytest.raises(sv.SpecificationError, match="str was given as program"):
-        sv.fastest(mechanism, "cars", {"force": 200.0}, (0.0, 2.0))
+    for pair, kind in (((mechanism, "cars"), "Program"), (("cars", program), "Mechanism")):
+        with pytest.raises(sv.SpecificationError, match=f"str was given in the place of a {kind}"):
+            sv.fastest(*pair, {"force": 200.0}, (0.0, 2.0))
+    for given in ("start", "parameters"):
+        with pytest.raises(sv.SpecificationError, match="go by name"):
+            sv.fastest(mechanism, program, {"force": 200.0}, (0.0, 2.0), **{given: [1.0]})
     for limit in ((1.0, -1.0), (None, None), "1..2", np.nan):
         with pytest.raises(sv.SpecificationError, match="interval"):
             sv.fastest(mechanism, program, {"force": limit}, (0.0, 2.0))

@@ -11,7 +11,8 @@ from servoctl.cli import main
 from servoctl.errors import LimitExceeded, NameUnknown, ServoError, SingularProgram, SpecificationError
 from servoctl.mechanisms import gallery
 from servoctl.simulation.rule import motion_error
-from servoctl.study.front import TradeOff
+from servoctl.simulation.simulate import ALL_METHODS
+from servoctl.study.front import COLOURS, TradeOff
 from servoctl.study.study import Study, load_study
 
 SPAN = (0.0, 1.0)
@@ -92,13 +93,19 @@ def test_the_machine_is_recorded(study):
     assert set(machine["versions"]) == {"servoctl", "python", "casadi", "numpy", "scipy"}
 
 
-def test_slow_candidates_are_skipped_and_say_so(scene):
+def test_slow_candidates_are_skipped_and_say_so(scene, monkeypatch):
+    monkeypatch.setattr("servoctl.study.tradeoff.FEW", 0)
     slow = sv.tradeoff(*scene, SPAN, ["RK4", "DOP853"], [None], rtol=TOLERANCES, step=STEPS, seconds=1e-9)
     assert len(slow) == 6
     fixed, adaptive = slow.where(method="RK4").rows(), slow.where(method="DOP853").rows()
     assert fixed[0]["failure"] == "" and all(r["failure"].startswith("skipped: step = 0.1 took") for r in fixed[1:])
     assert "More than 1e-09 s: ended at t =" in adaptive[0]["failure"]
     assert all("skipped: rtol = 0.001 took more than" in row["failure"] for row in adaptive[1:])
+
+
+def test_what_gets_lost_in_its_first_steps_skips_no_finer_setting(scene):
+    lost = sv.tradeoff(*scene, SPAN, "DOP853", [None], rtol=TOLERANCES, seconds=1e-9)
+    assert len(lost) == len(TOLERANCES) and all("ended at t =" in failure for failure in lost["failure"])
 
 
 def test_a_program_without_free_values_is_solved(gallery_model):
@@ -237,6 +244,18 @@ def test_without_a_reference_there_is_no_trade(gallery_model):
         sv.tradeoff(model, model.start(guess=scene.guess, **scene.start), (0.0, 1.0), ["RK4"], [None])
 
 
+def test_a_figure_of_failures_only_says_so(scene, tmp_path):
+    found = sv.tradeoff(*scene, SPAN, ["Taylor"], ["minimal"])
+    assert np.isnan(found["error"]).all() and len(found.pareto()) == 0
+    ax = found.plot()
+    ax.figure.savefig(tmp_path / "failed.png")
+    assert [text.get_text() for text in ax.texts] == ["every run failed"]
+
+
+def test_every_method_has_its_own_colour():
+    assert len(set(COLOURS)) == len(COLOURS) >= len(ALL_METHODS) - 2  # RK1 and RK2 are not measured by default
+
+
 # --- the command
 
 
@@ -259,3 +278,11 @@ def test_the_command_keeps_what_was_measured_where_nothing_reaches_it(tmp_path, 
     assert main(line.split()) == 2
     assert "seconds=1e-09 was asked for" in capsys.readouterr().err
     assert (tmp_path / "here" / "tradeoff.csv").exists() and (tmp_path / "here" / "report.txt").exists()
+
+
+@pytest.mark.parametrize("option", ["--limit", "--error", "--seconds"])
+@pytest.mark.parametrize("value", ["0", "-1", "nan", "inf", "x"])
+def test_the_command_refuses_what_is_no_positive_number_before_it_measures(option, value, capsys):
+    with pytest.raises(SystemExit):
+        main(["tradeoff", "appell-hamel", f"{option}={value}"])
+    assert "not a positive number" in capsys.readouterr().err

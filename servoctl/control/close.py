@@ -10,6 +10,7 @@ from servoctl.control.law import ON_SAMPLE, Law
 from servoctl.control.tracking import Reference, positive, require_plan, require_plant, resampled
 from servoctl.errors import InconsistentStart, IntegrationStopped, ServoError, SpecificationError, unknown
 from servoctl.model.closed import FINISHED, LAW_LOST, STATE_LOST, Loop, run_loop
+from servoctl.model.compiled import Compiled
 from servoctl.spec.coordinates import mapping
 from servoctl.spec.parameters import finite
 
@@ -164,7 +165,8 @@ def _start(plant, t0, x0, idle):
 def finish(plant, law, loop, conditions, plan):
     """Run a loop; the `Closed` of it, or the error that it ended with."""
     begin(law)
-    status, x, law_x, law_y, inputs = run_loop(plant.function("ode"), law.step, loop)
+    step = law.step if isinstance(law.step, Compiled) else law.answer
+    status, x, law_x, law_y, inputs = run_loop(plant.function("ode"), step, loop)
     t = loop.t0 + np.arange(len(x)) * loop.period
     m, n_y, n_z = loop.n_u, len(law.measures), len(law.memory)
     end = loop.t0 + len(x) * loop.period
@@ -364,7 +366,10 @@ def _as_law(law, plant, rate, t0, plan):
     name = getattr(law, "__name__", type(law).__name__)
     function = _Function(law, name, plant)
     idle = Reference(plan, plant, rate).idle if plan is not None else None
-    return Law(name, plant.state_names, plant.inputs, positive("rate", rate), t0, function, np.zeros((1, 1)), idle=idle)
+    return Law(
+        name, plant.state_names, plant.inputs, positive("rate", rate), t0, function, np.zeros((1, 1)),
+        idle=idle, plan=plan,
+    )  # fmt: skip
 
 
 class _Function:

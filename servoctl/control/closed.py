@@ -5,10 +5,12 @@ from functools import cached_property
 
 import numpy as np
 
+from servoctl.control.law import ON_SAMPLE
 from servoctl.control.tracking import resampled
 from servoctl.errors import SpecificationError, unknown
 from servoctl.model.laws import Residuals
 from servoctl.simulation.run import Run
+from servoctl.spec.parameters import finite
 
 NONE, LOWER, UPPER, FALLING, RISING = 0, -1, 1, -2, 2  # which limit an input has met
 
@@ -194,8 +196,9 @@ class Closed:
         SpecificationError
             If t is no sample of this run.
         """
+        t = finite("t", t, "time")
         k = int(np.argmin(np.abs(self.t - t)))
-        if abs(self.t[k] - t) > 1e-6 * self.loop.period:
+        if abs(self.t[k] - t) > ON_SAMPLE * self.loop.period:
             raise SpecificationError(
                 f"t = {t:.9g} s was asked for.",
                 f"The run has samples every {self.loop.period:g} s from {self.t[0]:g} to {self.t[-1]:g} s.",
@@ -255,7 +258,7 @@ class Closed:
         ]
         met = [("noise on", c.noise), ("quantised:", c.quantisation), ("disturbed:", c.disturbance)]
         told = [f"{what} {', '.join(names)}" for what, names in met if names]
-        told += [f"delay of {loop.delay} samples"] * bool(loop.delay)
+        told += [f"delay of {loop.delay} sample{'s' * (loop.delay > 1)}"] * bool(loop.delay)
         lines += [f"  {'; '.join(told)}"[:118]] * bool(told)
         if not len(self.t):
             return "\n".join(lines)
@@ -264,7 +267,7 @@ class Closed:
         if worst:
             told = (f"{name} {worst[name].max():.3g}, {worst[name][-1]:.3g}" for name in shown)
             lines.append(f"  residuals, at worst and at the end: {'; '.join(told)}")
-        if self.plan is not None and self.t[-1] > self.plan.t[-1] + 1e-6 * loop.period:
+        if self.plan is not None and self.t[-1] > self.plan.t[-1] + ON_SAMPLE * loop.period:
             lines.append(f"  the plan ends at t = {self.plan.t[-1]:g} s: its last row is held")
         for name in self.plant.inputs[:5]:
             share = np.mean(self.active[name] != NONE)

@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from servoctl.control.closed import Closed
 from servoctl.errors import SpecificationError
 
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")  # Okabe and Ito
@@ -13,6 +14,10 @@ def draw(run, units):
     """Panels one above the other: residuals, errors of coordinates by unit, each actuator."""
     from matplotlib.figure import Figure
 
+    if not isinstance(run, Closed):
+        raise SpecificationError(
+            f"A {type(run).__name__} was given.", "A closed loop is drawn.", "What sv.close returns.", "Give that."
+        )
     if not len(run.t):
         raise SpecificationError("The loop has no samples.", "A figure shows some.", do="See run.message.")
     errors = _errors(run, units)

@@ -9,6 +9,7 @@ from servoctl.model.linearising import linearise
 from servoctl.simulation.bounds import sampled_bound
 from servoctl.simulation.internal import internal_dynamics
 
+GROWN = 2.0  # by how much errors may grow along the plan, as by a passing eigenvalue that is hardly unstable
 TIME_CONSTANT = 0.25  # s: a rise in about a second where several poles coincide, as cranes and arms of human size need
 
 
@@ -74,7 +75,7 @@ def computed(plan, plant, rate=100.0, poles=None, delay=0):
 
 def _require_stable(plan):
     internal = internal_dynamics(plan.model, plan)
-    if internal.verdict == "unstable" and internal.growth > 2.0:
+    if internal.verdict == "unstable" and internal.growth > GROWN:
         worst = float(internal.eigenvalues.real.max())
         raise UnstableInternalDynamics(
             f"The program leaves {len(internal.names)} states free ({', '.join(internal.names)}), with an eigenvalue "
@@ -90,7 +91,7 @@ def _require_stable(plan):
 def _poles(poles, orders):
     """Poles of each residual by name."""
     if poles is None or np.ndim(poles) == 0 and not isinstance(poles, dict):
-        constant = TIME_CONSTANT if poles is None else positive("poles", poles)
+        constant = TIME_CONSTANT if poles is None else positive("time constant", poles)
         return {name: np.full(order, -1.0 / constant) for name, order in orders.items()}
     if not isinstance(poles, dict):
         raise SpecificationError(

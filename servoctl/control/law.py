@@ -5,6 +5,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from servoctl.errors import SpecificationError, unknown
+from servoctl.spec.parameters import finite
 
 _SIZES = ("n_x", "n_p", "n_y")  # of a compiled step: what it takes, its row, what it gives
 ON_SAMPLE = 1e-6  # of a period: how far from an instant of sampling a law may be asked
@@ -68,6 +69,10 @@ class Law:
                 "It has one column of finite numbers per sample.",
                 do="Correct it.",
             )
+        if finite("rate", self.rate) <= 0:
+            raise SpecificationError(
+                f"The law {self.name!r} has a rate of {self.rate:g} Hz.", "A rate is positive.", do="Change it."
+            )
         idle = np.zeros(len(self.inputs)) if self.idle is None else np.asarray(self.idle, dtype=float)
         object.__setattr__(self, "idle", idle)
         given = (len(self.measures) + len(self.memory), table.shape[0], self.n_out, idle.size)
@@ -89,6 +94,43 @@ class Law:
     def n_out(self):
         """The number of outputs of `step`."""
         return len(self.inputs) + len(self.memory) + len(self.signals)
+
+    def answer(self, t, x, row):
+        """What `step` says at a sample.
+
+        Parameters
+        ----------
+        t : float
+            [s]
+        x : (n_y + n_z,) array
+            Measurement and memory.
+        row : (n_row,) array
+            Of the table.
+
+        Returns
+        -------
+        (n_out,) array
+            Inputs, next memory, further signals.
+
+        Raises
+        ------
+        SpecificationError
+            If these are not n_out numbers.
+        """
+        said = self.step(t, x, row)
+        try:
+            out = np.asarray(said, dtype=float).ravel()
+        except (TypeError, ValueError):
+            out = np.zeros(0)
+        if out.size != self.n_out:
+            raise SpecificationError(
+                f"The step of the law {self.name!r} answered {said!r} at t = {t:.6g} s."[:200],
+                f"It answers {self.n_out} numbers: {len(self.inputs)} inputs, {len(self.memory)} of the next memory, "
+                f"{len(self.signals)} further signals.",
+                do="Return an array of them.",
+                t=float(t),
+            )
+        return out
 
     def start(self):
         """A controller that runs this law from its first memory on: law(t, measurement) -> u.
@@ -137,8 +179,9 @@ class Law:
         Raises
         ------
         SpecificationError
-            If t lies between samples, or before the first.
+            If t lies between samples, or before the first, or is no finite number.
         """
+        t = finite("t", t, "time")
         k = (t - self.t0) * self.rate
         if abs(k - round(k)) > ON_SAMPLE or round(k) < 0:
             nearest = self.t0 + max(round(k), 0) / self.rate
@@ -147,12 +190,12 @@ class Law:
                 f"It is sampled at {self.rate:g} Hz from t = {self.t0:g} s on.",
                 nearest=f"t = {nearest:.9g} s.",
                 do="Ask at an instant of sampling.",
-                t=float(t),
+                t=t,
             )
         return self.table[:, min(round(k), self.table.shape[1] - 1)]
 
     def __repr__(self):
-        shown = {name: value for name, value in self.info.items() if np.ndim(value) == 0}
+        shown = {name: value for name, value in self.info.items() if isinstance(value, (str, int, float))}
         lines = [
             f"Law: {self.name}, {self.rate:g} Hz, t = {self.t0:g} .. {self._end:g} s, then held",
             f"  measures {', '.join(self.measures) or '(nothing)'}"[:118],
@@ -197,7 +240,7 @@ class Controller:
         """
         law, m = self.law, len(self.law.inputs)
         y = as_measurement(measurement, law.measures)
-        out = np.asarray(law.step(t, np.concatenate([y, self.memory]), law.row(t)), dtype=float)
+        out = law.answer(t, np.concatenate([y, self.memory]), law.row(t))
         self.memory = out[m : m + len(self.memory)]
         self.signals = dict(zip(law.signals, out[m + len(self.memory) :].tolist(), strict=True))
         return out[:m]
@@ -220,11 +263,14 @@ def as_measurement(measurement, names):
         for name in names:
             if name not in measurement:
                 raise unknown(name, measurement, "measurement")
-        return np.array([measurement[name] for name in names], dtype=float)
-    y = np.asarray(measurement, dtype=float).ravel()
+        measurement = [measurement[name] for name in names]
+    try:
+        y = np.array([float(value) for value in np.ravel(measurement)])
+    except (TypeError, ValueError):
+        y = np.zeros(0)
     if y.shape != (len(names),):
         raise SpecificationError(
-            f"The measurement has {y.size} entries.",
+            f"The measurement {measurement!r} was given."[:200],
             f"The law measures {len(names)}: {', '.join(names) or '(nothing)'}.",
             do="Give them in this order, or as a dict.",
         )

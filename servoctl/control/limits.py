@@ -4,13 +4,15 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from servoctl.control.law import Law
+from servoctl.control.close import require_names
+from servoctl.control.law import ON_SAMPLE, Law
 from servoctl.control.lqr import Q_POSITION, R_INPUT, steady, tangents
 from servoctl.control.sampling import discretised
 from servoctl.control.tracking import Reference, positive, require_plant
 from servoctl.errors import LimitExceeded, SpecificationError, unknown
 from servoctl.model.allocation import Effects, SmallQP
 from servoctl.model.laws import Residuals
+from servoctl.model.plant import interval
 from servoctl.spec.coordinates import mapping
 from servoctl.spec.parameters import finite
 
@@ -37,9 +39,9 @@ def limited(law, plant, *, bounds=None, weights=None, priority=None, horizon=HOR
     law : Law
     plant : Plant
         What the controller believes of the machine: its limits are kept.
-    bounds : dict of str to (float, float), optional
-        Outputs of the mechanism, affine in the inputs, that stay within (low, high), None for an open side: a rope
-        that cannot push is {"tension": (0.0, None)}.
+    bounds : dict of str to (float, float) or float, optional
+        Outputs of the mechanism, affine in the inputs, that stay within (low, high), None for an open side, or within
+        (-c, c): a rope that cannot push is {"tension": (0.0, None)}.
     weights : dict of str to float, optional
         w_i of the residuals; default 1 each.
     priority : sequence of str, optional
@@ -65,7 +67,7 @@ def limited(law, plant, *, bounds=None, weights=None, priority=None, horizon=HOR
         During the loop, where no inputs keep limits and bounds together; it names them.
     """
     _require_law(law, plant)
-    bounds = {name: _interval(name, value) for name, value in mapping(bounds, "The bounds").items()}
+    bounds = {name: interval(name, value, "bound") for name, value in mapping(bounds, "The bounds").items()}
     if not (plant.limits or plant.rate_limits or bounds):
         raise SpecificationError(
             "The plant has no limits, and no bounds were given.",
@@ -82,7 +84,9 @@ def limited(law, plant, *, bounds=None, weights=None, priority=None, horizon=HOR
     names, D, at_once = _predicted(reference, positive("horizon", horizon))
     count, sizes = D.shape[0], _sizes(law.plan, plant)
     H = _metric(reference, names, _weights(names, weights, priority), at_once)
-    held = np.repeat(law.table, count, axis=1) if law.table.shape[1] == 1 else law.table
+    samples, columns = np.arange(max(count, law.table.shape[1])), law.table.shape[1]
+    along = np.vstack([reference.x, D.reshape(count, -1).T, H.reshape(count, -1).T])
+    table = [law.table[:, np.minimum(samples, columns - 1)], along[:, np.minimum(samples, count - 1)]]
     signals = (*(f"slack {n}" for n in names), *(f"limit {n}" for n in plant.inputs))
     signals += tuple(f"bound {n}" for n in bounds)
     low, high = _magnitudes(plant)
@@ -93,7 +97,7 @@ def limited(law, plant, *, bounds=None, weights=None, priority=None, horizon=HOR
         law,
         name=f"{law.name}, limited {how}",
         step=step,
-        table=np.vstack([held, reference.x, D.reshape(count, -1).T, H.reshape(count, -1).T]),
+        table=np.vstack(table),
         memory=np.concatenate([law.memory, np.clip(law.idle, low, high)]),
         memory_names=memory_names,
         signals=(*law.signals, *signals),
@@ -117,9 +121,13 @@ def _require_law(law, plant):
             "Slack is given to the residuals of a plan's program.",
             do="Make the law from a plan.",
         )
-    for name in law.measures:
-        if name not in plant.state_names:
-            raise unknown(name, plant.state_names, "state of the plant")
+    require_names(law, plant)
+    if abs(law.t0 - law.plan.t[0]) > ON_SAMPLE * law.period:
+        raise SpecificationError(
+            f"The law {law.name!r} begins at t = {law.t0:g} s, its plan at {law.plan.t[0]:g} s.",
+            "Limits are kept along the plan, sample by sample of the law.",
+            do="Let both begin at once.",
+        )
 
 
 def _magnitudes(plant):
@@ -203,7 +211,7 @@ class _Allocation:
         law, m = self.law, len(self.plant.inputs)
         n_y, n_z = len(law.measures), len(law.memory)
         rows = law.table.shape[0]
-        inner = np.asarray(law.step(t, x[: n_y + n_z], row[:rows]), dtype=float)
+        inner = law.answer(t, x[: n_y + n_z], row[:rows])
         wanted, memory, further = np.split(inner, [m, m + n_z])
         n_x, k = self.plant.n_x, self.k
         state, D, H = np.split(row[rows:].copy(), [n_x, n_x + k * m])
@@ -290,22 +298,6 @@ def _sizes(plan, plant):
     return np.array(found)
 
 
-def _interval(name, value):
-    try:
-        low, high = (-np.inf if value[0] is None else float(value[0]), np.inf if value[1] is None else float(value[1]))
-    except (TypeError, ValueError, IndexError, KeyError):
-        low = high = np.nan
-    if not low < high:
-        raise SpecificationError(
-            f"The bound of {name!r} is {value!r}.",
-            "A bound is a pair (low, high) with low < high; None leaves a side open.",
-            nearest="(0.0, None).",
-            do="Give a pair.",
-            name=name,
-        )
-    return low, high
-
-
 @dataclass(frozen=True)
 class LimitReport:
     """Which residuals gave way in a closed loop, when and by how much; made by `limit_report`.
@@ -319,7 +311,7 @@ class LimitReport:
     overload : tuple of (str, float, float, float) or None
         Of the plan itself: actuator, instant, what it asks, the limit; None if it asks for no more than there is.
     slower : float or None
-        Factor by which the plan would have to be slowed to keep the limits, where it was asked for.
+        Factor by which the plan would have to be slowed to keep the limits of magnitude, where it was asked for.
     """
 
     rows: tuple
@@ -337,7 +329,7 @@ class LimitReport:
             name, t, asked, limit = self.overload
             lines.append(f"  the plan asks {asked:.6g} of {name} at t = {t:.5g} s; the limit is {limit:.6g}")
         if self.slower:
-            lines.append(f"  slowed by the factor {self.slower:.5g} the plan would keep the limits")
+            lines.append(f"  slowed by the factor {self.slower:.5g} the plan would keep the limits of magnitude")
         return "\n".join(lines)
 
 
@@ -350,7 +342,7 @@ def limit_report(run, scene=None):
         Of a law made by `limited`.
     scene : dict, optional
         Arguments of `fastest` beside mechanism, program and limits ({"t_span": (0.0, 6.0), "guess": {...}}): then the
-        factor is solved for by which the plan would have to be slowed.
+        factor is solved for by which a plan that exceeds limits of magnitude would have to be slowed to keep them.
 
     Returns
     -------

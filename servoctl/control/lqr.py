@@ -20,7 +20,9 @@ def lqr(plan, plant, rate=100.0, Q=None, R=None, integral=None, varying=True):
 
     The plant is linearised along the plan in the middle of each sample and discretised exactly under the zero-order
     hold. The gains minimise Σ δxᵀQ δx + δuᵀR δu + zᵀQ_i z over the samples: backwards along the plan from the steady
-    solution at its end, or steady at each sample as if the plant were frozen there.
+    solution at its end, or steady at each sample as if the plant were frozen there. Frozen-time gains depend on the
+    choice of coordinates where the plan moves: linearisations in two of them differ by a transformation that varies in
+    time. Samples by which `close` is late are not in the design; larger R makes room for them.
 
     Parameters
     ----------
@@ -258,6 +260,7 @@ def weights(given, default, names, what, symbol, positive=False):
 
 def _integrals(integral, plan, plant):
     """Which residuals are integrated, and their weights; (None, None) without any."""
+    integral = bool(integral) if isinstance(integral, np.bool_) else integral
     if integral is None or integral is False or (isinstance(integral, dict) and not integral):
         return None, None
     residuals = Residuals(plan.model, plant, tuple(integral) if isinstance(integral, dict) else None)

@@ -8,9 +8,11 @@ import numpy as np
 from servoctl.control.close import span
 from servoctl.errors import InconsistentStart, IntegrationStopped, LimitExceeded, SingularProgram, SpecificationError
 from servoctl.model.model import derive
+from servoctl.model.plant import interval
 from servoctl.simulation.run import Run
 from servoctl.simulation.simulate import simulate
 from servoctl.spec.coordinates import mapping
+from servoctl.spec.mechanism import Mechanism
 from servoctl.spec.program import Program
 
 REACH = 12  # doublings of the time, in which a motion becomes as good as static, or halvings
@@ -82,15 +84,19 @@ def fastest(mechanism, program, limits, t_span, start=None, guess=None, paramete
     """
     from scipy.optimize import brentq
 
-    limits = {name: _interval(name, value) for name, value in mapping(limits, "The limits").items()}
+    limits = {name: interval(name, value, "limit") for name, value in mapping(limits, "The limits").items()}
     if not limits:
         raise SpecificationError(
             "No limits were given.", "A fastest time law is decided by a limit.", do='Give {"trolley": 100.0}.'
         )
-    if not isinstance(program, Program):
-        raise SpecificationError(
-            f"A {type(program).__name__} was given as program.", "A program is slowed.", do="Give a Program."
-        )
+    for given, kind in ((mechanism, Mechanism), (program, Program)):
+        if not isinstance(given, kind):
+            raise SpecificationError(
+                f"A {type(given).__name__} was given in the place of a {kind.__name__}.",
+                "A mechanism's program is slowed.",
+                do="Write sv.fastest(mechanism, program, ...).",
+            )
+    start, parameters = mapping(start, "Values of the start"), mapping(parameters, "The parameters")
     t0, t1 = span(t_span, "A program is slowed")
 
     @functools.cache
@@ -100,7 +106,7 @@ def fastest(mechanism, program, limits, t_span, start=None, guess=None, paramete
         try:
             model = derive(mechanism, slower, guess)
             model = model.with_parameters(**parameters) if parameters else model
-            held = {name: value / factor ** _level(model, name) for name, value in (start or {}).items()}
+            held = {name: value / factor ** _level(model, name) for name, value in start.items()}
             plan = simulate(model, model.start(t0, guess=guess, **held), (t0, t0 + (t1 - t0) * factor))
         except (SingularProgram, InconsistentStart, IntegrationStopped):
             return np.inf, ("", "", t0), slower, None
@@ -145,23 +151,6 @@ def _level(model, name):
     """Order of the derivative that a name stands for."""
     nq, n = model.nq, model.n
     return 0 if name not in model.jet_names[nq:] else 1 + (model.jet_names.index(name) - nq) // n
-
-
-def _interval(name, value):
-    try:
-        low, high = (-abs(value), abs(value)) if np.isscalar(value) else value
-        low = -np.inf if low is None else float(low)
-        high = np.inf if high is None else float(high)
-    except (TypeError, ValueError):
-        low = high = np.nan
-    if not low < high or not (np.isfinite(low) or np.isfinite(high)):
-        raise SpecificationError(
-            f"The limit of {name!r} is {value!r}.",
-            "A limit is an interval (lower, upper), or one number for both sides; None leaves a side open.",
-            do="Give (-100.0, 100.0).",
-            name=name,
-        )
-    return low, high
 
 
 def _refuse(last, factor, step):

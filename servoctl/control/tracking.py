@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from servoctl.control.law import Law
+from servoctl.control.law import ON_SAMPLE, Law
 from servoctl.control.sampling import sampled_radii
 from servoctl.errors import NotRealisable, ServoError, SpecificationError, unknown
 from servoctl.model.laws import affine_law
@@ -152,20 +152,21 @@ class Reference:
 
     def _command(self, a, name, held):
         later = self.t + self.plant.delay.get(name, 0.0)
-        if held in ("start", "middle"):
-            u = self._actuation(later + self.period / 2 * (held == "middle"))[a]
-        else:
+        at = later if held == "start" else later + self.period / 2
+        if held == "mean":
             nodes, weights = GAUSS
-            parts = (self._actuation(later + self.period * (1 + s) / 2)[a] for s in nodes)
+            parts = (self._actuation(at + self.period / 2 * s)[a] for s in nodes)
             u = sum(w / 2 * part for w, part in zip(weights, parts, strict=True))
-        if name in self.plant.lag:
-            u = (
-                u
-                + self.plant.lag[name]
-                * (self._actuation(later + self.period)[a] - self._actuation(later)[a])
-                * self.rate
-            )
-        return u
+        else:
+            u = self._actuation(at)[a]
+        return u + self.plant.lag[name] * self._slope(at)[a] if name in self.plant.lag else u
+
+    def _slope(self, t):
+        """du/dt of the plan's actuation, (m, N), by central differences over a sample as far as the plan reaches."""
+        low, high = (np.clip(t + side, self.t[0], self.end) for side in (-self.period / 2, self.period / 2))
+        span = high - low
+        known = span > ON_SAMPLE * self.period
+        return np.where(known, self._actuation(high) - self._actuation(low), 0.0) / np.where(known, span, 1.0)
 
     def linearised(self):
         """A (N, n_x, n_x) and B (N, n_x, m) of the plant in the middle of each sample."""
@@ -381,7 +382,8 @@ def _refuse_slow_rate(reference, A, B, K, radius):
             do="Choose gains for poles well below one over the delay.",
             radius=float(radius),
         )
-    if sampled_radii(A, B, K, 0.1 * reference.period, 0 * delays)[0] < radius**0.1 - UNSTABLE:
+    growth = max(0.0, float(np.linalg.eigvals(A[0] - B[0] @ K[0]).real.max()))
+    if np.log(radius) > 2 * growth * reference.period + UNSTABLE:  # what is unstable without sampling, is so with it
         raise ServoError(
             f"Sampled at {reference.rate:g} Hz, errors grow by the factor {radius:.4g} per sample at the plan's end.",
             "Under a zero-order hold ρ equal poles -p are stable for p·Ts < 1, 0.6752, 0.5111, 0.4116: ρ = 2 to 5.",

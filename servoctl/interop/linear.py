@@ -2,7 +2,6 @@
 
 import numpy as np
 
-from servoctl.control.close import whole
 from servoctl.control.closed import Closed
 from servoctl.control.law import Law, as_measurement
 from servoctl.control.sampling import discretised
@@ -12,6 +11,7 @@ from servoctl.interop.names import connected, force_names, output_names, signal_
 from servoctl.model.jacobians import differentiable, jacobian
 from servoctl.model.model import Model
 from servoctl.model.plant import Plant
+from servoctl.spec.parameters import finite
 
 
 def linearise(thing, t, x=None, u=None, *, memory=None, rate=None, disturbed=(), name=None):
@@ -57,6 +57,7 @@ def linearise(thing, t, x=None, u=None, *, memory=None, rate=None, disturbed=(),
                 f"It has {', '.join(('t', *(('x',) if kind is not Closed else ()), *valid))}.",
                 do="Leave it out.",
             )
+    t = finite("t", t, "time")
     if isinstance(thing, Plant):
         return _linear_plant(thing, t, thing.state(x), u, rate, disturbed, name or "plant")
     if isinstance(thing, Law):
@@ -115,6 +116,8 @@ def along(thing, run, times=None, **options):
 
 def _require_within(run, times):
     room = 1e-9 * (run.t[-1] - run.t[0])
+    if not len(times):
+        raise SpecificationError("No times were given.", "A linearisation has an instant.", do="Give one or more.")
     if np.any(np.diff(times) < 0) or times[0] < run.t[0] - room or times[-1] > run.t[-1] + room:
         raise SpecificationError(
             f"Times from {times[0]:g} to {times[-1]:g} s were given.",
@@ -257,7 +260,7 @@ def _linear_closed(closed, t, name):
         )
     u, y = closed.inputs[:, k], closed.measurements[:, k]
     own = _linear_plant(plant, t, x, u, law.rate, plant.disturbable, "plant")
-    own = _late(own, plant, whole(loop.delay, "delay", "samples"))
+    own = _late(own, plant, loop.delay)
     return connected(own, _linear_law(law, t, y, closed.memory[:, k], "law"), plant, law, name)
 
 

@@ -228,7 +228,7 @@ def _law(law, name, quantum=None):
     def answer(t, z, y):
         if quantum is not None:
             y = np.where(quantum > 0, quantum * np.rint(y / np.where(quantum > 0, quantum, 1.0)), y)
-        return np.asarray(law.step(t, np.append(y, z), law.row(t)), dtype=float)
+        return law.answer(t, np.append(y, z), law.row(t))
 
     return control.nlsys(
         (lambda t, z, y, _: answer(t, z, y)[m : m + n_z]) if n_z else None,

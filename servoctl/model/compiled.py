@@ -8,7 +8,6 @@ import contextlib
 import contextvars
 import functools
 
-import casadi as ca
 import numpy as np
 
 from servoctl.errors import SpecificationError, unknown
@@ -81,7 +80,7 @@ def compiled(f, name, loops=(), project=None, others=None, drivers="", sizes=Non
         raise SpecificationError(
             f"{name!r} is to be compiled from {f}",
             "A compiled function takes columns t, x, p to one dense column, without free symbols",
-            "The nearest is an SX function of this form",
+            "An SX function of this form",
             "Concatenate and densify the outputs; expand() an MX function",
             name=name,
         )
@@ -130,12 +129,11 @@ class Compiled:
         self._f, self._symbol = f, f"servoctl_{name}"
         self._x_shape, self._p_shape = (self.n_x,), (self.n_p,)
         self._evaluator = Interpreter(f, project, self._sizes)
-        self._settled, self._text, self._calls, self._points = False, None, 0, 0
+        self._settled, self._looked, self._text, self._calls, self._points = False, False, None, 0, 0
 
     def __reduce__(self):
-        project = self._project and self._project.serialize()
-        others = {key: f.serialize() for key, f in self._others.items()}
-        return _restored, (self._f.serialize(), self.name, self.loops, project, others, self._drivers, self._sizes)
+        parts = (self._f, self.name, self.loops, self._project, self._others, self._drivers, self._sizes)
+        return Compiled, parts, {"_text": self._text}
 
     def __repr__(self):
         how = "compiled" if self.backend == "c" else "evaluated by CasADi"
@@ -399,16 +397,20 @@ class Compiled:
 
     def _settle(self, build):
         """Move from CasADi to the library: at the first call if one is at hand, later if it is to be built."""
-        if self._settled or (self._text is not None and not build):
+        if self._settled or (self._looked and not build):
             return
-        parts = {"project": self._project, "others": self._others, "drivers": self._drivers, "sizes": self._sizes}
-        parts["wide"] = "newton" in self.loops
-        text = self._text or emit.emit(self._f, self._symbol, self.loops, **parts)
-        library = compiler.library(text, build, "-O3" if {"newton", "taylor"} & {*self.loops} else "-O1")
+        library = compiler.library(self.source(), build, "-O3" if {"newton", "taylor"} & {*self.loops} else "-O1")
         if library is not None:
             self._evaluator = Library(library, self._symbol, self.n_x, self.n_p, self.n_y)
-        self._settled = build or library is not None
-        self._text = None if self._settled else text
+        self._looked, self._settled = True, build or library is not None
+        self._text = None if self._settled else self._text
+
+    def source(self):
+        """C text of the library; kept, and pickled, until the library is loaded."""
+        if self._text is None:
+            parts = {"project": self._project, "others": self._others, "drivers": self._drivers, "sizes": self._sizes}
+            self._text = emit.emit(self._f, self._symbol, self.loops, **parts, wide="newton" in self.loops)
+        return self._text
 
     @functools.cached_property
     def _lanes(self):
@@ -441,9 +443,3 @@ class Compiled:
                 expected=shape,
             )
         return array
-
-
-def _restored(serialized, name, loops, project, others, drivers, sizes):
-    project = project and ca.Function.deserialize(project)
-    others = {key: ca.Function.deserialize(f) for key, f in others.items()}
-    return Compiled(ca.Function.deserialize(serialized), name, loops, project, others, drivers, sizes)

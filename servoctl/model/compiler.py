@@ -9,6 +9,7 @@ The flags keep the values of IEEE arithmetic with one exception: a product and a
 operation, which rounds once instead of twice. (Which C text is compiled is told in `emit`.)
 """
 
+import atexit
 import ctypes
 import functools
 import hashlib
@@ -133,7 +134,9 @@ def _optional_flags():
 
 @functools.cache
 def _scratch():
-    return tempfile.TemporaryDirectory(prefix="servoctl-")
+    directory = tempfile.TemporaryDirectory(prefix="servoctl-", ignore_cleanup_errors=True)  # Windows: of loaded files
+    atexit.register(directory.cleanup)
+    return Path(directory.name)
 
 
 def _build(text, level, file_name, command):
@@ -142,7 +145,7 @@ def _build(text, level, file_name, command):
         try:
             return _compile(text, level, cache_directory() / file_name, command)
         except OSError:
-            return _compile(text, level, Path(_scratch().name) / file_name, command)
+            return _compile(text, level, _scratch() / file_name, command)
     except (OSError, _CompilerFailed) as error:
         return _without(f"{' '.join(command)} failed: {error}")
 

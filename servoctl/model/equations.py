@@ -3,6 +3,7 @@
 from functools import cached_property
 
 import casadi as ca
+import numpy as np
 
 from servoctl.errors import SpecificationError
 from servoctl.model import saddle
@@ -10,7 +11,7 @@ from servoctl.model.emit import operations
 from servoctl.reduction.appell import plant_accelerations
 from servoctl.reduction.elimination import eliminate
 from servoctl.reduction.ranks import clean
-from servoctl.reduction.rows import gradient
+from servoctl.reduction.row import gradient
 from servoctl.spec.coordinates import jet_name
 
 
@@ -70,7 +71,7 @@ class Equations:
 
     def rest(self, rows, poles=False):
         """What is left of some rows, raised to order s̄, without γ^(s̄); with their error dynamics if `poles`."""
-        top, zero = ca.vertcat(*self.q.gamma(self.top)), ca.SX.zeros(self.q.n)
+        top, zero = self.q.jet(self.top), ca.SX.zeros(self.q.n)
         found = []
         for a in rows:
             *lower, highest = self.levels[a]
@@ -91,9 +92,21 @@ class Equations:
         found = [*self.r.guards, *((f"leading matrix {i + 1}", p) for i, p in enumerate(pivots))]
         return [(name, g) for name, g in found if any(self.q.where(s) is not None for s in ca.symvar(g))]
 
+    @property
+    def guard_sizes(self):
+        """Largest size of each pivot at the points where they were chosen, (n_g,) array."""
+        values, _ = self.r.points.evaluate([g for _, g in self.guards])
+        return np.abs(values).max(axis=1, initial=0.0).astype(float)
+
+    @property
+    def column_sizes(self):
+        """Largest entry of each column of L and of Bᵀ at the points where ranks were decided: two (n,) arrays."""
+        sizes = (np.abs(self.r.points.matrix(m)[0]) for m in (self.r.leading, self.r.realisation.B.T))
+        return [m.max(axis=(0, 2), initial=0.0).astype(float) for m in sizes]
+
     def rates(self, top):
         """X' for given γ^(s̄)."""
-        moving = self.q.V @ ca.vertcat(*self.q.gamma(1)) + self.q.h
+        moving = self.q.V @ self.q.jet(1) + self.q.h
         return ca.vertcat(moving, *(s for k in range(2, self.top) for s in self.q.gamma(k)), top)
 
     def ode(self, poles=False):
@@ -124,7 +137,7 @@ class Equations:
         """
         q, n = self.q, self.q.n
         zero = ca.SX.zeros(n)
-        w, dw = ca.vertcat(*q.gamma(1)), ca.vertcat(*q.gamma(2))
+        w, dw = q.jet(1), q.jet(2)
         first = ca.vertcat(*(level[1] for level in self.levels))
         second = ca.vertcat(*(level[2] for level in self.levels))
         velocity, _ = self._solve(-ca.substitute(first, w, zero))
@@ -132,7 +145,7 @@ class Equations:
         acceleration = ca.substitute(acceleration, w, velocity)
         rates = q.V @ velocity + q.h
         guards = [ca.substitute(g, ca.vertcat(w, dw), ca.vertcat(velocity, acceleration)) for _, g in self.guards]
-        return self.function("path", ca.vertcat(*q), [self._newton(), rates, velocity, acceleration, *guards])
+        return self.function("path", q.jet(0), [self._newton(), rates, velocity, acceleration, *guards])
 
     def _newton(self):
         q = self.q
@@ -147,7 +160,7 @@ class Equations:
                 do="Name them, or choose an integrating method.",
             )
         residual = ca.vertcat(residual, *q.invariants.values())
-        matrix = ca.jacobian(residual, ca.vertcat(*q))
+        matrix = ca.jacobian(residual, q.jet(0))
         values, sizes = self.r.points.matrix(matrix)
         return eliminate(matrix, -residual, clean(values, sizes))[0]
 
@@ -166,7 +179,7 @@ class Equations:
 
     def metric(self):
         """The inertia matrix M, column by column, at the state."""
-        mass = ca.substitute(self.r.mechanism.mass, ca.vertcat(*self.q.gamma(2)), ca.SX.zeros(self.q.n))
+        mass = ca.substitute(self.r.mechanism.mass, self.q.jet(2), ca.SX.zeros(self.q.n))
         frame = ca.vec(ca.densify(self.q.V))
         return self.function("metric", self.state, [ca.vec(ca.densify(mass)), frame])
 
@@ -194,7 +207,7 @@ class Equations:
         if not q.invariants:
             return ca.SX.zeros(q.nq)
         c = ca.vertcat(*q.invariants.values())
-        J = ca.jacobian(c, ca.vertcat(*q))
+        J = ca.jacobian(c, q.jet(0))
         return J.T @ eliminate(J @ J.T, -c, clean(*self.r.points.matrix(J @ J.T)))[0]
 
     def matrices(self):
@@ -205,7 +218,7 @@ class Equations:
     def plant(self):
         """(q', γ'') of the full mechanism as a function of (t, [q; γ'; inputs]), the inputs those of the program."""
         r, q = self.r, self.q
-        mechanism, acceleration = r.mechanism, ca.vertcat(*q.gamma(2))
+        mechanism, acceleration = r.mechanism, q.jet(2)
         zero = ca.SX.zeros(q.n)
         inputs = ca.SX.sym("input", r.actuation.shape[0])
         driven = mechanism.E @ inputs if r.program.by == "actuators" else inputs
@@ -215,12 +228,12 @@ class Equations:
         force = driven - ca.substitute(mechanism.balance, acceleration, zero)
         solution = plant_accelerations(mechanism, material, force, -second, r.points)
         x = ca.vertcat(*q, *q.gamma(1), inputs)
-        return self.function("plant", x, [q.V @ ca.vertcat(*q.gamma(1)) + q.h, solution])
+        return self.function("plant", x, [q.V @ q.jet(1) + q.h, solution])
 
     def multiplier_form(self):
         """Matrix and right side, column by column, of [M -B; C 0] [γ''; μ]: the form with multipliers."""
         r, q = self.r, self.q
-        acceleration, zero = ca.vertcat(*q.gamma(2)), ca.SX.zeros(q.n)
+        acceleration, zero = q.jet(2), ca.SX.zeros(q.n)
         rows = [row for row in r.given.values() if row.order <= 1 or (row.order == 2 and row.affine)]
         second = ca.vertcat(*(q.derivatives([row.expression], 2 - row.order)[-1][0] for row in rows))
         B = r.realisation.B
@@ -280,7 +293,7 @@ class Equations:
     def _power(self):
         """dE/dt, the power of forces without a potential, the size of its terms, what dE/dt owes to explicit time."""
         r, q = self.r, self.q
-        w = ca.vertcat(*q.gamma(1))
+        w = q.jet(1)
         rate = q.dt(r.mechanism.energy)
         force = r.mechanism.forces + r.realisation.B @ r.multipliers
         law = rate - ca.dot(w, r.mechanism.balance + r.mechanism.forces)
@@ -303,7 +316,7 @@ class Equations:
     def _residuals(self):
         """Given residuals, material constraints and hidden rows at every level that the jets reach."""
         names, expressions = [], []
-        for name, row in self.residual_rows.items():
+        for name, row in residual_rows(self.r).items():
             levels = self.q.derivatives([row.expression], max(0, self.top - row.order))
             names += [(name, j) for j in range(len(levels))]
             expressions += [level[0] for level in levels]
@@ -312,15 +325,31 @@ class Equations:
             expressions.append(expression)
         return names, expressions
 
-    @property
-    def residual_rows(self):
-        """Rows whose residuals a run reports, by name."""
-        hidden = {f"hidden: {row.name}": row for row in self.r.rows if row.story}
-        return {**self.r.given, **hidden}
+
+EQUATIONS = {  # what `compiled` makes of each: the function, its loops, its projection
+    "ode": lambda e: (e.ode(), ("rk",)),
+    "ode_projected": lambda e: (e.ode(), ("rk",), e.project()),
+    "ode_poles": lambda e: (e.ode(poles=True), ("rk",)),
+    "ode_jacobian": lambda e: (e.ode_jacobian(),),
+    "ode_poles_jacobian": lambda e: (e.ode_jacobian(poles=True),),
+    "path": lambda e: (e.path(), ("newton",)),
+    "invariants": lambda e: (e.invariants(),),
+    "metric": lambda e: (e.metric(),),
+    "matrices": lambda e: (e.matrices(),),
+    "plant": lambda e: (e.plant(),),
+    "multiplier_form": lambda e: (e.multiplier_form(),),
+    "accelerations": lambda e: (saddle.accelerations(e),),
+}
 
 
 def _level_name(name, j):
     return name if j == 0 else f"D{'' if j == 1 else j}({name})"
+
+
+def residual_rows(reduction):
+    """Rows whose residuals a run reports, by name."""
+    hidden = {f"hidden: {row.name}": row for row in reduction.rows if row.story}
+    return {**reduction.given, **hidden}
 
 
 def leading_names(reduction):

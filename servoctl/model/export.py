@@ -11,6 +11,7 @@ import numpy as np
 from servoctl.errors import SpecificationError
 from servoctl.model.c_files import Array, Constant, Routine, identifier, write
 from servoctl.model.compiled import Compiled
+from servoctl.model.start import State
 
 ITERATIONS, TOLERANCE = 30, 1e-13  # of Newton's method, as in `Compiled.newton`
 RESERVED = "auto break case char const continue default do double else enum extern float for goto if inline int long "
@@ -63,12 +64,19 @@ def export_c(source, folder, *, name=None, start=None):
         raise SpecificationError(
             "A start was given for a law.", "A law starts with its own memory.", do="Leave the start out."
         )
+    if start is not None and not isinstance(start, State):
+        raise SpecificationError(
+            f"A {type(start).__name__} was given as start.",
+            "A start satisfies every invariant at its time.",
+            nearest="model.start(...).",
+            do="Give that.",
+        )
     name = ("law" if law else "model") if name is None else name
-    if not re.fullmatch(r"[A-Za-z]\w*", name, re.ASCII) or name in RESERVED.split():
+    if not re.fullmatch(r"[A-Za-z]\w*", name if isinstance(name, str) else "", re.ASCII) or name in RESERVED.split():
         raise SpecificationError(
             f"The export is to be named {name!r}.",
             "The name begins every function of the C file: letters, digits and underscores, and no word of C or C++.",
-            nearest=f"{identifier(name)!r}." if identifier(name) != name else "",
+            nearest=f"{identifier(str(name))!r}." if identifier(str(name)) != name else "",
             do="Choose such a name.",
             name=name,
         )

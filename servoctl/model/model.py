@@ -6,18 +6,20 @@ import numpy as np
 
 from servoctl.errors import SpecificationError, unknown
 from servoctl.model.compiled import compiled
-from servoctl.model.equations import Equations, gradient_jets, leading_names
+from servoctl.model.derivation import Derivation
+from servoctl.model.equations import EQUATIONS, Equations, gradient_jets, leading_names, residual_rows
 from servoctl.model.formulations import FORMULATIONS
 from servoctl.model.implicit import implicit
-from servoctl.model.saddle import accelerations
+from servoctl.model.memo import Memo
 from servoctl.model.series import taylor_coefficients
 from servoctl.model.servo_dae import SERVO_DAE
 from servoctl.model.sundials import Sundials
 from servoctl.reduction.knots import require_smooth
-from servoctl.reduction.reduce import holds, reduce
+from servoctl.reduction.reduce import holds
 from servoctl.reduction.structure import structure
 from servoctl.spec.parameters import finite
 
+FUNCTIONS = {**EQUATIONS, **SERVO_DAE, **FORMULATIONS}
 SIGNALS = (
     "actuation", "reaction", "multipliers", "outputs", "energy", "balance", "coordinate_rates", "residuals",
     "inputs", "all_multipliers", "power", "reach",
@@ -26,6 +28,8 @@ SIGNALS = (
 
 def derive(mechanism, program, guess=None):
     """Derive reduced dynamics and required actuation from a mechanism and its program (3.18).
+
+    What another process has derived of the same specification is read from disk (see `servoctl.model.memo`).
 
     Parameters
     ----------
@@ -51,17 +55,18 @@ def derive(mechanism, program, guess=None):
     InconsistentStart
         If no state satisfies the constraints.
     """
-    return Model(reduce(mechanism, program, guess))
+    return Model(Derivation(mechanism, program, guess))
 
 
 class Model:
     """Reduced dynamics and required actuation of a program; made by `derive`.
 
-    Functions are derived and compiled when they are first used.
+    Functions are derived, or read from disk, and compiled when they are first used.
 
     Attributes
     ----------
-    reduction : Reduction
+    reduction : Derivation
+        The rows of the motion: a `Reduction`.
     parameters : (n_p,) array
         Values of the parameters.
     state_names : tuple of str
@@ -115,8 +120,8 @@ class Model:
             if name not in current:
                 raise unknown(name, list(current), "parameter")
         values = r.mechanism.parameters.values({**current, **changes})
-        if not holds(r, values):
-            return Model(reduce(r.mechanism, r.program, r.context.guess, values=values), values)
+        if not holds(r.derived, values):
+            return Model(Derivation(r.mechanism, r.program, r.context.guess, values=values), values)
         return Model(r, values, require_smooth(r.switches, values, r.smoothness), self._functions)
 
     def near(self, t, jets):
@@ -133,8 +138,9 @@ class Model:
         Model
         """
         guess = dict(zip(self.jet_names, map(float, jets), strict=True))
-        r = reduce(self.reduction.mechanism, self.reduction.program, near=(float(t), guess), values=self.parameters)
-        if [row.order for row in r.rows] != [row.order for row in self.reduction.rows] and r.free != self.free:
+        r, near = self.reduction, (float(t), guess)
+        r = Derivation(r.mechanism, r.program, near=near, values=self.parameters)
+        if r.free != self.free:
             raise SpecificationError(
                 f"Near t = {t:.6g} s the program has {r.free} free initial values, elsewhere {self.free}.",
                 "A motion keeps its number of free initial values.",
@@ -190,7 +196,7 @@ class Model:
     @property
     def residual_names(self):
         """Names of the rows whose residuals a run reports."""
-        return (*self._equations.residual_rows, *self.reduction.mechanism.q.invariants)
+        return (*residual_rows(self.reduction.outline), *self.reduction.mechanism.q.invariants)
 
     @property
     def knots(self):
@@ -205,21 +211,30 @@ class Model:
         SpecificationError
         """
         r = self.reduction
-        if r.switches and span not in self._knots_within:
-            self._knots_within[span] = require_smooth(r.switches, self.parameters, r.smoothness, span).times
+        if r.timed and span not in self._knots_within:
+            memo = r.memo if r.decided_at(self.parameters) else Memo(None)
+            self._knots_within[span] = memo.recall(
+                f"knots {span}", lambda: require_smooth(r.switches, self.parameters, r.smoothness, span).times
+            )
         return self._knots_within.get(span, ())
 
     @property
     def raised(self):
         """How often each row is differentiated to the common order s̄: {row name: ρ}."""
-        return {row.name: self.reduction.top - row.order for row in self.reduction.rows}
+        return {row.name: self.reduction.top - row.order for row in self.reduction.outline.rows}
 
     @cached_property
     def _equations(self):
         shared = self._functions
         if "equations" not in shared:
-            shared["equations"] = Equations(self.reduction)
+            shared["equations"] = Equations(self.reduction.derived)
         return shared["equations"]
+
+    def _once(self, name, build):
+        """What was built under a name, by this process or another."""
+        if name not in self._functions:
+            self._functions[name] = self.reduction.memo.recall(name, build)
+        return self._functions[name]
 
     def function(self, name):
         """One of the model's compiled functions of (t, x, p), built at first use.
@@ -234,28 +249,14 @@ class Model:
         -------
         Compiled
         """
-        if name not in self._functions:
-            build = {
-                "ode": lambda e: (e.ode(), ("rk",)),
-                "ode_projected": lambda e: (e.ode(), ("rk",), e.project()),
-                "ode_poles": lambda e: (e.ode(poles=True), ("rk",)),
-                "ode_jacobian": lambda e: (e.ode_jacobian(),),
-                "ode_poles_jacobian": lambda e: (e.ode_jacobian(poles=True),),
-                "path": lambda e: (e.path(), ("newton",)),
-                "invariants": lambda e: (e.invariants(),),
-                "metric": lambda e: (e.metric(),),
-                "matrices": lambda e: (e.matrices(),),
-                "plant": lambda e: (e.plant(),),
-                "multiplier_form": lambda e: (e.multiplier_form(),),
-                "accelerations": lambda e: (accelerations(e),),
-                **SERVO_DAE,
-                **FORMULATIONS,
-            }
-            if name not in build:
-                raise unknown(name, list(build), "function")
-            f, *options = build[name](self._equations)
-            self._functions[name] = compiled(f, name, *options)
-        return self._functions[name]
+        if name not in FUNCTIONS:
+            raise unknown(name, list(FUNCTIONS), "function")
+
+        def build():
+            f, *options = FUNCTIONS[name](self._equations)
+            return compiled(f, name, *options)
+
+        return self._once(name, build)
 
     def taylor(self, last):
         """The compiled Taylor coefficients with index up to `last`, with their loop.
@@ -269,13 +270,14 @@ class Model:
         -------
         Compiled
         """
-        e, q = self._equations, self.reduction.mechanism.q
-        key = f"taylor {last}"
-        if key not in self._functions:
+
+        def build():
+            e, q = self._equations, self.reduction.mechanism.q
             sizes = {"nq": q.nq, "n": q.n, "top": e.top, "last": last, "plain": int(q.plain)}
             f = taylor_coefficients(e, last)
-            self._functions[key] = compiled(f, f"taylor_{last}", ("taylor",), project=e.project(), sizes=sizes)
-        return self._functions[key]
+            return compiled(f, f"taylor_{last}", ("taylor",), project=e.project(), sizes=sizes)
+
+        return self._once(f"taylor {last}", build)
 
     def integrator(self, name, poles=False):
         """An integrator that solves equations in its steps, with error dynamics if `poles`.
@@ -290,9 +292,8 @@ class Model:
         Implicit or Sundials
         """
         key = f"{name} with poles" if poles else name
-        if key not in self._functions:
-            self._functions[key] = (implicit if name == "RadauIIA" else Sundials)(self._equations, name, poles)
-        return self._functions[key]
+        maker = implicit if name == "RadauIIA" else Sundials
+        return self._once(key, lambda: maker(self._equations, name, poles))
 
     def signals(self, kind, rate=0):
         """Names of a group of signals and the compiled function (t, Z, p) of them, or of their `rate`-th derivatives.
@@ -303,11 +304,12 @@ class Model:
             One of `SIGNALS`.
         rate : int
         """
-        key = f"signals {kind}{rate or ''}"
-        if key not in self._functions:
+
+        def build():
             names, f = self._equations.signals(kind, rate)
-            self._functions[key] = (names, compiled(f, f.name()))
-        return self._functions[key]
+            return names, compiled(f, f.name())
+
+        return self._once(f"signals {kind}{rate or ''}", build)
 
     @cached_property
     def signal_groups(self):
@@ -329,12 +331,14 @@ class Model:
 
     def invariant_names(self):
         """(level, name) of each invariant of the state, in the order of the function "invariants"."""
-        return [(level, name) for level, name, _ in self._equations.invariant_rows]
+        return self._once(
+            "invariant names", lambda: [(level, name) for level, name, _ in self._equations.invariant_rows]
+        )
 
     def pole_rows(self):
         """(row name, number of coefficients) of the error dynamics, in the order of the pole inputs."""
-        e = self._equations
-        return [(row.name, count) for row, count in zip(self.reduction.rows, e.raised, strict=True)]
+        r = self.reduction.outline
+        return [(row.name, r.top - row.order) for row in r.rows]
 
     def multiplier_form(self, t, jets):
         """[M -B; C 0] and right sides of the form with multipliers.
@@ -351,34 +355,31 @@ class Model:
         right : (rows, N) array
         """
         y = self.function("multiplier_form").grid(t, jets, self.parameters)
-        columns = self.n + self.reduction.realisation.B.shape[1]
+        columns = self.n + len(self.reduction.outline.realisation.dependent)
         rows = len(y) // (columns + 1)
         return y[rows:].reshape(columns, rows, -1).swapaxes(0, 1), y[:rows]
 
     def guard_names(self):
         """Names of the pivots logged by "ode" and "path"."""
-        return [name for name, _ in self._equations.guards]
+        return self._once("guard names", lambda: [name for name, _ in self._equations.guards])
 
     @cached_property
     def guard_sizes(self):
         """Largest size of each pivot at the points where they were chosen, (n_g,) array."""
-        values, _ = self.reduction.points.evaluate([g for _, g in self._equations.guards])
-        return np.abs(values).max(axis=1, initial=0.0).astype(float)
+        return self._once("guard sizes", lambda: self._equations.guard_sizes)
 
     @cached_property
     def column_sizes(self):
         """Largest entry of each column of L and of Bᵀ at the points where ranks were decided: two (n,) arrays."""
-        r = self.reduction
-        sizes = (np.abs(r.points.matrix(m)[0]) for m in (r.leading, r.realisation.B.T))
-        return [m.max(axis=(0, 2), initial=0.0).astype(float) for m in sizes]
+        return self._once("column sizes", lambda: self._equations.column_sizes)
 
     def row_stories(self):
         """What was done to each row, by name; empty for rows as they were given."""
-        return {row.name: row.story for row in self.reduction.rows}
+        return {row.name: row.story for row in self.reduction.outline.rows}
 
     def leading_names(self):
         """Names of the rows of the two matrices whose ranks carry the motion."""
-        return leading_names(self.reduction)
+        return leading_names(self.reduction.outline)
 
     def gradient_jets(self, row):
         """Names of the jets on which a row's leading gradient depends."""
@@ -386,7 +387,7 @@ class Model:
 
     def row_operations(self):
         """Operations of the rows ψ themselves, before anything is differentiated or compiled."""
-        return self._equations.row_operations
+        return self._once("row operations", lambda: self._equations.row_operations)
 
     def operations(self):
         """Operations of each function that has been built so far, by name."""
@@ -439,10 +440,8 @@ class Model:
         Structure
         """
         if t is None:
-            if "structure" not in self._functions:
-                self._functions["structure"] = structure(self.reduction)
-            return self._functions["structure"]
-        return structure(self.reduction, np.atleast_1d(t), np.asarray(jets), self.parameters)
+            return self._once("structure", lambda: structure(self.reduction.derived))
+        return structure(self.reduction.derived, np.atleast_1d(t), np.asarray(jets), self.parameters)
 
     def __repr__(self):
         from servoctl.model.report import describe

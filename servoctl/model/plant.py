@@ -28,7 +28,7 @@ def plant(mechanism, *, forces=None, damping=None, limits=None, rate_limits=None
     damping : dict of str to float, optional
         Viscous coefficients by coordinate (or quasi-velocity) [N s/m or N m s].
     limits : dict of str to float or (low, high), optional
-        Of the actuators' inputs; a number c stands for (-c, c).
+        Of the actuators' inputs; a number c stands for (-c, c), None leaves a side open.
     rate_limits : dict of str to float, optional
         Largest |du/dt| of the inputs [1/s]: from sample to sample an input changes by at most this times the period.
     lag : dict of str to float, optional
@@ -325,21 +325,40 @@ def _limits(limits, actuators):
     for name, value in mapping(limits, "The limits").items():
         if name not in actuators:
             raise unknown(name, actuators, "actuator")
-        pair = np.array([np.nan])
-        try:
-            pair = np.array([-value, value] if np.ndim(value) == 0 else value, dtype=float)
-        except (TypeError, ValueError):
-            pass
-        if pair.shape != (2,) or not pair[0] < pair[1]:
-            raise SpecificationError(
-                f"The limits of {name!r} are {value!r}.",
-                "Limits are a pair of numbers (low, high) with low < high, or a positive number for both sides.",
-                nearest=f"{{{name!r}: (-100.0, 100.0)}}.",
-                do="Give the pair; an infinity leaves a side open.",
-                name=name,
-            )
-        found[name] = (float(pair[0]), float(pair[1]))
+        found[name] = interval(name, value, "limit")
     return found
+
+
+def interval(name, value, what):
+    """The interval (low, high) that was given for a name, as floats: infinite on a side that is open.
+
+    Parameters
+    ----------
+    name : str
+    value : (float or None, float or None) or float
+        A number c stands for (-c, c), None leaves a side open.
+    what : str
+        What the interval is, in the singular: "limit", "bound".
+
+    Raises
+    ------
+    SpecificationError
+        If it is empty, open on both sides, or something else.
+    """
+    try:
+        low, high = (-value, value) if np.ndim(value) == 0 else value
+        low, high = -np.inf if low is None else float(low), np.inf if high is None else float(high)
+    except (TypeError, ValueError):
+        low = high = np.nan
+    if not low < high or np.isinf([low, high]).all():
+        raise SpecificationError(
+            f"The {what} of {name!r} is {value!r}.",
+            f"A {what} is an interval: a pair with low < high, None on an open side, or a positive number for both.",
+            nearest="(-100.0, 100.0).",
+            do="Give such a pair or number.",
+            name=name,
+        )
+    return low, high
 
 
 def _forces(mechanism, forces, names):

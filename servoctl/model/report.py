@@ -15,7 +15,7 @@ def describe(model):
     str
         At most twelve lines.
     """
-    r = model.reduction
+    r = model.reduction.outline
     lines = [
         f"Model: {' '.join(r.mechanism.q.names)}; program {', '.join(r.program.residuals)} by {_by(r)}",
         f"  {_raised(r)}",
@@ -56,7 +56,7 @@ def _raised(r):
 
 def _hidden_and_free(model):
     """Hidden constraints and free initial values, on one line where there is room."""
-    r = model.reduction
+    r = model.reduction.outline
     free = f"{model.free} free initial value{'s' * (model.free != 1)}"
     free += " (flat: nothing is integrated)" if model.flat else ""
     if not r.hidden:

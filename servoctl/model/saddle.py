@@ -11,9 +11,10 @@ from servoctl.errors import SpecificationError
 from servoctl.model.emit import operations
 from servoctl.reduction.elimination import eliminate
 from servoctl.reduction.ranks import clean
-from servoctl.reduction.rows import gradient
+from servoctl.reduction.row import gradient
 
 FEW = 8  # quasi-velocities: up to here (3.18) takes about as few operations
+CLOSE = 1.1  # times as many operations: up to here merging of common terms decides which are fewer
 
 
 def applies(reduction):
@@ -51,7 +52,7 @@ def solve(equations, poles=False):
     B, size = r.realisation.B, len(constraints)
     G = ca.vertcat(*(gradient(q, r.rows[a]) for a in constraints))
     matrix = ca.vertcat(ca.horzcat(r.mechanism.mass, -B), ca.horzcat(G, ca.SX(size, B.shape[1])))
-    acceleration = ca.vertcat(*q.gamma(2))
+    acceleration = q.jet(2)
     rest = ca.substitute(r.mechanism.balance, acceleration, ca.SX.zeros(q.n))
     right = -ca.vertcat(rest, *equations.rest(constraints, poles))
     solution, pivots = eliminate(matrix, right, clean(*r.points.matrix(matrix)))
@@ -74,10 +75,17 @@ def accelerations(equations):
             "balance and its residuals have orders up to 2.",
             do="Simulate it; a run has both.",
         )
-    sparse = equations.function("accelerations", equations.state, equations.saddle[:2])
+    sparse = ca.vertcat(*equations.saddle[:2])
     if equations.sparse:
-        return sparse
-    solution, acceleration = equations.dense(), ca.vertcat(*q.gamma(2))
-    multipliers = ca.substitute(r.multipliers, acceleration, solution)
-    dense = equations.function("accelerations", equations.state, [solution, multipliers])
-    return min(sparse, dense, key=operations)
+        return equations.function("accelerations", equations.state, [sparse])
+    solution, acceleration = equations.dense(), q.jet(2)
+    dense = ca.vertcat(solution, ca.substitute(r.multipliers, acceleration, solution))
+    few, many = sorted((sparse, dense), key=_instructions)
+    near = _instructions(many) < CLOSE * _instructions(few)
+    found = [equations.function("accelerations", equations.state, [y]) for y in ((few, many) if near else (few,))]
+    return min(found, key=operations) if near else found[0]
+
+
+def _instructions(column):
+    """Operations of a column whose common terms are not yet merged."""
+    return ca.Function("column", [], [column], {"allow_free": True}).n_instructions()

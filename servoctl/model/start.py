@@ -127,13 +127,19 @@ def _at_guess(invariants, x, residual, reference, weights, movable, names, free,
     return (moved, float(left)) if left < TOLERANCE else (x, residual)
 
 
+def _starts(reference, spread, tries):
+    """The reference, then points farther and farther from it."""
+    yield reference
+    rng = np.random.default_rng(1788)
+    for attempt in range(1, tries):
+        yield reference + attempt * 0.1 * rng.uniform(-1.0, 1.0, len(reference)) * spread
+
+
 def _best(invariants, reference, weights, movable, tries=6):
     """The projection of the reference onto the invariants, from perturbed starts where the first fails."""
-    rng = np.random.default_rng(1788)
     best, smallest = reference, np.inf
-    for attempt in range(tries):
-        noise = attempt * 0.1 * rng.uniform(-1.0, 1.0, len(reference)) * (1.0 + np.abs(reference)) * movable
-        x = _settle(invariants, reference + noise / np.sqrt(weights), weights, movable)
+    for first in _starts(reference, (1.0 + np.abs(reference)) * movable / np.sqrt(weights), tries):
+        x = _settle(invariants, first, weights, movable)
         x = _nearest(invariants, x, reference, weights, movable)
         residual = np.nan_to_num(np.abs(invariants.scaled(x)), nan=np.inf).max(initial=0.0)
         if residual < smallest:

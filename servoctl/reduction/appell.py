@@ -11,8 +11,8 @@ import numpy as np
 
 from servoctl.errors import NotRealisable, SpecificationError, unknown
 from servoctl.reduction.elimination import eliminate
-from servoctl.reduction.ranks import clean, decide, decide_all
-from servoctl.reduction.rows import gradient
+from servoctl.reduction.ranks import clean, decide_all, decide_each
+from servoctl.reduction.row import gradient
 
 LONGEST_SEARCH = 2  # times n: no relative degree exceeds the number of plant states
 
@@ -103,7 +103,7 @@ def realisation(mechanism, program, constraints, points):
     dependent = tuple(sorted(rank.columns))
     independent = tuple(i for i in range(q.n) if i not in dependent)
     cleaned = clean(numbers, sizes)
-    regular = [p for p in range(numbers.shape[2]) if decide(cleaned[:, list(dependent), p]).rank == len(cleaned)]
+    regular = [p for p, own in enumerate(decide_each(cleaned[:, list(dependent)])) if own.rank == len(cleaned)]
     return Realisation(B, actuation, dependent, independent, cleaned[:, :, regular or [best]])
 
 
@@ -152,7 +152,7 @@ def decoupling(mechanism, rows, material, points):
     For relative degree 2 P = G N E with N = M⁻¹, or T_m(T_mᵀMT_m)⁻¹T_mᵀ beside material rows.
     """
     q = mechanism.q
-    acceleration = ca.vertcat(*q.gamma(2))
+    acceleration = q.jet(2)
     rest = ca.substitute(mechanism.balance, acceleration, ca.SX.zeros(q.n))
     second = ca.vertcat(*(q.derivatives([row.expression], 2 - row.order)[-1][0] for row in material))
     second = ca.substitute(second, acceleration, ca.SX.zeros(q.n)) if material else ca.SX(0, 1)
@@ -165,7 +165,7 @@ def decoupling(mechanism, rows, material, points):
         expression = q.derivatives([row.expression], max(0, 2 - row.order))[-1][0] if row.order < 2 else row.expression
         level = max(row.order, 2)
         for _ in range(LONGEST_SEARCH * q.n):
-            coefficients = ca.jacobian(expression, ca.vertcat(*q.gamma(level))) @ moves
+            coefficients = ca.jacobian(expression, q.jet(level)) @ moves
             if np.any(clean(*points.matrix(coefficients))) or level > 2:
                 break
             expression = q.derivatives([ca.substitute(expression, acceleration, drift)], 1)[-1][0]

@@ -11,6 +11,7 @@ import numpy as np
 
 from servoctl.errors import SingularProgram
 from servoctl.reduction.ranks import ENTRY, equilibrate
+from servoctl.spec.elementary import divide, multiply, subtract
 
 THRESHOLD = 0.1  # a pivot may be this much smaller than the largest candidate of its row, after equilibration
 
@@ -36,7 +37,7 @@ def eliminate(matrix, right, numbers):
     SingularProgram
         If A is singular at a point.
     """
-    n, m = matrix.shape[0], right.shape[1]
+    n, m = right.shape
     system = _System(matrix, right, numbers)
     order = [system.step() for _ in range(n)]
     solution, rows, rhs = [None] * n, system.rows, system.rhs
@@ -44,7 +45,9 @@ def eliminate(matrix, right, numbers):
         others = [(a, solution[c]) for c, (a, _) in rows[i].items() if c != j]
         solution[j] = [_back(rhs[i][k], [(a, x[k]) for a, x in others], rows[i][j][0]) for k in range(m)]
     pivots = [rows[i][j][0] for i, j in order]
-    return ca.vertcat(*(ca.horzcat(*row) for row in solution)) if m else ca.SX(n, 0), pivots
+    if m != 1:
+        return ca.vertcat(*(ca.horzcat(*row) for row in solution)) if m else ca.SX(n, 0), pivots
+    return ca.vertcat(*(row[0] for row in solution)), pivots
 
 
 class _System:
@@ -58,11 +61,15 @@ class _System:
     """
 
     def __init__(self, matrix, right, numbers):
-        n, m = matrix.shape[0], right.shape[1]
-        scaled = np.stack([equilibrate(numbers[:, :, i])[0] for i in range(numbers.shape[2])], axis=2).astype(float)
-        present = [np.flatnonzero(row).tolist() for row in np.any(scaled, axis=2)]
-        self.rows = [{j: (matrix[i, j], scaled[i, j]) for j in present[i]} for i in range(n)]
-        self.rhs = [[right[i, j] for j in range(m)] for i in range(n)]
+        n = matrix.shape[0]
+        scaled = np.moveaxis(equilibrate(np.moveaxis(numbers, 2, 0))[0], 0, 2).astype(float)
+        entries = dict(zip(zip(*matrix.sparsity().get_triplet(), strict=True), matrix.nonzeros(), strict=True))
+        self.rows = [{} for _ in range(n)]
+        for i, j in zip(*(places.tolist() for places in np.nonzero(np.any(scaled, axis=2))), strict=True):
+            self.rows[i][j] = entries[i, j], scaled[i, j]
+        self.rhs = (
+            [right[i, :].elements() for i in range(n)] if right.shape[1] != 1 else [[b] for b in right.elements()]
+        )
         self.open = dict.fromkeys(range(n))
         self.members = [{} for _ in range(n)]  # of each column: open rows that have an entry there
         for i, row in enumerate(self.rows):
@@ -111,7 +118,7 @@ class _System:
     def _subtract(self, r, pivot_row, pivot_right, j):
         row, right, (pivot, number) = self.rows[r], self.rhs[r], pivot_row[j]
         entry, entry_number = row.pop(j)
-        factor, factor_number = entry / pivot, entry_number / number
+        factor, factor_number = divide(entry, pivot), entry_number / number
         for c, (a, a_number) in pivot_row.items():
             if c == j:
                 continue
@@ -122,11 +129,11 @@ class _System:
                 if row.pop(c, None) is not None:
                     del self.members[c][r]
             else:
-                row[c] = (old - factor * a, new)
+                row[c] = (subtract(old, multiply(factor, a)), new)
                 self.members[c][r] = None
         for k, b in enumerate(pivot_right):
             if not b.is_zero():
-                right[k] = right[k] - factor * b
+                right[k] = subtract(right[k], multiply(factor, b))
 
 
 _ZERO = ca.SX(0)
@@ -135,5 +142,5 @@ _ZERO = ca.SX(0)
 def _back(value, terms, pivot):
     for a, x in terms:
         if not x.is_zero():
-            value = value - a * x
-    return value if value.is_zero() else value / pivot
+            value = subtract(value, multiply(a, x))
+    return value if value.is_zero() else divide(value, pivot)

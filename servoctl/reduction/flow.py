@@ -6,9 +6,9 @@ from math import factorial
 import casadi as ca
 import numpy as np
 
-from servoctl.spec.taylor import Series, Tape
-
-REAL = np.longdouble
+from servoctl.reduction.row import gradient
+from servoctl.reduction.scalars import REAL, Scalars
+from servoctl.spec.taylor import Series
 
 
 class Flow:
@@ -17,12 +17,12 @@ class Flow:
     Parameters
     ----------
     q : Coordinates
-    rows : list of (expression, order) pairs
+    rows : list of Row
         Each contributes its coefficients 0 .. level - order.
     level : int
         Highest level K of the jets.
     points : Points
-        Only its parameters and their values are used here.
+        Only its parameters, their values, and its book are used here.
     signals : dict, optional
         Taylor coefficients of further symbols along the motion, by element hash: lists of (N,) arrays.
     real : type
@@ -31,18 +31,19 @@ class Flow:
 
     def __init__(self, q, rows, level, points, signals=None, real=float):
         self.q, self.level, self.points, self.signals, self.real = q, level, points, signals or {}, real
-        self.equations = [(a, i) for a, (_, order) in enumerate(rows) for i in range(level - order + 1)]
-        self.levels = np.array([rows[a][1] + i for a, i in self.equations], dtype=int)
-        self.first = np.cumsum([0, *(max(level - order + 1, 0) for _, order in rows)])
-        self.rows, self._made = rows, {}  # tapes, read when they are first needed
+        orders = [row.order for row in rows]
+        self.equations = [(a, i) for a, order in enumerate(orders) for i in range(level - order + 1)]
+        self.levels = np.array([orders[a] + i for a, i in self.equations], dtype=int)
+        self.first = np.cumsum([0, *(max(level - order + 1, 0) for order in orders)])
+        self.rows, self._made = rows, {}  # what is read when it is first needed
         self.members = {
-            order: np.array([a for a, (_, o) in enumerate(rows) if o == order], dtype=int)
-            for order in sorted({order for _, order in rows if order <= level})
+            order: np.array([a for a, own in enumerate(orders) if own == order], dtype=int)
+            for order in sorted({order for order in orders if order <= level})
         }
         if not q.plain:
-            moving = q.V @ ca.vertcat(*q.gamma(1)) + q.h
-            parts = [ca.densify(ca.jacobian(moving, ca.vertcat(*q))), ca.densify(q.V)]
-            self.motion = self._tape([], 0, moving.elements(), parts)
+            moving = q.V @ q.jet(1) + q.h
+            parts = [ca.densify(ca.jacobian(moving, q.jet(0))), ca.densify(q.V)]
+            self.motion = self._scalars([*moving.elements(), *(e for p in parts for e in p.nonzeros())])
 
     def at(self, points):
         """The same rows with the parameters of other points; what was read of the rows is shared."""
@@ -50,57 +51,49 @@ class Flow:
         flow.points = points
         return flow
 
+    def _scalars(self, expressions):
+        return Scalars(self.q, self.points.parameters, expressions)
+
     @property
     def groups(self):
         """For each order its rows with their gradients in q and all jets."""
         if "groups" not in self._made:
-            self._made["groups"] = [self._group(order, range(order + 1)) for order in self.members]
+            self._made["groups"] = [self._group(order) for order in self.members]
         return self._made["groups"]
 
-    @property
-    def bare(self):
-        """For each order its rows alone."""
-        if "bare" not in self._made:
-            self._made["bare"] = [self._group(order, []) for order in self.members]
-        return self._made["bare"]
-
-    def _group(self, order, levels):
-        expressions = [self.rows[a][0] for a in self.members[order]]
-        column = ca.vertcat(*expressions)
-        parts = [ca.jacobian(column, ca.vertcat(*(self.q.gamma(m) if m else self.q))) for m in levels]
-        return self._tape(self.members[order], order, expressions, parts)
+    def _group(self, order):
+        """Residuals of an order, the nonzero entries of their gradients, and the places of these."""
+        members = self.members[order]
+        residuals = [self.rows[a].expression for a in members]
+        parts = [ca.jacobian(ca.vertcat(*residuals), self.q.jet(m)) for m in range(order + 1)]
+        places = [np.array(p.sparsity().get_triplet(), dtype=int) for p in parts]
+        return members, order, self._scalars([*residuals, *(e for p in parts for e in p.nonzeros())]), places
 
     def leading(self, order, level):
-        """Rows of an order with their gradients in γ^(order), or in q itself for level 0."""
-        in_q = order == 0 and (level == 0 or self.q.plain)
+        """Rows of an order with the nonzero entries of their gradients in γ^(order), or in q itself for level 0.
+
+        Both as found in the book, and the places of the entries.
+        """
+        in_q = order == 0 and level == 0 and not self.q.plain
         if (order, in_q) not in self._made:
-            group = self._group(order, [order])
-            if order == 0 and not in_q:
-                expressions = [self.rows[a][0] for a in self.members[0]]
-                slopes = ca.jacobian(ca.vertcat(*expressions), ca.vertcat(*self.q)) @ self.q.V
-                group = self._tape(self.members[0], 0, expressions, [slopes])
-            self._made[order, in_q] = group
+            rows = [self.rows[a] for a in self.members[order]]
+            slopes = [ca.jacobian(row.expression, self.q.jet(0)) if in_q else gradient(self.q, row) for row in rows]
+            columns = [g.sparsity().get_triplet()[1] for g in slopes]
+            residuals, entries = [row.expression for row in rows], [e for g in slopes for e in g.nonzeros()]
+            known = self.points.book.find(self.q, self.points.parameters, [*residuals, *entries])
+            places = np.repeat(np.arange(len(rows)), [len(c) for c in columns]), np.array(sum(columns, []), dtype=int)
+            self._made[order, in_q] = known, places
         return self._made[order, in_q]
 
-    def _tape(self, members, order, expressions, parts):
-        """A group's residuals and the nonzero entries of their gradients, with the places of these."""
-        outputs = [*expressions, *(e for p in parts for e in p.nonzeros())]
-        symbols = ca.symvar(ca.vertcat(*outputs))
-        places = [np.array(p.sparsity().get_triplet(), dtype=int) for p in parts]
-        return members, order, Tape(symbols, outputs), symbols, places
-
-    def __call__(self, t, z, slopes=True):
-        """Coefficients (n_equations, N) and Jacobian (n_equations, nz, N) at times t (N,) and jets z (nz, N).
-
-        Without `slopes` the Jacobian is None.
-        """
+    def __call__(self, t, z):
+        """Coefficients (n_equations, N) and Jacobian (n_equations, nz, N) at times t (N,) and jets z (nz, N)."""
         n_points = z.shape[1]
         q_series, q_map = self._kinematics(t, z)
         residual = np.zeros((len(self.equations), n_points), dtype=REAL)
-        jacobian = np.zeros((len(self.equations), len(z), n_points), dtype=self.real) if slopes else None
-        for members, order, tape, symbols, places in self.groups if slopes else self.bare:
+        jacobian = np.zeros((len(self.equations), len(z), n_points), dtype=self.real)
+        for members, order, scalars, places in self.groups:
             depth = self.level - order
-            coefficients = self._run(tape, symbols, t, z, q_series, depth)
+            coefficients = self._run(scalars, t, z, q_series, depth)
             for i in range(depth + 1):
                 residual[self.first[members] + i] = coefficients[: len(members), i]
             offset = len(members)
@@ -123,31 +116,57 @@ class Flow:
             elif l + m <= self.level:
                 jacobian[equations, columns + nq + (l + m - 1) * n] += part * (factorial(l + m) / factorial(l))
 
+    def residual(self, t, z):
+        """The coefficients (n_equations, N) alone."""
+        q_series, _ = self._kinematics(t, z)
+        residual = np.zeros((len(self.equations), z.shape[1]), dtype=REAL)
+        for order, members in self.members.items():
+            known, _ = self.leading(order, self.level)
+            found = self._residuals(known, members, t, z, q_series, self.level - order)
+            for i in range(found.shape[1]):
+                residual[self.first[members] + i] = found[:, i]
+        return residual
+
     def at_level(self, t, z, level):
         """The equations of a level: residuals (n_equations, N) and slopes in γ_[level] or q (n_equations, n, N).
 
         Rows of other levels are zero. The slopes are those of the leading gradients.
         """
         q_series, _ = self._kinematics(t, z)
-        width = self.q.n if level else self.q.nq
         residual = np.zeros((len(self.equations), z.shape[1]), dtype=REAL)
-        slopes = np.zeros((len(self.equations), width, z.shape[1]))
-        for order in self.members:
+        slopes = np.zeros((len(self.equations), self.q.n if level else self.q.nq, z.shape[1]))
+        for order, members in self.members.items():
             if order > level:
                 continue
-            members, _, tape, symbols, [(rows, columns)] = self.leading(order, level)
-            depth = level - order
-            coefficients = self._run(tape, symbols, t, z, q_series, depth)
-            residual[self.first[members] + depth] = coefficients[: len(members), depth]
-            entries = coefficients[len(members) :, 0] * (factorial(level) / factorial(depth))
+            known, (rows, columns) = self.leading(order, level)
+            depth, entries = level - order, np.empty((len(members) + len(rows), z.shape[1]), dtype=REAL)
+            for scalars, own, given in known:
+                entries[given] = scalars.values(t, z, self.points.values)[own]
+            if depth:
+                found = self._residuals(known, members, t, z, q_series, depth)[:, depth]
+            else:
+                found = entries[: len(members)]
+            residual[self.first[members] + depth] = found
+            entries = entries[len(members) :] * (factorial(level) / factorial(depth))
             slopes[self.first[members[rows]] + depth, columns] = entries
         return residual, slopes
 
+    def _residuals(self, known, members, t, z, q_series, depth):
+        """Coefficients of the residuals of some rows, (rows, depth + 1, N)."""
+        result = np.empty((len(members), depth + 1, z.shape[1]), dtype=REAL)
+        for scalars, own, given in known:
+            pairs = [(i, a) for i, a in zip(own, given, strict=True) if a < len(members)]
+            if pairs and depth:
+                coefficients = self._run(scalars, t, z, q_series, depth, 1 + max(i for i, _ in pairs))
+            elif pairs:
+                coefficients = scalars.values(t, z, self.points.values)[:, None]
+            for i, a in pairs:
+                result[a] = coefficients[i]
+        return result
+
     def series(self, expressions, t, z, depth):
         """Taylor coefficients of expressions along a motion, (len, depth + 1, N)."""
-        q_series, _ = self._kinematics(t, z)
-        symbols = ca.symvar(ca.vertcat(*expressions))
-        return self._run(Tape(symbols, list(expressions)), symbols, t, z, q_series, depth)
+        return self._run(self._scalars(list(expressions)), t, z, self._kinematics(t, z)[0], depth)
 
     def _kinematics(self, t, z):
         """Taylor coefficients of q and, unless q' = γ', the derivative of each in z."""
@@ -157,9 +176,8 @@ class Flow:
         first = np.zeros((nq, len(z), n_points), dtype=self.real)
         first[np.arange(nq), np.arange(nq)] = 1.0
         series, maps = [z[:nq]], [first]
-        _, _, tape, symbols, _ = self.motion
         for k in range(self.level):
-            c = self._run(tape, symbols, t, z, series, k)
+            c = self._run(self.motion, t, z, series, k)
             slope = c[nq : nq + nq * nq].reshape(nq, nq, k + 1, n_points).astype(self.real)
             frame = c[nq + nq * nq :].reshape(n, nq, k + 1, n_points).astype(self.real)
             series.append(c[:nq, k] / (k + 1))
@@ -171,28 +189,34 @@ class Flow:
             maps.append(step / (k + 1))
         return series, maps
 
-    def _run(self, tape, symbols, t, z, q_series, depth):
-        inputs = [[self._input(s, k, t, z, q_series) for k in range(depth + 1)] for s in symbols]
-        series = Series(tape, inputs)
+    def _run(self, scalars, t, z, q_series, depth, first=None):
+        """Coefficients 0 .. depth of the first scalars, (first, depth + 1, N)."""
+        start = scalars.inputs(t, z, self.points.values)
+        inputs = [
+            [self._input(symbol, place, k, value, z, q_series) for k in range(depth + 1)]
+            for symbol, place, value in zip(scalars.tape.symbols, scalars.places, start, strict=True)
+        ]
+        series = Series(scalars.tape, inputs, first=first)
         with np.errstate(all="ignore"):
             for _ in range(depth + 1):
                 series.advance()
-        shape = (depth + 1, z.shape[1])
-        result = np.zeros((len(tape.outputs), *shape), dtype=REAL)
-        for i, c in enumerate(series.outputs):
-            for k in range(depth + 1):
-                result[i, k] = c[k]
+        outputs = scalars.tape.outputs[:first]
+        result = np.zeros((len(outputs), depth + 1, z.shape[1]), dtype=REAL)
+        for i, node in enumerate(outputs):
+            for k, c in enumerate(series.c[node]):
+                result[i, k] = c
         return result
 
-    def _input(self, symbol, k, t, z, q_series):
-        place = self.q.where(symbol)
-        if place is None and symbol.element_hash() in self.signals:
-            return self.signals[symbol.element_hash()][k]
+    def _input(self, symbol, place, k, value, z, q_series):
+        """Coefficient k of a symbol, whose value is coefficient 0."""
         if place is None:
-            return np.full(z.shape[1], self.points._parameter(symbol), dtype=REAL) if k == 0 else 0.0
+            own = self.signals.get(symbol.element_hash())
+            return own[k] if own else value if k == 0 else 0.0
         kind, level, i = place
+        if k == 0:
+            return value
         if kind == "t":
-            return t if k == 0 else float(k == 1)
+            return float(k == 1)
         if kind == "q":
             return q_series[k][i]
         if level + k > self.level:

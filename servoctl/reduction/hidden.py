@@ -14,7 +14,8 @@ from servoctl.reduction.elimination import eliminate
 from servoctl.reduction.flow import Flow
 from servoctl.reduction.manifold import solve
 from servoctl.reduction.ranks import NOISE, RESOLVED, clean, decide, decide_all, decide_each, generic
-from servoctl.reduction.rows import Row, dependence, gradient, leading, merge_uses, sample_rows, settle, settle_alone
+from servoctl.reduction.row import Row, gradient, merge_uses
+from servoctl.reduction.rows import dependence, leading, sample_rows, settle, settle_alone
 
 VANISHED = 1e-5  # of a row's gradient at random points: what is left of it on its solutions, if it is a square
 
@@ -59,7 +60,7 @@ def complete(q, rows, context, starts=None):
         if not len(points.t):
             _refuse_contradiction(q, rows, context)
         numbers, sizes = leading(q, rows, points)
-        ranks = decide_each(numbers, sizes)
+        ranks = decide_each(clean(numbers, sizes))
         rank, _ = generic(ranks)
         if not rank.clear:
             raise _ill_conditioned(rows, rank)
@@ -201,7 +202,7 @@ def _refuse_contradiction(q, rows, context):
     numbers, sizes = leading(q, rows, points)
     rank, _ = decide_all(numbers, sizes)
     if rank.clear and rank.rank < len(rows):
-        same = [p for p in range(numbers.shape[2]) if decide(numbers[:, :, p]).rank == rank.rank]
+        same = [p for p, own in enumerate(decide_each(numbers)) if own.rank == rank.rank]
         _step(q, rows, numbers[:, :, same], context)
     raise _no_state(rows)
 
@@ -257,7 +258,7 @@ def _refuse_square(q, row, context, slopes=None):
         if any(clear[i] and q.order(e) < 0 for i, e in zip(columns, own.nonzeros(), strict=True)):
             return
     start = sample_rows(q, [], row.order, context)
-    flow = Flow(q, [(row.expression, row.order)], row.order, start)
+    flow = Flow(q, [row], row.order, start)
     z, residual = solve(flow, start.t, start.z, iterations=40)
     sizes = []
     for jets in (start.z, z):
@@ -265,4 +266,19 @@ def _refuse_square(q, row, context, slopes=None):
         sizes.append(np.abs(values).max(axis=(0, 1)))
     solved = residual < 1e-3
     if solved.any() and np.all(sizes[1][solved] < VANISHED * sizes[0][solved]):
-        raise _vanishing_gradient(row)
+        if not _regular_nearby(flow, start.t[solved], z[:, solved]):
+            raise _vanishing_gradient(row)
+
+
+def _regular_nearby(flow, t, z):
+    """Whether a gradient is small on a row's solutions z only as all is small there: it is no smaller than beside them.
+
+    Newton's method has converged at a regular solution; at that of a square its steps only halve the way.
+    """
+    residual, slopes = flow(t, z)
+    beside = z * (1.0 + np.random.default_rng(1907).uniform(-0.5, 0.5, z.shape))
+    own, other = np.abs(slopes[0]).max(axis=0), np.abs(flow(t, beside)[1][0]).max(axis=0)
+    with np.errstate(all="ignore"):
+        steps = np.abs(residual[0] * slopes[0]) / (slopes[0] ** 2).sum(axis=0)
+    converged = np.all(steps <= VANISHED * np.abs(z), axis=0)
+    return bool(np.any(converged & (own > VANISHED * other)))

@@ -1,6 +1,7 @@
 """Where paths switch, and how smooth residuals are there, found from the expressions themselves."""
 
 from dataclasses import dataclass
+from functools import cached_property
 from math import factorial
 
 import casadi as ca
@@ -43,22 +44,26 @@ class Switches:
 
     def __init__(self, q, residuals, parameters):
         self.q, self.residuals = q, residuals
-        expressions = list(residuals.values())
-        self.symbols = ca.symvar(ca.vertcat(*expressions))
-        self.tape = Tape(self.symbols, expressions)
+        self.symbols = ca.symvar(ca.vertcat(*residuals.values()))
         self.parameters = [p.element_hash() for p in parameters]
+        self.timed = self._timed() if any(s.element_hash() == q.t.element_hash() for s in self.symbols) else []
+
+    @cached_property
+    def tape(self):
+        """The tape of the residuals."""
+        return Tape(self.symbols, list(self.residuals.values()))
+
+    def _timed(self):
+        """Switches of the tape that depend on t, and not on jets."""
         depends = []
         for node in self.tape.nodes:
             if node.kind == "input":
-                place = q.where(self.symbols[node.data])
+                place = self.q.where(self.symbols[node.data])
                 depends.append({"p" if place is None else "t" if place[0] == "t" else "jets"})
             else:
                 depends.append(set().union(*(depends[a] for a in node.args)) if node.args else set())
-        self.timed = []
-        for a, b in self.tape.switches:
-            both = depends[a] | (depends[b] if b is not None else set())
-            if "t" in both and "jets" not in both:
-                self.timed.append((a, b))
+        sides = ((a, b, depends[a] | (depends[b] if b is not None else set())) for a, b in self.tape.switches)
+        return [(a, b) for a, b, both in sides if "t" in both and "jets" not in both]
 
     def __bool__(self):
         return bool(self.timed)

@@ -5,27 +5,18 @@ their own solutions. A point is found by Gauss-Newton on all levels at once, fro
 the guess; residuals are evaluated by numerical Taylor arithmetic in extended precision.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from math import factorial
 
 import casadi as ca
 import numpy as np
 
-from servoctl.reduction.flow import REAL, Flow
-from servoctl.spec.taylor import Tape, evaluate
+from servoctl.reduction.flow import Flow
+from servoctl.reduction.scalars import REAL, Book
 
 ROUNDED = 8 * float(np.finfo(REAL).eps)  # a scaled residual below this is rounding
 ROUNDED_STEP = 1e-15  # a step from below this is worth one trial: shorter ones gain nothing
 WELL_CONDITIONED = 1e-3  # Cholesky pivots of A Aᵀ with unit diagonal above it: Newton's steps need no singular values
-
-
-class Scalars:
-    """SX scalars that are evaluated at several sets of points: read once."""
-
-    def __init__(self, expressions):
-        expressions = list(expressions)
-        self.symbols = ca.symvar(ca.vertcat(*expressions)) if expressions else []
-        self.tape = Tape(self.symbols, expressions)
 
 
 @dataclass(frozen=True)
@@ -42,6 +33,8 @@ class Points:
     values : (n_p,) array
     residual : (N,) array
         Largest scaled residual that is left at each point.
+    book : Book
+        Of what was read.
     """
 
     q: object
@@ -50,6 +43,8 @@ class Points:
     parameters: tuple
     values: np.ndarray
     residual: np.ndarray
+    book: Book = field(default_factory=Book, repr=False, compare=False)
+    _found: dict = field(default_factory=dict, init=False, repr=False, compare=False)
 
     def __repr__(self):
         return f"Points({len(self.t)} points, jets up to order {self.level})"
@@ -70,14 +65,16 @@ class Points:
 
     def evaluate(self, expressions):
         """Values and sizes of SX scalars at the points: two arrays (len, N)."""
-        return self.run(Scalars(expressions))
+        result = np.empty((2, len(expressions), len(self.t)), dtype=REAL)
+        for scalars, own, given in self.book.find(self.q, self.parameters, expressions):
+            if scalars not in self._found:
+                self._found[scalars] = scalars.evaluate(self.t, self.z, self.values)
+            result[:, given] = self._found[scalars][:, own]
+        return result[0], result[1]
 
-    def run(self, scalars):
-        """Values and sizes of `Scalars` at the points: two arrays (len, N)."""
-        inputs = np.empty((len(scalars.symbols), len(self.t)), dtype=REAL)
-        for i, symbol in enumerate(scalars.symbols):
-            inputs[i] = self._input(symbol)
-        return evaluate(scalars.tape, inputs)
+    def read(self, expressions):
+        """Read SX scalars together that will be needed one after the other."""
+        self.book.find(self.q, self.parameters, expressions)
 
     def matrix(self, expression):
         """Values and sizes of an SX matrix at the points: two arrays (rows, columns, N)."""
@@ -91,25 +88,16 @@ class Points:
         found[:, rows, columns] = nonzeros
         return tuple(found)
 
-    def _input(self, symbol):
-        place = self.q.where(symbol)
-        if place is None:
-            return np.full(len(self.t), self._parameter(symbol), dtype=REAL)
-        kind, level, i = place
-        return self.t if kind == "t" else self.jet(level)[i]
-
-    def _parameter(self, symbol):
-        hashes = [p.element_hash() for p in self.parameters]
-        return self.values[hashes.index(symbol.element_hash())]
-
     def joined(self, other):
         """These points and others of the same jets."""
-        t, z = np.append(self.t, other.t), np.hstack([self.z, other.z])
-        return Points(self.q, t, z, self.parameters, self.values, np.append(self.residual, other.residual))
+        residual = np.append(self.residual, other.residual)
+        return replace(self, t=np.append(self.t, other.t), z=np.hstack([self.z, other.z]), residual=residual)
 
     def take(self, keep):
         """Some of the points."""
-        return Points(self.q, self.t[keep], self.z[:, keep], self.parameters, self.values, self.residual[keep])
+        kept = replace(self, t=self.t[keep], z=self.z[:, keep], residual=self.residual[keep])
+        kept._found.update((scalars, found[:, :, keep]) for scalars, found in self._found.items())
+        return kept
 
 
 def solve(flow, t, z, iterations=60):
@@ -133,7 +121,7 @@ def solve(flow, t, z, iterations=60):
     scales = np.ones((len(flow.equations), len(t)))
     for level in range(flow.level + 1):
         _solve_level(flow, t, z, level, scales)
-    residual, _ = flow(t, z, slopes=False)
+    residual = flow.residual(t, z)
     norm = _norms(residual, scales)
     active = np.flatnonzero(norm > ROUNDED)
     for _ in range(iterations):
@@ -161,7 +149,7 @@ def _search(flow, t, z, step, scale, residual):
     trial, open_ = z + damping * step, np.arange(len(t))
     better = np.zeros(len(t), dtype=bool)
     for _ in range(12):
-        new, _ = flow(t[open_], trial[:, open_], slopes=False)
+        new = flow.residual(t[open_], trial[:, open_])
         with np.errstate(all="ignore"):
             good = np.max(np.abs(new) / scale[:, open_], axis=0) < before[open_]
         better[open_[good]] = True
@@ -243,7 +231,7 @@ def sample(q, rows, level, context, starts=None, flow=None, count=5, seed=1907):
     Parameters
     ----------
     q : Coordinates
-    rows : list of (expression, order) pairs
+    rows : list of Row
     level : int
         Highest level of the jets.
     context : Context
@@ -276,13 +264,13 @@ def sample(q, rows, level, context, starts=None, flow=None, count=5, seed=1907):
         for i in range(count):
             t[i] = starts.t[i % len(starts.t)]
             z[:shared, i] = starts.z[:shared, i % len(starts.t)] + (i // len(starts.t)) * 0.1 * z[:shared, i]
-    empty = Points(q, t, z.astype(REAL), context.parameters, context.values, np.zeros(count_tried))
-    flow = flow.at(empty) if flow else Flow(q, rows, level, empty)
+    starting = Points(q, t, z.astype(REAL), context.parameters, context.values, np.zeros(count_tried), context.book)
+    flow = flow.at(starting) if flow else Flow(q, rows, level, starting)
     found = []
     for some in (slice(count), slice(count, None)):  # the second half is needed where one of the first failed
         if sum(len(part.t) for part in found) < count:
             solved, residual = solve(flow, t[some], z[:, some])
-            part = Points(q, t[some], solved, context.parameters, context.values, residual.astype(float))
+            part = replace(starting, t=t[some], z=solved, residual=residual.astype(float))
             found.append(part.take(np.flatnonzero(residual < 1e-13)))
     return found[0] if len(found) == 1 else found[0].joined(found[1]).take(slice(count))
 
@@ -301,6 +289,8 @@ class Context:
         Values of jets about which points are looked for.
     spread : float
         Of the starts about guessed values, relative.
+    book : Book
+        Of what was read.
     """
 
     parameters: tuple
@@ -308,3 +298,4 @@ class Context:
     window: tuple
     guess: dict
     spread: float = 0.1
+    book: Book = field(default_factory=Book, repr=False, compare=False)

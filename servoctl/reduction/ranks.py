@@ -50,20 +50,23 @@ def clean(values, sizes):
 def equilibrate(matrix):
     """Scale rows and columns so that the largest entries are near 1; zero rows and columns stay.
 
+    Parameters
+    ----------
+    matrix : (..., m, n) array
+
     Returns
     -------
     scaled, row_factors, column_factors
+        (..., m, n), (..., m) and (..., n) arrays.
     """
     a = np.array(matrix, dtype=np.longdouble)
-    rows, columns = np.ones(a.shape[0], dtype=a.dtype), np.ones(a.shape[1], dtype=a.dtype)
-    for _ in range(6):
-        for axis, factors in ((1, rows), (0, columns)):
-            if not a.size:
-                break
+    rows, columns = np.ones(a.shape[:-1], dtype=a.dtype), np.ones(a.shape[:-2] + a.shape[-1:], dtype=a.dtype)
+    for _ in range(6 if a.size else 0):
+        for axis, factors in ((-1, rows), (-2, columns)):
             largest = np.abs(a).max(axis=axis)
             scale = 1.0 / np.sqrt(np.where(largest > 0, largest, 1.0))
             factors *= scale
-            a = a * (scale[:, None] if axis else scale[None, :])
+            a *= np.expand_dims(scale, axis)
     return a, rows, columns
 
 
@@ -80,22 +83,33 @@ def decide(matrix, resolved=RESOLVED):
     -------
     Rank
     """
-    a, _, _ = equilibrate(matrix)
-    rows, columns, pivots = list(range(a.shape[0])), list(range(a.shape[1])), []
-    for k in range(min(a.shape)):
-        rest = np.abs(a[k:, k:])
-        i, j = np.unravel_index(np.argmax(rest), rest.shape)
-        if not rest[i, j] > 0:
+    return decide_each(np.asarray(matrix)[:, :, None], resolved)[0]
+
+
+def decide_each(matrices, resolved=RESOLVED):
+    """The rank of each of N matrices, (m, n, N) with entries cleaned: a list of Rank."""
+    a, _, _ = equilibrate(np.moveaxis(matrices, 2, 0))
+    count, m, n = a.shape
+    each, least = np.arange(count), min(m, n)
+    rows, columns = np.tile(np.arange(m), (count, 1)), np.tile(np.arange(n), (count, 1))
+    pivots, open_ = np.zeros((count, least)), np.ones(count, dtype=bool)
+    for k in range(least):
+        rest = np.abs(a[:, k:, k:]).reshape(count, -1)
+        place = rest.argmax(axis=1)
+        open_ &= rest[each, place] > 0
+        if not open_.any():
             break
-        i, j = i + k, j + k
-        a[[k, i]], rows[k], rows[i] = a[[i, k]], rows[i], rows[k]
-        a[:, [k, j]], columns[k], columns[j] = a[:, [j, k]], columns[j], columns[k]
-        pivots.append(float(np.abs(a[k, k])))
-        a[k + 1 :, k:] -= np.outer(a[k + 1 :, k] / a[k, k], a[k, k:])
-        a[k + 1 :, k] = 0.0
-    rank = next((k for k, p in enumerate(pivots) if p <= resolved), len(pivots))
-    kept = min(pivots[:rank], default=np.inf)
-    return Rank(rank, kept, max(pivots[rank:], default=0.0), tuple(rows[:rank]), tuple(columns[:rank]))
+        i, j = place // (n - k) + k, place % (n - k) + k
+        for array, other in ((a, i), (rows, i), (a.swapaxes(1, 2), j), (columns, j)):
+            array[each, other], array[:, k] = array[:, k].copy(), array[each, other]
+        pivot = np.where(open_, a[:, k, k], 1.0)
+        pivots[:, k] = np.where(open_, np.abs(pivot), 0.0)
+        a[:, k + 1 :, k + 1 :] -= (a[:, k + 1 :, k] / pivot[:, None])[:, :, None] * a[:, None, k, k + 1 :]
+    ranks = (pivots > resolved).astype(int).cumprod(axis=1).sum(axis=1).tolist()
+    return [
+        Rank(r, min(p[:r], default=np.inf), max(p[r:], default=0.0), tuple(i[:r]), tuple(j[:r]))
+        for r, p, i, j in zip(ranks, pivots.tolist(), rows.tolist(), columns.tolist(), strict=True)
+    ]
 
 
 def decide_all(values, sizes):
@@ -113,12 +127,7 @@ def decide_all(values, sizes):
     index : int
         The point with the largest smallest kept pivot.
     """
-    return generic(decide_each(values, sizes))
-
-
-def decide_each(values, sizes):
-    """The rank at each point, of values (m, n, N) with sizes of the same shape: a list of Rank."""
-    return [decide(clean(values[:, :, i], sizes[:, :, i])) for i in range(values.shape[2])]
+    return generic(decide_each(clean(values, sizes)))
 
 
 def generic(ranks):

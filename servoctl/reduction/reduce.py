@@ -11,9 +11,10 @@ from servoctl.reduction.appell import Realisation, realisation, require_inertia
 from servoctl.reduction.flow import Flow
 from servoctl.reduction.hidden import as_rows, complete
 from servoctl.reduction.knots import Knots, Switches, require_smooth
-from servoctl.reduction.manifold import Context, Points, Scalars
+from servoctl.reduction.manifold import Context, Points
 from servoctl.reduction.ranks import Rank, clean, decide, decide_all
-from servoctl.reduction.rows import Row, gradient, merge_uses, sample_rows, settle_alone
+from servoctl.reduction.row import Row, gradient, merge_uses
+from servoctl.reduction.rows import sample_rows, settle_alone
 from servoctl.spec.coordinates import mapping
 from servoctl.spec.mechanism import Mechanism, require_known
 from servoctl.spec.parameters import finite
@@ -88,7 +89,7 @@ class Reduction:
     @cached_property
     def leading(self):
         """The leading matrix L, (n, n) SX."""
-        return ca.cse(ca.vertcat(*(gradient(self.mechanism.q, row) for row in self.rows)))
+        return ca.vertcat(*(gradient(self.mechanism.q, row) for row in self.rows))
 
     @cached_property
     def conditions(self):
@@ -97,17 +98,17 @@ class Reduction:
         levels = (q.derivatives([row.expression], max(0, self.top - row.order)) for row in self.given.values())
         left = [level[0] for found in levels for level in found]
         free = self.mechanism.balance - own @ self.multipliers
-        return Scalars([*self.leading.nonzeros(), *own.T.nonzeros(), *left, *free.elements()])
+        return [*self.leading.nonzeros(), *own.T.nonzeros(), *left, *free.elements()]
 
     @cached_property
     def decided(self):
         """Values and sizes of the conditions at the points of the reduction."""
-        return self.points.run(self.conditions)
+        return self.points.evaluate(self.conditions)
 
     @cached_property
     def flow(self):
         """The rows along a motion, as `holds` puts points on their manifold."""
-        return Flow(self.mechanism.q, [(row.expression, row.order) for row in self.rows], self.top, self.points)
+        return Flow(self.mechanism.q, self.rows, self.top, self.points)
 
     @cached_property
     def multipliers(self):
@@ -224,7 +225,7 @@ def holds(reduction, values):
     points = sample_rows(q, r.rows, r.top, context, starts=r.points, flow=r.flow)
     if not len(points.t):
         return False
-    after, start = points.run(r.conditions), 0
+    after, start = points.evaluate(r.conditions), 0
     for sparsity in (r.leading.sparsity(), r.realisation.B.T.sparsity()):
         entries = slice(start, start + sparsity.nnz())
         old, new = (

@@ -1,6 +1,6 @@
-"""The rows ψ_a = 0 that determine the motion, their orders and leading gradients."""
+"""The orders of rows, and their leading gradients, settled at points of the manifold."""
 
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 
 import casadi as ca
 import numpy as np
@@ -8,62 +8,14 @@ import numpy as np
 from servoctl.reduction.elimination import eliminate
 from servoctl.reduction.manifold import sample
 from servoctl.reduction.ranks import ENTRY, clean, combination, decide, equilibrate
+from servoctl.reduction.row import gradient, merge_uses
 
 DEPENDENT = 1e-11  # what may be left of a row after the combination of others, both equilibrated
 
 
-@dataclass(frozen=True)
-class Row:
-    """One scalar equation ψ(t, q, γ', ..., γ^(order)) = 0.
-
-    Attributes
-    ----------
-    expression : SX scalar
-    order : int
-        Highest level on which it depends on the manifold; 0 for q alone, -1 for neither q nor a jet.
-    name : str
-    kind : {"program", "material", "dynamics"}
-        Where it came from.
-    affine : bool
-        Whether it is affine in γ^(order).
-    story : str
-        What was done to it, if it is a hidden constraint.
-    uses : dict of str to int
-        How often each program residual stands differentiated in it.
-    """
-
-    expression: ca.SX
-    order: int
-    name: str
-    kind: str
-    affine: bool = True
-    story: str = ""
-    uses: dict = field(default_factory=dict)
-
-    def __repr__(self):
-        return f"Row({self.name}: {self.kind}, order {self.order}{', ' + self.story if self.story else ''})"
-
-
-def merge_uses(*parts):
-    """The highest number of differentiations of each residual among (uses, extra differentiations) pairs."""
-    total = {}
-    for uses, extra in parts:
-        for name, count in uses.items():
-            total[name] = max(total.get(name, 0), count + extra)
-    return total
-
-
-def gradient(q, row, level=None):
-    """∂ψ/∂γ^(level), (1, n) SX; for level 0 ∂ψ/∂q · V. Default: the row's own order, its leading gradient."""
-    level = row.order if level is None else level
-    if level == 0:
-        return ca.jacobian(row.expression, ca.vertcat(*q)) @ q.V
-    return ca.jacobian(row.expression, ca.vertcat(*q.gamma(level)))
-
-
 def sample_rows(q, rows, level, context, **options):
     """Points on the manifold of rows and their derivatives up to a level (see `manifold.sample`)."""
-    return sample(q, [(row.expression, row.order) for row in rows], level, context, **options)
+    return sample(q, rows, level, context, **options)
 
 
 def leading(q, rows, points):
@@ -80,14 +32,13 @@ def settle_alone(q, rows, context):
     list of (Row, (n, N) array or None)
         With the values of its leading gradient at the points, where this look was enough.
     """
-    levels = [max(row.order, q.order(row.expression), 0) for row in rows]
+    levels = [q.order(row.expression) for row in rows]
     found = [None] * len(rows)
-    for level in set(levels):
-        members = [a for a, own in enumerate(levels) if own == level and q.order(rows[a].expression) == level]
-        if not members:
-            continue
+    for level in set(levels) - {-1}:
+        members = [a for a, own in enumerate(levels) if own == level and rows[a].order <= level]
         points = sample_rows(q, [], level, context)
-        gradients = [gradient(q, replace(rows[a], order=level)) for a in members]
+        gradients = [gradient(q, rows[a], level) for a in members]
+        points.read([*(rows[a].expression for a in members), *(e for g in gradients for e in g.nonzeros())])
         values = clean(*points.matrix(ca.vertcat(*gradients)))
         for a, slopes, numbers in zip(members, gradients, values, strict=True):
             if np.any(numbers):
@@ -122,7 +73,7 @@ def settle(q, row, others, context, starts=None):
     if not len(points.t):
         return None, points
     for j in range(q.order(row.expression), -1, -1):
-        values, sizes = points.matrix(gradient(q, replace(row, order=j)))
+        values, sizes = points.matrix(gradient(q, row, j))
         values = clean(values, sizes)[0]
         if np.any(values):
             lower = [other for other in others if other.order < j or (other.order == j and other.affine and j > 0)]
@@ -132,7 +83,7 @@ def settle(q, row, others, context, starts=None):
             row = replaced
         elif j > 0:
             row = _drop(q, row, q.gamma(j), points)
-    if q.order(row.expression) == 0 and not np.any(clean(*points.matrix(gradient(q, replace(row, order=0))))):
+    if q.order(row.expression) == 0 and not np.any(clean(*points.matrix(gradient(q, row, 0)))):
         return replace(row, order=-1), points
     return replace(row, order=max(q.order(row.expression), -1)), points
 
@@ -148,7 +99,7 @@ def _drop(q, row, symbols, points):
 def _affine(q, expression, j, points):
     if j == 0:
         return True
-    jets = ca.vertcat(*q.gamma(j))
+    jets = q.jet(j)
     second = ca.jacobian(ca.vec(ca.jacobian(expression, jets)), jets)
     if not second.nnz():
         return True
@@ -211,7 +162,7 @@ def dependence(q, rows, numbers):
     weights : (len(support),) array
         Equilibrated size of each row's coefficient, smallest over the points; 1 for the dependent row.
     """
-    scaled = np.stack([equilibrate(numbers[:, :, p])[0] for p in range(numbers.shape[2])], axis=2)
+    scaled = np.moveaxis(equilibrate(np.moveaxis(numbers, 2, 0))[0], 0, 2)
     basis = []
     for b in range(len(rows)):
         coefficients, left = [], []

@@ -14,6 +14,7 @@ import numpy as np
 from servoctl.reduction.flow import Flow
 from servoctl.reduction.manifold import solve
 from servoctl.reduction.ranks import decide, solve_clean
+from servoctl.reduction.row import Row
 
 ZERO = 1e-12  # of the size of its terms: below this an entry of J is zero
 INDEPENDENT = 1e-7  # equilibrated pivots of J above this count
@@ -181,9 +182,10 @@ def _at_depth(reduction, points, depth):
     z = np.zeros((q.nq + level * q.n, len(points.t)), dtype=np.longdouble)
     shared = min(len(z), len(points.z))
     z[:shared] = points.z[:shared]
-    flow = Flow(q, [(row.expression, row.order) for row in reduction.rows], level, points)
+    flow = Flow(q, reduction.rows, level, points)
     z, _ = solve(flow, points.t, z)
-    z[np.abs(z) < AT_REST * np.maximum(1.0, np.abs(z).max(axis=0))] = 0.0
+    for part in (z[: q.nq], z[q.nq :]):
+        part[np.abs(part) < AT_REST * np.maximum(1.0, np.abs(part).max(axis=0))] = 0.0
     J, sizes = _input_jacobian(reduction, points, z, depth)
     result = []
     for p in range(len(points.t)):
@@ -209,9 +211,9 @@ def _input_jacobian(reduction, points, z, depth):
     signals = {s.element_hash(): [u[i, j] for j in range(depth + 1)] for i, s in enumerate(inputs.elements())}
     balance = (mechanism.balance - B @ inputs).elements()
     rows = [
-        *((e, 2) for e in balance),
-        *((r.expression, r.order) for r in material),
-        *((r.expression, r.order) for r in program),
+        *(Row(e, 2, name, "dynamics") for name, e in zip(q.jet_names(1), balance, strict=True)),
+        *material,
+        *program,
     ]
     flow = Flow(q, rows, level, points, signals, real=np.longdouble)
     _, jacobian = flow(points.t, z)

@@ -8,12 +8,14 @@ from math import comb, factorial, inf, pi
 import numpy as np
 
 from servoctl.errors import SpecificationError, unknown
+from servoctl.simulation.drift import is_whole
 from servoctl.simulation.tableaus import ORDERS, tableau
 
 SAME = {"DOP853": "RK8", "RK45": "RK5"}  # scipy's adaptive methods that go on with the result of these tableaus
 METHODS = (*ORDERS, *SAME, "RK23", "Taylor", "RadauIIA", "Radau")
 WITH_ORDER = ("Taylor", "RadauIIA")
 BEYOND = 1e-10  # of |R| over 1: roots of |R|² = 1 that only touch 1 are told from those that cross it
+MANY_STEPS = 1e5  # of an adaptive method: each takes a part of a millisecond
 FASTEST, HALVINGS = 4.0, 50  # of p·h: every sampled loop of two or more integrators is unstable there
 
 
@@ -161,7 +163,7 @@ def sampled_bound(rho, delay=0):
     sᵖ z^delay + Σ_k binom(ρ, k) s^(ρ-k) E_k(z)/k!, of exponent ρ: (s + 1)^ρ for small p h.
     """
     for name, value, low in (("rho", rho, 1), ("delay", delay, 0)):
-        if not (isinstance(value, (int, np.integer)) and low <= value <= 12):
+        if not (is_whole(value) and low <= value <= 12):
             raise SpecificationError(
                 f"{name}={value!r} was given.", f"It is a whole number from {low} to 12.", do=f"Give {low + 1}."
             )
@@ -231,6 +233,34 @@ def warn_fast_poles(method, poles, step):
             f"Steps of {step:.4g} s by {method} amplify the error dynamics of {row!r}, which the pole {number} 1/s was "
             f"to damp: |λ|h = {abs(pole) * step:.4g} exceeds {limit:.4g}. The largest stable step is {largest:.4g} s. "
             "Take it, slower poles, or drift='project'.",
+            RuntimeWarning,
+            stacklevel=_outside(),
+        )
+
+
+def warn_many_steps(method, poles, length):
+    """Warn where error dynamics hold the steps of an explicit adaptive method far below the span, with their number.
+
+    Parameters
+    ----------
+    method : str
+        One of `bounds.METHODS`.
+    poles : dict of str to (ρ,) arrays of complex
+        Of each row [1/s].
+    length : float
+        Of the span [s].
+    """
+    steps = [
+        (abs(pole) / limit, pole, row)
+        for row, values in poles.items()
+        for pole in values
+        if 0 < (limit := largest_explicit(method, None, float(np.angle(pole)))) < inf
+    ]
+    rate, pole, row = max(steps, key=lambda found: found[0], default=(0.0, 0.0, ""))
+    if rate * length > MANY_STEPS:
+        warnings.warn(
+            f"The pole {pole:g} 1/s of {row!r} holds the steps of {method} below {1 / rate:.2g} s: {rate * length:.1g} "
+            "steps over the span. Take slower poles, drift='project', or 'RadauIIA'.",
             RuntimeWarning,
             stacklevel=_outside(),
         )

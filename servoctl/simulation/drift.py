@@ -38,7 +38,7 @@ class Poles:
             if isinstance(self.values, float):
                 poles = [-1.0 / self.values] * count
             else:
-                poles = np.atleast_1d(self.values.get(name, [0.0] * count))
+                poles = _numbers(name, self.values.get(name, [0.0] * count))
             if len(poles) != count:
                 raise SpecificationError(
                     f"{len(poles)} poles were given for the row {name!r}.",
@@ -54,6 +54,21 @@ class Poles:
                 )
             found += list(polynomial.real[:0:-1])
         return np.array(found)
+
+
+def _numbers(row, poles):
+    try:
+        found = np.atleast_1d(np.asarray(poles, dtype=complex))
+    except (TypeError, ValueError):
+        found = np.full(1, np.nan)
+    if found.ndim != 1 or not np.all(np.isfinite(found)):
+        raise SpecificationError(
+            f"The poles {poles!r} were given for the row {row!r}.",
+            "Poles are finite numbers [1/s].",
+            do="Give [-5.0, -5.0].",
+            row=row,
+        )
+    return found
 
 
 @dataclass(frozen=True)
@@ -89,9 +104,13 @@ def poles(values):
     Raises
     ------
     SpecificationError
-        If the time constant is not positive.
+        If the time constant is not positive, or no row is named.
     """
     if isinstance(values, dict):
+        if not values:
+            raise SpecificationError(
+                "Poles of no row were given.", "Error dynamics belong to rows.", do="Give 0.1, or poles by row name."
+            )
         return Poles(dict(values))
     try:
         constant = np.nan if isinstance(values, bool) else float(values)

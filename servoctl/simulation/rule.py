@@ -7,6 +7,7 @@ rule does not trust it: the motion is computed with two tolerances, and their di
 """
 
 from dataclasses import replace
+from numbers import Real
 
 import numpy as np
 
@@ -147,7 +148,7 @@ def accurate(simulated, model, accuracy):
 
 def require_accuracy(accuracy):
     """An accuracy as a float, where it is one."""
-    if not (isinstance(accuracy, (int, float)) and LEAST <= accuracy <= MOST):
+    if not (isinstance(accuracy, Real) and LEAST <= accuracy <= MOST):
         raise SpecificationError(
             f"accuracy={accuracy!r} was given.",
             f"An accuracy is the largest relative error of the motion, from {LEAST:g} to {MOST:g}.",

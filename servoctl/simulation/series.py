@@ -81,6 +81,14 @@ class SeriesMethod:
         self.watch = Watch(self.model, t, x, self.watch)
         self.motion.count(pivot_changes=1)
 
+    def _leads_on(self, t, x):
+        """Whether other pivots were found."""
+        if self.motion.changes_pivots(t):
+            with contextlib.suppress(ServoError):
+                self._repivot(t, x)
+                return True
+        return False
+
     def _piece(self, a, x, b, pending):
         self.p = np.append(self.model.parameters, (a + b) / 2)  # paths take the branches of this piece
         while a != b and self.motion.stop is None:
@@ -95,10 +103,9 @@ class SeriesMethod:
             else:
                 a, x = t[stand], states[:, stand].copy()
             self.progress(a)
-            if repivot and not self.motion.changes_pivots(a):
-                self.motion.stop = self.watch.singular(a, x, "no choice of pivots leads on")
-            elif repivot:
-                self._repivot(a, x)
+            if repivot:
+                if not self._leads_on(a, x):
+                    self.motion.stop = self.watch.singular(a, x, "no choice of pivots leads on")
             elif why:
                 at = self._state(t, states, y, where)
                 self.motion.stop = self.watch.singular(where, at, why)

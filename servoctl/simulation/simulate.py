@@ -7,7 +7,7 @@ import numpy as np
 from servoctl.errors import InconsistentStart, SpecificationError, unknown
 from servoctl.simulation.adaptive import METHODS, ONE_STEP, Adaptive
 from servoctl.simulation.algebraic import algebraic
-from servoctl.simulation.bounds import row_poles
+from servoctl.simulation.bounds import row_poles, warn_many_steps
 from servoctl.simulation.drift import Minimal, Poles, Project, as_drift, is_whole
 from servoctl.simulation.fixed import fixed_step
 from servoctl.simulation.implicit import RADAU_ORDERS, RadauMethod
@@ -22,6 +22,8 @@ from servoctl.simulation.tableaus import ORDERS
 SAMPLES = 1001  # of a run unless t_eval says otherwise: smooth curves, and extrema refined to rounding
 MOST_STEPS = 10**8  # of fixed length: more would fill the memory with samples
 OFF = 1e-5  # of a start: residuals relative to their gradients times the state, above which it is no start
+EXPLICIT = ("RK23", "RK45", "DOP853")  # and adaptive
+FLOORED, FLOOR = (*ONE_STEP, "BDF"), 100 * np.finfo(float).eps  # least rtol of scipy's methods but LSODA
 ALL_METHODS = ("algebraic", "Taylor", "RadauIIA", *ORDERS, *METHODS, *MULTISTEP)
 
 
@@ -108,15 +110,23 @@ def _simulated(model, start, span, method, drift, rtol, atol, step, t_eval, orde
     t0, t1 = span
     method = _method(model, method)
     drift = _drift(model, drift, method)
-    if isinstance(drift, Poles) and t1 < t0:
-        _require_decay(model, drift)
+    if isinstance(drift, Poles):
+        _require_decay(model, drift, t0, t1)
+        if method in EXPLICIT:
+            warn_many_steps(method, row_poles(drift, model), abs(t1 - t0))
     _refuse_idle(method, step, order, jets, rtol, atol)
-    x0 = _state(model, start, t0)
-    if method != "algebraic" and (drift is None or isinstance(drift, Minimal)):
-        _require_consistent(model, t0, x0)
+    leads_back = method == "algebraic" or isinstance(drift, (Poles, Project))
+    x0 = (as_state if leads_back else consistent_state)(model, start, t0)
     knots = model.require_smooth((min(t0, t1), max(t0, t1)))
     times = _times(t0, t1, t_eval, knots)
     rtol, atol = _tolerance("rtol", rtol, 1e-9), _tolerance("atol", atol, 1e-11)
+    if method in FLOORED and rtol < FLOOR:
+        raise SpecificationError(
+            f"rtol={rtol:g} was given with method={method!r}.",
+            f"scipy's methods take {FLOOR:.3g} instead of less.",
+            nearest=f"rtol={1.01 * FLOOR:.3g}; method='Taylor' has no such limit.",
+            do="Change one of them.",
+        )
     bar = Progress((t0, t1), progress)
     try:
         if method == "algebraic":
@@ -197,43 +207,44 @@ def _method(model, method):
     return method
 
 
-def _drift(model, drift, method):
-    drift = as_drift(drift)
+def _drift(model, given, method):
+    drift = as_drift(given)
     if isinstance(drift, Minimal):
         require_minimal(model, method, (*ORDERS, *ONE_STEP))
     elif drift is not None and method == "algebraic":
         raise SpecificationError(
-            f"drift={drift} was given with method='algebraic'.",
+            f"drift={given!r} was given with method='algebraic'.",
             "Where every instant is solved for itself nothing drifts.",
             nearest="drift=None, or an integrating method such as 'DOP853'.",
             do="Leave one of them out.",
         )
     if isinstance(drift, Poles) and method == "Taylor":
         raise SpecificationError(
-            f"drift={drift} was given with method='Taylor'.",
+            f"drift={given!r} was given with method='Taylor'.",
             "The series are those of the undisturbed rows; error dynamics would need series of their own.",
             nearest="drift='project', which keeps residuals at rounding.",
             do="Project, or take another method.",
         )
     if isinstance(drift, Project) and method in (*METHODS, *MULTISTEP) and method not in ONE_STEP:
         raise SpecificationError(
-            f"drift={drift} was given with method={method!r}.",
+            f"drift={given!r} was given with method={method!r}.",
             "A multistep method carries past states, which projection would contradict.",
-            nearest=f"One of {', '.join(('RK4', *ONE_STEP))}, or poles.",
+            nearest=f"One of {', '.join(('Taylor', 'RadauIIA', 'RK4', *ONE_STEP))}, or poles.",
             do="Change one of them.",
         )
     return drift
 
 
-def _require_decay(model, drift):
-    """Refuse poles that amplify where time runs backwards."""
+def _require_decay(model, drift, t0, t1):
+    """Refuse poles that amplify in the direction of time."""
     drift.coefficients(model)  # refuses poles that do not fit the rows
     for row, values in row_poles(drift, model).items():
-        if np.any(np.real(values) < 0):
+        if np.any(np.real(values) * (t1 - t0) > 0):
+            way, sign = ("forward", "negative") if t1 > t0 else ("backwards", "positive")
             raise SpecificationError(
-                f"drift={drift} was given with a span that runs backwards: {row!r} has poles {values.tolist()} 1/s.",
-                "Error dynamics that decay forward in time grow backward, as e^(|t|/T).",
-                nearest="drift='project'; or poles by row with positive real parts.",
+                f"drift={drift} was given with a span that runs {way}: {row!r} has poles {np.asarray(values)} 1/s.",
+                "Error dynamics that decay forward in time grow backward, and the other way round.",
+                nearest=f"drift='project'; or poles by row with {sign} real parts.",
                 do="Change one of them.",
                 row=row,
             )
@@ -261,7 +272,7 @@ def _refuse_idle(method, step, order, jets, rtol, atol):
         if value is not None and method not in users:
             raise SpecificationError(
                 f"{name}={value!r} was given with method={method!r}.",
-                f"Only {' and '.join(users)} use it.",
+                f"It belongs to {', '.join(users)}.",
                 nearest=f"method={users[0]!r}.",
                 do=f"Leave {name} out.",
             )
@@ -278,7 +289,8 @@ def _refuse_idle(method, step, order, jets, rtol, atol):
             )
 
 
-def _state(model, start, t0):
+def as_state(model, start, t0):
+    """The state X (n_x,) that a start gives at t0."""
     try:
         values = np.asarray(start if isinstance(start, dict) else getattr(start, "values", start), dtype=float)
     except (TypeError, ValueError):
@@ -299,8 +311,9 @@ def _state(model, start, t0):
     return values
 
 
-def _require_consistent(model, t, x):
-    """Refuse a start off the constraints: without a treatment that leads back, the whole motion would be off."""
+def consistent_state(model, start, t):
+    """The same, refused off the constraints: without a treatment that leads back, the whole motion would be off."""
+    x = as_state(model, start, t)
     names = [name for _, name in model.invariant_names()]
     y = model.function("invariants")(t, x, model.parameters)
     values, slopes = y[: len(names)], y[len(names) :].reshape(len(x), len(names)).T
@@ -316,6 +329,7 @@ def _require_consistent(model, t, x):
             invariant=names[worst],
             residual=float(values[worst]),
         )
+    return x
 
 
 def _times(t0, t1, t_eval, knots):

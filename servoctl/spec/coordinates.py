@@ -6,6 +6,7 @@ from numbers import Integral
 import casadi as ca
 
 from servoctl.errors import SpecificationError
+from servoctl.spec.elementary import divide, multiply
 from servoctl.spec.taylor import Series, Tape, _is_zero
 
 
@@ -112,7 +113,7 @@ class Coordinates:
         self.nq = len(names)
         self.t = ca.SX.sym("t")
         self._q = tuple(ca.SX.sym(name) for name in names)
-        self._w = {}
+        self._w, self._columns = {}, {}
         self._index = {self.t.element_hash(): ("t", 0, 0)}
         self._index |= {s.element_hash(): ("q", 0, i) for i, s in enumerate(self._q)}
         self.velocity_names = tuple(f"d{name}" for name in names)
@@ -198,6 +199,12 @@ class Coordinates:
             self._index |= {s.element_hash(): ("w", k, i) for i, s in enumerate(symbols)}
         return self._w[k]
 
+    def jet(self, k):
+        """γ^(k), k >= 1, or q for k = 0, as a column: (n,) or (nq,) SX."""
+        if k not in self._columns:
+            self._columns[k] = ca.vertcat(*(self.gamma(k) if k else self._q))
+        return self._columns[k]
+
     def jet_names(self, k):
         """Names of γ^(k), k >= 1, or of q for k = 0."""
         if k == 0:
@@ -240,9 +247,9 @@ class Coordinates:
 
     def order(self, expression):
         """The highest k for which γ^(k) stands in an expression (0 for q alone, -1 for neither)."""
-        items = ca.vec(expression).elements() if isinstance(expression, ca.SX) else column(expression, "the expression")
-        symbols = ca.symvar(ca.vertcat(*items)) if items else []
-        found = [self.where(s) for s in symbols]
+        if not isinstance(expression, ca.SX):
+            expression = ca.SX(ca.vertcat(*column(expression, "the expression")))
+        found = [self.where(s) for s in ca.symvar(expression)]
         return max([-1, *(w[1] for w in found if w is not None and w[0] in "qw")])
 
     def derivatives(self, expressions, k):
@@ -257,49 +264,49 @@ class Coordinates:
         -------
         list of k + 1 lists of SX scalars
         """
-        expressions = [ca.SX(e) for e in expressions]
+        expressions = [_as_sx(e) for e in expressions]
         if k == 0:
             return [expressions]
-        symbols = ca.symvar(ca.vertcat(*expressions)) if expressions else []
-        places = [self.where(s) for s in symbols]
-        if any(p and p[0] == "q" for p in places) and not self.plain:
-            symbols = _union(symbols, ca.symvar(ca.vertcat(ca.vec(self.V), self.h)), self._q, self.gamma(1))
-            places = [self.where(s) for s in symbols]
-        series = self._series(symbols, places, expressions, k)
+        series = self._series(expressions, k)
         factor, result = 1.0, []
         for j in range(k + 1):
             factor *= max(j, 1)
-            result.append([_as_sx(c[j]) * factor for c in series.outputs[: len(expressions)]])
+            result.append([_as_sx(multiply(c[j], factor)) for c in series.outputs[: len(expressions)]])
         return result
 
-    def _series(self, symbols, places, expressions, k):
-        moving = [] if self.plain else (self.V @ ca.vertcat(*self.gamma(1)) + self.h).elements()
-        needs_q = any(p and p[0] == "q" for p in places)
-        tape = Tape(symbols, [*expressions, *(moving if needs_q else [])])
+    def _series(self, expressions, k):
+        symbols = None
+        if not self.plain:
+            symbols = ca.symvar(ca.vertcat(*expressions)) if expressions else []
+            if any((self.where(s) or ("",))[0] == "q" for s in symbols):
+                symbols = _union(symbols, ca.symvar(ca.vertcat(ca.vec(self.V), self.h)), self._q, self.gamma(1))
+                expressions = [*expressions, *(self.V @ self.jet(1) + self.h).elements()]
+        tape = Tape(symbols, expressions)
+        symbols, places = tape.symbols, [self.where(s) for s in tape.symbols]
         inputs = [[] for _ in symbols]
         series = Series(tape, inputs)
         factorial = 1.0
         for j in range(k + 1):
             factorial *= max(j, 1)
             for i, (symbol, place) in enumerate(zip(symbols, places, strict=True)):
-                inputs[i].append(self._coefficient(symbol, place, j, factorial, series, len(expressions)))
+                inputs[i].append(self._coefficient(symbol, place, j, factorial, series))
             series.advance()
         return series
 
-    def _coefficient(self, symbol, place, j, factorial, series, n_expressions):
+    def _coefficient(self, symbol, place, j, factorial, series):
         if place is None:
             return symbol if j == 0 else 0.0
         kind, level, i = place
         if kind == "t":
             return symbol if j == 0 else float(j == 1)
         if kind == "w":
-            return self.gamma(level + j)[i] / factorial
+            return divide(self.gamma(level + j)[i], factorial)
         if j == 0:
             return symbol
         if self.plain:
-            return self.gamma(j)[i] / factorial
-        velocity = series.outputs[n_expressions + i][j - 1]
-        return 0.0 if _is_zero(velocity) else velocity / j
+            return divide(self.gamma(j)[i], factorial)
+        velocity = series.c[series.tape.outputs[i - self.nq]][j - 1]  # the last outputs are q'
+        return 0.0 if _is_zero(velocity) else divide(velocity, j)
 
 
 def _order(k):

@@ -124,7 +124,7 @@ def close_many(
     arguments = (plant, law, x0, span(t_span), whole(delay, "delay", "samples"), conditions)
     loop, numbers = _prepared(arguments, substeps, columns, mapping(scale, "The scales"))
     derived = _unit(plant, law, plan, loop)
-    traced, every = [_index(name, derived.names) for name in record], _count("every", every)
+    traced, every = _traced(record, derived.names, every)
     seeds = _seeds(conditions, len(columns[next(iter(columns))]))
     own_noise = seeds and (lambda case: noisy(conditions.noise, law.measures, loop.samples + 1, seeds[case]))
     threads = threads if threads is None else _count("threads", threads)
@@ -192,7 +192,8 @@ def _columns(cases):
     except (TypeError, ValueError):
         columns = {}
     sizes = {values.shape for values in columns.values()}
-    if len(sizes) != 1 or len(next(iter(sizes))) != 1 or not all(np.isfinite(v).all() for v in columns.values()):
+    one = len(sizes) == 1 and all(len(shape) == 1 and shape[0] for shape in sizes)
+    if not one or not all(np.isfinite(v).all() for v in columns.values()):
         raise SpecificationError(
             f"The cases {', '.join(map(str, cases)) or '(none)'} are no columns of finite numbers of one length.",
             "A batch has one finite number per case in each column.",
@@ -262,6 +263,17 @@ def _index(name, names):
     return names.index(name)
 
 
+def _traced(record, names, every):
+    if isinstance(record, str) or every != 1 and not len(record):
+        raise SpecificationError(
+            f"record={record!r} and every={every!r} were given.",
+            "Signals whose traces are kept are named one by one; without any there is none to thin out.",
+            nearest='record=["theta"], every=10.',
+            do="Name them.",
+        )
+    return [_index(name, names) for name in record], _count("every", every)
+
+
 def _count(name, value):
     number = whole(value, name, "")
     if number < 1:
@@ -289,7 +301,7 @@ def _one_by_one(plant, law, plan, derived, loop, numbers, conditions, seeds, tra
                 quantisation=conditions.quantisation, disturbance=forces, substeps=loop.substeps, plan=plan,
             )  # fmt: skip
         except ServoError as error:
-            if not hasattr(error, "run"):
+            if error.run is None:
                 raise
             lost[0 if isinstance(error, IntegrationStopped) else 1, i] = error.details["t"]
             continue

@@ -186,11 +186,11 @@ def _draw(name, distribution):
     if plain(distribution) is not None:
         return lambda rng: distribution
     if hasattr(distribution, "rvs"):
-        return lambda rng: plain(distribution.rvs(random_state=rng))
+        return _told(name, lambda rng: plain(distribution.rvs(random_state=rng)))
     if hasattr(distribution, "sample"):
-        return lambda rng: plain(distribution.sample(rng=rng))
+        return _told(name, lambda rng: plain(distribution.sample(rng=rng)))
     if callable(distribution):
-        return distribution
+        return _told(name, distribution)
     raise SpecificationError(
         f"The distribution of {name} is {distribution!r}.",
         "A distribution is a number, a function of a random generator, or a frozen distribution of scipy.stats.",
@@ -198,3 +198,21 @@ def _draw(name, distribution):
         do="Give one of these.",
         name=name,
     )
+
+
+def _told(name, draw):
+    """The same draw; what numpy or scipy refuse to draw from names the parameter."""
+
+    def told(rng):
+        try:
+            return draw(rng)
+        except (TypeError, ValueError) as error:
+            raise SpecificationError(
+                f"{name} cannot be drawn: {error}.",
+                "A distribution is drawn from with a numpy Generator, for each case.",
+                nearest="lambda rng: rng.normal(100.0, 5.0).",
+                do="Correct its numbers.",
+                name=name,
+            ) from error
+
+    return told

@@ -5,7 +5,7 @@ from time import perf_counter
 import numpy as np
 
 from servoctl.errors import SpecificationError, unknown
-from servoctl.simulation.simulate import as_span, simulate
+from servoctl.simulation.simulate import as_span, consistent_state, simulate
 from servoctl.study.study import Study, machine
 
 FORMS = {"servo": "servo_dae", "projected": "servo_dae_projected"}
@@ -107,6 +107,8 @@ def dae_comparison(model, start, t_span, steps=None, forms=tuple(FORMS), methods
     ------
     NameUnknown
         For another form or method.
+    InconsistentStart
+        For a start off the constraints.
     SpecificationError
         If a step is not positive, or the program holds derivatives above velocities.
 
@@ -116,12 +118,14 @@ def dae_comparison(model, start, t_span, steps=None, forms=tuple(FORMS), methods
     rounding ε, and each of the r differentiations that the force needs divides by h: its error is C hᵖ + ε/hʳ, with a
     step of least error that no tolerance improves.
     """
+    forms, methods = ([names] if isinstance(names, str) else names for names in (forms, methods))
     for names, known, what in ((forms, FORMS, "form"), (methods, METHODS, "method")):
         for name in names:
             if name not in known:
                 raise unknown(name, known, what)
     t0, t1 = as_span(t_span)
     steps = _steps(t0, t1, steps)
+    consistent_state(model, start, t0)
     if not (len(forms) and len(methods)):
         raise SpecificationError(
             f"forms={forms!r} and methods={methods!r} were given.",

@@ -7,7 +7,10 @@ from servoctl.simulation.drift import project
 from servoctl.simulation.simulate import is_number
 from servoctl.study.study import Study, table
 
-COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000", "#8C6D31", "#7F7F7F", "#5E3C99")
+COLOURS = (
+    "#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000", "#8C6D31", "#7F7F7F", "#5E3C99",
+    "#882255", "#44AA99", "#B5BD00", "#FF7F9F",
+)  # fmt: skip
 DRIFTS = {"none": ("-", "o"), "project": ("--", "s"), "minimal": (":", "^")}  # others are time constants of poles
 POLES = ("-.", "D")
 SHOWN = 7
@@ -121,7 +124,7 @@ class TradeOff(Study):
             f"{asked}={limit:g} was asked for, which no setting that was measured reaches.",
             rule or "A recommendation is one of the settings that were measured.",
             nearest=nearest,
-            do=f"Ask for more {asked}, or measure other methods and settings by tradeoff(...).",
+            do="Raise it, or measure other methods and settings by tradeoff(...).",
             asked=limit,
             uncertainty=self.uncertainty,
         )
@@ -159,6 +162,9 @@ class TradeOff(Study):
         ax.axhspan(low / 10, low, color="#EEEEEE", zorder=-1)
         ax.set(xscale="log", yscale="log", xlabel=f"{cost} [s]" if cost == "seconds" else cost)
         ax.set(ylabel="error of the motion, relative", title=title)
+        if not len(good):
+            ax.set_xlim(1e-4, 1.0)
+            ax.text(0.5, 0.5, "every run failed", transform=ax.transAxes, ha="center")
         ax.set_ylim(low / 10, min(3.0, max(10 * told[good].max(initial=low), 100 * low)))
         ax.grid(True, which="major", color="#DDDDDD", linewidth=0.6)
         keys = [Line2D([], [], color=colour, label=method) for method, colour in colours.items()]

@@ -14,7 +14,7 @@ def draw(stability, method, poles):
     from matplotlib.figure import Figure
 
     length = abs(stability.t[-1] - stability.t[0])
-    poles = np.geomspace(0.3, 300.0, POLES) * 10 / length if poles is None else np.asarray(poles, dtype=float)
+    poles = np.geomspace(0.3, 300.0, POLES) * 10 / length if poles is None else poles
     figure = Figure(figsize=(10.0, 4.4), layout="constrained")
     left, right = figure.subplots(1, 2, sharex=True)
     _largest_steps(stability, left, poles)
@@ -23,7 +23,7 @@ def draw(stability, method, poles):
 
 
 def _largest_steps(stability, ax, poles):
-    poles = poles[::LINE]
+    poles = _fewer(poles)
     for colour, method in zip(COLOURS, (*ORDERS, "Taylor"), strict=False):
         steps = np.array([stability.largest_step(method, 1.0 / pole) for pole in poles])
         name = f"Taylor, order {stability.order}" if method == "Taylor" else method
@@ -42,9 +42,15 @@ def _radius(stability, ax, method, poles, limits):
     radius = np.array([[stability.radius(method, h, 1.0 / pole).max() for pole in poles] for h in steps])
     norm = BoundaryNorm(LEVELS, 256)
     shade = ax.contourf(poles, steps, np.minimum(radius, LEVELS[-1]), LEVELS, cmap="RdBu_r", norm=norm)
-    boundary = [stability.largest_step(method, 1.0 / pole) for pole in poles[::LINE]]
-    ax.plot(poles[::LINE], boundary, color="black", label="largest stable step")
+    fewer = _fewer(poles)
+    boundary = [stability.largest_step(method, 1.0 / pole) for pole in fewer]
+    ax.plot(fewer, boundary, color="black", label="largest stable step")
     ax.set(xscale="log", yscale="log", ylim=limits, xlabel="poles of the error dynamics, 1/T [1/s]")
     ax.set_title(f"{method}: spectral radius of a step, at worst along the plan", fontsize=11)
     ax.figure.colorbar(shade, ax=ax, label="factor per step (2: two or more)", ticks=LEVELS)
     ax.legend(fontsize=9, loc="lower left")
+
+
+def _fewer(poles):
+    """Those at which lines are drawn, the last among them."""
+    return np.unique(np.append(poles[::LINE], poles[-1]))

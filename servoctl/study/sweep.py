@@ -10,7 +10,7 @@ import signal
 import sys
 import threading
 from collections.abc import Mapping
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures import Executor, ProcessPoolExecutor, as_completed
 
 import numpy as np
 
@@ -119,9 +119,9 @@ def merge(studies):
     SpecificationError
         If there is none, or they belong to different sweeps.
     """
-    studies = list(studies)
-    keys = {study.meta.get("identity") for study in studies if study.kind == "sweep"}
-    if len(keys) != 1 or any(study.kind != "sweep" for study in studies):
+    studies = [studies] if isinstance(studies, Study) else list(studies)
+    keys = {getattr(study, "meta", {}).get("identity") for study in studies}  # that only a sweep has
+    if len(keys) != 1 or None in keys:
         raise SpecificationError(
             f"{len(studies)} studies of {len(keys)} different sweeps are to be merged.",
             "Shards of one sweep have the same cases, seed and function.",
@@ -327,7 +327,7 @@ def _seed(case, seed):
 
 def _part(shard, count):
     try:
-        i, n = map(int, shard)
+        i, n = (whole("shard", part) for part in shard)
     except (TypeError, ValueError):
         i = n = 0
     if not 1 <= i <= n:
@@ -353,7 +353,14 @@ def require_fitting(case, parameters, seed):
 
 
 def _require_sendable(case, executor):
-    """Refuse, before anything is computed, what processes could not receive."""
+    """Refuse, before anything is computed, what is no executor, and what processes could not receive."""
+    if not isinstance(executor, Executor | None):
+        raise SpecificationError(
+            f"executor={executor!r} was given.",
+            "Cases are computed here, or on an executor of concurrent.futures.",
+            nearest="concurrent.futures.ThreadPoolExecutor(2).",
+            do="Give an executor that is open.",
+        )
     if not isinstance(executor, ProcessPoolExecutor):
         return
     try:

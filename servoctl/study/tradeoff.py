@@ -11,7 +11,7 @@ from servoctl.errors import LimitExceeded, ServoError, SpecificationError, unkno
 from servoctl.model.compiled import compiling_at_once
 from servoctl.simulation.drift import Minimal, Poles, Project, as_drift
 from servoctl.simulation.rule import motion_error, relative_error
-from servoctl.simulation.simulate import ALL_METHODS, as_span, simulate
+from servoctl.simulation.simulate import ALL_METHODS, as_span, consistent_state, simulate
 from servoctl.simulation.tableaus import ORDERS
 from servoctl.study.front import TradeOff
 from servoctl.study.study import machine
@@ -22,6 +22,7 @@ STEPS = tuple(5 * 4**k for k in range(7))  # of a fixed length, in the span
 SAMPLES, COMPARED = 51, 201  # instants that adaptive methods give, and at most so many of any run are compared
 DENSE = 1001  # instants of the reference over which its power is integrated
 TIMED, ENOUGH = 3, 0.3  # calls timed after a warm-up, unless they take this part of `seconds` together
+FEW = 20  # steps: a run that takes too long for fewer has lost its way, and tells nothing of finer settings
 PATIENCE = 1.0  # s before a progress bar appears
 TIME_CONSTANT = 50  # of the default poles, in the span
 
@@ -55,7 +56,8 @@ def tradeoff(model, x0, t_span, methods=None, drift=None, *, rtol=TOLERANCES, st
         Steps of the methods of fixed step, and spacings of the instants of "algebraic" [s]; default: (t1 - t0)/5,
         and each next one a quarter of the one before, down to (t1 - t0)/20,480.
     seconds : float
-        That one run may take. One that takes longer is ended, and finer settings are skipped; their rows say so.
+        That one run may take. One that takes longer is ended, and finer settings are skipped if it had taken more
+        than a few steps; their rows say so.
     progress : bool, optional
         Show a progress bar; default: on a terminal, for work of more than a second.
 
@@ -68,11 +70,13 @@ def tradeoff(model, x0, t_span, methods=None, drift=None, *, rtol=TOLERANCES, st
     ------
     ServoError
         Where the reference cannot be had, such as SingularProgram where the motion ends.
+    InconsistentStart
+        For a start off the constraints: how a treatment leads back is no motion to measure others by.
     SpecificationError
         For settings that are none.
     """
     t0, t1 = as_span(t_span)
-    settings = {"rtol": _positive("rtol", rtol)}
+    settings = {"rtol": _positive("rtol", rtol, most=1.0)}
     settings["step"] = _positive("step", [abs(t1 - t0) / n for n in STEPS] if step is None else step)
     limit = _positive("seconds", [seconds])[0]
     drifts = (None, "project", "minimal", abs(t1 - t0) / TIME_CONSTANT) if drift is None else drift
@@ -113,6 +117,7 @@ class Reference:
     """
 
     def __init__(self, model, x0, t_span, seconds):
+        consistent_state(model, x0, t_span[0])
         self.model, self.start, self.span, self._known = model, x0, t_span, {}
         self.knots = [k for k in model.require_smooth((min(t_span), max(t_span))) if min(t_span) < k < max(t_span)]
         self.times = np.union1d(np.linspace(*t_span, SAMPLES), self.knots)
@@ -154,14 +159,15 @@ class Deadline:
     """What `simulate` takes as progress to end a run that takes more than some seconds from its first step on."""
 
     def __init__(self, seconds):
-        self.seconds, self.since = seconds, None
+        self.seconds, self.since, self.steps = seconds, None, 0
 
     def __call__(self, t):
         """Raise LimitExceeded where the time is over."""
         now = time.perf_counter()
-        self.since = self.since or now
+        self.since, self.steps = self.since or now, self.steps + 1
         if now - self.since > self.seconds:
-            raise LimitExceeded(f"More than {self.seconds:g} s: ended at t = {t:.4g} s", seconds=self.seconds, t=t)
+            told = f"More than {self.seconds:g} s: ended at t = {t:.4g} s"
+            raise LimitExceeded(told, seconds=self.seconds, steps=self.steps)
 
 
 def _whole(run):
@@ -196,7 +202,7 @@ def _ladder(reference, method, treatment, settings, seconds):
                 return
             except ServoError as error:
                 row["failure"] = f"{type(error).__name__}: {error}"
-                if "seconds" in error.details:
+                if error.details.get("steps", 0) > FEW:
                     over = f"skipped: {name} = {value:g} took more than {seconds:g} s"
         yield row
 
@@ -314,14 +320,15 @@ def _said(options):
     return f"{options['method']}{order}" + (f" at {options['rtol']:g}" if "rtol" in options else "")
 
 
-def _positive(name, given):
+def _positive(name, given, most=np.inf):
     try:
         values = [float(value) for value in np.atleast_1d(given)]
     except (TypeError, ValueError):
         values = []
-    if not values or not all(np.isfinite(value) and value > 0 for value in values):
+    if not values or not all(np.isfinite(value) and 0 < value <= most for value in values):
+        bound = "" if most == np.inf else f", at most {most:g}"
         raise SpecificationError(
-            f"{name} was given as {given!r}.", "It is a positive number, or several.", do=f"Leave {name} out."
+            f"{name} was given as {given!r}.", f"It is a positive number{bound}, or several.", do=f"Leave {name} out."
         )
     return values
 

@@ -51,6 +51,17 @@ def test_a_crane_stops_where_its_load_falls_freely(duration):
     assert run["hoist"][early] == pytest.approx(reference["hoist"][early], rel=1e-8)
 
 
+@pytest.mark.parametrize("method", ["Taylor", "RK4", "RadauIIA"])
+def test_an_integrated_crane_stops_there_too(method):
+    model = sv.derive(*overhead_crane(1.3))
+    with pytest.raises(sv.SingularProgram) as caught:
+        sv.simulate(model, model.start(guess={"l": 4.0}), (0.0, 1.3), method=method)
+    run, lost = caught.value.run, free_fall(1.3)
+    assert 0.9 * lost < run.t[-1] <= caught.value.details["t"] < 1.01 * lost
+    early = run.t < 0.8 * lost
+    assert run["hoist"][early] == pytest.approx(cf.overhead_crane(run.t, duration=1.3)["hoist"][early], rel=1e-5)
+
+
 # the wheel that stops ------------------------------------------------------------------------------------------------
 
 WHEEL_STOPS = 0.6983110523  # s

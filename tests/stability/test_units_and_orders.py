@@ -59,6 +59,21 @@ def test_a_crane_in_any_unit(unit):
         assert run[name] / unit == pytest.approx(reference[name], abs=1e-9 * np.abs(reference[name]).max())
 
 
+@pytest.mark.parametrize("unit", [1e-6, 1.0])
+@pytest.mark.parametrize("square", [False, True])
+def test_a_squared_constraint_is_told_from_a_small_one(square, unit):
+    q = sv.coordinates("x y")
+    x, y = q
+    circle = x**2 + y**2 - unit**2
+    program = sv.Program({"circle": circle**2 if square else circle}, by="ideal")
+    mechanism = sv.Mechanism(q, gibbs=sv.particle(q, 1.0, (x, y)))
+    if square:
+        with pytest.raises(sv.SingularProgram, match="vanishes on its own solutions"):
+            sv.derive(mechanism, program)
+    else:
+        assert sv.derive(mechanism, program).free == 2
+
+
 # orders --------------------------------------------------------------------------------------------------------------
 
 

@@ -1,0 +1,331 @@
+"""Derivations on disk: the same results to the bit, nothing derived twice, and never those of another specification."""
+
+import ast
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import casadi as ca
+import numpy as np
+import pytest
+
+import servoctl as sv
+from servoctl.mechanisms import gallery
+from servoctl.model import derivation, memo
+
+PACKAGE = Path(sv.__file__).parent
+
+
+@pytest.fixture
+def derived(monkeypatch, tmp_path):
+    """A list that grows with every derivation; what is derived is kept under `tmp_path`."""
+    calls, reduce = [], derivation.reduce
+    monkeypatch.setenv("SERVOCTL_CACHE", str(tmp_path))
+    monkeypatch.delenv("SERVOCTL_MEMO", raising=False)
+    monkeypatch.setattr(memo, "_stamp", lambda: "these sources")
+    monkeypatch.setattr(derivation, "reduce", lambda *given: calls.append(given) or reduce(*given))
+    return calls
+
+
+def entries(tmp_path):
+    return sorted((tmp_path / "derived").glob("*"))
+
+
+def pendulum(*, name="phi", m=2.0, length=0.5, path=None, by="actuators", torque="torque", output=None, gravity=9.81):
+    """A driven pendulum that follows a path."""
+    q = sv.coordinates(name)
+    p = sv.parameters(m=m, g=9.81)
+    angle = next(iter(q))
+    mechanism = sv.Mechanism(
+        q,
+        gibbs=p.m * length**2 * q.d(2)[0] ** 2 / 2,
+        potential=-p.m * (p.g if gravity == 9.81 else gravity) * length * ca.cos(angle),
+        actuators={torque: angle},
+        parameters=p,
+        outputs=output and output(q),
+    )
+    return mechanism, sv.Program({"swing": angle - (ca.sin(q.t) if path is None else path(q.t))}, by=by)
+
+
+def keyed(mechanism, program, guess=None, near=None, values=None):
+    values = mechanism.parameters.values() if values is None else values
+    return memo.key(mechanism, program, guess, near, values)
+
+
+def planned(name, **options):
+    """Everything that a run of a scene holds, and the run."""
+    scene = gallery[name]
+    model = sv.derive(*scene.build())
+    start = model.start(**scene.start, guess=scene.guess)
+    span = (scene.t_span[0], min(scene.t_span[1], scene.t_span[0] + 1.0))
+    run = sv.simulate(model, start, span, progress=False, t_eval=np.linspace(*span, 21), **options)
+    signals = [run[signal] for signal in model.signal_groups]
+    return [run.t, run.jets, *signals, *model.column_sizes, model.guard_sizes], run
+
+
+CASES = [
+    ("overhead-crane", {}),
+    ("appell-hamel", {"method": "Taylor", "drift": "project"}),
+    ("mass-on-car", {"drift": 0.1}),
+    ("crane-3d", {"method": "RadauIIA"}),
+]
+
+
+@pytest.mark.parametrize(("name", "options"), [c for c in CASES if c[0] in gallery])
+def test_the_memo_gives_the_same_run_to_the_bit_and_derives_nothing(derived, name, options):
+    first, run = planned(name, **options)
+    after_first = len(derived)
+    again, repeated = planned(name, **options)
+    assert after_first > 0 and len(derived) == after_first
+    assert len(first) == len(again)
+    assert all(np.array_equal(a, b, equal_nan=True) for a, b in zip(first, again, strict=True))
+    assert repr(run.model) == repr(repeated.model)
+    assert len(derived) == after_first
+
+
+SECOND_PROCESS = """
+import json
+import servoctl as sv
+from servoctl.mechanisms import gallery
+from servoctl.model import derivation
+
+calls, reduce = [], derivation.reduce
+derivation.reduce = lambda *given: calls.append(given) or reduce(*given)
+scene = gallery["overhead-crane"]
+model = sv.derive(*scene.build())
+run = sv.simulate(model, model.start(**scene.start, guess=scene.guess), scene.t_span, progress=False)
+print(json.dumps([len(calls), run["trolley"].tolist()]))
+"""
+
+
+def test_another_process_reads_what_one_derived(tmp_path):
+    environment = {name: value for name, value in os.environ.items() if name != "SERVOCTL_MEMO"}
+    environment |= {"SERVOCTL_CACHE": str(tmp_path), "PYTHONPATH": str(PACKAGE.parent)}
+    command = [sys.executable, "-c", SECOND_PROCESS]
+    told = [subprocess.run(command, env=environment, capture_output=True, text=True, check=True) for _ in range(2)]
+    (first, forces), (second, same) = (json.loads(done.stdout) for done in told)
+    assert (first, second) == (1, 0)
+    assert forces == same
+
+
+def test_one_specification_has_one_key(derived):
+    assert keyed(*pendulum()) == keyed(*pendulum()) is not None
+    assert keyed(*gallery["crane-3d"].build()) == keyed(*gallery["crane-3d"].build())
+
+
+def weighted(weights):
+    q = sv.coordinates("x")
+    mechanism = sv.Mechanism(q, gibbs=q.d(2)[0] ** 2 / 2, actuators={"left": next(iter(q)), "right": next(iter(q))})
+    return mechanism, sv.Program({"x": next(iter(q)) - q.t}, weights=weights)
+
+
+def test_every_difference_makes_another_key(derived):
+    near = (0.5, {"phi": 0.1, "dphi": 0.0, "d2phi": 0.0})
+    keys = [
+        keyed(*pendulum()),
+        keyed(*pendulum(name="psi")),
+        keyed(*pendulum(m=np.nextafter(2.0, 3.0))),
+        keyed(*pendulum(length=np.nextafter(0.5, 1.0))),
+        keyed(*pendulum(path=ca.cos)),
+        keyed(*pendulum(path=lambda t: ca.sin(t + 0))),
+        keyed(*pendulum(path=lambda t: ca.sin(2 * t))),
+        keyed(*pendulum(path=lambda t: ca.if_else(t < 1, t, 1))),
+        keyed(*pendulum(path=lambda t: ca.if_else(t <= 1, t, 1))),
+        keyed(*pendulum(by="ideal")),
+        keyed(*pendulum(torque="motor")),
+        keyed(*pendulum(gravity=9.80665)),
+        keyed(*pendulum(output=lambda q: {"height": ca.cos(next(iter(q)))})),
+        keyed(*pendulum(output=lambda q: {"depth": ca.cos(next(iter(q)))})),
+        keyed(*pendulum(output=lambda q: {"height": ca.sin(next(iter(q)))})),
+        keyed(*pendulum(), guess={"phi": 0.1}),
+        keyed(*pendulum(), guess={"phi": 0.2}),
+        keyed(*pendulum(), guess={"dphi": 0.1}),
+        keyed(*pendulum(), near=near),
+        keyed(*pendulum(), near=(0.6, near[1])),
+        keyed(*pendulum(), near=(0.5, near[1] | {"phi": 0.2})),
+        keyed(*pendulum(), values=[2.5, 9.81]),
+        keyed(*weighted(None)),
+        keyed(*weighted({"left": 1.0})),
+        keyed(*weighted({"right": 1.0})),
+        keyed(*weighted({"left": 2.0})),
+        keyed(*weighted({"left": 1.0, "right": 1.0})),
+    ]
+    same = pendulum(path=lambda t: ca.sin(t + 0))  # CasADi drops the zero: the same expression
+    assert keyed(*same) == keys[0] == keys.pop(5)
+    assert None not in keys and len(set(keys)) == len(keys)
+
+
+def test_sums_in_another_order_are_another_specification(derived):
+    left, right = (keyed(*pendulum(path=path)) for path in (lambda t: (t + t**2) + t**3, lambda t: t + (t**2 + t**3)))
+    assert left != right
+
+
+def test_quasi_velocities_and_constraints_are_told_apart(derived):
+    def sled(V=1.0, names="u", constraint="skate", factor=1.0, h=0.0):
+        q = sv.coordinates("x").with_quasi_velocities(names, [[V]], [h])
+        other = sv.coordinates("x y")
+        x, y = other
+        mechanism = sv.Mechanism(q, gibbs=q.w(1)[0] ** 2 / 2, actuators={"push": [1.0]})
+        bound = sv.Mechanism(
+            other, gibbs=(other.d(2)[0] ** 2 + other.d(2)[1] ** 2) / 2, actuators={"push": x},
+            constraints={constraint: y - factor * x},
+        )  # fmt: skip
+        return (
+            keyed(mechanism, sv.Program({"x": next(iter(q)) - q.t})),
+            keyed(bound, sv.Program({"x": x - other.t})),
+        )
+
+    frames = [sled()[0], sled(V=2.0)[0], sled(names="v")[0], sled(h=0.5)[0]]
+    bounds = [sled()[1], sled(constraint="wall")[1], sled(factor=2.0)[1]]
+    assert len({*frames, *bounds}) == 7 and None not in frames + bounds
+
+
+def test_the_key_holds_all_that_a_derivation_reads():
+    told = {
+        "mechanism": {"q", "balance", "mass", "energy", "forces", "E", "actuators", "constraints", "outputs",
+                      "parameters"},
+        "program": {"residuals", "by", "weights"},
+    }  # fmt: skip
+    files = [*(PACKAGE / "reduction").glob("*.py"), *(PACKAGE / "model").glob("*.py")]
+    others = {
+        "plant.py",
+        "plant_equations.py",
+        "laws.py",
+        "linearising.py",
+        "export.py",
+        "closed.py",
+        "allocation.py",
+    }  # of plants
+    read = {"mechanism": set(), "program": set()}
+    for path in files:
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))) if path.name not in others else ():
+            if isinstance(node, ast.Attribute):
+                owner = getattr(node.value, "id", getattr(node.value, "attr", ""))
+                if owner in read:
+                    read[owner].add(node.attr)
+    assert read == told  # `mass` is the Jacobian of `balance`
+
+
+def test_what_cannot_be_told_is_derived(derived, tmp_path):
+    class Own(sv.Mechanism):
+        pass
+
+    mechanism, program = pendulum()
+    mechanism.__class__ = Own
+    assert keyed(mechanism, program) is None
+    for count in (1, 2):
+        assert sv.derive(mechanism, program).flat
+        assert len(derived) == count
+    assert not (tmp_path / "derived").exists()
+
+
+def test_a_refused_specification_is_refused_again(derived, tmp_path):
+    mechanism, _ = pendulum()
+    q = mechanism.q
+    program = sv.Program({"a": next(iter(q)) - q.t, "b": next(iter(q)) - ca.sin(q.t)})
+    for _ in range(2):
+        with pytest.raises(sv.SpecificationError, match="contradict"):
+            sv.derive(mechanism, program)
+    with pytest.raises(sv.SpecificationError):
+        sv.derive(mechanism, "a program")
+    with pytest.raises(sv.SpecificationError):
+        sv.derive(mechanism, program, guess={"phi": np.nan})
+    assert len(derived) == 4 and not (tmp_path / "derived").exists()
+
+
+@pytest.mark.parametrize("damage", [lambda b: b"", lambda b: b[:-1], lambda b: bytes([b[0] ^ 1]) + b[1:]])
+def test_a_damaged_entry_is_derived_anew(derived, tmp_path, damage):
+    first, _ = planned("overhead-crane")
+    whole = {path: path.read_bytes() for path in entries(tmp_path)}
+    for path, content in whole.items():
+        path.write_bytes(damage(content))
+    again, _ = planned("overhead-crane")
+    assert len(derived) == 2
+    assert all(np.array_equal(a, b) for a, b in zip(first, again, strict=True))
+    assert entries(tmp_path) == sorted(whole)
+    planned("overhead-crane")
+    assert len(derived) == 2
+
+
+def test_without_a_directory_everything_is_derived(derived, tmp_path, monkeypatch):
+    (tmp_path / "file").write_text("no directory")
+    monkeypatch.setenv("SERVOCTL_CACHE", str(tmp_path / "file" / "cache"))
+    for count in (1, 2):
+        assert sv.derive(*pendulum()).flat
+        assert len(derived) == count
+
+
+def test_the_memo_can_be_switched_off(derived, tmp_path, monkeypatch):
+    monkeypatch.setenv("SERVOCTL_MEMO", "none")
+    for count in (1, 2):
+        assert sv.derive(*pendulum()).flat
+        assert len(derived) == count
+    assert not (tmp_path / "derived").exists()
+
+
+def test_expressions_derived_late_are_those_derived_at_once(derived):
+    early, late = (sv.derive(*gallery["overhead-crane"].build()) for _ in range(2))
+    assert len(derived) == 1 and late.free == early.free and late.reduction.top == early.reduction.top
+    assert [str(row.expression) for row in late.reduction.rows] == [str(r.expression) for r in early.reduction.rows]
+    assert len(derived) == 2
+    changed = [model.with_parameters(m_load=50.0) for model in (early, late)]
+    assert len(derived) == 2
+    jets = np.array([0.0, 4.0, 0.1, *np.full(6, 0.1)])
+    values = [model.signals("actuation")[1](0.3, jets, model.parameters) for model in changed]
+    assert np.array_equal(*values) and not np.array_equal(
+        values[0], early.signals("actuation")[1](0.3, jets, early.parameters)
+    )
+
+
+def test_other_pivots_are_kept_too(derived):
+    early, late = (sv.derive(*gallery["overhead-crane"].build()) for _ in range(2))
+    jets = np.array([0.0, 4.0, 0.1, *np.full(6, 0.1)])
+    found = [model.near(0.3, jets).function("path")(0.3, jets[:3], model.parameters) for model in (early, late)]
+    assert len(derived) == 2 and np.array_equal(*found)
+
+
+def test_a_changed_specification_is_refused(derived):
+    sv.derive(*pendulum())
+    mechanism, program = pendulum()
+    model = sv.derive(mechanism, program)
+    program.residuals["swing"] = next(iter(mechanism.q)) - ca.cos(mechanism.q.t)
+    with pytest.raises(sv.SpecificationError, match="changed after"):
+        len(model.reduction.rows)
+    with pytest.raises(AttributeError):
+        len(sv.derive(*pendulum()).reduction.nothing)
+
+
+def test_least_used_entries_go_first(derived, tmp_path, monkeypatch):
+    for length in (0.5, 0.6, 0.7):
+        sv.derive(*pendulum(length=length))
+    old, new = entries(tmp_path)[:2], entries(tmp_path)[2:]
+    for path in old:
+        os.utime(path, (1.0, 1.0))
+    monkeypatch.setattr(memo, "MOST_BYTES", sum(path.stat().st_size for path in old + new) - 1)
+    memo._prune(tmp_path / "derived")
+    assert set(entries(tmp_path)) <= set(new) and entries(tmp_path)
+    sv.derive(*pendulum(length=0.8))
+    assert not list((tmp_path / "derived").glob("*.tmp"))
+
+
+def test_sources_that_changed_are_other_sources(monkeypatch, tmp_path):
+    stamp = memo._stamp.__wrapped__
+    file = tmp_path / "package" / "model" / "memo.py"
+    file.parent.mkdir(parents=True)
+    file.write_text("a = 1")
+    monkeypatch.setattr(memo, "__file__", str(file))
+    monkeypatch.setattr(memo, "_LOADED", file.stat().st_ctime - 1)
+    assert stamp() is None  # changed after it was loaded
+    monkeypatch.setattr(memo, "_LOADED", file.stat().st_ctime + 10)
+    found = {stamp(), stamp()}
+    assert len(found) == 1 and None not in found
+    os.utime(file, ns=(1, 1))
+    found.add(stamp())
+    file.write_text("a = 12")
+    os.utime(file, ns=(1, 1))
+    found.add(stamp())
+    (tmp_path / "package" / "new.py").write_text("")
+    found.add(stamp())
+    assert len(found) == 4
