@@ -15,6 +15,7 @@ SENSORS = {"x": 1e-3, "l": 1e-3, "theta": 1e-3}  # m, m, rad: standard deviation
 NOISE = SENSORS | {"dx": 1e-2, "dl": 1e-2, "dtheta": 1e-2}  # m/s, m/s, rad/s
 LIMITS = {"trolley": 150.0, "hoist": (-1300.0, 0.0)}  # N
 WEAK = {"trolley": 100.0, "hoist": (-1300.0, 0.0)}  # N; the plan asks for 138 N of the trolley
+LOOKS = [{"linestyle": style, "color": colour} for style in sv.plots.STYLES for colour in sv.plots.COLOURS]
 RESERVE = 0.8  # of the weak trolley, for the plan; the rest is the feedback's
 
 
@@ -98,8 +99,8 @@ def draw(ax, runs):
     """The load's error in each of the runs over time, on a logarithmic scale."""
     ax.axvspan(2.0, 2.5, color="0.92")
     ax.axvline(6.0, color="0.7", linewidth=1)
-    for k, (name, run) in enumerate(runs.items()):
-        ax.semilogy(run.t, np.maximum(load_error(run), 1e-3), label=name, color=f"C{k}", linewidth=1.4)
+    for (name, run), look in zip(runs.items(), LOOKS, strict=False):
+        ax.semilogy(run.t, np.maximum(load_error(run), 1e-3), label=name, linewidth=1.4, **look)
     ax.text(2.25, 0.03, "gust", ha="center", color="0.4")
     ax.text(5.95, 0.03, "end of the path", ha="right", color="0.4")
     ax.set(xlim=(0.0, 8.0), ylim=(0.02, 7e4), xlabel="t [s]", ylabel="distance of the load from its path [mm]")

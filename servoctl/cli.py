@@ -5,11 +5,14 @@ import json
 import sys
 from pathlib import Path
 
+from servoctl import cli_loop
 from servoctl import commands as further
-from servoctl import loops
 from servoctl.errors import ServoError, SpecificationError, unknown
-from servoctl.options import assignment, mapping, positive
+from servoctl.options import METHODS_HELP, assignment, mapping, positive
 from servoctl.rundir import FILES, LOOP_FILES, Folder, Report, complain, plain, summary, versions
+from servoctl.simulation.drift import as_drift
+from servoctl.simulation.simulate import ALL_METHODS, as_span
+from servoctl.simulation.tableaus import ORDERS
 
 
 def main(argv=None):
@@ -75,15 +78,15 @@ def _run_options(run):
     run.add_argument("--guess", **pairs, help="where the rest of the start is looked for; frees what the scene holds")
     run.add_argument("--set", **pairs, help="parameters")
     run.add_argument("--accuracy", type=float, metavar="E", help="error of the motion, in place of method and settings")
-    run.add_argument("--method", help="algebraic, RK4, DOP853, Radau, ...; default: by the model")
-    run.add_argument("--step", type=float, metavar="H", help="step of RK4 [s]")
+    run.add_argument("--method", help=METHODS_HELP)
+    run.add_argument("--step", type=float, metavar="H", help=f"step of {', '.join(ORDERS)} and RadauIIA [s]")
     run.add_argument("--drift", type=_drift, metavar="D", help="none, project, minimal, or a time constant [s]")
     run.add_argument("--rtol", type=float, help="relative tolerance")
     run.add_argument("--atol", type=float, help="absolute tolerance")
     run.add_argument("--samples", type=_samples, metavar="N", help="equally spaced samples of the run")
     run.add_argument("--no-verify", action="store_true", help="leave out the check against the full mechanism")
     run.add_argument("--no-figures", action="store_true", help="leave out the figures")
-    loops.add(run)
+    cli_loop.add(run)
 
 
 def _tradeoff_options(trade):
@@ -187,20 +190,21 @@ def _compute(args, name, scene, folder):
     report = Report()
     span = tuple(args.t_span or scene.t_span)
     changes, held, guess = (mapping(getattr(args, name), f"--{name}") for name in ("set", "hold", "guess"))
+    _require_known(args, span)
     model = _with_parameters(sv.derive(*scene.build()), changes)
-    loops.require(args, model)
+    cli_loop.require(args, model)
     report.say(model)
     start = _start(model, scene, span[0], held, guess)
     report.say(start)
     run = _simulate(model, start, span, _options(args, span), report)
     folder.write(lambda path: run.save(path / "run.npz"))
     verification = None if args.no_verify else _verify(model, run, report)
-    closed, done = loops.closed_loop(args, model, run, report)
+    closed, done = cli_loop.closed_loop(args, model, run, report)
     if closed is not None:
         folder.write(lambda path: closed.save(path / "closed_loop.npz"))
     about = {"name": name, "given": args.scene, "description": scene.description}
     facts = {"scene": about, "command": args.command_line, "t_span": span, **summary(run, start, verification)}
-    facts |= {"closed_loop": loops.facts(closed)}
+    facts |= {"closed_loop": cli_loop.facts(closed)}
     text = json.dumps(facts, indent=2, allow_nan=False, ensure_ascii=False)
     folder.write(lambda path: (path / "summary.json").write_text(text + "\n", encoding="utf-8"))
     folder.write(lambda path: (path / "report.txt").write_text("\n".join(report.texts), encoding="utf-8"))
@@ -209,12 +213,20 @@ def _compute(args, name, scene, folder):
 
         folder.write(lambda path: save_figures(run, path, units=scene.units, title=name))
         if closed is not None:
-            folder.write(lambda path: loops.save_figure(closed, path, scene.units, name))
+            folder.write(lambda path: cli_loop.save_figure(closed, path, scene.units, name))
     print(f"{', '.join(f for f in (*FILES, *LOOP_FILES) if (folder.path / f).exists())} in {folder.path}")
     if not run.success:
         complain(f"The motion ended early, at t = {run.t[-1]:.6g} s; what was computed is kept.")
     verified = args.no_verify or (verification is not None and verification.passed)
     return 0 if run.success and verified and done and not folder.moved else 1
+
+
+def _require_known(args, span):
+    """Refuse a span, a method or a treatment of drift that no model has."""
+    as_span(span)
+    as_drift(args.drift)
+    if args.method is not None and args.method not in ALL_METHODS:
+        raise unknown(args.method, ALL_METHODS, "method")
 
 
 def _with_parameters(model, changes):

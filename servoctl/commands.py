@@ -8,7 +8,7 @@ from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 
 from servoctl.errors import ServoError, SpecificationError, unknown
-from servoctl.options import assignment, count, draw, drawn, given, mapping, shard, variation, whole
+from servoctl.options import METHODS_HELP, assignment, count, draw, drawn, given, mapping, shard, variation, whole
 from servoctl.rundir import Folder, Report, complain
 
 
@@ -34,7 +34,7 @@ def add(commands):
     sweep.add_argument("--draw", type=draw, metavar="NAME=normal:MEAN:STD", **many, help="what is random in them")
     sweep.add_argument("--seed", type=whole, help="of everything random")
     sweep.add_argument("--t-span", type=float, nargs=2, metavar=("T0", "T1"), help="[s]; default: the scene's")
-    sweep.add_argument("--method", help="algebraic, RK4, DOP853, Radau, ...; default: by the model")
+    sweep.add_argument("--method", help=METHODS_HELP)
     sweep.add_argument("--workers", type=count, metavar="N", help="processes; default: this one alone")
     sweep.add_argument("--shard", type=shard, metavar="I/N", help="only part I of N, for several machines")
     sweep.add_argument("--resume", action="store_true", help="go on where an interrupted sweep ended")

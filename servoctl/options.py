@@ -4,7 +4,9 @@ import argparse
 import math
 
 from servoctl.errors import SpecificationError
+from servoctl.simulation.simulate import ALL_METHODS
 
+METHODS_HELP = f"{', '.join(ALL_METHODS)}; default: by the model"
 DRAWS = {"normal": "MEAN:STD", "uniform": "LOW:HIGH", "lognormal": "MEDIAN:LOG_STD", "triangular": "LOW:MODE:HIGH"}
 
 

@@ -28,8 +28,8 @@ def path(run, x=None, y=None, ax=None, units=None):
     run : Run
     x, y : str, optional
         Names of signals. Default: two of x, y, z (or X, Y, Z, preferred) with the same beginning and end, such as
-        "x" and "z" or "tip_x" and "tip_y", among outputs and coordinates; else the first two coordinates; where
-        there is only one, it is drawn over time.
+        "x" and "z" or "tip_x" and "tip_y", among outputs and coordinates; else the first two coordinates; one
+        coordinate alone, or all of them along one axis, such as "x1" and "x2", are drawn over time.
     ax : Axes, optional
     units : dict of str to str, optional
         Unit of each signal, by name; derivatives' units follow. Equal ones have equal scales where both remain visible.
@@ -43,9 +43,10 @@ def path(run, x=None, y=None, ax=None, units=None):
     NameUnknown
         If there is no such signal.
     """
-    if x is None and y is None and len(_coordinates(run)) == 1:
-        return signals(run, _coordinates(run), _panels(1, 4.2)[0] if ax is None else ax, units)
-    first, second = _plane(run)
+    planes, names = _planes(run), _coordinates(run)
+    if x is None and y is None and not planes and _along_one_axis(names):
+        return signals(run, names, _panels(1, 4.2)[0] if ax is None else ax, units)
+    first, second, *_ = planes[0] if planes else dict.fromkeys([*names, *run.names])
     if x is None:
         x = first if y != first else second
     if y is None:
@@ -192,7 +193,7 @@ def sweep(study, names=None, against=None, units=None):
     NameUnknown
         If there is no such column.
     SpecificationError
-        If no result varies.
+        If no result varies, or it is no sweep.
     """
     from servoctl.study.sweep_figure import draw
 
@@ -297,18 +298,20 @@ def _antiderivative(name, names):
     return (found[2], int(found[1] or 1)) if found and found[2] in names else None
 
 
-def _plane(run):
-    """Two names that span a plane, by convention, or the first two coordinates."""
-    coordinates = _coordinates(run)
+def _planes(run):
+    """Groups of names that span a plane by convention, capitals first, and outputs before coordinates."""
     outputs = list(run.model.outputs) if run.model is not None else []
     groups = {}
-    for name in [*outputs, *coordinates]:
+    for name in [*outputs, *_coordinates(run)]:
         found = re.fullmatch(r"(.*_)?([xyzXYZ])(_.*|\d*)", name)
         if found:
             groups.setdefault((found[2].islower(), found[1], found[3]), []).append(name)
-    planes = sorted((group for group in groups.items() if len(group[1]) > 1), key=lambda group: group[0][0])
-    names = planes[0][1] if planes else list(dict.fromkeys([*coordinates, *run.names]))
-    return names[0], names[min(1, len(names) - 1)]
+    return [names for key, names in sorted(groups.items(), key=lambda group: group[0][0]) if len(names) > 1]
+
+
+def _along_one_axis(names):
+    axes = {name.rstrip("0123456789") for name in names}
+    return len(names) == 1 or len(axes) == 1 and axes < set("xyzXYZ")
 
 
 def _unit(name, units):

@@ -1,5 +1,6 @@
 """What a run leaves: the text that was printed, a folder with its files, and its facts as plain values."""
 
+import contextlib
 import math
 import os
 import sys
@@ -112,15 +113,14 @@ class Folder:
             self.path, self.moved = Path(tempfile.mkdtemp(prefix=f"servoctl-{self.name}-")), True
         except OSError as another:
             raise _nowhere(tempfile.gettempdir(), another) from error
+        self._made.append(self.path)
         complain(f"{self.name}: {error}", f"What was computed is kept: it is written to {self.path} instead.")
 
     def leave(self):
         """Remove the folders that were made for this run and stayed empty."""
         for path in self._made:
-            try:
+            with contextlib.suppress(OSError):
                 path.rmdir()
-            except OSError:
-                return
 
 
 def _nowhere(path, error):
@@ -193,12 +193,7 @@ def _structure(model):
 
 
 def _extrema(run, name):
-    values = run[name].tolist()
-    if all(map(math.isfinite, values)):
-        low, high = run.extrema(name)
-    else:
-        finite = [(t, v) for t, v in zip(run.t.tolist(), values, strict=True) if math.isfinite(v)] or [(None, None)]
-        low, high = min(finite, key=lambda item: item[1]), max(finite, key=lambda item: item[1])
+    low, high = run.extrema(name)
     return {"min": {"t": low[0], "value": low[1]}, "max": {"t": high[0], "value": high[1]}}
 
 

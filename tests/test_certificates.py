@@ -132,6 +132,42 @@ def test_a_drifted_state_fails(scene_run):
     assert "residual string" in proof.failures
 
 
+def test_higher_jets_excuse_no_residual(gallery_model):
+    model, scene = gallery_model("appell-hamel"), gallery["appell-hamel"]
+    start = model.start(**scene.start, guess=scene.guess)
+    run = sv.simulate(model, start, (0.0, 0.1), method="Taylor", jets=12)
+    moved = run.jets.copy()
+    moved[2] += 1e-5  # z off the string
+    short = moved[: len(model.jet_names)]
+    found = [
+        sv.verify(model, replace(run, jets=jets, jet_names=names, stored={}, stored_residual={}), segments=1)
+        for jets, names in ((moved, run.jet_names), (short, model.jet_names))
+    ]
+    assert np.abs(moved).max() > 100 * np.abs(short).max()
+    assert found[0].numbers["residual string"] == found[1].numbers["residual string"] > 1e-6
+    assert found[0].failures == found[1].failures
+
+
+def test_a_failure_tells_what_is_allowed(scene_run):
+    model, run = scene_run("appell-hamel")
+    moved = run.jets.copy()
+    moved[2] += 1e-3
+    text = repr(sv.verify(model, replace(run, jets=moved, stored={}, stored_residual={}), segments=3))
+    assert "(allowed 1e-06) (string)" in text and text.count("allowed") == 1
+    assert "allowed" not in repr(sv.verify(model, run, segments=3))
+
+
+@pytest.mark.parametrize("segments", [0, -1, "a", 2.5, True, None])
+def test_segments_that_check_nothing_are_refused(segments, scene_run):
+    with pytest.raises(sv.SpecificationError, match="segments=.* whole number, at least 1"):
+        sv.verify(*scene_run("overhead-crane"), segments=segments)
+
+
+def test_a_run_of_another_model_is_refused(scene_run):
+    with pytest.raises(sv.SpecificationError, match="a Run of another one"):
+        sv.verify(scene_run("vtol")[0], scene_run("overhead-crane")[1])
+
+
 @pytest.mark.parametrize("name", ["two-cars-ideal", "appell-hamel", "constant-speed"])
 def test_what_actuators_cannot_give_of_an_ideal_reaction_is_told(name, scene_run):
     model, run = scene_run(name)

@@ -16,6 +16,7 @@ from servoctl.cli import main
 from servoctl.errors import IntegrationStopped
 from servoctl.mechanisms import gallery
 from servoctl.rundir import FILES, LOOP_FILES
+from servoctl.simulation.simulate import ALL_METHODS
 
 FALL = '''"""A mass in a plane follows a path in x, and falls."""
 import servoctl as sv
@@ -272,7 +273,41 @@ def test_files_of_an_earlier_run_are_replaced_and_others_kept(here, fall):
     }  # fmt: skip
 
 
+def test_no_empty_folder_stays_where_nothing_can_be_written(here, fall, monkeypatch):
+    monkeypatch.setattr("tempfile.tempdir", str(here / "temporary"))
+    (here / "temporary").mkdir()
+
+    def full(*_):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(servoctl.Run, "save", full)
+    assert main(["run", fall, "--no-verify"]) == 2
+    assert not list((here / "temporary").iterdir()) and not (here / "servoctl-runs").exists()
+
+
 # --- options, interruption, verification
+
+
+@pytest.mark.parametrize(
+    ("options", "fact"),
+    [
+        ("--t-span 1 1", "t_span=(1.0, 1.0)"),
+        ("--t-span 0 nan", "t_span=(0.0, nan)"),
+        ("--method Euler", "No method is named 'Euler'"),
+        ("--drift -0.1", "-0.1"),
+    ],
+)
+def test_what_no_model_has_is_told_before_deriving(fall, capsys, monkeypatch, options, fact):
+    monkeypatch.setattr(servoctl, "derive", lambda *_: pytest.fail("derived first"))
+    assert main(["run", fall, *options.split()]) == 2
+    assert fact in words(capsys.readouterr().err)
+
+
+@pytest.mark.parametrize("command", ["run", "sweep"])
+def test_help_names_every_method(capsys, command):
+    with pytest.raises(SystemExit):
+        main([command, "--help"])
+    assert ", ".join(ALL_METHODS) in words(capsys.readouterr().out)
 
 
 def test_options_reach_the_simulation(fall, monkeypatch):

@@ -142,6 +142,7 @@ def test_a_loop_that_is_lost_is_kept_to_its_last_finite_sample(here, capsys):
         ("--no-loop --rate 50 --integral", ["--integral, --rate was given with --no-loop"]),
         ("--law computed --integral", ["--integral was given with --law computed"]),
         ("--no-loop --delay 1 --machine m_load=0", ["--machine, --delay was given with --no-loop"]),
+        ("--law feedforward --noise x=1e-3", ["--noise was given with --law feedforward, which measures nothing"]),
         ("--seed 0", ["--seed was given with no --noise"]),
         ("--machine m_load=1 m_load=2", ["--machine m_load was given twice"]),
     ],
@@ -155,7 +156,16 @@ def test_options_that_make_no_sense_are_refused_before_the_motion(here, capsys, 
 
 @pytest.mark.parametrize(
     "options",
-    ["--rate 0", "--rate -5", "--rate nan", "--seed -1", "--delay -1", "--noise x=nan", "--machine m_load=inf"],
+    [
+        "--rate 0",
+        "--rate -5",
+        "--rate nan",
+        "--seed -1",
+        "--delay -1",
+        "--noise x=nan",
+        "--noise x=-1",
+        "--machine m_load=inf",
+    ],
 )
 def test_numbers_that_make_no_sense_are_refused_by_the_parser(capsys, options):
     with pytest.raises(SystemExit):

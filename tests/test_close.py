@@ -6,6 +6,7 @@ from dataclasses import replace
 import casadi as ca
 import numpy as np
 import pytest
+from conftest import numbers
 
 import servoctl as sv
 from servoctl.mechanisms import gallery
@@ -449,6 +450,37 @@ def test_an_ideal_plan_is_no_command():
     plan = sv.simulate(model, model.start(guess={"x2": 0.0}), (0.0, 0.1))
     with pytest.raises(sv.NotRealisable, match="ideal reaction"):
         sv.feedforward(plan, sv.plant(mechanism))
+
+
+def test_more_samples_than_fit_into_memory_are_refused_with_their_number():
+    scene = gallery["overhead-crane"]
+    model = sv.derive(*scene.build())
+    plan = sv.simulate(model, model.start(t=2.0, guess=scene.guess), (2.0, 1e9))
+    plant = sv.plant(model.reduction.mechanism)
+    for build in (
+        lambda: sv.lqr(plan, plant),
+        lambda: sv.close(plant, lambda t, y: [0.0, -981.0], plan.state(2.0), (0.0, 1e9), rate=100.0),
+    ):
+        with pytest.raises(sv.SpecificationError, match=r"1e\+11 samples, which take .* GB.*Lower the rate"):
+            build()
+
+
+def test_residuals_of_order_2_are_those_of_the_accelerations():
+    """On its plan, a robot keeps the rate of its curvature up to the hold; an input that is off shows at once."""
+    scene = gallery["wheeled-robot"]
+    model = sv.derive(*scene.build())
+    plan = sv.simulate(model, model.start(**scene.start, guess=scene.guess), scene.t_span)
+    plant = sv.plant(model.reduction.mechanism)
+    worst = []
+    for rate in (100.0, 200.0):
+        run = sv.close(plant, sv.feedforward(plan, plant, rate=rate), plan.state(0.0), scene.t_span)
+        assert run.residual["clothoid"].shape == (1, len(run.t))
+        worst.append(np.abs(run.residual["clothoid"]).max())
+    assert 0 < worst[1] < 0.6 * worst[0] < 0.05
+    k, parameters = 40, dict(zip(plant.mechanism.parameters.names, plant.parameters, strict=False))
+    values = {"t": run.t[k]} | parameters | {name: run[name][k] for name in run.names}
+    expected = numbers([model.reduction.program.residuals["clothoid"]], values)
+    assert run.residual["clothoid"][:, k] == pytest.approx(expected, abs=1e-12)
 
 
 def test_a_closed_run_is_saved_and_loaded(crane_plan, tmp_path):

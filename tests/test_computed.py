@@ -1,6 +1,7 @@
 """Computed actuation: exact linearisation, dynamic extension, sampled poles, refusals."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -8,6 +9,7 @@ import pytest
 import servoctl as sv
 from servoctl.control.computed import sampled_radius
 from servoctl.mechanisms import cars, gallery, mass_on_car, vtol
+from servoctl.model.linearising import _Extension
 from servoctl.simulation.bounds import sampled_bound
 
 ORDERS = {  # zeros at infinity of the program's outputs (theory), which exact linearisation reaches
@@ -81,6 +83,44 @@ def test_the_hold_of_a_moving_path_costs_an_error_of_second_order(crane):
         run = sv.close(plant, sv.computed(crane, plant, rate=rate), crane.state(0.0), (0.0, 6.0))
         worst.append(np.hypot(run.residual["X"][0], run.residual["Z"][0]).max())
     assert worst[0] / worst[1] == pytest.approx(4.0, rel=0.1) and worst[1] < 1e-4
+
+
+def arm_residual(plan, rate, delay):
+    plant = sv.plant(plan.model.reduction.mechanism)
+    law = sv.computed(plan, plant, rate=rate, delay=delay)
+    run = sv.close(plant, law, plan.state(0.0), (0.0, 2.0), delay=delay)
+    return max(np.abs(run.residual[name][0]).max() for name in ("X", "Y"))
+
+
+def test_late_commands_are_those_of_the_time_when_they_are_held():
+    """By d samples too late the plan's actuation would cost an error of first order: 4e-4 m at 200 Hz."""
+    plan, _ = planned("two-link-arm")
+    prompt = arm_residual(plan, 200.0, 0)
+    for delay, room in ((1, 1.2), (2, 3.0)):
+        late = [arm_residual(plan, rate, delay) for rate in (200.0, 400.0)]
+        assert late[0] / late[1] == pytest.approx(4.0, rel=0.1) and late[0] < room * prompt
+
+
+def test_a_lag_needs_a_path_of_the_next_class():
+    """Its command holds one derivative more than the plan's actuation, which this path has not."""
+    plan, _ = planned("two-link-arm")
+    plant = sv.plant(plan.model.reduction.mechanism, lag={"shoulder": 0.02, "elbow": 0.02})
+    with pytest.raises(sv.SpecificationError, match=r"needs C\^3, has C\^2 at t = 0"):
+        sv.computed(plan, plant)
+
+
+@pytest.mark.parametrize("unit", [1.0, 1e-12])
+def test_choices_of_the_extension_do_not_depend_on_units(unit):
+    """The third row depends on both others, one of them in units of its own."""
+    base = np.array([[1.0, 2.0, 0.0], [0.0, 1.0, 3.0], [1.0, 3.0, 3.0]])
+    D = (np.array([1.0, unit, 1.0])[:, None] * base)[:, :, None]
+    given = SimpleNamespace(values=lambda D, beside=True: (D, np.abs(D)), rank=lambda: 2)
+    assert _Extension._needed(given, D, [0, 1], [0, 2], [2]).tolist() == [True, True]
+    random = np.random.default_rng(0)
+    for _ in range(10):
+        along = np.einsum("irk,rjk->ijk", random.standard_normal((3, 2, 8)), random.standard_normal((2, 3, 8)))
+        scaled = np.array([1.0, unit, 1.0])[:, None, None] * along
+        assert _Extension._pivots(given, scaled) == _Extension._pivots(given, along)
 
 
 def test_behind_a_lagging_actuator_the_hold_costs_an_error_of_second_order_too():

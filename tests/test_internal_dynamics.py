@@ -49,3 +49,11 @@ def test_symmetries_are_neutral_and_flat_programs_have_none():
     assert (found.verdict, found.names) == ("neutral", ("x", "y", "psi"))
     flat = internal(cars(), (0.0, 0.5), {})
     assert flat.verdict == "none" and "determines" in repr(flat)
+
+
+def test_a_run_without_its_model_is_refused(tmp_path):
+    model = sv.derive(*passive_arm())
+    run = sv.simulate(model, model.start(q2=0.0, dq2=0.0), (0.0, 0.5))
+    for other in (sv.load(run.save(tmp_path / "run")), None):
+        with pytest.raises(sv.SpecificationError, match="a loaded run has none"):
+            sv.internal_dynamics(model, other)

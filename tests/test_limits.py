@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import casadi as ca
 import numpy as np
 import pytest
 
@@ -138,6 +139,24 @@ def test_limits_and_bounds_that_exclude_each_other_stop_with_both_named(crane):
     law = sv.limited(sv.lqr(plan, sv.plant(mechanism)), machine, bounds={"tension": (500.0, None)})
     with pytest.raises(sv.LimitExceeded, match="At t = .*hoist -100 .. 0.*tension 500"):
         sv.close(machine, law, plan.state(0.0), (0.0, 1.0))
+
+
+@pytest.mark.parametrize("unit", [1.0, 1e3])
+def test_slacks_do_not_depend_on_the_units_of_inputs(unit):
+    """Forces in N and in kN, of which the plan uses far less than one: h²/(2m) of the largest, after the horizon h."""
+    q = sv.coordinates("x y")
+    x, y = q
+    mass = sv.particle(q, 2.0, ca.vertcat(x, y))
+    mechanism = sv.Mechanism(q, gibbs=mass, actuators={"a": unit * x, "b": unit * y})
+    path = sv.paths.rest_to_rest(q.t, 0.0, 1.0, duration=2.0)
+    model = sv.derive(mechanism, sv.Program({"X": x - path, "Y": y}))
+    plan = sv.simulate(model, model.start(), (0.0, 2.0))
+    plant = sv.plant(mechanism, rate_limits={"a": 1e3 / unit})
+    law = sv.limited(sv.feedforward(plan, plant, rate=50.0), plant)
+    used = unit * np.abs(plan["a"]).max()
+    X, Y = law.info["slack sizes"]
+    assert X == pytest.approx(0.5**2 / (2 * 2.0) * used, rel=1e-9)
+    assert Y == pytest.approx(1e-3 * X, rel=0.1)  # of an input that the plan leaves idle
 
 
 class Failing:

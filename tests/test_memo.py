@@ -122,7 +122,7 @@ def weighted(weights):
 
 
 def test_every_difference_makes_another_key(derived):
-    near = (0.5, {"phi": 0.1, "dphi": 0.0, "d2phi": 0.0})
+    near = (0.5, {"phi": 0.1, "dphi": 0.0, "d2phi": 0.0}, {"phi": 1.0})
     keys = [
         keyed(*pendulum()),
         keyed(*pendulum(name="psi")),
@@ -143,8 +143,9 @@ def test_every_difference_makes_another_key(derived):
         keyed(*pendulum(), guess={"phi": 0.2}),
         keyed(*pendulum(), guess={"dphi": 0.1}),
         keyed(*pendulum(), near=near),
-        keyed(*pendulum(), near=(0.6, near[1])),
-        keyed(*pendulum(), near=(0.5, near[1] | {"phi": 0.2})),
+        keyed(*pendulum(), near=(0.6, *near[1:])),
+        keyed(*pendulum(), near=(0.5, near[1] | {"phi": 0.2}, near[2])),
+        keyed(*pendulum(), near=(0.5, near[1], {"phi": 0.5})),
         keyed(*pendulum(), values=[2.5, 9.81]),
         keyed(*weighted(None)),
         keyed(*weighted({"left": 1.0})),

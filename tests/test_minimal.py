@@ -138,7 +138,7 @@ def pendulum(metre=1.0):
 
 @pytest.mark.parametrize(
     ("method", "metre"),
-    [("DOP853", 1.0), ("RK45", 1.0), ("Radau", 1.0), ("RK8", 1.0), ("DOP853", 1e3), ("DOP853", 1e-3)],
+    [("DOP853", 1.0), ("RK45", 1.0), ("Radau", 1.0), ("RK8", 1.0), ("DOP853", 1e6), ("DOP853", 1e-6)],
 )
 def test_a_turning_pendulum_changes_its_coordinates(method, metre):
     model = pendulum(metre)
@@ -239,3 +239,16 @@ def test_a_state_that_is_lost_ends_the_motion(wheel, monkeypatch):
     with pytest.raises(sv.IntegrationStopped, match="no solution|finite|step size") as caught:
         sv.simulate(model, start, (0.0, 1.0), method="DOP853", drift="minimal")
     assert 0.3 < caught.value.run.t[-1] <= 0.5 + 1e-9
+
+
+def test_without_invariants_everything_is_integrated():
+    q = sv.coordinates("x y")
+    x, y = q
+    mechanism = sv.Mechanism(q, gibbs=sv.particle(q, 1.0, (x, y)), potential=9.81 * y)
+    ax, ay = q.d(2)
+    model = sv.derive(mechanism, sv.Program({"lean": ax - ay - 9.81}, by="ideal"))
+    run = sv.simulate(
+        model, model.start(x=0.0, y=0.0, dx=1.0, dy=0.0), (0.0, 1.0), method="RK4", step=0.1, drift="minimal"
+    )
+    assert run.counters["integrated"] == 4
+    assert run["x"][-1] == pytest.approx(1.0, abs=1e-12) and run["y"][-1] == pytest.approx(-4.905, abs=1e-12)

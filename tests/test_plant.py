@@ -37,6 +37,34 @@ def test_accelerations_are_those_of_the_crane_by_hand(x):
     assert found[3:] == pytest.approx(crane_accelerations(x, u, d, 115.0, resisting), rel=1e-12)
 
 
+@pytest.mark.parametrize(
+    "load, text",
+    [(-1.0, "negative in a direction of .*dtheta, with m_load = -1"), (0.0, "singular: a direction of dtheta")],
+)
+def test_masses_that_are_none_are_refused(load, text):
+    """Of plants, models with other numbers, and mechanisms with such defaults."""
+    model = sv.derive(*gallery["overhead-crane"].build())
+    p = sv.parameters(m_load=load)
+    q = sv.coordinates("x theta")
+    x, theta = q
+    gibbs = sv.particle(q, 5.0, x) + sv.particle(q, p.m_load, ca.vertcat(x + ca.sin(theta), ca.cos(theta)))
+    own = sv.Mechanism(q, gibbs=gibbs, actuators={"force": x}, parameters=p)
+    for build in (
+        lambda: sv.plant(RELATIVE, m_load=load),
+        lambda: model.with_parameters(m_load=load),
+        lambda: sv.plant(own),
+        lambda: sv.derive(own, sv.Program({"X": x - q.t})),
+    ):
+        with pytest.raises(sv.SpecificationError, match=text):
+            build()
+
+
+def test_units_and_signs_that_are_no_masses_are_let_pass():
+    """A negative weight of gravity, and masses of 1e-9 kg beside others of 1e6."""
+    assert "g=-9.81" in repr(sv.plant(RELATIVE, g=-9.81))
+    sv.plant(RELATIVE, m_load=1e-9, m_trolley=1e6)
+
+
 def test_numbers_are_not_derived_again():
     assert sv.plant(RELATIVE, m_load=115.0).function("ode") is sv.plant(RELATIVE).function("ode")
     assert sv.plant(RELATIVE, damping={"x": 5.0}).function("ode") is sv.plant(RELATIVE, damping={"x": 1.0}).function(

@@ -14,6 +14,7 @@ from matplotlib.figure import Figure
 import servoctl
 from servoctl import plots
 from servoctl.errors import NameUnknown, ServoError, SpecificationError
+from servoctl.mechanisms import gallery
 from servoctl.simulation.run import Run
 
 UNITS = {"x": "m", "z": "m", "theta": "rad", "trolley": "N", "winch": "N m"}
@@ -74,7 +75,8 @@ def test_a_path_is_drawn_in_the_plane_that_the_names_span(run):
         ("x l X Z", ("X", "Z")),
         ("x x_m y_m", ("x_m", "y_m")),
         ("phi tip_x tip_z", ("tip_x", "tip_z")),
-        ("x1 x2 x3", ("x1", "x2")),
+        ("x1 x2 x3", ("t [s]", "x1, x2, x3")),
+        ("x1 y2", ("x1", "y2")),
         ("q1 q2", ("q1", "q2")),
     ],
 )
@@ -104,6 +106,21 @@ def test_flat_paths_keep_their_scales_apart(run):
 def test_an_open_run_is_no_closed_loop(run):
     with pytest.raises(SpecificationError, match="A Run was given.*sv.close"):
         plots.closed(run)
+
+
+def test_a_run_is_no_sweep(run):
+    with pytest.raises(SpecificationError, match="A Run was given.*sv.sweep"):
+        plots.sweep(run)
+    with pytest.raises(SpecificationError, match="A Study of the kind tradeoff was given"):
+        plots.sweep(servoctl.Study("tradeoff", {}, {}))
+
+
+def test_the_load_of_a_crane_is_drawn_on_its_path(gallery_model):
+    model, scene = gallery_model("overhead-crane"), gallery["overhead-crane"]
+    ax = plots.path(servoctl.simulate(model, model.start(guess=scene.guess), scene.t_span), units=scene.units)
+    curve = ax.get_lines()[0]
+    assert (ax.get_xlabel(), ax.get_ylabel()) == ("X [m]", "Z [m]")
+    assert np.allclose(curve.get_ydata(), 4.0 - 0.4 * curve.get_xdata(), rtol=0, atol=1e-12)
 
 
 def test_an_unknown_name_is_refused_with_the_nearest(run):

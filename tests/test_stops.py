@@ -286,3 +286,38 @@ def test_a_driven_pendulum_turns_by_more_than_360_degrees(method, derived):
     assert run.success and run.counters["pivot_changes"] >= 3
     assert np.hypot(run["x"] - np.cos(2 * run.t), run["y"] - np.sin(2 * run.t)).max() < 1e-8
     assert run["torque"] == pytest.approx(9.81 * np.cos(2 * run.t), abs=1e-6)
+
+
+def test_signals_without_a_finite_value_are_not_printed(gallery_model):
+    model, scene = gallery_model("overhead-crane"), gallery["overhead-crane"]
+    run = sv.simulate(model, model.start(guess=scene.guess), scene.t_span)
+    low, high = run.extrema("hoist")
+    run["tension"][:], run["hoist"][-1], run["X"][:] = np.nan, np.nan, np.inf
+    text = repr(run)
+    assert "tension" not in text and "nan" not in text and "inf" not in text
+    assert run.extrema("hoist") == (low, high) and f"hoist: {low[1]:.6g}" in text
+
+
+def led_round():
+    """A particle led round a circle by the direction in which it is seen: nothing is left to integrate."""
+    q = sv.coordinates("x y")
+    x, y = q
+    mechanism = sv.Mechanism(q, gibbs=sv.particle(q, 1.0, ca.vertcat(x, y)))
+    residuals = {"circle": x**2 + y**2 - 1.0, "direction": x * ca.sin(2 * q.t) - y * ca.cos(2 * q.t)}
+    return sv.derive(mechanism, sv.Program(residuals, by="ideal"), guess={"x": 1.0, "y": 0.0})
+
+
+@pytest.mark.parametrize("method", ["DOP853", "RadauIIA", "Taylor", "RK4", "algebraic"])
+def test_where_no_other_pivots_are_found_the_motion_is_kept(method, derived, monkeypatch):
+    def none_found(*_):
+        raise sv.InconsistentStart("No state was found.", "Points of a motion are consistent.")
+
+    model = derived(led_round if method == "algebraic" else driven_pendulum)
+    start = model.start(t=0.2, x=np.cos(0.4), y=np.sin(0.4))
+    monkeypatch.setattr(type(model), "near", none_found)
+    options = {"t_eval": np.linspace(0.2, 4.0, 381)} if method == "algebraic" else precise(method)
+    with pytest.raises(sv.SingularProgram) as caught:
+        sv.simulate(model, start, (0.2, 4.0), method=method, **options)
+    run = caught.value.run
+    assert 0.3 < run.t[-1] <= caught.value.details["t"] < 1.7  # within the first half turn
+    assert np.hypot(run["x"] - np.cos(2 * run.t), run["y"] - np.sin(2 * run.t)).max() < 1e-8

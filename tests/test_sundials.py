@@ -107,6 +107,21 @@ def test_failure_keeps_what_was_computed(method):
     np.testing.assert_allclose(run["x"][early], 1 / (1 - run.t[early]), rtol=1e-3)
 
 
+def test_an_integrator_that_cannot_be_made_leaves_the_start(method, model, start, monkeypatch):
+    """A run keeps nothing in the solver, which models share between threads."""
+    solver = model.integrator(method, False)
+    kept = dict(vars(solver))
+    given = (np.linspace(0.0, 0.1, 5), start.values, np.zeros(model.n), model.parameters, 1e-6, 1e-8)
+    assert solver.run(*given)[1]["steps"] > 0 and vars(solver) == kept
+
+    def broken(*_):
+        raise RuntimeError("no memory")
+
+    monkeypatch.setattr(ca, "integrator", broken)
+    x, counts = type(solver)(model._equations, method).run(*given)
+    assert x[:, 0].tolist() == start.values.tolist() and x.shape[1] == 1 and counts == {}
+
+
 def test_projection_is_refused_with_the_reason(method, model, start):
     with pytest.raises(sv.SpecificationError, match="multistep"):
         sv.simulate(model, start, (0.0, 1.0), method=method, drift="project")

@@ -20,7 +20,7 @@ ENTRIES = ("__init__.py", "__main__.py")  # of the package itself: they gather t
 
 LAYERS = (
     "errors", "spec", "reduction", "model", "simulation", "control", "study", "mechanisms", "plots", "interop",
-    "scenes", "rundir", "options", "commands", "loops", "cli",
+    "scenes", "rundir", "options", "commands", "cli_loop", "cli",
 )  # fmt: skip
 BEHIND_THE_SEAM = (
     "simulation",
@@ -32,10 +32,10 @@ BEHIND_THE_SEAM = (
     "rundir",
     "options",
     "commands",
-    "loops",
+    "cli_loop",
     "cli",
 )
-LATE = ("scipy", "matplotlib", "control", "tqdm", "xarray", "adam", "dask")
+LATE = ("scipy", "matplotlib", "control", "tqdm", "xarray", "dask")
 MOST_LINES, MOST_IN_A_FUNCTION, MOST_IN_A_REPR = 450, 80, 12
 
 
@@ -242,7 +242,3 @@ def test_a_file_stays_readable(path):
 @own_files
 def test_nothing_is_left_open(path):
     assert not re.search(r"\b(TODO|FIXME|XXX|NotImplementedError)\b", path.read_text())
-
-
-def test_type_information_is_announced():
-    assert (PACKAGE / "py.typed").exists()

@@ -325,6 +325,20 @@ def test_the_checkpoint_of_another_sweep_is_refused(tmp_path, case, cases, seed)
     assert kept.read_text() == text
 
 
+def test_a_function_of_the_same_name_in_another_module_is_another_sweep():
+    cases = sv.grid(m=[1.0])
+    studies = []
+    for module in ("one", "two"):
+        space = {"__name__": module}
+        exec("def case(m): return {'f': m}", space)
+        studies += [sv.sweep(case, cases) for case in (space["case"], functools.partial(space["case"]))]
+    first, _, second, _ = (study.meta["identity"] for study in studies)
+    assert first != second and studies[0].meta["case"] == studies[2].meta["case"] == "case"
+    assert studies[1].meta["identity"] != studies[3].meta["identity"]
+    with pytest.raises(SpecificationError, match="different sweeps"):
+        sv.merge([studies[0], studies[2]])
+
+
 @pytest.mark.parametrize("text", ["hello\n", "[]\n", "{}\n"])
 def test_a_file_that_is_no_checkpoint_is_left_alone(tmp_path, text):
     (tmp_path / "notes").write_text(text)
@@ -346,7 +360,7 @@ def test_a_run_gives_extrema_final_values_and_its_residual(gallery_model):
     run = sv.simulate(model, model.start(guess={"l": 4.0}), (0.0, 8.0), progress=False)
     row = sv.sweep(lambda m: run, {"m": [1]}).rows()[0]
     assert [name for name in row if name not in TOLD][2:] == [
-        f"{name}_{what}" for name in ("trolley", "hoist", "tension") for what in ("min", "max", "end")
+        f"{name}_{what}" for name in ("trolley", "hoist", "tension", "X", "Z") for what in ("min", "max", "end")
     ] + ["residual", "t_end"]
     assert row["trolley_max"] == run["trolley"].max() and row["tension_end"] == run["tension"][-1]
     assert row["residual"] == max(np.abs(run.residual[name]).max() for name in run.residual) and row["t_end"] == 8.0

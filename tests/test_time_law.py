@@ -42,6 +42,15 @@ def test_slowed_rates_and_curvatures_leave_the_path_where_it_is():
     assert np.abs(runs[0]["steer"] - 2.5**2 * runs[1]["steer"]).max() < 1e-6
 
 
+def test_the_motions_tried_are_shown(capsys, monkeypatch):
+    monkeypatch.setattr("servoctl.control.time_law.PATIENCE", 0)
+    sv.fastest(*cars(), {"force": 200.0}, (0.0, 2.0), progress=True)
+    told = capsys.readouterr().err
+    assert "fastest" in told and "motions" in told and "simulate" not in told
+    sv.fastest(*cars(), {"force": 200.0}, (0.0, 2.0))
+    assert not capsys.readouterr().err
+
+
 def test_held_velocities_are_slowed_too():
     law = sv.fastest(
         *wheeled_robot(), {"steer": 0.5}, (0.0, 5.0), start=gallery["wheeled-robot"].start, guess={"v": 1.0}
@@ -63,10 +72,10 @@ def test_a_limit_at_zero_is_a_limit():
 
 
 def test_motions_that_cease_to_exist_before_a_limit_are_no_fastest_ones(monkeypatch):
-    def simulated(model, start, span):
+    def simulated(model, start, span, **options):
         if span[1] < 1.5:
             raise sv.IntegrationStopped("No motion is quicker than 1.5 s.")
-        return sv.simulate(model, start, span)
+        return sv.simulate(model, start, span, **options)
 
     monkeypatch.setattr("servoctl.control.time_law.simulate", simulated)
     with pytest.raises(sv.LimitExceeded, match=r"below the factor 0\.75, before it reaches a limit"):

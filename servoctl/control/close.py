@@ -7,7 +7,7 @@ import numpy as np
 from servoctl.control.closed import Closed
 from servoctl.control.disturbances import require_seed, sampled
 from servoctl.control.law import ON_SAMPLE, Law
-from servoctl.control.tracking import Reference, positive, require_plan, require_plant, resampled
+from servoctl.control.tracking import Reference, positive, require_memory, require_plan, require_plant, resampled
 from servoctl.errors import InconsistentStart, IntegrationStopped, ServoError, SpecificationError, unknown
 from servoctl.model.closed import FINISHED, LAW_LOST, STATE_LOST, Loop, run_loop
 from servoctl.model.compiled import Compiled
@@ -113,6 +113,8 @@ def prepared(plant, law, x0, t_span, delay, conditions, substeps):
     """All numbers of a loop, in tables made beforehand."""
     t0, t1 = t_span
     samples = whole((t1 - t0) * law.rate, f"t_span of {t1 - t0:g} s at {law.rate:g} Hz", "samples")
+    kept = plant.n_x + len(law.measures) + len(law.memory) + law.n_out + len(plant.inputs) + len(conditions.noise)
+    require_memory(samples, kept, f"The loop runs for {t1 - t0:g} s at {law.rate:g} Hz")
     first = whole((t0 - law.t0) * law.rate, f"A start at {t0:g} s of a law from {law.t0:g} s on", "samples")
     low, high, change = limits(plant, law.period)
     idle = _idle(law, t0)

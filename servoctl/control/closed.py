@@ -165,11 +165,13 @@ class Closed:
     def residual(self):
         """Residuals of the plan's program, with the derivatives that the state decides, and of material constraints.
 
-        By name; (levels, N) arrays at the plant's states and parameters. Residuals of order 2 and higher are left out.
+        By name; (levels, N) arrays at the plant's states and parameters. Residuals of order 2 are those of the
+        accelerations right after each sample; residuals of higher order are left out.
         """
         found = {}
         if self.plan is not None:
-            found |= Residuals(self.plan.model, self.plant).levels(self.t, self.states)
+            jets = np.vstack([self.states, self._evaluated("accelerations")])
+            found |= Residuals(self.plan.model, self.plant, order=2).levels(self.t, jets)
         if self.plant.constrained:
             values = self.plant.function("constraints").grid(self.t, self.states, self.plant.p())
             found |= {name: value[None] for name, value in zip(self.plant.constraint_names(), values, strict=True)}

@@ -6,6 +6,7 @@ from servoctl.control.law import Law
 from servoctl.control.tracking import Reference, positive, refuse_transport, require_plan
 from servoctl.errors import SpecificationError, UnstableInternalDynamics, unknown
 from servoctl.model.linearising import linearise
+from servoctl.reduction.knots import require_smooth
 from servoctl.simulation.bounds import sampled_bound
 from servoctl.simulation.internal import internal_dynamics
 
@@ -18,7 +19,8 @@ def computed(plan, plant, rate=100.0, poles=None, delay=0):
 
     Each residual obeys Π(D - λ_i) φ = 0 as long as the machine is the plant: φ is differentiated along the plant until
     the inputs decouple, through dynamic extension where their decoupling matrix has no full rank. Between samples the
-    inputs are held: by how much the plan's actuation changes until the middle of each sample is added.
+    inputs are held, from `delay` samples after the measurement on: by how much the plan's actuation changes until the
+    middle of that time is added.
 
     Parameters
     ----------
@@ -32,7 +34,8 @@ def computed(plan, plant, rate=100.0, poles=None, delay=0):
         One time constant T [s] (all poles at -1/T), default 0.25 s, or the poles [1/s] of each residual, as many as its
         relative degree with the extension (`law.info["orders"]`).
     delay : int
-        Samples by which the loop will be late; the poles are checked for it.
+        Samples by which the loop will be late: the plan's actuation is taken as much ahead, and the poles are checked
+        for it.
 
     Returns
     -------
@@ -43,7 +46,8 @@ def computed(plan, plant, rate=100.0, poles=None, delay=0):
     UnstableInternalDynamics
         If what the program leaves free is unstable along the plan: linearisation would hide it, not stabilise it.
     SpecificationError
-        If the sampled error dynamics are unstable with these poles at this rate, or poles are of another number.
+        If the sampled error dynamics are unstable with these poles at this rate, poles are of another number, or a path
+        is not smooth enough: a lagging actuator's command holds one derivative more than the plan's actuation.
     NotRealisable
         If a residual depends on no input.
     """
@@ -56,12 +60,15 @@ def computed(plan, plant, rate=100.0, poles=None, delay=0):
         )
     _require_stable(plan)
     found = linearise(plan, plant)
+    reduction = plan.model.reduction
+    if reduction.timed and any(order > reduction.needs.get(name, 0) for name, order in found.orders.items()):
+        require_smooth(reduction.switches, plan.model.parameters, found.orders, (plan.t[0], plan.t[-1]))
     poles = _poles(poles, found.orders)
     for name, values in poles.items():
         _require_slow(name, values, rate, delay)
     coefficients = [np.poly(values).real[:0:-1] for values in poles.values() if len(values)]
     reference, count = Reference(plan, plant, rate), len(found.memory_names)
-    ahead = reference.ahead()
+    ahead = reference.ahead(delay)
     rows = ([plant.parameters, [1.0 / rate], u, *coefficients] for u in ahead.T)
     table = np.column_stack([np.concatenate(row) for row in rows])
     idle = np.array([plan[name][0] for name in plant.inputs])

@@ -19,6 +19,7 @@ from servoctl.spec.parameters import finite
 HORIZON = 0.5  # s
 FALLING = 1e-4  # of weights, from one residual to the next by priority
 UNSEEN = 1e-6  # weight of each state beside those of residuals: states that no residual sees stay where they are
+IDLE = 1e-3  # of the largest: the root of the cost of an input that the plan does not use
 MET = 1e-7  # of an input's range: how near its limit an input has met it
 SCENE = frozenset(("t_span", "start", "guess", "parameters"))  # what `fastest` takes beside program and limits
 GIVEN_WAY = 1e-6  # of a residual's largest effect: a slack that counts
@@ -30,7 +31,8 @@ def limited(law, plant, *, bounds=None, weights=None, priority=None, horizon=HOR
     At each sample the inputs u nearest to those of the law, u_law, by what the difference will cost the program: least
     is (u - u_law)ᵀ(R + BᵀPB)(u - u_law), with the cost-to-go P of Σ w_i φ_i² along the plan under the default R of
     `lqr` (and, for residuals of order 2, w_i times the square of their immediate change). By priority, the weights fall
-    by 1e-4 from one residual to the next. The slack of a residual is by how much it deviates after the horizon if
+    by 1e-4 from one residual to the next; that is decided sample by sample, and what is spared in each sample does not
+    always come out smaller over a whole motion. The slack of a residual is by how much it deviates after the horizon if
     the difference is held (for residuals of order 2, at once). Integrals of residuals in the law's memory stand still
     while slack is given (anti-windup), and an estimator's prediction is told the inputs that were applied.
 
@@ -82,8 +84,8 @@ def limited(law, plant, *, bounds=None, weights=None, priority=None, horizon=HOR
     _require_at_once(effects, plant, bounds)
     reference = Reference(law.plan, plant, law.rate)
     names, D, at_once = _predicted(reference, positive("horizon", horizon))
-    count, sizes = D.shape[0], _sizes(law.plan, plant)
     H = _metric(reference, names, _weights(names, weights, priority), at_once)
+    count, sizes = D.shape[0], _sizes(law.plan, plant, H)
     samples, columns = np.arange(max(count, law.table.shape[1])), law.table.shape[1]
     along = np.vstack([reference.x, D.reshape(count, -1).T, H.reshape(count, -1).T])
     table = [law.table[:, np.minimum(samples, columns - 1)], along[:, np.minimum(samples, count - 1)]]
@@ -288,14 +290,14 @@ def _weights(names, weights, priority):
     return found
 
 
-def _sizes(plan, plant):
-    """A typical size of each input: its range where it has limits, else what the plan uses."""
+def _sizes(plan, plant, H):
+    """A typical size of each input: its range where it has limits, else what the plan uses, if that costs anything."""
     found = []
     for name in plant.inputs:
         low, high = plant.limits.get(name, (-np.inf, np.inf))
-        used = float(np.abs(plan[name]).max())
-        found.append(high - low if np.isfinite(high - low) else max(used, 1.0))
-    return np.array(found)
+        found.append(high - low if np.isfinite(high - low) else float(np.abs(plan[name]).max()))
+    unit = 1 / np.sqrt(np.diagonal(H, axis1=1, axis2=2).max(axis=0))  # of each input, of the same cost
+    return np.maximum(found, (IDLE * np.max(found / unit) or 1.0) * unit)
 
 
 @dataclass(frozen=True)

@@ -1,6 +1,7 @@
 """The fastest time law of a program that its actuators can follow."""
 
 import functools
+import sys
 from dataclasses import dataclass
 
 import numpy as np
@@ -9,6 +10,7 @@ from servoctl.control.close import span
 from servoctl.errors import InconsistentStart, IntegrationStopped, LimitExceeded, SingularProgram, SpecificationError
 from servoctl.model.model import derive
 from servoctl.model.plant import interval
+from servoctl.simulation.motion import PATIENCE
 from servoctl.simulation.run import Run
 from servoctl.simulation.simulate import simulate
 from servoctl.spec.coordinates import mapping
@@ -50,7 +52,7 @@ class TimeLaw:
         )
 
 
-def fastest(mechanism, program, limits, t_span, start=None, guess=None, parameters=None):
+def fastest(mechanism, program, limits, t_span, start=None, guess=None, parameters=None, progress=None):
     """The fastest time law q(t0 + (t - t0)/σ) under which signals keep their limits, found by solving for σ.
 
     The motion's geometry stays; speeds go with 1/σ, accelerations with 1/σ². What a limit leaves beside static loads
@@ -68,6 +70,8 @@ def fastest(mechanism, program, limits, t_span, start=None, guess=None, paramete
         As for `Model.start`, for the program as given; derivatives that are held are slowed with the motion.
     parameters : dict of str to float, optional
         Other numbers for the mechanism's parameters.
+    progress : bool, optional
+        Show how many motions were tried; default: on a terminal, for work of more than a second.
 
     Returns
     -------
@@ -107,13 +111,16 @@ def fastest(mechanism, program, limits, t_span, start=None, guess=None, paramete
             model = derive(mechanism, slower, guess)
             model = model.with_parameters(**parameters) if parameters else model
             held = {name: value / factor ** _level(model, name) for name, value in start.items()}
-            plan = simulate(model, model.start(t0, guess=guess, **held), (t0, t0 + (t1 - t0) * factor))
+            plan = simulate(model, model.start(t0, guess=guess, **held), (t0, t0 + (t1 - t0) * factor), progress=False)
         except (SingularProgram, InconsistentStart, IntegrationStopped):
             return np.inf, ("", "", t0), slower, None
+        finally:
+            bar.update()
         return *_worst(plan, limits), slower, plan
 
-    quick, slow = _bracket(attempt)
-    factor = brentq(lambda sigma: min(attempt(sigma)[0], 1.0) + INSIDE, quick, slow, rtol=INSIDE / 10)
+    with _bar(progress) as bar:
+        quick, slow = _bracket(attempt)
+        factor = brentq(lambda sigma: min(attempt(sigma)[0], 1.0) + INSIDE, quick, slow, rtol=INSIDE / 10)
     excess, binding, slower, plan = attempt(factor)
     if not abs(excess) < NEAR:
         raise LimitExceeded(
@@ -124,6 +131,13 @@ def fastest(mechanism, program, limits, t_span, start=None, guess=None, paramete
             factor=factor,
         )
     return TimeLaw(factor, slower, plan, binding)
+
+
+def _bar(wanted):
+    from tqdm import tqdm
+
+    wanted = sys.stderr.isatty() if wanted is None else wanted
+    return tqdm(desc="fastest", unit=" motions", delay=PATIENCE, disable=not wanted)
 
 
 def _bracket(attempt):

@@ -13,6 +13,7 @@ from servoctl.spec.coordinates import mapping
 from servoctl.spec.parameters import finite
 
 UNSTABLE = 1e-9  # beyond 1: spectral radii that count as unstable
+MOST_MEMORY = 8e9  # bytes for what is kept of all samples: as much as common machines have
 GAUSS = np.polynomial.legendre.leggauss(3)
 
 
@@ -114,7 +115,7 @@ class Reference:
         self.plan, self.plant, self.rate = plan, plant, positive("rate", rate)
         require_plan(plan, plant)
         period = 1.0 / self.rate
-        count = int(np.floor((plan.t[-1] - plan.t[0]) * self.rate * (1 + 1e-12) + 1e-9))
+        count = np.floor((plan.t[-1] - plan.t[0]) * self.rate * (1 + 1e-12) + 1e-9)
         if count < 1:
             raise SpecificationError(
                 f"The plan lasts {plan.t[-1] - plan.t[0]:g} s, and is sampled every {period:g} s.",
@@ -122,7 +123,9 @@ class Reference:
                 nearest=f"rate={1 / (plan.t[-1] - plan.t[0]):.4g}.",
                 do="Raise the rate, or simulate a longer plan.",
             )
-        self.t = plan.t[0] + np.arange(count + 1) * period
+        matrices = 2 * (plant.n_x + len(plant.inputs)) ** 2  # linearisations, and the same from sample to sample
+        require_memory(count, matrices, f"The plan of {plan.t[-1] - plan.t[0]:g} s is sampled at {self.rate:g} Hz")
+        self.t = plan.t[0] + np.arange(int(count) + 1) * period
         self.period, self.end = period, plan.t[-1]
         self.x = self._states(self.t)
         self.middle = np.minimum(self.t + period / 2, self.end)
@@ -143,15 +146,22 @@ class Reference:
             raise unknown(held, ("middle", "mean"), "choice of the held value")
         return np.array([self._command(a, name, held) for a, name in enumerate(self.plant.inputs)])
 
-    def ahead(self):
-        """By how much the command in the middle of each sample exceeds that at its start, (m, N); at last 0."""
-        start = np.array([self._command(a, name, "start") for a, name in enumerate(self.plant.inputs)])
-        found = self.inputs() - start
+    def ahead(self, late=0):
+        """By how much the command in the middle of the time for which it is held exceeds that at each sample, (m, N).
+
+        Parameters
+        ----------
+        late : int
+            Samples from the measurement to the input: that of the sample k is held from the sample k + late on.
+        """
+        names = self.plant.inputs
+        middle = np.array([self._command(a, name, "middle", late * self.period) for a, name in enumerate(names)])
+        found = middle - np.array([self._command(a, name, "start") for a, name in enumerate(names)])
         found[:, -1] = 0.0
         return found
 
-    def _command(self, a, name, held):
-        later = self.t + self.plant.delay.get(name, 0.0)
+    def _command(self, a, name, held, late=0.0):
+        later = self.t + self.plant.delay.get(name, 0.0) + late
         at = later if held == "start" else later + self.period / 2
         if held == "mean":
             nodes, weights = GAUSS
@@ -216,6 +226,28 @@ def affine(name, reference, K, K_i=None, residuals=None, **facts):
         name, measures, plant.inputs, reference.rate, reference.t[0], step, np.vstack(parts),
         np.zeros(len(names)), tuple(f"integral of {n}" for n in names), (), reference.idle, reference.plan, facts,
     )  # fmt: skip
+
+
+def require_memory(samples, numbers, given):
+    """Refuse more samples than fit into memory.
+
+    Parameters
+    ----------
+    samples : float
+    numbers : int
+        Kept of each sample.
+    given : str
+        What asks for so many samples: the beginning of a sentence.
+    """
+    memory = 8.0 * samples * numbers
+    if memory > MOST_MEMORY:
+        raise SpecificationError(
+            f"{given}: {samples:.4g} samples, which take {memory / 1e9:.3g} GB.",
+            f"The numbers of all samples are kept, in {MOST_MEMORY / 1e9:g} GB at most.",
+            nearest=f"{MOST_MEMORY / (8 * numbers):.3g} samples.",
+            do="Lower the rate, or shorten the time.",
+            samples=float(samples),
+        )
 
 
 def require_plant(plant):

@@ -101,7 +101,7 @@ gallery = {
         "A trolley and a hoist carry a load along a straight path.",
         guess={"l": 4.0},
         t_span=(0.0, 8.0),
-        units=_units("x l [m] theta [rad] trolley hoist tension [N]"),
+        units=_units("x l X Z [m] theta [rad] trolley hoist tension [N]"),
     ),
     "overhead-crane-redundant": Scene(
         partial(overhead_crane, coordinates="redundant"),
@@ -115,7 +115,7 @@ gallery = {
         "Blajer's crane: a trolley and a winch carry a load.",
         guess={"beta": 40.0},
         t_span=(0.0, 6.0),
-        units=_units("x [m] beta theta [rad] trolley [N] winch [N m] tension [N]"),
+        units=_units("x X Z [m] beta theta [rad] trolley [N] winch [N m] tension [N]"),
     ),
     "winch-crane-redundant": Scene(
         partial(winch_crane, "redundant"),
@@ -129,7 +129,7 @@ gallery = {
         "A bridge, a trolley and a hoist lift a load along a quarter turn.",
         guess={"l": 5.0},
         t_span=(0.0, 6.0),
-        units=_units("x y l [m] theta phi [rad] bridge trolley hoist tension [N]"),
+        units=_units("x y l X Y Z [m] theta phi [rad] bridge trolley hoist tension [N]"),
     ),
     "crane-3d-redundant": Scene(
         partial(crane_3d, "redundant"),

@@ -1,7 +1,8 @@
 """Cranes whose load follows a path: a planar one, one with a winch, and a three-dimensional one.
 
 Each comes in relative coordinates (rope length and angles) or in redundant ones, where the load has Cartesian
-coordinates of its own and the rope is a material constraint. Z points down.
+coordinates of its own and the rope is a material constraint. Z points down. The tension of the rope is an output, and
+so is the load's position [m] where it is not among the coordinates.
 """
 
 from math import pi
@@ -140,14 +141,15 @@ def _following(q, p, machine, hung, actuators, path):
     load, rope, constraints = hung
     weight = p.m_load * p.g
     tension = weight * rope[-1] - p.m_load * ca.dot(q.dt(load, 2), rope)  # N, of m (g e - a) along the rope
+    axes = "XZ" if load.numel() == 2 else "XYZ"
+    positions = {} if constraints else {name: load[i] for i, name in enumerate(axes)}
     mechanism = sv.Mechanism(
         q,
         gibbs=machine + sv.particle(q, p.m_load, load),
         potential=-weight * load[-1],
         actuators=actuators,
         constraints=constraints,
-        outputs={"tension": tension},
+        outputs={"tension": tension} | positions,
         parameters=p,
     )
-    axes = "XZ" if load.numel() == 2 else "XYZ"
     return mechanism, sv.Program({name: load[i] - path[i] for i, name in enumerate(axes)}, by="actuators")

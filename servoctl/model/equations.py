@@ -10,7 +10,7 @@ from servoctl.model import saddle
 from servoctl.model.emit import operations
 from servoctl.reduction.appell import plant_accelerations
 from servoctl.reduction.elimination import eliminate
-from servoctl.reduction.ranks import clean
+from servoctl.reduction.ranks import clean, column_sizes
 from servoctl.reduction.row import gradient
 from servoctl.spec.coordinates import jet_name
 
@@ -100,9 +100,17 @@ class Equations:
 
     @property
     def column_sizes(self):
-        """Largest entry of each column of L and of Bᵀ at the points where ranks were decided: two (n,) arrays."""
-        sizes = (np.abs(self.r.points.matrix(m)[0]) for m in (self.r.leading, self.r.realisation.B.T))
-        return [m.max(axis=(0, 2), initial=0.0).astype(float) for m in sizes]
+        """Column sizes (see `ranks.column_sizes`) of L and of Bᵀ where ranks were decided: two (n,) arrays."""
+        matrices = (self.r.points.matrix(m)[0] for m in (self.r.leading, self.r.realisation.B.T))
+        return [column_sizes(m).max(axis=1, initial=0.0).astype(float) for m in matrices]
+
+    @property
+    def jet_sizes(self):
+        """Sizes of the jets by name: those that pivots were chosen with, else the largest at the points, at most 1."""
+        names = [name for k in range(self.top + 1) for name in self.q.jet_names(k)]
+        largest = np.vstack([self.r.points.jet(k) for k in range(self.top + 1)])
+        sizes = np.abs(largest).max(axis=1, initial=0.0).clip(max=1.0).astype(float)
+        return {name: size for name, size in zip(names, sizes, strict=True) if size > 0} | self.r.context.sizes
 
     def rates(self, top):
         """X' for given γ^(s̄)."""

@@ -3,6 +3,7 @@
 Every function takes and gives arrays in the order of an enum in the header, and keeps nothing between two calls.
 """
 
+import os
 import re
 
 import casadi as ca
@@ -54,12 +55,7 @@ def export_c(source, folder, *, name=None, start=None):
     """
     law = hasattr(source, "table") and isinstance(source.step, Compiled)
     if not law and not hasattr(source, "reduction"):
-        raise SpecificationError(
-            f"{type(source).__name__} is to be exported.",
-            "C is written from a Model or a Law.",
-            nearest="derive(mechanism, program) makes a Model.",
-            do="Give one of these. A law written in Python has no expressions to export.",
-        )
+        raise _without_expressions(source)
     if law and start is not None:
         raise SpecificationError(
             "A start was given for a law.", "A law starts with its own memory.", do="Leave the start out."
@@ -80,7 +76,32 @@ def export_c(source, folder, *, name=None, start=None):
             do="Choose such a name.",
             name=name,
         )
+    if not isinstance(folder, (str, os.PathLike)):
+        raise SpecificationError(
+            f"folder={folder!r} was given."[:200], "The files are written into a folder.", '"export".', "Give its path."
+        )
     return write(folder, name, *(_of_law(source) if law else _of_model(source, start)))
+
+
+def _without_expressions(source):
+    """The refusal of what C cannot be written from."""
+    if not hasattr(source, "table"):
+        return SpecificationError(
+            f"A {type(source).__name__} is to be exported.",
+            "C is written from a Model or a Law.",
+            nearest="derive(mechanism, program) makes a Model.",
+            do="Give one of these.",
+        )
+    given, rule = f"The law {source.name!r} is to be exported.", "C is written from the expressions of a law's step: "
+    inside = getattr(source.step, "law", None)
+    if inside is None:
+        return SpecificationError(given, rule + "one written in Python has none.", "sv.lqr and others.", "Export one.")
+    return SpecificationError(
+        given,
+        rule + "a limited law solves a quadratic program instead.",
+        nearest=f"The law inside, {inside.name!r}, whose commands the machine cuts off at its limits.",
+        do="Export the law that was given to `limited`.",
+    )
 
 
 # --- what is exported

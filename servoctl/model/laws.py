@@ -115,6 +115,8 @@ class Residuals:
         Its states and parameters are used: what the controller believes of the machine.
     names : sequence of str, optional
         Which residuals; default all whose order allows it.
+    order : int
+        The highest: 1 for functions of the state (q, γ'), 2 where accelerations are given beside it.
 
     Raises
     ------
@@ -124,14 +126,14 @@ class Residuals:
         If a residual that was named depends on accelerations.
     """
 
-    def __init__(self, model, plant, names=None):
+    def __init__(self, model, plant, names=None, order=1):
         mechanism, program = model.reduction.mechanism, model.reduction.program
         self._q = mechanism.q
         orders = {name: self._q.order(e) for name, e in program.residuals.items()}
         for name in names or ():
             if name not in orders:
                 raise unknown(name, orders, "residual")
-            if orders[name] > 1:
+            if orders[name] > order:
                 raise SpecificationError(
                     f"The residual {name!r} has order {orders[name]}.",
                     "A residual that is fed back is a function of the state (q, γ').",
@@ -139,7 +141,7 @@ class Residuals:
                     do="Leave it out.",
                     name=name,
                 )
-        self.names = tuple(name for name in orders if orders[name] <= 1 and (names is None or name in names))
+        self.names = tuple(name for name in orders if orders[name] <= order and (names is None or name in names))
         self.orders = tuple(max(orders[name], 0) for name in self.names)
         self._expressions = ca.vertcat(*(program.residuals[name] for name in self.names))
         own = plant.mechanism.parameters
@@ -152,7 +154,7 @@ class Residuals:
         for name in self.measures:
             if name not in plant.state_names:
                 raise unknown(name, plant.state_names, "state of the plant")
-        self._plant = plant
+        self._plant, self._order = plant, order
         self._built = {}
 
     def _states(self, expression):
@@ -162,21 +164,22 @@ class Residuals:
         """φ as an SX column of the symbols t, y (named by `measures`) and p."""
         found = self._states(self._expressions)
         old = [self._q.t, *found, *self._symbols]
-        new = [t, *(y[measures.index(s.name())] for s in found), *ca.vertsplit(p)] if old else []
+        new = [t, *(y[measures.index(s.name())] for s in found), *ca.vertsplit(p)]
         return ca.substitute(self._expressions, ca.vertcat(*old), ca.vertcat(*new))
 
     def _function(self, key, outputs):
         if key not in self._built:
-            state = ca.vertcat(*self._q, *self._q.gamma(1))
+            state = ca.vertcat(*self._q, *(s for k in range(self._order) for s in self._q.gamma(k + 1)))
             p = ca.vertcat(*self._symbols) if self._symbols else ca.SX(0, 1)
             y = ca.densify(ca.cse(ca.vertcat(*outputs(state))))
             self._built[key] = compiled(ca.Function(key, [self._q.t, state, p], [y]), key)
         return self._built[key]
 
-    def _order(self, x):
-        """States in the plan's order, from an array in the plant's."""
-        names = (*self._q.names, *self._q.jet_names(1))
-        rows = [self._plant.state_names.index(n) if n in self._plant.state_names else -1 for n in names]
+    def _ordered(self, x):
+        """States, and accelerations where they are given, in the plan's order, from an array in the plant's."""
+        names = (*self._q.names, *(name for k in range(self._order) for name in self._q.jet_names(k + 1)))
+        own = (*self._plant.state_names, *self._plant.mechanism.q.jet_names(2))
+        rows = [own.index(name) if name in own else -1 for name in names]
         return np.where(np.array(rows)[:, None] < 0, 0.0, x[rows])
 
     def levels(self, t, x):
@@ -186,12 +189,12 @@ class Residuals:
         ----------
         t : (N,) array
         x : (n_x, N) array
-            States of the plant.
+            States of the plant; for residuals of order 2 with accelerations behind them, (n_x + n, N).
 
         Returns
         -------
         dict of str to (levels, N) array
-            Two levels for a residual of order 0, one for one of order 1.
+            Two levels for a residual of order 0, one for the others.
         """
 
         def outputs(_state):
@@ -199,11 +202,11 @@ class Residuals:
             return [
                 level[0]
                 for e, order in zip(items, self.orders, strict=True)
-                for level in self._q.derivatives([e], 1 - order)
+                for level in self._q.derivatives([e], max(1 - order, 0))
             ]
 
-        values = self._function("residual_levels", outputs).grid(t, self._order(x), self.parameters)
-        counts = [2 - order for order in self.orders]
+        values = self._function("residual_levels", outputs).grid(t, self._ordered(x), self.parameters)
+        counts = [max(2 - order, 1) for order in self.orders]
         ends = np.cumsum([0, *counts])
         return {n: values[a:b] for n, a, b in zip(self.names, ends[:-1], ends[1:], strict=True)}
 
@@ -214,7 +217,7 @@ class Residuals:
         def outputs(state):
             return [ca.vec(ca.densify(ca.jacobian(self._expressions, state)))]
 
-        values = self._function("residual_jacobian", outputs).grid(t, self._order(x), self.parameters)
+        values = self._function("residual_jacobian", outputs).grid(t, self._ordered(x), self.parameters)
         values = values.reshape(-1, k, len(t)).transpose(2, 1, 0)
         found = np.zeros((len(t), k, self._plant.n_x))
         for i, name in enumerate((*self._q.names, *self._q.jet_names(1))):

@@ -18,6 +18,7 @@ from servoctl.reduction.ranks import clean, decide, decide_all
 from servoctl.spec.taylor import Tape, evaluate
 
 POINTS, AWAY, SEED = 8, 0.02, 20240229  # states along the plan, and how far beside them ranks are decided
+SHARE = 1e-9  # of the largest, in rows and columns of like size: entries below it are rounding
 MOST = 4  # derivatives, of the number of states, that may pass before an input appears
 
 
@@ -108,6 +109,17 @@ def _points(plan, plant):
 def _ascending(t, values):
     order = np.argsort(t)
     return t[order], values[order]
+
+
+def _without_units(matrices):
+    """Matrices (k, m, N) whose rows and columns are scaled, all by the same factors, so that entries are near 1."""
+    largest = np.abs(matrices).max(axis=2).astype(float)
+    rows, columns = np.nonzero(largest)
+    k, m = largest.shape
+    sums = np.zeros((len(rows), k + m))
+    sums[range(len(rows)), rows] = sums[range(len(rows)), k + columns] = 1.0
+    factors = np.exp(-np.linalg.lstsq(sums, np.log(largest[rows, columns]), rcond=None)[0])
+    return matrices * np.multiply.outer(factors[:k], factors[k:])[:, :, None]
 
 
 class _Extension:
@@ -204,22 +216,21 @@ class _Extension:
         """Which of the pivot rows' derivatives the other rows depend on."""
         values, sizes = self.values(D)
         best = decide_all(values, sizes)[1]
-        numbers = clean(values, sizes)[:, :, best].astype(float)
+        numbers = _without_units(clean(values, sizes))[:, :, best].astype(float)
         shares = np.linalg.solve(numbers[np.ix_(rows, columns)].T, numbers[np.ix_(others, columns)].T)
-        return np.abs(shares).max(axis=1) > 1e-9 * np.abs(shares).max()
+        return np.abs(shares).max(axis=1) > SHARE * np.abs(shares).max()
 
     def _pivots(self, D):
         """Rows and columns of the regular block that stays best at the states of the plan."""
         rank = self.rank()
-        values = clean(*self.values(D, beside=False)).astype(float)
-        generic = decide_all(*self.values(D))[0]
-        chosen = {(generic.rows, generic.columns)}
-        found = [decide(values[:, :, k]) for k in range(values.shape[2])]
-        chosen |= {(r.rows, r.columns) for r in found if r.rank == rank}
+        values = _without_units(clean(*self.values(D, beside=False))).astype(float)
+        generic = decide_all(_without_units(clean(*self.values(D))), 0.0)[0]
+        found = [generic, *(decide(values[:, :, k]) for k in range(values.shape[2]))]
+        chosen = {(tuple(sorted(r.rows)), tuple(sorted(r.columns))) for r in found if r.rank == rank}
 
         def worst(pair):
             blocks = values[np.ix_(*map(list, pair), range(values.shape[2]))]
-            return min(abs(np.linalg.det(blocks[:, :, k])) for k in range(values.shape[2]))
+            return np.abs(np.linalg.det(np.moveaxis(blocks, 2, 0))).min()
 
         rows, columns = max(sorted(chosen), key=worst)
         return list(rows), list(columns)

@@ -89,13 +89,13 @@ def key(mechanism, program, guess, near, values):
     if (type(mechanism.q), type(mechanism.parameters)) != (Coordinates, Parameters):
         return None
     try:
-        t, state = (None, {}) if near is None else near
+        t, state, sizes = (None, {}, {}) if near is None else near
         told = [
             stamp,
             _names(mechanism, program),
             [(name, float(value)) for name, value in (guess or {}).items()],
             None if near is None else float(t),
-            [(name, float(value)) for name, value in state.items()],
+            *([(name, float(value)) for name, value in some.items()] for some in (state, sizes)),
             np.asarray(values, dtype=float).tolist(),
         ]
         text = json.dumps(told, allow_nan=False) + "\n" + _expressions(mechanism, program)

@@ -1,5 +1,6 @@
 """The model: a reduction as functions on numbers, built when they are asked for."""
 
+from dataclasses import replace
 from functools import cached_property
 
 import numpy as np
@@ -14,6 +15,7 @@ from servoctl.model.memo import Memo
 from servoctl.model.series import taylor_coefficients
 from servoctl.model.servo_dae import SERVO_DAE
 from servoctl.model.sundials import Sundials
+from servoctl.reduction.appell import require_positive
 from servoctl.reduction.knots import require_smooth
 from servoctl.reduction.reduce import holds
 from servoctl.reduction.structure import structure
@@ -112,7 +114,7 @@ class Model:
         NameUnknown
             For a name that is no parameter.
         SpecificationError
-            For a value that is no finite number, or a path that is not smooth enough with it.
+            For a value that is no finite number, a path that is not smooth enough with it, or a negative mass.
         """
         r = self.reduction
         current = dict(zip(r.mechanism.parameters.names, self.parameters.tolist(), strict=True))
@@ -120,11 +122,12 @@ class Model:
             if name not in current:
                 raise unknown(name, list(current), "parameter")
         values = r.mechanism.parameters.values({**current, **changes})
+        require_positive(r.mechanism, replace(r.points, values=values))
         if not holds(r.derived, values):
             return Model(Derivation(r.mechanism, r.program, r.context.guess, values=values), values)
         return Model(r, values, require_smooth(r.switches, values, r.smoothness), self._functions)
 
-    def near(self, t, jets):
+    def near(self, t, jets, sizes=()):
         """The same motion with pivots chosen for a state; decisions are made again from the specification.
 
         Parameters
@@ -132,13 +135,16 @@ class Model:
         t : float
             [s]
         jets : (n_z,) array
+        sizes : dict of str to float, optional
+            What a jet near zero is small against; default: its size where ranks were decided, at most 1.
 
         Returns
         -------
         Model
         """
         guess = dict(zip(self.jet_names, map(float, jets), strict=True))
-        r, near = self.reduction, (float(t), guess)
+        usual = self._once("jet sizes", lambda: self._equations.jet_sizes)
+        r, near = self.reduction, (float(t), guess, usual | dict(sizes))
         r = Derivation(r.mechanism, r.program, near=near, values=self.parameters)
         if r.free != self.free:
             raise SpecificationError(
@@ -359,10 +365,6 @@ class Model:
         rows = len(y) // (columns + 1)
         return y[rows:].reshape(columns, rows, -1).swapaxes(0, 1), y[:rows]
 
-    def guard_names(self):
-        """Names of the pivots logged by "ode" and "path"."""
-        return self._once("guard names", lambda: [name for name, _ in self._equations.guards])
-
     @cached_property
     def guard_sizes(self):
         """Largest size of each pivot at the points where they were chosen, (n_g,) array."""
@@ -370,7 +372,7 @@ class Model:
 
     @cached_property
     def column_sizes(self):
-        """Largest entry of each column of L and of Bᵀ at the points where ranks were decided: two (n,) arrays."""
+        """Column sizes (see `ranks.column_sizes`) of L and of Bᵀ where ranks were decided: two (n,) arrays."""
         return self._once("column sizes", lambda: self._equations.column_sizes)
 
     def row_stories(self):
@@ -392,11 +394,8 @@ class Model:
     def operations(self):
         """Operations of each function that has been built so far, by name."""
         found = {name: f for name, f in self._functions.items() if hasattr(f, "operations")}
-        found |= {f.name: f for key, (_, f) in self._signal_functions()}
+        found |= {value[1].name: value[1] for key, value in self._functions.items() if key.startswith("signals ")}
         return {name: f.operations for name, f in found.items()}
-
-    def _signal_functions(self):
-        return [(key, value) for key, value in self._functions.items() if key.startswith("signals ")]
 
     def start(self, /, t=0.0, guess=None, **held):
         """A consistent state: held values fixed, the rest solved from every invariant at every level.

@@ -47,7 +47,7 @@ def plant(mechanism, *, forces=None, damping=None, limits=None, rate_limits=None
     NameUnknown
         For a name of no parameter, actuator or coordinate.
     SpecificationError
-        For a value that makes no sense, or a mass matrix that is singular.
+        For a value that makes no sense, or a mass matrix that is singular or negative.
     """
     if not isinstance(mechanism, Mechanism):
         raise SpecificationError(
@@ -72,6 +72,7 @@ def plant(mechanism, *, forces=None, damping=None, limits=None, rate_limits=None
     if key not in found:
         velocities = tuple(directions[names.index(name)] for name in damped)
         found[key] = (PlantEquations(mechanism, force, velocities, lagged), {})
+    found[key][0].require_inertia(values)
     numbers = np.concatenate([values, [damping[n] for n in damped], [1.0 / lag[n] for n in lagged]])
     state_names = (*mechanism.q.names, *directions, *lagged)
     return Plant(

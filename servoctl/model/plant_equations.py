@@ -1,15 +1,19 @@
 """The functions of a plant as SX expressions: the full mechanism under inputs, disturbances and further forces."""
 
+from dataclasses import replace
 from functools import cached_property
 from types import SimpleNamespace
 
 import casadi as ca
+import numpy as np
 
 from servoctl.model.equations import Equations
 from servoctl.model.folding import folded
 from servoctl.reduction.appell import plant_accelerations, require_inertia
 from servoctl.reduction.hidden import as_rows, complete
 from servoctl.reduction.manifold import Context
+
+CLEAR = 1e-6  # least eigenvalue of a mass matrix with unit diagonal that needs no decision about its rank
 
 
 class PlantEquations:
@@ -59,6 +63,30 @@ class PlantEquations:
         rows, _, points, _ = complete(self.q, as_rows(self.q, m.constraints, "material", context), context)
         require_inertia(m, rows, points)
         return rows, points
+
+    def require_inertia(self, values):
+        """Refuse parameters (n_p,) with which the mass matrix is singular or negative."""
+        rows, points = self._material
+        if not self._clearly_positive(values):
+            require_inertia(self.mechanism, rows, replace(points, values=values))
+
+    def _clearly_positive(self, values):
+        """Whether the mass matrix is far from singular at the points at hand."""
+        M = np.array(self._masses(values)).reshape(self.q.n, -1, self.q.n).swapaxes(0, 1)
+        size = np.sqrt(np.maximum(np.diagonal(M, axis1=1, axis2=2), 0.0))
+        if not np.isfinite(M).all() or not size.all():
+            return False
+        return np.linalg.eigvalsh(M / (size[:, :, None] * size[:, None, :])).min() > CLEAR
+
+    @cached_property
+    def _masses(self):
+        """A function of the parameters: the mass matrices at the points at hand, side by side."""
+        points = self._material[1]
+        symbols, state = ca.vertcat(*self.mechanism.parameters.symbols), ca.vertcat(*self.q, self.velocity)
+        at = np.vstack([points.t, points.jet(0), points.jet(1)]).astype(float)
+        mass = ca.Function("mass", [self.q.t, state, symbols], [ca.densify(self.mechanism.mass)])
+        sides = [mass(x[0], x[1:], symbols) for x in at.T]
+        return ca.Function("masses", [symbols], [ca.horzcat(*sides)])
 
     @property
     def constrained(self):

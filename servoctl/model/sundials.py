@@ -108,30 +108,30 @@ class Sundials:
         given = {"x0": x0, "p": p}
         if self.solver == "idas":  # γ^(s̄) starts without a rate, so that no first step would pass a test of its error
             given["z0"], options["suppress_algebraic"] = top, True
-        low, high, found = 0, len(t), None  # the integrator returns nothing where it fails: the last good end is sought
-        count = high
+        low, high, found, counts = 0, len(t), None, {}
+        count = high  # the integrator returns nothing where it fails: the last good end is sought
         while low + 1 < high or found is None:
-            x = self._to(grid[:count], given, options) if count > 1 else np.array(x0)[:, None]
+            x, told = self._to(grid[:count], given, options) if count > 1 else (np.array(x0)[:, None], counts)
             if x is None:
                 high = count
             else:
-                low, found = count, x
+                low, found, counts = count, x, told
                 if count == len(t):
                     break
             count = (low + high) // 2
-        return found, self.counts
+        return found, counts
 
     def _to(self, grid, given, options):
-        """States at the instants of a grid, None where the integrator fails."""
+        """States at the instants of a grid, None where the integrator fails; and counts."""
         pressed = []
         try:
-            integrator, self.counts = ca.integrator("motion", self.solver, self.parts, 0.0, grid[1:], options), {}
+            integrator = ca.integrator("motion", self.solver, self.parts, 0.0, grid[1:], options)
             with _interrupts() as pressed, contextlib.redirect_stderr(io.StringIO()):  # SUNDIALS tells what callers say
                 found = np.array(integrator(**given)["xf"])
         except RuntimeError as error:
             if pressed:
                 raise KeyboardInterrupt from error
-            return None
+            return None, {}
         told = integrator.stats()
-        self.counts = {name: int(told[key]) for name, key in COUNTS.items() if key in told}
-        return np.column_stack([given["x0"], found]) if np.isfinite(found).all() else None
+        counts = {name: int(told[key]) for name, key in COUNTS.items() if key in told}
+        return (np.column_stack([given["x0"], found]) if np.isfinite(found).all() else None), counts

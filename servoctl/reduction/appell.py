@@ -11,9 +11,10 @@ import numpy as np
 
 from servoctl.errors import NotRealisable, SpecificationError, unknown
 from servoctl.reduction.elimination import eliminate
-from servoctl.reduction.ranks import clean, decide_all, decide_each
+from servoctl.reduction.ranks import clean, decide_all, decide_each, equilibrate
 from servoctl.reduction.row import gradient
 
+NEGATIVE = 1e-9  # of the size of its entries: eigenvalues of an inertia matrix below minus this are no rounding
 LONGEST_SEARCH = 2  # times n: no relative degree exceeds the number of plant states
 
 
@@ -188,13 +189,14 @@ def plant_accelerations(mechanism, material, forces, second, points):
 
 
 def require_inertia(mechanism, material, points):
-    """Refuse an inertia matrix that is singular on the displacements that material constraints allow.
+    """Refuse an inertia matrix that is negative, or singular on the displacements that material constraints allow.
 
     Raises
     ------
     SpecificationError
-        Naming the coordinates of the direction without inertia.
+        Naming the coordinates of the direction without inertia, or with a negative one.
     """
+    require_positive(mechanism, points)
     q, n = mechanism.q, mechanism.q.n
     values, sizes = points.matrix(_saddle(mechanism, material))
     rank, best = decide_all(values, sizes)
@@ -209,3 +211,32 @@ def require_inertia(mechanism, material, points):
             do="Check the masses and inertias and their default numbers.",
             names=names,
         )
+
+
+def require_positive(mechanism, points):
+    """Refuse an inertia matrix that gives negative energy of acceleration to a direction.
+
+    Raises
+    ------
+    SpecificationError
+        Naming the coordinates of the direction, and the parameters that are negative.
+    """
+    matrices = np.moveaxis(clean(*points.matrix(mechanism.mass)), 2, 0)
+    scaled, rows, columns = equilibrate(matrices)
+    size = np.sqrt(rows * columns)
+    scaled = (size[:, :, None] * matrices * size[:, None, :]).astype(float)
+    values, directions = np.linalg.eigh(scaled[np.isfinite(scaled).all(axis=(1, 2))])
+    if not values.min(initial=0.0) < -NEGATIVE:
+        return
+    k = int(np.argmin(values[:, 0]))
+    direction = np.abs(directions[k, :, 0])
+    names = [mechanism.q.jet_names(1)[i] for i in np.flatnonzero(direction > 1e-6 * direction.max())]
+    pairs = zip(points.parameters, points.values, strict=True)
+    negative = [f"{symbol.name()} = {value:g}" for symbol, value in pairs if value < 0]
+    raise SpecificationError(
+        f"The mass matrix is negative in a direction of {', '.join(names)}"
+        + (f", with {', '.join(negative)}." if negative else "."),
+        "M = ∂²S/∂γ''² is positive definite: masses and moments of inertia are positive.",
+        do="Check the masses and inertias and their numbers.",
+        names=names,
+    )

@@ -256,7 +256,8 @@ def sample(q, rows, level, context, starts=None, flow=None, count=5, seed=1907):
         for k in range(level + 1):
             if name in q.jet_names(k):
                 i = q.jet_names(k).index(name) + (q.nq + (k - 1) * q.n if k else 0)
-                centre[i], spread[i] = value / factorial(k), context.spread * (abs(value) + 0.1) / factorial(k)
+                size = abs(value) + 0.1 * context.sizes.get(name, 1.0)
+                centre[i], spread[i] = value / factorial(k), context.spread * size / factorial(k)
     z = centre[:, None] + spread[:, None] * rng.uniform(-1.0, 1.0, (nz, count_tried))
     t = np.asarray(rng.uniform(*context.window, count_tried), dtype=REAL)
     if starts is not None and len(starts.t):
@@ -289,6 +290,8 @@ class Context:
         Values of jets about which points are looked for.
     spread : float
         Of the starts about guessed values, relative.
+    sizes : dict of str to float
+        What a guessed value near zero is small against; 1 where it is not given.
     book : Book
         Of what was read.
     """
@@ -298,4 +301,5 @@ class Context:
     window: tuple
     guess: dict
     spread: float = 0.1
+    sizes: dict = field(default_factory=dict)
     book: Book = field(default_factory=Book, repr=False, compare=False)

@@ -70,6 +70,12 @@ def equilibrate(matrix):
     return a, rows, columns
 
 
+def column_sizes(matrix):
+    """Largest entries of the columns of a matrix (m, n, ...) whose rows are divided by their own: (n, ...) array."""
+    rows = np.abs(matrix).max(axis=1, keepdims=True, initial=0.0)
+    return np.abs(matrix / np.where(rows > 0, rows, 1.0)).max(axis=0, initial=0.0)
+
+
 def decide(matrix, resolved=RESOLVED):
     """The rank of one matrix, by equilibration and complete pivoting.
 

@@ -162,8 +162,8 @@ def reduce(mechanism, program, guess=None, near=None, values=None):
     program : Program
     guess : dict of str to float, optional
         Values of coordinates or derivatives about which points of the manifold are looked for.
-    near : (t, jets), optional
-        An instant and a dict of jets: pivots are chosen there.
+    near : (t, jets, sizes), optional
+        An instant and dicts of jets and of their sizes along the motion: pivots are chosen there.
     values : (n_p,) array, optional
         Parameters at which ranks are decided; default: the mechanism's own.
 
@@ -298,8 +298,8 @@ def _require_outputs(reduction):
 def _context(mechanism, switches, guess, near, values):
     values = mechanism.parameters.values() if values is None else np.asarray(values, dtype=float)
     if near is not None:
-        t, guess = near
-        return Context(mechanism.parameters.symbols, values, (t - NEARBY, t + NEARBY), guess, spread=1e-3)
+        t, guess, sizes = near
+        return Context(mechanism.parameters.symbols, values, (t - NEARBY, t + NEARBY), guess, 1e-3, sizes)
     times = switches.times(values)
     window = (0.1, 1.1)
     if len(times) == 1:

@@ -1,14 +1,12 @@
 """scipy's adaptive methods on compiled right-hand sides, with the watch on rank and projection."""
 
-import contextlib
-
 import numpy as np
 
-from servoctl.errors import IntegrationStopped, ServoError
+from servoctl.errors import IntegrationStopped
 from servoctl.simulation.drift import Minimal, Poles, Project, Projector
 from servoctl.simulation.minimal import MinimalSolver, Sizes
 from servoctl.simulation.motion import Motion, breakpoints, interruptible, sign_change
-from servoctl.simulation.watch import DEGRADED, NEGLIGIBLE, VANISHING, Watch
+from servoctl.simulation.watch import DEGRADED, NEGLIGIBLE, NO_CHOICE, VANISHING, Watch
 
 METHODS = ("RK23", "RK45", "DOP853", "Radau", "BDF", "LSODA")
 ONE_STEP = ("RK23", "RK45", "DOP853", "Radau")
@@ -106,10 +104,15 @@ class Adaptive:
                 solver, history = self._change(other, *old, b)
                 continue
             if self._must_repivot:
-                self._count(solver)
                 t, x = solver.t, solver.y
                 self._sample(t, dense, x)
-                solver, history = self._change(self.model.near(t, np.append(x, self._top(t, x))), t, x, b)
+                other = self.watch.anew(t, x, self._top(t, x))
+                if other is None:
+                    self.motion.stop = self.watch.singular(t, x, NO_CHOICE)
+                    self._last(t, x)
+                    break
+                self._count(solver)
+                solver, history = self._change(other, t, x, b)
                 continue
             if self.projector is not None and (steps % self.drift.every == 0 or solver.status == "finished"):
                 solver.y = self.projector(solver.t, solver.y)
@@ -122,12 +125,15 @@ class Adaptive:
         self.motion.count(steps=steps)
         return solver.y
 
-    def _change(self, model, t, x, b):
+    def _change(self, variant, t, x, b):
         """Go on with another variant of the model from a state; its solver and the history of its pivots."""
-        self._use(model)
-        self.watch = Watch(model, t, x, self.watch)
-        self.motion.count(pivot_changes=1)
+        self._go_on(variant)
         return self._solver(t, x, b), [self._guards(t, x)]
+
+    def _go_on(self, variant):
+        model, self.watch = variant
+        self._use(model)
+        self.motion.count(pivot_changes=1)
 
     def _count(self, solver):
         self.motion.count(nfev=solver.nfev, njev=solver.njev, nlu=solver.nlu)
@@ -145,10 +151,9 @@ class Adaptive:
         """At the start: choose pivots anew where the model's own are far worse than its matrices."""
         y = self.f(t, x, self.p)
         if self.watch.bad_choice(y, self.n_x):
-            with contextlib.suppress(ServoError):
-                self._use(self.model.near(t, np.append(x, np.nan_to_num(y[self.n_x - self.model.n : self.n_x]))))
-            self.watch = Watch(self.model, t, x, self.watch)
-            self.motion.count(pivot_changes=1)
+            other = self.watch.anew(t, x, y[self.n_x - self.model.n : self.n_x])
+            if other is not None:
+                self._go_on(other)
             self.motion.stop = self.watch.refuse_start(t, x, self.f(t, x, self.p))
 
     def _watched(self, history, old, t, dense):

@@ -6,7 +6,7 @@ import numpy as np
 
 from servoctl.errors import IntegrationStopped, ServoError
 from servoctl.simulation.motion import Motion, interruptible
-from servoctl.simulation.watch import DEGRADED, Watch
+from servoctl.simulation.watch import DEGRADED, NO_CHOICE, Watch
 
 CHUNK = 4000  # instants per call of the loop: 0.2 ms compiled, 0.2 s where CasADi evaluates
 
@@ -51,14 +51,17 @@ def algebraic(model, t0, x0, times, progress):
                 q, previous = x[:, stand - 1], guards[:, max(stand - 2, 0) : stand]
                 done += stand
                 progress(block[stand - 1])
-            if repivot and not motion.changes_pivots(float(block[min(stand, len(block) - 1)])):
-                motion.stop = watch.singular(*_last(times, block, state, stand, why), "no choice of pivots leads on")
-                break
             if repivot:
-                at = min(stand, state.shape[1] - 1)
-                model = model.near(block[at], np.append(state[:, at], top[:, at]))
+                at, helps = (
+                    min(stand, state.shape[1] - 1),
+                    motion.changes_pivots(float(block[min(stand, len(block) - 1)])),
+                )
+                variant = watch.anew(block[at], state[:, at], top[:, at]) if helps else None
+                if variant is None:
+                    motion.stop = watch.singular(*_last(times, block, state, stand, why), NO_CHOICE)
+                    break
+                (model, watch), previous = variant, None
                 motion.count(pivot_changes=1)
-                watch, previous = Watch(model, block[at], state[:, at]), None
     return motion
 
 

@@ -1,18 +1,17 @@
 """Compiled explicit Runge-Kutta methods of fixed step."""
 
-import contextlib
 from itertools import pairwise
 
 import numpy as np
 
-from servoctl.errors import IntegrationStopped, ServoError
+from servoctl.errors import IntegrationStopped
 from servoctl.simulation.bounds import row_poles, warn_fast_poles, warn_unresolved
 from servoctl.simulation.drift import Minimal, Poles, Project
 from servoctl.simulation.minimal import Chart, Sizes
 from servoctl.simulation.motion import Motion, breakpoints, interruptible
 from servoctl.simulation.rule import component_sizes, state_levels
 from servoctl.simulation.tableaus import tableau
-from servoctl.simulation.watch import DEGRADED, NEGLIGIBLE, Watch
+from servoctl.simulation.watch import DEGRADED, NEGLIGIBLE, NO_CHOICE, Watch
 
 CHUNK = 2000  # steps per call of the compiled loop
 SLOW_CHUNK = 100  # of the loop in Python
@@ -78,15 +77,18 @@ class _Fixed:
 
     def start(self, t, x):
         if self.watch.bad_choice(self.f(t, x, self.p), self.f.n_x):
-            with contextlib.suppress(ServoError):
-                self._repivot(t, x)
+            self._repivot(t, x)
             self.motion.stop = self.watch.refuse_start(t, x, self.f(t, x, self.p))
 
     def _repivot(self, t, x):
-        top = np.nan_to_num(self.f(t, x, self.p)[self.f.n_x - self.model.n : self.f.n_x])
-        self._use(self.model.near(t, np.append(x, top)))
-        self.watch = Watch(self.model, t, x, self.watch)
+        """Go on with other pivots; whether there are any."""
+        variant = self.watch.anew(t, x, self.f(t, x, self.p)[self.f.n_x - self.model.n : self.f.n_x])
+        if variant is None:
+            return False
+        model, self.watch = variant
+        self._use(model)
         self.motion.count(pivot_changes=1)
+        return True
 
     def piece(self, a, x, h, count):
         """`count` steps of h from t = a; returns the last state."""
@@ -111,11 +113,10 @@ class _Fixed:
             last = guards[:, : good + 1][:, -3:]
             x, done = states[:, -1].copy(), done + good
             self.progress(t[-1])
-            if repivot and self.motion.changes_pivots(t[-1]):
-                self._repivot(t[-1], x)
+            if repivot and self.motion.changes_pivots(t[-1]) and self._repivot(t[-1], x):
                 last = None
             elif repivot:
-                self.motion.stop = self.watch.singular(t[-1], x, "no choice of pivots leads on")
+                self.motion.stop = self.watch.singular(t[-1], x, NO_CHOICE)
                 break
             elif short:
                 self._stop(t[-1], x, h, why)
@@ -188,9 +189,10 @@ class _Fixed:
         k, why = min(events)
         if why == "repivot":
             return k, "", k > 0 or before is not None
-        if self._measure(t, states, k) > DEGRADED and self._measure(t, states, k + 1) > DEGRADED:
-            return k, "", True
         self._locate(k, t, states, guards)
+        around = (self._measure(t, states, k), self._measure(t, states, k + 1), self.watch.rank_measure(*self._suspect))
+        if min(around) > DEGRADED:
+            return k, "", True
         j = max(k - 1, 0)
         top = self.f(t[j], states[:, j], self.p)[self.f.n_x - self.model.n : self.f.n_x]
         at = min(k, len(t) - 1)

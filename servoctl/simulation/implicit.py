@@ -8,7 +8,7 @@ from servoctl.errors import IntegrationStopped
 from servoctl.model.implicit import first_step, inside
 from servoctl.simulation.adaptive import INSIDE, Adaptive
 from servoctl.simulation.drift import Poles, Project
-from servoctl.simulation.watch import DEGRADED, Watch
+from servoctl.simulation.watch import DEGRADED, NO_CHOICE
 
 CHUNK = 200  # steps per call of the compiled loop
 RADAU_ORDERS = (5, 9, 13)
@@ -70,7 +70,7 @@ class InBulk(Adaptive):
             if why == "vanishes":
                 self._around(t, x, history)
             elif why == "degrades":
-                self._go_on(self.model.near(t, np.append(x, self._top(t, x))), t, x, history)
+                self._other(self.watch.anew(t, x, self._top(t, x)), t, x, history, (t, x, NO_CHOICE))
             elif steps.failed:
                 self._failed(t, x, "")
                 self._last(t, x)
@@ -102,17 +102,15 @@ class InBulk(Adaptive):
     def _around(self, t, x, history):
         """Before a pivot vanishes: go on with another choice of pivots, or say that the program is singular."""
         other = self.watch.other_choice(t, np.append(x, self._top(t, x)), *self._suspect[:2])
-        if other is None or not self.motion.changes_pivots(t):
-            self.motion.stop = self.watch.singular(*self._suspect)
+        self._other(other if self.motion.changes_pivots(t) else None, t, x, history, self._suspect)
+
+    def _other(self, variant, t, x, history, suspect):
+        if variant is None:
+            self.motion.stop = self.watch.singular(*suspect)
             self._last(t, x)
         else:
-            self._go_on(other, t, x, history)
-
-    def _go_on(self, model, t, x, history):
-        self._use(model)
-        self.watch = Watch(model, t, x, self.watch)
-        self.motion.count(pivot_changes=1)
-        history[:] = [self._guards(t, x)]
+            self._go_on(variant)
+            history[:] = [self._guards(t, x)]
 
     def _record(self, steps, stand):
         """Record the pending samples within the first `stand` steps."""

@@ -4,6 +4,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from servoctl.simulation.verify import require_model
+
 SAMPLES = 41  # instants along a run at which the internal dynamics is linearised
 NEUTRAL = 1e-7  # of the largest entry of the linearisation: a smaller real part is none
 
@@ -58,7 +60,13 @@ def internal_dynamics(model, run):
     Returns
     -------
     InternalDynamics
+
+    Raises
+    ------
+    SpecificationError
+        If the run is not of this model; a loaded run has none.
     """
+    require_model(model, run, "internal_dynamics")
     if model.free == 0:
         return InternalDynamics(run.t[:0], (), np.zeros((0, 0), complex), "none", 1.0)
     picked = np.unique(np.linspace(0, len(run.t) - 1, SAMPLES).astype(int))

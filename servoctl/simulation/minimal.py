@@ -12,6 +12,7 @@ from servoctl.reduction.ranks import equilibrate
 
 REACH = 2.0  # times as fast as the integrated values may the solved ones move before the choice is made anew
 BETTER = 2.0  # by how much another choice must be slower
+GROWN = 10.0  # times as large must a slope be for the sizes to be made anew
 ITERATIONS, HALVINGS = 12, 40
 CONVERGED = 1e-10  # relative: the Newton step after which the next is below rounding
 ROUNDING = 1e-7  # relative: steps below this that shrink no more are rounding
@@ -21,7 +22,7 @@ class Sizes:
     """Usual sizes of the entries of X, and factors that make the columns of the invariants' Jacobian comparable.
 
     They come from the points where ranks were decided, which lie about the guess in all directions: at one state a
-    column may vanish by chance.
+    column may vanish by chance. Along a motion they grow.
 
     Parameters
     ----------
@@ -38,12 +39,22 @@ class Sizes:
         x = np.vstack([points.jet(k) for k in range(top)]).astype(float)
         m = len(model.invariant_names())
         y = model.function("invariants").grid(np.asarray(points.t, dtype=float), x, model.parameters)[m:]
-        slopes = np.nan_to_num(np.abs(y)).max(axis=1).reshape(len(x), m).T
+        self._blocks, self._x = levels(model), np.zeros(len(x))
+        self._slopes, self._names = np.zeros((m, len(x))), model.invariant_names()
         self.columns, self.usual = np.ones(len(x)), np.ones(len(x))
-        for rows, columns in levels(model):
-            scale = equilibrate(slopes[np.ix_(rows, columns)])[2].astype(float)
+        self.grow(model, np.abs(x).max(axis=1), np.nan_to_num(np.abs(y)).max(axis=1).reshape(len(x), m).T)
+
+    def grow(self, model, x, slopes):
+        """Take in a state X and the Jacobian (m, n_x) of a model's invariants there, if these are the same."""
+        grown = np.all(np.isfinite(slopes)) and model.invariant_names() == self._names
+        if not grown or not np.any(np.abs(slopes) > GROWN * self._slopes):
+            return
+        self._x, self._slopes = np.maximum(np.abs(x), self._x), np.maximum(np.abs(slopes), self._slopes)
+        self.columns, self.usual = np.ones(len(x)), np.ones(len(x))
+        for rows, columns in self._blocks:
+            scale = equilibrate(self._slopes[np.ix_(rows, columns)])[2].astype(float)
             self.columns[columns] = scale
-            self.usual[columns] = scale * (np.abs(x[columns]).max(axis=1) / scale).max()
+            self.usual[columns] = scale * (self._x[columns] / scale).max()
 
 
 def levels(model):
@@ -74,8 +85,14 @@ class Chart:
         self.ode, self.p = model.function("ode"), model.parameters
         self._invariants, self._model = model.function("invariants"), model
         self.n_x, self.m = len(model.state_names), len(model.invariant_names())
-        self.blocks, self.columns, self.usual = levels(model), sizes.columns, sizes.usual
+        self.blocks, self.sizes = levels(model), sizes
+        self._grow(t, x)
         self.choose(t, x)
+
+    def _grow(self, t, x):
+        own = self._invariants(t, x, self.p)[self.m :].reshape(self.n_x, self.m).T
+        self.sizes.grow(self._model, x, own)
+        self.columns, self.usual = self.sizes.columns, self.sizes.usual
 
     def invariants(self, t, x):
         """Values (m,) and Jacobian (m, n_x) of the invariants, columns and rows scaled."""
@@ -115,6 +132,7 @@ class Chart:
 
     def improved(self, t, x):
         """Choose anew where the choice has degraded and another is better; whether it was changed."""
+        self._grow(t, x)
         before = self.reach(t, x)
         if before <= REACH:
             return False

@@ -188,13 +188,14 @@ class Run:
         Returns
         -------
         ((t, value), (t, value))
-            Of the minimum and the maximum.
+            Of the minimum and the maximum among finite values; NaN where there are none.
         """
         values = self[name]
         return tuple(self._refined(values, sign) for sign in (-1.0, 1.0))
 
     def _refined(self, values, sign):
-        k = int(np.argmax(sign * values))
+        known = np.isfinite(values)
+        k = int(np.argmax(np.where(known, sign * values, -np.inf)))
         best = (float(self.t[k]), float(values[k]))
         edges = [
             self.t[0],
@@ -207,6 +208,8 @@ class Run:
                 continue
             first = min(max(k - STENCIL // 2, inside[0]), max(inside[0], inside[-1] - STENCIL + 1))
             window = slice(first, min(first + STENCIL, inside[-1] + 1))
+            if not known[window].all():
+                continue
             centre, width = self.t[k], np.ptp(self.t[window]) / 2
             s = (self.t[window] - centre) / width
             polynomial = np.polynomial.Polynomial.fit(s, values[window], len(s) - 1, domain=[-1, 1])
@@ -288,7 +291,8 @@ class Run:
             "  " + ", ".join(f"{name} {count}" for name, count in self.counters.items() if count),
             "  largest residuals over all levels: " + ", ".join(f"{name} {worst[name]:.1e}" for name in shown),
         ]
-        for name in [*self._actuators(), *self._outputs()][:6]:
+        signals = [name for name in (*self._actuators(), *self._outputs()) if np.isfinite(self[name]).any()]
+        for name in signals[:7]:
             (t_low, low), (t_high, high) = self.extrema(name)
             lines.append(f"  {name}: {low:.6g} (t = {t_low:.4g} s) .. {high:.6g} (t = {t_high:.4g} s)")
         return "\n".join(line for line in lines if line.strip())

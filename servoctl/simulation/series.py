@@ -1,14 +1,13 @@
 """The Taylor method: compiled series steps, dense output from the coefficients, jets of any order."""
 
-import contextlib
 from math import factorial
 
 import numpy as np
 
-from servoctl.errors import IntegrationStopped, ServoError
+from servoctl.errors import IntegrationStopped
 from servoctl.simulation.drift import Project
 from servoctl.simulation.motion import Motion, breakpoints, interruptible
-from servoctl.simulation.watch import DEGRADED, NEGLIGIBLE, Watch
+from servoctl.simulation.watch import DEGRADED, NEGLIGIBLE, NO_CHOICE, Watch
 
 CHUNK = 100  # steps per call of the compiled loop
 INSIDE = np.array([0.25, 0.5, 0.75])  # of a step: where pivots are looked at
@@ -72,22 +71,18 @@ class SeriesMethod:
         y = self.f(t, x, self.p)
         first = np.append(x, y[self.n_c :])
         if not np.all(np.isfinite(y)) or self.watch.bad_choice(first, len(x)):
-            with contextlib.suppress(ServoError):
-                self._repivot(t, x)
+            self._repivot(t, x)
             self.motion.stop = self.watch.refuse_start(t, x, self.f(t, x, self.p))
 
     def _repivot(self, t, x):
-        self._use(self.model.near(t, np.append(x, np.zeros(self.n))))
-        self.watch = Watch(self.model, t, x, self.watch)
+        """Go on with other pivots; whether there are any."""
+        variant = self.watch.anew(t, x, np.zeros(self.n))
+        if variant is None:
+            return False
+        model, self.watch = variant
+        self._use(model)
         self.motion.count(pivot_changes=1)
-
-    def _leads_on(self, t, x):
-        """Whether other pivots were found."""
-        if self.motion.changes_pivots(t):
-            with contextlib.suppress(ServoError):
-                self._repivot(t, x)
-                return True
-        return False
+        return True
 
     def _piece(self, a, x, b, pending):
         self.p = np.append(self.model.parameters, (a + b) / 2)  # paths take the branches of this piece
@@ -104,8 +99,8 @@ class SeriesMethod:
                 a, x = t[stand], states[:, stand].copy()
             self.progress(a)
             if repivot:
-                if not self._leads_on(a, x):
-                    self.motion.stop = self.watch.singular(a, x, "no choice of pivots leads on")
+                if not (self.motion.changes_pivots(a) and self._repivot(a, x)):
+                    self.motion.stop = self.watch.singular(a, x, NO_CHOICE)
             elif why:
                 at = self._state(t, states, y, where)
                 self.motion.stop = self.watch.singular(where, at, why)

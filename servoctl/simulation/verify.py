@@ -5,6 +5,8 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from servoctl.errors import SpecificationError
+from servoctl.model.equations import residual_rows
+from servoctl.simulation.drift import is_whole
 
 LIMITS = {
     "acceleration": 1e-9,
@@ -19,7 +21,7 @@ INTEGRATED = 1e-6  # for what drift disturbs: where γ'' is itself integrated, o
 
 @dataclass(frozen=True)
 class Verification:
-    """Errors of a run against the full mechanism; every number is relative unless its name says residual.
+    """Errors of a run against the full mechanism; every number is relative.
 
     Attributes
     ----------
@@ -30,7 +32,7 @@ class Verification:
         "power": largest error of dE/dt = Σ force·velocity; "energy": of its integral over the samples;
         "multiplier form": largest disagreement of (3.18) with the form that has multipliers;
         "outside": part of an ideal reaction that the mechanism's actuators cannot give;
-        "residual NAME": largest residual at any level.
+        "residual NAME": largest residual at any level, relative to 1 plus the largest jet of the level's own order.
     failures : tuple of str
         Numbers that exceed their limit.
     notes : tuple of str
@@ -66,11 +68,16 @@ class Verification:
             "loop repeated": "states of the loop when it is run again",
         }
         lines = [f"Verification: {'passed' if self.passed else 'FAILED: ' + ', '.join(self.failures)}"]
-        lines += [f"  {words[key]}: {self.numbers[key]:.1e}" for key in words if key in self.numbers]
+        lines += [f"  {words[key]}: {self._told(key)}" for key in words if key in self.numbers]
         if worst:
-            lines.append(f"  largest residual at any level: {residuals[worst]:.1e} ({worst.removeprefix('residual ')})")
+            name = worst.removeprefix("residual ")
+            lines.append(f"  largest residual at any level: {self._told(worst)} ({name})")
         lines += [f"  {note}" for note in self.notes]
         return "\n".join(lines[:12])
+
+    def _told(self, key):
+        allowed = f" (allowed {self.limits[key]:.2g})" if key in self.failures and key in self.limits else ""
+        return f"{self.numbers[key]:.1e}{allowed}"
 
 
 def verify(model, run=None, segments=20):
@@ -90,21 +97,24 @@ def verify(model, run=None, segments=20):
     run : Run
         Of this model; none for a closed loop.
     segments : int
-        Number of restarted segments.
+        Number of restarted segments, at least 1.
 
     Returns
     -------
     Verification
+
+    Raises
+    ------
+    SpecificationError
+        If the run is not of this model, or segments is no whole number of at least 1.
     """
+    if not (is_whole(segments) and segments >= 1):
+        raise SpecificationError(
+            f"segments={segments!r} was given.", "It is a whole number, at least 1.", do="Give 20, or leave it out."
+        )
     if run is None and hasattr(model, "loop"):
         return model.verify()
-    if getattr(run, "model", None) is None or not hasattr(model, "reduction"):
-        raise SpecificationError(
-            f"verify was given a {type(model).__name__} and a {type(run).__name__} "
-            + ("without its model." if hasattr(run, "jets") else "."),
-            "A run is verified with the model that made it; a loaded run has none.",
-            do="Write sv.verify(model, run), or simulate again.",
-        )
+    require_model(model, run, "verify")
     good = np.flatnonzero(np.all(np.isfinite(run.jets), axis=0))
     numbers, limits, notes = {}, dict(LIMITS), []
     if model.reduction.top > 2 or (model.reduction.hidden and not model.flat):
@@ -131,6 +141,28 @@ def verify(model, run=None, segments=20):
     limit = {key: limits.get(key.split()[0] if key.startswith("residual") else key, np.inf) for key in numbers}
     failures = tuple(key for key, value in numbers.items() if not value <= limit[key])
     return Verification(numbers, failures, tuple(notes), limit)
+
+
+def require_model(model, run, what):
+    """Refuse a run that is not of a model.
+
+    Raises
+    ------
+    SpecificationError
+        Naming what was given to the function `what`.
+    """
+    states = getattr(model, "state_names", ())
+    if getattr(run, "model", None) is None or not hasattr(model, "reduction"):
+        which = " without its model" if hasattr(run, "jets") else ""
+    elif run.jet_names[: len(states)] != tuple(states):
+        which = " of another one"
+    else:
+        return
+    raise SpecificationError(
+        f"{what} was given a {type(model).__name__} and a {type(run).__name__}{which}.",
+        "A run belongs to the model that made it; a loaded run has none.",
+        do=f"Write sv.{what}(model, run), or simulate again.",
+    )
 
 
 def _acceleration(model, run, good, inputs):
@@ -164,9 +196,14 @@ def _energy(run, good, work):
 
 
 def _relative_residual(run, name, good):
-    """Largest residual over levels, each level relative to the largest jet of its order (at least 1)."""
-    residual = np.abs(run.residual[name][:, good])
-    return float((residual / (1.0 + np.abs(run.jets[:, good]).max(axis=0))).max(initial=0.0))
+    """Largest residual over levels, each relative to 1 plus the largest jet of its own order at that instant."""
+    model, row = run.model, residual_rows(run.model.reduction).get(name)
+    worst = 0.0
+    for order, level in enumerate(run.residual[name][:, good], start=row.order if row else 0):
+        first = model.nq + (order - 1) * model.n if order else 0
+        jets = run.jets[first : model.nq + order * model.n, good]
+        worst = max(worst, float((np.abs(level) / (1.0 + np.abs(jets).max(axis=0))).max(initial=0.0)))
+    return worst
 
 
 def _segments(model, run, good, u, count):

@@ -3,11 +3,13 @@
 import numpy as np
 
 from servoctl.errors import ServoError, SingularProgram
+from servoctl.reduction.ranks import column_sizes
 
 DEGRADED = 0.02  # of its reference: a pivot below this is chosen anew, if the matrix itself is better than that
 HELPS = 5.0  # by how much the matrix must be better
 NEGLIGIBLE = 1e-7  # of its reference: a pivot below this is zero
 HOPELESS = 1e-9  # an equilibrated singular value below this leaves no digits
+NO_CHOICE = "no choice of pivots leads on"
 VANISHING = 0.03  # of its reference: a row whose gradient is below this has lost it
 
 
@@ -33,9 +35,7 @@ class Watch:
         matrices = [np.nan_to_num(m, nan=0.0, posinf=0.0, neginf=0.0) for m in self._matrices(t, x)]
         self.columns = [
             np.where(now > 0, now, np.where(usual > 0, usual, 1.0))
-            for now, usual in zip(
-                (np.abs(m).max(axis=0, initial=0.0) for m in matrices), model.column_sizes, strict=True
-            )
+            for now, usual in zip(map(column_sizes, matrices), model.column_sizes, strict=True)
         ]
         if before is not None:
             self.columns = before.columns
@@ -125,6 +125,21 @@ class Watch:
         weakest = (np.abs(outputs[n_x:]) / np.where(reference > 0, reference, 1.0)).min(initial=1.0)
         return bool(weakest < DEGRADED and self.best.min() > HELPS * weakest)
 
+    def anew(self, t, x, top):
+        """The model with pivots chosen at a state x with γ^(s̄) = top, as far as that is finite, and the watch on it.
+
+        Returns
+        -------
+        (Model, Watch) or None
+            None where no choice is found.
+        """
+        sizes = {name: size for name, size in zip(self.model.state_names, self.largest, strict=True) if size > 0}
+        try:
+            model = self.model.near(t, np.append(x, np.nan_to_num(top)), sizes)
+            return model, Watch(model, t, x, self)
+        except ServoError:
+            return None
+
     def other_choice(self, t, jets, later, state):
         """The model with pivots and rows chosen anew at an instant, if that keeps its rank at a later state, else None.
 
@@ -141,14 +156,10 @@ class Watch:
 
         Returns
         -------
-        Model or None
+        (Model, Watch) or None
         """
-        try:
-            other = self.model.near(t, np.nan_to_num(jets))
-            watch = Watch(other, t, jets[: len(state)], self)
-        except ServoError:
-            return None
-        return other if watch.rank_measure(later, state) > DEGRADED else None
+        variant = self.anew(t, jets[: len(state)], jets[len(state) :])
+        return variant if variant and variant[1].rank_measure(later, state) > DEGRADED else None
 
     def singular(self, t, x, why):
         """The error that tells where, which row, and which jets are zero there."""

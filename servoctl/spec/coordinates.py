@@ -79,7 +79,7 @@ def mapping(value, what):
         return {}
     if not isinstance(value, dict) or not all(isinstance(key, str) for key in value):
         raise SpecificationError(
-            f"{what} were given as {value!r}."[:200],
+            f"{repr(value)[:150]} was given for {what[0].lower()}{what[1:]}.",
             "They go by name.",
             nearest='{"name": expression}.',
             do="Give a dict with text for keys.",

@@ -261,6 +261,14 @@ class Mechanism:
             if not items:
                 raise SpecificationError(f"{what} is empty.", "It has a displacement or a direction.", do="Give one.")
             direction = isinstance(value, (list, tuple, np.ndarray)) or len(items) > 1
+            if direction and len(items) != self.q.n:
+                rates = ", ".join(self.q.velocity_names)
+                raise SpecificationError(
+                    f"{what} has {len(items)} entries.",
+                    f"A direction has {self.q.n}, one for each of {rates}; a displacement is one scalar.",
+                    do="Give so many entries, or a scalar displacement.",
+                    name=name,
+                )
             if direction:
                 columns.append(self._column(items, what, self.q.n))
                 continue

@@ -16,7 +16,7 @@ def identity(name, cases, seed):
     Parameters
     ----------
     name : str
-        Of the function that computes a case.
+        Of the function that computes a case, with its module.
     cases : list of dict
     seed : int or None
 

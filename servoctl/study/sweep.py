@@ -79,7 +79,7 @@ def sweep(case, cases, *, executor=None, seed=None, checkpoint=None, shard=None,
     require_fitting(case, cases[0], seed)
     _require_sendable(case, executor)
     name = name_of(case)
-    key = identity(name, cases, seed)
+    key = identity(f"{_module_of(case)}.{name}", cases, seed)
     kept = Checkpoint(checkpoint, key) if checkpoint is not None else None
     rows = {row["case"]: row for row in kept.rows if row["case"] in mine} if kept else {}
     todo = [i for i in mine if i not in rows]
@@ -305,6 +305,11 @@ def name_of(case):
         bound = [*map(repr, case.args), *(f"{k}={v!r}" for k, v in sorted(case.keywords.items()))]
         return f"{name_of(case.func)}({', '.join(bound)})"
     return getattr(case, "__qualname__", type(case).__qualname__)
+
+
+def _module_of(case):
+    case = case.func if isinstance(case, functools.partial) else case
+    return getattr(case, "__module__", type(case).__module__)
 
 
 def _seed(case, seed):

@@ -3,6 +3,7 @@
 import numpy as np
 
 from servoctl.errors import SpecificationError
+from servoctl.study.study import Study
 from servoctl.study.sweep import TOLD
 
 COLOURS = ("#0072B2", "#D55E00")  # Okabe and Ito
@@ -14,6 +15,11 @@ def draw(study, names, against, units):
     """Rows of a histogram with percentiles and a scatter over one parameter."""
     from matplotlib.figure import Figure
 
+    if getattr(study, "kind", None) != "sweep":
+        kind = f"Study of the kind {study.kind}" if isinstance(study, Study) else type(study).__name__
+        raise SpecificationError(
+            f"A {kind} was given.", "A sweep is drawn.", "What sv.sweep or sv.merge returns.", "Give that."
+        )
     parameters = [name for name in study.meta["parameters"] if _varies(study, name)]
     results = [name for name in study.columns if name not in (*TOLD, "case", *study.meta["parameters"])]
     names = [name for name in results if _varies(study, name)][:MOST] if names is None else list(names)

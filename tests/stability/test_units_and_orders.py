@@ -59,6 +59,39 @@ def test_a_crane_in_any_unit(unit):
         assert run[name] / unit == pytest.approx(reference[name], abs=1e-9 * np.abs(reference[name]).max())
 
 
+def pendulum(unit, guess):
+    """A pendulum in x and y, its rod of 1 m a material constraint, with lengths in 1/unit metres; a cart beside it."""
+    p = sv.parameters(m=1.0, g=9.81 * unit, length=unit)
+    q = sv.coordinates("s x y")
+    s, x, y = q
+    mechanism = sv.Mechanism(
+        q,
+        gibbs=sv.particle(q, p.m, (x, y)) + sv.particle(q, 2.0, (s,)),
+        potential=p.m * p.g * y,
+        actuators={"force": s},
+        constraints={"rod": x**2 + y**2 - p.length**2},
+        parameters=p,
+    )
+    return sv.derive(mechanism, sv.Program({"cart": s - 0.1 * unit * ca.sin(q.t)}), guess={"y": -unit} if guess else {})
+
+
+@pytest.mark.parametrize("guess", [True, False])
+@pytest.mark.parametrize("unit", [1e-6, 1e-3, 1e6])
+def test_a_pendulum_goes_round_in_any_unit(unit, guess):
+    """Pivots change each time the rod passes a horizontal or a vertical, however long it is."""
+    model = pendulum(unit, guess)
+    assert model.free == 2 and "2 free" in repr(model)
+    start = model.start(x=0.0, y=-unit, dx=7.0 * unit)
+    reference = pendulum(1.0, guess)
+    plain = sv.simulate(reference, reference.start(x=0.0, y=-1.0, dx=7.0), (0.0, 2.0), rtol=1e-12, atol=1e-14)
+    for method in ("DOP853", "Taylor", "RadauIIA", "RK4"):
+        options = {"step": 1e-3} if method == "RK4" else {"rtol": 1e-12, "atol": 1e-14 * unit}
+        run = sv.simulate(model, start, (0.0, 2.0), method=method, t_eval=plain.t, **options)
+        assert run.success and run.counters["pivot_changes"] > 3
+        for name in ("x", "y"):
+            assert run[name] / unit == pytest.approx(plain[name], abs=1e-7)
+
+
 @pytest.mark.parametrize("unit", [1e-6, 1.0])
 @pytest.mark.parametrize("square", [False, True])
 def test_a_squared_constraint_is_told_from_a_small_one(square, unit):

@@ -27,10 +27,18 @@ def add(parser):
     loop.add_argument("--integral", action="store_true", help="LQR: integrals of the residuals, too")
     loop.add_argument("--rate", type=positive, metavar="HZ", help=f"samples per second; default {RATE:g}")
     loop.add_argument("--delay", type=whole, metavar="N", help="samples from the measurement to the input")
-    loop.add_argument("--noise", type=assignment, metavar="NAME=STD", **many, help="of measured states")
+    loop.add_argument("--noise", type=_deviation, metavar="NAME=STD", **many, help="of measured states")
     loop.add_argument("--seed", type=whole, help="of the noise")
     loop.add_argument("--limit", type=_limit, metavar="NAME=LOW:HIGH", **many, help="of actuators; or NAME=SIZE")
     loop.add_argument("--no-loop", action="store_true", help="leave out the closed loop")
+
+
+def _deviation(text):
+    """(name, standard deviation) of NAME=STD."""
+    name, value = assignment(text)
+    if value < 0:
+        raise argparse.ArgumentTypeError(f"{text!r}: a standard deviation is not negative")
+    return name, value
 
 
 def _limit(text):
@@ -61,6 +69,7 @@ def require(args, model):
     clashes = {
         "--no-loop": options if args.no_loop else [],
         "--law " + (args.law or ""): ["--integral"] if args.integral and args.law not in (None, "lqr") else [],
+        "--law feedforward, which measures nothing": ["--noise"] if args.noise and args.law == "feedforward" else [],
         "no --noise": ["--seed"] if args.seed is not None and not args.noise else [],
     }
     for kind, surplus in clashes.items():
