@@ -399,7 +399,8 @@ class Compiled:
         """Move from CasADi to the library: at the first call if one is at hand, later if it is to be built."""
         if self._settled or (self._looked and not build):
             return
-        library = compiler.library(self.source(), build, "-O3" if {"newton", "taylor"} & {*self.loops} else "-O1")
+        level = "-O3" if self._drivers or {"newton", "taylor"} & {*self.loops} else "-O1"
+        library = compiler.library(self.source(), build, level)
         if library is not None:
             self._evaluator = Library(library, self._symbol, self.n_x, self.n_p, self.n_y)
         self._looked, self._settled = True, build or library is not None
