@@ -6,6 +6,7 @@ import casadi as ca
 import numpy as np
 import pytest
 
+import servoctl as sv
 from servoctl.mechanisms import gallery
 from servoctl.model import compiler
 from servoctl.model.compiled import compiling_at_once
@@ -35,6 +36,22 @@ def gallery_model():
         return models[name]
 
     return model
+
+
+def pendulum(unit=1.0, guess=True):
+    """A pendulum in x and y, its rod of 1 m a material constraint, with lengths in 1/unit metres; a cart beside it."""
+    p = sv.parameters(m=1.0, g=9.81 * unit, length=unit)
+    q = sv.coordinates("s x y")
+    s, x, y = q
+    mechanism = sv.Mechanism(
+        q,
+        gibbs=sv.particle(q, p.m, (x, y)) + sv.particle(q, 2.0, (s,)),
+        potential=p.m * p.g * y,
+        actuators={"force": s},
+        constraints={"rod": x**2 + y**2 - p.length**2},
+        parameters=p,
+    )
+    return sv.derive(mechanism, sv.Program({"cart": s - 0.1 * unit * ca.sin(q.t)}), guess={"y": -unit} if guess else {})
 
 
 def numbers(expressions, values):

@@ -11,6 +11,7 @@ import pytest
 import servoctl as sv
 from servoctl.mechanisms import mass_on_car
 from servoctl.simulation import bounds
+from servoctl.simulation.rule import motion_error
 from servoctl.simulation.tableaus import ORDERS
 
 
@@ -124,6 +125,22 @@ def test_a_choice_beyond_the_bound_is_warned_about_with_its_number(sine):
     assert caught[0].filename == __file__
 
 
+def test_a_choice_beyond_the_bound_is_warned_about_backwards_in_time(sine):
+    with pytest.warns(RuntimeWarning, match=r"pole 60 1/s was to damp: \|λ\|h = 3 exceeds 2.785"):
+        sv.simulate(sine, sine.start(), (0.0, -1.0), "RK4", step=0.05, drift=sv.poles({"X": [60.0, 60.0]}))
+
+
+@pytest.mark.parametrize("direction", [1.0, -1.0])
+def test_poles_that_ask_for_a_hundred_thousand_adaptive_steps_are_warned_about(sine, direction):
+    """DOP853 is stable for steps of 6.4 over the pole: 1.6e6 of them in a second at 1e7 1/s."""
+    fast, slow = (sv.poles({"X": [-direction * rate] * 2}) for rate in (1e7, 10.0))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        sv.simulate(sine, sine.start(), (0.0, direction), "DOP853", drift=slow)
+        with pytest.raises(RuntimeWarning, match="of 'X' holds the steps of DOP853 below .*: 2e[+]06 steps"):
+            sv.simulate(sine, sine.start(), (0.0, direction), "DOP853", drift=fast)
+
+
 def test_complex_poles_are_judged_in_their_own_direction(sine):
     pair = {"X": [-20 + 45j, -20 - 45j]}  # |λ|h = 2.46, where the limit along this ray is 2.79
     with warnings.catch_warnings():
@@ -154,6 +171,35 @@ def test_steps_too_long_for_the_internal_dynamics_are_warned_about(method, step)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         sv.simulate(model, start, (0.0, 1.0), method=method, step=0.9 * largest)
+
+
+def test_stable_steps_that_do_not_resolve_the_motion_are_warned_about():
+    """Radau IIA of order 5 is stable with any step; steps of 3 s are wrong by six times the motion."""
+    model, span = sv.derive(*mass_on_car()), (0.0, 6.0)
+    exact = sv.simulate(model, model.start(), span, accuracy=1e-9)
+
+    def error(step):
+        run = sv.simulate(model, model.start(), span, method="RadauIIA", order=5, step=step)
+        assert run.counters["steps"] == 6.0 / step
+        return motion_error(model, run.jets, exact.jets)
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert error(0.5) < 0.01
+    with pytest.warns(RuntimeWarning, match="Steps of 3 s by RadauIIA do not resolve the motion") as caught:
+        assert error(3.0) > 1.0
+    assert "stable" not in str(caught[0].message) and caught[0].filename == __file__
+
+
+def test_steps_that_do_not_resolve_the_motion_before_a_knot_are_warned_about():
+    """The path ends at 3 s: the mass at rest behind it does not tell what went before."""
+    model, span = sv.derive(*mass_on_car(damping=10.0)), (0.0, 6.0)
+    start = model.start(s=0.0, ds=0.0)
+    with pytest.warns(RuntimeWarning, match="do not resolve the motion: at t = [0-2]"):
+        sv.simulate(model, start, span, method="RK4", step=0.3)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        sv.simulate(model, start, span, method="RK4", step=0.15)
 
 
 def test_steps_over_a_singularity_are_warned_about():

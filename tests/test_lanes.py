@@ -1,4 +1,4 @@
-"""Eight points at once: the vector functions against extended precision, blocks of Newton's iteration against points."""
+"""Sine and cosine of eight points at once, and of one, against extended precision; blocks of Newton's iteration."""
 
 import casadi as ca
 import mpmath
@@ -7,6 +7,7 @@ import pytest
 from test_compiled import P1, X2, T, function, newton_model
 
 from servoctl.model import emit
+from servoctl.model.closed import LAW_DRIVER
 from servoctl.model.compiled import compiled, compiling_at_once
 from servoctl.model.emit import SHARED, WIDE
 
@@ -24,23 +25,44 @@ def points(model, t, x, p):
     return np.array([model(now, column, p) for now, column in zip(t, x.T, strict=True)]).T
 
 
-def test_sine_and_cosine_of_eight_points_are_within_two_units():
+def at_points(model, x):
+    """A function for a loop to call in C: its sine and cosine are in line."""
+    return points(model, np.zeros(x.shape[1]), x, [0.0])
+
+
+def on_grid(model, x):
+    return model.grid(0.0, x, [0.0])
+
+
+BOTH = pytest.mark.parametrize(("drivers", "evaluated"), [("", on_grid), (LAW_DRIVER, at_points)], ids=["lanes", "one"])
+
+
+@BOTH
+def test_sine_and_cosine_are_within_two_units(drivers, evaluated):
     rng = np.random.default_rng(2)
     turns = np.arange(-60, 61) * np.pi / 2
     a = np.concatenate([rng.uniform(-10, 10, 200), rng.uniform(-1e5, 1e5, 100), turns, np.nextafter(turns, 99),
                         63661 * np.pi / 2 + np.linspace(-1e-9, 1e-9, 5), [0.0, -0.0, TINY, -TINY, LAST_SMALL, 1e-5]])
-    y = compiled(function(ca.sin(X2[0]), ca.cos(X2[0])), "circular").grid(0.0, np.vstack([a, a]), [0.0])
+    y = evaluated(compiled(function(ca.sin(X2[0]), ca.cos(X2[0])), "circular", drivers=drivers), np.vstack([a, a]))
     with mpmath.workdps(40):
         exact = np.array([[float(f(mpmath.mpf(v))) for v in a] for f in (mpmath.sin, mpmath.cos)])
     np.testing.assert_array_max_ulp(y, exact, maxulp=2)
     np.testing.assert_array_equal(np.signbit(y[0, -6:-4]), [False, True])
 
 
-def test_arguments_that_are_large_or_not_finite_do_not_disturb_other_points():
+@BOTH
+def test_arguments_that_are_large_or_not_finite_do_not_disturb_other_points(drivers, evaluated):
     a = np.array([0.3, np.nan, 1e300, np.inf, 0.3, -1e6, 1e5, 2.0])
-    y = compiled(function(ca.sin(X2[0])), "large").grid(0.0, np.vstack([a, a]), [0.0])
+    y = evaluated(compiled(function(ca.sin(X2[0]), ca.cos(X2[0])), "large", drivers=drivers), np.vstack([a, a]))
     with np.errstate(invalid="ignore"):
-        np.testing.assert_allclose(y[0], np.sin(a), rtol=4e-16, atol=0)
+        np.testing.assert_allclose(y, [np.sin(a), np.cos(a)], rtol=4e-16, atol=0)
+
+
+def test_the_sine_of_a_point_is_the_library_s_where_no_loop_calls_it():
+    f = function(ca.sin(X2[0]))
+    assert "#define v_sin s_sin" in emit.emit(f, "f", drivers=LAW_DRIVER)
+    assert "s_sin" not in emit.emit(f, "f") and "s_sin" not in emit.portable(f, "f")
+    assert "s_sin" not in emit.emit(function(ca.exp(X2[0])), "f", drivers=LAW_DRIVER)
 
 
 @pytest.mark.parametrize("n", [1, 7, 8, 9, 15, 16, 300])

@@ -6,6 +6,7 @@ import os
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import casadi as ca
 import numpy as np
@@ -13,7 +14,7 @@ import pytest
 
 import servoctl as sv
 from servoctl.mechanisms import gallery
-from servoctl.model import derivation, memo
+from servoctl.model import cache, derivation, memo
 
 PACKAGE = Path(sv.__file__).parent
 
@@ -296,6 +297,40 @@ def test_a_changed_specification_is_refused(derived):
         len(model.reduction.rows)
     with pytest.raises(AttributeError):
         len(sv.derive(*pendulum()).reduction.nothing)
+
+
+def test_what_a_changed_specification_gives_is_not_kept(derived):
+    made = [pendulum(output=lambda q: {"height": ca.cos(next(iter(q)))}) for _ in range(2)]
+    changed, model = (sv.derive(*specification) for specification in made)
+    made[0][0].outputs["height"] = ca.SX(7.0)
+    with pytest.raises(sv.SpecificationError, match="changed after"):
+        changed.signals("outputs")
+    with pytest.raises(sv.SpecificationError, match="changed after"):
+        changed.near(0.0, [0.0, 1.0, 0.0])
+    assert model.signals("outputs")[1](0.0, [0.3, 0.0, 0.0], model.parameters) == np.cos(0.3)
+
+
+def test_what_another_user_wrote_is_not_read(derived, tmp_path, monkeypatch):
+    sv.derive(*pendulum())
+    (entry,) = entries(tmp_path)
+    cache.kept(entry)
+    with monkeypatch.context() as patched:
+        patched.setattr(os, "fstat", lambda _: SimpleNamespace(st_uid=os.geteuid() + 1))
+        with pytest.raises(PermissionError):
+            cache.kept(entry)
+        sv.derive(*pendulum())
+    assert len(derived) == 2
+
+
+def test_a_whole_entry_that_is_no_pickle_is_derived_anew(derived, tmp_path):
+    sv.derive(*pendulum())
+    (entry,) = entries(tmp_path)
+    with cache.keeping(entry) as temporary:
+        Path(temporary).write_bytes(b"of another kind")
+    sv.derive(*pendulum())
+    assert len(derived) == 2
+    sv.derive(*pendulum())
+    assert len(derived) == 2
 
 
 def test_least_used_entries_go_first(derived, tmp_path, monkeypatch):

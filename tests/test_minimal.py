@@ -3,9 +3,9 @@
 import sys
 from pathlib import Path
 
-import casadi as ca
 import numpy as np
 import pytest
+from conftest import pendulum
 from scipy.integrate import solve_ivp
 
 import servoctl as sv
@@ -118,22 +118,6 @@ def test_a_unit_quaternion_has_a_local_chart(method, satellite):
     angle = np.pi / 3 * np.polyval([6.0, -15.0, 10.0, 0.0, 0.0, 0.0], run.t / 10.0)
     axis = 2 * (run["e1"] * run["e3"] + run["e0"] * run["e2"])
     assert axis == pytest.approx(np.sin(angle), abs=ROUNDING)
-
-
-def pendulum(metre=1.0):
-    """A pendulum in x and y with its rod of 1 m as a material constraint, in another unit of length."""
-    p = sv.parameters(m=1.0, g=9.81 * metre, length=metre)
-    q = sv.coordinates("s x y")  # s: a cart of its own, driven along a path
-    s, x, y = q
-    mechanism = sv.Mechanism(
-        q,
-        gibbs=sv.particle(q, p.m, (x, y)) + sv.particle(q, 2.0, (s,)),
-        potential=p.m * p.g * y,
-        actuators={"force": s},
-        constraints={"rod": x**2 + y**2 - p.length**2},
-        parameters=p,
-    )
-    return sv.derive(mechanism, sv.Program({"cart": s - 0.1 * metre * ca.sin(q.t)}), guess={"y": -metre})
 
 
 @pytest.mark.parametrize(

@@ -9,7 +9,9 @@ import pytest
 
 from servoctl.errors import SpecificationError
 from servoctl.spec import coordinates
-from servoctl.spec.taylor import Series, Tape, evaluate
+from servoctl.spec.evaluation import evaluate
+from servoctl.spec.tape import Tape
+from servoctl.spec.taylor import Series
 
 RNG = np.random.default_rng(31)
 DEEPEST = 6

@@ -224,9 +224,9 @@ def test_the_plot_draws_every_number(cost, study):
     "given, error, text",
     [
         ({"methods": ["RK3"]}, NameUnknown, "No method is named 'RK3'"),
-        ({"rtol": [1e-3, -1.0]}, SpecificationError, "rtol was given as"),
-        ({"step": "fine"}, SpecificationError, "step was given as 'fine'"),
-        ({"seconds": 0.0}, SpecificationError, "seconds was given as"),
+        ({"rtol": [1e-3, -1.0]}, SpecificationError, r"rtol=\[0.001, -1.0\] was given"),
+        ({"step": "fine"}, SpecificationError, "step='fine' was given"),
+        ({"seconds": 0.0}, SpecificationError, "seconds = 0 was given"),
         ({"drift": ["often"]}, NameUnknown, "drift treatment"),
         ({"drift": [sv.poles({"x_c": [-1.0]})]}, SpecificationError, "time constant"),
         ({"t_span": (0.0, 0.0)}, SpecificationError, "two different finite times"),

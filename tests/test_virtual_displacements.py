@@ -5,8 +5,9 @@ import numpy as np
 import pytest
 
 from servoctl.mechanisms import gallery
+from servoctl.reduction.manifold import sample
 from servoctl.reduction.ranks import clean
-from servoctl.reduction.rows import gradient, sample_rows
+from servoctl.reduction.row import gradient
 
 
 def virtual_displacements(realisation):
@@ -24,7 +25,7 @@ def points_of(gallery_model):
     def points(name):
         if name not in found:
             r = gallery_model(name).reduction
-            found[name] = sample_rows(r.mechanism.q, r.rows, max(r.top, 2), r.context, starts=r.points)
+            found[name] = sample(r.mechanism.q, r.rows, max(r.top, 2), r.context, starts=r.points)
         assert len(found[name].t) >= 3
         return found[name]
 

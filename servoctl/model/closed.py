@@ -51,8 +51,8 @@ static void NAME_limit(const NAME_loop *c, const double *command, const double *
 #define ALL_STATES _Pragma("GCC unroll 32") for (int i = 0; i < NAME_nx; i++)
 
 /* One Runge-Kutta step of order 4, with the rates written into it; d holds the disturbances at its start, middle and
-   end. */
-__attribute__((flatten))
+   end. Vectors of states would be filled and emptied one by one, in each stage: they take longer than numbers. */
+__attribute__((flatten, optimize("no-tree-vectorize")))
 static void NAME_rk4(const NAME_loop *c, double t, double h, const double *d, double *x, double *p)
 {
     double k1[NAME_nx + 1], k2[NAME_nx + 1], k3[NAME_nx + 1], k4[NAME_nx + 1], z[NAME_nx + 1];
@@ -72,6 +72,7 @@ static void NAME_rk4(const NAME_loop *c, double t, double h, const double *d, do
 }
 
 /* The loop; sample k at t0 + k period: measure, call the law, delay, limit, hold. Returns the samples completed. */
+__attribute__((optimize("no-tree-vectorize")))
 int64_t NAME_closed(NAME_law *law, NAME_loop *c)
 {
     double x[NAME_nx + 1], p[NAME_np + 1];

@@ -18,14 +18,14 @@ import platform
 import shlex
 import shutil
 import subprocess
-import sys
 import tempfile
 import threading
 import warnings
 from pathlib import Path
 
+from servoctl.model.cache import cache_directory, keeping, kept
+
 FLAGS = ("-fPIC", "-shared", "-w", "-fno-math-errno")
-_DIGEST = hashlib.sha256().digest_size
 
 _loaded = {}  # key -> ctypes.CDLL, or None where it could not be built
 _locks = {}  # key -> lock: no two threads compile the same text
@@ -64,10 +64,10 @@ def library(text, build=True, level="-O1"):
         lock = _locks.setdefault(key, threading.Lock())
     with lock:
         if key not in _loaded:
-            kept = _open_kept(cache_directory() / f"{key}.so")
-            if kept is None and not build:
+            loaded = _open(cache_directory() / f"{key}.so")
+            if loaded is None and not build:
                 return None
-            _loaded[key] = kept or _build(text, level, f"{key}.so", command)
+            _loaded[key] = loaded or _build(text, level, f"{key}.so", command)
         return _loaded[key]
 
 
@@ -75,25 +75,6 @@ def compiler():
     """Command of the C compiler that is used, None where there is none."""
     found = _compiler(*(os.environ.get(name) for name in ("SERVOCTL_COMPILER", "CC", "PATH")))
     return " ".join(found[0]) if found else None
-
-
-def cache_directory():
-    """Directory where compiled libraries are kept.
-
-    Returns
-    -------
-    pathlib.Path
-        ``SERVOCTL_CACHE`` if set, else ``servoctl`` under the user's cache directory; it need not exist.
-    """
-    if chosen := os.environ.get("SERVOCTL_CACHE"):
-        return Path(chosen).expanduser().absolute()
-    if base := os.environ.get("XDG_CACHE_HOME"):
-        return Path(base).absolute() / "servoctl"
-    if sys.platform == "darwin":
-        return Path.home() / "Library" / "Caches" / "servoctl"
-    if sys.platform == "win32":
-        return Path(os.environ.get("LOCALAPPDATA", Path.home())) / "servoctl" / "Cache"
-    return Path.home() / ".cache" / "servoctl"
 
 
 @functools.cache
@@ -151,10 +132,7 @@ def _build(text, level, file_name, command):
 
 
 def _compile(text, level, target, command):
-    target.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
-    handle, temporary = tempfile.mkstemp(dir=target.parent, suffix=".tmp")
-    os.close(handle)
-    try:
+    with keeping(target) as temporary:
         for flags in ((*FLAGS, *_optional_flags()), FLAGS):
             done = subprocess.run(
                 [*command, level, *flags, "-x", "c", "-", "-o", temporary, "-lm"],
@@ -168,29 +146,16 @@ def _compile(text, level, target, command):
                 break
         else:
             raise _CompilerFailed("; ".join(done.stderr.strip().splitlines()[:2]) or f"status {done.returncode}")
-        with open(temporary, "r+b") as file:
-            digest = hashlib.sha256(file.read()).digest()
-            file.write(digest)
-        os.replace(temporary, target)
-    finally:
-        Path(temporary).unlink(missing_ok=True)
-    return _open(target)
-
-
-def _open_kept(path):
-    """The library kept at a path, or None if there is none that is whole."""
-    try:
-        return _open(path)
-    except OSError:
-        return None
+    return ctypes.CDLL(str(target))
 
 
 def _open(path):
-    """Load a library whose last bytes are the digest of the others: loading a truncated one can end the process."""
-    content = path.read_bytes()
-    if hashlib.sha256(content[:-_DIGEST]).digest() != content[-_DIGEST:]:
-        raise OSError(f"{path} is damaged")
-    return ctypes.CDLL(str(path))
+    """The library kept at a path, or None: loading one that is not whole can end the process."""
+    try:
+        kept(path)
+        return ctypes.CDLL(str(path))
+    except OSError:
+        return None
 
 
 def _without(reason):

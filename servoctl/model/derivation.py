@@ -31,8 +31,6 @@ class Derivation:
         Without expressions: rows by name, order and story, ranks and knots.
     values : (n_p,) array
         Parameters at which ranks are decided.
-    memo : Memo
-        What else was derived of this specification.
     """
 
     def __init__(self, mechanism, program, guess=None, near=None, values=None):
@@ -40,8 +38,8 @@ class Derivation:
             values = mechanism.parameters.values()
         self.values = values
         self._given = mechanism, program, dict(guess) if isinstance(guess, dict) else guess, near, values
-        self.memo = Memo(key(*self._given))
-        outline = self.memo.recall("outline", lambda: _outline(self.derived))
+        self._memo = Memo(key(*self._given))
+        outline = self.recall("outline", lambda: _outline(self.derived))
         self.outline = replace(outline, mechanism=mechanism, program=program)
 
     @cached_property
@@ -51,15 +49,51 @@ class Derivation:
         Raises
         ------
         SpecificationError
-            If the specification has become another since its outline was read.
+            If the specification has become another.
         """
-        if "outline" in vars(self) and key(*self._given) != self.memo.key:
+        self._require_unchanged()
+        return reduce(*self._given)
+
+    def recall(self, name, build):
+        """What was derived of the specification under a name, or else what `build()` derives, which is kept.
+
+        Parameters
+        ----------
+        name : str
+        build : callable
+            Without arguments.
+
+        Raises
+        ------
+        SpecificationError
+            If it is to be built and the specification has become another.
+        """
+
+        def build_unchanged():
+            self._require_unchanged()
+            return build()
+
+        return self._memo.recall(name, build_unchanged)
+
+    def again(self, guess=None, near=None, values=None):
+        """The same specification derived with other choices (see `servoctl.reduction.reduce.reduce`).
+
+        Raises
+        ------
+        SpecificationError
+            If the specification has become another.
+        """
+        self._require_unchanged()
+        mechanism, program, *_ = self._given
+        return Derivation(mechanism, program, guess, near, values)
+
+    def _require_unchanged(self):
+        if key(*self._given) != self._memo.key:
             raise SpecificationError(
                 "The mechanism or the program was changed after its model was derived.",
                 "A specification is a value: what is derived of it later must fit what was derived before.",
                 do="Make another mechanism or program, and derive its model.",
             )
-        return reduce(*self._given)
 
     @property
     def timed(self):
@@ -67,7 +101,7 @@ class Derivation:
         return self.outline.switches
 
     def __getattr__(self, name):
-        if name.startswith("_") or name in ("outline", "memo", "values"):
+        if name.startswith("_") or name in ("outline", "values"):
             raise AttributeError(name)
         return getattr(self.outline if name in _AT_HAND else self.derived, name)
 

@@ -15,7 +15,7 @@ from itertools import chain, count
 import casadi as ca
 
 from servoctl.errors import SpecificationError, unknown
-from servoctl.model.loops import BISECTIONS, GRID, LOOPS, NEAR, PROJECTION, QUADRATIC, ROUNDING, lanes
+from servoctl.model.loops import BISECTIONS, GRID, LOOPS, NEAR, PROJECTION, QUADRATIC, ROUNDING, circular, lanes
 
 CHUNK = 350  # statements per C function: compile time is least, and flat, between 250 and 500
 WIDE = 3000  # operations: up to here a function is emitted for eight points at once as well
@@ -153,7 +153,7 @@ def emit(f, name, loops=(), chunk=CHUNK, project=None, others=None, drivers="", 
     others : dict of str to casadi.Function, optional
         Further SX functions of this form (their sizes may differ), which become ``name_KEY``.
     drivers : str
-        C text to append, with the placeholders of the loops.
+        C text to append, with the placeholders of the loops; with it sin and cos are our own, within 2 ulp, in line.
     sizes : dict of str to int, optional
         Constants ``name_KEY`` for the loops and drivers.
     wide : bool
@@ -185,6 +185,7 @@ def emit(f, name, loops=(), chunk=CHUNK, project=None, others=None, drivers="", 
         if "newton" in loops:
             copies += _function(_first(f, f.numel_in(1)), f"{name}_wide_step", chunk)
         body += lanes(copies, _OPERATIONS)
+    begin = _PRELUDE + (circular() if drivers and re.search(r"\bv_(sin|cos)\(", body) else "")
     wanted = [text for loop, text in LOOPS.items() if loop in loops]
     constants = f"#define NAME_wide_lanes {int(wide)}\n"
     constants += "".join(f"enum {{ NAME_{key} = {value} }};\n" for key, value in (sizes or {}).items())
@@ -201,7 +202,7 @@ def emit(f, name, loops=(), chunk=CHUNK, project=None, others=None, drivers="", 
         "NAME": name,
     }.items():
         drivers = drivers.replace(key, str(value))
-    return _PRELUDE + (_ERFINV if "v_erfinv" in body else "") + body + drivers
+    return begin + (_ERFINV if "v_erfinv" in body else "") + body + drivers
 
 
 def _first(f, n):

@@ -15,7 +15,8 @@ from servoctl.errors import NotRealisable, SpecificationError
 from servoctl.model.laws import law_step
 from servoctl.reduction.elimination import eliminate
 from servoctl.reduction.ranks import clean, decide, decide_all
-from servoctl.spec.taylor import Tape, evaluate
+from servoctl.spec.evaluation import evaluate
+from servoctl.spec.tape import Tape
 
 POINTS, AWAY, SEED = 8, 0.02, 20240229  # states along the plan, and how far beside them ranks are decided
 SHARE = 1e-9  # of the largest, in rows and columns of like size: entries below it are rounding

@@ -1,6 +1,6 @@
 """Derivations on disk: what one process derived, the next one reads.
 
-Entries lie in ``derived`` under the directory of the compiled libraries (see `compiler`), each under the hash of the
+Entries lie in ``derived`` under the directory of the compiled libraries (see `cache`), each under the hash of the
 specification with all its numbers, the name of what was derived, and the versions and sources that derived it. What
 cannot be read is derived; ``SERVOCTL_MEMO=none`` neither reads nor writes.
 """
@@ -13,15 +13,14 @@ import os
 import pickle
 import platform
 import sys
-import tempfile
 import time
 from pathlib import Path
 
 import casadi as ca
 import numpy as np
 
+from servoctl.model.cache import cache_directory, keeping, kept
 from servoctl.model.compiled import Compiled
-from servoctl.model.compiler import cache_directory
 from servoctl.spec.coordinates import Coordinates
 from servoctl.spec.mechanism import Mechanism
 from servoctl.spec.parameters import Parameters
@@ -31,7 +30,6 @@ MOST_BYTES = 2**28  # of all entries: beyond it those that were not used for the
 WRITES = 50  # of a process between two looks at that sum
 SETTLED = 1.0  # s: sources that changed later than this before they were loaded are not what runs
 
-_DIGEST = hashlib.sha256().digest_size
 _LOADED = time.time()
 _written = 0
 
@@ -155,20 +153,18 @@ def _sources(directory):
 
 
 def _read(path):
-    """A tuple with what is kept at a path, or None if there is nothing that is whole."""
+    """A tuple with what is kept at a path, or None if there is nothing that can be read."""
     try:
-        content = path.read_bytes()
-        if hashlib.sha256(content[:-_DIGEST]).digest() != content[-_DIGEST:]:
-            return None
+        content = kept(path)
         with contextlib.suppress(OSError):
             os.utime(path)
-        return pickle.loads(content[:-_DIGEST])
-    except OSError:
+        return pickle.loads(content)
+    except Exception:  # what is whole can still be of a library that was built in another way
         return None
 
 
 def _write(path, found):
-    """Keep something, if it can be: in a file of its own first, so that no reader meets half of it."""
+    """Keep something, if it can be."""
     global _written
     try:
         for part in found[0] if isinstance(found[0], tuple) else found:
@@ -178,17 +174,11 @@ def _write(path, found):
     except Exception:  # what holds expressions does not pickle, which CasADi tells by a bare Exception
         return
     with contextlib.suppress(OSError):
-        path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+        with keeping(path) as temporary:
+            Path(temporary).write_bytes(content)
         if _written % WRITES == 0:
             _prune(path.parent)
         _written += 1
-        handle, temporary = tempfile.mkstemp(dir=path.parent, suffix=".tmp")
-        try:
-            with os.fdopen(handle, "wb") as file:
-                file.write(content + hashlib.sha256(content).digest())
-            os.replace(temporary, path)
-        finally:
-            Path(temporary).unlink(missing_ok=True)
 
 
 def _prune(directory):

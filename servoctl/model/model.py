@@ -11,7 +11,6 @@ from servoctl.model.derivation import Derivation
 from servoctl.model.equations import EQUATIONS, Equations, gradient_jets, leading_names, residual_rows
 from servoctl.model.formulations import FORMULATIONS
 from servoctl.model.implicit import implicit
-from servoctl.model.memo import Memo
 from servoctl.model.series import taylor_coefficients
 from servoctl.model.servo_dae import SERVO_DAE
 from servoctl.model.sundials import Sundials
@@ -124,7 +123,7 @@ class Model:
         values = r.mechanism.parameters.values({**current, **changes})
         require_positive(r.mechanism, replace(r.points, values=values))
         if not holds(r.derived, values):
-            return Model(Derivation(r.mechanism, r.program, r.context.guess, values=values), values)
+            return Model(r.again(r.context.guess, values=values), values)
         return Model(r, values, require_smooth(r.switches, values, r.smoothness), self._functions)
 
     def near(self, t, jets, sizes=()):
@@ -144,8 +143,7 @@ class Model:
         """
         guess = dict(zip(self.jet_names, map(float, jets), strict=True))
         usual = self._once("jet sizes", lambda: self._equations.jet_sizes)
-        r, near = self.reduction, (float(t), guess, usual | dict(sizes))
-        r = Derivation(r.mechanism, r.program, near=near, values=self.parameters)
+        r = self.reduction.again(near=(float(t), guess, usual | dict(sizes)), values=self.parameters)
         if r.free != self.free:
             raise SpecificationError(
                 f"Near t = {t:.6g} s the program has {r.free} free initial values, elsewhere {self.free}.",
@@ -218,10 +216,12 @@ class Model:
         """
         r = self.reduction
         if r.timed and span not in self._knots_within:
-            memo = r.memo if r.decided_at(self.parameters) else Memo(None)
-            self._knots_within[span] = memo.recall(
-                f"knots {span}", lambda: require_smooth(r.switches, self.parameters, r.smoothness, span).times
-            )
+
+            def build():
+                return require_smooth(r.switches, self.parameters, r.smoothness, span).times
+
+            kept = r.decided_at(self.parameters)
+            self._knots_within[span] = r.recall(f"knots {span}", build) if kept else build()
         return self._knots_within.get(span, ())
 
     @property
@@ -239,7 +239,7 @@ class Model:
     def _once(self, name, build):
         """What was built under a name, by this process or another."""
         if name not in self._functions:
-            self._functions[name] = self.reduction.memo.recall(name, build)
+            self._functions[name] = self.reduction.recall(name, build)
         return self._functions[name]
 
     def function(self, name):

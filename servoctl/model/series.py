@@ -10,7 +10,8 @@ import casadi as ca
 
 from servoctl.reduction.elimination import eliminate
 from servoctl.reduction.ranks import clean
-from servoctl.spec.taylor import Series, Tape, _is_zero
+from servoctl.spec.tape import Tape
+from servoctl.spec.taylor import Series, is_zero
 
 
 class _Group:
@@ -64,7 +65,7 @@ class _Motion:
         if self.q.plain:
             self.coordinates[k] = self.gamma[k]
         else:
-            self.coordinates[k] = [c if _is_zero(c) else c / k for c in self.kinematics.advance(k)]
+            self.coordinates[k] = [c if is_zero(c) else c / k for c in self.kinematics.advance(k)]
 
     def guess(self, k):
         """γ_[k] = 0, and q_[k] as it then is."""
@@ -78,7 +79,7 @@ class _Motion:
             self.coordinates[k] = gamma
         else:
             self.kinematics.correct(k)
-            self.coordinates[k] = [c[-1] if _is_zero(c[-1]) else c[-1] / k for c in self.kinematics.series.outputs]
+            self.coordinates[k] = [c[-1] if is_zero(c[-1]) else c[-1] / k for c in self.kinematics.series.outputs]
 
     def coefficient(self, symbol, j):
         """Coefficient j of a symbol along the motion."""
@@ -91,7 +92,7 @@ class _Motion:
         if kind == "q":
             return self.coordinates[j][i]
         c = self.gamma[level + j][i]
-        return 0.0 if _is_zero(c) else c * float(factorial(level + j) // factorial(j))
+        return 0.0 if is_zero(c) else c * float(factorial(level + j) // factorial(j))
 
 
 def taylor_coefficients(equations, last):

@@ -52,7 +52,7 @@ class Flow:
         return flow
 
     def _scalars(self, expressions):
-        return Scalars(self.q, self.points.parameters, expressions)
+        return Scalars(self.q, self.points.parameters, expressions, self.signals)
 
     @property
     def groups(self):

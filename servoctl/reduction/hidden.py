@@ -12,10 +12,10 @@ import numpy as np
 from servoctl.errors import InconsistentStart, NotRealisable, SingularProgram, SpecificationError
 from servoctl.reduction.elimination import eliminate
 from servoctl.reduction.flow import Flow
-from servoctl.reduction.manifold import solve
+from servoctl.reduction.manifold import sample, solve
+from servoctl.reduction.orders import dependence, leading, settle, settle_alone
 from servoctl.reduction.ranks import NOISE, RESOLVED, clean, decide, decide_all, decide_each, generic
 from servoctl.reduction.row import Row, gradient, merge_uses
-from servoctl.reduction.rows import dependence, leading, sample_rows, settle, settle_alone
 
 VANISHED = 1e-5  # of a row's gradient at random points: what is left of it on its solutions, if it is a square
 
@@ -56,7 +56,7 @@ def complete(q, rows, context, starts=None):
     rows, guards, points = list(rows), [], starts
     while True:
         level = max([row.order for row in rows], default=0)
-        points = sample_rows(q, rows, level, context, starts=points)
+        points = sample(q, rows, level, context, starts=points)
         if not len(points.t):
             _refuse_contradiction(q, rows, context)
         numbers, sizes = leading(q, rows, points)
@@ -120,7 +120,7 @@ def _about(q, rows, b, context):
     """
     order = [*(a for a in range(len(rows)) if a != b and rows[a].order <= rows[b].order), b]
     rest = [row for a, row in enumerate(rows) if a != b]
-    points = sample_rows(q, rest, max(row.order for row in rows), context)
+    points = sample(q, rest, max(row.order for row in rows), context)
     numbers, _ = leading(q, rows, points)
     support, _ = dependence(q, [rows[a] for a in order], numbers[order])
     return ([order[i] for i in support] if support and support[-1] == len(order) - 1 else []), numbers
@@ -198,7 +198,7 @@ def _dependent(row, points, names, kinds, story):
 def _refuse_contradiction(q, rows, context):
     """No point satisfies all rows: look for the contradiction among them, and raise."""
     level = max(row.order for row in rows)
-    points = sample_rows(q, [], level, context)
+    points = sample(q, [], level, context)
     numbers, sizes = leading(q, rows, points)
     rank, _ = decide_all(numbers, sizes)
     if rank.clear and rank.rank < len(rows):
@@ -257,7 +257,7 @@ def _refuse_square(q, row, context, slopes=None):
         clear = np.all(sizes > VANISHED * sizes.max(axis=0), axis=1)
         if any(clear[i] and q.order(e) < 0 for i, e in zip(columns, own.nonzeros(), strict=True)):
             return
-    start = sample_rows(q, [], row.order, context)
+    start = sample(q, [], row.order, context)
     flow = Flow(q, [row], row.order, start)
     z, residual = solve(flow, start.t, start.z, iterations=40)
     sizes = []

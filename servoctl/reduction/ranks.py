@@ -93,7 +93,17 @@ def decide(matrix, resolved=RESOLVED):
 
 
 def decide_each(matrices, resolved=RESOLVED):
-    """The rank of each of N matrices, (m, n, N) with entries cleaned: a list of Rank."""
+    """The rank of each of N matrices (see `decide`).
+
+    Parameters
+    ----------
+    matrices : (m, n, N) array
+        With entries cleaned.
+
+    Returns
+    -------
+    list of Rank
+    """
     a, _, _ = equilibrate(np.moveaxis(matrices, 2, 0))
     count, m, n = a.shape
     each, least = np.arange(count), min(m, n)

@@ -11,10 +11,10 @@ from servoctl.reduction.appell import Realisation, realisation, require_inertia
 from servoctl.reduction.flow import Flow
 from servoctl.reduction.hidden import as_rows, complete
 from servoctl.reduction.knots import Knots, Switches, require_smooth
-from servoctl.reduction.manifold import Context, Points
+from servoctl.reduction.manifold import Context, Points, sample
+from servoctl.reduction.orders import settle_alone
 from servoctl.reduction.ranks import Rank, clean, decide, decide_all
 from servoctl.reduction.row import Row, gradient, merge_uses
-from servoctl.reduction.rows import sample_rows, settle_alone
 from servoctl.spec.coordinates import mapping
 from servoctl.spec.mechanism import Mechanism, require_known
 from servoctl.spec.parameters import finite
@@ -222,7 +222,7 @@ def holds(reduction, values):
     """
     q, r = reduction.mechanism.q, reduction
     context = replace(r.context, values=values)
-    points = sample_rows(q, r.rows, r.top, context, starts=r.points, flow=r.flow)
+    points = sample(q, r.rows, r.top, context, starts=r.points, flow=r.flow)
     if not len(points.t):
         return False
     after, start = points.evaluate(r.conditions), 0
@@ -312,5 +312,5 @@ def _context(mechanism, switches, guess, near, values):
 
 def _points_for(q, constraints, points, context):
     """Points on the manifold of all constraints, or on that of the material ones where there are none."""
-    found = sample_rows(q, constraints, max([2, *(row.order for row in constraints)]), context)
+    found = sample(q, constraints, max([2, *(row.order for row in constraints)]), context)
     return found if len(found.t) else points

@@ -17,6 +17,8 @@ class Scalars:
     q : Coordinates
     parameters : tuple of SX
     expressions : sequence of SX scalars
+    others : collection of int, optional
+        Element hashes of further symbols, whose values here are zero.
 
     Attributes
     ----------
@@ -25,7 +27,7 @@ class Scalars:
         What each symbol is; see `Coordinates.where`.
     """
 
-    def __init__(self, q, parameters, expressions):
+    def __init__(self, q, parameters, expressions, others=()):
         self.expressions, self.tape = expressions, Tape(None, expressions)
         self._last = None, None  # inputs, and the values of all nodes
         self.places = [q.where(s) for s in self.tape.symbols]
@@ -35,7 +37,7 @@ class Scalars:
         for i, (symbol, place) in enumerate(zip(self.tape.symbols, self.places, strict=True)):
             if place is None:
                 own = symbol.element_hash()
-                self._rows.append(1 + names.index(own) if own in names else 0)
+                self._rows.append(0 if own in others else 1 + names.index(own))
             else:
                 kind, level, k = place
                 start = first["q"] + q.nq + (level - 1) * q.n if kind == "w" else first[kind]
@@ -78,7 +80,19 @@ class Book:
         self._read = {}  # element hash: its scalars, and which of them it is
 
     def find(self, q, parameters, expressions):
-        """Where expressions stand: a list of (scalars, indices in these, indices in `expressions`)."""
+        """Where expressions stand; those that are new are read together.
+
+        Parameters
+        ----------
+        q : Coordinates
+        parameters : tuple of SX
+        expressions : sequence of SX scalars
+
+        Returns
+        -------
+        list of (Scalars, list of int, list of int)
+            Scalars that hold some of them, their places in these, and in `expressions`.
+        """
         hashes = [e.element_hash() for e in expressions]
         new = {h: e for h, e in zip(hashes, expressions, strict=True) if h not in self._read}
         if new:

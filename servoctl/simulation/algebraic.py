@@ -52,10 +52,8 @@ def algebraic(model, t0, x0, times, progress):
                 done += stand
                 progress(block[stand - 1])
             if repivot:
-                at, helps = (
-                    min(stand, state.shape[1] - 1),
-                    motion.changes_pivots(float(block[min(stand, len(block) - 1)])),
-                )
+                at, following = min(stand, state.shape[1] - 1), float(block[min(stand, len(block) - 1)])
+                helps = motion.changes_pivots(following)
                 variant = watch.anew(block[at], state[:, at], top[:, at]) if helps else None
                 if variant is None:
                     motion.stop = watch.singular(*_last(times, block, state, stand, why), NO_CHOICE)

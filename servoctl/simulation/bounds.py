@@ -218,21 +218,22 @@ def warn_fast_poles(method, poles, step):
     poles : dict of str to (ρ,) arrays of complex
         Of each row [1/s].
     step : float
-        [s]
+        [s]; negative where time runs backwards.
     """
     limits = [
         (limit / abs(pole), limit, pole, row)
         for row, values in poles.items()
         for pole in values
-        if np.real(pole) < 0 and abs(pole) * step > (limit := largest_explicit(method, None, float(np.angle(pole))))
+        if np.real(pole * step) < 0
+        and abs(pole * step) > (limit := largest_explicit(method, None, float(np.angle(pole * step))))
     ]
     if limits:
         largest, limit, pole, row = min(limits, key=lambda found: found[0])
         number = f"{pole.real:g}" if pole.imag == 0 else f"{pole:g}"
         warnings.warn(
-            f"Steps of {step:.4g} s by {method} amplify the error dynamics of {row!r}, which the pole {number} 1/s was "
-            f"to damp: |λ|h = {abs(pole) * step:.4g} exceeds {limit:.4g}. The largest stable step is {largest:.4g} s. "
-            "Take it, slower poles, or drift='project'.",
+            f"Steps of {abs(step):.4g} s by {method} amplify the error dynamics of {row!r}, which the pole {number} "
+            f"1/s was to damp: |λ|h = {abs(pole * step):.4g} exceeds {limit:.4g}. The largest stable step is "
+            f"{largest:.4g} s. Take it, slower poles, or drift='project'.",
             RuntimeWarning,
             stacklevel=_outside(),
         )
@@ -248,46 +249,45 @@ def warn_many_steps(method, poles, length):
     poles : dict of str to (ρ,) arrays of complex
         Of each row [1/s].
     length : float
-        Of the span [s].
+        Of the span [s]; negative where time runs backwards.
     """
     steps = [
         (abs(pole) / limit, pole, row)
         for row, values in poles.items()
         for pole in values
-        if 0 < (limit := largest_explicit(method, None, float(np.angle(pole)))) < inf
+        if 0 < (limit := largest_explicit(method, None, float(np.angle(pole * length)))) < inf
     ]
     rate, pole, row = max(steps, key=lambda found: found[0], default=(0.0, 0.0, ""))
-    if rate * length > MANY_STEPS:
+    count = rate * abs(length)
+    if count > MANY_STEPS:
         warnings.warn(
-            f"The pole {pole:g} 1/s of {row!r} holds the steps of {method} below {1 / rate:.2g} s: {rate * length:.1g} "
-            "steps over the span. Take slower poles, drift='project', or 'RadauIIA'.",
+            f"The pole {pole:g} 1/s of {row!r} holds the steps of {method} below {1 / rate:.2g} s: {count:.1g} steps "
+            "over the span. Take slower poles, drift='project', or 'RadauIIA'.",
             RuntimeWarning,
             stacklevel=_outside(),
         )
 
 
-def warn_unresolved(method, step, t, difference, rate):
+def warn_unresolved(method, step, difference, stable=inf):
     """Warn that steps do not resolve a motion, with the largest stable step where that is what fails.
 
     Parameters
     ----------
     method : str
         A fixed-step method.
-    step : float
-        [s]
-    t : float
-        Where one step was compared with two of half its length [s].
+    step : (start, end)
+        That was compared with two of half its length [s].
     difference : float
         Of the two, relative to the size of the state.
-    rate : float
-        The fastest rate |λ| of the motion there [1/s]; NaN where it is not known.
+    stable : float
+        The largest stable step there [s]; NaN where it is not known.
     """
-    limit = largest_explicit(method) / rate
-    stable = f" The largest stable step there is about {limit:.2g} s." if limit < step else ""
+    start, length = step[0], abs(step[1] - step[0])
+    bound = f" The largest stable step there is about {stable:.2g} s." if stable < length else ""
     warnings.warn(
-        f"Steps of {step:.4g} s by {method} do not resolve the motion: at t = {t:.6g} s one step and two of half its "
-        f"length differ by {difference:.2g} of the size of the state.{stable} Take shorter steps, 'RadauIIA' or "
-        "accuracy=1e-6.",
+        f"Steps of {length:.4g} s by {method} do not resolve the motion: at t = {start:.6g} s one step and two of half "
+        f"its length differ by {difference:.2g} of the size of the state.{bound} Take shorter steps, 'RadauIIA' that "
+        "finds its own, or accuracy=1e-6.",
         RuntimeWarning,
         stacklevel=_outside(),
     )

@@ -5,17 +5,16 @@ from itertools import pairwise
 import numpy as np
 
 from servoctl.errors import IntegrationStopped
-from servoctl.simulation.bounds import row_poles, warn_fast_poles, warn_unresolved
+from servoctl.simulation.bounds import largest_explicit, row_poles, warn_fast_poles, warn_unresolved
 from servoctl.simulation.drift import Minimal, Poles, Project
 from servoctl.simulation.minimal import Chart, Sizes
 from servoctl.simulation.motion import Motion, breakpoints, interruptible
-from servoctl.simulation.rule import component_sizes, state_levels
+from servoctl.simulation.resolution import unresolved
 from servoctl.simulation.tableaus import tableau
 from servoctl.simulation.watch import DEGRADED, NEGLIGIBLE, NO_CHOICE, Watch
 
 CHUNK = 2000  # steps per call of the compiled loop
 SLOW_CHUNK = 100  # of the loop in Python
-UNRESOLVED = 0.1  # of the state's size: what a step and two half steps differ by where they are too long
 POWERS, NUDGE = 6, 1e-6  # of the power iteration for the fastest rate: its length, and relative size of a deviation
 NEAR = 0.3  # of its reference: below this the least size of a pivot is looked for within a step
 
@@ -50,7 +49,7 @@ def fixed_step(model, method, drift, span, x0, step, knots, progress):
         cuts = breakpoints(span, knots)
         pieces = [(a, b, max(1, int(np.ceil(abs(b - a) / step * (1 - 1e-12))))) for a, b in pairwise(cuts)]
         if isinstance(drift, Poles):
-            warn_fast_poles(method, row_poles(drift, model), max(abs(b - a) / count for a, b, count in pieces))
+            warn_fast_poles(method, row_poles(drift, model), max(((b - a) / count for a, b, count in pieces), key=abs))
         x = x0
         for a, b, count in pieces:
             if motion.stop is not None:
@@ -124,22 +123,17 @@ class _Fixed:
         return x
 
     def look_back(self):
-        """Warn where a step and two half steps have little in common: of the last ones, the end and the fastest."""
-        model, t, states, _ = self.motion.pieces[-1]
-        if len(t) < 2:
-            return
-        size = component_sizes(states, state_levels(model))
+        """Warn where steps do not resolve the motion."""
         with np.errstate(all="ignore"):
-            fastest = int(np.argmax((np.abs(np.diff(states)) / size[:, None]).max(axis=0)))
-            for k in dict.fromkeys((len(t) - 2, fastest)):
-                x, step = states[:, k], t[k + 1] - t[k]
-                halves = self._steps(t[k], x, step / 2, 2)[0]
-                lost = halves.shape[1] < 3
-                change = np.full(len(x), np.inf) if lost else (states[:, k + 1] - halves[:, -1]) / size
-                difference = float(np.abs(change).max())
-                if not difference <= UNRESOLVED:
-                    warn_unresolved(self.method, abs(step), t[k], difference, self._fastest_rate(t[k], x, change, size))
-                    return
+            found = unresolved(self.motion.pieces, self._halved)
+            if found is not None:
+                step, x, difference, size = found
+                stable = largest_explicit(self.method) / self._fastest_rate(step[0], x, difference, size)
+                warn_unresolved(self.method, step, np.abs(difference).max(), stable)
+
+    def _halved(self, model, t, x, h):
+        self._use(model)
+        return self._steps(t, x, h, 2)[0]
 
     def _fastest_rate(self, t, x, direction, size):
         """|λ| of the mode that dominates in a direction, by power iteration; NaN where it is not finite."""

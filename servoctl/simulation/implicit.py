@@ -7,7 +7,9 @@ import numpy as np
 from servoctl.errors import IntegrationStopped
 from servoctl.model.implicit import first_step, inside
 from servoctl.simulation.adaptive import INSIDE, Adaptive
+from servoctl.simulation.bounds import warn_unresolved
 from servoctl.simulation.drift import Poles, Project
+from servoctl.simulation.resolution import unresolved
 from servoctl.simulation.watch import DEGRADED, NO_CHOICE
 
 CHUNK = 200  # steps per call of the compiled loop
@@ -157,6 +159,27 @@ class RadauMethod(InBulk):
         self.f = self.loop.f
         self.p = np.append(model.parameters, self.drift.coefficients(model)) if stabilised else model.parameters
         self.n_x = self.f.n_x
+
+    def run(self, t0, x0, t1, t_eval, knots):
+        """Integrate from t0 to t1; samples at t_eval. Fixed steps that do not resolve the motion are warned about."""
+        self.taken = []
+        motion = super().run(t0, x0, t1, t_eval, knots)
+        if self.step is not None and motion.stop is None and not motion.interrupted:
+            found = unresolved(self.taken, self._halved)
+            if found is not None:
+                step, _, difference, _ = found
+                warn_unresolved("RadauIIA", step, np.abs(difference).max())
+        return motion
+
+    def _halved(self, model, t, x, h):
+        self._use(model)
+        settings = (self.rtol, self.atol, 2, True, self.every)
+        return self.loop.steps(t, x, t + 2 * h, self.p, self.order, abs(h), *settings)[1]
+
+    def _record(self, steps, stand):
+        super()._record(steps, stand)
+        if self.step is not None:
+            self.taken.append((self.model, steps.t[: stand + 1], steps.x[:, : stand + 1]))
 
     def _begin(self, a, x, b):
         if self.step is None:

@@ -1,5 +1,6 @@
 """Generalised coordinates, quasi-velocities and their jets, and the total derivative (3.1)."""
 
+import threading
 from math import isfinite
 from numbers import Integral
 
@@ -7,7 +8,10 @@ import casadi as ca
 
 from servoctl.errors import SpecificationError
 from servoctl.spec.elementary import divide, multiply
-from servoctl.spec.taylor import Series, Tape, _is_zero
+from servoctl.spec.tape import Tape
+from servoctl.spec.taylor import Series, is_zero
+
+_guard = threading.Lock()
 
 
 def column(value, what, size=None):
@@ -113,7 +117,7 @@ class Coordinates:
         self.nq = len(names)
         self.t = ca.SX.sym("t")
         self._q = tuple(ca.SX.sym(name) for name in names)
-        self._w, self._columns = {}, {}
+        self._w = {}
         self._index = {self.t.element_hash(): ("t", 0, 0)}
         self._index |= {s.element_hash(): ("q", 0, i) for i, s in enumerate(self._q)}
         self.velocity_names = tuple(f"d{name}" for name in names)
@@ -193,17 +197,16 @@ class Coordinates:
     def gamma(self, k):
         """Symbols of γ^(k), k >= 1: a tuple of n SX scalars. γ' are the quasi-velocities."""
         if k not in self._w:
-            base = self.names if self.plain else self.velocity_names
-            symbols = tuple(ca.SX.sym(jet_name(name, k, self.plain)) for name in base)
-            self._w[k] = symbols
-            self._index |= {s.element_hash(): ("w", k, i) for i, s in enumerate(symbols)}
+            with _guard:  # threads that derive from one mechanism share its symbols
+                if k not in self._w:
+                    symbols = tuple(map(ca.SX.sym, self.jet_names(k)))
+                    self._index |= {s.element_hash(): ("w", k, i) for i, s in enumerate(symbols)}
+                    self._w[k] = symbols
         return self._w[k]
 
     def jet(self, k):
         """γ^(k), k >= 1, or q for k = 0, as a column: (n,) or (nq,) SX."""
-        if k not in self._columns:
-            self._columns[k] = ca.vertcat(*(self.gamma(k) if k else self._q))
-        return self._columns[k]
+        return ca.vertcat(*(self.gamma(k) if k else self._q))
 
     def jet_names(self, k):
         """Names of γ^(k), k >= 1, or of q for k = 0."""
@@ -306,7 +309,7 @@ class Coordinates:
         if self.plain:
             return divide(self.gamma(j)[i], factorial)
         velocity = series.c[series.tape.outputs[i - self.nq]][j - 1]  # the last outputs are q'
-        return 0.0 if _is_zero(velocity) else divide(velocity, j)
+        return 0.0 if is_zero(velocity) else divide(velocity, j)
 
 
 def _order(k):

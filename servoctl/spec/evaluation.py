@@ -8,6 +8,10 @@ from servoctl.spec.elementary import apply
 class Plan:
     """The nodes of a tape in an order in which those that are run together stand side by side.
 
+    Parameters
+    ----------
+    nodes : list of Node
+
     Attributes
     ----------
     place : (n_nodes,) array of int

@@ -7,8 +7,9 @@ import numpy as np
 
 from servoctl.errors import SpecificationError, unknown
 from servoctl.spec.coordinates import Coordinates, column, mapping
+from servoctl.spec.evaluation import evaluate
 from servoctl.spec.parameters import Parameters
-from servoctl.spec.taylor import Tape, evaluate
+from servoctl.spec.tape import Tape
 
 _SEED = 20021  # of the random points at which identities are tested
 

@@ -8,34 +8,30 @@ coefficient k of f is f^(k)/k!.
 """
 
 from servoctl.spec.elementary import add, apply, divide, multiply, select, subtract
-from servoctl.spec.evaluation import evaluate
-from servoctl.spec.tape import Tape
-
-__all__ = ["Series", "Tape", "evaluate"]
-
-
-def _is_zero(c):
-    return c.__class__ in _NUMBERS and c == 0
-
 
 _NUMBERS = (float, int)
+
+
+def is_zero(c):
+    """Whether a coefficient is the number zero, which needs no arithmetic."""
+    return c.__class__ in _NUMBERS and c == 0
 
 
 def _dot(pairs):
     total = 0.0
     for a, b in pairs:
-        if not (_is_zero(a) or _is_zero(b)):
+        if not (is_zero(a) or is_zero(b)):
             product = multiply(a, b)
-            total = product if _is_zero(total) else add(total, product)
+            total = product if is_zero(total) else add(total, product)
     return total
 
 
 def _plus(a, b):
-    return b if _is_zero(a) else a if _is_zero(b) else add(a, b)
+    return b if is_zero(a) else a if is_zero(b) else add(a, b)
 
 
 def _minus(a, b):
-    return a if _is_zero(b) else multiply(-1.0, b) if _is_zero(a) else subtract(a, b)
+    return a if is_zero(b) else multiply(-1.0, b) if is_zero(a) else subtract(a, b)
 
 
 def _inner_first(k, first=0):
@@ -85,7 +81,7 @@ class Series:
         for i, (kind, args, data) in enumerate(self.nodes):
             if kind == "mul":
                 a, b = c[args[0]][0], c[args[1]][0]
-                value = 0.0 if _is_zero(a) or _is_zero(b) else multiply(a, b)
+                value = 0.0 if is_zero(a) or is_zero(b) else multiply(a, b)
             elif kind == "add":
                 value = _plus(c[args[0]][0], c[args[1]][0])
             elif kind == "sub":
@@ -93,7 +89,7 @@ class Series:
                 value = _minus(a, b)
             elif kind == "neg":
                 a = c[args[0]][0]
-                value = 0.0 if _is_zero(a) else -a
+                value = 0.0 if is_zero(a) else -a
             elif kind == "input":
                 value = inputs[data][0]
             elif kind == "const":
@@ -129,7 +125,7 @@ class Series:
             return apply(node.data, *(self._first(j) for j in node.args)) if k == 0 else 0.0
         a = c[node.args[0]]
         if kind == "neg":
-            return 0.0 if _is_zero(a[k]) else -a[k]
+            return 0.0 if is_zero(a[k]) else -a[k]
         if kind == "scale":
             return multiply(a[k], node.data)
         if kind == "copy":
@@ -141,7 +137,7 @@ class Series:
             if k == 0:
                 return apply("sqrt", a[0])
             rest = _minus(a[k], _dot((y[j], y[k - j]) for j in range(1, k)))
-            return 0.0 if _is_zero(rest) else divide(rest, multiply(2.0, y[0]))
+            return 0.0 if is_zero(rest) else divide(rest, multiply(2.0, y[0]))
         if kind == "power":
             return self._constant_power(a, c[i], node.data, k)
         if kind == "fabs":
@@ -156,25 +152,25 @@ class Series:
         if kind == "div":
             y = c[i]
             rest = _minus(a[k], _dot((y[j], b[k - j]) for j in _inner_first(k) if j < k))
-            return 0.0 if _is_zero(rest) else divide(rest, b[0])
+            return 0.0 if is_zero(rest) else divide(rest, b[0])
         if kind == "gate":
-            return 0.0 if _is_zero(b[k]) else select(a[0] != 0, b[k], 0.0)
+            return 0.0 if is_zero(b[k]) else select(a[0] != 0, b[k], 0.0)
         first = self._first(node.args[0]) <= self._first(node.args[1])
         return select(first, *((a[k], b[k]) if kind == "fmin" else (b[k], a[k])))
 
     @staticmethod
     def _square(a, k):
         if k == 0:
-            return 0.0 if _is_zero(a[0]) else multiply(a[0], a[0])
-        inner = multiply(a[k // 2], a[k // 2]) if k % 2 == 0 and not _is_zero(a[k // 2]) else 0.0
+            return 0.0 if is_zero(a[0]) else multiply(a[0], a[0])
+        inner = multiply(a[k // 2], a[k // 2]) if k % 2 == 0 and not is_zero(a[k // 2]) else 0.0
         return _plus(inner, multiply(2.0, _dot((a[j], a[k - j]) for j in reversed(range((k + 1) // 2)))))
 
     @staticmethod
     def _constant_power(a, y, exponent, k):
         if k == 0:
             return a[0] ** exponent
-        total = _dot((multiply(exponent * (k - j) - j, a[k - j]), y[j]) for j in range(k) if not _is_zero(a[k - j]))
-        if _is_zero(total):
+        total = _dot((multiply(exponent * (k - j) - j, a[k - j]), y[j]) for j in range(k) if not is_zero(a[k - j]))
+        if is_zero(total):
             return 0.0
         vanishes = a[0] if k < exponent else sum(apply("fabs", c) for c in a)  # the power of a zero is zero
         return select(vanishes == 0, 0.0, divide(total, multiply(k, a[0])))
@@ -186,5 +182,5 @@ class Series:
         total = 0.0
         for argument, slope in zip(node.args, slopes, strict=True):
             a, g = self.c[argument], self.c[slope]
-            total = _plus(total, _dot((multiply(j, a[j]), g[k - j]) for j in _inner_first(k, 1) if not _is_zero(a[j])))
-        return total if k == 1 or _is_zero(total) else divide(total, k)
+            total = _plus(total, _dot((multiply(j, a[j]), g[k - j]) for j in _inner_first(k, 1) if not is_zero(a[j])))
+        return total if k == 1 or is_zero(total) else divide(total, k)

@@ -16,6 +16,7 @@ from servoctl.errors import SpecificationError
 from servoctl.simulation.bounds import amplification, row_poles
 from servoctl.simulation.drift import Poles, as_drift
 from servoctl.simulation.tableaus import ORDERS
+from servoctl.study.study import positives
 
 METHODS = (*ORDERS, "Taylor", "RadauIIA")
 RADAU_ORDER = 5  # unless it is given; all are L-stable
@@ -80,7 +81,7 @@ class StabilityMap:
         (N,) or (K, N) array
             max |R(hλ)| / max(1, |e^hλ|): a step is not blamed for what the motion does itself.
         """
-        step = positive("step", step, "A step is a positive number of seconds, or several.", "Give 1e-3.")
+        step = positives("step", step, do="Give 1e-3, in seconds.")
         z = np.multiply.outer(step, self.eigenvalues(drift))
         if order is None:
             order = {"Taylor": self.order, "RadauIIA": RADAU_ORDER}.get(method)
@@ -162,8 +163,8 @@ class StabilityMap:
         from servoctl.study.stability_figure import draw
 
         if poles is not None:
-            rule = "The axis of the map goes over two or more poles of positive magnitude 1/T [1/s]."
-            poles = np.sort(np.ravel(positive("poles", poles, rule, "Give numpy.geomspace(1, 100, 41).", fewest=2)))
+            do = "Give numpy.geomspace(1, 100, 41), in 1/s."
+            poles = np.sort(np.ravel(positives("poles", poles, do, fewest=2)))
         return draw(self, method, poles)
 
     def __repr__(self):
@@ -257,17 +258,6 @@ def _internal_rates(J, C, free):
     """Eigenvalues of Nᵀ J N, the columns of N orthonormal in ker C; where nothing moves there are none."""
     N = np.linalg.svd(C)[2][len(C[0]) - free :].T
     return np.linalg.eigvals(N.T @ J @ N).astype(complex)
-
-
-def positive(name, given, rule, do, fewest=1):
-    """Numbers that a designer gives as an array, refused unless all are positive and finite."""
-    try:
-        found = np.asarray(given, dtype=float)
-    except (TypeError, ValueError):
-        found = np.zeros(1)
-    if found.size < fewest or not np.all(np.isfinite(found) & (found > 0)):
-        raise SpecificationError(f"{name}={given!r} was given.", rule, do=do)
-    return found
 
 
 def _step_text(step):

@@ -7,6 +7,7 @@ import warnings
 
 import numpy as np
 
+from servoctl.control.tracking import positive
 from servoctl.errors import LimitExceeded, ServoError, SpecificationError, unknown
 from servoctl.model.compiled import compiling_at_once
 from servoctl.simulation.drift import Minimal, Poles, Project, as_drift
@@ -14,7 +15,7 @@ from servoctl.simulation.rule import motion_error, relative_error
 from servoctl.simulation.simulate import ALL_METHODS, as_span, consistent_state, simulate
 from servoctl.simulation.tableaus import ORDERS
 from servoctl.study.front import TradeOff
-from servoctl.study.study import machine
+from servoctl.study.study import machine, positives
 
 METHODS = tuple(name for name in ALL_METHODS if name not in ("RK1", "RK2", "RK23"))  # those need too many steps
 TOLERANCES = (1e-3, 1e-5, 1e-7, 1e-9, 1e-11, 1e-13)
@@ -76,9 +77,13 @@ def tradeoff(model, x0, t_span, methods=None, drift=None, *, rtol=TOLERANCES, st
         For settings that are none.
     """
     t0, t1 = as_span(t_span)
-    settings = {"rtol": _positive("rtol", rtol, most=1.0)}
-    settings["step"] = _positive("step", [abs(t1 - t0) / n for n in STEPS] if step is None else step)
-    limit = _positive("seconds", [seconds])[0]
+    steps = [abs(t1 - t0) / n for n in STEPS] if step is None else step
+    given = {
+        "rtol": positives("rtol", rtol, "Leave rtol out.", most=1.0),
+        "step": positives("step", steps, "Leave step out."),
+    }
+    settings = {name: np.ravel(values).tolist() for name, values in given.items()}
+    limit = positive("seconds", seconds)
     drifts = (None, "project", "minimal", abs(t1 - t0) / TIME_CONSTANT) if drift is None else drift
     combinations = _combinations(model, methods, drifts if isinstance(drifts, (list, tuple)) else [drifts])
     total = sum(len(settings[_kind(method)]) for method, _ in combinations)
@@ -318,19 +323,6 @@ def _label(treatment):
 def _said(options):
     order = f" of order {options['order']}" if "order" in options else ""
     return f"{options['method']}{order}" + (f" at {options['rtol']:g}" if "rtol" in options else "")
-
-
-def _positive(name, given, most=np.inf):
-    try:
-        values = [float(value) for value in np.atleast_1d(given)]
-    except (TypeError, ValueError):
-        values = []
-    if not values or not all(np.isfinite(value) and 0 < value <= most for value in values):
-        bound = "" if most == np.inf else f", at most {most:g}"
-        raise SpecificationError(
-            f"{name} was given as {given!r}.", f"It is a positive number{bound}, or several.", do=f"Leave {name} out."
-        )
-    return values
 
 
 def _bar(total, wanted):

@@ -4,6 +4,7 @@ import casadi as ca
 import closed_forms as cf
 import numpy as np
 import pytest
+from conftest import pendulum
 
 import servoctl as sv
 from servoctl.mechanisms import spiral
@@ -57,22 +58,6 @@ def test_a_crane_in_any_unit(unit):
     assert run["theta"] == pytest.approx(reference["theta"], abs=1e-10)
     for name in ("trolley", "hoist"):
         assert run[name] / unit == pytest.approx(reference[name], abs=1e-9 * np.abs(reference[name]).max())
-
-
-def pendulum(unit, guess):
-    """A pendulum in x and y, its rod of 1 m a material constraint, with lengths in 1/unit metres; a cart beside it."""
-    p = sv.parameters(m=1.0, g=9.81 * unit, length=unit)
-    q = sv.coordinates("s x y")
-    s, x, y = q
-    mechanism = sv.Mechanism(
-        q,
-        gibbs=sv.particle(q, p.m, (x, y)) + sv.particle(q, 2.0, (s,)),
-        potential=p.m * p.g * y,
-        actuators={"force": s},
-        constraints={"rod": x**2 + y**2 - p.length**2},
-        parameters=p,
-    )
-    return sv.derive(mechanism, sv.Program({"cart": s - 0.1 * unit * ca.sin(q.t)}), guess={"y": -unit} if guess else {})
 
 
 @pytest.mark.parametrize("guess", [True, False])

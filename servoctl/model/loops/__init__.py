@@ -5,13 +5,14 @@ function is ``NAME(t, x, p, y)``, and NAME_PROJECT(t, x, p) restores invariants 
 them.
 """
 
+from servoctl.model.loops.circular import circular
 from servoctl.model.loops.grid import GRID, PROJECTION
 from servoctl.model.loops.lanes import lanes
 from servoctl.model.loops.newton import NEWTON
 from servoctl.model.loops.rk import RK
 from servoctl.model.loops.taylor import TAYLOR
 
-__all__ = ["BISECTIONS", "GRID", "LOOPS", "NEAR", "PROJECTION", "QUADRATIC", "ROUNDING", "lanes"]
+__all__ = ["BISECTIONS", "GRID", "LOOPS", "NEAR", "PROJECTION", "QUADRATIC", "ROUNDING", "circular", "lanes"]
 
 BISECTIONS = 20  # halvings of one time step in newton: a millionth of it is a lost solution, not a long step
 ROUNDING = 2.0**-52  # a Newton correction this small relative to 1 + |x| cannot be reduced by another

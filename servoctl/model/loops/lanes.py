@@ -1,14 +1,14 @@
 """Several points at once, as C text: the vector type W with the functions that emitted statements call.
 
-A function is emitted a second time, with ``V``, ``K`` and ``v_sin`` in their meanings for W. sin and cos are those of
-fdlibm, after a reduction by three parts of pi/2; what has no formula here is taken lane by lane. Values differ from the
-scalar ones by rounding.
+A function is emitted a second time, with ``V``, ``K`` and ``v_sin`` in their meanings for W. What has no formula here
+or in `circular` is taken lane by lane. Values differ from the scalar ones by rounding.
 """
 
 import re
 
+from servoctl.model.loops.circular import FAR, turned
+
 LANES = 8
-FAR = 1e5  # beyond it sin and cos are those of the C library
 
 _TYPES = """
 enum { W_LANES = COUNT };
@@ -28,6 +28,8 @@ INLINE int w_any(I mask)
     __builtin_memcpy(&word, &bytes, W_LANES);
     return word != 0;
 }
+INLINE I w_bits(W a) { return (I)a; }
+INLINE W w_value(I bits) { return (W)bits; }
 INLINE W w_truth(I mask) { return (W)(mask & (I)ALL(1.0)); }
 """
 
@@ -46,25 +48,7 @@ _OWN = {
     "fmax": "w_select((a >= b) | (b != b), a, b)",
 }
 
-_SINCOS = """
-/* sin(a + turns pi/2), for lanes that are finite and not large. */
-INLINE W w_turned(W a, int64_t turns)
-{
-    const W n_shifted = a * 0.63661977236758134308 + 6755399441055744.0, n = n_shifted - 6755399441055744.0;
-    const W near = (a - n * 1.57079632673412561417e+00) - n * 6.07710050630396597660e-11;
-    const W r = near - n * 2.02226624879595063154e-21;
-    const W z = r * r, half = 0.5 * z, w = 1.0 - half;
-    const W s = w_select(r == 0, r, r + z * r * (-1.66666666666666324348e-01 + z * (8.33333333332248946124e-03
-        + z * (-1.98412698298579493134e-04 + z * (2.75573137070700676789e-06 + z * (-2.50507602534068634195e-08
-        + z * 1.58969099521155010221e-10))))));
-    const W c = w + (((1.0 - w) - half) + z * z * (4.16666666666666019037e-02 + z * (-1.38888888888741095749e-03
-        + z * (2.48015872894767294178e-05 + z * (-2.75573143513906633035e-07 + z * (2.08757232129817482790e-09
-        + z * -1.13596475577881948265e-11))))));
-    const I quadrant = (I)n_shifted + turns;
-    const W value = w_select((quadrant & 1) != 0, c, s);
-    return (W)((I)value ^ ((quadrant & 2) << 62));
-}
-
+_MODERATE = """
 INLINE int w_moderate(W a) { return !w_any(~((W)((I)a & 0x7fffffffffffffffLL) < FAR)); }
 """
 
@@ -115,6 +99,5 @@ def lanes(text, operations, n=LANES):
         f"#undef v_{name}\n" + (f"#define v_{name} {scalar}\n" if scalar else "") for name, (_, scalar) in used.items()
     )
     types = f"#define FAR {FAR}" + _TYPES.replace("COUNT", str(n)).replace("SAME", ", ".join(n * ["(c)"]))
-    return "".join(
-        (types, _SINCOS if used.keys() & {"sin", "cos"} else "", functions, begin, _MEANING, text, end, _MEANT)
-    )
+    circular = turned("w", "W", "I") + _MODERATE if used.keys() & {"sin", "cos"} else ""
+    return "".join((types, circular, functions, begin, _MEANING, text, end, _MEANT))

@@ -13,11 +13,6 @@ from servoctl.reduction.row import gradient, merge_uses
 DEPENDENT = 1e-11  # what may be left of a row after the combination of others, both equilibrated
 
 
-def sample_rows(q, rows, level, context, **options):
-    """Points on the manifold of rows and their derivatives up to a level (see `manifold.sample`)."""
-    return sample(q, rows, level, context, **options)
-
-
 def leading(q, rows, points):
     """The cleaned leading matrix L at points, (rows, n, N), and the sizes of its entries."""
     values, sizes = points.matrix(ca.vertcat(*(gradient(q, row) for row in rows)))
@@ -36,7 +31,7 @@ def settle_alone(q, rows, context):
     found = [None] * len(rows)
     for level in set(levels) - {-1}:
         members = [a for a, own in enumerate(levels) if own == level and rows[a].order <= level]
-        points = sample_rows(q, [], level, context)
+        points = sample(q, [], level, context)
         gradients = [gradient(q, rows[a], level) for a in members]
         points.read([*(rows[a].expression for a in members), *(e for g in gradients for e in g.nonzeros())])
         values = clean(*points.matrix(ca.vertcat(*gradients)))
@@ -69,7 +64,7 @@ def settle(q, row, others, context, starts=None):
     points : Points
     """
     level = max([row.order, q.order(row.expression), 0, *(other.order for other in others)])
-    points = sample_rows(q, others, level, context, starts=starts)
+    points = sample(q, others, level, context, starts=starts)
     if not len(points.t):
         return None, points
     for j in range(q.order(row.expression), -1, -1):
