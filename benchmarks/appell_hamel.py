@@ -15,7 +15,8 @@ from harness import Missing, Row, fastest, installed
 from native import COMPILER, build, function
 
 import servoctl as sv
-from servoctl.mechanisms import appell_hamel
+from servoctl.gallery import appell_hamel
+from servoctl.methods.series import series_loop
 
 DURATION = 10.0  # s
 P = {"m": 1.0, "M": 5.0, "I_x": 0.1125, "I_y": 0.225, "a": 0.3, "b": 0.1, "rho": 0.2, "g": 9.81}
@@ -76,7 +77,7 @@ def rolling():
 
 def taylor(scene, last, rtol):
     model, start = scene()
-    f, x0 = model.taylor(last), start.values
+    f, x0 = series_loop(model, last), start.values
     p = np.append(model.parameters, DURATION / 2)
 
     def call():

@@ -11,7 +11,7 @@ from harness import Missing, Row, fastest, installed
 from native import COMPILER
 
 import servoctl as sv
-from servoctl.mechanisms import planar_arm, spatial_arm
+from servoctl.gallery import planar_arm, spatial_arm
 
 P = {"m": 1.0, "l": 0.5, "g": 9.81}  # as the arms have them
 NO_COMPILER = Missing("gcc is not installed")

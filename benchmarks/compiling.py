@@ -10,8 +10,8 @@ from harness import Limit, Missing, Row
 from native import COMPILER, build, casadi_text, function
 
 import servoctl as sv
-from servoctl.model.emit import emit, operations
-from servoctl.model.series import taylor_coefficients
+from servoctl.codegen.emit import emit, operations
+from servoctl.methods.series import taylor_coefficients
 
 LAST = 48  # index of Taylor coefficients at which the function has 24,000 operations
 CALL, BUFFER = "casadi Function.__call__ of compiled code", "casadi FunctionBuffer of compiled code"
@@ -21,7 +21,7 @@ COLUMN, ARRAYS = (ctypes.c_double, *3 * [ctypes.c_void_p]), (*4 * [ctypes.c_void
 def compile_long():
     """From an SX function to a loaded library at -O2: our chunked text against CasADi's single C function."""
     model, start = appell_hamel.constrained()
-    f = taylor_coefficients(model._equations, LAST)
+    f = taylor_coefficients(model.equations, LAST)
     inputs = np.array([0.0]), start.values, np.append(model.parameters, 5.0)
     y = np.empty(f.numel_out(0))
     pointers = [v.ctypes.data for v in inputs]
@@ -115,7 +115,7 @@ def total_derivative(rounds):
 def taylor_growth(rounds):
     """The same for the Taylor coefficients of a motion, for indices up to 8 and up to 16."""
     model, _ = appell_hamel.constrained()
-    low, high = (operations(taylor_coefficients(model._equations, k)) for k in (8, 16))
+    low, high = (operations(taylor_coefficients(model.equations, k)) for k in (8, 16))
     return [high / low]
 
 

@@ -11,8 +11,8 @@ from harness import Limit, Missing, Row, installed
 from native import COMPILER
 
 import servoctl as sv
-from servoctl.mechanisms import planar_arm
-from servoctl.model import compiler
+from servoctl.codegen import compiler
+from servoctl.gallery import planar_arm
 from servoctl.model.saddle import accelerations
 
 PEER = "SymPy: Kane's method, lambdify(cse=True)"
@@ -21,7 +21,7 @@ LINKS = 4
 
 def derived(n, coordinates="joints"):
     """The SX function of accelerations and reaction, from nothing."""
-    return accelerations(sv.derive(*planar_arm(n, coordinates))._equations)
+    return accelerations(sv.derive(*planar_arm(n, coordinates)).equations)
 
 
 def compiled(n, coordinates):

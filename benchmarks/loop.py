@@ -11,7 +11,7 @@ from harness import Missing, Row, installed
 from native import COMPILER
 
 import servoctl as sv
-from servoctl.mechanisms import overhead_crane
+from servoctl.gallery import overhead_crane
 
 RATE, END = 1000.0, 10.0
 M_TROLLEY, M_HOIST, M_LOAD, G = 10.0, 5.0, 115.0, 9.81  # of the plant; the law believes in 100 kg

@@ -19,7 +19,7 @@ IMPORTS = 7  # processes at least, for a median
 FIRST_PLAN = """
 import json, time
 import servoctl as sv
-from servoctl.mechanisms import gallery
+from servoctl.gallery import gallery
 
 start = time.perf_counter()
 scene = gallery["overhead-crane"]

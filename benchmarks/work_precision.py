@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 import servoctl as sv
-from servoctl.mechanisms import gallery
+from servoctl.gallery import gallery
 
 DOCS = Path(__file__).parents[1] / "docs"
 SCENES = ("appell-hamel", "two-cars-ideal", "mass-on-car", "passive-arm", "wheeled-robot", "overhead-crane", "vtol")

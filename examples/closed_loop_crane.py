@@ -8,7 +8,7 @@ import sys
 import numpy as np
 
 import servoctl as sv
-from servoctl.mechanisms import overhead_crane
+from servoctl.gallery import overhead_crane
 
 GUST = {"theta": sv.disturbances.gust(60.0, 2.0, 2.5)}  # N m
 SENSORS = {"x": 1e-3, "l": 1e-3, "theta": 1e-3}  # m, m, rad: standard deviations

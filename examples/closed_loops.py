@@ -9,7 +9,7 @@ from functools import partial
 import numpy as np
 
 import servoctl as sv
-from servoctl.mechanisms import gallery, pendubot
+from servoctl.gallery import gallery, pendubot
 
 
 def planned(name, t_span=None, build=None, start=None):

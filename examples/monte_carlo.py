@@ -8,7 +8,7 @@ from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 import numpy as np
 
 import servoctl as sv
-from servoctl.mechanisms import overhead_crane
+from servoctl.gallery import overhead_crane
 
 
 @functools.cache

@@ -4,15 +4,15 @@ A specification flows one way: Mechanism and Program, by `derive`, become a Mode
 `verify` proves the run against the full mechanism.
 """
 
-from servoctl import interop, plots, spec
+from servoctl import interop, spec
 from servoctl.control import disturbances
 from servoctl.control.close import close
-from servoctl.control.closed import Closed
 from servoctl.control.computed import computed
 from servoctl.control.law import Controller, Law
 from servoctl.control.limits import LimitReport, limit_report, limited
 from servoctl.control.lqr import lqr
 from servoctl.control.observer import output_feedback
+from servoctl.control.result import Closed
 from servoctl.control.time_law import TimeLaw, fastest
 from servoctl.control.tracking import feedforward, pd
 from servoctl.errors import (
@@ -26,15 +26,15 @@ from servoctl.errors import (
     SpecificationError,
     UnstableInternalDynamics,
 )
-from servoctl.model.export import export_c
+from servoctl.export.c import export_c
+from servoctl.figures import run as plots
+from servoctl.internal_dynamics import InternalDynamics, internal_dynamics
+from servoctl.methods.bounds import sampled_bound
+from servoctl.methods.drift import poles, project
 from servoctl.model.model import Model, derive
-from servoctl.model.plant import Plant, plant
-from servoctl.simulation.bounds import sampled_bound
-from servoctl.simulation.drift import poles, project
-from servoctl.simulation.internal import InternalDynamics, internal_dynamics
-from servoctl.simulation.run import Run, load
-from servoctl.simulation.simulate import simulate
-from servoctl.simulation.verify import Verification, verify
+from servoctl.plants.plant import Plant, plant
+from servoctl.run import Run, load
+from servoctl.simulation import simulate
 from servoctl.spec import (
     Coordinates,
     Mechanism,
@@ -47,15 +47,16 @@ from servoctl.spec import (
     paths,
     rigid_body,
 )
-from servoctl.study.batch import Batch, close_many
 from servoctl.study.cases import grid, monte_carlo
+from servoctl.study.close_many import Batch, close_many
 from servoctl.study.dae import DaeComparison, dae_comparison
 from servoctl.study.formulation import FormulationCost, formulation_cost
 from servoctl.study.front import TradeOff
-from servoctl.study.stability import StabilityMap, stability
-from servoctl.study.study import Study, load_study
+from servoctl.study.stability_map import StabilityMap, stability
 from servoctl.study.sweep import merge, sweep
+from servoctl.study.table import Study, load_study
 from servoctl.study.tradeoff import tradeoff
+from servoctl.verification import Verification, verify
 
 __version__ = "0.1.0"
 

@@ -2,7 +2,7 @@
 
 import sys
 
-from servoctl.cli import main
+from servoctl.shell.main import main
 
 if __name__ == "__main__":
     sys.exit(main())

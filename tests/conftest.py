@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 import servoctl as sv
-from servoctl.mechanisms import gallery
-from servoctl.model import compiler
-from servoctl.model.compiled import compiling_at_once
+from servoctl.codegen import compiler
+from servoctl.codegen.function import compiling_at_once
+from servoctl.gallery import gallery
 from servoctl.model.model import derive
 
 os.environ["SERVOCTL_MEMO"] = "none"  # tests derive themselves what they test

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 import servoctl as sv
-from servoctl.cli import main
 from servoctl.errors import LimitExceeded, SpecificationError
-from servoctl.mechanisms import gallery
-from servoctl.simulation import rule
+from servoctl.gallery import gallery
+from servoctl.methods import accuracy as rule
+from servoctl.shell.main import main
 
 INTEGRATED = ("appell-hamel", "two-cars-ideal", "mass-on-car", "passive-arm", "pendubot", "wheeled-robot")
 ASKED = [*((name, accuracy) for name in INTEGRATED for accuracy in (1e-4, 1e-6, 1e-9)), ("spiral", 1e-6)]

@@ -5,7 +5,7 @@ import pytest
 from scipy.interpolate import make_interp_spline
 
 import servoctl as sv
-from servoctl.mechanisms import gallery
+from servoctl.gallery import gallery
 
 
 def taylor(gallery_model, name, t0, t1, jets):

@@ -17,7 +17,7 @@ from servoctl.errors import (
     SingularProgram,
     SpecificationError,
 )
-from servoctl.mechanisms import cars, mass_on_car, overhead_crane, spiral, vtol
+from servoctl.gallery import cars, mass_on_car, overhead_crane, spiral, vtol
 from servoctl.model.model import derive
 
 

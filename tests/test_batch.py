@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 import servoctl as sv
-from servoctl.mechanisms import gallery
-from servoctl.model import batch, compiler, emit
+from servoctl.codegen import compiler, emit
+from servoctl.control import batch
+from servoctl.gallery import gallery
 
 CRANE, PROGRAM = gallery["overhead-crane"].build()
 N = 32

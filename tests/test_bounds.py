@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 import servoctl as sv
-from servoctl.mechanisms import mass_on_car
-from servoctl.simulation import bounds
-from servoctl.simulation.rule import motion_error
-from servoctl.simulation.tableaus import ORDERS
+from servoctl.gallery import mass_on_car
+from servoctl.methods import bounds
+from servoctl.methods.accuracy import motion_error
+from servoctl.methods.tableaus import ORDERS
 
 
 @pytest.mark.parametrize(

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import servoctl as sv
-from servoctl.mechanisms import gallery
+from servoctl.gallery import gallery
 
 STOPS = {"appell-hamel-squared": 0.6983110523, "constant-speed-horizontal": 5.0 / 9.81}  # s: the others reach their end
 FLAT = (

@@ -12,11 +12,11 @@ from types import SimpleNamespace
 import pytest
 
 import servoctl
-from servoctl.cli import main
 from servoctl.errors import IntegrationStopped
-from servoctl.mechanisms import gallery
-from servoctl.rundir import FILES, LOOP_FILES
-from servoctl.simulation.simulate import ALL_METHODS
+from servoctl.gallery import gallery
+from servoctl.shell.folder import FILES, LOOP_FILES
+from servoctl.shell.main import main
+from servoctl.simulation import ALL_METHODS
 
 FALL = '''"""A mass in a plane follows a path in x, and falls."""
 import servoctl as sv
@@ -384,12 +384,12 @@ def test_report_of_an_earlier_run(here, fall, capsys):
 def test_the_version_and_a_quick_help():
     script = """
 import sys
-from servoctl.cli import main
+from servoctl.shell.main import main
 try:
     main(["--help"])
 except SystemExit as stop:
     assert stop.code == 0
-slow = [name for name in ("matplotlib", "scipy.integrate", "control", "servoctl.mechanisms") if name in sys.modules]
+slow = [name for name in ("matplotlib", "scipy.integrate", "control", "servoctl.gallery") if name in sys.modules]
 assert not slow, slow
 """
     helped = process(sys.executable, "-c", script)

@@ -8,10 +8,10 @@ import pytest
 from matplotlib.colors import to_hex
 
 import servoctl as sv
-from servoctl.cli import main
-from servoctl.control.closed_figure import LIMIT
-from servoctl.mechanisms import gallery
-from servoctl.rundir import FILES
+from servoctl.figures.loop import LIMIT
+from servoctl.gallery import gallery
+from servoctl.shell.folder import FILES
+from servoctl.shell.main import main
 
 CRANE, PROGRAM = gallery["overhead-crane"].build()
 UNITS = gallery["overhead-crane"].units

@@ -9,7 +9,7 @@ import pytest
 from conftest import numbers
 
 import servoctl as sv
-from servoctl.mechanisms import gallery
+from servoctl.gallery import gallery
 
 CRANE, CRANE_PROGRAM = gallery["overhead-crane"].build()
 

@@ -9,7 +9,7 @@ import pytest
 from scipy.optimize import brentq, minimize_scalar
 
 import servoctl as sv
-from servoctl.mechanisms import cars, gallery, mass_on_car, passive_arm, spiral, vtol
+from servoctl.gallery import cars, gallery, mass_on_car, passive_arm, spiral, vtol
 
 TIGHT = {"rtol": 1e-12, "atol": 1e-13}
 

@@ -10,10 +10,10 @@ import casadi as ca
 import numpy as np
 import pytest
 
+from servoctl.codegen import compiler, emit
+from servoctl.codegen.function import compiled, compiling_at_once
 from servoctl.errors import NameUnknown, SpecificationError
-from servoctl.model import compiler, emit
-from servoctl.model.compiled import compiled, compiling_at_once
-from servoctl.simulation.tableaus import tableau
+from servoctl.methods.tableaus import tableau
 
 T, X2, P1 = ca.SX.sym("t"), ca.SX.sym("x", 2), ca.SX.sym("p", 1)
 RK4 = tableau("RK4")

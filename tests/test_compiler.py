@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from test_compiled import P1, RK4, X2, T, function, numpy_rk4, pendulum
 
-from servoctl.model import compiler
-from servoctl.model.compiled import GRID_POINTS, SCALAR_CALLS, SOLVED, compiled
+from servoctl.codegen import compiler
+from servoctl.codegen.function import GRID_POINTS, SCALAR_CALLS, SOLVED, compiled
 
 
 @pytest.fixture

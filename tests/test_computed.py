@@ -8,9 +8,9 @@ import pytest
 
 import servoctl as sv
 from servoctl.control.computed import sampled_radius
-from servoctl.mechanisms import cars, gallery, mass_on_car, vtol
-from servoctl.model.linearising import _Extension
-from servoctl.simulation.bounds import sampled_bound
+from servoctl.control.linearising import _Extension
+from servoctl.gallery import cars, gallery, mass_on_car, vtol
+from servoctl.methods.bounds import sampled_bound
 
 ORDERS = {  # zeros at infinity of the program's outputs (theory), which exact linearisation reaches
     "two-link-arm": (2, 2),

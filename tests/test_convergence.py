@@ -10,8 +10,8 @@ import pytest
 from scipy.integrate import solve_ivp
 
 import servoctl as sv
-from servoctl.mechanisms import gallery
-from servoctl.simulation.motion import Progress
+from servoctl.gallery import gallery
+from servoctl.methods.motion import Progress
 
 AMPLITUDE = 1.0  # rad
 STATE = ("x", "y", "z", "phi", "theta", "dphi", "dtheta")

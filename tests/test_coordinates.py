@@ -8,7 +8,7 @@ from frames import boat
 
 from servoctl import spec as sv
 from servoctl.errors import NameUnknown, SpecificationError
-from servoctl.mechanisms import gallery
+from servoctl.gallery import gallery
 
 
 def names_of(symbols):

@@ -12,12 +12,12 @@ import numpy as np
 import pytest
 
 import servoctl as sv
+from servoctl.codegen.compiler import compiler
+from servoctl.codegen.function import compiled
 from servoctl.errors import ServoError, SpecificationError
-from servoctl.mechanisms import gallery
-from servoctl.model.c_files import Array, Constant, Routine, identifier, write
-from servoctl.model.compiled import compiled
-from servoctl.model.compiler import compiler
-from servoctl.model.export import export_c
+from servoctl.export.c import export_c
+from servoctl.export.files import Array, Constant, Routine, identifier, write
+from servoctl.gallery import gallery
 
 STRICT = ("-std=c99", "-O1", "-Wall", "-Wextra", "-pedantic", "-Werror")
 TOLERANCE = 1e-12

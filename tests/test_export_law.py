@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 import servoctl as sv
+from servoctl.codegen.compiler import compiler
 from servoctl.errors import SpecificationError
-from servoctl.mechanisms import gallery
-from servoctl.model.compiler import compiler
+from servoctl.gallery import gallery
 
 STRICT = ("-std=c99", "-O1", "-Wall", "-Wextra", "-pedantic", "-Werror")
 CRANE, PROGRAM = gallery["overhead-crane"].build()

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 import servoctl as sv
-from servoctl.mechanisms import gallery
-from servoctl.mechanisms.guided_arm import guided_arm
+from servoctl.gallery import gallery
+from servoctl.gallery.guided_arm import guided_arm
 from servoctl.study.formulation import NAMES, formulation_cost
-from servoctl.study.study import load_study
+from servoctl.study.table import load_study
 
 DOC = Path(__file__).parents[1] / "docs" / "formulations.md"
 JOINTS = [(2, 1), (4, 1), (4, 2), (4, 3), (8, 1), (8, 4), (8, 7)]

@@ -5,10 +5,10 @@ import numpy as np
 import pytest
 
 import servoctl as sv
+from servoctl.codegen.emit import operations
 from servoctl.errors import NameUnknown, SpecificationError
-from servoctl.mechanisms import planar_arm, spatial_arm
+from servoctl.gallery import planar_arm, spatial_arm
 from servoctl.model import saddle
-from servoctl.model.emit import operations
 from servoctl.model.model import derive
 
 
@@ -120,7 +120,7 @@ def _by_motors(mechanism, program):
 @pytest.mark.parametrize("driven", [False, True])
 def test_the_sparse_elimination_gives_what_3_18_gives(poles, driven):
     arm = planar_arm(4, "bodies")
-    equations = derive(*(_by_motors(*arm) if driven else arm))._equations
+    equations = derive(*(_by_motors(*arm) if driven else arm)).equations
     assert equations.sparse
     sparse, multipliers, _ = saddle.solve(equations, poles)
     dense = equations.dense(poles)
@@ -137,7 +137,7 @@ def test_the_sparse_elimination_gives_what_3_18_gives(poles, driven):
 def test_an_arm_of_bodies_moves_as_the_one_of_joint_angles():
     q, v = np.array([-0.9, 0.7, 0.5]), np.array([0.2, -0.3, 0.4])
     bodies, joints = (derive(*planar_arm(3, c)) for c in ("bodies", "joints"))
-    assert bodies._equations.sparse and not joints._equations.sparse
+    assert bodies.equations.sparse and not joints.equations.sparse
     start = bodies.start(guess=dict(zip(bodies.state_names, _bodies(q, v), strict=True)))
     other = joints.start(**dict(zip(joints.state_names, [*q, *v], strict=True)))
     options = {"t_eval": [0.0, 0.2, 0.4], "rtol": 1e-11, "atol": 1e-12, "progress": False}

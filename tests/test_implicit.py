@@ -8,9 +8,9 @@ from scipy.integrate import Radau, solve_ivp
 from scipy.integrate._ivp import radau as scipy_radau
 
 import servoctl as sv
-from servoctl.mechanisms import gallery
-from servoctl.model.implicit import first_step
-from servoctl.model.radau import basis, radau
+from servoctl.gallery import gallery
+from servoctl.methods.radau_loop import first_step, radau_steps
+from servoctl.methods.radau_tableau import basis, radau
 
 STATE = ("x", "y", "z", "phi", "theta", "dphi", "dtheta")
 ZERO = {"x": 0.0, "y": 0.0, "phi": 0.0, "theta": 0.0}
@@ -211,7 +211,7 @@ def test_options(model, start):
 @pytest.mark.parametrize("fixed", [False, True])
 @pytest.mark.parametrize("order", ORDERS)
 def test_python_takes_the_steps_of_c(order, fixed, project_every, model, start, monkeypatch):
-    solver, p = model.integrator("RadauIIA"), model.parameters
+    solver, p = radau_steps(model), model.parameters
     if solver.f.native("radau") is None:
         pytest.skip("no compiler")
     h = 0.05 if fixed else first_step(solver.f, 0.0, start.values, p, order, 2.0, 1e-6, 1e-8)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import servoctl as sv
-from servoctl.mechanisms import cars, gallery, mass_on_car, passive_arm, vtol
+from servoctl.gallery import cars, gallery, mass_on_car, passive_arm, vtol
 
 
 def internal(pair, span, start, **guess):

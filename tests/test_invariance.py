@@ -7,7 +7,7 @@ from conftest import motion, signal
 
 from servoctl import spec as sv
 from servoctl.errors import ServoError
-from servoctl.mechanisms import gallery, mass_on_car, overhead_crane, winch_crane
+from servoctl.gallery import gallery, mass_on_car, overhead_crane, winch_crane
 from servoctl.model.model import derive
 
 TIMES = (0.7, 2.0, 4.4)

@@ -5,7 +5,7 @@ import pytest
 
 from servoctl import spec as sv
 from servoctl.errors import SpecificationError
-from servoctl.mechanisms import cars, overhead_crane
+from servoctl.gallery import cars, overhead_crane
 from servoctl.model.model import derive
 
 

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from test_compiled import P1, X2, T, function, newton_model
 
-from servoctl.model import emit
-from servoctl.model.closed import LAW_DRIVER
-from servoctl.model.compiled import compiled, compiling_at_once
-from servoctl.model.emit import SHARED, WIDE
+from servoctl.codegen import emit
+from servoctl.codegen.emit import SHARED, WIDE
+from servoctl.codegen.function import compiled, compiling_at_once
+from servoctl.codegen.loops.closed import LAW_DRIVER
 
 TINY, LAST_SMALL = 1e-300, np.nextafter(1e5, 0)
 

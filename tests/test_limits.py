@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import servoctl as sv
-from servoctl.mechanisms import cars, overhead_crane, two_link_arm
+from servoctl.gallery import cars, overhead_crane, two_link_arm
 
 
 def planned(build, span, **guess):

@@ -7,7 +7,7 @@ import servoctl as sv
 from servoctl.control.lqr import weights
 from servoctl.control.sampling import discretised, exponentials
 from servoctl.control.tracking import Reference
-from servoctl.mechanisms import gallery
+from servoctl.gallery import gallery
 
 CRANE, CRANE_PROGRAM = gallery["overhead-crane"].build()
 GUST = {"theta": sv.disturbances.gust(60.0, 2.0, 2.5)}

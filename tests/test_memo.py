@@ -13,8 +13,9 @@ import numpy as np
 import pytest
 
 import servoctl as sv
-from servoctl.mechanisms import gallery
-from servoctl.model import cache, derivation, memo
+from servoctl.codegen import cache
+from servoctl.gallery import gallery
+from servoctl.model import derivation, memo
 
 PACKAGE = Path(sv.__file__).parent
 
@@ -89,7 +90,7 @@ def test_the_memo_gives_the_same_run_to_the_bit_and_derives_nothing(derived, nam
 SECOND_PROCESS = """
 import json
 import servoctl as sv
-from servoctl.mechanisms import gallery
+from servoctl.gallery import gallery
 from servoctl.model import derivation
 
 calls, reduce = [], derivation.reduce

@@ -9,7 +9,7 @@ from conftest import pendulum
 from scipy.integrate import solve_ivp
 
 import servoctl as sv
-from servoctl.simulation.minimal import Chart, Sizes
+from servoctl.methods.minimal import Chart, Sizes
 
 SCENES = (
     "appell-hamel", "constant-speed", "mass-on-car", "mass-on-car-absolute", "passive-arm", "spiral", "two-cars-ideal",
@@ -61,7 +61,7 @@ def test_nothing_drifts_in_20_seconds(method, wheel):
 
 @pytest.mark.parametrize("name", SCENES)
 def test_as_many_values_are_integrated_as_are_free(name, gallery_model):
-    from servoctl.mechanisms import gallery
+    from servoctl.gallery import gallery
 
     scene, model = gallery[name], gallery_model(name)
     start, t1 = model.start(**scene.start, guess=scene.guess), min(scene.t_span[1], 2.0)

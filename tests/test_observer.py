@@ -6,7 +6,7 @@ import pytest
 import servoctl as sv
 from servoctl.control.sampling import discretised
 from servoctl.control.tracking import Reference
-from servoctl.mechanisms import gallery, overhead_crane, two_link_arm
+from servoctl.gallery import gallery, overhead_crane, two_link_arm
 
 GUST = {"theta": lambda t: 60.0 * (2.0 < t < 2.5)}
 SENSORS = {"x": 1e-3, "l": 1e-3, "theta": 1e-3}

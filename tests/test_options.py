@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 import servoctl as sv
-from servoctl.mechanisms import gallery
-from servoctl.mechanisms.guided_arm import guided_arm
+from servoctl.gallery import gallery
+from servoctl.gallery.guided_arm import guided_arm
 from servoctl.study import tradeoff as module
 from servoctl.study.formulation import formulation_cost
 

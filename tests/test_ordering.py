@@ -4,10 +4,11 @@ import numpy as np
 import pytest
 
 import servoctl as sv
-from servoctl.mechanisms import gallery
-from servoctl.simulation.rule import motion_error
-from servoctl.simulation.series import order_for
-from servoctl.simulation.tableaus import ORDERS
+from servoctl.gallery import gallery
+from servoctl.methods.accuracy import motion_error
+from servoctl.methods.series import series_loop
+from servoctl.methods.tableaus import ORDERS
+from servoctl.methods.taylor import order_for
 
 ERROR = 1e-9
 INTERVALS = 32  # between samples: each is a whole number of fixed steps
@@ -24,7 +25,7 @@ def fewest(model, start, span, method, exact, t):
         jets = run.jets[:, :: setting // INTERVALS] if fixed else run.jets
         np.testing.assert_allclose(run.t[:: setting // INTERVALS] if fixed else run.t, t, atol=1e-9)
         if motion_error(model, jets, exact) <= ERROR:
-            series = model.taylor(order_for(setting) + model.reduction.top - 1) if method == "Taylor" else None
+            series = series_loop(model, order_for(setting) + model.reduction.top - 1) if method == "Taylor" else None
             each = (series or model.function("ode")).operations
             return run.counters["nfev"], run.counters["nfev"] * each
     raise AssertionError(f"{method} does not reach {ERROR}")

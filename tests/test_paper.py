@@ -8,7 +8,7 @@ from conftest import signal
 from scipy.optimize import brentq
 
 import servoctl as sv
-from servoctl.mechanisms import appell_hamel
+from servoctl.gallery import appell_hamel
 
 N = 20
 P = cf.APPELL_HAMEL

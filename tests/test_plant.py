@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 
 import servoctl as sv
-from servoctl.mechanisms import gallery
-from servoctl.model.folding import folded
+from servoctl.codegen.folding import folded
+from servoctl.gallery import gallery
 
 RELATIVE, REDUNDANT = (gallery[name].build()[0] for name in ("overhead-crane", "overhead-crane-redundant"))
 
@@ -222,7 +222,7 @@ def test_a_plant_says_what_was_set():
 
 @pytest.mark.parametrize("name", ["overhead-crane", "winch-crane", "mass-on-car", "passive-arm"])
 def test_gathered_powers_of_two_change_no_bit(name):
-    f = sv.derive(*gallery[name].build())._equations.ode()
+    f = sv.derive(*gallery[name].build()).equations.ode()
     inputs = f.sx_in()
     g = ca.Function("g", inputs, [ca.densify(folded(f))])
     random = np.random.default_rng(3)

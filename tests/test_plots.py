@@ -12,10 +12,10 @@ from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
 
 import servoctl
-from servoctl import plots
 from servoctl.errors import NameUnknown, ServoError, SpecificationError
-from servoctl.mechanisms import gallery
-from servoctl.simulation.run import Run
+from servoctl.figures import run as plots
+from servoctl.gallery import gallery
+from servoctl.run import Run
 
 UNITS = {"x": "m", "z": "m", "theta": "rad", "trolley": "N", "winch": "N m"}
 T = np.linspace(0.0, 2.0, 401)
@@ -298,7 +298,7 @@ def test_pyplot_and_the_backend_are_left_alone(tmp_path):
 import sys
 import numpy as np
 import servoctl
-from servoctl import plots
+from servoctl.figures import run as plots
 assert not [name for name in sys.modules if name.startswith("matplotlib")]
 t = np.linspace(0, 1, 9)
 plots.save_figures(servoctl.Run(t, np.array([t, t]), ("x", "y")), {str(tmp_path)!r})

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 import servoctl as sv
-from servoctl.mechanisms import cars, crane_3d, gallery, mass_on_car, overhead_crane, passive_arm, vtol
+from servoctl.gallery import cars, crane_3d, gallery, mass_on_car, overhead_crane, passive_arm, vtol
 
 ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]

@@ -9,7 +9,7 @@ from conftest import motion, signal
 
 from servoctl import spec as sv
 from servoctl.errors import InconsistentStart, NotRealisable, SingularProgram, SpecificationError
-from servoctl.mechanisms import cars, gallery, mass_on_car, overhead_crane, passive_arm, spiral
+from servoctl.gallery import cars, gallery, mass_on_car, overhead_crane, passive_arm, spiral
 from servoctl.model.model import derive
 from servoctl.reduction.ranks import EXTENDED
 

@@ -7,7 +7,7 @@ from conftest import motion, numbers, signal
 
 from servoctl import spec as sv
 from servoctl.errors import NameUnknown, NotRealisable, SpecificationError
-from servoctl.mechanisms import overhead_crane
+from servoctl.gallery import overhead_crane
 from servoctl.model.model import derive
 
 THRUSTERS = {

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 import servoctl as sv
-from servoctl.mechanisms import gallery
+from servoctl.gallery import gallery
 from servoctl.study.dae import dae_comparison
-from servoctl.study.study import load_study
+from servoctl.study.table import load_study
 
 DOC = Path(__file__).parents[1] / "docs" / "servo_dae.md"
 SCENES = ["overhead-crane", "crane-3d-redundant", "two-cars", "mass-on-car-absolute", "appell-hamel", "vtol"]

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 import servoctl as sv
-from servoctl.mechanisms import gallery, mass_on_car
-from servoctl.simulation.bounds import largest_explicit
-from servoctl.simulation.tableaus import ORDERS
-from servoctl.study.stability import METHODS, stability
+from servoctl.gallery import gallery, mass_on_car
+from servoctl.methods.bounds import largest_explicit
+from servoctl.methods.tableaus import ORDERS
+from servoctl.study.stability_map import METHODS, stability
 
 DOC = Path(__file__).parents[1] / "docs" / "servo_dae.md"
 

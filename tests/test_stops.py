@@ -7,7 +7,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 import servoctl as sv
-from servoctl.mechanisms import gallery
+from servoctl.gallery import gallery
 
 ADAPTIVE = ("RK23", "RK45", "DOP853", "Radau", "BDF", "LSODA", "Taylor")
 FIXED = ("RK1", "RK2", "RK4", "RK5", "RK8")

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import servoctl as sv
-from servoctl.mechanisms import gallery, mass_on_car, passive_arm, vtol
+from servoctl.gallery import gallery, mass_on_car, passive_arm, vtol
 
 
 @dataclass(frozen=True)

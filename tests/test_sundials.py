@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 import servoctl as sv
-from servoctl.mechanisms import gallery
+from servoctl.gallery import gallery
+from servoctl.methods.sundials_solver import sundials_solver
 
 STATE = ("x", "y", "z", "phi", "theta", "dphi", "dtheta")
 ZERO = {"x": 0.0, "y": 0.0, "phi": 0.0, "theta": 0.0}
@@ -50,7 +51,7 @@ def test_error_follows_the_tolerance(method, model, start):
 @pytest.mark.parametrize("drift", [None, 0.5])
 def test_idas_knows_nothing_of_the_elimination(method, drift, model):
     """Its equations are the rows themselves: L γ^(s̄) + rest, which vanishes at what the elimination finds."""
-    parts = model.integrator(method, drift is not None).parts
+    parts = sundials_solver(model, method, drift is not None).parts
     assert ("alg" in parts) == (method == "IDAS")
     if method == "IDAS":
         assert parts["z"].numel() == parts["alg"].numel() == model.n
@@ -109,7 +110,7 @@ def test_failure_keeps_what_was_computed(method):
 
 def test_an_integrator_that_cannot_be_made_leaves_the_start(method, model, start, monkeypatch):
     """A run keeps nothing in the solver, which models share between threads."""
-    solver = model.integrator(method, False)
+    solver = sundials_solver(model, method)
     kept = dict(vars(solver))
     given = (np.linspace(0.0, 0.1, 5), start.values, np.zeros(model.n), model.parameters, 1e-6, 1e-8)
     assert solver.run(*given)[1]["steps"] > 0 and vars(solver) == kept
@@ -118,7 +119,7 @@ def test_an_integrator_that_cannot_be_made_leaves_the_start(method, model, start
         raise RuntimeError("no memory")
 
     monkeypatch.setattr(ca, "integrator", broken)
-    x, counts = type(solver)(model._equations, method).run(*given)
+    x, counts = type(solver)(model.equations, method).run(*given)
     assert x[:, 0].tolist() == start.values.tolist() and x.shape[1] == 1 and counts == {}
 
 

@@ -16,9 +16,9 @@ import numpy as np
 import pytest
 
 import servoctl as sv
-from servoctl.cli import main
 from servoctl.errors import NameUnknown, ServoError, SpecificationError
-from servoctl.mechanisms import overhead_crane
+from servoctl.gallery import overhead_crane
+from servoctl.shell.main import main
 from servoctl.study.sweep import TOLD
 
 LOADS = {"m_load": lambda rng: rng.normal(115.0, 5.0)}

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from servoctl.errors import SpecificationError
+from servoctl.jets.evaluation import evaluate
+from servoctl.jets.series import Series
+from servoctl.jets.tape import Tape
 from servoctl.spec import coordinates
-from servoctl.spec.evaluation import evaluate
-from servoctl.spec.tape import Tape
-from servoctl.spec.taylor import Series
 
 RNG = np.random.default_rng(31)
 DEEPEST = 6

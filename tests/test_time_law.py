@@ -6,7 +6,7 @@ import pytest
 from scipy.optimize import brentq
 
 import servoctl as sv
-from servoctl.mechanisms import cars, gallery, overhead_crane, wheeled_robot
+from servoctl.gallery import cars, gallery, overhead_crane, wheeled_robot
 
 S13 = np.polynomial.Polynomial([0] * 7 + [1716, -9009, 20020, -24024, 16380, -6006, 924])
 

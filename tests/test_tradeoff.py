@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 
 import servoctl as sv
-from servoctl.cli import main
 from servoctl.errors import LimitExceeded, NameUnknown, ServoError, SingularProgram, SpecificationError
-from servoctl.mechanisms import gallery
-from servoctl.simulation.rule import motion_error
-from servoctl.simulation.simulate import ALL_METHODS
+from servoctl.gallery import gallery
+from servoctl.methods.accuracy import motion_error
+from servoctl.shell.main import main
+from servoctl.simulation import ALL_METHODS
 from servoctl.study.front import COLOURS, TradeOff
-from servoctl.study.study import Study, load_study
+from servoctl.study.table import Study, load_study
 
 SPAN = (0.0, 1.0)
 METHODS = ("Taylor", "DOP853", "RK4", "BDF")

@@ -4,7 +4,7 @@ import casadi as ca
 import numpy as np
 import pytest
 
-from servoctl.mechanisms import gallery
+from servoctl.gallery import gallery
 from servoctl.reduction.manifold import sample
 from servoctl.reduction.ranks import clean
 from servoctl.reduction.row import gradient

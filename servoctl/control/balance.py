@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 
 from servoctl.control.close import begin, disturbed
-from servoctl.model.closed import FINISHED, run_loop
-from servoctl.simulation.verify import Verification
+from servoctl.control.loop import FINISHED, run_loop
+from servoctl.verification import Verification
 
 HELD, WITHIN = 1e-8, 1e-12  # material constraints along a loop; limits, relative to the limit
 CONVERGES, EXACT = 0.7, 1e-10  # of the defect with steps half as long, relative to the other; what is rounding

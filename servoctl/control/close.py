@@ -4,13 +4,13 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from servoctl.control.closed import Closed
+from servoctl.codegen.function import Compiled
 from servoctl.control.disturbances import require_seed, sampled
 from servoctl.control.law import ON_SAMPLE, Law
+from servoctl.control.loop import FINISHED, LAW_LOST, STATE_LOST, Loop, run_loop
+from servoctl.control.result import Closed
 from servoctl.control.tracking import Reference, positive, require_memory, require_plan, require_plant, resampled
 from servoctl.errors import InconsistentStart, IntegrationStopped, ServoError, SpecificationError, unknown
-from servoctl.model.closed import FINISHED, LAW_LOST, STATE_LOST, Loop, run_loop
-from servoctl.model.compiled import Compiled
 from servoctl.spec.coordinates import mapping
 from servoctl.spec.parameters import finite
 

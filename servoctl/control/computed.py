@@ -3,12 +3,12 @@
 import numpy as np
 
 from servoctl.control.law import Law
+from servoctl.control.linearising import linearise
 from servoctl.control.tracking import Reference, positive, refuse_transport, require_plan
 from servoctl.errors import SpecificationError, UnstableInternalDynamics, unknown
-from servoctl.model.linearising import linearise
+from servoctl.internal_dynamics import internal_dynamics
+from servoctl.methods.bounds import sampled_bound
 from servoctl.reduction.knots import require_smooth
-from servoctl.simulation.bounds import sampled_bound
-from servoctl.simulation.internal import internal_dynamics
 
 GROWN = 2.0  # by how much errors may grow along the plan, as by a passing eigenvalue that is hardly unstable
 TIME_CONSTANT = 0.25  # s: a rise in about a second where several poles coincide, as cranes and arms of human size need

@@ -4,10 +4,10 @@ from dataclasses import replace
 
 import numpy as np
 
+from servoctl.control.feedback import Residuals
 from servoctl.control.sampling import discretised, spectral_radii
 from servoctl.control.tracking import Reference, affine, refuse_transport
 from servoctl.errors import ServoError, SpecificationError, unknown
-from servoctl.model.laws import Residuals
 from servoctl.spec.parameters import finite
 
 MARGINAL = 1 + 1e-6  # spectral radius of what may stay out of reach: it neither falls nor grows

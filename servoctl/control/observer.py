@@ -2,12 +2,12 @@
 
 import numpy as np
 
+from servoctl.control.feedback import Residuals, estimating_law
 from servoctl.control.law import Law
 from servoctl.control.lqr import tangents, weights
 from servoctl.control.sampling import discretised, spectral_radii
 from servoctl.control.tracking import Reference, refuse_transport, require_plant
 from servoctl.errors import ServoError, SpecificationError, unknown
-from servoctl.model.laws import Residuals, estimating_law
 from servoctl.spec.coordinates import mapping
 from servoctl.spec.parameters import finite
 

@@ -8,11 +8,11 @@ import numpy as np
 
 from servoctl.control.close import span
 from servoctl.errors import InconsistentStart, IntegrationStopped, LimitExceeded, SingularProgram, SpecificationError
+from servoctl.methods.motion import PATIENCE
 from servoctl.model.model import derive
-from servoctl.model.plant import interval
-from servoctl.simulation.motion import PATIENCE
-from servoctl.simulation.run import Run
-from servoctl.simulation.simulate import simulate
+from servoctl.plants.plant import interval
+from servoctl.run import Run
+from servoctl.simulation import simulate
 from servoctl.spec.coordinates import mapping
 from servoctl.spec.mechanism import Mechanism
 from servoctl.spec.program import Program

@@ -4,11 +4,11 @@ from dataclasses import replace
 
 import numpy as np
 
+from servoctl.control.feedback import affine_law
 from servoctl.control.law import ON_SAMPLE, Law
 from servoctl.control.sampling import sampled_radii
 from servoctl.errors import NotRealisable, ServoError, SpecificationError, unknown
-from servoctl.model.laws import affine_law
-from servoctl.model.plant import Plant
+from servoctl.plants.plant import Plant
 from servoctl.spec.coordinates import mapping
 from servoctl.spec.parameters import finite
 

@@ -2,15 +2,15 @@
 
 import numpy as np
 
-from servoctl.control.closed import Closed
+from servoctl.codegen.jacobians import differentiable, jacobian
 from servoctl.control.law import Law, as_measurement
+from servoctl.control.result import Closed
 from servoctl.control.sampling import discretised
 from servoctl.control.tracking import positive, resampled
 from servoctl.errors import SpecificationError, unknown
 from servoctl.interop.names import connected, force_names, output_names, signal_names, stranger
-from servoctl.model.jacobians import differentiable, jacobian
 from servoctl.model.model import Model
-from servoctl.model.plant import Plant
+from servoctl.plants.plant import Plant
 from servoctl.spec.parameters import finite
 
 

@@ -5,13 +5,13 @@ import math
 import numpy as np
 
 from servoctl.control.close import limits, steps
-from servoctl.control.closed import Closed
 from servoctl.control.law import Law
+from servoctl.control.result import Closed
 from servoctl.control.tracking import positive
 from servoctl.errors import ServoError, SpecificationError
 from servoctl.interop.names import connected, force_names, output_names, signal_names, stranger
 from servoctl.model.model import Model
-from servoctl.model.plant import Plant
+from servoctl.plants.plant import Plant
 
 SUBSTEPS = 10  # Runge-Kutta steps per sample: 1 ms at 100 Hz
 

@@ -5,9 +5,9 @@ from functools import cached_property
 import casadi as ca
 import numpy as np
 
+from servoctl.codegen.emit import operations
 from servoctl.errors import SpecificationError
 from servoctl.model import saddle
-from servoctl.model.emit import operations
 from servoctl.reduction.appell import plant_accelerations
 from servoctl.reduction.elimination import eliminate
 from servoctl.reduction.ranks import clean, column_sizes

@@ -19,8 +19,8 @@ from pathlib import Path
 import casadi as ca
 import numpy as np
 
-from servoctl.model.cache import cache_directory, keeping, kept
-from servoctl.model.compiled import Compiled
+from servoctl.codegen.cache import cache_directory, keeping, kept
+from servoctl.codegen.function import Compiled
 from servoctl.spec.coordinates import Coordinates
 from servoctl.spec.mechanism import Mechanism
 from servoctl.spec.parameters import Parameters

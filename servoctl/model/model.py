@@ -5,15 +5,12 @@ from functools import cached_property
 
 import numpy as np
 
+from servoctl.codegen.function import compiled
 from servoctl.errors import SpecificationError, unknown
-from servoctl.model.compiled import compiled
 from servoctl.model.derivation import Derivation
 from servoctl.model.equations import EQUATIONS, Equations, gradient_jets, leading_names, residual_rows
 from servoctl.model.formulations import FORMULATIONS
-from servoctl.model.implicit import implicit
-from servoctl.model.series import taylor_coefficients
 from servoctl.model.servo_dae import SERVO_DAE
-from servoctl.model.sundials import Sundials
 from servoctl.reduction.appell import require_positive
 from servoctl.reduction.knots import require_smooth
 from servoctl.reduction.reduce import holds
@@ -142,7 +139,7 @@ class Model:
         Model
         """
         guess = dict(zip(self.jet_names, map(float, jets), strict=True))
-        usual = self._once("jet sizes", lambda: self._equations.jet_sizes)
+        usual = self.once("jet sizes", lambda: self.equations.jet_sizes)
         r = self.reduction.again(near=(float(t), guess, usual | dict(sizes)), values=self.parameters)
         if r.free != self.free:
             raise SpecificationError(
@@ -230,14 +227,22 @@ class Model:
         return {row.name: self.reduction.top - row.order for row in self.reduction.outline.rows}
 
     @cached_property
-    def _equations(self):
+    def equations(self):
+        """The model's equations as expressions."""
         shared = self._functions
         if "equations" not in shared:
             shared["equations"] = Equations(self.reduction.derived)
         return shared["equations"]
 
-    def _once(self, name, build):
-        """What was built under a name, by this process or another."""
+    def once(self, name, build):
+        """What was built under a name, by this process or another.
+
+        Parameters
+        ----------
+        name : str
+        build : callable
+            Without arguments; called where nothing is found under the name.
+        """
         if name not in self._functions:
             self._functions[name] = self.reduction.recall(name, build)
         return self._functions[name]
@@ -259,47 +264,10 @@ class Model:
             raise unknown(name, list(FUNCTIONS), "function")
 
         def build():
-            f, *options = FUNCTIONS[name](self._equations)
+            f, *options = FUNCTIONS[name](self.equations)
             return compiled(f, name, *options)
 
-        return self._once(name, build)
-
-    def taylor(self, last):
-        """The compiled Taylor coefficients with index up to `last`, with their loop.
-
-        Parameters
-        ----------
-        last : int
-            Highest index κ of the coefficients γ_[κ].
-
-        Returns
-        -------
-        Compiled
-        """
-
-        def build():
-            e, q = self._equations, self.reduction.mechanism.q
-            sizes = {"nq": q.nq, "n": q.n, "top": e.top, "last": last, "plain": int(q.plain)}
-            f = taylor_coefficients(e, last)
-            return compiled(f, f"taylor_{last}", ("taylor",), project=e.project(), sizes=sizes)
-
-        return self._once(f"taylor {last}", build)
-
-    def integrator(self, name, poles=False):
-        """An integrator that solves equations in its steps, with error dynamics if `poles`.
-
-        Parameters
-        ----------
-        name : {"RadauIIA", "CVODES", "IDAS"}
-        poles : bool
-
-        Returns
-        -------
-        Implicit or Sundials
-        """
-        key = f"{name} with poles" if poles else name
-        maker = implicit if name == "RadauIIA" else Sundials
-        return self._once(key, lambda: maker(self._equations, name, poles))
+        return self.once(name, build)
 
     def signals(self, kind, rate=0):
         """Names of a group of signals and the compiled function (t, Z, p) of them, or of their `rate`-th derivatives.
@@ -312,10 +280,10 @@ class Model:
         """
 
         def build():
-            names, f = self._equations.signals(kind, rate)
+            names, f = self.equations.signals(kind, rate)
             return names, compiled(f, f.name())
 
-        return self._once(f"signals {kind}{rate or ''}", build)
+        return self.once(f"signals {kind}{rate or ''}", build)
 
     @cached_property
     def signal_groups(self):
@@ -337,8 +305,8 @@ class Model:
 
     def invariant_names(self):
         """(level, name) of each invariant of the state, in the order of the function "invariants"."""
-        return self._once(
-            "invariant names", lambda: [(level, name) for level, name, _ in self._equations.invariant_rows]
+        return self.once(
+            "invariant names", lambda: [(level, name) for level, name, _ in self.equations.invariant_rows]
         )
 
     def pole_rows(self):
@@ -368,12 +336,12 @@ class Model:
     @cached_property
     def guard_sizes(self):
         """Largest size of each pivot at the points where they were chosen, (n_g,) array."""
-        return self._once("guard sizes", lambda: self._equations.guard_sizes)
+        return self.once("guard sizes", lambda: self.equations.guard_sizes)
 
     @cached_property
     def column_sizes(self):
         """Column sizes (see `ranks.column_sizes`) of L and of Bᵀ where ranks were decided: two (n,) arrays."""
-        return self._once("column sizes", lambda: self._equations.column_sizes)
+        return self.once("column sizes", lambda: self.equations.column_sizes)
 
     def row_stories(self):
         """What was done to each row, by name; empty for rows as they were given."""
@@ -389,7 +357,7 @@ class Model:
 
     def row_operations(self):
         """Operations of the rows ψ themselves, before anything is differentiated or compiled."""
-        return self._once("row operations", lambda: self._equations.row_operations)
+        return self.once("row operations", lambda: self.equations.row_operations)
 
     def operations(self):
         """Operations of each function that has been built so far, by name."""
@@ -439,7 +407,7 @@ class Model:
         Structure
         """
         if t is None:
-            return self._once("structure", lambda: structure(self.reduction.derived))
+            return self.once("structure", lambda: structure(self.reduction.derived))
         return structure(self.reduction.derived, np.atleast_1d(t), np.asarray(jets), self.parameters)
 
     def __repr__(self):

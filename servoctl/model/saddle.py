@@ -7,8 +7,8 @@ their number. No multiplier is introduced numerically: γ'' is an expression of 
 
 import casadi as ca
 
+from servoctl.codegen.emit import operations
 from servoctl.errors import SpecificationError
-from servoctl.model.emit import operations
 from servoctl.reduction.elimination import eliminate
 from servoctl.reduction.ranks import clean
 from servoctl.reduction.row import gradient

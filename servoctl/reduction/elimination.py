@@ -10,8 +10,8 @@ import casadi as ca
 import numpy as np
 
 from servoctl.errors import SingularProgram
+from servoctl.jets.elementary import divide, multiply, subtract
 from servoctl.reduction.ranks import ENTRY, equilibrate
-from servoctl.spec.elementary import divide, multiply, subtract
 
 THRESHOLD = 0.1  # a pivot may be this much smaller than the largest candidate of its row, after equilibration
 

@@ -6,9 +6,9 @@ from math import factorial
 import casadi as ca
 import numpy as np
 
+from servoctl.jets.scalars import REAL, Scalars
+from servoctl.jets.series import Series
 from servoctl.reduction.row import gradient
-from servoctl.reduction.scalars import REAL, Scalars
-from servoctl.spec.taylor import Series
 
 
 class Flow:

@@ -8,8 +8,8 @@ import casadi as ca
 import numpy as np
 
 from servoctl.errors import SpecificationError
-from servoctl.spec.tape import Tape
-from servoctl.spec.taylor import Series
+from servoctl.jets.series import Series
+from servoctl.jets.tape import Tape
 
 MOST_BRANCHES = 24  # affine pieces that are followed through one operation
 JUMP = 1e-6  # of the largest value that a derivative takes nearby

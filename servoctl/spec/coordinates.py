@@ -7,9 +7,9 @@ from numbers import Integral
 import casadi as ca
 
 from servoctl.errors import SpecificationError
-from servoctl.spec.elementary import divide, multiply
-from servoctl.spec.tape import Tape
-from servoctl.spec.taylor import Series, is_zero
+from servoctl.jets.elementary import divide, multiply
+from servoctl.jets.series import Series, is_zero
+from servoctl.jets.tape import Tape
 
 _guard = threading.Lock()
 

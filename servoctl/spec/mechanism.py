@@ -6,10 +6,10 @@ import casadi as ca
 import numpy as np
 
 from servoctl.errors import SpecificationError, unknown
+from servoctl.jets.evaluation import evaluate
+from servoctl.jets.tape import Tape
 from servoctl.spec.coordinates import Coordinates, column, mapping
-from servoctl.spec.evaluation import evaluate
 from servoctl.spec.parameters import Parameters
-from servoctl.spec.tape import Tape
 
 _SEED = 20021  # of the random points at which identities are tested
 

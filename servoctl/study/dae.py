@@ -5,8 +5,8 @@ from time import perf_counter
 import numpy as np
 
 from servoctl.errors import SpecificationError, unknown
-from servoctl.simulation.simulate import as_span, consistent_state, simulate
-from servoctl.study.study import Study, machine
+from servoctl.simulation import as_span, consistent_state, simulate
+from servoctl.study.table import Study, machine
 
 FORMS = {"servo": "servo_dae", "projected": "servo_dae_projected"}
 METHODS = {"BE": 1, "BDF2": 2}

@@ -6,7 +6,7 @@ import numpy as np
 
 from servoctl.errors import SpecificationError, unknown
 from servoctl.model.model import derive
-from servoctl.study.study import Study, machine
+from servoctl.study.table import Study, machine
 
 NAMES = {
     "eliminated": "(3.18)",

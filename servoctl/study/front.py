@@ -3,9 +3,9 @@
 import numpy as np
 
 from servoctl.errors import LimitExceeded, SpecificationError, unknown
-from servoctl.simulation.drift import project
-from servoctl.simulation.simulate import is_number
-from servoctl.study.study import Study, table
+from servoctl.methods.drift import project
+from servoctl.simulation import is_number
+from servoctl.study.table import Study, table
 
 COLOURS = (
     "#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000", "#8C6D31", "#7F7F7F", "#5E3C99",

@@ -14,17 +14,17 @@ from concurrent.futures import Executor, ProcessPoolExecutor, as_completed
 
 import numpy as np
 
-from servoctl.control.closed import Closed
+from servoctl.codegen.function import compiling_at_once
+from servoctl.control.result import Closed
 from servoctl.errors import ServoError, SpecificationError
-from servoctl.model.compiled import compiling_at_once
-from servoctl.simulation.run import Run
+from servoctl.figures.sweep import TOLD
+from servoctl.run import Run
 from servoctl.study.cases import CASES, RESERVED, as_cases, generator, plain, whole
 from servoctl.study.checkpoint import Checkpoint, identity
-from servoctl.study.study import Study, machine
+from servoctl.study.table import Study, machine
 
 INTERRUPTED = 1  # status of a run that Ctrl-C ended
 PATIENCE = 1.0  # s before a progress bar appears
-TOLD = ("error", "message", "facts")  # columns of what went wrong, empty for a case that was finished
 
 
 def sweep(case, cases, *, executor=None, seed=None, checkpoint=None, shard=None, progress=None):

@@ -7,15 +7,15 @@ import warnings
 
 import numpy as np
 
+from servoctl.codegen.function import compiling_at_once
 from servoctl.control.tracking import positive
 from servoctl.errors import LimitExceeded, ServoError, SpecificationError, unknown
-from servoctl.model.compiled import compiling_at_once
-from servoctl.simulation.drift import Minimal, Poles, Project, as_drift
-from servoctl.simulation.rule import motion_error, relative_error
-from servoctl.simulation.simulate import ALL_METHODS, as_span, consistent_state, simulate
-from servoctl.simulation.tableaus import ORDERS
+from servoctl.methods.accuracy import motion_error, relative_error
+from servoctl.methods.drift import Minimal, Poles, Project, as_drift
+from servoctl.methods.tableaus import ORDERS
+from servoctl.simulation import ALL_METHODS, as_span, consistent_state, simulate
 from servoctl.study.front import TradeOff
-from servoctl.study.study import machine, positives
+from servoctl.study.table import machine, positives
 
 METHODS = tuple(name for name in ALL_METHODS if name not in ("RK1", "RK2", "RK23"))  # those need too many steps
 TOLERANCES = (1e-3, 1e-5, 1e-7, 1e-9, 1e-11, 1e-13)

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 import servoctl as sv
-from servoctl.mechanisms import cars, mass_on_car
+from servoctl.gallery import cars, mass_on_car
 
 RATIOS = (1e-8, 1e-4, 1e4, 1e8)
 

@@ -10,7 +10,7 @@ from scipy.integrate import solve_ivp
 from scipy.optimize import brentq
 
 import servoctl as sv
-from servoctl.mechanisms import overhead_crane, passive_arm
+from servoctl.gallery import overhead_crane, passive_arm
 
 # the crane whose load is dropped -------------------------------------------------------------------------------------
 

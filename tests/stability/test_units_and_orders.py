@@ -7,7 +7,7 @@ import pytest
 from conftest import pendulum
 
 import servoctl as sv
-from servoctl.mechanisms import spiral
+from servoctl.gallery import spiral
 
 UNITS = (1e-6, 1e6)  # units per metre: megametres to micrometres
 LENGTHS = {"a": 1, "b": 1, "rho": 1, "g": 1, "I_x": 2, "I_y": 2}  # of the Appell-Hamel mechanism, by power of length

@@ -1,0 +1,1 @@
+"""A function of (t, x, p) becomes code."""

@@ -1,0 +1,170 @@
+"""C text becomes a loaded library: compiled by the system's compiler, kept on disk by content.
+
+A library is kept under the user's cache directory (``SERVOCTL_CACHE``, else ``XDG_CACHE_HOME``, else the platform's
+place) under the hash of the C text, the flags, the compiler and the processor. The compiler is ``SERVOCTL_COMPILER``,
+else ``CC``, else the first of cc, gcc and clang; ``SERVOCTL_COMPILER=none`` compiles nothing. Without a compiler, or
+where it fails, one warning per process says so and the caller goes on without.
+
+The flags keep the values of IEEE arithmetic with one exception: a product and a sum may be contracted to one fused
+operation, which rounds once instead of twice. (Which C text is compiled is told in `emit`.)
+"""
+
+import atexit
+import ctypes
+import functools
+import hashlib
+import os
+import platform
+import shlex
+import shutil
+import subprocess
+import tempfile
+import threading
+import warnings
+from pathlib import Path
+
+from servoctl.codegen.cache import cache_directory, keeping, kept
+
+FLAGS = ("-fPIC", "-shared", "-w", "-fno-math-errno")
+
+_loaded = {}  # key -> ctypes.CDLL, or None where it could not be built
+_locks = {}  # key -> lock: no two threads compile the same text
+_guard = threading.Lock()
+_warned = False
+
+
+class _CompilerFailed(Exception):
+    """The compiler refused the text."""
+
+
+def library(text, build=True, level="-O1"):
+    """Load the library of a C translation unit, compiling it if it is not at hand.
+
+    Parameters
+    ----------
+    text : str
+        C text.
+    build : bool
+        Whether to compile if the library is neither loaded nor kept on disk.
+    level : str
+        Of optimisation: "-O1" compiles fastest, and straight-line code runs within a quarter of what "-O3" makes of it.
+
+    Returns
+    -------
+    ctypes.CDLL or None
+        None if there is none and it was not to be built, or could not be (which warns, once per process).
+    """
+    found = _compiler(*(os.environ.get(name) for name in ("SERVOCTL_COMPILER", "CC", "PATH")))
+    if found is None:
+        return _without("No C compiler was found, or SERVOCTL_COMPILER is none") if build else None
+    command, identity = found
+    parts = (text, level, *FLAGS, *_optional_flags(), identity, platform.machine(), _processor())
+    key = hashlib.sha256("\0".join(parts).encode()).hexdigest()
+    with _guard:
+        lock = _locks.setdefault(key, threading.Lock())
+    with lock:
+        if key not in _loaded:
+            loaded = _open(cache_directory() / f"{key}.so")
+            if loaded is None and not build:
+                return None
+            _loaded[key] = loaded or _build(text, level, f"{key}.so", command)
+        return _loaded[key]
+
+
+def compiler():
+    """Command of the C compiler that is used, None where there is none."""
+    found = _compiler(*(os.environ.get(name) for name in ("SERVOCTL_COMPILER", "CC", "PATH")))
+    return " ".join(found[0]) if found else None
+
+
+@functools.cache
+def _compiler(chosen, cc, path):
+    """Command of the compiler and what identifies it: its file's place, time and size (its version takes longer)."""
+    if chosen == "none":
+        return None
+    for candidate in (chosen, cc, "cc", "gcc", "clang"):
+        command = shlex.split(candidate or "")
+        if command and (program := shutil.which(command[0], path=path)):
+            files = [os.path.realpath(found) for word in command if (found := shutil.which(word, path=path))]
+            stats = [(file, os.stat(file).st_mtime_ns, os.stat(file).st_size) for file in files]
+            return (os.path.abspath(program), *command[1:]), repr((command, stats))
+    return None
+
+
+@functools.cache
+def _processor():
+    """The processor's model and features, empty where the system does not tell."""
+    telling = ("vendor_id", "cpu family", "model", "stepping", "flags", "Features", "CPU ")
+    try:
+        with open("/proc/cpuinfo", encoding="utf-8", errors="replace") as lines:
+            first = iter(lambda: lines.readline().rstrip("\n"), "")
+            return "\n".join(line for line in first if line.startswith(telling))
+    except OSError:
+        return ""
+
+
+def features():
+    """Features of the processor that code is compiled for, as words; empty where the system does not tell."""
+    return frozenset(_processor().split())
+
+
+def _optional_flags():
+    """Flags left out if the compiler refuses them; code for this very processor only where the key can name it."""
+    return ("-fno-semantic-interposition", *(("-march=native",) if _processor() else ()))
+
+
+@functools.cache
+def _scratch():
+    directory = tempfile.TemporaryDirectory(prefix="servoctl-", ignore_cleanup_errors=True)  # Windows: of loaded files
+    atexit.register(directory.cleanup)
+    return Path(directory.name)
+
+
+def _build(text, level, file_name, command):
+    """Compile into the cache, or into a temporary directory where the cache cannot be used."""
+    try:
+        try:
+            return _compile(text, level, cache_directory() / file_name, command)
+        except OSError:
+            return _compile(text, level, _scratch() / file_name, command)
+    except (OSError, _CompilerFailed) as error:
+        return _without(f"{' '.join(command)} failed: {error}")
+
+
+def _compile(text, level, target, command):
+    with keeping(target) as temporary:
+        for flags in ((*FLAGS, *_optional_flags()), FLAGS):
+            done = subprocess.run(
+                [*command, level, *flags, "-x", "c", "-", "-o", temporary, "-lm"],
+                input=text,
+                text=True,
+                capture_output=True,
+                cwd=target.parent,
+                check=False,
+            )
+            if done.returncode == 0:
+                break
+        else:
+            raise _CompilerFailed("; ".join(done.stderr.strip().splitlines()[:2]) or f"status {done.returncode}")
+    return ctypes.CDLL(str(target))
+
+
+def _open(path):
+    """The library kept at a path, or None: loading one that is not whole can end the process."""
+    try:
+        kept(path)
+        return ctypes.CDLL(str(path))
+    except OSError:
+        return None
+
+
+def _without(reason):
+    global _warned
+    if not _warned:
+        _warned = True
+        warnings.warn(
+            f"{reason}. CasADi evaluates the models instead: the same results, 10 to 100 times "
+            "slower in simulation. Install gcc or clang, or name a compiler in CC.",
+            RuntimeWarning,
+            stacklevel=2,
+        )

@@ -1,0 +1,446 @@
+"""A function of (t, x, p) seen through numpy: single points, grids, Runge-Kutta, and Newton along a path.
+
+Nothing is compiled before it pays. Where there is no compiler, CasADi's evaluation runs the same algorithms and the
+results differ by rounding only.
+"""
+
+import contextlib
+import contextvars
+import functools
+
+import numpy as np
+
+from servoctl.codegen import compiler, emit
+from servoctl.codegen.interpreted import Interpreter, restored
+from servoctl.codegen.loops import LOOPS
+from servoctl.codegen.native import Library
+from servoctl.errors import SpecificationError, unknown
+
+# Compiling takes 0.1 s or more. A consistent start makes tens of calls, an integration thousands; a grid costs CasADi
+# some 3 us per point, and a point of a path, solved by Newton's iteration in Python, as much as SOLVED of them.
+SCALAR_CALLS = 50
+GRID_POINTS = 20_000
+SOLVED = 5
+
+_AT_ONCE = contextvars.ContextVar("compiling at once", default=False)
+_OUTPUTS_PER_STATE = {"rk": 1, "newton": 2, "taylor": 1}
+
+
+@contextlib.contextmanager
+def compiling_at_once():
+    """Compile at the first call: results then do not depend, in their last bits, on how often a function was called."""
+    token = _AT_ONCE.set(True)
+    try:
+        yield
+    finally:
+        _AT_ONCE.reset(token)
+
+
+def compiled(f, name, loops=(), project=None, others=None, drivers="", sizes=None):
+    """Make a compiled function of an SX function.
+
+    Parameters
+    ----------
+    f : casadi.Function
+        SX function of t (scalar), x (n_x), p (n_p), all dense, with one dense column output y (n_y).
+    name : str
+        A C identifier.
+    loops : sequence of {"rk", "newton", "taylor"}
+        The loops that will be called.
+    project : casadi.Function, optional
+        Change of x that restores invariants, of the same inputs (t, x, p); loops may call it after their steps.
+    others : dict of str to casadi.Function, optional
+        Further functions of the same form in the same library, found by `Compiled.native`.
+    drivers : str
+        C text of further loops, with the placeholders of `loops`.
+    sizes : dict of str to int, optional
+        Constants that loops and drivers take; "taylor" takes the numbers of coordinates "nq" and quasi-velocities "n",
+        the order s̄ as "top", the highest index of coefficients "last", and whether q' = γ' as "plain".
+
+    Returns
+    -------
+    Compiled
+
+    Raises
+    ------
+    SpecificationError
+        If f has another shape than this, or too few outputs for a loop; at the first evaluation, if f contains an
+        operation that is not elementary.
+    NameUnknown
+        If a loop is none of the above.
+    """
+    columns = [*(f.sparsity_in(i) for i in range(f.n_in())), *(f.sparsity_out(i) for i in range(f.n_out()))]
+    if (
+        not f.is_a("SXFunction")
+        or f.has_free()
+        or (f.n_in(), f.n_out()) != (3, 1)
+        or f.numel_in(0) != 1
+        or not all(column.is_dense() and column.size2() == 1 for column in columns)
+    ):
+        raise SpecificationError(
+            f"{name!r} is to be compiled from {f}",
+            "A compiled function takes columns t, x, p to one dense column, without free symbols",
+            "An SX function of this form",
+            "Concatenate and densify the outputs; expand() an MX function",
+            name=name,
+        )
+    if not (name.isascii() and name.isidentifier()):
+        raise SpecificationError(
+            f"A compiled function is named {name!r}",
+            "Its name is a C identifier",
+            do="Use letters, digits and underscores",
+            name=name,
+        )
+    for loop in loops:
+        if loop not in LOOPS:
+            raise unknown(loop, LOOPS, "loop")
+        needed = _OUTPUTS_PER_STATE[loop] * f.numel_in(1)
+        if f.numel_out(0) < needed:
+            raise SpecificationError(
+                f"{name!r} has {f.numel_out(0)} outputs for {f.numel_in(1)} states",
+                f"{loop} needs the first {needed} outputs",
+                do="Add the outputs or leave the loop out",
+                name=name,
+                loop=loop,
+            )
+    return Compiled(f, name, tuple(loops), project, others, drivers, sizes)
+
+
+class Compiled:
+    """A function y = f(t, x, p), compiled as soon as it pays; made by `compiled`.
+
+    It may be called, and its loops run, from several threads at once. It pickles, and is loaded from the cache or
+    compiled again where it is unpickled.
+
+    Attributes
+    ----------
+    name : str
+        Its name.
+    n_x, n_p, n_y : int
+        Numbers of states, parameters and outputs.
+    loops : tuple of str
+        The loops it can run.
+    """
+
+    def __init__(self, f, name, loops, project=None, others=None, drivers="", sizes=None):
+        self.name, self.loops, self._project = name, loops, project
+        self._others, self._drivers, self._sizes = others or {}, drivers, sizes or {}
+        self.n_x, self.n_p, self.n_y = f.numel_in(1), f.numel_in(2), f.numel_out(0)
+        self._f, self._symbol = f, f"servoctl_{name}"
+        self._x_shape, self._p_shape = (self.n_x,), (self.n_p,)
+        self._evaluator = Interpreter(f, project, self._sizes)
+        self._settled, self._looked, self._text, self._calls, self._points = False, False, None, 0, 0
+
+    def __reduce__(self):
+        parts = (self._f, self.name, self.loops, self._project, self._others, self._drivers, self._sizes)
+        return Compiled, parts, {"_text": self._text}
+
+    def __repr__(self):
+        how = "compiled" if self.backend == "c" else "evaluated by CasADi"
+        return f"{self.name}: y[{self.n_y}] of t, x[{self.n_x}], p[{self.n_p}]; {self.operations} operations, {how}"
+
+    @functools.cached_property
+    def operations(self):
+        """Number of arithmetic operations of one evaluation."""
+        return emit.operations(self._f)
+
+    @property
+    def backend(self):
+        """``"c"`` once calls run the compiled library, ``"casadi"`` while CasADi evaluates them."""
+        return self.__dict__.get("_lanes", self._evaluator).backend
+
+    def __call__(self, t, x, p):
+        """Evaluate at one point.
+
+        Parameters
+        ----------
+        t : float
+            Time [s].
+        x : (n_x,) array
+            State, SI.
+        p : (n_p,) array
+            Parameters, SI.
+
+        Returns
+        -------
+        (n_y,) array
+            The outputs, a new array at each call.
+
+        Raises
+        ------
+        SpecificationError
+            If x or p has another shape.
+        """
+        if not self._settled:
+            self._calls += 1
+            self._settle(self._calls > SCALAR_CALLS or _AT_ONCE.get())
+        row_y, run = self._place(t, x, p)
+        run()
+        return row_y.copy()
+
+    def buffer(self):
+        """Arrays to write and read, and a call without arguments: for loops in Python over single evaluations.
+
+        They belong to the calling thread, and any other evaluation by it writes to them.
+
+        Returns
+        -------
+        t, x, p, y : (1,), (n_x,), (n_p,), (n_y,) arrays
+        call : callable
+            Computes y from what t, x and p hold.
+        """
+        self._settle(build=True)
+        return self._evaluator.workspace.buffer
+
+    def grid(self, t, x, p):
+        """Evaluate at N points.
+
+        Parameters
+        ----------
+        t : float or (N,) array
+            Times [s].
+        x : (n_x, N) array
+            One state per column, SI.
+        p : (n_p,) or (n_p, N) array
+            Parameters, SI; a matrix has a column per point.
+
+        Returns
+        -------
+        (n_y, N) array
+            The outputs.
+
+        Raises
+        ------
+        SpecificationError
+            If the shapes disagree.
+        """
+        n = np.shape(x)[-1] if np.ndim(x) == 2 else np.size(t)
+        x = self._array("x", x, (self.n_x, n))
+        t = self._array("t", np.broadcast_to(t, (n,)) if np.ndim(t) == 0 else t, (n,))
+        p = self._array("p", p, (self.n_p, n) if np.ndim(p) == 2 else self._p_shape)
+        self._points += n
+        self._settle(build=False)
+        y = np.empty((self.n_y, n))
+        (self._lanes if self._points > GRID_POINTS or _AT_ONCE.get() else self._evaluator).grid(t, x, p, y)
+        return y
+
+    def rk(self, t0, x0, h, n_steps, p, tableau, every=1, project_every=0):
+        """Integrate dx/dt, the first n_x outputs, by explicit Runge-Kutta steps.
+
+        Step k starts at t0 + k h. The run ends early, with what was computed, at a state that is not finite.
+
+        Parameters
+        ----------
+        t0 : float
+            Start [s].
+        x0 : (n_x,) array
+            State at t0, SI.
+        h : float
+            Step [s]; negative runs backwards.
+        n_steps : int
+            Number of steps.
+        p : (n_p,) array
+            Parameters, SI.
+        tableau : (a, b, c)
+            Of s stages: (s, s) array, strictly lower triangular, (s,) and (s,) arrays.
+        every : int
+            Number of steps between logged points; the start and the end are always logged.
+        project_every : int
+            Steps between projections; 0 for none.
+
+        Returns
+        -------
+        t : (N,) array
+            Logged times [s].
+        x : (n_x, N) array
+            States there.
+        guards : (n_y - n_x, N) array
+            The other outputs there.
+
+        Raises
+        ------
+        SpecificationError
+            If the loop was not asked for, a shape is another, or a count is out of range.
+        """
+        self._settle_loop("rk")
+        x0, p = self._array("x0", x0, self._x_shape), self._array("p", p, self._p_shape)
+        if n_steps < 0 or every < 1:
+            raise SpecificationError(
+                f"rk is to take {n_steps} steps and log every {every}",
+                "n_steps is at least 0 and every at least 1",
+                n_steps=n_steps,
+                every=every,
+            )
+        tableau = tuple(np.ascontiguousarray(part, dtype=float) for part in tableau)
+        log = np.append(np.arange(0, n_steps, every), n_steps)
+        states, guards = np.empty((self.n_x, log.size)), np.empty((self.n_y - self.n_x, log.size))
+        counts = (int(n_steps), int(every), int(project_every) if self._project is not None else 0)
+        n = 1 + self._evaluator.rk(float(t0), x0, float(h), counts, p, tableau, states, guards)
+        return t0 + log[:n] * h, states[:, :n], guards[:, :n]
+
+    def newton(self, t, x0, p, tol=1e-13, max_iter=30):
+        """Solve delta = 0 at each time in order; the outputs are the Newton step delta (n_x), dx/dt (n_x) and others.
+
+        A point is predicted from the last one by its rate and corrected until every |delta_i| <= tol (1 + |x_i|), then
+        once more where that still reduces delta. Where the correction fails the step in time is halved, up to 20 times.
+        Once compiled, eight points are predicted at once, by Hermite's interpolation from three before, and corrected
+        together; where that prediction is off by more than 1e-3 they are solved one by one.
+
+        Parameters
+        ----------
+        t : (N,) array
+            Times [s].
+        x0 : (n_x,) array
+            Start of the iteration at t[0], SI.
+        p : (n_p,) array
+            Parameters, SI.
+        tol : float
+            Tolerance relative to 1 + |x_i|.
+        max_iter : int
+            Corrections per point.
+
+        Returns
+        -------
+        x : (n_x, M) array
+            Solutions at the first M times, all N unless the iteration failed at t[M].
+        y : (n_y, M) array
+            Outputs there.
+        iterations : int
+            Number of evaluations made.
+
+        Raises
+        ------
+        SpecificationError
+            If the loop was not asked for or a shape is another.
+        """
+        self._points += SOLVED * np.size(t)
+        self._settle_loop("newton", self._points > GRID_POINTS or _AT_ONCE.get())
+        t = self._array("t", t, (np.size(t),))
+        x0, p = self._array("x0", x0, self._x_shape), self._array("p", p, self._p_shape)
+        x, y = np.empty((self.n_x, t.size)), np.empty((self.n_y, t.size))
+        n, iterations = self._evaluator.newton(t, x0, p, float(tol), int(max_iter), x, y)
+        return x[:, :n], y[:, :n], iterations
+
+    def taylor(self, t0, x0, t1, p, rtol, atol, max_steps, project_every=0):
+        """Steps of the Taylor method; the outputs are coefficients of q (unless plain) and γ by index, then guards.
+
+        A step is as long as its last term stays below the tolerance at every level of the state.
+
+        Parameters
+        ----------
+        t0, t1 : float
+            Start and end [s].
+        x0 : (n_x,) array
+            State at t0, SI.
+        p : (n_p,) array
+            Parameters, SI.
+        rtol, atol : float
+            Tolerance of each level of the state relative to its largest entry, and absolute.
+        max_steps : int
+            Number of steps at most.
+        project_every : int
+            Steps between projections; 0 for none.
+
+        Returns
+        -------
+        t : (S + 1,) array
+            Starts of the steps, and where the last one ended [s]; short of t1 where a step vanishes.
+        x : (n_x, S + 1) array
+            States there, SI.
+        y : (n_y, S) array
+            Outputs at the starts.
+
+        Raises
+        ------
+        SpecificationError
+            If the loop was not asked for or a shape is another.
+        """
+        self._settle_loop("taylor")
+        self._place(t0, x0, p)
+        every = project_every if self._project is not None else 0
+        log = self._evaluator.taylor(t1, rtol, atol, every, max_steps)
+        return log[:, 0], log[:, 1 : 1 + self.n_x].T, log[:-1, 1 + self.n_x :].T
+
+    def restore(self, t, x, p):
+        """The state (n_x,) with its invariants restored by `project`, evaluated by CasADi; x where there is none.
+
+        Parameters
+        ----------
+        t : float
+            [s]
+        x : (n_x,) array
+        p : (n_p,) array
+        """
+        return x if self._project is None else restored(self._project, t, x, p)
+
+    def native(self, suffix):
+        """The C function ``..._suffix`` of the library, built if need be; None without a compiler.
+
+        Parameters
+        ----------
+        suffix : str
+            "point", "grid", a key of `others`, or a function that `drivers` defines.
+        """
+        self._settle(build=True)
+        return self._evaluator.native(suffix)
+
+    def _settle_loop(self, loop, build=True):
+        if loop not in self.loops:
+            raise SpecificationError(
+                f"{self.name!r} was asked for its loop {loop}",
+                f"It was made with the loops {', '.join(self.loops) or '(none)'}",
+                do=f"Make it with loops=({loop!r},)",
+                name=self.name,
+                loop=loop,
+            )
+        self._settle(build)
+
+    def _settle(self, build):
+        """Move from CasADi to the library: at the first call if one is at hand, later if it is to be built."""
+        if self._settled or (self._looked and not build):
+            return
+        level = "-O3" if self._drivers or {"newton", "taylor"} & {*self.loops} else "-O1"
+        library = compiler.library(self.source(), build, level)
+        if library is not None:
+            self._evaluator = Library(library, self._symbol, self.n_x, self.n_p, self.n_y)
+        self._looked, self._settled = True, build or library is not None
+        self._text = None if self._settled else self._text
+
+    def source(self):
+        """C text of the library; kept, and pickled, until the library is loaded."""
+        if self._text is None:
+            parts = {"project": self._project, "others": self._others, "drivers": self._drivers, "sizes": self._sizes}
+            self._text = emit.emit(self._f, self._symbol, self.loops, **parts, wide="newton" in self.loops)
+        return self._text
+
+    @functools.cached_property
+    def _lanes(self):
+        """What evaluates long grids: a library of its own, as twice the code takes twice the time to compile."""
+        if "newton" not in self.loops:
+            library = compiler.library(emit.emit(self._f, self._symbol), level="-O1")
+            if library is not None:
+                return Library(library, self._symbol, self.n_x, self.n_p, self.n_y)
+        self._settle(build=True)
+        return self._evaluator
+
+    def _place(self, t, x, p):
+        """Put t, x and p where the evaluator reads them; where it writes y, and its call."""
+        row_t, row_x, row_p, row_y, run = self._evaluator.workspace.row
+        row_t[0] = t
+        try:
+            row_x[:], row_p[:] = x, p
+        except (TypeError, ValueError):  # not arrays of floats of the right shapes
+            row_x[:], row_p[:] = self._array("x", x, self._x_shape), self._array("p", p, self._p_shape)
+        return row_y, run
+
+    def _array(self, what, value, shape):
+        array = np.ascontiguousarray(value, dtype=float)
+        if array.shape != shape:
+            raise SpecificationError(
+                f"{what} of {self.name!r} has the shape {array.shape}",
+                f"Its shape is {shape}",
+                name=self.name,
+                shape=array.shape,
+                expected=shape,
+            )
+        return array

@@ -1,0 +1,277 @@
+"""The evaluations and loops of a compiled function, by CasADi and numpy: what runs where there is no compiler."""
+
+import threading
+
+import numpy as np
+
+from servoctl.codegen.loops import BISECTIONS, NEAR, QUADRATIC, ROUNDING
+
+BLOCK, STRIDE = 128, 16  # instants that are corrected together, and those from one solved alone to the next
+
+_guard = threading.Lock()
+
+
+class Workspace(threading.local):
+    """Per thread: views of t, x, p, y in one row of memory, and the call without arguments that works on it.
+
+    A memoryview is assigned in half the time that an array takes, and only from what has its own type and shape.
+    """
+
+    def __init__(self, n_x, n_p, n_y, connect):
+        row = np.zeros(1 + n_x + n_p + n_y)
+        parts = np.split(row, np.cumsum([1, n_x, n_p]))
+        run, self.kept = connect(row, parts)
+        self.row, self.buffer = (*map(memoryview, parts[:3]), parts[3], run), (*parts, run)
+        self.start, self.address = row[: 1 + n_x + n_p], row.ctypes.data
+        self._log = np.empty((0, 0)), 0
+
+    def log(self, rows, columns):
+        """Memory for a log, used again by the next, and its address."""
+        if len(self._log[0]) < rows:
+            log = np.empty((rows, columns))
+            self._log = log, log.ctypes.data
+        return self._log
+
+
+def connected(f, parts):
+    """The call of a CasADi function on arrays t, x, p, y, and what must be kept as long as it may be called."""
+    with _guard:
+        buffer, run = f.buffer()
+    for i, part in enumerate(parts[:3]):
+        buffer.set_arg(i, memoryview(part))
+    buffer.set_res(0, memoryview(parts[3]))
+    return run, buffer
+
+
+class Interpreter:
+    """Evaluation by CasADi, with the loops of `emit` in Python."""
+
+    backend = "casadi"
+
+    def __init__(self, f, project=None, sizes=None):
+        self._f, self._n_x, self._project, self._sizes = f, f.numel_in(1), project, sizes
+        self.workspace = Workspace(self._n_x, f.numel_in(2), f.numel_out(0), self._connect)
+
+    def _connect(self, row, parts):
+        return connected(self._f, parts)
+
+    def _value(self, t, x, p):
+        row_t, row_x, row_p, row_y, run = self.workspace.row
+        row_t[0], row_x[:], row_p[:] = t, x, p
+        run()
+        return row_y.copy()
+
+    def native(self, suffix):
+        """None: there is no library."""
+
+    def grid(self, t, x, p, y):
+        """Fill y (n_y, N) with the outputs at t (N,) and the columns of x, and of p if that is a matrix."""
+        for k, t_k in enumerate(t):
+            y[:, k] = self._value(t_k, x[:, k], p[:, k] if p.ndim == 2 else p)
+
+    @np.errstate(all="ignore")
+    def rk(self, t0, x0, h, counts, p, tableau, states, guards):
+        """Fill the columns of states and guards as `Compiled.rk` says; return the index of the last one filled."""
+        (n_steps, every, project_every), (a, b, c) = counts, tableau
+        x, column, n_x = x0, 0, self._n_x
+        for step in range(n_steps + 1):
+            if not np.isfinite(x).all():
+                break
+            y = self._value(t0 + step * h, x, p)
+            if step % every == 0 or step == n_steps:
+                states[:, column], guards[:, column] = x, y[n_x:]
+                column += 1
+            if step < n_steps:
+                k = [y[:n_x]]
+                for j in range(1, len(b)):
+                    z = x + h * (a[j, :j] @ np.array(k))
+                    k.append(self._value(t0 + (step + c[j]) * h, z, p)[:n_x])
+                x = x + h * (b @ np.array(k))
+                if project_every and (step + 1) % project_every == 0:
+                    x = self._restore(t0 + (step + 1) * h, x, p)
+        return column - 1
+
+    @np.errstate(all="ignore")
+    def taylor(self, t1, rtol, atol, every, max_steps):
+        """Rows (t, x, y) of the steps from the start in the workspace, as `Compiled.taylor` says."""
+        nq, n, top, last, plain = (self._sizes[key] for key in ("nq", "n", "top", "last", "plain"))
+        start, n_x = self.workspace.start.copy(), self._n_x
+        t, x, p, rows = start[0], start[1 : 1 + n_x], start[1 + n_x :], []
+        while True:
+            end = np.concatenate([[t], x, np.zeros(len(self.workspace.row[3]))])
+            if len(rows) == max_steps or t == t1:
+                break
+            y = self._value(t, x, p)
+            own = y[: nq * last].reshape(last, nq)
+            c = own if plain else y[nq * last : (nq + n) * last].reshape(last, n)
+            h = step_length(x, c, (nq, n, top), rtol, atol)
+            h = h if plain else min(h, step_length(x, own, (nq, nq, 1), rtol, atol))
+            if not h > 1e-13 * (1 + abs(t)):
+                break
+            ends = h >= abs(t1 - t) * (1 - 1e-12)
+            h = t1 - t if ends else np.copysign(h, t1 - t)
+            following = np.concatenate([x[:nq] + jet(own, 0, h), *(jet(c, j, h) for j in range(1, top))])
+            if not np.isfinite(following).all():
+                break
+            rows.append(np.concatenate([[t], x, y]))
+            t, x = t1 if ends else t + h, following
+            if every and len(rows) % every == 0:
+                x = self._restore(t, x, p)
+        return np.array([*rows, end])
+
+    def _restore(self, t, x, p):
+        return restored(self._project, t, x, p)
+
+    def newton(self, t, x0, p, tol, max_iter, x, y):
+        """Fill the columns of x and y as `Compiled.newton` says; return the points solved and the evaluations made."""
+        solve = _Newton(self._value, p, self._n_x, tol, max_iter)
+        together = _Together(self._f, p, self._n_x, tol) if t.size > BLOCK else None
+        point, k, alone = None, 0, 1
+        while k < t.size:
+            if alone <= k <= t.size - BLOCK:
+                found = together(solve, t[k - 1 : k + BLOCK], point)
+                if found:
+                    x[:, k : k + BLOCK], y[:, k : k + BLOCK], point = found
+                    k += BLOCK
+                    continue
+                alone = k + BLOCK
+            point = solve.correct(t[k], x0) if k == 0 else solve.advance(t[k - 1], t[k], *point)
+            if point is None:
+                break
+            x[:, k], y[:, k] = point
+            k += 1
+        return k, solve.count + (together.count if together else 0)
+
+
+def restored(project, t, x, p):
+    """The state after Newton's iteration of a projection onto its invariants, as the emitted loops do it."""
+    for _ in range(6):
+        d = np.asarray(project(t, x, p[: project.numel_in(2)])).ravel()
+        if not np.isfinite(d).all():
+            return x
+        largest, x = np.max(np.abs(d) / (1 + np.abs(x)), initial=0.0), x + d
+        if largest <= ROUNDING:
+            break
+    return x
+
+
+def jet(c, j, h):
+    """What Taylor coefficients c (last, n) of index 1 .. last add to the j-th derivative a time h later, (n,)."""
+    k = np.arange(1, len(c) + 1)
+    falling = np.prod([k - m for m in range(j)], axis=0) if j else np.ones(len(c))
+    total = np.zeros(c.shape[1])
+    for i in reversed(range(max(j, 1) - 1, len(c))):
+        total = total * h + falling[i] * c[i]
+    return total if j else total * h
+
+
+def step_length(x, c, shape, rtol, atol):
+    """The step at which the last term is below the tolerance, terms growing as the fastest of the upper half."""
+    nq, n, top = shape
+    h, last = np.inf, len(c)
+    for j in range(top):
+        level = x[:nq] if j == 0 else x[nq + (j - 1) * n : nq + j * n]
+        scale = atol + rtol * np.max(np.abs(level), initial=0.0)
+        for k in range(last // 2 if last // 2 > j else j + 1, last + 1):
+            term = np.prod([k - m for m in range(j)]) * np.max(np.abs(c[k - 1]), initial=0.0)
+            if not np.isfinite(term):
+                return 0.0
+            if term > 0:
+                h = min(h, rtol ** (1.0 / (last - j)) * (scale / rtol / term) ** (1.0 / (k - j)))
+    return h
+
+
+class _Together:
+    """Newton's iteration at a block of instants at once: a few are solved alone, the others start between these."""
+
+    def __init__(self, f, p, n_x, tol):
+        self._n_x, self._tol, self.count = n_x, tol, 0
+        self._parts = parts = self._t, self._x, _, self._y = (
+            np.zeros(BLOCK), np.zeros((BLOCK, n_x)), np.tile(p, (BLOCK, 1)), np.zeros((BLOCK, f.numel_out(0))),
+        )  # fmt: skip
+        self._run, self._kept = connected(f.map(BLOCK), parts)
+
+    @np.errstate(all="ignore")
+    def __call__(self, solve, t, point):
+        """Solutions at t[1:] from the one at t[0]: columns of x and y, and the last point; None if one is not found."""
+        points = [point]
+        for k in range(0, BLOCK, STRIDE):
+            point = solve.advance(t[k], t[k + STRIDE], *point)
+            if point is None:
+                return None
+            points.append(point)
+        self._t[:] = t[1:]
+        self._start(t, points)
+        defect = NEAR
+        while not defect <= QUADRATIC:
+            before, defect = defect, self._defect()
+            if not defect < before:
+                return None
+            self._x += self._y[:, : self._n_x]
+        return (self._x.T, self._y.T, (self._x[-1].copy(), self._y[-1].copy())) if self._defect() <= self._tol else None
+
+    def _start(self, t, points):
+        """Hermite's interpolation between the points solved alone."""
+        nodes, n_x = t[::STRIDE, None, None], self._n_x
+        x, rate = (np.array(v)[:, None] for v in zip(*((x, y[n_x : 2 * n_x]) for x, y in points), strict=True))
+        h = np.diff(nodes, axis=0)
+        s = (self._t.reshape(-1, STRIDE, 1) - nodes[:-1]) / h
+        r = 1 - s
+        start = r * r * ((1 + 2 * s) * x[:-1] + s * h * rate[:-1]) + s * s * ((1 + 2 * r) * x[1:] - r * h * rate[1:])
+        self._x[:] = start.reshape(BLOCK, n_x)
+
+    def _defect(self):
+        """The largest correction relative to 1 + |x|, after an evaluation."""
+        self._run()
+        self.count += BLOCK
+        return np.max(np.abs(self._y[:, : self._n_x]) / (1 + np.abs(self._x)))
+
+
+class _Newton:
+    """Newton's iteration along a path; a solution is a pair (x, y), or None where it was not found."""
+
+    def __init__(self, value, p, n_x, tol, max_iter):
+        self._value, self._p, self._n_x, self._tol, self._max_iter = value, p, n_x, tol, max_iter
+        self.count = 0
+
+    def _at(self, t, x):
+        self.count += 1
+        y = self._value(t, x, self._p)
+        delta = y[: self._n_x]
+        finite = np.isfinite(x).all() and np.isfinite(delta).all()
+        return y, delta, np.max(np.abs(delta) / (1 + np.abs(x)), initial=0.0) if finite else np.inf
+
+    @np.errstate(all="ignore")
+    def correct(self, t, x):
+        """Newton's iteration at time t from x."""
+        for _ in range(self._max_iter + 1):
+            y, delta, defect = self._at(t, x)
+            if defect <= self._tol:
+                break
+            if not np.isfinite(defect):
+                return None
+            x = x + delta
+        else:
+            return None
+        if defect > ROUNDING:
+            y_next, _, defect_next = self._at(t, x + delta)
+            if defect_next < defect:
+                return x + delta, y_next
+        return x, y
+
+    @np.errstate(all="ignore")
+    def advance(self, a, b, x, y):
+        """From the solution x, y at time a to the one at b: predicted by the rate; the step halved where that fails."""
+        t, done, pieces = a, 0, 1
+        while done < pieces:
+            following = b if done + 1 == pieces else a + (b - a) * ((done + 1) / pieces)
+            point = self.correct(following, x + (following - t) * y[self._n_x : 2 * self._n_x])
+            if point is not None:
+                (x, y), t, done = point, following, done + 1
+                while pieces > 1 and done % 2 == 0:
+                    done, pieces = done // 2, pieces // 2
+            elif pieces == 2**BISECTIONS:
+                return None
+            else:
+                done, pieces = 2 * done, 2 * pieces
+        return x, y

@@ -1,0 +1,39 @@
+"""Derivatives of compiled functions, from their expressions."""
+
+import functools
+
+import casadi as ca
+import numpy as np
+
+from servoctl.codegen.function import Compiled
+
+
+def differentiable(function):
+    """Whether there are expressions behind a function of (t, x, p)."""
+    return isinstance(function, Compiled)
+
+
+def jacobian(function, by, t, x, p):
+    """∂y/∂x or ∂y/∂p of a compiled function y(t, x, p) at a point, exactly.
+
+    Parameters
+    ----------
+    function : Compiled
+    by : {"x", "p"}
+    t : float
+        [s]
+    x, p : (n_x,), (n_p,) arrays
+
+    Returns
+    -------
+    (n_y, n) array
+    """
+    return np.array(_jacobian(function, by)(t, x, p))
+
+
+@functools.lru_cache(maxsize=64)
+def _jacobian(function, by):
+    f = function._f
+    t, x, p = (ca.SX.sym(name, f.numel_in(i)) for i, name in enumerate("txp"))
+    y = f(t, x, p)
+    return ca.Function("jacobian", [t, x, p], [ca.densify(ca.jacobian(y, x if by == "x" else p))])

@@ -1,0 +1,84 @@
+"""Calls into a compiled library through ctypes."""
+
+import ctypes
+import functools
+
+import casadi as ca
+
+from servoctl.codegen.interpreted import Workspace, connected
+
+
+class Library:
+    """Evaluation by a compiled library."""
+
+    backend = "c"
+
+    def __init__(self, library, symbol, n_x, n_p, n_y):
+        self._grid = library[f"{symbol}_grid"]
+        self._grid.restype = None
+        self._library, self._symbol = library, symbol
+        self._columns = 1 + n_x + n_y
+        self.workspace = Workspace(n_x, n_p, n_y, self._connect)
+
+    def _connect(self, row, parts):
+        """CasADi's buffer: its call without arguments takes a third of the time of a call through ctypes."""
+        return connected(ca.external(f"{self._symbol}_casadi", self._library._name), parts)
+
+    def native(self, suffix):
+        """The C function of this suffix."""
+        return self._library[f"{self._symbol}_{suffix}"]
+
+    def grid(self, t, x, p, y):
+        """As `Compiled.grid` says."""
+        self._grid(ctypes.c_int64(t.size), *map(pointer, (t, x, p)), ctypes.c_int64(p.ndim == 2), pointer(y))
+
+    def rk(self, t0, x0, h, counts, p, tableau, states, guards):
+        """As `Compiled.rk` says."""
+        run = self._library[f"{self._symbol}_rk"]
+        run.restype = ctypes.c_int64
+        return run(
+            ctypes.c_double(t0),
+            pointer(x0),
+            ctypes.c_double(h),
+            *map(ctypes.c_int64, counts),
+            pointer(p),
+            ctypes.c_int64(len(tableau[1])),
+            *map(pointer, tableau),
+            ctypes.c_int64(states.shape[1]),
+            pointer(states),
+            pointer(guards),
+        )
+
+    def taylor(self, t1, rtol, atol, every, max_steps):
+        """Rows (t, x, y) of the steps from the start in the workspace, as `Compiled.taylor` says."""
+        workspace = self.workspace
+        log, address = workspace.log(max_steps + 1, self._columns)
+        steps = self._taylor(workspace.address, t1, rtol, atol, every, max_steps, address)
+        return log[: steps + 1].copy()
+
+    @functools.cached_property
+    def _taylor(self):
+        run = self.native("taylor")
+        run.restype = ctypes.c_int64
+        run.argtypes = (ctypes.c_void_p, *3 * [ctypes.c_double], *2 * [ctypes.c_int64], ctypes.c_void_p)
+        return run
+
+    def newton(self, t, x0, p, tol, max_iter, x, y):
+        """As `Compiled.newton` says."""
+        run, count = self._library[f"{self._symbol}_newton"], ctypes.c_int64()
+        run.restype = ctypes.c_int64
+        n = run(
+            ctypes.c_int64(t.size),
+            *map(pointer, (t, x0, p)),
+            ctypes.c_double(tol),
+            ctypes.c_int64(max_iter),
+            pointer(x),
+            pointer(y),
+            ctypes.byref(count),
+        )
+        return n, count.value
+
+
+def pointer(array):
+    """The address of an array's first number."""
+    return ctypes.c_void_p(array.ctypes.data)

@@ -1,0 +1,1 @@
+"""C files of plans and laws."""

@@ -1,0 +1,1 @@
+"""Figures of runs, loops and studies."""

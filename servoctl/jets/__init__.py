@@ -1,0 +1,1 @@
+"""Taylor arithmetic: the series of an expression along a motion."""

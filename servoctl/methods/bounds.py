@@ -1,0 +1,301 @@
+"""How fast a pole may be: stability of integration steps, and of feedback that is sampled and held."""
+
+import sys
+import warnings
+from functools import cache
+from math import comb, factorial, inf, pi
+
+import numpy as np
+
+from servoctl.errors import SpecificationError, unknown
+from servoctl.methods.drift import is_whole
+from servoctl.methods.tableaus import ORDERS, tableau
+
+SAME = {"DOP853": "RK8", "RK45": "RK5"}  # scipy's adaptive methods that go on with the result of these tableaus
+METHODS = (*ORDERS, *SAME, "RK23", "Taylor", "RadauIIA", "Radau")
+WITH_ORDER = ("Taylor", "RadauIIA")
+BEYOND = 1e-10  # of |R| over 1: roots of |R|² = 1 that only touch 1 are told from those that cross it
+MANY_STEPS = 1e5  # of an adaptive method: each takes a part of a millisecond
+FASTEST, HALVINGS = 4.0, 50  # of p·h: every sampled loop of two or more integrators is unstable there
+
+
+@cache
+def stability_function(method, order=None):
+    """The factor R(z), z = hλ, by which one step multiplies a solution of x' = λx.
+
+    Parameters
+    ----------
+    method : str
+        One of `bounds.METHODS`.
+    order : int, optional
+        Of "Taylor" and "RadauIIA" (odd: 2s - 1 for s stages), which need it; no other method uses it.
+
+    Returns
+    -------
+    numerator, denominator : (k,) arrays
+        Coefficients by ascending powers of z. For an explicit tableau R = 1 + Σ bᵀAᵏ⁻¹1 zᵏ; for a series of order p
+        the first p + 1 terms of eᶻ; for Radau IIA of s stages its Padé fraction (s - 1, s). "Radau" has three stages.
+
+    Raises
+    ------
+    NameUnknown
+        For a method without a step map of its own: a multistep method has none.
+    SpecificationError
+        If the order is missing, is none of the method's, or is given where it is not used.
+    """
+    if method not in METHODS:
+        raise unknown(method, METHODS, "method")
+    whole = isinstance(order, (int, np.integer)) and order >= 1 and (method == "Taylor" or order % 2 == 1)
+    if not (whole if method in WITH_ORDER else order is None):
+        raise SpecificationError(
+            f"order={order!r} was given with method={method!r}.",
+            "The order belongs to 'Taylor' and, an odd one, to 'RadauIIA'.",
+            do="Give order=12 with 'Taylor', 5 with 'RadauIIA', and none otherwise.",
+        )
+    if method in ("Radau", "RadauIIA"):
+        stages = 3 if method == "Radau" else (order + 1) // 2
+        return _pade(stages - 1, stages), _pade(stages, stages - 1) * (-1.0) ** np.arange(stages + 1)
+    if method == "Taylor":
+        return np.array([1 / factorial(k) for k in range(order + 1)]), np.ones(1)
+    if method == "RK23":
+        return np.array([1.0, 1.0, 1 / 2, 1 / 6]), np.ones(1)  # three stages of order 3
+    a, b, _ = tableau(SAME.get(method, method))
+    powers, coefficients = np.ones(len(b)), [1.0]
+    for _ in range(len(b)):
+        coefficients.append(b @ powers)
+        powers = a @ powers
+    return np.trim_zeros(np.array(coefficients), "b"), np.ones(1)
+
+
+def _pade(k, m):
+    """Coefficients of degree k in the numerator of the Padé fraction (k, m) of eᶻ."""
+    return np.array([comb(k, j) * factorial(k + m - j) / factorial(k + m) for j in range(k + 1)])
+
+
+def amplification(method, z, order=None):
+    """|R(z)|: by how much one step multiplies a mode.
+
+    Parameters
+    ----------
+    method : str
+        One of `bounds.METHODS`.
+    z : array of complex
+        Steps times eigenvalues, hλ.
+    order : int, optional
+        Of "Taylor" and "RadauIIA".
+
+    Returns
+    -------
+    array
+        Of the shape of z.
+    """
+    above, below = stability_function(method, order)
+    with np.errstate(over="ignore", invalid="ignore"):
+        return np.abs(np.polyval(above[::-1], z) / np.polyval(below[::-1], z))
+
+
+@cache
+def largest_explicit(method, order=None, direction=pi):
+    """The largest |hλ| up to which a method damps a mode in one direction of the complex plane.
+
+    Parameters
+    ----------
+    method : str
+        One of `bounds.METHODS`.
+    order : int, optional
+        Of "Taylor" and "RadauIIA".
+    direction : float
+        arg λ [rad]; default π, the negative real axis: 2, 2, 2.785, 3.307 for RK1, RK2, RK4, RK5.
+
+    Returns
+    -------
+    float
+        inf for a mode that no step amplifies; 0 for one that every step amplifies.
+
+    Notes
+    -----
+    |R(re^{iφ})|² = 1 is a polynomial equation in r; the least positive root beyond which |R| exceeds 1 is returned.
+    """
+    above, below = (c * np.exp(1j * direction * np.arange(len(c))) for c in stability_function(method, order))
+    square = [np.convolve(c, c.conj()).real for c in (above, below)]
+    size = max(map(len, square))
+    square = [np.pad(c, (0, size - len(c))) for c in square]
+    difference = square[0] - square[1]
+    difference[np.abs(difference) <= 1e-14 * (np.abs(square[0]) + np.abs(square[1]))] = 0.0
+    roots = np.roots(np.trim_zeros(difference, "b")[::-1]) if np.any(difference) else np.zeros(0)
+    real = np.sort(roots.real[(np.abs(roots.imag) < 1e-7 * (1 + np.abs(roots))) & (roots.real > 1e-7)])
+    edges = [0.0, *real, real[-1] + 2.0 if len(real) else 1.0]
+    for low, high in zip(edges[:-1], edges[1:], strict=True):
+        middle = (low + high) / 2 * np.exp(1j * direction)
+        if amplification(method, middle, order) > 1 + BEYOND:
+            return float(low)
+    return inf
+
+
+@cache
+def sampled_bound(rho, delay=0):
+    """The fastest poles that sampled feedback may place on a chain of integrators, as p·h.
+
+    ρ equal poles -p are placed on a ρ-fold integrator, and the feedback is held for the period h: the loop is stable
+    if and only if p·h is below this number.
+
+    Parameters
+    ----------
+    rho : int
+        Number of integrators ρ, at least 1.
+    delay : int
+        Samples by which the feedback is late: u_k = -K x_(k-delay).
+
+    Returns
+    -------
+    float
+        1, 0.6752, 0.5111, 0.4116 for ρ = 2, 3, 4, 5; with one sample of delay 0.4262, 0.2703, 0.1979, 0.1561.
+
+    Raises
+    ------
+    SpecificationError
+        If ρ is not a whole number from 1 to 12, or the delay not one from 0 to 12.
+
+    Notes
+    -----
+    The k-th integral of a held input has the transfer function hᵏ E_k(z) / (k! (z - 1)ᵏ) with the Eulerian polynomial
+    E_k (Åström, Hagander and Sternby 1984), so that with z = 1 + p h s the characteristic polynomial is
+    sᵖ z^delay + Σ_k binom(ρ, k) s^(ρ-k) E_k(z)/k!, of exponent ρ: (s + 1)^ρ for small p h.
+    """
+    for name, value, low in (("rho", rho, 1), ("delay", delay, 0)):
+        if not (is_whole(value) and low <= value <= 12):
+            raise SpecificationError(
+                f"{name}={value!r} was given.", f"It is a whole number from {low} to 12.", do=f"Give {low + 1}."
+            )
+    steps = FASTEST * 2.0 ** (-np.arange(96)[::-1] / 8)
+    unstable = next(p for p in steps if not _sampled_stable(p, rho, delay))
+    low, high = unstable / 2 ** (1 / 8), unstable
+    for _ in range(HALVINGS):
+        middle = (low + high) / 2
+        low, high = (middle, high) if _sampled_stable(middle, rho, delay) else (low, middle)
+    return float(low)
+
+
+def _sampled_stable(p, rho, delay):
+    z = np.poly1d([p, 1.0])
+    polynomial = np.poly1d([1.0] + [0.0] * rho) * z**delay
+    for k in range(1, rho + 1):
+        weight = np.poly1d([comb(rho, k) / factorial(k)] + [0.0] * (rho - k))
+        polynomial += weight * np.polyval(np.poly1d(_eulerian(k)), z)
+    return bool(np.all(np.abs(1.0 + p * polynomial.roots) < 1.0))
+
+
+def _eulerian(k):
+    """Coefficients of the Eulerian polynomial E_k: 1; 1, 1; 1, 4, 1; 1, 11, 11, 1."""
+    return [sum((-1) ** j * comb(k + 1, j) * (i + 1 - j) ** k for j in range(i + 1)) for i in range(k)]
+
+
+def row_poles(drift, model):
+    """The poles [1/s] of every row's error dynamics: {row name: (ρ,) array}.
+
+    Parameters
+    ----------
+    drift : Poles
+    model : Model
+    """
+    one = isinstance(drift.values, float)
+    given = {} if one else drift.values
+    return {
+        row: np.full(count, -1 / drift.values) if one else np.atleast_1d(given.get(row, np.zeros(count)))
+        for row, count in model.pole_rows()
+    }
+
+
+def warn_fast_poles(method, poles, step):
+    """Warn where fixed steps amplify error dynamics that were meant to decay, with the largest step that does not.
+
+    The warning points to the first caller outside the package.
+
+    Parameters
+    ----------
+    method : str
+        A fixed-step method.
+    poles : dict of str to (ρ,) arrays of complex
+        Of each row [1/s].
+    step : float
+        [s]; negative where time runs backwards.
+    """
+    limits = [
+        (limit / abs(pole), limit, pole, row)
+        for row, values in poles.items()
+        for pole in values
+        if np.real(pole * step) < 0
+        and abs(pole * step) > (limit := largest_explicit(method, None, float(np.angle(pole * step))))
+    ]
+    if limits:
+        largest, limit, pole, row = min(limits, key=lambda found: found[0])
+        number = f"{pole.real:g}" if pole.imag == 0 else f"{pole:g}"
+        warnings.warn(
+            f"Steps of {abs(step):.4g} s by {method} amplify the error dynamics of {row!r}, which the pole {number} "
+            f"1/s was to damp: |λ|h = {abs(pole * step):.4g} exceeds {limit:.4g}. The largest stable step is "
+            f"{largest:.4g} s. Take it, slower poles, or drift='project'.",
+            RuntimeWarning,
+            stacklevel=_outside(),
+        )
+
+
+def warn_many_steps(method, poles, length):
+    """Warn where error dynamics hold the steps of an explicit adaptive method far below the span, with their number.
+
+    Parameters
+    ----------
+    method : str
+        One of `bounds.METHODS`.
+    poles : dict of str to (ρ,) arrays of complex
+        Of each row [1/s].
+    length : float
+        Of the span [s]; negative where time runs backwards.
+    """
+    steps = [
+        (abs(pole) / limit, pole, row)
+        for row, values in poles.items()
+        for pole in values
+        if 0 < (limit := largest_explicit(method, None, float(np.angle(pole * length)))) < inf
+    ]
+    rate, pole, row = max(steps, key=lambda found: found[0], default=(0.0, 0.0, ""))
+    count = rate * abs(length)
+    if count > MANY_STEPS:
+        warnings.warn(
+            f"The pole {pole:g} 1/s of {row!r} holds the steps of {method} below {1 / rate:.2g} s: {count:.1g} steps "
+            "over the span. Take slower poles, drift='project', or 'RadauIIA'.",
+            RuntimeWarning,
+            stacklevel=_outside(),
+        )
+
+
+def warn_unresolved(method, step, difference, stable=inf):
+    """Warn that steps do not resolve a motion, with the largest stable step where that is what fails.
+
+    Parameters
+    ----------
+    method : str
+        A fixed-step method.
+    step : (start, end)
+        That was compared with two of half its length [s].
+    difference : float
+        Of the two, relative to the size of the state.
+    stable : float
+        The largest stable step there [s]; NaN where it is not known.
+    """
+    start, length = step[0], abs(step[1] - step[0])
+    bound = f" The largest stable step there is about {stable:.2g} s." if stable < length else ""
+    warnings.warn(
+        f"Steps of {length:.4g} s by {method} do not resolve the motion: at t = {start:.6g} s one step and two of half "
+        f"its length differ by {difference:.2g} of the size of the state.{bound} Take shorter steps, 'RadauIIA' that "
+        "finds its own, or accuracy=1e-6.",
+        RuntimeWarning,
+        stacklevel=_outside(),
+    )
+
+
+def _outside():
+    """The stacklevel, in the calling function, of the first caller outside the package."""
+    level, frame = 1, sys._getframe(1)
+    while frame.f_back is not None and frame.f_globals["__name__"].split(".")[0] == __name__.split(".")[0]:
+        level, frame = level + 1, frame.f_back
+    return level

@@ -1,0 +1,198 @@
+"""The functions of a plant as SX expressions: the full mechanism under inputs, disturbances and further forces."""
+
+from dataclasses import replace
+from functools import cached_property
+from types import SimpleNamespace
+
+import casadi as ca
+import numpy as np
+
+from servoctl.codegen.folding import folded
+from servoctl.model.equations import Equations
+from servoctl.reduction.appell import plant_accelerations, require_inertia
+from servoctl.reduction.hidden import as_rows, complete
+from servoctl.reduction.manifold import Context
+
+CLEAR = 1e-6  # least eigenvalue of a mass matrix with unit diagonal that needs no decision about its rank
+
+
+class PlantEquations:
+    """Expressions of the state x = (q, γ', lagged inputs) and of p = (parameters, damping, 1/lag, u, d).
+
+    Parameters
+    ----------
+    mechanism : Mechanism
+    forces : (n,) SX
+        Further generalised forces.
+    damped : tuple of str
+        Names of the velocities with viscous damping.
+    lagged : tuple of str
+        Names of the actuators that lag behind their command.
+    """
+
+    def __init__(self, mechanism, forces, damped, lagged):
+        q = self.q = mechanism.q
+        self.mechanism, self.forces = mechanism, forces
+        self.velocity = ca.vertcat(*q.gamma(1))
+        self.lagging = ca.SX.sym("lagging", len(lagged))
+        self.state = ca.vertcat(*q, self.velocity, self.lagging)
+        self.damping, self.rates = ca.SX.sym("damping", len(damped)), ca.SX.sym("rate", len(lagged))
+        self.u, self.d = ca.SX.sym("u", len(mechanism.actuators)), ca.SX.sym("d", q.n)
+        self.p = ca.vertcat(*mechanism.parameters.symbols, self.damping, self.rates, self.u, self.d)
+        directions = list(q.jet_names(1))
+        self.resisting = ca.SX.zeros(q.n)
+        for c, name in zip(self.damping.elements(), damped, strict=True):
+            i = directions.index(name)
+            self.resisting[i] = -c * self.velocity[i]
+        self.lagged = [mechanism.actuators.index(name) for name in lagged]
+        self.force = ca.SX(self.u)
+        for a, value in zip(self.lagged, self.lagging.elements(), strict=True):
+            self.force[a] = value
+
+    def function(self, name, outputs, x=None, p=None):
+        """An SX function of (t, x, p) with one dense column."""
+        inputs = [self.q.t, self.state if x is None else x, self.p if p is None else p]
+        f = ca.Function(name, inputs, [ca.densify(ca.cse(ca.vertcat(*outputs)))])
+        return ca.Function(name, f.sx_in(), [ca.densify(ca.cse(folded(f)))], ["t", "x", "p"], ["y"])
+
+    @cached_property
+    def _material(self):
+        """Rows of the material constraints, of full rank, and points on their manifold."""
+        m = self.mechanism
+        context = Context(m.parameters.symbols, m.parameters.values(), (0.1, 1.1), {})
+        rows, _, points, _ = complete(self.q, as_rows(self.q, m.constraints, "material", context), context)
+        require_inertia(m, rows, points)
+        return rows, points
+
+    def require_inertia(self, values):
+        """Refuse parameters (n_p,) with which the mass matrix is singular or negative."""
+        rows, points = self._material
+        if not self._clearly_positive(values):
+            require_inertia(self.mechanism, rows, replace(points, values=values))
+
+    def _clearly_positive(self, values):
+        """Whether the mass matrix is far from singular at the points at hand."""
+        M = np.array(self._masses(values)).reshape(self.q.n, -1, self.q.n).swapaxes(0, 1)
+        size = np.sqrt(np.maximum(np.diagonal(M, axis1=1, axis2=2), 0.0))
+        if not np.isfinite(M).all() or not size.all():
+            return False
+        return np.linalg.eigvalsh(M / (size[:, :, None] * size[:, None, :])).min() > CLEAR
+
+    @cached_property
+    def _masses(self):
+        """A function of the parameters: the mass matrices at the points at hand, side by side."""
+        points = self._material[1]
+        symbols, state = ca.vertcat(*self.mechanism.parameters.symbols), ca.vertcat(*self.q, self.velocity)
+        at = np.vstack([points.t, points.jet(0), points.jet(1)]).astype(float)
+        mass = ca.Function("mass", [self.q.t, state, symbols], [ca.densify(self.mechanism.mass)])
+        sides = [mass(x[0], x[1:], symbols) for x in at.T]
+        return ca.Function("masses", [symbols], [ca.horzcat(*sides)])
+
+    @property
+    def constrained(self):
+        """Whether the state has invariants: material constraints or those of the kinematics."""
+        return bool(self.mechanism.constraints or self.q.invariants)
+
+    @cached_property
+    def acceleration(self):
+        """γ'' from [M G_mᵀ; G_m 0] [γ''; -λ] = [forces; ...]: material constraints are held, ideally."""
+        q, (rows, points) = self.q, self._material
+        acceleration, zero = ca.vertcat(*q.gamma(2)), ca.SX.zeros(q.n)
+        second = [q.derivatives([row.expression], 2 - row.order)[-1][0] for row in rows]
+        second = ca.substitute(ca.vertcat(*second), acceleration, zero) if rows else ca.SX(0, 1)
+        driven = self.mechanism.E @ self.force + self.d + self.forces + self.resisting
+        force = driven - ca.substitute(self.mechanism.balance, acceleration, zero)
+        return ca.cse(plant_accelerations(self.mechanism, rows, force, -second, points))
+
+    @cached_property
+    def state_rates(self):
+        """x'."""
+        q = self.q
+        lags = self.rates * (self.u[self.lagged] - self.lagging) if self.lagged else ca.SX(0, 1)
+        return ca.vertcat(q.V @ self.velocity + q.h, self.acceleration, lags)
+
+    def ode(self):
+        """x' of the state."""
+        return self.function("plant", [self.state_rates])
+
+    def ode_power(self):
+        """x' of the state and the power of all forces without a potential: the state grows by their work."""
+        x = ca.vertcat(self.state, ca.SX.sym("work"))
+        return self.function("plant_power", [self.state_rates, ca.sum1(self._powers)], x)
+
+    @property
+    def _powers(self):
+        """Power of the inputs, of the disturbances, and of friction and other forces."""
+        w = self.velocity
+        other = self.mechanism.forces + self.forces + self.resisting
+        return ca.vertcat(ca.dot(w, self.mechanism.E @ self.force), ca.dot(w, self.d), ca.dot(w, other))
+
+    def power(self):
+        """Energy and the three powers."""
+        return self.function("power", [self.mechanism.energy, self._powers])
+
+    @cached_property
+    def unbalanced(self):
+        """Why dE/dt is not the power of inputs, disturbances and other forces; "" where it is."""
+        q, m = self.q, self.mechanism
+        inertial = q.dt(m.energy) - ca.dot(self.velocity, m.balance + m.forces)
+        if not m.is_zero([inertial]):
+            return "the inertia terms depend on time or on more than wᵀMw/2"
+        for row in self._material[0]:
+            rate = q.derivatives([row.expression], 1 - row.order)[-1][0]
+            if not m.is_zero([rate - ca.jtimes(rate, self.velocity, self.velocity)]):  # its reaction does work
+                return f"the material constraint {row.name!r} moves by itself"
+        return ""
+
+    def jacobian(self):
+        """∂x'/∂x and ∂x'/∂u, column by column."""
+        parts = [ca.jacobian(self.state_rates, ca.vertcat(self.state, self.u))]
+        return self.function("jacobian", [ca.vec(ca.densify(parts[0]))])
+
+    def directions(self):
+        """E and V, column by column."""
+        return self.function("directions", [ca.vec(ca.densify(self.mechanism.E)), ca.vec(ca.densify(self.q.V))])
+
+    def accelerations(self):
+        """γ''."""
+        return self.function("accelerations", [self.acceleration])
+
+    def outputs(self):
+        """The mechanism's named outputs."""
+        found = [
+            ca.substitute(e, ca.vertcat(*self.q.gamma(2)), self.acceleration) for e in self.mechanism.outputs.values()
+        ]
+        return self.function("outputs", found)
+
+    def constraints(self):
+        """Names and values of the invariants of the state, level by level."""
+        if not self.constrained:
+            return [], self.function("constraints", [ca.SX(0, 1)])
+        found = self._invariants.invariant_rows
+        return [name for _, name, _ in found], self.function("constraints", [e for _, _, e in found])
+
+    def constraints_jacobian(self):
+        """Derivatives of the invariants of the state in x, column by column."""
+        values = ca.vertcat(*(e for _, _, e in self._invariants.invariant_rows))
+        return self.function("constraints_jacobian", [ca.vec(ca.densify(ca.jacobian(values, self.state)))])
+
+    def project(self, extra=0):
+        """The least change of the state that restores its invariants; None where there are none.
+
+        Parameters
+        ----------
+        extra : int
+            Number of states behind those of the plant, which stay as they are.
+        """
+        if not self.constrained:
+            return None
+        f = self._invariants.project()
+        n = f.numel_in(1)
+        change = f(self.q.t, self.state[:n], self.p[: f.numel_in(2)])
+        untouched = ca.SX.zeros(self.lagging.numel() + extra)
+        return self.function("project", [change, untouched], ca.vertcat(self.state, ca.SX.sym("extra", extra)))
+
+    @cached_property
+    def _invariants(self):
+        rows, points = self._material
+        return Equations(SimpleNamespace(mechanism=self.mechanism, top=2, rows=rows, points=points))

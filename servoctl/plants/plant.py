@@ -1,0 +1,382 @@
+"""The plant: the full mechanism with its own numbers, friction, actuators and their limits."""
+
+from dataclasses import dataclass, field
+
+import casadi as ca
+import numpy as np
+
+from servoctl.codegen.function import compiled
+from servoctl.codegen.loops.closed import DRIVER
+from servoctl.errors import SpecificationError, unknown
+from servoctl.plants.equations import PlantEquations
+from servoctl.spec.coordinates import column, mapping
+from servoctl.spec.mechanism import Mechanism, require_known
+from servoctl.spec.parameters import finite
+
+
+def plant(mechanism, *, forces=None, damping=None, limits=None, rate_limits=None, lag=None, delay=0.0, **parameters):
+    """Make the plant of a mechanism: what the controller acts on.
+
+    The equations are derived once for a mechanism and a set of further forces; other numbers cost nothing.
+
+    Parameters
+    ----------
+    mechanism : Mechanism
+    forces : dict of str to SX, optional
+        Further generalised forces, friction among them, by coordinate (or quasi-velocity) [N or N m]: expressions of
+        t, q, γ' and the parameters.
+    damping : dict of str to float, optional
+        Viscous coefficients by coordinate (or quasi-velocity) [N s/m or N m s].
+    limits : dict of str to float or (low, high), optional
+        Of the actuators' inputs; a number c stands for (-c, c), None leaves a side open.
+    rate_limits : dict of str to float, optional
+        Largest |du/dt| of the inputs [1/s]: from sample to sample an input changes by at most this times the period.
+    lag : dict of str to float, optional
+        Time constants of actuators that follow their input with first order [s]; each is a state of the plant.
+    delay : float or dict of str to float
+        Transport delay of all or of named inputs [s].
+    **parameters : float
+        Parameters of the mechanism that differ from their defaults, SI.
+
+    Returns
+    -------
+    Plant
+
+    Raises
+    ------
+    NameUnknown
+        For a name of no parameter, actuator or coordinate.
+    SpecificationError
+        For a value that makes no sense, or a mass matrix that is singular or negative.
+    """
+    if not isinstance(mechanism, Mechanism):
+        raise SpecificationError(
+            f"A {type(mechanism).__name__} was given in the place of a Mechanism.",
+            "A plant is made of a mechanism and numbers.",
+            do="Write sv.plant(mechanism, m_load=115.0).",
+        )
+    directions, actuators = mechanism.q.jet_names(1), mechanism.actuators
+    names = mechanism.q.names if mechanism.q.plain else mechanism.q.velocity_names
+    values = mechanism.parameters.values(parameters)
+    damping = _named_numbers(damping, names, "coordinate", "damping", low=0.0)
+    lag = _named_numbers(lag, actuators, "actuator", "lag", positive=True)
+    rate_limits = _named_numbers(rate_limits, actuators, "actuator", "rate limit", positive=True)
+    if not isinstance(delay, dict):
+        delay = dict.fromkeys(actuators, delay) if finite("delay", delay, "time") else {}
+    delay = _named_numbers(delay, actuators, "actuator", "delay", low=0.0)
+    force, key = _forces(mechanism, forces, names)
+    damped = tuple(name for name in names if name in damping)
+    lagged = tuple(name for name in actuators if name in lag)
+    key = (key, damped, lagged)
+    found = vars(mechanism).setdefault("_plants", {})  # as a cached property: derived once, whatever the numbers
+    if key not in found:
+        velocities = tuple(directions[names.index(name)] for name in damped)
+        found[key] = (PlantEquations(mechanism, force, velocities, lagged), {})
+    found[key][0].require_inertia(values)
+    numbers = np.concatenate([values, [damping[n] for n in damped], [1.0 / lag[n] for n in lagged]])
+    state_names = (*mechanism.q.names, *directions, *lagged)
+    return Plant(
+        mechanism, numbers, state_names, actuators, tuple(names),
+        _limits(limits, actuators), rate_limits, lag, {n: d for n, d in delay.items() if d}, damping,
+        equations=found[key][0], _functions=found[key][1],
+    )  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class Plant:
+    """The full mechanism under actuator inputs and disturbances, material constraints held; made by `plant`.
+
+    Attributes
+    ----------
+    mechanism : Mechanism
+    parameters : (n_c,) array
+        Numbers: the mechanism's parameters, damping coefficients, 1/lag.
+    state_names : tuple of str
+        Names of the state x = (q, γ', lagged inputs).
+    inputs : tuple of str
+        Names of the actuators.
+    disturbable : tuple of str
+        Names of the generalised forces that may be disturbed: those of the coordinates or quasi-velocities.
+    limits : dict of str to (float, float)
+    rate_limits, lag, delay, damping : dict of str to float
+    """
+
+    mechanism: Mechanism
+    parameters: np.ndarray
+    state_names: tuple
+    inputs: tuple
+    disturbable: tuple
+    limits: dict
+    rate_limits: dict
+    lag: dict
+    delay: dict
+    damping: dict
+    equations: PlantEquations = field(repr=False)
+    _functions: dict = field(repr=False)
+
+    @property
+    def n_x(self):
+        """The number of states."""
+        return len(self.state_names)
+
+    @property
+    def lagged(self):
+        """Names of the actuators that are states, in the order of the state."""
+        return self.state_names[self.n_x - len(self.lag) :]
+
+    @property
+    def constrained(self):
+        """Whether the state has invariants: material constraints, or those of the kinematics."""
+        return self.equations.constrained
+
+    def p(self, u=None, d=None):
+        """The vector p of the plant's functions: parameters, inputs u and disturbances d.
+
+        Parameters
+        ----------
+        u : (m,) or (m, N) array, optional
+            Inputs; default 0.
+        d : (n,) array, optional
+            Disturbances by generalised force; default 0.
+
+        Returns
+        -------
+        (n_p,) or (n_p, N) array
+        """
+        u = np.zeros(len(self.inputs)) if u is None else np.asarray(u, dtype=float)
+        d = np.zeros(len(self.disturbable)) if d is None else np.asarray(d, dtype=float)
+        if u.ndim == 1:
+            return np.concatenate([self.parameters, u, d])
+        fixed = np.repeat(self.parameters[:, None], u.shape[1], axis=1)
+        d = d if d.ndim == 2 else np.repeat(d[:, None], u.shape[1], axis=1)
+        return np.concatenate([fixed, u, d])
+
+    def function(self, name):
+        """One of the plant's compiled functions of (t, x, p), built at first use.
+
+        Parameters
+        ----------
+        name : str
+            "ode", "ode_power", "jacobian", "directions", "power", "accelerations", "outputs", "constraints" or
+            "constraints_jacobian".
+
+        Returns
+        -------
+        Compiled
+        """
+        if name not in self._functions:
+            e = self.equations
+            build = {
+                "ode": lambda: (e.ode(), (), e.project(), None, DRIVER),
+                "ode_power": lambda: (e.ode_power(), (), e.project(extra=1), None, DRIVER),
+                "jacobian": lambda: (e.jacobian(),),
+                "directions": lambda: (e.directions(),),
+                "power": lambda: (e.power(),),
+                "accelerations": lambda: (e.accelerations(),),
+                "outputs": lambda: (e.outputs(),),
+                "constraints": lambda: (e.constraints()[1],),
+                "constraints_jacobian": lambda: (e.constraints_jacobian(),),
+            }
+            if name not in build:
+                raise unknown(name, list(build), "function")
+            f, *options = build[name]()
+            self._functions[name] = compiled(f, f.name(), *options)
+        return self._functions[name]
+
+    def constraint_names(self):
+        """Names of the invariants in the order of the function "constraints"."""
+        return self.equations.constraints()[0]
+
+    def rates(self, t, x, u, d=None):
+        """The rates x' at one point.
+
+        Parameters
+        ----------
+        t : float
+            [s]
+        x : (n_x,) array
+        u : (m,) array
+        d : (n,) array, optional
+
+        Returns
+        -------
+        (n_x,) array
+        """
+        return self.function("ode")(t, x, self.p(u, d))
+
+    def linearised(self, t, x, u):
+        """A = ∂x'/∂x and B = ∂x'/∂u at points.
+
+        Parameters
+        ----------
+        t : (N,) array
+            [s]
+        x : (n_x, N) array
+        u : (m, N) array
+
+        Returns
+        -------
+        A : (N, n_x, n_x) array
+        B : (N, n_x, m) array
+        """
+        t, x, u = np.atleast_1d(t), np.asarray(x, dtype=float), np.asarray(u, dtype=float)
+        y = self.function("jacobian").grid(t, x, self.p(u))
+        both = y.reshape(-1, self.n_x, len(t)).transpose(2, 1, 0)
+        return both[:, :, : self.n_x], both[:, :, self.n_x :]
+
+    def state(self, values):
+        """A full state: an array of (q, γ') or of all states, or values by name.
+
+        Lagged inputs that are not given are NaN: `close` lets them start at the first input.
+
+        Parameters
+        ----------
+        values : array, dict of str to float, or a consistent start
+
+        Returns
+        -------
+        (n_x,) array
+
+        Raises
+        ------
+        SpecificationError
+            If entries are missing, too many or not finite.
+        """
+        names, n = self.state_names, self.n_x - len(self.lag)
+        values = getattr(values, "values", values) if not isinstance(values, dict) else values
+        if isinstance(values, dict):
+            for name in values:
+                if name not in names:
+                    raise unknown(name, names, "state")
+            missing = [name for name in names[:n] if name not in values]
+            if missing:
+                raise SpecificationError(
+                    f"The state has no {missing[0]}.", f"It is made of {', '.join(names)}.", do="Give all of them."
+                )
+            given = np.array([finite(k, values[k], "state") if k in values else np.nan for k in names])
+            return given
+        try:
+            given = np.asarray(values, dtype=float).ravel()
+        except (TypeError, ValueError) as error:
+            raise SpecificationError(
+                f"The state is a {type(values).__name__}.", "It is an array or a dict of numbers.", do="Give one."
+            ) from error
+        if given.size not in (n, self.n_x) or not np.isfinite(given).all():
+            raise SpecificationError(
+                f"The state {np.array2string(given, threshold=8)} was given.",
+                f"It has {n} finite numbers: {', '.join(names[:n])}"
+                + (f"; or {self.n_x}, with the inputs {', '.join(names[n:])}." if self.lag else "."),
+                nearest="plan.state(0.0).",
+                do="Give one number each.",
+                names=names,
+            )
+        return np.concatenate([given, np.full(self.n_x - given.size, np.nan)])
+
+    def __repr__(self):
+        m = self.mechanism
+        changed = [
+            f"{n}={v:g}"
+            for n, v in zip(m.parameters.names, self.parameters, strict=False)
+            if v != m.parameters.defaults[n]
+        ]
+        lines = [
+            f"Plant: state {' '.join(self.state_names)}"[:118],
+            f"  inputs {', '.join(self.inputs) or '(none)'}"[:118],
+        ]
+        if m.constraints:
+            lines.append(f"  material constraints held: {', '.join(m.constraints)}"[:118])
+        if changed:
+            lines.append(f"  changed: {', '.join(changed)}"[:118])
+        for what, values in (
+            ("limits", {n: f"{a:g} .. {b:g}" for n, (a, b) in self.limits.items()}),
+            ("rate limits [1/s]", _short(self.rate_limits)),
+            ("lag [s]", _short(self.lag)),
+            ("delay [s]", _short(self.delay)),
+            ("damping", _short(self.damping)),
+        ):
+            if values:
+                lines.append(f"  {what}: {', '.join(f'{n} {v}' for n, v in values.items())}"[:118])
+        return "\n".join(lines)
+
+
+def _short(values):
+    return {name: f"{value:g}" for name, value in values.items()}
+
+
+def _named_numbers(values, names, what, meaning, low=-np.inf, positive=False):
+    """Finite numbers by name, none below `low`."""
+    found = {}
+    for name, value in mapping(values, f"The {meaning}s").items():
+        if name not in names:
+            raise unknown(name, names, what)
+        number = finite(name, value, meaning)
+        if number < low or (positive and number <= 0):
+            raise SpecificationError(
+                f"The {meaning} of {name!r} is {number:g}.",
+                f"A {meaning} is {'positive' if positive else 'not negative'}.",
+                do="Leave it out, or change the number.",
+                name=name,
+            )
+        found[name] = number
+    return found
+
+
+def _limits(limits, actuators):
+    found = {}
+    for name, value in mapping(limits, "The limits").items():
+        if name not in actuators:
+            raise unknown(name, actuators, "actuator")
+        found[name] = interval(name, value, "limit")
+    return found
+
+
+def interval(name, value, what):
+    """The interval (low, high) that was given for a name, as floats: infinite on a side that is open.
+
+    Parameters
+    ----------
+    name : str
+    value : (float or None, float or None) or float
+        A number c stands for (-c, c), None leaves a side open.
+    what : str
+        What the interval is, in the singular: "limit", "bound".
+
+    Raises
+    ------
+    SpecificationError
+        If it is empty, open on both sides, or something else.
+    """
+    try:
+        low, high = (-value, value) if np.ndim(value) == 0 else value
+        low, high = -np.inf if low is None else float(low), np.inf if high is None else float(high)
+    except (TypeError, ValueError):
+        low = high = np.nan
+    if not low < high or np.isinf([low, high]).all():
+        raise SpecificationError(
+            f"The {what} of {name!r} is {value!r}.",
+            f"A {what} is an interval: a pair with low < high, None on an open side, or a positive number for both.",
+            nearest="(-100.0, 100.0).",
+            do="Give such a pair or number.",
+            name=name,
+        )
+    return low, high
+
+
+def _forces(mechanism, forces, names):
+    """Further generalised forces, (n,) SX, and what identifies them."""
+    q, total = mechanism.q, ca.SX.zeros(mechanism.q.n)
+    for name, value in mapping(forces, "The forces").items():
+        if name not in names:
+            raise unknown(name, names, "coordinate" if q.plain else "quasi-velocity")
+        expression = column(value, f"the force on {name!r}", 1)[0]
+        require_known(expression, mechanism, f"the force on {name!r}")
+        if q.order(expression) > 1:
+            raise SpecificationError(
+                f"The force on {name!r} depends on accelerations.",
+                "Forces of a plant are functions of t, q and γ'.",
+                nearest="A mass in the Gibbs function.",
+                do="Put it into the mechanism.",
+                name=name,
+            )
+        total[names.index(name)] = expression
+    return total, tuple((i, e.element_hash()) for i, e in enumerate(total.elements()) if not e.is_zero())

@@ -1,0 +1,373 @@
+"""A run: what a simulation computed, by name."""
+
+import json
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from servoctl.errors import ServoError, SpecificationError, unknown
+
+STENCIL = 9  # samples of the polynomial through which an extremum is refined: error of order h^9
+ROUNDING = 1e-14  # of the values beside it: an extremum between samples that is no further from one is that sample
+FORMAT = 1
+TOLD = ("method", "drift", "counters", "success", "status", "message", "knots")  # what a file keeps besides arrays
+
+
+@dataclass(frozen=True, eq=False)
+class Run:
+    """A motion with its actuation and its residuals; made by `simulate`, `close` or `load`.
+
+    `run["theta"]`, `run["dtheta"]`, `run["trolley"]` are (N,) arrays, SI, and so are the derivatives in time of an
+    actuation, output or energy, `run["dtrolley"]`, `run["d2trolley"]`, where the jets reach: `simulate(...,
+    method="Taylor", jets=3)`. `run.residual["X"]` is (levels, N): the residual and its derivatives.
+
+    Attributes
+    ----------
+    t : (N,) array
+        [s]
+    jets : (n_z, N) array
+        q, γ', ..., γ^(s̄), with the names `jet_names`.
+    counters : dict of str to int
+        nfev, njev, nlu, steps, iterations, projections, pivot changes: those that the method has.
+    success : bool
+    status : int
+        0 finished, 1 interrupted, -1 stopped.
+    message : str
+        What happened, and what to try next.
+    variants : tuple of (first, last + 1, model)
+        Where pivots were changed: which variant of the model holds for which samples; empty for the model alone.
+    """
+
+    t: np.ndarray
+    jets: np.ndarray
+    jet_names: tuple
+    model: object = None
+    method: str = ""
+    drift: str = ""
+    counters: dict = field(default_factory=dict)
+    success: bool = True
+    status: int = 0
+    message: str = ""
+    knots: tuple = ()
+    variants: tuple = ()
+    stored: dict = field(default_factory=dict)
+    stored_residual: dict = field(default_factory=dict)
+
+    @property
+    def names(self):
+        """Names of all signals."""
+        groups = self.model.signal_groups if self.model is not None else {}
+        return tuple(dict.fromkeys([*self.jet_names, *groups, *self.stored]))
+
+    def __getitem__(self, name):
+        if name in self.jet_names:
+            return self.jets[self.jet_names.index(name)]
+        if name not in self.stored:
+            groups = self.model.signal_groups if self.model is not None else {}
+            rate, base = (0, name) if name in groups else _split(name)
+            if base not in groups:
+                raise unknown(name, self.names, "signal")
+            names, values = self.signals(groups[base], rate)
+            self.stored.update(zip(names, values, strict=True))
+        return self.stored[name]
+
+    def signals(self, kind, rate=0):
+        """Names and (n, N) values of one of the model's groups of signals, or of their derivatives in time.
+
+        Parameters
+        ----------
+        kind : str
+            One of `servoctl.model.model.SIGNALS`.
+        rate : int
+            Order of the derivative. It may need jets above s̄.
+
+        Raises
+        ------
+        SpecificationError
+            If the run does not hold the jets that the derivative needs.
+        """
+        parts = []
+        for first, end, model in self.variants or ((0, len(self.t), self.model),):
+            names, f = model.signals(kind, rate)
+            if f.n_x > len(self.jets):
+                highest = (f.n_x - model.nq) // model.n
+                raise SpecificationError(
+                    f"{', '.join(names)} {'was' if len(names) == 1 else 'were'} asked for of a run with jets up to "
+                    f"order {(len(self.jets) - model.nq) // model.n}.",
+                    f"These derivatives in time follow from jets up to order {highest}.",
+                    nearest=f"simulate(..., method='Taylor', jets={highest}).",
+                    do="Simulate so.",
+                    jets=highest,
+                )
+            parts.append(f.grid(self.t[first:end], self.jets[: f.n_x, first:end], model.parameters))
+        return names, np.concatenate(parts, axis=1)
+
+    def variant(self, i):
+        """The variant of the model that holds at sample i."""
+        return next((model for first, end, model in self.variants if first <= i < end), self.model)
+
+    @property
+    def residual(self):
+        """Residuals of every constraint at every level: a mapping of names to (levels, N) arrays."""
+        return _Residuals(self)
+
+    def state(self, t):
+        """The state (q, γ') of the mechanism at an instant, between samples by Hermite interpolation.
+
+        Parameters
+        ----------
+        t : float
+            Within the run [s].
+
+        Returns
+        -------
+        (nq + n,) array
+        """
+        jets = self.at(t)
+        return jets[: self.model.nq + self.model.n]
+
+    def at(self, t):
+        """The jets Z at an instant (n_z,), between samples by Hermite interpolation of all derivatives.
+
+        Parameters
+        ----------
+        t : float
+            Within the run [s].
+
+        Raises
+        ------
+        SpecificationError
+            If t lies outside the run.
+        """
+        low, high = min(self.t[0], self.t[-1]), max(self.t[0], self.t[-1])
+        if not low - 1e-12 * (1 + abs(low)) <= t <= high + 1e-12 * (1 + abs(high)):
+            raise SpecificationError(
+                f"t = {t:g} s was asked for.", f"The run covers {low:g} to {high:g} s.", do="Ask for a time within."
+            )
+        if self.model is None:
+            raise SpecificationError(
+                "A loaded run knows its samples only.",
+                "Interpolation needs the model.",
+                do="Take a column of run.jets.",
+            )
+        i = int(np.argmin(np.abs(self.t - t)))
+        if abs(self.t[i] - t) < 1e-13 * max(1.0, high - low) or len(self.t) == 1:
+            return self.jets[:, i].copy()
+        step = 1 if (t > self.t[i]) == (self.t[-1] > self.t[0]) else -1
+        j = min(max(i + step, 0), len(self.t) - 1)
+        return self._hermite(t, *sorted((i, j), key=lambda k: self.t[k]))
+
+    def _hermite(self, t, i, j):
+        from scipy.interpolate import BPoly
+
+        model, ends = self.model, [self.t[i], self.t[j]]
+        nq, n = model.nq, model.n
+        top = (len(self.jets) - nq) // n
+        levels = [self.jets[nq + k * n : nq + (k + 1) * n, [i, j]] for k in range(top)]
+        plain = "coordinate_rates" not in model.signal_groups.values()
+        rates = levels if plain else self._coordinate_rates([i, j])
+        q = BPoly.from_derivatives(ends, np.stack([self.jets[:nq, [i, j]], *rates], axis=1).transpose(2, 1, 0))
+        if plain:
+            return np.concatenate([q(t, nu=k) for k in range(top + 1)])
+        w = BPoly.from_derivatives(ends, np.stack(levels, axis=1).transpose(2, 1, 0))
+        return np.concatenate([q(t), *(w(t, nu=k) for k in range(top))])
+
+    def _coordinate_rates(self, columns):
+        _, f = self.model.signals("coordinate_rates")
+        values = f.grid(self.t[columns], self.jets[: f.n_x, columns], self.model.parameters)
+        return [values[: self.model.nq], values[self.model.nq :]]
+
+    def extrema(self, name):
+        """The least and the greatest value of a signal, refined between samples.
+
+        Parameters
+        ----------
+        name : str
+
+        Returns
+        -------
+        ((t, value), (t, value))
+            Of the minimum and the maximum among finite values; NaN where there are none.
+        """
+        values = self[name]
+        return tuple(self._refined(values, sign) for sign in (-1.0, 1.0))
+
+    def _refined(self, values, sign):
+        known = np.isfinite(values)
+        k = int(np.argmax(np.where(known, sign * values, -np.inf)))
+        best = (float(self.t[k]), float(values[k]))
+        edges = [
+            self.t[0],
+            *[x for x in self.knots if min(self.t[0], self.t[-1]) < x < max(self.t[0], self.t[-1])],
+            self.t[-1],
+        ]
+        for a, b in zip(edges[:-1], edges[1:], strict=True):
+            inside = np.flatnonzero((self.t >= min(a, b)) & (self.t <= max(a, b)))
+            if k not in inside or len(inside) < 4:
+                continue
+            first = min(max(k - STENCIL // 2, inside[0]), max(inside[0], inside[-1] - STENCIL + 1))
+            window = slice(first, min(first + STENCIL, inside[-1] + 1))
+            if not known[window].all():
+                continue
+            centre, width = self.t[k], np.ptp(self.t[window]) / 2
+            s = (self.t[window] - centre) / width
+            polynomial = np.polynomial.Polynomial.fit(s, values[window], len(s) - 1, domain=[-1, 1])
+            neighbours = [(self.t[i] - centre) / width for i in (k - 1, k + 1) if i in inside]
+            for root in polynomial.deriv().roots():
+                if abs(root.imag) < 1e-9 and min([*neighbours, 0.0]) <= root.real <= max([*neighbours, 0.0]):
+                    value = float(polynomial(root.real))
+                    if sign * (value - best[1]) > ROUNDING * np.abs(values[window]).max():
+                        best = (float(centre + root.real * width), value)
+        return best
+
+    def save(self, path):
+        """Save the run as npz, without pickle: samples, all signals, residuals, and what happened.
+
+        Parameters
+        ----------
+        path : str or Path
+            A missing suffix .npz is added.
+
+        Returns
+        -------
+        Path
+
+        Raises
+        ------
+        ServoError
+            If the file cannot be written.
+        """
+        from pathlib import Path
+
+        path = Path(path)
+        path = path if path.suffix == ".npz" else path.with_name(path.name + ".npz")
+        signals = {name: self[name] for name in self.names if name not in self.jet_names}
+        meta = {name: getattr(self, name) for name in TOLD} | {"format": FORMAT, "jet_names": self.jet_names}
+        meta |= {"signals": list(signals), "residuals": list(self.residual)}
+        arrays = {f"signal_{i}": value for i, value in enumerate(signals.values())}
+        arrays |= {f"residual_{i}": self.residual[name] for i, name in enumerate(self.residual)}
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            np.savez_compressed(path, t=self.t, jets=self.jets, meta=np.array(json.dumps(meta)), **arrays)
+        except OSError as error:
+            raise ServoError(
+                f"The run cannot be written to {path}: {error.strerror or error}.",
+                "A run is saved where files may be created.",
+                nearest="The current folder, or the system's temporary one.",
+                do="Choose another path; the run itself is kept.",
+                path=str(path),
+            ) from error
+        return path
+
+    def to_xarray(self):
+        """The run as an xarray.Dataset over time, where xarray is installed.
+
+        Raises
+        ------
+        ServoError
+            If xarray is not installed.
+        """
+        try:
+            import xarray
+        except ImportError as error:
+            raise ServoError(
+                "xarray is not installed.", "A Dataset is an xarray object.", do="Install xarray, or use run.save."
+            ) from error
+        data = {name: ("t", self[name]) for name in self.names}
+        for name in self.residual:
+            data[f"residual_{name}"] = ((f"level_{name}", "t"), self.residual[name])
+        attributes = {"method": self.method, "drift": self.drift, "message": self.message, **self.counters}
+        return xarray.Dataset(data, coords={"t": self.t}, attrs=attributes)
+
+    def __repr__(self):
+        if not len(self.t):
+            return f"Run: no samples; {self.message}"
+        worst = {name: float(np.abs(self.residual[name]).max(initial=0.0)) for name in self.residual}
+        shown = sorted(worst, key=worst.get, reverse=True)[:4]
+        lines = [
+            f"Run: {len(self.t)} samples, t = {self.t[0]:g} .. {self.t[-1]:g} s; {self.message}",
+            f"  method {self.method}" + (f", drift: {self.drift}" if self.drift else ""),
+            "  " + ", ".join(f"{name} {count}" for name, count in self.counters.items() if count),
+            "  largest residuals over all levels: " + ", ".join(f"{name} {worst[name]:.1e}" for name in shown),
+        ]
+        signals = [name for name in (*self._actuators(), *self._outputs()) if np.isfinite(self[name]).any()]
+        for name in signals[:7]:
+            (t_low, low), (t_high, high) = self.extrema(name)
+            lines.append(f"  {name}: {low:.6g} (t = {t_low:.4g} s) .. {high:.6g} (t = {t_high:.4g} s)")
+        return "\n".join(line for line in lines if line.strip())
+
+    def _actuators(self):
+        return [n for n in (self.model.actuators if self.model is not None else ()) if n in self.names]
+
+    def _outputs(self):
+        return list(self.model.outputs) if self.model is not None else []
+
+
+def _split(name):
+    """The order k >= 1 and the rest of a name d..., d2..., d3...; 0 and the name itself where it is none."""
+    found = re.fullmatch(r"d([2-9]|[1-9]\d+)?(\D.*)", name) if isinstance(name, str) else None
+    return (int(found[1] or 1), found[2]) if found else (0, name)
+
+
+class _Residuals(Mapping):
+    """Residuals by name, computed at the first access."""
+
+    def __init__(self, run):
+        self._run = run
+
+    def __repr__(self):
+        return f"Residuals({', '.join(self._names())})"
+
+    def _names(self):
+        return list(self._run.stored_residual) if self._run.model is None else list(self._run.model.residual_names)
+
+    def __iter__(self):
+        return iter(self._names())
+
+    def __len__(self):
+        return len(self._names())
+
+    def __getitem__(self, name):
+        stored = self._run.stored_residual
+        if name not in stored:
+            if name not in self._names():
+                raise unknown(name, self._names(), "residual")
+            places, values = self._run.signals("residuals")
+            for row in dict.fromkeys(place[0] for place in places):
+                stored[row] = values[[i for i, place in enumerate(places) if place[0] == row]]
+        return stored[name]
+
+
+def load(path):
+    """A run from a file that `Run.save` wrote.
+
+    Parameters
+    ----------
+    path : str or Path
+
+    Returns
+    -------
+    Run
+        With its samples, signals and residuals; without its model.
+
+    Raises
+    ------
+    ServoError
+        If the file is missing or was not written by `Run.save`.
+    """
+    try:
+        with np.load(path, allow_pickle=False) as data:
+            meta = json.loads(str(data["meta"]))
+            signals = {name: data[f"signal_{i}"] for i, name in enumerate(meta["signals"])}
+            residuals = {name: data[f"residual_{i}"] for i, name in enumerate(meta["residuals"])}
+            told = {name: meta[name] for name in TOLD} | {"knots": tuple(meta["knots"])}
+            names = tuple(meta["jet_names"])
+            return Run(data["t"], data["jets"], names, stored=signals, stored_residual=residuals, **told)
+    except (OSError, KeyError, ValueError) as error:
+        raise ServoError(
+            f"{path} cannot be read as a run: {error}.",
+            "A run is an npz file written by Run.save.",
+            do="Check the path.",
+        ) from error

@@ -1,0 +1,222 @@
+"""What a run leaves: the text that was printed, a folder with its files, and its facts as plain values."""
+
+import contextlib
+import math
+import os
+import sys
+import tempfile
+import textwrap
+from pathlib import Path
+
+from servoctl.errors import ServoError
+
+WIDTH = 120  # columns of what is printed
+FILES = ("run.npz", "summary.json", "report.txt", "path.png", "coordinates.png", "actuation.png", "residuals.png")
+LOOP_FILES = ("closed_loop.npz", "closed_loop.png")
+
+
+class Report:
+    """What was printed, to be written as well."""
+
+    def __init__(self):
+        self.texts = []
+
+    def say(self, value):
+        """Print a value, long lines wrapped, and remember it."""
+        lines = (
+            textwrap.fill(line, WIDTH, subsequent_indent="    ", break_on_hyphens=False) if len(line) > WIDTH else line
+            for line in str(value).splitlines()
+        )
+        self.texts.append("\n".join(lines) + "\n")
+        try:
+            print(self.texts[-1], flush=True)
+        except BrokenPipeError:  # a reader that left, such as head, does not end the computation
+            sys.stdout = open(os.devnull, "w")
+
+
+def complain(*texts):
+    """Print texts to stderr in lines of readable length."""
+    for text in texts:
+        print(textwrap.fill(text, WIDTH, subsequent_indent="  ", break_on_hyphens=False), file=sys.stderr)
+
+
+class Folder:
+    """The folder of a run: tried before anything is computed, replaced by a temporary one where writing fails later.
+
+    Parameters
+    ----------
+    path : Path
+        Made where it is missing.
+    name : str
+        Of the run.
+
+    Attributes
+    ----------
+    path : Path
+        Where the files are.
+    moved : bool
+        Whether this is a temporary folder in place of the one that was asked for.
+
+    Raises
+    ------
+    ServoError
+        If no file can be made in it.
+    """
+
+    def __init__(self, path, name):
+        self.path, self.name, self.moved, self._done = path, name, False, []
+        self._made = [p for p in (path, *path.parents) if not p.exists()]
+        try:
+            path.mkdir(parents=True, exist_ok=True)
+            with tempfile.TemporaryFile(dir=path):
+                pass
+        except OSError as error:
+            self.leave()
+            reason = "it is a file" if path.is_file() else error.strerror or error
+            raise ServoError(
+                f"The folder {path} cannot be written: {reason}.",
+                "A run leaves its numbers and figures in a folder.",
+                nearest=f"The default is {Path('servoctl-runs', name)} in the current folder.",
+                do="Give another folder by --out. Nothing has been computed yet.",
+                folder=str(path),
+            ) from error
+
+    def write(self, action):
+        """Carry out `action(path)`; where it fails, it and all before it are carried out in a temporary folder.
+
+        Parameters
+        ----------
+        action : callable
+            Writes files into the folder that it is given. The first one finds the files of earlier runs removed.
+
+        Raises
+        ------
+        ServoError
+            If the temporary folder cannot be written, either.
+        """
+        try:
+            if not self._done:
+                for name in (*FILES, *LOOP_FILES):
+                    (self.path / name).unlink(missing_ok=True)
+            action(self.path)
+        except (OSError, ServoError) as error:
+            if self.moved:
+                raise _nowhere(self.path, error) from error
+            self._move(error)
+            for each in [*self._done, action]:
+                self.write(each)
+        else:
+            self._done.append(action)
+
+    def _move(self, error):
+        try:
+            self.path, self.moved = Path(tempfile.mkdtemp(prefix=f"servoctl-{self.name}-")), True
+        except OSError as another:
+            raise _nowhere(tempfile.gettempdir(), another) from error
+        self._made.append(self.path)
+        complain(f"{self.name}: {error}", f"What was computed is kept: it is written to {self.path} instead.")
+
+    def leave(self):
+        """Remove the folders that were made for this run and stayed empty."""
+        for path in self._made:
+            with contextlib.suppress(OSError):
+                path.rmdir()
+
+
+def _nowhere(path, error):
+    return ServoError(
+        f"{path} cannot be written, either: {error}.",
+        "A run leaves its numbers and figures in a folder.",
+        do="Make room or set TMPDIR, and run again; what was printed is above.",
+    )
+
+
+def summary(run, start, verification):
+    """Facts of a run as plain values, for JSON; what is not finite becomes None.
+
+    Parameters
+    ----------
+    run : Run
+        With its model.
+    start : State
+    verification : Verification or None
+
+    Returns
+    -------
+    dict
+        versions, parameters, method, outcome, counters, start, structure, extrema of actuators and outputs with their
+        times [s], worst residual of each constraint over all levels and at each, numbers of the verification.
+    """
+    from servoctl.figures.run import efforts
+
+    model = run.model
+    residuals = {name: [_worst(level) for level in run.residual[name].tolist()] for name in run.residual}
+    checked = verification is not None
+    return plain({
+        "versions": versions(),
+        "parameters": dict(zip(model.reduction.mechanism.parameters.names, model.parameters, strict=True)),
+        "method": run.method,
+        "drift": run.drift or None,
+        "success": run.success,
+        "status": run.status,
+        "message": run.message,
+        "t_end": run.t[-1],
+        "samples": len(run.t),
+        "counters": run.counters,
+        "free_initial_values": model.free,
+        "start": {
+            "t": start.t,
+            "values": dict(zip(start.names, start.values, strict=True)),
+            "held": start.held,
+            "free": start.free,
+            "residual": start.residual,
+        },
+        "structure": _structure(model),
+        "operations": model.operations(),
+        "extrema": {n: _extrema(run, n) for n in dict.fromkeys([*efforts(run), *model.outputs])},
+        "residuals": {name: {"worst": _worst(levels), "levels": levels} for name, levels in residuals.items()},
+        "verification": {"passed": verification.passed, "numbers": verification.numbers} if checked else None,
+    })  # fmt: skip
+
+
+def _worst(values):
+    return max(map(abs, values), default=0.0) if all(map(math.isfinite, values)) else math.nan
+
+
+def _structure(model):
+    try:
+        found = model.structure()
+    except ServoError as error:
+        return {"index": None, "message": str(error)}
+    names = ("index", "relative_degree", "decoupling_rank", "zeros_at_infinity", "essential_orders", "margin")
+    return {name: getattr(found, name) for name in names}
+
+
+def _extrema(run, name):
+    low, high = run.extrema(name)
+    return {"min": {"t": low[0], "value": low[1]}, "max": {"t": high[0], "value": high[1]}}
+
+
+def plain(value):
+    """Numbers, texts, lists and dicts of them; what is not finite becomes None."""
+    if isinstance(value, dict):
+        return {str(key): plain(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [plain(item) for item in value]
+    if hasattr(value, "tolist"):
+        return plain(value.tolist())
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def versions():
+    """Versions of servoctl, of what it computes with, and of Python: a dict of str to str."""
+    import platform
+    from importlib.metadata import version
+
+    import servoctl
+
+    return {
+        "servoctl": servoctl.__version__,
+        **{name: version(name) for name in ("casadi", "numpy", "scipy")},
+        "python": platform.python_version(),
+    }

@@ -1,0 +1,264 @@
+"""The largest stable step of every method along a plan, from the linearised step map.
+
+Near the manifold of the constraints the state splits in two. *Along* it move the Σ o_a internal states: in a frame N,
+orthonormal in the tangent space and carried along without turning in it (Nᵀ N' = 0), deviations N y obey y' = Nᵀ J N y
+with J = ∂X'/∂X; each state is measured by its size along the plan. *Off* it, every row that was raised ρ times obeys
+the error dynamics that the drift treatment gives it, whatever the motion: D^ρ ψ = 0 (ρ neutral eigenvalues),
+Π(D - λ) ψ = 0 (the poles), or nothing at all (projection, minimal coordinates). One step multiplies a mode of
+eigenvalue λ by R(hλ), the method's stability function.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from servoctl.errors import SpecificationError
+from servoctl.methods.bounds import amplification, row_poles
+from servoctl.methods.drift import Poles, as_drift
+from servoctl.methods.tableaus import ORDERS
+from servoctl.study.table import positives
+
+METHODS = (*ORDERS, "Taylor", "RadauIIA")
+RADAU_ORDER = 5  # unless it is given; all are L-stable
+SAMPLES = 101  # of the plan, where eigenvalues are taken: adjacent ones are alike on plans of some smoothness
+NEGLIGIBLE = 1e-9  # size of a state relative to the largest: rounding of one that stays zero
+GROWTH = 2.0  # by which counted errors may grow over the plan; neutral modes and rounding stay below that
+PER_DECADE, DECADES = 30, 7  # of steps tried below the length of the plan
+
+
+@dataclass(frozen=True, eq=False)
+class StabilityMap:
+    """Which steps are stable along a plan; made by `stability`.
+
+    Attributes
+    ----------
+    t : (N,) array
+        Instants of the plan [s].
+    rates : (N, f) array of complex
+        Eigenvalues of the internal dynamics there [1/s], f = Σ o_a.
+    model : Model
+    order : int
+        Of "Taylor" where none is given.
+    """
+
+    t: np.ndarray
+    rates: np.ndarray
+    model: object
+    order: int
+
+    def eigenvalues(self, drift=None):
+        """Eigenvalues [1/s] of all directions that count under a drift treatment, (N, f + poles).
+
+        Parameters
+        ----------
+        drift : None, "project", "minimal", float, `project(...)` or `poles(...)`, optional
+            As in `simulate`. Constraint violations count where poles govern them: without treatment they are neutral
+            under every method, and projection or minimal coordinates remove them.
+        """
+        drift = as_drift(drift)
+        if not isinstance(drift, Poles):
+            return self.rates
+        drift.coefficients(self.model)  # refuses poles that do not fit the rows
+        poles = np.concatenate([*row_poles(drift, self.model).values(), np.zeros(0)])
+        return np.hstack([self.rates, np.broadcast_to(poles, (len(self.t), len(poles)))])
+
+    def radius(self, method, step, drift=None, order=None):
+        """Spectral radius of the step map at each instant, relative to a mode's own growth.
+
+        Parameters
+        ----------
+        method : str
+            One of `simulation.bounds.METHODS`.
+        step : float or (K,) array
+            [s]
+        drift : optional
+            As in `simulate`.
+        order : int, optional
+            Of "Taylor" and "RadauIIA"; default: the map's own, and 5.
+
+        Returns
+        -------
+        (N,) or (K, N) array
+            max |R(hλ)| / max(1, |e^hλ|): a step is not blamed for what the motion does itself.
+        """
+        step = positives("step", step, do="Give 1e-3, in seconds.")
+        z = np.multiply.outer(step, self.eigenvalues(drift))
+        if order is None:
+            order = {"Taylor": self.order, "RadauIIA": RADAU_ORDER}.get(method)
+        own = np.exp(np.clip(z.real, 0.0, 700.0))
+        return (amplification(method, z, order) / own).max(axis=-1, initial=0.0)
+
+    def growth(self, method, step, drift=None, order=None):
+        """By how much errors in the counted directions grow over the plan, at most and beyond the motion's own growth.
+
+        Parameters
+        ----------
+        method : str
+            One of `simulation.bounds.METHODS`.
+        step : float or (K,) array
+            [s]
+        drift : optional
+            As in `simulate`.
+        order : int, optional
+            Of "Taylor" and "RadauIIA"; default: the map's own, and 5.
+
+        Returns
+        -------
+        float or (K,) array
+            exp ∫ ln max(1, radius) dt / h.
+        """
+        with np.errstate(over="ignore"):
+            gained = np.log(np.maximum(self.radius(method, step, drift, order), 1.0))
+            return np.exp(np.trapezoid(gained, np.abs(self.t - self.t[0]), axis=-1) / step)
+
+    def largest_step(self, method, drift=None, order=None):
+        """The largest stable step [s]: with it and all shorter ones counted errors grow at most twofold over the plan.
+
+        Parameters
+        ----------
+        method : str
+            One of `simulation.bounds.METHODS`. Of an adaptive method it is where step control settles.
+        drift : None, "project", "minimal", float, `project(...)` or `poles(...)`, optional
+            As in `simulate`.
+        order : int, optional
+            Of "Taylor" and "RadauIIA"; default: the map's own, and 5.
+
+        Returns
+        -------
+        float
+            inf where no step up to the length of the plan is unstable.
+
+        Raises
+        ------
+        NameUnknown
+            For a method without a step map of its own.
+        SpecificationError
+            For poles that do not fit the rows.
+        """
+        length = abs(self.t[-1] - self.t[0])
+        steps = length * 10.0 ** (-np.arange(DECADES * PER_DECADE, -1, -1) / PER_DECADE)
+        unstable = np.flatnonzero(self.growth(method, steps, drift, order) > GROWTH)
+        if not len(unstable):
+            return np.inf
+        low, high = (steps[unstable[0] - 1] if unstable[0] else 0.0), steps[unstable[0]]
+        while low > 0.0 and high - low > 1e-6 * high:
+            middle = (low + high) / 2
+            low, high = (low, middle) if self.growth(method, middle, drift, order) > GROWTH else (middle, high)
+        return float(low)
+
+    def plot(self, method="RK4", poles=None):
+        """Draw largest steps over the poles, and the spectral radius of one method over poles and steps.
+
+        Parameters
+        ----------
+        method : str
+            Whose spectral radius is drawn.
+        poles : (K,) array, optional
+            Magnitudes 1/T of the poles [1/s], two or more; default: 3 to 3,000 per length of the plan.
+
+        Returns
+        -------
+        matplotlib.figure.Figure
+        """
+        from servoctl.figures.stability import draw
+
+        if poles is not None:
+            do = "Give numpy.geomspace(1, 100, 41), in 1/s."
+            poles = np.sort(np.ravel(positives("poles", poles, do, fewest=2)))
+        return draw(self, method, poles)
+
+    def __repr__(self):
+        raised = {row: count for row, count in self.model.raised.items() if count}
+        story = ", ".join(f"{row} {count}x" for row, count in raised.items()) or "none: no row was differentiated"
+        shown = [None, 1.0, 0.1, 0.01]
+        lines = [
+            f"Stability along the plan: t = {self.t[0]:g} .. {self.t[-1]:g} s at {len(self.t)} instants",
+            f"  along the manifold: {self._internal()}",
+            f"  off the manifold: {story}; neutral without treatment, at the poles with, removed by projection",
+            f"  largest step [s] {'no poles':>12}" + "".join(f"{f'T = {T:g} s':>12}" for T in shown[1:]),
+        ]
+        for method in METHODS:
+            name = f"Taylor {self.order}" if method == "Taylor" else method
+            steps = (self.largest_step(method, drift) for drift in shown)
+            lines.append(f"  {name:<16} " + "".join(f"{_step_text(step):>12}" for step in steps))
+        return "\n".join(lines)
+
+    def _internal(self):
+        if not self.rates.shape[1]:
+            return "nothing moves, the program determines the motion"
+        fastest, growing = np.abs(self.rates).max(), self.rates.real.max()
+        text = f"{self.rates.shape[1]} internal states; |λ| up to {fastest:.4g} 1/s"
+        return text + (f", growth {growing:.4g} 1/s is the motion's own" if growing > 1e-6 * (1 + fastest) else "")
+
+
+def stability(model, run, order=12):
+    """Find the largest stable step of each method and drift treatment along a plan.
+
+    Parameters
+    ----------
+    model : Model
+    run : Run
+        A motion of this model.
+    order : int
+        Of the Taylor method.
+
+    Returns
+    -------
+    StabilityMap
+
+    Raises
+    ------
+    SpecificationError
+        If the run is no motion of this model, or its Jacobian is finite nowhere on it.
+
+    Notes
+    -----
+    Coefficients are frozen at each instant; eigenvalues of a motion that turns fast are uncertain by the rate at which
+    its manifold turns. Far from the imaginary axis, where steps become unstable, that is little.
+    """
+    n_x = len(model.state_names)
+    names = tuple(getattr(run, "jet_names", ()))[:n_x]
+    if names != tuple(model.state_names) or len(run.t) < 2:
+        raise SpecificationError(
+            f"The run has {len(run.t)} samples of {', '.join(names)}." if names else f"run={run!r} was given.",
+            f"The plan is a motion of the model, whose state is {', '.join(model.state_names)}.",
+            do="Give the run that simulate(model, ...) returned.",
+        )
+    keep = np.unique(np.linspace(0, len(run.t) - 1, SAMPLES).round().astype(int))
+    jacobians, normals = _along(model, run, keep, n_x)
+    finite = np.isfinite(jacobians).all(axis=(1, 2)) & np.isfinite(normals).all(axis=(1, 2))
+    if finite.sum() < 2:
+        raise SpecificationError(
+            "The Jacobian of the motion is not finite along the run.",
+            "Stability is read off the linearised motion.",
+            do="Check the run by verify(model, run).",
+        )
+    size = np.abs(run.jets[:n_x]).max(axis=1)
+    size[size <= NEGLIGIBLE * size.max()] = 1.0
+    jacobians, normals = jacobians[finite] * size / size[:, None], normals[finite] * size
+    rates = np.array([_internal_rates(J, C, model.free) for J, C in zip(jacobians, normals, strict=True)])
+    return StabilityMap(run.t[keep][finite], rates, model, order)
+
+
+def _along(model, run, keep, n_x):
+    """∂X'/∂X (N, n_x, n_x) and the invariants' Jacobian (N, m, n_x) at samples of a run."""
+    jacobians, normals = [], []
+    for first, end, variant in run.variants or ((0, len(run.t), model),):
+        own = keep[(keep >= first) & (keep < end)]
+        if len(own):
+            t, x, p = run.t[own], run.jets[:n_x, own], variant.parameters
+            jacobians.append(variant.function("ode_jacobian").grid(t, x, p).T.reshape(-1, n_x, n_x).swapaxes(1, 2))
+            m = len(variant.invariant_names())
+            y = variant.function("invariants").grid(t, x, p)[m:]
+            normals.append(y.T.reshape(len(own), n_x, m).swapaxes(1, 2))
+    return np.concatenate(jacobians), np.concatenate(normals)
+
+
+def _internal_rates(J, C, free):
+    """Eigenvalues of Nᵀ J N, the columns of N orthonormal in ker C; where nothing moves there are none."""
+    N = np.linalg.svd(C)[2][len(C[0]) - free :].T
+    return np.linalg.eigvals(N.T @ J @ N).astype(complex)
+
+
+def _step_text(step):
+    return "any" if np.isinf(step) else "none" if step == 0.0 else f"{step:.4g}"

@@ -1,0 +1,314 @@
+"""A study: a table by column names, failures among its rows, with what it was made from and on which machine."""
+
+import csv
+import functools
+import json
+import os
+import platform
+from dataclasses import dataclass, field, replace
+from importlib import metadata
+from pathlib import Path
+
+import numpy as np
+
+from servoctl.codegen.compiler import compiler
+from servoctl.errors import ServoError, SpecificationError, unknown
+
+FORMAT = 1
+SHOWN, WIDTH = 7, 12  # rows of a table in a repr, and columns
+
+
+@dataclass(frozen=True, eq=False)
+class Study:
+    """A table of results; made by `tradeoff`, `stability`, `sweep` or `load_study`.
+
+    `study["seconds"]` is a column, `study.rows()` a list of dicts, `len(study)` the number of rows.
+
+    Attributes
+    ----------
+    kind : str
+        What was studied: "tradeoff", "sweep".
+    columns : dict of str to (N,) array
+        Numbers or texts by name. What a row does not have is NaN among numbers, empty among texts.
+    meta : dict
+        What was given, and the machine with its versions: texts, numbers, and lists and dicts of them.
+    """
+
+    kind: str
+    columns: dict
+    meta: dict = field(default_factory=dict)
+
+    def __post_init__(self):
+        columns = {str(name): _array(values) for name, values in self.columns.items()}
+        lengths = {name: len(values) for name, values in columns.items()}
+        if len(set(lengths.values())) > 1:
+            raise SpecificationError(
+                f"The columns have the lengths {lengths}.",
+                "Each row has one entry in each column.",
+                do="Even them out.",
+            )
+        object.__setattr__(self, "columns", columns)
+
+    def __len__(self):
+        return len(next(iter(self.columns.values()), ()))
+
+    def __getitem__(self, name):
+        return self.column(name)
+
+    def column(self, name):
+        """The column with this name.
+
+        Parameters
+        ----------
+        name : str
+
+        Returns
+        -------
+        (N,) array
+
+        Raises
+        ------
+        NameUnknown
+        """
+        if name not in self.columns:
+            raise unknown(name, self.columns, "column")
+        return self.columns[name]
+
+    def rows(self):
+        """All rows as dicts of plain values."""
+        plain = {name: values.tolist() for name, values in self.columns.items()}
+        return [dict(zip(plain, row, strict=True)) for row in zip(*plain.values(), strict=True)]
+
+    def where(self, **values):
+        """The rows in which each column named has the value given.
+
+        Parameters
+        ----------
+        **values : float or str
+            By column name.
+
+        Returns
+        -------
+        Study
+        """
+        keep = np.ones(len(self), dtype=bool)
+        for name, value in values.items():
+            keep &= self.column(name) == value
+        return self.take(np.flatnonzero(keep))
+
+    def take(self, rows):
+        """The rows with these indices, in this order.
+
+        Parameters
+        ----------
+        rows : sequence of int
+
+        Returns
+        -------
+        Study
+        """
+        rows = np.asarray(rows, dtype=int)
+        return replace(self, columns={name: values[rows] for name, values in self.columns.items()})
+
+    def csv(self, path):
+        """Write the table as CSV: a line of names, then one line for each row; NaN for a number that is missing.
+
+        Parameters
+        ----------
+        path : str or Path
+
+        Returns
+        -------
+        Path
+
+        Raises
+        ------
+        ServoError
+            If the file cannot be written.
+        """
+
+        def write(path):
+            with open(path, "w", newline="", encoding="utf-8") as file:
+                lines = csv.writer(file, lineterminator="\n")
+                lines.writerow(self.columns)
+                lines.writerows(zip(*(values.tolist() for values in self.columns.values()), strict=True))
+
+        return _written(Path(path), write)
+
+    def save(self, path):
+        """Save the study as npz, without pickle; `load_study` reads it.
+
+        Parameters
+        ----------
+        path : str or Path
+            A missing suffix .npz is added.
+
+        Returns
+        -------
+        Path
+
+        Raises
+        ------
+        ServoError
+            If the file cannot be written.
+        """
+        path = Path(path)
+        path = path if path.suffix == ".npz" else path.with_name(path.name + ".npz")
+        told = {"format": FORMAT, "kind": self.kind, "names": list(self.columns), "meta": self.meta}
+        arrays = {f"column_{i}": values for i, values in enumerate(self.columns.values())}
+        return _written(path, lambda path: np.savez_compressed(path, told=np.array(json.dumps(told)), **arrays))
+
+    def to_xarray(self):
+        """The study as an xarray.Dataset over its rows, where xarray is installed: `.to_netcdf(path)` writes it.
+
+        Returns
+        -------
+        xarray.Dataset
+            The meta is its attributes, lists and dicts among them as JSON.
+
+        Raises
+        ------
+        ServoError
+            If xarray is not installed.
+        """
+        try:
+            import xarray
+        except ImportError as error:
+            raise ServoError(
+                "xarray is not installed.", "A Dataset is an xarray object.", do="Install xarray, or use csv or save."
+            ) from error
+        plain = {k: v if type(v) in (int, float, str) else json.dumps(v) for k, v in self.meta.items()}
+        columns = {name: ("row", values) for name, values in self.columns.items()}
+        return xarray.Dataset(columns, attrs={"kind": self.kind, **plain})
+
+    def __repr__(self):
+        lines = [f"Study: {self.kind}, {len(self)} rows", "  " + ", ".join(self.columns)]
+        lines += [f"  {self.meta['message']}"] if self.meta.get("message") else []
+        lines = [line if len(line) <= 120 else f"{line[:117]}..." for line in lines]
+        return "\n".join([*lines, *table(self, list(self.columns)[:WIDTH])])
+
+
+def table(study, names, most=SHOWN):
+    """Lines of readable width for the first rows of a study.
+
+    Parameters
+    ----------
+    study : Study
+    names : sequence of str
+        Columns.
+    most : int
+        Number of rows.
+
+    Returns
+    -------
+    list of str
+    """
+    texts = [[name, *(_short(value) for value in study[name][:most].tolist())] for name in names]
+    widths = [max(map(len, column)) for column in texts]
+    lines = [
+        "  " + "  ".join(f"{text:{width}}" for text, width in zip(row, widths, strict=True)).rstrip()
+        for row in zip(*texts, strict=True)
+    ]
+    lines = [line if len(line) <= 120 else f"{line[:117]}..." for line in lines]
+    return [*lines, f"  ... {len(study) - most} more rows"] if len(study) > most else lines
+
+
+def load_study(path):
+    """A study from a file that `Study.save` wrote.
+
+    Parameters
+    ----------
+    path : str or Path
+
+    Returns
+    -------
+    Study
+        Of the kind that was saved, such as `TradeOff`.
+
+    Raises
+    ------
+    ServoError
+        If the file is missing or was not written by `Study.save`.
+    """
+    try:
+        with np.load(path, allow_pickle=False) as data:
+            told = json.loads(str(data["told"]))
+            columns = {name: data[f"column_{i}"] for i, name in enumerate(told["names"])}
+    except (OSError, KeyError, ValueError) as error:
+        raise ServoError(
+            f"{path} cannot be read as a study: {error}.",
+            "A study is an npz file written by Study.save.",
+            do="Check the path.",
+            path=str(path),
+        ) from error
+    kind = next((own for own in Study.__subclasses__() if own.__name__.lower() == told["kind"]), Study)
+    return kind(told["kind"], columns, told["meta"])
+
+
+def machine():
+    """What numbers are measured on: processor, cores, system, compiler and versions, as a dict of plain values."""
+    from servoctl import __version__
+
+    versions = {name: _version(name) for name in ("casadi", "numpy", "scipy")}
+    return {
+        "processor": _processor(),
+        "cores": os.cpu_count(),
+        "system": f"{platform.system()} {platform.machine()}",
+        "compiler": compiler() or "none: loops are interpreted",
+        "versions": {"servoctl": __version__, "python": platform.python_version()} | versions,
+    }
+
+
+@functools.cache
+def _version(package):
+    return metadata.version(package)
+
+
+def _processor():
+    try:
+        with open("/proc/cpuinfo", encoding="utf-8") as lines:
+            return next(line.split(":", 1)[1].strip() for line in lines if line.startswith("model name"))
+    except (OSError, StopIteration):
+        return platform.processor() or platform.machine()
+
+
+def positives(name, given, do, fewest=1, most=np.inf):
+    """Numbers that a designer gives as an array, refused unless all are positive and finite."""
+    try:
+        found = np.asarray(given, dtype=float)
+    except (TypeError, ValueError):
+        found = np.zeros(1)
+    if found.size < fewest or not np.all(np.isfinite(found) & (found > 0) & (found <= most)):
+        count = "It is a positive number, or several" if fewest == 1 else f"It is {fewest} positive numbers or more"
+        bound = "" if most == np.inf else f", at most {most:g}"
+        raise SpecificationError(f"{name}={given!r} was given.", f"{count}{bound}.", do=do)
+    return found
+
+
+def _array(values):
+    """An array of one kind: what is missing is NaN among numbers, empty among texts."""
+    if isinstance(values, np.ndarray) and values.dtype != object:
+        return values
+    values = list(values)
+    if any(isinstance(value, str) for value in values):
+        return np.array(["" if value is None else str(value) for value in values])
+    return np.array([np.nan if value is None else value for value in values])
+
+
+def _short(value):
+    return f"{value:.3g}" if isinstance(value, float) else str(value)
+
+
+def _written(path, write):
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write(path)
+    except OSError as error:
+        raise ServoError(
+            f"The study cannot be written to {path}: {error.strerror or error}.",
+            "A study is saved where files may be created.",
+            nearest="The current folder, or the system's temporary one.",
+            do="Choose another path; the study itself is kept.",
+            path=str(path),
+        ) from error
+    return path

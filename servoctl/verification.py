@@ -1,0 +1,297 @@
+"""The proof: the full mechanism, under the required actuation, does what the reduced model says."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from servoctl.errors import SpecificationError
+from servoctl.methods.drift import is_whole
+from servoctl.model.equations import residual_rows
+
+LIMITS = {
+    "acceleration": 1e-9,
+    "segments": 1e-6,  # adaptive integration at 1e-11 of a motion that is interpolated between samples
+    "power": 1e-8,
+    "energy": 1e-5,  # power integrated over samples by splines
+    "multiplier form": 1e-9,
+    "residual": 1e-6,
+}
+INTEGRATED = 1e-6  # for what drift disturbs: where γ'' is itself integrated, or hidden rows are
+
+
+@dataclass(frozen=True)
+class Verification:
+    """Errors of a run against the full mechanism; every number is relative.
+
+    Attributes
+    ----------
+    numbers : dict of str to float
+        "acceleration": largest error of γ'' of the mechanism under the actuation at any sample, relative to the
+        largest γ'' of the run;
+        "segments": largest error of the state after restarted segments;
+        "power": largest error of dE/dt = Σ force·velocity; "energy": of its integral over the samples;
+        "multiplier form": largest disagreement of (3.18) with the form that has multipliers;
+        "outside": part of an ideal reaction that the mechanism's actuators cannot give;
+        "residual NAME": largest residual at any level, relative to 1 plus the largest jet of the level's own order.
+    failures : tuple of str
+        Numbers that exceed their limit.
+    notes : tuple of str
+        What could not be checked, and why.
+    limits : dict of str to float
+        The largest value of each number that passes.
+    """
+
+    numbers: dict
+    failures: tuple = ()
+    notes: tuple = ()
+    limits: dict = field(default_factory=dict)
+
+    @property
+    def passed(self):
+        """Whether every number is within its limit."""
+        return not self.failures
+
+    def __repr__(self):
+        residuals = {k: v for k, v in self.numbers.items() if k.startswith("residual ")}
+        worst = max(residuals, key=residuals.get, default=None)
+        words = {
+            "acceleration": "accelerations of the full mechanism under the actuation",
+            "segments": "states after restarted segments of the full mechanism",
+            "power": "power balance dE/dt = sum of force times velocity",
+            "energy": "energy against the integrated power",
+            "multiplier form": "(3.18) against the form with multipliers",
+            "outside": "part of the ideal reaction outside the actuators' reach",
+            "loop power": "energy gained less the work of all forces",
+            "loop power halved": "the same with steps half as long",
+            "loop constraints": "material constraints, values and rates",
+            "loop limits": "inputs beyond their limits",
+            "loop repeated": "states of the loop when it is run again",
+        }
+        lines = [f"Verification: {'passed' if self.passed else 'FAILED: ' + ', '.join(self.failures)}"]
+        lines += [f"  {words[key]}: {self._told(key)}" for key in words if key in self.numbers]
+        if worst:
+            name = worst.removeprefix("residual ")
+            lines.append(f"  largest residual at any level: {self._told(worst)} ({name})")
+        lines += [f"  {note}" for note in self.notes]
+        return "\n".join(lines[:12])
+
+    def _told(self, key):
+        allowed = f" (allowed {self.limits[key]:.2g})" if key in self.failures and key in self.limits else ""
+        return f"{self.numbers[key]:.1e}{allowed}"
+
+
+def verify(model, run=None, segments=20):
+    """Check a run against the full mechanism, not the reduced model.
+
+    The mechanism's accelerations under the required actuation are compared with the run's at every sample; the
+    mechanism is integrated in segments restarted from the run, no longer than the fastest unstable time constant;
+    residuals are taken at every level; dE/dt is compared with the power of all forces; and (3.18) with the form
+    that has multipliers.
+
+    A closed loop is verified alone, `verify(closed)`: its energy against the work of inputs, disturbances and
+    friction, at two lengths of step; material constraints; limits.
+
+    Parameters
+    ----------
+    model : Model or Closed
+    run : Run
+        Of this model; none for a closed loop.
+    segments : int
+        Number of restarted segments, at least 1.
+
+    Returns
+    -------
+    Verification
+
+    Raises
+    ------
+    SpecificationError
+        If the run is not of this model, or segments is no whole number of at least 1.
+    """
+    if not (is_whole(segments) and segments >= 1):
+        raise SpecificationError(
+            f"segments={segments!r} was given.", "It is a whole number, at least 1.", do="Give 20, or leave it out."
+        )
+    if run is None and hasattr(model, "loop"):
+        return model.verify()
+    require_model(model, run, "verify")
+    good = np.flatnonzero(np.all(np.isfinite(run.jets), axis=0))
+    numbers, limits, notes = {}, dict(LIMITS), []
+    if model.reduction.top > 2 or (model.reduction.hidden and not model.flat):
+        limits |= dict.fromkeys(("acceleration", "power", "multiplier form"), INTEGRATED)
+    inputs = run.signals("inputs")[1][:, good]
+    numbers["acceleration"] = _acceleration(model, run, good, inputs)
+    numbers["segments"] = _segments(model, run, good, inputs, segments)
+    rate, work, size, law = run.signals("power")[1][:, good]
+    largest = max(np.abs(size).max(), np.abs(rate).max(), 1e-300)
+    if np.abs(law).max() < 1e-9 * largest:
+        numbers["power"] = float(np.abs(rate - work).max() / largest)
+        numbers["energy"], sampling = _energy(run, good, work)
+        if limits["energy"] < numbers["energy"] <= sampling:
+            notes.append("the samples are too far apart to integrate the power more accurately")
+            limits["energy"] = sampling
+    else:
+        notes.append("power balance: not applicable, the inertia terms depend on time or on more than wᵀMw/2")
+    numbers["multiplier form"] = _multiplier_form(model, run, good)
+    if model.ideal and model.actuators:
+        numbers["outside"] = _outside(model, run, good)
+    numbers |= {f"residual {name}": _relative_residual(run, name, good) for name in run.residual}
+    if not run.success:
+        notes.append("the run did not reach its end: next to a singularity errors grow")
+    limit = {key: limits.get(key.split()[0] if key.startswith("residual") else key, np.inf) for key in numbers}
+    failures = tuple(key for key, value in numbers.items() if not value <= limit[key])
+    return Verification(numbers, failures, tuple(notes), limit)
+
+
+def require_model(model, run, what):
+    """Refuse a run that is not of a model.
+
+    Raises
+    ------
+    SpecificationError
+        Naming what was given to the function `what`.
+    """
+    states = getattr(model, "state_names", ())
+    if getattr(run, "model", None) is None or not hasattr(model, "reduction"):
+        which = " without its model" if hasattr(run, "jets") else ""
+    elif run.jet_names[: len(states)] != tuple(states):
+        which = " of another one"
+    else:
+        return
+    raise SpecificationError(
+        f"{what} was given a {type(model).__name__} and a {type(run).__name__}{which}.",
+        "A run belongs to the model that made it; a loaded run has none.",
+        do=f"Write sv.{what}(model, run), or simulate again.",
+    )
+
+
+def _acceleration(model, run, good, inputs):
+    """Largest error of the mechanism's γ'' under the inputs, relative to the largest γ'' of the run."""
+    n, nq = model.n, model.nq
+    found = model.function("plant").grid(run.t[good], np.vstack([run.jets[: nq + n, good], inputs]), model.parameters)
+    acceleration = run.jets[nq + n : nq + 2 * n, good]
+    return float(np.abs(found[nq:] - acceleration).max() / max(np.abs(acceleration).max(), 1e-300))
+
+
+def _energy(run, good, work):
+    """Largest difference of the energy from its start and the integrated power, relative to the energy's range.
+
+    Returns
+    -------
+    error : float
+    sampling : float
+        How much of it the samples cannot resolve: the change when every other sample is left out.
+    """
+    from scipy.interpolate import CubicSpline
+
+    order = np.argsort(run.t[good])
+    t, energy, work = run.t[good][order], run["energy"][good][order], work[order]
+    if len(t) < 5:
+        return 0.0, np.inf
+    gained = CubicSpline(t, work).antiderivative()(t)
+    coarse = CubicSpline(t[::2], work[::2]).antiderivative()(t[::2])
+    scale = max(np.ptp(energy), np.ptp(gained), 1e-3 * np.abs(energy).max(), 1e-12)
+    error = np.abs((energy - energy[0]) - (gained - gained[0])).max() / scale
+    return float(error), float(np.abs(coarse - gained[::2]).max() / scale)
+
+
+def _relative_residual(run, name, good):
+    """Largest residual over levels, each relative to 1 plus the largest jet of its own order at that instant."""
+    model, row = run.model, residual_rows(run.model.reduction).get(name)
+    worst = 0.0
+    for order, level in enumerate(run.residual[name][:, good], start=row.order if row else 0):
+        first = model.nq + (order - 1) * model.n if order else 0
+        jets = run.jets[first : model.nq + order * model.n, good]
+        worst = max(worst, float((np.abs(level) / (1.0 + np.abs(jets).max(axis=0))).max(initial=0.0)))
+    return worst
+
+
+def _segments(model, run, good, u, count):
+    """Largest relative error of the mechanism's state after segments restarted from the run."""
+    from scipy.integrate import solve_ivp
+
+    n, nq, p, plant = model.n, model.nq, model.parameters, model.function("plant")
+    t, states = run.t[good], run.jets[: nq + n, good]
+    if len(t) < 3:
+        return 0.0
+    size = np.abs(states).max(axis=1) + 1e-3 * np.abs(states).max() + 1e-12
+    worst = 0.0
+    last = len(t) - (2 if run.success else 3)  # next to a singularity the actuation cannot be interpolated
+    for i in np.unique(np.linspace(0, max(last, 0), count).astype(int)):
+        stop = _segment_end(model, run, good, i, u[:, i])
+        inputs = run.variant(good[i]).signals("inputs")[1]
+
+        def rates(s, x, inputs=inputs):
+            return plant(s, np.concatenate([x, inputs(s, run.at(s)[: inputs.n_x], p)]), p)[: nq + n]
+
+        found = solve_ivp(rates, (t[i], t[stop]), states[:, i], method="DOP853", rtol=1e-11, atol=1e-13 * size)
+        worst = max(worst, float(np.max(np.abs(found.y[:, -1] - states[:, stop]) / size)))
+    return worst
+
+
+def _segment_end(model, run, good, i, u):
+    """Up to five samples on, within the fastest unstable time constant, one variant and one piece of the paths."""
+    t = run.t[good]
+    x = run.jets[: model.nq + model.n, good[i]]
+    limit = 1.0 / max(_fastest_unstable(model, model.function("plant"), t[i], x, u), 1e-12)
+    stop = i + 1
+    while (
+        stop < min(len(t) - 1, i + 5)
+        and abs(t[stop + 1] - t[i]) <= limit
+        and run.variant(good[stop + 1]) is run.variant(good[i])
+        and not any(min(t[i], t[stop + 1]) < k < max(t[i], t[stop + 1]) for k in run.knots)
+    ):
+        stop += 1
+    return stop
+
+
+def _fastest_unstable(model, plant, t, x, u):
+    """The largest real part of the mechanism's linearised open-loop eigenvalues, by central differences."""
+    m, step = len(x), 1e-6 * (1.0 + np.abs(x))
+    columns = []
+    for i in range(m):
+        shift = np.zeros(m)
+        shift[i] = step[i]
+        ends = [plant(t, np.concatenate([x + sign * shift, u]), model.parameters)[:m] for sign in (1.0, -1.0)]
+        columns.append((ends[0] - ends[1]) / (2 * step[i]))
+    matrix = np.array(columns).T
+    return float(np.linalg.eigvals(matrix).real.max()) if np.all(np.isfinite(matrix)) else np.inf
+
+
+def _multiplier_form(model, run, good):
+    """How far (γ'', μ) are from solving [M -B; C 0] [γ''; μ] = ..., and from its solution where that is unique.
+
+    Hidden rows make the matrix singular: then the equations must hold, and nothing is solved.
+    """
+    n, nq = model.n, model.nq
+    multipliers = run.signals("all_multipliers")[1]
+    accelerations = run.jets[nq + n : nq + 2 * n]
+    unique, size = 0.0, np.abs(accelerations[:, good]).max()
+    left, terms = [], []
+    for first, end, variant in run.variants or ((0, len(run.t), model),):
+        matrices, rights = variant.multiplier_form(run.t[first:end], run.jets[: len(model.jet_names), first:end])
+        for k in good[(good >= first) & (good < end)] - first:
+            given = np.concatenate([accelerations[:, first + k], multipliers[:, first + k]])
+            a, b = matrices[..., k], rights[:, k]
+            left.append(np.abs(a @ given - b))
+            terms.append(np.abs(a) @ np.abs(given) + np.abs(b))
+            if not model.reduction.hidden and a.shape[0] == a.shape[1]:
+                rows = np.maximum(np.abs(a).max(axis=1), 1e-300)[:, None]
+                columns = np.maximum(np.abs(a / rows).max(axis=0), 1e-300)
+                solution = np.linalg.solve(a / rows / columns, b / rows[:, 0]) / columns
+                unique = max(unique, float(np.abs(solution[:n] - given[:n]).max() / max(size, 1e-300)))
+    largest = np.max(terms, axis=0)
+    return max(unique, float(np.max(np.max(left, axis=0) / np.where(largest > 0, largest, 1.0))))
+
+
+def _outside(model, run, good):
+    """Largest part of the ideal reaction outside the actuators' directions, relative to the reaction."""
+    values = run.signals("reach")[1][:, good]
+    n, m = model.n, (len(values) - model.n) // model.n
+    worst = 0.0
+    largest = max(np.abs(values[:n]).max(), 1e-300)
+    for k in range(values.shape[1]):
+        reaction, E = values[:n, k], values[n:, k].reshape(m, n).T
+        outside = reaction - E @ np.linalg.lstsq(E, reaction, rcond=None)[0]
+        worst = max(worst, float(np.abs(outside).max()) / largest)
+    return worst
