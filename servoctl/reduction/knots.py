@@ -44,10 +44,13 @@ class Switches:
     """
 
     def __init__(self, q, residuals, parameters):
-        self.q, self.residuals = q, residuals
+        self.q, self.residuals, self._given = q, residuals, (q, residuals, parameters)
         self.symbols = ca.symvar(ca.vertcat(*residuals.values()))
         self.parameters = [p.element_hash() for p in parameters]
         self.timed = self._timed() if any(s.element_hash() == q.t.element_hash() for s in self.symbols) else []
+
+    def __reduce__(self):
+        return Switches, self._given
 
     @cached_property
     def tape(self):

@@ -277,6 +277,36 @@ class Coordinates:
             result.append([_as_sx(multiply(c[j], factor)) for c in series.outputs[: len(expressions)]])
         return result
 
+    def as_function(self, expressions, parameters=()):
+        """Expressions of t, q, the jets and parameters as one function of these, which serialises and pickles.
+
+        Parameters
+        ----------
+        expressions : sequence of SX
+        parameters : sequence of SX
+            Their symbols.
+
+        Returns
+        -------
+        casadi.Function
+        """
+        highest = max(0, self.order(ca.vertcat(*(ca.vec(e) for e in expressions))))
+        return ca.Function("expressions", self._arguments(highest, parameters), list(expressions))
+
+    def from_function(self, function, parameters=()):
+        """The expressions of `as_function`, of this process or another, in these symbols: a list of SX."""
+        return function.call(self._arguments(function.n_in() - 3, parameters), True, False)
+
+    def _arguments(self, highest, parameters):
+        jets = [self.jet(k) for k in range(highest + 1)]
+        return [self.t, *jets, ca.vertcat(ca.SX(0, 1), *parameters)]
+
+    def __reduce__(self):
+        if self.plain:
+            return Coordinates, (self.names,)
+        frame = self.as_function([self.V, self.h, *self.invariants.values()])
+        return _moved, (self.names, self.velocity_names, frame, tuple(self.invariants))
+
     def _series(self, expressions, k):
         symbols = None
         if not self.plain:
@@ -310,6 +340,13 @@ class Coordinates:
             return divide(self.gamma(j)[i], factorial)
         velocity = series.c[series.tape.outputs[i - self.nq]][j - 1]  # the last outputs are q'
         return 0.0 if is_zero(velocity) else divide(velocity, j)
+
+
+def _moved(names, velocity_names, frame, invariants):
+    """Coordinates with quasi-velocities, as another process described them."""
+    q = Coordinates(names)
+    V, h, *values = q.from_function(frame)
+    return q.with_quasi_velocities(" ".join(velocity_names), V, h, dict(zip(invariants, values, strict=True)))
 
 
 def _order(k):

@@ -9,6 +9,7 @@ from servoctl.errors import SpecificationError, unknown
 from servoctl.jets.evaluation import evaluate
 from servoctl.jets.tape import Tape
 from servoctl.spec.coordinates import Coordinates, column, mapping
+from servoctl.spec.packing import packed, unpacked
 from servoctl.spec.parameters import Parameters
 
 _SEED = 20021  # of the random points at which identities are tested
@@ -107,6 +108,10 @@ class Mechanism:
                 lines.append(f"  {what}: {', '.join(names)}")
         lines.append(f"  {self.parameters!r}"[:118])
         return "\n".join(lines)
+
+    def __reduce__(self):
+        content = packed(vars(self), self.q, self.parameters, {"parameters": self.parameters})
+        return _unpickled, (self.q, self.parameters, content)
 
     @cached_property
     def balance(self):
@@ -329,6 +334,12 @@ class Mechanism:
                         name=name,
                     )
                 seen[name] = what
+
+
+def _unpickled(q, parameters, content):
+    mechanism = object.__new__(Mechanism)
+    vars(mechanism).update(unpacked(content, q, parameters, {"parameters": parameters}))
+    return mechanism
 
 
 def require_known(expression, mechanism, what):
