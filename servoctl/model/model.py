@@ -234,7 +234,7 @@ class Model:
         SpecificationError
         """
         r = self.reduction
-        if r.switches and span not in self._knots_within:
+        if r.timed and span not in self._knots_within:
 
             def build():
                 return require_smooth(r.switches, self.parameters, r.smoothness, span).times

@@ -153,37 +153,20 @@ def fingerprint(mechanism, program, guess=None, near=None, values=None):
     try:
         t, state, sizes = (None, {}, {}) if near is None else near
         facts = [
-            _names(mechanism, program),
+            list(program.residuals),
+            program.by,
+            [(name, None if isinstance(weight, ca.SX) else float(weight)) for name, weight in program.weights.items()],
             [(name, float(value)) for name, value in (guess or {}).items()],
             None if near is None else float(t),
             *([(name, float(value)) for name, value in some.items()] for some in (state, sizes)),
             np.asarray(mechanism.parameters.values() if values is None else values, dtype=float).tolist(),
         ]
-        text = json.dumps(facts, allow_nan=False) + "\n" + _expressions(mechanism, program)
+        expressions = [*program.residuals.values(), *(w for w in program.weights.values() if isinstance(w, ca.SX))]
+        function = mechanism.q.as_function(expressions, mechanism.parameters.symbols)
+        text = "\n".join([json.dumps(facts, allow_nan=False), mechanism.as_text(), function.serialize()])
     except Exception:  # the derivation says what is wrong; CasADi raises bare ones
         return None
     return hashlib.sha256(text.encode()).hexdigest()
-
-
-def _names(mechanism, program):
-    """All names, and the numbers among the weights: with the numbers of entries, what each expression is for."""
-    q, weights = mechanism.q, program.weights.items()
-    return [
-        [q.names, q.velocity_names, q.plain, list(q.invariants)],
-        [mechanism.actuators, list(mechanism.constraints), list(mechanism.outputs), mechanism.parameters.names],
-        [list(program.residuals), program.by, [(n, None if isinstance(w, ca.SX) else float(w)) for n, w in weights]],
-    ]
-
-
-def _expressions(mechanism, program):
-    """Every expression that a derivation reads, of each as a serialised function of t, q, the jets and parameters."""
-    q, symbols = mechanism.q, mechanism.parameters.symbols
-    of_mechanism = [
-        q.V, q.h, *q.invariants.values(), mechanism.balance, mechanism.energy, mechanism.forces, mechanism.E,
-        *mechanism.constraints.values(), *mechanism.outputs.values(),
-    ]  # fmt: skip
-    of_program = [*program.residuals.values(), *(w for w in program.weights.values() if isinstance(w, ca.SX))]
-    return "\n".join(q.as_function(outputs, symbols).serialize() for outputs in (of_mechanism, of_program))
 
 
 @functools.cache

@@ -24,30 +24,56 @@ class PlantEquations:
     mechanism : Mechanism
     forces : (n,) SX
         Further generalised forces.
-    damped : tuple of str
-        Names of the velocities with viscous damping.
-    lagged : tuple of str
-        Names of the actuators that lag behind their command.
+    damped : tuple of int
+        Velocities with viscous damping.
+    lagged : tuple of int
+        Actuators that lag behind their command.
+
+    Attributes
+    ----------
+    functions : dict of str to Compiled
+        What was compiled of them so far.
     """
 
     def __init__(self, mechanism, forces, damped, lagged):
         q = self.q = mechanism.q
-        self.mechanism, self.forces = mechanism, forces
+        self.mechanism, self.forces, self.damped, self.lagged = mechanism, forces, damped, lagged
+        self.functions = {}
         self.velocity = ca.vertcat(*q.gamma(1))
         self.lagging = ca.SX.sym("lagging", len(lagged))
         self.state = ca.vertcat(*q, self.velocity, self.lagging)
         self.damping, self.rates = ca.SX.sym("damping", len(damped)), ca.SX.sym("rate", len(lagged))
         self.u, self.d = ca.SX.sym("u", len(mechanism.actuators)), ca.SX.sym("d", q.n)
         self.p = ca.vertcat(*mechanism.parameters.symbols, self.damping, self.rates, self.u, self.d)
-        directions = list(q.jet_names(1))
         self.resisting = ca.SX.zeros(q.n)
-        for c, name in zip(self.damping.elements(), damped, strict=True):
-            i = directions.index(name)
+        for c, i in zip(self.damping.elements(), damped, strict=True):
             self.resisting[i] = -c * self.velocity[i]
-        self.lagged = [mechanism.actuators.index(name) for name in lagged]
         self.force = ca.SX(self.u)
-        for a, value in zip(self.lagged, self.lagging.elements(), strict=True):
+        for a, value in zip(lagged, self.lagging.elements(), strict=True):
             self.force[a] = value
+
+    def __eq__(self, other):
+        return isinstance(other, PlantEquations) and self._key == other._key
+
+    def __hash__(self):
+        return hash(self._key)
+
+    @cached_property
+    def _key(self):
+        """What they are derived from: they are written in the symbols of one mechanism, so that counts as an object."""
+        return id(self.mechanism), self.forces_as_text(), self.damped, self.lagged
+
+    def __reduce__(self):
+        return _unpickled, (self.mechanism, self._further, self.damped, self.lagged)
+
+    @property
+    def _further(self):
+        """Further forces, as a function of t, q, γ' and the parameters."""
+        return self.q.as_function([self.forces], self.mechanism.parameters.symbols)
+
+    def forces_as_text(self):
+        """Further forces: the same text for the same operations in the same order, and for no others."""
+        return self._further.serialize()
 
     def function(self, name, outputs, x=None, p=None):
         """An SX function of (t, x, p) with one dense column."""
@@ -108,7 +134,7 @@ class PlantEquations:
     def state_rates(self):
         """x'."""
         q = self.q
-        lags = self.rates * (self.u[self.lagged] - self.lagging) if self.lagged else ca.SX(0, 1)
+        lags = self.rates * (self.u[list(self.lagged)] - self.lagging) if self.lagged else ca.SX(0, 1)
         return ca.vertcat(q.V @ self.velocity + q.h, self.acceleration, lags)
 
     def ode(self):
@@ -196,3 +222,7 @@ class PlantEquations:
     def _invariants(self):
         rows, points = self._material
         return Equations(SimpleNamespace(mechanism=self.mechanism, top=2, rows=rows, points=points))
+
+
+def _unpickled(mechanism, forces, damped, lagged):
+    return PlantEquations(mechanism, *mechanism.q.from_function(forces, mechanism.parameters.symbols), damped, lagged)

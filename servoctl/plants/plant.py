@@ -1,6 +1,7 @@
 """The plant: the full mechanism with its own numbers, friction, actuators and their limits."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
+from functools import lru_cache
 
 import casadi as ca
 import numpy as np
@@ -11,6 +12,9 @@ from servoctl.codegen.loops.closed import DRIVER
 from servoctl.errors import SpecificationError, unknown
 from servoctl.plants.equations import PlantEquations
 from servoctl.spec.mechanism import Mechanism, require_known
+from servoctl.values import Value
+
+LATEST = 32  # plants whose equations are held for those that differ from them in numbers alone
 
 
 def plant(mechanism, *, forces=None, damping=None, limits=None, rate_limits=None, lag=None, delay=0.0, **parameters):
@@ -54,7 +58,7 @@ def plant(mechanism, *, forces=None, damping=None, limits=None, rate_limits=None
             "A plant is made of a mechanism and numbers.",
             do="Write sv.plant(mechanism, m_load=115.0).",
         )
-    directions, actuators = mechanism.q.jet_names(1), mechanism.actuators
+    actuators = mechanism.actuators
     names = mechanism.q.names if mechanism.q.plain else mechanism.q.velocity_names
     values = mechanism.parameters.values(parameters)
     damping = numbers_by_name(damping, names, "coordinate", "damping", low=0.0)
@@ -63,26 +67,27 @@ def plant(mechanism, *, forces=None, damping=None, limits=None, rate_limits=None
     if not isinstance(delay, dict):
         delay = dict.fromkeys(actuators, delay) if finite("delay", delay, "time") else {}
     delay = numbers_by_name(delay, actuators, "actuator", "delay", low=0.0)
-    force, key = _forces(mechanism, forces, names)
-    damped = tuple(name for name in names if name in damping)
-    lagged = tuple(name for name in actuators if name in lag)
-    key = (key, damped, lagged)
-    found = vars(mechanism).setdefault("_plants", {})  # as a cached property: derived once, whatever the numbers
-    if key not in found:
-        velocities = tuple(directions[names.index(name)] for name in damped)
-        found[key] = (PlantEquations(mechanism, force, velocities, lagged), {})
-    found[key][0].require_inertia(values)
-    numbers = np.concatenate([values, [damping[n] for n in damped], [1.0 / lag[n] for n in lagged]])
-    state_names = (*mechanism.q.names, *directions, *lagged)
+    damped = tuple(i for i, name in enumerate(names) if name in damping)
+    lagged = tuple(i for i, name in enumerate(actuators) if name in lag)
+    equations = _latest(PlantEquations(mechanism, _forces(mechanism, forces, names), damped, lagged))
+    equations.require_inertia(values)
+    rates = [1.0 / lag[actuators[i]] for i in lagged]
+    numbers = np.concatenate([values, [damping[names[i]] for i in damped], rates])
+    state_names = (*mechanism.q.names, *mechanism.q.jet_names(1), *(actuators[i] for i in lagged))
     return Plant(
         mechanism, numbers, state_names, actuators, tuple(names),
-        _limits(limits, actuators), rate_limits, lag, {n: d for n, d in delay.items() if d}, damping,
-        equations=found[key][0], _functions=found[key][1],
+        _limits(limits, actuators), rate_limits, lag, {n: d for n, d in delay.items() if d}, damping, equations,
     )  # fmt: skip
 
 
+@lru_cache(LATEST)
+def _latest(equations):
+    """The equations that were derived before of the same mechanism and forces, or else these."""
+    return equations
+
+
 @dataclass(frozen=True, eq=False)
-class Plant:
+class Plant(Value):
     """The full mechanism under actuator inputs and disturbances, material constraints held; made by `plant`.
 
     Attributes
@@ -110,8 +115,15 @@ class Plant:
     lag: dict
     delay: dict
     damping: dict
-    equations: PlantEquations = field(repr=False)
-    _functions: dict = field(repr=False)
+    equations: PlantEquations = field(repr=False, compare=False)
+
+    def __eq__(self, other):
+        return super().__eq__(other) and self.equations.forces_as_text() == other.equations.forces_as_text()
+
+    __hash__ = Value.__hash__
+
+    def __reduce__(self):
+        return _unpickled, ({f.name: getattr(self, f.name) for f in fields(self)},)
 
     @property
     def n_x(self):
@@ -163,24 +175,13 @@ class Plant:
         -------
         Compiled
         """
-        if name not in self._functions:
-            e = self.equations
-            build = {
-                "ode": lambda: (e.ode(), (), e.project(), None, DRIVER),
-                "ode_power": lambda: (e.ode_power(), (), e.project(extra=1), None, DRIVER),
-                "jacobian": lambda: (e.jacobian(),),
-                "directions": lambda: (e.directions(),),
-                "power": lambda: (e.power(),),
-                "accelerations": lambda: (e.accelerations(),),
-                "outputs": lambda: (e.outputs(),),
-                "constraints": lambda: (e.constraints()[1],),
-                "constraints_jacobian": lambda: (e.constraints_jacobian(),),
-            }
-            if name not in build:
-                raise unknown(name, list(build), "function")
-            f, *options = build[name]()
-            self._functions[name] = compiled(f, f.name(), *options)
-        return self._functions[name]
+        built = self.equations.functions
+        if name not in built:
+            if name not in FUNCTIONS:
+                raise unknown(name, list(FUNCTIONS), "function")
+            f, *options = FUNCTIONS[name](self.equations)
+            built[name] = compiled(f, f.name(), *options)
+        return built[name]
 
     def constraint_names(self):
         """Names of the invariants in the order of the function "constraints"."""
@@ -312,7 +313,7 @@ def _limits(limits, actuators):
 
 
 def _forces(mechanism, forces, names):
-    """Further generalised forces, (n,) SX, and what identifies them."""
+    """Further generalised forces, (n,) SX."""
     q, total = mechanism.q, ca.SX.zeros(mechanism.q.n)
     for name, value in mapping(forces, "The forces").items():
         if name not in names:
@@ -328,4 +329,21 @@ def _forces(mechanism, forces, names):
                 name=name,
             )
         total[names.index(name)] = expression
-    return total, tuple((i, e.element_hash()) for i, e in enumerate(total.elements()) if not e.is_zero())
+    return total
+
+
+def _unpickled(values):
+    return Plant(**values | {"equations": _latest(values["equations"])})
+
+
+FUNCTIONS = {  # what `compiled` makes of each: the function, its loops, its projection, other functions, further loops
+    "ode": lambda e: (e.ode(), (), e.project(), None, DRIVER),
+    "ode_power": lambda e: (e.ode_power(), (), e.project(extra=1), None, DRIVER),
+    "jacobian": lambda e: (e.jacobian(),),
+    "directions": lambda e: (e.directions(),),
+    "power": lambda e: (e.power(),),
+    "accelerations": lambda e: (e.accelerations(),),
+    "outputs": lambda e: (e.outputs(),),
+    "constraints": lambda e: (e.constraints()[1],),
+    "constraints_jacobian": lambda e: (e.constraints_jacobian(),),
+}

@@ -1,6 +1,7 @@
 """The mechanism: its balance r = ∂S/∂γ'' - Γ, its actuators and its material constraints."""
 
-from functools import cached_property
+import json
+from functools import cached_property, lru_cache
 
 import casadi as ca
 import numpy as np
@@ -12,8 +13,8 @@ from servoctl.jets.tape import Tape
 from servoctl.spec.coordinates import Coordinates
 from servoctl.spec.packing import packed, unpacked
 from servoctl.spec.parameters import Parameters
-from servoctl.spec.parameters import Parameters
 
+LATEST = 32  # mechanisms from other processes that are held
 _SEED = 20021  # of the random points at which identities are tested
 
 
@@ -110,6 +111,25 @@ class Mechanism:
                 lines.append(f"  {what}: {', '.join(names)}")
         lines.append(f"  {self.parameters!r}"[:118])
         return "\n".join(lines)
+
+    def as_text(self):
+        """Names, numbers and expressions: the same text for the same operations in the same order, and for no others."""
+        q, p = self.q, self.parameters
+        names = [q.names, q.velocity_names, q.plain, list(q.invariants), self.actuators, list(self.constraints)]
+        expressions = [
+            q.V, q.h, *q.invariants.values(), self.balance, self.energy, self.forces, self.E,
+            *self.constraints.values(), *self.outputs.values(),
+        ]  # fmt: skip
+        function = q.as_function(expressions, p.symbols).serialize()
+        return json.dumps([names, list(self.outputs), p.defaults]) + "\n" + function
+
+    def __eq__(self, other):
+        if type(other) is not type(self):
+            return NotImplemented
+        return self is other or self.as_text() == other.as_text()
+
+    def __hash__(self):
+        return hash((self.q.names, self.actuators, self.parameters.names))
 
     def __reduce__(self):
         content = packed(vars(self), self.q, self.parameters, {"parameters": self.parameters})
@@ -341,6 +361,12 @@ class Mechanism:
 def _unpickled(q, parameters, content):
     mechanism = object.__new__(Mechanism)
     vars(mechanism).update(unpacked(content, q, parameters, {"parameters": parameters}))
+    return _latest(mechanism)
+
+
+@lru_cache(LATEST)
+def _latest(mechanism):
+    """An equal mechanism that came before from another process, or else this one: what is derived of it is shared."""
     return mechanism
 
 
