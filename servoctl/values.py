@@ -9,10 +9,9 @@ class Value:
     """What a frozen dataclass inherits to be compared by its fields, arrays among them; NaN equals NaN."""
 
     def __eq__(self, other):
-        if type(other) is not type(self):
-            return NotImplemented
-        names = [f.name for f in fields(self) if f.compare]
-        return self is other or all(same(getattr(self, name), getattr(other, name)) for name in names)
+        if self is other or type(self) is not type(other):
+            return self is other
+        return all(same(getattr(self, f.name), getattr(other, f.name)) for f in fields(self) if f.compare)
 
     def __hash__(self):
         entries = (getattr(self, f.name) for f in fields(self) if f.compare)

@@ -135,6 +135,19 @@ class Compiled:
         parts = (self._f, self.name, self.loops, self._project, self._others, self._drivers, self._sizes)
         return Compiled, parts, {"_text": self._text}
 
+    def __eq__(self, other):
+        return self is other or (isinstance(other, Compiled) and self._as_text == other._as_text)
+
+    def __hash__(self):
+        return hash((self.name, self.n_x, self.n_p, self.n_y))
+
+    @functools.cached_property
+    def _as_text(self):
+        """What it was made of: functions that compute the same by the same operations say the same."""
+        _, parts, _ = self.__reduce__()
+        flat = [item for part in parts for item in (part.items() if isinstance(part, dict) else [part])]
+        return repr(["".join(map(_serialised, item)) if isinstance(item, tuple) else _serialised(item) for item in flat])
+
     def __repr__(self):
         how = "compiled" if self.backend == "c" else "evaluated by CasADi"
         return f"{self.name}: y[{self.n_y}] of t, x[{self.n_x}], p[{self.n_p}]; {self.operations} operations, {how}"
@@ -444,3 +457,7 @@ class Compiled:
                 expected=shape,
             )
         return array
+
+
+def _serialised(part):
+    return part.serialize() if hasattr(part, "serialize") else repr(part)

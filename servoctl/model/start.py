@@ -6,13 +6,14 @@ import numpy as np
 
 from servoctl.checks import finite, mapping
 from servoctl.errors import InconsistentStart, ServoError, unknown
+from servoctl.values import Value
 
 TOLERANCE = 1e-10  # of a residual relative to its gradient times the state; Newton reaches rounding
 GUESSED = 1e3  # weight of a guessed value against one that is merely to stay near zero
 
 
-@dataclass(frozen=True)
-class State:
+@dataclass(frozen=True, eq=False)
+class State(Value):
     """A consistent state of a model at an instant.
 
     Attributes

@@ -72,7 +72,7 @@ class PlantEquations:
         return self.q.as_function([self.forces], self.mechanism.parameters.symbols)
 
     def forces_as_text(self):
-        """Further forces: the same text for the same operations in the same order, and for no others."""
+        """Further forces: the same for the same operations in the same order, and for no others."""
         return self._further.serialize()
 
     def function(self, name, outputs, x=None, p=None):

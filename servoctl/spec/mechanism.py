@@ -113,7 +113,7 @@ class Mechanism:
         return "\n".join(lines)
 
     def as_text(self):
-        """Names, numbers and expressions: the same text for the same operations in the same order, and for no others."""
+        """Names, numbers and expressions: the same for the same operations in the same order, and for no others."""
         q, p = self.q, self.parameters
         names = [q.names, q.velocity_names, q.plain, list(q.invariants), self.actuators, list(self.constraints)]
         expressions = [
