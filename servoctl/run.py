@@ -88,7 +88,7 @@ class Run(Value):
         Parameters
         ----------
         kind : str
-            One of `servoctl.model.model.SIGNALS`.
+            One of `servoctl.model.equations.SIGNALS`.
         rate : int
             Order of the derivative. It may need jets above s̄.
 

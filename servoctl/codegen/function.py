@@ -145,8 +145,7 @@ class Compiled:
     def _as_text(self):
         """What it was made of: functions that compute the same by the same operations say the same."""
         _, parts, _ = self.__reduce__()
-        flat = [item for part in parts for item in (part.items() if isinstance(part, dict) else [part])]
-        return repr(["".join(map(_serialised, item)) if isinstance(item, tuple) else _serialised(item) for item in flat])
+        return repr([_serialised(part) for part in parts])
 
     def __repr__(self):
         how = "compiled" if self.backend == "c" else "evaluated by CasADi"
@@ -460,4 +459,6 @@ class Compiled:
 
 
 def _serialised(part):
-    return part.serialize() if hasattr(part, "serialize") else repr(part)
+    if isinstance(part, dict):
+        return {name: _serialised(value) for name, value in part.items()}
+    return part.serialize() if hasattr(part, "serialize") else part

@@ -8,7 +8,7 @@ import numpy as np
 from servoctl.checks import finite
 from servoctl.codegen.function import compiled
 from servoctl.errors import SpecificationError, unknown
-from servoctl.model.equations import EQUATIONS, Equations, gradient_jets, leading_names, residual_rows
+from servoctl.model.equations import EQUATIONS, SIGNALS, Equations, gradient_jets, leading_names, residual_rows
 from servoctl.model.formulations import FORMULATIONS
 from servoctl.model.report import describe
 from servoctl.model.servo_dae import SERVO_DAE
@@ -19,10 +19,6 @@ from servoctl.reduction.reduce import holds, reduce
 from servoctl.reduction.structure import structure
 
 FUNCTIONS = {**EQUATIONS, **SERVO_DAE, **FORMULATIONS}
-SIGNALS = (
-    "actuation", "reaction", "multipliers", "outputs", "energy", "balance", "coordinate_rates", "residuals",
-    "inputs", "all_multipliers", "power", "reach",
-)  # fmt: skip
 
 
 def derive(mechanism, program, guess=None):
@@ -300,6 +296,8 @@ class Model:
             One of `SIGNALS`.
         rate : int
         """
+        if kind not in SIGNALS:
+            raise unknown(kind, list(SIGNALS), "group of signals")
 
         def build():
             names, f = self.equations.signals(kind, rate)

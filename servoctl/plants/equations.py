@@ -2,13 +2,12 @@
 
 from dataclasses import replace
 from functools import cached_property
-from types import SimpleNamespace
 
 import casadi as ca
 import numpy as np
 
 from servoctl.codegen.folding import folded
-from servoctl.model.equations import Equations
+from servoctl.model.equations import Invariants
 from servoctl.reduction.appell import plant_accelerations, require_inertia
 from servoctl.reduction.hidden import as_rows, complete
 from servoctl.reduction.manifold import Context
@@ -221,7 +220,7 @@ class PlantEquations:
     @cached_property
     def _invariants(self):
         rows, points = self._material
-        return Equations(SimpleNamespace(mechanism=self.mechanism, top=2, rows=rows, points=points))
+        return Invariants(self.mechanism, rows, 2, points)
 
 
 def _unpickled(mechanism, forces, damped, lagged):

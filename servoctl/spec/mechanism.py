@@ -14,7 +14,7 @@ from servoctl.spec.coordinates import Coordinates
 from servoctl.spec.packing import packed, unpacked
 from servoctl.spec.parameters import Parameters
 
-LATEST = 32  # mechanisms from other processes that are held
+ARRIVED = 32  # mechanisms from other processes that are held
 _SEED = 20021  # of the random points at which identities are tested
 
 
@@ -364,7 +364,7 @@ def _unpickled(q, parameters, content):
     return _latest(mechanism)
 
 
-@lru_cache(LATEST)
+@lru_cache(ARRIVED)
 def _latest(mechanism):
     """An equal mechanism that came before from another process, or else this one: what is derived of it is shared."""
     return mechanism
