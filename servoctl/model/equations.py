@@ -5,7 +5,6 @@ from functools import cached_property
 import casadi as ca
 import numpy as np
 
-from servoctl.codegen.emit import operations
 from servoctl.errors import SpecificationError
 from servoctl.model import saddle
 from servoctl.reduction.appell import plant_accelerations
@@ -104,11 +103,6 @@ class Equations(Invariants):
         self.coefficients = [
             [ca.SX.sym(f"c{a}_{j}") for j in range(count)] for a, count in enumerate(self.raised)
         ]  # of the error dynamics of each row
-
-    @cached_property
-    def row_operations(self):
-        """Operations of the rows ψ themselves."""
-        return operations(self.function("rows", self.jets, [row.expression for row in self.r.rows]))
 
     def _solve(self, right):
         """L⁻¹ right and the pivots of L."""

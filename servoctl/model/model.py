@@ -375,10 +375,6 @@ class Model:
         """Names of the jets on which a row's leading gradient depends."""
         return gradient_jets(self.reduction, row)
 
-    def row_operations(self):
-        """Operations of the rows ψ themselves, before anything is differentiated or compiled."""
-        return self.once("row operations", lambda: self.equations.row_operations)
-
     def operations(self):
         """Operations of each function that has been built so far, by name."""
         found = {name: f for name, f in self._functions.items() if hasattr(f, "operations")}
