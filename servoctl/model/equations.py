@@ -1,4 +1,4 @@
-"""The functions of a motion as SX expressions: each is built only when it is asked for."""
+"""The functions of a motion as SX expressions: each is built at its first use."""
 
 from functools import cached_property
 
@@ -51,10 +51,10 @@ class Invariants:
     @cached_property
     def invariant_rows(self):
         """(level, name, SX): what the state satisfies, ψ_a^(j) for j < s̄ - o_a and the kinematics' own invariants."""
-        found = [(0, name, e) for name, e in self.q.invariants.items()]
+        rows = [(0, name, e) for name, e in self.q.invariants.items()]
         for row, level in zip(self.rows, self.levels, strict=True):
-            found += [(row.order + j, _level_name(row.name, j), e) for j, e in enumerate(level[:-1])]
-        return sorted(found, key=lambda item: item[0])
+            rows += [(row.order + j, _level_name(row.name, j), e) for j, e in enumerate(level[:-1])]
+        return sorted(rows, key=lambda item: item[0])
 
     def invariants(self):
         """Outputs (values, Jacobian in X column by column) of the invariants."""
@@ -122,14 +122,14 @@ class Equations(Invariants):
     def rest(self, rows, poles=False):
         """What is left of some rows, raised to order s̄, without γ^(s̄); with their error dynamics if `poles`."""
         top, zero = self.q.jet(self.top), ca.SX.zeros(self.q.n)
-        found = []
+        rests = []
         for a in rows:
             *lower, highest = self.levels[a]
             row = ca.substitute(highest, top, zero)
             if poles:
                 row += sum(c * e for c, e in zip(self.coefficients[a], lower, strict=True))
-            found.append(row)
-        return found
+            rests.append(row)
+        return rests
 
     def dense(self, poles=False):
         """γ^(s̄) from the rows, L γ^(s̄) = -rest."""
@@ -139,8 +139,8 @@ class Equations(Invariants):
     def guards(self):
         """Pivots that a motion must not let vanish: a list of (name, SX)."""
         pivots = self.saddle[2] if self.sparse else self._solve(ca.SX(self.q.n, 0))[1]
-        found = [*self.r.guards, *((f"leading matrix {i + 1}", p) for i, p in enumerate(pivots))]
-        return [(name, g) for name, g in found if any(self.q.where(s) is not None for s in ca.symvar(g))]
+        named = [*self.r.guards, *((f"leading matrix {i + 1}", p) for i, p in enumerate(pivots))]
+        return [(name, g) for name, g in named if any(self.q.where(s) is not None for s in ca.symvar(g))]
 
     @property
     def guard_sizes(self):
@@ -295,10 +295,10 @@ class Equations(Invariants):
 
     def _multipliers(self):
         names = [*self.r.program.residuals, *self.r.mechanism.constraints]
-        own = self.r.multipliers
-        if self.r.program.by == "actuators":
-            names, own = [*self.r.mechanism.constraints], own[len(self.r.program.residuals) :]
-        return [f"multiplier_{name}" for name in names], [own]
+        multipliers = self.r.multipliers
+        if self.r.program.by == "actuators":  # then those of the program are the actuation
+            names, multipliers = [*self.r.mechanism.constraints], multipliers[len(self.r.program.residuals) :]
+        return [f"multiplier_{name}" for name in names], [multipliers]
 
     def _outputs(self):
         return list(self.r.mechanism.outputs), list(self.r.mechanism.outputs.values())
@@ -397,8 +397,8 @@ def leading_names(reduction):
     constraints = [row for row in reduction.rows if row.kind != "dynamics"]
     program = [row.name for row in constraints if row.kind == "program"]
     material = [row.name for row in constraints if row.kind == "material"]
-    own = program if reduction.program.by == "ideal" else list(reduction.mechanism.actuators)[: len(program)]
-    return [row.name for row in reduction.rows], [*own, *material]
+    directions = program if reduction.program.by == "ideal" else list(reduction.mechanism.actuators)[: len(program)]
+    return [row.name for row in reduction.rows], [*directions, *material]
 
 
 def gradient_jets(reduction, name):

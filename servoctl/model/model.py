@@ -44,7 +44,7 @@ def derive(mechanism, program, guess=None):
     NotRealisable
         If the actuators cannot realise the program.
     SingularProgram
-        If a residual's gradient vanishes on its own solutions, or a rank cannot be told.
+        If a residual's gradient vanishes on its own solutions, or a rank cannot be decided.
     InconsistentStart
         If no state satisfies the constraints.
     """
@@ -99,7 +99,7 @@ class Model:
         return _unpickled, (mechanism, pack(self.reduction), choices, self.parameters, self._knots)
 
     def names_to(self, size):
-        """Names of the first `size` jets, beyond γ^(s̄) where asked for."""
+        """Names of the first `size` jets, which may be more than those up to γ^(s̄)."""
         q, names, k = self.reduction.mechanism.q, list(self.jet_names), self.reduction.top
         while len(names) < size:
             k += 1
@@ -235,8 +235,8 @@ class Model:
             def build():
                 return require_smooth(r.switches, self.parameters, r.smoothness, span).times
 
-            kept = np.array_equal(self.parameters, r.context.values)
-            self._knots_within[span] = self._store.recall(f"knots {span}", build) if kept else build()
+            stored = np.array_equal(self.parameters, r.context.values)
+            self._knots_within[span] = self._store.recall(f"knots {span}", build) if stored else build()
         return self._knots_within.get(span, ())
 
     @property
@@ -259,7 +259,7 @@ class Model:
         ----------
         name : str
         build : callable
-            Without arguments; called where nothing is found under the name.
+            Without arguments; called where there is nothing under the name yet.
         """
         if name not in self._functions:
             self._functions[name] = self._store.recall(name, build)
@@ -364,7 +364,7 @@ class Model:
         return self.once("column sizes", lambda: self.equations.column_sizes)
 
     def row_stories(self):
-        """What was done to each row, by name; empty for rows as they were given."""
+        """What was done to each row, by name; empty for the designer's own rows."""
         return {row.name: row.story for row in self.reduction.rows}
 
     def leading_names(self):
@@ -377,9 +377,8 @@ class Model:
 
     def operations(self):
         """Operations of each function that has been built so far, by name."""
-        found = {name: f for name, f in self._functions.items() if hasattr(f, "operations")}
-        found |= {value[1].name: value[1] for key, value in self._functions.items() if key.startswith("signals ")}
-        return {name: f.operations for name, f in found.items()}
+        signals = {value[1].name: value[1] for value in self._functions.values() if isinstance(value, tuple)}
+        return {name: f.operations for name, f in (self._functions | signals).items() if hasattr(f, "operations")}
 
     def start(self, /, t=0.0, guess=None, **held):
         """A consistent state: held values fixed, the rest solved from every invariant at every level.
@@ -392,7 +391,7 @@ class Model:
             Where free values come from, and where the solution is looked for; other values are as near zero as the
             invariants allow.
         **held : float
-            Values of coordinates and derivatives to be kept exactly.
+            Values of coordinates and derivatives that the start has exactly.
 
         Returns
         -------

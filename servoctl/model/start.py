@@ -29,7 +29,7 @@ class State(Value):
     values : (n_x,) array
     names : tuple of str
     held : tuple of str
-        Names whose values were given.
+        Names whose values were fixed.
     free : tuple of str
         Names that the invariants left free, beside the held ones; their values come from the guess or are near zero.
     residual : float
@@ -95,24 +95,24 @@ class _Aim:
 def consistent(model, t, held, guess):
     """See `Model.start`."""
     names = model.state_names
-    given = {**mapping(guess, "The guesses"), **held}
-    for name in given:
+    chosen = {**mapping(guess, "The guesses"), **held}
+    for name in chosen:
         if name not in names:
             raise unknown(name, names, "state")
-    given = {name: finite(name, value) for name, value in given.items()}
-    reference = np.array([given.get(name, 0.0) for name in names])
-    weights = np.array([GUESSED if name in given and name not in held else 1.0 for name in names])
+    chosen = {name: finite(name, value) for name, value in chosen.items()}
+    reference = np.array([chosen.get(name, 0.0) for name in names])
+    weights = np.array([GUESSED if name in chosen and name not in held else 1.0 for name in names])
     aim = _Aim(names, reference, weights, np.array([name not in held for name in names]))
     invariants, x, residual = _solve(model, t, aim)
     if not residual < TOLERANCE:
         _refuse(invariants, aim, held, x)
-    free = _free(invariants, x, aim, given)
-    x, residual = _at_guess(invariants, x, residual, aim, [name in free and name in given for name in names])
+    free = _free(invariants, x, aim, chosen)
+    x, residual = _at_guess(invariants, x, residual, aim, [name in free and name in chosen for name in names])
     return State(t, x, names, tuple(held), free, residual)
 
 
 def _solve(model, t, aim):
-    """The start by the model's own choice of pivots, or by one made at the reference or near what was found."""
+    """The start by the model's own choice of pivots, or by one made at the reference or near the best state so far."""
     invariants = _Invariants(model, t)
     finite_there = np.all(np.isfinite(invariants(aim.reference)[0]))
     x, residual = _best(invariants, aim) if finite_there else (aim.reference, np.inf)
@@ -229,7 +229,7 @@ def _free(invariants, x, aim, guess):
 
 
 def _refuse(invariants, aim, held, x):
-    """Say which held value is against the invariants, or which invariant no state was found for."""
+    """Say which held value is against the invariants, or which invariant no state satisfies."""
     left = np.abs(invariants.scaled(x))
     worst = invariants.names[int(np.argmax(left))]
     loosened, residual = _best(invariants, aim.moving(np.ones(len(aim.names), dtype=bool)), tries=2)

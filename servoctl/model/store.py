@@ -56,7 +56,7 @@ class Store:
         self.fingerprint = fingerprint(*self.specification)
 
     def recall(self, name, build):
-        """What is kept under a name, or else what `build()` returns, which is kept.
+        """The entry of a name, or else what `build()` returns, which becomes the entry.
 
         Parameters
         ----------
@@ -78,7 +78,7 @@ class Store:
         return content[0]
 
     def reduction(self, reduce):
-        """The `Reduction` that is kept, in the designer's own symbols, or else that of `reduce`, which is kept.
+        """The `Reduction` on disk, in the designer's own symbols, or else that of `reduce`, which is written.
 
         Parameters
         ----------
@@ -110,7 +110,7 @@ class Store:
             )
 
     def _path(self, name):
-        """Where an entry lies; None where nothing is kept."""
+        """Where an entry lies; None where nothing is read or written."""
         stamp = None if os.environ.get("SERVOCTL_MEMO") == "none" else _stamp()
         if stamp is None or self.fingerprint is None:
             return None
@@ -144,7 +144,7 @@ def fingerprint(mechanism, program, guess=None, near=None, values=None):
     Returns
     -------
     str or None
-        None for what does not tell itself completely: what is derived of it is not kept.
+        None for a value of another class, which may say more than its expressions: nothing of it goes to disk.
     """
     if (type(mechanism), type(program)) != (Mechanism, Program):
         return None
@@ -196,7 +196,7 @@ def _sources(directory):
 
 
 def _read(path):
-    """What is kept at a path, or None if there is nothing that can be read."""
+    """The entry at a path, a tuple, or None if there is nothing that can be read."""
     if path is None:
         return None
     try:
@@ -230,14 +230,14 @@ def _write(path, entry):
 
 def _prune(directory):
     """Remove what was not used for the longest time, if all entries together are too large."""
-    kept = []
+    entries = []
     for entry in os.scandir(directory):
         with contextlib.suppress(OSError):  # another process removed it
-            kept.append((entry.stat().st_mtime, entry.stat().st_size, entry.path))
-    total = sum(size for _, size, _ in kept)
+            entries.append((entry.stat().st_mtime, entry.stat().st_size, entry.path))
+    total = sum(size for _, size, _ in entries)
     if total <= MOST_BYTES:
         return
-    for _, size, path in sorted(kept):
+    for _, size, path in sorted(entries):
         if total <= MOST_BYTES / 2:
             break
         with contextlib.suppress(OSError):

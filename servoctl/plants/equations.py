@@ -184,17 +184,17 @@ class PlantEquations:
 
     def outputs(self):
         """The mechanism's named outputs."""
-        found = [
+        values = [
             ca.substitute(e, ca.vertcat(*self.q.gamma(2)), self.acceleration) for e in self.mechanism.outputs.values()
         ]
-        return self.function("outputs", found)
+        return self.function("outputs", values)
 
     def constraints(self):
         """Names and values of the invariants of the state, level by level."""
         if not self.constrained:
             return [], self.function("constraints", [ca.SX(0, 1)])
-        found = self._invariants.invariant_rows
-        return [name for _, name, _ in found], self.function("constraints", [e for _, _, e in found])
+        rows = self._invariants.invariant_rows
+        return [name for _, name, _ in rows], self.function("constraints", [e for _, _, e in rows])
 
     def constraints_jacobian(self):
         """Derivatives of the invariants of the state in x, column by column."""

@@ -54,7 +54,7 @@ def plant(mechanism, *, forces=None, damping=None, limits=None, rate_limits=None
     """
     if not isinstance(mechanism, Mechanism):
         raise SpecificationError(
-            f"A {type(mechanism).__name__} was given in the place of a Mechanism.",
+            f"The first argument is a {type(mechanism).__name__}.",
             "A plant is made of a mechanism and numbers.",
             do="Write sv.plant(mechanism, m_load=115.0).",
         )
@@ -227,7 +227,7 @@ class Plant(Value):
     def state(self, values):
         """A full state: an array of (q, γ') or of all states, or values by name.
 
-        Lagged inputs that are not given are NaN: `close` lets them start at the first input.
+        Lagged inputs without a value are NaN: `close` lets them start at the first input.
 
         Parameters
         ----------
@@ -253,24 +253,23 @@ class Plant(Value):
                 raise SpecificationError(
                     f"The state has no {missing[0]}.", f"It is made of {', '.join(names)}.", do="Give all of them."
                 )
-            given = np.array([finite(k, values[k], "state") if k in values else np.nan for k in names])
-            return given
+            return np.array([finite(k, values[k], "state") if k in values else np.nan for k in names])
         try:
-            given = np.asarray(values, dtype=float).ravel()
+            state = np.asarray(values, dtype=float).ravel()
         except (TypeError, ValueError) as error:
             raise SpecificationError(
                 f"The state is a {type(values).__name__}.", "It is an array or a dict of numbers.", do="Give one."
             ) from error
-        if given.size not in (n, self.n_x) or not np.isfinite(given).all():
+        if state.size not in (n, self.n_x) or not np.isfinite(state).all():
             raise SpecificationError(
-                f"The state {np.array2string(given, threshold=8)} was given.",
+                f"The state is {np.array2string(state, threshold=8)}.",
                 f"It has {n} finite numbers: {', '.join(names[:n])}"
                 + (f"; or {self.n_x}, with the inputs {', '.join(names[n:])}." if self.lag else "."),
                 nearest="plan.state(0.0).",
                 do="Give one number each.",
                 names=names,
             )
-        return np.concatenate([given, np.full(self.n_x - given.size, np.nan)])
+        return np.concatenate([state, np.full(self.n_x - state.size, np.nan)])
 
     def __repr__(self):
         m = self.mechanism
