@@ -325,9 +325,7 @@ class Model:
 
     def invariant_names(self):
         """(level, name) of each invariant of the state, in the order of the function "invariants"."""
-        return self.once(
-            "invariant names", lambda: [(level, name) for level, name, _ in self.equations.invariant_rows]
-        )
+        return self.once("invariant names", lambda: [(level, name) for level, name, _ in self.equations.invariant_rows])
 
     def pole_rows(self):
         """(row name, number of coefficients) of the error dynamics, in the order of the pole inputs."""

@@ -70,4 +70,3 @@ def _rule(r):
     )
     rule = "the generalised Chetaev rule, a postulate at this order" if bent else "d'Alembert's principle"
     return f"(3.18) with T from ker G; dependent: {dependent}; under {rule}"
-
