@@ -1,7 +1,7 @@
 """The functions of a plant as SX expressions: the full mechanism under inputs, disturbances and further forces."""
 
 from dataclasses import replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 
 import casadi as ca
 import numpy as np
@@ -12,6 +12,7 @@ from servoctl.reduction.appell import plant_accelerations, require_inertia
 from servoctl.reduction.hidden import as_rows, complete
 from servoctl.reduction.manifold import Context
 
+LATEST = 32  # sets of equations that are held
 CLEAR = 1e-6  # least eigenvalue of a mass matrix with unit diagonal that needs no decision about its rank
 
 
@@ -21,8 +22,8 @@ class PlantEquations:
     Parameters
     ----------
     mechanism : Mechanism
-    forces : (n,) SX
-        Further generalised forces.
+    forces : str
+        Further generalised forces, (n,): a serialised function (see `Coordinates.as_function`); "" without any.
     damped : tuple of int
         Velocities with viscous damping.
     lagged : tuple of int
@@ -30,14 +31,17 @@ class PlantEquations:
 
     Attributes
     ----------
+    choices : (str, tuple of int, tuple of int)
+        Forces, damped velocities and lagging actuators.
     functions : dict of str to Compiled
         What was compiled of them so far.
     """
 
     def __init__(self, mechanism, forces, damped, lagged):
         q = self.q = mechanism.q
-        self.mechanism, self.forces, self.damped, self.lagged = mechanism, forces, damped, lagged
+        self.mechanism, self.choices, self.lagged = mechanism, (forces, damped, lagged), lagged
         self.functions = {}
+        self.forces = _expression(forces, mechanism)
         self.velocity = ca.vertcat(*q.gamma(1))
         self.lagging = ca.SX.sym("lagging", len(lagged))
         self.state = ca.vertcat(*q, self.velocity, self.lagging)
@@ -50,29 +54,6 @@ class PlantEquations:
         self.force = ca.SX(self.u)
         for a, value in zip(lagged, self.lagging.elements(), strict=True):
             self.force[a] = value
-
-    def __eq__(self, other):
-        return isinstance(other, PlantEquations) and self._key == other._key
-
-    def __hash__(self):
-        return hash(self._key)
-
-    @cached_property
-    def _key(self):
-        """What they are derived from: they are written in the symbols of one mechanism, so that counts as an object."""
-        return id(self.mechanism), self.forces_as_text(), self.damped, self.lagged
-
-    def __reduce__(self):
-        return _unpickled, (self.mechanism, self._further, self.damped, self.lagged)
-
-    @property
-    def _further(self):
-        """Further forces, as a function of t, q, γ' and the parameters."""
-        return self.q.as_function([self.forces], self.mechanism.parameters.symbols)
-
-    def forces_as_text(self):
-        """Further forces: the same for the same operations in the same order, and for no others."""
-        return self._further.serialize()
 
     def function(self, name, outputs, x=None, p=None):
         """An SX function of (t, x, p) with one dense column."""
@@ -223,5 +204,41 @@ class PlantEquations:
         return Invariants(self.mechanism, rows, 2, points)
 
 
-def _unpickled(mechanism, forces, damped, lagged):
-    return PlantEquations(mechanism, *mechanism.q.from_function(forces, mechanism.parameters.symbols), damped, lagged)
+def _expression(forces, mechanism):
+    if not forces:
+        return ca.SX.zeros(mechanism.q.n)
+    return mechanism.q.from_function(ca.Function.deserialize(forces), mechanism.parameters.symbols)[0]
+
+
+def plant_equations(mechanism, *choices):
+    """The equations of a plant, derived once for all plants that differ in numbers alone.
+
+    Parameters
+    ----------
+    mechanism : Mechanism
+    *choices
+        Forces, damped velocities and lagging actuators, as `PlantEquations` takes them.
+
+    Returns
+    -------
+    PlantEquations
+    """
+    return _latest(_Identity(mechanism), choices)
+
+
+@lru_cache(LATEST)
+def _latest(identity, choices):
+    return PlantEquations(identity.value, *choices)
+
+
+class _Identity:
+    """A value that equals itself alone: equations are written in the symbols of one mechanism, not of an equal one."""
+
+    def __init__(self, value):
+        self.value = value
+
+    def __eq__(self, other):
+        return self.value is other.value
+
+    def __hash__(self):
+        return id(self.value)

@@ -1,7 +1,6 @@
 """The plant: the full mechanism with its own numbers, friction, actuators and their limits."""
 
 from dataclasses import dataclass, field, fields
-from functools import lru_cache
 
 import casadi as ca
 import numpy as np
@@ -10,11 +9,9 @@ from servoctl.checks import column, finite, interval, mapping, numbers_by_name
 from servoctl.codegen.function import compiled
 from servoctl.codegen.loops.closed import DRIVER
 from servoctl.errors import SpecificationError, unknown
-from servoctl.plants.equations import PlantEquations
+from servoctl.plants.equations import PlantEquations, plant_equations
 from servoctl.spec.mechanism import Mechanism, require_known
 from servoctl.values import Value
-
-LATEST = 32  # plants whose equations are held for those that differ from them in numbers alone
 
 
 def plant(mechanism, *, forces=None, damping=None, limits=None, rate_limits=None, lag=None, delay=0.0, **parameters):
@@ -55,7 +52,7 @@ def plant(mechanism, *, forces=None, damping=None, limits=None, rate_limits=None
     if not isinstance(mechanism, Mechanism):
         raise SpecificationError(
             f"The first argument is a {type(mechanism).__name__}.",
-            "A plant is made of a mechanism and numbers.",
+            "A plant is made of a Mechanism and numbers.",
             do="Write sv.plant(mechanism, m_load=115.0).",
         )
     actuators = mechanism.actuators
@@ -69,7 +66,7 @@ def plant(mechanism, *, forces=None, damping=None, limits=None, rate_limits=None
     delay = numbers_by_name(delay, actuators, "actuator", "delay", low=0.0)
     damped = tuple(i for i, name in enumerate(names) if name in damping)
     lagged = tuple(i for i, name in enumerate(actuators) if name in lag)
-    equations = _latest(PlantEquations(mechanism, _forces(mechanism, forces, names), damped, lagged))
+    equations = plant_equations(mechanism, _forces(mechanism, forces, names), damped, lagged)
     equations.require_inertia(values)
     rates = [1.0 / lag[actuators[i]] for i in lagged]
     numbers = np.concatenate([values, [damping[names[i]] for i in damped], rates])
@@ -78,12 +75,6 @@ def plant(mechanism, *, forces=None, damping=None, limits=None, rate_limits=None
         mechanism, numbers, state_names, actuators, tuple(names),
         _limits(limits, actuators), rate_limits, lag, {n: d for n, d in delay.items() if d}, damping, equations,
     )  # fmt: skip
-
-
-@lru_cache(LATEST)
-def _latest(equations):
-    """The equations that were derived before of the same mechanism and forces, or else these."""
-    return equations
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,12 +109,13 @@ class Plant(Value):
     equations: PlantEquations = field(repr=False, compare=False)
 
     def __eq__(self, other):
-        return super().__eq__(other) and self.equations.forces_as_text() == other.equations.forces_as_text()
+        return super().__eq__(other) and self.equations.choices == other.equations.choices
 
     __hash__ = Value.__hash__
 
     def __reduce__(self):
-        return _unpickled, ({f.name: getattr(self, f.name) for f in fields(self)},)
+        numbers = {f.name: getattr(self, f.name) for f in fields(self) if f.name != "equations"}
+        return _unpickled, (numbers, self.equations.choices)
 
     @property
     def n_x(self):
@@ -312,7 +304,7 @@ def _limits(limits, actuators):
 
 
 def _forces(mechanism, forces, names):
-    """Further generalised forces, (n,) SX."""
+    """Further generalised forces, (n,), as a serialised function; "" without any."""
     q, total = mechanism.q, ca.SX.zeros(mechanism.q.n)
     for name, value in mapping(forces, "The forces").items():
         if name not in names:
@@ -328,11 +320,11 @@ def _forces(mechanism, forces, names):
                 name=name,
             )
         total[names.index(name)] = expression
-    return total
+    return "" if total.is_zero() else q.as_function([total], mechanism.parameters.symbols).serialize()
 
 
-def _unpickled(values):
-    return Plant(**values | {"equations": _latest(values["equations"])})
+def _unpickled(numbers, choices):
+    return Plant(**numbers, equations=plant_equations(numbers["mechanism"], *choices))
 
 
 FUNCTIONS = {  # what `compiled` makes of each: the function, its loops, its projection, other functions, further loops
