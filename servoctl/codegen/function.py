@@ -1,7 +1,6 @@
 """A function of (t, x, p) seen through numpy: single points, grids, Runge-Kutta, and Newton along a path.
 
-Nothing is compiled before it pays. Where there is no compiler, CasADi's evaluation runs the same algorithms and the
-results differ by rounding only.
+Nothing is compiled before it pays; without a compiler CasADi runs the same algorithms, and results differ by rounding.
 """
 
 import contextlib
@@ -115,7 +114,6 @@ class Compiled:
     Attributes
     ----------
     name : str
-        Its name.
     n_x, n_p, n_y : int
         Numbers of states, parameters and outputs.
     loops : tuple of str
@@ -136,16 +134,10 @@ class Compiled:
         return Compiled, parts, {"_text": self._text}
 
     def __eq__(self, other):
-        return self is other or (isinstance(other, Compiled) and self._as_text == other._as_text)
+        return self is other or (isinstance(other, Compiled) and self.source() == other.source())
 
     def __hash__(self):
         return hash((self.name, self.n_x, self.n_p, self.n_y))
-
-    @functools.cached_property
-    def _as_text(self):
-        """What it was made of: functions that compute the same by the same operations say the same."""
-        _, parts, _ = self.__reduce__()
-        return repr([_serialised(part) for part in parts])
 
     def __repr__(self):
         how = "compiled" if self.backend == "c" else "evaluated by CasADi"
@@ -456,9 +448,3 @@ class Compiled:
                 expected=shape,
             )
         return array
-
-
-def _serialised(part):
-    if isinstance(part, dict):
-        return {name: _serialised(value) for name, value in part.items()}
-    return part.serialize() if hasattr(part, "serialize") else part

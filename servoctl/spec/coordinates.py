@@ -209,7 +209,18 @@ class Coordinates:
         return ca.Function("expressions", self._arguments(highest, parameters), list(expressions))
 
     def from_function(self, function, parameters=()):
-        """The expressions of `as_function`, of this process or another, in these symbols: a list of SX."""
+        """The expressions of a function that `as_function` made, here or in another process, in these symbols.
+
+        Parameters
+        ----------
+        function : casadi.Function
+        parameters : sequence of SX
+            Their symbols.
+
+        Returns
+        -------
+        list of SX
+        """
         return function.call(self._arguments(function.n_in() - 3, parameters), True, False)
 
     def _arguments(self, highest, parameters):
