@@ -1,9 +1,9 @@
 """C text becomes a loaded library: compiled by the system's compiler, kept on disk by content.
 
 A library is kept under the user's cache directory (``SERVOCTL_CACHE``, else ``XDG_CACHE_HOME``, else the platform's
-place) under the hash of the C text, the flags, the compiler and the processor. The compiler is ``SERVOCTL_COMPILER``,
-else ``CC``, else the first of cc, gcc and clang; ``SERVOCTL_COMPILER=none`` compiles nothing. Without a compiler, or
-where it fails, one warning per process says so and the caller goes on without.
+place) under the hash of the C text, the files that it may include, the flags, the compiler and the processor. The
+compiler is ``SERVOCTL_COMPILER``, else ``CC``, else the first of cc, gcc and clang; ``SERVOCTL_COMPILER=none`` compiles
+nothing. Without a compiler, or where it fails, one warning per process says so and the caller goes on without.
 
 The flags keep the values of IEEE arithmetic with one exception: a product and a sum may be contracted to one fused
 operation, which rounds once instead of twice. (Which C text is compiled is told in `emit`.)
@@ -24,6 +24,7 @@ import warnings
 from pathlib import Path
 
 from servoctl.codegen.cache import cache_directory, keeping, kept
+from servoctl.codegen.loops import SOURCES, digest
 
 FLAGS = ("-fPIC", "-shared", "-w", "-fno-math-errno")
 
@@ -58,7 +59,7 @@ def library(text, build=True, level="-O1"):
     if found is None:
         return _without("No C compiler was found, or SERVOCTL_COMPILER is none") if build else None
     command, identity = found
-    parts = (text, level, *FLAGS, *_optional_flags(), identity, platform.machine(), _processor())
+    parts = (text, digest(), level, *FLAGS, *_optional_flags(), identity, platform.machine(), _processor())
     key = hashlib.sha256("\0".join(parts).encode()).hexdigest()
     with _guard:
         lock = _locks.setdefault(key, threading.Lock())
@@ -135,7 +136,7 @@ def _compile(text, level, target, command):
     with keeping(target) as temporary:
         for flags in ((*FLAGS, *_optional_flags()), FLAGS):
             done = subprocess.run(
-                [*command, level, *flags, "-x", "c", "-", "-o", temporary, "-lm"],
+                [*command, level, *flags, f"-I{SOURCES}", "-x", "c", "-", "-o", temporary, "-lm"],
                 input=text,
                 text=True,
                 capture_output=True,
