@@ -208,7 +208,7 @@ def test_names_that_are_no_identifiers_stay_apart_and_end_no_comment(tmp_path):
     f = ca.Function("f", [t, x, p], [ca.densify(ca.erfinv(x / 8) + ca.sign(x))])
     names = ("a b", "a_b", "θ */ int x; /*", "@")
     array, no = Array("x", "Any", names), Array("p", "None", ())
-    routine = Routine("f", "Any.", (Scalar("t"), array.given(), no.given(), array.changed("y")))
+    routine = Routine("f", "Any.", (Scalar("t"), array.input(), no.input(), array.output("y")))
     files = write(tmp_path, "any", Contents([array, no], [Constant("half", 0.5, "A half")], {"f": f}, [routine]))
     ours = Exported(files, "any")
     values, y = np.array([-3.0, 0.5, 3.0, 0.0]), np.empty(4)

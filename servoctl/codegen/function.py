@@ -260,7 +260,7 @@ class Compiled:
         Raises
         ------
         SpecificationError
-            If the loop was not asked for, a shape is another, or a count is out of range.
+            If it was made without the loop, a shape is another, or a count is out of range.
         """
         self._settle_loop("rk")
         x0, p = self._array("x0", x0, self._x_shape), self._array("p", p, self._p_shape)
@@ -311,7 +311,7 @@ class Compiled:
         Raises
         ------
         SpecificationError
-            If the loop was not asked for or a shape is another.
+            If it was made without the loop, or a shape is another.
         """
         self._points += SOLVED * np.size(t)
         self._settle_loop("newton", self._points > GRID_POINTS or _AT_ONCE.get())
@@ -353,7 +353,7 @@ class Compiled:
         Raises
         ------
         SpecificationError
-            If the loop was not asked for or a shape is another.
+            If it was made without the loop, or a shape is another.
         """
         self._settle_loop("taylor")
         self._place(t0, x0, p)
@@ -387,7 +387,7 @@ class Compiled:
     def _settle_loop(self, loop, build=True):
         if loop not in self.loops:
             raise SpecificationError(
-                f"{self.name!r} was asked for its loop {loop}",
+                f"{self.name!r} has no loop {loop}",
                 f"It was made with the loops {', '.join(self.loops) or '(none)'}",
                 do=f"Make it with loops=({loop!r},)",
                 name=self.name,
@@ -415,7 +415,7 @@ class Compiled:
 
     @functools.cached_property
     def _lanes(self):
-        """What evaluates long grids: a library of its own, as twice the code takes twice the time to compile."""
+        """What evaluates long grids: a separate library, as twice the code takes twice the time to compile."""
         if "newton" not in self.loops:
             library = compiler.library(emit.emit(self.expression, self._symbol), level="-O1")
             if library is not None:

@@ -4,7 +4,7 @@ import ctypes
 import os
 import weakref
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import casadi as ca
 import numpy as np
@@ -50,7 +50,6 @@ class Unit:
     inputs: tuple
     residuals: object
     n_y: int
-    _libraries: dict = field(default_factory=dict, repr=False)
 
     @property
     def names(self):
@@ -61,9 +60,8 @@ class Unit:
 
     def library(self, n):
         """The C function of n lanes; None without a compiler."""
-        if n not in self._libraries:
-            self._libraries[n] = compiler.library(f"#define W_LANES {n}\n{self.text}", level="-O3")
-        return self._libraries[n] and self._libraries[n].batch
+        library = compiler.library(f"#define W_LANES {n}\n{self.text}", level="-O3")
+        return library and library.batch
 
 
 def unit(plant, law, disturbed, residuals=None):
@@ -101,8 +99,8 @@ def _derived(plant, law, disturbed, residuals):
     command, common, common_values = _apart(law.step.expression(t_k, y, row), ca.vertcat(t_k, row))
     phi = ca.SX(0, 1)
     if residuals:
-        own = [plant.mechanism.parameters.names.index(s.name()) for s in residuals._symbols]
-        phi = residuals.expression(t_k, x, plant.state_names, constants[own])
+        places = [plant.mechanism.parameters.names.index(s.name()) for s in residuals._symbols]
+        phi = residuals.expression(t_k, x, plant.state_names, constants[places])
     phi, s, s_values = _apart(phi, t_k)
     phi, v, v_values = _apart(phi, constants)
     sizes = {
@@ -211,7 +209,7 @@ def run_batch(unit, loop, cases, noise=None, traced=(), every=1, threads=None):
     count, width, size = cases[1].shape[1], 2 * n, len(unit.names)
     blocks = -(-count // width)
     columns = np.minimum(np.arange(blocks * width), count - 1)
-    found = np.empty((2 + 3 * size, blocks * width))
+    gathered = np.empty((2 + 3 * size, blocks * width))
     trace = np.empty((loop.samples // every + 1 if len(traced) else 0, len(traced), blocks * width))
     late = 0 if loop.transport is None else int(np.max(loop.transport)) // loop.substeps + 1
     depth = 1 + max(loop.delay, late)
@@ -219,7 +217,7 @@ def run_batch(unit, loop, cases, noise=None, traced=(), every=1, threads=None):
     arguments = Arguments(**vars(loop) | {
         "constants": constants, "x0": x0, "scale": scale, "table": _common(unit, loop), "noise": None, "p": None,
         "depth": depth, "every": every, "columns": blocks * width, "n_traced": len(traced), "traced": traced,
-        "found": found, "trace": trace,
+        "gathered": gathered, "trace": trace,
     })  # fmt: skip
 
     def run(first, last):
@@ -233,7 +231,7 @@ def run_batch(unit, loop, cases, noise=None, traced=(), every=1, threads=None):
     starts = range(0, blocks, length)
     with ThreadPoolExecutor(threads) as pool:
         list(pool.map(run, starts, (min(first + length, blocks) for first in starts)))
-    lost, largest, squares, last = np.split(found[:, :count], [2, 2 + size, 2 + 2 * size])
+    lost, largest, squares, last = np.split(gathered[:, :count], [2, 2 + size, 2 + 2 * size])
     return Gathered(*lost, largest, np.sqrt(squares / (loop.samples + 1)), last, trace[:, :, :count])
 
 

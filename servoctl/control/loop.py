@@ -12,7 +12,7 @@ FINISHED, STATE_LOST, LAW_LOST = 0, 1, 2  # how a loop ends
 
 @dataclass(frozen=True)
 class Loop:
-    """What a closed loop needs beside the plant and the law; arrays that were not asked for are None.
+    """What a closed loop needs beside the plant and the law; arrays that are not used are None.
 
     Attributes
     ----------
@@ -43,7 +43,7 @@ class Loop:
     transport : (n_u,) integer array
         Integration steps by which each input arrives late.
     at_u : int
-        Where the inputs stand in p.
+        Index of the first input in p.
     """
 
     samples: int
@@ -76,7 +76,7 @@ _FIELDS = {
     "status",
     ctypes.c_double: "t0 period",
     ctypes.c_void_p: "p x0 z0 table noise quantum low high change idle disturbance constants scale measured transport "
-    "disturbed traced x law_x law_y input found trace",
+    "disturbed traced x law_x law_y input gathered trace",
 }
 _WHOLE = {"measured", "transport", "disturbed", "traced"}  # arrays of whole numbers
 

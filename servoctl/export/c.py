@@ -128,15 +128,15 @@ def _of_model(model, start):
     z = Array("z", "Jets z = (x, highest derivative), SI", model.jet_names)
     u = Array("u", "Reaction u, SI" if model.ideal else "Actuation u, SI", actuation)
     r, y = Array("r", "Residuals r, each with its time derivatives, SI", levels), Array("y", "Outputs y, SI", outputs)
-    at = (TIME, z.given(), p.given())
+    at = (TIME, z.input(), p.input())
     functions = {"actuation": control.expression, "residuals": residual.expression}
     routines = [
-        Routine("actuation", "u at time t [s] and jets z of the motion.", (*at, u.changed())),
-        Routine("residuals", "r at time t [s] and jets z: zero on the motion.", (*at, r.changed())),
+        Routine("actuation", "u at time t [s] and jets z of the motion.", (*at, u.output())),
+        Routine("residuals", "r at time t [s] and jets z: zero on the motion.", (*at, r.output())),
     ]
     if outputs:
         functions["outputs"] = output.expression
-        routines.append(Routine("outputs", "y at time t [s] and jets z.", (*at, y.changed())))
+        routines.append(Routine("outputs", "y at time t [s] and jets z.", (*at, y.output())))
     constants = [Constant("p", model.parameters, "Parameters p, with the values they have in the model")]
     if start is not None:
         constants += [Constant("t0", start.t, "Time of the start [s]")]
@@ -157,7 +157,7 @@ def _algebraic(model, x, z, p, u):
         "becomes the state: that of one instant is the guess of the next. Returns the number of corrections; -1 where "
         "no solution was found: z and u are then unchanged, and x is to be set again."
     )
-    arguments = (TIME, x.changed(), p.given(), z.changed(), u.changed())
+    arguments = (TIME, x.output(), p.input(), z.output(), u.output())
     sizes = {"N": model.n, "NQ": model.nq, "NY": f.numel_out(0), "ITERATIONS": ITERATIONS, "TOLERANCE": TOLERANCE}
     return {"path": f}, [Routine("feedforward", about, arguments, "int")], ("newton.c",), sizes
 
@@ -172,11 +172,11 @@ def _integrated(model, x, z, p, u):
         "feedforward": "Feedforward: jets z and u at time t [s] and state x of the plan.",
         "advance": "Takes the plan's state x from time t to t + h [s]: a step of Runge and Kutta's of order 4.",
     }
-    at = (TIME, x.given(), p.given())
+    at = (TIME, x.input(), p.input())
     routines = [
-        Routine("rates", about["rates"], (*at, x.changed("dx"))),
-        Routine("feedforward", about["feedforward"], (*at, z.changed(), u.changed())),
-        Routine("advance", about["advance"], (TIME, Scalar("h"), x.changed(), p.given())),
+        Routine("rates", about["rates"], (*at, x.output("dx"))),
+        Routine("feedforward", about["feedforward"], (*at, z.output(), u.output())),
+        Routine("advance", about["advance"], (TIME, Scalar("h"), x.output(), p.input())),
     ]
     return {"rates": rates}, routines, ("integrated.c",), {"N": model.n, "NX": size}
 
@@ -191,8 +191,8 @@ def _of_law(law):
         f"called every {1 / law.rate:.9g} s from t = {law.t0:g} s; after its last row the table stays there."
     )
     routines = (
-        Routine("start", "Sets the memory z to its value at the start.", (z.changed(),)),
-        Routine("step", about, (TIME, y.given(), z.changed(), u.changed())),
+        Routine("start", "Sets the memory z to its value at the start.", (z.output(),)),
+        Routine("step", about, (TIME, y.input(), z.output(), u.output())),
     )
     memory = np.asarray(law.memory, dtype=float)
     constants = (Constant("z0", memory if len(memory) else np.zeros(1)), Constant("table", table.T.ravel()))

@@ -39,11 +39,11 @@ class Array:
         """The C constant that holds its length."""
         return f"{prefix.upper()}_N{self.key.upper()}"
 
-    def given(self):
+    def input(self):
         """Itself as an input of a C function."""
         return Argument(self, self.key, "const double")
 
-    def changed(self, name=""):
+    def output(self, name=""):
         """Itself as an output of a C function."""
         return Argument(self, name or self.key, "double")
 

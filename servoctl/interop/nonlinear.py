@@ -131,14 +131,8 @@ def _plant(plant, name, disturbed, rate, substeps, delay=0):
 
     disturbed, forces = force_names(plant, disturbed)
     period = None if rate is None else 1.0 / positive("rate", rate)
-    if period is None and (plant.rate_limits or plant.delay or substeps is not None):
-        what = "limits of rate" if plant.rate_limits else "transport delay" if plant.delay else "substeps"
-        raise SpecificationError(
-            f"A plant with {what} is to be a system in continuous time.",
-            "Limits of rate, transport delays and substeps belong to inputs that are sampled and held.",
-            nearest="interop.nlsys(plant, rate=100.0).",
-            do="Give the rate.",
-        )
+    if period is None:
+        _require_continuous(plant, substeps)
     inputs = [*plant.inputs, *(f"disturbance {force}" for force in disturbed)]
     m, n_x, symbols = len(plant.inputs), plant.n_x, plant.mechanism.parameters.names
     ode, low_high = plant.function("ode"), limits(plant, 1.0)[:2]
@@ -157,11 +151,11 @@ def _plant(plant, name, disturbed, rate, substeps, delay=0):
 
     states, update = list(plant.state_names), rates
     if period is not None:
-        held = _Held(plant, period, SUBSTEPS if substeps is None else substeps, delay)
-        states += held.names
+        sampled = _SampledPlant(plant, period, SUBSTEPS if substeps is None else substeps, delay)
+        states += sampled.names
 
         def update(t, x, u, params):
-            return held(t, x, u, lambda inputs: numbers(np.append(inputs, u[m:]), params))
+            return sampled(t, x, u, lambda inputs: numbers(np.append(inputs, u[m:]), params))
 
     return control.nlsys(
         update, outputs, name=name, inputs=inputs, states=states, outputs=output_names(plant), dt=period or 0,
@@ -169,8 +163,20 @@ def _plant(plant, name, disturbed, rate, substeps, delay=0):
     )  # fmt: skip
 
 
-class _Held:
-    """A plant over one sample, with what stands before it in a loop; the state is [x; past commands; past inputs]."""
+def _require_continuous(plant, substeps):
+    """Refuse what belongs to samples."""
+    if plant.rate_limits or plant.delay or substeps is not None:
+        what = "limits of rate" if plant.rate_limits else "transport delay" if plant.delay else "substeps"
+        raise SpecificationError(
+            f"A plant with {what} is to be a system in continuous time.",
+            "Limits of rate, transport delays and substeps belong to inputs that are sampled and held.",
+            nearest="interop.nlsys(plant, rate=100.0).",
+            do="Give the rate.",
+        )
+
+
+class _SampledPlant:
+    """A plant over one sample behind delays and limits; its state is [x; past commands; past inputs]."""
 
     def __init__(self, plant, period, substeps, delay):
         self.plant, self.delay, self.m = plant, delay, len(plant.inputs)
@@ -191,8 +197,8 @@ class _Held:
         applied = limited(commands[self.delay], before, self.low, self.high, self.change)
         inputs = np.vstack([applied[None], inputs])
         ages = (samples_ago(s, self.late, self.substeps) for s in range(self.substeps))
-        steps = (3 * (numbers(inputs[age, range(m)]),) for age in ages)
-        x = hold(self.plant.function("ode"), t, self.h, x, steps)
+        stages = (3 * (numbers(inputs[age, range(m)]),) for age in ages)
+        x = hold(self.plant.function("ode"), t, self.h, x, stages)
         return np.concatenate([x, commands[: self.delay].ravel(), inputs[: self.past].ravel()])
 
 

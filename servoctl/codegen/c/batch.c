@@ -144,14 +144,14 @@ INLINE void advance(double t, double h, const double *d, Cases *s)
 
 INLINE void end(const Loop *c, int64_t at, const Cases *s)
 {
-    double *found = c->found + at;
-    w_store(found, s->state_lost);
-    w_store(found + c->columns, s->law_lost);
+    double *rows = c->gathered + at;
+    w_store(rows, s->state_lost);
+    w_store(rows + c->columns, s->law_lost);
     for (int i = 0; i < NT; i++) {
         const W last = i < NX ? s->x[i] : i < NX + NU ? s->u[i - NX] : s->r[i - NX - NU];
-        w_store(found + (2 + i) * c->columns, s->largest[i]);
-        w_store(found + (2 + NT + i) * c->columns, s->squares[i]);
-        w_store(found + (2 + 2 * NT + i) * c->columns, last);
+        w_store(rows + (2 + i) * c->columns, s->largest[i]);
+        w_store(rows + (2 + NT + i) * c->columns, s->squares[i]);
+        w_store(rows + (2 + 2 * NT + i) * c->columns, last);
     }
 }
 

@@ -10,7 +10,7 @@ typedef struct {
     const double *p, *x0, *z0, *table, *noise, *quantum, *low, *high, *change, *idle, *disturbance, *constants, *scale;
     const int64_t *measured, *transport, *disturbed, *traced;
     double *x, *law_x, *law_y, *input; /* logs of one loop */
-    double *found, *trace;             /* and of many */
+    double *gathered, *trace;          /* and of many */
 } Loop;
 
 INLINE V quantised(const Loop *c, int64_t i, V value)
