@@ -1,5 +1,5 @@
 /* Sine and cosine for a type of numbers: fdlibm's, after a reduction by three parts of pi/2; within 2 units in the last
-   place. Before it, OF(name) makes the names of the type's functions, and REAL and WHOLE are its numbers and integers. */
+   place. Before it, OF(name) names the functions of the type, and REAL and WHOLE are its numbers and integers. */
 
 #define FAR 1e5 /* beyond it sin and cos are those of the C library */
 

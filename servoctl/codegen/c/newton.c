@@ -42,7 +42,7 @@ static int correct(double t, double *x, const double *p, double tol, int64_t max
 /* From the solution x, y at time a to the one at b: predicted by the rate and corrected; halves the step where that
    fails. */
 static int advance(double a, double b, double *x, const double *p, double tol, int64_t max_iter, double *y,
-                        int64_t *count)
+                   int64_t *count)
 {
     double x_next[NX + 1], y_next[NY + 1], t = a;
     for (int64_t done = 0, pieces = 1; done < pieces; ) {
@@ -92,7 +92,7 @@ static inline double wide_relative_step(const W *x, const W *y)
    corrected together, by the first outputs alone until the correction is small. Returns whether all were found; then
    the logs hold them. */
 static int block(int64_t n, int64_t k, const double *t, const W *p, double tol, double *x_log, double *y_log,
-                      int64_t *count)
+                 int64_t *count)
 {
     W x[NX + 1], y[NY + 1], value[3], rate[3];
     const W now = w_load(t + k);
@@ -122,7 +122,7 @@ static int block(int64_t n, int64_t k, const double *t, const W *p, double tol, 
 
 /* The solution at each of n times in order; the logs hold n columns. Returns the number of points solved. */
 int64_t FN(newton)(int64_t n, const double *t, const double *x0, const double *p, double tol, int64_t max_iter,
-                    double *x_log, double *y_log, int64_t *count)
+           double *x_log, double *y_log, int64_t *count)
 {
     double x[NX + 1], y[NY + 1];
     int64_t alone = 9;

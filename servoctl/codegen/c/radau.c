@@ -148,7 +148,8 @@ static double rounded(double h)
     return ldexp(rint(part * 1024) / 1024, exponent);
 }
 
-static double weighted_norm(const double *v, int64_t stride, const double *x, const double *next, double rtol, double atol)
+static double weighted_norm(const double *v, int64_t stride, const double *x, const double *next, double rtol,
+                            double atol)
 {
     double sum = 0;
     for (int64_t i = 0; i < NX; i++) {
@@ -159,8 +160,8 @@ static double weighted_norm(const double *v, int64_t stride, const double *x, co
 }
 
 /* The norm of the error that the embedded method shows, smoothed by the real system. */
-static double error_norm(Method *m, double t, const double *x, const double *f, const double *z, double h,
-                         double rtol, double atol, int again)
+static double error_norm(Method *m, double t, const double *x, const double *f, const double *z, double h, double rtol,
+                         double atol, int again)
 {
     const int64_t n = NX, s = m->s;
     double next[NX + 1], point[NX + 1], y[NY + 1], size = 0;
@@ -202,9 +203,9 @@ static void extrapolate(const Method *m, const double *z, double ratio, double *
    max_steps without reaching t1 where a step vanishes. counts are those of rejected steps, evaluations, Jacobians and
    decompositions. */
 int64_t FN(radau)(double t0, const double *x0, double t1, const double *p, int64_t s, const double *table,
-                   int64_t limit, double tol, int64_t fixed, double rtol, double atol, int64_t project_every,
-                   int64_t max_steps, double *step, double *work, int64_t *pivots, double *t_log, double *x_log,
-                   double *y_log, double *z_log, int64_t *counts)
+           int64_t limit, double tol, int64_t fixed, double rtol, double atol, int64_t project_every, int64_t max_steps,
+           double *step, double *work, int64_t *pivots, double *t_log, double *x_log, double *y_log, double *z_log,
+           int64_t *counts)
 {
     const int64_t n = NX;
     const double *parts = table + s + 3 * s * s;

@@ -5,8 +5,8 @@
    state. The logs hold n_log columns. Returns the index of the last column written: a state that is not finite ends the
    run. */
 int64_t FN(rk)(double t0, const double *x0, double h, int64_t n_steps, int64_t every, int64_t project_every,
-                const double *p, int64_t s, const double *a, const double *b, const double *c, int64_t n_log,
-                double *x_log, double *guard_log)
+           const double *p, int64_t s, const double *a, const double *b, const double *c, int64_t n_log, double *x_log,
+           double *guard_log)
 {
     double x[NX + 1], z[NX + 1], k[s][NY + 1];
     int64_t column = 0, due = 1;
