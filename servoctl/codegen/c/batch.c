@@ -7,7 +7,7 @@
    NW, NV, NL, NS        what `numbers` computes for rates and signals; what all cases share for law and signals
    NO, NR, NT            outputs of the law, residuals, all that is gathered
 
-   and MEASURED, the measured states. What all cases share is a table that law and signals take, a row for each sample. */
+   and MEASURED, the measured states. What all cases share is a table for law and signals, a row for each sample. */
 #include "unit.h"
 #include "lanes.h"
 
