@@ -323,15 +323,16 @@ def require_combination(model, method, drift):
         )
     if type(drift) in method.refused:
         forms = {**{repr(form): type(value) for form, value in SHORT_FORMS.items()}, "a time constant": Poles}
-        taken = ", ".join(form for form, treatment in forms.items() if treatment not in method.refused)
+        taken = [form for form, treatment in forms.items() if treatment not in method.refused]
         others = [name for name, other in METHODS.items() if type(drift) not in other.refused and name != "algebraic"]
         raise SpecificationError(
             f"{given}.",
             method.refused[type(drift)],
-            nearest=f"with this method drift={taken}; with this treatment {', '.join(others)}.",
+            nearest=f"with this method drift={', '.join(taken)}; with this treatment {', '.join(others)}.",
             do="Change one of them.",
             method=str(method),
             drift=drift,
+            methods=others,
         )
 
 

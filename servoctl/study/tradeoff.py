@@ -11,14 +11,13 @@ from servoctl.codegen.function import compiling_at_once
 from servoctl.control.tracking import positive
 from servoctl.errors import LimitExceeded, ServoError, SpecificationError, unknown
 from servoctl.methods.accuracy import motion_error, relative_error
-from servoctl.methods.choice import METHODS as ALL_METHODS
-from servoctl.methods.choice import Adaptive, Algebraic, RungeKutta, Taylor, as_method
+from servoctl.methods.choice import METHODS, Adaptive, Algebraic, RungeKutta, Taylor, as_method
 from servoctl.methods.drift import MinimalCoordinates, Poles, Project, as_drift
 from servoctl.simulation import as_span, consistent_state, simulate
 from servoctl.study.front import TradeOff, method_at
 from servoctl.study.table import machine, positives
 
-METHODS = tuple(name for name in ALL_METHODS if name not in ("RK1", "RK2", "RK23"))  # those need too many steps
+MEASURED = tuple(name for name in METHODS if name not in ("RK1", "RK2", "RK23"))  # those need too many steps
 TOLERANCES = (1e-3, 1e-5, 1e-7, 1e-9, 1e-11, 1e-13)
 STEPS = tuple(5 * 4**k for k in range(7))  # of a fixed length, in the span
 SAMPLES, COMPARED = 51, 201  # instants that adaptive methods give, and at most so many of any run are compared
@@ -276,11 +275,11 @@ def _energy_balance(run, knots):
 def _combinations(model, methods, drifts):
     """Pairs of method and treatment; default methods are those that the model can have."""
     if methods is None:
-        methods = METHODS if model.flat else [name for name in METHODS if name != "algebraic"]
+        methods = MEASURED if model.flat else [name for name in MEASURED if name != "algebraic"]
     methods = list(methods) if isinstance(methods, (list, tuple)) else [methods]
     for method in methods:
-        if not (isinstance(method, str) and method in ALL_METHODS):
-            raise unknown(method, ALL_METHODS, "method")
+        if not (isinstance(method, str) and method in METHODS):
+            raise unknown(method, METHODS, "method")
     treatments = [as_drift(value) for value in drifts]
     for value in treatments:
         if isinstance(value, Poles) and not isinstance(value.values, float):
