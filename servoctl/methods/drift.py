@@ -4,18 +4,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from servoctl.checks import is_whole
 from servoctl.errors import SpecificationError, unknown
-
-
-def is_whole(value):
-    """Whether a value is a whole number, Python's or NumPy's; True and False are none."""
-    return isinstance(value, (int, np.integer)) and not isinstance(value, bool)
-
-
-def is_number(value):
-    """Whether a value is a finite number, Python's or NumPy's; True and False are none."""
-    numbers = (int, float, np.integer, np.floating)
-    return isinstance(value, numbers) and not isinstance(value, bool) and bool(np.isfinite(value))
 
 
 @dataclass(frozen=True)

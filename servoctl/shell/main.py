@@ -5,6 +5,7 @@ import json
 import sys
 from pathlib import Path
 
+from servoctl.checks import as_span
 from servoctl.errors import ServoError, SpecificationError, unknown
 from servoctl.methods.choice import as_method, default_method
 from servoctl.methods.drift import as_drift
@@ -13,7 +14,6 @@ from servoctl.shell import commands as further
 from servoctl.shell import loop as cli_loop
 from servoctl.shell.folder import FILES, LOOP_FILES, Folder, Report, complain, plain, summary, versions
 from servoctl.shell.options import METHODS_HELP, assignment, mapping, positive
-from servoctl.simulation import as_span
 
 
 def main(argv=None):

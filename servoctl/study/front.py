@@ -2,9 +2,10 @@
 
 import numpy as np
 
+from servoctl.checks import is_number
 from servoctl.errors import LimitExceeded, SpecificationError, unknown
 from servoctl.methods.choice import Algebraic, RungeKutta, as_method
-from servoctl.methods.drift import Project, is_number
+from servoctl.methods.drift import Project
 from servoctl.study.table import Study, table
 
 COLOURS = (

@@ -12,13 +12,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from servoctl.checks import positives
 from servoctl.errors import SpecificationError
 from servoctl.methods.bounds import amplification, row_poles
 from servoctl.methods.drift import Poles, as_drift
 from servoctl.methods.tableaus import ORDERS
-from servoctl.study.table import positives
 
-METHODS = (*ORDERS, "Taylor", "RadauIIA")
+TABULATED = (*ORDERS, "Taylor", "RadauIIA")
 RADAU_ORDER = 5  # unless it is given; all are L-stable
 SAMPLES = 101  # of the plan, where eigenvalues are taken: adjacent ones are alike on plans of some smoothness
 NEGLIGIBLE = 1e-9  # size of a state relative to the largest: rounding of one that stays zero
@@ -68,7 +68,7 @@ class StabilityMap:
         Parameters
         ----------
         method : str
-            One of `simulation.bounds.METHODS`.
+            One of `methods.bounds.METHODS`.
         step : float or (K,) array
             [s]
         drift : optional
@@ -94,7 +94,7 @@ class StabilityMap:
         Parameters
         ----------
         method : str
-            One of `simulation.bounds.METHODS`.
+            One of `methods.bounds.METHODS`.
         step : float or (K,) array
             [s]
         drift : optional
@@ -117,7 +117,7 @@ class StabilityMap:
         Parameters
         ----------
         method : str
-            One of `simulation.bounds.METHODS`. Of an adaptive method it is where step control settles.
+            One of `methods.bounds.METHODS`. Of an adaptive method it is where step control settles.
         drift : None, "project", "minimal", float, `Project(...)` or `Poles(...)`, optional
             As in `simulate`.
         order : int, optional
@@ -177,7 +177,7 @@ class StabilityMap:
             f"  off the manifold: {story}; neutral without treatment, at the poles with, removed by projection",
             f"  largest step [s] {'no poles':>12}" + "".join(f"{f'T = {T:g} s':>12}" for T in shown[1:]),
         ]
-        for method in METHODS:
+        for method in TABULATED:
             name = f"Taylor {self.order}" if method == "Taylor" else method
             steps = (self.largest_step(method, drift) for drift in shown)
             lines.append(f"  {name:<16} " + "".join(f"{_step_text(step):>12}" for step in steps))

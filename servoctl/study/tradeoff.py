@@ -7,20 +7,20 @@ import warnings
 
 import numpy as np
 
+from servoctl.checks import as_span, positive, positives
 from servoctl.codegen.function import compiling_at_once
-from servoctl.control.tracking import positive
 from servoctl.errors import LimitExceeded, ServoError, SpecificationError, unknown
 from servoctl.methods.accuracy import motion_error, relative_error
 from servoctl.methods.choice import METHODS, Adaptive, Algebraic, RungeKutta, Taylor, as_method
 from servoctl.methods.drift import MinimalCoordinates, Poles, Project, as_drift
-from servoctl.simulation import as_span, consistent_state, simulate
+from servoctl.simulation import consistent_state, simulate
 from servoctl.study.front import TradeOff, method_at
-from servoctl.study.table import machine, positives
+from servoctl.study.table import machine
 
 MEASURED = tuple(name for name in METHODS if name not in ("RK1", "RK2", "RK23"))  # those need too many steps
 TOLERANCES = (1e-3, 1e-5, 1e-7, 1e-9, 1e-11, 1e-13)
-STEPS = tuple(5 * 4**k for k in range(7))  # of a fixed length, in the span
-SAMPLES, COMPARED = 51, 201  # instants that adaptive methods give, and at most so many of any run are compared
+STEP_COUNTS = tuple(5 * 4**k for k in range(7))  # of a fixed length, in the span
+INSTANTS, COMPARED = 51, 201  # instants that adaptive methods give, and at most so many of any run are compared
 DENSE = 1001  # instants of the reference over which its power is integrated
 TIMED, ENOUGH = 3, 0.3  # calls timed after a warm-up, unless they take this part of `seconds` together
 FEW = 20  # steps: a run that takes too long for fewer has lost its way, and tells nothing of finer settings
@@ -76,7 +76,7 @@ def tradeoff(model, x0, t_span, methods=None, drift=None, *, settings=None, seco
         For settings that are none.
     """
     t0, t1 = as_span(t_span)
-    settings = _settings(settings or {}, abs(t1 - t0))
+    settings = _ladders(settings or {}, abs(t1 - t0))
     limit = positive("seconds", seconds)
     drifts = (None, "project", "minimal", abs(t1 - t0) / TIME_CONSTANT) if drift is None else drift
     combinations = _combinations(model, methods, drifts if isinstance(drifts, (list, tuple)) else [drifts])
@@ -119,7 +119,7 @@ class Reference:
         consistent_state(model, x0, t_span[0])
         self.model, self.start, self.span, self._known = model, x0, t_span, {}
         self.knots = [k for k in model.require_smooth((min(t_span), max(t_span))) if min(t_span) < k < max(t_span)]
-        self.times = np.union1d(np.linspace(*t_span, SAMPLES), self.knots)
+        self.times = np.union1d(np.linspace(*t_span, INSTANTS), self.knots)
         checks = [Adaptive("DOP853", 3e-14, 1e-15), Taylor(12, rtol=1e-14, atol=1e-14)]
         self.method, self.drift = Taylor(16, rtol=1e-15, atol=1e-15), Project()
         if model.flat:
@@ -189,10 +189,10 @@ def _ladder(reference, method, treatment, settings, seconds):
     """A row for each setting, from coarse to fine, until finer ones are too slow or cannot be told from exact."""
     over, name = "", _kind(method)
     for value in sorted(settings, reverse=True):
-        row = {"method": method, "drift": _label(treatment), "setting": name, "value": value, "failure": over}
+        row = {"method": method, "drift": _drift_word(treatment), "setting": name, "value": value, "failure": over}
         if not over:
             try:
-                row |= _measured(reference, method, treatment, value, seconds)
+                row |= _errors_and_cost(reference, method, treatment, value, seconds)
                 if not row["resolved"]:
                     over = f"skipped: {name} = {value:g} reaches what the reference is certain to"
                 elif row["seconds"] > seconds:
@@ -207,7 +207,7 @@ def _ladder(reference, method, treatment, settings, seconds):
         yield row
 
 
-def _measured(reference, name, treatment, value, seconds):
+def _errors_and_cost(reference, name, treatment, value, seconds):
     """Errors, counts and time of one setting."""
     model, (t0, t1) = reference.model, reference.span
     method, times = method_at(name, value), reference.times
@@ -298,13 +298,13 @@ def _combinations(model, methods, drifts):
     return pairs
 
 
-def _settings(given, length):
+def _ladders(given, length):
     """Values of "rtol" and "step", the latter for a span of some length [s]."""
     for name in given:
         if name not in ("rtol", "step"):
             raise unknown(name, ("rtol", "step"), "setting")
     rtol = positives("rtol", given.get("rtol", TOLERANCES), "Leave rtol out.", most=1.0)
-    step = positives("step", given.get("step", [length / n for n in STEPS]), "Leave step out.")
+    step = positives("step", given.get("step", [length / n for n in STEP_COUNTS]), "Leave step out.")
     return {"rtol": np.ravel(rtol).tolist(), "step": np.ravel(step).tolist()}
 
 
@@ -312,7 +312,7 @@ def _kind(method):
     return "step" if isinstance(as_method(method), (Algebraic, RungeKutta)) else "rtol"
 
 
-def _label(treatment):
+def _drift_word(treatment):
     """A word for a treatment from which `TradeOff.recommend` makes it again."""
     if isinstance(treatment, Poles):
         return f"{treatment.values:g}"
