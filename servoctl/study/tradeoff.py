@@ -7,7 +7,7 @@ import warnings
 
 import numpy as np
 
-from servoctl.checks import as_span, positive, positives
+from servoctl.checks import as_span, mapping, positive, positives
 from servoctl.codegen.function import compiling_at_once
 from servoctl.errors import LimitExceeded, ServoError, SpecificationError, unknown
 from servoctl.methods.accuracy import motion_error, relative_error
@@ -76,7 +76,7 @@ def tradeoff(model, x0, t_span, methods=None, drift=None, *, settings=None, seco
         For settings that are none.
     """
     t0, t1 = as_span(t_span)
-    settings = _ladders(settings or {}, abs(t1 - t0))
+    settings = _ladders(mapping(settings, "The settings"), abs(t1 - t0))
     limit = positive("seconds", seconds)
     drifts = (None, "project", "minimal", abs(t1 - t0) / TIME_CONSTANT) if drift is None else drift
     combinations = _combinations(model, methods, drifts if isinstance(drifts, (list, tuple)) else [drifts])
