@@ -6,17 +6,16 @@ import numpy as np
 
 from servoctl.errors import InconsistentStart, SpecificationError, unknown
 from servoctl.methods.accuracy import accurate
-from servoctl.methods.adaptive import METHODS, ONE_STEP, Adaptive
 from servoctl.methods.algebraic import algebraic
-from servoctl.methods.bounds import row_poles, warn_many_steps
 from servoctl.methods.drift import Minimal, Poles, Project, as_drift, is_whole
 from servoctl.methods.minimal import require_minimal
 from servoctl.methods.motion import Progress
-from servoctl.methods.radau import RADAU_ORDERS, RadauMethod
-from servoctl.methods.runge_kutta import fixed_step
-from servoctl.methods.sundials import MULTISTEP, SundialsMethod
-from servoctl.methods.tableaus import ORDERS
-from servoctl.methods.taylor import SeriesMethod
+from servoctl.methods.radau import RADAU_ORDERS, RadauSteps
+from servoctl.methods.runge_kutta import ORDERS, RungeKuttaSteps
+from servoctl.methods.scipy_methods import METHODS, ONE_STEP, ScipySteps
+from servoctl.methods.stability import row_poles, run_checked, warn_many_steps
+from servoctl.methods.sundials import MULTISTEP, SundialsSteps
+from servoctl.methods.taylor import TaylorSteps
 from servoctl.run import Run
 
 SAMPLES = 1001  # of a run unless t_eval says otherwise: smooth curves, and extrema refined to rounding
@@ -132,16 +131,18 @@ def _simulated(model, start, span, method, drift, rtol, atol, step, t_eval, orde
         if method == "algebraic":
             motion = algebraic(model, t0, x0, times, bar)
         elif method == "Taylor":
-            motion = SeriesMethod(model, drift, rtol, atol, order, jets or 0, bar).run(t0, x0, t1, times, knots)
+            motion = TaylorSteps(model, drift, rtol, atol, order, jets or 0, bar).run(t0, x0, t1, times, knots)
         elif method == "RadauIIA":
             fixed = None if step is None else _step(step, t0, t1)
-            motion = RadauMethod(model, drift, rtol, atol, order, fixed, bar).run(t0, x0, t1, times, knots)
+            stepping = RadauSteps(model, drift, rtol, atol, order, fixed, bar)
+            motion = (run_checked if fixed else RadauSteps.run)(stepping, t0, x0, t1, times, knots)
         elif method in MULTISTEP:
-            motion = SundialsMethod(model, method, drift, rtol, atol, t1 - t0, bar).run(t0, x0, t1, times, knots)
+            motion = SundialsSteps(model, method, drift, rtol, atol, t1 - t0, bar).run(t0, x0, t1, times, knots)
         elif method in ORDERS:
-            motion = fixed_step(model, method, drift, (t0, t1), x0, _step(step, t0, t1), knots, bar)
+            stepping = RungeKuttaSteps(model, method, drift, _step(step, t0, t1), bar)
+            motion = run_checked(stepping, t0, x0, t1, times, knots)
         else:
-            motion = Adaptive(model, method, drift, rtol, atol, bar).run(t0, x0, t1, times, knots)
+            motion = ScipySteps(model, method, drift, rtol, atol, bar).run(t0, x0, t1, times, knots)
     finally:
         bar.close()
     return _finish(model, motion, method, drift, knots, (t0, x0, t1), None if t_eval is None else times)

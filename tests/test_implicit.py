@@ -9,8 +9,7 @@ from scipy.integrate._ivp import radau as scipy_radau
 
 import servoctl as sv
 from servoctl.gallery import gallery
-from servoctl.methods.radau_loop import first_step, radau_steps
-from servoctl.methods.radau_tableau import basis, radau
+from servoctl.methods.radau import basis, first_step, radau, radau_steps
 
 STATE = ("x", "y", "z", "phi", "theta", "dphi", "dtheta")
 ZERO = {"x": 0.0, "y": 0.0, "phi": 0.0, "theta": 0.0}

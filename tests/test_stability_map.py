@@ -9,8 +9,8 @@ import pytest
 
 import servoctl as sv
 from servoctl.gallery import gallery, mass_on_car
-from servoctl.methods.bounds import largest_explicit
-from servoctl.methods.tableaus import ORDERS
+from servoctl.methods.runge_kutta import ORDERS
+from servoctl.methods.stability import largest_explicit
 from servoctl.study.stability_map import METHODS, stability
 
 DOC = Path(__file__).parents[1] / "docs" / "servo_dae.md"

@@ -13,9 +13,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from servoctl.errors import SpecificationError
-from servoctl.methods.bounds import amplification, row_poles
 from servoctl.methods.drift import Poles, as_drift
-from servoctl.methods.tableaus import ORDERS
+from servoctl.methods.runge_kutta import ORDERS
+from servoctl.methods.stability import amplification, row_poles
 from servoctl.study.table import positives
 
 METHODS = (*ORDERS, "Taylor", "RadauIIA")

@@ -12,7 +12,7 @@ from servoctl.control.tracking import positive
 from servoctl.errors import LimitExceeded, ServoError, SpecificationError, unknown
 from servoctl.methods.accuracy import motion_error, relative_error
 from servoctl.methods.drift import Minimal, Poles, Project, as_drift
-from servoctl.methods.tableaus import ORDERS
+from servoctl.methods.runge_kutta import ORDERS
 from servoctl.simulation import ALL_METHODS, as_span, consistent_state, simulate
 from servoctl.study.front import TradeOff
 from servoctl.study.table import machine, positives
