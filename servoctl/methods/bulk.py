@@ -38,7 +38,8 @@ class BulkSteps(Stepping):
         inside = np.array([*DenseStretch.inside, 1.0])
         times = (steps.t[:-1, None] + np.outer(np.diff(steps.t), inside)).ravel()
         pivots = self.f.grid(times, steps.within(inside).reshape(self.n_x, -1), self.p)[self.n_x :]
-        self.motion.count(watched=times.size if len(pivots) else 0)
+        if len(pivots):
+            self.motion.count(watched=times.size)
         return DenseStretch(
             steps.t,
             steps.x,
