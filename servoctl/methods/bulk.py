@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from servoctl.methods.monitor import DenseStretch, Fine
+from servoctl.methods.monitor import INSIDE, DenseStretch, Fine
 from servoctl.methods.motion import Stepping
 
 
@@ -35,7 +35,7 @@ class BulkSteps(Stepping):
 
     def _stretch(self, steps):
         """The steps; they have passed their test of error, and others begin where they end."""
-        inside = np.array([*DenseStretch.inside, 1.0])
+        inside = np.array([*INSIDE, 1.0])
         times = (steps.t[:-1, None] + np.outer(np.diff(steps.t), inside)).ravel()
         pivots = self.f.grid(times, steps.within(inside).reshape(self.n_x, -1), self.p)[self.n_x :]
         if len(pivots):

@@ -15,7 +15,7 @@ BETTER = 2.0  # by how much another choice must be slower
 GROWN = 10.0  # times as large must a slope be for the sizes to be made anew
 ITERATIONS, HALVINGS = 12, 40
 CONVERGED = 1e-10  # relative: the Newton step after which the next is below rounding
-ROUNDING = 1e-7  # relative: steps below this that shrink no more are rounding
+ROUNDING, SHRINKS = 1e-7, 0.3  # relative: steps below this that do not shrink to this part of the last are rounding
 
 
 class Sizes:
@@ -159,7 +159,7 @@ class Chart:
             size = np.abs(columns * step / np.maximum(np.abs(x), self.usual)[self.solved]).max(initial=0.0)
             if not np.isfinite(size):
                 break
-            if size <= CONVERGED or 0.3 * last < size <= ROUNDING:
+            if size <= CONVERGED or SHRINKS * last < size <= ROUNDING:
                 return x if np.linalg.slogdet(matrix)[0] == self.sign else np.full(self.n_x, np.nan)
             last = size
         return np.full(self.n_x, np.nan)

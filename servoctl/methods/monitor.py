@@ -17,6 +17,9 @@ HELPS = 5.0  # by how much the matrix must be better
 NEGLIGIBLE = 1e-7  # of its reference: a pivot below this is zero
 HOPELESS = 1e-9  # an equilibrated singular value below this leaves no digits
 VANISHING = 0.03  # of its reference: a row whose gradient is below this has lost it
+LOST = 0.1  # of its best: a rank measure below this, and not the integrator, is why no step succeeds
+HIDES = 10.0  # times the root of a residual: a pivot that touches zero quadratically may be zero below this
+SHARE = 0.1  # of the largest entry of a null vector: what has less of it is not named
 LINGERS = 5.0  # times the way to its crossing that a pivot may stay at what the residual hides
 NO_CHOICE = "no choice of pivots leads on"
 INSIDE = (0.25, 0.5, 0.75)  # of a step with dense output: where pivots are inspected, beside its end
@@ -77,7 +80,7 @@ class Stretch:
     x : (n_x, S + 1) array
         States there.
     pivots : (n_g, S, m) array
-        At m instants of each step: at its end, and before it at `inside`.
+        At m instants of each step, the last of which is its end.
     top : callable
         γ^(s̄) from (t, X).
     crosses : bool
@@ -132,21 +135,18 @@ class DenseStretch(Stretch):
         X from (k, t).
     pivots_at : callable
         Pivots from (t, X).
-    inside : tuple of float
-        Fractions of a step at which pivots are inspected.
     resumes : bool
         Whether the dense output is as good as the steps, so that the motion may go on from within a step.
     """
 
     dense: object = None
     pivots_at: object = None
-    inside: tuple = INSIDE
     resumes: bool = False
 
     def instants(self, k):
         """Instants of step k at which pivots are known, its start first."""
         a, b = self.t[k : k + 2]
-        return np.array([a, *(a + s * (b - a) for s in self.inside), b])
+        return np.array([a, *(a + s * (b - a) for s in INSIDE), b])
 
     def inner_pivots(self, k):
         """Pivots (n_g, N) at `instants` but for the start."""
@@ -334,7 +334,7 @@ class Monitor:
         if lingering is not None:
             return lingering
         t, x = stretch.t[k + 1], stretch.x[:, k + 1]
-        degraded = weakest[-1] < DEGRADED and self.chart_only(weakest[-1], t, x)
+        degraded = weakest[-1] < DEGRADED and self.pivots_only(weakest[-1], t, x)
         return _other_pivots(k + 1, t, x) if degraded else None
 
     def _touched(self, stretch, k, sizes, scale):
@@ -356,8 +356,9 @@ class Monitor:
             return _other_pivots(k, before, stretch.state(k, before))
         x, before = stretch.state(k, t), stretch.last_before(k, t)
         singular, start = Singular(k, t, x, why), stretch.state(k, before)
-        variant = self.other_choice(before, np.append(start, stretch.top(before, start)), t, x)
-        return singular if variant is None else Repivot(k, before, start, variant, singular)
+        variant = self.repivoted(before, start, stretch.top(before, start))
+        helps = variant is not None and variant[1].rank_measure(t, x) > DEGRADED
+        return Repivot(k, before, start, variant, singular) if helps else singular
 
     def _lingers(self, k, instants, sizes, x):
         """That the program is singular if a pivot sank into what the residual hides, was to cross zero, and stays."""
@@ -372,7 +373,7 @@ class Monitor:
         crossing, ahead, at = self.sunk
         if abs(t - crossing) < LINGERS * ahead or (t - crossing) * (t - instants[0]) < 0:
             return None
-        return None if self.chart_only(sizes[1], t, x) else Singular(k, crossing, at, "a pivot stays at zero")
+        return None if self.pivots_only(sizes[1], t, x) else Singular(k, crossing, at, "a pivot stays at zero")
 
     def residual(self, t, x):
         """Largest residual of the invariants, relative to their gradients at the start."""
@@ -381,14 +382,14 @@ class Monitor:
 
     def lost(self, t, x):
         """Whether rank, not the integrator, is what fails at a state where no step succeeds."""
-        return self.rank_measure(t, x) < 0.1 or float(self.best.min()) < HOPELESS
+        return self.rank_measure(t, x) < LOST or float(self.best.min()) < HOPELESS
 
     def hidden_zero(self, relative, t, x):
         """Whether a relative pivot, or the matrices themselves, are so small that the residual hides a zero."""
-        return min(relative, self.rank_measure(t, x)) < max(NEGLIGIBLE, 10.0 * np.sqrt(self.residual(t, x)))
+        return min(relative, self.rank_measure(t, x)) < max(NEGLIGIBLE, HIDES * np.sqrt(self.residual(t, x)))
 
-    def chart_only(self, relative, t, x):
-        """Whether a degraded pivot is only a bad choice: the matrices themselves are far better."""
+    def pivots_only(self, relative, t, x):
+        """Whether a degraded pivot is only badly chosen: the matrices themselves are far better."""
         return self.rank_measure(t, x) > HELPS * max(abs(relative), NEGLIGIBLE)
 
     def refuse_start(self, t, x, outputs):
@@ -403,13 +404,13 @@ class Monitor:
         weakest = (np.abs(pivots) / np.where(reference > 0, reference, 1.0)).min(initial=1.0)
         return bool(weakest < DEGRADED and self.best.min() > HELPS * weakest)
 
-    def anew(self, t, x, top):
+    def repivoted(self, t, x, top):
         """The model with pivots chosen at a state x with γ^(s̄) = top, as far as that is finite, and its monitor.
 
         Returns
         -------
         (Model, Monitor) or None
-            None where no choice is found.
+            None where no pivots are found.
         """
         sizes = {name: size for name, size in zip(self.model.state_names, self.largest, strict=True) if size > 0}
         try:
@@ -417,27 +418,6 @@ class Monitor:
             return model, Monitor(model, t, x, self)
         except ServoError:
             return None
-
-    def other_choice(self, t, jets, later, state):
-        """The model with pivots and rows chosen anew at an instant, if that keeps its rank at a later state, else None.
-
-        Parameters
-        ----------
-        t : float
-            Before the pivot vanishes [s].
-        jets : (n_z,) array
-            Jets there.
-        later : float
-            Where the pivot vanishes [s].
-        state : (n_x,) array
-            State there.
-
-        Returns
-        -------
-        (Model, Monitor) or None
-        """
-        variant = self.anew(t, jets[: len(state)], jets[len(state) :])
-        return variant if variant and variant[1].rank_measure(later, state) > DEGRADED else None
 
     def failed(self, t, x, why, *error):
         """The error of a state from which no step leads on: rank is lost (`why`), or what the method says of itself.
@@ -503,7 +483,7 @@ class Monitor:
         norms = np.linalg.norm(scaled, axis=1)[:, None]
         scaled = scaled / np.where(norms > 0, norms, 1.0)
         weights = np.abs(np.linalg.svd(scaled)[0][:, -1])
-        return [self.l_names[j] for j in np.flatnonzero(weights > 0.1 * weights.max())]
+        return [self.l_names[j] for j in np.flatnonzero(weights > SHARE * weights.max())]
 
     def _null_direction(self, matrices):
         """Names of the accelerations that the rows leave open: the right null vector of L."""
@@ -513,4 +493,4 @@ class Monitor:
             return list(names)
         rows = np.linalg.norm(leading / columns, axis=1)
         vector = np.abs(np.linalg.svd((leading / columns) / np.where(rows > 0, rows, 1.0)[:, None])[2][-1] / columns)
-        return [names[j] for j in np.flatnonzero(vector > 0.1 * vector.max())]
+        return [names[j] for j in np.flatnonzero(vector > SHARE * vector.max())]

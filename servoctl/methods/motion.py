@@ -180,7 +180,7 @@ class Stepping:
         """Choose other pivots at the start of the first piece, up to b, where the model's own are a bad choice."""
         self.monitor = Monitor(self.model, t, x)
         if self.monitor.bad_choice(self._outputs(t, x), self._pivots(t, x)):
-            variant = self.monitor.anew(t, x, self._top(t, x))
+            variant = self.monitor.repivoted(t, x, self._top(t, x))
             if variant is not None:
                 self._go_on(variant, t, x)
             self.motion.stop = self.monitor.refuse_start(t, x, self._outputs(t, x))
@@ -207,7 +207,7 @@ class Stepping:
             t, x = outcome.t, outcome.x
             variant = None
             if self.motion.changes_pivots(t):
-                variant = outcome.variant or self.monitor.anew(t, x, self._top(t, x))
+                variant = outcome.variant or self.monitor.repivoted(t, x, self._top(t, x))
             if variant is not None:
                 self._go_on(variant, t, x)
                 return True

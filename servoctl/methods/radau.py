@@ -15,6 +15,7 @@ from servoctl.methods.drift import Project
 from servoctl.methods.motion import equal_steps
 
 RADAU_ORDERS = (5, 9, 13)
+LEAST_RTOL = {5: 1e-4, 9: 1e-7}  # above which an order needs less work than the next
 TOLERANCE = 1e-2  # of the Newton iteration, relative to the tolerance of a step
 TIGHT, PATIENT = 1e-4, 3  # the same where steps are fixed, and how many times more iterations they may take
 ITERATIONS = {5: 7, 9: 12, 13: 17}  # at most, by order (Hairer and Wanner 1999)
@@ -78,7 +79,7 @@ def basis(c, theta):
 
 def radau_order(rtol):
     """The order of least work for a tolerance."""
-    return 5 if rtol > 1e-4 else 9 if rtol > 1e-7 else 13
+    return next((order for order, least in LEAST_RTOL.items() if rtol > least), RADAU_ORDERS[-1])
 
 
 def radau_steps(model, poles=False):

@@ -8,9 +8,10 @@ from math import comb, factorial, inf, pi
 
 import numpy as np
 
+from servoctl.checks import is_whole
 from servoctl.errors import SpecificationError, unknown
 from servoctl.methods.accuracy import component_sizes, state_levels
-from servoctl.methods.drift import Poles, is_whole
+from servoctl.methods.drift import Poles
 from servoctl.methods.motion import breakpoints, equal_steps
 from servoctl.methods.runge_kutta import ORDERS, tableau
 

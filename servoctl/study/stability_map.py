@@ -11,12 +11,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from servoctl.checks import positives
 from servoctl.errors import SpecificationError
 from servoctl.internal_dynamics import linearised
 from servoctl.methods.drift import Poles, as_drift
 from servoctl.methods.runge_kutta import ORDERS
 from servoctl.methods.stability import amplification, row_poles
-from servoctl.study.table import positives
 
 METHODS = (*ORDERS, "Taylor", "RadauIIA")
 RADAU_ORDER = 5  # unless it is given; all are L-stable
