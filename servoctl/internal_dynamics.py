@@ -11,8 +11,8 @@ import numpy as np
 
 from servoctl.verification import require_model
 
-SAMPLES = 41  # instants along a run at which the internal dynamics is linearised
-NEGLIGIBLE = 1e-9  # size of a state relative to the largest: rounding of one that stays zero
+INSTANTS = 41  # instants along a run at which the internal dynamics is linearised
+AT_ZERO = 1e-9  # size of a state relative to the largest: rounding of one that stays zero
 NEUTRAL = 1e-7  # of the largest entry of the linearisation: a smaller real part is none
 
 
@@ -72,7 +72,7 @@ def linearised(model, run, count):
         Bases of the kernel of the invariants' Jacobian, SI.
     """
     n_x, size = len(model.state_names), np.abs(run.jets[: len(model.state_names)]).max(axis=1)
-    size[size <= NEGLIGIBLE * size.max()] = 1.0
+    size[size <= AT_ZERO * size.max()] = 1.0
     picked = np.unique(np.linspace(0, len(run.t) - 1, count).round().astype(int))
     J, C = (np.concatenate(parts) for parts in zip(*_jacobians(model, run, picked, n_x), strict=True))
     finite = np.isfinite(J).all(axis=(1, 2)) & np.isfinite(C).all(axis=(1, 2))
@@ -114,7 +114,7 @@ def internal_dynamics(model, run):
     require_model(model, run, "internal_dynamics")
     if model.free == 0:
         return InternalDynamics(run.t[:0], (), np.zeros((0, 0), complex), "none", 1.0)
-    times, matrices, bases = linearised(model, run, SAMPLES)
+    times, matrices, bases = linearised(model, run, INSTANTS)
     eigenvalues = np.linalg.eigvals(matrices).astype(complex)
     order = np.argsort(-eigenvalues.real, axis=1, kind="stable")
     eigenvalues = np.take_along_axis(eigenvalues, order, axis=1).T

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from servoctl.methods.monitor import INSIDE, DenseStretch, Fine
+from servoctl.methods.monitor import FRACTIONS, DenseStretch, Fine
 from servoctl.methods.motion import Stepping
 
 
@@ -12,8 +12,6 @@ class BulkSteps(Stepping):
     They come as a value with the ends t (S + 1,) [s], states x (n_x, S + 1) there, `at(k, times)` and `within(theta)`
     for the states in between, and `failed`, whether no step succeeds after them.
     """
-
-    every = 0
 
     def _piece(self, a, x, b, times):
         self.pending, self.forward, t = times, b >= a, a
@@ -35,7 +33,7 @@ class BulkSteps(Stepping):
 
     def _stretch(self, steps):
         """The steps; they have passed their test of error, and others begin where they end."""
-        inside = np.array([*INSIDE, 1.0])
+        inside = np.array([*FRACTIONS, 1.0])
         times = (steps.t[:-1, None] + np.outer(np.diff(steps.t), inside)).ravel()
         pivots = self.f.grid(times, steps.within(inside).reshape(self.n_x, -1), self.p)[self.n_x :]
         if len(pivots):
@@ -61,7 +59,10 @@ class BulkSteps(Stepping):
         states = steps.x[:, np.clip(owner, 0, stand)]
         for k in np.unique(owner[owner < stand]):
             states[:, owner == k] = steps.at(k, times[owner == k])
-        if self.every:
-            states = self.loop.settle(times, states, self.p)
+        states = self._settled(times, states)
         top = self.f.grid(times, states, self.p)[self.n_x - self.model.n : self.n_x]
         self.motion.add(self.model, times, states, top)
+
+    def _settled(self, times, states):
+        """States of samples as they are recorded."""
+        return states

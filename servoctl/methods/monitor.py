@@ -22,7 +22,7 @@ HIDES = 10.0  # times the root of a residual: a pivot that touches zero quadrati
 SHARE = 0.1  # of the largest entry of a null vector: what has less of it is not named
 LINGERS = 5.0  # times the way to its crossing that a pivot may stay at what the residual hides
 NO_CHOICE = "no choice of pivots leads on"
-INSIDE = (0.25, 0.5, 0.75)  # of a step with dense output: where pivots are inspected, beside its end
+FRACTIONS = (0.25, 0.5, 0.75)  # of a step with dense output: where pivots are inspected, beside its end
 
 
 @dataclass(frozen=True)
@@ -146,7 +146,7 @@ class DenseStretch(Stretch):
     def instants(self, k):
         """Instants of step k at which pivots are known, its start first."""
         a, b = self.t[k : k + 2]
-        return np.array([a, *(a + s * (b - a) for s in INSIDE), b])
+        return np.array([a, *(a + s * (b - a) for s in FRACTIONS), b])
 
     def inner_pivots(self, k):
         """Pivots (n_g, N) at `instants` but for the start."""
@@ -375,18 +375,15 @@ class Monitor:
             return None
         return None if self.pivots_only(sizes[1], t, x) else Singular(k, crossing, at, "a pivot stays at zero")
 
-    def residual(self, t, x):
-        """Largest residual of the invariants, relative to their gradients at the start."""
-        value = self.invariants(t, x, self.model.parameters)[: self.m]
-        return float(np.abs(value / self.gradients).max(initial=0.0))
-
     def lost(self, t, x):
         """Whether rank, not the integrator, is what fails at a state where no step succeeds."""
         return self.rank_measure(t, x) < LOST or float(self.best.min()) < HOPELESS
 
     def hidden_zero(self, relative, t, x):
         """Whether a relative pivot, or the matrices themselves, are so small that the residual hides a zero."""
-        return min(relative, self.rank_measure(t, x)) < max(NEGLIGIBLE, HIDES * np.sqrt(self.residual(t, x)))
+        values = self.invariants(t, x, self.model.parameters)[: self.m]
+        residual = np.abs(values / self.gradients).max(initial=0.0)  # relative to the gradients at the start
+        return min(relative, self.rank_measure(t, x)) < max(NEGLIGIBLE, HIDES * np.sqrt(residual))
 
     def pivots_only(self, relative, t, x):
         """Whether a degraded pivot is only badly chosen: the matrices themselves are far better."""
@@ -405,13 +402,7 @@ class Monitor:
         return bool(weakest < DEGRADED and self.best.min() > HELPS * weakest)
 
     def repivoted(self, t, x, top):
-        """The model with pivots chosen at a state x with γ^(s̄) = top, as far as that is finite, and its monitor.
-
-        Returns
-        -------
-        (Model, Monitor) or None
-            None where no pivots are found.
-        """
+        """The model with pivots chosen at x with γ^(s̄) = top, as far as that is finite, and its monitor; or None."""
         sizes = {name: size for name, size in zip(self.model.state_names, self.largest, strict=True) if size > 0}
         try:
             model = self.model.near(t, np.append(x, np.nan_to_num(top)), sizes)
@@ -420,19 +411,9 @@ class Monitor:
             return None
 
     def failed(self, t, x, why, *error):
-        """The error of a state from which no step leads on: rank is lost (`why`), or what the method says of itself.
+        """The error of a state from which no step leads on: rank is lost (`why`), or the method's own.
 
-        Parameters
-        ----------
-        t : float
-        x : (n_x,) array
-        why : str
-        *error : str
-            What happened, the rule, what to do.
-
-        Returns
-        -------
-        SingularProgram or IntegrationStopped
+        `error` says what happened, the rule, and what to do.
         """
         if self.lost(t, x):
             return self.singular(t, x, why)
@@ -456,15 +437,12 @@ class Monitor:
         direction = self._null_direction(matrices)
         where = f", where {' and '.join(f'{name} = 0' for name in zero)}" if zero else ""
         dependent = [] if lost else self._dependent_rows(matrices[0])
-        what = (
-            f"the gradient of row {', '.join(map(repr, lost))} vanishes"
-            if lost
-            else f"the rows {', '.join(map(repr, dependent))} lose their rank"
-        )
+        what = f"the gradient of row {', '.join(map(repr, lost))} vanishes"
+        what = what if lost else f"the rows {', '.join(map(repr, dependent))} lose their rank"
         return SingularProgram(
             f"The program is singular at t = {t:.7g} s: {what}{where}; {why}.",
-            f"The smallest equilibrated singular value is {measure:.1e} of its best along the motion; in the direction "
-            f"of {', '.join(direction)} the equations say nothing.",
+            f"The smallest equilibrated singular value is {measure:.1e} of its best along the motion; accelerations "
+            f"are undetermined in the direction of {', '.join(direction)}.",
             nearest=f"The motion before t = {t:.6g} s, which is kept.",
             do="State the residual in a form whose gradient does not vanish (linear in velocities, not squared), "
             "or plan around this state.",

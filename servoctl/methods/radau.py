@@ -16,9 +16,9 @@ from servoctl.methods.motion import equal_steps
 
 RADAU_ORDERS = (5, 9, 13)
 LEAST_RTOL = {5: 1e-4, 9: 1e-7}  # above which an order needs less work than the next
-TOLERANCE = 1e-2  # of the Newton iteration, relative to the tolerance of a step
+NEWTON_TOLERANCE = 1e-2  # of the Newton iteration, relative to the tolerance of a step
 TIGHT, PATIENT = 1e-4, 3  # the same where steps are fixed, and how many times more iterations they may take
-ITERATIONS = {5: 7, 9: 12, 13: 17}  # at most, by order (Hairer and Wanner 1999)
+NEWTON_ITERATIONS = {5: 7, 9: 12, 13: 17}  # at most, by order (Hairer and Wanner 1999)
 
 
 # Stages by order. All are L-stable; the matrix of an odd number of stages has one real eigenvalue.
@@ -82,13 +82,13 @@ def radau_order(rtol):
     return next((order for order, least in LEAST_RTOL.items() if rtol > least), RADAU_ORDERS[-1])
 
 
-def radau_steps(model, poles=False):
-    """The compiled loop over Radau IIA steps of a model, with error dynamics of its rows if `poles`."""
-    name = "RadauIIA_poles" if poles else "RadauIIA"
+def radau_loop(model, poles=False):
+    """The compiled X' of a model, whose library holds the loop over Radau IIA steps; with error dynamics if `poles`."""
 
     def build():
         e = model.equations
-        return RadauLoop(e.ode(poles), e.ode_jacobian(poles), e.project(), name)
+        name, others = "RadauIIA_poles" if poles else "RadauIIA", {"jacobian": e.ode_jacobian(poles)}
+        return compiled(e.ode(poles), name, project=e.project(), others=others, drivers=STEPS)
 
     return model.once("RadauIIA with poles" if poles else "RadauIIA", build)
 
@@ -117,117 +117,81 @@ class Settings:
     @property
     def iterations(self):
         """The most iterations of Newton's method in a step."""
-        return ITERATIONS[self.order] * (PATIENT if self.fixed else 1)
+        return NEWTON_ITERATIONS[self.order] * (PATIENT if self.fixed else 1)
 
     @property
     def tolerance(self):
         """The tolerance of Newton's method, relative to that of a step."""
-        return max(TIGHT if self.fixed else TOLERANCE, 10 * ROUNDING / self.rtol)
+        return max(TIGHT if self.fixed else NEWTON_TOLERANCE, 10 * ROUNDING / self.rtol)
 
 
-class RadauLoop:
-    """Right-hand side X' with its Jacobian and the compiled loop over Radau IIA steps.
+def radau_steps(f, t0, x0, t1, p, h, settings, max_steps):
+    """Radau IIA steps towards t1.
 
     Parameters
     ----------
-    f, jacobian, project : casadi.Function
-        SX functions of (t, x, p): X' and guards, ∂X'/∂X column by column, the change of X that restores invariants.
-    name : str
-        A C identifier.
-
-    Attributes
-    ----------
     f : Compiled
-        X' and guards; its library holds the loop.
+        From `radau_loop`.
+    t0 : float
+        Start [s].
+    x0 : (n_x,) array
+        State at t0, SI.
+    t1 : float
+        End [s].
+    p : (n_p,) array
+        Parameters, SI.
+    h : float
+        Length of the first step [s], positive.
+    settings : Settings
+    max_steps : int
+
+    Returns
+    -------
+    t : (S + 1,) array
+        Starts of the steps, and where the last one ended [s]; short of t1 where steps vanish.
+    x : (n_x, S + 1) array
+        States there, SI.
+    z : (S, s, n_x) array
+        Increments of the stages.
+    h : float
+        Length that the next step should have [s].
+    counts : (4,) array
+        Rejected steps, evaluations of X', of the Jacobian, decompositions.
     """
+    parts, n = radau(settings.order), len(x0)
+    s, table = len(parts[0]), np.concatenate([np.ravel(part) for part in parts])
+    x0, p = np.ascontiguousarray(x0, dtype=float), np.ascontiguousarray(p, dtype=float)
+    work, pivots = np.empty(n * n * (s + 2) + n * (2 * s + 2)), np.empty((s + 1) // 2 * n, dtype=np.int64)
+    t, x, y = np.empty(max_steps + 1), np.empty((max_steps + 1, n)), np.empty((max_steps, f.n_y))
+    z, step, counts = np.empty((max_steps, s, n)), np.array([float(h)]), np.zeros(4, dtype=np.int64)
+    run = f.native("radau")
+    run.restype = ctypes.c_int64
+    k = run(
+        ctypes.c_double(t0),
+        pointer(x0),
+        ctypes.c_double(t1),
+        pointer(p),
+        ctypes.c_int64(s),
+        pointer(table),
+        ctypes.c_int64(settings.iterations),
+        ctypes.c_double(settings.tolerance),
+        ctypes.c_int64(settings.fixed),
+        ctypes.c_double(settings.rtol),
+        ctypes.c_double(settings.atol),
+        ctypes.c_int64(settings.project_every),
+        ctypes.c_int64(max_steps),
+        *map(pointer, (step, work, pivots, t, x, y, z, counts)),
+    )
+    return t[: k + 1], x[: k + 1].T, z[:k], float(step[0]), counts
 
-    def __init__(self, f, jacobian, project, name):
-        self.f = compiled(f, name, project=project, others={"jacobian": jacobian}, drivers=STEPS)
 
-    @property
-    def operations(self):
-        """Number of arithmetic operations of one evaluation of X'."""
-        return self.f.operations
-
-    def require_compiler(self):
-        """Refuse to go on where there is no library.
-
-        Raises
-        ------
-        SpecificationError
-        """
-        if self.f.native("radau") is None:
-            raise SpecificationError(
-                "method='RadauIIA' was given, and there is no C compiler.",
-                "The loop over its steps is C code.",
-                nearest="method='Radau', scipy's of order 5.",
-                do="Take that, or install a C compiler (gcc or clang).",
-            )
-
-    def steps(self, t0, x0, t1, p, h, settings, max_steps):
-        """Radau IIA steps towards t1.
-
-        Parameters
-        ----------
-        t0 : float
-            Start [s].
-        x0 : (n_x,) array
-            State at t0, SI.
-        t1 : float
-            End [s].
-        p : (n_p,) array
-            Parameters, SI.
-        h : float
-            Length of the first step [s], positive.
-        settings : Settings
-        max_steps : int
-
-        Returns
-        -------
-        t : (S + 1,) array
-            Starts of the steps, and where the last one ended [s]; short of t1 where steps vanish.
-        x : (n_x, S + 1) array
-            States there, SI.
-        z : (S, s, n_x) array
-            Increments of the stages.
-        h : float
-            Length that the next step should have [s].
-        counts : (4,) array
-            Rejected steps, evaluations of X', of the Jacobian, decompositions.
-        """
-        parts, n = radau(settings.order), len(x0)
-        s, table = len(parts[0]), np.concatenate([np.ravel(part) for part in parts])
-        x0, p = np.ascontiguousarray(x0, dtype=float), np.ascontiguousarray(p, dtype=float)
-        work, pivots = np.empty(n * n * (s + 2) + n * (2 * s + 2)), np.empty((s + 1) // 2 * n, dtype=np.int64)
-        t, x, y = np.empty(max_steps + 1), np.empty((max_steps + 1, n)), np.empty((max_steps, self.f.n_y))
-        z, step, counts = np.empty((max_steps, s, n)), np.array([float(h)]), np.zeros(4, dtype=np.int64)
-        run = self.f.native("radau")
-        run.restype = ctypes.c_int64
-        k = run(
-            ctypes.c_double(t0),
-            pointer(x0),
-            ctypes.c_double(t1),
-            pointer(p),
-            ctypes.c_int64(s),
-            pointer(table),
-            ctypes.c_int64(settings.iterations),
-            ctypes.c_double(settings.tolerance),
-            ctypes.c_int64(settings.fixed),
-            ctypes.c_double(settings.rtol),
-            ctypes.c_double(settings.atol),
-            ctypes.c_int64(settings.project_every),
-            ctypes.c_int64(max_steps),
-            *map(pointer, (step, work, pivots, t, x, y, z, counts)),
-        )
-        return t[: k + 1], x[: k + 1].T, z[:k], float(step[0]), counts
-
-    def settle(self, t, x, p):
-        """States x (n_x, N) at times t (N,) moved onto the invariants."""
-        rows, t = np.array(x.T, dtype=float, order="C"), np.ascontiguousarray(t, dtype=float)
-        run, p = self.f.native("settle"), np.ascontiguousarray(p, dtype=float)
-        run.restype = None
-        run(ctypes.c_int64(len(t)), *map(pointer, (t, rows, p)))
-        return rows.T
+def settle(f, t, x, p):
+    """States x (n_x, N) at times t (N,) moved onto the invariants, by the library of `radau_loop`."""
+    rows, t = np.array(x.T, dtype=float, order="C"), np.ascontiguousarray(t, dtype=float)
+    run, p = f.native("settle"), np.ascontiguousarray(p, dtype=float)
+    run.restype = None
+    run(ctypes.c_int64(len(t)), *map(pointer, (t, rows, p)))
+    return rows.T
 
 
 def inside(order, theta, z):
@@ -317,14 +281,20 @@ class RadauSteps(BulkSteps):
         super().__init__(model, "RadauIIA", drift, progress)
 
     def _function(self, model, poles):
-        self.loop = radau_steps(model, poles)
-        self.loop.require_compiler()
-        return self.loop.f
+        f = radau_loop(model, poles)
+        if f.native("radau") is None:
+            raise SpecificationError(
+                "method='RadauIIA' was given, and there is no C compiler.",
+                "The loop over its steps is C code.",
+                nearest="method='Radau', scipy's of order 5.",
+                do="Take that, or install a C compiler (gcc or clang).",
+            )
+        return f
 
     def halved(self, model, t, x, h):
         """States (n_x, 3) at t, t + h and t + 2 h by two steps; fewer where one fails."""
         self._use(model)
-        return self.loop.steps(t, x, t + 2 * h, self.p, abs(h), self.settings, 2)[1]
+        return radau_steps(self.f, t, x, t + 2 * h, self.p, abs(h), self.settings, 2)[1]
 
     def _record(self, steps, stand):
         super()._record(steps, stand)
@@ -339,13 +309,16 @@ class RadauSteps(BulkSteps):
             self.h = abs(equal_steps(a, b, self.step)[0])
 
     def _steps(self, t, x, b):
-        t, x, z, self.h, counts = self.loop.steps(t, x, b, self.p, self.h, self.settings, self.most)
+        t, x, z, self.h, counts = radau_steps(self.f, t, x, b, self.p, self.h, self.settings, self.most)
         self.motion.count(steps=len(z), **dict(zip(("rejected", "nfev", "njev", "nlu"), counts, strict=True)))
         if self.every:
             self.motion.count(projections=len(z) // self.every)
             if t[-1] == b:
-                x = np.column_stack([x[:, :-1], self.loop.settle(t[-1:], x[:, -1:], self.p)])
+                x = np.column_stack([x[:, :-1], self._settled(t[-1:], x[:, -1:])])
         return Steps(t, x, len(z) < self.most and t[-1] != b, self.settings.order, z)
+
+    def _settled(self, times, states):
+        return settle(self.f, times, states, self.p) if self.every else states
 
     def _fail(self, t, x):
         why = "its steps vanish" if self.step is None else "a fixed step is not solved by the Newton iteration"

@@ -8,7 +8,7 @@ from servoctl.methods.minimal import Chart, Sizes
 from servoctl.methods.monitor import DEGRADED, Fine, Singular, Stretch
 from servoctl.methods.motion import Stepping, equal_steps
 
-NEAR = 0.3  # of its reference: below this the least size of a pivot is looked for within a step
+NEARLY_ZERO = 0.3  # of its reference: below this the least size of a pivot is looked for within a step
 ORDERS = {"RK1": 1, "RK2": 2, "RK4": 4, "RK5": 5, "RK8": 8}
 """Order of each method: Euler's, the midpoint rule, the classical one of Kutta (1901), Dormand and Prince's of orders
 5 (1980) and 8 (Prince and Dormand 1981), whose coefficients are scipy's."""
@@ -144,7 +144,7 @@ class RungeKuttaSteps(Stepping):
         scale = np.where(self.monitor.reference > 0, self.monitor.reference, 1.0)
         sizes = np.abs(pivots) / scale[:, None]
         padded = np.pad(sizes, ((0, 0), (1, 1)), constant_values=np.inf)
-        low = (sizes < NEAR) & (sizes <= padded[:, :-2]) & (sizes <= padded[:, 2:])
+        low = (sizes < NEARLY_ZERO) & (sizes <= padded[:, :-2]) & (sizes <= padded[:, 2:])
         for k, i in np.argwhere(low.T):
             first, last = max(k - 1, 0), min(k + 1, len(t) - 1)
             chart = Chart(self.model, self.sizes, t[first], states[:, first])

@@ -4,7 +4,7 @@ import numpy as np
 
 from servoctl.methods.drift import Minimal, Project
 from servoctl.methods.minimal import MinimalSolver, Sizes
-from servoctl.methods.monitor import INSIDE, DenseStretch, Fine
+from servoctl.methods.monitor import FRACTIONS, DenseStretch, Fine
 from servoctl.methods.motion import Stepping
 
 METHODS = ("RK23", "RK45", "DOP853", "Radau", "BDF", "LSODA")
@@ -86,7 +86,7 @@ class ScipySteps(Stepping):
     def _stretch(self, t, x, solver, dense):
         """The last step; it has passed its test of error, and another begins where it ends."""
         end, ends = (solver.t, solver.y), np.array([t, solver.t])
-        inside = [t + s * (end[0] - t) for s in INSIDE]
+        inside = [t + s * (end[0] - t) for s in FRACTIONS]
         pivots = np.array([*(self._pivots(s, dense(s)) for s in inside), self._pivots(*end)]).T
         self.motion.count(watched=len(inside) + 1)
         return DenseStretch(

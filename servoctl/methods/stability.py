@@ -16,7 +16,7 @@ from servoctl.methods.motion import breakpoints, equal_steps
 from servoctl.methods.runge_kutta import ORDERS, tableau
 
 SAME = {"DOP853": "RK8", "RK45": "RK5"}  # scipy's adaptive methods that go on with the result of these tableaus
-METHODS = (*ORDERS, *SAME, "RK23", "Taylor", "RadauIIA", "Radau")
+STEP_MAPS = (*ORDERS, *SAME, "RK23", "Taylor", "RadauIIA", "Radau")
 WITH_ORDER = ("Taylor", "RadauIIA")
 BEYOND = 1e-10  # of |R| over 1: roots of |R|² = 1 that only touch 1 are told from those that cross it
 MANY_STEPS = 1e5  # of an adaptive method: each takes a part of a millisecond
@@ -32,7 +32,7 @@ def stability_function(method, order=None):
     Parameters
     ----------
     method : str
-        One of `bounds.METHODS`.
+        One of `STEP_MAPS`.
     order : int, optional
         Of "Taylor" and "RadauIIA" (odd: 2s - 1 for s stages), which need it; no other method uses it.
 
@@ -49,8 +49,8 @@ def stability_function(method, order=None):
     SpecificationError
         If the order is missing, is none of the method's, or is given where it is not used.
     """
-    if method not in METHODS:
-        raise unknown(method, METHODS, "method")
+    if method not in STEP_MAPS:
+        raise unknown(method, STEP_MAPS, "method")
     whole = isinstance(order, (int, np.integer)) and order >= 1 and (method == "Taylor" or order % 2 == 1)
     if not (whole if method in WITH_ORDER else order is None):
         raise SpecificationError(
@@ -84,7 +84,7 @@ def amplification(method, z, order=None):
     Parameters
     ----------
     method : str
-        One of `bounds.METHODS`.
+        One of `STEP_MAPS`.
     z : array of complex
         Steps times eigenvalues, hλ.
     order : int, optional
@@ -107,7 +107,7 @@ def largest_explicit(method, order=None, direction=pi):
     Parameters
     ----------
     method : str
-        One of `bounds.METHODS`.
+        One of `STEP_MAPS`.
     order : int, optional
         Of "Taylor" and "RadauIIA".
     direction : float
@@ -251,7 +251,7 @@ def warn_many_steps(method, poles, length):
     Parameters
     ----------
     method : str
-        One of `bounds.METHODS`.
+        One of `STEP_MAPS`.
     poles : dict of str to (ρ,) arrays of complex
         Of each row [1/s].
     length : float

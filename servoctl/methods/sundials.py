@@ -114,36 +114,36 @@ class Sundials:
         forward = np.sign(t[-1] - t[0])
         grid, p = forward * (t - t[0]), np.concatenate([p, [t[0], forward]])
         options = {"reltol": rtol, "abstol": atol, "max_num_steps": MOST_STEPS, "disable_internal_warnings": True}
-        given = {"x0": x0, "p": p}
+        inputs = {"x0": x0, "p": p}
         if self.solver == "idas":  # γ^(s̄) starts without a rate, so that no first step would pass a test of its error
-            given["z0"], options["suppress_algebraic"] = top, True
-        low, high, found, counts = 0, len(t), None, {}
+            inputs["z0"], options["suppress_algebraic"] = top, True
+        low, high, states, counts = 0, len(t), None, {}
         count = high  # the integrator returns nothing where it fails: the last good end is sought
-        while low + 1 < high or found is None:
-            x, told = self._to(grid[:count], given, options) if count > 1 else (np.array(x0)[:, None], counts)
+        while low + 1 < high or states is None:
+            x, work = self._to(grid[:count], inputs, options) if count > 1 else (np.array(x0)[:, None], counts)
             if x is None:
                 high = count
             else:
-                low, found, counts = count, x, told
+                low, states, counts = count, x, work
                 if count == len(t):
                     break
             count = (low + high) // 2
-        return found, counts
+        return states, counts
 
-    def _to(self, grid, given, options):
+    def _to(self, grid, inputs, options):
         """States at the instants of a grid, None where the integrator fails; and counts."""
         pressed = []
         try:
             integrator = ca.integrator("motion", self.solver, self.parts, 0.0, grid[1:], options)
-            with _interrupts() as pressed, contextlib.redirect_stderr(io.StringIO()):  # SUNDIALS tells what callers say
-                found = np.array(integrator(**given)["xf"])
+            with _interrupts() as pressed, contextlib.redirect_stderr(io.StringIO()):  # its complaints, raised below
+                states = np.array(integrator(**inputs)["xf"])
         except RuntimeError as error:
             if pressed:
                 raise KeyboardInterrupt from error
             return None, {}
-        told = integrator.stats()
-        counts = {name: int(told[key]) for name, key in COUNTS.items() if key in told}
-        return (np.column_stack([given["x0"], found]) if np.isfinite(found).all() else None), counts
+        stats = integrator.stats()
+        counts = {name: int(stats[key]) for name, key in COUNTS.items() if key in stats}
+        return (np.column_stack([inputs["x0"], states]) if np.isfinite(states).all() else None), counts
 
 
 def sundials_solver(model, solver, poles=False):

@@ -22,7 +22,6 @@ from servoctl.reduction.ranks import clean
 LOWEST, HIGHEST = 4, 24  # orders: below, steps are too short; above, compiling grows faster than steps
 
 
-
 class _Group:
     """Rows of one order with their running series."""
 
@@ -254,15 +253,14 @@ class TaylorSteps(Stepping):
 
     def _coefficients(self, y):
         """Coefficients of q and of γ with index 1 .. last."""
-        own = y[: self.nq * self.last].reshape(self.last, self.nq)
-        c = own if self.plain else y[self.nq * self.last : self.n_c].reshape(self.last, self.n)
-        return own, c
+        of_q = y[: self.nq * self.last].reshape(self.last, self.nq)
+        return of_q, of_q if self.plain else y[self.nq * self.last : self.n_c].reshape(self.last, self.n)
 
     def _jets(self, x, y, h, top):
         """Jets q, γ', ..., γ^(top) at times h (N,) after a step's start, (nq + top n, N)."""
-        own, c = self._coefficients(y)
-        rows = [x[: self.nq, None] + _level(own, 0, h)]
-        return np.concatenate([*rows, *(_level(c, j, h) for j in range(1, top + 1))])
+        of_q, of_gamma = self._coefficients(y)
+        q = x[: self.nq, None] + _level(of_q, 0, h)
+        return np.concatenate([q, *(_level(of_gamma, j, h) for j in range(1, top + 1))])
 
     def _sample(self, t, states, y, pending, end):
         """Record pending samples up to `end`; those that remain."""
@@ -275,8 +273,8 @@ class TaylorSteps(Stepping):
             k = np.clip(np.searchsorted(direction * t, direction * times, "right") - 1, 0, y.shape[1] - 1)
             parts = np.empty((self.nq + self.jets * self.n, len(times)))
             for step in np.unique(k):
-                own = k == step
-                parts[:, own] = self._jets(states[:, step], y[:, step], times[own] - t[step], self.jets)
+                here = k == step
+                parts[:, here] = self._jets(states[:, step], y[:, step], times[here] - t[step], self.jets)
             n_x = len(states)
             self.motion.add(self.model, times, parts[:n_x], parts[n_x:])
         return pending[~due]

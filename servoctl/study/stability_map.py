@@ -18,9 +18,9 @@ from servoctl.methods.drift import Poles, as_drift
 from servoctl.methods.runge_kutta import ORDERS
 from servoctl.methods.stability import amplification, row_poles
 
-METHODS = (*ORDERS, "Taylor", "RadauIIA")
+MAPPED = (*ORDERS, "Taylor", "RadauIIA")
 RADAU_ORDER = 5  # unless it is given; all are L-stable
-SAMPLES = 101  # of the plan, where eigenvalues are taken: adjacent ones are alike on plans of some smoothness
+PLAN_INSTANTS = 101  # of the plan, where eigenvalues are taken: adjacent ones are alike on plans of some smoothness
 GROWTH = 2.0  # by which counted errors may grow over the plan; neutral modes and rounding stay below that
 PER_DECADE, DECADES = 30, 7  # of steps tried below the length of the plan
 
@@ -67,7 +67,7 @@ class StabilityMap:
         Parameters
         ----------
         method : str
-            One of `methods.stability.METHODS`.
+            One of `methods.stability.STEP_MAPS`.
         step : float or (K,) array
             [s]
         drift : optional
@@ -93,7 +93,7 @@ class StabilityMap:
         Parameters
         ----------
         method : str
-            One of `methods.stability.METHODS`.
+            One of `methods.stability.STEP_MAPS`.
         step : float or (K,) array
             [s]
         drift : optional
@@ -116,7 +116,7 @@ class StabilityMap:
         Parameters
         ----------
         method : str
-            One of `methods.stability.METHODS`. Of an adaptive method it is where step control settles.
+            One of `methods.stability.STEP_MAPS`. Of an adaptive method it is where step control settles.
         drift : None, "project", "minimal", float, `project(...)` or `poles(...)`, optional
             As in `simulate`.
         order : int, optional
@@ -176,7 +176,7 @@ class StabilityMap:
             f"  off the manifold: {story}; neutral without treatment, at the poles with, removed by projection",
             f"  largest step [s] {'no poles':>12}" + "".join(f"{f'T = {T:g} s':>12}" for T in shown[1:]),
         ]
-        for method in METHODS:
+        for method in MAPPED:
             name = f"Taylor {self.order}" if method == "Taylor" else method
             steps = (self.largest_step(method, drift) for drift in shown)
             lines.append(f"  {name:<16} " + "".join(f"{_step_text(step):>12}" for step in steps))
@@ -222,7 +222,7 @@ def stability(model, run, order=12):
             f"The plan is a motion of the model, whose state is {', '.join(model.state_names)}.",
             do="Give the run that simulate(model, ...) returned.",
         )
-    t, matrices, _ = linearised(model, run, SAMPLES)
+    t, matrices, _ = linearised(model, run, PLAN_INSTANTS)
     if len(t) < 2:
         raise SpecificationError(
             "The Jacobian of the motion is not finite along the run.",
