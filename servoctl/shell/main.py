@@ -9,7 +9,7 @@ from servoctl.checks import as_span
 from servoctl.errors import ServoError, SpecificationError, unknown
 from servoctl.methods.choice import as_method, default_method
 from servoctl.methods.drift import as_drift
-from servoctl.methods.tableaus import ORDERS
+from servoctl.methods.runge_kutta import ORDERS
 from servoctl.shell import commands as further
 from servoctl.shell import loop as cli_loop
 from servoctl.shell.folder import FILES, LOOP_FILES, Folder, Report, complain, plain, summary, versions
