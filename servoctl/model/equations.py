@@ -222,12 +222,6 @@ class Equations(Invariants):
         values, sizes = self.r.points.matrix(matrix)
         return eliminate(matrix, -residual, clean(values, sizes))[0]
 
-    def metric(self):
-        """The inertia matrix M, column by column, at the state."""
-        mass = ca.substitute(self.r.mechanism.mass, self.q.jet(2), ca.SX.zeros(self.q.n))
-        frame = ca.vec(ca.densify(self.q.V))
-        return self.function("metric", self.state, [ca.vec(ca.densify(mass)), frame])
-
     def matrices(self):
         """L and Bᵀ, column by column, and which rows they have: what must keep its rank."""
         L, B = self.r.leading, self.r.realisation.B.T
@@ -358,7 +352,6 @@ EQUATIONS = {  # what `compiled` makes of each: the function, its loops, its pro
     "ode_poles_jacobian": lambda e: (e.ode_jacobian(poles=True),),
     "path": lambda e: (e.path(), ("newton",)),
     "invariants": lambda e: (e.invariants(),),
-    "metric": lambda e: (e.metric(),),
     "matrices": lambda e: (e.matrices(),),
     "plant": lambda e: (e.plant(),),
     "multiplier_form": lambda e: (e.multiplier_form(),),

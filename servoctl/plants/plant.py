@@ -7,7 +7,6 @@ import numpy as np
 
 from servoctl.checks import column, finite, interval, mapping, numbers_by_name
 from servoctl.codegen.function import compiled
-from servoctl.codegen.loops.closed import DRIVER
 from servoctl.errors import SpecificationError, unknown
 from servoctl.plants.equations import PlantEquations, plant_equations
 from servoctl.spec.mechanism import Mechanism, require_known
@@ -327,9 +326,9 @@ def _unpickled(numbers, choices):
     return Plant(**numbers, equations=plant_equations(numbers["mechanism"], *choices))
 
 
-FUNCTIONS = {  # what `compiled` makes of each: the function, its loops, its projection, other functions, further loops
-    "ode": lambda e: (e.ode(), (), e.project(), None, DRIVER),
-    "ode_power": lambda e: (e.ode_power(), (), e.project(extra=1), None, DRIVER),
+FUNCTIONS = {  # what `compiled` makes of each: the function, its loops, its projection
+    "ode": lambda e: (e.ode(), ("closed",), e.project()),
+    "ode_power": lambda e: (e.ode_power(), ("closed",), e.project(extra=1)),
     "jacobian": lambda e: (e.jacobian(),),
     "directions": lambda e: (e.directions(),),
     "power": lambda e: (e.power(),),
