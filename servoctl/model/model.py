@@ -188,11 +188,6 @@ class Model:
         return self.reduction.mechanism.q.nq
 
     @property
-    def plain(self):
-        """Whether the coordinates' rates are the quasi-velocities, q' = γ'."""
-        return self.reduction.mechanism.q.plain
-
-    @property
     def coordinate_names(self):
         """Names of the coordinates."""
         return self.reduction.mechanism.q.names
@@ -241,7 +236,7 @@ class Model:
 
     @property
     def raised(self):
-        """How often each row is differentiated to the common order s̄: {row name: ρ}."""
+        """How often each row is differentiated to the common order s̄, {row name: ρ}; its error dynamics have ρ poles."""
         return {row.name: self.reduction.top - row.order for row in self.reduction.rows}
 
     @cached_property
@@ -326,11 +321,6 @@ class Model:
     def invariant_names(self):
         """(level, name) of each invariant of the state, in the order of the function "invariants"."""
         return self.once("invariant names", lambda: [(level, name) for level, name, _ in self.equations.invariant_rows])
-
-    def pole_rows(self):
-        """(row name, number of coefficients) of the error dynamics, in the order of the pole inputs."""
-        r = self.reduction
-        return [(row.name, r.top - row.order) for row in r.rows]
 
     def multiplier_form(self, t, jets):
         """[M -B; C 0] and right sides of the form with multipliers.
