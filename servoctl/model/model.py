@@ -236,7 +236,7 @@ class Model:
 
     @property
     def raised(self):
-        """How often each row is differentiated to the common order s̄, {row name: ρ}; its error dynamics have ρ poles."""
+        """How often each row is differentiated to the common order s̄, {row name: ρ}: the number of its poles."""
         return {row.name: self.reduction.top - row.order for row in self.reduction.rows}
 
     @cached_property
