@@ -12,7 +12,6 @@ import numpy as np
 from servoctl.errors import NotRealisable, SpecificationError, unknown
 from servoctl.reduction.elimination import eliminate
 from servoctl.reduction.ranks import clean, decide_all, decide_each, equilibrate
-from servoctl.reduction.row import gradient
 
 NEGATIVE = 1e-9  # of the size of its entries: eigenvalues of an inertia matrix below minus this are no rounding
 LONGEST_SEARCH = 2  # times n: no relative degree exceeds the number of plant states
@@ -84,7 +83,7 @@ def realisation(mechanism, program, constraints, points):
         If there are fewer actuators than residuals, or they cannot move them.
     """
     q = mechanism.q
-    leading = {kind: [gradient(q, row) for row in constraints if row.kind == kind] for kind in ("program", "material")}
+    leading = {kind: [row.gradient(q) for row in constraints if row.kind == kind] for kind in ("program", "material")}
     material = [g.T for g in leading["material"]]
     if program.by == "ideal":
         directions, actuation = [g.T for g in leading["program"]], None
@@ -113,7 +112,7 @@ def _actuator_directions(mechanism, program, constraints, points):
     q = mechanism.q
     k, m = len(program.residuals), len(mechanism.actuators)
     material = [row for row in constraints if row.kind == "material"]
-    both = ca.horzcat(mechanism.E, *(gradient(q, row).T for row in material))
+    both = ca.horzcat(mechanism.E, *(row.gradient(q).T for row in material))
     rank = decide_all(*points.matrix(both.T))[0].rank if both.shape[1] else 0
     free = rank - len(material)
     if k > free:
@@ -177,7 +176,7 @@ def decoupling(mechanism, rows, material, points):
 def _saddle(mechanism, material):
     """[M G_mᵀ; G_m 0]."""
     n, k = mechanism.q.n, len(material)
-    G = ca.vertcat(*(gradient(mechanism.q, row) for row in material)) if material else ca.SX(0, n)
+    G = ca.vertcat(*(row.gradient(mechanism.q) for row in material)) if material else ca.SX(0, n)
     return ca.vertcat(ca.horzcat(mechanism.mass, G.T), ca.horzcat(G, ca.SX.zeros(k, k)))
 
 

@@ -10,12 +10,12 @@ import casadi as ca
 import numpy as np
 
 from servoctl.errors import InconsistentStart, NotRealisable, SingularProgram, SpecificationError
+from servoctl.jets.flow import Flow
 from servoctl.reduction.elimination import eliminate
-from servoctl.reduction.flow import Flow
 from servoctl.reduction.manifold import sample, solve
 from servoctl.reduction.orders import dependence, leading, settle, settle_alone
 from servoctl.reduction.ranks import NOISE, RESOLVED, clean, decide, decide_all, decide_each, generic
-from servoctl.reduction.row import Row, gradient, merge_uses
+from servoctl.reduction.row import Row, merge_uses
 
 VANISHED = 1e-5  # of a row's gradient at random points: what is left of it on its solutions, if it is a square
 
@@ -132,8 +132,8 @@ def _combine(q, rows, b, others, top, numbers):
     if not others:
         return chi, []
     columns = sorted(decide(numbers[others, :, 0]).columns)
-    matrix = ca.vertcat(*(gradient(q, rows[a]) for a in others))[:, columns].T
-    target = -gradient(q, rows[b])[:, columns].T
+    matrix = ca.vertcat(*(rows[a].gradient(q) for a in others))[:, columns].T
+    target = -rows[b].gradient(q)[:, columns].T
     w, pivots = eliminate(matrix, target, numbers[others][:, columns].swapaxes(0, 1))
     for a, weight in zip(others, w.elements(), strict=True):
         chi = chi + weight * q.derivatives([rows[a].expression], top - rows[a].order)[-1][0]
@@ -249,7 +249,7 @@ def _refuse_square(q, row, context, slopes=None):
     A gradient without the highest jets is as large on the solutions, which determine these alone, as elsewhere; and
     so is an entry that holds no coordinate. `slopes` are the values of the gradient at the points, where known.
     """
-    own = gradient(q, row)
+    own = row.gradient(q)
     if row.order > 0 and q.order(own) < row.order:
         return
     if slopes is not None:
@@ -262,7 +262,7 @@ def _refuse_square(q, row, context, slopes=None):
     z, residual = solve(flow, start.t, start.z, iterations=40)
     sizes = []
     for jets in (start.z, z):
-        values, _ = replace(start, z=jets).matrix(gradient(q, row))
+        values, _ = replace(start, z=jets).matrix(row.gradient(q))
         sizes.append(np.abs(values).max(axis=(0, 1)))
     solved = residual < 1e-3
     if solved.any() and np.all(sizes[1][solved] < VANISHED * sizes[0][solved]):

@@ -11,8 +11,8 @@ from math import factorial
 import casadi as ca
 import numpy as np
 
+from servoctl.jets.flow import Flow
 from servoctl.jets.scalars import REAL, Book
-from servoctl.reduction.flow import Flow
 
 ROUNDED = 8 * float(np.finfo(REAL).eps)  # a scaled residual below this is rounding
 ROUNDED_STEP = 1e-15  # a step from below this is worth one trial: shorter ones gain nothing

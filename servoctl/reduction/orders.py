@@ -8,14 +8,14 @@ import numpy as np
 from servoctl.reduction.elimination import eliminate
 from servoctl.reduction.manifold import sample
 from servoctl.reduction.ranks import ENTRY, clean, combination, decide, equilibrate
-from servoctl.reduction.row import gradient, merge_uses
+from servoctl.reduction.row import merge_uses
 
 DEPENDENT = 1e-11  # what may be left of a row after the combination of others, both equilibrated
 
 
 def leading(q, rows, points):
     """The cleaned leading matrix L at points, (rows, n, N), and the sizes of its entries."""
-    values, sizes = points.matrix(ca.vertcat(*(gradient(q, row) for row in rows)))
+    values, sizes = points.matrix(ca.vertcat(*(row.gradient(q) for row in rows)))
     return clean(values, sizes), sizes
 
 
@@ -32,7 +32,7 @@ def settle_alone(q, rows, context):
     for level in set(levels) - {-1}:
         members = [a for a, own in enumerate(levels) if own == level and rows[a].order <= level]
         points = sample(q, [], level, context)
-        gradients = [gradient(q, rows[a], level) for a in members]
+        gradients = [rows[a].gradient(q, level) for a in members]
         points.read([*(rows[a].expression for a in members), *(e for g in gradients for e in g.nonzeros())])
         values = clean(*points.matrix(ca.vertcat(*gradients)))
         for a, slopes, numbers in zip(members, gradients, values, strict=True):
@@ -68,7 +68,7 @@ def settle(q, row, others, context, starts=None):
     if not len(points.t):
         return None, points
     for j in range(q.order(row.expression), -1, -1):
-        values, sizes = points.matrix(gradient(q, row, j))
+        values, sizes = points.matrix(row.gradient(q, j))
         values = clean(values, sizes)[0]
         if np.any(values):
             lower = [other for other in others if other.order < j or (other.order == j and other.affine and j > 0)]
@@ -78,7 +78,7 @@ def settle(q, row, others, context, starts=None):
             row = replaced
         elif j > 0:
             row = _drop(q, row, q.gamma(j), points)
-    if q.order(row.expression) == 0 and not np.any(clean(*points.matrix(gradient(q, row, 0)))):
+    if q.order(row.expression) == 0 and not np.any(clean(*points.matrix(row.gradient(q, 0)))):
         return replace(row, order=-1), points
     return replace(row, order=max(q.order(row.expression), -1)), points
 
@@ -122,7 +122,7 @@ def _replace(q, row, j, values, lower, points):
     zero = ca.SX.zeros(len(jets))
     raised = ca.vertcat(*(q.derivatives([other.expression], j - other.order)[-1][0] for other in rows))
     rest = ca.substitute(raised, ca.vertcat(*jets), zero)
-    matrix = ca.vertcat(*(gradient(q, other) for other in rows))[:, columns]
+    matrix = ca.vertcat(*(other.gradient(q) for other in rows))[:, columns]
     solution, _ = eliminate(matrix, -rest, numbers[:, columns])
     full = ca.SX.zeros(len(jets))
     full[columns] = solution

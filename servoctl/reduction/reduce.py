@@ -7,14 +7,14 @@ import casadi as ca
 import numpy as np
 
 from servoctl.errors import NotRealisable, SpecificationError, unknown
+from servoctl.jets.flow import Flow
 from servoctl.reduction.appell import Realisation, realisation, require_inertia
-from servoctl.reduction.flow import Flow
 from servoctl.reduction.hidden import as_rows, complete
 from servoctl.reduction.knots import Knots, Switches, require_smooth
 from servoctl.reduction.manifold import Context, Points, sample
 from servoctl.reduction.orders import settle_alone
 from servoctl.reduction.ranks import Rank, clean, decide, decide_all
-from servoctl.reduction.row import Row, gradient, merge_uses
+from servoctl.reduction.row import Row, merge_uses
 from servoctl.spec.coordinates import mapping
 from servoctl.spec.mechanism import Mechanism, require_known
 from servoctl.spec.parameters import finite
@@ -89,7 +89,7 @@ class Reduction:
     @cached_property
     def leading(self):
         """The leading matrix L, (n, n) SX."""
-        return ca.vertcat(*(gradient(self.mechanism.q, row) for row in self.rows))
+        return ca.vertcat(*(row.gradient(self.mechanism.q) for row in self.rows))
 
     @cached_property
     def conditions(self):
@@ -275,7 +275,7 @@ def _constraints(mechanism, program, given, context):
         return constraints, points, guards
     constraints = [*program_rows, *material]
     points = _points_for(q, constraints, points, context)
-    G = ca.vertcat(*(gradient(q, row) for row in constraints))
+    G = ca.vertcat(*(row.gradient(q) for row in constraints))
     if decide_all(*points.matrix(G))[0].rank < len(constraints):
         complete(q, constraints, context, points)
     return constraints, points, guards

@@ -34,6 +34,15 @@ class Row:
     uses: dict = field(default_factory=dict)
     _gradients: dict = field(default_factory=dict, repr=False, compare=False)
 
+    def gradient(self, q, level=None):
+        """∂ψ/∂γ^(level), (1, n) SX; for level 0 ∂ψ/∂q · V. Default: the row's own order, its leading gradient."""
+        level = self.order if level is None else level
+        key = self.expression.element_hash(), level
+        if key not in self._gradients:
+            slopes = ca.jacobian(self.expression, q.jet(level))
+            self._gradients[key] = self.expression, slopes if level or q.plain else slopes @ q.V
+        return self._gradients[key][1]
+
     def __repr__(self):
         return f"Row({self.name}: {self.kind}, order {self.order}{', ' + self.story if self.story else ''})"
 
@@ -46,12 +55,3 @@ def merge_uses(*parts):
             total[name] = max(total.get(name, 0), count + extra)
     return total
 
-
-def gradient(q, row, level=None):
-    """∂ψ/∂γ^(level), (1, n) SX; for level 0 ∂ψ/∂q · V. Default: the row's own order, its leading gradient."""
-    level = row.order if level is None else level
-    key = row.expression.element_hash(), level
-    if key not in row._gradients:
-        found = ca.jacobian(row.expression, q.jet(level))
-        row._gradients[key] = row.expression, found if level or q.plain else found @ q.V
-    return row._gradients[key][1]

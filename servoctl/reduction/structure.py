@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import casadi as ca
 import numpy as np
 
-from servoctl.reduction.flow import Flow
+from servoctl.jets.flow import Flow
 from servoctl.reduction.manifold import solve
 from servoctl.reduction.ranks import decide, solve_clean
 from servoctl.reduction.row import Row

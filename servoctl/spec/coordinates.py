@@ -1,13 +1,14 @@
 """Generalised coordinates, quasi-velocities and their jets, and the total derivative (3.1)."""
 
 import threading
-from math import isfinite
+from math import factorial, isfinite
 from numbers import Integral
 
 import casadi as ca
 
 from servoctl.errors import SpecificationError
 from servoctl.jets.elementary import divide, multiply
+from servoctl.jets.motion import Motion
 from servoctl.jets.series import Series, is_zero
 from servoctl.jets.tape import Tape
 
@@ -270,46 +271,45 @@ class Coordinates:
         expressions = [_as_sx(e) for e in expressions]
         if k == 0:
             return [expressions]
-        series = self._series(expressions, k)
-        factor, result = 1.0, []
-        for j in range(k + 1):
-            factor *= max(j, 1)
-            result.append([_as_sx(multiply(c[j], factor)) for c in series.outputs[: len(expressions)]])
-        return result
+        outputs = self._series(expressions, k).outputs[: len(expressions)]
+        return [[_as_sx(multiply(c[j], float(factorial(j)))) for c in outputs] for j in range(k + 1)]
 
     def _series(self, expressions, k):
-        symbols = None
+        """Coefficients 0 to k of expressions, and behind them those of q' = V w + h where q itself is in them."""
+        symbols, moving = None, []
         if not self.plain:
             symbols = ca.symvar(ca.vertcat(*expressions)) if expressions else []
             if any((self.where(s) or ("",))[0] == "q" for s in symbols):
                 symbols = _union(symbols, ca.symvar(ca.vertcat(ca.vec(self.V), self.h)), self._q, self.gamma(1))
-                expressions = [*expressions, *(self.V @ self.jet(1) + self.h).elements()]
-        tape = Tape(symbols, expressions)
-        symbols, places = tape.symbols, [self.where(s) for s in tape.symbols]
-        inputs = [[] for _ in symbols]
+                moving = (self.V @ self.jet(1) + self.h).elements()
+        tape = Tape(symbols, [*expressions, *moving])
+        inputs = [[] for _ in tape.symbols]
         series = Series(tape, inputs)
-        factorial = 1.0
+        motion = _SymbolicMotion(self, [series.c[node] for node in tape.outputs[len(expressions) :]])
         for j in range(k + 1):
-            factorial *= max(j, 1)
-            for i, (symbol, place) in enumerate(zip(symbols, places, strict=True)):
-                inputs[i].append(self._coefficient(symbol, place, j, factorial, series))
+            for symbol, coefficients in zip(tape.symbols, inputs, strict=True):
+                coefficients.append(motion.coefficient(symbol, j))
             series.advance()
         return series
 
-    def _coefficient(self, symbol, place, j, factorial, series):
-        if place is None:
-            return symbol if j == 0 else 0.0
-        kind, level, i = place
-        if kind == "t":
-            return symbol if j == 0 else float(j == 1)
-        if kind == "w":
-            return divide(self.gamma(level + j)[i], factorial)
+
+class _SymbolicMotion(Motion):
+    """The motion whose jets γ^(k) are symbols; `rates` are the coefficients of q', so far, where q' is not γ'."""
+
+    def __init__(self, q, rates):
+        super().__init__(q)
+        self.rates = rates
+
+    def coordinate(self, i, j):
         if j == 0:
-            return symbol
-        if self.plain:
-            return divide(self.gamma(j)[i], factorial)
-        velocity = series.c[series.tape.outputs[i - self.nq]][j - 1]  # the last outputs are q'
-        return 0.0 if is_zero(velocity) else divide(velocity, j)
+            return self.q.d(0)[i]
+        if self.q.plain:
+            return self.velocity(i, 0, j)
+        rate = self.rates[i][j - 1]
+        return 0.0 if is_zero(rate) else divide(rate, j)
+
+    def velocity(self, i, level, j):
+        return divide(self.q.gamma(level + j)[i], float(factorial(j)))
 
 
 def _order(k):
