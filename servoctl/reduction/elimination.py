@@ -11,7 +11,8 @@ import numpy as np
 
 from servoctl.errors import SingularProgram
 from servoctl.jets.elementary import divide, multiply, subtract
-from servoctl.reduction.ranks import ENTRY, equilibrate
+from servoctl.reduction.ranks import equilibrate
+from servoctl.tolerances import ENTRY
 
 THRESHOLD = 0.1  # a pivot may be this much smaller than the largest candidate of its row, after equilibration
 

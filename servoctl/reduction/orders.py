@@ -7,10 +7,13 @@ import numpy as np
 
 from servoctl.reduction.elimination import eliminate
 from servoctl.reduction.manifold import sample
-from servoctl.reduction.ranks import ENTRY, clean, combination, decide, equilibrate
+from servoctl.reduction.ranks import clean, combination, decide, equilibrate, refined
 from servoctl.reduction.row import merge_uses
+from servoctl.tolerances import DEPENDENT, ENTRY
 
-DEPENDENT = 1e-11  # what may be left of a row after the combination of others, both equilibrated
+TAKES_PART = 1e-12  # coefficient times the largest entry of a row: below this the row is no part of a combination
+SUPPORTS = 1e-9  # equilibrated coefficient, at any point, above which a row is part of a dependence
+BASIS_CUTOFF = 1e-12  # singular values of rows found independent, against the largest
 
 
 def leading(q, rows, points):
@@ -112,7 +115,7 @@ def _replace(q, row, j, values, lower, points):
         c, left = combination(numbers[:, :, p], values[:, p])
         if left > DEPENDENT:
             return None
-        support |= set(np.flatnonzero(np.abs(c * np.abs(numbers[:, :, p]).max(axis=1).astype(float)) > 1e-12))
+        support |= set(np.flatnonzero(np.abs(c * np.abs(numbers[:, :, p]).max(axis=1).astype(float)) > TAKES_PART))
     chosen = _independent([lower[a] for a in sorted(support)], numbers[sorted(support)])
     if not chosen or any(other.order == j and not other.affine for other, _ in chosen):
         return None
@@ -162,23 +165,15 @@ def dependence(q, rows, numbers):
     for b in range(len(rows)):
         coefficients, left = [], []
         for p in range(scaled.shape[2]):
-            c, rest = _plain_combination(scaled[basis, :, p], scaled[b, :, p])
+            c, rest = refined(scaled[basis, :, p], scaled[b, :, p], BASIS_CUTOFF)
             coefficients.append(np.abs(c))
             left.append(rest)
         if max(left) > DEPENDENT:
             basis.append(b)
             continue
         size = np.array(coefficients)
-        support = [a for i, a in enumerate(basis) if size[:, i].max(initial=0.0) > 1e-9]
+        support = [a for i, a in enumerate(basis) if size[:, i].max(initial=0.0) > SUPPORTS]
         weights = [size[:, i].min(initial=np.inf) for i, a in enumerate(basis) if a in support]
         return [*support, b], np.array([*weights, 1.0])
     return [], np.array([])
 
-
-def _plain_combination(rows, target):
-    c, residual = np.zeros(len(rows)), target.copy()
-    for _ in range(3):
-        if len(rows):
-            c = c + np.linalg.lstsq(rows.T.astype(float), residual.astype(float), rcond=1e-12)[0]
-            residual = target - c.astype(np.longdouble) @ rows
-    return c, float(np.abs(residual).max(initial=0.0))

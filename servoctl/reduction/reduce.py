@@ -14,7 +14,7 @@ from servoctl.reduction.knots import Knots, Switches, require_smooth
 from servoctl.reduction.manifold import Context, Points, sample
 from servoctl.reduction.orders import settle_alone
 from servoctl.reduction.ranks import Rank, clean, decide, decide_all
-from servoctl.reduction.row import Row, merge_uses
+from servoctl.reduction.row import Balance, Row, merge_uses
 from servoctl.spec.coordinates import mapping
 from servoctl.spec.mechanism import Mechanism, require_known
 from servoctl.spec.parameters import finite
@@ -127,7 +127,6 @@ class Reduction:
 
 NEARBY = 0.01  # s about an instant for which pivots are chosen: at the instant alone, accidents look like laws
 HELD = 1e-9  # of the size of its terms: what may be left of a residual at points where the rows hold
-FORCE = "the force on"  # names in the balance, in refusals of forces that jump
 
 
 def needs(rows):
@@ -138,9 +137,9 @@ def needs(rows):
 def smoothness(switches, rows):
     """The class in time that each expression of the switches needs; a force that no derivative is taken of may jump."""
     found = needs(rows)
-    forces = found.get(FORCE, 0)
+    forces = found.pop(Balance(), 0)
     if forces:
-        found |= dict.fromkeys((name for name in switches.residuals if name.startswith(FORCE)), forces)
+        found |= {name: forces for name in switches.residuals if isinstance(name, Balance)}
     return found
 
 
@@ -179,7 +178,7 @@ def reduce(mechanism, program, guess=None, near=None, values=None):
     _check(mechanism, program, guess)
     q = mechanism.q
     names = q.names if q.plain else q.velocity_names
-    forces = {f"{FORCE} {name}": r for name, r in zip(names, mechanism.balance.elements(), strict=True)}
+    forces = {Balance(name): r for name, r in zip(names, mechanism.balance.elements(), strict=True)}
     switches = Switches(q, {**program.residuals, **mechanism.constraints, **forces}, mechanism.parameters.symbols)
     context = _context(mechanism, switches, guess, near, values)
     given = as_rows(q, program.residuals, "program", context) + as_rows(q, mechanism.constraints, "material", context)
@@ -188,7 +187,7 @@ def reduce(mechanism, program, guess=None, near=None, values=None):
     expressions, pivots = split.dynamics(mechanism.balance)
     guards = [*guards, *((f"choice of dependent coordinates {i + 1}", p) for i, p in enumerate(pivots))]
     dynamics = [
-        Row(e, max(q.order(e), 0), f"balance of {names[i]}", "dynamics", uses={FORCE: 0})
+        Row(e, max(q.order(e), 0), f"balance of {names[i]}", "dynamics", uses={Balance(): 0})
         for i, e in zip(split.independent, expressions, strict=True)
     ]
     dynamics = [row for row, _ in settle_alone(q, dynamics, context)]

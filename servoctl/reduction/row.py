@@ -6,6 +6,22 @@ import casadi as ca
 
 
 @dataclass(frozen=True)
+class Balance:
+    """The balance r among the expressions that rows are made of, or one component of it.
+
+    Attributes
+    ----------
+    component : str
+        Name of a coordinate or quasi-velocity; empty for all of them.
+    """
+
+    component: str = ""
+
+    def __str__(self):
+        return f"the force on {self.component}" if self.component else "the balance"
+
+
+@dataclass(frozen=True)
 class Row:
     """One scalar equation ψ(t, q, γ', ..., γ^(order)) = 0.
 
@@ -21,8 +37,8 @@ class Row:
         Whether it is affine in γ^(order).
     story : str
         What was done to it, if it is a hidden constraint.
-    uses : dict of str to int
-        How often each program residual stands differentiated in it.
+    uses : dict of (str or Balance) to int
+        Highest derivative of each program residual, and of the balance, that stands in it.
     """
 
     expression: ca.SX
