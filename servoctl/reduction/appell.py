@@ -14,6 +14,7 @@ from servoctl.reduction.elimination import eliminate
 from servoctl.reduction.ranks import clean, decide_all, decide_each, equilibrate
 
 NEGATIVE = 1e-9  # of the size of its entries: eigenvalues of an inertia matrix below minus this are no rounding
+NAMED = 1e-6  # of its largest component: smaller ones of a direction are not named in an error
 LONGEST_SEARCH = 2  # times n: no relative degree exceeds the number of plant states
 
 
@@ -202,7 +203,7 @@ def require_inertia(mechanism, material, points):
     if rank.rank < len(values):
         cleaned = clean(values, sizes)[:, :, best].astype(float)
         null = np.linalg.svd(cleaned)[2][-1][:n]
-        names = [q.jet_names(1)[i] for i in np.flatnonzero(np.abs(null) > 1e-6 * np.abs(null).max())]
+        names = [q.jet_names(1)[i] for i in np.flatnonzero(np.abs(null) > NAMED * np.abs(null).max())]
         raise SpecificationError(
             f"The mass matrix is singular: a direction of {', '.join(names)} has no inertia.",
             "M = ∂²S/∂γ''² is positive definite on the displacements that material constraints allow.",
@@ -229,7 +230,7 @@ def require_positive(mechanism, points):
         return
     k = int(np.argmin(values[:, 0]))
     direction = np.abs(directions[k, :, 0])
-    names = [mechanism.q.jet_names(1)[i] for i in np.flatnonzero(direction > 1e-6 * direction.max())]
+    names = [mechanism.q.jet_names(1)[i] for i in np.flatnonzero(direction > NAMED * direction.max())]
     pairs = zip(points.parameters, points.values, strict=True)
     negative = [f"{symbol.name()} = {value:g}" for symbol, value in pairs if value < 0]
     raise SpecificationError(

@@ -109,7 +109,8 @@ def _lowest(q, rows, numbers, context, starts=None):
     support, weights = dependence(q, [rows[a] for a in order], numbers[order])
     support = [order[i] for i in support]
     top = max(rows[a].order for a in support)
-    b = max((rows[a].kind == "dynamics", w, a) for a, w in zip(support, weights, strict=True) if rows[a].order == top)[2]
+    highest = ((a, w) for a, w in zip(support, weights, strict=True) if rows[a].order == top)
+    b = max((rows[a].kind == "dynamics", w, a) for a, w in highest)[2]
     combination = _combination(q, rows, b, support, numbers, context, starts)
     if combination.row.order >= top:
         support, numbers = _about(q, rows, b, context)

@@ -109,6 +109,7 @@ class Points:
         return kept
 
 
+@np.errstate(all="ignore")  # trial steps may leave the domain of the rows: what is not finite is no improvement
 def solve(flow, t, z, iterations=STEPS):
     """Move jets onto the manifold of a flow's rows: level by level, then by damped Gauss-Newton on all levels.
 
@@ -159,8 +160,7 @@ def _search(flow, t, z, step, scale, residual):
     better = np.zeros(len(t), dtype=bool)
     for _ in range(SHORTENINGS):
         new = flow.residual(t[open_], trial[:, open_])
-        with np.errstate(all="ignore"):
-            good = np.max(np.abs(new) / scale[:, open_], axis=0) < before[open_]
+        good = np.max(np.abs(new) / scale[:, open_], axis=0) < before[open_]
         better[open_[good]] = True
         open_ = open_[~good & (before[open_] > ROUNDED_STEP)]
         if not len(open_):
@@ -191,24 +191,21 @@ def _solve_level(flow, t, z, level, scales):
 
 def _scales(jacobian, z):
     """Size of each residual's gradient times that of the jets, (equations, N)."""
-    with np.errstate(all="ignore"):
-        scale = np.sqrt((jacobian**2 * (1.0 + np.abs(z.astype(float))) ** 2).sum(axis=1))
+    scale = np.sqrt((jacobian**2 * (1.0 + np.abs(z.astype(float))) ** 2).sum(axis=1))
     return np.where(scale > 0, scale, 1.0)
 
 
 def _norms(residual, scales):
-    with np.errstate(all="ignore"):
-        norm = np.max(np.abs(residual) / scales, axis=0).astype(REAL)
+    norm = np.max(np.abs(residual) / scales, axis=0).astype(REAL)
     return np.where(np.isfinite(norm), norm, np.inf)
 
 
 def _least_steps(jacobian, residual):
     """Steps of least length to where the linearised residual vanishes, (nz, N); zero where this is not finite."""
     a = np.moveaxis(jacobian, 2, 0)
-    with np.errstate(all="ignore"):
-        scale = np.sqrt((a**2).sum(axis=2))
-        scale[~(scale > 0)] = 1.0
-        a, b = a / scale[:, :, None], (residual.T / scale).astype(float)
+    scale = np.sqrt((a**2).sum(axis=2))
+    scale[~(scale > 0)] = 1.0
+    a, b = a / scale[:, :, None], (residual.T / scale).astype(float)
     steps = _normal_steps(a, b)
     return (np.array([_least_step(*one) for one in zip(a, b, strict=True)]) if steps is None else steps).T.astype(REAL)
 

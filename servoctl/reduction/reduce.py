@@ -19,6 +19,7 @@ from servoctl.spec.coordinates import mapping
 from servoctl.spec.mechanism import Mechanism, require_known
 from servoctl.spec.parameters import finite
 from servoctl.spec.program import Program
+from servoctl.tolerances import TINY
 
 
 @dataclass(frozen=True)
@@ -126,6 +127,10 @@ class Reduction:
 
 
 NEARBY = 0.01  # s about an instant for which pivots are chosen: at the instant alone, accidents look like laws
+NEAR_SPREAD = 1e-3  # relative width of the points about a state for which pivots are chosen
+WINDOW = (0.1, 1.1)  # s, where points are drawn if nothing switches; t = 0 is too often a special instant
+LONE_WINDOW = 1.0  # s on either side of a single switch
+INSIDE = 0.07  # of the time between the first and the last switch is left out at both ends, where paths begin and end
 HELD = 1e-9  # of the size of its terms: what may be left of a residual at points where the rows hold
 
 
@@ -235,7 +240,7 @@ def holds(reduction, values):
             return False
         start = entries.stop
     found, sizes = (part[start:] for part in after)
-    return bool(np.all(np.abs(found) <= HELD * np.maximum(sizes, 1e-300)))
+    return bool(np.all(np.abs(found) <= HELD * np.maximum(sizes, TINY)))
 
 
 def _check(mechanism, program, guess):
@@ -298,14 +303,14 @@ def _context(mechanism, switches, guess, near, values):
     values = mechanism.parameters.values() if values is None else np.asarray(values, dtype=float)
     if near is not None:
         t, guess, sizes = near
-        return Context(mechanism.parameters.symbols, values, (t - NEARBY, t + NEARBY), guess, 1e-3, sizes)
+        return Context(mechanism.parameters.symbols, values, (t - NEARBY, t + NEARBY), guess, NEAR_SPREAD, sizes)
     times = switches.times(values)
-    window = (0.1, 1.1)
+    window = WINDOW
     if len(times) == 1:
-        window = (times[0] - 1.0, times[0] + 1.0)
+        window = (times[0] - LONE_WINDOW, times[0] + LONE_WINDOW)
     elif times:
         width = times[-1] - times[0]
-        window = (times[0] + 0.07 * width, times[-1] - 0.07 * width)
+        window = (times[0] + INSIDE * width, times[-1] - INSIDE * width)
     return Context(mechanism.parameters.symbols, values, window, guess or {})
 
 

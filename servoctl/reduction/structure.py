@@ -15,8 +15,8 @@ from servoctl.jets.flow import Flow
 from servoctl.reduction.manifold import solve
 from servoctl.reduction.ranks import decide, solve_clean
 from servoctl.reduction.row import Row
+from servoctl.tolerances import ENTRY
 
-ZERO = 1e-12  # of the size of its terms: below this an entry of J is zero
 INDEPENDENT = 1e-7  # equilibrated pivots of J above this count
 AT_REST = 1e-13  # of the largest jet: below this a jet is zero, not small
 DEPTHS = (2, 4, 6, 8, 12, 16, 24, 32)  # N that are tried until all zeros at infinity are found
@@ -54,7 +54,8 @@ class Structure:
     margin : float
         Smallest equilibrated pivot that was counted in any rank.
     realisation : str
-        "orthogonal", "mixed" or "tangential": rank of P full, between, or zero.
+        "orthogonal", "mixed" or "tangential": rank of P full, between, or zero; "undecided" if not all zeros at
+        infinity were found; "ideal".
     at : tuple of (float, Local)
         The structure at each instant [s].
     """
@@ -79,7 +80,7 @@ class Structure:
         if self.index is None and not self.zeros_at_infinity:
             return "Structure: not computed, index and relative degrees are those of residuals of order 0, 1 or 2"
         vector = "a vector relative degree exists" if self.decoupling_rank == k else "no vector relative degree"
-        pairs = ", ".join(f"{name} {r}" for name, r in zip(self.residuals, self.relative_degree, strict=True))
+        pairs = ", ".join(f"{name} {r}" for name, r in zip(self.residuals, self.relative_degree, strict=False))
         essential = ", ".join(f"{name} {r}" for name, r in zip(self.residuals, self.essential_orders, strict=False))
         lines = [
             f"Structure: index {'not defined' if self.index is None else self.index}; {self.realisation} realisation",
@@ -124,12 +125,9 @@ def structure(reduction, t=None, jets=None, values=None):
     points = reduction.points if t is None else _points(reduction, t, jets, values)
     locals_ = _locals(reduction, points)
     typical = _most_common(locals_)
-    rank_P = (
-        typical.decoupling_rank
-        if max(typical.relative_degree) <= 2
-        else sum(r <= 2 for r in typical.relative_degree) and typical.decoupling_rank
-    )
+    rank_P = typical.decoupling_rank if any(r <= 2 for r in typical.relative_degree) else 0
     kind = "orthogonal" if rank_P == len(names) else "tangential" if rank_P == 0 else "mixed"
+    kind = kind if typical.relative_degree else "undecided"
     margin = min(local.margin for local in locals_)
     at = tuple(zip(np.asarray(points.t, dtype=float).tolist(), locals_, strict=True))
     return Structure(
@@ -189,7 +187,7 @@ def _at_depth(reduction, points, depth):
     J, sizes = _input_jacobian(reduction, points, z, depth)
     result = []
     for p in range(len(points.t)):
-        clean = np.where(np.abs(J[..., p]) <= ZERO * sizes[..., p], 0.0, J[..., p])
+        clean = np.where(np.abs(J[..., p]) <= ENTRY * sizes[..., p], 0.0, J[..., p])
         local = _local(clean, k, depth)
         if local is None:
             return None

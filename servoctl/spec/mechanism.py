@@ -10,8 +10,11 @@ from servoctl.jets.evaluation import evaluate
 from servoctl.jets.tape import Tape
 from servoctl.spec.coordinates import Coordinates, column, mapping
 from servoctl.spec.parameters import Parameters
+from servoctl.tolerances import ENTRY
 
-_SEED = 20021  # of the random points at which identities are tested
+IDENTITY_SEED = 20021  # of the random points at which identities are tested
+RANDOM = (0.3, 1.3)  # where these lie, parameters in units of their defaults: of order one, and away from zero
+INTEGRABLE = 1e-9  # of the largest bracket of columns of V: what may lie outside their span
 
 
 class Mechanism:
@@ -191,7 +194,7 @@ class Mechanism:
             v = point[: self.q.V.numel()].reshape(self.q.n, self.q.nq).T
             rest = point[self.q.V.numel() :].reshape(-1, self.q.nq).T
             outside = rest - v @ np.linalg.lstsq(v, rest, rcond=None)[0]
-            if np.abs(outside).max(initial=0.0) > 1e-9 * max(1.0, np.abs(rest).max(initial=0.0)):
+            if np.abs(outside).max(initial=0.0) > INTEGRABLE * max(1.0, np.abs(rest).max(initial=0.0)):
                 raise SpecificationError(
                     "A kinetic energy was given in quasi-velocities whose frame V is not integrable.",
                     "Lagrange's equations do not hold for velocities restricted by nonholonomic constraints.",
@@ -207,7 +210,7 @@ class Mechanism:
         items : sequence of SX scalars
         """
         values, sizes = self.at_random(items)
-        return bool(np.all(np.abs(values) <= 1e-12 * sizes))
+        return bool(np.all(np.abs(values) <= ENTRY * sizes))
 
     def at_random(self, items):
         """Values and sizes of expressions at four seeded random points of t, jets and parameters.
@@ -221,7 +224,7 @@ class Mechanism:
         values, sizes : (len(items), 4) arrays
         """
         symbols = ca.symvar(ca.vertcat(*items)) if len(items) else []
-        points = np.random.default_rng(_SEED).uniform(0.3, 1.3, (len(symbols), 4)).astype(np.longdouble)
+        points = np.random.default_rng(IDENTITY_SEED).uniform(*RANDOM, (len(symbols), 4)).astype(np.longdouble)
         for i, s in enumerate(symbols):
             if self.q.where(s) is None:
                 points[i] *= self.parameters.defaults.get(s.name(), 1.0)

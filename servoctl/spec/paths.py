@@ -20,6 +20,8 @@ import numpy as np
 from servoctl.errors import SpecificationError, unknown
 from servoctl.spec.coordinates import column
 
+MISSED = 1e-9  # of the largest point: a spline that passes its points farther away is refused
+ORTHONORMAL = 1e-9  # by which products of a circle's axes may differ from those of unit vectors at right angles
 
 def rest_to_rest(t, start, end, duration, smoothness=4, t_start=0.0):
     """Move from rest to rest along the polynomial of degree 2k + 1 whose first k derivatives vanish at both ends.
@@ -274,12 +276,12 @@ def _spline_pieces(times, points, degree, vanishing):
     pieces = np.array([c * half[:, None] ** order for order, c in enumerate(taylor)])
     starts, stops = pieces[::2].sum(axis=0) - pieces[1::2].sum(axis=0), pieces.sum(axis=0)
     miss = max(np.abs(starts - points[:-1]).max(), np.abs(stops - points[1:]).max())
-    if not miss <= 1e-9 * np.abs(points).max():
+    if not miss <= MISSED * np.abs(points).max():
         ratio = half.max() / half.min()
         raise SpecificationError(
             f"The spline of degree {degree} misses its points by {miss:.1e}; its longest interval is {ratio:.3g} times "
             "its shortest",
-            "A spline passes through its points, within 1e-9 of the largest",
+            f"A spline passes through its points, within {MISSED:g} of the largest",
             "Intervals in proportion to the distances between the points, or a lower smoothness",
             "Change the times or the smoothness",
             degree=degree,
@@ -388,7 +390,7 @@ def _orthonormal(axes, centre):
     e1, e2 = (_column(axis, f"axes[{i}]") for i, axis in enumerate(axes))
     _same_size(centre=centre, **{"axes[0]": e1, "axes[1]": e2})
     gram = ca.vertcat(ca.dot(e1, e1) - 1, ca.dot(e1, e2), ca.dot(e2, e2) - 1)
-    if gram.is_constant() and np.abs(np.array(ca.DM(gram))).max() > 1e-9:
+    if gram.is_constant() and np.abs(np.array(ca.DM(gram))).max() > ORTHONORMAL:
         raise SpecificationError(
             f"The circle's axes are {axes!r}", "They are unit vectors at right angles",
             "e1/|e1|, then e2 less its part along e1, divided by its length", "Give orthonormal axes", axes=axes,
