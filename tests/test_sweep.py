@@ -183,8 +183,8 @@ def test_cases_that_form_no_table_are_refused(cases, text):
     ("call", "text"),
     [
         (lambda: sv.grid(m=[]), "m has no values"),
-        (lambda: sv.monte_carlo(-1, seed=1), "n is -1"),
-        (lambda: sv.monte_carlo(2, seed=None), "seed is None"),
+        (lambda: sv.monte_carlo(-1, seed=1), "n=-1"),
+        (lambda: sv.monte_carlo(2, seed=None), "seed=None"),
         (lambda: sv.monte_carlo(2, seed=1, m=[1, 2]), "distribution of m"),
         (lambda: sv.monte_carlo(2, seed=1, m=lambda rng: rng.normal(1.0, -1.0)), "m cannot be drawn: scale < 0"),
         (lambda: sv.sweep(halves, sv.grid(m=1), executor=2), "executor=2"),

@@ -17,8 +17,8 @@ import operator
 import casadi as ca
 import numpy as np
 
+from servoctl.checks import column
 from servoctl.errors import SpecificationError, unknown
-from servoctl.spec.coordinates import column
 
 MISSED = 1e-9  # of the largest point: a spline that passes its points farther away is refused
 ORTHONORMAL = 1e-9  # by which products of a circle's axes may differ from those of unit vectors at right angles
