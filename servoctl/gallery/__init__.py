@@ -5,8 +5,8 @@
     model = sv.derive(*scene.build())
     run = sv.simulate(model, model.start(**scene.start, guess=scene.guess), scene.t_span)
 
-A file of one's own takes the place of a scene where it defines `scene()`, which returns (Mechanism, Program), and, if
-wanted, START, GUESS, T_SPAN and UNITS with the meanings of `start`, `guess`, `t_span` and `units` below.
+A user's file serves as a scene if it defines `scene()`, which returns (Mechanism, Program), and optionally START,
+GUESS, T_SPAN and UNITS with the meanings of `start`, `guess`, `t_span` and `units` below.
 """
 
 import re

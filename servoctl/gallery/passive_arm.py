@@ -16,7 +16,7 @@ def passive_arm(Gamma=0.3):
     Parameters
     ----------
     Gamma : float
-        Weight of the passive joint in the output; 0.5 stands for the angle of the arm's tip, roughly.
+        Weight of the passive joint in the output; 0.5 gives roughly the angle of the arm's tip.
 
     Returns
     -------

@@ -6,7 +6,7 @@ from servoctl.jets.elementary import apply
 
 
 class Plan:
-    """The nodes of a tape in an order in which those that are run together stand side by side.
+    """The nodes of a tape sorted so that those that are run together are neighbours.
 
     Parameters
     ----------
@@ -15,12 +15,12 @@ class Plan:
     Attributes
     ----------
     place : (n_nodes,) array of int
-        Where each node of the tape stands.
+        Of each node of the tape, in this order.
     constants, inputs : (places, values) and (places, indices)
     groups : list of (kind, data, slice, (operands, size) array)
         With the places of the operands. A square is a product here.
     slopes : dict of int to list of (size,) arrays
-        Of groups of kind "quad", by their first place: where dy/da stands for each operand.
+        Of groups of kind "quad", by their first place: the places of dy/da for each operand.
     """
 
     def __init__(self, nodes):

@@ -80,7 +80,7 @@ class Book:
         self._read = {}  # element hash: its scalars, and which of them it is
 
     def find(self, q, parameters, expressions):
-        """Where expressions stand; those that are new are read together.
+        """Where expressions are found; new ones are read together.
 
         Parameters
         ----------

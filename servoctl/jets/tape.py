@@ -37,7 +37,7 @@ _REFUSED = {
 }  # fmt: skip
 
 
-_OPTIONS = {"allow_free": True, "live_variables": False}  # every instruction has a place of its own
+_OPTIONS = {"allow_free": True, "live_variables": False}  # every instruction has its own place
 
 
 class Tape:
@@ -46,7 +46,7 @@ class Tape:
     Parameters
     ----------
     symbols : sequence of SX scalars or None
-        The inputs, in the order in which values are given for them; None for all that stand in the expressions.
+        The inputs, in the order of their values; None for all that the expressions hold.
     expressions : sequence of SX scalars
         The outputs.
 

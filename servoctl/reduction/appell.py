@@ -98,7 +98,7 @@ def realisation(mechanism, program, constraints, points):
         raise NotRealisable(
             f"The directions of the actuators {', '.join(mechanism.actuators)} and of the material constraints are "
             f"dependent (rank {rank.rank} of {B.shape[1]}).",
-            "Each actuator needs a direction of its own.",
+            "The directions of the actuators are independent of each other.",
             do="Remove an actuator or a constraint.",
         )
     dependent = tuple(sorted(rank.columns))
@@ -207,8 +207,7 @@ def require_inertia(mechanism, material, points):
         raise SpecificationError(
             f"The mass matrix is singular: a direction of {', '.join(names)} has no inertia.",
             "M = ∂²S/∂γ''² is positive definite on the displacements that material constraints allow.",
-            nearest="A small mass or inertia there, or one coordinate less.",
-            do="Check the masses and inertias and their default numbers.",
+            do="Check the masses and inertias and their numbers, or leave out a coordinate.",
             names=names,
         )
 

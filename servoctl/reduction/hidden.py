@@ -53,7 +53,7 @@ def complete(q, rows, context, starts=None):
     NotRealisable
         If the dependence involves the mechanism's dynamics.
     SingularProgram
-        If a row's gradient vanishes on its own solutions, or a rank cannot be told.
+        If a row's gradient vanishes on its own solutions, or a rank is undecided in double precision.
     InconsistentStart
         If no state satisfies the rows.
     """
@@ -176,8 +176,8 @@ def _require_affine(rows, support, top):
         raise SpecificationError(
             f"The residual {bent[0]!r} is not linear in its highest derivative and depends on other rows there.",
             "Hidden constraints are found among rows that are linear in their highest derivatives.",
-            nearest=f"The time derivative of {bent[0]!r}, which is linear in its highest derivative.",
-            do="Give that derivative as the residual and hold the residual itself at the start.",
+            do=f"Give the time derivative of {bent[0]!r}, which is linear in its highest derivative, as the "
+            "residual, and hold the residual itself at the start.",
             rows=bent,
         )
 
@@ -186,8 +186,7 @@ def _vanishing_gradient(row):
     return SingularProgram(
         f"The gradient of row {row.name!r} vanishes on its own solutions.",
         "A constraint is regular: a squared one, like φ² = 0, says nothing about the directions in which φ grows.",
-        nearest=f"A form of {row.name!r} that changes sign where it is crossed.",
-        do="State the residual that was squared, not its square.",
+        do=f"Write {row.name!r} so that it changes sign where it is crossed: what was squared, not its square.",
         row=row.name,
     )
 

@@ -42,7 +42,7 @@ class Reduction:
     switches : Switches
     context : Context
     given : dict of str to Row
-        The designer's residuals and the material constraints as they were given.
+        Rows of the designer's residuals and material constraints, by name.
     """
 
     mechanism: Mechanism
@@ -134,7 +134,7 @@ HELD = 1e-9  # of the size of its terms: what may be left of a residual at point
 
 
 def needs(rows):
-    """Derivatives of each residual, and of the given forces, that stand in γ'' and so in the actuation."""
+    """Derivatives of each residual and of the balance that γ'', and so the actuation, holds."""
     return merge_uses(*((row.uses, max(0, 2 - row.order)) for row in rows))
 
 
@@ -246,7 +246,7 @@ def _check(mechanism, program, guess):
     for value, kind in ((mechanism, Mechanism), (program, Program)):
         if not isinstance(value, kind):
             raise SpecificationError(
-                f"A {type(value).__name__} was given in the place of a {kind.__name__}.",
+                f"Expected a {kind.__name__}, got a {type(value).__name__}.",
                 "A model is derived from a mechanism and a program, in this order.",
                 do="Write sv.derive(mechanism, program).",
             )
@@ -258,7 +258,7 @@ def _check(mechanism, program, guess):
     twice = [name for name in program.residuals if name in mechanism.constraints]
     if twice:
         raise SpecificationError(
-            f"{twice[0]!r} names a residual and a material constraint.", "Each has a name of its own.", do="Rename one."
+            f"{twice[0]!r} names a residual and a material constraint.", "Their names differ.", do="Rename one of them."
         )
     known = [*q.names, *(name for k in range(1, 8) for name in q.jet_names(k))]
     for name, value in mapping(guess, "The guesses").items():
@@ -292,8 +292,7 @@ def _require_outputs(reduction):
             raise SpecificationError(
                 f"The output {name!r} has order {q.order(expression)}.",
                 f"A motion of this program has jets up to order {top}.",
-                nearest='simulate(..., method="Taylor", jets=...) for derivatives of any order.',
-                do="Give an output of lower order, and take its derivatives from such a run.",
+                do="Give an output of lower order, and take its derivatives from a run of the Taylor method with jets.",
                 name=name,
             )
 

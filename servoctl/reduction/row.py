@@ -38,7 +38,7 @@ class Row:
     story : str
         What was done to it, if it is a hidden constraint.
     uses : dict of (str or Balance) to int
-        Highest derivative of each program residual, and of the balance, that stands in it.
+        Highest derivative of each program residual, and of the balance, in it.
     """
 
     expression: ca.SX

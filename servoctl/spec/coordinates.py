@@ -19,7 +19,7 @@ _guard = threading.Lock()
 class Coordinates:
     """Generalised coordinates q, quasi-velocities w with q' = V w + h (3.1), and jets of any order.
 
-    Made by `coordinates`. Iterating gives the coordinates' symbols. Jets are created when first asked for.
+    Made by `coordinates`. Iterating gives the coordinates' symbols. Symbols of jets are made on first use.
 
     Attributes
     ----------
@@ -57,7 +57,7 @@ class Coordinates:
         return f"Coordinates({' '.join(self.names)}{frame})"
 
     def with_quasi_velocities(self, names, V, h=None, invariants=None):
-        """The same coordinates, moved by quasi-velocities w of one's own: q' = V w + h (3.1).
+        """The same coordinates, with quasi-velocities w: q' = V w + h (3.1).
 
         Parameters
         ----------
@@ -135,7 +135,7 @@ class Coordinates:
     def d(self, k=1):
         """The k-th time derivatives of the coordinates: a tuple of nq SX scalars.
 
-        Without quasi-velocities of one's own these are symbols; with them, expressions of w and its derivatives.
+        Symbols where q' = w, else expressions of w and its derivatives.
         """
         if _order(k) == 0:
             return self._q
@@ -166,7 +166,7 @@ class Coordinates:
         return self._index.get(symbol.element_hash())
 
     def order(self, expression):
-        """The highest k for which γ^(k) stands in an expression (0 for q alone, -1 for neither)."""
+        """The highest k for which an expression holds γ^(k) (0 for q alone, -1 for neither)."""
         if not isinstance(expression, ca.SX):
             expression = ca.SX(ca.vertcat(*column(expression, "the expression")))
         found = [self.where(s) for s in ca.symvar(expression)]
@@ -231,7 +231,7 @@ class _SymbolicMotion(Motion):
 def _order(k):
     if isinstance(k, bool) or not isinstance(k, Integral) or k < 0:
         raise SpecificationError(
-            f"A derivative of order {k!r} was asked for.",
+            f"The order of a derivative is {k!r}.",
             "An order is a whole number, at least 0.",
             do="Write q.d(1), q.w(1) or q.dt(expression, 2).",
         )
@@ -266,7 +266,7 @@ def _split(names, what):
     for name in names:
         if not name.isidentifier() or name in ("t", "guess"):
             raise SpecificationError(
-                f"{name!r} was given as a name.",
+                f"{name!r} is no name.",
                 "A name is a Python identifier other than t and guess, which are arguments of a start.",
                 do="Rename it.",
             )
@@ -275,7 +275,7 @@ def _split(names, what):
 
 
 def _refuse_clash(names):
-    """Refuse names of which one stands twice, or is the name of a derivative of another."""
+    """Refuse names that repeat, or that are names of derivatives of others."""
     owner = {}
     for name in names:
         if name in owner:
@@ -290,7 +290,7 @@ def _refuse_clash(names):
 def _clash(name, why):
     return SpecificationError(
         f"The name {name!r} clashes: {why}.",
-        "Every coordinate, quasi-velocity and derivative has a name of its own (theta, dtheta, d2theta, ...).",
+        "Coordinates, quasi-velocities and derivatives (theta, dtheta, d2theta, ...) have different names.",
         do="Rename one of them.",
         name=name,
     )
@@ -312,6 +312,6 @@ def coordinates(names):
     Raises
     ------
     SpecificationError
-        If a name is no identifier, is `t`, stands twice, or is also a derivative's name.
+        If a name is no identifier, is `t`, repeats, or is also a derivative's name.
     """
     return Coordinates(_split(names, "coordinates"))

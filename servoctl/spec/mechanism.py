@@ -27,7 +27,7 @@ class Mechanism:
     ----------
     q : Coordinates
     gibbs : SX, optional
-        Gibbs-Appell function S(t, q, γ', γ''), at most quadratic in γ'' (`particle`, `rigid_body`, or one's own).
+        Gibbs-Appell function S(t, q, γ', γ''), at most quadratic in γ'' (`particle`, `rigid_body`, or written out).
     potential : SX, optional
         Potential energy U(q, t) [J]; gives Γ = -Vᵀ ∂U/∂q.
     actuators : dict of str to SX or sequence, optional
@@ -167,8 +167,7 @@ class Mechanism:
                 "The Gibbs function is not quadratic in the accelerations." if self._gibbs is not None
                 else "The balance is not linear in the accelerations.",
                 "S = Σ m a·a/2 is quadratic in γ'', so that ∂S/∂γ'' is linear (3.8).",
-                nearest="S built by sv.particle and sv.rigid_body.",
-                do="Check the powers of the second derivatives.",
+                do="Build S by sv.particle and sv.rigid_body, or check the powers of the second derivatives.",
             )  # fmt: skip
         if self._gibbs is not None and self._kinetic is not None:
             difference = ca.gradient(self._gibbs, acceleration) - self._lagrange()
@@ -197,10 +196,10 @@ class Mechanism:
             outside = rest - v @ np.linalg.lstsq(v, rest, rcond=None)[0]
             if np.abs(outside).max(initial=0.0) > INTEGRABLE * max(1.0, np.abs(rest).max(initial=0.0)):
                 raise SpecificationError(
-                    "A kinetic energy was given in quasi-velocities whose frame V is not integrable.",
+                    "The kinetic energy is in quasi-velocities whose frame V is not integrable.",
                     "Lagrange's equations do not hold for velocities restricted by nonholonomic constraints.",
-                    nearest="A Gibbs function, which holds in any quasi-velocities (3.10).",
-                    do="Give gibbs=..., or all velocities and the constraints as material constraints.",
+                    do="Give a Gibbs function, which holds in any quasi-velocities (3.10), or all velocities with the "
+                    "constraints as material constraints.",
                 )
 
     def is_zero(self, items):
@@ -264,7 +263,7 @@ class Mechanism:
             what = f"actuator {name!r}"
             items = column(value, what)
             if not items:
-                raise SpecificationError(f"{what} is empty.", "It has a displacement or a direction.", do="Give one.")
+                raise SpecificationError(f"{what} is empty.", "An actuator has a displacement or a direction.")
             direction = isinstance(value, (list, tuple, np.ndarray)) or len(items) > 1
             if direction and len(items) != self.q.n:
                 rates = ", ".join(self.q.velocity_names)
