@@ -20,9 +20,8 @@ from servoctl.gallery.constant_speed import constant_speed
 from servoctl.gallery.cranes import crane_3d, overhead_crane, winch_crane
 from servoctl.gallery.links import planar_arm, spatial_arm
 from servoctl.gallery.mass_on_car import mass_on_car
-from servoctl.gallery.passive_arm import passive_arm
 from servoctl.gallery.spirals import spiral
-from servoctl.gallery.two_links import pendubot, two_link_arm
+from servoctl.gallery.two_links import passive_arm, pendubot, two_link_arm
 from servoctl.gallery.vtol import vtol
 from servoctl.gallery.wheeled_robot import wheeled_robot
 

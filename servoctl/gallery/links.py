@@ -8,7 +8,7 @@ from itertools import accumulate
 
 import casadi as ca
 
-from servoctl import spec as sv
+import servoctl as sv
 from servoctl.errors import SpecificationError, unknown
 
 COORDINATES = ("joints", "bodies")

@@ -4,7 +4,7 @@ from math import factorial
 
 import casadi as ca
 
-from servoctl import spec as sv
+import servoctl as sv
 from servoctl.errors import SpecificationError
 
 
