@@ -15,7 +15,7 @@ MOST_BRANCHES = 24  # affine pieces that are followed through one operation
 SCAN = 801  # instants at which switches that are not affine in t are looked for
 BISECTIONS = 60  # halvings of an interval between two of them: all digits of a double
 SAME_INSTANT = 1e-9  # of the time between the first and the last switch: closer ones are one
-FAR, CLOSE = 1e-4, 1e-7  # distances of series from an instant, of its neighbourhood
+WIDE, NARROW = 1e-4, 1e-7  # distances of series from an instant, of its neighbourhood
 JUMP = 1e-6  # of the largest value that a derivative takes nearby: smaller jumps are rounding
 STAYS = 0.5  # of the difference of far series is left between close ones at a jump; else it falls with the distance
 AROUND = np.setdiff1d(np.linspace(-1.0, 1.0, 41), [0.0])  # where a derivative's size is taken, of the neighbourhood
@@ -187,7 +187,7 @@ class Switches:
         if not times:
             return {}
         near = np.array([_neighbourhood(times, i) for i in range(len(times))])
-        far, close = FAR * near, CLOSE * near
+        far, close = WIDE * near, NARROW * near
         t = np.array([times - far, times + far, times - close, times + close, *(times + near * x for x in AROUND)])
         series = self._run(t.ravel(), values, max(needs.values(), default=0) + EXTRA + 1)
         result = {}

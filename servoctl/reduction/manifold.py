@@ -18,9 +18,9 @@ from servoctl.tolerances import CUTOFF
 ROUNDED = 8 * float(np.finfo(REAL).eps)  # a scaled residual below this is rounding
 ROUNDED_STEP = 1e-15  # a step from below this is worth one trial: shorter ones gain nothing
 WELL_CONDITIONED = 1e-3  # Cholesky pivots of A Aᵀ with unit diagonal above it: Newton's steps need no singular values
-CONVERGED = 1e-17  # relative step below which a level is solved
+LEVEL_SOLVED = 1e-17  # relative step below which a level is solved
 ON_MANIFOLD = 1e-13  # scaled residual of a point that is kept: far below ENTRY, so that zeros show
-STEPS = 60  # Gauss-Newton steps on all levels together
+GAUSS_NEWTON_STEPS = 60  # Gauss-Newton steps on all levels together
 COORDINATE_STEPS, JET_STEPS = 8, 2  # Newton steps for q, and for a level of jets, where rows are mostly affine
 SHORTENINGS = 12  # of a step, each to a quarter, before a point is given up
 SPREAD = 0.1  # relative width of starts about a guess, in its own size and in that usual for a value near zero
@@ -110,7 +110,7 @@ class Points:
 
 
 @np.errstate(all="ignore")  # trial steps may leave the domain of the rows: what is not finite is no improvement
-def solve(flow, t, z, iterations=STEPS):
+def solve(flow, t, z, iterations=GAUSS_NEWTON_STEPS):
     """Move jets onto the manifold of a flow's rows: level by level, then by damped Gauss-Newton on all levels.
 
     Parameters
@@ -185,7 +185,7 @@ def _solve_level(flow, t, z, level, scales):
         longest = np.max(np.abs(step) / (1.0 + np.abs(z[columns])), axis=0)
         z[columns] += step / np.maximum(1.0, longest) if level == 0 else step
         scales[rows] = _scales(slopes, z[columns])
-        if np.all(np.abs(step) <= CONVERGED * (1.0 + np.abs(z[columns]))):
+        if np.all(np.abs(step) <= LEVEL_SOLVED * (1.0 + np.abs(z[columns]))):
             break
 
 

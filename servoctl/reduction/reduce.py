@@ -129,7 +129,7 @@ NEARBY = 0.01  # s about an instant for which pivots are chosen: at the instant 
 NEAR_SPREAD = 1e-3  # relative width of the points about a state for which pivots are chosen
 WINDOW = (0.1, 1.1)  # s, where points are drawn if nothing switches; t = 0 is too often a special instant
 LONE_WINDOW = 1.0  # s on either side of a single switch
-INSIDE = 0.07  # of the time between the first and the last switch is left out at both ends, where paths begin and end
+INSET = 0.07  # of the time between the first and the last switch is left out at both ends, where paths begin and end
 HELD = 1e-9  # of the size of its terms: what may be left of a residual at points where the rows hold
 
 
@@ -308,7 +308,7 @@ def _context(mechanism, switches, guess, near, values):
         window = (times[0] - LONE_WINDOW, times[0] + LONE_WINDOW)
     elif times:
         width = times[-1] - times[0]
-        window = (times[0] + INSIDE * width, times[-1] - INSIDE * width)
+        window = (times[0] + INSET * width, times[-1] - INSET * width)
     return Context(mechanism.parameters.symbols, values, window, guess or {})
 
 
