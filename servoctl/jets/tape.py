@@ -68,12 +68,12 @@ class Tape:
 
     def __init__(self, symbols, expressions):
         function = ca.Function("tape", [], list(expressions), _OPTIONS)
-        found = function.free_sx()
-        self.symbols = list(found if symbols is None else symbols)
+        free = function.free_sx()
+        self.symbols = list(free if symbols is None else symbols)
         self.nodes, self.switches, self._pairs = [], [], {}
         inputs = {s.element_hash(): self._add("input", data=i) for i, s in enumerate(self.symbols)}
         self.outputs = [None] * len(expressions)
-        self._read(function, [inputs[s.element_hash()] for s in found])
+        self._read(function, [inputs[s.element_hash()] for s in free])
         if None in self.outputs:
             zero = self._add("const", data=0.0)
             self.outputs = [zero if node is None else node for node in self.outputs]

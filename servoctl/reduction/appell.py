@@ -104,7 +104,7 @@ def realisation(mechanism, program, constraints, points):
     dependent = tuple(sorted(rank.columns))
     independent = tuple(i for i in range(q.n) if i not in dependent)
     cleaned = clean(numbers, sizes)
-    regular = [p for p, own in enumerate(decide_each(cleaned[:, list(dependent)])) if own.rank == len(cleaned)]
+    regular = [p for p, rank in enumerate(decide_each(cleaned[:, list(dependent)])) if rank.rank == len(cleaned)]
     return Realisation(B, actuation, dependent, independent, cleaned[:, :, regular or [best]])
 
 

@@ -68,7 +68,7 @@ def complete(q, rows, context, starts=None):
         rank, _ = generic(ranks)
         if not rank.clear:
             raise _ill_conditioned(rows, rank)
-        same = [p for p, own in enumerate(ranks) if own.rank == rank.rank]
+        same = [p for p, other in enumerate(ranks) if other.rank == rank.rank]
         if rank.rank == len(rows):
             return rows, rank, points.take(same), guards
         combination = _lowest(q, rows, numbers[:, :, same], context, points)
@@ -226,7 +226,7 @@ def _no_common_state(q, rows, context):
     numbers, sizes = leading(q, rows, points)
     rank, _ = decide_all(numbers, sizes)
     if rank.clear and rank.rank < len(rows):
-        same = [p for p, own in enumerate(decide_each(numbers)) if own.rank == rank.rank]
+        same = [p for p, other in enumerate(decide_each(numbers)) if other.rank == rank.rank]
         combination = _lowest(q, rows, numbers[:, :, same], context)
         if combination.row.order < 0:
             return _dependent(rows, combination)
@@ -255,8 +255,8 @@ def _ill_conditioned(rows, rank):
 
 def as_rows(q, named, kind, context):
     """Rows of named residuals with their true orders."""
-    given = [Row(e, max(q.order(e), 0), name, kind, uses={name: 0}) for name, e in named.items()]
-    settled = settle_alone(q, given, context)
+    rows = [Row(e, max(q.order(e), 0), name, kind, uses={name: 0}) for name, e in named.items()]
+    settled = settle_alone(q, rows, context)
     for row, slopes in settled:
         if row.order < 0:
             raise SpecificationError(
@@ -275,13 +275,13 @@ def _refuse_square(q, row, context, slopes=None):
     A gradient without the highest jets is as large on the solutions, which determine these alone, as elsewhere; and
     so is an entry that holds no coordinate. `slopes` are the values of the gradient at the points, where known.
     """
-    own = row.gradient(q)
-    if row.order > 0 and q.order(own) < row.order:
+    slope = row.gradient(q)
+    if row.order > 0 and q.order(slope) < row.order:
         return
     if slopes is not None:
-        sizes, columns = np.abs(slopes), own.sparsity().get_triplet()[1]
+        sizes, columns = np.abs(slopes), slope.sparsity().get_triplet()[1]
         clear = np.all(sizes > VANISHED * sizes.max(axis=0), axis=1)
-        if any(clear[i] and q.order(e) < 0 for i, e in zip(columns, own.nonzeros(), strict=True)):
+        if any(clear[i] and q.order(e) < 0 for i, e in zip(columns, slope.nonzeros(), strict=True)):
             return
     start = sample(q, [], row.order, context)
     flow = Flow(q, [row], row.order, start)
@@ -303,8 +303,8 @@ def _regular_nearby(flow, t, z):
     """
     residual, slopes = flow(t, z)
     beside = z * (1.0 + np.random.default_rng(SEED).uniform(-BESIDE, BESIDE, z.shape))
-    own, other = np.abs(slopes[0]).max(axis=0), np.abs(flow(t, beside)[1][0]).max(axis=0)
+    here, there = np.abs(slopes[0]).max(axis=0), np.abs(flow(t, beside)[1][0]).max(axis=0)
     with np.errstate(all="ignore"):
         steps = np.abs(residual[0] * slopes[0]) / (slopes[0] ** 2).sum(axis=0)
     converged = np.all(steps <= VANISHED * np.abs(z), axis=0)
-    return bool(np.any(converged & (own > VANISHED * other)))
+    return bool(np.any(converged & (here > VANISHED * there)))

@@ -87,16 +87,16 @@ class Switches:
         if not self.timed:
             return []
         pieces = self._affine(values)
-        found = set()
+        instants = set()
         for a, b in self.timed:
             for c0, c1 in pieces[a] or ():
                 for d0, d1 in (pieces[b] or ()) if b is not None else ((0.0, 0.0),):
                     if c1 != d1:
-                        found.add((d0 - c0) / (c1 - d1))
-        window = [*found, *(span or ())]
+                        instants.add((d0 - c0) / (c1 - d1))
+        window = [*instants, *(span or ())]
         if window and max(window) > min(window):
-            found |= self._scan(values, min(window), max(window), found)
-        times = sorted(found)
+            instants |= self._scan(values, min(window), max(window), instants)
+        times = sorted(instants)
         width = max(times[-1] - times[0], SAME_INSTANT) if times else 1.0
         return [t for i, t in enumerate(times) if i == 0 or t - times[i - 1] > SAME_INSTANT * width]
 

@@ -75,10 +75,10 @@ class Points:
     def evaluate(self, expressions):
         """Values and sizes of SX scalars at the points: two arrays (len, N)."""
         result = np.empty((2, len(expressions), len(self.t)), dtype=REAL)
-        for scalars, own, given in self.book.find(self.q, self.parameters, expressions):
+        for scalars, sources, targets in self.book.find(self.q, self.parameters, expressions):
             if scalars not in self._found:
                 self._found[scalars] = scalars.evaluate(self.t, self.z, self.values)
-            result[:, given] = self._found[scalars][:, own]
+            result[:, targets] = self._found[scalars][:, sources]
         return result[0], result[1]
 
     def read(self, expressions):
@@ -93,9 +93,9 @@ class Points:
     def placed(self, sparsity, *nonzeros):
         """Arrays (rows, columns, N) from their nonzero entries (nnz, N)."""
         rows, columns = sparsity.get_triplet()
-        found = np.zeros((len(nonzeros), *sparsity.shape, len(self.t)), dtype=REAL)
-        found[:, rows, columns] = nonzeros
-        return tuple(found)
+        matrices = np.zeros((len(nonzeros), *sparsity.shape, len(self.t)), dtype=REAL)
+        matrices[:, rows, columns] = nonzeros
+        return tuple(matrices)
 
     def joined(self, other):
         """These points and others of the same jets."""
@@ -104,9 +104,9 @@ class Points:
 
     def take(self, keep):
         """Some of the points."""
-        kept = replace(self, t=self.t[keep], z=self.z[:, keep], residual=self.residual[keep])
-        kept._found.update((scalars, found[:, :, keep]) for scalars, found in self._found.items())
-        return kept
+        some = replace(self, t=self.t[keep], z=self.z[:, keep], residual=self.residual[keep])
+        some._found.update((scalars, values[:, :, keep]) for scalars, values in self._found.items())
+        return some
 
 
 @np.errstate(all="ignore")  # trial steps may leave the domain of the rows: what is not finite is no improvement

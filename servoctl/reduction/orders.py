@@ -31,9 +31,9 @@ def settle_alone(q, rows, context):
         With the values of its leading gradient at the points, where this look was enough.
     """
     levels = [q.order(row.expression) for row in rows]
-    found = [None] * len(rows)
+    settled = [None] * len(rows)
     for level in set(levels) - {-1}:
-        members = [a for a, own in enumerate(levels) if own == level and rows[a].order <= level]
+        members = [a for a, order in enumerate(levels) if order == level and rows[a].order <= level]
         points = sample(q, [], level, context)
         gradients = [rows[a].gradient(q, level) for a in members]
         points.read([*(rows[a].expression for a in members), *(e for g in gradients for e in g.nonzeros())])
@@ -41,8 +41,8 @@ def settle_alone(q, rows, context):
         for a, slopes, numbers in zip(members, gradients, values, strict=True):
             if np.any(numbers):
                 affine = q.order(slopes) < level or _affine(q, rows[a].expression, level, points)
-                found[a] = replace(rows[a], order=level, affine=affine), numbers
-    return [pair or (settle(q, row, [], context)[0], None) for pair, row in zip(found, rows, strict=True)]
+                settled[a] = replace(rows[a], order=level, affine=affine), numbers
+    return [pair or (settle(q, row, [], context)[0], None) for pair, row in zip(settled, rows, strict=True)]
 
 
 def settle(q, row, others, context, starts=None):
@@ -135,12 +135,12 @@ def _replace(q, row, j, values, lower, points):
 
 def _independent(rows, numbers):
     """A largest independent subset of rows, with their numbers."""
-    kept = []
+    independent = []
     for row, number in zip(rows, numbers, strict=True):
-        trial = [*kept, (row, number)]
+        trial = [*independent, (row, number)]
         if decide(np.array([n[:, 0] for _, n in trial])).rank == len(trial):
-            kept = trial
-    return kept
+            independent = trial
+    return independent
 
 
 def dependence(q, rows, numbers):

@@ -94,11 +94,11 @@ class Reduction:
     @cached_property
     def conditions(self):
         """What `holds` looks at: L, Bᵀ, and then the residuals with their derivatives, and the balance."""
-        q, own = self.mechanism.q, self.realisation.B
+        q, B = self.mechanism.q, self.realisation.B
         levels = (q.derivatives([row.expression], max(0, self.top - row.order)) for row in self.given.values())
-        left = [level[0] for found in levels for level in found]
-        free = self.mechanism.balance - own @ self.multipliers
-        return [*self.leading.nonzeros(), *own.T.nonzeros(), *left, *free.elements()]
+        left = [level[0] for orders in levels for level in orders]
+        free = self.mechanism.balance - B @ self.multipliers
+        return [*self.leading.nonzeros(), *B.T.nonzeros(), *left, *free.elements()]
 
     @cached_property
     def decided(self):
@@ -119,10 +119,10 @@ class Reduction:
     def actuation(self):
         """Required actuation u (m,) SX, or for an ideal program the reaction of the program, (n,) SX."""
         k = len(self.program.residuals)
-        own = self.multipliers[:k]
+        multipliers = self.multipliers[:k]
         if self.program.by == "actuators":
-            return ca.cse(self.realisation.actuation @ own)
-        return ca.cse(self.realisation.B[:, :k] @ own)
+            return ca.cse(self.realisation.actuation @ multipliers)
+        return ca.cse(self.realisation.B[:, :k] @ multipliers)
 
 
 NEARBY = 0.01  # s about an instant for which pivots are chosen: at the instant alone, accidents look like laws
@@ -140,11 +140,11 @@ def needs(rows):
 
 def smoothness(switches, rows):
     """The class in time that each expression of the switches needs; a force that no derivative is taken of may jump."""
-    found = needs(rows)
-    forces = found.pop(Balance(), 0)
+    total = needs(rows)
+    forces = total.pop(Balance(), 0)
     if forces:
-        found |= {name: forces for name in switches.residuals if isinstance(name, Balance)}
-    return found
+        total |= {name: forces for name in switches.residuals if isinstance(name, Balance)}
+    return total
 
 
 def _idle(row, program):
@@ -185,8 +185,11 @@ def reduce(mechanism, program, guess=None, near=None, values=None):
     forces = {Balance(name): r for name, r in zip(names, mechanism.balance.elements(), strict=True)}
     switches = Switches(q, {**program.residuals, **mechanism.constraints, **forces}, mechanism.parameters.symbols)
     context = _context(mechanism, switches, guess, near, values)
-    given = as_rows(q, program.residuals, "program", context) + as_rows(q, mechanism.constraints, "material", context)
-    constraints, points, guards = _constraints(mechanism, program, given, context)
+    original = [
+        *as_rows(q, program.residuals, "program", context),
+        *as_rows(q, mechanism.constraints, "material", context),
+    ]
+    constraints, points, guards = _constraints(mechanism, program, original, context)
     split = realisation(mechanism, program, constraints, points)
     expressions, pivots = split.dynamics(mechanism.balance)
     guards = [*guards, *((f"choice of dependent coordinates {i + 1}", p) for i, p in enumerate(pivots))]
@@ -200,12 +203,12 @@ def reduce(mechanism, program, guess=None, near=None, values=None):
             raise _idle(row, program)
     rows, rank, points, more = complete(q, [*constraints, *dynamics], context, points)
     knots = require_smooth(switches, context.values, smoothness(switches, rows))
-    by_name = {row.name: row for row in given}
-    found = Reduction(
+    by_name = {row.name: row for row in original}
+    reduction = Reduction(
         mechanism, program, tuple(rows), split, rank, points, (*guards, *more), knots, switches, context, by_name
     )
-    _require_outputs(found)
-    return found
+    _require_outputs(reduction)
+    return reduction
 
 
 def holds(reduction, values):
@@ -232,14 +235,14 @@ def holds(reduction, values):
     for sparsity in (r.leading.sparsity(), r.realisation.B.T.sparsity()):
         entries = slice(start, start + sparsity.nnz())
         old, new = (
-            clean(*p.placed(sparsity, *(part[entries] for part in found)))
-            for p, found in ((r.points, r.decided), (points, after))
+            clean(*p.placed(sparsity, *(part[entries] for part in values_and_sizes)))
+            for p, values_and_sizes in ((r.points, r.decided), (points, after))
         )
         if np.any(np.any(new, axis=2) & ~np.any(old, axis=2)) or decide(new[:, :, 0]).rank < len(new):
             return False
         start = entries.stop
-    found, sizes = (part[start:] for part in after)
-    return bool(np.all(np.abs(found) <= HELD * np.maximum(sizes, TINY)))
+    left, sizes = (part[start:] for part in after)
+    return bool(np.all(np.abs(left) <= HELD * np.maximum(sizes, TINY)))
 
 
 def _check(mechanism, program, guess):
@@ -314,5 +317,5 @@ def _context(mechanism, switches, guess, near, values):
 
 def _points_for(q, constraints, points, context):
     """Points on the manifold of all constraints, or on that of the material ones where there are none."""
-    found = sample(q, constraints, max([2, *(row.order for row in constraints)]), context)
-    return found if len(found.t) else points
+    common = sample(q, constraints, max([2, *(row.order for row in constraints)]), context)
+    return common if len(common.t) else points

@@ -156,8 +156,8 @@ def _points(reduction, t, jets, values):
     """Points of a motion from its samples."""
     from math import factorial
 
-    q, given = reduction.mechanism.q, np.asarray(jets, dtype=np.longdouble)
-    z = given.copy()
+    q, samples = reduction.mechanism.q, np.asarray(jets, dtype=np.longdouble)
+    z = samples.copy()
     for k in range(1, (len(z) - q.nq) // q.n + 1):
         z[q.nq + (k - 1) * q.n : q.nq + k * q.n] /= factorial(k)
     sample = reduction.points
@@ -167,9 +167,9 @@ def _points(reduction, t, jets, values):
 
 def _locals(reduction, points):
     for depth in DEPTHS:
-        found = _at_depth(reduction, points, depth)
-        if found is not None:
-            return found
+        locals_ = _at_depth(reduction, points, depth)
+        if locals_ is not None:
+            return locals_
     return [Local((), 0, (), (), None, 0.0)] * len(points.t)
 
 
@@ -246,23 +246,23 @@ def _response(jacobian, b, plant, bound, k, depth):
     motion = np.zeros((n * size, k, size), dtype=np.longdouble)
     reaction = np.zeros((k_m, size, k, size), dtype=np.longdouble)
     for i in range(size):
-        own = [*order[i * n : (i + 1) * n], *(n * size + i * k_m + m for m in range(k_m))]
-        block = rows[own][:, i * n : (i + 1) * n]
+        members = [*order[i * n : (i + 1) * n], *(n * size + i * k_m + m for m in range(k_m))]
+        block = rows[members][:, i * n : (i + 1) * n]
         matrix = np.block([[block[:n], -b[k:, :, 0].T], [block[n:], np.zeros((k_m, k_m))]])
         right = np.zeros((n + k_m, k, size), dtype=np.longdouble)
         for j in range(i + 1):
             right[:n, :, j] += b[:k, :, i - j].T
             if j < i:
                 right[:n] += np.einsum("am,mkl->akl", b[k:, :, i - j].T, reaction[:, j])
-        right -= np.einsum("ac,ckl->akl", rows[own][:, : i * n], motion[: i * n])
+        right -= np.einsum("ac,ckl->akl", rows[members][:, : i * n], motion[: i * n])
         solution = solve_clean(matrix, right.reshape(n + k_m, -1)).reshape(n + k_m, k, size)
         motion[i * n : (i + 1) * n], reaction[:, i] = solution[:n], solution[n:]
     return motion.reshape(n * size, k * size)
 
 
 def _rank(matrix):
-    found = decide(matrix, INDEPENDENT)
-    return found.rank, found.kept
+    rank = decide(matrix, INDEPENDENT)
+    return rank.rank, rank.kept
 
 
 def _local(J, k, depth):

@@ -169,8 +169,8 @@ class Coordinates:
         """The highest k for which an expression holds γ^(k) (0 for q alone, -1 for neither)."""
         if not isinstance(expression, ca.SX):
             expression = ca.SX(ca.vertcat(*column(expression, "the expression")))
-        found = [self.where(s) for s in ca.symvar(expression)]
-        return max([-1, *(w[1] for w in found if w is not None and w[0] in "qw")])
+        places = [self.where(s) for s in ca.symvar(expression)]
+        return max([-1, *(place[1] for place in places if place is not None and place[0] in "qw")])
 
     def derivatives(self, expressions, k):
         """Total derivatives of orders 0 to k by one propagation of Taylor series.

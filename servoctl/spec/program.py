@@ -102,13 +102,13 @@ class Program:
                 do="Write the slower program yourself.",
             )
         symbols, values = [q.t], [instant + (q.t - instant) / sigma]
-        own = {name: ca.SX(value) for name, value in self.weights.items()}
-        for k in range(1, max(map(q.order, (*self.residuals.values(), *own.values()))) + 1):
+        weights = {name: ca.SX(value) for name, value in self.weights.items()}
+        for k in range(1, max(map(q.order, (*self.residuals.values(), *weights.values()))) + 1):
             symbols += q.gamma(k)
             values += [sigma**k * s for s in q.gamma(k)]
-        slower = iter(ca.substitute([*self.residuals.values(), *own.values()], symbols, values))
+        slower = iter(ca.substitute([*self.residuals.values(), *weights.values()], symbols, values))
         residuals = {name: next(slower) for name in self.residuals}
-        return Program(residuals, self.by, {name: next(slower) for name in own} or None)
+        return Program(residuals, self.by, {name: next(slower) for name in weights} or None)
 
     def __repr__(self):
         return f"Program({', '.join(self.residuals)}; by {self.by})"
