@@ -12,7 +12,7 @@ import numpy as np
 from servoctl.errors import InconsistentStart, NotRealisable, SingularProgram, SpecificationError
 from servoctl.jets.flow import Flow
 from servoctl.reduction.elimination import eliminate
-from servoctl.reduction.manifold import SEED, sample, solve
+from servoctl.reduction.manifold import POINTS_SEED, sample, solve
 from servoctl.reduction.orders import dependence, leading, settle, settle_alone
 from servoctl.reduction.ranks import clean, decide, decide_all, decide_each, generic
 from servoctl.reduction.row import Row, merge_uses
@@ -302,7 +302,7 @@ def _regular_nearby(flow, t, z):
     Newton's method has converged at a regular solution; at that of a square its steps only halve the way.
     """
     residual, slopes = flow(t, z)
-    beside = z * (1.0 + np.random.default_rng(SEED).uniform(-BESIDE, BESIDE, z.shape))
+    beside = z * (1.0 + np.random.default_rng(POINTS_SEED).uniform(-BESIDE, BESIDE, z.shape))
     here, there = np.abs(slopes[0]).max(axis=0), np.abs(flow(t, beside)[1][0]).max(axis=0)
     with np.errstate(all="ignore"):
         steps = np.abs(residual[0] * slopes[0]) / (slopes[0] ** 2).sum(axis=0)

@@ -25,7 +25,7 @@ COORDINATE_STEPS, JET_STEPS = 8, 2  # Newton steps for q, and for a level of jet
 SHORTENINGS = 12  # of a step, each to a quarter, before a point is given up
 SPREAD = 0.1  # relative width of starts about a guess, in its own size and in that usual for a value near zero
 POINTS = 5  # at which ranks are decided; as many starts again where one of the first fails
-SEED = 1907  # of the random starts
+POINTS_SEED = 1907  # of the random starts
 
 
 @dataclass(frozen=True)
@@ -269,7 +269,7 @@ def sample(q, rows, level, context, starts=None, flow=None):
 
 def _random_starts(q, level, context):
     """Times (2 POINTS,) in the window and jets (nz, 2 POINTS) about the guess, in [-1, 1] where there is none."""
-    rng, nz = np.random.default_rng(SEED), q.nq + level * q.n
+    rng, nz = np.random.default_rng(POINTS_SEED), q.nq + level * q.n
     centre, spread = np.zeros(nz), np.ones(nz)
     for name, value in context.guess.items():
         for k in range(level + 1):
