@@ -138,3 +138,31 @@ def test_negative_an_inertia_is_negative_below_1e_9_of_its_size(excess, negative
         assert set(caught.value.details["names"]) == {"dx", "dy"}
     else:
         assert sv.derive(mechanism, program).free == 2
+
+
+@pytest.mark.parametrize("height, refused", [(3e-6, True), (3e-7, False)])
+def test_jump_a_path_jumps_above_1e_6_of_its_largest_value_nearby(height, refused):
+    q = sv.coordinates("x")
+    (x,) = q
+    mechanism = sv.Mechanism(q, gibbs=sv.particle(q, 1.0, x), actuators={"force": x})
+    program = sv.Program({"a": x - ca.cos(q.t - 1.0) - height * (q.t > 1.0)})
+    if refused:
+        with pytest.raises(SpecificationError) as caught:
+            sv.derive(mechanism, program)
+        assert caught.value.details["has"] == -1 and caught.value.details["t"] == pytest.approx(1.0)
+    else:
+        assert sv.derive(mechanism, program).free == 0
+
+
+@pytest.mark.parametrize("twist, integrable", [(5e-9, False), (5e-10, True)])
+def test_integrable_a_frame_is_integrable_up_to_1e_9(twist, integrable):
+    """The bracket of (1, 0, 0) and (0, 1, ε x) is (0, 0, ε), outside their span."""
+    q = sv.coordinates("x y z")
+    x = list(q)[0]
+    q = q.with_quasi_velocities("u v", [[1, 0], [0, 1], [0, twist * x]])
+    u, v = q.w()
+    if integrable:
+        sv.Mechanism(q, kinetic=(u**2 + v**2) / 2)
+    else:
+        with pytest.raises(SpecificationError):
+            sv.Mechanism(q, kinetic=(u**2 + v**2) / 2)

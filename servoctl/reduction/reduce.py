@@ -179,7 +179,7 @@ def reduce(mechanism, program, guess=None, near=None, values=None):
     SpecificationError, NotRealisable, SingularProgram, InconsistentStart
         See `hidden.complete` and `appell.realisation`.
     """
-    _check(mechanism, program, guess)
+    _require_parts(mechanism, program, guess)
     q = mechanism.q
     names = q.names if q.plain else q.velocity_names
     forces = {Balance(name): r for name, r in zip(names, mechanism.balance.elements(), strict=True)}
@@ -245,7 +245,7 @@ def holds(reduction, values):
     return bool(np.all(np.abs(left) <= HELD * np.maximum(sizes, TINY)))
 
 
-def _check(mechanism, program, guess):
+def _require_parts(mechanism, program, guess):
     for value, kind in ((mechanism, Mechanism), (program, Program)):
         if not isinstance(value, kind):
             raise SpecificationError(

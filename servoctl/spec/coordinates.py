@@ -13,7 +13,7 @@ from servoctl.jets.motion import Motion
 from servoctl.jets.series import Series, is_zero
 from servoctl.jets.tape import Tape
 
-_guard = threading.Lock()
+_lock = threading.Lock()
 
 
 class Coordinates:
@@ -80,7 +80,7 @@ class Coordinates:
         SpecificationError
             If sizes disagree or a name is taken.
         """
-        names = _split(names, "quasi-velocities")
+        names = _identifiers(names, "quasi-velocities")
         V = matrix(V, "V")
         if V.shape != (self.nq, len(names)):
             raise SpecificationError(
@@ -114,7 +114,7 @@ class Coordinates:
     def gamma(self, k):
         """Symbols of γ^(k), k >= 1: a tuple of n SX scalars. γ' are the quasi-velocities."""
         if k not in self._w:
-            with _guard:  # threads that derive from one mechanism share its symbols
+            with _lock:  # threads that derive from one mechanism share its symbols
                 if k not in self._w:
                     symbols = tuple(map(ca.SX.sym, self.jet_names(k)))
                     self._index |= {s.element_hash(): ("w", k, i) for i, s in enumerate(symbols)}
@@ -256,7 +256,7 @@ def jet_name(name, k, plain=True):
     return name if order == 0 else f"d{name}" if order == 1 else f"d{order}{name}"
 
 
-def _split(names, what):
+def _identifiers(names, what):
     if not isinstance(names, str) or not names.split():
         raise SpecificationError(
             f"The names of the {what} are {names!r}.", "They are one text of names separated by blanks.",
@@ -314,4 +314,4 @@ def coordinates(names):
     SpecificationError
         If a name is no identifier, is `t`, repeats, or is also a derivative's name.
     """
-    return Coordinates(_split(names, "coordinates"))
+    return Coordinates(_identifiers(names, "coordinates"))

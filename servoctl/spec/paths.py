@@ -59,7 +59,7 @@ def rest_to_rest(t, start, end, duration, smoothness=4, t_start=0.0):
     """
     t, t_start = _scalar(t, "t"), _scalar(t_start, "t_start")
     sigma = ca.fmin(ca.fmax((t - t_start) / _positive(duration, "duration"), 0), 1)
-    return line(_step(sigma, _smoothness(smoothness)), start, end)
+    return line(_smooth_step(sigma, _smoothness(smoothness)), start, end)
 
 
 def trapezoid(t, distance, duration, ramp, smoothness=4, t_start=0.0):
@@ -245,14 +245,14 @@ def spline(t, times, points, smoothness=2, ends="rest"):
     return value
 
 
-def _step(sigma, k):
+def _smooth_step(sigma, k):
     """Regularised incomplete beta function I_sigma(k + 1, k + 1): 0 to 1, k derivatives zero at both ends."""
     binomials = ca.SX([math.comb(2 * j, j) for j in range(k, -1, -1)])
     return 0.5 + (sigma - 0.5) * ca.polyval(binomials, sigma * (1 - sigma))
 
 
 def _integral_of_step(sigma, k):
-    """Integral of `_step` from 0 to sigma: (sigma - sum_(j=0..k) Catalan_j (sigma (1 - sigma))^(j+1))/2."""
+    """Integral of `_smooth_step` from 0 to sigma: (sigma - sum_(j=0..k) Catalan_j (sigma (1 - sigma))^(j+1))/2."""
     catalan = ca.SX([math.comb(2 * j, j) // (j + 1) for j in range(k, -1, -1)] + [0])
     return (sigma - ca.polyval(catalan, sigma * (1 - sigma))) / 2
 
