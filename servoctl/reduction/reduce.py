@@ -20,6 +20,13 @@ from servoctl.spec.mechanism import Mechanism, require_known
 from servoctl.spec.program import Program
 from servoctl.tolerances import TINY
 
+NEARBY = 0.01  # s about an instant for which pivots are chosen: at the instant alone, accidents look like laws
+NEAR_SPREAD = 1e-3  # relative width of the points about a state for which pivots are chosen
+WINDOW = (0.1, 1.1)  # s, where points are drawn if nothing switches; t = 0 is too often a special instant
+LONE_WINDOW = 1.0  # s on either side of a single switch
+INSET = 0.07  # of the time between the first and the last switch is left out at both ends, where paths begin and end
+HELD = 1e-9  # of the size of its terms: what may be left of a residual at points where the rows hold
+
 
 @dataclass(frozen=True)
 class Reduction:
@@ -123,14 +130,6 @@ class Reduction:
         if self.program.by == "actuators":
             return ca.cse(self.realisation.actuation @ multipliers)
         return ca.cse(self.realisation.B[:, :k] @ multipliers)
-
-
-NEARBY = 0.01  # s about an instant for which pivots are chosen: at the instant alone, accidents look like laws
-NEAR_SPREAD = 1e-3  # relative width of the points about a state for which pivots are chosen
-WINDOW = (0.1, 1.1)  # s, where points are drawn if nothing switches; t = 0 is too often a special instant
-LONE_WINDOW = 1.0  # s on either side of a single switch
-INSET = 0.07  # of the time between the first and the last switch is left out at both ends, where paths begin and end
-HELD = 1e-9  # of the size of its terms: what may be left of a residual at points where the rows hold
 
 
 def needs(rows):
