@@ -8,7 +8,7 @@ from servoctl.codegen.function import compiled
 from servoctl.codegen.interpreted import Interpreter
 from servoctl.codegen.loops import ROUNDING
 from servoctl.codegen.native import pointer
-from servoctl.methods.radau_tableau import STEPS, basis, radau
+from servoctl.methods.radau_tableau import basis, radau
 
 TOLERANCE = 1e-2  # of the Newton iteration, relative to the tolerance of a step
 TIGHT, PATIENT = 1e-4, 3  # the same where steps are fixed, and how many times more iterations they may take
@@ -54,7 +54,7 @@ class Implicit:
     """
 
     def __init__(self, f, jacobian, project, name):
-        self.f = compiled(f, name, project=project, others={"jacobian": jacobian}, drivers=STEPS)
+        self.f = compiled(f, name, ("radau",), project, {"jacobian": jacobian})
         self._functions = (f, jacobian, project)
 
     @property
@@ -185,7 +185,7 @@ def _rounded(h):
 
 
 class _Loop:
-    """The loop of `radau.STEPS` in Python over CasADi's evaluation."""
+    """The loop of radau.c in Python over CasADi's evaluation."""
 
     def __init__(self, functions, p, parts, settings):
         f, jacobian, project = functions
