@@ -71,6 +71,7 @@ class _Invariants:
         return value / np.maximum(np.sqrt((jacobian**2 * (1.0 + np.abs(x)) ** 2).sum(axis=1)), 1e-300)
 
 
+@np.errstate(all="ignore")  # trial steps may leave the domain of the equations
 def consistent(model, t, held, guess):
     """See `Model.start`."""
     names = model.state_names
