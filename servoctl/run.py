@@ -222,7 +222,7 @@ class Run(Value):
                 continue
             centre, width = self.t[k], np.ptp(self.t[window]) / 2
             s = (self.t[window] - centre) / width
-            polynomial = np.polynomial.Polynomial.fit(s, values[window], len(s) - 1, domain=[-1, 1])
+            polynomial, _ = np.polynomial.Polynomial.fit(s, values[window], len(s) - 1, domain=[-1, 1], full=True)
             neighbours = [(self.t[i] - centre) / width for i in (k - 1, k + 1) if i in inside]
             for root in polynomial.deriv().roots():
                 if abs(root.imag) < 1e-9 and min([*neighbours, 0.0]) <= root.real <= max([*neighbours, 0.0]):

@@ -199,3 +199,16 @@ def test_real_powers_that_start_from_zero_are_as_smooth_as_they_are(exponent):
     """max(t - 1, 0)^4.5 is of class C^4."""
     model = follower(lambda t, p: ca.power(ca.fmax(t - 1, 0), exponent))
     assert model.knots == pytest.approx([1.0])
+
+
+def test_a_residual_may_be_named_like_a_force():
+    """Two cars need C^4 of the path, whatever its residual is called."""
+    q = sv.coordinates("x1 x2")
+    x1, x2 = q
+    S = sv.particle(q, 1.0, x1) + sv.particle(q, 1.0, x2)
+    mechanism = sv.Mechanism(q, gibbs=S, potential=(x1 - x2) ** 2 / 2, actuators={"force": x2})
+    path = sv.paths.rest_to_rest(q.t, 0.0, 1.0, duration=2.0, smoothness=2)
+    with pytest.raises(SpecificationError) as caught:
+        derive(mechanism, sv.Program({"the force on x1": x1 - path}))
+    assert caught.value.details["name"] == "the force on x1"
+    assert (caught.value.details["needs"], caught.value.details["has"]) == (4, 2)

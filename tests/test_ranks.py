@@ -7,7 +7,8 @@ from conftest import numbers
 
 from servoctl.errors import SingularProgram
 from servoctl.reduction.elimination import eliminate
-from servoctl.reduction.ranks import NOISE, clean, combination, decide, decide_all, equilibrate
+from servoctl.reduction.ranks import clean, combination, decide, decide_all, equilibrate
+from servoctl.tolerances import NOISE
 
 LONG = np.longdouble
 

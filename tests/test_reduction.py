@@ -11,7 +11,7 @@ from servoctl import spec as sv
 from servoctl.errors import InconsistentStart, NotRealisable, SingularProgram, SpecificationError
 from servoctl.gallery import cars, gallery, mass_on_car, overhead_crane, passive_arm, spiral
 from servoctl.model.model import derive
-from servoctl.reduction.ranks import EXTENDED
+from servoctl.tolerances import EXTENDED
 
 
 def orders(model):

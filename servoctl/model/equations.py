@@ -10,7 +10,6 @@ from servoctl.model import saddle
 from servoctl.reduction.appell import plant_accelerations
 from servoctl.reduction.elimination import eliminate
 from servoctl.reduction.ranks import clean, column_sizes
-from servoctl.reduction.row import gradient
 from servoctl.spec.coordinates import jet_name
 
 
@@ -69,7 +68,7 @@ class Invariants:
             values = ca.vertcat(*(self.levels[a][level - self.rows[a].order] for a in rows))
             change = ca.SX.zeros(q.n)
             if rows:
-                J = ca.vertcat(*(gradient(q, self.rows[a]) for a in rows))
+                J = ca.vertcat(*(self.rows[a].gradient(q) for a in rows))
                 saddle = ca.vertcat(ca.horzcat(mass, J.T), ca.horzcat(J, ca.SX.zeros(len(rows), len(rows))))
                 numbers = clean(*self.points.matrix(saddle))
                 change = eliminate(saddle, ca.vertcat(ca.SX.zeros(q.n), -values), numbers)[0][: q.n]
@@ -399,6 +398,6 @@ def gradient_jets(reduction, name):
     q = reduction.mechanism.q
     for row in (*reduction.rows, *reduction.given.values()):
         if row.name == name:
-            places = [q.where(s) for s in ca.symvar(gradient(q, row))]
+            places = [q.where(s) for s in ca.symvar(row.gradient(q))]
             return [q.jet_names(level)[i] for kind, level, i in filter(None, places) if kind != "t"]
     return []

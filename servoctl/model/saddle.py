@@ -11,7 +11,6 @@ from servoctl.codegen.emit import operations
 from servoctl.errors import SpecificationError
 from servoctl.reduction.elimination import eliminate
 from servoctl.reduction.ranks import clean
-from servoctl.reduction.row import gradient
 
 FEW = 8  # quasi-velocities: up to here (3.18) takes about as few operations
 CLOSE = 1.1  # times as many operations: up to here merging of common terms decides which are fewer
@@ -50,7 +49,7 @@ def solve(equations, poles=False):
     r, q = equations.r, equations.q
     constraints = [a for a, row in enumerate(r.rows) if row.kind != "dynamics"]
     B, size = r.realisation.B, len(constraints)
-    G = ca.vertcat(*(gradient(q, r.rows[a]) for a in constraints))
+    G = ca.vertcat(*(r.rows[a].gradient(q) for a in constraints))
     matrix = ca.vertcat(ca.horzcat(r.mechanism.mass, -B), ca.horzcat(G, ca.SX(size, B.shape[1])))
     acceleration = q.jet(2)
     rest = ca.substitute(r.mechanism.balance, acceleration, ca.SX.zeros(q.n))

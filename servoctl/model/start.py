@@ -92,6 +92,7 @@ class _Aim:
         return replace(self, movable=movable)
 
 
+@np.errstate(all="ignore")  # trial steps may leave the domain of the equations
 def consistent(model, t, held, guess):
     """See `Model.start`."""
     names = model.state_names

@@ -63,7 +63,7 @@ def rigid_body(q, mass, inertia, position=None, rotation=None, rates=None):
     """
     if (rotation is None) == (rates is None):
         raise SpecificationError(
-            "rigid_body was given " + ("neither" if rates is None else "both") + " of rotation and rates.",
+            f"rigid_body has {'neither' if rates is None else 'both'} of rotation and rates.",
             "The body's rates come from one of them.",
             do="Give rotation=R(q) or rates=ω(q, q').",
         )
