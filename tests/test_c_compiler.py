@@ -6,7 +6,7 @@ import warnings
 import casadi as ca
 import numpy as np
 import pytest
-from test_compiled import P1, RK4, X2, T, function, numpy_rk4, pendulum
+from test_compiled_functions import P1, RK4, X2, T, function, numpy_rk4, pendulum
 
 from servoctl.codegen import compiler
 from servoctl.codegen.function import GRID_POINTS, SCALAR_CALLS, SOLVED, compiled
