@@ -7,6 +7,7 @@ import subprocess
 
 import numpy as np
 import pytest
+from refusals import refused
 
 import servoctl as sv
 from servoctl.codegen.compiler import compiler
@@ -40,19 +41,17 @@ MEMORY = {
 def test_laws_without_expressions_name_themselves_and_what_can_be_exported(plan, tmp_path):
     plant = sv.plant(CRANE, limits={"trolley": 150.0})
     inside = sv.lqr(plan, plant)
-    with pytest.raises(
-        SpecificationError, match="limited by weight.*quadratic program.*'lqr, time-varying'.*`limited`"
-    ):
+    with refused(SpecificationError, "limited by weight", "'lqr, time-varying'"):
         sv.export_c(sv.limited(inside, plant), tmp_path)
     own = sv.Law("held", (), ("trolley", "hoist"), 100.0, 0.0, lambda t, x, row: row, np.zeros((2, 1)))
-    with pytest.raises(SpecificationError, match="'held'.*written in Python"):
+    with refused(SpecificationError, "'held'", "Python"):
         sv.export_c(own, tmp_path)
-    with pytest.raises(SpecificationError, match="A dict is to be exported"):
+    with refused(SpecificationError, "dict", "Model", "Law"):
         sv.export_c({}, tmp_path)
     for folder in (None, 3):
-        with pytest.raises(SpecificationError, match=f"folder={folder}"):
+        with refused(SpecificationError, f"folder={folder}"):
             sv.export_c(inside, folder)
-    with pytest.raises(SpecificationError, match="A int was given as start"):
+    with refused(SpecificationError, "int", "start"):
         sv.export_c(plan.model, tmp_path, start=3)
 
 
@@ -134,5 +133,5 @@ def test_the_table_is_a_constant_and_indices_have_names(plan, tmp_path):
 
 def test_a_law_that_allocates_in_python_is_refused(plan, tmp_path):
     machine = sv.plant(CRANE, limits={"trolley": 120.0})
-    with pytest.raises(SpecificationError, match="limited law solves a quadratic program"):
+    with refused(SpecificationError, "limited by weight"):
         sv.export_c(sv.limited(sv.lqr(plan, sv.plant(CRANE)), machine), tmp_path)
