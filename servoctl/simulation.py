@@ -4,12 +4,13 @@ from dataclasses import replace
 
 import numpy as np
 
+from servoctl.checks import as_span, is_number, is_whole
 from servoctl.errors import InconsistentStart, SpecificationError, unknown
 from servoctl.methods.accuracy import accurate
 from servoctl.methods.adaptive import METHODS, ONE_STEP, Adaptive
 from servoctl.methods.algebraic import algebraic
 from servoctl.methods.bounds import row_poles, warn_many_steps
-from servoctl.methods.drift import Minimal, Poles, Project, as_drift, is_whole
+from servoctl.methods.drift import Minimal, Poles, Project, as_drift
 from servoctl.methods.minimal import require_minimal
 from servoctl.methods.motion import Progress
 from servoctl.methods.radau import RADAU_ORDERS, RadauMethod
@@ -176,19 +177,6 @@ def _resample(run, times):
     variants = tuple((i, i + 1, model) for i, model in enumerate(owner)) if len(run.variants) > 1 else run.variants[:1]
     variants = tuple((0, len(times), v[2]) for v in variants) if len(variants) == 1 else variants
     return replace(run, t=times, jets=np.array([run.at(t) for t in times]).T, variants=variants)
-
-
-def as_span(t_span):
-    """A span of time as two different finite numbers [s]."""
-    try:
-        t0, t1 = map(float, t_span)
-    except (TypeError, ValueError):
-        t0 = t1 = np.nan
-    if not (np.isfinite(t0) and np.isfinite(t1)) or t0 == t1:
-        raise SpecificationError(
-            f"t_span={t_span!r} was given.", "A span is two different finite times.", do="Give (0.0, 2.0)."
-        )
-    return t0, t1
 
 
 def _method(model, method):
@@ -377,9 +365,3 @@ def _tolerance(name, value, usual):
             f"{name}={value!r} was given.", "A tolerance is a positive number, at most 1.", do=f"Give {usual:g}."
         )
     return float(value)
-
-
-def is_number(value):
-    """Whether a value is a finite number, Python's or NumPy's; True and False are none."""
-    numbers = (int, float, np.integer, np.floating)
-    return isinstance(value, numbers) and not isinstance(value, bool) and bool(np.isfinite(value))

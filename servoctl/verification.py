@@ -4,8 +4,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from servoctl.checks import is_whole
 from servoctl.errors import SpecificationError
-from servoctl.methods.drift import is_whole
 from servoctl.model.equations import residual_rows
 
 LIMITS = {

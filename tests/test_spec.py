@@ -337,7 +337,7 @@ def test_a_quadratic_gibbs_function_in_disguise_is_accepted():
         ({"gibbs": "S", "constraints": {"rail": "d3x"}}, ["rail", "order 3", "program"]),
         ({"gibbs": "S", "actuators": {"rail": "dx"}}, ["velocities"]),
         ({"gibbs": "S", "actuators": {"rail": (1, 0)}}, ["'rail' has 2 entries", "one for each of dx;", "scalar"]),
-        ({"gibbs": "S", "actuators": 3}, ["3 was given for the actuators."]),
+        ({"gibbs": "S", "actuators": 3}, ["The actuators are 3"]),
         ({"gibbs": "S", "actuators": {"rail": "t"}}, ["rail", "no coordinate"]),
         ({"gibbs": "S", "actuators": {"x": "x"}}, ["'x'"]),
         ({"gibbs": "S", "actuators": {"d2x": "x"}}, ["'d2x'"]),

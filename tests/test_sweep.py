@@ -184,8 +184,8 @@ def test_cases_that_form_no_table_are_refused(cases, fact):
     ("call", "fact"),
     [
         (lambda: sv.grid(m=[]), {"name": "m"}),
-        (lambda: sv.monte_carlo(-1, seed=1), {"value": -1}),
-        (lambda: sv.monte_carlo(2, seed=None), "seed"),
+        (lambda: sv.monte_carlo(-1, seed=1), "n=-1"),
+        (lambda: sv.monte_carlo(2, seed=None), "seed=None"),
         (lambda: sv.monte_carlo(2, seed=1, m=[1, 2]), {"name": "m"}),
         (lambda: sv.monte_carlo(2, seed=1, m=lambda rng: rng.normal(1.0, -1.0)), {"name": "m"}),
         (lambda: sv.sweep(halves, sv.grid(m=1), executor=2), "executor=2"),

@@ -4,15 +4,14 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from servoctl.checks import ON_SAMPLE, as_span, finite, mapping, positive, require_memory, whole, whole_multiple
 from servoctl.codegen.function import Compiled
-from servoctl.control.disturbances import require_seed, sampled
-from servoctl.control.law import ON_SAMPLE, Law
+from servoctl.control.disturbances import sampled
+from servoctl.control.law import Law
 from servoctl.control.loop import FINISHED, LAW_LOST, STATE_LOST, Loop, run_loop
 from servoctl.control.result import Closed
-from servoctl.control.tracking import Reference, positive, require_memory, require_plan, require_plant, resampled
+from servoctl.control.tracking import Reference, require_plan, require_plant, resampled
 from servoctl.errors import InconsistentStart, IntegrationStopped, ServoError, SpecificationError, unknown
-from servoctl.spec.coordinates import mapping
-from servoctl.spec.parameters import finite
 
 RESOLVED = 0.05  # |λ| h at most: then one Runge-Kutta step of order 4 errs by 3e-9
 MOST_SUBSTEPS = 1000
@@ -82,7 +81,7 @@ def close(
         If the state is no longer finite; what was computed is in `run`.
     """
     require_plant(plant)
-    t_span = span(t_span)
+    t_span = as_span(t_span, forward=True)
     law = _as_law(law, plant, rate, t_span[0], plan)
     require_names(law, plant)
     if plan is not None:
@@ -93,9 +92,9 @@ def close(
     names = ("The disturbances", "The noise", "The quantisation")
     conditions = Conditions(
         *(dict(mapping(values, what)) for values, what in zip(given, names, strict=True)),
-        0 if seed is None else require_seed(seed),
+        0 if seed is None else whole("seed", seed),
     )
-    loop = prepared(plant, law, x0, t_span, whole(delay, "delay", "samples"), conditions, substeps)
+    loop = prepared(plant, law, x0, t_span, whole_multiple(delay, "delay", "samples"), conditions, substeps)
     return finish(plant, law, loop, conditions, law.plan if plan is None else plan)
 
 
@@ -112,10 +111,10 @@ class Conditions:
 def prepared(plant, law, x0, t_span, delay, conditions, substeps):
     """All numbers of a loop, in tables made beforehand."""
     t0, t1 = t_span
-    samples = whole((t1 - t0) * law.rate, f"t_span of {t1 - t0:g} s at {law.rate:g} Hz", "samples")
+    samples = whole_multiple((t1 - t0) * law.rate, f"t_span of {t1 - t0:g} s at {law.rate:g} Hz", "samples")
     kept = plant.n_x + len(law.measures) + len(law.memory) + law.n_out + len(plant.inputs) + len(conditions.noise)
     require_memory(samples, kept, f"The loop runs for {t1 - t0:g} s at {law.rate:g} Hz")
-    first = whole((t0 - law.t0) * law.rate, f"A start at {t0:g} s of a law from {law.t0:g} s on", "samples")
+    first = whole_multiple((t0 - law.t0) * law.rate, f"A start at {t0:g} s of a law from {law.t0:g} s on", "samples")
     low, high, change = limits(plant, law.period)
     idle = _idle(law, t0)
     idle = idle if low is None else np.clip(idle, low, high)
@@ -211,24 +210,6 @@ def begin(law):
         law.step.begin()
 
 
-def whole(number, what, of):
-    """A whole number at least 0, given to rounding.
-
-    Raises
-    ------
-    SpecificationError
-        Naming the nearest.
-    """
-    number = finite(what, number)
-    nearest = max(round(number), 0)
-    if abs(number - nearest) > ON_SAMPLE * max(1.0, 1e-6 * abs(number)):
-        raise SpecificationError(
-            f"{what} makes {number:.9g} {of}.", f"It is a whole number of {of}, at least 0.", f"{nearest}.",
-            "Change it.", number=number,
-        )  # fmt: skip
-    return nearest
-
-
 def limits(plant, period):
     """Lower and upper limits of the inputs, and the largest change in a sample; None for those the plant has not."""
     pairs = np.array([plant.limits.get(name, (-np.inf, np.inf)) for name in plant.inputs]).reshape(-1, 2)
@@ -250,7 +231,7 @@ def steps(plant, period, substeps, t0, x0, u0):
         least = _resolving(plant, period, t0, x0, u0)
         fitting = (n for n in range(least, MOST_SUBSTEPS + 1) if _fits(delays * n / period))
         substeps = next(fitting, least)
-    substeps = whole(substeps, "substeps", "steps per sample")
+    substeps = whole_multiple(substeps, "substeps", "steps per sample")
     if substeps < 1:
         raise SpecificationError("substeps = 0 was given.", "A sample is at least one step.", "1.", "Change it.")
     if not plant.delay:
@@ -324,23 +305,6 @@ def _index(name, names, what):
     if name not in names:
         raise unknown(name, names, what)
     return names.index(name)
-
-
-def span(t_span, what="A loop runs"):
-    """The interval (t0, t1), t1 > t0 [s]."""
-    try:
-        t0, t1 = (finite("t_span", t, "time") for t in t_span)
-    except TypeError:
-        t0, t1 = 0.0, -1.0
-    except ValueError as error:
-        if isinstance(error, SpecificationError):
-            raise
-        t0, t1 = 0.0, -1.0
-    if t1 <= t0:
-        raise SpecificationError(
-            f"t_span={t_span!r} was given.", f"{what} from t0 to a later t1 [s].", "(0.0, 8.0).", "Change it."
-        )
-    return t0, t1
 
 
 def _as_law(law, plant, rate, t0, plan):

@@ -2,9 +2,10 @@
 
 import numpy as np
 
+from servoctl.checks import positive
 from servoctl.control.law import Law
 from servoctl.control.linearising import linearise
-from servoctl.control.tracking import Reference, positive, refuse_transport, require_plan
+from servoctl.control.tracking import Reference, refuse_transport, require_plan
 from servoctl.errors import SpecificationError, UnstableInternalDynamics, unknown
 from servoctl.internal_dynamics import internal_dynamics
 from servoctl.methods.bounds import sampled_bound

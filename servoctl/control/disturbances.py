@@ -4,8 +4,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from servoctl.checks import finite, whole
 from servoctl.errors import SpecificationError
-from servoctl.spec.parameters import finite
 
 __all__ = ["gust", "noise", "step"]
 
@@ -146,19 +146,7 @@ def noise(std, bandwidth, seed=0):
             "The deviation is not negative, the bandwidth positive.",
             do="Change them.",
         )
-    return Noise(std, bandwidth, require_seed(seed))
-
-
-def require_seed(seed):
-    """A seed that numpy takes: a whole number, at least 0.
-
-    Raises
-    ------
-    SpecificationError
-    """
-    if isinstance(seed, bool) or not isinstance(seed, (int, np.integer)) or seed < 0:
-        raise SpecificationError(f"seed={seed!r} was given.", "A seed is a whole number, at least 0.", do="Give one.")
-    return int(seed)
+    return Noise(std, bandwidth, whole("seed", seed))
 
 
 def sampled(name, function, t):

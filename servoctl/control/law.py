@@ -4,11 +4,10 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from servoctl.checks import ON_SAMPLE, finite
 from servoctl.errors import SpecificationError, unknown
-from servoctl.spec.parameters import finite
 
 _SIZES = ("n_x", "n_p", "n_y")  # of a compiled step: what it takes, its row, what it gives
-ON_SAMPLE = 1e-6  # of a period: how far from an instant of sampling a law may be asked
 
 
 @dataclass(frozen=True, eq=False)

@@ -4,17 +4,15 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from servoctl.checks import ON_SAMPLE, finite, interval, mapping, positive
 from servoctl.control.allocation import Effects, SmallQP
 from servoctl.control.close import require_names
 from servoctl.control.feedback import Residuals
-from servoctl.control.law import ON_SAMPLE, Law
+from servoctl.control.law import Law
 from servoctl.control.lqr import Q_POSITION, R_INPUT, steady, tangents
 from servoctl.control.sampling import discretised
-from servoctl.control.tracking import Reference, positive, require_plant
+from servoctl.control.tracking import Reference, require_plant
 from servoctl.errors import LimitExceeded, SpecificationError, unknown
-from servoctl.plants.plant import interval
-from servoctl.spec.coordinates import mapping
-from servoctl.spec.parameters import finite
 
 HORIZON = 0.5  # s
 FALLING = 1e-4  # of weights, from one residual to the next by priority

@@ -4,11 +4,11 @@ from dataclasses import replace
 
 import numpy as np
 
+from servoctl.checks import finite
 from servoctl.control.feedback import Residuals
 from servoctl.control.sampling import discretised, spectral_radii
 from servoctl.control.tracking import Reference, affine, refuse_transport
 from servoctl.errors import ServoError, SpecificationError, unknown
-from servoctl.spec.parameters import finite
 
 MARGINAL = 1 + 1e-6  # spectral radius of what may stay out of reach: it neither falls nor grows
 DOUBLINGS, CONVERGED = 60, 1e-12  # of the horizon of the Riccati equation; its last relative change

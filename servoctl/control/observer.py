@@ -2,14 +2,13 @@
 
 import numpy as np
 
+from servoctl.checks import finite, mapping
 from servoctl.control.feedback import Residuals, estimating_law
 from servoctl.control.law import Law
 from servoctl.control.lqr import tangents, weights
 from servoctl.control.sampling import discretised, spectral_radii
 from servoctl.control.tracking import Reference, refuse_transport, require_plant
 from servoctl.errors import ServoError, SpecificationError, unknown
-from servoctl.spec.coordinates import mapping
-from servoctl.spec.parameters import finite
 
 POSITION_NOISE, VELOCITY_NOISE = 1e-3, 1.0  # per √s, of coordinates and velocities
 

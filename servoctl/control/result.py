@@ -5,12 +5,11 @@ from functools import cached_property
 
 import numpy as np
 
+from servoctl.checks import ON_SAMPLE, finite
 from servoctl.control.feedback import Residuals
-from servoctl.control.law import ON_SAMPLE
 from servoctl.control.tracking import resampled
 from servoctl.errors import SpecificationError, unknown
 from servoctl.run import Run
-from servoctl.spec.parameters import finite
 
 NONE, LOWER, UPPER, FALLING, RISING = 0, -1, 1, -2, 2  # which limit an input has met
 

@@ -6,14 +6,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from servoctl.control.close import span
+from servoctl.checks import as_span, interval, mapping
 from servoctl.errors import InconsistentStart, IntegrationStopped, LimitExceeded, SingularProgram, SpecificationError
 from servoctl.methods.motion import PATIENCE
 from servoctl.model.model import derive
-from servoctl.plants.plant import interval
 from servoctl.run import Run
 from servoctl.simulation import simulate
-from servoctl.spec.coordinates import mapping
 from servoctl.spec.mechanism import Mechanism
 from servoctl.spec.program import Program
 
@@ -101,7 +99,7 @@ def fastest(mechanism, program, limits, t_span, start=None, guess=None, paramete
                 do="Write sv.fastest(mechanism, program, ...).",
             )
     start, parameters = mapping(start, "Values of the start"), mapping(parameters, "The parameters")
-    t0, t1 = span(t_span, "A program is slowed")
+    t0, t1 = as_span(t_span, forward=True)
 
     @functools.cache
     def attempt(factor):

@@ -4,16 +4,14 @@ from dataclasses import replace
 
 import numpy as np
 
+from servoctl.checks import ON_SAMPLE, finite, mapping, positive, require_memory
 from servoctl.control.feedback import affine_law
-from servoctl.control.law import ON_SAMPLE, Law
+from servoctl.control.law import Law
 from servoctl.control.sampling import sampled_radii
 from servoctl.errors import NotRealisable, ServoError, SpecificationError, unknown
 from servoctl.plants.plant import Plant
-from servoctl.spec.coordinates import mapping
-from servoctl.spec.parameters import finite
 
 UNSTABLE = 1e-9  # beyond 1: spectral radii that count as unstable
-MOST_MEMORY = 8e9  # bytes for what is kept of all samples: as much as common machines have
 GAUSS = np.polynomial.legendre.leggauss(3)
 
 
@@ -228,28 +226,6 @@ def affine(name, reference, K, K_i=None, residuals=None, **facts):
     )  # fmt: skip
 
 
-def require_memory(samples, numbers, given):
-    """Refuse more samples than fit into memory.
-
-    Parameters
-    ----------
-    samples : float
-    numbers : int
-        Kept of each sample.
-    given : str
-        What asks for so many samples: the beginning of a sentence.
-    """
-    memory = 8.0 * samples * numbers
-    if memory > MOST_MEMORY:
-        raise SpecificationError(
-            f"{given}: {samples:.4g} samples, which take {memory / 1e9:.3g} GB.",
-            f"The numbers of all samples are kept, in {MOST_MEMORY / 1e9:g} GB at most.",
-            nearest=f"{MOST_MEMORY / (8 * numbers):.3g} samples.",
-            do="Lower the rate, or shorten the time.",
-            samples=float(samples),
-        )
-
-
 def require_plant(plant):
     """Refuse what is no plant."""
     if not isinstance(plant, Plant):
@@ -362,19 +338,6 @@ def _hermite(t, derivatives, i, h, times):
     high = np.einsum("jk,knm->jnm", np.linalg.inv(matrix), np.array(missing))
     c = [*low, *high]
     return [sum(perm(j, k) * c[j] * s ** (j - k) for j in range(k, 2 * r)) / h**k for k in range(r)]
-
-
-def positive(name, value):
-    """A positive finite number.
-
-    Raises
-    ------
-    SpecificationError
-    """
-    number = finite(name, value)
-    if number <= 0:
-        raise SpecificationError(f"{name} = {number:g} was given.", f"The {name} is positive.", do="Change it.")
-    return number
 
 
 def _gains(gains, plant, what):

@@ -2,16 +2,16 @@
 
 import numpy as np
 
+from servoctl.checks import finite, positive
 from servoctl.codegen.jacobians import differentiable, jacobian
 from servoctl.control.law import Law, as_measurement
 from servoctl.control.result import Closed
 from servoctl.control.sampling import discretised
-from servoctl.control.tracking import positive, resampled
+from servoctl.control.tracking import resampled
 from servoctl.errors import SpecificationError, unknown
 from servoctl.interop.names import connected, force_names, output_names, signal_names, stranger
 from servoctl.model.model import Model
 from servoctl.plants.plant import Plant
-from servoctl.spec.parameters import finite
 
 
 def linearise(thing, t, x=None, u=None, *, memory=None, rate=None, disturbed=(), name=None):

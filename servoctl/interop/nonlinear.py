@@ -4,10 +4,10 @@ import math
 
 import numpy as np
 
+from servoctl.checks import positive
 from servoctl.control.close import limits, steps
 from servoctl.control.law import Law
 from servoctl.control.result import Closed
-from servoctl.control.tracking import positive
 from servoctl.errors import ServoError, SpecificationError
 from servoctl.interop.names import connected, force_names, output_names, signal_names, stranger
 from servoctl.model.model import Model

@@ -7,8 +7,8 @@ from math import comb, factorial, inf, pi
 
 import numpy as np
 
+from servoctl.checks import is_whole
 from servoctl.errors import SpecificationError, unknown
-from servoctl.methods.drift import is_whole
 from servoctl.methods.tableaus import ORDERS, tableau
 
 SAME = {"DOP853": "RK8", "RK45": "RK5"}  # scipy's adaptive methods that go on with the result of these tableaus

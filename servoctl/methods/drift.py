@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from servoctl.checks import is_whole
 from servoctl.errors import SpecificationError, unknown
 
 
@@ -140,11 +141,6 @@ def project(every=1):
     if not is_whole(every) or every < 1:
         raise SpecificationError(f"every={every!r} was given.", "It is a whole number, at least 1.", do="Give 1.")
     return Project(int(every))
-
-
-def is_whole(value):
-    """Whether a value is a whole number, Python's or NumPy's; True and False are none."""
-    return isinstance(value, (int, np.integer)) and not isinstance(value, bool)
 
 
 def as_drift(value):

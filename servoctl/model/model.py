@@ -5,6 +5,7 @@ from functools import cached_property
 
 import numpy as np
 
+from servoctl.checks import finite
 from servoctl.codegen.function import compiled
 from servoctl.errors import SpecificationError, unknown
 from servoctl.model.derivation import Derivation
@@ -15,7 +16,6 @@ from servoctl.reduction.appell import require_positive
 from servoctl.reduction.knots import require_smooth
 from servoctl.reduction.reduce import holds
 from servoctl.reduction.structure import structure
-from servoctl.spec.parameters import finite
 
 FUNCTIONS = {**EQUATIONS, **SERVO_DAE, **FORMULATIONS}
 SIGNALS = (

@@ -4,9 +4,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from servoctl.checks import finite, mapping
 from servoctl.errors import InconsistentStart, ServoError, unknown
-from servoctl.spec.coordinates import mapping
-from servoctl.spec.parameters import finite
 
 TOLERANCE = 1e-10  # of a residual relative to its gradient times the state; Newton reaches rounding
 GUESSED = 1e3  # weight of a guessed value against one that is merely to stay near zero

@@ -5,13 +5,12 @@ from dataclasses import dataclass, field
 import casadi as ca
 import numpy as np
 
+from servoctl.checks import column, finite, interval, mapping, numbers_by_name
 from servoctl.codegen.function import compiled
 from servoctl.codegen.loops.closed import DRIVER
 from servoctl.errors import SpecificationError, unknown
 from servoctl.plants.equations import PlantEquations
-from servoctl.spec.coordinates import column, mapping
 from servoctl.spec.mechanism import Mechanism, require_known
-from servoctl.spec.parameters import finite
 
 
 def plant(mechanism, *, forces=None, damping=None, limits=None, rate_limits=None, lag=None, delay=0.0, **parameters):
@@ -58,12 +57,12 @@ def plant(mechanism, *, forces=None, damping=None, limits=None, rate_limits=None
     directions, actuators = mechanism.q.jet_names(1), mechanism.actuators
     names = mechanism.q.names if mechanism.q.plain else mechanism.q.velocity_names
     values = mechanism.parameters.values(parameters)
-    damping = _named_numbers(damping, names, "coordinate", "damping", low=0.0)
-    lag = _named_numbers(lag, actuators, "actuator", "lag", positive=True)
-    rate_limits = _named_numbers(rate_limits, actuators, "actuator", "rate limit", positive=True)
+    damping = numbers_by_name(damping, names, "coordinate", "damping", low=0.0)
+    lag = numbers_by_name(lag, actuators, "actuator", "lag", positive=True)
+    rate_limits = numbers_by_name(rate_limits, actuators, "actuator", "rate limit", positive=True)
     if not isinstance(delay, dict):
         delay = dict.fromkeys(actuators, delay) if finite("delay", delay, "time") else {}
-    delay = _named_numbers(delay, actuators, "actuator", "delay", low=0.0)
+    delay = numbers_by_name(delay, actuators, "actuator", "delay", low=0.0)
     force, key = _forces(mechanism, forces, names)
     damped = tuple(name for name in names if name in damping)
     lagged = tuple(name for name in actuators if name in lag)
@@ -303,24 +302,6 @@ def _short(values):
     return {name: f"{value:g}" for name, value in values.items()}
 
 
-def _named_numbers(values, names, what, meaning, low=-np.inf, positive=False):
-    """Finite numbers by name, none below `low`."""
-    found = {}
-    for name, value in mapping(values, f"The {meaning}s").items():
-        if name not in names:
-            raise unknown(name, names, what)
-        number = finite(name, value, meaning)
-        if number < low or (positive and number <= 0):
-            raise SpecificationError(
-                f"The {meaning} of {name!r} is {number:g}.",
-                f"A {meaning} is {'positive' if positive else 'not negative'}.",
-                do="Leave it out, or change the number.",
-                name=name,
-            )
-        found[name] = number
-    return found
-
-
 def _limits(limits, actuators):
     found = {}
     for name, value in mapping(limits, "The limits").items():
@@ -328,38 +309,6 @@ def _limits(limits, actuators):
             raise unknown(name, actuators, "actuator")
         found[name] = interval(name, value, "limit")
     return found
-
-
-def interval(name, value, what):
-    """The interval (low, high) that was given for a name, as floats: infinite on a side that is open.
-
-    Parameters
-    ----------
-    name : str
-    value : (float or None, float or None) or float
-        A number c stands for (-c, c), None leaves a side open.
-    what : str
-        What the interval is, in the singular: "limit", "bound".
-
-    Raises
-    ------
-    SpecificationError
-        If it is empty, open on both sides, or something else.
-    """
-    try:
-        low, high = (-value, value) if np.ndim(value) == 0 else value
-        low, high = -np.inf if low is None else float(low), np.inf if high is None else float(high)
-    except (TypeError, ValueError):
-        low = high = np.nan
-    if not low < high or np.isinf([low, high]).all():
-        raise SpecificationError(
-            f"The {what} of {name!r} is {value!r}.",
-            f"A {what} is an interval: a pair with low < high, None on an open side, or a positive number for both.",
-            nearest="(-100.0, 100.0).",
-            do="Give such a pair or number.",
-            name=name,
-        )
-    return low, high
 
 
 def _forces(mechanism, forces, names):

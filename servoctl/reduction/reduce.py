@@ -6,6 +6,7 @@ from functools import cached_property
 import casadi as ca
 import numpy as np
 
+from servoctl.checks import finite, mapping
 from servoctl.errors import NotRealisable, SpecificationError, unknown
 from servoctl.reduction.appell import Realisation, realisation, require_inertia
 from servoctl.reduction.flow import Flow
@@ -15,9 +16,7 @@ from servoctl.reduction.manifold import Context, Points, sample
 from servoctl.reduction.orders import settle_alone
 from servoctl.reduction.ranks import Rank, clean, decide, decide_all
 from servoctl.reduction.row import Row, gradient, merge_uses
-from servoctl.spec.coordinates import mapping
 from servoctl.spec.mechanism import Mechanism, require_known
-from servoctl.spec.parameters import finite
 from servoctl.spec.program import Program
 
 

@@ -5,6 +5,7 @@ import json
 import sys
 from pathlib import Path
 
+from servoctl.checks import as_span
 from servoctl.errors import ServoError, SpecificationError, unknown
 from servoctl.methods.drift import as_drift
 from servoctl.methods.tableaus import ORDERS
@@ -12,7 +13,7 @@ from servoctl.shell import commands as further
 from servoctl.shell import loop as cli_loop
 from servoctl.shell.folder import FILES, LOOP_FILES, Folder, Report, complain, plain, summary, versions
 from servoctl.shell.options import METHODS_HELP, assignment, mapping, positive
-from servoctl.simulation import ALL_METHODS, as_span
+from servoctl.simulation import ALL_METHODS
 
 
 def main(argv=None):

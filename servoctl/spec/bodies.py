@@ -2,8 +2,9 @@
 
 import casadi as ca
 
+from servoctl.checks import column, matrix
 from servoctl.errors import SpecificationError
-from servoctl.spec.coordinates import Coordinates, column, matrix
+from servoctl.spec.coordinates import Coordinates
 
 
 def particle(q, mass, position):

@@ -1,102 +1,17 @@
 """Generalised coordinates, quasi-velocities and their jets, and the total derivative (3.1)."""
 
 import threading
-from math import isfinite
 from numbers import Integral
 
 import casadi as ca
 
+from servoctl.checks import column, mapping, matrix
 from servoctl.errors import SpecificationError
 from servoctl.jets.elementary import divide, multiply
 from servoctl.jets.series import Series, is_zero
 from servoctl.jets.tape import Tape
 
 _guard = threading.Lock()
-
-
-def column(value, what, size=None):
-    """A list of SX scalars from a scalar, a sequence, or an SX column.
-
-    Raises
-    ------
-    SpecificationError
-        If the value is no CasADi expression or number, holds NaN, or has another length than `size`.
-    """
-    try:
-        if isinstance(value, (list, tuple)):
-            value = ca.vertcat(*value) if value else ca.SX(0, 1)
-        flat = ca.densify(ca.vec(ca.SX(value)))
-        items = flat.elements()
-    except Exception as error:  # CasADi raises several types here, none of which helps the designer
-        raise SpecificationError(
-            f"{what} is a {type(value).__name__}, not an expression.",
-            "Specifications are CasADi SX expressions of the coordinates, parameters and t, or numbers.",
-            do="Build it from the symbols with CasADi's own functions (ca.sin, ca.sqrt, ca.vertcat, ...).",
-            what=what,
-        ) from error
-    if size is not None and len(items) != size:
-        raise SpecificationError(
-            f"{what} has {len(items)} entries.", f"It needs {size}.", do="Give one entry each.", what=what
-        )
-    if any(holds_no_number(item) for item in items):
-        raise SpecificationError(
-            f"{what} holds NaN or infinity.",
-            "Functions of math and most of numpy turn symbols into NaN without a word.",
-            nearest="ca.sin instead of math.sin, ca.norm_2 instead of np.linalg.norm.",
-            do="Use CasADi's functions on symbols.",
-            what=what,
-        )
-    return items
-
-
-def matrix(value, what):
-    """An SX matrix from a number, an SX matrix, an array, or nested sequences of scalars.
-
-    Raises
-    ------
-    SpecificationError
-        If it is none of these, is ragged, or holds NaN or infinity.
-    """
-    try:
-        if isinstance(value, (list, tuple)):
-            value = ca.vertcat(*(ca.horzcat(*row) if isinstance(row, (list, tuple)) else ca.SX(row) for row in value))
-        result = ca.SX(value)
-    except Exception as error:  # CasADi raises several types here
-        raise SpecificationError(
-            f"{what} is {value!r}.",
-            "It is a matrix of numbers and expressions.",
-            do="Give rows of equal length.",
-            what=what,
-        ) from error
-    column(ca.vec(result), what)
-    return result
-
-
-def mapping(value, what):
-    """A dict with text for keys, from a dict or None.
-
-    Raises
-    ------
-    SpecificationError
-    """
-    if value is None:
-        return {}
-    if not isinstance(value, dict) or not all(isinstance(key, str) for key in value):
-        raise SpecificationError(
-            f"{repr(value)[:150]} was given for {what[0].lower()}{what[1:]}.",
-            "They go by name.",
-            nearest='{"name": expression}.',
-            do="Give a dict with text for keys.",
-            what=what,
-        )
-    return value
-
-
-def holds_no_number(expression):
-    """Whether a constant NaN or infinity stands anywhere in an SX scalar."""
-    f = ca.Function("f", [], [expression], {"allow_free": True})
-    constants = (f.instruction_constant(k) for k in range(f.n_instructions()) if f.instruction_id(k) == ca.OP_CONST)
-    return any(not isfinite(c) for c in constants)
 
 
 class Coordinates:

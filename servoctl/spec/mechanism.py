@@ -5,10 +5,11 @@ from functools import cached_property
 import casadi as ca
 import numpy as np
 
+from servoctl.checks import column, mapping
 from servoctl.errors import SpecificationError, unknown
 from servoctl.jets.evaluation import evaluate
 from servoctl.jets.tape import Tape
-from servoctl.spec.coordinates import Coordinates, column, mapping
+from servoctl.spec.coordinates import Coordinates
 from servoctl.spec.parameters import Parameters
 
 _SEED = 20021  # of the random points at which identities are tested

@@ -1,10 +1,10 @@
 """Parameters: symbols in the equations, numbers at run time."""
 
-import math
 
 import casadi as ca
 import numpy as np
 
+from servoctl.checks import finite
 from servoctl.errors import SpecificationError, unknown
 
 
@@ -67,25 +67,6 @@ class Parameters:
                 raise unknown(name, list(numbers), "parameter")
             numbers[name] = finite(name, value, "parameter")
         return np.array(list(numbers.values()), dtype=float)
-
-
-def finite(name, value, what="value"):
-    """A finite float from a number.
-
-    Raises
-    ------
-    SpecificationError
-        Naming what was given.
-    """
-    try:
-        number = math.nan if isinstance(value, (str, bytes, complex)) else float(value)
-    except Exception:  # CasADi raises its own types for symbols
-        number = math.nan
-    if not math.isfinite(number):
-        raise SpecificationError(
-            f"The {what} {name!r} is {value!r}.", f"A {what} is a finite number.", do="Give a number.", name=name
-        )
-    return number
 
 
 def parameters(**values):

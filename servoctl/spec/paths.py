@@ -17,8 +17,8 @@ import operator
 import casadi as ca
 import numpy as np
 
+from servoctl.checks import column
 from servoctl.errors import SpecificationError, unknown
-from servoctl.spec.coordinates import column
 
 
 def rest_to_rest(t, start, end, duration, smoothness=4, t_start=0.0):

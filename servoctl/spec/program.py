@@ -3,8 +3,8 @@
 import casadi as ca
 import numpy as np
 
+from servoctl.checks import column, mapping
 from servoctl.errors import SpecificationError
-from servoctl.spec.coordinates import column, mapping
 
 REALISATIONS = ("ideal", "actuators")
 

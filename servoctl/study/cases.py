@@ -4,6 +4,7 @@ import itertools
 import math
 from collections.abc import Mapping
 
+from servoctl.checks import plain, whole
 from servoctl.errors import SpecificationError
 
 DRAWS, CASES = 0, 1  # first spawn key: random numbers of the parameters, and those that a case draws for itself
@@ -124,25 +125,6 @@ def as_cases(cases):
                 case=i,
             )
     return found
-
-
-def whole(name, value):
-    """A whole number that is not negative, or an error that names it."""
-    try:
-        number = int(value)
-    except (TypeError, ValueError, OverflowError):
-        number = -1
-    if number < 0 or number != value:
-        raise SpecificationError(
-            f"{name} is {value!r}.", f"{name} is a whole number, 0 or more.", do=f"Give such a {name}.", value=value
-        )
-    return number
-
-
-def plain(value):
-    """A number, text or truth value of Python's own kinds, or None."""
-    value = value.item() if getattr(value, "ndim", None) == 0 else value
-    return value if isinstance(value, (bool, int, float, str)) else None
 
 
 def _case(i, case):

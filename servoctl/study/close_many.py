@@ -4,15 +4,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from servoctl.checks import as_span, mapping, whole, whole_multiple
 from servoctl.codegen.function import Compiled
 from servoctl.control.batch import Gathered, run_batch, unit
-from servoctl.control.close import CONSISTENT, Conditions, close, noisy, prepared, require_names, span, steps, whole
-from servoctl.control.disturbances import require_seed
+from servoctl.control.close import CONSISTENT, Conditions, close, noisy, prepared, require_names, steps
 from servoctl.control.feedback import Residuals
 from servoctl.control.law import Law
 from servoctl.control.tracking import require_plant
 from servoctl.errors import InconsistentStart, IntegrationStopped, ServoError, SpecificationError, unknown
-from servoctl.spec.coordinates import mapping
 from servoctl.study.cases import CASES, as_cases, generator
 from servoctl.study.table import Study, machine, table
 
@@ -121,18 +120,18 @@ def close_many(
     _require(plant, law)
     plan, columns = law.plan if plan is None else plan, _columns(cases)
     conditions = _conditions(disturbance, noise, quantisation, seed)
-    arguments = (plant, law, x0, span(t_span), whole(delay, "delay", "samples"), conditions)
+    arguments = (plant, law, x0, as_span(t_span, forward=True), whole_multiple(delay, "delay", "samples"), conditions)
     loop, numbers = _prepared(arguments, substeps, columns, mapping(scale, "The scales"))
     derived = _unit(plant, law, plan, loop)
     traced, every = _traced(record, derived.names, every)
     seeds = _seeds(conditions, len(columns[next(iter(columns))]))
     own_noise = seeds and (lambda case: noisy(conditions.noise, law.measures, loop.samples + 1, seeds[case]))
-    threads = threads if threads is None else _count("threads", threads)
+    threads = threads if threads is None else whole("threads", threads, least=1)
     found = run_batch(derived, loop, *numbers, own_noise, traced, every, threads)
     if found is None:
         found = _one_by_one(plant, law, plan, derived, loop, numbers, conditions, seeds, traced, every)
     meta = {"law": law.name, "rate": law.rate, "substeps": loop.substeps, "delay": loop.delay, "machine": machine()}
-    study = _study(columns, seeds, derived.names, found, {"t_span": list(span(t_span))} | meta)
+    study = _study(columns, seeds, derived.names, found, {"t_span": list(as_span(t_span, forward=True))} | meta)
     t = loop.t0 + np.arange(len(found.trace)) * every * loop.period
     return Batch(study, t, dict(zip(record, np.moveaxis(found.trace, 1, 0), strict=True)))
 
@@ -155,7 +154,7 @@ def _conditions(disturbance, noise, quantisation, seed):
         raise SpecificationError("A seed was given without noise.", "The seed is that of the noise.", do="Remove it.")
     given = {"disturbances": disturbance, "noise": noise, "quantisation": quantisation}
     by_name = (dict(mapping(values, f"The {what}")) for what, values in given.items())
-    return Conditions(*by_name, 0 if seed is None else require_seed(seed))
+    return Conditions(*by_name, 0 if seed is None else whole("seed", seed))
 
 
 def _prepared(arguments, substeps, columns, scale):
@@ -271,14 +270,7 @@ def _traced(record, names, every):
             nearest='record=["theta"], every=10.',
             do="Name them.",
         )
-    return [_index(name, names) for name in record], _count("every", every)
-
-
-def _count(name, value):
-    number = whole(value, name, "")
-    if number < 1:
-        raise SpecificationError(f"{name}={value!r} was given.", "It is at least 1.", do="Change it.")
-    return number
+    return [_index(name, names) for name in record], whole("every", every, least=1)
 
 
 def _one_by_one(plant, law, plan, derived, loop, numbers, conditions, seeds, traced, every):

@@ -4,8 +4,9 @@ from time import perf_counter
 
 import numpy as np
 
+from servoctl.checks import as_span
 from servoctl.errors import SpecificationError, unknown
-from servoctl.simulation import as_span, consistent_state, simulate
+from servoctl.simulation import consistent_state, simulate
 from servoctl.study.table import Study, machine
 
 FORMS = {"servo": "servo_dae", "projected": "servo_dae_projected"}

@@ -2,9 +2,9 @@
 
 import numpy as np
 
+from servoctl.checks import is_number
 from servoctl.errors import LimitExceeded, SpecificationError, unknown
 from servoctl.methods.drift import project
-from servoctl.simulation import is_number
 from servoctl.study.table import Study, table
 
 COLOURS = (

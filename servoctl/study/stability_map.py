@@ -12,11 +12,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from servoctl.checks import positives
 from servoctl.errors import SpecificationError
 from servoctl.methods.bounds import amplification, row_poles
 from servoctl.methods.drift import Poles, as_drift
 from servoctl.methods.tableaus import ORDERS
-from servoctl.study.table import positives
 
 METHODS = (*ORDERS, "Taylor", "RadauIIA")
 RADAU_ORDER = 5  # unless it is given; all are L-stable

@@ -14,12 +14,13 @@ from concurrent.futures import Executor, ProcessPoolExecutor, as_completed
 
 import numpy as np
 
+from servoctl.checks import plain, whole
 from servoctl.codegen.function import compiling_at_once
 from servoctl.control.result import Closed
 from servoctl.errors import ServoError, SpecificationError
 from servoctl.figures.sweep import TOLD
 from servoctl.run import Run
-from servoctl.study.cases import CASES, RESERVED, as_cases, generator, plain, whole
+from servoctl.study.cases import CASES, RESERVED, as_cases, generator
 from servoctl.study.checkpoint import Checkpoint, identity
 from servoctl.study.table import Study, machine
 

@@ -272,19 +272,6 @@ def _processor():
         return platform.processor() or platform.machine()
 
 
-def positives(name, given, do, fewest=1, most=np.inf):
-    """Numbers that a designer gives as an array, refused unless all are positive and finite."""
-    try:
-        found = np.asarray(given, dtype=float)
-    except (TypeError, ValueError):
-        found = np.zeros(1)
-    if found.size < fewest or not np.all(np.isfinite(found) & (found > 0) & (found <= most)):
-        count = "It is a positive number, or several" if fewest == 1 else f"It is {fewest} positive numbers or more"
-        bound = "" if most == np.inf else f", at most {most:g}"
-        raise SpecificationError(f"{name}={given!r} was given.", f"{count}{bound}.", do=do)
-    return found
-
-
 def _array(values):
     """An array of one kind: what is missing is NaN among numbers, empty among texts."""
     if isinstance(values, np.ndarray) and values.dtype != object:

@@ -7,15 +7,15 @@ import warnings
 
 import numpy as np
 
+from servoctl.checks import as_span, positive, positives
 from servoctl.codegen.function import compiling_at_once
-from servoctl.control.tracking import positive
 from servoctl.errors import LimitExceeded, ServoError, SpecificationError, unknown
 from servoctl.methods.accuracy import motion_error, relative_error
 from servoctl.methods.drift import Minimal, Poles, Project, as_drift
 from servoctl.methods.tableaus import ORDERS
-from servoctl.simulation import ALL_METHODS, as_span, consistent_state, simulate
+from servoctl.simulation import ALL_METHODS, consistent_state, simulate
 from servoctl.study.front import TradeOff
-from servoctl.study.table import machine, positives
+from servoctl.study.table import machine
 
 METHODS = tuple(name for name in ALL_METHODS if name not in ("RK1", "RK2", "RK23"))  # those need too many steps
 TOLERANCES = (1e-3, 1e-5, 1e-7, 1e-9, 1e-11, 1e-13)
