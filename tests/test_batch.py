@@ -6,22 +6,17 @@ import casadi as ca
 import mpmath
 import numpy as np
 import pytest
+from conftest import relative
 from refusals import refused
+from scenes import CRANE
 
 import servoctl as sv
 from servoctl.codegen import compiler, emit
 from servoctl.control import batch
 from servoctl.gallery import gallery
 
-CRANE, PROGRAM = gallery["overhead-crane"].build()
 N = 32
 GUST = sv.disturbances.gust(1.0, 1.0, 1.5)
-
-
-@pytest.fixture(scope="module")
-def plan():
-    model = sv.derive(CRANE, PROGRAM)
-    return sv.simulate(model, model.start(guess={"l": 4.0}), (0.0, 8.0))
 
 
 @pytest.fixture(scope="module")
@@ -31,11 +26,6 @@ def cases():
         "m_load": rng.uniform(85.0, 115.0, N), "damping x": rng.uniform(0.0, 10.0, N),
         "theta": rng.uniform(-0.05, 0.05, N), "wind": rng.uniform(0.0, 60.0, N),
     }  # fmt: skip
-
-
-def relative(found, values):
-    """Difference relative to the largest value of each signal."""
-    return np.abs(np.asarray(found) - np.asarray(values)).max() / max(np.abs(values).max(), 1e-300)
 
 
 def alone(plant, law, plan, cases, i, seed=None, **given):

@@ -8,37 +8,10 @@ import numpy as np
 import pytest
 from conftest import numbers
 from refusals import refused
+from scenes import CRANE, POINT, ROPE
 
 import servoctl as sv
 from servoctl.gallery import gallery
-
-CRANE, CRANE_PROGRAM = gallery["overhead-crane"].build()
-
-
-def point_mass(m=2.0):
-    p = sv.parameters(m=m)
-    q = sv.coordinates("x")
-    (x,) = q
-    path = sv.paths.rest_to_rest(q.t, 0.0, 1.0, duration=1.0, smoothness=3)
-    mechanism = sv.Mechanism(q, gibbs=sv.particle(q, p.m, x), actuators={"force": x}, parameters=p)
-    return mechanism, sv.Program({"X": x - path}, by="actuators")
-
-
-POINT, POINT_PROGRAM = point_mass()
-ROPE = gallery["overhead-crane-redundant"].build()[0]
-
-
-@pytest.fixture(scope="module")
-def crane_plan():
-    model = sv.derive(CRANE, CRANE_PROGRAM)
-    return sv.simulate(model, model.start(guess={"l": 4.0}), (0.0, 8.0))
-
-
-@pytest.fixture(scope="module")
-def point_plan():
-    model = sv.derive(POINT, POINT_PROGRAM)
-    return sv.simulate(model, model.start(), (0.0, 2.0))
-
 
 # the loop against a recursion -----------------------------------------------------------------------------------------
 

@@ -8,14 +8,13 @@ import subprocess
 import numpy as np
 import pytest
 from refusals import refused
+from scenes import CRANE
 
 import servoctl as sv
 from servoctl.codegen.compiler import compiler
 from servoctl.errors import SpecificationError
-from servoctl.gallery import gallery
 
 STRICT = ("-std=c99", "-O1", "-Wall", "-Wextra", "-pedantic", "-Werror")
-CRANE, PROGRAM = gallery["overhead-crane"].build()
 SENSORS = {"x": 1e-3, "l": 1e-3, "theta": 1e-3}
 
 LAWS = {
@@ -53,12 +52,6 @@ def test_laws_without_expressions_name_themselves_and_what_can_be_exported(plan,
             sv.export_c(inside, folder)
     with refused(SpecificationError, "int", "start"):
         sv.export_c(plan.model, tmp_path, start=3)
-
-
-@pytest.fixture(scope="module")
-def plan():
-    model = sv.derive(CRANE, PROGRAM)
-    return sv.simulate(model, model.start(guess={"l": 4.0}), (0.0, 8.0))
 
 
 def library(law, folder):

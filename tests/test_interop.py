@@ -6,6 +6,7 @@ import control
 import numpy as np
 import pytest
 from refusals import refused
+from scenes import CRANE, ROPE
 from scipy.optimize import brentq
 
 import servoctl as sv
@@ -14,16 +15,8 @@ from servoctl.control.sampling import discretised
 from servoctl.errors import NameUnknown, ServoError, SpecificationError
 from servoctl.gallery import gallery, mass_on_car
 
-CRANE, CRANE_PROGRAM = gallery["overhead-crane"].build()
-ROPE, _ = gallery["overhead-crane-redundant"].build()
 CAR, CAR_PROGRAM = mass_on_car(alpha=0.0)
 SUDDEN = {"x": 0.1, "l": 4.0, "theta": -0.05, "dx": 0.0, "dl": 0.1, "dtheta": 0.0}
-
-
-@pytest.fixture(scope="module")
-def plan():
-    model = sv.derive(CRANE, CRANE_PROGRAM)
-    return sv.simulate(model, model.start(guess={"l": 4.0}), (0.0, 8.0))
 
 
 @pytest.fixture(scope="module")

@@ -6,9 +6,10 @@ import casadi as ca
 import numpy as np
 import pytest
 from refusals import refused
+from scenes import CRANE
 
 import servoctl as sv
-from servoctl.gallery import cars, overhead_crane, two_link_arm
+from servoctl.gallery import cars, two_link_arm
 
 
 def planned(build, span, **guess):
@@ -18,8 +19,8 @@ def planned(build, span, **guess):
 
 
 @pytest.fixture(scope="module")
-def crane():
-    return planned(overhead_crane, (0.0, 8.0), l=4.0)
+def crane(crane_plan):
+    return crane_plan, CRANE
 
 
 @pytest.fixture(scope="module")

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from refusals import refused
+from scenes import CRANE
 
 import servoctl as sv
 from servoctl.control.lqr import weights
@@ -10,15 +11,10 @@ from servoctl.control.sampling import discretised, exponentials
 from servoctl.control.tracking import Reference
 from servoctl.gallery import gallery
 
-CRANE, CRANE_PROGRAM = gallery["overhead-crane"].build()
+pytestmark = pytest.mark.usefixtures("at_once")
+
 GUST = {"theta": sv.disturbances.gust(60.0, 2.0, 2.5)}
 WEIGHTS = {"Q": [1e3] * 3 + [1e2] * 3, "R": 1e-3}
-
-
-@pytest.fixture(scope="module")
-def plan():
-    model = sv.derive(CRANE, CRANE_PROGRAM)
-    return sv.simulate(model, model.start(guess={"l": 4.0}), (0.0, 8.0))
 
 
 def load_error(run):

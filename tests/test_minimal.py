@@ -33,12 +33,6 @@ def worst_residual(run):
     return max(float(np.abs(run.residual[name]).max()) for name in run.residual)
 
 
-@pytest.fixture(scope="module")
-def wheel(gallery_model):
-    model = gallery_model("appell-hamel")
-    return model, model.start(x=0.0, y=0.0, z=0.0, phi=0.0, theta=0.0, dphi=1.0, dtheta=2.0)
-
-
 @pytest.mark.parametrize("method", SETTINGS)
 def test_appell_hamel_in_six_values(method, wheel):
     model, start = wheel

@@ -3,22 +3,20 @@
 import numpy as np
 import pytest
 from refusals import refused
+from scenes import CRANE
 
 import servoctl as sv
 from servoctl.control.sampling import discretised
 from servoctl.control.tracking import Reference
-from servoctl.gallery import gallery, overhead_crane, two_link_arm
+from servoctl.gallery import gallery, two_link_arm
 
 GUST = {"theta": lambda t: 60.0 * (2.0 < t < 2.5)}
 SENSORS = {"x": 1e-3, "l": 1e-3, "theta": 1e-3}
 
 
 @pytest.fixture(scope="module")
-def crane():
-    mechanism, program = overhead_crane()
-    model = sv.derive(mechanism, program)
-    plan = sv.simulate(model, model.start(guess={"l": 4.0}), (0.0, 8.0))
-    return plan, sv.plant(mechanism), sv.plant(mechanism, m_load=115.0)
+def crane(crane_plan):
+    return crane_plan, sv.plant(CRANE), sv.plant(CRANE, m_load=115.0)
 
 
 def worst(run):

@@ -5,7 +5,6 @@ import pytest
 from refusals import refused, warned
 
 import servoctl as sv
-from servoctl.gallery import gallery
 from servoctl.gallery.guided_arm import guided_arm
 from servoctl.study import tradeoff as module
 from servoctl.study.formulation import formulation_cost
@@ -15,9 +14,8 @@ SPAN = (0.0, 0.2)
 
 
 @pytest.fixture(scope="module")
-def scene(gallery_model):
-    model, scene = gallery_model("appell-hamel"), gallery["appell-hamel"]
-    return model, model.start(guess=scene.guess, **scene.start)
+def scene(wheel):
+    return wheel
 
 
 def stopped(fact, make):

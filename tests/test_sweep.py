@@ -420,11 +420,9 @@ def case(m, rng):
 
 
 @pytest.fixture
-def here(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(sys, "path", list(sys.path))
-    (tmp_path / "own.py").write_text(OWN)
-    return tmp_path
+def here(here):
+    (here / "own.py").write_text(OWN)
+    return here
 
 
 def test_the_command_varies_parameters_of_a_scene(here, capsys):

@@ -23,9 +23,8 @@ TOLERANCES, STEPS = (1e-3, 1e-6, 1e-9), (0.1, 0.025, 0.005)
 
 
 @pytest.fixture(scope="module")
-def scene(gallery_model):
-    model, scene = gallery_model("appell-hamel"), gallery["appell-hamel"]
-    return model, model.start(guess=scene.guess, **scene.start)
+def scene(wheel):
+    return wheel
 
 
 @pytest.fixture(scope="module")

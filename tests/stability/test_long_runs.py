@@ -10,12 +10,6 @@ import servoctl as sv
 START = {"x": 0.0, "y": 0.0, "z": 0.0, "phi": 0.0, "theta": 0.0, "dphi": 1.0, "dtheta": 2.0}
 
 
-@pytest.fixture(scope="module")
-def wheel(gallery_model):
-    model = gallery_model("appell-hamel")
-    return model, model.start(**START)
-
-
 def integral(run, p=cf.APPELL_HAMEL):
     """H = maρφ'²/(2B) + maρθ'²/(2A) - (bmg/A) ln θ', with which φ' and θ' are periodic."""
     A = p["I_y"] + p["a"] ** 2 * (p["M"] + p["m"]) + p["b"] ** 2 * p["m"]

@@ -3,16 +3,13 @@
 import closed_forms as cf
 import numpy as np
 import pytest
+from conftest import relative
 from refusals import refused
 
 import servoctl as sv
 from servoctl.gallery import cars, mass_on_car
 
 RATIOS = (1e-8, 1e-4, 1e4, 1e8)
-
-
-def relative(found, reference):
-    return np.abs(found - reference).max() / np.abs(reference).max()
 
 
 @pytest.fixture(scope="module")
