@@ -45,7 +45,7 @@ class InternalDynamics:
         )
 
 
-def internal_dynamics(model, run):
+def internal_dynamics(model, run) -> InternalDynamics:
     """Linearise the internal dynamics along a run, in Σ o_a of the state's own entries.
 
     With the state split by the invariants Ψ(t, X) = 0 into dependent and independent entries, ∂X/∂y spans the kernel of
