@@ -13,7 +13,8 @@ import matplotlib.pyplot as plt  # noqa: E402
 PACKAGE = Path(__file__).parents[2] / "servoctl"
 WIDTH, HEIGHT = 1.62, 0.5  # of a box, of which the floors are one apart
 STEP, TRIES = 2.0, 6000  # between columns; moves that are tried
-EDGE, FILL, ARROW = "#4a6785", "#eef3f8", "#9db2c6"
+EDGE, FILL = "#4a6785", "#eef3f8"
+ARROW = {"arrowstyle": "-|>", "color": "#9db2c6", "lw": 1.1, "shrinkA": 0, "shrinkB": 0}
 
 
 def rooms():
@@ -99,8 +100,7 @@ def draw(path):
     for name, found in arrows.items():
         for below in found:
             (x, y), (u, v) = place[name], place[below]
-            ax.annotate("", (u, v + HEIGHT / 2), (x, y - HEIGHT / 2), zorder=1,
-                        arrowprops={"arrowstyle": "-|>", "color": ARROW, "lw": 1.1, "shrinkA": 0, "shrinkB": 0})  # fmt: skip
+            ax.annotate("", (u, v + HEIGHT / 2), (x, y - HEIGHT / 2), zorder=1, arrowprops=ARROW)
     for name, (x, y) in place.items():
         box = plt.Rectangle((x - WIDTH / 2, y - HEIGHT / 2), WIDTH, HEIGHT, fc=FILL, ec=EDGE, lw=1.2, zorder=2)
         ax.add_patch(box)
