@@ -1,5 +1,6 @@
 """The model: a reduction as functions on numbers, built when they are asked for."""
 
+from collections.abc import Mapping
 from dataclasses import replace
 from functools import cached_property
 
@@ -12,10 +13,13 @@ from servoctl.model.derivation import Derivation
 from servoctl.model.equations import EQUATIONS, Equations, gradient_jets, leading_names, residual_rows
 from servoctl.model.formulations import FORMULATIONS
 from servoctl.model.servo_dae import SERVO_DAE
+from servoctl.model.start import State, consistent
 from servoctl.reduction.appell import require_positive
 from servoctl.reduction.knots import require_smooth
 from servoctl.reduction.reduce import holds
 from servoctl.reduction.structure import structure
+from servoctl.spec.mechanism import Mechanism
+from servoctl.spec.program import Program
 
 FUNCTIONS = {**EQUATIONS, **SERVO_DAE, **FORMULATIONS}
 SIGNALS = (
@@ -24,7 +28,7 @@ SIGNALS = (
 )  # fmt: skip
 
 
-def derive(mechanism, program, guess=None):
+def derive(mechanism: Mechanism, program: Program, guess: Mapping[str, float] | None = None) -> "Model":
     """Derive reduced dynamics and required actuation from a mechanism and its program (3.18).
 
     What another process has derived of the same specification is read from disk (see `servoctl.model.memo`).
@@ -91,7 +95,7 @@ class Model:
             names += q.jet_names(k)
         return tuple(names[:size])
 
-    def with_parameters(self, **changes):
+    def with_parameters(self, **changes: float) -> "Model":
         """The same model with other numbers.
 
         Nothing is derived or compiled again, unless what was zero or of low rank at the old numbers no longer is.
@@ -365,7 +369,7 @@ class Model:
         found |= {value[1].name: value[1] for key, value in self._functions.items() if key.startswith("signals ")}
         return {name: f.operations for name, f in found.items()}
 
-    def start(self, /, t=0.0, guess=None, **held):
+    def start(self, /, t: float = 0.0, guess: Mapping[str, float] | None = None, **held: float) -> State:
         """A consistent state: held values fixed, the rest solved from every invariant at every level.
 
         Parameters
@@ -389,8 +393,6 @@ class Model:
         InconsistentStart
             If a held value contradicts an invariant, or no consistent state is found.
         """
-        from servoctl.model.start import consistent
-
         return consistent(self, finite("t", t, "time"), held, guess)
 
     def structure(self, t=None, jets=None):
