@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from servoctl.errors import ServoError, SpecificationError, unknown
+from servoctl.values import Value, same
 
 STENCIL = 9  # samples of the polynomial through which an extremum is refined: error of order h^9
 ROUNDING = 1e-14  # of the values beside it: an extremum between samples that is no further from one is that sample
@@ -16,7 +17,7 @@ TOLD = ("method", "drift", "counters", "success", "status", "message", "knots") 
 
 
 @dataclass(frozen=True, eq=False)
-class Run:
+class Run(Value):
     """A motion with its actuation and its residuals; made by `simulate`, `close` or `load`.
 
     `run["theta"]`, `run["dtheta"]`, `run["trolley"]` are (N,) arrays, SI, and so are the derivatives in time of an
@@ -52,8 +53,16 @@ class Run:
     message: str = ""
     knots: tuple = ()
     variants: tuple = ()
-    stored: dict = field(default_factory=dict)
-    stored_residual: dict = field(default_factory=dict)
+    stored: dict = field(default_factory=dict, compare=False)
+    stored_residual: dict = field(default_factory=dict, compare=False)
+
+    def __eq__(self, other):
+        if not super().__eq__(other):
+            return False
+        follows = self.model is not None  # from the jets
+        return follows or same((self.stored, self.stored_residual), (other.stored, other.stored_residual))
+
+    __hash__ = Value.__hash__
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -79,7 +88,7 @@ class Run:
         Parameters
         ----------
         kind : str
-            One of `servoctl.model.model.SIGNALS`.
+            One of `servoctl.model.equations.SIGNALS`.
         rate : int
             Order of the derivative. It may need jets above s̄.
 

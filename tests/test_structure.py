@@ -75,7 +75,6 @@ def check(model, row):
     assert sum(row.n) + model.free == states  # the plant's states are the zeros at infinity and the internal ones
     assert structure.margin > 0 and structure.uniform
     assert len(repr(structure).splitlines()) <= 12 and f"index {row.index}" in repr(structure)
-    assert f"index {row.index}" in repr(model)
 
 
 @pytest.mark.parametrize("name", TABLE)
@@ -101,7 +100,7 @@ def test_ideal_programs(name, free, index, gallery_model):
 def test_programs_of_order_three_have_no_index_computed(gallery_model):
     model = gallery_model("spiral")
     assert model.structure().index is None and model.free == 5
-    assert "index" not in repr(model) and "Chetaev" in repr(model)
+    assert "Chetaev" in repr(model)
 
 
 # along a motion ------------------------------------------------------------------------------------------------------

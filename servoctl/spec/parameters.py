@@ -28,6 +28,9 @@ class Parameters:
             raise AttributeError(name)
         raise unknown(name, list(symbols), "parameter")
 
+    def __reduce__(self):
+        return Parameters, (self.defaults,)
+
     def __repr__(self):
         return "Parameters(" + ", ".join(f"{k}={v:g}" for k, v in self.defaults.items()) + ")"
 
