@@ -55,7 +55,7 @@ def call_once(arrays):
     f, x, p = model.function("ode"), start.values, model.parameters
     for _ in range(100):
         exact = f(0.0, x, p)  # by now it is compiled
-    plain = f._f
+    plain = f.expression
     if COMPILER:
         plain = ca.external(plain.name(), str(build(casadi_text(plain), "-O1")))
     buffer, trigger = plain.buffer()

@@ -4,7 +4,6 @@ import casadi as ca
 import numpy as np
 
 from servoctl.codegen.function import compiled
-from servoctl.codegen.loops.closed import LAW_DRIVER
 from servoctl.errors import SpecificationError, unknown
 
 
@@ -28,7 +27,7 @@ def law_step(name, t, x, row, outputs):
         (t_k, [y; z], row_k) -> [u; z+; further signals], with the C function that loops take.
     """
     y = ca.densify(ca.cse(ca.vertcat(*outputs)))
-    return compiled(ca.Function(name, [t, x, row], [y], ["t", "x", "p"], ["y"]), name, drivers=LAW_DRIVER)
+    return compiled(ca.Function(name, [t, x, row], [y], ["t", "x", "p"], ["y"]), name, ("law",))
 
 
 def affine_law(measures, n_u, feedback=True, residuals=None):

@@ -133,7 +133,7 @@ class Stepping:
     ----------
     model : Model
     method : str
-    drift : None, Poles, Project or Minimal
+    drift : None, Poles, Project or MinimalCoordinates
     progress : callable
     """
 

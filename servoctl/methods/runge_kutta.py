@@ -3,7 +3,7 @@
 import numpy as np
 
 from servoctl.errors import unknown
-from servoctl.methods.drift import Minimal, Project
+from servoctl.methods.drift import MinimalCoordinates, Project
 from servoctl.methods.minimal import Chart, Sizes
 from servoctl.methods.monitor import DEGRADED, Fine, Singular, Stretch
 from servoctl.methods.motion import Stepping, equal_steps
@@ -57,7 +57,7 @@ class RungeKuttaSteps(Stepping):
     model : Model
     method : str
         One of `ORDERS`.
-    drift : None, Poles, Project or Minimal
+    drift : None, Poles, Project or MinimalCoordinates
     step : float
         [s]
     progress : callable
@@ -68,7 +68,7 @@ class RungeKuttaSteps(Stepping):
     def __init__(self, model, method, drift, step, progress):
         self.tableau, self.step = tableau(method), step
         self.every = drift.every if isinstance(drift, Project) else 0
-        self.sizes = Sizes(model) if isinstance(drift, Minimal) else None
+        self.sizes = Sizes(model) if isinstance(drift, MinimalCoordinates) else None
         super().__init__(model, method, drift, progress)
 
     def _function(self, model, poles):

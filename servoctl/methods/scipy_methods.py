@@ -2,13 +2,11 @@
 
 import numpy as np
 
-from servoctl.methods.drift import Minimal, Project
+from servoctl.methods.drift import MinimalCoordinates, Project
 from servoctl.methods.minimal import MinimalSolver, Sizes
 from servoctl.methods.monitor import FRACTIONS, DenseStretch, Fine
 from servoctl.methods.motion import Stepping
 
-METHODS = ("RK23", "RK45", "DOP853", "Radau", "BDF", "LSODA")
-ONE_STEP = ("RK23", "RK45", "DOP853", "Radau")
 IMPLICIT = ("Radau", "BDF")
 
 
@@ -19,15 +17,15 @@ class ScipySteps(Stepping):
     ----------
     model : Model
     method : str
-        One of `METHODS`.
-    drift : None, Poles, Project or Minimal
+        One of `choice.SCIPY`.
+    drift : None, Poles, Project or MinimalCoordinates
     rtol, atol : float
     progress : callable
     """
 
     def __init__(self, model, method, drift, rtol, atol, progress):
         self.tolerances = {"rtol": rtol, "atol": atol}
-        self.sizes = Sizes(model) if isinstance(drift, Minimal) else None
+        self.sizes = Sizes(model) if isinstance(drift, MinimalCoordinates) else None
         super().__init__(model, method, drift, progress)
 
     def _use(self, model):
@@ -46,7 +44,7 @@ class ScipySteps(Stepping):
         import scipy.integrate
 
         method = getattr(scipy.integrate, self.method)
-        if isinstance(self.drift, Minimal):
+        if isinstance(self.drift, MinimalCoordinates):
             return MinimalSolver(method, self.model, self.sizes, a, x, b, self.tolerances, self.slopes is not None)
         exact = {} if self.slopes is None else {"jac": self._jacobian}
         return method(self._rates, a, x, b, **self.tolerances, **exact)

@@ -15,7 +15,6 @@ import numpy as np
 from servoctl.methods.bulk import BulkSteps
 from servoctl.methods.drift import Poles
 
-MULTISTEP = ("CVODES", "IDAS")
 WATCHED = 1000  # intervals of a span at whose ends pivots are looked at, beside the samples
 MOST_STEPS = 20_000  # between two instants of the grid
 SOLVERS = {"CVODES": "cvodes", "IDAS": "idas"}

@@ -127,7 +127,7 @@ def close_many(
     seeds = _seeds(conditions, len(columns[next(iter(columns))]))
     own_noise = seeds and (lambda case: noisy(conditions.noise, law.measures, loop.samples + 1, seeds[case]))
     threads = threads if threads is None else whole("threads", threads, least=1)
-    found = run_batch(derived, loop, *numbers, own_noise, traced, every, threads)
+    found = run_batch(derived, loop, numbers, own_noise, traced, every, threads)
     if found is None:
         found = _one_by_one(plant, law, plan, derived, loop, numbers, conditions, seeds, traced, every)
     meta = {"law": law.name, "rate": law.rate, "substeps": loop.substeps, "delay": loop.delay, "machine": machine()}
