@@ -65,12 +65,12 @@ class Run(Value):
     __hash__ = Value.__hash__
 
     @property
-    def names(self):
+    def names(self) -> tuple[str, ...]:
         """Names of all signals."""
         groups = self.model.signal_groups if self.model is not None else {}
         return tuple(dict.fromkeys([*self.jet_names, *groups, *self.stored]))
 
-    def __getitem__(self, name):
+    def __getitem__(self, name: str) -> np.ndarray:
         if name in self.jet_names:
             return self.jets[self.jet_names.index(name)]
         if name not in self.stored:
@@ -113,16 +113,16 @@ class Run(Value):
             parts.append(f.grid(self.t[first:end], self.jets[: f.n_x, first:end], model.parameters))
         return names, np.concatenate(parts, axis=1)
 
-    def variant(self, i):
+    def variant(self, i: int):
         """The variant of the model that holds at sample i."""
         return next((model for first, end, model in self.variants if first <= i < end), self.model)
 
     @property
-    def residual(self):
+    def residual(self) -> Mapping[str, np.ndarray]:
         """Residuals of every constraint at every level: a mapping of names to (levels, N) arrays."""
         return _Residuals(self)
 
-    def state(self, t):
+    def state(self, t: float) -> np.ndarray:
         """The state (q, γ') of the mechanism at an instant, between samples by Hermite interpolation.
 
         Parameters
@@ -137,7 +137,7 @@ class Run(Value):
         jets = self.at(t)
         return jets[: self.model.nq + self.model.n]
 
-    def at(self, t):
+    def at(self, t: float) -> np.ndarray:
         """The jets Z at an instant (n_z,), between samples by Hermite interpolation of all derivatives.
 
         Parameters
@@ -188,7 +188,7 @@ class Run(Value):
         values = f.grid(self.t[columns], self.jets[: f.n_x, columns], self.model.parameters)
         return [values[: self.model.nq], values[self.model.nq :]]
 
-    def extrema(self, name):
+    def extrema(self, name: str) -> tuple[tuple[float, float], tuple[float, float]]:
         """The least and the greatest value of a signal, refined between samples.
 
         Parameters
@@ -349,7 +349,7 @@ class _Residuals(Mapping):
         return stored[name]
 
 
-def load(path):
+def load(path) -> Run:
     """A run from a file that `Run.save` wrote.
 
     Parameters

@@ -11,6 +11,7 @@ from types import SimpleNamespace
 import casadi as ca
 import numpy as np
 import pytest
+from refusals import refused
 
 import servoctl as sv
 from servoctl.codegen import cache
@@ -219,7 +220,7 @@ def test_a_refused_specification_is_refused_again(derived, tmp_path):
     q = mechanism.q
     program = sv.Program({"a": next(iter(q)) - q.t, "b": next(iter(q)) - ca.sin(q.t)})
     for _ in range(2):
-        with pytest.raises(sv.SpecificationError, match="contradict"):
+        with refused(sv.SpecificationError, "contradict", rows=["a", "b"]):
             sv.derive(mechanism, program)
     with pytest.raises(sv.SpecificationError):
         sv.derive(mechanism, "a program")
@@ -307,7 +308,7 @@ def test_a_changed_specification_changes_no_model(derived):
     model = sv.derive(mechanism, program)
     program.residuals["swing"] = next(iter(mechanism.q)) - ca.cos(mechanism.q.t)
     assert as_text(model.reduction) == as_text(sv.derive(*pendulum()).reduction)
-    with pytest.raises(sv.SpecificationError):
+    with refused(sv.SpecificationError, "mechanism", "program"):
         model.signals("residuals")
 
 
@@ -315,9 +316,9 @@ def test_what_a_changed_specification_gives_is_not_kept(derived):
     made = [pendulum(output=lambda q: {"height": ca.cos(next(iter(q)))}) for _ in range(2)]
     changed, model = (sv.derive(*specification) for specification in made)
     made[0][0].outputs["height"] = ca.SX(7.0)
-    with pytest.raises(sv.SpecificationError, match="changed after"):
+    with refused(sv.SpecificationError, "mechanism", "program"):
         changed.signals("outputs")
-    with pytest.raises(sv.SpecificationError, match="changed after"):
+    with refused(sv.SpecificationError, "mechanism", "program"):
         changed.near(0.0, [0.0, 1.0, 0.0])
     assert model.signals("outputs")[1](0.0, [0.3, 0.0, 0.0], model.parameters) == np.cos(0.3)
 

@@ -1,5 +1,6 @@
 """The model: a reduction as functions on numbers, built at their first use."""
 
+from collections.abc import Mapping
 from dataclasses import replace
 from functools import cached_property
 
@@ -12,16 +13,19 @@ from servoctl.model.equations import EQUATIONS, SIGNALS, Equations, gradient_jet
 from servoctl.model.formulations import FORMULATIONS
 from servoctl.model.report import describe
 from servoctl.model.servo_dae import SERVO_DAE
+from servoctl.model.start import State, consistent
 from servoctl.model.store import Store, pack, unpack
 from servoctl.reduction.appell import require_positive
 from servoctl.reduction.knots import require_smooth
 from servoctl.reduction.reduce import holds, reduce
 from servoctl.reduction.structure import structure
+from servoctl.spec.mechanism import Mechanism
+from servoctl.spec.program import Program
 
 FUNCTIONS = {**EQUATIONS, **SERVO_DAE, **FORMULATIONS}
 
 
-def derive(mechanism, program, guess=None):
+def derive(mechanism: Mechanism, program: Program, guess: Mapping[str, float] | None = None) -> "Model":
     """Derive reduced dynamics and required actuation from a mechanism and its program (3.18).
 
     Parameters
@@ -106,7 +110,7 @@ class Model:
             names += q.jet_names(k)
         return tuple(names[:size])
 
-    def with_parameters(self, **changes):
+    def with_parameters(self, **changes: float) -> "Model":
         """The same model with other numbers.
 
         Nothing is derived or compiled again, unless what was zero or of low rank at the old numbers no longer is.
@@ -368,7 +372,7 @@ class Model:
         signals = {value[1].name: value[1] for value in self._functions.values() if isinstance(value, tuple)}
         return {name: f.operations for name, f in (self._functions | signals).items() if hasattr(f, "operations")}
 
-    def start(self, /, t=0.0, guess=None, **held):
+    def start(self, /, t: float = 0.0, guess: Mapping[str, float] | None = None, **held: float) -> State:
         """A consistent state: held values fixed, the rest solved from every invariant at every level.
 
         Parameters
@@ -392,8 +396,6 @@ class Model:
         InconsistentStart
             If a held value contradicts an invariant, or no consistent state is found.
         """
-        from servoctl.model.start import consistent
-
         return consistent(self, finite("t", t, "time"), held, guess)
 
     def structure(self, t=None, jets=None):

@@ -13,7 +13,10 @@ from servoctl.spec.mechanism import Mechanism, require_known
 from servoctl.values import Value
 
 
-def plant(mechanism, *, forces=None, damping=None, limits=None, rate_limits=None, lag=None, delay=0.0, **parameters):
+def plant(
+    mechanism: Mechanism, *, forces=None, damping=None, limits=None, rate_limits=None, lag=None, delay=0.0,
+    **parameters: float,
+) -> "Plant":  # fmt: skip
     """Make the plant of a mechanism: what the controller acts on.
 
     The equations are derived once for a mechanism and a set of further forces; other numbers cost nothing.
@@ -178,7 +181,7 @@ class Plant(Value):
         """Names of the invariants in the order of the function "constraints"."""
         return self.equations.constraints()[0]
 
-    def rates(self, t, x, u, d=None):
+    def rates(self, t, x, u, d=None) -> np.ndarray:
         """The rates x' at one point.
 
         Parameters
@@ -215,7 +218,7 @@ class Plant(Value):
         both = y.reshape(-1, self.n_x, len(t)).transpose(2, 1, 0)
         return both[:, :, : self.n_x], both[:, :, self.n_x :]
 
-    def state(self, values):
+    def state(self, values) -> np.ndarray:
         """A full state: an array of (q, γ') or of all states, or values by name.
 
         Lagged inputs without a value are NaN: `close` lets them start at the first input.

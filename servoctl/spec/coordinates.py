@@ -1,6 +1,7 @@
 """Generalised coordinates, quasi-velocities and their jets, and the total derivative (3.1)."""
 
 import threading
+from collections.abc import Iterable
 from math import factorial
 from numbers import Integral
 
@@ -44,7 +45,7 @@ class Coordinates:
     def __iter__(self):
         return iter(self._q)
 
-    def __len__(self):
+    def __len__(self) -> int:
         return self.nq
 
     @property
@@ -125,7 +126,7 @@ class Coordinates:
         """γ^(k), k >= 1, or q for k = 0, as a column: (n,) or (nq,) SX."""
         return ca.vertcat(*(self.gamma(k) if k else self._q))
 
-    def jet_names(self, k):
+    def jet_names(self, k: int) -> tuple[str, ...]:
         """Names of γ^(k), k >= 1, or of q for k = 0."""
         if k == 0:
             return self.names
@@ -344,7 +345,7 @@ def _clash(name, why):
     )
 
 
-def coordinates(names):
+def coordinates(names: str | Iterable[str]) -> Coordinates:
     """Generalised coordinates by name, with jets of any order on demand.
 
     Parameters

@@ -72,7 +72,7 @@ class Parameters:
         return np.array(list(numbers.values()), dtype=float)
 
 
-def parameters(**values):
+def parameters(**values: float) -> Parameters:
     """Parameters with their default numbers, e.g. `parameters(m=1.0, g=9.81)`.
 
     Parameters

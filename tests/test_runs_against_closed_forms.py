@@ -6,6 +6,7 @@ import casadi as ca
 import closed_forms as cf
 import numpy as np
 import pytest
+from conftest import relative
 from scipy.optimize import brentq, minimize_scalar
 
 import servoctl as sv
@@ -13,11 +14,6 @@ from servoctl.gallery import cars, gallery, mass_on_car, passive_arm, spiral, vt
 from servoctl.methods.choice import as_method
 
 TIGHT = {"rtol": 1e-12, "atol": 1e-13}
-
-
-def relative(found, expected):
-    """Largest error, of the largest value."""
-    return np.max(np.abs(found - expected)) / np.max(np.abs(expected))
 
 
 def peak(reference, signal, near, sign):
