@@ -110,7 +110,7 @@ def _derived(plant, law, disturbed, residuals):
     phi, v, v_values = _apart(phi, constants)
     sizes = {
         "NX": x.numel(), "NU": n_u, "NP": p.numel(), "NC": n_c, "NW": w.numel(), "NV": v.numel(),
-        "ND": len(disturbed), "NY": len(law.measures), "NZ": len(law.memory), "NO": law.n_out, "NL": common.numel(),
+        "ND": len(disturbed), "NY": len(law.measures), "NZ": len(law.state), "NO": law.n_out, "NL": common.numel(),
         "NS": s.numel(), "NR": phi.numel(), "NT": x.numel() + n_u + phi.numel(),
     }  # fmt: skip
     functions = [

@@ -5,9 +5,10 @@ from dataclasses import replace
 import numpy as np
 
 from servoctl.checks import finite
-from servoctl.control.feedback import Residuals
+from servoctl.control.feedback import StateFeedback, affine
+from servoctl.control.reference import Reference, refuse_transport
+from servoctl.control.residuals import Residuals
 from servoctl.control.sampling import discretised, spectral_radii
-from servoctl.control.tracking import Reference, affine, refuse_transport
 from servoctl.errors import ServoError, SpecificationError, unknown
 
 MARGINAL = 1 + 1e-6  # spectral radius of what may stay out of reach: it neither falls nor grows
@@ -67,27 +68,36 @@ def lqr(plan, plant, rate=100.0, Q=None, R=None, integral=None, varying=True):
         )
     reference = Reference(plan, plant, rate)
     refuse_transport(plant, "The design is")
-    q = plant.mechanism.q
-    default = np.zeros(plant.n_x)
-    default[: q.nq + q.n] = [Q_POSITION] * q.nq + [Q_VELOCITY] * q.n
-    Q = weights(Q, default, plant.state_names, "state", "Q")
+    Q = weights(Q, _state_weights(plant), plant.state_names, "state", "Q")
     R = weights(R, np.full(len(plant.inputs), R_INPUT), plant.inputs, "actuator", "R", positive=True)
     residuals, Q_i = _integrals(integral, plan, plant)
     A, B = discretised(*reference.linearised(), reference.period)
-    if residuals:
-        A, B, Q = _with_integrals(A, B, Q, residuals, Q_i, reference)
+    augmented = _with_integrals(A, B, Q, residuals, Q_i, reference) if residuals else (A, B, Q)
     basis = tangents(reference, 0 if residuals is None else len(Q_i))
-    K = _varying(A, B, Q, R, basis) if varying else steady(A, B, Q, R, basis)[0]
-    radii = spectral_radii(_reduced(A - B @ K, basis))
-    facts = {
+    K, radii = _gains(*augmented, R, basis, varying)
+    K_x, K_i = np.split(K, [plant.n_x], axis=2)
+    integrated = residuals.names if residuals else ()
+    how = f"lqr, {'time-varying' if varying else 'frozen-time'}" + (", with integrals" if residuals else "")
+    info = {
         "largest spectral radius along the plan": float(radii.max()),
         "spectral radius at its end": float(radii[-1]),
-        "gains": K, "Q": Q, "R": R, "integrated": residuals.names if residuals else (), "states": plant.state_names,
+        "gains": K, "Q": augmented[2], "R": R, "integrated": integrated, "states": plant.state_names,
     }  # fmt: skip
-    n_x = plant.n_x
-    how = f"lqr, {'time-varying' if varying else 'frozen-time'}" + (", with integrals" if residuals else "")
-    law = affine(how, reference, K[:, :, :n_x], K[:, :, n_x:], residuals)
-    return replace(law, info=facts)
+    law = affine(how, reference, K_x, K_i, residuals, info)
+    return replace(law, feedback=StateFeedback(plant.state_names, integrated, K_x, K_i))
+
+
+def _state_weights(plant):
+    """The default diagonal of Q: coordinates, velocities, and 0 for lagged inputs."""
+    q, diagonal = plant.mechanism.q, np.zeros(plant.n_x)
+    diagonal[: q.nq + q.n] = [Q_POSITION] * q.nq + [Q_VELOCITY] * q.n
+    return diagonal
+
+
+def _gains(A, B, Q, R, basis, varying):
+    """K (N, m, n) along the plan or frozen at each sample, and the spectral radii of A - B K, (N,)."""
+    K = _varying(A, B, Q, R, basis) if varying else steady(A, B, Q, R, basis)[0]
+    return K, spectral_radii(_reduced(A - B @ K, basis))
 
 
 def _with_integrals(A, B, Q, residuals, Q_i, reference):
@@ -115,9 +125,9 @@ def tangents(reference, extra=0):
     rank = int(np.linalg.matrix_rank(J[0], tol=1e-9 * np.abs(J[0]).max()))
     T = np.linalg.svd(J)[2][:, rank:].transpose(0, 2, 1)
     n, r = T.shape[1:]
-    found = np.zeros((len(T), n + extra, r + extra))
-    found[:, :n, :r], found[:, n:, r:] = T, np.eye(extra)
-    return found
+    bases = np.zeros((len(T), n + extra, r + extra))
+    bases[:, :n, :r], bases[:, n:, r:] = T, np.eye(extra)
+    return bases
 
 
 def _reduced(A, basis):
@@ -165,8 +175,7 @@ def steady(A, B, Q, R, basis):
         raise ServoError(
             "The steady Riccati equation has no stabilising solution.",
             "Each unstable or marginal mode is reached by the inputs and seen by the weights.",
-            nearest="Weights on all states; fewer integrals than inputs; another set of actuators.",
-            do="Check which modes the actuators reach.",
+            do="Weigh all states, integrate fewer residuals than there are inputs, or choose other actuators.",
             radius=float(radii.max()),
         )
     return K @ left, T[-1] @ P[-1] @ T[-1].T
@@ -225,26 +234,25 @@ def weights(given, default, names, what, symbol, positive=False):
     NameUnknown
     SpecificationError
     """
-    n, found = len(names), np.array(default, dtype=float)
+    n, entries = len(names), np.array(default, dtype=float)
     if isinstance(given, dict):
         for name, value in given.items():
             if name not in names:
                 raise unknown(name, names, what)
-            found[list(names).index(name)] = finite(name, value, "weight")
+            entries[list(names).index(name)] = finite(name, value, "weight")
     elif given is not None:
         try:
-            found = np.asarray(given, dtype=float)
+            entries = np.asarray(given, dtype=float)
         except (TypeError, ValueError):
-            found = np.empty(())
-            given = None
-        found = np.full(n, float(found)) if found.ndim == 0 and given is not None else found
-    matrix = np.diag(found) if found.shape == (n,) else found
+            entries = np.empty((0, 0))
+        entries = np.full(n, float(entries)) if entries.ndim == 0 else entries
+    matrix = np.diag(entries) if entries.shape == (n,) else entries
     if matrix.shape != (n, n):
         raise SpecificationError(
-            f"{symbol} has the shape {found.shape}.",
+            f"{symbol} has the shape {entries.shape}." if entries.size else f"{symbol} is {given!r}."[:200],
             f"It is a number, {n} numbers or an ({n}, {n}) matrix, for {', '.join(names)}; or numbers by name.",
             do="Give one weight each.",
-            shape=found.shape,
+            shape=entries.shape,
         )
     symmetric = np.isfinite(matrix).all() and np.allclose(matrix, matrix.T, rtol=1e-9, atol=0)
     least = np.linalg.eigvalsh(matrix).min(initial=np.inf) if symmetric else -np.inf
@@ -270,6 +278,6 @@ def _integrals(integral, plan, plant):
             "A residual that is fed back is a function of the state (q, γ').",
             do="Leave out integral.",
         )
-    given = None if integral is True else integral
+    weighted = None if integral is True else integral
     names = residuals.names
-    return residuals, weights(given, np.full(len(names), Q_INTEGRAL), names, "residual", "integral", positive=True)
+    return residuals, weights(weighted, np.full(len(names), Q_INTEGRAL), names, "residual", "integral", positive=True)

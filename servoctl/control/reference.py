@@ -1,93 +1,13 @@
-"""Laws from a plan: its actuation alone, or with proportional and derivative feedback of the actuated displacements."""
+"""The reference of a law: a plan at the instants of sampling, with what the plant's linearisation is there."""
 
 from dataclasses import replace
+from math import factorial, perm
 
 import numpy as np
 
-from servoctl.checks import ON_SAMPLE, finite, mapping, positive, require_memory
-from servoctl.control.feedback import affine_law
-from servoctl.control.law import Law
-from servoctl.control.sampling import sampled_radii
+from servoctl.checks import ON_SAMPLE, positive, require_memory
 from servoctl.errors import NotRealisable, ServoError, SpecificationError, unknown
 from servoctl.plants.plant import Plant
-
-UNSTABLE = 1e-9  # beyond 1: spectral radii that count as unstable
-GAUSS = np.polynomial.legendre.leggauss(3)
-
-
-def feedforward(plan, plant, rate=100.0, held="middle"):
-    """The plan's actuation, held over each sample; no feedback.
-
-    An actuator's lag T is inverted, u + T du/dt, and its transport delay is met by commanding earlier.
-
-    Parameters
-    ----------
-    plan : Run
-        With its model, by="actuators".
-    plant : Plant
-        What the controller believes of the machine.
-    rate : float
-        Samples per second [Hz]; default 100, a usual rate of industrial drives.
-    held : {"middle", "mean"}
-        The actuation in the middle of the sample (default: the error of the hold is then of second order in the
-        period), or its mean over the sample.
-
-    Returns
-    -------
-    Law
-    """
-    reference = Reference(plan, plant, rate)
-    table = reference.inputs(held)
-    return Law(
-        "feedforward", (), plant.inputs, reference.rate, reference.t[0], affine_law((), len(plant.inputs), False),
-        table, idle=reference.idle, plan=plan,
-    )  # fmt: skip
-
-
-def pd(plan, plant, rate=100.0, kp=None, kd=None):
-    """The plan's actuation, and feedback of each actuator's own displacement and speed about the plan.
-
-    u_a = u_plan - kp_a e_a - kd_a de_a/dt with e_a = E_aᵀ(γ - γ_plan): the error of the displacement that the actuator
-    works on.
-
-    Parameters
-    ----------
-    plan : Run
-    plant : Plant
-        What the controller believes of the machine.
-    rate : float
-        Samples per second [Hz].
-    kp, kd : dict of str to float
-        Gains by actuator: input per displacement and per speed.
-
-    Returns
-    -------
-    Law
-        Its info holds the largest spectral radius of the sampled error dynamics along the plan.
-
-    Raises
-    ------
-    NameUnknown
-        For a gain of no actuator.
-    ServoError
-        If the rate is too low for the gains: the last sample's error dynamics are unstable, and were not at a higher
-        rate.
-    """
-    reference = Reference(plan, plant, rate)
-    kp, kd = (_gains(gains, plant, what) for gains, what in ((kp, "kp"), (kd, "kd")))
-    q, n_x, m = plant.mechanism.q, plant.n_x, len(plant.inputs)
-    nq, n = len(q.names), len(plant.disturbable)
-    p = plant.p(reference.middle_input)
-    both = plant.function("directions").grid(reference.t, reference.x, p)
-    E, V = both[: n * m].reshape(m, n, -1).transpose(2, 0, 1), both[n * m :].reshape(n, nq, -1).transpose(2, 1, 0)
-    K = np.zeros((len(reference.t), m, n_x))
-    K[:, :, :nq] = kp[:, None] * (E @ np.linalg.pinv(V))
-    K[:, :, nq : nq + n] = kd[:, None] * E
-    law = affine(f"pd, kp {_named(kp, plant)}, kd {_named(kd, plant)}", reference, K)
-    A, B = reference.linearised()
-    radius = sampled_radii(A, B, K, reference.period, _transport(plant))
-    _refuse_slow_rate(reference, A[-1:], B[-1:], K[-1:], radius[-1])
-    return replace(law, info={"largest spectral radius along the plan": float(radius.max())})
 
 
 class Reference:
@@ -138,11 +58,9 @@ class Reference:
         run, plant = resampled(self.plan, np.minimum(t, self.end)), self.plant
         return np.array([run[name] for name in plant.state_names])  # a lagged input follows the plan's
 
-    def inputs(self, held="middle"):
-        """The command of each sample, (m, N): the plan's actuation, with lag and transport delay inverted."""
-        if held not in ("middle", "mean"):
-            raise unknown(held, ("middle", "mean"), "choice of the held value")
-        return np.array([self._command(a, name, held) for a, name in enumerate(self.plant.inputs)])
+    def inputs(self):
+        """The command of each sample, (m, N): the actuation in its middle, with lag and transport delay inverted."""
+        return self._commands(self.period / 2)
 
     def ahead(self, late=0):
         """By how much the command in the middle of the time for which it is held exceeds that at each sample, (m, N).
@@ -152,21 +70,17 @@ class Reference:
         late : int
             Samples from the measurement to the input: that of the sample k is held from the sample k + late on.
         """
-        names = self.plant.inputs
-        middle = np.array([self._command(a, name, "middle", late * self.period) for a, name in enumerate(names)])
-        found = middle - np.array([self._command(a, name, "start") for a, name in enumerate(names)])
-        found[:, -1] = 0.0
-        return found
+        exceeding = self._commands(self.period / 2, late * self.period) - self._commands(0.0)
+        exceeding[:, -1] = 0.0
+        return exceeding
 
-    def _command(self, a, name, held, late=0.0):
-        later = self.t + self.plant.delay.get(name, 0.0) + late
-        at = later if held == "start" else later + self.period / 2
-        if held == "mean":
-            nodes, weights = GAUSS
-            parts = (self._actuation(at + self.period / 2 * s)[a] for s in nodes)
-            u = sum(w / 2 * part for w, part in zip(weights, parts, strict=True))
-        else:
-            u = self._actuation(at)[a]
+    def _commands(self, into, late=0.0):
+        """Commands for the plan's actuation a time into each hold that begins `late` after its sample [s], (m, N)."""
+        return np.array([self._command(a, name, into, late) for a, name in enumerate(self.plant.inputs)])
+
+    def _command(self, a, name, into, late):
+        at = self.t + self.plant.delay.get(name, 0.0) + late + into
+        u = self._actuation(at)[a]
         return u + self.plant.lag[name] * self._slope(at)[a] if name in self.plant.lag else u
 
     def _slope(self, t):
@@ -189,41 +103,6 @@ class Reference:
                 t=float(self.middle[lost][0]),
             )
         return A, B
-
-
-def affine(name, reference, K, K_i=None, residuals=None, **facts):
-    """The law u = u_ff - K (x - x_ref) - K_i z of gains along a reference.
-
-    Parameters
-    ----------
-    name : str
-    reference : Reference
-    K : (N, m, n_x) array
-        Gains; states whose gains all vanish are not measured.
-    K_i : (N, m, n_z) array, optional
-    residuals : Residuals, optional
-        What is integrated in z.
-    **facts
-        For the law's info.
-
-    Returns
-    -------
-    Law
-    """
-    plant, names = reference.plant, residuals.names if residuals else ()
-    used = np.any(K != 0, axis=(0, 1))
-    needed = set(residuals.measures) if residuals else set()
-    measures = tuple(n for n, u in zip(plant.state_names, used, strict=True) if u or n in needed)
-    where = [plant.state_names.index(name) for name in measures]
-    parts = [reference.inputs(), reference.x[where], K[:, :, where].reshape(len(K), -1).T]
-    if residuals:
-        parts.append(K_i.reshape(len(K_i), -1).T)
-        parts.append(np.tile(np.append(reference.period, residuals.parameters)[:, None], len(reference.t)))
-    step = affine_law(measures, len(plant.inputs), residuals=residuals)
-    return Law(
-        name, measures, plant.inputs, reference.rate, reference.t[0], step, np.vstack(parts),
-        np.zeros(len(names)), tuple(f"integral of {n}" for n in names), (), reference.idle, reference.plan, facts,
-    )  # fmt: skip
 
 
 def require_plant(plant):
@@ -328,8 +207,6 @@ def _hermite(t, derivatives, i, h, times):
     -------
     list of (n, M) arrays
     """
-    from math import factorial, perm
-
     r, s = len(derivatives), (times - t[i]) / h
     low = [d[:, i] * h**k / factorial(k) for k, d in enumerate(derivatives)]
     matrix = np.array([[perm(j, k) for j in range(r, 2 * r)] for k in range(r)], dtype=float)
@@ -338,51 +215,3 @@ def _hermite(t, derivatives, i, h, times):
     high = np.einsum("jk,knm->jnm", np.linalg.inv(matrix), np.array(missing))
     c = [*low, *high]
     return [sum(perm(j, k) * c[j] * s ** (j - k) for j in range(k, 2 * r)) / h**k for k in range(r)]
-
-
-def _gains(gains, plant, what):
-    found = np.zeros(len(plant.inputs))
-    for name, value in mapping(gains, f"The gains {what}").items():
-        if name not in plant.inputs:
-            raise unknown(name, plant.inputs, "actuator")
-        if np.ndim(value) != 0:
-            raise SpecificationError(
-                f"The gain {what} of {name!r} has the shape {np.shape(value)}.",
-                "Each actuator has one number.",
-                do=f"Write {what}={{{name!r}: 100.0}}.",
-            )
-        found[plant.inputs.index(name)] = finite(name, value, f"gain {what}")
-    return found
-
-
-def _named(gains, plant):
-    return " ".join(f"{name}={k:g}" for name, k in zip(plant.inputs, gains, strict=True) if k) or "none"
-
-
-def _transport(plant):
-    return np.array([plant.delay.get(name, 0.0) for name in plant.inputs])
-
-
-def _refuse_slow_rate(reference, A, B, K, radius):
-    """Refuse gains that are unstable as sampled and delayed, at the plan's end, where they were not otherwise."""
-    delays = _transport(reference.plant)
-    if radius <= 1 + UNSTABLE:
-        return
-    if sampled_radii(A, B, K, reference.period, 0 * delays)[0] <= 1 + UNSTABLE:
-        raise ServoError(
-            f"With the transport delay of {delays.max():g} s errors grow by the factor {radius:.4g} per sample at the "
-            "plan's end.",
-            "A delay of d samples lowers the bound of poles: p·Ts < 0.4262 for ρ = 2 and d = 1.",
-            nearest="Lower gains.",
-            do="Choose gains for poles well below one over the delay.",
-            radius=float(radius),
-        )
-    growth = max(0.0, float(np.linalg.eigvals(A[0] - B[0] @ K[0]).real.max()))
-    if np.log(radius) > 2 * growth * reference.period + UNSTABLE:  # what is unstable without sampling, is so with it
-        raise ServoError(
-            f"Sampled at {reference.rate:g} Hz, errors grow by the factor {radius:.4g} per sample at the plan's end.",
-            "Under a zero-order hold ρ equal poles -p are stable for p·Ts < 1, 0.6752, 0.5111, 0.4116: ρ = 2 to 5.",
-            nearest="A higher rate, or lower gains.",
-            do="Choose gains for poles well below the rate.",
-            radius=float(radius),
-        )

@@ -1,0 +1,133 @@
+"""Residuals of a program as functions of a plant's state, by name."""
+
+import casadi as ca
+import numpy as np
+
+from servoctl.codegen.function import compiled
+from servoctl.errors import SpecificationError, unknown
+
+
+class Residuals:
+    """Residuals of a program as functions of a plant's state, matched by name.
+
+    Parameters
+    ----------
+    model : Model
+        Of the plan.
+    plant : Plant
+        Its states and parameters are used: what the controller believes of the machine.
+    names : sequence of str, optional
+        Which residuals; default all whose order allows it.
+    order : int
+        The highest: 1 for functions of the state (q, γ'), 2 where accelerations are given beside it.
+
+    Raises
+    ------
+    NameUnknown
+        If a residual is none of the program's, or needs a state or a parameter that the plant lacks.
+    SpecificationError
+        If a residual that was named depends on accelerations.
+    """
+
+    def __init__(self, model, plant, names=None, order=1):
+        mechanism, program = model.reduction.mechanism, model.reduction.program
+        self._q = mechanism.q
+        orders = {name: self._q.order(e) for name, e in program.residuals.items()}
+        for name in names or ():
+            if name not in orders:
+                raise unknown(name, orders, "residual")
+            if orders[name] > order:
+                raise SpecificationError(
+                    f"The residual {name!r} has order {orders[name]}.",
+                    "A residual that is fed back is a function of the state (q, γ').",
+                    nearest=", ".join(repr(n) for n, order in orders.items() if order <= 1),
+                    do="Leave it out.",
+                    name=name,
+                )
+        self.names = tuple(name for name in orders if orders[name] <= order and (names is None or name in names))
+        self.orders = tuple(max(orders[name], 0) for name in self.names)
+        self._expressions = ca.vertcat(*(program.residuals[name] for name in self.names))
+        own = plant.mechanism.parameters
+        self._symbols = [s for s in mechanism.parameters.symbols if _depends(self._expressions, s)]
+        for s in self._symbols:
+            if s.name() not in own.names:
+                raise unknown(s.name(), own.names, "parameter of the plant")
+        self.parameters = np.array([plant.parameters[own.names.index(s.name())] for s in self._symbols])
+        self.measures = tuple(s.name() for s in self._states(self._expressions))
+        for name in self.measures:
+            if name not in plant.state_names:
+                raise unknown(name, plant.state_names, "state of the plant")
+        self._plant, self._order = plant, order
+        self._built = {}
+
+    def _states(self, expression):
+        return [s for s in (*self._q, *self._q.gamma(1)) if _depends(expression, s)]
+
+    def expression(self, t, y, measures, p):
+        """φ as an SX column of the symbols t, y (named by `measures`) and p."""
+        found = self._states(self._expressions)
+        old = [self._q.t, *found, *self._symbols]
+        new = [t, *(y[measures.index(s.name())] for s in found), *ca.vertsplit(p)]
+        return ca.substitute(self._expressions, ca.vertcat(*old), ca.vertcat(*new))
+
+    def _function(self, key, outputs):
+        if key not in self._built:
+            state = ca.vertcat(*self._q, *(s for k in range(self._order) for s in self._q.gamma(k + 1)))
+            p = ca.vertcat(*self._symbols) if self._symbols else ca.SX(0, 1)
+            y = ca.densify(ca.cse(ca.vertcat(*outputs(state))))
+            self._built[key] = compiled(ca.Function(key, [self._q.t, state, p], [y]), key)
+        return self._built[key]
+
+    def _ordered(self, x):
+        """States, and accelerations where they are given, in the plan's order, from an array in the plant's."""
+        names = (*self._q.names, *(name for k in range(self._order) for name in self._q.jet_names(k + 1)))
+        own = (*self._plant.state_names, *self._plant.mechanism.q.jet_names(2))
+        rows = [own.index(name) if name in own else -1 for name in names]
+        return np.where(np.array(rows)[:, None] < 0, 0.0, x[rows])
+
+    def levels(self, t, x):
+        """Residuals and those of their derivatives that the state decides.
+
+        Parameters
+        ----------
+        t : (N,) array
+        x : (n_x, N) array
+            States of the plant; for residuals of order 2 with accelerations behind them, (n_x + n, N).
+
+        Returns
+        -------
+        dict of str to (levels, N) array
+            Two levels for a residual of order 0, one for the others.
+        """
+
+        def outputs(_state):
+            items = self._expressions.elements()
+            return [
+                level[0]
+                for e, order in zip(items, self.orders, strict=True)
+                for level in self._q.derivatives([e], max(1 - order, 0))
+            ]
+
+        values = self._function("residual_levels", outputs).grid(t, self._ordered(x), self.parameters)
+        counts = [max(2 - order, 1) for order in self.orders]
+        ends = np.cumsum([0, *counts])
+        return {n: values[a:b] for n, a, b in zip(self.names, ends[:-1], ends[1:], strict=True)}
+
+    def jacobian(self, t, x):
+        """∂φ/∂x along states of the plant, (N, k, n_x)."""
+        k = len(self.names)
+
+        def outputs(state):
+            return [ca.vec(ca.densify(ca.jacobian(self._expressions, state)))]
+
+        values = self._function("residual_jacobian", outputs).grid(t, self._ordered(x), self.parameters)
+        values = values.reshape(-1, k, len(t)).transpose(2, 1, 0)
+        found = np.zeros((len(t), k, self._plant.n_x))
+        for i, name in enumerate((*self._q.names, *self._q.jet_names(1))):
+            if name in self._plant.state_names:
+                found[:, :, self._plant.state_names.index(name)] = values[:, :, i]
+        return found
+
+
+def _depends(expression, symbol):
+    return bool(ca.depends_on(expression, symbol))
