@@ -67,21 +67,7 @@ def close(plant, law, x0, t_span, *, sensors=None, timing=None, disturbance=None
 
 
 def prepared(plant, law, x0, t_span, conditions):
-    """All numbers of a loop, in tables made beforehand.
-
-    Parameters
-    ----------
-    plant : Plant
-    law : Law
-    x0 : array or dict of str to float
-    t_span : (t0, t1)
-        [s]
-    conditions : Conditions
-
-    Returns
-    -------
-    Loop
-    """
+    """All numbers of a `Loop`, in tables made beforehand."""
     (t0, t1), sensors, timing, forces = t_span, conditions.sensors, conditions.timing, conditions.disturbance
     samples = whole_multiple((t1 - t0) * law.rate, f"t_span of {t1 - t0:g} s at {law.rate:g} Hz", "samples")
     stored = plant.n_x + len(law.measures) + len(law.state) + law.n_out + len(plant.inputs) + len(sensors.noise)

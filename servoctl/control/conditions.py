@@ -4,7 +4,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from servoctl.checks import ON_SAMPLE, finite, mapping, positive, whole
+from servoctl.checks import ON_SAMPLE, mapping, numbers_by_name, positive, whole
 from servoctl.control.disturbances import sampled
 from servoctl.errors import SpecificationError, unknown
 
@@ -38,8 +38,8 @@ class Sensors:
 
     def __post_init__(self):
         for what in ("noise", "quantisation"):
-            values = mapping(getattr(self, what), f"The {what}")
-            object.__setattr__(self, what, {name: _not_negative(name, v, what) for name, v in values.items()})
+            values = getattr(self, what) or {}
+            object.__setattr__(self, what, numbers_by_name(values, values, "measured state", what, low=0.0))
         if self.seed is None:
             return
         object.__setattr__(self, "seed", whole("seed", self.seed))
@@ -66,12 +66,12 @@ class Sensors:
         (count, n_y) array or None
             None without noise.
         """
-        std = by_measure(self.noise, measures)
+        std = _by_measure(self.noise, measures)
         return None if std is None else np.random.default_rng(self.seed or 0).standard_normal((count, len(std))) * std
 
     def quantum(self, measures):
         """The quantisation in the order of `measures`, (n_y,), 0 for what is not quantised; None without any."""
-        return by_measure(self.quantisation, measures)
+        return _by_measure(self.quantisation, measures)
 
 
 @dataclass(frozen=True)
@@ -144,16 +144,7 @@ class Conditions:
         return np.stack([sampled(name, f, t) for name, f in self.disturbance.items()], axis=-1)
 
 
-def _not_negative(name, value, what):
-    number = finite(name, value, what)
-    if number < 0:
-        raise SpecificationError(
-            f"The {what} of {name!r} is {value}.", "It is not negative.", do="Change it.", name=name, value=number
-        )
-    return number
-
-
-def by_measure(values, measures):
+def _by_measure(values, measures):
     """Numbers by name in the order of the measurement, 0 for those without; None without any."""
     if not values:
         return None
@@ -164,33 +155,27 @@ def by_measure(values, measures):
 
 
 def index(name, names, what):
-    """Where a name stands among others.
-
-    Raises
-    ------
-    NameUnknown
-    """
+    """Where a name stands among others; `what` is a name's meaning in the singular."""
     if name not in names:
         raise unknown(name, names, what)
     return names.index(name)
 
 
+def ranges(plant, period):
+    """Lower and upper limits of the inputs, and the largest change in a sample, (m,) each; infinite without any."""
+    low, high = np.array([plant.limits.get(name, (-np.inf, np.inf)) for name in plant.inputs]).reshape(-1, 2).T
+    return low, high, np.array([plant.rate_limits.get(name, np.inf) for name in plant.inputs]) * period
+
+
 def limits(plant, period):
-    """Lower and upper limits of the inputs, and the largest change in a sample; None for those the plant has not."""
-    pairs = np.array([plant.limits.get(name, (-np.inf, np.inf)) for name in plant.inputs]).reshape(-1, 2)
-    change = np.array([plant.rate_limits.get(name, np.inf) for name in plant.inputs]) * period
-    low, high = (pairs[:, 0], pairs[:, 1]) if plant.limits else (None, None)
+    """The same; None for limits and rate limits that the plant has not."""
+    low, high, change = ranges(plant, period)
+    low, high = (low, high) if plant.limits else (None, None)
     return low, high, change if plant.rate_limits else None
 
 
 def steps(plant, period, substeps, t0, x0, u0):
-    """Integration steps per sample, and those by which each input arrives late (None for no transport delay).
-
-    Raises
-    ------
-    SpecificationError
-        If a transport delay is no whole number of steps, or the start does not tell how many steps are needed.
-    """
+    """Integration steps per sample, and those by which each input arrives late (None for no transport delay)."""
     delays = np.array([plant.delay.get(name, 0.0) for name in plant.inputs])
     if substeps is None:
         least = _resolving(plant, period, t0, x0, u0)

@@ -11,23 +11,9 @@ from servoctl.control.law import Law
 
 
 def law_step(name, t, x, row, outputs):
-    """A compiled step function of a law, from expressions.
+    """The compiled step of a law, (t_k, [y; z], row_k) -> [u; z+; signals], with the C function that loops take.
 
-    Parameters
-    ----------
-    name : str
-        A C identifier.
-    t : SX
-        Symbol of the instant t_k.
-    x, row : (n,) SX
-        Symbols of measurement and controller state, and of a column of the schedule.
-    outputs : sequence of SX
-        Command, next controller state, further signals.
-
-    Returns
-    -------
-    Compiled
-        (t_k, [y; z], row_k) -> [u; z+; further signals], with the C function that loops take.
+    `t`, `x` and `row` are symbols, `outputs` expressions of them: command, next controller state, further signals.
     """
     y = ca.densify(ca.cse(ca.vertcat(*outputs)))
     return compiled(ca.Function(name, [t, x, row], [y], ["t", "x", "p"], ["y"]), name, drivers=LAW_DRIVER)
@@ -36,21 +22,8 @@ def law_step(name, t, x, row, outputs):
 def affine_law(measures, n_u, feedback=True, residuals=None):
     """u = u_ff - K (y - y_ref) - K_i z,  z+ = z + Ts φ(t, y).
 
-    Parameters
-    ----------
-    measures : tuple of str
-        Names of the measured states y.
-    n_u : int
-        Number of inputs.
-    feedback : bool
-        Without it the law is u_ff alone.
-    residuals : Residuals, optional
-        What is integrated.
-
-    Returns
-    -------
-    Compiled
-        Its schedule has the columns [u_ff; y_ref; K row by row; K_i row by row; Ts; parameters of φ], as far as needed.
+    y are the measured states, z integrates residuals if there are any; without feedback the law is u_ff alone. Its
+    schedule has the columns [u_ff; y_ref; K row by row; K_i row by row; Ts; parameters of φ], as far as needed.
     """
     t, u_ff = ca.SX.sym("t"), ca.SX.sym("u_ff", n_u)
     if not feedback:
@@ -91,21 +64,7 @@ class StateFeedback:
 def affine(name, reference, K, K_i=None, residuals=None, info=None):
     """The law u = u_ff - K (x - x_ref) - K_i z of gains along a reference.
 
-    Parameters
-    ----------
-    name : str
-    reference : Reference
-    K : (N, m, n_x) array
-        Gains; states whose gains all vanish are not measured.
-    K_i : (N, m, n_z) array, optional
-    residuals : Residuals, optional
-        What is integrated in z.
-    info : dict, optional
-        Facts of the design.
-
-    Returns
-    -------
-    Law
+    K is (N, m, n_x), K_i (N, m, n_z); states whose gains all vanish are not measured. `info` are facts of the design.
     """
     plant, names = reference.plant, residuals.names if residuals else ()
     used = np.any(K != 0, axis=(0, 1))

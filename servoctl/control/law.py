@@ -45,8 +45,9 @@ class Law:
         Which entries of the controller state are integrals of residuals.
     feedback : StateFeedback or None
         Its gains on all states of a plant, where it has such gains.
-    estimator : Estimator or None
-        How it estimates the state, where it does.
+    input_matrix : (N, n_z, m) array or None
+        Of an estimator: how the controller state after each sample changes with the inputs of that sample. An
+        allocation that gives others than the law's own corrects the prediction by it.
     allocation : Allocation or None
         How it keeps limits, where it does.
     """
@@ -66,7 +67,7 @@ class Law:
     info: dict = field(default_factory=dict)
     integrators: tuple = ()
     feedback: object = None
-    estimator: object = None
+    input_matrix: np.ndarray = None
     allocation: object = None
 
     def __post_init__(self):
@@ -145,10 +146,9 @@ class Law:
             out = np.zeros(0)
         if out.size != self.n_out:
             raise SpecificationError(
-                f"The step of the law {self.name!r} answered {answer!r} at t = {t:.6g} s."[:200],
-                f"It answers {self.n_out} numbers: {len(self.inputs)} inputs, {len(self.state)} of the next controller "
-                f"state, {len(self.signals)} further signals.",
-                do="Return an array of them.",
+                f"The law {self.name!r} answered {answer!r} at t = {t:.6g} s."[:200],
+                f"It answers {self.n_out} numbers: {', '.join((*self.inputs, *self.state_names, *self.signals))}.",
+                do="Return a sequence of them in this order.",
                 t=float(t),
                 n_out=self.n_out,
             )
@@ -326,25 +326,14 @@ class UserStep:
         return replace(self, function=function)
 
     def __call__(self, t, x, _row):
-        """The inputs, (m,), of the measured states x, (n_y,), at t [s]."""
+        """The inputs, (m,), of the measured states x, (n_y,), at t [s]; `Law.answer` checks them."""
         u = self.function(t, dict(zip(self.states, x.tolist(), strict=True)))
         if isinstance(u, dict):
             for name in (*u, *self.inputs):
                 if name not in self.inputs or name not in u:
                     raise unknown(name, self.inputs if name not in self.inputs else u, "input of the law")
             u = [u[name] for name in self.inputs]
-        try:
-            values = np.asarray(u, dtype=float).reshape(-1)
-        except (TypeError, ValueError):
-            values = np.zeros(0)
-        if values.size != len(self.inputs):
-            raise SpecificationError(
-                f"The law {self.name!r} answered {u!r} at t = {t:.6g} s."[:200],
-                f"It answers {len(self.inputs)} numbers: {', '.join(self.inputs)}.",
-                do="Return a sequence in this order, or a dict.",
-                t=t,
-            )
-        return values
+        return u
 
 
 def as_measurement(measurement, names):

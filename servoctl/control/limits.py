@@ -8,9 +8,10 @@ from types import SimpleNamespace
 import casadi as ca
 import numpy as np
 
-from servoctl.checks import ON_SAMPLE, finite, interval, mapping, positive
+from servoctl.checks import ON_SAMPLE, interval, mapping, numbers_by_name, positive
 from servoctl.codegen.function import compiled
 from servoctl.control.close import require_names
+from servoctl.control.conditions import ranges
 from servoctl.control.law import Law
 from servoctl.control.lqr import Q_POSITION, R_INPUT, steady, tangents
 from servoctl.control.reference import Reference, require_plant
@@ -29,13 +30,7 @@ GIVEN_WAY = 1e-6  # of a residual's largest effect: a slack that counts
 
 
 class Layout:
-    """Named parts of a vector, one after another.
-
-    Parameters
-    ----------
-    **shapes : int or tuple of int
-        Of each part; a matrix stands row by row.
-    """
+    """Named parts of a vector, one after another; matrices row by row."""
 
     def __init__(self, **shapes):
         self._shapes = {name: (shape,) if isinstance(shape, int) else shape for name, shape in shapes.items()}
@@ -48,19 +43,7 @@ class Layout:
 
 
 class Effects:
-    """What inputs do at once: o = c + O u for expressions that depend on accelerations.
-
-    Parameters
-    ----------
-    plant : Plant
-    expressions : dict of str to SX
-        Outputs of the mechanism or residuals of a program, of t, q, γ' and γ''.
-
-    Raises
-    ------
-    SpecificationError
-        If an expression is not affine in the inputs.
-    """
+    """What inputs do at once: o = c + O u for expressions of t, q, γ' and γ'' by name, affine in the inputs."""
 
     def __init__(self, plant, expressions):
         self.names, self._plant = tuple(expressions), plant
@@ -88,27 +71,14 @@ class Effects:
         return self._acting[self.names.index(name)]
 
     def __call__(self, t, x):
-        """c (j,) and O (j, m) at a state.
-
-        Parameters
-        ----------
-        t : float
-            [s]
-        x : (n_x,) array
-        """
+        """c (j,) and O (j, m) at a state x (n_x,)."""
         j, m = len(self.names), len(self._plant.inputs)
         y = self._function(t, x, self._plant.parameters)
         return y[:j], y[j:].reshape(m, j).T
 
 
 class SmallQP:
-    """min xᵀH x/2 subject to low <= x <= high and least <= A x <= most, by DAQP through CasADi.
-
-    Parameters
-    ----------
-    n, rows : int
-        Numbers of unknowns and of rows of A.
-    """
+    """min xᵀH x/2 of n unknowns subject to low <= x <= high and least <= A x <= most, by DAQP through CasADi."""
 
     def __init__(self, n, rows):
         shapes = {"h": ca.Sparsity.dense(n, n), "a": ca.Sparsity.dense(rows, n)}
@@ -176,7 +146,7 @@ def limited(law, plant, *, bounds=None, weights=None, priority=None, horizon=HOR
     H = _metric(reference, residuals, _weights(residuals, weights, priority), at_once)
     sizes = _sizes(law.plan, plant, H)
     allocation = Allocation(law, plant, effects, bounds, residuals, sizes, np.abs(D).max(axis=0) @ sizes)
-    low, high = _magnitudes(plant)
+    low, high, _ = ranges(plant, law.period)
     return replace(
         law,
         name=f"{law.name}, limited " + (f"by priority {' > '.join(priority)}" if priority else "by weight"),
@@ -237,11 +207,6 @@ def _require_law(law, plant):
             "Limits are kept along the plan, sample by sample of the law.",
             do="Let both begin at once.",
         )
-
-
-def _magnitudes(plant):
-    """Lower and upper limits of the inputs, infinite where the plant has none."""
-    return np.array([plant.limits.get(name, (-np.inf, np.inf)) for name in plant.inputs]).T
 
 
 def _require_at_once(effects, plant, bounds):
@@ -358,8 +323,7 @@ class Allocation:
     @cached_property
     def _limits(self):
         """Lower and upper limits, and the largest change in a sample, (m,) each."""
-        change = np.array([self.plant.rate_limits.get(name, np.inf) for name in self.plant.inputs]) * self.law.period
-        return *_magnitudes(self.plant), change
+        return ranges(self.plant, self.law.period)
 
     @cached_property
     def _qp(self):
@@ -390,10 +354,10 @@ class Allocation:
         law, following = self.law, following.copy()
         if gives_way and law.integrators:
             following[list(law.integrators)] = z[list(law.integrators)]
-        if law.estimator is None:
+        if law.input_matrix is None:
             return following
-        matrices = law.estimator.input_matrix
-        return following + matrices[min(round((t - law.t0) * law.rate), len(matrices) - 1)] @ difference
+        k = min(round((t - law.t0) * law.rate), len(law.input_matrix) - 1)
+        return following + law.input_matrix[k] @ difference
 
     def _allocate(self, t, wanted, low, high, H, c, O):
         """The inputs, from a quadratic program in (u - u_law)/size where those of the law do not do."""
@@ -425,36 +389,31 @@ class Allocation:
 
 def _weights(names, weights, priority):
     """The residuals' weights, (k,)."""
-    weights = mapping(weights, "The weights")
-    if isinstance(priority, str) or not np.iterable(priority or ()) or len({*(priority or ())}) < len(priority or ()):
+    weights = numbers_by_name(weights, names, "residual", "weight", positive=True)
+    if not priority:
+        return np.array([weights.get(name, 1.0) for name in names])
+    if isinstance(priority, str) or not np.iterable(priority) or len({*priority}) < len(priority):
         raise SpecificationError(
             f"priority={priority!r} was given.",
             "A priority is a sequence of residuals, each once, the most important first.",
             do=f"Order some of {', '.join(names)}.",
         )
-    if weights and priority:
+    if weights:
         raise SpecificationError(
             "Weights and a priority were given.", "Slack goes by one of them.", do="Leave one of them out."
         )
-    for name in (*weights, *(priority or ())):
+    for name in priority:
         if name not in names:
             raise unknown(name, names, "residual")
-    if priority:
-        order = [*dict.fromkeys(priority), *(n for n in names if n not in priority)]
-        return np.array([FALLING ** order.index(name) for name in names])
-    numbers = np.array([finite(name, weights.get(name, 1.0), "weight") for name in names])
-    if numbers.min() <= 0:
-        raise SpecificationError(
-            f"The weights {weights} were given.", "A residual's weight is positive.", do="Give positive numbers."
-        )
-    return numbers
+    order = [*priority, *(n for n in names if n not in priority)]
+    return np.array([FALLING ** order.index(name) for name in names])
 
 
 def _sizes(plan, plant, H):
     """A typical size of each input: its range where it has limits, else what the plan uses, if that costs anything."""
-    ranges = np.array([high - low for low, high in _magnitudes(plant).T])
+    low, high, _ = ranges(plant, 1.0)
     used = np.array([np.abs(plan[name]).max() for name in plant.inputs])
-    sizes = np.where(np.isfinite(ranges), ranges, used)
+    sizes = np.where(np.isfinite(high - low), high - low, used)
     unit = 1 / np.sqrt(np.diagonal(H, axis1=1, axis2=2).max(axis=0))  # of each input, of the same cost
     return np.maximum(sizes, (IDLE * np.max(sizes / unit) or 1.0) * unit)
 

@@ -4,12 +4,12 @@ from dataclasses import replace
 
 import numpy as np
 
-from servoctl.checks import finite
+from servoctl.checks import numbers_by_name
 from servoctl.control.feedback import StateFeedback, affine
 from servoctl.control.reference import Reference, refuse_transport
 from servoctl.control.residuals import Residuals
 from servoctl.control.sampling import discretised, spectral_radii
-from servoctl.errors import ServoError, SpecificationError, unknown
+from servoctl.errors import ServoError, SpecificationError
 
 MARGINAL = 1 + 1e-6  # spectral radius of what may stay out of reach: it neither falls nor grows
 DOUBLINGS, CONVERGED = 60, 1e-12  # of the horizon of the Riccati equation; its last relative change
@@ -111,12 +111,7 @@ def _with_integrals(A, B, Q, residuals, Q_i, reference):
 
 
 def tangents(reference, extra=0):
-    """Orthonormal bases of the states that material constraints allow, at each sample; None without any.
-
-    Returns
-    -------
-    (N, n, r) array or None
-    """
+    """Orthonormal bases of the states that material constraints allow, (N, n, r); None without any."""
     plant = reference.plant
     if not plant.constrained:
         return None
@@ -141,22 +136,8 @@ def steady(A, B, Q, R, basis):
     By the structure-preserving doubling algorithm (Chu, Fan, Lin, Wang 2004) at all samples at once: step k gives the
     solution of a horizon of 2^k samples.
 
-    Parameters
-    ----------
-    A, B : (N, n, n), (N, n, m) arrays
-    Q, R : (n, n), (m, m) arrays
-    basis : (N, n, r) array or None
-        Of the tangent spaces.
-
-    Returns
-    -------
-    K : (N, m, n) array
-    P : (n, n) array
-
-    Raises
-    ------
-    ServoError
-        If there is no stabilising solution.
+    A, B are (N, n, n), (N, n, m); Q, R are (n, n), (m, m); a basis of the tangent spaces is (N, n, r). Returns
+    K (N, m, n) and P (n, n).
     """
     T = np.eye(A.shape[1])[None] if basis is None else basis
     left = T.swapaxes(1, 2)
@@ -211,35 +192,15 @@ def _riccati(A, B, Q, R, P):
 
 
 def weights(given, default, names, what, symbol, positive=False):
-    """A weight matrix from a number, numbers by name, a diagonal or a matrix.
+    """A weight matrix, (n, n), from a number, numbers by name, a diagonal or a matrix.
 
-    Parameters
-    ----------
-    given : float, dict, or array, optional
-    default : (n,) array
-    names : sequence of str
-    what : str
-        What the names stand for.
-    symbol : str
-        Q or R, for messages.
-    positive : bool
-        Whether it must be definite, not only semidefinite.
-
-    Returns
-    -------
-    (n, n) array
-
-    Raises
-    ------
-    NameUnknown
-    SpecificationError
+    `default` is a diagonal; `what` the names' meaning, `symbol` the matrix's name in messages; `positive` refuses what
+    is only semidefinite.
     """
     n, entries = len(names), np.array(default, dtype=float)
     if isinstance(given, dict):
-        for name, value in given.items():
-            if name not in names:
-                raise unknown(name, names, what)
-            entries[list(names).index(name)] = finite(name, value, "weight")
+        for name, weight in numbers_by_name(given, names, what, "weight").items():
+            entries[names.index(name)] = weight
     elif given is not None:
         try:
             entries = np.asarray(given, dtype=float)

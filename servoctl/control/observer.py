@@ -1,34 +1,18 @@
 """Output feedback: a Kalman filter along the plan estimates what is not measured."""
 
-from dataclasses import dataclass
-
 import casadi as ca
 import numpy as np
 
-from servoctl.checks import finite, mapping
+from servoctl.checks import numbers_by_name
 from servoctl.control.feedback import integral_names, integration, law_step
 from servoctl.control.law import Law
 from servoctl.control.lqr import tangents, weights
 from servoctl.control.reference import Reference, refuse_transport, require_plant
 from servoctl.control.residuals import Residuals
 from servoctl.control.sampling import discretised, spectral_radii
-from servoctl.errors import ServoError, SpecificationError, unknown
+from servoctl.errors import ServoError, SpecificationError
 
 POSITION_NOISE, VELOCITY_NOISE = 1e-3, 1.0  # per √s, of coordinates and velocities
-
-
-@dataclass(frozen=True, eq=False)
-class Estimator:
-    """How a law estimates the state.
-
-    Attributes
-    ----------
-    input_matrix : (N, n_z, m) array
-        How the controller state after each sample changes with the inputs of that sample: an allocation that gives
-        others than the law's own corrects the prediction by it.
-    """
-
-    input_matrix: np.ndarray
 
 
 def estimating_law(states, where, n_u, residuals=None):
@@ -36,21 +20,8 @@ def estimating_law(states, where, n_u, residuals=None):
 
     δx⁺ = δx̂ + L (y - y_ref - C δx̂),  u = u_ff - K δx⁺ - K_i z,  δx̂+ = A δx⁺ + B δu,  z+ = z + Ts φ(t, x_ref + δx⁺).
 
-    Parameters
-    ----------
-    states : tuple of str
-        Names of the plant's states.
-    where : sequence of int
-        Which of them are measured.
-    n_u : int
-        Number of inputs.
-    residuals : Residuals, optional
-        What is integrated.
-
-    Returns
-    -------
-    Compiled
-        Its schedule has the columns [u_ff; x_ref; K, K_i, L, A, B row by row; Ts; parameters of φ].
+    Its schedule has the columns [u_ff; x_ref; K, K_i, L, A, B row by row; Ts; parameters of φ]; `states` are those of
+    the plant, of which those at `where` are measured; `residuals` are integrated in z.
     """
     n_x, n_y, n_z = len(states), len(where), len(residuals.names) if residuals else 0
     t, y, estimate, z = (ca.SX.sym("t"), *(ca.SX.sym(s, n) for s, n in (("y", n_y), ("e", n_x), ("z", n_z))))
@@ -125,7 +96,7 @@ def output_feedback(law, plant, noise, process=None):
         step=estimating_law(plant.state_names, where, len(plant.inputs), residuals), schedule=np.vstack(schedule),
         state=np.zeros(n_x + n_z), state_names=_state_names(plant, gains.residuals), idle=law.idle, plan=law.plan,
         info=law.info | {"spectral radius of the filter": float(spectral_radii(errors).max())},
-        integrators=tuple(range(n_x, n_x + n_z)), feedback=gains, estimator=Estimator(input_matrix),
+        integrators=tuple(range(n_x, n_x + n_z)), feedback=gains, input_matrix=input_matrix,
     )  # fmt: skip
 
 
@@ -145,7 +116,7 @@ def _process_noise(plant):
 def _require_lqr(law, plant):
     """Refuse a law that has no gains on the states of this plant, or estimates or allocates already."""
     require_plant(plant)
-    if not isinstance(law, Law) or law.feedback is None or law.estimator or law.allocation:
+    if not isinstance(law, Law) or law.feedback is None or law.input_matrix is not None or law.allocation:
         raise SpecificationError(
             f"The law {getattr(law, 'name', law)!r} is no LQR's on the state.",
             "Output feedback replaces the state by an estimate.",
@@ -172,18 +143,7 @@ def _onto(basis, A, B):
 
 def _deviations(noise, plant):
     """Names of the measured states, and the standard deviations of their noise, (n_y,)."""
-    deviations = {}
-    for name, value in mapping(noise, "The noise").items():
-        if name not in plant.state_names:
-            raise unknown(name, plant.state_names, "state of the plant")
-        deviations[name] = finite(name, value, "standard deviation")
-        if deviations[name] <= 0:
-            raise SpecificationError(
-                f"The noise of {name!r} is {deviations[name]:g}.",
-                "A filter weighs measurements by positive standard deviations.",
-                do="Give the resolution of the sensor.",
-                name=name,
-            )
+    deviations = numbers_by_name(noise, plant.state_names, "state of the plant", "standard deviation", positive=True)
     if not deviations:
         raise SpecificationError(
             "No noise was given.",

@@ -163,18 +163,7 @@ def require_plan(plan, plant):
 
 
 def resampled(plan, times):
-    """The plan at other instants, between its samples by Hermite interpolation of all derivatives.
-
-    Parameters
-    ----------
-    plan : Run
-    times : (N,) array
-        In increasing order, within the plan [s].
-
-    Returns
-    -------
-    Run
-    """
+    """The plan at other instants within it, (N,) [s], increasing, by Hermite interpolation of all derivatives."""
     model, t = plan.model, plan.t
     nq, n = model.nq, model.n
     top = (len(plan.jets) - nq) // n
@@ -192,20 +181,10 @@ def resampled(plan, times):
 
 
 def _hermite(t, derivatives, i, h, times):
-    """Values and derivatives at times of the polynomials that match all derivatives at the ends of their intervals.
+    """Values and derivatives at times (M,) of the polynomials that match all derivatives at the ends of intervals.
 
-    Parameters
-    ----------
-    t : (N,) array
-    derivatives : list of (n, N) arrays
-        Of orders 0, 1, ..., r.
-    i, h : (M,) arrays
-        Interval of each instant, and its length.
-    times : (M,) array
-
-    Returns
-    -------
-    list of (n, M) arrays
+    `derivatives` are (n, N) arrays of the orders 0, 1, ..., r at t (N,); `i` and `h` the interval of each instant and
+    its length. Returns as many (n, M) arrays.
     """
     r, s = len(derivatives), (times - t[i]) / h
     low = [d[:, i] * h**k / factorial(k) for k, d in enumerate(derivatives)]

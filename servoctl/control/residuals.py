@@ -19,14 +19,18 @@ class Residuals:
     names : sequence of str, optional
         Which residuals; default all whose order allows it.
     order : int
-        The highest: 1 for functions of the state (q, γ'), 2 where accelerations are given beside it.
+        The highest: 1 for functions of the state (q, γ'), 2 where accelerations follow it.
 
-    Raises
-    ------
-    NameUnknown
-        If a residual is none of the program's, or needs a state or a parameter that the plant lacks.
-    SpecificationError
-        If a residual that was named depends on accelerations.
+    Attributes
+    ----------
+    names, orders : tuple
+        Of the residuals, and of their highest derivatives.
+    expressions, symbols : SX, list of SX
+        The residuals, and the parameters in them.
+    parameters : (n_p,) array
+        Numbers of these.
+    measures : tuple of str
+        The states in them.
     """
 
     def __init__(self, model, plant, names=None, order=1):
@@ -46,14 +50,14 @@ class Residuals:
                 )
         self.names = tuple(name for name in orders if orders[name] <= order and (names is None or name in names))
         self.orders = tuple(max(orders[name], 0) for name in self.names)
-        self._expressions = ca.vertcat(*(program.residuals[name] for name in self.names))
+        self.expressions = ca.vertcat(*(program.residuals[name] for name in self.names))
         own = plant.mechanism.parameters
-        self._symbols = [s for s in mechanism.parameters.symbols if _depends(self._expressions, s)]
-        for s in self._symbols:
+        self.symbols = [s for s in mechanism.parameters.symbols if _depends(self.expressions, s)]
+        for s in self.symbols:
             if s.name() not in own.names:
                 raise unknown(s.name(), own.names, "parameter of the plant")
-        self.parameters = np.array([plant.parameters[own.names.index(s.name())] for s in self._symbols])
-        self.measures = tuple(s.name() for s in self._states(self._expressions))
+        self.parameters = np.array([plant.parameters[own.names.index(s.name())] for s in self.symbols])
+        self.measures = tuple(s.name() for s in self._states(self.expressions))
         for name in self.measures:
             if name not in plant.state_names:
                 raise unknown(name, plant.state_names, "state of the plant")
@@ -65,15 +69,15 @@ class Residuals:
 
     def expression(self, t, y, measures, p):
         """φ as an SX column of the symbols t, y (named by `measures`) and p."""
-        found = self._states(self._expressions)
-        old = [self._q.t, *found, *self._symbols]
-        new = [t, *(y[measures.index(s.name())] for s in found), *ca.vertsplit(p)]
-        return ca.substitute(self._expressions, ca.vertcat(*old), ca.vertcat(*new))
+        states = self._states(self.expressions)
+        old = [self._q.t, *states, *self.symbols]
+        new = [t, *(y[measures.index(s.name())] for s in states), *ca.vertsplit(p)]
+        return ca.substitute(self.expressions, ca.vertcat(*old), ca.vertcat(*new))
 
     def _function(self, key, outputs):
         if key not in self._built:
             state = ca.vertcat(*self._q, *(s for k in range(self._order) for s in self._q.gamma(k + 1)))
-            p = ca.vertcat(*self._symbols) if self._symbols else ca.SX(0, 1)
+            p = ca.vertcat(*self.symbols) if self.symbols else ca.SX(0, 1)
             y = ca.densify(ca.cse(ca.vertcat(*outputs(state))))
             self._built[key] = compiled(ca.Function(key, [self._q.t, state, p], [y]), key)
         return self._built[key]
@@ -88,20 +92,12 @@ class Residuals:
     def levels(self, t, x):
         """Residuals and those of their derivatives that the state decides.
 
-        Parameters
-        ----------
-        t : (N,) array
-        x : (n_x, N) array
-            States of the plant; for residuals of order 2 with accelerations behind them, (n_x + n, N).
-
-        Returns
-        -------
-        dict of str to (levels, N) array
-            Two levels for a residual of order 0, one for the others.
+        By name, (levels, N) arrays along states x (n_x, N) of the plant at t (N,); for residuals of order 2 with
+        accelerations behind the states. Two levels for a residual of order 0, one for the others.
         """
 
         def outputs(_state):
-            items = self._expressions.elements()
+            items = self.expressions.elements()
             return [
                 level[0]
                 for e, order in zip(items, self.orders, strict=True)
@@ -118,15 +114,15 @@ class Residuals:
         k = len(self.names)
 
         def outputs(state):
-            return [ca.vec(ca.densify(ca.jacobian(self._expressions, state)))]
+            return [ca.vec(ca.densify(ca.jacobian(self.expressions, state)))]
 
         values = self._function("residual_jacobian", outputs).grid(t, self._ordered(x), self.parameters)
         values = values.reshape(-1, k, len(t)).transpose(2, 1, 0)
-        found = np.zeros((len(t), k, self._plant.n_x))
+        jacobian = np.zeros((len(t), k, self._plant.n_x))
         for i, name in enumerate((*self._q.names, *self._q.jet_names(1))):
             if name in self._plant.state_names:
-                found[:, :, self._plant.state_names.index(name)] = values[:, :, i]
-        return found
+                jacobian[:, :, self._plant.state_names.index(name)] = values[:, :, i]
+        return jacobian
 
 
 def _depends(expression, symbol):
