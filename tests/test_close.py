@@ -402,14 +402,14 @@ def test_a_handmade_law_that_answers_otherwise_is_refused(crane_plan, answer):
 
 @pytest.mark.parametrize("measurement", ["a", None, {"x": None}, [0.0, 1.0]])
 def test_what_is_no_measurement_is_refused(measurement):
-    with pytest.raises(sv.SpecificationError, match="The law measures 1: x"):
+    with pytest.raises(sv.SpecificationError, match="It has 1 numbers: x"):
         handmade()(0.0, measurement)
 
 
 def test_a_law_is_asked_at_times_and_has_a_rate():
     with pytest.raises(sv.SpecificationError, match="'t' is nan"):
         handmade()(np.nan, [0.0])
-    with pytest.raises(sv.SpecificationError, match="rate of 0 Hz"):
+    with pytest.raises(sv.SpecificationError, match="rate = 0"):
         handmade(rate=0.0)
 
 

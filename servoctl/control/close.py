@@ -105,17 +105,27 @@ def _start(plant, t0, x0, idle):
     x = np.array(
         [at_rest[name] if np.isnan(value) else value for name, value in zip(plant.state_names, x, strict=True)]
     )
-    if plant.constrained:
-        values = np.abs(plant.function("constraints")(t0, x, plant.p()))
-        worst = int(np.argmax(values))
-        if values[worst] > CONSISTENT * max(1.0, np.abs(x).max()):
-            raise InconsistentStart(
-                f"{plant.constraint_names()[worst]} is {values[worst]:.3g} at the start.",
-                "Nature keeps material constraints and their rates at zero.",
-                do="Give a start that satisfies them, such as plan.state(t0) or model.start(...).",
-                values=dict(zip(plant.constraint_names(), values.tolist(), strict=True)),
-            )
+    require_consistent(plant, t0, x[:, None], plant.p()[:, None])
     return x
+
+
+def require_consistent(plant, t0, starts, p):
+    """Refuse starts (n_x, N) that violate material constraints, with p (n_p, N) the plant's numbers in each case."""
+    if not plant.constrained:
+        return
+    values = np.abs(plant.function("constraints").grid(t0, starts, p))
+    relative = values / np.maximum(1.0, np.abs(starts).max(axis=0))
+    row, case = np.unravel_index(int(np.argmax(relative)), values.shape)
+    if relative[row, case] > CONSISTENT:
+        names = plant.constraint_names()
+        which = f" of case {case}" if starts.shape[1] > 1 else ""
+        raise InconsistentStart(
+            f"{names[row]} is {values[row, case]:.3g} at the start{which}.",
+            "Nature keeps material constraints and their rates at zero.",
+            do="Give a start that satisfies them, such as plan.state(t0) or model.start(...).",
+            values=dict(zip(names, values[:, case].tolist(), strict=True)),
+            case=int(case),
+        )
 
 
 def _finish(plant, law, plan, loop, conditions):

@@ -7,7 +7,6 @@ algorithm of Descusse and Moog. Ranks are decided by numbers, at states about a 
 """
 
 from dataclasses import dataclass
-from math import factorial
 
 import casadi as ca
 import numpy as np
@@ -16,6 +15,7 @@ from servoctl.checks import positive, whole
 from servoctl.control.feedback import law_step
 from servoctl.control.law import Law
 from servoctl.control.reference import Reference, refuse_transport, require_plan
+from servoctl.control.sampling import sampled_radii
 from servoctl.errors import NotRealisable, SpecificationError, UnstableInternalDynamics, unknown
 from servoctl.internal_dynamics import internal_dynamics
 from servoctl.jets.evaluation import evaluate
@@ -426,33 +426,7 @@ def _require_slow(name, poles, rate, delay):
 
 
 def sampled_radius(poles, rate, delay=0):
-    """The largest factor per sample of a chain of integrators whose poles are placed by held feedback.
-
-    Parameters
-    ----------
-    poles : (ρ,) array of complex
-        [1/s]
-    rate : float
-        [Hz]
-    delay : int
-        Samples.
-
-    Returns
-    -------
-    float
-    """
-    order, h = len(poles), 1.0 / rate
-    n = order + delay
-    A = np.zeros((n, n))
-    for i in range(order):
-        for j in range(i, order):
-            A[i, j] = h ** (j - i) / factorial(j - i)
-    B = np.array([h ** (order - i) / factorial(order - i) for i in range(order)])
-    K = np.poly(poles).real[:0:-1]
-    if delay:
-        A[:order, order] = B
-        A[range(order, n - 1), range(order + 1, n)] = 1.0
-        A[n - 1, :order] = -K
-    else:
-        A -= np.outer(B, K)
-    return float(np.abs(np.linalg.eigvals(A)).max(initial=0.0))
+    """The largest factor per sample of ρ integrators whose poles (ρ,) [1/s] are placed by held, delayed feedback."""
+    n = len(poles)
+    A, B, K = np.eye(n, k=1)[None], np.eye(n)[None, :, -1:], np.poly(poles).real[None, None, :0:-1]
+    return float(sampled_radii(A, B, K, 1.0 / rate, np.array([delay / rate]))[0])

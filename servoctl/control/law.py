@@ -4,7 +4,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from servoctl.checks import ON_SAMPLE, finite
+from servoctl.checks import ON_SAMPLE, finite, positive
 from servoctl.codegen.function import Compiled
 from servoctl.errors import SpecificationError, unknown
 
@@ -81,13 +81,7 @@ class Law:
                 do="Correct it.",
                 shape=schedule.shape,
             )
-        if finite("rate", self.rate) <= 0:
-            raise SpecificationError(
-                f"The law {self.name!r} has a rate of {self.rate:g} Hz.",
-                "A rate is positive.",
-                do="Change it.",
-                rate=self.rate,
-            )
+        positive("rate", self.rate)
         idle = np.zeros(len(self.inputs)) if self.idle is None else np.asarray(self.idle, dtype=float)
         object.__setattr__(self, "idle", idle)
         self._require_sizes()
@@ -274,7 +268,7 @@ class Controller:
         (m,) array
         """
         law, m, n_z = self.law, len(self.law.inputs), len(self.state)
-        y = as_measurement(measurement, law.measures)
+        y = ordered(measurement, law.measures, "measurement", exactly=False)
         out = self._step(t, np.concatenate([y, self.state]), law.row(t))
         self.state = out[m : m + n_z]
         self.signals = dict(zip(law.signals, out[m + n_z :].tolist(), strict=True))
@@ -326,39 +320,48 @@ class UserStep:
         return replace(self, function=function)
 
     def __call__(self, t, x, _row):
-        """The inputs, (m,), of the measured states x, (n_y,), at t [s]; `Law.answer` checks them."""
+        """The inputs, (m,), of the measured states x, (n_y,), at t [s]."""
         u = self.function(t, dict(zip(self.states, x.tolist(), strict=True)))
-        if isinstance(u, dict):
-            for name in (*u, *self.inputs):
-                if name not in self.inputs or name not in u:
-                    raise unknown(name, self.inputs if name not in self.inputs else u, "input of the law")
-            u = [u[name] for name in self.inputs]
-        return u
+        return ordered(u, self.inputs, f"answer of the law {self.name!r} at t = {t:.6g} s")
 
 
-def as_measurement(measurement, names):
-    """The measured values in the order of their names, (n_y,).
+def ordered(values, names, what, exactly=True):
+    """Numbers in the order of their names, (n,), from as many numbers or from a dict.
+
+    Parameters
+    ----------
+    values : (n,) array or dict of str to float
+    names : sequence of str
+    what : str
+        What the values are, for messages: "measurement".
+    exactly : bool
+        Whether further names are refused.
 
     Raises
     ------
     NameUnknown
-        If one is missing.
+        If a name is missing, or there are further ones.
     SpecificationError
-        If an array has another shape.
+        If they are not n numbers.
     """
-    if isinstance(measurement, dict):
+    numbers = values
+    if isinstance(values, dict):
         for name in names:
-            if name not in measurement:
-                raise unknown(name, measurement, "measurement")
-        measurement = [measurement[name] for name in names]
+            if name not in values:
+                raise unknown(name, values, what)
+        for name in values if exactly else ():
+            if name not in names:
+                raise unknown(name, names, what)
+        numbers = [values[name] for name in names]
     try:
-        y = np.array([float(value) for value in np.ravel(measurement)])
+        numbers = np.array([float(number) for number in np.ravel(numbers)])
     except (TypeError, ValueError):
-        y = np.zeros(0)
-    if y.shape != (len(names),):
+        numbers = np.zeros(0)
+    if numbers.shape != (len(names),):
         raise SpecificationError(
-            f"The measurement {measurement!r} was given."[:200],
-            f"The law measures {len(names)}: {', '.join(names) or '(nothing)'}.",
+            f"The {what} is {values!r}."[:200],
+            f"It has {len(names)} numbers: {', '.join(names) or '(none)'}.",
             do="Give them in this order, or as a dict.",
+            names=names,
         )
-    return y
+    return numbers

@@ -4,7 +4,7 @@ import numpy as np
 
 from servoctl.checks import finite, positive
 from servoctl.codegen.jacobians import differentiable, jacobian
-from servoctl.control.law import Law, as_measurement
+from servoctl.control.law import Law, ordered
 from servoctl.control.reference import resampled
 from servoctl.control.result import Closed
 from servoctl.control.sampling import discretised
@@ -187,7 +187,7 @@ def _linear_plant(plant, t, x, u, rate, disturbed, name):
             do="Linearise the plant without delay.",
         )
     (disturbed, forces), m, n_x = force_names(plant, disturbed), len(plant.inputs), plant.n_x
-    u = np.zeros(m) if u is None else _inputs(u, plant)
+    u = np.zeros(m) if u is None else ordered(u, plant.inputs, "input")
     at_rest = [0.0] * (n_x - len(plant.lag)) + [u[plant.inputs.index(name)] for name in plant.lagged]
     x = np.where(np.isnan(x), at_rest, x)
     p, at_u = plant.p(u), len(plant.parameters)
@@ -205,22 +205,6 @@ def _linear_plant(plant, t, x, u, rate, disturbed, name):
     )  # fmt: skip
 
 
-def _inputs(u, plant):
-    """Inputs in the order of the actuators, (m,)."""
-    if isinstance(u, dict):
-        for name in (*u, *plant.inputs):
-            if name not in u or name not in plant.inputs:
-                raise unknown(name, plant.inputs if name in u else u, "input")
-        u = [u[name] for name in plant.inputs]
-    found = np.asarray(u, dtype=float).ravel()
-    if found.shape != (len(plant.inputs),):
-        raise SpecificationError(
-            f"{found.size} inputs were given.", f"The plant has {len(plant.inputs)}: {', '.join(plant.inputs)}.",
-            do="Give them in this order, or as a dict.",
-        )  # fmt: skip
-    return found
-
-
 def _linear_law(law, t, x, controller_state, name):
     import control
 
@@ -235,7 +219,7 @@ def _linear_law(law, t, x, controller_state, name):
             raise SpecificationError("The law has no plan.", "A linearisation has a point.", do="Give the measurement.")
         at = resampled(law.plan, np.clip([float(t)], law.plan.t[0], law.plan.t[-1]))
         x = {measure: at[measure][0] for measure in law.measures}
-    y, m, n_z = as_measurement(x, law.measures), len(law.inputs), len(law.state)
+    y, m, n_z = ordered(x, law.measures, "measurement", exactly=False), len(law.inputs), len(law.state)
     z = np.asarray(law.state if controller_state is None else controller_state, dtype=float)
     if z.shape != (n_z,):
         raise SpecificationError(

@@ -7,11 +7,11 @@ import numpy as np
 from servoctl.checks import mapping, whole
 from servoctl.codegen.function import Compiled
 from servoctl.control.batch import Gathered, run_batch, unit
-from servoctl.control.close import CONSISTENT, close
+from servoctl.control.close import close, require_consistent
 from servoctl.control.conditions import Timing, index, steps
 from servoctl.control.residuals import Residuals
 from servoctl.control.result import Closed
-from servoctl.errors import InconsistentStart, IntegrationStopped, ServoError, SpecificationError, unknown
+from servoctl.errors import IntegrationStopped, ServoError, SpecificationError, unknown
 from servoctl.study.cases import CASES, as_cases, generator
 from servoctl.study.table import Study, machine, table
 
@@ -133,7 +133,8 @@ def _require(run):
 def _resolved(run, constants, starts):
     """The numbers of the loop, with as many integration steps as the case with the fastest eigenvalue needs."""
     plant, law, loop = run.plant, run.law, run.loop
-    _require_consistent(plant, loop.t0, constants, starts)
+    rest = np.zeros((len(plant.inputs) + len(plant.disturbable), starts.shape[1]))
+    require_consistent(plant, loop.t0, starts, np.vstack([constants, rest]))
     if run.conditions.timing.substeps is not None:
         return loop
     substeps = _most_steps(plant, law, loop, constants, starts)
@@ -205,22 +206,6 @@ def _case_numbers(run, columns, scale):
             raise unknown(name, (*parameters, *plant.state_names, *scale.values()), "parameter, state or scale")
     factors = [columns[scale[name]] if name in scale else np.ones(n) for name in disturbance]
     return constants, starts, np.array(factors).reshape(len(factors), n)
-
-
-def _require_consistent(plant, t0, constants, starts):
-    if not plant.constrained:
-        return
-    rest = np.zeros((len(plant.inputs) + len(plant.disturbable), starts.shape[1]))
-    values = np.abs(plant.function("constraints").grid(t0, starts, np.vstack([constants, rest])))
-    values = values / np.maximum(1.0, np.abs(starts).max(axis=0))
-    row, case = np.unravel_index(int(np.argmax(values)), values.shape)
-    if values[row, case] > CONSISTENT:
-        raise InconsistentStart(
-            f"{plant.constraint_names()[row]} is {values[row, case]:.3g} at the start of case {case}.",
-            "Nature keeps material constraints and their rates at zero.",
-            do="Give each case a start that satisfies them.",
-            case=int(case),
-        )
 
 
 def _most_steps(plant, law, loop, constants, starts):
