@@ -158,9 +158,10 @@ def _balance(run, good, limits, notes):
 def _acceleration(model, run, good, inputs):
     """Largest error of the mechanism's γ'' under the inputs, relative to the largest γ'' of the run."""
     n, nq = model.n, model.nq
-    found = model.function("plant").grid(run.t[good], np.vstack([run.jets[: nq + n, good], inputs]), model.parameters)
+    states = np.vstack([run.jets[: nq + n, good], inputs])
+    rates = model.function("plant").grid(run.t[good], states, model.parameters)
     acceleration = run.jets[nq + n : nq + 2 * n, good]
-    return float(np.abs(found[nq:] - acceleration).max() / max(np.abs(acceleration).max(), 1e-300))
+    return float(np.abs(rates[nq:] - acceleration).max() / max(np.abs(acceleration).max(), 1e-300))
 
 
 def _energy(run, good, work):
@@ -214,8 +215,8 @@ def _segments(model, run, good, u, count):
         def rates(s, x, inputs=inputs):
             return plant(s, np.concatenate([x, inputs(s, run.at(s)[: inputs.n_x], p)]), p)[: nq + n]
 
-        found = solve_ivp(rates, (t[i], t[stop]), states[:, i], method="DOP853", rtol=1e-11, atol=1e-13 * size)
-        worst = max(worst, float(np.max(np.abs(found.y[:, -1] - states[:, stop]) / size)))
+        segment = solve_ivp(rates, (t[i], t[stop]), states[:, i], method="DOP853", rtol=1e-11, atol=1e-13 * size)
+        worst = max(worst, float(np.max(np.abs(segment.y[:, -1] - states[:, stop]) / size)))
     return worst
 
 

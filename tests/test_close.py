@@ -360,6 +360,14 @@ BAD = {
 }  # fmt: skip
 
 
+def test_sensors_and_timing_are_values():
+    sensors, timing = sv.Sensors(noise={"x": 1}, seed=3), sv.Timing(rate=100, delay=2.0)
+    assert sensors == sv.Sensors({"x": 1.0}, {}, 3) and timing == sv.Timing(100.0, 2, None)
+    assert pickle.loads(pickle.dumps((sensors, timing))) == (sensors, timing)
+    with pytest.raises(AttributeError):
+        timing.delay = 1
+
+
 @pytest.mark.parametrize("what", BAD)
 def test_bad_input_is_refused_by_name(what):
     call, kind, fact = BAD[what]
@@ -433,7 +441,7 @@ def test_laws_refuse_plans_and_plants_that_do_not_fit(point_plan, crane_plan, tm
     with pytest.raises(sv.ServoError, match="not finite at t = .*smooth"):
         sv.pd(point_plan, rough, kp={"force": 100.0})
     for make in (sv.feedforward, sv.pd, sv.lqr, sv.computed):
-        with pytest.raises(sv.SpecificationError, match="in the place of a Plant"):
+        with pytest.raises(sv.SpecificationError, match="was given as plant"):
             make(point_plan, POINT)
     with pytest.raises(sv.SpecificationError, match="finite number"):
         sv.pd(point_plan, sv.plant(POINT), kp={"force": [1.0, 2.0]})

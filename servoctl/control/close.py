@@ -1,4 +1,4 @@
-"""The sampled closed loop: a plant, a law, and what stands between them."""
+"""The sampled closed loop: a plant, a law, and what is between them."""
 
 import numpy as np
 
@@ -152,20 +152,18 @@ def _finish(plant, law, plan, loop, conditions):
 
 def _stopped(law, loop, status, end):
     """The error of a loop whose state, or whose law's answer, is not finite at its end [s]."""
-    before = f"The motion up to t = {max(end - loop.period, loop.t0):.6g} s, which is kept in run."
+    before = f"`.run` is the motion up to t = {max(end - loop.period, loop.t0):.6g} s."
     if status == STATE_LOST:
         return IntegrationStopped(
             f"The closed loop has no finite state at t = {end:.6g} s.",
             "An unstable loop grows until its numbers end; integration steps that are too long do the same.",
-            nearest=before,
-            do="Check signs and rate of the law; take more substeps.",
+            do=f"Check signs and rate of the law; take more substeps; {before}",
             t=end,
         )
     return ServoError(
         f"The law {law.name!r} answered with NaN or infinity at t = {end:.6g} s.",
         "A command is a finite number at each sample.",
-        nearest=before,
-        do="Check what the law does with this measurement.",
+        do=f"Check what the law does with this measurement; {before}",
         t=end,
     )
 

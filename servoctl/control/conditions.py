@@ -1,4 +1,4 @@
-"""What stands between a plant and its law in a sampled loop: sensors, timing and disturbances."""
+"""What is between a plant and its law in a sampled loop: sensors, timing and disturbances."""
 
 from dataclasses import dataclass, field
 
@@ -155,7 +155,7 @@ def _by_measure(values, measures):
 
 
 def index(name, names, what):
-    """Where a name stands among others; `what` is a name's meaning in the singular."""
+    """The place of a name among others; `what` is a name's meaning in the singular."""
     if name not in names:
         raise unknown(name, names, what)
     return names.index(name)

@@ -199,11 +199,11 @@ class _Extension:
         others = [i for i in range(D.shape[0]) if i not in rows]
         rest = [j for j in range(D.shape[1]) if j not in columns]
         block = D[rows, columns]
-        own = ca.vertcat(*(self.levels[i][-1] for i in rows))
-        own = ca.substitute(own, self.v[columns], ca.SX.zeros(len(columns)))
+        drift = ca.vertcat(*(self.levels[i][-1] for i in rows))
+        drift = ca.substitute(drift, self.v[columns], ca.SX.zeros(len(columns)))
         held = self._needed(D, rows, columns, others)
         new = [ca.SX.sym(self._name(i)) for i in rows]
-        solved, _ = eliminate(block, ca.vertcat(*new) - own, clean(*self.values(block, beside=False)))
+        solved, _ = eliminate(block, ca.vertcat(*new) - drift, clean(*self.values(block, beside=False)))
         self._substitute(self.v[columns], solved)
         inputs = []
         for i, symbol, integrated in zip(rows, new, held, strict=True):
@@ -234,8 +234,8 @@ class _Extension:
         rank = self.rank()
         values = _without_units(clean(*self.values(D, beside=False))).astype(float)
         generic = decide_all(_without_units(clean(*self.values(D))), 0.0)[0]
-        found = [generic, *(decide(values[:, :, k]) for k in range(values.shape[2]))]
-        chosen = {(tuple(sorted(r.rows)), tuple(sorted(r.columns))) for r in found if r.rank == rank}
+        ranks = [generic, *(decide(values[:, :, k]) for k in range(values.shape[2]))]
+        chosen = {(tuple(sorted(r.rows)), tuple(sorted(r.columns))) for r in ranks if r.rank == rank}
 
         def worst(pair):
             blocks = values[np.ix_(*map(list, pair), range(values.shape[2]))]
@@ -280,7 +280,7 @@ class _Extension:
 
 
 def computed(plan, plant, rate=100.0, poles=None, delay=0):
-    """The actuation that the plant's own equations ask for at the measured state, with error dynamics by poles.
+    """The actuation by the plant's equations at the measured state, with error dynamics by poles.
 
     Each residual obeys Π(D - λ_i) φ = 0 as long as the machine is the plant: φ is differentiated along the plant until
     the inputs decouple, through dynamic extension where their decoupling matrix has no full rank. Between samples the

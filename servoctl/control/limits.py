@@ -57,8 +57,7 @@ class Effects:
             raise SpecificationError(
                 f"One of {', '.join(self.names)} is not affine in the inputs.",
                 "Bounds are linear inequalities of the inputs at each state.",
-                nearest="Forces of constraint and accelerations, which are affine.",
-                do="Bound another output.",
+                do="Bound forces of constraint or accelerations, which are affine.",
             )
         self._acting = [bool(slopes[i, :].nnz()) for i in range(len(self.names))]
         still = ca.substitute(values, e.u, ca.SX.zeros(e.u.numel()))
@@ -191,7 +190,7 @@ def _require_law(law, plant):
     if not isinstance(law, Law) or law.allocation:
         raise SpecificationError(
             f"A {type(law).__name__} was given as law." if not isinstance(law, Law) else f"{law.name!r} was given.",
-            "Limits are kept around a law that does not keep them yet.",
+            "Limits are allocated around a law without limits.",
             do="Give a law made from a plan, as by sv.lqr, and all bounds and weights at once.",
         )
     if law.plan is None:
@@ -380,8 +379,7 @@ class Allocation:
         raise LimitExceeded(
             f"At t = {t:.6g} s no inputs within {limits} keep {bounds or 'the rows'}.",
             "Limits and bounds are kept together; slack is given to the program's residuals alone.",
-            nearest="The motion before, which is kept in `.run`.",
-            do="Widen a limit or a bound, or slow the plan (sv.fastest).",
+            do="Widen a limit or a bound, or slow the plan (sv.fastest); `.run` is the motion before.",
             t=float(t),
             bounds=self.effects.names,
         )

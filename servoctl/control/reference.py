@@ -98,8 +98,7 @@ class Reference:
             raise ServoError(
                 f"The plant's linearisation is not finite at t = {self.middle[lost][0]:.6g} s of the plan.",
                 "Laws of linear feedback are designed where forces have finite slopes.",
-                nearest="A force that is smooth, such as tanh(v/0.01) for sign(v).",
-                do="Smooth the force in the plant of the design, and close the loop with the other.",
+                do="Design for a plant with a smooth force, tanh(v/0.01) for sign(v); close the loop with the other.",
                 t=float(self.middle[lost][0]),
             )
         return A, B
@@ -109,10 +108,9 @@ def require_plant(plant):
     """Refuse what is no plant."""
     if not isinstance(plant, Plant):
         raise SpecificationError(
-            f"A {type(plant).__name__} was given in the place of a Plant.",
+            f"A {type(plant).__name__} was given as plant.",
             "Laws are designed for a plant, and a loop is closed around one.",
-            nearest="sv.plant(mechanism).",
-            do="Make the plant of the mechanism.",
+            do="Make the plant of the mechanism: sv.plant(mechanism).",
         )
 
 
@@ -122,8 +120,8 @@ def refuse_transport(plant, what):
         raise SpecificationError(
             f"The plant has a transport delay of {max(plant.delay.values()):g} s.",
             f"{what} that of a plant without delay.",
-            nearest="sv.plant(mechanism) for the design, and the plant with its delay in sv.close.",
-            do="Design for the plant without delay, and close the loop with it.",
+            do="Design for sv.plant(mechanism) without delay, and close the loop around the plant with it.",
+            delay=dict(plant.delay),
         )
 
 
@@ -147,14 +145,13 @@ def require_plan(plan, plant):
         raise NotRealisable(
             "The plan is realised by an ideal reaction.",
             "A law commands actuators.",
-            nearest='Program(..., by="actuators").',
-            do="Derive the program for the actuators, and simulate that plan.",
+            do='Derive Program(..., by="actuators"), and simulate that plan.',
         )
-    own = plan.jet_names[: model.nq + model.n]
+    state_names = plan.jet_names[: model.nq + model.n]
     for given, valid, what in (
-        (own, plant.state_names, "state of the plant"),
+        (state_names, plant.state_names, "state of the plant"),
         (model.actuators, plant.inputs, "actuator of the plant"),
-        (plant.state_names[: plant.n_x - len(plant.lag)], own, "state of the plan"),
+        (plant.state_names[: plant.n_x - len(plant.lag)], state_names, "state of the plan"),
         (plant.inputs, model.actuators, "actuator of the plan"),
     ):
         for name in given:

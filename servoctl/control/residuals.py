@@ -51,12 +51,12 @@ class Residuals:
         self.names = tuple(name for name in orders if orders[name] <= order and (names is None or name in names))
         self.orders = tuple(max(orders[name], 0) for name in self.names)
         self.expressions = ca.vertcat(*(program.residuals[name] for name in self.names))
-        own = plant.mechanism.parameters
+        valid = plant.mechanism.parameters.names
         self.symbols = [s for s in mechanism.parameters.symbols if _depends(self.expressions, s)]
         for s in self.symbols:
-            if s.name() not in own.names:
-                raise unknown(s.name(), own.names, "parameter of the plant")
-        self.parameters = np.array([plant.parameters[own.names.index(s.name())] for s in self.symbols])
+            if s.name() not in valid:
+                raise unknown(s.name(), valid, "parameter of the plant")
+        self.parameters = np.array([plant.parameters[valid.index(s.name())] for s in self.symbols])
         self.measures = tuple(s.name() for s in self._states(self.expressions))
         for name in self.measures:
             if name not in plant.state_names:
@@ -85,8 +85,8 @@ class Residuals:
     def _ordered(self, x):
         """States, and accelerations where they are given, in the plan's order, from an array in the plant's."""
         names = (*self._q.names, *(name for k in range(self._order) for name in self._q.jet_names(k + 1)))
-        own = (*self._plant.state_names, *self._plant.mechanism.q.jet_names(2))
-        rows = [own.index(name) if name in own else -1 for name in names]
+        columns = (*self._plant.state_names, *self._plant.mechanism.q.jet_names(2))
+        rows = [columns.index(name) if name in columns else -1 for name in names]
         return np.where(np.array(rows)[:, None] < 0, 0.0, x[rows])
 
     def levels(self, t, x):

@@ -138,7 +138,7 @@ class _Scene:
         for given, kind in ((self.mechanism, Mechanism), (self.program, Program)):
             if not isinstance(given, kind):
                 raise SpecificationError(
-                    f"A {type(given).__name__} was given in the place of a {kind.__name__}.",
+                    f"A {type(given).__name__} was given as {kind.__name__.lower()}.",
                     "A mechanism's program is slowed.",
                     do="Write sv.fastest(mechanism, program, ...).",
                 )
@@ -187,7 +187,7 @@ def _worst(plan, limits):
 
 
 def _level(model, name):
-    """Order of the derivative that a name stands for."""
+    """Order of the derivative of a name."""
     nq, n = model.nq, model.n
     return 0 if name not in model.jet_names[nq:] else 1 + (model.jet_names.index(name) - nq) // n
 

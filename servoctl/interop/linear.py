@@ -243,13 +243,12 @@ def _linear_closed(closed, t, name):
             "The measurement is quantised.", "Steps have no linearisation.", do="Close the loop without quantisation."
         )
     u, y = closed.inputs[:, k], closed.measurements[:, k]
-    own = _linear_plant(plant, t, x, u, law.rate, plant.disturbable, "plant")
-    own = _late(own, plant, loop.delay)
-    return connected(own, _linear_law(law, t, y, closed.controller_states[:, k], "law"), plant, law, name)
+    system = _late(_linear_plant(plant, t, x, u, law.rate, plant.disturbable, "plant"), plant, loop.delay)
+    return connected(system, _linear_law(law, t, y, closed.controller_states[:, k], "law"), plant, law, name)
 
 
 def _late(system, plant, delay):
-    """A sampled plant whose actuators are told each command `delay` samples late: past commands are further states."""
+    """A sampled plant whose actuators receive each command `delay` samples late: past commands are further states."""
     import control
 
     if not delay:

@@ -224,7 +224,7 @@ def _traced(record, names, every):
     if isinstance(record, str) or every != 1 and not len(record):
         raise SpecificationError(
             f"record={record!r} and every={every!r} were given.",
-            "Signals whose traces are kept are named one by one; without any there is none to thin out.",
+            "Traced signals are named one by one; without any there is none to thin out.",
             do='Name them: record=["theta"], every=10.',
         )
     return [index(name, names, "signal") for name in record], whole("every", every, least=1)
