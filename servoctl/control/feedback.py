@@ -1,6 +1,6 @@
 """Laws of feedback about a reference: u = u_ff - K (y - y_ref) - K_i z, with residuals integrated in z."""
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import casadi as ca
 import numpy as np
@@ -41,8 +41,7 @@ def affine_law(measures, n_u, feedback=True, residuals=None):
     return law_step("affine", t, ca.vertcat(y, z), ca.vertcat(*row, period, p), [u, z + period * phi])
 
 
-@dataclass(frozen=True, eq=False)
-class StateFeedback:
+class StateFeedback(NamedTuple):
     """Gains on all states of a plant, u = u_ff - K (x - x_ref) - K_i z; what an estimate of x may be fed to.
 
     Attributes

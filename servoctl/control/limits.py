@@ -1,6 +1,6 @@
 """Laws under limits: each sample's inputs from a small quadratic program that says which residual gives way."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from math import prod
 from types import SimpleNamespace
@@ -82,7 +82,10 @@ class SmallQP:
     def __init__(self, n, rows):
         shapes = {"h": ca.Sparsity.dense(n, n), "a": ca.Sparsity.dense(rows, n)}
         self._solve = ca.conic("qp", "daqp", shapes, {"error_on_fail": False})
-        self._g = np.zeros(n)
+        self._g, self._sizes = np.zeros(n), (n, rows)
+
+    def __reduce__(self):
+        return SmallQP, self._sizes
 
     def __call__(self, H, low, high, A, least, most):
         """The solution (n,), or None where there is none."""
@@ -289,7 +292,7 @@ class Allocation:
 
     law: Law
     plant: object
-    effects: Effects
+    effects: Effects = field(compare=False)  # follows from the plant and its outputs
     bounds: np.ndarray
     residuals: tuple
     sizes: np.ndarray
