@@ -29,8 +29,9 @@ from servoctl.errors import (
 from servoctl.export.c import export_c
 from servoctl.figures import run as plots
 from servoctl.internal_dynamics import InternalDynamics, internal_dynamics
-from servoctl.methods.bounds import sampled_bound
-from servoctl.methods.drift import poles, project
+from servoctl.methods.choice import Adaptive, Algebraic, RadauIIA, RungeKutta, Sundials, Taylor
+from servoctl.methods.drift import MinimalCoordinates, Poles, Project
+from servoctl.methods.stability import sampled_bound
 from servoctl.model.model import Model, derive
 from servoctl.plants.plant import Plant, plant
 from servoctl.run import Run, load
@@ -61,6 +62,8 @@ from servoctl.verification import Verification, verify
 __version__ = "0.1.0"
 
 __all__ = [
+    "Adaptive",
+    "Algebraic",
     "Batch",
     "Closed",
     "Controller",
@@ -74,18 +77,25 @@ __all__ = [
     "LimitExceeded",
     "LimitReport",
     "Mechanism",
+    "MinimalCoordinates",
     "Model",
     "NameUnknown",
     "NotRealisable",
     "Parameters",
     "Plant",
+    "Poles",
     "Program",
+    "Project",
+    "RadauIIA",
     "Run",
+    "RungeKutta",
     "ServoError",
     "SingularProgram",
     "SpecificationError",
     "StabilityMap",
     "Study",
+    "Sundials",
+    "Taylor",
     "TimeLaw",
     "TradeOff",
     "UnstableInternalDynamics",
@@ -119,8 +129,6 @@ __all__ = [
     "pd",
     "plant",
     "plots",
-    "poles",
-    "project",
     "rigid_body",
     "sampled_bound",
     "simulate",

@@ -13,7 +13,7 @@ import pytest
 from servoctl.codegen import compiler, emit
 from servoctl.codegen.function import compiled, compiling_at_once
 from servoctl.errors import NameUnknown, SpecificationError
-from servoctl.methods.tableaus import tableau
+from servoctl.methods.runge_kutta import tableau
 
 T, X2, P1 = ca.SX.sym("t"), ca.SX.sym("x", 2), ca.SX.sym("p", 1)
 RK4 = tableau("RK4")

@@ -10,7 +10,7 @@ import servoctl as sv
 from servoctl.control.computed import sampled_radius
 from servoctl.control.linearising import _Extension
 from servoctl.gallery import cars, gallery, mass_on_car, vtol
-from servoctl.methods.bounds import sampled_bound
+from servoctl.methods.stability import sampled_bound
 
 ORDERS = {  # zeros at infinity of the program's outputs (theory), which exact linearisation reaches
     "two-link-arm": (2, 2),

@@ -8,7 +8,7 @@ from servoctl.control.linearising import linearise
 from servoctl.control.tracking import Reference, refuse_transport, require_plan
 from servoctl.errors import SpecificationError, UnstableInternalDynamics, unknown
 from servoctl.internal_dynamics import internal_dynamics
-from servoctl.methods.bounds import sampled_bound
+from servoctl.methods.stability import sampled_bound
 from servoctl.reduction.knots import require_smooth
 
 GROWN = 2.0  # by how much errors may grow along the plan, as by a passing eigenvalue that is hardly unstable

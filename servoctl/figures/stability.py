@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from servoctl.methods.tableaus import ORDERS
+from servoctl.methods.runge_kutta import ORDERS
 
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")  # Okabe and Ito
 STEPS, POLES, LINE = 120, 81, 3  # of the shaded map; every third pole for lines

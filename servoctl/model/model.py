@@ -253,7 +253,7 @@ class Model:
         Parameters
         ----------
         name : str
-            "ode", "ode_projected", "ode_poles", "ode_jacobian", "ode_poles_jacobian", "path", "invariants", "metric",
+            "ode", "ode_projected", "ode_poles", "ode_jacobian", "ode_poles_jacobian", "path", "invariants",
             "matrices", "plant", "multiplier_form", "accelerations", or one of `SERVO_DAE` and `FORMULATIONS`.
 
         Returns
