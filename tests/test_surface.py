@@ -19,7 +19,7 @@ FILES = sorted(PACKAGE.rglob("*.py"))
 ENTRIES = ("__init__.py", "__main__.py")  # of the package itself: they gather the rest
 
 LAYERS = (
-    "errors", "tolerances", "checks", "jets", "spec", "reduction", "codegen", "model", "plants", "run", "methods", "simulation", "verification", "internal_dynamics",
+    "errors", "values", "tolerances", "checks", "jets", "spec", "reduction", "codegen", "model", "plants", "run", "methods", "simulation", "verification", "internal_dynamics",
     "control", "figures", "study", "interop", "export", "gallery", "shell",
 )  # fmt: skip
 WITHOUT_CASADI = ("study", "figures", "interop", "shell")

@@ -6,12 +6,13 @@ import numpy as np
 
 from servoctl.checks import ON_SAMPLE, finite
 from servoctl.errors import SpecificationError, unknown
+from servoctl.values import Value
 
 _SIZES = ("n_x", "n_p", "n_y")  # of a compiled step: what it takes, its row, what it gives
 
 
 @dataclass(frozen=True, eq=False)
-class Law:
+class Law(Value):
     """A sampled law u = law(t, measurement); made by `feedforward`, `pd`, `lqr` and others.
 
     At the sample k of t_k = t0 + k/rate, `step` maps t_k, [y; z] and the k-th column of `table` to [u; z+; further

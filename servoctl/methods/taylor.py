@@ -199,7 +199,8 @@ class TaylorSteps(Stepping):
         self.model, self.n_x = model, len(model.state_names)
         last = max(self.order + model.reduction.top - 1, self.jets + 1)
         self.f = series_loop(model, last)
-        self.nq, self.n, self.top, self.last, self.plain = model.nq, model.n, model.reduction.top, last, model.plain
+        self.nq, self.n, self.top, self.last = model.nq, model.n, model.reduction.top, last
+        self.plain = model.reduction.mechanism.q.plain
         self.n_c = (0 if self.plain else self.nq * last) + self.n * last
 
     def _start(self, t, x, b):

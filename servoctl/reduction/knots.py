@@ -47,13 +47,20 @@ class Switches:
     q : Coordinates
     residuals : dict of str to SX
     parameters : tuple of SX
+    timed : list of (int, int or None), optional
+        Sides of the switches, as nodes of the tape, where they are known.
     """
 
-    def __init__(self, q, residuals, parameters):
-        self.q, self.residuals = q, residuals
+    def __init__(self, q, residuals, parameters, timed=None):
+        self.q, self.residuals, self._given = q, residuals, (q, residuals, parameters)
         self.symbols = ca.symvar(ca.vertcat(*residuals.values()))
         self.parameters = [p.element_hash() for p in parameters]
-        self.timed = self._timed() if any(s.element_hash() == q.t.element_hash() for s in self.symbols) else []
+        self.timed = timed
+        if timed is None:
+            self.timed = self._timed() if any(s.element_hash() == q.t.element_hash() for s in self.symbols) else []
+
+    def __reduce__(self):
+        return Switches, (*self._given, self.timed)
 
     @cached_property
     def tape(self):

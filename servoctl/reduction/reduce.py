@@ -89,6 +89,11 @@ class Reduction:
         return smoothness(self.switches, self.rows)
 
     @property
+    def timed(self):
+        """Whether paths switch at instants."""
+        return bool(self.switches)
+
+    @property
     def hidden(self):
         """The rows that are hidden constraints."""
         return tuple(row for row in self.rows if row.story)

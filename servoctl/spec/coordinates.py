@@ -1,6 +1,7 @@
 """Generalised coordinates, quasi-velocities and their jets, and the total derivative (3.1)."""
 
 import threading
+from collections.abc import Iterable
 from math import factorial
 from numbers import Integral
 
@@ -44,7 +45,7 @@ class Coordinates:
     def __iter__(self):
         return iter(self._q)
 
-    def __len__(self):
+    def __len__(self) -> int:
         return self.nq
 
     @property
@@ -125,7 +126,7 @@ class Coordinates:
         """γ^(k), k >= 1, or q for k = 0, as a column: (n,) or (nq,) SX."""
         return ca.vertcat(*(self.gamma(k) if k else self._q))
 
-    def jet_names(self, k):
+    def jet_names(self, k: int) -> tuple[str, ...]:
         """Names of γ^(k), k >= 1, or of q for k = 0."""
         if k == 0:
             return self.names
@@ -190,6 +191,47 @@ class Coordinates:
         outputs = self._series(expressions, k).outputs[: len(expressions)]
         return [[_as_sx(multiply(c[j], float(factorial(j)))) for c in outputs] for j in range(k + 1)]
 
+    def as_function(self, expressions, parameters=()):
+        """Expressions of t, q, the jets and parameters as one function of these, which serialises and pickles.
+
+        Parameters
+        ----------
+        expressions : sequence of SX
+        parameters : sequence of SX
+            Their symbols.
+
+        Returns
+        -------
+        casadi.Function
+        """
+        highest = max(0, self.order(ca.vertcat(*(ca.vec(e) for e in expressions))))
+        return ca.Function("expressions", self._arguments(highest, parameters), list(expressions))
+
+    def from_function(self, function, parameters=()):
+        """The expressions of a function that `as_function` made, here or in another process, in these symbols.
+
+        Parameters
+        ----------
+        function : casadi.Function
+        parameters : sequence of SX
+            Their symbols.
+
+        Returns
+        -------
+        list of SX
+        """
+        return function.call(self._arguments(function.n_in() - 3, parameters), True, False)
+
+    def _arguments(self, highest, parameters):
+        jets = [self.jet(k) for k in range(highest + 1)]
+        return [self.t, *jets, ca.vertcat(ca.SX(0, 1), *parameters)]
+
+    def __reduce__(self):
+        if self.plain:
+            return Coordinates, (self.names,)
+        frame = self.as_function([self.V, self.h, *self.invariants.values()])
+        return _moved, (self.names, self.velocity_names, frame, tuple(self.invariants))
+
     def _series(self, expressions, k):
         """Coefficients 0 to k of expressions, and behind them those of q' = V w + h where q itself is in them."""
         symbols, moving = None, []
@@ -226,6 +268,13 @@ class _SymbolicMotion(Motion):
 
     def velocity(self, i, level, j):
         return divide(self.q.gamma(level + j)[i], float(factorial(j)))
+
+
+def _moved(names, velocity_names, frame, invariants):
+    """Coordinates with quasi-velocities, as another process described them."""
+    q = Coordinates(names)
+    V, h, *values = q.from_function(frame)
+    return q.with_quasi_velocities(" ".join(velocity_names), V, h, dict(zip(invariants, values, strict=True)))
 
 
 def _order(k):
@@ -296,7 +345,7 @@ def _clash(name, why):
     )
 
 
-def coordinates(names):
+def coordinates(names: str | Iterable[str]) -> Coordinates:
     """Generalised coordinates by name, with jets of any order on demand.
 
     Parameters

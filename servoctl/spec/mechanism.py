@@ -1,6 +1,7 @@
 """The mechanism: its balance r = ∂S/∂γ'' - Γ, its actuators and its material constraints."""
 
-from functools import cached_property
+import json
+from functools import cached_property, lru_cache
 
 import casadi as ca
 import numpy as np
@@ -10,9 +11,11 @@ from servoctl.errors import SpecificationError, unknown
 from servoctl.jets.evaluation import evaluate
 from servoctl.jets.tape import Tape
 from servoctl.spec.coordinates import Coordinates
+from servoctl.spec.packing import packed, unpacked
 from servoctl.spec.parameters import Parameters
 from servoctl.tolerances import ENTRY
 
+ARRIVED = 32  # mechanisms from other processes that are held
 IDENTITY_SEED = 20021  # of the random points at which identities are tested
 RANDOM = (0.3, 1.3)  # where these lie, parameters in units of their defaults: of order one, and away from zero
 INTEGRABLE = 1e-9  # of the largest bracket of columns of V: what may lie outside their span
@@ -111,6 +114,29 @@ class Mechanism:
                 lines.append(f"  {what}: {', '.join(names)}")
         lines.append(f"  {self.parameters!r}"[:118])
         return "\n".join(lines)
+
+    def as_text(self):
+        """Names, numbers and expressions: the same for the same operations in the same order, and for no others."""
+        q, p = self.q, self.parameters
+        names = [q.names, q.velocity_names, q.plain, list(q.invariants), self.actuators, list(self.constraints)]
+        expressions = [
+            q.V, q.h, *q.invariants.values(), self.balance, self.energy, self.forces, self.E,
+            *self.constraints.values(), *self.outputs.values(),
+        ]  # fmt: skip
+        function = q.as_function(expressions, p.symbols).serialize()
+        return json.dumps([names, list(self.outputs), p.defaults]) + "\n" + function
+
+    def __eq__(self, other):
+        if type(other) is not type(self):
+            return NotImplemented
+        return self is other or self.as_text() == other.as_text()
+
+    def __hash__(self):
+        return hash((self.q.names, self.actuators, self.parameters.names))
+
+    def __reduce__(self):
+        content = packed(vars(self), self.q, self.parameters, {"parameters": self.parameters})
+        return _unpickled, (self.q, self.parameters, content)
 
     @cached_property
     def balance(self):
@@ -332,6 +358,18 @@ class Mechanism:
                         name=name,
                     )
                 seen[name] = what
+
+
+def _unpickled(q, parameters, content):
+    mechanism = object.__new__(Mechanism)
+    vars(mechanism).update(unpacked(content, q, parameters, {"parameters": parameters}))
+    return _latest(mechanism)
+
+
+@lru_cache(ARRIVED)
+def _latest(mechanism):
+    """An equal mechanism that came before from another process, or else this one: what is derived of it is shared."""
+    return mechanism
 
 
 def require_known(expression, mechanism, what):

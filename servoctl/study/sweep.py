@@ -28,7 +28,7 @@ INTERRUPTED = 1  # status of a run that Ctrl-C ended
 PATIENCE = 1.0  # s before a progress bar appears
 
 
-def sweep(case, cases, *, executor=None, seed=None, checkpoint=None, shard=None, progress=None):
+def sweep(case, cases, *, executor=None, seed=None, checkpoint=None, shard=None, progress=None) -> Study:
     """Compute every case and gather the numbers in one table.
 
     The table is the same, bit for bit, however many workers compute it and in whatever order, on processors of one
@@ -103,7 +103,7 @@ def sweep(case, cases, *, executor=None, seed=None, checkpoint=None, shard=None,
     return Study("sweep", columns, meta | {"message": _message(columns, meta, len(mine))})
 
 
-def merge(studies):
+def merge(studies) -> Study:
     """The shards of a sweep as one table, in the order of the cases.
 
     Parameters

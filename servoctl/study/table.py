@@ -49,13 +49,13 @@ class Study:
             )
         object.__setattr__(self, "columns", columns)
 
-    def __len__(self):
+    def __len__(self) -> int:
         return len(next(iter(self.columns.values()), ()))
 
-    def __getitem__(self, name):
+    def __getitem__(self, name: str) -> np.ndarray:
         return self.column(name)
 
-    def column(self, name):
+    def column(self, name: str) -> np.ndarray:
         """The column with this name.
 
         Parameters
@@ -74,12 +74,12 @@ class Study:
             raise unknown(name, self.columns, "column")
         return self.columns[name]
 
-    def rows(self):
+    def rows(self) -> list[dict]:
         """All rows as dicts of plain values."""
         plain = {name: values.tolist() for name, values in self.columns.items()}
         return [dict(zip(plain, row, strict=True)) for row in zip(*plain.values(), strict=True)]
 
-    def where(self, **values):
+    def where(self, **values) -> "Study":
         """The rows in which each column named has the value given.
 
         Parameters
@@ -213,7 +213,7 @@ def table(study, names, most=SHOWN):
     return [*lines, f"  ... {len(study) - most} more rows"] if len(study) > most else lines
 
 
-def load_study(path):
+def load_study(path) -> Study:
     """A study from a file that `Study.save` wrote.
 
     Parameters
