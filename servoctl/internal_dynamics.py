@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from servoctl.verification import require_model
+from servoctl.run import require_model
 
 INSTANTS = 41  # instants along a run at which the internal dynamics is linearised
 AT_ZERO = 1e-9  # size of a state relative to the largest: rounding of one that stays zero

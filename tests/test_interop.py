@@ -50,12 +50,12 @@ def same(found, run, names, tolerance=1e-9):
 def test_interconnect_of_plant_and_lqr_is_close_on_the_crane(plan, integral):
     law = sv.lqr(plan, sv.plant(CRANE), rate=50.0, integral=integral)
     machine = sv.plant(CRANE, m_load=115.0)
-    run = sv.close(machine, law, SUDDEN, (0.0, 4.0), substeps=4)
+    run = sv.close(machine, law, SUDDEN, (0.0, 4.0), timing=sv.Timing(substeps=4))
     loop = control.interconnect(
         [interop.nlsys(machine, rate=50.0, substeps=4), interop.nlsys(law)],
         inputs=[], outputs=[*machine.state_names, *machine.mechanism.outputs, *law.inputs],
     )  # fmt: skip
-    found = respond(loop, run.t, x0=np.append(run.states[:, 0], law.memory))
+    found = respond(loop, run.t, x0=np.append(run.states[:, 0], law.state))
     assert loop.state_labels[:6] == [f"plant_{name}" for name in machine.state_names]
     same(found, run, [*machine.state_names, *machine.mechanism.outputs, *machine.inputs])
 
@@ -66,9 +66,14 @@ def test_a_closed_run_becomes_its_loop_with_noise_disturbance_limits_delays_and_
     limits = {"limits": {"trolley": 140.0}, "rate_limits": {"hoist": 400.0}}
     machine = sv.plant(CRANE, m_load=115.0, lag={"trolley": 0.06}, delay={"hoist": 0.03}, **limits)
     run = sv.close(
-        machine, law, plan.state(0.0), (0.0, 3.0), delay=2, noise={"x": 1e-3, "dtheta": 1e-3},
-        quantisation={"l": 1e-3}, disturbance={"theta": lambda t: 60.0 * (1.0 < t < 1.5)}, substeps=4,
-    )  # fmt: skip
+        machine,
+        law,
+        plan.state(0.0),
+        (0.0, 3.0),
+        sensors=sv.Sensors(noise={"x": 1e-3, "dtheta": 1e-3}, quantisation={"l": 1e-3}),
+        timing=sv.Timing(delay=2, substeps=4),
+        disturbance={"theta": lambda t: 60.0 * (1.0 < t < 1.5)},
+    )
     assert all(np.any(run.active[name]) for name in machine.inputs), "both limits are met"
     loop = interop.nlsys(run)
     inputs = np.zeros((loop.ninputs, len(run.t)))
@@ -96,7 +101,7 @@ def test_material_constraints_are_held_in_a_sampled_plant():
 def test_a_limited_law_is_a_system_too(plan):
     machine = sv.plant(CRANE, m_load=115.0, limits={"trolley": 120.0})
     law = sv.limited(sv.lqr(plan, sv.plant(CRANE), rate=20.0), machine)
-    run = sv.close(machine, law, plan.state(0.0), (0.0, 3.0), substeps=4)
+    run = sv.close(machine, law, plan.state(0.0), (0.0, 3.0), timing=sv.Timing(substeps=4))
     assert np.any(run.signal["limit trolley"])
     found = respond(interop.nlsys(run), run.t, x0=interop.start(run))
     same(found, run, machine.state_names)
@@ -262,8 +267,8 @@ def test_margins_tell_the_delay_at_which_the_loop_is_lost(car_plan):
     _, pm, _, _, wgc, _ = control.stability_margins(control.frequency_response(gain, w))
     samples = np.deg2rad(pm) / wgc * 100.0
     stable = [
-        np.abs(interop.linearise(sv.close(plant, law, car_plan.state(0.0), (0.0, 6.0), delay=d), end).poles()).max() < 1
-        for d in (int(np.floor(samples)), int(np.ceil(samples)))
+        np.abs(interop.linearise(sv.close(plant, law, car_plan.state(0.0), (0.0, 6.0), timing=t), end).poles()).max() < 1
+        for t in (sv.Timing(delay=int(np.floor(samples))), sv.Timing(delay=int(np.ceil(samples))))
     ]
     assert stable == [True, False]
 
@@ -287,7 +292,7 @@ def test_output_feedback_and_computed_laws_are_linearised(car_plan, plan):
     plant = sv.plant(CRANE)
     filtered = sv.output_feedback(sv.lqr(plan, plant, rate=50.0), plant, {"x": 1e-3, "l": 1e-3, "theta": 1e-3})
     for law in (filtered, sv.computed(plan, plant)):
-        t, z = 2.0, law.memory + 0.0
+        t, z = 2.0, law.state + 0.0
         exact, y = (
             interop.linearise(law, t),
             np.array([plan.state(t)[plant.state_names.index(n)] for n in law.measures]),
@@ -295,7 +300,7 @@ def test_output_feedback_and_computed_laws_are_linearised(car_plan, plan):
         near = interop.nlsys(law).linearize(z, y, t=t, eps=1e-6)
         scale = max(np.abs(exact.D).max(), 1.0)
         assert np.abs(exact.D - near.D).max() < 1e-4 * scale and np.abs(exact.A - near.A).max() < 1e-4
-        assert exact.state_labels == list(law.memory_names) and exact.output_labels == ["trolley", "hoist"]
+        assert exact.state_labels == list(law.state_names) and exact.output_labels == ["trolley", "hoist"]
 
 
 # what cannot be --------------------------------------------------------------------------------------------------------
@@ -318,12 +323,12 @@ def test_output_feedback_and_computed_laws_are_linearised(car_plan, plan):
         (lambda c: interop.linearise(sv.plant(CRANE), 0.0, SUDDEN, {"hoist": 1.0}), NameUnknown, {"name": "trolley"}),
         (lambda c: list(interop.along(sv.plant(CRANE), c["plan"], [9.0])), SpecificationError, "0 to 8 s"),
         (lambda c: interop.loop_gain(interop.linearise(sv.plant(CRANE), 0.0, SUDDEN), interop.linearise(c["law"], 0.0),
-                                     "trolley"), SpecificationError, "0.02 s"),
+                                     "trolley"), SpecificationError, "dt = 0 s, the law 0.02 s.*rate=50"),
         (lambda c: interop.loop_gain(sv.plant(CRANE), c["law"], "trolley"), SpecificationError, "Plant"),
         (lambda c: interop.linearise(c["late"], 0.0, SUDDEN), SpecificationError, "0.05 s"),
         (lambda c: interop.linearise(c["law"], 0.0, rate=3.0), SpecificationError, "Law"),
         (lambda c: interop.linearise(c["law"], 0.003), SpecificationError, {"t": 0.003}),
-        (lambda c: interop.linearise(c["law"], 0.0, memory=[1.0]), SpecificationError, "(1,)"),
+        (lambda c: interop.linearise(c["law"], 0.0, controller_state=[1.0]), SpecificationError, "(1,)"),
         (lambda c: interop.linearise(c["plan"].model, 0.0, [1.0]), SpecificationError, "6 "),
         (lambda c: list(interop.along(3, c["plan"], [0.0])), SpecificationError, "int"),
         (lambda c: list(interop.along(c["law"], c["plan"], [])), SpecificationError, "times"),
@@ -349,7 +354,7 @@ def test_laws_without_expressions_are_refused_where_these_are_needed(plan):
         def start(self):
             return lambda t, y: [0.0, -1128.0]
 
-    run = sv.close(sv.plant(CRANE), Own(), SUDDEN, (0.0, 0.1), rate=100.0)
+    run = sv.close(sv.plant(CRANE), Own(), SUDDEN, (0.0, 0.1), timing=sv.Timing(rate=100.0))
     with refused(SpecificationError, "'Own'"):
         interop.nlsys(run)
 

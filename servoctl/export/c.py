@@ -54,7 +54,7 @@ def export_c(source, folder, *, name=None, start=None):
     ServoError
         If the files cannot be written.
     """
-    law = hasattr(source, "table") and isinstance(source.step, Compiled)
+    law = hasattr(source, "schedule") and isinstance(source.step, Compiled)
     if not law and not hasattr(source, "reduction"):
         raise _without_expressions(source)
     _require_start(law, start)
@@ -71,7 +71,7 @@ def _require_start(law, start):
     """A start is that of a model."""
     if law and start is not None:
         raise SpecificationError(
-            "A start was given for a law.", "A law starts with its own memory.", do="Leave the start out."
+            "A start was given for a law.", "A law starts with its controller state.", do="Leave the start out."
         )
     if start is not None and not isinstance(start, State):
         raise SpecificationError(
@@ -96,7 +96,7 @@ def _require_name(name):
 
 def _without_expressions(source):
     """The refusal of what C cannot be written from."""
-    if not hasattr(source, "table"):
+    if not hasattr(source, "schedule"):
         return SpecificationError(
             f"A {type(source).__name__} is to be exported.",
             "C is written from a Model or a Law.",
@@ -182,20 +182,20 @@ def _integrated(model, x, z, p, u):
 
 
 def _of_law(law):
-    f, table = law.step.expression, np.atleast_2d(np.asarray(law.table, dtype=float))
+    f, table = law.step.expression, np.atleast_2d(np.asarray(law.schedule, dtype=float))
     y = Array("y", "Measurement y, SI", law.measures)
     u = Array("u", "Command u, SI", law.inputs)
-    z = Array("z", "Memory z", law.memory_names)
+    z = Array("z", "Controller state z", law.state_names)
     about = (
-        "One sample of the law: command u of the measurement y and the memory z, which becomes the next one. To be "
-        f"called every {1 / law.rate:.9g} s from t = {law.t0:g} s; after its last row the table stays there."
+        "One sample of the law: command u of the measurement y and the controller state z, which becomes the next one. "
+        f"To be called every {1 / law.rate:.9g} s from t = {law.t0:g} s; beyond the schedule its last row holds."
     )
     routines = (
-        Routine("start", "Sets the memory z to its value at the start.", (z.output(),)),
+        Routine("start", "Sets the controller state z to its value at the start.", (z.output(),)),
         Routine("step", about, (TIME, y.input(), z.output(), u.output())),
     )
-    memory = np.asarray(law.memory, dtype=float)
-    constants = (Constant("z0", memory if len(memory) else np.zeros(1)), Constant("table", table.T.ravel()))
+    state = np.asarray(law.state, dtype=float)
+    constants = (Constant("z0", state if len(state) else np.zeros(1)), Constant("table", table.T.ravel()))
     sizes = {f"N{a.key.upper()}": len(a.names) for a in (y, u, z)} | {"NO": f.numel_out(0), "WIDTH": len(table)}
     sizes |= {"ROWS": table.shape[1], "T0": float(law.t0), "RATE": float(law.rate)}
     return Contents((y, u, z), constants, {"law": f}, routines, ("law.c",), sizes)

@@ -68,7 +68,7 @@ def _errors(run, units):
 
 def _input(ax, run, name, unit):
     """What an actuator was given, what the plan has and the law asked for, and its limits."""
-    from servoctl.control.tracking import resampled
+    from servoctl.control.reference import resampled
 
     if run.plan is not None:
         within = run.t[run.t <= run.plan.t[-1]]

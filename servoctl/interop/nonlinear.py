@@ -5,7 +5,7 @@ import math
 import numpy as np
 
 from servoctl.checks import positive
-from servoctl.control.close import limits, steps
+from servoctl.control.conditions import limits, steps
 from servoctl.control.law import Law
 from servoctl.control.loop import hold, limited, quantised, samples_ago
 from servoctl.control.result import Closed
@@ -70,7 +70,7 @@ def nlsys(thing, *, rate=None, substeps=None, disturbed=(), name=None):
 
 
 def start(closed):
-    """The state in which the system of a closed loop starts, for X0 of python-control: plant, past inputs, memory.
+    """The state in which the system of a closed loop starts, for X0 of python-control: plant, past inputs, law.
 
     Parameters
     ----------
@@ -214,14 +214,13 @@ def _pasts(plant, loop):
 def _law(law, name, quantum=None):
     import control
 
-    if hasattr(getattr(law.step, "_given", None), "start"):
+    if getattr(law.step, "stateful", False):
         raise SpecificationError(
-            f"The law {law.name!r} keeps its memory to itself.",
+            f"The law {law.name!r} keeps its state to itself.",
             "python-control asks for outputs and states apart, more than once per sample.",
-            nearest="A Law, whose memory is a state.",
             do="Run it by sv.close, or write it as a control.nlsys.",
         )
-    m, n_z = len(law.inputs), len(law.memory)
+    m, n_z = len(law.inputs), len(law.state)
 
     def answer(t, z, y):
         return law.answer(t, np.append(quantised(y, quantum), z), law.row(t))
@@ -229,7 +228,7 @@ def _law(law, name, quantum=None):
     return control.nlsys(
         (lambda t, z, y, _: answer(t, z, y)[m : m + n_z]) if n_z else None,
         lambda t, z, y, _: answer(t, z, y)[:m],
-        name=name, inputs=signal_names(law.measures, law.inputs), outputs=law.inputs, states=law.memory_names or None,
+        name=name, inputs=signal_names(law.measures, law.inputs), outputs=law.inputs, states=law.state_names or None,
         dt=law.period,
     )  # fmt: skip
 

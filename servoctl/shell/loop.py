@@ -122,7 +122,7 @@ def closed_loop(args, model, plan, report):
         run = getattr(error, "run", None)
         return run if run is not None and len(run.t) else None, not asked
     report.say(run)
-    if "slack of" in run.law.info:
+    if run.law.allocation:
         from servoctl.control.limits import limit_report
 
         report.say(limit_report(run))
@@ -131,6 +131,7 @@ def closed_loop(args, model, plan, report):
 
 def _closed(args, model, plan):
     from servoctl.control.close import close
+    from servoctl.control.conditions import Sensors, Timing
     from servoctl.plants.plant import plant
 
     mechanism = model.reduction.mechanism
@@ -141,14 +142,15 @@ def _closed(args, model, plan):
     law = _law(args, plan, nominal)
     start, samples = float(plan.t[0]), math.floor((plan.t[-1] - plan.t[0]) * law.rate * (1 + 1e-12) + 1e-9)
     span = (start, start + samples / law.rate)
-    return close(machine, law, plan.state(start), span, delay=args.delay or 0, noise=noise or None, seed=args.seed)
+    sensors, timing = Sensors(noise=noise, seed=args.seed), Timing(delay=args.delay or 0)
+    return close(machine, law, plan.state(start), span, sensors=sensors, timing=timing)
 
 
 def _law(args, plan, nominal):
-    from servoctl.control.computed import computed
+    from servoctl.control.feedforward import feedforward
+    from servoctl.control.inverse_dynamics import computed
     from servoctl.control.limits import limited
     from servoctl.control.lqr import lqr
-    from servoctl.control.tracking import feedforward
 
     rate = RATE if args.rate is None else args.rate
     if args.law == "feedforward":
@@ -180,7 +182,7 @@ def facts(closed):
         "rate": closed.law.rate,
         "machine": dict(zip(names, closed.plant.parameters.tolist(), strict=False)),
         "delay": closed.loop.delay,
-        "noise": closed.conditions.noise,
+        "noise": closed.conditions.sensors.noise,
         "success": closed.success,
         "message": closed.message,
         "t_end": float(closed.t[-1]),
