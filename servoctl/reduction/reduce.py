@@ -299,7 +299,7 @@ def _require_outputs(reduction):
             raise SpecificationError(
                 f"The output {name!r} has order {q.order(expression)}.",
                 f"A motion of this program has jets up to order {top}.",
-                do="Give an output of lower order, and take its derivatives from a run of the Taylor method with jets.",
+                do="Give an output of lower order, and take its derivatives from a run by method=sv.Taylor(jets=...).",
                 name=name,
             )
 
