@@ -49,8 +49,6 @@ from servoctl.spec import (
 )
 from servoctl.study.cases import grid, monte_carlo
 from servoctl.study.close_many import Batch, close_many
-from servoctl.study.dae import DaeComparison, dae_comparison
-from servoctl.study.formulation import FormulationCost, formulation_cost
 from servoctl.study.front import TradeOff
 from servoctl.study.stability_map import StabilityMap, stability
 from servoctl.study.sweep import merge, sweep
@@ -65,8 +63,6 @@ __all__ = [
     "Closed",
     "Controller",
     "Coordinates",
-    "DaeComparison",
-    "FormulationCost",
     "InconsistentStart",
     "IntegrationStopped",
     "InternalDynamics",
@@ -95,13 +91,11 @@ __all__ = [
     "close_many",
     "computed",
     "coordinates",
-    "dae_comparison",
     "derive",
     "disturbances",
     "export_c",
     "fastest",
     "feedforward",
-    "formulation_cost",
     "grid",
     "internal_dynamics",
     "interop",

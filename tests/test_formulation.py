@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 import servoctl as sv
+from benchmarks.literature.formulations import NAMES, formulation, formulation_cost
 from servoctl.gallery import gallery
 from servoctl.gallery.guided_arm import guided_arm
-from servoctl.study.formulation import NAMES, formulation_cost
 from servoctl.study.table import load_study
 
 DOC = Path(__file__).parents[1] / "docs" / "formulations.md"
@@ -41,8 +41,8 @@ def test_the_accelerations_are_those_of_the_model():
     x = np.random.default_rng(1).uniform(0.2, 1.2, len(model.state_names))
     rates = model.function("ode")(0.0, x, model.parameters)[model.nq : model.nq + model.n]
     for how in ("eliminated", "sparse", "qr"):
-        assert model.function(f"formulation_{how}")(0.0, x, model.parameters) == pytest.approx(rates, rel=1e-9)
-        forces = model.function(f"formulation_{how}_forces")(0.0, x, model.parameters)
+        assert formulation(model, how)(0.0, x, model.parameters) == pytest.approx(rates, rel=1e-9)
+        forces = formulation(model, how, forces=True)(0.0, x, model.parameters)
         jets = np.concatenate([x, rates])
         mu = model.signals("all_multipliers")[1](0.0, jets, model.parameters)
         assert forces == pytest.approx(np.concatenate([rates, mu]), rel=1e-8)

@@ -10,14 +10,11 @@ from servoctl.codegen.function import compiled
 from servoctl.errors import SpecificationError, unknown
 from servoctl.model.derivation import Derivation
 from servoctl.model.equations import EQUATIONS, Equations, gradient_jets, leading_names, residual_rows
-from servoctl.model.formulations import FORMULATIONS
-from servoctl.model.servo_dae import SERVO_DAE
 from servoctl.reduction.appell import require_positive
 from servoctl.reduction.knots import require_smooth
 from servoctl.reduction.reduce import holds
 from servoctl.reduction.structure import structure
 
-FUNCTIONS = {**EQUATIONS, **SERVO_DAE, **FORMULATIONS}
 SIGNALS = (
     "actuation", "reaction", "multipliers", "outputs", "energy", "balance", "coordinate_rates", "residuals",
     "inputs", "all_multipliers", "power", "reach",
@@ -254,17 +251,17 @@ class Model:
         ----------
         name : str
             "ode", "ode_projected", "ode_poles", "ode_jacobian", "ode_poles_jacobian", "path", "invariants", "metric",
-            "matrices", "plant", "multiplier_form", "accelerations", or one of `SERVO_DAE` and `FORMULATIONS`.
+            "matrices", "plant", "multiplier_form", or "accelerations".
 
         Returns
         -------
         Compiled
         """
-        if name not in FUNCTIONS:
-            raise unknown(name, list(FUNCTIONS), "function")
+        if name not in EQUATIONS:
+            raise unknown(name, list(EQUATIONS), "function")
 
         def build():
-            f, *options = FUNCTIONS[name](self.equations)
+            f, *options = EQUATIONS[name](self.equations)
             return compiled(f, name, *options)
 
         return self.once(name, build)
