@@ -4,7 +4,8 @@ A specification flows one way: Mechanism and Program, by `derive`, become a Mode
 `verify` proves the run against the full mechanism.
 """
 
-from servoctl import interop, spec
+from servoctl import figures, interop, spec
+from servoctl import figures as plots
 from servoctl.control import disturbances
 from servoctl.control.close import close
 from servoctl.control.computed import computed
@@ -27,7 +28,6 @@ from servoctl.errors import (
     UnstableInternalDynamics,
 )
 from servoctl.export.c import export_c
-from servoctl.figures import run as plots
 from servoctl.internal_dynamics import InternalDynamics, internal_dynamics
 from servoctl.methods.bounds import sampled_bound
 from servoctl.methods.drift import poles, project
@@ -50,9 +50,10 @@ from servoctl.spec import (
 from servoctl.study.cases import grid, monte_carlo
 from servoctl.study.close_many import Batch, close_many
 from servoctl.study.front import TradeOff
+from servoctl.study.load import load_study
 from servoctl.study.stability_map import StabilityMap, stability
 from servoctl.study.sweep import merge, sweep
-from servoctl.study.table import Study, load_study
+from servoctl.study.table import Study
 from servoctl.study.tradeoff import tradeoff
 from servoctl.verification import Verification, verify
 
@@ -96,6 +97,7 @@ __all__ = [
     "export_c",
     "fastest",
     "feedforward",
+    "figures",
     "grid",
     "internal_dynamics",
     "interop",

@@ -12,12 +12,12 @@ from servoctl.methods.algebraic import algebraic
 from servoctl.methods.bounds import row_poles, warn_many_steps
 from servoctl.methods.drift import Minimal, Poles, Project, as_drift
 from servoctl.methods.minimal import require_minimal
-from servoctl.methods.motion import Progress
 from servoctl.methods.radau import RADAU_ORDERS, RadauMethod
 from servoctl.methods.runge_kutta import fixed_step
 from servoctl.methods.sundials import MULTISTEP, SundialsMethod
 from servoctl.methods.tableaus import ORDERS
 from servoctl.methods.taylor import SeriesMethod
+from servoctl.progress import Progress
 from servoctl.run import Run
 
 SAMPLES = 1001  # of a run unless t_eval says otherwise: smooth curves, and extrema refined to rounding

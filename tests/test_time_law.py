@@ -43,7 +43,7 @@ def test_slowed_rates_and_curvatures_leave_the_path_where_it_is():
 
 
 def test_the_motions_tried_are_shown(capsys, monkeypatch):
-    monkeypatch.setattr("servoctl.control.time_law.PATIENCE", 0)
+    monkeypatch.setattr("servoctl.progress.PATIENCE", 0)
     sv.fastest(*cars(), {"force": 200.0}, (0.0, 2.0), progress=True)
     told = capsys.readouterr().err
     assert "fastest" in told and "motions" in told and "simulate" not in told

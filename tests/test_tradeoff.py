@@ -8,12 +8,14 @@ import pytest
 
 import servoctl as sv
 from servoctl.errors import LimitExceeded, NameUnknown, ServoError, SingularProgram, SpecificationError
+from servoctl.figures.work_precision import COLOURS
 from servoctl.gallery import gallery
 from servoctl.methods.accuracy import motion_error
 from servoctl.shell.main import main
 from servoctl.simulation import ALL_METHODS
-from servoctl.study.front import COLOURS, TradeOff
-from servoctl.study.table import Study, load_study
+from servoctl.study.front import TradeOff
+from servoctl.study.load import load_study
+from servoctl.study.table import Study
 
 SPAN = (0.0, 1.0)
 METHODS = ("Taylor", "DOP853", "RK4", "BDF")

@@ -10,6 +10,7 @@ import numpy as np
 
 from servoctl.codegen.function import compiled
 from servoctl.errors import SpecificationError, unknown
+from servoctl.figures import style
 from servoctl.model import saddle
 from servoctl.model.model import derive
 from servoctl.study.table import Study, machine
@@ -119,14 +120,12 @@ class FormulationCost(Study):
         -------
         matplotlib.figure.Figure
         """
-        from matplotlib.figure import Figure
-
-        figure = Figure(figsize=(10.0, 4.2), layout="constrained")
+        figure, (panels,) = style.figure(4.2, columns=2, sharex=True)
         largest = {int(n): int(self.where(n=n)["k"].max()) for n in np.unique(self["n"])}
         keep = [i for i, (n, k) in enumerate(zip(self["n"], self["k"], strict=True)) if k == largest[int(n)]]
         own = self.take(keep)
         labels = {"operations": "operations for γ''", "microseconds": "time of one evaluation [µs]"}
-        for ax, name in zip(figure.subplots(1, 2, sharex=True), labels, strict=True):
+        for ax, name in zip(panels, labels, strict=True):
             for i, how in enumerate(dict.fromkeys(own["formulation"].tolist())):
                 part = own.where(formulation=how)
                 ax.loglog(part["n"], part[name], "osDv"[i % 4] + "-", label=how)

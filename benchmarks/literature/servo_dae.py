@@ -11,6 +11,7 @@ import numpy as np
 from servoctl.checks import as_span, positives
 from servoctl.codegen.function import compiled
 from servoctl.errors import SpecificationError, unknown
+from servoctl.figures import style
 from servoctl.reduction.elimination import eliminate
 from servoctl.reduction.ranks import clean, decide_all
 from servoctl.simulation import consistent_state, simulate
@@ -146,11 +147,9 @@ class DaeComparison(Study):
         -------
         matplotlib.figure.Figure
         """
-        from matplotlib.figure import Figure
-
-        figure = Figure(figsize=(10.0, 4.2), layout="constrained")
-        for ax, name in zip(figure.subplots(1, 2, sharex=True), ("motion", "force"), strict=True):
-            for colour, form in zip(("#0072B2", "#D55E00"), FORMS, strict=True):
+        figure, (panels,) = style.figure(4.2, columns=2, sharex=True)
+        for ax, name in zip(panels, ("motion", "force"), strict=True):
+            for colour, form in zip(style.COLOURS, FORMS, strict=False):
                 for mark, method in zip(("o-", "s--"), METHODS, strict=True):
                     own = self.where(form=form, method=method)
                     if len(own):

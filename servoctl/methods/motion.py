@@ -1,13 +1,9 @@
-"""What every integrator shares: pieces of a motion, progress, and where a pivot vanishes."""
+"""What every integrator shares: pieces of a motion, and where a pivot vanishes."""
 
 import contextlib
-import sys
-import time
 from dataclasses import dataclass, field
 
 import numpy as np
-
-PATIENCE = 1.0  # s before a progress bar appears
 
 
 @dataclass
@@ -58,42 +54,6 @@ class Motion:
             else:
                 variants.append((i, i + 1, model))
         return t[keep], z[:, keep], variants
-
-
-class Progress:
-    """A progress bar over time that appears when the work takes long.
-
-    `wanted` None means: on a terminal; a function is called with the time instead.
-    """
-
-    def __init__(self, span, wanted):
-        self.t0, self.total = span[0], abs(span[1] - span[0])
-        self.told = wanted if callable(wanted) else None
-        self.wanted = sys.stderr.isatty() if wanted is None else wanted
-        self.since, self.bar, self.done = time.monotonic(), None, 0.0
-
-    def __call__(self, t):
-        """Show that the work has come to t [s]."""
-        if self.told is not None:
-            self.told(t)
-            return
-        if not self.wanted:
-            return
-        if self.bar is None:
-            if time.monotonic() - self.since < PATIENCE:
-                return
-            from tqdm import tqdm
-
-            self.bar = tqdm(
-                total=self.total, unit="s", desc="simulate", bar_format="{l_bar}{bar}| {n:.3g}/{total:.3g} s"
-            )
-        self.bar.update(abs(t - self.t0) - self.done)
-        self.done = abs(t - self.t0)
-
-    def close(self):
-        """Remove the bar."""
-        if self.bar is not None:
-            self.bar.close()
 
 
 @contextlib.contextmanager

@@ -272,7 +272,7 @@ def _units(given):
 
 def _leave(study, folder, stem, units):
     """Print, save and draw; returns the exit code."""
-    from servoctl.figures import run as plots
+    from servoctl import figures
 
     report = Report()
     report.say(study)
@@ -286,7 +286,7 @@ def _leave(study, folder, stem, units):
     folder.write(lambda path: (path / f"{stem}.json").write_text(text, encoding="utf-8"))
     written = [f"{stem}{suffix}" for suffix in (".npz", ".csv", ".json")]
     try:
-        figure = plots.sweep(study, units=units)
+        figure = figures.sweep(study, units=units)
         figure.suptitle(f"{folder.name}: {study.meta['message']}", fontsize=11)
     except SpecificationError as error:
         complain(f"There is no figure: {error}")

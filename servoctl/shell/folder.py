@@ -147,7 +147,7 @@ def summary(run, start, verification):
         versions, parameters, method, outcome, counters, start, structure, extrema of actuators and outputs with their
         times [s], worst residual of each constraint over all levels and at each, numbers of the verification.
     """
-    from servoctl.figures.run import efforts
+    from servoctl.figures import efforts
 
     model = run.model
     residuals = {name: [_worst(level) for level in run.residual[name].tolist()] for name in run.residual}

@@ -207,8 +207,8 @@ def save_figure(closed, folder, units, title):
     title : str
         Put over the figure.
     """
-    from servoctl.figures.run import closed as draw
+    from servoctl import figures
 
-    figure = draw(closed, units=units)[0].figure
+    figure = figures.closed(closed, units=units)[0].figure
     figure.suptitle(f"{title}: closed loop, {closed.law.name}, {closed.law.rate:g} Hz")
     figure.savefig(folder / "closed_loop.png", dpi=100)

@@ -210,7 +210,7 @@ def _compute(args, name, scene, folder):
     folder.write(lambda path: (path / "summary.json").write_text(text + "\n", encoding="utf-8"))
     folder.write(lambda path: (path / "report.txt").write_text("\n".join(report.texts), encoding="utf-8"))
     if not args.no_figures:
-        from servoctl.figures.run import save_figures
+        from servoctl.figures import save_figures
 
         folder.write(lambda path: save_figures(run, path, units=scene.units, title=name))
         if closed is not None:

@@ -8,7 +8,8 @@ from servoctl.checks import plain, whole
 from servoctl.errors import SpecificationError
 
 DRAWS, CASES = 0, 1  # first spawn key: random numbers of the parameters, and those that a case draws for itself
-RESERVED = ("case", "error", "message", "facts", "rng")
+FAILURE = ("error", "message", "facts")  # columns of what went wrong
+RESERVED = ("case", *FAILURE, "rng")
 
 
 def grid(**values):

@@ -7,12 +7,7 @@ from servoctl.errors import LimitExceeded, SpecificationError, unknown
 from servoctl.methods.drift import project
 from servoctl.study.table import Study, table
 
-COLOURS = (
-    "#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000", "#8C6D31", "#7F7F7F", "#5E3C99",
-    "#882255", "#44AA99", "#B5BD00", "#FF7F9F",
-)  # fmt: skip
-DRIFTS = {"none": ("-", "o"), "project": ("--", "s"), "minimal": (":", "^")}  # others are time constants of poles
-POLES = ("-.", "D")
+DRIFTS = ("none", "project", "minimal")  # others are time constants of poles
 SHOWN = 7
 
 
@@ -142,43 +137,9 @@ class TradeOff(Study):
         -------
         Axes
         """
-        from matplotlib.figure import Figure
-        from matplotlib.lines import Line2D
+        from servoctl.figures.work_precision import draw
 
-        ax = Figure(figsize=(8.0, 5.0), layout="constrained").subplots() if ax is None else ax
-        good, told, across = self._good(), self._told(), self.column(_cost(cost))
-        methods = [str(m) for m in dict.fromkeys(self["method"][good].tolist())]
-        drifts = list(dict.fromkeys(self["drift"][good].tolist()))
-        colours = {method: COLOURS[i % len(COLOURS)] for i, method in enumerate(methods)}
-        for method in methods:
-            for drift in drifts:
-                own = [i for i in good if self["method"][i] == method and self["drift"][i] == drift]
-                line, mark = DRIFTS.get(drift, POLES)
-                ax.plot(across[own], told[own], line, marker=mark, color=colours[method], markersize=4, linewidth=1.1)
-        front = self.pareto(cost)
-        ax.plot(front[cost], front._told(), color="#BBBBBB", linewidth=6, zorder=0, solid_capstyle="round")
-        ax.scatter(front[cost], front._told(), s=60, color="#BBBBBB", zorder=0)
-        low = max(self.uncertainty, 1e-17)
-        ax.axhspan(low / 10, low, color="#EEEEEE", zorder=-1)
-        ax.set(xscale="log", yscale="log", xlabel=f"{cost} [s]" if cost == "seconds" else cost)
-        ax.set(ylabel="error of the motion, relative", title=title)
-        if not len(good):
-            ax.set_xlim(1e-4, 1.0)
-            ax.text(0.5, 0.5, "every run failed", transform=ax.transAxes, ha="center")
-        ax.set_ylim(low / 10, min(3.0, max(10 * told[good].max(initial=low), 100 * low)))
-        ax.grid(True, which="major", color="#DDDDDD", linewidth=0.6)
-        keys = [Line2D([], [], color=colour, label=method) for method, colour in colours.items()]
-        for drift in drifts:
-            line, mark = DRIFTS.get(drift, POLES)
-            label = {"none": "as it drifts", "project": "projected", "minimal": "minimal coordinates"}
-            keys.append(
-                Line2D([], [], color="#555555", linestyle=line, marker=mark, markersize=4,
-                       label=label.get(drift, f"poles at -1/({drift} s)"))
-            )  # fmt: skip
-        keys.append(Line2D([], [], color="#BBBBBB", linewidth=6, label="Pareto front"))
-        keys.append(Line2D([], [], color="#EEEEEE", linewidth=6, label="below the reference's\nown uncertainty"))
-        ax.legend(handles=keys, loc="center left", bbox_to_anchor=(1.01, 0.5), frameon=False, fontsize=8)
-        return ax
+        return draw(self, ax, _cost(cost), title)
 
     def _good(self):
         return np.flatnonzero(np.isfinite(self["error"]) & np.isfinite(self["seconds"]))

@@ -165,7 +165,7 @@ class StabilityMap:
         if poles is not None:
             do = "Give numpy.geomspace(1, 100, 41), in 1/s."
             poles = np.sort(np.ravel(positives("poles", poles, do, fewest=2)))
-        return draw(self, method, poles)
+        return draw(self, method, poles, (*ORDERS, "Taylor"))
 
     def __repr__(self):
         raised = {row: count for row, count in self.model.raised.items() if count}

@@ -7,7 +7,6 @@ import json
 import multiprocessing
 import pickle
 import signal
-import sys
 import threading
 from collections.abc import Mapping
 from concurrent.futures import Executor, ProcessPoolExecutor, as_completed
@@ -18,14 +17,13 @@ from servoctl.checks import plain, whole
 from servoctl.codegen.function import compiling_at_once
 from servoctl.control.result import Closed
 from servoctl.errors import ServoError, SpecificationError
-from servoctl.figures.sweep import TOLD
+from servoctl.progress import progress_bar
 from servoctl.run import Run
-from servoctl.study.cases import CASES, RESERVED, as_cases, generator
+from servoctl.study.cases import CASES, FAILURE, RESERVED, as_cases, generator
 from servoctl.study.checkpoint import Checkpoint, identity
 from servoctl.study.table import Study, machine
 
 INTERRUPTED = 1  # status of a run that Ctrl-C ended
-PATIENCE = 1.0  # s before a progress bar appears
 
 
 def sweep(case, cases, *, executor=None, seed=None, checkpoint=None, shard=None, progress=None):
@@ -81,20 +79,20 @@ def sweep(case, cases, *, executor=None, seed=None, checkpoint=None, shard=None,
     _require_sendable(case, executor)
     name = name_of(case)
     key = identity(f"{_module_of(case)}.{name}", cases, seed)
-    kept = Checkpoint(checkpoint, key) if checkpoint is not None else None
-    rows = {row["case"]: row for row in kept.rows if row["case"] in mine} if kept else {}
-    todo = [i for i in mine if i not in rows]
+    work = _in_turn if executor is None else functools.partial(_on, executor)
     lost, interrupted = {}, False
-    with _bar(progress, len(mine), len(rows)) as bar, contextlib.closing(kept) if kept else contextlib.nullcontext():
-        work = _in_turn if executor is None else functools.partial(_on, executor)
-        try:
-            for i, row, finished in work(case, [(i, cases[i]) for i in todo], seed):
-                (rows if finished else lost)[i] = row
-                if kept and finished:
-                    kept.add(row)
-                bar.update()
-        except KeyboardInterrupt:
-            interrupted = True
+    with Checkpoint(checkpoint, key) as disk:
+        rows = {row["case"]: row for row in disk.rows if row["case"] in mine}
+        todo = [(i, cases[i]) for i in mine if i not in rows]
+        with progress_bar("sweep", progress, len(mine), initial=len(rows), unit="case") as bar:
+            try:
+                for i, row, finished in work(case, todo, seed):
+                    (rows if finished else lost)[i] = row
+                    if finished:
+                        disk.add(row)
+                    bar.update()
+            except KeyboardInterrupt:
+                interrupted = True
     if lost and not rows:
         raise _died(next(iter(lost.values())), len(mine))
     meta = {"case": name, "identity": key, "seed": seed, "count": len(cases), "shard": list(shard) if shard else None}
@@ -137,8 +135,8 @@ def merge(studies):
             else:
                 rows[row["case"]] = row
     lost -= {i for study in studies for i in study["case"].tolist() if i not in study.meta["lost"]}
-    names = dict.fromkeys(name for study in studies for name in study.columns if name not in TOLD)
-    columns = {name: [rows[i].get(name) for i in sorted(rows)] for name in (*names, *TOLD)}
+    names = dict.fromkeys(name for study in studies for name in study.columns if name not in FAILURE)
+    columns = {name: [rows[i].get(name) for i in sorted(rows)] for name in (*names, *FAILURE)}
     meta = studies[0].meta | {"shard": None, "lost": sorted(lost)}
     meta["interrupted"] = any(study.meta["interrupted"] for study in studies) and len(rows) < meta["count"]
     return Study("sweep", columns, meta | {"message": _message(columns, meta, meta["count"])})
@@ -290,13 +288,6 @@ def _noticing():
         signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
-def _bar(wanted, total, done):
-    from tqdm import tqdm
-
-    wanted = sys.stderr.isatty() if wanted is None else wanted
-    return tqdm(total=total, initial=done, desc="sweep", unit="case", delay=PATIENCE, disable=not wanted)
-
-
 # --- what is asked
 
 
@@ -410,4 +401,4 @@ def _columns(cases, rows):
     columns = {"case": [row["case"] for row in rows]}
     columns |= {name: [cases[row["case"]][name] for row in rows] for name in cases[0]}
     columns |= {name: [row.get("numbers", {}).get(name) for row in rows] for name in results}
-    return columns | {name: np.array([row.get(name, "") for row in rows], dtype=str) for name in TOLD}
+    return columns | {name: np.array([row.get(name, "") for row in rows], dtype=str) for name in FAILURE}

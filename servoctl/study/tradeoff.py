@@ -1,7 +1,6 @@
 """The measured trade: what each method, setting and treatment of drift costs and reaches on one's own motion."""
 
 import itertools
-import sys
 import time
 import warnings
 
@@ -13,6 +12,7 @@ from servoctl.errors import LimitExceeded, ServoError, SpecificationError, unkno
 from servoctl.methods.accuracy import motion_error, relative_error
 from servoctl.methods.drift import Minimal, Poles, Project, as_drift
 from servoctl.methods.tableaus import ORDERS
+from servoctl.progress import progress_bar
 from servoctl.simulation import ALL_METHODS, consistent_state, simulate
 from servoctl.study.front import TradeOff
 from servoctl.study.table import machine
@@ -24,7 +24,6 @@ SAMPLES, COMPARED = 51, 201  # instants that adaptive methods give, and at most 
 DENSE = 1001  # instants of the reference over which its power is integrated
 TIMED, ENOUGH = 3, 0.3  # calls timed after a warm-up, unless they take this part of `seconds` together
 FEW = 20  # steps: a run that takes too long for fewer has lost its way, and tells nothing of finer settings
-PATIENCE = 1.0  # s before a progress bar appears
 TIME_CONSTANT = 50  # of the default poles, in the span
 
 
@@ -87,7 +86,7 @@ def tradeoff(model, x0, t_span, methods=None, drift=None, *, rtol=TOLERANCES, st
     drifts = (None, "project", "minimal", abs(t1 - t0) / TIME_CONSTANT) if drift is None else drift
     combinations = _combinations(model, methods, drifts if isinstance(drifts, (list, tuple)) else [drifts])
     total = sum(len(settings[_kind(method)]) for method, _ in combinations)
-    with compiling_at_once(), _bar(total, progress) as bar, warnings.catch_warnings():
+    with compiling_at_once(), progress_bar("tradeoff", progress, total, unit="run") as bar, warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)  # of steps outside the stable range: the rows have what they do
         reference, rows, interrupted = Reference(model, x0, (t0, t1), limit), [], False
         try:
@@ -323,10 +322,3 @@ def _label(treatment):
 def _said(options):
     order = f" of order {options['order']}" if "order" in options else ""
     return f"{options['method']}{order}" + (f" at {options['rtol']:g}" if "rtol" in options else "")
-
-
-def _bar(total, wanted):
-    from tqdm import tqdm
-
-    wanted = sys.stderr.isatty() if wanted is None else wanted
-    return tqdm(total=total, desc="tradeoff", unit="run", delay=PATIENCE, disable=not wanted)
