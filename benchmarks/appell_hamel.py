@@ -91,10 +91,8 @@ def simulated(order, rtol):
     model, start = constrained()
 
     def call():
-        run = sv.simulate(
-            model, start, (0.0, DURATION), "Taylor", t_eval=[DURATION], rtol=rtol, atol=rtol, order=order,
-            progress=False,
-        )  # fmt: skip
+        method = sv.Taylor(order, rtol=rtol, atol=rtol)
+        run = sv.simulate(model, start, (0.0, DURATION), method, t_eval=[DURATION], progress=False)
         return run.jets[:10, -1]
 
     return call

@@ -30,7 +30,8 @@ from servoctl.errors import (
 from servoctl.export.c import export_c
 from servoctl.internal_dynamics import InternalDynamics, internal_dynamics
 from servoctl.methods.bounds import sampled_bound
-from servoctl.methods.drift import poles, project
+from servoctl.methods.choice import Adaptive, Algebraic, RadauIIA, RungeKutta, Sundials, Taylor
+from servoctl.methods.drift import MinimalCoordinates, Poles, Project
 from servoctl.model.model import Model, derive
 from servoctl.plants.plant import Plant, plant
 from servoctl.run import Run, load
@@ -60,6 +61,8 @@ from servoctl.verification import Verification, verify
 __version__ = "0.1.0"
 
 __all__ = [
+    "Adaptive",
+    "Algebraic",
     "Batch",
     "Closed",
     "Controller",
@@ -71,18 +74,25 @@ __all__ = [
     "LimitExceeded",
     "LimitReport",
     "Mechanism",
+    "MinimalCoordinates",
     "Model",
     "NameUnknown",
     "NotRealisable",
     "Parameters",
     "Plant",
+    "Poles",
     "Program",
+    "Project",
+    "RadauIIA",
     "Run",
+    "RungeKutta",
     "ServoError",
     "SingularProgram",
     "SpecificationError",
     "StabilityMap",
     "Study",
+    "Sundials",
+    "Taylor",
     "TimeLaw",
     "TradeOff",
     "UnstableInternalDynamics",
@@ -115,8 +125,6 @@ __all__ = [
     "pd",
     "plant",
     "plots",
-    "poles",
-    "project",
     "rigid_body",
     "sampled_bound",
     "simulate",

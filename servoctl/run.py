@@ -20,7 +20,7 @@ class Run:
 
     `run["theta"]`, `run["dtheta"]`, `run["trolley"]` are (N,) arrays, SI, and so are the derivatives in time of an
     actuation, output or energy, `run["dtrolley"]`, `run["d2trolley"]`, where the jets reach: `simulate(...,
-    method="Taylor", jets=3)`. `run.residual["X"]` is (levels, N): the residual and its derivatives.
+    method=sv.Taylor(jets=3))`. `run.residual["X"]` is (levels, N): the residual and its derivatives.
 
     Attributes
     ----------
@@ -96,7 +96,7 @@ class Run:
                     f"{', '.join(names)} {'was' if len(names) == 1 else 'were'} asked for of a run with jets up to "
                     f"order {(len(self.jets) - model.nq) // model.n}.",
                     f"These derivatives in time follow from jets up to order {highest}.",
-                    nearest=f"simulate(..., method='Taylor', jets={highest}).",
+                    nearest=f"simulate(..., method=sv.Taylor(jets={highest})).",
                     do="Simulate so.",
                     jets=highest,
                 )

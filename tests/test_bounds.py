@@ -12,6 +12,7 @@ import servoctl as sv
 from servoctl.gallery import mass_on_car
 from servoctl.methods import bounds
 from servoctl.methods.accuracy import motion_error
+from servoctl.methods.choice import as_method
 from servoctl.methods.tableaus import ORDERS
 
 
@@ -107,7 +108,7 @@ def sine():
 
 
 def sine_error(model, pole, method="RK4"):
-    run = sv.simulate(model, model.start(), (0.0, 100.0), method, step=0.05, drift=1 / pole)
+    run = sv.simulate(model, model.start(), (0.0, 100.0), as_method(method, step=0.05), drift=1 / pole)
     return np.abs(run["x"] - np.sin(run.t)).max()
 
 
@@ -127,13 +128,13 @@ def test_a_choice_beyond_the_bound_is_warned_about_with_its_number(sine):
 
 def test_a_choice_beyond_the_bound_is_warned_about_backwards_in_time(sine):
     with pytest.warns(RuntimeWarning, match=r"pole 60 1/s was to damp: \|λ\|h = 3 exceeds 2.785"):
-        sv.simulate(sine, sine.start(), (0.0, -1.0), "RK4", step=0.05, drift=sv.poles({"X": [60.0, 60.0]}))
+        sv.simulate(sine, sine.start(), (0.0, -1.0), sv.RungeKutta(4, step=0.05), drift=sv.Poles({"X": [60.0, 60.0]}))
 
 
 @pytest.mark.parametrize("direction", [1.0, -1.0])
 def test_poles_that_ask_for_a_hundred_thousand_adaptive_steps_are_warned_about(sine, direction):
     """DOP853 is stable for steps of 6.4 over the pole: 1.6e6 of them in a second at 1e7 1/s."""
-    fast, slow = (sv.poles({"X": [-direction * rate] * 2}) for rate in (1e7, 10.0))
+    fast, slow = (sv.Poles({"X": [-direction * rate] * 2}) for rate in (1e7, 10.0))
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         sv.simulate(sine, sine.start(), (0.0, direction), "DOP853", drift=slow)
@@ -145,9 +146,9 @@ def test_complex_poles_are_judged_in_their_own_direction(sine):
     pair = {"X": [-20 + 45j, -20 - 45j]}  # |λ|h = 2.46, where the limit along this ray is 2.79
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        sv.simulate(sine, sine.start(), (0.0, 1.0), "RK4", step=0.05, drift=sv.poles(pair))
+        sv.simulate(sine, sine.start(), (0.0, 1.0), sv.RungeKutta(4, step=0.05), drift=sv.Poles(pair))
     with pytest.warns(RuntimeWarning, match="RK2"):
-        sv.simulate(sine, sine.start(), (0.0, 1.0), "RK2", step=0.05, drift=sv.poles(pair))
+        sv.simulate(sine, sine.start(), (0.0, 1.0), sv.RungeKutta(2, step=0.05), drift=sv.Poles(pair))
 
 
 def test_no_choice_within_the_bound_is_warned_about(sine):
@@ -164,13 +165,13 @@ def test_steps_too_long_for_the_internal_dynamics_are_warned_about(method, step)
     start = model.start(s=0.0, ds=0.0)
     largest = sv.stability(model, sv.simulate(model, start, (0.0, 1.0), method="RadauIIA")).largest_step(method)
     with pytest.warns(RuntimeWarning, match=f"Steps of {step:g} s by {method} do not resolve the motion") as caught:
-        sv.simulate(model, start, (0.0, 1.0), method=method, step=step)
+        sv.simulate(model, start, (0.0, 1.0), method=as_method(method, step=step))
     told = float(re.search(r"largest stable step there is about (\S+) s", str(caught[0].message))[1])
     assert told == pytest.approx(largest, rel=0.05)
     assert caught[0].filename == __file__
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        sv.simulate(model, start, (0.0, 1.0), method=method, step=0.9 * largest)
+        sv.simulate(model, start, (0.0, 1.0), method=as_method(method, step=0.9 * largest))
 
 
 def test_stable_steps_that_do_not_resolve_the_motion_are_warned_about():
@@ -179,7 +180,7 @@ def test_stable_steps_that_do_not_resolve_the_motion_are_warned_about():
     exact = sv.simulate(model, model.start(), span, accuracy=1e-9)
 
     def error(step):
-        run = sv.simulate(model, model.start(), span, method="RadauIIA", order=5, step=step)
+        run = sv.simulate(model, model.start(), span, method=sv.RadauIIA(order=5, step=step))
         assert run.counters["steps"] == 6.0 / step
         return motion_error(model, run.jets, exact.jets)
 
@@ -196,10 +197,10 @@ def test_steps_that_do_not_resolve_the_motion_before_a_knot_are_warned_about():
     model, span = sv.derive(*mass_on_car(damping=10.0)), (0.0, 6.0)
     start = model.start(s=0.0, ds=0.0)
     with pytest.warns(RuntimeWarning, match="do not resolve the motion: at t = [0-2]"):
-        sv.simulate(model, start, span, method="RK4", step=0.3)
+        sv.simulate(model, start, span, method=sv.RungeKutta(4, step=0.3))
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        sv.simulate(model, start, span, method="RK4", step=0.15)
+        sv.simulate(model, start, span, method=sv.RungeKutta(4, step=0.15))
 
 
 def test_steps_over_a_singularity_are_warned_about():
@@ -216,4 +217,4 @@ def test_steps_over_a_singularity_are_warned_about():
     start = model.start(s=0.0, ds=1.0, guess={"y": -1.0})
     for drift in (None, 0.5, "project"):
         with pytest.warns(RuntimeWarning, match="do not resolve the motion"):
-            sv.simulate(model, start, (0.0, 1.5), method="RK4", step=0.3, drift=drift)
+            sv.simulate(model, start, (0.0, 1.5), method=sv.RungeKutta(4, step=0.3), drift=drift)

@@ -7,6 +7,7 @@ import pytest
 
 import servoctl as sv
 from servoctl.gallery import gallery
+from servoctl.methods.choice import as_method
 
 STOPS = {"appell-hamel-squared": 0.6983110523, "constant-speed-horizontal": 5.0 / 9.81}  # s: the others reach their end
 FLAT = (
@@ -39,14 +40,13 @@ def scene_run(gallery_model):
 def _simulated(model, scene, method, drift):
     t0, t1 = scene.t_span
     start = model.start(**scene.start, guess=scene.guess)
+    t_eval = np.linspace(t0, t1, 101) if method not in (None, "RK4") else None
     if method == "RK4":
-        options = {"step": (t1 - t0) / 4000}
+        method = sv.RungeKutta(4, step=(t1 - t0) / 4000)
     elif method in ("DOP853", "Taylor"):
-        options = {"rtol": 1e-12, "atol": 1e-13, "t_eval": np.linspace(t0, t1, 101)}
-    else:
-        options = {"t_eval": np.linspace(t0, t1, 101)} if method else {}
+        method = as_method(method, rtol=1e-12, atol=1e-13)
     try:
-        return model, sv.simulate(model, start, scene.t_span, method=method, drift=drift, **options)
+        return model, sv.simulate(model, start, scene.t_span, method, drift=drift, t_eval=t_eval)
     except sv.SingularProgram as error:
         return model, error.run
 
@@ -135,7 +135,7 @@ def test_a_drifted_state_fails(scene_run):
 def test_higher_jets_excuse_no_residual(gallery_model):
     model, scene = gallery_model("appell-hamel"), gallery["appell-hamel"]
     start = model.start(**scene.start, guess=scene.guess)
-    run = sv.simulate(model, start, (0.0, 0.1), method="Taylor", jets=12)
+    run = sv.simulate(model, start, (0.0, 0.1), method=sv.Taylor(jets=12))
     moved = run.jets.copy()
     moved[2] += 1e-5  # z off the string
     short = moved[: len(model.jet_names)]

@@ -14,9 +14,9 @@ import pytest
 import servoctl
 from servoctl.errors import IntegrationStopped
 from servoctl.gallery import gallery
+from servoctl.methods.choice import METHODS as ALL_METHODS
 from servoctl.shell.folder import FILES, LOOP_FILES
 from servoctl.shell.main import main
-from servoctl.simulation import ALL_METHODS
 
 FALL = '''"""A mass in a plane follows a path in x, and falls."""
 import servoctl as sv
@@ -318,12 +318,15 @@ def test_options_reach_the_simulation(fall, monkeypatch):
         raise IntegrationStopped("enough")
 
     monkeypatch.setattr(servoctl, "simulate", simulate)
-    line = "--t-span 0.5 1.0 --method RK4 --step 1e-3 --drift project --rtol 1e-6 --atol 1e-7 --samples 6"
+    line = "--t-span 0.5 1.0 --method RK4 --step 1e-3 --drift project --samples 6"
     assert main(["run", fall, *line.split()]) == 2
     assert given["t_eval"] == pytest.approx([0.5, 0.6, 0.7, 0.8, 0.9, 1.0]) and given["t_eval"][-1] == 1.0
     del given["t_eval"]
-    expected = {"method": "RK4", "step": 1e-3, "drift": "project", "rtol": 1e-6, "atol": 1e-7}
+    expected = {"method": servoctl.RungeKutta(4, step=1e-3), "drift": "project"}
     assert given == {**expected, "span": (0.5, 1.0), "t": 0.5}
+    given.clear()
+    assert main(["run", fall, "--method", "Radau", "--rtol", "1e-6", "--atol", "1e-7"]) == 2
+    assert given == {"method": servoctl.Adaptive("Radau", 1e-6, 1e-7), "span": (0.0, 1.0), "t": 0.0}
     given.clear()
     assert main(["run", fall, "--drift", "0.1"]) == 2
     assert given == {"drift": 0.1, "span": (0.0, 1.0), "t": 0.0}

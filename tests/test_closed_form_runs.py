@@ -10,6 +10,7 @@ from scipy.optimize import brentq, minimize_scalar
 
 import servoctl as sv
 from servoctl.gallery import cars, gallery, mass_on_car, passive_arm, spiral, vtol
+from servoctl.methods.choice import as_method
 
 TIGHT = {"rtol": 1e-12, "atol": 1e-13}
 
@@ -60,13 +61,13 @@ def spiral_start(order):
 
 
 @pytest.mark.parametrize(
-    ("order", "options"),
-    [*((order, {"rtol": 1e-10, "atol": 1e-12}) for order in ORDERS), (3, {"method": "RK4"}), (8, {"method": "RK4"})],
+    ("order", "method"),
+    [*((order, sv.Adaptive(rtol=1e-10, atol=1e-12)) for order in ORDERS), (3, "RK4"), (8, "RK4")],
 )
-def test_spirals_end_at_one_radian(order, options):
+def test_spirals_end_at_one_radian(order, method):
     model, start = spiral_start(order)
     assert model.free == order + 2  # the program's order, and 2 of (3.18)
-    run = sv.simulate(model, start, (0.0, 2.0), t_eval=np.linspace(0, 2, 9), **options)
+    run = sv.simulate(model, start, (0.0, 2.0), method, t_eval=np.linspace(0, 2, 9))
     reference = cf.spiral(run.t, order)
     for name in ("x", "y", "dx", "dy"):
         assert np.max(np.abs(run[name] - reference[name])) < 1e-9
@@ -78,7 +79,7 @@ def test_spirals_end_at_one_radian(order, options):
 def test_spirals_by_series_of_which_every_third_coefficient_is_zero(terms):
     order = 4
     model, start = spiral_start(order)
-    run = sv.simulate(model, start, (0.0, 2.0), method="Taylor", order=terms, t_eval=np.linspace(0, 2, 9), **TIGHT)
+    run = sv.simulate(model, start, (0.0, 2.0), method=sv.Taylor(order=terms, **TIGHT), t_eval=np.linspace(0, 2, 9))
     reference = cf.spiral(run.t, order)
     assert max(np.max(np.abs(run[name] - reference[name])) for name in ("x", "y", "dx", "dy")) < 1e-9
 
@@ -133,7 +134,7 @@ def test_cars_force(N, gallery_model):
 
 def test_two_cars_by_an_ideal_reaction_are_another_motion(gallery_model):
     model = gallery_model("two-cars-ideal")
-    run = sv.simulate(model, model.start(x2=0.0, dx2=0.0), (0.0, 12.0), **TIGHT)
+    run = sv.simulate(model, model.start(x2=0.0, dx2=0.0), (0.0, 12.0), sv.Adaptive(**TIGHT))
     t, value = run.extrema("reaction_x1")[1]
     assert value == pytest.approx(6.852059, abs=5e-7) and t == pytest.approx(0.7091, abs=5e-5)
     assert run.extrema("x2")[1][1] - 2.0 == pytest.approx(1.966911, abs=5e-7)
@@ -254,7 +255,7 @@ def test_mass_on_car(alpha, damping, free, index, coordinates):
     model = sliding_mass(alpha, damping, coordinates)
     assert model.free == free and model.structure().index == index
     start = at_rest(model, alpha, coordinates)
-    run = sv.simulate(model, start, (0.0, 6.0), **({} if model.flat else TIGHT))
+    run = sv.simulate(model, start, (0.0, 6.0), None if model.flat else sv.Adaptive(**TIGHT))
     reference = cf.mass_on_car(run.t, alpha, damping)
     if coordinates == "absolute":
         along = (run["x_m"] - run["x"]) * np.cos(alpha) + run["y_m"] * np.sin(alpha)
@@ -334,7 +335,7 @@ def test_the_unstable_arm_stops_where_the_relative_degree_is_lost(method):
     model = arm("unit")
     options = {"step": 1e-3} if method == "RK4" else {}
     with pytest.raises(sv.SingularProgram) as caught:
-        sv.simulate(model, model.start(q2=0.0, dq2=0.0), (0.0, 2.0), method=method, **options)
+        sv.simulate(model, model.start(q2=0.0, dq2=0.0), (0.0, 2.0), method=as_method(method, **options))
     run = caught.value.run
     q2 = np.interp(caught.value.details["t"], run.t[-2:], run["q2"][-2:])
     assert abs(np.rad2deg(run["q2"]).max()) < 48.19 and run.t[-1] > 0.3

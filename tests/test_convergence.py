@@ -11,6 +11,7 @@ from scipy.integrate import solve_ivp
 
 import servoctl as sv
 from servoctl.gallery import gallery
+from servoctl.methods.choice import as_method
 from servoctl.progress import Progress
 
 AMPLITUDE = 1.0  # rad
@@ -50,8 +51,8 @@ class Case:
     def __init__(self, model, start, error):
         self.model, self.start, self.error = model, start, error
 
-    def run(self, method, t_span=(0.0, 2.0), **options):
-        return sv.simulate(self.model, self.start, t_span, method=method, **options)
+    def run(self, method, t_span=(0.0, 2.0), drift=None, t_eval=None, **settings):
+        return sv.simulate(self.model, self.start, t_span, as_method(method, **settings), drift=drift, t_eval=t_eval)
 
 
 @pytest.fixture(scope="module")
@@ -160,7 +161,7 @@ def by_quarters(run, name="rod"):
 @pytest.mark.parametrize("method", ["DOP853", "Radau", "RK4"])
 def test_projection_leaves_no_residual(method, rod):
     options = {"step": 2e-3} if method == "RK4" else {"rtol": 1e-8}
-    run = sv.simulate(*rod, (0.0, 20.0), method=method, drift="project", **options)
+    run = sv.simulate(*rod, (0.0, 20.0), method=as_method(method, **options), drift="project")
     assert max(by_quarters(run)) <= 1e-11 and run.counters["projections"] > 0
     assert np.abs(run.residual["rod"]).max() <= 1e-11  # at the level of accelerations too
     assert np.abs(run["energy"] - run["energy"][0]).max() < 1e-4
@@ -168,7 +169,7 @@ def test_projection_leaves_no_residual(method, rod):
 
 def test_projection_of_every_tenth_step_is_enough(rod):
     often, seldom = (
-        sv.simulate(*rod, (0.0, 20.0), method="RK4", step=2e-3, drift=sv.project(every)) for every in (1, 10)
+        sv.simulate(*rod, (0.0, 20.0), method=sv.RungeKutta(4, step=2e-3), drift=sv.Project(every)) for every in (1, 10)
     )
     assert seldom.counters["projections"] == pytest.approx(often.counters["projections"] / 10, abs=2)
     assert max(by_quarters(seldom)) < 1e-9
@@ -177,8 +178,8 @@ def test_projection_of_every_tenth_step_is_enough(rod):
 @pytest.mark.parametrize("method", ["DOP853", "RK4", "LSODA"])
 def test_error_dynamics_bound_the_residual(method, rod):
     options = {"step": 2e-3} if method == "RK4" else {"rtol": 1e-9}
-    free = by_quarters(sv.simulate(*rod, (0.0, 20.0), method=method, **options))
-    held = by_quarters(sv.simulate(*rod, (0.0, 20.0), method=method, drift=0.5, **options))
+    free = by_quarters(sv.simulate(*rod, (0.0, 20.0), method=as_method(method, **options)))
+    held = by_quarters(sv.simulate(*rod, (0.0, 20.0), method=as_method(method, **options), drift=0.5))
     assert free[-1] > 3 * free[0]  # without treatment it grows
     assert max(held[1:]) < 3 * held[0] and held[-1] < 0.5 * free[-1]
 
@@ -202,22 +203,22 @@ def tracking(rho):
 def tracking_error(rho, drift):
     model = tracking(rho)
     start = model.start(**{name: 0.0 for name in model.state_names if name.endswith("y")})
-    run = sv.simulate(model, start, (0.0, 100.0), method="RK4", step=0.05, drift=drift)
+    run = sv.simulate(model, start, (0.0, 100.0), method=sv.RungeKutta(4, step=0.05), drift=drift)
     return np.abs(run["x"] - np.sin(run.t)).max()
 
 
 @pytest.mark.parametrize(("rho", "without", "by_poles"), [(2, 2.2e-7, 2.3e-6), (4, 3.6e-4, 2.1e-7)])
 def test_poles_cost_accuracy_at_low_order_and_save_it_at_high_order(rho, without, by_poles):
     assert tracking_error(rho, None) == pytest.approx(without, rel=0.05)
-    assert tracking_error(rho, sv.poles({"x": [-5.0] * rho})) == pytest.approx(by_poles, rel=0.05)
+    assert tracking_error(rho, sv.Poles({"x": [-5.0] * rho})) == pytest.approx(by_poles, rel=0.05)
     assert tracking_error(rho, "project") < 1e-12
 
 
 def test_poles_beyond_the_stability_of_rk4_diverge():
-    assert tracking_error(2, sv.poles({"x": [-40.0] * 2})) < 1e-3  # |λ h| = 2 < 2.785
+    assert tracking_error(2, sv.Poles({"x": [-40.0] * 2})) < 1e-3  # |λ h| = 2 < 2.785
     with np.errstate(all="ignore"), pytest.warns(RuntimeWarning, match="largest stable step is 0.04642 s"):
         try:
-            error = tracking_error(2, sv.poles({"x": [-60.0] * 2}))
+            error = tracking_error(2, sv.Poles({"x": [-60.0] * 2}))
         except sv.IntegrationStopped:
             error = np.inf
     assert error > 1.0
@@ -234,13 +235,13 @@ def test_poles_beyond_the_stability_of_rk4_diverge():
 )
 def test_wrong_poles_are_refused(values, error, fact, rod):
     with pytest.raises(error, match=fact):
-        sv.simulate(*rod, (0.0, 1.0), drift=sv.poles(values))
+        sv.simulate(*rod, (0.0, 1.0), drift=sv.Poles(values))
 
 
 def test_poles_per_row(rod):
     model, start = rod
     assert model.raised["rod"] == 2 and model.raised["cart"] == 2
-    run = sv.simulate(model, start, (0.0, 5.0), drift=sv.poles({"rod": [-3.0 + 1.0j, -3.0 - 1.0j]}))
+    run = sv.simulate(model, start, (0.0, 5.0), drift=sv.Poles({"rod": [-3.0 + 1.0j, -3.0 - 1.0j]}))
     assert run.success and "rod" in run.drift
     assert max(by_quarters(run)) < 1e-6
 
@@ -254,7 +255,7 @@ def test_time_runs_backwards(name, method, case):
     options = {} if method == "RK4" else {"rtol": 1e-11, "atol": 1e-13}
     there = case[name].run(method, **options)
     start = case[name].start.values
-    back = sv.simulate(case[name].model, there.jets[: len(start), -1], (2.0, 0.0), method=method, **options)
+    back = sv.simulate(case[name].model, there.jets[: len(start), -1], (2.0, 0.0), method=as_method(method, **options))
     assert back.success and back.t[0] == 2.0 and back.t[-1] == 0.0
     assert back.jets[: len(start), -1] == pytest.approx(start, abs=1e-7)
 

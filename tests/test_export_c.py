@@ -78,7 +78,7 @@ def test_feedforward_of_internal_dynamics_is_the_runge_kutta_run(name, gallery_m
     scene, model = gallery[name], gallery_model(name)
     start = model.start(**scene.start, guess=scene.guess)
     steps, end = 50, 0.5
-    run = sv.simulate(model, start, (0.0, end), method="RK4", step=end / steps)
+    run = sv.simulate(model, start, (0.0, end), method=sv.RungeKutta(4, step=end / steps))
     plan = exported(model, tmp_path, start=start)
     names, _ = model.signals("reaction" if model.ideal else "actuation")
     x, p = start.values.copy(), model.parameters

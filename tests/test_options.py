@@ -7,6 +7,7 @@ import servoctl as sv
 from benchmarks.literature import dae_comparison, formulation_cost
 from servoctl.gallery import gallery
 from servoctl.gallery.guided_arm import guided_arm
+from servoctl.methods.choice import as_method
 from servoctl.study import tradeoff as module
 
 ADAPTIVE = ("Taylor", "RadauIIA", "DOP853", "Radau", "LSODA", "CVODES", "IDAS")
@@ -30,14 +31,14 @@ def refused(what, make):
 @pytest.mark.parametrize("name", ["rtol", "atol"])
 def test_tolerances(method, name, scene):
     for value in (0.0, -1e-6, np.nan, np.inf, 2.0, "1e-6", [1e-6], True):
-        refused(f"{name}=", lambda value=value: sv.simulate(*scene, SPAN, method=method, **{name: value}))
+        refused(f"{name}=", lambda value=value: sv.simulate(*scene, SPAN, method=as_method(method, **{name: value})))
 
 
 @pytest.mark.parametrize("method", ["RK4", "RadauIIA"])
 def test_steps(method, scene):
     for value in (0, -1, np.nan, np.inf, "a", True, 1e-320, 1e-10):
-        refused("step=", lambda value=value: sv.simulate(*scene, SPAN, method=method, step=value))
-    run = sv.simulate(*scene, SPAN, method=method, step=np.float32(0.05))
+        refused("step=", lambda value=value: sv.simulate(*scene, SPAN, method=as_method(method, step=value)))
+    run = sv.simulate(*scene, SPAN, method=as_method(method, step=np.float32(0.05)))
     assert run.success and run.counters["steps"] == 4
 
 
@@ -48,12 +49,12 @@ def test_times_of_samples(times, scene):
 
 def test_whole_numbers(scene):
     for options in ({"order": True}, {"order": 5.0}, {"order": "a"}, {"jets": True}, {"jets": 2.5}):
-        refused(next(iter(options)), lambda options=options: sv.simulate(*scene, SPAN, method="Taylor", **options))
-    run = sv.simulate(*scene, SPAN, method="Taylor", order=np.int64(8), jets=np.int64(3), t_eval=[0.0, 0.2])
+        refused(next(iter(options)), lambda options=options: sv.simulate(*scene, SPAN, method=sv.Taylor(**options)))
+    run = sv.simulate(*scene, SPAN, method=sv.Taylor(order=np.int64(8), jets=np.int64(3)), t_eval=[0.0, 0.2])
     assert "d3theta" in run.names
     for every in (True, 0, 1.0):
-        refused("every", lambda every=every: sv.project(every))
-    refused("True", lambda: sv.poles(True))
+        refused("every", lambda every=every: sv.Project(every))
+    refused("True", lambda: sv.Poles(True))
 
 
 def test_what_a_study_is_asked_for(scene):
@@ -61,7 +62,7 @@ def test_what_a_study_is_asked_for(scene):
         refused_study = {"methods": ["RK4"], "drift": [None]} | options
         with pytest.raises(sv.SpecificationError, match="at least one method"):
             sv.tradeoff(*scene, SPAN, **refused_study)
-    study = sv.tradeoff(*scene, SPAN, "RK4", sv.project(2), step=0.1, seconds=20.0)
+    study = sv.tradeoff(*scene, SPAN, "RK4", sv.Project(2), settings={"step": 0.1}, seconds=20.0)
     assert study["drift"].tolist() == ["project 2"]
     for options in ({"error": 0}, {"error": "a"}, {"seconds": -1.0}, {"error": np.nan}):
         refused(next(iter(options)), lambda options=options: study.recommend(**options))
@@ -71,7 +72,7 @@ def test_ctrl_c_ends_a_study_and_keeps_its_rows(scene, monkeypatch):
     real = module.simulate
 
     def interrupted(*given, **options):
-        if options.get("step") == 0.02:
+        if given[3] == sv.RungeKutta(4, step=0.02):
 
             def stop(t):
                 raise KeyboardInterrupt
@@ -80,7 +81,7 @@ def test_ctrl_c_ends_a_study_and_keeps_its_rows(scene, monkeypatch):
         return real(*given, **options)
 
     monkeypatch.setattr(module, "simulate", interrupted)
-    study = sv.tradeoff(*scene, SPAN, ["RK4", "RK8"], [None], step=[0.1, 0.05, 0.02], seconds=20.0)
+    study = sv.tradeoff(*scene, SPAN, ["RK4", "RK8"], [None], settings={"step": [0.1, 0.05, 0.02]}, seconds=20.0)
     assert study.rows()[0]["method"] == "RK4" and study["value"].tolist() == [0.1, 0.05]
     assert np.all(np.isfinite(study["error"])) and study.meta["message"] == "interrupted"
     assert "interrupted" in repr(study).splitlines()[0]
@@ -104,7 +105,7 @@ def test_what_a_stability_map_is_asked_for(scene):
     model, start = scene
     with pytest.raises(sv.SpecificationError, match="run=None"):
         sv.stability(model, None)
-    found = sv.stability(model, sv.simulate(model, start, SPAN, method="RK4", step=0.01))
+    found = sv.stability(model, sv.simulate(model, start, SPAN, method=sv.RungeKutta(4, step=0.01)))
     for step in (0.0, -1.0, np.nan, [0.1, 0.0]):
         refused("step=", lambda step=step: found.radius("RK4", step))
 
@@ -112,11 +113,11 @@ def test_what_a_stability_map_is_asked_for(scene):
 @pytest.mark.parametrize("method", ["RK4", "DOP853", "RadauIIA", "CVODES"])
 def test_error_dynamics_backwards_in_time(method, scene):
     model, start = scene
-    end = sv.simulate(model, start, SPAN, method="Taylor", drift="project", rtol=1e-13, atol=1e-15)
+    end = sv.simulate(model, start, SPAN, method=sv.Taylor(rtol=1e-13, atol=1e-15), drift="project")
     there = end.jets[: len(start.values), -1]
     with pytest.raises(sv.SpecificationError, match="grow backward.*'project'"):
         sv.simulate(model, there, SPAN[::-1], method=method, drift=0.05)
-    growing = sv.poles({row: [20.0] * count for row, count in model.raised.items() if count})
+    growing = sv.Poles({row: [20.0] * count for row, count in model.raised.items() if count})
     back = sv.simulate(model, there, SPAN[::-1], method=method, drift=growing)
     assert back.jets[: len(there), -1] == pytest.approx(start.values, abs=1e-7)
 
@@ -126,10 +127,10 @@ def test_error_dynamics_backwards_in_time(method, scene):
 
 def test_poles_by_row_are_finite_numbers_that_damp(scene):
     for poles in ([np.nan, -1.0], ["a", "b"], "ab", None, [[-1.0, -1.0]]):
-        refused("'string'", lambda poles=poles: sv.simulate(*scene, SPAN, drift=sv.poles({"string": poles})))
-    refused("no row", lambda: sv.poles({}))
+        refused("'string'", lambda poles=poles: sv.simulate(*scene, SPAN, drift=sv.Poles({"string": poles})))
+    refused("no row", lambda: sv.Poles({}))
     with pytest.raises(sv.SpecificationError, match="runs forward.*'string'.*negative real parts"):
-        sv.simulate(*scene, SPAN, drift=sv.poles({"string": [1.0, -2.0]}))
+        sv.simulate(*scene, SPAN, drift=sv.Poles({"string": [1.0, -2.0]}))
 
 
 @pytest.mark.parametrize("method", ["RK23", "DOP853"])
@@ -145,9 +146,9 @@ def test_poles_that_take_an_explicit_method_a_million_steps_are_told(method, sce
 def test_tolerances_that_scipy_would_replace_are_refused(scene):
     for method in ("RK23", "DOP853", "Radau", "BDF"):
         with pytest.raises(sv.SpecificationError, match="take 2.22e-14 instead of less.*'Taylor'"):
-            sv.simulate(*scene, SPAN, method=method, rtol=1e-15)
-    assert sv.simulate(*scene, SPAN, method="Taylor", rtol=1e-15).success
-    refused("at most 1", lambda: sv.tradeoff(*scene, SPAN, ["DOP853"], [None], rtol=[10.0, 1e-6]))
+            sv.simulate(*scene, SPAN, method=as_method(method, rtol=1e-15))
+    assert sv.simulate(*scene, SPAN, method=sv.Taylor(rtol=1e-15)).success
+    refused("at most 1", lambda: sv.tradeoff(*scene, SPAN, ["DOP853"], [None], settings={"rtol": [10.0, 1e-6]}))
 
 
 def test_studies_refuse_a_start_off_the_constraints(scene):
@@ -165,7 +166,7 @@ def test_a_comparison_of_one_form_and_method(scene):
 
 
 def test_what_a_figure_of_stability_is_asked_for(scene):
-    found = sv.stability(scene[0], sv.simulate(*scene, SPAN, method="RK4", step=0.01))
+    found = sv.stability(scene[0], sv.simulate(*scene, SPAN, method=sv.RungeKutta(4, step=0.01)))
     for poles in ("abc", 10.0, [10.0], [-1.0, 2.0], [np.nan, 1.0]):
         refused("poles=", lambda poles=poles: found.plot("RK4", poles))
     refused("step=", lambda: found.growth("RK4", "abc"))

@@ -6,6 +6,7 @@ import pytest
 import servoctl as sv
 from servoctl.gallery import gallery
 from servoctl.methods.accuracy import motion_error
+from servoctl.methods.choice import as_method
 from servoctl.methods.series import series_loop
 from servoctl.methods.tableaus import ORDERS
 from servoctl.methods.taylor import order_for
@@ -20,8 +21,8 @@ def fewest(model, start, span, method, exact, t):
     """Evaluations, and operations in them, of the coarsest setting whose error is at most ERROR."""
     fixed = method in ORDERS
     for setting in STEPS if fixed else TOLERANCES:
-        given = {"step": (span[1] - span[0]) / setting} if fixed else {"rtol": setting, "atol": setting, "t_eval": t}
-        run = sv.simulate(model, start, span, method, **given)
+        given = {"step": (span[1] - span[0]) / setting} if fixed else {"rtol": setting, "atol": setting}
+        run = sv.simulate(model, start, span, as_method(method, **given), t_eval=None if fixed else t)
         jets = run.jets[:, :: setting // INTERVALS] if fixed else run.jets
         np.testing.assert_allclose(run.t[:: setting // INTERVALS] if fixed else run.t, t, atol=1e-9)
         if motion_error(model, jets, exact) <= ERROR:
@@ -35,7 +36,7 @@ def fewest(model, start, span, method, exact, t):
 def test_taylor_then_dop853_then_rk45_then_rk4(name, gallery_model):
     model, scene = gallery_model(name), gallery[name]
     start, t = model.start(guess=scene.guess, **scene.start), np.linspace(*scene.t_span, INTERVALS + 1)
-    exact = sv.simulate(model, start, scene.t_span, "DOP853", rtol=3e-14, atol=1e-15, t_eval=t).jets
+    exact = sv.simulate(model, start, scene.t_span, sv.Adaptive("DOP853", rtol=3e-14, atol=1e-15), t_eval=t).jets
     costs = [fewest(model, start, scene.t_span, m, exact, t) for m in ("Taylor", "DOP853", "RK45", "RK4")]
     evaluations, operations = zip(*costs, strict=True)
     assert list(evaluations) == sorted(set(evaluations))

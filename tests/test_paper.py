@@ -9,6 +9,7 @@ from scipy.optimize import brentq
 
 import servoctl as sv
 from servoctl.gallery import appell_hamel
+from servoctl.methods.choice import as_method
 
 N = 20
 P = cf.APPELL_HAMEL
@@ -64,7 +65,7 @@ def model(request, gallery_model):
 @pytest.fixture(scope="module")
 def run(gallery_model):
     model = gallery_model("appell-hamel")
-    return sv.simulate(model, model.start(**START), (0.0, 2.0), rtol=1e-12, atol=1e-13)
+    return sv.simulate(model, model.start(**START), (0.0, 2.0), sv.Adaptive(rtol=1e-12, atol=1e-13))
 
 
 def test_random_states_satisfy_the_program(model):
@@ -157,7 +158,11 @@ def test_tabulated_states(method, gallery_model):
     model = gallery_model("appell-hamel")
     tolerances = {"step": 5e-4} if method == "RK4" else {"rtol": 1e-10, "atol": 1e-12}
     run = sv.simulate(
-        model, model.start(**START), (0.0, 2.0), method=method, t_eval=list(cf.APPELL_HAMEL_STATES), **tolerances
+        model,
+        model.start(**START),
+        (0.0, 2.0),
+        method=as_method(method, **tolerances),
+        t_eval=list(cf.APPELL_HAMEL_STATES),
     )
     found = np.array([run[name] for name in ("x", "y", "z", "phi", "theta", "dphi", "dtheta")])
     printed = np.array(list(cf.APPELL_HAMEL_STATES.values())).T

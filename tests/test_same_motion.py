@@ -138,11 +138,11 @@ def plain_motion(name):
 
 def motion(system, **options):
     model, start, duration, _ = system
-    tolerances = {} if model.flat else {"rtol": 1e-12, "atol": 1e-13}
+    method = None if model.flat else sv.Adaptive(rtol=1e-12, atol=1e-13)
     guess = start.get("guess")
     held = {k: v for k, v in start.items() if k != "guess"}
     state = options.pop("state", None) or model.start(guess=guess, **held)
-    return sv.simulate(model, state, (0.0, duration), t_eval=np.linspace(0.0, duration, 41), **tolerances)
+    return sv.simulate(model, state, (0.0, duration), method, t_eval=np.linspace(0.0, duration, 41))
 
 
 def report(model):

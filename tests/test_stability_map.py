@@ -10,6 +10,7 @@ import pytest
 import servoctl as sv
 from servoctl.gallery import gallery, mass_on_car
 from servoctl.methods.bounds import largest_explicit
+from servoctl.methods.choice import as_method
 from servoctl.methods.tableaus import ORDERS
 from servoctl.study.stability_map import METHODS, stability
 
@@ -44,7 +45,9 @@ def test_simulations_diverge_where_the_map_says(stiff, method, drift):
     largest = found.largest_step(method, drift)
 
     def error(step):  # after the path's end, where no knot shortens a step
-        moved = sv.simulate(model, model.start(t=3.0, s=0.1, ds=0.0), (3.0, 63.0), method, step=step, drift=drift)
+        moved = sv.simulate(
+            model, model.start(t=3.0, s=0.1, ds=0.0), (3.0, 63.0), as_method(method, step=step), drift=drift
+        )
         assert len(moved.t) == pytest.approx(60.0 / step, abs=2.0)
         return np.abs(moved["s"][-1])
 
@@ -61,7 +64,7 @@ def test_poles_faster_than_the_internal_dynamics_decide(stiff, method):
     assert largest == pytest.approx(largest_explicit(method) / pole, rel=0.01)
 
     def violation(step):
-        moved = sv.simulate(model, model.start(s=0.0, ds=0.0), (0.0, 6.0), method, step=step, drift=1 / pole)
+        moved = sv.simulate(model, model.start(s=0.0, ds=0.0), (0.0, 6.0), as_method(method, step=step), drift=1 / pole)
         return np.abs(moved.residual["z"][0]).max()
 
     assert violation(0.97 * largest) < 1e-2
@@ -98,7 +101,7 @@ def test_an_undamped_oscillation_is_amplified_by_methods_of_low_order(gallery_mo
     for method in ("RK1", "RK2"):
         swing = []
         for step in (1e-3, found.largest_step(method)):
-            moved = sv.simulate(model, model.start(**scene.start), (0.0, 200.0), method, step=step)
+            moved = sv.simulate(model, model.start(**scene.start), (0.0, 200.0), as_method(method, step=step))
             swing.append(np.ptp(moved["x2"][moved.t > 190.0]))
         assert 1.8 < swing[1] / swing[0] < 2.3  # twofold over the plan, as the map's limit says
 
@@ -127,9 +130,9 @@ def test_a_manifold_that_turns_gives_no_false_rates(gallery_model):
 def test_poles_that_fit_no_row_and_foreign_runs_are_refused(stiff, gallery_model):
     model, run, found = stiff
     with pytest.raises(sv.NameUnknown, match="nothing"):
-        found.largest_step("RK4", sv.poles({"nothing": [-1.0, -2.0]}))
+        found.largest_step("RK4", sv.Poles({"nothing": [-1.0, -2.0]}))
     with pytest.raises(sv.SpecificationError, match="2 poles"):
-        found.largest_step("RK4", sv.poles({"z": [-1.0]}))
+        found.largest_step("RK4", sv.Poles({"z": [-1.0]}))
     with pytest.raises(sv.NameUnknown, match="BDF"):
         found.largest_step("BDF")
     with pytest.raises(sv.SpecificationError, match="x1"):

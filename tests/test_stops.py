@@ -8,6 +8,7 @@ from scipy.integrate import solve_ivp
 
 import servoctl as sv
 from servoctl.gallery import gallery
+from servoctl.methods.choice import as_method
 
 ADAPTIVE = ("RK23", "RK45", "DOP853", "Radau", "BDF", "LSODA", "Taylor")
 FIXED = ("RK1", "RK2", "RK4", "RK5", "RK8")
@@ -95,7 +96,7 @@ def test_error_dynamics_do_not_carry_a_motion_through(method, squared, on_the_ri
 @pytest.mark.parametrize("method", METHODS)
 def test_the_linear_program_passes(method, gallery_model):
     model = gallery_model("appell-hamel")
-    run = sv.simulate(model, model.start(dphi=1.0, **ZERO), (0.0, 2.0), method=method, **tolerances(method))
+    run = sv.simulate(model, model.start(dphi=1.0, **ZERO), (0.0, 2.0), method=as_method(method, **tolerances(method)))
     within = 5e-2 if method == "RK1" else 1e-6
     assert run.success and run.t[-1] == 2.0
     assert run["dphi"][-1] == pytest.approx(cf.APPELL_HAMEL_STATES[2.0][5], abs=within)
@@ -104,7 +105,7 @@ def test_the_linear_program_passes(method, gallery_model):
 @pytest.mark.parametrize("method", [m for m in METHODS if m != "RK1"])  # Euler's own error here is 7e-2 s
 def test_a_wheel_that_starts_backwards_stops_later(method, squared):
     start = squared.start(guess={"dx": -0.5}, dphi=-1.0, **ZERO)
-    run = sv.simulate(squared, start, (0.0, 1.0), method=method, **tolerances(method))
+    run = sv.simulate(squared, start, (0.0, 1.0), method=as_method(method, **tolerances(method)))
     assert run.success
     error = stopped(squared, start, (0.0, 2.5), method=method, **tolerances(method))
     assert_told(error, BACKWARDS_STOPS, 1e-2 if method == "RK2" else 1e-3)  # 6e-3 s is the midpoint rule's own error
@@ -113,7 +114,7 @@ def test_a_wheel_that_starts_backwards_stops_later(method, squared):
 @pytest.mark.parametrize("method", METHODS)
 def test_a_fast_wheel_does_not_stop(method, squared):
     start = squared.start(guess={"dx": 7.5}, dphi=15.0, **ZERO)
-    run = sv.simulate(squared, start, (0.0, 2.0), method=method, **tolerances(method))
+    run = sv.simulate(squared, start, (0.0, 2.0), method=as_method(method, **tolerances(method)))
     reference = cf.appell_hamel(run.t[[-1]], dphi=15.0)
     assert run.success
     assert run["dphi"][-1] == pytest.approx(reference["dphi"][0], abs=0.1 if method == "RK1" else 1e-5)
@@ -123,7 +124,7 @@ def test_a_fast_wheel_does_not_stop(method, squared):
 def test_a_start_where_the_wheel_stands_is_refused(method, squared):
     with pytest.raises(sv.ServoError, match="dphi") as caught:
         start = squared.start(guess={"dx": 0.0}, dphi=0.0, **ZERO)
-        sv.simulate(squared, start, (0.0, 0.5), method=method, **tolerances(method))
+        sv.simulate(squared, start, (0.0, 0.5), method=as_method(method, **tolerances(method)))
     assert isinstance(caught.value, sv.SingularProgram)
     assert "speed" in str(caught.value)
 
@@ -134,7 +135,7 @@ def test_a_start_where_the_wheel_stands_is_refused(method, squared):
 def test_constant_speed_follows_its_closed_form(gallery_model):
     model, scene = gallery_model("constant-speed"), gallery["constant-speed"]
     start = model.start(**scene.start, guess=scene.guess)
-    run = sv.simulate(model, start, (0.0, 1.0), rtol=1e-12, atol=1e-13)
+    run = sv.simulate(model, start, (0.0, 1.0), sv.Adaptive(rtol=1e-12, atol=1e-13))
     reference = cf.constant_speed(run.t)
     for name in ("x", "y", "dx", "dy"):
         assert np.max(np.abs(run[name] - reference[name])) < 1e-9
@@ -171,7 +172,7 @@ def test_no_false_alarm(name, method, gallery_model):
     span = (t0, t1 if method in ("DOP853", "Taylor", "RK4") else t0 + 0.2 * (t1 - t0))
     step = {"step": (t1 - t0) / 500} if method == "RK4" else {"rtol": 1e-6, "atol": 1e-8}
     order = {"order": 8} if method == "Taylor" else {}
-    run = sv.simulate(model, start, span, method=method, t_eval=np.linspace(*span, 11), **step, **order)
+    run = sv.simulate(model, start, span, method=as_method(method, **step, **order), t_eval=np.linspace(*span, 11))
     assert run.success and run.t[-1] == span[1]
     assert np.all(np.isfinite(run.jets))
 
@@ -248,7 +249,7 @@ def precise(method):
 def test_a_particle_goes_round_and_round(kind, method, derived):
     model = derived(on_a_circle, kind)
     start = model.start(x=1.0, y=0.0, dx=0.0, dy=1.0)
-    run = sv.simulate(model, start, (0.0, 20.0), method=method, drift=drifts(method)[-1], **precise(method))
+    run = sv.simulate(model, start, (0.0, 20.0), method=as_method(method, **precise(method)), drift=drifts(method)[-1])
     assert run.success and run.counters["pivot_changes"] >= 6
     error = np.hypot(run["x"] - np.cos(run.t), run["y"] - np.sin(run.t)).max()
     assert error < (1e-6 if method == "BDF" else 1e-8)
@@ -258,7 +259,7 @@ def test_long_steps_change_pivots_on_the_way_back_too(derived):
     model = derived(on_a_circle, "equation")
     x, y = np.cos(20.0), np.sin(20.0)
     start = model.start(t=20.0, x=x, y=y, dx=-y, dy=x)
-    run = sv.simulate(model, start, (20.0, 0.0), method="Taylor", drift="project", order=20, rtol=1e-11, atol=1e-13)
+    run = sv.simulate(model, start, (20.0, 0.0), method=sv.Taylor(order=20, rtol=1e-11, atol=1e-13), drift="project")
     assert run.success and run.counters["steps"] < 30 and run.counters["pivot_changes"] >= 6
     assert np.hypot(run["x"] - np.cos(run.t), run["y"] - np.sin(run.t)).max() < 1e-9
 
@@ -267,7 +268,7 @@ def test_long_steps_change_pivots_on_the_way_back_too(derived):
 def test_a_pendulum_goes_over_the_top(method, derived):
     model = derived(pendulum_on_a_cart)
     start = model.start(s=0.0, ds=0.0, x=0.0, y=-1.0, dx=7.0)
-    run = sv.simulate(model, start, (0.0, 3.0), method=method, drift=drifts(method)[-1], **precise(method))
+    run = sv.simulate(model, start, (0.0, 3.0), method=as_method(method, **precise(method)), drift=drifts(method)[-1])
     swing = solve_ivp(lambda t, z: [z[1], -9.81 * np.cos(z[0])], (0.0, 3.0), [-np.pi / 2, 7.0], **REFERENCE)
     angle = swing.sol(run.t)[0]
     assert angle[-1] > angle[0] + 2 * np.pi
@@ -282,7 +283,7 @@ def test_a_pendulum_goes_over_the_top(method, derived):
 def test_a_driven_pendulum_turns_by_more_than_360_degrees(method, derived):
     model = derived(driven_pendulum)
     start = model.start(x=1.0, y=0.0)
-    run = sv.simulate(model, start, (0.0, 4.0), method=method, drift=drifts(method)[-1], **precise(method))
+    run = sv.simulate(model, start, (0.0, 4.0), method=as_method(method, **precise(method)), drift=drifts(method)[-1])
     assert run.success and run.counters["pivot_changes"] >= 3
     assert np.hypot(run["x"] - np.cos(2 * run.t), run["y"] - np.sin(2 * run.t)).max() < 1e-8
     assert run["torque"] == pytest.approx(9.81 * np.cos(2 * run.t), abs=1e-6)
@@ -315,9 +316,9 @@ def test_where_no_other_pivots_are_found_the_motion_is_kept(method, derived, mon
     model = derived(led_round if method == "algebraic" else driven_pendulum)
     start = model.start(t=0.2, x=np.cos(0.4), y=np.sin(0.4))
     monkeypatch.setattr(type(model), "near", none_found)
-    options = {"t_eval": np.linspace(0.2, 4.0, 381)} if method == "algebraic" else precise(method)
+    settings = {} if method == "algebraic" else precise(method)
     with pytest.raises(sv.SingularProgram) as caught:
-        sv.simulate(model, start, (0.2, 4.0), method=method, **options)
+        sv.simulate(model, start, (0.2, 4.0), as_method(method, **settings), t_eval=np.linspace(0.2, 4.0, 381))
     run = caught.value.run
     assert 0.3 < run.t[-1] <= caught.value.details["t"] < 1.7  # within the first half turn
     assert np.hypot(run["x"] - np.cos(2 * run.t), run["y"] - np.sin(2 * run.t)).max() < 1e-8

@@ -11,6 +11,7 @@ import pytest
 
 import servoctl as sv
 from servoctl.gallery import gallery
+from servoctl.methods.choice import as_method
 from servoctl.methods.sundials_solver import sundials_solver
 
 STATE = ("x", "y", "z", "phi", "theta", "dphi", "dtheta")
@@ -33,7 +34,7 @@ def start(model):
 
 @pytest.mark.parametrize("drift", [None, 0.5])
 def test_tabulated_states(method, drift, model, start):
-    run = sv.simulate(model, start, (0.0, 2.0), method=method, drift=drift, t_eval=[0.5, 1.0, 2.0], **TIGHT)
+    run = sv.simulate(model, start, (0.0, 2.0), method=as_method(method, **TIGHT), drift=drift, t_eval=[0.5, 1.0, 2.0])
     for k, values in enumerate(cf.APPELL_HAMEL_STATES.values()):
         np.testing.assert_allclose([run[name][k] for name in STATE], values, rtol=0, atol=1e-8)
     assert run.t.tolist() == [0.5, 1.0, 2.0] and run.counters["steps"] > 50
@@ -42,7 +43,7 @@ def test_tabulated_states(method, drift, model, start):
 def test_error_follows_the_tolerance(method, model, start):
     errors = []
     for rtol in (1e-5, 1e-7, 1e-9):
-        run = sv.simulate(model, start, (0.0, 2.0), method=method, rtol=rtol, atol=rtol / 100)
+        run = sv.simulate(model, start, (0.0, 2.0), method=as_method(method, rtol=rtol, atol=rtol / 100))
         reference = cf.appell_hamel(run.t)
         errors.append(max(np.abs(run[name] - reference[name]).max() for name in STATE))
     assert errors == sorted(errors, reverse=True) and errors[0] > 100 * errors[-1] and errors[-1] < 1e-6
@@ -59,8 +60,8 @@ def test_idas_knows_nothing_of_the_elimination(method, drift, model):
 
 def test_backwards(method, model, start):
     n = len(start.values)
-    there = sv.simulate(model, start, (0.0, 2.0), method=method, **TIGHT)
-    back = sv.simulate(model, there.jets[:n, -1], (2.0, 0.0), method=method, **TIGHT)
+    there = sv.simulate(model, start, (0.0, 2.0), method=as_method(method, **TIGHT))
+    back = sv.simulate(model, there.jets[:n, -1], (2.0, 0.0), method=as_method(method, **TIGHT))
     assert np.all(np.diff(back.t) < 0)
     assert np.abs(back.jets[:n, -1] - start.values).max() < 1e-8
 
@@ -68,8 +69,8 @@ def test_backwards(method, model, start):
 def test_knots(method, gallery_model):
     model = gallery_model("two-cars-ideal")
     start = model.start(x2=0.0, dx2=0.0)
-    run = sv.simulate(model, start, (0.0, 3.0), method=method, **TIGHT)
-    reference = sv.simulate(model, start, (0.0, 3.0), method="Taylor", rtol=1e-13, atol=1e-15)
+    run = sv.simulate(model, start, (0.0, 3.0), method=as_method(method, **TIGHT))
+    reference = sv.simulate(model, start, (0.0, 3.0), method=sv.Taylor(rtol=1e-13, atol=1e-15))
     assert set(model.knots) & set(run.t[1:-1])
     assert np.abs(run.jets[:4] - reference.jets[:4]).max() < 1e-8
 
@@ -80,7 +81,7 @@ def test_steep_starts(method, scene, gallery_model):
     model, scene = gallery_model(scene), gallery[scene]
     start = model.start(**scene.start, guess=scene.guess)
     run = sv.simulate(model, start, scene.t_span, method=method)
-    reference = sv.simulate(model, start, scene.t_span, method="Taylor", rtol=1e-13, atol=1e-15, t_eval=run.t)
+    reference = sv.simulate(model, start, scene.t_span, method=sv.Taylor(rtol=1e-13, atol=1e-15), t_eval=run.t)
     sizes = 1.0 + np.abs(reference.jets).max(axis=1, keepdims=True)
     assert run.success and (np.abs(run.jets - reference.jets) / sizes)[: len(start.values)].max() < 1e-6
 
@@ -101,7 +102,9 @@ def test_failure_keeps_what_was_computed(method):
     mechanism = sv.Mechanism(q, gibbs=sv.particle(q, 1.0, ca.vertcat(x, y)))
     escaping = sv.derive(mechanism, sv.Program({"growth": q.d(1)[0] - x**2}, by="ideal"))
     with pytest.raises(sv.IntegrationStopped) as caught:
-        sv.simulate(escaping, escaping.start(x=1.0, y=0.0, dy=0.0), (0.0, 1.2), method=method, rtol=1e-6, atol=1e-8)
+        sv.simulate(
+            escaping, escaping.start(x=1.0, y=0.0, dy=0.0), (0.0, 1.2), method=as_method(method, rtol=1e-6, atol=1e-8)
+        )
     run = caught.value.run
     assert 0.9 < run.t[-1] < 1.01
     early = run.t < 0.9
@@ -139,6 +142,6 @@ def interruptible():
 def test_ctrl_c_is_no_failure_of_the_integrator(method, model, start, interruptible):
     sv.simulate(model, start, (0.0, 0.1), method=method)  # compiled
     threading.Timer(0.3, lambda: os.kill(os.getpid(), signal.SIGINT)).start()
-    run = sv.simulate(model, start, (0.0, 3000.0), method=method, **TIGHT)  # tens of seconds
+    run = sv.simulate(model, start, (0.0, 3000.0), method=as_method(method, **TIGHT))  # tens of seconds
     assert run.status == 1 and not run.success and "interrupted" in run.message
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler

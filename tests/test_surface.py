@@ -163,7 +163,7 @@ def test_a_large_specification_prints_in_twelve_lines():
         assert short(value)
 
 
-@pytest.mark.parametrize("value", [sv.project(), sv.poles(0.1), sv.poles({"X": (-1.0, -2.0)}), gallery["vtol"]])
+@pytest.mark.parametrize("value", [sv.Project(), sv.Poles(0.1), sv.Poles({"X": (-1.0, -2.0)}), gallery["vtol"]])
 def test_small_values_print_in_twelve_lines(value):
     assert short(value)
     assert short(str(value))

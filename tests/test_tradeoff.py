@@ -11,8 +11,9 @@ from servoctl.errors import LimitExceeded, NameUnknown, ServoError, SingularProg
 from servoctl.figures.work_precision import COLOURS
 from servoctl.gallery import gallery
 from servoctl.methods.accuracy import motion_error
+from servoctl.methods.choice import METHODS as ALL_METHODS
+from servoctl.methods.choice import as_method
 from servoctl.shell.main import main
-from servoctl.simulation import ALL_METHODS
 from servoctl.study.front import TradeOff
 from servoctl.study.load import load_study
 from servoctl.study.table import Study
@@ -31,7 +32,7 @@ def scene(gallery_model):
 
 @pytest.fixture(scope="module")
 def study(scene):
-    return sv.tradeoff(*scene, SPAN, METHODS, DRIFTS, rtol=TOLERANCES, step=STEPS, seconds=20.0)
+    return sv.tradeoff(*scene, SPAN, METHODS, DRIFTS, settings={"rtol": TOLERANCES, "step": STEPS}, seconds=20.0)
 
 
 def synthetic(errors, seconds, uncertainty=1e-12, **changes):
@@ -64,8 +65,8 @@ def test_each_candidate_has_a_row(study):
 def test_the_numbers_are_those_of_the_run(drift, method, step, study, scene):
     model, start = scene
     row = study.where(method=method, drift=drift, value=step).rows()[0]
-    run = sv.simulate(model, start, SPAN, method, drift=drift, step=step)
-    exact = sv.simulate(model, start, SPAN, "DOP853", rtol=3e-14, atol=1e-15, t_eval=run.t)
+    run = sv.simulate(model, start, SPAN, as_method(method, step=step), drift=drift)
+    exact = sv.simulate(model, start, SPAN, sv.Adaptive("DOP853", rtol=3e-14, atol=1e-15), t_eval=run.t)
     assert row["error"] == pytest.approx(motion_error(model, run.jets, exact.jets), rel=1e-3)
     assert row["residual"] == max(np.abs(run.residual[name]).max() for name in run.residual)
     assert row["evaluations"] == run.counters["nfev"] and row["steps"] == run.counters["steps"]
@@ -97,7 +98,9 @@ def test_the_machine_is_recorded(study):
 
 def test_slow_candidates_are_skipped_and_say_so(scene, monkeypatch):
     monkeypatch.setattr("servoctl.study.tradeoff.FEW", 0)
-    slow = sv.tradeoff(*scene, SPAN, ["RK4", "DOP853"], [None], rtol=TOLERANCES, step=STEPS, seconds=1e-9)
+    slow = sv.tradeoff(
+        *scene, SPAN, ["RK4", "DOP853"], [None], settings={"rtol": TOLERANCES, "step": STEPS}, seconds=1e-9
+    )
     assert len(slow) == 6
     fixed, adaptive = slow.where(method="RK4").rows(), slow.where(method="DOP853").rows()
     assert fixed[0]["failure"] == "" and all(r["failure"].startswith("skipped: step = 0.1 took") for r in fixed[1:])
@@ -106,7 +109,7 @@ def test_slow_candidates_are_skipped_and_say_so(scene, monkeypatch):
 
 
 def test_what_gets_lost_in_its_first_steps_skips_no_finer_setting(scene):
-    lost = sv.tradeoff(*scene, SPAN, "DOP853", [None], rtol=TOLERANCES, seconds=1e-9)
+    lost = sv.tradeoff(*scene, SPAN, "DOP853", [None], settings={"rtol": TOLERANCES}, seconds=1e-9)
     assert len(lost) == len(TOLERANCES) and all("ended at t =" in failure for failure in lost["failure"])
 
 
@@ -114,13 +117,18 @@ def test_a_program_without_free_values_is_solved(gallery_model):
     model, scene = gallery_model("overhead-crane"), gallery["overhead-crane"]
     start = model.start(guess=scene.guess)
     crane = sv.tradeoff(
-        model, start, (0.0, 8.0), ["algebraic", "Taylor", "RK4"], [None, "project"], rtol=[1e-3, 1e-6], step=[0.1]
+        model,
+        start,
+        (0.0, 8.0),
+        ["algebraic", "Taylor", "RK4"],
+        [None, "project"],
+        settings={"rtol": [1e-3, 1e-6], "step": [0.1]},
     )
     assert crane.meta["reference"]["method"] == "algebraic" and crane.uncertainty < 1e-12
     solved = crane.where(method="algebraic")
     assert len(solved) == 1 and solved["error"][0] <= 1e-12 and solved["actuation"][0] <= 1e-11
     assert crane.where(method="RK4", drift="none")["error"][0] > 1e-9
-    assert crane.recommend(error=1e-12) == {"method": "algebraic"}
+    assert crane.recommend(error=1e-12) == {"method": sv.Algebraic()}
 
 
 # --- advice
@@ -144,16 +152,16 @@ def test_a_recommendation_is_kept(study, scene):
     best = study.recommend(error=1e-6)
     assert best.row["error"] <= 1e-6
     run = sv.simulate(*scene, SPAN, **best)
-    exact = sv.simulate(*scene, SPAN, "DOP853", rtol=3e-14, atol=1e-15, t_eval=run.t)
+    exact = sv.simulate(*scene, SPAN, sv.Adaptive("DOP853", rtol=3e-14, atol=1e-15), t_eval=run.t)
     assert motion_error(scene[0], run.jets, exact.jets) <= 2e-6
     assert study.recommend(seconds=1e3).row["error"] == study.pareto()["error"][-1]
 
 
 def test_the_fastest_within_an_error_and_the_best_within_a_time():
     made = synthetic([1e-2, 1e-6, 1e-9, np.nan, 1e-15], [1e-3, 2e-3, 5e-3, np.nan, 1.0])
-    assert made.recommend(error=1e-5) == {"method": "Taylor", "drift": "project", "rtol": 0.1, "atol": 1e-3}
-    assert made.recommend(seconds=6e-3)["rtol"] == 0.01
-    assert made.recommend(error=1e-12)["rtol"] == 1e-4
+    assert made.recommend(error=1e-5) == {"method": sv.Taylor(rtol=0.1, atol=1e-3), "drift": "project"}
+    assert made.recommend(seconds=6e-3)["method"].rtol == 0.01
+    assert made.recommend(error=1e-12)["method"].rtol == 1e-4
     with pytest.raises(LimitExceeded, match="error=1e-14.*certain to 1e-12 only.*error 1e-12 in 1 s"):
         made.recommend(error=1e-14)  # what lies below the reference's uncertainty is not known
     with pytest.raises(LimitExceeded, match="seconds=1e-05 was asked.*rtol 1: error 0.01 in 0.001 s"):
@@ -168,7 +176,7 @@ def test_the_fastest_within_an_error_and_the_best_within_a_time():
 @pytest.mark.parametrize("drift", ["none", "project", "project 5", "0.05", "minimal"])
 def test_a_recommended_treatment_is_the_measured_one(drift):
     options = synthetic([1e-6], [1.0], drift=[drift]).recommend(error=1e-3)
-    wanted = {"none": None, "project 5": sv.project(5), "0.05": 0.05}.get(drift, drift)
+    wanted = {"none": None, "project 5": sv.Project(5), "0.05": 0.05}.get(drift, drift)
     assert options.get("drift") == wanted
 
 
@@ -226,11 +234,12 @@ def test_the_plot_draws_every_number(cost, study):
     "given, error, text",
     [
         ({"methods": ["RK3"]}, NameUnknown, "No method is named 'RK3'"),
-        ({"rtol": [1e-3, -1.0]}, SpecificationError, r"rtol=\[0.001, -1.0\] was given"),
-        ({"step": "fine"}, SpecificationError, "step='fine' was given"),
+        ({"settings": {"rtol": [1e-3, -1.0]}}, SpecificationError, r"rtol=\[0.001, -1.0\] was given"),
+        ({"settings": {"order": [8]}}, NameUnknown, "No setting is named 'order'"),
+        ({"settings": {"step": "fine"}}, SpecificationError, "step='fine' was given"),
         ({"seconds": 0.0}, SpecificationError, "seconds = 0 was given"),
         ({"drift": ["often"]}, NameUnknown, "drift treatment"),
-        ({"drift": [sv.poles({"x_c": [-1.0]})]}, SpecificationError, "time constant"),
+        ({"drift": [sv.Poles({"x_c": [-1.0]})]}, SpecificationError, "time constant"),
         ({"t_span": (0.0, 0.0)}, SpecificationError, "two different finite times"),
         ({"t_span": 3.0}, SpecificationError, "two different finite times"),
     ],

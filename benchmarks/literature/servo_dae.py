@@ -12,6 +12,7 @@ from servoctl.checks import as_span, positives
 from servoctl.codegen.function import compiled
 from servoctl.errors import SpecificationError, unknown
 from servoctl.figures import style
+from servoctl.methods.choice import Taylor
 from servoctl.reduction.elimination import eliminate
 from servoctl.reduction.ranks import clean, decide_all
 from servoctl.simulation import consistent_state, simulate
@@ -250,7 +251,7 @@ def _steps(t0, t1, steps):
 
 def _reference(model, start, t):
     """(q, γ', μ) of the model's own solution, (nq + n + b, N), and all jets at its start."""
-    options = {} if model.flat else {"method": "Taylor", "drift": "project", "rtol": 1e-13, "atol": 1e-14}
+    options = {} if model.flat else {"method": Taylor(rtol=1e-13, atol=1e-14), "drift": "project"}
     run = simulate(model, start, (t[0], t[-1]), t_eval=t, progress=False, **options)
     columns = np.searchsorted(run.t, t - 1e-12 * (t[-1] - t[0]))
     forces = run.signals("all_multipliers")[1]

@@ -12,6 +12,8 @@ from numbers import Real
 import numpy as np
 
 from servoctl.errors import LimitExceeded, SpecificationError
+from servoctl.methods.choice import Algebraic, Taylor
+from servoctl.methods.drift import Project
 from servoctl.methods.taylor import order_for
 
 FLOOR = 1e-3  # least size of a component relative to the largest of its level: what is zero has rounding for its size
@@ -76,25 +78,27 @@ def motion_error(model, jets, reference):
     return relative_error(jets[:n_x], reference[:n_x], state_levels(model))
 
 
-def options_for(model, accuracy):
-    """Arguments of `simulate` with which the rule begins for an accuracy of the motion.
+def method_for(model, accuracy, jets=None):
+    """The method with which the rule begins for an accuracy of the motion.
 
     Parameters
     ----------
     model : Model
     accuracy : float
+    jets : int, optional
+        Highest derivative in the samples; the Taylor method gives it, also where nothing is integrated.
 
     Returns
     -------
-    dict
+    Algebraic or Taylor
     """
-    if model.flat:
-        return {"method": "algebraic"}
+    if model.flat and jets is None:
+        return Algebraic()
     rtol = max(MARGIN * accuracy, FINEST)
-    return {"method": "Taylor", "drift": "project", "rtol": rtol, "atol": rtol, "order": order_for(rtol)}
+    return Taylor(order_for(rtol), jets, rtol, rtol)
 
 
-def accurate(simulated, model, accuracy):
+def accurate(simulated, model, accuracy, method=None, drift=None):
     """The motion with an error of at most `accuracy`.
 
     Where nothing is integrated, each instant is solved to rounding. Else the tolerance is lowered until two successive
@@ -103,10 +107,14 @@ def accurate(simulated, model, accuracy):
     Parameters
     ----------
     simulated : callable
-        From arguments of `simulate` to a Run.
+        From a method and a treatment of drift to a Run.
     model : Model
     accuracy : float
         See `motion_error`.
+    method : None or Taylor
+        `Taylor(jets=...)` asks for jets; order and tolerances follow from the accuracy.
+    drift : None
+        Follows from the accuracy.
 
     Returns
     -------
@@ -116,18 +124,22 @@ def accurate(simulated, model, accuracy):
     Raises
     ------
     SpecificationError
-        For an accuracy out of range.
+        For an accuracy out of range, or together with what it determines.
     LimitExceeded
         Where rounding grows beyond it first; `.run` is the best motion.
     """
-    options = options_for(model, require_accuracy(accuracy))
-    run = simulated(**options)
-    if model.flat or not run.success:
+    accuracy, jets = require_accuracy(accuracy), _jets_alone(accuracy, method, drift)
+    method = method_for(model, accuracy, jets)
+    if isinstance(method, Algebraic):
+        return simulated(method, None)
+    run = simulated(method, Project())
+    if not run.success:
         return run
     best = np.inf
-    while options["rtol"] > FINEST:
-        options |= dict.fromkeys(("rtol", "atol"), max(FINER * options["rtol"], FINEST))
-        finer = simulated(**options)
+    while method.rtol > FINEST:
+        rtol = max(FINER * method.rtol, FINEST)
+        method = replace(method, rtol=rtol, atol=rtol)
+        finer = simulated(method, Project())
         if not finer.success:
             return finer
         difference = motion_error(model, run.jets, finer.jets)
@@ -155,3 +167,19 @@ def require_accuracy(accuracy):
             do="Give 1e-6.",
         )
     return float(accuracy)
+
+
+def _jets_alone(accuracy, method, drift):
+    """The jets that a method asks for beside an accuracy; anything else that the accuracy determines is refused."""
+    if drift is None and method is None:
+        return None
+    if drift is None and isinstance(method, Taylor) and method.jets and method == Taylor(jets=method.jets):
+        return method.jets
+    chosen = {name: value for name, value in (("method", method), ("drift", drift)) if value is not None}
+    raise SpecificationError(
+        f"accuracy={accuracy!r} was given with {', '.join(f'{name}={value!r}' for name, value in chosen.items())}.",
+        "An accuracy determines the method, its settings and the treatment of drift; only jets may be asked for.",
+        nearest=f"method=sv.Taylor(jets={method.jets})." if getattr(method, "jets", None) else "",
+        do="Leave one of them out.",
+        **chosen,
+    )

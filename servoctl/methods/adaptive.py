@@ -3,13 +3,11 @@
 import numpy as np
 
 from servoctl.errors import IntegrationStopped
-from servoctl.methods.drift import Minimal, Poles, Project, Projector
+from servoctl.methods.drift import MinimalCoordinates, Poles, Project, Projector
 from servoctl.methods.minimal import MinimalSolver, Sizes
 from servoctl.methods.monitor import DEGRADED, NEGLIGIBLE, NO_CHOICE, VANISHING, Watch
 from servoctl.methods.motion import Motion, breakpoints, interruptible, sign_change
 
-METHODS = ("RK23", "RK45", "DOP853", "Radau", "BDF", "LSODA")
-ONE_STEP = ("RK23", "RK45", "DOP853", "Radau")
 IMPLICIT = ("Radau", "BDF")
 LINGERS = 5.0  # times the way to its crossing that a sunk pivot may stay at zero
 INSIDE = (0.25, 0.5, 0.75, 1.0)  # of a step: where pivots are looked at
@@ -22,8 +20,8 @@ class Adaptive:
     ----------
     model : Model
     method : str
-        One of `METHODS`.
-    drift : None, Poles, Project or Minimal
+        One of `choice.SCIPY`.
+    drift : None, Poles, Project or MinimalCoordinates
     rtol, atol : float
     progress : callable
     """
@@ -32,7 +30,7 @@ class Adaptive:
         self.method, self.drift = method, drift
         self.rtol, self.atol, self.progress = rtol, atol, progress
         self.motion = Motion()
-        self.sizes = Sizes(model) if isinstance(drift, Minimal) else None
+        self.sizes = Sizes(model) if isinstance(drift, MinimalCoordinates) else None
         self._use(model)
 
     def _use(self, model):
@@ -74,7 +72,7 @@ class Adaptive:
         import scipy.integrate
 
         method, tolerances = getattr(scipy.integrate, self.method), {"rtol": self.rtol, "atol": self.atol}
-        if isinstance(self.drift, Minimal):
+        if isinstance(self.drift, MinimalCoordinates):
             return MinimalSolver(method, self.model, self.sizes, a, x, b, tolerances, self.slopes is not None)
         exact = {} if self.slopes is None else {"jac": self._jacobian}
         return method(self._rates, a, x, b, **tolerances, **exact)

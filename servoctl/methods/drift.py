@@ -12,25 +12,32 @@ from servoctl.errors import SpecificationError, unknown
 class Poles:
     """Error dynamics Π(D - λ_i) ψ = 0 in place of D^ρ ψ = 0 in every row that was raised ρ times.
 
-    Attributes
+    Parameters
     ----------
     values : float or dict of str to sequence of complex
-        One time constant T [s] (all poles at -1/T), or ρ poles [1/s] per row name; rows that are not named keep
-        D^ρ ψ = 0.
+        One time constant T [s] (all poles at -1/T), or ρ poles [1/s] per row name, as many as `model.raised` says;
+        rows that are not named keep D^ρ ψ = 0.
+
+    Raises
+    ------
+    SpecificationError
+        If the time constant is not positive, no row is named, or poles are not finite or not in conjugate pairs.
     """
 
     values: object
 
+    def __post_init__(self):
+        checked = _by_row(self.values) if isinstance(self.values, dict) else _time_constant(self.values)
+        object.__setattr__(self, "values", checked)
+
     def __str__(self):
-        return (
-            f"poles at {-1 / self.values:g} 1/s"
-            if isinstance(self.values, float)
-            else f"poles of {', '.join(self.values)}"
-        )
+        if isinstance(self.values, float):
+            return f"poles at {-1 / self.values:g} 1/s"
+        return f"poles of {', '.join(self.values)}"
 
     def coefficients(self, model):
         """The coefficients c_0 .. c_(ρ-1) of each row's error dynamics, in the order of the model's pole inputs."""
-        found, rows = [], dict(model.pole_rows())
+        coefficients, rows = [], dict(model.pole_rows())
         if isinstance(self.values, dict):
             for name in self.values:
                 if name not in rows:
@@ -39,7 +46,7 @@ class Poles:
             if isinstance(self.values, float):
                 poles = [-1.0 / self.values] * count
             else:
-                poles = _numbers(name, self.values.get(name, [0.0] * count))
+                poles = np.asarray(self.values.get(name, [0.0] * count), dtype=complex)
             if len(poles) != count:
                 raise SpecificationError(
                     f"{len(poles)} poles were given for the row {name!r}.",
@@ -48,114 +55,97 @@ class Poles:
                     row=name,
                     count=count,
                 )
-            polynomial = np.atleast_1d(np.poly(poles))
-            if np.abs(polynomial.imag).max(initial=0.0) > 1e-9 * np.abs(polynomial).max():
-                raise SpecificationError(
-                    f"The poles of {name!r} are not in conjugate pairs.", "Error dynamics are real.", do="Pair them."
-                )
-            found += list(polynomial.real[:0:-1])
-        return np.array(found)
+            coefficients += list(np.atleast_1d(np.poly(poles)).real[:0:-1])
+        return np.array(coefficients)
 
 
-def _numbers(row, poles):
+def _time_constant(value):
     try:
-        found = np.atleast_1d(np.asarray(poles, dtype=complex))
+        constant = np.nan if isinstance(value, bool) else float(value)
     except (TypeError, ValueError):
-        found = np.full(1, np.nan)
-    if found.ndim != 1 or not np.all(np.isfinite(found)):
+        constant = np.nan
+    if not (np.isfinite(constant) and constant > 0):
+        raise SpecificationError(
+            f"The time constant {value!r} was given.",
+            "A time constant is a positive number of seconds.",
+            do="Give 0.1, or poles by row name.",
+            value=value,
+        )
+    return constant
+
+
+def _by_row(values):
+    if not values:
+        raise SpecificationError(
+            "Poles of no row were given.", "Error dynamics belong to rows.", do="Give 0.1, or poles by row name."
+        )
+    return {row: _poles(row, poles) for row, poles in values.items()}
+
+
+def _poles(row, poles):
+    """The poles of a row as a tuple, finite and in conjugate pairs."""
+    try:
+        array = np.atleast_1d(np.asarray(poles, dtype=complex))
+    except (TypeError, ValueError):
+        array = np.full(1, np.nan)
+    if array.ndim != 1 or not np.all(np.isfinite(array)):
         raise SpecificationError(
             f"The poles {poles!r} were given for the row {row!r}.",
             "Poles are finite numbers [1/s].",
             do="Give [-5.0, -5.0].",
             row=row,
         )
-    return found
+    polynomial = np.atleast_1d(np.poly(array))
+    if np.abs(polynomial.imag).max(initial=0.0) > 1e-9 * np.abs(polynomial).max():
+        raise SpecificationError(
+            f"The poles of {row!r} are not in conjugate pairs.", "Error dynamics are real.", do="Pair them.", row=row
+        )
+    return tuple(np.atleast_1d(poles).tolist())
 
 
 @dataclass(frozen=True)
 class Project:
-    """After every `every`-th step, the least change of the jets in the metric M that restores the invariants."""
+    """After every `every`-th step, the least change of the jets in the metric M that restores the invariants.
+
+    Parameters
+    ----------
+    every : int
+        Steps between projections, at least 1.
+    """
 
     every: int = 1
+
+    def __post_init__(self):
+        if not is_whole(self.every) or self.every < 1:
+            raise SpecificationError(
+                f"every={self.every!r} was given.", "It is a whole number, at least 1.", do="Give 1.", every=self.every
+            )
+        object.__setattr__(self, "every", int(self.every))
 
     def __str__(self):
         return "projected after every step" if self.every == 1 else f"projected after every {self.every} steps"
 
 
 @dataclass(frozen=True)
-class Minimal:
+class MinimalCoordinates:
     """Only as many values as the program leaves free are integrated, the others solved from the constraints."""
 
     def __str__(self):
         return "minimal coordinates"
 
 
-def poles(values):
-    """Error dynamics against drift, for `simulate(..., drift=...)`.
-
-    Parameters
-    ----------
-    values : float or dict of str to sequence of complex
-        A time constant [s], or the poles [1/s] of each row by name, as many as `model.raised` says.
-
-    Returns
-    -------
-    Poles
-
-    Raises
-    ------
-    SpecificationError
-        If the time constant is not positive, or no row is named.
-    """
-    if isinstance(values, dict):
-        if not values:
-            raise SpecificationError(
-                "Poles of no row were given.", "Error dynamics belong to rows.", do="Give 0.1, or poles by row name."
-            )
-        return Poles(dict(values))
-    try:
-        constant = np.nan if isinstance(values, bool) else float(values)
-    except (TypeError, ValueError):
-        constant = np.nan
-    if not (np.isfinite(constant) and constant > 0):
-        raise SpecificationError(
-            f"The time constant {values!r} was given.",
-            "A time constant is a positive number of seconds.",
-            do="Give 0.1, or poles by row name.",
-        )
-    return Poles(constant)
-
-
-def project(every=1):
-    """Projection against drift, for `simulate(..., drift=...)`.
-
-    Parameters
-    ----------
-    every : int
-        Steps between projections.
-
-    Returns
-    -------
-    Project
-    """
-    if not is_whole(every) or every < 1:
-        raise SpecificationError(f"every={every!r} was given.", "It is a whole number, at least 1.", do="Give 1.")
-    return Project(int(every))
+SHORT_FORMS = {"none": None, "project": Project(), "minimal": MinimalCoordinates()}
 
 
 def as_drift(value):
-    """The treatment that a designer's `drift=` means: None, "project", "minimal", a time constant, or a value."""
-    if value is None or isinstance(value, (Poles, Project, Minimal)):
+    """The treatment that a designer's `drift=` means: None, a short form, a time constant [s], or a value."""
+    if value is None or isinstance(value, (Poles, Project, MinimalCoordinates)):
         return value
     if isinstance(value, str):
-        if value == "none":
-            return None
-        if value == "project":
-            return Project()
-        if value == "minimal":
-            return Minimal()
-        raise unknown(value, ["none", "project", "minimal", "a time constant [s]"], "drift treatment")
-    return poles(value)
+        if value not in SHORT_FORMS:
+            raise unknown(value, [*SHORT_FORMS, "a time constant [s]"], "drift treatment")
+        return SHORT_FORMS[value]
+    return Poles(value)
 
 
 class Projector:

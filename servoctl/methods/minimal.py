@@ -7,7 +7,7 @@ chosen by pivoted QR, and anew when the choice degrades. Nothing is left to drif
 
 import numpy as np
 
-from servoctl.errors import IntegrationStopped, SpecificationError
+from servoctl.errors import IntegrationStopped
 from servoctl.reduction.ranks import equilibrate
 
 REACH = 2.0  # times as fast as the integrated values may the solved ones move before the choice is made anew
@@ -320,40 +320,3 @@ class MinimalSolver:
                 t=float(t),
             )
         return x
-
-
-def require_minimal(model, method, methods):
-    """Refuse minimal coordinates with a method that cannot take them.
-
-    Parameters
-    ----------
-    model : Model
-    method : str
-    methods : sequence of str
-        Those that can.
-
-    Raises
-    ------
-    SpecificationError
-    """
-    given = f"drift='minimal' was given with method={method!r}"
-    if model.flat and method != "algebraic":
-        raise SpecificationError(
-            f"{given} for a program that determines the motion completely.",
-            "Without free initial values nothing is left to integrate: each instant is a Newton solve.",
-            nearest="method='algebraic'.",
-            do="Leave the method out.",
-            free=0,
-        )
-    if method not in ("algebraic", *methods):
-        why = (
-            "The choice of coordinates changes along the motion, which past states and loops outside would not notice."
-        )
-        if method == "Taylor":
-            why = "The series give every jet from the rows themselves: nothing is solved for the remaining ones."
-        raise SpecificationError(
-            f"{given}.",
-            why,
-            nearest=f"One of {', '.join(methods)}; or drift='project'.",
-            do="Change one of them.",
-        )

@@ -13,7 +13,6 @@ from servoctl.methods.radau_loop import first_step, inside, radau_steps
 from servoctl.methods.resolution import unresolved
 
 CHUNK = 200  # steps per call of the compiled loop
-RADAU_ORDERS = (5, 9, 13)
 
 
 def radau_order(rtol):

@@ -6,7 +6,7 @@ import numpy as np
 
 from servoctl.errors import IntegrationStopped
 from servoctl.methods.bounds import largest_explicit, row_poles, warn_fast_poles, warn_unresolved
-from servoctl.methods.drift import Minimal, Poles, Project
+from servoctl.methods.drift import MinimalCoordinates, Poles, Project
 from servoctl.methods.minimal import Chart, Sizes
 from servoctl.methods.monitor import DEGRADED, NEGLIGIBLE, NO_CHOICE, Watch
 from servoctl.methods.motion import Motion, breakpoints, interruptible
@@ -27,7 +27,7 @@ def fixed_step(model, method, drift, span, x0, step, knots, progress):
     model : Model
     method : str
         One of `tableaus.ORDERS`.
-    drift : None, Poles, Project or Minimal
+    drift : None, Poles, Project or MinimalCoordinates
     span : (t0, t1)
         [s]
     x0 : (n_x,) array
@@ -65,7 +65,7 @@ class _Fixed:
         self.method, self.drift, self.motion, self.progress = method, drift, motion, progress
         self.tableau = tableau(method)
         self.every = drift.every if isinstance(drift, Project) else 0
-        self.sizes = Sizes(model) if isinstance(drift, Minimal) else None
+        self.sizes = Sizes(model) if isinstance(drift, MinimalCoordinates) else None
         self._use(model)
 
     def _use(self, model):
@@ -94,7 +94,7 @@ class _Fixed:
         self._suspect = (a, x)
         n_x, n, done = self.f.n_x, self.model.n, 0
         chunk = CHUNK - CHUNK % self.every if 0 < self.every < CHUNK else self.every or CHUNK
-        chunk = SLOW_CHUNK if isinstance(self.drift, Minimal) else chunk
+        chunk = SLOW_CHUNK if isinstance(self.drift, MinimalCoordinates) else chunk
         last = None
         while done < count:
             steps = min(chunk, count - done)
@@ -107,7 +107,7 @@ class _Fixed:
             self.motion.add(self.model, t, states, top)
             projections = good // self.every if self.every else 0
             self.motion.count(steps=good, nfev=len(self.tableau[1]) * good, projections=projections)
-            if isinstance(self.drift, Minimal):
+            if isinstance(self.drift, MinimalCoordinates):
                 self.motion.count(coordinate_changes=self._changed[:good].sum())
             last = guards[:, : good + 1][:, -3:]
             x, done = states[:, -1].copy(), done + good
@@ -146,7 +146,7 @@ class _Fixed:
 
     def _steps(self, t, x, h, count):
         """States (n_x, N + 1) of `count` steps and the pivots there; fewer where no state is finite."""
-        if not isinstance(self.drift, Minimal):
+        if not isinstance(self.drift, MinimalCoordinates):
             return self.f.rk(t, x, h, count, self.p, self.tableau, 1, self.every)[1:]
         chart = Chart(self.model, self.sizes, t, x)
         states, self._changed = chart.steps(t, x, h, count, self.tableau)
@@ -208,7 +208,7 @@ class _Fixed:
         Where the constraints are exact, a pivot that touches zero leaves no residual to be seen by: its least size is
         looked for within the steps.
         """
-        if not isinstance(self.drift, Minimal) or len(t) < 2:
+        if not isinstance(self.drift, MinimalCoordinates) or len(t) < 2:
             return None
         padded = np.pad(sizes, ((0, 0), (1, 1)), constant_values=np.inf)
         low = (sizes < NEAR) & (sizes <= padded[:, :-2]) & (sizes <= padded[:, 2:])

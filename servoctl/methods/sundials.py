@@ -9,7 +9,6 @@ from servoctl.methods.drift import Poles
 from servoctl.methods.radau import InBulk
 from servoctl.methods.sundials_solver import MOST_STEPS, sundials_solver
 
-MULTISTEP = ("CVODES", "IDAS")
 WATCHED = 1000  # intervals of a span at whose ends pivots are looked at, beside the samples
 
 

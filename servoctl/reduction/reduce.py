@@ -288,7 +288,7 @@ def _require_outputs(reduction):
             raise SpecificationError(
                 f"The output {name!r} has order {q.order(expression)}.",
                 f"A motion of this program has jets up to order {top}.",
-                nearest='simulate(..., method="Taylor", jets=...) for derivatives of any order.',
+                nearest='simulate(..., method=sv.Taylor(jets=...)) for derivatives of any order.',
                 do="Give an output of lower order, and take its derivatives from such a run.",
                 name=name,
             )

@@ -7,13 +7,13 @@ from pathlib import Path
 
 from servoctl.checks import as_span
 from servoctl.errors import ServoError, SpecificationError, unknown
+from servoctl.methods.choice import as_method, default_method
 from servoctl.methods.drift import as_drift
 from servoctl.methods.tableaus import ORDERS
 from servoctl.shell import commands as further
 from servoctl.shell import loop as cli_loop
 from servoctl.shell.folder import FILES, LOOP_FILES, Folder, Report, complain, plain, summary, versions
 from servoctl.shell.options import METHODS_HELP, assignment, mapping, positive
-from servoctl.simulation import ALL_METHODS
 
 
 def main(argv=None):
@@ -197,7 +197,7 @@ def _compute(args, name, scene, folder):
     report.say(model)
     start = _start(model, scene, span[0], held, guess)
     report.say(start)
-    run = _simulate(model, start, span, _options(args, span), report)
+    run = _simulate(model, start, span, _options(args, model, span), report)
     folder.write(lambda path: run.save(path / "run.npz"))
     verification = None if args.no_verify else _verify(model, run, report)
     closed, done = cli_loop.closed_loop(args, model, run, report)
@@ -226,8 +226,8 @@ def _require_known(args, span):
     """Refuse a span, a method or a treatment of drift that no model has."""
     as_span(span)
     as_drift(args.drift)
-    if args.method is not None and args.method not in ALL_METHODS:
-        raise unknown(args.method, ALL_METHODS, "method")
+    if args.method is not None:
+        as_method(args.method)
 
 
 def _with_parameters(model, changes):
@@ -253,10 +253,12 @@ def _start(model, scene, t0, hold, guess):
     return model.start(t=t0, guess={**scene.guess, **guess}, **held)
 
 
-def _options(args, span):
+def _options(args, model, span):
     """Arguments of `simulate` that were given."""
-    names = ("accuracy", "method", "step", "drift", "rtol", "atol")
-    options = {name: getattr(args, name) for name in names if getattr(args, name) is not None}
+    options = {name: getattr(args, name) for name in ("accuracy", "drift") if getattr(args, name) is not None}
+    settings = {name: getattr(args, name) for name in ("step", "rtol", "atol") if getattr(args, name) is not None}
+    if args.method or settings:
+        options["method"] = as_method(args.method or default_method(model), **settings)
     if args.samples:
         options["t_eval"] = [span[0] + (span[1] - span[0]) * i / (args.samples - 1) for i in range(args.samples)]
         options["t_eval"][-1] = span[1]
@@ -343,4 +345,6 @@ def _recommended(study, args, report):
     options = ", ".join(f"{key}={value!r}" for key, value in best.items())
     error = max(best.row["error"], study.uncertainty)
     report.say(f"Recommended: {options}; error at most {error:.1e} in {best.row['seconds']:.2g} s")
-    return dict(best)
+    method = best["method"]
+    settings = {name: value for name, value in vars(method).items() if name in ("step", "rtol", "atol") and value}
+    return {**best, "method": str(method), **settings}

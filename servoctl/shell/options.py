@@ -4,9 +4,9 @@ import argparse
 import math
 
 from servoctl.errors import SpecificationError
-from servoctl.simulation import ALL_METHODS
+from servoctl.methods.choice import METHODS
 
-METHODS_HELP = f"{', '.join(ALL_METHODS)}; default: by the model"
+METHODS_HELP = f"{', '.join(METHODS)}; default: by the model"
 DRAWS = {"normal": "MEAN:STD", "uniform": "LOW:HIGH", "lognormal": "MEDIAN:LOG_STD", "triangular": "LOW:MODE:HIGH"}
 
 

@@ -4,7 +4,8 @@ import numpy as np
 
 from servoctl.checks import is_number
 from servoctl.errors import LimitExceeded, SpecificationError, unknown
-from servoctl.methods.drift import project
+from servoctl.methods.choice import Algebraic, RungeKutta, as_method
+from servoctl.methods.drift import Project
 from servoctl.study.table import Study, table
 
 DRIFTS = ("none", "project", "minimal")  # others are time constants of poles
@@ -165,15 +166,22 @@ class TradeOff(Study):
         return "\n".join([*lines, *table(front.take(shown), names, SHOWN)])
 
 
+def method_at(name, value):
+    """The method of a name with a step of `value` [s], or a tolerance: rtol is `value`, atol a hundredth."""
+    method = as_method(name)
+    if isinstance(method, Algebraic):
+        return method
+    settings = {"step": value} if isinstance(method, RungeKutta) else {"rtol": value, "atol": value / 100}
+    return as_method(method, **settings)
+
+
 def _arguments(row):
     """The arguments of `simulate` that a row was measured with."""
-    options, drift = {"method": row["method"]}, row["drift"]
+    options, drift = {"method": method_at(row["method"], row["value"])}, row["drift"]
     if drift != "none":
         word, _, every = drift.partition(" ")
-        options["drift"] = project(int(every)) if every else word if word in DRIFTS else float(drift)
-    if row["method"] != "algebraic":
-        options[row["setting"]] = row["value"]
-    return options | ({"atol": row["value"] / 100} if row["setting"] == "rtol" else {})
+        options["drift"] = Project(int(every)) if every else word if word in DRIFTS else float(drift)
+    return options
 
 
 def _name(row):

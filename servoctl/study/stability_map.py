@@ -51,7 +51,7 @@ class StabilityMap:
 
         Parameters
         ----------
-        drift : None, "project", "minimal", float, `project(...)` or `poles(...)`, optional
+        drift : None, "project", "minimal", float, `Project(...)` or `Poles(...)`, optional
             As in `simulate`. Constraint violations count where poles govern them: without treatment they are neutral
             under every method, and projection or minimal coordinates remove them.
         """
@@ -118,7 +118,7 @@ class StabilityMap:
         ----------
         method : str
             One of `simulation.bounds.METHODS`. Of an adaptive method it is where step control settles.
-        drift : None, "project", "minimal", float, `project(...)` or `poles(...)`, optional
+        drift : None, "project", "minimal", float, `Project(...)` or `Poles(...)`, optional
             As in `simulate`.
         order : int, optional
             Of "Taylor" and "RadauIIA"; default: the map's own, and 5.

@@ -10,14 +10,14 @@ from servoctl.checks import as_span, positive, positives
 from servoctl.codegen.function import compiling_at_once
 from servoctl.errors import LimitExceeded, ServoError, SpecificationError, unknown
 from servoctl.methods.accuracy import motion_error, relative_error
-from servoctl.methods.drift import Minimal, Poles, Project, as_drift
-from servoctl.methods.tableaus import ORDERS
+from servoctl.methods.choice import METHODS, Adaptive, Algebraic, RungeKutta, Taylor, as_method
+from servoctl.methods.drift import MinimalCoordinates, Poles, Project, as_drift
 from servoctl.progress import progress_bar
-from servoctl.simulation import ALL_METHODS, consistent_state, simulate
-from servoctl.study.front import TradeOff
+from servoctl.simulation import consistent_state, simulate
+from servoctl.study.front import TradeOff, method_at
 from servoctl.study.table import machine
 
-METHODS = tuple(name for name in ALL_METHODS if name not in ("RK1", "RK2", "RK23"))  # those need too many steps
+MEASURED = tuple(name for name in METHODS if name not in ("RK1", "RK2", "RK23"))  # those need too many steps
 TOLERANCES = (1e-3, 1e-5, 1e-7, 1e-9, 1e-11, 1e-13)
 STEPS = tuple(5 * 4**k for k in range(7))  # of a fixed length, in the span
 SAMPLES, COMPARED = 51, 201  # instants that adaptive methods give, and at most so many of any run are compared
@@ -27,7 +27,7 @@ FEW = 20  # steps: a run that takes too long for fewer has lost its way, and tel
 TIME_CONSTANT = 50  # of the default poles, in the span
 
 
-def tradeoff(model, x0, t_span, methods=None, drift=None, *, rtol=TOLERANCES, step=None, seconds=0.3, progress=None):
+def tradeoff(model, x0, t_span, methods=None, drift=None, *, settings=None, seconds=0.3, progress=None):
     """Measure error and cost of methods, settings and treatments of drift on one motion.
 
     The reference is made here: the Taylor method of order 16 at a tolerance of 1e-15, or Newton's method at each
@@ -44,17 +44,16 @@ def tradeoff(model, x0, t_span, methods=None, drift=None, *, rtol=TOLERANCES, st
     t_span : (t0, t1)
         [s]
     methods : sequence of str, optional
-        Of those that `simulate` has; default: all but "RK1", "RK2" and "RK23".
+        Short forms of those that `simulate` has; default: all but "RK1", "RK2" and "RK23".
     drift : sequence, optional
         Treatments as `simulate` takes them; default: None, "project", "minimal" and poles at -50/(t1 - t0).
 
     Other arguments
 
-    rtol : sequence of float
-        Tolerances of the adaptive methods; atol is a hundredth.
-    step : sequence of float, optional
-        Steps of the methods of fixed step, and spacings of the instants of "algebraic" [s]; default: (t1 - t0)/5,
-        and each next one a quarter of the one before, down to (t1 - t0)/20,480.
+    settings : dict of str to sequence of float, optional
+        "rtol": tolerances of the adaptive methods, default 1e-3 to 1e-13; atol is a hundredth. "step": steps of the
+        methods of fixed step, and spacings of the instants of "algebraic" [s]; default (t1 - t0)/5, and each next one
+        a quarter of the one before, down to (t1 - t0)/20,480.
     seconds : float
         That one run may take. One that takes longer is ended, and finer settings are skipped if it had taken more
         than a few steps; their rows say so.
@@ -76,12 +75,7 @@ def tradeoff(model, x0, t_span, methods=None, drift=None, *, rtol=TOLERANCES, st
         For settings that are none.
     """
     t0, t1 = as_span(t_span)
-    steps = [abs(t1 - t0) / n for n in STEPS] if step is None else step
-    given = {
-        "rtol": positives("rtol", rtol, "Leave rtol out.", most=1.0),
-        "step": positives("step", steps, "Leave step out."),
-    }
-    settings = {name: np.ravel(values).tolist() for name, values in given.items()}
+    settings = _settings(settings or {}, abs(t1 - t0))
     limit = positive("seconds", seconds)
     drifts = (None, "project", "minimal", abs(t1 - t0) / TIME_CONSTANT) if drift is None else drift
     combinations = _combinations(model, methods, drifts if isinstance(drifts, (list, tuple)) else [drifts])
@@ -125,26 +119,26 @@ class Reference:
         self.model, self.start, self.span, self._known = model, x0, t_span, {}
         self.knots = [k for k in model.require_smooth((min(t_span), max(t_span))) if min(t_span) < k < max(t_span)]
         self.times = np.union1d(np.linspace(*t_span, SAMPLES), self.knots)
-        own = {"method": "Taylor", "drift": "project", "rtol": 1e-15, "atol": 1e-15, "order": 16}
-        checks = [{"method": "DOP853", "drift": "project", "rtol": 3e-14, "atol": 1e-15}]
-        checks += [{"method": "Taylor", "drift": "project", "rtol": 1e-14, "atol": 1e-14, "order": 12}]
-        self.options, checks = ({"method": "algebraic"}, checks[::-1]) if model.flat else (own, checks)
+        checks = [Adaptive("DOP853", 3e-14, 1e-15), Taylor(12, rtol=1e-14, atol=1e-14)]
+        self.method, self.drift = Taylor(16, rtol=1e-15, atol=1e-15), Project()
+        if model.flat:
+            self.method, self.drift, checks = Algebraic(), None, checks[::-1]
         self.told = self._verified(checks, seconds)
 
     def _verified(self, checks, seconds):
         """The agreement with the first other method that comes to the end in time."""
         exact = self.at(self.times)
         dense = np.union1d(np.linspace(*self.span, DENSE), self.knots)
-        for options in checks:
-            late = Deadline(10 * seconds)
+        for method in checks:
+            options = {"drift": Project(), "t_eval": self.times, "progress": Deadline(10 * seconds)}
             try:
-                run = _whole(simulate(self.model, self.start, self.span, t_eval=self.times, progress=late, **options))
+                run = _whole(simulate(self.model, self.start, self.span, method, **options))
             except ServoError as error:
                 failure = error
                 continue
             return {
-                "method": _said(self.options),
-                "verified by": _said(options),
+                "method": _said(self.method),
+                "verified by": _said(method),
                 "error": motion_error(self.model, run.jets, exact.jets),
                 "actuation": relative_error(actuation(run), actuation(exact)),
                 "energy": _energy_balance(self.at(dense), self.knots),
@@ -155,7 +149,8 @@ class Reference:
         """The run with samples at these times (N,) [s]."""
         key = times.tobytes()
         if key not in self._known:
-            self._known[key] = _whole(simulate(self.model, self.start, self.span, t_eval=times, **self.options))
+            run = simulate(self.model, self.start, self.span, self.method, drift=self.drift, t_eval=times)
+            self._known[key] = _whole(run)
         return self._known[key]
 
 
@@ -196,7 +191,7 @@ def _ladder(reference, method, treatment, settings, seconds):
         row = {"method": method, "drift": _label(treatment), "setting": name, "value": value, "failure": over}
         if not over:
             try:
-                row |= _measured(reference, _options(method, treatment, value), seconds)
+                row |= _measured(reference, method, treatment, value, seconds)
                 if not row["resolved"]:
                     over = f"skipped: {name} = {value:g} reaches what the reference is certain to"
                 elif row["seconds"] > seconds:
@@ -211,17 +206,18 @@ def _ladder(reference, method, treatment, settings, seconds):
         yield row
 
 
-def _measured(reference, options, seconds):
+def _measured(reference, name, treatment, value, seconds):
     """Errors, counts and time of one setting."""
     model, (t0, t1) = reference.model, reference.span
-    if options["method"] == "algebraic":
-        instants = np.linspace(t0, t1, 1 + round(abs(t1 - t0) / options.pop("step")))
-        options["t_eval"] = np.union1d(instants, reference.knots)
-    elif "step" not in options:
-        options["t_eval"] = reference.times
+    method, times = method_at(name, value), reference.times
+    if isinstance(method, Algebraic):
+        times = np.union1d(np.linspace(t0, t1, 1 + round(abs(t1 - t0) / value)), reference.knots)
+    elif isinstance(method, RungeKutta):
+        times = None
 
     def once():
-        return _whole(simulate(model, reference.start, reference.span, progress=Deadline(seconds), **options))
+        options = {"drift": treatment, "t_eval": times, "progress": Deadline(seconds)}
+        return _whole(simulate(model, reference.start, reference.span, method, **options))
 
     run, timed = once(), []
     for _ in range(TIMED):
@@ -278,11 +274,11 @@ def _energy_balance(run, knots):
 def _combinations(model, methods, drifts):
     """Pairs of method and treatment; default methods are those that the model can have."""
     if methods is None:
-        methods = METHODS if model.flat else [name for name in METHODS if name != "algebraic"]
+        methods = MEASURED if model.flat else [name for name in MEASURED if name != "algebraic"]
     methods = list(methods) if isinstance(methods, (list, tuple)) else [methods]
     for method in methods:
-        if method not in ALL_METHODS:
-            raise unknown(method, ALL_METHODS, "method")
+        if not (isinstance(method, str) and method in METHODS):
+            raise unknown(method, METHODS, "method")
     treatments = [as_drift(value) for value in drifts]
     for value in treatments:
         if isinstance(value, Poles) and not isinstance(value.values, float):
@@ -301,13 +297,18 @@ def _combinations(model, methods, drifts):
     return pairs
 
 
+def _settings(given, length):
+    """Values of "rtol" and "step", the latter for a span of some length [s]."""
+    for name in given:
+        if name not in ("rtol", "step"):
+            raise unknown(name, ("rtol", "step"), "setting")
+    rtol = positives("rtol", given.get("rtol", TOLERANCES), "Leave rtol out.", most=1.0)
+    step = positives("step", given.get("step", [length / n for n in STEPS]), "Leave step out.")
+    return {"rtol": np.ravel(rtol).tolist(), "step": np.ravel(step).tolist()}
+
+
 def _kind(method):
-    return "step" if method in ("algebraic", *ORDERS) else "rtol"
-
-
-def _options(method, treatment, value):
-    setting = {"rtol": value, "atol": value / 100} if _kind(method) == "rtol" else {"step": value}
-    return {"method": method, **({"drift": treatment} if treatment is not None else {}), **setting}
+    return "step" if isinstance(as_method(method), (Algebraic, RungeKutta)) else "rtol"
 
 
 def _label(treatment):
@@ -316,9 +317,10 @@ def _label(treatment):
         return f"{treatment.values:g}"
     if isinstance(treatment, Project):
         return "project" if treatment.every == 1 else f"project {treatment.every}"
-    return "minimal" if isinstance(treatment, Minimal) else "none"
+    return "minimal" if isinstance(treatment, MinimalCoordinates) else "none"
 
 
-def _said(options):
-    order = f" of order {options['order']}" if "order" in options else ""
-    return f"{options['method']}{order}" + (f" at {options['rtol']:g}" if "rtol" in options else "")
+def _said(method):
+    order = f" of order {method.order}" if isinstance(method, Taylor) else ""
+    return f"{method}{order}" + (f" at {method.rtol:g}" if hasattr(method, "rtol") else "")
+

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 import servoctl as sv
+from servoctl.methods.choice import as_method
 
 START = {"x": 0.0, "y": 0.0, "z": 0.0, "phi": 0.0, "theta": 0.0, "dphi": 1.0, "dtheta": 2.0}
 
@@ -30,7 +31,7 @@ def varies(values):
 
 def test_a_thousand_seconds_keep_energy_and_the_second_integral(wheel):
     model, start = wheel
-    run = sv.simulate(model, start, (0.0, 1000.0), method="Taylor", drift="project", rtol=1e-14, atol=1e-16)
+    run = sv.simulate(model, start, (0.0, 1000.0), method=sv.Taylor(rtol=1e-14, atol=1e-16), drift="project")
     assert varies(run["energy"]) < 1e-9 and varies(integral(run)) < 1e-9
     assert max(np.abs(run.residual[name]).max() for name in run.residual) < 1e-9
     assert run["dtheta"].min() > 0 and np.ptp(run["dphi"]) > 1.0  # periodic, not at rest
@@ -40,7 +41,7 @@ def test_phi_and_theta_rates_return_after_hundreds_of_periods(wheel):
     """The period, from the first crossings of φ' = 0 upwards, still holds at the end."""
     model, start = wheel
     t = np.append(np.linspace(0.0, 20.0, 4001), np.linspace(980.0, 1000.0, 4001))
-    run = sv.simulate(model, start, (0.0, 1000.0), method="Taylor", drift="project", rtol=1e-14, atol=1e-16, t_eval=t)
+    run = sv.simulate(model, start, (0.0, 1000.0), method=sv.Taylor(rtol=1e-14, atol=1e-16), drift="project", t_eval=t)
     crossings = [
         run.t[i] - run["dphi"][i] * (run.t[i + 1] - run.t[i]) / (run["dphi"][i + 1] - run["dphi"][i])
         for i in np.flatnonzero((run["dphi"][:-1] < 0) & (run["dphi"][1:] >= 0))
@@ -56,7 +57,7 @@ def test_phi_and_theta_rates_return_after_hundreds_of_periods(wheel):
 def test_a_million_fixed_steps(drift, most, wheel):
     model, start = wheel
     t = np.linspace(0.0, 100.0, 101)
-    run = sv.simulate(model, start, (0.0, 100.0), method="RK4", drift=drift, step=1e-4, t_eval=t)
+    run = sv.simulate(model, start, (0.0, 100.0), method=sv.RungeKutta(4, step=1e-4), drift=drift, t_eval=t)
     assert run.counters["steps"] == 1_000_000
     levels = {name: np.abs(run.residual[name]).max(axis=1) for name in run.residual}
     assert {name: len(level) for name, level in levels.items()} == {"x_c": 2, "y_c": 2, "string": 3}
@@ -69,9 +70,9 @@ def test_a_million_fixed_steps(drift, most, wheel):
 def test_there_and_back(method, drift, wheel):
     model, start = wheel
     options = {"step": 1e-2} if method == "RK8" else {"rtol": 1e-10, "atol": 1e-12}
-    there = sv.simulate(model, start, (0.0, 3.0), method=method, drift=drift, **options)
+    there = sv.simulate(model, start, (0.0, 3.0), method=as_method(method, **options), drift=drift)
     end = there.jets[: len(model.state_names), -1]
-    back = sv.simulate(model, end, (3.0, 0.0), method=method, drift=drift, **options)
+    back = sv.simulate(model, end, (3.0, 0.0), method=as_method(method, **options), drift=drift)
     assert back.t[-1] == 0.0
     assert back.jets[: len(model.state_names), -1] == pytest.approx(start.values, abs=1e-7)
 
@@ -110,7 +111,7 @@ def test_a_start_of_other_parameters_is_refused(wheel):
 
 def test_rounding_of_a_long_run_is_no_reason_to_refuse_its_end(wheel):
     model, start = wheel
-    run = sv.simulate(model, start, (0.0, 20.0), method="RK4", step=1e-2)
+    run = sv.simulate(model, start, (0.0, 20.0), method=sv.RungeKutta(4, step=1e-2))
     off = max(np.abs(run.residual[name][:, -1]).max() for name in run.residual)
     again = sv.simulate(model, run.jets[: len(model.state_names), -1], (20.0, 21.0))
     assert off > 1e-10 and again.success

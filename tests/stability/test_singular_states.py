@@ -11,6 +11,7 @@ from scipy.optimize import brentq
 
 import servoctl as sv
 from servoctl.gallery import overhead_crane, passive_arm
+from servoctl.methods.choice import as_method
 
 # the crane whose load is dropped -------------------------------------------------------------------------------------
 
@@ -74,13 +75,15 @@ def test_the_wheel_stops_in_every_formulation(method, drift, gallery_model):
     """The linear program passes the instant, the squared one ends there; neither goes on along the other branch."""
     options = {"step": 1e-3} if method == "RK4" else {"rtol": 1e-10, "atol": 1e-12}
     linear = gallery_model("appell-hamel")
-    run = sv.simulate(linear, linear.start(z=0.0, **WHEEL), (0.0, 1.0), method=method, drift=drift, **options)
+    run = sv.simulate(
+        linear, linear.start(z=0.0, **WHEEL), (0.0, 1.0), method=as_method(method, **options), drift=drift
+    )
     assert run["dphi"][-1] == pytest.approx(-0.4458690776, abs=1e-6)
     assert run["x"][-1] == pytest.approx(-0.1974199455, abs=1e-6)
     squared = gallery_model("appell-hamel-squared")
     start = squared.start(guess={"dx": 0.5}, **WHEEL)
     with pytest.raises(sv.SingularProgram) as caught:
-        sv.simulate(squared, start, (0.0, 1.0), method=method, drift=drift, **options)
+        sv.simulate(squared, start, (0.0, 1.0), method=as_method(method, **options), drift=drift)
     assert abs(caught.value.details["t"] - WHEEL_STOPS) < 5e-3
     assert "dphi" in caught.value.details["zero"]
 
@@ -117,7 +120,7 @@ def test_a_curvature_ends_where_the_speed_does(method):
     start = model.start(x=0.0, y=0.0, dx=2.0, dy=0.0)
     options = {"step": 1e-3} if method == "RK4" else {"rtol": 1e-10, "atol": 1e-12}
     with pytest.raises((sv.SingularProgram, sv.IntegrationStopped)) as caught:
-        sv.simulate(model, start, (0.0, 2.0), method=method, **options)
+        sv.simulate(model, start, (0.0, 2.0), method=as_method(method, **options))
     lost, run = reference.t_events[0][0], caught.value.run
     assert 0.9 * lost < run.t[-1] < lost + 2e-3
     early = run.t < 0.9 * lost
@@ -135,7 +138,7 @@ def test_the_passive_arm_stops_at_its_lost_relative_degree(method, drift):
     model = sv.derive(*passive_arm(0.5))
     options = {"step": 2e-3} if method == "RK8" else {}
     with pytest.raises(sv.SingularProgram) as caught:
-        sv.simulate(model, model.start(q2=0.0, dq2=0.0), (0.0, 2.0), method=method, drift=drift, **options)
+        sv.simulate(model, model.start(q2=0.0, dq2=0.0), (0.0, 2.0), method=as_method(method, **options), drift=drift)
     run = caught.value.run
     assert 30.0 < np.rad2deg(np.abs(run["q2"][-1])) < 48.1897 + 0.01
     assert 0.0 <= caught.value.details["t"] - run.t[-1] < 0.02  # the last degrees take some milliseconds

@@ -8,6 +8,7 @@ from conftest import pendulum
 
 import servoctl as sv
 from servoctl.gallery import spiral
+from servoctl.methods.choice import as_method
 
 UNITS = (1e-6, 1e6)  # units per metre: megametres to micrometres
 LENGTHS = {"a": 1, "b": 1, "rho": 1, "g": 1, "I_x": 2, "I_y": 2}  # of the Appell-Hamel mechanism, by power of length
@@ -24,7 +25,7 @@ def test_appell_hamel_in_any_unit(method, drift, unit, gallery_model):
     scaled = model.with_parameters(**{name: numbers[name] * unit**power for name, power in LENGTHS.items()})
     start = scaled.start(x=0.0, y=0.0, z=0.0, phi=0.0, theta=0.0, dphi=1.0, dtheta=2.0)
     options = {"step": 1e-3} if method == "RK4" else {"rtol": 1e-12, "atol": 1e-14 * min(unit, 1.0)}
-    run = sv.simulate(scaled, start, (0.0, 2.0), method=method, drift=drift, t_eval=[1.0, 2.0], **options)
+    run = sv.simulate(scaled, start, (0.0, 2.0), method=as_method(method, **options), drift=drift, t_eval=[1.0, 2.0])
     reference = cf.appell_hamel(run.t)
     for name in ("x", "y", "z"):
         assert run[name] / unit == pytest.approx(reference[name], abs=1e-9)
@@ -68,10 +69,12 @@ def test_a_pendulum_goes_round_in_any_unit(unit, guess):
     assert model.free == 2 and "2 free" in repr(model)
     start = model.start(x=0.0, y=-unit, dx=7.0 * unit)
     reference = pendulum(1.0, guess)
-    plain = sv.simulate(reference, reference.start(x=0.0, y=-1.0, dx=7.0), (0.0, 2.0), rtol=1e-12, atol=1e-14)
+    plain = sv.simulate(
+        reference, reference.start(x=0.0, y=-1.0, dx=7.0), (0.0, 2.0), sv.Adaptive(rtol=1e-12, atol=1e-14)
+    )
     for method in ("DOP853", "Taylor", "RadauIIA", "RK4"):
         options = {"step": 1e-3} if method == "RK4" else {"rtol": 1e-12, "atol": 1e-14 * unit}
-        run = sv.simulate(model, start, (0.0, 2.0), method=method, t_eval=plain.t, **options)
+        run = sv.simulate(model, start, (0.0, 2.0), method=as_method(method, **options), t_eval=plain.t)
         assert run.success and run.counters["pivot_changes"] > 3
         for name in ("x", "y"):
             assert run[name] / unit == pytest.approx(plain[name], abs=1e-7)
@@ -100,7 +103,7 @@ def test_a_spiral_of_order_16():
     straight = {f"d{k}{axis}": 0.0 for k in range(2, 16) for axis in "xy"}
     start = model.start(x=0.0, y=0.0, dx=1.0, dy=0.0, guess=straight)
     assert model.free == 18
-    run = sv.simulate(model, start, (0.0, 2.0), rtol=1e-7, atol=1e-9, t_eval=np.linspace(0, 2, 9))
+    run = sv.simulate(model, start, (0.0, 2.0), sv.Adaptive(rtol=1e-7, atol=1e-9), t_eval=np.linspace(0, 2, 9))
     reference = cf.spiral(run.t, 16)
     for name in ("x", "y", "dx", "dy"):
         assert np.abs(run[name] - reference[name]).max() < 1e-7
@@ -115,7 +118,7 @@ STEP = 1e-2  # s
 def test_poles_within_the_stability_of_rk4_keep_the_motion(speed, gallery_model):
     model = gallery_model("appell-hamel")
     start = model.start(x=0.0, y=0.0, z=0.0, phi=0.0, theta=0.0, dphi=1.0, dtheta=2.0)
-    run = sv.simulate(model, start, (0.0, 2.0), method="RK4", step=STEP, drift=sv.poles(STEP / speed))
+    run = sv.simulate(model, start, (0.0, 2.0), method=sv.RungeKutta(4, step=STEP), drift=sv.Poles(STEP / speed))
     assert np.abs(run["theta"] - cf.appell_hamel(run.t)["theta"]).max() < 1e-6
     assert np.abs(run.residual["string"][0]).max() < 1e-6
 
@@ -126,7 +129,7 @@ def test_poles_beyond_it_are_told(speed, gallery_model):
     model = gallery_model("appell-hamel")
     start = model.start(x=0.0, y=0.0, z=0.0, phi=0.0, theta=0.0, dphi=1.0, dtheta=2.0)
     with pytest.raises(sv.ServoError) as caught:
-        sv.simulate(model, start, (0.0, 10.0), method="RK4", step=STEP, drift=sv.poles(STEP / speed))
+        sv.simulate(model, start, (0.0, 10.0), method=sv.RungeKutta(4, step=STEP), drift=sv.Poles(STEP / speed))
     assert "poles" in str(caught.value)
 
 
@@ -135,7 +138,12 @@ def test_an_implicit_method_bears_any_poles(speed, gallery_model):
     model = gallery_model("appell-hamel")
     start = model.start(x=0.0, y=0.0, z=0.0, phi=0.0, theta=0.0, dphi=1.0, dtheta=2.0)
     run = sv.simulate(
-        model, start, (0.0, 2.0), method="Radau", drift=sv.poles(STEP / speed), rtol=1e-8, atol=1e-10, t_eval=[1.0, 2.0]
+        model,
+        start,
+        (0.0, 2.0),
+        method=sv.Adaptive("Radau", rtol=1e-8, atol=1e-10),
+        drift=sv.Poles(STEP / speed),
+        t_eval=[1.0, 2.0],
     )
     assert run["theta"] == pytest.approx(cf.appell_hamel(run.t)["theta"], abs=1e-6)
     assert np.abs(run.residual["string"][0]).max() < 1e-12
