@@ -50,12 +50,11 @@ from servoctl.spec import (
 )
 from servoctl.study.cases import grid, monte_carlo
 from servoctl.study.close_many import Batch, close_many
-from servoctl.study.front import TradeOff
 from servoctl.study.load import load_study
 from servoctl.study.stability_map import StabilityMap, stability
 from servoctl.study.sweep import merge, sweep
 from servoctl.study.table import Study
-from servoctl.study.tradeoff import tradeoff
+from servoctl.study.tradeoff import TradeOff, tradeoff
 from servoctl.verification import Verification, verify
 
 __version__ = "0.1.0"

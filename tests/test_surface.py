@@ -24,7 +24,7 @@ LAYERS = (
 )  # fmt: skip
 WITHOUT_CASADI = ("study", "figures", "interop", "shell")
 LATE = ("scipy", "matplotlib", "control", "tqdm", "xarray", "dask")
-MOST_LINES, MOST_IN_A_FUNCTION, MOST_IN_A_REPR = 450, 80, 12
+MOST_IN_A_FUNCTION, MOST_IN_A_REPR = 80, 12
 
 
 def relative(path):
@@ -218,9 +218,7 @@ def test_importing_servoctl_loads_no_heavy_package():
 
 @own_files
 def test_a_file_stays_readable(path):
-    text = path.read_text()
-    assert len(text.splitlines()) <= MOST_LINES
-    tree = ast.parse(text)
+    tree = ast.parse(path.read_text())
     for node in ast.walk(tree):
         if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
             length = node.end_lineno - node.lineno + 1

@@ -14,9 +14,9 @@ from servoctl.methods.accuracy import motion_error
 from servoctl.methods.choice import METHODS as ALL_METHODS
 from servoctl.methods.choice import as_method
 from servoctl.shell.main import main
-from servoctl.study.front import TradeOff
 from servoctl.study.load import load_study
 from servoctl.study.table import Study
+from servoctl.study.tradeoff import TradeOff
 
 SPAN = (0.0, 1.0)
 METHODS = ("Taylor", "DOP853", "RK4", "BDF")
@@ -164,7 +164,7 @@ def test_the_fastest_within_an_error_and_the_best_within_a_time():
     assert made.recommend(error=1e-12)["method"].rtol == 1e-4
     with pytest.raises(LimitExceeded, match="error=1e-14.*certain to 1e-12 only.*error 1e-12 in 1 s"):
         made.recommend(error=1e-14)  # what lies below the reference's uncertainty is not known
-    with pytest.raises(LimitExceeded, match="seconds=1e-05 was asked.*rtol 1: error 0.01 in 0.001 s"):
+    with pytest.raises(LimitExceeded, match="seconds=1e-05 was given.*rtol 1: error 0.01 in 0.001 s"):
         made.recommend(seconds=1e-5)
     with pytest.raises(LimitExceeded, match="every run failed"):
         synthetic([np.nan], [np.nan]).recommend(error=1.0)
@@ -287,7 +287,7 @@ def test_the_command_keeps_what_was_measured_where_nothing_reaches_it(tmp_path, 
     monkeypatch.chdir(tmp_path)
     line = "tradeoff appell-hamel --t-span 0 0.5 --method RK4 --drift none --out here --seconds 1e-9"
     assert main(line.split()) == 2
-    assert "seconds=1e-09 was asked for" in capsys.readouterr().err
+    assert "seconds=1e-09 was given" in capsys.readouterr().err
     assert (tmp_path / "here" / "tradeoff.csv").exists() and (tmp_path / "here" / "report.txt").exists()
 
 
