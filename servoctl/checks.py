@@ -133,13 +133,13 @@ def positive(name, value):
     return number
 
 
-def positives(name, given, do, fewest=1, most=np.inf):
+def positives(name, values, do, fewest=1, most=np.inf):
     """Positive finite numbers as an array, from a number or an array-like.
 
     Parameters
     ----------
     name : str
-    given : float or array-like
+    values : float or array-like
     do : str
         What the message suggests.
     fewest : int
@@ -147,13 +147,13 @@ def positives(name, given, do, fewest=1, most=np.inf):
         The largest number allowed.
     """
     try:
-        numbers = np.asarray(given, dtype=float)
+        numbers = np.asarray(values, dtype=float)
     except (TypeError, ValueError):
         numbers = np.zeros(1)
     if numbers.size < fewest or not np.all(np.isfinite(numbers) & (numbers > 0) & (numbers <= most)):
         count = "It is a positive number, or several" if fewest == 1 else f"It is {fewest} positive numbers or more"
         bound = "" if most == np.inf else f", at most {most:g}"
-        raise SpecificationError(f"{name}={given!r} was given.", f"{count}{bound}.", do=do, name=name, value=given)
+        raise SpecificationError(f"{name}={values!r} was given.", f"{count}{bound}.", do=do, name=name, value=values)
     return numbers
 
 

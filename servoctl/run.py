@@ -10,7 +10,7 @@ from servoctl import archive
 from servoctl.errors import SpecificationError, unknown
 
 STENCIL = 9  # samples of the polynomial through which an extremum is refined: error of order h^9
-ROUNDING = 1e-14  # of the values beside it: an extremum between samples that is no further from one is that sample
+AS_SAMPLED = 1e-14  # of the values beside it: an extremum between samples that is no further from one is that sample
 FACTS = ("method", "drift", "counters", "success", "status", "message", "knots", "jet_names")  # of a saved run
 
 
@@ -93,7 +93,7 @@ class Run:
             if f.n_x > len(self.jets):
                 highest = (f.n_x - model.nq) // model.n
                 raise SpecificationError(
-                    f"{', '.join(names)} {'was' if len(names) == 1 else 'were'} asked for of a run with jets up to "
+                    f"{', '.join(names)} {'is' if len(names) == 1 else 'are'} not in a run with jets up to "
                     f"order {(len(self.jets) - model.nq) // model.n}.",
                     f"These derivatives in time follow from jets up to order {highest}.",
                     nearest=f"simulate(..., method=sv.Taylor(jets={highest})).",
@@ -143,7 +143,7 @@ class Run:
         low, high = min(self.t[0], self.t[-1]), max(self.t[0], self.t[-1])
         if not low - 1e-12 * (1 + abs(low)) <= t <= high + 1e-12 * (1 + abs(high)):
             raise SpecificationError(
-                f"t = {t:g} s was asked for.", f"The run covers {low:g} to {high:g} s.", do="Ask for a time within."
+                f"t = {t:g} s was given.", f"The run covers {low:g} to {high:g} s.", do="Give a time within."
             )
         if self.model is None:
             raise SpecificationError(
@@ -217,7 +217,7 @@ class Run:
             for root in polynomial.deriv().roots():
                 if abs(root.imag) < 1e-9 and min([*neighbours, 0.0]) <= root.real <= max([*neighbours, 0.0]):
                     value = float(polynomial(root.real))
-                    if sign * (value - best[1]) > ROUNDING * np.abs(values[window]).max():
+                    if sign * (value - best[1]) > AS_SAMPLED * np.abs(values[window]).max():
                         best = (float(centre + root.real * width), value)
         return best
 

@@ -12,7 +12,8 @@ from servoctl.gallery import gallery, mass_on_car
 from servoctl.methods.bounds import largest_explicit
 from servoctl.methods.choice import as_method
 from servoctl.methods.tableaus import ORDERS
-from servoctl.study.stability_map import METHODS, stability
+from servoctl.study.stability_map import MAPPED as METHODS
+from servoctl.study.stability_map import stability
 
 DOC = Path(__file__).parents[1] / "docs" / "servo_dae.md"
 

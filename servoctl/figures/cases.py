@@ -5,7 +5,7 @@ import numpy as np
 from servoctl.errors import SpecificationError
 from servoctl.figures import style
 
-MOST = 4  # results in one figure
+MOST_RESULTS = 4  # results in one figure
 SHARES = {5: "--", 50: "-", 95: ":"}  # percentiles
 
 
@@ -39,7 +39,7 @@ def sweep(study, names=None, against=None, units=None):
         raise SpecificationError(f"A {kind} was given.", "The figure is that of a sweep, from sv.sweep or sv.merge.")
     parameters = [name for name in study.meta["parameters"] if _varies(study, name)]
     results = [name for name in study.columns if name not in ("case", *study.meta["parameters"])]
-    names = [name for name in results if _varies(study, name)][:MOST] if names is None else list(names)
+    names = [name for name in results if _varies(study, name)][:MOST_RESULTS] if names is None else list(names)
     if not names:
         raise SpecificationError(
             f"Of {len(study)} rows no result varies.",

@@ -64,24 +64,24 @@ def _lost(ax, run):
 
 def _errors(run, units):
     """(label, {name: values}) of each panel of errors."""
-    found = []
+    groups = []
     program = {n: v[0] for n, v in run.residual.items() if n not in run.plant.constraint_names()}
     if program:
-        found.append(("residuals, SI", program))
-    groups = {}
+        groups.append(("residuals, SI", program))
+    by_unit = {}
     for name in run.plant.mechanism.q.names:
         if name in run.error:
-            groups.setdefault(units.get(name, ""), {})[name] = run.error[name]
-    return found + [(label("off the plan", unit), group) for unit, group in groups.items()]
+            by_unit.setdefault(units.get(name, ""), {})[name] = run.error[name]
+    return groups + [(label("off the plan", unit), errors) for unit, errors in by_unit.items()]
 
 
 def _input(ax, run, name, unit):
     """What an actuator was given, what the plan has and the law asked for, and its limits."""
     if run.plan is not None:
         ax.plot(*run.planned(name), "--", color="black", linewidth=0.9, zorder=3, label="plan")
-    given, asked = run.input[name], run.command[name]
-    if not np.array_equal(given, asked):
-        ax.plot(run.t, asked, color=COLOURS[1], linewidth=0.7, drawstyle="steps-post", label="command")
+    given, command = run.input[name], run.command[name]
+    if not np.array_equal(given, command):
+        ax.plot(run.t, command, color=COLOURS[1], linewidth=0.7, drawstyle="steps-post", label="command")
     ax.plot(run.t, given, color=COLOURS[0], linewidth=1.2, drawstyle="steps-post", label="input")
     low, high = run.plant.limits.get(name, (-np.inf, np.inf))
     met = [limit for limit in (low, high) if np.isfinite(limit)]

@@ -27,8 +27,8 @@ def coordinates(run):
 
 def _antiderivative(name, names):
     """(q, k) of the k-th derivative of a signal, or None."""
-    found = re.fullmatch(r"d(\d*)(.+)", name)
-    return (found[2], int(found[1] or 1)) if found and found[2] in names else None
+    match = re.fullmatch(r"d(\d*)(.+)", name)
+    return (match[2], int(match[1] or 1)) if match and match[2] in names else None
 
 
 def planes(run):
@@ -36,9 +36,9 @@ def planes(run):
     outputs = list(run.model.outputs) if run.model is not None else []
     groups = {}
     for name in [*outputs, *coordinates(run)]:
-        found = re.fullmatch(r"(.*_)?([xyzXYZ])(_.*|\d*)", name)
-        if found:
-            groups.setdefault((found[2].islower(), found[1], found[3]), []).append(name)
+        match = re.fullmatch(r"(.*_)?([xyzXYZ])(_.*|\d*)", name)
+        if match:
+            groups.setdefault((match[2].islower(), match[1], match[3]), []).append(name)
     return [names for key, names in sorted(groups.items(), key=lambda group: group[0][0]) if len(names) > 1]
 
 
@@ -56,8 +56,8 @@ def unit_of(name, units):
         return "J"
     if name.startswith("reaction_"):
         return {"m": "N", "rad": "N m"}.get(units.get(name.removeprefix("reaction_")), "")
-    found = _antiderivative(name, units)
-    return "" if found is None else units[found[0]] + ("/s" if found[1] == 1 else f"/s$^{{{found[1]}}}$")
+    base = _antiderivative(name, units)
+    return "" if base is None else units[base[0]] + ("/s" if base[1] == 1 else f"/s$^{{{base[1]}}}$")
 
 
 def label_of(names, units):

@@ -11,11 +11,11 @@ from servoctl.errors import SpecificationError
 from servoctl.figures.names import along_one_axis, coordinates, efforts, label_of, planes, unit_of
 from servoctl.figures.style import BESIDE, COLOURS, STYLES, look, panels
 
-FLOOR = 1e-18  # of residuals on a logarithmic scale, so that exact zeros are seen
+LEAST = 1e-18  # of residuals on a logarithmic scale, so that exact zeros are seen
 BINS = 100  # of time, in each of which a residual is drawn by its greatest magnitude: rounding stays a band
 LAST, UNBOUNDED = 0.01, 2.0  # a signal that doubles its range in the last hundredth of a stopped run leaves the frame
-NEGLIGIBLE = 1e-9  # variation relative to the largest value of the same unit: rounding, not filled with it
-ROUNDING = 1e-14  # magnitude relative to the largest value of any unit, in SI: rounding, too
+FLAT = 1e-9  # variation relative to the largest value of the same unit: rounding, not filled with it
+VISIBLE = 1e-14  # magnitude relative to the largest value of any unit, in SI: rounding, too
 
 
 def path(run, x=None, y=None, ax=None, units=None):
@@ -150,16 +150,16 @@ def residuals(run, ax=None):
     ax = panels(1, 5.0)[0] if ax is None else ax
     bins = np.array_split(np.arange(len(run.t)), min(BINS, len(run.t)))
     t = np.array([run.t[rows].mean() for rows in bins])
-    levels, top = 0, FLOOR
+    levels, top = 0, LEAST
     for i, name in enumerate(run.residual):
-        values = np.maximum(np.abs(run.residual[name]), FLOOR)
+        values = np.maximum(np.abs(run.residual[name]), LEAST)
         levels = max(levels, len(values))
         for j, row in enumerate(values):
             worst = np.array([row[rows].max() for rows in bins])
-            top = max(top, worst[np.isfinite(worst)].max(initial=FLOOR))
+            top = max(top, worst[np.isfinite(worst)].max(initial=LEAST))
             ax.plot(t, worst, STYLES[j % len(STYLES)], color=COLOURS[i % len(COLOURS)], linewidth=1.0 if j else 1.8)
     ax.set_yscale("log")
-    ax.set(xlabel="t [s]", ylabel="|residual|, SI (1e-18: zero)", ylim=(FLOOR / 2, max(10 * top, 1e-12)))
+    ax.set(xlabel="t [s]", ylabel="|residual|, SI (1e-18: zero)", ylim=(LEAST / 2, max(10 * top, 1e-12)))
     ax.grid(alpha=0.3)
     _instants(run, [ax])
     _end(run, [ax])
@@ -217,8 +217,7 @@ def _over_time(run, groups, ax, units, extrema=False):
         raise SpecificationError(
             f"{len(axes)} Axes were given.",
             f"There are {len(groups)} panels: {'; '.join(', '.join(group) for group in groups)}.",
-            nearest="One Axes, which takes all of them.",
-            do="Give as many Axes as panels, or one.",
+            do="Give as many Axes as panels, or one, which takes all.",
         )
     largest = _largest(run, [name for group in groups for name in group], units)
     for panel, group in zip(axes, groups, strict=True):
@@ -226,7 +225,7 @@ def _over_time(run, groups, ax, units, extrema=False):
         for i, name in enumerate(group):
             panel.plot(run.t, run[name], label=label_of([name], units if mixed else {}), **look(i))
         of_unit = max(largest[unit_of(name, units)] for name in group)
-        _frame(panel, run, group, max(largest.values()) if of_unit < ROUNDING * max(largest.values()) else of_unit)
+        _frame(panel, run, group, max(largest.values()) if of_unit < VISIBLE * max(largest.values()) else of_unit)
         panel.set_ylabel(label_of(group, units))
         panel.grid(alpha=0.3)
         if len(group) > 1:
@@ -242,19 +241,19 @@ def _over_time(run, groups, ax, units, extrema=False):
 
 def _largest(run, names, units):
     """Greatest magnitude among the signals of each unit."""
-    found = {}
+    largest = {}
     for name in names:
         values = np.abs(run[name])
         unit = unit_of(name, units)
-        found[unit] = max(found.get(unit, 0.0), values[np.isfinite(values)].max(initial=0.0))
-    return found
+        largest[unit] = max(largest.get(unit, 0.0), values[np.isfinite(values)].max(initial=0.0))
+    return largest
 
 
 def _frame(ax, run, names, largest):
     """Keep rounding from filling the panel, and what grows without bound before a stop from flattening the rest."""
     values = np.concatenate([run[name] for name in names])
     values = values[np.isfinite(values)]
-    if values.size and np.ptp(values) < NEGLIGIBLE * largest:
+    if values.size and np.ptp(values) < FLAT * largest:
         middle = (values.min() + values.max()) / 2
         ax.set_ylim(middle - largest / 10, middle + largest / 10)
     if run.success or len(run.t) < 3:

@@ -4,14 +4,14 @@ import numpy as np
 
 from servoctl.figures import style
 
-STEPS, POLES, LINE = 120, 81, 3  # of the shaded map; every third pole for lines
+SHADED_STEPS, SHADED_POLES, LINE = 120, 81, 3  # of the shaded map; every third pole for lines
 LEVELS = (0.0, 0.5, 0.8, 0.9, 0.95, 1.0, 1.05, 1.2, 1.5, 2.0)  # of the radius: fine where stability ends
 
 
-def draw(stability, method, poles, methods):
+def draw_stability(stability, method, poles, methods):
     """Largest steps of several methods over the poles; spectral radius of one method over poles and steps."""
     length = abs(stability.t[-1] - stability.t[0])
-    poles = np.geomspace(0.3, 300.0, POLES) * 10 / length if poles is None else poles
+    poles = np.geomspace(0.3, 300.0, SHADED_POLES) * 10 / length if poles is None else poles
     figure, ((left, right),) = style.figure(4.4, columns=2, sharex=True)
     _largest_steps(stability, left, poles, methods)
     _radius(stability, right, method, poles, left.get_ylim())
@@ -34,7 +34,7 @@ def _largest_steps(stability, ax, poles, methods):
 def _radius(stability, ax, method, poles, limits):
     from matplotlib.colors import BoundaryNorm
 
-    steps = np.geomspace(*limits, STEPS)
+    steps = np.geomspace(*limits, SHADED_STEPS)
     radius = np.array([[stability.radius(method, h, 1.0 / pole).max() for pole in poles] for h in steps])
     norm = BoundaryNorm(LEVELS, 256)
     shade = ax.contourf(poles, steps, np.minimum(radius, LEVELS[-1]), LEVELS, cmap="RdBu_r", norm=norm)

@@ -13,7 +13,7 @@ LOOKS = {  # of a treatment of drift: line, marker, words
 FRONT, UNRESOLVED, GREY = "#BBBBBB", "#EEEEEE", "#555555"
 
 
-def draw(study, ax, cost, title):
+def draw_tradeoff(study, ax, cost, title):
     """Draw errors over a cost, a line for each method and treatment, with the Pareto front.
 
     Parameters

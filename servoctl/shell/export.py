@@ -7,7 +7,7 @@ from servoctl.shell.options import MANY, SCENE_HELP, assignment, by_name
 from servoctl.shell.scenes import find_scene
 
 
-def add(commands):
+def add_export(commands):
     """Add the command to the subparsers of the command line."""
     export = commands.add_parser("export-c", help="the feedforward and residuals of a scene as one C file and header")
     export.add_argument("scene", metavar="NAME_OR_FILE", help=SCENE_HELP)

@@ -13,7 +13,7 @@ import servoctl as sv
 from servoctl.errors import ServoError
 from servoctl.study.table import machine
 
-WIDTH = 120  # columns of what is printed
+COLUMNS = 120  # columns of what is printed
 FILES = ("run.npz", "summary.json", "report.txt", "path.png", "coordinates.png", "actuation.png", "residuals.png")
 LOOP_FILES = ("closed_loop.npz", "closed_loop.png")
 
@@ -31,11 +31,7 @@ class Report:
 
     def say(self, value):
         """Print a value, long lines wrapped, and remember it."""
-        lines = (
-            textwrap.fill(line, WIDTH, subsequent_indent="    ", break_on_hyphens=False) if len(line) > WIDTH else line
-            for line in str(value).splitlines()
-        )
-        self.texts.append("\n".join(lines) + "\n")
+        self.texts.append("\n".join(_wrapped(line, "    ") for line in str(value).splitlines()) + "\n")
         try:
             print(self.texts[-1], flush=True)
         except BrokenPipeError:  # a reader that left, such as head, does not end the computation
@@ -45,7 +41,13 @@ class Report:
 def complain(*texts):
     """Print texts to stderr in lines of readable length."""
     for text in texts:
-        print(textwrap.fill(text, WIDTH, subsequent_indent="  ", break_on_hyphens=False), file=sys.stderr)
+        print(_wrapped(text, "  "), file=sys.stderr)
+
+
+def _wrapped(line, indent):
+    if len(line) <= COLUMNS:
+        return line
+    return textwrap.fill(line, COLUMNS, subsequent_indent=indent, break_on_hyphens=False)
 
 
 class Folder:
@@ -210,11 +212,11 @@ def _worst(values):
 
 def _structure(model):
     try:
-        found = model.structure()
+        structure = model.structure()
     except ServoError as error:
         return {"index": None, "message": str(error)}
     names = ("index", "relative_degree", "decoupling_rank", "zeros_at_infinity", "essential_orders", "margin")
-    return {name: getattr(found, name) for name in names}
+    return {name: getattr(structure, name) for name in names}
 
 
 def _extrema(run, name):

@@ -11,7 +11,7 @@ GIVEN = ("machine", "law", "integral", "rate", "delay", "noise", "seed", "limit"
 RATE = 100.0  # Hz
 
 
-def add(parser):
+def add_loop(parser):
     """Add the options of the closed loop to a command.
 
     Parameters

@@ -56,8 +56,8 @@ def _parser():
     report = commands.add_parser("report", help="what is done to a specification, and its structure; no simulation")
     report.add_argument("scene", metavar="NAME_OR_FILE", help="a gallery name, a .py file, or the folder of a run")
     report.set_defaults(command=_report)
-    for module in (run, tradeoff, sweep, export):
-        module.add(commands)
+    for add in (run.add_run, tradeoff.add_tradeoff, sweep.add_sweep, export.add_export):
+        add(commands)
     return parser
 
 

@@ -12,7 +12,7 @@ from servoctl.shell.options import METHODS_HELP, add_motion, drift, samples
 from servoctl.shell.scenes import find_scene
 
 
-def add(commands):
+def add_run(commands):
     """Add the command to the subparsers of the command line."""
     run = commands.add_parser("run", help="derive, simulate, verify; leave figures and numbers in a folder")
     add_motion(run)
@@ -26,7 +26,7 @@ def add(commands):
     run.add_argument("--samples", type=samples, metavar="N", help="equally spaced samples of the run")
     run.add_argument("--no-verify", action="store_true", help="leave out the check against the full mechanism")
     run.add_argument("--no-figures", action="store_true", help="leave out the figures")
-    loop.add(run)
+    loop.add_loop(run)
     run.set_defaults(command=_run)
 
 

@@ -17,7 +17,7 @@ from servoctl.study.sweep import require_fitting
 COMPUTING = ("vary", "monte_carlo", "draw", "seed", "t_span", "method", "workers", "shard", "resume")
 
 
-def add(commands):
+def add_sweep(commands):
     """Add the command to the subparsers of the command line."""
     sweep = commands.add_parser("sweep", help="many cases of a scene, on several processes or machines, in one table")
     scene = "a gallery name, or a .py file with scene() or case(**parameters)"
@@ -84,8 +84,7 @@ def _computed(args, folder):
         raise SpecificationError(
             f"{checkpoint} holds the finished cases of a sweep that did not end.",
             "Work that was done is not thrown away.",
-            nearest="--resume goes on where it ended.",
-            do="Give --resume, another folder by --out, or remove the file.",
+            do="Give --resume to go on where it ended, another folder by --out, or remove the file.",
             checkpoint=str(checkpoint),
         )
     options = {"seed": args.seed if random else None, "checkpoint": checkpoint, "shard": args.shard}

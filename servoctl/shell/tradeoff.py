@@ -9,7 +9,7 @@ from servoctl.shell.scenes import find_scene
 FILES = ("tradeoff.npz", "tradeoff.csv", "tradeoff.png", "report.txt", "summary.json")
 
 
-def add(commands):
+def add_tradeoff(commands):
     """Add the command to the subparsers of the command line."""
     trade = commands.add_parser("tradeoff", help="measure what each method and treatment of drift costs and reaches")
     add_motion(trade)

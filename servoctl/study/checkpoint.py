@@ -93,7 +93,7 @@ def _rows(path, lines, key):
     """The rows of a checkpoint, if it belongs to the sweep with this identity."""
     try:
         header, *rows = (json.loads(line) for line in lines) if lines else ({"identity": key},)
-        found = header["identity"]
+        identity_there = header["identity"]
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise SpecificationError(
             f"{path} is no checkpoint of a sweep.",
@@ -101,12 +101,12 @@ def _rows(path, lines, key):
             do="Choose another path; the file was not changed.",
             path=str(path),
         ) from error
-    if found != key:
+    if identity_there != key:
         raise SpecificationError(
             f"The checkpoint {path} belongs to other cases, another seed or another case function.",
             "A sweep goes on where its own checkpoint ends: rows of different sweeps form no table.",
-            nearest=f"It holds {len(rows)} rows.",
             do="Give the same cases, seed and function, or another path; the file was not changed.",
             path=str(path),
+            rows=len(rows),
         )
     return rows

@@ -18,9 +18,9 @@ from servoctl.methods.bounds import amplification, row_poles
 from servoctl.methods.drift import Poles, as_drift
 from servoctl.methods.tableaus import ORDERS
 
-METHODS = (*ORDERS, "Taylor", "RadauIIA")
+MAPPED = (*ORDERS, "Taylor", "RadauIIA")
 RADAU_ORDER = 5  # unless it is given; all are L-stable
-SAMPLES = 101  # of the plan, where eigenvalues are taken: adjacent ones are alike on plans of some smoothness
+MOST_INSTANTS = 101  # of the plan, where eigenvalues are taken: adjacent ones are alike on plans of some smoothness
 NEGLIGIBLE = 1e-9  # size of a state relative to the largest: rounding of one that stays zero
 GROWTH = 2.0  # by which counted errors may grow over the plan; neutral modes and rounding stay below that
 PER_DECADE, DECADES = 30, 7  # of steps tried below the length of the plan
@@ -68,7 +68,7 @@ class StabilityMap:
         Parameters
         ----------
         method : str
-            One of `simulation.bounds.METHODS`.
+            "RK1" to "RK8", "RK23", "RK45", "DOP853", "Taylor", "RadauIIA" or "Radau".
         step : float or (K,) array
             [s]
         drift : optional
@@ -85,8 +85,8 @@ class StabilityMap:
         z = np.multiply.outer(step, self.eigenvalues(drift))
         if order is None:
             order = {"Taylor": self.order, "RadauIIA": RADAU_ORDER}.get(method)
-        own = np.exp(np.clip(z.real, 0.0, 700.0))
-        return (amplification(method, z, order) / own).max(axis=-1, initial=0.0)
+        motion = np.exp(np.clip(z.real, 0.0, 700.0))
+        return (amplification(method, z, order) / motion).max(axis=-1, initial=0.0)
 
     def growth(self, method, step, drift=None, order=None):
         """By how much errors in the counted directions grow over the plan, at most and beyond the motion's own growth.
@@ -94,7 +94,7 @@ class StabilityMap:
         Parameters
         ----------
         method : str
-            One of `simulation.bounds.METHODS`.
+            "RK1" to "RK8", "RK23", "RK45", "DOP853", "Taylor", "RadauIIA" or "Radau".
         step : float or (K,) array
             [s]
         drift : optional
@@ -117,7 +117,8 @@ class StabilityMap:
         Parameters
         ----------
         method : str
-            One of `simulation.bounds.METHODS`. Of an adaptive method it is where step control settles.
+            "RK1" to "RK8", "RK23", "RK45", "DOP853", "Taylor", "RadauIIA" or "Radau"; of an adaptive method it is where
+            step control settles.
         drift : None, "project", "minimal", float, `Project(...)` or `Poles(...)`, optional
             As in `simulate`.
         order : int, optional
@@ -160,12 +161,12 @@ class StabilityMap:
         -------
         matplotlib.figure.Figure
         """
-        from servoctl.figures.stability import draw
+        from servoctl.figures.stability import draw_stability
 
         if poles is not None:
             do = "Give numpy.geomspace(1, 100, 41), in 1/s."
             poles = np.sort(np.ravel(positives("poles", poles, do, fewest=2)))
-        return draw(self, method, poles, (*ORDERS, "Taylor"))
+        return draw_stability(self, method, poles, (*ORDERS, "Taylor"))
 
     def __repr__(self):
         raised = {row: count for row, count in self.model.raised.items() if count}
@@ -177,7 +178,7 @@ class StabilityMap:
             f"  off the manifold: {story}; neutral without treatment, at the poles with, removed by projection",
             f"  largest step [s] {'no poles':>12}" + "".join(f"{f'T = {T:g} s':>12}" for T in shown[1:]),
         ]
-        for method in METHODS:
+        for method in MAPPED:
             name = f"Taylor {self.order}" if method == "Taylor" else method
             steps = (self.largest_step(method, drift) for drift in shown)
             lines.append(f"  {name:<16} " + "".join(f"{_step_text(step):>12}" for step in steps))
@@ -224,7 +225,7 @@ def stability(model, run, order=12):
             f"The plan is a motion of the model, whose state is {', '.join(model.state_names)}.",
             do="Give the run that simulate(model, ...) returned.",
         )
-    keep = np.unique(np.linspace(0, len(run.t) - 1, SAMPLES).round().astype(int))
+    keep = np.unique(np.linspace(0, len(run.t) - 1, MOST_INSTANTS).round().astype(int))
     jacobians, normals = _along(model, run, keep, n_x)
     finite = np.isfinite(jacobians).all(axis=(1, 2)) & np.isfinite(normals).all(axis=(1, 2))
     if finite.sum() < 2:
@@ -244,13 +245,13 @@ def _along(model, run, keep, n_x):
     """∂X'/∂X (N, n_x, n_x) and the invariants' Jacobian (N, m, n_x) at samples of a run."""
     jacobians, normals = [], []
     for first, end, variant in run.variants or ((0, len(run.t), model),):
-        own = keep[(keep >= first) & (keep < end)]
-        if len(own):
-            t, x, p = run.t[own], run.jets[:n_x, own], variant.parameters
+        rows = keep[(keep >= first) & (keep < end)]
+        if len(rows):
+            t, x, p = run.t[rows], run.jets[:n_x, rows], variant.parameters
             jacobians.append(variant.function("ode_jacobian").grid(t, x, p).T.reshape(-1, n_x, n_x).swapaxes(1, 2))
             m = len(variant.invariant_names())
             y = variant.function("invariants").grid(t, x, p)[m:]
-            normals.append(y.T.reshape(len(own), n_x, m).swapaxes(1, 2))
+            normals.append(y.T.reshape(len(rows), n_x, m).swapaxes(1, 2))
     return np.concatenate(jacobians), np.concatenate(normals)
 
 

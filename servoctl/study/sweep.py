@@ -170,17 +170,16 @@ def evaluate(case, index, parameters, seed):
 
 
 def _numbers(result, parameters):
-    found = dict(result) if isinstance(result, Mapping) else summary(result)
-    for name, value in found.items():
+    numbers = dict(result) if isinstance(result, Mapping) else summary(result)
+    for name, value in numbers.items():
         if name in parameters or name in RESERVED or plain(value) is None:
             raise SpecificationError(
                 f"The case returned {name} = {value!r}.",
-                "A case returns numbers and texts, by names that are not those of its parameters.",
-                nearest=f"Columns with a meaning of their own are {', '.join(RESERVED)}.",
+                f"A case returns numbers and texts, by names other than its parameters' and {', '.join(RESERVED)}.",
                 do="Rename it, or take one number of it.",
                 name=name,
             )
-    return {str(name): plain(value) for name, value in found.items()}
+    return {str(name): plain(value) for name, value in numbers.items()}
 
 
 def summary(run):
@@ -202,31 +201,31 @@ def summary(run):
         If it is neither.
     """
     if isinstance(run, Closed):
-        found = _extrema(run, (*run.plant.inputs, *run.plant.mechanism.outputs))
+        numbers = _extrema(run, (*run.plant.inputs, *run.plant.mechanism.outputs))
         errors = {name: np.abs(levels[0]) for name, levels in run.residual.items()}
-        found |= {f"{name}_worst": float(error.max()) for name, error in errors.items()}
-        found |= {f"{name}_last": float(error[-1]) for name, error in errors.items()}
+        numbers |= {f"{name}_worst": float(error.max()) for name, error in errors.items()}
+        numbers |= {f"{name}_last": float(error[-1]) for name, error in errors.items()}
     elif isinstance(run, Run):
         if run.status == INTERRUPTED:
             raise KeyboardInterrupt
         known = run.names if run.model is None else (*run.model.actuators, *run.model.outputs)
-        found = _extrema(run, [name for name in known if name in run.names])
-        found["residual"] = max((float(np.abs(run.residual[name]).max()) for name in run.residual), default=0.0)
+        numbers = _extrema(run, [name for name in known if name in run.names])
+        numbers["residual"] = max((float(np.abs(run.residual[name]).max()) for name in run.residual), default=0.0)
     else:
         raise SpecificationError(
             f"The case returned {type(run).__name__}.",
             "A case returns numbers by name, a Run, or the run of a closed loop.",
             do="Return one of these.",
         )
-    return {**found, "t_end": float(run.t[-1])}
+    return {**numbers, "t_end": float(run.t[-1])}
 
 
 def _extrema(run, names):
-    found = {}
+    numbers = {}
     for name in names:
         values = run[name]
-        found |= {f"{name}_min": values.min(), f"{name}_max": values.max(), f"{name}_end": values[-1]}
-    return {name: float(value) for name, value in found.items()}
+        numbers |= {f"{name}_min": values.min(), f"{name}_max": values.max(), f"{name}_end": values[-1]}
+    return {name: float(value) for name, value in numbers.items()}
 
 
 # --- where cases are computed
@@ -272,8 +271,8 @@ def _lost(index, error):
 def _noticing():
     """A list that is not empty once Ctrl-C was pressed, even where the interrupt is caught inside."""
     pressed = []
-    own = threading.current_thread() is threading.main_thread()
-    if not own or signal.getsignal(signal.SIGINT) is not signal.default_int_handler:
+    in_main = threading.current_thread() is threading.main_thread()
+    if not in_main or signal.getsignal(signal.SIGINT) is not signal.default_int_handler:
         yield pressed
         return
 
@@ -288,7 +287,7 @@ def _noticing():
         signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
-# --- what is asked
+# --- what was given
 
 
 def name_of(case):
@@ -329,7 +328,7 @@ def _part(shard, count):
         i = n = 0
     if not 1 <= i <= n:
         raise SpecificationError(
-            f"shard = {shard!r}.", "A shard (i, n) is part i of n, from 1 to n.", nearest="(1, 4).", shard=shard
+            f"shard = {shard!r}.", "A shard (i, n) is part i of n, from 1 to n.", do="Give (1, 4).", shard=shard
         )
     return range(i - 1, count, n)
 
@@ -355,8 +354,7 @@ def _require_sendable(case, executor):
         raise SpecificationError(
             f"executor={executor!r} was given.",
             "Cases are computed here, or on an executor of concurrent.futures.",
-            nearest="concurrent.futures.ThreadPoolExecutor(2).",
-            do="Give an executor that is open.",
+            do="Give an executor that is open, such as concurrent.futures.ThreadPoolExecutor(2).",
         )
     if not isinstance(executor, ProcessPoolExecutor):
         return
@@ -365,9 +363,8 @@ def _require_sendable(case, executor):
     except Exception as error:
         raise SpecificationError(
             f"The case {name_of(case)} cannot be sent to another process: {error}.",
-            "A process receives a function by its name: it stands at the top level of a module, and holds no model.",
-            nearest="loky and Dask send other functions, too.",
-            do="Move it there, and derive the model inside of it, kept by functools.cache.",
+            "A process receives a function by its name: it is at the top level of a module, and holds no model.",
+            do="Move it there, and derive the model inside of it, kept by functools.cache, or use loky or Dask.",
             case=name_of(case),
         ) from error
 
@@ -388,7 +385,6 @@ def _died(row, count):
     return ServoError(
         f"The executor finished none of {count} cases. {row['error']}: {row['message']}",
         "A worker imports the module of the case, computes it and sends its numbers back.",
-        nearest="executor=None computes the cases here, and shows what they do.",
         do='Let a script start its work below if __name__ == "__main__", and check the memory that a case needs.',
         error=row["error"],
     )

@@ -13,7 +13,7 @@ from servoctl import archive
 from servoctl.codegen.compiler import compiler
 from servoctl.errors import SpecificationError, unknown
 
-SHOWN, WIDTH = 7, 12  # rows of a table in a repr, and columns
+SHOWN, MOST_COLUMNS = 7, 12  # rows of a table in a repr, and columns
 
 
 @dataclass(frozen=True, eq=False)
@@ -170,7 +170,7 @@ class Study:
         lines = [f"Study: {self.kind}, {len(self)} rows", "  " + ", ".join(self.columns)]
         lines += [f"  {self.meta['message']}"] if self.meta.get("message") else []
         lines = [line if len(line) <= 120 else f"{line[:117]}..." for line in lines]
-        return "\n".join([*lines, *table(self, list(self.columns)[:WIDTH])])
+        return "\n".join([*lines, *table(self, list(self.columns)[:MOST_COLUMNS])])
 
 
 def table(study, names, most=SHOWN):

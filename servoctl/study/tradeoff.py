@@ -14,19 +14,18 @@ from servoctl.methods.choice import METHODS, Adaptive, Algebraic, RungeKutta, Ta
 from servoctl.methods.drift import MinimalCoordinates, Poles, Project, as_drift
 from servoctl.progress import progress_bar
 from servoctl.simulation import consistent_state, simulate
-from servoctl.study.table import Study, machine, table
+from servoctl.study.table import SHOWN, Study, machine, table
 
 MEASURED = tuple(name for name in METHODS if name not in ("RK1", "RK2", "RK23"))  # those need too many steps
 TOLERANCES = (1e-3, 1e-5, 1e-7, 1e-9, 1e-11, 1e-13)
-STEPS = tuple(5 * 4**k for k in range(7))  # of a fixed length, in the span
-SAMPLES, COMPARED = 51, 201  # instants that adaptive methods give, and at most so many of any run are compared
+FIXED_STEPS = tuple(5 * 4**k for k in range(7))  # of a fixed length, in the span
+INSTANTS, COMPARED = 51, 201  # instants that adaptive methods give, and at most so many of any run are compared
 DENSE = 1001  # instants of the reference over which its power is integrated
 TIMED, ENOUGH = 3, 0.3  # calls timed after a warm-up, unless they take this part of `seconds` together
 FEW = 20  # steps: a run that takes too long for fewer has lost its way, and tells nothing of finer settings
 TIME_CONSTANT = 50  # of the default poles, in the span
 DRIFTS = ("none", "project", "minimal")  # others are time constants of poles
 COSTS = ("seconds", "evaluations", "steps")
-SHOWN = 7  # rows in a repr
 
 
 def tradeoff(model, x0, t_span, methods=None, drift=None, *, settings=None, seconds=0.3, progress=None):
@@ -225,9 +224,9 @@ class TradeOff(Study):
         -------
         Axes
         """
-        from servoctl.figures.work_precision import draw
+        from servoctl.figures.work_precision import draw_tradeoff
 
-        return draw(self, ax, _cost(cost), title)
+        return draw_tradeoff(self, ax, _cost(cost), title)
 
     def _good(self):
         return np.flatnonzero(np.isfinite(self["error"]) & np.isfinite(self["seconds"]))
@@ -278,7 +277,7 @@ class Reference:
         consistent_state(model, x0, t_span[0])
         self.model, self.start, self.span, self._known = model, x0, t_span, {}
         self.knots = [k for k in model.require_smooth((min(t_span), max(t_span))) if min(t_span) < k < max(t_span)]
-        self.times = np.union1d(np.linspace(*t_span, SAMPLES), self.knots)
+        self.times = np.union1d(np.linspace(*t_span, INSTANTS), self.knots)
         checks = [Adaptive("DOP853", 3e-14, 1e-15), Taylor(12, rtol=1e-14, atol=1e-14)]
         self.method, self.drift = Taylor(16, rtol=1e-15, atol=1e-15), Project()
         if model.flat:
@@ -345,7 +344,7 @@ def actuation(run):
 
 
 def _ladder(reference, method, treatment, settings, seconds):
-    """A row for each setting, from coarse to fine, until finer ones are too slow or cannot be told from exact."""
+    """A row for each setting, from coarse to fine, until they are too slow or as exact as the reference."""
     over, name = "", _kind(method)
     for value in sorted(settings, reverse=True):
         row = {"method": method, "drift": _label(treatment), "setting": name, "value": value, "failure": over}
@@ -420,15 +419,15 @@ def _energy_balance(run, knots):
     t, work, energy = run.t[order], run.signals("power")[1][1][order], run["energy"][order]
     gained, cuts = [0.0], [t[0], *knots, t[-1]]
     for a, b in itertools.pairwise(cuts):
-        own = (t >= a) & (t <= b)
-        if own.sum() < 2:
+        piece = (t >= a) & (t <= b)
+        if piece.sum() < 2:
             return np.nan
-        spline = make_interp_spline(t[own], work[own], k=min(9, (own.sum() - 1) // 2 * 2 - 1 or 1))
-        gained += list(gained[-1] + spline.antiderivative()(t[own])[1:])
+        spline = make_interp_spline(t[piece], work[piece], k=min(9, (piece.sum() - 1) // 2 * 2 - 1 or 1))
+        gained += list(gained[-1] + spline.antiderivative()(t[piece])[1:])
     return float(np.abs(energy - energy[0] - gained).max() / max(np.abs(energy).max(), 1e-300))
 
 
-# --- what is asked
+# --- what is measured
 
 
 def _combinations(model, methods, drifts):
@@ -443,7 +442,7 @@ def _combinations(model, methods, drifts):
     for value in treatments:
         if isinstance(value, Poles) and not isinstance(value.values, float):
             raise SpecificationError(
-                "Poles by row were given.", "A row of the study tells its drift in a word.", do="Give a time constant."
+                "Poles by row were given.", "A row of the study names its drift in a word.", do="Give a time constant."
             )
     pairs = [(m, d) for m in methods for d in treatments if m != "algebraic"]
     pairs = [*((m, None) for m in methods if m == "algebraic"), *pairs]
@@ -451,19 +450,18 @@ def _combinations(model, methods, drifts):
         raise SpecificationError(
             f"methods={methods!r} and drift={drifts!r} were given.",
             "A study measures at least one method with one treatment of drift.",
-            nearest="drift=[None].",
-            do="Leave both out to measure most.",
+            do="Leave both out to measure most, or give drift=[None].",
         )
     return pairs
 
 
-def _settings(given, length):
+def _settings(settings, length):
     """Values of "rtol" and "step", the latter for a span of some length [s]."""
-    for name in given:
+    for name in settings:
         if name not in ("rtol", "step"):
             raise unknown(name, ("rtol", "step"), "setting")
-    rtol = positives("rtol", given.get("rtol", TOLERANCES), "Leave rtol out.", most=1.0)
-    step = positives("step", given.get("step", [length / n for n in STEPS]), "Leave step out.")
+    rtol = positives("rtol", settings.get("rtol", TOLERANCES), "Leave rtol out.", most=1.0)
+    step = positives("step", settings.get("step", [length / n for n in FIXED_STEPS]), "Leave step out.")
     return {"rtol": np.ravel(rtol).tolist(), "step": np.ravel(step).tolist()}
 
 
