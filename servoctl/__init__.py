@@ -56,8 +56,7 @@ from servoctl.study.sweep import merge, sweep
 from servoctl.study.table import Study
 from servoctl.study.tradeoff import TradeOff, tradeoff
 from servoctl.verification import Verification, verify
-
-__version__ = "0.1.0"
+from servoctl.version import __version__ as __version__
 
 __all__ = [
     "Adaptive",

@@ -12,6 +12,7 @@ import numpy as np
 from servoctl import archive
 from servoctl.codegen.compiler import compiler
 from servoctl.errors import SpecificationError, unknown
+from servoctl.version import __version__
 
 SHOWN, MOST_COLUMNS = 7, 12  # rows of a table in a repr, and columns
 
@@ -200,8 +201,6 @@ def table(study, names, most=SHOWN):
 
 def machine():
     """What numbers are measured on: processor, cores, system, compiler and versions, as a dict of plain values."""
-    from servoctl import __version__
-
     versions = {name: _version(name) for name in ("casadi", "numpy", "scipy")}
     return {
         "processor": _processor(),
