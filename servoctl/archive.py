@@ -15,18 +15,7 @@ FORMAT, SUFFIX = 1, ".npz"
 def writing(path, what, folder=False):
     """Write below a folder that is made where it is missing; what the file system refuses is a `ServoError`.
 
-    Parameters
-    ----------
-    path : str or Path
-        The file, or the folder.
-    what : str
-        What is written: "run", "study", "figures".
-    folder : bool
-        Whether the path is the folder.
-
-    Yields
-    ------
-    Path
+    The path is a file, or the `folder` itself; `what` is written: "run", "study", "figures".
     """
     path = Path(path)
     try:
@@ -42,28 +31,7 @@ def writing(path, what, folder=False):
 
 
 def save(path, what, facts, arrays):
-    """Write arrays and facts as npz.
-
-    Parameters
-    ----------
-    path : str or Path
-        A missing suffix .npz is added.
-    what : str
-        "run" or "study".
-    facts : dict
-        Texts, numbers, and lists and dicts of them.
-    arrays : dict of str to array
-
-    Returns
-    -------
-    Path
-        With its suffix.
-
-    Raises
-    ------
-    ServoError
-        If the file cannot be written.
-    """
+    """Write arrays and JSON-able facts as npz; a missing suffix is added. The path."""
     path = Path(path)
     path = path if path.suffix == SUFFIX else path.with_name(path.name + SUFFIX)
     with writing(path, what):
@@ -72,21 +40,7 @@ def save(path, what, facts, arrays):
 
 
 def read(path, what, build):
-    """What `build(facts, arrays)` makes of an archive.
-
-    Parameters
-    ----------
-    path : str or Path
-    what : str
-        "run" or "study".
-    build : callable
-        Called with the facts and with the arrays by name, each read from the file when it is looked up.
-
-    Raises
-    ------
-    ServoError
-        If the file is missing, or is no archive of this kind.
-    """
+    """What `build(facts, arrays)` makes of an archive; `ServoError` if there is none of this kind."""
     try:
         with np.load(path, allow_pickle=False) as data:
             return build(json.loads(str(data["meta"])), data)
@@ -100,20 +54,7 @@ def read(path, what, build):
 
 
 def dataset(variables, coordinates, attributes):
-    """An xarray.Dataset.
-
-    Parameters
-    ----------
-    variables, coordinates : dict
-        As `xarray.Dataset` takes them.
-    attributes : dict
-        Numbers and texts; what else is among them becomes JSON.
-
-    Raises
-    ------
-    ServoError
-        If xarray is not installed.
-    """
+    """An xarray.Dataset; attributes that are no numbers or texts become JSON. `ServoError` without xarray."""
     try:
         import xarray
     except ImportError as error:

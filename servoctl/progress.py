@@ -7,36 +7,14 @@ PATIENCE = 1.0  # s before a bar appears
 
 
 def progress_bar(name, wanted, total=None, **options):
-    """A bar of tqdm.
-
-    Parameters
-    ----------
-    name : str
-    wanted : bool or None
-        None means: on a terminal.
-    total : float, optional
-    **options
-        Of tqdm: unit, initial, bar_format, and the delay before it appears [s], by default a second.
-
-    Returns
-    -------
-    tqdm
-    """
+    """A bar of tqdm that appears after a second; `wanted` None means on a terminal. Options are those of tqdm."""
     from tqdm import tqdm
 
     return tqdm(desc=name, total=total, disable=not _shown(wanted), **{"delay": PATIENCE, **options})
 
 
 class Progress:
-    """Progress over time, as a bar or as calls of a function.
-
-    Parameters
-    ----------
-    span : (t0, t1)
-        [s]
-    wanted : bool, callable or None
-        A function is called with each time that is reached; None means a bar on a terminal.
-    """
+    """Progress over a span [s], as a bar or as calls of a function of time; `wanted` None: a bar on a terminal."""
 
     def __init__(self, span, wanted):
         self.t0, self.total = span[0], abs(span[1] - span[0])

@@ -8,21 +8,7 @@ BESIDE = {"loc": "upper left", "bbox_to_anchor": (1.01, 1.0), "frameon": False} 
 
 
 def figure(height, rows=1, columns=1, width=FIGURE_WIDTH, **options):
-    """A figure outside pyplot, so that the user's backend stays as it is, and its (rows, columns) array of Axes.
-
-    Parameters
-    ----------
-    height, width : float
-        [inches]
-    rows, columns : int
-    **options
-        Of `Figure.subplots`.
-
-    Returns
-    -------
-    figure : matplotlib.figure.Figure
-    axes : (rows, columns) array of Axes
-    """
+    """A figure outside pyplot, so that the user's backend stays as it is, and its (rows, columns) array of Axes."""
     from matplotlib.figure import Figure
 
     empty = Figure(figsize=(width, height), dpi=100, layout="constrained")

@@ -14,19 +14,7 @@ FRONT, UNRESOLVED, GREY = "#BBBBBB", "#EEEEEE", "#555555"
 
 
 def draw_tradeoff(study, ax, cost, title):
-    """Draw errors over a cost, a line for each method and treatment, with the Pareto front.
-
-    Parameters
-    ----------
-    study : TradeOff
-    ax : Axes or None
-    cost : {"seconds", "evaluations", "steps"}
-    title : str
-
-    Returns
-    -------
-    Axes
-    """
+    """Draw errors over a cost, a line for each method and treatment, with the Pareto front."""
     ax = style.figure(5.0, width=8.0)[1][0, 0] if ax is None else ax
     good = np.isfinite(study["error"]) & np.isfinite(study["seconds"])
     methods, drifts = (list(dict.fromkeys(study[name][good].tolist())) for name in ("method", "drift"))

@@ -53,24 +53,7 @@ def _wrapped(line, indent):
 class Folder:
     """The folder of a run: tried before anything is computed, replaced by a temporary one where writing fails later.
 
-    Parameters
-    ----------
-    path : Path
-        Made where it is missing.
-    name : str
-        Of the run.
-
-    Attributes
-    ----------
-    path : Path
-        Where the files are.
-    moved : bool
-        Whether this is a temporary folder in place of the one that was given.
-
-    Raises
-    ------
-    ServoError
-        If no file can be made in it.
+    Its `path` is where the files are; it has `moved` if that is a temporary folder in place of the one that was given.
     """
 
     def __init__(self, path, name):
@@ -106,17 +89,9 @@ class Folder:
         self.write_text(name, text + "\n")
 
     def write(self, action):
-        """Carry out `action(path)`; where it fails, it and all before it are carried out in a temporary folder.
+        """Carry out `action(path)`, which writes files; where it fails, it and all before it go to a temporary folder.
 
-        Parameters
-        ----------
-        action : callable
-            Writes files into the folder that it is given. The first one finds the files of earlier runs removed.
-
-        Raises
-        ------
-        ServoError
-            If the temporary folder cannot be written, either.
+        The first action finds the files of earlier runs removed. A ServoError where no temporary folder can be written.
         """
         try:
             if not self._done:
@@ -161,21 +136,7 @@ def folder_of(args, name, ending=""):
 
 
 def summary(run, start, verification):
-    """Facts of a run, for JSON.
-
-    Parameters
-    ----------
-    run : Run
-        With its model.
-    start : State
-    verification : Verification or None
-
-    Returns
-    -------
-    dict
-        versions, parameters, method, outcome, counters, start, structure, extrema of actuators and outputs with their
-        times [s], worst residual of each constraint over all levels and at each, numbers of the verification.
-    """
+    """Facts of a run, for JSON: versions, numbers, outcome, start, structure, extrema, residuals, verification."""
     model = run.model
     residuals = {name: [_worst(level) for level in run.residual[name].tolist()] for name in run.residual}
     checked = verification is not None

@@ -12,12 +12,7 @@ RATE = 100.0  # Hz
 
 
 def add_loop(parser):
-    """Add the options of the closed loop to a command.
-
-    Parameters
-    ----------
-    parser : argparse.ArgumentParser
-    """
+    """Add the options of the closed loop to a command."""
     loop = parser.add_argument_group("the closed loop, of programs realised by actuators")
     loop.add_argument(
         "--machine", type=assignment, metavar="NAME=VALUE", **MANY, help="parameters that the plan missed"
@@ -33,17 +28,7 @@ def add_loop(parser):
 
 
 def require(args, model):
-    """Refuse options of the loop that contradict each other, and names that the mechanism has not.
-
-    Parameters
-    ----------
-    args : argparse.Namespace
-    model : Model
-
-    Raises
-    ------
-    SpecificationError, NameUnknown
-    """
+    """Refuse options of the loop that contradict each other, and names that the mechanism does not have."""
     if args.no_loop:
         _refuse(used(args, GIVEN), "with --no-loop")
     if args.law not in (None, "lqr"):
@@ -75,22 +60,7 @@ def _refuse(options, why):
 
 
 def closed_loop(args, model, plan, report):
-    """Close the loop about the plan, and say what came of it.
-
-    Parameters
-    ----------
-    args : argparse.Namespace
-    model : Model
-    plan : Run
-    report : Report
-
-    Returns
-    -------
-    closed : Closed or None
-        None where there is no loop.
-    done : bool
-        Whether the options were followed.
-    """
+    """Close the loop about the plan, and print it: the Closed or None, and whether the options were followed."""
     if args.no_loop:
         return None, True
     done = not used(args, GIVEN)  # nothing is missed where no option asks for a loop
@@ -134,16 +104,7 @@ def _law(args, plan, nominal):
 
 
 def facts(closed):
-    """Numbers of a closed loop for the summary: worst and last errors, what each actuator did.
-
-    Parameters
-    ----------
-    closed : Closed or None
-
-    Returns
-    -------
-    dict or None
-    """
+    """Worst and last errors of a closed loop, and what each actuator did, for the summary."""
     if closed is None:
         return None
     names = closed.plant.mechanism.parameters.names
@@ -170,16 +131,7 @@ def facts(closed):
 
 
 def save_figure(closed, folder, units, title):
-    """Write closed_loop.png.
-
-    Parameters
-    ----------
-    closed : Closed
-    folder : Path
-    units : dict of str to str
-    title : str
-        Put over the figure.
-    """
+    """Write closed_loop.png."""
     figure = sv.figures.closed(closed, units=units)[0].figure
     figure.suptitle(f"{title}: closed loop, {closed.law.name}, {closed.law.rate:g} Hz")
     figure.savefig(folder / "closed_loop.png", dpi=100)

@@ -10,15 +10,7 @@ from servoctl.shell.options import by_name
 
 @dataclass(frozen=True)
 class Motion:
-    """A derived model with its numbers, its start and its time.
-
-    Attributes
-    ----------
-    model : Model
-    start : State
-    span : (t0, t1)
-        [s]
-    """
+    """A derived model with its numbers, its start, and its time (t0, t1) [s]."""
 
     model: object
     start: object
@@ -28,18 +20,7 @@ class Motion:
 def described(args, scene, report, require=lambda model: None):
     """Derive the model of a scene and find its start; print both.
 
-    Parameters
-    ----------
-    args : argparse.Namespace
-        With the options of `add_motion`.
-    scene : Scene
-    report : Report
-    require : callable
-        Called with the model before anything is printed; raises for options that do not fit it.
-
-    Returns
-    -------
-    Motion
+    `require` is called with the model before anything is printed; it raises for options that do not fit.
     """
     span = as_span(tuple(args.t_span or scene.t_span))
     changes, held, guess = (by_name(getattr(args, name), f"--{name}") for name in ("set", "hold", "guess"))

@@ -25,23 +25,7 @@ def add_motion(parser):
 
 
 def by_name(pairs, option):
-    """A dict of (name, value) pairs, each name once.
-
-    Parameters
-    ----------
-    pairs : sequence of (str, object)
-    option : str
-        For the message.
-
-    Returns
-    -------
-    dict
-
-    Raises
-    ------
-    SpecificationError
-        For a name that occurs twice.
-    """
+    """A dict of (name, value) pairs, each name once; the option is for the message."""
     values = {}
     for name, value in pairs:
         if name in values:
@@ -54,17 +38,7 @@ def by_name(pairs, option):
 
 
 def used(args, names):
-    """Those of these options that were given, as they are written; 0 counts as given.
-
-    Parameters
-    ----------
-    args : argparse.Namespace
-    names : sequence of str
-
-    Returns
-    -------
-    list of str
-    """
+    """Those of these options that were given, as they are written; 0 counts as given."""
     values = {f"--{name.replace('_', '-')}": getattr(args, name) for name in names}
     return [option for option, value in values.items() if value is not None and value is not False and value != []]
 

@@ -88,22 +88,7 @@ def stamp(given):
 
 
 def own_case(given):
-    """The function `case` that a user's file defines for sweeps; None where there is none.
-
-    Parameters
-    ----------
-    given : str
-        A name of the gallery, or the path of a .py file.
-
-    Returns
-    -------
-    callable or None
-
-    Raises
-    ------
-    SpecificationError
-        If the file is missing or raises.
-    """
+    """The function `case` that a user's file defines for sweeps; None where there is none."""
     from servoctl.gallery import gallery
 
     path = Path(given)

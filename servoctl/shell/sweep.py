@@ -161,21 +161,7 @@ def _derived(given, _):
 
 
 def scene_case(given, options, /, **values):
-    """Simulate the plan of a scene with other parameters and held values of the start.
-
-    Parameters
-    ----------
-    given : str
-        A name of the gallery, or a file.
-    options : tuple of (str, object)
-        Of `simulate`, and t_span.
-    **values : float
-        By name.
-
-    Returns
-    -------
-    Run
-    """
+    """Simulate the plan of a scene; `values` are parameters and held values, `options` those of `simulate`."""
     scene, model = find_scene(given)[1], _model(given)
     options, parameters = dict(options), model.reduction.mechanism.parameters.names
     model = model.with_parameters(**{name: value for name, value in values.items() if name in parameters})

@@ -63,19 +63,7 @@ def monte_carlo(n, /, *, seed, **distributions):
 def generator(seed, kind, index, name=""):
     """The numpy Generator of one case, whatever cases come before it and wherever they run.
 
-    Parameters
-    ----------
-    seed : int
-    kind : int
-        `DRAWS` or `CASES`.
-    index : int
-        Of the case.
-    name : str
-        Of the parameter that is drawn.
-
-    Returns
-    -------
-    numpy.random.Generator
+    A stream for each seed, kind (`DRAWS` or `CASES`), index of the case and name of the parameter.
     """
     import numpy as np
 
@@ -83,23 +71,7 @@ def generator(seed, kind, index, name=""):
 
 
 def as_cases(cases):
-    """Cases in the order given, each a dict of plain values.
-
-    Parameters
-    ----------
-    cases : sequence of dict, or dict of sequences
-        One dict of parameters per case, or one column per parameter.
-
-    Returns
-    -------
-    list of dict
-        With values of Python's own kinds.
-
-    Raises
-    ------
-    SpecificationError
-        For no case, columns of different lengths, cases of different names, a value that is no number or text.
-    """
+    """Cases in the order given, from dicts or from a dict of columns, each a dict of Python's own kinds of values."""
     if isinstance(cases, Mapping):
         columns = {name: _column(name, values) for name, values in cases.items()}
         lengths = {name: len(column) for name, column in columns.items()}

@@ -11,43 +11,15 @@ FORMAT = 1
 
 
 def identity(name, cases, seed):
-    """What two sweeps must share for their rows to belong together: a digest of the case's name, the cases, the seed.
-
-    Parameters
-    ----------
-    name : str
-        Of the function that computes a case, with its module.
-    cases : list of dict
-    seed : int or None
-
-    Returns
-    -------
-    str
-    """
+    """What sweeps must share for their rows to belong together: a digest of the case's name, the cases, the seed."""
     return hashlib.sha256(json.dumps([name, cases, seed]).encode()).hexdigest()
 
 
 class Checkpoint:
     """Rows on disk: those of an earlier sweep are read, further ones appended and flushed as they come.
 
-    Parameters
-    ----------
-    path : str, Path or None
-        Made where it is missing; None keeps nothing.
-    key : str
-        The sweep's `identity`.
-
-    Attributes
-    ----------
-    rows : list of dict
-        What was there. A last line that was cut off is dropped.
-
-    Raises
-    ------
-    SpecificationError
-        If the file belongs to another sweep, or is no checkpoint.
-    ServoError
-        If it cannot be read or written.
+    The path None keeps nothing. `rows` is what was there; a last line that was cut off is dropped. A file of another
+    sweep, or one that is no checkpoint, raises SpecificationError; one that cannot be opened ServoError.
     """
 
     def __init__(self, path, key):

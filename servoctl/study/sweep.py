@@ -143,20 +143,7 @@ def merge(studies):
 
 
 def evaluate(case, index, parameters, seed):
-    """One row: the numbers of a case, or how it failed.
-
-    Parameters
-    ----------
-    case : callable
-    index : int
-    parameters : dict
-    seed : int or None
-
-    Returns
-    -------
-    dict
-        case, and numbers (dict) or error, message and facts (JSON).
-    """
+    """One row: case (the index), and the numbers of a case, or how it failed: error, message, facts (JSON)."""
     if multiprocessing.parent_process() is not None and threading.current_thread() is threading.main_thread():
         signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the parent: a case is whole or not computed
     drawn = {} if seed is None else {"rng": generator(seed, CASES, index)}

@@ -175,20 +175,7 @@ class Study:
 
 
 def table(study, names, most=SHOWN):
-    """Lines of readable width for the first rows of a study.
-
-    Parameters
-    ----------
-    study : Study
-    names : sequence of str
-        Columns.
-    most : int
-        Number of rows.
-
-    Returns
-    -------
-    list of str
-    """
+    """Lines of readable width for some columns and the first rows of a study."""
     texts = [[name, *(_short(value) for value in study[name][:most].tolist())] for name in names]
     widths = [max(map(len, column)) for column in texts]
     lines = [

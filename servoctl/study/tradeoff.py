@@ -258,19 +258,7 @@ class TradeOff(Study):
 class Reference:
     """The motion against which others are measured, at any instants.
 
-    Parameters
-    ----------
-    model : Model
-    x0 : State or (n_x,) array
-    t_span : (t0, t1)
-        [s]
-    seconds : float
-        That one run may take; the verification may take ten times as long.
-
-    Attributes
-    ----------
-    agreement : dict
-        The two methods, and how far they agree on motion and actuation.
+    `agreement` has its method, the one that verified it (which may take ten times `seconds`), and how far they agree.
     """
 
     def __init__(self, model, x0, t_span, seconds):
