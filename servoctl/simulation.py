@@ -30,8 +30,8 @@ from servoctl.methods.taylor import SeriesMethod
 from servoctl.progress import Progress
 from servoctl.run import Run
 
-SAMPLES = 1001  # of a run unless t_eval says otherwise: smooth curves, and extrema refined to rounding
-STEPS = 2000  # of fixed length in a span, unless the method has its own
+DEFAULT_SAMPLES = 1001  # of a run unless t_eval says otherwise: smooth curves, and extrema refined to rounding
+STEPS_IN_SPAN = 2000  # of fixed length in a span, unless the method has its own
 MOST_STEPS = 10**8  # of fixed length: more would fill the memory with samples
 OFF = 1e-5  # of a start: residuals relative to their gradients times the state, above which it is no start
 
@@ -125,10 +125,10 @@ def _motion(model, method, drift, span, x0, times, knots, bar):
         case Taylor(order, jets, rtol, atol):
             return SeriesMethod(model, drift, rtol, atol, order, jets or 0, bar).run(*arguments)
         case RadauIIA(order, step, rtol, atol):
-            step = None if step is None else _step(step, t0, t1)
+            step = None if step is None else _step_length(step, t0, t1)
             return RadauMethod(model, drift, rtol, atol, order, step, bar).run(*arguments)
         case RungeKutta(_, step):
-            return fixed_step(model, str(method), drift, span, x0, _step(step, t0, t1), knots, bar)
+            return fixed_step(model, str(method), drift, span, x0, _step_length(step, t0, t1), knots, bar)
         case Sundials(name, rtol, atol):
             return SundialsMethod(model, name, drift, rtol, atol, t1 - t0, bar).run(*arguments)
         case Adaptive(name, rtol, atol):
@@ -159,8 +159,6 @@ def _resample(run, times):
     variants = tuple((i, i + 1, model) for i, model in enumerate(owner)) if len(run.variants) > 1 else run.variants[:1]
     variants = tuple((0, len(times), v[2]) for v in variants) if len(variants) == 1 else variants
     return replace(run, t=times, jets=np.array([run.at(t) for t in times]).T, variants=variants)
-
-
 
 
 def _require_decay(model, drift, t0, t1):
@@ -223,7 +221,7 @@ def consistent_state(model, start, t):
 
 def _times(t0, t1, t_eval, knots):
     if t_eval is None:
-        times = np.union1d(np.linspace(t0, t1, SAMPLES), [k for k in knots if min(t0, t1) < k < max(t0, t1)])
+        times = np.union1d(np.linspace(t0, t1, DEFAULT_SAMPLES), [k for k in knots if min(t0, t1) < k < max(t0, t1)])
     else:
         try:
             times = np.unique(np.asarray(t_eval, dtype=float))
@@ -240,9 +238,9 @@ def _times(t0, t1, t_eval, knots):
     return times if t1 > t0 else times[::-1]
 
 
-def _step(step, t0, t1):
+def _step_length(step, t0, t1):
     if step is None:
-        return abs(t1 - t0) / STEPS
+        return abs(t1 - t0) / STEPS_IN_SPAN
     if abs(t1 - t0) > MOST_STEPS * step:
         raise SpecificationError(
             f"step={step!r} was given for a span of {abs(t1 - t0):g} s.",

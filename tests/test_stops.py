@@ -41,10 +41,10 @@ def on_the_right_branch(squared):
     return squared.start(guess={"dx": 0.5}, dphi=1.0, **ZERO)
 
 
-def stopped(model, start, t_span, **options):
+def stopped(model, start, t_span, method, drift=None, **settings):
     """The error by which a simulation ends."""
     with pytest.raises(sv.SingularProgram) as caught:
-        sv.simulate(model, start, t_span, **options)
+        sv.simulate(model, start, t_span, as_method(method, **settings), drift=drift)
     return caught.value
 
 

@@ -11,15 +11,16 @@ from numbers import Real
 
 import numpy as np
 
+from servoctl.checks import is_number
 from servoctl.errors import LimitExceeded, SpecificationError
 from servoctl.methods.choice import Algebraic, Taylor
 from servoctl.methods.drift import Project
 from servoctl.methods.taylor import order_for
 
-FLOOR = 1e-3  # least size of a component relative to the largest of its level: what is zero has rounding for its size
+SMALLEST_SIZE = 1e-3  # of a component relative to the largest of its level: what is zero has rounding for its size
 MARGIN, FINER = 0.1, 1e-2  # first tolerance by the accuracy, and of each next one by the one before
 FINEST = 1e-15  # tolerance: below, steps shorten and rounding grows
-MOST, LEAST = 1e-1, 1e-13  # accuracies that make sense in double precision
+COARSEST_ACCURACY, FINEST_ACCURACY = 1e-1, 1e-13  # accuracies that make sense in double precision
 
 
 def relative_error(values, reference, levels=None):
@@ -50,7 +51,7 @@ def component_sizes(values, levels):
     size = np.abs(values).max(axis=1)
     for level in np.unique(levels):
         own = levels == level
-        size[own] = np.maximum(size[own], FLOOR * size[own].max())
+        size[own] = np.maximum(size[own], SMALLEST_SIZE * size[own].max())
     size[size == 0] = 1.0
     return size
 
@@ -160,11 +161,14 @@ def accurate(simulated, model, accuracy, method=None, drift=None):
 
 def require_accuracy(accuracy):
     """An accuracy as a float, where it is one."""
-    if not (isinstance(accuracy, Real) and LEAST <= accuracy <= MOST):
+    low, high = FINEST_ACCURACY, COARSEST_ACCURACY
+    if not (isinstance(accuracy, Real) and low <= accuracy <= high):
         raise SpecificationError(
             f"accuracy={accuracy!r} was given.",
-            f"An accuracy is the largest relative error of the motion, from {LEAST:g} to {MOST:g}.",
-            do="Give 1e-6.",
+            f"An accuracy is the largest relative error of the motion, from {low:g} to {high:g}.",
+            nearest=f"{np.clip(accuracy, low, high):g}." if is_number(accuracy) else "",
+            do="Give 1e-6, or a number in this range.",
+            accuracy=accuracy,
         )
     return float(accuracy)
 

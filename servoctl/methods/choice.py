@@ -13,7 +13,7 @@ SCIPY = ("RK23", "RK45", "DOP853", "Radau", "BDF", "LSODA")
 EXPLICIT, MULTISTEP = ("RK23", "RK45", "DOP853"), ("BDF", "LSODA")
 SUNDIALS = ("CVODES", "IDAS")
 RADAU_ORDERS = (5, 9, 13)
-FLOOR = 100 * np.finfo(float).eps  # least rtol of scipy's methods but LSODA
+LEAST_RTOL = 100 * np.finfo(float).eps  # least rtol of scipy's methods but LSODA
 HIGHEST = 40  # order of a series, and level of jets
 
 PAST_STATES = "A multistep method carries past states, which projection would contradict."
@@ -35,7 +35,7 @@ def _positive(name, value, most=np.inf):
     return float(value)
 
 
-def _whole(name, value, low):
+def _whole_number(name, value, low):
     if not (is_whole(value) and low <= value <= HIGHEST):
         raise SpecificationError(
             f"{name}={value!r} was given.",
@@ -117,7 +117,7 @@ class Taylor(Method):
 
     def __post_init__(self):
         order, jets = (
-            None if value is None else _whole(name, value, low)
+            None if value is None else _whole_number(name, value, low)
             for name, value, low in (("order", self.order, 2), ("jets", self.jets, 1))
         )
         self._set(order=order, jets=jets)
@@ -199,11 +199,11 @@ class Adaptive(Method):
         if self.name not in SCIPY:
             raise unknown(self.name, SCIPY, "method of scipy")
         self._set_tolerances()
-        if self.rtol < FLOOR and self.name != "LSODA":
+        if self.rtol < LEAST_RTOL and self.name != "LSODA":
             raise SpecificationError(
                 f"rtol={self.rtol:g} was given with method={self.name!r}.",
-                f"scipy's methods take {FLOOR:.3g} instead of less.",
-                nearest=f"rtol={1.01 * FLOOR:.3g}; method='Taylor' has no such limit.",
+                f"scipy's methods take {LEAST_RTOL:.3g} instead of less.",
+                nearest=f"rtol={1.01 * LEAST_RTOL:.3g}; method='Taylor' has no such limit.",
                 do="Change one of them.",
                 rtol=self.rtol,
             )
@@ -274,13 +274,13 @@ def as_method(value, **settings):
     method = value if isinstance(value, Method) else METHODS.get(value) if isinstance(value, str) else None
     if method is None:
         raise unknown(value, METHODS, "method")
-    settings = {name: setting for name, setting in settings.items() if setting is not None}
+    known, settings = setting_names(method), {name: s for name, s in settings.items() if s is not None}
     for name, setting in settings.items():
-        if name not in _settings(method):
-            users = ", ".join(short for short, other in METHODS.items() if name in _settings(other))
+        if name not in known:
+            users = ", ".join(short for short, other in METHODS.items() if name in setting_names(other))
             raise SpecificationError(
                 f"{name}={setting!r} was given with method={str(method)!r}.",
-                f"{method} takes {', '.join(_settings(method)) or 'no settings'}; {name} belongs to {users or 'none'}.",
+                f"{method} takes {', '.join(known) or 'no settings'}; {name} belongs to {users or 'none'}.",
                 do=f"Leave {name} out, or take a method that has it.",
                 **{name: setting},
             )
@@ -337,6 +337,6 @@ def require_combination(model, method, drift):
         )
 
 
-def _settings(method):
+def setting_names(method):
     """Names of what may be set beside what the short form tells."""
     return [f.name for f in fields(method) if f.name not in method.named_by]

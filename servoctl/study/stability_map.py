@@ -18,7 +18,7 @@ from servoctl.methods.bounds import amplification, row_poles
 from servoctl.methods.drift import Poles, as_drift
 from servoctl.methods.tableaus import ORDERS
 
-MAPPED = (*ORDERS, "Taylor", "RadauIIA")
+TABULATED = (*ORDERS, "Taylor", "RadauIIA")
 RADAU_ORDER = 5  # unless it is given; all are L-stable
 MOST_INSTANTS = 101  # of the plan, where eigenvalues are taken: adjacent ones are alike on plans of some smoothness
 NEGLIGIBLE = 1e-9  # size of a state relative to the largest: rounding of one that stays zero
@@ -178,7 +178,7 @@ class StabilityMap:
             f"  off the manifold: {story}; neutral without treatment, at the poles with, removed by projection",
             f"  largest step [s] {'no poles':>12}" + "".join(f"{f'T = {T:g} s':>12}" for T in shown[1:]),
         ]
-        for method in MAPPED:
+        for method in TABULATED:
             name = f"Taylor {self.order}" if method == "Taylor" else method
             steps = (self.largest_step(method, drift) for drift in shown)
             lines.append(f"  {name:<16} " + "".join(f"{_step_text(step):>12}" for step in steps))

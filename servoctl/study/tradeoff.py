@@ -6,7 +6,7 @@ import warnings
 
 import numpy as np
 
-from servoctl.checks import as_span, is_number, positive, positives
+from servoctl.checks import as_span, is_number, mapping, positive, positives
 from servoctl.codegen.function import compiling_at_once
 from servoctl.errors import LimitExceeded, ServoError, SpecificationError, unknown
 from servoctl.methods.accuracy import motion_error, relative_error
@@ -18,7 +18,7 @@ from servoctl.study.table import SHOWN, Study, machine, table
 
 MEASURED = tuple(name for name in METHODS if name not in ("RK1", "RK2", "RK23"))  # those need too many steps
 TOLERANCES = (1e-3, 1e-5, 1e-7, 1e-9, 1e-11, 1e-13)
-FIXED_STEPS = tuple(5 * 4**k for k in range(7))  # of a fixed length, in the span
+STEP_COUNTS = tuple(5 * 4**k for k in range(7))  # of a fixed length, in the span
 INSTANTS, COMPARED = 51, 201  # instants that adaptive methods give, and at most so many of any run are compared
 DENSE = 1001  # instants of the reference over which its power is integrated
 TIMED, ENOUGH = 3, 0.3  # calls timed after a warm-up, unless they take this part of `seconds` together
@@ -76,7 +76,7 @@ def tradeoff(model, x0, t_span, methods=None, drift=None, *, settings=None, seco
         For settings that are none.
     """
     t0, t1 = as_span(t_span)
-    settings = _settings(settings or {}, abs(t1 - t0))
+    settings = _ladders(mapping(settings, "The settings"), abs(t1 - t0))
     limit = positive("seconds", seconds)
     drifts = (None, "project", "minimal", abs(t1 - t0) / TIME_CONSTANT) if drift is None else drift
     combinations = _combinations(model, methods, drifts if isinstance(drifts, (list, tuple)) else [drifts])
@@ -335,10 +335,10 @@ def _ladder(reference, method, treatment, settings, seconds):
     """A row for each setting, from coarse to fine, until they are too slow or as exact as the reference."""
     over, name = "", _kind(method)
     for value in sorted(settings, reverse=True):
-        row = {"method": method, "drift": _label(treatment), "setting": name, "value": value, "failure": over}
+        row = {"method": method, "drift": _drift_word(treatment), "setting": name, "value": value, "failure": over}
         if not over:
             try:
-                row |= _measured(reference, method, treatment, value, seconds)
+                row |= _errors_and_cost(reference, method, treatment, value, seconds)
                 if not row["resolved"]:
                     over = f"skipped: {name} = {value:g} reaches what the reference is certain to"
                 elif row["seconds"] > seconds:
@@ -353,7 +353,7 @@ def _ladder(reference, method, treatment, settings, seconds):
         yield row
 
 
-def _measured(reference, name, treatment, value, seconds):
+def _errors_and_cost(reference, name, treatment, value, seconds):
     """Errors, counts and time of one setting."""
     model, (t0, t1) = reference.model, reference.span
     method, times = method_at(name, value), reference.times
@@ -443,13 +443,13 @@ def _combinations(model, methods, drifts):
     return pairs
 
 
-def _settings(settings, length):
+def _ladders(settings, length):
     """Values of "rtol" and "step", the latter for a span of some length [s]."""
     for name in settings:
         if name not in ("rtol", "step"):
             raise unknown(name, ("rtol", "step"), "setting")
     rtol = positives("rtol", settings.get("rtol", TOLERANCES), "Leave rtol out.", most=1.0)
-    step = positives("step", settings.get("step", [length / n for n in FIXED_STEPS]), "Leave step out.")
+    step = positives("step", settings.get("step", [length / n for n in STEP_COUNTS]), "Leave step out.")
     return {"rtol": np.ravel(rtol).tolist(), "step": np.ravel(step).tolist()}
 
 
@@ -457,7 +457,7 @@ def _kind(method):
     return "step" if isinstance(as_method(method), (Algebraic, RungeKutta)) else "rtol"
 
 
-def _label(treatment):
+def _drift_word(treatment):
     """A word for a treatment from which `TradeOff.recommend` makes it again."""
     if isinstance(treatment, Poles):
         return f"{treatment.values:g}"
