@@ -27,13 +27,13 @@ def loop(end=END):
     model = sv.derive(mechanism, program)
     plan = sv.simulate(model, model.start(guess={"l": 4.0}), (0.0, END), progress=False)
     law = sv.lqr(plan, sv.plant(mechanism), rate=RATE)
-    table = law.table.copy()
-    table[8:] = table[8:, -1:]
-    law = sv.Law(law.name, law.measures, law.inputs, RATE, 0.0, law.step, table, idle=law.idle, plan=plan)
+    schedule = law.schedule.copy()
+    schedule[8:] = schedule[8:, -1:]
+    law = sv.Law(law.name, law.measures, law.inputs, RATE, 0.0, law.step, schedule, idle=law.idle, plan=plan)
     plant = sv.plant(mechanism, m_load=M_LOAD, damping=DAMPING)
     count = round(end * RATE)
-    u_ff, reference = table[:2, : count + 1], table[2:8, : count + 1]
-    return plant, law, plan.state(0.0), u_ff, reference, table[8:, -1].reshape(2, 6)
+    u_ff, reference = schedule[:2, : count + 1], schedule[2:8, : count + 1]
+    return plant, law, plan.state(0.0), u_ff, reference, schedule[8:, -1].reshape(2, 6)
 
 
 def rates(x, u, m=M_LOAD, c_x=DAMPING["x"], c_l=DAMPING["l"]):
@@ -54,7 +54,7 @@ def rates(x, u, m=M_LOAD, c_x=DAMPING["x"], c_l=DAMPING["l"]):
 
 def ours(substeps=1):
     plant, law, x0, *_ = loop()
-    return lambda: sv.close(plant, law, x0, (0.0, END), substeps=substeps).states
+    return lambda: sv.close(plant, law, x0, (0.0, END), timing=sv.Timing(substeps=substeps)).states
 
 
 def python_control():

@@ -35,7 +35,8 @@ def ours():
     plant, law, x0, *_ = loop(END)
 
     def call():
-        many = sv.close_many(plant, law, x0, (0.0, END), cases(), substeps=1, threads=THREADS)
+        run = sv.close(plant, law, x0, (0.0, END), timing=sv.Timing(substeps=1))
+        many = sv.close_many(run, cases(), threads=THREADS)
         largest = [many[f"max |{name}|"] for name in SIGNALS]
         return np.array([*largest, *(many[f"rms {name}"] ** 2 for name in SIGNALS)])
 
@@ -49,7 +50,7 @@ def one_by_one():
     for i in range(SINGLE):
         m, c_x, c_l = parameters()[:, i]
         own = sv.plant(plant.mechanism, m_load=m, damping={"x": c_x, "l": c_l})
-        run = sv.close(own, law, x0, (0.0, END), substeps=1)
+        run = sv.close(own, law, x0, (0.0, END), timing=sv.Timing(substeps=1))
         values = np.vstack([run.states, run.inputs])
         found[:, i] = [*np.abs(values).max(axis=1), *np.mean(values**2, axis=1)]
     return found

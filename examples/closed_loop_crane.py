@@ -131,7 +131,8 @@ def main(fast=False, save=None):
         noise = {state: std for state, std in NOISE.items() if state in law.measures}
         runs[name] = closed(mechanism, plan, law, limits)
         numbers |= told(name, runs[name]) | {f"{name}: at 6 s [mm]": load_error(runs[name])[600]}
-        noisy = closed(mechanism, plan, law, limits, noise=noise, seed=1 if noise else None, delay=1)
+        sensors, timing = sv.Sensors(noise=noise, seed=1 if noise else None), sv.Timing(delay=1)
+        noisy = closed(mechanism, plan, law, limits, sensors=sensors, timing=timing)
         numbers |= told(f"noise, {name}", noisy)
     calm = sv.close(sv.plant(mechanism), every["computed, 0.25 s"], plan.state(0.0), (0.0, 8.0))
     numbers |= told("computed, 0.25 s, as planned", calm)

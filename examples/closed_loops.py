@@ -28,9 +28,10 @@ def program_error(run):
 
 def followed(plan, machine, law, noise, delay, off=0.0, error=program_error, **disturbance):
     """Worst and last error under a law and under feedforward alone, and whether both power balances hold."""
-    given = {"x0": plan.state(0.0) + off, "t_span": (0.0, plan.t[-1]), "delay": delay, "disturbance": disturbance}
+    given = {"timing": sv.Timing(delay=delay), "disturbance": disturbance}
+    given |= {"x0": plan.state(0.0) + off, "t_span": (0.0, plan.t[-1])}
     alone = sv.close(machine, sv.feedforward(plan, sv.plant(plan.model.reduction.mechanism), rate=law.rate), **given)
-    run = sv.close(machine, law, noise=noise, seed=1, **given)
+    run = sv.close(machine, law, sensors=sv.Sensors(noise=noise, seed=1), **given)
     print(run)
     return {
         "worst": error(run).max(),

@@ -26,7 +26,8 @@ def case(load, gust, rng):
     disturbance = {"x": sv.disturbances.gust(gust, 2.0, 2.5)}
     noise, seed = {"theta": 1e-3}, int(rng.integers(2**31))
     plant = sv.plant(mechanism, m_load=load)
-    run = sv.close(plant, law, plan.state(0.0), (0.0, 8.0), noise=noise, seed=seed, disturbance=disturbance)
+    sensors = sv.Sensors(noise=noise, seed=seed)
+    run = sv.close(plant, law, plan.state(0.0), (0.0, 8.0), sensors=sensors, disturbance=disturbance)
     error = 1e3 * np.hypot(*(run.residual[name][0] for name in ("X", "Z")))
     return {"worst_error": error.max(), "last_error": error[-1], "trolley_max": np.abs(run["trolley"]).max()}
 

@@ -8,14 +8,16 @@ from servoctl import figures, interop, spec
 from servoctl import figures as plots
 from servoctl.control import disturbances
 from servoctl.control.close import close
-from servoctl.control.computed import computed
+from servoctl.control.conditions import Sensors, Timing
+from servoctl.control.feedforward import feedforward
+from servoctl.control.inverse_dynamics import computed
 from servoctl.control.law import Controller, Law
 from servoctl.control.limits import LimitReport, limit_report, limited
 from servoctl.control.lqr import lqr
 from servoctl.control.observer import output_feedback
+from servoctl.control.pd import pd
 from servoctl.control.result import Closed
 from servoctl.control.time_law import TimeLaw, fastest
-from servoctl.control.tracking import feedforward, pd
 from servoctl.errors import (
     InconsistentStart,
     IntegrationStopped,
@@ -84,6 +86,7 @@ __all__ = [
     "RadauIIA",
     "Run",
     "RungeKutta",
+    "Sensors",
     "ServoError",
     "SingularProgram",
     "SpecificationError",
@@ -92,6 +95,7 @@ __all__ = [
     "Sundials",
     "Taylor",
     "TimeLaw",
+    "Timing",
     "TradeOff",
     "UnstableInternalDynamics",
     "Verification",

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from servoctl.verification import require_model
+from servoctl.run import require_model
 
 SAMPLES = 41  # instants along a run at which the internal dynamics is linearised
 NEUTRAL = 1e-7  # of the largest entry of the linearisation: a smaller real part is none

@@ -342,3 +342,25 @@ def _from_archive(facts, arrays):
     residuals = {name: arrays[f"residual_{i}"] for i, name in enumerate(facts["residuals"])}
     facts = {name: tuple(facts[name]) if isinstance(facts[name], list) else facts[name] for name in FACTS}
     return Run(arrays["t"], arrays["jets"], stored=signals, stored_residual=residuals, **facts)
+
+
+def require_model(model, run, what):
+    """Refuse a run that is not of a model.
+
+    Raises
+    ------
+    SpecificationError
+        Naming what was given to the function `what`.
+    """
+    states = getattr(model, "state_names", ())
+    if getattr(run, "model", None) is None or not hasattr(model, "reduction"):
+        which = " without its model" if hasattr(run, "jets") else ""
+    elif run.jet_names[: len(states)] != tuple(states):
+        which = " of another one"
+    else:
+        return
+    raise SpecificationError(
+        f"{what} was given a {type(model).__name__} and a {type(run).__name__}{which}.",
+        "A run belongs to the model that made it; a loaded run has none.",
+        do=f"Write sv.{what}(model, run), or simulate again.",
+    )

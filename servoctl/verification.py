@@ -1,12 +1,14 @@
-"""The proof: the full mechanism, under the required actuation, does what the reduced model says."""
+"""Checks against the full mechanism: what a run says is what the mechanism does; what a loop gains, forces worked."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from servoctl.checks import is_whole
-from servoctl.errors import SpecificationError
+from servoctl.checks import whole
+from servoctl.control.loop import FINISHED, run_loop
+from servoctl.control.result import Closed
 from servoctl.model.equations import residual_rows
+from servoctl.run import require_model
 
 LIMITS = {
     "acceleration": 1e-9,
@@ -17,6 +19,8 @@ LIMITS = {
     "residual": 1e-6,
 }
 INTEGRATED = 1e-6  # for what drift disturbs: where γ'' is itself integrated, or hidden rows are
+LOOP_LIMITS = {"loop power": 1e-3, "loop constraints": 1e-8, "loop limits": 1e-12, "loop repeated": 1e-9}  # relative
+CONVERGES, EXACT = 0.7, 1e-10  # of the defect with steps half as long, relative to the other; what is rounding
 
 
 @dataclass(frozen=True)
@@ -68,14 +72,14 @@ class Verification:
             "loop repeated": "states of the loop when it is run again",
         }
         lines = [f"Verification: {'passed' if self.passed else 'FAILED: ' + ', '.join(self.failures)}"]
-        lines += [f"  {words[key]}: {self._told(key)}" for key in words if key in self.numbers]
+        lines += [f"  {words[key]}: {self._number(key)}" for key in words if key in self.numbers]
         if worst:
             name = worst.removeprefix("residual ")
-            lines.append(f"  largest residual at any level: {self._told(worst)} ({name})")
+            lines.append(f"  largest residual at any level: {self._number(worst)} ({name})")
         lines += [f"  {note}" for note in self.notes]
         return "\n".join(lines[:12])
 
-    def _told(self, key):
+    def _number(self, key):
         allowed = f" (allowed {self.limits[key]:.2g})" if key in self.failures and key in self.limits else ""
         return f"{self.numbers[key]:.1e}{allowed}"
 
@@ -108,69 +112,56 @@ def verify(model, run=None, segments=20):
     SpecificationError
         If the run is not of this model, or segments is no whole number of at least 1.
     """
-    if not (is_whole(segments) and segments >= 1):
-        raise SpecificationError(
-            f"segments={segments!r} was given.", "It is a whole number, at least 1.", do="Give 20, or leave it out."
-        )
-    if run is None and hasattr(model, "loop"):
-        return model.verify()
+    segments = whole("segments", segments, least=1)
+    if run is None and isinstance(model, Closed):
+        return _verify_loop(model)
     require_model(model, run, "verify")
     good = np.flatnonzero(np.all(np.isfinite(run.jets), axis=0))
-    numbers, limits, notes = {}, dict(LIMITS), []
+    limits, notes = dict(LIMITS), []
     if model.reduction.top > 2 or (model.reduction.hidden and not model.flat):
         limits |= dict.fromkeys(("acceleration", "power", "multiplier form"), INTEGRATED)
     inputs = run.signals("inputs")[1][:, good]
-    numbers["acceleration"] = _acceleration(model, run, good, inputs)
-    numbers["segments"] = _segments(model, run, good, inputs, segments)
-    rate, work, size, law = run.signals("power")[1][:, good]
-    largest = max(np.abs(size).max(), np.abs(rate).max(), 1e-300)
-    if np.abs(law).max() < 1e-9 * largest:
-        numbers["power"] = float(np.abs(rate - work).max() / largest)
-        numbers["energy"], sampling = _energy(run, good, work)
-        if limits["energy"] < numbers["energy"] <= sampling:
-            notes.append("the samples are too far apart to integrate the power more accurately")
-            limits["energy"] = sampling
-    else:
-        notes.append("power balance: not applicable, the inertia terms depend on time or on more than wᵀMw/2")
-    numbers["multiplier form"] = _multiplier_form(model, run, good)
+    numbers = {
+        "acceleration": _acceleration(model, run, good, inputs),
+        "segments": _segments(model, run, good, inputs, segments),
+        **_balance(run, good, limits, notes),
+        "multiplier form": _multiplier_form(model, run, good),
+    }
     if model.ideal and model.actuators:
         numbers["outside"] = _outside(model, run, good)
     numbers |= {f"residual {name}": _relative_residual(run, name, good) for name in run.residual}
     if not run.success:
         notes.append("the run did not reach its end: next to a singularity errors grow")
-    limit = {key: limits.get(key.split()[0] if key.startswith("residual") else key, np.inf) for key in numbers}
-    failures = tuple(key for key, value in numbers.items() if not value <= limit[key])
-    return Verification(numbers, failures, tuple(notes), limit)
+    limits = {key: limits.get("residual" if key.startswith("residual ") else key, np.inf) for key in numbers}
+    return _judged(numbers, limits, notes)
 
 
-def require_model(model, run, what):
-    """Refuse a run that is not of a model.
+def _judged(numbers, limits, notes):
+    failures = tuple(key for key, value in numbers.items() if not value <= limits[key])
+    return Verification(numbers, failures, tuple(notes), limits)
 
-    Raises
-    ------
-    SpecificationError
-        Naming what was given to the function `what`.
-    """
-    states = getattr(model, "state_names", ())
-    if getattr(run, "model", None) is None or not hasattr(model, "reduction"):
-        which = " without its model" if hasattr(run, "jets") else ""
-    elif run.jet_names[: len(states)] != tuple(states):
-        which = " of another one"
-    else:
-        return
-    raise SpecificationError(
-        f"{what} was given a {type(model).__name__} and a {type(run).__name__}{which}.",
-        "A run belongs to the model that made it; a loaded run has none.",
-        do=f"Write sv.{what}(model, run), or simulate again.",
-    )
+
+def _balance(run, good, limits, notes):
+    """Errors of the power and of the energy where they apply; limits and notes are completed."""
+    rate, work, size, of_time = run.signals("power")[1][:, good]
+    largest = max(np.abs(size).max(), np.abs(rate).max(), 1e-300)
+    if np.abs(of_time).max() >= 1e-9 * largest:
+        notes.append("power balance: not applicable, the inertia terms depend on time or on more than wᵀMw/2")
+        return {}
+    energy, sampling = _energy(run, good, work)
+    if limits["energy"] < energy <= sampling:
+        notes.append("the samples are too far apart to integrate the power more accurately")
+        limits["energy"] = sampling
+    return {"power": float(np.abs(rate - work).max() / largest), "energy": energy}
 
 
 def _acceleration(model, run, good, inputs):
     """Largest error of the mechanism's γ'' under the inputs, relative to the largest γ'' of the run."""
     n, nq = model.n, model.nq
-    found = model.function("plant").grid(run.t[good], np.vstack([run.jets[: nq + n, good], inputs]), model.parameters)
+    states = np.vstack([run.jets[: nq + n, good], inputs])
+    rates = model.function("plant").grid(run.t[good], states, model.parameters)
     acceleration = run.jets[nq + n : nq + 2 * n, good]
-    return float(np.abs(found[nq:] - acceleration).max() / max(np.abs(acceleration).max(), 1e-300))
+    return float(np.abs(rates[nq:] - acceleration).max() / max(np.abs(acceleration).max(), 1e-300))
 
 
 def _energy(run, good, work):
@@ -224,8 +215,8 @@ def _segments(model, run, good, u, count):
         def rates(s, x, inputs=inputs):
             return plant(s, np.concatenate([x, inputs(s, run.at(s)[: inputs.n_x], p)]), p)[: nq + n]
 
-        found = solve_ivp(rates, (t[i], t[stop]), states[:, i], method="DOP853", rtol=1e-11, atol=1e-13 * size)
-        worst = max(worst, float(np.max(np.abs(found.y[:, -1] - states[:, stop]) / size)))
+        segment = solve_ivp(rates, (t[i], t[stop]), states[:, i], method="DOP853", rtol=1e-11, atol=1e-13 * size)
+        worst = max(worst, float(np.max(np.abs(segment.y[:, -1] - states[:, stop]) / size)))
     return worst
 
 
@@ -295,3 +286,73 @@ def _outside(model, run, good):
         outside = reaction - E @ np.linalg.lstsq(E, reaction, rcond=None)[0]
         worst = max(worst, float(np.abs(outside).max()) / largest)
     return worst
+
+
+def _verify_loop(closed):
+    """Power balance, material constraints and limits of a closed loop.
+
+    The loop is run again with the work of inputs, disturbances and friction as one more state, by the same method: the
+    energy gained less this work is an error of integration, which shrinks with the steps. A force that the plant feels
+    and the balance does not know, or the other way round, leaves a defect that does not.
+    """
+    plant, numbers, limits, notes = closed.plant, {}, dict(LOOP_LIMITS), []
+    defect, numbers["loop repeated"] = _defect(closed, 1)
+    if plant.equations.unbalanced:
+        notes.append(f"power balance: not applicable, {plant.equations.unbalanced}")
+    elif numbers["loop repeated"] <= limits["loop repeated"]:
+        numbers["loop power"] = defect
+        numbers["loop power halved"] = _defect(closed, 2)[0]
+        limits["loop power halved"] = max(CONVERGES * defect, EXACT)
+    if plant.constrained:
+        largest = max(np.abs(closed.residual[name]).max() for name in plant.constraint_names())
+        numbers["loop constraints"] = float(largest / max(1.0, np.abs(closed.states).max()))
+    if plant.limits or plant.rate_limits:
+        numbers["loop limits"] = _excess(closed)
+    return _judged(numbers, limits, notes)
+
+
+def _defect(closed, finer):
+    """Largest |E - E0 - W| relative to the energy turned over, of the loop with steps shorter by a whole factor.
+
+    Returns
+    -------
+    defect : float
+    repeated : float
+        Largest difference of the states from those of the run, relative to their sizes.
+    """
+    plant, loop = closed.plant, closed.loop
+    substeps = loop.substeps * finer
+    again = replace(
+        loop,
+        samples=len(closed.t) - 1,
+        substeps=substeps,
+        x0=np.append(loop.x0, 0.0),
+        disturbance=closed.conditions.forces(loop.t0, loop.period / substeps, loop.samples * substeps),
+        transport=None if loop.transport is None else loop.transport * finer,
+    )
+    status, x, *_ = run_loop(plant.function("ode_power"), closed.law.begin(), again)
+    if status != FINISHED:
+        return np.inf, np.inf
+    states, work = x[:, :-1].T, x[:, -1]
+    energy = plant.function("power").grid(closed.t, states, closed.p)[0]
+    scale = max(np.ptp(energy), np.ptp(work), 1e-6 * np.abs(energy).max(), 1e-12)
+    size = np.abs(closed.states).max(axis=1, keepdims=True) + 1e-9
+    return (
+        float(np.abs(energy - energy[0] - work).max() / scale),
+        float((np.abs(states - closed.states) / size).max()),
+    )
+
+
+def _excess(closed):
+    """How far an input lies beyond its limits or its limits of rate, relative to these."""
+    loop, excesses = closed.loop, [0.0]
+    if loop.low is not None:
+        for u, low, high in zip(closed.inputs, loop.low, loop.high, strict=True):
+            size = max([abs(v) for v in (low, high) if np.isfinite(v)], default=1.0) or 1.0
+            excesses += [(u.max() - high) / size, (low - u.min()) / size]
+    if loop.change is not None:
+        limited = loop.change < np.inf
+        most, inputs = loop.change[limited], closed.inputs[limited]
+        changes = np.abs(np.diff(np.column_stack([loop.idle[limited], inputs]), axis=1)).max(axis=1)
+        excesses += list((changes - most) / (np.abs(inputs).max(axis=1) + most))
+    return float(max(excesses))

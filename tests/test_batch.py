@@ -46,16 +46,18 @@ def alone(plant, law, plan, cases, i, seed=None, **given):
         delay=plant.delay, **changed,
     )  # fmt: skip
     wind = sv.disturbances.gust(cases["wind"][i], 1.0, 1.5)
-    return sv.close(own, law, x0, disturbance={"x": wind}, seed=seed, **given)
+    sensors = replace(given["sensors"], seed=seed)
+    return sv.close(own, law, x0, disturbance={"x": wind}, **given | {"sensors": sensors})
 
 
 LOOPS = {
     "plain": ({}, {}),
     "noise, delay and limits": (
-        {"limits": {"trolley": 120.0}, "rate_limits": {"hoist": 2e4}}, {"noise": {"theta": 1e-4, "x": 1e-4}, "delay": 2}
+        {"limits": {"trolley": 120.0}, "rate_limits": {"hoist": 2e4}},
+        {"sensors": sv.Sensors(noise={"theta": 1e-4, "x": 1e-4}, seed=3), "timing": sv.Timing(delay=2, substeps=5)},
     ),
     "lag, transport and quantisation": (
-        {"lag": {"hoist": 0.01}, "delay": {"trolley": 0.011}}, {"quantisation": {"l": 1e-4}}
+        {"lag": {"hoist": 0.01}, "delay": {"trolley": 0.011}}, {"sensors": sv.Sensors(quantisation={"l": 1e-4})}
     ),
 }  # fmt: skip
 
@@ -65,12 +67,10 @@ def test_each_case_equals_the_loop_alone(plan, cases, what):
     of_plant, of_loop = LOOPS[what]
     plant = sv.plant(CRANE, damping={"x": 5.0}, **of_plant)
     law = sv.lqr(plan, replace(plant, delay={}), rate=200.0, integral=True)
-    given = {"t_span": (0.0, 4.0), "substeps": 5, **of_loop}
-    seeded = {"seed": 3} if "noise" in of_loop else {}
-    many = sv.close_many(
-        plant, law, plan.state(0.0), cases=cases, disturbance={"x": GUST}, scale={"x": "wind"},
-        record=("theta", "trolley", "residual X"), every=10, **given, **seeded,
-    )  # fmt: skip
+    given = {"t_span": (0.0, 4.0), "sensors": sv.Sensors(), "timing": sv.Timing(substeps=5), **of_loop}
+    seeded = bool(given["sensors"].noise)
+    one = sv.close(plant, law, plan.state(0.0), disturbance={"x": GUST}, **given)
+    many = sv.close_many(one, cases, scale={"x": "wind"}, record=("theta", "trolley", "residual X"), every=10)
     assert len(many) == N and not np.any(many["error"] != "")
     limited = False
     for i in range(N):
@@ -94,11 +94,14 @@ def test_each_case_equals_the_loop_alone(plan, cases, what):
 def test_lanes_and_threads_do_not_change_a_case(plan, cases, monkeypatch):
     plant = sv.plant(CRANE, damping={"x": 5.0})
     law = sv.lqr(plan, plant, rate=100.0)
-    given = {"noise": {"theta": 1e-3}, "seed": 7, "disturbance": {"x": GUST}, "scale": {"x": "wind"}, "substeps": 2}
+    sensors, timing = sv.Sensors(noise={"theta": 1e-3}, seed=7), sv.Timing(substeps=2)
+    one = sv.close(
+        plant, law, plan.state(0.0), (0.0, 2.0), sensors=sensors, timing=timing, disturbance={"x": GUST}
+    )  # fmt: skip
     few = {name: values[:5] for name, values in cases.items()}
 
     def results(cases, **options):
-        study = sv.close_many(plant, law, plan.state(0.0), (0.0, 2.0), cases, **given, **options).study
+        study = sv.close_many(one, cases, scale={"x": "wind"}, **options).study
         return np.array([study[name] for name in study.columns if name not in ("error", "message", "case")])
 
     everything = results(cases, threads=1)
@@ -113,11 +116,11 @@ def test_without_a_compiler_the_loops_are_closed_one_by_one(plan, cases, monkeyp
     plant = sv.plant(CRANE, damping={"x": 5.0})
     law = sv.lqr(plan, plant, rate=100.0)
     few = {name: values[:3] for name, values in cases.items()}
-    arguments = (plant, law, plan.state(0.0), (0.0, 0.5), few)
-    given = {"noise": {"theta": 1e-3}, "seed": 7, "disturbance": {"x": GUST}, "scale": {"x": "wind"}, "record": ("x",)}
-    there = sv.close_many(*arguments, **given)
+    sensors = sv.Sensors(noise={"theta": 1e-3}, seed=7)
+    one = sv.close(plant, law, plan.state(0.0), (0.0, 0.5), sensors=sensors, disturbance={"x": GUST})
+    there = sv.close_many(one, few, scale={"x": "wind"}, record=("x",))
     monkeypatch.setattr(batch.Unit, "library", lambda self, n: None)
-    alone = sv.close_many(*arguments, **given)
+    alone = sv.close_many(one, few, scale={"x": "wind"}, record=("x",))
     assert list(alone.study.columns) == list(there.study.columns)
     assert alone.trace["x"] == pytest.approx(there.trace["x"], rel=1e-12)
     for name in alone.study.columns:
@@ -138,38 +141,32 @@ def test_laws_of_the_toolkit(plan, name):
     plant = sv.plant(CRANE)
     law = LAWS[name](plan, plant)
     loads = np.linspace(90.0, 110.0, 9)
-    many = sv.close_many(plant, law, plan.state(0.0), (0.0, 1.0), {"m_load": loads}, substeps=2)
+    given = (law, plan.state(0.0), (0.0, 1.0))
+    many = sv.close_many(sv.close(plant, *given, timing=sv.Timing(substeps=2)), {"m_load": loads})
     for i in (0, 8):
-        run = sv.close(sv.plant(CRANE, m_load=loads[i]), law, plan.state(0.0), (0.0, 1.0), substeps=2)
+        run = sv.close(sv.plant(CRANE, m_load=loads[i]), *given, timing=sv.Timing(substeps=2))
         for state, row in zip(plant.state_names, run.states, strict=True):
             assert many[f"final {state}"][i] == pytest.approx(row[-1], rel=1e-10, abs=1e-12)
 
 
 def test_a_long_plant_is_called_not_written_into_the_steps(plan, cases, monkeypatch):
     plant = sv.plant(CRANE, damping={"x": 5.0})
-    arguments = (plan.state(0.0), (0.0, 1.0), {"m_load": cases["m_load"]})
     short, long = [], []
     for inlined, kept in ((batch.INLINED, short), (0, long)):
         monkeypatch.setattr(batch, "INLINED", inlined)
-        kept += [sv.close_many(plant, sv.lqr(plan, plant, rate=100.0), *arguments)["max |theta|"]]
+        one = sv.close(plant, sv.lqr(plan, plant, rate=100.0), plan.state(0.0), (0.0, 1.0))
+        kept += [sv.close_many(one, {"m_load": cases["m_load"]})["max |theta|"]]
     assert long[0] == pytest.approx(short[0], rel=1e-13)
 
 
 def test_cases_keep_their_seeds_when_there_are_more(plan):
     plant = sv.plant(CRANE)
-    law = sv.feedforward(plan, plant, rate=50.0)
     pd = sv.pd(plan, plant, rate=50.0, kp={"trolley": 100.0, "hoist": 100.0}, kd={"trolley": 50.0, "hoist": 50.0})
-    seeds = [
-        sv.close_many(plant, pd, plan.state(0.0), (0.0, 0.1), {"m_load": np.full(n, 100.0)}, noise={"x": 1e-3}, seed=4)[
-            "seed"
-        ]
-        for n in (3, 9)
-    ]
+    one = sv.close(plant, pd, plan.state(0.0), (0.0, 0.1), sensors=sv.Sensors(noise={"x": 1e-3}, seed=4))
+    seeds = [sv.close_many(one, {"m_load": np.full(n, 100.0)})["seed"] for n in (3, 9)]
     assert np.array_equal(seeds[0], seeds[1][:3]) and len(set(seeds[1])) == 9
     study = sv.sweep(lambda m, rng: {"first": float(rng.integers(2**31))}, {"m": [1.0, 2.0, 3.0]}, seed=4)
     assert np.array_equal(study["first"], seeds[0])
-    with pytest.raises(sv.NameUnknown):
-        sv.close_many(plant, law, plan.state(0.0), (0.0, 0.1), {"m_load": [100.0]}, noise={"x": 1e-3})
 
 
 def test_a_loop_that_diverges_is_a_row_and_disturbs_no_other(plan):
@@ -177,9 +174,10 @@ def test_a_loop_that_diverges_is_a_row_and_disturbs_no_other(plan):
     law = sv.lqr(plan, plant, rate=100.0)
     damping = np.full(9, 1.0)
     damping[4] = 1e5  # steps of 10 ms are far too long for it
-    many = sv.close_many(plant, law, plan.state(0.0), (0.0, 8.0), {"damping x": damping}, substeps=1)
+    given = (law, plan.state(0.0), (0.0, 8.0))
+    many = sv.close_many(sv.close(plant, *given, timing=sv.Timing(substeps=1)), {"damping x": damping})
     with pytest.raises(sv.IntegrationStopped) as caught:
-        sv.close(sv.plant(CRANE, damping={"x": 1e5}), law, plan.state(0.0), (0.0, 8.0), substeps=1)
+        sv.close(sv.plant(CRANE, damping={"x": 1e5}), *given, timing=sv.Timing(substeps=1))
     assert many["error"].tolist() == [""] * 4 + ["IntegrationStopped"] + [""] * 4
     assert f"t = {caught.value.details['t']:.6g} s" in many["message"][4]
     assert np.isnan(many["final x"][4]) and np.ptp(np.delete(many["final x"], 4)) == 0
@@ -195,10 +193,11 @@ def test_material_constraints_are_held(name):
     law = sv.lqr(plan, plant, rate=100.0)
     parameter = next(n for n in mechanism.parameters.names if n.startswith("m"))
     values = mechanism.parameters.defaults[parameter] * np.linspace(0.9, 1.1, 9)
-    many = sv.close_many(plant, law, plan.state(0.0), (0.0, 1.0), {parameter: values}, substeps=2)
+    given = (law, plan.state(0.0), (0.0, 1.0))
+    many = sv.close_many(sv.close(plant, *given, timing=sv.Timing(substeps=2)), {parameter: values})
     for i in (0, 8):
         own = sv.plant(mechanism, **{parameter: values[i]})
-        run = sv.close(own, law, plan.state(0.0), (0.0, 1.0), substeps=2)
+        run = sv.close(own, *given, timing=sv.Timing(substeps=2))
         for row, state in zip(run.states, plant.state_names, strict=True):
             assert many[f"max |{state}|"][i] == pytest.approx(np.abs(row).max(), rel=1e-11, abs=1e-13)
 
@@ -206,11 +205,9 @@ def test_material_constraints_are_held(name):
 def test_the_steps_are_those_of_the_case_that_needs_most(plan):
     plant = sv.plant(CRANE, damping={"x": 5.0})
     law = sv.feedforward(plan, plant, rate=50.0)
-    many = sv.close_many(plant, law, plan.state(0.0), (0.0, 0.1), {"damping x": [1.0, 900.0]})
-    alone = [
-        sv.close(sv.plant(CRANE, damping={"x": c}), law, plan.state(0.0), (0.0, 0.1)).loop.substeps
-        for c in (1.0, 900.0)
-    ]
+    given = (law, plan.state(0.0), (0.0, 0.1))
+    many = sv.close_many(sv.close(plant, *given), {"damping x": [1.0, 900.0]})
+    alone = [sv.close(sv.plant(CRANE, damping={"x": c}), *given).loop.substeps for c in (1.0, 900.0)]
     assert alone[0] < alone[1] == many.study.meta["substeps"]
 
 
@@ -246,9 +243,12 @@ def test_sine_and_cosine_of_the_lanes_are_within_two_units(n):
 def test_laws_in_python_are_sent_to_sweep(plan):
     plant = sv.plant(CRANE, limits={"trolley": 100.0})
     limited = sv.limited(sv.lqr(plan, plant, rate=50.0), plant)
-    for law in (lambda t, y: [0.0, 0.0], limited):
+    for law, rate in ((lambda t, y: [0.0, -981.0], 50.0), (limited, None)):
+        one = sv.close(plant, law, plan.state(0.0), (0.0, 0.1), timing=sv.Timing(rate=rate))
         with pytest.raises(sv.SpecificationError, match="sweep"):
-            sv.close_many(plant, law, plan.state(0.0), (0.0, 1.0), {"m_load": [100.0]})
+            sv.close_many(one, {"m_load": [100.0]})
+    with pytest.raises(sv.SpecificationError, match="Closed"):
+        sv.close_many(plan, {"m_load": [100.0]})
 
 
 BAD = {
@@ -260,10 +260,9 @@ BAD = {
     "every without traces": ({"m_load": [100.0]}, {"every": 5}, "none to thin out"),
     "a name alone": ({"m_load": [100.0]}, {"record": "theta"}, "one by one"),
     "scale of no disturbance": ({"m_load": [1.0]}, {"scale": {"x": "m_load"}}, "disturbance"),
-    "scale without its column": ({"m_load": [1.0]}, {"scale": {"x": "w"}, "disturbance": {"x": 1.0}}, "column of the cases"),
+    "scale without its column": ({"m_load": [1.0]}, {"scale": {"theta": "w"}}, "column of the cases"),
     "trace of nothing": ({"m_load": [100.0]}, {"record": ("thet",)}, "theta"),
     "every": ({"m_load": [100.0]}, {"record": ("theta",), "every": 0}, "at least 1"),
-    "seed without noise": ({"m_load": [100.0]}, {"seed": 1}, "without noise"),
 }  # fmt: skip
 
 
@@ -272,8 +271,9 @@ def test_bad_input_is_refused(plan, what):
     cases, given, told = BAD[what]
     plant = sv.plant(CRANE)
     law = sv.lqr(plan, plant, rate=50.0)
+    one = sv.close(plant, law, plan.state(0.0), (0.0, 0.2), disturbance={"theta": 1.0})
     with pytest.raises(sv.ServoError, match=told):
-        sv.close_many(plant, law, plan.state(0.0), (0.0, 0.2), cases, **given)
+        sv.close_many(one, cases, **given)
 
 
 def test_starts_off_the_constraints_are_refused():
@@ -285,5 +285,6 @@ def test_starts_off_the_constraints_are_refused():
     law = sv.lqr(plan, plant, rate=100.0)
     name = plant.state_names[0]
     start = plan.state(0.0)[0]
+    one = sv.close(plant, law, plan.state(0.0), (0.0, 0.1))
     with pytest.raises(sv.InconsistentStart, match="case 1"):
-        sv.close_many(plant, law, plan.state(0.0), (0.0, 0.1), {name: [start, start + 0.1]})
+        sv.close_many(one, {name: [start, start + 0.1]})

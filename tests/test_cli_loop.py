@@ -57,7 +57,8 @@ def test_the_machine_has_its_own_numbers(plan):
     _, facts, run = crane("--machine m_load=115 --integral --rate 50 --delay 1 --noise x=1e-3 --seed 4")
     law = sv.lqr(plan, sv.plant(CRANE), rate=50.0, integral=True)
     machine = sv.plant(CRANE, m_load=115.0)
-    expected = sv.close(machine, law, plan.state(0.0), (0.0, 8.0), delay=1, noise={"x": 1e-3}, seed=4)
+    sensors, timing = sv.Sensors(noise={"x": 1e-3}, seed=4), sv.Timing(delay=1)
+    expected = sv.close(machine, law, plan.state(0.0), (0.0, 8.0), sensors=sensors, timing=timing)
     for name in machine.state_names:
         assert np.array_equal(run[name], expected[name])
     assert facts["machine"] == {"m_trolley": 10.0, "m_hoist": 5.0, "m_load": 115.0, "g": 9.81}
@@ -207,6 +208,6 @@ def test_the_figure_of_a_loop_shows_errors_inputs_and_limits(plan):
 
 def test_a_loop_without_plan_and_units_is_drawn_by_name():
     x0 = {"x": 0.0, "l": 4.0, "theta": 0.1, "dx": 0.0, "dl": 0.0, "dtheta": 0.0}
-    run = sv.close(sv.plant(CRANE), lambda t, y: [0.0, -981.0], x0, (0.0, 1.0), rate=50.0)
+    run = sv.close(sv.plant(CRANE), lambda t, y: [0.0, -981.0], x0, (0.0, 1.0), timing=sv.Timing(rate=50.0))
     axes = sv.figures.closed(run)
     assert [ax.get_ylabel() for ax in axes] == ["trolley", "hoist"] and list(curves(axes[0])) == ["input"]

@@ -161,22 +161,22 @@ def law(memory=2, samples=5):
     following = x[2:] + error[:memory] / 100.0
     f = ca.Function("law", [t, x, p], [ca.densify(ca.vertcat(u, following, ca.sumsqr(error)))])
     table = np.random.default_rng(3).normal(size=(5, samples))
-    facts = {"measures": ("x", "dx"), "inputs": ("push",), "rate": 100.0, "t0": 0.5, "memory": np.full(memory, 0.25)}
-    facts["memory_names"] = ("integral of x", "integral of dx")[:memory]
-    return SimpleNamespace(step=compiled(f, "law"), table=table, **facts)
+    facts = {"measures": ("x", "dx"), "inputs": ("push",), "rate": 100.0, "t0": 0.5, "state": np.full(memory, 0.25)}
+    facts["state_names"] = ("integral of x", "integral of dx")[:memory]
+    return SimpleNamespace(step=compiled(f, "law"), schedule=table, **facts)
 
 
 @pytest.mark.parametrize("memory", [0, 2])
 def test_a_law_steps_as_in_python(memory, tmp_path):
     given = law(memory)
     ours = Exported(export_c(given, tmp_path, name="loop"), "loop")
-    z, u, expected = np.full(max(memory, 1), np.nan), np.empty(1), given.memory
+    z, u, expected = np.full(max(memory, 1), np.nan), np.empty(1), given.state
     ours("start", z)
-    assert np.array_equal(z[:memory], given.memory)
+    assert np.array_equal(z[:memory], given.state)
     random = np.random.default_rng(4)
     for k in range(-1, 9):
         t, y = 0.5 + k / 100, random.normal(size=2)
-        row = given.table[:, min(max(k, 0), 4)]
+        row = given.schedule[:, min(max(k, 0), 4)]
         wanted = given.step(t, np.append(y, expected), row)
         ours("step", t, y, z, u)
         assert close(u, wanted[:1]) and close(z[:memory], wanted[1 : 1 + memory])
@@ -190,13 +190,13 @@ def test_an_lqr_with_integral_steps_as_its_controller(gallery_model, tmp_path):
     plan = sv.simulate(model, model.start(guess={"l": 4.0}), (0.0, 8.0))
     designed = sv.lqr(plan, sv.plant(model.reduction.mechanism), rate=50.0, integral=True)
     ours, controller = Exported(export_c(designed, tmp_path, name="loop"), "loop"), designed.start()
-    z, u, random = np.empty(len(designed.memory)), np.empty(2), np.random.default_rng(5)
+    z, u, random = np.empty(len(designed.state)), np.empty(2), np.random.default_rng(5)
     ours("start", z)
     for k in range(0, 450, 3):
         t = k / 50.0
         y = plan.state(min(t, 8.0)) + random.normal(scale=0.01, size=6)
         ours("step", t, y, z, u)
-        assert close(u, controller(t, y)) and close(z, controller.memory)
+        assert close(u, controller(t, y)) and close(z, controller.state)
     assert list(ours.indices("y")) == list(designed.measures)
 
 

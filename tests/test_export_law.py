@@ -78,14 +78,14 @@ class InC:
         self.law, (self.c, self.header) = law, library(law, folder)
 
     def start(self):
-        z, u = np.full(max(len(self.law.memory), 1), np.nan), np.empty(len(self.law.inputs))
+        z, u = np.full(max(len(self.law.state), 1), np.nan), np.empty(len(self.law.inputs))
         self.c.loop_start(z.ctypes.data_as(ctypes.c_void_p))
-        self.memory = [z[: len(self.law.memory)].copy()]
+        self.states = [z[: len(self.law.state)].copy()]
 
         def step(t, measurement):
             y = np.array([measurement[name] for name in self.law.measures] or [0.0])
             self.c.loop_step(ctypes.c_double(t), *(a.ctypes.data_as(ctypes.c_void_p) for a in (y, z, u)))
-            self.memory.append(z[: len(self.law.memory)].copy())
+            self.states.append(z[: len(self.law.state)].copy())
             return u.copy()
 
         return step
@@ -101,14 +101,14 @@ def test_a_law_in_c_answers_what_it_answered_in_the_loop(name, plan, tmp_path):
     machine = sv.plant(CRANE, m_load=115.0, lag={"trolley": 0.05} if "lagged" in name else None)
     span = (0.0, 4.0) if name in ("feedforward", "pd") else (0.0, 9.0)  # beyond the table, where its last row holds
     noise = {measure: 1e-3 for measure in law.measures}
-    run = sv.close(machine, law, plan.state(0.0), span, noise=noise or None)
-    assert len(law.memory) == MEMORY.get(name, 0)
+    run = sv.close(machine, law, plan.state(0.0), span, sensors=sv.Sensors(noise))
+    assert len(law.state) == MEMORY.get(name, 0)
     ours = InC(law, tmp_path)
     step = ours.start()
     measured = [dict(zip(law.measures, y, strict=True)) for y in run.measurements.T]
     commands = np.array([step(t, y) for t, y in zip(run.t, measured, strict=True)]).T
     assert close_to(commands, run.commands)
-    assert close_to(np.array(ours.memory[:-1]).T, run.memory)
+    assert close_to(np.array(ours.states[:-1]).T, run.controller_states)
 
 
 @pytest.mark.parametrize("name", ["lqr with integral", "computed"])
@@ -116,7 +116,7 @@ def test_a_loop_closed_by_the_c_file_is_the_loop_of_the_law(name, plan, tmp_path
     law = LAWS[name](plan, sv.plant(CRANE))
     given = (plan.state(0.0), (0.0, 4.0))
     run = sv.close(sv.plant(CRANE, m_load=110.0), law, *given)
-    ours = sv.close(sv.plant(CRANE, m_load=110.0), InC(law, tmp_path), *given, rate=100.0, plan=plan)
+    ours = sv.close(sv.plant(CRANE, m_load=110.0), InC(law, tmp_path), *given, timing=sv.Timing(rate=100.0), plan=plan)
     assert np.abs(ours.states - run.states).max() < 1e-10 and np.abs(run.states - plan.state(0.0)[:, None]).max() > 1
 
 
@@ -129,7 +129,7 @@ def test_the_table_is_a_constant_and_indices_have_names(plan, tmp_path):
     assert "LOOP_Z_integral_of_X" in header and "LOOP_U_hoist" in header
     size = int(re.search(r"static const double \w*table\[(\d+)\]", source)[1])
     assert set(re.findall(r"#include (\S+)", source)) == {'"loop.h"', "<math.h>", "<stdint.h>"}
-    assert size == law.table.size and "malloc" not in source
+    assert size == law.schedule.size and "malloc" not in source
 
 
 def test_a_law_that_allocates_in_python_is_refused(plan, tmp_path):

@@ -56,12 +56,12 @@ def same(found, run, names, tolerance=1e-9):
 def test_interconnect_of_plant_and_lqr_is_close_on_the_crane(plan, integral):
     law = sv.lqr(plan, sv.plant(CRANE), rate=50.0, integral=integral)
     machine = sv.plant(CRANE, m_load=115.0)
-    run = sv.close(machine, law, SUDDEN, (0.0, 4.0), substeps=4)
+    run = sv.close(machine, law, SUDDEN, (0.0, 4.0), timing=sv.Timing(substeps=4))
     loop = control.interconnect(
         [interop.nlsys(machine, rate=50.0, substeps=4), interop.nlsys(law)],
         inputs=[], outputs=[*machine.state_names, *machine.mechanism.outputs, *law.inputs],
     )  # fmt: skip
-    found = respond(loop, run.t, x0=np.append(run.states[:, 0], law.memory))
+    found = respond(loop, run.t, x0=np.append(run.states[:, 0], law.state))
     assert loop.state_labels[:6] == [f"plant_{name}" for name in machine.state_names]
     same(found, run, [*machine.state_names, *machine.mechanism.outputs, *machine.inputs])
 
@@ -72,9 +72,14 @@ def test_a_closed_run_becomes_its_loop_with_noise_disturbance_limits_delays_and_
     limits = {"limits": {"trolley": 140.0}, "rate_limits": {"hoist": 400.0}}
     machine = sv.plant(CRANE, m_load=115.0, lag={"trolley": 0.06}, delay={"hoist": 0.03}, **limits)
     run = sv.close(
-        machine, law, plan.state(0.0), (0.0, 3.0), delay=2, noise={"x": 1e-3, "dtheta": 1e-3},
-        quantisation={"l": 1e-3}, disturbance={"theta": lambda t: 60.0 * (1.0 < t < 1.5)}, substeps=4,
-    )  # fmt: skip
+        machine,
+        law,
+        plan.state(0.0),
+        (0.0, 3.0),
+        sensors=sv.Sensors(noise={"x": 1e-3, "dtheta": 1e-3}, quantisation={"l": 1e-3}),
+        timing=sv.Timing(delay=2, substeps=4),
+        disturbance={"theta": lambda t: 60.0 * (1.0 < t < 1.5)},
+    )
     assert all(np.any(run.active[name]) for name in machine.inputs), "both limits are met"
     loop = interop.nlsys(run)
     inputs = np.zeros((loop.ninputs, len(run.t)))
@@ -102,7 +107,7 @@ def test_material_constraints_are_held_in_a_sampled_plant():
 def test_a_limited_law_is_a_system_too(plan):
     machine = sv.plant(CRANE, m_load=115.0, limits={"trolley": 120.0})
     law = sv.limited(sv.lqr(plan, sv.plant(CRANE), rate=20.0), machine)
-    run = sv.close(machine, law, plan.state(0.0), (0.0, 3.0), substeps=4)
+    run = sv.close(machine, law, plan.state(0.0), (0.0, 3.0), timing=sv.Timing(substeps=4))
     assert np.any(run.signal["limit trolley"])
     found = respond(interop.nlsys(run), run.t, x0=interop.start(run))
     same(found, run, machine.state_names)
@@ -268,8 +273,8 @@ def test_margins_tell_the_delay_at_which_the_loop_is_lost(car_plan):
     _, pm, _, _, wgc, _ = control.stability_margins(control.frequency_response(gain, w))
     samples = np.deg2rad(pm) / wgc * 100.0
     stable = [
-        np.abs(interop.linearise(sv.close(plant, law, car_plan.state(0.0), (0.0, 6.0), delay=d), end).poles()).max() < 1
-        for d in (int(np.floor(samples)), int(np.ceil(samples)))
+        np.abs(interop.linearise(sv.close(plant, law, car_plan.state(0.0), (0.0, 6.0), timing=t), end).poles()).max() < 1
+        for t in (sv.Timing(delay=int(np.floor(samples))), sv.Timing(delay=int(np.ceil(samples))))
     ]
     assert stable == [True, False]
 
@@ -293,7 +298,7 @@ def test_output_feedback_and_computed_laws_are_linearised(car_plan, plan):
     plant = sv.plant(CRANE)
     filtered = sv.output_feedback(sv.lqr(plan, plant, rate=50.0), plant, {"x": 1e-3, "l": 1e-3, "theta": 1e-3})
     for law in (filtered, sv.computed(plan, plant)):
-        t, z = 2.0, law.memory + 0.0
+        t, z = 2.0, law.state + 0.0
         exact, y = (
             interop.linearise(law, t),
             np.array([plan.state(t)[plant.state_names.index(n)] for n in law.measures]),
@@ -301,7 +306,7 @@ def test_output_feedback_and_computed_laws_are_linearised(car_plan, plan):
         near = interop.nlsys(law).linearize(z, y, t=t, eps=1e-6)
         scale = max(np.abs(exact.D).max(), 1.0)
         assert np.abs(exact.D - near.D).max() < 1e-4 * scale and np.abs(exact.A - near.A).max() < 1e-4
-        assert exact.state_labels == list(law.memory_names) and exact.output_labels == ["trolley", "hoist"]
+        assert exact.state_labels == list(law.state_names) and exact.output_labels == ["trolley", "hoist"]
 
 
 # what cannot be --------------------------------------------------------------------------------------------------------
@@ -320,7 +325,7 @@ def test_output_feedback_and_computed_laws_are_linearised(car_plan, plan):
         (lambda c: interop.nlsys(sv.plant(CRANE), disturbed=["thet"]), NameUnknown, "Nearest: 'theta'"),
         (lambda c: interop.start(c["plan"]), SpecificationError, "A start belongs to the Closed"),
         (lambda c: interop.linearise(sv.plant(CRANE), 0.0), SpecificationError, "has 6 finite numbers"),
-        (lambda c: interop.linearise(sv.plant(CRANE), 0.0, SUDDEN, [1.0]), SpecificationError, "1 inputs were given"),
+        (lambda c: interop.linearise(sv.plant(CRANE), 0.0, SUDDEN, [1.0]), SpecificationError, "It has 2 numbers: trolley, hoist"),
         (lambda c: interop.linearise(sv.plant(CRANE), 0.0, SUDDEN, {"hoist": 1.0}), NameUnknown, "'trolley'"),
         (lambda c: list(interop.along(sv.plant(CRANE), c["plan"], [9.0])), SpecificationError, "within the run: 0 to 8"),
         (lambda c: interop.loop_gain(interop.linearise(sv.plant(CRANE), 0.0, SUDDEN), interop.linearise(c["law"], 0.0),
@@ -329,7 +334,7 @@ def test_output_feedback_and_computed_laws_are_linearised(car_plan, plan):
         (lambda c: interop.linearise(c["late"], 0.0, SUDDEN), SpecificationError, "transport delay of 0.05 s"),
         (lambda c: interop.linearise(c["law"], 0.0, rate=3.0), SpecificationError, "rate was given for a Law"),
         (lambda c: interop.linearise(c["law"], 0.003), SpecificationError, "sampled at 50 Hz"),
-        (lambda c: interop.linearise(c["law"], 0.0, memory=[1.0]), SpecificationError, "remembers 0 numbers"),
+        (lambda c: interop.linearise(c["law"], 0.0, controller_state=[1.0]), SpecificationError, "has 0 numbers"),
         (lambda c: interop.linearise(c["plan"].model, 0.0, [1.0]), SpecificationError, "has 6 numbers: x, l"),
         (lambda c: list(interop.along(3, c["plan"], [0.0])), SpecificationError, "A int was given"),
         (lambda c: list(interop.along(c["law"], c["plan"], [])), SpecificationError, "No times"),
@@ -355,7 +360,7 @@ def test_laws_without_expressions_are_refused_where_these_are_needed(plan):
         def start(self):
             return lambda t, y: [0.0, -1128.0]
 
-    run = sv.close(sv.plant(CRANE), Own(), SUDDEN, (0.0, 0.1), rate=100.0)
+    run = sv.close(sv.plant(CRANE), Own(), SUDDEN, (0.0, 0.1), timing=sv.Timing(rate=100.0))
     with pytest.raises(SpecificationError, match="keeps its memory to itself"):
         interop.nlsys(run)
 

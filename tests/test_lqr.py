@@ -5,8 +5,8 @@ import pytest
 
 import servoctl as sv
 from servoctl.control.lqr import weights
+from servoctl.control.reference import Reference
 from servoctl.control.sampling import discretised, exponentials
-from servoctl.control.tracking import Reference
 from servoctl.gallery import gallery
 
 CRANE, CRANE_PROGRAM = gallery["overhead-crane"].build()
@@ -50,14 +50,14 @@ def test_the_integral_of_the_program_takes_it_back(plan, varying):
     law = sv.lqr(plan, sv.plant(CRANE), integral=1e4, varying=varying, **WEIGHTS)
     worst, at_6, at_8 = heavier(plan, law)
     assert worst <= 0.060 and at_6 <= 0.010 and at_8 <= 0.003
-    assert law.memory_names == ("integral of X", "integral of Z")
+    assert law.state_names == ("integral of X", "integral of Z")
 
 
 def test_defaults_are_the_weights_of_the_design(plan):
     plain = sv.lqr(plan, sv.plant(CRANE), integral=True)
     said = sv.lqr(plan, sv.plant(CRANE), integral={"X": 1e4, "Z": 1e4}, **WEIGHTS)
     named = sv.lqr(plan, sv.plant(CRANE), Q={"theta": 1e3}, R={"hoist": 1e-3}, integral=[1e4, 1e4])
-    assert np.array_equal(plain.table, said.table) and np.array_equal(plain.table, named.table)
+    assert np.array_equal(plain.schedule, said.schedule) and np.array_equal(plain.schedule, named.schedule)
 
 
 def test_a_plant_as_planned_follows_its_plan(plan):
@@ -152,7 +152,7 @@ def test_a_lag_is_part_of_the_design(plan):
 
 def test_the_law_says_what_it_is(plan):
     law = sv.lqr(plan, sv.plant(CRANE), integral={"Z": 1e4})
-    assert law.memory_names == ("integral of Z",) and len(law.memory) == 1
+    assert law.state_names == ("integral of Z",) and len(law.state) == 1
     for fact in ("time-varying", "100 Hz", "spectral radius", "trolley, hoist"):
         assert fact in repr(law)
     assert law.info["largest spectral radius along the plan"] < 1.0
@@ -201,7 +201,7 @@ def test_what_is_out_of_reach_and_does_not_grow_is_left_alone():
 
 BAD = {
     "Q of five": (lambda p, m: sv.lqr(p, m, Q=[1.0] * 5), sv.SpecificationError, r"\(5,\)"),
-    "Q of text": (lambda p, m: sv.lqr(p, m, Q="large"), sv.SpecificationError, "shape"),
+    "Q of text": (lambda p, m: sv.lqr(p, m, Q="large"), sv.SpecificationError, "6 numbers"),
     "Q of no state": (lambda p, m: sv.lqr(p, m, Q={"thet": 1.0}), sv.NameUnknown, "theta"),
     "negative Q": (lambda p, m: sv.lqr(p, m, Q={"x": -1.0}), sv.SpecificationError, "semidefinite"),
     "odd Q": (lambda p, m: sv.lqr(p, m, Q=np.triu(np.ones((6, 6)))), sv.SpecificationError, "symmetric"),

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 import servoctl as sv
+from servoctl.control.reference import Reference
 from servoctl.control.sampling import discretised
-from servoctl.control.tracking import Reference
 from servoctl.gallery import gallery, overhead_crane, two_link_arm
 
 GUST = {"theta": lambda t: 60.0 * (2.0 < t < 2.5)}
@@ -45,7 +45,7 @@ def test_the_filter_forgets_a_wrong_start(crane):
     run = sv.close(nominal, law, start, (0.0, 8.0))
     k = 300
     true = np.array([run[name][k] for name in nominal.state_names]) - plan.state(run.t[k])
-    assert run.memory[:, k] == pytest.approx(true, abs=2e-3)
+    assert run.controller_states[:, k] == pytest.approx(true, abs=2e-3)
     assert worst(run)[-1] < 0.05 * worst(run)[0]
 
 
@@ -83,8 +83,8 @@ def test_noise_costs_less_than_differencing_would(crane):
     costs = []
     for given in (sv.output_feedback(law, nominal, SENSORS), Differencing(law, SENSORS)):
         noisy, quiet = (
-            sv.close(machine, given, plan.state(0.0), (0.0, 8.0), rate=100.0, noise=noise, seed=seed, plan=plan)
-            for noise, seed in ((SENSORS, 3), (None, None))
+            sv.close(machine, given, plan.state(0.0), (0.0, 8.0), timing=sv.Timing(rate=100.0), sensors=sensors, plan=plan)
+            for sensors in (sv.Sensors(noise=SENSORS, seed=3), sv.Sensors())
         )
         costs.append(np.std(noisy.commands - quiet.commands, axis=1))
         assert np.abs(worst(noisy) - worst(quiet)).max() < 5e-3
@@ -110,7 +110,7 @@ def gains(law, n_x, n_y):
     """L of each sample, from the law's table [u_ff; x_ref; K; L; A; B]."""
     m = len(law.inputs)
     first = m + n_x + m * n_x
-    return law.table[first : first + n_x * n_y].T.reshape(-1, n_x, n_y)
+    return law.schedule[first : first + n_x * n_y].T.reshape(-1, n_x, n_y)
 
 
 def test_a_filter_on_constrained_states_is_that_of_their_tangent_spaces():
@@ -140,8 +140,8 @@ def test_a_filter_on_constrained_states_is_that_of_their_tangent_spaces():
         assert L == pytest.approx(K, rel=1e-6, abs=1e-8)
         P = project[k + 1] @ (A[k] @ (P - K @ C @ P) @ A[k].T + W) @ project[k + 1]
     assert law.info["spectral radius of the filter"] < 1.0
-    run = sv.close(plant, law, plan.state(0.0), (0.0, 4.0), noise=sensors, seed=1)
-    assert np.abs(np.einsum("kij,jk->ki", J, run.memory)).max() < 1e-12 and worst(run).max() < 0.01
+    run = sv.close(plant, law, plan.state(0.0), (0.0, 4.0), sensors=sv.Sensors(noise=sensors, seed=1))
+    assert np.abs(np.einsum("kij,jk->ki", J, run.controller_states)).max() < 1e-12 and worst(run).max() < 0.01
 
 
 def test_bad_input(crane):

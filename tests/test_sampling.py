@@ -28,8 +28,7 @@ def test_loops_turn_unstable_where_their_sampled_radius_says(late):
             lambda t, y, K=K: -K @ [y["x"], y["dx"]],
             [1.0, 0.0],
             (0.0, 20.0),
-            rate=100.0,
-            substeps=10,
+            timing=sv.Timing(rate=100.0, substeps=10),
         )
         size = np.abs(run.states).max(axis=0)
         grew.append(bool(size[-200:].max() > size[800:1000].max()))

@@ -36,7 +36,7 @@ def design():
 def crane_loop(m_load, rng):
     mechanism, plan, law = design()
     plant, seed = sv.plant(mechanism, m_load=m_load), int(rng.integers(2**31))
-    return sv.close(plant, law, plan.state(0.0), (0.0, 1.0), noise={"theta": 1e-3}, seed=seed)
+    return sv.close(plant, law, plan.state(0.0), (0.0, 1.0), sensors=sv.Sensors(noise={"theta": 1e-3}, seed=seed))
 
 
 def halves(m):

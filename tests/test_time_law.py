@@ -108,7 +108,7 @@ def test_bad_input():
         with pytest.raises(sv.SpecificationError, match="limits|later t1"):
             sv.fastest(mechanism, program, limits, span)
     for pair, kind in (((mechanism, "cars"), "Program"), (("cars", program), "Mechanism")):
-        with pytest.raises(sv.SpecificationError, match=f"str was given in the place of a {kind}"):
+        with pytest.raises(sv.SpecificationError, match=f"A str was given as {kind.lower()}"):
             sv.fastest(*pair, {"force": 200.0}, (0.0, 2.0))
     for given in ("start", "parameters"):
         with pytest.raises(sv.SpecificationError, match="go by name"):

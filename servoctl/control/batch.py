@@ -84,7 +84,7 @@ def unit(plant, law, disturbed, residuals=None):
     Unit
     """
     kept = vars(law.step).setdefault("_batches", {})
-    phi = tuple(e.element_hash() for e in residuals._expressions.elements()) if residuals else ()
+    phi = tuple(e.element_hash() for e in residuals.expressions.elements()) if residuals else ()
     key = (plant.equations, law.measures, disturbed, phi)
     if key not in kept:
         kept[key] = _derived(plant, law, disturbed, residuals)
@@ -104,13 +104,13 @@ def _derived(plant, law, disturbed, residuals):
     command, common, common_values = _apart(step(t_k, y, row), ca.vertcat(t_k, row))
     phi = ca.SX(0, 1)
     if residuals:
-        own = [plant.mechanism.parameters.names.index(s.name()) for s in residuals._symbols]
+        own = [plant.mechanism.parameters.names.index(s.name()) for s in residuals.symbols]
         phi = residuals.expression(t_k, x, plant.state_names, constants[own])
     phi, s, s_values = _apart(phi, t_k)
     phi, v, v_values = _apart(phi, constants)
     sizes = {
         "NX": x.numel(), "NU": n_u, "NP": p.numel(), "NC": n_c, "NW": w.numel(), "NV": v.numel(),
-        "ND": len(disturbed), "NY": len(law.measures), "NZ": len(law.memory), "NO": law.n_out, "NL": common.numel(),
+        "ND": len(disturbed), "NY": len(law.measures), "NZ": len(law.state), "NO": law.n_out, "NL": common.numel(),
         "NS": s.numel(), "NR": phi.numel(), "NT": x.numel() + n_u + phi.numel(),
     }  # fmt: skip
     functions = [

@@ -15,12 +15,36 @@ CHECKED = 9  # instants at which a function of arrays is compared with its value
 
 @dataclass(frozen=True)
 class Gust:
-    """A force that rises, lasts and falls; made by `gust`."""
+    """A force of one size between two instants, as a function of time, with edges of half a cosine.
+
+    Parameters
+    ----------
+    size : float
+        [N or N m]
+    start, end : float
+        [s]
+    rise : float
+        Duration of each edge [s]; 0 for a rectangle, half of the gust for the "one minus cosine" of wind loads.
+
+    Raises
+    ------
+    SpecificationError
+        If it does not end after its start, or its edges take longer.
+    """
 
     size: float
     start: float
     end: float
-    rise: float
+    rise: float = 0.0
+
+    def __post_init__(self):
+        _as_floats(self)
+        if self.end <= self.start or not 0 <= self.rise <= (self.end - self.start) / 2:
+            raise SpecificationError(
+                f"A gust from {self.start:g} to {self.end:g} s with edges of {self.rise:g} s was given.",
+                "A gust ends after its start, and each edge takes at most half of it.",
+                do=f"Give an end > {self.start:g} and 0 <= rise <= (end - start)/2.",
+            )
 
     def __call__(self, t):
         """The force at times t [s]."""
@@ -34,10 +58,21 @@ class Gust:
 
 @dataclass(frozen=True)
 class Step:
-    """A force that sets in and stays; made by `step`."""
+    """A force that sets in at an instant and stays, as a function of time.
+
+    Parameters
+    ----------
+    size : float
+        [N or N m]
+    at : float
+        [s]
+    """
 
     size: float
     at: float
+
+    def __post_init__(self):
+        _as_floats(self)
 
     def __call__(self, t):
         """The force at times t [s]."""
@@ -46,11 +81,37 @@ class Step:
 
 @dataclass(frozen=True)
 class Noise:
-    """A stationary random force without power above a frequency; made by `noise`."""
+    """A stationary random force as a function of time: harmonics up to a frequency, of equal power and random phase.
+
+    It does not depend on how it is sampled.
+
+    Parameters
+    ----------
+    std : float
+        Standard deviation over time [N or N m].
+    bandwidth : float
+        Highest frequency [Hz].
+    seed : int
+        The same seed gives the same force.
+
+    Raises
+    ------
+    SpecificationError
+    """
 
     std: float
     bandwidth: float
-    seed: int
+    seed: int = 0
+
+    def __post_init__(self):
+        object.__setattr__(self, "seed", whole("seed", self.seed))
+        _as_floats(self, "std", "bandwidth")
+        if self.std < 0 or self.bandwidth <= 0:
+            raise SpecificationError(
+                f"A noise of standard deviation {self.std:g} up to {self.bandwidth:g} Hz was given.",
+                "The deviation is not negative, the bandwidth positive.",
+                do="Change them.",
+            )
 
     def __call__(self, t):
         """The force at times t [s]."""
@@ -64,119 +125,26 @@ class Noise:
         return self.std * np.sqrt(2 / HARMONICS) * total
 
 
-def gust(size, start, end, rise=0.0):
-    """A gust: a force of one size between two instants, with edges of half a cosine.
-
-    Parameters
-    ----------
-    size : float
-        [N or N m]
-    start, end : float
-        [s]
-    rise : float
-        Duration of each edge [s]; 0 for a rectangle, half of the gust for the "one minus cosine" of wind loads.
-
-    Returns
-    -------
-    Gust
-        A function of time.
-
-    Raises
-    ------
-    SpecificationError
-    """
-    size, start, end, rise = (
-        finite(n, v) for n, v in zip(("size", "start", "end", "rise"), (size, start, end, rise), strict=True)
-    )
-    if end <= start or not 0 <= rise <= (end - start) / 2:
-        raise SpecificationError(
-            f"A gust from {start:g} to {end:g} s with edges of {rise:g} s was asked for.",
-            "A gust ends after it started, and each edge takes at most half of it.",
-            nearest=f"end > {start:g}, 0 <= rise <= (end - start)/2.",
-            do="Change the instants.",
-        )
-    return Gust(size, start, end, rise)
+gust, step, noise = Gust, Step, Noise
 
 
-def step(size, at):
-    """A force that sets in at an instant and stays.
-
-    Parameters
-    ----------
-    size : float
-        [N or N m]
-    at : float
-        [s]
-
-    Returns
-    -------
-    Step
-        A function of time.
-    """
-    return Step(finite("size", size), finite("at", at))
-
-
-def noise(std, bandwidth, seed=0):
-    """A stationary random force: harmonics up to a frequency, of equal power and random phase.
-
-    As a function of time it does not depend on how it is sampled.
-
-    Parameters
-    ----------
-    std : float
-        Standard deviation over time [N or N m].
-    bandwidth : float
-        Highest frequency [Hz].
-    seed : int
-        The same seed gives the same force.
-
-    Returns
-    -------
-    Noise
-        A function of time.
-
-    Raises
-    ------
-    SpecificationError
-    """
-    std, bandwidth = finite("std", std), finite("bandwidth", bandwidth)
-    if std < 0 or bandwidth <= 0:
-        raise SpecificationError(
-            f"A noise of standard deviation {std:g} up to {bandwidth:g} Hz was asked for.",
-            "The deviation is not negative, the bandwidth positive.",
-            do="Change them.",
-        )
-    return Noise(std, bandwidth, whole("seed", seed))
+def _as_floats(value, *names):
+    """Make numbers of a frozen value finite floats; without names all of them."""
+    for name in names or value.__dataclass_fields__:
+        object.__setattr__(value, name, finite(name, getattr(value, name)))
 
 
 def sampled(name, function, t):
-    """Values of a disturbance at times of any shape, whether or not its function takes arrays.
-
-    Parameters
-    ----------
-    name : str
-    function : callable or float
-    t : array
-        [s]
-
-    Returns
-    -------
-    array of t's shape
-
-    Raises
-    ------
-    SpecificationError
-        If a value is no finite number.
-    """
+    """Values of a disturbance at times of any shape, whether or not its function takes arrays."""
     if not callable(function):
         return np.full(t.shape, finite(name, function, "disturbance"))
     flat = t.ravel()
     some = np.linspace(0, flat.size - 1, CHECKED).astype(int) if flat.size else np.zeros(0, dtype=int)
     values = None
     try:
-        found = np.asarray(function(flat), dtype=float)
-        if found.shape == flat.shape and np.allclose(found[some], _singly(name, function, flat[some]), rtol=1e-12):
-            values = found
+        at_once = np.asarray(function(flat), dtype=float)
+        if at_once.shape == flat.shape and np.allclose(at_once[some], _singly(name, function, flat[some]), rtol=1e-12):
+            values = at_once
     except Exception:  # a function of one number may raise anything when it is given many
         values = None
     values = _singly(name, function, flat) if values is None else values
@@ -198,7 +166,6 @@ def _singly(name, function, t):
         raise SpecificationError(
             f"The disturbance of {name!r} does not give a number: {error}.",
             "A disturbance is a function of time [s] to a generalised force.",
-            nearest="lambda t: 60.0 * (2.0 < t < 2.5).",
-            do="Correct its function.",
+            do="Correct its function: lambda t: 60.0 * (2.0 < t < 2.5).",
             name=name,
         ) from error

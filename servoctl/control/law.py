@@ -1,21 +1,20 @@
-"""Laws: what a controller does at each sample, as frozen values; a law with memory is started."""
+"""Laws: what a controller does at each sample, as frozen values; a law with a controller state is started."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from servoctl.checks import ON_SAMPLE, finite
+from servoctl.checks import ON_SAMPLE, finite, positive
+from servoctl.codegen.function import Compiled
 from servoctl.errors import SpecificationError, unknown
-
-_SIZES = ("n_x", "n_p", "n_y")  # of a compiled step: what it takes, its row, what it gives
 
 
 @dataclass(frozen=True, eq=False)
 class Law:
     """A sampled law u = law(t, measurement); made by `feedforward`, `pd`, `lqr` and others.
 
-    At the sample k of t_k = t0 + k/rate, `step` maps t_k, [y; z] and the k-th column of `table` to [u; z+; further
-    signals]: y is the measurement, z the memory. Beyond the table its last column holds.
+    At the sample k of t_k = t0 + k/rate, `step` maps t_k, [y; z] and the k-th column of `schedule` to [u; z+; further
+    signals]: y is the measurement, z the controller state. Beyond the schedule its last column holds.
 
     Attributes
     ----------
@@ -30,18 +29,27 @@ class Law:
         Instant of the first sample [s].
     step : Compiled or callable
         (t_k, [y; z], row_k) -> [u; z+; further signals].
-    table : (n_row, N) array
-        What the law needs at each sample: inputs, references, gains.
-    memory : (n_z,) array
-        The memory z at the start.
-    memory_names, signals : tuple of str
-        Names of the memory and of the further signals.
+    schedule : (n_row, N) array
+        The gain schedule: what the law needs at each sample, inputs, references and gains.
+    state : (n_z,) array
+        The controller state z at the start.
+    state_names, signals : tuple of str
+        Names of the controller state's entries and of the further signals.
     idle : (m,) array
         The inputs before the first command arrives.
     plan : Run or None
-        The plan it was made from.
+        The reference trajectory it was made from.
     info : dict
         Facts of the design: gains, poles, spectral radius.
+    integrators : tuple of int
+        Which entries of the controller state are integrals of residuals.
+    feedback : StateFeedback or None
+        Its gains on all states of a plant, where it has such gains.
+    input_matrix : (N, n_z, m) array or None
+        Of an estimator: how the controller state after each sample changes with the inputs of that sample. An
+        allocation that gives others than the law's own corrects the prediction by it.
+    allocation : Allocation or None
+        How it keeps limits, where it does.
     """
 
     name: str
@@ -50,38 +58,47 @@ class Law:
     rate: float
     t0: float
     step: object
-    table: np.ndarray
-    memory: np.ndarray = field(default_factory=lambda: np.zeros(0))
-    memory_names: tuple = ()
+    schedule: np.ndarray
+    state: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    state_names: tuple = ()
     signals: tuple = ()
     idle: np.ndarray = None
     plan: object = None
     info: dict = field(default_factory=dict)
+    integrators: tuple = ()
+    feedback: object = None
+    input_matrix: np.ndarray = None
+    allocation: object = None
 
     def __post_init__(self):
-        table = np.asarray(self.table, dtype=float)
-        object.__setattr__(self, "table", np.ascontiguousarray(table.T).T)  # loops read it column by column
-        if table.ndim != 2 or not table.shape[1] or not np.isfinite(table).all():
+        schedule = np.asarray(self.schedule, dtype=float)
+        object.__setattr__(self, "schedule", np.ascontiguousarray(schedule.T).T)  # loops read it column by column
+        if schedule.ndim != 2 or not schedule.shape[1] or not np.isfinite(schedule).all():
             raise SpecificationError(
-                f"The table of the law {self.name!r} has the shape {table.shape}"
-                + ("." if np.isfinite(table).all() else " and holds NaN or infinity."),
+                f"The schedule of the law {self.name!r} has the shape {schedule.shape}"
+                + ("." if np.isfinite(schedule).all() else " and holds NaN or infinity."),
                 "It has one column of finite numbers per sample.",
                 do="Correct it.",
+                shape=schedule.shape,
             )
-        if finite("rate", self.rate) <= 0:
-            raise SpecificationError(
-                f"The law {self.name!r} has a rate of {self.rate:g} Hz.", "A rate is positive.", do="Change it."
-            )
+        positive("rate", self.rate)
         idle = np.zeros(len(self.inputs)) if self.idle is None else np.asarray(self.idle, dtype=float)
         object.__setattr__(self, "idle", idle)
-        given = (len(self.measures) + len(self.memory), table.shape[0], self.n_out, idle.size)
-        wanted = (*(getattr(self.step, size, n) for size, n in zip(_SIZES, given, strict=False)), len(self.inputs))
-        if given != wanted:
+        self._require_sizes()
+
+    def _require_sizes(self):
+        """Refuse numbers of measurements, states and signals that the step does not have."""
+        sizes = (len(self.measures) + len(self.state), self.schedule.shape[0], self.n_out, self.idle.size)
+        of_step = (self.step.n_x, self.step.n_p, self.step.n_y) if hasattr(self.step, "n_x") else sizes[:3]
+        valid = (*of_step, len(self.inputs))
+        if sizes != valid:
             raise SpecificationError(
-                f"The law {self.name!r} has {given[0]} measurements and memories, rows of {given[1]} numbers, "
-                f"{given[2]} answers and {given[3]} idle inputs.",
-                f"Its step takes {wanted[0]} and rows of {wanted[1]}, gives {wanted[2]}; its inputs are {wanted[3]}.",
-                do="Give measures, memory, table, signals and idle that belong to the step.",
+                f"The law {self.name!r} has {sizes[0]} measurements and controller states, columns of {sizes[1]} "
+                f"numbers, {sizes[2]} outputs and {sizes[3]} idle inputs.",
+                f"Its step takes {valid[0]} and columns of {valid[1]}, gives {valid[2]}; its inputs are {valid[3]}.",
+                do="Give measures, state, schedule, signals and idle that belong to the step.",
+                sizes=sizes,
+                valid=valid,
             )
 
     @property
@@ -92,47 +109,59 @@ class Law:
     @property
     def n_out(self):
         """The number of outputs of `step`."""
-        return len(self.inputs) + len(self.memory) + len(self.signals)
+        return len(self.inputs) + len(self.state) + len(self.signals)
 
     def answer(self, t, x, row):
-        """What `step` says at a sample.
+        """The output of `step` at a sample, checked.
 
         Parameters
         ----------
         t : float
             [s]
         x : (n_y + n_z,) array
-            Measurement and memory.
+            Measurement and controller state.
         row : (n_row,) array
-            Of the table.
+            Of the schedule.
 
         Returns
         -------
         (n_out,) array
-            Inputs, next memory, further signals.
+            Inputs, next controller state, further signals.
 
         Raises
         ------
         SpecificationError
             If these are not n_out numbers.
         """
-        said = self.step(t, x, row)
+        answer = self.step(t, x, row)
         try:
-            out = np.asarray(said, dtype=float).ravel()
+            out = np.asarray(answer, dtype=float).ravel()
         except (TypeError, ValueError):
             out = np.zeros(0)
         if out.size != self.n_out:
             raise SpecificationError(
-                f"The step of the law {self.name!r} answered {said!r} at t = {t:.6g} s."[:200],
-                f"It answers {self.n_out} numbers: {len(self.inputs)} inputs, {len(self.memory)} of the next memory, "
-                f"{len(self.signals)} further signals.",
-                do="Return an array of them.",
+                f"The law {self.name!r} answered {answer!r} at t = {t:.6g} s."[:200],
+                f"It answers {self.n_out} numbers: {', '.join((*self.inputs, *self.state_names, *self.signals))}.",
+                do="Return a sequence of them in this order.",
                 t=float(t),
+                n_out=self.n_out,
             )
         return out
 
+    def begin(self):
+        """The step for one run: compiled, or checked at each sample; a user's function with a start is started.
+
+        Returns
+        -------
+        Compiled or callable
+            (t_k, [y; z], row_k) -> [u; z+; further signals].
+        """
+        if isinstance(self.step, Compiled):
+            return self.step
+        return (replace(self, step=self.step.started()) if isinstance(self.step, UserStep) else self).answer
+
     def start(self):
-        """A controller that runs this law from its first memory on: law(t, measurement) -> u.
+        """A controller that runs this law from its first state on: law(t, measurement) -> u.
 
         Returns
         -------
@@ -141,7 +170,7 @@ class Law:
         return Controller(self)
 
     def __call__(self, t, measurement):
-        """The inputs of a law without memory.
+        """The inputs of a law without a controller state.
 
         Parameters
         ----------
@@ -156,19 +185,19 @@ class Law:
         Raises
         ------
         SpecificationError
-            If the law has a memory, t is between samples, or the measurement has another shape.
+            If the law has a controller state, t is between samples, or the measurement has another shape.
         """
-        if len(self.memory):
+        if len(self.state):
             raise SpecificationError(
-                f"The law {self.name!r} has the memory {', '.join(self.memory_names)}.",
-                "A law is a value and keeps nothing.",
-                nearest="controller = law.start(); controller(t, measurement).",
-                do="Start it.",
+                f"The law {self.name!r} has the controller state {', '.join(self.state_names)}.",
+                "A law is a value and remembers nothing.",
+                do="Start it: controller = law.start(); controller(t, measurement).",
+                state_names=self.state_names,
             )
         return Controller(self)(t, measurement)
 
     def row(self, t):
-        """The column of the table at an instant of sampling, (n_row,).
+        """The column of the schedule at an instant of sampling, (n_row,).
 
         Parameters
         ----------
@@ -185,13 +214,13 @@ class Law:
         if abs(k - round(k)) > ON_SAMPLE or round(k) < 0:
             nearest = self.t0 + max(round(k), 0) / self.rate
             raise SpecificationError(
-                f"The law was asked at t = {t:.9g} s.",
+                f"The law was evaluated at t = {t:.9g} s.",
                 f"It is sampled at {self.rate:g} Hz from t = {self.t0:g} s on.",
                 nearest=f"t = {nearest:.9g} s.",
-                do="Ask at an instant of sampling.",
+                do="Evaluate it at an instant of sampling.",
                 t=t,
             )
-        return self.table[:, min(round(k), self.table.shape[1] - 1)]
+        return self.schedule[:, min(round(k), self.schedule.shape[1] - 1)]
 
     def __repr__(self):
         shown = {name: value for name, value in self.info.items() if isinstance(value, (str, int, float))}
@@ -200,29 +229,30 @@ class Law:
             f"  measures {', '.join(self.measures) or '(nothing)'}"[:118],
             f"  commands {', '.join(self.inputs)}"[:118],
         ]
-        if self.memory_names:
-            lines.append(f"  memory: {', '.join(self.memory_names)}"[:118])
+        if self.state_names:
+            lines.append(f"  controller state: {', '.join(self.state_names)}"[:118])
         lines += [f"  {name}: {v:.4g}" if isinstance(v, float) else f"  {name}: {v}"[:118] for name, v in shown.items()]
         return "\n".join(lines[:12])
 
     @property
     def _end(self):
-        return self.t0 + (self.table.shape[1] - 1) / self.rate
+        return self.t0 + (self.schedule.shape[1] - 1) / self.rate
 
 
 class Controller:
-    """A law at work: it has the law's memory, and changes it at each call; made by `Law.start`.
+    """A law at work: it has the law's state, and changes it at each call; made by `Law.start`.
 
     Attributes
     ----------
     law : Law
-    memory : (n_z,) array
+    state : (n_z,) array
+        The controller state.
     signals : dict of str to float
         The law's further signals at the last call.
     """
 
     def __init__(self, law):
-        self.law, self.memory, self.signals = law, np.array(law.memory, dtype=float), {}
+        self.law, self.state, self.signals, self._step = law, np.array(law.state, dtype=float), {}, law.begin()
 
     def __call__(self, t, measurement):
         """The inputs at an instant of sampling.
@@ -237,40 +267,101 @@ class Controller:
         -------
         (m,) array
         """
-        law, m = self.law, len(self.law.inputs)
-        y = as_measurement(measurement, law.measures)
-        out = law.answer(t, np.concatenate([y, self.memory]), law.row(t))
-        self.memory = out[m : m + len(self.memory)]
-        self.signals = dict(zip(law.signals, out[m + len(self.memory) :].tolist(), strict=True))
+        law, m, n_z = self.law, len(self.law.inputs), len(self.state)
+        y = ordered(measurement, law.measures, "measurement", exactly=False)
+        out = self._step(t, np.concatenate([y, self.state]), law.row(t))
+        self.state = out[m : m + n_z]
+        self.signals = dict(zip(law.signals, out[m + n_z :].tolist(), strict=True))
         return out[:m]
 
     def __repr__(self):
-        return f"Controller of {self.law.name}: memory {np.array2string(self.memory, precision=4, threshold=8)}"
+        return f"Controller of {self.law.name}: state {np.array2string(self.state, precision=4, threshold=8)}"
 
 
-def as_measurement(measurement, names):
-    """The measured values in the order of their names, (n_y,).
+@dataclass(frozen=True)
+class UserStep:
+    """A user's function law(t, measurement) -> inputs as the step of a law.
+
+    Attributes
+    ----------
+    function : callable
+        Or what has a method `start` that gives the function.
+    name : str
+    states, inputs : tuple of str
+        Names of the measured states and of the actuators.
+    """
+
+    function: object
+    name: str
+    states: tuple
+    inputs: tuple
+
+    @property
+    def stateful(self):
+        """Whether the function has a state of its own, which `start` resets."""
+        return hasattr(self.function, "start")
+
+    def started(self):
+        """The same with a function that starts afresh.
+
+        Raises
+        ------
+        SpecificationError
+            If its `start` gives no function.
+        """
+        function = self.function.start() if self.stateful else self.function
+        if not callable(function):
+            raise SpecificationError(
+                f"The law {self.name!r} was started, and gave a {type(function).__name__}.",
+                "A law's start gives the function that answers.",
+                do="Return it from start: return lambda t, y: {...}.",
+                name=self.name,
+            )
+        return replace(self, function=function)
+
+    def __call__(self, t, x, _row):
+        """The inputs, (m,), of the measured states x, (n_y,), at t [s]."""
+        u = self.function(t, dict(zip(self.states, x.tolist(), strict=True)))
+        return ordered(u, self.inputs, f"answer of the law {self.name!r} at t = {t:.6g} s")
+
+
+def ordered(values, names, what, exactly=True):
+    """Numbers in the order of their names, (n,), from as many numbers or from a dict.
+
+    Parameters
+    ----------
+    values : (n,) array or dict of str to float
+    names : sequence of str
+    what : str
+        What the values are, for messages: "measurement".
+    exactly : bool
+        Whether further names are refused.
 
     Raises
     ------
     NameUnknown
-        If one is missing.
+        If a name is missing, or there are further ones.
     SpecificationError
-        If an array has another shape.
+        If they are not n numbers.
     """
-    if isinstance(measurement, dict):
+    numbers = values
+    if isinstance(values, dict):
         for name in names:
-            if name not in measurement:
-                raise unknown(name, measurement, "measurement")
-        measurement = [measurement[name] for name in names]
+            if name not in values:
+                raise unknown(name, values, what)
+        for name in values if exactly else ():
+            if name not in names:
+                raise unknown(name, names, what)
+        numbers = [values[name] for name in names]
     try:
-        y = np.array([float(value) for value in np.ravel(measurement)])
+        numbers = np.array([float(number) for number in np.ravel(numbers)])
     except (TypeError, ValueError):
-        y = np.zeros(0)
-    if y.shape != (len(names),):
+        numbers = np.zeros(0)
+    if numbers.shape != (len(names),):
         raise SpecificationError(
-            f"The measurement {measurement!r} was given."[:200],
-            f"The law measures {len(names)}: {', '.join(names) or '(nothing)'}.",
+            f"The {what} is {values!r}."[:200],
+            f"It has {len(names)} numbers: {', '.join(names) or '(none)'}.",
             do="Give them in this order, or as a dict.",
+            names=names,
         )
-    return y
+    return numbers

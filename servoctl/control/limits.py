@@ -1,18 +1,24 @@
 """Laws under limits: each sample's inputs from a small quadratic program that says which residual gives way."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from math import prod
+from types import SimpleNamespace
 
+import casadi as ca
 import numpy as np
 
-from servoctl.checks import ON_SAMPLE, finite, interval, mapping, positive
-from servoctl.control.allocation import Effects, SmallQP
+from servoctl.checks import ON_SAMPLE, interval, mapping, numbers_by_name, positive
+from servoctl.codegen.function import compiled
 from servoctl.control.close import require_names
-from servoctl.control.feedback import Residuals
+from servoctl.control.conditions import ranges
 from servoctl.control.law import Law
 from servoctl.control.lqr import Q_POSITION, R_INPUT, steady, tangents
+from servoctl.control.reference import Reference, require_plant
+from servoctl.control.residuals import Residuals
 from servoctl.control.sampling import discretised
-from servoctl.control.tracking import Reference, require_plant
-from servoctl.errors import LimitExceeded, SpecificationError, unknown
+from servoctl.control.time_law import fastest
+from servoctl.errors import LimitExceeded, ServoError, SpecificationError, unknown
 
 HORIZON = 0.5  # s
 FALLING = 1e-4  # of weights, from one residual to the next by priority
@@ -23,7 +29,78 @@ SCENE = frozenset(("t_span", "start", "guess", "parameters"))  # what `fastest` 
 GIVEN_WAY = 1e-6  # of a residual's largest effect: a slack that counts
 
 
-def limited(law, plant, *, bounds=None, weights=None, priority=None, horizon=HORIZON, solver="daqp"):
+class Layout:
+    """Named parts of a vector, one after another; matrices row by row."""
+
+    def __init__(self, **shapes):
+        self._shapes = {name: (shape,) if isinstance(shape, int) else shape for name, shape in shapes.items()}
+        self._ends = np.cumsum([prod(shape) for shape in self._shapes.values()])[:-1]
+
+    def split(self, vector):
+        """The parts by name, as attributes."""
+        parts = zip(self._shapes.items(), np.split(vector, self._ends), strict=True)
+        return SimpleNamespace(**{name: part.reshape(shape) for (name, shape), part in parts})
+
+
+class Effects:
+    """What inputs do at once: o = c + O u for expressions of t, q, γ' and γ'' by name, affine in the inputs."""
+
+    def __init__(self, plant, expressions):
+        self.names, self._plant = tuple(expressions), plant
+        e = plant.equations
+        values = ca.vertcat(ca.SX(0, 1), *expressions.values())
+        values = ca.substitute(values, ca.vertcat(*e.q.gamma(2)), e.acceleration)
+        values = ca.substitute(values, e.d, ca.SX.zeros(e.q.n))
+        slopes = ca.jacobian(values, e.u)
+        bent = ca.jacobian(ca.vec(slopes), e.u)
+        if bent.nnz() and not plant.mechanism.is_zero(bent.nonzeros()):
+            raise SpecificationError(
+                f"One of {', '.join(self.names)} is not affine in the inputs.",
+                "Bounds are linear inequalities of the inputs at each state.",
+                do="Bound forces of constraint or accelerations, which are affine.",
+            )
+        self._acting = [bool(slopes[i, :].nnz()) for i in range(len(self.names))]
+        still = ca.substitute(values, e.u, ca.SX.zeros(e.u.numel()))
+        numbers = e.p[: e.p.numel() - e.u.numel() - e.q.n]
+        parts = ca.densify(ca.cse(ca.vertcat(still, ca.vec(ca.densify(slopes)))))
+        self._function = compiled(ca.Function("effects", [e.q.t, e.state, numbers], [parts]), "effects")
+
+    def acts(self, name):
+        """Whether an input changes this expression at once."""
+        return self._acting[self.names.index(name)]
+
+    def __call__(self, t, x):
+        """c (j,) and O (j, m) at a state x (n_x,)."""
+        j, m = len(self.names), len(self._plant.inputs)
+        y = self._function(t, x, self._plant.parameters)
+        return y[:j], y[j:].reshape(m, j).T
+
+
+class SmallQP:
+    """min xᵀH x/2 of n unknowns subject to low <= x <= high and least <= A x <= most, by DAQP through CasADi."""
+
+    def __init__(self, n, rows):
+        shapes = {"h": ca.Sparsity.dense(n, n), "a": ca.Sparsity.dense(rows, n)}
+        self._solve = ca.conic("qp", "daqp", shapes, {"error_on_fail": False})
+        self._g, self._sizes = np.zeros(n), (n, rows)
+
+    def __reduce__(self):
+        return SmallQP, self._sizes
+
+    def __call__(self, H, low, high, A, least, most):
+        """The solution (n,), or None where there is none."""
+        try:
+            solution = self._solve(h=H, g=self._g, a=A, lba=least, uba=most, lbx=low, ubx=high)
+        except RuntimeError as error:  # CasADi's only type
+            raise ServoError(
+                f"The quadratic program failed: {str(error).splitlines()[0][:100]}.",
+                "Its data are finite numbers.",
+                do="Check weights and limits.",
+            ) from error
+        return np.asarray(solution["x"]).ravel() if self._solve.stats()["success"] else None
+
+
+def limited(law, plant, *, bounds=None, weights=None, priority=None, horizon=HORIZON):
     """A law whose inputs are allocated within the plant's limits of magnitude and rate, and within bounds of outputs.
 
     At each sample the inputs u nearest to those of the law, u_law, by what the difference will cost the program: least
@@ -31,8 +108,8 @@ def limited(law, plant, *, bounds=None, weights=None, priority=None, horizon=HOR
     `lqr` (and, for residuals of order 2, w_i times the square of their immediate change). By priority, the weights fall
     by 1e-4 from one residual to the next; that is decided sample by sample, and what is spared in each sample does not
     always come out smaller over a whole motion. The slack of a residual is by how much it deviates after the horizon if
-    the difference is held (for residuals of order 2, at once). Integrals of residuals in the law's memory stand still
-    while slack is given (anti-windup), and an estimator's prediction is told the inputs that were applied.
+    the difference is held (for residuals of order 2, at once). Integrals of residuals in the controller state are
+    held while slack is given (anti-windup), and an estimator's prediction takes the inputs that were applied.
 
     Parameters
     ----------
@@ -45,11 +122,9 @@ def limited(law, plant, *, bounds=None, weights=None, priority=None, horizon=HOR
     weights : dict of str to float, optional
         w_i of the residuals; default 1 each.
     priority : sequence of str, optional
-        Residuals, the most important first, in the place of weights.
+        Residuals, the most important first, instead of weights.
     horizon : float
         Of the slack [s]; default 0.5, in which actuators of cranes, arms and vehicles show in positions.
-    solver : {"daqp", "qrqp"}
-        Of the quadratic programs, through CasADi.
 
     Returns
     -------
@@ -62,58 +137,64 @@ def limited(law, plant, *, bounds=None, weights=None, priority=None, horizon=HOR
     SpecificationError
         If there is nothing to keep, or weights and priority are both given.
     NameUnknown
-        For a name of no residual, output or solver.
+        For a name of no residual or output.
     LimitExceeded
         During the loop, where no inputs keep limits and bounds together; it names them.
     """
     _require_law(law, plant)
+    effects, bounds = _bounded(plant, bounds)
+    reference = Reference(law.plan, plant, law.rate)
+    residuals, D, at_once = _predicted(reference, positive("horizon", horizon))
+    H = _metric(reference, residuals, _weights(residuals, weights, priority), at_once)
+    sizes = _sizes(law.plan, plant, H)
+    allocation = Allocation(law, plant, effects, bounds, residuals, sizes, np.abs(D).max(axis=0) @ sizes)
+    low, high, _ = ranges(plant, law.period)
+    return replace(
+        law,
+        name=f"{law.name}, limited " + (f"by priority {' > '.join(priority)}" if priority else "by weight"),
+        step=allocation,
+        schedule=_schedule(law, reference, D, H),
+        state=np.concatenate([law.state, np.clip(law.idle, low, high)]),
+        state_names=(*law.state_names, *(f"last {name}" for name in plant.inputs)),
+        signals=(*law.signals, *allocation.signals),
+        allocation=allocation,
+    )
+
+
+def _bounded(plant, bounds):
+    """What the inputs do at once to bounded outputs, and the bounds, (j, 2)."""
     bounds = {name: interval(name, value, "bound") for name, value in mapping(bounds, "The bounds").items()}
     if not (plant.limits or plant.rate_limits or bounds):
         raise SpecificationError(
             "The plant has no limits, and no bounds were given.",
             "An allocation keeps limits.",
-            nearest='sv.plant(mechanism, limits={"trolley": 150.0}).',
-            do="Give the plant its limits.",
+            do='Give the plant its limits: sv.plant(mechanism, limits={"trolley": 150.0}).',
         )
     for name in bounds:
         if name not in plant.mechanism.outputs:
             raise unknown(name, plant.mechanism.outputs, "output of the mechanism")
     effects = Effects(plant, {name: plant.mechanism.outputs[name] for name in bounds})
     _require_at_once(effects, plant, bounds)
-    reference = Reference(law.plan, plant, law.rate)
-    names, D, at_once = _predicted(reference, positive("horizon", horizon))
-    H = _metric(reference, names, _weights(names, weights, priority), at_once)
-    count, sizes = D.shape[0], _sizes(law.plan, plant, H)
-    samples, columns = np.arange(max(count, law.table.shape[1])), law.table.shape[1]
+    return effects, np.array(list(bounds.values())).reshape(-1, 2)
+
+
+def _schedule(law, reference, D, H):
+    """The law's schedule, x_ref, D and H at each sample; the last columns hold."""
+    count = len(D)
     along = np.vstack([reference.x, D.reshape(count, -1).T, H.reshape(count, -1).T])
-    table = [law.table[:, np.minimum(samples, columns - 1)], along[:, np.minimum(samples, count - 1)]]
-    signals = (*(f"slack {n}" for n in names), *(f"limit {n}" for n in plant.inputs))
-    signals += tuple(f"bound {n}" for n in bounds)
-    low, high = _magnitudes(plant)
-    memory_names = (*law.memory_names, *(f"last {name}" for name in plant.inputs))
-    step = _Allocation(law, plant, effects, sizes, tuple(bounds.values()), len(names), solver)
-    how = f"by priority {' > '.join(priority)}" if priority else "by weight"
-    return replace(
-        law,
-        name=f"{law.name}, limited {how}",
-        step=step,
-        table=np.vstack(table),
-        memory=np.concatenate([law.memory, np.clip(law.idle, low, high)]),
-        memory_names=memory_names,
-        signals=(*law.signals, *signals),
-        info=law.info | {"slack of": names, "limited plant": plant, "slack sizes": np.abs(D).max(axis=0) @ sizes},
-    )
+    samples = np.arange(max(count, law.schedule.shape[1]))
+    parts = (law.schedule, along)
+    return np.vstack([part[:, np.minimum(samples, part.shape[1] - 1)] for part in parts])
 
 
 def _require_law(law, plant):
     """Refuse what is no law of a plan, or measures what the plant lacks."""
     require_plant(plant)
-    if not isinstance(law, Law) or "slack of" in law.info:
+    if not isinstance(law, Law) or law.allocation:
         raise SpecificationError(
             f"A {type(law).__name__} was given as law." if not isinstance(law, Law) else f"{law.name!r} was given.",
-            "Limits are kept around a law that does not keep them yet.",
-            nearest="sv.lqr(plan, plant).",
-            do="Give a law made from a plan, and all bounds and weights at once.",
+            "Limits are allocated around a law without limits.",
+            do="Give a law made from a plan, as by sv.lqr, and all bounds and weights at once.",
         )
     if law.plan is None:
         raise SpecificationError(
@@ -130,11 +211,6 @@ def _require_law(law, plant):
         )
 
 
-def _magnitudes(plant):
-    """Lower and upper limits of the inputs, infinite where the plant has none."""
-    return np.array([plant.limits.get(name, (-np.inf, np.inf)) for name in plant.inputs]).T
-
-
 def _require_at_once(effects, plant, bounds):
     """Refuse bounds of what no input changes at once, as behind lagging actuators."""
     for name in bounds:
@@ -143,7 +219,6 @@ def _require_at_once(effects, plant, bounds):
                 f"No input changes {name!r} at once"
                 + (f": {', '.join(plant.lagged)} lag behind their commands." if plant.lag else "."),
                 "A bound is kept by the inputs of the same sample.",
-                nearest="The bound, with a plant without lag.",
                 do="Leave the bound out, or design with actuators that act at once.",
                 name=name,
             )
@@ -193,44 +268,98 @@ def _metric(reference, names, weights, at_once):
     return H
 
 
-class _Allocation:
-    """The step of a limited law: (t, [y; z; last u], [row; x_ref; D; H]) -> [u; z+; u; signals]."""
+@dataclass(frozen=True, eq=False)
+class Allocation:
+    """The step of a limited law: (t, [y; z; last u], [column; x_ref; D; H]) -> [u; z+; u; signals].
 
-    def __init__(self, law, plant, effects, sizes, bounds, k, solver):
-        self.law, self.plant, self.effects, self.sizes = law, plant, effects, sizes
-        m, self.k = len(plant.inputs), k
-        self.low, self.high = _magnitudes(plant)
-        self.change = np.array([plant.rate_limits.get(name, np.inf) for name in plant.inputs]) * law.period
-        self.bounds = np.array(bounds).reshape(-1, 2)
-        self.where = [plant.state_names.index(name) for name in law.measures]
-        self.integrals = np.array([name.startswith("integral of ") for name in law.memory_names], dtype=bool)
-        self.told = law.info.get("memory from input")
-        self.qp = SmallQP(m, len(bounds), solver)
+    Attributes
+    ----------
+    law : Law
+        Whose inputs are allocated.
+    plant : Plant
+        Whose limits are kept.
+    effects : Effects
+        What inputs do at once to the bounded outputs.
+    bounds : (j, 2) array
+        Of these.
+    residuals : tuple of str
+        Names of what may give way.
+    sizes : (m,) array
+        Of the inputs.
+    slack_sizes : (k,) array
+        Largest effects of inputs of these sizes on the residuals.
+    """
+
+    law: Law
+    plant: object
+    effects: Effects = field(compare=False)  # follows from the plant and its outputs
+    bounds: np.ndarray
+    residuals: tuple
+    sizes: np.ndarray
+    slack_sizes: np.ndarray
+
+    @property
+    def limits(self):
+        """(kind, name) of what may be met: ("limit", an actuator) and ("bound", a bounded output)."""
+        return (*(("limit", name) for name in self.plant.inputs), *(("bound", name) for name in self.effects.names))
+
+    @property
+    def signals(self):
+        """Names of the further signals: slacks, limits and bounds."""
+        return (*(f"slack {name}" for name in self.residuals), *(f"{kind} {name}" for kind, name in self.limits))
+
+    @cached_property
+    def _layouts(self):
+        """Of the arguments x and row, and of the answer of the law."""
+        law, m, k, n_z = self.law, len(self.sizes), len(self.residuals), len(self.law.state)
+        return (
+            Layout(y=len(law.measures), z=n_z, last=m),
+            Layout(column=law.schedule.shape[0], x_ref=self.plant.n_x, D=(k, m), H=(m, m)),
+            Layout(u=m, z=n_z, signals=len(law.signals)),
+        )
+
+    @cached_property
+    def _measured(self):
+        return [self.plant.state_names.index(name) for name in self.law.measures]
+
+    @cached_property
+    def _limits(self):
+        """Lower and upper limits, and the largest change in a sample, (m,) each."""
+        return ranges(self.plant, self.law.period)
+
+    @cached_property
+    def _qp(self):
+        return SmallQP(len(self.sizes), len(self.bounds))
 
     def __call__(self, t, x, row):
-        law, m = self.law, len(self.plant.inputs)
-        n_y, n_z = len(law.measures), len(law.memory)
-        rows = law.table.shape[0]
-        inner = law.answer(t, x[: n_y + n_z], row[:rows])
-        wanted, memory, further = np.split(inner, [m, m + n_z])
-        n_x, k = self.plant.n_x, self.k
-        state, D, H = np.split(row[rows:].copy(), [n_x, n_x + k * m])
-        D, H = D.reshape(k, m), H.reshape(m, m)
-        state[self.where] = x[:n_y]
-        last = x[n_y + n_z :]
-        low, high = np.maximum(self.low, last - self.change), np.minimum(self.high, last + self.change)
+        """The inputs, the next controller state and the signals, in one array."""
+        of_arguments, of_column, of_answer = self._layouts
+        now, along = of_arguments.split(x), of_column.split(row)
+        wanted = of_answer.split(self.law.answer(t, np.concatenate([now.y, now.z]), along.column))
+        state = along.x_ref.copy()
+        state[self._measured] = now.y
+        low, high, change = self._limits
+        low, high = np.maximum(low, now.last - change), np.minimum(high, now.last + change)
         c, O = self.effects(t, state)
-        u = self._allocate(t, wanted, low, high, H, c, O)
-        slack = D @ (u - wanted)
+        u = self._allocate(t, wanted.u, low, high, along.H, c, O)
+        difference = u - wanted.u
+        slack = along.D @ difference
+        gives_way = np.any(np.abs(slack) > GIVEN_WAY * (np.abs(along.D) @ self.sizes))
+        z = self._advanced(t, now.z, wanted.z, gives_way, difference)
         room = MET * self.sizes
-        active = np.where(u <= low + room, -1.0, np.where(u >= high - room, 1.0, 0.0)) * (np.abs(u - wanted) > room)
+        active = np.where(u <= low + room, -1.0, np.where(u >= high - room, 1.0, 0.0)) * (np.abs(difference) > room)
         reached = np.where(np.abs(c + O @ u - self.bounds.T) <= MET * (np.abs(O) @ self.sizes), [[-1.0], [1.0]], 0.0)
-        held = self.integrals & bool(np.any(np.abs(slack) > GIVEN_WAY * (np.abs(D) @ self.sizes)))
-        memory = np.where(held, x[n_y : n_y + n_z], memory)
-        if self.told is not None:
-            k = min(round((t - law.t0) * law.rate), len(self.told) - 1)
-            memory = memory + self.told[k] @ (u - wanted)
-        return np.concatenate([u, memory, u, further, slack, active, reached.sum(axis=0)])
+        return np.concatenate([u, z, u, wanted.signals, slack, active, reached.sum(axis=0)])
+
+    def _advanced(self, t, z, following, gives_way, difference):
+        """The next controller state: integrals are held while slack is given, an estimate takes the applied inputs."""
+        law, following = self.law, following.copy()
+        if gives_way and law.integrators:
+            following[list(law.integrators)] = z[list(law.integrators)]
+        if law.input_matrix is None:
+            return following
+        k = min(round((t - law.t0) * law.rate), len(law.input_matrix) - 1)
+        return following + law.input_matrix[k] @ difference
 
     def _allocate(self, t, wanted, low, high, H, c, O):
         """The inputs, from a quadratic program in (u - u_law)/size where those of the law do not do."""
@@ -241,20 +370,19 @@ class _Allocation:
         scale = np.maximum(np.abs(A).max(axis=1, initial=0.0), 1e-300)
         H = S @ H @ S
         ends = (low - wanted) / self.sizes, (high - wanted) / self.sizes
-        v = self.qp(H / np.abs(H).max(), np.zeros(len(H)), *ends, A / scale[:, None], least / scale, most / scale)
+        v = self._qp(H / np.abs(H).max(), *ends, A / scale[:, None], least / scale, most / scale)
         if v is None:
-            self._refuse(t, low, high, c)
+            self._refuse(t, low, high)
         return np.clip(wanted + self.sizes * v, low, high)
 
-    def _refuse(self, t, low, high, c):
+    def _refuse(self, t, low, high):
         names = self.plant.inputs
         limits = ", ".join(f"{n} {a:.6g} .. {b:.6g}" for n, a, b in zip(names, low, high, strict=True))
         bounds = ", ".join(f"{n} {a:.6g} .. {b:.6g}" for n, (a, b) in zip(self.effects.names, self.bounds, strict=True))
         raise LimitExceeded(
             f"At t = {t:.6g} s no inputs within {limits} keep {bounds or 'the rows'}.",
             "Limits and bounds are kept together; slack is given to the program's residuals alone.",
-            nearest="The motion before, which is kept in `.run`.",
-            do="Widen a limit or a bound, or slow the plan (sv.fastest).",
+            do="Widen a limit or a bound, or slow the plan (sv.fastest); `.run` is the motion before.",
             t=float(t),
             bounds=self.effects.names,
         )
@@ -262,40 +390,33 @@ class _Allocation:
 
 def _weights(names, weights, priority):
     """The residuals' weights, (k,)."""
-    weights = mapping(weights, "The weights")
-    if isinstance(priority, str) or not np.iterable(priority or ()) or len({*(priority or ())}) < len(priority or ()):
+    weights = numbers_by_name(weights, names, "residual", "weight", positive=True)
+    if not priority:
+        return np.array([weights.get(name, 1.0) for name in names])
+    if isinstance(priority, str) or not np.iterable(priority) or len({*priority}) < len(priority):
         raise SpecificationError(
             f"priority={priority!r} was given.",
             "A priority is a sequence of residuals, each once, the most important first.",
-            nearest=f"{list(names)}.",
-            do="Give it.",
+            do=f"Order some of {', '.join(names)}.",
         )
-    if weights and priority:
+    if weights:
         raise SpecificationError(
             "Weights and a priority were given.", "Slack goes by one of them.", do="Leave one of them out."
         )
-    for name in (*weights, *(priority or ())):
+    for name in priority:
         if name not in names:
             raise unknown(name, names, "residual")
-    if priority:
-        order = [*dict.fromkeys(priority), *(n for n in names if n not in priority)]
-        return np.array([FALLING ** order.index(name) for name in names])
-    found = np.array([finite(name, weights.get(name, 1.0), "weight") for name in names])
-    if found.min() <= 0:
-        raise SpecificationError(
-            f"The weights {weights} were given.", "A residual's weight is positive.", do="Give positive numbers."
-        )
-    return found
+    order = [*priority, *(n for n in names if n not in priority)]
+    return np.array([FALLING ** order.index(name) for name in names])
 
 
 def _sizes(plan, plant, H):
     """A typical size of each input: its range where it has limits, else what the plan uses, if that costs anything."""
-    found = []
-    for name in plant.inputs:
-        low, high = plant.limits.get(name, (-np.inf, np.inf))
-        found.append(high - low if np.isfinite(high - low) else float(np.abs(plan[name]).max()))
+    low, high, _ = ranges(plant, 1.0)
+    used = np.array([np.abs(plan[name]).max() for name in plant.inputs])
+    sizes = np.where(np.isfinite(high - low), high - low, used)
     unit = 1 / np.sqrt(np.diagonal(H, axis1=1, axis2=2).max(axis=0))  # of each input, of the same cost
-    return np.maximum(found, (IDLE * np.max(found / unit) or 1.0) * unit)
+    return np.maximum(sizes, (IDLE * np.max(sizes / unit) or 1.0) * unit)
 
 
 @dataclass(frozen=True)
@@ -309,9 +430,9 @@ class LimitReport:
     limits : dict of str to float
         Share of the samples at which each actuator or bound was met.
     overload : tuple of (str, float, float, float) or None
-        Of the plan itself: actuator, instant, what it asks, the limit; None if it asks for no more than there is.
+        Of the plan itself: actuator, instant, its value, the limit; None if it keeps all limits.
     slower : float or None
-        Factor by which the plan would have to be slowed to keep the limits of magnitude, where it was asked for.
+        Factor by which the plan would have to be slowed to keep the limits of magnitude, where a scene is given.
     """
 
     rows: tuple
@@ -326,8 +447,8 @@ class LimitReport:
         for name, share in list(self.limits.items())[:4]:
             lines.append(f"  {name} at its limit during {100 * share:.3g} % of the samples")
         if self.overload:
-            name, t, asked, limit = self.overload
-            lines.append(f"  the plan asks {asked:.6g} of {name} at t = {t:.5g} s; the limit is {limit:.6g}")
+            name, t, needed, limit = self.overload
+            lines.append(f"  the plan needs {needed:.6g} of {name} at t = {t:.5g} s; the limit is {limit:.6g}")
         if self.slower:
             lines.append(f"  slowed by the factor {self.slower:.5g} the plan would keep the limits of magnitude")
         return "\n".join(lines)
@@ -354,45 +475,45 @@ def limit_report(run, scene=None):
         If the law is not limited.
     """
     law = getattr(run, "law", None)
-    if "slack of" not in getattr(law, "info", {}):
+    allocation = getattr(law, "allocation", None)
+    if allocation is None:
         raise SpecificationError(
             f"The law {getattr(law, 'name', None)!r} is not limited.",
             "The report reads the slacks of an allocation.",
-            nearest="sv.limited(law, plant).",
-            do="Close the loop with it.",
+            do="Close the loop with a law of sv.limited(law, plant).",
         )
     if scene is not None and not (isinstance(scene, dict) and "t_span" in scene and SCENE.issuperset(scene)):
         raise SpecificationError(
             f"scene={scene!r} was given."[:200],
             f"A scene has the span of the program as given, and what sv.fastest takes: {', '.join(sorted(SCENE))}.",
-            nearest='{"t_span": (0.0, 6.0), "guess": {"l": 4.0}}.',
-            do="Give such a dict.",
+            do='Give a dict, such as {"t_span": (0.0, 6.0), "guess": {"l": 4.0}}.',
         )
-    names, plant, sizes = (run.law.info[key] for key in ("slack of", "limited plant", "slack sizes"))
-    rows = []
-    for name, size in zip(names, sizes, strict=True):
-        slack = np.abs(run.signal[f"slack {name}"])
-        given = np.flatnonzero(slack > GIVEN_WAY * size)
-        if len(given):
-            k = int(np.argmax(slack))
-            rows.append((name, *(float(run.t[i]) for i in (given[0], given[-1])), float(slack[k]), float(run.t[k])))
-    signals = [name for name in run.law.signals if name.startswith(("limit ", "bound "))]
-    limits = {s.split(" ", 1)[1]: float(np.mean(run.signal[s] != 0)) for s in signals}
-    overload = _overload(run.plan, plant)
-    slower = None
+    met = {name: run.signal[f"{kind} {name}"] for kind, name in allocation.limits}
+    shares = {name: float(np.mean(values != 0)) for name, values in met.items()}
+    overload, slower = _overload(run.plan, allocation.plant), None
     if scene is not None and overload is not None:
-        from servoctl.control.time_law import fastest
-
         reduction = run.plan.model.reduction
-        slower = fastest(reduction.mechanism, reduction.program, plant.limits, **scene).factor
-    return LimitReport(tuple(rows), {n: s for n, s in limits.items() if s}, overload, slower)
+        slower = fastest(reduction.mechanism, reduction.program, allocation.plant.limits, **scene).factor
+    return LimitReport(_slacks(run, allocation), {n: s for n, s in shares.items() if s}, overload, slower)
+
+
+def _slacks(run, allocation):
+    """Of each residual that gave way: name, first and last instant, largest slack and its instant."""
+    rows = []
+    for name, size in zip(allocation.residuals, allocation.slack_sizes, strict=True):
+        slack = np.abs(run.signal[f"slack {name}"])
+        samples = np.flatnonzero(slack > GIVEN_WAY * size)
+        if len(samples):
+            k = int(np.argmax(slack))
+            rows.append((name, *(float(run.t[i]) for i in samples[[0, -1]]), float(slack[k]), float(run.t[k])))
+    return tuple(rows)
 
 
 def _overload(plan, plant):
     """The largest excess of the plan over the limits of magnitude: actuator, instant, value, limit."""
-    found = []
+    excesses = []
     for name, (low, high) in plant.limits.items():
         (t_low, least), (t_high, most) = plan.extrema(name)
-        found += [(low - least, name, t_low, least, low), (most - high, name, t_high, most, high)]
-    excess, *told = max(found, default=(0.0,))
-    return tuple(told) if excess > 0 else None
+        excesses += [(low - least, name, t_low, least, low), (most - high, name, t_high, most, high)]
+    excess, *facts = max(excesses, default=(0.0,))
+    return tuple(facts) if excess > 0 else None

@@ -4,11 +4,12 @@ from dataclasses import replace
 
 import numpy as np
 
-from servoctl.checks import finite
-from servoctl.control.feedback import Residuals
+from servoctl.checks import numbers_by_name
+from servoctl.control.feedback import StateFeedback, affine
+from servoctl.control.reference import Reference, refuse_transport
+from servoctl.control.residuals import Residuals
 from servoctl.control.sampling import discretised, spectral_radii
-from servoctl.control.tracking import Reference, affine, refuse_transport
-from servoctl.errors import ServoError, SpecificationError, unknown
+from servoctl.errors import ServoError, SpecificationError
 
 MARGINAL = 1 + 1e-6  # spectral radius of what may stay out of reach: it neither falls nor grows
 DOUBLINGS, CONVERGED = 60, 1e-12  # of the horizon of the Riccati equation; its last relative change
@@ -67,27 +68,36 @@ def lqr(plan, plant, rate=100.0, Q=None, R=None, integral=None, varying=True):
         )
     reference = Reference(plan, plant, rate)
     refuse_transport(plant, "The design is")
-    q = plant.mechanism.q
-    default = np.zeros(plant.n_x)
-    default[: q.nq + q.n] = [Q_POSITION] * q.nq + [Q_VELOCITY] * q.n
-    Q = weights(Q, default, plant.state_names, "state", "Q")
+    Q = weights(Q, _state_weights(plant), plant.state_names, "state", "Q")
     R = weights(R, np.full(len(plant.inputs), R_INPUT), plant.inputs, "actuator", "R", positive=True)
     residuals, Q_i = _integrals(integral, plan, plant)
     A, B = discretised(*reference.linearised(), reference.period)
-    if residuals:
-        A, B, Q = _with_integrals(A, B, Q, residuals, Q_i, reference)
+    augmented = _with_integrals(A, B, Q, residuals, Q_i, reference) if residuals else (A, B, Q)
     basis = tangents(reference, 0 if residuals is None else len(Q_i))
-    K = _varying(A, B, Q, R, basis) if varying else steady(A, B, Q, R, basis)[0]
-    radii = spectral_radii(_reduced(A - B @ K, basis))
-    facts = {
+    K, radii = _gains(*augmented, R, basis, varying)
+    K_x, K_i = np.split(K, [plant.n_x], axis=2)
+    integrated = residuals.names if residuals else ()
+    how = f"lqr, {'time-varying' if varying else 'frozen-time'}" + (", with integrals" if residuals else "")
+    info = {
         "largest spectral radius along the plan": float(radii.max()),
         "spectral radius at its end": float(radii[-1]),
-        "gains": K, "Q": Q, "R": R, "integrated": residuals.names if residuals else (), "states": plant.state_names,
+        "gains": K, "Q": augmented[2], "R": R, "integrated": integrated, "states": plant.state_names,
     }  # fmt: skip
-    n_x = plant.n_x
-    how = f"lqr, {'time-varying' if varying else 'frozen-time'}" + (", with integrals" if residuals else "")
-    law = affine(how, reference, K[:, :, :n_x], K[:, :, n_x:], residuals)
-    return replace(law, info=facts)
+    law = affine(how, reference, K_x, K_i, residuals, info)
+    return replace(law, feedback=StateFeedback(plant.state_names, integrated, K_x, K_i))
+
+
+def _state_weights(plant):
+    """The default diagonal of Q: coordinates, velocities, and 0 for lagged inputs."""
+    q, diagonal = plant.mechanism.q, np.zeros(plant.n_x)
+    diagonal[: q.nq + q.n] = [Q_POSITION] * q.nq + [Q_VELOCITY] * q.n
+    return diagonal
+
+
+def _gains(A, B, Q, R, basis, varying):
+    """K (N, m, n) along the plan or frozen at each sample, and the spectral radii of A - B K, (N,)."""
+    K = _varying(A, B, Q, R, basis) if varying else steady(A, B, Q, R, basis)[0]
+    return K, spectral_radii(_reduced(A - B @ K, basis))
 
 
 def _with_integrals(A, B, Q, residuals, Q_i, reference):
@@ -101,12 +111,7 @@ def _with_integrals(A, B, Q, residuals, Q_i, reference):
 
 
 def tangents(reference, extra=0):
-    """Orthonormal bases of the states that material constraints allow, at each sample; None without any.
-
-    Returns
-    -------
-    (N, n, r) array or None
-    """
+    """Orthonormal bases of the states that material constraints allow, (N, n, r); None without any."""
     plant = reference.plant
     if not plant.constrained:
         return None
@@ -115,9 +120,9 @@ def tangents(reference, extra=0):
     rank = int(np.linalg.matrix_rank(J[0], tol=1e-9 * np.abs(J[0]).max()))
     T = np.linalg.svd(J)[2][:, rank:].transpose(0, 2, 1)
     n, r = T.shape[1:]
-    found = np.zeros((len(T), n + extra, r + extra))
-    found[:, :n, :r], found[:, n:, r:] = T, np.eye(extra)
-    return found
+    bases = np.zeros((len(T), n + extra, r + extra))
+    bases[:, :n, :r], bases[:, n:, r:] = T, np.eye(extra)
+    return bases
 
 
 def _reduced(A, basis):
@@ -131,22 +136,8 @@ def steady(A, B, Q, R, basis):
     By the structure-preserving doubling algorithm (Chu, Fan, Lin, Wang 2004) at all samples at once: step k gives the
     solution of a horizon of 2^k samples.
 
-    Parameters
-    ----------
-    A, B : (N, n, n), (N, n, m) arrays
-    Q, R : (n, n), (m, m) arrays
-    basis : (N, n, r) array or None
-        Of the tangent spaces.
-
-    Returns
-    -------
-    K : (N, m, n) array
-    P : (n, n) array
-
-    Raises
-    ------
-    ServoError
-        If there is no stabilising solution.
+    A, B are (N, n, n), (N, n, m); Q, R are (n, n), (m, m); a basis of the tangent spaces is (N, n, r). Returns
+    K (N, m, n) and P (n, n).
     """
     T = np.eye(A.shape[1])[None] if basis is None else basis
     left = T.swapaxes(1, 2)
@@ -165,8 +156,7 @@ def steady(A, B, Q, R, basis):
         raise ServoError(
             "The steady Riccati equation has no stabilising solution.",
             "Each unstable or marginal mode is reached by the inputs and seen by the weights.",
-            nearest="Weights on all states; fewer integrals than inputs; another set of actuators.",
-            do="Check which modes the actuators reach.",
+            do="Weigh all states, integrate fewer residuals than there are inputs, or choose other actuators.",
             radius=float(radii.max()),
         )
     return K @ left, T[-1] @ P[-1] @ T[-1].T
@@ -202,49 +192,28 @@ def _riccati(A, B, Q, R, P):
 
 
 def weights(given, default, names, what, symbol, positive=False):
-    """A weight matrix from a number, numbers by name, a diagonal or a matrix.
+    """A weight matrix, (n, n), from a number, numbers by name, a diagonal or a matrix.
 
-    Parameters
-    ----------
-    given : float, dict, or array, optional
-    default : (n,) array
-    names : sequence of str
-    what : str
-        What the names stand for.
-    symbol : str
-        Q or R, for messages.
-    positive : bool
-        Whether it must be definite, not only semidefinite.
-
-    Returns
-    -------
-    (n, n) array
-
-    Raises
-    ------
-    NameUnknown
-    SpecificationError
+    `default` is a diagonal; `what` the names' meaning, `symbol` the matrix's name in messages; `positive` refuses what
+    is only semidefinite.
     """
-    n, found = len(names), np.array(default, dtype=float)
+    n, entries = len(names), np.array(default, dtype=float)
     if isinstance(given, dict):
-        for name, value in given.items():
-            if name not in names:
-                raise unknown(name, names, what)
-            found[list(names).index(name)] = finite(name, value, "weight")
+        for name, weight in numbers_by_name(given, names, what, "weight").items():
+            entries[names.index(name)] = weight
     elif given is not None:
         try:
-            found = np.asarray(given, dtype=float)
+            entries = np.asarray(given, dtype=float)
         except (TypeError, ValueError):
-            found = np.empty(())
-            given = None
-        found = np.full(n, float(found)) if found.ndim == 0 and given is not None else found
-    matrix = np.diag(found) if found.shape == (n,) else found
+            entries = np.empty((0, 0))
+        entries = np.full(n, float(entries)) if entries.ndim == 0 else entries
+    matrix = np.diag(entries) if entries.shape == (n,) else entries
     if matrix.shape != (n, n):
         raise SpecificationError(
-            f"{symbol} has the shape {found.shape}.",
+            f"{symbol} has the shape {entries.shape}." if entries.size else f"{symbol} is {given!r}."[:200],
             f"It is a number, {n} numbers or an ({n}, {n}) matrix, for {', '.join(names)}; or numbers by name.",
             do="Give one weight each.",
-            shape=found.shape,
+            shape=entries.shape,
         )
     symmetric = np.isfinite(matrix).all() and np.allclose(matrix, matrix.T, rtol=1e-9, atol=0)
     least = np.linalg.eigvalsh(matrix).min(initial=np.inf) if symmetric else -np.inf
@@ -270,6 +239,6 @@ def _integrals(integral, plan, plant):
             "A residual that is fed back is a function of the state (q, γ').",
             do="Leave out integral.",
         )
-    given = None if integral is True else integral
+    weighted = None if integral is True else integral
     names = residuals.names
-    return residuals, weights(given, np.full(len(names), Q_INTEGRAL), names, "residual", "integral", positive=True)
+    return residuals, weights(weighted, np.full(len(names), Q_INTEGRAL), names, "residual", "integral", positive=True)

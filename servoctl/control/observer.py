@@ -1,16 +1,43 @@
 """Output feedback: a Kalman filter along the plan estimates what is not measured."""
 
+import casadi as ca
 import numpy as np
 
-from servoctl.checks import finite, mapping
-from servoctl.control.feedback import Residuals, estimating_law
+from servoctl.checks import numbers_by_name
+from servoctl.control.feedback import integral_names, integration, law_step
 from servoctl.control.law import Law
 from servoctl.control.lqr import tangents, weights
+from servoctl.control.reference import Reference, refuse_transport, require_plant
+from servoctl.control.residuals import Residuals
 from servoctl.control.sampling import discretised, spectral_radii
-from servoctl.control.tracking import Reference, refuse_transport, require_plant
-from servoctl.errors import ServoError, SpecificationError, unknown
+from servoctl.errors import ServoError, SpecificationError
 
 POSITION_NOISE, VELOCITY_NOISE = 1e-3, 1.0  # per √s, of coordinates and velocities
+
+
+def estimating_law(states, where, n_u, residuals=None):
+    """An affine law on an estimated state.
+
+    δx⁺ = δx̂ + L (y - y_ref - C δx̂),  u = u_ff - K δx⁺ - K_i z,  δx̂+ = A δx⁺ + B δu,  z+ = z + Ts φ(t, x_ref + δx⁺).
+
+    Its schedule has the columns [u_ff; x_ref; K, K_i, L, A, B row by row; Ts; parameters of φ]; `states` are those of
+    the plant, of which those at `where` are measured; `residuals` are integrated in z.
+    """
+    n_x, n_y, n_z = len(states), len(where), len(residuals.names) if residuals else 0
+    t, y, estimate, z = (ca.SX.sym("t"), *(ca.SX.sym(s, n) for s, n in (("y", n_y), ("e", n_x), ("z", n_z))))
+    u_ff, x_ref = ca.SX.sym("u_ff", n_u), ca.SX.sym("x_ref", n_x)
+    shapes = {"K": (n_u, n_x), "K_i": (n_u, n_z), "L": (n_x, n_y), "A": (n_x, n_x), "B": (n_x, n_u)}
+    symbols = {name: ca.SX.sym(name, columns, rows) for name, (rows, columns) in shapes.items()}  # transposed
+    K, K_i, L, A, B = (matrix.T for matrix in symbols.values())
+    corrected = estimate + L @ (y - x_ref[where] - estimate[where])
+    du = -K @ corrected - K_i @ z
+    row = [u_ff, x_ref, *map(ca.vec, symbols.values())]
+    outputs = [u_ff + du, A @ corrected + B @ du]
+    if n_z:
+        period, p = ca.SX.sym("Ts"), ca.SX.sym("p", residuals.parameters.size)
+        row += [period, p]
+        outputs.append(z + period * residuals.expression(t, x_ref + corrected, states, p))
+    return law_step("estimating", t, ca.vertcat(y, estimate, z), ca.vertcat(*row), outputs)
 
 
 def output_feedback(law, plant, noise, process=None):
@@ -48,55 +75,60 @@ def output_feedback(law, plant, noise, process=None):
         If the measured states do not tell the others: a mode that they do not see does not decay.
     """
     _require_lqr(law, plant)
-    measured, deviations = _measured(noise, plant)
-    reference = Reference(law.plan, plant, law.rate)
+    measured, deviations = _deviations(noise, plant)
+    reference, gains = Reference(law.plan, plant, law.rate), law.feedback
     basis = tangents(reference)
     A, B = _onto(basis, *discretised(*reference.linearised(), reference.period))
-    n_x, n = plant.n_x, len(plant.disturbable)
-    default = np.zeros(n_x)
-    default[: n_x - len(plant.lag)] = POSITION_NOISE**2
-    default[n_x - len(plant.lag) - n : n_x - len(plant.lag)] = VELOCITY_NOISE**2
-    W = weights(process, default, plant.state_names, "state", "process") * reference.period
+    n_x, n_z = plant.n_x, len(gains.residuals)
+    W = weights(process, _process_noise(plant), plant.state_names, "state", "process") * reference.period
     where = [plant.state_names.index(name) for name in measured]
-    L = _filter(A, np.eye(n_x)[where], W, np.diag(deviations**2), basis)
-    names = law.info["integrated"]
-    residuals = Residuals(law.plan.model, plant, names) if names else None
-    K = law.info["gains"]
-    count, columns = len(reference.t), []
-    for part in (K[:, :, :n_x], K[:, :, n_x:], L, A, B):  # row by row
-        columns.append(part.reshape(count, -1).T)
-    table = [reference.inputs(), reference.x, *columns]
-    if residuals:
-        table.append(np.tile(np.append(reference.period, residuals.parameters)[:, None], count))
-    step = estimating_law(plant.state_names, where, len(plant.inputs), residuals)
-    memory_names = (*(f"estimated error of {name}" for name in plant.state_names), *law.memory_names)
-    errors = A @ (np.eye(n_x) - L @ np.eye(n_x)[where])
+    C = np.eye(n_x)[where]
+    L = _filter(A, C, W, np.diag(deviations**2), basis)
+    errors = A @ (np.eye(n_x) - L @ C)
     errors = errors if basis is None else basis.swapaxes(1, 2) @ errors @ basis
-    told = np.concatenate([B, np.zeros((count, len(names), B.shape[2]))], axis=1)
-    facts = law.info | {"measured": measured, "memory from input": told}
-    facts["spectral radius of the filter"] = float(spectral_radii(errors).max())
+    residuals = Residuals(law.plan.model, plant, gains.residuals) if n_z else None
+    schedule = [reference.inputs(), reference.x]
+    schedule += [part.reshape(len(A), -1).T for part in (gains.K, gains.K_i, L, A, B)]  # row by row
+    schedule += [integration(reference, residuals)] if residuals else []
+    input_matrix = np.concatenate([B, np.zeros((len(B), n_z, B.shape[2]))], axis=1)
     return Law(
-        f"{law.name}, output feedback", measured, plant.inputs, law.rate, law.t0, step, np.vstack(table),
-        np.zeros(n_x + len(names)), memory_names, (), law.idle, law.plan, facts,
+        name=f"{law.name}, output feedback", measures=measured, inputs=plant.inputs, rate=law.rate, t0=law.t0,
+        step=estimating_law(plant.state_names, where, len(plant.inputs), residuals), schedule=np.vstack(schedule),
+        state=np.zeros(n_x + n_z), state_names=_state_names(plant, gains.residuals), idle=law.idle, plan=law.plan,
+        info=law.info | {"spectral radius of the filter": float(spectral_radii(errors).max())},
+        integrators=tuple(range(n_x, n_x + n_z)), feedback=gains, input_matrix=input_matrix,
     )  # fmt: skip
 
 
+def _state_names(plant, residuals):
+    return (*(f"estimated error of {name}" for name in plant.state_names), *integral_names(residuals))
+
+
+def _process_noise(plant):
+    """The default intensity by state: of coordinates and velocities, none of lagged inputs."""
+    n_x, lagged, n = plant.n_x, len(plant.lag), len(plant.disturbable)
+    intensity = np.zeros(n_x)
+    intensity[: n_x - lagged] = POSITION_NOISE**2
+    intensity[n_x - lagged - n : n_x - lagged] = VELOCITY_NOISE**2
+    return intensity
+
+
 def _require_lqr(law, plant):
-    """Refuse a law that has no gains on the states of this plant."""
+    """Refuse a law that has no gains on the states of this plant, or estimates or allocates already."""
     require_plant(plant)
-    info = getattr(law, "info", {})
-    if "gains" not in info or "measured" in info or "slack of" in info:
+    if not isinstance(law, Law) or law.feedback is None or law.input_matrix is not None or law.allocation:
         raise SpecificationError(
             f"The law {getattr(law, 'name', law)!r} is no LQR's on the state.",
-            "Output feedback puts an estimate in the place of the state.",
-            nearest="lqr(plan, plant, ...).",
-            do="Give the law that lqr made.",
+            "Output feedback replaces the state by an estimate.",
+            do="Give the law that sv.lqr made.",
         )
-    if law.info["states"] != plant.state_names:
+    if law.feedback.states != plant.state_names:
         raise SpecificationError(
-            f"The law has gains on {', '.join(law.info['states'])}.",
+            f"The law has gains on {', '.join(law.feedback.states)}.",
             f"The plant has the states {', '.join(plant.state_names)}.",
             do="Make law and estimator for the same plant, lagging actuators included.",
+            states=law.feedback.states,
+            valid=plant.state_names,
         )
     refuse_transport(plant, "The prediction is")
 
@@ -109,27 +141,16 @@ def _onto(basis, A, B):
     return T @ (T.swapaxes(1, 2) @ A), T @ (T.swapaxes(1, 2) @ B)
 
 
-def _measured(noise, plant):
-    found = {}
-    for name, value in mapping(noise, "The noise").items():
-        if name not in plant.state_names:
-            raise unknown(name, plant.state_names, "state of the plant")
-        found[name] = finite(name, value, "standard deviation")
-        if found[name] <= 0:
-            raise SpecificationError(
-                f"The noise of {name!r} is {found[name]:g}.",
-                "A filter weighs measurements by positive standard deviations.",
-                do="Give the resolution of the sensor.",
-                name=name,
-            )
-    if not found:
+def _deviations(noise, plant):
+    """Names of the measured states, and the standard deviations of their noise, (n_y,)."""
+    deviations = numbers_by_name(noise, plant.state_names, "state of the plant", "standard deviation", positive=True)
+    if not deviations:
         raise SpecificationError(
             "No noise was given.",
             "The states whose noise is given are those that are measured.",
-            nearest='{"x": 1e-3}.',
-            do="Name the measured states.",
+            do='Name the measured states: {"x": 1e-3}.',
         )
-    return tuple(found), np.array(list(found.values()))
+    return tuple(deviations), np.array(list(deviations.values()))
 
 
 def _filter(A, C, W, V, basis):
@@ -146,8 +167,7 @@ def _filter(A, C, W, V, basis):
         raise ServoError(
             f"The filter's Riccati equation has no stabilising solution ({error}).",
             "Each mode that does not decay by itself is seen by the measured states.",
-            nearest="Measure the coordinates; velocities alone do not tell where a machine is.",
-            do="Measure more states.",
+            do="Measure more states: velocities alone do not tell where a machine is.",
         ) from error
     L = np.empty((count, n_x, len(C)))
     for k in range(count):

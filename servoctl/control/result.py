@@ -6,8 +6,8 @@ from functools import cached_property
 import numpy as np
 
 from servoctl.checks import ON_SAMPLE, finite
-from servoctl.control.feedback import Residuals
-from servoctl.control.tracking import resampled
+from servoctl.control.reference import resampled
+from servoctl.control.residuals import Residuals
 from servoctl.errors import SpecificationError, unknown
 from servoctl.run import Run
 
@@ -28,16 +28,16 @@ class Closed:
     states : (n_x, N) array
         Of the plant, with the names `plant.state_names`.
     inputs, commands : (m, N) arrays
-        What the actuators were given from each sample on, within their limits; what the law had asked for there.
-    measurements, memory, signals : arrays
-        With the names of `law.measures`, `law.memory_names`, `law.signals`.
+        What the actuators were given from each sample on, within their limits; what the law commanded there.
+    measurements, controller_states, signals : (n_y, N), (n_z, N), (n_s, N) arrays
+        With the names of `law.measures`, `law.state_names`, `law.signals`.
     plant : Plant
     law : Law
     plan : Run or None
     loop : Loop
-        All that the loop was given.
+        The numbers of the loop.
     conditions : Conditions
-        Disturbances, noise, quantisation by name.
+        Sensors, timing and disturbances, by name.
     success : bool
     status : int
         0 finished, -1 stopped.
@@ -49,7 +49,7 @@ class Closed:
     inputs: np.ndarray
     commands: np.ndarray
     measurements: np.ndarray
-    memory: np.ndarray
+    controller_states: np.ndarray
     signals: np.ndarray
     plant: object
     law: object
@@ -88,38 +88,42 @@ class Closed:
 
     def _evaluated(self, kind):
         if kind not in self._evaluations:
-            p = self.plant.p(self._arriving, self._disturbances)
-            self._evaluations[kind] = self.plant.function(kind).grid(self.t, self.states, p)
+            self._evaluations[kind] = self.plant.function(kind).grid(self.t, self.states, self.p)
         return self._evaluations[kind]
+
+    @cached_property
+    def p(self):
+        """The plant's parameters, inputs as they arrive after transport, and disturbances at each sample, (n_p, N)."""
+        return self.plant.p(self._arriving, self._disturbances)
 
     @cached_property
     def _arriving(self):
         """Inputs as they reach the plant at each sample, after transport, (m, N)."""
-        loop, found = self.loop, self.inputs.copy()
+        loop, inputs = self.loop, self.inputs.copy()
         if loop.transport is not None:
             for a, late in enumerate(loop.transport):
                 sent = (np.arange(len(self.t)) * loop.substeps - late) // loop.substeps
-                found[a] = np.where(sent < 0, loop.idle[a], self.inputs[a, np.maximum(sent, 0)])
-        return found
+                inputs[a] = np.where(sent < 0, loop.idle[a], self.inputs[a, np.maximum(sent, 0)])
+        return inputs
 
     @cached_property
     def _disturbances(self):
         """Disturbances right after each sample, (n, N)."""
-        found, loop = np.zeros((len(self.plant.disturbable), len(self.t))), self.loop
+        forces, loop = np.zeros((len(self.plant.disturbable), len(self.t))), self.loop
         if loop.disturbance is not None:
             steps = np.minimum(np.arange(len(self.t)) * loop.substeps, len(loop.disturbance) - 1)
             ends = np.where(np.arange(len(self.t)) < loop.samples, 0, 2)
-            found[loop.disturbed] = loop.disturbance[steps, ends].T
-        return found
+            forces[loop.disturbed] = loop.disturbance[steps, ends].T
+        return forces
 
     @property
     def measured(self):
-        """What the law was told, by name: (N,) arrays with noise and quantisation."""
+        """What the law measured, by name: (N,) arrays with noise and quantisation."""
         return dict(zip(self.law.measures, self.measurements, strict=True))
 
     @property
     def command(self):
-        """What the law asked for at each sample, by actuator."""
+        """What the law commanded at each sample, by actuator."""
         return dict(zip(self.plant.inputs, self.commands, strict=True))
 
     @property
@@ -134,25 +138,25 @@ class Closed:
 
     @property
     def signal(self):
-        """Memory and further signals of the law at each sample, by name."""
-        names = (*self.law.memory_names, *self.law.signals)
-        return dict(zip(names, (*self.memory, *self.signals), strict=True))
+        """Controller states and further signals of the law at each sample, by name."""
+        names = (*self.law.state_names, *self.law.signals)
+        return dict(zip(names, (*self.controller_states, *self.signals), strict=True))
 
     @property
     def active(self):
         """Which limit each input met, by actuator: (N,) of -1 lower, 1 upper, -2 and 2 of its rate, 0 none."""
-        late, loop, found = self._late, self.loop, {}
+        late, loop, codes = self._late, self.loop, {}
         before = np.column_stack([loop.idle, self.inputs[:, :-1]])
         for a, name in enumerate(self.plant.inputs):
             code = np.zeros(len(self.t), dtype=int)
-            asked = late[a]
+            wanted = late[a]
             if loop.low is not None:
-                code[asked < loop.low[a]], code[asked > loop.high[a]] = LOWER, UPPER
-                asked = np.clip(asked, loop.low[a], loop.high[a])
+                code[wanted < loop.low[a]], code[wanted > loop.high[a]] = LOWER, UPPER
+                wanted = np.clip(wanted, loop.low[a], loop.high[a])
             if loop.change is not None:
-                code[asked > before[a] + loop.change[a]], code[asked < before[a] - loop.change[a]] = RISING, FALLING
-            found[name] = code
-        return found
+                code[wanted > before[a] + loop.change[a]], code[wanted < before[a] - loop.change[a]] = RISING, FALLING
+            codes[name] = code
+        return codes
 
     @property
     def _late(self):
@@ -167,14 +171,14 @@ class Closed:
         By name; (levels, N) arrays at the plant's states and parameters. Residuals of order 2 are those of the
         accelerations right after each sample; residuals of higher order are left out.
         """
-        found = {}
+        residuals = {}
         if self.plan is not None:
             jets = np.vstack([self.states, self._evaluated("accelerations")])
-            found |= Residuals(self.plan.model, self.plant, order=2).levels(self.t, jets)
+            residuals |= Residuals(self.plan.model, self.plant, order=2).levels(self.t, jets)
         if self.plant.constrained:
             values = self.plant.function("constraints").grid(self.t, self.states, self.plant.p())
-            found |= {name: value[None] for name, value in zip(self.plant.constraint_names(), values, strict=True)}
-        return found
+            residuals |= {name: value[None] for name, value in zip(self.plant.constraint_names(), values, strict=True)}
+        return residuals
 
     @cached_property
     def error(self):
@@ -218,18 +222,13 @@ class Closed:
         k = int(np.argmin(np.abs(self.t - t)))
         if abs(self.t[k] - t) > ON_SAMPLE * self.loop.period:
             raise SpecificationError(
-                f"t = {t:.9g} s was asked for.",
+                f"t = {t:.9g} s was given.",
                 f"The run has samples every {self.loop.period:g} s from {self.t[0]:g} to {self.t[-1]:g} s.",
                 nearest=f"t = {self.t[k]:.9g} s.",
-                do="Ask for a sample.",
+                do="Give the instant of a sample.",
+                t=t,
             )
         return self.states[:, k].copy()
-
-    def verify(self):
-        """The power balance of this run: see `servoctl.verify`."""
-        from servoctl.control.balance import balance
-
-        return balance(self)
 
     def to_run(self):
         """The samples as a plain `Run`, with "command NAME" and "measured NAME" among its signals: what is saved."""
@@ -268,23 +267,20 @@ class Closed:
         return _same, (self.to_run(),)  # plant and model hold expressions, which do not pickle
 
     def __repr__(self):
-        loop, c = self.loop, self.conditions
+        loop = self.loop
         lines = [
             f"Closed: {len(self.t)} samples at {1 / loop.period:g} Hz, t = {loop.t0:g} .. "
             f"{loop.t0 + max(len(self.t) - 1, 0) * loop.period:g} s; {self.message}",
             f"  law: {self.law.name}; {loop.substeps} integration step{'s' * (loop.substeps > 1)} per sample",
+            *self._exposure(),
         ]
-        met = [("noise on", c.noise), ("quantised:", c.quantisation), ("disturbed:", c.disturbance)]
-        told = [f"{what} {', '.join(names)}" for what, names in met if names]
-        told += [f"delay of {loop.delay} sample{'s' * (loop.delay > 1)}"] * bool(loop.delay)
-        lines += [f"  {'; '.join(told)}"[:118]] * bool(told)
         if not len(self.t):
             return "\n".join(lines)
         worst = {name: np.abs(values[0]) for name, values in self.residual.items()}
-        shown = sorted(worst, key=lambda name: -worst[name].max())[:3]
         if worst:
-            told = (f"{name} {worst[name].max():.3g}, {worst[name][-1]:.3g}" for name in shown)
-            lines.append(f"  residuals, at worst and at the end: {'; '.join(told)}")
+            largest = sorted(worst, key=lambda name: -worst[name].max())[:3]
+            errors = "; ".join(f"{name} {worst[name].max():.3g}, {worst[name][-1]:.3g}" for name in largest)
+            lines.append(f"  residuals, at worst and at the end: {errors}")
         if self.plan is not None and self.t[-1] > self.plan.t[-1] + ON_SAMPLE * loop.period:
             lines.append(f"  the plan ends at t = {self.plan.t[-1]:g} s: its last row is held")
         for name in self.plant.inputs[:5]:
@@ -292,6 +288,14 @@ class Closed:
             limited = f"; limited during {100 * share:.3g} % of the samples" if share else ""
             lines.append(f"  {name}: {self.input[name].min():.6g} .. {self.input[name].max():.6g}{limited}")
         return "\n".join(lines[:12])
+
+    def _exposure(self):
+        """The line that says what the loop was exposed to, if it was to anything."""
+        c, delay = self.conditions, self.loop.delay
+        kinds = (("noise on", c.sensors.noise), ("quantised:", c.sensors.quantisation), ("disturbed:", c.disturbance))
+        parts = [f"{what} {', '.join(names)}" for what, names in kinds if names]
+        parts += [f"delay of {delay} sample{'s' * (delay > 1)}"] * bool(delay)
+        return [f"  {'; '.join(parts)}"[:118]] * bool(parts)
 
 
 def _same(run):

@@ -30,12 +30,12 @@ def exponentials(matrices):
     norm = np.abs(matrices).sum(axis=2).max(initial=0.0)
     squarings = max(0, int(np.ceil(np.log2(max(norm, 1e-300) / SCALED))))
     scaled, eye = matrices / 2**squarings, np.eye(matrices.shape[1])
-    found = eye
+    power = eye
     for k in range(TERMS, 0, -1):
-        found = eye + scaled @ found / k
+        power = eye + scaled @ power / k
     for _ in range(squarings):
-        found = found @ found
-    return found
+        power = power @ power
+    return power
 
 
 def spectral_radii(matrices):
@@ -65,17 +65,17 @@ def sampled_radii(A, B, K, period, delays):
     count, n, m = B.shape
     whole = np.floor(delays / period + 1e-9).astype(int)
     rest = np.maximum(delays - whole * period, 0.0)
-    kept = int(whole.max(initial=0)) + bool(rest.max(initial=0.0) > 1e-9 * period)
-    loop = np.zeros((count, n + m * kept, n + m * kept))
+    past = int(whole.max(initial=0)) + bool(rest.max(initial=0.0) > 1e-9 * period)
+    loop = np.zeros((count, n + m * past, n + m * past))
     loop[:, :n, :n] = discretised(A, B, period)[0]
     for a, (d, late) in enumerate(zip(whole, rest, strict=True)):
         early, soon = discretised(A, B[:, :, a : a + 1], period - late)
         for samples, gamma in ((d, soon), (d + 1, early @ discretised(A, B[:, :, a : a + 1], late)[1])):
             if samples == 0:
                 loop[:, :n, :n] -= gamma @ K[:, a : a + 1]
-            elif samples <= kept:
+            elif samples <= past:
                 loop[:, :n, n + m * (samples - 1) + a] += gamma[:, :, 0]
-    if kept:
+    if past:
         loop[:, n : n + m, :n] = -K
-        loop[:, n + m :, n:-m] = np.eye(m * (kept - 1))
+        loop[:, n + m :, n:-m] = np.eye(m * (past - 1))
     return spectral_radii(loop)

@@ -15,8 +15,8 @@ from servoctl.spec.mechanism import Mechanism
 from servoctl.spec.program import Program
 
 REACH = 12  # doublings of the time, in which a motion becomes as good as static, or halvings
-INSIDE = 1e-6  # of a limit: how far below it the fastest time law stays
-NEAR = 1e-4  # of a limit: how near the fastest time law comes to it, unless motions cease to exist before
+BELOW = 1e-6  # of a limit: how far below it the fastest time law stays
+REACHED = 1e-4  # of a limit: how near the fastest time law comes to it, unless motions cease to exist before
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,74 +85,101 @@ def fastest(mechanism, program, limits, t_span, start=None, guess=None, paramete
     """
     from scipy.optimize import brentq
 
-    limits = {name: interval(name, value, "limit") for name, value in mapping(limits, "The limits").items()}
-    if not limits:
-        raise SpecificationError(
-            "No limits were given.", "A fastest time law is decided by a limit.", do='Give {"trolley": 100.0}.'
-        )
-    for given, kind in ((mechanism, Mechanism), (program, Program)):
-        if not isinstance(given, kind):
-            raise SpecificationError(
-                f"A {type(given).__name__} was given in the place of a {kind.__name__}.",
-                "A mechanism's program is slowed.",
-                do="Write sv.fastest(mechanism, program, ...).",
-            )
-    start, parameters = mapping(start, "Values of the start"), mapping(parameters, "The parameters")
-    t0, t1 = as_span(t_span, forward=True)
+    scene = _Scene(
+        mechanism,
+        program,
+        {name: interval(name, value, "limit") for name, value in mapping(limits, "The limits").items()},
+        as_span(t_span, forward=True),
+        mapping(start, "Values of the start"),
+        guess,
+        mapping(parameters, "The parameters"),
+    )
 
     @functools.cache
     def attempt(factor):
-        """(worst excess, binding, program, plan) of a time law; an infinite excess where there is no motion."""
-        slower = program.slowed(mechanism.q, factor, at=t0)
         try:
-            model = derive(mechanism, slower, guess)
-            model = model.with_parameters(**parameters) if parameters else model
-            held = {name: value / factor ** _level(model, name) for name, value in start.items()}
-            plan = simulate(model, model.start(t0, guess=guess, **held), (t0, t0 + (t1 - t0) * factor), progress=False)
-        except (SingularProgram, InconsistentStart, IntegrationStopped):
-            return np.inf, ("", "", t0), slower, None
+            return scene.slowed(factor)
         finally:
             bar.update()
-        return *_worst(plan, limits), slower, plan
 
     with progress_bar("fastest", progress, unit=" motions") as bar:
         quick, slow = _bracket(attempt)
-        factor = brentq(lambda sigma: min(attempt(sigma)[0], 1.0) + INSIDE, quick, slow, rtol=INSIDE / 10)
+        factor = brentq(lambda sigma: min(attempt(sigma)[0], 1.0) + BELOW, quick, slow, rtol=BELOW / 10)
     excess, binding, slower, plan = attempt(factor)
-    if not abs(excess) < NEAR:
+    if not abs(excess) < REACHED:
         raise LimitExceeded(
             f"No motion exists below the factor {factor:.6g}, before it reaches a limit.",
             "A fastest time law is decided by a limit that is reached.",
             nearest=f"Limits that are reached between the factors {factor:.6g} and {slow:g}.",
-            do="Give tighter limits, or slow the program by a factor of your own (Program.slowed).",
+            do="Give tighter limits, or slow the program by a factor that you choose (Program.slowed).",
             factor=factor,
         )
     return TimeLaw(factor, slower, plan, binding)
 
 
+@dataclass(frozen=True)
+class _Scene:
+    """What is slowed: a program, its motion and the limits of its signals."""
+
+    mechanism: Mechanism
+    program: Program
+    limits: dict
+    t_span: tuple
+    start: dict
+    guess: dict
+    parameters: dict
+
+    def __post_init__(self):
+        if not self.limits:
+            raise SpecificationError(
+                "No limits were given.", "A fastest time law is decided by a limit.", do='Give {"trolley": 100.0}.'
+            )
+        for given, kind in ((self.mechanism, Mechanism), (self.program, Program)):
+            if not isinstance(given, kind):
+                raise SpecificationError(
+                    f"A {type(given).__name__} was given as {kind.__name__.lower()}.",
+                    "A mechanism's program is slowed.",
+                    do="Write sv.fastest(mechanism, program, ...).",
+                )
+
+    def slowed(self, factor):
+        """(worst excess, binding, program, plan) of a time law; an infinite excess where there is no motion."""
+        t0, t1 = self.t_span
+        slower = self.program.slowed(self.mechanism.q, factor, at=t0)
+        try:
+            model = derive(self.mechanism, slower, self.guess)
+            model = model.with_parameters(**self.parameters) if self.parameters else model
+            held = {name: value / factor ** _level(model, name) for name, value in self.start.items()}
+            start = model.start(t0, guess=self.guess, **held)
+            plan = simulate(model, start, (t0, t0 + (t1 - t0) * factor), progress=False)
+        except (SingularProgram, InconsistentStart, IntegrationStopped):
+            return np.inf, ("", "", t0), slower, None
+        return *_worst(plan, self.limits), slower, plan
+
+
 def _bracket(attempt):
     """A factor at which a limit is exceeded, and the double of it, at which all are kept."""
     factor = 1.0
-    step = 2.0 if attempt(factor)[0] > -INSIDE else 0.5
+    step = 2.0 if attempt(factor)[0] > -BELOW else 0.5
     for _ in range(REACH):
         before, factor = factor, factor * step
-        if (attempt(factor)[0] > -INSIDE) != (step > 1):
+        if (attempt(factor)[0] > -BELOW) != (step > 1):
             return min(before, factor), max(before, factor)
     _refuse(attempt(factor), factor, step)
 
 
 def _worst(plan, limits):
     """Largest excess over the limits, relative to their size, and where it is."""
-    found = []
+    excesses = []
     for name, (low, high) in limits.items():
         (t_low, least), (t_high, most) = plan.extrema(name)
         size = max(abs(v) for v in (low, high) if np.isfinite(v)) or max(abs(least), abs(most)) or 1.0
-        found += [((low - least) / size, (name, "lower", t_low)), ((most - high) / size, (name, "upper", t_high))]
-    return max(found)
+        excesses += [((low - least) / size, (name, "lower", t_low)), ((most - high) / size, (name, "upper", t_high))]
+    return max(excesses)
 
 
 def _level(model, name):
-    """Order of the derivative that a name stands for."""
+    """Order of the derivative of a name."""
     nq, n = model.nq, model.n
     return 0 if name not in model.jet_names[nq:] else 1 + (model.jet_names.index(name) - nq) // n
 

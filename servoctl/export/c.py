@@ -53,7 +53,7 @@ def export_c(source, folder, *, name=None, start=None):
     ServoError
         If the files cannot be written.
     """
-    law = hasattr(source, "table") and isinstance(source.step, Compiled)
+    law = hasattr(source, "schedule") and isinstance(source.step, Compiled)
     if not law and not hasattr(source, "reduction"):
         raise _without_expressions(source)
     if law and start is not None:
@@ -85,7 +85,7 @@ def export_c(source, folder, *, name=None, start=None):
 
 def _without_expressions(source):
     """The refusal of what C cannot be written from."""
-    if not hasattr(source, "table"):
+    if not hasattr(source, "schedule"):
         return SpecificationError(
             f"A {type(source).__name__} is to be exported.",
             "C is written from a Model or a Law.",
@@ -208,11 +208,11 @@ def _integrated(model, x, z, p, u):
 
 
 def _of_law(law):
-    f, table = law.step._f, np.atleast_2d(np.asarray(law.table, dtype=float))
+    f, table = law.step._f, np.atleast_2d(np.asarray(law.schedule, dtype=float))
     width, last = len(table), table.shape[1] - 1
     y = Array("y", "Measurement y, SI", law.measures)
     u = Array("u", "Command u, SI", law.inputs)
-    z = Array("z", "Memory z", law.memory_names)
+    z = Array("z", "Memory z", law.state_names)
     ny, nu, nz = (len(array.names) for array in (y, u, z))
     start = f"""
     for (int i = 0; i < {nz}; i++) z[i] = @_z0[i];
@@ -232,7 +232,7 @@ def _of_law(law):
         "One sample of the law: command u of the measurement y and the memory z, which becomes the next one. To be "
         f"called every {1 / law.rate:.9g} s from t = {law.t0:g} s; after its last row the table stays there."
     )
-    constants = [Constant("z0", np.asarray(law.memory, dtype=float), "Memory z at the start")] if nz else []
+    constants = [Constant("z0", np.asarray(law.state, dtype=float), "Memory z at the start")] if nz else []
     return (
         [y, u, z],
         [*constants, Constant("table", table.T.ravel())],

@@ -4,17 +4,17 @@ import numpy as np
 
 from servoctl.checks import finite, positive
 from servoctl.codegen.jacobians import differentiable, jacobian
-from servoctl.control.law import Law, as_measurement
+from servoctl.control.law import Law, ordered
+from servoctl.control.reference import resampled
 from servoctl.control.result import Closed
 from servoctl.control.sampling import discretised
-from servoctl.control.tracking import resampled
 from servoctl.errors import SpecificationError, unknown
 from servoctl.interop.names import connected, force_names, output_names, signal_names, stranger
 from servoctl.model.model import Model
 from servoctl.plants.plant import Plant
 
 
-def linearise(thing, t, x=None, u=None, *, memory=None, rate=None, disturbed=(), name=None):
+def linearise(thing, t, x=None, u=None, *, controller_state=None, rate=None, disturbed=(), name=None):
     """A model, plant, law or closed loop linearised exactly, from its expressions, as a named `control.StateSpace`.
 
     Parameters
@@ -27,7 +27,7 @@ def linearise(thing, t, x=None, u=None, *, memory=None, rate=None, disturbed=(),
         State of the model or plant; of a law the measurement, default its plan's.
     u : (m,) array or dict of str to float, optional
         Of a plant: its inputs; default 0.
-    memory : (n_z,) array, optional
+    controller_state : (n_z,) array, optional
         Of a law; default that at its start.
     rate : float, optional
         Of a plant: discretised exactly under a zero-order hold of 1/rate.
@@ -47,8 +47,9 @@ def linearise(thing, t, x=None, u=None, *, memory=None, rate=None, disturbed=(),
     NameUnknown
         For a disturbance on no generalised force.
     """
-    options = {"u": u is not None, "memory": memory is not None, "rate": rate is not None, "disturbed": bool(disturbed)}
-    allowed = {Plant: ("u", "rate", "disturbed"), Law: ("memory",), Closed: (), Model: ()}
+    options = {"u": u is not None, "controller_state": controller_state is not None}
+    options |= {"rate": rate is not None, "disturbed": bool(disturbed)}
+    allowed = {Plant: ("u", "rate", "disturbed"), Law: ("controller_state",), Closed: (), Model: ()}
     for kind, valid in allowed.items():
         surplus = [option for option, given in options.items() if given and option not in valid]
         if isinstance(thing, kind) and (surplus or (kind is Closed and x is not None)):
@@ -61,7 +62,7 @@ def linearise(thing, t, x=None, u=None, *, memory=None, rate=None, disturbed=(),
     if isinstance(thing, Plant):
         return _linear_plant(thing, t, thing.state(x), u, rate, disturbed, name or "plant")
     if isinstance(thing, Law):
-        return _linear_law(thing, t, x, memory, name or "law")
+        return _linear_law(thing, t, x, controller_state, name or "law")
     if isinstance(thing, Closed):
         return _linear_closed(thing, t, name or "loop")
     if isinstance(thing, Model):
@@ -186,7 +187,7 @@ def _linear_plant(plant, t, x, u, rate, disturbed, name):
             do="Linearise the plant without delay.",
         )
     (disturbed, forces), m, n_x = force_names(plant, disturbed), len(plant.inputs), plant.n_x
-    u = np.zeros(m) if u is None else _inputs(u, plant)
+    u = np.zeros(m) if u is None else ordered(u, plant.inputs, "input")
     at_rest = [0.0] * (n_x - len(plant.lag)) + [u[plant.inputs.index(name)] for name in plant.lagged]
     x = np.where(np.isnan(x), at_rest, x)
     p, at_u = plant.p(u), len(plant.parameters)
@@ -204,48 +205,31 @@ def _linear_plant(plant, t, x, u, rate, disturbed, name):
     )  # fmt: skip
 
 
-def _inputs(u, plant):
-    """Inputs in the order of the actuators, (m,)."""
-    if isinstance(u, dict):
-        for name in (*u, *plant.inputs):
-            if name not in u or name not in plant.inputs:
-                raise unknown(name, plant.inputs if name in u else u, "input")
-        u = [u[name] for name in plant.inputs]
-    found = np.asarray(u, dtype=float).ravel()
-    if found.shape != (len(plant.inputs),):
-        raise SpecificationError(
-            f"{found.size} inputs were given.", f"The plant has {len(plant.inputs)}: {', '.join(plant.inputs)}.",
-            do="Give them in this order, or as a dict.",
-        )  # fmt: skip
-    return found
-
-
-def _linear_law(law, t, x, memory, name):
+def _linear_law(law, t, x, controller_state, name):
     import control
 
     if not differentiable(law.step):
         raise SpecificationError(
             f"The law {law.name!r} is computed in Python.",
             "A linearisation is taken from expressions.",
-            nearest="The law that it allocates within limits; interop.nlsys(law).linearize(...), by differences.",
-            do="Linearise one of these.",
+            do="Linearise the law that it allocates within limits, or interop.nlsys(law) by differences.",
         )
     if x is None:
         if law.plan is None:
             raise SpecificationError("The law has no plan.", "A linearisation has a point.", do="Give the measurement.")
         at = resampled(law.plan, np.clip([float(t)], law.plan.t[0], law.plan.t[-1]))
         x = {measure: at[measure][0] for measure in law.measures}
-    y, m, n_z = as_measurement(x, law.measures), len(law.inputs), len(law.memory)
-    z = np.asarray(law.memory if memory is None else memory, dtype=float)
+    y, m, n_z = ordered(x, law.measures, "measurement", exactly=False), len(law.inputs), len(law.state)
+    z = np.asarray(law.state if controller_state is None else controller_state, dtype=float)
     if z.shape != (n_z,):
         raise SpecificationError(
-            f"The memory has the shape {z.shape}.", f"The law remembers {n_z} numbers.", do="Give as many."
+            f"The controller state has the shape {z.shape}.", f"That of the law has {n_z} numbers.", do="Give as many."
         )
     J = jacobian(law.step, "x", t, np.append(y, z), law.row(t))
     n_y = len(y)
     A, B, C, D = J[m : m + n_z, n_y:], J[m : m + n_z, :n_y], J[:m, n_y:], J[:m, :n_y]
     return control.ss(
-        A, B, C, D, dt=law.period, name=name, states=law.memory_names, outputs=law.inputs,
+        A, B, C, D, dt=law.period, name=name, states=law.state_names, outputs=law.inputs,
         inputs=signal_names(law.measures, law.inputs), remove_useless_states=False,
     )  # fmt: skip
 
@@ -259,13 +243,12 @@ def _linear_closed(closed, t, name):
             "The measurement is quantised.", "Steps have no linearisation.", do="Close the loop without quantisation."
         )
     u, y = closed.inputs[:, k], closed.measurements[:, k]
-    own = _linear_plant(plant, t, x, u, law.rate, plant.disturbable, "plant")
-    own = _late(own, plant, loop.delay)
-    return connected(own, _linear_law(law, t, y, closed.memory[:, k], "law"), plant, law, name)
+    system = _late(_linear_plant(plant, t, x, u, law.rate, plant.disturbable, "plant"), plant, loop.delay)
+    return connected(system, _linear_law(law, t, y, closed.controller_states[:, k], "law"), plant, law, name)
 
 
 def _late(system, plant, delay):
-    """A sampled plant whose actuators are told each command `delay` samples late: past commands are further states."""
+    """A sampled plant whose actuators receive each command `delay` samples late: past commands are further states."""
     import control
 
     if not delay:

@@ -11,7 +11,7 @@ def output_names(plant):
 
 
 def signal_names(names, inputs):
-    """Names of states as signals: a lagged actuator is told from its input."""
+    """Names of states as signals: a lagged actuator is distinguished from its input."""
     return [f"lagged {name}" if name in inputs else name for name in names]
 
 

@@ -5,7 +5,7 @@ import math
 import numpy as np
 
 from servoctl.checks import positive
-from servoctl.control.close import limits, steps
+from servoctl.control.conditions import limits, steps
 from servoctl.control.law import Law
 from servoctl.control.result import Closed
 from servoctl.errors import ServoError, SpecificationError
@@ -216,14 +216,14 @@ def _pasts(plant, loop):
 def _law(law, name, quantum=None):
     import control
 
-    if hasattr(getattr(law.step, "_given", None), "start"):
+    if getattr(law.step, "stateful", False):
         raise SpecificationError(
             f"The law {law.name!r} keeps its memory to itself.",
             "python-control asks for outputs and states apart, more than once per sample.",
             nearest="A Law, whose memory is a state.",
             do="Run it by sv.close, or write it as a control.nlsys.",
         )
-    m, n_z = len(law.inputs), len(law.memory)
+    m, n_z = len(law.inputs), len(law.state)
 
     def answer(t, z, y):
         if quantum is not None:
@@ -233,7 +233,7 @@ def _law(law, name, quantum=None):
     return control.nlsys(
         (lambda t, z, y, _: answer(t, z, y)[m : m + n_z]) if n_z else None,
         lambda t, z, y, _: answer(t, z, y)[:m],
-        name=name, inputs=signal_names(law.measures, law.inputs), outputs=law.inputs, states=law.memory_names or None,
+        name=name, inputs=signal_names(law.measures, law.inputs), outputs=law.inputs, states=law.state_names or None,
         dt=law.period,
     )  # fmt: skip
 

@@ -75,7 +75,7 @@ def closed_loop(args, model, plan, report):
         run = getattr(error, "run", None)
         return run if run is not None and len(run.t) else None, done
     report.say(run)
-    if "slack of" in run.law.info:
+    if run.law.allocation:
         report.say(sv.limit_report(run))
     return run, True
 
@@ -89,7 +89,8 @@ def _closed(args, model, plan):
     law = _law(args, plan, nominal)
     start, samples = float(plan.t[0]), math.floor((plan.t[-1] - plan.t[0]) * law.rate * (1 + 1e-12) + 1e-9)
     span = (start, start + samples / law.rate)
-    return sv.close(machine, law, plan.state(start), span, delay=args.delay or 0, noise=noise or None, seed=args.seed)
+    sensors, timing = sv.Sensors(noise=noise, seed=args.seed), sv.Timing(delay=args.delay or 0)
+    return sv.close(machine, law, plan.state(start), span, sensors=sensors, timing=timing)
 
 
 def _law(args, plan, nominal):
@@ -114,7 +115,7 @@ def facts(closed):
         "rate": closed.law.rate,
         "machine": dict(zip(names, closed.plant.parameters.tolist(), strict=False)),
         "delay": closed.loop.delay,
-        "noise": closed.conditions.noise,
+        "noise": closed.conditions.sensors.noise,
         "success": closed.success,
         "message": closed.message,
         "t_end": float(closed.t[-1]),

@@ -1,0 +1,129 @@
+"""Residuals of a program as functions of a plant's state, by name."""
+
+import casadi as ca
+import numpy as np
+
+from servoctl.codegen.function import compiled
+from servoctl.errors import SpecificationError, unknown
+
+
+class Residuals:
+    """Residuals of a program as functions of a plant's state, matched by name.
+
+    Parameters
+    ----------
+    model : Model
+        Of the plan.
+    plant : Plant
+        Its states and parameters are used: what the controller believes of the machine.
+    names : sequence of str, optional
+        Which residuals; default all whose order allows it.
+    order : int
+        The highest: 1 for functions of the state (q, γ'), 2 where accelerations follow it.
+
+    Attributes
+    ----------
+    names, orders : tuple
+        Of the residuals, and of their highest derivatives.
+    expressions, symbols : SX, list of SX
+        The residuals, and the parameters in them.
+    parameters : (n_p,) array
+        Numbers of these.
+    measures : tuple of str
+        The states in them.
+    """
+
+    def __init__(self, model, plant, names=None, order=1):
+        mechanism, program = model.reduction.mechanism, model.reduction.program
+        self._q = mechanism.q
+        orders = {name: self._q.order(e) for name, e in program.residuals.items()}
+        for name in names or ():
+            if name not in orders:
+                raise unknown(name, orders, "residual")
+            if orders[name] > order:
+                raise SpecificationError(
+                    f"The residual {name!r} has order {orders[name]}.",
+                    "A residual that is fed back is a function of the state (q, γ').",
+                    nearest=", ".join(repr(n) for n, order in orders.items() if order <= 1),
+                    do="Leave it out.",
+                    name=name,
+                )
+        self.names = tuple(name for name in orders if orders[name] <= order and (names is None or name in names))
+        self.orders = tuple(max(orders[name], 0) for name in self.names)
+        self.expressions = ca.vertcat(*(program.residuals[name] for name in self.names))
+        valid = plant.mechanism.parameters.names
+        self.symbols = [s for s in mechanism.parameters.symbols if _depends(self.expressions, s)]
+        for s in self.symbols:
+            if s.name() not in valid:
+                raise unknown(s.name(), valid, "parameter of the plant")
+        self.parameters = np.array([plant.parameters[valid.index(s.name())] for s in self.symbols])
+        self.measures = tuple(s.name() for s in self._states(self.expressions))
+        for name in self.measures:
+            if name not in plant.state_names:
+                raise unknown(name, plant.state_names, "state of the plant")
+        self._plant, self._order = plant, order
+        self._built = {}
+
+    def _states(self, expression):
+        return [s for s in (*self._q, *self._q.gamma(1)) if _depends(expression, s)]
+
+    def expression(self, t, y, measures, p):
+        """φ as an SX column of the symbols t, y (named by `measures`) and p."""
+        states = self._states(self.expressions)
+        old = [self._q.t, *states, *self.symbols]
+        new = [t, *(y[measures.index(s.name())] for s in states), *ca.vertsplit(p)]
+        return ca.substitute(self.expressions, ca.vertcat(*old), ca.vertcat(*new))
+
+    def _function(self, key, outputs):
+        if key not in self._built:
+            state = ca.vertcat(*self._q, *(s for k in range(self._order) for s in self._q.gamma(k + 1)))
+            p = ca.vertcat(*self.symbols) if self.symbols else ca.SX(0, 1)
+            y = ca.densify(ca.cse(ca.vertcat(*outputs(state))))
+            self._built[key] = compiled(ca.Function(key, [self._q.t, state, p], [y]), key)
+        return self._built[key]
+
+    def _ordered(self, x):
+        """States, and accelerations where they are given, in the plan's order, from an array in the plant's."""
+        names = (*self._q.names, *(name for k in range(self._order) for name in self._q.jet_names(k + 1)))
+        columns = (*self._plant.state_names, *self._plant.mechanism.q.jet_names(2))
+        rows = [columns.index(name) if name in columns else -1 for name in names]
+        return np.where(np.array(rows)[:, None] < 0, 0.0, x[rows])
+
+    def levels(self, t, x):
+        """Residuals and those of their derivatives that the state decides.
+
+        By name, (levels, N) arrays along states x (n_x, N) of the plant at t (N,); for residuals of order 2 with
+        accelerations behind the states. Two levels for a residual of order 0, one for the others.
+        """
+
+        def outputs(_state):
+            items = self.expressions.elements()
+            return [
+                level[0]
+                for e, order in zip(items, self.orders, strict=True)
+                for level in self._q.derivatives([e], max(1 - order, 0))
+            ]
+
+        values = self._function("residual_levels", outputs).grid(t, self._ordered(x), self.parameters)
+        counts = [max(2 - order, 1) for order in self.orders]
+        ends = np.cumsum([0, *counts])
+        return {n: values[a:b] for n, a, b in zip(self.names, ends[:-1], ends[1:], strict=True)}
+
+    def jacobian(self, t, x):
+        """∂φ/∂x along states of the plant, (N, k, n_x)."""
+        k = len(self.names)
+
+        def outputs(state):
+            return [ca.vec(ca.densify(ca.jacobian(self.expressions, state)))]
+
+        values = self._function("residual_jacobian", outputs).grid(t, self._ordered(x), self.parameters)
+        values = values.reshape(-1, k, len(t)).transpose(2, 1, 0)
+        jacobian = np.zeros((len(t), k, self._plant.n_x))
+        for i, name in enumerate((*self._q.names, *self._q.jet_names(1))):
+            if name in self._plant.state_names:
+                jacobian[:, :, self._plant.state_names.index(name)] = values[:, :, i]
+        return jacobian
+
+
+def _depends(expression, symbol):
+    return bool(ca.depends_on(expression, symbol))
