@@ -16,7 +16,7 @@ from native import COMPILER, build, function
 
 import servoctl as sv
 from servoctl.gallery import appell_hamel
-from servoctl.methods.series import series_loop
+from servoctl.methods.taylor import series_loop
 
 DURATION = 10.0  # s
 P = {"m": 1.0, "M": 5.0, "I_x": 0.1125, "I_y": 0.225, "a": 0.3, "b": 0.1, "rho": 0.2, "g": 9.81}

@@ -11,7 +11,7 @@ from native import COMPILER, build, casadi_text, function
 
 import servoctl as sv
 from servoctl.codegen.emit import emit, operations
-from servoctl.methods.series import taylor_coefficients
+from servoctl.methods.taylor import taylor_coefficients
 
 LAST = 48  # index of Taylor coefficients at which the function has 24,000 operations
 CALL, BUFFER = "casadi Function.__call__ of compiled code", "casadi FunctionBuffer of compiled code"
@@ -55,7 +55,7 @@ def call_once(arrays):
     f, x, p = model.function("ode"), start.values, model.parameters
     for _ in range(100):
         exact = f(0.0, x, p)  # by now it is compiled
-    plain = f._f
+    plain = f.expression
     if COMPILER:
         plain = ca.external(plain.name(), str(build(casadi_text(plain), "-O1")))
     buffer, trigger = plain.buffer()

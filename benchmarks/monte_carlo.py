@@ -90,7 +90,7 @@ def casadi_map():
     import casadi as ca
 
     plant, _, x0, u_ff, reference, K = loop(END)
-    ode = plant.function("ode")._f
+    ode = plant.function("ode").expression
     t, x, p = ode.sx_in()
     numbers = ca.SX(plant.p())
     own, largest, squares = ca.SX.sym("own", 3), ca.SX.sym("largest", 8), ca.SX.sym("squares", 8)

@@ -6,6 +6,8 @@ import subprocess
 import tempfile
 from pathlib import Path
 
+from servoctl.codegen.loops import SOURCES
+
 COMPILER = shutil.which("gcc")
 _directory = tempfile.TemporaryDirectory(prefix="servoctl-benchmarks-")
 
@@ -14,7 +16,8 @@ def build(text, *flags):
     """Path of the shared library of a C text, compiled afresh."""
     library = Path(tempfile.mkstemp(suffix=".so", dir=_directory.name)[1])
     subprocess.run(
-        [COMPILER, *flags, "-w", "-march=native", "-fPIC", "-shared", "-x", "c", "-", "-o", library, "-lm"],
+        [COMPILER, *flags, "-w", "-march=native", f"-I{SOURCES}", "-fPIC", "-shared", "-x", "c", "-", "-o", library,
+         "-lm"],
         input=text, text=True, check=True,
     )  # fmt: skip
     return library

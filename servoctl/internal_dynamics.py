@@ -1,4 +1,9 @@
-"""The internal dynamics that a program leaves: its eigenvalues along a motion, and what they allow."""
+"""The internal dynamics that a program leaves: its linearisation and eigenvalues along a motion.
+
+Deviations on the manifold of the constraints are N y, in a frame N that is orthonormal in the tangent space and moves
+along without turning in it (Nᵀ N' = 0): y' = Nᵀ J N y with J = ∂X'/∂X. Each state is measured by its size along the
+motion.
+"""
 
 from dataclasses import dataclass
 
@@ -6,7 +11,8 @@ import numpy as np
 
 from servoctl.run import require_model
 
-SAMPLES = 41  # instants along a run at which the internal dynamics is linearised
+INSTANTS = 41  # instants along a run at which the internal dynamics is linearised
+AT_ZERO = 1e-9  # size of a state relative to the largest: rounding of one that stays zero
 NEUTRAL = 1e-7  # of the largest entry of the linearisation: a smaller real part is none
 
 
@@ -19,7 +25,7 @@ class InternalDynamics:
     t : (N,) array
         [s]
     names : tuple of str
-        The states that were taken as its coordinates, Σ o_a of them.
+        States that may serve as its coordinates, Σ o_a of them.
     eigenvalues : (Σ o_a, N) complex array
         [1/s], by descending real part.
     verdict : {"none", "stable", "neutral", "unstable"}
@@ -45,11 +51,50 @@ class InternalDynamics:
         )
 
 
-def internal_dynamics(model, run):
-    """Linearise the internal dynamics along a run, in Σ o_a of the state's own entries.
+def linearised(model, run, count):
+    """Linearise the internal dynamics along a run.
 
-    With the state split by the invariants Ψ(t, X) = 0 into dependent and independent entries, ∂X/∂y spans the kernel of
-    ∂Ψ/∂X, and the internal dynamics y' = f_y(t, X(y, t)) has the Jacobian (∂f/∂X)_y ∂X/∂y.
+    Parameters
+    ----------
+    model : Model
+    run : Run
+        A motion of it.
+    count : int
+        Number of instants, spread over the samples; those where the motion has no finite Jacobian are left out.
+
+    Returns
+    -------
+    t : (N,) array
+        [s]
+    A : (N, f, f) array
+        Nᵀ J N [1/s], f = Σ o_a.
+    N : (N, n_x, f) array
+        Bases of the kernel of the invariants' Jacobian, SI.
+    """
+    n_x, size = len(model.state_names), np.abs(run.jets[: len(model.state_names)]).max(axis=1)
+    size[size <= AT_ZERO * size.max()] = 1.0
+    picked = np.unique(np.linspace(0, len(run.t) - 1, count).round().astype(int))
+    J, C = (np.concatenate(parts) for parts in zip(*_jacobians(model, run, picked, n_x), strict=True))
+    finite = np.isfinite(J).all(axis=(1, 2)) & np.isfinite(C).all(axis=(1, 2))
+    first = min(C.shape[1], n_x - model.free)
+    transposed = np.linalg.svd(C[finite] * size)[2][:, first : first + model.free]
+    N = transposed.swapaxes(1, 2)
+    return run.t[picked][finite], transposed @ (J[finite] * size / size[:, None]) @ N, size[:, None] * N
+
+
+def _jacobians(model, run, picked, n_x):
+    """∂X'/∂X (N, n_x, n_x) and the invariants' Jacobian (N, m, n_x) at samples, by variant of the model."""
+    for first, end, variant in run.variants or ((0, len(run.t), model),):
+        own = picked[(picked >= first) & (picked < end)]
+        if len(own):
+            t, x, p, m = run.t[own], run.jets[:n_x, own], variant.parameters, len(variant.invariant_names())
+            J = variant.function("ode_jacobian").grid(t, x, p).T.reshape(-1, n_x, n_x).swapaxes(1, 2)
+            C = variant.function("invariants").grid(t, x, p)[m:].T.reshape(-1, n_x, m).swapaxes(1, 2)
+            yield J, C
+
+
+def internal_dynamics(model, run):
+    """Find the eigenvalues of the internal dynamics along a run.
 
     Parameters
     ----------
@@ -69,40 +114,20 @@ def internal_dynamics(model, run):
     require_model(model, run, "internal_dynamics")
     if model.free == 0:
         return InternalDynamics(run.t[:0], (), np.zeros((0, 0), complex), "none", 1.0)
-    picked = np.unique(np.linspace(0, len(run.t) - 1, SAMPLES).astype(int))
-    times, states = run.t[picked], run.jets[: len(model.state_names), picked]
-    own = [run.variant(i) for i in picked]
-    tangents = [_tangent(*point) for point in zip(own, times, states.T, strict=True)]
-    entries = _independent(tangents)
-    reduced = [_reduced(*point, basis, entries) for *point, basis in zip(own, times, states.T, tangents, strict=True)]
-    found = [np.linalg.eigvals(matrix) for matrix in reduced]
-    eigenvalues = np.array([values[np.argsort(-values.real)] for values in found]).T
-    largest, rounding = eigenvalues.real.max(axis=0), NEUTRAL * np.abs(reduced).max()
+    times, matrices, bases = linearised(model, run, INSTANTS)
+    eigenvalues = np.linalg.eigvals(matrices).astype(complex)
+    order = np.argsort(-eigenvalues.real, axis=1, kind="stable")
+    eigenvalues = np.take_along_axis(eigenvalues, order, axis=1).T
+    largest, rounding = eigenvalues.real.max(axis=0), NEUTRAL * np.abs(matrices).max()
     verdict = "unstable" if largest.max() > rounding else "stable" if largest.max() < -rounding else "neutral"
     growth = float(np.exp(np.trapezoid(np.maximum(largest, 0.0), np.abs(times - times[0]))))
-    return InternalDynamics(times, tuple(model.state_names[i] for i in entries), eigenvalues, verdict, growth)
+    return InternalDynamics(times, _independent(model, bases), eigenvalues, verdict, growth)
 
 
-def _tangent(model, t, x):
-    """A basis of the states' changes that the invariants allow, (n_x, Σ o_a)."""
-    from scipy.linalg import null_space
-
-    n_x, count = len(x), len(model.invariant_names())
-    jacobian = model.function("invariants")(t, x, model.parameters)[count:].reshape(n_x, count).T
-    sizes = np.abs(jacobian).max(axis=1, keepdims=True, initial=0.0)
-    return null_space(jacobian / np.where(sizes > 0, sizes, 1.0))[:, : model.free] if count else np.eye(n_x)
-
-
-def _independent(tangents):
-    """Entries of the state that serve as coordinates of the motion's freedom at all instants."""
+def _independent(model, bases):
+    """Names of states that serve as coordinates of the motion's freedom at all instants."""
     from scipy.linalg import qr
 
-    _, _, pivots = qr(np.concatenate([basis.T for basis in tangents]), pivoting=True)
-    return np.sort(pivots[: tangents[0].shape[1]])
-
-
-def _reduced(model, t, x, basis, entries):
-    """The Jacobian of the internal dynamics in the chosen entries."""
-    n_x = len(x)
-    jacobian = model.function("ode_jacobian")(t, x, model.parameters).reshape(n_x, n_x).T
-    return (jacobian @ basis)[entries] @ np.linalg.inv(basis[entries])
+    tangents = np.linalg.qr(bases)[0]
+    _, _, pivots = qr(np.concatenate(tangents.swapaxes(1, 2)), pivoting=True)
+    return tuple(model.state_names[i] for i in np.sort(pivots[: model.free]))

@@ -6,10 +6,8 @@ import numpy as np
 
 from servoctl.checks import as_span
 from servoctl.errors import InconsistentStart, SpecificationError
-from servoctl.methods import adaptive
 from servoctl.methods.accuracy import accurate
 from servoctl.methods.algebraic import algebraic
-from servoctl.methods.bounds import row_poles, warn_many_steps
 from servoctl.methods.choice import (
     EXPLICIT,
     Adaptive,
@@ -23,10 +21,12 @@ from servoctl.methods.choice import (
     require_combination,
 )
 from servoctl.methods.drift import Poles, Project, as_drift
-from servoctl.methods.radau import RadauMethod
-from servoctl.methods.runge_kutta import fixed_step
-from servoctl.methods.sundials import SundialsMethod
-from servoctl.methods.taylor import SeriesMethod
+from servoctl.methods.radau import RadauSteps
+from servoctl.methods.runge_kutta import RungeKuttaSteps
+from servoctl.methods.scipy_methods import ScipySteps
+from servoctl.methods.stability import row_poles, run_checked, warn_many_steps
+from servoctl.methods.sundials import SundialsSteps
+from servoctl.methods.taylor import TaylorSteps
 from servoctl.progress import Progress
 from servoctl.run import Run
 
@@ -123,16 +123,18 @@ def _motion(model, method, drift, span, x0, times, knots, bar):
         case Algebraic():
             return algebraic(model, t0, x0, times, bar)
         case Taylor(order, jets, rtol, atol):
-            return SeriesMethod(model, drift, rtol, atol, order, jets or 0, bar).run(*arguments)
+            return TaylorSteps(model, drift, rtol, atol, order, jets or 0, bar).run(*arguments)
         case RadauIIA(order, step, rtol, atol):
             step = None if step is None else _step_length(step, t0, t1)
-            return RadauMethod(model, drift, rtol, atol, order, step, bar).run(*arguments)
+            stepping = RadauSteps(model, drift, rtol, atol, order, step, bar)
+            return run_checked(stepping, *arguments) if step else stepping.run(*arguments)
         case RungeKutta(_, step):
-            return fixed_step(model, str(method), drift, span, x0, _step_length(step, t0, t1), knots, bar)
+            stepping = RungeKuttaSteps(model, str(method), drift, _step_length(step, t0, t1), bar)
+            return run_checked(stepping, *arguments)
         case Sundials(name, rtol, atol):
-            return SundialsMethod(model, name, drift, rtol, atol, t1 - t0, bar).run(*arguments)
+            return SundialsSteps(model, name, drift, rtol, atol, t1 - t0, bar).run(*arguments)
         case Adaptive(name, rtol, atol):
-            return adaptive.Adaptive(model, name, drift, rtol, atol, bar).run(*arguments)
+            return ScipySteps(model, name, drift, rtol, atol, bar).run(*arguments)
 
 
 def _run(model, motion, method, drift, knots, span):

@@ -224,12 +224,13 @@ def test_sine_and_cosine_of_the_lanes_are_within_two_units(n):
     a = np.resize(a, -(-len(a) // 8) * 8)
     x = ca.SX.sym("x", 1)
     f = ca.Function("f", [ca.SX.sym("t"), x, ca.SX(0, 1)], [ca.vertcat(ca.sin(x), ca.cos(x))])
-    text = emit.portable(f, "circular") + (
+    unit = f"#define W_LANES {n}\n{emit.unit({'NAME': 'sines'})}{emit.include('lanes.h')}"
+    text = unit + emit.function(f, "circular", emit.LANES) + (
         "void all(int64_t n, const double *a, double *y)\n{\n    for (int64_t k = 0; k < n; k += W_LANES) {\n"
-        "        V v[2], w = *(const U *)(a + k);\n        circular(w, &w, &w, v);\n"
+        "        W v[2], w = *(const U *)(a + k);\n        circular(w, &w, &w, v);\n"
         "        *(U *)(y + k) = v[0];\n        *(U *)(y + n + k) = v[1];\n    }\n}\n"
     )
-    library = compiler.library(emit.prelude(text) + emit.several(text, n), level="-O3")
+    library = compiler.library(text, level="-O3")
     y = np.empty((2, len(a)))
     library.all(ctypes.c_int64(len(a)), *(ctypes.c_void_p(array.ctypes.data) for array in (a, y)))
     with mpmath.workdps(60):

@@ -10,10 +10,10 @@ import pytest
 
 import servoctl as sv
 from servoctl.gallery import mass_on_car
-from servoctl.methods import bounds
+from servoctl.methods import stability as bounds
 from servoctl.methods.accuracy import motion_error
 from servoctl.methods.choice import as_method
-from servoctl.methods.tableaus import ORDERS
+from servoctl.methods.runge_kutta import ORDERS
 
 
 @pytest.mark.parametrize(

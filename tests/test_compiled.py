@@ -13,7 +13,7 @@ import pytest
 from servoctl.codegen import compiler, emit
 from servoctl.codegen.function import compiled, compiling_at_once
 from servoctl.errors import NameUnknown, SpecificationError
-from servoctl.methods.tableaus import tableau
+from servoctl.methods.runge_kutta import tableau
 
 T, X2, P1 = ca.SX.sym("t"), ca.SX.sym("x", 2), ca.SX.sym("p", 1)
 RK4 = tableau("RK4")
@@ -101,7 +101,7 @@ def test_chunks_equal_one_function_and_casadi_to_the_last_bit(monkeypatch):
     results = []
     for chunk in (100, emit.CHUNK, 10**9):
         text = emit.emit(f, "f", chunk=chunk)
-        assert ("V w[" in text) == (chunk < 10**9)
+        assert ("double w[" in text) == (chunk < 10**9)
         compiler.library(text)["f_point"](ctypes.c_void_p(row.ctypes.data))
         results.append(row[4:].copy())
     expected = np.asarray(f(0.3, [0.5, -0.7], 1.1)).ravel()
@@ -111,7 +111,7 @@ def test_chunks_equal_one_function_and_casadi_to_the_last_bit(monkeypatch):
 
 def test_the_work_vector_uses_its_places_again():
     text = emit.emit(random_function(2000), "f", chunk=100)
-    places = int(text.split("V w[")[1].split("]")[0])
+    places = int(text.split("double w[")[1].split("]")[0])
     assert places < text.count("    w[") / 2
 
 

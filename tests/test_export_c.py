@@ -16,7 +16,7 @@ from servoctl.codegen.compiler import compiler
 from servoctl.codegen.function import compiled
 from servoctl.errors import ServoError, SpecificationError
 from servoctl.export.c import export_c
-from servoctl.export.files import Array, Constant, Routine, identifier, write
+from servoctl.export.files import Array, Constant, Contents, Routine, Scalar, identifier, write
 from servoctl.gallery import gallery
 
 STRICT = ("-std=c99", "-O1", "-Wall", "-Wextra", "-pedantic", "-Werror")
@@ -208,8 +208,8 @@ def test_names_that_are_no_identifiers_stay_apart_and_end_no_comment(tmp_path):
     f = ca.Function("f", [t, x, p], [ca.densify(ca.erfinv(x / 8) + ca.sign(x))])
     names = ("a b", "a_b", "θ */ int x; /*", "@")
     array, no = Array("x", "Any", names), Array("p", "None", ())
-    call = ("double t", array.given(), no.given(), array.changed("y"))
-    files = write(tmp_path, "any", [array, no], [Constant("half", 0.5, "A half")], [Routine("f", f, "Any.", call)])
+    routine = Routine("f", "Any.", (Scalar("t"), array.input(), no.input(), array.output("y")))
+    files = write(tmp_path, "any", Contents([array, no], [Constant("half", 0.5, "A half")], {"f": f}, [routine]))
     ours = Exported(files, "any")
     values, y = np.array([-3.0, 0.5, 3.0, 0.0]), np.empty(4)
     ours("f", 0.0, values, np.empty(0), y)
@@ -243,7 +243,7 @@ def test_a_start_is_one_of_the_model(gallery_model, tmp_path):
 
 def test_a_start_for_a_law_is_refused(gallery_model, tmp_path):
     start = gallery_model("two-cars").start()
-    with pytest.raises(SpecificationError, match="its own memory"):
+    with pytest.raises(SpecificationError, match="its controller state"):
         export_c(law(), tmp_path, start=start)
 
 

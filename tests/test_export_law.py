@@ -128,7 +128,7 @@ def test_the_table_is_a_constant_and_indices_have_names(plan, tmp_path):
         assert re.search(rf"LOOP_Y_{name} = {law.measures.index(name)}\b", header)
     assert "LOOP_Z_integral_of_X" in header and "LOOP_U_hoist" in header
     size = int(re.search(r"static const double \w*table\[(\d+)\]", source)[1])
-    assert set(re.findall(r"#include (\S+)", source)) == {'"loop.h"', "<math.h>", "<stdint.h>"}
+    assert set(re.findall(r"#include (\S+)", source)) == {'"loop.h"', "<math.h>"}
     assert size == law.schedule.size and "malloc" not in source
 
 

@@ -1,4 +1,4 @@
-"""Radau IIA: the tableau, orders, stiff scenes, exact Jacobians, projection, reversed time, stops, the loop in Python."""
+"""Radau IIA: the tableau, orders, stiff scenes, exact Jacobians, projection, reversed time, stops, compilers."""
 
 import casadi as ca
 import closed_forms as cf
@@ -8,10 +8,10 @@ from scipy.integrate import Radau, solve_ivp
 from scipy.integrate._ivp import radau as scipy_radau
 
 import servoctl as sv
+from servoctl.codegen import compiler
 from servoctl.gallery import gallery
 from servoctl.methods.choice import as_method
-from servoctl.methods.radau_loop import first_step, radau_steps
-from servoctl.methods.radau_tableau import basis, radau
+from servoctl.methods.radau import basis, radau
 
 STATE = ("x", "y", "z", "phi", "theta", "dphi", "dtheta")
 ZERO = {"x": 0.0, "y": 0.0, "phi": 0.0, "theta": 0.0}
@@ -207,23 +207,14 @@ def test_options():
         assert caught.value.details == options
 
 
-# the loop in Python --------------------------------------------------------------------------------------------------
+# without a compiler --------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("project_every", [0, 2])
-@pytest.mark.parametrize("fixed", [False, True])
-@pytest.mark.parametrize("order", ORDERS)
-def test_python_takes_the_steps_of_c(order, fixed, project_every, model, start, monkeypatch):
-    solver, p = radau_steps(model), model.parameters
-    if solver.f.native("radau") is None:
-        pytest.skip("no compiler")
-    h = 0.05 if fixed else first_step(solver.f, 0.0, start.values, p, order, 2.0, 1e-6, 1e-8)
-    arguments = (0.0, start.values, 2.0, p, order, h, 1e-6, 1e-8, 200, fixed, project_every)
-    by_c = solver.steps(*arguments)
-    settled = solver.settle(by_c[0], by_c[1] + 1e-4, p)
-    monkeypatch.setattr(solver.f, "native", lambda suffix: None)
-    by_python = solver.steps(*arguments)
-    for ours, theirs in zip(by_python, by_c, strict=True):
-        np.testing.assert_allclose(ours, theirs, rtol=1e-11, atol=1e-11)
-    assert by_python[5].tolist() == by_c[5].tolist()
-    np.testing.assert_allclose(solver.settle(by_c[0], by_c[1] + 1e-4, p), settled, rtol=0, atol=1e-12)
+def test_without_a_compiler_scipys_method_is_named(start, monkeypatch):
+    monkeypatch.setenv("SERVOCTL_COMPILER", "none")
+    monkeypatch.setattr(compiler, "_warned", True)
+    model = sv.derive(*gallery["appell-hamel"].build())
+    for step in (None, 0.01):
+        with pytest.raises(sv.SpecificationError, match="'Radau'"):
+            sv.simulate(model, start, (0.0, 0.1), method=sv.RadauIIA(step=step))
+    assert sv.simulate(model, start, (0.0, 0.1), method="Radau").success

@@ -361,7 +361,7 @@ def test_laws_without_expressions_are_refused_where_these_are_needed(plan):
             return lambda t, y: [0.0, -1128.0]
 
     run = sv.close(sv.plant(CRANE), Own(), SUDDEN, (0.0, 0.1), timing=sv.Timing(rate=100.0))
-    with pytest.raises(SpecificationError, match="keeps its memory to itself"):
+    with pytest.raises(SpecificationError, match="keeps its state to itself"):
         interop.nlsys(run)
 
 

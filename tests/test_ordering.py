@@ -7,9 +7,8 @@ import servoctl as sv
 from servoctl.gallery import gallery
 from servoctl.methods.accuracy import motion_error
 from servoctl.methods.choice import as_method
-from servoctl.methods.series import series_loop
-from servoctl.methods.tableaus import ORDERS
-from servoctl.methods.taylor import order_for
+from servoctl.methods.runge_kutta import ORDERS
+from servoctl.methods.taylor import order_for, series_loop
 
 ERROR = 1e-9
 INTERVALS = 32  # between samples: each is a whole number of fixed steps

@@ -9,10 +9,10 @@ import pytest
 
 import servoctl as sv
 from servoctl.gallery import gallery, mass_on_car
-from servoctl.methods.bounds import largest_explicit
 from servoctl.methods.choice import as_method
-from servoctl.methods.tableaus import ORDERS
-from servoctl.study.stability_map import TABULATED, stability
+from servoctl.methods.runge_kutta import ORDERS
+from servoctl.methods.stability import largest_explicit
+from servoctl.study.stability_map import MAPPED, stability
 
 DOC = Path(__file__).parents[1] / "docs" / "servo_dae.md"
 
@@ -81,7 +81,7 @@ def test_a_flat_program_has_steps_to_fear_only_where_poles_are_given(gallery_mod
     model, scene = gallery_model("two-cars"), gallery["two-cars"]
     found = stability(model, sv.simulate(model, model.start(), scene.t_span))
     assert found.rates.shape[1] == 0
-    for method in TABULATED:
+    for method in MAPPED:
         assert found.largest_step(method) == found.largest_step(method, "project") == np.inf
     for method in ORDERS:
         assert found.largest_step(method, 0.001) == pytest.approx(0.001 * largest_explicit(method), rel=0.01)

@@ -12,7 +12,7 @@ import pytest
 import servoctl as sv
 from servoctl.gallery import gallery
 from servoctl.methods.choice import as_method
-from servoctl.methods.sundials_solver import sundials_solver
+from servoctl.methods.sundials import sundials_solver
 
 STATE = ("x", "y", "z", "phi", "theta", "dphi", "dtheta")
 ZERO = {"x": 0.0, "y": 0.0, "phi": 0.0, "theta": 0.0}

@@ -1,12 +1,12 @@
 """C text becomes a loaded library: compiled by the system's compiler, kept on disk by content.
 
 A library is kept under the user's cache directory (``SERVOCTL_CACHE``, else ``XDG_CACHE_HOME``, else the platform's
-place) under the hash of the C text, the flags, the compiler and the processor. The compiler is ``SERVOCTL_COMPILER``,
-else ``CC``, else the first of cc, gcc and clang; ``SERVOCTL_COMPILER=none`` compiles nothing. Without a compiler, or
-where it fails, one warning per process says so and the caller goes on without.
+place) under the hash of the C text, the files that it may include, the flags, the compiler and the processor. The
+compiler is ``SERVOCTL_COMPILER``, else ``CC``, else the first of cc, gcc and clang; ``SERVOCTL_COMPILER=none`` compiles
+nothing. Without a compiler, or where it fails, one warning per process says so and the caller goes on without.
 
 The flags keep the values of IEEE arithmetic with one exception: a product and a sum may be contracted to one fused
-operation, which rounds once instead of twice. (Which C text is compiled is told in `emit`.)
+operation, which rounds once instead of twice. (`emit` writes the C text.)
 """
 
 import atexit
@@ -24,6 +24,7 @@ import warnings
 from pathlib import Path
 
 from servoctl.codegen.cache import cache_directory, keeping, kept
+from servoctl.codegen.loops import SOURCES, digest
 
 FLAGS = ("-fPIC", "-shared", "-w", "-fno-math-errno")
 
@@ -54,11 +55,10 @@ def library(text, build=True, level="-O1"):
     ctypes.CDLL or None
         None if there is none and it was not to be built, or could not be (which warns, once per process).
     """
-    found = _compiler(*(os.environ.get(name) for name in ("SERVOCTL_COMPILER", "CC", "PATH")))
-    if found is None:
+    command, identity = _compiler()
+    if command is None:
         return _without("No C compiler was found, or SERVOCTL_COMPILER is none") if build else None
-    command, identity = found
-    parts = (text, level, *FLAGS, *_optional_flags(), identity, platform.machine(), _processor())
+    parts = (text, digest(), level, *FLAGS, *_optional_flags(), identity, platform.machine(), _processor())
     key = hashlib.sha256("\0".join(parts).encode()).hexdigest()
     with _guard:
         lock = _locks.setdefault(key, threading.Lock())
@@ -73,22 +73,27 @@ def library(text, build=True, level="-O1"):
 
 def compiler():
     """Command of the C compiler that is used, None where there is none."""
-    found = _compiler(*(os.environ.get(name) for name in ("SERVOCTL_COMPILER", "CC", "PATH")))
-    return " ".join(found[0]) if found else None
+    command, _ = _compiler()
+    return None if command is None else " ".join(command)
+
+
+def _compiler():
+    """Command of the compiler and what identifies it; None and None where there is none."""
+    return _identified(*(os.environ.get(name) for name in ("SERVOCTL_COMPILER", "CC", "PATH")))
 
 
 @functools.cache
-def _compiler(chosen, cc, path):
-    """Command of the compiler and what identifies it: its file's place, time and size (its version takes longer)."""
+def _identified(chosen, cc, path):
+    """The compiler with its file's place, time and size (its version takes longer)."""
     if chosen == "none":
-        return None
+        return None, None
     for candidate in (chosen, cc, "cc", "gcc", "clang"):
         command = shlex.split(candidate or "")
         if command and (program := shutil.which(command[0], path=path)):
-            files = [os.path.realpath(found) for word in command if (found := shutil.which(word, path=path))]
+            files = [os.path.realpath(file) for word in command if (file := shutil.which(word, path=path))]
             stats = [(file, os.stat(file).st_mtime_ns, os.stat(file).st_size) for file in files]
             return (os.path.abspath(program), *command[1:]), repr((command, stats))
-    return None
+    return None, None
 
 
 @functools.cache
@@ -135,7 +140,7 @@ def _compile(text, level, target, command):
     with keeping(target) as temporary:
         for flags in ((*FLAGS, *_optional_flags()), FLAGS):
             done = subprocess.run(
-                [*command, level, *flags, "-x", "c", "-", "-o", temporary, "-lm"],
+                [*command, level, *flags, f"-I{SOURCES}", "-x", "c", "-", "-o", temporary, "-lm"],
                 input=text,
                 text=True,
                 capture_output=True,

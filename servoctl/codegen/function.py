@@ -36,7 +36,7 @@ def compiling_at_once():
         _AT_ONCE.reset(token)
 
 
-def compiled(f, name, loops=(), project=None, others=None, drivers="", sizes=None):
+def compiled(f, name, loops=(), project=None, others=None, sizes=None):
     """Make a compiled function of an SX function.
 
     Parameters
@@ -45,16 +45,14 @@ def compiled(f, name, loops=(), project=None, others=None, drivers="", sizes=Non
         SX function of t (scalar), x (n_x), p (n_p), all dense, with one dense column output y (n_y).
     name : str
         A C identifier.
-    loops : sequence of {"rk", "newton", "taylor"}
-        The loops that will be called.
+    loops : sequence of {"rk", "newton", "taylor", "radau", "closed", "law"}
+        The loops that will be called: the first three by methods of the result, the others by `Compiled.native`.
     project : casadi.Function, optional
         Change of x that restores invariants, of the same inputs (t, x, p); loops may call it after their steps.
     others : dict of str to casadi.Function, optional
         Further functions of the same form in the same library, found by `Compiled.native`.
-    drivers : str
-        C text of further loops, with the placeholders of `loops`.
     sizes : dict of str to int, optional
-        Constants that loops and drivers take; "taylor" takes the numbers of coordinates "nq" and quasi-velocities "n",
+        Constants that loops take; "taylor" takes the numbers of coordinates "nq" and quasi-velocities "n",
         the order s̄ as "top", the highest index of coefficients "last", and whether q' = γ' as "plain".
 
     Returns
@@ -94,7 +92,7 @@ def compiled(f, name, loops=(), project=None, others=None, drivers="", sizes=Non
     for loop in loops:
         if loop not in LOOPS:
             raise unknown(loop, LOOPS, "loop")
-        needed = _OUTPUTS_PER_STATE[loop] * f.numel_in(1)
+        needed = _OUTPUTS_PER_STATE.get(loop, 0) * f.numel_in(1)
         if f.numel_out(0) < needed:
             raise SpecificationError(
                 f"{name!r} has {f.numel_out(0)} outputs for {f.numel_in(1)} states",
@@ -103,7 +101,7 @@ def compiled(f, name, loops=(), project=None, others=None, drivers="", sizes=Non
                 name=name,
                 loop=loop,
             )
-    return Compiled(f, name, tuple(loops), project, others, drivers, sizes)
+    return Compiled(f, name, tuple(loops), project, others, sizes)
 
 
 class Compiled:
@@ -120,19 +118,21 @@ class Compiled:
         Numbers of states, parameters and outputs.
     loops : tuple of str
         The loops it can run.
+    expression : casadi.Function
+        The SX function (t, x, p) -> y.
     """
 
-    def __init__(self, f, name, loops, project=None, others=None, drivers="", sizes=None):
+    def __init__(self, f, name, loops, project=None, others=None, sizes=None):
         self.name, self.loops, self._project = name, loops, project
-        self._others, self._drivers, self._sizes = others or {}, drivers, sizes or {}
+        self._others, self._sizes = others or {}, sizes or {}
         self.n_x, self.n_p, self.n_y = f.numel_in(1), f.numel_in(2), f.numel_out(0)
-        self._f, self._symbol = f, f"servoctl_{name}"
+        self.expression, self._symbol = f, f"servoctl_{name}"
         self._x_shape, self._p_shape = (self.n_x,), (self.n_p,)
         self._evaluator = Interpreter(f, project, self._sizes)
         self._settled, self._looked, self._text, self._calls, self._points = False, False, None, 0, 0
 
     def __reduce__(self):
-        parts = (self._f, self.name, self.loops, self._project, self._others, self._drivers, self._sizes)
+        parts = (self.expression, self.name, self.loops, self._project, self._others, self._sizes)
         return Compiled, parts, {"_text": self._text}
 
     def __repr__(self):
@@ -142,7 +142,7 @@ class Compiled:
     @functools.cached_property
     def operations(self):
         """Number of arithmetic operations of one evaluation."""
-        return emit.operations(self._f)
+        return emit.operations(self.expression)
 
     @property
     def backend(self):
@@ -260,7 +260,7 @@ class Compiled:
         Raises
         ------
         SpecificationError
-            If the loop was not asked for, a shape is another, or a count is out of range.
+            If it was made without the loop, a shape is another, or a count is out of range.
         """
         self._settle_loop("rk")
         x0, p = self._array("x0", x0, self._x_shape), self._array("p", p, self._p_shape)
@@ -311,7 +311,7 @@ class Compiled:
         Raises
         ------
         SpecificationError
-            If the loop was not asked for or a shape is another.
+            If it was made without the loop, or a shape is another.
         """
         self._points += SOLVED * np.size(t)
         self._settle_loop("newton", self._points > GRID_POINTS or _AT_ONCE.get())
@@ -353,7 +353,7 @@ class Compiled:
         Raises
         ------
         SpecificationError
-            If the loop was not asked for or a shape is another.
+            If it was made without the loop, or a shape is another.
         """
         self._settle_loop("taylor")
         self._place(t0, x0, p)
@@ -379,7 +379,7 @@ class Compiled:
         Parameters
         ----------
         suffix : str
-            "point", "grid", a key of `others`, or a function that `drivers` defines.
+            "point", "grid", a key of `others`, or a function that a loop's file defines.
         """
         self._settle(build=True)
         return self._evaluator.native(suffix)
@@ -387,7 +387,7 @@ class Compiled:
     def _settle_loop(self, loop, build=True):
         if loop not in self.loops:
             raise SpecificationError(
-                f"{self.name!r} was asked for its loop {loop}",
+                f"{self.name!r} has no loop {loop}",
                 f"It was made with the loops {', '.join(self.loops) or '(none)'}",
                 do=f"Make it with loops=({loop!r},)",
                 name=self.name,
@@ -399,7 +399,7 @@ class Compiled:
         """Move from CasADi to the library: at the first call if one is at hand, later if it is to be built."""
         if self._settled or (self._looked and not build):
             return
-        level = "-O3" if self._drivers or {"newton", "taylor"} & {*self.loops} else "-O1"
+        level = "-O1" if {*self.loops} <= {"rk"} else "-O3"
         library = compiler.library(self.source(), build, level)
         if library is not None:
             self._evaluator = Library(library, self._symbol, self.n_x, self.n_p, self.n_y)
@@ -409,15 +409,15 @@ class Compiled:
     def source(self):
         """C text of the library; kept, and pickled, until the library is loaded."""
         if self._text is None:
-            parts = {"project": self._project, "others": self._others, "drivers": self._drivers, "sizes": self._sizes}
-            self._text = emit.emit(self._f, self._symbol, self.loops, **parts, wide="newton" in self.loops)
+            parts = {"project": self._project, "others": self._others, "sizes": self._sizes}
+            self._text = emit.emit(self.expression, self._symbol, self.loops, **parts, wide="newton" in self.loops)
         return self._text
 
     @functools.cached_property
     def _lanes(self):
-        """What evaluates long grids: a library of its own, as twice the code takes twice the time to compile."""
+        """What evaluates long grids: a separate library, as twice the code takes twice the time to compile."""
         if "newton" not in self.loops:
-            library = compiler.library(emit.emit(self._f, self._symbol), level="-O1")
+            library = compiler.library(emit.emit(self.expression, self._symbol), level="-O1")
             if library is not None:
                 return Library(library, self._symbol, self.n_x, self.n_p, self.n_y)
         self._settle(build=True)

@@ -4,9 +4,7 @@ import threading
 
 import numpy as np
 
-from servoctl.codegen.loops import BISECTIONS, NEAR, QUADRATIC, ROUNDING
-
-BLOCK, STRIDE = 128, 16  # instants that are corrected together, and those from one solved alone to the next
+from servoctl.codegen.loops import BISECTIONS, ROUNDING
 
 _guard = threading.Lock()
 
@@ -124,23 +122,13 @@ class Interpreter:
 
     def newton(self, t, x0, p, tol, max_iter, x, y):
         """Fill the columns of x and y as `Compiled.newton` says; return the points solved and the evaluations made."""
-        solve = _Newton(self._value, p, self._n_x, tol, max_iter)
-        together = _Together(self._f, p, self._n_x, tol) if t.size > BLOCK else None
-        point, k, alone = None, 0, 1
-        while k < t.size:
-            if alone <= k <= t.size - BLOCK:
-                found = together(solve, t[k - 1 : k + BLOCK], point)
-                if found:
-                    x[:, k : k + BLOCK], y[:, k : k + BLOCK], point = found
-                    k += BLOCK
-                    continue
-                alone = k + BLOCK
+        solve, point = _Newton(self._value, p, self._n_x, tol, max_iter), None
+        for k in range(t.size):
             point = solve.correct(t[k], x0) if k == 0 else solve.advance(t[k - 1], t[k], *point)
             if point is None:
-                break
+                return k, solve.count
             x[:, k], y[:, k] = point
-            k += 1
-        return k, solve.count + (together.count if together else 0)
+        return t.size, solve.count
 
 
 def restored(project, t, x, p):
@@ -179,52 +167,6 @@ def step_length(x, c, shape, rtol, atol):
             if term > 0:
                 h = min(h, rtol ** (1.0 / (last - j)) * (scale / rtol / term) ** (1.0 / (k - j)))
     return h
-
-
-class _Together:
-    """Newton's iteration at a block of instants at once: a few are solved alone, the others start between these."""
-
-    def __init__(self, f, p, n_x, tol):
-        self._n_x, self._tol, self.count = n_x, tol, 0
-        self._parts = parts = self._t, self._x, _, self._y = (
-            np.zeros(BLOCK), np.zeros((BLOCK, n_x)), np.tile(p, (BLOCK, 1)), np.zeros((BLOCK, f.numel_out(0))),
-        )  # fmt: skip
-        self._run, self._kept = connected(f.map(BLOCK), parts)
-
-    @np.errstate(all="ignore")
-    def __call__(self, solve, t, point):
-        """Solutions at t[1:] from the one at t[0]: columns of x and y, and the last point; None if one is not found."""
-        points = [point]
-        for k in range(0, BLOCK, STRIDE):
-            point = solve.advance(t[k], t[k + STRIDE], *point)
-            if point is None:
-                return None
-            points.append(point)
-        self._t[:] = t[1:]
-        self._start(t, points)
-        defect = NEAR
-        while not defect <= QUADRATIC:
-            before, defect = defect, self._defect()
-            if not defect < before:
-                return None
-            self._x += self._y[:, : self._n_x]
-        return (self._x.T, self._y.T, (self._x[-1].copy(), self._y[-1].copy())) if self._defect() <= self._tol else None
-
-    def _start(self, t, points):
-        """Hermite's interpolation between the points solved alone."""
-        nodes, n_x = t[::STRIDE, None, None], self._n_x
-        x, rate = (np.array(v)[:, None] for v in zip(*((x, y[n_x : 2 * n_x]) for x, y in points), strict=True))
-        h = np.diff(nodes, axis=0)
-        s = (self._t.reshape(-1, STRIDE, 1) - nodes[:-1]) / h
-        r = 1 - s
-        start = r * r * ((1 + 2 * s) * x[:-1] + s * h * rate[:-1]) + s * s * ((1 + 2 * r) * x[1:] - r * h * rate[1:])
-        self._x[:] = start.reshape(BLOCK, n_x)
-
-    def _defect(self):
-        """The largest correction relative to 1 + |x|, after an evaluation."""
-        self._run()
-        self.count += BLOCK
-        return np.max(np.abs(self._y[:, : self._n_x]) / (1 + np.abs(self._x)))
 
 
 class _Newton:

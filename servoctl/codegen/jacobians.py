@@ -33,7 +33,7 @@ def jacobian(function, by, t, x, p):
 
 @functools.lru_cache(maxsize=64)
 def _jacobian(function, by):
-    f = function._f
+    f = function.expression
     t, x, p = (ca.SX.sym(name, f.numel_in(i)) for i, name in enumerate("txp"))
     y = f(t, x, p)
     return ca.Function("jacobian", [t, x, p], [ca.densify(ca.jacobian(y, x if by == "x" else p))])

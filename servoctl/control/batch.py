@@ -2,21 +2,22 @@
 
 import ctypes
 import os
-import re
+import weakref
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import casadi as ca
 import numpy as np
 
 from servoctl.codegen import compiler, emit
 from servoctl.codegen.function import Compiled, compiled, compiling_at_once
-from servoctl.codegen.loops import ROUNDING
-from servoctl.codegen.loops.batch import BATCH
 from servoctl.codegen.native import pointer
+from servoctl.control.loop import Arguments
 
 INLINED = 300  # operations: up to here the plant's rates are written into each stage of a step, for two vectors in turn
 PER_THREAD = 16  # tasks: so that threads end at about the same time
+
+_UNITS = weakref.WeakKeyDictionary()  # step of a law -> its units
 
 
 def lanes():
@@ -32,7 +33,7 @@ class Unit:
     Attributes
     ----------
     text : str
-        In terms of V and K.
+        Of any number of lanes.
     table : Compiled
         (t_k, nothing, row_k of the law) -> what all cases have in common at a sample.
     states, inputs : tuple of str
@@ -49,7 +50,6 @@ class Unit:
     inputs: tuple
     residuals: object
     n_y: int
-    _libraries: dict = field(default_factory=dict, repr=False)
 
     @property
     def names(self):
@@ -60,10 +60,8 @@ class Unit:
 
     def library(self, n):
         """The C function of n lanes; None without a compiler."""
-        if n not in self._libraries:
-            text = emit.prelude(self.text) + emit.several(self.text, n)
-            self._libraries[n] = compiler.library(text, level="-O3")
-        return self._libraries[n] and self._libraries[n].batch
+        library = compiler.library(f"#define W_LANES {n}\n{self.text}", level="-O3")
+        return library and library.batch
 
 
 def unit(plant, law, disturbed, residuals=None):
@@ -83,104 +81,79 @@ def unit(plant, law, disturbed, residuals=None):
     -------
     Unit
     """
-    kept = vars(law.step).setdefault("_batches", {})
+    units = _UNITS.setdefault(law.step, {})
     phi = tuple(e.element_hash() for e in residuals.expressions.elements()) if residuals else ()
     key = (plant.equations, law.measures, disturbed, phi)
-    if key not in kept:
-        kept[key] = _derived(plant, law, disturbed, residuals)
-    return kept[key]
+    if key not in units:
+        units[key] = _derived(plant, law, disturbed, residuals)
+    return units[key]
 
 
 def _derived(plant, law, disturbed, residuals):
-    e, n_c, n_u = plant.equations, len(plant.parameters), len(plant.inputs)
-    t, x, p = plant.function("ode")._f.sx_in()
-    constants, forces = p[:n_c], p[n_c + n_u :]
-    rates = plant.function("ode")._f(t, x, p)
-    calm = [i for i in range(forces.numel()) if i not in disturbed]
-    rates = ca.substitute(rates, forces[calm], ca.SX.zeros(len(calm)))
+    """Rates, law and residuals in C, each without what depends on the case's parameters, or on the sample, alone."""
+    n_c, n_u, project = len(plant.parameters), len(plant.inputs), plant.equations.project()
+    t, x, p, rates = _rates(plant, disturbed)
+    constants, applied = p[:n_c], ca.vertcat(p[n_c : n_c + n_u], p[n_c + n_u :][list(disturbed)])
     rates, w, w_values = _apart(rates, constants)
-    step = law.step._f
-    t_k, y, row = step.sx_in()
-    command, common, common_values = _apart(step(t_k, y, row), ca.vertcat(t_k, row))
+    t_k, y, row = law.step.expression.sx_in()
+    command, common, common_values = _apart(law.step.expression(t_k, y, row), ca.vertcat(t_k, row))
     phi = ca.SX(0, 1)
     if residuals:
-        own = [plant.mechanism.parameters.names.index(s.name()) for s in residuals.symbols]
-        phi = residuals.expression(t_k, x, plant.state_names, constants[own])
+        places = [plant.mechanism.parameters.names.index(s.name()) for s in residuals.symbols]
+        phi = residuals.expression(t_k, x, plant.state_names, constants[places])
     phi, s, s_values = _apart(phi, t_k)
     phi, v, v_values = _apart(phi, constants)
     sizes = {
         "NX": x.numel(), "NU": n_u, "NP": p.numel(), "NC": n_c, "NW": w.numel(), "NV": v.numel(),
-        "ND": len(disturbed), "NY": len(law.measures), "NZ": len(law.state), "NO": law.n_out, "NL": common.numel(),
+        "ND": len(disturbed), "NM": len(law.measures), "NZ": len(law.state), "NO": law.n_out, "NL": common.numel(),
         "NS": s.numel(), "NR": phi.numel(), "NT": x.numel() + n_u + phi.numel(),
     }  # fmt: skip
-    functions = [
-        _function("numbers", t, constants, ca.SX(0, 1), ca.vertcat(w_values, v_values)),
-        _of_two(_function("rates", t, x, ca.vertcat(w, p[n_c : n_c + n_u], forces[list(disturbed)]), rates)),
-        _of_common(_function("law", t_k, y, common, command)),
-        _of_common(_function("told", t_k, ca.vertcat(x, v), s, phi)),
-    ]
-    project = e.project()
-    if project is not None:
-        functions.append(_function("change", *project.sx_in(), project(*project.sx_in())))
     where = ", ".join(str(plant.state_names.index(name)) for name in law.measures) or "0"
-    text = "\n".join(
-        [
-            f"\nenum {{ {', '.join(f'{name} = {value}' for name, value in sizes.items())} }};",
-            f"#define INVARIANTS {int(project is not None)}\n#define SMALL {ROUNDING!r}",
-            f"static const int measured[] = {{ {where} }};",
-            *(text for _, text in functions),
-            BATCH,
-        ]
-    )
-    table = ca.Function("table", [t_k, ca.SX(0, 1), row], [ca.densify(ca.vertcat(common_values, s_values))])
-    return Unit(text, compiled(table, "table"), plant.state_names, plant.inputs, residuals, len(law.measures))
+    constants_of_c = {"NAME": "batch", "MEASURED": f"{{{where}}}"} | ({} if project is None else {"PROJECTED": ""})
+    parts = [
+        emit.unit(sizes | constants_of_c),
+        emit.include("lanes.h"),
+        _lanes("numbers", t, constants, ca.SX(0, 1), ca.vertcat(w_values, v_values)),
+        _rates_of_two(_function("rates", t, x, ca.vertcat(w, applied), rates)),
+        _lanes("law", t_k, y, common, command, emit.LANES_COMMON),
+        _lanes("signals", t_k, ca.vertcat(x, v), s, phi, emit.LANES_COMMON),
+        "" if project is None else _lanes("change", *project.sx_in(), project(*project.sx_in())),
+        emit.include("batch.c"),
+    ]
+    table = _function("table", t_k, ca.SX(0, 1), row, ca.vertcat(common_values, s_values))
+    return Unit("".join(parts), compiled(table, "table"), plant.state_names, plant.inputs, residuals, len(law.measures))
+
+
+def _rates(plant, disturbed):
+    """Symbols t, x and p of a plant, and x' without disturbances but those of some generalised forces."""
+    f = plant.function("ode").expression
+    t, x, p = f.sx_in()
+    forces = p[len(plant.parameters) + len(plant.inputs) :]
+    calm = [i for i in range(forces.numel()) if i not in disturbed]
+    return t, x, p, ca.substitute(f(t, x, p), forces[calm], ca.SX.zeros(len(calm)))
 
 
 def _apart(expression, symbols):
     """An expression with new symbols for what depends on some symbols alone; these, and what they stand for."""
-    found, new, values = ca.extract_parametric(ca.cse(expression), symbols, {"extract_trivial": True})
-    return found, ca.vertcat(ca.SX(0, 1), *new), ca.vertcat(ca.SX(0, 1), *values)
+    rest, new, values = ca.extract_parametric(ca.cse(expression), symbols, {"extract_trivial": True})
+    return rest, ca.vertcat(ca.SX(0, 1), *new), ca.vertcat(ca.SX(0, 1), *values)
 
 
 def _function(name, t, x, p, value):
-    f = ca.Function(name, [t, x, p], [ca.densify(ca.cse(value))])
-    return f, emit.portable(f, name)
+    return ca.Function(name, [t, x, p], [ca.densify(ca.cse(value))])
 
 
-def _of_two(function):
-    """A function for two vectors of cases, statement by statement: one waits for its last while the other goes on."""
-    f, text = function
-    statements = text.split(")\n{\n", 1)[1]
-    if emit.operations(f) > INLINED:
-        return f, f"{text}\n{_TWO}{{\n    rates(t, x, p, y);\n    rates(t, x2, p2, y2);\n}}\n"
-    lines = [line for line in statements.splitlines() if line.startswith(("    const V a", "    y["))]
-    twice = (part for line in lines for part in (line, _ARGUMENT.sub("2", _VALUE.sub("b", line))))
-    return f, "\n".join([f"{_TWO}{{", *twice, "}", ""])
+def _lanes(name, t, x, p, value, dialect=emit.LANES):
+    """C text of an expression for the cases in the lanes of a vector."""
+    return emit.function(_function(name, t, x, p, value), name, dialect)
 
 
-def _of_common(function):
-    """A function whose last argument is the same in all lanes."""
-    f, text = function
-    return f, re.sub(r"\bp\[(\d+)\]", r"K(p[\1])", text).replace("const V *restrict p", "const double *restrict p")
-
-
-_TWO = """
-INLINE void rates_of_two(const V t, const V *restrict x, const V *restrict p, V *restrict y,
-                         const V *restrict x2, const V *restrict p2, V *restrict y2)
-"""
-_VALUE, _ARGUMENT = re.compile(r"\ba(?=\d)"), re.compile(r"(?<=\b[xpy])(?=\[)")
-
-_COUNTS = "samples substeps delay depth every n_traced columns".split()
-_WHOLE = ("transport", "traced")
-_REALS = "constants x0 scale z0 table quantum low high change idle disturbance".split()
-
-
-class _Arguments(ctypes.Structure):
-    _fields_ = [
-        *((name, ctypes.c_int64) for name in _COUNTS),
-        *((name, ctypes.c_double) for name in ("t0", "period")),
-        *((name, ctypes.c_void_p) for name in (*_REALS, *_WHOLE, "found", "trace")),
-    ]
+def _rates_of_two(f):
+    """C text of the rates of two vectors of cases, written into each stage where they are short."""
+    if emit.operations(f) <= INLINED:
+        return emit.function_of_two(f, "rates_of_two", emit.LANES_INLINE)
+    calls = "    rates(t, x, p, y);\n    rates(t, x2, p2, y2);\n}\n"
+    return emit.function(f, "rates", emit.LANES) + emit.LANES_INLINE.head("rates_of_two", ("", "2")) + calls
 
 
 @dataclass(frozen=True)
@@ -205,7 +178,7 @@ class Gathered:
     trace: np.ndarray
 
 
-def run_batch(unit, loop, constants, x0, scale, noise=None, traced=(), every=1, threads=None, n=None):
+def run_batch(unit, loop, cases, noise=None, traced=(), every=1, threads=None):
     """Run the closed loops of N cases.
 
     Parameters
@@ -213,11 +186,8 @@ def run_batch(unit, loop, constants, x0, scale, noise=None, traced=(), every=1, 
     unit : Unit
     loop : Loop
         What the cases have in common; its p, x0 and noise are not used.
-    constants : (n_c, N) array
-        Parameters of the plant by case.
-    x0 : (n_x, N) array
-    scale : (n_d, N) array
-        Of the disturbances.
+    cases : (constants, x0, scale)
+        (n_c, N), (n_x, N) and (n_d, N) arrays: parameters of the plant, start, factors of the disturbances.
     noise : callable, optional
         From the index of a case to its noise, (samples + 1, n_y).
     traced : sequence of int
@@ -225,64 +195,55 @@ def run_batch(unit, loop, constants, x0, scale, noise=None, traced=(), every=1, 
     every : int
     threads : int, optional
         Default: one per core.
-    n : int, optional
-        Lanes; default `lanes()`.
 
     Returns
     -------
     Gathered or None
         None without a compiler. The numbers do not depend on the number of threads.
     """
-    n = n or lanes()
+    n = lanes()
     native = unit.library(n)
     if native is None:
         return None
-    count, width, size = x0.shape[1], 2 * n, len(unit.names)
-    blocks, samples = -(-count // width), np.arange(loop.samples + 1)
+    native.restype = None
+    count, width, size = cases[1].shape[1], 2 * n, len(unit.names)
+    blocks = -(-count // width)
     columns = np.minimum(np.arange(blocks * width), count - 1)
-    found = np.empty((2 + 3 * size, blocks * width))
+    gathered = np.empty((2 + 3 * size, blocks * width))
     trace = np.empty((loop.samples // every + 1 if len(traced) else 0, len(traced), blocks * width))
     late = 0 if loop.transport is None else int(np.max(loop.transport)) // loop.substeps + 1
     depth = 1 + max(loop.delay, late)
-    given = {
-        "samples": loop.samples, "substeps": loop.substeps, "delay": loop.delay, "depth": depth, "every": every,
-        "n_traced": len(traced), "columns": blocks * width, "t0": loop.t0, "period": loop.period, "found": found,
-        "trace": trace, "traced": np.array(traced, dtype=np.int64), "transport": loop.transport,
-        "constants": constants[:, columns], "x0": x0[:, columns], "scale": scale[:, columns],
-        "table": _common(unit, loop, samples),
-    }  # fmt: skip
-    arguments, kept = _Arguments(), []
-    for name, kind in _Arguments._fields_:
-        value = given.get(name, getattr(loop, name, None))
-        if kind is ctypes.c_void_p and value is not None:
-            kept.append(np.ascontiguousarray(value, dtype=np.int64 if name in _WHOLE else np.float64))
-            value = pointer(kept[-1])
-        setattr(arguments, name, value)
-    native.restype = None
+    constants, x0, scale = (part[:, columns] for part in cases)
+    arguments = Arguments(**vars(loop) | {
+        "constants": constants, "x0": x0, "scale": scale, "table": _common(unit, loop), "noise": None, "p": None,
+        "depth": depth, "every": every, "columns": blocks * width, "n_traced": len(traced), "traced": traced,
+        "gathered": gathered, "trace": trace,
+    })  # fmt: skip
 
     def run(first, last):
-        own = None if noise is None else np.empty((last - first, loop.samples + 1, unit.n_y, width))
-        for case in range(first * width, last * width) if noise is not None else ():
-            own[case // width - first, :, :, case % width] = noise(columns[case])
+        noisy = None if noise is None else _noise(noise, columns[first * width : last * width], unit.n_y, width)
         scratch = np.empty(2 * depth * loop.n_u * width + 1)
-        native(
-            ctypes.byref(arguments), ctypes.c_int64(first), ctypes.c_int64(last),
-            None if own is None else pointer(own), pointer(scratch),
-        )  # fmt: skip
+        rows = (None if noisy is None else pointer(noisy), pointer(scratch))
+        native(ctypes.byref(arguments), ctypes.c_int64(first), ctypes.c_int64(last), *rows)
 
     threads = threads or os.cpu_count() or 1
     length = 1 if noise is not None else -(-blocks // (threads * PER_THREAD))
     starts = range(0, blocks, length)
     with ThreadPoolExecutor(threads) as pool:
         list(pool.map(run, starts, (min(first + length, blocks) for first in starts)))
-    parts = np.split(found[:, :count], [1, 2, 2 + size, 2 + 2 * size])
-    return Gathered(
-        parts[0][0], parts[1][0], parts[2], np.sqrt(parts[3] / (loop.samples + 1)), parts[4], trace[:, :, :count]
-    )
+    lost, largest, squares, last = np.split(gathered[:, :count], [2, 2 + size, 2 + 2 * size])
+    return Gathered(*lost, largest, np.sqrt(squares / (loop.samples + 1)), last, trace[:, :, :count])
 
 
-def _common(unit, loop, samples):
+def _noise(noise, cases, n_y, width):
+    """Noise of some cases, (blocks, samples + 1, n_y, width) as `batch` takes it."""
+    columns = np.stack([noise(case) for case in cases], axis=-1)
+    return np.ascontiguousarray(np.moveaxis(columns.reshape(*columns.shape[:1], n_y, -1, width), 2, 0))
+
+
+def _common(unit, loop):
     """The table of what all cases have in common, a row per sample."""
+    samples = np.arange(loop.samples + 1)
     rows = loop.table[np.minimum(loop.first + samples, len(loop.table) - 1)].T
     with compiling_at_once():
         return unit.table.grid(loop.t0 + samples * loop.period, np.zeros((0, len(samples))), rows).T

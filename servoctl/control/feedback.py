@@ -6,7 +6,6 @@ import casadi as ca
 import numpy as np
 
 from servoctl.codegen.function import compiled
-from servoctl.codegen.loops.closed import LAW_DRIVER
 from servoctl.control.law import Law
 
 
@@ -16,7 +15,7 @@ def law_step(name, t, x, row, outputs):
     `t`, `x` and `row` are symbols, `outputs` expressions of them: command, next controller state, further signals.
     """
     y = ca.densify(ca.cse(ca.vertcat(*outputs)))
-    return compiled(ca.Function(name, [t, x, row], [y], ["t", "x", "p"], ["y"]), name, drivers=LAW_DRIVER)
+    return compiled(ca.Function(name, [t, x, row], [y], ["t", "x", "p"], ["y"]), name, ("law",))
 
 
 def affine_law(measures, n_u, feedback=True, residuals=None):

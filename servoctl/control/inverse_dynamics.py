@@ -20,7 +20,7 @@ from servoctl.errors import NotRealisable, SpecificationError, UnstableInternalD
 from servoctl.internal_dynamics import internal_dynamics
 from servoctl.jets.evaluation import evaluate
 from servoctl.jets.tape import Tape
-from servoctl.methods.bounds import sampled_bound
+from servoctl.methods.stability import sampled_bound
 from servoctl.reduction.elimination import eliminate
 from servoctl.reduction.knots import require_smooth
 from servoctl.reduction.ranks import clean, decide, decide_all

@@ -33,13 +33,13 @@ class Layout:
     """Named parts of a vector, one after another; matrices row by row."""
 
     def __init__(self, **shapes):
-        self._shapes = {name: (shape,) if isinstance(shape, int) else shape for name, shape in shapes.items()}
-        self._ends = np.cumsum([prod(shape) for shape in self._shapes.values()])[:-1]
+        shapes = {name: (shape,) if isinstance(shape, int) else shape for name, shape in shapes.items()}
+        ends = np.cumsum([0, *(prod(shape) for shape in shapes.values())]).tolist()
+        self._parts = [(name, slice(*ends[i : i + 2]), shape) for i, (name, shape) in enumerate(shapes.items())]
 
     def split(self, vector):
         """The parts by name, as attributes."""
-        parts = zip(self._shapes.items(), np.split(vector, self._ends), strict=True)
-        return SimpleNamespace(**{name: part.reshape(shape) for (name, shape), part in parts})
+        return SimpleNamespace(**{name: vector[part].reshape(shape) for name, part, shape in self._parts})
 
 
 class Effects:

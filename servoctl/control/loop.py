@@ -9,9 +9,10 @@ from servoctl.codegen.native import pointer
 
 FINISHED, STATE_LOST, LAW_LOST = 0, 1, 2  # how a loop ends
 
+
 @dataclass(frozen=True)
 class Loop:
-    """What a closed loop needs beside the plant and the law; arrays that were not asked for are None.
+    """What a closed loop needs beside the plant and the law; arrays that are not used are None.
 
     Attributes
     ----------
@@ -42,7 +43,7 @@ class Loop:
     transport : (n_u,) integer array
         Integration steps by which each input arrives late.
     at_u : int
-        Where the inputs stand in p.
+        Index of the first input in p.
     """
 
     samples: int
@@ -70,19 +71,39 @@ class Loop:
     transport: np.ndarray = None
 
 
-_COUNTS = "samples substeps delay n_y n_z n_u n_out n_row rows first n_d at_u".split()
-_REALS = "p x0 z0 table noise quantum low high change idle disturbance".split()
-_WHOLE = "measured transport disturbed".split()
-_LOGS = "x law_x law_y input".split()
+_FIELDS = {
+    ctypes.c_int64: "samples substeps delay n_y n_z n_u n_out n_row rows first n_d at_u depth every n_traced columns "
+    "status",
+    ctypes.c_double: "t0 period",
+    ctypes.c_void_p: "p x0 z0 table noise quantum low high change idle disturbance constants scale measured transport "
+    "disturbed traced x law_x law_y input gathered trace",
+}
+_WHOLE = {"measured", "transport", "disturbed", "traced"}  # arrays of whole numbers
 
 
-class _Arguments(ctypes.Structure):
-    _fields_ = [
-        *((name, ctypes.c_int64) for name in _COUNTS),
-        *((name, ctypes.c_double) for name in ("t0", "period")),
-        *((name, ctypes.c_void_p) for name in (*_REALS, *_WHOLE, *_LOGS)),
-        ("status", ctypes.c_int64),
-    ]
+class Arguments(ctypes.Structure):
+    """The C structure ``Loop`` of `codegen/c/sampled.h`, which one loop and many loops take.
+
+    Parameters
+    ----------
+    **values
+        Its fields by name, with arrays for pointers, which it keeps; None and fields that are left out are 0. What is
+        no field of it is passed over.
+    """
+
+    _fields_ = [(name, kind) for kind, names in _FIELDS.items() for name in names.split()]
+
+    def __init__(self, **values):
+        super().__init__()
+        self.arrays = []
+        for name, kind in self._fields_:
+            value = values.get(name)
+            if value is None:
+                continue
+            if kind is ctypes.c_void_p:
+                self.arrays.append(np.ascontiguousarray(value, dtype=np.int64 if name in _WHOLE else np.float64))
+                value = pointer(self.arrays[-1])
+            setattr(self, name, value)
 
 
 _STEP = ctypes.CFUNCTYPE(None, ctypes.c_double, ctypes.c_void_p, ctypes.c_void_p, ctypes.c_void_p)
@@ -94,7 +115,7 @@ def run_loop(ode, law, loop):
     Parameters
     ----------
     ode : Compiled
-        Of the plant, made with `DRIVER`.
+        Of the plant, made with the loop "closed".
     law : Compiled or callable
         (t, [y; z], row) -> [u; z+; further signals].
     loop : Loop
@@ -114,47 +135,35 @@ def run_loop(ode, law, loop):
         Inputs applied from there on.
     """
     n, n_y, n_z = loop.samples + 1, len(loop.measured), len(loop.z0)
-    x, law_x = np.empty((n, ode.n_x)), np.empty((n + 1, n_y + n_z))
-    law_y, inputs = np.empty((n, loop.n_out)), np.empty((n, loop.n_u))
-    logs = (x, law_x, law_y, inputs)
+    logs = {
+        "x": np.empty((n, ode.n_x)), "law_x": np.empty((n + 1, n_y + n_z)),
+        "law_y": np.empty((n, loop.n_out)), "input": np.empty((n, loop.n_u)),
+    }  # fmt: skip
     native = ode.native("closed")
     if native is None:
-        done, status = _interpreted(ode, law, loop, *logs)
+        done, status = _interpreted(ode, law, loop, *logs.values())
     else:
         done, status = _native(native, law, loop, logs)
-    return status, *(log[:done] for log in logs)
+    return status, *(log[:done] for log in logs.values())
 
 
 def _native(native, law, loop, logs):
+    """The loop of closed.c; returns the samples completed and the status."""
     step = law.native("step") if hasattr(law, "native") else None
-    failures, callback = [], None
+    failures = []
     if step is None:
-        callback = _STEP(_called_back(law, loop, logs, failures))
-        step = callback
-    sizes = {
-        "n_y": len(loop.measured), "n_z": len(loop.z0), "n_d": len(loop.disturbed),
-        "rows": loop.table.shape[0], "n_row": loop.table.shape[1],
-    }  # fmt: skip
-    a = _Arguments(t0=loop.t0, period=loop.period, status=FINISHED)
-    for name in _COUNTS:
-        setattr(a, name, sizes.get(name, getattr(loop, name, 0)))
-    kept = []
-    for names, kind in ((_REALS, np.float64), (_WHOLE, np.int64)):
-        for name in names:
-            value = getattr(loop, name)
-            if value is not None:
-                kept.append(np.ascontiguousarray(value, dtype=kind))
-                setattr(a, name, pointer(kept[-1]))
-    for name, log in zip(_LOGS, logs, strict=True):
-        setattr(a, name, pointer(log))
+        step = _STEP(_called_back(law, loop, logs["law_x"].shape[1], failures))
+    rows, n_row = loop.table.shape
+    sizes = {"n_y": len(loop.measured), "n_z": len(loop.z0), "n_d": len(loop.disturbed), "rows": rows, "n_row": n_row}
+    arguments = Arguments(**vars(loop) | sizes | logs, status=FINISHED)
     native.restype = ctypes.c_int64
-    done = native(ctypes.cast(step, ctypes.c_void_p), ctypes.byref(a))
-    return done, failures[0] if failures else a.status
+    done = native(ctypes.cast(step, ctypes.c_void_p), ctypes.byref(arguments))
+    return done, failures[0] if failures else arguments.status
 
 
-def _called_back(law, loop, logs, failures):
+def _called_back(law, loop, n_in, failures):
     """A function for C that calls a Python law; what it raises is kept, and ends the loop."""
-    n_in, n_row, n_out = logs[1].shape[1], loop.table.shape[1], loop.n_out
+    n_row, n_out = loop.table.shape[1], loop.n_out
 
     def view(address, size):
         return np.ctypeslib.as_array((ctypes.c_double * size).from_address(address)) if size else np.empty(0)
@@ -170,57 +179,92 @@ def _called_back(law, loop, logs, failures):
     return step
 
 
+# --- the rule of the loop in Python, as sampled.h, rk4.h and closed.c have it
+
+
+def quantised(y, quantum):
+    """Measurements y (n_y,) in whole steps of quantum (n_y,), where these are positive; None for none."""
+    if quantum is None:
+        return y
+    return np.where(quantum > 0, quantum * np.rint(y / np.where(quantum > 0, quantum, 1.0)), y)
+
+
+def limited(command, before, low, high, change):
+    """Inputs (n_u,) of one sample: the command within its limits, and those of its change from the inputs before."""
+    u = command if low is None else np.clip(command, low, high)
+    return u if change is None else np.clip(u, before - change, before + change)
+
+
+def samples_ago(step, transport, substeps):
+    """Samples since the inputs that arrive in an integration step of this one were applied, (n_u,) whole numbers."""
+    return -((step - transport) // substeps)
+
+
+def hold(ode, t, h, x, steps):
+    """The state at the end of a sample.
+
+    Parameters
+    ----------
+    ode : Compiled
+    t, h : float
+        Start of the sample, length of an integration step [s].
+    x : (n_x,) array
+    steps : iterable of (start, middle, end)
+        Parameters (n_p,) of the plant, with inputs and disturbances, in each step.
+
+    Returns
+    -------
+    (n_x,) array
+    """
+    for s, stages in enumerate(steps):
+        x = ode.restore(t + (s + 1) * h, _rk4(ode, t + s * h, h, x, stages), stages[2])
+    return x
+
+
+def _rk4(ode, t, h, x, stages):
+    """One Runge-Kutta step of order 4."""
+    start, middle, end = stages
+    n = len(x)
+    k1 = ode(t, x, start)[:n]
+    k2 = ode(t + h / 2, x + h / 2 * k1, middle)[:n]
+    k3 = ode(t + h / 2, x + h / 2 * k2, middle)[:n]
+    k4 = ode(t + h, x + h * k3, end)[:n]
+    return x + h / 6 * (k1 + 2 * (k2 + k3) + k4)
+
+
+def _steps(c, k, inputs):
+    """Parameters at the start, the middle and the end of each step of sample k."""
+    d_at, late = c.at_u + c.n_u + c.disturbed, 0 if c.transport is None else c.transport
+    for s in range(c.substeps):
+        stages = np.tile(c.p, (3, 1))
+        applied = k - samples_ago(s, late, c.substeps) + np.zeros(c.n_u, dtype=int)
+        stages[:, c.at_u : c.at_u + c.n_u] = np.where(applied < 0, c.idle, inputs[applied, range(c.n_u)])
+        if len(d_at):
+            stages[:, d_at] = c.disturbance[k * c.substeps + s]
+        yield stages
+
+
 @np.errstate(all="ignore")
 def _interpreted(ode, law, c, x_log, law_x, law_y, inputs):
-    """The loop of `DRIVER` in Python; returns the samples completed and the status."""
-    n_y, n_z, n_u, n_d = len(c.measured), len(c.z0), c.n_u, len(c.disturbed)
-    x, p, h = c.x0.copy(), c.p.copy(), c.period / c.substeps
+    """The loop of closed.c in Python; returns the samples completed and the status."""
+    n_y, n_z, n_u, x = len(c.measured), len(c.z0), c.n_u, c.x0
     law_x[0, n_y:] = c.z0
     for k in range(c.samples + 1):
         t = c.t0 + k * c.period
         if not np.isfinite(x).all():
             return k, STATE_LOST
         x_log[k] = x
-        y = x[c.measured]
-        y = y if c.noise is None else y + c.noise[k]
-        if c.quantum is not None:
-            steps = np.where(c.quantum > 0, c.quantum, 1.0)
-            y = np.where(c.quantum > 0, c.quantum * np.rint(y / steps), y)
-        law_x[k, :n_y] = y
+        law_x[k, :n_y] = quantised(x[c.measured] + (0.0 if c.noise is None else c.noise[k]), c.quantum)
         try:
             law_y[k] = law(t, law_x[k].copy(), c.table[min(c.first + k, len(c.table) - 1)])
         except BaseException as error:  # as in C: the motion before is kept
             return k, error
         if not np.isfinite(law_y[k, : n_u + n_z]).all():
             return k, LAW_LOST
-        u = law_y[k - c.delay, :n_u] if k >= c.delay else c.idle
-        before = inputs[k - 1] if k else c.idle
-        u = u if c.low is None else np.clip(u, c.low, c.high)
-        inputs[k] = u if c.change is None else np.clip(u, before - c.change, before + c.change)
+        command = law_y[k - c.delay, :n_u] if k >= c.delay else c.idle
+        inputs[k] = limited(command, inputs[k - 1] if k else c.idle, c.low, c.high, c.change)
         if k == c.samples:
             break
         law_x[k + 1, n_y:] = law_y[k, n_u : n_u + n_z]
-        p[c.at_u : c.at_u + n_u] = inputs[k]
-        for s in range(c.substeps):
-            step = k * c.substeps + s
-            for i in range(n_u if c.transport is not None else 0):
-                sent = step - c.transport[i]
-                p[c.at_u + i] = c.idle[i] if sent < 0 else inputs[sent // c.substeps, i]
-            x = _rk4(ode, c, t + s * h, h, c.disturbance[step] if n_d else None, x, p)
-            x = ode.restore(t + (s + 1) * h, x, p)
+        x = hold(ode, t, c.period / c.substeps, x, _steps(c, k, inputs))
     return c.samples + 1, FINISHED
-
-
-def _rk4(ode, c, t, h, d, x, p):
-    """One Runge-Kutta step of order 4; d (3, n_d) holds the disturbances at its start, middle and end."""
-
-    def rate(stage, instant, state):
-        if d is not None:
-            p[c.at_u + c.n_u + c.disturbed] = d[stage]
-        return ode(instant, state, p)[: len(x)]
-
-    k1 = rate(0, t, x)
-    k2 = rate(1, t + h / 2, x + h / 2 * k1)
-    k3 = rate(1, t + h / 2, x + h / 2 * k2)
-    k4 = rate(2, t + h, x + h * k3)
-    return x + h / 6 * (k1 + 2 * (k2 + k3) + k4)

@@ -3,12 +3,15 @@
 import re
 import textwrap
 import unicodedata
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from importlib import resources
 from pathlib import Path
 
+import casadi as ca
 import numpy as np
 
 from servoctl.codegen import emit
+from servoctl.codegen.loops import source
 from servoctl.errors import ServoError
 
 WIDTH = 110  # of the lines of a file
@@ -32,18 +35,42 @@ class Array:
     about: str
     names: tuple
 
-    @property
-    def size(self):
+    def length(self, prefix):
         """The C constant that holds its length."""
-        return f"@@_N{self.key.upper()}"
+        return f"{prefix.upper()}_N{self.key.upper()}"
 
-    def given(self, name=""):
+    def input(self):
         """Itself as an input of a C function."""
-        return f"const {self.changed(name)}"
+        return Argument(self, self.key, "const double")
 
-    def changed(self, name=""):
+    def output(self, name=""):
         """Itself as an output of a C function."""
-        return f"double {name or self.key}[{self.size}]" if len(self.names) else f"double *{name or self.key}"
+        return Argument(self, name or self.key, "double")
+
+
+@dataclass(frozen=True)
+class Argument:
+    """An array as an argument of a C function, under a name."""
+
+    array: Array
+    name: str
+    kind: str
+
+    def declaration(self, prefix):
+        """As C declares it."""
+        places = f"{self.name}[{self.array.length(prefix)}]" if len(self.array.names) else f"*{self.name}"
+        return f"{self.kind} {places}"
+
+
+@dataclass(frozen=True)
+class Scalar:
+    """A number as an argument of a C function."""
+
+    name: str
+
+    def declaration(self, prefix):
+        """As C declares it."""
+        return f"double {self.name}"
 
 
 @dataclass(frozen=True)
@@ -53,7 +80,7 @@ class Constant:
     Parameters
     ----------
     name : str
-        After the prefix and an underscore.
+        After the prefix and an underscore; alone for one that stays in the C file.
     values : float or (N,) array
     about : str
         What it is, for the header; empty for one that stays in the C file.
@@ -63,60 +90,83 @@ class Constant:
     values: object
     about: str = ""
 
-    @property
-    def declaration(self):
+    def declaration(self, prefix):
         """Its declaration without a value."""
-        return f"const double @_{self.name}{f'[{len(self.values)}]' if np.ndim(self.values) else ''}"
+        name = f"const double {prefix}_{self.name}" if self.about else f"static const double {self.name}"
+        return f"{name}[{len(self.values)}]" if np.ndim(self.values) else name
 
     @property
     def text(self):
         """Its values as C."""
-        literals = [emit.literal(float(value))[2:-1] for value in np.ravel(self.values)]
+        literals = [emit.literal(float(value)).strip("()") for value in np.ravel(self.values)]
         lines = "".join(f"    {', '.join(literals[k : k + 4])},\n" for k in range(0, len(literals), 4))
         return f"{{\n{lines}}}" if np.ndim(self.values) else literals[0]
 
 
 @dataclass(frozen=True)
 class Routine:
-    """A C function.
+    """A public C function, which calls the static one of its name.
 
     Parameters
     ----------
     name : str
         After the prefix and an underscore.
-    body : str or casadi.Function
-        Statements; or an SX function of (t, x, p) with one dense column, whose arguments are t, x, p and y.
     about : str
-        What it computes, for the header; empty for one that stays in the C file.
-    arguments : sequence of str
-        As the header shows them.
+        What it computes, for the header.
+    arguments : sequence of Argument and Scalar
     result : {"void", "int"}
     """
 
     name: str
-    body: object
-    about: str = ""
-    arguments: tuple = ()
+    about: str
+    arguments: tuple
     result: str = "void"
 
-    @property
-    def declaration(self):
+    def declaration(self, prefix):
         """Its declaration without a semicolon."""
-        return f"{self.result} @_{self.name}({', '.join(self.arguments)})"
+        arguments = ", ".join(argument.declaration(prefix) for argument in self.arguments)
+        return f"{self.result} {prefix}_{self.name}({arguments})"
+
+    def definition(self, prefix):
+        """Its definition."""
+        call = f"{self.name}({', '.join(argument.name for argument in self.arguments)});"
+        return f"\n{self.declaration(prefix)}\n{{\n    {'return ' if self.result == 'int' else ''}{call}\n}}\n"
 
 
-def write(folder, name, arrays, constants, routines):
+@dataclass(frozen=True)
+class Contents:
+    """What a C file and its header hold.
+
+    Parameters
+    ----------
+    arrays : sequence of Array
+    constants : sequence of Constant
+    functions : dict of str to casadi.Function
+        Static functions by name, SX functions of (t, x, p) with one dense column.
+    routines : sequence of Routine
+    sources : sequence of str
+        Files of the folder `sources` with further static functions, which may call those before.
+    sizes : dict of str to float
+        Macros that these take.
+    """
+
+    arrays: tuple
+    constants: tuple
+    functions: dict
+    routines: tuple
+    sources: tuple = ()
+    sizes: dict = field(default_factory=dict)
+
+
+def write(folder, name, contents):
     """Write NAME.c and NAME.h of any functions.
 
     Parameters
     ----------
     folder : str or Path
     name : str
-        A C identifier; it takes the place of @ in the texts, in upper case that of @@.
-    arrays : sequence of Array
-    constants : sequence of Constant
-    routines : sequence of Routine
-        Each after those that it calls.
+        A C identifier, the prefix of all that is public.
+    contents : Contents
 
     Returns
     -------
@@ -128,12 +178,11 @@ def write(folder, name, arrays, constants, routines):
         If the files cannot be written.
     """
     folder = Path(folder)
-    texts = {f"{name}.c": _source(constants, routines), f"{name}.h": _header(arrays, constants, routines)}
+    texts = {f"{name}.c": _source(name, contents), f"{name}.h": _header(name, contents)}
     try:
         folder.mkdir(parents=True, exist_ok=True)
         for file, text in texts.items():
-            text = _wrapped(text.replace("@@", name.upper()).replace("@", name))
-            (folder / file).write_text(text, encoding="utf-8")
+            (folder / file).write_text(_wrapped(text), encoding="utf-8")
     except OSError as error:
         raise ServoError(
             f"The C files cannot be written to {folder}: {error.strerror or error}.",
@@ -144,44 +193,44 @@ def write(folder, name, arrays, constants, routines):
     return tuple(folder / file for file in texts)
 
 
-def _header(arrays, constants, routines):
+def _header(name, contents):
+    guard = f"{name.upper()}_H"
     parts = [
-        f"/* @.h: written by servoctl {_version()}. SI units and radians; arrays must not overlap. */\n",
-        '#ifndef @@_H\n#define @@_H\n\n#ifdef __cplusplus\nextern "C" {\n#endif\n',
+        f"/* {name}.h: written by servoctl {_version()}. SI units and radians; arrays must not overlap. */\n",
+        f'#ifndef {guard}\n#define {guard}\n\n#ifdef __cplusplus\nextern "C" {{\n#endif\n',
     ]
-    parts += [_comment(f"{array.about}.") + _enum(array) for array in arrays]
-    parts += [_comment(f"{c.about}.") + f"extern {c.declaration};\n" for c in constants if c.about]
-    parts += [_comment(r.about) + f"{r.declaration};\n" for r in routines if r.about]
-    return "\n".join([*parts, "#ifdef __cplusplus\n}\n#endif\n\n#endif /* @@_H */\n"])
+    parts += [_comment(f"{array.about}.") + _enum(name, array) for array in contents.arrays]
+    parts += [_comment(f"{c.about}.") + f"extern {c.declaration(name)};\n" for c in contents.constants if c.about]
+    parts += [_comment(r.about) + f"{r.declaration(name)};\n" for r in contents.routines]
+    return "\n".join([*parts, f"#ifdef __cplusplus\n}}\n#endif\n\n#endif /* {guard} */\n"])
 
 
-def _enum(array):
+def _enum(name, array):
     used, lines = set(), []
-    for i, name in enumerate(array.names):
-        word = unique = identifier(name)
+    for i, entry in enumerate(array.names):
+        word = unique = identifier(entry)
         while unique in used:
             unique = f"{word}_{i}"
         used.add(unique)
-        told = "" if unique == name else f" /* {_harmless(name)} */"
-        lines.append(f"    @@_{array.key.upper()}_{unique} = {i},{told}\n")
-    return f"enum {{\n{''.join(lines)}    {array.size} = {len(array.names)}\n}};\n"
+        comment = "" if unique == entry else f" /* {_harmless(entry)} */"
+        lines.append(f"    {name.upper()}_{array.key.upper()}_{unique} = {i},{comment}\n")
+    return f"enum {{\n{''.join(lines)}    {array.length(name)} = {len(array.names)}\n}};\n"
 
 
-def _source(constants, routines):
-    data = "".join(f"\n{'' if c.about else 'static '}{c.declaration} = {c.text};\n" for c in constants)
-    functions = "".join(map(_definition, routines))
-    first = f'/* @.c: written by servoctl {_version()}. C99; link with -lm. */\n#include "@.h"\n'
-    return first + emit.prelude(functions) + data + functions
-
-
-def _definition(routine):
-    if isinstance(routine.body, str):
-        return f"\n{routine.declaration}\n{{{routine.body}}}\n"
-    if not routine.about:
-        return emit.portable(routine.body, f"@_{routine.name}")
-    arguments = ", ".join(re.search(r"\w+(?=\[|$)", text)[0] for text in routine.arguments)
-    inner = emit.portable(routine.body, f"@_{routine.name}_f")
-    return f"{inner}\n{routine.declaration}\n{{\n    @_{routine.name}_f({arguments});\n}}\n"
+def _source(name, contents):
+    inverse = any(emit.contains(f, ca.OP_ERFINV) for f in contents.functions.values())
+    sources = resources.files("servoctl.export") / "sources"
+    parts = [
+        f'/* {name}.c: written by servoctl {_version()}. C99; link with -lm. */\n#include "{name}.h"\n',
+        "#include <math.h>\n",
+        *(f"#define {key} {emit.literal(value)}\n" for key, value in contents.sizes.items()),
+        *(f"\n{c.declaration(name)} = {c.text};\n" for c in contents.constants),
+        f"\n{source('inverse_erf.h')}" if inverse else "",
+        *(emit.function(f, key, emit.PORTABLE) for key, f in contents.functions.items()),
+        *((sources / file).read_text(encoding="utf-8") for file in contents.sources),
+        *(routine.definition(name) for routine in contents.routines),
+    ]
+    return "".join(parts)
 
 
 def _comment(text):

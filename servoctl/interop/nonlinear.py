@@ -7,6 +7,7 @@ import numpy as np
 from servoctl.checks import positive
 from servoctl.control.conditions import limits, steps
 from servoctl.control.law import Law
+from servoctl.control.loop import hold, limited, quantised, samples_ago
 from servoctl.control.result import Closed
 from servoctl.errors import ServoError, SpecificationError
 from servoctl.interop.names import connected, force_names, output_names, signal_names, stranger
@@ -69,7 +70,7 @@ def nlsys(thing, *, rate=None, substeps=None, disturbed=(), name=None):
 
 
 def start(closed):
-    """The state in which the system of a closed loop starts, for X0 of python-control: plant, past inputs, memory.
+    """The state in which the system of a closed loop starts, for X0 of python-control: plant, past inputs, law.
 
     Parameters
     ----------
@@ -130,14 +131,8 @@ def _plant(plant, name, disturbed, rate, substeps, delay=0):
 
     disturbed, forces = force_names(plant, disturbed)
     period = None if rate is None else 1.0 / positive("rate", rate)
-    if period is None and (plant.rate_limits or plant.delay or substeps is not None):
-        what = "limits of rate" if plant.rate_limits else "transport delay" if plant.delay else "substeps"
-        raise SpecificationError(
-            f"A plant with {what} is to be a system in continuous time.",
-            "Limits of rate, transport delays and substeps belong to inputs that are sampled and held.",
-            nearest="interop.nlsys(plant, rate=100.0).",
-            do="Give the rate.",
-        )
+    if period is None:
+        _require_continuous(plant, substeps)
     inputs = [*plant.inputs, *(f"disturbance {force}" for force in disturbed)]
     m, n_x, symbols = len(plant.inputs), plant.n_x, plant.mechanism.parameters.names
     ode, low_high = plant.function("ode"), limits(plant, 1.0)[:2]
@@ -145,7 +140,7 @@ def _plant(plant, name, disturbed, rate, substeps, delay=0):
     def numbers(u, params):
         d = np.zeros(len(plant.disturbable))
         d[forces] = u[m:]
-        applied = u[:m] if low_high[0] is None else np.clip(u[:m], *low_high)
+        applied = limited(u[:m], None, *low_high, None)
         return np.concatenate([_numbers(plant.parameters, symbols, params), applied, d])
 
     def rates(t, x, u, params):
@@ -156,11 +151,11 @@ def _plant(plant, name, disturbed, rate, substeps, delay=0):
 
     states, update = list(plant.state_names), rates
     if period is not None:
-        held = _Held(plant, period, SUBSTEPS if substeps is None else substeps, delay)
-        states += held.names
+        sampled = _SampledPlant(plant, period, SUBSTEPS if substeps is None else substeps, delay)
+        states += sampled.names
 
         def update(t, x, u, params):
-            return held(t, x, u, lambda inputs: numbers(np.append(inputs, u[m:]), params))
+            return sampled(t, x, u, lambda inputs: numbers(np.append(inputs, u[m:]), params))
 
     return control.nlsys(
         update, outputs, name=name, inputs=inputs, states=states, outputs=output_names(plant), dt=period or 0,
@@ -168,8 +163,20 @@ def _plant(plant, name, disturbed, rate, substeps, delay=0):
     )  # fmt: skip
 
 
-class _Held:
-    """A plant over one sample, with what stands before it in a loop; the state is [x; past commands; past inputs]."""
+def _require_continuous(plant, substeps):
+    """Refuse what belongs to samples."""
+    if plant.rate_limits or plant.delay or substeps is not None:
+        what = "limits of rate" if plant.rate_limits else "transport delay" if plant.delay else "substeps"
+        raise SpecificationError(
+            f"A plant with {what} is to be a system in continuous time.",
+            "Limits of rate, transport delays and substeps belong to inputs that are sampled and held.",
+            nearest="interop.nlsys(plant, rate=100.0).",
+            do="Give the rate.",
+        )
+
+
+class _SampledPlant:
+    """A plant over one sample behind delays and limits; its state is [x; past commands; past inputs]."""
 
     def __init__(self, plant, period, substeps, delay):
         self.plant, self.delay, self.m = plant, delay, len(plant.inputs)
@@ -184,23 +191,14 @@ class _Held:
 
     def __call__(self, t, state, u, numbers):
         m, n_x = self.m, self.plant.n_x
-        x, queues = state[:n_x].copy(), state[n_x:].reshape(-1, m)
+        x, queues = state[:n_x], state[n_x:].reshape(-1, m)
         commands, inputs = np.vstack([u[None, :m], queues[: self.delay]]), queues[self.delay :]
-        asked = commands[self.delay]
-        if self.low is not None:
-            asked = np.clip(asked, self.low, self.high)
-        if self.change is not None:
-            asked = np.clip(asked, inputs[0] - self.change, inputs[0] + self.change)
-        inputs = np.vstack([asked[None], inputs])
-        ode, h = self.plant.function("ode"), self.h
-        for s in range(self.substeps):
-            sent = -((s - self.late) // self.substeps)
-            p, now = numbers(inputs[sent, range(m)]), t + s * h
-            k1 = ode(now, x, p)
-            k2 = ode(now + h / 2, x + h / 2 * k1, p)
-            k3 = ode(now + h / 2, x + h / 2 * k2, p)
-            k4 = ode(now + h, x + h * k3, p)
-            x = ode.restore(now + h, x + h / 6 * (k1 + 2 * (k2 + k3) + k4), p)
+        before = inputs[0] if len(inputs) else None
+        applied = limited(commands[self.delay], before, self.low, self.high, self.change)
+        inputs = np.vstack([applied[None], inputs])
+        ages = (samples_ago(s, self.late, self.substeps) for s in range(self.substeps))
+        stages = (3 * (numbers(inputs[age, range(m)]),) for age in ages)
+        x = hold(self.plant.function("ode"), t, self.h, x, stages)
         return np.concatenate([x, commands[: self.delay].ravel(), inputs[: self.past].ravel()])
 
 
@@ -218,17 +216,14 @@ def _law(law, name, quantum=None):
 
     if getattr(law.step, "stateful", False):
         raise SpecificationError(
-            f"The law {law.name!r} keeps its memory to itself.",
+            f"The law {law.name!r} keeps its state to itself.",
             "python-control asks for outputs and states apart, more than once per sample.",
-            nearest="A Law, whose memory is a state.",
             do="Run it by sv.close, or write it as a control.nlsys.",
         )
     m, n_z = len(law.inputs), len(law.state)
 
     def answer(t, z, y):
-        if quantum is not None:
-            y = np.where(quantum > 0, quantum * np.rint(y / np.where(quantum > 0, quantum, 1.0)), y)
-        return law.answer(t, np.append(y, z), law.row(t))
+        return law.answer(t, np.append(quantised(y, quantum), z), law.row(t))
 
     return control.nlsys(
         (lambda t, z, y, _: answer(t, z, y)[m : m + n_z]) if n_z else None,

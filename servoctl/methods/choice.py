@@ -7,12 +7,12 @@ import numpy as np
 from servoctl.checks import is_number, is_whole
 from servoctl.errors import SpecificationError, unknown
 from servoctl.methods.drift import SHORT_FORMS, MinimalCoordinates, Poles, Project
-from servoctl.methods.tableaus import ORDERS
+from servoctl.methods.radau import RADAU_ORDERS
+from servoctl.methods.runge_kutta import ORDERS
 
 SCIPY = ("RK23", "RK45", "DOP853", "Radau", "BDF", "LSODA")
 EXPLICIT, MULTISTEP = ("RK23", "RK45", "DOP853"), ("BDF", "LSODA")
 SUNDIALS = ("CVODES", "IDAS")
-RADAU_ORDERS = (5, 9, 13)
 LEAST_RTOL = 100 * np.finfo(float).eps  # least rtol of scipy's methods but LSODA
 HIGHEST = 40  # order of a series, and level of jets
 

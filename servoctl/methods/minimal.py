@@ -2,7 +2,7 @@
 
 At level j the invariants ψ_a^(j-o_a) = 0 of all rows of order o_a <= j determine as many components of γ^(j) (at level
 0, with the kinematics' own invariants, of q) as there are rows; the others, Σ o_a in all, are integrated. Which ones is
-chosen by pivoted QR, and anew when the choice degrades. Nothing is left to drift.
+chosen by pivoted QR, and again when the choice degrades. Nothing is left to drift.
 """
 
 import numpy as np
@@ -10,12 +10,12 @@ import numpy as np
 from servoctl.errors import IntegrationStopped
 from servoctl.reduction.ranks import equilibrate
 
-REACH = 2.0  # times as fast as the integrated values may the solved ones move before the choice is made anew
+REACH = 2.0  # times as fast as the integrated values may the solved ones move before the choice is made again
 BETTER = 2.0  # by how much another choice must be slower
-GROWN = 10.0  # times as large must a slope be for the sizes to be made anew
+GROWN = 10.0  # times as large must a slope be for the sizes to be taken again
 ITERATIONS, HALVINGS = 12, 40
 CONVERGED = 1e-10  # relative: the Newton step after which the next is below rounding
-ROUNDING = 1e-7  # relative: steps below this that shrink no more are rounding
+STALLED, SHRINKS = 1e-7, 0.3  # relative: steps below this that do not shrink to this part of the last are rounding
 
 
 class Sizes:
@@ -131,7 +131,7 @@ class Chart:
         return largest
 
     def improved(self, t, x):
-        """Choose anew where the choice has degraded and another is better; whether it was changed."""
+        """Choose again where the choice has degraded and another is better; whether it was changed."""
         self._grow(t, x)
         before = self.reach(t, x)
         if before <= REACH:
@@ -159,7 +159,7 @@ class Chart:
             size = np.abs(columns * step / np.maximum(np.abs(x), self.usual)[self.solved]).max(initial=0.0)
             if not np.isfinite(size):
                 break
-            if size <= CONVERGED or 0.3 * last < size <= ROUNDING:
+            if size <= CONVERGED or SHRINKS * last < size <= STALLED:
                 return x if np.linalg.slogdet(matrix)[0] == self.sign else np.full(self.n_x, np.nan)
             last = size
         return np.full(self.n_x, np.nan)

@@ -1,19 +1,200 @@
-"""The watch on rank: pivots that degrade are chosen anew; where no pivot helps, the program is singular."""
+"""The monitor of pivots: what becomes of them along a motion, and what follows from it.
+
+A pivot that changes its sign, touches zero, vanishes or stays at zero marks a state where the program is singular, or
+where only the choice of pivots fails; the equilibrated matrices L and B tell which. A pivot that degrades is replaced
+as soon as the matrices are far better than it.
+"""
+
+from dataclasses import dataclass
 
 import numpy as np
 
-from servoctl.errors import ServoError, SingularProgram
+from servoctl.errors import IntegrationStopped, ServoError, SingularProgram
 from servoctl.reduction.ranks import column_sizes
 
-DEGRADED = 0.02  # of its reference: a pivot below this is chosen anew, if the matrix itself is better than that
+DEGRADED = 0.02  # of its reference: a pivot below this is replaced, if the matrix itself is better than that
 HELPS = 5.0  # by how much the matrix must be better
 NEGLIGIBLE = 1e-7  # of its reference: a pivot below this is zero
 HOPELESS = 1e-9  # an equilibrated singular value below this leaves no digits
-NO_CHOICE = "no choice of pivots leads on"
 VANISHING = 0.03  # of its reference: a row whose gradient is below this has lost it
+LOST = 0.1  # of its best: a rank measure below this, and not the integrator, is why no step succeeds
+HIDES = 10.0  # times the root of a residual: a pivot that touches zero quadratically may be zero below this
+SHARE = 0.1  # of the largest entry of a null vector: what has less of it is not named
+LINGERS = 5.0  # times the way to its crossing that a pivot may stay at what the residual hides
+NO_CHOICE = "no choice of pivots leads on"
+FRACTIONS = (0.25, 0.5, 0.75)  # of a step with dense output: where pivots are inspected, beside its end
 
 
-class Watch:
+@dataclass(frozen=True)
+class Fine:
+    """The pivots allow all `steps` steps."""
+
+    steps: int
+
+
+@dataclass(frozen=True)
+class Singular:
+    """After `steps` whole steps the program is singular at t [s], X = x, for a reason."""
+
+    steps: int
+    t: float
+    x: np.ndarray
+    why: str
+
+
+@dataclass(frozen=True)
+class Repivot:
+    """After `steps` whole steps the motion goes on from t [s], X = x with other pivots.
+
+    Attributes
+    ----------
+    steps : int
+    t : float
+    x : (n_x,) array
+    variant : (Model, Monitor) or None
+        With other pivots; None where they are still to be chosen.
+    otherwise : Singular
+        What holds where no other pivots lead on.
+    """
+
+    steps: int
+    t: float
+    x: np.ndarray
+    variant: tuple | None
+    otherwise: Singular
+
+
+def _other_pivots(steps, t, x):
+    """The motion goes on from a state whose rank is there, with pivots that are still to be chosen."""
+    return Repivot(steps, t, x, None, Singular(steps, t, x, NO_CHOICE))
+
+
+@dataclass(frozen=True)
+class Stretch:
+    """Steps of a method without dense output: between their ends states and pivots are interpolated linearly.
+
+    Attributes
+    ----------
+    t : (S + 1,) array
+        Ends of the steps [s].
+    x : (n_x, S + 1) array
+        States there.
+    pivots : (n_g, S, m) array
+        At m instants of each step, the last of which is its end.
+    top : callable
+        γ^(s̄) from (t, X).
+    crosses : bool
+        Whether a step over a zero of a pivot is as good as any other, so that the motion goes on from its end.
+    """
+
+    t: np.ndarray
+    x: np.ndarray
+    pivots: np.ndarray
+    top: object
+    crosses: bool = False
+
+    def instants(self, k):
+        """Instants of step k at which pivots are known, its start first."""
+        return self.t[k : k + 2]
+
+    def inner_pivots(self, k):
+        """Pivots (n_g, N) at `instants` but for the start."""
+        return self.pivots[:, k]
+
+    def state(self, k, t):
+        """X at an instant of step k."""
+        s = (t - self.t[k]) / (self.t[k + 1] - self.t[k])
+        return (1 - s) * self.x[:, k] + s * self.x[:, k + 1]
+
+    def zero(self, k, i, ends, sizes):
+        """Where pivot i, which has opposite signs at both ends, vanishes between them."""
+        a, b = np.abs(sizes)
+        return ends[0] + a / (a + b) * (ends[1] - ends[0])
+
+    def least(self, k, i, instants, sizes, scale):
+        """Where pivot i is least in step k, and its size there relative to a scale, from such sizes at instants."""
+        j = int(np.argmin(sizes))
+        return instants[j], sizes[j]
+
+    def ranks_at(self, k, t):
+        """Instants at which the matrices must have their rank for a zero at t to be one of the pivots only."""
+        return self.t[k], t, self.t[k + 1]  # where the zero lies is known but roughly
+
+    def last_before(self, k, t):
+        """The last instant before t from which the motion may go on."""
+        return self.t[k]
+
+
+@dataclass(frozen=True)
+class DenseStretch(Stretch):
+    """Steps of a method with dense output.
+
+    Attributes
+    ----------
+    dense : callable
+        X from (k, t).
+    pivots_at : callable
+        Pivots from (t, X).
+    resumes : bool
+        Whether the dense output is as good as the steps, so that the motion may go on from within a step.
+    """
+
+    dense: object = None
+    pivots_at: object = None
+    resumes: bool = False
+
+    def instants(self, k):
+        """Instants of step k at which pivots are known, its start first."""
+        a, b = self.t[k : k + 2]
+        return np.array([a, *(a + s * (b - a) for s in FRACTIONS), b])
+
+    def inner_pivots(self, k):
+        """Pivots (n_g, N) at `instants` but for the start."""
+        if self.pivots.shape[2] > 1:
+            return self.pivots[:, k]
+        inner = [self.pivots_at(s, self.dense(k, s)) for s in self.instants(k)[1:-1]]
+        return np.column_stack([*inner, self.pivots[:, k]])
+
+    def state(self, k, t):
+        """X at an instant of step k."""
+        at = {self.t[k]: k, self.t[k + 1]: k + 1}.get(t)
+        return self.dense(k, t) if at is None else self.x[:, at]
+
+    def _pivot(self, k, i, t):
+        return self.pivots_at(t, self.dense(k, t))[i]
+
+    def zero(self, k, i, ends, sizes):
+        """Where pivot i, which has opposite signs at both ends, vanishes between them."""
+        from scipy.optimize import brentq
+
+        a, b = (self._pivot(k, i, t) for t in ends)
+        if np.sign(a) == np.sign(b):  # where states were projected the dense output differs from what was inspected
+            return ends[0] if abs(a) < abs(b) else ends[1]
+        return brentq(lambda s: self._pivot(k, i, s), *ends, xtol=1e-14)
+
+    def least(self, k, i, instants, sizes, scale):
+        """Where pivot i is least in step k, and its size there relative to a scale."""
+        from scipy.optimize import minimize_scalar
+
+        low, high = sorted(self.t[k : k + 2])
+        found = minimize_scalar(lambda s: abs(self._pivot(k, i, s)), bounds=(low, high), method="bounded",
+                                options={"xatol": 1e-10 * max(high - low, 1e-12)})  # fmt: skip
+        best = min([*instants, float(found.x)], key=lambda s: abs(self._pivot(k, i, s)))
+        return best, abs(self._pivot(k, i, best)) / scale
+
+    def ranks_at(self, k, t):
+        """Instants at which the matrices must have their rank for a zero at t to be one of the pivots only."""
+        return (t,)
+
+    def last_before(self, k, t):
+        """The last instant before t from which the motion may go on."""
+        if not self.resumes:
+            return self.t[k]
+        instants = self.instants(k)
+        return instants[max(int(np.searchsorted(np.abs(instants - instants[0]), abs(t - instants[0]))) - 1, 0)]
+
+
+class Monitor:
     """Pivots and matrices of a model along a motion.
 
     Parameters
@@ -22,8 +203,8 @@ class Watch:
     t : float
     x : (n_x,) array
         Where references are taken; they grow along the motion.
-    before : Watch, optional
-        The watch on the variant that this one replaces: its references are kept for columns and for the rows that
+    before : Monitor, optional
+        The monitor of the variant that this one replaces: its references are kept for columns and for the rows that
         both have, so that a row whose gradient has nearly vanished does not look new.
     """
 
@@ -81,12 +262,14 @@ class Watch:
         self.best = np.maximum(self.best, now)
         return float(np.min(now / np.where(self.best > 0, self.best, 1.0)))
 
-    def relative(self, guards):
-        """Pivots (n_g,) or (n_g, N) relative to the largest size that each has had until then."""
-        guards = np.asarray(guards)
-        if not guards.size:
-            return guards
-        sizes = np.abs(guards.reshape(len(guards), -1))
+    def begin(self, pivots):
+        """Take the pivots (n_g,) at the start of a piece as what the first step is compared with."""
+        self.sunk = None
+        self.recent = self._relative(pivots[:, None])[0]
+
+    def _relative(self, pivots):
+        """Pivots (n_g, N) relative to the largest size that each has had until then, and these sizes."""
+        sizes = np.abs(pivots)
         sizes = np.where(np.isfinite(sizes), sizes, 0.0)
         if self.reference is None:
             sizes[:, 0] *= self.lift
@@ -94,72 +277,148 @@ class Watch:
             sizes[:, 0] = np.maximum(sizes[:, 0], self.reference)
         largest = np.maximum.accumulate(sizes, axis=1)
         self.reference = largest[:, -1]
-        return guards / np.where(largest > 0, largest, 1.0).reshape(guards.shape)
+        return pivots / np.where(largest > 0, largest, 1.0), largest
 
-    def residual(self, t, x):
-        """Largest residual of the invariants, relative to their gradients at the start."""
-        value = self.invariants(t, x, self.model.parameters)[: self.m]
-        return float(np.abs(value / self.gradients).max(initial=0.0))
+    def inspect(self, stretch):
+        """Inspect the pivots along steps that follow those inspected before.
+
+        Parameters
+        ----------
+        stretch : Stretch
+
+        Returns
+        -------
+        Fine, Repivot or Singular
+        """
+        n_g, count, m = stretch.pivots.shape
+        if not stretch.pivots.size:
+            return Fine(count)
+        relative, largest = self._relative(stretch.pivots.reshape(n_g, -1))
+        track = np.column_stack([self.recent, relative])
+        first = self.recent.shape[1] - 1
+        weak = np.any(np.abs(track[:, first:]) < DEGRADED, axis=0)
+        changed = np.any(np.sign(track[:, first:-1]) * np.sign(track[:, first + 1 :]) < 0, axis=0)
+        suspicious = np.any((weak[1:] | changed).reshape(count, m), axis=1) | weak[:-1:m]
+        last = -1
+        for k in np.flatnonzero(suspicious):
+            if k > last + 1:
+                self.sunk = None
+            start = first + k * m
+            scale = largest[:, (k + 1) * m - 1]
+            outcome = self._step(stretch, k, track[:, max(start - 1, 0) : start + 1], np.where(scale > 0, scale, 1.0))
+            if outcome is not None:
+                return outcome
+            last = k
+        if last < count - 1:
+            self.sunk = None
+        self.recent = track[:, -2:]
+        return Fine(count)
+
+    def _step(self, stretch, k, before, scale):
+        """What one step leads to, None where all is well; `before` are relative pivots at and before its start."""
+        instants, after = stretch.instants(k), stretch.inner_pivots(k) / scale[:, None]
+        track = np.column_stack([before[:, -1], after])
+        changed = np.argwhere(np.sign(track[:, :-1]) * np.sign(track[:, 1:]) < 0)
+        if len(changed):
+            i, j = changed[np.argmin(changed[:, 1])]
+            t = stretch.zero(k, i, instants[j : j + 2], track[i, j : j + 2])
+            return self._vanishing(stretch, k, t, "a pivot changes its sign")
+        t = self._touched(stretch, k, np.abs(np.column_stack([before, after])), scale)
+        if t is not None:
+            return self._vanishing(stretch, k, t, "a pivot touches zero")
+        sizes = np.abs(track[:, 1:])
+        if sizes.min() < NEGLIGIBLE:
+            return self._vanishing(stretch, k, instants[1 + np.argmin(sizes.min(axis=0))], "a pivot has vanished")
+        weakest = np.abs(track[np.argmin(sizes[:, -1])])
+        lingering = self._lingers(k, instants[-2:], weakest[-2:], stretch.x[:, k + 1])
+        if lingering is not None:
+            return lingering
+        t, x = stretch.t[k + 1], stretch.x[:, k + 1]
+        degraded = weakest[-1] < DEGRADED and self.pivots_only(weakest[-1], t, x)
+        return _other_pivots(k + 1, t, x) if degraded else None
+
+    def _touched(self, stretch, k, sizes, scale):
+        """Where a pivot is least within a step and the residual hides its zero, or None."""
+        middle = sizes[:, 1:-1]
+        low = (middle < sizes[:, :-2]) & (middle <= sizes[:, 2:]) & (middle < DEGRADED)
+        for i in np.argwhere(low.T)[:, 1]:
+            t, size = stretch.least(k, i, stretch.instants(k), sizes[i, -len(stretch.instants(k)) :], scale[i])
+            if self.hidden_zero(size, t, stretch.state(k, t)):
+                return t
+        return None
+
+    def _vanishing(self, stretch, k, t, why):
+        """What follows from a pivot that vanishes at t in step k: only the choice of pivots fails, or the program."""
+        if min(self.rank_measure(s, stretch.state(k, s)) for s in stretch.ranks_at(k, t)) > DEGRADED:
+            if stretch.crosses:
+                return _other_pivots(k + 1, stretch.t[k + 1], stretch.x[:, k + 1])
+            before = stretch.last_before(k, t)
+            return _other_pivots(k, before, stretch.state(k, before))
+        x, before = stretch.state(k, t), stretch.last_before(k, t)
+        singular, start = Singular(k, t, x, why), stretch.state(k, before)
+        variant = self.repivoted(before, start, stretch.top(before, start))
+        helps = variant is not None and variant[1].rank_measure(t, x) > DEGRADED
+        return Repivot(k, before, start, variant, singular) if helps else singular
+
+    def _lingers(self, k, instants, sizes, x):
+        """That the program is singular if a pivot sank into what the residual hides, was to cross zero, and stays."""
+        t = instants[1]
+        if sizes[1] >= DEGRADED or not self.hidden_zero(sizes[1], t, x):
+            self.sunk = None
+            return None
+        if self.sunk is None:
+            slope = (sizes[0] - sizes[1]) / abs(t - instants[0])
+            ahead = sizes[1] / slope if slope > 0 else 0.0
+            self.sunk = (t + np.copysign(ahead, t - instants[0]), ahead, x)
+        crossing, ahead, at = self.sunk
+        if abs(t - crossing) < LINGERS * ahead or (t - crossing) * (t - instants[0]) < 0:
+            return None
+        return None if self.pivots_only(sizes[1], t, x) else Singular(k, crossing, at, "a pivot stays at zero")
 
     def lost(self, t, x):
         """Whether rank, not the integrator, is what fails at a state where no step succeeds."""
-        return self.rank_measure(t, x) < 0.1 or float(self.best.min()) < HOPELESS
+        return self.rank_measure(t, x) < LOST or float(self.best.min()) < HOPELESS
 
     def hidden_zero(self, relative, t, x):
         """Whether a relative pivot, or the matrices themselves, are so small that the residual hides a zero."""
-        return min(relative, self.rank_measure(t, x)) < max(NEGLIGIBLE, 10.0 * np.sqrt(self.residual(t, x)))
+        values = self.invariants(t, x, self.model.parameters)[: self.m]
+        residual = np.abs(values / self.gradients).max(initial=0.0)  # relative to the gradients at the start
+        return min(relative, self.rank_measure(t, x)) < max(NEGLIGIBLE, HIDES * np.sqrt(residual))
 
-    def chart_only(self, relative, t, x):
-        """Whether a degraded pivot is only a bad choice: the matrices themselves are far better."""
+    def pivots_only(self, relative, t, x):
+        """Whether a degraded pivot is only badly chosen: the matrices themselves are far better."""
         return self.rank_measure(t, x) > HELPS * max(abs(relative), NEGLIGIBLE)
 
     def refuse_start(self, t, x, outputs):
         """The error of a start at which the accelerations are not finite with any choice of pivots, or None."""
         return None if np.all(np.isfinite(outputs)) else self.singular(t, x, "the accelerations are not finite there")
 
-    def bad_choice(self, outputs, n_x):
-        """Whether the outputs of a right-hand side at the start show pivots far worse than the matrices."""
+    def bad_choice(self, outputs, pivots):
+        """Whether the outputs of a method's function at the start are not finite, or pivots far worse than matrices."""
         if not np.all(np.isfinite(outputs)):
             return True
         reference = self.model.guard_sizes
-        weakest = (np.abs(outputs[n_x:]) / np.where(reference > 0, reference, 1.0)).min(initial=1.0)
+        weakest = (np.abs(pivots) / np.where(reference > 0, reference, 1.0)).min(initial=1.0)
         return bool(weakest < DEGRADED and self.best.min() > HELPS * weakest)
 
-    def anew(self, t, x, top):
-        """The model with pivots chosen at a state x with γ^(s̄) = top, as far as that is finite, and the watch on it.
-
-        Returns
-        -------
-        (Model, Watch) or None
-            None where no choice is found.
-        """
+    def repivoted(self, t, x, top):
+        """The model with pivots chosen at x with γ^(s̄) = top, as far as that is finite, and its monitor; or None."""
         sizes = {name: size for name, size in zip(self.model.state_names, self.largest, strict=True) if size > 0}
         try:
             model = self.model.near(t, np.append(x, np.nan_to_num(top)), sizes)
-            return model, Watch(model, t, x, self)
+            return model, Monitor(model, t, x, self)
         except ServoError:
             return None
 
-    def other_choice(self, t, jets, later, state):
-        """The model with pivots and rows chosen anew at an instant, if that keeps its rank at a later state, else None.
+    def failed(self, t, x, why, *error):
+        """The error of a state from which no step leads on: rank is lost (`why`), or the method's own.
 
-        Parameters
-        ----------
-        t : float
-            Before the pivot vanishes [s].
-        jets : (n_z,) array
-            Jets there.
-        later : float
-            Where the pivot vanishes [s].
-        state : (n_x,) array
-            State there.
-
-        Returns
-        -------
-        (Model, Watch) or None
+        `error` says what happened, the rule, and what to do.
         """
-        variant = self.anew(t, jets[: len(state)], jets[len(state) :])
-        return variant if variant and variant[1].rank_measure(later, state) > DEGRADED else None
+        if self.lost(t, x):
+            return self.singular(t, x, why)
+        what, rule, do = error
+        return IntegrationStopped(what, rule, f"The motion before t = {t:.6g} s, which is kept.", do, t=float(t))
 
     def singular(self, t, x, why):
         """The error that tells where, which row, and which jets are zero there."""
@@ -178,15 +437,12 @@ class Watch:
         direction = self._null_direction(matrices)
         where = f", where {' and '.join(f'{name} = 0' for name in zero)}" if zero else ""
         dependent = [] if lost else self._dependent_rows(matrices[0])
-        what = (
-            f"the gradient of row {', '.join(map(repr, lost))} vanishes"
-            if lost
-            else f"the rows {', '.join(map(repr, dependent))} lose their rank"
-        )
+        what = f"the gradient of row {', '.join(map(repr, lost))} vanishes"
+        what = what if lost else f"the rows {', '.join(map(repr, dependent))} lose their rank"
         return SingularProgram(
             f"The program is singular at t = {t:.7g} s: {what}{where}; {why}.",
-            f"The smallest equilibrated singular value is {measure:.1e} of its best along the motion; in the direction "
-            f"of {', '.join(direction)} the equations say nothing.",
+            f"The smallest equilibrated singular value is {measure:.1e} of its best along the motion; accelerations "
+            f"are undetermined in the direction of {', '.join(direction)}.",
             nearest=f"The motion before t = {t:.6g} s, which is kept.",
             do="State the residual in a form whose gradient does not vanish (linear in velocities, not squared), "
             "or plan around this state.",
@@ -205,7 +461,7 @@ class Watch:
         norms = np.linalg.norm(scaled, axis=1)[:, None]
         scaled = scaled / np.where(norms > 0, norms, 1.0)
         weights = np.abs(np.linalg.svd(scaled)[0][:, -1])
-        return [self.l_names[j] for j in np.flatnonzero(weights > 0.1 * weights.max())]
+        return [self.l_names[j] for j in np.flatnonzero(weights > SHARE * weights.max())]
 
     def _null_direction(self, matrices):
         """Names of the accelerations that the rows leave open: the right null vector of L."""
@@ -215,4 +471,4 @@ class Watch:
             return list(names)
         rows = np.linalg.norm(leading / columns, axis=1)
         vector = np.abs(np.linalg.svd((leading / columns) / np.where(rows > 0, rows, 1.0)[:, None])[2][-1] / columns)
-        return [names[j] for j in np.flatnonzero(vector > 0.1 * vector.max())]
+        return [names[j] for j in np.flatnonzero(vector > SHARE * vector.max())]

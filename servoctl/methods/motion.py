@@ -1,9 +1,13 @@
-"""What every integrator shares: pieces of a motion, and where a pivot vanishes."""
+"""What every integration shares: pieces of a motion, and other pivots where the monitor wants them."""
 
 import contextlib
 from dataclasses import dataclass, field
+from itertools import pairwise
 
 import numpy as np
+
+from servoctl.methods.drift import Poles
+from servoctl.methods.monitor import VANISHING, Monitor, Repivot
 
 
 @dataclass
@@ -74,6 +78,104 @@ def breakpoints(span, knots):
     return [t0, *(inside if t1 >= t0 else reversed(inside)), t1]
 
 
-def sign_change(before, after):
-    """Indices of guards that change their sign between two samples."""
-    return np.flatnonzero(np.sign(before) * np.sign(after) < 0)
+def equal_steps(a, b, step):
+    """Length [s] and number of equal steps from a to b, the longest that are at most `step`; negative backwards."""
+    count = max(1, int(np.ceil(abs(b - a) / step * (1 - 1e-12))))
+    return (b - a) / count, count
+
+
+class Stepping:
+    """One integration: the model in use, the monitor of its pivots, and the motion so far.
+
+    A method takes the steps of a smooth piece in `_piece(a, x, b, times)` and returns the state at its end.
+
+    Parameters
+    ----------
+    model : Model
+    method : str
+    drift : None, Poles, Project or MinimalCoordinates
+    progress : callable
+    """
+
+    def __init__(self, model, method, drift, progress):
+        self.method, self.drift, self.progress, self.motion = method, drift, progress, Motion()
+        self._use(model)
+
+    def _use(self, model):
+        poles = isinstance(self.drift, Poles)
+        self.model, self.f, self.n_x = model, self._function(model, poles), len(model.state_names)
+        self.p = np.append(model.parameters, self.drift.coefficients(model)) if poles else model.parameters
+
+    def _function(self, model, poles):
+        """The compiled X' and pivots."""
+        return model.function("ode_poles" if poles else "ode")
+
+    def run(self, t0, x0, t1, t_eval, knots):
+        """Integrate from t0 to t1 [s].
+
+        Parameters
+        ----------
+        t0 : float
+        x0 : (n_x,) array
+        t1 : float
+        t_eval : (N,) array
+            Instants of the samples, in the order of the motion [s].
+        knots : sequence of float
+            At which steps end [s].
+
+        Returns
+        -------
+        Motion
+        """
+        with interruptible(self.motion):
+            x, cuts = x0, breakpoints((t0, t1), knots)
+            self._start(t0, x0, cuts[1])
+            for a, b in pairwise(cuts):
+                if self.motion.stop is not None:
+                    break
+                x = self._piece(a, x, b, t_eval[(t_eval >= min(a, b)) & (t_eval <= max(a, b))])
+        return self.motion
+
+    def _start(self, t, x, b):
+        """Choose other pivots at the start of the first piece, up to b, where the model's own are a bad choice."""
+        self.monitor = Monitor(self.model, t, x)
+        if self.monitor.bad_choice(self._outputs(t, x), self._pivots(t, x)):
+            variant = self.monitor.repivoted(t, x, self._top(t, x))
+            if variant is not None:
+                self._go_on(variant, t, x)
+            self.motion.stop = self.monitor.refuse_start(t, x, self._outputs(t, x))
+
+    def _outputs(self, t, x):
+        return self.f(t, x, self.p)
+
+    def _pivots(self, t, x):
+        return self._outputs(t, x)[self.n_x :]
+
+    def _top(self, t, x):
+        """γ^(s̄) at a state."""
+        return self._outputs(t, x)[self.n_x - self.model.n : self.n_x]
+
+    def _go_on(self, variant, t, x):
+        model, self.monitor = variant
+        self._use(model)
+        self.monitor.begin(self._pivots(t, x))
+        self.motion.count(pivot_changes=1)
+
+    def _follow(self, outcome):
+        """Go on with other pivots where the monitor says so; False where the program is singular."""
+        if isinstance(outcome, Repivot):
+            t, x = outcome.t, outcome.x
+            variant = None
+            if self.motion.changes_pivots(t):
+                variant = outcome.variant or self.monitor.repivoted(t, x, self._top(t, x))
+            if variant is not None:
+                self._go_on(variant, t, x)
+                return True
+            outcome = outcome.otherwise
+        self.motion.stop = self.monitor.singular(outcome.t, outcome.x, outcome.why)
+        return False
+
+    def _keep_last(self, t, x):
+        """Record the last state, whatever the samples; not so near a singularity that γ^(s̄) is lost."""
+        if self.monitor.rank_measure(t, x) > VANISHING:
+            self.motion.add(self.model, [t], x[:, None], self._top(t, x)[:, None])

@@ -1,23 +1,220 @@
-"""Integrations in bulk, watched and sampled afterwards; Radau IIA methods for stiff motions among them."""
+"""Radau IIA methods for stiff motions: tableaus, the compiled steps with exact Jacobians, and their integration."""
 
+import ctypes
+import functools
 from dataclasses import dataclass
 
 import numpy as np
 
-from servoctl.errors import IntegrationStopped
-from servoctl.methods.adaptive import INSIDE, Adaptive
-from servoctl.methods.bounds import warn_unresolved
-from servoctl.methods.drift import Poles, Project
-from servoctl.methods.monitor import DEGRADED, NO_CHOICE
-from servoctl.methods.radau_loop import first_step, inside, radau_steps
-from servoctl.methods.resolution import unresolved
+from servoctl.codegen.function import compiled
+from servoctl.codegen.loops import ROUNDING
+from servoctl.codegen.native import pointer
+from servoctl.errors import SpecificationError
+from servoctl.methods.bulk import BulkSteps
+from servoctl.methods.drift import Project
+from servoctl.methods.motion import equal_steps
 
-CHUNK = 200  # steps per call of the compiled loop
+RADAU_ORDERS = (5, 9, 13)
+LEAST_RTOL = {5: 1e-4, 9: 1e-7}  # above which an order needs less work than the next
+NEWTON_TOLERANCE = 1e-2  # of the Newton iteration, relative to the tolerance of a step
+TIGHT, PATIENT = 1e-4, 3  # the same where steps are fixed, and how many times more iterations they may take
+NEWTON_ITERATIONS = {5: 7, 9: 12, 13: 17}  # at most, by order (Hairer and Wanner 1999)
+
+
+# Stages by order. All are L-stable; the matrix of an odd number of stages has one real eigenvalue.
+STAGES = {5: 3, 9: 5, 13: 7}
+
+
+@functools.cache
+def radau(order):
+    """The Radau IIA method of an order (Hairer and Wanner 1996, IV.5 and IV.8).
+
+    Parameters
+    ----------
+    order : {5, 9, 13}
+
+    Returns
+    -------
+    c : (s,) array
+        Nodes, the last of which is 1.
+    rate : (s, s) array
+        A⁻¹: what takes increments of the stages to h times their rates, the derivative of the collocation polynomial.
+    from_pairs, to_pairs : (s, s) arrays
+        Real and imaginary parts of the eigenvectors of A⁻¹ as columns, and their inverse.
+    mu : ((s + 1)/2, 2) array
+        Eigenvalues of A⁻¹, real and imaginary parts: the real one, then one of each pair.
+    e : (s,) array
+        Weights of the increments in the error of the embedded method of order s.
+    """
+    from scipy.special import roots_jacobi
+
+    s = STAGES[order]
+    c = np.append((1.0 + roots_jacobi(s - 1, 1.0, 0.0)[0]) / 2.0, 1.0)
+    nodes = np.append(0.0, c)
+    gaps = nodes[:, None] - nodes + np.eye(s + 1)
+    weights = 1.0 / gaps.prod(axis=1)
+    derivative = weights / weights[:, None] / gaps
+    derivative[np.diag_indices(s + 1)] = (1.0 / gaps).sum(axis=1) - 1.0
+    rate = derivative[1:, 1:]
+    values, vectors = np.linalg.eig(rate)
+    real = np.argmin(np.abs(values.imag))
+    pairs = [i for i in np.argsort(values.imag) if values[i].imag > 1e-6]
+    columns = [vectors[:, real].real, *(part for i in pairs for part in (vectors[:, i].real, vectors[:, i].imag))]
+    from_pairs = np.array(columns).T
+    mu = np.array([[values[real].real, 0.0], *([values[i].real, -values[i].imag] for i in pairs)])
+    # The embedded quadrature has the weight 1/mu_0 at the start and is of order s: what it adds to the weights b_i,
+    # times A⁻¹; scaled so that (mu_0/h - J)⁻¹ (f + sum e_i z_i / h) is the error.
+    powers = np.vander(c, s, increasing=True).T
+    e = mu[0, 0] * np.linalg.solve(powers, np.append(-1.0 / mu[0, 0], np.zeros(s - 1))) @ rate
+    return c, rate, from_pairs, np.linalg.inv(from_pairs), mu, e
+
+
+def basis(c, theta):
+    """Lagrange polynomials of the nodes c, and 0, at theta (N,): an (s, N) array."""
+    nodes = np.append(0.0, c)
+    rows = [[k for k in range(len(nodes)) if k != j] for j in range(1, len(nodes))]
+    return np.array([np.prod([(theta - nodes[k]) / (nodes[j + 1] - nodes[k]) for k in r], axis=0)
+                     for j, r in enumerate(rows)])  # fmt: skip
 
 
 def radau_order(rtol):
     """The order of least work for a tolerance."""
-    return 5 if rtol > 1e-4 else 9 if rtol > 1e-7 else 13
+    return next((order for order, least in LEAST_RTOL.items() if rtol > least), RADAU_ORDERS[-1])
+
+
+def radau_loop(model, poles=False):
+    """The compiled X' of a model, whose library holds the loop over Radau IIA steps; with error dynamics if `poles`."""
+
+    def build():
+        e = model.equations
+        name, others = "RadauIIA_poles" if poles else "RadauIIA", {"jacobian": e.ode_jacobian(poles)}
+        return compiled(e.ode(poles), name, ("radau",), e.project(), others)
+
+    return model.once("RadauIIA with poles" if poles else "RadauIIA", build)
+
+
+@dataclass(frozen=True)
+class Settings:
+    """How Radau IIA steps are taken.
+
+    Attributes
+    ----------
+    order : {5, 9, 13}
+    rtol, atol : float
+        Tolerance of each entry of the state, relative and absolute, of the embedded method of order s.
+    fixed : bool
+        Whether all steps have the length of the first.
+    project_every : int
+        Steps between projections; 0 for none.
+    """
+
+    order: int
+    rtol: float
+    atol: float
+    fixed: bool = False
+    project_every: int = 0
+
+    @property
+    def iterations(self):
+        """The most iterations of Newton's method in a step."""
+        return NEWTON_ITERATIONS[self.order] * (PATIENT if self.fixed else 1)
+
+    @property
+    def tolerance(self):
+        """The tolerance of Newton's method, relative to that of a step."""
+        return max(TIGHT if self.fixed else NEWTON_TOLERANCE, 10 * ROUNDING / self.rtol)
+
+
+def radau_steps(f, t0, x0, t1, p, h, settings, max_steps):
+    """Radau IIA steps towards t1.
+
+    Parameters
+    ----------
+    f : Compiled
+        From `radau_loop`.
+    t0 : float
+        Start [s].
+    x0 : (n_x,) array
+        State at t0, SI.
+    t1 : float
+        End [s].
+    p : (n_p,) array
+        Parameters, SI.
+    h : float
+        Length of the first step [s], positive.
+    settings : Settings
+    max_steps : int
+
+    Returns
+    -------
+    t : (S + 1,) array
+        Starts of the steps, and where the last one ended [s]; short of t1 where steps vanish.
+    x : (n_x, S + 1) array
+        States there, SI.
+    z : (S, s, n_x) array
+        Increments of the stages.
+    h : float
+        Length that the next step should have [s].
+    counts : (4,) array
+        Rejected steps, evaluations of X', of the Jacobian, decompositions.
+    """
+    parts, n = radau(settings.order), len(x0)
+    s, table = len(parts[0]), np.concatenate([np.ravel(part) for part in parts])
+    x0, p = np.ascontiguousarray(x0, dtype=float), np.ascontiguousarray(p, dtype=float)
+    work, pivots = np.empty(n * n * (s + 2) + n * (2 * s + 2)), np.empty((s + 1) // 2 * n, dtype=np.int64)
+    t, x, y = np.empty(max_steps + 1), np.empty((max_steps + 1, n)), np.empty((max_steps, f.n_y))
+    z, step, counts = np.empty((max_steps, s, n)), np.array([float(h)]), np.zeros(4, dtype=np.int64)
+    run = f.native("radau")
+    run.restype = ctypes.c_int64
+    k = run(
+        ctypes.c_double(t0),
+        pointer(x0),
+        ctypes.c_double(t1),
+        pointer(p),
+        ctypes.c_int64(s),
+        pointer(table),
+        ctypes.c_int64(settings.iterations),
+        ctypes.c_double(settings.tolerance),
+        ctypes.c_int64(settings.fixed),
+        ctypes.c_double(settings.rtol),
+        ctypes.c_double(settings.atol),
+        ctypes.c_int64(settings.project_every),
+        ctypes.c_int64(max_steps),
+        *map(pointer, (step, work, pivots, t, x, y, z, counts)),
+    )
+    return t[: k + 1], x[: k + 1].T, z[:k], float(step[0]), counts
+
+
+def settle(f, t, x, p):
+    """States x (n_x, N) at times t (N,) moved onto the invariants, by the library of `radau_loop`."""
+    rows, t = np.array(x.T, dtype=float, order="C"), np.ascontiguousarray(t, dtype=float)
+    run, p = f.native("settle"), np.ascontiguousarray(p, dtype=float)
+    run.restype = None
+    run(ctypes.c_int64(len(t)), *map(pointer, (t, rows, p)))
+    return rows.T
+
+
+def inside(order, theta, z):
+    """Increments at fractions theta (N,) of steps from their stages z (..., s, n_x): (..., N, n_x)."""
+    return np.einsum("jm,...jl->...ml", basis(radau(order)[0], np.asarray(theta)), z)
+
+
+def first_step(f, t, x, p, span, settings):
+    """Length of a first step (Hairer, Nørsett and Wanner 1993, II.4); f is a Compiled with the outputs X', guards."""
+    n, power = len(x), 1.0 / (STAGES[settings.order] + 1)
+    scale = settings.atol + settings.rtol * np.abs(x)
+    slope = f(t, x, p)[:n]
+    d0, d1 = _size(x / scale), _size(slope / scale)
+    h = min(abs(span), 1e-6 if d0 < 1e-5 or d1 < 1e-5 else 0.01 * d0 / d1)
+    signed = np.copysign(h, span)
+    d2 = _size((f(t + signed, x + signed * slope, p)[:n] - slope) / scale) / h
+    longer = max(1e-6, h * 1e-3) if max(d1, d2) <= 1e-15 else (0.01 / max(d1, d2)) ** power
+    h = min(100 * h, longer, abs(span))
+    return h if np.isfinite(h) and h > 0 else 1e-6 * abs(span)
+
+
+def _size(v):
+    return float(np.sqrt(np.mean(np.square(v)))) if v.size else 0.0
 
 
 @dataclass(frozen=True)
@@ -53,84 +250,7 @@ class Steps:
         return self.x[:, :-1, None] + np.moveaxis(inside(self.order, theta, self.z), 2, 0)
 
 
-class InBulk(Adaptive):
-    """An integration that takes many steps at once, watched and sampled afterwards; `_steps` takes them."""
-
-    every = 0
-
-    def _piece(self, a, x, b):
-        self.pending, self._sunk = np.array(self.pending), None
-        self._begin(a, x, b)
-        history, t = [self._guards(a, x)], a
-        while t != b and self.motion.stop is None:
-            steps = self._steps(t, x, b)
-            stand, why = self._looked_at(steps, history)
-            self._record(steps, stand)
-            t, x = steps.t[stand], steps.x[:, stand].copy()
-            self.progress(t)
-            if why == "vanishes":
-                self._around(t, x, history)
-            elif why == "degrades":
-                self._other(self.watch.anew(t, x, self._top(t, x)), t, x, history, (t, x, NO_CHOICE))
-            elif steps.failed:
-                self._failed(t, x, "")
-                self._last(t, x)
-        return x
-
-    def _looked_at(self, steps, history):
-        """How many steps stand, and whether a pivot "vanishes" in the next or "degrades" there."""
-        total = len(steps.t) - 1
-        if not total or not history[0].size:
-            return total, ""
-        times = (steps.t[:-1, None] + np.outer(np.diff(steps.t), INSIDE)).ravel()
-        guards = self.f.grid(times, steps.within(np.array(INSIDE)).reshape(self.n_x, -1), self.p)[self.n_x :]
-        self.motion.count(watched=times.size)
-        reference = self.watch.reference
-        track = np.column_stack([history[-1], self.watch.relative(guards)])
-        quiet = np.all(np.sign(track[:, 1:]) * np.sign(track[:, :-1]) > 0) and np.all(np.abs(track) >= DEGRADED)
-        if quiet and self._sunk is None:
-            history[:] = [track[:, -2], track[:, -1]]
-            return total, ""
-        self.watch.reference = reference
-        for k in range(total):
-            start = (steps.t[k], steps.x[:, k].copy())
-            if self._watched(history, start, steps.t[k + 1], lambda s, k=k: steps.at(k, np.array([s]))[:, 0]):
-                return k, "vanishes"
-            if self._must_repivot:
-                return k + 1, "degrades"
-        return total, ""
-
-    def _around(self, t, x, history):
-        """Before a pivot vanishes: go on with another choice of pivots, or say that the program is singular."""
-        other = self.watch.other_choice(t, np.append(x, self._top(t, x)), *self._suspect[:2])
-        self._other(other if self.motion.changes_pivots(t) else None, t, x, history, self._suspect)
-
-    def _other(self, variant, t, x, history, suspect):
-        if variant is None:
-            self.motion.stop = self.watch.singular(*suspect)
-            self._last(t, x)
-        else:
-            self._go_on(variant)
-            history[:] = [self._guards(t, x)]
-
-    def _record(self, steps, stand):
-        """Record the pending samples within the first `stand` steps."""
-        direction = 1.0 if self.forward else -1.0
-        due = direction * self.pending <= direction * steps.t[stand]
-        times, self.pending = self.pending[due], self.pending[~due]
-        if not len(times):
-            return
-        owner = np.searchsorted(direction * steps.t[: stand + 1], direction * times, "right") - 1
-        states = steps.x[:, np.clip(owner, 0, stand)]
-        for k in np.unique(owner[owner < stand]):
-            states[:, owner == k] = steps.at(k, times[owner == k])
-        if self.every:
-            states = self.loop.settle(times, states, self.p)
-        top = self.f.grid(times, states, self.p)[self.n_x - self.model.n : self.n_x]
-        self.motion.add(self.model, times, states, top)
-
-
-class RadauMethod(InBulk):
+class RadauSteps(BulkSteps):
     """One integration by a Radau IIA method.
 
     Parameters
@@ -143,37 +263,38 @@ class RadauMethod(InBulk):
     step : float or None
         Length of fixed steps [s]; None adapts them.
     progress : callable
+
+    Raises
+    ------
+    SpecificationError
+        Where there is no C compiler.
     """
 
+    most = 200  # steps per call of the compiled loop
+
     def __init__(self, model, drift, rtol, atol, order, step, progress):
-        self.order, self.step = radau_order(rtol) if order is None else order, step
+        self.step, self.taken = step, []
         self.every = drift.every if isinstance(drift, Project) else 0
-        self.chunk = max(CHUNK - CHUNK % self.every, self.every) if self.every else CHUNK
-        super().__init__(model, "RadauIIA", drift, rtol, atol, progress)
+        self.most = max(self.most - self.most % self.every, self.every) if self.every else self.most
+        order = radau_order(rtol) if order is None else order
+        self.settings = Settings(order, rtol, atol, step is not None, self.every)
+        super().__init__(model, "RadauIIA", drift, progress)
 
-    def _use(self, model):
-        self.model = model
-        stabilised = isinstance(self.drift, Poles)
-        self.loop = radau_steps(model, stabilised)
-        self.f = self.loop.f
-        self.p = np.append(model.parameters, self.drift.coefficients(model)) if stabilised else model.parameters
-        self.n_x = self.f.n_x
+    def _function(self, model, poles):
+        f = radau_loop(model, poles)
+        if f.native("radau") is None:
+            raise SpecificationError(
+                "method='RadauIIA' was given, and there is no C compiler.",
+                "The loop over its steps is C code.",
+                nearest="method='Radau', scipy's of order 5.",
+                do="Take that, or install a C compiler (gcc or clang).",
+            )
+        return f
 
-    def run(self, t0, x0, t1, t_eval, knots):
-        """Integrate from t0 to t1; samples at t_eval. Fixed steps that do not resolve the motion are warned about."""
-        self.taken = []
-        motion = super().run(t0, x0, t1, t_eval, knots)
-        if self.step is not None and motion.stop is None and not motion.interrupted:
-            found = unresolved(self.taken, self._halved)
-            if found is not None:
-                step, _, difference, _ = found
-                warn_unresolved("RadauIIA", step, np.abs(difference).max())
-        return motion
-
-    def _halved(self, model, t, x, h):
+    def halved(self, model, t, x, h):
+        """States (n_x, 3) at t, t + h and t + 2 h by two steps; fewer where one fails."""
         self._use(model)
-        settings = (self.rtol, self.atol, 2, True, self.every)
-        return self.loop.steps(t, x, t + 2 * h, self.p, self.order, abs(h), *settings)[1]
+        return radau_steps(self.f, t, x, t + 2 * h, self.p, abs(h), self.settings, 2)[1]
 
     def _record(self, steps, stand):
         super()._record(steps, stand)
@@ -182,30 +303,32 @@ class RadauMethod(InBulk):
 
     def _begin(self, a, x, b):
         if self.step is None:
-            self.h = first_step(self.f, a, x, self.p, self.order, b - a, self.rtol, self.atol)
+            self.h = first_step(self.f, a, x, self.p, b - a, self.settings)
             self.motion.count(nfev=2)
         else:
-            self.h = abs(b - a) / max(1, np.ceil(abs(b - a) / self.step * (1 - 1e-12)))
+            self.h = abs(equal_steps(a, b, self.step)[0])
 
     def _steps(self, t, x, b):
-        settings = (self.rtol, self.atol, self.chunk, self.step is not None, self.every)
-        t, x, _, z, self.h, counts = self.loop.steps(t, x, b, self.p, self.order, self.h, *settings)
+        t, x, z, self.h, counts = radau_steps(self.f, t, x, b, self.p, self.h, self.settings, self.most)
         self.motion.count(steps=len(z), **dict(zip(("rejected", "nfev", "njev", "nlu"), counts, strict=True)))
         if self.every:
             self.motion.count(projections=len(z) // self.every)
             if t[-1] == b:
-                x = np.column_stack([x[:, :-1], self.loop.settle(t[-1:], x[:, -1:], self.p)])
-        return Steps(t, x, len(z) < self.chunk and t[-1] != b, self.order, z)
+                x = np.column_stack([x[:, :-1], self._settled(t[-1:], x[:, -1:])])
+        return Steps(t, x, len(z) < self.most and t[-1] != b, self.settings.order, z)
 
-    def _failed(self, t, x, message):
-        if self.watch.lost(t, x):
-            self.motion.stop = self.watch.singular(t, x, "the step of the integrator shrinks to nothing")
-            return
+    def _settled(self, times, states):
+        return settle(self.f, times, states, self.p) if self.every else states
+
+    def _fail(self, t, x):
         why = "its steps vanish" if self.step is None else "a fixed step is not solved by the Newton iteration"
-        self.motion.stop = IntegrationStopped(
+        self.motion.stop = self.monitor.failed(
+            t,
+            x,
+            "the step of the integrator shrinks to nothing",
             f"RadauIIA stopped at t = {t:.7g} s: {why}.",
             "A motion is integrated as far as its solution exists and steps can be solved.",
-            nearest=f"The motion before t = {t:.6g} s, which is kept.",
-            do="Take a smaller step or none, loosen rtol, or see whether the motion escapes.",
-            t=float(t),
+            "Take a smaller step or none, loosen rtol, or see whether the motion escapes.",
         )
+
+

@@ -1,15 +1,154 @@
-"""CVODES and IDAS of SUNDIALS, through CasADi: independent integrators for comparison."""
+"""CVODES and IDAS of SUNDIALS, through CasADi: independent integrators for comparison.
 
+CVODES integrates the ODE, IDAS the equations before elimination.
+"""
+
+import contextlib
+import io
+import signal
+import threading
 from dataclasses import dataclass
 
+import casadi as ca
 import numpy as np
 
-from servoctl.errors import IntegrationStopped
+from servoctl.methods.bulk import BulkSteps
 from servoctl.methods.drift import Poles
-from servoctl.methods.radau import InBulk
-from servoctl.methods.sundials_solver import MOST_STEPS, sundials_solver
 
 WATCHED = 1000  # intervals of a span at whose ends pivots are looked at, beside the samples
+MOST_STEPS = 20_000  # between two instants of the grid
+SOLVERS = {"CVODES": "cvodes", "IDAS": "idas"}
+COUNTS = {"steps": "nsteps", "nfev": "nfevals", "nlu": "nlinsetups"}
+
+
+def rows_unsolved(equations, poles=False):
+    """The rows that determine γ^(s̄), L γ^(s̄) + rest = 0, in the form in which they were differentiated.
+
+    Returns
+    -------
+    z : casadi.SX
+        γ^(s̄).
+    residual : casadi.SX
+    """
+    e, residual = equations, []
+    for a, level in enumerate(e.levels):
+        row = level[-1]
+        if poles:
+            row += sum(c * lower for c, lower in zip(e.coefficients[a], level[:-1], strict=True))
+        residual.append(row)
+    return ca.vertcat(*e.q.gamma(e.top)), ca.vertcat(*residual)
+
+
+@contextlib.contextmanager
+def _interrupts():
+    """A list that is no longer empty once Ctrl-C was pressed, which CasADi turns into a failure of the integrator."""
+    pressed, before = [], signal.getsignal(signal.SIGINT)
+    if threading.current_thread() is not threading.main_thread() or not callable(before):
+        yield pressed
+        return
+
+    def note(number, frame):
+        pressed.append(number)
+        raise KeyboardInterrupt
+
+    signal.signal(signal.SIGINT, note)
+    try:
+        yield pressed
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+class Sundials:
+    """A motion at the instants of a grid.
+
+    Parameters
+    ----------
+    equations : Equations
+    solver : {"CVODES", "IDAS"}
+        CVODES integrates X' = f(t, X); IDAS integrates X' = (V γ' + h, γ'', ..., γ^(s̄)) with L γ^(s̄) + rest = 0 beside
+        it, which no elimination has touched.
+    poles : bool
+        Whether rows carry error dynamics.
+    """
+
+    def __init__(self, equations, solver, poles=False):
+        self.solver = SOLVERS[solver]
+        e = equations
+        f = e.ode(poles)
+        self.n_x, t = f.numel_in(1), ca.SX.sym("t")
+        p, way = (
+            ca.SX.sym("p", f.numel_in(2)),
+            ca.SX.sym("way", 2),
+        )  # time is way[0] + way[1] t, so that it may run back
+        parts = {"t": t, "x": e.state, "p": ca.vertcat(p, way)}
+        if solver == "IDAS":
+            z, residual = rows_unsolved(e, poles)
+            extra = [c for row in e.coefficients for c in row] if poles else []
+            form = ca.Function("form", [e.q.t, e.state, z, ca.vertcat(e.parameters, *extra)], [e.rates(z), residual])
+            rates, rows = form(way[0] + way[1] * t, e.state, z, p)
+            self.parts = parts | {"z": z, "ode": way[1] * rates, "alg": rows}
+        else:
+            self.parts = parts | {"ode": way[1] * f(way[0] + way[1] * t, e.state, p)[: self.n_x]}
+
+    def run(self, t, x0, top, p, rtol, atol):
+        """States at the instants of a grid, as far as the integrator comes.
+
+        Parameters
+        ----------
+        t : (N,) array
+            Increasing or decreasing instants [s]; x0 holds at t[0].
+        x0 : (n_x,) array
+        top : (n,) array
+            γ^(s̄) there, from which IDAS starts.
+        p : (n_p,) array
+        rtol, atol : float
+
+        Returns
+        -------
+        x : (n_x, M) array
+            States at the first M instants; all N unless the integrator failed.
+        counts : dict of str to int
+            Steps, evaluations of f or of the residual, decompositions, as far as the solver tells.
+        """
+        forward = np.sign(t[-1] - t[0])
+        grid, p = forward * (t - t[0]), np.concatenate([p, [t[0], forward]])
+        options = {"reltol": rtol, "abstol": atol, "max_num_steps": MOST_STEPS, "disable_internal_warnings": True}
+        inputs = {"x0": x0, "p": p}
+        if self.solver == "idas":  # γ^(s̄) starts without a rate, so that no first step would pass a test of its error
+            inputs["z0"], options["suppress_algebraic"] = top, True
+        low, high, states, counts = 0, len(t), None, {}
+        count = high  # the integrator returns nothing where it fails: the last good end is sought
+        while low + 1 < high or states is None:
+            x, work = self._to(grid[:count], inputs, options) if count > 1 else (np.array(x0)[:, None], counts)
+            if x is None:
+                high = count
+            else:
+                low, states, counts = count, x, work
+                if count == len(t):
+                    break
+            count = (low + high) // 2
+        return states, counts
+
+    def _to(self, grid, inputs, options):
+        """States at the instants of a grid, None where the integrator fails; and counts."""
+        pressed = []
+        try:
+            integrator = ca.integrator("motion", self.solver, self.parts, 0.0, grid[1:], options)
+            with _interrupts() as pressed, contextlib.redirect_stderr(io.StringIO()):  # its complaints, raised below
+                states = np.array(integrator(**inputs)["xf"])
+        except RuntimeError as error:
+            if pressed:
+                raise KeyboardInterrupt from error
+            return None, {}
+        stats = integrator.stats()
+        counts = {name: int(stats[key]) for name, key in COUNTS.items() if key in stats}
+        return (np.column_stack([inputs["x0"], states]) if np.isfinite(states).all() else None), counts
+
+
+def sundials_solver(model, solver, poles=False):
+    """The integrator of a model by "CVODES" or "IDAS", with error dynamics if `poles`."""
+    key = f"{solver} with poles" if poles else solver
+    return model.once(key, lambda: Sundials(model.equations, solver, poles))
 
 
 @dataclass(frozen=True)
@@ -38,7 +177,7 @@ class Grid:
         return x0 + rise * (x1 - x0) + h * s * (1.0 - s) * ((1.0 - s) * slope0 - s * slope1)
 
 
-class SundialsMethod(InBulk):
+class SundialsSteps(BulkSteps):
     """One integration by CVODES, or by IDAS on the rows before elimination.
 
     Parameters
@@ -53,8 +192,8 @@ class SundialsMethod(InBulk):
     """
 
     def __init__(self, model, method, drift, rtol, atol, span, progress):
-        self.resolution = abs(span) / WATCHED
-        super().__init__(model, method, drift, rtol, atol, progress)
+        self.resolution, self.rtol, self.atol = abs(span) / WATCHED, rtol, atol
+        super().__init__(model, method, drift, progress)
 
     def _use(self, model):
         super()._use(model)
@@ -73,14 +212,12 @@ class SundialsMethod(InBulk):
         t, failed = grid[: states.shape[1]], states.shape[1] < len(grid)
         return Grid(t, states, self.f.grid(t, states, self.p)[: self.n_x], failed)
 
-    def _failed(self, t, x, message):
-        if self.watch.lost(t, x):
-            self.motion.stop = self.watch.singular(t, x, "the integrator finds no further step")
-            return
-        self.motion.stop = IntegrationStopped(
+    def _fail(self, t, x):
+        self.motion.stop = self.monitor.failed(
+            t,
+            x,
+            "the integrator finds no further step",
             f"{self.method} stopped at t = {t:.7g} s: no step succeeds, or {MOST_STEPS:,} reach no further sample.",
             "A motion is integrated as far as its solution exists and steps can be solved.",
-            nearest=f"The motion before t = {t:.6g} s, which is kept.",
-            do="Loosen rtol, give more t_eval, take 'RadauIIA', or see whether the motion escapes.",
-            t=float(t),
+            "Loosen rtol, give more t_eval, take 'RadauIIA', or see whether the motion escapes.",
         )

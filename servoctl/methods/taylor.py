@@ -1,18 +1,170 @@
-"""The Taylor method: compiled series steps, dense output from the coefficients, jets of any order."""
+"""The Taylor method: coefficients of a motion as one SX function, compiled steps, dense output, jets of any order.
+
+The coefficients follow the scheme of Pryce and Nedialkov's DAETS: at motion index κ row a contributes its Taylor
+coefficient κ - o_a, computed with γ_[κ] = 0, and L γ_[κ] = -((κ - o_a)!/κ!) [ψ_a]_(κ - o_a): every coefficient of the
+motion by one solve with the same L.
+"""
 
 from math import factorial
 
+import casadi as ca
 import numpy as np
 
-from servoctl.errors import IntegrationStopped
+from servoctl.codegen.function import compiled
+from servoctl.jets.series import Series, is_zero
+from servoctl.jets.tape import Tape
 from servoctl.methods.drift import Project
-from servoctl.methods.monitor import DEGRADED, NEGLIGIBLE, NO_CHOICE, Watch
-from servoctl.methods.motion import Motion, breakpoints, interruptible
-from servoctl.methods.series import series_loop
+from servoctl.methods.monitor import DenseStretch, Fine, Repivot
+from servoctl.methods.motion import Stepping
+from servoctl.reduction.elimination import eliminate
+from servoctl.reduction.ranks import clean
 
-CHUNK = 100  # steps per call of the compiled loop
-INSIDE = np.array([0.25, 0.5, 0.75])  # of a step: where pivots are looked at
 LOWEST, HIGHEST = 4, 24  # orders: below, steps are too short; above, compiling grows faster than steps
+
+
+class _Group:
+    """Rows of one order with their running series."""
+
+    def __init__(self, motion, order, members, expressions):
+        self.motion, self.order, self.members = motion, order, members
+        self.symbols = ca.symvar(ca.vertcat(*expressions))
+        self.inputs = [[] for _ in self.symbols]
+        tape = Tape(self.symbols, expressions)
+        self.series = Series(tape, self.inputs, self._decided(tape))
+
+    def _decided(self, tape):
+        """Values of what depends on time alone, at the instant by which branches are taken."""
+        place = self.motion.q.where
+        timed = [place(s) is None or place(s)[0] == "t" for s in self.symbols]
+        at = [[self.motion.branch if (place(s) or ("",))[0] == "t" else s] for s in self.symbols]
+        values, alone = Series(tape, at), []
+        values.advance()
+        for node in tape.nodes:
+            alone.append(timed[node.data] if node.kind == "input" else all(alone[a] for a in node.args))
+        return {i: values.c[i][0] for i, own in enumerate(alone) if own}
+
+    def advance(self, k):
+        """Coefficient k - order of the rows, from the motion's coefficients up to k."""
+        for i, symbol in enumerate(self.symbols):
+            self.inputs[i].append(self.motion.coefficient(symbol, k - self.order))
+        self.series.advance()
+        return [c[-1] for c in self.series.outputs]
+
+    def correct(self, k):
+        """The same again after γ_[k] was found."""
+        j = k - self.order
+        self.series.replace_last({i: self.motion.coefficient(s, j) for i, s in enumerate(self.symbols)})
+
+
+class _Motion:
+    """Coefficients of q and γ found so far."""
+
+    def __init__(self, equations):
+        self.q, self.top, self.branch = equations.q, equations.top, ca.SX.sym("t_branch")
+        self.gamma = {k: [s / factorial(k) for s in self.q.gamma(k)] for k in range(1, self.top)}
+        self.coordinates = {0: list(self.q)}
+        moving = (self.q.V @ ca.vertcat(*self.q.gamma(1)) + self.q.h).elements()
+        self.kinematics = None if self.q.plain else _Group(self, 1, range(self.q.nq), moving)
+        for k in range(1, self.top):
+            self._move(k)
+
+    def _move(self, k):
+        """q_[k] from q' = V w + h."""
+        if self.q.plain:
+            self.coordinates[k] = self.gamma[k]
+        else:
+            self.coordinates[k] = [c if is_zero(c) else c / k for c in self.kinematics.advance(k)]
+
+    def guess(self, k):
+        """γ_[k] = 0, and q_[k] as it then is."""
+        self.gamma[k] = [0.0] * self.q.n
+        self._move(k)
+
+    def settle(self, k, gamma):
+        """γ_[k] as found, and q_[k] with it."""
+        self.gamma[k] = gamma
+        if self.q.plain:
+            self.coordinates[k] = gamma
+        else:
+            self.kinematics.correct(k)
+            self.coordinates[k] = [c[-1] if is_zero(c[-1]) else c[-1] / k for c in self.kinematics.series.outputs]
+
+    def coefficient(self, symbol, j):
+        """Coefficient j of a symbol along the motion."""
+        place = self.q.where(symbol)
+        if place is None:
+            return symbol if j == 0 else 0.0
+        kind, level, i = place
+        if kind == "t":
+            return symbol if j == 0 else float(j == 1)
+        if kind == "q":
+            return self.coordinates[j][i]
+        c = self.gamma[level + j][i]
+        return 0.0 if is_zero(c) else c * float(factorial(level + j) // factorial(j))
+
+
+def taylor_coefficients(equations, last):
+    """Normalised Taylor coefficients of q and γ with index 1 .. last at a state.
+
+    Parameters
+    ----------
+    equations : Equations
+    last : int
+        At least s̄ + 1.
+
+    Returns
+    -------
+    casadi.Function
+        Of (t, X, p) with the instant by which paths take their branches appended to p; outputs q_[1], ..., q_[last]
+        (left out where q' = γ'), γ_[1], ..., γ_[last], guards.
+    """
+    r, q = equations.r, equations.q
+    motion = _Motion(equations)
+    groups = []
+    for order in sorted({row.order for row in r.rows}):
+        members = [a for a, row in enumerate(r.rows) if row.order == order]
+        groups.append(_Group(motion, order, members, [r.rows[a].expression for a in members]))
+        for k in range(order, equations.top):
+            groups[-1].advance(k)
+    numbers = clean(*r.points.matrix(r.leading))
+    for k in range(equations.top, last + 1):
+        motion.guess(k)
+        right = [None] * q.n
+        for group in groups:
+            scale = -factorial(k - group.order) / factorial(k)
+            for a, c in zip(group.members, group.advance(k), strict=True):
+                right[a] = ca.SX(c) * scale
+        solution, _ = eliminate(r.leading, ca.vertcat(*right), numbers)
+        motion.settle(k, [0.0 if x.is_zero() else x for x in solution.elements()])
+        for group in groups:
+            group.correct(k)
+    coefficients = [] if q.plain else [ca.SX(c) for k in range(1, last + 1) for c in motion.coordinates[k]]
+    coefficients += [ca.SX(c) for k in range(1, last + 1) for c in motion.gamma[k]]
+    outputs = [*coefficients, *(g for _, g in equations.guards)]
+    return equations.function("taylor", equations.state, outputs, motion.branch)
+
+
+def series_loop(model, last):
+    """The compiled Taylor coefficients of a model with index up to `last`, with their loop.
+
+    Parameters
+    ----------
+    model : Model
+    last : int
+        Highest index κ of the coefficients γ_[κ].
+
+    Returns
+    -------
+    Compiled
+    """
+
+    def build():
+        e, q = model.equations, model.reduction.mechanism.q
+        sizes = {"nq": q.nq, "n": q.n, "top": e.top, "last": last, "plain": int(q.plain)}
+        f = taylor_coefficients(e, last)
+        return compiled(f, f"taylor_{last}", ("taylor",), project=e.project(), sizes=sizes)
+
+    return model.once(f"taylor {last}", build)
 
 
 def order_for(rtol):
@@ -24,7 +176,7 @@ def order_for(rtol):
     return int(np.clip(np.ceil(5.0 - 0.5 * np.log(rtol)), LOWEST, HIGHEST))
 
 
-class SeriesMethod:
+class TaylorSteps(Stepping):
     """One integration by the Taylor method.
 
     Parameters
@@ -39,143 +191,76 @@ class SeriesMethod:
     progress : callable
     """
 
+    most = 100  # steps per call of the compiled loop
+
     def __init__(self, model, drift, rtol, atol, order, jets, progress):
-        self.rtol, self.atol, self.progress = rtol, atol, progress
+        self.rtol, self.atol = rtol, atol
         self.order = order_for(rtol) if order is None else order
         self.every = drift.every if isinstance(drift, Project) else 0
         self.jets = max(jets, model.reduction.top)
-        self.motion = Motion()
-        self._use(model)
+        super().__init__(model, "Taylor", drift, progress)
 
     def _use(self, model):
-        self.model = model
+        self.model, self.n_x = model, len(model.state_names)
         last = max(self.order + model.reduction.top - 1, self.jets + 1)
         self.f = series_loop(model, last)
         self.nq, self.n, self.top, self.last, self.plain = model.nq, model.n, model.reduction.top, last, model.plain
         self.n_c = (0 if self.plain else self.nq * last) + self.n * last
 
-    def run(self, t0, x0, t1, t_eval, knots):
-        """Integrate from t0 to t1; samples at t_eval."""
-        with interruptible(self.motion):
-            self.watch = Watch(self.model, t0, x0)
-            x, cuts = x0, breakpoints((t0, t1), knots)
-            self._start(t0, x0, (cuts[0] + cuts[1]) / 2)
-            for a, b in zip(cuts[:-1], cuts[1:], strict=True):
-                if self.motion.stop is not None:
-                    break
-                inside = (t_eval >= min(a, b)) & (t_eval <= max(a, b))
-                x = self._piece(a, x, b, t_eval[inside])
-        return self.motion
+    def _start(self, t, x, b):
+        self.p = np.append(self.model.parameters, (t + b) / 2)
+        super()._start(t, x, b)
 
-    def _start(self, t, x, after):
-        self.p = np.append(self.model.parameters, after)
-        y = self.f(t, x, self.p)
-        first = np.append(x, y[self.n_c :])
-        if not np.all(np.isfinite(y)) or self.watch.bad_choice(first, len(x)):
-            self._repivot(t, x)
-            self.motion.stop = self.watch.refuse_start(t, x, self.f(t, x, self.p))
+    def _pivots(self, t, x):
+        return self._outputs(t, x)[self.n_c :]
 
-    def _repivot(self, t, x):
-        """Go on with other pivots; whether there are any."""
-        variant = self.watch.anew(t, x, np.zeros(self.n))
-        if variant is None:
-            return False
-        model, self.watch = variant
-        self._use(model)
-        self.motion.count(pivot_changes=1)
-        return True
+    def _top(self, t, x):
+        """Zeros for γ^(s̄): it only starts the search for other pivots, and the series would give it at their cost."""
+        return np.zeros(self.n)
 
-    def _piece(self, a, x, b, pending):
+    def _piece(self, a, x, b, times):
         self.p = np.append(self.model.parameters, (a + b) / 2)  # paths take the branches of this piece
+        self.monitor.begin(self._pivots(a, x))
         while a != b and self.motion.stop is None:
-            t, states, y = self.f.taylor(a, x, b, self.p, self.rtol, self.atol, CHUNK, self.every)
-            steps = len(t) - 1
-            stand, where, why, repivot = self._check(t, states, y)
+            t, states, y = self.f.taylor(a, x, b, self.p, self.rtol, self.atol, self.most, self.every)
+            outcome = self.monitor.inspect(self._stretch(t, states, y))
+            fine, stand = isinstance(outcome, Fine), outcome.steps
             self.motion.count(steps=stand, nfev=stand)
-            end = t[stand] if where is None else where
-            pending = self._sample(t, states, y, pending, end)
-            if repivot and where is not None:
-                a, x = where, self._state(t, states, y, where)
-            else:
-                a, x = t[stand], states[:, stand].copy()
+            times = self._sample(t, states, y, times, t[stand] if fine else outcome.t)
+            go_on = isinstance(outcome, Repivot)
+            a, x = (outcome.t, outcome.x) if go_on else (t[stand], states[:, stand].copy())
             self.progress(a)
-            if repivot:
-                if not (self.motion.changes_pivots(a) and self._repivot(a, x)):
-                    self.motion.stop = self.watch.singular(a, x, NO_CHOICE)
-            elif why:
-                at = self._state(t, states, y, where)
-                self.motion.stop = self.watch.singular(where, at, why)
-            elif steps < CHUNK and a != b:
-                self._stopped(a, x)
-        if len(pending) and self.motion.stop is None:
-            self._sample(np.array([a, a]), np.column_stack([x, x]), self._outputs(a, x), pending, a)
+            if not fine:
+                self._follow(outcome)
+            elif stand < self.most and a != b:
+                self._fail(a, x)
+        if len(times) and self.motion.stop is None:
+            self._sample(np.array([a, a]), np.column_stack([x, x]), self._outputs(a, x)[:, None], times, a)
         return x
 
-    def _outputs(self, t, x):
-        return self.f(t, x, self.p)[:, None]
+    def _stretch(self, t, states, y):
+        """The steps; between their ends pivots are evaluated only where one may vanish, at the cost of a step each."""
+        ends = np.column_stack([y[self.n_c :, 1:], self._pivots(t[-1], states[:, -1])]) if len(t) > 1 else y[self.n_c :]
+        return DenseStretch(
+            t,
+            states,
+            ends[:, :, None],
+            self._top,
+            dense=lambda k, s: self._jets(states[:, k], y[:, k], np.array([s - t[k]]), self.top - 1)[:, 0],
+            pivots_at=self._pivots,
+            resumes=True,
+        )
 
     def _coefficients(self, y):
         """Coefficients of q and of γ with index 1 .. last."""
-        own = y[: self.nq * self.last].reshape(self.last, self.nq)
-        c = own if self.plain else y[self.nq * self.last : self.n_c].reshape(self.last, self.n)
-        return own, c
+        of_q = y[: self.nq * self.last].reshape(self.last, self.nq)
+        return of_q, of_q if self.plain else y[self.nq * self.last : self.n_c].reshape(self.last, self.n)
 
     def _jets(self, x, y, h, top):
         """Jets q, γ', ..., γ^(top) at times h (N,) after a step's start, (nq + top n, N)."""
-        own, c = self._coefficients(y)
-        rows = [x[: self.nq, None] + _level(own, 0, h)]
-        return np.concatenate([*rows, *(_level(c, j, h) for j in range(1, top + 1))])
-
-    def _state(self, t, states, y, when):
-        direction = np.sign(t[-1] - t[0])
-        k = min(int(np.searchsorted(direction * t, direction * when, "right")) - 1, y.shape[1] - 1)
-        return self._jets(states[:, k], y[:, k], np.array([when - t[k]]), self.top - 1)[:, 0]
-
-    def _check(self, t, states, y):
-        """Whole steps that stand, where the next one is left, why, and whether other pivots lead on from there."""
-        steps = y.shape[1]
-        if not steps or y.shape[0] == self.n_c:
-            return steps, None, "", False
-        ends = np.column_stack([y[self.n_c :], self.f(t[-1], states[:, -1], self.p)[self.n_c :]])
-        track = np.abs(self.watch.relative(ends))
-        suspicious = np.any(np.sign(ends[:, :-1]) * np.sign(ends[:, 1:]) < 0, axis=0)
-        suspicious |= np.any((track[:, :-1] < DEGRADED) | (track[:, 1:] < DEGRADED), axis=0)
-        for k in np.flatnonzero(suspicious):
-            inside = t[k] + INSIDE * (t[k + 1] - t[k])
-            between = self._jets(states[:, k], y[:, k], inside - t[k], self.top - 1)
-            middle = [self.f(s, between[:, i], self.p)[self.n_c :] for i, s in enumerate(inside)]
-            found = self._vanishing(
-                self.watch.relative(np.array([ends[:, k], *middle, ends[:, k + 1]]).T),
-                [t[k], *inside, t[k + 1]],
-                *(k, t, states, y),
-            )
-            if found is not None:
-                return found
-        return steps, None, "", False
-
-    def _vanishing(self, track, instants, k, t, states, y):
-        changed = np.argwhere(np.sign(track[:, :-1]) * np.sign(track[:, 1:]) < 0)
-        weak = np.argwhere(np.abs(track) < NEGLIGIBLE)
-        if len(changed) or len(weak):
-            i, j = changed[np.argmin(changed[:, 1])] if len(changed) else weak[np.argmin(weak[:, 1])]
-            where = instants[j]
-            if len(changed):
-                where = self._root(i, instants[j], instants[j + 1], t, states, y)
-            at = self._state(t, states, y, where)
-            until = instants[j if len(changed) else max(j - 1, 0)]
-            before = np.append(self._state(t, states, y, until), np.zeros(self.n))
-            if self.watch.rank_measure(where, at) > DEGRADED or self.watch.other_choice(until, before, where, at):
-                return k, until, "", True
-            return k, where, "a pivot changes its sign" if len(changed) else "a pivot has vanished", False
-        lowest = np.abs(track[:, -1])
-        if lowest.min(initial=1.0) < DEGRADED and self.watch.chart_only(lowest.min(), t[k + 1], states[:, k + 1]):
-            return k + 1, None, "", True
-        return None
-
-    def _root(self, i, a, b, t, states, y):
-        from scipy.optimize import brentq
-
-        return brentq(lambda s: self.f(s, self._state(t, states, y, s), self.p)[self.n_c + i], a, b, xtol=1e-13)
+        of_q, of_gamma = self._coefficients(y)
+        q = x[: self.nq, None] + _level(of_q, 0, h)
+        return np.concatenate([q, *(_level(of_gamma, j, h) for j in range(1, top + 1))])
 
     def _sample(self, t, states, y, pending, end):
         """Record pending samples up to `end`; those that remain."""
@@ -188,23 +273,21 @@ class SeriesMethod:
             k = np.clip(np.searchsorted(direction * t, direction * times, "right") - 1, 0, y.shape[1] - 1)
             parts = np.empty((self.nq + self.jets * self.n, len(times)))
             for step in np.unique(k):
-                own = k == step
-                parts[:, own] = self._jets(states[:, step], y[:, step], times[own] - t[step], self.jets)
+                here = k == step
+                parts[:, here] = self._jets(states[:, step], y[:, step], times[here] - t[step], self.jets)
             n_x = len(states)
             self.motion.add(self.model, times, parts[:n_x], parts[n_x:])
         return pending[~due]
 
-    def _stopped(self, t, x):
-        if self.watch.lost(t, x):
-            self.motion.stop = self.watch.singular(t, x, "the radius of convergence shrinks to nothing")
-        else:
-            self.motion.stop = IntegrationStopped(
-                f"The Taylor method stopped at t = {t:.7g} s: its steps vanish or are not finite.",
-                "A step is as long as the series converges.",
-                nearest=f"The motion before t = {t:.6g} s, which is kept.",
-                do="See whether the motion escapes or meets a point where it is not smooth.",
-                t=float(t),
-            )
+    def _fail(self, t, x):
+        self.motion.stop = self.monitor.failed(
+            t,
+            x,
+            "the radius of convergence shrinks to nothing",
+            f"The Taylor method stopped at t = {t:.7g} s: its steps vanish or are not finite.",
+            "A step is as long as the series converges.",
+            "See whether the motion escapes or meets a point where it is not smooth.",
+        )
 
 
 def _level(c, j, h):

@@ -185,12 +185,6 @@ class Equations:
         values = ca.vertcat(*(e for _, _, e in self.invariant_rows))
         return self.function("invariants", self.state, [values, ca.vec(ca.densify(ca.jacobian(values, self.state)))])
 
-    def metric(self):
-        """The inertia matrix M, column by column, at the state."""
-        mass = ca.substitute(self.r.mechanism.mass, self.q.jet(2), ca.SX.zeros(self.q.n))
-        frame = ca.vec(ca.densify(self.q.V))
-        return self.function("metric", self.state, [ca.vec(ca.densify(mass)), frame])
-
     def project(self):
         """The least change of the state in the metric M (δq = V δγ) that restores the invariants, level by level."""
         r, q, changes = self.r, self.q, []
@@ -342,7 +336,6 @@ EQUATIONS = {  # what `compiled` makes of each: the function, its loops, its pro
     "ode_poles_jacobian": lambda e: (e.ode_jacobian(poles=True),),
     "path": lambda e: (e.path(), ("newton",)),
     "invariants": lambda e: (e.invariants(),),
-    "metric": lambda e: (e.metric(),),
     "matrices": lambda e: (e.matrices(),),
     "plant": lambda e: (e.plant(),),
     "multiplier_form": lambda e: (e.multiplier_form(),),

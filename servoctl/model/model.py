@@ -250,7 +250,7 @@ class Model:
         Parameters
         ----------
         name : str
-            "ode", "ode_projected", "ode_poles", "ode_jacobian", "ode_poles_jacobian", "path", "invariants", "metric",
+            "ode", "ode_projected", "ode_poles", "ode_jacobian", "ode_poles_jacobian", "path", "invariants",
             "matrices", "plant", "multiplier_form", or "accelerations".
 
         Returns

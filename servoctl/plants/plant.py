@@ -7,7 +7,6 @@ import numpy as np
 
 from servoctl.checks import column, finite, interval, mapping, numbers_by_name
 from servoctl.codegen.function import compiled
-from servoctl.codegen.loops.closed import DRIVER
 from servoctl.errors import SpecificationError, unknown
 from servoctl.plants.equations import PlantEquations
 from servoctl.spec.mechanism import Mechanism, require_known
@@ -166,8 +165,8 @@ class Plant:
         if name not in self._functions:
             e = self.equations
             build = {
-                "ode": lambda: (e.ode(), (), e.project(), None, DRIVER),
-                "ode_power": lambda: (e.ode_power(), (), e.project(extra=1), None, DRIVER),
+                "ode": lambda: (e.ode(), ("closed",), e.project()),
+                "ode_power": lambda: (e.ode_power(), ("closed",), e.project(extra=1)),
                 "jacobian": lambda: (e.jacobian(),),
                 "directions": lambda: (e.directions(),),
                 "power": lambda: (e.power(),),

@@ -4,7 +4,7 @@ import servoctl as sv
 from servoctl.errors import ServoError
 from servoctl.methods.choice import as_method, default_method
 from servoctl.methods.drift import as_drift
-from servoctl.methods.tableaus import ORDERS
+from servoctl.methods.runge_kutta import ORDERS
 from servoctl.shell import loop
 from servoctl.shell.folder import FILES, LOOP_FILES, Report, complain, folder_of, summary
 from servoctl.shell.motion import described

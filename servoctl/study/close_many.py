@@ -102,7 +102,7 @@ def close_many(run, cases, *, scale=None, record=(), every=1, threads=None):
     traced, every = _traced(record, derived.names, every)
     seeds = _seeds(run.conditions.sensors, len(columns[next(iter(columns))]))
     threads = threads if threads is None else whole("threads", threads, least=1)
-    gathered = run_batch(derived, loop, *numbers, _noise(run, seeds), traced, every, threads)
+    gathered = run_batch(derived, loop, numbers, _noise(run, seeds), traced, every, threads)
     if gathered is None:
         gathered = _one_by_one(run, derived, loop, numbers, seeds, traced, every)
     meta = {

@@ -1,8 +1,7 @@
 """The largest stable step of every method along a plan, from the linearised step map.
 
-Near the manifold of the constraints the state splits in two. *Along* it move the Σ o_a internal states: in a frame N,
-orthonormal in the tangent space and carried along without turning in it (Nᵀ N' = 0), deviations N y obey y' = Nᵀ J N y
-with J = ∂X'/∂X; each state is measured by its size along the plan. *Off* it, every row that was raised ρ times obeys
+Near the manifold of the constraints the state splits in two. *Along* it move the Σ o_a internal states, as
+`internal_dynamics` linearises them. *Off* it, every row that was raised ρ times obeys
 the error dynamics that the drift treatment gives it, whatever the motion: D^ρ ψ = 0 (ρ neutral eigenvalues),
 Π(D - λ) ψ = 0 (the poles), or nothing at all (projection, minimal coordinates). One step multiplies a mode of
 eigenvalue λ by R(hλ), the method's stability function.
@@ -14,14 +13,14 @@ import numpy as np
 
 from servoctl.checks import positives
 from servoctl.errors import SpecificationError
-from servoctl.methods.bounds import amplification, row_poles
+from servoctl.internal_dynamics import linearised
 from servoctl.methods.drift import Poles, as_drift
-from servoctl.methods.tableaus import ORDERS
+from servoctl.methods.runge_kutta import ORDERS
+from servoctl.methods.stability import amplification, row_poles
 
-TABULATED = (*ORDERS, "Taylor", "RadauIIA")
+MAPPED = (*ORDERS, "Taylor", "RadauIIA")
 RADAU_ORDER = 5  # unless it is given; all are L-stable
-MOST_INSTANTS = 101  # of the plan, where eigenvalues are taken: adjacent ones are alike on plans of some smoothness
-NEGLIGIBLE = 1e-9  # size of a state relative to the largest: rounding of one that stays zero
+PLAN_INSTANTS = 101  # of the plan, where eigenvalues are taken: adjacent ones are alike on plans of some smoothness
 GROWTH = 2.0  # by which counted errors may grow over the plan; neutral modes and rounding stay below that
 PER_DECADE, DECADES = 30, 7  # of steps tried below the length of the plan
 
@@ -178,7 +177,7 @@ class StabilityMap:
             f"  off the manifold: {story}; neutral without treatment, at the poles with, removed by projection",
             f"  largest step [s] {'no poles':>12}" + "".join(f"{f'T = {T:g} s':>12}" for T in shown[1:]),
         ]
-        for method in TABULATED:
+        for method in MAPPED:
             name = f"Taylor {self.order}" if method == "Taylor" else method
             steps = (self.largest_step(method, drift) for drift in shown)
             lines.append(f"  {name:<16} " + "".join(f"{_step_text(step):>12}" for step in steps))
@@ -217,48 +216,21 @@ def stability(model, run, order=12):
     Coefficients are frozen at each instant; eigenvalues of a motion that turns fast are uncertain by the rate at which
     its manifold turns. Far from the imaginary axis, where steps become unstable, that is little.
     """
-    n_x = len(model.state_names)
-    names = tuple(getattr(run, "jet_names", ()))[:n_x]
+    names = tuple(getattr(run, "jet_names", ()))[: len(model.state_names)]
     if names != tuple(model.state_names) or len(run.t) < 2:
         raise SpecificationError(
             f"The run has {len(run.t)} samples of {', '.join(names)}." if names else f"run={run!r} was given.",
             f"The plan is a motion of the model, whose state is {', '.join(model.state_names)}.",
             do="Give the run that simulate(model, ...) returned.",
         )
-    keep = np.unique(np.linspace(0, len(run.t) - 1, MOST_INSTANTS).round().astype(int))
-    jacobians, normals = _along(model, run, keep, n_x)
-    finite = np.isfinite(jacobians).all(axis=(1, 2)) & np.isfinite(normals).all(axis=(1, 2))
-    if finite.sum() < 2:
+    t, matrices, _ = linearised(model, run, PLAN_INSTANTS)
+    if len(t) < 2:
         raise SpecificationError(
             "The Jacobian of the motion is not finite along the run.",
             "Stability is read off the linearised motion.",
             do="Check the run by verify(model, run).",
         )
-    size = np.abs(run.jets[:n_x]).max(axis=1)
-    size[size <= NEGLIGIBLE * size.max()] = 1.0
-    jacobians, normals = jacobians[finite] * size / size[:, None], normals[finite] * size
-    rates = np.array([_internal_rates(J, C, model.free) for J, C in zip(jacobians, normals, strict=True)])
-    return StabilityMap(run.t[keep][finite], rates, model, order)
-
-
-def _along(model, run, keep, n_x):
-    """∂X'/∂X (N, n_x, n_x) and the invariants' Jacobian (N, m, n_x) at samples of a run."""
-    jacobians, normals = [], []
-    for first, end, variant in run.variants or ((0, len(run.t), model),):
-        rows = keep[(keep >= first) & (keep < end)]
-        if len(rows):
-            t, x, p = run.t[rows], run.jets[:n_x, rows], variant.parameters
-            jacobians.append(variant.function("ode_jacobian").grid(t, x, p).T.reshape(-1, n_x, n_x).swapaxes(1, 2))
-            m = len(variant.invariant_names())
-            y = variant.function("invariants").grid(t, x, p)[m:]
-            normals.append(y.T.reshape(len(rows), n_x, m).swapaxes(1, 2))
-    return np.concatenate(jacobians), np.concatenate(normals)
-
-
-def _internal_rates(J, C, free):
-    """Eigenvalues of Nᵀ J N, the columns of N orthonormal in ker C; where nothing moves there are none."""
-    N = np.linalg.svd(C)[2][len(C[0]) - free :].T
-    return np.linalg.eigvals(N.T @ J @ N).astype(complex)
+    return StabilityMap(t, np.linalg.eigvals(matrices).astype(complex), model, order)
 
 
 def _step_text(step):

@@ -1,71 +1,12 @@
-"""Radau IIA methods as data, and their adaptive steps as C text."""
+/* Adaptive steps of the Radau IIA methods (Hairer and Wanner 1996, IV.8). */
+#include "unit.h"
+#include "restore.h"
 
-import functools
-
-import numpy as np
-
-# Stages by order. All are L-stable; the matrix of an odd number of stages has one real eigenvalue.
-STAGES = {5: 3, 9: 5, 13: 7}
-
-
-@functools.cache
-def radau(order):
-    """The Radau IIA method of an order (Hairer and Wanner 1996, IV.5 and IV.8).
-
-    Parameters
-    ----------
-    order : {5, 9, 13}
-
-    Returns
-    -------
-    c : (s,) array
-        Nodes, the last of which is 1.
-    rate : (s, s) array
-        A⁻¹: what takes increments of the stages to h times their rates, the derivative of the collocation polynomial.
-    from_pairs, to_pairs : (s, s) arrays
-        Real and imaginary parts of the eigenvectors of A⁻¹ as columns, and their inverse.
-    mu : ((s + 1)/2, 2) array
-        Eigenvalues of A⁻¹, real and imaginary parts: the real one, then one of each pair.
-    e : (s,) array
-        Weights of the increments in the error of the embedded method of order s.
-    """
-    from scipy.special import roots_jacobi
-
-    s = STAGES[order]
-    c = np.append((1.0 + roots_jacobi(s - 1, 1.0, 0.0)[0]) / 2.0, 1.0)
-    nodes = np.append(0.0, c)
-    gaps = nodes[:, None] - nodes + np.eye(s + 1)
-    weights = 1.0 / gaps.prod(axis=1)
-    derivative = weights / weights[:, None] / gaps
-    derivative[np.diag_indices(s + 1)] = (1.0 / gaps).sum(axis=1) - 1.0
-    rate = derivative[1:, 1:]
-    values, vectors = np.linalg.eig(rate)
-    real = np.argmin(np.abs(values.imag))
-    pairs = [i for i in np.argsort(values.imag) if values[i].imag > 1e-6]
-    columns = [vectors[:, real].real, *(part for i in pairs for part in (vectors[:, i].real, vectors[:, i].imag))]
-    from_pairs = np.array(columns).T
-    mu = np.array([[values[real].real, 0.0], *([values[i].real, -values[i].imag] for i in pairs)])
-    # The embedded quadrature has the weight 1/mu_0 at the start and is of order s: what it adds to the weights b_i,
-    # times A⁻¹; scaled so that (mu_0/h - J)⁻¹ (f + sum e_i z_i / h) is the error.
-    powers = np.vander(c, s, increasing=True).T
-    e = mu[0, 0] * np.linalg.solve(powers, np.append(-1.0 / mu[0, 0], np.zeros(s - 1))) @ rate
-    return c, rate, from_pairs, np.linalg.inv(from_pairs), mu, e
-
-
-def basis(c, theta):
-    """Lagrange polynomials of the nodes c, and 0, at theta (N,): an (s, N) array."""
-    nodes = np.append(0.0, c)
-    rows = [[k for k in range(len(nodes)) if k != j] for j in range(1, len(nodes))]
-    return np.array([np.prod([(theta - nodes[k]) / (nodes[j + 1] - nodes[k]) for k in r], axis=0)
-                     for j, r in enumerate(rows)])  # fmt: skip
-
-
-STEPS = """
 /* LU decomposition with partial pivoting of a complex matrix, real and imaginary parts side by side; the diagonal keeps
    the inverses of the pivots. */
-static int NAME_factor(double *a, int64_t *pivot)
+static int factor(double *a, int64_t *pivot)
 {
-    const int64_t n = NAME_nx;
+    const int64_t n = NX;
     for (int64_t k = 0; k < n; k++) {
         double best = 0;
         for (int64_t i = k; i < n; i++) {
@@ -98,9 +39,9 @@ static int NAME_factor(double *a, int64_t *pivot)
     return 1;
 }
 
-static void NAME_backsolve(const double *a, const int64_t *pivot, double *b)
+static void backsolve(const double *a, const int64_t *pivot, double *b)
 {
-    const int64_t n = NAME_nx;
+    const int64_t n = NX;
     for (int64_t k = 0; k < n; k++) {
         double re = b[2 * pivot[k]], im = b[2 * pivot[k] + 1];
         b[2 * pivot[k]] = b[2 * k];
@@ -131,12 +72,12 @@ typedef struct {
     const double *c, *rate, *from_pairs, *to_pairs, *mu, *e, *p;
     double tol, floor, *jacobian, *lu, *scale, *r, *b;
     int64_t *pivots, nfev, njev, nlu, rejected;
-} NAME_method;
+} Method;
 
 /* The (s + 1)/2 matrices mu/h - J. */
-static int NAME_prepare(NAME_method *m, double h)
+static int prepare(Method *m, double h)
 {
-    const int64_t n = NAME_nx;
+    const int64_t n = NX;
     m->nlu++;
     for (int64_t k = 0; k < (m->s + 1) / 2; k++) {
         double *a = m->lu + 2 * k * n * n;
@@ -145,16 +86,16 @@ static int NAME_prepare(NAME_method *m, double h)
                 a[2 * (i * n + j)] = (i == j ? m->mu[2 * k] / h : 0) - m->jacobian[j * n + i];
                 a[2 * (i * n + j) + 1] = i == j ? m->mu[2 * k + 1] / h : 0;
             }
-        if (!NAME_factor(a, m->pivots + k * n)) return 0;
+        if (!factor(a, m->pivots + k * n)) return 0;
     }
     return 1;
 }
 
 /* The simplified Newton iteration for the increments z (s, n_x) of the stages; returns its length, 0 where it fails. */
-static int64_t NAME_iterate(NAME_method *m, double t, const double *x, double h, double *z, double *rate)
+static int64_t iterate(Method *m, double t, const double *x, double h, double *z, double *rate)
 {
-    const int64_t n = NAME_nx, s = m->s;
-    double point[NAME_nx + 1], y[NAME_ny + 1], last = 0;
+    const int64_t n = NX, s = m->s;
+    double point[NX + 1], y[NY + 1], last = 0;
     *rate = 0;
     for (int64_t k = 0; k < m->limit; k++) {
         for (int64_t i = 0; i < s; i++) {
@@ -178,7 +119,7 @@ static int64_t NAME_iterate(NAME_method *m, double t, const double *x, double h,
                 m->b[2 * (q * n + l)] = q ? re : im;
                 m->b[2 * (q * n + l) + 1] = q ? im : 0;
             }
-            NAME_backsolve(m->lu + 2 * q * n * n, m->pivots + q * n, m->b + 2 * q * n);
+            backsolve(m->lu + 2 * q * n * n, m->pivots + q * n, m->b + 2 * q * n);
         }
         double norm = 0;
         for (int64_t i = 0; i < s; i++)
@@ -200,29 +141,30 @@ static int64_t NAME_iterate(NAME_method *m, double t, const double *x, double h,
 }
 
 /* A length to 10 bits: rounding in the estimated error does not show in the steps. */
-static double NAME_rounded(double h)
+static double rounded(double h)
 {
     int exponent;
     const double part = frexp(h, &exponent);
     return ldexp(rint(part * 1024) / 1024, exponent);
 }
 
-static double NAME_size(const double *v, int64_t stride, const double *x, const double *next, double rtol, double atol)
+static double weighted_norm(const double *v, int64_t stride, const double *x, const double *next, double rtol,
+                            double atol)
 {
     double sum = 0;
-    for (int64_t i = 0; i < NAME_nx; i++) {
+    for (int64_t i = 0; i < NX; i++) {
         const double e = v[stride * i] / (atol + rtol * fmax(fabs(x[i]), fabs(next[i])));
         sum += e * e;
     }
-    return sqrt(sum / NAME_nx);
+    return sqrt(sum / NX);
 }
 
 /* The norm of the error that the embedded method shows, smoothed by the real system. */
-static double NAME_error(NAME_method *m, double t, const double *x, const double *f, const double *z, double h,
-                         double rtol, double atol, int again)
+static double error_norm(Method *m, double t, const double *x, const double *f, const double *z, double h, double rtol,
+                         double atol, int again)
 {
-    const int64_t n = NAME_nx, s = m->s;
-    double next[NAME_nx + 1], point[NAME_nx + 1], y[NAME_ny + 1], size = 0;
+    const int64_t n = NX, s = m->s;
+    double next[NX + 1], point[NX + 1], y[NY + 1], size = 0;
     for (int64_t l = 0; l < n; l++) next[l] = x[l] + z[(s - 1) * n + l];
     for (int64_t round = 0; round < 2; round++) {
         for (int64_t l = 0; l < n; l++) {
@@ -231,8 +173,8 @@ static double NAME_error(NAME_method *m, double t, const double *x, const double
             m->b[2 * l] = (round ? y[l] : f[l]) + sum / h;
             m->b[2 * l + 1] = 0;
         }
-        NAME_backsolve(m->lu, m->pivots, m->b);
-        size = NAME_size(m->b, 2, x, next, rtol, atol);
+        backsolve(m->lu, m->pivots, m->b);
+        size = weighted_norm(m->b, 2, x, next, rtol, atol);
         if (!again || size <= 1 || round) return size;
         for (int64_t l = 0; l < n; l++) point[l] = x[l] + m->b[2 * l];
         NAME(t, point, m->p, y);
@@ -242,9 +184,9 @@ static double NAME_error(NAME_method *m, double t, const double *x, const double
 }
 
 /* Increments that continue the collocation polynomial of the last step, `ratio` times as far as that was long. */
-static void NAME_continue(const NAME_method *m, const double *z, double ratio, double *guess)
+static void extrapolate(const Method *m, const double *z, double ratio, double *guess)
 {
-    const int64_t n = NAME_nx, s = m->s;
+    const int64_t n = NX, s = m->s;
     for (int64_t i = 0; i < s * n; i++) guess[i] = -z[(s - 1) * n + i % n];
     for (int64_t i = 0; i < s; i++)
         for (int64_t j = 0; j < s; j++) {
@@ -260,29 +202,29 @@ static void NAME_continue(const NAME_method *m, const double *z, double ratio, d
    increments of its stages; one row more of time and state for the end. Returns the number of steps; fewer than
    max_steps without reaching t1 where a step vanishes. counts are those of rejected steps, evaluations, Jacobians and
    decompositions. */
-int64_t NAME_radau(double t0, const double *x0, double t1, const double *p, int64_t s, const double *table,
-                   int64_t limit, double tol, int64_t fixed, double rtol, double atol, int64_t project_every,
-                   int64_t max_steps, double *step, double *work, int64_t *pivots, double *t_log, double *x_log,
-                   double *y_log, double *z_log, int64_t *counts)
+int64_t FN(radau)(double t0, const double *x0, double t1, const double *p, int64_t s, const double *table,
+           int64_t limit, double tol, int64_t fixed, double rtol, double atol, int64_t project_every, int64_t max_steps,
+           double *step, double *work, int64_t *pivots, double *t_log, double *x_log, double *y_log, double *z_log,
+           int64_t *counts)
 {
-    const int64_t n = NAME_nx;
+    const int64_t n = NX;
     const double *parts = table + s + 3 * s * s;
-    NAME_method m = {s, limit, table, table + s, table + s + s * s, table + s + 2 * s * s, parts, parts + s + 1, p,
+    Method m = {s, limit, table, table + s, table + s + s * s, table + s + 2 * s * s, parts, parts + s + 1, p,
                      tol, 10 * ROUNDING / rtol, work, work + n * n, work + n * n * (s + 2), 0, 0, pivots, 0, 0, 0, 0};
-    double x[NAME_nx + 1], t = t0, h = *step, h_before = 0, e_before = 0, prepared = 0;
+    double x[NX + 1], t = t0, h = *step, h_before = 0, e_before = 0, prepared = 0;
     m.r = m.scale + n;
     m.b = m.r + s * n;
     int current = 0, useful = 0;
     int64_t k = 0;
     for (int64_t i = 0; i < n; i++) x[i] = x0[i];
     for (; ; k++) {
-        double *y = y_log + k * NAME_ny, *z = z_log + k * s * n;
+        double *y = y_log + k * NY, *z = z_log + k * s * n;
         t_log[k] = t;
         for (int64_t i = 0; i < n; i++) x_log[k * n + i] = x[i];
         if (k == max_steps || t == t1) break;
         NAME(t, x, p, y);
         m.nfev++;
-        if (!useful) { NAME_jacobian(t, x, p, m.jacobian); m.njev++; current = useful = 1; prepared = 0; }
+        if (!useful) { FN(jacobian)(t, x, p, m.jacobian); m.njev++; current = useful = 1; prepared = 0; }
         for (int64_t i = 0; i < n; i++) m.scale[i] = atol + rtol * fabs(x[i]);
         double rate = 0, signed_h = 0, error = 0, factor = 1;
         int64_t iterations = 0, refused = 0, ends = 0, stuck = 0;
@@ -291,28 +233,28 @@ int64_t NAME_radau(double t0, const double *x0, double t1, const double *p, int6
             if (stuck) break;
             ends = h >= fabs(t1 - t) * (1 - 1e-12);
             signed_h = ends ? t1 - t : t1 > t ? h : -h;
-            if (k) NAME_continue(&m, z - s * n, signed_h / (t - t_log[k - 1]), z);
+            if (k) extrapolate(&m, z - s * n, signed_h / (t - t_log[k - 1]), z);
             else for (int64_t i = 0; i < s * n; i++) z[i] = 0;
             iterations = 0;
-            if (prepared == signed_h || NAME_prepare(&m, signed_h)) {
+            if (prepared == signed_h || prepare(&m, signed_h)) {
                 prepared = signed_h;
-                iterations = NAME_iterate(&m, t, x, signed_h, z, &rate);
+                iterations = iterate(&m, t, x, signed_h, z, &rate);
             }
             if (!iterations) {
                 if (current) h = 0.5 * fabs(signed_h);
-                else { NAME_jacobian(t, x, p, m.jacobian); m.njev++; current = 1; refused--; }
+                else { FN(jacobian)(t, x, p, m.jacobian); m.njev++; current = 1; refused--; }
                 prepared = 0;
                 continue;
             }
             if (fixed) break;
-            error = NAME_error(&m, t, x, y, z, signed_h, rtol, atol, refused > 0 || k == 0);
+            error = error_norm(&m, t, x, y, z, signed_h, rtol, atol, refused > 0 || k == 0);
             const double power = -1.0 / (double)(s + 1);
             const double safety = 0.9 * (double)(2 * limit + 1) / (double)(2 * limit + iterations);
             factor = pow(fmax(error, 1e-10), power);
             if (h_before > 0 && error > 0) factor *= fmin(1, fabs(signed_h) / h_before * pow(e_before / error, -power));
             factor *= safety;
             if (error <= 1) break;
-            h = NAME_rounded(fabs(signed_h) * (isfinite(error) ? fmax(0.2, factor) : 0.5));
+            h = rounded(fabs(signed_h) * (isfinite(error) ? fmax(0.2, factor) : 0.5));
         }
         m.rejected += refused;
         if (stuck) break;
@@ -323,8 +265,8 @@ int64_t NAME_radau(double t0, const double *x0, double t1, const double *p, int6
         useful = iterations <= 2 || rate <= 1e-3;
         current = 0;
         if (!fixed && !(useful && factor < 1.2 && factor > 0.9))
-            h = NAME_rounded(h_before * fmin(factor, refused ? 1 : 5));
-        if (project_every && (k + 1) % project_every == 0) NAME_PROJECT(t, x, p);
+            h = rounded(h_before * fmin(factor, refused ? 1 : 5));
+        if (project_every && (k + 1) % project_every == 0) restore(t, x, p);
     }
     *step = h;
     counts[0] = m.rejected;
@@ -335,8 +277,7 @@ int64_t NAME_radau(double t0, const double *x0, double t1, const double *p, int6
 }
 
 /* Restores the invariants at n instants; x is (n, n_x). */
-void NAME_settle(int64_t n, const double *t, double *x, const double *p)
+void FN(settle)(int64_t n, const double *t, double *x, const double *p)
 {
-    for (int64_t k = 0; k < n; k++) NAME_PROJECT(t[k], x + k * NAME_nx, p);
+    for (int64_t k = 0; k < n; k++) restore(t[k], x + k * NX, p);
 }
-"""

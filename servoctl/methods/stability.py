@@ -1,22 +1,28 @@
-"""How fast a pole may be: stability of integration steps, and of feedback that is sampled and held."""
+"""How fast a pole may be, and whether steps resolve a motion: stability of integration, and of sampled feedback."""
 
 import sys
 import warnings
 from functools import cache
+from itertools import pairwise
 from math import comb, factorial, inf, pi
 
 import numpy as np
 
 from servoctl.checks import is_whole
 from servoctl.errors import SpecificationError, unknown
-from servoctl.methods.tableaus import ORDERS, tableau
+from servoctl.methods.accuracy import component_sizes, state_levels
+from servoctl.methods.drift import Poles
+from servoctl.methods.motion import breakpoints, equal_steps
+from servoctl.methods.runge_kutta import ORDERS, tableau
 
 SAME = {"DOP853": "RK8", "RK45": "RK5"}  # scipy's adaptive methods that go on with the result of these tableaus
-METHODS = (*ORDERS, *SAME, "RK23", "Taylor", "RadauIIA", "Radau")
+STEP_MAPS = (*ORDERS, *SAME, "RK23", "Taylor", "RadauIIA", "Radau")
 WITH_ORDER = ("Taylor", "RadauIIA")
 BEYOND = 1e-10  # of |R| over 1: roots of |R|² = 1 that only touch 1 are told from those that cross it
 MANY_STEPS = 1e5  # of an adaptive method: each takes a part of a millisecond
 FASTEST, HALVINGS = 4.0, 50  # of p·h: every sampled loop of two or more integrators is unstable there
+POWERS, NUDGE = 6, 1e-6  # of the power iteration for the fastest rate: its length, and relative size of a deviation
+UNRESOLVED = 0.1  # of the state's size: what a step and two half steps differ by where they are too long
 
 
 @cache
@@ -26,7 +32,7 @@ def stability_function(method, order=None):
     Parameters
     ----------
     method : str
-        One of `bounds.METHODS`.
+        One of `STEP_MAPS`.
     order : int, optional
         Of "Taylor" and "RadauIIA" (odd: 2s - 1 for s stages), which need it; no other method uses it.
 
@@ -43,8 +49,8 @@ def stability_function(method, order=None):
     SpecificationError
         If the order is missing, is none of the method's, or is given where it is not used.
     """
-    if method not in METHODS:
-        raise unknown(method, METHODS, "method")
+    if method not in STEP_MAPS:
+        raise unknown(method, STEP_MAPS, "method")
     whole = isinstance(order, (int, np.integer)) and order >= 1 and (method == "Taylor" or order % 2 == 1)
     if not (whole if method in WITH_ORDER else order is None):
         raise SpecificationError(
@@ -78,7 +84,7 @@ def amplification(method, z, order=None):
     Parameters
     ----------
     method : str
-        One of `bounds.METHODS`.
+        One of `STEP_MAPS`.
     z : array of complex
         Steps times eigenvalues, hλ.
     order : int, optional
@@ -101,7 +107,7 @@ def largest_explicit(method, order=None, direction=pi):
     Parameters
     ----------
     method : str
-        One of `bounds.METHODS`.
+        One of `STEP_MAPS`.
     order : int, optional
         Of "Taylor" and "RadauIIA".
     direction : float
@@ -245,7 +251,7 @@ def warn_many_steps(method, poles, length):
     Parameters
     ----------
     method : str
-        One of `bounds.METHODS`.
+        One of `STEP_MAPS`.
     poles : dict of str to (ρ,) arrays of complex
         Of each row [1/s].
     length : float
@@ -291,6 +297,83 @@ def warn_unresolved(method, step, difference, stable=inf):
         RuntimeWarning,
         stacklevel=_outside(),
     )
+
+
+def unresolved(pieces, halved):
+    """The last step of a motion, or else that of the fastest change, if two of half its length lead elsewhere.
+
+    Parameters
+    ----------
+    pieces : list of (model, t, states, ...)
+        Steps from t[k] to t[k + 1] [s] with states (n_x, N) by one variant of the model.
+    halved : callable
+        (model, t, x, h) -> states (n_x, 3) at t, t + h and t + 2 h; fewer where a step fails.
+
+    Returns
+    -------
+    ((start, end), x, difference, size) or None
+        Of the step [s]; the state (n_x,) at its start; by how much both ends differ, relative to the sizes (n_x,) of
+        the state's entries: (n_x,) array.
+    """
+    pieces = [(model, t, states) for model, t, states, *_ in pieces if len(t) > 1]
+    if not pieces:
+        return None
+    largest = np.column_stack([np.abs(states).max(axis=1) for _, _, states in pieces])
+    size = component_sizes(largest, state_levels(pieces[0][0]))
+    changes = [(np.abs(np.diff(states)) / size[:, None]).max(axis=0) for _, _, states in pieces]
+    fastest = int(np.argmax([change.max() for change in changes]))
+    last = (len(pieces) - 1, len(changes[-1]) - 1)
+    for i, k in dict.fromkeys((last, (fastest, int(np.argmax(changes[fastest]))))):
+        model, t, states = pieces[i]
+        halves = halved(model, t[k], states[:, k], (t[k + 1] - t[k]) / 2)
+        lost = halves.shape[1] < 3
+        difference = np.full(len(size), np.inf) if lost else (states[:, k + 1] - halves[:, -1]) / size
+        if not np.abs(difference).max() <= UNRESOLVED:
+            return t[k : k + 2], states[:, k], difference, size
+    return None
+
+
+def run_checked(stepping, t0, x0, t1, t_eval, knots):
+    """The motion by steps of fixed length, which are warned about where they amplify errors or do not resolve it.
+
+    Parameters
+    ----------
+    stepping : RungeKuttaSteps or RadauSteps
+        With a step.
+    t0 : float
+    x0 : (n_x,) array
+    t1 : float
+    t_eval, knots : sequences of float
+        See `Stepping.run`.
+
+    Returns
+    -------
+    Motion
+    """
+    explicit = stepping.method in ORDERS
+    if explicit and isinstance(stepping.drift, Poles):
+        lengths = (equal_steps(a, b, stepping.step)[0] for a, b in pairwise(breakpoints((t0, t1), knots)))
+        warn_fast_poles(stepping.method, row_poles(stepping.drift, stepping.model), max(lengths, key=abs))
+    motion = stepping.run(t0, x0, t1, t_eval, knots)
+    if motion.stop is None and not motion.interrupted:
+        with np.errstate(all="ignore"):
+            found = unresolved(stepping.taken, stepping.halved)
+            if found is not None:
+                step, x, difference, size = found
+                rate = _fastest_rate(stepping, step[0], x, difference, size) if explicit else 0.0
+                stable = largest_explicit(stepping.method) / rate if explicit else inf
+                warn_unresolved(stepping.method, step, np.abs(difference).max(), stable)
+    return motion
+
+
+def _fastest_rate(stepping, t, x, direction, size):
+    """|λ| of the mode that dominates in a direction, by power iteration; NaN where it is not finite."""
+    rate = np.nan
+    for _ in range(POWERS):
+        direction = NUDGE * direction / np.abs(direction).max()
+        ahead = stepping.rates(t, x + size * direction) - stepping.rates(t, x)
+        direction, rate = ahead / size, float(np.abs(ahead / size).max() / NUDGE)
+    return rate
 
 
 def _outside():

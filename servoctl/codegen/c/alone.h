@@ -1,0 +1,50 @@
+/* A unit of small sizes, for editors and compilers that see one file of this folder alone. */
+#define NAME example
+#define NX 4
+#define NP 3
+#define NY 9
+#define PROJECTED
+#define WIDE
+
+#define ROUNDING 0x1p-52
+#define BISECTIONS 20
+#define NEAR 1e-3
+#define QUADRATIC 1e-8
+
+/* taylor.c */
+#define NQ 2
+#define N 2
+#define TOP 2
+#define LAST 4
+#define PLAIN 1
+
+/* batch.c */
+#define NU 2
+#define NC 2
+#define NW 2
+#define NV 1
+#define ND 1
+#define NO 3
+#define NM 4
+#define NZ 1
+#define NL 2
+#define NS 1
+#define NR 2
+#define NT 8
+#define MEASURED {0, 1, 2, 3}
+
+#include "lanes.h"
+
+#define DECLARED(name, number) \
+    void name(number t, const number *restrict x, const number *restrict p, number *restrict y);
+DECLARED(example, double)
+DECLARED(example_project, double)
+DECLARED(example_jacobian, double)
+DECLARED(example_wide, W)
+DECLARED(example_wide_step, W)
+DECLARED(numbers, W)
+DECLARED(change, W)
+void law(W t, const W *restrict x, const double *restrict p, W *restrict y);
+void signals(W t, const W *restrict x, const double *restrict p, W *restrict y);
+void rates_of_two(W t, const W *restrict x, const W *restrict p, W *restrict y,
+                  const W *restrict x2, const W *restrict p2, W *restrict y2);

@@ -1,0 +1,69 @@
+/* The sampled closed loop around a plant. It calls the law through a pointer. */
+#include "unit.h"
+#include "restore.h"
+
+#define V double
+#define V_OF(number) (number)
+#define V_CALL(name) name
+#include "sampled.h"
+
+typedef void Law(double t, const double *x, const double *p, double *y);
+
+/* y = C x + noise, quantised. */
+static void measure(const Loop *c, int64_t k, const double *x, double *y)
+{
+    for (int64_t i = 0; i < c->n_y; i++) {
+        const double value = x[c->measured[i]];
+        y[i] = quantised(c, i, c->noise ? value + c->noise[k * c->n_y + i] : value);
+    }
+}
+
+#define EACH _Pragma("GCC unroll 32") for (int i = 0; i < NX; i++)
+#define AT(v) v[i]
+#define RATES(stage, instant, state, k) \
+    for (int64_t i = 0; i < c->n_d; i++) pd[c->disturbed[i]] = d[stage * c->n_d + i]; \
+    NAME(instant, state, p, k)
+
+/* A step with the rates written into it; d holds the disturbances at its start, middle and end. Vectors of states would
+   be filled and emptied one by one, in each stage: they take longer than numbers. */
+__attribute__((flatten, optimize("no-tree-vectorize")))
+static void advance(const Loop *c, double t, double h, const double *d, double *x, double *p)
+{
+    double k1[NX + 1], k2[NX + 1], k3[NX + 1], k4[NX + 1], z[NX + 1], *pd = p + c->at_u + c->n_u;
+#include "rk4.h"
+}
+
+/* The loop; sample k at t0 + k period: measure, call the law, delay, limit, hold. Returns the samples completed. */
+__attribute__((optimize("no-tree-vectorize")))
+int64_t FN(closed)(Law *law, Loop *c)
+{
+    double x[NX + 1], p[NP + 1];
+    const double h = c->period / (double)c->substeps;
+    for (int i = 0; i < NX; i++) x[i] = c->x0[i];
+    for (int i = 0; i < NP; i++) p[i] = c->p[i];
+    for (int64_t i = 0; i < c->n_z; i++) c->law_x[c->n_y + i] = c->z0[i];
+    for (int64_t k = 0; ; k++) {
+        const double t = c->t0 + (double)k * c->period;
+        const int64_t row = c->first + k < c->rows ? c->first + k : c->rows - 1;
+        double *y = c->law_x + k * (c->n_y + c->n_z), *out = c->law_y + k * c->n_out, *u = c->input + k * c->n_u;
+        for (int i = 0; i < NX; i++) if (!isfinite(x[i])) { c->status = 1; return k; }
+        for (int i = 0; i < NX; i++) c->x[k * NX + i] = x[i];
+        measure(c, k, x, y);
+        law(t, y, c->table + row * c->n_row, out);
+        for (int64_t i = 0; i < c->n_u + c->n_z; i++) if (!isfinite(out[i])) { c->status = 2; return k; }
+        const double *command = k < c->delay ? c->idle : out - c->delay * c->n_out, *before = k ? u - c->n_u : c->idle;
+        for (int64_t i = 0; i < c->n_u; i++) u[i] = limited(c, i, command[i], before[i]);
+        if (k == c->samples) return k + 1;
+        for (int64_t i = 0; i < c->n_z; i++) y[c->n_y + c->n_z + c->n_y + i] = out[c->n_u + i];
+        for (int64_t i = 0; i < c->n_u; i++) p[c->at_u + i] = u[i];
+        for (int64_t s = 0; s < c->substeps; s++) {
+            const int64_t step = k * c->substeps + s;
+            for (int64_t i = 0; c->transport && i < c->n_u; i++) {
+                const int64_t sent = step - c->transport[i];
+                p[c->at_u + i] = sent < 0 ? c->idle[i] : c->input[sent / c->substeps * c->n_u + i];
+            }
+            advance(c, t + (double)s * h, h, c->disturbance + 3 * step * c->n_d, x, p);
+            restore(t + (double)(s + 1) * h, x, p);
+        }
+    }
+}

@@ -1,0 +1,28 @@
+/* The rule of a sampled loop that one loop and the lanes of many have in common. Before it, V is the type of numbers,
+   V_OF(number) a V of one number, and V_CALL(name) a function of V. */
+
+/* Mirrored by servoctl/control/loop.py; arrays that are not used are null. */
+typedef struct {
+    int64_t samples, substeps, delay, n_y, n_z, n_u, n_out, n_row, rows, first, n_d, at_u; /* of any loop */
+    int64_t depth, every, n_traced, columns;                                               /* of many */
+    int64_t status;                                                                        /* of one: how it ended */
+    double t0, period;
+    const double *p, *x0, *z0, *table, *noise, *quantum, *low, *high, *change, *idle, *disturbance, *constants, *scale;
+    const int64_t *measured, *transport, *disturbed, *traced;
+    double *x, *law_x, *law_y, *input; /* logs of one loop */
+    double *gathered, *trace;          /* and of many */
+} Loop;
+
+INLINE V quantised(const Loop *c, int64_t i, V value)
+{
+    if (c->quantum && c->quantum[i] > 0) value = c->quantum[i] * V_CALL(rint)(value / c->quantum[i]);
+    return value;
+}
+
+/* The input of one sample: the command, kept within its limits and its limits of rate. */
+INLINE V limited(const Loop *c, int64_t i, V value, V before)
+{
+    if (c->low) value = V_CALL(fmin)(V_CALL(fmax)(value, V_OF(c->low[i])), V_OF(c->high[i]));
+    if (c->change) value = V_CALL(fmin)(V_CALL(fmax)(value, before - c->change[i]), before + c->change[i]);
+    return value;
+}

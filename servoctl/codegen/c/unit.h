@@ -1,0 +1,28 @@
+/* What every unit begins with. The emitter defines, before it includes a file of this folder,
+
+   NAME            the function: void NAME(double t, const double *x, const double *p, double *y), x -> y
+   NX, NP, NY      the lengths of x, p and y
+   PROJECTED       where there is NAME_project, the change of x that restores invariants
+   WIDE            where there are NAME_wide and NAME_wide_step, the same for eight points at once
+   ROUNDING, BISECTIONS, NEAR, QUADRATIC    tolerances of Newton's iterations
+
+   and what the file itself names. A file that is read alone takes them from alone.h. */
+#ifndef UNIT_H
+#define UNIT_H
+
+#include <math.h>
+#include <stdint.h>
+
+#define GLUED_(a, b) a##_##b
+#define GLUED(a, b) GLUED_(a, b)
+#define FN(suffix) GLUED(NAME, suffix) /* NAME_suffix: a function that is called from outside */
+#define INLINE static inline __attribute__((always_inline))
+
+#include "inline_sine.h"
+#include "inverse_erf.h"
+
+#ifndef NAME
+#include "alone.h"
+#endif
+
+#endif

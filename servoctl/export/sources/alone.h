@@ -1,0 +1,22 @@
+/* What an exported file has before each of these: sizes, functions and tables; for compilers that see one alone. */
+#include <math.h>
+
+#define N 2
+#define NQ 2
+#define NX 4
+#define NY 8
+#define NU 2
+#define NZ 1
+#define NO 3
+#define ITERATIONS 30
+#define TOLERANCE 1e-13
+#define T0 0.0
+#define RATE 100.0
+#define ROWS 2
+#define WIDTH 3
+
+void path(double t, const double *x, const double *p, double *y);
+void rates(double t, const double *x, const double *p, double *y);
+void actuation(double t, const double *x, const double *p, double *y);
+void law(double t, const double *x, const double *p, double *y);
+static const double z0[NZ] = {0}, table[ROWS * WIDTH] = {0};

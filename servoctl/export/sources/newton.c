@@ -1,0 +1,24 @@
+
+/* Newton's method for the coordinates in x, whose rates and second derivatives follow; the number of corrections. */
+static int feedforward(double t, double *x, const double *p, double *z, double *u)
+{
+    double y[NY];
+    for (int iteration = 0; iteration <= ITERATIONS; iteration++) {
+        double defect = 0;
+        path(t, x, p, y);
+        for (int i = 0; i < NQ; i++) {
+            const double e = fabs(y[i]) / (1 + fabs(x[i]));
+            if (!(e < INFINITY)) return -1;
+            if (e > defect) defect = e;
+        }
+        if (defect <= TOLERANCE) {
+            for (int i = 0; i < NQ; i++) z[i] = x[i];
+            for (int i = 0; i < 2 * N; i++) z[NQ + i] = y[2 * NQ + i];
+            for (int i = 0; i < N; i++) x[NQ + i] = z[NQ + i];
+            actuation(t, z, p, u);
+            return iteration;
+        }
+        for (int i = 0; i < NQ; i++) x[i] += y[i];
+    }
+    return -1;
+}

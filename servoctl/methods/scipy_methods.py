@@ -1,0 +1,136 @@
+"""scipy's adaptive methods on compiled right-hand sides, with projection after their steps."""
+
+import numpy as np
+
+from servoctl.methods.drift import MinimalCoordinates, Project
+from servoctl.methods.minimal import MinimalSolver, Sizes
+from servoctl.methods.monitor import FRACTIONS, DenseStretch, Fine
+from servoctl.methods.motion import Stepping
+
+IMPLICIT = ("Radau", "BDF")
+
+
+class ScipySteps(Stepping):
+    """One integration by one of scipy's methods.
+
+    Parameters
+    ----------
+    model : Model
+    method : str
+        One of `choice.SCIPY`.
+    drift : None, Poles, Project or MinimalCoordinates
+    rtol, atol : float
+    progress : callable
+    """
+
+    def __init__(self, model, method, drift, rtol, atol, progress):
+        self.tolerances = {"rtol": rtol, "atol": atol}
+        self.sizes = Sizes(model) if isinstance(drift, MinimalCoordinates) else None
+        super().__init__(model, method, drift, progress)
+
+    def _use(self, model):
+        super()._use(model)
+        name = f"{self.f.name}_jacobian"
+        self.slopes = model.function(name) if self.method in IMPLICIT else None
+        self.restore = model.function("ode_projected").restore if isinstance(self.drift, Project) else None
+
+    def _rates(self, t, x):
+        return self.f(t, x, self.p)[: self.n_x]
+
+    def _jacobian(self, t, x):
+        return self.slopes(t, x, self.p).reshape(self.n_x, self.n_x).T
+
+    def _solver(self, a, x, b):
+        import scipy.integrate
+
+        method = getattr(scipy.integrate, self.method)
+        if isinstance(self.drift, MinimalCoordinates):
+            return MinimalSolver(method, self.model, self.sizes, a, x, b, self.tolerances, self.slopes is not None)
+        exact = {} if self.slopes is None else {"jac": self._jacobian}
+        return method(self._rates, a, x, b, **self.tolerances, **exact)
+
+    def _piece(self, a, x, b, times):
+        self.pending, self.forward = list(times), b >= a
+        solver, steps = self._solver(a, x, b), 0
+        self.monitor.begin(self._pivots(a, x))
+        self._sample(a, None, x)
+        while solver.status == "running":
+            t, x = solver.t, solver.y.copy()
+            with np.errstate(all="ignore"):
+                message = solver.step()
+            if solver.status == "failed" or not np.all(np.isfinite(solver.y)):
+                self._fail(t, x, message)
+                break
+            steps, dense = steps + 1, solver.dense_output()
+            outcome = self.monitor.inspect(self._stretch(t, x, solver, dense))
+            if isinstance(outcome, Fine):
+                if self.restore is not None and (steps % self.drift.every == 0 or solver.status == "finished"):
+                    self._project(solver)
+                self._sample(solver.t, dense, solver.y)
+                self.progress(solver.t)
+                continue
+            if outcome.steps:
+                t, x = solver.t, solver.y
+                self._sample(t, dense, x)
+            if not self._follow(outcome):
+                self._keep_last(t, x)
+                break
+            self._count(solver)
+            solver = self._solver(t, x, b)
+        self._count(solver)
+        self.motion.count(steps=steps)
+        return solver.y
+
+    def _stretch(self, t, x, solver, dense):
+        """The last step; it has passed its test of error, and another begins where it ends."""
+        end, ends = (solver.t, solver.y), np.array([t, solver.t])
+        inside = [t + s * (end[0] - t) for s in FRACTIONS]
+        pivots = np.array([*(self._pivots(s, dense(s)) for s in inside), self._pivots(*end)]).T
+        self.motion.count(watched=len(inside) + 1)
+        return DenseStretch(
+            ends,
+            np.column_stack([x, end[1]]),
+            pivots[:, None],
+            self._top,
+            crosses=True,
+            dense=lambda k, s: dense(s),
+            pivots_at=self._pivots,
+        )
+
+    def _project(self, solver):
+        solver.y = self.restore(solver.t, solver.y, self.p)
+        if hasattr(solver, "f"):
+            solver.f = solver.fun(solver.t, solver.y)
+        self.motion.count(projections=1)
+
+    def _count(self, solver):
+        self.motion.count(nfev=solver.nfev, njev=solver.njev, nlu=solver.nlu)
+        if isinstance(solver, MinimalSolver):
+            self.motion.counters["integrated"] = len(solver.chart.free)
+            self.motion.count(coordinate_changes=solver.changes)
+
+    def _fail(self, t, x, message):
+        self.motion.stop = self.monitor.failed(
+            t,
+            x,
+            "the step of the integrator shrinks to nothing",
+            f"{self.method} stopped at t = {t:.7g} s: {message or 'the state is no longer finite'}.",
+            "A motion is integrated as far as its solution exists.",
+            "Loosen rtol, take a method for stiff equations (Radau), or see whether the motion escapes.",
+        )
+        self._keep_last(t, x)
+
+    def _sample(self, t, dense, x):
+        """Record the samples that are pending up to t."""
+        times, states = [], []
+        while self.pending and (self.pending[0] <= t if self.forward else self.pending[0] >= t):
+            s = self.pending.pop(0)
+            y = x if s == t and x is not None else dense(s)
+            if self.restore is not None and (x is None or s != t):
+                y = self.restore(s, y, self.p)
+            times.append(s)
+            states.append(y)
+        if times:
+            states = np.array(states).T
+            top = np.array([self._top(s, y) for s, y in zip(times, states.T, strict=True)]).T
+            self.motion.add(self.model, times, states, top)

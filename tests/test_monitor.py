@@ -1,0 +1,95 @@
+"""The monitor of pivots: what it says of quiet steps, of badly chosen pivots and of a lost rank."""
+
+import casadi as ca
+import closed_forms as cf
+import numpy as np
+import pytest
+
+import servoctl as sv
+from servoctl.methods.monitor import DEGRADED, NO_CHOICE, DenseStretch, Fine, Monitor, Repivot, Singular, Stretch
+
+
+@pytest.fixture(scope="module")
+def circle():
+    """A particle kept on the unit circle."""
+    q = sv.coordinates("x y")
+    x, y = q
+    mechanism = sv.Mechanism(q, gibbs=sv.particle(q, 2.0, ca.vertcat(x, y)))
+    return sv.derive(mechanism, sv.Program({"circle": x**2 + y**2 - 1.0}, by="ideal"))
+
+
+def functions(model):
+    """Pivots and γ'' at (t, X)."""
+    f, p, n_x, n = model.function("ode"), model.parameters, len(model.state_names), model.n
+    return lambda t, x: f(t, x, p)[n_x:], lambda t, x: f(t, x, p)[n_x - n : n_x]
+
+
+def round_the_circle(t):
+    return np.array([np.cos(t), np.sin(t), -np.sin(t), np.cos(t)])
+
+
+def begun(model, t, x):
+    monitor = Monitor(model, t, x)
+    monitor.begin(functions(model)[0](t, x))
+    return monitor
+
+
+def sampled(model, t, x, **options):
+    pivots, top = functions(model)
+    values = np.array([pivots(s, column) for s, column in zip(t[1:], x.T[1:], strict=True)]).T
+    return Stretch(t, x, values[:, :, None], top, **options)
+
+
+def test_quiet_steps_are_fine(circle):
+    t = np.linspace(0.0, 0.7, 15)
+    assert begun(circle, 0.0, round_the_circle(0.0)).inspect(sampled(circle, t, round_the_circle(t))) == Fine(14)
+    none = Stretch(t[:1], round_the_circle(t[:1]), np.zeros((1, 0, 1)), functions(circle)[1])
+    assert begun(circle, 0.0, round_the_circle(0.0)).inspect(none) == Fine(0)
+
+
+def test_what_was_inspected_in_two_parts_is_what_was_inspected_at_once(circle):
+    t = np.linspace(0.0, 2.0, 201)
+    monitor = begun(circle, 0.0, round_the_circle(0.0))
+    at_once = monitor.inspect(sampled(circle, t, round_the_circle(t)))
+    monitor = begun(circle, 0.0, round_the_circle(0.0))
+    assert monitor.inspect(sampled(circle, t[:61], round_the_circle(t[:61]))) == Fine(60)
+    later = monitor.inspect(sampled(circle, t[60:], round_the_circle(t[60:])))
+    assert isinstance(later, Repivot) and (later.steps + 60, later.t) == (at_once.steps, at_once.t)
+
+
+@pytest.mark.parametrize("crosses", [False, True])
+def test_a_pivot_that_degrades_or_changes_its_sign_is_replaced(crosses, circle):
+    fine = np.linspace(0.0, 2.0, 201)  # the pivot x degrades below 0.02 at t = 1.56
+    outcome = begun(circle, 0.0, round_the_circle(0.0)).inspect(sampled(circle, fine, round_the_circle(fine)))
+    assert isinstance(outcome, Repivot) and outcome.variant is None and outcome.otherwise.why == NO_CHOICE
+    assert fine[outcome.steps] == outcome.t == pytest.approx(np.pi / 2, abs=2 * DEGRADED)
+    coarse = np.array([0.0, 1.2, 1.9, 2.6])
+    x = round_the_circle(coarse)
+    outcome = begun(circle, 0.0, x[:, 0]).inspect(sampled(circle, coarse, x, crosses=crosses))
+    assert isinstance(outcome, Repivot) and (outcome.steps, outcome.t) == ((2, 1.9) if crosses else (1, 1.2))
+    np.testing.assert_array_equal(outcome.x, x[:, outcome.steps])
+
+
+def test_dense_output_is_left_just_before_the_zero(circle):
+    pivots, top = functions(circle)
+    t, x = np.array([0.0, 2.0]), round_the_circle(np.array([0.0, 2.0]))
+    stretch = DenseStretch(
+        t, x, pivots(2.0, x[:, 1])[:, None, None], top,
+        dense=lambda k, s: round_the_circle(s), pivots_at=pivots, resumes=True,
+    )  # fmt: skip
+    outcome = begun(circle, 0.0, x[:, 0]).inspect(stretch)
+    assert isinstance(outcome, Repivot) and (outcome.steps, outcome.t) == (0, 1.5)
+    np.testing.assert_array_equal(outcome.x, round_the_circle(1.5))
+
+
+def test_a_lost_rank_is_singular_where_it_is_lost(gallery_model):
+    """States of the linear program, which passes, seen by the squared one, which is singular where the wheel stops."""
+    linear, squared = gallery_model("appell-hamel"), gallery_model("appell-hamel-squared")
+    start = linear.start(dphi=1.0, dtheta=2.0, x=0.0, y=0.0, phi=0.0, theta=0.0)
+    run = sv.simulate(linear, start, (0.0, 1.0), "Taylor", t_eval=np.linspace(0.0, 1.0, 101))
+    names = list(squared.state_names)
+    x = np.array([run[name] for name in names])
+    outcome = begun(squared, 0.0, x[:, 0]).inspect(sampled(squared, run.t, x))
+    assert isinstance(outcome, Singular) and run.t[outcome.steps] <= outcome.t <= run.t[outcome.steps + 1]
+    assert abs(outcome.t - cf.WHEEL_STOPS) < 1e-3
+    assert abs(outcome.x[names.index("dphi")]) < 1e-2
