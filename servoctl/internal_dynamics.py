@@ -93,7 +93,7 @@ def _jacobians(model, run, picked, n_x):
             yield J, C
 
 
-def internal_dynamics(model, run):
+def internal_dynamics(model, run) -> InternalDynamics:
     """Find the eigenvalues of the internal dynamics along a run.
 
     Parameters

@@ -8,6 +8,7 @@ import numpy as np
 
 from servoctl import archive
 from servoctl.errors import SpecificationError, unknown
+from servoctl.values import Value, same
 
 STENCIL = 9  # samples of the polynomial through which an extremum is refined: error of order h^9
 AS_SAMPLED = 1e-14  # of the values beside it: an extremum between samples that is no further from one is that sample
@@ -15,7 +16,7 @@ FACTS = ("method", "drift", "counters", "success", "status", "message", "knots",
 
 
 @dataclass(frozen=True, eq=False)
-class Run:
+class Run(Value):
     """A motion with its actuation and its residuals; made by `simulate`, `close` or `load`.
 
     `run["theta"]`, `run["dtheta"]`, `run["trolley"]` are (N,) arrays, SI, and so are the derivatives in time of an
@@ -51,16 +52,24 @@ class Run:
     message: str = ""
     knots: tuple = ()
     variants: tuple = ()
-    stored: dict = field(default_factory=dict)
-    stored_residual: dict = field(default_factory=dict)
+    stored: dict = field(default_factory=dict, compare=False)
+    stored_residual: dict = field(default_factory=dict, compare=False)
+
+    def __eq__(self, other):
+        if not super().__eq__(other):
+            return False
+        follows = self.model is not None  # from the jets
+        return follows or same((self.stored, self.stored_residual), (other.stored, other.stored_residual))
+
+    __hash__ = Value.__hash__
 
     @property
-    def names(self):
+    def names(self) -> tuple[str, ...]:
         """Names of all signals."""
         groups = self.model.signal_groups if self.model is not None else {}
         return tuple(dict.fromkeys([*self.jet_names, *groups, *self.stored]))
 
-    def __getitem__(self, name):
+    def __getitem__(self, name: str) -> np.ndarray:
         if name in self.jet_names:
             return self.jets[self.jet_names.index(name)]
         if name not in self.stored:
@@ -78,7 +87,7 @@ class Run:
         Parameters
         ----------
         kind : str
-            One of `servoctl.model.model.SIGNALS`.
+            One of `servoctl.model.equations.SIGNALS`.
         rate : int
             Order of the derivative. It may need jets above s̄.
 
@@ -103,16 +112,16 @@ class Run:
             parts.append(f.grid(self.t[first:end], self.jets[: f.n_x, first:end], model.parameters))
         return names, np.concatenate(parts, axis=1)
 
-    def variant(self, i):
+    def variant(self, i: int):
         """The variant of the model that holds at sample i."""
         return next((model for first, end, model in self.variants if first <= i < end), self.model)
 
     @property
-    def residual(self):
+    def residual(self) -> Mapping[str, np.ndarray]:
         """Residuals of every constraint at every level: a mapping of names to (levels, N) arrays."""
         return _Residuals(self)
 
-    def state(self, t):
+    def state(self, t: float) -> np.ndarray:
         """The state (q, γ') of the mechanism at an instant, between samples by Hermite interpolation.
 
         Parameters
@@ -127,7 +136,7 @@ class Run:
         jets = self.at(t)
         return jets[: self.model.nq + self.model.n]
 
-    def at(self, t):
+    def at(self, t: float) -> np.ndarray:
         """The jets Z at an instant (n_z,), between samples by Hermite interpolation of all derivatives.
 
         Parameters
@@ -178,7 +187,7 @@ class Run:
         values = f.grid(self.t[columns], self.jets[: f.n_x, columns], self.model.parameters)
         return [values[: self.model.nq], values[self.model.nq :]]
 
-    def extrema(self, name):
+    def extrema(self, name: str) -> tuple[tuple[float, float], tuple[float, float]]:
         """The least and the greatest value of a signal, refined between samples.
 
         Parameters
@@ -212,7 +221,7 @@ class Run:
                 continue
             centre, width = self.t[k], np.ptp(self.t[window]) / 2
             s = (self.t[window] - centre) / width
-            polynomial = np.polynomial.Polynomial.fit(s, values[window], len(s) - 1, domain=[-1, 1])
+            polynomial, _ = np.polynomial.Polynomial.fit(s, values[window], len(s) - 1, domain=[-1, 1], full=True)
             neighbours = [(self.t[i] - centre) / width for i in (k - 1, k + 1) if i in inside]
             for root in polynomial.deriv().roots():
                 if abs(root.imag) < 1e-9 and min([*neighbours, 0.0]) <= root.real <= max([*neighbours, 0.0]):
@@ -317,7 +326,7 @@ class _Residuals(Mapping):
         return stored[name]
 
 
-def load(path):
+def load(path) -> Run:
     """A run from a file that `Run.save` wrote.
 
     Parameters

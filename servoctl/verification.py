@@ -84,7 +84,7 @@ class Verification:
         return f"{self.numbers[key]:.1e}{allowed}"
 
 
-def verify(model, run=None, segments=20):
+def verify(model, run=None, segments: int = 20) -> Verification:
     """Check a run against the full mechanism, not the reduced model.
 
     The mechanism's accelerations under the required actuation are compared with the run's at every sample; the

@@ -1,10 +1,12 @@
 """Models that are derived once for all tests, and numbers from expressions."""
 
 import os
+import sys
 
 import casadi as ca
 import numpy as np
 import pytest
+from scenes import CRANE, CRANE_PROGRAM, POINT, POINT_PROGRAM
 
 import servoctl as sv
 from servoctl.codegen import compiler
@@ -25,6 +27,21 @@ def backend(request, monkeypatch):
         yield request.param
 
 
+@pytest.fixture
+def at_once():
+    """Compiled code at the first call: what shares a model with other tests has the same bits in any order."""
+    with compiling_at_once():
+        yield
+
+
+@pytest.fixture
+def here(tmp_path, monkeypatch):
+    """The current folder is an empty one, and what a scene file adds to the import path is forgotten."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", list(sys.path))
+    return tmp_path
+
+
 @pytest.fixture(scope="session")
 def gallery_model():
     """A function from a gallery name to its model, derived at the first call."""
@@ -36,6 +53,33 @@ def gallery_model():
         return models[name]
 
     return model
+
+
+@pytest.fixture(scope="session")
+def crane_plan():
+    """The overhead crane's motion over 8 s: the path ends at 6 s."""
+    model = derive(CRANE, CRANE_PROGRAM)
+    return sv.simulate(model, model.start(guess={"l": 4.0}), (0.0, 8.0))
+
+
+@pytest.fixture(scope="session")
+def plan(crane_plan):
+    """The crane's motion, in modules that have no other."""
+    return crane_plan
+
+
+@pytest.fixture(scope="session")
+def point_plan():
+    """The point mass's motion over 2 s: the path ends at 1 s."""
+    model = derive(POINT, POINT_PROGRAM)
+    return sv.simulate(model, model.start(), (0.0, 2.0))
+
+
+@pytest.fixture(scope="session")
+def wheel(gallery_model):
+    """The Appell-Hamel mechanism and its start."""
+    model, scene = gallery_model("appell-hamel"), gallery["appell-hamel"]
+    return model, model.start(guess=scene.guess, **scene.start)
 
 
 def pendulum(unit=1.0, guess=True):
@@ -52,6 +96,16 @@ def pendulum(unit=1.0, guess=True):
         parameters=p,
     )
     return sv.derive(mechanism, sv.Program({"cart": s - 0.1 * unit * ca.sin(q.t)}), guess={"y": -unit} if guess else {})
+
+
+def words(text):
+    """The text without its line breaks."""
+    return " ".join(text.split())
+
+
+def relative(found, expected):
+    """Largest error, of the largest value."""
+    return np.abs(np.asarray(found) - np.asarray(expected)).max() / max(np.abs(expected).max(), 1e-300)
 
 
 def numbers(expressions, values):

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from refusals import refused
 
 import servoctl as sv
 from servoctl.errors import LimitExceeded, SpecificationError
@@ -98,7 +99,7 @@ def test_jets_and_samples_go_with_an_accuracy(gallery_model):
 def test_an_accuracy_leaves_nothing_else_to_choose(given, gallery_model):
     model, scene = gallery_model("appell-hamel"), gallery["appell-hamel"]
     start = model.start(guess=scene.guess, **scene.start)
-    with pytest.raises(SpecificationError, match="accuracy=1e-06") as caught:
+    with refused(SpecificationError, "accuracy=1e-06", next(iter(given))) as caught:
         sv.simulate(model, start, (0.0, 1.0), accuracy=1e-6, **given)
     assert caught.value.details == given
 
@@ -107,7 +108,7 @@ def test_an_accuracy_leaves_nothing_else_to_choose(given, gallery_model):
 def test_an_accuracy_is_a_small_number(accuracy, gallery_model):
     model, scene = gallery_model("appell-hamel"), gallery["appell-hamel"]
     start = model.start(guess=scene.guess, **scene.start)
-    with pytest.raises(SpecificationError, match="accuracy.*1e-13 to 0.1"):
+    with refused(SpecificationError, "accuracy", "1e-13", "0.1"):
         sv.simulate(model, start, (0.0, 1.0), accuracy=accuracy)
 
 
@@ -120,7 +121,7 @@ def test_an_accuracy_may_be_a_number_of_numpy(gallery_model):
 @pytest.mark.parametrize("given", [{"rtol": 1e-6}, {"atol": 1e-6}], ids=str)
 @pytest.mark.parametrize("method", ["RK4", "RK8"])
 def test_a_tolerance_is_refused_where_it_is_not_used(method, given):
-    with pytest.raises(SpecificationError, match=f"method='{method}'.*takes step") as caught:
+    with refused(SpecificationError, next(iter(given)), method) as caught:
         as_method(method, **given)
     assert caught.value.details == given
 
@@ -135,7 +136,7 @@ def test_where_rounding_hides_the_motion_the_accuracy_is_refused(gallery_model):
         run = sv.simulate(model, start, (0.0, 0.5), method, drift=drift, t_eval=[0.0, 0.5])
         return replace(run, jets=run.jets * (1.0 + 1e-6 * random.standard_normal(run.jets.shape)))
 
-    with pytest.raises(LimitExceeded, match="accuracy=1e-09 was asked for.*two tolerances agree to") as error:
+    with refused(LimitExceeded, accuracy=1e-9) as error:
         rule.accurate(spoilt, model, 1e-9)
     assert asked == sorted(asked, reverse=True) and asked[-1] == rule.FINEST and len(set(asked)) == len(asked)
     assert 1e-8 < error.value.details["reached"] < 1e-5 and error.value.run is not None

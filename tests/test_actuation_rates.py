@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from refusals import refused
 from scipy.interpolate import make_interp_spline
 
 import servoctl as sv
@@ -49,7 +50,7 @@ def test_rates_across_a_change_of_pivots(gallery_model):
 def test_a_run_without_the_jets_says_how_to_get_them(method, gallery_model):
     model = gallery_model("overhead-crane")
     run = sv.simulate(model, model.start(), (0.0, 1.0), method=method, t_eval=[0.0, 1.0])
-    with pytest.raises(sv.SpecificationError, match=r"method=sv.Taylor\(jets=3\)") as caught:
+    with refused(sv.SpecificationError, jets=3) as caught:
         run["dtrolley"]
     assert caught.value.details["jets"] == 3
 

@@ -7,6 +7,7 @@ import casadi as ca
 import numpy as np
 import pytest
 from conftest import motion, signal
+from refusals import refused
 
 from servoctl import spec as sv
 from servoctl.errors import (
@@ -21,14 +22,10 @@ from servoctl.gallery import cars, mass_on_car, overhead_crane, spiral, vtol
 from servoctl.model.model import derive
 
 
-def refused(kind, facts, make):
+def stopped(kind, facts, make):
     """The error that `make` raises, of this type, with these facts in its text."""
-    with pytest.raises(kind) as caught:
+    with refused(kind, *facts) as caught:
         make()
-    text = str(caught.value)
-    assert [fact for fact in facts if fact not in text] == [], text
-    assert type(caught.value) is kind, text
-    assert "  " not in text and "\n" not in text and text[-1] in ".!?"
     return caught.value
 
 
@@ -47,14 +44,14 @@ def test_fewer_actuators_than_constraints():
     x, y = q
     program = sv.Program({"east": x - ca.sin(q.t), "north": y})
     facts = ["2 residuals", "east", "north", "1 independent", "pull", "by='ideal'"]
-    error = refused(NotRealisable, facts, lambda: derive(mechanism, program))
+    error = stopped(NotRealisable, facts, lambda: derive(mechanism, program))
     assert error.details["residuals"] == ["east", "north"] and error.details["actuators"] == ["pull"]
 
 
 def test_no_actuators_at_all():
     q, mechanism = plane(actuators=None)
     program = sv.Program({"east": next(iter(q)) - ca.sin(q.t)})
-    refused(NotRealisable, ["1 residual", "east", "none"], lambda: derive(mechanism, program))
+    stopped(NotRealisable, ["1 residual", "east", "none"], lambda: derive(mechanism, program))
 
 
 @pytest.mark.parametrize("power", [3, 4])
@@ -62,7 +59,7 @@ def test_a_gibbs_function_that_is_not_quadratic(power):
     q = sv.coordinates("x y")
     ddx, ddy = q.d(2)
     facts = ["Gibbs function", "not quadratic", "sv.particle"]
-    refused(SpecificationError, facts, lambda: sv.Mechanism(q, gibbs=ddx**2 + ddy**power))
+    stopped(SpecificationError, facts, lambda: sv.Mechanism(q, gibbs=ddx**2 + ddy**power))
 
 
 @pytest.mark.parametrize("where", ["gibbs", "potential", "forces", "actuators", "constraints", "outputs"])
@@ -79,14 +76,14 @@ def test_a_foreign_symbol_in_a_mechanism(where):
         "constraints": {"constraints": {"rail": y - wind}},
         "outputs": {"outputs": {"o": wind}},
     }[where]
-    error = refused(SpecificationError, ["'wind'", "symbol"], lambda: sv.Mechanism(q, **({"gibbs": S} | foreign)))
+    error = stopped(SpecificationError, ["'wind'", "symbol"], lambda: sv.Mechanism(q, **({"gibbs": S} | foreign)))
     assert error.details["name"] == "wind"
 
 
 def test_a_foreign_symbol_in_a_program():
     q, mechanism = plane()
     program = sv.Program({"east": next(iter(q)) - ca.SX.sym("target")})
-    error = refused(SpecificationError, ["'east'", "'target'"], lambda: derive(mechanism, program))
+    error = stopped(SpecificationError, ["'east'", "'target'"], lambda: derive(mechanism, program))
     assert error.details["name"] == "target"
 
 
@@ -94,7 +91,7 @@ def test_a_symbol_of_the_same_name_is_another_one():
     q, mechanism = plane()
     twin = next(iter(sv.coordinates("x")))
     program = sv.Program({"east": twin - q.t})
-    error = refused(SpecificationError, ["'east'", "'x'", "another one"], lambda: derive(mechanism, program))
+    error = stopped(SpecificationError, ["'east'", "'x'", "another one"], lambda: derive(mechanism, program))
     assert error.details["name"] == "x"
 
 
@@ -102,7 +99,7 @@ def test_parameters_that_the_mechanism_was_not_given():
     p = sv.parameters(m_load=1.0)
     q = sv.coordinates("x")
     (x,) = q
-    refused(SpecificationError, ["'m_load'", "parameters="], lambda: sv.Mechanism(q, gibbs=sv.particle(q, p.m_load, x)))
+    stopped(SpecificationError, ["'m_load'", "parameters="], lambda: sv.Mechanism(q, gibbs=sv.particle(q, p.m_load, x)))
 
 
 def test_a_misspelt_symbol_shows_the_nearest():
@@ -110,7 +107,7 @@ def test_a_misspelt_symbol_shows_the_nearest():
     q = sv.coordinates("x")
     (x,) = q
     S = sv.particle(q, ca.SX.sym("m_laod"), x)
-    refused(SpecificationError, ["'m_laod'", "m_load"], lambda: sv.Mechanism(q, gibbs=S, parameters=p))
+    stopped(SpecificationError, ["'m_laod'", "m_load"], lambda: sv.Mechanism(q, gibbs=S, parameters=p))
 
 
 @pytest.mark.parametrize("by", ["ideal", "actuators"])
@@ -118,7 +115,7 @@ def test_dependent_constraints(by):
     q, mechanism = plane()
     x, y = q
     program = sv.Program({"one": x - ca.sin(q.t), "other": 2 * x - 2 * ca.sin(q.t)}, by=by)
-    error = refused(SpecificationError, ["one", "other", "dependent"], lambda: derive(mechanism, program))
+    error = stopped(SpecificationError, ["one", "other", "dependent"], lambda: derive(mechanism, program))
     assert set(error.details["rows"]) == {"one", "other"}
 
 
@@ -127,7 +124,7 @@ def test_contradictory_constraints(by):
     q, mechanism = plane()
     x, y = q
     program = sv.Program({"one": x - ca.sin(q.t), "other": x - 1 - ca.sin(q.t)}, by=by)
-    error = refused(SpecificationError, ["one", "other", "contradict"], lambda: derive(mechanism, program))
+    error = stopped(SpecificationError, ["one", "other", "contradict"], lambda: derive(mechanism, program))
     assert set(error.details["rows"]) == {"one", "other"}
 
 
@@ -138,7 +135,7 @@ def test_material_constraints_that_depend_or_contradict():
         constraints = {"rail": y - 1, "guide": second(y)}
         mechanism = sv.Mechanism(q, gibbs=sv.particle(q, 1.0, (x, y)), actuators={"a": x}, constraints=constraints)
         program = sv.Program({"east": x - ca.sin(q.t)})
-        refused(SpecificationError, ["rail", "guide", word], lambda m=mechanism, p=program: derive(m, p))
+        stopped(SpecificationError, ["rail", "guide", word], lambda m=mechanism, p=program: derive(m, p))
 
 
 def test_a_program_that_no_actuator_can_realise():
@@ -147,7 +144,7 @@ def test_a_program_that_no_actuator_can_realise():
     S = sv.particle(q, 1.0, (x, y, z))
     mechanism = sv.Mechanism(q, gibbs=S, actuators={"pull": x, "push": y})
     program = sv.Program({"height": z - ca.sin(q.t), "east": x})
-    error = refused(NotRealisable, ["height", "actuator"], lambda: derive(mechanism, program))
+    error = stopped(NotRealisable, ["height", "actuator"], lambda: derive(mechanism, program))
     assert "height" in error.details["rows"]
 
 
@@ -156,7 +153,7 @@ def test_a_program_that_only_gravity_could_realise():
     x, z = q
     mechanism = sv.Mechanism(q, gibbs=sv.particle(q, 1.0, (x, z)), potential=9.81 * z, actuators={"pull": x})
     program = sv.Program({"height": z - ca.sin(q.t)})
-    refused(NotRealisable, ["height"], lambda: derive(mechanism, program))
+    stopped(NotRealisable, ["height"], lambda: derive(mechanism, program))
 
 
 def test_a_path_that_is_not_smooth_enough():
@@ -164,7 +161,7 @@ def test_a_path_that_is_not_smooth_enough():
     q = mechanism.q
     path = sv.paths.rest_to_rest(q.t, 0.5, 2.5, duration=2.0, smoothness=2, t_start=3.0)
     program = sv.Program({"car 1": next(iter(q)) - path})
-    error = refused(SpecificationError, ["'car 1'", "needs C^4, has C^2 at t = 3"], lambda: derive(mechanism, program))
+    error = stopped(SpecificationError, ["'car 1'", "needs C^4, has C^2 at t = 3"], lambda: derive(mechanism, program))
     facts = {key: error.details[key] for key in ("name", "needs", "has")}
     assert facts == {"name": "car 1", "needs": 4, "has": 2} and error.details["t"] == pytest.approx(3.0)
 
@@ -173,7 +170,7 @@ def test_a_squared_constraint():
     q, mechanism = plane()
     x, _ = q
     program = sv.Program({"squared": (x - ca.sin(q.t)) ** 2}, by="ideal")
-    error = refused(SingularProgram, ["'squared'", "gradient"], lambda: derive(mechanism, program))
+    error = stopped(SingularProgram, ["'squared'", "gradient"], lambda: derive(mechanism, program))
     assert error.details["row"] == "squared"
 
 
@@ -185,7 +182,7 @@ def test_a_singular_mass_matrix(mass):
     S = sv.particle(q, 2.0, x) + sv.particle(q, p.m if mass == "p" else mass, y)
     mechanism = sv.Mechanism(q, gibbs=S, actuators={"a": x}, parameters=p)
     program = sv.Program({"east": x - ca.sin(q.t)})
-    error = refused(SpecificationError, ["mass matrix is singular", "dy"], lambda: derive(mechanism, program))
+    error = stopped(SpecificationError, ["mass matrix is singular", "dy"], lambda: derive(mechanism, program))
     assert error.details["names"] == ["dy"] and "dx" not in str(error)
 
 
@@ -195,7 +192,7 @@ def test_a_direction_without_inertia_between_coordinates():
     S = sv.particle(q, 2.0, x + y) + sv.particle(q, 1.0, z)
     mechanism = sv.Mechanism(q, gibbs=S, actuators={"a": x})
     program = sv.Program({"east": x - ca.sin(q.t)})
-    error = refused(SpecificationError, ["singular", "dx", "dy"], lambda: derive(mechanism, program))
+    error = stopped(SpecificationError, ["singular", "dx", "dy"], lambda: derive(mechanism, program))
     assert set(error.details["names"]) == {"dx", "dy"}
 
 
@@ -279,7 +276,7 @@ def test_nan_from_math_names_the_functions_to_use_instead(where):
         "position": lambda: sv.particle(q, 1.0, value),
         "potential": lambda: sv.Mechanism(q, gibbs=sv.particle(q, 1.0, (x, y)), potential=value),
     }[where]
-    error = refused(SpecificationError, ["NaN", "ca.sin", "math"], make)
+    error = stopped(SpecificationError, ["NaN", "ca.sin", "math"], make)
     assert error.details["what"]
 
 
@@ -288,9 +285,9 @@ def test_nan_from_math_names_the_functions_to_use_instead(where):
 
 @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf, None, "much", [1.0], ca.SX.sym("m")])
 def test_numbers_of_parameters_that_are_none(value):
-    refused(SpecificationError, ["'m'", "finite number"], lambda: sv.parameters(m=value))
+    stopped(SpecificationError, ["'m'", "finite number"], lambda: sv.parameters(m=value))
     model = derive(*cars(2))
-    error = refused(SpecificationError, ["'m1'", "finite number"], lambda: model.with_parameters(m1=value))
+    error = stopped(SpecificationError, ["'m1'", "finite number"], lambda: model.with_parameters(m1=value))
     assert error.details["name"] == "m1"
 
 
@@ -305,7 +302,7 @@ def test_numbers_of_a_start_that_are_none(value, how):
         "t": lambda: model.start(value),
         "derive": lambda: derive(mechanism, program, guess={"s": value}),
     }[how]
-    refused(SpecificationError, ["t" if how == "t" else "s", repr(value)], make)
+    stopped(SpecificationError, ["t" if how == "t" else "s", repr(value)], make)
 
 
 # names ---------------------------------------------------------------------------------------------------------------
@@ -325,7 +322,7 @@ def test_numbers_of_a_start_that_are_none(value, how):
 )
 def test_unknown_names_show_the_nearest(make, match):
     model = derive(*overhead_crane())
-    error = refused(NameUnknown, [f"Nearest: {match!r}"], lambda: make(model))
+    error = stopped(NameUnknown, [f"Nearest: {match!r}"], lambda: make(model))
     assert error.details["match"] == match and error.details["name"] != match
     assert set(error.details) == {"name", "valid", "match"}
 
@@ -345,7 +342,7 @@ def test_a_coordinate_of_any_name_can_be_held_or_is_refused_at_once(name):
 
 
 def test_names_that_resemble_nothing_list_the_valid_ones():
-    error = refused(NameUnknown, ["'qqq'", "theta", "dl"], lambda: derive(*overhead_crane()).start(qqq=1.0))
+    error = stopped(NameUnknown, ["'qqq'", "theta", "dl"], lambda: derive(*overhead_crane()).start(qqq=1.0))
     assert error.details["match"] is None
 
 
@@ -363,7 +360,7 @@ def test_no_consistent_start_anywhere():
     q, mechanism = plane()
     x, y = q
     program = sv.Program({"circle": x**2 + y**2 + 1}, by="ideal")
-    error = refused(InconsistentStart, ["circle", "guess"], lambda: derive(mechanism, program))
+    error = stopped(InconsistentStart, ["circle", "guess"], lambda: derive(mechanism, program))
     assert error.details["rows"] == ["circle"]
 
 
@@ -373,13 +370,13 @@ def test_no_consistent_start_at_this_time():
     x, y = q
     model = derive(mechanism, sv.Program({"wave": ca.sin(x) - q.t, "north": y}), guess={"x": 0.3})
     assert model.start(0.5)["x"] == pytest.approx(np.arcsin(0.5))
-    error = refused(InconsistentStart, ["'wave'", "guess"], lambda: model.start(2.0))
+    error = stopped(InconsistentStart, ["'wave'", "guess"], lambda: model.start(2.0))
     assert error.details["invariant"] == "wave" and error.details["residual"] > 1e-3
 
 
 def test_a_held_value_against_an_invariant():
     model = derive(*overhead_crane())
-    error = refused(InconsistentStart, ["x = 3", "held"], lambda: model.start(x=3.0, guess={"l": 4.0}))
+    error = stopped(InconsistentStart, ["x = 3", "held"], lambda: model.start(x=3.0, guess={"l": 4.0}))
     assert error.details["held"] == "x" and error.details["nearest_value"] == pytest.approx(0.0, abs=1e-9)
     assert error.details["invariant"] in str(error)
 
@@ -387,7 +384,7 @@ def test_a_held_value_against_an_invariant():
 def test_a_held_velocity_against_an_invariant():
     model = derive(*mass_on_car())
     held = {"s": 0.0, "ds": 0.0, "dx": 2.0}
-    error = refused(InconsistentStart, ["is held", "D(z)"], lambda: model.start(0.0, **held))
+    error = stopped(InconsistentStart, ["is held", "D(z)"], lambda: model.start(0.0, **held))
     assert error.details["held"] in ("dx", "ds") and error.details["invariant"] == "D(z)"
 
 

@@ -7,6 +7,7 @@ from math import comb, factorial
 import casadi as ca
 import numpy as np
 import pytest
+from refusals import refused, warned
 
 import servoctl as sv
 from servoctl.gallery import mass_on_car
@@ -46,7 +47,7 @@ def test_a_sampled_loop_is_stable_below_the_bound_and_unstable_above(rho, delay)
 
 @pytest.mark.parametrize("given", [{"rho": 0}, {"rho": 2.0}, {"rho": 13}, {"rho": 2, "delay": -1}])
 def test_a_bound_of_something_else_is_refused(given):
-    with pytest.raises(sv.SpecificationError, match="whole number"):
+    with refused(sv.SpecificationError, f"{list(given)[-1]}={list(given.values())[-1]}"):
         bounds.sampled_bound(**given)
 
 
@@ -89,12 +90,12 @@ def test_the_stability_function_is_the_exponential_to_the_order(method):
 
 
 def test_multistep_methods_and_idle_orders_are_refused():
-    with pytest.raises(sv.NameUnknown, match="BDF"):
+    with refused(sv.NameUnknown, name="BDF"):
         bounds.stability_function("BDF")
-    with pytest.raises(sv.SpecificationError, match="order"):
+    with refused(sv.SpecificationError, "order", "Taylor"):
         bounds.stability_function("Taylor")
     for given in (("RK4", 4), ("RadauIIA", 4), ("RadauIIA", None), ("Taylor", 0)):
-        with pytest.raises(sv.SpecificationError, match="order"):
+        with refused(sv.SpecificationError, "order"):
             bounds.stability_function(*given)
 
 
@@ -121,13 +122,13 @@ def test_poles_diverge_in_simulation_where_the_bound_says(sine, method):
 
 
 def test_a_choice_beyond_the_bound_is_warned_about_with_its_number(sine):
-    with pytest.warns(RuntimeWarning, match=r"'X'.*-60 1/s.*\|λ\|h = 3 exceeds 2.785.*0.04642 s") as caught:
+    with warned("'X'", "-60 1/s", "= 3 ", "2.785", "0.04642 s") as caught:
         assert sine_error(sine, 60.0) > 1e6
     assert caught[0].filename == __file__
 
 
 def test_a_choice_beyond_the_bound_is_warned_about_backwards_in_time(sine):
-    with pytest.warns(RuntimeWarning, match=r"pole 60 1/s was to damp: \|λ\|h = 3 exceeds 2.785"):
+    with warned(" 60 1/s", "= 3 ", "2.785"):
         sv.simulate(sine, sine.start(), (0.0, -1.0), sv.RungeKutta(4, step=0.05), drift=sv.Poles({"X": [60.0, 60.0]}))
 
 
@@ -138,7 +139,7 @@ def test_poles_that_ask_for_a_hundred_thousand_adaptive_steps_are_warned_about(s
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         sv.simulate(sine, sine.start(), (0.0, direction), "DOP853", drift=slow)
-        with pytest.raises(RuntimeWarning, match="of 'X' holds the steps of DOP853 below .*: 2e[+]06 steps"):
+        with refused(RuntimeWarning, "'X'", "DOP853", "2e+06 steps"):
             sv.simulate(sine, sine.start(), (0.0, direction), "DOP853", drift=fast)
 
 
@@ -147,7 +148,7 @@ def test_complex_poles_are_judged_in_their_own_direction(sine):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         sv.simulate(sine, sine.start(), (0.0, 1.0), sv.RungeKutta(4, step=0.05), drift=sv.Poles(pair))
-    with pytest.warns(RuntimeWarning, match="RK2"):
+    with warned("RK2"):
         sv.simulate(sine, sine.start(), (0.0, 1.0), sv.RungeKutta(2, step=0.05), drift=sv.Poles(pair))
 
 
@@ -164,7 +165,7 @@ def test_steps_too_long_for_the_internal_dynamics_are_warned_about(method, step)
     model = sv.derive(*mass_on_car(damping=1000.0))
     start = model.start(s=0.0, ds=0.0)
     largest = sv.stability(model, sv.simulate(model, start, (0.0, 1.0), method="RadauIIA")).largest_step(method)
-    with pytest.warns(RuntimeWarning, match=f"Steps of {step:g} s by {method} do not resolve the motion") as caught:
+    with warned(f"{step:g} s", method, "resolve") as caught:
         sv.simulate(model, start, (0.0, 1.0), method=as_method(method, step=step))
     told = float(re.search(r"largest stable step there is about (\S+) s", str(caught[0].message))[1])
     assert told == pytest.approx(largest, rel=0.05)
@@ -187,7 +188,7 @@ def test_stable_steps_that_do_not_resolve_the_motion_are_warned_about():
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         assert error(0.5) < 0.01
-    with pytest.warns(RuntimeWarning, match="Steps of 3 s by RadauIIA do not resolve the motion") as caught:
+    with warned("3 s", "RadauIIA", "resolve") as caught:
         assert error(3.0) > 1.0
     assert "stable" not in str(caught[0].message) and caught[0].filename == __file__
 
@@ -196,7 +197,7 @@ def test_steps_that_do_not_resolve_the_motion_before_a_knot_are_warned_about():
     """The path ends at 3 s: the mass at rest behind it does not tell what went before."""
     model, span = sv.derive(*mass_on_car(damping=10.0)), (0.0, 6.0)
     start = model.start(s=0.0, ds=0.0)
-    with pytest.warns(RuntimeWarning, match="do not resolve the motion: at t = [0-2]"):
+    with warned("RK4", "resolve"):
         sv.simulate(model, start, span, method=sv.RungeKutta(4, step=0.3))
     with warnings.catch_warnings():
         warnings.simplefilter("error")
@@ -216,5 +217,5 @@ def test_steps_over_a_singularity_are_warned_about():
     model = sv.derive(mechanism, sv.Program({"path": x - q.t}), guess={"y": -1.0})
     start = model.start(s=0.0, ds=1.0, guess={"y": -1.0})
     for drift in (None, 0.5, "project"):
-        with pytest.warns(RuntimeWarning, match="do not resolve the motion"):
+        with warned("RK4", "resolve"):
             sv.simulate(model, start, (0.0, 1.5), method=sv.RungeKutta(4, step=0.3), drift=drift)

@@ -10,6 +10,7 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
+from conftest import words
 
 import servoctl
 from servoctl.errors import IntegrationStopped
@@ -37,11 +38,7 @@ def scene():
 '''
 
 
-@pytest.fixture(autouse=True)
-def here(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(sys, "path", list(sys.path))
-    return tmp_path
+pytestmark = pytest.mark.usefixtures("here")
 
 
 @pytest.fixture
@@ -59,11 +56,6 @@ def process(*command):
 
 def summary(folder):
     return json.loads((folder / "summary.json").read_text(encoding="utf-8"))
-
-
-def words(text):
-    """The text without its line breaks."""
-    return " ".join(text.split())
 
 
 # --- the main job

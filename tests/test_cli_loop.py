@@ -1,11 +1,12 @@
 """The closed loop of `servoctl run`: by default about the plan's own numbers, else on the machine that is named."""
 
 import json
-import sys
 
 import numpy as np
 import pytest
+from conftest import words
 from matplotlib.colors import to_hex
+from scenes import CRANE
 
 import servoctl as sv
 from servoctl.figures.loop import LIMIT
@@ -13,21 +14,10 @@ from servoctl.gallery import gallery
 from servoctl.shell.folder import FILES
 from servoctl.shell.main import main
 
-CRANE, PROGRAM = gallery["overhead-crane"].build()
 UNITS = gallery["overhead-crane"].units
 
 
-@pytest.fixture(autouse=True)
-def here(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(sys, "path", list(sys.path))
-    return tmp_path
-
-
-@pytest.fixture(scope="module")
-def plan():
-    model = sv.derive(CRANE, PROGRAM)
-    return sv.simulate(model, model.start(guess={"l": 4.0}), (0.0, 8.0))
+pytestmark = pytest.mark.usefixtures("here", "at_once")
 
 
 def crane(*options):
@@ -35,10 +25,6 @@ def crane(*options):
     code = main(["run", "overhead-crane", "--no-verify", "--no-figures", "--out", "crane", *" ".join(options).split()])
     with open("crane/summary.json", encoding="utf-8") as file:
         return code, json.load(file)["closed_loop"], sv.load("crane/closed_loop.npz")
-
-
-def words(text):
-    return " ".join(text.split())
 
 
 # the loop --------------------------------------------------------------------------------------------------------------

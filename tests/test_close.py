@@ -7,37 +7,11 @@ import casadi as ca
 import numpy as np
 import pytest
 from conftest import numbers
+from refusals import refused
+from scenes import CRANE, POINT, ROPE
 
 import servoctl as sv
 from servoctl.gallery import gallery
-
-CRANE, CRANE_PROGRAM = gallery["overhead-crane"].build()
-
-
-def point_mass(m=2.0):
-    p = sv.parameters(m=m)
-    q = sv.coordinates("x")
-    (x,) = q
-    path = sv.paths.rest_to_rest(q.t, 0.0, 1.0, duration=1.0, smoothness=3)
-    mechanism = sv.Mechanism(q, gibbs=sv.particle(q, p.m, x), actuators={"force": x}, parameters=p)
-    return mechanism, sv.Program({"X": x - path}, by="actuators")
-
-
-POINT, POINT_PROGRAM = point_mass()
-ROPE = gallery["overhead-crane-redundant"].build()[0]
-
-
-@pytest.fixture(scope="module")
-def crane_plan():
-    model = sv.derive(CRANE, CRANE_PROGRAM)
-    return sv.simulate(model, model.start(guess={"l": 4.0}), (0.0, 8.0))
-
-
-@pytest.fixture(scope="module")
-def point_plan():
-    model = sv.derive(POINT, POINT_PROGRAM)
-    return sv.simulate(model, model.start(), (0.0, 2.0))
-
 
 # the loop against a recursion -----------------------------------------------------------------------------------------
 
@@ -146,12 +120,12 @@ def test_pole_placement_goes_unstable_where_the_period_is_too_long(delay, limit)
     assert low == pytest.approx(limit, rel=0.02)
 
 
-@pytest.mark.parametrize(("product", "refused"), [(0.98, False), (1.02, True), (30.0, True)])
-def test_gains_too_fast_for_their_rate_are_refused(point_plan, product, refused):
+@pytest.mark.parametrize(("product", "fast"), [(0.98, False), (1.02, True), (30.0, True)])
+def test_gains_too_fast_for_their_rate_are_refused(point_plan, product, fast):
     p = 20.0
     gains = {"kp": {"force": 2.0 * p**2}, "kd": {"force": 2.0 * 2 * p}}
-    if refused:
-        with pytest.raises(sv.ServoError, match=r"per sample.*0\.6752"):
+    if fast:
+        with refused(sv.ServoError, "0.6752"):
             sv.pd(point_plan, sv.plant(POINT), rate=p / product, **gains)
     else:
         law = sv.pd(point_plan, sv.plant(POINT), rate=p / product, **gains)
@@ -199,7 +173,7 @@ def test_pd_brings_the_actuated_displacements_back(crane_plan):
 def test_a_law_with_a_controller_state_is_started(crane_plan):
     plant = sv.plant(CRANE)
     law = sv.lqr(crane_plan, plant, integral=True)
-    with pytest.raises(sv.SpecificationError, match="law.start"):
+    with refused(sv.SpecificationError, "law.start", "integral of X"):
         law(0.0, crane_plan.state(0.0))
     run = sv.close(sv.plant(CRANE, m_load=115.0), law, crane_plan.state(0.0), (0.0, 1.0))
     controller = law.start()
@@ -314,47 +288,47 @@ def close(plant=None, law=LAW, x0=(0.0, 0.0), span=(0.0, 1.0), rate=20.0, delay=
 
 BAD = {
     "no plant": (lambda: close(plant=POINT), sv.SpecificationError, "sv.plant"),
-    "no law": (lambda: close(law=3.0), sv.SpecificationError, "law"),
-    "no rate": (lambda: close(rate=None), sv.SpecificationError, "once per sample"),
-    "negative rate": (lambda: close(rate=-5.0), sv.SpecificationError, "positive"),
-    "time that is no sample": (lambda: close(span=(0.0, 1.01)), sv.SpecificationError, "20.2.*20"),
-    "time backwards": (lambda: close(span=(1.0, 0.0)), sv.SpecificationError, "later"),
-    "half a delay": (lambda: close(delay=0.5), sv.SpecificationError, "whole number"),
-    "negative delay": (lambda: close(delay=-1), sv.SpecificationError, "at least 0"),
-    "half a step": (lambda: close(substeps=1.5), sv.SpecificationError, "whole number"),
-    "no step": (lambda: close(substeps=0), sv.SpecificationError, "at least 1"),
+    "no law": (lambda: close(law=3.0), sv.SpecificationError, "float"),
+    "no rate": (lambda: close(rate=None), sv.SpecificationError, "rate"),
+    "negative rate": (lambda: close(rate=-5.0), sv.SpecificationError, "-5"),
+    "time that is no sample": (lambda: close(span=(0.0, 1.01)), sv.SpecificationError, {"number": 20.2}),
+    "time backwards": (lambda: close(span=(1.0, 0.0)), sv.SpecificationError, "(1.0, 0.0)"),
+    "half a delay": (lambda: close(delay=0.5), sv.SpecificationError, {"number": 0.5}),
+    "negative delay": (lambda: close(delay=-1), sv.SpecificationError, {"number": -1.0}),
+    "half a step": (lambda: close(substeps=1.5), sv.SpecificationError, {"number": 1.5}),
+    "no step": (lambda: close(substeps=0), sv.SpecificationError, "substeps"),
     "transport between steps": (
-        lambda: close(plant=sv.plant(POINT, delay=0.02), substeps=1), sv.SpecificationError, "Rates of 50 Hz",
+        lambda: close(plant=sv.plant(POINT, delay=0.02), substeps=1), sv.SpecificationError, {"name": "force"},
     ),
-    "noise on nothing": (lambda: close(sensors=sv.Sensors(noise={"y": 0.1})), sv.NameUnknown, "x, dx"),
-    "negative noise": (lambda: close(sensors=sv.Sensors(noise={"x": -0.1})), sv.SpecificationError, "not negative"),
-    "seed of nothing": (lambda: close(sensors=sv.Sensors(seed=3)), sv.SpecificationError, "without noise"),
-    "odd seed": (lambda: close(sensors=sv.Sensors(noise={"x": 0.1}, seed=0.5)), sv.SpecificationError, "whole number"),
-    "quantised nothing": (lambda: close(sensors=sv.Sensors(quantisation={"y": 0.1})), sv.NameUnknown, "x, dx"),
-    "disturbance of nothing": (lambda: close(disturbance={"dx": LAW}), sv.NameUnknown, "generalised force"),
-    "disturbance of text": (lambda: close(disturbance={"x": "gust"}), sv.SpecificationError, "finite number"),
-    "disturbance of NaN": (lambda: close(disturbance={"x": lambda t: np.nan * t}), sv.SpecificationError, "not finite"),
-    "disturbance of lists": (lambda: close(disturbance={"x": lambda t: [1, 2]}), sv.SpecificationError, "not give a number"),
+    "noise on nothing": (lambda: close(sensors=sv.Sensors(noise={"y": 0.1})), sv.NameUnknown, {"valid": ("x", "dx")}),
+    "negative noise": (lambda: close(sensors=sv.Sensors(noise={"x": -0.1})), sv.SpecificationError, "-0.1"),
+    "seed of nothing": (lambda: close(sensors=sv.Sensors(seed=3)), sv.SpecificationError, "seed"),
+    "odd seed": (lambda: close(sensors=sv.Sensors(noise={"x": 0.1}, seed=0.5)), sv.SpecificationError, "seed=0.5"),
+    "quantised nothing": (lambda: close(sensors=sv.Sensors(quantisation={"y": 0.1})), sv.NameUnknown, {"valid": ("x", "dx")}),
+    "disturbance of nothing": (lambda: close(disturbance={"dx": LAW}), sv.NameUnknown, {"name": "dx"}),
+    "disturbance of text": (lambda: close(disturbance={"x": "gust"}), sv.SpecificationError, {"name": "x"}),
+    "disturbance of NaN": (lambda: close(disturbance={"x": lambda t: np.nan * t}), sv.SpecificationError, {"name": "x"}),
+    "disturbance of lists": (lambda: close(disturbance={"x": lambda t: [1, 2]}), sv.SpecificationError, {"name": "x"}),
     "start off the rope": (
         lambda: close(plant=sv.plant(ROPE), law=lambda t, y: [0.0, 0.0], x0=[0.0, 4.0, 1.0, 4.0, 0.0, 0.0, 0.0, 0.0]),
-        sv.InconsistentStart, "rope is 1 at the start",
+        sv.InconsistentStart, {"values": {"rope": 1.0, "D(rope)": 0.0}},
     ),
-    "start of NaN": (lambda: close(x0=[np.nan, 0.0]), sv.SpecificationError, "2 finite numbers"),
-    "law of two inputs": (lambda: close(law=lambda t, y: [0.0, 1.0]), sv.SpecificationError, "1 numbers: force"),
-    "law of an odd name": (lambda: close(law=lambda t, y: {"forc": 0.0}), sv.NameUnknown, "force"),
-    "law of NaN": (lambda: close(law=lambda t, y: [np.nan if t > 0.52 else 0.0]), sv.ServoError, "t = 0.55 s"),
-    "law that is a class": (lambda: close(law=Counting), sv.SpecificationError, "A type was given as law"),
-    "law that starts nothing": (lambda: close(law=Idle()), sv.SpecificationError, "gave a int"),
-    "plan of no model": (lambda: close(plan=3.0), sv.SpecificationError, "given as plan"),
+    "start of NaN": (lambda: close(x0=[np.nan, 0.0]), sv.SpecificationError, {"names": ("x", "dx")}),
+    "law of two inputs": (lambda: close(law=lambda t, y: [0.0, 1.0]), sv.SpecificationError, "force"),
+    "law of an odd name": (lambda: close(law=lambda t, y: {"forc": 0.0}), sv.NameUnknown, {"match": "force"}),
+    "law of NaN": (lambda: close(law=lambda t, y: [np.nan if t > 0.52 else 0.0]), sv.ServoError, {"t": 0.55}),
+    "law that is a class": (lambda: close(law=Counting), sv.SpecificationError, "type"),
+    "law that starts nothing": (lambda: close(law=Idle()), sv.SpecificationError, "'Idle'"),
+    "plan of no model": (lambda: close(plan=3.0), sv.SpecificationError, "float"),
     "sensors of a dict": (lambda: close(sensors={"noise": {"x": 0.1}}), sv.SpecificationError, "sv.Sensors"),
-    "seed of text": (lambda: close(sensors=sv.Sensors(noise={"x": 0.1}, seed="")), sv.SpecificationError, "whole number"),
-    "seed of no noise": (lambda: close(sensors=sv.Sensors(noise={}, seed=1)), sv.SpecificationError, "without noise"),
+    "seed of text": (lambda: close(sensors=sv.Sensors(noise={"x": 0.1}, seed="")), sv.SpecificationError, "seed=''"),
+    "seed of no noise": (lambda: close(sensors=sv.Sensors(noise={}, seed=1)), sv.SpecificationError, "seed"),
     "lag far below the period": (
-        lambda: close(plant=sv.plant(POINT, lag={"force": 1e-6})), sv.SpecificationError, "1e.06 1/s.*substeps=1000000",
+        lambda: close(plant=sv.plant(POINT, lag={"force": 1e-6})), sv.SpecificationError, "1e+06 1/s",
     ),
     "force without a slope": (
         lambda: close(plant=sv.plant(POINT, forces={"x": -ca.sqrt(ca.fabs(POINT.q.d(1)[0]))})),
-        sv.SpecificationError, "not finite",
+        sv.SpecificationError, "substeps",
     ),
     "law that fails": (lambda: close(law=lambda t, y: [y["z"]]), KeyError, "z"),
 }  # fmt: skip
@@ -371,7 +345,7 @@ def test_sensors_and_timing_are_values():
 @pytest.mark.parametrize("what", BAD)
 def test_bad_input_is_refused_by_name(what):
     call, kind, fact = BAD[what]
-    with pytest.raises(kind, match=fact):
+    with refused(kind, fact):
         call()
 
 
@@ -388,7 +362,7 @@ def test_what_was_computed_before_a_law_failed_is_kept():
 
 
 def test_a_loop_that_diverges_stops_with_its_motion():
-    with pytest.raises(sv.IntegrationStopped, match="finite state") as caught:
+    with refused(sv.IntegrationStopped, "3.15 s") as caught:
         close(
             plant=sv.plant(POINT, forces={"x": 1e6 * next(iter(POINT.q))}), x0=(1.0, 1.0), span=(0.0, 50.0), substeps=1
         )
@@ -404,50 +378,50 @@ def handmade(step=lambda t, x, row: [-x[0], -981.0], **other):
 def test_a_handmade_law_that_answers_otherwise_is_refused(crane_plan, answer):
     law = handmade(lambda t, x, row: answer)
     for ask in (lambda: law(0.0, [0.0]), lambda: sv.close(sv.plant(CRANE), law, crane_plan.state(0.0), (0.0, 0.1))):
-        with pytest.raises(sv.SpecificationError, match=r"t = 0 s\. It answers 2 numbers"):
+        with refused(sv.SpecificationError, "2 numbers", t=0.0):
             ask()
 
 
 @pytest.mark.parametrize("measurement", ["a", None, {"x": None}, [0.0, 1.0]])
 def test_what_is_no_measurement_is_refused(measurement):
-    with pytest.raises(sv.SpecificationError, match="It has 1 numbers: x"):
+    with refused(sv.SpecificationError, "1: x"):
         handmade()(0.0, measurement)
 
 
 def test_a_law_is_asked_at_times_and_has_a_rate():
-    with pytest.raises(sv.SpecificationError, match="'t' is nan"):
+    with refused(sv.SpecificationError, name="t"):
         handmade()(np.nan, [0.0])
-    with pytest.raises(sv.SpecificationError, match="rate = 0"):
+    with refused(sv.SpecificationError, "'own'", "0 Hz"):
         handmade(rate=0.0)
 
 
 def test_laws_refuse_plans_and_plants_that_do_not_fit(point_plan, crane_plan, tmp_path):
-    with pytest.raises(sv.NameUnknown, match="state of the plant"):
+    with refused(sv.NameUnknown, name="x"):
         sv.feedforward(point_plan, sv.plant(gallery["two-cars"].build()[0]))
-    with pytest.raises(sv.SpecificationError, match="loaded run"):
+    with refused(sv.SpecificationError, "Run", "plan"):
         sv.feedforward(sv.load(point_plan.save(tmp_path / "plan")), sv.plant(POINT))
-    with pytest.raises(sv.SpecificationError, match="designed for"):
+    with refused(sv.SpecificationError, "50 Hz", "100 Hz"):
         law, timing = sv.feedforward(point_plan, sv.plant(POINT)), sv.Timing(rate=50.0)
         sv.close(sv.plant(POINT), law, [0, 0], (0.0, 1.0), timing=timing)
-    with pytest.raises(sv.SpecificationError, match="samples"):
+    with refused(sv.SpecificationError, "0.005 s", number=0.5):
         sv.close(sv.plant(POINT), sv.feedforward(point_plan, sv.plant(POINT)), [0, 0], (0.005, 1.005))
-    with pytest.raises(sv.SpecificationError, match="lasts 2 s, and is sampled every 10 s"):
+    with refused(sv.SpecificationError, "2 s", "10 s"):
         sv.feedforward(point_plan, sv.plant(POINT), rate=0.1)
     law = sv.pd(point_plan, sv.plant(POINT), kp={"force": 100.0}, kd={"force": 20.0})
     for wrong in ({"schedule": law.schedule[:2]}, {"state": np.zeros(1)}, {"measures": ()}, {"idle": np.zeros(2)}):
-        with pytest.raises(sv.SpecificationError, match="belong to the step"):
+        with refused(sv.SpecificationError, law.name):
             replace(law, **wrong)
     rough = sv.plant(POINT, forces={"x": -ca.sqrt(ca.fabs(POINT.q.d(1)[0]))})
-    with pytest.raises(sv.ServoError, match="not finite at t = .*smooth"):
+    with refused(sv.ServoError, "plant", t=pytest.approx(1.005)):
         sv.pd(point_plan, rough, kp={"force": 100.0})
     for make in (sv.feedforward, sv.pd, sv.lqr, sv.computed):
-        with pytest.raises(sv.SpecificationError, match="was given as plant"):
+        with refused(sv.SpecificationError, "Mechanism", "sv.plant"):
             make(point_plan, POINT)
-    with pytest.raises(sv.SpecificationError, match="finite number"):
+    with refused(sv.SpecificationError, "kp", "'force'"):
         sv.pd(point_plan, sv.plant(POINT), kp={"force": [1.0, 2.0]})
-    with pytest.raises(sv.NameUnknown, match="force"):
+    with refused(sv.NameUnknown, name="forc", match="force"):
         sv.pd(point_plan, sv.plant(POINT), kp={"forc": 1.0})
-    with pytest.raises(sv.NameUnknown, match="actuator of the plant|state of the plant"):
+    with refused(sv.NameUnknown, name="start"):
         sv.close(sv.plant(POINT), sv.feedforward(crane_plan, sv.plant(CRANE)), [0, 0], (0.0, 1.0))
 
 
@@ -455,7 +429,7 @@ def test_an_ideal_plan_is_no_command():
     mechanism, program = gallery["two-cars-ideal"].build()
     model = sv.derive(mechanism, program)
     plan = sv.simulate(model, model.start(guess={"x2": 0.0}), (0.0, 0.1))
-    with pytest.raises(sv.NotRealisable, match="ideal reaction"):
+    with refused(sv.NotRealisable, "ideal"):
         sv.feedforward(plan, sv.plant(mechanism))
 
 
@@ -468,7 +442,7 @@ def test_more_samples_than_fit_into_memory_are_refused_with_their_number():
         lambda: sv.lqr(plan, plant),
         lambda: sv.close(plant, lambda t, y: [0.0, -981.0], plan.state(2.0), (0.0, 1e9), timing=sv.Timing(100.0)),
     ):
-        with pytest.raises(sv.SpecificationError, match=r"1e\+11 samples, which take .* GB.*Lower the rate"):
+        with refused(sv.SpecificationError, "GB", samples=pytest.approx(1e11, rel=1e-8)):
             build()
 
 
@@ -502,9 +476,9 @@ def test_a_closed_run_is_saved_and_loaded(crane_plan, tmp_path):
     sent = pickle.loads(pickle.dumps(run))  # as a worker returns it
     assert np.array_equal(sent["trolley"], run["trolley"]) and np.array_equal(sent.residual["Z"], run.residual["Z"])
     assert len(repr(run).splitlines()) <= 12 and len(repr(run.law).splitlines()) <= 12
-    with pytest.raises(sv.NameUnknown, match="theta"):
+    with refused(sv.NameUnknown, name="thetta", match="theta"):
         run["thetta"]
-    with pytest.raises(sv.SpecificationError, match="samples every"):
+    with refused(sv.SpecificationError, "0.005 s"):
         run.state(0.005)
 
 

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 from conftest import at_random, numbers
 from frames import boat
+from refusals import refused
 
 from servoctl import spec as sv
 from servoctl.errors import NameUnknown, SpecificationError
@@ -84,7 +85,7 @@ def test_orders_that_are_no_whole_numbers_are_refused(order, plain):
     if not plain:
         q = q.with_quasi_velocities("u v", [[1, 0], [0, 1]])
     for ask in (q.d, q.w, lambda k: q.dt(ca.vertcat(*q), k)):
-        with pytest.raises(SpecificationError, match="order"):
+        with refused(SpecificationError, "order"):
             ask(order)
 
 
@@ -137,11 +138,11 @@ def test_quasi_velocities_of_wrong_size_or_name_are_refused(names, V, facts):
 
 def test_frames_that_depend_on_velocities_are_refused():
     q = sv.coordinates("x y")
-    with pytest.raises(SpecificationError, match="dx"):
+    with refused(SpecificationError, "V", "dx"):
         q.with_quasi_velocities("u v", [[1, q.d(1)[0]], [0, 1]])
-    with pytest.raises(SpecificationError, match="dy"):
+    with refused(SpecificationError, "h", "dy"):
         q.with_quasi_velocities("u v", [[1, 0], [0, 1]], h=[q.d(1)[1], 0])
-    with pytest.raises(SpecificationError, match="3 entries"):
+    with refused(SpecificationError, "3", "2", what="h"):
         q.with_quasi_velocities("u v", [[1, 0], [0, 1]], h=[0, 0, 0])
 
 
@@ -149,7 +150,7 @@ def test_a_frame_with_a_foreign_symbol_is_refused_by_the_mechanism():
     q = sv.coordinates("x y")
     foreign = ca.SX.sym("slope")
     q = q.with_quasi_velocities("u v", [[1, foreign], [0, 1]])
-    with pytest.raises(SpecificationError, match="slope"):
+    with refused(SpecificationError, name="slope"):
         sv.Mechanism(q, gibbs=sv.particle(q, 1.0, tuple(q)))
 
 
@@ -172,25 +173,25 @@ def test_parameters_are_symbols_with_numbers():
     "value", [np.nan, np.inf, -np.inf, None, "heavy", 1j, [1.0, 2.0], ca.SX.sym("m"), ca.MX.sym("m"), ca.DM([1, 2])]
 )
 def test_parameters_that_are_no_finite_numbers_are_refused(value):
-    with pytest.raises(SpecificationError, match="'m'") as caught:
+    with refused(SpecificationError, name="m") as caught:
         sv.parameters(g=9.81, m=value)
     assert caught.value.details["name"] == "m"
-    with pytest.raises(SpecificationError, match="'m'"):
+    with refused(SpecificationError, name="m"):
         sv.parameters(m=1.0).values({"m": value})
 
 
 def test_unknown_parameters_show_the_nearest():
     p = sv.parameters(m_load=100.0, m_trolley=10.0)
-    with pytest.raises(NameUnknown, match="m_load") as caught:
+    with refused(NameUnknown, name="m_laod", match="m_load") as caught:
         _ = p.m_laod
     assert caught.value.details["match"] == "m_load"
-    with pytest.raises(NameUnknown, match="m_trolley"):
+    with refused(NameUnknown, name="m_troley", match="m_trolley"):
         p.values({"m_troley": 1.0})
 
 
 @pytest.mark.parametrize("name", ["t", "names", "values", "symbols", "defaults"])
 def test_parameters_do_not_hide_attributes(name):
-    with pytest.raises(SpecificationError, match=name):
+    with refused(SpecificationError, repr(name)):
         sv.parameters(**{name: 1.0})
 
 

@@ -7,14 +7,14 @@ import subprocess
 
 import numpy as np
 import pytest
+from refusals import refused
+from scenes import CRANE
 
 import servoctl as sv
 from servoctl.codegen.compiler import compiler
 from servoctl.errors import SpecificationError
-from servoctl.gallery import gallery
 
 STRICT = ("-std=c99", "-O1", "-Wall", "-Wextra", "-pedantic", "-Werror")
-CRANE, PROGRAM = gallery["overhead-crane"].build()
 SENSORS = {"x": 1e-3, "l": 1e-3, "theta": 1e-3}
 
 LAWS = {
@@ -40,26 +40,18 @@ MEMORY = {
 def test_laws_without_expressions_name_themselves_and_what_can_be_exported(plan, tmp_path):
     plant = sv.plant(CRANE, limits={"trolley": 150.0})
     inside = sv.lqr(plan, plant)
-    with pytest.raises(
-        SpecificationError, match="limited by weight.*quadratic program.*'lqr, time-varying'.*`limited`"
-    ):
+    with refused(SpecificationError, "limited by weight", "'lqr, time-varying'"):
         sv.export_c(sv.limited(inside, plant), tmp_path)
     own = sv.Law("held", (), ("trolley", "hoist"), 100.0, 0.0, lambda t, x, row: row, np.zeros((2, 1)))
-    with pytest.raises(SpecificationError, match="'held'.*written in Python"):
+    with refused(SpecificationError, "'held'", "Python"):
         sv.export_c(own, tmp_path)
-    with pytest.raises(SpecificationError, match="A dict is to be exported"):
+    with refused(SpecificationError, "dict", "Model", "Law"):
         sv.export_c({}, tmp_path)
     for folder in (None, 3):
-        with pytest.raises(SpecificationError, match=f"folder={folder}"):
+        with refused(SpecificationError, f"folder={folder}"):
             sv.export_c(inside, folder)
-    with pytest.raises(SpecificationError, match="A int was given as start"):
+    with refused(SpecificationError, "int", "start"):
         sv.export_c(plan.model, tmp_path, start=3)
-
-
-@pytest.fixture(scope="module")
-def plan():
-    model = sv.derive(CRANE, PROGRAM)
-    return sv.simulate(model, model.start(guess={"l": 4.0}), (0.0, 8.0))
 
 
 def library(law, folder):
@@ -134,5 +126,5 @@ def test_the_table_is_a_constant_and_indices_have_names(plan, tmp_path):
 
 def test_a_law_that_allocates_in_python_is_refused(plan, tmp_path):
     machine = sv.plant(CRANE, limits={"trolley": 120.0})
-    with pytest.raises(SpecificationError, match="limited law solves a quadratic program"):
+    with refused(SpecificationError, "limited by weight"):
         sv.export_c(sv.limited(sv.lqr(plan, sv.plant(CRANE)), machine), tmp_path)

@@ -3,6 +3,7 @@
 import casadi as ca
 import numpy as np
 import pytest
+from refusals import refused
 
 import servoctl as sv
 from servoctl.codegen.emit import operations
@@ -151,13 +152,13 @@ def test_an_arm_of_bodies_moves_as_the_one_of_joint_angles():
 
 
 def test_accelerations_are_refused_where_the_balance_is_differentiated(gallery_model):
-    with pytest.raises(SpecificationError, match="hidden constraints"):
+    with refused(SpecificationError, "order 2", "1 hidden"):
         gallery_model("overhead-crane").function("accelerations")
 
 
 def test_arms_refuse_what_they_do_not_know():
     for arm, least in ((planar_arm, 2), (spatial_arm, 3)):
-        with pytest.raises(SpecificationError, match=f"n = {least}"):
+        with refused(SpecificationError, f"n = {least}"):
             arm(least - 1)
         with pytest.raises(NameUnknown):
             arm(4, "absolute")

@@ -5,6 +5,8 @@ import warnings
 import control
 import numpy as np
 import pytest
+from refusals import refused
+from scenes import CRANE, ROPE
 from scipy.optimize import brentq
 
 import servoctl as sv
@@ -13,16 +15,8 @@ from servoctl.control.sampling import discretised
 from servoctl.errors import NameUnknown, ServoError, SpecificationError
 from servoctl.gallery import gallery, mass_on_car
 
-CRANE, CRANE_PROGRAM = gallery["overhead-crane"].build()
-ROPE, _ = gallery["overhead-crane-redundant"].build()
 CAR, CAR_PROGRAM = mass_on_car(alpha=0.0)
 SUDDEN = {"x": 0.1, "l": 4.0, "theta": -0.05, "dx": 0.0, "dl": 0.1, "dtheta": 0.0}
-
-
-@pytest.fixture(scope="module")
-def plan():
-    model = sv.derive(CRANE, CRANE_PROGRAM)
-    return sv.simulate(model, model.start(guess={"l": 4.0}), (0.0, 8.0))
 
 
 @pytest.fixture(scope="module")
@@ -313,47 +307,47 @@ def test_output_feedback_and_computed_laws_are_linearised(car_plan, plan):
 
 
 @pytest.mark.parametrize(
-    ("action", "error", "text"),
+    ("action", "error", "fact"),
     [
-        (lambda c: interop.nlsys(c["plan"]), SpecificationError, "A Run was given.*run.model"),
-        (lambda c: interop.linearise(3, 0.0), SpecificationError, "A int was given"),
-        (lambda c: interop.nlsys(c["law"], rate=10.0), SpecificationError, "laws and loops have their own rate"),
-        (lambda c: interop.nlsys(c["late"]), SpecificationError, "transport delay is to be a system in continuous"),
-        (lambda c: interop.nlsys(sv.plant(CRANE), substeps=3), SpecificationError, "substeps is to be"),
+        (lambda c: interop.nlsys(c["plan"]), SpecificationError, "Run"),
+        (lambda c: interop.linearise(3, 0.0), SpecificationError, "int"),
+        (lambda c: interop.nlsys(c["law"], rate=10.0), SpecificationError, "rate"),
+        (lambda c: interop.nlsys(c["late"]), SpecificationError, "transport delay"),
+        (lambda c: interop.nlsys(sv.plant(CRANE), substeps=3), SpecificationError, "substeps"),
         (lambda c: interop.nlsys(sv.plant(CRANE, rate_limits={"hoist": 9.0})), SpecificationError, "limits of rate"),
-        (lambda c: interop.nlsys(c["late"], rate=33.0), SpecificationError, "whole number of integration steps"),
-        (lambda c: interop.nlsys(sv.plant(CRANE), disturbed=["thet"]), NameUnknown, "Nearest: 'theta'"),
-        (lambda c: interop.start(c["plan"]), SpecificationError, "A start belongs to the Closed"),
-        (lambda c: interop.linearise(sv.plant(CRANE), 0.0), SpecificationError, "has 6 finite numbers"),
-        (lambda c: interop.linearise(sv.plant(CRANE), 0.0, SUDDEN, [1.0]), SpecificationError, "It has 2 numbers: trolley, hoist"),
-        (lambda c: interop.linearise(sv.plant(CRANE), 0.0, SUDDEN, {"hoist": 1.0}), NameUnknown, "'trolley'"),
-        (lambda c: list(interop.along(sv.plant(CRANE), c["plan"], [9.0])), SpecificationError, "within the run: 0 to 8"),
+        (lambda c: interop.nlsys(c["late"], rate=33.0), SpecificationError, {"name": "trolley"}),
+        (lambda c: interop.nlsys(sv.plant(CRANE), disturbed=["thet"]), NameUnknown, {"match": "theta"}),
+        (lambda c: interop.start(c["plan"]), SpecificationError, "Closed"),
+        (lambda c: interop.linearise(sv.plant(CRANE), 0.0), SpecificationError, "6 "),
+        (lambda c: interop.linearise(sv.plant(CRANE), 0.0, SUDDEN, [1.0]), SpecificationError, "trolley, hoist"),
+        (lambda c: interop.linearise(sv.plant(CRANE), 0.0, SUDDEN, {"hoist": 1.0}), NameUnknown, {"name": "trolley"}),
+        (lambda c: list(interop.along(sv.plant(CRANE), c["plan"], [9.0])), SpecificationError, "0 to 8 s"),
         (lambda c: interop.loop_gain(interop.linearise(sv.plant(CRANE), 0.0, SUDDEN), interop.linearise(c["law"], 0.0),
                                      "trolley"), SpecificationError, "dt = 0 s, the law 0.02 s.*rate=50"),
-        (lambda c: interop.loop_gain(sv.plant(CRANE), c["law"], "trolley"), SpecificationError, "two linear systems"),
-        (lambda c: interop.linearise(c["late"], 0.0, SUDDEN), SpecificationError, "transport delay of 0.05 s"),
-        (lambda c: interop.linearise(c["law"], 0.0, rate=3.0), SpecificationError, "rate was given for a Law"),
-        (lambda c: interop.linearise(c["law"], 0.003), SpecificationError, "sampled at 50 Hz"),
-        (lambda c: interop.linearise(c["law"], 0.0, controller_state=[1.0]), SpecificationError, "has 0 numbers"),
-        (lambda c: interop.linearise(c["plan"].model, 0.0, [1.0]), SpecificationError, "has 6 numbers: x, l"),
-        (lambda c: list(interop.along(3, c["plan"], [0.0])), SpecificationError, "A int was given"),
-        (lambda c: list(interop.along(c["law"], c["plan"], [])), SpecificationError, "No times"),
-        (lambda c: interop.linearise(sv.plant(CRANE), "now", SUDDEN), SpecificationError, "'t' is 'now'"),
-        (lambda c: c["law"].row(np.nan), SpecificationError, "'t' is nan"),
+        (lambda c: interop.loop_gain(sv.plant(CRANE), c["law"], "trolley"), SpecificationError, "Plant"),
+        (lambda c: interop.linearise(c["late"], 0.0, SUDDEN), SpecificationError, "0.05 s"),
+        (lambda c: interop.linearise(c["law"], 0.0, rate=3.0), SpecificationError, "Law"),
+        (lambda c: interop.linearise(c["law"], 0.003), SpecificationError, {"t": 0.003}),
+        (lambda c: interop.linearise(c["law"], 0.0, controller_state=[1.0]), SpecificationError, "(1,)"),
+        (lambda c: interop.linearise(c["plan"].model, 0.0, [1.0]), SpecificationError, "6 "),
+        (lambda c: list(interop.along(3, c["plan"], [0.0])), SpecificationError, "int"),
+        (lambda c: list(interop.along(c["law"], c["plan"], [])), SpecificationError, "times"),
+        (lambda c: interop.linearise(sv.plant(CRANE), "now", SUDDEN), SpecificationError, {"name": "t"}),
+        (lambda c: c["law"].row(np.nan), SpecificationError, {"name": "t"}),
         (lambda c: interop.loop_gain(interop.linearise(sv.plant(CRANE), 0.0, SUDDEN, rate=50.0),
-                                     interop.linearise(c["law"], 0.0), "troley"), NameUnknown, "Nearest: 'trolley'"),
+                                     interop.linearise(c["law"], 0.0), "troley"), NameUnknown, {"match": "trolley"}),
     ],
 )  # fmt: skip
-def test_what_is_refused(plan, action, error, text):
+def test_what_is_refused(plan, action, error, fact):
     given = {"plan": plan, "law": sv.lqr(plan, sv.plant(CRANE), rate=50.0), "late": sv.plant(CRANE, delay=0.05)}
-    with pytest.raises(error, match=text):
+    with refused(error, fact):
         action(given)
 
 
 def test_laws_without_expressions_are_refused_where_these_are_needed(plan):
     machine = sv.plant(CRANE, limits={"trolley": 120.0})
     law = sv.limited(sv.lqr(plan, sv.plant(CRANE), rate=20.0), machine)
-    with pytest.raises(SpecificationError, match="computed in Python"):
+    with refused(SpecificationError, "limited by weight"):
         interop.linearise(law, 0.0)
 
     class Own:
@@ -361,11 +355,11 @@ def test_laws_without_expressions_are_refused_where_these_are_needed(plan):
             return lambda t, y: [0.0, -1128.0]
 
     run = sv.close(sv.plant(CRANE), Own(), SUDDEN, (0.0, 0.1), timing=sv.Timing(rate=100.0))
-    with pytest.raises(SpecificationError, match="keeps its state to itself"):
+    with refused(SpecificationError, "'Own'"):
         interop.nlsys(run)
 
 
 def test_a_model_whose_pivots_vanish_says_so(gallery_model):
     model = gallery_model("overhead-crane")
-    with pytest.raises(ServoError, match="not finite at t = 1 s"):
+    with refused(ServoError, t=1.0):
         interop.nlsys(model).dynamics(1.0, np.zeros(6), [])

@@ -4,7 +4,7 @@ import casadi as ca
 import mpmath
 import numpy as np
 import pytest
-from test_compiled import P1, X2, T, function, newton_model
+from test_compiled_functions import P1, X2, T, function, newton_model
 
 from servoctl.codegen import emit
 from servoctl.codegen.emit import SHARED, WIDE

@@ -5,9 +5,11 @@ from dataclasses import replace
 import casadi as ca
 import numpy as np
 import pytest
+from refusals import refused
+from scenes import CRANE
 
 import servoctl as sv
-from servoctl.gallery import cars, overhead_crane, two_link_arm
+from servoctl.gallery import cars, two_link_arm
 
 
 def planned(build, span, **guess):
@@ -17,8 +19,8 @@ def planned(build, span, **guess):
 
 
 @pytest.fixture(scope="module")
-def crane():
-    return planned(overhead_crane, (0.0, 8.0), l=4.0)
+def crane(crane_plan):
+    return crane_plan, CRANE
 
 
 @pytest.fixture(scope="module")
@@ -136,7 +138,7 @@ def test_limits_and_bounds_that_exclude_each_other_stop_with_both_named(crane):
     plan, mechanism = crane
     machine = sv.plant(mechanism, limits={"hoist": (-100.0, 0.0)})
     law = sv.limited(sv.lqr(plan, sv.plant(mechanism)), machine, bounds={"tension": (500.0, None)})
-    with pytest.raises(sv.LimitExceeded, match="At t = .*hoist -100 .. 0.*tension 500"):
+    with refused(sv.LimitExceeded, "hoist -100 .. 0", "tension 500", bounds=("tension",)):
         sv.close(machine, law, plan.state(0.0), (0.0, 1.0))
 
 
@@ -214,37 +216,37 @@ def test_an_estimator_predicts_from_what_was_applied(crane):
 def test_bad_input(crane):
     plan, mechanism = crane
     law, machine = sv.lqr(plan, sv.plant(mechanism)), sv.plant(mechanism, limits={"trolley": 100.0})
-    with pytest.raises(sv.SpecificationError, match="no limits"):
+    with refused(sv.SpecificationError, "limits"):
         sv.limited(law, sv.plant(mechanism))
-    with pytest.raises(sv.NameUnknown, match="tension"):
+    with refused(sv.NameUnknown, name="tensoin", match="tension"):
         sv.limited(law, machine, bounds={"tensoin": (0.0, None)})
     for bound in ((0.0, 1.0, 2.0), (1.0, 0.0), (None, None), "all"):
-        with pytest.raises(sv.SpecificationError, match="bound of 'tension'.*interval"):
+        with refused(sv.SpecificationError, name="tension"):
             sv.limited(law, machine, bounds={"tension": bound})
-    with pytest.raises(sv.NameUnknown, match="residual"):
+    with refused(sv.NameUnknown, name="Y"):
         sv.limited(law, machine, priority=["Y"])
     for options in ({"weights": {"X": 1.0}, "priority": ["X"]}, {"weights": {"X": 0.0}}, {"horizon": 0.0}):
         with pytest.raises(sv.SpecificationError):
             sv.limited(law, machine, **options)
     for priority in ("X", 3, ["X", "X"]):
-        with pytest.raises(sv.SpecificationError, match="each once"):
+        with refused(sv.SpecificationError, "priority"):
             sv.limited(law, machine, priority=priority)
-    with pytest.raises(sv.SpecificationError, match="law without limits"):
+    with refused(sv.SpecificationError, "limited by weight"):
         sv.limited(sv.limited(law, machine), machine)
-    with pytest.raises(sv.SpecificationError, match="function was given"):
+    with refused(sv.SpecificationError, "function"):
         sv.limited(lambda t, y: [0.0, 0.0], machine)
     slow = sv.plant(mechanism, limits={"trolley": 100.0}, lag={"trolley": 0.1, "hoist": 0.1})
-    with pytest.raises(sv.SpecificationError, match="'tension' at once: trolley, hoist lag"):
+    with refused(sv.SpecificationError, "trolley, hoist", name="tension"):
         sv.limited(sv.lqr(plan, slow), slow, bounds={"tension": (0.0, None)})
-    with pytest.raises(sv.NameUnknown, match="'trolley'"):
+    with refused(sv.NameUnknown, name="trolley"):
         sv.limited(sv.lqr(plan, slow), machine)
-    with pytest.raises(sv.SpecificationError, match="not limited"):
+    with refused(sv.SpecificationError, "None"):
         sv.limit_report(plan)
     run = sv.close(machine, sv.limited(law, machine), plan.state(0.0), (0.0, 0.1))
     for scene in ({}, "crane", {"t_span": (0.0, 6.0), "gues": {"l": 4.0}}):
-        with pytest.raises(sv.SpecificationError, match="guess, parameters, start, t_span"):
+        with refused(sv.SpecificationError, "scene"):
             sv.limit_report(run, scene)
-    with pytest.raises(sv.SpecificationError, match="not limited"):
+    with refused(sv.SpecificationError, "lqr, time-varying"):
         sv.limit_report(sv.close(machine, law, plan.state(0.0), (0.0, 0.1)))
 
 
@@ -259,7 +261,7 @@ def test_a_handmade_law_is_limited_whatever_its_schedule(crane, columns):
     run = sv.close(machine, sv.limited(law, machine), plan.state(0.0), (0.0, 0.3))
     assert np.allclose(run["trolley"], np.minimum(100.0 * run.t, 10.0), rtol=1e-14)
     assert np.array_equal(run.command["hoist"][:10], -981.0 - np.minimum(np.arange(10), columns - 1))
-    with pytest.raises(sv.SpecificationError, match="begins at t = 1 s, its plan at 0 s"):
+    with refused(sv.SpecificationError, "1 s", "0 s"):
         sv.limited(replace(law, t0=1.0), machine)
     assert len(repr(sv.limited(law, machine)).splitlines()) <= 5, "a law's repr holds no other repr"
 

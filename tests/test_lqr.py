@@ -2,6 +2,8 @@
 
 import numpy as np
 import pytest
+from refusals import refused
+from scenes import CRANE
 
 import servoctl as sv
 from servoctl.control.lqr import weights
@@ -9,15 +11,10 @@ from servoctl.control.reference import Reference
 from servoctl.control.sampling import discretised, exponentials
 from servoctl.gallery import gallery
 
-CRANE, CRANE_PROGRAM = gallery["overhead-crane"].build()
+pytestmark = pytest.mark.usefixtures("at_once")
+
 GUST = {"theta": sv.disturbances.gust(60.0, 2.0, 2.5)}
 WEIGHTS = {"Q": [1e3] * 3 + [1e2] * 3, "R": 1e-3}
-
-
-@pytest.fixture(scope="module")
-def plan():
-    model = sv.derive(CRANE, CRANE_PROGRAM)
-    return sv.simulate(model, model.start(guess={"l": 4.0}), (0.0, 8.0))
 
 
 def load_error(run):
@@ -195,33 +192,33 @@ def test_what_is_out_of_reach_and_does_not_grow_is_left_alone():
     assert law.info["spectral radius at its end"] == pytest.approx(1.0, abs=1e-9)
     run = sv.close(plant, law, plan.state(0.0) + [0.1, 0.0, 0.0, 0.0], (0.0, 1.0))
     assert abs(run.error["x"][-1]) < 0.02
-    with pytest.raises(sv.ServoError, match="reached"):
+    with refused(sv.ServoError, "Riccati"):
         sv.lqr(plan, plant, varying=False)
 
 
 BAD = {
-    "Q of five": (lambda p, m: sv.lqr(p, m, Q=[1.0] * 5), sv.SpecificationError, r"\(5,\)"),
-    "Q of text": (lambda p, m: sv.lqr(p, m, Q="large"), sv.SpecificationError, "6 numbers"),
-    "Q of no state": (lambda p, m: sv.lqr(p, m, Q={"thet": 1.0}), sv.NameUnknown, "theta"),
+    "Q of five": (lambda p, m: sv.lqr(p, m, Q=[1.0] * 5), sv.SpecificationError, {"shape": (5,)}),
+    "Q of text": (lambda p, m: sv.lqr(p, m, Q="large"), sv.SpecificationError, "Q"),
+    "Q of no state": (lambda p, m: sv.lqr(p, m, Q={"thet": 1.0}), sv.NameUnknown, {"match": "theta"}),
     "negative Q": (lambda p, m: sv.lqr(p, m, Q={"x": -1.0}), sv.SpecificationError, "semidefinite"),
     "odd Q": (lambda p, m: sv.lqr(p, m, Q=np.triu(np.ones((6, 6)))), sv.SpecificationError, "symmetric"),
     "R of zero": (lambda p, m: sv.lqr(p, m, R=0.0), sv.SpecificationError, "definite"),
-    "R of three": (lambda p, m: sv.lqr(p, m, R=np.eye(3)), sv.SpecificationError, r"\(3, 3\)"),
+    "R of three": (lambda p, m: sv.lqr(p, m, R=np.eye(3)), sv.SpecificationError, {"shape": (3, 3)}),
     "R of NaN": (lambda p, m: sv.lqr(p, m, R=np.nan), sv.SpecificationError, "definite"),
-    "integral of nothing": (lambda p, m: sv.lqr(p, m, integral={"Y": 1.0}), sv.NameUnknown, "X, Z"),
-    "integral of three": (lambda p, m: sv.lqr(p, m, integral=[1.0] * 3), sv.SpecificationError, "X, Z"),
-    "rate of zero": (lambda p, m: sv.lqr(p, m, rate=0.0), sv.SpecificationError, "positive"),
-    "plant of a delay": (lambda p, m: sv.lqr(p, sv.plant(CRANE, delay=0.02)), sv.SpecificationError, "transport delay"),
-    "varying of text": (lambda p, m: sv.lqr(p, m, varying="frozen"), sv.SpecificationError, "True, or are frozen"),
-    "no plan": (lambda p, m: sv.lqr(m, m), sv.SpecificationError, "Plant was given as plan"),
-    "out of reach": (lambda p, m: sv.lqr(*two_masses(-4.0)), sv.ServoError, "reached"),
+    "integral of nothing": (lambda p, m: sv.lqr(p, m, integral={"Y": 1.0}), sv.NameUnknown, {"valid": ("X", "Z")}),
+    "integral of three": (lambda p, m: sv.lqr(p, m, integral=[1.0] * 3), sv.SpecificationError, {"shape": (3,)}),
+    "rate of zero": (lambda p, m: sv.lqr(p, m, rate=0.0), sv.SpecificationError, "rate"),
+    "plant of a delay": (lambda p, m: sv.lqr(p, sv.plant(CRANE, delay=0.02)), sv.SpecificationError, "0.02 s"),
+    "varying of text": (lambda p, m: sv.lqr(p, m, varying="frozen"), sv.SpecificationError, "varying='frozen'"),
+    "no plan": (lambda p, m: sv.lqr(m, m), sv.SpecificationError, "Plant"),
+    "out of reach": (lambda p, m: sv.lqr(*two_masses(-4.0)), sv.ServoError, "Riccati"),
 }  # fmt: skip
 
 
 @pytest.mark.parametrize("what", BAD)
 def test_bad_input_is_refused_by_name(plan, what):
     call, kind, fact = BAD[what]
-    with pytest.raises(kind, match=fact):
+    with refused(kind, fact):
         call(plan, sv.plant(CRANE))
 
 
@@ -231,7 +228,7 @@ def test_a_residual_of_accelerations_is_not_fed_back():
     mechanism = sv.Mechanism(q, gibbs=sv.particle(q, 1.0, x), actuators={"force": x})
     model = sv.derive(mechanism, sv.Program({"A": q.d(2)[0] - 1.0}))
     plan = sv.simulate(model, model.start(x=0.0, dx=0.0), (0.0, 1.0))
-    with pytest.raises(sv.SpecificationError, match="order 2|order 0 or 1"):
+    with refused(sv.SpecificationError, "order 0 or 1"):
         sv.lqr(plan, sv.plant(mechanism), integral=True)
-    with pytest.raises(sv.SpecificationError, match="order 2"):
+    with refused(sv.SpecificationError, "order 2", name="A"):
         sv.lqr(plan, sv.plant(mechanism), integral={"A": 1.0})

@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from conftest import pendulum
+from refusals import refused
 from scipy.integrate import solve_ivp
 
 import servoctl as sv
@@ -31,12 +32,6 @@ ROUNDING = 1e-11
 def worst_residual(run):
     """Over all rows, levels and samples."""
     return max(float(np.abs(run.residual[name]).max()) for name in run.residual)
-
-
-@pytest.fixture(scope="module")
-def wheel(gallery_model):
-    model = gallery_model("appell-hamel")
-    return model, model.start(x=0.0, y=0.0, z=0.0, phi=0.0, theta=0.0, dphi=1.0, dtheta=2.0)
 
 
 @pytest.mark.parametrize("method", SETTINGS)
@@ -193,22 +188,21 @@ def test_a_flat_program_leaves_nothing_to_integrate(method, gallery_model):
 
 def test_a_flat_program_is_not_integrated_in_minimal_coordinates(gallery_model):
     model = gallery_model("overhead-crane")
-    with pytest.raises(sv.SpecificationError, match="nothing is left to integrate") as caught:
+    with refused(sv.SpecificationError, "algebraic", free=0):
         sv.simulate(model, model.start(), (0.0, 6.0), method="DOP853", drift="minimal")
-    assert "algebraic" in str(caught.value) and caught.value.details["free"] == 0
 
 
-@pytest.mark.parametrize(("method", "why"), [("Taylor", "series"), ("BDF", "past states"), ("LSODA", "past states")])
-def test_methods_that_cannot_are_refused(method, why, wheel):
+@pytest.mark.parametrize("method", ["Taylor", "BDF", "LSODA"])
+def test_methods_that_cannot_are_refused(method, wheel):
     model, start = wheel
-    with pytest.raises(sv.SpecificationError, match=why) as caught:
+    with refused(sv.SpecificationError, method, "RK4", "DOP853") as caught:
         sv.simulate(model, start, (0.0, 1.0), method=method, drift="minimal")
     assert caught.value.details["methods"] == ["RK1", "RK2", "RK4", "RK5", "RK8", "RK23", "RK45", "DOP853", "Radau"]
 
 
 def test_an_unknown_treatment_shows_the_nearest(wheel):
     model, start = wheel
-    with pytest.raises(sv.NameUnknown, match="minimal"):
+    with refused(sv.NameUnknown, name="minimum", match="minimal"):
         sv.simulate(model, start, (0.0, 1.0), drift="minimum")
 
 
@@ -220,7 +214,7 @@ def test_a_state_that_is_lost_ends_the_motion(wheel, monkeypatch):
         return np.full(self.n_x, np.nan) if 0.5 < t < 0.6 else lift(self, t, y, near)
 
     monkeypatch.setattr(Chart, "lift", lost)
-    with pytest.raises(sv.IntegrationStopped, match="no solution|finite|step size") as caught:
+    with refused(sv.IntegrationStopped, "DOP853") as caught:
         sv.simulate(model, start, (0.0, 1.0), method="DOP853", drift="minimal")
     assert 0.3 < caught.value.run.t[-1] <= 0.5 + 1e-9
 

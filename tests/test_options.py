@@ -2,10 +2,10 @@
 
 import numpy as np
 import pytest
+from refusals import refused, warned
 
 import servoctl as sv
 from benchmarks.literature import dae_comparison, formulation_cost
-from servoctl.gallery import gallery
 from servoctl.gallery.guided_arm import guided_arm
 from servoctl.methods.choice import as_method
 from servoctl.study import tradeoff as module
@@ -15,57 +15,54 @@ SPAN = (0.0, 0.2)
 
 
 @pytest.fixture(scope="module")
-def scene(gallery_model):
-    model, scene = gallery_model("appell-hamel"), gallery["appell-hamel"]
-    return model, model.start(guess=scene.guess, **scene.start)
+def scene(wheel):
+    return wheel
 
 
-def refused(what, make):
-    with pytest.raises(sv.SpecificationError) as caught:
+def stopped(fact, make):
+    with refused(sv.SpecificationError, fact):
         make()
-    text = str(caught.value)
-    assert what in text and any(word in text for word in ("Give ", "Take ", "Leave ")), text
 
 
 @pytest.mark.parametrize("method", ADAPTIVE)
 @pytest.mark.parametrize("name", ["rtol", "atol"])
 def test_tolerances(method, name, scene):
     for value in (0.0, -1e-6, np.nan, np.inf, 2.0, "1e-6", [1e-6], True):
-        refused(f"{name}=", lambda value=value: sv.simulate(*scene, SPAN, method=as_method(method, **{name: value})))
+        stopped(f"{name}=", lambda value=value: sv.simulate(*scene, SPAN, method=as_method(method, **{name: value})))
 
 
 @pytest.mark.parametrize("method", ["RK4", "RadauIIA"])
 def test_steps(method, scene):
     for value in (0, -1, np.nan, np.inf, "a", True, 1e-320, 1e-10):
-        refused("step=", lambda value=value: sv.simulate(*scene, SPAN, method=as_method(method, step=value)))
+        stopped("step=", lambda value=value: sv.simulate(*scene, SPAN, method=as_method(method, step=value)))
     run = sv.simulate(*scene, SPAN, method=as_method(method, step=np.float32(0.05)))
     assert run.success and run.counters["steps"] == 4
 
 
 @pytest.mark.parametrize("times", ["a", ["a"], [np.nan, 0.1], [0.0, np.inf], [None], {"t": 1}])
 def test_times_of_samples(times, scene):
-    refused("t_eval=", lambda: sv.simulate(*scene, SPAN, t_eval=times))
+    stopped("t_eval=", lambda: sv.simulate(*scene, SPAN, t_eval=times))
 
 
 def test_whole_numbers(scene):
     for options in ({"order": True}, {"order": 5.0}, {"order": "a"}, {"jets": True}, {"jets": 2.5}):
-        refused(next(iter(options)), lambda options=options: sv.simulate(*scene, SPAN, method=sv.Taylor(**options)))
+        stopped(next(iter(options)), lambda options=options: sv.simulate(*scene, SPAN, method=sv.Taylor(**options)))
     run = sv.simulate(*scene, SPAN, method=sv.Taylor(order=np.int64(8), jets=np.int64(3)), t_eval=[0.0, 0.2])
     assert "d3theta" in run.names
     for every in (True, 0, 1.0):
-        refused("every", lambda every=every: sv.Project(every))
-    refused("True", lambda: sv.Poles(True))
+        stopped("every", lambda every=every: sv.Project(every))
+    stopped("True", lambda: sv.Poles(True))
 
 
 def test_what_a_study_is_asked_for(scene):
     for options in ({"methods": []}, {"drift": []}):
         refused_study = {"methods": ["RK4"], "drift": [None]} | options
-        with pytest.raises(sv.SpecificationError, match="at least one method"):
+        with refused(sv.SpecificationError, "methods", "drift"):
             sv.tradeoff(*scene, SPAN, **refused_study)
     study = sv.tradeoff(*scene, SPAN, "RK4", sv.Project(2), settings={"step": 0.1}, seconds=20.0)
     assert study["drift"].tolist() == ["project 2"]
     for options in ({"error": 0}, {"error": "a"}, {"seconds": -1.0}, {"error": np.nan}):
-        refused(next(iter(options)), lambda options=options: study.recommend(**options))
+        stopped(next(iter(options)), lambda options=options: study.recommend(**options))
 
 
 def test_ctrl_c_ends_a_study_and_keeps_its_rows(scene, monkeypatch):
@@ -91,23 +88,23 @@ def test_what_comparisons_are_asked_for(gallery_model):
     model = gallery_model("two-cars")
     start = model.start()
     for options in ({"steps": "a"}, {"steps": []}, {"steps": [np.nan]}, {"steps": [1e-300]}, {"steps": [2.0]}):
-        refused("steps=", lambda options=options: dae_comparison(model, start, (0.0, 1.0), **options))
-    refused("t_span=", lambda: dae_comparison(model, start, (0.0,)))
-    with pytest.raises(sv.SpecificationError, match="later t1"):
+        stopped("steps=", lambda options=options: dae_comparison(model, start, (0.0, 1.0), **options))
+    stopped("t_span=", lambda: dae_comparison(model, start, (0.0,)))
+    with refused(sv.SpecificationError, "t_span=(1.0, 0.0)"):
         dae_comparison(model, model.start(t=1.0), (1.0, 0.0), steps=[0.1])
-    with pytest.raises(sv.SpecificationError, match="at least one of each"):
+    with refused(sv.SpecificationError, "forms=[]"):
         dae_comparison(model, start, (0.0, 1.0), forms=[])
     for cases in ([], [3], [("a", 1)]):
-        refused("cases=", lambda cases=cases: formulation_cost(guided_arm, cases))
+        stopped("cases=", lambda cases=cases: formulation_cost(guided_arm, cases))
 
 
 def test_what_a_stability_map_is_asked_for(scene):
     model, start = scene
-    with pytest.raises(sv.SpecificationError, match="run=None"):
+    with refused(sv.SpecificationError, "run=None"):
         sv.stability(model, None)
     found = sv.stability(model, sv.simulate(model, start, SPAN, method=sv.RungeKutta(4, step=0.01)))
     for step in (0.0, -1.0, np.nan, [0.1, 0.0]):
-        refused("step=", lambda step=step: found.radius("RK4", step))
+        stopped("step=", lambda step=step: found.radius("RK4", step))
 
 
 @pytest.mark.parametrize("method", ["RK4", "DOP853", "RadauIIA", "CVODES"])
@@ -115,7 +112,7 @@ def test_error_dynamics_backwards_in_time(method, scene):
     model, start = scene
     end = sv.simulate(model, start, SPAN, method=sv.Taylor(rtol=1e-13, atol=1e-15), drift="project")
     there = end.jets[: len(start.values), -1]
-    with pytest.raises(sv.SpecificationError, match="grow backward.*'project'"):
+    with refused(sv.SpecificationError, "'project'", row="x_c"):
         sv.simulate(model, there, SPAN[::-1], method=method, drift=0.05)
     growing = sv.Poles({row: [20.0] * count for row, count in model.raised.items() if count})
     back = sv.simulate(model, there, SPAN[::-1], method=method, drift=growing)
@@ -127,9 +124,9 @@ def test_error_dynamics_backwards_in_time(method, scene):
 
 def test_poles_by_row_are_finite_numbers_that_damp(scene):
     for poles in ([np.nan, -1.0], ["a", "b"], "ab", None, [[-1.0, -1.0]]):
-        refused("'string'", lambda poles=poles: sv.simulate(*scene, SPAN, drift=sv.Poles({"string": poles})))
-    refused("no row", lambda: sv.Poles({}))
-    with pytest.raises(sv.SpecificationError, match="runs forward.*'string'.*negative real parts"):
+        stopped("'string'", lambda poles=poles: sv.simulate(*scene, SPAN, drift=sv.Poles({"string": poles})))
+    stopped("no row", lambda: sv.Poles({}))
+    with refused(sv.SpecificationError, row="string"):
         sv.simulate(*scene, SPAN, drift=sv.Poles({"string": [1.0, -2.0]}))
 
 
@@ -138,17 +135,17 @@ def test_poles_that_take_an_explicit_method_a_million_steps_are_told(method, sce
     def ended(t):
         raise TimeoutError
 
-    with pytest.warns(RuntimeWarning, match=rf"The pole -1e\+08 1/s of .* steps of {method} .* steps over the span"):
+    with warned("-1e+08 1/s", method):
         with pytest.raises(TimeoutError):
             sv.simulate(*scene, SPAN, method=method, drift=1e-8, progress=ended)
 
 
 def test_tolerances_that_scipy_would_replace_are_refused(scene):
     for method in ("RK23", "DOP853", "Radau", "BDF"):
-        with pytest.raises(sv.SpecificationError, match="take 2.22e-14 instead of less.*'Taylor'"):
+        with refused(sv.SpecificationError, "rtol=1e-15", "2.22e-14"):
             sv.simulate(*scene, SPAN, method=as_method(method, rtol=1e-15))
     assert sv.simulate(*scene, SPAN, method=sv.Taylor(rtol=1e-15)).success
-    refused("at most 1", lambda: sv.tradeoff(*scene, SPAN, ["DOP853"], [None], settings={"rtol": [10.0, 1e-6]}))
+    stopped("at most 1", lambda: sv.tradeoff(*scene, SPAN, ["DOP853"], [None], settings={"rtol": [10.0, 1e-6]}))
 
 
 def test_studies_refuse_a_start_off_the_constraints(scene):
@@ -168,7 +165,7 @@ def test_a_comparison_of_one_form_and_method(scene):
 def test_what_a_figure_of_stability_is_asked_for(scene):
     found = sv.stability(scene[0], sv.simulate(*scene, SPAN, method=sv.RungeKutta(4, step=0.01)))
     for poles in ("abc", 10.0, [10.0], [-1.0, 2.0], [np.nan, 1.0]):
-        refused("poles=", lambda poles=poles: found.plot("RK4", poles))
-    refused("step=", lambda: found.growth("RK4", "abc"))
+        stopped("poles=", lambda poles=poles: found.plot("RK4", poles))
+    stopped("step=", lambda: found.growth("RK4", "abc"))
     left, right = found.plot("RK4", [100.0, 10.0]).axes[:2]
     assert list(left.lines[0].get_xdata()) == list(right.lines[0].get_xdata()) == [10.0, 100.0]

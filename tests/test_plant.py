@@ -3,6 +3,7 @@
 import casadi as ca
 import numpy as np
 import pytest
+from refusals import refused
 
 import servoctl as sv
 from servoctl.codegen.folding import folded
@@ -38,10 +39,10 @@ def test_accelerations_are_those_of_the_crane_by_hand(x):
 
 
 @pytest.mark.parametrize(
-    "load, text",
-    [(-1.0, "negative in a direction of .*dtheta, with m_load = -1"), (0.0, "singular: a direction of dtheta")],
+    "load, facts",
+    [(-1.0, ("negative", "dtheta", "m_load = -1")), (0.0, ("singular", "dtheta"))],
 )
-def test_masses_that_are_none_are_refused(load, text):
+def test_masses_that_are_none_are_refused(load, facts):
     """Of plants, models with other numbers, and mechanisms with such defaults."""
     model = sv.derive(*gallery["overhead-crane"].build())
     p = sv.parameters(m_load=load)
@@ -55,7 +56,7 @@ def test_masses_that_are_none_are_refused(load, text):
         lambda: sv.plant(own),
         lambda: sv.derive(own, sv.Program({"X": x - q.t})),
     ):
-        with pytest.raises(sv.SpecificationError, match=text):
+        with refused(sv.SpecificationError, *facts):
             build()
 
 
@@ -155,37 +156,37 @@ def test_a_plant_takes_states_by_name_and_as_arrays():
 
 BAD = {
     "no mechanism": (lambda: sv.plant("crane"), sv.SpecificationError, "Mechanism"),
-    "unknown parameter": (lambda: sv.plant(RELATIVE, m_lod=115.0), sv.NameUnknown, "m_load"),
-    "infinite parameter": (lambda: sv.plant(RELATIVE, m_load=np.inf), sv.SpecificationError, "finite"),
-    "limit of no actuator": (lambda: sv.plant(RELATIVE, limits={"troley": 5.0}), sv.NameUnknown, "trolley"),
-    "limits reversed": (lambda: sv.plant(RELATIVE, limits={"trolley": (5.0, -5.0)}), sv.SpecificationError, "low < high"),
-    "limit open on both sides": (lambda: sv.plant(RELATIVE, limits={"trolley": (None, np.inf)}), sv.SpecificationError, "pair"),
-    "limit of text": (lambda: sv.plant(RELATIVE, limits={"trolley": "five"}), sv.SpecificationError, "pair"),
-    "negative rate": (lambda: sv.plant(RELATIVE, rate_limits={"trolley": -1.0}), sv.SpecificationError, "positive"),
-    "negative lag": (lambda: sv.plant(RELATIVE, lag={"trolley": -1.0}), sv.SpecificationError, "positive"),
-    "negative delay": (lambda: sv.plant(RELATIVE, delay=-0.1), sv.SpecificationError, "negative"),
-    "negative damping": (lambda: sv.plant(RELATIVE, damping={"x": -5.0}), sv.SpecificationError, "negative"),
-    "damped nothing": (lambda: sv.plant(RELATIVE, damping={"thet": 5.0}), sv.NameUnknown, "theta"),
-    "force on nothing": (lambda: sv.plant(RELATIVE, forces={"y": 1.0}), sv.NameUnknown, "x, l, theta"),
-    "force of a stranger": (lambda: sv.plant(RELATIVE, forces={"x": ca.SX.sym("v")}), sv.SpecificationError, "'v'"),
+    "unknown parameter": (lambda: sv.plant(RELATIVE, m_lod=115.0), sv.NameUnknown, {"match": "m_load"}),
+    "infinite parameter": (lambda: sv.plant(RELATIVE, m_load=np.inf), sv.SpecificationError, {"name": "m_load"}),
+    "limit of no actuator": (lambda: sv.plant(RELATIVE, limits={"troley": 5.0}), sv.NameUnknown, {"match": "trolley"}),
+    "limits reversed": (lambda: sv.plant(RELATIVE, limits={"trolley": (5.0, -5.0)}), sv.SpecificationError, "(5.0, -5.0)"),
+    "limit open on both sides": (lambda: sv.plant(RELATIVE, limits={"trolley": (None, np.inf)}), sv.SpecificationError, "inf"),
+    "limit of text": (lambda: sv.plant(RELATIVE, limits={"trolley": "five"}), sv.SpecificationError, "'five'"),
+    "negative rate": (lambda: sv.plant(RELATIVE, rate_limits={"trolley": -1.0}), sv.SpecificationError, {"name": "trolley"}),
+    "negative lag": (lambda: sv.plant(RELATIVE, lag={"trolley": -1.0}), sv.SpecificationError, {"name": "trolley"}),
+    "negative delay": (lambda: sv.plant(RELATIVE, delay=-0.1), sv.SpecificationError, "-0.1"),
+    "negative damping": (lambda: sv.plant(RELATIVE, damping={"x": -5.0}), sv.SpecificationError, {"name": "x"}),
+    "damped nothing": (lambda: sv.plant(RELATIVE, damping={"thet": 5.0}), sv.NameUnknown, {"match": "theta"}),
+    "force on nothing": (lambda: sv.plant(RELATIVE, forces={"y": 1.0}), sv.NameUnknown, {"valid": ("x", "l", "theta")}),
+    "force of a stranger": (lambda: sv.plant(RELATIVE, forces={"x": ca.SX.sym("v")}), sv.SpecificationError, {"name": "v"}),
     "force of accelerations": (
         lambda: sv.plant(RELATIVE, forces={"x": RELATIVE.q.d(2)[0]}), sv.SpecificationError, "accelerations",
     ),
-    "state too short": (lambda: sv.plant(RELATIVE).state(np.zeros(5)), sv.SpecificationError, "6 finite"),
-    "state of no name": (lambda: sv.plant(RELATIVE).state({"y": 1.0}), sv.NameUnknown, "theta"),
-    "state incomplete": (lambda: sv.plant(RELATIVE).state({"x": 1.0}), sv.SpecificationError, "no l"),
-    "function": (lambda: sv.plant(RELATIVE).function("odd"), sv.NameUnknown, "ode"),
-    "gust backwards": (lambda: sv.disturbances.gust(1.0, 2.0, 1.0), sv.SpecificationError, "ends after"),
-    "gust of edges": (lambda: sv.disturbances.gust(1.0, 1.0, 2.0, rise=0.6), sv.SpecificationError, "half"),
-    "noise of no seed": (lambda: sv.disturbances.noise(1.0, 5.0, seed=-1), sv.SpecificationError, "seed"),
-    "noise of no band": (lambda: sv.disturbances.noise(1.0, 0.0), sv.SpecificationError, "positive"),
+    "state too short": (lambda: sv.plant(RELATIVE).state(np.zeros(5)), sv.SpecificationError, "6 "),
+    "state of no name": (lambda: sv.plant(RELATIVE).state({"y": 1.0}), sv.NameUnknown, {"name": "y"}),
+    "state incomplete": (lambda: sv.plant(RELATIVE).state({"x": 1.0}), sv.SpecificationError, "l"),
+    "function": (lambda: sv.plant(RELATIVE).function("odd"), sv.NameUnknown, {"name": "odd"}),
+    "gust backwards": (lambda: sv.disturbances.gust(1.0, 2.0, 1.0), sv.SpecificationError, "from 2 to 1 s"),
+    "gust of edges": (lambda: sv.disturbances.gust(1.0, 1.0, 2.0, rise=0.6), sv.SpecificationError, "0.6 s"),
+    "noise of no seed": (lambda: sv.disturbances.noise(1.0, 5.0, seed=-1), sv.SpecificationError, "seed=-1"),
+    "noise of no band": (lambda: sv.disturbances.noise(1.0, 0.0), sv.SpecificationError, "0 Hz"),
 }  # fmt: skip
 
 
 @pytest.mark.parametrize("what", BAD)
 def test_bad_input_is_refused_by_name(what):
     call, kind, fact = BAD[what]
-    with pytest.raises(kind, match=fact):
+    with refused(kind, fact):
         call()
 
 

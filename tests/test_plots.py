@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
+from refusals import refused
 
 import servoctl
 from servoctl import figures as plots
@@ -104,14 +105,14 @@ def test_flat_paths_keep_their_scales_apart(run):
 
 
 def test_an_open_run_is_no_closed_loop(run):
-    with pytest.raises(SpecificationError, match="A Run was given.*sv.close"):
+    with refused(SpecificationError, "Run", "sv.close"):
         plots.closed(run)
 
 
 def test_a_run_is_no_sweep(run):
-    with pytest.raises(SpecificationError, match="A Run was given.*sv.sweep"):
+    with refused(SpecificationError, "Run", "sv.sweep"):
         plots.sweep(run)
-    with pytest.raises(SpecificationError, match="A Study of the kind tradeoff was given"):
+    with refused(SpecificationError, "tradeoff", "sv.sweep"):
         plots.sweep(servoctl.Study("tradeoff", {}, {}))
 
 
@@ -124,7 +125,7 @@ def test_the_load_of_a_crane_is_drawn_on_its_path(gallery_model):
 
 
 def test_an_unknown_name_is_refused_with_the_nearest(run):
-    with pytest.raises(NameUnknown, match="Nearest: 'theta'"):
+    with refused(NameUnknown, name="thetta", match="theta"):
         plots.path(run, "x", "thetta")
 
 
@@ -151,7 +152,7 @@ def test_one_axes_takes_all_signals_and_keeps_their_units_apart(run):
 
 
 def test_axes_must_be_as_many_as_panels(run):
-    with pytest.raises(SpecificationError, match="3 Axes were given. There are 2 panels: x, z; theta"):
+    with refused(SpecificationError, "3 Axes", "2 panels"):
         plots.signals(run, ax=Figure().subplots(3), units=UNITS)
     two = Figure().subplots(2)
     assert list(plots.signals(run, ax=two, units=UNITS)) == list(two)
@@ -207,7 +208,7 @@ def test_an_ideal_program_shows_its_reaction():
 
 
 def test_a_run_without_actuation_says_so():
-    with pytest.raises(SpecificationError, match="no actuation"):
+    with refused(SpecificationError, "actuation"):
         plots.actuation(a_run())
 
 
@@ -289,7 +290,7 @@ def test_a_run_of_one_sample_is_drawn(tmp_path):
 
 def test_a_folder_that_cannot_be_written(run, tmp_path):
     (tmp_path / "file").write_text("")
-    with pytest.raises(ServoError, match="figures cannot be written to .*file"):
+    with refused(ServoError, path=str(tmp_path / "file")):
         plots.save_figures(run, tmp_path / "file")
 
 

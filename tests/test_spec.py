@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 from conftest import at_random, numbers
 from frames import UNIT, boat, euler_angles, quaternion, same
+from refusals import refused
 
 from servoctl import spec as sv
 from servoctl.errors import NameUnknown, SpecificationError
@@ -175,7 +176,7 @@ def test_rolling_coin_with_quasi_velocities_that_roll():
 def test_a_kinetic_energy_on_a_frame_that_is_not_integrable_is_refused():
     q = rolling_coin()
     spin, turn = q.w()
-    with pytest.raises(SpecificationError, match="not integrable") as caught:
+    with refused(SpecificationError, "Gibbs") as caught:
         sv.Mechanism(q, kinetic=0.375 * spin**2 + 0.05 * turn**2)
     assert "Gibbs" in str(caught.value)
 
@@ -206,7 +207,7 @@ def test_gibbs_and_kinetic_that_disagree_are_refused_with_the_component():
     dx, dtheta = q.d(1)
     S = sv.particle(q, 2.0, tuple(q))
     assert sv.Mechanism(q, gibbs=S, kinetic=dx**2 + dtheta**2).mass.shape == (2, 2)
-    with pytest.raises(SpecificationError, match="d2theta") as caught:
+    with refused(SpecificationError, components=["d2theta"]) as caught:
         sv.Mechanism(q, gibbs=S, kinetic=dx**2 + 1.0000001 * dtheta**2)
     assert caught.value.details["components"] == ["d2theta"]
 
@@ -285,7 +286,7 @@ def test_forces_by_name_and_by_column():
     column = sv.Mechanism(q, gibbs=S, forces=(0, -2 * dy))
     same(named.balance, ca.vertcat(q.d(2)[0], q.d(2)[1] + 2 * dy), q)
     same(named.balance, column.balance, q)
-    with pytest.raises(NameUnknown, match="'ya'") as caught:
+    with refused(NameUnknown, name="ya") as caught:
         sv.Mechanism(q, gibbs=S, forces={"ya": dx})
     assert caught.value.details["match"] == "y"
 
@@ -293,7 +294,7 @@ def test_forces_by_name_and_by_column():
 def test_forces_on_quasi_velocities_go_by_their_names():
     q = boat()
     S = sv.particle(q, 1.0, tuple(q))
-    with pytest.raises(NameUnknown, match="quasi-velocity"):
+    with refused(NameUnknown, name="psi"):
         sv.Mechanism(q, gibbs=S, forces={"psi": 1.0})
 
 
@@ -304,9 +305,9 @@ def test_a_balance_from_elsewhere_takes_the_place_of_a_gibbs_function():
     mechanism = sv.Mechanism(q, balance=given, potential=5 * x**2, forces={"theta": -q.d(1)[1]})
     same(mechanism.balance, given + ca.vertcat(10 * x, q.d(1)[1]), q)
     same(ca.vec(mechanism.mass), ca.vertcat(3, ca.cos(theta), ca.cos(theta), 2), q)
-    with pytest.raises(SpecificationError, match="not linear in the accelerations"):
+    with refused(SpecificationError, "balance", "accelerations"):
         sv.Mechanism(q, balance=ca.vertcat(ddx**3, ddtheta))
-    with pytest.raises(SpecificationError, match="2"):
+    with refused(SpecificationError, "3", "2", what="the balance"):
         sv.Mechanism(q, balance=ca.vertcat(ddx, ddtheta, x))
 
 
@@ -360,5 +361,5 @@ def test_mechanisms_that_contradict_themselves_are_refused(options, facts):
 
 
 def test_a_mechanism_starts_from_coordinates():
-    with pytest.raises(SpecificationError, match="list"):
+    with refused(SpecificationError, "list"):
         sv.Mechanism(["x"])

@@ -4,6 +4,7 @@ import casadi as ca
 import closed_forms as cf
 import numpy as np
 import pytest
+from refusals import refused
 from scipy.integrate import solve_ivp
 
 import servoctl as sv
@@ -122,11 +123,9 @@ def test_a_fast_wheel_does_not_stop(method, squared):
 
 @pytest.mark.parametrize("method", METHODS)
 def test_a_start_where_the_wheel_stands_is_refused(method, squared):
-    with pytest.raises(sv.ServoError, match="dphi") as caught:
+    with refused(sv.SingularProgram, "speed", "dphi"):
         start = squared.start(guess={"dx": 0.0}, dphi=0.0, **ZERO)
         sv.simulate(squared, start, (0.0, 0.5), method=as_method(method, **tolerances(method)))
-    assert isinstance(caught.value, sv.SingularProgram)
-    assert "speed" in str(caught.value)
 
 
 # constant speed ------------------------------------------------------------------------------------------------------

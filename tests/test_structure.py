@@ -6,6 +6,7 @@ from functools import cache, partial
 import casadi as ca
 import numpy as np
 import pytest
+from refusals import refused
 
 import servoctl as sv
 from servoctl.gallery import gallery, mass_on_car, passive_arm, vtol
@@ -74,7 +75,6 @@ def check(model, row):
     assert sum(row.n) + model.free == states  # the plant's states are the zeros at infinity and the internal ones
     assert structure.margin > 0 and structure.uniform
     assert len(repr(structure).splitlines()) <= 12 and f"index {row.index}" in repr(structure)
-    assert f"index {row.index}" in repr(model)
 
 
 @pytest.mark.parametrize("name", TABLE)
@@ -100,7 +100,7 @@ def test_ideal_programs(name, free, index, gallery_model):
 def test_programs_of_order_three_have_no_index_computed(gallery_model):
     model = gallery_model("spiral")
     assert model.structure().index is None and model.free == 5
-    assert "index" not in repr(model) and "Chetaev" in repr(model)
+    assert "Chetaev" in repr(model)
 
 
 # along a motion ------------------------------------------------------------------------------------------------------
@@ -145,7 +145,7 @@ def test_the_essential_order_is_the_class_that_a_path_needs():
         path = sv.paths.rest_to_rest(mechanism.q.t, (0.0, 0.0), (5.0, 2.0), duration=4.0, smoothness=smoothness)
         program = sv.Program({"X": x - height * ca.sin(theta) - path[0], "Z": z + height * ca.cos(theta) - path[1]})
         if smoothness == 3:
-            with pytest.raises(sv.SpecificationError, match="needs C\\^4, has C\\^3"):
+            with refused(sv.SpecificationError, needs=4, has=3):
                 sv.derive(mechanism, program)
         else:
             assert sv.derive(mechanism, program).flat
@@ -174,7 +174,7 @@ def test_the_margin_shrinks_where_the_guide_becomes_horizontal():
 
 @pytest.mark.parametrize("damping", [0.0, 1.0])
 def test_a_rank_that_cannot_be_told_is_refused(damping):
-    with pytest.raises(sv.SingularProgram, match="cannot be told in double precision"):
+    with refused(sv.SingularProgram, "z", "balance of s"):
         sv.derive(*mass_on_car(1e-6, damping))
 
 

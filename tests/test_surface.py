@@ -19,8 +19,9 @@ FILES = sorted(PACKAGE.rglob("*.py"))
 ENTRIES = ("__init__.py", "__main__.py")  # of the package itself: they gather the rest
 
 LAYERS = (
-    "version", "errors", "checks", "archive", "progress", "jets", "spec", "reduction", "codegen", "model", "plants", "run", "methods",
-    "simulation", "internal_dynamics", "figures", "control", "verification", "study", "interop", "export", "gallery", "shell",
+    "version", "errors", "values", "tolerances", "checks", "archive", "progress", "jets", "spec", "reduction", "codegen",
+    "model", "plants", "run", "methods", "simulation", "internal_dynamics", "figures", "control", "verification", "study",
+    "interop", "export", "gallery", "shell",
 )  # fmt: skip
 WITHOUT_CASADI = ("study", "figures", "interop", "shell")
 LATE = ("scipy", "matplotlib", "control", "tqdm", "xarray", "dask")

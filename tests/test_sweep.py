@@ -14,6 +14,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from refusals import refused
 
 import servoctl as sv
 from servoctl.errors import NameUnknown, ServoError, SpecificationError
@@ -162,50 +163,50 @@ def test_columns_are_cases_as_well():
 
 
 @pytest.mark.parametrize(
-    ("cases", "text"),
+    ("cases", "fact"),
     [
-        ([], "There is no case"),
-        ({"m": [1, 2], "l": [1]}, "lengths m: 2, l: 1"),
-        ([{"m": 1}, {"l": 1}], "Case 1 has the parameters l, case 0 m"),
-        ([{"m": [1, 2]}], "Parameter m of case 0"),
-        ([{"m": math.inf}], "Parameter m of case 0 is inf"),
-        ([3], "Case 0 is 3"),
-        ([{"error": 1}], "parameter named 'error'"),
-        ([{"l": 1}], r"halves\(m\): missing a required argument: 'm'"),
+        ([], "case"),
+        ({"m": [1, 2], "l": [1]}, {"lengths": {"m": 2, "l": 1}}),
+        ([{"m": 1}, {"l": 1}], {"case": 1}),
+        ([{"m": [1, 2]}], {"name": "m", "case": 0}),
+        ([{"m": math.inf}], {"name": "m", "case": 0}),
+        ([3], {"case": 0}),
+        ([{"error": 1}], {"name": "error"}),
+        ([{"l": 1}], {"parameters": ["l"]}),
     ],
 )
-def test_cases_that_form_no_table_are_refused(cases, text):
-    with pytest.raises(SpecificationError, match=text):
+def test_cases_that_form_no_table_are_refused(cases, fact):
+    with refused(SpecificationError, fact):
         sv.sweep(halves, cases)
 
 
 @pytest.mark.parametrize(
-    ("call", "text"),
+    ("call", "fact"),
     [
-        (lambda: sv.grid(m=[]), "m has no values"),
+        (lambda: sv.grid(m=[]), {"name": "m"}),
         (lambda: sv.monte_carlo(-1, seed=1), "n=-1"),
         (lambda: sv.monte_carlo(2, seed=None), "seed=None"),
-        (lambda: sv.monte_carlo(2, seed=1, m=[1, 2]), "distribution of m"),
-        (lambda: sv.monte_carlo(2, seed=1, m=lambda rng: rng.normal(1.0, -1.0)), "m cannot be drawn: scale < 0"),
+        (lambda: sv.monte_carlo(2, seed=1, m=[1, 2]), {"name": "m"}),
+        (lambda: sv.monte_carlo(2, seed=1, m=lambda rng: rng.normal(1.0, -1.0)), {"name": "m"}),
         (lambda: sv.sweep(halves, sv.grid(m=1), executor=2), "executor=2"),
-        (lambda: sv.sweep(halves, sv.grid(m=1), executor=ThreadPoolExecutor), "executor that is open"),
-        (lambda: sv.sweep(halves, sv.grid(m=1), shard=(1.5, 2)), r"shard = \(1.5, 2\)"),
-        (lambda: sv.sweep(halves, sv.grid(m=1), seed=1), "no parameter rng"),
-        (lambda: sv.sweep(crane_loop, sv.grid(m_load=100)), "No seed was given"),
-        (lambda: sv.sweep(halves, sv.grid(m=1), shard=(3, 2)), r"shard = \(3, 2\)"),
-        (lambda: sv.sweep(3, sv.grid(m=1)), "The case is 3"),
+        (lambda: sv.sweep(halves, sv.grid(m=1), executor=ThreadPoolExecutor), "ThreadPoolExecutor"),
+        (lambda: sv.sweep(halves, sv.grid(m=1), shard=(1.5, 2)), {"shard": (1.5, 2)}),
+        (lambda: sv.sweep(halves, sv.grid(m=1), seed=1), {"seed": 1}),
+        (lambda: sv.sweep(crane_loop, sv.grid(m_load=100)), {"seed": None}),
+        (lambda: sv.sweep(halves, sv.grid(m=1), shard=(3, 2)), {"shard": (3, 2)}),
+        (lambda: sv.sweep(3, sv.grid(m=1)), "case is 3"),
         (lambda: sv.merge([]), "0 studies"),
         (lambda: sv.merge([3]), "1 studies"),
-        (lambda: sv.merge([sv.sweep(halves, sv.grid(m=i)) for i in (1, 2)]), "2 different sweeps"),
+        (lambda: sv.merge([sv.sweep(halves, sv.grid(m=i)) for i in (1, 2)]), "2 studies"),
     ],
 )
-def test_what_cannot_be_swept_is_refused(call, text):
-    with pytest.raises(SpecificationError, match=text):
+def test_what_cannot_be_swept_is_refused(call, fact):
+    with refused(SpecificationError, fact):
         call()
 
 
 def test_a_function_that_processes_cannot_receive_is_refused_before_anything_runs():
-    with spawned(1) as pool, pytest.raises(SpecificationError, match="cannot be sent to another process"):
+    with spawned(1) as pool, refused(SpecificationError, "lambda"):
         sv.sweep(lambda m: {"r": m}, sv.grid(m=[1]), executor=pool)
 
 
@@ -241,14 +242,14 @@ def test_a_pool_that_dies_leaves_what_was_finished(tmp_path):
 
 
 def test_a_pool_that_dies_at_once_is_an_error():
-    with spawned(1) as pool, pytest.raises(ServoError, match="finished none of 2 cases. BrokenProcessPool"):
+    with spawned(1) as pool, refused(ServoError, "2 cases", error="BrokenProcessPool"):
         sv.sweep(deadly, sv.grid(m=[5, 5]), executor=pool)
 
 
 def test_a_pool_that_was_shut_down_is_an_error():
     with ThreadPoolExecutor(1) as pool:
         pass
-    with pytest.raises(ServoError, match="finished none of 1 cases. RuntimeError.*shutdown"):
+    with refused(ServoError, "1 cases", error="RuntimeError"):
         sv.sweep(halves, sv.grid(m=[1]), executor=pool)
 
 
@@ -320,7 +321,7 @@ def test_the_checkpoint_of_another_sweep_is_refused(tmp_path, case, cases, seed)
     kept = tmp_path / "kept"
     sv.sweep(Counting(), {"m": [1, 2]}, seed=1, checkpoint=kept)
     text = kept.read_text()
-    with pytest.raises(SpecificationError, match="other cases, another seed or another case function"):
+    with refused(SpecificationError, path=str(kept)):
         sv.sweep(case, cases, seed=seed, checkpoint=kept)
     assert kept.read_text() == text
 
@@ -335,20 +336,20 @@ def test_a_function_of_the_same_name_in_another_module_is_another_sweep():
     first, _, second, _ = (study.meta["identity"] for study in studies)
     assert first != second and studies[0].meta["case"] == studies[2].meta["case"] == "case"
     assert studies[1].meta["identity"] != studies[3].meta["identity"]
-    with pytest.raises(SpecificationError, match="different sweeps"):
+    with refused(SpecificationError, "2 studies"):
         sv.merge([studies[0], studies[2]])
 
 
 @pytest.mark.parametrize("text", ["hello\n", "[]\n", "{}\n"])
 def test_a_file_that_is_no_checkpoint_is_left_alone(tmp_path, text):
     (tmp_path / "notes").write_text(text)
-    with pytest.raises(SpecificationError, match="no checkpoint"):
+    with refused(SpecificationError, path=str(tmp_path / "notes")):
         sv.sweep(halves, {"m": [1]}, checkpoint=tmp_path / "notes")
     assert (tmp_path / "notes").read_text() == text
 
 
 def test_a_checkpoint_that_cannot_be_opened_is_told(tmp_path):
-    with pytest.raises(ServoError, match="cannot be opened"):
+    with refused(ServoError, path=str(tmp_path)):
         sv.sweep(halves, {"m": [1]}, checkpoint=tmp_path)
 
 
@@ -399,7 +400,7 @@ def test_the_figure_shows_percentiles_dependence_and_failures():
     assert sv.figures.sweep(study, ["r"], "b").axes[1].get_xlabel() == "b"
     with pytest.raises(NameUnknown):
         sv.figures.sweep(study, ["rr"])
-    with pytest.raises(SpecificationError, match="no result varies"):
+    with refused(SpecificationError, "2 rows"):
         sv.figures.sweep(study.take([0, 1]), [])
 
 
@@ -419,11 +420,9 @@ def case(m, rng):
 
 
 @pytest.fixture
-def here(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(sys, "path", list(sys.path))
-    (tmp_path / "own.py").write_text(OWN)
-    return tmp_path
+def here(here):
+    (here / "own.py").write_text(OWN)
+    return here
 
 
 def test_the_command_varies_parameters_of_a_scene(here, capsys):

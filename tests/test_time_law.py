@@ -3,6 +3,7 @@
 import casadi as ca
 import numpy as np
 import pytest
+from refusals import refused
 from scipy.optimize import brentq
 
 import servoctl as sv
@@ -78,7 +79,7 @@ def test_motions_that_cease_to_exist_before_a_limit_are_no_fastest_ones(monkeypa
         return sv.simulate(model, start, span, **options)
 
     monkeypatch.setattr("servoctl.control.time_law.simulate", simulated)
-    with pytest.raises(sv.LimitExceeded, match=r"below the factor 0\.75, before it reaches a limit"):
+    with refused(sv.LimitExceeded, factor=pytest.approx(0.75, abs=1e-4)):
         sv.fastest(*cars(), {"force": 3000.0}, (0.0, 2.0))
 
 
@@ -92,29 +93,31 @@ def test_weights_of_actuators_are_slowed_as_well():
 
 
 def test_static_loads_beyond_the_limits_are_refused_with_the_numbers():
-    with pytest.raises(sv.LimitExceeded, match="hoist still exceeds its lower limit.*-981 .. -981"):
+    with refused(sv.LimitExceeded, "-981", name="hoist", factor=4096.0):
         sv.fastest(*overhead_crane(), {"hoist": (-900.0, 0.0)}, (0.0, 6.0), guess={"l": 4.0})
 
 
 def test_bad_input():
     mechanism, program = cars()
     for factor in (0.0, -1.0, "fast", np.nan):
-        with pytest.raises(sv.SpecificationError, match="positive number"):
+        with refused(sv.SpecificationError, "factor"):
             program.slowed(mechanism.q, factor)
     for at in ("now", None, np.nan):
-        with pytest.raises(sv.SpecificationError, match="finite number"):
+        with refused(sv.SpecificationError, repr(at)):
             program.slowed(mechanism.q, 2.0, at=at)
-    for limits, span in (({}, (0.0, 2.0)), (5.0, (0.0, 2.0)), ({"force": 200.0}, (2.0, 0.0))):
-        with pytest.raises(sv.SpecificationError, match="limits|later t1"):
+    for limits, span, fact in (
+        ({}, (0.0, 2.0), "limits"), (5.0, (0.0, 2.0), "limits"), ({"force": 200.0}, (2.0, 0.0), "(2.0, 0.0)")
+    ):  # fmt: skip
+        with refused(sv.SpecificationError, fact):
             sv.fastest(mechanism, program, limits, span)
     for pair, kind in (((mechanism, "cars"), "Program"), (("cars", program), "Mechanism")):
-        with pytest.raises(sv.SpecificationError, match=f"A str was given as {kind.lower()}"):
+        with refused(sv.SpecificationError, "str", kind.lower()):
             sv.fastest(*pair, {"force": 200.0}, (0.0, 2.0))
     for given in ("start", "parameters"):
-        with pytest.raises(sv.SpecificationError, match="go by name"):
+        with refused(sv.SpecificationError, "[1.0]"):
             sv.fastest(mechanism, program, {"force": 200.0}, (0.0, 2.0), **{given: [1.0]})
     for limit in ((1.0, -1.0), (None, None), "1..2", np.nan):
-        with pytest.raises(sv.SpecificationError, match="interval"):
+        with refused(sv.SpecificationError, name="force"):
             sv.fastest(mechanism, program, {"force": limit}, (0.0, 2.0))
-    with pytest.raises(sv.NameUnknown, match="force"):
+    with refused(sv.NameUnknown, name="forse", match="force"):
         sv.fastest(mechanism, program, {"forse": 1.0}, (0.0, 2.0))

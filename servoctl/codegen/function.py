@@ -1,7 +1,6 @@
 """A function of (t, x, p) seen through numpy: single points, grids, Runge-Kutta, and Newton along a path.
 
-Nothing is compiled before it pays. Where there is no compiler, CasADi's evaluation runs the same algorithms and the
-results differ by rounding only.
+Nothing is compiled before it pays; without a compiler CasADi runs the same algorithms, and results differ by rounding.
 """
 
 import contextlib
@@ -113,7 +112,6 @@ class Compiled:
     Attributes
     ----------
     name : str
-        Its name.
     n_x, n_p, n_y : int
         Numbers of states, parameters and outputs.
     loops : tuple of str
@@ -134,6 +132,12 @@ class Compiled:
     def __reduce__(self):
         parts = (self.expression, self.name, self.loops, self._project, self._others, self._sizes)
         return Compiled, parts, {"_text": self._text}
+
+    def __eq__(self, other):
+        return self is other or (isinstance(other, Compiled) and self.source() == other.source())
+
+    def __hash__(self):
+        return hash((self.name, self.n_x, self.n_p, self.n_y))
 
     def __repr__(self):
         how = "compiled" if self.backend == "c" else "evaluated by CasADi"

@@ -7,10 +7,11 @@ import numpy as np
 from servoctl.checks import ON_SAMPLE, finite, positive
 from servoctl.codegen.function import Compiled
 from servoctl.errors import SpecificationError, unknown
+from servoctl.values import Value
 
 
 @dataclass(frozen=True, eq=False)
-class Law:
+class Law(Value):
     """A sampled law u = law(t, measurement); made by `feedforward`, `pd`, `lqr` and others.
 
     At the sample k of t_k = t0 + k/rate, `step` maps t_k, [y; z] and the k-th column of `schedule` to [u; z+; further

@@ -19,7 +19,7 @@ class Loop:
     samples, substeps, delay : int
         Number of periods, Runge-Kutta steps in each, samples from a command to the input.
     n_u, n_out : int
-        Numbers of inputs, and of the law's outputs: inputs, memory and further signals.
+        Numbers of inputs, and of the law's outputs: inputs, controller state and further signals.
     first : int
         The law's row at the first sample.
     t0, period : float
@@ -27,7 +27,7 @@ class Loop:
     p : (n_p,) array
         Of the plant, with room for inputs and disturbances at the end.
     x0, z0 : (n_x,), (n_z,) arrays
-        State of the plant and memory of the law at the start.
+        State of the plant and controller state at the start.
     table : (rows, n_row) array
         Of the law; the last row holds beyond the end.
     measured, disturbed : (n_y,), (n_d,) integer arrays
@@ -128,9 +128,9 @@ def run_loop(ode, law, loop):
     x : (N, n_x) array
         States at the samples completed.
     law_x : (N, n_y + n_z) array
-        Measurement and memory there.
+        Measurement and controller state there.
     law_y : (N, n_out) array
-        Command, next memory and further signals there.
+        Command, next controller state and further signals there.
     inputs : (N, n_u) array
         Inputs applied from there on.
     """

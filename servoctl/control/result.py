@@ -264,7 +264,7 @@ class Closed:
         return self.to_run().save(path)
 
     def __reduce__(self):
-        return _same, (self.to_run(),)  # plant and model hold expressions, which do not pickle
+        return _same, (self.to_run(),)  # disturbances may be functions that do not pickle
 
     def __repr__(self):
         loop = self.loop

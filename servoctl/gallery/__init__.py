@@ -5,8 +5,8 @@
     model = sv.derive(*scene.build())
     run = sv.simulate(model, model.start(**scene.start, guess=scene.guess), scene.t_span)
 
-A file of one's own takes the place of a scene where it defines `scene()`, which returns (Mechanism, Program), and, if
-wanted, START, GUESS, T_SPAN and UNITS with the meanings of `start`, `guess`, `t_span` and `units` below.
+A user's file serves as a scene if it defines `scene()`, which returns (Mechanism, Program), and optionally START,
+GUESS, T_SPAN and UNITS with the meanings of `start`, `guess`, `t_span` and `units` below.
 """
 
 import re
@@ -20,9 +20,8 @@ from servoctl.gallery.constant_speed import constant_speed
 from servoctl.gallery.cranes import crane_3d, overhead_crane, winch_crane
 from servoctl.gallery.links import planar_arm, spatial_arm
 from servoctl.gallery.mass_on_car import mass_on_car
-from servoctl.gallery.passive_arm import passive_arm
 from servoctl.gallery.spirals import spiral
-from servoctl.gallery.two_links import pendubot, two_link_arm
+from servoctl.gallery.two_links import passive_arm, pendubot, two_link_arm
 from servoctl.gallery.vtol import vtol
 from servoctl.gallery.wheeled_robot import wheeled_robot
 

@@ -2,7 +2,7 @@
 
 import casadi as ca
 
-from servoctl import spec as sv
+import servoctl as sv
 from servoctl.errors import unknown
 
 

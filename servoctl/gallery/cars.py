@@ -2,7 +2,7 @@
 
 import casadi as ca
 
-from servoctl import spec as sv
+import servoctl as sv
 from servoctl.errors import SpecificationError
 
 
@@ -37,7 +37,7 @@ def cars(N=2, masses=None, stiffnesses=None, gaps=None, by="actuators"):
     """
     if N < 2:
         raise SpecificationError(
-            f"{N} car was asked for.", "The force passes through a spring.", "N = 2.", "Ask for at least two cars."
+            f"A row of {N} cars.", "The force passes through a spring.", nearest="N = 2."
         )
     masses = _per_car("masses", masses, [1.0] * (N - 1) + [2.0])
     stiffnesses = _per_car("stiffnesses", stiffnesses, [1.0] * (N - 1))
@@ -66,6 +66,6 @@ def _per_car(what, given, default):
     values = default if given is None else list(given)
     if len(values) != len(default):
         raise SpecificationError(
-            f"{len(values)} {what} were given.", f"This row of cars has {len(default)}.", do="Give one each."
+            f"There are {len(values)} {what}.", f"This row of cars has {len(default)}."
         )
     return values

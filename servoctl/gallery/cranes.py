@@ -1,7 +1,7 @@
 """Cranes whose load follows a path: a planar one, one with a winch, and a three-dimensional one.
 
 Each comes in relative coordinates (rope length and angles) or in redundant ones, where the load has Cartesian
-coordinates of its own and the rope is a material constraint. Z points down. The tension of the rope is an output, and
+coordinates and the rope is a material constraint. Z points down. The tension of the rope is an output, and
 so is the load's position [m] where it is not among the coordinates.
 """
 
@@ -9,7 +9,7 @@ from math import pi
 
 import casadi as ca
 
-from servoctl import spec as sv
+import servoctl as sv
 from servoctl.errors import unknown
 
 COORDINATES = ("relative", "redundant")
@@ -131,7 +131,7 @@ def _hanging(trolley, length, rope):
 
 
 def _roped(trolley, length, load):
-    """Position of a load with coordinates of its own, the rope's direction, and the rope as material constraint."""
+    """Position of a load with Cartesian coordinates, the rope's direction, and the rope as material constraint."""
     offset = load - trolley
     return load, offset / length, {"rope": ca.dot(offset, offset) - length**2}
 

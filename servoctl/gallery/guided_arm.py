@@ -2,7 +2,7 @@
 
 import casadi as ca
 
-from servoctl import spec as sv
+import servoctl as sv
 from servoctl.errors import SpecificationError
 from servoctl.gallery.links import planar_arm
 
@@ -33,7 +33,9 @@ def guided_arm(n=4, k=2, coordinates="joints"):
     mechanism, _ = planar_arm(n, coordinates)
     if not 1 <= k < n:
         raise SpecificationError(
-            f"{k} joints of {n} are to be guided.", "At least one is, and one is not.", do=f"Give k from 1 to {n - 1}."
+            f"k = {k} guided joints of {n}.",
+            "At least one is guided and one is not.",
+            nearest=f"k = {min(max(k, 1), n - 1)}.",
         )
     q, length = list(mechanism.q), mechanism.parameters.l
     inclinations = [sum(q[: i + 1]) for i in range(n)] if coordinates == "joints" else q[2::3]

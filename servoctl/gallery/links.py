@@ -8,7 +8,7 @@ from itertools import accumulate
 
 import casadi as ca
 
-from servoctl import spec as sv
+import servoctl as sv
 from servoctl.errors import SpecificationError, unknown
 
 COORDINATES = ("joints", "bodies")
@@ -135,10 +135,7 @@ def spatial_arm(n=3, coordinates="joints"):
 def _check(n, coordinates, least):
     if n < least:
         raise SpecificationError(
-            f"{n} links were asked for.",
-            "The joints can give the end point any acceleration.",
-            f"n = {least}.",
-            f"Ask for at least {least} links.",
+            f"An arm of {n} links.", "The joints can give the end point any acceleration.", nearest=f"n = {least}."
         )
     if coordinates not in COORDINATES:
         raise unknown(coordinates, COORDINATES, "kind of coordinates")

@@ -4,7 +4,7 @@ from math import factorial
 
 import casadi as ca
 
-from servoctl import spec as sv
+import servoctl as sv
 from servoctl.errors import SpecificationError
 
 
@@ -32,7 +32,7 @@ def spiral(order=3, c=None):
     """
     if order < 2:
         raise SpecificationError(
-            f"A spiral of order {order} was asked for.", "Curvature has order 2.", "Order 2, a circle.", "Raise it."
+            f"A spiral of order {order}.", "Curvature has order 2.", nearest="order = 2, a circle."
         )
     n = order - 2
     p = sv.parameters(m=1.0, c=factorial(n + 1) / 2 ** (n + 1) if c is None else c)  # kg, 1/(m s^n)

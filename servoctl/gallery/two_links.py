@@ -1,8 +1,10 @@
-"""Planar arms of two links in gravity: both joints driven, or the shoulder alone."""
+"""Planar arms of two links: both joints driven or the shoulder alone, in gravity; or an elastic elbow, without."""
+
+from math import pi
 
 import casadi as ca
 
-from servoctl import spec as sv
+import servoctl as sv
 
 
 def two_link_arm():
@@ -15,12 +17,12 @@ def two_link_arm():
     """
     p = sv.parameters(m1=4.0, m2=3.0, l1=0.6, l2=0.5, I1=0.12, I2=0.07, g=9.81)  # kg, kg, m, m, kg m^2, kg m^2, m/s^2
     q = sv.coordinates("q1 q2")  # rad from the horizontal, rad (relative)
-    elbow, end, S, potential = _links(q, p)
+    end, S, height = _links(q, (p.m1, p.m2), (p.l1, p.l2), (p.I1, p.I2))
     path = sv.paths.rest_to_rest(q.t, start=(0.6, 0.4), end=(0.2, 0.9), duration=2.0, smoothness=2)
     mechanism = sv.Mechanism(
         q,
         gibbs=S,
-        potential=potential,
+        potential=p.g * height,
         actuators=dict(zip(("shoulder", "elbow"), q, strict=True)),
         outputs={"X_end": end[0], "Y_end": end[1]},
         parameters=p,
@@ -51,13 +53,13 @@ def pendubot(start=-90.0, end=0.0, duration=3.0, damping=0.05):
     p = sv.parameters(m1=4.0, m2=3.0, l1=0.6, l2=0.5, I1=0.12, I2=0.07, g=9.81, d=damping)
     q = sv.coordinates("q1 q2")  # rad from the horizontal, rad (relative)
     q1, _ = q
-    _, end_point, S, potential = _links(q, p)
+    end_point, S, height = _links(q, (p.m1, p.m2), (p.l1, p.l2), (p.I1, p.I2))
     degree = ca.pi / 180
     path = sv.paths.rest_to_rest(q.t, start * degree, end * degree, duration=duration, smoothness=2)
     mechanism = sv.Mechanism(
         q,
         gibbs=S,
-        potential=potential,
+        potential=p.g * height,
         forces={"q2": -p.d * q.d(1)[1]},
         actuators={"shoulder": q1},
         outputs={"X_end": end_point[0], "Y_end": end_point[1]},
@@ -66,14 +68,47 @@ def pendubot(start=-90.0, end=0.0, duration=3.0, damping=0.05):
     return mechanism, sv.Program({"angle": q1 - path}, by="actuators")
 
 
-def _links(q, p):
-    """Positions of elbow and end [m], the Gibbs function and the potential [J]."""
+def passive_arm(Gamma=0.3):
+    """q1 + Γ q2 turns by 90° in 2 s, by the torque of the first joint alone; no gravity.
+
+    Two equal homogeneous links. The internal dynamics are stable for Γ < 0.4 and unstable above; at Γ = 0.4 the
+    leading coefficient 0.2 (1 - cos q2) vanishes in the straight pose.
+
+    Parameters
+    ----------
+    Gamma : float
+        Weight of the passive joint in the output; 0.5 gives roughly the angle of the arm's tip.
+
+    Returns
+    -------
+    Mechanism, Program
+        Realised by the actuator "torque" [N m] on q1.
+    """
+    p = sv.parameters(m=1.0, l=1.0, I=1 / 12, c=10.0, d=1.0, Gamma=Gamma)  # kg, m, kg m^2, N m/rad, N m s/rad, 1
+    q = sv.coordinates("q1 q2")  # rad, rad (relative)
+    q1, q2 = q
+    _, S, _ = _links(q, (p.m, p.m), (p.l, p.l), (p.I, p.I))
+    path = sv.paths.rest_to_rest(q.t, 0.0, pi / 2, duration=2.0, smoothness=4)
+    mechanism = sv.Mechanism(
+        q,
+        gibbs=S,
+        potential=p.c * q2**2 / 2,
+        forces={"q2": -p.d * q.d(1)[1]},
+        actuators={"torque": q1},
+        parameters=p,
+    )
+    return mechanism, sv.Program({"angle": q1 + p.Gamma * q2 - path}, by="actuators")
+
+
+def _links(q, masses, lengths, inertias):
+    """Position of the end [m], the Gibbs function, and the sum of masses times heights [kg m]."""
     q1, q2 = q
     dq1, dq2 = q.d(1)
+    (m1, m2), (l1, l2), (I1, I2) = masses, lengths, inertias
     along = [ca.vertcat(ca.cos(a), ca.sin(a)) for a in (q1, q1 + q2)]
-    elbow = p.l1 * along[0]
-    end = elbow + p.l2 * along[1]
-    middle = elbow + p.l2 / 2 * along[1]
-    S = sv.rigid_body(q, p.m1, (0, 0, p.I1), position=elbow / 2, rates=(0, 0, dq1))
-    S += sv.rigid_body(q, p.m2, (0, 0, p.I2), position=middle, rates=(0, 0, dq1 + dq2))
-    return elbow, end, S, p.g * (p.m1 * elbow[1] / 2 + p.m2 * middle[1])
+    elbow = l1 * along[0]
+    end = elbow + l2 * along[1]
+    middle = elbow + l2 / 2 * along[1]
+    S = sv.rigid_body(q, m1, (0, 0, I1), position=elbow / 2, rates=(0, 0, dq1))
+    S += sv.rigid_body(q, m2, (0, 0, I2), position=middle, rates=(0, 0, dq1 + dq2))
+    return end, S, m1 * elbow[1] / 2 + m2 * middle[1]

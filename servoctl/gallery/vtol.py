@@ -4,7 +4,7 @@ from math import radians
 
 import casadi as ca
 
-from servoctl import spec as sv
+import servoctl as sv
 from servoctl.errors import unknown
 
 POINTS = ("flat", "centre")

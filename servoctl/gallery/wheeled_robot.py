@@ -2,7 +2,7 @@
 
 import casadi as ca
 
-from servoctl import spec as sv
+import servoctl as sv
 
 
 def wheeled_robot(turn=90.0, speed=1.0, duration=4.0):

@@ -5,6 +5,9 @@ import operator
 import casadi as ca
 import numpy as np
 
+if ca.GlobalOptions.getNumpyMode() == 0:  # nothing chosen: NumPy's functions of symbols work, and CasADi warns of them
+    ca.GlobalOptions.setNumpyMode(-1)  # the same without a warning
+
 _NUMPY = {
     "sin": np.sin, "cos": np.cos, "tan": np.tan, "exp": np.exp, "log": np.log, "sqrt": np.sqrt,
     "asin": np.arcsin, "acos": np.arccos, "atan": np.arctan, "sinh": np.sinh, "cosh": np.cosh,

@@ -6,7 +6,7 @@ from servoctl.jets.elementary import apply
 
 
 class Plan:
-    """The nodes of a tape in an order in which those that are run together stand side by side.
+    """The nodes of a tape sorted so that those that are run together are neighbours.
 
     Parameters
     ----------
@@ -15,12 +15,12 @@ class Plan:
     Attributes
     ----------
     place : (n_nodes,) array of int
-        Where each node of the tape stands.
+        Of each node of the tape, in this order.
     constants, inputs : (places, values) and (places, indices)
     groups : list of (kind, data, slice, (operands, size) array)
         With the places of the operands. A square is a product here.
     slopes : dict of int to list of (size,) arrays
-        Of groups of kind "quad", by their first place: where dy/da stands for each operand.
+        Of groups of kind "quad", by their first place: the places of dy/da for each operand.
     """
 
     def __init__(self, nodes):
@@ -47,9 +47,9 @@ class Plan:
             kind, data = sorts[sort[order[first]]]
             _, args, _ = nodes[order[first]]
             if not args:
-                given = self.constants if kind == "const" else self.inputs
-                given[0].extend(range(first, last))
-                given[1].extend(nodes[i].data for i in order[first:last])
+                leaves = self.constants if kind == "const" else self.inputs
+                leaves[0].extend(range(first, last))
+                leaves[1].extend(nodes[i].data for i in order[first:last])
                 continue
             count = 2 if kind == "mul" else len(args)
             self.groups.append((kind, data, slice(first, last), operands[:count, first:last].copy()))
@@ -63,32 +63,34 @@ class Plan:
     def values(self, inputs):
         """The value of every node at N points, (n_nodes, N), from those of the inputs, (n_inputs, N)."""
         v = np.empty((len(self.place), *inputs.shape[1:]), dtype=inputs.dtype)
-        for (places, given), source in ((self.constants, None), (self.inputs, inputs)):
-            v[places] = np.array(given)[:, None] if source is None else source[given]
-        for kind, data, own, operands in self.groups:
-            given = v.take(operands, axis=0)
+        places, constants = self.constants
+        v[places] = np.array(constants)[:, None]
+        places, indices = self.inputs
+        v[places] = inputs[indices]
+        for kind, data, here, operands in self.groups:
+            values = v.take(operands, axis=0)
             if kind in _ARITHMETIC:
-                _ARITHMETIC[kind](*given, out=v[own])
+                _ARITHMETIC[kind](*values, out=v[here])
             else:
-                v[own] = _VALUE[kind](data, *given)
+                v[here] = _VALUE[kind](data, *values)
         return v
 
     def sizes(self, v):
         """The size of the terms that made every node, (n_nodes, N), from the values."""
         magnitude = np.abs(v)
         size = magnitude.copy()
-        for kind, data, own, operands in self.groups:
-            given = size.take(operands, axis=0)
+        for kind, data, here, operands in self.groups:
+            parts = size.take(operands, axis=0)
             if kind in ("add", "sub"):
-                np.add(*given, out=size[own])
+                np.add(*parts, out=size[here])
             elif kind == "mul":
                 a, b = magnitude.take(operands, axis=0)
-                np.add(a * given[1], given[0] * b, out=size[own])
+                np.add(a * parts[1], parts[0] * b, out=size[here])
             elif kind == "quad":
-                for slope, part in zip(self.slopes[own.start], given, strict=True):
-                    size[own] += np.nan_to_num(magnitude.take(slope, axis=0)) * part
+                for slope, part in zip(self.slopes[here.start], parts, strict=True):
+                    size[here] += np.nan_to_num(magnitude.take(slope, axis=0)) * part
             elif kind != "constant":
-                size[own] = _SIZE[kind](data, magnitude[own], *v.take(operands, axis=0), *given)
+                size[here] = _SIZE[kind](data, magnitude[here], *v.take(operands, axis=0), *parts)
         return size
 
 

@@ -36,8 +36,8 @@ class Scalars:
         self._rows, self._factors = [], np.ones((len(self.places), 1))
         for i, (symbol, place) in enumerate(zip(self.tape.symbols, self.places, strict=True)):
             if place is None:
-                own = symbol.element_hash()
-                self._rows.append(0 if own in others else 1 + names.index(own))
+                key = symbol.element_hash()
+                self._rows.append(0 if key in others else 1 + names.index(key))
             else:
                 kind, level, k = place
                 start = first["q"] + q.nq + (level - 1) * q.n if kind == "w" else first[kind]
@@ -80,7 +80,7 @@ class Book:
         self._read = {}  # element hash: its scalars, and which of them it is
 
     def find(self, q, parameters, expressions):
-        """Where expressions stand; those that are new are read together.
+        """Where expressions are found; new ones are read together.
 
         Parameters
         ----------
@@ -98,9 +98,9 @@ class Book:
         if new:
             scalars = Scalars(q, parameters, list(new.values()))
             self._read |= {h: (scalars, i) for i, h in enumerate(new)}
-        found = {}
+        by_scalars = {}
         for at, (scalars, i) in enumerate(map(self._read.get, hashes)):
-            own, given = found.setdefault(scalars, ([], []))
-            own.append(i)
-            given.append(at)
-        return [(scalars, *places) for scalars, places in found.items()]
+            sources, targets = by_scalars.setdefault(scalars, ([], []))
+            sources.append(i)
+            targets.append(at)
+        return [(scalars, *places) for scalars, places in by_scalars.items()]

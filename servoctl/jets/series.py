@@ -133,15 +133,11 @@ class Series:
         if kind == "sq":
             return self._square(a, k)
         if kind == "sqrt":
-            y = c[i]
-            if k == 0:
-                return apply("sqrt", a[0])
-            rest = _minus(a[k], _dot((y[j], y[k - j]) for j in range(1, k)))
-            return 0.0 if is_zero(rest) else divide(rest, multiply(2.0, y[0]))
+            return self._root(a, c[i], k)
         if kind == "power":
             return self._constant_power(a, c[i], node.data, k)
-        if kind == "fabs":
-            return select(self._first(node.args[0]) >= 0, a[k], -a[k])
+        if kind in ("fabs", "gate", "fmin", "fmax"):
+            return self._branch(node, k)
         b = c[node.args[1]]
         if kind == "add":
             return _plus(a[k], b[k])
@@ -153,10 +149,17 @@ class Series:
             y = c[i]
             rest = _minus(a[k], _dot((y[j], b[k - j]) for j in _inner_first(k) if j < k))
             return 0.0 if is_zero(rest) else divide(rest, b[0])
-        if kind == "gate":
+        raise TypeError(f"a tape holds a node of kind {kind!r}")
+
+    def _branch(self, node, k):
+        """Coefficient k of an operation that takes one of its branches."""
+        a, b = (self.c[i] for i in (node.args[0], node.args[-1]))
+        if node.kind == "fabs":
+            return select(self._first(node.args[0]) >= 0, a[k], -a[k])
+        if node.kind == "gate":
             return 0.0 if is_zero(b[k]) else select(a[0] != 0, b[k], 0.0)
         first = self._first(node.args[0]) <= self._first(node.args[1])
-        return select(first, *((a[k], b[k]) if kind == "fmin" else (b[k], a[k])))
+        return select(first, *((a[k], b[k]) if node.kind == "fmin" else (b[k], a[k])))
 
     @staticmethod
     def _square(a, k):
@@ -164,6 +167,13 @@ class Series:
             return 0.0 if is_zero(a[0]) else multiply(a[0], a[0])
         inner = multiply(a[k // 2], a[k // 2]) if k % 2 == 0 and not is_zero(a[k // 2]) else 0.0
         return _plus(inner, multiply(2.0, _dot((a[j], a[k - j]) for j in reversed(range((k + 1) // 2)))))
+
+    @staticmethod
+    def _root(a, y, k):
+        if k == 0:
+            return apply("sqrt", a[0])
+        rest = _minus(a[k], _dot((y[j], y[k - j]) for j in range(1, k)))
+        return 0.0 if is_zero(rest) else divide(rest, multiply(2.0, y[0]))
 
     @staticmethod
     def _constant_power(a, y, exponent, k):

@@ -37,7 +37,7 @@ _REFUSED = {
 }  # fmt: skip
 
 
-_OPTIONS = {"allow_free": True, "live_variables": False}  # every instruction has a place of its own
+_OPTIONS = {"allow_free": True, "live_variables": False}  # every instruction has its own place
 
 
 class Tape:
@@ -46,7 +46,7 @@ class Tape:
     Parameters
     ----------
     symbols : sequence of SX scalars or None
-        The inputs, in the order in which values are given for them; None for all that stand in the expressions.
+        The inputs, in the order of their values; None for all that the expressions hold.
     expressions : sequence of SX scalars
         The outputs.
 
@@ -68,12 +68,12 @@ class Tape:
 
     def __init__(self, symbols, expressions):
         function = ca.Function("tape", [], list(expressions), _OPTIONS)
-        found = function.free_sx()
-        self.symbols = list(found if symbols is None else symbols)
+        free = function.free_sx()
+        self.symbols = list(free if symbols is None else symbols)
         self.nodes, self.switches, self._pairs = [], [], {}
         inputs = {s.element_hash(): self._add("input", data=i) for i, s in enumerate(self.symbols)}
         self.outputs = [None] * len(expressions)
-        self._read(function, [inputs[s.element_hash()] for s in found])
+        self._read(function, [inputs[s.element_hash()] for s in free])
         if None in self.outputs:
             zero = self._add("const", data=0.0)
             self.outputs = [zero if node is None else node for node in self.outputs]

@@ -37,7 +37,7 @@ class Poles:
 
     def coefficients(self, model):
         """The coefficients c_0 .. c_(ρ-1) of each row's error dynamics, in the order of the model's pole inputs."""
-        coefficients, rows = [], dict(model.pole_rows())
+        coefficients, rows = [], model.raised
         if isinstance(self.values, dict):
             for name in self.values:
                 if name not in rows:

@@ -280,8 +280,6 @@ class MinimalSolver:
         """(nfev, njev, nlu) over all choices of coordinates."""
         return self.done + (self.solver.nfev, self.solver.njev, self.solver.nlu)
 
-    nfev, njev, nlu = (property(lambda self, i=i: self.work[i]) for i in range(3))
-
     def step(self):
         """One step of the method, before it a change of coordinates where that is due; half as long where X is lost."""
         if self.chart.improved(self.t, self.y):

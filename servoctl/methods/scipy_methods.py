@@ -104,8 +104,10 @@ class ScipySteps(Stepping):
         self.motion.count(projections=1)
 
     def _count(self, solver):
-        self.motion.count(nfev=solver.nfev, njev=solver.njev, nlu=solver.nlu)
-        if isinstance(solver, MinimalSolver):
+        minimal = isinstance(solver, MinimalSolver)
+        work = solver.work if minimal else (solver.nfev, solver.njev, solver.nlu)
+        self.motion.count(**dict(zip(("nfev", "njev", "nlu"), work, strict=True)))
+        if minimal:
             self.motion.counters["integrated"] = len(solver.chart.free)
             self.motion.count(coordinate_changes=solver.changes)
 

@@ -208,7 +208,7 @@ def row_poles(drift, model):
     given = {} if one else drift.values
     return {
         row: np.full(count, -1 / drift.values) if one else np.atleast_1d(given.get(row, np.zeros(count)))
-        for row, count in model.pole_rows()
+        for row, count in model.raised.items()
     }
 
 

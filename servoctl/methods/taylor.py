@@ -11,6 +11,7 @@ import casadi as ca
 import numpy as np
 
 from servoctl.codegen.function import compiled
+from servoctl.jets.motion import Motion, shifted
 from servoctl.jets.series import Series, is_zero
 from servoctl.jets.tape import Tape
 from servoctl.methods.drift import Project
@@ -56,11 +57,12 @@ class _Group:
         self.series.replace_last({i: self.motion.coefficient(s, j) for i, s in enumerate(self.symbols)})
 
 
-class _Motion:
+class _Motion(Motion):
     """Coefficients of q and γ found so far."""
 
     def __init__(self, equations):
-        self.q, self.top, self.branch = equations.q, equations.top, ca.SX.sym("t_branch")
+        super().__init__(equations.q)
+        self.top, self.branch = equations.top, ca.SX.sym("t_branch")
         self.gamma = {k: [s / factorial(k) for s in self.q.gamma(k)] for k in range(1, self.top)}
         self.coordinates = {0: list(self.q)}
         moving = (self.q.V @ ca.vertcat(*self.q.gamma(1)) + self.q.h).elements()
@@ -89,18 +91,11 @@ class _Motion:
             self.kinematics.correct(k)
             self.coordinates[k] = [c[-1] if is_zero(c[-1]) else c[-1] / k for c in self.kinematics.series.outputs]
 
-    def coefficient(self, symbol, j):
-        """Coefficient j of a symbol along the motion."""
-        place = self.q.where(symbol)
-        if place is None:
-            return symbol if j == 0 else 0.0
-        kind, level, i = place
-        if kind == "t":
-            return symbol if j == 0 else float(j == 1)
-        if kind == "q":
-            return self.coordinates[j][i]
-        c = self.gamma[level + j][i]
-        return 0.0 if is_zero(c) else c * float(factorial(level + j) // factorial(j))
+    def coordinate(self, i, j):
+        return self.coordinates[j][i]
+
+    def velocity(self, i, level, j):
+        return shifted(self.gamma[level + j][i], level, j)
 
 
 def taylor_coefficients(equations, last):
@@ -204,7 +199,8 @@ class TaylorSteps(Stepping):
         self.model, self.n_x = model, len(model.state_names)
         last = max(self.order + model.reduction.top - 1, self.jets + 1)
         self.f = series_loop(model, last)
-        self.nq, self.n, self.top, self.last, self.plain = model.nq, model.n, model.reduction.top, last, model.plain
+        self.nq, self.n, self.top, self.last = model.nq, model.n, model.reduction.top, last
+        self.plain = model.reduction.mechanism.q.plain
         self.n_c = (0 if self.plain else self.nq * last) + self.n * last
 
     def _start(self, t, x, b):

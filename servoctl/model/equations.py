@@ -1,22 +1,94 @@
-"""The functions of a motion as SX expressions: each is built only when it is asked for."""
+"""The functions of a motion as SX expressions: each is built at its first use."""
 
 from functools import cached_property
 
 import casadi as ca
 import numpy as np
 
-from servoctl.codegen.emit import operations
 from servoctl.errors import SpecificationError
 from servoctl.model import saddle
 from servoctl.reduction.appell import plant_accelerations
 from servoctl.reduction.elimination import eliminate
 from servoctl.reduction.ranks import clean, column_sizes
-from servoctl.reduction.row import gradient
 from servoctl.spec.coordinates import jet_name
 
 
-class Equations:
-    """Expressions of a reduction, in the state X = (q, γ', ..., γ^(s̄-1)) and the jets Z = (X, γ^(s̄)).
+class Invariants:
+    """What the state X = (q, γ', ..., γ^(s̄-1)) of a motion satisfies: its rows, and their derivatives, below γ^(s̄).
+
+    Parameters
+    ----------
+    mechanism : Mechanism
+    rows : sequence of Row
+    top : int
+        s̄.
+    points : Points
+        On the manifold of the rows: there pivots are chosen.
+    """
+
+    def __init__(self, mechanism, rows, top, points):
+        self.mechanism, self.rows, self.top, self.points = mechanism, rows, top, points
+        q = self.q = mechanism.q
+        self.state = ca.vertcat(*q, *(s for k in range(1, top) for s in q.gamma(k)))
+        self.parameters = ca.vertcat(*mechanism.parameters.symbols)
+        self.raised = [top - row.order for row in rows]
+
+    @cached_property
+    def levels(self):
+        """For each row its total derivatives of orders 0 .. s̄ - o_a."""
+        return [
+            [level[0] for level in self.q.derivatives([row.expression], count)]
+            for row, count in zip(self.rows, self.raised, strict=True)
+        ]
+
+    def function(self, name, x, outputs, extra=None):
+        """An SX function of (t, x, p) with one dense column."""
+        p = self.parameters if extra is None else ca.vertcat(self.parameters, extra)
+        y = ca.densify(ca.cse(ca.vertcat(*outputs)))
+        return ca.Function(name, [self.q.t, x, p], [y], ["t", "x", "p"], ["y"])
+
+    @cached_property
+    def invariant_rows(self):
+        """(level, name, SX): what the state satisfies, ψ_a^(j) for j < s̄ - o_a and the kinematics' own invariants."""
+        rows = [(0, name, e) for name, e in self.q.invariants.items()]
+        for row, level in zip(self.rows, self.levels, strict=True):
+            rows += [(row.order + j, _level_name(row.name, j), e) for j, e in enumerate(level[:-1])]
+        return sorted(rows, key=lambda item: item[0])
+
+    def invariants(self):
+        """Outputs (values, Jacobian in X column by column) of the invariants."""
+        values = ca.vertcat(*(e for _, _, e in self.invariant_rows))
+        return self.function("invariants", self.state, [values, ca.vec(ca.densify(ca.jacobian(values, self.state)))])
+
+    def project(self):
+        """The least change of the state in the metric M (δq = V δγ) that restores the invariants, level by level."""
+        q, mass, changes = self.q, self.mechanism.mass, []
+        for level in range(self.top):
+            rows = [a for a, row in enumerate(self.rows) if row.order <= level]
+            values = ca.vertcat(*(self.levels[a][level - self.rows[a].order] for a in rows))
+            change = ca.SX.zeros(q.n)
+            if rows:
+                J = ca.vertcat(*(self.rows[a].gradient(q) for a in rows))
+                saddle = ca.vertcat(ca.horzcat(mass, J.T), ca.horzcat(J, ca.SX.zeros(len(rows), len(rows))))
+                numbers = clean(*self.points.matrix(saddle))
+                change = eliminate(saddle, ca.vertcat(ca.SX.zeros(q.n), -values), numbers)[0][: q.n]
+            if level == 0 and not q.plain:
+                change = q.V @ change + self._restore_kinematics()
+            changes.append(change)
+        return self.function("project", self.state, changes)
+
+    def _restore_kinematics(self):
+        """The least change of q that restores the kinematics' own invariants."""
+        q = self.q
+        if not q.invariants:
+            return ca.SX.zeros(q.nq)
+        c = ca.vertcat(*q.invariants.values())
+        J = ca.jacobian(c, q.jet(0))
+        return J.T @ eliminate(J @ J.T, -c, clean(*self.points.matrix(J @ J.T)))[0]
+
+
+class Equations(Invariants):
+    """Expressions of a reduction, in the state X and the jets Z = (X, γ^(s̄)).
 
     Parameters
     ----------
@@ -24,35 +96,12 @@ class Equations:
     """
 
     def __init__(self, reduction):
+        super().__init__(reduction.mechanism, reduction.rows, reduction.top, reduction.points)
         self.r = reduction
-        self.q = reduction.mechanism.q
-        self.top = reduction.top
-        self.state = ca.vertcat(*self.q, *(s for k in range(1, self.top) for s in self.q.gamma(k)))
         self.jets = ca.vertcat(self.state, *self.q.gamma(self.top))
-        self.parameters = ca.vertcat(*reduction.mechanism.parameters.symbols)
-        self.raised = [self.top - row.order for row in reduction.rows]
         self.coefficients = [
             [ca.SX.sym(f"c{a}_{j}") for j in range(count)] for a, count in enumerate(self.raised)
         ]  # of the error dynamics of each row
-
-    @cached_property
-    def levels(self):
-        """For each row its total derivatives of orders 0 .. s̄ - o_a."""
-        return [
-            [level[0] for level in self.q.derivatives([row.expression], count)]
-            for row, count in zip(self.r.rows, self.raised, strict=True)
-        ]
-
-    @cached_property
-    def row_operations(self):
-        """Operations of the rows ψ themselves."""
-        return operations(self.function("rows", self.jets, [row.expression for row in self.r.rows]))
-
-    def function(self, name, x, outputs, extra=None):
-        """An SX function of (t, x, p) with one dense column."""
-        p = self.parameters if extra is None else ca.vertcat(self.parameters, extra)
-        y = ca.densify(ca.cse(ca.vertcat(*outputs)))
-        return ca.Function(name, [self.q.t, x, p], [y], ["t", "x", "p"], ["y"])
 
     def _solve(self, right):
         """L⁻¹ right and the pivots of L."""
@@ -72,14 +121,14 @@ class Equations:
     def rest(self, rows, poles=False):
         """What is left of some rows, raised to order s̄, without γ^(s̄); with their error dynamics if `poles`."""
         top, zero = self.q.jet(self.top), ca.SX.zeros(self.q.n)
-        found = []
+        rests = []
         for a in rows:
             *lower, highest = self.levels[a]
             row = ca.substitute(highest, top, zero)
             if poles:
                 row += sum(c * e for c, e in zip(self.coefficients[a], lower, strict=True))
-            found.append(row)
-        return found
+            rests.append(row)
+        return rests
 
     def dense(self, poles=False):
         """γ^(s̄) from the rows, L γ^(s̄) = -rest."""
@@ -89,8 +138,8 @@ class Equations:
     def guards(self):
         """Pivots that a motion must not let vanish: a list of (name, SX)."""
         pivots = self.saddle[2] if self.sparse else self._solve(ca.SX(self.q.n, 0))[1]
-        found = [*self.r.guards, *((f"leading matrix {i + 1}", p) for i, p in enumerate(pivots))]
-        return [(name, g) for name, g in found if any(self.q.where(s) is not None for s in ca.symvar(g))]
+        named = [*self.r.guards, *((f"leading matrix {i + 1}", p) for i, p in enumerate(pivots))]
+        return [(name, g) for name, g in named if any(self.q.where(s) is not None for s in ca.symvar(g))]
 
     @property
     def guard_sizes(self):
@@ -172,46 +221,6 @@ class Equations:
         values, sizes = self.r.points.matrix(matrix)
         return eliminate(matrix, -residual, clean(values, sizes))[0]
 
-    @cached_property
-    def invariant_rows(self):
-        """(level, name, SX): what the state satisfies, ψ_a^(j) for j < s̄ - o_a and the kinematics' own invariants."""
-        found = [(0, name, e) for name, e in self.q.invariants.items()]
-        for row, level in zip(self.r.rows, self.levels, strict=True):
-            found += [(row.order + j, _level_name(row.name, j), e) for j, e in enumerate(level[:-1])]
-        return sorted(found, key=lambda item: item[0])
-
-    def invariants(self):
-        """Outputs (values, Jacobian in X column by column) of the invariants."""
-        values = ca.vertcat(*(e for _, _, e in self.invariant_rows))
-        return self.function("invariants", self.state, [values, ca.vec(ca.densify(ca.jacobian(values, self.state)))])
-
-    def project(self):
-        """The least change of the state in the metric M (δq = V δγ) that restores the invariants, level by level."""
-        r, q, changes = self.r, self.q, []
-        mass = r.mechanism.mass
-        for level in range(self.top):
-            rows = [a for a, row in enumerate(r.rows) if row.order <= level]
-            values = ca.vertcat(*(self.levels[a][level - r.rows[a].order] for a in rows))
-            change = ca.SX.zeros(q.n)
-            if rows:
-                J = ca.vertcat(*(gradient(q, r.rows[a]) for a in rows))
-                saddle = ca.vertcat(ca.horzcat(mass, J.T), ca.horzcat(J, ca.SX.zeros(len(rows), len(rows))))
-                numbers = clean(*r.points.matrix(saddle))
-                change = eliminate(saddle, ca.vertcat(ca.SX.zeros(q.n), -values), numbers)[0][: q.n]
-            if level == 0 and not q.plain:
-                change = q.V @ change + self._restore_kinematics()
-            changes.append(change)
-        return self.function("project", self.state, changes)
-
-    def _restore_kinematics(self):
-        """The least change of q that restores the kinematics' own invariants."""
-        q = self.q
-        if not q.invariants:
-            return ca.SX.zeros(q.nq)
-        c = ca.vertcat(*q.invariants.values())
-        J = ca.jacobian(c, q.jet(0))
-        return J.T @ eliminate(J @ J.T, -c, clean(*self.r.points.matrix(J @ J.T)))[0]
-
     def matrices(self):
         """L and Bᵀ, column by column, and which rows they have: what must keep its rank."""
         L, B = self.r.leading, self.r.realisation.B.T
@@ -249,12 +258,18 @@ class Equations:
 
         A derivative is a function of the jets up to the highest that it holds, which may lie above s̄.
 
+        Parameters
+        ----------
+        kind : str
+            One of `SIGNALS`.
+        rate : int
+
         Returns
         -------
         names : list of str
         function : casadi.Function
         """
-        names, expressions = getattr(self, f"_{kind}")()
+        names, expressions = SIGNALS[kind](self)
         if not rate:
             return names, self.function(kind, self.jets, expressions)
         expressions = self.q.derivatives(ca.vertcat(*expressions).elements(), rate)[rate]
@@ -273,10 +288,10 @@ class Equations:
 
     def _multipliers(self):
         names = [*self.r.program.residuals, *self.r.mechanism.constraints]
-        own = self.r.multipliers
-        if self.r.program.by == "actuators":
-            names, own = [*self.r.mechanism.constraints], own[len(self.r.program.residuals) :]
-        return [f"multiplier_{name}" for name in names], [own]
+        multipliers = self.r.multipliers
+        if self.r.program.by == "actuators":  # then those of the program are the actuation
+            names, multipliers = [*self.r.mechanism.constraints], multipliers[len(self.r.program.residuals) :]
+        return [f"multiplier_{name}" for name in names], [multipliers]
 
     def _outputs(self):
         return list(self.r.mechanism.outputs), list(self.r.mechanism.outputs.values())
@@ -343,6 +358,22 @@ EQUATIONS = {  # what `compiled` makes of each: the function, its loops, its pro
 }
 
 
+SIGNALS = {  # names and expressions of each group
+    "actuation": Equations._actuation,
+    "reaction": Equations._reaction,
+    "multipliers": Equations._multipliers,
+    "outputs": Equations._outputs,
+    "energy": Equations._energy,
+    "balance": Equations._balance,
+    "coordinate_rates": Equations._coordinate_rates,
+    "residuals": Equations._residuals,
+    "inputs": Equations._inputs,
+    "all_multipliers": Equations._all_multipliers,
+    "power": Equations._power,
+    "reach": Equations._reach,
+}
+
+
 def _level_name(name, j):
     return name if j == 0 else f"D{'' if j == 1 else j}({name})"
 
@@ -358,8 +389,8 @@ def leading_names(reduction):
     constraints = [row for row in reduction.rows if row.kind != "dynamics"]
     program = [row.name for row in constraints if row.kind == "program"]
     material = [row.name for row in constraints if row.kind == "material"]
-    own = program if reduction.program.by == "ideal" else list(reduction.mechanism.actuators)[: len(program)]
-    return [row.name for row in reduction.rows], [*own, *material]
+    directions = program if reduction.program.by == "ideal" else list(reduction.mechanism.actuators)[: len(program)]
+    return [row.name for row in reduction.rows], [*directions, *material]
 
 
 def gradient_jets(reduction, name):
@@ -367,6 +398,6 @@ def gradient_jets(reduction, name):
     q = reduction.mechanism.q
     for row in (*reduction.rows, *reduction.given.values()):
         if row.name == name:
-            places = [q.where(s) for s in ca.symvar(gradient(q, row))]
+            places = [q.where(s) for s in ca.symvar(row.gradient(q))]
             return [q.jet_names(level)[i] for kind, level, i in filter(None, places) if kind != "t"]
     return []

@@ -1,5 +1,6 @@
-"""The model: a reduction as functions on numbers, built when they are asked for."""
+"""The model: a reduction as functions on numbers, built at their first use."""
 
+from collections.abc import Mapping
 from dataclasses import replace
 from functools import cached_property
 
@@ -8,23 +9,20 @@ import numpy as np
 from servoctl.checks import finite
 from servoctl.codegen.function import compiled
 from servoctl.errors import SpecificationError, unknown
-from servoctl.model.derivation import Derivation
-from servoctl.model.equations import EQUATIONS, Equations, gradient_jets, leading_names, residual_rows
+from servoctl.model.equations import EQUATIONS, SIGNALS, Equations, gradient_jets, leading_names, residual_rows
+from servoctl.model.report import describe
+from servoctl.model.start import State, consistent
+from servoctl.model.store import Store, pack, unpack
 from servoctl.reduction.appell import require_positive
 from servoctl.reduction.knots import require_smooth
-from servoctl.reduction.reduce import holds
+from servoctl.reduction.reduce import holds, reduce
 from servoctl.reduction.structure import structure
-
-SIGNALS = (
-    "actuation", "reaction", "multipliers", "outputs", "energy", "balance", "coordinate_rates", "residuals",
-    "inputs", "all_multipliers", "power", "reach",
-)  # fmt: skip
+from servoctl.spec.mechanism import Mechanism
+from servoctl.spec.program import Program
 
 
-def derive(mechanism, program, guess=None):
+def derive(mechanism: Mechanism, program: Program, guess: Mapping[str, float] | None = None) -> "Model":
     """Derive reduced dynamics and required actuation from a mechanism and its program (3.18).
-
-    What another process has derived of the same specification is read from disk (see `servoctl.model.memo`).
 
     Parameters
     ----------
@@ -46,22 +44,29 @@ def derive(mechanism, program, guess=None):
     NotRealisable
         If the actuators cannot realise the program.
     SingularProgram
-        If a residual's gradient vanishes on its own solutions, or a rank cannot be told.
+        If a residual's gradient vanishes on its own solutions, or a rank cannot be decided.
     InconsistentStart
         If no state satisfies the constraints.
     """
-    return Model(Derivation(mechanism, program, guess))
+    return _derived(mechanism, program, guess)
+
+
+def _derived(*specification):
+    """The model of what `reduce` takes; what another process has reduced is read from disk."""
+    store = Store(*specification)
+    return Model(store.reduction(reduce), store)
 
 
 class Model:
     """Reduced dynamics and required actuation of a program; made by `derive`.
 
-    Functions are derived, or read from disk, and compiled when they are first used.
+    Functions are derived, or read from disk, and compiled at their first use. A model is a value: it is equal to
+    another of the same specification and numbers, and pickles with these; its functions are built again.
 
     Attributes
     ----------
-    reduction : Derivation
-        The rows of the motion: a `Reduction`.
+    reduction : Reduction
+        The rows of the motion.
     parameters : (n_p,) array
         Values of the parameters.
     state_names : tuple of str
@@ -70,25 +75,38 @@ class Model:
         Names of the jets Z = (X, γ^(s̄)).
     """
 
-    def __init__(self, reduction, values=None, knots=None, shared=None):
+    def __init__(self, reduction, store, values=None, knots=None, functions=None):
         q = reduction.mechanism.q
-        self.reduction = reduction
-        self.parameters = reduction.mechanism.parameters.values() if values is None else values
+        self.reduction, self._store = reduction, store
+        self.parameters = reduction.context.values.copy() if values is None else values
         self._knots = reduction.knots if knots is None else knots
         self.state_names = tuple(name for k in range(reduction.top) for name in q.jet_names(k))
         self.jet_names = (*self.state_names, *q.jet_names(reduction.top))
-        self._functions = {} if shared is None else shared
+        self._functions = {} if functions is None else functions  # shared by models that differ in numbers alone
         self._knots_within = {}  # span: knots
 
+    def __eq__(self, other):
+        if not isinstance(other, Model):
+            return NotImplemented
+        known = self._store.fingerprint is not None and self._store.fingerprint == other._store.fingerprint
+        return self is other or (known and np.array_equal(self.parameters, other.parameters))
+
+    def __hash__(self):
+        return hash(self._store.fingerprint)
+
+    def __reduce__(self):
+        mechanism, _, *choices = self._store.specification
+        return _unpickled, (mechanism, pack(self.reduction), choices, self.parameters, self._knots)
+
     def names_to(self, size):
-        """Names of the first `size` jets, beyond γ^(s̄) where asked for."""
+        """Names of the first `size` jets, which may be more than those up to γ^(s̄)."""
         q, names, k = self.reduction.mechanism.q, list(self.jet_names), self.reduction.top
         while len(names) < size:
             k += 1
             names += q.jet_names(k)
         return tuple(names[:size])
 
-    def with_parameters(self, **changes):
+    def with_parameters(self, **changes: float) -> "Model":
         """The same model with other numbers.
 
         Nothing is derived or compiled again, unless what was zero or of low rank at the old numbers no longer is.
@@ -116,9 +134,10 @@ class Model:
                 raise unknown(name, list(current), "parameter")
         values = r.mechanism.parameters.values({**current, **changes})
         require_positive(r.mechanism, replace(r.points, values=values))
-        if not holds(r.derived, values):
-            return Model(r.again(r.context.guess, values=values), values)
-        return Model(r, values, require_smooth(r.switches, values, r.smoothness), self._functions)
+        if not holds(r, values):
+            self._store.require_unchanged()
+            return _derived(r.mechanism, r.program, r.context.guess, None, values)
+        return Model(r, self._store, values, require_smooth(r.switches, values, r.smoothness), self._functions)
 
     def near(self, t, jets, sizes=()):
         """The same motion with pivots chosen for a state; decisions are made again from the specification.
@@ -137,14 +156,16 @@ class Model:
         """
         guess = dict(zip(self.jet_names, map(float, jets), strict=True))
         usual = self.once("jet sizes", lambda: self.equations.jet_sizes)
-        r = self.reduction.again(near=(float(t), guess, usual | dict(sizes)), values=self.parameters)
-        if r.free != self.free:
+        self._store.require_unchanged()
+        r, place = self.reduction, (float(t), guess, usual | dict(sizes))
+        near = _derived(r.mechanism, r.program, None, place, self.parameters)
+        if near.free != self.free:
             raise SpecificationError(
-                f"Near t = {t:.6g} s the program has {r.free} free initial values, elsewhere {self.free}.",
+                f"Near t = {t:.6g} s the program has {near.free} free initial values, elsewhere {self.free}.",
                 "A motion keeps its number of free initial values.",
                 do="Treat the two regimes as two models.",
             )
-        return Model(r, self.parameters, self._knots)
+        return Model(near.reduction, near._store, self.parameters, self._knots)
 
     @property
     def free(self):
@@ -165,11 +186,6 @@ class Model:
     def nq(self):
         """The number of coordinates."""
         return self.reduction.mechanism.q.nq
-
-    @property
-    def plain(self):
-        """Whether the coordinates' rates are the quasi-velocities, q' = γ'."""
-        return self.reduction.mechanism.q.plain
 
     @property
     def coordinate_names(self):
@@ -194,7 +210,7 @@ class Model:
     @property
     def residual_names(self):
         """Names of the rows whose residuals a run reports."""
-        return (*residual_rows(self.reduction.outline), *self.reduction.mechanism.q.invariants)
+        return (*residual_rows(self.reduction), *self.reduction.mechanism.q.invariants)
 
     @property
     def knots(self):
@@ -214,21 +230,21 @@ class Model:
             def build():
                 return require_smooth(r.switches, self.parameters, r.smoothness, span).times
 
-            kept = r.decided_at(self.parameters)
-            self._knots_within[span] = r.recall(f"knots {span}", build) if kept else build()
+            stored = np.array_equal(self.parameters, r.context.values)
+            self._knots_within[span] = self._store.recall(f"knots {span}", build) if stored else build()
         return self._knots_within.get(span, ())
 
     @property
     def raised(self):
-        """How often each row is differentiated to the common order s̄: {row name: ρ}."""
-        return {row.name: self.reduction.top - row.order for row in self.reduction.outline.rows}
+        """How often each row is differentiated to the common order s̄, {row name: ρ}: the number of its poles."""
+        return {row.name: self.reduction.top - row.order for row in self.reduction.rows}
 
     @cached_property
     def equations(self):
         """The model's equations as expressions."""
         shared = self._functions
         if "equations" not in shared:
-            shared["equations"] = Equations(self.reduction.derived)
+            shared["equations"] = Equations(self.reduction)
         return shared["equations"]
 
     def once(self, name, build):
@@ -238,10 +254,10 @@ class Model:
         ----------
         name : str
         build : callable
-            Without arguments; called where nothing is found under the name.
+            Without arguments; called where there is nothing under the name yet.
         """
         if name not in self._functions:
-            self._functions[name] = self.reduction.recall(name, build)
+            self._functions[name] = self._store.recall(name, build)
         return self._functions[name]
 
     def function(self, name):
@@ -275,6 +291,8 @@ class Model:
             One of `SIGNALS`.
         rate : int
         """
+        if kind not in SIGNALS:
+            raise unknown(kind, list(SIGNALS), "group of signals")
 
         def build():
             names, f = self.equations.signals(kind, rate)
@@ -302,14 +320,7 @@ class Model:
 
     def invariant_names(self):
         """(level, name) of each invariant of the state, in the order of the function "invariants"."""
-        return self.once(
-            "invariant names", lambda: [(level, name) for level, name, _ in self.equations.invariant_rows]
-        )
-
-    def pole_rows(self):
-        """(row name, number of coefficients) of the error dynamics, in the order of the pole inputs."""
-        r = self.reduction.outline
-        return [(row.name, r.top - row.order) for row in r.rows]
+        return self.once("invariant names", lambda: [(level, name) for level, name, _ in self.equations.invariant_rows])
 
     def multiplier_form(self, t, jets):
         """[M -B; C 0] and right sides of the form with multipliers.
@@ -326,7 +337,7 @@ class Model:
         right : (rows, N) array
         """
         y = self.function("multiplier_form").grid(t, jets, self.parameters)
-        columns = self.n + len(self.reduction.outline.realisation.dependent)
+        columns = self.n + len(self.reduction.realisation.dependent)
         rows = len(y) // (columns + 1)
         return y[rows:].reshape(columns, rows, -1).swapaxes(0, 1), y[:rows]
 
@@ -341,28 +352,23 @@ class Model:
         return self.once("column sizes", lambda: self.equations.column_sizes)
 
     def row_stories(self):
-        """What was done to each row, by name; empty for rows as they were given."""
-        return {row.name: row.story for row in self.reduction.outline.rows}
+        """What was done to each row, by name; empty for the designer's own rows."""
+        return {row.name: row.story for row in self.reduction.rows}
 
     def leading_names(self):
         """Names of the rows of the two matrices whose ranks carry the motion."""
-        return leading_names(self.reduction.outline)
+        return leading_names(self.reduction)
 
     def gradient_jets(self, row):
         """Names of the jets on which a row's leading gradient depends."""
         return gradient_jets(self.reduction, row)
 
-    def row_operations(self):
-        """Operations of the rows ψ themselves, before anything is differentiated or compiled."""
-        return self.once("row operations", lambda: self.equations.row_operations)
-
     def operations(self):
         """Operations of each function that has been built so far, by name."""
-        found = {name: f for name, f in self._functions.items() if hasattr(f, "operations")}
-        found |= {value[1].name: value[1] for key, value in self._functions.items() if key.startswith("signals ")}
-        return {name: f.operations for name, f in found.items()}
+        signals = {value[1].name: value[1] for value in self._functions.values() if isinstance(value, tuple)}
+        return {name: f.operations for name, f in (self._functions | signals).items() if hasattr(f, "operations")}
 
-    def start(self, /, t=0.0, guess=None, **held):
+    def start(self, /, t: float = 0.0, guess: Mapping[str, float] | None = None, **held: float) -> State:
         """A consistent state: held values fixed, the rest solved from every invariant at every level.
 
         Parameters
@@ -373,7 +379,7 @@ class Model:
             Where free values come from, and where the solution is looked for; other values are as near zero as the
             invariants allow.
         **held : float
-            Values of coordinates and derivatives to be kept exactly.
+            Values of coordinates and derivatives that the start has exactly.
 
         Returns
         -------
@@ -386,8 +392,6 @@ class Model:
         InconsistentStart
             If a held value contradicts an invariant, or no consistent state is found.
         """
-        from servoctl.model.start import consistent
-
         return consistent(self, finite("t", t, "time"), held, guess)
 
     def structure(self, t=None, jets=None):
@@ -404,10 +408,13 @@ class Model:
         Structure
         """
         if t is None:
-            return self.once("structure", lambda: structure(self.reduction.derived))
-        return structure(self.reduction.derived, np.atleast_1d(t), np.asarray(jets), self.parameters)
+            return self.once("structure", lambda: structure(self.reduction))
+        return structure(self.reduction, np.atleast_1d(t), np.asarray(jets), self.parameters)
 
     def __repr__(self):
-        from servoctl.model.report import describe
-
         return describe(self)
+
+
+def _unpickled(mechanism, content, choices, parameters, knots):
+    reduction = unpack(content, mechanism)
+    return Model(reduction, Store(mechanism, reduction.program, *choices), parameters, knots)

@@ -15,26 +15,19 @@ def describe(model):
     str
         At most twelve lines.
     """
-    r = model.reduction.outline
+    r = model.reduction
     lines = [
         f"Model: {' '.join(r.mechanism.q.names)}; program {', '.join(r.program.residuals)} by {_by(r)}",
         f"  {_raised(r)}",
         *_hidden_and_free(model),
         f"  {_rule(r)}",
     ]
-    structure = model.structure()
-    if structure.index is not None:
-        zeros = ", ".join(map(str, structure.zeros_at_infinity))
-        lines.append(
-            f"  index {structure.index}; zeros at infinity of order {zeros}; {structure.realisation} realisation"
-        )
     if any(not row.affine for row in r.rows):
         bent = ", ".join(row.name for row in r.rows if not row.affine)
         lines.append(f"  {bent}: not linear in the highest derivative, differentiated once more")
     lines.append(f"  margins: smallest pivot kept {r.rank.kept:.1e}, largest dropped {r.rank.dropped:.1e}")
     if model.knots:
         lines.append(f"  paths switch at t = {', '.join(f'{k:g}' for k in model.knots[:8])} s")
-    lines.append(f"  {_functions(model)}")
     return "\n".join(line if len(line) <= WIDTH else line[: WIDTH - 3] + "..." for line in lines)
 
 
@@ -56,7 +49,7 @@ def _raised(r):
 
 def _hidden_and_free(model):
     """Hidden constraints and free initial values, on one line where there is room."""
-    r = model.reduction.outline
+    r = model.reduction
     free = f"{model.free} free initial value{'s' * (model.free != 1)}"
     free += " (flat: nothing is integrated)" if model.flat else ""
     if not r.hidden:
@@ -77,8 +70,3 @@ def _rule(r):
     )
     rule = "the generalised Chetaev rule, a postulate at this order" if bent else "d'Alembert's principle"
     return f"(3.18) with T from ker G; dependent: {dependent}; under {rule}"
-
-
-def _functions(model):
-    built = {"rows of the motion": model.row_operations(), **model.operations()}
-    return "operations: " + ", ".join(f"{name} {count}" for name, count in built.items())

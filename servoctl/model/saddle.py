@@ -11,7 +11,6 @@ from servoctl.codegen.emit import operations
 from servoctl.errors import SpecificationError
 from servoctl.reduction.elimination import eliminate
 from servoctl.reduction.ranks import clean
-from servoctl.reduction.row import gradient
 
 FEW = 8  # quasi-velocities: up to here (3.18) takes about as few operations
 CLOSE = 1.1  # times as many operations: up to here merging of common terms decides which are fewer
@@ -28,8 +27,8 @@ def applies(reduction):
     -------
     bool
     """
-    own = [row for row in reduction.rows if row.kind == "dynamics"]
-    return reduction.top == 2 and all(row.order == 2 and not row.story for row in own)
+    dynamics = [row for row in reduction.rows if row.kind == "dynamics"]
+    return reduction.top == 2 and all(row.order == 2 and not row.story for row in dynamics)
 
 
 def solve(equations, poles=False):
@@ -50,7 +49,7 @@ def solve(equations, poles=False):
     r, q = equations.r, equations.q
     constraints = [a for a, row in enumerate(r.rows) if row.kind != "dynamics"]
     B, size = r.realisation.B, len(constraints)
-    G = ca.vertcat(*(gradient(q, r.rows[a]) for a in constraints))
+    G = ca.vertcat(*(r.rows[a].gradient(q) for a in constraints))
     matrix = ca.vertcat(ca.horzcat(r.mechanism.mass, -B), ca.horzcat(G, ca.SX(size, B.shape[1])))
     acceleration = q.jet(2)
     rest = ca.substitute(r.mechanism.balance, acceleration, ca.SX.zeros(q.n))
@@ -70,7 +69,7 @@ def accelerations(equations):
     r, q = equations.r, equations.q
     if not applies(r):
         raise SpecificationError(
-            f"The accelerations of a motion of order {r.top} with {len(r.hidden)} hidden constraints were asked for.",
+            f"The motion has order {r.top} and {len(r.hidden)} hidden constraints.",
             "Accelerations and multipliers follow from a state (q, γ') where the program needs no derivative of the "
             "balance and its residuals have orders up to 2.",
             do="Simulate it; a run has both.",
@@ -82,8 +81,9 @@ def accelerations(equations):
     dense = ca.vertcat(solution, ca.substitute(r.multipliers, acceleration, solution))
     few, many = sorted((sparse, dense), key=_instructions)
     near = _instructions(many) < CLOSE * _instructions(few)
-    found = [equations.function("accelerations", equations.state, [y]) for y in ((few, many) if near else (few,))]
-    return min(found, key=operations) if near else found[0]
+    columns = (few, many) if near else (few,)
+    functions = [equations.function("accelerations", equations.state, [y]) for y in columns]
+    return min(functions, key=operations) if near else functions[0]
 
 
 def _instructions(column):

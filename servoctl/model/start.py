@@ -1,18 +1,25 @@
 """Consistent starts: every invariant at every level, held values exact, the rest as near its guess as possible."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from servoctl.checks import finite, mapping
 from servoctl.errors import InconsistentStart, ServoError, unknown
+from servoctl.values import Value
 
 TOLERANCE = 1e-10  # of a residual relative to its gradient times the state; Newton reaches rounding
 GUESSED = 1e3  # weight of a guessed value against one that is merely to stay near zero
+TRIES = 6  # starts of the iteration, the first at the reference
+FARTHER = 0.1  # of the state's size: how much farther from the reference each further start lies
+SEED = 1788  # of these starts
+REACHED = 1e-16  # a scaled residual below this is not improved
+REPEATED = 1e-12  # singular values below this fraction of the largest are no direction of a step
+SPANNED = 1e-9  # of a column of the Jacobian outside the span of others: below this it lies in it
 
 
-@dataclass(frozen=True)
-class State:
+@dataclass(frozen=True, eq=False)
+class State(Value):
     """A consistent state of a model at an instant.
 
     Attributes
@@ -22,7 +29,7 @@ class State:
     values : (n_x,) array
     names : tuple of str
     held : tuple of str
-        Names whose values were given.
+        Names whose values were fixed.
     free : tuple of str
         Names that the invariants left free, beside the held ones; their values come from the guess or are near zero.
     residual : float
@@ -71,75 +78,84 @@ class _Invariants:
         return value / np.maximum(np.sqrt((jacobian**2 * (1.0 + np.abs(x)) ** 2).sum(axis=1)), 1e-300)
 
 
+@dataclass(frozen=True, eq=False)
+class _Aim:
+    """Where a start is looked for: near a reference, by weights, with some values movable; arrays (n_x,)."""
+
+    names: tuple
+    reference: np.ndarray
+    weights: np.ndarray
+    movable: np.ndarray
+
+    def moving(self, movable):
+        """The same aim with other movable values."""
+        return replace(self, movable=movable)
+
+
+@np.errstate(all="ignore")  # trial steps may leave the domain of the equations
 def consistent(model, t, held, guess):
     """See `Model.start`."""
     names = model.state_names
-    both = {**mapping(guess, "The guesses"), **held}
-    given = {name: finite(name, value) for name, value in both.items() if _known(name, names)}
-    reference, weights = np.zeros(len(names)), np.ones(len(names))
-    for name, value in given.items():
-        reference[names.index(name)] = value
-        weights[names.index(name)] = 1.0 if name in held else GUESSED
-    movable = np.array([name not in held for name in names])
-    invariants, x, residual = _solve(model, t, reference, weights, movable)
+    chosen = {**mapping(guess, "The guesses"), **held}
+    for name in chosen:
+        if name not in names:
+            raise unknown(name, names, "state")
+    chosen = {name: finite(name, value) for name, value in chosen.items()}
+    reference = np.array([chosen.get(name, 0.0) for name in names])
+    weights = np.array([GUESSED if name in chosen and name not in held else 1.0 for name in names])
+    aim = _Aim(names, reference, weights, np.array([name not in held for name in names]))
+    invariants, x, residual = _solve(model, t, aim)
     if not residual < TOLERANCE:
-        _refuse(invariants, reference, weights, held, names, x)
-    free = _free(invariants, x, movable, names, given)
-    x, residual = _at_guess(invariants, x, residual, reference, weights, movable, names, free, given)
+        _refuse(invariants, aim, held, x)
+    free = _free(invariants, x, aim, chosen)
+    x, residual = _at_guess(invariants, x, residual, aim, [name in free and name in chosen for name in names])
     return State(t, x, names, tuple(held), free, residual)
 
 
-def _solve(model, t, reference, weights, movable):
-    """The start by the model's own choice of pivots, or by one made at the reference or near what was found."""
+def _solve(model, t, aim):
+    """The start by the model's own choice of pivots, or by one made at the reference or near the best state so far."""
     invariants = _Invariants(model, t)
-    finite_there = np.all(np.isfinite(invariants(reference)[0]))
-    x, residual = _best(invariants, reference, weights, movable) if finite_there else (reference, np.inf)
-    for at in (reference, None):
+    finite_there = np.all(np.isfinite(invariants(aim.reference)[0]))
+    x, residual = _best(invariants, aim) if finite_there else (aim.reference, np.inf)
+    for at in (aim.reference, None):
         if residual < TOLERANCE:
             break
         if at is None and not finite_there:
-            x, residual = _best(invariants, reference, weights, movable)
+            x, residual = _best(invariants, aim)
         try:  # a pivot of the model may vanish there
             other = _Invariants(model.near(t, np.append(x if at is None else at, np.zeros(model.n))), t)
         except ServoError:
             continue
-        y, left = _best(other, reference, weights, movable)
+        y, left = _best(other, aim)
         if left < residual or not np.isfinite(residual):
             invariants, x, residual = other, y, left
     return invariants, x, residual
 
 
-def _known(name, names):
-    if name not in names:
-        raise unknown(name, names, "state")
-    return True
-
-
-def _at_guess(invariants, x, residual, reference, weights, movable, names, free, given):
-    """The start with free values exactly as guessed, where that is consistent."""
-    guessed = np.array([name in free and name in given for name in names])
+def _at_guess(invariants, x, residual, aim, guessed):
+    """The start with some free values exactly as guessed, where that is consistent."""
+    guessed = np.array(guessed)
     if not guessed.any():
         return x, residual
-    start = np.where(guessed, reference, x)
-    moved = _settle(invariants, start, weights, movable & ~guessed)
+    moved = _settle(invariants, np.where(guessed, aim.reference, x), aim.moving(aim.movable & ~guessed))
     left = np.abs(invariants.scaled(moved)).max(initial=0.0)
     return (moved, float(left)) if left < TOLERANCE else (x, residual)
 
 
-def _starts(reference, spread, tries):
+def _starts(aim, tries):
     """The reference, then points farther and farther from it."""
-    yield reference
-    rng = np.random.default_rng(1788)
+    yield aim.reference
+    spread = (1.0 + np.abs(aim.reference)) * aim.movable / np.sqrt(aim.weights)
+    rng = np.random.default_rng(SEED)
     for attempt in range(1, tries):
-        yield reference + attempt * 0.1 * rng.uniform(-1.0, 1.0, len(reference)) * spread
+        yield aim.reference + attempt * FARTHER * rng.uniform(-1.0, 1.0, len(spread)) * spread
 
 
-def _best(invariants, reference, weights, movable, tries=6):
+def _best(invariants, aim, tries=TRIES):
     """The projection of the reference onto the invariants, from perturbed starts where the first fails."""
-    best, smallest = reference, np.inf
-    for first in _starts(reference, (1.0 + np.abs(reference)) * movable / np.sqrt(weights), tries):
-        x = _settle(invariants, first, weights, movable)
-        x = _nearest(invariants, x, reference, weights, movable)
+    best, smallest = aim.reference, np.inf
+    for first in _starts(aim, tries):
+        x = _nearest(invariants, _settle(invariants, first, aim), aim)
         residual = np.nan_to_num(np.abs(invariants.scaled(x)), nan=np.inf).max(initial=0.0)
         if residual < smallest:
             best, smallest = x, residual
@@ -148,25 +164,25 @@ def _best(invariants, reference, weights, movable, tries=6):
     return best, float(smallest)
 
 
-def _step(value, jacobian, weights, movable):
+def _step(value, jacobian, aim):
     """The least weighted change of the movable values that solves the linearised invariants."""
     rows = np.sqrt((jacobian**2).sum(axis=1))
     rows = np.where(rows > 0, rows, 1.0)
-    a = (jacobian / rows[:, None])[:, movable] / weights[movable]
+    a = (jacobian / rows[:, None])[:, aim.movable] / aim.weights[aim.movable]
     full = np.zeros(jacobian.shape[1])
     if a.size and np.all(np.isfinite(a)) and np.all(np.isfinite(value)):
-        full[movable] = np.linalg.lstsq(a, value / rows, rcond=1e-12)[0] / weights[movable]
+        full[aim.movable] = np.linalg.lstsq(a, value / rows, rcond=REPEATED)[0] / aim.weights[aim.movable]
     return full
 
 
-def _settle(invariants, x, weights, movable, iterations=60):
+def _settle(invariants, x, aim, iterations=60):
     """Damped Gauss-Newton with least steps."""
     value, jacobian = invariants(x)
     norm = np.abs(invariants.scaled(x)).max(initial=0.0)
     for _ in range(iterations):
-        if norm < 1e-16:
+        if norm < REACHED:
             break
-        step = _step(-value, jacobian, weights, movable)
+        step = _step(-value, jacobian, aim)
         damping = 1.0 / max(1.0, np.max(np.abs(step) / (1.0 + np.abs(x)), initial=0.0))
         for _ in range(15):
             trial = x + damping * step
@@ -181,44 +197,45 @@ def _settle(invariants, x, weights, movable, iterations=60):
     return x
 
 
-def _nearest(invariants, x, reference, weights, movable, iterations=40):
+def _nearest(invariants, x, aim, iterations=40):
     """The point of the invariants nearest the reference, by successive projection."""
     for _ in range(iterations):
         value, jacobian = invariants(x)
         with np.errstate(all="ignore"):
-            trial = reference + _step(-value - jacobian @ (reference - x), jacobian, weights, movable)
-        trial = _settle(invariants, trial, weights, movable, 12)
-        distance, before = (np.sum((weights * (y - reference)) ** 2) for y in (trial, x))
+            trial = aim.reference + _step(-value - jacobian @ (aim.reference - x), jacobian, aim)
+        trial = _settle(invariants, trial, aim, 12)
+        distance, before = (np.sum((aim.weights * (y - aim.reference)) ** 2) for y in (trial, x))
         if np.abs(invariants.scaled(trial)).max(initial=0.0) > TOLERANCE or not distance < before * (1 - 1e-12):
             break
         x = trial
     return x
 
 
-def _free(invariants, x, movable, names, guess):
+def _free(invariants, x, aim, guess):
     """Names that the invariants leave free: guessed ones where possible, and low derivatives."""
     _, jacobian = invariants(x)
     rows = np.sqrt((jacobian**2).sum(axis=1))
     scaled = jacobian / np.where(rows > 0, rows, 1.0)[:, None]
-    candidates = [i for i in reversed(range(len(names))) if movable[i]]
-    candidates.sort(key=lambda i: names[i] in guess)
+    movable = np.flatnonzero(aim.movable)
+    candidates = sorted(reversed(movable), key=lambda i: aim.names[i] in guess)
     basis, determined = np.zeros((len(rows), 0)), set()
     for i in candidates:
         column = scaled[:, i] - basis @ (basis.T @ scaled[:, i])
         column -= basis @ (basis.T @ column)
         size = np.linalg.norm(column)
-        if size > 1e-9 * max(np.linalg.norm(scaled[:, i]), 1e-12):
+        if size > SPANNED * max(np.linalg.norm(scaled[:, i]), 1e-12):
             basis = np.column_stack([basis, column / size])
             determined.add(i)
-    return tuple(names[i] for i in range(len(names)) if movable[i] and i not in determined)
+    return tuple(aim.names[i] for i in movable if i not in determined)
 
 
-def _refuse(invariants, reference, weights, held, names, x):
+def _refuse(invariants, aim, held, x):
+    """Say which held value is against the invariants, or which invariant no state satisfies."""
     left = np.abs(invariants.scaled(x))
     worst = invariants.names[int(np.argmax(left))]
-    loosened, residual = _best(invariants, reference, weights, np.ones(len(names), dtype=bool), tries=2)
+    loosened, residual = _best(invariants, aim.moving(np.ones(len(aim.names), dtype=bool)), tries=2)
     if held and residual < TOLERANCE:
-        moved = {n: float(loosened[names.index(n)]) for n in held}
+        moved = {n: float(loosened[aim.names.index(n)]) for n in held}
         change = max(moved, key=lambda n: abs(moved[n] - held[n]) / (1.0 + abs(held[n])))
         raise InconsistentStart(
             f"{change} = {held[change]:g} is held, against the invariant {worst!r} (residual {left.max():.2e}).",

@@ -1,18 +1,18 @@
 """The functions of a plant as SX expressions: the full mechanism under inputs, disturbances and further forces."""
 
 from dataclasses import replace
-from functools import cached_property
-from types import SimpleNamespace
+from functools import cached_property, lru_cache
 
 import casadi as ca
 import numpy as np
 
 from servoctl.codegen.folding import folded
-from servoctl.model.equations import Equations
+from servoctl.model.equations import Invariants
 from servoctl.reduction.appell import plant_accelerations, require_inertia
 from servoctl.reduction.hidden import as_rows, complete
 from servoctl.reduction.manifold import Context
 
+LATEST = 32  # sets of equations that are held
 CLEAR = 1e-6  # least eigenvalue of a mass matrix with unit diagonal that needs no decision about its rank
 
 
@@ -22,31 +22,37 @@ class PlantEquations:
     Parameters
     ----------
     mechanism : Mechanism
-    forces : (n,) SX
-        Further generalised forces.
-    damped : tuple of str
-        Names of the velocities with viscous damping.
-    lagged : tuple of str
-        Names of the actuators that lag behind their command.
+    forces : str
+        Further generalised forces, (n,): a serialised function (see `Coordinates.as_function`); "" without any.
+    damped : tuple of int
+        Velocities with viscous damping.
+    lagged : tuple of int
+        Actuators that lag behind their command.
+
+    Attributes
+    ----------
+    choices : (str, tuple of int, tuple of int)
+        Forces, damped velocities and lagging actuators.
+    functions : dict of str to Compiled
+        What was compiled of them so far.
     """
 
     def __init__(self, mechanism, forces, damped, lagged):
         q = self.q = mechanism.q
-        self.mechanism, self.forces = mechanism, forces
+        self.mechanism, self.choices, self.lagged = mechanism, (forces, damped, lagged), lagged
+        self.functions = {}
+        self.forces = _expression(forces, mechanism)
         self.velocity = ca.vertcat(*q.gamma(1))
         self.lagging = ca.SX.sym("lagging", len(lagged))
         self.state = ca.vertcat(*q, self.velocity, self.lagging)
         self.damping, self.rates = ca.SX.sym("damping", len(damped)), ca.SX.sym("rate", len(lagged))
         self.u, self.d = ca.SX.sym("u", len(mechanism.actuators)), ca.SX.sym("d", q.n)
         self.p = ca.vertcat(*mechanism.parameters.symbols, self.damping, self.rates, self.u, self.d)
-        directions = list(q.jet_names(1))
         self.resisting = ca.SX.zeros(q.n)
-        for c, name in zip(self.damping.elements(), damped, strict=True):
-            i = directions.index(name)
+        for c, i in zip(self.damping.elements(), damped, strict=True):
             self.resisting[i] = -c * self.velocity[i]
-        self.lagged = [mechanism.actuators.index(name) for name in lagged]
         self.force = ca.SX(self.u)
-        for a, value in zip(self.lagged, self.lagging.elements(), strict=True):
+        for a, value in zip(lagged, self.lagging.elements(), strict=True):
             self.force[a] = value
 
     def function(self, name, outputs, x=None, p=None):
@@ -108,7 +114,7 @@ class PlantEquations:
     def state_rates(self):
         """x'."""
         q = self.q
-        lags = self.rates * (self.u[self.lagged] - self.lagging) if self.lagged else ca.SX(0, 1)
+        lags = self.rates * (self.u[list(self.lagged)] - self.lagging) if self.lagged else ca.SX(0, 1)
         return ca.vertcat(q.V @ self.velocity + q.h, self.acceleration, lags)
 
     def ode(self):
@@ -159,17 +165,17 @@ class PlantEquations:
 
     def outputs(self):
         """The mechanism's named outputs."""
-        found = [
+        values = [
             ca.substitute(e, ca.vertcat(*self.q.gamma(2)), self.acceleration) for e in self.mechanism.outputs.values()
         ]
-        return self.function("outputs", found)
+        return self.function("outputs", values)
 
     def constraints(self):
         """Names and values of the invariants of the state, level by level."""
         if not self.constrained:
             return [], self.function("constraints", [ca.SX(0, 1)])
-        found = self._invariants.invariant_rows
-        return [name for _, name, _ in found], self.function("constraints", [e for _, _, e in found])
+        rows = self._invariants.invariant_rows
+        return [name for _, name, _ in rows], self.function("constraints", [e for _, _, e in rows])
 
     def constraints_jacobian(self):
         """Derivatives of the invariants of the state in x, column by column."""
@@ -195,4 +201,44 @@ class PlantEquations:
     @cached_property
     def _invariants(self):
         rows, points = self._material
-        return Equations(SimpleNamespace(mechanism=self.mechanism, top=2, rows=rows, points=points))
+        return Invariants(self.mechanism, rows, 2, points)
+
+
+def _expression(forces, mechanism):
+    if not forces:
+        return ca.SX.zeros(mechanism.q.n)
+    return mechanism.q.from_function(ca.Function.deserialize(forces), mechanism.parameters.symbols)[0]
+
+
+def plant_equations(mechanism, *choices):
+    """The equations of a plant, derived once for all plants that differ in numbers alone.
+
+    Parameters
+    ----------
+    mechanism : Mechanism
+    *choices
+        Forces, damped velocities and lagging actuators, as `PlantEquations` takes them.
+
+    Returns
+    -------
+    PlantEquations
+    """
+    return _latest(_Identity(mechanism), choices)
+
+
+@lru_cache(LATEST)
+def _latest(identity, choices):
+    return PlantEquations(identity.value, *choices)
+
+
+class _Identity:
+    """A value that equals itself alone: equations are written in the symbols of one mechanism, not of an equal one."""
+
+    def __init__(self, value):
+        self.value = value
+
+    def __eq__(self, other):
+        return self.value is other.value
+
+    def __hash__(self):
+        return id(self.value)

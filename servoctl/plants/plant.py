@@ -1,6 +1,6 @@
 """The plant: the full mechanism with its own numbers, friction, actuators and their limits."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 
 import casadi as ca
 import numpy as np
@@ -8,11 +8,15 @@ import numpy as np
 from servoctl.checks import column, finite, interval, mapping, numbers_by_name
 from servoctl.codegen.function import compiled
 from servoctl.errors import SpecificationError, unknown
-from servoctl.plants.equations import PlantEquations
+from servoctl.plants.equations import PlantEquations, plant_equations
 from servoctl.spec.mechanism import Mechanism, require_known
+from servoctl.values import Value
 
 
-def plant(mechanism, *, forces=None, damping=None, limits=None, rate_limits=None, lag=None, delay=0.0, **parameters):
+def plant(
+    mechanism: Mechanism, *, forces=None, damping=None, limits=None, rate_limits=None, lag=None, delay=0.0,
+    **parameters: float,
+) -> "Plant":  # fmt: skip
     """Make the plant of a mechanism: what the controller acts on.
 
     The equations are derived once for a mechanism and a set of further forces; other numbers cost nothing.
@@ -49,11 +53,11 @@ def plant(mechanism, *, forces=None, damping=None, limits=None, rate_limits=None
     """
     if not isinstance(mechanism, Mechanism):
         raise SpecificationError(
-            f"A {type(mechanism).__name__} was given in the place of a Mechanism.",
-            "A plant is made of a mechanism and numbers.",
+            f"The first argument is a {type(mechanism).__name__}.",
+            "A plant is made of a Mechanism and numbers.",
             do="Write sv.plant(mechanism, m_load=115.0).",
         )
-    directions, actuators = mechanism.q.jet_names(1), mechanism.actuators
+    actuators = mechanism.actuators
     names = mechanism.q.names if mechanism.q.plain else mechanism.q.velocity_names
     values = mechanism.parameters.values(parameters)
     damping = numbers_by_name(damping, names, "coordinate", "damping", low=0.0)
@@ -62,26 +66,21 @@ def plant(mechanism, *, forces=None, damping=None, limits=None, rate_limits=None
     if not isinstance(delay, dict):
         delay = dict.fromkeys(actuators, delay) if finite("delay", delay, "time") else {}
     delay = numbers_by_name(delay, actuators, "actuator", "delay", low=0.0)
-    force, key = _forces(mechanism, forces, names)
-    damped = tuple(name for name in names if name in damping)
-    lagged = tuple(name for name in actuators if name in lag)
-    key = (key, damped, lagged)
-    found = vars(mechanism).setdefault("_plants", {})  # as a cached property: derived once, whatever the numbers
-    if key not in found:
-        velocities = tuple(directions[names.index(name)] for name in damped)
-        found[key] = (PlantEquations(mechanism, force, velocities, lagged), {})
-    found[key][0].require_inertia(values)
-    numbers = np.concatenate([values, [damping[n] for n in damped], [1.0 / lag[n] for n in lagged]])
-    state_names = (*mechanism.q.names, *directions, *lagged)
+    damped = tuple(i for i, name in enumerate(names) if name in damping)
+    lagged = tuple(i for i, name in enumerate(actuators) if name in lag)
+    equations = plant_equations(mechanism, _forces(mechanism, forces, names), damped, lagged)
+    equations.require_inertia(values)
+    rates = [1.0 / lag[actuators[i]] for i in lagged]
+    numbers = np.concatenate([values, [damping[names[i]] for i in damped], rates])
+    state_names = (*mechanism.q.names, *mechanism.q.jet_names(1), *(actuators[i] for i in lagged))
     return Plant(
         mechanism, numbers, state_names, actuators, tuple(names),
-        _limits(limits, actuators), rate_limits, lag, {n: d for n, d in delay.items() if d}, damping,
-        equations=found[key][0], _functions=found[key][1],
+        _limits(limits, actuators), rate_limits, lag, {n: d for n, d in delay.items() if d}, damping, equations,
     )  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
-class Plant:
+class Plant(Value):
     """The full mechanism under actuator inputs and disturbances, material constraints held; made by `plant`.
 
     Attributes
@@ -109,8 +108,16 @@ class Plant:
     lag: dict
     delay: dict
     damping: dict
-    equations: PlantEquations = field(repr=False)
-    _functions: dict = field(repr=False)
+    equations: PlantEquations = field(repr=False, compare=False)
+
+    def __eq__(self, other):
+        return super().__eq__(other) and self.equations.choices == other.equations.choices
+
+    __hash__ = Value.__hash__
+
+    def __reduce__(self):
+        numbers = {f.name: getattr(self, f.name) for f in fields(self) if f.name != "equations"}
+        return _unpickled, (numbers, self.equations.choices)
 
     @property
     def n_x(self):
@@ -162,30 +169,19 @@ class Plant:
         -------
         Compiled
         """
-        if name not in self._functions:
-            e = self.equations
-            build = {
-                "ode": lambda: (e.ode(), ("closed",), e.project()),
-                "ode_power": lambda: (e.ode_power(), ("closed",), e.project(extra=1)),
-                "jacobian": lambda: (e.jacobian(),),
-                "directions": lambda: (e.directions(),),
-                "power": lambda: (e.power(),),
-                "accelerations": lambda: (e.accelerations(),),
-                "outputs": lambda: (e.outputs(),),
-                "constraints": lambda: (e.constraints()[1],),
-                "constraints_jacobian": lambda: (e.constraints_jacobian(),),
-            }
-            if name not in build:
-                raise unknown(name, list(build), "function")
-            f, *options = build[name]()
-            self._functions[name] = compiled(f, f.name(), *options)
-        return self._functions[name]
+        built = self.equations.functions
+        if name not in built:
+            if name not in FUNCTIONS:
+                raise unknown(name, list(FUNCTIONS), "function")
+            f, *options = FUNCTIONS[name](self.equations)
+            built[name] = compiled(f, f.name(), *options)
+        return built[name]
 
     def constraint_names(self):
         """Names of the invariants in the order of the function "constraints"."""
         return self.equations.constraints()[0]
 
-    def rates(self, t, x, u, d=None):
+    def rates(self, t, x, u, d=None) -> np.ndarray:
         """The rates x' at one point.
 
         Parameters
@@ -222,10 +218,10 @@ class Plant:
         both = y.reshape(-1, self.n_x, len(t)).transpose(2, 1, 0)
         return both[:, :, : self.n_x], both[:, :, self.n_x :]
 
-    def state(self, values):
+    def state(self, values) -> np.ndarray:
         """A full state: an array of (q, γ') or of all states, or values by name.
 
-        Lagged inputs that are not given are NaN: `close` lets them start at the first input.
+        Lagged inputs without a value are NaN: `close` lets them start at the first input.
 
         Parameters
         ----------
@@ -251,24 +247,23 @@ class Plant:
                 raise SpecificationError(
                     f"The state has no {missing[0]}.", f"It is made of {', '.join(names)}.", do="Give all of them."
                 )
-            given = np.array([finite(k, values[k], "state") if k in values else np.nan for k in names])
-            return given
+            return np.array([finite(k, values[k], "state") if k in values else np.nan for k in names])
         try:
-            given = np.asarray(values, dtype=float).ravel()
+            state = np.asarray(values, dtype=float).ravel()
         except (TypeError, ValueError) as error:
             raise SpecificationError(
                 f"The state is a {type(values).__name__}.", "It is an array or a dict of numbers.", do="Give one."
             ) from error
-        if given.size not in (n, self.n_x) or not np.isfinite(given).all():
+        if state.size not in (n, self.n_x) or not np.isfinite(state).all():
             raise SpecificationError(
-                f"The state {np.array2string(given, threshold=8)} was given.",
+                f"The state is {np.array2string(state, threshold=8)}.",
                 f"It has {n} finite numbers: {', '.join(names[:n])}"
                 + (f"; or {self.n_x}, with the inputs {', '.join(names[n:])}." if self.lag else "."),
                 nearest="plan.state(0.0).",
                 do="Give one number each.",
                 names=names,
             )
-        return np.concatenate([given, np.full(self.n_x - given.size, np.nan)])
+        return np.concatenate([state, np.full(self.n_x - state.size, np.nan)])
 
     def __repr__(self):
         m = self.mechanism
@@ -311,7 +306,7 @@ def _limits(limits, actuators):
 
 
 def _forces(mechanism, forces, names):
-    """Further generalised forces, (n,) SX, and what identifies them."""
+    """Further generalised forces, (n,), as a serialised function; "" without any."""
     q, total = mechanism.q, ca.SX.zeros(mechanism.q.n)
     for name, value in mapping(forces, "The forces").items():
         if name not in names:
@@ -327,4 +322,21 @@ def _forces(mechanism, forces, names):
                 name=name,
             )
         total[names.index(name)] = expression
-    return total, tuple((i, e.element_hash()) for i, e in enumerate(total.elements()) if not e.is_zero())
+    return "" if total.is_zero() else q.as_function([total], mechanism.parameters.symbols).serialize()
+
+
+def _unpickled(numbers, choices):
+    return Plant(**numbers, equations=plant_equations(numbers["mechanism"], *choices))
+
+
+FUNCTIONS = {  # what `compiled` makes of each: the function, its loops, its projection
+    "ode": lambda e: (e.ode(), ("closed",), e.project()),
+    "ode_power": lambda e: (e.ode_power(), ("closed",), e.project(extra=1)),
+    "jacobian": lambda e: (e.jacobian(),),
+    "directions": lambda e: (e.directions(),),
+    "power": lambda e: (e.power(),),
+    "accelerations": lambda e: (e.accelerations(),),
+    "outputs": lambda e: (e.outputs(),),
+    "constraints": lambda e: (e.constraints()[1],),
+    "constraints_jacobian": lambda e: (e.constraints_jacobian(),),
+}

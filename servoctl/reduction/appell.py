@@ -12,9 +12,9 @@ import numpy as np
 from servoctl.errors import NotRealisable, SpecificationError, unknown
 from servoctl.reduction.elimination import eliminate
 from servoctl.reduction.ranks import clean, decide_all, decide_each, equilibrate
-from servoctl.reduction.row import gradient
 
 NEGATIVE = 1e-9  # of the size of its entries: eigenvalues of an inertia matrix below minus this are no rounding
+NAMED = 1e-6  # of its largest component: smaller ones of a direction are not named in an error
 LONGEST_SEARCH = 2  # times n: no relative degree exceeds the number of plant states
 
 
@@ -84,7 +84,7 @@ def realisation(mechanism, program, constraints, points):
         If there are fewer actuators than residuals, or they cannot move them.
     """
     q = mechanism.q
-    leading = {kind: [gradient(q, row) for row in constraints if row.kind == kind] for kind in ("program", "material")}
+    leading = {kind: [row.gradient(q) for row in constraints if row.kind == kind] for kind in ("program", "material")}
     material = [g.T for g in leading["material"]]
     if program.by == "ideal":
         directions, actuation = [g.T for g in leading["program"]], None
@@ -98,13 +98,13 @@ def realisation(mechanism, program, constraints, points):
         raise NotRealisable(
             f"The directions of the actuators {', '.join(mechanism.actuators)} and of the material constraints are "
             f"dependent (rank {rank.rank} of {B.shape[1]}).",
-            "Each actuator needs a direction of its own.",
+            "The directions of the actuators are independent of each other.",
             do="Remove an actuator or a constraint.",
         )
     dependent = tuple(sorted(rank.columns))
     independent = tuple(i for i in range(q.n) if i not in dependent)
     cleaned = clean(numbers, sizes)
-    regular = [p for p, own in enumerate(decide_each(cleaned[:, list(dependent)])) if own.rank == len(cleaned)]
+    regular = [p for p, rank in enumerate(decide_each(cleaned[:, list(dependent)])) if rank.rank == len(cleaned)]
     return Realisation(B, actuation, dependent, independent, cleaned[:, :, regular or [best]])
 
 
@@ -113,7 +113,7 @@ def _actuator_directions(mechanism, program, constraints, points):
     q = mechanism.q
     k, m = len(program.residuals), len(mechanism.actuators)
     material = [row for row in constraints if row.kind == "material"]
-    both = ca.horzcat(mechanism.E, *(gradient(q, row).T for row in material))
+    both = ca.horzcat(mechanism.E, *(row.gradient(q).T for row in material))
     rank = decide_all(*points.matrix(both.T))[0].rank if both.shape[1] else 0
     free = rank - len(material)
     if k > free:
@@ -177,7 +177,7 @@ def decoupling(mechanism, rows, material, points):
 def _saddle(mechanism, material):
     """[M G_mᵀ; G_m 0]."""
     n, k = mechanism.q.n, len(material)
-    G = ca.vertcat(*(gradient(mechanism.q, row) for row in material)) if material else ca.SX(0, n)
+    G = ca.vertcat(*(row.gradient(mechanism.q) for row in material)) if material else ca.SX(0, n)
     return ca.vertcat(ca.horzcat(mechanism.mass, G.T), ca.horzcat(G, ca.SX.zeros(k, k)))
 
 
@@ -203,12 +203,11 @@ def require_inertia(mechanism, material, points):
     if rank.rank < len(values):
         cleaned = clean(values, sizes)[:, :, best].astype(float)
         null = np.linalg.svd(cleaned)[2][-1][:n]
-        names = [q.jet_names(1)[i] for i in np.flatnonzero(np.abs(null) > 1e-6 * np.abs(null).max())]
+        names = [q.jet_names(1)[i] for i in np.flatnonzero(np.abs(null) > NAMED * np.abs(null).max())]
         raise SpecificationError(
             f"The mass matrix is singular: a direction of {', '.join(names)} has no inertia.",
             "M = ∂²S/∂γ''² is positive definite on the displacements that material constraints allow.",
-            nearest="A small mass or inertia there, or one coordinate less.",
-            do="Check the masses and inertias and their default numbers.",
+            do="Check the masses and inertias and their numbers, or leave out a coordinate.",
             names=names,
         )
 
@@ -230,7 +229,7 @@ def require_positive(mechanism, points):
         return
     k = int(np.argmin(values[:, 0]))
     direction = np.abs(directions[k, :, 0])
-    names = [mechanism.q.jet_names(1)[i] for i in np.flatnonzero(direction > 1e-6 * direction.max())]
+    names = [mechanism.q.jet_names(1)[i] for i in np.flatnonzero(direction > NAMED * direction.max())]
     pairs = zip(points.parameters, points.values, strict=True)
     negative = [f"{symbol.name()} = {value:g}" for symbol, value in pairs if value < 0]
     raise SpecificationError(

@@ -11,7 +11,8 @@ import numpy as np
 
 from servoctl.errors import SingularProgram
 from servoctl.jets.elementary import divide, multiply, subtract
-from servoctl.reduction.ranks import ENTRY, equilibrate
+from servoctl.reduction.ranks import equilibrate
+from servoctl.tolerances import ENTRY
 
 THRESHOLD = 0.1  # a pivot may be this much smaller than the largest candidate of its row, after equilibration
 
@@ -100,20 +101,20 @@ class _System:
         return i, j
 
     def _pivot(self):
-        best, found = None, None
+        least, place = None, None
         for i in self.open:
             fill = len(self.rows[i]) - 1
             for j, size in self.candidates[i]:
                 key = (fill * (len(self.members[j]) - 1), -size)
-                if best is None or key < best:
-                    best, found = key, (i, j)
-        if found is None:
+                if least is None or key < least:
+                    least, place = key, (i, j)
+        if place is None:
             raise SingularProgram(
                 "A system of equations is singular at the points where its pivots are chosen.",
                 "Pivots are chosen where the equations have full rank.",
                 do="Give derive a guess near the motion.",
             )
-        return found
+        return place
 
     def _subtract(self, r, pivot_row, pivot_right, j):
         row, right, (pivot, number) = self.rows[r], self.rhs[r], pivot_row[j]

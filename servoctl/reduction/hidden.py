@@ -4,20 +4,24 @@ While the leading matrix L of the rows is singular on their manifold, w with w�
 χ = Σ w_a D^(o - o_a) ψ_a of lower order, which replaces one row; the sum of the orders falls at every step.
 """
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import casadi as ca
 import numpy as np
 
 from servoctl.errors import InconsistentStart, NotRealisable, SingularProgram, SpecificationError
+from servoctl.jets.flow import Flow
 from servoctl.reduction.elimination import eliminate
-from servoctl.reduction.flow import Flow
-from servoctl.reduction.manifold import sample, solve
+from servoctl.reduction.manifold import POINTS_SEED, sample, solve
 from servoctl.reduction.orders import dependence, leading, settle, settle_alone
-from servoctl.reduction.ranks import NOISE, RESOLVED, clean, decide, decide_all, decide_each, generic
-from servoctl.reduction.row import Row, gradient, merge_uses
+from servoctl.reduction.ranks import clean, decide, decide_all, decide_each, generic
+from servoctl.reduction.row import Row, merge_uses
+from servoctl.tolerances import NOISE, RESOLVED
 
 VANISHED = 1e-5  # of a row's gradient at random points: what is left of it on its solutions, if it is a square
+SQUARE_STEPS = 40  # of Newton's method towards them, which for a square only halves the way at each
+SOLVED = 1e-3  # scaled residual of points at which the gradient of a possible square is looked at
+BESIDE = 0.5  # relative distance of the points with which solutions are compared
 
 
 def complete(q, rows, context, starts=None):
@@ -49,7 +53,7 @@ def complete(q, rows, context, starts=None):
     NotRealisable
         If the dependence involves the mechanism's dynamics.
     SingularProgram
-        If a row's gradient vanishes on its own solutions, or a rank cannot be told.
+        If a row's gradient vanishes on its own solutions, or a rank is undecided in double precision.
     InconsistentStart
         If no state satisfies the rows.
     """
@@ -58,46 +62,69 @@ def complete(q, rows, context, starts=None):
         level = max([row.order for row in rows], default=0)
         points = sample(q, rows, level, context, starts=points)
         if not len(points.t):
-            _refuse_contradiction(q, rows, context)
+            raise _no_common_state(q, rows, context)
         numbers, sizes = leading(q, rows, points)
         ranks = decide_each(clean(numbers, sizes))
         rank, _ = generic(ranks)
         if not rank.clear:
             raise _ill_conditioned(rows, rank)
-        same = [p for p, own in enumerate(ranks) if own.rank == rank.rank]
+        same = [p for p, other in enumerate(ranks) if other.rank == rank.rank]
         if rank.rank == len(rows):
             return rows, rank, points.take(same), guards
-        rows, new_guards = _step(q, rows, numbers[:, :, same], context, points)
-        guards += new_guards
+        combination = _lowest(q, rows, numbers[:, :, same], context, points)
+        if combination.row.order < 0:
+            raise _dependent(rows, combination)
+        rows[combination.replaces] = combination.row
+        guards += [(f"combination of {combination.row.story}", pivot) for pivot in combination.pivots]
 
 
-def _step(q, rows, numbers, context, starts=None):
-    """One replacement: the rows with a hidden constraint in the place of one of them."""
+@dataclass(frozen=True)
+class _Combination:
+    """A combination of rows whose leading gradients cancel.
+
+    Attributes
+    ----------
+    row : Row
+        Settled; of order -1 where it depends on t alone.
+    replaces : int
+        The row of the highest order that it may replace.
+    support : list of int
+        The rows that were combined.
+    points : Points
+        On the manifold of all rows but the replaced one.
+    pivots : list of SX
+        By which the combination divides.
+    """
+
+    row: Row
+    replaces: int
+    support: list
+    points: object
+    pivots: list
+
+
+def _lowest(q, rows, numbers, context, starts=None):
+    """The combination of dependent rows that takes the place of one of them, of lower order than it."""
     order = sorted(range(len(rows)), key=lambda a: (rows[a].kind == "dynamics", rows[a].order, a))
     support, weights = dependence(q, [rows[a] for a in order], numbers[order])
     support = [order[i] for i in support]
     top = max(rows[a].order for a in support)
-    candidates = [
-        (rows[a].kind == "dynamics", w, a) for a, w in zip(support, weights, strict=True) if rows[a].order == top
-    ]
-    b = max(candidates)[2]
-    new, points, pivots, story = _combination(q, rows, b, support, top, numbers, context, starts)
-    if new.order >= top:
+    highest = ((a, w) for a, w in zip(support, weights, strict=True) if rows[a].order == top)
+    b = max((rows[a].kind == "dynamics", w, a) for a, w in highest)[2]
+    combination = _combination(q, rows, b, support, numbers, context, starts)
+    if combination.row.order >= top:
         support, numbers = _about(q, rows, b, context)
         if not support:
             raise _vanishing_gradient(rows[b])
-        new, points, pivots, story = _combination(q, rows, b, support, top, numbers, context)
-        if new.order >= top:
+        combination = _combination(q, rows, b, support, numbers, context)
+        if combination.row.order >= top:
             raise _vanishing_gradient(rows[b])
-    kinds = {rows[a].kind for a in support}
-    if new.order < 0:
-        raise _dependent(new, points, [rows[a].name for a in support], kinds, story)
-    new = replace(new, name=rows[b].name, kind=rows[b].kind, story=story)
-    return [new if a == b else row for a, row in enumerate(rows)], [(f"combination of {story}", p) for p in pivots]
+    return combination
 
 
-def _combination(q, rows, b, support, top, numbers, context, starts=None):
+def _combination(q, rows, b, support, numbers, context, starts=None):
     """Row b combined with the others of a support, settled on the manifold of all other rows."""
+    top = rows[b].order
     _require_affine(rows, support, top)
     others = [a for a in support if a != b]
     chi, pivots = _combine(q, rows, b, others, top, numbers)
@@ -105,11 +132,10 @@ def _combination(q, rows, b, support, top, numbers, context, starts=None):
     story = f"{rows[b].name} with {', '.join(names)}" if names else rows[b].name
     rest = [row for a, row in enumerate(rows) if a != b]
     uses = merge_uses(*((rows[a].uses, top - rows[a].order) for a in support))
-    candidate = replace(rows[b], expression=chi, order=top, uses=uses)
-    new, points = settle(q, candidate, rest, context, starts)
-    if new is None:
+    row, points = settle(q, replace(rows[b], expression=chi, order=top, uses=uses), rest, context, starts)
+    if row is None:
         raise _no_state(rest)
-    return new, points, pivots, story
+    return _Combination(replace(row, story=story), b, support, points, pivots)
 
 
 def _about(q, rows, b, context):
@@ -132,8 +158,8 @@ def _combine(q, rows, b, others, top, numbers):
     if not others:
         return chi, []
     columns = sorted(decide(numbers[others, :, 0]).columns)
-    matrix = ca.vertcat(*(gradient(q, rows[a]) for a in others))[:, columns].T
-    target = -gradient(q, rows[b])[:, columns].T
+    matrix = ca.vertcat(*(rows[a].gradient(q) for a in others))[:, columns].T
+    target = -rows[b].gradient(q)[:, columns].T
     w, pivots = eliminate(matrix, target, numbers[others][:, columns].swapaxes(0, 1))
     for a, weight in zip(others, w.elements(), strict=True):
         chi = chi + weight * q.derivatives([rows[a].expression], top - rows[a].order)[-1][0]
@@ -150,8 +176,8 @@ def _require_affine(rows, support, top):
         raise SpecificationError(
             f"The residual {bent[0]!r} is not linear in its highest derivative and depends on other rows there.",
             "Hidden constraints are found among rows that are linear in their highest derivatives.",
-            nearest=f"The time derivative of {bent[0]!r}, which is linear in its highest derivative.",
-            do="Give that derivative as the residual and hold the residual itself at the start.",
+            do=f"Give the time derivative of {bent[0]!r}, which is linear in its highest derivative, as the "
+            "residual, and hold the residual itself at the start.",
             rows=bent,
         )
 
@@ -160,23 +186,22 @@ def _vanishing_gradient(row):
     return SingularProgram(
         f"The gradient of row {row.name!r} vanishes on its own solutions.",
         "A constraint is regular: a squared one, like φ² = 0, says nothing about the directions in which φ grows.",
-        nearest=f"A form of {row.name!r} that changes sign where it is crossed.",
-        do="State the residual that was squared, not its square.",
+        do=f"Write {row.name!r} so that it changes sign where it is crossed: what was squared, not its square.",
         row=row.name,
     )
 
 
-def _dependent(row, points, names, kinds, story):
-    values, sizes = points.evaluate([row.expression])
-    zero = not np.any(clean(values, sizes))
+def _dependent(rows, combination):
+    """What is wrong with rows of which a combination depends on t alone."""
+    names, story = [rows[a].name for a in combination.support], combination.row.story
+    zero = not np.any(clean(*combination.points.evaluate([combination.row.expression])))
     what = ", ".join(names)
-    if "dynamics" in kinds:
-        program = [n for n in names if n != row.name] or names
+    if any(rows[a].kind == "dynamics" for a in combination.support):
+        program = [name for name in names if name != combination.row.name] or names
         return NotRealisable(
             f"The actuation never reaches the program: the combination {story} "
             + ("vanishes identically." if zero else "depends on nothing but t and is not zero."),
             "Every residual needs an actuator that moves it.",
-            nearest="Residuals of coordinates that the actuators move.",
             do=f"Change the actuators or the rows {', '.join(program)}.",
             rows=names,
         )
@@ -195,16 +220,17 @@ def _dependent(row, points, names, kinds, story):
     )
 
 
-def _refuse_contradiction(q, rows, context):
-    """No point satisfies all rows: look for the contradiction among them, and raise."""
-    level = max(row.order for row in rows)
-    points = sample(q, [], level, context)
+def _no_common_state(q, rows, context):
+    """What is wrong with rows that no point satisfies: a contradiction among them, where there is one."""
+    points = sample(q, [], max(row.order for row in rows), context)
     numbers, sizes = leading(q, rows, points)
     rank, _ = decide_all(numbers, sizes)
     if rank.clear and rank.rank < len(rows):
-        same = [p for p, own in enumerate(decide_each(numbers)) if own.rank == rank.rank]
-        _step(q, rows, numbers[:, :, same], context)
-    raise _no_state(rows)
+        same = [p for p, other in enumerate(decide_each(numbers)) if other.rank == rank.rank]
+        combination = _lowest(q, rows, numbers[:, :, same], context)
+        if combination.row.order < 0:
+            return _dependent(rows, combination)
+    return _no_state(rows)
 
 
 def _no_state(rows):
@@ -229,8 +255,8 @@ def _ill_conditioned(rows, rank):
 
 def as_rows(q, named, kind, context):
     """Rows of named residuals with their true orders."""
-    given = [Row(e, max(q.order(e), 0), name, kind, uses={name: 0}) for name, e in named.items()]
-    settled = settle_alone(q, given, context)
+    rows = [Row(e, max(q.order(e), 0), name, kind, uses={name: 0}) for name, e in named.items()]
+    settled = settle_alone(q, rows, context)
     for row, slopes in settled:
         if row.order < 0:
             raise SpecificationError(
@@ -249,22 +275,22 @@ def _refuse_square(q, row, context, slopes=None):
     A gradient without the highest jets is as large on the solutions, which determine these alone, as elsewhere; and
     so is an entry that holds no coordinate. `slopes` are the values of the gradient at the points, where known.
     """
-    own = gradient(q, row)
-    if row.order > 0 and q.order(own) < row.order:
+    slope = row.gradient(q)
+    if row.order > 0 and q.order(slope) < row.order:
         return
     if slopes is not None:
-        sizes, columns = np.abs(slopes), own.sparsity().get_triplet()[1]
+        sizes, columns = np.abs(slopes), slope.sparsity().get_triplet()[1]
         clear = np.all(sizes > VANISHED * sizes.max(axis=0), axis=1)
-        if any(clear[i] and q.order(e) < 0 for i, e in zip(columns, own.nonzeros(), strict=True)):
+        if any(clear[i] and q.order(e) < 0 for i, e in zip(columns, slope.nonzeros(), strict=True)):
             return
     start = sample(q, [], row.order, context)
     flow = Flow(q, [row], row.order, start)
-    z, residual = solve(flow, start.t, start.z, iterations=40)
+    z, residual = solve(flow, start.t, start.z, iterations=SQUARE_STEPS)
     sizes = []
     for jets in (start.z, z):
-        values, _ = replace(start, z=jets).matrix(gradient(q, row))
+        values, _ = replace(start, z=jets).matrix(row.gradient(q))
         sizes.append(np.abs(values).max(axis=(0, 1)))
-    solved = residual < 1e-3
+    solved = residual < SOLVED
     if solved.any() and np.all(sizes[1][solved] < VANISHED * sizes[0][solved]):
         if not _regular_nearby(flow, start.t[solved], z[:, solved]):
             raise _vanishing_gradient(row)
@@ -276,9 +302,9 @@ def _regular_nearby(flow, t, z):
     Newton's method has converged at a regular solution; at that of a square its steps only halve the way.
     """
     residual, slopes = flow(t, z)
-    beside = z * (1.0 + np.random.default_rng(1907).uniform(-0.5, 0.5, z.shape))
-    own, other = np.abs(slopes[0]).max(axis=0), np.abs(flow(t, beside)[1][0]).max(axis=0)
+    beside = z * (1.0 + np.random.default_rng(POINTS_SEED).uniform(-BESIDE, BESIDE, z.shape))
+    here, there = np.abs(slopes[0]).max(axis=0), np.abs(flow(t, beside)[1][0]).max(axis=0)
     with np.errstate(all="ignore"):
         steps = np.abs(residual[0] * slopes[0]) / (slopes[0] ** 2).sum(axis=0)
     converged = np.all(steps <= VANISHED * np.abs(z), axis=0)
-    return bool(np.any(converged & (own > VANISHED * other)))
+    return bool(np.any(converged & (here > VANISHED * there)))

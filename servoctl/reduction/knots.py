@@ -12,9 +12,15 @@ from servoctl.jets.series import Series
 from servoctl.jets.tape import Tape
 
 MOST_BRANCHES = 24  # affine pieces that are followed through one operation
-JUMP = 1e-6  # of the largest value that a derivative takes nearby
+SCAN = 801  # instants at which switches that are not affine in t are looked for
+BISECTIONS = 60  # halvings of an interval between two of them: all digits of a double
+SAME_INSTANT = 1e-9  # of the time between the first and the last switch: closer ones are one
+WIDE, NARROW = 1e-4, 1e-7  # distances of series from an instant, of its neighbourhood
+JUMP = 1e-6  # of the largest value that a derivative takes nearby: smaller jumps are rounding
+STAYS = 0.5  # of the difference of far series is left between close ones at a jump; else it falls with the distance
 AROUND = np.setdiff1d(np.linspace(-1.0, 1.0, 41), [0.0])  # where a derivative's size is taken, of the neighbourhood
 EXTRA = 4  # coefficients beyond those needed, by which series are shifted to the instant itself
+ALONE = 0.5  # s, the neighbourhood of a single switch
 
 
 @dataclass(frozen=True)
@@ -41,13 +47,20 @@ class Switches:
     q : Coordinates
     residuals : dict of str to SX
     parameters : tuple of SX
+    timed : list of (int, int or None), optional
+        Sides of the switches, as nodes of the tape, where they are known.
     """
 
-    def __init__(self, q, residuals, parameters):
-        self.q, self.residuals = q, residuals
+    def __init__(self, q, residuals, parameters, timed=None):
+        self.q, self.residuals, self._given = q, residuals, (q, residuals, parameters)
         self.symbols = ca.symvar(ca.vertcat(*residuals.values()))
         self.parameters = [p.element_hash() for p in parameters]
-        self.timed = self._timed() if any(s.element_hash() == q.t.element_hash() for s in self.symbols) else []
+        self.timed = timed
+        if timed is None:
+            self.timed = self._timed() if any(s.element_hash() == q.t.element_hash() for s in self.symbols) else []
+
+    def __reduce__(self):
+        return Switches, (*self._given, self.timed)
 
     @cached_property
     def tape(self):
@@ -81,18 +94,18 @@ class Switches:
         if not self.timed:
             return []
         pieces = self._affine(values)
-        found = set()
+        instants = set()
         for a, b in self.timed:
             for c0, c1 in pieces[a] or ():
                 for d0, d1 in (pieces[b] or ()) if b is not None else ((0.0, 0.0),):
                     if c1 != d1:
-                        found.add((d0 - c0) / (c1 - d1))
-        window = [*found, *(span or ())]
+                        instants.add((d0 - c0) / (c1 - d1))
+        window = [*instants, *(span or ())]
         if window and max(window) > min(window):
-            found |= self._scan(values, min(window), max(window), found)
-        times = sorted(found)
-        width = max(times[-1] - times[0], 1e-9) if times else 1.0
-        return [t for i, t in enumerate(times) if i == 0 or t - times[i - 1] > 1e-9 * width]
+            instants |= self._scan(values, min(window), max(window), instants)
+        times = sorted(instants)
+        width = max(times[-1] - times[0], SAME_INSTANT) if times else 1.0
+        return [t for i, t in enumerate(times) if i == 0 or t - times[i - 1] > SAME_INSTANT * width]
 
     def _affine(self, values):
         """For each node the affine pieces (c0, c1) that it may take, or None where one is not affine."""
@@ -127,23 +140,25 @@ class Switches:
         return result if 0 < len(result) <= MOST_BRANCHES else None
 
     def _scan(self, values, t0, t1, known):
+        """Instants between t0 and t1, beside the known ones, at which a switch changes sides, by bisection."""
+
         def sides(t):
             c = self._run(t, values, 1).c
             return [np.broadcast_to(c[a][0] - (c[b][0] if b is not None else 0.0), t.shape) for a, b in self.timed]
 
-        grid = np.linspace(t0, t1, 801)
-        found = set()
+        grid = np.linspace(t0, t1, SCAN)
+        instants = set()
         for s, g in enumerate(sides(grid)):
-            told = np.flatnonzero(g != 0)
-            for i, j in zip(told[:-1], told[1:], strict=True):
+            decided = np.flatnonzero(g != 0)
+            for i, j in zip(decided[:-1], decided[1:], strict=True):
                 low, high = grid[i], grid[j]
                 if g[i] * g[j] > 0 or any(low <= k <= high for k in known):
                     continue
-                for _ in range(60):
+                for _ in range(BISECTIONS):
                     middle = (low + high) / 2
                     low, high = (middle, high) if sides(np.array([middle]))[s][0] * g[i] > 0 else (low, middle)
-                found.add(float((low + high) / 2))
-        return found
+                instants.add(float((low + high) / 2))
+        return instants
 
     def _run(self, t, values, depth):
         t = np.asarray(t, dtype=np.longdouble)
@@ -155,7 +170,7 @@ class Switches:
             elif place[0] == "t":
                 first = t
             else:
-                first = np.longdouble(0.3 + 0.1 * ((7 * i) % 10))
+                first = np.longdouble(0.3 + 0.1 * ((7 * i) % 10))  # of jets that no switch depends on: any number
             inputs.append([first, *(float(k == 1 and place is not None and place[0] == "t") for k in range(1, depth))])
         series = Series(self.tape, inputs)
         with np.errstate(all="ignore"):
@@ -179,28 +194,50 @@ class Switches:
         if not times:
             return {}
         near = np.array([_neighbourhood(times, i) for i in range(len(times))])
-        steps = [1e-4 * near, 1e-7 * near]
-        t = np.concatenate([*(times + x for h in steps for x in (-h, h)), *(times + near * x for x in AROUND)])
-        series = self._run(t, values, max(needs.values(), default=0) + EXTRA + 1)
+        far, close = WIDE * near, NARROW * near
+        t = np.array([times - far, times + far, times - close, times + close, *(times + near * x for x in AROUND)])
+        series = self._run(t.ravel(), values, max(needs.values(), default=0) + EXTRA + 1)
         result = {}
         for name, c in zip(self.residuals, series.outputs, strict=True):
-            c = np.array([np.broadcast_to(x, t.shape) for x in c]).reshape(len(c), -1, len(times))
+            c = np.array([np.broadcast_to(x, t.size) for x in c]).reshape(len(c), *t.shape)
             for i, when in enumerate(times):
-                far, close = (
-                    np.subtract(_shift(c[:, 2 * s, i], h[i]), _shift(c[:, 2 * s + 1, i], -h[i]))
-                    for s, h in enumerate(steps)
-                )
-                for k in range(needs.get(name, -1) + 1):
-                    if abs(close[k]) > max(JUMP * np.abs(c[k, :, i]).max(), 0.5 * abs(far[k])):
-                        result.setdefault(name, []).append((when, k - 1))
-                        break
+                wide = jump(c[:, 0, i], c[:, 1, i], far[i])
+                narrow = jump(c[:, 2, i], c[:, 3, i], close[i])
+                least = np.maximum(JUMP * np.abs(c[:, :, i]).max(axis=1), np.nan_to_num(STAYS * np.abs(wide)))
+                rough = np.flatnonzero(np.abs(narrow) > least)
+                if rough.size and rough[0] <= needs.get(name, -1):
+                    result.setdefault(name, []).append((when, int(rough[0]) - 1))
         return result
 
 
+def jump(before, after, h):
+    """Jumps of a function's Taylor coefficients at an instant, from series on either side of it.
+
+        before              instant               after
+    ------|--------------------|--------------------|------> t
+         -h     shifted to     0     shifted to     h
+
+    Where the function is smooth, the two shifted series differ by what they leave out, which falls with h; a jump
+    does not.
+
+    Parameters
+    ----------
+    before, after : (n,) arrays
+        Taylor coefficients at -h and at h.
+    h : float
+        [s]
+
+    Returns
+    -------
+    (n,) array
+    """
+    return np.subtract(_shift(after, -h), _shift(before, h))
+
+
 def _neighbourhood(times, i):
-    """How far to look on either side of an instant: to half the way to the nearest other, or 1 s."""
+    """How far to look on either side of an instant: to half the way to the nearest other, where there is one."""
     distances = [abs(times[j] - times[i]) for j in (i - 1, i + 1) if 0 <= j < len(times)]
-    return 0.5 * min(distances) if distances else 0.5
+    return 0.5 * min(distances) if distances else ALONE
 
 
 def _shift(c, h):
@@ -239,18 +276,22 @@ def require_smooth(switches, values, needs, span=None):
     """
     times = switches.times(values, span)
     classes = switches.classes(values, needs, times)
-    for name, found in classes.items():
-        when, k = min(found, key=lambda pair: pair[1])
+    for name, instants in classes.items():
+        when, k = min(instants, key=lambda pair: pair[1])
         if k < needs.get(name, 0):
-            has = f"C^{k}" if k >= 0 else "a jump"
-            raise SpecificationError(
-                f"The path in {name!r} needs C^{needs[name]}, has {has} at t = {when:.6g}.",
-                f"The actuation holds derivative {needs[name]} of {name!r}, which must be continuous.",
-                nearest=f"A path of smoothness {needs[name]}.",
-                do=f"Give sv.paths.rest_to_rest(..., smoothness={needs[name]}), or a spline of that class.",
-                name=name,
-                needs=needs[name],
-                has=k,
-                t=when,
-            )
+            raise _too_rough(name, needs[name], k, when)
     return Knots(tuple(times), classes)
+
+
+def _too_rough(name, need, k, when):
+    what = f"The path in {name!r}" if isinstance(name, str) else str(name).capitalize()
+    has = f"C^{k}" if k >= 0 else "a jump"
+    return SpecificationError(
+        f"{what} needs C^{need}, has {has} at t = {when:.6g}.",
+        f"The actuation holds derivative {need} of it, which must be continuous.",
+        do=f"Give sv.paths.rest_to_rest(..., smoothness={need}), or a spline of that class.",
+        name=str(name),
+        needs=need,
+        has=k,
+        t=when,
+    )

@@ -11,12 +11,21 @@ from math import factorial
 import casadi as ca
 import numpy as np
 
+from servoctl.jets.flow import Flow
 from servoctl.jets.scalars import REAL, Book
-from servoctl.reduction.flow import Flow
+from servoctl.tolerances import CUTOFF
 
 ROUNDED = 8 * float(np.finfo(REAL).eps)  # a scaled residual below this is rounding
 ROUNDED_STEP = 1e-15  # a step from below this is worth one trial: shorter ones gain nothing
 WELL_CONDITIONED = 1e-3  # Cholesky pivots of A Aᵀ with unit diagonal above it: Newton's steps need no singular values
+LEVEL_SOLVED = 1e-17  # relative step below which a level is solved
+ON_MANIFOLD = 1e-13  # scaled residual of a point that is kept: far below ENTRY, so that zeros show
+GAUSS_NEWTON_STEPS = 60  # Gauss-Newton steps on all levels together
+COORDINATE_STEPS, JET_STEPS = 8, 2  # Newton steps for q, and for a level of jets, where rows are mostly affine
+SHORTENINGS = 12  # of a step, each to a quarter, before a point is given up
+SPREAD = 0.1  # relative width of starts about a guess, in its own size and in that usual for a value near zero
+POINTS = 5  # at which ranks are decided; as many starts again where one of the first fails
+POINTS_SEED = 1907  # of the random starts
 
 
 @dataclass(frozen=True)
@@ -66,10 +75,10 @@ class Points:
     def evaluate(self, expressions):
         """Values and sizes of SX scalars at the points: two arrays (len, N)."""
         result = np.empty((2, len(expressions), len(self.t)), dtype=REAL)
-        for scalars, own, given in self.book.find(self.q, self.parameters, expressions):
+        for scalars, sources, targets in self.book.find(self.q, self.parameters, expressions):
             if scalars not in self._found:
                 self._found[scalars] = scalars.evaluate(self.t, self.z, self.values)
-            result[:, given] = self._found[scalars][:, own]
+            result[:, targets] = self._found[scalars][:, sources]
         return result[0], result[1]
 
     def read(self, expressions):
@@ -84,9 +93,9 @@ class Points:
     def placed(self, sparsity, *nonzeros):
         """Arrays (rows, columns, N) from their nonzero entries (nnz, N)."""
         rows, columns = sparsity.get_triplet()
-        found = np.zeros((len(nonzeros), *sparsity.shape, len(self.t)), dtype=REAL)
-        found[:, rows, columns] = nonzeros
-        return tuple(found)
+        matrices = np.zeros((len(nonzeros), *sparsity.shape, len(self.t)), dtype=REAL)
+        matrices[:, rows, columns] = nonzeros
+        return tuple(matrices)
 
     def joined(self, other):
         """These points and others of the same jets."""
@@ -95,12 +104,13 @@ class Points:
 
     def take(self, keep):
         """Some of the points."""
-        kept = replace(self, t=self.t[keep], z=self.z[:, keep], residual=self.residual[keep])
-        kept._found.update((scalars, found[:, :, keep]) for scalars, found in self._found.items())
-        return kept
+        some = replace(self, t=self.t[keep], z=self.z[:, keep], residual=self.residual[keep])
+        some._found.update((scalars, values[:, :, keep]) for scalars, values in self._found.items())
+        return some
 
 
-def solve(flow, t, z, iterations=60):
+@np.errstate(all="ignore")  # trial steps may leave the domain of the rows: what is not finite is no improvement
+def solve(flow, t, z, iterations=GAUSS_NEWTON_STEPS):
     """Move jets onto the manifold of a flow's rows: level by level, then by damped Gauss-Newton on all levels.
 
     Parameters
@@ -148,10 +158,9 @@ def _search(flow, t, z, step, scale, residual):
     damping, before = 1.0 / np.maximum(1.0, longest), np.max(np.abs(residual) / scale, axis=0)
     trial, open_ = z + damping * step, np.arange(len(t))
     better = np.zeros(len(t), dtype=bool)
-    for _ in range(12):
+    for _ in range(SHORTENINGS):
         new = flow.residual(t[open_], trial[:, open_])
-        with np.errstate(all="ignore"):
-            good = np.max(np.abs(new) / scale[:, open_], axis=0) < before[open_]
+        good = np.max(np.abs(new) / scale[:, open_], axis=0) < before[open_]
         better[open_[good]] = True
         open_ = open_[~good & (before[open_] > ROUNDED_STEP)]
         if not len(open_):
@@ -169,63 +178,61 @@ def _solve_level(flow, t, z, level, scales):
     rows = np.flatnonzero(flow.levels == level)
     nq, n = flow.q.nq, flow.q.n
     columns = slice(0, nq) if level == 0 else slice(nq + (level - 1) * n, nq + level * n)
-    for _ in range((8 if level == 0 else 2) if len(rows) else 0):
+    for _ in range((COORDINATE_STEPS if level == 0 else JET_STEPS) if len(rows) else 0):
         residual, slopes = flow.at_level(t, z, level)
         residual, slopes = residual[rows], slopes[rows]
         step = _least_steps(slopes, residual)
         longest = np.max(np.abs(step) / (1.0 + np.abs(z[columns])), axis=0)
         z[columns] += step / np.maximum(1.0, longest) if level == 0 else step
         scales[rows] = _scales(slopes, z[columns])
-        if np.all(np.abs(step) <= 1e-17 * (1.0 + np.abs(z[columns]))):
+        if np.all(np.abs(step) <= LEVEL_SOLVED * (1.0 + np.abs(z[columns]))):
             break
 
 
 def _scales(jacobian, z):
     """Size of each residual's gradient times that of the jets, (equations, N)."""
-    with np.errstate(all="ignore"):
-        scale = np.sqrt((jacobian**2 * (1.0 + np.abs(z.astype(float))) ** 2).sum(axis=1))
+    scale = np.sqrt((jacobian**2 * (1.0 + np.abs(z.astype(float))) ** 2).sum(axis=1))
     return np.where(scale > 0, scale, 1.0)
 
 
 def _norms(residual, scales):
-    with np.errstate(all="ignore"):
-        norm = np.max(np.abs(residual) / scales, axis=0).astype(REAL)
+    norm = np.max(np.abs(residual) / scales, axis=0).astype(REAL)
     return np.where(np.isfinite(norm), norm, np.inf)
 
 
 def _least_steps(jacobian, residual):
-    """Steps of least length to where the linearised residual vanishes, (nz, N)."""
+    """Steps of least length to where the linearised residual vanishes, (nz, N); zero where this is not finite."""
     a = np.moveaxis(jacobian, 2, 0)
     scale = np.sqrt((a**2).sum(axis=2))
     scale[~(scale > 0)] = 1.0
     a, b = a / scale[:, :, None], (residual.T / scale).astype(float)
-    if np.all(np.isfinite(a)) and np.all(np.isfinite(b)):
-        gram = a @ a.swapaxes(1, 2)
-        try:
-            if np.linalg.cholesky(gram).diagonal(axis1=1, axis2=2).min(initial=np.inf) > WELL_CONDITIONED:
-                return -(a.swapaxes(1, 2) @ np.linalg.solve(gram, b[:, :, None]))[:, :, 0].T.astype(REAL)
-        except np.linalg.LinAlgError:
-            pass
-    return np.array([_least_step(jacobian[:, :, p], residual[:, p]) for p in range(residual.shape[1])]).T
+    steps = _normal_steps(a, b)
+    return (np.array([_least_step(*one) for one in zip(a, b, strict=True)]) if steps is None else steps).T.astype(REAL)
 
 
-def _least_step(jacobian, residual):
-    scale = np.sqrt((jacobian**2).sum(axis=1))
-    scale = np.where(scale > 0, scale, 1.0)
-    a, b = jacobian / scale[:, None], residual / scale
+def _least_step(a, b):
+    """The step of least length at one point, by singular values where the normal equations lose digits."""
     if not (np.all(np.isfinite(a)) and np.all(np.isfinite(b))):
-        return np.zeros(jacobian.shape[1], dtype=REAL)
-    b, gram = b.astype(float), a @ a.T
+        return np.zeros(a.shape[1])
+    steps = _normal_steps(a[None], b[None])
+    return -np.linalg.lstsq(a, b, rcond=CUTOFF)[0] if steps is None else steps[0]
+
+
+def _normal_steps(a, b):
+    """-Aᵀ(A Aᵀ)⁻¹ b of A (N, m, nz) and b (N, m), or None unless all are finite and well conditioned."""
+    if not (np.all(np.isfinite(a)) and np.all(np.isfinite(b))):
+        return None
+    gram = a @ a.swapaxes(1, 2)
     try:
-        least = np.diag(np.linalg.cholesky(gram)).min()
+        pivots = np.linalg.cholesky(gram).diagonal(axis1=1, axis2=2)
     except np.linalg.LinAlgError:
-        least = 0.0
-    if least > WELL_CONDITIONED:
-        return -(a.T @ np.linalg.solve(gram, b)).astype(REAL)
-    return -np.linalg.lstsq(a, b, rcond=1e-11)[0].astype(REAL)
+        return None
+    if not pivots.min(initial=np.inf) > WELL_CONDITIONED:
+        return None
+    return -(a.swapaxes(1, 2) @ np.linalg.solve(gram, b[:, :, None]))[:, :, 0]
 
 
-def sample(q, rows, level, context, starts=None, flow=None, count=5, seed=1907):
+def sample(q, rows, level, context, starts=None, flow=None):
     """Seeded random points that satisfy rows and their derivatives up to a level.
 
     Parameters
@@ -240,40 +247,45 @@ def sample(q, rows, level, context, starts=None, flow=None, count=5, seed=1907):
         Earlier points: their jets are starts, beside random ones.
     flow : Flow, optional
         Of the same rows and level, from an earlier call.
-    count : int
-        Points to look for.
 
     Returns
     -------
     Points
-        Those that were found, at most `count`; none if no start converged.
+        Those that were found, at most `POINTS`; none if no start converged.
     """
-    rng = np.random.default_rng(seed)
-    count_tried = 2 * count
-    nz = q.nq + level * q.n
+    t, z = _random_starts(q, level, context)
+    if starts is not None and len(starts.t):
+        shared = min(len(z), len(starts.z))
+        for i in range(POINTS):
+            again, p = divmod(i, len(starts.t))
+            t[i], z[:shared, i] = starts.t[p], starts.z[:shared, p] + again * SPREAD * z[:shared, i]
+    starting = Points(q, t, z.astype(REAL), context.parameters, context.values, np.zeros(len(t)), context.book)
+    flow = flow.at(starting) if flow else Flow(q, rows, level, starting)
+    points = _solved(starting, flow, slice(POINTS))
+    if len(points.t) == POINTS:
+        return points
+    return points.joined(_solved(starting, flow, slice(POINTS, None))).take(slice(POINTS))
+
+
+def _random_starts(q, level, context):
+    """Times (2 POINTS,) in the window and jets (nz, 2 POINTS) about the guess, in [-1, 1] where there is none."""
+    rng, nz = np.random.default_rng(POINTS_SEED), q.nq + level * q.n
     centre, spread = np.zeros(nz), np.ones(nz)
     for name, value in context.guess.items():
         for k in range(level + 1):
             if name in q.jet_names(k):
                 i = q.jet_names(k).index(name) + (q.nq + (k - 1) * q.n if k else 0)
-                size = abs(value) + 0.1 * context.sizes.get(name, 1.0)
+                size = abs(value) + SPREAD * context.sizes.get(name, 1.0)
                 centre[i], spread[i] = value / factorial(k), context.spread * size / factorial(k)
-    z = centre[:, None] + spread[:, None] * rng.uniform(-1.0, 1.0, (nz, count_tried))
-    t = np.asarray(rng.uniform(*context.window, count_tried), dtype=REAL)
-    if starts is not None and len(starts.t):
-        shared = min(nz, len(starts.z))
-        for i in range(count):
-            t[i] = starts.t[i % len(starts.t)]
-            z[:shared, i] = starts.z[:shared, i % len(starts.t)] + (i // len(starts.t)) * 0.1 * z[:shared, i]
-    starting = Points(q, t, z.astype(REAL), context.parameters, context.values, np.zeros(count_tried), context.book)
-    flow = flow.at(starting) if flow else Flow(q, rows, level, starting)
-    found = []
-    for some in (slice(count), slice(count, None)):  # the second half is needed where one of the first failed
-        if sum(len(part.t) for part in found) < count:
-            solved, residual = solve(flow, t[some], z[:, some])
-            part = replace(starting, t=t[some], z=solved, residual=residual.astype(float))
-            found.append(part.take(np.flatnonzero(residual < 1e-13)))
-    return found[0] if len(found) == 1 else found[0].joined(found[1]).take(slice(count))
+    z = centre[:, None] + spread[:, None] * rng.uniform(-1.0, 1.0, (nz, 2 * POINTS))
+    return np.asarray(rng.uniform(*context.window, 2 * POINTS), dtype=REAL), z
+
+
+def _solved(starting, flow, some):
+    """Those of some starting points that Newton's method brings onto the manifold."""
+    z, residual = solve(flow, starting.t[some], starting.z[:, some])
+    points = replace(starting, t=starting.t[some], z=z, residual=residual.astype(float))
+    return points.take(np.flatnonzero(residual < ON_MANIFOLD))
 
 
 @dataclass(frozen=True)
@@ -300,6 +312,6 @@ class Context:
     values: np.ndarray
     window: tuple
     guess: dict
-    spread: float = 0.1
+    spread: float = SPREAD
     sizes: dict = field(default_factory=dict)
     book: Book = field(default_factory=Book, repr=False, compare=False)

@@ -7,15 +7,18 @@ import numpy as np
 
 from servoctl.reduction.elimination import eliminate
 from servoctl.reduction.manifold import sample
-from servoctl.reduction.ranks import ENTRY, clean, combination, decide, equilibrate
-from servoctl.reduction.row import gradient, merge_uses
+from servoctl.reduction.ranks import clean, combination, decide, equilibrate, refined
+from servoctl.reduction.row import merge_uses
+from servoctl.tolerances import DEPENDENT, ENTRY
 
-DEPENDENT = 1e-11  # what may be left of a row after the combination of others, both equilibrated
+TAKES_PART = 1e-12  # coefficient times the largest entry of a row: below this the row is no part of a combination
+SUPPORTS = 1e-9  # equilibrated coefficient, at any point, above which a row is part of a dependence
+BASIS_CUTOFF = 1e-12  # singular values of rows found independent, against the largest
 
 
 def leading(q, rows, points):
     """The cleaned leading matrix L at points, (rows, n, N), and the sizes of its entries."""
-    values, sizes = points.matrix(ca.vertcat(*(gradient(q, row) for row in rows)))
+    values, sizes = points.matrix(ca.vertcat(*(row.gradient(q) for row in rows)))
     return clean(values, sizes), sizes
 
 
@@ -28,18 +31,18 @@ def settle_alone(q, rows, context):
         With the values of its leading gradient at the points, where this look was enough.
     """
     levels = [q.order(row.expression) for row in rows]
-    found = [None] * len(rows)
+    settled = [None] * len(rows)
     for level in set(levels) - {-1}:
-        members = [a for a, own in enumerate(levels) if own == level and rows[a].order <= level]
+        members = [a for a, order in enumerate(levels) if order == level and rows[a].order <= level]
         points = sample(q, [], level, context)
-        gradients = [gradient(q, rows[a], level) for a in members]
+        gradients = [rows[a].gradient(q, level) for a in members]
         points.read([*(rows[a].expression for a in members), *(e for g in gradients for e in g.nonzeros())])
         values = clean(*points.matrix(ca.vertcat(*gradients)))
         for a, slopes, numbers in zip(members, gradients, values, strict=True):
             if np.any(numbers):
                 affine = q.order(slopes) < level or _affine(q, rows[a].expression, level, points)
-                found[a] = replace(rows[a], order=level, affine=affine), numbers
-    return [pair or (settle(q, row, [], context)[0], None) for pair, row in zip(found, rows, strict=True)]
+                settled[a] = replace(rows[a], order=level, affine=affine), numbers
+    return [pair or (settle(q, row, [], context)[0], None) for pair, row in zip(settled, rows, strict=True)]
 
 
 def settle(q, row, others, context, starts=None):
@@ -68,7 +71,7 @@ def settle(q, row, others, context, starts=None):
     if not len(points.t):
         return None, points
     for j in range(q.order(row.expression), -1, -1):
-        values, sizes = points.matrix(gradient(q, row, j))
+        values, sizes = points.matrix(row.gradient(q, j))
         values = clean(values, sizes)[0]
         if np.any(values):
             lower = [other for other in others if other.order < j or (other.order == j and other.affine and j > 0)]
@@ -78,7 +81,7 @@ def settle(q, row, others, context, starts=None):
             row = replaced
         elif j > 0:
             row = _drop(q, row, q.gamma(j), points)
-    if q.order(row.expression) == 0 and not np.any(clean(*points.matrix(gradient(q, row, 0)))):
+    if q.order(row.expression) == 0 and not np.any(clean(*points.matrix(row.gradient(q, 0)))):
         return replace(row, order=-1), points
     return replace(row, order=max(q.order(row.expression), -1)), points
 
@@ -112,7 +115,7 @@ def _replace(q, row, j, values, lower, points):
         c, left = combination(numbers[:, :, p], values[:, p])
         if left > DEPENDENT:
             return None
-        support |= set(np.flatnonzero(np.abs(c * np.abs(numbers[:, :, p]).max(axis=1).astype(float)) > 1e-12))
+        support |= set(np.flatnonzero(np.abs(c * np.abs(numbers[:, :, p]).max(axis=1).astype(float)) > TAKES_PART))
     chosen = _independent([lower[a] for a in sorted(support)], numbers[sorted(support)])
     if not chosen or any(other.order == j and not other.affine for other, _ in chosen):
         return None
@@ -122,7 +125,7 @@ def _replace(q, row, j, values, lower, points):
     zero = ca.SX.zeros(len(jets))
     raised = ca.vertcat(*(q.derivatives([other.expression], j - other.order)[-1][0] for other in rows))
     rest = ca.substitute(raised, ca.vertcat(*jets), zero)
-    matrix = ca.vertcat(*(gradient(q, other) for other in rows))[:, columns]
+    matrix = ca.vertcat(*(other.gradient(q) for other in rows))[:, columns]
     solution, _ = eliminate(matrix, -rest, numbers[:, columns])
     full = ca.SX.zeros(len(jets))
     full[columns] = solution
@@ -132,12 +135,12 @@ def _replace(q, row, j, values, lower, points):
 
 def _independent(rows, numbers):
     """A largest independent subset of rows, with their numbers."""
-    kept = []
+    independent = []
     for row, number in zip(rows, numbers, strict=True):
-        trial = [*kept, (row, number)]
+        trial = [*independent, (row, number)]
         if decide(np.array([n[:, 0] for _, n in trial])).rank == len(trial):
-            kept = trial
-    return kept
+            independent = trial
+    return independent
 
 
 def dependence(q, rows, numbers):
@@ -162,23 +165,15 @@ def dependence(q, rows, numbers):
     for b in range(len(rows)):
         coefficients, left = [], []
         for p in range(scaled.shape[2]):
-            c, rest = _plain_combination(scaled[basis, :, p], scaled[b, :, p])
+            c, rest = refined(scaled[basis, :, p], scaled[b, :, p], BASIS_CUTOFF)
             coefficients.append(np.abs(c))
             left.append(rest)
         if max(left) > DEPENDENT:
             basis.append(b)
             continue
         size = np.array(coefficients)
-        support = [a for i, a in enumerate(basis) if size[:, i].max(initial=0.0) > 1e-9]
+        support = [a for i, a in enumerate(basis) if size[:, i].max(initial=0.0) > SUPPORTS]
         weights = [size[:, i].min(initial=np.inf) for i, a in enumerate(basis) if a in support]
         return [*support, b], np.array([*weights, 1.0])
     return [], np.array([])
 
-
-def _plain_combination(rows, target):
-    c, residual = np.zeros(len(rows)), target.copy()
-    for _ in range(3):
-        if len(rows):
-            c = c + np.linalg.lstsq(rows.T.astype(float), residual.astype(float), rcond=1e-12)[0]
-            residual = target - c.astype(np.longdouble) @ rows
-    return c, float(np.abs(residual).max(initial=0.0))

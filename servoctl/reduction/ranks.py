@@ -9,10 +9,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-ENTRY = 1e-12  # an entry below this fraction of its terms' size is zero
-RESOLVED = 1e-10  # an equilibrated pivot above this can be divided by in double precision
-EXTENDED = np.finfo(np.longdouble).eps < 1e-18
-NOISE = 3e-17 if EXTENDED else 1e-13  # an equilibrated pivot below this is zero
+from servoctl.tolerances import CUTOFF, ENTRY, NOISE, REFINEMENTS, RESOLVED, TINY
+
+SWEEPS = 6  # of equilibration, each takes the root of what is left: entries of 1e±30 come within a factor of 3
 
 
 @dataclass(frozen=True)
@@ -61,7 +60,7 @@ def equilibrate(matrix):
     """
     a = np.array(matrix, dtype=np.longdouble)
     rows, columns = np.ones(a.shape[:-1], dtype=a.dtype), np.ones(a.shape[:-2] + a.shape[-1:], dtype=a.dtype)
-    for _ in range(6 if a.size else 0):
+    for _ in range(SWEEPS if a.size else 0):
         for axis, factors in ((-1, rows), (-2, columns)):
             largest = np.abs(a).max(axis=axis)
             scale = 1.0 / np.sqrt(np.where(largest > 0, largest, 1.0))
@@ -169,19 +168,19 @@ def combination(rows, target):
     c : (m,) array
     left : float
     """
-    scaled, row_factors, column_factors = equilibrate(np.vstack([rows, target[None, :]]))
-    a, b = scaled[:-1].astype(float), scaled[-1].astype(float)
-    c = np.zeros(len(a))
-    if len(a):
-        residual = scaled[-1].copy()
-        for _ in range(3):  # refined in extended precision
-            step = np.linalg.lstsq(a.T, residual.astype(float), rcond=1e-11)[0]
-            c = c + step
-            residual = scaled[-1] - c.astype(np.longdouble) @ scaled[:-1]
-    else:
-        residual = scaled[-1]
-    left = float(np.abs(residual).max(initial=0.0)) / max(float(np.abs(b).max(initial=0.0)), 1e-300)
-    return c * (row_factors[:-1] / row_factors[-1]).astype(float), left
+    scaled, row_factors, _ = equilibrate(np.vstack([rows, target[None, :]]))
+    c, left = refined(scaled[:-1], scaled[-1], CUTOFF)
+    largest = float(np.abs(scaled[-1].astype(float)).max(initial=0.0))
+    return c * (row_factors[:-1] / row_factors[-1]).astype(float), left / max(largest, TINY)
+
+
+def refined(rows, target, cutoff):
+    """Least squares c @ rows = target, refined in extended precision: c (m,) and the largest residual."""
+    c, residual = np.zeros(len(rows)), target.copy()
+    for _ in range(REFINEMENTS if len(rows) else 0):
+        c = c + np.linalg.lstsq(rows.T.astype(float), residual.astype(float), rcond=cutoff)[0]
+        residual = target - c.astype(np.longdouble) @ rows
+    return c, float(np.abs(residual).max(initial=0.0))
 
 
 def solve_clean(matrix, right):

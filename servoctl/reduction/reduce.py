@@ -8,16 +8,24 @@ import numpy as np
 
 from servoctl.checks import finite, mapping
 from servoctl.errors import NotRealisable, SpecificationError, unknown
+from servoctl.jets.flow import Flow
 from servoctl.reduction.appell import Realisation, realisation, require_inertia
-from servoctl.reduction.flow import Flow
 from servoctl.reduction.hidden import as_rows, complete
 from servoctl.reduction.knots import Knots, Switches, require_smooth
 from servoctl.reduction.manifold import Context, Points, sample
 from servoctl.reduction.orders import settle_alone
 from servoctl.reduction.ranks import Rank, clean, decide, decide_all
-from servoctl.reduction.row import Row, gradient, merge_uses
+from servoctl.reduction.row import Balance, Row, merge_uses
 from servoctl.spec.mechanism import Mechanism, require_known
 from servoctl.spec.program import Program
+from servoctl.tolerances import TINY
+
+NEARBY = 0.01  # s about an instant for which pivots are chosen: at the instant alone, accidents look like laws
+NEAR_SPREAD = 1e-3  # relative width of the points about a state for which pivots are chosen
+WINDOW = (0.1, 1.1)  # s, where points are drawn if nothing switches; t = 0 is too often a special instant
+LONE_WINDOW = 1.0  # s on either side of a single switch
+INSET = 0.07  # of the time between the first and the last switch is left out at both ends, where paths begin and end
+HELD = 1e-9  # of the size of its terms: what may be left of a residual at points where the rows hold
 
 
 @dataclass(frozen=True)
@@ -41,7 +49,7 @@ class Reduction:
     switches : Switches
     context : Context
     given : dict of str to Row
-        The designer's residuals and the material constraints as they were given.
+        Rows of the designer's residuals and material constraints, by name.
     """
 
     mechanism: Mechanism
@@ -81,6 +89,11 @@ class Reduction:
         return smoothness(self.switches, self.rows)
 
     @property
+    def timed(self):
+        """Whether paths switch at instants."""
+        return bool(self.switches)
+
+    @property
     def hidden(self):
         """The rows that are hidden constraints."""
         return tuple(row for row in self.rows if row.story)
@@ -88,16 +101,16 @@ class Reduction:
     @cached_property
     def leading(self):
         """The leading matrix L, (n, n) SX."""
-        return ca.vertcat(*(gradient(self.mechanism.q, row) for row in self.rows))
+        return ca.vertcat(*(row.gradient(self.mechanism.q) for row in self.rows))
 
     @cached_property
     def conditions(self):
         """What `holds` looks at: L, Bᵀ, and then the residuals with their derivatives, and the balance."""
-        q, own = self.mechanism.q, self.realisation.B
+        q, B = self.mechanism.q, self.realisation.B
         levels = (q.derivatives([row.expression], max(0, self.top - row.order)) for row in self.given.values())
-        left = [level[0] for found in levels for level in found]
-        free = self.mechanism.balance - own @ self.multipliers
-        return [*self.leading.nonzeros(), *own.T.nonzeros(), *left, *free.elements()]
+        left = [level[0] for orders in levels for level in orders]
+        free = self.mechanism.balance - B @ self.multipliers
+        return [*self.leading.nonzeros(), *B.T.nonzeros(), *left, *free.elements()]
 
     @cached_property
     def decided(self):
@@ -118,29 +131,24 @@ class Reduction:
     def actuation(self):
         """Required actuation u (m,) SX, or for an ideal program the reaction of the program, (n,) SX."""
         k = len(self.program.residuals)
-        own = self.multipliers[:k]
+        multipliers = self.multipliers[:k]
         if self.program.by == "actuators":
-            return ca.cse(self.realisation.actuation @ own)
-        return ca.cse(self.realisation.B[:, :k] @ own)
-
-
-NEARBY = 0.01  # s about an instant for which pivots are chosen: at the instant alone, accidents look like laws
-HELD = 1e-9  # of the size of its terms: what may be left of a residual at points where the rows hold
-FORCE = "the force on"  # names in the balance, in refusals of forces that jump
+            return ca.cse(self.realisation.actuation @ multipliers)
+        return ca.cse(self.realisation.B[:, :k] @ multipliers)
 
 
 def needs(rows):
-    """Derivatives of each residual, and of the given forces, that stand in γ'' and so in the actuation."""
+    """Derivatives of each residual and of the balance that γ'', and so the actuation, holds."""
     return merge_uses(*((row.uses, max(0, 2 - row.order)) for row in rows))
 
 
 def smoothness(switches, rows):
     """The class in time that each expression of the switches needs; a force that no derivative is taken of may jump."""
-    found = needs(rows)
-    forces = found.get(FORCE, 0)
+    total = needs(rows)
+    forces = total.pop(Balance(), 0)
     if forces:
-        found |= dict.fromkeys((name for name in switches.residuals if name.startswith(FORCE)), forces)
-    return found
+        total |= {name: forces for name in switches.residuals if isinstance(name, Balance)}
+    return total
 
 
 def _idle(row, program):
@@ -175,19 +183,22 @@ def reduce(mechanism, program, guess=None, near=None, values=None):
     SpecificationError, NotRealisable, SingularProgram, InconsistentStart
         See `hidden.complete` and `appell.realisation`.
     """
-    _check(mechanism, program, guess)
+    _require_parts(mechanism, program, guess)
     q = mechanism.q
     names = q.names if q.plain else q.velocity_names
-    forces = {f"{FORCE} {name}": r for name, r in zip(names, mechanism.balance.elements(), strict=True)}
+    forces = {Balance(name): r for name, r in zip(names, mechanism.balance.elements(), strict=True)}
     switches = Switches(q, {**program.residuals, **mechanism.constraints, **forces}, mechanism.parameters.symbols)
     context = _context(mechanism, switches, guess, near, values)
-    given = as_rows(q, program.residuals, "program", context) + as_rows(q, mechanism.constraints, "material", context)
-    constraints, points, guards = _constraints(mechanism, program, given, context)
+    original = [
+        *as_rows(q, program.residuals, "program", context),
+        *as_rows(q, mechanism.constraints, "material", context),
+    ]
+    constraints, points, guards = _constraints(mechanism, program, original, context)
     split = realisation(mechanism, program, constraints, points)
     expressions, pivots = split.dynamics(mechanism.balance)
     guards = [*guards, *((f"choice of dependent coordinates {i + 1}", p) for i, p in enumerate(pivots))]
     dynamics = [
-        Row(e, max(q.order(e), 0), f"balance of {names[i]}", "dynamics", uses={FORCE: 0})
+        Row(e, max(q.order(e), 0), f"balance of {names[i]}", "dynamics", uses={Balance(): 0})
         for i, e in zip(split.independent, expressions, strict=True)
     ]
     dynamics = [row for row, _ in settle_alone(q, dynamics, context)]
@@ -196,12 +207,12 @@ def reduce(mechanism, program, guess=None, near=None, values=None):
             raise _idle(row, program)
     rows, rank, points, more = complete(q, [*constraints, *dynamics], context, points)
     knots = require_smooth(switches, context.values, smoothness(switches, rows))
-    by_name = {row.name: row for row in given}
-    found = Reduction(
+    by_name = {row.name: row for row in original}
+    reduction = Reduction(
         mechanism, program, tuple(rows), split, rank, points, (*guards, *more), knots, switches, context, by_name
     )
-    _require_outputs(found)
-    return found
+    _require_outputs(reduction)
+    return reduction
 
 
 def holds(reduction, values):
@@ -228,21 +239,21 @@ def holds(reduction, values):
     for sparsity in (r.leading.sparsity(), r.realisation.B.T.sparsity()):
         entries = slice(start, start + sparsity.nnz())
         old, new = (
-            clean(*p.placed(sparsity, *(part[entries] for part in found)))
-            for p, found in ((r.points, r.decided), (points, after))
+            clean(*p.placed(sparsity, *(part[entries] for part in values_and_sizes)))
+            for p, values_and_sizes in ((r.points, r.decided), (points, after))
         )
         if np.any(np.any(new, axis=2) & ~np.any(old, axis=2)) or decide(new[:, :, 0]).rank < len(new):
             return False
         start = entries.stop
-    found, sizes = (part[start:] for part in after)
-    return bool(np.all(np.abs(found) <= HELD * np.maximum(sizes, 1e-300)))
+    left, sizes = (part[start:] for part in after)
+    return bool(np.all(np.abs(left) <= HELD * np.maximum(sizes, TINY)))
 
 
-def _check(mechanism, program, guess):
+def _require_parts(mechanism, program, guess):
     for value, kind in ((mechanism, Mechanism), (program, Program)):
         if not isinstance(value, kind):
             raise SpecificationError(
-                f"A {type(value).__name__} was given in the place of a {kind.__name__}.",
+                f"Expected a {kind.__name__}, got a {type(value).__name__}.",
                 "A model is derived from a mechanism and a program, in this order.",
                 do="Write sv.derive(mechanism, program).",
             )
@@ -254,7 +265,7 @@ def _check(mechanism, program, guess):
     twice = [name for name in program.residuals if name in mechanism.constraints]
     if twice:
         raise SpecificationError(
-            f"{twice[0]!r} names a residual and a material constraint.", "Each has a name of its own.", do="Rename one."
+            f"{twice[0]!r} names a residual and a material constraint.", "Their names differ.", do="Rename one of them."
         )
     known = [*q.names, *(name for k in range(1, 8) for name in q.jet_names(k))]
     for name, value in mapping(guess, "The guesses").items():
@@ -274,7 +285,7 @@ def _constraints(mechanism, program, given, context):
         return constraints, points, guards
     constraints = [*program_rows, *material]
     points = _points_for(q, constraints, points, context)
-    G = ca.vertcat(*(gradient(q, row) for row in constraints))
+    G = ca.vertcat(*(row.gradient(q) for row in constraints))
     if decide_all(*points.matrix(G))[0].rank < len(constraints):
         complete(q, constraints, context, points)
     return constraints, points, guards
@@ -288,8 +299,7 @@ def _require_outputs(reduction):
             raise SpecificationError(
                 f"The output {name!r} has order {q.order(expression)}.",
                 f"A motion of this program has jets up to order {top}.",
-                nearest='simulate(..., method=sv.Taylor(jets=...)) for derivatives of any order.',
-                do="Give an output of lower order, and take its derivatives from such a run.",
+                do="Give an output of lower order, and take its derivatives from a run of the Taylor method with jets.",
                 name=name,
             )
 
@@ -298,18 +308,18 @@ def _context(mechanism, switches, guess, near, values):
     values = mechanism.parameters.values() if values is None else np.asarray(values, dtype=float)
     if near is not None:
         t, guess, sizes = near
-        return Context(mechanism.parameters.symbols, values, (t - NEARBY, t + NEARBY), guess, 1e-3, sizes)
+        return Context(mechanism.parameters.symbols, values, (t - NEARBY, t + NEARBY), guess, NEAR_SPREAD, sizes)
     times = switches.times(values)
-    window = (0.1, 1.1)
+    window = WINDOW
     if len(times) == 1:
-        window = (times[0] - 1.0, times[0] + 1.0)
+        window = (times[0] - LONE_WINDOW, times[0] + LONE_WINDOW)
     elif times:
         width = times[-1] - times[0]
-        window = (times[0] + 0.07 * width, times[-1] - 0.07 * width)
+        window = (times[0] + INSET * width, times[-1] - INSET * width)
     return Context(mechanism.parameters.symbols, values, window, guess or {})
 
 
 def _points_for(q, constraints, points, context):
     """Points on the manifold of all constraints, or on that of the material ones where there are none."""
-    found = sample(q, constraints, max([2, *(row.order for row in constraints)]), context)
-    return found if len(found.t) else points
+    common = sample(q, constraints, max([2, *(row.order for row in constraints)]), context)
+    return common if len(common.t) else points

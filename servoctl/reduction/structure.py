@@ -11,12 +11,12 @@ from dataclasses import dataclass, replace
 import casadi as ca
 import numpy as np
 
-from servoctl.reduction.flow import Flow
+from servoctl.jets.flow import Flow
 from servoctl.reduction.manifold import solve
 from servoctl.reduction.ranks import decide, solve_clean
 from servoctl.reduction.row import Row
+from servoctl.tolerances import ENTRY
 
-ZERO = 1e-12  # of the size of its terms: below this an entry of J is zero
 INDEPENDENT = 1e-7  # equilibrated pivots of J above this count
 AT_REST = 1e-13  # of the largest jet: below this a jet is zero, not small
 DEPTHS = (2, 4, 6, 8, 12, 16, 24, 32)  # N that are tried until all zeros at infinity are found
@@ -54,7 +54,8 @@ class Structure:
     margin : float
         Smallest equilibrated pivot that was counted in any rank.
     realisation : str
-        "orthogonal", "mixed" or "tangential": rank of P full, between, or zero.
+        "orthogonal", "mixed" or "tangential": rank of P full, between, or zero; "undecided" if not all zeros at
+        infinity were found; "ideal".
     at : tuple of (float, Local)
         The structure at each instant [s].
     """
@@ -79,7 +80,7 @@ class Structure:
         if self.index is None and not self.zeros_at_infinity:
             return "Structure: not computed, index and relative degrees are those of residuals of order 0, 1 or 2"
         vector = "a vector relative degree exists" if self.decoupling_rank == k else "no vector relative degree"
-        pairs = ", ".join(f"{name} {r}" for name, r in zip(self.residuals, self.relative_degree, strict=True))
+        pairs = ", ".join(f"{name} {r}" for name, r in zip(self.residuals, self.relative_degree, strict=False))
         essential = ", ".join(f"{name} {r}" for name, r in zip(self.residuals, self.essential_orders, strict=False))
         lines = [
             f"Structure: index {'not defined' if self.index is None else self.index}; {self.realisation} realisation",
@@ -124,12 +125,9 @@ def structure(reduction, t=None, jets=None, values=None):
     points = reduction.points if t is None else _points(reduction, t, jets, values)
     locals_ = _locals(reduction, points)
     typical = _most_common(locals_)
-    rank_P = (
-        typical.decoupling_rank
-        if max(typical.relative_degree) <= 2
-        else sum(r <= 2 for r in typical.relative_degree) and typical.decoupling_rank
-    )
+    rank_P = typical.decoupling_rank if any(r <= 2 for r in typical.relative_degree) else 0
     kind = "orthogonal" if rank_P == len(names) else "tangential" if rank_P == 0 else "mixed"
+    kind = kind if typical.relative_degree else "undecided"
     margin = min(local.margin for local in locals_)
     at = tuple(zip(np.asarray(points.t, dtype=float).tolist(), locals_, strict=True))
     return Structure(
@@ -158,8 +156,8 @@ def _points(reduction, t, jets, values):
     """Points of a motion from its samples."""
     from math import factorial
 
-    q, given = reduction.mechanism.q, np.asarray(jets, dtype=np.longdouble)
-    z = given.copy()
+    q, samples = reduction.mechanism.q, np.asarray(jets, dtype=np.longdouble)
+    z = samples.copy()
     for k in range(1, (len(z) - q.nq) // q.n + 1):
         z[q.nq + (k - 1) * q.n : q.nq + k * q.n] /= factorial(k)
     sample = reduction.points
@@ -169,9 +167,9 @@ def _points(reduction, t, jets, values):
 
 def _locals(reduction, points):
     for depth in DEPTHS:
-        found = _at_depth(reduction, points, depth)
-        if found is not None:
-            return found
+        locals_ = _at_depth(reduction, points, depth)
+        if locals_ is not None:
+            return locals_
     return [Local((), 0, (), (), None, 0.0)] * len(points.t)
 
 
@@ -189,7 +187,7 @@ def _at_depth(reduction, points, depth):
     J, sizes = _input_jacobian(reduction, points, z, depth)
     result = []
     for p in range(len(points.t)):
-        clean = np.where(np.abs(J[..., p]) <= ZERO * sizes[..., p], 0.0, J[..., p])
+        clean = np.where(np.abs(J[..., p]) <= ENTRY * sizes[..., p], 0.0, J[..., p])
         local = _local(clean, k, depth)
         if local is None:
             return None
@@ -248,23 +246,23 @@ def _response(jacobian, b, plant, bound, k, depth):
     motion = np.zeros((n * size, k, size), dtype=np.longdouble)
     reaction = np.zeros((k_m, size, k, size), dtype=np.longdouble)
     for i in range(size):
-        own = [*order[i * n : (i + 1) * n], *(n * size + i * k_m + m for m in range(k_m))]
-        block = rows[own][:, i * n : (i + 1) * n]
+        members = [*order[i * n : (i + 1) * n], *(n * size + i * k_m + m for m in range(k_m))]
+        block = rows[members][:, i * n : (i + 1) * n]
         matrix = np.block([[block[:n], -b[k:, :, 0].T], [block[n:], np.zeros((k_m, k_m))]])
         right = np.zeros((n + k_m, k, size), dtype=np.longdouble)
         for j in range(i + 1):
             right[:n, :, j] += b[:k, :, i - j].T
             if j < i:
                 right[:n] += np.einsum("am,mkl->akl", b[k:, :, i - j].T, reaction[:, j])
-        right -= np.einsum("ac,ckl->akl", rows[own][:, : i * n], motion[: i * n])
+        right -= np.einsum("ac,ckl->akl", rows[members][:, : i * n], motion[: i * n])
         solution = solve_clean(matrix, right.reshape(n + k_m, -1)).reshape(n + k_m, k, size)
         motion[i * n : (i + 1) * n], reaction[:, i] = solution[:n], solution[n:]
     return motion.reshape(n * size, k * size)
 
 
 def _rank(matrix):
-    found = decide(matrix, INDEPENDENT)
-    return found.rank, found.kept
+    rank = decide(matrix, INDEPENDENT)
+    return rank.rank, rank.kept
 
 
 def _local(J, k, depth):

@@ -9,7 +9,7 @@ from servoctl.shell.options import by_name
 
 
 @dataclass(frozen=True)
-class Motion:
+class Scenario:
     """A derived model with its numbers, its start, and its time (t0, t1) [s]."""
 
     model: object
@@ -29,7 +29,7 @@ def described(args, scene, report, require=lambda model: None):
     report.say(model)
     start = _start(model, scene, span[0], held, guess)
     report.say(start)
-    return Motion(model, start, span)
+    return Scenario(model, start, span)
 
 
 def with_parameters(model, changes):

@@ -7,7 +7,7 @@ from servoctl.errors import SpecificationError
 from servoctl.spec.coordinates import Coordinates
 
 
-def particle(q, mass, position):
+def particle(q: Coordinates, mass, position):
     """The Gibbs-Appell function of a particle, S = m a·a / 2 (3.8).
 
     Parameters
@@ -33,7 +33,7 @@ def particle(q, mass, position):
     return mass * ca.dot(acceleration, acceleration) / 2
 
 
-def rigid_body(q, mass, inertia, position=None, rotation=None, rates=None):
+def rigid_body(q: Coordinates, mass, inertia, position=None, rotation=None, rates=None):
     """The Gibbs-Appell function of a rigid body (3.11), about its centre of mass or a fixed point.
 
     S = m a·a/2 + α·Jα/2 + α·(ω × Jω), with ω, α and J in the body's axes.
@@ -63,7 +63,7 @@ def rigid_body(q, mass, inertia, position=None, rotation=None, rates=None):
     """
     if (rotation is None) == (rates is None):
         raise SpecificationError(
-            "rigid_body was given " + ("neither" if rates is None else "both") + " of rotation and rates.",
+            f"rigid_body has {'neither' if rates is None else 'both'} of rotation and rates.",
             "The body's rates come from one of them.",
             do="Give rotation=R(q) or rates=ω(q, q').",
         )
@@ -77,7 +77,7 @@ def rigid_body(q, mass, inertia, position=None, rotation=None, rates=None):
     return particle(q, mass, position) + spin
 
 
-def body_rates(q, rotation):
+def body_rates(q: Coordinates, rotation):
     """Body rates ω [rad/s] of a rotation matrix R from body to inertial axes: RᵀR' is the cross product by ω.
 
     Parameters

@@ -1,6 +1,8 @@
 """Generalised coordinates, quasi-velocities and their jets, and the total derivative (3.1)."""
 
 import threading
+from collections.abc import Iterable
+from math import factorial
 from numbers import Integral
 
 import casadi as ca
@@ -8,16 +10,17 @@ import casadi as ca
 from servoctl.checks import column, mapping, matrix
 from servoctl.errors import SpecificationError
 from servoctl.jets.elementary import divide, multiply
+from servoctl.jets.motion import Motion
 from servoctl.jets.series import Series, is_zero
 from servoctl.jets.tape import Tape
 
-_guard = threading.Lock()
+_lock = threading.Lock()
 
 
 class Coordinates:
     """Generalised coordinates q, quasi-velocities w with q' = V w + h (3.1), and jets of any order.
 
-    Made by `coordinates`. Iterating gives the coordinates' symbols. Jets are created when first asked for.
+    Made by `coordinates`. Iterating gives the coordinates' symbols. Symbols of jets are made on first use.
 
     Attributes
     ----------
@@ -42,7 +45,7 @@ class Coordinates:
     def __iter__(self):
         return iter(self._q)
 
-    def __len__(self):
+    def __len__(self) -> int:
         return self.nq
 
     @property
@@ -55,7 +58,7 @@ class Coordinates:
         return f"Coordinates({' '.join(self.names)}{frame})"
 
     def with_quasi_velocities(self, names, V, h=None, invariants=None):
-        """The same coordinates, moved by quasi-velocities w of one's own: q' = V w + h (3.1).
+        """The same coordinates, with quasi-velocities w: q' = V w + h (3.1).
 
         Parameters
         ----------
@@ -78,7 +81,7 @@ class Coordinates:
         SpecificationError
             If sizes disagree or a name is taken.
         """
-        names = _split(names, "quasi-velocities")
+        names = _identifiers(names, "quasi-velocities")
         V = matrix(V, "V")
         if V.shape != (self.nq, len(names)):
             raise SpecificationError(
@@ -112,7 +115,7 @@ class Coordinates:
     def gamma(self, k):
         """Symbols of γ^(k), k >= 1: a tuple of n SX scalars. γ' are the quasi-velocities."""
         if k not in self._w:
-            with _guard:  # threads that derive from one mechanism share its symbols
+            with _lock:  # threads that derive from one mechanism share its symbols
                 if k not in self._w:
                     symbols = tuple(map(ca.SX.sym, self.jet_names(k)))
                     self._index |= {s.element_hash(): ("w", k, i) for i, s in enumerate(symbols)}
@@ -123,7 +126,7 @@ class Coordinates:
         """γ^(k), k >= 1, or q for k = 0, as a column: (n,) or (nq,) SX."""
         return ca.vertcat(*(self.gamma(k) if k else self._q))
 
-    def jet_names(self, k):
+    def jet_names(self, k: int) -> tuple[str, ...]:
         """Names of γ^(k), k >= 1, or of q for k = 0."""
         if k == 0:
             return self.names
@@ -133,7 +136,7 @@ class Coordinates:
     def d(self, k=1):
         """The k-th time derivatives of the coordinates: a tuple of nq SX scalars.
 
-        Without quasi-velocities of one's own these are symbols; with them, expressions of w and its derivatives.
+        Symbols where q' = w, else expressions of w and its derivatives.
         """
         if _order(k) == 0:
             return self._q
@@ -164,11 +167,11 @@ class Coordinates:
         return self._index.get(symbol.element_hash())
 
     def order(self, expression):
-        """The highest k for which γ^(k) stands in an expression (0 for q alone, -1 for neither)."""
+        """The highest k for which an expression holds γ^(k) (0 for q alone, -1 for neither)."""
         if not isinstance(expression, ca.SX):
             expression = ca.SX(ca.vertcat(*column(expression, "the expression")))
-        found = [self.where(s) for s in ca.symvar(expression)]
-        return max([-1, *(w[1] for w in found if w is not None and w[0] in "qw")])
+        places = [self.where(s) for s in ca.symvar(expression)]
+        return max([-1, *(place[1] for place in places if place is not None and place[0] in "qw")])
 
     def derivatives(self, expressions, k):
         """Total derivatives of orders 0 to k by one propagation of Taylor series.
@@ -185,52 +188,99 @@ class Coordinates:
         expressions = [_as_sx(e) for e in expressions]
         if k == 0:
             return [expressions]
-        series = self._series(expressions, k)
-        factor, result = 1.0, []
-        for j in range(k + 1):
-            factor *= max(j, 1)
-            result.append([_as_sx(multiply(c[j], factor)) for c in series.outputs[: len(expressions)]])
-        return result
+        outputs = self._series(expressions, k).outputs[: len(expressions)]
+        return [[_as_sx(multiply(c[j], float(factorial(j)))) for c in outputs] for j in range(k + 1)]
+
+    def as_function(self, expressions, parameters=()):
+        """Expressions of t, q, the jets and parameters as one function of these, which serialises and pickles.
+
+        Parameters
+        ----------
+        expressions : sequence of SX
+        parameters : sequence of SX
+            Their symbols.
+
+        Returns
+        -------
+        casadi.Function
+        """
+        highest = max(0, self.order(ca.vertcat(*(ca.vec(e) for e in expressions))))
+        return ca.Function("expressions", self._arguments(highest, parameters), list(expressions))
+
+    def from_function(self, function, parameters=()):
+        """The expressions of a function that `as_function` made, here or in another process, in these symbols.
+
+        Parameters
+        ----------
+        function : casadi.Function
+        parameters : sequence of SX
+            Their symbols.
+
+        Returns
+        -------
+        list of SX
+        """
+        return function.call(self._arguments(function.n_in() - 3, parameters), True, False)
+
+    def _arguments(self, highest, parameters):
+        jets = [self.jet(k) for k in range(highest + 1)]
+        return [self.t, *jets, ca.vertcat(ca.SX(0, 1), *parameters)]
+
+    def __reduce__(self):
+        if self.plain:
+            return Coordinates, (self.names,)
+        frame = self.as_function([self.V, self.h, *self.invariants.values()])
+        return _moved, (self.names, self.velocity_names, frame, tuple(self.invariants))
 
     def _series(self, expressions, k):
-        symbols = None
+        """Coefficients 0 to k of expressions, and behind them those of q' = V w + h where q itself is in them."""
+        symbols, moving = None, []
         if not self.plain:
             symbols = ca.symvar(ca.vertcat(*expressions)) if expressions else []
             if any((self.where(s) or ("",))[0] == "q" for s in symbols):
                 symbols = _union(symbols, ca.symvar(ca.vertcat(ca.vec(self.V), self.h)), self._q, self.gamma(1))
-                expressions = [*expressions, *(self.V @ self.jet(1) + self.h).elements()]
-        tape = Tape(symbols, expressions)
-        symbols, places = tape.symbols, [self.where(s) for s in tape.symbols]
-        inputs = [[] for _ in symbols]
+                moving = (self.V @ self.jet(1) + self.h).elements()
+        tape = Tape(symbols, [*expressions, *moving])
+        inputs = [[] for _ in tape.symbols]
         series = Series(tape, inputs)
-        factorial = 1.0
+        motion = _SymbolicMotion(self, [series.c[node] for node in tape.outputs[len(expressions) :]])
         for j in range(k + 1):
-            factorial *= max(j, 1)
-            for i, (symbol, place) in enumerate(zip(symbols, places, strict=True)):
-                inputs[i].append(self._coefficient(symbol, place, j, factorial, series))
+            for symbol, coefficients in zip(tape.symbols, inputs, strict=True):
+                coefficients.append(motion.coefficient(symbol, j))
             series.advance()
         return series
 
-    def _coefficient(self, symbol, place, j, factorial, series):
-        if place is None:
-            return symbol if j == 0 else 0.0
-        kind, level, i = place
-        if kind == "t":
-            return symbol if j == 0 else float(j == 1)
-        if kind == "w":
-            return divide(self.gamma(level + j)[i], factorial)
+
+class _SymbolicMotion(Motion):
+    """The motion whose jets γ^(k) are symbols; `rates` are the coefficients of q', so far, where q' is not γ'."""
+
+    def __init__(self, q, rates):
+        super().__init__(q)
+        self.rates = rates
+
+    def coordinate(self, i, j):
         if j == 0:
-            return symbol
-        if self.plain:
-            return divide(self.gamma(j)[i], factorial)
-        velocity = series.c[series.tape.outputs[i - self.nq]][j - 1]  # the last outputs are q'
-        return 0.0 if is_zero(velocity) else divide(velocity, j)
+            return self.q.d(0)[i]
+        if self.q.plain:
+            return self.velocity(i, 0, j)
+        rate = self.rates[i][j - 1]
+        return 0.0 if is_zero(rate) else divide(rate, j)
+
+    def velocity(self, i, level, j):
+        return divide(self.q.gamma(level + j)[i], float(factorial(j)))
+
+
+def _moved(names, velocity_names, frame, invariants):
+    """Coordinates with quasi-velocities, as another process described them."""
+    q = Coordinates(names)
+    V, h, *values = q.from_function(frame)
+    return q.with_quasi_velocities(" ".join(velocity_names), V, h, dict(zip(invariants, values, strict=True)))
 
 
 def _order(k):
     if isinstance(k, bool) or not isinstance(k, Integral) or k < 0:
         raise SpecificationError(
-            f"A derivative of order {k!r} was asked for.",
+            f"The order of a derivative is {k!r}.",
             "An order is a whole number, at least 0.",
             do="Write q.d(1), q.w(1) or q.dt(expression, 2).",
         )
@@ -255,7 +305,7 @@ def jet_name(name, k, plain=True):
     return name if order == 0 else f"d{name}" if order == 1 else f"d{order}{name}"
 
 
-def _split(names, what):
+def _identifiers(names, what):
     if not isinstance(names, str) or not names.split():
         raise SpecificationError(
             f"The names of the {what} are {names!r}.", "They are one text of names separated by blanks.",
@@ -265,7 +315,7 @@ def _split(names, what):
     for name in names:
         if not name.isidentifier() or name in ("t", "guess"):
             raise SpecificationError(
-                f"{name!r} was given as a name.",
+                f"{name!r} is no name.",
                 "A name is a Python identifier other than t and guess, which are arguments of a start.",
                 do="Rename it.",
             )
@@ -274,7 +324,7 @@ def _split(names, what):
 
 
 def _refuse_clash(names):
-    """Refuse names of which one stands twice, or is the name of a derivative of another."""
+    """Refuse names that repeat, or that are names of derivatives of others."""
     owner = {}
     for name in names:
         if name in owner:
@@ -289,13 +339,13 @@ def _refuse_clash(names):
 def _clash(name, why):
     return SpecificationError(
         f"The name {name!r} clashes: {why}.",
-        "Every coordinate, quasi-velocity and derivative has a name of its own (theta, dtheta, d2theta, ...).",
+        "Coordinates, quasi-velocities and derivatives (theta, dtheta, d2theta, ...) have different names.",
         do="Rename one of them.",
         name=name,
     )
 
 
-def coordinates(names):
+def coordinates(names: str | Iterable[str]) -> Coordinates:
     """Generalised coordinates by name, with jets of any order on demand.
 
     Parameters
@@ -311,6 +361,6 @@ def coordinates(names):
     Raises
     ------
     SpecificationError
-        If a name is no identifier, is `t`, stands twice, or is also a derivative's name.
+        If a name is no identifier, is `t`, repeats, or is also a derivative's name.
     """
-    return Coordinates(_split(names, "coordinates"))
+    return Coordinates(_identifiers(names, "coordinates"))

@@ -1,6 +1,7 @@
 """The mechanism: its balance r = ∂S/∂γ'' - Γ, its actuators and its material constraints."""
 
-from functools import cached_property
+import json
+from functools import cached_property, lru_cache
 
 import casadi as ca
 import numpy as np
@@ -10,9 +11,14 @@ from servoctl.errors import SpecificationError, unknown
 from servoctl.jets.evaluation import evaluate
 from servoctl.jets.tape import Tape
 from servoctl.spec.coordinates import Coordinates
+from servoctl.spec.packing import packed, unpacked
 from servoctl.spec.parameters import Parameters
+from servoctl.tolerances import ENTRY
 
-_SEED = 20021  # of the random points at which identities are tested
+ARRIVED = 32  # mechanisms from other processes that are held
+IDENTITY_SEED = 20021  # of the random points at which identities are tested
+RANDOM = (0.3, 1.3)  # where these lie, parameters in units of their defaults: of order one, and away from zero
+INTEGRABLE = 1e-9  # of the largest bracket of columns of V: what may lie outside their span
 
 
 class Mechanism:
@@ -24,7 +30,7 @@ class Mechanism:
     ----------
     q : Coordinates
     gibbs : SX, optional
-        Gibbs-Appell function S(t, q, γ', γ''), at most quadratic in γ'' (`particle`, `rigid_body`, or one's own).
+        Gibbs-Appell function S(t, q, γ', γ''), at most quadratic in γ'' (`particle`, `rigid_body`, or written out).
     potential : SX, optional
         Potential energy U(q, t) [J]; gives Γ = -Vᵀ ∂U/∂q.
     actuators : dict of str to SX or sequence, optional
@@ -109,6 +115,29 @@ class Mechanism:
         lines.append(f"  {self.parameters!r}"[:118])
         return "\n".join(lines)
 
+    def as_text(self):
+        """Names, numbers and expressions: the same for the same operations in the same order, and for no others."""
+        q, p = self.q, self.parameters
+        names = [q.names, q.velocity_names, q.plain, list(q.invariants), self.actuators, list(self.constraints)]
+        expressions = [
+            q.V, q.h, *q.invariants.values(), self.balance, self.energy, self.forces, self.E,
+            *self.constraints.values(), *self.outputs.values(),
+        ]  # fmt: skip
+        function = q.as_function(expressions, p.symbols).serialize()
+        return json.dumps([names, list(self.outputs), p.defaults]) + "\n" + function
+
+    def __eq__(self, other):
+        if type(other) is not type(self):
+            return NotImplemented
+        return self is other or self.as_text() == other.as_text()
+
+    def __hash__(self):
+        return hash((self.q.names, self.actuators, self.parameters.names))
+
+    def __reduce__(self):
+        content = packed(vars(self), self.q, self.parameters, {"parameters": self.parameters})
+        return _unpickled, (self.q, self.parameters, content)
+
     @cached_property
     def balance(self):
         """r = ∂S/∂γ'' - Γ without actuation, (n,) SX in units of generalised force."""
@@ -164,8 +193,7 @@ class Mechanism:
                 "The Gibbs function is not quadratic in the accelerations." if self._gibbs is not None
                 else "The balance is not linear in the accelerations.",
                 "S = Σ m a·a/2 is quadratic in γ'', so that ∂S/∂γ'' is linear (3.8).",
-                nearest="S built by sv.particle and sv.rigid_body.",
-                do="Check the powers of the second derivatives.",
+                do="Build S by sv.particle and sv.rigid_body, or check the powers of the second derivatives.",
             )  # fmt: skip
         if self._gibbs is not None and self._kinetic is not None:
             difference = ca.gradient(self._gibbs, acceleration) - self._lagrange()
@@ -192,12 +220,12 @@ class Mechanism:
             v = point[: self.q.V.numel()].reshape(self.q.n, self.q.nq).T
             rest = point[self.q.V.numel() :].reshape(-1, self.q.nq).T
             outside = rest - v @ np.linalg.lstsq(v, rest, rcond=None)[0]
-            if np.abs(outside).max(initial=0.0) > 1e-9 * max(1.0, np.abs(rest).max(initial=0.0)):
+            if np.abs(outside).max(initial=0.0) > INTEGRABLE * max(1.0, np.abs(rest).max(initial=0.0)):
                 raise SpecificationError(
-                    "A kinetic energy was given in quasi-velocities whose frame V is not integrable.",
+                    "The kinetic energy is in quasi-velocities whose frame V is not integrable.",
                     "Lagrange's equations do not hold for velocities restricted by nonholonomic constraints.",
-                    nearest="A Gibbs function, which holds in any quasi-velocities (3.10).",
-                    do="Give gibbs=..., or all velocities and the constraints as material constraints.",
+                    do="Give a Gibbs function, which holds in any quasi-velocities (3.10), or all velocities with the "
+                    "constraints as material constraints.",
                 )
 
     def is_zero(self, items):
@@ -208,7 +236,7 @@ class Mechanism:
         items : sequence of SX scalars
         """
         values, sizes = self.at_random(items)
-        return bool(np.all(np.abs(values) <= 1e-12 * sizes))
+        return bool(np.all(np.abs(values) <= ENTRY * sizes))
 
     def at_random(self, items):
         """Values and sizes of expressions at four seeded random points of t, jets and parameters.
@@ -222,7 +250,7 @@ class Mechanism:
         values, sizes : (len(items), 4) arrays
         """
         symbols = ca.symvar(ca.vertcat(*items)) if len(items) else []
-        points = np.random.default_rng(_SEED).uniform(0.3, 1.3, (len(symbols), 4)).astype(np.longdouble)
+        points = np.random.default_rng(IDENTITY_SEED).uniform(*RANDOM, (len(symbols), 4)).astype(np.longdouble)
         for i, s in enumerate(symbols):
             if self.q.where(s) is None:
                 points[i] *= self.parameters.defaults.get(s.name(), 1.0)
@@ -261,7 +289,7 @@ class Mechanism:
             what = f"actuator {name!r}"
             items = column(value, what)
             if not items:
-                raise SpecificationError(f"{what} is empty.", "It has a displacement or a direction.", do="Give one.")
+                raise SpecificationError(f"{what} is empty.", "An actuator has a displacement or a direction.")
             direction = isinstance(value, (list, tuple, np.ndarray)) or len(items) > 1
             if direction and len(items) != self.q.n:
                 rates = ", ".join(self.q.velocity_names)
@@ -330,6 +358,18 @@ class Mechanism:
                         name=name,
                     )
                 seen[name] = what
+
+
+def _unpickled(q, parameters, content):
+    mechanism = object.__new__(Mechanism)
+    vars(mechanism).update(unpacked(content, q, parameters, {"parameters": parameters}))
+    return _latest(mechanism)
+
+
+@lru_cache(ARRIVED)
+def _latest(mechanism):
+    """An equal mechanism that came before from another process, or else this one: what is derived of it is shared."""
+    return mechanism
 
 
 def require_known(expression, mechanism, what):

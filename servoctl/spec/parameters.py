@@ -28,6 +28,9 @@ class Parameters:
             raise AttributeError(name)
         raise unknown(name, list(symbols), "parameter")
 
+    def __reduce__(self):
+        return Parameters, (self.defaults,)
+
     def __repr__(self):
         return "Parameters(" + ", ".join(f"{k}={v:g}" for k, v in self.defaults.items()) + ")"
 
@@ -69,7 +72,7 @@ class Parameters:
         return np.array(list(numbers.values()), dtype=float)
 
 
-def parameters(**values):
+def parameters(**values: float) -> Parameters:
     """Parameters with their default numbers, e.g. `parameters(m=1.0, g=9.81)`.
 
     Parameters

@@ -8,7 +8,7 @@ another scalar path, the *time law*::
 
 Pieces are joined by `fmin`, `fmax` and comparisons of the time alone, so that a derivative of any order is
 right on whichever side of a knot these are evaluated. A path of class C^k has k continuous derivatives; the
-docstrings tell k for each function of a smooth first argument. A path along a time law has the lower class.
+docstrings state k for each function of a smooth first argument. A path along a time law has the lower class.
 """
 
 import math
@@ -20,6 +20,8 @@ import numpy as np
 from servoctl.checks import column
 from servoctl.errors import SpecificationError, unknown
 
+MISSED = 1e-9  # of the largest point: a spline that passes its points farther away is refused
+ORTHONORMAL = 1e-9  # by which products of a circle's axes may differ from those of unit vectors at right angles
 
 def rest_to_rest(t, start, end, duration, smoothness=4, t_start=0.0):
     """Move from rest to rest along the polynomial of degree 2k + 1 whose first k derivatives vanish at both ends.
@@ -57,7 +59,7 @@ def rest_to_rest(t, start, end, duration, smoothness=4, t_start=0.0):
     """
     t, t_start = _scalar(t, "t"), _scalar(t_start, "t_start")
     sigma = ca.fmin(ca.fmax((t - t_start) / _positive(duration, "duration"), 0), 1)
-    return line(_step(sigma, _smoothness(smoothness)), start, end)
+    return line(_smooth_step(sigma, _smoothness(smoothness)), start, end)
 
 
 def trapezoid(t, distance, duration, ramp, smoothness=4, t_start=0.0):
@@ -171,8 +173,7 @@ def circle(angle, centre, radius, axes=None):
         raise SpecificationError(
             f"The circle's centre has {n} entries and axes are {'not ' if axes is None else ''}given",
             "A circle lies in the plane (2 entries), or in space (3) in the plane that two axes span",
-            "axes=((1, 0, 0), (0, 1, 0)) is the horizontal plane where the third entry is vertical",
-            "Give a centre with 2 entries, or one with 3 and the axes",
+            do="Give a centre with 2 entries, or one with 3 and the axes.",
             size=n,
         )
     e1, e2 = _orthonormal(((1, 0), (0, 1)) if axes is None else axes, centre)
@@ -244,14 +245,14 @@ def spline(t, times, points, smoothness=2, ends="rest"):
     return value
 
 
-def _step(sigma, k):
+def _smooth_step(sigma, k):
     """Regularised incomplete beta function I_sigma(k + 1, k + 1): 0 to 1, k derivatives zero at both ends."""
     binomials = ca.SX([math.comb(2 * j, j) for j in range(k, -1, -1)])
     return 0.5 + (sigma - 0.5) * ca.polyval(binomials, sigma * (1 - sigma))
 
 
 def _integral_of_step(sigma, k):
-    """Integral of `_step` from 0 to sigma: (sigma - sum_(j=0..k) Catalan_j (sigma (1 - sigma))^(j+1))/2."""
+    """Integral of `_smooth_step` from 0 to sigma: (sigma - sum_(j=0..k) Catalan_j (sigma (1 - sigma))^(j+1))/2."""
     catalan = ca.SX([math.comb(2 * j, j) // (j + 1) for j in range(k, -1, -1)] + [0])
     return (sigma - ca.polyval(catalan, sigma * (1 - sigma))) / 2
 
@@ -274,14 +275,13 @@ def _spline_pieces(times, points, degree, vanishing):
     pieces = np.array([c * half[:, None] ** order for order, c in enumerate(taylor)])
     starts, stops = pieces[::2].sum(axis=0) - pieces[1::2].sum(axis=0), pieces.sum(axis=0)
     miss = max(np.abs(starts - points[:-1]).max(), np.abs(stops - points[1:]).max())
-    if not miss <= 1e-9 * np.abs(points).max():
+    if not miss <= MISSED * np.abs(points).max():
         ratio = half.max() / half.min()
         raise SpecificationError(
             f"The spline of degree {degree} misses its points by {miss:.1e}; its longest interval is {ratio:.3g} times "
             "its shortest",
-            "A spline passes through its points, within 1e-9 of the largest",
-            "Intervals in proportion to the distances between the points, or a lower smoothness",
-            "Change the times or the smoothness",
+            f"A spline passes through its points, within {MISSED:g} of the largest",
+            do="Choose intervals in proportion to the distances between the points, or a lower smoothness.",
             degree=degree,
             miss=miss,
             ratio=ratio,
@@ -300,8 +300,7 @@ def _via_points(times, points):
         raise SpecificationError(
             "The spline's times or points hold something other than finite numbers",
             "Via points are numbers, not expressions, in arrays of shapes (n,) and (n,) or (n, dim)",
-            "A line or rest_to_rest takes expressions",
-            "Give finite numbers, and as many entries in each point",
+            do="Give finite numbers, or a line or rest_to_rest, which take expressions.",
             times=times,
             points=points,
         )
@@ -309,8 +308,7 @@ def _via_points(times, points):
         raise SpecificationError(
             f"The spline's times have shape {times.shape} and its points {points.shape}",
             "There are n >= 2 times, and one point for each",
-            "(n,) times and (n,) or (n, dim) points",
-            "Give one point for each time; points in rows, their entries in columns",
+            do="Give one point for each time; points in rows, their entries in columns.",
             times=times.shape,
             points=points.shape,
         )
@@ -332,7 +330,7 @@ def _column(value, what):
     if not items or (len(shape) == 2 and 1 not in shape):
         raise SpecificationError(
             f"{what} has the shape {shape or (0,)}", "A point of a path is a number or a vector of one entry or more",
-            "(0.0, 1.0)", "Give one point", what=what, shape=shape,
+            what=what, shape=shape,
         )  # fmt: skip
     return ca.vertcat(*items)
 
@@ -343,8 +341,8 @@ def _scalar(value, what):
     if value.numel() != 1:
         raise SpecificationError(
             f"{what} has {value.numel()} entries", f"A path is an expression of one scalar {what}",
-            "The time symbol q.t, a scalar path, a parameter or a number",
-            "Give one; to tabulate a path, make a casadi.Function of it", what=what, size=value.numel(),
+            do="Give q.t, a scalar path, a parameter or a number; to tabulate a path, make a casadi.Function of it.",
+            what=what, size=value.numel(),
         )  # fmt: skip
     return value
 
@@ -383,17 +381,28 @@ def _orthonormal(axes, centre):
     if not isinstance(axes, (list, tuple, np.ndarray)) or len(axes) != 2:
         raise SpecificationError(
             f"The circle's axes are {axes!r}", "Two orthonormal vectors span its plane",
-            "axes=((1, 0, 0), (0, 1, 0))", "Give a pair of vectors", axes=axes,
+            do="Give a pair of vectors.", axes=axes,
         )  # fmt: skip
     e1, e2 = (_column(axis, f"axes[{i}]") for i, axis in enumerate(axes))
     _same_size(centre=centre, **{"axes[0]": e1, "axes[1]": e2})
     gram = ca.vertcat(ca.dot(e1, e1) - 1, ca.dot(e1, e2), ca.dot(e2, e2) - 1)
-    if gram.is_constant() and np.abs(np.array(ca.DM(gram))).max() > 1e-9:
+    if gram.is_constant() and np.abs(np.array(ca.DM(gram))).max() > ORTHONORMAL:
         raise SpecificationError(
             f"The circle's axes are {axes!r}", "They are unit vectors at right angles",
-            "e1/|e1|, then e2 less its part along e1, divided by its length", "Give orthonormal axes", axes=axes,
+            nearest=_orthonormalised(e1, e2), axes=axes,
         )  # fmt: skip
     return e1, e2
+
+
+def _orthonormalised(e1, e2):
+    """Text of the orthonormal axes of the same plane, by Gram and Schmidt; empty for parallel vectors."""
+    a, b = (np.array(ca.DM(e)).ravel() for e in (e1, e2))
+    a = a / (np.linalg.norm(a) or 1.0)
+    b = b - (a @ b) * a
+    if not np.linalg.norm(b) > ORTHONORMAL:
+        return ""
+    pair = (", ".join(f"{x:.6g}" for x in e) for e in (a, b / np.linalg.norm(b)))
+    return "(({}), ({}))".format(*pair)
 
 
 def _same_size(**columns):

@@ -1,5 +1,7 @@
 """Program (servo) constraints of any order."""
 
+import difflib
+
 import casadi as ca
 import numpy as np
 
@@ -39,15 +41,14 @@ class Program:
             )
         if not isinstance(by, str) or by not in REALISATIONS:
             raise SpecificationError(
-                f"by={by!r} was given.",
+                f"by={by!r}.",
                 "A program is realised by 'ideal' reactions or by the mechanism's 'actuators'.",
-                nearest="'actuators'" if str(by).startswith("a") else "'ideal'",
-                do="Choose one.",
+                nearest="".join(map(repr, difflib.get_close_matches(str(by), REALISATIONS, 1))),
             )
         mapping(residuals, "The residuals")
         if weights is not None and by != "actuators":
             raise SpecificationError(
-                "Weights were given for an ideal program.", "Weights choose among actuators.", do="Remove them."
+                "An ideal program has weights.", "Weights choose among actuators.", do="Leave them out."
             )
         self.residuals = {name: _residual(name, value) for name, value in residuals.items()}
         self.by = by
@@ -85,14 +86,14 @@ class Program:
         sigma, instant = _number(factor), _number(at)
         if not sigma > 0:
             raise SpecificationError(
-                f"A program was to be slowed by the factor {factor!r}.",
+                f"The factor by which a program is slowed is {factor!r}.",
                 "The factor is a positive number: 2.0 takes twice as long.",
                 do="Give a number above zero.",
                 factor=factor,
             )
         if np.isnan(instant):
             raise SpecificationError(
-                f"at={at!r} was given.", "The instant that stays where it is is a finite number.", do="Give one [s]."
+                f"at={at!r}.", "The instant that stays where it is is a finite number [s]."
             )
         if not q.plain and (not q.h.is_zero() or ca.depends_on(q.V, q.t)):
             raise SpecificationError(
@@ -101,13 +102,13 @@ class Program:
                 do="Write the slower program yourself.",
             )
         symbols, values = [q.t], [instant + (q.t - instant) / sigma]
-        own = {name: ca.SX(value) for name, value in self.weights.items()}
-        for k in range(1, max(map(q.order, (*self.residuals.values(), *own.values()))) + 1):
+        weights = {name: ca.SX(value) for name, value in self.weights.items()}
+        for k in range(1, max(map(q.order, (*self.residuals.values(), *weights.values()))) + 1):
             symbols += q.gamma(k)
             values += [sigma**k * s for s in q.gamma(k)]
-        slower = iter(ca.substitute([*self.residuals.values(), *own.values()], symbols, values))
+        slower = iter(ca.substitute([*self.residuals.values(), *weights.values()], symbols, values))
         residuals = {name: next(slower) for name in self.residuals}
-        return Program(residuals, self.by, {name: next(slower) for name in own} or None)
+        return Program(residuals, self.by, {name: next(slower) for name in weights} or None)
 
     def __repr__(self):
         return f"Program({', '.join(self.residuals)}; by {self.by})"
@@ -121,7 +122,7 @@ def _residual(name, value):
         raise SpecificationError(
             f"The residual {name!r} has {len(items)} entries.",
             "A residual is a scalar.",
-            do="Give each component a name of its own.",
+            do="Name each component.",
             name=name,
         )
     if not ca.symvar(items[0]):
@@ -144,8 +145,7 @@ def _weight(name, value):
         raise SpecificationError(
             f"The weight of {name!r} is {value!r}.",
             "The actuation of least uᵀWu exists for positive weights.",
-            nearest="1.0, the default.",
-            do="Give a positive number or an expression.",
+            do="Give a positive number or an expression; the default is 1.",
             name=name,
         )
     return number

@@ -12,7 +12,7 @@ FAILURE = ("error", "message", "facts")  # columns of what went wrong
 RESERVED = ("case", *FAILURE, "rng")
 
 
-def grid(**values):
+def grid(**values) -> list[dict]:
     """All combinations of values: the last name varies fastest.
 
     Parameters
@@ -33,7 +33,7 @@ def grid(**values):
     return [dict(zip(columns, row, strict=True)) for row in itertools.product(*columns.values())]
 
 
-def monte_carlo(n, /, *, seed, **distributions):
+def monte_carlo(n: int, /, *, seed: int, **distributions) -> list[dict]:
     """Random cases; case i depends on the seed and on i alone, so that more cases begin with the same ones.
 
     Parameters

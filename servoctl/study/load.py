@@ -7,7 +7,7 @@ from servoctl.study.tradeoff import TradeOff
 KINDS = {"tradeoff": TradeOff}  # others are plain studies
 
 
-def load_study(path):
+def load_study(path) -> Study:
     """A study from a file that `Study.save` wrote.
 
     Parameters

@@ -191,7 +191,7 @@ class StabilityMap:
         return text + (f", growth {growing:.4g} 1/s is the motion's own" if growing > 1e-6 * (1 + fastest) else "")
 
 
-def stability(model, run, order=12):
+def stability(model, run, order: int = 12) -> StabilityMap:
     """Find the largest stable step of each method and drift treatment along a plan.
 
     Parameters

@@ -26,7 +26,7 @@ from servoctl.study.table import Study, machine
 INTERRUPTED = 1  # status of a run that Ctrl-C ended
 
 
-def sweep(case, cases, *, executor=None, seed=None, checkpoint=None, shard=None, progress=None):
+def sweep(case, cases, *, executor=None, seed=None, checkpoint=None, shard=None, progress=None) -> Study:
     """Compute every case and gather the numbers in one table.
 
     The table is the same, bit for bit, however many workers compute it and in whatever order, on processors of one
@@ -101,7 +101,7 @@ def sweep(case, cases, *, executor=None, seed=None, checkpoint=None, shard=None,
     return Study("sweep", columns, meta | {"message": _message(columns, meta, len(mine))})
 
 
-def merge(studies):
+def merge(studies) -> Study:
     """The shards of a sweep as one table, in the order of the cases.
 
     Parameters

@@ -48,13 +48,13 @@ class Study:
             )
         object.__setattr__(self, "columns", columns)
 
-    def __len__(self):
+    def __len__(self) -> int:
         return len(next(iter(self.columns.values()), ()))
 
-    def __getitem__(self, name):
+    def __getitem__(self, name: str) -> np.ndarray:
         return self.column(name)
 
-    def column(self, name):
+    def column(self, name: str) -> np.ndarray:
         """The column with this name.
 
         Parameters
@@ -73,12 +73,12 @@ class Study:
             raise unknown(name, self.columns, "column")
         return self.columns[name]
 
-    def rows(self):
+    def rows(self) -> list[dict]:
         """All rows as dicts of plain values."""
         plain = {name: values.tolist() for name, values in self.columns.items()}
         return [dict(zip(plain, row, strict=True)) for row in zip(*plain.values(), strict=True)]
 
-    def where(self, **values):
+    def where(self, **values) -> "Study":
         """The rows in which each column named has the value given.
 
         Parameters

@@ -5,6 +5,7 @@ import closed_forms as cf
 import numpy as np
 import pytest
 from conftest import pendulum
+from refusals import refused
 
 import servoctl as sv
 from servoctl.gallery import spiral
@@ -89,7 +90,7 @@ def test_a_squared_constraint_is_told_from_a_small_one(square, unit):
     program = sv.Program({"circle": circle**2 if square else circle}, by="ideal")
     mechanism = sv.Mechanism(q, gibbs=sv.particle(q, 1.0, (x, y)))
     if square:
-        with pytest.raises(sv.SingularProgram, match="vanishes on its own solutions"):
+        with refused(sv.SingularProgram, row="circle"):
             sv.derive(mechanism, program)
     else:
         assert sv.derive(mechanism, program).free == 2

@@ -1,4 +1,4 @@
-"""The same motion in other words: names, order, units, quasi-velocities, equivalent constraints; other numbers."""
+"""The same report and the same accelerations in other words: names, order, units, equivalent constraints; numbers."""
 
 import casadi as ca
 import numpy as np

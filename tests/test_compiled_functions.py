@@ -9,6 +9,7 @@ import threading
 import casadi as ca
 import numpy as np
 import pytest
+from refusals import refused
 
 from servoctl.codegen import compiler, emit
 from servoctl.codegen.function import compiled, compiling_at_once
@@ -129,7 +130,7 @@ def test_text_depends_on_content_only():
 
 def test_an_operation_without_c_is_named():
     model = compiled(function(X2[0].printme(X2[1])), "talkative")
-    with pytest.raises(SpecificationError, match="OP_PRINTME"):
+    with refused(SpecificationError, "OP_PRINTME"):
         model(0.0, [0.0, 0.0], [0.0])
 
 
@@ -224,9 +225,9 @@ def test_wrong_functions_are_refused(make):
 
 
 def test_an_unknown_loop_is_named():
-    with pytest.raises(NameUnknown, match="'rk'"):
+    with refused(NameUnknown, name="rk5", match="rk"):
         compiled(function(X2), "f", ("rk5",))
-    with pytest.raises(NameUnknown, match="'newton'"):
+    with refused(NameUnknown, name="newtons", match="newton"):
         emit.emit(function(X2), "f", ("newtons",))
 
 

@@ -6,9 +6,9 @@ from math import factorial
 import casadi as ca
 import numpy as np
 
+from servoctl.jets.motion import Motion, shifted
 from servoctl.jets.scalars import REAL, Scalars
 from servoctl.jets.series import Series
-from servoctl.reduction.row import gradient
 
 
 class Flow:
@@ -37,7 +37,7 @@ class Flow:
         self.first = np.cumsum([0, *(max(level - order + 1, 0) for order in orders)])
         self.rows, self._made = rows, {}  # what is read when it is first needed
         self.members = {
-            order: np.array([a for a, own in enumerate(orders) if own == order], dtype=int)
+            order: np.array([a for a, row in enumerate(rows) if row.order == order], dtype=int)
             for order in sorted({order for order in orders if order <= level})
         }
         if not q.plain:
@@ -77,12 +77,12 @@ class Flow:
         in_q = order == 0 and level == 0 and not self.q.plain
         if (order, in_q) not in self._made:
             rows = [self.rows[a] for a in self.members[order]]
-            slopes = [ca.jacobian(row.expression, self.q.jet(0)) if in_q else gradient(self.q, row) for row in rows]
+            slopes = [ca.jacobian(row.expression, self.q.jet(0)) if in_q else row.gradient(self.q) for row in rows]
             columns = [g.sparsity().get_triplet()[1] for g in slopes]
             residuals, entries = [row.expression for row in rows], [e for g in slopes for e in g.nonzeros()]
-            known = self.points.book.find(self.q, self.points.parameters, [*residuals, *entries])
+            read = self.points.book.find(self.q, self.points.parameters, [*residuals, *entries])
             places = np.repeat(np.arange(len(rows)), [len(c) for c in columns]), np.array(sum(columns, []), dtype=int)
-            self._made[order, in_q] = known, places
+            self._made[order, in_q] = read, places
         return self._made[order, in_q]
 
     def __call__(self, t, z):
@@ -121,10 +121,10 @@ class Flow:
         q_series, _ = self._kinematics(t, z)
         residual = np.zeros((len(self.equations), z.shape[1]), dtype=REAL)
         for order, members in self.members.items():
-            known, _ = self.leading(order, self.level)
-            found = self._residuals(known, members, t, z, q_series, self.level - order)
-            for i in range(found.shape[1]):
-                residual[self.first[members] + i] = found[:, i]
+            read, _ = self.leading(order, self.level)
+            coefficients = self._residuals(read, members, t, z, q_series, self.level - order)
+            for i in range(coefficients.shape[1]):
+                residual[self.first[members] + i] = coefficients[:, i]
         return residual
 
     def at_level(self, t, z, level):
@@ -138,24 +138,24 @@ class Flow:
         for order, members in self.members.items():
             if order > level:
                 continue
-            known, (rows, columns) = self.leading(order, level)
+            read, (rows, columns) = self.leading(order, level)
             depth, entries = level - order, np.empty((len(members) + len(rows), z.shape[1]), dtype=REAL)
-            for scalars, own, given in known:
-                entries[given] = scalars.values(t, z, self.points.values)[own]
+            for scalars, sources, targets in read:
+                entries[targets] = scalars.values(t, z, self.points.values)[sources]
             if depth:
-                found = self._residuals(known, members, t, z, q_series, depth)[:, depth]
+                coefficients = self._residuals(read, members, t, z, q_series, depth)[:, depth]
             else:
-                found = entries[: len(members)]
-            residual[self.first[members] + depth] = found
+                coefficients = entries[: len(members)]
+            residual[self.first[members] + depth] = coefficients
             entries = entries[len(members) :] * (factorial(level) / factorial(depth))
             slopes[self.first[members[rows]] + depth, columns] = entries
         return residual, slopes
 
-    def _residuals(self, known, members, t, z, q_series, depth):
+    def _residuals(self, read, members, t, z, q_series, depth):
         """Coefficients of the residuals of some rows, (rows, depth + 1, N)."""
         result = np.empty((len(members), depth + 1, z.shape[1]), dtype=REAL)
-        for scalars, own, given in known:
-            pairs = [(i, a) for i, a in zip(own, given, strict=True) if a < len(members)]
+        for scalars, sources, targets in read:
+            pairs = [(i, a) for i, a in zip(sources, targets, strict=True) if a < len(members)]
             if pairs and depth:
                 coefficients = self._run(scalars, t, z, q_series, depth, 1 + max(i for i, _ in pairs))
             elif pairs:
@@ -191,11 +191,11 @@ class Flow:
 
     def _run(self, scalars, t, z, q_series, depth, first=None):
         """Coefficients 0 .. depth of the first scalars, (first, depth + 1, N)."""
-        start = scalars.inputs(t, z, self.points.values)
-        inputs = [
-            [self._input(symbol, place, k, value, z, q_series) for k in range(depth + 1)]
-            for symbol, place, value in zip(scalars.tape.symbols, scalars.places, start, strict=True)
-        ]
+        motion, values = _Numbers(self.q, z, q_series, self.level), scalars.inputs(t, z, self.points.values)
+        inputs = []
+        for symbol, value in zip(scalars.tape.symbols, values, strict=True):
+            higher = (motion.coefficient(symbol, k) for k in range(1, depth + 1))
+            inputs.append(self.signals.get(symbol.element_hash()) or [value, *higher])
         series = Series(scalars.tape, inputs, first=first)
         with np.errstate(all="ignore"):
             for _ in range(depth + 1):
@@ -207,19 +207,18 @@ class Flow:
                 result[i, k] = c
         return result
 
-    def _input(self, symbol, place, k, value, z, q_series):
-        """Coefficient k of a symbol, whose value is coefficient 0."""
-        if place is None:
-            own = self.signals.get(symbol.element_hash())
-            return own[k] if own else value if k == 0 else 0.0
-        kind, level, i = place
-        if k == 0:
-            return value
-        if kind == "t":
-            return float(k == 1)
-        if kind == "q":
-            return q_series[k][i]
-        if level + k > self.level:
-            return np.zeros(z.shape[1], dtype=REAL)
-        start = self.q.nq + (level + k - 1) * self.q.n
-        return z[start + i] * (factorial(level + k) / factorial(k))
+
+class _Numbers(Motion):
+    """The motion of jets z (nz, N); those above a level are zero."""
+
+    def __init__(self, q, z, q_series, level):
+        super().__init__(q)
+        self.z, self.q_series, self.level = z, q_series, level
+
+    def coordinate(self, i, j):
+        return self.q_series[j][i]
+
+    def velocity(self, i, level, j):
+        if level + j > self.level:
+            return np.zeros(self.z.shape[1], dtype=REAL)
+        return shifted(self.z[self.q.nq + (level + j - 1) * self.q.n + i], level, j)

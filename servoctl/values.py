@@ -1,0 +1,34 @@
+"""Frozen values: two are equal where all their fields are."""
+
+from dataclasses import fields
+
+import numpy as np
+
+
+class Value:
+    """What a frozen dataclass inherits to be compared by its fields, arrays among them; NaN equals NaN."""
+
+    def __eq__(self, other):
+        if self is other or type(self) is not type(other):
+            return self is other
+        return all(same(getattr(self, f.name), getattr(other, f.name)) for f in fields(self) if f.compare)
+
+    def __hash__(self):
+        entries = (getattr(self, f.name) for f in fields(self) if f.compare)
+        return hash((type(self), *(entry for entry in entries if isinstance(entry, (str, int, float)))))
+
+
+def same(a, b):
+    """Whether two values are equal; arrays, and containers that hold arrays, by their entries."""
+    if a is b:
+        return True
+    if isinstance(a, np.ndarray) or isinstance(b, np.ndarray):
+        a, b = np.asarray(a), np.asarray(b)
+        return a.dtype == b.dtype and np.array_equal(a, b, equal_nan=a.dtype.kind in "fc")
+    if type(a) is not type(b):
+        return False
+    if isinstance(a, dict):
+        return list(a) == list(b) and all(same(a[key], b[key]) for key in a)
+    if isinstance(a, (list, tuple)):
+        return len(a) == len(b) and all(map(same, a, b))
+    return bool(a == b) or (isinstance(a, float) and a != a and b != b)

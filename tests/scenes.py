@@ -1,0 +1,20 @@
+"""Mechanisms and programs that several test modules share; `conftest` derives and simulates them once."""
+
+import servoctl as sv
+from servoctl.gallery import gallery
+
+CRANE, CRANE_PROGRAM = gallery["overhead-crane"].build()
+ROPE = gallery["overhead-crane-redundant"].build()[0]
+
+
+def point_mass(smoothness=3):
+    """A driven mass of 2 kg that moves by 1 m in 1 s."""
+    p = sv.parameters(m=2.0)
+    q = sv.coordinates("x")
+    (x,) = q
+    path = sv.paths.rest_to_rest(q.t, 0.0, 1.0, duration=1.0, smoothness=smoothness)
+    mechanism = sv.Mechanism(q, gibbs=sv.particle(q, p.m, x), actuators={"force": x}, parameters=p)
+    return mechanism, sv.Program({"X": x - path}, by="actuators")
+
+
+POINT, POINT_PROGRAM = point_mass()

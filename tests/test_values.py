@@ -1,0 +1,174 @@
+"""Values: models, plants, runs and laws are equal by what they say, travel to other processes, and never change."""
+
+import multiprocessing
+import pickle
+import subprocess
+import sys
+from concurrent.futures import ProcessPoolExecutor
+
+import casadi as ca
+import numpy as np
+import pytest
+
+import servoctl as sv
+from servoctl.gallery import gallery
+
+SCENES = ("overhead-crane", "appell-hamel", "crane-3d", "constant-speed", "three-cars", "wheeled-robot")
+
+
+def again(value):
+    """A value as another process gets it."""
+    return pickle.loads(pickle.dumps(value))
+
+
+@pytest.fixture(scope="module")
+def crane():
+    """The crane's mechanism, model, plan, plant with all that a plant may have, and a law."""
+    scene = gallery["overhead-crane"]
+    mechanism, program = scene.build()
+    model = sv.derive(mechanism, program)
+    plan = sv.simulate(model, model.start(**scene.start, guess=scene.guess), scene.t_span, progress=False)
+    friction = {"theta": -3.0 * ca.tanh(mechanism.q.d(1)[2])}
+    limits = {"trolley": 5000.0}
+    plant = sv.plant(mechanism, m_load=115.0, damping={"x": 2.0}, lag={"hoist": 0.05}, limits=limits, forces=friction)
+    return mechanism, model, plan, plant, sv.lqr(plan, sv.plant(mechanism), rate=100.0)
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_a_model_that_travelled_is_equal_and_computes_the_same_bits(name):
+    scene = gallery[name]
+    model = sv.derive(*scene.build())
+    sent = again(model)
+    assert sent == model and hash(sent) == hash(model) and repr(sent) == repr(model)
+    assert sent.function("ode").source() == model.function("ode").source()
+    start = model.start(**scene.start, guess=scene.guess)
+    there = sent.start(**scene.start, guess=scene.guess)
+    assert there == start and np.array_equal(there.values, start.values)
+    span = (scene.t_span[0], scene.t_span[0] + 0.2)
+    here, far = (sv.simulate(m, start, span, t_eval=np.linspace(*span, 5), progress=False) for m in (model, sent))
+    assert far == here and again(here) == here
+    group = next(iter(model.signal_groups))
+    assert np.array_equal(far[group], here[group]) and np.array_equal(again(here)[group], here[group])
+
+
+def test_models_differ_by_what_they_say(crane):
+    mechanism, model, plan, _, _ = crane
+    jets = plan.jets[:, 3]
+    others = [
+        model.with_parameters(m_load=90.0),
+        model.near(plan.t[3], jets),
+        sv.derive(*gallery["overhead-crane"].build(), guess={"l": 3.0}),
+        sv.derive(*gallery["crane-3d"].build()),
+    ]
+    assert all(other != model and again(other) == other for other in others)
+    assert sv.derive(*gallery["overhead-crane"].build()) == model == model.with_parameters()
+    assert model != "a model"
+    assert again(mechanism) == mechanism != gallery["crane-3d"].build()[0]
+
+
+def test_a_model_that_travelled_takes_other_numbers_and_other_pivots(crane):
+    _, model, plan, _, _ = crane
+    t, jets = plan.t[5], plan.jets[:, 5]
+    for change in (lambda m: m.with_parameters(m_load=50.0), lambda m: m.near(t, jets)):
+        here, far = change(model), change(again(model))
+        assert here == far
+        values = [m.signals("actuation")[1](t, jets, m.parameters) for m in (here, far)]
+        assert np.array_equal(*values)
+
+
+def test_a_plant_that_travelled_is_equal_and_computes_the_same_bits(crane):
+    mechanism, _, _, plant, _ = crane
+    sent = again(plant)
+    assert sent == plant and hash(sent) == hash(plant) and repr(sent) == repr(plant)
+    x, u, d = [0.1, 4.0, 0.1, 0.2, 0.3, 0.1, 20.0], [3.0, -900.0], [0.0, 1.0, 2.0]
+    assert np.array_equal(sent.rates(0.2, x, u, d), plant.rates(0.2, x, u, d))
+    without = sv.plant(mechanism, m_load=115.0, damping={"x": 2.0}, lag={"hoist": 0.05}, limits={"trolley": 5000.0})
+    assert without != plant
+    assert sv.plant(mechanism, m_load=115.0) != sv.plant(mechanism, m_load=116.0)
+
+
+def test_plants_that_travelled_share_what_is_derived_of_them(crane):
+    *_, plant, _ = crane
+    content = pickle.dumps(plant)
+    first, second = pickle.loads(content), pickle.loads(content)
+    assert first.mechanism is second.mechanism and first.function("ode") is second.function("ode")
+
+
+def test_runs_and_laws_that_travelled_are_equal(crane):
+    mechanism, _, plan, _, law = crane
+    sent = again(plan)
+    assert sent == plan and hash(sent) == hash(plan) and sent != plan.t.size
+    assert np.array_equal(sent["trolley"], plan["trolley"])
+    assert all(np.array_equal(sent.residual[name], plan.residual[name]) for name in plan.residual)
+    nominal = sv.plant(mechanism)
+    noise = dict.fromkeys(mechanism.q.names, 1e-3)
+    laws = [law, sv.feedforward(plan, nominal), sv.pd(plan, nominal), sv.lqr(plan, nominal, integral=True)]
+    laws.append(sv.output_feedback(law, nominal, noise=noise))
+    for value in laws:
+        assert again(value) == value and hash(again(value)) == hash(value)
+    assert len({repr(value) for value in laws}) == len(laws)
+    assert all(value != other for i, value in enumerate(laws) for other in laws[:i])
+
+
+def test_a_loaded_run_is_equal_by_its_signals(crane, tmp_path):
+    _, _, plan, _, _ = crane
+    loaded = sv.load(plan.save(tmp_path / "plan"))
+    assert again(loaded) == loaded == sv.load(tmp_path / "plan.npz") != plan
+    loaded.stored["trolley"][0] += 1.0
+    assert loaded != sv.load(tmp_path / "plan.npz")
+
+
+def test_loops_of_what_travelled_are_the_same_to_the_bit(crane):
+    _, _, plan, _, law = crane
+    plant = sv.plant(crane[0], m_load=115.0)
+    here = sv.close(plant, law, plan.state(0.0), (0.0, 0.5))
+    there = sv.close(*again((plant, law)), plan.state(0.0), (0.0, 0.5))
+    assert np.array_equal(here.states, there.states) and np.array_equal(here.inputs, there.inputs)
+
+
+def endpoint(model, start, t):
+    """What a worker computes."""
+    return sv.simulate(model, start, (0.0, t), progress=False)
+
+
+def test_models_and_runs_go_to_spawned_processes_and_come_back(crane):
+    _, model, plan, _, _ = crane
+    start = model.start(guess={"l": 4.0})
+    with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as pool:
+        back = pool.submit(endpoint, model, start, 0.5).result()
+    here = endpoint(model, start, 0.5)
+    assert back == here and back.model == model
+    assert np.array_equal(back["trolley"], here["trolley"])
+
+
+UNPICKLED = """
+import pickle, sys
+values = pickle.loads(sys.stdin.buffer.read())
+sys.stdout.buffer.write(pickle.dumps(values))
+"""
+
+
+def test_values_survive_a_process_that_imported_nothing(crane):
+    sent = subprocess.run([sys.executable, "-c", UNPICKLED], input=pickle.dumps(crane), capture_output=True, check=True)
+    assert pickle.loads(sent.stdout) == crane
+
+
+def test_a_model_prints_the_same_whatever_was_done_with_it():
+    scene = gallery["overhead-crane"]
+    model = sv.derive(*scene.build())
+    before = repr(model)
+    model.structure(), model.operations(), model.function("ode")
+    run = sv.simulate(model, model.start(guess={"l": 4.0}), (0.0, 0.5), progress=False)
+    assert run["trolley"].size and repr(model) == before == repr(sv.derive(*scene.build()))
+
+
+def test_nothing_is_written_into_a_specification():
+    mechanism, program = gallery["overhead-crane"].build()
+    assert mechanism.mass.shape == (3, 3) and mechanism.energy.shape == (1, 1)  # derived once, when they are read
+    before = {value: dict(vars(value)) for value in (mechanism, mechanism.parameters)} | {program: dict(vars(program))}
+    model = sv.derive(mechanism, program)
+    plan = sv.simulate(model, model.start(guess={"l": 4.0}), (0.0, 0.5), progress=False)
+    sv.close(sv.plant(mechanism), sv.lqr(plan, sv.plant(mechanism)), plan.state(0.0), (0.0, 0.5))
+    for value, attributes in before.items():
+        assert list(vars(value)) == list(attributes)
+        assert all(vars(value)[name] is attributes[name] for name in attributes)
