@@ -15,7 +15,7 @@ SENSORS = {"x": 1e-3, "l": 1e-3, "theta": 1e-3}  # m, m, rad: standard deviation
 NOISE = SENSORS | {"dx": 1e-2, "dl": 1e-2, "dtheta": 1e-2}  # m/s, m/s, rad/s
 LIMITS = {"trolley": 150.0, "hoist": (-1300.0, 0.0)}  # N
 WEAK = {"trolley": 100.0, "hoist": (-1300.0, 0.0)}  # N; the plan asks for 138 N of the trolley
-LOOKS = [{"linestyle": style, "color": colour} for style in sv.plots.STYLES for colour in sv.plots.COLOURS]
+LOOKS = [{"linestyle": style, "color": colour} for style in sv.figures.STYLES for colour in sv.figures.COLOURS]
 RESERVE = 0.8  # of the weak trolley, for the plan; the rest is the feedback's
 
 

@@ -4,7 +4,8 @@ A specification flows one way: Mechanism and Program, by `derive`, become a Mode
 `verify` proves the run against the full mechanism.
 """
 
-from servoctl import interop, spec
+from servoctl import figures, interop, spec
+from servoctl import figures as plots
 from servoctl.control import disturbances
 from servoctl.control.close import close
 from servoctl.control.conditions import Sensors, Timing
@@ -29,7 +30,6 @@ from servoctl.errors import (
     UnstableInternalDynamics,
 )
 from servoctl.export.c import export_c
-from servoctl.figures import run as plots
 from servoctl.internal_dynamics import InternalDynamics, internal_dynamics
 from servoctl.methods.choice import Adaptive, Algebraic, RadauIIA, RungeKutta, Sundials, Taylor
 from servoctl.methods.drift import MinimalCoordinates, Poles, Project
@@ -52,16 +52,13 @@ from servoctl.spec import (
 )
 from servoctl.study.cases import grid, monte_carlo
 from servoctl.study.close_many import Batch, close_many
-from servoctl.study.dae import DaeComparison, dae_comparison
-from servoctl.study.formulation import FormulationCost, formulation_cost
-from servoctl.study.front import TradeOff
+from servoctl.study.load import load_study
 from servoctl.study.stability_map import StabilityMap, stability
 from servoctl.study.sweep import merge, sweep
-from servoctl.study.table import Study, load_study
-from servoctl.study.tradeoff import tradeoff
+from servoctl.study.table import Study
+from servoctl.study.tradeoff import TradeOff, tradeoff
 from servoctl.verification import Verification, verify
-
-__version__ = "0.1.0"
+from servoctl.version import __version__ as __version__
 
 __all__ = [
     "Adaptive",
@@ -70,8 +67,6 @@ __all__ = [
     "Closed",
     "Controller",
     "Coordinates",
-    "DaeComparison",
-    "FormulationCost",
     "InconsistentStart",
     "IntegrationStopped",
     "InternalDynamics",
@@ -109,13 +104,12 @@ __all__ = [
     "close_many",
     "computed",
     "coordinates",
-    "dae_comparison",
     "derive",
     "disturbances",
     "export_c",
     "fastest",
     "feedforward",
-    "formulation_cost",
+    "figures",
     "grid",
     "internal_dynamics",
     "interop",

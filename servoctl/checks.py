@@ -15,13 +15,7 @@ MOST_MEMORY = 8e9  # bytes for the numbers of all samples: as much as common mac
 
 
 def column(value, what, size=None):
-    """A list of SX scalars from a scalar, a sequence, or an SX column.
-
-    Raises
-    ------
-    SpecificationError
-        If the value is no CasADi expression or number, holds NaN, or has another length than `size`.
-    """
+    """A list of SX scalars from a scalar, a sequence, or an SX column; `size` is the length that it must have."""
     try:
         if isinstance(value, (list, tuple)):
             value = ca.vertcat(*value) if value else ca.SX(0, 1)
@@ -50,13 +44,7 @@ def column(value, what, size=None):
 
 
 def matrix(value, what):
-    """An SX matrix from a number, an SX matrix, an array, or nested sequences of scalars.
-
-    Raises
-    ------
-    SpecificationError
-        If it is none of these, is ragged, or holds NaN or infinity.
-    """
+    """An SX matrix from a number, an SX matrix, an array, or nested sequences of scalars."""
     try:
         if isinstance(value, (list, tuple)):
             value = ca.vertcat(*(ca.horzcat(*row) if isinstance(row, (list, tuple)) else ca.SX(row) for row in value))
@@ -80,14 +68,7 @@ def _holds_no_number(expression):
 
 
 def mapping(value, what):
-    """A dict with text for keys, from a dict or None.
-
-    Parameters
-    ----------
-    value : dict or None
-    what : str
-        What goes by name, at the beginning of a sentence: "The limits".
-    """
+    """A dict with text for keys, from a dict or None; `what` begins the message: "The limits"."""
     if value is None:
         return {}
     if not isinstance(value, dict) or not all(isinstance(key, str) for key in value):
@@ -133,27 +114,16 @@ def positive(name, value):
     return number
 
 
-def positives(name, given, do, fewest=1, most=np.inf):
-    """Positive finite numbers as an array, from a number or an array-like.
-
-    Parameters
-    ----------
-    name : str
-    given : float or array-like
-    do : str
-        What the message suggests.
-    fewest : int
-    most : float
-        The largest number allowed.
-    """
+def positives(name, values, do, fewest=1, most=np.inf):
+    """Positive finite numbers as an array, from a number or an array-like, at least `fewest`, each at most `most`."""
     try:
-        numbers = np.asarray(given, dtype=float)
+        numbers = np.asarray(values, dtype=float)
     except (TypeError, ValueError):
         numbers = np.zeros(1)
     if numbers.size < fewest or not np.all(np.isfinite(numbers) & (numbers > 0) & (numbers <= most)):
         count = "It is a positive number, or several" if fewest == 1 else f"It is {fewest} positive numbers or more"
         bound = "" if most == np.inf else f", at most {most:g}"
-        raise SpecificationError(f"{name}={given!r} was given.", f"{count}{bound}.", do=do, name=name, value=given)
+        raise SpecificationError(f"{name}={values!r} was given.", f"{count}{bound}.", do=do, name=name, value=values)
     return numbers
 
 
@@ -171,16 +141,7 @@ def whole(name, value, least=0):
 
 
 def whole_multiple(number, what, of):
-    """How many whole units a number is, to rounding, at least 0.
-
-    Parameters
-    ----------
-    number : float
-    what : str
-        What is counted, at the beginning of a sentence: "delay".
-    of : str
-        The units: "samples".
-    """
+    """How many whole units a number is, to rounding, at least 0: `what` is counted ("delay"), `of` what ("samples")."""
     number = finite(what, number)
     nearest = max(round(number), 0)
     if abs(number - nearest) > ON_SAMPLE * max(1.0, 1e-6 * abs(number)):
@@ -196,18 +157,7 @@ def whole_multiple(number, what, of):
 def interval(name, value, what):
     """The interval (low, high) of a name as floats, infinite on a side that is open.
 
-    Parameters
-    ----------
-    name : str
-    value : (float or None, float or None) or float
-        A number c stands for (-c, c), None leaves a side open.
-    what : str
-        What the interval is, in the singular: "limit", "bound".
-
-    Raises
-    ------
-    SpecificationError
-        If it is empty, open on both sides, or something else.
+    A number c stands for (-c, c), None leaves a side open; `what` it is, in the singular: "limit", "bound".
     """
     try:
         low, high = (-value, value) if np.ndim(value) == 0 else value
@@ -226,25 +176,7 @@ def interval(name, value, what):
 
 
 def numbers_by_name(values, names, what, meaning, low=-np.inf, positive=False):
-    """Finite numbers by name.
-
-    Parameters
-    ----------
-    values : dict of str to float, or None
-    names : sequence of str
-        The names that exist.
-    what, meaning : str
-        What the names and the numbers stand for, in the singular: "actuator", "lag".
-    low : float
-        The least number allowed.
-    positive : bool
-        Whether 0 is refused, too.
-
-    Raises
-    ------
-    NameUnknown
-    SpecificationError
-    """
+    """Finite numbers by name, none below `low`; `what` has them ("actuator"), `meaning` is what they are ("lag")."""
     numbers = {}
     for name, value in mapping(values, f"The {meaning}s").items():
         if name not in names:
@@ -279,16 +211,7 @@ def as_span(t_span, forward=False):
 
 
 def require_memory(samples, numbers, given):
-    """Refuse more samples than fit into memory.
-
-    Parameters
-    ----------
-    samples : float
-    numbers : int
-        Kept of each sample.
-    given : str
-        What takes so many samples: the beginning of a sentence.
-    """
+    """Refuse more samples than fit into memory: of each, so many numbers are kept; `given` begins the message."""
     memory = 8.0 * samples * numbers
     if memory > MOST_MEMORY:
         raise SpecificationError(

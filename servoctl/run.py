@@ -1,19 +1,18 @@
 """A run: what a simulation computed, by name."""
 
-import json
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
 
-from servoctl.errors import ServoError, SpecificationError, unknown
+from servoctl import archive
+from servoctl.errors import SpecificationError, unknown
 from servoctl.values import Value, same
 
 STENCIL = 9  # samples of the polynomial through which an extremum is refined: error of order h^9
-ROUNDING = 1e-14  # of the values beside it: an extremum between samples that is no further from one is that sample
-FORMAT = 1
-TOLD = ("method", "drift", "counters", "success", "status", "message", "knots")  # what a file keeps besides arrays
+AS_SAMPLED = 1e-14  # of the values beside it: an extremum between samples that is no further from one is that sample
+FACTS = ("method", "drift", "counters", "success", "status", "message", "knots", "jet_names")  # of a saved run
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,7 +102,7 @@ class Run(Value):
             if f.n_x > len(self.jets):
                 highest = (f.n_x - model.nq) // model.n
                 raise SpecificationError(
-                    f"{', '.join(names)} {'was' if len(names) == 1 else 'were'} asked for of a run with jets up to "
+                    f"{', '.join(names)} {'is' if len(names) == 1 else 'are'} not in a run with jets up to "
                     f"order {(len(self.jets) - model.nq) // model.n}.",
                     f"These derivatives in time follow from jets up to order {highest}.",
                     nearest=f"simulate(..., method=sv.Taylor(jets={highest})).",
@@ -153,7 +152,7 @@ class Run(Value):
         low, high = min(self.t[0], self.t[-1]), max(self.t[0], self.t[-1])
         if not low - 1e-12 * (1 + abs(low)) <= t <= high + 1e-12 * (1 + abs(high)):
             raise SpecificationError(
-                f"t = {t:g} s was asked for.", f"The run covers {low:g} to {high:g} s.", do="Ask for a time within."
+                f"t = {t:g} s was given.", f"The run covers {low:g} to {high:g} s.", do="Give a time within."
             )
         if self.model is None:
             raise SpecificationError(
@@ -227,7 +226,7 @@ class Run(Value):
             for root in polynomial.deriv().roots():
                 if abs(root.imag) < 1e-9 and min([*neighbours, 0.0]) <= root.real <= max([*neighbours, 0.0]):
                     value = float(polynomial(root.real))
-                    if sign * (value - best[1]) > ROUNDING * np.abs(values[window]).max():
+                    if sign * (value - best[1]) > AS_SAMPLED * np.abs(values[window]).max():
                         best = (float(centre + root.real * width), value)
         return best
 
@@ -248,27 +247,11 @@ class Run(Value):
         ServoError
             If the file cannot be written.
         """
-        from pathlib import Path
-
-        path = Path(path)
-        path = path if path.suffix == ".npz" else path.with_name(path.name + ".npz")
-        signals = {name: self[name] for name in self.names if name not in self.jet_names}
-        meta = {name: getattr(self, name) for name in TOLD} | {"format": FORMAT, "jet_names": self.jet_names}
-        meta |= {"signals": list(signals), "residuals": list(self.residual)}
-        arrays = {f"signal_{i}": value for i, value in enumerate(signals.values())}
+        signals = [name for name in self.names if name not in self.jet_names]
+        facts = {name: getattr(self, name) for name in FACTS} | {"signals": signals, "residuals": list(self.residual)}
+        arrays = {"t": self.t, "jets": self.jets} | {f"signal_{i}": self[name] for i, name in enumerate(signals)}
         arrays |= {f"residual_{i}": self.residual[name] for i, name in enumerate(self.residual)}
-        try:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            np.savez_compressed(path, t=self.t, jets=self.jets, meta=np.array(json.dumps(meta)), **arrays)
-        except OSError as error:
-            raise ServoError(
-                f"The run cannot be written to {path}: {error.strerror or error}.",
-                "A run is saved where files may be created.",
-                nearest="The current folder, or the system's temporary one.",
-                do="Choose another path; the run itself is kept.",
-                path=str(path),
-            ) from error
-        return path
+        return archive.save(path, "run", facts, arrays)
 
     def to_xarray(self):
         """The run as an xarray.Dataset over time, where xarray is installed.
@@ -278,17 +261,11 @@ class Run(Value):
         ServoError
             If xarray is not installed.
         """
-        try:
-            import xarray
-        except ImportError as error:
-            raise ServoError(
-                "xarray is not installed.", "A Dataset is an xarray object.", do="Install xarray, or use run.save."
-            ) from error
         data = {name: ("t", self[name]) for name in self.names}
         for name in self.residual:
             data[f"residual_{name}"] = ((f"level_{name}", "t"), self.residual[name])
         attributes = {"method": self.method, "drift": self.drift, "message": self.message, **self.counters}
-        return xarray.Dataset(data, coords={"t": self.t}, attrs=attributes)
+        return archive.dataset(data, {"t": self.t}, attributes)
 
     def __repr__(self):
         if not len(self.t):
@@ -366,20 +343,14 @@ def load(path) -> Run:
     ServoError
         If the file is missing or was not written by `Run.save`.
     """
-    try:
-        with np.load(path, allow_pickle=False) as data:
-            meta = json.loads(str(data["meta"]))
-            signals = {name: data[f"signal_{i}"] for i, name in enumerate(meta["signals"])}
-            residuals = {name: data[f"residual_{i}"] for i, name in enumerate(meta["residuals"])}
-            told = {name: meta[name] for name in TOLD} | {"knots": tuple(meta["knots"])}
-            names = tuple(meta["jet_names"])
-            return Run(data["t"], data["jets"], names, stored=signals, stored_residual=residuals, **told)
-    except (OSError, KeyError, ValueError) as error:
-        raise ServoError(
-            f"{path} cannot be read as a run: {error}.",
-            "A run is an npz file written by Run.save.",
-            do="Check the path.",
-        ) from error
+    return archive.read(path, "run", _from_archive)
+
+
+def _from_archive(facts, arrays):
+    signals = {name: arrays[f"signal_{i}"] for i, name in enumerate(facts["signals"])}
+    residuals = {name: arrays[f"residual_{i}"] for i, name in enumerate(facts["residuals"])}
+    facts = {name: tuple(facts[name]) if isinstance(facts[name], list) else facts[name] for name in FACTS}
+    return Run(arrays["t"], arrays["jets"], stored=signals, stored_residual=residuals, **facts)
 
 
 def require_model(model, run, what):

@@ -21,13 +21,13 @@ from servoctl.methods.choice import (
     require_combination,
 )
 from servoctl.methods.drift import Poles, Project, as_drift
-from servoctl.methods.motion import Progress
 from servoctl.methods.radau import RadauSteps
 from servoctl.methods.runge_kutta import RungeKuttaSteps
 from servoctl.methods.scipy_methods import ScipySteps
 from servoctl.methods.stability import row_poles, run_checked, warn_many_steps
 from servoctl.methods.sundials import SundialsSteps
 from servoctl.methods.taylor import TaylorSteps
+from servoctl.progress import Progress
 from servoctl.run import Run
 
 DEFAULT_SAMPLES = 1001  # of a run unless t_eval says otherwise: smooth curves, and extrema refined to rounding

@@ -13,7 +13,7 @@ from scipy.integrate import solve_ivp
 import servoctl as sv
 from servoctl.gallery import gallery
 from servoctl.methods.choice import as_method
-from servoctl.methods.motion import Progress
+from servoctl.progress import Progress
 
 AMPLITUDE = 1.0  # rad
 STATE = ("x", "y", "z", "phi", "theta", "dphi", "dtheta")

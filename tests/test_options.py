@@ -5,10 +5,10 @@ import pytest
 from refusals import refused, warned
 
 import servoctl as sv
+from benchmarks.literature import dae_comparison, formulation_cost
 from servoctl.gallery.guided_arm import guided_arm
 from servoctl.methods.choice import as_method
 from servoctl.study import tradeoff as module
-from servoctl.study.formulation import formulation_cost
 
 ADAPTIVE = ("Taylor", "RadauIIA", "DOP853", "Radau", "LSODA", "CVODES", "IDAS")
 SPAN = (0.0, 0.2)
@@ -88,12 +88,12 @@ def test_what_comparisons_are_asked_for(gallery_model):
     model = gallery_model("two-cars")
     start = model.start()
     for options in ({"steps": "a"}, {"steps": []}, {"steps": [np.nan]}, {"steps": [1e-300]}, {"steps": [2.0]}):
-        stopped("steps=", lambda options=options: sv.dae_comparison(model, start, (0.0, 1.0), **options))
-    stopped("t_span=", lambda: sv.dae_comparison(model, start, (0.0,)))
-    with refused(sv.SpecificationError, "t_span=(1, 0)"):
-        sv.dae_comparison(model, model.start(t=1.0), (1.0, 0.0), steps=[0.1])
+        stopped("steps=", lambda options=options: dae_comparison(model, start, (0.0, 1.0), **options))
+    stopped("t_span=", lambda: dae_comparison(model, start, (0.0,)))
+    with refused(sv.SpecificationError, "t_span=(1.0, 0.0)"):
+        dae_comparison(model, model.start(t=1.0), (1.0, 0.0), steps=[0.1])
     with refused(sv.SpecificationError, "forms=[]"):
-        sv.dae_comparison(model, start, (0.0, 1.0), forms=[])
+        dae_comparison(model, start, (0.0, 1.0), forms=[])
     for cases in ([], [3], [("a", 1)]):
         stopped("cases=", lambda cases=cases: formulation_cost(guided_arm, cases))
 
@@ -154,11 +154,11 @@ def test_studies_refuse_a_start_off_the_constraints(scene):
     with pytest.raises(sv.InconsistentStart):
         sv.tradeoff(model, off, SPAN, ["Taylor"], ["project"])
     with pytest.raises(sv.InconsistentStart):
-        sv.dae_comparison(model, off, SPAN, steps=[0.1])
+        dae_comparison(model, off, SPAN, steps=[0.1])
 
 
 def test_a_comparison_of_one_form_and_method(scene):
-    found = sv.dae_comparison(*scene, SPAN, [0.1], "projected", "BE")
+    found = dae_comparison(*scene, SPAN, [0.1], "projected", "BE")
     assert [(row["form"], row["method"]) for row in found.rows()] == [("projected", "BE")]
 
 

@@ -13,8 +13,8 @@ from matplotlib.figure import Figure
 from refusals import refused
 
 import servoctl
+from servoctl import figures as plots
 from servoctl.errors import NameUnknown, ServoError, SpecificationError
-from servoctl.figures import run as plots
 from servoctl.gallery import gallery
 from servoctl.run import Run
 
@@ -290,7 +290,7 @@ def test_a_run_of_one_sample_is_drawn(tmp_path):
 
 def test_a_folder_that_cannot_be_written(run, tmp_path):
     (tmp_path / "file").write_text("")
-    with refused(ServoError, folder=str(tmp_path / "file")):
+    with refused(ServoError, path=str(tmp_path / "file")):
         plots.save_figures(run, tmp_path / "file")
 
 
@@ -299,7 +299,7 @@ def test_pyplot_and_the_backend_are_left_alone(tmp_path):
 import sys
 import numpy as np
 import servoctl
-from servoctl.figures import run as plots
+from servoctl import figures as plots
 assert not [name for name in sys.modules if name.startswith("matplotlib")]
 t = np.linspace(0, 1, 9)
 plots.save_figures(servoctl.Run(t, np.array([t, t]), ("x", "y")), {str(tmp_path)!r})

@@ -20,7 +20,7 @@ import servoctl as sv
 from servoctl.errors import NameUnknown, ServoError, SpecificationError
 from servoctl.gallery import overhead_crane
 from servoctl.shell.main import main
-from servoctl.study.sweep import TOLD
+from servoctl.study.cases import FAILURE
 
 LOADS = {"m_load": lambda rng: rng.normal(115.0, 5.0)}
 
@@ -360,7 +360,7 @@ def test_a_run_gives_extrema_final_values_and_its_residual(gallery_model):
     model = gallery_model("overhead-crane")
     run = sv.simulate(model, model.start(guess={"l": 4.0}), (0.0, 8.0), progress=False)
     row = sv.sweep(lambda m: run, {"m": [1]}).rows()[0]
-    assert [name for name in row if name not in TOLD][2:] == [
+    assert [name for name in row if name not in FAILURE][2:] == [
         f"{name}_{what}" for name in ("trolley", "hoist", "tension", "X", "Z") for what in ("min", "max", "end")
     ] + ["residual", "t_end"]
     assert row["trolley_max"] == run["trolley"].max() and row["tension_end"] == run["tension"][-1]
@@ -388,7 +388,7 @@ def test_the_figure_shows_percentiles_dependence_and_failures():
         return {"r": 10 * a + b, "still": 1.0}
 
     study = sv.sweep(case, sv.monte_carlo(200, seed=1, a=lambda r: r.uniform(0, 2), b=lambda r: r.uniform(0, 2)))
-    figure = sv.plots.sweep(study, units={"r": "N"})
+    figure = sv.figures.sweep(study, units={"r": "N"})
     histogram, scatter = figure.axes
     assert (histogram.get_xlabel(), scatter.get_xlabel(), scatter.get_ylabel()) == ("r [N]", "a", "r [N]")
     lines = [line.get_xdata()[0] for line in histogram.get_lines()]
@@ -397,11 +397,11 @@ def test_the_figure_shows_percentiles_dependence_and_failures():
     assert sum(patch.get_height() for patch in histogram.patches) == len(finished)
     failed = len(study) - len(finished)
     assert failed and scatter.get_legend().get_texts()[0].get_text() == f"{failed} without result"
-    assert sv.plots.sweep(study, ["r"], "b").axes[1].get_xlabel() == "b"
+    assert sv.figures.sweep(study, ["r"], "b").axes[1].get_xlabel() == "b"
     with pytest.raises(NameUnknown):
-        sv.plots.sweep(study, ["rr"])
+        sv.figures.sweep(study, ["rr"])
     with refused(SpecificationError, "2 rows"):
-        sv.plots.sweep(study.take([0, 1]), [])
+        sv.figures.sweep(study.take([0, 1]), [])
 
 
 def test_a_sweep_of_functions_pickles_by_name():

@@ -44,7 +44,7 @@ def test_slowed_rates_and_curvatures_leave_the_path_where_it_is():
 
 
 def test_the_motions_tried_are_shown(capsys, monkeypatch):
-    monkeypatch.setattr("servoctl.control.time_law.PATIENCE", 0)
+    monkeypatch.setattr("servoctl.progress.PATIENCE", 0)
     sv.fastest(*cars(), {"force": 200.0}, (0.0, 2.0), progress=True)
     told = capsys.readouterr().err
     assert "fastest" in told and "motions" in told and "simulate" not in told
@@ -111,7 +111,7 @@ def test_bad_input():
         with refused(sv.SpecificationError, fact):
             sv.fastest(mechanism, program, limits, span)
     for pair, kind in (((mechanism, "cars"), "Program"), (("cars", program), "Mechanism")):
-        with refused(sv.SpecificationError, "str", kind):
+        with refused(sv.SpecificationError, "str", kind.lower()):
             sv.fastest(*pair, {"force": 200.0}, (0.0, 2.0))
     for given in ("start", "parameters"):
         with refused(sv.SpecificationError, "[1.0]"):

@@ -188,6 +188,23 @@ class Closed:
         plan = resampled(self.plan, np.clip(self.t, self.plan.t[0], self.plan.t[-1]))
         return {name: self[name] - plan[name] for name in self.plant.state_names if name in plan.names}
 
+    def planned(self, name):
+        """A signal of the plan at the samples up to the plan's end.
+
+        Parameters
+        ----------
+        name : str
+
+        Returns
+        -------
+        t, values : (K,) arrays
+            Empty without a plan.
+        """
+        if self.plan is None:
+            return np.zeros(0), np.zeros(0)
+        t = self.t[self.t <= self.plan.t[-1]]
+        return t, resampled(self.plan, t)[name]
+
     def state(self, t):
         """The state of the plant at a sample, (n_x,).
 

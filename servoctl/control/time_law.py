@@ -1,15 +1,14 @@
 """The fastest time law of a program that its actuators can follow."""
 
 import functools
-import sys
 from dataclasses import dataclass
 
 import numpy as np
 
 from servoctl.checks import as_span, interval, mapping
 from servoctl.errors import InconsistentStart, IntegrationStopped, LimitExceeded, SingularProgram, SpecificationError
-from servoctl.methods.motion import PATIENCE
 from servoctl.model.model import derive
+from servoctl.progress import progress_bar
 from servoctl.run import Run
 from servoctl.simulation import simulate
 from servoctl.spec.mechanism import Mechanism
@@ -103,7 +102,7 @@ def fastest(mechanism, program, limits, t_span, start=None, guess=None, paramete
         finally:
             bar.update()
 
-    with _bar(progress) as bar:
+    with progress_bar("fastest", progress, unit=" motions") as bar:
         quick, slow = _bracket(attempt)
         factor = brentq(lambda sigma: min(attempt(sigma)[0], 1.0) + BELOW, quick, slow, rtol=BELOW / 10)
     excess, binding, slower, plan = attempt(factor)
@@ -156,13 +155,6 @@ class _Scene:
         except (SingularProgram, InconsistentStart, IntegrationStopped):
             return np.inf, ("", "", t0), slower, None
         return *_worst(plan, self.limits), slower, plan
-
-
-def _bar(wanted):
-    from tqdm import tqdm
-
-    wanted = sys.stderr.isatty() if wanted is None else wanted
-    return tqdm(desc="fastest", unit=" motions", delay=PATIENCE, disable=not wanted)
 
 
 def _bracket(attempt):

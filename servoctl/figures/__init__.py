@@ -1,1 +1,20 @@
-"""Figures of runs, loops and studies."""
+"""Figures of runs, closed loops and sweeps; each function returns matplotlib's Axes or Figure."""
+
+from servoctl.figures.cases import sweep
+from servoctl.figures.loop import closed
+from servoctl.figures.names import efforts
+from servoctl.figures.run import actuation, path, residuals, save_figures, signals
+from servoctl.figures.style import COLOURS, STYLES
+
+__all__ = [
+    "COLOURS",
+    "STYLES",
+    "actuation",
+    "closed",
+    "efforts",
+    "path",
+    "residuals",
+    "save_figures",
+    "signals",
+    "sweep",
+]

@@ -2,44 +2,53 @@
 
 import numpy as np
 
-from servoctl.control.result import Closed
 from servoctl.errors import SpecificationError
+from servoctl.figures.style import BESIDE, COLOURS, label, look, panels
 
-COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")  # Okabe and Ito
-STYLES = ("-", "--", ":", "-.")
 LIMIT = "#A00000"
 
 
-def draw(run, units):
-    """Panels one above the other: residuals, errors of coordinates by unit, each actuator."""
-    from matplotlib.figure import Figure
+def closed(run, units=None):
+    """Draw a closed loop: the program's residuals, coordinates less those of the plan, inputs with plan and limits.
 
-    if not isinstance(run, Closed):
-        raise SpecificationError(
-            f"A {type(run).__name__} was given.", "A closed loop is drawn.", "What sv.close returns.", "Give that."
-        )
+    Parameters
+    ----------
+    run : Closed
+    units : dict of str to str, optional
+        Unit of each coordinate and actuator, by name.
+
+    Returns
+    -------
+    (n,) array of Axes
+
+    Raises
+    ------
+    SpecificationError
+        If the loop ended before its first sample, or it is no closed loop.
+    """
+    if not hasattr(run, "commands"):
+        raise SpecificationError(f"A {type(run).__name__} was given.", "The figure is that of a loop, from sv.close.")
     if not len(run.t):
-        raise SpecificationError("The loop has no samples.", "A figure shows some.", do="See run.message.")
+        raise SpecificationError("The loop has no samples.", "It ended before the first one.", do="See run.message.")
+    units = units or {}
     errors = _errors(run, units)
     count = len(errors) + len(run.plant.inputs)
-    figure = Figure(figsize=(10.0, 1.0 + 1.9 * count), dpi=100, layout="constrained")
-    axes = figure.subplots(count, 1, sharex=True, squeeze=False)[:, 0]
-    for ax, (label, curves) in zip(axes, errors, strict=False):
+    axes = panels(count, 1.0 + 1.9 * count)
+    for ax, (text, curves) in zip(axes, errors, strict=False):
         for i, (name, values) in enumerate(curves.items()):
-            style = STYLES[i // len(COLOURS) % len(STYLES)]
-            ax.plot(run.t, values, style, color=COLOURS[i % len(COLOURS)], label=name)
-        ax.set_ylabel(label)
+            ax.plot(run.t, values, label=name, **look(i))
+        ax.set_ylabel(text)
     for ax, name in zip(axes[len(errors) :], run.plant.inputs, strict=True):
         _input(ax, run, name, units.get(name, ""))
     for ax in axes:
         ax.grid(alpha=0.3)
         ax.margins(x=0.01)
         if ax.get_legend_handles_labels()[0]:
-            ax.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0), frameon=False)
+            ax.legend(**BESIDE)
         if not run.success:
             _lost(ax, run)
     axes[-1].set_xlabel("t [s]")
-    figure.align_ylabels(list(axes))
+    axes[0].figure.align_ylabels(list(axes))
     return axes
 
 
@@ -55,27 +64,24 @@ def _lost(ax, run):
 
 def _errors(run, units):
     """(label, {name: values}) of each panel of errors."""
-    found = []
+    groups = []
     program = {n: v[0] for n, v in run.residual.items() if n not in run.plant.constraint_names()}
     if program:
-        found.append(("residuals, SI", program))
-    groups = {}
+        groups.append(("residuals, SI", program))
+    by_unit = {}
     for name in run.plant.mechanism.q.names:
         if name in run.error:
-            groups.setdefault(units.get(name, ""), {})[name] = run.error[name]
-    return found + [(f"off the plan [{unit}]" if unit else "off the plan", group) for unit, group in groups.items()]
+            by_unit.setdefault(units.get(name, ""), {})[name] = run.error[name]
+    return groups + [(label("off the plan", unit), errors) for unit, errors in by_unit.items()]
 
 
 def _input(ax, run, name, unit):
     """What an actuator was given, what the plan has and the law asked for, and its limits."""
-    from servoctl.control.reference import resampled
-
     if run.plan is not None:
-        within = run.t[run.t <= run.plan.t[-1]]
-        ax.plot(within, resampled(run.plan, within)[name], "--", color="black", linewidth=0.9, zorder=3, label="plan")
-    given, asked = run.input[name], run.command[name]
-    if not np.array_equal(given, asked):
-        ax.plot(run.t, asked, color=COLOURS[1], linewidth=0.7, drawstyle="steps-post", label="command")
+        ax.plot(*run.planned(name), "--", color="black", linewidth=0.9, zorder=3, label="plan")
+    given, command = run.input[name], run.command[name]
+    if not np.array_equal(given, command):
+        ax.plot(run.t, command, color=COLOURS[1], linewidth=0.7, drawstyle="steps-post", label="command")
     ax.plot(run.t, given, color=COLOURS[0], linewidth=1.2, drawstyle="steps-post", label="input")
     low, high = run.plant.limits.get(name, (-np.inf, np.inf))
     met = [limit for limit in (low, high) if np.isfinite(limit)]
@@ -85,4 +91,4 @@ def _input(ax, run, name, unit):
         values = np.concatenate([given, met])
         room = 0.15 * max(np.ptp(values), 1e-300)
         ax.set_ylim(values.min() - room, values.max() + room)
-    ax.set_ylabel(f"{name} [{unit}]" if unit else name)
+    ax.set_ylabel(label(name, unit))

@@ -4,20 +4,18 @@ Without `ax` a figure is made outside pyplot, so that the user's backend stays a
 a window or a notebook give `ax=plt.subplots()[1]`.
 """
 
-import re
-
 import numpy as np
 
-from servoctl.errors import ServoError, SpecificationError
+from servoctl.archive import writing
+from servoctl.errors import SpecificationError
+from servoctl.figures.names import along_one_axis, coordinates, efforts, label_of, planes, unit_of
+from servoctl.figures.style import BESIDE, COLOURS, STYLES, look, panels
 
-COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")  # Okabe and Ito
-STYLES = ("-", "--", ":", "-.")
-WIDTH = 10.0  # inches: 1000 px at matplotlib's 100 dpi
-FLOOR = 1e-18  # of residuals on a logarithmic scale, so that exact zeros are seen
+LEAST = 1e-18  # of residuals on a logarithmic scale, so that exact zeros are seen
 BINS = 100  # of time, in each of which a residual is drawn by its greatest magnitude: rounding stays a band
 LAST, UNBOUNDED = 0.01, 2.0  # a signal that doubles its range in the last hundredth of a stopped run leaves the frame
-NEGLIGIBLE = 1e-9  # variation relative to the largest value of the same unit: rounding, not filled with it
-ROUNDING = 1e-14  # magnitude relative to the largest value of any unit, in SI: rounding, too
+FLAT = 1e-9  # variation relative to the largest value of the same unit: rounding, not filled with it
+VISIBLE = 1e-14  # magnitude relative to the largest value of any unit, in SI: rounding, too
 
 
 def path(run, x=None, y=None, ax=None, units=None):
@@ -43,24 +41,24 @@ def path(run, x=None, y=None, ax=None, units=None):
     NameUnknown
         If there is no such signal.
     """
-    planes, names = _planes(run), _coordinates(run)
-    if x is None and y is None and not planes and _along_one_axis(names):
-        return signals(run, names, _panels(1, 4.2)[0] if ax is None else ax, units)
-    first, second, *_ = planes[0] if planes else dict.fromkeys([*names, *run.names])
+    groups, names = planes(run), coordinates(run)
+    if x is None and y is None and not groups and along_one_axis(names):
+        return signals(run, names, panels(1, 4.2)[0] if ax is None else ax, units)
+    first, second, *_ = groups[0] if groups else dict.fromkeys([*names, *run.names])
     if x is None:
         x = first if y != first else second
     if y is None:
         y = second if x != second else first
     units = units or {}
     across, up = run[x], run[y]
-    ax = _panels(1, 6.0)[0] if ax is None else ax
+    ax = panels(1, 6.0)[0] if ax is None else ax
     ax.plot(across, up, color=COLOURS[0])
     ax.plot(across[0], up[0], "o", color=COLOURS[0], markerfacecolor="white", label=f"start, t = {run.t[0]:.4g} s")
     _, word, mark = _ending(run)
     ax.plot(across[-1], up[-1], mark, color=COLOURS[1], label=f"{word}, t = {run.t[-1]:.4g} s")
-    ax.set(xlabel=_label([x], units), ylabel=_label([y], units))
+    ax.set(xlabel=label_of([x], units), ylabel=label_of([y], units))
     spans = sorted(float(np.ptp(v[np.isfinite(v)])) if np.isfinite(v).any() else 0.0 for v in (across, up))
-    if _unit(x, units) and _unit(x, units) == _unit(y, units) and spans[1] <= 5 * spans[0]:
+    if unit_of(x, units) and unit_of(x, units) == unit_of(y, units) and spans[1] <= 5 * spans[0]:
         ax.set_aspect("equal", adjustable="datalim")
     ax.grid(alpha=0.3)
     ax.legend()
@@ -93,10 +91,10 @@ def signals(run, names=None, ax=None, units=None):
         If the number of Axes is not that of the panels.
     """
     units = units or {}
-    names = _coordinates(run) if names is None else [names] if isinstance(names, str) else list(names)
+    names = coordinates(run) if names is None else [names] if isinstance(names, str) else list(names)
     groups = {}
     for name in names:
-        groups.setdefault(_unit(name, units) or (name,), []).append(name)
+        groups.setdefault(unit_of(name, units) or (name,), []).append(name)
     return _over_time(run, list(groups.values()), ax, units)
 
 
@@ -149,78 +147,24 @@ def residuals(run, ax=None):
     -------
     Axes
     """
-    ax = _panels(1, 5.0)[0] if ax is None else ax
+    ax = panels(1, 5.0)[0] if ax is None else ax
     bins = np.array_split(np.arange(len(run.t)), min(BINS, len(run.t)))
     t = np.array([run.t[rows].mean() for rows in bins])
-    levels, top = 0, FLOOR
+    levels, top = 0, LEAST
     for i, name in enumerate(run.residual):
-        values = np.maximum(np.abs(run.residual[name]), FLOOR)
+        values = np.maximum(np.abs(run.residual[name]), LEAST)
         levels = max(levels, len(values))
         for j, row in enumerate(values):
             worst = np.array([row[rows].max() for rows in bins])
-            top = max(top, worst[np.isfinite(worst)].max(initial=FLOOR))
-            style, colour = STYLES[j % len(STYLES)], COLOURS[i % len(COLOURS)]
-            ax.plot(t, worst, style, color=colour, linewidth=1.0 if j else 1.8)
+            top = max(top, worst[np.isfinite(worst)].max(initial=LEAST))
+            ax.plot(t, worst, STYLES[j % len(STYLES)], color=COLOURS[i % len(COLOURS)], linewidth=1.0 if j else 1.8)
     ax.set_yscale("log")
-    ax.set(xlabel="t [s]", ylabel="|residual|, SI (1e-18: zero)", ylim=(FLOOR / 2, max(10 * top, 1e-12)))
+    ax.set(xlabel="t [s]", ylabel="|residual|, SI (1e-18: zero)", ylim=(LEAST / 2, max(10 * top, 1e-12)))
     ax.grid(alpha=0.3)
     _instants(run, [ax])
     _end(run, [ax])
     _keys(ax, list(run.residual), levels)
     return ax
-
-
-def sweep(study, names=None, against=None, units=None):
-    """Draw results of a sweep: histograms with percentiles, and each over a parameter.
-
-    Parameters
-    ----------
-    study : Study
-        From `sweep` or `merge`.
-    names : sequence of str, optional
-        Columns; default: the first four results that vary.
-    against : str, optional
-        Column across; default: for each result the parameter with the largest rank correlation.
-    units : dict of str to str, optional
-        Unit of each column, by name.
-
-    Returns
-    -------
-    matplotlib.figure.Figure
-
-    Raises
-    ------
-    NameUnknown
-        If there is no such column.
-    SpecificationError
-        If no result varies, or it is no sweep.
-    """
-    from servoctl.figures.sweep import draw
-
-    return draw(study, names, against, units)
-
-
-def closed(run, units=None):
-    """Draw a closed loop: the program's residuals, coordinates less those of the plan, inputs with plan and limits.
-
-    Parameters
-    ----------
-    run : Closed
-    units : dict of str to str, optional
-        Unit of each coordinate and actuator, by name.
-
-    Returns
-    -------
-    (n,) array of Axes
-
-    Raises
-    ------
-    SpecificationError
-        If the loop ended before its first sample, or it is no closed loop.
-    """
-    from servoctl.figures.loop import draw
-
-    return draw(run, units or {})
 
 
 def save_figures(run, folder, units=None, title=""):
@@ -246,98 +190,19 @@ def save_figures(run, folder, units=None, title=""):
     ServoError
         If the folder cannot be written.
     """
-    from pathlib import Path
-
-    folder = Path(folder)
     drawn = {"path": path(run, units=units), "coordinates": signals(run, units=units)}
     if efforts(run):
         drawn["actuation"] = actuation(run, units=units)
     if len(run.residual):
         drawn["residuals"] = residuals(run)
     files = []
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
+    with writing(folder, "figures", folder=True) as folder:
         for name, axes in drawn.items():
             figure = np.ravel(axes)[0].figure
             figure.suptitle(f"{title}: {name}" if title else name)
             files.append(folder / f"{name}.png")
             figure.savefig(files[-1], dpi=100)
-    except OSError as error:
-        raise ServoError(
-            f"Figures cannot be written to {folder}: {error.strerror or error}.",
-            "Figures are saved where files may be created.",
-            nearest="The current folder, or the system's temporary one.",
-            do="Choose another folder; the run itself is kept.",
-            folder=str(folder),
-        ) from error
     return files
-
-
-def efforts(run):
-    """Names of the run's actuators, or of the ideal reaction's components; of a loaded run, outputs among them."""
-    reaction = [name for name in run.names if name.startswith("reaction_")]
-    if reaction:
-        return reaction
-    if run.model is not None:
-        return [name for name in run.model.actuators if name in run.names]
-    rates = {f"{d}{name}" for name in run.jet_names for d in ("d", "d2")}
-    return [n for n in run.stored if n != "energy" and not n.startswith("multiplier_") and n not in rates]
-
-
-def _coordinates(run):
-    if run.model is not None:
-        return list(run.model.coordinate_names)
-    base = [name for name in run.jet_names if _antiderivative(name, run.jet_names) is None]
-    moved = [name for name in base if f"d{name}" in run.stored]  # by quasi-velocities: q' is no jet
-    return moved or base
-
-
-def _antiderivative(name, names):
-    """(q, k) of the k-th derivative of a signal, or None."""
-    found = re.fullmatch(r"d(\d*)(.+)", name)
-    return (found[2], int(found[1] or 1)) if found and found[2] in names else None
-
-
-def _planes(run):
-    """Groups of names that span a plane by convention, capitals first, and outputs before coordinates."""
-    outputs = list(run.model.outputs) if run.model is not None else []
-    groups = {}
-    for name in [*outputs, *_coordinates(run)]:
-        found = re.fullmatch(r"(.*_)?([xyzXYZ])(_.*|\d*)", name)
-        if found:
-            groups.setdefault((found[2].islower(), found[1], found[3]), []).append(name)
-    return [names for key, names in sorted(groups.items(), key=lambda group: group[0][0]) if len(names) > 1]
-
-
-def _along_one_axis(names):
-    axes = {name.rstrip("0123456789") for name in names}
-    return len(names) == 1 or len(axes) == 1 and axes < set("xyzXYZ")
-
-
-def _unit(name, units):
-    """Unit of a signal, also of a derivative or of a component of the reaction; "" where it is not known."""
-    if name in units:
-        return units[name]
-    if name == "energy":
-        return "J"
-    if name.startswith("reaction_"):
-        return {"m": "N", "rad": "N m"}.get(units.get(name.removeprefix("reaction_")), "")
-    found = _antiderivative(name, units)
-    return "" if found is None else units[found[0]] + ("/s" if found[1] == 1 else f"/s$^{{{found[1]}}}$")
-
-
-def _label(names, units):
-    unit = {_unit(name, units) for name in names}
-    text = ", ".join(names) if len(names) < 4 else ", ".join([*names[:2], "...", names[-1]])
-    return f"{text} [{unit.pop()}]" if len(unit) == 1 and unit != {""} else text
-
-
-def _panels(count, height):
-    """Axes one above the other, over the same time, in a new figure of `WIDTH`."""
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(WIDTH, height), dpi=100, layout="constrained")
-    return figure.subplots(count, 1, sharex=True, squeeze=False)[:, 0]
 
 
 def _over_time(run, groups, ax, units, extrema=False):
@@ -347,27 +212,24 @@ def _over_time(run, groups, ax, units, extrema=False):
     alone = isinstance(ax, Axes)
     if alone:
         groups = [[name for group in groups for name in group]]
-    axes = np.ravel(_panels(len(groups), max(4.2, 1.0 + 1.9 * len(groups))) if ax is None else ax)
+    axes = np.ravel(panels(len(groups), max(4.2, 1.0 + 1.9 * len(groups))) if ax is None else ax)
     if len(axes) != len(groups):
         raise SpecificationError(
             f"{len(axes)} Axes were given.",
             f"There are {len(groups)} panels: {'; '.join(', '.join(group) for group in groups)}.",
-            nearest="One Axes, which takes all of them.",
-            do="Give as many Axes as panels, or one.",
+            do="Give as many Axes as panels, or one, which takes all.",
         )
     largest = _largest(run, [name for group in groups for name in group], units)
     for panel, group in zip(axes, groups, strict=True):
-        mixed = len({_unit(name, units) for name in group}) > 1
+        mixed = len({unit_of(name, units) for name in group}) > 1
         for i, name in enumerate(group):
-            style = STYLES[i // len(COLOURS) % len(STYLES)]
-            label = _label([name], units if mixed else {})
-            panel.plot(run.t, run[name], style, color=COLOURS[i % len(COLOURS)], label=label)
-        of_unit = max(largest[_unit(name, units)] for name in group)
-        _frame(panel, run, group, max(largest.values()) if of_unit < ROUNDING * max(largest.values()) else of_unit)
-        panel.set_ylabel(_label(group, units))
+            panel.plot(run.t, run[name], label=label_of([name], units if mixed else {}), **look(i))
+        of_unit = max(largest[unit_of(name, units)] for name in group)
+        _frame(panel, run, group, max(largest.values()) if of_unit < VISIBLE * max(largest.values()) else of_unit)
+        panel.set_ylabel(label_of(group, units))
         panel.grid(alpha=0.3)
         if len(group) > 1:
-            panel.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0), frameon=False)
+            panel.legend(**BESIDE)
         if extrema:
             panel.set_title("\n".join(_extrema(run, name, units) for name in group), fontsize="small", loc="left")
     axes[-1].set_xlabel("t [s]")
@@ -379,19 +241,19 @@ def _over_time(run, groups, ax, units, extrema=False):
 
 def _largest(run, names, units):
     """Greatest magnitude among the signals of each unit."""
-    found = {}
+    largest = {}
     for name in names:
         values = np.abs(run[name])
-        unit = _unit(name, units)
-        found[unit] = max(found.get(unit, 0.0), values[np.isfinite(values)].max(initial=0.0))
-    return found
+        unit = unit_of(name, units)
+        largest[unit] = max(largest.get(unit, 0.0), values[np.isfinite(values)].max(initial=0.0))
+    return largest
 
 
 def _frame(ax, run, names, largest):
     """Keep rounding from filling the panel, and what grows without bound before a stop from flattening the rest."""
     values = np.concatenate([run[name] for name in names])
     values = values[np.isfinite(values)]
-    if values.size and np.ptp(values) < NEGLIGIBLE * largest:
+    if values.size and np.ptp(values) < FLAT * largest:
         middle = (values.min() + values.max()) / 2
         ax.set_ylim(middle - largest / 10, middle + largest / 10)
     if run.success or len(run.t) < 3:
@@ -406,7 +268,7 @@ def _frame(ax, run, names, largest):
 def _extrema(run, name, units):
     if not np.all(np.isfinite(run[name])):
         return f"{name}: not finite at some instants"
-    unit = _unit(name, units)
+    unit = unit_of(name, units)
     low, high = (f"{value + 0.0:.6g} {unit}".strip() + f" (t = {t:.4g} s)" for t, value in run.extrema(name))
     return f"{name}: {low} to {high}"
 
@@ -446,5 +308,4 @@ def _keys(ax, names, levels):
         Line2D([], [], color="black", linestyle=STYLES[j % len(STYLES)], label=words[j])
         for j in range(levels if levels > 1 else 0)
     ]
-    beside = {"loc": "upper left", "bbox_to_anchor": (1.01, 1.0), "frameon": False, "fontsize": "small"}
-    ax.legend(handles=[*colours, *styles], **beside)
+    ax.legend(handles=[*colours, *styles], fontsize="small", **BESIDE)

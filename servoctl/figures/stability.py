@@ -2,33 +2,29 @@
 
 import numpy as np
 
-from servoctl.methods.runge_kutta import ORDERS
+from servoctl.figures import style
 
-COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")  # Okabe and Ito
-STEPS, POLES, LINE = 120, 81, 3  # of the shaded map; every third pole for lines
+SHADED_STEPS, SHADED_POLES, LINE = 120, 81, 3  # of the shaded map; every third pole for lines
 LEVELS = (0.0, 0.5, 0.8, 0.9, 0.95, 1.0, 1.05, 1.2, 1.5, 2.0)  # of the radius: fine where stability ends
 
 
-def draw(stability, method, poles):
-    """Largest steps of all methods over the poles; spectral radius of one method over poles and steps."""
-    from matplotlib.figure import Figure
-
+def draw_stability(stability, method, poles, methods):
+    """Largest steps of several methods over the poles; spectral radius of one method over poles and steps."""
     length = abs(stability.t[-1] - stability.t[0])
-    poles = np.geomspace(0.3, 300.0, POLES) * 10 / length if poles is None else poles
-    figure = Figure(figsize=(10.0, 4.4), layout="constrained")
-    left, right = figure.subplots(1, 2, sharex=True)
-    _largest_steps(stability, left, poles)
+    poles = np.geomspace(0.3, 300.0, SHADED_POLES) * 10 / length if poles is None else poles
+    figure, ((left, right),) = style.figure(4.4, columns=2, sharex=True)
+    _largest_steps(stability, left, poles, methods)
     _radius(stability, right, method, poles, left.get_ylim())
     return figure
 
 
-def _largest_steps(stability, ax, poles):
+def _largest_steps(stability, ax, poles, methods):
     poles = _fewer(poles)
-    for colour, method in zip(COLOURS, (*ORDERS, "Taylor"), strict=False):
+    for colour, method in zip(style.COLOURS, methods, strict=False):
         steps = np.array([stability.largest_step(method, 1.0 / pole) for pole in poles])
         name = f"Taylor, order {stability.order}" if method == "Taylor" else method
-        style = "--" if method == "RK2" else "-"  # on the real axis as far as RK1
-        ax.loglog(poles, np.where(steps > 0, steps, np.nan), style, color=colour, label=name)
+        line = "--" if method == "RK2" else "-"  # on the real axis as far as RK1
+        ax.loglog(poles, np.where(steps > 0, steps, np.nan), line, color=colour, label=name)
     ax.set(xlabel="poles of the error dynamics, 1/T [1/s]", ylabel="step h [s]")
     ax.set_title("Largest stable step", fontsize=11)
     ax.grid(alpha=0.3)
@@ -38,7 +34,7 @@ def _largest_steps(stability, ax, poles):
 def _radius(stability, ax, method, poles, limits):
     from matplotlib.colors import BoundaryNorm
 
-    steps = np.geomspace(*limits, STEPS)
+    steps = np.geomspace(*limits, SHADED_STEPS)
     radius = np.array([[stability.radius(method, h, 1.0 / pole).max() for pole in poles] for h in steps])
     norm = BoundaryNorm(LEVELS, 256)
     shade = ax.contourf(poles, steps, np.minimum(radius, LEVELS[-1]), LEVELS, cmap="RdBu_r", norm=norm)

@@ -1,8 +1,6 @@
-"""What every integration shares: pieces of a motion, progress, and other pivots where the monitor wants them."""
+"""What every integration shares: pieces of a motion, and other pivots where the monitor wants them."""
 
 import contextlib
-import sys
-import time
 from dataclasses import dataclass, field
 from itertools import pairwise
 
@@ -10,8 +8,6 @@ import numpy as np
 
 from servoctl.methods.drift import Poles
 from servoctl.methods.monitor import VANISHING, Monitor, Repivot
-
-PATIENCE = 1.0  # s before a progress bar appears
 
 
 @dataclass
@@ -62,42 +58,6 @@ class Motion:
             else:
                 variants.append((i, i + 1, model))
         return t[keep], z[:, keep], variants
-
-
-class Progress:
-    """A progress bar over time that appears when the work takes long.
-
-    `wanted` None means: on a terminal; a function is called with the time instead.
-    """
-
-    def __init__(self, span, wanted):
-        self.t0, self.total = span[0], abs(span[1] - span[0])
-        self.told = wanted if callable(wanted) else None
-        self.wanted = sys.stderr.isatty() if wanted is None else wanted
-        self.since, self.bar, self.done = time.monotonic(), None, 0.0
-
-    def __call__(self, t):
-        """Show that the work has come to t [s]."""
-        if self.told is not None:
-            self.told(t)
-            return
-        if not self.wanted:
-            return
-        if self.bar is None:
-            if time.monotonic() - self.since < PATIENCE:
-                return
-            from tqdm import tqdm
-
-            self.bar = tqdm(
-                total=self.total, unit="s", desc="simulate", bar_format="{l_bar}{bar}| {n:.3g}/{total:.3g} s"
-            )
-        self.bar.update(abs(t - self.t0) - self.done)
-        self.done = abs(t - self.t0)
-
-    def close(self):
-        """Remove the bar."""
-        if self.bar is not None:
-            self.bar.close()
 
 
 @contextlib.contextmanager

@@ -10,9 +10,7 @@ from servoctl.checks import finite
 from servoctl.codegen.function import compiled
 from servoctl.errors import SpecificationError, unknown
 from servoctl.model.equations import EQUATIONS, SIGNALS, Equations, gradient_jets, leading_names, residual_rows
-from servoctl.model.formulations import FORMULATIONS
 from servoctl.model.report import describe
-from servoctl.model.servo_dae import SERVO_DAE
 from servoctl.model.start import State, consistent
 from servoctl.model.store import Store, pack, unpack
 from servoctl.reduction.appell import require_positive
@@ -21,8 +19,6 @@ from servoctl.reduction.reduce import holds, reduce
 from servoctl.reduction.structure import structure
 from servoctl.spec.mechanism import Mechanism
 from servoctl.spec.program import Program
-
-FUNCTIONS = {**EQUATIONS, **SERVO_DAE, **FORMULATIONS}
 
 
 def derive(mechanism: Mechanism, program: Program, guess: Mapping[str, float] | None = None) -> "Model":
@@ -271,17 +267,17 @@ class Model:
         ----------
         name : str
             "ode", "ode_projected", "ode_poles", "ode_jacobian", "ode_poles_jacobian", "path", "invariants",
-            "matrices", "plant", "multiplier_form", "accelerations", or one of `SERVO_DAE` and `FORMULATIONS`.
+            "matrices", "plant", "multiplier_form", or "accelerations".
 
         Returns
         -------
         Compiled
         """
-        if name not in FUNCTIONS:
-            raise unknown(name, list(FUNCTIONS), "function")
+        if name not in EQUATIONS:
+            raise unknown(name, list(EQUATIONS), "function")
 
         def build():
-            f, *options = FUNCTIONS[name](self.equations)
+            f, *options = EQUATIONS[name](self.equations)
             return compiled(f, name, *options)
 
         return self.once(name, build)

@@ -1,6 +1,7 @@
 """What a run leaves: the text that was printed, a folder with its files, and its facts as plain values."""
 
 import contextlib
+import json
 import math
 import os
 import sys
@@ -8,9 +9,11 @@ import tempfile
 import textwrap
 from pathlib import Path
 
+import servoctl as sv
 from servoctl.errors import ServoError
+from servoctl.study.table import machine
 
-WIDTH = 120  # columns of what is printed
+COLUMNS = 120  # columns of what is printed
 FILES = ("run.npz", "summary.json", "report.txt", "path.png", "coordinates.png", "actuation.png", "residuals.png")
 LOOP_FILES = ("closed_loop.npz", "closed_loop.png")
 
@@ -21,13 +24,14 @@ class Report:
     def __init__(self):
         self.texts = []
 
+    @property
+    def text(self):
+        """All that was printed."""
+        return "\n".join(self.texts)
+
     def say(self, value):
         """Print a value, long lines wrapped, and remember it."""
-        lines = (
-            textwrap.fill(line, WIDTH, subsequent_indent="    ", break_on_hyphens=False) if len(line) > WIDTH else line
-            for line in str(value).splitlines()
-        )
-        self.texts.append("\n".join(lines) + "\n")
+        self.texts.append("\n".join(_wrapped(line, "    ") for line in str(value).splitlines()) + "\n")
         try:
             print(self.texts[-1], flush=True)
         except BrokenPipeError:  # a reader that left, such as head, does not end the computation
@@ -37,30 +41,19 @@ class Report:
 def complain(*texts):
     """Print texts to stderr in lines of readable length."""
     for text in texts:
-        print(textwrap.fill(text, WIDTH, subsequent_indent="  ", break_on_hyphens=False), file=sys.stderr)
+        print(_wrapped(text, "  "), file=sys.stderr)
+
+
+def _wrapped(line, indent):
+    if len(line) <= COLUMNS:
+        return line
+    return textwrap.fill(line, COLUMNS, subsequent_indent=indent, break_on_hyphens=False)
 
 
 class Folder:
     """The folder of a run: tried before anything is computed, replaced by a temporary one where writing fails later.
 
-    Parameters
-    ----------
-    path : Path
-        Made where it is missing.
-    name : str
-        Of the run.
-
-    Attributes
-    ----------
-    path : Path
-        Where the files are.
-    moved : bool
-        Whether this is a temporary folder in place of the one that was asked for.
-
-    Raises
-    ------
-    ServoError
-        If no file can be made in it.
+    Its `path` is where the files are; it has `moved` if that is a temporary folder in place of the one that was given.
     """
 
     def __init__(self, path, name):
@@ -71,28 +64,34 @@ class Folder:
             with tempfile.TemporaryFile(dir=path):
                 pass
         except OSError as error:
-            self.leave()
+            self._leave()
             reason = "it is a file" if path.is_file() else error.strerror or error
             raise ServoError(
                 f"The folder {path} cannot be written: {reason}.",
-                "A run leaves its numbers and figures in a folder.",
-                nearest=f"The default is {Path('servoctl-runs', name)} in the current folder.",
+                f"A run leaves its numbers and figures in a folder, by default {Path('servoctl-runs', name)}.",
                 do="Give another folder by --out. Nothing has been computed yet.",
                 folder=str(path),
             ) from error
 
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_):
+        self._leave()
+
+    def write_text(self, name, text):
+        """Write a text file."""
+        self.write(lambda path: (path / name).write_text(text, encoding="utf-8"))
+
+    def write_json(self, name, facts):
+        """Write facts as JSON; what is not finite becomes null."""
+        text = json.dumps(jsonable(facts), indent=2, allow_nan=False, ensure_ascii=False)
+        self.write_text(name, text + "\n")
+
     def write(self, action):
-        """Carry out `action(path)`; where it fails, it and all before it are carried out in a temporary folder.
+        """Carry out `action(path)`, which writes files; where it fails, it and all before it go to a temporary folder.
 
-        Parameters
-        ----------
-        action : callable
-            Writes files into the folder that it is given. The first one finds the files of earlier runs removed.
-
-        Raises
-        ------
-        ServoError
-            If the temporary folder cannot be written, either.
+        The first action finds the files of earlier runs removed. A ServoError where no temporary folder can be written.
         """
         try:
             if not self._done:
@@ -116,7 +115,7 @@ class Folder:
         self._made.append(self.path)
         complain(f"{self.name}: {error}", f"What was computed is kept: it is written to {self.path} instead.")
 
-    def leave(self):
+    def _leave(self):
         """Remove the folders that were made for this run and stayed empty."""
         for path in self._made:
             with contextlib.suppress(OSError):
@@ -131,29 +130,18 @@ def _nowhere(path, error):
     )
 
 
+def folder_of(args, name, ending=""):
+    """The folder given by --out, or servoctl-runs/NAME and the ending."""
+    return Folder(Path(args.out) if args.out else Path("servoctl-runs", name + ending), name)
+
+
 def summary(run, start, verification):
-    """Facts of a run as plain values, for JSON; what is not finite becomes None.
-
-    Parameters
-    ----------
-    run : Run
-        With its model.
-    start : State
-    verification : Verification or None
-
-    Returns
-    -------
-    dict
-        versions, parameters, method, outcome, counters, start, structure, extrema of actuators and outputs with their
-        times [s], worst residual of each constraint over all levels and at each, numbers of the verification.
-    """
-    from servoctl.figures.run import efforts
-
+    """Facts of a run, for JSON: versions, numbers, outcome, start, structure, extrema, residuals, verification."""
     model = run.model
     residuals = {name: [_worst(level) for level in run.residual[name].tolist()] for name in run.residual}
     checked = verification is not None
-    return plain({
-        "versions": versions(),
+    return {
+        "versions": machine()["versions"],
         "parameters": dict(zip(model.reduction.mechanism.parameters.names, model.parameters, strict=True)),
         "method": run.method,
         "drift": run.drift or None,
@@ -173,10 +161,10 @@ def summary(run, start, verification):
         },
         "structure": _structure(model),
         "operations": model.operations(),
-        "extrema": {n: _extrema(run, n) for n in dict.fromkeys([*efforts(run), *model.outputs])},
+        "extrema": {n: _extrema(run, n) for n in dict.fromkeys([*sv.figures.efforts(run), *model.outputs])},
         "residuals": {name: {"worst": _worst(levels), "levels": levels} for name, levels in residuals.items()},
         "verification": {"passed": verification.passed, "numbers": verification.numbers} if checked else None,
-    })  # fmt: skip
+    }
 
 
 def _worst(values):
@@ -185,11 +173,11 @@ def _worst(values):
 
 def _structure(model):
     try:
-        found = model.structure()
+        structure = model.structure()
     except ServoError as error:
         return {"index": None, "message": str(error)}
     names = ("index", "relative_degree", "decoupling_rank", "zeros_at_infinity", "essential_orders", "margin")
-    return {name: getattr(found, name) for name in names}
+    return {name: getattr(structure, name) for name in names}
 
 
 def _extrema(run, name):
@@ -197,26 +185,12 @@ def _extrema(run, name):
     return {"min": {"t": low[0], "value": low[1]}, "max": {"t": high[0], "value": high[1]}}
 
 
-def plain(value):
+def jsonable(value):
     """Numbers, texts, lists and dicts of them; what is not finite becomes None."""
     if isinstance(value, dict):
-        return {str(key): plain(item) for key, item in value.items()}
+        return {str(key): jsonable(item) for key, item in value.items()}
     if isinstance(value, (list, tuple)):
-        return [plain(item) for item in value]
+        return [jsonable(item) for item in value]
     if hasattr(value, "tolist"):
-        return plain(value.tolist())
+        return jsonable(value.tolist())
     return None if isinstance(value, float) and not math.isfinite(value) else value
-
-
-def versions():
-    """Versions of servoctl, of what it computes with, and of Python: a dict of str to str."""
-    import platform
-    from importlib.metadata import version
-
-    import servoctl
-
-    return {
-        "servoctl": servoctl.__version__,
-        **{name: version(name) for name in ("casadi", "numpy", "scipy")},
-        "python": platform.python_version(),
-    }

@@ -1,84 +1,42 @@
 """The closed loop of `servoctl run`: the plan under feedback, on a machine with other numbers."""
 
-import argparse
 import math
 
+import servoctl as sv
 from servoctl.errors import ServoError, SpecificationError, unknown
-from servoctl.shell.options import assignment, given, mapping, positive, whole
+from servoctl.shell.options import MANY, assignment, by_name, deviation, limits, positive, used, whole
 
 LAWS = ("lqr", "computed", "feedforward")
 GIVEN = ("machine", "law", "integral", "rate", "delay", "noise", "seed", "limit")
 RATE = 100.0  # Hz
 
 
-def add(parser):
-    """Add the options of the closed loop to a command.
-
-    Parameters
-    ----------
-    parser : argparse.ArgumentParser
-    """
-    many = {"nargs": "+", "action": "extend", "default": []}
+def add_loop(parser):
+    """Add the options of the closed loop to a command."""
     loop = parser.add_argument_group("the closed loop, of programs realised by actuators")
     loop.add_argument(
-        "--machine", type=assignment, metavar="NAME=VALUE", **many, help="parameters that the plan missed"
+        "--machine", type=assignment, metavar="NAME=VALUE", **MANY, help="parameters that the plan missed"
     )
     loop.add_argument("--law", choices=LAWS, help="default: lqr, about the plan")
     loop.add_argument("--integral", action="store_true", help="LQR: integrals of the residuals, too")
     loop.add_argument("--rate", type=positive, metavar="HZ", help=f"samples per second; default {RATE:g}")
     loop.add_argument("--delay", type=whole, metavar="N", help="samples from the measurement to the input")
-    loop.add_argument("--noise", type=_deviation, metavar="NAME=STD", **many, help="of measured states")
+    loop.add_argument("--noise", type=deviation, metavar="NAME=STD", **MANY, help="of measured states")
     loop.add_argument("--seed", type=whole, help="of the noise")
-    loop.add_argument("--limit", type=_limit, metavar="NAME=LOW:HIGH", **many, help="of actuators; or NAME=SIZE")
+    loop.add_argument("--limit", type=limits, metavar="NAME=LOW:HIGH", **MANY, help="of actuators; or NAME=SIZE")
     loop.add_argument("--no-loop", action="store_true", help="leave out the closed loop")
 
 
-def _deviation(text):
-    """(name, standard deviation) of NAME=STD."""
-    name, value = assignment(text)
-    if value < 0:
-        raise argparse.ArgumentTypeError(f"{text!r}: a standard deviation is not negative")
-    return name, value
-
-
-def _limit(text):
-    """(name, limits) of NAME=SIZE or NAME=LOW:HIGH."""
-    name, _, value = text.partition("=")
-    try:
-        low, high = (float(part) for part in value.split(":")) if ":" in value else (-float(value), float(value))
-    except ValueError:
-        low = high = math.nan
-    if not name.strip() or not low < high:
-        raise argparse.ArgumentTypeError(f"{text!r} is neither NAME=LOW:HIGH nor NAME=SIZE, such as trolley=150")
-    return name.strip(), (low, high)
-
-
 def require(args, model):
-    """Refuse options of the loop that contradict each other, and names that the mechanism has not.
-
-    Parameters
-    ----------
-    args : argparse.Namespace
-    model : Model
-
-    Raises
-    ------
-    SpecificationError, NameUnknown
-    """
-    options = given(args, GIVEN)
-    clashes = {
-        "--no-loop": options if args.no_loop else [],
-        "--law " + (args.law or ""): ["--integral"] if args.integral and args.law not in (None, "lqr") else [],
-        "--law feedforward, which measures nothing": ["--noise"] if args.noise and args.law == "feedforward" else [],
-        "no --noise": ["--seed"] if args.seed is not None and not args.noise else [],
-    }
-    for kind, surplus in clashes.items():
-        if surplus:
-            raise SpecificationError(
-                f"{', '.join(surplus)} was given with {kind}.",
-                "Options of the closed loop are never ignored.",
-                do="Leave one of them out.",
-            )
+    """Refuse options of the loop that contradict each other, and names that the mechanism does not have."""
+    if args.no_loop:
+        _refuse(used(args, GIVEN), "with --no-loop")
+    if args.law not in (None, "lqr"):
+        _refuse(used(args, ("integral",)), f"with --law {args.law}")
+    if args.law == "feedforward":
+        _refuse(used(args, ("noise",)), "with --law feedforward, which measures nothing")
+    if not args.noise:
+        _refuse(used(args, ("seed",)), "with no --noise")
     mechanism = model.reduction.mechanism
     valid = {
         "machine": (mechanism.parameters.names, "parameter"),
@@ -86,93 +44,68 @@ def require(args, model):
         "limit": (mechanism.actuators, "actuator"),
     }
     for option, (names, what) in valid.items():
-        for name in mapping(getattr(args, option), f"--{option}"):
+        for name in by_name(getattr(args, option), f"--{option}"):
             if name not in names:
                 raise unknown(name, names, what)
 
 
+def _refuse(options, why):
+    if options:
+        raise SpecificationError(
+            f"{', '.join(options)} was given {why}.",
+            "Options of the closed loop are never ignored.",
+            do="Leave one of them out.",
+            options=options,
+        )
+
+
 def closed_loop(args, model, plan, report):
-    """Close the loop about the plan, and say what came of it.
-
-    Parameters
-    ----------
-    args : argparse.Namespace
-    model : Model
-    plan : Run
-    report : Report
-
-    Returns
-    -------
-    closed : Closed or None
-        None where there is no loop.
-    done : bool
-        Whether what was asked for was done.
-    """
+    """Close the loop about the plan, and print it: the Closed or None, and whether the options were followed."""
     if args.no_loop:
         return None, True
-    asked = bool(given(args, GIVEN))
+    done = not used(args, GIVEN)  # nothing is missed where no option asks for a loop
     if model.ideal or not plan.success:
         why = "a law commands actuators, not an ideal reaction" if model.ideal else "the motion ended early"
         report.say(f"Closed loop: left out, as {why}.")
-        return None, not asked
+        return None, done
     try:
         run = _closed(args, model, plan)
     except ServoError as error:
         report.say(f"Closed loop: {type(error).__name__}: {error}")
         run = getattr(error, "run", None)
-        return run if run is not None and len(run.t) else None, not asked
+        return run if run is not None and len(run.t) else None, done
     report.say(run)
     if run.law.allocation:
-        from servoctl.control.limits import limit_report
-
-        report.say(limit_report(run))
+        report.say(sv.limit_report(run))
     return run, True
 
 
 def _closed(args, model, plan):
-    from servoctl.control.close import close
-    from servoctl.control.conditions import Sensors, Timing
-    from servoctl.plants.plant import plant
-
     mechanism = model.reduction.mechanism
     believed = dict(zip(mechanism.parameters.names, model.parameters.tolist(), strict=True))
-    limits, noise = mapping(args.limit, "--limit"), mapping(args.noise, "--noise")
-    nominal = plant(mechanism, limits=limits, **believed)
-    machine = plant(mechanism, limits=limits, **believed | mapping(args.machine, "--machine"))
+    limits, noise = by_name(args.limit, "--limit"), by_name(args.noise, "--noise")
+    nominal = sv.plant(mechanism, limits=limits, **believed)
+    machine = sv.plant(mechanism, limits=limits, **believed | by_name(args.machine, "--machine"))
     law = _law(args, plan, nominal)
     start, samples = float(plan.t[0]), math.floor((plan.t[-1] - plan.t[0]) * law.rate * (1 + 1e-12) + 1e-9)
     span = (start, start + samples / law.rate)
-    sensors, timing = Sensors(noise=noise, seed=args.seed), Timing(delay=args.delay or 0)
-    return close(machine, law, plan.state(start), span, sensors=sensors, timing=timing)
+    sensors, timing = sv.Sensors(noise=noise, seed=args.seed), sv.Timing(delay=args.delay or 0)
+    return sv.close(machine, law, plan.state(start), span, sensors=sensors, timing=timing)
 
 
 def _law(args, plan, nominal):
-    from servoctl.control.feedforward import feedforward
-    from servoctl.control.inverse_dynamics import computed
-    from servoctl.control.limits import limited
-    from servoctl.control.lqr import lqr
-
     rate = RATE if args.rate is None else args.rate
     if args.law == "feedforward":
-        return feedforward(plan, nominal, rate)
+        return sv.feedforward(plan, nominal, rate)
     if args.law == "computed":
-        law = computed(plan, nominal, rate, delay=args.delay or 0)
+        law = sv.computed(plan, nominal, rate, delay=args.delay or 0)
     else:
-        law = lqr(plan, nominal, rate, integral=args.integral or None)
-    return limited(law, nominal) if nominal.limits else law
+        law = sv.lqr(plan, nominal, rate, integral=args.integral or None)
+    return sv.limited(law, nominal) if nominal.limits else law
 
 
 def facts(closed):
-    """Numbers of a closed loop for the summary: worst and last errors, what each actuator did.
-
-    Parameters
-    ----------
-    closed : Closed or None
-
-    Returns
-    -------
-    dict or None
-    """
+    """Worst and last errors of a closed loop, and what each actuator did, for the summary."""
     if closed is None:
         return None
     names = closed.plant.mechanism.parameters.names
@@ -199,18 +132,7 @@ def facts(closed):
 
 
 def save_figure(closed, folder, units, title):
-    """Write closed_loop.png.
-
-    Parameters
-    ----------
-    closed : Closed
-    folder : Path
-    units : dict of str to str
-    title : str
-        Put over the figure.
-    """
-    from servoctl.figures.run import closed as draw
-
-    figure = draw(closed, units=units)[0].figure
+    """Write closed_loop.png."""
+    figure = sv.figures.closed(closed, units=units)[0].figure
     figure.suptitle(f"{title}: closed loop, {closed.law.name}, {closed.law.rate:g} Hz")
     figure.savefig(folder / "closed_loop.png", dpi=100)

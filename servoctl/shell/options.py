@@ -7,91 +7,134 @@ from servoctl.errors import SpecificationError
 from servoctl.methods.choice import METHODS
 
 METHODS_HELP = f"{', '.join(METHODS)}; default: by the model"
+SCENE_HELP = "a gallery name, or a .py file that defines scene()"
+MANY = {"nargs": "+", "action": "extend", "default": []}  # options that take several values, and may be repeated
 DRAWS = {"normal": "MEAN:STD", "uniform": "LOW:HIGH", "lognormal": "MEDIAN:LOG_STD", "triangular": "LOW:MODE:HIGH"}
 
 
-def assignment(text):
-    """(name, number) of NAME=VALUE."""
-    name, _, value = text.partition("=")
-    try:
-        number = float(value)
-    except ValueError:
-        number = math.nan
-    if not name.strip() or not math.isfinite(number):
-        raise argparse.ArgumentTypeError(
-            f"{text!r} is not NAME=VALUE with a number, such as theta=0.1; the scene's name comes before such options"
-        )
-    return name.strip(), number
+def add_motion(parser):
+    """Add what describes a motion of a scene: the scene, its time, parameters and start."""
+    parser.add_argument("scene", metavar="NAME_OR_FILE", help=SCENE_HELP)
+    parser.add_argument("--t-span", type=float, nargs=2, metavar=("T0", "T1"), help="[s]; default: the scene's")
+    pairs = {"type": assignment, "metavar": "NAME=VALUE", **MANY}
+    parser.add_argument("--hold", **pairs, help="values that the start keeps, beside the scene's own")
+    parser.add_argument(
+        "--guess", **pairs, help="where the rest of the start is looked for; frees what the scene holds"
+    )
+    parser.add_argument("--set", **pairs, help="parameters")
 
 
-def mapping(pairs, option):
-    """A dict of (name, value) pairs, each name once.
-
-    Parameters
-    ----------
-    pairs : sequence of (str, object)
-    option : str
-        For the message.
-
-    Returns
-    -------
-    dict
-
-    Raises
-    ------
-    SpecificationError
-        For a name that occurs twice.
-    """
-    found = {}
+def by_name(pairs, option):
+    """A dict of (name, value) pairs, each name once; the option is for the message."""
+    values = {}
     for name, value in pairs:
-        if name in found:
+        if name in values:
+            both = " and ".join(f"{v:g}" if isinstance(v, float) else str(v) for v in (values[name], value))
             raise SpecificationError(
-                f"{option} {name} was given twice: {_short(found[name])} and {_short(value)}.",
-                "A name has one value.",
-                do="Leave one of them out.",
-                name=name,
+                f"{option} {name} was given twice: {both}.", "A name has one value.", do="Leave one out.", name=name
             )
-        found[name] = value
-    return found
+        values[name] = value
+    return values
 
 
-def _short(value):
-    return f"{value:g}" if isinstance(value, float) else value
+def used(args, names):
+    """Those of these options that were given, as they are written; 0 counts as given."""
+    values = {f"--{name.replace('_', '-')}": getattr(args, name) for name in names}
+    return [option for option, value in values.items() if value is not None and value is not False and value != []]
 
 
-def variation(text):
-    """(name, list of numbers) of NAME=LOW:HIGH:N or NAME=A,B,C."""
-    name, _, value = text.partition("=")
-    try:
-        if ":" in value:
-            low, high, count = value.split(":")
-            low, high, count = float(low), float(high), int(count)
-            if count < 2:
-                raise ValueError
-            numbers = [low + (high - low) * i / (count - 1) for i in range(count - 1)] + [high]
-        else:
-            numbers = [float(part) for part in value.split(",")]
-    except ValueError:
-        numbers = []
-    if not name.strip() or not numbers:
-        raise argparse.ArgumentTypeError(
-            f"{text!r} is neither NAME=LOW:HIGH:N with at least 2 values nor NAME=A,B,C, such as m_load=80:120:9"
-        )
-    return name.strip(), numbers
+# --- types of arguments
 
 
-def draw(text):
-    """(name, (kind, numbers)) of NAME=KIND:A:B."""
-    name, _, value = text.partition("=")
-    kind, *numbers = value.split(":")
-    try:
-        numbers = tuple(float(number) for number in numbers)
-    except ValueError:
-        numbers = ()
-    if not name.strip() or kind not in DRAWS or len(numbers) != DRAWS[kind].count(":") + 1:
-        forms = ", ".join(f"NAME={kind}:{form}" for kind, form in DRAWS.items())
-        raise argparse.ArgumentTypeError(f"{text!r} is none of {forms}, such as m_load=normal:100:5")
-    return name.strip(), (kind, *numbers)
+def _typed(read, form):
+    """A type for argparse: what `read(text)` gives, refused with the form where that is None or fails."""
+
+    def parse(text):
+        try:
+            value = read(text)
+        except ValueError:
+            value = None
+        if value is None:
+            raise argparse.ArgumentTypeError(f"{text!r} is {form}")
+        return value
+
+    return parse
+
+
+def _named(read, form):
+    """A type for argparse: the name and the value of NAME=VALUE."""
+
+    def split(text):
+        name, _, text = text.partition("=")
+        value = read(text)
+        return None if value is None or not name.strip() else (name.strip(), value)
+
+    return _typed(split, form)
+
+
+def _finite(text):
+    return float(text) if math.isfinite(float(text)) else None
+
+
+def _at_least(least):
+    def read(text):
+        return int(text) if text.isdecimal() and int(text) >= least else None
+
+    return _typed(read, f"not a whole number of at least {least}")
+
+
+def _positive(text):
+    return float(text) if 0 < float(text) < math.inf else None
+
+
+def _deviation(text):
+    return float(text) if 0 <= float(text) < math.inf else None
+
+
+def _values(text):
+    if ":" not in text:
+        return [float(part) for part in text.split(",")]
+    low, high, count = text.split(":")
+    low, high, count = float(low), float(high), int(count)
+    return [low + (high - low) * i / (count - 1) for i in range(count - 1)] + [high] if count >= 2 else None
+
+
+def _draw(text):
+    kind, *numbers = text.split(":")
+    numbers = tuple(float(number) for number in numbers)
+    return (kind, *numbers) if kind in DRAWS and len(numbers) == DRAWS[kind].count(":") + 1 else None
+
+
+def _limits(text):
+    low, high = (float(part) for part in text.split(":")) if ":" in text else (-float(text), float(text))
+    return (low, high) if low < high else None
+
+
+def _shard(text):
+    i, n = (int(part) if part.isdecimal() else 0 for part in text.split("/"))
+    return (i, n) if 1 <= i <= n else None
+
+
+def _drift(text):
+    return text if text in ("none", "project", "minimal") else float(text)
+
+
+whole, count, samples = _at_least(0), _at_least(1), _at_least(2)
+positive = _typed(_positive, "not a positive number")
+drift = _typed(_drift, "not none, project, minimal or a time constant [s]")
+shard = _typed(_shard, "not I/N with I from 1 to N, such as 1/4")
+assignment = _named(
+    _finite, "not NAME=VALUE with a number, such as theta=0.1; the scene's name comes before such options"
+)
+deviation = _named(_deviation, "not NAME=STD with a standard deviation that is not negative, such as theta=0.001")
+limits = _named(_limits, "neither NAME=LOW:HIGH nor NAME=SIZE, such as trolley=150")
+variation = _named(
+    _values, "neither NAME=LOW:HIGH:N with at least 2 values nor NAME=A,B,C, such as m_load=80:120:9"
+)
+draw = _named(
+    _draw,
+    f"none of {', '.join(f'NAME={kind}:{form}' for kind, form in DRAWS.items())}, such as m_load=normal:100:5",
+)
 
 
 def drawn(kind, *numbers):
@@ -102,52 +145,3 @@ def drawn(kind, *numbers):
         "lognormal": lambda rng: numbers[0] * rng.lognormal(0.0, numbers[1]),
         "triangular": lambda rng: rng.triangular(*numbers),
     }[kind]
-
-
-def shard(text):
-    """(i, n) of I/N."""
-    i, _, n = text.partition("/")
-    if not (i.isdecimal() and n.isdecimal() and 1 <= int(i) <= int(n)):
-        raise argparse.ArgumentTypeError(f"{text!r} is not I/N with I from 1 to N, such as 1/4")
-    return int(i), int(n)
-
-
-def count(text):
-    """A whole number of at least 1."""
-    if not (text.isdecimal() and int(text) >= 1):
-        raise argparse.ArgumentTypeError(f"{text!r} is not a whole number of at least 1")
-    return int(text)
-
-
-def whole(text):
-    """A whole number of at least 0."""
-    if not text.isdecimal():
-        raise argparse.ArgumentTypeError(f"{text!r} is not a whole number of at least 0")
-    return int(text)
-
-
-def positive(text):
-    """A positive number."""
-    try:
-        number = float(text)
-    except ValueError:
-        number = math.nan
-    if not 0 < number < math.inf:
-        raise argparse.ArgumentTypeError(f"{text!r} is not a positive number")
-    return number
-
-
-def given(args, names):
-    """Those of these options that were given, as they are written: 0 is given, too.
-
-    Parameters
-    ----------
-    args : argparse.Namespace
-    names : sequence of str
-
-    Returns
-    -------
-    list of str
-    """
-    values = {f"--{name.replace('_', '-')}": getattr(args, name) for name in names}
-    return [option for option, value in values.items() if value is not None and value is not False and value != []]

@@ -32,8 +32,8 @@ def find_scene(given):
     NameUnknown
         If the gallery has no such scene.
     SpecificationError
-        If the file is missing, raises, has no `scene()`, or holds values of other kinds. Errors in the file are told
-        with their line.
+        If the file is missing, raises, has no `scene()`, or holds values of other kinds. Errors in the file are
+        reported with their line.
     """
     from servoctl.gallery import gallery
 
@@ -88,32 +88,17 @@ def stamp(given):
 
 
 def own_case(given):
-    """The function `case` that a user's file defines for sweeps; None where there is none.
-
-    Parameters
-    ----------
-    given : str
-        A name of the gallery, or the path of a .py file.
-
-    Returns
-    -------
-    callable or None
-
-    Raises
-    ------
-    SpecificationError
-        If the file is missing or raises.
-    """
+    """The function `case` that a user's file defines for sweeps; None where there is none."""
     from servoctl.gallery import gallery
 
     path = Path(given)
     if given in gallery or path.suffix != ".py":
         return None
-    return getattr(_kept(path, stamp(given)), "case", None)
+    return getattr(_imported(path, stamp(given)), "case", None)
 
 
 @functools.cache
-def _kept(path, _):
+def _imported(path, _):
     return _module(path)
 
 
@@ -129,7 +114,7 @@ def _import(path):
 
 
 def _reported(path, action):
-    """What `action()` returns; an exception in the user's file is told with its line there."""
+    """What `action()` returns; an exception in the user's file is reported with its line there."""
     try:
         return action()
     except ServoError as error:
@@ -181,16 +166,16 @@ def _nearest(module):
     """A function of the file that may be meant."""
     from servoctl.spec import Mechanism, Program
 
-    own = [n for n, v in vars(module).items() if callable(v) and getattr(v, "__module__", "") == _MODULE]
-    if own:
-        return f"The file defines {', '.join(f'{name}()' for name in own[:5])}."
+    functions = [n for n, v in vars(module).items() if callable(v) and getattr(v, "__module__", "") == _MODULE]
+    if functions:
+        return f"The file defines {', '.join(f'{name}()' for name in functions[:5])}."
     if any(isinstance(v, (Mechanism, Program)) for v in vars(module).values()):
         return "The file makes a mechanism or program outside any function: return them from scene()."
     return ""
 
 
 def _settings(path, module):
-    found = {}
+    settings = {}
     for name, check, form in (
         ("START", _numbers, '{"theta": 0.1}'),
         ("GUESS", _numbers, '{"theta": 0.1}'),
@@ -207,8 +192,8 @@ def _settings(path, module):
                     file=str(path),
                     name=name,
                 )
-            found[name.lower()] = value
-    return found
+            settings[name.lower()] = value
+    return settings
 
 
 def _number(value):

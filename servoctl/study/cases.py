@@ -8,7 +8,8 @@ from servoctl.checks import plain, whole
 from servoctl.errors import SpecificationError
 
 DRAWS, CASES = 0, 1  # first spawn key: random numbers of the parameters, and those that a case draws for itself
-RESERVED = ("case", "error", "message", "facts", "rng")
+FAILURE = ("error", "message", "facts")  # columns of what went wrong
+RESERVED = ("case", *FAILURE, "rng")
 
 
 def grid(**values) -> list[dict]:
@@ -62,19 +63,7 @@ def monte_carlo(n: int, /, *, seed: int, **distributions) -> list[dict]:
 def generator(seed, kind, index, name=""):
     """The numpy Generator of one case, whatever cases come before it and wherever they run.
 
-    Parameters
-    ----------
-    seed : int
-    kind : int
-        `DRAWS` or `CASES`.
-    index : int
-        Of the case.
-    name : str
-        Of the parameter that is drawn.
-
-    Returns
-    -------
-    numpy.random.Generator
+    A stream for each seed, kind (`DRAWS` or `CASES`), index of the case and name of the parameter.
     """
     import numpy as np
 
@@ -82,23 +71,7 @@ def generator(seed, kind, index, name=""):
 
 
 def as_cases(cases):
-    """Cases in the order given, each a dict of plain values.
-
-    Parameters
-    ----------
-    cases : sequence of dict, or dict of sequences
-        One dict of parameters per case, or one column per parameter.
-
-    Returns
-    -------
-    list of dict
-        With values of Python's own kinds.
-
-    Raises
-    ------
-    SpecificationError
-        For no case, columns of different lengths, cases of different names, a value that is no number or text.
-    """
+    """Cases in the order given, from dicts or from a dict of columns, each a dict of Python's own kinds of values."""
     if isinstance(cases, Mapping):
         columns = {name: _column(name, values) for name, values in cases.items()}
         lengths = {name: len(column) for name, column in columns.items()}
@@ -106,33 +79,32 @@ def as_cases(cases):
             raise SpecificationError(
                 f"The columns of the cases have the lengths {', '.join(f'{n}: {k}' for n, k in lengths.items())}.",
                 "A dict of columns has one value per case in each.",
-                nearest="grid(...) gives all combinations.",
-                do="Give columns of one length, or a grid.",
+                do="Give columns of one length, or all combinations by grid(...).",
                 lengths=lengths,
             )
         cases = [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]
-    found = [_case(i, case) for i, case in enumerate(cases)]
-    if not found:
+    cases = [_case(i, case) for i, case in enumerate(cases)]
+    if not cases:
         raise SpecificationError(
-            "There is no case.", "A sweep needs at least one.", nearest="grid(m=[1.0, 2.0]) has two.", do="Add cases."
+            "There is no case.", "A sweep needs at least one.", do="Add cases, as by grid(m=[1.0, 2.0])."
         )
-    for i, case in enumerate(found):
-        if set(case) != set(found[0]):
+    for i, case in enumerate(cases):
+        if set(case) != set(cases[0]):
             raise SpecificationError(
-                f"Case {i} has the parameters {', '.join(case)}, case 0 {', '.join(found[0])}.",
+                f"Case {i} has the parameters {', '.join(case)}, case 0 {', '.join(cases[0])}.",
                 "All cases of a sweep have the same parameters, so that they form one table.",
                 do="Give every case every parameter.",
                 case=i,
             )
-    return found
+    return cases
 
 
 def _case(i, case):
     if not isinstance(case, Mapping):
         raise SpecificationError(
-            f"Case {i} is {case!r}.", "A case is a dict of parameters.", nearest='{"m_load": 100.0}.', case=i
+            f"Case {i} is {case!r}.", "A case is a dict of parameters.", do='Give {"m_load": 100.0}.', case=i
         )
-    found = {}
+    values = {}
     for name, value in case.items():
         if not isinstance(name, str) or not name.isidentifier() or name in RESERVED:
             raise SpecificationError(
@@ -141,16 +113,16 @@ def _case(i, case):
                 do="Choose another name.",
                 name=name,
             )
-        found[name] = plain(value)
-        if found[name] is None or (isinstance(found[name], float) and not math.isfinite(found[name])):
+        values[name] = plain(value)
+        if values[name] is None or (isinstance(values[name], float) and not math.isfinite(values[name])):
             raise SpecificationError(
                 f"Parameter {name} of case {i} is {value!r}.",
-                "A parameter is a finite number, a text, or True or False: it stands in one cell of a table.",
+                "A parameter is a finite number, a text, or True or False: one cell of a table.",
                 do="Give an index or a name, and look up what it stands for inside the case.",
                 name=name,
                 case=i,
             )
-    return found
+    return values
 
 
 def _column(name, values):
@@ -168,33 +140,31 @@ def _draw(name, distribution):
     if plain(distribution) is not None:
         return lambda rng: distribution
     if hasattr(distribution, "rvs"):
-        return _told(name, lambda rng: plain(distribution.rvs(random_state=rng)))
+        return _checked(name, lambda rng: plain(distribution.rvs(random_state=rng)))
     if hasattr(distribution, "sample"):
-        return _told(name, lambda rng: plain(distribution.sample(rng=rng)))
+        return _checked(name, lambda rng: plain(distribution.sample(rng=rng)))
     if callable(distribution):
-        return _told(name, distribution)
+        return _checked(name, distribution)
     raise SpecificationError(
         f"The distribution of {name} is {distribution!r}.",
         "A distribution is a number, a function of a random generator, or a frozen distribution of scipy.stats.",
-        nearest="lambda rng: rng.normal(100.0, 5.0).",
-        do="Give one of these.",
+        do="Give lambda rng: rng.normal(100.0, 5.0).",
         name=name,
     )
 
 
-def _told(name, draw):
+def _checked(name, draw):
     """The same draw; what numpy or scipy refuse to draw from names the parameter."""
 
-    def told(rng):
+    def draw_checked(rng):
         try:
             return draw(rng)
         except (TypeError, ValueError) as error:
             raise SpecificationError(
                 f"{name} cannot be drawn: {error}.",
                 "A distribution is drawn from with a numpy Generator, for each case.",
-                nearest="lambda rng: rng.normal(100.0, 5.0).",
                 do="Correct its numbers.",
                 name=name,
             ) from error
 
-    return told
+    return draw_checked

@@ -67,7 +67,7 @@ class StabilityMap:
         Parameters
         ----------
         method : str
-            One of `methods.stability.STEP_MAPS`.
+            "RK1" to "RK8", "RK23", "RK45", "DOP853", "Taylor", "RadauIIA" or "Radau".
         step : float or (K,) array
             [s]
         drift : optional
@@ -84,8 +84,8 @@ class StabilityMap:
         z = np.multiply.outer(step, self.eigenvalues(drift))
         if order is None:
             order = {"Taylor": self.order, "RadauIIA": RADAU_ORDER}.get(method)
-        own = np.exp(np.clip(z.real, 0.0, 700.0))
-        return (amplification(method, z, order) / own).max(axis=-1, initial=0.0)
+        motion = np.exp(np.clip(z.real, 0.0, 700.0))
+        return (amplification(method, z, order) / motion).max(axis=-1, initial=0.0)
 
     def growth(self, method, step, drift=None, order=None):
         """By how much errors in the counted directions grow over the plan, at most and beyond the motion's own growth.
@@ -93,7 +93,7 @@ class StabilityMap:
         Parameters
         ----------
         method : str
-            One of `methods.stability.STEP_MAPS`.
+            "RK1" to "RK8", "RK23", "RK45", "DOP853", "Taylor", "RadauIIA" or "Radau".
         step : float or (K,) array
             [s]
         drift : optional
@@ -116,7 +116,8 @@ class StabilityMap:
         Parameters
         ----------
         method : str
-            One of `methods.stability.STEP_MAPS`. Of an adaptive method it is where step control settles.
+            "RK1" to "RK8", "RK23", "RK45", "DOP853", "Taylor", "RadauIIA" or "Radau"; of an adaptive method it is where
+            step control settles.
         drift : None, "project", "minimal", float, `Project(...)` or `Poles(...)`, optional
             As in `simulate`.
         order : int, optional
@@ -159,12 +160,12 @@ class StabilityMap:
         -------
         matplotlib.figure.Figure
         """
-        from servoctl.figures.stability import draw
+        from servoctl.figures.stability import draw_stability
 
         if poles is not None:
             do = "Give numpy.geomspace(1, 100, 41), in 1/s."
             poles = np.sort(np.ravel(positives("poles", poles, do, fewest=2)))
-        return draw(self, method, poles)
+        return draw_stability(self, method, poles, (*ORDERS, "Taylor"))
 
     def __repr__(self):
         raised = {row: count for row, count in self.model.raised.items() if count}

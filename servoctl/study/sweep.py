@@ -7,7 +7,6 @@ import json
 import multiprocessing
 import pickle
 import signal
-import sys
 import threading
 from collections.abc import Mapping
 from concurrent.futures import Executor, ProcessPoolExecutor, as_completed
@@ -18,14 +17,13 @@ from servoctl.checks import plain, whole
 from servoctl.codegen.function import compiling_at_once
 from servoctl.control.result import Closed
 from servoctl.errors import ServoError, SpecificationError
-from servoctl.figures.sweep import TOLD
+from servoctl.progress import progress_bar
 from servoctl.run import Run
-from servoctl.study.cases import CASES, RESERVED, as_cases, generator
+from servoctl.study.cases import CASES, FAILURE, RESERVED, as_cases, generator
 from servoctl.study.checkpoint import Checkpoint, identity
 from servoctl.study.table import Study, machine
 
 INTERRUPTED = 1  # status of a run that Ctrl-C ended
-PATIENCE = 1.0  # s before a progress bar appears
 
 
 def sweep(case, cases, *, executor=None, seed=None, checkpoint=None, shard=None, progress=None) -> Study:
@@ -81,20 +79,20 @@ def sweep(case, cases, *, executor=None, seed=None, checkpoint=None, shard=None,
     _require_sendable(case, executor)
     name = name_of(case)
     key = identity(f"{_module_of(case)}.{name}", cases, seed)
-    kept = Checkpoint(checkpoint, key) if checkpoint is not None else None
-    rows = {row["case"]: row for row in kept.rows if row["case"] in mine} if kept else {}
-    todo = [i for i in mine if i not in rows]
+    work = _in_turn if executor is None else functools.partial(_on, executor)
     lost, interrupted = {}, False
-    with _bar(progress, len(mine), len(rows)) as bar, contextlib.closing(kept) if kept else contextlib.nullcontext():
-        work = _in_turn if executor is None else functools.partial(_on, executor)
-        try:
-            for i, row, finished in work(case, [(i, cases[i]) for i in todo], seed):
-                (rows if finished else lost)[i] = row
-                if kept and finished:
-                    kept.add(row)
-                bar.update()
-        except KeyboardInterrupt:
-            interrupted = True
+    with Checkpoint(checkpoint, key) as disk:
+        rows = {row["case"]: row for row in disk.rows if row["case"] in mine}
+        todo = [(i, cases[i]) for i in mine if i not in rows]
+        with progress_bar("sweep", progress, len(mine), initial=len(rows), unit="case") as bar:
+            try:
+                for i, row, finished in work(case, todo, seed):
+                    (rows if finished else lost)[i] = row
+                    if finished:
+                        disk.add(row)
+                    bar.update()
+            except KeyboardInterrupt:
+                interrupted = True
     if lost and not rows:
         raise _died(next(iter(lost.values())), len(mine))
     meta = {"case": name, "identity": key, "seed": seed, "count": len(cases), "shard": list(shard) if shard else None}
@@ -137,28 +135,15 @@ def merge(studies) -> Study:
             else:
                 rows[row["case"]] = row
     lost -= {i for study in studies for i in study["case"].tolist() if i not in study.meta["lost"]}
-    names = dict.fromkeys(name for study in studies for name in study.columns if name not in TOLD)
-    columns = {name: [rows[i].get(name) for i in sorted(rows)] for name in (*names, *TOLD)}
+    names = dict.fromkeys(name for study in studies for name in study.columns if name not in FAILURE)
+    columns = {name: [rows[i].get(name) for i in sorted(rows)] for name in (*names, *FAILURE)}
     meta = studies[0].meta | {"shard": None, "lost": sorted(lost)}
     meta["interrupted"] = any(study.meta["interrupted"] for study in studies) and len(rows) < meta["count"]
     return Study("sweep", columns, meta | {"message": _message(columns, meta, meta["count"])})
 
 
 def evaluate(case, index, parameters, seed):
-    """One row: the numbers of a case, or how it failed.
-
-    Parameters
-    ----------
-    case : callable
-    index : int
-    parameters : dict
-    seed : int or None
-
-    Returns
-    -------
-    dict
-        case, and numbers (dict) or error, message and facts (JSON).
-    """
+    """One row: case (the index), and the numbers of a case, or how it failed: error, message, facts (JSON)."""
     if multiprocessing.parent_process() is not None and threading.current_thread() is threading.main_thread():
         signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the parent: a case is whole or not computed
     drawn = {} if seed is None else {"rng": generator(seed, CASES, index)}
@@ -172,17 +157,16 @@ def evaluate(case, index, parameters, seed):
 
 
 def _numbers(result, parameters):
-    found = dict(result) if isinstance(result, Mapping) else summary(result)
-    for name, value in found.items():
+    numbers = dict(result) if isinstance(result, Mapping) else summary(result)
+    for name, value in numbers.items():
         if name in parameters or name in RESERVED or plain(value) is None:
             raise SpecificationError(
                 f"The case returned {name} = {value!r}.",
-                "A case returns numbers and texts, by names that are not those of its parameters.",
-                nearest=f"Columns with a meaning of their own are {', '.join(RESERVED)}.",
+                f"A case returns numbers and texts, by names other than its parameters' and {', '.join(RESERVED)}.",
                 do="Rename it, or take one number of it.",
                 name=name,
             )
-    return {str(name): plain(value) for name, value in found.items()}
+    return {str(name): plain(value) for name, value in numbers.items()}
 
 
 def summary(run):
@@ -204,31 +188,31 @@ def summary(run):
         If it is neither.
     """
     if isinstance(run, Closed):
-        found = _extrema(run, (*run.plant.inputs, *run.plant.mechanism.outputs))
+        numbers = _extrema(run, (*run.plant.inputs, *run.plant.mechanism.outputs))
         errors = {name: np.abs(levels[0]) for name, levels in run.residual.items()}
-        found |= {f"{name}_worst": float(error.max()) for name, error in errors.items()}
-        found |= {f"{name}_last": float(error[-1]) for name, error in errors.items()}
+        numbers |= {f"{name}_worst": float(error.max()) for name, error in errors.items()}
+        numbers |= {f"{name}_last": float(error[-1]) for name, error in errors.items()}
     elif isinstance(run, Run):
         if run.status == INTERRUPTED:
             raise KeyboardInterrupt
         known = run.names if run.model is None else (*run.model.actuators, *run.model.outputs)
-        found = _extrema(run, [name for name in known if name in run.names])
-        found["residual"] = max((float(np.abs(run.residual[name]).max()) for name in run.residual), default=0.0)
+        numbers = _extrema(run, [name for name in known if name in run.names])
+        numbers["residual"] = max((float(np.abs(run.residual[name]).max()) for name in run.residual), default=0.0)
     else:
         raise SpecificationError(
             f"The case returned {type(run).__name__}.",
             "A case returns numbers by name, a Run, or the run of a closed loop.",
             do="Return one of these.",
         )
-    return {**found, "t_end": float(run.t[-1])}
+    return {**numbers, "t_end": float(run.t[-1])}
 
 
 def _extrema(run, names):
-    found = {}
+    numbers = {}
     for name in names:
         values = run[name]
-        found |= {f"{name}_min": values.min(), f"{name}_max": values.max(), f"{name}_end": values[-1]}
-    return {name: float(value) for name, value in found.items()}
+        numbers |= {f"{name}_min": values.min(), f"{name}_max": values.max(), f"{name}_end": values[-1]}
+    return {name: float(value) for name, value in numbers.items()}
 
 
 # --- where cases are computed
@@ -274,8 +258,8 @@ def _lost(index, error):
 def _noticing():
     """A list that is not empty once Ctrl-C was pressed, even where the interrupt is caught inside."""
     pressed = []
-    own = threading.current_thread() is threading.main_thread()
-    if not own or signal.getsignal(signal.SIGINT) is not signal.default_int_handler:
+    in_main = threading.current_thread() is threading.main_thread()
+    if not in_main or signal.getsignal(signal.SIGINT) is not signal.default_int_handler:
         yield pressed
         return
 
@@ -290,14 +274,7 @@ def _noticing():
         signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
-def _bar(wanted, total, done):
-    from tqdm import tqdm
-
-    wanted = sys.stderr.isatty() if wanted is None else wanted
-    return tqdm(total=total, initial=done, desc="sweep", unit="case", delay=PATIENCE, disable=not wanted)
-
-
-# --- what is asked
+# --- what was given
 
 
 def name_of(case):
@@ -338,7 +315,7 @@ def _part(shard, count):
         i = n = 0
     if not 1 <= i <= n:
         raise SpecificationError(
-            f"shard = {shard!r}.", "A shard (i, n) is part i of n, from 1 to n.", nearest="(1, 4).", shard=shard
+            f"shard = {shard!r}.", "A shard (i, n) is part i of n, from 1 to n.", do="Give (1, 4).", shard=shard
         )
     return range(i - 1, count, n)
 
@@ -364,8 +341,7 @@ def _require_sendable(case, executor):
         raise SpecificationError(
             f"executor={executor!r} was given.",
             "Cases are computed here, or on an executor of concurrent.futures.",
-            nearest="concurrent.futures.ThreadPoolExecutor(2).",
-            do="Give an executor that is open.",
+            do="Give an executor that is open, such as concurrent.futures.ThreadPoolExecutor(2).",
         )
     if not isinstance(executor, ProcessPoolExecutor):
         return
@@ -374,9 +350,8 @@ def _require_sendable(case, executor):
     except Exception as error:
         raise SpecificationError(
             f"The case {name_of(case)} cannot be sent to another process: {error}.",
-            "A process receives a function by its name: it stands at the top level of a module, and holds no model.",
-            nearest="loky and Dask send other functions, too.",
-            do="Move it there, and derive the model inside of it, kept by functools.cache.",
+            "A process receives a function by its name: it is at the top level of a module, and holds no model.",
+            do="Move it there, and derive the model inside of it, kept by functools.cache, or use loky or Dask.",
             case=name_of(case),
         ) from error
 
@@ -397,7 +372,6 @@ def _died(row, count):
     return ServoError(
         f"The executor finished none of {count} cases. {row['error']}: {row['message']}",
         "A worker imports the module of the case, computes it and sends its numbers back.",
-        nearest="executor=None computes the cases here, and shows what they do.",
         do='Let a script start its work below if __name__ == "__main__", and check the memory that a case needs.',
         error=row["error"],
     )
@@ -410,4 +384,4 @@ def _columns(cases, rows):
     columns = {"case": [row["case"] for row in rows]}
     columns |= {name: [cases[row["case"]][name] for row in rows] for name in cases[0]}
     columns |= {name: [row.get("numbers", {}).get(name) for row in rows] for name in results}
-    return columns | {name: np.array([row.get(name, "") for row in rows], dtype=str) for name in TOLD}
+    return columns | {name: np.array([row.get(name, "") for row in rows], dtype=str) for name in FAILURE}

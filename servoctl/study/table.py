@@ -2,20 +2,19 @@
 
 import csv
 import functools
-import json
 import os
 import platform
 from dataclasses import dataclass, field, replace
 from importlib import metadata
-from pathlib import Path
 
 import numpy as np
 
+from servoctl import archive
 from servoctl.codegen.compiler import compiler
-from servoctl.errors import ServoError, SpecificationError, unknown
+from servoctl.errors import SpecificationError, unknown
+from servoctl.version import __version__
 
-FORMAT = 1
-SHOWN, WIDTH = 7, 12  # rows of a table in a repr, and columns
+SHOWN, MOST_COLUMNS = 7, 12  # rows of a table in a repr, and columns
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,14 +125,11 @@ class Study:
         ServoError
             If the file cannot be written.
         """
-
-        def write(path):
-            with open(path, "w", newline="", encoding="utf-8") as file:
-                lines = csv.writer(file, lineterminator="\n")
-                lines.writerow(self.columns)
-                lines.writerows(zip(*(values.tolist() for values in self.columns.values()), strict=True))
-
-        return _written(Path(path), write)
+        with archive.writing(path, "study") as path, open(path, "w", newline="", encoding="utf-8") as file:
+            lines = csv.writer(file, lineterminator="\n")
+            lines.writerow(self.columns)
+            lines.writerows(zip(*(values.tolist() for values in self.columns.values()), strict=True))
+        return path
 
     def save(self, path):
         """Save the study as npz, without pickle; `load_study` reads it.
@@ -152,11 +148,8 @@ class Study:
         ServoError
             If the file cannot be written.
         """
-        path = Path(path)
-        path = path if path.suffix == ".npz" else path.with_name(path.name + ".npz")
-        told = {"format": FORMAT, "kind": self.kind, "names": list(self.columns), "meta": self.meta}
-        arrays = {f"column_{i}": values for i, values in enumerate(self.columns.values())}
-        return _written(path, lambda path: np.savez_compressed(path, told=np.array(json.dumps(told)), **arrays))
+        facts = {"kind": self.kind, "names": list(self.columns), "meta": self.meta}
+        return archive.save(path, "study", facts, {f"column_{i}": c for i, c in enumerate(self.columns.values())})
 
     def to_xarray(self):
         """The study as an xarray.Dataset over its rows, where xarray is installed: `.to_netcdf(path)` writes it.
@@ -171,38 +164,18 @@ class Study:
         ServoError
             If xarray is not installed.
         """
-        try:
-            import xarray
-        except ImportError as error:
-            raise ServoError(
-                "xarray is not installed.", "A Dataset is an xarray object.", do="Install xarray, or use csv or save."
-            ) from error
-        plain = {k: v if type(v) in (int, float, str) else json.dumps(v) for k, v in self.meta.items()}
         columns = {name: ("row", values) for name, values in self.columns.items()}
-        return xarray.Dataset(columns, attrs={"kind": self.kind, **plain})
+        return archive.dataset(columns, {}, {"kind": self.kind, **self.meta})
 
     def __repr__(self):
         lines = [f"Study: {self.kind}, {len(self)} rows", "  " + ", ".join(self.columns)]
         lines += [f"  {self.meta['message']}"] if self.meta.get("message") else []
         lines = [line if len(line) <= 120 else f"{line[:117]}..." for line in lines]
-        return "\n".join([*lines, *table(self, list(self.columns)[:WIDTH])])
+        return "\n".join([*lines, *table(self, list(self.columns)[:MOST_COLUMNS])])
 
 
 def table(study, names, most=SHOWN):
-    """Lines of readable width for the first rows of a study.
-
-    Parameters
-    ----------
-    study : Study
-    names : sequence of str
-        Columns.
-    most : int
-        Number of rows.
-
-    Returns
-    -------
-    list of str
-    """
+    """Lines of readable width for some columns and the first rows of a study."""
     texts = [[name, *(_short(value) for value in study[name][:most].tolist())] for name in names]
     widths = [max(map(len, column)) for column in texts]
     lines = [
@@ -213,42 +186,8 @@ def table(study, names, most=SHOWN):
     return [*lines, f"  ... {len(study) - most} more rows"] if len(study) > most else lines
 
 
-def load_study(path) -> Study:
-    """A study from a file that `Study.save` wrote.
-
-    Parameters
-    ----------
-    path : str or Path
-
-    Returns
-    -------
-    Study
-        Of the kind that was saved, such as `TradeOff`.
-
-    Raises
-    ------
-    ServoError
-        If the file is missing or was not written by `Study.save`.
-    """
-    try:
-        with np.load(path, allow_pickle=False) as data:
-            told = json.loads(str(data["told"]))
-            columns = {name: data[f"column_{i}"] for i, name in enumerate(told["names"])}
-    except (OSError, KeyError, ValueError) as error:
-        raise ServoError(
-            f"{path} cannot be read as a study: {error}.",
-            "A study is an npz file written by Study.save.",
-            do="Check the path.",
-            path=str(path),
-        ) from error
-    kind = next((own for own in Study.__subclasses__() if own.__name__.lower() == told["kind"]), Study)
-    return kind(told["kind"], columns, told["meta"])
-
-
 def machine():
     """What numbers are measured on: processor, cores, system, compiler and versions, as a dict of plain values."""
-    from servoctl import __version__
-
     versions = {name: _version(name) for name in ("casadi", "numpy", "scipy")}
     return {
         "processor": _processor(),
@@ -284,18 +223,3 @@ def _array(values):
 
 def _short(value):
     return f"{value:.3g}" if isinstance(value, float) else str(value)
-
-
-def _written(path, write):
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        write(path)
-    except OSError as error:
-        raise ServoError(
-            f"The study cannot be written to {path}: {error.strerror or error}.",
-            "A study is saved where files may be created.",
-            nearest="The current folder, or the system's temporary one.",
-            do="Choose another path; the study itself is kept.",
-            path=str(path),
-        ) from error
-    return path

@@ -1,21 +1,20 @@
-"""The measured trade: what each method, setting and treatment of drift costs and reaches on one's own motion."""
+"""The measured trade: what each method, setting and treatment of drift costs and reaches on a motion."""
 
 import itertools
-import sys
 import time
 import warnings
 
 import numpy as np
 
-from servoctl.checks import as_span, mapping, positive, positives
+from servoctl.checks import as_span, is_number, mapping, positive, positives
 from servoctl.codegen.function import compiling_at_once
 from servoctl.errors import LimitExceeded, ServoError, SpecificationError, unknown
 from servoctl.methods.accuracy import motion_error, relative_error
 from servoctl.methods.choice import METHODS, Adaptive, Algebraic, RungeKutta, Taylor, as_method
 from servoctl.methods.drift import MinimalCoordinates, Poles, Project, as_drift
+from servoctl.progress import progress_bar
 from servoctl.simulation import consistent_state, simulate
-from servoctl.study.front import TradeOff, method_at
-from servoctl.study.table import machine
+from servoctl.study.table import SHOWN, Study, machine, table
 
 MEASURED = tuple(name for name in METHODS if name not in ("RK1", "RK2", "RK23"))  # those need too many steps
 TOLERANCES = (1e-3, 1e-5, 1e-7, 1e-9, 1e-11, 1e-13)
@@ -24,8 +23,9 @@ INSTANTS, COMPARED = 51, 201  # instants that adaptive methods give, and at most
 DENSE = 1001  # instants of the reference over which its power is integrated
 TIMED, ENOUGH = 3, 0.3  # calls timed after a warm-up, unless they take this part of `seconds` together
 FEW = 20  # steps: a run that takes too long for fewer has lost its way, and tells nothing of finer settings
-PATIENCE = 1.0  # s before a progress bar appears
 TIME_CONSTANT = 50  # of the default poles, in the span
+DRIFTS = ("none", "project", "minimal")  # others are time constants of poles
+COSTS = ("seconds", "evaluations", "steps")
 
 
 def tradeoff(model, x0, t_span, methods=None, drift=None, *, settings=None, seconds=0.3, progress=None):
@@ -81,7 +81,7 @@ def tradeoff(model, x0, t_span, methods=None, drift=None, *, settings=None, seco
     drifts = (None, "project", "minimal", abs(t1 - t0) / TIME_CONSTANT) if drift is None else drift
     combinations = _combinations(model, methods, drifts if isinstance(drifts, (list, tuple)) else [drifts])
     total = sum(len(settings[_kind(method)]) for method, _ in combinations)
-    with compiling_at_once(), _bar(total, progress) as bar, warnings.catch_warnings():
+    with compiling_at_once(), progress_bar("tradeoff", progress, total, unit="run") as bar, warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)  # of steps outside the stable range: the rows have what they do
         reference, rows, interrupted = Reference(model, x0, (t0, t1), limit), [], False
         try:
@@ -92,27 +92,173 @@ def tradeoff(model, x0, t_span, methods=None, drift=None, *, settings=None, seco
         except KeyboardInterrupt:
             interrupted = True
     columns = {name: [row.get(name) for row in rows] for name in TradeOff.COLUMNS}
-    told = {"t_span": [t0, t1], "seconds": limit, "reference": reference.told, "machine": machine()}
-    told["message"] = "interrupted" if interrupted else ""
-    return TradeOff("tradeoff", columns, {**told, "measured": time.strftime("%Y-%m-%d")})
+    meta = {"t_span": [t0, t1], "seconds": limit, "reference": reference.agreement, "machine": machine()}
+    meta |= {"message": "interrupted" if interrupted else "", "measured": time.strftime("%Y-%m-%d")}
+    return TradeOff("tradeoff", columns, meta)
+
+
+class Recommendation(dict):
+    """Arguments of `simulate`, and in `row` what was measured with them; made by `TradeOff.recommend`.
+
+    `sv.simulate(model, x0, t_span, **study.recommend(error=1e-6))`
+    """
+
+    def __init__(self, options, row):
+        super().__init__(options)
+        self.row = row
+
+
+class TradeOff(Study):
+    """Errors and costs of methods, settings and treatments of drift on one motion; made by `tradeoff`.
+
+    Columns: method; drift ("none", "project", "minimal", or the time constant of the poles in s); setting ("rtol" or
+    "step") and its value; error of the motion: the largest deviation from the reference over all instants and
+    components of the state, each relative to its largest magnitude (at least 1e-3 of the largest of its level);
+    actuation: the same of the required forces and moments; residual: the largest of any constraint at any level, in
+    its unit; energy: energy gained less the work done along the reference, relative to the largest energy; power:
+    dE/dt less the power of all forces, relative (NaN where it does not apply); evaluations of the right-hand side, or
+    of the series, or Newton steps; steps; seconds: the shortest call after a warm-up, with 51 samples by methods that
+    find their steps (more samples take longer), and one at each instant or step by the others; resolved: whether the
+    error exceeds the reference's own uncertainty; failure: why there is no number.
+    """
+
+    COLUMNS = (
+        "method", "drift", "setting", "value", "error", "actuation", "residual", "energy", "power", "evaluations",
+        "steps", "seconds", "resolved", "failure",
+    )  # fmt: skip
+
+    @property
+    def uncertainty(self):
+        """How far the reference and the method that verified it agree on the motion."""
+        return self.meta["reference"]["error"]
+
+    def pareto(self, cost="seconds"):
+        """The rows that no other beats in both error and cost, from cheap to accurate.
+
+        Errors below the reference's uncertainty count as equal to it.
+
+        Parameters
+        ----------
+        cost : {"seconds", "evaluations", "steps"}
+
+        Returns
+        -------
+        TradeOff
+        """
+        good, error = self._good(), self._errors()
+        front, best = [], np.inf
+        for i in good[np.lexsort((error[good], self.column(_cost(cost))[good]))]:
+            if error[i] < best:
+                front.append(i)
+                best = error[i]
+        return self.take(front)
+
+    def recommend(self, *, error=None, seconds=None):
+        """What to give to `simulate`: the fastest within an error, or the most accurate within a time.
+
+        Parameters
+        ----------
+        error : float, optional
+            Largest error of the motion, relative.
+        seconds : float, optional
+            Longest time of a call [s], on the machine that measured.
+
+        Returns
+        -------
+        Recommendation
+            A dict of arguments; `.row` has what was measured.
+
+        Raises
+        ------
+        SpecificationError
+            Unless one of the two is given.
+        LimitExceeded
+            Where nothing reaches it; the message names the nearest that does.
+        """
+        if (error is None) == (seconds is None):
+            raise SpecificationError(
+                f"error={error!r} and seconds={seconds!r} were given.",
+                "A recommendation answers one question: the fastest within an error, or the best within a time.",
+                do="Give recommend(error=1e-6) or recommend(seconds=1e-3).",
+            )
+        wanted, limit = ("error", error) if seconds is None else ("seconds", seconds)
+        if not (is_number(limit) and limit > 0):
+            raise SpecificationError(
+                f"{wanted}={limit!r} was given.", f"{wanted} is a positive number.", do="Give 1e-6.", **{wanted: limit}
+            )
+        front = self.pareto()
+        reached = front._errors() if wanted == "error" else front["seconds"]
+        within = np.flatnonzero(reached <= limit)
+        if not len(within):
+            raise self._out_of_reach(wanted, limit, front)
+        row = front.rows()[within[0] if wanted == "error" else within[-1]]
+        return Recommendation(_arguments(row), row)
+
+    def _out_of_reach(self, wanted, limit, front):
+        nearest = ""
+        if len(front):
+            row = front.rows()[-1 if wanted == "error" else 0]
+            best = max(row["error"], self.uncertainty)
+            nearest = f"{_name(row)}: error {best:.2g} in {row['seconds']:.2g} s"
+        rule = f"The reference is itself certain to {self.uncertainty:.1g} only" if wanted == "error" else ""
+        return LimitExceeded(
+            f"{wanted}={limit:g} was given, which no setting that was measured reaches"
+            + ("." if len(front) else ": every run failed, see the column failure."),
+            rule or "A recommendation is one of the settings that were measured.",
+            nearest=nearest,
+            do="Raise it, or measure other methods and settings by tradeoff(...).",
+            limit=limit,
+            uncertainty=self.uncertainty,
+        )
+
+    def plot(self, ax=None, cost="seconds", title=""):
+        """Draw the work-precision diagram: error of the motion over cost, a line for each method and treatment.
+
+        Parameters
+        ----------
+        ax : Axes, optional
+        cost : {"seconds", "evaluations", "steps"}
+        title : str
+
+        Returns
+        -------
+        Axes
+        """
+        from servoctl.figures.work_precision import draw_tradeoff
+
+        return draw_tradeoff(self, ax, _cost(cost), title)
+
+    def _good(self):
+        return np.flatnonzero(np.isfinite(self["error"]) & np.isfinite(self["seconds"]))
+
+    def _errors(self):
+        """Errors, those below the reference's uncertainty raised to it."""
+        return np.maximum(self["error"], self.uncertainty)
+
+    def __repr__(self):
+        t0, t1 = self.meta["t_span"]
+        reference, where = self.meta["reference"], self.meta["machine"]
+        front = self.pareto()
+        shown = np.unique(np.linspace(0, len(front) - 1, min(SHOWN, len(front))).round().astype(int))
+        lines = [
+            f"Trade-off: {len(self)} rows, {len(self) - len(self._good())} without numbers; t = {t0:g} .. {t1:g} s"
+            + ("; interrupted" if self.meta.get("message") else ""),
+            f"  reference: {reference['method']}; {reference['verified by']} agrees to {reference['error']:.1e}, "
+            f"actuation to {reference['actuation']:.1e}",
+            f"  on {where['processor']}, {where['cores']} cores, compiler {where['compiler']}",
+            f"  fastest for each error, {len(shown)} of {len(front)}:" if len(front) else "  every run failed",
+        ]
+        names = ("method", "drift", "setting", "value", "error", "actuation", "evaluations", "seconds")
+        return "\n".join([*lines, *table(front.take(shown), names, SHOWN)])
+
+
+# --- the reference
 
 
 class Reference:
     """The motion against which others are measured, at any instants.
 
-    Parameters
-    ----------
-    model : Model
-    x0 : State or (n_x,) array
-    t_span : (t0, t1)
-        [s]
-    seconds : float
-        That one run may take; the verification may take ten times as long.
-
-    Attributes
-    ----------
-    told : dict
-        The two methods, and how far they agree on motion and actuation.
+    `agreement` has its method, the one that verified it (which may take ten times `seconds`), and how far they agree.
     """
 
     def __init__(self, model, x0, t_span, seconds):
@@ -124,7 +270,7 @@ class Reference:
         self.method, self.drift = Taylor(16, rtol=1e-15, atol=1e-15), Project()
         if model.flat:
             self.method, self.drift, checks = Algebraic(), None, checks[::-1]
-        self.told = self._verified(checks, seconds)
+        self.agreement = self._verified(checks, seconds)
 
     def _verified(self, checks, seconds):
         """The agreement with the first other method that comes to the end in time."""
@@ -166,8 +312,8 @@ class Deadline:
         now = time.perf_counter()
         self.since, self.steps = self.since or now, self.steps + 1
         if now - self.since > self.seconds:
-            told = f"More than {self.seconds:g} s: ended at t = {t:.4g} s"
-            raise LimitExceeded(told, seconds=self.seconds, steps=self.steps)
+            late = f"More than {self.seconds:g} s: ended at t = {t:.4g} s"
+            raise LimitExceeded(late, seconds=self.seconds, steps=self.steps)
 
 
 def _whole(run):
@@ -186,7 +332,7 @@ def actuation(run):
 
 
 def _ladder(reference, method, treatment, settings, seconds):
-    """A row for each setting, from coarse to fine, until finer ones are too slow or cannot be told from exact."""
+    """A row for each setting, from coarse to fine, until they are too slow or as exact as the reference."""
     over, name = "", _kind(method)
     for value in sorted(settings, reverse=True):
         row = {"method": method, "drift": _drift_word(treatment), "setting": name, "value": value, "failure": over}
@@ -249,7 +395,7 @@ def _errors(reference, run):
         "residual": max((float(np.abs(levels).max(initial=0.0)) for levels in run.residual.values()), default=0.0),
         "energy": float(drifted / max(np.abs(exact_energy).max(), 1e-300)),
         "power": float(np.abs(rate - work).max() / largest) if lawful else np.nan,
-        "resolved": bool(error >= reference.told["error"]),
+        "resolved": bool(error >= reference.agreement["error"]),
     }
 
 
@@ -261,15 +407,15 @@ def _energy_balance(run, knots):
     t, work, energy = run.t[order], run.signals("power")[1][1][order], run["energy"][order]
     gained, cuts = [0.0], [t[0], *knots, t[-1]]
     for a, b in itertools.pairwise(cuts):
-        own = (t >= a) & (t <= b)
-        if own.sum() < 2:
+        piece = (t >= a) & (t <= b)
+        if piece.sum() < 2:
             return np.nan
-        spline = make_interp_spline(t[own], work[own], k=min(9, (own.sum() - 1) // 2 * 2 - 1 or 1))
-        gained += list(gained[-1] + spline.antiderivative()(t[own])[1:])
+        spline = make_interp_spline(t[piece], work[piece], k=min(9, (piece.sum() - 1) // 2 * 2 - 1 or 1))
+        gained += list(gained[-1] + spline.antiderivative()(t[piece])[1:])
     return float(np.abs(energy - energy[0] - gained).max() / max(np.abs(energy).max(), 1e-300))
 
 
-# --- what is asked
+# --- what is measured
 
 
 def _combinations(model, methods, drifts):
@@ -284,7 +430,7 @@ def _combinations(model, methods, drifts):
     for value in treatments:
         if isinstance(value, Poles) and not isinstance(value.values, float):
             raise SpecificationError(
-                "Poles by row were given.", "A row of the study tells its drift in a word.", do="Give a time constant."
+                "Poles by row were given.", "A row of the study names its drift in a word.", do="Give a time constant."
             )
     pairs = [(m, d) for m in methods for d in treatments if m != "algebraic"]
     pairs = [*((m, None) for m in methods if m == "algebraic"), *pairs]
@@ -292,19 +438,18 @@ def _combinations(model, methods, drifts):
         raise SpecificationError(
             f"methods={methods!r} and drift={drifts!r} were given.",
             "A study measures at least one method with one treatment of drift.",
-            nearest="drift=[None].",
-            do="Leave both out to measure most.",
+            do="Leave both out to measure most, or give drift=[None].",
         )
     return pairs
 
 
-def _ladders(given, length):
+def _ladders(settings, length):
     """Values of "rtol" and "step", the latter for a span of some length [s]."""
-    for name in given:
+    for name in settings:
         if name not in ("rtol", "step"):
             raise unknown(name, ("rtol", "step"), "setting")
-    rtol = positives("rtol", given.get("rtol", TOLERANCES), "Leave rtol out.", most=1.0)
-    step = positives("step", given.get("step", [length / n for n in STEP_COUNTS]), "Leave step out.")
+    rtol = positives("rtol", settings.get("rtol", TOLERANCES), "Leave rtol out.", most=1.0)
+    step = positives("step", settings.get("step", [length / n for n in STEP_COUNTS]), "Leave step out.")
     return {"rtol": np.ravel(rtol).tolist(), "step": np.ravel(step).tolist()}
 
 
@@ -326,8 +471,32 @@ def _said(method):
     return f"{method}{order}" + (f" at {method.rtol:g}" if hasattr(method, "rtol") else "")
 
 
-def _bar(total, wanted):
-    from tqdm import tqdm
+# --- methods and treatments in words
 
-    wanted = sys.stderr.isatty() if wanted is None else wanted
-    return tqdm(total=total, desc="tradeoff", unit="run", delay=PATIENCE, disable=not wanted)
+
+def method_at(name, value):
+    """The method of a name with a step of `value` [s], or a tolerance: rtol is `value`, atol a hundredth."""
+    method = as_method(name)
+    if isinstance(method, Algebraic):
+        return method
+    settings = {"step": value} if isinstance(method, RungeKutta) else {"rtol": value, "atol": value / 100}
+    return as_method(method, **settings)
+
+
+def _arguments(row):
+    """The arguments of `simulate` that a row was measured with."""
+    options, drift = {"method": method_at(row["method"], row["value"])}, row["drift"]
+    if drift != "none":
+        word, _, every = drift.partition(" ")
+        options["drift"] = Project(int(every)) if every else word if word in DRIFTS else float(drift)
+    return options
+
+
+def _name(row):
+    return ", ".join([row["method"], f"drift {row['drift']}", f"{row['setting']} {row['value']:g}"])
+
+
+def _cost(name):
+    if name not in COSTS:
+        raise unknown(name, COSTS, "cost")
+    return name

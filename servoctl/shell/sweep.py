@@ -1,37 +1,31 @@
-"""Commands beside running a scene: `servoctl sweep` and `servoctl export-c`."""
+"""`servoctl sweep`: many cases of a scene in one table, on several processes or machines."""
 
 import functools
 import inspect
-import json
 import multiprocessing
 from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 
+import servoctl as sv
 from servoctl.errors import ServoError, SpecificationError, unknown
-from servoctl.shell.folder import Folder, Report, complain
-from servoctl.shell.options import METHODS_HELP, assignment, count, draw, drawn, given, mapping, shard, variation, whole
+from servoctl.shell.folder import Report, complain, folder_of
+from servoctl.shell.options import MANY, METHODS_HELP, by_name, count, draw, drawn, shard, used, variation, whole
+from servoctl.shell.scenes import find_scene, own_case, stamp
+from servoctl.study.sweep import require_fitting
+
+# what computes, and has no place beside --merge
+COMPUTING = ("vary", "monte_carlo", "draw", "seed", "t_span", "method", "workers", "shard", "resume")
 
 
-def add(commands):
-    """Add the commands to the subparsers of the command line.
-
-    Parameters
-    ----------
-    commands : argparse subparsers
-    """
-    many = {"nargs": "+", "action": "extend", "default": []}
+def add_sweep(commands):
+    """Add the command to the subparsers of the command line."""
     sweep = commands.add_parser("sweep", help="many cases of a scene, on several processes or machines, in one table")
-    sweep.add_argument(
-        "scene",
-        metavar="NAME_OR_FILE",
-        nargs="?",
-        help="a gallery name, or a .py file with scene() or case(**parameters)",
-    )
-    sweep.add_argument(
-        "--vary", type=variation, metavar="NAME=LOW:HIGH:N", **many, help="all combinations of such values"
-    )
+    scene = "a gallery name, or a .py file with scene() or case(**parameters)"
+    sweep.add_argument("scene", metavar="NAME_OR_FILE", nargs="?", help=scene)
+    vary = {"type": variation, "metavar": "NAME=LOW:HIGH:N", **MANY}
+    sweep.add_argument("--vary", **vary, help="all combinations of such values")
     sweep.add_argument("--monte-carlo", type=count, metavar="N", help="N random cases, of each combination")
-    sweep.add_argument("--draw", type=draw, metavar="NAME=normal:MEAN:STD", **many, help="what is random in them")
+    sweep.add_argument("--draw", type=draw, metavar="NAME=normal:MEAN:STD", **MANY, help="what is random in them")
     sweep.add_argument("--seed", type=whole, help="of everything random")
     sweep.add_argument("--t-span", type=float, nargs=2, metavar=("T0", "T1"), help="[s]; default: the scene's")
     sweep.add_argument("--method", help=METHODS_HELP)
@@ -41,79 +35,34 @@ def add(commands):
     sweep.add_argument("--out", metavar="DIR", help="folder; default servoctl-runs/NAME-sweep")
     sweep.add_argument("--merge", metavar="DIR", nargs="+", help="no computation: join the shards in these folders")
     sweep.set_defaults(command=_sweep)
-    export = commands.add_parser("export-c", help="the feedforward and residuals of a scene as one C file and header")
-    export.add_argument("scene", metavar="NAME_OR_FILE", help="a gallery name, or a .py file that defines scene()")
-    export.add_argument("--out", metavar="DIR", required=True, help="folder for the two files")
-    export.add_argument("--name", help="prefix of the files and of all functions; default: the scene's name")
-    export.add_argument("--set", type=assignment, metavar="NAME=VALUE", **many, help="parameters")
-    export.set_defaults(command=_export_c)
-
-
-# what computes, and has no place beside --merge
-COMPUTING = ("vary", "monte_carlo", "draw", "seed", "t_span", "method", "workers", "shard", "resume")
-
-# --- export-c
-
-
-def _export_c(args):
-    from servoctl.export.c import export_c
-    from servoctl.export.files import identifier
-    from servoctl.shell.scenes import find_scene
-
-    name, scene = find_scene(args.scene)
-    model = _model(args.scene).with_parameters(**mapping(args.set, "--set"))
-    start = model.start(t=scene.t_span[0], guess=scene.guess, **scene.start)
-    files = export_c(model, args.out, name=args.name or identifier(name), start=start)
-    print(f"{', '.join(file.name for file in files)} in {args.out}")
-    return 0
-
-
-# --- sweep
 
 
 def _sweep(args):
-    import servoctl as sv
-
     if args.merge:
-        _require_alone(args)
-        study = sv.merge(sv.load_study(path) for path in _shards(args.merge))
-        name = Path(args.merge[0]).name
-    elif args.scene is None:
+        return _merge(args)
+    if args.scene is None:
         raise SpecificationError(
             "servoctl sweep was given no scene.",
             "A sweep computes cases of a scene, or merges shards.",
-            nearest="servoctl sweep overhead-crane --vary m_load=80:120:9",
-            do="Name a scene, or give --merge.",
+            do="Name a scene, as in servoctl sweep overhead-crane --vary m_load=80:120:9, or give --merge.",
         )
-    else:
-        name, study = None, None
-    folder = _folder(args, name)
-    try:
-        study = _computed(args, folder) if study is None else study
-        return _leave(study, folder, _stem(args), _units(args.scene))
-    finally:
-        folder.leave()
+    name = Path(args.scene).stem if args.scene.endswith(".py") else find_scene(args.scene)[0]
+    with folder_of(args, f"{name}-sweep") as folder:
+        return _leave(_computed(args, folder), folder, _stem(args), _units(args.scene))
 
 
-def _require_alone(args):
-    surplus = given(args, COMPUTING)
-    if surplus:
+def _merge(args):
+    computing = used(args, COMPUTING)
+    if computing:
         raise SpecificationError(
-            f"{', '.join(surplus)} was given with --merge.",
+            f"{', '.join(computing)} was given with --merge.",
             "Merging joins what was computed, and computes nothing.",
             do="Leave one of them out.",
+            options=computing,
         )
-
-
-def _folder(args, merged):
-    from servoctl.shell.scenes import find_scene
-
-    name = merged or f"{_scene_name(args.scene, find_scene)}-sweep"
-    return Folder(Path(args.out) if args.out else Path("servoctl-runs", name), name)
-
-
-def _scene_name(given, find_scene):
-    return Path(given).stem if given.endswith(".py") else find_scene(given)[0]
+    study = sv.merge(sv.load_study(path) for path in _shards(args.merge))
+    with folder_of(args, Path(args.merge[0]).name) as folder:
+        return _leave(study, folder, "sweep", _units(args.scene))
 
 
 def _stem(args):
@@ -121,11 +70,9 @@ def _stem(args):
 
 
 def _computed(args, folder):
-    import servoctl as sv
-
     cases, case = _cases(args), _case(args)
     random = "rng" in inspect.signature(case).parameters
-    surplus = [] if random or args.draw else given(args, ("seed", "monte_carlo"))
+    surplus = [] if random or args.draw else used(args, ("seed", "monte_carlo"))
     if surplus or (random or args.draw) and args.seed is None:
         raise SpecificationError(
             f"{', '.join(surplus)} was given, and nothing is random." if surplus else "There is no --seed.",
@@ -137,8 +84,7 @@ def _computed(args, folder):
         raise SpecificationError(
             f"{checkpoint} holds the finished cases of a sweep that did not end.",
             "Work that was done is not thrown away.",
-            nearest="--resume goes on where it ended.",
-            do="Give --resume, another folder by --out, or remove the file.",
+            do="Give --resume to go on where it ended, another folder by --out, or remove the file.",
             checkpoint=str(checkpoint),
         )
     options = {"seed": args.seed if random else None, "checkpoint": checkpoint, "shard": args.shard}
@@ -153,19 +99,14 @@ def _computed(args, folder):
 
 
 def _cases(args):
-    import servoctl as sv
-
-    varied, random = mapping(args.vary, "--vary"), mapping(args.draw, "--draw")
+    varied, random = by_name(args.vary, "--vary"), by_name(args.draw, "--draw")
     both = [name for name in varied if name in random]
-    if both or bool(random) > bool(args.monte_carlo) or not (varied or args.monte_carlo):
-        raise SpecificationError(
-            f"{', '.join(both)} is both varied and drawn." if both
-            else "--draw was given without --monte-carlo N." if random
-            else "Neither --vary nor --monte-carlo was given.",
-            "A sweep takes all combinations of the values of --vary, each with N draws of --monte-carlo.",
-            nearest="--vary m_load=80:120:9, or --monte-carlo 100 --draw m_load=normal:100:5 --seed 1.",
-            do="Say what differs between the cases.",
-        )  # fmt: skip
+    if both:
+        raise _unclear(f"{', '.join(both)} is both varied and drawn.")
+    if random and not args.monte_carlo:
+        raise _unclear("--draw was given without --monte-carlo N.")
+    if not (varied or args.monte_carlo):
+        raise _unclear("Neither --vary nor --monte-carlo was given.")
     grid = sv.grid(**varied)
     if not args.monte_carlo:
         return grid
@@ -174,11 +115,16 @@ def _cases(args):
     return [{**grid[i // args.monte_carlo], **case} for i, case in enumerate(draws)]
 
 
+def _unclear(given):
+    return SpecificationError(
+        given,
+        "A sweep takes all combinations of the values of --vary, each with N draws of --monte-carlo.",
+        do="Give --vary m_load=80:120:9, or --monte-carlo 100 --draw m_load=normal:100:5 --seed 1.",
+    )
+
+
 def _case(args):
     """The function of one case; a file's own case() is found again by its file in every process."""
-    from servoctl.shell.scenes import own_case
-    from servoctl.study.sweep import require_fitting
-
     own = own_case(args.scene)
     if own is None:
         _require_names(args)
@@ -206,38 +152,16 @@ def _require_names(args):
 
 def _model(given):
     """The model of a scene, derived once in each process."""
-    from servoctl.shell.scenes import stamp
-
     return _derived(given, stamp(given))
 
 
 @functools.cache
 def _derived(given, _):
-    from servoctl.model.model import derive
-    from servoctl.shell.scenes import find_scene
-
-    return derive(*find_scene(given)[1].build())
+    return sv.derive(*find_scene(given)[1].build())
 
 
 def scene_case(given, options, /, **values):
-    """Simulate the plan of a scene with other parameters and held values of the start.
-
-    Parameters
-    ----------
-    given : str
-        A name of the gallery, or a file.
-    options : tuple of (str, object)
-        Of `simulate`, and t_span.
-    **values : float
-        By name.
-
-    Returns
-    -------
-    Run
-    """
-    from servoctl.shell.scenes import find_scene
-    from servoctl.simulation import simulate
-
+    """Simulate the plan of a scene; `values` are parameters and held values, `options` those of `simulate`."""
     scene, model = find_scene(given)[1], _model(given)
     options, parameters = dict(options), model.reduction.mechanism.parameters.names
     model = model.with_parameters(**{name: value for name, value in values.items() if name in parameters})
@@ -245,35 +169,27 @@ def scene_case(given, options, /, **values):
     guess = {name: value for name, value in scene.guess.items() if name not in held}
     span = options.pop("t_span", scene.t_span)
     start = model.start(t=span[0], guess=guess, **{**scene.start, **held})
-    return simulate(model, start, span, progress=False, **options)
+    return sv.simulate(model, start, span, progress=False, **options)
 
 
 def own_plain_case(given, /, **values):
     """What case() of a user's file returns."""
-    from servoctl.shell.scenes import own_case
-
     return own_case(given)(**values)
 
 
 def own_random_case(given, /, rng, **values):
     """What case() of a user's file returns, which draws random numbers."""
-    from servoctl.shell.scenes import own_case
-
     return own_case(given)(rng=rng, **values)
 
 
 def _units(given):
     """Units of states and of what a row has of a signal, by column."""
-    from servoctl.shell.scenes import find_scene, own_case
-
     known = find_scene(given)[1].units if given and own_case(given) is None else {}
     return {f"{name}{end}": unit for name, unit in known.items() for end in ("", "_min", "_max", "_end")}
 
 
 def _leave(study, folder, stem, units):
     """Print, save and draw; returns the exit code."""
-    from servoctl.figures import run as plots
-
     report = Report()
     report.say(study)
     failures = study.take([i for i, error in enumerate(study["error"].tolist()) if error])
@@ -282,11 +198,10 @@ def _leave(study, folder, stem, units):
         complain(f"Case {i}: {text}")
     folder.write(lambda path: study.save(path / f"{stem}.npz"))
     folder.write(lambda path: study.csv(path / f"{stem}.csv"))
-    text = json.dumps(study.meta, indent=2, ensure_ascii=False) + "\n"
-    folder.write(lambda path: (path / f"{stem}.json").write_text(text, encoding="utf-8"))
+    folder.write_json(f"{stem}.json", study.meta)
     written = [f"{stem}{suffix}" for suffix in (".npz", ".csv", ".json")]
     try:
-        figure = plots.sweep(study, units=units)
+        figure = sv.figures.sweep(study, units=units)
         figure.suptitle(f"{folder.name}: {study.meta['message']}", fontsize=11)
     except SpecificationError as error:
         complain(f"There is no figure: {error}")

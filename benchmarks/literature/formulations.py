@@ -1,10 +1,17 @@
-"""What a formulation costs: (3.18), which needs no multipliers, against the equations with them."""
+"""What a formulation costs: (3.18), which needs no multipliers, against the equations with them.
+
+One motion in several formulations, their operations and times; see docs/formulations.md.
+"""
 
 from time import perf_counter
 
+import casadi as ca
 import numpy as np
 
+from servoctl.codegen.function import compiled
 from servoctl.errors import SpecificationError, unknown
+from servoctl.figures import style
+from servoctl.model import saddle
 from servoctl.model.model import derive
 from servoctl.study.table import Study, machine
 
@@ -17,6 +24,71 @@ NAMES = {
 POINTS, REPEATED = 300, 5  # states at which accelerations are evaluated, and how often: the least time counts
 FEW = 20  # states where nothing is timed: not enough to compile for
 SEED = 3
+
+
+def formulation(model, how, forces=False):
+    """γ'' at a state, with the multipliers if `forces`, in one formulation, as a compiled function of the model.
+
+    Parameters
+    ----------
+    model : Model
+    how : {"eliminated", "sparse", "qr", "assembly"}
+        (3.18) with the constraints, multipliers afterwards from r_D = B_D μ; the matrix [M -B; G 0] of accelerations
+        and multipliers by sparse symbolic elimination; the same matrix by CasADi's `solve`, a dense QR factorisation;
+        or that matrix itself, column by column, and its right side, for a dense numerical solution.
+    forces : bool
+        Whether the multipliers are asked for: where they are not, what only they need is left out.
+
+    Returns
+    -------
+    Compiled
+        Of (t, X, p); outputs γ'', and μ.
+
+    Raises
+    ------
+    SpecificationError
+        If accelerations do not follow from a state.
+    """
+    name = f"formulation_{how}{'_forces' if forces else ''}"
+
+    def build():
+        equations = model.equations
+        return compiled(equations.function(name, equations.state, _outputs(equations, how, forces)), name)
+
+    return model.once(name, build)
+
+
+def _outputs(equations, how, forces):
+    r, q = equations.r, equations.q
+    if not saddle.applies(r):
+        raise SpecificationError(
+            f"The program leads to a motion of order {r.top} with {len(r.hidden)} hidden constraints.",
+            "Formulations are compared where the balance itself, with the constraints, gives the accelerations.",
+            do="Give a program of order 2 or less without hidden constraints.",
+        )
+    acceleration = ca.vertcat(*q.gamma(2))
+    if how == "eliminated":
+        solution = equations.dense()
+        multipliers = ca.substitute(r.multipliers, acceleration, solution) if forces else ca.SX(0, 1)
+    elif how == "sparse":
+        solution, multipliers, _ = saddle.solve(equations)
+    else:
+        matrix, right = _multiplier_form(equations)
+        if how == "assembly":
+            return [ca.vec(ca.densify(matrix)), right]
+        both = ca.solve(matrix, right)
+        solution, multipliers = both[: q.n], both[q.n :]
+    return [solution, multipliers] if forces else [solution]
+
+
+def _multiplier_form(equations):
+    r, q = equations.r, equations.q
+    rows = [a for a, row in enumerate(r.rows) if row.kind != "dynamics"]
+    acceleration, B = ca.vertcat(*q.gamma(2)), r.realisation.B
+    G = ca.jacobian(ca.vertcat(*(equations.levels[a][-1] for a in rows)), acceleration)
+    matrix = ca.vertcat(ca.horzcat(r.mechanism.mass, -B), ca.horzcat(G, ca.SX(len(rows), B.shape[1])))
+    balance = ca.substitute(r.mechanism.balance, acceleration, ca.SX.zeros(q.n))
+    return matrix, -ca.vertcat(balance, *equations.rest(rows))
 
 
 class FormulationCost(Study):
@@ -48,14 +120,12 @@ class FormulationCost(Study):
         -------
         matplotlib.figure.Figure
         """
-        from matplotlib.figure import Figure
-
-        figure = Figure(figsize=(10.0, 4.2), layout="constrained")
+        figure, (panels,) = style.figure(4.2, columns=2, sharex=True)
         largest = {int(n): int(self.where(n=n)["k"].max()) for n in np.unique(self["n"])}
         keep = [i for i, (n, k) in enumerate(zip(self["n"], self["k"], strict=True)) if k == largest[int(n)]]
         own = self.take(keep)
         labels = {"operations": "operations for γ''", "microseconds": "time of one evaluation [µs]"}
-        for ax, name in zip(figure.subplots(1, 2, sharex=True), labels, strict=True):
+        for ax, name in zip(panels, labels, strict=True):
             for i, how in enumerate(dict.fromkeys(own["formulation"].tolist())):
                 part = own.where(formulation=how)
                 ax.loglog(part["n"], part[name], "osDv"[i % 4] + "-", label=how)
@@ -119,13 +189,13 @@ def _measured(n, k, model, formulations, timed):
     t, x = np.zeros(points), rng.uniform(0.2, 1.2, (len(model.state_names), points))
     first, rows = None, []
     for how in formulations:
-        f = model.function(f"formulation_{how}")
+        f = formulation(model, how)
         if how == "assembly":
             size = model.n + model.reduction.realisation.B.shape[1]
             count = f.operations + round(2 * size**3 / 3 + 2 * size**2)
             counts = (count, count)
         else:
-            counts = (f.operations, model.function(f"formulation_{how}_forces").operations)
+            counts = (f.operations, formulation(model, how, forces=True).operations)
 
         def evaluate(f=f, dense=how == "assembly"):
             y = f.grid(t, x, model.parameters)

@@ -3,25 +3,43 @@
 import numpy as np
 
 from servoctl.errors import SpecificationError
+from servoctl.figures import style
 
-COLOURS = ("#0072B2", "#D55E00")  # Okabe and Ito
-TOLD = ("error", "message", "facts")  # columns of what went wrong, which are no results
-MOST = 4  # results in one figure
+MOST_RESULTS = 4  # results in one figure
 SHARES = {5: "--", 50: "-", 95: ":"}  # percentiles
 
 
-def draw(study, names, against, units):
-    """Rows of a histogram with percentiles and a scatter over one parameter."""
-    from matplotlib.figure import Figure
+def sweep(study, names=None, against=None, units=None):
+    """Draw results of a sweep: histograms with percentiles, and each over a parameter.
 
+    Parameters
+    ----------
+    study : Study
+        From `sweep` or `merge`.
+    names : sequence of str, optional
+        Columns; default: the first four results that vary.
+    against : str, optional
+        Column across; default: for each result the parameter with the largest rank correlation.
+    units : dict of str to str, optional
+        Unit of each column, by name.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+
+    Raises
+    ------
+    NameUnknown
+        If there is no such column.
+    SpecificationError
+        If no result varies, or it is no sweep.
+    """
     if getattr(study, "kind", None) != "sweep":
         kind = f"Study of the kind {study.kind}" if hasattr(study, "kind") else type(study).__name__
-        raise SpecificationError(
-            f"A {kind} was given.", "A sweep is drawn.", "What sv.sweep or sv.merge returns.", "Give that."
-        )
+        raise SpecificationError(f"A {kind} was given.", "The figure is that of a sweep, from sv.sweep or sv.merge.")
     parameters = [name for name in study.meta["parameters"] if _varies(study, name)]
-    results = [name for name in study.columns if name not in (*TOLD, "case", *study.meta["parameters"])]
-    names = [name for name in results if _varies(study, name)][:MOST] if names is None else list(names)
+    results = [name for name in study.columns if name not in ("case", *study.meta["parameters"])]
+    names = [name for name in results if _varies(study, name)][:MOST_RESULTS] if names is None else list(names)
     if not names:
         raise SpecificationError(
             f"Of {len(study)} rows no result varies.",
@@ -30,32 +48,33 @@ def draw(study, names, against, units):
         )
     if against is not None:
         study.column(against)
-    figure = Figure(figsize=(10.0, 0.6 + 2.5 * len(names)), layout="constrained")
-    for name, axes in zip(names, figure.subplots(len(names), 2, squeeze=False), strict=True):
+    units = units or {}
+    figure, rows = style.figure(0.6 + 2.5 * len(names), rows=len(names), columns=2)
+    for name, axes in zip(names, rows, strict=True):
         values = np.asarray(study[name], dtype=float)
-        _histogram(axes[0], values, _label(name, units))
+        _histogram(axes[0], values, style.label(name, units.get(name)))
         by = against or _strongest(study, parameters, values)
         _scatter(axes[1], study[by], values, study["error"] != "")
-        axes[1].set(xlabel=_label(by, units), ylabel=_label(name, units))
+        axes[1].set(xlabel=style.label(by, units.get(by)), ylabel=style.label(name, units.get(name)))
     figure.suptitle(f"{study.meta['case']}: {study.meta['message']}", fontsize=11)
     return figure
 
 
 def _histogram(ax, values, label):
     values = values[np.isfinite(values)]
-    ax.hist(values, bins="auto" if len(values) < 5000 else 60, color=COLOURS[0], alpha=0.55)
-    for share, style in SHARES.items():
+    ax.hist(values, bins="auto" if len(values) < 5000 else 60, color=style.COLOURS[0], alpha=0.55)
+    for share, line in SHARES.items():
         value = np.percentile(values, share)
-        ax.axvline(value, color="black", linestyle=style, label=f"{share} %: {value:.4g}")
+        ax.axvline(value, color="black", linestyle=line, label=f"{share} %: {value:.4g}")
     ax.set(xlabel=label, ylabel="cases")
     ax.legend(fontsize=9, ncols=3, loc="lower center", bbox_to_anchor=(0.5, 1.0), frameon=False)
 
 
 def _scatter(ax, x, values, failed):
-    ax.plot(x, values, "o", color=COLOURS[0], markersize=3.5 if len(x) > 60 else 5, alpha=0.6)
+    ax.plot(x, values, "o", color=style.COLOURS[0], markersize=3.5 if len(x) > 60 else 5, alpha=0.6)
     if failed.any():
-        bottom = {"transform": ax.get_xaxis_transform(), "color": COLOURS[1], "label": f"{failed.sum()} without result"}
-        ax.plot(x[failed], np.full(failed.sum(), 0.03), "x", **bottom)
+        at_the_bottom = {"transform": ax.get_xaxis_transform(), "label": f"{failed.sum()} without result"}
+        ax.plot(x[failed], np.full(failed.sum(), 0.03), "x", color=style.COLOURS[1], **at_the_bottom)
         ax.legend(fontsize=9)
     ax.grid(alpha=0.3)
 
@@ -77,7 +96,3 @@ def _strongest(study, parameters, values):
         return parameters[0] if parameters else "case"
     strength = {name: abs(spearmanr(study[name][known], values[known]).statistic) for name in parameters}
     return max(strength, key=lambda name: np.nan_to_num(strength[name]), default="case")
-
-
-def _label(name, units):
-    return f"{name} [{units[name]}]" if name in (units or {}) else name

@@ -1,21 +1,102 @@
-"""Backward Euler and BDF2 on the servo DAE itself, the comparison that the literature makes."""
+"""The servo DAE itself, as the literature integrates it: its residual, and backward Euler and BDF2 on it.
+
+Unknowns are coordinates, velocities and the forces that realise the program; see docs/servo_dae.md.
+"""
 
 from time import perf_counter
 
+import casadi as ca
 import numpy as np
 
-from servoctl.checks import as_span
+from servoctl.checks import as_span, positives
+from servoctl.codegen.function import compiled
 from servoctl.errors import SpecificationError, unknown
+from servoctl.figures import style
 from servoctl.methods.choice import Taylor
+from servoctl.reduction.elimination import eliminate
+from servoctl.reduction.ranks import clean, decide_all
 from servoctl.simulation import consistent_state, simulate
 from servoctl.study.table import Study, machine
 
-FORMS = {"servo": "servo_dae", "projected": "servo_dae_projected"}
+FORMS = ("servo", "projected")
 METHODS = {"BE": 1, "BDF2": 2}
 MOST_ITERATIONS, CLOSE = 15, 1e-6  # of Newton's method; what its last change of q may be relative to 1 + |q|
 MOST_STEPS = 10**7  # each is a Newton iteration in Python
 LAYER = 10  # steps at the start that are left out: formulas of order p need index + p of them to forget it
 TRUNCATED, ROUNDED = 3.0, 3.0  # a step belongs to a branch of the error where it is that much above the minimum
+
+
+
+def servo_dae(model, form):
+    """Residual and Jacobian of one implicit step on the servo DAE, as a compiled function of the model.
+
+    Unknowns are z = (q, γ', μ) with the multipliers μ of the reaction B μ: the inputs u where actuators realise the
+    program without redundancy. Rates are those of a linear multistep formula, q̇ = α q + s_q and γ̈ = α γ' + s_γ.
+
+    "servo" is the DAE as it stands, q̇ = V γ' + h, r(t, q, γ', γ̈) = B μ, φ = 0: of index 5 where the essential order
+    is 4. "projected" is that of Blajer and Kołodziejczyk (2004), of lower index: the balance on ker C only, and
+    φ̈ = 0 with the accelerations of the plant, C M⁻¹(B μ - r₀) + ξ = 0, beside φ = 0.
+
+    Parameters
+    ----------
+    model : Model
+    form : {"servo", "projected"}
+
+    Returns
+    -------
+    Compiled
+        Of t, z (nq + n + b) and (p, α, s_q, s_γ); outputs the residual and its Jacobian in z, column by column.
+
+    Raises
+    ------
+    SpecificationError
+        If a residual holds derivatives above velocities: such a program is no DAE in these unknowns.
+    """
+    name = f"servo_dae_{form}"
+    return model.once(name, lambda: compiled(_step(model.equations, form, name), name))
+
+
+def _step(equations, form, name):
+    r, q = equations.r, equations.q
+    rows = list(r.given.values())
+    high = [row.name for row in rows if row.order > 1]
+    if high:
+        raise SpecificationError(
+            f"The program's {', '.join(high)} holds derivatives of order 2 or higher.",
+            "The servo DAE has coordinates, velocities and forces as unknowns.",
+            nearest="A program on coordinates and velocities.",
+            do="Compare by tradeoff(...) instead.",
+        )
+    B = r.realisation.B
+    velocity, acceleration = ca.vertcat(*q.gamma(1)), ca.vertcat(*q.gamma(2))
+    mu, alpha = ca.SX.sym("mu", B.shape[1]), ca.SX.sym("alpha")
+    past_q, past_v = ca.SX.sym("past_q", q.nq), ca.SX.sym("past_v", q.n)
+    balance = _projected(equations, rows, mu) if form == "projected" else r.mechanism.balance - B @ mu
+    moving = alpha * ca.vertcat(*q) + past_q - q.V @ velocity - q.h
+    residual = ca.vertcat(moving, balance, *(row.expression for row in rows))
+    residual = ca.substitute(residual, acceleration, alpha * velocity + past_v)
+    z = ca.vertcat(*q, velocity, mu)
+    jacobian = ca.vec(ca.densify(ca.jacobian(residual, z)))
+    return equations.function(name, z, [residual, jacobian], ca.vertcat(alpha, past_q, past_v))
+
+
+def _projected(equations, rows, mu):
+    """Dᵀ(r - B μ) with C D = 0, and φ̈ with the accelerations of the plant."""
+    r, q = equations.r, equations.q
+    acceleration, zero = ca.vertcat(*q.gamma(2)), ca.SX.zeros(q.n)
+    second = ca.vertcat(*(q.derivatives([row.expression], 2 - row.order)[-1][0] for row in rows))
+    C = ca.jacobian(second, acceleration)
+    numbers, sizes = r.points.matrix(C)
+    numbers = clean(numbers, sizes)
+    dependent = sorted(decide_all(*r.points.matrix(C))[0].columns)
+    independent = [i for i in range(q.n) if i not in dependent]
+    unbalanced = r.mechanism.balance - r.realisation.B @ mu
+    A = eliminate(C[:, dependent], -C[:, independent], numbers[:, dependent])[0]
+    free = unbalanced[independent] + A.T @ unbalanced[dependent]
+    mass = r.mechanism.mass
+    force = -ca.substitute(unbalanced, acceleration, zero)
+    plant = eliminate(mass, force, clean(*r.points.matrix(mass)))[0]
+    return ca.vertcat(free, ca.substitute(second, acceleration, plant))
 
 
 class DaeComparison(Study):
@@ -67,11 +148,9 @@ class DaeComparison(Study):
         -------
         matplotlib.figure.Figure
         """
-        from matplotlib.figure import Figure
-
-        figure = Figure(figsize=(10.0, 4.2), layout="constrained")
-        for ax, name in zip(figure.subplots(1, 2, sharex=True), ("motion", "force"), strict=True):
-            for colour, form in zip(("#0072B2", "#D55E00"), FORMS, strict=True):
+        figure, (panels,) = style.figure(4.2, columns=2, sharex=True)
+        for ax, name in zip(panels, ("motion", "force"), strict=True):
+            for colour, form in zip(style.COLOURS, FORMS, strict=False):
                 for mark, method in zip(("o-", "s--"), METHODS, strict=True):
                     own = self.where(form=form, method=method)
                     if len(own):
@@ -121,19 +200,10 @@ def dae_comparison(model, start, t_span, steps=None, forms=tuple(FORMS), methods
     step of least error that no tolerance improves.
     """
     forms, methods = ([names] if isinstance(names, str) else names for names in (forms, methods))
-    for names, known, what in ((forms, FORMS, "form"), (methods, METHODS, "method")):
-        for name in names:
-            if name not in known:
-                raise unknown(name, known, what)
-    t0, t1 = as_span(t_span)
+    t0, t1 = as_span(t_span, forward=True)
     steps = _steps(t0, t1, steps)
+    _require_known(forms, methods)
     consistent_state(model, start, t0)
-    if not (len(forms) and len(methods)):
-        raise SpecificationError(
-            f"forms={forms!r} and methods={methods!r} were given.",
-            "A comparison has at least one of each.",
-            do="Leave them out to compare all.",
-        )
     rows = []
     for step in steps:
         count = max(2, round((t1 - t0) / step))
@@ -151,29 +221,32 @@ def dae_comparison(model, start, t_span, steps=None, forms=tuple(FORMS), methods
     return study
 
 
+def _require_known(forms, methods):
+    for names, known, what in ((forms, FORMS, "form"), (methods, METHODS, "method")):
+        for name in names:
+            if name not in known:
+                raise unknown(name, known, what)
+    if not (len(forms) and len(methods)):
+        raise SpecificationError(
+            f"forms={forms!r} and methods={methods!r} were given.",
+            "A comparison has at least one of each.",
+            do="Leave them out to compare all.",
+        )
+
+
 def _steps(t0, t1, steps):
     """Steps as an array of positive lengths, the default ones where none are given."""
-    if t1 < t0:
-        raise SpecificationError(
-            f"t_span=({t0:g}, {t1:g}) was given.",
-            "The comparison runs forward: its formulas damp what they compute in the direction of time.",
-            nearest=f"({t1:g}, {t0:g}).",
-            do="Start at the earlier time.",
-        )
+    length = t1 - t0
     if steps is None:
-        return (t1 - t0) / 20.0 / 2.0 ** np.arange(12)
-    try:
-        found = np.atleast_1d(np.asarray(steps, dtype=float)).ravel()
-    except (TypeError, ValueError):
-        found = np.zeros(0)
-    if not len(found) or not np.all((found > (t1 - t0) / MOST_STEPS) & (found <= t1 - t0)):
+        return length / 20.0 / 2.0 ** np.arange(12)
+    steps = np.ravel(positives("steps", steps, f"Give steps such as {length / 20:g} s.", most=length))
+    if steps.min() <= length / MOST_STEPS:
         raise SpecificationError(
             f"steps={steps!r} were given over {t0:g} .. {t1:g} s.",
-            f"Steps are positive, no longer than the span, and no more than {MOST_STEPS:,} fill it.",
-            nearest=f"[{(t1 - t0) / 20:g}, {(t1 - t0) / 200:g}].",
-            do="Give such steps, or leave them out.",
+            f"No more than {MOST_STEPS:,} steps fill the span.",
+            do=f"Give steps above {length / MOST_STEPS:.2g} s.",
         )
-    return found
+    return steps
 
 
 def _reference(model, start, t):
@@ -186,10 +259,10 @@ def _reference(model, start, t):
 
 
 def _integrated(model, form, method, t, reference, first):
-    f = model.function(FORMS[form])
+    f = servo_dae(model, form)
     rates = np.zeros(model.nq + model.n)
     if not np.all(np.isfinite(f(t[0], reference[:, 0], np.concatenate([model.parameters, [1.0], rates])))):
-        f = model.near(t[0], first).function(FORMS[form])  # pivots of the projection vanish at the start
+        f = servo_dae(model.near(t[0], first), form)  # pivots of the projection vanish at the start
     began = perf_counter()
     z, iterations = _march(f, model, METHODS[method], t, reference[:, 0])
     seconds = perf_counter() - began

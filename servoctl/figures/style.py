@@ -1,0 +1,30 @@
+"""What all figures share: colours, line styles, panels, legends, labels."""
+
+COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")  # Okabe and Ito
+MORE = ("#8C6D31", "#7F7F7F", "#5E3C99", "#882255", "#44AA99", "#B5BD00", "#FF7F9F")  # where there are many curves
+STYLES = ("-", "--", ":", "-.")
+FIGURE_WIDTH = 10.0  # inches: 1000 px at matplotlib's 100 dpi
+BESIDE = {"loc": "upper left", "bbox_to_anchor": (1.01, 1.0), "frameon": False}  # a legend to the right of its panel
+
+
+def figure(height, rows=1, columns=1, width=FIGURE_WIDTH, **options):
+    """A figure outside pyplot, so that the user's backend stays as it is, and its (rows, columns) array of Axes."""
+    from matplotlib.figure import Figure
+
+    empty = Figure(figsize=(width, height), dpi=100, layout="constrained")
+    return empty, empty.subplots(rows, columns, squeeze=False, **options)
+
+
+def panels(count, height):
+    """Axes one above the other, over the same time, in a new figure."""
+    return figure(height, rows=count, sharex=True)[1][:, 0]
+
+
+def look(i):
+    """Colour and line style of the i-th curve."""
+    return {"color": COLOURS[i % len(COLOURS)], "linestyle": STYLES[i // len(COLOURS) % len(STYLES)]}
+
+
+def label(text, unit):
+    """A text with its unit in brackets, if it has one."""
+    return f"{text} [{unit}]" if unit else text

@@ -1,0 +1,57 @@
+"""The motion that a command's scene and options describe."""
+
+from dataclasses import dataclass
+
+import servoctl as sv
+from servoctl.checks import as_span
+from servoctl.errors import SpecificationError, unknown
+from servoctl.shell.options import by_name
+
+
+@dataclass(frozen=True)
+class Scenario:
+    """A derived model with its numbers, its start, and its time (t0, t1) [s]."""
+
+    model: object
+    start: object
+    span: tuple
+
+
+def described(args, scene, report, require=lambda model: None):
+    """Derive the model of a scene and find its start; print both.
+
+    `require` is called with the model before anything is printed; it raises for options that do not fit.
+    """
+    span = as_span(tuple(args.t_span or scene.t_span))
+    changes, held, guess = (by_name(getattr(args, name), f"--{name}") for name in ("set", "hold", "guess"))
+    model = with_parameters(sv.derive(*scene.build()), changes)
+    require(model)
+    report.say(model)
+    start = _start(model, scene, span[0], held, guess)
+    report.say(start)
+    return Scenario(model, start, span)
+
+
+def with_parameters(model, changes):
+    """A model with other numbers; a name that is no parameter is refused."""
+    valid = model.reduction.mechanism.parameters.names
+    for name in changes:
+        if name not in valid:
+            raise unknown(name, valid, "parameter")
+    return model.with_parameters(**changes) if changes else model
+
+
+def _start(model, scene, t0, hold, guess):
+    both = [name for name in guess if name in hold]
+    if both:
+        raise SpecificationError(
+            f"{', '.join(both)} is both held and guessed.",
+            "A value of the start is kept exactly, or is where the solution is looked for.",
+            do="Give it to --hold or to --guess.",
+            names=both,
+        )
+    held = {name: value for name, value in scene.start.items() if name not in guess} | hold
+    for name in held:
+        if name not in model.state_names:
+            raise unknown(name, model.state_names, "state")
+    return model.start(t=t0, guess={**scene.guess, **guess}, **held)

@@ -1,0 +1,111 @@
+"""`servoctl run`: derive, simulate, verify, close the loop, and leave figures and numbers in a folder."""
+
+import servoctl as sv
+from servoctl.errors import ServoError
+from servoctl.methods.choice import as_method, default_method
+from servoctl.methods.drift import as_drift
+from servoctl.methods.runge_kutta import ORDERS
+from servoctl.shell import loop
+from servoctl.shell.folder import FILES, LOOP_FILES, Report, complain, folder_of, summary
+from servoctl.shell.motion import described
+from servoctl.shell.options import METHODS_HELP, add_motion, drift, samples
+from servoctl.shell.scenes import find_scene
+
+
+def add_run(commands):
+    """Add the command to the subparsers of the command line."""
+    run = commands.add_parser("run", help="derive, simulate, verify; leave figures and numbers in a folder")
+    add_motion(run)
+    run.add_argument("--out", metavar="DIR", help="folder; files of an earlier run in it are replaced")
+    run.add_argument("--accuracy", type=float, metavar="E", help="error of the motion, in place of method and settings")
+    run.add_argument("--method", help=METHODS_HELP)
+    run.add_argument("--step", type=float, metavar="H", help=f"step of {', '.join(ORDERS)} and RadauIIA [s]")
+    run.add_argument("--drift", type=drift, metavar="D", help="none, project, minimal, or a time constant [s]")
+    run.add_argument("--rtol", type=float, help="relative tolerance")
+    run.add_argument("--atol", type=float, help="absolute tolerance")
+    run.add_argument("--samples", type=samples, metavar="N", help="equally spaced samples of the run")
+    run.add_argument("--no-verify", action="store_true", help="leave out the check against the full mechanism")
+    run.add_argument("--no-figures", action="store_true", help="leave out the figures")
+    loop.add_loop(run)
+    run.set_defaults(command=_run)
+
+
+def _run(args):
+    name, scene = find_scene(args.scene)
+    with folder_of(args, name) as folder:
+        return _compute(args, name, scene, folder)
+
+
+def _compute(args, name, scene, folder):
+    """Derive, simulate, save, verify, close the loop and draw, in this order; returns the exit code."""
+    report = Report()
+    _require_known(args)
+    motion = described(args, scene, report, require=lambda model: loop.require(args, model))
+    run = _simulate(motion, _options(args, motion), report)
+    folder.write(lambda path: run.save(path / "run.npz"))
+    verification = None if args.no_verify else _verify(motion.model, run, report)
+    closed, done = loop.closed_loop(args, motion.model, run, report)
+    if closed is not None:
+        folder.write(lambda path: closed.save(path / "closed_loop.npz"))
+    about = {"name": name, "given": args.scene, "description": scene.description}
+    facts = {"scene": about, "command": args.command_line, "t_span": motion.span}
+    facts |= {**summary(run, motion.start, verification), "closed_loop": loop.facts(closed)}
+    folder.write_json("summary.json", facts)
+    folder.write_text("report.txt", report.text)
+    if not args.no_figures:
+        folder.write(lambda path: sv.figures.save_figures(run, path, units=scene.units, title=name))
+        if closed is not None:
+            folder.write(lambda path: loop.save_figure(closed, path, scene.units, name))
+    print(f"{', '.join(f for f in (*FILES, *LOOP_FILES) if (folder.path / f).exists())} in {folder.path}")
+    if not run.success:
+        complain(f"The motion ended early, at t = {run.t[-1]:.6g} s; what was computed is kept.")
+    verified = args.no_verify or (verification is not None and verification.passed)
+    return 0 if run.success and verified and done and not folder.moved else 1
+
+
+def _require_known(args):
+    """Refuse a method or a treatment of drift that no model has, before anything is derived."""
+    as_drift(args.drift)
+    if args.method is not None:
+        as_method(args.method)
+
+
+def _options(args, motion):
+    """Arguments of `simulate` that were given."""
+    options = {} if args.accuracy is None else {"accuracy": args.accuracy}
+    options |= {} if args.drift in (None, "none") else {"drift": args.drift}
+    settings = {name: getattr(args, name) for name in ("step", "rtol", "atol") if getattr(args, name) is not None}
+    if args.method or settings:
+        options["method"] = as_method(args.method or default_method(motion.model), **settings)
+    if args.samples:
+        (t0, t1), intervals = motion.span, args.samples - 1
+        options["t_eval"] = [t0 + (t1 - t0) * i / intervals for i in range(intervals)] + [t1]
+    return options
+
+
+def _simulate(motion, options, report):
+    """The run; where the motion stops, what was computed of it."""
+    try:
+        run = sv.simulate(motion.model, motion.start, motion.span, **options)
+        report.say(run)
+        return run
+    except ServoError as error:
+        if error.run is None:
+            raise
+        report.say(error.run)
+        report.say(f"{type(error).__name__}: {error}")
+        return error.run
+
+
+def _verify(model, run, report):
+    """The verification; None where there is none."""
+    if not run.success:
+        report.say("Verification: left out, as the motion ended early.")
+        return None
+    try:
+        verification = sv.verify(model, run)
+    except (ServoError, KeyboardInterrupt) as error:
+        report.say(f"Verification: {str(error) or 'interrupted'}")
+        return None
+    report.say(verification)
+    return verification
