@@ -111,7 +111,7 @@ def test_bad_input():
         with refused(sv.SpecificationError, fact):
             sv.fastest(mechanism, program, limits, span)
     for pair, kind in (((mechanism, "cars"), "Program"), (("cars", program), "Mechanism")):
-        with refused(sv.SpecificationError, "str", kind):
+        with refused(sv.SpecificationError, "str", kind.lower()):
             sv.fastest(*pair, {"force": 200.0}, (0.0, 2.0))
     for given in ("start", "parameters"):
         with refused(sv.SpecificationError, "[1.0]"):

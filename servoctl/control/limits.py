@@ -19,6 +19,7 @@ from servoctl.control.residuals import Residuals
 from servoctl.control.sampling import discretised
 from servoctl.control.time_law import fastest
 from servoctl.errors import LimitExceeded, ServoError, SpecificationError, unknown
+from servoctl.values import Value
 
 HORIZON = 0.5  # s
 FALLING = 1e-4  # of weights, from one residual to the next by priority
@@ -269,7 +270,7 @@ def _metric(reference, names, weights, at_once):
 
 
 @dataclass(frozen=True, eq=False)
-class Allocation:
+class Allocation(Value):
     """The step of a limited law: (t, [y; z; last u], [column; x_ref; D; H]) -> [u; z+; u; signals].
 
     Attributes
