@@ -104,6 +104,7 @@ def test_runs_and_laws_that_travelled_are_equal(crane):
     noise = dict.fromkeys(mechanism.q.names, 1e-3)
     laws = [law, sv.feedforward(plan, nominal), sv.pd(plan, nominal), sv.lqr(plan, nominal, integral=True)]
     laws.append(sv.output_feedback(law, nominal, noise=noise))
+    laws.append(sv.limited(law, sv.plant(mechanism, limits={"trolley": 2000.0, "hoist": 3000.0})))
     for value in laws:
         assert again(value) == value and hash(again(value)) == hash(value)
     assert len({repr(value) for value in laws}) == len(laws)

@@ -15,7 +15,6 @@ from servoctl.spec.packing import packed, unpacked
 from servoctl.spec.parameters import Parameters
 from servoctl.tolerances import ENTRY
 
-ARRIVED = 32  # mechanisms from other processes that are held
 IDENTITY_SEED = 20021  # of the random points at which identities are tested
 RANDOM = (0.3, 1.3)  # where these lie, parameters in units of their defaults: of order one, and away from zero
 INTEGRABLE = 1e-9  # of the largest bracket of columns of V: what may lie outside their span
@@ -366,9 +365,9 @@ def _unpickled(q, parameters, content):
     return _latest(mechanism)
 
 
-@lru_cache(ARRIVED)
+@lru_cache(32)
 def _latest(mechanism):
-    """An equal mechanism that came before from another process, or else this one: what is derived of it is shared."""
+    """An equal one of the last mechanisms from other processes, or else this one: what is derived of it is shared."""
     return mechanism
 
 
