@@ -244,17 +244,17 @@ def test_laws_in_python_are_sent_to_sweep(plan):
 
 
 BAD = {
-    "unknown column": ({"mload": [1.0]}, {}, "m_load"),
-    "other lengths": ({"m_load": [1.0, 2.0], "theta": [0.0]}, {}, "columns of finite numbers"),
-    "not finite": ({"m_load": [np.nan]}, {}, "columns of finite numbers"),
-    "no case": ({}, {}, "columns of finite numbers"),
-    "empty columns": ({"m_load": []}, {}, "columns of finite numbers"),
-    "every without traces": ({"m_load": [100.0]}, {"every": 5}, "none to thin out"),
-    "a name alone": ({"m_load": [100.0]}, {"record": "theta"}, "one by one"),
-    "scale of no disturbance": ({"m_load": [1.0]}, {"scale": {"x": "m_load"}}, "disturbance"),
-    "scale without its column": ({"m_load": [1.0]}, {"scale": {"theta": "w"}}, "column of the cases"),
-    "trace of nothing": ({"m_load": [100.0]}, {"record": ("thet",)}, "theta"),
-    "every": ({"m_load": [100.0]}, {"record": ("theta",), "every": 0}, "at least 1"),
+    "unknown column": (sv.NameUnknown, {"mload": [1.0]}, {}, {"match": "m_load"}),
+    "other lengths": (sv.SpecificationError, {"m_load": [1.0, 2.0], "theta": [0.0]}, {}, "cases"),
+    "not finite": (sv.SpecificationError, {"m_load": [np.nan]}, {}, "cases"),
+    "no case": (sv.SpecificationError, {}, {}, "cases"),
+    "empty columns": (sv.SpecificationError, {"m_load": []}, {}, "cases"),
+    "every without traces": (sv.SpecificationError, {"m_load": [100.0]}, {"every": 5}, "every=5"),
+    "a name alone": (sv.SpecificationError, {"m_load": [100.0]}, {"record": "theta"}, "record='theta'"),
+    "scale of no disturbance": (sv.NameUnknown, {"m_load": [1.0]}, {"scale": {"x": "m_load"}}, {"name": "x"}),
+    "scale without its column": (sv.NameUnknown, {"m_load": [1.0]}, {"scale": {"theta": "w"}}, {"name": "w"}),
+    "trace of nothing": (sv.NameUnknown, {"m_load": [100.0]}, {"record": ("thet",)}, {"match": "theta"}),
+    "every": (sv.SpecificationError, {"m_load": [100.0]}, {"record": ("theta",), "every": 0}, "every=0"),
 }  # fmt: skip
 
 

@@ -323,7 +323,7 @@ def test_output_feedback_and_computed_laws_are_linearised(car_plan, plan):
         (lambda c: interop.linearise(sv.plant(CRANE), 0.0, SUDDEN, {"hoist": 1.0}), NameUnknown, {"name": "trolley"}),
         (lambda c: list(interop.along(sv.plant(CRANE), c["plan"], [9.0])), SpecificationError, "0 to 8 s"),
         (lambda c: interop.loop_gain(interop.linearise(sv.plant(CRANE), 0.0, SUDDEN), interop.linearise(c["law"], 0.0),
-                                     "trolley"), SpecificationError, "dt = 0 s, the law 0.02 s.*rate=50"),
+                                     "trolley"), SpecificationError, "0.02 s"),
         (lambda c: interop.loop_gain(sv.plant(CRANE), c["law"], "trolley"), SpecificationError, "Plant"),
         (lambda c: interop.linearise(c["late"], 0.0, SUDDEN), SpecificationError, "0.05 s"),
         (lambda c: interop.linearise(c["law"], 0.0, rate=3.0), SpecificationError, "Law"),

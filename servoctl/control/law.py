@@ -347,12 +347,12 @@ def ordered(values, names, what, exactly=True):
     """
     numbers = values
     if isinstance(values, dict):
-        for name in names:
-            if name not in values:
-                raise unknown(name, values, what)
         for name in values if exactly else ():
             if name not in names:
                 raise unknown(name, names, what)
+        for name in names:
+            if name not in values:
+                raise unknown(name, values, what)
         numbers = [values[name] for name in names]
     try:
         numbers = np.array([float(number) for number in np.ravel(numbers)])
