@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from servoctl.methods.monitor import FRACTIONS, DenseStretch, Fine
+from servoctl.methods.monitor import FRACTIONS, DenseStretch, Fine, Repivot
 from servoctl.methods.motion import Stepping
 
 
@@ -20,14 +20,19 @@ class BulkSteps(Stepping):
         while t != b and self.motion.stop is None:
             steps = self._steps(t, x, b)
             outcome = self.monitor.inspect(self._stretch(steps))
-            self._record(steps, outcome.steps)
-            t, x = steps.t[outcome.steps], steps.x[:, outcome.steps].copy()
+            last = outcome.steps
+            # A step in which a pivot vanishes is sampled with the next pivots: its own lose digits near the zero.
+            before = max(last - 1, 0) if isinstance(outcome, Repivot) else last
+            self._record(steps, 0, before)
+            t, x = steps.t[last], steps.x[:, last].copy()
+            goes_on = isinstance(outcome, Fine) or self._follow(outcome)
+            if before < last:
+                self._record(steps, before, last)
             self.progress(t)
-            if not isinstance(outcome, Fine):
-                if not self._follow(outcome):
-                    self._keep_last(t, x)
-            elif steps.failed:
+            if goes_on and isinstance(outcome, Fine) and steps.failed:
                 self._fail(t, x)
+                goes_on = False
+            if not goes_on:
                 self._keep_last(t, x)
         return x
 
@@ -48,17 +53,17 @@ class BulkSteps(Stepping):
             pivots_at=self._pivots,
         )
 
-    def _record(self, steps, stand):
-        """Record the pending samples within the first `stand` steps."""
+    def _record(self, steps, first, last):
+        """Record the pending samples from the start of step `first` to the start of step `last`."""
         direction = 1.0 if self.forward else -1.0
-        due = direction * self.pending <= direction * steps.t[stand]
+        due = direction * self.pending <= direction * steps.t[last]
         times, self.pending = self.pending[due], self.pending[~due]
         if not len(times):
             return
-        owner = np.searchsorted(direction * steps.t[: stand + 1], direction * times, "right") - 1
-        states = steps.x[:, np.clip(owner, 0, stand)]
-        for k in np.unique(owner[owner < stand]):
-            states[:, owner == k] = steps.at(k, times[owner == k])
+        step = first + np.searchsorted(direction * steps.t[first : last + 1], direction * times, "right") - 1
+        states = steps.x[:, np.clip(step, 0, last)]
+        for k in np.unique(step[step < last]):
+            states[:, step == k] = steps.at(k, times[step == k])
         states = self._settled(times, states)
         top = self.f.grid(times, states, self.p)[self.n_x - self.model.n : self.n_x]
         self.motion.add(self.model, times, states, top)

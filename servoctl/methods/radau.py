@@ -296,10 +296,10 @@ class RadauSteps(BulkSteps):
         self._use(model)
         return radau_steps(self.f, t, x, t + 2 * h, self.p, abs(h), self.settings, 2)[1]
 
-    def _record(self, steps, stand):
-        super()._record(steps, stand)
+    def _record(self, steps, first, last):
+        super()._record(steps, first, last)
         if self.step is not None:
-            self.taken.append((self.model, steps.t[: stand + 1], steps.x[:, : stand + 1]))
+            self.taken.append((self.model, steps.t[first : last + 1], steps.x[:, first : last + 1]))
 
     def _begin(self, a, x, b):
         if self.step is None:

@@ -71,8 +71,11 @@ class ScipySteps(Stepping):
                 continue
             if outcome.steps:
                 t, x = solver.t, solver.y
+            goes_on = self._follow(outcome)
+            # A step in which a pivot vanishes is sampled with the next pivots: its own lose digits near the zero.
+            if outcome.steps:
                 self._sample(t, dense, x)
-            if not self._follow(outcome):
+            if not goes_on:
                 self._keep_last(t, x)
                 break
             self._count(solver)
