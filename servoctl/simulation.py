@@ -12,19 +12,21 @@ from servoctl.methods.choice import (
     EXPLICIT,
     Adaptive,
     Algebraic,
+    Poles,
+    Project,
     RadauIIA,
     RungeKutta,
     Sundials,
     Taylor,
+    as_drift,
     as_method,
     default_method,
     require_combination,
 )
-from servoctl.methods.drift import Poles, Project, as_drift
 from servoctl.methods.radau import RadauSteps
 from servoctl.methods.runge_kutta import RungeKuttaSteps
 from servoctl.methods.scipy_methods import ScipySteps
-from servoctl.methods.stability import row_poles, run_checked, warn_many_steps
+from servoctl.methods.stability import run_checked, warn_many_steps
 from servoctl.methods.sundials import SundialsSteps
 from servoctl.methods.taylor import TaylorSteps
 from servoctl.progress import Progress
@@ -97,7 +99,7 @@ def simulate(model, start, t_span, method=None, *, drift=None, accuracy=None, t_
     if isinstance(drift, Poles):
         _require_decay(model, drift, t0, t1)
         if str(method) in EXPLICIT:
-            warn_many_steps(str(method), row_poles(drift, model), t1 - t0)
+            warn_many_steps(str(method), drift.by_row(model), t1 - t0)
     leads_back = isinstance(method, Algebraic) or isinstance(drift, (Poles, Project))
     x0 = (as_state if leads_back else consistent_state)(model, start, t0)
     knots = model.require_smooth((min(span), max(span)))
@@ -165,8 +167,7 @@ def _resample(run, times):
 
 def _require_decay(model, drift, t0, t1):
     """Refuse poles that amplify in the direction of time."""
-    drift.coefficients(model)  # refuses poles that do not fit the rows
-    for row, values in row_poles(drift, model).items():
+    for row, values in drift.by_row(model).items():
         if np.any(np.real(values) * (t1 - t0) > 0):
             way, sign = ("forward", "negative") if t1 > t0 else ("backwards", "positive")
             raise SpecificationError(

@@ -13,8 +13,7 @@ import numpy as np
 
 from servoctl.checks import is_number
 from servoctl.errors import LimitExceeded, SpecificationError
-from servoctl.methods.choice import Algebraic, Taylor
-from servoctl.methods.drift import Project
+from servoctl.methods.choice import Algebraic, Project, Taylor
 from servoctl.methods.taylor import order_for
 
 SMALLEST_SIZE = 1e-3  # of a component relative to the largest of its level: what is zero has rounding for its size

@@ -6,7 +6,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from servoctl.methods.drift import Poles
+from servoctl.methods.choice import Poles
 from servoctl.methods.monitor import VANISHING, Monitor, Repivot
 
 

@@ -11,10 +11,9 @@ from servoctl.codegen.loops import ROUNDING
 from servoctl.codegen.native import pointer
 from servoctl.errors import SpecificationError
 from servoctl.methods.bulk import BulkSteps
-from servoctl.methods.drift import Project
+from servoctl.methods.choice import RADAU_ORDERS, Project
 from servoctl.methods.motion import equal_steps
 
-RADAU_ORDERS = (5, 9, 13)
 LEAST_RTOL = {5: 1e-4, 9: 1e-7}  # above which an order needs less work than the next
 NEWTON_TOLERANCE = 1e-2  # of the Newton iteration, relative to the tolerance of a step
 TIGHT, PATIENT = 1e-4, 3  # the same where steps are fixed, and how many times more iterations they may take

@@ -3,19 +3,16 @@
 import numpy as np
 
 from servoctl.errors import unknown
-from servoctl.methods.drift import MinimalCoordinates, Project
+from servoctl.methods.choice import ORDERS, MinimalCoordinates, Project
 from servoctl.methods.minimal import Chart, Sizes
 from servoctl.methods.monitor import DEGRADED, Fine, Singular, Stretch
 from servoctl.methods.motion import Stepping, equal_steps
 
 NEARLY_ZERO = 0.3  # of its reference: below this the least size of a pivot is looked for within a step
-ORDERS = {"RK1": 1, "RK2": 2, "RK4": 4, "RK5": 5, "RK8": 8}
-"""Order of each method: Euler's, the midpoint rule, the classical one of Kutta (1901), Dormand and Prince's of orders
-5 (1980) and 8 (Prince and Dormand 1981), whose coefficients are scipy's."""
 
 
 def tableau(name):
-    """The tableau (a, b, c) of a method.
+    """The tableau (a, b, c) of a method; the coefficients of RK5 and RK8 are scipy's.
 
     Parameters
     ----------

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from servoctl.methods.drift import MinimalCoordinates, Project
+from servoctl.methods.choice import MinimalCoordinates, Project
 from servoctl.methods.minimal import MinimalSolver, Sizes
 from servoctl.methods.monitor import FRACTIONS, DenseStretch, Fine
 from servoctl.methods.motion import Stepping

@@ -8,12 +8,12 @@ from math import comb, factorial, inf, pi
 
 import numpy as np
 
-from servoctl.checks import is_whole
+from servoctl.checks import whole_of
 from servoctl.errors import SpecificationError, unknown
 from servoctl.methods.accuracy import component_sizes, state_levels
-from servoctl.methods.drift import Poles
+from servoctl.methods.choice import ORDERS, Poles
 from servoctl.methods.motion import breakpoints, equal_steps
-from servoctl.methods.runge_kutta import ORDERS, tableau
+from servoctl.methods.runge_kutta import tableau
 
 SAME = {"DOP853": "RK8", "RK45": "RK5"}  # scipy's adaptive methods that go on with the result of these tableaus
 STEP_MAPS = (*ORDERS, *SAME, "RK23", "Taylor", "RadauIIA", "Radau")
@@ -168,11 +168,8 @@ def sampled_bound(rho, delay=0):
     E_k (Åström, Hagander and Sternby 1984), so that with z = 1 + p h s the characteristic polynomial is
     sᵖ z^delay + Σ_k binom(ρ, k) s^(ρ-k) E_k(z)/k!, of exponent ρ: (s + 1)^ρ for small p h.
     """
-    for name, value, low in (("rho", rho, 1), ("delay", delay, 0)):
-        if not (is_whole(value) and low <= value <= 12):
-            raise SpecificationError(
-                f"{name}={value!r} was given.", f"It is a whole number from {low} to 12.", do=f"Give {low + 1}."
-            )
+    whole_of("rho", rho, range(1, 13))
+    whole_of("delay", delay, range(13))
     steps = FASTEST * 2.0 ** (-np.arange(96)[::-1] / 8)
     unstable = next(p for p in steps if not _sampled_stable(p, rho, delay))
     low, high = unstable / 2 ** (1 / 8), unstable
@@ -194,22 +191,6 @@ def _sampled_stable(p, rho, delay):
 def _eulerian(k):
     """Coefficients of the Eulerian polynomial E_k: 1; 1, 1; 1, 4, 1; 1, 11, 11, 1."""
     return [sum((-1) ** j * comb(k + 1, j) * (i + 1 - j) ** k for j in range(i + 1)) for i in range(k)]
-
-
-def row_poles(drift, model):
-    """The poles [1/s] of every row's error dynamics: {row name: (ρ,) array}.
-
-    Parameters
-    ----------
-    drift : Poles
-    model : Model
-    """
-    one = isinstance(drift.values, float)
-    given = {} if one else drift.values
-    return {
-        row: np.full(count, -1 / drift.values) if one else np.atleast_1d(given.get(row, np.zeros(count)))
-        for row, count in model.raised.items()
-    }
 
 
 def warn_fast_poles(method, poles, step):
@@ -353,7 +334,7 @@ def run_checked(stepping, t0, x0, t1, t_eval, knots):
     explicit = stepping.method in ORDERS
     if explicit and isinstance(stepping.drift, Poles):
         lengths = (equal_steps(a, b, stepping.step)[0] for a, b in pairwise(breakpoints((t0, t1), knots)))
-        warn_fast_poles(stepping.method, row_poles(stepping.drift, stepping.model), max(lengths, key=abs))
+        warn_fast_poles(stepping.method, stepping.drift.by_row(stepping.model), max(lengths, key=abs))
     motion = stepping.run(t0, x0, t1, t_eval, knots)
     if motion.stop is None and not motion.interrupted:
         with np.errstate(all="ignore"):

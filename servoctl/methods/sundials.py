@@ -13,7 +13,7 @@ import casadi as ca
 import numpy as np
 
 from servoctl.methods.bulk import BulkSteps
-from servoctl.methods.drift import Poles
+from servoctl.methods.choice import Poles
 
 WATCHED = 1000  # intervals of a span at whose ends pivots are looked at, beside the samples
 MOST_STEPS = 20_000  # between two instants of the grid

@@ -14,7 +14,7 @@ from servoctl.codegen.function import compiled
 from servoctl.jets.motion import Motion, shifted
 from servoctl.jets.series import Series, is_zero
 from servoctl.jets.tape import Tape
-from servoctl.methods.drift import Project
+from servoctl.methods.choice import Project
 from servoctl.methods.monitor import DenseStretch, Fine, Repivot
 from servoctl.methods.motion import Stepping
 from servoctl.reduction.elimination import eliminate
