@@ -7,10 +7,10 @@ from servoctl.methods.motion import Stepping
 
 
 class BulkSteps(Stepping):
-    """An integration that takes many steps at once; `_steps` takes them.
+    """An integration that takes many steps at once, by `_steps`.
 
-    They come as a value with the ends t (S + 1,) [s], states x (n_x, S + 1) there, `at(k, times)` and `within(theta)`
-    for the states in between, and `failed`, whether no step succeeds after them.
+    `_steps` returns an object with the ends t (S + 1,) [s], states x (n_x, S + 1) there, `at(k, times)` and
+    `within(theta)` for the states in between, and `failed`: whether no step succeeds after them.
     """
 
     def _piece(self, a, x, b, times):
@@ -29,7 +29,7 @@ class BulkSteps(Stepping):
             if before < last:
                 self._record(steps, before, last)
             self.progress(t)
-            if goes_on and isinstance(outcome, Fine) and steps.failed:
+            if isinstance(outcome, Fine) and steps.failed:
                 self._fail(t, x)
                 goes_on = False
             if not goes_on:
@@ -37,7 +37,7 @@ class BulkSteps(Stepping):
         return x
 
     def _stretch(self, steps):
-        """The steps; they have passed their test of error, and others begin where they end."""
+        """The steps for the monitor: they have passed their error test, and the next begin where they end."""
         inside = np.array([*FRACTIONS, 1.0])
         times = (steps.t[:-1, None] + np.outer(np.diff(steps.t), inside)).ravel()
         pivots = self.f.grid(times, steps.within(inside).reshape(self.n_x, -1), self.p)[self.n_x :]
@@ -69,5 +69,5 @@ class BulkSteps(Stepping):
         self.motion.add(self.model, times, states, top)
 
     def _settled(self, times, states):
-        """States of samples as they are recorded."""
+        """States of samples, projected if the method projects."""
         return states

@@ -94,7 +94,7 @@ def _time_constant(value):
 def _poles_by_row(values):
     if not values:
         raise SpecificationError(
-            "The dict of poles is empty.",
+            "The dict of poles names no row.",
             "Error dynamics belong to rows.",
             do="Name a row of model.raised, or pass a time constant.",
             values=values,

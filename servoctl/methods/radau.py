@@ -14,14 +14,11 @@ from servoctl.methods.bulk import BulkSteps
 from servoctl.methods.choice import RADAU_ORDERS, Project
 from servoctl.methods.motion import equal_steps
 
-LEAST_RTOL = {5: 1e-4, 9: 1e-7}  # above which an order needs less work than the next
+LEAST_RTOL = {5: 1e-4, 9: 1e-7}  # rtol above which an order needs less work than the next
 NEWTON_TOLERANCE = 1e-2  # of the Newton iteration, relative to the tolerance of a step
-TIGHT, PATIENT = 1e-4, 3  # the same where steps are fixed, and how many times more iterations they may take
+TIGHT, PATIENT = 1e-4, 3  # the same for fixed steps, and the factor of iterations that they may take
 NEWTON_ITERATIONS = {5: 7, 9: 12, 13: 17}  # at most, by order (Hairer and Wanner 1999)
-
-
-# Stages by order. All are L-stable; the matrix of an odd number of stages has one real eigenvalue.
-STAGES = {5: 3, 9: 5, 13: 7}
+STAGES = {5: 3, 9: 5, 13: 7}  # all L-stable; for an odd number of stages A has one real eigenvalue
 
 
 @functools.cache
@@ -37,7 +34,7 @@ def radau(order):
     c : (s,) array
         Nodes, the last of which is 1.
     rate : (s, s) array
-        A⁻¹: what takes increments of the stages to h times their rates, the derivative of the collocation polynomial.
+        A⁻¹, which maps increments of the stages to h times their rates (the collocation polynomial's derivative).
     from_pairs, to_pairs : (s, s) arrays
         Real and imaginary parts of the eigenvectors of A⁻¹ as columns, and their inverse.
     mu : ((s + 1)/2, 2) array
@@ -72,8 +69,8 @@ def basis(c, theta):
     """Lagrange polynomials of the nodes c, and 0, at theta (N,): an (s, N) array."""
     nodes = np.append(0.0, c)
     rows = [[k for k in range(len(nodes)) if k != j] for j in range(1, len(nodes))]
-    return np.array([np.prod([(theta - nodes[k]) / (nodes[j + 1] - nodes[k]) for k in r], axis=0)
-                     for j, r in enumerate(rows)])  # fmt: skip
+    factors = ([(theta - nodes[k]) / (nodes[j + 1] - nodes[k]) for k in row] for j, row in enumerate(rows))
+    return np.array([np.prod(row, axis=0) for row in factors])
 
 
 def radau_order(rtol):
@@ -131,12 +128,10 @@ def radau_steps(f, t0, x0, t1, p, h, settings, max_steps):
     ----------
     f : Compiled
         From `radau_loop`.
-    t0 : float
-        Start [s].
+    t0, t1 : float
+        [s]
     x0 : (n_x,) array
         State at t0, SI.
-    t1 : float
-        End [s].
     p : (n_p,) array
         Parameters, SI.
     h : float
@@ -147,7 +142,7 @@ def radau_steps(f, t0, x0, t1, p, h, settings, max_steps):
     Returns
     -------
     t : (S + 1,) array
-        Starts of the steps, and where the last one ended [s]; short of t1 where steps vanish.
+        Starts of the steps and the end of the last [s], which lies before t1 if steps vanish.
     x : (n_x, S + 1) array
         States there, SI.
     z : (S, s, n_x) array
@@ -199,7 +194,7 @@ def inside(order, theta, z):
 
 
 def first_step(f, t, x, p, span, settings):
-    """Length of a first step (Hairer, Nørsett and Wanner 1993, II.4); f is a Compiled with the outputs X', guards."""
+    """Length of a first step (Hairer, Nørsett and Wanner 1993, II.4); f is a Compiled with the outputs X', pivots."""
     n, power = len(x), 1.0 / (STAGES[settings.order] + 1)
     scale = settings.atol + settings.rtol * np.abs(x)
     slope = f(t, x, p)[:n]
@@ -286,12 +281,13 @@ class RadauSteps(BulkSteps):
                 "method='RadauIIA' was given, and there is no C compiler.",
                 "The loop over its steps is C code.",
                 nearest="method='Radau', scipy's of order 5.",
-                do="Take that, or install a C compiler (gcc or clang).",
+                do="Use it, or install a C compiler (gcc or clang).",
+                method="RadauIIA",
             )
         return f
 
     def halved(self, model, t, x, h):
-        """States (n_x, 3) at t, t + h and t + 2 h by two steps; fewer where one fails."""
+        """States (n_x, 3) at t, t + h and t + 2 h by two steps; fewer if one fails."""
         self._use(model)
         return radau_steps(self.f, t, x, t + 2 * h, self.p, abs(h), self.settings, 2)[1]
 
@@ -327,7 +323,5 @@ class RadauSteps(BulkSteps):
             "the step of the integrator shrinks to nothing",
             f"RadauIIA stopped at t = {t:.7g} s: {why}.",
             "A motion is integrated as far as its solution exists and steps can be solved.",
-            "Take a smaller step or none, loosen rtol, or see whether the motion escapes.",
+            "Use a smaller step or none, use a larger rtol, or check whether the motion escapes.",
         )
-
-

@@ -3,7 +3,7 @@
 import numpy as np
 
 from servoctl.methods.choice import MinimalCoordinates, Project
-from servoctl.methods.minimal import MinimalSolver, Sizes
+from servoctl.methods.minimal import Chart, MinimalSolver, Sizes
 from servoctl.methods.monitor import FRACTIONS, DenseStretch, Fine
 from servoctl.methods.motion import Stepping
 
@@ -43,11 +43,13 @@ class ScipySteps(Stepping):
     def _solver(self, a, x, b):
         import scipy.integrate
 
-        method = getattr(scipy.integrate, self.method)
+        def solver(rates, t, y, jacobian, **options):
+            exact = {"jac": jacobian} if self.slopes is not None else {}
+            return getattr(scipy.integrate, self.method)(rates, t, y, b, **self.tolerances, **exact, **options)
+
         if isinstance(self.drift, MinimalCoordinates):
-            return MinimalSolver(method, self.model, self.sizes, a, x, b, self.tolerances, self.slopes is not None)
-        exact = {} if self.slopes is None else {"jac": self._jacobian}
-        return method(self._rates, a, x, b, **self.tolerances, **exact)
+            return MinimalSolver(solver, Chart(self.model, self.sizes, a, x), a, x)
+        return solver(self._rates, a, x, self._jacobian)
 
     def _piece(self, a, x, b, times):
         self.pending, self.forward = list(times), b >= a
@@ -85,14 +87,13 @@ class ScipySteps(Stepping):
         return solver.y
 
     def _stretch(self, t, x, solver, dense):
-        """The last step; it has passed its test of error, and another begins where it ends."""
-        end, ends = (solver.t, solver.y), np.array([t, solver.t])
-        inside = [t + s * (end[0] - t) for s in FRACTIONS]
-        pivots = np.array([*(self._pivots(s, dense(s)) for s in inside), self._pivots(*end)]).T
+        """The last step for the monitor: it has passed its error test, and the next begins where it ends."""
+        inside = [t + s * (solver.t - t) for s in FRACTIONS]
+        pivots = np.array([*(self._pivots(s, dense(s)) for s in inside), self._pivots(solver.t, solver.y)]).T
         self.motion.count(watched=len(inside) + 1)
         return DenseStretch(
-            ends,
-            np.column_stack([x, end[1]]),
+            np.array([t, solver.t]),
+            np.column_stack([x, solver.y]),
             pivots[:, None],
             self._top,
             crosses=True,
@@ -121,17 +122,17 @@ class ScipySteps(Stepping):
             "the step of the integrator shrinks to nothing",
             f"{self.method} stopped at t = {t:.7g} s: {message or 'the state is no longer finite'}.",
             "A motion is integrated as far as its solution exists.",
-            "Loosen rtol, take a method for stiff equations (Radau), or see whether the motion escapes.",
+            "Use a larger rtol or a method for stiff equations ('Radau'), or check whether the motion escapes.",
         )
         self._keep_last(t, x)
 
     def _sample(self, t, dense, x):
-        """Record the samples that are pending up to t."""
+        """Record the pending samples up to t, the end of a step with state x; `dense` interpolates within it."""
         times, states = [], []
         while self.pending and (self.pending[0] <= t if self.forward else self.pending[0] >= t):
             s = self.pending.pop(0)
-            y = x if s == t and x is not None else dense(s)
-            if self.restore is not None and (x is None or s != t):
+            y = x if s == t else dense(s)
+            if self.restore is not None and s != t:
                 y = self.restore(s, y, self.p)
             times.append(s)
             states.append(y)
