@@ -36,12 +36,11 @@ from servoctl.methods.taylor import TaylorSteps
 from servoctl.model.model import Model
 from servoctl.model.start import State
 from servoctl.progress import Progress
-from servoctl.run import Run
+from servoctl.run import SAME_TIME, Run
 
 DEFAULT_SAMPLES = 1001  # without t_eval: smooth curves, and extrema refined to rounding
 STEPS_IN_SPAN = 2000  # steps of fixed length in a span if the method has no step
 MOST_STEPS = 10**8  # of fixed length: more would fill the memory with samples
-SAME_TIME = 1e-12  # relative: rounding of an instant
 OFF = 1e-5  # residual relative to its gradient times the state, above which a start is inconsistent
 
 
