@@ -8,7 +8,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from servoctl.run import require_model
+from servoctl.model.model import Model
+from servoctl.run import Run, require_model
 
 INSTANTS = 41  # instants along a run at which the internal dynamics is linearised
 AT_ZERO = 1e-9  # size of a state relative to the largest, below which it is the rounding of zero
@@ -92,7 +93,7 @@ def _jacobians(model, run, picked, n_x):
             yield J, C
 
 
-def internal_dynamics(model, run) -> InternalDynamics:
+def internal_dynamics(model: Model, run: Run) -> InternalDynamics:
     """Find the eigenvalues of the internal dynamics along a run.
 
     Parameters

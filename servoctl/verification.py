@@ -8,7 +8,8 @@ from servoctl.checks import whole
 from servoctl.control.loop import FINISHED, run_loop
 from servoctl.control.result import Closed
 from servoctl.model.equations import residual_rows
-from servoctl.run import require_model
+from servoctl.model.model import Model
+from servoctl.run import Run, require_model
 
 LIMITS = {
     "acceleration": 1e-9,
@@ -84,7 +85,7 @@ class Verification:
         return f"{self.numbers[key]:.1e}{allowed}"
 
 
-def verify(model, run=None, segments: int = 20) -> Verification:
+def verify(model: Model | Closed, run: Run | None = None, segments: int = 20) -> Verification:
     """Check a run against the full mechanism, not the reduced model.
 
     The mechanism's accelerations under the required actuation are compared with the run's at every sample. The
@@ -131,7 +132,7 @@ def verify(model, run=None, segments: int = 20) -> Verification:
         numbers["outside"] = _outside(model, run, good)
     numbers |= {f"residual {name}": _relative_residual(run, name, good) for name in run.residual}
     if not run.success:
-        notes.append("the run ended early: errors grow near a singularity")
+        notes.append("the run did not reach its end: errors grow near a singularity")
     limits = {key: limits.get("residual" if key.startswith("residual ") else key, np.inf) for key in numbers}
     return _judged(numbers, limits, notes)
 
