@@ -29,6 +29,8 @@ def algebraic(model, t0, x0, times, progress):
 
 
 class _Algebraic(Stepping):
+    rank_lost = "Newton's method finds no solution beyond"
+    advice = "Check whether the path leaves the reach of the mechanism."
     most = 4000  # instants per call of the loop: 0.2 ms compiled, 0.2 s where CasADi evaluates
 
     def _function(self, model, poles):
@@ -71,22 +73,13 @@ class _Algebraic(Stepping):
                 if not isinstance(outcome, Fine):
                     self._follow(outcome)
                 elif len(ends) < len(block):
-                    self._fail(block[0] if t is None else t, x)
+                    why = "Newton's method finds no solution of the program beyond"
+                    self._fail(block[0] if t is None else t, x, why)
         return self.motion
 
     def _inspect(self, t, state, pivots):
         """The monitor's outcome; an instant solved beyond a pivot's zero is as accurate as any other."""
         return self.monitor.inspect(Stretch(t, state, pivots[:, :, None], self._top, crosses=True))
-
-    def _fail(self, t, x):
-        self.motion.stop = self.monitor.failed(
-            t,
-            x,
-            "Newton's method finds no solution beyond",
-            f"Newton's method finds no solution of the program after t = {t:.7g} s.",
-            "A flat program is solved for the coordinates at each instant.",
-            "Check whether the path leaves the reach of the mechanism.",
-        )
 
 
 def _split(model, q, y):

@@ -7,7 +7,7 @@ from servoctl.methods.motion import Stepping
 
 
 class BulkSteps(Stepping):
-    """An integration that takes many steps at once, by `_steps`.
+    """An integration that takes many steps at once, by `_steps`; `failure` is the reason if no further one succeeds.
 
     `_steps` returns an object with the ends t (S + 1,) [s], states x (n_x, S + 1) there, `at(k, times)` and
     `within(theta)` for the states in between, and `failed`: whether no step succeeds after them.
@@ -30,7 +30,7 @@ class BulkSteps(Stepping):
                 self._record(steps, before, last)
             self.progress(t)
             if isinstance(outcome, Fine) and steps.failed:
-                self._fail(t, x)
+                self._fail(t, x, self.failure)
                 goes_on = False
             if not goes_on:
                 self._keep_last(t, x)

@@ -414,15 +414,19 @@ class Monitor:
         except ServoError:
             return None
 
-    def failed(self, t, x, why, *error):
-        """The error of a state from which no step succeeds: singular for the reason `why`, or the method's own error.
+    def failed(self, t, x, why, what, do):
+        """The error of a state from which no step succeeds: singular for the reason `why`, or the method's own.
 
-        `error` are the sentences of the latter: what happened, the rule, and what to do.
+        The latter says `what` happened and what to `do`.
         """
         if self.lost(t, x):
             return self.singular(t, x, why)
-        what, rule, do = error
-        return IntegrationStopped(what, rule, do=f"{do} The run before this instant is in .run.", t=float(t))
+        return IntegrationStopped(
+            f"{what}.",
+            "A motion is integrated as far as its solution exists and steps succeed.",
+            do=f"{do} The run before this instant is in .run.",
+            t=float(t),
+        )
 
     def singular(self, t, x, why):
         """The error that names the instant, the rows that lose rank, and the jets that are zero there."""

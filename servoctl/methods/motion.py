@@ -86,7 +86,8 @@ def equal_steps(a, b, step):
 class Stepping:
     """One integration: the model in use, the monitor of its pivots, and the motion so far.
 
-    A method takes the steps of a smooth piece in `_piece(a, x, b, times)` and returns the state at its end.
+    A method takes the steps of a smooth piece in `_piece(a, x, b, times)` and returns the state at its end. If a step
+    fails, `rank_lost` describes this for a singular program, and `advice` is for other failures.
 
     Parameters
     ----------
@@ -95,6 +96,9 @@ class Stepping:
     drift : None, Poles, Project or MinimalCoordinates
     progress : callable
     """
+
+    rank_lost = "the step of the integrator shrinks to nothing"
+    advice = "Use a larger rtol, or check whether the motion escapes."
 
     def __init__(self, model, method, drift, progress):
         self.method, self.drift, self.progress, self.motion = method, drift, progress, Motion()
@@ -173,6 +177,11 @@ class Stepping:
             outcome = outcome.otherwise
         self.motion.stop = self.monitor.singular(outcome.t, outcome.x, outcome.why)
         return False
+
+    def _fail(self, t, x, why):
+        """Stop because no step succeeds."""
+        what = f"{self.method} stopped at t = {t:.7g} s: {why}"
+        self.motion.stop = self.monitor.failed(t, x, self.rank_lost, what, self.advice)
 
     def _keep_last(self, t, x):
         """Record the last state, unless it is so near a singularity that γ^(s̄) is lost."""

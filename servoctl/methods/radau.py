@@ -265,9 +265,11 @@ class RadauSteps(BulkSteps):
     """
 
     most = 200  # steps per call of the compiled loop
+    advice = "Use a smaller step or none, use a larger rtol, or check whether the motion escapes."
 
     def __init__(self, model, drift, rtol, atol, order, step, progress):
         self.step, self.taken = step, []
+        self.failure = "its steps vanish" if step is None else "the Newton iteration does not solve a fixed step"
         self.every = drift.every if isinstance(drift, Project) else 0
         self.most = max(self.most - self.most % self.every, self.every) if self.every else self.most
         order = radau_order(rtol) if order is None else order
@@ -314,14 +316,3 @@ class RadauSteps(BulkSteps):
 
     def _settled(self, times, states):
         return settle(self.f, times, states, self.p) if self.every else states
-
-    def _fail(self, t, x):
-        why = "its steps vanish" if self.step is None else "a fixed step is not solved by the Newton iteration"
-        self.motion.stop = self.monitor.failed(
-            t,
-            x,
-            "the step of the integrator shrinks to nothing",
-            f"RadauIIA stopped at t = {t:.7g} s: {why}.",
-            "A motion is integrated as far as its solution exists and steps can be solved.",
-            "Use a smaller step or none, use a larger rtol, or check whether the motion escapes.",
-        )

@@ -60,6 +60,8 @@ class RungeKuttaSteps(Stepping):
     progress : callable
     """
 
+    rank_lost = "the state is no longer finite"
+    advice = "Use a smaller step (stable below about 2.8 over the largest eigenvalue), slower poles, or 'DOP853'."
     most, most_in_python = 2000, 100  # steps per call of the compiled loop, and of the one on minimal coordinates
 
     def __init__(self, model, method, drift, step, progress):
@@ -94,7 +96,7 @@ class RungeKuttaSteps(Stepping):
             if not isinstance(outcome, Fine):
                 self._follow(outcome)
             elif good < steps:
-                self._fail(t[good], x, h)
+                self._fail(t[good], x, f"a step of {abs(h):.3g} s leads to no finite state")
         return x
 
     def _record(self, t, states):
@@ -150,13 +152,3 @@ class RungeKuttaSteps(Stepping):
             if hidden and self.monitor.rank_measure(at, x) < DEGRADED:
                 return Singular(first, at, x, "a pivot touches zero")
         return None
-
-    def _fail(self, t, x, h):
-        self.motion.stop = self.monitor.failed(
-            t,
-            x,
-            "the state is no longer finite",
-            f"{self.method} with steps of {abs(h):.3g} s has no finite state after t = {t:.7g} s.",
-            "Explicit methods are stable for steps below about 2.8 over the largest eigenvalue.",
-            "Use a smaller step, slower poles, or an adaptive method.",
-        )

@@ -23,6 +23,8 @@ class ScipySteps(Stepping):
     progress : callable
     """
 
+    advice = "Use a larger rtol or a method for stiff equations ('Radau'), or check whether the motion escapes."
+
     def __init__(self, model, method, drift, rtol, atol, progress):
         self.tolerances = {"rtol": rtol, "atol": atol}
         self.sizes = Sizes(model) if isinstance(drift, MinimalCoordinates) else None
@@ -61,7 +63,8 @@ class ScipySteps(Stepping):
             with np.errstate(all="ignore"):
                 message = solver.step()
             if solver.status == "failed" or not np.all(np.isfinite(solver.y)):
-                self._fail(t, x, message)
+                self._fail(t, x, (message or "the state is no longer finite").rstrip("."))
+                self._keep_last(t, x)
                 break
             steps, dense = steps + 1, solver.dense_output()
             outcome = self.monitor.inspect(self._stretch(t, x, solver, dense))
@@ -114,17 +117,6 @@ class ScipySteps(Stepping):
         if minimal:
             self.motion.counters["integrated"] = len(solver.chart.free)
             self.motion.count(coordinate_changes=solver.changes)
-
-    def _fail(self, t, x, message):
-        self.motion.stop = self.monitor.failed(
-            t,
-            x,
-            "the step of the integrator shrinks to nothing",
-            f"{self.method} stopped at t = {t:.7g} s: {message or 'the state is no longer finite'}.",
-            "A motion is integrated as far as its solution exists.",
-            "Use a larger rtol or a method for stiff equations ('Radau'), or check whether the motion escapes.",
-        )
-        self._keep_last(t, x)
 
     def _sample(self, t, dense, x):
         """Record the pending samples up to t, the end of a step with state x; `dense` interpolates within it."""

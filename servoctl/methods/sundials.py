@@ -189,6 +189,10 @@ class SundialsSteps(BulkSteps):
     progress : callable
     """
 
+    rank_lost = "the integrator finds no further step"
+    failure = f"no step succeeds, or {MOST_STEPS:,} reach no further sample"
+    advice = "Use a larger rtol, more t_eval or 'RadauIIA', or check whether the motion escapes."
+
     def __init__(self, model, method, drift, rtol, atol, span, progress):
         self.resolution, self.rtol, self.atol = abs(span) / WATCHED, rtol, atol
         super().__init__(model, method, drift, progress)
@@ -209,13 +213,3 @@ class SundialsSteps(BulkSteps):
         self.motion.count(**counts)
         t, failed = grid[: states.shape[1]], states.shape[1] < len(grid)
         return Grid(t, states, self.f.grid(t, states, self.p)[: self.n_x], failed)
-
-    def _fail(self, t, x):
-        self.motion.stop = self.monitor.failed(
-            t,
-            x,
-            "the integrator finds no further step",
-            f"{self.method} stopped at t = {t:.7g} s: no step succeeds, or {MOST_STEPS:,} reach no further sample.",
-            "A motion is integrated as far as its solution exists and steps can be solved.",
-            "Use a larger rtol, more t_eval or 'RadauIIA', or check whether the motion escapes.",
-        )

@@ -187,6 +187,8 @@ class TaylorSteps(Stepping):
     """
 
     most = 100  # steps per call of the compiled loop
+    rank_lost = "the radius of convergence shrinks to nothing"
+    advice = "Check whether the motion escapes or meets a point where it is not smooth."
 
     def __init__(self, model, drift, rtol, atol, order, jets, progress):
         self.rtol, self.atol = rtol, atol
@@ -229,7 +231,7 @@ class TaylorSteps(Stepping):
             if not fine:
                 self._follow(outcome)
             elif steps < self.most and a != b:
-                self._fail(a, x)
+                self._fail(a, x, "its steps vanish or are not finite")
         if len(times) and self.motion.stop is None:
             self._sample(np.array([a, a]), np.column_stack([x, x]), self._outputs(a, x)[:, None], times, a)
         return x
@@ -274,16 +276,6 @@ class TaylorSteps(Stepping):
             n_x = len(states)
             self.motion.add(self.model, times, parts[:n_x], parts[n_x:])
         return pending[~due]
-
-    def _fail(self, t, x):
-        self.motion.stop = self.monitor.failed(
-            t,
-            x,
-            "the radius of convergence shrinks to nothing",
-            f"The Taylor method stopped at t = {t:.7g} s: its steps vanish or are not finite.",
-            "A step is as long as the series converges.",
-            "Check whether the motion escapes or meets a point where it is not smooth.",
-        )
 
 
 def _level(c, j, h):
