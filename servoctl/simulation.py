@@ -165,7 +165,7 @@ def _run(model, motion, method, drift, knots, span):
     if motion.stop is not None:
         status, message = -1, f"stopped: {str(motion.stop).split('. ')[0]}"
     elif motion.interrupted:
-        status, message = 1, f"interrupted at {last} of {span[2]:g} s"
+        status, message = 1, f"interrupted at {last} of {span[2]:g} s; what was computed is kept"
     else:
         status, message = 0, "finished"
     facts = {"method": str(method), "drift": str(drift or ""), "counters": motion.counters, "knots": knots}
