@@ -117,8 +117,8 @@ def positives(name, values, do, fewest=1, most=np.inf):
     except (TypeError, ValueError):
         numbers = np.zeros(1)
     if numbers.size < fewest or not np.all(np.isfinite(numbers) & (numbers > 0) & (numbers <= most)):
-        rule = "It must be a positive number, or several" if fewest == 1 else f"It must be {fewest} positive numbers or more"
-        rule += "." if most == np.inf else f", each at most {most:g}."
+        count = "It must be a positive number, or several" if fewest == 1 else f"Give at least {fewest}, all positive"
+        rule = count + ("." if most == np.inf else f", each at most {most:g}.")
         raise SpecificationError(f"{name}={values!r} was given.", rule, do=do, name=name, value=values)
     return numbers
 

@@ -57,7 +57,11 @@ def monte_carlo(n: int, /, *, seed: int, **distributions) -> list[dict]:
     """
     n, seed = whole("n", n), whole("seed", seed)
     draws = {name: _draw(name, distribution) for name, distribution in distributions.items()}
-    return [{name: _value(name, draw, generator(seed, DRAWS, i, name)) for name, draw in draws.items()} for i in range(n)]
+
+    def case(i):
+        return {name: _value(name, draw, generator(seed, DRAWS, i, name)) for name, draw in draws.items()}
+
+    return [case(i) for i in range(n)]
 
 
 def generator(seed, kind, index, name=""):
