@@ -17,7 +17,7 @@ def add_run(commands):
     run = commands.add_parser("run", help="derive, simulate, verify; write figures and numbers to a folder")
     add_motion(run)
     run.add_argument("--out", metavar="DIR", help="folder; files of an earlier run are replaced")
-    run.add_argument("--accuracy", type=float, metavar="E", help="error of the motion, not with method, rtol, atol")
+    run.add_argument("--accuracy", type=float, metavar="E", help="largest error of the motion; sets method and steps")
     run.add_argument("--method", help=METHODS_HELP)
     run.add_argument("--step", type=float, metavar="H", help=f"step of {', '.join(ORDERS)} and RadauIIA [s]")
     run.add_argument("--drift", type=drift, metavar="D", help="none, project, minimal, or a time constant [s]")
