@@ -72,19 +72,9 @@ class NameUnknown(ServoError):
 
 
 def unknown(name, valid, what):
-    """The error for an unknown name, to be raised by the caller.
+    """The `NameUnknown` for a name that is not valid, to be raised by the caller; `what` it names: "parameter".
 
-    Parameters
-    ----------
-    name : str
-    valid : iterable of str
-    what : str
-        What the names stand for, in the singular: `"parameter"`, `"method"`.
-
-    Returns
-    -------
-    NameUnknown
-        With `details` `name`, `valid` (tuple) and `match` (the closest valid name, or None).
+    Its details are `name`, `valid` (tuple) and `match` (the closest valid name, or None).
     """
     valid = tuple(str(candidate) for candidate in valid)
     by_lower_case = {candidate.lower(): candidate for candidate in reversed(valid)}

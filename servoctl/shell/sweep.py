@@ -43,7 +43,7 @@ def _sweep(args):
         return _merge(args)
     if args.scene is None:
         example = "servoctl sweep overhead-crane --vary m_load=80:120:9"
-        raise SpecificationError("No scene was given.", do=f"Name one, as in {example}, or give --merge.", scene=None)
+        raise SpecificationError("servoctl sweep was given no scene.", do=f"Name one, as in {example}, or give --merge.", scene=None)
     name = Path(args.scene).stem if args.scene.endswith(".py") else find_scene(args.scene)[0]
     with folder_of(args, f"{name}-sweep") as folder:
         return _leave(_computed(args, folder), folder, _stem(args), _units(args.scene))

@@ -24,13 +24,13 @@ def add_tradeoff(commands):
 
 
 def _tradeoff(args):
+    """Derive, measure, save, draw and recommend; returns the exit code."""
     name, scene = find_scene(args.scene)
     with folder_of(args, name, "-tradeoff") as folder:
-        return _measure(args, name, scene, folder)
+        return _measured(args, name, scene, folder)
 
 
-def _measure(args, name, scene, folder):
-    """Derive, measure, save, draw and recommend; returns the exit code."""
+def _measured(args, name, scene, folder):
     report = Report()
     motion = described(args, scene, report)
     limit = {} if args.limit is None else {"seconds": args.limit}

@@ -178,22 +178,9 @@ def _numbers(result, parameters):
 
 
 def summary(run):
-    """The numbers of a run that make a row.
+    """Numbers of a Run or Closed by name: NAME_min, NAME_max and NAME_end of actuators and outputs, and t_end [s].
 
-    Parameters
-    ----------
-    run : Run or Closed
-
-    Returns
-    -------
-    dict of str to float
-        NAME_min, NAME_max and NAME_end of actuators and outputs, and t_end [s]; for a plan `residual`, the largest
-        over all rows and levels; for a closed loop RESIDUAL_worst and RESIDUAL_last, for each row of the program.
-
-    Raises
-    ------
-    SpecificationError
-        If it is neither.
+    A plan has `residual`, the largest over all rows and levels; a closed loop NAME_worst and NAME_last of each row.
     """
     if isinstance(run, Closed):
         numbers = _extrema(run, (*run.plant.inputs, *run.plant.mechanism.outputs))
@@ -207,20 +194,14 @@ def summary(run):
         numbers = _extrema(run, [name for name in known if name in run.names])
         numbers["residual"] = max((float(np.abs(run.residual[name]).max()) for name in run.residual), default=0.0)
     else:
-        raise SpecificationError(
-            f"The case returned {type(run).__name__}.",
-            "A case returns a dict of numbers, a Run, or the run of a closed loop.",
-            type=type(run).__name__,
-        )
+        kind, rule = type(run).__name__, "A case returns a dict of numbers, a Run, or the run of a closed loop."
+        raise SpecificationError(f"The case returned {kind}.", rule, type=kind)
     return {**numbers, "t_end": float(run.t[-1])}
 
 
 def _extrema(run, names):
-    numbers = {}
-    for name in names:
-        values = run[name]
-        numbers |= {f"{name}_min": values.min(), f"{name}_max": values.max(), f"{name}_end": values[-1]}
-    return {name: float(value) for name, value in numbers.items()}
+    ends = {"min": np.min, "max": np.max, "end": lambda values: values[-1]}
+    return {f"{name}_{end}": float(of(run[name])) for name in names for end, of in ends.items()}
 
 
 # --- where cases are computed
@@ -258,7 +239,7 @@ def _on(executor, case, todo, seed):
 
 
 def _lost(index, error):
-    message = f"The executor did not finish this case: {error}" if str(error) else "The executor did not finish this."
+    message = f"The executor did not finish this case{f': {error}' if str(error) else '.'}"
     return {"case": index, "error": type(error).__name__, "message": message, "facts": "{}"}
 
 
@@ -372,7 +353,7 @@ def _message(columns, meta, count):
     parts = [f"{len(columns['case']) - failed} of {count} cases finished"]
     parts += [f"{failed - lost} failed"] if failed > lost else []
     parts += [f"{lost} not finished by the executor"] if lost else []
-    parts += ["interrupted: what was computed is kept"] if meta["interrupted"] else []
+    parts += ["interrupted"] if meta["interrupted"] else []
     return ", ".join(parts)
 
 

@@ -52,20 +52,7 @@ class Study:
         return self.column(name)
 
     def column(self, name: str) -> np.ndarray:
-        """The column with this name.
-
-        Parameters
-        ----------
-        name : str
-
-        Returns
-        -------
-        (N,) array
-
-        Raises
-        ------
-        NameUnknown
-        """
+        """The column with this name, (N,); NameUnknown if there is none."""
         if name not in self.columns:
             raise unknown(name, self.columns, "column")
         return self.columns[name]
@@ -76,17 +63,7 @@ class Study:
         return [dict(zip(plain, row, strict=True)) for row in zip(*plain.values(), strict=True)]
 
     def where(self, **values) -> "Study":
-        """The rows that have these values.
-
-        Parameters
-        ----------
-        **values : float or str
-            Values by the names of their columns.
-
-        Returns
-        -------
-        Study
-        """
+        """The rows that have these values, numbers or texts by the names of their columns."""
         keep = np.ones(len(self), dtype=bool)
         for name, value in values.items():
             keep &= self.column(name) == value
@@ -94,8 +71,7 @@ class Study:
 
     def take(self, rows) -> "Study":
         """The rows with these indices (sequence of int), in this order, as a Study."""
-        rows = np.asarray(rows, dtype=int)
-        return replace(self, columns={name: values[rows] for name, values in self.columns.items()})
+        return replace(self, columns={n: values[np.asarray(rows, dtype=int)] for n, values in self.columns.items()})
 
     def csv(self, path):
         """Write the table as CSV: a line of names, then one line for each row; a missing number is NaN.

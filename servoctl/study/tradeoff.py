@@ -134,7 +134,8 @@ class TradeOff(Study):
         if len(front):
             row = front.rows()[-1 if wanted == "error" else 0]
             best = max(row["error"], self.uncertainty)
-            nearest = f"{_name(row)}: error {best:.2g} in {row['seconds']:.2g} s"
+            nearest = f"{row['method']}, drift {row['drift']}, {row['setting']} {row['value']:g}: "
+            nearest += f"error {best:.2g} in {row['seconds']:.2g} s"
         reason = "no measured setting reaches it" if len(front) else "every run failed, see the column failure"
         return LimitExceeded(
             f"{wanted}={limit:g} was given, and {reason}.",
@@ -440,10 +441,9 @@ def _combinations(model, methods, drifts):
         if not (isinstance(method, str) and method in METHODS):
             raise unknown(method, METHODS, "method")
     treatments = [as_drift(value) for value in drifts]
-    for value in treatments:
-        if isinstance(value, Poles) and not isinstance(value.values, float):
-            rule, do = "A study names each treatment by one word or number.", "Give one time constant for all rows."
-            raise SpecificationError("Poles by row were given.", rule, do=do, drift=value)
+    if any(isinstance(value, Poles) and not isinstance(value.values, float) for value in treatments):
+        rule, do = "A study names each treatment by one word or number.", "Give one time constant for all rows."
+        raise SpecificationError("Poles by row were given.", rule, do=do, drift=list(drifts))
     pairs = [(m, None) for m in methods if m == "algebraic"]
     pairs += [(m, d) for m in methods for d in treatments if m != "algebraic"]
     if not pairs:
@@ -504,10 +504,6 @@ def _arguments(row):
         word, _, every = drift.partition(" ")
         options["drift"] = Project(int(every)) if every else word if word in DRIFTS else float(drift)
     return options
-
-
-def _name(row):
-    return ", ".join([row["method"], f"drift {row['drift']}", f"{row['setting']} {row['value']:g}"])
 
 
 def _cost(name):
