@@ -42,8 +42,8 @@ def _sweep(args):
     if args.merge:
         return _merge(args)
     if args.scene is None:
-        example = "servoctl sweep overhead-crane --vary m_load=80:120:9"
-        raise SpecificationError("servoctl sweep was given no scene.", do=f"Name one, as in {example}, or give --merge.", scene=None)
+        do = "Name one, as in servoctl sweep overhead-crane --vary m_load=80:120:9, or give --merge."
+        raise SpecificationError("servoctl sweep was given no scene.", do=do, scene=None)
     name = Path(args.scene).stem if args.scene.endswith(".py") else find_scene(args.scene)[0]
     with folder_of(args, f"{name}-sweep") as folder:
         return _leave(_computed(args, folder), folder, _stem(args), _units(args.scene))
