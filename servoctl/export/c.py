@@ -5,13 +5,16 @@ Every function takes and gives arrays in the order of an enum in the header, and
 
 import os
 import re
+from pathlib import Path
 
 import casadi as ca
 import numpy as np
 
 from servoctl.codegen.function import Compiled
+from servoctl.control.law import Law
 from servoctl.errors import SpecificationError
 from servoctl.export.files import Array, Constant, Contents, Routine, Scalar, identifier, write
+from servoctl.model.model import Model
 from servoctl.model.start import State
 
 ITERATIONS, TOLERANCE = 30, 1e-13  # of Newton's method, as in `Compiled.newton`
@@ -21,7 +24,9 @@ RESERVED += "register restrict return short signed sizeof static struct switch t
 RESERVED += "while class new delete this template typename operator private public protected friend namespace using"
 
 
-def export_c(source, folder, *, name=None, start=None):
+def export_c(
+    source: Model | Law, folder: str | os.PathLike, *, name: str | None = None, start: State | None = None
+) -> tuple[Path, Path]:
     """Write a model's feedforward and residuals, or a law's step, as NAME.c and NAME.h: self-contained C99.
 
     Main arguments
