@@ -1,10 +1,13 @@
 """The evaluations and loops of a compiled function, by CasADi and numpy: what runs where there is no compiler."""
 
 import threading
+from itertools import pairwise
 
 import numpy as np
 
-from servoctl.codegen.loops import BISECTIONS, ROUNDING
+from servoctl.codegen.loops import BISECTIONS, NEAR, QUADRATIC, ROUNDING
+
+BLOCK, STRIDE = 128, 16  # instants of a path that are solved together; from one that is solved alone to the next
 
 _guard = threading.Lock()
 
@@ -122,13 +125,23 @@ class Interpreter:
 
     def newton(self, t, x0, p, tol, max_iter, x, y):
         """Fill the columns of x and y as `Compiled.newton` says; return the points solved and the evaluations made."""
-        solve, point = _Newton(self._value, p, self._n_x, tol, max_iter), None
-        for k in range(t.size):
-            point = solve.correct(t[k], x0) if k == 0 else solve.advance(t[k - 1], t[k], *point)
+        solve, k, alone = _Newton(self._value, p, self._n_x, tol, max_iter), 0, 1
+        parts = np.zeros(BLOCK), np.zeros((BLOCK, len(x))), np.tile(p, (BLOCK, 1)), np.zeros((BLOCK, len(y)))
+        block = (parts, *connected(self._f.map(BLOCK), parts)) if t.size > BLOCK else None
+        while k < t.size:
+            point = (x[:, k - 1].copy(), y[:, k - 1].copy()) if k else None
+            if alone <= k <= t.size - BLOCK:
+                if solve.together(t[k - 1 : k + BLOCK], point, block):
+                    x[:, k : k + BLOCK], y[:, k : k + BLOCK] = parts[1].T, parts[3].T
+                    k += BLOCK
+                    continue
+                alone = k + BLOCK
+            point = solve.advance(t[k - 1], t[k], *point) if k else solve.correct(t[k], x0)
             if point is None:
-                return k, solve.count
+                break
             x[:, k], y[:, k] = point
-        return t.size, solve.count
+            k += 1
+        return k, solve.count
 
 
 def restored(project, t, x, p):
@@ -217,3 +230,35 @@ class _Newton:
             else:
                 done, pieces = 2 * done, 2 * pieces
         return x, y
+
+    @np.errstate(all="ignore")
+    def together(self, t, point, block):
+        """Fill the block with the solutions at t[1:], from the one at t[0]; False where the iteration fails.
+
+        Every `STRIDE`-th instant is solved alone; the others start from Hermite's cubic interpolation between these.
+        """
+        (instants, x, _, y), run, _ = block
+        n_x, nodes = self._n_x, [point]
+        for a, b in pairwise(t[::STRIDE]):
+            if (point := self.advance(a, b, *nodes[-1])) is None:
+                return False
+            nodes.append(point)
+        z = np.array([x for x, _ in nodes])[:, None]
+        rate = np.array([y[n_x : 2 * n_x] for _, y in nodes])[:, None]
+        instants[:], h = t[1:], np.diff(t[::STRIDE])[:, None, None]
+        s = (t[1:].reshape(-1, STRIDE, 1) - t[:-1:STRIDE, None, None]) / h
+        r = 1 - s
+        start = r * r * ((1 + 2 * s) * z[:-1] + s * h * rate[:-1]) + s * s * ((1 + 2 * r) * z[1:] - r * h * rate[1:])
+        x[:], defect = start.reshape(BLOCK, n_x), NEAR
+
+        def correction():
+            run()
+            self.count += BLOCK
+            return np.max(np.abs(y[:, :n_x]) / (1 + np.abs(x)))
+
+        while not defect <= QUADRATIC:
+            before, defect = defect, correction()
+            if not defect < before:  # the interpolation was too far off, or the iteration does not converge
+                return False
+            x += y[:, :n_x]
+        return correction() <= self._tol
