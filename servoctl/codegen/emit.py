@@ -15,7 +15,6 @@ from itertools import chain, count
 import casadi as ca
 
 from servoctl.codegen.loops import BISECTIONS, INLINE_SINES, LOOPS, NEAR, QUADRATIC, ROUNDING
-from servoctl.errors import SpecificationError, unknown
 
 CHUNK = 350  # statements per C function: compile time is least, and flat, between 250 and 500
 WIDE = 3000  # operations: up to here a function is emitted for eight points at once as well
@@ -41,6 +40,7 @@ _ELEMENTARY = {getattr(ca, f"OP_{name.upper()}"): (name, 1) for name in _UNARY}
 _ELEMENTARY |= {getattr(ca, f"OP_{name.upper()}"): (name, 2) for name in _BINARY} | {ca.OP_CONSTPOW: ("pow", 2)}
 _COPIES = {ca.OP_ASSIGN, ca.OP_LIFT}  # the first operand, unchanged
 _NOT_ARITHMETIC = {ca.OP_CONST, ca.OP_INPUT, ca.OP_OUTPUT, *_COPIES}
+EMITTED = frozenset({*_ARITHMETIC, *_ELEMENTARY, *_NOT_ARITHMETIC})  # instructions that have a C counterpart
 
 _FORMS_OF_ONE = {
     "sign": "({0} < 0 ? -1 : {0} > 0 ? 1 : {0})",
@@ -167,17 +167,7 @@ def emit(f, name, loops=(), *, project=None, others=None, sizes=None, wide=True,
     -------
     str
         The same text for the same function, name and loops, in every process.
-
-    Raises
-    ------
-    SpecificationError
-        If f contains an operation that has no C counterpart here.
-    NameUnknown
-        If a loop is none of the above.
     """
-    for loop in loops:
-        if loop not in LOOPS:
-            raise unknown(loop, LOOPS, "loop")
     dialect = SCALAR_INLINE if INLINE_SINES.intersection(loops) else SCALAR
     scalar = {name: f} | ({} if project is None else {f"{name}_project": project})
     scalar |= {f"{name}_{key}": other for key, other in (others or {}).items()}
@@ -277,18 +267,10 @@ def _statements(f, dialect, suffix=""):
             statements.append((f"y{suffix}[{target[1]}]", ca.OP_ASSIGN, (register[source[0]],)))
         elif operation in _COPIES:
             register[target[0]] = register[source[0]]
-        elif operation in _ARITHMETIC or operation in _ELEMENTARY:
+        else:
             statements.append((values, operation, tuple(register[i] for i in source)))
             register[target[0]] = values
             values += 1
-        else:
-            raise SpecificationError(
-                f"the function {f.name()} contains the operation {_operation_name(operation)}",
-                "only scalar arithmetic can be compiled",
-                nearest="the elementary functions of CasADi's SX",
-                do="write the expression with these, or expand() the function called",
-                operation=operation,
-            )
     return statements
 
 
@@ -307,10 +289,6 @@ def _with_reciprocals(statements):
             operation, operands = ca.OP_MUL, (a, reciprocal[b])
         result.append((target, operation, operands))
     return result
-
-
-def _operation_name(operation):
-    return next((name for name in dir(ca) if name.startswith("OP_") and getattr(ca, name) == operation), operation)
 
 
 def _line(statement, dialect, value="a"):

@@ -6,7 +6,9 @@ Nothing is compiled before it pays; without a compiler CasADi runs the same algo
 import contextlib
 import contextvars
 import functools
+import os
 
+import casadi as ca
 import numpy as np
 
 from servoctl.codegen import compiler, emit
@@ -61,11 +63,39 @@ def compiled(f, name, loops=(), project=None, others=None, sizes=None):
     Raises
     ------
     SpecificationError
-        If f has another shape than this, or too few outputs for a loop; at the first evaluation, if f contains an
-        operation that is not elementary.
+        If f has another shape than this, contains an operation that is not elementary, or has too few outputs for a
+        loop.
     NameUnknown
         If a loop is none of the above.
     """
+    _require_columns(f, name)
+    for part in filter(None, (f, project, *(others or {}).values())):
+        _require_elementary(part)
+    if not (name.isascii() and name.isidentifier()):
+        raise SpecificationError(
+            f"The function is named {name!r}.",
+            "A compiled function has a C identifier as its name.",
+            do="Use letters, digits and underscores.",
+            name=name,
+        )
+    for loop in loops:
+        if loop not in LOOPS:
+            raise unknown(loop, LOOPS, "loop")
+        needed = _OUTPUTS_PER_STATE.get(loop, 0) * f.numel_in(1)
+        if f.numel_out(0) < needed:
+            raise SpecificationError(
+                f"{name!r} has {f.numel_out(0)} outputs for {f.numel_in(1)} states.",
+                f"The loop {loop} reads the first {needed} outputs.",
+                do="Add the outputs, or leave the loop out.",
+                name=name,
+                loop=loop,
+                outputs=f.numel_out(0),
+                needed=needed,
+            )
+    return Compiled(f, name, tuple(loops), project, others, sizes)
+
+
+def _require_columns(f, name):
     columns = [*(f.sparsity_in(i) for i in range(f.n_in())), *(f.sparsity_out(i) for i in range(f.n_out()))]
     if (
         not f.is_a("SXFunction")
@@ -75,32 +105,28 @@ def compiled(f, name, loops=(), project=None, others=None, sizes=None):
         or not all(column.is_dense() and column.size2() == 1 for column in columns)
     ):
         raise SpecificationError(
-            f"{name!r} is to be compiled from {f}",
-            "A compiled function takes columns t, x, p to one dense column, without free symbols",
-            "An SX function of this form",
-            "Concatenate and densify the outputs; expand() an MX function",
+            f"{name!r} is the function {f}.",
+            "A compiled function is an SX function that takes columns t, x, p to one dense column.",
+            do="Concatenate and densify the outputs, declare all symbols as inputs, and expand() an MX function.",
             name=name,
+            function=str(f),
         )
-    if not (name.isascii() and name.isidentifier()):
+
+
+def _require_elementary(f):
+    for operation in {f.instruction_id(k) for k in range(f.n_instructions())} - emit.EMITTED:
         raise SpecificationError(
-            f"A compiled function is named {name!r}",
-            "Its name is a C identifier",
-            do="Use letters, digits and underscores",
-            name=name,
+            f"The function {f.name()} contains the operation {_name_of(operation)}.",
+            "Only scalar arithmetic and the elementary functions of CasADi's SX are compiled.",
+            do="Write the expression with these, or expand() the function that it calls.",
+            function=f.name(),
+            operation=_name_of(operation),
         )
-    for loop in loops:
-        if loop not in LOOPS:
-            raise unknown(loop, LOOPS, "loop")
-        needed = _OUTPUTS_PER_STATE.get(loop, 0) * f.numel_in(1)
-        if f.numel_out(0) < needed:
-            raise SpecificationError(
-                f"{name!r} has {f.numel_out(0)} outputs for {f.numel_in(1)} states",
-                f"{loop} needs the first {needed} outputs",
-                do="Add the outputs or leave the loop out",
-                name=name,
-                loop=loop,
-            )
-    return Compiled(f, name, tuple(loops), project, others, sizes)
+
+
+def _name_of(operation):
+    """CasADi's name of an instruction, such as OP_SIN."""
+    return next((name for name in dir(ca) if name.startswith("OP_") and getattr(ca, name) == operation), operation)
 
 
 class Compiled:
@@ -131,7 +157,9 @@ class Compiled:
 
     def __reduce__(self):
         parts = (self.expression, self.name, self.loops, self._project, self._others, self._sizes)
-        return Compiled, parts, {"_text": self._text}
+        # Emitting takes longer than reading: the C text travels until the library is loaded, where it can be compiled.
+        text = None if self._settled or compiler.compiler() is None else self.source()
+        return Compiled, parts, {"_text": text}
 
     def __eq__(self, other):
         return self is other or (isinstance(other, Compiled) and self.source() == other.source())
@@ -403,11 +431,15 @@ class Compiled:
         """Move from CasADi to the library: at the first call if one is at hand, later if it is to be built."""
         if self._settled or (self._looked and not build):
             return
+        self._looked = True
+        if not build and os.environ.get("SERVOCTL_COMPILER") == "none":
+            return  # without the emission of C text, which takes longer than a short motion
         level = "-O1" if {*self.loops} <= {"rk"} else "-O3"
-        library = compiler.library(self.source(), build, level)
+        text = "" if compiler.compiler() is None else self.source()
+        library = compiler.library(text, build, level)
         if library is not None:
             self._evaluator = Library(library, self._symbol, self.n_x, self.n_p, self.n_y)
-        self._looked, self._settled = True, build or library is not None
+        self._settled = build or library is not None
         self._text = None if self._settled else self._text
 
     def source(self):

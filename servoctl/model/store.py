@@ -21,7 +21,6 @@ import casadi as ca
 import numpy as np
 
 from servoctl.codegen.cache import cache_directory, keeping, kept
-from servoctl.codegen.function import Compiled
 from servoctl.errors import SpecificationError
 from servoctl.spec.coordinates import Coordinates
 from servoctl.spec.mechanism import Mechanism
@@ -214,9 +213,6 @@ def _write(path, entry):
     if path is None:
         return
     try:
-        for part in entry[0] if isinstance(entry[0], tuple) else entry:
-            if isinstance(part, Compiled):
-                part.source()
         content = pickle.dumps(entry)
     except Exception:  # what holds expressions does not pickle, which CasADi tells by a bare Exception
         return
