@@ -397,7 +397,7 @@ class Monitor:
         """Whether the outputs of a method's function at the start are not finite, or pivots far worse than matrices."""
         if not np.all(np.isfinite(outputs)):
             return True
-        reference = self.model.guard_sizes
+        reference = self.model.pivot_sizes
         weakest = (np.abs(pivots) / np.where(reference > 0, reference, 1.0)).min(initial=1.0)
         return bool(weakest < DEGRADED and self.best.min() > HELPS * weakest)
 
