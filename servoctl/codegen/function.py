@@ -131,8 +131,8 @@ def _name_of(operation):
 class Compiled:
     """A function y = f(t, x, p) that compiles as soon as it pays; made by `compiled`.
 
-    Several threads may call it and its loops at once. It pickles: the copy loads its library from the cache, or builds it
-    again.
+    Several threads may call it and its loops at once. It pickles: the copy loads its library from the cache, or builds
+    it again.
 
     Attributes
     ----------
