@@ -192,8 +192,8 @@ class _Newton:
         self.count += 1
         y = self._value(t, x, self._p)
         delta = y[: self._n_x]
-        finite = np.isfinite(x).all() and np.isfinite(delta).all()
-        return y, delta, np.max(np.abs(delta) / (1 + np.abs(x)), initial=0.0) if finite else np.inf
+        defect = (np.abs(delta) / (1 + np.abs(x))).max(initial=0.0)  # a NaN or inf of delta shows here, an inf of x not
+        return y, delta, defect if defect < np.inf and np.isfinite(x).all() else np.inf
 
     @np.errstate(all="ignore")
     def correct(self, t, x):
