@@ -11,8 +11,8 @@ import pytest
 
 import servoctl as sv
 from servoctl.errors import SingularProgram, SpecificationError
-from servoctl.reduction.orders import dependence
 from servoctl.reduction.ranks import clean, decide
+from servoctl.reduction.rows import dependence
 from servoctl.tolerances import EXTENDED
 
 ROOT = Path(__file__).parents[1]

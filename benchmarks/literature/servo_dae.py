@@ -13,8 +13,7 @@ from servoctl.codegen.function import compiled
 from servoctl.errors import SpecificationError, unknown
 from servoctl.figures import style
 from servoctl.methods.choice import Taylor
-from servoctl.reduction.elimination import eliminate
-from servoctl.reduction.ranks import clean, decide_all
+from servoctl.reduction.ranks import clean, decide_all, eliminate
 from servoctl.simulation import consistent_state, simulate
 from servoctl.study.table import Study, machine
 

@@ -5,9 +5,17 @@ variable, coefficient by coefficient, with the usual recurrences (O(k) operation
 product). The coefficients are SX expressions, when a derivative is to be derived, or NumPy arrays over
 many points, when it is to be evaluated: the same recurrences serve both. Coefficients are *normalised*:
 coefficient k of f is f^(k)/k!.
+
+A `Motion` gives the coefficients of every symbol of an expression; a `Flow` is rows along a motion in numbers.
 """
 
-from servoctl.jets.elementary import add, apply, divide, multiply, select, subtract
+from copy import copy
+from math import factorial
+
+import casadi as ca
+import numpy as np
+
+from servoctl.jets.tape import REAL, Scalars, add, apply, divide, multiply, select, subtract
 
 _NUMBERS = (float, int)
 
@@ -194,3 +202,244 @@ class Series:
             a, g = self.c[argument], self.c[slope]
             total = _plus(total, _dot((multiply(j, a[j]), g[k - j]) for j in _inner_first(k, 1) if not is_zero(a[j])))
         return total if k == 1 or is_zero(total) else divide(total, k)
+
+
+class Motion:
+    """A motion by its normalised Taylor coefficients.
+
+    Subclasses say what these are of q_i, `coordinate(i, j)`, and of γ_i^(l), `velocity(i, l, j)`.
+
+    Parameters
+    ----------
+    q : Coordinates
+    """
+
+    def __init__(self, q):
+        self.q = q
+
+    def coefficient(self, symbol, j):
+        """Coefficient j of a symbol: t_[0] = t and t_[1] = 1, q_[j], (γ^(l))_[j]; all else is constant."""
+        kind, level, i = self.q.where(symbol) or ("constant", 0, 0)
+        if kind == "q":
+            return self.coordinate(i, j)
+        if kind == "w":
+            return self.velocity(i, level, j)
+        return symbol if j == 0 else float(kind == "t" and j == 1)
+
+
+def shifted(c, level, j):
+    """(γ^(l))_[j] = γ_[l+j] (l + j)!/j!, from c = γ_[l+j]."""
+    return 0.0 if is_zero(c) else c * float(factorial(level + j) // factorial(j))
+
+
+class Flow:
+    """Rows along a motion: Taylor coefficients of the residuals, and their Jacobian in the jets.
+
+    Parameters
+    ----------
+    q : Coordinates
+    rows : list of Row
+        Each contributes its coefficients 0 .. level - order.
+    level : int
+        Highest level K of the jets.
+    points : Points
+        Only its parameters, their values, and its book are used here.
+    signals : dict, optional
+        Taylor coefficients of further symbols along the motion, by element hash: lists of (N,) arrays.
+    real : type
+        Of the Jacobian; double precision is enough for Newton's method.
+    """
+
+    def __init__(self, q, rows, level, points, signals=None, real=float):
+        self.q, self.level, self.points, self.signals, self.real = q, level, points, signals or {}, real
+        orders = [row.order for row in rows]
+        self.equations = [(a, i) for a, order in enumerate(orders) for i in range(level - order + 1)]
+        self.levels = np.array([orders[a] + i for a, i in self.equations], dtype=int)
+        self.first = np.cumsum([0, *(max(level - order + 1, 0) for order in orders)])
+        self.rows, self._made = rows, {}  # what is read when it is first needed
+        self.members = {
+            order: np.array([a for a, row in enumerate(rows) if row.order == order], dtype=int)
+            for order in sorted({order for order in orders if order <= level})
+        }
+        if not q.plain:
+            moving = q.V @ q.jet(1) + q.h
+            parts = [ca.densify(ca.jacobian(moving, q.jet(0))), ca.densify(q.V)]
+            self.motion = self._scalars([*moving.elements(), *(e for p in parts for e in p.nonzeros())])
+
+    def at(self, points):
+        """The same rows with the parameters of other points; what was read of the rows is shared."""
+        flow = copy(self)
+        flow.points = points
+        return flow
+
+    def _scalars(self, expressions):
+        return Scalars(self.q, self.points.parameters, expressions, self.signals)
+
+    @property
+    def groups(self):
+        """For each order its rows with their gradients in q and all jets."""
+        if "groups" not in self._made:
+            self._made["groups"] = [self._group(order) for order in self.members]
+        return self._made["groups"]
+
+    def _group(self, order):
+        """Residuals of an order, the nonzero entries of their gradients, and the places of these."""
+        members = self.members[order]
+        residuals = [self.rows[a].expression for a in members]
+        parts = [ca.jacobian(ca.vertcat(*residuals), self.q.jet(m)) for m in range(order + 1)]
+        places = [np.array(p.sparsity().get_triplet(), dtype=int) for p in parts]
+        return members, order, self._scalars([*residuals, *(e for p in parts for e in p.nonzeros())]), places
+
+    def leading(self, order, level):
+        """Rows of an order with the nonzero entries of their gradients in γ^(order), or in q itself for level 0.
+
+        Both as found in the book, and the places of the entries.
+        """
+        in_q = order == 0 and level == 0 and not self.q.plain
+        if (order, in_q) not in self._made:
+            rows = [self.rows[a] for a in self.members[order]]
+            slopes = [ca.jacobian(row.expression, self.q.jet(0)) if in_q else row.gradient(self.q) for row in rows]
+            columns = [g.sparsity().get_triplet()[1] for g in slopes]
+            residuals, entries = [row.expression for row in rows], [e for g in slopes for e in g.nonzeros()]
+            read = self.points.book.find(self.q, self.points.parameters, [*residuals, *entries])
+            places = np.repeat(np.arange(len(rows)), [len(c) for c in columns]), np.array(sum(columns, []), dtype=int)
+            self._made[order, in_q] = read, places
+        return self._made[order, in_q]
+
+    def __call__(self, t, z):
+        """Coefficients (n_equations, N) and Jacobian (n_equations, nz, N) at times t (N,) and jets z (nz, N)."""
+        n_points = z.shape[1]
+        q_series, q_map = self._kinematics(t, z)
+        residual = np.zeros((len(self.equations), n_points), dtype=REAL)
+        jacobian = np.zeros((len(self.equations), len(z), n_points), dtype=self.real)
+        for members, order, scalars, places in self.groups:
+            depth = self.level - order
+            coefficients = self._run(scalars, t, z, q_series, depth)
+            for i in range(depth + 1):
+                residual[self.first[members] + i] = coefficients[: len(members), i]
+            offset = len(members)
+            for m, (rows, columns) in enumerate(places):
+                entries = coefficients[offset : offset + len(rows)].astype(self.real)
+                offset += len(rows)
+                for i in range(depth + 1):
+                    self._add_slopes(jacobian, self.first[members[rows]] + i, columns, m, entries[:, : i + 1], q_map)
+        return residual, jacobian
+
+    def _add_slopes(self, jacobian, equations, columns, m, entries, q_map):
+        """Add to coefficient i of equations what ∂ψ/∂γ^(m) contributes, from its coefficients 0 .. i."""
+        nq, n, i = self.q.nq, self.q.n, entries.shape[1] - 1
+        for l in range(i + 1):
+            part = entries[:, i - l]
+            if m == 0 and not self.q.plain:
+                np.add.at(jacobian, equations, part[:, None, :] * q_map[l][columns])
+            elif m == 0:
+                jacobian[equations, columns + (nq + (l - 1) * n if l else 0)] += part
+            elif l + m <= self.level:
+                jacobian[equations, columns + nq + (l + m - 1) * n] += part * (factorial(l + m) / factorial(l))
+
+    def residual(self, t, z):
+        """The coefficients (n_equations, N) alone."""
+        q_series, _ = self._kinematics(t, z)
+        residual = np.zeros((len(self.equations), z.shape[1]), dtype=REAL)
+        for order, members in self.members.items():
+            read, _ = self.leading(order, self.level)
+            coefficients = self._residuals(read, members, t, z, q_series, self.level - order)
+            for i in range(coefficients.shape[1]):
+                residual[self.first[members] + i] = coefficients[:, i]
+        return residual
+
+    def at_level(self, t, z, level):
+        """The equations of a level: residuals (n_equations, N) and slopes in γ_[level] or q (n_equations, n, N).
+
+        Rows of other levels are zero. The slopes are those of the leading gradients.
+        """
+        q_series, _ = self._kinematics(t, z)
+        residual = np.zeros((len(self.equations), z.shape[1]), dtype=REAL)
+        slopes = np.zeros((len(self.equations), self.q.n if level else self.q.nq, z.shape[1]))
+        for order, members in self.members.items():
+            if order > level:
+                continue
+            read, (rows, columns) = self.leading(order, level)
+            depth, entries = level - order, np.empty((len(members) + len(rows), z.shape[1]), dtype=REAL)
+            for scalars, sources, targets in read:
+                entries[targets] = scalars.values(t, z, self.points.values)[sources]
+            if depth:
+                coefficients = self._residuals(read, members, t, z, q_series, depth)[:, depth]
+            else:
+                coefficients = entries[: len(members)]
+            residual[self.first[members] + depth] = coefficients
+            entries = entries[len(members) :] * (factorial(level) / factorial(depth))
+            slopes[self.first[members[rows]] + depth, columns] = entries
+        return residual, slopes
+
+    def _residuals(self, read, members, t, z, q_series, depth):
+        """Coefficients of the residuals of some rows, (rows, depth + 1, N)."""
+        result = np.empty((len(members), depth + 1, z.shape[1]), dtype=REAL)
+        for scalars, sources, targets in read:
+            pairs = [(i, a) for i, a in zip(sources, targets, strict=True) if a < len(members)]
+            if pairs and depth:
+                coefficients = self._run(scalars, t, z, q_series, depth, 1 + max(i for i, _ in pairs))
+            elif pairs:
+                coefficients = scalars.values(t, z, self.points.values)[:, None]
+            for i, a in pairs:
+                result[a] = coefficients[i]
+        return result
+
+    def series(self, expressions, t, z, depth):
+        """Taylor coefficients of expressions along a motion, (len, depth + 1, N)."""
+        return self._run(self._scalars(list(expressions)), t, z, self._kinematics(t, z)[0], depth)
+
+    def _kinematics(self, t, z):
+        """Taylor coefficients of q and, unless q' = γ', the derivative of each in z."""
+        nq, n, n_points = self.q.nq, self.q.n, z.shape[1]
+        if self.q.plain:
+            return [z[:nq], *(z[nq + k * n : nq + (k + 1) * n] for k in range(self.level))], None
+        first = np.zeros((nq, len(z), n_points), dtype=self.real)
+        first[np.arange(nq), np.arange(nq)] = 1.0
+        series, maps = [z[:nq]], [first]
+        for k in range(self.level):
+            c = self._run(self.motion, t, z, series, k)
+            slope = c[nq : nq + nq * nq].reshape(nq, nq, k + 1, n_points).astype(self.real)
+            frame = c[nq + nq * nq :].reshape(n, nq, k + 1, n_points).astype(self.real)
+            series.append(c[:nq, k] / (k + 1))
+            step = np.zeros_like(first)
+            for l in range(k + 1):
+                step += np.einsum("jip,jzp->izp", slope[:, :, k - l], maps[l])
+                start = nq + l * n
+                step[:, start : start + n] += (l + 1) * np.swapaxes(frame[:, :, k - l], 0, 1)
+            maps.append(step / (k + 1))
+        return series, maps
+
+    def _run(self, scalars, t, z, q_series, depth, first=None):
+        """Coefficients 0 .. depth of the first scalars, (first, depth + 1, N)."""
+        motion, values = _Numbers(self.q, z, q_series, self.level), scalars.inputs(t, z, self.points.values)
+        inputs = []
+        for symbol, value in zip(scalars.tape.symbols, values, strict=True):
+            higher = (motion.coefficient(symbol, k) for k in range(1, depth + 1))
+            inputs.append(self.signals.get(symbol.element_hash()) or [value, *higher])
+        series = Series(scalars.tape, inputs, first=first)
+        with np.errstate(all="ignore"):
+            for _ in range(depth + 1):
+                series.advance()
+        outputs = scalars.tape.outputs[:first]
+        result = np.zeros((len(outputs), depth + 1, z.shape[1]), dtype=REAL)
+        for i, node in enumerate(outputs):
+            for k, c in enumerate(series.c[node]):
+                result[i, k] = c
+        return result
+
+
+class _Numbers(Motion):
+    """The motion of jets z (nz, N); those above a level are zero."""
+
+    def __init__(self, q, z, q_series, level):
+        super().__init__(q)
+        self.z, self.q_series, self.level = z, q_series, level
+
+    def coordinate(self, i, j):
+        return self.q_series[j][i]
+
+    def velocity(self, i, level, j):
+        if level + j > self.level:
+            return np.zeros(self.z.shape[1], dtype=REAL)
+        return shifted(self.z[self.q.nq + (level + j - 1) * self.q.n + i], level, j)

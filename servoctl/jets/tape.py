@@ -1,13 +1,76 @@
-"""Tapes: the primitive operations of SX expressions, read once and run many times."""
+"""Tapes: the primitive operations of SX expressions, read once and evaluated at many points.
+
+Elementary functions of expressions or numbers come first, then the tape; below them its values at many points, with
+the sizes of the terms that made them.
+"""
 
 import math
+import operator
 from functools import cached_property
+from math import factorial
 from typing import NamedTuple
 
 import casadi as ca
+import numpy as np
 
 from servoctl.errors import SpecificationError
-from servoctl.jets.evaluation import Plan
+
+REAL = np.longdouble
+
+if ca.GlobalOptions.getNumpyMode() == 0:  # nothing chosen: NumPy's functions of symbols work, and CasADi warns of them
+    ca.GlobalOptions.setNumpyMode(-1)  # the same without a warning
+
+_NUMPY = {
+    "sin": np.sin, "cos": np.cos, "tan": np.tan, "exp": np.exp, "log": np.log, "sqrt": np.sqrt,
+    "asin": np.arcsin, "acos": np.arccos, "atan": np.arctan, "sinh": np.sinh, "cosh": np.cosh,
+    "tanh": np.tanh, "asinh": np.arcsinh, "acosh": np.arccosh, "atanh": np.arctanh, "expm1": np.expm1,
+    "log1p": np.log1p, "sign": np.sign, "fabs": np.abs, "atan2": np.arctan2,
+    "power": np.power,
+    "lt": lambda a, b: 1.0 * (a < b), "le": lambda a, b: 1.0 * (a <= b),
+    "eq": lambda a, b: 1.0 * (a == b), "ne": lambda a, b: 1.0 * (a != b),
+    "logic_and": lambda a, b: 1.0 * ((a != 0) & (b != 0)), "logic_or": lambda a, b: 1.0 * ((a != 0) | (b != 0)),
+    "logic_not": lambda a: 1.0 * (a == 0),
+}  # fmt: skip
+_CASADI = {name: getattr(ca, name) for name in _NUMPY} | {"erf": ca.erf}
+
+
+def _np_erf(x):
+    from scipy.special import erf
+
+    return erf(np.asarray(x, dtype=float))
+
+
+_NUMPY["erf"] = _np_erf
+
+
+def apply(name, *args):
+    """The function `name` on SX expressions or on numbers and arrays, whichever is given."""
+    if any(isinstance(a, ca.SX) for a in args):
+        return _CASADI[name](*args)
+    return _NUMPY[name](*args)
+
+
+def _arithmetic(name, code):
+    """An operation of two: `SX.binary` skips the search for a common type, which takes ten times as long."""
+    plain, of_two, symbolic = getattr(operator, name), ca.SX.binary, ca.SX
+
+    def run(a, b):
+        return of_two(code, a, b) if a.__class__ is symbolic or b.__class__ is symbolic else plain(a, b)
+
+    return run
+
+
+add = _arithmetic("add", ca.OP_ADD)
+subtract = _arithmetic("sub", ca.OP_SUB)
+multiply = _arithmetic("mul", ca.OP_MUL)
+divide = _arithmetic("truediv", ca.OP_DIV)
+
+
+def select(condition, yes, no):
+    """`yes` where `condition` is not zero, else `no`; works on SX expressions and on arrays."""
+    if any(isinstance(a, ca.SX) for a in (condition, yes, no)):
+        return ca.if_else(condition, yes, no)
+    return np.where(condition, yes, no)
 
 
 class Node(NamedTuple):
@@ -223,3 +286,243 @@ class Tape:
         root = self._add("sqrt", self._add("add" if name == "asinh" else "sub", one, square))
         slope = self._add("div", one, root)
         return self._add("neg", slope) if name == "acos" else slope
+
+
+class Plan:
+    """The nodes of a tape sorted so that those that are run together are neighbours.
+
+    Parameters
+    ----------
+    nodes : list of Node
+
+    Attributes
+    ----------
+    place : (n_nodes,) array of int
+        Of each node of the tape, in this order.
+    constants, inputs : (places, values) and (places, indices)
+    groups : list of (kind, data, slice, (operands, size) array)
+        With the places of the operands. A square is a product here.
+    slopes : dict of int to list of (size,) arrays
+        Of groups of kind "quad", by their first place: the places of dy/da for each operand.
+    """
+
+    def __init__(self, nodes):
+        sorts, sort, depth = {}, [], []
+        for kind, args, data in nodes:
+            if args:
+                a, b = depth[args[0]], depth[args[-1]]
+                depth.append(1 + (a if a > b else b))
+                key = ("mul", None) if kind == "sq" else (kind, data[0] if kind == "quad" else data)
+            else:
+                depth.append(0)
+                key = kind, None
+            sort.append(sorts.setdefault(key, len(sorts)))
+        order = np.lexsort((sort, depth))
+        self.place = np.empty(len(nodes), dtype=int)
+        self.place[order] = np.arange(len(nodes))
+        changes = np.diff(np.array([depth, sort])[:, order]).any(axis=0)
+        bounds = [0, *(1 + np.flatnonzero(changes)).tolist(), len(nodes)] if nodes else [0]
+        ends = [[args[k] if args else 0 for _, args, _ in nodes] for k in (0, -1)]
+        operands = self._places(ends)[:, order]
+        sorts, order = list(sorts), order.tolist()
+        self.constants, self.inputs, self.groups, self.slopes = ([], []), ([], []), [], {}
+        for first, last in zip(bounds[:-1], bounds[1:], strict=True):
+            kind, data = sorts[sort[order[first]]]
+            _, args, _ = nodes[order[first]]
+            if not args:
+                leaves = self.constants if kind == "const" else self.inputs
+                leaves[0].extend(range(first, last))
+                leaves[1].extend(nodes[i].data for i in order[first:last])
+                continue
+            count = 2 if kind == "mul" else len(args)
+            self.groups.append((kind, data, slice(first, last), operands[:count, first:last].copy()))
+            if kind == "quad":
+                slopes = zip(*(nodes[i].data[1] for i in order[first:last]), strict=True)
+                self.slopes[first] = [self._places(column) for column in slopes]
+
+    def _places(self, nodes):
+        return self.place[np.asarray(nodes, dtype=int)]
+
+    def values(self, inputs):
+        """The value of every node at N points, (n_nodes, N), from those of the inputs, (n_inputs, N)."""
+        v = np.empty((len(self.place), *inputs.shape[1:]), dtype=inputs.dtype)
+        places, constants = self.constants
+        v[places] = np.array(constants)[:, None]
+        places, indices = self.inputs
+        v[places] = inputs[indices]
+        for kind, data, here, operands in self.groups:
+            values = v.take(operands, axis=0)
+            if kind in _ARITHMETIC:
+                _ARITHMETIC[kind](*values, out=v[here])
+            else:
+                v[here] = _VALUE[kind](data, *values)
+        return v
+
+    def sizes(self, v):
+        """The size of the terms that made every node, (n_nodes, N), from the values."""
+        magnitude = np.abs(v)
+        size = magnitude.copy()
+        for kind, data, here, operands in self.groups:
+            parts = size.take(operands, axis=0)
+            if kind in ("add", "sub"):
+                np.add(*parts, out=size[here])
+            elif kind == "mul":
+                a, b = magnitude.take(operands, axis=0)
+                np.add(a * parts[1], parts[0] * b, out=size[here])
+            elif kind == "quad":
+                for slope, part in zip(self.slopes[here.start], parts, strict=True):
+                    size[here] += np.nan_to_num(magnitude.take(slope, axis=0)) * part
+            elif kind != "constant":
+                size[here] = _SIZE[kind](data, magnitude[here], *v.take(operands, axis=0), *parts)
+        return size
+
+
+def _power_size(exponent, y, a, size):
+    return y * (1.0 + abs(exponent) * size / np.maximum(np.abs(a), np.finfo(float).tiny))
+
+
+_ARITHMETIC = {"add": np.add, "sub": np.subtract, "mul": np.multiply, "div": np.divide, "neg": np.negative}
+_VALUE = {
+    "copy": lambda _, a: a,
+    "scale": lambda factor, a: a * factor,
+    "sqrt": lambda _, a: np.sqrt(a),
+    "fabs": lambda _, a: np.abs(a),
+    "power": lambda exponent, a: a**exponent,
+    "gate": lambda _, a, b: np.where(a != 0, b, 0.0),
+    "fmin": lambda _, a, b: np.where(a <= b, a, b),
+    "fmax": lambda _, a, b: np.where(a <= b, b, a),
+    "constant": apply,
+    "quad": apply,
+}
+_SIZE = {  # from the magnitude of y, and values and sizes of the operands
+    "div": lambda _, y, a, b, size_a, size_b: (size_a + y * size_b) / np.abs(b),
+    "neg": lambda _, y, a, size: size,
+    "copy": lambda _, y, a, size: size,
+    "fabs": lambda _, y, a, size: size,
+    "scale": lambda factor, y, a, size: abs(factor) * size,
+    "sqrt": lambda _, y, a, size: _power_size(0.5, y, a, size),
+    "power": _power_size,
+    "gate": lambda _, y, a, b, size_a, size_b: np.where(a != 0, size_b, 0.0),
+    "fmin": lambda _, y, a, b, size_a, size_b: np.where(a <= b, size_a, size_b),
+    "fmax": lambda _, y, a, b, size_a, size_b: np.where(a <= b, size_b, size_a),
+}
+
+
+def evaluate(tape, inputs):
+    """Values of a tape's outputs and the size of the terms that made them.
+
+    The size of a sum is the sum of the sizes, of a product |a| size(b) + size(a) |b|, of y = f(a)
+    |y| + |f'(a)| size(a): rounding is of the order of the machine's epsilon times the size, so an output far
+    below its size is zero. Runs in the precision of `inputs`.
+
+    Parameters
+    ----------
+    tape : Tape
+    inputs : (n_inputs, N) array
+        Values of the inputs at N points.
+
+    Returns
+    -------
+    values, sizes : (n_outputs, N) arrays
+    """
+    outputs = tape.plan.place[tape.outputs]
+    with np.errstate(all="ignore"):
+        v = tape.plan.values(np.asarray(inputs))
+        return v[outputs], tape.plan.sizes(v)[outputs]
+
+
+class Scalars:
+    """Some SX scalars with the places of their symbols in jet space.
+
+    Parameters
+    ----------
+    q : Coordinates
+    parameters : tuple of SX
+    expressions : sequence of SX scalars
+    others : collection of int, optional
+        Element hashes of further symbols, whose values here are zero.
+
+    Attributes
+    ----------
+    tape : Tape
+    places : list
+        What each symbol is; see `Coordinates.where`.
+    """
+
+    def __init__(self, q, parameters, expressions, others=()):
+        self.expressions, self.tape = expressions, Tape(None, expressions)
+        self._last = None, None  # inputs, and the values of all nodes
+        self.places = [q.where(s) for s in self.tape.symbols]
+        names = [p.element_hash() for p in parameters]
+        first = {"t": 1 + len(names), "q": 2 + len(names)}
+        self._rows, self._factors = [], np.ones((len(self.places), 1))
+        for i, (symbol, place) in enumerate(zip(self.tape.symbols, self.places, strict=True)):
+            if place is None:
+                key = symbol.element_hash()
+                self._rows.append(0 if key in others else 1 + names.index(key))
+            else:
+                kind, level, k = place
+                start = first["q"] + q.nq + (level - 1) * q.n if kind == "w" else first[kind]
+                self._rows.append(start + k)
+                self._factors[i] = factorial(level)
+
+    def inputs(self, t, z, values):
+        """Values of the symbols (n, N) at times t (N,) and jets z (nz, N); jets above those of z are zero."""
+        sources = np.empty((2 + len(values) + len(z), len(t)), dtype=REAL)
+        sources[0], sources[1 : 1 + len(values)] = 0.0, values[:, None]
+        sources[1 + len(values)], sources[2 + len(values) :] = t, z
+        return sources[[row if row < len(sources) else 0 for row in self._rows]] * self._factors
+
+    def values(self, t, z, values):
+        """Values of the scalars (len, N)."""
+        return self._nodes(t, z, values)[self.tape.plan.place[self.tape.outputs]]
+
+    def evaluate(self, t, z, values):
+        """Values and sizes of the scalars (2, len, N); see `evaluation.evaluate`."""
+        nodes = self._nodes(t, z, values)
+        with np.errstate(all="ignore"):
+            sizes = self.tape.plan.sizes(nodes)
+        return np.array([nodes, sizes])[:, self.tape.plan.place[self.tape.outputs]]
+
+    def _nodes(self, t, z, values):
+        """Values of all nodes of the tape; those of the last points are remembered."""
+        inputs = self.inputs(t, z, values)
+        last, nodes = self._last
+        if not np.array_equal(inputs, last):
+            with np.errstate(all="ignore"):
+                nodes = self.tape.plan.values(inputs)
+            self._last = inputs, nodes
+        return nodes
+
+
+class Book:
+    """The scalars that were read so far."""
+
+    def __init__(self):
+        self._read = {}  # element hash: its scalars, and which of them it is
+
+    def find(self, q, parameters, expressions):
+        """Where expressions are found; new ones are read together.
+
+        Parameters
+        ----------
+        q : Coordinates
+        parameters : tuple of SX
+        expressions : sequence of SX scalars
+
+        Returns
+        -------
+        list of (Scalars, list of int, list of int)
+            Scalars that hold some of them, their places in these, and in `expressions`.
+        """
+        hashes = [e.element_hash() for e in expressions]
+        new = {h: e for h, e in zip(hashes, expressions, strict=True) if h not in self._read}
+        if new:
+            scalars = Scalars(q, parameters, list(new.values()))
+            self._read |= {h: (scalars, i) for i, h in enumerate(new)}
+        by_scalars = {}
+        for at, (scalars, i) in enumerate(map(self._read.get, hashes)):
+            sources, targets = by_scalars.setdefault(scalars, ([], []))
+            sources.append(i)
+            targets.append(at)
+        return [(scalars, *places) for scalars, places in by_scalars.items()]

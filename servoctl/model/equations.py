@@ -8,8 +8,7 @@ import numpy as np
 from servoctl.errors import SpecificationError
 from servoctl.model import saddle
 from servoctl.reduction.appell import plant_accelerations
-from servoctl.reduction.elimination import eliminate
-from servoctl.reduction.ranks import clean, column_sizes
+from servoctl.reduction.ranks import clean, column_sizes, eliminate
 from servoctl.spec.coordinates import jet_name
 
 

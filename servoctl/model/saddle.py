@@ -9,8 +9,7 @@ import casadi as ca
 
 from servoctl.codegen.emit import operations
 from servoctl.errors import SpecificationError
-from servoctl.reduction.elimination import eliminate
-from servoctl.reduction.ranks import clean
+from servoctl.reduction.ranks import clean, eliminate
 
 FEW = 8  # quasi-velocities: up to here (3.18) takes about as few operations
 CLOSE = 1.1  # times as many operations: up to here merging of common terms decides which are fewer

@@ -10,8 +10,7 @@ import casadi as ca
 import numpy as np
 
 from servoctl.errors import NotRealisable, SpecificationError, unknown
-from servoctl.reduction.elimination import eliminate
-from servoctl.reduction.ranks import clean, decide_all, decide_each, equilibrate
+from servoctl.reduction.ranks import clean, decide_all, decide_each, eliminate, equilibrate
 
 NEGATIVE = 1e-9  # of the size of its entries: eigenvalues of an inertia matrix below minus this are no rounding
 NAMED = 1e-6  # of its largest component: smaller ones of a direction are not named in an error

@@ -10,18 +10,10 @@ import casadi as ca
 import numpy as np
 
 from servoctl.errors import InconsistentStart, NotRealisable, SingularProgram, SpecificationError
-from servoctl.jets.flow import Flow
-from servoctl.reduction.elimination import eliminate
-from servoctl.reduction.manifold import POINTS_SEED, sample, solve
-from servoctl.reduction.orders import dependence, leading, settle, settle_alone
-from servoctl.reduction.ranks import clean, decide, decide_all, decide_each, generic
-from servoctl.reduction.row import Row, merge_uses
+from servoctl.reduction.manifold import sample
+from servoctl.reduction.ranks import clean, decide, decide_all, decide_each, eliminate, generic
+from servoctl.reduction.rows import Row, dependence, leading, merge_uses, settle, vanishing_gradient
 from servoctl.tolerances import NOISE, RESOLVED
-
-VANISHED = 1e-5  # of a row's gradient at random points: what is left of it on its solutions, if it is a square
-SQUARE_STEPS = 40  # of Newton's method towards them, which for a square only halves the way at each
-SOLVED = 1e-3  # scaled residual of points at which the gradient of a possible square is looked at
-BESIDE = 0.5  # relative distance of the points with which solutions are compared
 
 
 def complete(q, rows, context, starts=None):
@@ -115,10 +107,10 @@ def _lowest(q, rows, numbers, context, starts=None):
     if combination.row.order >= top:
         support, numbers = _about(q, rows, b, context)
         if not support:
-            raise _vanishing_gradient(rows[b])
+            raise vanishing_gradient(rows[b])
         combination = _combination(q, rows, b, support, numbers, context)
         if combination.row.order >= top:
-            raise _vanishing_gradient(rows[b])
+            raise vanishing_gradient(rows[b])
     return combination
 
 
@@ -182,15 +174,6 @@ def _require_affine(rows, support, top):
         )
 
 
-def _vanishing_gradient(row):
-    return SingularProgram(
-        f"The gradient of row {row.name!r} vanishes on its own solutions.",
-        "A constraint is regular: a squared one, like φ² = 0, says nothing about the directions in which φ grows.",
-        do=f"Write {row.name!r} so that it changes sign where it is crossed: what was squared, not its square.",
-        row=row.name,
-    )
-
-
 def _dependent(rows, combination):
     """What is wrong with rows of which a combination depends on t alone."""
     names, story = [rows[a].name for a in combination.support], combination.row.story
@@ -251,60 +234,3 @@ def _ill_conditioned(rows, rank):
         kept=rank.kept,
         dropped=rank.dropped,
     )
-
-
-def as_rows(q, named, kind, context):
-    """Rows of named residuals with their true orders."""
-    rows = [Row(e, max(q.order(e), 0), name, kind, uses={name: 0}) for name, e in named.items()]
-    settled = settle_alone(q, rows, context)
-    for row, slopes in settled:
-        if row.order < 0:
-            raise SpecificationError(
-                f"The residual {row.name!r} depends on no coordinate.",
-                "A constraint restricts the motion.",
-                do="Use the symbols of the mechanism's coordinates.",
-                name=row.name,
-            )
-        _refuse_square(q, row, context, slopes)
-    return [row for row, _ in settled]
-
-
-def _refuse_square(q, row, context, slopes=None):
-    """Refuse a residual whose gradient vanishes where the residual does: φ² = 0 and its like.
-
-    A gradient without the highest jets is as large on the solutions, which determine these alone, as elsewhere; and
-    so is an entry that holds no coordinate. `slopes` are the values of the gradient at the points, where known.
-    """
-    slope = row.gradient(q)
-    if row.order > 0 and q.order(slope) < row.order:
-        return
-    if slopes is not None:
-        sizes, columns = np.abs(slopes), slope.sparsity().get_triplet()[1]
-        clear = np.all(sizes > VANISHED * sizes.max(axis=0), axis=1)
-        if any(clear[i] and q.order(e) < 0 for i, e in zip(columns, slope.nonzeros(), strict=True)):
-            return
-    start = sample(q, [], row.order, context)
-    flow = Flow(q, [row], row.order, start)
-    z, residual = solve(flow, start.t, start.z, iterations=SQUARE_STEPS)
-    sizes = []
-    for jets in (start.z, z):
-        values, _ = replace(start, z=jets).matrix(row.gradient(q))
-        sizes.append(np.abs(values).max(axis=(0, 1)))
-    solved = residual < SOLVED
-    if solved.any() and np.all(sizes[1][solved] < VANISHED * sizes[0][solved]):
-        if not _regular_nearby(flow, start.t[solved], z[:, solved]):
-            raise _vanishing_gradient(row)
-
-
-def _regular_nearby(flow, t, z):
-    """Whether a gradient is small on a row's solutions z only as all is small there: it is no smaller than beside them.
-
-    Newton's method has converged at a regular solution; at that of a square its steps only halve the way.
-    """
-    residual, slopes = flow(t, z)
-    beside = z * (1.0 + np.random.default_rng(POINTS_SEED).uniform(-BESIDE, BESIDE, z.shape))
-    here, there = np.abs(slopes[0]).max(axis=0), np.abs(flow(t, beside)[1][0]).max(axis=0)
-    with np.errstate(all="ignore"):
-        steps = np.abs(residual[0] * slopes[0]) / (slopes[0] ** 2).sum(axis=0)
-    converged = np.all(steps <= VANISHED * np.abs(z), axis=0)
-    return bool(np.any(converged & (here > VANISHED * there)))

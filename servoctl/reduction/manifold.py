@@ -11,8 +11,8 @@ from math import factorial
 import casadi as ca
 import numpy as np
 
-from servoctl.jets.flow import Flow
-from servoctl.jets.scalars import REAL, Book
+from servoctl.jets.series import Flow
+from servoctl.jets.tape import REAL, Book
 from servoctl.tolerances import CUTOFF
 
 ROUNDED = 8 * float(np.finfo(REAL).eps)  # a scaled residual below this is rounding

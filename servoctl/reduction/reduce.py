@@ -8,14 +8,13 @@ import numpy as np
 
 from servoctl.checks import finite, mapping
 from servoctl.errors import NotRealisable, SpecificationError, unknown
-from servoctl.jets.flow import Flow
+from servoctl.jets.series import Flow
 from servoctl.reduction.appell import Realisation, realisation, require_inertia
-from servoctl.reduction.hidden import as_rows, complete
+from servoctl.reduction.hidden import complete
 from servoctl.reduction.knots import Knots, Switches, require_smooth
 from servoctl.reduction.manifold import Context, Points, sample
-from servoctl.reduction.orders import settle_alone
 from servoctl.reduction.ranks import Rank, clean, decide, decide_all
-from servoctl.reduction.row import Balance, Row, merge_uses
+from servoctl.reduction.rows import Balance, Row, as_rows, merge_uses, settle_alone
 from servoctl.spec.mechanism import Mechanism, require_known
 from servoctl.spec.program import Program
 from servoctl.tolerances import TINY

@@ -11,10 +11,10 @@ from dataclasses import dataclass, replace
 import casadi as ca
 import numpy as np
 
-from servoctl.jets.flow import Flow
+from servoctl.jets.series import Flow
 from servoctl.reduction.manifold import solve
 from servoctl.reduction.ranks import decide, solve_clean
-from servoctl.reduction.row import Row
+from servoctl.reduction.rows import Row
 from servoctl.tolerances import ENTRY
 
 INDEPENDENT = 1e-7  # equilibrated pivots of J above this count

@@ -9,10 +9,8 @@ import casadi as ca
 
 from servoctl.checks import column, mapping, matrix
 from servoctl.errors import SpecificationError
-from servoctl.jets.elementary import divide, multiply
-from servoctl.jets.motion import Motion
-from servoctl.jets.series import Series, is_zero
-from servoctl.jets.tape import Tape
+from servoctl.jets.series import Motion, Series, is_zero
+from servoctl.jets.tape import Tape, divide, multiply
 
 _lock = threading.Lock()
 

@@ -8,8 +8,7 @@ import numpy as np
 
 from servoctl.checks import column, mapping
 from servoctl.errors import SpecificationError, unknown
-from servoctl.jets.evaluation import evaluate
-from servoctl.jets.tape import Tape
+from servoctl.jets.tape import Tape, evaluate
 from servoctl.spec.coordinates import Coordinates
 from servoctl.spec.packing import packed, unpacked
 from servoctl.spec.parameters import Parameters

@@ -1,19 +1,157 @@
-"""The orders of rows, and their leading gradients, settled at points of the manifold."""
+"""Rows ψ = 0, their orders on the manifold of other rows, and dependences among their leading gradients."""
 
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 
 import casadi as ca
 import numpy as np
 
-from servoctl.reduction.elimination import eliminate
-from servoctl.reduction.manifold import sample
-from servoctl.reduction.ranks import clean, combination, decide, equilibrate, refined
-from servoctl.reduction.row import merge_uses
+from servoctl.errors import SingularProgram, SpecificationError
+from servoctl.jets.series import Flow
+from servoctl.reduction.manifold import POINTS_SEED, sample, solve
+from servoctl.reduction.ranks import clean, combination, decide, eliminate, equilibrate, refined
 from servoctl.tolerances import DEPENDENT, ENTRY
 
 TAKES_PART = 1e-12  # coefficient times the largest entry of a row: below this the row is no part of a combination
 SUPPORTS = 1e-9  # equilibrated coefficient, at any point, above which a row is part of a dependence
 BASIS_CUTOFF = 1e-12  # singular values of rows found independent, against the largest
+VANISHED = 1e-5  # of a row's gradient at random points: what is left of it on its solutions, if it is a square
+SQUARE_STEPS = 40  # of Newton's method towards them, which for a square only halves the way at each
+SOLVED = 1e-3  # scaled residual of points at which the gradient of a possible square is looked at
+BESIDE = 0.5  # relative distance of the points with which solutions are compared
+
+
+@dataclass(frozen=True)
+class Balance:
+    """The balance r among the expressions that rows are made of, or one component of it.
+
+    Attributes
+    ----------
+    component : str
+        Name of a coordinate or quasi-velocity; empty for all of them.
+    """
+
+    component: str = ""
+
+    def __str__(self):
+        return f"the force on {self.component}" if self.component else "the balance"
+
+
+@dataclass(frozen=True)
+class Row:
+    """One scalar equation ψ(t, q, γ', ..., γ^(order)) = 0.
+
+    Attributes
+    ----------
+    expression : SX scalar
+    order : int
+        Highest level on which it depends on the manifold; 0 for q alone, -1 for neither q nor a jet.
+    name : str
+    kind : {"program", "material", "dynamics"}
+        Where it came from.
+    affine : bool
+        Whether it is affine in γ^(order).
+    story : str
+        What was done to it, if it is a hidden constraint.
+    uses : dict of (str or Balance) to int
+        Highest derivative of each program residual, and of the balance, in it.
+    """
+
+    expression: ca.SX
+    order: int
+    name: str
+    kind: str
+    affine: bool = True
+    story: str = ""
+    uses: dict = field(default_factory=dict)
+    _gradients: dict = field(default_factory=dict, repr=False, compare=False)
+
+    def gradient(self, q, level=None):
+        """∂ψ/∂γ^(level), (1, n) SX; for level 0 ∂ψ/∂q · V. Default: the row's own order, its leading gradient."""
+        level = self.order if level is None else level
+        key = self.expression.element_hash(), level
+        if key not in self._gradients:
+            slopes = ca.jacobian(self.expression, q.jet(level))
+            self._gradients[key] = self.expression, slopes if level or q.plain else slopes @ q.V
+        return self._gradients[key][1]
+
+    def __repr__(self):
+        return f"Row({self.name}: {self.kind}, order {self.order}{', ' + self.story if self.story else ''})"
+
+
+def merge_uses(*parts):
+    """The highest number of differentiations of each residual among (uses, extra differentiations) pairs."""
+    total = {}
+    for uses, extra in parts:
+        for name, count in uses.items():
+            total[name] = max(total.get(name, 0), count + extra)
+    return total
+
+
+def as_rows(q, named, kind, context):
+    """Rows of named residuals with their true orders."""
+    rows = [Row(e, max(q.order(e), 0), name, kind, uses={name: 0}) for name, e in named.items()]
+    settled = settle_alone(q, rows, context)
+    for row, slopes in settled:
+        if row.order < 0:
+            raise SpecificationError(
+                f"The residual {row.name!r} depends on no coordinate.",
+                "A constraint restricts the motion.",
+                do="Use the symbols of the mechanism's coordinates.",
+                name=row.name,
+            )
+        _refuse_square(q, row, context, slopes)
+    return [row for row, _ in settled]
+
+
+def _refuse_square(q, row, context, slopes=None):
+    """Refuse a residual whose gradient vanishes where the residual does: φ² = 0 and its like.
+
+    A gradient without the highest jets is as large on the solutions, which determine these alone, as elsewhere; and
+    so is an entry that holds no coordinate. `slopes` are the values of the gradient at the points, where known.
+    """
+    slope = row.gradient(q)
+    if row.order > 0 and q.order(slope) < row.order:
+        return
+    if slopes is not None:
+        sizes, columns = np.abs(slopes), slope.sparsity().get_triplet()[1]
+        clear = np.all(sizes > VANISHED * sizes.max(axis=0), axis=1)
+        if any(clear[i] and q.order(e) < 0 for i, e in zip(columns, slope.nonzeros(), strict=True)):
+            return
+    start = sample(q, [], row.order, context)
+    flow = Flow(q, [row], row.order, start)
+    z, residual = solve(flow, start.t, start.z, iterations=SQUARE_STEPS)
+    sizes = []
+    for jets in (start.z, z):
+        values, _ = replace(start, z=jets).matrix(row.gradient(q))
+        sizes.append(np.abs(values).max(axis=(0, 1)))
+    solved = residual < SOLVED
+    if solved.any() and np.all(sizes[1][solved] < VANISHED * sizes[0][solved]):
+        if not _regular_nearby(flow, start.t[solved], z[:, solved]):
+            raise vanishing_gradient(row)
+
+
+def _regular_nearby(flow, t, z):
+    """Whether a gradient is small on a row's solutions z only as all is small there: it is no smaller than beside them.
+
+    Newton's method has converged at a regular solution; at that of a square its steps only halve the way.
+    """
+    residual, slopes = flow(t, z)
+    beside = z * (1.0 + np.random.default_rng(POINTS_SEED).uniform(-BESIDE, BESIDE, z.shape))
+    here, there = np.abs(slopes[0]).max(axis=0), np.abs(flow(t, beside)[1][0]).max(axis=0)
+    with np.errstate(all="ignore"):
+        steps = np.abs(residual[0] * slopes[0]) / (slopes[0] ** 2).sum(axis=0)
+    converged = np.all(steps <= VANISHED * np.abs(z), axis=0)
+    return bool(np.any(converged & (here > VANISHED * there)))
+
+
+def vanishing_gradient(row):
+    """The error of a row whose gradient vanishes wherever the row holds."""
+    return SingularProgram(
+        f"The gradient of row {row.name!r} vanishes on its own solutions.",
+        "A constraint is regular: a squared one, like φ² = 0, says nothing about the directions in which φ grows.",
+        do=f"Write {row.name!r} so that it changes sign where it is crossed: what was squared, not its square.",
+        row=row.name,
+    )
 
 
 def leading(q, rows, points):
@@ -176,4 +314,3 @@ def dependence(q, rows, numbers):
         weights = [size[:, i].min(initial=np.inf) for i, a in enumerate(basis) if a in support]
         return [*support, b], np.array([*weights, 1.0])
     return [], np.array([])
-
