@@ -57,7 +57,7 @@ def servo_dae(model, form):
 
 def _step(equations, form, name):
     r, q = equations.r, equations.q
-    rows = list(r.given.values())
+    rows = list(r.original.values())
     high = [row.name for row in rows if row.order > 1]
     if high:
         raise SpecificationError(

@@ -43,17 +43,29 @@ def _minus(a, b):
 
 
 def _inner_first(k, first=0):
-    """Indices first..k of a product's terms, those with the latest coefficients last: the others are known earlier."""
+    """Indices first..k of a product's terms; terms with the highest coefficients, which come latest, are last."""
     return sorted(range(first, k + 1), key=lambda j: max(j, k - j))
 
 
 class Series:
     """A tape run on truncated power series, one coefficient at a time.
 
-    `inputs[i]` is the list of coefficients of input i; before `advance()` computes coefficient k, each
-    must hold at least k + 1 entries. `outputs[i]` are the coefficients of output i so far. Branches are taken by
-    coefficient 0 of what is compared; `decided` may give other values for nodes, at which to take them. With
-    `first` only so many of the tape's outputs are computed.
+    Parameters
+    ----------
+    tape : Tape
+    inputs : list of list
+        Coefficients of each input; before `advance()` computes coefficient k, at least k + 1 of them.
+    decided : dict of int to value, optional
+        Values of nodes by which branches are taken. Default: coefficient 0 of the compared nodes.
+    first : int, optional
+        How many of the tape's outputs are computed; default all.
+
+    Attributes
+    ----------
+    c : list of list
+        The coefficients of each node so far.
+    k : int
+        Their number.
     """
 
     def __init__(self, tape, inputs, decided=None, first=None):
@@ -63,10 +75,6 @@ class Series:
         self.c = [[] for _ in self.nodes]
         self.k = 0
         self.decided = decided or {}
-
-    def _first(self, node):
-        """The value of a node by which branches are taken."""
-        return self.decided[node] if node in self.decided else self.c[node][0]
 
     @property
     def outputs(self):
@@ -107,13 +115,7 @@ class Series:
             c[i].append(value)
 
     def replace_last(self, coefficients):
-        """Recompute the last coefficient after the inputs' last coefficients changed.
-
-        Parameters
-        ----------
-        coefficients : dict
-            Input index to its new last coefficient.
-        """
+        """Recompute the last coefficient with new last coefficients of inputs, a dict by index of the input."""
         for i, value in coefficients.items():
             self.inputs[i][self.k - 1] = value
         for c in self.c:
@@ -130,7 +132,7 @@ class Series:
         if kind == "quad":
             return self._quadrature(node, k)
         if kind == "constant":
-            return apply(node.data, *(self._first(j) for j in node.args)) if k == 0 else 0.0
+            return apply(node.data, *(self._deciding(j) for j in node.args)) if k == 0 else 0.0
         a = c[node.args[0]]
         if kind == "neg":
             return 0.0 if is_zero(a[k]) else -a[k]
@@ -159,15 +161,19 @@ class Series:
             return 0.0 if is_zero(rest) else divide(rest, b[0])
         raise TypeError(f"a tape holds a node of kind {kind!r}")
 
+    def _deciding(self, node):
+        """The value of a node by which branches are taken."""
+        return self.decided[node] if node in self.decided else self.c[node][0]
+
     def _branch(self, node, k):
-        """Coefficient k of an operation that takes one of its branches."""
+        """Coefficient k of an operation with branches: that of the branch taken."""
         a, b = (self.c[i] for i in (node.args[0], node.args[-1]))
         if node.kind == "fabs":
-            return select(self._first(node.args[0]) >= 0, a[k], -a[k])
+            return select(self._deciding(node.args[0]) >= 0, a[k], -a[k])
         if node.kind == "gate":
             return 0.0 if is_zero(b[k]) else select(a[0] != 0, b[k], 0.0)
-        first = self._first(node.args[0]) <= self._first(node.args[1])
-        return select(first, *((a[k], b[k]) if node.kind == "fmin" else (b[k], a[k])))
+        first_is_least = self._deciding(node.args[0]) <= self._deciding(node.args[1])
+        return select(first_is_least, *((a[k], b[k]) if node.kind == "fmin" else (b[k], a[k])))
 
     @staticmethod
     def _square(a, k):
@@ -190,7 +196,8 @@ class Series:
         total = _dot((multiply(exponent * (k - j) - j, a[k - j]), y[j]) for j in range(k) if not is_zero(a[k - j]))
         if is_zero(total):
             return 0.0
-        vanishes = a[0] if k < exponent else sum(apply("fabs", c) for c in a)  # the power of a zero is zero
+        # The recurrence divides by a_0. Where a_0 = 0 coefficients below the exponent vanish, and all do where a = 0.
+        vanishes = a[0] if k < exponent else sum(apply("fabs", c) for c in a)
         return select(vanishes == 0, 0.0, divide(total, multiply(k, a[0])))
 
     def _quadrature(self, node, k):
@@ -205,9 +212,9 @@ class Series:
 
 
 class Motion:
-    """A motion by its normalised Taylor coefficients.
+    """The normalised Taylor coefficients of every symbol along a motion.
 
-    Subclasses say what these are of q_i, `coordinate(i, j)`, and of γ_i^(l), `velocity(i, l, j)`.
+    Subclasses define `coordinate(i, j)`, coefficient j of q_i, and `velocity(i, l, j)`, coefficient j of γ_i^(l).
 
     Parameters
     ----------
@@ -218,7 +225,7 @@ class Motion:
         self.q = q
 
     def coefficient(self, symbol, j):
-        """Coefficient j of a symbol: t_[0] = t and t_[1] = 1, q_[j], (γ^(l))_[j]; all else is constant."""
+        """Coefficient j of a symbol: q_[j], (γ^(l))_[j], t_[0] = t and t_[1] = 1; other symbols are constant."""
         kind, level, i = self.q.where(symbol) or ("constant", 0, 0)
         if kind == "q":
             return self.coordinate(i, j)
@@ -243,11 +250,11 @@ class Flow:
     level : int
         Highest level K of the jets.
     points : Points
-        Only its parameters, their values, and its book are used here.
+        Its parameters, their values, and its book of scalars.
     signals : dict, optional
         Taylor coefficients of further symbols along the motion, by element hash: lists of (N,) arrays.
     real : type
-        Of the Jacobian; double precision is enough for Newton's method.
+        Type of the Jacobian; double precision is enough for Newton's method.
     """
 
     def __init__(self, q, rows, level, points, signals=None, real=float):
@@ -256,7 +263,7 @@ class Flow:
         self.equations = [(a, i) for a, order in enumerate(orders) for i in range(level - order + 1)]
         self.levels = np.array([orders[a] + i for a, i in self.equations], dtype=int)
         self.first = np.cumsum([0, *(max(level - order + 1, 0) for order in orders)])
-        self.rows, self._made = rows, {}  # what is read when it is first needed
+        self.rows, self._cache = rows, {}
         self.members = {
             order: np.array([a for a, row in enumerate(rows) if row.order == order], dtype=int)
             for order in sorted({order for order in orders if order <= level})
@@ -267,7 +274,7 @@ class Flow:
             self.motion = self._scalars([*moving.elements(), *(e for p in parts for e in p.nonzeros())])
 
     def at(self, points):
-        """The same rows with the parameters of other points; what was read of the rows is shared."""
+        """The same rows with the parameters of other points, and the same cached tapes."""
         flow = copy(self)
         flow.points = points
         return flow
@@ -277,13 +284,13 @@ class Flow:
 
     @property
     def groups(self):
-        """For each order its rows with their gradients in q and all jets."""
-        if "groups" not in self._made:
-            self._made["groups"] = [self._group(order) for order in self.members]
-        return self._made["groups"]
+        """The rows of each order with their gradients in q and all jets."""
+        if "groups" not in self._cache:
+            self._cache["groups"] = [self._group(order) for order in self.members]
+        return self._cache["groups"]
 
     def _group(self, order):
-        """Residuals of an order, the nonzero entries of their gradients, and the places of these."""
+        """The rows of an order, the tape of their residuals and nonzero gradient entries, and places of the entries."""
         members = self.members[order]
         residuals = [self.rows[a].expression for a in members]
         parts = [ca.jacobian(ca.vertcat(*residuals), self.q.jet(m)) for m in range(order + 1)]
@@ -291,20 +298,20 @@ class Flow:
         return members, order, self._scalars([*residuals, *(e for p in parts for e in p.nonzeros())]), places
 
     def leading(self, order, level):
-        """Rows of an order with the nonzero entries of their gradients in γ^(order), or in q itself for level 0.
+        """Residuals of an order and nonzero entries of their gradients in γ^(order), or in q itself for level 0.
 
-        Both as found in the book, and the places of the entries.
+        Returns their places in the book of scalars, and the places (rows, columns) of the entries.
         """
         in_q = order == 0 and level == 0 and not self.q.plain
-        if (order, in_q) not in self._made:
+        if (order, in_q) not in self._cache:
             rows = [self.rows[a] for a in self.members[order]]
             slopes = [ca.jacobian(row.expression, self.q.jet(0)) if in_q else row.gradient(self.q) for row in rows]
             columns = [g.sparsity().get_triplet()[1] for g in slopes]
             residuals, entries = [row.expression for row in rows], [e for g in slopes for e in g.nonzeros()]
-            read = self.points.book.find(self.q, self.points.parameters, [*residuals, *entries])
+            in_book = self.points.book.find(self.q, self.points.parameters, [*residuals, *entries])
             places = np.repeat(np.arange(len(rows)), [len(c) for c in columns]), np.array(sum(columns, []), dtype=int)
-            self._made[order, in_q] = read, places
-        return self._made[order, in_q]
+            self._cache[order, in_q] = in_book, places
+        return self._cache[order, in_q]
 
     def __call__(self, t, z):
         """Coefficients (n_equations, N) and Jacobian (n_equations, nz, N) at times t (N,) and jets z (nz, N)."""
@@ -326,7 +333,7 @@ class Flow:
         return residual, jacobian
 
     def _add_slopes(self, jacobian, equations, columns, m, entries, q_map):
-        """Add to coefficient i of equations what ∂ψ/∂γ^(m) contributes, from its coefficients 0 .. i."""
+        """Add the contribution of ∂ψ/∂γ^(m), by its coefficients 0 .. i, to the slopes of coefficient i of ψ."""
         nq, n, i = self.q.nq, self.q.n, entries.shape[1] - 1
         for l in range(i + 1):
             part = entries[:, i - l]
@@ -342,8 +349,8 @@ class Flow:
         q_series, _ = self._kinematics(t, z)
         residual = np.zeros((len(self.equations), z.shape[1]), dtype=REAL)
         for order, members in self.members.items():
-            read, _ = self.leading(order, self.level)
-            coefficients = self._residuals(read, members, t, z, q_series, self.level - order)
+            in_book, _ = self.leading(order, self.level)
+            coefficients = self._residuals(in_book, members, t, z, q_series, self.level - order)
             for i in range(coefficients.shape[1]):
                 residual[self.first[members] + i] = coefficients[:, i]
         return residual
@@ -359,12 +366,12 @@ class Flow:
         for order, members in self.members.items():
             if order > level:
                 continue
-            read, (rows, columns) = self.leading(order, level)
+            in_book, (rows, columns) = self.leading(order, level)
             depth, entries = level - order, np.empty((len(members) + len(rows), z.shape[1]), dtype=REAL)
-            for scalars, sources, targets in read:
+            for scalars, sources, targets in in_book:
                 entries[targets] = scalars.values(t, z, self.points.values)[sources]
             if depth:
-                coefficients = self._residuals(read, members, t, z, q_series, depth)[:, depth]
+                coefficients = self._residuals(in_book, members, t, z, q_series, depth)[:, depth]
             else:
                 coefficients = entries[: len(members)]
             residual[self.first[members] + depth] = coefficients
@@ -372,10 +379,10 @@ class Flow:
             slopes[self.first[members[rows]] + depth, columns] = entries
         return residual, slopes
 
-    def _residuals(self, read, members, t, z, q_series, depth):
+    def _residuals(self, in_book, members, t, z, q_series, depth):
         """Coefficients of the residuals of some rows, (rows, depth + 1, N)."""
         result = np.empty((len(members), depth + 1, z.shape[1]), dtype=REAL)
-        for scalars, sources, targets in read:
+        for scalars, sources, targets in in_book:
             pairs = [(i, a) for i, a in zip(sources, targets, strict=True) if a < len(members)]
             if pairs and depth:
                 coefficients = self._run(scalars, t, z, q_series, depth, 1 + max(i for i, _ in pairs))

@@ -16,16 +16,17 @@ import numpy as np
 from servoctl.errors import SpecificationError
 
 REAL = np.longdouble
+MOST_SQUARED = 64  # the largest whole exponent that is written as squares and products
 
-if ca.GlobalOptions.getNumpyMode() == 0:  # nothing chosen: NumPy's functions of symbols work, and CasADi warns of them
-    ca.GlobalOptions.setNumpyMode(-1)  # the same without a warning
+# Mode 0 is CasADi's default: NumPy's functions of symbols work, each with a warning. Mode -1 gives no warning.
+if ca.GlobalOptions.getNumpyMode() == 0:
+    ca.GlobalOptions.setNumpyMode(-1)
 
 _NUMPY = {
     "sin": np.sin, "cos": np.cos, "tan": np.tan, "exp": np.exp, "log": np.log, "sqrt": np.sqrt,
     "asin": np.arcsin, "acos": np.arccos, "atan": np.arctan, "sinh": np.sinh, "cosh": np.cosh,
     "tanh": np.tanh, "asinh": np.arcsinh, "acosh": np.arccosh, "atanh": np.arctanh, "expm1": np.expm1,
-    "log1p": np.log1p, "sign": np.sign, "fabs": np.abs, "atan2": np.arctan2,
-    "power": np.power,
+    "log1p": np.log1p, "sign": np.sign, "fabs": np.abs, "atan2": np.arctan2, "power": np.power,
     "lt": lambda a, b: 1.0 * (a < b), "le": lambda a, b: 1.0 * (a <= b),
     "eq": lambda a, b: 1.0 * (a == b), "ne": lambda a, b: 1.0 * (a != b),
     "logic_and": lambda a, b: 1.0 * ((a != 0) & (b != 0)), "logic_or": lambda a, b: 1.0 * ((a != 0) | (b != 0)),
@@ -34,30 +35,30 @@ _NUMPY = {
 _CASADI = {name: getattr(ca, name) for name in _NUMPY} | {"erf": ca.erf}
 
 
-def _np_erf(x):
+def _erf(x):
     from scipy.special import erf
 
     return erf(np.asarray(x, dtype=float))
 
 
-_NUMPY["erf"] = _np_erf
+_NUMPY["erf"] = _erf
 
 
 def apply(name, *args):
-    """The function `name` on SX expressions or on numbers and arrays, whichever is given."""
-    if any(isinstance(a, ca.SX) for a in args):
-        return _CASADI[name](*args)
-    return _NUMPY[name](*args)
+    """The function `name` of SX expressions, or of numbers and arrays."""
+    functions = _CASADI if any(isinstance(a, ca.SX) for a in args) else _NUMPY
+    return functions[name](*args)
 
 
 def _arithmetic(name, code):
-    """An operation of two: `SX.binary` skips the search for a common type, which takes ten times as long."""
-    plain, of_two, symbolic = getattr(operator, name), ca.SX.binary, ca.SX
+    """A binary operation on SX expressions, or on numbers and arrays."""
+    numeric, binary, symbolic = getattr(operator, name), ca.SX.binary, ca.SX
 
-    def run(a, b):
-        return of_two(code, a, b) if a.__class__ is symbolic or b.__class__ is symbolic else plain(a, b)
+    # SX.binary skips CasADi's search for a common type, which takes ten times as long as the operation.
+    def operation(a, b):
+        return binary(code, a, b) if a.__class__ is symbolic or b.__class__ is symbolic else numeric(a, b)
 
-    return run
+    return operation
 
 
 add = _arithmetic("add", ca.OP_ADD)
@@ -82,9 +83,9 @@ class Node(NamedTuple):
 
 
 _BINARY = {ca.OP_FMIN: "fmin", ca.OP_FMAX: "fmax", ca.OP_IF_ELSE_ZERO: "gate"}
-_PLAIN = {ca.OP_ADD: "add", ca.OP_SUB: "sub", ca.OP_MUL: "mul", ca.OP_DIV: "div"}  # of two, without a branch
+_ARITHMETIC_NODES = {ca.OP_ADD: "add", ca.OP_SUB: "sub", ca.OP_MUL: "mul", ca.OP_DIV: "div"}
 _UNARY = {ca.OP_NEG: "neg", ca.OP_SQ: "sq", ca.OP_SQRT: "sqrt", ca.OP_FABS: "fabs", ca.OP_ASSIGN: "copy"}
-_CONSTANT = {
+_CONSTANT = {  # piecewise constant: their derivatives are zero
     ca.OP_LT: "lt", ca.OP_LE: "le", ca.OP_EQ: "eq", ca.OP_NE: "ne", ca.OP_AND: "logic_and", ca.OP_OR: "logic_or",
     ca.OP_NOT: "logic_not", ca.OP_SIGN: "sign",
 }  # fmt: skip
@@ -98,9 +99,7 @@ _REFUSED = {
     ca.OP_FLOOR: "floor", ca.OP_CEIL: "ceil", ca.OP_FMOD: "fmod", ca.OP_REMAINDER: "remainder",
     ca.OP_COPYSIGN: "copysign", ca.OP_ERFINV: "erfinv",
 }  # fmt: skip
-
-
-_OPTIONS = {"allow_free": True, "live_variables": False}  # every instruction has its own place
+_OPTIONS = {"allow_free": True, "live_variables": False}  # CasADi reuses no place, so instruction k writes to place k
 
 
 class Tape:
@@ -109,7 +108,7 @@ class Tape:
     Parameters
     ----------
     symbols : sequence of SX scalars or None
-        The inputs, in the order of their values; None for all that the expressions hold.
+        The inputs, in the order of their values. Default: all symbols of the expressions.
     expressions : sequence of SX scalars
         The outputs.
 
@@ -147,7 +146,7 @@ class Tape:
         return Plan(self.nodes)
 
     def needed(self, first):
-        """How many nodes are needed for so many first outputs."""
+        """The number of leading nodes that compute the first outputs, so many of them."""
         count = i = 1 + max(self.outputs[:first], default=-1)
         while i:
             i -= 1
@@ -161,23 +160,23 @@ class Tape:
         return len(self.nodes) - 1
 
     def _read(self, function, symbols):
-        """Append the instructions; their symbols come in the order of `symbols`."""
+        """Append the instructions of a function, whose free symbols have the nodes `symbols`."""
         work, nodes, symbols = [], self.nodes, iter(symbols)
-        read, taken = function.instruction_id, function.instruction_input
+        code, operands = function.instruction_id, function.instruction_input
         for k in range(function.n_instructions()):
-            op = read(k)
-            if op in _PLAIN:
-                a, b = taken(k)
+            op = code(k)
+            if op in _ARITHMETIC_NODES:
+                a, b = operands(k)
                 work.append(len(nodes))
-                nodes.append(Node(_PLAIN[op], (work[a], work[b])))
+                nodes.append(Node(_ARITHMETIC_NODES[op], (work[a], work[b])))
             elif op == ca.OP_OUTPUT:
-                self.outputs[function.instruction_output(k)[0]] = work[taken(k)[0]]
+                self.outputs[function.instruction_output(k)[0]] = work[operands(k)[0]]
             elif op == ca.OP_PARAMETER:
                 work.append(next(symbols))
             elif op == ca.OP_CONST:
                 work.append(self._add("const", data=function.instruction_constant(k)))
             else:
-                work.append(self._operation(op, [work[i] for i in taken(k)]))
+                work.append(self._operation(op, [work[i] for i in operands(k)]))
 
     def _operation(self, op, a):
         if op in _BINARY:
@@ -206,10 +205,12 @@ class Tape:
             return self._add("quad", a[0], a[1], data=("atan2", (gy, gx)))
         if op in _FUNCTION:
             return self._function(_FUNCTION[op], a[0])
+        name = _REFUSED.get(op, f"CasADi operation {op}")
         raise SpecificationError(
-            f"The expression uses {_REFUSED.get(op, f'CasADi operation {op}')}.",
-            "A program or mechanism is differentiated in time; this operation has no derivative.",
-            do="Write it with if_else, fmin, fmax or fabs, whose branches are differentiated.",
+            f"The expression uses {name}.",
+            "Expressions of a program or mechanism are differentiated in time, and this operation has no derivative.",
+            do="Use if_else, fmin, fmax or fabs: each of their branches is differentiated.",
+            operation=name,
         )
 
     def _power(self, base, exponent):
@@ -218,10 +219,8 @@ class Tape:
             return self._symbolic_power(base, exponent)
         c = node.data
         if not math.isfinite(c):
-            raise SpecificationError(
-                f"The expression raises to the power {c}.", "An exponent is finite.", do="Check the expression."
-            )
-        if c != int(c) or abs(c) > 64:
+            raise SpecificationError(f"The expression has the exponent {c}.", "Exponents are finite.", exponent=c)
+        if c != int(c) or abs(c) > MOST_SQUARED:
             return self._add("power", base, data=c)
         result, square, n = None, base, abs(int(c))
         while n:
@@ -235,7 +234,7 @@ class Tape:
         return self._add("div", one, result) if c < 0 else result
 
     def _symbolic_power(self, base, exponent):
-        """y = a^b with y' = (b y/a) a' + (y ln a) b'; the logarithm does not enter where b does not change."""
+        """y = a^b with y' = (b y/a) a' + (y ln a) b'. Where b is constant, ln a has the factor zero and drops out."""
         n = len(self.nodes)
         y = self._add("quad", base, exponent, data=None)
         by_base = self._add("div", self._add("mul", exponent, y), base)
@@ -249,7 +248,8 @@ class Tape:
         if name in ("sin", "cos", "sinh", "cosh"):
             hyperbolic = name.endswith("h")
             s, c = ("sinh", "cosh") if hyperbolic else ("sin", "cos")
-            n = len(self.nodes)  # sin is node n, cos n + 1, and -sin n + 2: each uses the other's lower coefficients
+            # sin is node n, cos n + 1, and -sin n + 2: each uses lower coefficients of the other.
+            n = len(self.nodes)
             self._pairs[s, a] = self._add("quad", a, data=(s, (n + 1,)))
             self._pairs[c, a] = self._add("quad", a, data=(c, (n if hyperbolic else n + 2,)))
             if not hyperbolic:
@@ -261,7 +261,7 @@ class Tape:
         return y
 
     def _slope(self, name, a, y):
-        """The node of dy/da for y = name(a); it may use y itself."""
+        """The node of dy/da for y = name(a), which may refer to y."""
         one = self._add("const", data=1.0)
         if name == "exp":
             return y
@@ -289,7 +289,7 @@ class Tape:
 
 
 class Plan:
-    """The nodes of a tape sorted so that those that are run together are neighbours.
+    """An order of a tape's nodes in which each group of equal operations is evaluated by one call of NumPy.
 
     Parameters
     ----------
@@ -298,12 +298,12 @@ class Plan:
     Attributes
     ----------
     place : (n_nodes,) array of int
-        Of each node of the tape, in this order.
+        Place of each node in this order.
     constants, inputs : (places, values) and (places, indices)
     groups : list of (kind, data, slice, (operands, size) array)
-        With the places of the operands. A square is a product here.
+        Operation, its places, and the places of its operands. Squares are products here.
     slopes : dict of int to list of (size,) arrays
-        Of groups of kind "quad", by their first place: the places of dy/da for each operand.
+        For a group of kind "quad", by its first place: the places of dy/da for each operand.
     """
 
     def __init__(self, nodes):
@@ -344,7 +344,7 @@ class Plan:
         return self.place[np.asarray(nodes, dtype=int)]
 
     def values(self, inputs):
-        """The value of every node at N points, (n_nodes, N), from those of the inputs, (n_inputs, N)."""
+        """Values of all nodes at N points, (n_nodes, N), from values of the inputs, (n_inputs, N)."""
         v = np.empty((len(self.place), *inputs.shape[1:]), dtype=inputs.dtype)
         places, constants = self.constants
         v[places] = np.array(constants)[:, None]
@@ -359,7 +359,7 @@ class Plan:
         return v
 
     def sizes(self, v):
-        """The size of the terms that made every node, (n_nodes, N), from the values."""
+        """Sizes of the terms of all nodes, (n_nodes, N), from the values; see `evaluate`."""
         magnitude = np.abs(v)
         size = magnitude.copy()
         for kind, data, here, operands in self.groups:
@@ -409,11 +409,11 @@ _SIZE = {  # from the magnitude of y, and values and sizes of the operands
 
 
 def evaluate(tape, inputs):
-    """Values of a tape's outputs and the size of the terms that made them.
+    """Values of a tape's outputs and the sizes of their terms.
 
-    The size of a sum is the sum of the sizes, of a product |a| size(b) + size(a) |b|, of y = f(a)
-    |y| + |f'(a)| size(a): rounding is of the order of the machine's epsilon times the size, so an output far
-    below its size is zero. Runs in the precision of `inputs`.
+    The size of a + b is size(a) + size(b), that of a b is |a| size(b) + size(a) |b|, and that of y = f(a) is
+    |y| + |f'(a)| size(a). Rounding errors are about the machine's epsilon times the size, so an output far below its
+    size is zero. The precision is that of `inputs`.
 
     Parameters
     ----------
@@ -432,7 +432,7 @@ def evaluate(tape, inputs):
 
 
 class Scalars:
-    """Some SX scalars with the places of their symbols in jet space.
+    """SX scalars on one tape, with the places of their symbols in jet space.
 
     Parameters
     ----------
@@ -440,7 +440,7 @@ class Scalars:
     parameters : tuple of SX
     expressions : sequence of SX scalars
     others : collection of int, optional
-        Element hashes of further symbols, whose values here are zero.
+        Element hashes of symbols outside jet space, which are evaluated as zero.
 
     Attributes
     ----------
@@ -467,7 +467,7 @@ class Scalars:
                 self._factors[i] = factorial(level)
 
     def inputs(self, t, z, values):
-        """Values of the symbols (n, N) at times t (N,) and jets z (nz, N); jets above those of z are zero."""
+        """Values of the symbols (n, N) at times t (N,) and jets z (nz, N). Jets of a higher level than z are zero."""
         sources = np.empty((2 + len(values) + len(z), len(t)), dtype=REAL)
         sources[0], sources[1 : 1 + len(values)] = 0.0, values[:, None]
         sources[1 + len(values)], sources[2 + len(values) :] = t, z
@@ -478,14 +478,14 @@ class Scalars:
         return self._nodes(t, z, values)[self.tape.plan.place[self.tape.outputs]]
 
     def evaluate(self, t, z, values):
-        """Values and sizes of the scalars (2, len, N); see `evaluation.evaluate`."""
+        """Values and sizes of the scalars (2, len, N); see `evaluate`."""
         nodes = self._nodes(t, z, values)
         with np.errstate(all="ignore"):
             sizes = self.tape.plan.sizes(nodes)
         return np.array([nodes, sizes])[:, self.tape.plan.place[self.tape.outputs]]
 
     def _nodes(self, t, z, values):
-        """Values of all nodes of the tape; those of the last points are remembered."""
+        """Values of all nodes of the tape, cached for the last points."""
         inputs = self.inputs(t, z, values)
         last, nodes = self._last
         if not np.array_equal(inputs, last):
@@ -496,13 +496,13 @@ class Scalars:
 
 
 class Book:
-    """The scalars that were read so far."""
+    """The scalars of earlier calls: no expression is put on a second tape."""
 
     def __init__(self):
-        self._read = {}  # element hash: its scalars, and which of them it is
+        self._places = {}  # element hash: its Scalars, and its index among them
 
     def find(self, q, parameters, expressions):
-        """Where expressions are found; new ones are read together.
+        """The scalars that hold expressions; expressions that no call has seen before share a new tape.
 
         Parameters
         ----------
@@ -513,15 +513,15 @@ class Book:
         Returns
         -------
         list of (Scalars, list of int, list of int)
-            Scalars that hold some of them, their places in these, and in `expressions`.
+            Scalars that hold some of the expressions, the indices among them, and the indices in `expressions`.
         """
         hashes = [e.element_hash() for e in expressions]
-        new = {h: e for h, e in zip(hashes, expressions, strict=True) if h not in self._read}
+        new = {h: e for h, e in zip(hashes, expressions, strict=True) if h not in self._places}
         if new:
             scalars = Scalars(q, parameters, list(new.values()))
-            self._read |= {h: (scalars, i) for i, h in enumerate(new)}
+            self._places |= {h: (scalars, i) for i, h in enumerate(new)}
         by_scalars = {}
-        for at, (scalars, i) in enumerate(map(self._read.get, hashes)):
+        for at, (scalars, i) in enumerate(map(self._places.get, hashes)):
             sources, targets = by_scalars.setdefault(scalars, ([], []))
             sources.append(i)
             targets.append(at)

@@ -38,7 +38,7 @@ def _by(r):
 def _raised(r):
     """How often the residuals are differentiated until the accelerations appear: 'X, Z differentiated 2x each'."""
     groups = {}
-    for name, row in r.given.items():
+    for name, row in r.original.items():
         groups.setdefault((max(0, r.top - row.order), row.order), []).append(name)
     parts = []
     for (count, order), names in groups.items():
@@ -66,7 +66,7 @@ def _rule(r):
     if r.program.by == "actuators":
         return f"(3.18) with T from ker Eᵀ; dependent: {dependent}; no rule for the reaction is assumed"
     bent = any(
-        row.order >= 2 or (row.order == 1 and not row.affine) for row in r.given.values() if row.kind == "program"
+        row.order >= 2 or (row.order == 1 and not row.affine) for row in r.original.values() if row.kind == "program"
     )
     rule = "the generalised Chetaev rule, a postulate at this order" if bent else "d'Alembert's principle"
     return f"(3.18) with T from ker G; dependent: {dependent}; under {rule}"

@@ -26,30 +26,30 @@ def complete(q, rows, context, starts=None):
         At most n; each with its settled order.
     context : Context
     starts : Points, optional
-        Where to look for points.
+        Starts for points of the manifold.
 
     Returns
     -------
     rows : list of Row
     rank : Rank
-        Of the final leading matrix, with its margins.
+        Rank of the final leading matrix, with its margins.
     points : Points
-        On the final manifold.
-    guards : list of (str, SX)
-        Pivots by which the combinations divide.
+        Points of the final manifold.
+    pivots : list of (str, SX)
+        Pivots by which the combinations divide, each with a description.
 
     Raises
     ------
     SpecificationError
         If constraints depend on each other or contradict each other.
     NotRealisable
-        If the dependence involves the mechanism's dynamics.
+        If the dependence involves rows of (3.18).
     SingularProgram
         If a row's gradient vanishes on its own solutions, or a rank is undecided in double precision.
     InconsistentStart
         If no state satisfies the rows.
     """
-    rows, guards, points = list(rows), [], starts
+    rows, pivots, points = list(rows), [], starts
     while True:
         level = max([row.order for row in rows], default=0)
         points = sample(q, rows, level, context, starts=points)
@@ -62,12 +62,12 @@ def complete(q, rows, context, starts=None):
             raise _ill_conditioned(rows, rank)
         same = [p for p, other in enumerate(ranks) if other.rank == rank.rank]
         if rank.rank == len(rows):
-            return rows, rank, points.take(same), guards
+            return rows, rank, points.take(same), pivots
         combination = _lowest(q, rows, numbers[:, :, same], context, points)
         if combination.row.order < 0:
             raise _dependent(rows, combination)
         rows[combination.replaces] = combination.row
-        guards += [(f"combination of {combination.row.story}", pivot) for pivot in combination.pivots]
+        pivots += [(f"combination of {combination.row.story}", pivot) for pivot in combination.pivots]
 
 
 @dataclass(frozen=True)
@@ -77,15 +77,15 @@ class _Combination:
     Attributes
     ----------
     row : Row
-        Settled; of order -1 where it depends on t alone.
+        With its true order; -1 if it depends on t alone.
     replaces : int
-        The row of the highest order that it may replace.
+        Index of the row that it replaces, one of the highest order in the support.
     support : list of int
-        The rows that were combined.
+        Indices of the combined rows.
     points : Points
-        On the manifold of all rows but the replaced one.
+        Points on the manifold of all rows but the replaced one.
     pivots : list of SX
-        By which the combination divides.
+        Pivots by which the combination divides.
     """
 
     row: Row
@@ -96,26 +96,25 @@ class _Combination:
 
 
 def _lowest(q, rows, numbers, context, starts=None):
-    """The combination of dependent rows that takes the place of one of them, of lower order than it."""
+    """The combination of dependent rows that replaces one of them by a row of lower order."""
+    # Rows of (3.18) come last and are replaced first: the designer's constraints stay as they are written.
     order = sorted(range(len(rows)), key=lambda a: (rows[a].kind == "dynamics", rows[a].order, a))
-    support, weights = dependence(q, [rows[a] for a in order], numbers[order])
+    support, weights = dependence(numbers[order])
     support = [order[i] for i in support]
     top = max(rows[a].order for a in support)
     highest = ((a, w) for a, w in zip(support, weights, strict=True) if rows[a].order == top)
     b = max((rows[a].kind == "dynamics", w, a) for a, w in highest)[2]
     combination = _combination(q, rows, b, support, numbers, context, starts)
     if combination.row.order >= top:
-        support, numbers = _about(q, rows, b, context)
-        if not support:
-            raise vanishing_gradient(rows[b])
-        combination = _combination(q, rows, b, support, numbers, context)
-        if combination.row.order >= top:
+        support, numbers = _beside_manifold(q, rows, b, context)
+        combination = _combination(q, rows, b, support, numbers, context) if support else None
+        if combination is None or combination.row.order >= top:
             raise vanishing_gradient(rows[b])
     return combination
 
 
 def _combination(q, rows, b, support, numbers, context, starts=None):
-    """Row b combined with the others of a support, settled on the manifold of all other rows."""
+    """Row b combined with the others of a support, with its order on the manifold of all other rows."""
     top = rows[b].order
     _require_affine(rows, support, top)
     others = [a for a in support if a != b]
@@ -130,17 +129,17 @@ def _combination(q, rows, b, support, numbers, context, starts=None):
     return _Combination(replace(row, story=story), b, support, points, pivots)
 
 
-def _about(q, rows, b, context):
-    """The rows that give row b's leading gradient at states of the others, where b itself need not hold, with L there.
+def _beside_manifold(q, rows, b, context):
+    """The rows whose combination is row b's leading gradient where all rows but b hold, and L at such points.
 
-    On the manifold of all rows coefficients may vanish that do not vanish about it: a load that is lifted straight up
-    never swings, and only about its motion is it seen that the combination forbids swinging.
+    Coefficients may vanish on the manifold of all rows and not beside it. A load that is lifted straight up never
+    swings; only beside its motion does the combination show that it forbids swinging.
     """
     order = [*(a for a in range(len(rows)) if a != b and rows[a].order <= rows[b].order), b]
     rest = [row for a, row in enumerate(rows) if a != b]
     points = sample(q, rest, max(row.order for row in rows), context)
     numbers, _ = leading(q, rows, points)
-    support, _ = dependence(q, [rows[a] for a in order], numbers[order])
+    support, _ = dependence(numbers[order])
     return ([order[i] for i in support] if support and support[-1] == len(order) - 1 else []), numbers
 
 
@@ -163,48 +162,51 @@ def _derivative_name(row, k):
 
 
 def _require_affine(rows, support, top):
-    bent = [rows[a].name for a in support if rows[a].order == top and not rows[a].affine]
-    if bent:
+    nonlinear = [rows[a].name for a in support if rows[a].order == top and not rows[a].affine]
+    if nonlinear:
         raise SpecificationError(
-            f"The residual {bent[0]!r} is not linear in its highest derivative and depends on other rows there.",
-            "Hidden constraints are found among rows that are linear in their highest derivatives.",
-            do=f"Give the time derivative of {bent[0]!r}, which is linear in its highest derivative, as the "
-            "residual, and hold the residual itself at the start.",
-            rows=bent,
+            f"The residual {nonlinear[0]!r} is nonlinear in its highest derivative and depends on other rows there.",
+            "Hidden constraints are derived from rows that are linear in their highest derivatives.",
+            do=f"Program the time derivative of {nonlinear[0]!r}, which is linear in its highest derivative, and start "
+            "where the residual is zero.",
+            rows=nonlinear,
         )
 
 
 def _dependent(rows, combination):
-    """What is wrong with rows of which a combination depends on t alone."""
+    """The error of rows whose combination depends on t alone."""
     names, story = [rows[a].name for a in combination.support], combination.row.story
     zero = not np.any(clean(*combination.points.evaluate([combination.row.expression])))
-    what = ", ".join(names)
+    listed = ", ".join(names)
     if any(rows[a].kind == "dynamics" for a in combination.support):
         program = [name for name in names if name != combination.row.name] or names
         return NotRealisable(
-            f"The actuation never reaches the program: the combination {story} "
-            + ("vanishes identically." if zero else "depends on nothing but t and is not zero."),
+            f"No derivative of the program contains the actuation: the combination {story} "
+            + ("vanishes identically." if zero else "depends on t alone and is not zero."),
             "Every residual needs an actuator that moves it.",
             do=f"Change the actuators or the rows {', '.join(program)}.",
             rows=names,
+            combination=story,
         )
     if zero:
         return SpecificationError(
-            f"The constraints {what} are dependent: the combination {story} vanishes identically.",
-            "Constraints are independent of each other.",
-            do=f"Leave out one of {what}.",
+            f"The constraints {listed} are dependent: the combination {story} vanishes identically.",
+            "Constraints must be independent of each other.",
+            do=f"Remove one of {listed}.",
             rows=names,
+            combination=story,
         )
     return SpecificationError(
-        f"The constraints {what} contradict each other: the combination {story} depends on t alone and is not zero.",
-        "Constraints have a common solution.",
-        do=f"Correct one of {what}.",
+        f"The constraints {listed} contradict each other: the combination {story} depends on t alone and is not zero.",
+        "Constraints must have a common solution.",
+        do=f"Correct one of {listed}.",
         rows=names,
+        combination=story,
     )
 
 
 def _no_common_state(q, rows, context):
-    """What is wrong with rows that no point satisfies: a contradiction among them, where there is one."""
+    """The error of rows that no point satisfies: a contradiction among them, where there is one."""
     points = sample(q, [], max(row.order for row in rows), context)
     numbers, sizes = leading(q, rows, points)
     rank, _ = decide_all(numbers, sizes)
@@ -218,19 +220,20 @@ def _no_common_state(q, rows, context):
 
 def _no_state(rows):
     return InconsistentStart(
-        f"No state was found that satisfies {', '.join(sorted({row.name for row in rows}))} with their derivatives.",
-        "Constraints have a common solution near the guess.",
-        do="Give derive a guess={...} near the motion, or correct the constraints.",
+        f"No state satisfies {', '.join(sorted({row.name for row in rows}))} and their time derivatives.",
+        "Newton's method searches for such states about the guess.",
+        do="Pass guess={...} near the motion to derive, or correct the constraints.",
         rows=[row.name for row in rows],
     )
 
 
 def _ill_conditioned(rows, rank):
     return SingularProgram(
-        f"Whether the rows {', '.join(row.name for row in rows)} are independent cannot be told in double precision: "
-        f"the smallest pivot that counts is {rank.kept:.2e}, the largest that does not {rank.dropped:.2e}.",
-        f"An equilibrated pivot is zero (below {NOISE:.0e}) or resolved (above {RESOLVED:.0e}).",
-        do="Move the parameters away from the singular case, or state the singular case exactly.",
+        f"Double precision cannot decide whether the rows {', '.join(row.name for row in rows)} are independent: the "
+        f"smallest pivot that counts is {rank.kept:.2e}, the largest that does not {rank.dropped:.2e}.",
+        f"An equilibrated pivot must be zero (below {NOISE:.0e}) or resolved (above {RESOLVED:.0e}).",
+        do="Move the parameters away from the singular case, or set them to the singular case exactly.",
+        rows=[row.name for row in rows],
         kept=rank.kept,
         dropped=rank.dropped,
     )

@@ -1,8 +1,12 @@
-"""Rank decisions at points of the constraint manifold: zero is a number, and its size is known.
+"""Ranks at points of the constraint manifold, and symbolic elimination with pivots chosen at such points.
 
-Entries far below the size of the terms that made them are zero; the rest is equilibrated, so that units do not
-matter, and eliminated with complete pivoting in extended precision where the platform has it. A pivot is then
-zero (rounding of extended precision), or resolvable in double precision, or between: ill-conditioned.
+Entries far below the size of their terms are zero. The rest is equilibrated, so that units do not matter, and
+eliminated with complete pivoting, in extended precision where the platform has it. A pivot is then zero (rounding of
+extended precision), or resolved in double precision, or between these: ill-conditioned.
+
+Symbolic elimination keeps its pivots for all later instants: it takes the pivot with the least fill-in (Markowitz)
+among those of sufficient size at the points, and leaves out entries that vanish at all of them. It returns the
+pivots, whose size along a motion shows when the choice has become bad.
 """
 
 from dataclasses import dataclass
@@ -14,8 +18,8 @@ from servoctl.errors import SingularProgram
 from servoctl.jets.tape import divide, multiply, subtract
 from servoctl.tolerances import CUTOFF, ENTRY, NOISE, REFINEMENTS, RESOLVED, TINY
 
-THRESHOLD = 0.1  # a pivot may be this much smaller than the largest candidate of its row, after equilibration
-SWEEPS = 6  # of equilibration, each takes the root of what is left: entries of 1e±30 come within a factor of 3
+THRESHOLD = 0.1  # least size of a pivot, relative to the largest entry of its equilibrated row
+SWEEPS = 6  # of equilibration; each takes the square root of the remaining factors: 1e±30 comes within a factor of 3
 
 
 @dataclass(frozen=True)
@@ -26,11 +30,11 @@ class Rank:
     ----------
     rank : int
     kept : float
-        Smallest equilibrated pivot that counts (inf if none).
+        Smallest equilibrated pivot that counts; inf if none does.
     dropped : float
-        Largest equilibrated pivot that does not count (0 if none).
+        Largest equilibrated pivot that does not count; 0 if all do.
     rows, columns : tuple of int
-        The pivots' places, best first.
+        Places of the pivots, largest first.
     """
 
     rank: int
@@ -46,7 +50,7 @@ class Rank:
 
 
 def clean(values, sizes):
-    """Values with every entry that is rounding in the size of its terms set to zero."""
+    """Values with zeros for all entries that are rounding errors of their terms, whose sizes are given."""
     return np.where(np.abs(values) <= ENTRY * sizes, 0.0, values)
 
 
@@ -74,7 +78,7 @@ def equilibrate(matrix):
 
 
 def column_sizes(matrix):
-    """Largest entries of the columns of a matrix (m, n, ...) whose rows are divided by their own: (n, ...) array."""
+    """Largest entries (n, ...) of the columns of a matrix (m, n, ...) whose rows are scaled to largest entry 1."""
     rows = np.abs(matrix).max(axis=1, keepdims=True, initial=0.0)
     return np.abs(matrix / np.where(rows > 0, rows, 1.0)).max(axis=0, initial=0.0)
 
@@ -84,8 +88,9 @@ def decide(matrix, resolved=RESOLVED):
 
     Parameters
     ----------
-    matrix : (m, n) array, entries cleaned
-    resolved : float
+    matrix : (m, n) array
+        With entries cleaned.
+    resolved : float, optional
         Pivots above it count.
 
     Returns
@@ -132,7 +137,7 @@ def decide_each(matrices, resolved=RESOLVED):
 
 
 def decide_all(values, sizes):
-    """The generic rank over several points: that of the point with the highest rank, then the clearest.
+    """The generic rank over several points: the highest rank, at the clearest point that has it.
 
     Parameters
     ----------
@@ -144,7 +149,7 @@ def decide_all(values, sizes):
     Rank
         `kept` is the smallest over the points of that rank, `dropped` the largest over all points.
     index : int
-        The point with the largest smallest kept pivot.
+        The point of that rank whose smallest kept pivot is largest.
     """
     return generic(decide_each(clean(values, sizes)))
 
@@ -160,7 +165,7 @@ def generic(ranks):
 
 
 def combination(rows, target):
-    """Coefficients c with c @ rows = target, and what is left over, relative to the target.
+    """Coefficients c with c @ rows = target, and the residual relative to the target.
 
     Parameters
     ----------
@@ -170,12 +175,12 @@ def combination(rows, target):
     Returns
     -------
     c : (m,) array
-    left : float
+    residual : float
     """
     scaled, row_factors, _ = equilibrate(np.vstack([rows, target[None, :]]))
-    c, left = refined(scaled[:-1], scaled[-1], CUTOFF)
+    c, residual = refined(scaled[:-1], scaled[-1], CUTOFF)
     largest = float(np.abs(scaled[-1].astype(float)).max(initial=0.0))
-    return c * (row_factors[:-1] / row_factors[-1]).astype(float), left / max(largest, TINY)
+    return c * (row_factors[:-1] / row_factors[-1]).astype(float), residual / max(largest, TINY)
 
 
 def refined(rows, target, cutoff):
@@ -188,9 +193,9 @@ def refined(rows, target, cutoff):
 
 
 def solve_clean(matrix, right):
-    """Solve A X = B in extended precision, with every difference that is rounding in its terms set to zero.
+    """Solve A X = B in extended precision, with zeros for all differences that are rounding errors of their terms.
 
-    What vanishes in exact arithmetic is then zero in the solution.
+    Entries that vanish in exact arithmetic are then zero in the solution.
 
     Parameters
     ----------
@@ -217,7 +222,7 @@ def solve_clean(matrix, right):
 
 
 def _difference(a, b):
-    """a - b, zero where it is rounding."""
+    """a - b, zero where it is a rounding error."""
     result = a - b
     return np.where(np.abs(result) <= ENTRY * (np.abs(a) + np.abs(b)), 0.0, result)
 
@@ -257,13 +262,18 @@ def eliminate(matrix, right, numbers):
 
 
 class _System:
-    """Rows that are still to be eliminated, with what the choice of pivots needs to know of them.
+    """A system under elimination.
 
     Attributes
     ----------
     rows : list of dict
-        For each row its entries by column, an SX scalar and its numbers.
+        For each row its entries by column: an SX scalar and its equilibrated numbers.
     rhs : list of lists of SX
+    open : dict with the indices of rows that are not yet pivot rows, in order
+    members : list of dict
+        For each column the open rows that have an entry there.
+    candidates : list of lists
+        For each row the columns whose entries may be pivots, with their sizes.
     """
 
     def __init__(self, matrix, right, numbers):
@@ -277,7 +287,7 @@ class _System:
             [right[i, :].elements() for i in range(n)] if right.shape[1] != 1 else [[b] for b in right.elements()]
         )
         self.open = dict.fromkeys(range(n))
-        self.members = [{} for _ in range(n)]  # of each column: open rows that have an entry there
+        self.members = [{} for _ in range(n)]
         for i, row in enumerate(self.rows):
             for j in row:
                 self.members[j][i] = None
@@ -285,7 +295,7 @@ class _System:
 
     @staticmethod
     def _large(row):
-        """Columns whose entries may be pivots, with their sizes."""
+        """The candidates of a row: a size is the smallest over the points."""
         if not row:
             return []
         sizes = np.abs([number for _, number in row.values()]).min(axis=1).tolist()
@@ -316,8 +326,9 @@ class _System:
         if place is None:
             raise SingularProgram(
                 "A system of equations is singular at the points where its pivots are chosen.",
-                "Pivots are chosen where the equations have full rank.",
-                do="Give derive a guess near the motion.",
+                "Elimination needs equations of full rank.",
+                do="Pass guess={...} near the motion to derive.",
+                rows=list(self.open),
             )
         return place
 

@@ -13,21 +13,21 @@ from servoctl.tolerances import DEPENDENT, ENTRY
 
 TAKES_PART = 1e-12  # coefficient times the largest entry of a row: below this the row is no part of a combination
 SUPPORTS = 1e-9  # equilibrated coefficient, at any point, above which a row is part of a dependence
-BASIS_CUTOFF = 1e-12  # singular values of rows found independent, against the largest
-VANISHED = 1e-5  # of a row's gradient at random points: what is left of it on its solutions, if it is a square
-SQUARE_STEPS = 40  # of Newton's method towards them, which for a square only halves the way at each
-SOLVED = 1e-3  # scaled residual of points at which the gradient of a possible square is looked at
+BASIS_CUTOFF = 1e-12  # relative singular value of independent rows below which a direction is left out
+VANISHED = 1e-5  # gradient on a row's solutions, relative to random points, below which the row is a square
+SQUARE_STEPS = 40  # Newton steps towards these solutions; for a square each only halves the distance
+SOLVED = 1e-3  # scaled residual of points at which the gradient of a possible square is judged
 BESIDE = 0.5  # relative distance of the points with which solutions are compared
 
 
 @dataclass(frozen=True)
 class Balance:
-    """The balance r among the expressions that rows are made of, or one component of it.
+    """The key of the balance r, or of one component of it, beside the names of residuals.
 
     Attributes
     ----------
     component : str
-        Name of a coordinate or quasi-velocity; empty for all of them.
+        Name of a coordinate or quasi-velocity; empty for the whole balance.
     """
 
     component: str = ""
@@ -44,16 +44,16 @@ class Row:
     ----------
     expression : SX scalar
     order : int
-        Highest level on which it depends on the manifold; 0 for q alone, -1 for neither q nor a jet.
+        Highest k with ∂ψ/∂γ^(k) ≠ 0 on the manifold; 0 for q alone, -1 for t alone.
     name : str
     kind : {"program", "material", "dynamics"}
-        Where it came from.
+        Its origin.
     affine : bool
         Whether it is affine in γ^(order).
     story : str
-        What was done to it, if it is a hidden constraint.
+        The combination that it is, if it is a hidden constraint.
     uses : dict of (str or Balance) to int
-        Highest derivative of each program residual, and of the balance, in it.
+        Highest derivative of each residual, and of the balance, that ψ contains.
     """
 
     expression: ca.SX
@@ -66,7 +66,7 @@ class Row:
     _gradients: dict = field(default_factory=dict, repr=False, compare=False)
 
     def gradient(self, q, level=None):
-        """∂ψ/∂γ^(level), (1, n) SX; for level 0 ∂ψ/∂q · V. Default: the row's own order, its leading gradient."""
+        """∂ψ/∂γ^(level), (1, n) SX; for level 0 ∂ψ/∂q · V. Default level: the order, for the leading gradient."""
         level = self.order if level is None else level
         key = self.expression.element_hash(), level
         if key not in self._gradients:
@@ -88,7 +88,26 @@ def merge_uses(*parts):
 
 
 def as_rows(q, named, kind, context):
-    """Rows of named residuals with their true orders."""
+    """Rows of named residuals with their true orders.
+
+    Parameters
+    ----------
+    q : Coordinates
+    named : dict of str to SX scalar
+    kind : {"program", "material"}
+    context : Context
+
+    Returns
+    -------
+    list of Row
+
+    Raises
+    ------
+    SpecificationError
+        If a residual depends on no coordinate.
+    SingularProgram
+        If a residual is a square: its gradient vanishes wherever the residual does.
+    """
     rows = [Row(e, max(q.order(e), 0), name, kind, uses={name: 0}) for name, e in named.items()]
     settled = settle_alone(q, rows, context)
     for row, slopes in settled:
@@ -96,7 +115,7 @@ def as_rows(q, named, kind, context):
             raise SpecificationError(
                 f"The residual {row.name!r} depends on no coordinate.",
                 "A constraint restricts the motion.",
-                do="Use the symbols of the mechanism's coordinates.",
+                do="Write it with the symbols of the mechanism's coordinates.",
                 name=row.name,
             )
         _refuse_square(q, row, context, slopes)
@@ -104,25 +123,26 @@ def as_rows(q, named, kind, context):
 
 
 def _refuse_square(q, row, context, slopes=None):
-    """Refuse a residual whose gradient vanishes where the residual does: φ² = 0 and its like.
+    """Refuse a residual whose gradient vanishes wherever the residual does, such as φ² = 0.
 
-    A gradient without the highest jets is as large on the solutions, which determine these alone, as elsewhere; and
-    so is an entry that holds no coordinate. `slopes` are the values of the gradient at the points, where known.
+    `slopes` are values of the gradient at points, where they are known.
     """
-    slope = row.gradient(q)
-    if row.order > 0 and q.order(slope) < row.order:
+    gradient = row.gradient(q)
+    # The solutions determine only the highest jets: a gradient without these is as large there as anywhere,
+    if row.order > 0 and q.order(gradient) < row.order:
         return
+    # and so is an entry without any coordinate.
     if slopes is not None:
-        sizes, columns = np.abs(slopes), slope.sparsity().get_triplet()[1]
+        sizes, columns = np.abs(slopes), gradient.sparsity().get_triplet()[1]
         clear = np.all(sizes > VANISHED * sizes.max(axis=0), axis=1)
-        if any(clear[i] and q.order(e) < 0 for i, e in zip(columns, slope.nonzeros(), strict=True)):
+        if any(clear[i] and q.order(e) < 0 for i, e in zip(columns, gradient.nonzeros(), strict=True)):
             return
     start = sample(q, [], row.order, context)
     flow = Flow(q, [row], row.order, start)
     z, residual = solve(flow, start.t, start.z, iterations=SQUARE_STEPS)
     sizes = []
     for jets in (start.z, z):
-        values, _ = replace(start, z=jets).matrix(row.gradient(q))
+        values, _ = replace(start, z=jets).matrix(gradient)
         sizes.append(np.abs(values).max(axis=(0, 1)))
     solved = residual < SOLVED
     if solved.any() and np.all(sizes[1][solved] < VANISHED * sizes[0][solved]):
@@ -131,9 +151,9 @@ def _refuse_square(q, row, context, slopes=None):
 
 
 def _regular_nearby(flow, t, z):
-    """Whether a gradient is small on a row's solutions z only as all is small there: it is no smaller than beside them.
+    """Whether a row's gradient at its solutions z is no smaller than beside them, where all of it is small.
 
-    Newton's method has converged at a regular solution; at that of a square its steps only halve the way.
+    At a regular solution Newton's method has converged; towards that of a square its steps only halve the distance.
     """
     residual, slopes = flow(t, z)
     beside = z * (1.0 + np.random.default_rng(POINTS_SEED).uniform(-BESIDE, BESIDE, z.shape))
@@ -148,25 +168,27 @@ def vanishing_gradient(row):
     """The error of a row whose gradient vanishes wherever the row holds."""
     return SingularProgram(
         f"The gradient of row {row.name!r} vanishes on its own solutions.",
-        "A constraint is regular: a squared one, like φ² = 0, says nothing about the directions in which φ grows.",
-        do=f"Write {row.name!r} so that it changes sign where it is crossed: what was squared, not its square.",
+        "A constraint φ = 0 needs a gradient there; that of φ² = 0 is zero and determines no direction of the motion.",
+        do=f"Write {row.name!r} without the square, so that it changes sign at its solutions.",
         row=row.name,
     )
 
 
 def leading(q, rows, points):
-    """The cleaned leading matrix L at points, (rows, n, N), and the sizes of its entries."""
+    """The leading matrix L at points, (rows, n, N), with rounding set to zero, and the sizes of its entries."""
     values, sizes = points.matrix(ca.vertcat(*(row.gradient(q) for row in rows)))
     return clean(values, sizes), sizes
 
 
 def settle_alone(q, rows, context):
-    """Each row settled without others (see `settle`), most of them by one look at all leading gradients.
+    """The true order of each row by itself; see `settle`.
+
+    For most rows one evaluation of all leading gradients decides, and `settle` treats the rest.
 
     Returns
     -------
     list of (Row, (n, N) array or None)
-        With the values of its leading gradient at the points, where this look was enough.
+        Each row, and the values of its leading gradient at the points if that evaluation decided.
     """
     levels = [q.order(row.expression) for row in rows]
     settled = [None] * len(rows)
@@ -184,10 +206,10 @@ def settle_alone(q, rows, context):
 
 
 def settle(q, row, others, context, starts=None):
-    """Find the order on which a row depends on the manifold of the others, and free it of false symbols.
+    """Determine the order of a row on the manifold of other rows, and eliminate jets that it only seems to contain.
 
-    From its highest symbol downwards: jets on which the row does not depend there are set to zero; jets that
-    the other rows determine are replaced by what those rows say.
+    From the highest jet downwards: a jet with a zero gradient is set to zero, and a jet that the other rows
+    determine is replaced by their solution.
 
     Parameters
     ----------
@@ -195,13 +217,14 @@ def settle(q, row, others, context, starts=None):
     row : Row
         Its `order` is an upper bound.
     others : list of Row
+    context : Context
     starts : Points, optional
-        Where to look for points.
+        Starts for points of the manifold.
 
     Returns
     -------
-    Row
-        With its true order (-1 for none), or `None` if no point satisfies the others.
+    Row or None
+        With its true order, -1 for none; None if no point satisfies the other rows.
     points : Points
     """
     level = max([row.order, q.order(row.expression), 0, *(other.order for other in others)])
@@ -209,23 +232,22 @@ def settle(q, row, others, context, starts=None):
     if not len(points.t):
         return None, points
     for j in range(q.order(row.expression), -1, -1):
-        values, sizes = points.matrix(row.gradient(q, j))
-        values = clean(values, sizes)[0]
+        values = clean(*points.matrix(row.gradient(q, j)))[0]
         if np.any(values):
             lower = [other for other in others if other.order < j or (other.order == j and other.affine and j > 0)]
-            replaced = _replace(q, row, j, values, lower, points)
-            if replaced is None:
+            eliminated = _eliminated(q, row, j, values, lower, points)
+            if eliminated is None:
                 return replace(row, order=j, affine=_affine(q, row.expression, j, points)), points
-            row = replaced
+            row = eliminated
         elif j > 0:
-            row = _drop(q, row, q.gamma(j), points)
+            row = _without(q, row, q.gamma(j), points)
     if q.order(row.expression) == 0 and not np.any(clean(*points.matrix(row.gradient(q, 0)))):
         return replace(row, order=-1), points
     return replace(row, order=max(q.order(row.expression), -1)), points
 
 
-def _drop(q, row, symbols, points):
-    """The row with jets on which it does not depend set to zero; unchanged if its value would change."""
+def _without(q, row, symbols, points):
+    """The row with jets set to zero, or the row itself if that changes its value at a point."""
     expression = ca.substitute(row.expression, ca.vertcat(*symbols), ca.SX.zeros(len(symbols)))
     values, sizes = points.evaluate([expression, row.expression])
     same = np.abs(values[0] - values[1]) <= ENTRY * (sizes[0] + sizes[1])
@@ -233,18 +255,16 @@ def _drop(q, row, symbols, points):
 
 
 def _affine(q, expression, j, points):
+    """Whether an expression is affine in γ^(j); rows of order 0 count as affine."""
     if j == 0:
         return True
     jets = q.jet(j)
     second = ca.jacobian(ca.vec(ca.jacobian(expression, jets)), jets)
-    if not second.nnz():
-        return True
-    values, sizes = points.evaluate(second.nonzeros())
-    return not np.any(clean(values, sizes))
+    return not second.nnz() or not np.any(clean(*points.evaluate(second.nonzeros())))
 
 
-def _replace(q, row, j, values, lower, points):
-    """The row with γ^(j) replaced by what the lower rows say, or None where they do not determine it."""
+def _eliminated(q, row, j, values, lower, points):
+    """The row with γ^(j) replaced by the solution of lower rows, or None where these do not determine it."""
     if not lower:
         return None
     numbers, _ = leading(q, lower, points)
@@ -254,37 +274,26 @@ def _replace(q, row, j, values, lower, points):
         if left > DEPENDENT:
             return None
         support |= set(np.flatnonzero(np.abs(c * np.abs(numbers[:, :, p]).max(axis=1).astype(float)) > TAKES_PART))
-    chosen = _independent([lower[a] for a in sorted(support)], numbers[sorted(support)])
-    if not chosen or any(other.order == j and not other.affine for other, _ in chosen):
+    basis = []
+    for a in sorted(support):
+        if decide(numbers[[*basis, a], :, 0]).rank == len(basis) + 1:
+            basis.append(a)
+    rows, numbers = [lower[a] for a in basis], numbers[basis]
+    if not rows or any(other.order == j and not other.affine for other in rows):
         return None
-    rows, numbers = [other for other, _ in chosen], np.array([n for _, n in chosen])
     columns = sorted(decide(numbers[:, :, 0]).columns)
-    jets = q.gamma(j)
-    zero = ca.SX.zeros(len(jets))
+    jets = q.jet(j)
     raised = ca.vertcat(*(q.derivatives([other.expression], j - other.order)[-1][0] for other in rows))
-    rest = ca.substitute(raised, ca.vertcat(*jets), zero)
+    rest = ca.substitute(raised, jets, ca.SX.zeros(q.n))
     matrix = ca.vertcat(*(other.gradient(q) for other in rows))[:, columns]
-    solution, _ = eliminate(matrix, -rest, numbers[:, columns])
-    full = ca.SX.zeros(len(jets))
-    full[columns] = solution
+    solution = ca.SX.zeros(q.n)
+    solution[columns], _ = eliminate(matrix, -rest, numbers[:, columns])
     uses = merge_uses((row.uses, 0), *((other.uses, j - other.order) for other in rows))
-    return replace(row, expression=ca.cse(ca.substitute(row.expression, ca.vertcat(*jets), full)), uses=uses)
+    return replace(row, expression=ca.cse(ca.substitute(row.expression, jets, solution)), uses=uses)
 
 
-def _independent(rows, numbers):
-    """A largest independent subset of rows, with their numbers."""
-    independent = []
-    for row, number in zip(rows, numbers, strict=True):
-        trial = [*independent, (row, number)]
-        if decide(np.array([n[:, 0] for _, n in trial])).rank == len(trial):
-            independent = trial
-    return independent
-
-
-def dependence(q, rows, numbers):
-    """One dependent row and the combination of others that gives its leading gradient.
-
-    Rows are taken in the order given; the first that depends on those before it is reported.
+def dependence(numbers):
+    """The first row whose leading gradient is a combination of those before it, and that combination.
 
     Parameters
     ----------
@@ -294,13 +303,13 @@ def dependence(q, rows, numbers):
     Returns
     -------
     support : list of int
-        Indices of the rows of the combination, the dependent one last.
+        Indices of the rows of the combination, the dependent one last; empty if no row is dependent.
     weights : (len(support),) array
-        Equilibrated size of each row's coefficient, smallest over the points; 1 for the dependent row.
+        Smallest size over the points of each equilibrated coefficient; 1 for the dependent row.
     """
     scaled = np.moveaxis(equilibrate(np.moveaxis(numbers, 2, 0))[0], 0, 2)
     basis = []
-    for b in range(len(rows)):
+    for b in range(len(scaled)):
         coefficients, left = [], []
         for p in range(scaled.shape[2]):
             c, rest = refined(scaled[basis, :, p], scaled[b, :, p], BASIS_CUTOFF)

@@ -16,7 +16,7 @@ from servoctl.tolerances import ENTRY
 
 IDENTITY_SEED = 20021  # of the random points at which identities are tested
 RANDOM = (0.3, 1.3)  # where these lie, parameters in units of their defaults: of order one, and away from zero
-INTEGRABLE = 1e-9  # of the largest bracket of columns of V: what may lie outside their span
+INTEGRABLE = 1e-9  # part of the brackets of V's columns outside their span, relative to the largest bracket
 
 
 class Mechanism:
