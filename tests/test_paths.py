@@ -209,7 +209,7 @@ def test_spline_takes_a_derivative_by_taylor_arithmetic_as_by_jacobians():
         (lambda: paths.trapezoid(T, 1, duration=2.0, ramp=1.5), ["1.5 s", "2 s", "longest ramp is 1 s"]),
         (lambda: paths.trapezoid(T, 1, duration=2.0, ramp=1.0, smoothness=0), ["smoothness = 0", "at least 1"]),
         (lambda: paths.circle(T, (0, 0), -1.0), ["radius = -1", "radius = 1"]),
-        (lambda: paths.circle(T, (0, 0, 0), 1.0), ["3 entries", "axes are not given"]),
+        (lambda: paths.circle(T, (0, 0, 0), 1.0), ["3 entries", "no axes"]),
         (lambda: paths.circle(T, (0, 0, 0), 1.0, ((1, 0), (0, 1))), ["centre has 3", "axes[0] has 2"]),
         (lambda: paths.circle(T, (0, 0), 1.0, ((1, 0), (1, 1))), ["right angles"]),
         (lambda: paths.circle(T, (0, 0), 1.0, 5), ["axes are 5", "pair"]),

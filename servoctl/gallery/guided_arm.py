@@ -36,6 +36,8 @@ def guided_arm(n=4, k=2, coordinates="joints"):
             f"k = {k} guided joints of {n}.",
             "At least one is guided and one is not.",
             nearest=f"k = {min(max(k, 1), n - 1)}.",
+            n=n,
+            k=k,
         )
     q, length = list(mechanism.q), mechanism.parameters.l
     inclinations = [sum(q[: i + 1]) for i in range(n)] if coordinates == "joints" else q[2::3]

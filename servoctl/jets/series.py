@@ -25,12 +25,14 @@ def is_zero(c):
     return c.__class__ in _NUMBERS and c == 0
 
 
+def _times(a, b):
+    return 0.0 if is_zero(a) or is_zero(b) else multiply(a, b)
+
+
 def _dot(pairs):
     total = 0.0
     for a, b in pairs:
-        if not (is_zero(a) or is_zero(b)):
-            product = multiply(a, b)
-            total = product if is_zero(total) else add(total, product)
+        total = _plus(total, _times(a, b))
     return total
 
 
@@ -83,36 +85,9 @@ class Series:
 
     def advance(self):
         """Compute the next coefficient of every node."""
-        k, c = self.k, self.c
-        if k == 0:
-            self._start()
-        else:
-            for i, node in enumerate(self.nodes):
-                c[i].append(self._coefficient(node, i, k))
+        for i, node in enumerate(self.nodes):
+            self.c[i].append(self._coefficient(node, i, self.k))
         self.k += 1
-
-    def _start(self):
-        """Coefficient 0 of every node: its value, without the recurrences."""
-        c, inputs = self.c, self.inputs
-        for i, (kind, args, data) in enumerate(self.nodes):
-            if kind == "mul":
-                a, b = c[args[0]][0], c[args[1]][0]
-                value = 0.0 if is_zero(a) or is_zero(b) else multiply(a, b)
-            elif kind == "add":
-                value = _plus(c[args[0]][0], c[args[1]][0])
-            elif kind == "sub":
-                a, b = c[args[0]][0], c[args[1]][0]
-                value = _minus(a, b)
-            elif kind == "neg":
-                a = c[args[0]][0]
-                value = 0.0 if is_zero(a) else -a
-            elif kind == "input":
-                value = inputs[data][0]
-            elif kind == "const":
-                value = data
-            else:
-                value = self._coefficient(self.nodes[i], i, 0)
-            c[i].append(value)
 
     def replace_last(self, coefficients):
         """Recompute the last coefficient with new last coefficients of inputs, a dict by index of the input."""
@@ -124,20 +99,31 @@ class Series:
         self.advance()
 
     def _coefficient(self, node, i, k):
-        c, kind = self.c, node.kind
+        """Coefficient k of node i from lower ones of all nodes and coefficients k of earlier nodes."""
+        c, (kind, args, data) = self.c, node
+        if kind in ("mul", "add", "sub", "div"):
+            a, b = c[args[0]], c[args[1]]
+            if kind == "mul":
+                return _dot((a[j], b[k - j]) for j in _inner_first(k)) if k else _times(a[0], b[0])
+            if kind == "add":
+                return _plus(a[k], b[k])
+            if kind == "sub":
+                return _minus(a[k], b[k])
+            rest = _minus(a[k], _dot((c[i][j], b[k - j]) for j in _inner_first(k) if j < k))
+            return 0.0 if is_zero(rest) else divide(rest, b[0])
         if kind == "input":
-            return self.inputs[node.data][k]
+            return self.inputs[data][k]
         if kind == "const":
-            return node.data if k == 0 else 0.0
+            return data if k == 0 else 0.0
         if kind == "quad":
             return self._quadrature(node, k)
         if kind == "constant":
-            return apply(node.data, *(self._deciding(j) for j in node.args)) if k == 0 else 0.0
-        a = c[node.args[0]]
+            return apply(data, *(self._deciding(j) for j in args)) if k == 0 else 0.0
+        a = c[args[0]]
         if kind == "neg":
             return 0.0 if is_zero(a[k]) else -a[k]
         if kind == "scale":
-            return multiply(a[k], node.data)
+            return multiply(a[k], data)
         if kind == "copy":
             return a[k]
         if kind == "sq":
@@ -145,21 +131,8 @@ class Series:
         if kind == "sqrt":
             return self._root(a, c[i], k)
         if kind == "power":
-            return self._constant_power(a, c[i], node.data, k)
-        if kind in ("fabs", "gate", "fmin", "fmax"):
-            return self._branch(node, k)
-        b = c[node.args[1]]
-        if kind == "add":
-            return _plus(a[k], b[k])
-        if kind == "sub":
-            return _minus(a[k], b[k])
-        if kind == "mul":
-            return _dot((a[j], b[k - j]) for j in _inner_first(k))
-        if kind == "div":
-            y = c[i]
-            rest = _minus(a[k], _dot((y[j], b[k - j]) for j in _inner_first(k) if j < k))
-            return 0.0 if is_zero(rest) else divide(rest, b[0])
-        raise TypeError(f"a tape holds a node of kind {kind!r}")
+            return self._constant_power(a, c[i], data, k)
+        return self._branch(node, k)
 
     def _deciding(self, node):
         """The value of a node by which branches are taken."""
@@ -177,9 +150,7 @@ class Series:
 
     @staticmethod
     def _square(a, k):
-        if k == 0:
-            return 0.0 if is_zero(a[0]) else multiply(a[0], a[0])
-        inner = multiply(a[k // 2], a[k // 2]) if k % 2 == 0 and not is_zero(a[k // 2]) else 0.0
+        inner = 0.0 if k % 2 else _times(a[k // 2], a[k // 2])
         return _plus(inner, multiply(2.0, _dot((a[j], a[k - j]) for j in reversed(range((k + 1) // 2)))))
 
     @staticmethod

@@ -72,27 +72,13 @@ def complete(q, rows, context, starts=None):
 
 @dataclass(frozen=True)
 class _Combination:
-    """A combination of rows whose leading gradients cancel.
+    """A combination of rows whose leading gradients cancel."""
 
-    Attributes
-    ----------
-    row : Row
-        With its true order; -1 if it depends on t alone.
-    replaces : int
-        Index of the row that it replaces, one of the highest order in the support.
-    support : list of int
-        Indices of the combined rows.
-    points : Points
-        Points on the manifold of all rows but the replaced one.
-    pivots : list of SX
-        Pivots by which the combination divides.
-    """
-
-    row: Row
-    replaces: int
-    support: list
-    points: object
-    pivots: list
+    row: Row  # with its true order, -1 if it depends on t alone
+    replaces: int  # index of the row that it replaces, one of the highest order in the support
+    support: list  # indices of the combined rows
+    points: object  # on the manifold of all rows but the replaced one
+    pivots: list  # SX by which the combination divides
 
 
 def _lowest(q, rows, numbers, context, starts=None):

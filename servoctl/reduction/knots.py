@@ -21,7 +21,6 @@ STAYS = 0.5  # a jump keeps more than this fraction of its size from far to clos
 AROUND = np.setdiff1d(np.linspace(-1.0, 1.0, 41), [0.0])  # places in the neighbourhood for the size of a derivative
 EXTRA = 4  # additional coefficients for shifting series to the instant itself
 ALONE = 0.5  # s, the neighbourhood of a single switch
-OTHER_JETS = 0.3  # and more, in steps of 0.1: values of jets, on which no switch depends
 
 
 @dataclass(frozen=True)
@@ -168,7 +167,8 @@ class Switches:
             elif place[0] == "t":
                 first = t
             else:
-                first = np.longdouble(OTHER_JETS + 0.1 * ((7 * i) % 10))
+                # No switch depends on jets; these values keep divisions by them from zero.
+                first = np.longdouble(0.3 + 0.1 * ((7 * i) % 10))
             inputs.append([first, *(float(k == 1 and place is not None and place[0] == "t") for k in range(1, depth))])
         series = Series(self.tape, inputs)
         with np.errstate(all="ignore"):
@@ -265,21 +265,7 @@ _PIECE = {
 
 
 def require_smooth(switches, values, needs, span=None):
-    """The knots of a program whose paths are as smooth as needed.
-
-    Parameters
-    ----------
-    switches : Switches
-    values : (n_p,) array
-        Parameters.
-    needs : dict of str to int
-        The class that each residual needs.
-    span : (t0, t1), optional
-        See `Switches.times`.
-
-    Returns
-    -------
-    Knots
+    """The knots of paths that have the class that each residual needs, a dict by name.
 
     Raises
     ------

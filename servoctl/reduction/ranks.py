@@ -84,29 +84,19 @@ def column_sizes(matrix):
 
 
 def decide(matrix, resolved=RESOLVED):
-    """The rank of one matrix, by equilibration and complete pivoting.
-
-    Parameters
-    ----------
-    matrix : (m, n) array
-        With entries cleaned.
-    resolved : float, optional
-        Pivots above it count.
-
-    Returns
-    -------
-    Rank
-    """
+    """The rank of one matrix (m, n); see `decide_each`."""
     return decide_each(np.asarray(matrix)[:, :, None], resolved)[0]
 
 
 def decide_each(matrices, resolved=RESOLVED):
-    """The rank of each of N matrices (see `decide`).
+    """The rank of each of N matrices, by equilibration and complete pivoting.
 
     Parameters
     ----------
     matrices : (m, n, N) array
         With entries cleaned.
+    resolved : float, optional
+        Equilibrated pivots above it count.
 
     Returns
     -------
@@ -264,16 +254,8 @@ def eliminate(matrix, right, numbers):
 class _System:
     """A system under elimination.
 
-    Attributes
-    ----------
-    rows : list of dict
-        For each row its entries by column: an SX scalar and its equilibrated numbers.
-    rhs : list of lists of SX
-    open : dict with the indices of rows that are not yet pivot rows, in order
-    members : list of dict
-        For each column the open rows that have an entry there.
-    candidates : list of lists
-        For each row the columns whose entries may be pivots, with their sizes.
+    `rows` has for each row its entries by column, an SX scalar with its equilibrated numbers, and `candidates` the
+    columns whose entries may be pivots; `open` lists the rows that were no pivot rows yet, `members` those of a column.
     """
 
     def __init__(self, matrix, right, numbers):

@@ -88,18 +88,7 @@ def merge_uses(*parts):
 
 
 def as_rows(q, named, kind, context):
-    """Rows of named residuals with their true orders.
-
-    Parameters
-    ----------
-    q : Coordinates
-    named : dict of str to SX scalar
-    kind : {"program", "material"}
-    context : Context
-
-    Returns
-    -------
-    list of Row
+    """Rows of residuals by name, of kind "program" or "material", with their true orders.
 
     Raises
     ------

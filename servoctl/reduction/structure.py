@@ -89,15 +89,13 @@ class Structure:
             f"  smallest pivot counted {self.margin:.1e}",
         ]
         if not self.uniform:
-            other = [(t, a) for t, a in self.at if replace(a, margin=0.0) != replace(self._typical(), margin=0.0)]
+            typical = _most_common([local for _, local in self.at])
+            other = [(t, a) for t, a in self.at if replace(a, margin=0.0) != typical]
             lines.append(
                 f"  it differs at {len(other)} of {len(self.at)} instants, first t = {other[0][0]:.4g} s: relative "
                 f"degrees {other[0][1].relative_degree}, zeros at infinity {other[0][1].zeros_at_infinity}"
             )
         return "\n".join(lines)
-
-    def _typical(self):
-        return _most_common([local for _, local in self.at])
 
 
 def structure(reduction, t=None, jets=None, values=None):
@@ -136,8 +134,7 @@ def structure(reduction, t=None, jets=None, values=None):
 
 
 def _most_common(locals_):
-    counts = Counter(replace(local, margin=0.0) for local in locals_)
-    return counts.most_common(1)[0][0]
+    return Counter(replace(local, margin=0.0) for local in locals_).most_common(1)[0][0]
 
 
 def _by_orders(reduction, names, orders):
