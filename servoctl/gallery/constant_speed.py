@@ -1,4 +1,4 @@
-"""A particle kept at constant speed in gravity."""
+"""A particle at constant speed in gravity."""
 
 import casadi as ca
 

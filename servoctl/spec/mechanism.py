@@ -20,7 +20,7 @@ INTEGRABLE = 1e-9  # part of the brackets of V's columns outside their span, rel
 
 
 class Mechanism:
-    """A mechanism under given forces, actuators and material constraints.
+    """A mechanism with forces, actuators and material constraints.
 
     Main arguments
 
@@ -45,7 +45,7 @@ class Mechanism:
     forces : dict of str to SX, or (n,) SX, optional
         Generalised forces by coordinate (or quasi-velocity) name.
     constraints : dict of str to SX, optional
-        Material constraints, of order 0, 1 or 2: realised by nature, ideally.
+        Material constraints of order 0, 1 or 2, realised by ideal reactions.
     outputs : dict of str to SX, optional
         Named outputs, expressions of t, q and jets.
 

@@ -63,7 +63,9 @@ class Parameters:
         """
         numbers = dict(self.defaults)
         if changes is not None and not isinstance(changes, dict):
-            raise SpecificationError(f"The parameters are {changes!r}.", "Parameters change by name, in a dict.")
+            raise SpecificationError(
+                f"The parameters are {changes!r}.", "Parameters change by name, in a dict.", values=changes
+            )
         for name, value in (changes or {}).items():
             if name not in numbers:
                 raise unknown(name, list(numbers), "parameter")
