@@ -99,7 +99,7 @@ _REFUSED = {
     ca.OP_FLOOR: "floor", ca.OP_CEIL: "ceil", ca.OP_FMOD: "fmod", ca.OP_REMAINDER: "remainder",
     ca.OP_COPYSIGN: "copysign", ca.OP_ERFINV: "erfinv",
 }  # fmt: skip
-_OPTIONS = {"allow_free": True, "live_variables": False}  # CasADi reuses no place, so instruction k writes to place k
+_OPTIONS = {"allow_free": True, "live_variables": False}  # no place is reused: operations fill them in order
 
 
 class Tape:

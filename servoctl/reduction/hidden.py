@@ -83,7 +83,8 @@ class _Combination:
 
 def _lowest(q, rows, numbers, context, starts=None):
     """The combination of dependent rows that replaces one of them by a row of lower order."""
-    # Rows of (3.18) come last and are replaced first: the designer's constraints stay as they are written.
+    # Rows of (3.18) come last, and are replaced first among those of highest order: where it can be, the designer's
+    # constraints stay as they are written.
     order = sorted(range(len(rows)), key=lambda a: (rows[a].kind == "dynamics", rows[a].order, a))
     support, weights = dependence(numbers[order])
     support = [order[i] for i in support]
