@@ -266,8 +266,8 @@ def as_text(reduction):
         ("actuation", reduction.actuation),
         ("multipliers", reduction.multipliers),
     ]
-    rows = [(row.name, row.expression) for row in (*reduction.rows, *reduction.given.values())]
-    return [(name, str(expression)) for name, expression in (*rows, *reduction.guards, *matrices)]
+    rows = [(row.name, row.expression) for row in (*reduction.rows, *reduction.original.values())]
+    return [(name, str(expression)) for name, expression in (*rows, *reduction.pivots, *matrices)]
 
 
 @pytest.mark.parametrize("name", gallery)

@@ -13,8 +13,7 @@ from servoctl.codegen.function import compiled
 from servoctl.errors import SpecificationError, unknown
 from servoctl.figures import style
 from servoctl.methods.choice import Taylor
-from servoctl.reduction.elimination import eliminate
-from servoctl.reduction.ranks import clean, decide_all
+from servoctl.reduction.ranks import clean, decide_all, eliminate
 from servoctl.simulation import consistent_state, simulate
 from servoctl.study.table import Study, machine
 
@@ -58,7 +57,7 @@ def servo_dae(model, form):
 
 def _step(equations, form, name):
     r, q = equations.r, equations.q
-    rows = list(r.given.values())
+    rows = list(r.original.values())
     high = [row.name for row in rows if row.order > 1]
     if high:
         raise SpecificationError(

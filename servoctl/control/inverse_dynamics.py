@@ -18,12 +18,10 @@ from servoctl.control.reference import Reference, refuse_transport, require_plan
 from servoctl.control.sampling import sampled_radii
 from servoctl.errors import NotRealisable, SpecificationError, UnstableInternalDynamics, unknown
 from servoctl.internal_dynamics import internal_dynamics
-from servoctl.jets.evaluation import evaluate
-from servoctl.jets.tape import Tape
+from servoctl.jets.tape import Tape, evaluate
 from servoctl.methods.stability import sampled_bound
-from servoctl.reduction.elimination import eliminate
 from servoctl.reduction.knots import require_smooth
-from servoctl.reduction.ranks import clean, decide, decide_all
+from servoctl.reduction.ranks import clean, decide, decide_all, eliminate
 
 RANK_POINTS, AWAY, SEED = 8, 0.02, 20240229  # states along the plan, and how far beside them ranks are decided
 SHARE = 1e-9  # of the largest, in rows and columns of like size: entries below it are rounding

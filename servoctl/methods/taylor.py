@@ -11,14 +11,12 @@ import casadi as ca
 import numpy as np
 
 from servoctl.codegen.function import compiled
-from servoctl.jets.motion import Motion, shifted
-from servoctl.jets.series import Series, is_zero
+from servoctl.jets.series import Motion, Series, is_zero, shifted
 from servoctl.jets.tape import Tape
 from servoctl.methods.choice import Project
 from servoctl.methods.monitor import DenseStretch, Fine, Repivot
 from servoctl.methods.motion import Stepping
-from servoctl.reduction.elimination import eliminate
-from servoctl.reduction.ranks import clean
+from servoctl.reduction.ranks import clean, eliminate
 
 LOWEST, HIGHEST = 4, 24  # orders: below, steps are too short; above, compiling grows faster than steps
 

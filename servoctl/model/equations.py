@@ -8,8 +8,7 @@ import numpy as np
 from servoctl.errors import SpecificationError
 from servoctl.model import saddle
 from servoctl.reduction.appell import plant_accelerations
-from servoctl.reduction.elimination import eliminate
-from servoctl.reduction.ranks import clean, column_sizes
+from servoctl.reduction.ranks import clean, column_sizes, eliminate
 from servoctl.spec.coordinates import jet_name
 
 
@@ -138,7 +137,7 @@ class Equations(Invariants):
     def pivots(self):
         """Pivots that depend on the motion, which must not vanish: a list of (name, SX)."""
         leading = self.saddle[2] if self.sparse else self._solve(ca.SX(self.q.n, 0))[1]
-        named = [*self.r.guards, *((f"leading matrix {i + 1}", p) for i, p in enumerate(leading))]
+        named = [*self.r.pivots, *((f"leading matrix {i + 1}", p) for i, p in enumerate(leading))]
         return [(name, p) for name, p in named if any(self.q.where(s) is not None for s in ca.symvar(p))]
 
     @property
@@ -233,7 +232,7 @@ class Equations(Invariants):
         zero = ca.SX.zeros(q.n)
         inputs = ca.SX.sym("input", r.actuation.shape[0])
         driven = mechanism.E @ inputs if r.program.by == "actuators" else inputs
-        material = [row for row in r.given.values() if row.kind == "material"]
+        material = [row for row in r.original.values() if row.kind == "material"]
         second = [q.derivatives([row.expression], 2 - row.order)[-1][0] for row in material]
         second = ca.substitute(ca.vertcat(*second), acceleration, zero) if material else ca.SX(0, 1)
         force = driven - ca.substitute(mechanism.balance, acceleration, zero)
@@ -245,7 +244,7 @@ class Equations(Invariants):
         """Matrix and right side, column by column, of [M -B; C 0] [γ''; μ]: the form with multipliers."""
         r, q = self.r, self.q
         acceleration, zero = q.jet(2), ca.SX.zeros(q.n)
-        rows = [row for row in r.given.values() if row.order <= 1 or (row.order == 2 and row.affine)]
+        rows = [row for row in r.original.values() if row.order <= 1 or (row.order == 2 and row.affine)]
         second = ca.vertcat(*(q.derivatives([row.expression], 2 - row.order)[-1][0] for row in rows))
         B = r.realisation.B
         C = ca.jacobian(second, acceleration) if rows else ca.SX(0, q.n)
@@ -368,7 +367,7 @@ def _level_name(name, j):
 def residual_rows(reduction):
     """Rows whose residuals a run reports, by name."""
     hidden = {f"hidden: {row.name}": row for row in reduction.rows if row.story}
-    return {**reduction.given, **hidden}
+    return {**reduction.original, **hidden}
 
 
 def leading_names(reduction):
@@ -383,7 +382,7 @@ def leading_names(reduction):
 def gradient_jets(reduction, name):
     """Names of the jets on which the leading gradient of a row depends."""
     q = reduction.mechanism.q
-    for row in (*reduction.rows, *reduction.given.values()):
+    for row in (*reduction.rows, *reduction.original.values()):
         if row.name == name:
             places = [q.where(s) for s in ca.symvar(row.gradient(q))]
             return [q.jet_names(level)[i] for kind, level, i in filter(None, places) if kind != "t"]

@@ -28,7 +28,7 @@ def _by(r):
 def _raised(r):
     """'X, Z (order 0) differentiated 2x each': until the accelerations appear."""
     groups = {}
-    for name, row in r.given.items():
+    for name, row in r.original.items():
         groups.setdefault((max(0, r.top - row.order), row.order), []).append(name)
     parts = []
     for (count, order), names in groups.items():
@@ -55,7 +55,7 @@ def _rule(r):
     dependent = ", ".join(names[i] for i in r.realisation.dependent) or "none"
     if r.program.by == "actuators":
         return f"(3.18) with T from ker Eᵀ; dependent: {dependent}; no rule for the reaction is assumed"
-    program = [row for row in r.given.values() if row.kind == "program"]
+    program = [row for row in r.original.values() if row.kind == "program"]
     classical = all(row.order == 0 or (row.order == 1 and row.affine) for row in program)
     rule = "d'Alembert's principle" if classical else "the generalised Chetaev rule, a postulate at this order"
     return f"(3.18) with T from ker G; dependent: {dependent}; under {rule}"

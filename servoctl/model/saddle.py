@@ -9,8 +9,7 @@ import casadi as ca
 
 from servoctl.codegen.emit import operations
 from servoctl.errors import SpecificationError
-from servoctl.reduction.elimination import eliminate
-from servoctl.reduction.ranks import clean
+from servoctl.reduction.ranks import clean, eliminate
 
 FEW = 8  # quasi-velocities: up to this number (3.18) takes about as few operations
 CLOSE = 1.1  # ratio of operations up to which the forms are compared after common terms are merged

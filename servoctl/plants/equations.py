@@ -9,8 +9,9 @@ import numpy as np
 from servoctl.codegen.folding import folded
 from servoctl.model.equations import Invariants
 from servoctl.reduction.appell import plant_accelerations, require_inertia
-from servoctl.reduction.hidden import as_rows, complete
+from servoctl.reduction.hidden import complete
 from servoctl.reduction.manifold import Context
+from servoctl.reduction.rows import as_rows
 
 LATEST = 32  # plants whose equations stay in memory
 CLEAR = 1e-6  # a mass matrix with unit diagonal and a larger least eigenvalue is clearly positive definite
