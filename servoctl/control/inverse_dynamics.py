@@ -335,7 +335,7 @@ def computed(plan, plant, rate=100.0, poles=None, delay=0):
         name="computed", measures=plant.state_names, inputs=plant.inputs, rate=rate, t0=float(plan.t[0]),
         step=linear.step, schedule=np.column_stack([np.concatenate(column) for column in columns]),
         state=np.zeros(len(linear.state_names)), state_names=linear.state_names,
-        idle=np.array([plan[name][0] for name in plant.inputs]), plan=plan, info=info,
+        initial_input=np.array([plan[name][0] for name in plant.inputs]), plan=plan, info=info,
     )  # fmt: skip
 
 

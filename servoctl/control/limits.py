@@ -155,7 +155,7 @@ def limited(law, plant, *, bounds=None, weights=None, priority=None, horizon=HOR
         name=f"{law.name}, limited " + (f"by priority {' > '.join(priority)}" if priority else "by weight"),
         step=allocation,
         schedule=_schedule(law, reference, D, H),
-        state=np.concatenate([law.state, np.clip(law.idle, low, high)]),
+        state=np.concatenate([law.state, np.clip(law.initial_input, low, high)]),
         state_names=(*law.state_names, *(f"last {name}" for name in plant.inputs)),
         signals=(*law.signals, *allocation.signals),
         allocation=allocation,

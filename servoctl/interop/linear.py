@@ -225,7 +225,7 @@ def _linear_law(law, t, x, controller_state, name):
         raise SpecificationError(
             f"The controller state has the shape {z.shape}.", f"That of the law has {n_z} numbers.", do="Give as many."
         )
-    J = jacobian(law.step, "x", t, np.append(y, z), law.row(t))
+    J = jacobian(law.step, "x", t, np.append(y, z), law.schedule_at(t))
     n_y = len(y)
     A, B, C, D = J[m : m + n_z, n_y:], J[m : m + n_z, :n_y], J[:m, n_y:], J[:m, :n_y]
     return control.ss(

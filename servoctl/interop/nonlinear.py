@@ -88,7 +88,7 @@ def start(closed):
     if not isinstance(closed, Closed):
         raise stranger(closed, "A start belongs to the Closed of sv.close.")
     loop = closed.loop
-    return np.concatenate([loop.x0, np.tile(loop.idle, sum(_pasts(closed.plant, loop))), loop.z0])
+    return np.concatenate([loop.x0, np.tile(loop.initial_input, sum(_pasts(closed.plant, loop))), loop.z0])
 
 
 def _model(model, name):
@@ -223,7 +223,7 @@ def _law(law, name, quantum=None):
     m, n_z = len(law.inputs), len(law.state)
 
     def answer(t, z, y):
-        return law.answer(t, np.append(quantised(y, quantum), z), law.row(t))
+        return law.answer(t, np.append(quantised(y, quantum), z), law.schedule_at(t))
 
     return control.nlsys(
         (lambda t, z, y, _: answer(t, z, y)[m : m + n_z]) if n_z else None,

@@ -140,7 +140,7 @@ def _resolved(run, constants, starts):
     substeps = _most_steps(plant, law, loop, constants, starts)
     if substeps == loop.substeps:
         return loop
-    transport = steps(plant, law.period, substeps, loop.t0, loop.x0, loop.idle)[1]
+    transport = steps(plant, law.period, substeps, loop.t0, loop.x0, loop.initial_input)[1]
     forces = run.conditions.forces(loop.t0, law.period / substeps, loop.samples * substeps)
     return replace(loop, substeps=substeps, transport=transport, disturbance=forces)
 
@@ -211,13 +211,13 @@ def _case_numbers(run, columns, scale):
 def _most_steps(plant, law, loop, constants, starts):
     """Integration steps per sample of the case with the fastest eigenvalue at the start."""
     n_x, n = starts.shape
-    inputs = np.repeat(loop.idle[:, None], n, axis=1)
+    inputs = np.repeat(loop.initial_input[:, None], n, axis=1)
     p = np.vstack([constants, inputs, np.zeros((len(plant.disturbable), n))])
     both = plant.function("jacobian").grid(loop.t0, starts, p).reshape(-1, n_x, n).transpose(2, 1, 0)
     A = np.where(np.isfinite(both[:, :, :n_x]), both[:, :, :n_x], 0.0)
     case = int(np.argmax(np.abs(np.linalg.eigvals(A)).max(axis=1)))
     slowest = replace(plant, parameters=constants[:, case])
-    return max(loop.substeps, steps(slowest, law.period, None, loop.t0, starts[:, case], loop.idle)[0])
+    return max(loop.substeps, steps(slowest, law.period, None, loop.t0, starts[:, case], loop.initial_input)[0])
 
 
 def _traced(record, names, every):
