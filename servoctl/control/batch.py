@@ -1,4 +1,4 @@
-"""Thousands of closed loops of one plant and one law: a compiled unit in which the lanes of a vector are cases."""
+"""Thousands of closed loops of one plant and one law, in compiled code whose vector lanes are cases."""
 
 import ctypes
 import os
@@ -14,32 +14,32 @@ from servoctl.codegen.function import Compiled, compiled, compiling_at_once
 from servoctl.codegen.native import pointer
 from servoctl.control.loop import Arguments
 
-INLINED = 300  # operations: up to here the plant's rates are written into each stage of a step, for two vectors in turn
-PER_THREAD = 16  # tasks: so that threads end at about the same time
+INLINED = 300  # operations of the plant's rates, up to which they are inlined into each stage, for two vectors in turn
+PER_THREAD = 16  # tasks, so that threads end at about the same time
 
 _UNITS = weakref.WeakKeyDictionary()  # step of a law -> its units
 
 
 def lanes():
-    """How many cases one core takes at once: 8 where the processor has AVX-512, 4 with AVX2, else 1."""
+    """Number of cases in one vector: 8 with AVX-512, 4 with AVX2, else 1."""
     features = compiler.features()
     return 8 if "avx512f" in features else 4 if "avx2" in features else 1
 
 
 @dataclass(frozen=True, eq=False)
 class Unit:
-    """The C text of a batch, but for its lanes, with what makes its table; made by `unit`.
+    """The C text of a batch and the function of its table; made by `unit`.
 
     Attributes
     ----------
     text : str
-        Of any number of lanes.
+        C for any number of lanes.
     table : Compiled
-        (t_k, nothing, row_k of the law) -> what all cases have in common at a sample.
+        (t_k, nothing, row k of the schedule) -> values at a sample that are common to all cases.
     states, inputs : tuple of str
-        What is gathered, in this order,
+        Names of the gathered states and inputs.
     residuals : Residuals or None
-        and then these.
+        Gathered residuals.
     n_y : int
         Number of measurements.
     """
@@ -53,29 +53,29 @@ class Unit:
 
     @property
     def names(self):
-        """Names of what is gathered and may be traced; "input a" where the actuator a is itself a state."""
+        """Names of the gathered quantities; "input a" for the input of a lagged actuator a, which is also a state."""
         inputs = (f"input {name}" if name in self.states else name for name in self.inputs)
         residuals = self.residuals.names if self.residuals else ()
         return (*self.states, *inputs, *(f"residual {name}" for name in residuals))
 
     def library(self, n):
-        """The C function of n lanes; None without a compiler."""
+        """The C function for n lanes; None without a compiler."""
         library = compiler.library(f"#define W_LANES {n}\n{self.text}", level="-O3")
         return library and library.batch
 
 
 def unit(plant, law, disturbed, residuals=None):
-    """The unit of a plant and a law, derived once for all numbers of both.
+    """The unit of a plant and a law; one serves all numbers of both.
 
     Parameters
     ----------
     plant : Plant
     law : Law
-        Of the toolkit: its step is an expression.
+        Its step is compiled.
     disturbed : tuple of int
-        Which generalised forces are disturbed.
+        Indices of the disturbed generalised forces.
     residuals : Residuals, optional
-        What is gathered beside states and inputs.
+        Gathered in addition to states and inputs.
 
     Returns
     -------
@@ -90,7 +90,7 @@ def unit(plant, law, disturbed, residuals=None):
 
 
 def _derived(plant, law, disturbed, residuals):
-    """Rates, law and residuals in C, each without what depends on the case's parameters, or on the sample, alone."""
+    """Rates, law and residuals in C; parts that depend on the case alone, or on the sample alone, are split off."""
     n_c, n_u, project = len(plant.parameters), len(plant.inputs), plant.equations.project()
     t, x, p, rates = _rates(plant, disturbed)
     constants, applied = p[:n_c], ca.vertcat(p[n_c : n_c + n_u], p[n_c + n_u :][list(disturbed)])
@@ -125,7 +125,7 @@ def _derived(plant, law, disturbed, residuals):
 
 
 def _rates(plant, disturbed):
-    """Symbols t, x and p of a plant, and x' without disturbances but those of some generalised forces."""
+    """Symbols t, x and p of a plant, and x' with disturbances of some generalised forces only."""
     f = plant.function("ode").expression
     t, x, p = f.sx_in()
     forces = p[len(plant.parameters) + len(plant.inputs) :]
@@ -134,7 +134,7 @@ def _rates(plant, disturbed):
 
 
 def _apart(expression, symbols):
-    """An expression with new symbols for what depends on some symbols alone; these, and what they stand for."""
+    """An expression with new symbols for parts that depend on some symbols alone; the new symbols; their expressions."""
     rest, new, values = ca.extract_parametric(ca.cse(expression), symbols, {"extract_trivial": True})
     return rest, ca.vertcat(ca.SX(0, 1), *new), ca.vertcat(ca.SX(0, 1), *values)
 
@@ -149,7 +149,7 @@ def _lanes(name, t, x, p, value, dialect=emit.LANES):
 
 
 def _rates_of_two(f):
-    """C text of the rates of two vectors of cases, written into each stage where they are short."""
+    """C text of the rates of two vectors of cases, inlined if they are short."""
     if emit.operations(f) <= INLINED:
         return emit.function_of_two(f, "rates_of_two", emit.LANES_INLINE)
     calls = "    rates(t, x, p, y);\n    rates(t, x2, p2, y2);\n}\n"
@@ -158,16 +158,16 @@ def _rates_of_two(f):
 
 @dataclass(frozen=True)
 class Gathered:
-    """What remains of a batch of N cases; n quantities in the order of `Unit.names`.
+    """Results of a batch of N cases; n quantities in the order of `Unit.names`.
 
     Attributes
     ----------
     state_lost, law_lost : (N,) arrays
-        First samples at which the state, or the law's answer, is not finite [s]; infinite where there is none.
+        Instants of the first samples at which the state, or the law's output, is not finite [s]; else infinite.
     largest, rms, last : (n, N) arrays
         Largest size over all samples, root of the mean square, value at the end.
     trace : (K, n_traced, N) array
-        Of every so many samples.
+        Values at every n-th sample.
     """
 
     state_lost: np.ndarray
@@ -185,14 +185,15 @@ def run_batch(unit, loop, cases, noise=None, traced=(), every=1, threads=None):
     ----------
     unit : Unit
     loop : Loop
-        What the cases have in common; its p, x0 and noise are not used.
+        The loop of all cases; its p, x0 and noise are not used.
     cases : (constants, x0, scale)
-        (n_c, N), (n_x, N) and (n_d, N) arrays: parameters of the plant, start, factors of the disturbances.
+        (n_c, N), (n_x, N) and (n_d, N) arrays: parameters of the plant, initial states, factors of the disturbances.
     noise : callable, optional
-        From the index of a case to its noise, (samples + 1, n_y).
+        Maps the index of a case to its noise, (samples + 1, n_y).
     traced : sequence of int
-        Which of the quantities are kept at every so many samples.
+        Indices of the traced quantities.
     every : int
+        Samples from one value of a trace to the next.
     threads : int, optional
         Default: one per core.
 
@@ -236,13 +237,13 @@ def run_batch(unit, loop, cases, noise=None, traced=(), every=1, threads=None):
 
 
 def _noise(noise, cases, n_y, width):
-    """Noise of some cases, (blocks, samples + 1, n_y, width) as `batch` takes it."""
+    """Noise of some cases in the order of batch.c, (blocks, samples + 1, n_y, width)."""
     columns = np.stack([noise(case) for case in cases], axis=-1)
     return np.ascontiguousarray(np.moveaxis(columns.reshape(*columns.shape[:1], n_y, -1, width), 2, 0))
 
 
 def _common(unit, loop):
-    """The table of what all cases have in common, a row per sample."""
+    """The table of values that are common to all cases, a row per sample."""
     samples = np.arange(loop.samples + 1)
     rows = loop.table[np.minimum(loop.first + samples, len(loop.table) - 1)].T
     with compiling_at_once():

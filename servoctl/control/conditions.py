@@ -53,7 +53,20 @@ class Sensors:
             )
 
     def noisy(self, measures, count):
-        """Normally distributed noise of the states `measures` at each sample, (count, n_y); None without noise."""
+        """Normally distributed noise of the measurement at each sample.
+
+        Parameters
+        ----------
+        measures : tuple of str
+            Names of the measured states.
+        count : int
+            Number of samples.
+
+        Returns
+        -------
+        (count, n_y) array or None
+            None without noise.
+        """
         std = _by_measure(self.noise, measures)
         return None if std is None else np.random.default_rng(self.seed or 0).standard_normal((count, len(std))) * std
 

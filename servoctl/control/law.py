@@ -316,7 +316,7 @@ class UserStep:
         return hasattr(self.function, "start")
 
     def started(self):
-        """This step with its function started, where it has a method `start`."""
+        """The same step with its function started, where it has a method `start`."""
         function = self.function.start() if self.stateful else self.function
         if not callable(function):
             raise SpecificationError(
