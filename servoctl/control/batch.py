@@ -134,7 +134,7 @@ def _rates(plant, disturbed):
 
 
 def _apart(expression, symbols):
-    """An expression with new symbols for parts that depend on some symbols alone; the new symbols; their expressions."""
+    """An expression with new symbols for parts that depend on some symbols alone; these symbols; their values."""
     rest, new, values = ca.extract_parametric(ca.cse(expression), symbols, {"extract_trivial": True})
     return rest, ca.vertcat(ca.SX(0, 1), *new), ca.vertcat(ca.SX(0, 1), *values)
 

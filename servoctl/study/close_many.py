@@ -235,7 +235,7 @@ def _most_steps(plant, law, loop, constants, starts):
 def _traced(record, names, every):
     if isinstance(record, str) or every != 1 and not len(record):
         raise SpecificationError(
-            f"record is {record!r}, every is {every!r}.",
+            f"record={record!r} and every={every!r} were given.",
             "record is a sequence of names; every thins out their traces.",
             do='Pass names: record=["theta"], every=10.',
             record=record,
