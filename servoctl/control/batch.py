@@ -28,20 +28,10 @@ def lanes():
 
 @dataclass(frozen=True, eq=False)
 class Unit:
-    """The C text of a batch and the function of its table; made by `unit`.
+    """The C text of a batch for any number of lanes, and the function of its table; made by `unit`.
 
-    Attributes
-    ----------
-    text : str
-        C for any number of lanes.
-    table : Compiled
-        (t_k, nothing, row k of the schedule) -> values at a sample that are common to all cases.
-    states, inputs : tuple of str
-        Names of the gathered states and inputs.
-    residuals : Residuals or None
-        Gathered residuals.
-    n_y : int
-        Number of measurements.
+    `table` maps t_k and row k of the schedule to values that are common to all cases at a sample. `states`, `inputs`
+    and `residuals` (Residuals or None) are gathered; `n_y` is the number of measurements.
     """
 
     text: str
@@ -65,21 +55,9 @@ class Unit:
 
 
 def unit(plant, law, disturbed, residuals=None):
-    """The unit of a plant and a law; one serves all numbers of both.
+    """The unit of a plant and a compiled law; one serves all numbers of both.
 
-    Parameters
-    ----------
-    plant : Plant
-    law : Law
-        Its step is compiled.
-    disturbed : tuple of int
-        Indices of the disturbed generalised forces.
-    residuals : Residuals, optional
-        Gathered in addition to states and inputs.
-
-    Returns
-    -------
-    Unit
+    `disturbed` are the indices of disturbed generalised forces; `residuals` are gathered beside states and inputs.
     """
     units = _UNITS.setdefault(law.step, {})
     phi = tuple(e.element_hash() for e in residuals.expressions.elements()) if residuals else ()
@@ -158,16 +136,11 @@ def _rates_of_two(f):
 
 @dataclass(frozen=True)
 class Gathered:
-    """Results of a batch of N cases; n quantities in the order of `Unit.names`.
+    """Results of a batch of N cases, for n quantities in the order of `Unit.names`.
 
-    Attributes
-    ----------
-    state_lost, law_lost : (N,) arrays
-        Instants of the first samples at which the state, or the law's output, is not finite [s]; else infinite.
-    largest, rms, last : (n, N) arrays
-        Largest size over all samples, root of the mean square, value at the end.
-    trace : (K, n_traced, N) array
-        Values at every n-th sample.
+    `state_lost` and `law_lost` (N,) are the instants [s] at which the state, or the law's output, is first not finite,
+    else infinite; `largest`, `rms` and `last` (n, N) the largest size over all samples, the root of the mean square and
+    the value at the end; `trace` (K, n_traced, N) the values at every n-th sample.
     """
 
     state_lost: np.ndarray
@@ -179,28 +152,12 @@ class Gathered:
 
 
 def run_batch(unit, loop, cases, noise=None, traced=(), every=1, threads=None):
-    """Run the closed loops of N cases.
+    """Run the closed loops of N cases: `Gathered`, or None without a compiler.
 
-    Parameters
-    ----------
-    unit : Unit
-    loop : Loop
-        The loop of all cases; its p, x0 and noise are not used.
-    cases : (constants, x0, scale)
-        (n_c, N), (n_x, N) and (n_d, N) arrays: parameters of the plant, initial states, factors of the disturbances.
-    noise : callable, optional
-        Maps the index of a case to its noise, (samples + 1, n_y).
-    traced : sequence of int
-        Indices of the traced quantities.
-    every : int
-        Samples from one value of a trace to the next.
-    threads : int, optional
-        Default: one per core.
-
-    Returns
-    -------
-    Gathered or None
-        None without a compiler. The numbers do not depend on the number of threads.
+    `loop` holds for all cases, without its p, x0 and noise. `cases` are parameters of the plant (n_c, N), initial
+    states (n_x, N) and factors of the disturbances (n_d, N); `noise` maps a case's index to its (samples + 1, n_y).
+    `traced` are indices of quantities that are traced at every n-th sample. By default there is one thread per core;
+    the numbers do not depend on it.
     """
     n = lanes()
     native = unit.library(n)

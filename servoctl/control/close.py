@@ -20,16 +20,10 @@ CONSISTENT = 1e-6  # of the state: the largest residual of a material constraint
 
 
 def close(
-    plant: Plant,
-    law: Law | Callable[..., Any],
-    x0: ArrayLike | Mapping[str, float],
-    t_span: tuple[float, float],
-    *,
-    sensors: Sensors | None = None,
-    timing: Timing | None = None,
-    disturbance: Mapping[str, Callable[..., Any] | float] | None = None,
-    plan: Run | None = None,
-) -> Closed:
+    plant: Plant, law: Law | Callable[..., Any], x0: ArrayLike | Mapping[str, float], t_span: tuple[float, float], *,
+    sensors: Sensors | None = None, timing: Timing | None = None,
+    disturbance: Mapping[str, Callable[..., Any] | float] | None = None, plan: Run | None = None,
+) -> Closed:  # fmt: skip
     """Run a sampled law on a plant.
 
     In each sample the state is measured, with noise and quantisation; the law computes a command; after the delay the

@@ -110,15 +110,7 @@ class Timing:
 
 @dataclass(frozen=True)
 class Conditions:
-    """Sensors, timing and disturbances of a loop.
-
-    Attributes
-    ----------
-    sensors : Sensors
-    timing : Timing
-    disturbance : dict of str to callable or float
-        Generalised forces by coordinate (or quasi-velocity), functions of t [s].
-    """
+    """Sensors, timing and disturbances of a loop: generalised forces by coordinate (or quasi-velocity), of t [s]."""
 
     sensors: Sensors = field(default_factory=Sensors)
     timing: Timing = field(default_factory=Timing)

@@ -40,14 +40,7 @@ def affine_law(measures, n_u, residuals=None):
 class StateFeedback(NamedTuple):
     """Gains on all states of a plant, u = u_ff - K (x - x_ref) - K_i z, for a measured or an estimated state.
 
-    Attributes
-    ----------
-    states : tuple of str
-        Names of the plant's states x.
-    residuals : tuple of str
-        Names of the residuals that z integrates.
-    K, K_i : (N, m, n_x), (N, m, n_z) arrays
-        Gains at each sample.
+    `states` are the names of x, `residuals` those that z integrates; K (N, m, n_x) and K_i (N, m, n_z) by sample.
     """
 
     states: tuple

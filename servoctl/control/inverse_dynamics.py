@@ -40,17 +40,10 @@ TIME_CONSTANT = 0.25  # s: several poles there rise in about a second, as suits 
 class Linearisation:
     """The exact linearisation of a program; made by `linearise`.
 
-    Attributes
-    ----------
-    orders : dict of str to int
-        Order of the error dynamics by residual: its relative degree with the extension.
-    relative_degree : dict of str to int
-        First derivative of each residual that depends on an input.
-    state_names : tuple of str
-        The controller state ξ: derivatives of residuals behind integrators.
-    step : Compiled
-        (t, [x; ξ], column) -> [u; ξ+]; the column is [plant's parameters; Ts; increment of u; coefficients of the error
-        dynamics].
+    `orders` are those of the error dynamics by residual, i.e. relative degrees with the extension, `relative_degree`
+    those without. The controller state ξ, with the names `state_names`, are derivatives of residuals behind
+    integrators. `step` maps (t, [x; ξ], column) to [u; ξ+]; the column is [plant's parameters; Ts; increment of u;
+    coefficients of the error dynamics].
     """
 
     orders: dict
@@ -60,25 +53,9 @@ class Linearisation:
 
 
 def linearise(plan, plant):
-    """Exact linearisation of the plan's program by the inputs of a plant.
+    """Exact linearisation of the plan's program by the inputs of a plant; ranks are decided about the plan's states.
 
-    Parameters
-    ----------
-    plan : Run
-        Its program is linearised; ranks are decided about its states.
-    plant : Plant
-        The controller's model of the machine, of the same mechanism.
-
-    Returns
-    -------
-    Linearisation
-
-    Raises
-    ------
-    SpecificationError
-        If a residual has an order above 2, or the plant is of another mechanism.
-    NotRealisable
-        If a residual depends on no input.
+    Refuses residuals of an order above 2, a plant of another mechanism, and residuals that depend on no input.
     """
     _require_invertible(plan.model.reduction, plant)
     extension = _Extension(plant, in_symbols_of(plant, plan.model), _points(plan, plant))
@@ -278,12 +255,9 @@ class _Extension:
 
 
 def computed(
-    plan: Run,
-    plant: Plant,
-    rate: float = 100.0,
-    poles: float | Mapping[str, Sequence[complex]] | None = None,
+    plan: Run, plant: Plant, rate: float = 100.0, poles: float | Mapping[str, Sequence[complex]] | None = None,
     delay: int = 0,
-) -> Law:
+) -> Law:  # fmt: skip
     """Inverse dynamics at the measured state, with error dynamics by poles.
 
     Each residual obeys Π(D - λ_i) φ = 0 if the machine is the plant: φ is differentiated along the plant until the

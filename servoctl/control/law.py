@@ -294,15 +294,9 @@ class Controller:
 
 @dataclass(frozen=True)
 class UserStep:
-    """A user's function law(t, measurement) -> inputs as the step of a law.
+    """A user's function law(t, measurement) -> inputs, or an object whose method `start` returns one, as step of a law.
 
-    Attributes
-    ----------
-    function : callable or object with `start`
-        `start` returns the function.
-    name : str
-    states, inputs : tuple of str
-        Names of the measured states and of the actuators.
+    `states` and `inputs` are the names of the measured states and of the actuators.
     """
 
     function: object
@@ -337,21 +331,7 @@ class UserStep:
 def ordered(values, names, what, exactly=True):
     """Numbers in the order of their names, (n,), from an array in this order or from a dict.
 
-    Parameters
-    ----------
-    values : (n,) array or dict of str to float
-    names : sequence of str
-    what : str
-        What the values are, for messages: "measurement".
-    exactly : bool
-        Whether a dict may have no other names.
-
-    Raises
-    ------
-    NameUnknown
-        If a name is missing, or one is not valid.
-    SpecificationError
-        If the values are not n numbers.
+    `what` the values are ("measurement") goes into messages; `exactly` refuses further names in a dict.
     """
     numbers = values
     if isinstance(values, dict):

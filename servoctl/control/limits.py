@@ -104,14 +104,9 @@ class SmallQP:
 
 
 def limited(
-    law: Law,
-    plant: Plant,
-    *,
-    bounds: Mapping[str, Any] | None = None,
-    weights: Mapping[str, float] | None = None,
-    priority: Sequence[str] | None = None,
-    horizon: float = HORIZON,
-) -> Law:
+    law: Law, plant: Plant, *, bounds: Mapping[str, Any] | None = None, weights: Mapping[str, float] | None = None,
+    priority: Sequence[str] | None = None, horizon: float = HORIZON,
+) -> Law:  # fmt: skip
     """A law whose inputs are allocated within the plant's limits of magnitude and rate, and within bounds of outputs.
 
     At each sample the inputs u differ from those of the law, u_law, at the least cost to the program:
@@ -285,22 +280,9 @@ def _metric(reference, names, weights, at_once):
 class Allocation(Value):
     """The step of a limited law: (t, [y; z; last u], [column; x_ref; D; H]) -> [u; z+; u; signals].
 
-    Attributes
-    ----------
-    law : Law
-        The law without limits.
-    plant : Plant
-        The plant with the limits.
-    effects : Effects
-        Immediate effects of the inputs on the bounded outputs.
-    bounds : (j, 2) array
-        Lower and upper bounds of these outputs.
-    residuals : tuple of str
-        Names of the residuals, which may have slack.
-    sizes : (m,) array
-        Typical sizes of the inputs.
-    slack_sizes : (k,) array
-        Largest effects of inputs of these sizes on the residuals.
+    `law` is the law without limits, `plant` the plant with them; `effects` are those of the inputs on the bounded
+    outputs, `bounds` (j, 2). `residuals` may have slack; `sizes` (m,) are typical sizes of the inputs, `slack_sizes`
+    (k,) the largest effects of such inputs on the residuals.
     """
 
     law: Law

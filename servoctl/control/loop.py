@@ -13,63 +13,31 @@ FINISHED, STATE_LOST, LAW_LOST = 0, 1, 2  # how a loop ends
 
 @dataclass(frozen=True, eq=False)
 class Loop(Value):
-    """The numbers of a closed loop; arrays that are not used are None.
-
-    Attributes
-    ----------
-    samples, substeps, delay : int
-        Number of periods, Runge-Kutta steps per period, samples from a command to the input.
-    n_u, n_out : int
-        Numbers of inputs, and of the law's outputs: command, controller state, further signals.
-    first : int
-        Row of the gain schedule at the first sample.
-    at_u : int
-        Index of the first input in p.
-    t0, period : float
-        [s]
-    p : (n_p,) array
-        Parameters of the plant; inputs and disturbances follow at the end.
-    x0, z0 : (n_x,), (n_z,) arrays
-        Initial state of the plant and initial controller state.
-    table : (rows, n_row) array
-        Gain schedule of the law, a row per sample; the last row holds after the end.
-    measured, disturbed : (n_y,), (n_d,) integer arrays
-        Indices of the measured states and of the disturbed generalised forces.
-    initial_input : (n_u,) array
-        The inputs until the first command arrives.
-    disturbance : (samples * substeps, 3, n_d) array
-        At the start, the middle and the end of each step.
-    noise : (samples + 1, n_y) array
-    quantum : (n_y,) array
-    low, high, change : (n_u,) arrays
-        Limits of the inputs, and of their change from sample to sample.
-    transport : (n_u,) integer array
-        Integration steps by which each input arrives late.
-    """
+    """The numbers of a closed loop; arrays that are not used are None."""
 
     samples: int
-    substeps: int
-    delay: int
+    substeps: int  # Runge-Kutta steps per sample
+    delay: int  # samples from a command to the input
     n_u: int
-    n_out: int
-    first: int
-    at_u: int
-    t0: float
-    period: float
+    n_out: int  # outputs of the law: command, controller state, further signals
+    first: int  # row of the table at the first sample
+    at_u: int  # index of the first input in p; disturbances follow the inputs
+    t0: float  # [s]
+    period: float  # [s]
     p: np.ndarray
     x0: np.ndarray
-    z0: np.ndarray
-    table: np.ndarray
-    measured: np.ndarray
-    disturbed: np.ndarray
-    initial_input: np.ndarray
-    disturbance: np.ndarray = None
-    noise: np.ndarray = None
-    quantum: np.ndarray = None
-    low: np.ndarray = None
+    z0: np.ndarray  # initial controller state
+    table: np.ndarray  # gain schedule, a row per sample; the last row holds after the end
+    measured: np.ndarray  # (n_y,) indices of states
+    disturbed: np.ndarray  # (n_d,) indices of generalised forces
+    initial_input: np.ndarray  # (n_u,) until the first command arrives
+    disturbance: np.ndarray = None  # (samples * substeps, 3, n_d) at the start, the middle and the end of each step
+    noise: np.ndarray = None  # (samples + 1, n_y)
+    quantum: np.ndarray = None  # (n_y,)
+    low: np.ndarray = None  # (n_u,) limits of the inputs
     high: np.ndarray = None
-    change: np.ndarray = None
-    transport: np.ndarray = None
+    change: np.ndarray = None  # (n_u,) largest change of the inputs from sample to sample
+    transport: np.ndarray = None  # (n_u,) integration steps by which each input arrives late
 
 
 _FIELDS = {
@@ -83,13 +51,10 @@ _WHOLE = {"measured", "transport", "disturbed", "traced"}  # arrays of whole num
 
 
 class Arguments(ctypes.Structure):
-    """The C structure ``Loop`` of `codegen/c/sampled.h`, for one loop and for many.
+    """The C structure ``Loop`` of `codegen/c/sampled.h`, for one loop and for many, from its fields by name.
 
-    Parameters
-    ----------
-    **values
-        Fields by name, arrays for pointers; the structure holds a reference to them. None and missing fields are 0;
-        names that are no field are ignored.
+    Arrays are passed for pointers, and the structure holds a reference to them. None and missing fields are 0; names
+    that are no field are ignored.
     """
 
     _fields_ = [(name, kind) for kind, names in _FIELDS.items() for name in names.split()]
@@ -113,27 +78,10 @@ _STEP = ctypes.CFUNCTYPE(None, ctypes.c_double, ctypes.c_void_p, ctypes.c_void_p
 def run_loop(ode, law, loop):
     """Run a closed loop: in C, which calls a law in Python back, or in Python without a compiler.
 
-    Parameters
-    ----------
-    ode : Compiled
-        The plant's rates, compiled with the loop "closed".
-    law : Compiled or callable
-        (t, [y; z], row of the schedule) -> [u; z+; signals].
-    loop : Loop
-
-    Returns
-    -------
-    status : int or BaseException
-        FINISHED; STATE_LOST or LAW_LOST if the state or the law's output is not finite at the next sample; or the
-        error that the law raised there.
-    x : (N, n_x) array
-        States at the completed samples.
-    law_x : (N, n_y + n_z) array
-        Measurements and controller states.
-    law_y : (N, n_out) array
-        Commands, next controller states and further signals.
-    inputs : (N, n_u) array
-        Inputs from each sample on.
+    `ode` are the plant's rates, compiled with the loop "closed"; `law` maps (t, [y; z], row of the schedule) to
+    [u; z+; signals]. Returns the status (FINISHED; STATE_LOST or LAW_LOST if the state or the law's output is not
+    finite at the next sample; or the error that the law raised there), and at the N completed samples the states
+    (N, n_x), measurements and controller states (N, n_y + n_z), outputs of the law (N, n_out) and inputs (N, n_u).
     """
     n, n_y, n_z = loop.samples + 1, len(loop.measured), len(loop.z0)
     logs = {

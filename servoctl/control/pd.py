@@ -17,12 +17,9 @@ UNSTABLE = 1e-9  # a spectral radius above 1 by more than this is unstable
 
 
 def pd(
-    plan: Run,
-    plant: Plant,
-    rate: float = 100.0,
-    kp: Mapping[str, float] | None = None,
+    plan: Run, plant: Plant, rate: float = 100.0, kp: Mapping[str, float] | None = None,
     kd: Mapping[str, float] | None = None,
-) -> Law:
+) -> Law:  # fmt: skip
     """The plan's actuation, with feedback of the error of each actuator's displacement and its rate.
 
     u_a = u_plan - kp_a e_a - kd_a de_a/dt with e_a = E_aᵀ(γ - γ_plan), the displacement on which the actuator works.

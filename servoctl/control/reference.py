@@ -13,20 +13,9 @@ from servoctl.plants.plant import Plant
 class Reference:
     """States, inputs and linearisations at the sampling instants of a plan; plan and plant must have the same names.
 
-    Attributes
-    ----------
-    rate : float
-        [Hz]
-    t : (N,) array
-        t_k = t0 + k/rate within the plan [s].
-    x : (n_x, N) array
-        States of the plant at t.
-    middle : (N,) array
-        Middles of the samples, up to the plan's end [s].
-    middle_x, middle_input : (n_x, N), (m, N) arrays
-        States and the plan's actuation in the middles.
-    initial_input : (m,) array
-        The plan's actuation at its start.
+    t (N,) are the sampling instants t0 + k/rate within the plan [s], x (n_x, N) the states there; middle (N,) are the
+    middles of the samples up to the plan's end, middle_x (n_x, N) and middle_input (m, N) the states and the plan's
+    actuation there; initial_input (m,) is the plan's first actuation.
     """
 
     def __init__(self, plan, plant, rate):
@@ -65,13 +54,7 @@ class Reference:
         return self._commands(0.0, self.period / 2)
 
     def ahead(self, delay=0):
-        """The command in the middle of the hold minus that at the sample, (m, N).
-
-        Parameters
-        ----------
-        delay : int
-            Samples from the measurement to the input: the command of sample k is held from sample k + delay on.
-        """
+        """Commands in the middle of the hold, `delay` samples late, minus those at the samples, (m, N)."""
         change = self._commands(delay * self.period, self.period / 2) - self._commands(0.0, 0.0)
         change[:, -1] = 0.0
         return change

@@ -8,18 +8,9 @@ from servoctl.errors import SpecificationError, unknown
 
 
 class Residuals:
-    """Residuals of a program at the states and parameters of a plant.
+    """Residuals of a model's program at the states and parameters of a plant.
 
-    Parameters
-    ----------
-    model : Model
-        The model of the plan.
-    plant : Plant
-        The controller's model of the machine.
-    names : sequence of str, optional
-        Selected residuals; default all of this order.
-    order : int
-        The highest order: 1 for functions of the state (q, γ'), 2 with accelerations.
+    `names` selects some; `order` is the highest: 1 for functions of the state (q, γ'), 2 with accelerations.
 
     Attributes
     ----------

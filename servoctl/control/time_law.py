@@ -52,15 +52,10 @@ class TimeLaw:
 
 
 def fastest(
-    mechanism: Mechanism,
-    program: Program,
-    limits: Mapping[str, Any],
-    t_span: tuple[float, float],
-    start: Mapping[str, float] | None = None,
-    guess: Mapping[str, float] | None = None,
-    parameters: Mapping[str, float] | None = None,
-    progress: bool | None = None,
-) -> TimeLaw:
+    mechanism: Mechanism, program: Program, limits: Mapping[str, Any], t_span: tuple[float, float],
+    start: Mapping[str, float] | None = None, guess: Mapping[str, float] | None = None,
+    parameters: Mapping[str, float] | None = None, progress: bool | None = None,
+) -> TimeLaw:  # fmt: skip
     """The fastest time law q(t0 + (t - t0)/σ) under which signals keep their limits.
 
     The geometry of the motion stays; speeds scale with 1/σ, accelerations with 1/σ²; static loads stay. If several σ

@@ -114,7 +114,8 @@ def along(thing, run, times=None, **options):
     for k, t in enumerate(times):
         if isinstance(thing, Plant):
             inputs = [f"input {name}" if isinstance(run, Closed) else name for name in thing.inputs]
-            yield linearise(thing, t, _at(values, thing.state_names, k), [values[name][k] for name in inputs], **options)
+            u = list(_at(values, inputs, k).values())
+            yield linearise(thing, t, _at(values, thing.state_names, k), u, **options)
         elif isinstance(thing, Law):
             yield linearise(thing, t, _at(values, thing.measures, k), **options)
         elif isinstance(thing, Model):
@@ -234,7 +235,7 @@ def _linear_law(law, t, x, controller_state, name):
     if x is None:
         if law.plan is None:
             raise SpecificationError(
-                f"The law {law.name!r} has no plan.", "A law is linearised about a measurement.", do="Pass x.", name=law.name
+                f"The law {law.name!r} has no plan.", "A law is linearised about x.", do="Pass x.", name=law.name
             )
         at = resampled(law.plan, np.clip([float(t)], law.plan.t[0], law.plan.t[-1]))
         x = {measure: at[measure][0] for measure in law.measures}

@@ -57,14 +57,9 @@ class Batch:
 
 
 def close_many(
-    run: Closed,
-    cases: Mapping[str, ArrayLike] | Sequence[Mapping[str, float]],
-    *,
-    scale: Mapping[str, str] | None = None,
-    record: Sequence[str] = (),
-    every: int = 1,
-    threads: int | None = None,
-) -> Batch:
+    run: Closed, cases: Mapping[str, ArrayLike] | Sequence[Mapping[str, float]], *,
+    scale: Mapping[str, str] | None = None, record: Sequence[str] = (), every: int = 1, threads: int | None = None,
+) -> Batch:  # fmt: skip
     """Run a closed loop thousands of times, with different numbers in each case.
 
     The loops run in compiled code, in the lanes of vectors and on threads; without a compiler one after the other. The
