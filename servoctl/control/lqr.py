@@ -73,7 +73,7 @@ def lqr(
     """
     if not isinstance(varying, (bool, np.bool_)):
         raise SpecificationError(
-            f"varying={varying!r} was given.", "It is True (gains along the plan) or False (frozen-time gains).", value=varying
+            f"varying={varying!r} was given.", "It is True (along the plan) or False (frozen time).", value=varying
         )
     reference = Reference(plan, plant, rate)
     refuse_transport(plant, "The design is")
