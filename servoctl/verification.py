@@ -343,6 +343,6 @@ def _excess(closed):
     if loop.change is not None:
         limited = loop.change < np.inf
         most, inputs = loop.change[limited], closed.inputs[limited]
-        changes = np.abs(np.diff(np.column_stack([loop.idle[limited], inputs]), axis=1)).max(axis=1)
+        changes = np.abs(np.diff(np.column_stack([loop.initial_input[limited], inputs]), axis=1)).max(axis=1)
         excesses += list((changes - most) / (np.abs(inputs).max(axis=1) + most))
     return float(max(excesses))
