@@ -140,6 +140,31 @@ def whole(name, value, least=0):
     return number
 
 
+def positive_number(name, value, most=np.inf):
+    """A positive number up to `most` as a float; text and truth values are none."""
+    if not (is_number(value) and 0 < value <= most):
+        raise SpecificationError(
+            f"{name}={value!r} was given.",
+            f"It is a positive number{f', at most {most:g}' if np.isfinite(most) else ''}.",
+            nearest=f"{name}={most:g}." if is_number(value) and value > most else "",
+            **{name: value},
+        )
+    return float(value)
+
+
+def whole_of(name, value, valid):
+    """An int out of `valid`, a range or a tuple of int; 5.0 is none."""
+    if not (is_whole(value) and value in valid):
+        span = f"from {valid[0]} to {valid[-1]}" if isinstance(valid, range) else f"out of {', '.join(map(str, valid))}"
+        raise SpecificationError(
+            f"{name}={value!r} was given.",
+            f"It is a whole number {span}.",
+            nearest=f"{name}={min(valid, key=lambda number: abs(number - value))}." if is_number(value) else "",
+            **{name: value},
+        )
+    return int(value)
+
+
 def whole_multiple(number, what, of):
     """How many whole units a number is, to rounding, at least 0: `what` is counted ("delay"), `of` what ("samples")."""
     number = finite(what, number)

@@ -2,8 +2,7 @@
 
 import servoctl as sv
 from servoctl.errors import ServoError
-from servoctl.methods.choice import as_method, default_method
-from servoctl.methods.drift import as_drift
+from servoctl.methods.choice import as_drift, as_method, default_method
 from servoctl.methods.runge_kutta import ORDERS
 from servoctl.shell import loop
 from servoctl.shell.folder import FILES, LOOP_FILES, Report, complain, folder_of, summary

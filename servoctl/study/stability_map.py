@@ -14,9 +14,9 @@ import numpy as np
 from servoctl.checks import positives
 from servoctl.errors import SpecificationError
 from servoctl.internal_dynamics import linearised
-from servoctl.methods.drift import Poles, as_drift
+from servoctl.methods.choice import Poles, as_drift
 from servoctl.methods.runge_kutta import ORDERS
-from servoctl.methods.stability import amplification, row_poles
+from servoctl.methods.stability import amplification
 
 MAPPED = (*ORDERS, "Taylor", "RadauIIA")
 RADAU_ORDER = 5  # unless it is given; all are L-stable
@@ -58,7 +58,7 @@ class StabilityMap:
         if not isinstance(drift, Poles):
             return self.rates
         drift.coefficients(self.model)  # refuses poles that do not fit the rows
-        poles = np.concatenate([*row_poles(drift, self.model).values(), np.zeros(0)])
+        poles = np.concatenate([*drift.by_row(self.model).values(), np.zeros(0)])
         return np.hstack([self.rates, np.broadcast_to(poles, (len(self.t), len(poles)))])
 
     def radius(self, method, step, drift=None, order=None):

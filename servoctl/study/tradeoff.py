@@ -10,8 +10,18 @@ from servoctl.checks import as_span, is_number, mapping, positive, positives
 from servoctl.codegen.function import compiling_at_once
 from servoctl.errors import LimitExceeded, ServoError, SpecificationError, unknown
 from servoctl.methods.accuracy import motion_error, relative_error
-from servoctl.methods.choice import METHODS, Adaptive, Algebraic, RungeKutta, Taylor, as_method
-from servoctl.methods.drift import MinimalCoordinates, Poles, Project, as_drift
+from servoctl.methods.choice import (
+    METHODS,
+    Adaptive,
+    Algebraic,
+    MinimalCoordinates,
+    Poles,
+    Project,
+    RungeKutta,
+    Taylor,
+    as_drift,
+    as_method,
+)
 from servoctl.progress import progress_bar
 from servoctl.simulation import consistent_state, simulate
 from servoctl.study.table import SHOWN, Study, machine, table
