@@ -261,7 +261,7 @@ def test_ctrl_c_returns_what_is_done():
 
     study = sv.sweep(interrupted, sv.grid(m=range(6)))
     assert study["r"].tolist() == [0, 1, 2] and study.meta["interrupted"]
-    assert study.meta["message"] == "3 of 6 cases finished, interrupted: what was computed is kept"
+    assert study.meta["message"] == "3 of 6 cases finished, interrupted"
 
 
 def test_a_case_that_swallows_ctrl_c_is_not_finished():

@@ -236,7 +236,7 @@ def test_the_plot_draws_every_number(cost, study):
         ({"methods": ["RK3"]}, NameUnknown, "No method is named 'RK3'"),
         ({"settings": {"rtol": [1e-3, -1.0]}}, SpecificationError, "rtol=[0.001, -1.0] was given"),
         ({"settings": {"order": [8]}}, NameUnknown, "No setting is named 'order'"),
-        ({"settings": 1e-3}, SpecificationError, "They go by name"),
+        ({"settings": 1e-3}, SpecificationError, "given by name"),
         ({"settings": {"step": "fine"}}, SpecificationError, "step='fine' was given"),
         ({"seconds": 0.0}, SpecificationError, "seconds = 0 was given"),
         ({"drift": ["often"]}, NameUnknown, "drift treatment"),

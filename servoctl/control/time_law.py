@@ -49,7 +49,16 @@ class TimeLaw:
         )
 
 
-def fastest(mechanism, program, limits, t_span, start=None, guess=None, parameters=None, progress=None):
+def fastest(
+    mechanism: Mechanism,
+    program: Program,
+    limits: dict,
+    t_span: tuple[float, float],
+    start: dict[str, float] | None = None,
+    guess: dict[str, float] | None = None,
+    parameters: dict[str, float] | None = None,
+    progress: bool | None = None,
+) -> TimeLaw:
     """The fastest time law q(t0 + (t - t0)/σ) under which signals keep their limits, found by solving for σ.
 
     The motion's geometry stays; speeds go with 1/σ, accelerations with 1/σ². What a limit leaves beside static loads

@@ -401,7 +401,7 @@ class Monitor:
         """Whether outputs at the start are not finite, or pivots are far worse than the matrices."""
         if not np.all(np.isfinite(outputs)):
             return True
-        reference = self.model.guard_sizes
+        reference = self.model.pivot_sizes
         weakest = (np.abs(pivots) / np.where(reference > 0, reference, 1.0)).min(initial=1.0)
         return bool(weakest < DEGRADED and self.best.min() > HELPS * weakest)
 

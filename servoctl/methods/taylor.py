@@ -135,7 +135,7 @@ def taylor_coefficients(equations, last):
             group.correct(k)
     coefficients = [] if q.plain else [ca.SX(c) for k in range(1, last + 1) for c in motion.coordinates[k]]
     coefficients += [ca.SX(c) for k in range(1, last + 1) for c in motion.gamma[k]]
-    outputs = [*coefficients, *(g for _, g in equations.guards)]
+    outputs = [*coefficients, *(g for _, g in equations.pivots)]
     return equations.function("taylor", equations.state, outputs, motion.branch)
 
 

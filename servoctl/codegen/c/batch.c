@@ -76,7 +76,7 @@ INLINE void begin(const Loop *c, int64_t at, double *scratch, Cases *s)
     for (int i = 0; i < NV; i++) s->x[NX + i] = w[NW + i];
 }
 
-/* Sample k: measure, law, delay, limits; what is gathered there. */
+/* Sample k: measure, law, delay, limits; gathered quantities. */
 INLINE void sample(const Loop *c, int64_t k, int64_t at, const double *noise, Cases *s)
 {
     const double t = c->t0 + (double)k * c->period, *row = c->table + k * (NL + NS);
@@ -115,7 +115,7 @@ INLINE void sample(const Loop *c, int64_t k, int64_t at, const double *noise, Ca
     for (int i = 0; i < NU; i++) s->p[NW + i] = u[i];
 }
 
-/* What arrives in one integration step after transport. */
+/* The inputs of one integration step, after the transport delay. */
 INLINE void transported(const Loop *c, int64_t step, Cases *s)
 {
     for (int i = 0; i < NU; i++) {

@@ -19,7 +19,7 @@ INLINE V quantised(const Loop *c, int64_t i, V value)
     return value;
 }
 
-/* The input of one sample: the command, kept within its limits and its limits of rate. */
+/* The input of one sample: the command, cut to its limits and its rate limits. */
 INLINE V limited(const Loop *c, int64_t i, V value, V before)
 {
     if (c->low) value = V_CALL(fmin)(V_CALL(fmax)(value, V_OF(c->low[i])), V_OF(c->high[i]));
