@@ -136,12 +136,12 @@ def test_a_program_without_free_values_is_solved(gallery_model):
 
 def test_the_front_is_what_nothing_beats(study):
     front = study.pareto()
-    told = np.maximum(study["error"], study.uncertainty)
-    good = np.isfinite(told)
+    observed = np.maximum(study["error"], study.uncertainty)
+    good = np.isfinite(observed)
     wanted = [
         i for i in np.flatnonzero(good)
-        if not np.any(good & (told <= told[i]) & (study["seconds"] <= study["seconds"][i])
-                      & ((told < told[i]) | (study["seconds"] < study["seconds"][i])))
+        if not np.any(good & (observed <= observed[i]) & (study["seconds"] <= study["seconds"][i])
+                      & ((observed < observed[i]) | (study["seconds"] < study["seconds"][i])))
     ]  # fmt: skip
     assert sorted(front["seconds"]) == sorted(study["seconds"][wanted])
     assert np.all(np.diff(front["seconds"]) > 0)

@@ -13,6 +13,7 @@ import matplotlib.pyplot as plt  # noqa: E402
 PACKAGE = Path(__file__).parents[2] / "servoctl"
 WIDTH, HEIGHT = 1.62, 0.5  # of a box; floors are 1 apart
 STEP, TRIES = 2.0, 6000  # distance of columns; moves of the search
+TOOLS = ("errors", "checks", "tolerances", "values", "archive", "progress", "version")  # of which any room may import
 EDGE, FILL = "#4a6785", "#eef3f8"
 ARROW = {"arrowstyle": "-|>", "color": "#9db2c6", "lw": 1.1, "shrinkA": 0, "shrinkB": 0}
 
@@ -93,24 +94,29 @@ def placed(floor, arrows):
 
 
 def draw(path):
-    """Draw rooms by height, errors at the bottom; an arrow points at an imported room that no other arrow implies."""
+    """Draw rooms by height above a row of tools; an arrow points at an imported room that no other arrow implies."""
     lines, imports = rooms()
-    floor, arrows = heights(imports), direct(imports)
-    place = placed(floor, arrows)
-    xs, ys = np.array(list(place.values())).T
+    heights(imports)  # of all rooms, so that a circle through the tools is an error, too
+    imports = {name: imported - set(TOOLS) for name, imported in imports.items() if name not in TOOLS}
+    arrows = direct(imports)
+    place = placed(heights(imports), arrows)
+    middle = np.mean([x for x, _ in place.values()])
+    row = {name: (middle + (i - (len(TOOLS) - 1) / 2) * 1.1 * WIDTH, -1.2) for i, name in enumerate(TOOLS)}
+    xs, ys = np.array([*place.values(), *row.values()]).T
     figure, ax = plt.subplots(figsize=(np.ptp(xs) + 2.4, 0.8 * np.ptp(ys) + 1.0), layout="constrained")
     for name, imported in arrows.items():
         for below in imported:
             (x, y), (u, v) = place[name], place[below]
             ax.annotate("", (u, v + HEIGHT / 2), (x, y - HEIGHT / 2), zorder=1, arrowprops=ARROW)
-    for name, (x, y) in place.items():
+    ax.text(xs.min() - WIDTH / 2, -0.8, "tools, which any room may import", size=8, color="#556", va="center")
+    for name, (x, y) in (place | row).items():
         box = plt.Rectangle((x - WIDTH / 2, y - HEIGHT / 2), WIDTH, HEIGHT, fc=FILL, ec=EDGE, lw=1.2, zorder=2)
         ax.add_patch(box)
         folder = "/" if (PACKAGE / name).is_dir() else ""
         ax.text(x, y + 0.06, name + folder, ha="center", va="center", size=10, zorder=3)
         ax.text(x, y - 0.15, f"{lines[name]:,} lines", ha="center", va="center", size=7, color="#556", zorder=3)
     ax.set_xlim(xs.min() - 1.2, xs.max() + 1.2)
-    ax.set_ylim(-0.5, ys.max() + 0.5)
+    ax.set_ylim(ys.min() - 0.5, ys.max() + 0.5)
     ax.axis("off")
     figure.savefig(path, dpi=100)
     plt.close(figure)
