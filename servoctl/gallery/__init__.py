@@ -92,7 +92,7 @@ gallery = {
     ),
     "appell-hamel-squared": Scene(
         partial(appell_hamel, "squared"),
-        "The paper's own form (4.4): singular when the wheel stops, at 0.698 s.",
+        "The paper's squared form (4.4): singular when the wheel stops, at 0.698 s.",
         **_APPELL_HAMEL,
     ),
     "overhead-crane": Scene(
