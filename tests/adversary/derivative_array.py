@@ -15,9 +15,12 @@ from math import factorial
 
 import casadi as ca
 import numpy as np
+from scipy.linalg import lstsq
 
 LEVELS = 8  # derivatives of w that formulas may name
 CUTOFF = 1e-11  # singular values below this fraction of the largest count as zero
+HELD = 1e-11  # a state that leaves equations no more than this is consistent
+ITERATIONS = 25
 
 
 def series_of(function, inputs, size):
@@ -219,8 +222,13 @@ class Reference:
         state = np.zeros(len(x), dtype=bool)
         q_state, w_state, _ = self._parts(state, N)
         q_state[:, 0], w_state[:, : self.top - 1] = True, True
-        for held in (True, False) if near else (False,):
-            if not self._newton(t, x, N, ~state if held else np.ones(len(x), dtype=bool), 8 if held else 25):
+        everything = np.ones(len(x), dtype=bool)
+        if not self._newton(t, x, N, ~state if near else everything):
+            return None
+        if near:
+            residual, J = self.array(t, q, w, multipliers)
+            off = np.abs(residual / np.maximum(np.abs(J).max(axis=1), 1e-300)).max()
+            if off > HELD and not self._newton(t, x, N, everything):
                 return None
         residual, J = self.array(t, q, w, multipliers)
         scale = 1 / np.maximum(np.abs(J).max(axis=1), 1e-300)
@@ -228,10 +236,10 @@ class Reference:
         reaction = np.array(self._force(t, q, w, multipliers))
         return Solution(q[:, 0], w.copy(), reaction, clear, gain, float(np.abs(residual * scale).max()), loose)
 
-    def _newton(self, t, x, N, free, iterations):
+    def _newton(self, t, x, N, free):
         """Gauss-Newton steps of least norm on the free coefficients of x, in place; False where numbers end."""
         size = np.inf
-        for _ in range(iterations):
+        for _ in range(ITERATIONS):
             residual, J = self.array(t, *self._parts(x, N))
             if not np.all(np.isfinite(J)):
                 return False
@@ -252,9 +260,8 @@ class Reference:
 
     @staticmethod
     def _least(J, r):
-        u, s, v = np.linalg.svd(J, full_matrices=False)
-        keep = s > CUTOFF * s[0]
-        return v[keep].T @ ((u[:, keep].T @ r) / s[keep])
+        """The step of least norm; a complete orthogonal factorisation, several times faster than an SVD."""
+        return lstsq(J, r, cond=CUTOFF, lapack_driver="gelsy", check_finite=False)[0]
 
     def _determined(self, J, state, N):
         key = np.zeros(len(state), dtype=bool)

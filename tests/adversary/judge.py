@@ -12,10 +12,12 @@ from derivative_array import Reference
 import servoctl as sv
 
 AGREE = 1e-7  # of accelerations and actuation, relative to 1 plus the largest of them
-SPAN, INSTANTS = 0.4, (0, 7, 20)  # s; samples of 21 at which the reference is asked
+SPAN, SAMPLES = 0.4, 201  # s; verify interpolates the actuation between samples
+INSTANTS = (0, 70, 200)  # samples at which the reference is asked
 DOUBTFUL = 1e-5  # relative singular values below this confirm a refusal on rank
 SHARP = 1e5  # sensitivities of accelerations above this confirm a refusal as singular
 STEEPER = 30.0  # the growth of that sensitivity from start to stop that confirms a stop
+POWER = 0.3  # or it grows at least with this power of one over the time that is left
 LARGE = 1e4  # a motion that has grown so far may end
 PATIENCE = 60  # s for a case
 
@@ -105,9 +107,9 @@ def _judge(case):
         start = model.start(guess=guess)
         stage = "simulate"
         method = None if model.flat else sv.Adaptive("DOP853", rtol=1e-12, atol=1e-13)
-        run = sv.simulate(model, start, (0.0, SPAN), method, t_eval=np.linspace(0.0, SPAN, 21))
+        run = sv.simulate(model, start, (0.0, SPAN), method, t_eval=np.linspace(0.0, SPAN, SAMPLES))
         stage = "verify"
-        proof = sv.verify(model, run, segments=3)
+        proof = sv.verify(model, run, segments=1)
     except sv.ServoError as error:
         return _refused(reference, case, stage, error, start)
     except _OutOfTime:
@@ -168,6 +170,20 @@ def _refused(reference, case, stage, error, start):
     return Verdict(f"wrong: refusal without cause, {what}, {_sentence(error)}", str(error))
 
 
+def _growth(reference, run, t, end):
+    """Whether the sensitivity of the accelerations grows without bound towards the stop at t, in words."""
+    left = np.abs(t - run.t)
+    earlier = np.flatnonzero(left >= 4 * left[-1] + 1e-3)
+    if not end.clear or end.gain > SHARP or not len(earlier):
+        return f"the sensitivity is {end.gain:.1e} at the stop" if not end.clear or end.gain > SHARP else ""
+    for k in (earlier[-1], 0):
+        before = reference.determined(run.t[k], *_jets(run, k, reference.n), near=True)
+        power = POWER if k else 0.0
+        if before is not None and end.gain > before.gain * max(STEEPER if not k else 1.5, (left[k] / left[-1]) ** power):
+            return f"the sensitivity grows from {before.gain:.1e} at {run.t[k]:.3g} s to {end.gain:.1e} at {run.t[-1]:.3g} s"
+    return ""
+
+
 def _sentence(error):
     """The error's first words without names and numbers, for the table."""
     return re.sub(r"[\d.e+-]+|'[^']*'", "…", str(error))[:60]
@@ -185,7 +201,6 @@ def _cause(reference, case, start, error):
         t, (q, w) = run.t[-1], _jets(run, -1, case.n)
         if np.abs(run.jets[:, -1]).max() > LARGE:
             return f"the motion has grown to {np.abs(run.jets[:, -1]).max():.1e}"
-        t = float(error.details.get("t", t))
     points = [reference.determined(t, q, w[:, : reference.top - 1], near)]
     for seed in range(1, 4 if start is None else 1):  # ranks may fall at one point by accident
         rng = np.random.default_rng(seed)
@@ -199,11 +214,9 @@ def _cause(reference, case, start, error):
     if not any(p.clear for p in solved):
         return f"accelerations or actuation undetermined at {len(solved)} points ({solved[0].loose:.1e})"
     if run is not None and len(run.t):
-        first = reference.determined(run.t[0], *_jets(run, 0, case.n), near=True)
-        best = first.gain if first is not None and first.clear else np.inf
-        end = solved[0]
-        if not end.clear or end.gain > min(SHARP, STEEPER * best):
-            return f"the sensitivity has grown from {best:.1e} to {end.gain:.1e}"
+        growth = _growth(reference, run, float(error.details.get("t", t)), solved[0])
+        if growth:
+            return growth
     elif min(p.gain for p in solved) > SHARP:
         return f"accelerations and actuation have the sensitivity {min(p.gain for p in solved):.1e}"
     ranks = [reference.ranks(t, p.q, p.w) for p in solved]

@@ -12,6 +12,7 @@ from pathlib import Path
 
 os.environ.setdefault("SERVOCTL_COMPILER", "none")  # a case is evaluated too few times to be worth compiling
 os.environ.setdefault("SERVOCTL_MEMO", "none")
+os.environ.setdefault("OMP_NUM_THREADS", "1")  # matrices are small: threads only wait for each other
 sys.path[:0] = [str(Path(__file__).parent), str(Path(__file__).parents[2])]
 
 from judge import judge  # noqa: E402
