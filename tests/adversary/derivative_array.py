@@ -158,7 +158,9 @@ class Reference:
         self.multipliers = ca.vertcat(*unknown)
         self.count = force.numel()
         total = self.balance - reaction - self.Gm.T @ nu
-        rows = ca.vertcat(self.V @ self.w[0] + self.h, total, *extra, self.rows, self.material)
+        nearly = "nearly dependent" in case.kinds  # the array is as badly conditioned as such rows, their equivalent is not
+        program, orders = (self.plain, self.orders) if nearly else (self.rows, self.orders_given)
+        rows = ca.vertcat(self.V @ self.w[0] + self.h, total, *extra, program, self.material)
         levels = [self.q, *self.w[: self.top + 1]]
         values = ca.vertcat(self.t, *levels, self.multipliers)
         jacobian = ca.jacobian(rows, ca.vertcat(*levels, self.multipliers))
@@ -167,7 +169,7 @@ class Reference:
         self.function = ca.Function("rows", [values], [ca.cse(ca.vertcat(ca.densify(rows), nonzeros))])
         self.n_rows, self.n_extra = rows.numel(), sum(e.numel() for e in extra)
         _, made = self.leading(self.material)
-        self.row_levels = [0] * n + [1] * n + [-10] * self.n_extra + [order - 1 for order in (*self.orders_given, *made)]
+        self.row_levels = [0] * n + [1] * n + [-10] * self.n_extra + [order - 1 for order in (*orders, *made)]
         at = ca.vertcat(self.t, self.q, *self.w)
         self.at = lambda name, e: ca.Function(name, [at], [e])
         self.matrices = ca.Function("m", [at], [self.mass, self.E, self.G_given, self.Gm])

@@ -179,9 +179,8 @@ def _program(pick, n, k, ideal, known):
             kinds.append("hidden program row")
         elif twist == 8:
             order = orders[-1]
-            small = pick(1, 5)
-            core = f"{_decimal(pick)}*({plain[-1]}) + 1e-{small}*({_row(pick, n, a, order, known)})"
-            rows.append(core)
+            small, core = pick(1, 5), _row(pick, n, a, order, known)
+            rows.append(f"{_decimal(pick)}*({plain[-1]}) + 1e-{small}*({core})")
             kinds.append("nearly dependent")
         elif twist == 7 and pick(0, 3) == 3:
             order, core = orders[-1], f"{_decimal(pick)}*({plain[-1]})"
