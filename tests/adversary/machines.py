@@ -179,8 +179,8 @@ def _program(pick, n, k, ideal, known):
             kinds.append("hidden program row")
         elif twist == 8:
             order = orders[-1]
-            small, core = pick(1, 5), _row(pick, n, a, order, known)
-            rows.append(f"{_decimal(pick)}*({plain[-1]}) + 1e-{small}*({core})")
+            small, factor, core = pick(1, 5), _decimal(pick), _row(pick, n, a, order, known)
+            rows.append(f"{factor}*({plain[-1]}) + 1e-{small}*({core})")
             kinds.append("nearly dependent")
         elif twist == 7 and pick(0, 3) == 3:
             order, core = orders[-1], f"{_decimal(pick)}*({plain[-1]})"
