@@ -19,7 +19,8 @@ from scipy.linalg import lstsq
 
 LEVELS = 8  # derivatives of w that formulas may name
 CUTOFF = 1e-11  # singular values below this fraction of the largest count as zero
-HELD = 1e-11  # a state that leaves equations no more than this is consistent
+HELD = 1e-11  # a state that leaves equations no more than this, relative to the coefficients, is consistent
+MOVED = 1e-6  # of the state: farther than this no drift has taken it
 ITERATIONS = 25
 
 
@@ -230,8 +231,11 @@ class Reference:
         if near:
             residual, J = self.array(t, q, w, multipliers)
             off = np.abs(residual / np.maximum(np.abs(J).max(axis=1), 1e-300)).max()
-            if off > HELD and not self._newton(t, x, N, everything):
+            held = x.copy()
+            if off > HELD * (1 + np.abs(x).max()) and not self._newton(t, x, N, everything):
                 return None
+            if np.abs(x - held)[state].max() > MOVED * (1 + np.abs(held[state]).max()):
+                x[:] = held  # Newton's method has left for another motion, next to a singular one
         residual, J = self.array(t, q, w, multipliers)
         scale = 1 / np.maximum(np.abs(J).max(axis=1), 1e-300)
         clear, gain, loose = self._determined(J[:, ~state] * scale[:, None], state, N)

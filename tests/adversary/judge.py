@@ -134,7 +134,7 @@ def _compared(reference, case, model, run, proof):
     for k in INSTANTS:
         q, w = _jets(run, k, n)
         solution = reference.determined(run.t[k], q, w[:, : min(w.shape[1], top)], near=True)
-        if solution is None or not solution.clear or solution.residual > 1e-9:
+        if solution is None or not solution.clear or solution.residual > AGREE:
             numbers = "none" if solution is None else f"loose {solution.loose:.1e}, residual {solution.residual:.1e}"
             unclear = f"at t = {run.t[k]:.2f}: {numbers}"
             continue
