@@ -170,17 +170,17 @@ def _refused(reference, case, stage, error, start):
     return Verdict(f"wrong: refusal without cause, {what}, {_sentence(error)}", str(error))
 
 
-def _growth(reference, run, t, end):
+def _growth(reference, run, t, last, end):
     """Whether the sensitivity of the accelerations grows without bound towards the stop at t, in words."""
     left = np.abs(t - run.t)
-    earlier = np.flatnonzero(left >= 4 * left[-1] + 1e-3)
+    earlier = np.flatnonzero(left >= 2 * left[last] + 1e-3)
     if not end.clear or end.gain > SHARP or not len(earlier):
         return f"the sensitivity is {end.gain:.1e} at the stop" if not end.clear or end.gain > SHARP else ""
     for k in (earlier[-1], 0):
         before = reference.determined(run.t[k], *_jets(run, k, reference.n), near=True)
         power = POWER if k else 0.0
-        if before is not None and end.gain > before.gain * max(STEEPER if not k else 1.5, (left[k] / left[-1]) ** power):
-            return f"the sensitivity grows from {before.gain:.1e} at {run.t[k]:.3g} s to {end.gain:.1e} at {run.t[-1]:.3g} s"
+        if before is not None and end.gain > before.gain * max(STEEPER if not k else 1.5, (left[k] / left[last]) ** power):
+            return f"the sensitivity grows from {before.gain:.1e} at {run.t[k]:.3g} s to {end.gain:.1e} at {run.t[last]:.3g} s"
     return ""
 
 
@@ -207,6 +207,13 @@ def _cause(reference, case, start, error):
         points.append(reference.determined(0.1 * seed, q + rng.normal(0, 0.3, case.n), w[:, :1]))
     points = [p for p in points if p is not None]
     solved = [p for p in points if p.residual < 1e-9]
+    last = -1
+    while run is not None and not solved and 4 - last <= len(run.t):  # next to a stop the array may be singular
+        last -= 1
+        before = reference.determined(run.t[last], *_jets(run, last, case.n), near=True)
+        solved = [before] if before is not None and before.residual < 1e-9 else []
+        if last < -5:
+            break
     if not solved:
         return f"no consistent point: residuals {', '.join(f'{p.residual:.1e}' for p in points)}"
     if isinstance(error, sv.InconsistentStart):
@@ -214,7 +221,7 @@ def _cause(reference, case, start, error):
     if not any(p.clear for p in solved):
         return f"accelerations or actuation undetermined at {len(solved)} points ({solved[0].loose:.1e})"
     if run is not None and len(run.t):
-        growth = _growth(reference, run, float(error.details.get("t", t)), solved[0])
+        growth = _growth(reference, run, float(error.details.get("t", t)), last, solved[0])
         if growth:
             return growth
     elif min(p.gain for p in solved) > SHARP:
