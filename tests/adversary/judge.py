@@ -214,6 +214,8 @@ def _cause(reference, case, start, error):
         solved = [before] if before is not None and before.residual < 1e-9 else []
         if last < -5:
             break
+    if not solved and start is not None:  # there is one, and the reference has no verdict there
+        return ""
     if not solved:
         return f"no consistent point: residuals {', '.join(f'{p.residual:.1e}' for p in points)}"
     if isinstance(error, sv.InconsistentStart):

@@ -70,6 +70,7 @@ def draw(pick, known=True):
 
     - Paths linear in time: a motion without acceleration, which `verify` measures against itself.
     - A row of order three or above that a combination of lower order replaces: `verify` does not know its derivatives.
+    - Rows that differ by 1e-3 or less: `verify` compares forms without regard to their condition.
     - A combination of rows by a decimal factor: its coefficients, folded in double precision, do not cancel to the last
       digit, and are refused as neither zero nor resolved. Powers of two cancel.
     """
@@ -179,7 +180,7 @@ def _program(pick, n, k, ideal, known):
             kinds.append("hidden program row")
         elif twist == 8:
             order = orders[-1]
-            small, factor, core = pick(1, 5), _decimal(pick), _row(pick, n, a, order, known)
+            small, factor, core = pick(1, 5 if known else 2), _decimal(pick), _row(pick, n, a, order, known)
             rows.append(f"{factor}*({plain[-1]}) + 1e-{small}*({core})")
             kinds.append("nearly dependent")
         elif twist == 7 and pick(0, 3) == 3:
