@@ -70,11 +70,11 @@ MUTANTS = {  # name: (file, old text, new text, tests)
     ),
     "Taylor's factorial is one off": (
         "methods/taylor.py", "scale = -factorial(k - group.order) / factorial(k)",
-        "scale = -factorial(k - group.order) / factorial(max(k - 1, 1))", ("test_taylor.py",),
+        "scale = -factorial(k - group.order) / factorial(max(k - 1, 1))", ("test_convergence.py", *MOTION[:1]),
     ),
     "Taylor's dense output is one off": (
         "methods/taylor.py", "factorial(k) // factorial(k - j)", "factorial(k) // factorial(max(k - j - 1, 0))",
-        ("test_taylor.py",),
+        ("test_convergence.py", *MOTION[:1]),
     ),
     "RK4 with a wrong weight": (
         "methods/runge_kutta.py", '"RK4": [1 / 6, 1 / 3, 1 / 3, 1 / 6]', '"RK4": [1 / 6, 1 / 3, 1 / 6, 1 / 3]', MOTION,
