@@ -8,7 +8,6 @@ import gc
 import importlib.util
 import math
 import os
-import platform
 import statistics
 import subprocess
 import time
@@ -16,7 +15,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from importlib import metadata
 
-import servoctl
+from servoctl.study import table as study
 
 os.environ["SERVOCTL_MEMO"] = "none"  # what is timed as derived is derived
 
@@ -94,12 +93,11 @@ def installed(*modules):
 
 def fastest(make, settings, error, within):
     """The fastest of `make(*setting)` among the settings whose answers are within an error, or `Missing`."""
-    found = []
-    for setting in settings:
-        call = make(*setting)
-        if error(_answer(call())) <= within:
-            found.append((min(_sample(call, _number(call, TRIAL)) for _ in range(TRIALS)), call))
-    return min(found, key=lambda item: item[0])[1] if found else Missing(f"no setting reaches {within:.0e}")
+    calls = [make(*setting) for setting in settings]
+    exact = [call for call in calls if error(_answer(call())) <= within]
+    if not exact:
+        return Missing(f"no setting reaches {within:.0e}")
+    return min(exact, key=lambda call: min(_sample(call, _number(call, TRIAL)) for _ in range(TRIALS)))
 
 
 def measure(row, rounds):
@@ -156,7 +154,7 @@ def _answer(result):
 
 
 def _number(call, seconds):
-    """Of calls that take this long."""
+    """How many calls take this long."""
     return max(1, math.ceil(seconds / max(_sample(call, 1), 1e-9)))
 
 
@@ -176,25 +174,11 @@ def _quartiles(samples):
 
 
 def machine():
-    """What the numbers were measured on: processor, cores, system, compiler and versions."""
-    names = ("casadi", "numpy", "scipy", "heyoka", "sympy", "control", "mujoco", "numba")
-    modules = {name: name for name in names} | {"pin": "pinocchio"}
-    versions = {name: metadata.version(name) for name, module in modules.items() if installed(module)}
-    return {
-        "processor": _processor(),
-        "cores": os.cpu_count(),
-        "system": f"{platform.system()} {platform.machine()}",
-        "compiler": _first_line("gcc", "--version"),
-        "versions": {"servoctl": servoctl.__version__, "python": platform.python_version()} | versions,
-    }
-
-
-def _processor():
-    try:
-        with open("/proc/cpuinfo", encoding="utf-8") as lines:
-            return next(line.split(":", 1)[1].strip() for line in lines if line.startswith("model name"))
-    except (OSError, StopIteration):
-        return platform.processor()
+    """What the numbers were measured on: that of a study, with gcc's version and those of the peers."""
+    peers = {name: name for name in ("heyoka", "sympy", "control", "mujoco", "numba")} | {"pin": "pinocchio"}
+    about = study.machine()
+    about["versions"] |= {name: metadata.version(name) for name, module in peers.items() if installed(module)}
+    return about | {"compiler": _first_line("gcc", "--version")}
 
 
 def _first_line(*command):

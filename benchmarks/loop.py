@@ -29,7 +29,9 @@ def loop(end=END):
     law = sv.lqr(plan, sv.plant(mechanism), rate=RATE)
     schedule = law.schedule.copy()
     schedule[8:] = schedule[8:, -1:]
-    law = sv.Law(law.name, law.measures, law.inputs, RATE, 0.0, law.step, schedule, idle=law.idle, plan=plan)
+    law = sv.Law(
+        law.name, law.measures, law.inputs, RATE, 0.0, law.step, schedule, initial_input=law.initial_input, plan=plan
+    )
     plant = sv.plant(mechanism, m_load=M_LOAD, damping=DAMPING)
     count = round(end * RATE)
     u_ff, reference = schedule[:2, : count + 1], schedule[2:8, : count + 1]

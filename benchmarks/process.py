@@ -1,4 +1,4 @@
-"""What a new process waits for: the import, and the first plan with and without a cache."""
+"""Times of a new process: the import, and the first plan with and without a cache."""
 
 import json
 import os
@@ -14,7 +14,7 @@ from harness import Limit, Row, Timed
 import servoctl as sv
 
 ROOT = Path(sv.__file__).parents[1]
-IMPORTS = 7  # processes at least, for a median
+IMPORTS = 7  # least number of processes for a median
 
 FIRST_PLAN = """
 import json, time
@@ -32,7 +32,7 @@ IMPORT = "import json, time; a = time.perf_counter(); import servoctl; print(jso
 
 
 def fresh(code, cache):
-    """Run in a new process, with its own directory for what is kept; what it says it took, and its answer."""
+    """Run code in a new process with this cache directory: the seconds that it measures, and its answer."""
     environment = os.environ | {"SERVOCTL_CACHE": cache, "SERVOCTL_MEMO": "", "PYTHONPATH": str(ROOT)}
     done = subprocess.run(
         [sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True, cwd=cache
@@ -64,7 +64,7 @@ def second_process():
     def warm():
         return fresh(FIRST_PLAN, directory.name)
 
-    warm.directory = directory  # kept as long as the row
+    warm.directory = directory  # deleted with the row
     return Row(
         "Crane from specification to first plan: a second process", warm, {"the first process, empty cache": cold},
         lambda forces: np.abs(forces - exact).max() / np.abs(exact).max(), 1e-9,

@@ -14,7 +14,7 @@ GUST = {"theta": sv.disturbances.gust(60.0, 2.0, 2.5)}  # N m
 SENSORS = {"x": 1e-3, "l": 1e-3, "theta": 1e-3}  # m, m, rad: standard deviations
 NOISE = SENSORS | {"dx": 1e-2, "dl": 1e-2, "dtheta": 1e-2}  # m/s, m/s, rad/s
 LIMITS = {"trolley": 150.0, "hoist": (-1300.0, 0.0)}  # N
-WEAK = {"trolley": 100.0, "hoist": (-1300.0, 0.0)}  # N; the plan asks for 138 N of the trolley
+WEAK = {"trolley": 100.0, "hoist": (-1300.0, 0.0)}  # N; the plan needs 138 N
 LOOKS = [{"linestyle": style, "color": colour} for style in sv.figures.STYLES for colour in sv.figures.COLOURS]
 RESERVE = 0.8  # of the weak trolley, for the plan; the rest is the feedback's
 
@@ -27,7 +27,7 @@ def planned():
 
 
 def laws(mechanism, plan):
-    """The laws by name, all at 100 Hz, all for the nominal load but the one that says so."""
+    """The laws by name, at 100 Hz, designed for the nominal load except where the name says otherwise."""
     nominal = sv.plant(mechanism)
     integral = sv.lqr(plan, nominal, integral=True)
     gains = {"kp": {"trolley": 2000.0, "hoist": 8000.0}, "kd": {"trolley": 800.0, "hoist": 2000.0}}  # N/m, N s/m
@@ -55,7 +55,7 @@ def load_error(run):
     return 1e3 * np.hypot(run.residual["X"][0], run.residual["Z"][0])
 
 
-def told(name, run):
+def summary(name, run):
     """Worst and last error, the largest trolley force, and whether the power balance of a run holds."""
     error = load_error(run)
     return {
@@ -67,7 +67,7 @@ def told(name, run):
 
 
 def refusal(mechanism, plan, time_constant=0.015):
-    """What is said to poles that are too fast for 100 Hz."""
+    """The error raised for poles that are too fast for 100 Hz."""
     try:
         sv.computed(plan, sv.plant(mechanism), poles=time_constant)
     except sv.SpecificationError as error:
@@ -76,21 +76,21 @@ def refusal(mechanism, plan, time_constant=0.015):
 
 
 def overloaded(mechanism, plan, fast=False):
-    """A trolley of 100 N, for which the plan asks too much: bounded by allocation, then slowed to what it can do."""
+    """A trolley of 100 N, less than the plan needs: inputs bounded by allocation, then a slower plan."""
     nominal, weak = sv.plant(mechanism), sv.plant(mechanism, limits=WEAK)
     scene = {"t_span": (0.0, 6.0), "guess": {"l": 4.0}}
     base = sv.lqr(plan, nominal, integral=True)
     clipped = closed(mechanism, plan, base, WEAK)
-    kept = closed(mechanism, plan, sv.limited(base, weak), WEAK)
-    report = sv.limit_report(kept, None if fast else scene)
+    limited = closed(mechanism, plan, sv.limited(base, weak), WEAK)
+    report = sv.limit_report(limited, None if fast else scene)
     print(report)
     slower = sv.fastest(mechanism, plan.model.reduction.program, {"trolley": RESERVE * WEAK["trolley"]}, **scene)
     print(slower)
     base = sv.lqr(slower.plan, nominal, integral=True)
     slowed = closed(mechanism, slower.plan, sv.limited(base, weak), WEAK, end=10.0)
     print(sv.limit_report(slowed))
-    numbers = told("overloaded, clipped", clipped) | told("overloaded, limited", kept) | told("slowed", slowed)
-    numbers |= {"the plan asks [N]": report.overload[2], "reserve factor": slower.factor}
+    numbers = summary("overloaded, clipped", clipped) | summary("overloaded, limited", limited)
+    numbers |= summary("slowed", slowed) | {"the plan needs [N]": report.overload[2], "reserve factor": slower.factor}
     numbers["slowed: residuals that gave way"] = len(sv.limit_report(slowed).rows)
     return numbers | ({} if fast else {"slower": report.slower})
 
@@ -119,10 +119,10 @@ def save_figure(runs, path):
 
 
 def main(fast=False, save=None):
-    """Errors of the load [mm] and the largest trolley force [N] under each law; `fast` leaves out one time law.
+    """Errors of the load [mm] and the largest trolley force [N] under each law.
 
-    Those of the same loop with noise and one sample of delay follow under "noise, ...". `save` names a file for the
-    figure.
+    Names that begin with "noise, " belong to the same loop with noise and one sample of delay. `fast` leaves out one
+    time law; `save` names a file for the figure.
     """
     mechanism, plan = planned()
     numbers, runs, every = {}, {}, laws(mechanism, plan)
@@ -130,12 +130,12 @@ def main(fast=False, save=None):
         limits = LIMITS if name == "limited" else None
         noise = {state: std for state, std in NOISE.items() if state in law.measures}
         runs[name] = closed(mechanism, plan, law, limits)
-        numbers |= told(name, runs[name]) | {f"{name}: at 6 s [mm]": load_error(runs[name])[600]}
+        numbers |= summary(name, runs[name]) | {f"{name}: at 6 s [mm]": load_error(runs[name])[600]}
         sensors, timing = sv.Sensors(noise=noise, seed=1 if noise else None), sv.Timing(delay=1)
         noisy = closed(mechanism, plan, law, limits, sensors=sensors, timing=timing)
-        numbers |= told(f"noise, {name}", noisy)
+        numbers |= summary(f"noise, {name}", noisy)
     calm = sv.close(sv.plant(mechanism), every["computed, 0.25 s"], plan.state(0.0), (0.0, 8.0))
-    numbers |= told("computed, 0.25 s, as planned", calm)
+    numbers |= summary("computed, 0.25 s, as planned", calm)
     print(refusal(mechanism, plan))
     if save:
         save_figure(runs, save)

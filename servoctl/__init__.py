@@ -31,8 +31,17 @@ from servoctl.errors import (
 )
 from servoctl.export.c import export_c
 from servoctl.internal_dynamics import InternalDynamics, internal_dynamics
-from servoctl.methods.choice import Adaptive, Algebraic, RadauIIA, RungeKutta, Sundials, Taylor
-from servoctl.methods.drift import MinimalCoordinates, Poles, Project
+from servoctl.methods.choice import (
+    Adaptive,
+    Algebraic,
+    MinimalCoordinates,
+    Poles,
+    Project,
+    RadauIIA,
+    RungeKutta,
+    Sundials,
+    Taylor,
+)
 from servoctl.methods.stability import sampled_bound
 from servoctl.model.model import Model, derive
 from servoctl.plants.plant import Plant, plant

@@ -1,4 +1,4 @@
-"""Files of results: npz archives without pickle, and what is said where one cannot be written or read."""
+"""Files of results: npz archives without pickle, and the errors where one cannot be written or read."""
 
 import contextlib
 import json
@@ -13,9 +13,9 @@ FORMAT, SUFFIX = 1, ".npz"
 
 @contextlib.contextmanager
 def writing(path, what, folder=False):
-    """Write below a folder that is made where it is missing; what the file system refuses is a `ServoError`.
+    """A context for writing a file, or into a `folder`, which is made if missing; an OSError becomes a `ServoError`.
 
-    The path is a file, or the `folder` itself; `what` is written: "run", "study", "figures".
+    `what` names the content: "run", "study", "figures".
     """
     path = Path(path)
     try:
@@ -24,14 +24,14 @@ def writing(path, what, folder=False):
     except OSError as error:
         raise ServoError(
             f"The {what} cannot be written to {path}: {error.strerror or error}.",
-            "Results are written where files may be created.",
             do="Choose another path; nothing that was computed is lost.",
             path=str(path),
+            what=what,
         ) from error
 
 
 def save(path, what, facts, arrays):
-    """Write arrays and JSON-able facts as npz; a missing suffix is added. The path."""
+    """Write arrays and JSON-able facts as npz and return the path; a missing suffix is added."""
     path = Path(path)
     path = path if path.suffix == SUFFIX else path.with_name(path.name + SUFFIX)
     with writing(path, what):
@@ -40,26 +40,24 @@ def save(path, what, facts, arrays):
 
 
 def read(path, what, build):
-    """What `build(facts, arrays)` makes of an archive; `ServoError` if there is none of this kind."""
+    """`build(facts, arrays)` of an archive; `ServoError` if the file is not one of this kind."""
     try:
         with np.load(path, allow_pickle=False) as data:
             return build(json.loads(str(data["meta"])), data)
     except (OSError, KeyError, ValueError) as error:
         raise ServoError(
             f"{path} cannot be read as a {what}: {error}.",
-            f"A {what} is an npz file written by {what.capitalize()}.save.",
-            do="Check the path.",
+            f"A {what} is read from an npz file that {what.capitalize()}.save wrote.",
             path=str(path),
+            what=what,
         ) from error
 
 
 def dataset(variables, coordinates, attributes):
-    """An xarray.Dataset; attributes that are no numbers or texts become JSON. `ServoError` without xarray."""
+    """An xarray.Dataset; attributes other than numbers and texts become JSON. `ServoError` without xarray."""
     try:
         import xarray
     except ImportError as error:
-        raise ServoError(
-            "xarray is not installed.", "A Dataset is an xarray object.", do="Install xarray, or use save."
-        ) from error
+        raise ServoError("xarray is not installed.", do="Install xarray, or use save.", package="xarray") from error
     attributes = {k: v if type(v) in (int, float, str) else json.dumps(v) for k, v in attributes.items()}
     return xarray.Dataset(variables, coords=coordinates, attrs=attributes)

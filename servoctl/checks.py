@@ -1,6 +1,6 @@
-"""What a designer may give: numbers, intervals, columns, names; each check returns the value in one form or raises.
+"""Checks of input: expressions first, numbers below. Each returns the value in one form or raises.
 
-Expressions first, numbers below. All raise `SpecificationError`, with what was given in its `details`.
+All raise `SpecificationError`, with the name and the value in its `details`.
 """
 
 import math
@@ -10,34 +10,34 @@ import numpy as np
 
 from servoctl.errors import SpecificationError, unknown
 
-ON_SAMPLE = 1e-6  # of a period: how far from an instant of sampling, or a count from a whole number, rounding may lead
-MOST_MEMORY = 8e9  # bytes for the numbers of all samples: as much as common machines have
+ON_SAMPLE = 1e-6  # rounding of a sampling instant [periods], or of a count
+MOST_MEMORY = 8e9  # bytes for all samples: the memory of common machines
 
 
 def column(value, what, size=None):
-    """A list of SX scalars from a scalar, a sequence, or an SX column; `size` is the length that it must have."""
+    """A list of SX scalars from a scalar, a sequence, or an SX column, of length `size` if that is given."""
     try:
         if isinstance(value, (list, tuple)):
             value = ca.vertcat(*value) if value else ca.SX(0, 1)
         flat = ca.densify(ca.vec(ca.SX(value)))
         items = flat.elements()
     except Exception as error:  # CasADi raises several types here, none of which helps the designer
+        kind = type(value).__name__
         raise SpecificationError(
-            f"{what} is a {type(value).__name__}, not an expression.",
-            "Specifications are CasADi SX expressions of the coordinates, parameters and t, or numbers.",
-            do="Build it from the symbols with CasADi's own functions (ca.sin, ca.sqrt, ca.vertcat, ...).",
+            f"{what} is a {kind}, not an expression.",
+            "Specifications are numbers, or CasADi SX expressions of the coordinates, parameters and t.",
+            do="Build it from the symbols with CasADi's functions (ca.sin, ca.sqrt, ca.vertcat, ...).",
             what=what,
+            type=kind,
         ) from error
     if size is not None and len(items) != size:
-        raise SpecificationError(
-            f"{what} has {len(items)} entries.", f"It needs {size}.", do="Give one entry each.", what=what
-        )
+        given = f"{what} has {len(items)} entries."
+        raise SpecificationError(given, f"It needs {size}.", what=what, entries=len(items), size=size)
     if any(_holds_no_number(item) for item in items):
         raise SpecificationError(
             f"{what} holds NaN or infinity.",
-            "Functions of math and most of numpy turn symbols into NaN without a word.",
-            nearest="ca.sin instead of math.sin, ca.norm_2 instead of np.linalg.norm.",
-            do="Use CasADi's functions on symbols.",
+            "Functions of math and most of numpy turn symbols into NaN without a warning.",
+            do="Use CasADi's functions on symbols: ca.sin instead of math.sin, ca.norm_2 instead of np.linalg.norm.",
             what=what,
         )
     return items
@@ -50,12 +50,8 @@ def matrix(value, what):
             value = ca.vertcat(*(ca.horzcat(*row) if isinstance(row, (list, tuple)) else ca.SX(row) for row in value))
         result = ca.SX(value)
     except Exception as error:  # CasADi raises several types here
-        raise SpecificationError(
-            f"{what} is {value!r}.",
-            "It is a matrix of numbers and expressions.",
-            do="Give rows of equal length.",
-            what=what,
-        ) from error
+        rule, do = "It must be a matrix of numbers and expressions.", "Give rows of equal length."
+        raise SpecificationError(f"{what} is {value!r}.", rule, do=do, what=what) from error
     column(ca.vec(result), what)
     return result
 
@@ -68,41 +64,41 @@ def _holds_no_number(expression):
 
 
 def mapping(value, what):
-    """A dict with text for keys, from a dict or None; `what` begins the message: "The limits"."""
+    """A dict with text keys, from a dict or None; `what` begins the message: "The limits"."""
     if value is None:
         return {}
     if not isinstance(value, dict) or not all(isinstance(key, str) for key in value):
-        raise SpecificationError(
-            f"{what} are {repr(value)[:150]}.", "They go by name.", do="Give a dict with text for keys.", what=what
-        )
+        rule, do = "They are given by name.", "Give a dict with text keys."
+        raise SpecificationError(f"{what} are {repr(value)[:150]}.", rule, do=do, what=what, value=value)
     return value
 
 
 def is_number(value):
-    """Whether a value is a finite number, Python's or NumPy's; True and False are none."""
+    """Whether a value is a finite number of Python or NumPy; True and False are not."""
     numbers = (int, float, np.integer, np.floating)
     return isinstance(value, numbers) and not isinstance(value, bool) and bool(np.isfinite(value))
 
 
 def is_whole(value):
-    """Whether a value is a whole number, Python's or NumPy's; True and False are none."""
+    """Whether a value is an integer of Python or NumPy; True and False are not."""
     return isinstance(value, (int, np.integer)) and not isinstance(value, bool)
 
 
 def plain(value):
-    """A number, text or truth value of Python's own kinds, or None."""
+    """A number, text or truth value as Python's bool, int, float or str; None for anything else."""
     value = value.item() if getattr(value, "ndim", None) == 0 else value
     return value if isinstance(value, (bool, int, float, str)) else None
 
 
 def finite(name, value, what="value"):
-    """A finite float from a number."""
+    """A finite float from a number; `what` it is, in the singular: "limit", "noise"."""
     try:
         number = math.nan if isinstance(value, (str, bytes, complex)) else float(value)
     except Exception:  # CasADi raises its own types for symbols
         number = math.nan
     if not math.isfinite(number):
-        raise SpecificationError(f"The {what} {name!r} is {value!r}.", f"A {what} is a finite number.", name=name)
+        given, rule = f"The {what} {name!r} is {value!r}.", f"A {what} must be a finite number."
+        raise SpecificationError(given, rule, name=name, type=type(value).__name__)
     return number
 
 
@@ -110,54 +106,79 @@ def positive(name, value):
     """A positive finite float from a number."""
     number = finite(name, value)
     if number <= 0:
-        raise SpecificationError(f"{name} = {number:g} was given.", f"The {name} is positive.", name=name, value=number)
+        raise SpecificationError(f"{name} = {number:g} was given.", "It must be positive.", name=name, value=number)
     return number
 
 
 def positives(name, values, do, fewest=1, most=np.inf):
-    """Positive finite numbers as an array, from a number or an array-like, at least `fewest`, each at most `most`."""
+    """An array of at least `fewest` positive numbers, none above `most`, from a number or an array-like."""
     try:
         numbers = np.asarray(values, dtype=float)
     except (TypeError, ValueError):
         numbers = np.zeros(1)
     if numbers.size < fewest or not np.all(np.isfinite(numbers) & (numbers > 0) & (numbers <= most)):
-        count = "It is a positive number, or several" if fewest == 1 else f"It is {fewest} positive numbers or more"
-        bound = "" if most == np.inf else f", at most {most:g}"
-        raise SpecificationError(f"{name}={values!r} was given.", f"{count}{bound}.", do=do, name=name, value=values)
+        count = "It must be a positive number, or several" if fewest == 1 else f"Give at least {fewest}, all positive"
+        rule = count + ("." if most == np.inf else f", each at most {most:g}.")
+        raise SpecificationError(f"{name}={values!r} was given.", rule, do=do, name=name, value=values)
     return numbers
 
 
 def whole(name, value, least=0):
-    """An int from a whole number (1000.0 is one, True is none) that is not below `least`."""
+    """An int from a whole number that is at least `least`: from 1000.0, too, but not from True."""
     try:
         number = least - 1 if isinstance(value, (bool, str, bytes)) else int(value)
     except (TypeError, ValueError, OverflowError):
         number = least - 1
     if number < least or number != value:
-        raise SpecificationError(
-            f"{name}={value!r} was given.", f"It is a whole number, at least {least}.", name=name, value=value
-        )
+        rule = f"It must be a whole number, at least {least}."
+        raise SpecificationError(f"{name}={value!r} was given.", rule, name=name, value=value, least=least)
     return number
 
 
+def positive_number(name, value, most=np.inf):
+    """A positive number up to `most` as a float; text and truth values are none."""
+    if not (is_number(value) and 0 < value <= most):
+        raise SpecificationError(
+            f"{name}={value!r} was given.",
+            f"It is a positive number{f', at most {most:g}' if np.isfinite(most) else ''}.",
+            nearest=f"{name}={most:g}." if is_number(value) and value > most else "",
+            **{name: value},
+        )
+    return float(value)
+
+
+def whole_of(name, value, valid):
+    """An int out of `valid`, a range or a tuple of int; 5.0 is none."""
+    if not (is_whole(value) and value in valid):
+        span = f"from {valid[0]} to {valid[-1]}" if isinstance(valid, range) else f"out of {', '.join(map(str, valid))}"
+        raise SpecificationError(
+            f"{name}={value!r} was given.",
+            f"It is a whole number {span}.",
+            nearest=f"{name}={min(valid, key=lambda number: abs(number - value))}." if is_number(value) else "",
+            **{name: value},
+        )
+    return int(value)
+
+
 def whole_multiple(number, what, of):
-    """How many whole units a number is, to rounding, at least 0: `what` is counted ("delay"), `of` what ("samples")."""
+    """A number that is whole to rounding, as an int of at least 0: `what` ("delay") is counted in `of` ("samples")."""
     number = finite(what, number)
     nearest = max(round(number), 0)
     if abs(number - nearest) > ON_SAMPLE * max(1.0, 1e-6 * abs(number)):
         raise SpecificationError(
             f"{what} makes {number:.9g} {of}.",
-            f"It is a whole number of {of}, at least 0.",
+            f"It must be a whole number of {of}, at least 0.",
             nearest=f"{nearest}.",
+            what=what,
             number=number,
         )
     return nearest
 
 
 def interval(name, value, what):
-    """The interval (low, high) of a name as floats, infinite on a side that is open.
+    """The interval (low, high) of a name as floats, infinite on an open side; `what` it is: "limit", "bound".
 
-    A number c stands for (-c, c), None leaves a side open; `what` it is, in the singular: "limit", "bound".
+    A number c means (-c, c); None leaves a side open.
     """
     try:
         low, high = (-value, value) if np.ndim(value) == 0 else value
@@ -167,7 +188,7 @@ def interval(name, value, what):
     if not low < high or np.isinf([low, high]).all():
         raise SpecificationError(
             f"The {what} of {name!r} is {value!r}.",
-            f"A {what} is an interval: a pair with low < high, None on an open side, or a positive number for both.",
+            f"A {what} is an interval: low < high with None on an open side, or a positive number c for (-c, c).",
             nearest=f"({high:g}, {low:g})." if -np.inf < high < low < np.inf else "",
             name=name,
             value=value,
@@ -176,7 +197,7 @@ def interval(name, value, what):
 
 
 def numbers_by_name(values, names, what, meaning, low=-np.inf, positive=False):
-    """Finite numbers by name, none below `low`; `what` has them ("actuator"), `meaning` is what they are ("lag")."""
+    """Finite numbers by name, none below `low`: each `what` ("actuator") has a `meaning` ("lag")."""
     numbers = {}
     for name, value in mapping(values, f"The {meaning}s").items():
         if name not in names:
@@ -185,8 +206,7 @@ def numbers_by_name(values, names, what, meaning, low=-np.inf, positive=False):
         if number < low or (positive and number <= 0):
             raise SpecificationError(
                 f"The {meaning} of {name!r} is {number:g}.",
-                f"A {meaning} is {'positive' if positive else 'not negative'}.",
-                do="Leave it out, or change the number.",
+                f"A {meaning} must {'be positive' if positive else 'not be negative'}.",
                 name=name,
                 value=number,
             )
@@ -194,7 +214,7 @@ def numbers_by_name(values, names, what, meaning, low=-np.inf, positive=False):
 
 
 def as_span(t_span, forward=False):
-    """A span of time as two different finite numbers [s]; `forward` allows no other than t1 > t0."""
+    """A time span as two different finite numbers [s]; with `forward`, t1 must exceed t0."""
     try:
         t0, t1 = map(float, t_span)
     except (TypeError, ValueError):
@@ -202,22 +222,22 @@ def as_span(t_span, forward=False):
     if not (np.isfinite(t0) and np.isfinite(t1)) or t0 == t1 or (forward and t1 < t0):
         raise SpecificationError(
             f"t_span={t_span!r} was given.",
-            "It goes from t0 to a later t1 [s]." if forward else "A span is two different finite times [s].",
+            f"It must be two different finite times (t0, t1) [s]{', with t0 < t1' if forward else ''}.",
             nearest=f"({t1:g}, {t0:g})." if t1 < t0 else "",
-            do="" if t1 < t0 else "Give (0.0, 2.0).",
             t_span=t_span,
         )
     return t0, t1
 
 
 def require_memory(samples, numbers, given):
-    """Refuse more samples than fit into memory: of each, so many numbers are kept; `given` begins the message."""
+    """Refuse samples, each of so many `numbers`, that do not fit into memory; `given` begins the message."""
     memory = 8.0 * samples * numbers
     if memory > MOST_MEMORY:
         raise SpecificationError(
             f"{given}: {samples:.4g} samples, which take {memory / 1e9:.3g} GB.",
-            f"The numbers of all samples are kept, in {MOST_MEMORY / 1e9:g} GB at most.",
+            f"All samples are held in memory, at most {MOST_MEMORY / 1e9:g} GB.",
             nearest=f"{MOST_MEMORY / (8 * numbers):.3g} samples.",
-            do="Lower the rate, or shorten the time.",
+            do="Lower the rate, or shorten the time span.",
             samples=float(samples),
+            memory=memory,
         )

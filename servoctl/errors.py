@@ -1,34 +1,34 @@
 """The errors of servoctl.
 
-Each message has four parts: what was given, the rule, the nearest valid thing, what to do. The facts are also
-in `details`.
+Each message has up to four sentences: what was given, the rule, the nearest valid value, what to do. The facts are
+also in `details`.
 """
 
 import difflib
 
 
 class ServoError(ValueError):
-    """Raised, through one of its children, when a specification or a motion breaks a rule of the toolkit.
+    """Base of all errors of the toolkit: a specification or a motion breaks a rule.
 
     Parameters
     ----------
     given : str
-        What was given, with its value.
+        The input, with its value.
     rule : str, optional
         The rule that it breaks.
     nearest : str, optional
-        The nearest valid thing.
+        The nearest valid value, computed from the input.
     do : str, optional
-        What to do about it.
+        What to do, unless the rule says it.
     **details
-        The same facts as values, kept in `details`.
+        The same facts as values.
 
     Attributes
     ----------
     details : dict
         The facts of the message, by name.
     run : Run or None
-        The part of the motion that was computed before an integration stopped.
+        What was computed before an integration stopped.
     """
 
     def __init__(self, given, rule="", nearest="", do="", **details):
@@ -40,7 +40,7 @@ class ServoError(ValueError):
 
 
 class SpecificationError(ServoError):
-    """Raised when coordinates, a mechanism, a program or a path contradict themselves or each other."""
+    """Raised when an input is of the wrong kind, or contradicts itself or another one."""
 
 
 class NotRealisable(ServoError):
@@ -48,11 +48,11 @@ class NotRealisable(ServoError):
 
 
 class InconsistentStart(ServoError):
-    """Raised when no start satisfies the held values and every invariant, or none was found from the guess."""
+    """Raised when no state satisfies the held values and every constraint, or the guess leads to none."""
 
 
 class SingularProgram(ServoError):
-    """Raised when the equations of motion lose rank, such as where a row's gradient vanishes on its own solutions."""
+    """Raised when the equations of motion lose rank, as where a constraint's gradient vanishes on its solutions."""
 
 
 class UnstableInternalDynamics(ServoError):
@@ -64,29 +64,17 @@ class LimitExceeded(ServoError):
 
 
 class IntegrationStopped(ServoError):
-    """Raised when an integrator cannot go on; what it computed is in `run`."""
+    """Raised when an integrator cannot continue; what it computed is in `run`."""
 
 
 class NameUnknown(ServoError):
-    """Raised when a name is none of those that exist; the nearest match is in the message."""
+    """Raised when a name is unknown; the message has the closest valid one."""
 
 
 def unknown(name, valid, what):
-    """Make the error for a name that is none of the valid ones.
+    """The `NameUnknown` for a name that is not valid, to be raised by the caller; `what` it names: "parameter".
 
-    Parameters
-    ----------
-    name : str
-        The name that was given.
-    valid : iterable of str
-        The names that exist.
-    what : str
-        What the names stand for, in the singular: `"parameter"`, `"method"`.
-
-    Returns
-    -------
-    NameUnknown
-        To be raised by the caller, with `details` `name`, `valid` (tuple) and `match` (str or None).
+    Its details are `name`, `valid` (tuple) and `match` (the closest valid name, or None).
     """
     valid = tuple(str(candidate) for candidate in valid)
     by_lower_case = {candidate.lower(): candidate for candidate in reversed(valid)}
@@ -96,7 +84,6 @@ def unknown(name, valid, what):
         f"No {what} is named {name!r}",
         f"The names are: {', '.join(valid)}" if valid else f"There is no {what} at all",
         repr(nearest) if nearest else "",
-        "Use one of these names" if valid else f"Leave the {what} out",
         name=name,
         valid=valid,
         match=nearest,

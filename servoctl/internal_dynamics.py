@@ -1,38 +1,38 @@
 """The internal dynamics that a program leaves: its linearisation and eigenvalues along a motion.
 
-Deviations on the manifold of the constraints are N y, in a frame N that is orthonormal in the tangent space and moves
-along without turning in it (Nᵀ N' = 0): y' = Nᵀ J N y with J = ∂X'/∂X. Each state is measured by its size along the
-motion.
+Deviations on the manifold of the constraints are N y. The frame N is orthonormal in the tangent space and does not turn
+within it (Nᵀ N' = 0), so that y' = Nᵀ J N y with J = ∂X'/∂X. States are scaled by their sizes along the motion.
 """
 
 from dataclasses import dataclass
 
 import numpy as np
 
-from servoctl.run import require_model
+from servoctl.model.model import Model
+from servoctl.run import Run, require_model
 
 INSTANTS = 41  # instants along a run at which the internal dynamics is linearised
-AT_ZERO = 1e-9  # size of a state relative to the largest: rounding of one that stays zero
-NEUTRAL = 1e-7  # of the largest entry of the linearisation: a smaller real part is none
+AT_ZERO = 1e-9  # size of a state relative to the largest, below which it is the rounding of zero
+NEUTRAL = 1e-7  # of the largest entry of the linearisation: a smaller real part counts as zero
 
 
 @dataclass(frozen=True, eq=False)
 class InternalDynamics:
-    """Eigenvalues of the motion's freedom that the program leaves, frozen at instants; made by `internal_dynamics`.
+    """Eigenvalues of the internal dynamics, frozen at instants; made by `internal_dynamics`.
 
     Attributes
     ----------
     t : (N,) array
         [s]
     names : tuple of str
-        States that may serve as its coordinates, Σ o_a of them.
+        Σ o_a states that may serve as its coordinates.
     eigenvalues : (Σ o_a, N) complex array
         [1/s], by descending real part.
     verdict : {"none", "stable", "neutral", "unstable"}
-        None is left for flat programs; "neutral" has eigenvalues on the imaginary axis (symmetries, oscillations
-        without damping), "unstable" some to the right of it at some instant.
+        "none" for flat programs; "neutral" has eigenvalues on the imaginary axis (symmetries, undamped oscillations),
+        "unstable" some to the right of it at some instant.
     growth : float
-        exp of the integral of the largest positive real part over the run: by how much errors of the start grow.
+        exp of the integral of the largest positive real part over the run: the growth of initial errors.
     """
 
     t: np.ndarray
@@ -60,7 +60,7 @@ def linearised(model, run, count):
     run : Run
         A motion of it.
     count : int
-        Number of instants, spread over the samples; those where the motion has no finite Jacobian are left out.
+        Number of instants, spread over the samples; those without a finite Jacobian are left out.
 
     Returns
     -------
@@ -85,15 +85,15 @@ def linearised(model, run, count):
 def _jacobians(model, run, picked, n_x):
     """∂X'/∂X (N, n_x, n_x) and the invariants' Jacobian (N, m, n_x) at samples, by variant of the model."""
     for first, end, variant in run.variants or ((0, len(run.t), model),):
-        own = picked[(picked >= first) & (picked < end)]
-        if len(own):
-            t, x, p, m = run.t[own], run.jets[:n_x, own], variant.parameters, len(variant.invariant_names())
+        samples = picked[(picked >= first) & (picked < end)]
+        if len(samples):
+            t, x, p, m = run.t[samples], run.jets[:n_x, samples], variant.parameters, len(variant.invariant_names())
             J = variant.function("ode_jacobian").grid(t, x, p).T.reshape(-1, n_x, n_x).swapaxes(1, 2)
             C = variant.function("invariants").grid(t, x, p)[m:].T.reshape(-1, n_x, m).swapaxes(1, 2)
             yield J, C
 
 
-def internal_dynamics(model, run) -> InternalDynamics:
+def internal_dynamics(model: Model, run: Run) -> InternalDynamics:
     """Find the eigenvalues of the internal dynamics along a run.
 
     Parameters
@@ -125,7 +125,7 @@ def internal_dynamics(model, run) -> InternalDynamics:
 
 
 def _independent(model, bases):
-    """Names of states that serve as coordinates of the motion's freedom at all instants."""
+    """Names of states that serve as coordinates of the internal dynamics at all instants."""
     from scipy.linalg import qr
 
     tangents = np.linalg.qr(bases)[0]

@@ -7,14 +7,14 @@ PATIENCE = 1.0  # s before a bar appears
 
 
 def progress_bar(name, wanted, total=None, **options):
-    """A bar of tqdm that appears after a second; `wanted` None means on a terminal. Options are those of tqdm."""
+    """A bar of tqdm, with its options, that appears after a second; `wanted` None means on a terminal."""
     from tqdm import tqdm
 
     return tqdm(desc=name, total=total, disable=not _shown(wanted), **{"delay": PATIENCE, **options})
 
 
 class Progress:
-    """Progress over a span [s], as a bar or as calls of a function of time; `wanted` None: a bar on a terminal."""
+    """Progress over a span [s], as a bar or as calls of a function of time; `wanted` None means a bar on a terminal."""
 
     def __init__(self, span, wanted):
         self.t0, self.total = span[0], abs(span[1] - span[0])
@@ -23,7 +23,7 @@ class Progress:
         self.since, self.bar, self.done = time.monotonic(), None, 0.0
 
     def __call__(self, t):
-        """Show that the work has come to t [s]."""
+        """Show that t [s] is reached."""
         if self.call is not None:
             self.call(t)
         elif self.wanted and (self.bar is not None or time.monotonic() - self.since >= PATIENCE):

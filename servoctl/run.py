@@ -11,7 +11,8 @@ from servoctl.errors import SpecificationError, unknown
 from servoctl.values import Value, same
 
 STENCIL = 9  # samples of the polynomial through which an extremum is refined: error of order h^9
-AS_SAMPLED = 1e-14  # of the values beside it: an extremum between samples that is no further from one is that sample
+AS_SAMPLED = 1e-14  # relative: a refined extremum must exceed the sampled one by this
+SAME_TIME = 1e-12  # relative: rounding of an instant
 FACTS = ("method", "drift", "counters", "success", "status", "message", "knots", "jet_names")  # of a saved run
 
 
@@ -19,8 +20,8 @@ FACTS = ("method", "drift", "counters", "success", "status", "message", "knots",
 class Run(Value):
     """A motion with its actuation and its residuals; made by `simulate`, `close` or `load`.
 
-    `run["theta"]`, `run["dtheta"]`, `run["trolley"]` are (N,) arrays, SI, and so are the derivatives in time of an
-    actuation, output or energy, `run["dtrolley"]`, `run["d2trolley"]`, where the jets reach: `simulate(...,
+    `run["theta"]`, `run["dtheta"]`, `run["trolley"]` are (N,) arrays, SI. Time derivatives of an actuation, output or
+    energy are `run["dtrolley"]`, `run["d2trolley"]`; they may need higher jets, from `simulate(...,
     method=sv.Taylor(jets=3))`. `run.residual["X"]` is (levels, N): the residual and its derivatives.
 
     Attributes
@@ -30,14 +31,14 @@ class Run(Value):
     jets : (n_z, N) array
         q, γ', ..., γ^(s̄), with the names `jet_names`.
     counters : dict of str to int
-        nfev, njev, nlu, steps, iterations, projections, pivot changes: those that the method has.
+        nfev, njev, nlu, steps, iterations, projections, pivot_changes, as the method counts them.
     success : bool
     status : int
         0 finished, 1 interrupted, -1 stopped.
     message : str
-        What happened, and what to try next.
+        Whether the run finished, and if not, why.
     variants : tuple of (first, last + 1, model)
-        Where pivots were changed: which variant of the model holds for which samples; empty for the model alone.
+        The variant of the model, with its choice of pivots, for each range of samples; empty if there is only one.
     """
 
     t: np.ndarray
@@ -58,22 +59,27 @@ class Run(Value):
     def __eq__(self, other):
         if not super().__eq__(other):
             return False
-        follows = self.model is not None  # from the jets
-        return follows or same((self.stored, self.stored_residual), (other.stored, other.stored_residual))
+        # with a model all signals follow from the jets, and `stored` only holds those already computed
+        signals = (self.stored, self.stored_residual), (other.stored, other.stored_residual)
+        return self.model is not None or same(*signals)
 
     __hash__ = Value.__hash__
 
     @property
+    def _groups(self):
+        """The model's group of each signal; none for a loaded run, whose signals are all stored."""
+        return self.model.signal_groups if self.model is not None else {}
+
+    @property
     def names(self) -> tuple[str, ...]:
         """Names of all signals."""
-        groups = self.model.signal_groups if self.model is not None else {}
-        return tuple(dict.fromkeys([*self.jet_names, *groups, *self.stored]))
+        return tuple(dict.fromkeys([*self.jet_names, *self._groups, *self.stored]))
 
     def __getitem__(self, name: str) -> np.ndarray:
         if name in self.jet_names:
             return self.jets[self.jet_names.index(name)]
         if name not in self.stored:
-            groups = self.model.signal_groups if self.model is not None else {}
+            groups = self._groups
             rate, base = (0, name) if name in groups else _split(name)
             if base not in groups:
                 raise unknown(name, self.names, "signal")
@@ -82,14 +88,14 @@ class Run(Value):
         return self.stored[name]
 
     def signals(self, kind, rate=0):
-        """Names and (n, N) values of one of the model's groups of signals, or of their derivatives in time.
+        """Names and (n, N) values of one of the model's groups of signals, or of their time derivatives.
 
         Parameters
         ----------
         kind : str
             One of `servoctl.model.equations.SIGNALS`.
         rate : int
-            Order of the derivative. It may need jets above s̄.
+            Order of the derivative, which may need jets above s̄.
 
         Raises
         ------
@@ -100,14 +106,13 @@ class Run(Value):
         for first, end, model in self.variants or ((0, len(self.t), self.model),):
             names, f = model.signals(kind, rate)
             if f.n_x > len(self.jets):
-                highest = (f.n_x - model.nq) // model.n
+                present, needed = ((size - model.nq) // model.n for size in (len(self.jets), f.n_x))
                 raise SpecificationError(
-                    f"{', '.join(names)} {'is' if len(names) == 1 else 'are'} not in a run with jets up to "
-                    f"order {(len(self.jets) - model.nq) // model.n}.",
-                    f"These derivatives in time follow from jets up to order {highest}.",
-                    nearest=f"simulate(..., method=sv.Taylor(jets={highest})).",
-                    do="Simulate so.",
-                    jets=highest,
+                    f"The run has jets up to order {present}, too few for {', '.join(names)}.",
+                    f"These time derivatives follow from jets up to order {needed}.",
+                    do=f"Simulate with method=sv.Taylor(jets={needed}).",
+                    names=names,
+                    jets=needed,
                 )
             parts.append(f.grid(self.t[first:end], self.jets[: f.n_x, first:end], model.parameters))
         return names, np.concatenate(parts, axis=1)
@@ -133,8 +138,7 @@ class Run(Value):
         -------
         (nq + n,) array
         """
-        jets = self.at(t)
-        return jets[: self.model.nq + self.model.n]
+        return self.at(t)[: self.model.nq + self.model.n]
 
     def at(self, t: float) -> np.ndarray:
         """The jets Z at an instant (n_z,), between samples by Hermite interpolation of all derivatives.
@@ -150,15 +154,20 @@ class Run(Value):
             If t lies outside the run.
         """
         low, high = min(self.t[0], self.t[-1]), max(self.t[0], self.t[-1])
-        if not low - 1e-12 * (1 + abs(low)) <= t <= high + 1e-12 * (1 + abs(high)):
+        if not low - SAME_TIME * (1 + abs(low)) <= t <= high + SAME_TIME * (1 + abs(high)):
             raise SpecificationError(
-                f"t = {t:g} s was given.", f"The run covers {low:g} to {high:g} s.", do="Give a time within."
+                f"t = {t:g} s lies outside the run.",
+                f"It covers {low:g} to {high:g} s.",
+                nearest=f"t = {low if t < low else high:g} s." if np.isfinite(t) else "",
+                t=t,
+                span=(low, high),
             )
         if self.model is None:
             raise SpecificationError(
-                "A loaded run knows its samples only.",
-                "Interpolation needs the model.",
-                do="Take a column of run.jets.",
+                "The run was loaded from a file, without its model.",
+                "Values between samples need the model.",
+                do="Use a column of run.jets.",
+                t=t,
             )
         i = int(np.argmin(np.abs(self.t - t)))
         if abs(self.t[i] - t) < 1e-13 * max(1.0, high - low) or len(self.t) == 1:
@@ -197,7 +206,7 @@ class Run(Value):
         Returns
         -------
         ((t, value), (t, value))
-            Of the minimum and the maximum among finite values; NaN where there are none.
+            Minimum and maximum of the finite values; NaN if there are none.
         """
         values = self[name]
         return tuple(self._refined(values, sign) for sign in (-1.0, 1.0))
@@ -206,11 +215,9 @@ class Run(Value):
         known = np.isfinite(values)
         k = int(np.argmax(np.where(known, sign * values, -np.inf)))
         best = (float(self.t[k]), float(values[k]))
-        edges = [
-            self.t[0],
-            *[x for x in self.knots if min(self.t[0], self.t[-1]) < x < max(self.t[0], self.t[-1])],
-            self.t[-1],
-        ]
+        low, high = sorted((self.t[0], self.t[-1]))
+        # no polynomial crosses a knot, where derivatives jump
+        edges = [self.t[0], *(knot for knot in self.knots if low < knot < high), self.t[-1]]
         for a, b in zip(edges[:-1], edges[1:], strict=True):
             inside = np.flatnonzero((self.t >= min(a, b)) & (self.t <= max(a, b)))
             if k not in inside or len(inside) < 4:
@@ -278,23 +285,18 @@ class Run(Value):
             "  " + ", ".join(f"{name} {count}" for name, count in self.counters.items() if count),
             "  largest residuals over all levels: " + ", ".join(f"{name} {worst[name]:.1e}" for name in shown),
         ]
-        signals = [name for name in (*self._actuators(), *self._outputs()) if np.isfinite(self[name]).any()]
+        signals = (*self.model.actuators, *self.model.outputs) if self.model is not None else ()
+        signals = [name for name in signals if name in self.names and np.isfinite(self[name]).any()]
         for name in signals[:7]:
             (t_low, low), (t_high, high) = self.extrema(name)
             lines.append(f"  {name}: {low:.6g} (t = {t_low:.4g} s) .. {high:.6g} (t = {t_high:.4g} s)")
         return "\n".join(line for line in lines if line.strip())
 
-    def _actuators(self):
-        return [n for n in (self.model.actuators if self.model is not None else ()) if n in self.names]
-
-    def _outputs(self):
-        return list(self.model.outputs) if self.model is not None else []
-
 
 def _split(name):
-    """The order k >= 1 and the rest of a name d..., d2..., d3...; 0 and the name itself where it is none."""
-    found = re.fullmatch(r"d([2-9]|[1-9]\d+)?(\D.*)", name) if isinstance(name, str) else None
-    return (int(found[1] or 1), found[2]) if found else (0, name)
+    """The order k and the rest of a name d..., d2..., d3...; 0 and the name itself if it is no derivative."""
+    derivative = re.fullmatch(r"d([2-9]|[1-9]\d+)?(\D.*)", name) if isinstance(name, str) else None
+    return (int(derivative[1] or 1), derivative[2]) if derivative else (0, name)
 
 
 class _Residuals(Mapping):
@@ -320,9 +322,9 @@ class _Residuals(Mapping):
         if name not in stored:
             if name not in self._names():
                 raise unknown(name, self._names(), "residual")
-            places, values = self._run.signals("residuals")
-            for row in dict.fromkeys(place[0] for place in places):
-                stored[row] = values[[i for i, place in enumerate(places) if place[0] == row]]
+            levels, values = self._run.signals("residuals")
+            for row in dict.fromkeys(level[0] for level in levels):
+                stored[row] = values[[i for i, level in enumerate(levels) if level[0] == row]]
         return stored[name]
 
 
@@ -354,22 +356,18 @@ def _from_archive(facts, arrays):
 
 
 def require_model(model, run, what):
-    """Refuse a run that is not of a model.
-
-    Raises
-    ------
-    SpecificationError
-        Naming what was given to the function `what`.
-    """
+    """Refuse a run of another model, or none; `what` is the function that needs both."""
     states = getattr(model, "state_names", ())
     if getattr(run, "model", None) is None or not hasattr(model, "reduction"):
         which = " without its model" if hasattr(run, "jets") else ""
     elif run.jet_names[: len(states)] != tuple(states):
-        which = " of another one"
+        which = " of another model"
     else:
         return
     raise SpecificationError(
-        f"{what} was given a {type(model).__name__} and a {type(run).__name__}{which}.",
-        "A run belongs to the model that made it; a loaded run has none.",
+        f"sv.{what} received a {type(model).__name__} and a {type(run).__name__}{which}.",
+        "It needs a model and a run of this model; a run that was loaded from a file has none.",
         do=f"Write sv.{what}(model, run), or simulate again.",
+        model=type(model).__name__,
+        run=type(run).__name__,
     )

@@ -1,8 +1,10 @@
 """From a model and a start to a run."""
 
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from servoctl.checks import as_span
 from servoctl.errors import InconsistentStart, SpecificationError
@@ -12,31 +14,47 @@ from servoctl.methods.choice import (
     EXPLICIT,
     Adaptive,
     Algebraic,
+    Method,
+    MinimalCoordinates,
+    Poles,
+    Project,
     RadauIIA,
     RungeKutta,
     Sundials,
     Taylor,
+    as_drift,
     as_method,
     default_method,
     require_combination,
 )
-from servoctl.methods.drift import Poles, Project, as_drift
 from servoctl.methods.radau import RadauSteps
 from servoctl.methods.runge_kutta import RungeKuttaSteps
 from servoctl.methods.scipy_methods import ScipySteps
-from servoctl.methods.stability import row_poles, run_checked, warn_many_steps
+from servoctl.methods.stability import run_checked, warn_many_steps
 from servoctl.methods.sundials import SundialsSteps
 from servoctl.methods.taylor import TaylorSteps
+from servoctl.model.model import Model
+from servoctl.model.start import State
 from servoctl.progress import Progress
-from servoctl.run import Run
+from servoctl.run import SAME_TIME, Run
 
-DEFAULT_SAMPLES = 1001  # of a run unless t_eval says otherwise: smooth curves, and extrema refined to rounding
-STEPS_IN_SPAN = 2000  # of fixed length in a span, unless the method has its own
+DEFAULT_SAMPLES = 1001  # without t_eval: smooth curves, and extrema refined to rounding
+STEPS_IN_SPAN = 2000  # steps of fixed length in a span if the method has no step
 MOST_STEPS = 10**8  # of fixed length: more would fill the memory with samples
-OFF = 1e-5  # of a start: residuals relative to their gradients times the state, above which it is no start
+OFF = 1e-5  # residual relative to its gradient times the state, above which a start is inconsistent
 
 
-def simulate(model, start, t_span, method=None, *, drift=None, accuracy=None, t_eval=None, progress=None):
+def simulate(
+    model: Model,
+    start: State | ArrayLike,
+    t_span: Sequence[float],
+    method: Method | str | None = None,
+    *,
+    drift: Project | Poles | MinimalCoordinates | str | float | None = None,
+    accuracy: float | None = None,
+    t_eval: ArrayLike | None = None,
+    progress: bool | Callable[[float], object] | None = None,
+) -> Run:
     """Simulate the motion that a program prescribes.
 
     Main arguments
@@ -48,41 +66,42 @@ def simulate(model, start, t_span, method=None, *, drift=None, accuracy=None, t_
         From `model.start`.
     t_span : (t0, t1)
         [s]; t1 < t0 runs backwards.
-    method : Algebraic, Taylor, RadauIIA, RungeKutta, Adaptive, Sundials, or the short form of one, optional
-        Such as `sv.Taylor(jets=3)` or `sv.RungeKutta(4, step=1e-3)`; "algebraic", "Taylor", "RadauIIA", "RK1" to
-        "RK8", "DOP853" and scipy's others, "CVODES" and "IDAS" stand for the values with their defaults. Default:
-        "algebraic" where the program determines the motion completely (Σ o_a = 0: a Newton solve at each instant, no
-        integration), else "DOP853". "Taylor" is the most accurate; "RadauIIA" is for stiff scenes.
+    method : Algebraic, Taylor, RadauIIA, RungeKutta, Adaptive, Sundials, or a short form, optional
+        A method with its settings, such as `sv.Taylor(jets=3)` or `sv.RungeKutta(4, step=1e-3)`, or the short form of
+        a method with its defaults: "algebraic", "Taylor", "RadauIIA", "RK1" to "RK8", scipy's names, "CVODES" or
+        "IDAS". Default: "algebraic" (a Newton solve at each instant) if the program determines the motion completely,
+        Σ o_a = 0, else "DOP853". "Taylor" is the most accurate; "RadauIIA" is for stiff motions.
     drift : None, "project", "minimal", float, `Project(...)`, `Poles(...)` or `MinimalCoordinates()`, optional
-        Treatment of constraint drift; a number is the time constant of the error dynamics [s]. "minimal" integrates
-        as many values as the program leaves free and solves the others: exact, in Python, at many times the cost.
+        Treatment of constraint drift. A number is the time constant of the error dynamics [s]. "minimal" integrates
+        as many values as the program leaves free and solves for the others: exact, in Python, at many times the cost.
     accuracy : float, optional
-        Largest error of the motion, relative to each component's size, in place of method and drift: they follow from
-        it (`servoctl.methods.accuracy`), and the error is measured. `method=sv.Taylor(jets=3)` beside it asks for
-        jets.
+        Largest error of the motion, relative to each component's size. It determines method and drift
+        (`servoctl.methods.accuracy`), and the error is measured. Only `method=sv.Taylor(jets=3)` may be combined
+        with it, for jets.
 
     Other arguments
 
     t_eval : (N,) array, optional
         Times of the samples [s], within t_span. Default: 1001 instants and the knots; all steps of `RungeKutta`.
     progress : bool or callable, optional
-        Show a bar; default: on a terminal, after a second. Or a function of the time reached [s], which may raise.
+        Whether to show a bar; default: on a terminal, after a second. A callable receives the time reached [s]; an
+        exception that it raises ends the simulation.
 
     Returns
     -------
     Run
-        Ctrl-C returns what was computed, with `success` False.
+        After Ctrl-C it holds what was computed, with `success` False.
 
     Raises
     ------
     SingularProgram, IntegrationStopped
-        Where the motion ends; `.run` holds what was computed.
+        If the motion ends early; `.run` holds what was computed.
     LimitExceeded
-        Where the accuracy is out of reach.
+        If the accuracy is out of reach.
     InconsistentStart
-        For a start off the constraints, unless the treatment of drift leads back.
+        If the start violates the constraints and the treatment of drift does not correct it.
     SpecificationError
-        For a method and a treatment of drift that do not go together, or a path that is not smooth enough.
+        If method and drift do not go together, or a path is not smooth enough.
     """
     if accuracy is not None:
 
@@ -97,7 +116,7 @@ def simulate(model, start, t_span, method=None, *, drift=None, accuracy=None, t_
     if isinstance(drift, Poles):
         _require_decay(model, drift, t0, t1)
         if str(method) in EXPLICIT:
-            warn_many_steps(str(method), row_poles(drift, model), t1 - t0)
+            warn_many_steps(str(method), drift.by_row(model), t1 - t0)
     leads_back = isinstance(method, Algebraic) or isinstance(drift, (Poles, Project))
     x0 = (as_state if leads_back else consistent_state)(model, start, t0)
     knots = model.require_smooth((min(span), max(span)))
@@ -117,7 +136,7 @@ def simulate(model, start, t_span, method=None, *, drift=None, accuracy=None, t_
 
 
 def _motion(model, method, drift, span, x0, times, knots, bar):
-    """The motion by a method: samples at the times (N,), of `RungeKutta` at its steps."""
+    """Integrate by a method; samples are taken at the times (N,), by `RungeKutta` at its steps."""
     (t0, t1), arguments = span, (span[0], x0, span[1], times, knots)
     match method:
         case Algebraic():
@@ -138,8 +157,8 @@ def _motion(model, method, drift, span, x0, times, knots, bar):
 
 
 def _run(model, motion, method, drift, knots, span):
-    """The run that a motion makes, to its end or its stop."""
-    if not motion.pieces:
+    """The run of a motion, to its end or its stop."""
+    if not motion.pieces:  # interrupted or stopped before the first sample
         motion.add(model, [span[0]], span[1][:, None], np.full((model.n, 1), np.nan))
     t, jets, variants = motion.samples()
     last = f"t = {t[-1]:.7g} s"
@@ -155,26 +174,29 @@ def _run(model, motion, method, drift, knots, span):
 
 
 def _resample(run, times):
+    """The run at other times, each with the variant of the nearest step."""
     low, high = min(run.t[0], run.t[-1]), max(run.t[0], run.t[-1])
     times = times[(times >= low) & (times <= high)]
-    owner = [run.variant(int(np.argmin(np.abs(run.t - t)))) for t in times]
-    variants = tuple((i, i + 1, model) for i, model in enumerate(owner)) if len(run.variants) > 1 else run.variants[:1]
-    variants = tuple((0, len(times), v[2]) for v in variants) if len(variants) == 1 else variants
+    if len(run.variants) == 1:
+        variants = ((0, len(times), run.variants[0][2]),)
+    else:
+        nearest = (int(np.argmin(np.abs(run.t - t))) for t in times)
+        variants = tuple((i, i + 1, run.variant(step)) for i, step in enumerate(nearest))
     return replace(run, t=times, jets=np.array([run.at(t) for t in times]).T, variants=variants)
 
 
 def _require_decay(model, drift, t0, t1):
     """Refuse poles that amplify in the direction of time."""
-    drift.coefficients(model)  # refuses poles that do not fit the rows
-    for row, values in row_poles(drift, model).items():
+    for row, values in drift.by_row(model).items():
         if np.any(np.real(values) * (t1 - t0) > 0):
-            way, sign = ("forward", "negative") if t1 > t0 else ("backwards", "positive")
+            sign = "negative" if t1 > t0 else "positive"
             raise SpecificationError(
-                f"drift={drift} was given with a span that runs {way}: {row!r} has poles {np.asarray(values)} 1/s.",
-                "Error dynamics that decay forward in time grow backward, and the other way round.",
-                nearest=f"drift='project'; or poles by row with {sign} real parts.",
-                do="Change one of them.",
+                f"The row {row!r} has the poles {np.asarray(values)} 1/s, and t_span is {t0:g} to {t1:g} s.",
+                f"In this direction of time error dynamics decay if their poles have {sign} real parts.",
+                do="Use drift='project', or poles by row with such real parts.",
                 row=row,
+                poles=list(values),
+                t_span=(t0, t1),
             )
 
 
@@ -189,19 +211,23 @@ def as_state(model, start, t0):
             f"The start has the shape {values.shape}.",
             f"A state of this model has {len(model.state_names)} finite entries: {', '.join(model.state_names)}.",
             do="Make it by model.start(...).",
+            shape=values.shape,
+            names=model.state_names,
         )
     t = getattr(start, "t", t0)
-    if abs(t - t0) > 1e-12 * max(1.0, abs(t0)):
+    if abs(t - t0) > SAME_TIME * max(1.0, abs(t0)):
         raise SpecificationError(
             f"The start is consistent at t = {t:g} s, the span begins at {t0:g} s.",
-            "A start satisfies the constraints at the first instant.",
+            "Constraints depend on time, so that a start belongs to the first instant of the span.",
             do=f"Use model.start(t={t0:g}, ...).",
+            t=t,
+            t0=t0,
         )
     return values
 
 
 def consistent_state(model, start, t):
-    """The same, refused off the constraints: without a treatment that leads back, the whole motion would be off."""
+    """The state that a start gives, which must satisfy the invariants: nothing would lead the motion back to them."""
     x = as_state(model, start, t)
     names = [name for _, name in model.invariant_names()]
     y = model.function("invariants")(t, x, model.parameters)
@@ -212,9 +238,8 @@ def consistent_state(model, start, t):
         worst = int(np.argmax(off))
         raise InconsistentStart(
             f"The start leaves the residual {values[worst]:.3g} of {names[worst]!r}.",
-            "A start satisfies every constraint at every level; what is off at the start stays off.",
-            nearest="drift='project', which moves it onto the constraints; error dynamics lead back, too.",
-            do="Make it by model.start(guess={...}).",
+            "It must satisfy every constraint at every level, or the whole motion violates them.",
+            do="Complete it by model.start(guess={...}), or use drift='project', which corrects it.",
             invariant=names[worst],
             residual=float(values[worst]),
         )
@@ -231,11 +256,15 @@ def _times(t0, t1, t_eval, knots):
             times = np.array([np.nan])
         if not np.all(np.isfinite(times)):
             raise SpecificationError(
-                f"t_eval={t_eval!r} was given.", "It is a sequence of finite times [s].", do="Give [0.0, 0.5, 1.0]."
+                f"t_eval={t_eval!r} was given.", "It is a sequence of finite times [s].", t_eval=t_eval
             )
-        if not times.size or times[0] < min(t0, t1) - 1e-12 or times[-1] > max(t0, t1) + 1e-12:
+        if not times.size or times[0] < min(t0, t1) - SAME_TIME or times[-1] > max(t0, t1) + SAME_TIME:
+            covered = f"covers {times[0]:g} to {times[-1]:g} s" if times.size else "is empty"
             raise SpecificationError(
-                "t_eval lies outside t_span or is empty.", "Samples are taken within the span.", do="Extend t_span."
+                f"t_eval {covered}.",
+                f"Samples lie within t_span, {min(t0, t1):g} to {max(t0, t1):g} s.",
+                t_eval=t_eval,
+                t_span=(t0, t1),
             )
     return times if t1 > t0 else times[::-1]
 
@@ -246,9 +275,10 @@ def _step_length(step, t0, t1):
     if abs(t1 - t0) > MOST_STEPS * step:
         raise SpecificationError(
             f"step={step!r} was given for a span of {abs(t1 - t0):g} s.",
-            f"At most {MOST_STEPS:,} steps fit into memory, each of them a sample.",
+            f"Each step is a sample, and at most {MOST_STEPS:,} fit into memory.",
             nearest=f"step={abs(t1 - t0) / MOST_STEPS:.2g}.",
             do="Take a longer step, an adaptive method, or several spans.",
             step=step,
+            span=abs(t1 - t0),
         )
     return step

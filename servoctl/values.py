@@ -1,4 +1,4 @@
-"""Frozen values: two are equal where all their fields are."""
+"""Equality of frozen values by their fields, arrays among them."""
 
 from dataclasses import fields
 
@@ -6,7 +6,7 @@ import numpy as np
 
 
 class Value:
-    """What a frozen dataclass inherits to be compared by its fields, arrays among them; NaN equals NaN."""
+    """Base of frozen dataclasses that compare by their fields, arrays among them; NaN equals NaN."""
 
     def __eq__(self, other):
         if self is other or type(self) is not type(other):
@@ -19,7 +19,7 @@ class Value:
 
 
 def same(a, b):
-    """Whether two values are equal; arrays, and containers that hold arrays, by their entries."""
+    """Whether two values are equal, with arrays and containers of arrays compared by their entries."""
     if a is b:
         return True
     if isinstance(a, np.ndarray) or isinstance(b, np.ndarray):

@@ -1,4 +1,4 @@
-"""Checks against the full mechanism: what a run says is what the mechanism does; what a loop gains, forces worked."""
+"""Checks of a run against the full mechanism, and of a closed loop against its power balance."""
 
 from dataclasses import dataclass, field, replace
 
@@ -8,7 +8,8 @@ from servoctl.checks import whole
 from servoctl.control.loop import FINISHED, run_loop
 from servoctl.control.result import Closed
 from servoctl.model.equations import residual_rows
-from servoctl.run import require_model
+from servoctl.model.model import Model
+from servoctl.run import Run, require_model
 
 LIMITS = {
     "acceleration": 1e-9,
@@ -18,14 +19,27 @@ LIMITS = {
     "multiplier form": 1e-9,
     "residual": 1e-6,
 }
-INTEGRATED = 1e-6  # for what drift disturbs: where γ'' is itself integrated, or hidden rows are
+INTEGRATED = 1e-6  # limit for numbers that drift disturbs: γ'' is integrated itself, or rows are hidden
 LOOP_LIMITS = {"loop power": 1e-3, "loop constraints": 1e-8, "loop limits": 1e-12, "loop repeated": 1e-9}  # relative
-CONVERGES, EXACT = 0.7, 1e-10  # of the defect with steps half as long, relative to the other; what is rounding
+CONVERGES, EXACT = 0.7, 1e-10  # largest defect with steps half as long, relative to the other; defect that is rounding
+WORDS = {
+    "acceleration": "accelerations of the full mechanism under the actuation",
+    "segments": "states after restarted segments of the full mechanism",
+    "power": "power balance dE/dt = sum of force times velocity",
+    "energy": "energy against the integrated power",
+    "multiplier form": "(3.18) against the form with multipliers",
+    "outside": "part of the ideal reaction outside the actuators' reach",
+    "loop power": "energy gained less the work of all forces",
+    "loop power halved": "the same with steps half as long",
+    "loop constraints": "material constraints, values and rates",
+    "loop limits": "inputs beyond their limits",
+    "loop repeated": "states of the loop when it is run again",
+}
 
 
 @dataclass(frozen=True)
 class Verification:
-    """Errors of a run against the full mechanism; every number is relative.
+    """Errors of a run against the full mechanism, all of them relative.
 
     Attributes
     ----------
@@ -35,14 +49,14 @@ class Verification:
         "segments": largest error of the state after restarted segments;
         "power": largest error of dE/dt = Σ force·velocity; "energy": of its integral over the samples;
         "multiplier form": largest disagreement of (3.18) with the form that has multipliers;
-        "outside": part of an ideal reaction that the mechanism's actuators cannot give;
-        "residual NAME": largest residual at any level, relative to 1 plus the largest jet of the level's own order.
+        "outside": part of an ideal reaction that the mechanism's actuators cannot exert;
+        "residual NAME": largest residual at any level, relative to 1 plus the largest jet of the level's order.
     failures : tuple of str
-        Numbers that exceed their limit.
+        Names of numbers that exceed their limits.
     notes : tuple of str
-        What could not be checked, and why.
+        Checks that do not apply, and why.
     limits : dict of str to float
-        The largest value of each number that passes.
+        Largest value of each number that passes.
     """
 
     numbers: dict
@@ -58,21 +72,8 @@ class Verification:
     def __repr__(self):
         residuals = {k: v for k, v in self.numbers.items() if k.startswith("residual ")}
         worst = max(residuals, key=residuals.get, default=None)
-        words = {
-            "acceleration": "accelerations of the full mechanism under the actuation",
-            "segments": "states after restarted segments of the full mechanism",
-            "power": "power balance dE/dt = sum of force times velocity",
-            "energy": "energy against the integrated power",
-            "multiplier form": "(3.18) against the form with multipliers",
-            "outside": "part of the ideal reaction outside the actuators' reach",
-            "loop power": "energy gained less the work of all forces",
-            "loop power halved": "the same with steps half as long",
-            "loop constraints": "material constraints, values and rates",
-            "loop limits": "inputs beyond their limits",
-            "loop repeated": "states of the loop when it is run again",
-        }
         lines = [f"Verification: {'passed' if self.passed else 'FAILED: ' + ', '.join(self.failures)}"]
-        lines += [f"  {words[key]}: {self._number(key)}" for key in words if key in self.numbers]
+        lines += [f"  {WORDS[key]}: {self._number(key)}" for key in WORDS if key in self.numbers]
         if worst:
             name = worst.removeprefix("residual ")
             lines.append(f"  largest residual at any level: {self._number(worst)} ({name})")
@@ -84,22 +85,22 @@ class Verification:
         return f"{self.numbers[key]:.1e}{allowed}"
 
 
-def verify(model, run=None, segments: int = 20) -> Verification:
+def verify(model: Model | Closed, run: Run | None = None, segments: int = 20) -> Verification:
     """Check a run against the full mechanism, not the reduced model.
 
-    The mechanism's accelerations under the required actuation are compared with the run's at every sample; the
-    mechanism is integrated in segments restarted from the run, no longer than the fastest unstable time constant;
-    residuals are taken at every level; dE/dt is compared with the power of all forces; and (3.18) with the form
+    The mechanism's accelerations under the required actuation are compared with the run's at every sample. The
+    mechanism is integrated in segments restarted from the run, no longer than the fastest unstable time constant.
+    Residuals are evaluated at every level, dE/dt is compared with the power of all forces, and (3.18) with the form
     that has multipliers.
 
-    A closed loop is verified alone, `verify(closed)`: its energy against the work of inputs, disturbances and
-    friction, at two lengths of step; material constraints; limits.
+    A closed loop is verified by `verify(closed)`: its energy against the work of inputs, disturbances and friction,
+    with two lengths of step; material constraints; limits.
 
     Parameters
     ----------
     model : Model or Closed
     run : Run
-        Of this model; none for a closed loop.
+        Of this model; omitted for a closed loop.
     segments : int
         Number of restarted segments, at least 1.
 
@@ -110,7 +111,7 @@ def verify(model, run=None, segments: int = 20) -> Verification:
     Raises
     ------
     SpecificationError
-        If the run is not of this model, or segments is no whole number of at least 1.
+        If the run is not of this model, or segments is not a whole number of at least 1.
     """
     segments = whole("segments", segments, least=1)
     if run is None and isinstance(model, Closed):
@@ -131,7 +132,7 @@ def verify(model, run=None, segments: int = 20) -> Verification:
         numbers["outside"] = _outside(model, run, good)
     numbers |= {f"residual {name}": _relative_residual(run, name, good) for name in run.residual}
     if not run.success:
-        notes.append("the run did not reach its end: next to a singularity errors grow")
+        notes.append("the run did not reach its end: errors grow near a singularity")
     limits = {key: limits.get("residual" if key.startswith("residual ") else key, np.inf) for key in numbers}
     return _judged(numbers, limits, notes)
 
@@ -142,7 +143,7 @@ def _judged(numbers, limits, notes):
 
 
 def _balance(run, good, limits, notes):
-    """Errors of the power and of the energy where they apply; limits and notes are completed."""
+    """Errors of power and energy if the balance applies; adds to limits and notes."""
     rate, work, size, of_time = run.signals("power")[1][:, good]
     largest = max(np.abs(size).max(), np.abs(rate).max(), 1e-300)
     if np.abs(of_time).max() >= 1e-9 * largest:
@@ -165,13 +166,9 @@ def _acceleration(model, run, good, inputs):
 
 
 def _energy(run, good, work):
-    """Largest difference of the energy from its start and the integrated power, relative to the energy's range.
+    """Largest difference between the energy gained and the integrated power, relative to the energy's range.
 
-    Returns
-    -------
-    error : float
-    sampling : float
-        How much of it the samples cannot resolve: the change when every other sample is left out.
+    The second number is the part that the samples cannot resolve: the change if every other sample is left out.
     """
     from scipy.interpolate import CubicSpline
 
@@ -221,7 +218,7 @@ def _segments(model, run, good, u, count):
 
 
 def _segment_end(model, run, good, i, u):
-    """Up to five samples on, within the fastest unstable time constant, one variant and one piece of the paths."""
+    """The last of five samples within the fastest unstable time constant, one variant and one piece of the paths."""
     t = run.t[good]
     x = run.jets[: model.nq + model.n, good[i]]
     limit = 1.0 / max(_fastest_unstable(model, model.function("plant"), t[i], x, u), 1e-12)
@@ -238,62 +235,58 @@ def _segment_end(model, run, good, i, u):
 
 def _fastest_unstable(model, plant, t, x, u):
     """The largest real part of the mechanism's linearised open-loop eigenvalues, by central differences."""
-    m, step = len(x), 1e-6 * (1.0 + np.abs(x))
-    columns = []
-    for i in range(m):
-        shift = np.zeros(m)
-        shift[i] = step[i]
-        ends = [plant(t, np.concatenate([x + sign * shift, u]), model.parameters)[:m] for sign in (1.0, -1.0)]
-        columns.append((ends[0] - ends[1]) / (2 * step[i]))
-    matrix = np.array(columns).T
+
+    def rates(x):
+        return plant(t, np.concatenate([x, u]), model.parameters)[: len(x)]
+
+    steps = np.diag(1e-6 * (1.0 + np.abs(x)))
+    matrix = np.array([(rates(x + step) - rates(x - step)) / (2 * step[i]) for i, step in enumerate(steps)]).T
     return float(np.linalg.eigvals(matrix).real.max()) if np.all(np.isfinite(matrix)) else np.inf
 
 
 def _multiplier_form(model, run, good):
-    """How far (γ'', μ) are from solving [M -B; C 0] [γ''; μ] = ..., and from its solution where that is unique.
+    """Largest error of (γ'', μ) in [M -B; C 0] [γ''; μ] = ..., and against its solution if that is unique.
 
-    Hidden rows make the matrix singular: then the equations must hold, and nothing is solved.
+    Hidden rows make the matrix singular; then only the residual of the equations is taken.
     """
     n, nq = model.n, model.nq
     multipliers = run.signals("all_multipliers")[1]
     accelerations = run.jets[nq + n : nq + 2 * n]
     unique, size = 0.0, np.abs(accelerations[:, good]).max()
-    left, terms = [], []
+    residuals, terms = [], []
     for first, end, variant in run.variants or ((0, len(run.t), model),):
         matrices, rights = variant.multiplier_form(run.t[first:end], run.jets[: len(model.jet_names), first:end])
         for k in good[(good >= first) & (good < end)] - first:
-            given = np.concatenate([accelerations[:, first + k], multipliers[:, first + k]])
+            unknowns = np.concatenate([accelerations[:, first + k], multipliers[:, first + k]])
             a, b = matrices[..., k], rights[:, k]
-            left.append(np.abs(a @ given - b))
-            terms.append(np.abs(a) @ np.abs(given) + np.abs(b))
+            residuals.append(np.abs(a @ unknowns - b))
+            terms.append(np.abs(a) @ np.abs(unknowns) + np.abs(b))
             if not model.reduction.hidden and a.shape[0] == a.shape[1]:
                 rows = np.maximum(np.abs(a).max(axis=1), 1e-300)[:, None]
                 columns = np.maximum(np.abs(a / rows).max(axis=0), 1e-300)
                 solution = np.linalg.solve(a / rows / columns, b / rows[:, 0]) / columns
-                unique = max(unique, float(np.abs(solution[:n] - given[:n]).max() / max(size, 1e-300)))
+                unique = max(unique, float(np.abs(solution[:n] - unknowns[:n]).max() / max(size, 1e-300)))
     largest = np.max(terms, axis=0)
-    return max(unique, float(np.max(np.max(left, axis=0) / np.where(largest > 0, largest, 1.0))))
+    return max(unique, float(np.max(np.max(residuals, axis=0) / np.where(largest > 0, largest, 1.0))))
 
 
 def _outside(model, run, good):
     """Largest part of the ideal reaction outside the actuators' directions, relative to the reaction."""
     values = run.signals("reach")[1][:, good]
-    n, m = model.n, (len(values) - model.n) // model.n
-    worst = 0.0
-    largest = max(np.abs(values[:n]).max(), 1e-300)
-    for k in range(values.shape[1]):
-        reaction, E = values[:n, k], values[n:, k].reshape(m, n).T
+    n, worst = model.n, 0.0
+    for column in values.T:
+        reaction, E = column[:n], column[n:].reshape(-1, n).T
         outside = reaction - E @ np.linalg.lstsq(E, reaction, rcond=None)[0]
-        worst = max(worst, float(np.abs(outside).max()) / largest)
-    return worst
+        worst = max(worst, float(np.abs(outside).max()))
+    return worst / max(np.abs(values[:n]).max(), 1e-300)
 
 
 def _verify_loop(closed):
     """Power balance, material constraints and limits of a closed loop.
 
-    The loop is run again with the work of inputs, disturbances and friction as one more state, by the same method: the
-    energy gained less this work is an error of integration, which shrinks with the steps. A force that the plant feels
-    and the balance does not know, or the other way round, leaves a defect that does not.
+    The loop is run again by the same method with the work of inputs, disturbances and friction as one more state. The
+    energy gained less this work is an integration error, which shrinks with the steps. A force that acts on the plant
+    but is missing in the balance, or the other way round, leaves a defect that does not shrink.
     """
     plant, numbers, limits, notes = closed.plant, {}, dict(LOOP_LIMITS), []
     defect, numbers["loop repeated"] = _defect(closed, 1)
@@ -312,13 +305,10 @@ def _verify_loop(closed):
 
 
 def _defect(closed, finer):
-    """Largest |E - E0 - W| relative to the energy turned over, of the loop with steps shorter by a whole factor.
+    """Defect of the power balance of the loop, with steps shorter by a whole factor, and difference of its states.
 
-    Returns
-    -------
-    defect : float
-    repeated : float
-        Largest difference of the states from those of the run, relative to their sizes.
+    The defect is the largest |E - E0 - W| relative to the range of the energy; the states are compared with those of
+    the run, relative to their sizes.
     """
     plant, loop = closed.plant, closed.loop
     substeps = loop.substeps * finer
@@ -344,7 +334,7 @@ def _defect(closed, finer):
 
 
 def _excess(closed):
-    """How far an input lies beyond its limits or its limits of rate, relative to these."""
+    """Largest excess of an input over its limits or its rate limits, relative to these."""
     loop, excesses = closed.loop, [0.0]
     if loop.low is not None:
         for u, low, high in zip(closed.inputs, loop.low, loop.high, strict=True):
@@ -353,6 +343,6 @@ def _excess(closed):
     if loop.change is not None:
         limited = loop.change < np.inf
         most, inputs = loop.change[limited], closed.inputs[limited]
-        changes = np.abs(np.diff(np.column_stack([loop.idle[limited], inputs]), axis=1)).max(axis=1)
+        changes = np.abs(np.diff(np.column_stack([loop.initial_input[limited], inputs]), axis=1)).max(axis=1)
         excesses += list((changes - most) / (np.abs(inputs).max(axis=1) + most))
     return float(max(excesses))

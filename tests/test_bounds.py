@@ -167,8 +167,8 @@ def test_steps_too_long_for_the_internal_dynamics_are_warned_about(method, step)
     largest = sv.stability(model, sv.simulate(model, start, (0.0, 1.0), method="RadauIIA")).largest_step(method)
     with warned(f"{step:g} s", method, "resolve") as caught:
         sv.simulate(model, start, (0.0, 1.0), method=as_method(method, step=step))
-    told = float(re.search(r"largest stable step there is about (\S+) s", str(caught[0].message))[1])
-    assert told == pytest.approx(largest, rel=0.05)
+    bound = float(re.search(r"largest stable step there is about (\S+) s", str(caught[0].message))[1])
+    assert bound == pytest.approx(largest, rel=0.05)
     assert caught[0].filename == __file__
     with warnings.catch_warnings():
         warnings.simplefilter("error")

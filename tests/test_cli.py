@@ -346,8 +346,8 @@ def test_a_failed_verification_is_seen_in_the_exit_code(here, fall, monkeypatch)
     failed = SimpleNamespace(passed=False, numbers={"acceleration": float("nan")})
     monkeypatch.setattr(servoctl, "verify", lambda *_: failed)
     assert main(["run", fall, "--no-figures"]) == 1
-    told = summary(here / "servoctl-runs" / "fall")["verification"]
-    assert told == {"passed": False, "numbers": {"acceleration": None}}
+    verification = summary(here / "servoctl-runs" / "fall")["verification"]
+    assert verification == {"passed": False, "numbers": {"acceleration": None}}
 
 
 # --- the other commands
@@ -389,8 +389,8 @@ assert not slow, slow
 """
     helped = process(sys.executable, "-c", script)
     assert all(word in helped.stdout for word in ("list", "report", "run", "scene()"))
-    told = process(sys.executable, "-m", "servoctl", "--version")
-    assert told.stdout == f"servoctl {servoctl.__version__}\n"
+    version = process(sys.executable, "-m", "servoctl", "--version")
+    assert version.stdout == f"servoctl {servoctl.__version__}\n"
 
 
 def test_a_terminal_without_greek_letters(here, fall, monkeypatch):

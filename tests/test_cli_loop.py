@@ -88,7 +88,7 @@ def test_a_rate_that_does_not_divide_the_span_ends_at_its_last_sample():
 @pytest.mark.parametrize(("options", "code"), [("", 0), ("--rate 50", 1)])
 def test_an_ideal_reaction_has_no_loop(here, capsys, options, code):
     line = "run two-cars-ideal --no-verify --no-figures --out ideal"
-    assert main([*line.split(), *options.split()]) == code  # what was asked for was not done
+    assert main([*line.split(), *options.split()]) == code  # an option of the line took no effect
     assert "Closed loop: left out, as a law commands actuators, not an ideal reaction." in capsys.readouterr().out
     assert {f.name for f in (here / "ideal").iterdir()} == {"run.npz", "summary.json", "report.txt"}
     assert json.loads((here / "ideal" / "summary.json").read_text(encoding="utf-8"))["closed_loop"] is None

@@ -408,7 +408,7 @@ def test_laws_refuse_plans_and_plants_that_do_not_fit(point_plan, crane_plan, tm
     with refused(sv.SpecificationError, "2 s", "10 s"):
         sv.feedforward(point_plan, sv.plant(POINT), rate=0.1)
     law = sv.pd(point_plan, sv.plant(POINT), kp={"force": 100.0}, kd={"force": 20.0})
-    for wrong in ({"schedule": law.schedule[:2]}, {"state": np.zeros(1)}, {"measures": ()}, {"idle": np.zeros(2)}):
+    for wrong in ({"schedule": law.schedule[:2]}, {"state": np.zeros(1)}, {"measures": ()}, {"initial_input": np.zeros(2)}):
         with refused(sv.SpecificationError, law.name):
             replace(law, **wrong)
     rough = sv.plant(POINT, forces={"x": -ca.sqrt(ca.fabs(POINT.q.d(1)[0]))})
@@ -473,13 +473,30 @@ def test_a_closed_run_is_saved_and_loaded(crane_plan, tmp_path):
     assert np.array_equal(back["command hoist"], run.command["hoist"])
     assert np.array_equal(back["measured x"], run.measured["x"])
     assert np.array_equal(back.residual["X"], run.residual["X"])
-    sent = pickle.loads(pickle.dumps(run))  # as a worker returns it
-    assert np.array_equal(sent["trolley"], run["trolley"]) and np.array_equal(sent.residual["Z"], run.residual["Z"])
     assert len(repr(run).splitlines()) <= 12 and len(repr(run.law).splitlines()) <= 12
     with refused(sv.NameUnknown, name="thetta", match="theta"):
         run["thetta"]
     with refused(sv.SpecificationError, "0.005 s"):
         run.state(0.005)
+
+
+def test_a_closed_run_travels_as_itself(crane_plan):
+    plant, x0, span, options = conditions(crane_plan)
+    law = sv.lqr(crane_plan, sv.plant(CRANE), integral=True)
+    gust = {"x": sv.disturbances.gust(60.0, 0.2, 0.5)}
+    run = sv.close(plant, law, x0, span, **options | {"disturbance": gust})
+    text = str(run)
+    content = pickle.dumps(run)
+    sent = pickle.loads(content)
+    assert sent == run and sent.conditions == run.conditions and pickle.loads(pickle.dumps(sent)) == run
+    assert str(sent) == text and b"_evaluations" not in content, "evaluated signals stay at home"
+    assert np.array_equal(sent["d2theta"], run["d2theta"]) and np.array_equal(sent.residual["Z"], run.residual["Z"])
+    again = sv.close(sent.plant, sent.law, x0, span, **options | {"disturbance": gust}, plan=sent.plan)
+    assert np.array_equal(again.states, run.states)
+    with refused(sv.SpecificationError, "'x'", what="disturbance of 'x'"):
+        pickle.dumps(sv.close(plant, law, x0, span, **options | {"disturbance": {"x": lambda t: 0.0}}))
+    with refused(sv.SpecificationError, what="law '<lambda>'"):
+        pickle.dumps(sv.close(plant, lambda t, y: [0.0, 0.0], x0, span, timing=sv.Timing(rate=100.0)))
 
 
 def test_a_loop_that_starts_mid_plan_waits_with_the_plans_present_actuation(crane_plan):

@@ -129,9 +129,10 @@ def test_text_depends_on_content_only():
 
 
 def test_an_operation_without_c_is_named():
-    model = compiled(function(X2[0].printme(X2[1])), "talkative")
-    with refused(SpecificationError, "OP_PRINTME"):
-        model(0.0, [0.0, 0.0], [0.0])
+    with refused(SpecificationError, operation="OP_PRINTME"):
+        compiled(function(X2[0].printme(X2[1])), "talkative")
+    with refused(SpecificationError, operation="OP_PRINTME"):
+        compiled(function(X2), "quiet", ("rk",), function(X2[0].printme(X2[1])))
 
 
 # --- points and grids
@@ -228,7 +229,7 @@ def test_an_unknown_loop_is_named():
     with refused(NameUnknown, name="rk5", match="rk"):
         compiled(function(X2), "f", ("rk5",))
     with refused(NameUnknown, name="newtons", match="newton"):
-        emit.emit(function(X2), "f", ("newtons",))
+        compiled(function(X2), "f", ("newtons",))
 
 
 # --- Runge-Kutta

@@ -1,5 +1,6 @@
 """Computed actuation: exact linearisation, dynamic extension, sampled poles, refusals."""
 
+import pickle
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -162,7 +163,7 @@ def test_loops_turn_unstable_where_the_bound_says_within_two_per_cent(rho, delay
     mechanism, program = build()
     model = sv.derive(mechanism, program)
     plan = sv.simulate(model, model.start(**held), (0.0, 8.0))
-    plant = sv.plant(mechanism, lag=lag)
+    plant = sv.plant(mechanism)
     law = sv.computed(plan, plant, rate=rate, poles=10.0)
     (name,) = law.info["orders"]
     assert law.info["orders"][name] == rho
@@ -208,5 +209,21 @@ def test_bad_input(crane_plan):
         sv.computed(crane_plan, sv.plant(plant.mechanism, delay=0.05))
     with refused(sv.NameUnknown, name="x", match="X"):
         sv.computed(crane_plan, plant, poles={"x": [-1.0] * 4})
-    with refused(sv.SpecificationError, "plant", "plan"):
-        sv.computed(crane_plan, sv.plant(gallery["overhead-crane"].build()[0]))
+    with refused(sv.SpecificationError, "plant", "plan", plan=crane_plan.model.reduction.mechanism.q.names):
+        heavier = {"actuators": {"trolley": [1, 0, 0], "hoist": [0, 0, 1]}, "parameters": plant.mechanism.parameters}
+        other = sv.Mechanism(plant.mechanism.q, balance=2 * plant.mechanism.balance, **heavier)
+        sv.computed(crane_plan, sv.plant(other))
+
+
+def test_a_plant_of_an_equal_mechanism_is_inverted(crane_plan):
+    """A mechanism that travelled by pickle, or was built again, has other symbols of the same names."""
+    mechanism = crane_plan.model.reduction.mechanism
+    law = sv.computed(crane_plan, sv.plant(mechanism))
+    for other in (pickle.loads(pickle.dumps(mechanism)), gallery["overhead-crane"].build()[0]):
+        assert other is not mechanism
+        copy = sv.computed(crane_plan, sv.plant(other))
+        assert copy.info["orders"] == law.info["orders"] and copy.state_names == law.state_names
+        x = np.append(crane_plan.state(0.5), [0.1] * len(law.state))
+        column = law.schedule_at(0.5)
+        assert np.array_equal(copy.schedule_at(0.5), column)
+        assert np.allclose(copy.answer(0.5, x, column), law.answer(0.5, x, column), rtol=1e-12)

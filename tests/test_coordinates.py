@@ -55,7 +55,7 @@ def test_order_of_an_expression_is_its_highest_jet():
         ("x dx", "'dx'"),
         ("x y d2x", "'d2x'"),
         ("dx x", "'dx'"),
-        ("x x", "given twice"),
+        ("x x", "twice"),
         ("x t", "'t'"),
         ("x 2y", "'2y'"),
         ("x-y", "'x-y'"),

@@ -26,10 +26,10 @@ def numbers():
 
 @pytest.mark.parametrize("path", sorted(EXAMPLES.glob("*.py")), ids=lambda path: path.stem)
 def test_every_example_is_verified_and_returns_numbers(numbers, path):
-    found = numbers(path.stem)
-    checks = [value for name, value in found.items() if name.endswith("verified")]
+    result = numbers(path.stem)
+    checks = [value for name, value in result.items() if name.endswith("verified")]
     assert checks and all(checks)
-    assert all(np.isfinite(value) for value in found.values())
+    assert all(np.isfinite(value) for value in result.values())
 
 
 @pytest.mark.parametrize("path", sorted(EXAMPLES.glob("*.py")), ids=lambda path: path.stem)
@@ -40,66 +40,66 @@ def test_every_example_explains_itself_and_runs_as_a_script(path):
 
 
 def test_appell_hamel(numbers):
-    found = numbers("appell_hamel")
-    assert found["free"] == 6
-    state = [found[name] for name in ("x", "y", "z", "phi", "theta", "dphi", "dtheta")]
+    result = numbers("appell_hamel")
+    assert result["free"] == 6
+    state = [result[name] for name in ("x", "y", "z", "phi", "theta", "dphi", "dtheta")]
     assert np.abs(np.array(state) - known.APPELL_HAMEL_STATES[2.0]).max() < 1e-8
-    assert found["energy drift"] < 1e-8
+    assert result["energy drift"] < 1e-8
 
 
 def test_overhead_crane(numbers):
-    found = numbers("overhead_crane")
-    assert (found["free"], found["index"]) == (0, 5)
+    result = numbers("overhead_crane")
+    assert (result["free"], result["index"]) == (0, 5)
     exact = known.overhead_crane(np.linspace(0.0, 8.0, 80_001))
     for name in ("trolley", "hoist", "theta"):
-        assert found[f"{name} min"] == pytest.approx(exact[name].min(), rel=1e-6)
-        assert found[f"{name} max"] == pytest.approx(exact[name].max(), rel=1e-6)
+        assert result[f"{name} min"] == pytest.approx(exact[name].min(), rel=1e-6)
+        assert result[f"{name} max"] == pytest.approx(exact[name].max(), rel=1e-6)
     printed = {"trolley": (-137.991607, 134.331943), "hoist": (-1044.370897, -935.793762)}
     for name, (least, greatest) in printed.items():
-        assert (found[f"{name} min"], found[f"{name} max"]) == pytest.approx((least, greatest), abs=1e-6)
-    assert np.rad2deg([found["theta min"], found["theta max"]]) == pytest.approx((-7.1814, 7.9766), abs=1e-4)
+        assert (result[f"{name} min"], result[f"{name} max"]) == pytest.approx((least, greatest), abs=1e-6)
+    assert np.rad2deg([result["theta min"], result["theta max"]]) == pytest.approx((-7.1814, 7.9766), abs=1e-4)
 
 
 def test_two_cars(numbers):
-    found = numbers("two_cars")
-    assert found["ideal max"] == pytest.approx(6.852059, abs=1e-6)
-    assert found["ideal at"] == pytest.approx(0.7091, abs=1e-4)
-    assert found["ideal swing"] == pytest.approx(1.966911, abs=1e-6)
-    assert found["actuators max"] == pytest.approx(316.175102075, rel=1e-9)
-    assert found["actuators at"] == pytest.approx(1.248527, abs=1e-6)
-    assert found["actuators swing"] < 1e-9
-    assert (found["ideal free"], found["actuators free"]) == (2, 0)
-    assert found["ideal outside"] == pytest.approx(1.0)
+    result = numbers("two_cars")
+    assert result["ideal max"] == pytest.approx(6.852059, abs=1e-6)
+    assert result["ideal at"] == pytest.approx(0.7091, abs=1e-4)
+    assert result["ideal swing"] == pytest.approx(1.966911, abs=1e-6)
+    assert result["actuators max"] == pytest.approx(316.175102075, rel=1e-9)
+    assert result["actuators at"] == pytest.approx(1.248527, abs=1e-6)
+    assert result["actuators swing"] < 1e-9
+    assert (result["ideal free"], result["actuators free"]) == (2, 0)
+    assert result["ideal outside"] == pytest.approx(1.0)
     t = np.linspace(0.0, 2.0, 20_001)
-    assert found["ideal max"] == pytest.approx(known.cars_ideal(t)["reaction"].max(), rel=1e-7)
-    assert found["actuators max"] == pytest.approx(known.cars(t)["force"].max(), rel=1e-6)
+    assert result["ideal max"] == pytest.approx(known.cars_ideal(t)["reaction"].max(), rel=1e-7)
+    assert result["actuators max"] == pytest.approx(known.cars(t)["force"].max(), rel=1e-6)
 
 
 def test_spiral(numbers):
-    found, exact = numbers("spiral"), known.spiral(np.array(2.0), 5, c=1.5)
-    assert found["free"] == 7
-    assert found["heading"] == pytest.approx(1.0, abs=1e-9)
-    assert (found["x"], found["y"]) == pytest.approx((float(exact["x"]), float(exact["y"])), abs=1e-9)
-    assert found["speed error"] < 1e-8
+    result, exact = numbers("spiral"), known.spiral(np.array(2.0), 5, c=1.5)
+    assert result["free"] == 7
+    assert result["heading"] == pytest.approx(1.0, abs=1e-9)
+    assert (result["x"], result["y"]) == pytest.approx((float(exact["x"]), float(exact["y"])), abs=1e-9)
+    assert result["speed error"] < 1e-8
 
 
 def test_redundant_thrusters(numbers):
-    found = numbers("redundant_thrusters")
+    result = numbers("redundant_thrusters")
     for case in ("equal", "weak bow"):
-        assert found[f"{case} against the least norm"] < 1e-12
-    assert found["weak bow bow"] < found["equal bow"] / 3
-    assert found["weak bow stern"] > found["equal stern"]
+        assert result[f"{case} against the least norm"] < 1e-12
+    assert result["weak bow bow"] < result["equal bow"] / 3
+    assert result["weak bow stern"] > result["equal stern"]
 
 
 def test_quaternion(numbers):
-    found = numbers("quaternion")
+    result = numbers("quaternion")
     t = np.linspace(0.0, 10.0, 1001)
     rate, acceleration = (known.rest_to_rest(t, k, 0.0, np.pi / 3, 10.0, 2) for k in (1, 2))
     torque = np.hypot(40.0 * acceleration, 60.0 * 0.5 * rate)
-    assert found["torque max"] == pytest.approx(torque.max(), rel=1e-9)
-    assert found["free"] == 2
-    assert found["spin change"] < 1e-12
-    assert found["unit error"] < 1e-14
+    assert result["torque max"] == pytest.approx(torque.max(), rel=1e-9)
+    assert result["free"] == 2
+    assert result["spin change"] < 1e-12
+    assert result["unit error"] < 1e-14
 
 
 # closed loops ----------------------------------------------------------------------------------------------------------
@@ -109,59 +109,59 @@ PATH_END, END = "at 6 s [mm]", "at the end [mm]"
 
 
 def test_closed_loop_crane_falls_under_feedforward_alone(numbers):
-    found = numbers("closed_loop_crane")
-    assert found[f"feedforward: {PATH_END}"] == pytest.approx(22.4e3, rel=0.01)
+    result = numbers("closed_loop_crane")
+    assert result[f"feedforward: {PATH_END}"] == pytest.approx(22.4e3, rel=0.01)
     for what, t in ((PATH_END, 6.0), (END, 8.0)):  # hoist and load, 120 kg, under the weight that nothing carries
-        assert found[f"feedforward: {what}"] == pytest.approx(1e3 * LOST / 120.0 * t**2 / 2, rel=0.02)
+        assert result[f"feedforward: {what}"] == pytest.approx(1e3 * LOST / 120.0 * t**2 / 2, rel=0.02)
 
 
 def test_closed_loop_crane_deflects_as_each_law_is_stiff(numbers):
     """What remains without an integral: weight over gain; for computed, 6 T² of the acceleration that is wrong."""
-    found = numbers("closed_loop_crane")
-    assert found[f"PD: {END}"] == pytest.approx(1e3 * LOST / 8000.0, rel=0.03)
-    assert found[f"LQR: {END}"] == pytest.approx(1e3 * LOST / 1000.0, rel=0.03)
+    result = numbers("closed_loop_crane")
+    assert result[f"PD: {END}"] == pytest.approx(1e3 * LOST / 8000.0, rel=0.03)
+    assert result[f"LQR: {END}"] == pytest.approx(1e3 * LOST / 1000.0, rel=0.03)
     for T in (0.25, 0.06):
-        assert found[f"computed, {T} s: {END}"] == pytest.approx(1e3 * 6 * T**2 * LOST / 105.0, rel=0.002)
+        assert result[f"computed, {T} s: {END}"] == pytest.approx(1e3 * 6 * T**2 * LOST / 105.0, rel=0.002)
 
 
 def test_closed_loop_crane_comes_back_where_the_law_integrates_or_knows(numbers):
-    found = numbers("closed_loop_crane")
-    assert 140.0 <= found[f"LQR: {PATH_END}"] <= 160.0
+    result = numbers("closed_loop_crane")
+    assert 140.0 <= result[f"LQR: {PATH_END}"] <= 160.0
     for name, worst, at_6, end in (
         ("LQR with integral", 60.0, 10.0, 3.0),
         ("output feedback", 60.0, 10.0, 3.0),
         ("limited", 60.0, 25.0, 5.0),
         ("computed, 0.25 s, load known", 20.0, 0.2, 0.01),
     ):
-        errors = [found[f"{name}: {what}"] for what in ("worst [mm]", PATH_END, END)]
+        errors = [result[f"{name}: {what}"] for what in ("worst [mm]", PATH_END, END)]
         assert np.all(np.array(errors) <= [worst, at_6, end]), name
-    assert found["computed, 0.25 s, as planned: worst [mm]"] < 0.03, "what the hold leaves"
-    assert found["limited: trolley [N]"] <= 150.0 < found["LQR with integral: trolley [N]"]
+    assert result["computed, 0.25 s, as planned: worst [mm]"] < 0.03, "what the hold leaves"
+    assert result["limited: trolley [N]"] <= 150.0 < result["LQR with integral: trolley [N]"]
 
 
 def test_closed_loop_crane_with_noise_and_delay(numbers):
     """Little worse than without; but poles of 1/0.06 s turn the noise into a hundred times the plan's force."""
-    found = numbers("closed_loop_crane")
+    result = numbers("closed_loop_crane")
     for name in ("PD", "computed, 0.25 s", "LQR", "LQR with integral", "output feedback"):
-        quiet, noisy = (found[f"{before}{name}: worst [mm]"] for before in ("", "noise, "))
+        quiet, noisy = (result[f"{before}{name}: worst [mm]"] for before in ("", "noise, "))
         assert noisy == pytest.approx(quiet, rel=0.03)
-        assert found[f"noise, {name}: {END}"] <= found[f"{name}: {END}"] + 1.0
-    assert found["noise, limited: trolley [N]"] <= 150.0 and found["noise, limited: worst [mm]"] < 80.0
-    assert found["noise, computed, 0.06 s: trolley [N]"] > 100 * found["feedforward: trolley [N]"]
-    assert found["noise, LQR with integral: trolley [N]"] < 400.0
+        assert result[f"noise, {name}: {END}"] <= result[f"{name}: {END}"] + 1.0
+    assert result["noise, limited: trolley [N]"] <= 150.0 and result["noise, limited: worst [mm]"] < 80.0
+    assert result["noise, computed, 0.06 s: trolley [N]"] > 100 * result["feedforward: trolley [N]"]
+    assert result["noise, LQR with integral: trolley [N]"] < 400.0
 
 
 def test_closed_loop_crane_with_a_weak_trolley(numbers):
-    """The plan asks for 138 N of 100: bounded by allocation, and slowed to 80 N it runs without slack."""
-    found = numbers("closed_loop_crane")
-    assert found["the plan asks [N]"] == pytest.approx(-137.991607, abs=1e-5)
+    """The plan needs 138 N of 100: bounded by allocation, and slowed to 80 N it runs without slack."""
+    result = numbers("closed_loop_crane")
+    assert result["the plan needs [N]"] == pytest.approx(-137.991607, abs=1e-5)
     for name in ("overloaded, clipped", "overloaded, limited", "slowed"):
-        assert found[f"{name}: trolley [N]"] <= 100.0
-    assert found[f"overloaded, limited: {END}"] < 0.5 * found[f"overloaded, clipped: {END}"]
-    assert found["overloaded, limited: worst [mm]"] < 2000.0
-    assert (137.99 / 80.0) ** 0.5 == pytest.approx(found["reserve factor"], rel=0.02)  # accelerations go with 1/σ²
-    assert found["slowed: residuals that gave way"] == 0
-    assert found["slowed: worst [mm]"] < 60.0 and found[f"slowed: {END}"] < 0.1
+        assert result[f"{name}: trolley [N]"] <= 100.0
+    assert result[f"overloaded, limited: {END}"] < 0.5 * result[f"overloaded, clipped: {END}"]
+    assert result["overloaded, limited: worst [mm]"] < 2000.0
+    assert (137.99 / 80.0) ** 0.5 == pytest.approx(result["reserve factor"], rel=0.02)  # accelerations go with 1/σ²
+    assert result["slowed: residuals that gave way"] == 0
+    assert result["slowed: worst [mm]"] < 60.0 and result[f"slowed: {END}"] < 0.1
 
 
 MACHINES = {  # at most: worst and last error (m, rad); feedforward alone is worse by at least this factor
@@ -176,24 +176,24 @@ MACHINES = {  # at most: worst and last error (m, rad); feedforward alone is wor
 
 @pytest.mark.parametrize("name", MACHINES)
 def test_closed_loops_stay_near_their_plans(numbers, name):
-    found, (worst, last, factor) = numbers("closed_loops"), MACHINES[name]
-    assert found[f"{name}: worst"] < worst and found[f"{name}: last"] < last
-    assert found[f"{name}: feedforward worst"] > factor * found[f"{name}: worst"]
+    result, (worst, last, factor) = numbers("closed_loops"), MACHINES[name]
+    assert result[f"{name}: worst"] < worst and result[f"{name}: last"] < last
+    assert result[f"{name}: feedforward worst"] > factor * result[f"{name}: worst"]
 
 
 def test_closed_loops_show_what_computed_actuation_cannot_do(numbers):
     """A curvature says nothing of the place; and the upright pendubot's eigenvalue is that of its linearisation."""
-    found = numbers("closed_loops")
-    assert found["wheeled robot: computed last"] > 5 * found["wheeled robot: worst"]
+    result = numbers("closed_loops")
+    assert result["wheeled robot: computed last"] > 5 * result["wheeled robot: worst"]
     inertia, torque, damping = 0.07 + 3.0 * 0.25**2, 3.0 * 9.81 * 0.25, 0.05  # of the second link about the elbow
-    assert found["pendubot: eigenvalue"] == pytest.approx(max(np.roots([inertia, damping, -torque])), rel=1e-4)
+    assert result["pendubot: eigenvalue"] == pytest.approx(max(np.roots([inertia, damping, -torque])), rel=1e-4)
 
 
 def test_the_table_of_other_machines_is_what_the_example_says(numbers):
-    found, page = numbers("closed_loops"), (EXAMPLES.parent / "docs" / "closed_loop.md").read_text()
+    result, page = numbers("closed_loops"), (EXAMPLES.parent / "docs" / "closed_loop.md").read_text()
     rows = re.findall(r"^\| ([^|]+) \| [^|]+ \| ([\d.]+) \| ([\d.]+) \| ([\d.]+) \|$", page, re.M)
     assert [row[0] for row in rows] == list(MACHINES)
     for name, *cells in rows:
         for cell, what in zip(cells, ("worst", "last", "feedforward worst"), strict=True):
             digits = len(cell.partition(".")[2])
-            assert cell == f"{found[f'{name}: {what}']:.{digits}f}"
+            assert cell == f"{result[f'{name}: {what}']:.{digits}f}"

@@ -248,8 +248,7 @@ def test_a_start_for_a_law_is_refused(gallery_model, tmp_path):
         export_c(law(), tmp_path, start=start)
 
 
-def test_a_folder_that_is_a_file_is_told(gallery_model, tmp_path):
+def test_a_folder_that_is_a_file_is_refused(gallery_model, tmp_path):
     (tmp_path / "taken").write_text("")
-    with refused(ServoError, folder=str(tmp_path / "taken")) as caught:
+    with refused(ServoError, path=str(tmp_path / "taken")):
         export_c(gallery_model("two-cars"), tmp_path / "taken")
-    assert caught.value.details["folder"].endswith("taken")

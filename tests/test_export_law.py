@@ -40,17 +40,17 @@ MEMORY = {
 def test_laws_without_expressions_name_themselves_and_what_can_be_exported(plan, tmp_path):
     plant = sv.plant(CRANE, limits={"trolley": 150.0})
     inside = sv.lqr(plan, plant)
-    with refused(SpecificationError, "limited by weight", "'lqr, time-varying'"):
+    with refused(SpecificationError, "limited by weight", limited="lqr, time-varying"):
         sv.export_c(sv.limited(inside, plant), tmp_path)
     own = sv.Law("held", (), ("trolley", "hoist"), 100.0, 0.0, lambda t, x, row: row, np.zeros((2, 1)))
-    with refused(SpecificationError, "'held'", "Python"):
+    with refused(SpecificationError, "Python", law="held"):
         sv.export_c(own, tmp_path)
-    with refused(SpecificationError, "dict", "Model", "Law"):
+    with refused(SpecificationError, "Model", "Law", type="dict"):
         sv.export_c({}, tmp_path)
     for folder in (None, 3):
-        with refused(SpecificationError, f"folder={folder}"):
+        with refused(SpecificationError, folder=folder):
             sv.export_c(inside, folder)
-    with refused(SpecificationError, "int", "start"):
+    with refused(SpecificationError, "start", type="int"):
         sv.export_c(plan.model, tmp_path, start=3)
 
 

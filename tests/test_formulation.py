@@ -9,8 +9,8 @@ from refusals import refused
 
 import servoctl as sv
 from benchmarks.literature.formulations import NAMES, FormulationCost, formulation, formulation_cost
+from benchmarks.literature.guided_arm import guided_arm
 from servoctl.gallery import gallery
-from servoctl.gallery.guided_arm import guided_arm
 from servoctl.study.load import load_study
 
 DOC = Path(__file__).parents[1] / "docs" / "formulations.md"

@@ -333,7 +333,7 @@ def test_output_feedback_and_computed_laws_are_linearised(car_plan, plan):
         (lambda c: list(interop.along(3, c["plan"], [0.0])), SpecificationError, "int"),
         (lambda c: list(interop.along(c["law"], c["plan"], [])), SpecificationError, "times"),
         (lambda c: interop.linearise(sv.plant(CRANE), "now", SUDDEN), SpecificationError, {"name": "t"}),
-        (lambda c: c["law"].row(np.nan), SpecificationError, {"name": "t"}),
+        (lambda c: c["law"].schedule_at(np.nan), SpecificationError, {"name": "t"}),
         (lambda c: interop.loop_gain(interop.linearise(sv.plant(CRANE), 0.0, SUDDEN, rate=50.0),
                                      interop.linearise(c["law"], 0.0), "troley"), NameUnknown, {"match": "trolley"}),
     ],

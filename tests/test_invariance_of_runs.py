@@ -233,7 +233,7 @@ def test_a_differentiated_constraint_has_one_more_free_initial_value(name, which
     system = SYSTEMS[name](Words(residuals=differentiated(which)))
     model, reference = system[0], plain(name)[0]
     assert model.free == reference.free + 1
-    assert model.reduction.given[which].order == reference.reduction.given[which].order + 1
+    assert model.reduction.original[which].order == reference.reduction.original[which].order + 1
     first = plain_motion(name)
     jets = dict(zip(first.jet_names, first.jets[:, 0].tolist(), strict=True))
     state = model.start(guess={n: jets[n] for n in model.state_names})

@@ -85,9 +85,9 @@ def test_the_allocation_is_the_least_of_its_cost(arm):
     machine = sv.plant(mechanism, limits={"shoulder": (0.0, 20.0), "elbow": 3.0})
     law = sv.limited(sv.computed(plan, sv.plant(mechanism), rate=200.0), machine)
     y = plan.state(0.4) + [0.02, 0.03, 0.1, -0.2]
-    x, row = np.concatenate([y, law.state]), law.row(0.4)
+    x, row = np.concatenate([y, law.state]), law.schedule_at(0.4)
     u = law.step(0.4, x, row)[:2]
-    wanted = law.step.law.step(0.4, y, law.step.law.row(0.4))[:2]
+    wanted = law.step.law.step(0.4, y, law.step.law.schedule_at(0.4))[:2]
     assert wanted[0] > 20.0
     H = row[-4:].reshape(2, 2)
     grid = np.array(np.meshgrid(np.linspace(0, 20, 401), np.linspace(-3, 3, 401))).reshape(2, -1)

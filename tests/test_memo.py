@@ -61,7 +61,7 @@ def planned(name, **options):
     span = (scene.t_span[0], min(scene.t_span[1], scene.t_span[0] + 1.0))
     run = sv.simulate(model, start, span, progress=False, t_eval=np.linspace(*span, 21), **options)
     signals = [run[signal] for signal in model.signal_groups]
-    return [run.t, run.jets, *signals, *model.column_sizes, model.guard_sizes], run
+    return [run.t, run.jets, *signals, *model.column_sizes, model.pivot_sizes], run
 
 
 CASES = [
@@ -266,8 +266,8 @@ def as_text(reduction):
         ("actuation", reduction.actuation),
         ("multipliers", reduction.multipliers),
     ]
-    rows = [(row.name, row.expression) for row in (*reduction.rows, *reduction.given.values())]
-    return [(name, str(expression)) for name, expression in (*rows, *reduction.guards, *matrices)]
+    rows = [(row.name, row.expression) for row in (*reduction.rows, *reduction.original.values())]
+    return [(name, str(expression)) for name, expression in (*rows, *reduction.pivots, *matrices)]
 
 
 @pytest.mark.parametrize("name", gallery)
@@ -326,11 +326,11 @@ def test_what_a_changed_specification_gives_is_not_kept(derived):
 def test_what_another_user_wrote_is_not_read(derived, tmp_path, monkeypatch):
     sv.derive(*pendulum())
     (entry,) = entries(tmp_path)
-    cache.kept(entry)
+    cache.read_cached(entry)
     with monkeypatch.context() as patched:
         patched.setattr(os, "fstat", lambda _: SimpleNamespace(st_uid=os.geteuid() + 1))
         with pytest.raises(PermissionError):
-            cache.kept(entry)
+            cache.read_cached(entry)
         sv.derive(*pendulum())
     assert len(derived) == 2
 
@@ -338,7 +338,7 @@ def test_what_another_user_wrote_is_not_read(derived, tmp_path, monkeypatch):
 def test_a_whole_entry_that_is_no_pickle_is_derived_anew(derived, tmp_path):
     sv.derive(*pendulum())
     (entry,) = entries(tmp_path)
-    with cache.keeping(entry) as temporary:
+    with cache.replacing(entry) as temporary:
         Path(temporary).write_bytes(b"of another kind")
     sv.derive(*pendulum())
     assert len(derived) == 2

@@ -11,8 +11,8 @@ import pytest
 
 import servoctl as sv
 from servoctl.errors import SingularProgram, SpecificationError
-from servoctl.reduction.orders import dependence
 from servoctl.reduction.ranks import clean, decide
+from servoctl.reduction.rows import dependence
 from servoctl.tolerances import EXTENDED
 
 ROOT = Path(__file__).parents[1]
@@ -104,7 +104,7 @@ def test_noise_rounding_of_terms_hundreds_of_times_as_large_as_an_entry_is_zero(
 @pytest.mark.parametrize("rest, depends", [(1e-10, False), (1e-11, True)])
 def test_dependent_a_row_is_a_combination_of_others_up_to_1e_11(rest, depends):
     rows = np.array([[1.0, 0.0, 1.0], [0.0, 1.0, 1.0], [1.0, 1.0, 2.0 + rest]])
-    support, _ = dependence(None, [None] * 3, rows[:, :, None])
+    support, _ = dependence(rows[:, :, None])
     assert support == ([0, 1, 2] if depends else [])
 
 

@@ -6,7 +6,7 @@ from refusals import refused, warned
 
 import servoctl as sv
 from benchmarks.literature import dae_comparison, formulation_cost
-from servoctl.gallery.guided_arm import guided_arm
+from benchmarks.literature.guided_arm import guided_arm
 from servoctl.methods.choice import as_method
 from servoctl.study import tradeoff as module
 

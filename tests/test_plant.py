@@ -172,9 +172,9 @@ BAD = {
     "force of accelerations": (
         lambda: sv.plant(RELATIVE, forces={"x": RELATIVE.q.d(2)[0]}), sv.SpecificationError, "accelerations",
     ),
-    "state too short": (lambda: sv.plant(RELATIVE).state(np.zeros(5)), sv.SpecificationError, "6 "),
+    "state too short": (lambda: sv.plant(RELATIVE).state(np.zeros(5)), sv.SpecificationError, {"size": 5}),
     "state of no name": (lambda: sv.plant(RELATIVE).state({"y": 1.0}), sv.NameUnknown, {"name": "y"}),
-    "state incomplete": (lambda: sv.plant(RELATIVE).state({"x": 1.0}), sv.SpecificationError, "l"),
+    "state incomplete": (lambda: sv.plant(RELATIVE).state({"x": 1.0}), sv.SpecificationError, {"missing": ["l", "theta", "dx", "dl", "dtheta"]}),
     "function": (lambda: sv.plant(RELATIVE).function("odd"), sv.NameUnknown, {"name": "odd"}),
     "gust backwards": (lambda: sv.disturbances.gust(1.0, 2.0, 1.0), sv.SpecificationError, "from 2 to 1 s"),
     "gust of edges": (lambda: sv.disturbances.gust(1.0, 1.0, 2.0, rise=0.6), sv.SpecificationError, "0.6 s"),

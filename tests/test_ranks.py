@@ -7,8 +7,7 @@ from conftest import numbers
 from refusals import refused
 
 from servoctl.errors import SingularProgram
-from servoctl.reduction.elimination import eliminate
-from servoctl.reduction.ranks import clean, combination, decide, decide_all, equilibrate
+from servoctl.reduction.ranks import clean, combination, decide, decide_all, eliminate, equilibrate
 from servoctl.tolerances import NOISE
 
 LONG = np.longdouble

@@ -103,7 +103,7 @@ def test_the_gallery_table_is_what_the_models_say(gallery_model):
     assert list(rows) == list(gallery)
     for name, (what, orders, hidden, index, free) in rows.items():
         model = gallery_model(name)
-        given = model.reduction.given.values()
+        given = model.reduction.original.values()
         kinds = [listed(row.order for row in given if row.kind == kind) for kind in ("program", "material")]
         assert what == gallery[name].description.rstrip(".")
         assert orders == " + ".join(filter(None, kinds))

@@ -330,7 +330,7 @@ def test_a_quadratic_gibbs_function_in_disguise_is_accepted():
 @pytest.mark.parametrize(
     ("options", "facts"),
     [
-        ({}, ["Neither", "gibbs", "kinetic", "balance"]),
+        ({}, ["inertia", "gibbs", "kinetic", "balance"]),
         ({"potential": "dx"}, ["potential", "order 1"]),
         ({"kinetic": "d2x"}, ["kinetic", "order 2"]),
         ({"gibbs": "d3x"}, ["Gibbs", "order 3"]),

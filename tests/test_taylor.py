@@ -9,9 +9,8 @@ import pytest
 from refusals import refused
 
 from servoctl.errors import SpecificationError
-from servoctl.jets.evaluation import evaluate
 from servoctl.jets.series import Series
-from servoctl.jets.tape import Tape
+from servoctl.jets.tape import Tape, evaluate
 from servoctl.spec import coordinates
 
 RNG = np.random.default_rng(31)

@@ -136,12 +136,12 @@ def test_a_program_without_free_values_is_solved(gallery_model):
 
 def test_the_front_is_what_nothing_beats(study):
     front = study.pareto()
-    told = np.maximum(study["error"], study.uncertainty)
-    good = np.isfinite(told)
+    observed = np.maximum(study["error"], study.uncertainty)
+    good = np.isfinite(observed)
     wanted = [
         i for i in np.flatnonzero(good)
-        if not np.any(good & (told <= told[i]) & (study["seconds"] <= study["seconds"][i])
-                      & ((told < told[i]) | (study["seconds"] < study["seconds"][i])))
+        if not np.any(good & (observed <= observed[i]) & (study["seconds"] <= study["seconds"][i])
+                      & ((observed < observed[i]) | (study["seconds"] < study["seconds"][i])))
     ]  # fmt: skip
     assert sorted(front["seconds"]) == sorted(study["seconds"][wanted])
     assert np.all(np.diff(front["seconds"]) > 0)
@@ -236,7 +236,7 @@ def test_the_plot_draws_every_number(cost, study):
         ({"methods": ["RK3"]}, NameUnknown, "No method is named 'RK3'"),
         ({"settings": {"rtol": [1e-3, -1.0]}}, SpecificationError, "rtol=[0.001, -1.0] was given"),
         ({"settings": {"order": [8]}}, NameUnknown, "No setting is named 'order'"),
-        ({"settings": 1e-3}, SpecificationError, "They go by name"),
+        ({"settings": 1e-3}, SpecificationError, "given by name"),
         ({"settings": {"step": "fine"}}, SpecificationError, "step='fine' was given"),
         ({"seconds": 0.0}, SpecificationError, "seconds = 0 was given"),
         ({"drift": ["often"]}, NameUnknown, "drift treatment"),

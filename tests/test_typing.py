@@ -44,3 +44,24 @@ sv.parameters(m="heavy")
     assert code == 1
     assert [int(error.split(":")[1]) for error in errors] == [4, 7, 8]
     assert "ndarray" in errors[0] and "Model" in errors[1] and '"m"' in errors[2]
+
+
+def test_a_loop_has_its_types(tmp_path):
+    script = """import servoctl as sv
+
+def looped(mechanism: sv.Mechanism, plan: sv.Run) -> sv.Closed:
+    plant = sv.plant(mechanism, limits={"trolley": 100.0})
+    law: sv.Law = sv.limited(sv.lqr(plan, plant, Q={"theta": 1e4}, integral=True), plant, priority=["X"])
+    sensors, timing = sv.Sensors({"theta": 1e-3}, seed=1), sv.Timing(delay=1)
+    return sv.close(plant, law, plan.state(0.0), (0.0, 8.0), sensors=sensors, timing=timing)
+
+def worst(run: sv.Closed) -> float:
+    batch = sv.close_many(run, {"m_load": [90.0, 110.0]}, record=["theta"])
+    text: str = run.input["trolley"]
+    sv.close(run.plant, run.law, run.states, (0.0, 1.0), timing=0.01)
+    law: sv.Law = sv.fastest
+    return float(batch["max |theta|"].max())
+"""
+    code, errors = checked(script, tmp_path)
+    assert [int(error.split(":")[1]) for error in errors] == [11, 12, 13], errors
+    assert "ndarray" in errors[0] and "Timing" in errors[1] and "Law" in errors[2]

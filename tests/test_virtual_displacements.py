@@ -88,8 +88,8 @@ def test_final_rows_are_regular_and_vanish_at_every_level(name, gallery_model, p
     q = r.mechanism.q
     assert len(r.rows) == q.n == r.rank.rank and r.rank.clear and r.rank.kept > 1e-6
     assert r.free == sum(row.order for row in r.rows) and r.top >= 2
-    assert set(r.given) == {*r.program.residuals, *r.mechanism.constraints}
-    for row in (*r.rows, *r.given.values()):
+    assert set(r.original) == {*r.program.residuals, *r.mechanism.constraints}
+    for row in (*r.rows, *r.original.values()):
         for level in q.derivatives([row.expression], max(0, r.top - row.order)):
             values, sizes = points.evaluate(level)
             assert np.all(np.abs(values) <= 1e-12 * np.maximum(sizes, 1e-12)), row.name
@@ -107,6 +107,6 @@ def test_rows_hold_no_false_symbols(name, gallery_model, points_of):
 @pytest.mark.parametrize("name", gallery)
 def test_hidden_rows_say_what_was_combined_and_lower_the_orders(name, gallery_model):
     r = gallery_model(name).reduction
-    start = sum(row.order for row in r.given.values()) + 2 * (r.mechanism.q.n - len(r.given))
+    start = sum(row.order for row in r.original.values()) + 2 * (r.mechanism.q.n - len(r.original))
     assert r.free <= start - len(r.hidden)
     assert all(" with " in row.story for row in r.hidden)

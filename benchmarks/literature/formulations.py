@@ -37,7 +37,7 @@ def formulation(model, how, forces=False):
         and multipliers by sparse symbolic elimination; the same matrix by CasADi's `solve`, a dense QR factorisation;
         or that matrix itself, column by column, and its right side, for a dense numerical solution.
     forces : bool
-        Whether the multipliers are asked for: where they are not, what only they need is left out.
+        Whether to compute the multipliers, too.
 
     Returns
     -------
@@ -63,8 +63,10 @@ def _outputs(equations, how, forces):
     if not saddle.applies(r):
         raise SpecificationError(
             f"The program leads to a motion of order {r.top} with {len(r.hidden)} hidden constraints.",
-            "Formulations are compared where the balance itself, with the constraints, gives the accelerations.",
+            "Formulations are compared where the balance and the constraints give the accelerations.",
             do="Give a program of order 2 or less without hidden constraints.",
+            order=r.top,
+            hidden=len(r.hidden),
         )
     acceleration = ca.vertcat(*q.gamma(2))
     if how == "eliminated":
@@ -108,8 +110,7 @@ class FormulationCost(Study):
         names = list(dict.fromkeys(self["formulation"].tolist()))
         lines = ["| n | k | " + " | ".join(names) + " |", "|---" * (2 + len(names)) + "|"]
         for n, k in dict.fromkeys(zip(self["n"].tolist(), self["k"].tolist(), strict=True)):
-            own = self.where(n=n, k=k)
-            cells = [f"{row['operations']:,} / {row['with_forces']:,}" for row in own.rows()]
+            cells = [f"{row['operations']:,} / {row['with_forces']:,}" for row in self.where(n=n, k=k).rows()]
             lines.append(f"| {n} | {k} | " + " | ".join(cells) + " |")
         return "\n".join(lines)
 
@@ -122,12 +123,12 @@ class FormulationCost(Study):
         """
         figure, (panels,) = style.figure(4.2, columns=2, sharex=True)
         largest = {int(n): int(self.where(n=n)["k"].max()) for n in np.unique(self["n"])}
-        keep = [i for i, (n, k) in enumerate(zip(self["n"], self["k"], strict=True)) if k == largest[int(n)]]
-        own = self.take(keep)
+        rows = [i for i, (n, k) in enumerate(zip(self["n"], self["k"], strict=True)) if k == largest[int(n)]]
+        constrained = self.take(rows)
         labels = {"operations": "operations for γ''", "microseconds": "time of one evaluation [µs]"}
         for ax, name in zip(panels, labels, strict=True):
-            for i, how in enumerate(dict.fromkeys(own["formulation"].tolist())):
-                part = own.where(formulation=how)
+            for i, how in enumerate(dict.fromkeys(constrained["formulation"].tolist())):
+                part = constrained.where(formulation=how)
                 ax.loglog(part["n"], part[name], "osDv"[i % 4] + "-", label=how)
             ax.set(xlabel="n, with the most constraints k", ylabel=labels[name])
             ax.grid(alpha=0.3)
@@ -175,8 +176,10 @@ def formulation_cost(build, cases, formulations=tuple(NAMES), timed=True):
     if not (pairs and len(formulations)):
         raise SpecificationError(
             f"cases={cases!r} and formulations={formulations!r} were given.",
-            "A study has at least one pair (n, k) of whole numbers, and one formulation.",
-            do="Give [(4, 2)].",
+            "A study needs at least one pair (n, k) of whole numbers, and one formulation.",
+            do="Give cases such as [(4, 2)].",
+            cases=cases,
+            formulations=formulations,
         )
     rows = [row for n, k in pairs for row in _measured(n, k, derive(*build(n, k)), formulations, timed)]
     columns = {name: [row[name] for row in rows] for name in rows[0]}
@@ -201,12 +204,12 @@ def _measured(n, k, model, formulations, timed):
             y = f.grid(t, x, model.parameters)
             return _solved(y, model.n) if dense else y
 
-        found = evaluate()
+        accelerations = evaluate()
         seconds = min(_seconds(evaluate) for _ in range(REPEATED)) if timed else np.nan
-        first = found if first is None else first
-        difference = np.abs(found - first).max() / np.abs(first).max()
-        told = {"operations": counts[0], "with_forces": counts[1], "microseconds": 1e6 * seconds / points}
-        rows.append({"n": n, "k": k, "formulation": NAMES[how], **told, "difference": float(difference)})
+        first = accelerations if first is None else first
+        difference = np.abs(accelerations - first).max() / np.abs(first).max()
+        cost = {"operations": counts[0], "with_forces": counts[1], "microseconds": 1e6 * seconds / points}
+        rows.append({"n": n, "k": k, "formulation": NAMES[how], **cost, "difference": float(difference)})
     return rows
 
 

@@ -13,8 +13,7 @@ from servoctl.codegen.function import compiled
 from servoctl.errors import SpecificationError, unknown
 from servoctl.figures import style
 from servoctl.methods.choice import Taylor
-from servoctl.reduction.elimination import eliminate
-from servoctl.reduction.ranks import clean, decide_all
+from servoctl.reduction.ranks import clean, decide_all, eliminate
 from servoctl.simulation import consistent_state, simulate
 from servoctl.study.table import Study, machine
 
@@ -58,14 +57,14 @@ def servo_dae(model, form):
 
 def _step(equations, form, name):
     r, q = equations.r, equations.q
-    rows = list(r.given.values())
+    rows = list(r.original.values())
     high = [row.name for row in rows if row.order > 1]
     if high:
         raise SpecificationError(
             f"The program's {', '.join(high)} holds derivatives of order 2 or higher.",
             "The servo DAE has coordinates, velocities and forces as unknowns.",
-            nearest="A program on coordinates and velocities.",
-            do="Compare by tradeoff(...) instead.",
+            do="Give a program on coordinates and velocities, or compare methods by tradeoff(...).",
+            rows=high,
         )
     B = r.realisation.B
     velocity, acceleration = ca.vertcat(*q.gamma(1)), ca.vertcat(*q.gamma(2))
@@ -128,18 +127,18 @@ class DaeComparison(Study):
         for name, value in (("form", form), ("method", method)):
             if value not in self[name]:
                 raise unknown(value, dict.fromkeys(self[name].tolist()), name)
-        own = self.where(form=form, method=method)
-        own = own.take(np.flatnonzero(np.isfinite(own["force"])))
-        if not len(own):
+        rows = self.where(form=form, method=method)
+        rows = rows.take(np.flatnonzero(np.isfinite(rows["force"])))
+        if not len(rows):
             return dict.fromkeys(("step", "force", "motion", "order", "rounding", "fitted_step"), np.nan)
-        h, error = own["step"], own["force"]
+        h, error = rows["step"], rows["force"]
         i = int(np.argmin(error))
         p, C = _branch(h, error, (h > h[i]) & (error > TRUNCATED * error[i]) & (error < 0.3))
         slope, rounding = _branch(h, error, (h < h[i]) & (error > ROUNDED * error[i]))
         r = -slope
         least = (r * rounding / (p * C)) ** (1 / (p + r)) if p > 0 and r > 0 else np.nan
-        found = {"step": h[i], "force": error[i], "motion": own["motion"][i]}
-        return {k: float(v) for k, v in (found | {"order": p, "rounding": r, "fitted_step": least}).items()}
+        measured = {"step": h[i], "force": error[i], "motion": rows["motion"][i]}
+        return {k: float(v) for k, v in (measured | {"order": p, "rounding": r, "fitted_step": least}).items()}
 
     def plot(self):
         """Draw the errors of motion and force over the step.
@@ -152,10 +151,10 @@ class DaeComparison(Study):
         for ax, name in zip(panels, ("motion", "force"), strict=True):
             for colour, form in zip(style.COLOURS, FORMS, strict=False):
                 for mark, method in zip(("o-", "s--"), METHODS, strict=True):
-                    own = self.where(form=form, method=method)
-                    if len(own):
+                    rows = self.where(form=form, method=method)
+                    if len(rows):
                         label = f"{method}, {form} form" + (" (index as it is)" if form == "servo" else "")
-                        ax.loglog(own["step"], own[name], mark, color=colour, markersize=4, label=label)
+                        ax.loglog(rows["step"], rows[name], mark, color=colour, markersize=4, label=label)
             ax.set(xlabel="step h [s]", ylabel=f"relative error of the {name}")
             ax.grid(alpha=0.3)
         figure.axes[0].legend(fontsize=9)
@@ -229,8 +228,10 @@ def _require_known(forms, methods):
     if not (len(forms) and len(methods)):
         raise SpecificationError(
             f"forms={forms!r} and methods={methods!r} were given.",
-            "A comparison has at least one of each.",
+            "A comparison needs at least one of each.",
             do="Leave them out to compare all.",
+            forms=forms,
+            methods=methods,
         )
 
 
@@ -243,8 +244,9 @@ def _steps(t0, t1, steps):
     if steps.min() <= length / MOST_STEPS:
         raise SpecificationError(
             f"steps={steps!r} were given over {t0:g} .. {t1:g} s.",
-            f"No more than {MOST_STEPS:,} steps fill the span.",
-            do=f"Give steps above {length / MOST_STEPS:.2g} s.",
+            f"At most {MOST_STEPS:,} steps may fill the span.",
+            nearest=f"{length / MOST_STEPS:.2g} s.",
+            steps=steps,
         )
     return steps
 
@@ -300,12 +302,12 @@ def _march(f, model, order, t, z0):
             weights = (1.5, -2.0, 0.5)
         history = sum(w * x[:moving] for w, x in zip(weights[1:], reversed(past), strict=False)) / h
         p = np.concatenate([model.parameters, [weights[0] / h], history])
-        found, iterations = _newton(f, t[k], z[-1], p, model.nq)
+        state, iterations = _newton(f, t[k], z[-1], p, model.nq)
         total += iterations
-        if found is None:
+        if state is None:
             break
-        z.append(found)
-        past = [*past[-1:], found]
+        z.append(state)
+        past = [*past[-1:], state]
     return np.array(z).T, total
 
 
@@ -328,9 +330,9 @@ def _newton(f, t, z, p, nq):
     return (z if last < CLOSE else None), MOST_ITERATIONS
 
 
-def _branch(h, error, own):
+def _branch(h, error, rows):
     """Slope and factor of error = factor · h^slope on some of the points; NaN for fewer than two."""
-    if own.sum() < 2:
+    if rows.sum() < 2:
         return np.nan, np.nan
-    slope, logarithm = np.polyfit(np.log(h[own]), np.log(error[own]), 1)
+    slope, logarithm = np.polyfit(np.log(h[rows]), np.log(error[rows]), 1)
     return slope, np.exp(logarithm)

@@ -11,8 +11,9 @@ matplotlib.use("Agg")
 import matplotlib.pyplot as plt  # noqa: E402
 
 PACKAGE = Path(__file__).parents[2] / "servoctl"
-WIDTH, HEIGHT = 1.62, 0.5  # of a box, of which the floors are one apart
-STEP, TRIES = 2.0, 6000  # between columns; moves that are tried
+WIDTH, HEIGHT = 1.62, 0.5  # of a box; floors are 1 apart
+STEP, TRIES = 2.0, 6000  # distance of columns; moves of the search
+TOOLS = ("errors", "checks", "tolerances", "values", "archive", "progress", "version")  # of which any room may import
 EDGE, FILL = "#4a6785", "#eef3f8"
 ARROW = {"arrowstyle": "-|>", "color": "#9db2c6", "lw": 1.1, "shrinkA": 0, "shrinkB": 0}
 
@@ -30,9 +31,9 @@ def rooms():
         modules = [n.module for n in nodes if isinstance(n, ast.ImportFrom) and n.module]
         modules += [f"servoctl.{a.name}" for n in nodes if isinstance(n, ast.ImportFrom) and n.module == "servoctl"
                     for a in n.names]  # fmt: skip
-        found = {m.split(".")[1] for m in modules if m.startswith("servoctl.")}
-        imports.setdefault(name, set()).update(found - {name})
-    return lines, {name: found & set(lines) for name, found in imports.items()}
+        imported = {m.split(".")[1] for m in modules if m.startswith("servoctl.")}
+        imports.setdefault(name, set()).update(imported - {name})
+    return lines, {name: imported & set(lines) for name, imported in imports.items()}
 
 
 def heights(imports):
@@ -46,17 +47,19 @@ def heights(imports):
 
 
 def direct(imports):
-    """Imports that no longer path implies."""
+    """Imports that are not implied by a longer path."""
 
     def reach(name):
         return set().union(*({below} | reach(below) for below in imports[name])) if imports[name] else set()
 
-    return {name: {b for b in found if not any(b in reach(other) for other in found - {b})}
-            for name, found in imports.items()}  # fmt: skip
+    return {
+        name: {b for b in imported if not any(b in reach(other) for other in imported - {b})}
+        for name, imported in imports.items()
+    }
 
 
 def hidden(start, end, boxes):
-    """How many boxes a straight arrow would run behind."""
+    """Number of boxes that a straight arrow runs behind."""
     s = np.linspace(0.05, 0.95, 30)[:, None]
     points = np.array(start) * (1 - s) + np.array(end) * s
     inside = np.abs(points[:, None] - boxes) < [WIDTH / 2 + 0.04, HEIGHT / 2 + 0.04]
@@ -74,8 +77,8 @@ def placed(floor, arrows):
         place = {n: (column[n] * STEP, floor[n]) for n in names}
         boxes = {n: np.array([p for m, p in place.items() if m != n]) for n in names}
         total = 0.0
-        for name, found in arrows.items():
-            for below in found:
+        for name, imported in arrows.items():
+            for below in imported:
                 others = np.array([p for m, p in place.items() if m not in (name, below)])
                 total += abs(column[name] - column[below]) + 20 * hidden(place[name], place[below], others)
         clash = sum(np.any(np.all(np.abs(boxes[n] - place[n]) < [0.9 * STEP, 0.5], axis=1)) for n in names)
@@ -91,24 +94,29 @@ def placed(floor, arrows):
 
 
 def draw(path):
-    """Rooms by height, errors at the bottom; an arrow points at what is imported and is implied by no other arrow."""
+    """Draw rooms by height above a row of tools; an arrow points at an imported room that no other arrow implies."""
     lines, imports = rooms()
-    floor, arrows = heights(imports), direct(imports)
-    place = placed(floor, arrows)
-    xs, ys = np.array(list(place.values())).T
+    heights(imports)  # of all rooms, so that a circle through the tools is an error, too
+    imports = {name: imported - set(TOOLS) for name, imported in imports.items() if name not in TOOLS}
+    arrows = direct(imports)
+    place = placed(heights(imports), arrows)
+    middle = np.mean([x for x, _ in place.values()])
+    row = {name: (middle + (i - (len(TOOLS) - 1) / 2) * 1.1 * WIDTH, -1.2) for i, name in enumerate(TOOLS)}
+    xs, ys = np.array([*place.values(), *row.values()]).T
     figure, ax = plt.subplots(figsize=(np.ptp(xs) + 2.4, 0.8 * np.ptp(ys) + 1.0), layout="constrained")
-    for name, found in arrows.items():
-        for below in found:
+    for name, imported in arrows.items():
+        for below in imported:
             (x, y), (u, v) = place[name], place[below]
             ax.annotate("", (u, v + HEIGHT / 2), (x, y - HEIGHT / 2), zorder=1, arrowprops=ARROW)
-    for name, (x, y) in place.items():
+    ax.text(xs.min() - WIDTH / 2, -0.8, "tools, which any room may import", size=8, color="#556", va="center")
+    for name, (x, y) in (place | row).items():
         box = plt.Rectangle((x - WIDTH / 2, y - HEIGHT / 2), WIDTH, HEIGHT, fc=FILL, ec=EDGE, lw=1.2, zorder=2)
         ax.add_patch(box)
         folder = "/" if (PACKAGE / name).is_dir() else ""
         ax.text(x, y + 0.06, name + folder, ha="center", va="center", size=10, zorder=3)
         ax.text(x, y - 0.15, f"{lines[name]:,} lines", ha="center", va="center", size=7, color="#556", zorder=3)
     ax.set_xlim(xs.min() - 1.2, xs.max() + 1.2)
-    ax.set_ylim(-0.5, ys.max() + 0.5)
+    ax.set_ylim(ys.min() - 0.5, ys.max() + 0.5)
     ax.axis("off")
     figure.savefig(path, dpi=100)
     plt.close(figure)

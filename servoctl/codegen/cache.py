@@ -1,6 +1,7 @@
-"""Files that are kept from one process to the next: libraries and derivations.
+"""Files that one process leaves to the next: compiled libraries and derivations.
 
-They are loaded and run as they are: only what this user, or the administrator, wrote is read, and only what is whole.
+Their content is loaded and run. Therefore a file is read only if this user or the administrator wrote it, and only with
+the digest at its end.
 """
 
 import contextlib
@@ -14,7 +15,7 @@ _DIGEST = hashlib.sha256().digest_size
 
 
 def cache_directory():
-    """Directory where compiled libraries and derivations are kept.
+    """Directory of compiled libraries and derivations.
 
     Returns
     -------
@@ -32,21 +33,13 @@ def cache_directory():
     return Path.home() / ".cache" / "servoctl"
 
 
-def kept(path):
-    """Content of a file that `keeping` wrote.
-
-    Parameters
-    ----------
-    path : pathlib.Path
-
-    Returns
-    -------
-    bytes
+def read_cached(path):
+    """Content (bytes) of a file that `replacing` wrote.
 
     Raises
     ------
     OSError
-        If there is none, it is damaged, or another user wrote it.
+        If the file is missing, is damaged, or belongs to another user.
     """
     with open(path, "rb") as file:
         if hasattr(os, "geteuid") and os.fstat(file.fileno()).st_uid not in (os.geteuid(), 0):
@@ -58,22 +51,13 @@ def kept(path):
 
 
 @contextlib.contextmanager
-def keeping(path):
-    """A temporary file to write, which with a digest at its end takes its place at a path: no reader meets half of it.
-
-    Parameters
-    ----------
-    path : pathlib.Path
-
-    Yields
-    ------
-    str
-        The temporary file's name.
+def replacing(path):
+    """The name of a temporary file, which replaces the one at `path` in one step, with its digest appended.
 
     Raises
     ------
     OSError
-        If it cannot be written.
+        If the file cannot be written.
     """
     path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
     handle, temporary = tempfile.mkstemp(dir=path.parent, suffix=".tmp")

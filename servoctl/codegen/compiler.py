@@ -1,12 +1,12 @@
-"""C text becomes a loaded library: compiled by the system's compiler, kept on disk by content.
+"""Libraries from C text: compiled by the system's compiler, stored on disk by content, loaded.
 
-A library is kept under the user's cache directory (``SERVOCTL_CACHE``, else ``XDG_CACHE_HOME``, else the platform's
-place) under the hash of the C text, the files that it may include, the flags, the compiler and the processor. The
-compiler is ``SERVOCTL_COMPILER``, else ``CC``, else the first of cc, gcc and clang; ``SERVOCTL_COMPILER=none`` compiles
-nothing. Without a compiler, or where it fails, one warning per process says so and the caller goes on without.
+A library lies in the cache directory under the hash of its C text, the files that this may include, the flags, the
+compiler and the processor. The compiler is ``SERVOCTL_COMPILER``, else ``CC``, else the first of cc, gcc and clang;
+``SERVOCTL_COMPILER=none`` compiles nothing. Without a compiler, or where it fails, the process warns once and CasADi
+evaluates instead.
 
-The flags keep the values of IEEE arithmetic with one exception: a product and a sum may be contracted to one fused
-operation, which rounds once instead of twice. (`emit` writes the C text.)
+The flags preserve IEEE arithmetic with one exception: a product and a sum may be contracted to one fused operation,
+which rounds once instead of twice.
 """
 
 import atexit
@@ -23,7 +23,7 @@ import threading
 import warnings
 from pathlib import Path
 
-from servoctl.codegen.cache import cache_directory, keeping, kept
+from servoctl.codegen.cache import cache_directory, read_cached, replacing
 from servoctl.codegen.loops import SOURCES, digest
 
 FLAGS = ("-fPIC", "-shared", "-w", "-fno-math-errno")
@@ -39,21 +39,21 @@ class _CompilerFailed(Exception):
 
 
 def library(text, build=True, level="-O1"):
-    """Load the library of a C translation unit, compiling it if it is not at hand.
+    """Load the library of a C translation unit; compile it where it is neither loaded nor on disk.
 
     Parameters
     ----------
     text : str
         C text.
     build : bool
-        Whether to compile if the library is neither loaded nor kept on disk.
+        Whether to compile at all.
     level : str
-        Of optimisation: "-O1" compiles fastest, and straight-line code runs within a quarter of what "-O3" makes of it.
+        Optimisation level. "-O1" compiles fastest, and its straight-line code is at most a quarter slower than "-O3".
 
     Returns
     -------
     ctypes.CDLL or None
-        None if there is none and it was not to be built, or could not be (which warns, once per process).
+        None if the library does not exist and `build` is false, or if compiling failed (one warning per process).
     """
     command, identity = _compiler()
     if command is None:
@@ -72,19 +72,19 @@ def library(text, build=True, level="-O1"):
 
 
 def compiler():
-    """Command of the C compiler that is used, None where there is none."""
+    """Command of the C compiler; None without one."""
     command, _ = _compiler()
     return None if command is None else " ".join(command)
 
 
 def _compiler():
-    """Command of the compiler and what identifies it; None and None where there is none."""
+    """Command of the compiler (a tuple) and its identity (str); (None, None) without a compiler."""
     return _identified(*(os.environ.get(name) for name in ("SERVOCTL_COMPILER", "CC", "PATH")))
 
 
 @functools.cache
 def _identified(chosen, cc, path):
-    """The compiler with its file's place, time and size (its version takes longer)."""
+    # Place, time and size of the program identify it: calling it for its version takes longer than loading a library.
     if chosen == "none":
         return None, None
     for candidate in (chosen, cc, "cc", "gcc", "clang"):
@@ -98,35 +98,36 @@ def _identified(chosen, cc, path):
 
 @functools.cache
 def _processor():
-    """The processor's model and features, empty where the system does not tell."""
-    telling = ("vendor_id", "cpu family", "model", "stepping", "flags", "Features", "CPU ")
+    """The processor's model and features; "" where the system does not publish them."""
+    identifying = ("vendor_id", "cpu family", "model", "stepping", "flags", "Features", "CPU ")
     try:
         with open("/proc/cpuinfo", encoding="utf-8", errors="replace") as lines:
             first = iter(lambda: lines.readline().rstrip("\n"), "")
-            return "\n".join(line for line in first if line.startswith(telling))
+            return "\n".join(line for line in first if line.startswith(identifying))
     except OSError:
         return ""
 
 
 def features():
-    """Features of the processor that code is compiled for, as words; empty where the system does not tell."""
+    """Features of the processor, as words; empty where the system does not publish them."""
     return frozenset(_processor().split())
 
 
 def _optional_flags():
-    """Flags left out if the compiler refuses them; code for this very processor only where the key can name it."""
+    # A compiler may refuse them. Code for this very processor only where the library's key names the processor.
     return ("-fno-semantic-interposition", *(("-march=native",) if _processor() else ()))
 
 
 @functools.cache
 def _scratch():
-    directory = tempfile.TemporaryDirectory(prefix="servoctl-", ignore_cleanup_errors=True)  # Windows: of loaded files
+    # Windows does not delete loaded libraries.
+    directory = tempfile.TemporaryDirectory(prefix="servoctl-", ignore_cleanup_errors=True)
     atexit.register(directory.cleanup)
     return Path(directory.name)
 
 
 def _build(text, level, file_name, command):
-    """Compile into the cache, or into a temporary directory where the cache cannot be used."""
+    """Compile into the cache, or into a temporary directory if the cache cannot be written."""
     try:
         try:
             return _compile(text, level, cache_directory() / file_name, command)
@@ -137,7 +138,7 @@ def _build(text, level, file_name, command):
 
 
 def _compile(text, level, target, command):
-    with keeping(target) as temporary:
+    with replacing(target) as temporary:
         for flags in ((*FLAGS, *_optional_flags()), FLAGS):
             done = subprocess.run(
                 [*command, level, *flags, f"-I{SOURCES}", "-x", "c", "-", "-o", temporary, "-lm"],
@@ -155,9 +156,8 @@ def _compile(text, level, target, command):
 
 
 def _open(path):
-    """The library kept at a path, or None: loading one that is not whole can end the process."""
     try:
-        kept(path)
+        read_cached(path)  # loading a damaged library can end the process
         return ctypes.CDLL(str(path))
     except OSError:
         return None
@@ -168,8 +168,8 @@ def _without(reason):
     if not _warned:
         _warned = True
         warnings.warn(
-            f"{reason}. CasADi evaluates the models instead: the same results, 10 to 100 times "
-            "slower in simulation. Install gcc or clang, or name a compiler in CC.",
+            f"{reason}. CasADi evaluates the models instead: the same results, simulations 10 to 100 times slower. "
+            "Install gcc or clang, or name a compiler in CC.",
             RuntimeWarning,
             stacklevel=2,
         )

@@ -1,10 +1,10 @@
-"""C text from the instruction list of an SX function: the function itself and a unit that includes the loops over it.
+"""C text of an SX function from its instruction list, and translation units with loops over it.
 
 The function is a ``casadi.Function`` with inputs t (scalar), x (n_x), p (n_p) and one dense column output y (n_y). A
-`Dialect` says how its numbers are written: as ``double``, or as vectors whose lanes are points. A long function is cut
-into chunks, and the values that outlive a chunk are kept in memory: compilers need more than linear time for one long
-function. Where several values are divided by one, as by a pivot, its reciprocal multiplies them, which rounds twice
-instead of once: a division takes as long as eight products.
+`Dialect` defines how numbers are written: as ``double``, or as vectors whose lanes are points. A long function is cut
+into chunks that share a work vector, because compilers need more than linear time for one long function. Where several
+values have the same divisor, such as a pivot, they are multiplied with its reciprocal: a division takes as long as
+eight products. This rounds twice instead of once.
 """
 
 import math
@@ -15,11 +15,10 @@ from itertools import chain, count
 import casadi as ca
 
 from servoctl.codegen.loops import BISECTIONS, INLINE_SINES, LOOPS, NEAR, QUADRATIC, ROUNDING
-from servoctl.errors import SpecificationError, unknown
 
 CHUNK = 350  # statements per C function: compile time is least, and flat, between 250 and 500
 WIDE = 3000  # operations: up to here a function is emitted for eight points at once as well
-SHARED = 2  # divisions by the same value: from here on its reciprocal is taken once, and multiplied with
+SHARED = 2  # divisions by the same value: from here on they become products with its reciprocal
 
 _ARITHMETIC = {
     ca.OP_ASSIGN: "{0}",
@@ -41,6 +40,7 @@ _ELEMENTARY = {getattr(ca, f"OP_{name.upper()}"): (name, 1) for name in _UNARY}
 _ELEMENTARY |= {getattr(ca, f"OP_{name.upper()}"): (name, 2) for name in _BINARY} | {ca.OP_CONSTPOW: ("pow", 2)}
 _COPIES = {ca.OP_ASSIGN, ca.OP_LIFT}  # the first operand, unchanged
 _NOT_ARITHMETIC = {ca.OP_CONST, ca.OP_INPUT, ca.OP_OUTPUT, *_COPIES}
+EMITTED = frozenset({*_ARITHMETIC, *_ELEMENTARY, *_NOT_ARITHMETIC})  # instructions that have a C counterpart
 
 _FORMS_OF_ONE = {
     "sign": "({0} < 0 ? -1 : {0} > 0 ? 1 : {0})",
@@ -58,22 +58,22 @@ _FORMS_OF_ONE = {
 
 @dataclass(frozen=True)
 class Dialect:
-    """How C writes the numbers of a function, and the function's head.
+    """How C writes the numbers and the head of a function.
 
     Attributes
     ----------
     number : str
-        Their type.
+        Type of the numbers.
     literal : str
-        A constant of this type, from a C number in the place of {}.
+        Format of a constant: {} is replaced by a C number.
     prefix : str
-        Of the names of elementary functions.
+        Prefix of elementary functions.
     forms : dict of str to str
-        Operations that are written otherwise, by name.
+        Formats of the operations that are no call of an elementary function, by name.
     common : bool
-        Whether p holds one ``double`` for all lanes.
+        Whether all lanes share p, an array of ``double``.
     linkage : str
-        Of the function and of its chunks; external functions have chunks that are not inlined.
+        Linkage of the function and of its chunks; without one, the chunks are static and not inlined.
     """
 
     number: str = "double"
@@ -84,16 +84,16 @@ class Dialect:
     linkage: str = ""
 
     def constant(self, value):
-        """A number, exactly."""
+        """A number as C text, exactly."""
         return self.literal.format(literal(value))
 
     def operand(self, array, i, suffix=""):
-        """An input: t, an entry of x or of p."""
+        """C text of t, or of an entry of x or p."""
         place = array if array == "t" else f"{array}{suffix}[{i}]"
         return self.literal.format(place) if array == "p" and self.common else place
 
     def expression(self, operation, operands):
-        """An operation of CasADi on operands in C."""
+        """C text of an operation on operands."""
         if operation in _ARITHMETIC:
             return _ARITHMETIC[operation].format(*operands, one=self.constant(1.0), two=self.constant(2.0))
         name, n = _ELEMENTARY[operation]
@@ -102,7 +102,7 @@ class Dialect:
         return f"{self.prefix}{name}({', '.join(operands[:n])})"
 
     def head(self, name, suffixes=("",), work=False):
-        """The beginning of a C function, up to its first statement."""
+        """C text of a function up to its first statement."""
         number, shared = self.number, "double" if self.common else self.number
         arguments = [
             f"const {number} *restrict x{s}, const {shared} *restrict p{s}, {number} *restrict y{s}" for s in suffixes
@@ -123,43 +123,32 @@ LANES_COMMON = Dialect("W", "ALL({})", "w_", common=True, linkage="static ")
 
 
 def operations(f):
-    """Number of arithmetic instructions of an SX function.
-
-    Parameters
-    ----------
-    f : casadi.Function
-        An SX function.
-
-    Returns
-    -------
-    int
-        Instructions that compute; constants, inputs, outputs and copies are not counted.
-    """
+    """Number of arithmetic instructions of an SX function: all but constants, inputs, outputs and copies."""
     return sum(f.instruction_id(k) not in _NOT_ARITHMETIC for k in range(f.n_instructions()))
 
 
 def emit(f, name, loops=(), *, project=None, others=None, sizes=None, wide=True, chunk=CHUNK):
-    """C translation unit of a function and of the loops over it; it includes files of `loops.SOURCES`.
+    """C translation unit of a function and of loops over it; it includes files of `loops.SOURCES`.
 
-    It defines ``void name(double t, const double *x, const double *p, double *y)`` (``y`` overlaps no input),
-    ``name_point``, ``name_grid``, ``name_casadi``, which CasADi can call, and what each loop's file defines.
+    The unit defines ``void name(double t, const double *x, const double *p, double *y)`` (``y`` overlaps no input),
+    ``name_point``, ``name_grid``, ``name_casadi`` in the form that CasADi calls, and the functions of each loop's file.
 
     Parameters
     ----------
     f : casadi.Function
-        SX function of t (scalar), x (n_x), p (n_p) with one dense column output y (n_y).
+        SX function (t, x, p) -> y of elementary operations (`EMITTED`).
     name : str
         A C identifier, the prefix of every external symbol.
     loops : sequence of {"rk", "newton", "taylor", "radau", "closed", "law"}
         Files to include.
     project : casadi.Function, optional
-        Change of x (n_x) that restores invariants, of the same inputs; loops may call it after their steps.
+        SX function (t, x, p) -> change of x that restores invariants; loops may call it after their steps.
     others : dict of str to casadi.Function, optional
-        Further SX functions of this form (their sizes may differ), which become ``name_KEY``.
+        Further SX functions of this form, with sizes of their own, which become ``name_KEY``.
     sizes : dict of str to int, optional
-        Constants of the loops; in capitals in C.
+        Constants of the loops; their names are in capitals in C.
     wide : bool
-        Whether grids, and Newton's method, may take eight points at once, by a second copy of f.
+        Whether grids and Newton's method may evaluate eight points at once, by a second copy of f.
     chunk : int
         Largest number of statements in one C function.
 
@@ -167,17 +156,7 @@ def emit(f, name, loops=(), *, project=None, others=None, sizes=None, wide=True,
     -------
     str
         The same text for the same function, name and loops, in every process.
-
-    Raises
-    ------
-    SpecificationError
-        If f contains an operation that has no C counterpart here.
-    NameUnknown
-        If a loop is none of the above.
     """
-    for loop in loops:
-        if loop not in LOOPS:
-            raise unknown(loop, LOOPS, "loop")
     dialect = SCALAR_INLINE if INLINE_SINES.intersection(loops) else SCALAR
     scalar = {name: f} | ({} if project is None else {f"{name}_project": project})
     scalar |= {f"{name}_{key}": other for key, other in (others or {}).items()}
@@ -195,40 +174,24 @@ def emit(f, name, loops=(), *, project=None, others=None, sizes=None, wide=True,
 
 
 def unit(constants):
-    """The beginning of a translation unit: its constants by name, and `unit.h`."""
+    """Head of a translation unit: #define lines of constants by name, and `unit.h`."""
     tolerances = {"ROUNDING": ROUNDING, "BISECTIONS": BISECTIONS, "NEAR": NEAR, "QUADRATIC": QUADRATIC}
     lines = (f"#define {key} {value}\n" for key, value in (tolerances | constants).items())
     return "".join(("#include <math.h>\n#include <stdint.h>\n", *lines, include("unit.h")))
 
 
 def include(name):
-    """A line of C that includes a file."""
+    """C line that includes a file."""
     return f'#include "{name}"\n'
 
 
 def _first(f, n):
-    """The function of the first n outputs alone."""
     inputs = f.sx_in()
     return ca.Function(f.name(), inputs, [f(*inputs)[:n]])
 
 
 def function(f, name, dialect=SCALAR, chunk=CHUNK):
-    """C text of one function, in chunks where it is long.
-
-    Parameters
-    ----------
-    f : casadi.Function
-        As `emit` takes it.
-    name : str
-        A C identifier.
-    dialect : Dialect
-    chunk : int
-        Largest number of statements in one C function.
-
-    Returns
-    -------
-    str
-    """
+    """C text of one function y = f(t, x, p), cut into chunks of at most `chunk` statements."""
     statements = _with_reciprocals(_statements(f, dialect))
     chunks = [statements[k : k + chunk] for k in range(0, len(statements), chunk)]
     if len(chunks) > 1:
@@ -237,20 +200,7 @@ def function(f, name, dialect=SCALAR, chunk=CHUNK):
 
 
 def function_of_two(f, name, dialect):
-    """C text of y = f(t, x, p) and y2 = f(t, x2, p2), statement by statement: one waits while the other goes on.
-
-    Parameters
-    ----------
-    f : casadi.Function
-        As `emit` takes it.
-    name : str
-        A C identifier.
-    dialect : Dialect
-
-    Returns
-    -------
-    str
-    """
+    """C text of y = f(t, x, p) and y2 = f(t, x2, p2), with alternating statements: the processor overlaps the two."""
     one, two = (_with_reciprocals(_statements(f, dialect, suffix)) for suffix in ("", "2"))
     lines = ((_line(a, dialect), _line(b, dialect, "b")) for a, b in zip(one, two, strict=True))
     return dialect.head(name, ("", "2")) + "".join(chain.from_iterable(lines)) + "}\n"
@@ -265,7 +215,7 @@ def literal(value):
 
 
 def _statements(f, dialect, suffix=""):
-    """Single assignments: (value number, or C text of an output; operation; operands as value numbers or C text)."""
+    """Single assignments (target, operation, operands); values are numbered, inputs and outputs are C text."""
     register, statements, values = {}, [], 0
     for k in range(f.n_instructions()):
         operation, source, target = f.instruction_id(k), f.instruction_input(k), f.instruction_output(k)
@@ -277,23 +227,15 @@ def _statements(f, dialect, suffix=""):
             statements.append((f"y{suffix}[{target[1]}]", ca.OP_ASSIGN, (register[source[0]],)))
         elif operation in _COPIES:
             register[target[0]] = register[source[0]]
-        elif operation in _ARITHMETIC or operation in _ELEMENTARY:
+        else:
             statements.append((values, operation, tuple(register[i] for i in source)))
             register[target[0]] = values
             values += 1
-        else:
-            raise SpecificationError(
-                f"the function {f.name()} contains the operation {_operation_name(operation)}",
-                "only scalar arithmetic can be compiled",
-                nearest="the elementary functions of CasADi's SX",
-                do="write the expression with these, or expand() the function called",
-                operation=operation,
-            )
     return statements
 
 
 def _with_reciprocals(statements):
-    """The statements with one reciprocal for all divisions by the same value, where these are `SHARED` or more."""
+    """The statements, with products by a reciprocal where `SHARED` or more divisions have the same divisor."""
     divisors = Counter(operands[1] for _, operation, operands in statements if operation == ca.OP_DIV)
     new = count(len(statements))
     reciprocal = {v: next(new) for v, n in divisors.items() if n >= SHARED and isinstance(v, int)}
@@ -309,12 +251,8 @@ def _with_reciprocals(statements):
     return result
 
 
-def _operation_name(operation):
-    return next((name for name in dir(ca) if name.startswith("OP_") and getattr(ca, name) == operation), operation)
-
-
 def _line(statement, dialect, value="a"):
-    """One statement as a line of C; values are named by a letter and their number."""
+    """C line of a statement; a value's name is a letter and its number."""
     target, operation, operands = statement
     text = dialect.expression(operation, [v if isinstance(v, str) else f"{value}{v}" for v in operands])
     place = target if isinstance(target, str) else f"const {dialect.number} {value}{target}"
@@ -322,7 +260,7 @@ def _line(statement, dialect, value="a"):
 
 
 def _chunked(name, chunks, dialect):
-    """A function as calls of its chunks, which share a work vector w."""
+    """C text of a function that calls its chunks, which share a work vector w."""
     home = {target: here for here, chunk in enumerate(chunks) for target, _, _ in chunk if isinstance(target, int)}
     slots, n_slots = _slots(chunks, home)
     functions = (
@@ -335,7 +273,7 @@ def _chunked(name, chunks, dialect):
 
 
 def _chunk(statements, slots, home, here, dialect):
-    """C lines of one chunk: a value from another chunk is loaded from w at its first use, one for another is stored."""
+    """C lines of a chunk: values of other chunks are loaded from w at their first use, values for others are stored."""
     known, lines = set(), []
     for statement in statements:
         target, _, operands = statement
@@ -350,7 +288,7 @@ def _chunk(statements, slots, home, here, dialect):
 
 
 def _slots(chunks, home):
-    """Where each value that outlives its chunk is kept; a place is used again after the last chunk that reads it."""
+    """Index in w of each value that outlives its chunk; it is free again after the last chunk that reads the value."""
     last = {
         v: here for here, chunk in enumerate(chunks) for _, _, operands in chunk for v in operands if isinstance(v, int)
     }
@@ -366,5 +304,5 @@ def _slots(chunks, home):
 
 
 def contains(f, operation):
-    """Whether an SX function contains an operation of CasADi, such as ``casadi.OP_ERFINV``."""
+    """Whether an SX function contains an operation, such as ``casadi.OP_ERFINV``."""
     return any(f.instruction_id(k) == operation for k in range(f.n_instructions()))

@@ -1,4 +1,4 @@
-"""Powers of two are gathered: SX leaves the factors 1/2 and 2 of energies and gradients where they arose."""
+"""Powers of two, gathered: SX leaves the factors 1/2 and 2 of energies and gradients where they arise."""
 
 import math
 
@@ -8,9 +8,9 @@ _OF_ONE = {ca.OP_ASSIGN: 1.0, ca.OP_NEG: -1.0, ca.OP_TWICE: 2.0}
 
 
 def folded(f):
-    """The outputs of an SX function with factors of ± powers of two moved to where they cost least.
+    """The output of an SX function with its factors ±2^k gathered.
 
-    Results are the same to the last bit, as products with powers of two do not round.
+    Results are the same to the last bit, because products with powers of two do not round.
 
     Parameters
     ----------
@@ -31,18 +31,18 @@ def folded(f):
         elif operation == ca.OP_CONST:
             work[target[0]] = _constant(f.instruction_constant(k))
         elif operation == ca.OP_OUTPUT:
-            outputs[target[1]] = _whole(work[source[0]])
+            outputs[target[1]] = _product(work[source[0]])
         else:
             work[target[0]] = _operation(operation, [work[i] for i in source])
     return ca.vertcat(*outputs)
 
 
 def _constant(value):
-    """±2^k as a factor of one, other numbers as they are."""
+    """(factor, expression) of a number: ±2^k is all factor."""
     return (value, ca.SX(1)) if value and abs(math.frexp(value)[0]) == 0.5 else (1.0, ca.SX(value))
 
 
-def _whole(term):
+def _product(term):
     factor, expression = term
     return expression if factor == 1 else -expression if factor == -1 else factor * expression
 
@@ -66,5 +66,5 @@ def _operation(operation, terms):
             (c, a), (d, b) = (d, b), (c, a)
         ratio = d / c
         return c, a + b if ratio == 1 else a - b if ratio == -1 else a + ratio * b
-    whole = [_whole(term) for term in terms]
-    return 1.0, (ca.SX.unary(operation, *whole) if len(whole) == 1 else ca.SX.binary(operation, *whole))
+    operands = [_product(term) for term in terms]
+    return 1.0, (ca.SX.unary if len(operands) == 1 else ca.SX.binary)(operation, *operands)

@@ -1,12 +1,14 @@
-"""A function of (t, x, p) seen through numpy: single points, grids, Runge-Kutta, and Newton along a path.
+"""A function of (t, x, p) on NumPy arrays: single points, grids, Runge-Kutta, Taylor, and Newton along a path.
 
-Nothing is compiled before it pays; without a compiler CasADi runs the same algorithms, and results differ by rounding.
+CasADi evaluates it until compiling pays, and wherever there is no compiler; the two agree to rounding.
 """
 
 import contextlib
 import contextvars
 import functools
+import os
 
+import casadi as ca
 import numpy as np
 
 from servoctl.codegen import compiler, emit
@@ -27,7 +29,7 @@ _OUTPUTS_PER_STATE = {"rk": 1, "newton": 2, "taylor": 1}
 
 @contextlib.contextmanager
 def compiling_at_once():
-    """Compile at the first call: results then do not depend, in their last bits, on how often a function was called."""
+    """Let functions compile at their first call, so that their last bits do not depend on earlier calls."""
     token = _AT_ONCE.set(True)
     try:
         yield
@@ -45,14 +47,14 @@ def compiled(f, name, loops=(), project=None, others=None, sizes=None):
     name : str
         A C identifier.
     loops : sequence of {"rk", "newton", "taylor", "radau", "closed", "law"}
-        The loops that will be called: the first three by methods of the result, the others by `Compiled.native`.
+        Loops over f: the first three are methods of the result, the others are called by `Compiled.native`.
     project : casadi.Function, optional
-        Change of x that restores invariants, of the same inputs (t, x, p); loops may call it after their steps.
+        SX function (t, x, p) -> change of x that restores invariants; loops may call it after their steps.
     others : dict of str to casadi.Function, optional
-        Further functions of the same form in the same library, found by `Compiled.native`.
+        Further functions of the same form in the same library, called by `Compiled.native`.
     sizes : dict of str to int, optional
-        Constants that loops take; "taylor" takes the numbers of coordinates "nq" and quasi-velocities "n",
-        the order s̄ as "top", the highest index of coefficients "last", and whether q' = γ' as "plain".
+        Constants of the loops. Those of "taylor": the numbers of coordinates "nq" and of quasi-velocities "n", the
+        order s̄ "top", the highest index of coefficients "last", and "plain" (1 if q' = γ', else 0).
 
     Returns
     -------
@@ -61,11 +63,38 @@ def compiled(f, name, loops=(), project=None, others=None, sizes=None):
     Raises
     ------
     SpecificationError
-        If f has another shape than this, or too few outputs for a loop; at the first evaluation, if f contains an
-        operation that is not elementary.
+        If f is no such function, contains an operation that is not elementary, or has too few outputs for a loop.
     NameUnknown
-        If a loop is none of the above.
+        If a loop is none of these.
     """
+    _require_columns(f, name)
+    for part in filter(None, (f, project, *(others or {}).values())):
+        _require_elementary(part)
+    if not (name.isascii() and name.isidentifier()):
+        raise SpecificationError(
+            f"The function is named {name!r}.",
+            "A compiled function has a C identifier as its name.",
+            do="Use letters, digits and underscores.",
+            name=name,
+        )
+    for loop in loops:
+        if loop not in LOOPS:
+            raise unknown(loop, LOOPS, "loop")
+        needed = _OUTPUTS_PER_STATE.get(loop, 0) * f.numel_in(1)
+        if f.numel_out(0) < needed:
+            raise SpecificationError(
+                f"{name!r} has {f.numel_out(0)} outputs for {f.numel_in(1)} states.",
+                f"The loop {loop} reads the first {needed} outputs.",
+                do="Add the outputs, or leave the loop out.",
+                name=name,
+                loop=loop,
+                outputs=f.numel_out(0),
+                needed=needed,
+            )
+    return Compiled(f, name, tuple(loops), project, others, sizes)
+
+
+def _require_columns(f, name):
     columns = [*(f.sparsity_in(i) for i in range(f.n_in())), *(f.sparsity_out(i) for i in range(f.n_out()))]
     if (
         not f.is_a("SXFunction")
@@ -75,39 +104,35 @@ def compiled(f, name, loops=(), project=None, others=None, sizes=None):
         or not all(column.is_dense() and column.size2() == 1 for column in columns)
     ):
         raise SpecificationError(
-            f"{name!r} is to be compiled from {f}",
-            "A compiled function takes columns t, x, p to one dense column, without free symbols",
-            "An SX function of this form",
-            "Concatenate and densify the outputs; expand() an MX function",
+            f"{name!r} is the function {f}.",
+            "A compiled function is an SX function that takes columns t, x, p to one dense column.",
+            do="Concatenate and densify the outputs, declare all symbols as inputs, and expand() an MX function.",
             name=name,
+            function=str(f),
         )
-    if not (name.isascii() and name.isidentifier()):
+
+
+def _require_elementary(f):
+    for operation in {f.instruction_id(k) for k in range(f.n_instructions())} - emit.EMITTED:
         raise SpecificationError(
-            f"A compiled function is named {name!r}",
-            "Its name is a C identifier",
-            do="Use letters, digits and underscores",
-            name=name,
+            f"The function {f.name()} contains the operation {_name_of(operation)}.",
+            "Only scalar arithmetic and the elementary functions of CasADi's SX are compiled.",
+            do="Write the expression with these, or expand() the function that it calls.",
+            function=f.name(),
+            operation=_name_of(operation),
         )
-    for loop in loops:
-        if loop not in LOOPS:
-            raise unknown(loop, LOOPS, "loop")
-        needed = _OUTPUTS_PER_STATE.get(loop, 0) * f.numel_in(1)
-        if f.numel_out(0) < needed:
-            raise SpecificationError(
-                f"{name!r} has {f.numel_out(0)} outputs for {f.numel_in(1)} states",
-                f"{loop} needs the first {needed} outputs",
-                do="Add the outputs or leave the loop out",
-                name=name,
-                loop=loop,
-            )
-    return Compiled(f, name, tuple(loops), project, others, sizes)
+
+
+def _name_of(operation):
+    """CasADi's name of an instruction, such as OP_SIN."""
+    return next((name for name in dir(ca) if name.startswith("OP_") and getattr(ca, name) == operation), operation)
 
 
 class Compiled:
-    """A function y = f(t, x, p), compiled as soon as it pays; made by `compiled`.
+    """A function y = f(t, x, p) that compiles as soon as it pays; made by `compiled`.
 
-    It may be called, and its loops run, from several threads at once. It pickles, and is loaded from the cache or
-    compiled again where it is unpickled.
+    Several threads may call it and its loops at once. It pickles: the copy loads its library from the cache, or builds
+    it again.
 
     Attributes
     ----------
@@ -115,7 +140,7 @@ class Compiled:
     n_x, n_p, n_y : int
         Numbers of states, parameters and outputs.
     loops : tuple of str
-        The loops it can run.
+        Loops that it can run.
     expression : casadi.Function
         The SX function (t, x, p) -> y.
     """
@@ -131,7 +156,9 @@ class Compiled:
 
     def __reduce__(self):
         parts = (self.expression, self.name, self.loops, self._project, self._others, self._sizes)
-        return Compiled, parts, {"_text": self._text}
+        # Emitting takes longer than reading: the C text travels until the library is loaded, where it can be compiled.
+        text = None if self._settled or compiler.compiler() is None else self.source()
+        return Compiled, parts, {"_text": text}
 
     def __eq__(self, other):
         return self is other or (isinstance(other, Compiled) and self.source() == other.source())
@@ -150,7 +177,7 @@ class Compiled:
 
     @property
     def backend(self):
-        """``"c"`` once calls run the compiled library, ``"casadi"`` while CasADi evaluates them."""
+        """``"c"`` once the library is loaded, ``"casadi"`` until then."""
         return self.__dict__.get("_lanes", self._evaluator).backend
 
     def __call__(self, t, x, p):
@@ -168,7 +195,7 @@ class Compiled:
         Returns
         -------
         (n_y,) array
-            The outputs, a new array at each call.
+            A new array at each call.
 
         Raises
         ------
@@ -183,15 +210,15 @@ class Compiled:
         return row_y.copy()
 
     def buffer(self):
-        """Arrays to write and read, and a call without arguments: for loops in Python over single evaluations.
+        """Arrays and a call without arguments, for loops in Python over single evaluations.
 
-        They belong to the calling thread, and any other evaluation by it writes to them.
+        They belong to the calling thread; its other evaluations overwrite them.
 
         Returns
         -------
         t, x, p, y : (1,), (n_x,), (n_p,), (n_y,) arrays
         call : callable
-            Computes y from what t, x and p hold.
+            Computes y from t, x and p.
         """
         self._settle(build=True)
         return self._evaluator.workspace.buffer
@@ -206,12 +233,11 @@ class Compiled:
         x : (n_x, N) array
             One state per column, SI.
         p : (n_p,) or (n_p, N) array
-            Parameters, SI; a matrix has a column per point.
+            Parameters, SI; a matrix has one column per point.
 
         Returns
         -------
         (n_y, N) array
-            The outputs.
 
         Raises
         ------
@@ -231,7 +257,7 @@ class Compiled:
     def rk(self, t0, x0, h, n_steps, p, tableau, every=1, project_every=0):
         """Integrate dx/dt, the first n_x outputs, by explicit Runge-Kutta steps.
 
-        Step k starts at t0 + k h. The run ends early, with what was computed, at a state that is not finite.
+        Step k starts at t0 + k h. The run ends before the first state that is not finite.
 
         Parameters
         ----------
@@ -246,49 +272,49 @@ class Compiled:
         p : (n_p,) array
             Parameters, SI.
         tableau : (a, b, c)
-            Of s stages: (s, s) array, strictly lower triangular, (s,) and (s,) arrays.
+            Coefficients of s stages: (s, s) array, strictly lower triangular, (s,) and (s,) arrays.
         every : int
             Number of steps between logged points; the start and the end are always logged.
         project_every : int
-            Steps between projections; 0 for none.
+            Number of steps between projections; 0 for no projection.
 
         Returns
         -------
         t : (N,) array
             Logged times [s].
         x : (n_x, N) array
-            States there.
-        guards : (n_y - n_x, N) array
-            The other outputs there.
+            States at these times, SI.
+        outputs : (n_y - n_x, N) array
+            The further outputs at these times.
 
         Raises
         ------
         SpecificationError
-            If it was made without the loop, a shape is another, or a count is out of range.
+            If the function has no loop "rk", an array has another shape, or a count is out of range.
         """
         self._settle_loop("rk")
         x0, p = self._array("x0", x0, self._x_shape), self._array("p", p, self._p_shape)
         if n_steps < 0 or every < 1:
             raise SpecificationError(
-                f"rk is to take {n_steps} steps and log every {every}",
-                "n_steps is at least 0 and every at least 1",
+                f"n_steps={n_steps} and every={every}.",
+                "n_steps is at least 0, every at least 1.",
                 n_steps=n_steps,
                 every=every,
             )
         tableau = tuple(np.ascontiguousarray(part, dtype=float) for part in tableau)
         log = np.append(np.arange(0, n_steps, every), n_steps)
-        states, guards = np.empty((self.n_x, log.size)), np.empty((self.n_y - self.n_x, log.size))
+        states, outputs = np.empty((self.n_x, log.size)), np.empty((self.n_y - self.n_x, log.size))
         counts = (int(n_steps), int(every), int(project_every) if self._project is not None else 0)
-        n = 1 + self._evaluator.rk(float(t0), x0, float(h), counts, p, tableau, states, guards)
-        return t0 + log[:n] * h, states[:, :n], guards[:, :n]
+        n = 1 + self._evaluator.rk(float(t0), x0, float(h), counts, p, tableau, states, outputs)
+        return t0 + log[:n] * h, states[:, :n], outputs[:, :n]
 
     def newton(self, t, x0, p, tol=1e-13, max_iter=30):
         """Solve delta = 0 at each time in order; the outputs are the Newton step delta (n_x), dx/dt (n_x) and others.
 
         A point is predicted from the last one by its rate and corrected until every |delta_i| <= tol (1 + |x_i|), then
-        once more where that still reduces delta. Where the correction fails the step in time is halved, up to 20 times.
-        Once compiled, eight points are predicted at once, by Hermite's interpolation from three before, and corrected
-        together; where that prediction is off by more than 1e-3 they are solved one by one.
+        once more if that still reduces delta. If the correction fails, the step in time is halved, up to 20 times.
+        Points in blocks are predicted by Hermite's interpolation and corrected together; they are solved one by one
+        if the prediction is off by more than 1e-3. Compiled code takes eight points at once, CasADi 128.
 
         Parameters
         ----------
@@ -306,16 +332,16 @@ class Compiled:
         Returns
         -------
         x : (n_x, M) array
-            Solutions at the first M times, all N unless the iteration failed at t[M].
+            Solutions at the first M times; M < N if the iteration fails at t[M].
         y : (n_y, M) array
-            Outputs there.
+            Outputs at these times.
         iterations : int
-            Number of evaluations made.
+            Number of evaluations.
 
         Raises
         ------
         SpecificationError
-            If it was made without the loop, or a shape is another.
+            If the function has no loop "newton", or an array has another shape.
         """
         self._points += SOLVED * np.size(t)
         self._settle_loop("newton", self._points > GRID_POINTS or _AT_ONCE.get())
@@ -326,9 +352,9 @@ class Compiled:
         return x[:, :n], y[:, :n], iterations
 
     def taylor(self, t0, x0, t1, p, rtol, atol, max_steps, project_every=0):
-        """Steps of the Taylor method; the outputs are coefficients of q (unless plain) and γ by index, then guards.
+        """Steps of the Taylor method; the outputs are coefficients of q (unless plain) and γ by index, then pivots.
 
-        A step is as long as its last term stays below the tolerance at every level of the state.
+        A step is as long as its last term meets the tolerance at every level of the state.
 
         Parameters
         ----------
@@ -339,25 +365,25 @@ class Compiled:
         p : (n_p,) array
             Parameters, SI.
         rtol, atol : float
-            Tolerance of each level of the state relative to its largest entry, and absolute.
+            Tolerances of each level of the state: relative to its largest entry, and absolute.
         max_steps : int
-            Number of steps at most.
+            Largest number of steps.
         project_every : int
-            Steps between projections; 0 for none.
+            Number of steps between projections; 0 for no projection.
 
         Returns
         -------
         t : (S + 1,) array
-            Starts of the steps, and where the last one ended [s]; short of t1 where a step vanishes.
+            Starts of the steps and end of the last one [s]; the end is before t1 if the step length vanishes.
         x : (n_x, S + 1) array
-            States there, SI.
+            States at these times, SI.
         y : (n_y, S) array
             Outputs at the starts.
 
         Raises
         ------
         SpecificationError
-            If it was made without the loop, or a shape is another.
+            If the function has no loop "taylor", or an array has another shape.
         """
         self._settle_loop("taylor")
         self._place(t0, x0, p)
@@ -366,24 +392,16 @@ class Compiled:
         return log[:, 0], log[:, 1 : 1 + self.n_x].T, log[:-1, 1 + self.n_x :].T
 
     def restore(self, t, x, p):
-        """The state (n_x,) with its invariants restored by `project`, evaluated by CasADi; x where there is none.
-
-        Parameters
-        ----------
-        t : float
-            [s]
-        x : (n_x,) array
-        p : (n_p,) array
-        """
+        """The state (n_x,) with its invariants restored by `project`, by CasADi; x if there is no `project`."""
         return x if self._project is None else restored(self._project, t, x, p)
 
     def native(self, suffix):
-        """The C function ``..._suffix`` of the library, built if need be; None without a compiler.
+        """A C function of the library, which is compiled if necessary; None without a compiler.
 
         Parameters
         ----------
         suffix : str
-            "point", "grid", a key of `others`, or a function that a loop's file defines.
+            Name after ``servoctl_NAME_``: "point", "grid", a key of `others`, or a function of a loop's file.
         """
         self._settle(build=True)
         return self._evaluator.native(suffix)
@@ -391,27 +409,32 @@ class Compiled:
     def _settle_loop(self, loop, build=True):
         if loop not in self.loops:
             raise SpecificationError(
-                f"{self.name!r} has no loop {loop}",
-                f"It was made with the loops {', '.join(self.loops) or '(none)'}",
-                do=f"Make it with loops=({loop!r},)",
+                f"{self.name!r} has no loop {loop!r}.",
+                f"Its loops are {', '.join(self.loops) or '(none)'}.",
+                do=f"Make it with loops=({loop!r},).",
                 name=self.name,
                 loop=loop,
+                loops=self.loops,
             )
         self._settle(build)
 
     def _settle(self, build):
-        """Move from CasADi to the library: at the first call if one is at hand, later if it is to be built."""
+        """Change from CasADi to the library: to one on disk at the first call, to a new one if `build`."""
         if self._settled or (self._looked and not build):
             return
+        self._looked = True
+        if not build and os.environ.get("SERVOCTL_COMPILER") == "none":
+            return  # without the emission of C text, which takes longer than a short motion
         level = "-O1" if {*self.loops} <= {"rk"} else "-O3"
-        library = compiler.library(self.source(), build, level)
+        text = "" if compiler.compiler() is None else self.source()
+        library = compiler.library(text, build, level)
         if library is not None:
             self._evaluator = Library(library, self._symbol, self.n_x, self.n_p, self.n_y)
-        self._looked, self._settled = True, build or library is not None
+        self._settled = build or library is not None
         self._text = None if self._settled else self._text
 
     def source(self):
-        """C text of the library; kept, and pickled, until the library is loaded."""
+        """C text of the library."""
         if self._text is None:
             parts = {"project": self._project, "others": self._others, "sizes": self._sizes}
             self._text = emit.emit(self.expression, self._symbol, self.loops, **parts, wide="newton" in self.loops)
@@ -419,7 +442,7 @@ class Compiled:
 
     @functools.cached_property
     def _lanes(self):
-        """What evaluates long grids: a separate library, as twice the code takes twice the time to compile."""
+        """Evaluator of long grids: a separate library, because twice the code takes twice the time to compile."""
         if "newton" not in self.loops:
             library = compiler.library(emit.emit(self.expression, self._symbol), level="-O1")
             if library is not None:
@@ -428,7 +451,7 @@ class Compiled:
         return self._evaluator
 
     def _place(self, t, x, p):
-        """Put t, x and p where the evaluator reads them; where it writes y, and its call."""
+        """Write t, x and p into the thread's workspace; return its y and its call."""
         row_t, row_x, row_p, row_y, run = self._evaluator.workspace.row
         row_t[0] = t
         try:
@@ -441,9 +464,10 @@ class Compiled:
         array = np.ascontiguousarray(value, dtype=float)
         if array.shape != shape:
             raise SpecificationError(
-                f"{what} of {self.name!r} has the shape {array.shape}",
-                f"Its shape is {shape}",
+                f"{what} of {self.name!r} has the shape {array.shape}.",
+                f"Its shape is {shape}.",
                 name=self.name,
+                array=what,
                 shape=array.shape,
                 expected=shape,
             )

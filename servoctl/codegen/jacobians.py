@@ -9,7 +9,7 @@ from servoctl.codegen.function import Compiled
 
 
 def differentiable(function):
-    """Whether there are expressions behind a function of (t, x, p)."""
+    """Whether a function of (t, x, p) has expressions."""
     return isinstance(function, Compiled)
 
 

@@ -14,27 +14,27 @@ class Library:
     backend = "c"
 
     def __init__(self, library, symbol, n_x, n_p, n_y):
-        self._grid = library[f"{symbol}_grid"]
-        self._grid.restype = None
         self._library, self._symbol = library, symbol
+        self._grid = self.native("grid")
+        self._grid.restype = None
         self._columns = 1 + n_x + n_y
         self.workspace = Workspace(n_x, n_p, n_y, self._connect)
 
     def _connect(self, row, parts):
-        """CasADi's buffer: its call without arguments takes a third of the time of a call through ctypes."""
+        # CasADi's buffer: its call without arguments takes a third of the time of a call through ctypes.
         return connected(ca.external(f"{self._symbol}_casadi", self._library._name), parts)
 
     def native(self, suffix):
-        """The C function of this suffix."""
+        """The C function ``SYMBOL_suffix``."""
         return self._library[f"{self._symbol}_{suffix}"]
 
     def grid(self, t, x, p, y):
-        """As `Compiled.grid` says."""
+        """See `Compiled.grid`."""
         self._grid(ctypes.c_int64(t.size), *map(pointer, (t, x, p)), ctypes.c_int64(p.ndim == 2), pointer(y))
 
-    def rk(self, t0, x0, h, counts, p, tableau, states, guards):
-        """As `Compiled.rk` says."""
-        run = self._library[f"{self._symbol}_rk"]
+    def rk(self, t0, x0, h, counts, p, tableau, states, outputs):
+        """See `Compiled.rk`."""
+        run = self.native("rk")
         run.restype = ctypes.c_int64
         return run(
             ctypes.c_double(t0),
@@ -46,11 +46,11 @@ class Library:
             *map(pointer, tableau),
             ctypes.c_int64(states.shape[1]),
             pointer(states),
-            pointer(guards),
+            pointer(outputs),
         )
 
     def taylor(self, t1, rtol, atol, every, max_steps):
-        """Rows (t, x, y) of the steps from the start in the workspace, as `Compiled.taylor` says."""
+        """Rows (t, x, y) of the steps from the start in the workspace; see `Compiled.taylor`."""
         workspace = self.workspace
         log, address = workspace.log(max_steps + 1, self._columns)
         steps = self._taylor(workspace.address, t1, rtol, atol, every, max_steps, address)
@@ -64,8 +64,8 @@ class Library:
         return run
 
     def newton(self, t, x0, p, tol, max_iter, x, y):
-        """As `Compiled.newton` says."""
-        run, count = self._library[f"{self._symbol}_newton"], ctypes.c_int64()
+        """See `Compiled.newton`."""
+        run, count = self.native("newton"), ctypes.c_int64()
         run.restype = ctypes.c_int64
         n = run(
             ctypes.c_int64(t.size),

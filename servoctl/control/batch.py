@@ -1,4 +1,4 @@
-"""Thousands of closed loops of one plant and one law: a compiled unit in which the lanes of a vector are cases."""
+"""Thousands of closed loops of one plant and one law, in compiled code whose vector lanes are cases."""
 
 import ctypes
 import os
@@ -14,34 +14,24 @@ from servoctl.codegen.function import Compiled, compiled, compiling_at_once
 from servoctl.codegen.native import pointer
 from servoctl.control.loop import Arguments
 
-INLINED = 300  # operations: up to here the plant's rates are written into each stage of a step, for two vectors in turn
-PER_THREAD = 16  # tasks: so that threads end at about the same time
+INLINED = 300  # operations of the plant's rates, up to which they are inlined into each stage, for two vectors in turn
+PER_THREAD = 16  # tasks, so that threads end at about the same time
 
 _UNITS = weakref.WeakKeyDictionary()  # step of a law -> its units
 
 
 def lanes():
-    """How many cases one core takes at once: 8 where the processor has AVX-512, 4 with AVX2, else 1."""
+    """Number of cases in one vector: 8 with AVX-512, 4 with AVX2, else 1."""
     features = compiler.features()
     return 8 if "avx512f" in features else 4 if "avx2" in features else 1
 
 
 @dataclass(frozen=True, eq=False)
 class Unit:
-    """The C text of a batch, but for its lanes, with what makes its table; made by `unit`.
+    """The C text of a batch for any number of lanes, and the function of its table; made by `unit`.
 
-    Attributes
-    ----------
-    text : str
-        Of any number of lanes.
-    table : Compiled
-        (t_k, nothing, row_k of the law) -> what all cases have in common at a sample.
-    states, inputs : tuple of str
-        What is gathered, in this order,
-    residuals : Residuals or None
-        and then these.
-    n_y : int
-        Number of measurements.
+    `table` maps t_k and row k of the schedule to values that are common to all cases at a sample. `states`, `inputs`
+    and `residuals` (Residuals or None) are gathered; `n_y` is the number of measurements.
     """
 
     text: str
@@ -53,33 +43,21 @@ class Unit:
 
     @property
     def names(self):
-        """Names of what is gathered and may be traced; "input a" where the actuator a is itself a state."""
+        """Names of the gathered quantities; "input a" for the input of a lagged actuator a, which is also a state."""
         inputs = (f"input {name}" if name in self.states else name for name in self.inputs)
         residuals = self.residuals.names if self.residuals else ()
         return (*self.states, *inputs, *(f"residual {name}" for name in residuals))
 
     def library(self, n):
-        """The C function of n lanes; None without a compiler."""
+        """The C function for n lanes; None without a compiler."""
         library = compiler.library(f"#define W_LANES {n}\n{self.text}", level="-O3")
         return library and library.batch
 
 
 def unit(plant, law, disturbed, residuals=None):
-    """The unit of a plant and a law, derived once for all numbers of both.
+    """The unit of a plant and a compiled law; one serves all numbers of both.
 
-    Parameters
-    ----------
-    plant : Plant
-    law : Law
-        Of the toolkit: its step is an expression.
-    disturbed : tuple of int
-        Which generalised forces are disturbed.
-    residuals : Residuals, optional
-        What is gathered beside states and inputs.
-
-    Returns
-    -------
-    Unit
+    `disturbed` are the indices of disturbed generalised forces; `residuals` are gathered beside states and inputs.
     """
     units = _UNITS.setdefault(law.step, {})
     phi = tuple(e.element_hash() for e in residuals.expressions.elements()) if residuals else ()
@@ -90,7 +68,7 @@ def unit(plant, law, disturbed, residuals=None):
 
 
 def _derived(plant, law, disturbed, residuals):
-    """Rates, law and residuals in C, each without what depends on the case's parameters, or on the sample, alone."""
+    """Rates, law and residuals in C; parts that depend on the case alone, or on the sample alone, are split off."""
     n_c, n_u, project = len(plant.parameters), len(plant.inputs), plant.equations.project()
     t, x, p, rates = _rates(plant, disturbed)
     constants, applied = p[:n_c], ca.vertcat(p[n_c : n_c + n_u], p[n_c + n_u :][list(disturbed)])
@@ -125,7 +103,7 @@ def _derived(plant, law, disturbed, residuals):
 
 
 def _rates(plant, disturbed):
-    """Symbols t, x and p of a plant, and x' without disturbances but those of some generalised forces."""
+    """Symbols t, x and p of a plant, and x' with disturbances of some generalised forces only."""
     f = plant.function("ode").expression
     t, x, p = f.sx_in()
     forces = p[len(plant.parameters) + len(plant.inputs) :]
@@ -134,7 +112,7 @@ def _rates(plant, disturbed):
 
 
 def _apart(expression, symbols):
-    """An expression with new symbols for what depends on some symbols alone; these, and what they stand for."""
+    """An expression with new symbols for parts that depend on some symbols alone; these symbols; their values."""
     rest, new, values = ca.extract_parametric(ca.cse(expression), symbols, {"extract_trivial": True})
     return rest, ca.vertcat(ca.SX(0, 1), *new), ca.vertcat(ca.SX(0, 1), *values)
 
@@ -149,7 +127,7 @@ def _lanes(name, t, x, p, value, dialect=emit.LANES):
 
 
 def _rates_of_two(f):
-    """C text of the rates of two vectors of cases, written into each stage where they are short."""
+    """C text of the rates of two vectors of cases, inlined if they are short."""
     if emit.operations(f) <= INLINED:
         return emit.function_of_two(f, "rates_of_two", emit.LANES_INLINE)
     calls = "    rates(t, x, p, y);\n    rates(t, x2, p2, y2);\n}\n"
@@ -158,16 +136,11 @@ def _rates_of_two(f):
 
 @dataclass(frozen=True)
 class Gathered:
-    """What remains of a batch of N cases; n quantities in the order of `Unit.names`.
+    """Results of a batch of N cases, for n quantities in the order of `Unit.names`.
 
-    Attributes
-    ----------
-    state_lost, law_lost : (N,) arrays
-        First samples at which the state, or the law's answer, is not finite [s]; infinite where there is none.
-    largest, rms, last : (n, N) arrays
-        Largest size over all samples, root of the mean square, value at the end.
-    trace : (K, n_traced, N) array
-        Of every so many samples.
+    `state_lost` and `law_lost` (N,) are the instants [s] at which the state, or the law's output, is first not finite,
+    else infinite; `largest`, `rms` and `last` (n, N) the largest size over all samples, the root of the mean square and
+    the value at the end; `trace` (K, n_traced, N) the values at every n-th sample.
     """
 
     state_lost: np.ndarray
@@ -179,27 +152,12 @@ class Gathered:
 
 
 def run_batch(unit, loop, cases, noise=None, traced=(), every=1, threads=None):
-    """Run the closed loops of N cases.
+    """Run the closed loops of N cases: `Gathered`, or None without a compiler.
 
-    Parameters
-    ----------
-    unit : Unit
-    loop : Loop
-        What the cases have in common; its p, x0 and noise are not used.
-    cases : (constants, x0, scale)
-        (n_c, N), (n_x, N) and (n_d, N) arrays: parameters of the plant, start, factors of the disturbances.
-    noise : callable, optional
-        From the index of a case to its noise, (samples + 1, n_y).
-    traced : sequence of int
-        Which of the quantities are kept at every so many samples.
-    every : int
-    threads : int, optional
-        Default: one per core.
-
-    Returns
-    -------
-    Gathered or None
-        None without a compiler. The numbers do not depend on the number of threads.
+    `loop` holds for all cases, without its p, x0 and noise. `cases` are parameters of the plant (n_c, N), initial
+    states (n_x, N) and factors of the disturbances (n_d, N); `noise` maps a case's index to its (samples + 1, n_y).
+    `traced` are indices of quantities that are traced at every n-th sample. By default there is one thread per core;
+    the numbers do not depend on it.
     """
     n = lanes()
     native = unit.library(n)
@@ -236,13 +194,13 @@ def run_batch(unit, loop, cases, noise=None, traced=(), every=1, threads=None):
 
 
 def _noise(noise, cases, n_y, width):
-    """Noise of some cases, (blocks, samples + 1, n_y, width) as `batch` takes it."""
+    """Noise of some cases in the order of batch.c, (blocks, samples + 1, n_y, width)."""
     columns = np.stack([noise(case) for case in cases], axis=-1)
     return np.ascontiguousarray(np.moveaxis(columns.reshape(*columns.shape[:1], n_y, -1, width), 2, 0))
 
 
 def _common(unit, loop):
-    """The table of what all cases have in common, a row per sample."""
+    """The table of values that are common to all cases, a row per sample."""
     samples = np.arange(loop.samples + 1)
     rows = loop.table[np.minimum(loop.first + samples, len(loop.table) - 1)].T
     with compiling_at_once():

@@ -1,5 +1,6 @@
-"""What is between a plant and its law in a sampled loop: sensors, timing and disturbances."""
+"""The conditions of a sampled loop: sensors, timing and disturbances."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -8,23 +9,23 @@ from servoctl.checks import ON_SAMPLE, mapping, numbers_by_name, positive, whole
 from servoctl.control.disturbances import sampled
 from servoctl.errors import SpecificationError, unknown
 
-RESOLVED = 0.05  # |λ| h at most: then one Runge-Kutta step of order 4 errs by 3e-9
+RESOLVED = 0.05  # largest |λ| h: the error of one Runge-Kutta step of order 4 is then 3e-9
 MOST_SUBSTEPS = 1000
-WITHIN_STEP = 1e-9  # of a step: how far inside it disturbances are taken, so that they may jump at its ends
+WITHIN_STEP = 1e-9  # of a step: disturbances are sampled this far inside its ends, at which they may jump
 
 
 @dataclass(frozen=True)
 class Sensors:
-    """How the states are measured: what a law sees is the state with noise, then quantised.
+    """Noise and quantisation of the measured states, in this order.
 
     Parameters
     ----------
     noise : dict of str to float
         Standard deviation of normally distributed noise by measured state, SI.
     quantisation : dict of str to float
-        Step of the measurement by measured state, SI.
+        Resolution by measured state, SI.
     seed : int, optional
-        Of the noise; default 0.
+        Seed of the noise; default 0.
 
     Raises
     ------
@@ -32,9 +33,9 @@ class Sensors:
         For a number that is negative or not finite, and a seed without noise.
     """
 
-    noise: dict = field(default_factory=dict)
-    quantisation: dict = field(default_factory=dict)
-    seed: int = None
+    noise: Mapping[str, float] = field(default_factory=dict)
+    quantisation: Mapping[str, float] = field(default_factory=dict)
+    seed: int | None = None
 
     def __post_init__(self):
         for what in ("noise", "quantisation"):
@@ -45,9 +46,9 @@ class Sensors:
         object.__setattr__(self, "seed", whole("seed", self.seed))
         if not self.noise:
             raise SpecificationError(
-                f"seed={self.seed} was given without noise.",
+                f"The sensors have seed={self.seed} and no noise.",
                 "The seed is that of the noise.",
-                do="Remove it.",
+                do="Leave it out, or pass noise.",
                 seed=self.seed,
             )
 
@@ -70,34 +71,34 @@ class Sensors:
         return None if std is None else np.random.default_rng(self.seed or 0).standard_normal((count, len(std))) * std
 
     def quantum(self, measures):
-        """The quantisation in the order of `measures`, (n_y,), 0 for what is not quantised; None without any."""
+        """The quantisation in the order of `measures`, (n_y,), 0 for a state without; None if no state has any."""
         return _by_measure(self.quantisation, measures)
 
 
 @dataclass(frozen=True)
 class Timing:
-    """When a law is sampled, how late its commands are, and how finely the plant is integrated in between.
+    """Sampling rate, delay of the commands, and integration steps per sample.
 
     Parameters
     ----------
     rate : float, optional
-        Samples per second [Hz]; needed for a function, a Law has its own.
+        Samples per second [Hz]; required for a function as law. A Law has a rate.
     delay : int
         Samples from the measurement to the input. Until the first command arrives the inputs are the plan's actuation
-        at the start, or the law's `idle` without a plan.
+        at the start, or the law's `initial_input` without a plan.
     substeps : int, optional
-        Integration steps per sample; default: enough for |λ| h <= 0.05 of the fastest eigenvalue λ at the start, and
+        Integration steps per sample; default: enough for |λ| h <= 0.05 with the fastest eigenvalue λ at the start, and
         for a transport delay of whole steps.
 
     Raises
     ------
     SpecificationError
-        For a rate that is not positive, a delay or substeps that are no whole numbers.
+        For a rate that is not positive, and a delay or substeps that are not whole numbers.
     """
 
-    rate: float = None
+    rate: float | None = None
     delay: int = 0
-    substeps: int = None
+    substeps: int | None = None
 
     def __post_init__(self):
         object.__setattr__(self, "delay", whole("delay", self.delay))
@@ -109,15 +110,7 @@ class Timing:
 
 @dataclass(frozen=True)
 class Conditions:
-    """What a loop is exposed to.
-
-    Attributes
-    ----------
-    sensors : Sensors
-    timing : Timing
-    disturbance : dict of str to callable or float
-        Generalised forces by coordinate (or quasi-velocity), functions of t [s].
-    """
+    """Sensors, timing and disturbances of a loop: generalised forces by coordinate (or quasi-velocity), of t [s]."""
 
     sensors: Sensors = field(default_factory=Sensors)
     timing: Timing = field(default_factory=Timing)
@@ -128,9 +121,11 @@ class Conditions:
             value = kind() if getattr(self, name) is None else getattr(self, name)
             if not isinstance(value, kind):
                 raise SpecificationError(
-                    f"{name}={value!r} was given."[:200],
-                    f"They are a value of sv.{kind.__name__}.",
+                    f"{name} is {value!r}."[:200],
+                    f"It is a value of sv.{kind.__name__}.",
                     do=f"Write {name}=sv.{kind.__name__}(...).",
+                    name=name,
+                    kind=type(value).__name__,
                 )
             object.__setattr__(self, name, value)
         object.__setattr__(self, "disturbance", dict(mapping(self.disturbance, "The disturbances")))
@@ -145,7 +140,7 @@ class Conditions:
 
 
 def _by_measure(values, measures):
-    """Numbers by name in the order of the measurement, 0 for those without; None without any."""
+    """Numbers by name in the order of the measurement, 0 for missing names; None if there are no numbers."""
     if not values:
         return None
     numbers = np.zeros(len(measures))
@@ -155,7 +150,7 @@ def _by_measure(values, measures):
 
 
 def index(name, names, what):
-    """The place of a name among others; `what` is a name's meaning in the singular."""
+    """The index of a name; `what` the names stand for, in the singular."""
     if name not in names:
         raise unknown(name, names, what)
     return names.index(name)
@@ -168,14 +163,14 @@ def ranges(plant, period):
 
 
 def limits(plant, period):
-    """The same; None for limits and rate limits that the plant has not."""
+    """The same three arrays; None for limits or rate limits that the plant does not have."""
     low, high, change = ranges(plant, period)
     low, high = (low, high) if plant.limits else (None, None)
     return low, high, change if plant.rate_limits else None
 
 
 def steps(plant, period, substeps, t0, x0, u0):
-    """Integration steps per sample, and those by which each input arrives late (None for no transport delay)."""
+    """Integration steps per sample, and transport delays in such steps, (m,) integers or None without any."""
     delays = np.array([plant.delay.get(name, 0.0) for name in plant.inputs])
     if substeps is None:
         least = _resolving(plant, period, t0, x0, u0)
@@ -187,19 +182,21 @@ def steps(plant, period, substeps, t0, x0, u0):
     late = delays * substeps / period
     if not _fits(late):
         name = plant.inputs[int(np.argmax(np.abs(late - np.rint(late))))]
-        _refuse_delay(name, plant.delay[name], period, substeps)
+        raise _split_delay(name, plant.delay[name], period, substeps)
     return substeps, np.rint(late).astype(np.int64)
 
 
-def _refuse_delay(name, delay, period, substeps):
+def _split_delay(name, delay, period, substeps):
+    """The error for a transport delay that is no whole number of integration steps."""
     rates = sorted(k / delay for k in {max(int(np.floor(delay / period)), 1), int(np.ceil(delay / period))})
-    raise SpecificationError(
+    return SpecificationError(
         f"The transport delay {delay:g} s of {name!r} is {delay * substeps / period:.6g} integration steps of "
         f"{period / substeps:g} s.",
         "A transport delay is a whole number of integration steps.",
         nearest=f"Rates of {' or '.join(f'{rate:.6g}' for rate in rates)} Hz.",
         do="Change the rate, the substeps or the delay.",
         name=name,
+        delay=delay,
         rates=rates,
     )
 
@@ -211,13 +208,15 @@ def _resolving(plant, period, t0, x0, u0):
     least = fastest * period / RESOLVED
     if not least <= MOST_SUBSTEPS:
         raise SpecificationError(
-            f"The plant's linearisation at the start has eigenvalues of up to {fastest:.4g} 1/s, at {1 / period:g} Hz."
+            f"The plant's linearisation at the start has the eigenvalue {fastest:.4g} 1/s; a sample is {period:g} s."
             if fastest < np.inf
             else "The plant's linearisation at the start is not finite.",
-            f"Without substeps a sample is divided into at most {MOST_SUBSTEPS} steps, each resolving these.",
+            f"The default substeps resolve the fastest eigenvalue, with at most {MOST_SUBSTEPS} per sample.",
             nearest=f"sv.Timing(substeps={least:.0f})." if fastest < np.inf else "",
-            do="Give substeps, or leave out a lag or a stiffness that fast.",
+            do="Pass substeps, or leave out such a short lag or high stiffness.",
             eigenvalue=float(fastest),
+            substeps=float(least),
+            most=MOST_SUBSTEPS,
         )
     return max(1, int(np.ceil(least)))
 

@@ -1,4 +1,4 @@
-"""Disturbances by name: generalised forces as functions of time, seeded where they are random."""
+"""Disturbances: generalised forces as functions of time; random ones have a seed."""
 
 from dataclasses import dataclass
 
@@ -9,13 +9,13 @@ from servoctl.errors import SpecificationError
 
 __all__ = ["gust", "noise", "step"]
 
-HARMONICS = 64  # of a band-limited noise: its values are normally distributed to a few per cent
-CHECKED = 9  # instants at which a function of arrays is compared with its values one by one
+HARMONICS = 64  # of the noise: its values are then normally distributed to a few per cent
+CHECKED = 9  # instants at which a function's values for an array are compared with those one by one
 
 
 @dataclass(frozen=True)
 class Gust:
-    """A force of one size between two instants, as a function of time, with edges of half a cosine.
+    """A constant force between two instants, with edges of half a cosine.
 
     Parameters
     ----------
@@ -24,12 +24,12 @@ class Gust:
     start, end : float
         [s]
     rise : float
-        Duration of each edge [s]; 0 for a rectangle, half of the gust for the "one minus cosine" of wind loads.
+        Duration of each edge [s]: 0 gives a rectangle, (end - start)/2 the "one minus cosine" of wind loads.
 
     Raises
     ------
     SpecificationError
-        If it does not end after its start, or its edges take longer.
+        If the end is not after the start, or the edges overlap.
     """
 
     size: float
@@ -41,9 +41,12 @@ class Gust:
         _as_floats(self)
         if self.end <= self.start or not 0 <= self.rise <= (self.end - self.start) / 2:
             raise SpecificationError(
-                f"A gust from {self.start:g} to {self.end:g} s with edges of {self.rise:g} s was given.",
-                "A gust ends after its start, and each edge takes at most half of it.",
-                do=f"Give an end > {self.start:g} and 0 <= rise <= (end - start)/2.",
+                f"The gust lasts from {self.start:g} to {self.end:g} s, its edges {self.rise:g} s each.",
+                "A gust ends after its start; its two edges do not overlap.",
+                do=f"Choose end > {self.start:g} and 0 <= rise <= (end - start)/2.",
+                start=self.start,
+                end=self.end,
+                rise=self.rise,
             )
 
     def __call__(self, t):
@@ -58,7 +61,7 @@ class Gust:
 
 @dataclass(frozen=True)
 class Step:
-    """A force that sets in at an instant and stays, as a function of time.
+    """A constant force from an instant on.
 
     Parameters
     ----------
@@ -81,9 +84,9 @@ class Step:
 
 @dataclass(frozen=True)
 class Noise:
-    """A stationary random force as a function of time: harmonics up to a frequency, of equal power and random phase.
+    """A stationary random force: harmonics of equal power and random phase up to a frequency.
 
-    It does not depend on how it is sampled.
+    It is a function of time: values do not depend on how it is sampled.
 
     Parameters
     ----------
@@ -97,6 +100,7 @@ class Noise:
     Raises
     ------
     SpecificationError
+        For a negative deviation, and a bandwidth that is not positive.
     """
 
     std: float
@@ -108,9 +112,11 @@ class Noise:
         _as_floats(self, "std", "bandwidth")
         if self.std < 0 or self.bandwidth <= 0:
             raise SpecificationError(
-                f"A noise of standard deviation {self.std:g} up to {self.bandwidth:g} Hz was given.",
-                "The deviation is not negative, the bandwidth positive.",
-                do="Change them.",
+                f"The noise has std={self.std:g} and bandwidth={self.bandwidth:g} Hz.",
+                "A standard deviation is not negative, a bandwidth is positive.",
+                nearest=f"std={abs(self.std):g}, bandwidth={abs(self.bandwidth):g}." if self.bandwidth else "",
+                std=self.std,
+                bandwidth=self.bandwidth,
             )
 
     def __call__(self, t):
@@ -135,26 +141,26 @@ def _as_floats(value, *names):
 
 
 def sampled(name, function, t):
-    """Values of a disturbance at times of any shape, whether or not its function takes arrays."""
+    """Values of a disturbance at times t of any shape; its function may take arrays or single numbers."""
     if not callable(function):
         return np.full(t.shape, finite(name, function, "disturbance"))
     flat = t.ravel()
     some = np.linspace(0, flat.size - 1, CHECKED).astype(int) if flat.size else np.zeros(0, dtype=int)
-    values = None
     try:
         at_once = np.asarray(function(flat), dtype=float)
-        if at_once.shape == flat.shape and np.allclose(at_once[some], _singly(name, function, flat[some]), rtol=1e-12):
-            values = at_once
-    except Exception:  # a function of one number may raise anything when it is given many
-        values = None
-    values = _singly(name, function, flat) if values is None else values
+        same = at_once.shape == flat.shape
+        same = same and np.allclose(at_once[some], _singly(name, function, flat[some]), rtol=1e-12)
+    except Exception:  # a function of one number may raise anything for an array
+        same = False
+    values = at_once if same else _singly(name, function, flat)
     if not np.isfinite(values).all():
         at = flat[np.flatnonzero(~np.isfinite(values))[0]]
         raise SpecificationError(
             f"The disturbance of {name!r} is not finite at t = {at:.6g} s.",
             "A disturbance is a finite generalised force at each instant.",
-            do="Correct its function.",
+            do="Correct its function there.",
             name=name,
+            t=float(at),
         )
     return values.reshape(t.shape)
 
@@ -164,8 +170,8 @@ def _singly(name, function, t):
         return np.array([float(function(instant)) for instant in t.tolist()])
     except (TypeError, ValueError) as error:
         raise SpecificationError(
-            f"The disturbance of {name!r} does not give a number: {error}.",
-            "A disturbance is a function of time [s] to a generalised force.",
-            do="Correct its function: lambda t: 60.0 * (2.0 < t < 2.5).",
+            f"The disturbance of {name!r} does not return a number: {error}.",
+            "A disturbance maps time [s] to a generalised force.",
+            do="Pass such a function: lambda t: 60.0 * (2.0 < t < 2.5).",
             name=name,
         ) from error

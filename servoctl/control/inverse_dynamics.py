@@ -1,11 +1,12 @@
 """Inverse dynamics control: exact linearisation of a program on the measured state, with error dynamics by poles.
 
-A residual is differentiated along the plant until an input appears, φ^(r) = b + D v. Where the decoupling matrix D has
-rank ρ < k, ρ of these derivatives are made inputs by regular feedback, those that the other rows depend on become
-states of the law (an integrator goes before each), and the others are differentiated on: the dynamic extension
-algorithm of Descusse and Moog. Ranks are decided by numbers, at states about a plan.
+A residual is differentiated along the plant until an input appears, φ^(r) = b + D v. If the decoupling matrix D has
+rank ρ < k, regular feedback makes ρ of these derivatives inputs. Those on which the other rows depend get an integrator
+and become controller states, and the others are differentiated further: the dynamic extension algorithm of Descusse and
+Moog. Ranks are decided by numbers, at states about a plan.
 """
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import casadi as ca
@@ -15,38 +16,32 @@ from servoctl.checks import positive, whole
 from servoctl.control.feedback import law_step
 from servoctl.control.law import Law
 from servoctl.control.reference import Reference, refuse_transport, require_plan
+from servoctl.control.residuals import in_symbols_of
 from servoctl.control.sampling import sampled_radii
 from servoctl.errors import NotRealisable, SpecificationError, UnstableInternalDynamics, unknown
 from servoctl.internal_dynamics import internal_dynamics
-from servoctl.jets.evaluation import evaluate
-from servoctl.jets.tape import Tape
+from servoctl.jets.tape import Tape, evaluate
 from servoctl.methods.stability import sampled_bound
-from servoctl.reduction.elimination import eliminate
+from servoctl.plants.plant import Plant
 from servoctl.reduction.knots import require_smooth
-from servoctl.reduction.ranks import clean, decide, decide_all
+from servoctl.reduction.ranks import clean, decide, decide_all, eliminate
+from servoctl.run import Run
 
-RANK_POINTS, AWAY, SEED = 8, 0.02, 20240229  # states along the plan, and how far beside them ranks are decided
-SHARE = 1e-9  # of the largest, in rows and columns of like size: entries below it are rounding
-MOST_DERIVATIVES = 4  # derivatives, of the number of states, that may pass before an input appears
-GROWN = 2.0  # by how much errors may grow along the plan, as by a passing eigenvalue that is hardly unstable
-TIME_CONSTANT = 0.25  # s: a rise in about a second where several poles coincide, as cranes and arms of human size need
+RANK_POINTS, AWAY, SEED = 8, 0.02, 20240229  # states for the ranks, and their distance from the plan
+SHARE = 1e-9  # of the largest entry, in rows and columns of like size: smaller ones are rounding
+MOST_DERIVATIVES = 4  # of the number of states: derivatives of a residual until an input appears
+GROWN = 2.0  # growth of errors along the plan up to which unstable internal dynamics pass: they hardly show in it
+TIME_CONSTANT = 0.25  # s: several poles there rise in about a second, as suits cranes and arms of human size
 
 
 @dataclass(frozen=True)
 class Linearisation:
-    """What an exact linearisation consists of.
+    """The exact linearisation of a program; made by `linearise`.
 
-    Attributes
-    ----------
-    orders : dict of str to int
-        For each residual the order n_i of its error dynamics: its relative degree, extension included.
-    relative_degree : dict of str to int
-        First derivative of each residual that holds an input.
-    state_names : tuple of str
-        The controller state ξ: derivatives of residuals that integrators prescribe.
-    step : Compiled
-        (t, [x; ξ], row) -> [u; ξ+] with row = [plant's numbers; Ts; what is added to u; coefficients of the error
-        dynamics].
+    `orders` are those of the error dynamics by residual, i.e. relative degrees with the extension, `relative_degree`
+    those without. The controller state ξ, with the names `state_names`, are derivatives of residuals behind
+    integrators. `step` maps (t, [x; ξ], column) to [u; ξ+]; the column is [plant's parameters; Ts; increment of u;
+    coefficients of the error dynamics].
     """
 
     orders: dict
@@ -56,72 +51,52 @@ class Linearisation:
 
 
 def linearise(plan, plant):
-    """Exact linearisation of the plan's program by the inputs of a plant.
+    """Exact linearisation of the plan's program by the inputs of a plant; ranks are decided about the plan's states.
 
-    Parameters
-    ----------
-    plan : Run
-        Its program, and states about which ranks are decided.
-    plant : Plant
-        Of the same mechanism: what the law believes of the machine.
-
-    Returns
-    -------
-    Linearisation
-
-    Raises
-    ------
-    SpecificationError
-        If a residual has an order above 2, or the plant is of another mechanism.
-    NotRealisable
-        If a residual depends on no input.
+    Refuses residuals of an order above 2, a plant of another mechanism, and residuals that depend on no input.
     """
-    model = plan.model
-    mechanism, program = model.reduction.mechanism, model.reduction.program
-    _require_invertible(mechanism, program, plant)
-    extension = _Extension(plant, program.residuals, _points(plan, plant))
-    while extension.rank() < len(program.residuals):
+    _require_invertible(plan.model.reduction, plant)
+    extension = _Extension(plant, in_symbols_of(plant, plan.model), _points(plan, plant))
+    while extension.rank() < len(extension.names):
         extension.extend()
     return extension.law()
 
 
-def _require_invertible(mechanism, program, plant):
-    """Refuse a plant of another mechanism, and residuals that its state and inputs do not decide."""
-    if plant.mechanism is not mechanism:
+def _require_invertible(reduction, plant):
+    """Refuse a plant of another mechanism, and residuals of an order above 2."""
+    if plant.mechanism != reduction.mechanism:
         raise SpecificationError(
-            "The plant and the plan are made of two mechanisms.",
-            "Exact linearisation inverts the plant that the program was written for.",
+            "The plant and the plan have different mechanisms.",
+            "Exact linearisation inverts the mechanism of the program.",
             do="Make the plant of the plan's mechanism, or use sv.lqr.",
+            plant=plant.mechanism.q.names,
+            plan=reduction.mechanism.q.names,
         )
-    high = [name for name, e in program.residuals.items() if mechanism.q.order(e) > 2]
-    if high:
-        raise SpecificationError(
-            f"The residual {high[0]!r} has order {mechanism.q.order(program.residuals[high[0]])}.",
-            "The plant's state and inputs decide derivatives up to γ''.",
-            do="Use sv.lqr, which follows plans of any order.",
-            name=high[0],
-        )
+    for name, residual in reduction.program.residuals.items():
+        if (order := reduction.mechanism.q.order(residual)) > 2:
+            raise SpecificationError(
+                f"The residual {name!r} has order {order}.",
+                "The plant's state and inputs determine derivatives up to γ''.",
+                do="Use sv.lqr, which follows plans of any order.",
+                name=name,
+                order=order,
+            )
 
 
 def _points(plan, plant):
-    """(t, x) at states of the plan, and the same somewhat beside it: two lists."""
+    """Times (N,), states of the plan (N, n_x), and states somewhat beside it."""
     random = np.random.default_rng(SEED)
     times = np.linspace(plan.t[0], plan.t[-1], RANK_POINTS + 2)[1:-1]
     states = np.array([plan.state(t) for t in times])
-    size = np.maximum(np.abs(states).max(axis=0), 1.0)
-    lagging = np.array([[np.interp(t, *_ascending(plan.t, plan[name])) for name in plant.lagged] for t in times])
-    states = np.concatenate([states, lagging.reshape(len(times), -1)], axis=1)
-    size = np.concatenate([size, np.maximum(np.abs(lagging).max(axis=0, initial=0.0), 1.0)[: lagging.shape[1]]])
-    return times, states, states + AWAY * size * random.uniform(-1, 1, states.shape)
-
-
-def _ascending(t, values):
-    order = np.argsort(t)
-    return t[order], values[order]
+    sizes = np.maximum(np.abs(states).max(axis=0), 1.0)
+    lagging = [np.interp(times, plan.t, plan[name]) for name in plant.lagged]
+    states = np.column_stack([states, *lagging])
+    sizes = np.concatenate([sizes, [max(np.abs(values).max(), 1.0) for values in lagging]])
+    return times, states, states + AWAY * sizes * random.uniform(-1, 1, states.shape)
 
 
 def _without_units(matrices):
-    """Matrices (k, m, N) whose rows and columns are scaled, all by the same factors, so that entries are near 1."""
+    """Matrices (k, m, N) with rows and columns scaled by factors common to all, so that entries are near 1."""
     largest = np.abs(matrices).max(axis=2).astype(float)
     rows, columns = np.nonzero(largest)
     k, m = largest.shape
@@ -151,9 +126,8 @@ class _Extension:
 
     def _rate(self, expression):
         """The total derivative along the extended plant."""
-        held = ca.vertcat(self.t, self.x, self.xi)
-        rate = ca.vertcat(1, self.x_rate, self.xi_rate)
-        return ca.cse(ca.jtimes(expression, held, rate))
+        variables, rates = ca.vertcat(self.t, self.x, self.xi), ca.vertcat(1, self.x_rate, self.xi_rate)
+        return ca.cse(ca.jtimes(expression, variables, rates))
 
     def _differentiate(self, level):
         """Differentiate a residual's last level until an input appears in it."""
@@ -161,16 +135,18 @@ class _Extension:
             if len(level) > MOST_DERIVATIVES * self.x.numel():
                 name = self.names[self.levels.index(level)]
                 raise NotRealisable(
-                    f"No derivative of the residual {name!r} up to the order {len(level) - 1} holds an input.",
-                    "A residual is realised by inputs that it depends on.",
+                    f"No derivative of the residual {name!r} up to order {len(level) - 1} depends on an input.",
+                    "The inputs realise a residual through one of its derivatives.",
                     do="Choose other residuals or actuators.",
                     name=name,
+                    order=len(level) - 1,
                 )
-            level[-1] = ca.substitute(level[-1], self.v, ca.SX.zeros(self.v.shape))  # names it, depends not on it
+            # v still occurs in the expression, in terms that cancel; ca.jtimes would carry it along
+            level[-1] = ca.substitute(level[-1], self.v, ca.SX.zeros(self.v.shape))
             level.append(self._rate(level[-1]))
 
     def values(self, matrix, beside=True):
-        """Numbers of a matrix at the states beside the plan, or on it: values and sizes, (rows, columns, N)."""
+        """Values of a matrix at states beside the plan, or on it, and their sizes: (rows, columns, N) each."""
         times, on, off = self.points
         states = off if beside else on
         random = np.random.default_rng(SEED + 1)
@@ -201,28 +177,25 @@ class _Extension:
         block = D[rows, columns]
         drift = ca.vertcat(*(self.levels[i][-1] for i in rows))
         drift = ca.substitute(drift, self.v[columns], ca.SX.zeros(len(columns)))
-        held = self._needed(D, rows, columns, others)
-        new = [ca.SX.sym(self._name(i)) for i in rows]
+        integrated = self._needed(D, rows, columns, others)
+        new = [ca.SX.sym(f"{self.names[i]}_{len(self.levels[i]) - 1}") for i in rows]
         solved, _ = eliminate(block, ca.vertcat(*new) - drift, clean(*self.values(block, beside=False)))
         self._substitute(self.v[columns], solved)
         inputs = []
-        for i, symbol, integrated in zip(rows, new, held, strict=True):
+        for i, symbol, needed in zip(rows, new, integrated, strict=True):
             self.levels[i][-1] = symbol
-            if integrated:
-                following = ca.SX.sym(f"d{symbol.name()}")
+            if needed:
+                rate = ca.SX.sym(f"d{symbol.name()}")
                 self.state_names.append(symbol.name())
-                self.xi, self.xi_rate = ca.vertcat(self.xi, symbol), ca.vertcat(self.xi_rate, following)
-                self.levels[i].append(following)
-            inputs.append(following if integrated else symbol)
+                self.xi, self.xi_rate = ca.vertcat(self.xi, symbol), ca.vertcat(self.xi_rate, rate)
+                self.levels[i].append(rate)
+            inputs.append(rate if needed else symbol)
         self.v = ca.vertcat(*inputs, self.v[rest])
         for i in others:
             self._differentiate(self.levels[i])
 
-    def _name(self, i):
-        return f"{self.names[i]}_{len(self.levels[i]) - 1}"
-
     def _needed(self, D, rows, columns, others):
-        """Which of the pivot rows' derivatives the other rows depend on."""
+        """Whether other rows depend on the derivative of a pivot row, (ρ,) bool."""
         values, sizes = self.values(D)
         best = decide_all(values, sizes)[1]
         numbers = _without_units(clean(values, sizes))[:, :, best].astype(float)
@@ -230,7 +203,7 @@ class _Extension:
         return np.abs(shares).max(axis=1) > SHARE * np.abs(shares).max()
 
     def _pivots(self, D):
-        """Rows and columns of the regular block that stays best at the states of the plan."""
+        """Rows and columns of the regular block whose smallest determinant at states of the plan is largest."""
         rank = self.rank()
         values = _without_units(clean(*self.values(D, beside=False))).astype(float)
         generic = decide_all(_without_units(clean(*self.values(D))), 0.0)[0]
@@ -245,7 +218,7 @@ class _Extension:
         return list(rows), list(columns)
 
     def _substitute(self, old, new):
-        """Replace symbols in everything that names them."""
+        """Replace symbols in all expressions of the extended plant."""
         parts = [self.x_rate, self.u, self.xi_rate, *(e for level in self.levels for e in level)]
         parts = [ca.cse(ca.substitute(part, old, new)) for part in parts]
         self.x_rate, self.u, self.xi_rate = parts[:3]
@@ -253,24 +226,24 @@ class _Extension:
         self.levels = [[next(rest) for _ in level] for level in self.levels]
 
     def law(self):
-        """The linearisation, once the decoupling matrix has full rank."""
+        """The linearisation by a decoupling matrix of full rank."""
         D, counts = self.decoupling, [len(level) - 1 for level in self.levels]
         c = [ca.SX.sym(f"c_{name}", count) for name, count in zip(self.names, counts, strict=True)]
         tops = [ca.substitute(level[-1], self.v, ca.SX.zeros(self.v.shape)) for level in self.levels]
         errors = (ca.dot(ci, ca.vertcat(*level[:-1])) for ci, level in zip(c, self.levels, strict=True))
-        wanted = -ca.vertcat(*(top + error for top, error in zip(tops, errors, strict=True)))
+        target = -ca.vertcat(*(top + error for top, error in zip(tops, errors, strict=True)))
         square = D if D.shape[0] == D.shape[1] else D @ D.T
-        solved = eliminate(square, wanted, clean(*self.values(square, beside=False)))[0]
+        solved = eliminate(square, target, clean(*self.values(square, beside=False)))[0]
         self._substitute(self.v, solved if square is D else D.T @ solved)
         period, ahead = ca.SX.sym("Ts"), ca.SX.sym("ahead", self.u.numel())
-        row = ca.vertcat(self.numbers, period, ahead, *c)
-        out = [self.u + ahead, self._advanced(period)]
-        step = law_step("computed", self.t, ca.vertcat(self.x, self.xi), row, out)
+        column = ca.vertcat(self.numbers, period, ahead, *c)
+        outputs = [self.u + ahead, self._advanced(period)]
+        step = law_step("computed", self.t, ca.vertcat(self.x, self.xi), column, outputs)
         orders = dict(zip(self.names, counts, strict=True))
         return Linearisation(orders, self.relative_degree, tuple(self.state_names), step)
 
     def _advanced(self, period):
-        """ξ a period later, the measurement held: the series of ξ' in ξ, which ends for chains of integrators."""
+        """ξ a period later with x held: its Taylor series, which is finite for chains of integrators."""
         total, term, factor = self.xi, self.xi_rate, period
         for k in range(1, self.xi.numel() + 1):
             total += factor * term
@@ -279,28 +252,29 @@ class _Extension:
         return total
 
 
-def computed(plan, plant, rate=100.0, poles=None, delay=0):
-    """The actuation by the plant's equations at the measured state, with error dynamics by poles.
+def computed(
+    plan: Run, plant: Plant, rate: float = 100.0, poles: float | Mapping[str, Sequence[complex]] | None = None,
+    delay: int = 0,
+) -> Law:  # fmt: skip
+    """Inverse dynamics at the measured state, with error dynamics by poles.
 
-    Each residual obeys Π(D - λ_i) φ = 0 as long as the machine is the plant: φ is differentiated along the plant until
-    the inputs decouple, through dynamic extension where their decoupling matrix has no full rank. Between samples the
-    inputs are held, from `delay` samples after the measurement on: by how much the plan's actuation changes until the
-    middle of that time is added.
+    Each residual obeys Π(D - λ_i) φ = 0 if the machine is the plant: φ is differentiated along the plant until the
+    inputs decouple, with dynamic extension if their decoupling matrix is singular. The command is held from `delay`
+    samples after the measurement on; the change of the plan's actuation until the middle of the hold is added.
 
     Parameters
     ----------
     plan : Run
         Ranks are decided about its states.
     plant : Plant
-        What the controller believes of the machine, of the plan's mechanism, without transport delay.
+        The controller's model of the machine, of the plan's mechanism, without transport delay.
     rate : float
         Samples per second [Hz].
     poles : float or dict of str to sequence of complex, optional
-        One time constant T [s] (all poles at -1/T), default 0.25 s, or the poles [1/s] of each residual, as many as its
+        One time constant T [s] (all poles at -1/T), default 0.25 s, or the poles [1/s] by residual, as many as its
         relative degree with the extension (`law.info["orders"]`).
     delay : int
-        Samples by which the loop will be late: the plan's actuation is taken as much ahead, and the poles are checked
-        for it.
+        Delay of the loop in samples, for which the poles are checked.
 
     Returns
     -------
@@ -309,10 +283,10 @@ def computed(plan, plant, rate=100.0, poles=None, delay=0):
     Raises
     ------
     UnstableInternalDynamics
-        If what the program leaves free is unstable along the plan: linearisation would hide it, not stabilise it.
+        If the internal dynamics are unstable along the plan: linearisation would hide them, not stabilise them.
     SpecificationError
-        If the sampled error dynamics are unstable with these poles at this rate, poles are of another number, or a path
-        is not smooth enough: a lagging actuator's command holds one derivative more than the plan's actuation.
+        If the sampled error dynamics are unstable, the number of poles is wrong, or a path is not smooth enough: the
+        command of a lagging actuator needs one derivative more than the plan's actuation.
     NotRealisable
         If a residual depends on no input.
     """
@@ -335,12 +309,12 @@ def computed(plan, plant, rate=100.0, poles=None, delay=0):
         name="computed", measures=plant.state_names, inputs=plant.inputs, rate=rate, t0=float(plan.t[0]),
         step=linear.step, schedule=np.column_stack([np.concatenate(column) for column in columns]),
         state=np.zeros(len(linear.state_names)), state_names=linear.state_names,
-        idle=np.array([plan[name][0] for name in plant.inputs]), plan=plan, info=info,
+        initial_input=np.array([plan[name][0] for name in plant.inputs]), plan=plan, info=info,
     )  # fmt: skip
 
 
 def _require_smooth(plan, orders):
-    """Refuse paths that are less smooth than what is differentiated of them."""
+    """Refuse paths with fewer derivatives than the error dynamics need."""
     reduction = plan.model.reduction
     if reduction.timed and any(order > reduction.needs.get(name, 0) for name, order in orders.items()):
         require_smooth(reduction.switches, plan.model.parameters, orders, (plan.t[0], plan.t[-1]))
@@ -351,11 +325,11 @@ def _require_stable(plan):
     if internal.verdict == "unstable" and internal.growth > GROWN:
         worst = float(internal.eigenvalues.real.max())
         raise UnstableInternalDynamics(
-            f"The program leaves {len(internal.names)} states free ({', '.join(internal.names)}), with an eigenvalue "
-            f"of {worst:.6g} 1/s along the plan.",
+            f"The internal dynamics of {', '.join(internal.names)} have an eigenvalue of {worst:.6g} 1/s on the plan.",
             "Exact linearisation makes them unobservable and does not stabilise them.",
             do="Use sv.lqr, which stabilises the whole state about the plan, or choose another output.",
             eigenvalue=worst,
+            growth=float(internal.growth),
             states=internal.names,
         )
 
@@ -367,9 +341,10 @@ def _poles(poles, orders):
         return {name: np.full(order, -1.0 / constant) for name, order in orders.items()}
     if not isinstance(poles, dict):
         raise SpecificationError(
-            f"poles={poles!r} was given.",
-            "Poles are one time constant, or go by residual.",
-            do="Give {" + ", ".join(f"{name!r}: {order} poles" for name, order in orders.items()) + "}.",
+            f"poles is {poles!r}.",
+            "It is one time constant [s], or poles by residual.",
+            do="Pass {" + ", ".join(f"{name!r}: {order} poles" for name, order in orders.items()) + "}.",
+            orders=orders,
         )
     for name in poles:
         if name not in orders:
@@ -383,8 +358,8 @@ def _poles(poles, orders):
         if values.shape != (order,) or not np.isfinite(values).all() or not _paired(values):
             raise SpecificationError(
                 f"The poles of {name!r} are {poles.get(name)!r}.",
-                f"Its error dynamics have order {order}: as many poles, complex ones in conjugate pairs.",
-                do=f"Give them, as {[-4.0] * order}.",
+                f"Its error dynamics have order {order} and as many poles, complex ones in conjugate pairs.",
+                do=f"Pass {order}, as {[-4.0] * order}.",
                 name=name,
                 order=order,
             )
@@ -393,7 +368,7 @@ def _poles(poles, orders):
 
 
 def _paired(poles):
-    """Whether complex poles come in conjugate pairs."""
+    """Whether the set of poles is its own conjugate."""
     return np.allclose(np.sort_complex(poles), np.sort_complex(poles.conj()), rtol=1e-9, atol=0)
 
 
@@ -406,8 +381,9 @@ def _require_slow(name, poles, rate, delay):
             f"The poles of {name!r} are {poles}.",
             "Error dynamics decay where each pole has a negative real part.",
             nearest=f"{mirrored}." if np.all(poles.real) else "",
-            do="Change the sign.",
+            do="Choose poles in the left half plane.",
             name=name,
+            poles=poles,
         )
     radius = sampled_radius(poles, rate, delay) if order else 0.0
     if not radius < 1.0:
@@ -420,13 +396,15 @@ def _require_slow(name, poles, rate, delay):
             nearest=f"Poles slower than {bound * rate:.4g} 1/s, or a rate above {fastest / bound:.4g} Hz.",
             do="Change one of them.",
             name=name,
+            pole=fastest,
+            rate=rate,
             bound=bound,
             radius=radius,
         )
 
 
 def sampled_radius(poles, rate, delay=0):
-    """The largest factor per sample of ρ integrators whose poles (ρ,) [1/s] are placed by held, delayed feedback."""
+    """Spectral radius of ρ integrators under feedback that is held and delayed, with poles (ρ,) [1/s]."""
     n = len(poles)
     A, B, K = np.eye(n, k=1)[None], np.eye(n)[None, :, -1:], np.poly(poles).real[None, None, :0:-1]
     return float(sampled_radii(A, B, K, 1.0 / rate, np.array([delay / rate]))[0])

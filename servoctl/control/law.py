@@ -1,12 +1,16 @@
 """Laws: what a controller does at each sample, as frozen values; a law with a controller state is started."""
 
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from servoctl.checks import ON_SAMPLE, finite, positive
 from servoctl.codegen.function import Compiled
 from servoctl.errors import SpecificationError, unknown
+from servoctl.run import Run
 from servoctl.values import Value
 
 
@@ -14,62 +18,62 @@ from servoctl.values import Value
 class Law(Value):
     """A sampled law u = law(t, measurement); made by `feedforward`, `pd`, `lqr` and others.
 
-    At the sample k of t_k = t0 + k/rate, `step` maps t_k, [y; z] and the k-th column of `schedule` to [u; z+; further
-    signals]: y is the measurement, z the controller state. Beyond the schedule its last column holds.
+    At the sampling instant t_k = t0 + k/rate, `step` maps t_k, [y; z] and column k of `schedule` to [u; z+; signals]:
+    y is the measurement, z the controller state, u the command. After its end the last column of the schedule holds.
 
     Attributes
     ----------
     name : str
     measures : tuple of str
-        Names of the plant's states that are measured, the order of y.
+        Names of the measured states of the plant, in the order of y.
     inputs : tuple of str
-        Names of the actuators, the order of u.
+        Names of the actuators, in the order of u.
     rate : float
         Samples per second [Hz].
     t0 : float
         Instant of the first sample [s].
     step : Compiled or callable
-        (t_k, [y; z], row_k) -> [u; z+; further signals].
-    schedule : (n_row, N) array
-        The gain schedule: what the law needs at each sample, inputs, references and gains.
+        (t_k, [y; z], column k) -> [u; z+; signals].
+    schedule : (n_s, N) array
+        The gain schedule: feedforward inputs, reference states and gains at each sample.
     state : (n_z,) array
-        The controller state z at the start.
+        The initial controller state.
     state_names, signals : tuple of str
-        Names of the controller state's entries and of the further signals.
-    idle : (m,) array
-        The inputs before the first command arrives.
+        Names of the controller states, and of the further signals.
+    initial_input : (m,) array
+        The inputs that act until the first command arrives; default 0.
     plan : Run or None
-        The reference trajectory it was made from.
+        The reference trajectory of the design.
     info : dict
-        Facts of the design: gains, poles, spectral radius.
+        Results of the design: gains, poles, spectral radii.
     integrators : tuple of int
-        Which entries of the controller state are integrals of residuals.
+        Indices of the controller states that integrate residuals.
     feedback : StateFeedback or None
-        Its gains on all states of a plant, where it has such gains.
+        Gains on all states of the plant, if the design has them.
     input_matrix : (N, n_z, m) array or None
-        Of an estimator: how the controller state after each sample changes with the inputs of that sample. An
-        allocation that gives others than the law's own corrects the prediction by it.
+        For a law with an estimator: the derivative of the next controller state with respect to the inputs of the same
+        sample. An allocation uses it to correct the prediction for the inputs that act.
     allocation : Allocation or None
-        How it keeps limits, where it does.
+        The allocation of a limited law.
     """
 
     name: str
-    measures: tuple
-    inputs: tuple
+    measures: tuple[str, ...]
+    inputs: tuple[str, ...]
     rate: float
     t0: float
-    step: object
+    step: Callable[..., Any]
     schedule: np.ndarray
     state: np.ndarray = field(default_factory=lambda: np.zeros(0))
-    state_names: tuple = ()
-    signals: tuple = ()
-    idle: np.ndarray = None
-    plan: object = None
-    info: dict = field(default_factory=dict)
-    integrators: tuple = ()
-    feedback: object = None
-    input_matrix: np.ndarray = None
-    allocation: object = None
+    state_names: tuple[str, ...] = ()
+    signals: tuple[str, ...] = ()
+    initial_input: np.ndarray | None = None
+    plan: Run | None = None
+    info: dict[str, Any] = field(default_factory=dict)
+    integrators: tuple[int, ...] = ()
+    feedback: Any = None
+    input_matrix: np.ndarray | None = None
+    allocation: Any = None
 
     def __post_init__(self):
         schedule = np.asarray(self.schedule, dtype=float)
@@ -78,26 +82,28 @@ class Law(Value):
             raise SpecificationError(
                 f"The schedule of the law {self.name!r} has the shape {schedule.shape}"
                 + ("." if np.isfinite(schedule).all() else " and holds NaN or infinity."),
-                "It has one column of finite numbers per sample.",
-                do="Correct it.",
+                "A gain schedule has one column of finite numbers per sample.",
+                do="Pass an array of the shape (numbers per sample, samples).",
+                name=self.name,
                 shape=schedule.shape,
             )
         positive("rate", self.rate)
-        idle = np.zeros(len(self.inputs)) if self.idle is None else np.asarray(self.idle, dtype=float)
-        object.__setattr__(self, "idle", idle)
+        initial = np.zeros(len(self.inputs)) if self.initial_input is None else self.initial_input
+        object.__setattr__(self, "initial_input", np.asarray(initial, dtype=float))
         self._require_sizes()
 
     def _require_sizes(self):
         """Refuse numbers of measurements, states and signals that the step does not have."""
-        sizes = (len(self.measures) + len(self.state), self.schedule.shape[0], self.n_out, self.idle.size)
+        sizes = (len(self.measures) + len(self.state), self.schedule.shape[0], self.n_out, self.initial_input.size)
         of_step = (self.step.n_x, self.step.n_p, self.step.n_y) if hasattr(self.step, "n_x") else sizes[:3]
         valid = (*of_step, len(self.inputs))
         if sizes != valid:
             raise SpecificationError(
-                f"The law {self.name!r} has {sizes[0]} measurements and controller states, columns of {sizes[1]} "
-                f"numbers, {sizes[2]} outputs and {sizes[3]} idle inputs.",
-                f"Its step takes {valid[0]} and columns of {valid[1]}, gives {valid[2]}; its inputs are {valid[3]}.",
-                do="Give measures, state, schedule, signals and idle that belong to the step.",
+                f"The law {self.name!r} has {sizes[0]} measurements and controller states, a schedule of {sizes[1]} "
+                f"numbers per sample, {sizes[2]} outputs and {sizes[3]} initial inputs.",
+                f"Its step takes {valid[0]} and {valid[1]} and returns {valid[2]}; the law has {valid[3]} inputs.",
+                do="Pass measures, state, schedule, signals and initial_input that fit the step.",
+                name=self.name,
                 sizes=sizes,
                 valid=valid,
             )
@@ -112,8 +118,8 @@ class Law(Value):
         """The number of outputs of `step`."""
         return len(self.inputs) + len(self.state) + len(self.signals)
 
-    def answer(self, t, x, row):
-        """The output of `step` at a sample, checked.
+    def answer(self, t, x, column):
+        """The output of `step` at a sampling instant, checked.
 
         Parameters
         ----------
@@ -121,48 +127,51 @@ class Law(Value):
             [s]
         x : (n_y + n_z,) array
             Measurement and controller state.
-        row : (n_row,) array
-            Of the schedule.
+        column : (n_s,) array
+            The schedule at t.
 
         Returns
         -------
         (n_out,) array
-            Inputs, next controller state, further signals.
+            Command, next controller state, further signals.
 
         Raises
         ------
         SpecificationError
-            If these are not n_out numbers.
+            If `step` does not return n_out numbers.
         """
-        answer = self.step(t, x, row)
+        answer = self.step(t, x, column)
         try:
             out = np.asarray(answer, dtype=float).ravel()
         except (TypeError, ValueError):
             out = np.zeros(0)
         if out.size != self.n_out:
             raise SpecificationError(
-                f"The law {self.name!r} answered {answer!r} at t = {t:.6g} s."[:200],
-                f"It answers {self.n_out} numbers: {', '.join((*self.inputs, *self.state_names, *self.signals))}.",
+                f"The law {self.name!r} returned {answer!r} at t = {t:.6g} s."[:200],
+                f"Its output is {self.n_out} numbers: {', '.join((*self.inputs, *self.state_names, *self.signals))}.",
                 do="Return a sequence of them in this order.",
+                name=self.name,
                 t=float(t),
                 n_out=self.n_out,
             )
         return out
 
     def begin(self):
-        """The step for one run: compiled, or checked at each sample; a user's function with a start is started.
+        """The step for one run: a compiled step as it is, another one checked at each sample.
+
+        A user's function that has a method `start` is started.
 
         Returns
         -------
         Compiled or callable
-            (t_k, [y; z], row_k) -> [u; z+; further signals].
+            (t_k, [y; z], column k) -> [u; z+; signals].
         """
         if isinstance(self.step, Compiled):
             return self.step
         return (replace(self, step=self.step.started()) if isinstance(self.step, UserStep) else self).answer
 
-    def start(self):
-        """A controller that runs this law from its first state on: law(t, measurement) -> u.
+    def start(self) -> "Controller":
+        """A controller in the law's initial state: controller(t, measurement) -> u.
 
         Returns
         -------
@@ -170,13 +179,13 @@ class Law(Value):
         """
         return Controller(self)
 
-    def __call__(self, t, measurement):
-        """The inputs of a law without a controller state.
+    def __call__(self, t: float, measurement: ArrayLike | Mapping[str, float]) -> np.ndarray:
+        """The command of a law without a controller state.
 
         Parameters
         ----------
         t : float
-            An instant of sampling [s].
+            A sampling instant [s].
         measurement : (n_y,) array or dict of str to float
 
         Returns
@@ -191,14 +200,15 @@ class Law(Value):
         if len(self.state):
             raise SpecificationError(
                 f"The law {self.name!r} has the controller state {', '.join(self.state_names)}.",
-                "A law is a value and remembers nothing.",
+                "A law is a constant value; its controller carries the state from sample to sample.",
                 do="Start it: controller = law.start(); controller(t, measurement).",
+                name=self.name,
                 state_names=self.state_names,
             )
         return Controller(self)(t, measurement)
 
-    def row(self, t):
-        """The column of the schedule at an instant of sampling, (n_row,).
+    def schedule_at(self, t: float) -> np.ndarray:
+        """The column of the gain schedule at a sampling instant, (n_s,).
 
         Parameters
         ----------
@@ -208,18 +218,21 @@ class Law(Value):
         Raises
         ------
         SpecificationError
-            If t lies between samples, or before the first, or is no finite number.
+            If t is between samples, before the first, or not finite.
         """
         t = finite("t", t, "time")
         k = (t - self.t0) * self.rate
         if abs(k - round(k)) > ON_SAMPLE or round(k) < 0:
             nearest = self.t0 + max(round(k), 0) / self.rate
             raise SpecificationError(
-                f"The law was evaluated at t = {t:.9g} s.",
-                f"It is sampled at {self.rate:g} Hz from t = {self.t0:g} s on.",
+                f"t = {t:.9g} s is not a sampling instant of the law {self.name!r}.",
+                f"Its samples are at {self.rate:g} Hz from t = {self.t0:g} s on.",
                 nearest=f"t = {nearest:.9g} s.",
-                do="Evaluate it at an instant of sampling.",
+                do="Call it at a sampling instant.",
+                name=self.name,
                 t=t,
+                nearest_t=nearest,
+                rate=self.rate,
             )
         return self.schedule[:, min(round(k), self.schedule.shape[1] - 1)]
 
@@ -241,7 +254,7 @@ class Law(Value):
 
 
 class Controller:
-    """A law at work: it has the law's state, and changes it at each call; made by `Law.start`.
+    """A law at work, whose state changes at each call; made by `Law.start`.
 
     Attributes
     ----------
@@ -255,8 +268,8 @@ class Controller:
     def __init__(self, law):
         self.law, self.state, self.signals, self._step = law, np.array(law.state, dtype=float), {}, law.begin()
 
-    def __call__(self, t, measurement):
-        """The inputs at an instant of sampling.
+    def __call__(self, t: float, measurement: ArrayLike | Mapping[str, float]) -> np.ndarray:
+        """The command at a sampling instant.
 
         Parameters
         ----------
@@ -270,7 +283,7 @@ class Controller:
         """
         law, m, n_z = self.law, len(self.law.inputs), len(self.state)
         y = ordered(measurement, law.measures, "measurement", exactly=False)
-        out = self._step(t, np.concatenate([y, self.state]), law.row(t))
+        out = self._step(t, np.concatenate([y, self.state]), law.schedule_at(t))
         self.state = out[m : m + n_z]
         self.signals = dict(zip(law.signals, out[m + n_z :].tolist(), strict=True))
         return out[:m]
@@ -281,15 +294,9 @@ class Controller:
 
 @dataclass(frozen=True)
 class UserStep:
-    """A user's function law(t, measurement) -> inputs as the step of a law.
+    """A user's function law(t, measurement) -> inputs, or an object whose method `start` returns one, as step of a law.
 
-    Attributes
-    ----------
-    function : callable
-        Or what has a method `start` that gives the function.
-    name : str
-    states, inputs : tuple of str
-        Names of the measured states and of the actuators.
+    `states` and `inputs` are the names of the measured states and of the actuators.
     """
 
     function: object
@@ -299,51 +306,32 @@ class UserStep:
 
     @property
     def stateful(self):
-        """Whether the function has a state of its own, which `start` resets."""
+        """Whether the function has a state, which `start` resets."""
         return hasattr(self.function, "start")
 
     def started(self):
-        """The same with a function that starts afresh.
-
-        Raises
-        ------
-        SpecificationError
-            If its `start` gives no function.
-        """
+        """The same step with its function started, where it has a method `start`."""
         function = self.function.start() if self.stateful else self.function
         if not callable(function):
             raise SpecificationError(
-                f"The law {self.name!r} was started, and gave a {type(function).__name__}.",
-                "A law's start gives the function that answers.",
+                f"The method start of the law {self.name!r} returned a {type(function).__name__}.",
+                "It returns the function that is called at each sample.",
                 do="Return it from start: return lambda t, y: {...}.",
                 name=self.name,
+                kind=type(function).__name__,
             )
         return replace(self, function=function)
 
-    def __call__(self, t, x, _row):
+    def __call__(self, t, x, _column):
         """The inputs, (m,), of the measured states x, (n_y,), at t [s]."""
         u = self.function(t, dict(zip(self.states, x.tolist(), strict=True)))
-        return ordered(u, self.inputs, f"answer of the law {self.name!r} at t = {t:.6g} s")
+        return ordered(u, self.inputs, f"output of the law {self.name!r} at t = {t:.6g} s")
 
 
 def ordered(values, names, what, exactly=True):
-    """Numbers in the order of their names, (n,), from as many numbers or from a dict.
+    """Numbers in the order of their names, (n,), from an array in this order or from a dict.
 
-    Parameters
-    ----------
-    values : (n,) array or dict of str to float
-    names : sequence of str
-    what : str
-        What the values are, for messages: "measurement".
-    exactly : bool
-        Whether further names are refused.
-
-    Raises
-    ------
-    NameUnknown
-        If a name is missing, or there are further ones.
-    SpecificationError
-        If they are not n numbers.
+    `what` the values are ("measurement") goes into messages; `exactly` refuses further names in a dict.
     """
     numbers = values
     if isinstance(values, dict):
@@ -362,7 +350,8 @@ def ordered(values, names, what, exactly=True):
         raise SpecificationError(
             f"The {what} is {values!r}."[:200],
             f"It has {len(names)} numbers: {', '.join(names) or '(none)'}.",
-            do="Give them in this order, or as a dict.",
+            do="Pass them in this order, or as a dict.",
             names=names,
+            what=what,
         )
     return numbers

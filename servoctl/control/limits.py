@@ -1,9 +1,11 @@
-"""Laws under limits: each sample's inputs from a small quadratic program that says which residual gives way."""
+"""Laws under limits: a small quadratic program per sample decides the inputs, and which residual gives way."""
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from math import prod
 from types import SimpleNamespace
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -15,23 +17,25 @@ from servoctl.control.conditions import ranges
 from servoctl.control.law import Law
 from servoctl.control.lqr import Q_POSITION, R_INPUT, steady, tangents
 from servoctl.control.reference import Reference, require_plant
-from servoctl.control.residuals import Residuals
+from servoctl.control.residuals import Residuals, in_symbols_of
+from servoctl.control.result import Closed
 from servoctl.control.sampling import discretised
 from servoctl.control.time_law import fastest
 from servoctl.errors import LimitExceeded, ServoError, SpecificationError, unknown
+from servoctl.plants.plant import Plant
 from servoctl.values import Value
 
 HORIZON = 0.5  # s
-FALLING = 1e-4  # of weights, from one residual to the next by priority
-UNSEEN = 1e-6  # weight of each state beside those of residuals: states that no residual sees stay where they are
-IDLE = 1e-3  # of the largest: the root of the cost of an input that the plan does not use
-MET = 1e-7  # of an input's range: how near its limit an input has met it
-SCENE = frozenset(("t_span", "start", "guess", "parameters"))  # what `fastest` takes beside program and limits
-GIVEN_WAY = 1e-6  # of a residual's largest effect: a slack that counts
+FALLING = 1e-4  # ratio of weights from one residual to the next by priority
+UNSEEN = 1e-6  # weight of each state relative to residuals: keeps states at rest that no residual sees
+IDLE = 1e-3  # least cost of an input that the plan does not use, as the root of its share in the largest cost
+MET = 1e-7  # of an input's size: distance from a limit at which it is met
+GIVEN_WAY = 1e-6  # of a residual's largest effect: least slack that counts
+SCENE = frozenset(("t_span", "start", "guess", "parameters"))  # arguments of `fastest` for a scene
 
 
 class Layout:
-    """Named parts of a vector, one after another; matrices row by row."""
+    """Named parts of a vector, in this order; matrices row by row."""
 
     def __init__(self, **shapes):
         shapes = {name: (shape,) if isinstance(shape, int) else shape for name, shape in shapes.items()}
@@ -44,7 +48,7 @@ class Layout:
 
 
 class Effects:
-    """What inputs do at once: o = c + O u for expressions of t, q, γ' and γ'' by name, affine in the inputs."""
+    """The immediate effects of inputs: o = c + O u for expressions of t, q, γ' and γ'', affine in the inputs."""
 
     def __init__(self, plant, expressions):
         self.names, self._plant = tuple(expressions), plant
@@ -59,16 +63,13 @@ class Effects:
                 f"One of {', '.join(self.names)} is not affine in the inputs.",
                 "Bounds are linear inequalities of the inputs at each state.",
                 do="Bound forces of constraint or accelerations, which are affine.",
+                names=self.names,
             )
-        self._acting = [bool(slopes[i, :].nnz()) for i in range(len(self.names))]
+        self.immediate = {name for i, name in enumerate(self.names) if slopes[i, :].nnz()}  # an input changes these
         still = ca.substitute(values, e.u, ca.SX.zeros(e.u.numel()))
         numbers = e.p[: e.p.numel() - e.u.numel() - e.q.n]
         parts = ca.densify(ca.cse(ca.vertcat(still, ca.vec(ca.densify(slopes)))))
         self._function = compiled(ca.Function("effects", [e.q.t, e.state, numbers], [parts]), "effects")
-
-    def acts(self, name):
-        """Whether an input changes this expression at once."""
-        return self._acting[self.names.index(name)]
 
     def __call__(self, t, x):
         """c (j,) and O (j, m) at a state x (n_x,)."""
@@ -89,61 +90,65 @@ class SmallQP:
         return SmallQP, self._sizes
 
     def __call__(self, H, low, high, A, least, most):
-        """The solution (n,), or None where there is none."""
+        """The solution (n,), or None if there is none."""
         try:
             solution = self._solve(h=H, g=self._g, a=A, lba=least, uba=most, lbx=low, ubx=high)
         except RuntimeError as error:  # CasADi's only type
             raise ServoError(
-                f"The quadratic program failed: {str(error).splitlines()[0][:100]}.",
+                f"The quadratic program of the allocation failed: {str(error).splitlines()[0][:100]}.",
                 "Its data are finite numbers.",
-                do="Check weights and limits.",
+                do="Check weights and limits for very large numbers.",
+                size=self._sizes,
             ) from error
         return np.asarray(solution["x"]).ravel() if self._solve.stats()["success"] else None
 
 
-def limited(law, plant, *, bounds=None, weights=None, priority=None, horizon=HORIZON):
+def limited(
+    law: Law, plant: Plant, *, bounds: Mapping[str, Any] | None = None, weights: Mapping[str, float] | None = None,
+    priority: Sequence[str] | None = None, horizon: float = HORIZON,
+) -> Law:  # fmt: skip
     """A law whose inputs are allocated within the plant's limits of magnitude and rate, and within bounds of outputs.
 
-    At each sample the inputs u nearest to those of the law, u_law, by what the difference will cost the program: least
-    is (u - u_law)ᵀ(R + BᵀPB)(u - u_law), with the cost-to-go P of Σ w_i φ_i² along the plan under the default R of
-    `lqr` (and, for residuals of order 2, w_i times the square of their immediate change). By priority, the weights fall
-    by 1e-4 from one residual to the next; that is decided sample by sample, and what is spared in each sample does not
-    always come out smaller over a whole motion. The slack of a residual is by how much it deviates after the horizon if
-    the difference is held (for residuals of order 2, at once). Integrals of residuals in the controller state are
-    held while slack is given (anti-windup), and an estimator's prediction takes the inputs that were applied.
+    At each sample the inputs u differ from those of the law, u_law, at the least cost to the program:
+    (u - u_law)ᵀ(R + BᵀPB)(u - u_law), with the cost-to-go P of Σ w_i φ_i² along the plan under the default R of `lqr`.
+    For residuals of order 2, w_i times the square of their immediate change is added. With a priority the weights fall
+    by 1e-4 from one residual to the next; the choice is made sample by sample, and a residual of high priority is not
+    always smaller over a whole motion. The slack of a residual is its deviation after the horizon if the difference is
+    held (for residuals of order 2, its immediate deviation). While there is slack, integrals of residuals in the
+    controller state are held (anti-windup). An estimator predicts with the inputs that act.
 
     Parameters
     ----------
     law : Law
     plant : Plant
-        What the controller believes of the machine: its limits are kept.
+        The controller's model of the machine, with its limits.
     bounds : dict of str to (float, float) or float, optional
         Outputs of the mechanism, affine in the inputs, that stay within (low, high), None for an open side, or within
         (-c, c): a rope that cannot push is {"tension": (0.0, None)}.
     weights : dict of str to float, optional
-        w_i of the residuals; default 1 each.
+        w_i by residual; default 1 each.
     priority : sequence of str, optional
         Residuals, the most important first, instead of weights.
     horizon : float
-        Of the slack [s]; default 0.5, in which actuators of cranes, arms and vehicles show in positions.
+        Horizon of the slack [s]; default 0.5, after which actuators of cranes, arms and vehicles show in positions.
 
     Returns
     -------
     Law
-        With the further signals "slack X" for each residual (its own units), "limit a" for each actuator (-1 lower,
+        With the further signals "slack X" for each residual (its units), "limit a" for each actuator (-1 lower,
         1 upper, 0 none) and "bound o" for each bounded output. `limit_report` reads them.
 
     Raises
     ------
     SpecificationError
-        If there is nothing to keep, or weights and priority are both given.
+        If there are no limits and bounds, or both weights and priority.
     NameUnknown
-        For a name of no residual or output.
+        For an unknown residual or output.
     LimitExceeded
-        During the loop, where no inputs keep limits and bounds together; it names them.
+        During the loop, if no inputs satisfy limits and bounds together.
     """
     _require_law(law, plant)
-    effects, bounds = _bounded(plant, bounds)
+    effects, bounds = _bounds(plant, bounds)
     reference = Reference(law.plan, plant, law.rate)
     residuals, D, at_once = _predicted(reference, positive("horizon", horizon))
     H = _metric(reference, residuals, _weights(residuals, weights, priority), at_once)
@@ -155,32 +160,42 @@ def limited(law, plant, *, bounds=None, weights=None, priority=None, horizon=HOR
         name=f"{law.name}, limited " + (f"by priority {' > '.join(priority)}" if priority else "by weight"),
         step=allocation,
         schedule=_schedule(law, reference, D, H),
-        state=np.concatenate([law.state, np.clip(law.idle, low, high)]),
+        state=np.concatenate([law.state, np.clip(law.initial_input, low, high)]),
         state_names=(*law.state_names, *(f"last {name}" for name in plant.inputs)),
         signals=(*law.signals, *allocation.signals),
         allocation=allocation,
     )
 
 
-def _bounded(plant, bounds):
-    """What the inputs do at once to bounded outputs, and the bounds, (j, 2)."""
+def _bounds(plant, bounds):
+    """The effects of inputs on the bounded outputs, and the bounds, (j, 2)."""
     bounds = {name: interval(name, value, "bound") for name, value in mapping(bounds, "The bounds").items()}
     if not (plant.limits or plant.rate_limits or bounds):
         raise SpecificationError(
-            "The plant has no limits, and no bounds were given.",
-            "An allocation keeps limits.",
-            do='Give the plant its limits: sv.plant(mechanism, limits={"trolley": 150.0}).',
+            "There are no limits of the plant and no bounds.",
+            "An allocation keeps inputs within limits.",
+            do='Pass bounds, or limits of the plant: sv.plant(mechanism, limits={"trolley": 150.0}).',
+            names=plant.inputs,
         )
     for name in bounds:
         if name not in plant.mechanism.outputs:
             raise unknown(name, plant.mechanism.outputs, "output of the mechanism")
     effects = Effects(plant, {name: plant.mechanism.outputs[name] for name in bounds})
-    _require_at_once(effects, plant, bounds)
+    for name in bounds:
+        if name not in effects.immediate:
+            raise SpecificationError(
+                f"No input changes {name!r} immediately"
+                + (f": {', '.join(plant.lagged)} lag behind their commands." if plant.lag else "."),
+                "A bound is kept by the inputs of the same sample.",
+                do="Leave the bound out, or design for actuators without lag.",
+                name=name,
+                lagged=plant.lagged,
+            )
     return effects, np.array(list(bounds.values())).reshape(-1, 2)
 
 
 def _schedule(law, reference, D, H):
-    """The law's schedule, x_ref, D and H at each sample; the last columns hold."""
+    """The law's schedule followed by x_ref, D and H at each sample; the last columns hold."""
     count = len(D)
     along = np.vstack([reference.x, D.reshape(count, -1).T, H.reshape(count, -1).T])
     samples = np.arange(max(count, law.schedule.shape[1]))
@@ -189,57 +204,49 @@ def _schedule(law, reference, D, H):
 
 
 def _require_law(law, plant):
-    """Refuse what is no law of a plan, or measures what the plant lacks."""
+    """Refuse anything but a law without allocation that has a plan, starts with it and has the names of the plant."""
     require_plant(plant)
     if not isinstance(law, Law) or law.allocation:
         raise SpecificationError(
-            f"A {type(law).__name__} was given as law." if not isinstance(law, Law) else f"{law.name!r} was given.",
+            f"Expected a Law, got a {type(law).__name__}." if not isinstance(law, Law) else f"{law.name!r} is limited.",
             "Limits are allocated around a law without limits.",
-            do="Give a law made from a plan, as by sv.lqr, and all bounds and weights at once.",
+            do="Pass a law made from a plan, as by sv.lqr, and all bounds and weights in one call.",
+            name=getattr(law, "name", None),
         )
     if law.plan is None:
         raise SpecificationError(
             f"The law {law.name!r} has no plan.",
             "Slack is given to the residuals of a plan's program.",
             do="Make the law from a plan.",
+            name=law.name,
         )
     require_names(law, plant)
     if abs(law.t0 - law.plan.t[0]) > ON_SAMPLE * law.period:
         raise SpecificationError(
             f"The law {law.name!r} begins at t = {law.t0:g} s, its plan at {law.plan.t[0]:g} s.",
-            "Limits are kept along the plan, sample by sample of the law.",
-            do="Let both begin at once.",
+            "Samples of law and plan coincide.",
+            do="Let both begin at the same instant.",
+            t0=law.t0,
+            plan_t0=float(law.plan.t[0]),
         )
 
 
-def _require_at_once(effects, plant, bounds):
-    """Refuse bounds of what no input changes at once, as behind lagging actuators."""
-    for name in bounds:
-        if not effects.acts(name):
-            raise SpecificationError(
-                f"No input changes {name!r} at once"
-                + (f": {', '.join(plant.lagged)} lag behind their commands." if plant.lag else "."),
-                "A bound is kept by the inputs of the same sample.",
-                do="Leave the bound out, or design with actuators that act at once.",
-                name=name,
-            )
-
-
 def _predicted(reference, horizon):
-    """Names of the residuals, by how much each deviates after the horizon per unit of input, (N, k, m), and at once."""
+    """Names of residuals, their deviation after the horizon per unit of input (N, k, m), immediate effects by name."""
     plan, plant = reference.plan, reference.plant
-    program, q = plan.model.reduction.program, plant.mechanism.q
+    program, q = plan.model.reduction.program, plan.model.reduction.mechanism.q
     residuals = Residuals(plan.model, plant)
     _, B = discretised(*reference.linearised(), horizon)
     D = dict(zip(residuals.names, np.moveaxis(residuals.jacobian(reference.t, reference.x) @ B, 1, 0), strict=True))
-    second = {name: e for name, e in program.residuals.items() if name not in D}
-    for name, e in second.items():
-        if q.order(e) > 2:
+    second = {name: e for name, e in in_symbols_of(plant, plan.model).items() if name not in D}
+    for name in second:
+        if (order := q.order(program.residuals[name])) > 2:
             raise SpecificationError(
-                f"The residual {name!r} has order {q.order(e)}.",
-                "Slack is given to residuals that the state and the inputs decide, of order 2 at most.",
-                do="Limit the commands by the plant's own limits, without allocation.",
+                f"The residual {name!r} has order {order}.",
+                "Slack is given to residuals of order 2 at most, which the state and the inputs determine.",
+                do="Leave out sv.limited; the plant limits the commands.",
                 name=name,
+                order=order,
             )
     effects = Effects(plant, second)
     slopes = np.array([effects(t, x)[1] for t, x in zip(reference.t, reference.x.T, strict=True)])
@@ -273,22 +280,9 @@ def _metric(reference, names, weights, at_once):
 class Allocation(Value):
     """The step of a limited law: (t, [y; z; last u], [column; x_ref; D; H]) -> [u; z+; u; signals].
 
-    Attributes
-    ----------
-    law : Law
-        Whose inputs are allocated.
-    plant : Plant
-        Whose limits are kept.
-    effects : Effects
-        What inputs do at once to the bounded outputs.
-    bounds : (j, 2) array
-        Of these.
-    residuals : tuple of str
-        Names of what may give way.
-    sizes : (m,) array
-        Of the inputs.
-    slack_sizes : (k,) array
-        Largest effects of inputs of these sizes on the residuals.
+    `law` is the law without limits, `plant` the plant with them; `effects` are those of the inputs on the bounded
+    outputs, `bounds` (j, 2). `residuals` may have slack; `sizes` (m,) are typical sizes of the inputs, `slack_sizes`
+    (k,) the largest effects of such inputs on the residuals.
     """
 
     law: Law
@@ -301,7 +295,7 @@ class Allocation(Value):
 
     @property
     def limits(self):
-        """(kind, name) of what may be met: ("limit", an actuator) and ("bound", a bounded output)."""
+        """Pairs ("limit", actuator) and ("bound", output)."""
         return (*(("limit", name) for name in self.plant.inputs), *(("bound", name) for name in self.effects.names))
 
     @property
@@ -311,7 +305,7 @@ class Allocation(Value):
 
     @cached_property
     def _layouts(self):
-        """Of the arguments x and row, and of the answer of the law."""
+        """Layouts of the arguments x and column, and of the law's output."""
         law, m, k, n_z = self.law, len(self.sizes), len(self.residuals), len(self.law.state)
         return (
             Layout(y=len(law.measures), z=n_z, last=m),
@@ -332,60 +326,63 @@ class Allocation(Value):
     def _qp(self):
         return SmallQP(len(self.sizes), len(self.bounds))
 
-    def __call__(self, t, x, row):
+    def __call__(self, t, x, column):
         """The inputs, the next controller state and the signals, in one array."""
-        of_arguments, of_column, of_answer = self._layouts
-        now, along = of_arguments.split(x), of_column.split(row)
-        wanted = of_answer.split(self.law.answer(t, np.concatenate([now.y, now.z]), along.column))
+        of_x, of_column, of_output = self._layouts
+        now, along = of_x.split(x), of_column.split(column)
+        desired = of_output.split(self.law.answer(t, np.concatenate([now.y, now.z]), along.column))
         state = along.x_ref.copy()
         state[self._measured] = now.y
         low, high, change = self._limits
         low, high = np.maximum(low, now.last - change), np.minimum(high, now.last + change)
         c, O = self.effects(t, state)
-        u = self._allocate(t, wanted.u, low, high, along.H, c, O)
-        difference = u - wanted.u
+        u = self._allocate(t, desired.u, low, high, along.H, c, O)
+        difference = u - desired.u
         slack = along.D @ difference
         gives_way = np.any(np.abs(slack) > GIVEN_WAY * (np.abs(along.D) @ self.sizes))
-        z = self._advanced(t, now.z, wanted.z, gives_way, difference)
+        z = self._advanced(t, now.z, desired.z, gives_way, difference)
         room = MET * self.sizes
         active = np.where(u <= low + room, -1.0, np.where(u >= high - room, 1.0, 0.0)) * (np.abs(difference) > room)
         reached = np.where(np.abs(c + O @ u - self.bounds.T) <= MET * (np.abs(O) @ self.sizes), [[-1.0], [1.0]], 0.0)
-        return np.concatenate([u, z, u, wanted.signals, slack, active, reached.sum(axis=0)])
+        return np.concatenate([u, z, u, desired.signals, slack, active, reached.sum(axis=0)])
 
-    def _advanced(self, t, z, following, gives_way, difference):
-        """The next controller state: integrals are held while slack is given, an estimate takes the applied inputs."""
-        law, following = self.law, following.copy()
+    def _advanced(self, t, z, z_next, gives_way, difference):
+        """The next controller state: integrals are held while there is slack, an estimate takes the inputs that act."""
+        law, z_next = self.law, z_next.copy()
         if gives_way and law.integrators:
-            following[list(law.integrators)] = z[list(law.integrators)]
+            z_next[list(law.integrators)] = z[list(law.integrators)]
         if law.input_matrix is None:
-            return following
+            return z_next
         k = min(round((t - law.t0) * law.rate), len(law.input_matrix) - 1)
-        return following + law.input_matrix[k] @ difference
+        return z_next + law.input_matrix[k] @ difference
 
-    def _allocate(self, t, wanted, low, high, H, c, O):
-        """The inputs, from a quadratic program in (u - u_law)/size where those of the law do not do."""
-        least, most = self.bounds.T - c - O @ wanted
-        if np.all((low <= wanted) & (wanted <= high)) and np.all((least <= 0) & (0 <= most)):
-            return wanted
+    def _allocate(self, t, desired, low, high, H, c, O):
+        """The inputs: those of the law if they are admissible, else from a quadratic program in (u - u_law)/size."""
+        least, most = self.bounds.T - c - O @ desired
+        if np.all((low <= desired) & (desired <= high)) and np.all((least <= 0) & (0 <= most)):
+            return desired
         S, A = np.diag(self.sizes), O * self.sizes
+        # rows are scaled to entries of order one, for the tolerance of the solver
         scale = np.maximum(np.abs(A).max(axis=1, initial=0.0), 1e-300)
         H = S @ H @ S
-        ends = (low - wanted) / self.sizes, (high - wanted) / self.sizes
+        ends = (low - desired) / self.sizes, (high - desired) / self.sizes
         v = self._qp(H / np.abs(H).max(), *ends, A / scale[:, None], least / scale, most / scale)
         if v is None:
-            self._refuse(t, low, high)
-        return np.clip(wanted + self.sizes * v, low, high)
+            raise self._infeasible(t, low, high)
+        return np.clip(desired + self.sizes * v, low, high)
 
-    def _refuse(self, t, low, high):
+    def _infeasible(self, t, low, high):
         names = self.plant.inputs
         limits = ", ".join(f"{n} {a:.6g} .. {b:.6g}" for n, a, b in zip(names, low, high, strict=True))
         bounds = ", ".join(f"{n} {a:.6g} .. {b:.6g}" for n, (a, b) in zip(self.effects.names, self.bounds, strict=True))
-        raise LimitExceeded(
-            f"At t = {t:.6g} s no inputs within {limits} keep {bounds or 'the rows'}.",
-            "Limits and bounds are kept together; slack is given to the program's residuals alone.",
-            do="Widen a limit or a bound, or slow the plan (sv.fastest); `.run` is the motion before.",
+        return LimitExceeded(
+            f"At t = {t:.6g} s no inputs within {limits} satisfy {bounds or 'the limits'}.",
+            "Limits and bounds hold together; only residuals have slack.",
+            do="Widen a limit or a bound, or slow the plan (sv.fastest); `.run` is the motion so far.",
             t=float(t),
             bounds=self.effects.names,
+            low=low,
+            high=high,
         )
 
 
@@ -396,13 +393,18 @@ def _weights(names, weights, priority):
         return np.array([weights.get(name, 1.0) for name in names])
     if isinstance(priority, str) or not np.iterable(priority) or len({*priority}) < len(priority):
         raise SpecificationError(
-            f"priority={priority!r} was given.",
-            "A priority is a sequence of residuals, each once, the most important first.",
-            do=f"Order some of {', '.join(names)}.",
+            f"The priority is {priority!r}.",
+            "It is a sequence of residuals, each once, the most important first.",
+            do=f"Pass some of {', '.join(names)}.",
+            names=names,
         )
     if weights:
         raise SpecificationError(
-            "Weights and a priority were given.", "Slack goes by one of them.", do="Leave one of them out."
+            f"Weights of {', '.join(weights)} and a priority were given.",
+            "A priority sets the weights of all residuals.",
+            do="Leave out one of them.",
+            weights=weights,
+            priority=tuple(priority),
         )
     for name in priority:
         if name not in names:
@@ -412,34 +414,35 @@ def _weights(names, weights, priority):
 
 
 def _sizes(plan, plant, H):
-    """A typical size of each input: its range where it has limits, else what the plan uses, if that costs anything."""
+    """A typical size of each input, (m,): the width of its limits, else its largest value in the plan."""
     low, high, _ = ranges(plant, 1.0)
     used = np.array([np.abs(plan[name]).max() for name in plant.inputs])
     sizes = np.where(np.isfinite(high - low), high - low, used)
-    unit = 1 / np.sqrt(np.diagonal(H, axis1=1, axis2=2).max(axis=0))  # of each input, of the same cost
+    unit = 1 / np.sqrt(np.diagonal(H, axis1=1, axis2=2).max(axis=0))  # inputs of equal cost
+    # an input that the plan does not use has a small size, not zero: it divides
     return np.maximum(sizes, (IDLE * np.max(sizes / unit) or 1.0) * unit)
 
 
 @dataclass(frozen=True)
 class LimitReport:
-    """Which residuals gave way in a closed loop, when and by how much; made by `limit_report`.
+    """The residuals that gave way in a closed loop; made by `limit_report`.
 
     Attributes
     ----------
     rows : tuple of (str, float, float, float, float)
         Residual, first and last instant with slack [s], largest slack (units of φ, after the horizon) and its instant.
     limits : dict of str to float
-        Share of the samples at which each actuator or bound was met.
+        Share of the samples at which a limit of an actuator or a bound was met.
     overload : tuple of (str, float, float, float) or None
-        Of the plan itself: actuator, instant, its value, the limit; None if it keeps all limits.
+        Largest excess of the plan: actuator, instant, value, limit; None if the plan is within all limits.
     slower : float or None
-        Factor by which the plan would have to be slowed to keep the limits of magnitude, where a scene is given.
+        With a scene: factor by which the plan must be slowed to stay within the limits of magnitude.
     """
 
-    rows: tuple
-    limits: dict
-    overload: tuple = None
-    slower: float = None
+    rows: tuple[tuple[str, float, float, float, float], ...]
+    limits: dict[str, float]
+    overload: tuple[str, float, float, float] | None = None
+    slower: float | None = None
 
     def __repr__(self):
         lines = ["LimitReport: " + ("no residual gave way" if not self.rows else "residuals gave way")]
@@ -455,16 +458,16 @@ class LimitReport:
         return "\n".join(lines)
 
 
-def limit_report(run, scene=None):
-    """Which residuals gave way in a closed loop with a limited law, and what would have avoided it.
+def limit_report(run: Closed, scene: Mapping[str, Any] | None = None) -> LimitReport:
+    """Report which residuals gave way in a closed loop with a limited law, and what would avoid it.
 
     Parameters
     ----------
     run : Closed
-        Of a law made by `limited`.
+        Run of a law made by `limited`.
     scene : dict, optional
-        Arguments of `fastest` beside mechanism, program and limits ({"t_span": (0.0, 6.0), "guess": {...}}): then the
-        factor is solved for by which a plan that exceeds limits of magnitude would have to be slowed to keep them.
+        Arguments t_span, start, guess and parameters of `fastest`, as {"t_span": (0.0, 6.0), "guess": {...}}. If the
+        plan exceeds limits of magnitude, the report then has the factor by which it must be slowed.
 
     Returns
     -------
@@ -482,24 +485,25 @@ def limit_report(run, scene=None):
             f"The law {getattr(law, 'name', None)!r} is not limited.",
             "The report reads the slacks of an allocation.",
             do="Close the loop with a law of sv.limited(law, plant).",
+            name=getattr(law, "name", None),
         )
     if scene is not None and not (isinstance(scene, dict) and "t_span" in scene and SCENE.issuperset(scene)):
         raise SpecificationError(
-            f"scene={scene!r} was given."[:200],
-            f"A scene has the span of the program as given, and what sv.fastest takes: {', '.join(sorted(SCENE))}.",
-            do='Give a dict, such as {"t_span": (0.0, 6.0), "guess": {"l": 4.0}}.',
+            f"The scene is {scene!r}."[:200],
+            f"It is a dict with t_span and arguments of sv.fastest: {', '.join(sorted(SCENE))}.",
+            do='Pass one such as {"t_span": (0.0, 6.0), "guess": {"l": 4.0}}.',
+            valid=sorted(SCENE),
         )
-    met = {name: run.signal[f"{kind} {name}"] for kind, name in allocation.limits}
-    shares = {name: float(np.mean(values != 0)) for name, values in met.items()}
+    met = {name: float(np.mean(run.signal[f"{kind} {name}"] != 0)) for kind, name in allocation.limits}
     overload, slower = _overload(run.plan, allocation.plant), None
     if scene is not None and overload is not None:
         reduction = run.plan.model.reduction
         slower = fastest(reduction.mechanism, reduction.program, allocation.plant.limits, **scene).factor
-    return LimitReport(_slacks(run, allocation), {n: s for n, s in shares.items() if s}, overload, slower)
+    return LimitReport(_slacks(run, allocation), {name: s for name, s in met.items() if s}, overload, slower)
 
 
 def _slacks(run, allocation):
-    """Of each residual that gave way: name, first and last instant, largest slack and its instant."""
+    """(residual, first and last instant, largest slack, its instant) of each residual that gave way."""
     rows = []
     for name, size in zip(allocation.residuals, allocation.slack_sizes, strict=True):
         slack = np.abs(run.signal[f"slack {name}"])
@@ -511,7 +515,7 @@ def _slacks(run, allocation):
 
 
 def _overload(plan, plant):
-    """The largest excess of the plan over the limits of magnitude: actuator, instant, value, limit."""
+    """(actuator, instant, value, limit) of the plan's largest excess over limits of magnitude, or None."""
     excesses = []
     for name, (low, high) in plant.limits.items():
         (t_low, least), (t_high, most) = plan.extrema(name)

@@ -6,89 +6,55 @@ from dataclasses import dataclass
 import numpy as np
 
 from servoctl.codegen.native import pointer
+from servoctl.values import Value
 
 FINISHED, STATE_LOST, LAW_LOST = 0, 1, 2  # how a loop ends
 
 
-@dataclass(frozen=True)
-class Loop:
-    """What a closed loop needs beside the plant and the law; arrays that are not used are None.
-
-    Attributes
-    ----------
-    samples, substeps, delay : int
-        Number of periods, Runge-Kutta steps in each, samples from a command to the input.
-    n_u, n_out : int
-        Numbers of inputs, and of the law's outputs: inputs, controller state and further signals.
-    first : int
-        The law's row at the first sample.
-    t0, period : float
-        [s]
-    p : (n_p,) array
-        Of the plant, with room for inputs and disturbances at the end.
-    x0, z0 : (n_x,), (n_z,) arrays
-        State of the plant and controller state at the start.
-    table : (rows, n_row) array
-        Of the law; the last row holds beyond the end.
-    measured, disturbed : (n_y,), (n_d,) integer arrays
-        Which states are measured, which generalised forces disturbed.
-    noise : (samples + 1, n_y) array
-    quantum : (n_y,) array
-    low, high, change : (n_u,) arrays
-        Limits of the inputs, and of their change from sample to sample.
-    idle : (n_u,) array
-        The inputs before the first command arrives.
-    disturbance : (samples * substeps, 3, n_d) array
-        At the start, the middle and the end of each step.
-    transport : (n_u,) integer array
-        Integration steps by which each input arrives late.
-    at_u : int
-        Index of the first input in p.
-    """
+@dataclass(frozen=True, eq=False)
+class Loop(Value):
+    """The numbers of a closed loop; arrays that are not used are None."""
 
     samples: int
-    substeps: int
-    delay: int
+    substeps: int  # Runge-Kutta steps per sample
+    delay: int  # samples from a command to the input
     n_u: int
-    n_out: int
-    first: int
-    at_u: int
-    t0: float
-    period: float
+    n_out: int  # outputs of the law: command, controller state, further signals
+    first: int  # row of the table at the first sample
+    at_u: int  # index of the first input in p; disturbances follow the inputs
+    t0: float  # [s]
+    period: float  # [s]
     p: np.ndarray
     x0: np.ndarray
-    z0: np.ndarray
-    table: np.ndarray
-    measured: np.ndarray
-    disturbed: np.ndarray
-    idle: np.ndarray
-    disturbance: np.ndarray = None
-    noise: np.ndarray = None
-    quantum: np.ndarray = None
-    low: np.ndarray = None
+    z0: np.ndarray  # initial controller state
+    table: np.ndarray  # gain schedule, a row per sample; the last row holds after the end
+    measured: np.ndarray  # (n_y,) indices of states
+    disturbed: np.ndarray  # (n_d,) indices of generalised forces
+    initial_input: np.ndarray  # (n_u,) until the first command arrives
+    disturbance: np.ndarray = None  # (samples * substeps, 3, n_d) at the start, the middle and the end of each step
+    noise: np.ndarray = None  # (samples + 1, n_y)
+    quantum: np.ndarray = None  # (n_y,)
+    low: np.ndarray = None  # (n_u,) limits of the inputs
     high: np.ndarray = None
-    change: np.ndarray = None
-    transport: np.ndarray = None
+    change: np.ndarray = None  # (n_u,) largest change of the inputs from sample to sample
+    transport: np.ndarray = None  # (n_u,) integration steps by which each input arrives late
 
 
 _FIELDS = {
     ctypes.c_int64: "samples substeps delay n_y n_z n_u n_out n_row rows first n_d at_u depth every n_traced columns "
     "status",
     ctypes.c_double: "t0 period",
-    ctypes.c_void_p: "p x0 z0 table noise quantum low high change idle disturbance constants scale measured transport "
-    "disturbed traced x law_x law_y input gathered trace",
+    ctypes.c_void_p: "p x0 z0 table noise quantum low high change initial_input disturbance constants scale measured "
+    "transport disturbed traced x law_x law_y input gathered trace",
 }
 _WHOLE = {"measured", "transport", "disturbed", "traced"}  # arrays of whole numbers
 
 
 class Arguments(ctypes.Structure):
-    """The C structure ``Loop`` of `codegen/c/sampled.h`, which one loop and many loops take.
+    """The C structure ``Loop`` of `codegen/c/sampled.h`, for one loop and for many, from its fields by name.
 
-    Parameters
-    ----------
-    **values
-        Its fields by name, with arrays for pointers, which it keeps; None and fields that are left out are 0. What is
-        no field of it is passed over.
+    Arrays are passed for pointers, and the structure holds a reference to them. None and missing fields are 0; names
+    that are no field are ignored.
     """
 
     _fields_ = [(name, kind) for kind, names in _FIELDS.items() for name in names.split()]
@@ -110,29 +76,12 @@ _STEP = ctypes.CFUNCTYPE(None, ctypes.c_double, ctypes.c_void_p, ctypes.c_void_p
 
 
 def run_loop(ode, law, loop):
-    """Run a closed loop: in C, with a compiled law or one that is called back, or in Python without a compiler.
+    """Run a closed loop: in C, which calls a law in Python back, or in Python without a compiler.
 
-    Parameters
-    ----------
-    ode : Compiled
-        Of the plant, made with the loop "closed".
-    law : Compiled or callable
-        (t, [y; z], row) -> [u; z+; further signals].
-    loop : Loop
-
-    Returns
-    -------
-    status : int or BaseException
-        FINISHED; STATE_LOST or LAW_LOST where the state or the law's answer is not finite at the next sample; or what
-        the law raised there.
-    x : (N, n_x) array
-        States at the samples completed.
-    law_x : (N, n_y + n_z) array
-        Measurement and controller state there.
-    law_y : (N, n_out) array
-        Command, next controller state and further signals there.
-    inputs : (N, n_u) array
-        Inputs applied from there on.
+    `ode` are the plant's rates, compiled with the loop "closed"; `law` maps (t, [y; z], row of the schedule) to
+    [u; z+; signals]. Returns the status (FINISHED; STATE_LOST or LAW_LOST if the state or the law's output is not
+    finite at the next sample; or the error that the law raised there), and at the N completed samples the states
+    (N, n_x), measurements and controller states (N, n_y + n_z), outputs of the law (N, n_out) and inputs (N, n_u).
     """
     n, n_y, n_z = loop.samples + 1, len(loop.measured), len(loop.z0)
     logs = {
@@ -148,7 +97,7 @@ def run_loop(ode, law, loop):
 
 
 def _native(native, law, loop, logs):
-    """The loop of closed.c; returns the samples completed and the status."""
+    """The loop of closed.c; returns the number of completed samples and the status."""
     step = law.native("step") if hasattr(law, "native") else None
     failures = []
     if step is None:
@@ -162,7 +111,7 @@ def _native(native, law, loop, logs):
 
 
 def _called_back(law, loop, n_in, failures):
-    """A function for C that calls a Python law; what it raises is kept, and ends the loop."""
+    """A function for C that calls a Python law; an error goes to `failures` and ends the loop."""
     n_row, n_out = loop.table.shape[1], loop.n_out
 
     def view(address, size):
@@ -172,64 +121,48 @@ def _called_back(law, loop, n_in, failures):
         out = view(y, n_out)
         try:
             out[:] = law(t, view(x, n_in).copy(), view(row, n_row).copy())
-        except BaseException as error:  # C cannot pass it on
+        except BaseException as error:  # an exception cannot cross C
             failures.append(error)
             out[:] = np.nan
 
     return step
 
 
-# --- the rule of the loop in Python, as sampled.h, rk4.h and closed.c have it
+# --- the loop in Python, operation by operation as in sampled.h, rk4.h and closed.c
 
 
 def quantised(y, quantum):
-    """Measurements y (n_y,) in whole steps of quantum (n_y,), where these are positive; None for none."""
+    """Measurements y (n_y,) rounded to multiples of quantum (n_y,) where that is positive; None: no quantisation."""
     if quantum is None:
         return y
     return np.where(quantum > 0, quantum * np.rint(y / np.where(quantum > 0, quantum, 1.0)), y)
 
 
 def limited(command, before, low, high, change):
-    """Inputs (n_u,) of one sample: the command within its limits, and those of its change from the inputs before."""
+    """Inputs (n_u,) of one sample: the command clipped to its limits, then to the largest change per sample."""
     u = command if low is None else np.clip(command, low, high)
     return u if change is None else np.clip(u, before - change, before + change)
 
 
 def samples_ago(step, transport, substeps):
-    """Samples since the inputs that arrive in an integration step of this one were applied, (n_u,) whole numbers."""
+    """Age in samples of the inputs that act in an integration step, behind a transport delay, (n_u,) integers."""
     return -((step - transport) // substeps)
 
 
 def hold(ode, t, h, x, steps):
-    """The state at the end of a sample.
+    """The state x (n_x,) at the end of a sample that starts at t, by Runge-Kutta steps of order 4 and length h [s].
 
-    Parameters
-    ----------
-    ode : Compiled
-    t, h : float
-        Start of the sample, length of an integration step [s].
-    x : (n_x,) array
-    steps : iterable of (start, middle, end)
-        Parameters (n_p,) of the plant, with inputs and disturbances, in each step.
-
-    Returns
-    -------
-    (n_x,) array
+    `steps` are the plant's numbers (n_p,), with inputs and disturbances, at the start, middle and end of each step.
     """
-    for s, stages in enumerate(steps):
-        x = ode.restore(t + (s + 1) * h, _rk4(ode, t + s * h, h, x, stages), stages[2])
-    return x
-
-
-def _rk4(ode, t, h, x, stages):
-    """One Runge-Kutta step of order 4."""
-    start, middle, end = stages
     n = len(x)
-    k1 = ode(t, x, start)[:n]
-    k2 = ode(t + h / 2, x + h / 2 * k1, middle)[:n]
-    k3 = ode(t + h / 2, x + h / 2 * k2, middle)[:n]
-    k4 = ode(t + h, x + h * k3, end)[:n]
-    return x + h / 6 * (k1 + 2 * (k2 + k3) + k4)
+    for s, (start, middle, end) in enumerate(steps):
+        at = t + s * h
+        k1 = ode(at, x, start)[:n]
+        k2 = ode(at + h / 2, x + h / 2 * k1, middle)[:n]
+        k3 = ode(at + h / 2, x + h / 2 * k2, middle)[:n]
+        k4 = ode(at + h, x + h * k3, end)[:n]
+        x = ode.restore(t + (s + 1) * h, x + h / 6 * (k1 + 2 * (k2 + k3) + k4), end)
+    return x
 
 
 def _steps(c, k, inputs):
@@ -238,7 +171,7 @@ def _steps(c, k, inputs):
     for s in range(c.substeps):
         stages = np.tile(c.p, (3, 1))
         applied = k - samples_ago(s, late, c.substeps) + np.zeros(c.n_u, dtype=int)
-        stages[:, c.at_u : c.at_u + c.n_u] = np.where(applied < 0, c.idle, inputs[applied, range(c.n_u)])
+        stages[:, c.at_u : c.at_u + c.n_u] = np.where(applied < 0, c.initial_input, inputs[applied, range(c.n_u)])
         if len(d_at):
             stages[:, d_at] = c.disturbance[k * c.substeps + s]
         yield stages
@@ -246,7 +179,7 @@ def _steps(c, k, inputs):
 
 @np.errstate(all="ignore")
 def _interpreted(ode, law, c, x_log, law_x, law_y, inputs):
-    """The loop of closed.c in Python; returns the samples completed and the status."""
+    """The loop of closed.c in Python; returns the number of completed samples and the status."""
     n_y, n_z, n_u, x = len(c.measured), len(c.z0), c.n_u, c.x0
     law_x[0, n_y:] = c.z0
     for k in range(c.samples + 1):
@@ -257,12 +190,12 @@ def _interpreted(ode, law, c, x_log, law_x, law_y, inputs):
         law_x[k, :n_y] = quantised(x[c.measured] + (0.0 if c.noise is None else c.noise[k]), c.quantum)
         try:
             law_y[k] = law(t, law_x[k].copy(), c.table[min(c.first + k, len(c.table) - 1)])
-        except BaseException as error:  # as in C: the motion before is kept
+        except BaseException as error:  # as in C: the motion so far is returned
             return k, error
         if not np.isfinite(law_y[k, : n_u + n_z]).all():
             return k, LAW_LOST
-        command = law_y[k - c.delay, :n_u] if k >= c.delay else c.idle
-        inputs[k] = limited(command, inputs[k - 1] if k else c.idle, c.low, c.high, c.change)
+        command = law_y[k - c.delay, :n_u] if k >= c.delay else c.initial_input
+        inputs[k] = limited(command, inputs[k - 1] if k else c.initial_input, c.low, c.high, c.change)
         if k == c.samples:
             break
         law_x[k + 1, n_y:] = law_y[k, n_u : n_u + n_z]

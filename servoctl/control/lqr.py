@@ -1,70 +1,79 @@
 """LQR about a plan: time-varying by the discrete Riccati equation along it, or frozen at each instant."""
 
+from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from servoctl.checks import numbers_by_name
 from servoctl.control.feedback import StateFeedback, affine
+from servoctl.control.law import Law
 from servoctl.control.reference import Reference, refuse_transport
 from servoctl.control.residuals import Residuals
 from servoctl.control.sampling import discretised, spectral_radii
 from servoctl.errors import ServoError, SpecificationError
+from servoctl.plants.plant import Plant
+from servoctl.run import Run
 
-MARGINAL = 1 + 1e-6  # spectral radius of what may stay out of reach: it neither falls nor grows
-DOUBLINGS, CONVERGED = 60, 1e-12  # of the horizon of the Riccati equation; its last relative change
+MARGINAL = 1 + 1e-6  # spectral radius up to which a mode that no input reaches neither decays nor grows
+DOUBLINGS, CONVERGED = 60, 1e-12  # of the horizon of the Riccati equation; relative change at convergence
 Q_POSITION, Q_VELOCITY, R_INPUT, Q_INTEGRAL = 1e3, 1e2, 1e-3, 1e4
 
 
-def lqr(plan, plant, rate=100.0, Q=None, R=None, integral=None, varying=True):
-    """The plan's actuation with linear-quadratic feedback about the plan, sampled.
+def lqr(
+    plan: Run, plant: Plant, rate: float = 100.0, Q: ArrayLike | Mapping[str, float] | None = None,
+    R: ArrayLike | Mapping[str, float] | None = None, integral: bool | ArrayLike | Mapping[str, float] | None = None,
+    varying: bool = True,
+) -> Law:  # fmt: skip
+    """The plan's actuation with sampled linear-quadratic feedback about the plan.
 
     The plant is linearised along the plan in the middle of each sample and discretised exactly under the zero-order
-    hold. The gains minimise Σ δxᵀQ δx + δuᵀR δu + zᵀQ_i z over the samples: backwards along the plan from the steady
-    solution at its end, or steady at each sample as if the plant were frozen there. Frozen-time gains depend on the
-    choice of coordinates where the plan moves: linearisations in two of them differ by a transformation that varies in
-    time. Samples by which `close` is late are not in the design; larger R makes room for them.
+    hold. The gains minimise Σ δxᵀQ δx + δuᵀR δu + zᵀQ_i z over the samples. Time-varying gains come from the Riccati
+    equation backwards along the plan, from the steady solution at its end; frozen-time gains from the steady solution
+    at each sample. Frozen-time gains depend on the choice of coordinates where the plan moves: linearisations in two of
+    them differ by a transformation that varies in time. The design does not include the delay of `close`; a larger R
+    makes room for it.
 
     Parameters
     ----------
     plan : Run
         With its model, by="actuators".
     plant : Plant
-        What the controller believes of the machine, without transport delay.
+        The controller's model of the machine, without transport delay.
     rate : float
         Samples per second [Hz].
     Q : float, dict of str to float, or (n_x,) or (n_x, n_x) array, optional
-        Weights of the states, by name for those that differ from the defaults: 1e3 for coordinates, 1e2 for
-        velocities, 0 for lagged inputs; an error of 3 cm costs as much as 0.1 m/s or 0.1 rad/s, and, with R,
-        as much as 30 N: right for machines of metres and kilonewtons.
+        Weights of the states, by name for some of them. Default: 1e3 for coordinates, 1e2 for velocities, 0 for lagged
+        inputs. With the default R an error of 3 cm then costs as much as 0.1 m/s, 0.1 rad/s or 30 N, which suits
+        machines of metres and kilonewtons.
     R : float, dict of str to float, or (m,) or (m, m) array, optional
         Weights of the inputs; default 1e-3.
     integral : bool, float, dict of str to float, or (k,) array, optional
-        Weights of the integrals of the program's residuals, by residual: removes the error that a constant mismatch or
-        disturbance leaves. True: 1e4 each, so that an error of 3 mm that lasts for 1 s costs as much as 1 cm of error.
-        Default: none.
+        Weights of the integrals of the program's residuals, by residual; they remove the error that a constant mismatch
+        or disturbance leaves. True: 1e4 each, so that an error of 3 mm that lasts for 1 s costs as much as 1 cm of
+        error. Default: none.
     varying : bool
         False: frozen-time gains.
 
     Returns
     -------
     Law
-        Its info holds "gains" (N, m, n_x + k) on "states" and integrals, the spectral radii of the sampled error
-        dynamics, Q, R.
+        `info` has "gains" (N, m, n_x + k) on "states" and integrals, the spectral radii of the sampled error dynamics,
+        Q and R.
 
     Raises
     ------
     NameUnknown
-        For a weight of no state, input or residual, or where plan and plant have other names.
+        For a weight of an unknown state, input or residual, and if plan and plant have different names.
     SpecificationError
         For weights of a wrong shape, or not (semi)definite.
     ServoError
-        If an unstable mode is not reached by the inputs or not seen by the weights; with frozen-time gains, a marginal
-        one, too.
+        If no input reaches, or no weight sees, an unstable mode; with frozen-time gains, also a marginal one.
     """
     if not isinstance(varying, (bool, np.bool_)):
         raise SpecificationError(
-            f"varying={varying!r} was given.", "Gains vary along the plan, True, or are frozen, False.", do="Give one."
+            f"varying={varying!r} was given.", "It is True (along the plan) or False (frozen time).", value=varying
         )
     reference = Reference(plan, plant, rate)
     refuse_transport(plant, "The design is")
@@ -74,7 +83,8 @@ def lqr(plan, plant, rate=100.0, Q=None, R=None, integral=None, varying=True):
     A, B = discretised(*reference.linearised(), reference.period)
     augmented = _with_integrals(A, B, Q, residuals, Q_i, reference) if residuals else (A, B, Q)
     basis = tangents(reference, 0 if residuals is None else len(Q_i))
-    K, radii = _gains(*augmented, R, basis, varying)
+    K = _varying(*augmented, R, basis) if varying else steady(*augmented, R, basis)[0]
+    radii = spectral_radii(_reduced(augmented[0] - augmented[1] @ K, basis))
     K_x, K_i = np.split(K, [plant.n_x], axis=2)
     integrated = residuals.names if residuals else ()
     how = f"lqr, {'time-varying' if varying else 'frozen-time'}" + (", with integrals" if residuals else "")
@@ -94,12 +104,6 @@ def _state_weights(plant):
     return diagonal
 
 
-def _gains(A, B, Q, R, basis, varying):
-    """K (N, m, n) along the plan or frozen at each sample, and the spectral radii of A - B K, (N,)."""
-    K = _varying(A, B, Q, R, basis) if varying else steady(A, B, Q, R, basis)[0]
-    return K, spectral_radii(_reduced(A - B @ K, basis))
-
-
 def _with_integrals(A, B, Q, residuals, Q_i, reference):
     """The plant with z+ = z + Ts φ, φ = C δx among its states."""
     (count, n, m), k = B.shape, len(Q_i)
@@ -111,7 +115,7 @@ def _with_integrals(A, B, Q, residuals, Q_i, reference):
 
 
 def tangents(reference, extra=0):
-    """Orthonormal bases of the states that material constraints allow, (N, n, r); None without any."""
+    """Orthonormal bases of the tangent spaces of material constraints, (N, n, r); None without constraints."""
     plant = reference.plant
     if not plant.constrained:
         return None
@@ -126,18 +130,16 @@ def tangents(reference, extra=0):
 
 
 def _reduced(A, basis):
-    """TᵀAT: error dynamics on the states that material constraints allow."""
+    """TᵀAT: error dynamics on the tangent space."""
     return A if basis is None else basis.swapaxes(1, 2) @ A @ basis
 
 
 def steady(A, B, Q, R, basis):
-    """K of the steady Riccati equation at each sample and the last P, on the tangent space where there is one.
+    """K (N, m, n) of the steady Riccati equation at each sample, and the last P (n, n).
 
-    By the structure-preserving doubling algorithm (Chu, Fan, Lin, Wang 2004) at all samples at once: step k gives the
-    solution of a horizon of 2^k samples.
-
-    A, B are (N, n, n), (N, n, m); Q, R are (n, n), (m, m); a basis of the tangent spaces is (N, n, r). Returns
-    K (N, m, n) and P (n, n).
+    The structure-preserving doubling algorithm (Chu, Fan, Lin, Wang 2004) for all samples at once: step k is the
+    solution of a horizon of 2^k samples. A, B are (N, n, n), (N, n, m); Q, R are (n, n), (m, m); the basis of the
+    tangent spaces is (N, n, r) or None.
     """
     T = np.eye(A.shape[1])[None] if basis is None else basis
     left = T.swapaxes(1, 2)
@@ -155,7 +157,7 @@ def steady(A, B, Q, R, basis):
     if not radii.max() < 1:
         raise ServoError(
             "The steady Riccati equation has no stabilising solution.",
-            "Each unstable or marginal mode is reached by the inputs and seen by the weights.",
+            "The inputs must reach, and the weights must see, each unstable or marginal mode.",
             do="Weigh all states, integrate fewer residuals than there are inputs, or choose other actuators.",
             radius=float(radii.max()),
         )
@@ -163,9 +165,9 @@ def steady(A, B, Q, R, basis):
 
 
 def _varying(A, B, Q, R, basis):
-    """The Riccati equation backwards along the plan, from the steady solution at its end, whose gains then hold.
+    """The Riccati equation backwards along the plan, from the steady solution at its end.
 
-    Where there is none, as for a spin that no input reaches, from a horizon beyond the end that is as long as the plan.
+    If there is none, as for a spin that no input reaches, from a horizon after the end that is as long as the plan.
     """
     count = len(A)
     K = np.empty((count, B.shape[2], A.shape[1]))
@@ -184,51 +186,55 @@ def _varying(A, B, Q, R, basis):
 
 
 def _riccati(A, B, Q, R, P):
-    """The gain of one sample, and the cost P one sample earlier."""
+    """The gain of one sample, and P one sample earlier."""
     PB = P @ B
     K = np.linalg.solve(R + B.T @ PB, PB.T @ A)
     P = Q + A.T @ P @ (A - B @ K)
     return K, (P + P.T) / 2
 
 
-def weights(given, default, names, what, symbol, positive=False):
+def weights(values, default, names, what, symbol, positive=False):
     """A weight matrix, (n, n), from a number, numbers by name, a diagonal or a matrix.
 
-    `default` is a diagonal; `what` the names' meaning, `symbol` the matrix's name in messages; `positive` refuses what
-    is only semidefinite.
+    `default` is a diagonal; `what` the names stand for, `symbol` the matrix's name in messages; `positive` refuses a
+    matrix that is only semidefinite.
     """
     n, entries = len(names), np.array(default, dtype=float)
-    if isinstance(given, dict):
-        for name, weight in numbers_by_name(given, names, what, "weight").items():
+    if isinstance(values, dict):
+        for name, weight in numbers_by_name(values, names, what, "weight").items():
             entries[names.index(name)] = weight
-    elif given is not None:
+    elif values is not None:
         try:
-            entries = np.asarray(given, dtype=float)
+            entries = np.asarray(values, dtype=float)
         except (TypeError, ValueError):
             entries = np.empty((0, 0))
         entries = np.full(n, float(entries)) if entries.ndim == 0 else entries
     matrix = np.diag(entries) if entries.shape == (n,) else entries
     if matrix.shape != (n, n):
         raise SpecificationError(
-            f"{symbol} has the shape {entries.shape}." if entries.size else f"{symbol} is {given!r}."[:200],
+            f"{symbol} has the shape {entries.shape}." if entries.size else f"{symbol} is {values!r}."[:200],
             f"It is a number, {n} numbers or an ({n}, {n}) matrix, for {', '.join(names)}; or numbers by name.",
-            do="Give one weight each.",
+            do=f"Pass one weight for each {what}.",
+            name=symbol,
             shape=entries.shape,
+            names=names,
         )
     symmetric = np.isfinite(matrix).all() and np.allclose(matrix, matrix.T, rtol=1e-9, atol=0)
     least = np.linalg.eigvalsh(matrix).min(initial=np.inf) if symmetric else -np.inf
     scale = np.abs(matrix).max(initial=0.0) if symmetric else 1.0
     if least < (1e-14 if positive else -1e-12) * max(scale, 1e-300):
         raise SpecificationError(
-            f"{symbol} is {np.array2string(np.asarray(given), threshold=9)}.",
-            f"It is symmetric and positive {'definite' if positive else 'semidefinite'}.",
-            do="Give positive weights.",
+            f"{symbol} is {np.array2string(np.asarray(values), threshold=9)}.",
+            f"It is finite, symmetric and positive {'definite' if positive else 'semidefinite'}.",
+            do="Pass positive weights.",
+            name=symbol,
+            least=float(least),
         )
     return matrix
 
 
 def _integrals(integral, plan, plant):
-    """Which residuals are integrated, and their weights; (None, None) without any."""
+    """The integrated residuals and their weights; (None, None) without integrals."""
     integral = bool(integral) if isinstance(integral, np.bool_) else integral
     if integral is None or integral is False or (isinstance(integral, dict) and not integral):
         return None, None
@@ -238,6 +244,7 @@ def _integrals(integral, plan, plant):
             "The program has no residual of order 0 or 1.",
             "A residual that is fed back is a function of the state (q, γ').",
             do="Leave out integral.",
+            names=tuple(plan.model.reduction.program.residuals),
         )
     weighted = None if integral is True else integral
     names = residuals.names

@@ -1,7 +1,10 @@
-"""Output feedback: a Kalman filter along the plan estimates what is not measured."""
+"""Output feedback: a Kalman filter along the plan estimates the state from some measured entries."""
+
+from collections.abc import Mapping
 
 import casadi as ca
 import numpy as np
+from numpy.typing import ArrayLike
 
 from servoctl.checks import numbers_by_name
 from servoctl.control.feedback import integral_names, integration, law_step
@@ -11,17 +14,18 @@ from servoctl.control.reference import Reference, refuse_transport, require_plan
 from servoctl.control.residuals import Residuals
 from servoctl.control.sampling import discretised, spectral_radii
 from servoctl.errors import ServoError, SpecificationError
+from servoctl.plants.plant import Plant
 
 POSITION_NOISE, VELOCITY_NOISE = 1e-3, 1.0  # per √s, of coordinates and velocities
 
 
 def estimating_law(states, where, n_u, residuals=None):
-    """An affine law on an estimated state.
+    """The step of affine feedback on an estimated state.
 
     δx⁺ = δx̂ + L (y - y_ref - C δx̂),  u = u_ff - K δx⁺ - K_i z,  δx̂+ = A δx⁺ + B δu,  z+ = z + Ts φ(t, x_ref + δx⁺).
 
-    Its schedule has the columns [u_ff; x_ref; K, K_i, L, A, B row by row; Ts; parameters of φ]; `states` are those of
-    the plant, of which those at `where` are measured; `residuals` are integrated in z.
+    Columns of the schedule are [u_ff; x_ref; K, K_i, L, A, B row by row; Ts; parameters of φ]. `states` are those of
+    the plant, `where` the indices of the measured ones; z integrates the residuals φ.
     """
     n_x, n_y, n_z = len(states), len(where), len(residuals.names) if residuals else 0
     t, y, estimate, z = (ca.SX.sym("t"), *(ca.SX.sym(s, n) for s, n in (("y", n_y), ("e", n_x), ("z", n_z))))
@@ -31,20 +35,25 @@ def estimating_law(states, where, n_u, residuals=None):
     K, K_i, L, A, B = (matrix.T for matrix in symbols.values())
     corrected = estimate + L @ (y - x_ref[where] - estimate[where])
     du = -K @ corrected - K_i @ z
-    row = [u_ff, x_ref, *map(ca.vec, symbols.values())]
+    column = [u_ff, x_ref, *map(ca.vec, symbols.values())]
     outputs = [u_ff + du, A @ corrected + B @ du]
     if n_z:
         period, p = ca.SX.sym("Ts"), ca.SX.sym("p", residuals.parameters.size)
-        row += [period, p]
+        column += [period, p]
         outputs.append(z + period * residuals.expression(t, x_ref + corrected, states, p))
-    return law_step("estimating", t, ca.vertcat(y, estimate, z), ca.vertcat(*row), outputs)
+    return law_step("estimating", t, ca.vertcat(y, estimate, z), ca.vertcat(*column), outputs)
 
 
-def output_feedback(law, plant, noise, process=None):
-    """The feedback of an LQR on a state that is estimated from some measured entries by a Kalman filter.
+def output_feedback(
+    law: Law,
+    plant: Plant,
+    noise: Mapping[str, float],
+    process: ArrayLike | Mapping[str, float] | None = None,
+) -> Law:
+    """The feedback of an LQR on a state that a Kalman filter estimates from some measured entries.
 
-    At each sample the prediction of the state's deviation from the plan is corrected by the measurement, fed back, and
-    predicted on by the plant linearised along the plan: δx⁺ = δx̂ + L (δy - C δx̂), u = u_ff - K δx⁺ - K_i z,
+    At each sample the measurement corrects the predicted deviation from the plan, the gains act on it, and the plant
+    linearised along the plan predicts the next one: δx⁺ = δx̂ + L (δy - C δx̂), u = u_ff - K δx⁺ - K_i z,
     δx̂ = A δx⁺ + B δu. The filter's covariance follows the discrete Riccati equation along the plan, from the steady
     solution at its start.
 
@@ -53,13 +62,13 @@ def output_feedback(law, plant, noise, process=None):
     law : Law
         Made by `lqr` for the same plant.
     plant : Plant
-        What the controller believes of the machine.
+        The controller's model of the machine.
     noise : dict of str to float
-        Standard deviation of the noise of each measured state, by name: only these are measured.
+        Standard deviation of the measurement noise by measured state. Other states are not measured.
     process : float, dict of str to float, or (n_x,) or (n_x, n_x) array, optional
-        Intensity of what disturbs each state: variance that it gathers per second; by name for those that differ from
-        the defaults, 1e-6 for coordinates and 1 for velocities (unknown accelerations of about 1 m/s² or rad/s² that
-        change within a second: model errors and gusts of cranes and arms).
+        Intensity of the process noise: variance that each state gathers per second, by name for some of them. Default:
+        1e-6 for coordinates and 1 for velocities, i.e. unknown accelerations of about 1 m/s² or rad/s² that change
+        within a second, as by model errors and gusts of cranes and arms.
 
     Returns
     -------
@@ -68,11 +77,11 @@ def output_feedback(law, plant, noise, process=None):
     Raises
     ------
     NameUnknown
-        For noise of no state of the plant.
+        For noise of an unknown state.
     SpecificationError
-        If the law is no LQR's, or nothing is measured.
+        If the law is not made by `lqr`, or nothing is measured.
     ServoError
-        If the measured states do not tell the others: a mode that they do not see does not decay.
+        If a mode that the measured states do not see does not decay.
     """
     _require_lqr(law, plant)
     measured, deviations = _deviations(noise, plant)
@@ -94,18 +103,15 @@ def output_feedback(law, plant, noise, process=None):
     return Law(
         name=f"{law.name}, output feedback", measures=measured, inputs=plant.inputs, rate=law.rate, t0=law.t0,
         step=estimating_law(plant.state_names, where, len(plant.inputs), residuals), schedule=np.vstack(schedule),
-        state=np.zeros(n_x + n_z), state_names=_state_names(plant, gains.residuals), idle=law.idle, plan=law.plan,
+        state=np.zeros(n_x + n_z), initial_input=law.initial_input, plan=law.plan,
+        state_names=(*(f"estimated error of {name}" for name in plant.state_names), *integral_names(gains.residuals)),
         info=law.info | {"spectral radius of the filter": float(spectral_radii(errors).max())},
         integrators=tuple(range(n_x, n_x + n_z)), feedback=gains, input_matrix=input_matrix,
     )  # fmt: skip
 
 
-def _state_names(plant, residuals):
-    return (*(f"estimated error of {name}" for name in plant.state_names), *integral_names(residuals))
-
-
 def _process_noise(plant):
-    """The default intensity by state: of coordinates and velocities, none of lagged inputs."""
+    """The default intensity by state; 0 for lagged inputs."""
     n_x, lagged, n = plant.n_x, len(plant.lag), len(plant.disturbable)
     intensity = np.zeros(n_x)
     intensity[: n_x - lagged] = POSITION_NOISE**2
@@ -114,19 +120,20 @@ def _process_noise(plant):
 
 
 def _require_lqr(law, plant):
-    """Refuse a law that has no gains on the states of this plant, or estimates or allocates already."""
+    """Refuse a law without gains on the states of this plant, or with an estimator or an allocation."""
     require_plant(plant)
     if not isinstance(law, Law) or law.feedback is None or law.input_matrix is not None or law.allocation:
         raise SpecificationError(
-            f"The law {getattr(law, 'name', law)!r} is no LQR's on the state.",
-            "Output feedback replaces the state by an estimate.",
-            do="Give the law that sv.lqr made.",
+            f"The law {getattr(law, 'name', law)!r} has no feedback of the measured state.",
+            "Output feedback applies the gains of an LQR to an estimated state.",
+            do="Pass the law of sv.lqr.",
+            name=getattr(law, "name", None),
         )
     if law.feedback.states != plant.state_names:
         raise SpecificationError(
             f"The law has gains on {', '.join(law.feedback.states)}.",
             f"The plant has the states {', '.join(plant.state_names)}.",
-            do="Make law and estimator for the same plant, lagging actuators included.",
+            do="Design law and estimator for the same plant, lagging actuators included.",
             states=law.feedback.states,
             valid=plant.state_names,
         )
@@ -134,7 +141,7 @@ def _require_lqr(law, plant):
 
 
 def _onto(basis, A, B):
-    """A and B followed by the projection onto what material constraints allow at the next sample."""
+    """A and B, projected onto the tangent space of the material constraints at the next sample."""
     if basis is None:
         return A, B
     T = basis[np.minimum(np.arange(len(A)) + 1, len(A) - 1)]
@@ -146,15 +153,16 @@ def _deviations(noise, plant):
     deviations = numbers_by_name(noise, plant.state_names, "state of the plant", "standard deviation", positive=True)
     if not deviations:
         raise SpecificationError(
-            "No noise was given.",
-            "The states whose noise is given are those that are measured.",
-            do='Name the measured states: {"x": 1e-3}.',
+            "No state has a noise.",
+            "States with a standard deviation are measured, no others.",
+            do='Name the measured states: noise={"x": 1e-3}.',
+            names=plant.state_names,
         )
     return tuple(deviations), np.array(list(deviations.values()))
 
 
 def _filter(A, C, W, V, basis):
-    """Gains L (N, n_x, n_y) of the filter along the plan, the covariance in the basis of each sample."""
+    """Gains L (N, n_x, n_y) of the filter along the plan; covariances are in the basis of each sample."""
     from scipy.linalg import solve_discrete_are
 
     count, n_x = len(A), A.shape[1]
@@ -166,8 +174,9 @@ def _filter(A, C, W, V, basis):
     except (np.linalg.LinAlgError, ValueError) as error:
         raise ServoError(
             f"The filter's Riccati equation has no stabilising solution ({error}).",
-            "Each mode that does not decay by itself is seen by the measured states.",
-            do="Measure more states: velocities alone do not tell where a machine is.",
+            "The measured states must see each mode that does not decay.",
+            do="Measure more states; velocities alone do not determine the position.",
+            measured=len(C),
         ) from error
     L = np.empty((count, n_x, len(C)))
     for k in range(count):

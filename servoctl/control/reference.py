@@ -1,4 +1,4 @@
-"""The reference of a law: a plan at the instants of sampling, with what the plant's linearisation is there."""
+"""The reference of a law: a plan at the sampling instants, with the plant's linearisation about it."""
 
 from dataclasses import replace
 from math import factorial, perm
@@ -11,22 +11,11 @@ from servoctl.plants.plant import Plant
 
 
 class Reference:
-    """A plan at the instants of sampling: states, inputs, linearisations; refused where plan and plant do not fit.
+    """States, inputs and linearisations at the sampling instants of a plan; plan and plant must have the same names.
 
-    Attributes
-    ----------
-    rate : float
-        [Hz]
-    t : (N,) array
-        t_k = t0 + k/rate within the plan [s].
-    x : (n_x, N) array
-        The plant's states there.
-    middle : (N,) array
-        Middles of the samples, no later than the plan's end [s].
-    middle_x, middle_input : (n_x, N), (m, N) arrays
-        States and plan's actuation there.
-    idle : (m,) array
-        The plan's first actuation.
+    t (N,) are the sampling instants t0 + k/rate within the plan [s], x (n_x, N) the states there; middle (N,) are the
+    middles of the samples up to the plan's end, middle_x (n_x, N) and middle_input (m, N) the states and the plan's
+    actuation there; initial_input (m,) is the plan's first actuation.
     """
 
     def __init__(self, plan, plant, rate):
@@ -36,19 +25,21 @@ class Reference:
         count = np.floor((plan.t[-1] - plan.t[0]) * self.rate * (1 + 1e-12) + 1e-9)
         if count < 1:
             raise SpecificationError(
-                f"The plan lasts {plan.t[-1] - plan.t[0]:g} s, and is sampled every {period:g} s.",
-                "A plan that is followed is at least one sample long.",
+                f"The plan lasts {plan.t[-1] - plan.t[0]:g} s, a sample {period:g} s.",
+                "A plan is at least one sample long.",
                 nearest=f"rate={1 / (plan.t[-1] - plan.t[0]):.4g}.",
                 do="Raise the rate, or simulate a longer plan.",
+                duration=float(plan.t[-1] - plan.t[0]),
+                period=period,
             )
-        matrices = 2 * (plant.n_x + len(plant.inputs)) ** 2  # linearisations, and the same from sample to sample
+        matrices = 2 * (plant.n_x + len(plant.inputs)) ** 2  # linearisations in continuous and in discrete time
         require_memory(count, matrices, f"The plan of {plan.t[-1] - plan.t[0]:g} s is sampled at {self.rate:g} Hz")
         self.t = plan.t[0] + np.arange(int(count) + 1) * period
         self.period, self.end = period, plan.t[-1]
         self.x = self._states(self.t)
         self.middle = np.minimum(self.t + period / 2, self.end)
         self.middle_x, self.middle_input = self._states(self.middle), self._actuation(self.middle)
-        self.idle = self._actuation(self.t[:1])[:, 0]
+        self.initial_input = self._actuation(self.t[:1])[:, 0]
 
     def _actuation(self, t):
         run = resampled(self.plan, np.minimum(t, self.end))
@@ -60,31 +51,25 @@ class Reference:
 
     def inputs(self):
         """The command of each sample, (m, N): the actuation in its middle, with lag and transport delay inverted."""
-        return self._commands(self.period / 2)
+        return self._commands(0.0, self.period / 2)
 
-    def ahead(self, late=0):
-        """By how much the command in the middle of the time for which it is held exceeds that at each sample, (m, N).
+    def ahead(self, delay=0):
+        """Commands in the middle of the hold, `delay` samples late, minus those at the samples, (m, N)."""
+        change = self._commands(delay * self.period, self.period / 2) - self._commands(0.0, 0.0)
+        change[:, -1] = 0.0
+        return change
 
-        Parameters
-        ----------
-        late : int
-            Samples from the measurement to the input: that of the sample k is held from the sample k + late on.
-        """
-        exceeding = self._commands(self.period / 2, late * self.period) - self._commands(0.0)
-        exceeding[:, -1] = 0.0
-        return exceeding
-
-    def _commands(self, into, late=0.0):
-        """Commands for the plan's actuation a time into each hold that begins `late` after its sample [s], (m, N)."""
-        return np.array([self._command(a, name, into, late) for a, name in enumerate(self.plant.inputs)])
-
-    def _command(self, a, name, into, late):
-        at = self.t + self.plant.delay.get(name, 0.0) + late + into
-        u = self._actuation(at)[a]
-        return u + self.plant.lag[name] * self._slope(at)[a] if name in self.plant.lag else u
+    def _commands(self, late, into):
+        """Commands for the plan's actuation at a time `into` a hold that begins `late` after its sample [s], (m, N)."""
+        lag, commands = self.plant.lag, []
+        for a, name in enumerate(self.plant.inputs):
+            at = self.t + self.plant.delay.get(name, 0.0) + late + into
+            u = self._actuation(at)[a]
+            commands.append(u + lag[name] * self._slope(at)[a] if name in lag else u)
+        return np.array(commands)
 
     def _slope(self, t):
-        """du/dt of the plan's actuation, (m, N), by central differences over a sample as far as the plan reaches."""
+        """du/dt of the plan's actuation, (m, N), by central differences over a sample, within the plan."""
         low, high = (np.clip(t + side, self.t[0], self.end) for side in (-self.period / 2, self.period / 2))
         span = high - low
         known = span > ON_SAMPLE * self.period
@@ -97,25 +82,26 @@ class Reference:
         if lost.any():
             raise ServoError(
                 f"The plant's linearisation is not finite at t = {self.middle[lost][0]:.6g} s of the plan.",
-                "Laws of linear feedback are designed where forces have finite slopes.",
-                do="Design for a plant with a smooth force, tanh(v/0.01) for sign(v); close the loop with the other.",
+                "Linear feedback needs forces with finite slopes along the plan.",
+                do="Design for a plant with a smooth force, tanh(v/0.01) for sign(v), and close the loop with sign(v).",
                 t=float(self.middle[lost][0]),
             )
         return A, B
 
 
 def require_plant(plant):
-    """Refuse what is no plant."""
+    """Refuse anything but a Plant."""
     if not isinstance(plant, Plant):
         raise SpecificationError(
-            f"A {type(plant).__name__} was given as plant.",
-            "Laws are designed for a plant, and a loop is closed around one.",
+            f"Expected a Plant, got a {type(plant).__name__}.",
+            "Laws are designed for plants, and loops are closed around them.",
             do="Make the plant of the mechanism: sv.plant(mechanism).",
+            kind=type(plant).__name__,
         )
 
 
 def refuse_transport(plant, what):
-    """Refuse a transport delay where a law's design knows none."""
+    """Refuse a plant with transport delay; `what` begins the rule: "The design is"."""
     if plant.delay:
         raise SpecificationError(
             f"The plant has a transport delay of {max(plant.delay.values()):g} s.",
@@ -126,35 +112,38 @@ def refuse_transport(plant, what):
 
 
 def require_plan(plan, plant):
-    """Refuse a plan that is none, or that names what the plant lacks."""
+    """Refuse anything but a run with its model, forward in time, by actuators, with the names of the plant."""
     require_plant(plant)
     model = getattr(plan, "model", None)
     if model is None or not hasattr(plan, "jets"):
         raise SpecificationError(
-            f"A {type(plan).__name__}{' without its model' if hasattr(plan, 'jets') else ''} was given as plan.",
-            "A law is made from a run of sv.simulate, which interpolates between its samples.",
-            do="Simulate the plan here; a loaded run has no model.",
+            f"The plan is a {type(plan).__name__}{' without its model' if hasattr(plan, 'jets') else ''}.",
+            "A plan is a run of sv.simulate; its model interpolates between samples.",
+            do="Simulate the plan; a loaded run has no model.",
+            kind=type(plan).__name__,
         )
     if len(plan.t) < 2 or plan.t[-1] <= plan.t[0] or not np.isfinite(plan.jets).all():
         raise SpecificationError(
             f"The plan has {len(plan.t)} samples from t = {plan.t[0]:g} to {plan.t[-1]:g} s.",
-            "A plan that is followed goes forward in time, through finite states.",
+            "A plan goes forward in time, through finite states.",
             do="Simulate it over (t0, t1) with t1 > t0.",
+            samples=len(plan.t),
+            t_span=(float(plan.t[0]), float(plan.t[-1])),
         )
     if model.ideal:
         raise NotRealisable(
             "The plan is realised by an ideal reaction.",
             "A law commands actuators.",
-            do='Derive Program(..., by="actuators"), and simulate that plan.',
+            do='Derive the program with by="actuators", and simulate that plan.',
         )
     state_names = plan.jet_names[: model.nq + model.n]
-    for given, valid, what in (
+    for names, valid, what in (
         (state_names, plant.state_names, "state of the plant"),
         (model.actuators, plant.inputs, "actuator of the plant"),
         (plant.state_names[: plant.n_x - len(plant.lag)], state_names, "state of the plan"),
         (plant.inputs, model.actuators, "actuator of the plan"),
     ):
-        for name in given:
+        for name in names:
             if name not in valid:
                 raise unknown(name, valid, what)
 

@@ -1,4 +1,4 @@
-"""Residuals of a program as functions of a plant's state, by name."""
+"""Residuals of a program as functions of a plant's state, matched by name."""
 
 import casadi as ca
 import numpy as np
@@ -8,29 +8,20 @@ from servoctl.errors import SpecificationError, unknown
 
 
 class Residuals:
-    """Residuals of a program as functions of a plant's state, matched by name.
+    """Residuals of a model's program at the states and parameters of a plant.
 
-    Parameters
-    ----------
-    model : Model
-        Of the plan.
-    plant : Plant
-        Its states and parameters are used: what the controller believes of the machine.
-    names : sequence of str, optional
-        Which residuals; default all whose order allows it.
-    order : int
-        The highest: 1 for functions of the state (q, γ'), 2 where accelerations follow it.
+    `names` selects some; `order` is the highest: 1 for functions of the state (q, γ'), 2 with accelerations.
 
     Attributes
     ----------
     names, orders : tuple
-        Of the residuals, and of their highest derivatives.
+        Names and orders of the residuals.
     expressions, symbols : SX, list of SX
-        The residuals, and the parameters in them.
+        The residuals, and the parameters on which they depend.
     parameters : (n_p,) array
-        Numbers of these.
+        The plant's numbers of these parameters.
     measures : tuple of str
-        The states in them.
+        The states on which the residuals depend.
     """
 
     def __init__(self, model, plant, names=None, order=1):
@@ -47,6 +38,7 @@ class Residuals:
                     nearest=", ".join(repr(n) for n, order in orders.items() if order <= 1),
                     do="Leave it out.",
                     name=name,
+                    order=orders[name],
                 )
         self.names = tuple(name for name in orders if orders[name] <= order and (names is None or name in names))
         self.orders = tuple(max(orders[name], 0) for name in self.names)
@@ -83,17 +75,16 @@ class Residuals:
         return self._built[key]
 
     def _ordered(self, x):
-        """States, and accelerations where they are given, in the plan's order, from an array in the plant's."""
+        """States (and accelerations, for order 2) in the plan's order, from an array in the plant's order."""
         names = (*self._q.names, *(name for k in range(self._order) for name in self._q.jet_names(k + 1)))
         columns = (*self._plant.state_names, *self._plant.mechanism.q.jet_names(2))
         rows = [columns.index(name) if name in columns else -1 for name in names]
         return np.where(np.array(rows)[:, None] < 0, 0.0, x[rows])
 
     def levels(self, t, x):
-        """Residuals and those of their derivatives that the state decides.
+        """Residuals, and the derivative of those of order 0: (2, N) and (1, N) arrays by name.
 
-        By name, (levels, N) arrays along states x (n_x, N) of the plant at t (N,); for residuals of order 2 with
-        accelerations behind the states. Two levels for a residual of order 0, one for the others.
+        `x` (n_x, N) are states of the plant at t (N,); for order 2 with accelerations below the states.
         """
 
         def outputs(_state):
@@ -123,6 +114,25 @@ class Residuals:
             if name in self._plant.state_names:
                 jacobian[:, :, self._plant.state_names.index(name)] = values[:, :, i]
         return jacobian
+
+
+def in_symbols_of(plant, model):
+    """The residuals of a model's program as expressions of the plant's symbols, by name.
+
+    Equal mechanisms, such as copies that were pickled apart, have different symbols of the same names.
+    """
+    program, mechanism = model.reduction.program, model.reduction.mechanism
+    if mechanism.q is plant.mechanism.q and mechanism.parameters is plant.mechanism.parameters:
+        return dict(program.residuals)
+    new = {symbol.name(): symbol for symbol in _symbols(plant.mechanism)}
+    old = [symbol for symbol in _symbols(mechanism) if symbol.name() in new]
+    values = ca.vertcat(*(new[symbol.name()] for symbol in old))
+    return {name: ca.substitute(e, ca.vertcat(*old), values) for name, e in program.residuals.items()}
+
+
+def _symbols(mechanism):
+    q = mechanism.q
+    return [q.t, *q, *q.gamma(1), *q.gamma(2), *mechanism.parameters.symbols]
 
 
 def _depends(expression, symbol):

@@ -1,39 +1,49 @@
 """The run of a closed loop, by name."""
 
-from dataclasses import dataclass
+import pickle
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
 from functools import cached_property
 
 import numpy as np
 
 from servoctl.checks import ON_SAMPLE, finite
+from servoctl.control.conditions import Conditions
+from servoctl.control.law import Law, UserStep
+from servoctl.control.loop import Loop
 from servoctl.control.reference import resampled
 from servoctl.control.residuals import Residuals
 from servoctl.errors import SpecificationError, unknown
+from servoctl.plants.plant import Plant
 from servoctl.run import Run
+from servoctl.values import Value
 
 NONE, LOWER, UPPER, FALLING, RISING = 0, -1, 1, -2, 2  # which limit an input has met
 
 
 @dataclass(frozen=True, eq=False)
-class Closed:
+class Closed(Value):
     """The motion of a plant under a law; made by `close`.
 
-    `run["theta"]`, `run["dtheta"]`, `run["d2theta"]`, `run["trolley"]` are (N,) arrays at the samples, SI: what an
-    actuator does; with a lag that is a state. `run.residual["X"]` is (levels, N).
+    `run["theta"]`, `run["dtheta"]`, `run["d2theta"]`, `run["trolley"]` are (N,) arrays at the samples, SI. The
+    signal of an actuator is its force or torque; with a lag that is a state. `run.residual["X"]` is (levels, N).
 
     Attributes
     ----------
     t : (N,) array
         [s]
     states : (n_x, N) array
-        Of the plant, with the names `plant.state_names`.
-    inputs, commands : (m, N) arrays
-        What the actuators were given from each sample on, within their limits; what the law commanded there.
+        States of the plant, in the order of `plant.state_names`.
+    inputs : (m, N) array
+        Inputs from each sample on, after delay and limits.
+    commands : (m, N) array
+        Commands of the law.
     measurements, controller_states, signals : (n_y, N), (n_z, N), (n_s, N) arrays
-        With the names of `law.measures`, `law.state_names`, `law.signals`.
+        In the order of `law.measures`, `law.state_names` and `law.signals`.
     plant : Plant
     law : Law
     plan : Run or None
+        The reference trajectory.
     loop : Loop
         The numbers of the loop.
     conditions : Conditions
@@ -51,33 +61,33 @@ class Closed:
     measurements: np.ndarray
     controller_states: np.ndarray
     signals: np.ndarray
-    plant: object
-    law: object
-    plan: object
-    loop: object
-    conditions: object
+    plant: Plant
+    law: Law
+    plan: Run | None
+    loop: Loop
+    conditions: Conditions
     success: bool = True
     status: int = 0
     message: str = ""
 
-    @property
-    def names(self):
-        """Names of all signals."""
-        p = self.plant
-        accelerations = p.mechanism.q.jet_names(2)
-        return tuple(dict.fromkeys([*p.state_names, *p.inputs, *accelerations, *p.mechanism.outputs, "energy"]))
+    @cached_property
+    def _kinds(self):
+        """Names of the evaluated signals, by the function of the plant that evaluates them."""
+        mechanism = self.plant.mechanism
+        return {"accelerations": mechanism.q.jet_names(2), "outputs": tuple(mechanism.outputs), "power": ("energy",)}
 
-    def __getitem__(self, name):
-        p = self.plant
-        if name in p.state_names:
-            return self.states[p.state_names.index(name)]
-        if name in p.inputs:
-            return self.inputs[p.inputs.index(name)]
-        for kind, names in (
-            ("accelerations", p.mechanism.q.jet_names(2)),
-            ("outputs", tuple(p.mechanism.outputs)),
-            ("power", ("energy",)),
-        ):
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of all signals."""
+        evaluated = (name for names in self._kinds.values() for name in names)
+        return tuple(dict.fromkeys([*self.plant.state_names, *self.plant.inputs, *evaluated]))
+
+    def __getitem__(self, name: str) -> np.ndarray:
+        if name in self.plant.state_names:
+            return self.states[self.plant.state_names.index(name)]
+        if name in self.plant.inputs:
+            return self.inputs[self.plant.inputs.index(name)]
+        for kind, names in self._kinds.items():
             if name in names:
                 return self._evaluated(kind)[names.index(name)]
         raise unknown(name, self.names, "signal")
@@ -93,18 +103,13 @@ class Closed:
 
     @cached_property
     def p(self):
-        """The plant's parameters, inputs as they arrive after transport, and disturbances at each sample, (n_p, N)."""
-        return self.plant.p(self._arriving, self._disturbances)
-
-    @cached_property
-    def _arriving(self):
-        """Inputs as they reach the plant at each sample, after transport, (m, N)."""
+        """The plant's parameters, inputs after the transport delay, and disturbances at each sample, (n_p, N)."""
         loop, inputs = self.loop, self.inputs.copy()
         if loop.transport is not None:
             for a, late in enumerate(loop.transport):
                 sent = (np.arange(len(self.t)) * loop.substeps - late) // loop.substeps
-                inputs[a] = np.where(sent < 0, loop.idle[a], self.inputs[a, np.maximum(sent, 0)])
-        return inputs
+                inputs[a] = np.where(sent < 0, loop.initial_input[a], self.inputs[a, np.maximum(sent, 0)])
+        return self.plant.p(inputs, self._disturbances)
 
     @cached_property
     def _disturbances(self):
@@ -117,59 +122,55 @@ class Closed:
         return forces
 
     @property
-    def measured(self):
-        """What the law measured, by name: (N,) arrays with noise and quantisation."""
+    def measured(self) -> dict[str, np.ndarray]:
+        """Measurements with noise and quantisation, (N,) by state."""
         return dict(zip(self.law.measures, self.measurements, strict=True))
 
     @property
-    def command(self):
-        """What the law commanded at each sample, by actuator."""
+    def command(self) -> dict[str, np.ndarray]:
+        """Commands of the law, (N,) by actuator."""
         return dict(zip(self.plant.inputs, self.commands, strict=True))
 
     @property
-    def input(self):
-        """What each actuator was given from each sample on: the command after delay and limits."""
+    def input(self) -> dict[str, np.ndarray]:
+        """Inputs from each sample on, (N,) by actuator: commands after delay and limits."""
         return dict(zip(self.plant.inputs, self.inputs, strict=True))
 
     @property
-    def disturbance(self):
-        """Disturbances right after each sample, by generalised force."""
+    def disturbance(self) -> dict[str, np.ndarray]:
+        """Disturbances right after each sample, (N,) by generalised force."""
         return dict(zip(self.plant.disturbable, self._disturbances, strict=True))
 
     @property
-    def signal(self):
-        """Controller states and further signals of the law at each sample, by name."""
+    def signal(self) -> dict[str, np.ndarray]:
+        """Controller states and further signals of the law at each sample, (N,) by name."""
         names = (*self.law.state_names, *self.law.signals)
         return dict(zip(names, (*self.controller_states, *self.signals), strict=True))
 
     @property
-    def active(self):
-        """Which limit each input met, by actuator: (N,) of -1 lower, 1 upper, -2 and 2 of its rate, 0 none."""
-        late, loop, codes = self._late, self.loop, {}
-        before = np.column_stack([loop.idle, self.inputs[:, :-1]])
+    def active(self) -> dict[str, np.ndarray]:
+        """The limit that each input has met, (N,) by actuator: -1 lower, 1 upper, -2 and 2 of its rate, 0 none."""
+        loop, codes = self.loop, {}
+        k = np.arange(len(self.t)) - loop.delay
+        delayed = np.where(k < 0, loop.initial_input[:, None], self.commands[:, np.maximum(k, 0)])
+        before = np.column_stack([loop.initial_input, self.inputs[:, :-1]])
         for a, name in enumerate(self.plant.inputs):
-            code = np.zeros(len(self.t), dtype=int)
-            wanted = late[a]
+            code, command = np.zeros(len(self.t), dtype=int), delayed[a]
             if loop.low is not None:
-                code[wanted < loop.low[a]], code[wanted > loop.high[a]] = LOWER, UPPER
-                wanted = np.clip(wanted, loop.low[a], loop.high[a])
+                code[command < loop.low[a]], code[command > loop.high[a]] = LOWER, UPPER
+                command = np.clip(command, loop.low[a], loop.high[a])
             if loop.change is not None:
-                code[wanted > before[a] + loop.change[a]], code[wanted < before[a] - loop.change[a]] = RISING, FALLING
+                code[command > before[a] + loop.change[a]] = RISING
+                code[command < before[a] - loop.change[a]] = FALLING
             codes[name] = code
         return codes
 
-    @property
-    def _late(self):
-        """Commands when they reach the limits, after the delay, (m, N)."""
-        k = np.arange(len(self.t)) - self.loop.delay
-        return np.where(k < 0, self.loop.idle[:, None], self.commands[:, np.maximum(k, 0)])
-
     @cached_property
-    def residual(self):
-        """Residuals of the plan's program, with the derivatives that the state decides, and of material constraints.
+    def residual(self) -> Mapping[str, np.ndarray]:
+        """Residuals of the plan's program and of material constraints, (levels, N) by name.
 
-        By name; (levels, N) arrays at the plant's states and parameters. Residuals of order 2 are those of the
-        accelerations right after each sample; residuals of higher order are left out.
+        Levels are the residual and its derivatives up to the velocities, at the plant's states and parameters. A
+        residual of order 2 is evaluated with the accelerations right after each sample; higher orders are left out.
         """
         residuals = {}
         if self.plan is not None:
@@ -181,15 +182,15 @@ class Closed:
         return residuals
 
     @cached_property
-    def error(self):
-        """States less those of the plan, by name; beyond the plan's end less its last ones. Empty without a plan."""
+    def error(self) -> Mapping[str, np.ndarray]:
+        """States minus those of the plan (after its end, minus its last ones), by name; empty without a plan."""
         if self.plan is None:
             return {}
         plan = resampled(self.plan, np.clip(self.t, self.plan.t[0], self.plan.t[-1]))
         return {name: self[name] - plan[name] for name in self.plant.state_names if name in plan.names}
 
-    def planned(self, name):
-        """A signal of the plan at the samples up to the plan's end.
+    def planned(self, name: str) -> tuple[np.ndarray, np.ndarray]:
+        """A signal of the plan at the samples up to its end.
 
         Parameters
         ----------
@@ -205,39 +206,39 @@ class Closed:
         t = self.t[self.t <= self.plan.t[-1]]
         return t, resampled(self.plan, t)[name]
 
-    def state(self, t):
+    def state(self, t: float) -> np.ndarray:
         """The state of the plant at a sample, (n_x,).
 
         Parameters
         ----------
         t : float
-            An instant of sampling [s].
+            A sampling instant [s].
 
         Raises
         ------
         SpecificationError
-            If t is no sample of this run.
+            If t is between samples, or outside the run.
         """
         t = finite("t", t, "time")
         k = int(np.argmin(np.abs(self.t - t)))
         if abs(self.t[k] - t) > ON_SAMPLE * self.loop.period:
             raise SpecificationError(
-                f"t = {t:.9g} s was given.",
-                f"The run has samples every {self.loop.period:g} s from {self.t[0]:g} to {self.t[-1]:g} s.",
+                f"t = {t:.9g} s is not a sample of the run.",
+                f"Its samples are {self.loop.period:g} s apart, from {self.t[0]:g} to {self.t[-1]:g} s.",
                 nearest=f"t = {self.t[k]:.9g} s.",
-                do="Give the instant of a sample.",
+                do="Pass a sampling instant, as of `run.t`.",
                 t=t,
+                nearest_t=float(self.t[k]),
             )
         return self.states[:, k].copy()
 
-    def to_run(self):
-        """The samples as a plain `Run`, with "command NAME" and "measured NAME" among its signals: what is saved."""
+    def to_run(self) -> Run:
+        """The samples as a plain `Run`, with the further signals "command a", "input a", "measured x" and "law z"."""
         p = self.plant
         stored = {name: self[name] for name in self.names if name not in p.state_names}
-        for what, values in (
-            ("command", self.command), ("input", self.input), ("measured", self.measured), ("law", self.signal)
-        ):  # fmt: skip
-            stored |= {f"{what} {name}": value for name, value in values.items()}
+        kinds = {"command": self.command, "input": self.input, "measured": self.measured, "law": self.signal}
+        for kind, values in kinds.items():
+            stored |= {f"{kind} {name}": value for name, value in values.items()}
         counters = {"samples": len(self.t), "substeps": self.loop.substeps, "delay": self.loop.delay}
         return Run(
             self.t, self.states, p.state_names, None, f"closed loop: {self.law.name}", "", counters, self.success,
@@ -245,7 +246,7 @@ class Closed:
         )  # fmt: skip
 
     def save(self, path):
-        """Save the run as npz, without pickle; `load` gives it back as a plain `Run`.
+        """Save the run as npz, without pickle; `load` returns it as a plain `Run`.
 
         Parameters
         ----------
@@ -264,7 +265,21 @@ class Closed:
         return self.to_run().save(path)
 
     def __reduce__(self):
-        return _same, (self.to_run(),)  # disturbances may be functions that do not pickle
+        functions = {f"disturbance of {name!r}": f for name, f in self.conditions.disturbance.items()}
+        law = self.law.step.law if self.law.allocation else self.law
+        if isinstance(law.step, UserStep):
+            functions[f"law {law.name!r}"] = law.step.function
+        for what, function in functions.items():
+            try:
+                pickle.dumps(function)
+            except Exception as error:  # pickle raises several types
+                raise SpecificationError(
+                    f"The {what} cannot be pickled: {error}.",
+                    "A closed loop travels with its law and disturbances; pickle takes functions of a module by name.",
+                    do="Use functions of a module or sv.disturbances instead of a lambda, or send run.to_run().",
+                    what=what,
+                ) from error
+        return Closed, tuple(getattr(self, f.name) for f in fields(self))
 
     def __repr__(self):
         loop = self.loop
@@ -276,13 +291,13 @@ class Closed:
         ]
         if not len(self.t):
             return "\n".join(lines)
-        worst = {name: np.abs(values[0]) for name, values in self.residual.items()}
-        if worst:
-            largest = sorted(worst, key=lambda name: -worst[name].max())[:3]
-            errors = "; ".join(f"{name} {worst[name].max():.3g}, {worst[name][-1]:.3g}" for name in largest)
-            lines.append(f"  residuals, at worst and at the end: {errors}")
+        sizes = {name: np.abs(values[0]) for name, values in self.residual.items()}
+        if sizes:
+            largest = sorted(sizes, key=lambda name: -sizes[name].max())[:3]
+            shown = "; ".join(f"{name} {sizes[name].max():.3g} / {sizes[name][-1]:.3g}" for name in largest)
+            lines.append(f"  max / final residual: {shown}")
         if self.plan is not None and self.t[-1] > self.plan.t[-1] + ON_SAMPLE * loop.period:
-            lines.append(f"  the plan ends at t = {self.plan.t[-1]:g} s: its last row is held")
+            lines.append(f"  the plan ends at t = {self.plan.t[-1]:g} s; its last sample is held")
         for name in self.plant.inputs[:5]:
             share = np.mean(self.active[name] != NONE)
             limited = f"; limited during {100 * share:.3g} % of the samples" if share else ""
@@ -290,13 +305,9 @@ class Closed:
         return "\n".join(lines[:12])
 
     def _exposure(self):
-        """The line that says what the loop was exposed to, if it was to anything."""
+        """A line of noise, quantisation, disturbances and delay, where there are any."""
         c, delay = self.conditions, self.loop.delay
         kinds = (("noise on", c.sensors.noise), ("quantised:", c.sensors.quantisation), ("disturbed:", c.disturbance))
         parts = [f"{what} {', '.join(names)}" for what, names in kinds if names]
         parts += [f"delay of {delay} sample{'s' * (delay > 1)}"] * bool(delay)
         return [f"  {'; '.join(parts)}"[:118]] * bool(parts)
-
-
-def _same(run):
-    return run

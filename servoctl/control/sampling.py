@@ -6,18 +6,7 @@ SCALED, TERMS = 0.5, 16  # norm of a matrix whose exponential is summed; 0.5^17/
 
 
 def discretised(A, B, period):
-    """Exact discretisation under a zero-order hold: exp([A B; 0 0] Ts).
-
-    Parameters
-    ----------
-    A, B : (N, n, n), (N, n, m) arrays
-    period : float
-        [s]
-
-    Returns
-    -------
-    (N, n, n), (N, n, m) arrays
-    """
+    """Exact discretisation of A (N, n, n), B (N, n, m) under a zero-order hold of a period [s]: exp([A B; 0 0] Ts)."""
     n, m = B.shape[1:]
     both = np.zeros((len(A), n + m, n + m))
     both[:, :n, :n], both[:, :n, n:] = A * period, B * period
@@ -44,23 +33,11 @@ def spectral_radii(matrices):
 
 
 def sampled_radii(A, B, K, period, delays):
-    """Largest factor of errors per sample under u = -K x, held, where each input arrives late, at each instant.
+    """Largest factor of errors per sample under u = -K x, held, with a delay [s] of each input, (N,).
 
-    With a delay of d samples and the part θ of one more, x+ = e^(A Ts) x + Γ_0 u_(k-d) + Γ_1 u_(k-d-1), where Γ_0 =
-    Γ(Ts - θ) and Γ_1 = e^(A (Ts - θ)) Γ(θ) (Åström and Wittenmark, Computer-Controlled Systems, section 2.3).
-
-    Parameters
-    ----------
-    A, B, K : (N, n, n), (N, n, m), (N, m, n) arrays
-        Of the plant in continuous time; gains.
-    period : float
-        [s]
-    delays : (m,) array
-        [s]
-
-    Returns
-    -------
-    (N,) array
+    A (N, n, n) and B (N, n, m) are in continuous time, K is (N, m, n), `delays` (m,). With a delay of d samples and the
+    part θ of one more, x+ = e^(A Ts) x + Γ_0 u_(k-d) + Γ_1 u_(k-d-1), where Γ_0 = Γ(Ts - θ) and Γ_1 = e^(A (Ts - θ))
+    Γ(θ) (Åström and Wittenmark, Computer-Controlled Systems, section 2.3).
     """
     count, n, m = B.shape
     whole = np.floor(delays / period + 1e-9).astype(int)

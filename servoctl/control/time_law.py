@@ -1,7 +1,9 @@
 """The fastest time law of a program that its actuators can follow."""
 
 import functools
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -14,31 +16,31 @@ from servoctl.simulation import simulate
 from servoctl.spec.mechanism import Mechanism
 from servoctl.spec.program import Program
 
-REACH = 12  # doublings of the time, in which a motion becomes as good as static, or halvings
-BELOW = 1e-6  # of a limit: how far below it the fastest time law stays
-REACHED = 1e-4  # of a limit: how near the fastest time law comes to it, unless motions cease to exist before
+REACH = 12  # doublings of the time, after which a motion is nearly static, or halvings
+BELOW = 1e-6  # of a limit: distance that the fastest time law keeps from it
+REACHED = 1e-4  # of a limit: largest distance at which it counts as reached
 
 
 @dataclass(frozen=True, eq=False)
 class TimeLaw:
-    """A program slowed, or quickened, to where its first limit is reached; made by `fastest`.
+    """A program whose time is scaled until a signal reaches its limit; made by `fastest`.
 
     Attributes
     ----------
     factor : float
-        How many times as long as given the motion takes.
+        Duration of the motion over that of the original program.
     program : Program
         The program with this time law.
     plan : Run
-        Its motion; every limit holds.
+        Its motion, within all limits.
     binding : (str, str, float)
-        The signal that reaches its limit, which side ("lower" or "upper"), and when [s].
+        The signal that reaches its limit, the side ("lower" or "upper"), and the instant [s].
     """
 
     factor: float
-    program: object
+    program: Program
     plan: Run
-    binding: tuple
+    binding: tuple[str, str, float]
 
     def __repr__(self):
         name, side, t = self.binding
@@ -49,26 +51,30 @@ class TimeLaw:
         )
 
 
-def fastest(mechanism, program, limits, t_span, start=None, guess=None, parameters=None, progress=None):
-    """The fastest time law q(t0 + (t - t0)/σ) under which signals keep their limits, found by solving for σ.
+def fastest(
+    mechanism: Mechanism, program: Program, limits: Mapping[str, Any], t_span: tuple[float, float],
+    start: Mapping[str, float] | None = None, guess: Mapping[str, float] | None = None,
+    parameters: Mapping[str, float] | None = None, progress: bool | None = None,
+) -> TimeLaw:  # fmt: skip
+    """The fastest time law q(t0 + (t - t0)/σ) under which signals keep their limits.
 
-    The motion's geometry stays; speeds go with 1/σ, accelerations with 1/σ². What a limit leaves beside static loads
-    decides. Where several σ reach a limit the one next to the given time law, σ = 1, is found.
+    The geometry of the motion stays; speeds scale with 1/σ, accelerations with 1/σ²; static loads stay. If several σ
+    reach a limit, the result is the one next to σ = 1.
 
     Parameters
     ----------
     mechanism : Mechanism
     program : Program
     limits : dict of str to (float, float) or float
-        Lower and upper limit of actuators and outputs by name; one number is symmetric. `None` leaves a side open.
+        Lower and upper limit of actuators and outputs by name; a number c is (-c, c), None leaves a side open.
     t_span : (t0, t1)
-        Of the program as given [s].
+        Span of the original program [s].
     start, guess : dict of str to float, optional
-        As for `Model.start`, for the program as given; derivatives that are held are slowed with the motion.
+        As for `Model.start`, for the original program; derivatives in `start` are scaled with the motion.
     parameters : dict of str to float, optional
-        Other numbers for the mechanism's parameters.
+        Parameters of the mechanism that differ from their defaults.
     progress : bool, optional
-        Show how many motions were tried; default: on a terminal, for work of more than a second.
+        Show the number of simulated motions; default: on a terminal, for work of more than a second.
 
     Returns
     -------
@@ -77,11 +83,11 @@ def fastest(mechanism, program, limits, t_span, start=None, guess=None, paramete
     Raises
     ------
     LimitExceeded
-        If the motion exceeds a limit however slow it is, or does not exist any more where it would reach one.
+        If even a nearly static motion exceeds a limit, or motions cease to exist before one is reached.
     SpecificationError
-        For limits that are no interval, and a time that does not go forward.
+        For limits that are no interval, and a span that does not go forward.
     NameUnknown
-        For a limit on something that is no signal of the plan.
+        For a limit of an unknown signal.
     """
     from scipy.optimize import brentq
 
@@ -108,18 +114,19 @@ def fastest(mechanism, program, limits, t_span, start=None, guess=None, paramete
     excess, binding, slower, plan = attempt(factor)
     if not abs(excess) < REACHED:
         raise LimitExceeded(
-            f"No motion exists below the factor {factor:.6g}, before it reaches a limit.",
-            "A fastest time law is decided by a limit that is reached.",
+            f"No motion exists below the factor {factor:.6g}, and none above it reaches a limit.",
+            "The fastest time law reaches a limit.",
             nearest=f"Limits that are reached between the factors {factor:.6g} and {slow:g}.",
-            do="Give tighter limits, or slow the program by a factor that you choose (Program.slowed).",
+            do="Pass tighter limits, or choose a factor yourself (Program.slowed).",
             factor=factor,
+            slow=slow,
         )
     return TimeLaw(factor, slower, plan, binding)
 
 
 @dataclass(frozen=True)
 class _Scene:
-    """What is slowed: a program, its motion and the limits of its signals."""
+    """A program, its span and start, and the limits of its signals."""
 
     mechanism: Mechanism
     program: Program
@@ -132,25 +139,26 @@ class _Scene:
     def __post_init__(self):
         if not self.limits:
             raise SpecificationError(
-                "No limits were given.", "A fastest time law is decided by a limit.", do='Give {"trolley": 100.0}.'
+                "There are no limits.", "The fastest time law reaches a limit.", do='Pass some, as {"trolley": 100.0}.'
             )
-        for given, kind in ((self.mechanism, Mechanism), (self.program, Program)):
-            if not isinstance(given, kind):
+        for value, kind in ((self.mechanism, Mechanism), (self.program, Program)):
+            if not isinstance(value, kind):
                 raise SpecificationError(
-                    f"A {type(given).__name__} was given as {kind.__name__.lower()}.",
-                    "A mechanism's program is slowed.",
+                    f"The {kind.__name__.lower()} is a {type(value).__name__}.",
+                    "A time law belongs to a Program of a Mechanism.",
                     do="Write sv.fastest(mechanism, program, ...).",
+                    kind=type(value).__name__,
                 )
 
     def slowed(self, factor):
-        """(worst excess, binding, program, plan) of a time law; an infinite excess where there is no motion."""
+        """(largest excess, binding, program, plan) of a time law; the excess is infinite if there is no motion."""
         t0, t1 = self.t_span
         slower = self.program.slowed(self.mechanism.q, factor, at=t0)
         try:
             model = derive(self.mechanism, slower, self.guess)
             model = model.with_parameters(**self.parameters) if self.parameters else model
-            held = {name: value / factor ** _level(model, name) for name, value in self.start.items()}
-            start = model.start(t0, guess=self.guess, **held)
+            values = {name: value / factor ** _level(model, name) for name, value in self.start.items()}
+            start = model.start(t0, guess=self.guess, **values)
             plan = simulate(model, start, (t0, t0 + (t1 - t0) * factor), progress=False)
         except (SingularProgram, InconsistentStart, IntegrationStopped):
             return np.inf, ("", "", t0), slower, None
@@ -158,18 +166,18 @@ class _Scene:
 
 
 def _bracket(attempt):
-    """A factor at which a limit is exceeded, and the double of it, at which all are kept."""
+    """A factor that exceeds a limit, and the double of it, which keeps all."""
     factor = 1.0
     step = 2.0 if attempt(factor)[0] > -BELOW else 0.5
     for _ in range(REACH):
         before, factor = factor, factor * step
         if (attempt(factor)[0] > -BELOW) != (step > 1):
             return min(before, factor), max(before, factor)
-    _refuse(attempt(factor), factor, step)
+    raise _unreached(factor) if step < 1 else _exceeded(attempt(factor), factor)
 
 
 def _worst(plan, limits):
-    """Largest excess over the limits, relative to their size, and where it is."""
+    """Largest excess over the limits, relative to their size, and its (signal, side, instant)."""
     excesses = []
     for name, (low, high) in limits.items():
         (t_low, least), (t_high, most) = plan.extrema(name)
@@ -184,20 +192,23 @@ def _level(model, name):
     return 0 if name not in model.jet_names[nq:] else 1 + (model.jet_names.index(name) - nq) // n
 
 
-def _refuse(last, factor, step):
-    excess, (name, side, t), _, plan = last
-    if step < 1:
-        raise SpecificationError(
-            f"No limit is reached even {1 / factor:g} times as fast as given.",
-            "A fastest time law is decided by a limit.",
-            do="Give limits of the actuators that the motion uses.",
-        )
+def _unreached(factor):
+    return SpecificationError(
+        f"No limit is reached even {1 / factor:g} times as fast as the program.",
+        "The fastest time law reaches a limit.",
+        do="Pass limits of the actuators that the motion uses.",
+        factor=factor,
+    )
+
+
+def _exceeded(last, factor):
+    _, (name, side, t), _, plan = last
     reached = "no motion exists" if plan is None else f"{name} still exceeds its {side} limit at t = {t:.5g} s"
-    raise LimitExceeded(
+    return LimitExceeded(
         f"{factor:g} times slower, {reached}.",
-        "Slowing reduces what accelerations ask for, not static loads.",
+        "Slowing reduces accelerations, not static loads.",
         nearest="" if plan is None else f"{name} within {' .. '.join(f'{v:.6g}' for _, v in plan.extrema(name))}.",
-        do="Give limits that hold the mechanism at rest, or another path.",
+        do="Pass limits that hold the mechanism at rest, or choose another path.",
         name=name,
         factor=factor,
     )

@@ -1,17 +1,20 @@
-"""C export: a model's feedforward and residuals, or a law's step, without a library or memory of their own.
+"""C export: a model's feedforward and residuals, or a law's step, without libraries and without static memory.
 
-Every function takes and gives arrays in the order of an enum in the header, and keeps nothing between two calls.
+The header has an enum of the indices of every array.
 """
 
 import os
 import re
+from pathlib import Path
 
 import casadi as ca
 import numpy as np
 
 from servoctl.codegen.function import Compiled
+from servoctl.control.law import Law
 from servoctl.errors import SpecificationError
 from servoctl.export.files import Array, Constant, Contents, Routine, Scalar, identifier, write
+from servoctl.model.model import Model
 from servoctl.model.start import State
 
 ITERATIONS, TOLERANCE = 30, 1e-13  # of Newton's method, as in `Compiled.newton`
@@ -21,7 +24,9 @@ RESERVED += "register restrict return short signed sizeof static struct switch t
 RESERVED += "while class new delete this template typename operator private public protected friend namespace using"
 
 
-def export_c(source, folder, *, name=None, start=None):
+def export_c(
+    source: Model | Law, folder: str | os.PathLike, *, name: str | None = None, start: State | None = None
+) -> tuple[Path, Path]:
     """Write a model's feedforward and residuals, or a law's step, as NAME.c and NAME.h: self-contained C99.
 
     Main arguments
@@ -29,18 +34,19 @@ def export_c(source, folder, *, name=None, start=None):
     Parameters
     ----------
     source : Model or Law
-        A model gives `NAME_feedforward` (a program that determines the motion completely: time -> actuation by Newton's
-        method; else: state -> actuation, with `NAME_advance` for a Runge-Kutta step of the state),
-        `NAME_actuation`, `NAME_residuals` and `NAME_outputs`; a law gives `NAME_start` and `NAME_step`.
+        A model becomes `NAME_feedforward`, `NAME_actuation`, `NAME_residuals` and `NAME_outputs`. If its program
+        determines the motion completely, the feedforward finds the actuation at a time by Newton's method; else it
+        computes the actuation at a state, and `NAME_advance` is a Runge-Kutta step of the state. A law becomes
+        `NAME_start` and `NAME_step`.
     folder : str or Path
-        Made where it is missing; files of the same name are replaced.
+        It is created if it does not exist; files of the same name are replaced.
 
     Other arguments
 
     name : str, optional
-        Prefix of all names and of the files; default "model" or "law".
+        Name of the files and prefix of all C names; default "model" or "law".
     start : State, optional
-        A consistent start of the model, written as `NAME_x0` with its time `NAME_t0`.
+        Consistent start of the model, written as `NAME_x0` with its time `NAME_t0`.
 
     Returns
     -------
@@ -50,7 +56,7 @@ def export_c(source, folder, *, name=None, start=None):
     Raises
     ------
     SpecificationError
-        If the name is no C identifier, the source is neither model nor law, a start is given for a law.
+        If the name is no C identifier, the source has no expressions, or a law has a start.
     ServoError
         If the files cannot be written.
     """
@@ -62,60 +68,68 @@ def export_c(source, folder, *, name=None, start=None):
     _require_name(name)
     if not isinstance(folder, (str, os.PathLike)):
         raise SpecificationError(
-            f"folder={folder!r} was given."[:200], "The files are written into a folder.", '"export".', "Give its path."
+            f"folder={folder!r}."[:200],
+            "The files are written into a folder.",
+            do="Pass its path, a str or a Path.",
+            folder=folder,
         )
     return write(folder, name, _of_law(source) if law else _of_model(source, start))
 
 
 def _require_start(law, start):
-    """A start is that of a model."""
     if law and start is not None:
         raise SpecificationError(
-            "A start was given for a law.", "A law starts with its controller state.", do="Leave the start out."
+            "start= is set in the export of a law.",
+            "A law starts with its controller state.",
+            do="Leave start= out.",
+            start=start,
         )
     if start is not None and not isinstance(start, State):
         raise SpecificationError(
-            f"A {type(start).__name__} was given as start.",
-            "A start satisfies every invariant at its time.",
-            nearest="model.start(...).",
-            do="Give that.",
+            f"start= is a {type(start).__name__}.",
+            "The start of a model is a consistent State.",
+            do="Pass model.start(...).",
+            type=type(start).__name__,
         )
 
 
 def _require_name(name):
-    """The prefix of an export is a word that C and C++ leave free."""
     if not re.fullmatch(r"[A-Za-z]\w*", name if isinstance(name, str) else "", re.ASCII) or name in RESERVED.split():
         raise SpecificationError(
-            f"The export is to be named {name!r}.",
-            "The name begins every function of the C file: letters, digits and underscores, and no word of C or C++.",
+            f"The name of the export is {name!r}.",
+            "A name has letters, digits and underscores, begins with a letter, and is no keyword of C or C++.",
             nearest=f"{identifier(str(name))!r}." if identifier(str(name)) != name else "",
-            do="Choose such a name.",
+            do="Choose another name.",
             name=name,
         )
 
 
 def _without_expressions(source):
-    """The refusal of what C cannot be written from."""
+    """The SpecificationError of a source without expressions."""
     if not hasattr(source, "schedule"):
+        kind = type(source).__name__
         return SpecificationError(
-            f"A {type(source).__name__} is to be exported.",
-            "C is written from a Model or a Law.",
-            nearest="derive(mechanism, program) makes a Model.",
-            do="Give one of these.",
+            f"The source of the export is a {kind}.",
+            "C code is written from a Model or a Law.",
+            do="Pass derive(mechanism, program), or a law such as sv.lqr(...).",
+            type=kind,
         )
-    given, rule = f"The law {source.name!r} is to be exported.", "C is written from the expressions of a law's step: "
-    inside = getattr(source.step, "law", None)
-    if inside is None:
-        return SpecificationError(given, rule + "one written in Python has none.", "sv.lqr and others.", "Export one.")
+    limited, rule = getattr(source.step, "law", None), "C code is written from the expressions of a law's step."
+    if limited is None:
+        return SpecificationError(
+            f"The step of the law {source.name!r} is a Python function.",
+            rule,
+            do="Export a law with expressions, such as sv.lqr(...).",
+            law=source.name,
+        )
     return SpecificationError(
-        given,
-        rule + "a limited law solves a quadratic program instead.",
-        nearest=f"The law inside, {inside.name!r}, whose commands the machine cuts off at its limits.",
-        do="Export the law that was given to `limited`.",
+        f"The step of the law {source.name!r} is a quadratic program.",
+        rule,
+        nearest=f"The law {limited.name!r}, which it limits.",
+        do="Export that law, and limit the inputs on the machine.",
+        law=source.name,
+        limited=limited.name,
     )
-
-
-# --- what is exported
 
 
 def _of_model(model, start):
@@ -150,12 +164,12 @@ def _of_model(model, start):
 
 
 def _algebraic(model, x, z, p, u):
-    """Feedforward of a program that determines the motion: Newton's method on (q' , γ', γ'') as `path` gives them."""
+    """Feedforward of a program that determines the motion: Newton's method along `path`."""
     f = model.function("path").expression
     about = (
         "Feedforward: jets z and u at time t [s], by Newton's method. The coordinates in x are its guess, and x "
-        "becomes the state: that of one instant is the guess of the next. Returns the number of corrections; -1 where "
-        "no solution was found: z and u are then unchanged, and x is to be set again."
+        "becomes the state, the guess of the next instant. Returns the number of corrections, or -1 if the iteration "
+        "fails: z and u are then unchanged, and x must be set again."
     )
     arguments = (TIME, x.output(), p.input(), z.output(), u.output())
     sizes = {"N": model.n, "NQ": model.nq, "NY": f.numel_out(0), "ITERATIONS": ITERATIONS, "TOLERANCE": TOLERANCE}
@@ -163,14 +177,14 @@ def _algebraic(model, x, z, p, u):
 
 
 def _integrated(model, x, z, p, u):
-    """Feedforward of a program with internal dynamics: the state of the plan is integrated beside it."""
+    """Feedforward of a program with internal dynamics, and a step of the plan's state."""
     f, size = model.function("ode").expression, len(model.state_names)
     arguments = f.sx_in()
     rates = ca.Function("rates", arguments, [f(*arguments)[:size]])
     about = {
         "rates": "dx/dt at time t [s] and state x of the plan; not finite where its equations lose rank.",
         "feedforward": "Feedforward: jets z and u at time t [s] and state x of the plan.",
-        "advance": "Takes the plan's state x from time t to t + h [s]: a step of Runge and Kutta's of order 4.",
+        "advance": "Takes the plan's state x from time t to t + h [s]: a Runge-Kutta step of order 4.",
     }
     at = (TIME, x.input(), p.input())
     routines = [
@@ -188,7 +202,7 @@ def _of_law(law):
     z = Array("z", "Controller state z", law.state_names)
     about = (
         "One sample of the law: command u of the measurement y and the controller state z, which becomes the next one. "
-        f"To be called every {1 / law.rate:.9g} s from t = {law.t0:g} s; beyond the schedule its last row holds."
+        f"Call it every {1 / law.rate:.9g} s from t = {law.t0:g} s; after the schedule its last row applies."
     )
     routines = (
         Routine("start", "Sets the controller state z to its value at the start.", (z.output(),)),

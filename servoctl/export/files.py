@@ -1,34 +1,33 @@
-"""C files of named functions: one C99 source and its header, with an enum of indices for every array."""
+"""C files of named functions: a C99 source and its header, with an enum of indices for every array."""
 
 import re
 import textwrap
 import unicodedata
 from dataclasses import dataclass, field
 from importlib import resources
-from pathlib import Path
 
 import casadi as ca
 import numpy as np
 
+from servoctl import archive
 from servoctl.codegen import emit
 from servoctl.codegen.loops import source
-from servoctl.errors import ServoError
 
-WIDTH = 110  # of the lines of a file
+WIDTH = 110  # longest line of a file
 
 
 @dataclass(frozen=True)
 class Array:
-    """An array of the interface, its indices an enum.
+    """An array of the interface, with an enum of its indices.
 
     Parameters
     ----------
     key : str
-        Its name as an argument: m_load of p is `CRANE_P_m_load`, their number `CRANE_NP`.
+        Name as an argument: p gives the indices `CRANE_P_m_load` and the length `CRANE_NP`.
     about : str
-        What it is, for the header.
+        Description in the header.
     names : sequence of str
-        Of its entries.
+        Names of the entries.
     """
 
     key: str
@@ -36,28 +35,28 @@ class Array:
     names: tuple
 
     def length(self, prefix):
-        """The C constant that holds its length."""
+        """C constant with its length."""
         return f"{prefix.upper()}_N{self.key.upper()}"
 
     def input(self):
-        """Itself as an input of a C function."""
+        """Input argument of a C function."""
         return Argument(self, self.key, "const double")
 
     def output(self, name=""):
-        """Itself as an output of a C function."""
+        """Output argument of a C function."""
         return Argument(self, name or self.key, "double")
 
 
 @dataclass(frozen=True)
 class Argument:
-    """An array as an argument of a C function, under a name."""
+    """An array as a named argument of a C function."""
 
     array: Array
     name: str
     kind: str
 
     def declaration(self, prefix):
-        """As C declares it."""
+        """C declaration."""
         places = f"{self.name}[{self.array.length(prefix)}]" if len(self.array.names) else f"*{self.name}"
         return f"{self.kind} {places}"
 
@@ -69,7 +68,7 @@ class Scalar:
     name: str
 
     def declaration(self, prefix):
-        """As C declares it."""
+        """C declaration."""
         return f"double {self.name}"
 
 
@@ -80,10 +79,10 @@ class Constant:
     Parameters
     ----------
     name : str
-        After the prefix and an underscore; alone for one that stays in the C file.
+        C name; a public constant has the prefix and an underscore before it.
     values : float or (N,) array
     about : str
-        What it is, for the header; empty for one that stays in the C file.
+        Description in the header; "" for a constant that is not public.
     """
 
     name: str
@@ -91,13 +90,13 @@ class Constant:
     about: str = ""
 
     def declaration(self, prefix):
-        """Its declaration without a value."""
+        """C declaration without a value."""
         name = f"const double {prefix}_{self.name}" if self.about else f"static const double {self.name}"
         return f"{name}[{len(self.values)}]" if np.ndim(self.values) else name
 
     @property
     def text(self):
-        """Its values as C."""
+        """C text of the values."""
         literals = [emit.literal(float(value)).strip("()") for value in np.ravel(self.values)]
         lines = "".join(f"    {', '.join(literals[k : k + 4])},\n" for k in range(0, len(literals), 4))
         return f"{{\n{lines}}}" if np.ndim(self.values) else literals[0]
@@ -105,14 +104,14 @@ class Constant:
 
 @dataclass(frozen=True)
 class Routine:
-    """A public C function, which calls the static one of its name.
+    """A public C function, which calls the static function of the same name.
 
     Parameters
     ----------
     name : str
-        After the prefix and an underscore.
+        Name after the prefix and an underscore.
     about : str
-        What it computes, for the header.
+        Description in the header.
     arguments : sequence of Argument and Scalar
     result : {"void", "int"}
     """
@@ -123,19 +122,19 @@ class Routine:
     result: str = "void"
 
     def declaration(self, prefix):
-        """Its declaration without a semicolon."""
+        """C declaration without a semicolon."""
         arguments = ", ".join(argument.declaration(prefix) for argument in self.arguments)
         return f"{self.result} {prefix}_{self.name}({arguments})"
 
     def definition(self, prefix):
-        """Its definition."""
+        """C definition."""
         call = f"{self.name}({', '.join(argument.name for argument in self.arguments)});"
         return f"\n{self.declaration(prefix)}\n{{\n    {'return ' if self.result == 'int' else ''}{call}\n}}\n"
 
 
 @dataclass(frozen=True)
 class Contents:
-    """What a C file and its header hold.
+    """Contents of a C file and its header.
 
     Parameters
     ----------
@@ -145,9 +144,9 @@ class Contents:
         Static functions by name, SX functions of (t, x, p) with one dense column.
     routines : sequence of Routine
     sources : sequence of str
-        Files of the folder `sources` with further static functions, which may call those before.
+        Files of the folder `sources` with further static functions, which may call `functions`.
     sizes : dict of str to float
-        Macros that these take.
+        Macros of these files.
     """
 
     arrays: tuple
@@ -159,38 +158,18 @@ class Contents:
 
 
 def write(folder, name, contents):
-    """Write NAME.c and NAME.h of any functions.
-
-    Parameters
-    ----------
-    folder : str or Path
-    name : str
-        A C identifier, the prefix of all that is public.
-    contents : Contents
-
-    Returns
-    -------
-    (Path, Path)
+    """Write NAME.c and NAME.h; their two paths. `name`, a C identifier, is the prefix of all public names.
 
     Raises
     ------
     ServoError
         If the files cannot be written.
     """
-    folder = Path(folder)
     texts = {f"{name}.c": _source(name, contents), f"{name}.h": _header(name, contents)}
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
+    with archive.writing(folder, "C export", folder=True) as place:
         for file, text in texts.items():
-            (folder / file).write_text(_wrapped(text), encoding="utf-8")
-    except OSError as error:
-        raise ServoError(
-            f"The C files cannot be written to {folder}: {error.strerror or error}.",
-            "An export leaves a C file and its header in a folder.",
-            do="Choose another folder.",
-            folder=str(folder),
-        ) from error
-    return tuple(folder / file for file in texts)
+            (place / file).write_text(_wrapped(text), encoding="utf-8")
+    return tuple(place / file for file in texts)
 
 
 def _header(name, contents):
@@ -238,27 +217,17 @@ def _comment(text):
 
 
 def _wrapped(text):
-    """Long lines on several ones."""
     how = {"subsequent_indent": "    ", "break_long_words": False, "break_on_hyphens": False}
     return "".join(f"{textwrap.fill(x, WIDTH, **how) if len(x) > WIDTH else x}\n" for x in text.splitlines())
 
 
 def _harmless(text):
-    """Text inside a comment, which it must not end, nor begin another."""
+    """Text that neither ends a C comment nor begins another."""
     return text.replace("*/", "* /").replace("/*", "/ *").replace("\\", "/")
 
 
 def identifier(name):
-    """A C identifier that reads like a name: Greek letters in words, underscores for what is neither letter nor digit.
-
-    Parameters
-    ----------
-    name : str
-
-    Returns
-    -------
-    str
-    """
+    """The C identifier of a name: Greek letters are spelt out, other characters become underscores."""
     letters = (c if c.isascii() else unicodedata.name(c, "_").split()[-1].lower() for c in name)
     word = re.sub(r"\W+", "_", "".join(letters), flags=re.ASCII).strip("_")
     return f"_{word}" if not word or word[0].isdigit() else word

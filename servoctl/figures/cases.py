@@ -1,4 +1,4 @@
-"""The figure of a sweep: how results are distributed, and on what they depend."""
+"""The figure of a sweep: distributions of results, and their dependence on parameters."""
 
 import numpy as np
 
@@ -10,7 +10,7 @@ SHARES = {5: "--", 50: "-", 95: ":"}  # percentiles
 
 
 def sweep(study, names=None, against=None, units=None):
-    """Draw results of a sweep: histograms with percentiles, and each over a parameter.
+    """Draw results of a sweep: histograms with percentiles, and each result over a parameter.
 
     Parameters
     ----------
@@ -19,7 +19,7 @@ def sweep(study, names=None, against=None, units=None):
     names : sequence of str, optional
         Columns; default: the first four results that vary.
     against : str, optional
-        Column across; default: for each result the parameter with the largest rank correlation.
+        Column of the horizontal axis; default: for each result the parameter with the largest rank correlation.
     units : dict of str to str, optional
         Unit of each column, by name.
 
@@ -32,19 +32,20 @@ def sweep(study, names=None, against=None, units=None):
     NameUnknown
         If there is no such column.
     SpecificationError
-        If no result varies, or it is no sweep.
+        If no result varies, or the study is not a sweep.
     """
     if getattr(study, "kind", None) != "sweep":
         kind = f"Study of the kind {study.kind}" if hasattr(study, "kind") else type(study).__name__
-        raise SpecificationError(f"A {kind} was given.", "The figure is that of a sweep, from sv.sweep or sv.merge.")
+        raise SpecificationError(f"A {kind} was given.", do="Give a study from sv.sweep or sv.merge.", kind=kind)
     parameters = [name for name in study.meta["parameters"] if _varies(study, name)]
     results = [name for name in study.columns if name not in ("case", *study.meta["parameters"])]
     names = [name for name in results if _varies(study, name)][:MOST_RESULTS] if names is None else list(names)
     if not names:
         raise SpecificationError(
-            f"Of {len(study)} rows no result varies.",
+            f"No result varies among the {len(study)} rows.",
             "The figure shows numbers that differ between cases.",
-            do="Look at study.rows(); the column error says what failed.",
+            do="See study.rows(); the column error has what failed.",
+            rows=len(study),
         )
     if against is not None:
         study.column(against)

@@ -9,7 +9,7 @@ LIMIT = "#A00000"
 
 
 def closed(run, units=None):
-    """Draw a closed loop: the program's residuals, coordinates less those of the plan, inputs with plan and limits.
+    """Draw a closed loop: residuals of the program, deviations from the plan, inputs with plan and limits.
 
     Parameters
     ----------
@@ -24,12 +24,13 @@ def closed(run, units=None):
     Raises
     ------
     SpecificationError
-        If the loop ended before its first sample, or it is no closed loop.
+        If the loop has no samples, or is not a closed loop.
     """
     if not hasattr(run, "commands"):
-        raise SpecificationError(f"A {type(run).__name__} was given.", "The figure is that of a loop, from sv.close.")
+        kind = type(run).__name__
+        raise SpecificationError(f"A {kind} was given.", do="Give a closed loop from sv.close.", type=kind)
     if not len(run.t):
-        raise SpecificationError("The loop has no samples.", "It ended before the first one.", do="See run.message.")
+        raise SpecificationError("The loop ended before its first sample.", do="See run.message.", samples=0)
     units = units or {}
     errors = _errors(run, units)
     count = len(errors) + len(run.plant.inputs)
@@ -46,14 +47,14 @@ def closed(run, units=None):
         if ax.get_legend_handles_labels()[0]:
             ax.legend(**BESIDE)
         if not run.success:
-            _lost(ax, run)
+            _early_end(ax, run)
     axes[-1].set_xlabel("t [s]")
     axes[0].figure.align_ylabels(list(axes))
     return axes
 
 
-def _lost(ax, run):
-    """Mark the end of a loop that was lost; what grows without bound after three quarters of it leaves the frame."""
+def _early_end(ax, run):
+    """Mark the end of a loop that failed; the frame is that of its first three quarters, as the rest may diverge."""
     until = run.t[0] + 0.75 * (run.t[-1] - run.t[0])
     drawn = np.concatenate([np.asarray(line.get_xydata(), dtype=float) for line in ax.get_lines()])
     early = drawn[drawn[:, 0] <= until, 1]
@@ -76,19 +77,19 @@ def _errors(run, units):
 
 
 def _input(ax, run, name, unit):
-    """What an actuator was given, what the plan has and the law asked for, and its limits."""
+    """The input of an actuator with its plan, its command where that differs, and its limits."""
     if run.plan is not None:
         ax.plot(*run.planned(name), "--", color="black", linewidth=0.9, zorder=3, label="plan")
-    given, command = run.input[name], run.command[name]
-    if not np.array_equal(given, command):
+    force, command = run.input[name], run.command[name]
+    if not np.array_equal(force, command):
         ax.plot(run.t, command, color=COLOURS[1], linewidth=0.7, drawstyle="steps-post", label="command")
-    ax.plot(run.t, given, color=COLOURS[0], linewidth=1.2, drawstyle="steps-post", label="input")
+    ax.plot(run.t, force, color=COLOURS[0], linewidth=1.2, drawstyle="steps-post", label="input")
     low, high = run.plant.limits.get(name, (-np.inf, np.inf))
-    met = [limit for limit in (low, high) if np.isfinite(limit)]
-    for limit in met:
-        ax.axhline(limit, color=LIMIT, linestyle=":", linewidth=1.4, label="limit" if limit == met[0] else None)
-    if met:
-        values = np.concatenate([given, met])
+    limits = [limit for limit in (low, high) if np.isfinite(limit)]
+    for limit in limits:
+        ax.axhline(limit, color=LIMIT, linestyle=":", linewidth=1.4, label="limit" if limit == limits[0] else None)
+    if limits:
+        values = np.concatenate([force, limits])
         room = 0.15 * max(np.ptp(values), 1e-300)
         ax.set_ylim(values.min() - room, values.max() + room)
     ax.set_ylabel(label(name, unit))

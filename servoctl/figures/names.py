@@ -1,4 +1,4 @@
-"""Which signals a figure of a run shows, and their units: from names alone, so that loaded runs are drawn, too."""
+"""The signals that figures of a run show by default, and their units, from names alone: loaded runs have no model."""
 
 import re
 
@@ -6,7 +6,7 @@ from servoctl.figures import style
 
 
 def efforts(run):
-    """Names of the run's actuators, or of the ideal reaction's components; of a loaded run, outputs among them."""
+    """Names of the run's actuators or of the components of its ideal reaction; for a loaded run with the outputs."""
     reaction = [name for name in run.names if name.startswith("reaction_")]
     if reaction:
         return reaction
@@ -17,12 +17,12 @@ def efforts(run):
 
 
 def coordinates(run):
-    """Names of the run's coordinates; of a loaded run those of which derivatives are known."""
+    """Names of the run's coordinates; for a loaded run of those whose derivatives are stored."""
     if run.model is not None:
         return list(run.model.coordinate_names)
     base = [name for name in run.jet_names if _antiderivative(name, run.jet_names) is None]
-    moved = [name for name in base if f"d{name}" in run.stored]  # by quasi-velocities: q' is no jet
-    return moved or base
+    by_quasi_velocities = [name for name in base if f"d{name}" in run.stored]  # q' is then a signal, and no jet
+    return by_quasi_velocities or base
 
 
 def _antiderivative(name, names):
@@ -32,7 +32,7 @@ def _antiderivative(name, names):
 
 
 def planes(run):
-    """Groups of names that span a plane by convention, capitals first, and outputs before coordinates."""
+    """Groups of names of axes such as (X, Z) or (tip_x, tip_y): capitals first, outputs before coordinates."""
     outputs = list(run.model.outputs) if run.model is not None else []
     groups = {}
     for name in [*outputs, *coordinates(run)]:
@@ -43,13 +43,13 @@ def planes(run):
 
 
 def along_one_axis(names):
-    """Whether names are one coordinate, or numbered ones of one axis: x1, x2, ..."""
+    """Whether names are a single one, or numbered ones of one axis: x1, x2, ..."""
     axes = {name.rstrip("0123456789") for name in names}
     return len(names) == 1 or len(axes) == 1 and axes < set("xyzXYZ")
 
 
 def unit_of(name, units):
-    """Unit of a signal, also of a derivative or of a component of the reaction; "" where it is not known."""
+    """Unit of a signal, of a derivative or of a component of the reaction; "" if unknown."""
     if name in units:
         return units[name]
     if name == "energy":

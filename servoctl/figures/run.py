@@ -1,7 +1,8 @@
 """Figures of a run: path, signals, actuation and residuals, each returning matplotlib's Axes.
 
-Without `ax` a figure is made outside pyplot, so that the user's backend stays as it is: `ax.figure.savefig(...)`. For
-a window or a notebook give `ax=plt.subplots()[1]`.
+In all functions `units` has the unit of each signal by name; those of derivatives follow. Without `ax` a figure is made
+outside pyplot, which leaves the user's backend unchanged: `ax.figure.savefig(...)`. For a window or a notebook give
+`ax=plt.subplots()[1]`.
 """
 
 import numpy as np
@@ -11,26 +12,26 @@ from servoctl.errors import SpecificationError
 from servoctl.figures.names import along_one_axis, coordinates, efforts, label_of, planes, unit_of
 from servoctl.figures.style import BESIDE, COLOURS, STYLES, look, panels
 
-LEAST = 1e-18  # of residuals on a logarithmic scale, so that exact zeros are seen
-BINS = 100  # of time, in each of which a residual is drawn by its greatest magnitude: rounding stays a band
+LEAST = 1e-18  # residual drawn for exact zeros on the logarithmic scale
+BINS = 100  # bins of time, each drawn by the greatest magnitude in it: rounding becomes a line
 LAST, UNBOUNDED = 0.01, 2.0  # a signal that doubles its range in the last hundredth of a stopped run leaves the frame
-FLAT = 1e-9  # variation relative to the largest value of the same unit: rounding, not filled with it
-VISIBLE = 1e-14  # magnitude relative to the largest value of any unit, in SI: rounding, too
+FLAT = 1e-9  # variation relative to the largest value of the same unit below which it is rounding
+VISIBLE = 1e-14  # magnitude relative to the largest value of any unit, in SI, below which it is rounding
 
 
 def path(run, x=None, y=None, ax=None, units=None):
-    """Draw two signals against each other, with the run's start and end.
+    """Draw one signal over another, with the start and end of the run.
 
     Parameters
     ----------
     run : Run
     x, y : str, optional
-        Names of signals. Default: two of x, y, z (or X, Y, Z, preferred) with the same beginning and end, such as
-        "x" and "z" or "tip_x" and "tip_y", among outputs and coordinates; else the first two coordinates; one
-        coordinate alone, or all of them along one axis, such as "x1" and "x2", are drawn over time.
+        Names of signals. Default: two of x, y, z (or X, Y, Z, preferred) with the same prefix and suffix, such as
+        "x" and "z" or "tip_x" and "tip_y", among outputs and coordinates; else the first two coordinates. A single
+        coordinate, or coordinates along one axis, such as "x1" and "x2", are drawn over time.
     ax : Axes, optional
     units : dict of str to str, optional
-        Unit of each signal, by name; derivatives' units follow. Equal ones have equal scales where both remain visible.
+        Signals of the same unit have equal scales if both remain visible.
 
     Returns
     -------
@@ -45,17 +46,15 @@ def path(run, x=None, y=None, ax=None, units=None):
     if x is None and y is None and not groups and along_one_axis(names):
         return signals(run, names, panels(1, 4.2)[0] if ax is None else ax, units)
     first, second, *_ = groups[0] if groups else dict.fromkeys([*names, *run.names])
-    if x is None:
-        x = first if y != first else second
-    if y is None:
-        y = second if x != second else first
+    x = (first if y != first else second) if x is None else x
+    y = (second if x != second else first) if y is None else y
     units = units or {}
     across, up = run[x], run[y]
     ax = panels(1, 6.0)[0] if ax is None else ax
     ax.plot(across, up, color=COLOURS[0])
     ax.plot(across[0], up[0], "o", color=COLOURS[0], markerfacecolor="white", label=f"start, t = {run.t[0]:.4g} s")
-    _, word, mark = _ending(run)
-    ax.plot(across[-1], up[-1], mark, color=COLOURS[1], label=f"{word}, t = {run.t[-1]:.4g} s")
+    word = _ending(run)
+    ax.plot(across[-1], up[-1], "s" if run.success else "X", color=COLOURS[1], label=f"{word}, t = {run.t[-1]:.4g} s")
     ax.set(xlabel=label_of([x], units), ylabel=label_of([y], units))
     spans = sorted(float(np.ptp(v[np.isfinite(v)])) if np.isfinite(v).any() else 0.0 for v in (across, up))
     if unit_of(x, units) and unit_of(x, units) == unit_of(y, units) and spans[1] <= 5 * spans[0]:
@@ -73,15 +72,14 @@ def signals(run, names=None, ax=None, units=None):
     run : Run
     names : sequence of str, optional
     ax : Axes or sequence of Axes, optional
-        One Axes takes all signals; a sequence has one for each panel. Default: a new figure with one panel for all
-        signals of the same unit, and one for each signal whose unit is not known.
+        One Axes for all signals, or one for each panel. Default: a new figure with one panel for all signals of the
+        same unit, and one for each signal of unknown unit.
     units : dict of str to str, optional
-        Unit of each signal, by name; derivatives' units follow.
 
     Returns
     -------
     Axes or (n,) array of Axes
-        As `ax` was given; an array by default.
+        An Axes if `ax` is one, else an array.
 
     Raises
     ------
@@ -99,23 +97,23 @@ def signals(run, names=None, ax=None, units=None):
 
 
 def actuation(run, ax=None, units=None, names=None):
-    """Draw the required actuation over time, with its extrema: every actuator, or the ideal reaction.
+    """Draw the required actuation, of all actuators or of the ideal reaction, over time with its extrema.
 
     Parameters
     ----------
     run : Run
     ax : Axes or sequence of Axes, optional
-        One Axes takes all; a sequence has one for each actuator. Default: a new figure with a panel for each.
+        One Axes for all signals, or one for each. Default: a new figure with a panel for each.
     units : dict of str to str, optional
-        Unit of each signal, by name; those of an ideal reaction follow from the coordinates' (m: N; rad: N m).
+        Units of an ideal reaction follow from those of the coordinates (m: N; rad: N m).
     names : sequence of str, optional
-        Default: the actuators, or all `reaction_*` of an ideal program. A loaded run does not tell actuators from
-        outputs: it shows both.
+        Default: the actuators, or all `reaction_*` of an ideal program; for a loaded run, which does not distinguish
+        actuators and outputs, both.
 
     Returns
     -------
     Axes or (n,) array of Axes
-        As `ax` was given; an array by default.
+        An Axes if `ax` is one, else an array.
 
     Raises
     ------
@@ -126,16 +124,15 @@ def actuation(run, ax=None, units=None, names=None):
     """
     names = efforts(run) if names is None else [names] if isinstance(names, str) else list(names)
     if not names:
-        raise SpecificationError(
-            "The run has no actuation.", "It is known where a model or stored signals hold it.", do="Name signals."
-        )
+        rule = "It needs a model, or stored signals."
+        raise SpecificationError("The run has no actuation.", rule, do="Give names of signals.", names=run.names)
     return _over_time(run, [[name] for name in names], ax, units or {}, extrema=True)
 
 
 def residuals(run, ax=None):
     """Draw the magnitude of every constraint's residual at every level, on a logarithmic scale.
 
-    Colours tell constraints, line styles levels (the residual and its derivatives). Each point is the greatest
+    Each constraint has a colour, each level (the residual and its derivatives) a line style. Each point is the greatest
     magnitude within 1/100 of the run, at least 1e-18.
 
     Parameters
@@ -174,16 +171,15 @@ def save_figures(run, folder, units=None, title=""):
     ----------
     run : Run
     folder : str or Path
-        Made where it is missing.
+        Made if it is missing.
     units : dict of str to str, optional
-        Unit of each signal, by name.
     title : str, optional
-        Put over each figure.
+        Title of each figure.
 
     Returns
     -------
     list of Path
-        The files; without actuation.png or residuals.png where the run has no actuation or no residuals.
+        The files; without actuation.png or residuals.png if the run has no actuation or no residuals.
 
     Raises
     ------
@@ -206,18 +202,20 @@ def save_figures(run, folder, units=None, title=""):
 
 
 def _over_time(run, groups, ax, units, extrema=False):
-    """Draw groups of signals: one panel each, or all in the one Axes that was given."""
+    """Draw groups of signals: one panel for each, or all in `ax` if that is a single Axes."""
     from matplotlib.axes import Axes
 
-    alone = isinstance(ax, Axes)
-    if alone:
+    single = isinstance(ax, Axes)
+    if single:
         groups = [[name for group in groups for name in group]]
     axes = np.ravel(panels(len(groups), max(4.2, 1.0 + 1.9 * len(groups))) if ax is None else ax)
     if len(axes) != len(groups):
         raise SpecificationError(
             f"{len(axes)} Axes were given.",
             f"There are {len(groups)} panels: {'; '.join(', '.join(group) for group in groups)}.",
-            do="Give as many Axes as panels, or one, which takes all.",
+            do="Give as many Axes as panels, or one for all.",
+            axes=len(axes),
+            panels=len(groups),
         )
     largest = _largest(run, [name for group in groups for name in group], units)
     for panel, group in zip(axes, groups, strict=True):
@@ -236,7 +234,7 @@ def _over_time(run, groups, ax, units, extrema=False):
     axes[0].figure.align_ylabels(list(axes))
     _instants(run, axes)
     _end(run, axes)
-    return axes[0] if alone else axes
+    return axes[0] if single else axes
 
 
 def _largest(run, names, units):
@@ -250,7 +248,7 @@ def _largest(run, names, units):
 
 
 def _frame(ax, run, names, largest):
-    """Keep rounding from filling the panel, and what grows without bound before a stop from flattening the rest."""
+    """Limits of a panel that neither rounding fills nor a divergence before a stop flattens."""
     values = np.concatenate([run[name] for name in names])
     values = values[np.isfinite(values)]
     if values.size and np.ptp(values) < FLAT * largest:
@@ -282,19 +280,18 @@ def _instants(run, axes):
 
 
 def _ending(run):
-    """Whether the run reached its end, the word for it, and its marker."""
-    words = {0: ("end", "s"), 1: ("interrupted", "X"), -1: ("stopped", "X")}
-    return run.success, *words[0 if run.success else run.status or -1]
+    if run.success:
+        return "end"
+    return "interrupted" if run.status == 1 else "stopped"
 
 
 def _end(run, axes):
     """Mark where a run stopped early."""
-    done, word, _ = _ending(run)
-    if done:
+    if run.success:
         return
     for ax in axes:
         ax.axvline(run.t[-1], color="black", linestyle="--", linewidth=1.2)
-    axes[0].set_title(f"{word} after t = {run.t[-1]:.6g} s", fontsize="small", loc="right")
+    axes[0].set_title(f"{_ending(run)} after t = {run.t[-1]:.6g} s", fontsize="small", loc="right")
 
 
 def _keys(ax, names, levels):

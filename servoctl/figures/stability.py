@@ -4,12 +4,12 @@ import numpy as np
 
 from servoctl.figures import style
 
-SHADED_STEPS, SHADED_POLES, LINE = 120, 81, 3  # of the shaded map; every third pole for lines
-LEVELS = (0.0, 0.5, 0.8, 0.9, 0.95, 1.0, 1.05, 1.2, 1.5, 2.0)  # of the radius: fine where stability ends
+SHADED_STEPS, SHADED_POLES, LINE = 120, 81, 3  # points of the shaded map; lines have every third pole
+LEVELS = (0.0, 0.5, 0.8, 0.9, 0.95, 1.0, 1.05, 1.2, 1.5, 2.0)  # levels of the radius, fine near the bound of stability
 
 
 def draw_stability(stability, method, poles, methods):
-    """Largest steps of several methods over the poles; spectral radius of one method over poles and steps."""
+    """Draw largest steps of several methods over the poles, and the spectral radius of one over poles and steps."""
     length = abs(stability.t[-1] - stability.t[0])
     poles = np.geomspace(0.3, 300.0, SHADED_POLES) * 10 / length if poles is None else poles
     figure, ((left, right),) = style.figure(4.4, columns=2, sharex=True)
@@ -23,7 +23,7 @@ def _largest_steps(stability, ax, poles, methods):
     for colour, method in zip(style.COLOURS, methods, strict=False):
         steps = np.array([stability.largest_step(method, 1.0 / pole) for pole in poles])
         name = f"Taylor, order {stability.order}" if method == "Taylor" else method
-        line = "--" if method == "RK2" else "-"  # on the real axis as far as RK1
+        line = "--" if method == "RK2" else "-"  # it coincides with RK1 on the real axis
         ax.loglog(poles, np.where(steps > 0, steps, np.nan), line, color=colour, label=name)
     ax.set(xlabel="poles of the error dynamics, 1/T [1/s]", ylabel="step h [s]")
     ax.set_title("Largest stable step", fontsize=11)
@@ -48,5 +48,5 @@ def _radius(stability, ax, method, poles, limits):
 
 
 def _fewer(poles):
-    """Those at which lines are drawn, the last among them."""
+    """The poles of the lines, with the last."""
     return np.unique(np.append(poles[::LINE], poles[-1]))

@@ -1,14 +1,14 @@
-"""What all figures share: colours, line styles, panels, legends, labels."""
+"""Shared by all figures: colours, line styles, panels, legends, labels."""
 
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")  # Okabe and Ito
-MORE = ("#8C6D31", "#7F7F7F", "#5E3C99", "#882255", "#44AA99", "#B5BD00", "#FF7F9F")  # where there are many curves
+MORE = ("#8C6D31", "#7F7F7F", "#5E3C99", "#882255", "#44AA99", "#B5BD00", "#FF7F9F")  # for more curves
 STYLES = ("-", "--", ":", "-.")
 FIGURE_WIDTH = 10.0  # inches: 1000 px at matplotlib's 100 dpi
 BESIDE = {"loc": "upper left", "bbox_to_anchor": (1.01, 1.0), "frameon": False}  # a legend to the right of its panel
 
 
 def figure(height, rows=1, columns=1, width=FIGURE_WIDTH, **options):
-    """A figure outside pyplot, so that the user's backend stays as it is, and its (rows, columns) array of Axes."""
+    """A figure outside pyplot, which leaves the user's backend unchanged, and its (rows, columns) array of Axes."""
     from matplotlib.figure import Figure
 
     empty = Figure(figsize=(width, height), dpi=100, layout="constrained")
@@ -16,7 +16,7 @@ def figure(height, rows=1, columns=1, width=FIGURE_WIDTH, **options):
 
 
 def panels(count, height):
-    """Axes one above the other, over the same time, in a new figure."""
+    """Axes one above the other in a new figure, with one time axis."""
     return figure(height, rows=count, sharex=True)[1][:, 0]
 
 
@@ -26,5 +26,5 @@ def look(i):
 
 
 def label(text, unit):
-    """A text with its unit in brackets, if it has one."""
+    """A text with its unit in brackets, if there is one."""
     return f"{text} [{unit}]" if unit else text

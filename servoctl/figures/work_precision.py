@@ -1,11 +1,11 @@
-"""The work-precision diagram of a measured trade."""
+"""The work-precision diagram of a trade-off."""
 
 import numpy as np
 
 from servoctl.figures import style
 
 COLOURS = (*style.COLOURS, *style.MORE)
-LOOKS = {  # of a treatment of drift: line, marker, words
+LOOKS = {  # line, marker and label of each treatment of drift
     "none": ("-", "o", "as it drifts"),
     "project": ("--", "s", "projected"),
     "minimal": (":", "^", "minimal coordinates"),
@@ -14,7 +14,7 @@ FRONT, UNRESOLVED, GREY = "#BBBBBB", "#EEEEEE", "#555555"
 
 
 def draw_tradeoff(study, ax, cost, title):
-    """Draw errors over a cost, a line for each method and treatment, with the Pareto front."""
+    """Draw errors over a cost, with a line for each method and treatment, and the Pareto front."""
     ax = style.figure(5.0, width=8.0)[1][0, 0] if ax is None else ax
     good = np.isfinite(study["error"]) & np.isfinite(study["seconds"])
     methods, drifts = (list(dict.fromkeys(study[name][good].tolist())) for name in ("method", "drift"))

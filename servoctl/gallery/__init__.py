@@ -48,7 +48,7 @@ __all__ = [
 
 @dataclass(frozen=True)
 class Scene:
-    """A mechanism with its program, a start and a span of time.
+    """A mechanism with a program, initial values and a time span.
 
     Parameters
     ----------
@@ -57,9 +57,9 @@ class Scene:
     description : str
         One sentence.
     start : dict of str to float
-        Values held at the start, by name, SI.
+        Free initial values by name, SI.
     guess : dict of str to float
-        Guesses for the rest of the start, by name, SI.
+        Guesses of the other initial values by name, SI.
     t_span : (2,) tuple of float
         [s]
     units : dict of str to str

@@ -12,8 +12,8 @@ def appell_hamel(form="linear"):
     Parameters
     ----------
     form : {"linear", "squared"}
-        "linear" rolls by (4.1), (4.2). "squared" is the paper's own (4.4): the speed of the wheel's centre,
-        squared, and its direction. Squaring makes the program singular wherever the wheel stops, φ' = 0.
+        "linear" rolls by (4.1), (4.2). "squared" is (4.4): the squared speed of the wheel's centre and
+        its direction. Squaring makes the program singular wherever the wheel stops, φ' = 0.
 
     Returns
     -------

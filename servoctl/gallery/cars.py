@@ -36,19 +36,13 @@ def cars(N=2, masses=None, stiffnesses=None, gaps=None, by="actuators"):
         If there are fewer than two cars, or a list has a wrong length.
     """
     if N < 2:
-        raise SpecificationError(
-            f"A row of {N} cars.", "The force passes through a spring.", nearest="N = 2."
-        )
-    masses = _per_car("masses", masses, [1.0] * (N - 1) + [2.0])
-    stiffnesses = _per_car("stiffnesses", stiffnesses, [1.0] * (N - 1))
-    gaps = _per_car("gaps", gaps, [0.5] * (N - 1))
-    cars_from_1 = range(1, N + 1)
+        raise SpecificationError(f"A row of {N} cars.", "A spring joins two cars.", nearest="N = 2.", N=N)
     p = sv.parameters(
-        **{f"m{i}": m for i, m in zip(cars_from_1, masses, strict=True)},  # kg
-        **{f"k{i}": k for i, k in zip(cars_from_1, stiffnesses, strict=False)},  # N/m
-        **{f"gap{i}": gap for i, gap in zip(cars_from_1, gaps, strict=False)},  # m
+        **_numbered("m", "masses", masses, [1.0] * (N - 1) + [2.0]),  # kg
+        **_numbered("k", "stiffnesses", stiffnesses, [1.0] * (N - 1)),  # N/m
+        **_numbered("gap", "gaps", gaps, [0.5] * (N - 1)),  # m
     )
-    q = sv.coordinates(" ".join(f"x{i}" for i in cars_from_1))  # m, each
+    q = sv.coordinates(" ".join(f"x{i}" for i in range(1, N + 1)))  # m, each
     x, m, k, gap = tuple(q), p.symbols[:N], p.symbols[N : 2 * N - 1], p.symbols[2 * N - 1 :]
     stretch = ca.vertcat(*(x[i] - x[i + 1] - gap[i] for i in range(N - 1)))
     path = sv.paths.rest_to_rest(q.t, 0.5, 2.5, duration=2.0, smoothness=max(6, 2 * N))
@@ -62,10 +56,10 @@ def cars(N=2, masses=None, stiffnesses=None, gaps=None, by="actuators"):
     return mechanism, sv.Program({"car 1": x[0] - path}, by=by)
 
 
-def _per_car(what, given, default):
-    values = default if given is None else list(given)
+def _numbered(letter, what, values, default):
+    values = default if values is None else list(values)
     if len(values) != len(default):
         raise SpecificationError(
-            f"There are {len(values)} {what}.", f"This row of cars has {len(default)}."
+            f"There are {len(values)} {what}.", f"This row of cars has {len(default)}.", name=what, values=values
         )
-    return values
+    return {f"{letter}{i}": value for i, value in enumerate(values, 1)}

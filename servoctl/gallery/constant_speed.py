@@ -1,4 +1,4 @@
-"""A particle kept at constant speed in gravity."""
+"""A particle at constant speed in gravity."""
 
 import casadi as ca
 
@@ -7,10 +7,10 @@ from servoctl.errors import unknown
 
 
 def constant_speed(realisation="ideal"):
-    """|v|² is kept at 5² m²/s², by an ideal reaction or by a horizontal force.
+    """An ideal reaction or a horizontal force keeps |v|² at 5² m²/s².
 
-    Started horizontally, the ideal motion has the heading -arcsin tanh(g t / v). A horizontal force leaves the fall
-    free, and cannot keep the speed beyond t = v/g, where it grows without bound.
+    From a horizontal start the ideal motion has the heading -arcsin tanh(g t / v). A horizontal force does not act on
+    the fall; it grows without bound towards t = v/g, where the motion ends.
 
     Parameters
     ----------

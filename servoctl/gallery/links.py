@@ -1,7 +1,7 @@
 """Arms of n equal links whose end point is guided ideally: a plane one and a spatial one.
 
-Each comes in joint angles, where the inertia matrix is full, or with the bodies' own coordinates and the joints as
-material constraints, where everything is sparse and the operations grow with n.
+Each comes in joint angles, where the inertia matrix is full, or in coordinates of each body with the joints as
+material constraints, where everything is sparse and operation counts grow like n.
 """
 
 from itertools import accumulate
@@ -15,7 +15,7 @@ COORDINATES = ("joints", "bodies")
 
 
 def planar_arm(n=3, coordinates="joints", acceleration=(0.0, 0.0)):
-    """n homogeneous rods hang in a vertical plane; the end of the last one is given its acceleration.
+    """n homogeneous rods hang in a vertical plane; an ideal reaction programs the acceleration of the last one's end.
 
     Parameters
     ----------
@@ -46,8 +46,8 @@ def planar_arm(n=3, coordinates="joints", acceleration=(0.0, 0.0)):
         inclinations, centres = list(accumulate(q)), None
     else:
         q = sv.coordinates(_names("x y phi", n))
-        own = [list(q)[3 * i : 3 * i + 3] for i in range(n)]
-        inclinations, centres = [phi for _, _, phi in own], [ca.vertcat(x, y) for x, y, _ in own]
+        xs, ys, inclinations = (list(q)[i::3] for i in range(3))
+        centres = [ca.vertcat(x, y) for x, y in zip(xs, ys, strict=True)]
     halves = [p.l / 2 * ca.vertcat(ca.cos(phi), ca.sin(phi)) for phi in inclinations]
     joint, constraints = ca.SX.zeros(2), {}
     if centres is None:
@@ -71,7 +71,7 @@ def planar_arm(n=3, coordinates="joints", acceleration=(0.0, 0.0)):
         outputs={"X": joint[0], "Y": joint[1]},
         parameters=p,
     )
-    residuals = {name: a - given for name, a, given in zip("XY", end, acceleration, strict=True)}
+    residuals = {name: a - target for name, a, target in zip("XY", end, acceleration, strict=True)}
     return mechanism, sv.Program(residuals, by="ideal")
 
 
@@ -84,8 +84,8 @@ def spatial_arm(n=3, coordinates="joints"):
         Number of links, at least 3.
     coordinates : {"joints", "bodies"}
         The joint angles theta1, theta2, ... [rad]; or these, and for each link the integrals a, b, c [rad] of its
-        angular velocity and x, y, z [m] of its joint's velocity in its own axes, whose rates the material constraints
-        "joint 1 a", ... bind to those of the link before.
+        angular velocity and x, y, z [m] of its joint's velocity along its axes, whose rates the material constraints
+        "joint 1 a", ... equate to those by the link before.
 
     Returns
     -------
@@ -113,12 +113,12 @@ def spatial_arm(n=3, coordinates="joints"):
         turn = _turn(angle, i % 2)
         handed = ca.vertcat(turn @ spin, turn @ (speed + (ca.cross(spin, rod) if i else 0)))
         handed[1 if i % 2 else 2] += rates[width * i]
-        own = handed if joints else ca.vertcat(*rates[width * i + 1 : width * (i + 1)])
+        twist = handed if joints else ca.vertcat(*rates[width * i + 1 : width * (i + 1)])
         if not joints:
             names = (f"joint {i + 1} {letter}" for letter in "abcxyz")
-            constraints |= dict(zip(names, (own - handed).elements(), strict=True))
-        spin, speed, gravity = own[:3], own[3:], turn @ gravity
-        twists.append(own)
+            constraints |= dict(zip(names, (twist - handed).elements(), strict=True))
+        spin, speed, gravity = twist[:3], twist[3:], turn @ gravity
+        twists.append(twist)
         wrenches.append(ca.vertcat(ca.cross(rod / 2, p.m * gravity), p.m * gravity))
     twists, changes = q.derivatives(ca.vertcat(*twists).elements(), 1)
     S, inertia = 0, p.m * p.l**2 / 12 * ca.vertcat(0, 1, 1)
@@ -135,7 +135,7 @@ def spatial_arm(n=3, coordinates="joints"):
 def _check(n, coordinates, least):
     if n < least:
         raise SpecificationError(
-            f"An arm of {n} links.", "The joints can give the end point any acceleration.", nearest=f"n = {least}."
+            f"An arm of {n} links.", f"Its end point needs {least} joints.", nearest=f"n = {least}.", n=n
         )
     if coordinates not in COORDINATES:
         raise unknown(coordinates, COORDINATES, "kind of coordinates")
@@ -150,7 +150,7 @@ def _names(letters, n):
 
 
 def _turn(angle, about_y):
-    """What turns components along the axes of a link into those along the next one's."""
+    """The rotation of components along the axes of a link to those along the axes of the next link."""
     s, c = ca.sin(angle), ca.cos(angle)
     rows = [[c, 0, -s], [0, 1, 0], [s, 0, c]] if about_y else [[c, s, 0], [-s, c, 0], [0, 0, 1]]
     return ca.vertcat(*(ca.horzcat(*row) for row in rows))

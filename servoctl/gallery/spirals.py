@@ -9,7 +9,7 @@ from servoctl.errors import SpecificationError
 
 
 def spiral(order=3, c=None):
-    """The n-th time derivative of the path's curvature is kept at c, n = order - 2, by an ideal reaction.
+    """An ideal reaction keeps the n-th time derivative of the path's curvature at c, n = order - 2.
 
     κ = (x'y'' - y'x'')/|v|³ holds second derivatives, so the program has order n + 2. The reaction does no work: the
     speed stays. From speed 1 and rest curvature the heading is c t^(n+1)/(n+1)! (for n = 1 Cornu's spiral).
@@ -32,7 +32,7 @@ def spiral(order=3, c=None):
     """
     if order < 2:
         raise SpecificationError(
-            f"A spiral of order {order}.", "Curvature has order 2.", nearest="order = 2, a circle."
+            f"A spiral of order {order}.", "Curvature has order 2.", nearest="order = 2, a circle.", order=order
         )
     n = order - 2
     p = sv.parameters(m=1.0, c=factorial(n + 1) / 2 ** (n + 1) if c is None else c)  # kg, 1/(m s^n)

@@ -9,7 +9,7 @@ def wheeled_robot(turn=90.0, speed=1.0, duration=4.0):
     """At constant speed, the curvature κ = r/v of the path grows and falls: dκ/dt = c sin(2πt/T), a smooth turn.
 
     The wheels do not slip sideways: the quasi-velocities are the speed v and the yaw rate r. The program has the
-    orders 1 and 2. The turn takes the time T, the heading changes by the angle given, and the robot goes straight on.
+    orders 1 and 2. The turn takes the time T and changes the heading by `turn`; then the robot goes straight on.
 
     Parameters
     ----------

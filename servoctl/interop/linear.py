@@ -1,4 +1,4 @@
-"""Linear systems of python-control, by name: exact linearisations."""
+"""Exact linearisations as linear systems of python-control, by name."""
 
 import numpy as np
 
@@ -13,6 +13,8 @@ from servoctl.interop.names import connected, force_names, output_names, signal_
 from servoctl.model.model import Model
 from servoctl.plants.plant import Plant
 
+OPTIONS = {Plant: ("x", "u", "rate", "disturbed"), Law: ("x", "controller_state"), Closed: (), Model: ("x",)}
+
 
 def linearise(thing, t, x=None, u=None, *, controller_state=None, rate=None, disturbed=(), name=None):
     """A model, plant, law or closed loop linearised exactly, from its expressions, as a named `control.StateSpace`.
@@ -20,44 +22,37 @@ def linearise(thing, t, x=None, u=None, *, controller_state=None, rate=None, dis
     Parameters
     ----------
     thing : Model, Plant, Law or Closed
-        A plant is linearised where no limit is met. Of a closed loop that is its state at the sample t.
+        Limits of a plant are ignored. A closed loop is linearised about its state at the sample t.
     t : float
         [s]
     x : (n,) array or dict of str to float
-        State of the model or plant; of a law the measurement, default its plan's.
+        State of the model or plant, or measurement of the law; default for a law: that of its plan.
     u : (m,) array or dict of str to float, optional
-        Of a plant: its inputs; default 0.
+        Inputs of a plant; default 0.
     controller_state : (n_z,) array, optional
-        Of a law; default that at its start.
+        Controller state of a law; default its initial one.
     rate : float, optional
-        Of a plant: discretised exactly under a zero-order hold of 1/rate.
+        A plant is discretised exactly under a zero-order hold of 1/rate [s].
     disturbed : sequence of str
-        Of a plant: generalised forces that are inputs, too.
+        Generalised forces of a plant that are further inputs.
     name : str, optional
 
     Returns
     -------
     control.StateSpace
-        With the names of `nlsys`; a law's and a closed loop's in discrete time, u = C z + D y about the point.
+        With the names of `nlsys`; laws and closed loops in discrete time, u = C z + D y about the point.
 
     Raises
     ------
     SpecificationError
-        For a law written in Python, a plant with transport delay, options that the thing does not have.
+        For a law written in Python, a plant with transport delay, and options that do not apply.
     NameUnknown
-        For a disturbance on no generalised force.
+        For a disturbance of an unknown generalised force.
     """
-    options = {"u": u is not None, "controller_state": controller_state is not None}
-    options |= {"rate": rate is not None, "disturbed": bool(disturbed)}
-    allowed = {Plant: ("u", "rate", "disturbed"), Law: ("controller_state",), Closed: (), Model: ()}
-    for kind, valid in allowed.items():
-        surplus = [option for option, given in options.items() if given and option not in valid]
-        if isinstance(thing, kind) and (surplus or (kind is Closed and x is not None)):
-            raise SpecificationError(
-                f"{', '.join(surplus) or 'x'} was given for a {kind.__name__}.",
-                f"It has {', '.join(('t', *(('x',) if kind is not Closed else ()), *valid))}.",
-                do="Leave it out.",
-            )
+    _require_applicable(
+        thing, x=x is not None, u=u is not None, controller_state=controller_state is not None, rate=rate is not None,
+        disturbed=bool(disturbed),
+    )  # fmt: skip
     t = finite("t", t, "time")
     if isinstance(thing, Plant):
         return _linear_plant(thing, t, thing.state(x), u, rate, disturbed, name or "plant")
@@ -70,19 +65,33 @@ def linearise(thing, t, x=None, u=None, *, controller_state=None, rate=None, dis
     raise stranger(thing)
 
 
+def _require_applicable(thing, **used):
+    """Refuse options that do not apply to the thing."""
+    for kind, valid in OPTIONS.items():
+        surplus = [option for option, is_used in used.items() if is_used and option not in valid]
+        if isinstance(thing, kind) and surplus:
+            raise SpecificationError(
+                f"{', '.join(surplus)} was given for a {kind.__name__}.",
+                f"The point and options of a {kind.__name__} are {', '.join(('t', *valid))}.",
+                do="Leave it out.",
+                names=surplus,
+                valid=valid,
+            )
+
+
 def along(thing, run, times=None, **options):
-    """A plant, model or law linearised along a run, one after another.
+    """Linearisations of a plant, model or law along a run.
 
     Parameters
     ----------
     thing : Plant, Model or Law
     run : Run or Closed
-        Gives states, inputs or measurements, by name.
+        States, inputs or measurements by name.
     times : (N,) array, optional
-        [s], in increasing order within the run; of a law instants of sampling, of a closed loop its samples. Default:
-        all samples of the run.
+        Increasing instants [s] within the run: sampling instants for a law, samples of a closed loop. Default: all
+        samples of the run.
     **options
-        rate, disturbed, name: of `linearise`.
+        Options rate, disturbed and name of `linearise`.
 
     Yields
     ------
@@ -104,26 +113,32 @@ def along(thing, run, times=None, **options):
         values = resampled(run, times)
     for k, t in enumerate(times):
         if isinstance(thing, Plant):
-            x = {name: values[name][k] for name in thing.state_names}
             inputs = [f"input {name}" if isinstance(run, Closed) else name for name in thing.inputs]
-            yield linearise(thing, t, x, [values[name][k] for name in inputs], **options)
+            u = list(_at(values, inputs, k).values())
+            yield linearise(thing, t, _at(values, thing.state_names, k), u, **options)
         elif isinstance(thing, Law):
-            yield linearise(thing, t, {name: values[name][k] for name in thing.measures}, **options)
+            yield linearise(thing, t, _at(values, thing.measures, k), **options)
         elif isinstance(thing, Model):
-            yield linearise(thing, t, np.array([values[name][k] for name in thing.state_names]), **options)
+            yield linearise(thing, t, list(_at(values, thing.state_names, k).values()), **options)
         else:
             raise stranger(thing)
+
+
+def _at(values, names, k):
+    return {name: values[name][k] for name in names}
 
 
 def _require_within(run, times):
     room = 1e-9 * (run.t[-1] - run.t[0])
     if not len(times):
-        raise SpecificationError("No times were given.", "A linearisation has an instant.", do="Give one or more.")
+        raise SpecificationError("There are no times.", "A linearisation has an instant.", times=times)
     if np.any(np.diff(times) < 0) or times[0] < run.t[0] - room or times[-1] > run.t[-1] + room:
         raise SpecificationError(
-            f"Times from {times[0]:g} to {times[-1]:g} s were given.",
-            f"They increase, within the run: {run.t[0]:g} to {run.t[-1]:g} s.",
-            do="Give such times.",
+            f"The times go from {times[0]:g} to {times[-1]:g} s.",
+            f"Times increase, within {run.t[0]:g} to {run.t[-1]:g} s of the run.",
+            do="Sort them, and leave out those beyond the run.",
+            times=times,
+            span=(float(run.t[0]), float(run.t[-1])),
         )
 
 
@@ -151,7 +166,7 @@ def loop_gain(plant, law, at):
     NameUnknown
         If the law has no such actuator.
     SpecificationError
-        For what is no linear system, or different sampling.
+        For anything but linear systems, and for different sampling.
     """
     import control
 
@@ -161,13 +176,15 @@ def loop_gain(plant, law, at):
     if plant.dt != law.dt:
         raise SpecificationError(
             f"The plant has dt = {plant.dt:g} s, the law {law.dt:g} s.",
-            "A sampled law is closed around a plant that is sampled alike.",
+            "Plant and law have the same sampling period.",
             nearest=f"interop.linearise(plant, t, x, u, rate={1 / law.dt:g}).",
             do="Linearise the plant with the law's rate.",
+            plant_dt=plant.dt,
+            law_dt=law.dt,
         )
     if at not in law.output_labels:
         raise unknown(at, law.output_labels, "actuator")
-    plant, law = _renamed(plant, "plant"), _renamed(law, "law")
+    plant, law = plant.copy("plant", use_prefix_suffix=False), law.copy("law", use_prefix_suffix=False)
     wires = [[f"plant.{a}", f"law.{a}"] for a in law.output_labels if a != at]
     wires += [[f"law.{y}", f"plant.{y}"] for y in law.input_labels]
     return control.interconnect(
@@ -182,9 +199,9 @@ def _linear_plant(plant, t, x, u, rate, disturbed, name):
     if plant.delay:
         raise SpecificationError(
             f"The plant has a transport delay of {max(plant.delay.values()):g} s.",
-            "A linear system of finite order has none in continuous time, and whole samples of it in discrete time.",
-            nearest="sv.plant without delay, and a delay of sv.close or a control.pade in series.",
-            do="Linearise the plant without delay.",
+            "A delay in continuous time has no linear system of finite order.",
+            do="Linearise the plant without delay, and put control.pade in series or a delay of samples into sv.close.",
+            delay=dict(plant.delay),
         )
     (disturbed, forces), m, n_x = force_names(plant, disturbed), len(plant.inputs), plant.n_x
     u = np.zeros(m) if u is None else ordered(u, plant.inputs, "input")
@@ -211,21 +228,28 @@ def _linear_law(law, t, x, controller_state, name):
     if not differentiable(law.step):
         raise SpecificationError(
             f"The law {law.name!r} is computed in Python.",
-            "A linearisation is taken from expressions.",
-            do="Linearise the law that it allocates within limits, or interop.nlsys(law) by differences.",
+            "An exact linearisation needs expressions.",
+            do="Linearise the law without sv.limited, or interop.nlsys(law) by differences.",
+            name=law.name,
         )
     if x is None:
         if law.plan is None:
-            raise SpecificationError("The law has no plan.", "A linearisation has a point.", do="Give the measurement.")
+            raise SpecificationError(
+                f"The law {law.name!r} has no plan.", "A law is linearised about x.", do="Pass x.", name=law.name
+            )
         at = resampled(law.plan, np.clip([float(t)], law.plan.t[0], law.plan.t[-1]))
         x = {measure: at[measure][0] for measure in law.measures}
     y, m, n_z = ordered(x, law.measures, "measurement", exactly=False), len(law.inputs), len(law.state)
     z = np.asarray(law.state if controller_state is None else controller_state, dtype=float)
     if z.shape != (n_z,):
         raise SpecificationError(
-            f"The controller state has the shape {z.shape}.", f"That of the law has {n_z} numbers.", do="Give as many."
+            f"The controller state has the shape {z.shape}.",
+            f"That of the law {law.name!r} has {n_z} numbers.",
+            do=f"Pass {', '.join(law.state_names) or 'none'}.",
+            shape=z.shape,
+            size=n_z,
         )
-    J = jacobian(law.step, "x", t, np.append(y, z), law.row(t))
+    J = jacobian(law.step, "x", t, np.append(y, z), law.schedule_at(t))
     n_y = len(y)
     A, B, C, D = J[m : m + n_z, n_y:], J[m : m + n_z, :n_y], J[:m, n_y:], J[:m, :n_y]
     return control.ss(
@@ -240,7 +264,10 @@ def _linear_closed(closed, t, name):
     k = int(np.argmin(np.abs(closed.t - t)))
     if loop.quantum is not None:
         raise SpecificationError(
-            "The measurement is quantised.", "Steps have no linearisation.", do="Close the loop without quantisation."
+            f"The measurement of {', '.join(closed.conditions.sensors.quantisation)} is quantised.",
+            "Rounding has no linearisation.",
+            do="Close the loop without quantisation.",
+            quantisation=closed.conditions.sensors.quantisation,
         )
     u, y = closed.inputs[:, k], closed.measurements[:, k]
     system = _late(_linear_plant(plant, t, x, u, law.rate, plant.disturbable, "plant"), plant, loop.delay)
@@ -248,7 +275,7 @@ def _linear_closed(closed, t, name):
 
 
 def _late(system, plant, delay):
-    """A sampled plant whose actuators receive each command `delay` samples late: past commands are further states."""
+    """A sampled plant behind a delay of its inputs in samples: past commands are further states."""
     import control
 
     if not delay:
@@ -275,9 +302,12 @@ def _linear_model(model, t, x, name):
     n, n_x, p = model.n, len(model.state_names), model.parameters
     if x.shape != (n_x,):
         raise SpecificationError(
-            f"The state has the shape {x.shape}.", f"It has {n_x} numbers: {', '.join(model.state_names)}.",
-            nearest="model.start(...).", do="Give them in this order.",
-        )  # fmt: skip
+            f"The state has the shape {x.shape}.",
+            f"It has {n_x} numbers: {', '.join(model.state_names)}.",
+            do="Pass them in this order, as model.start(...) does.",
+            shape=x.shape,
+            names=model.state_names,
+        )
     ode = model.function("ode")
     A = jacobian(ode, "x", t, x, p)[:n_x]
     z, to_jets = np.append(x, ode(t, x, p)[n_x - n : n_x]), np.vstack([np.eye(n_x), A[-n:]])
@@ -288,12 +318,3 @@ def _linear_model(model, t, x, name):
     return control.ss(
         A, np.zeros((n_x, 0)), C, np.zeros((len(C), 0)), name=name, states=model.state_names, outputs=names, inputs=[]
     )
-
-
-def _renamed(system, name):
-    import control
-
-    return control.ss(
-        system.A, system.B, system.C, system.D, dt=system.dt, name=name, states=system.state_labels,
-        inputs=system.input_labels, outputs=system.output_labels, remove_useless_states=False,
-    )  # fmt: skip

@@ -2,21 +2,21 @@
 
 from servoctl.errors import SpecificationError, unknown
 
-RULE = "Systems of python-control are made of a Model, a Plant, a Law or the Closed of sv.close."
+RULE = "A system of python-control is made of a Model, a Plant, a Law or the Closed of sv.close."
 
 
 def output_names(plant):
-    """Outputs of a plant: states as signals, and the mechanism's outputs."""
+    """Output names of a plant: its states, and the outputs of the mechanism."""
     return [*signal_names(plant.state_names, plant.inputs), *plant.mechanism.outputs]
 
 
 def signal_names(names, inputs):
-    """Names of states as signals: a lagged actuator is distinguished from its input."""
+    """Signal names of states: "lagged a" for the state of an actuator a, whose input is "a"."""
     return [f"lagged {name}" if name in inputs else name for name in names]
 
 
 def force_names(plant, disturbed):
-    """Generalised forces that are inputs, by one name or several, and where they stand among the disturbances."""
+    """Names of disturbed generalised forces, from one name or several, and their indices."""
     names = (disturbed,) if isinstance(disturbed, str) else tuple(disturbed)
     for name in names:
         if name not in plant.disturbable:
@@ -41,6 +41,7 @@ def connected(system, law_system, plant, law, name):
 
 
 def stranger(thing, rule=RULE):
-    """The error for what is no model, plant, law or loop."""
+    """The error for an object of an unknown type."""
     nearest = "run.model, of a plan." if hasattr(thing, "jets") else ""
-    return SpecificationError(f"A {type(thing).__name__} was given.", rule, nearest=nearest, do="Give one of these.")
+    kind = type(thing).__name__
+    return SpecificationError(f"The object is a {kind}.", rule, nearest=nearest, kind=kind)

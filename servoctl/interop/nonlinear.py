@@ -30,15 +30,15 @@ def nlsys(thing, *, rate=None, substeps=None, disturbed=(), name=None):
     ----------
     thing : Model, Plant, Law or Closed
     rate : float, optional
-        Of a plant only: samples per second [Hz]. It is then a system in discrete time, whose inputs are held over each
-        sample; python-control interconnects a law with no other. Limits of rate and transport delays need it: past
-        inputs are then further states.
+        Samples per second [Hz] of a plant, which is then a system in discrete time with inputs held over each sample.
+        Required to interconnect it with a law, and for limits of rate and transport delays, with which past inputs are
+        further states.
     substeps : int, optional
-        Of a sampled plant: Runge-Kutta steps of order 4 per sample; default 10.
+        Runge-Kutta steps of order 4 per sample of a plant; default 10.
     disturbed : sequence of str
-        Of a plant: generalised forces with an input "disturbance NAME" of their own.
+        Generalised forces of a plant that have an input "disturbance NAME".
     name : str, optional
-        Of the system; default "model", "plant", "law" or "loop".
+        Name of the system; default "model", "plant", "law" or "loop".
 
     Returns
     -------
@@ -48,15 +48,16 @@ def nlsys(thing, *, rate=None, substeps=None, disturbed=(), name=None):
     Raises
     ------
     SpecificationError
-        For what is none of these, options that it does not have, limits of rate or delays in continuous time.
+        For other objects, options that do not apply, and limits of rate or delays in continuous time.
     NameUnknown
-        For a disturbance on no generalised force.
+        For a disturbance of an unknown generalised force.
     """
     if not isinstance(thing, Plant) and (rate is not None or substeps is not None or disturbed):
         raise SpecificationError(
             f"rate, substeps or disturbed was given for a {type(thing).__name__}.",
-            "They are those of a plant; laws and loops have their own rate, models are continuous.",
+            "They apply to plants: laws and loops have a rate, models are continuous.",
             do="Leave them out.",
+            kind=type(thing).__name__,
         )
     if isinstance(thing, Plant):
         return _plant(thing, name or "plant", disturbed, rate, substeps)
@@ -70,7 +71,7 @@ def nlsys(thing, *, rate=None, substeps=None, disturbed=(), name=None):
 
 
 def start(closed):
-    """The state in which the system of a closed loop starts, for X0 of python-control: plant, past inputs, law.
+    """The initial state of a closed loop's system, X0 of python-control: plant, past inputs, law.
 
     Parameters
     ----------
@@ -83,12 +84,13 @@ def start(closed):
     Raises
     ------
     SpecificationError
-        For what is no closed loop.
+        For anything but a closed loop.
     """
     if not isinstance(closed, Closed):
-        raise stranger(closed, "A start belongs to the Closed of sv.close.")
-    loop = closed.loop
-    return np.concatenate([loop.x0, np.tile(loop.idle, sum(_pasts(closed.plant, loop))), loop.z0])
+        raise stranger(closed, "The initial state is that of a Closed of sv.close.")
+    loop, late = closed.loop, 0 if closed.loop.transport is None else closed.loop.transport
+    past = loop.delay + _past_inputs(closed.plant, late, loop.substeps)
+    return np.concatenate([loop.x0, np.tile(loop.initial_input, past), loop.z0])
 
 
 def _model(model, name):
@@ -104,9 +106,8 @@ def _model(model, name):
         if not np.isfinite(y).all():
             raise ServoError(
                 f"The reduced dynamics is not finite at t = {t:.6g} s.",
-                "A model has the pivots of its derivation; they may vanish along a motion.",
-                nearest="sv.simulate, which chooses others there.",
-                do="Take model.near(t, jets), or stay away from there.",
+                "A pivot of the model vanishes here; sv.simulate would choose others.",
+                do="Use model.near(t, jets), whose pivots are those of a state near by.",
                 t=float(t),
             )
         return y
@@ -122,7 +123,7 @@ def _model(model, name):
 
 
 def _numbers(p, symbols, params):
-    """The parameters p with those that python-control passes on by name."""
+    """The parameters p with the values of python-control's params."""
     return np.append([params[name] for name in symbols], p[len(symbols) :])
 
 
@@ -164,14 +165,14 @@ def _plant(plant, name, disturbed, rate, substeps, delay=0):
 
 
 def _require_continuous(plant, substeps):
-    """Refuse what belongs to samples."""
+    """Refuse limits of rate, delays and substeps without a rate."""
     if plant.rate_limits or plant.delay or substeps is not None:
         what = "limits of rate" if plant.rate_limits else "transport delay" if plant.delay else "substeps"
         raise SpecificationError(
-            f"A plant with {what} is to be a system in continuous time.",
-            "Limits of rate, transport delays and substeps belong to inputs that are sampled and held.",
-            nearest="interop.nlsys(plant, rate=100.0).",
-            do="Give the rate.",
+            f"The system has {what} and no rate.",
+            "Limits of rate, transport delays and substeps need inputs that are sampled and held.",
+            do="Pass the rate: interop.nlsys(plant, rate=100.0).",
+            what=what,
         )
 
 
@@ -203,12 +204,8 @@ class _SampledPlant:
 
 
 def _past_inputs(plant, late, substeps):
-    """Samples by which applied inputs are remembered."""
+    """Number of past samples whose inputs are states."""
     return max(math.ceil(np.max(late, initial=0) / substeps), 1 if plant.rate_limits else 0)
-
-
-def _pasts(plant, loop):
-    return loop.delay, _past_inputs(plant, 0 if loop.transport is None else loop.transport, loop.substeps)
 
 
 def _law(law, name, quantum=None):
@@ -216,14 +213,15 @@ def _law(law, name, quantum=None):
 
     if getattr(law.step, "stateful", False):
         raise SpecificationError(
-            f"The law {law.name!r} keeps its state to itself.",
-            "python-control asks for outputs and states apart, more than once per sample.",
-            do="Run it by sv.close, or write it as a control.nlsys.",
+            f"The law {law.name!r} has a hidden state.",
+            "python-control evaluates outputs and states separately, more than once per sample.",
+            do="Run it with sv.close, or write it as a control.nlsys.",
+            name=law.name,
         )
     m, n_z = len(law.inputs), len(law.state)
 
     def answer(t, z, y):
-        return law.answer(t, np.append(quantised(y, quantum), z), law.row(t))
+        return law.answer(t, np.append(quantised(y, quantum), z), law.schedule_at(t))
 
     return control.nlsys(
         (lambda t, z, y, _: answer(t, z, y)[m : m + n_z]) if n_z else None,
@@ -235,5 +233,5 @@ def _law(law, name, quantum=None):
 
 def _closed(closed, name):
     plant, loop = closed.plant, closed.loop
-    own = _plant(plant, "plant", plant.disturbable, 1.0 / loop.period, loop.substeps, loop.delay)
-    return connected(own, _law(closed.law, "law", loop.quantum), plant, closed.law, name)
+    system = _plant(plant, "plant", plant.disturbable, 1.0 / loop.period, loop.substeps, loop.delay)
+    return connected(system, _law(closed.law, "law", loop.quantum), plant, closed.law, name)

@@ -5,9 +5,17 @@ variable, coefficient by coefficient, with the usual recurrences (O(k) operation
 product). The coefficients are SX expressions, when a derivative is to be derived, or NumPy arrays over
 many points, when it is to be evaluated: the same recurrences serve both. Coefficients are *normalised*:
 coefficient k of f is f^(k)/k!.
+
+A `Motion` gives the coefficients of every symbol of an expression; a `Flow` is rows along a motion in numbers.
 """
 
-from servoctl.jets.elementary import add, apply, divide, multiply, select, subtract
+from copy import copy
+from math import factorial
+
+import casadi as ca
+import numpy as np
+
+from servoctl.jets.tape import REAL, Scalars, add, apply, divide, multiply, select, subtract
 
 _NUMBERS = (float, int)
 
@@ -17,12 +25,14 @@ def is_zero(c):
     return c.__class__ in _NUMBERS and c == 0
 
 
+def _times(a, b):
+    return 0.0 if is_zero(a) or is_zero(b) else multiply(a, b)
+
+
 def _dot(pairs):
     total = 0.0
     for a, b in pairs:
-        if not (is_zero(a) or is_zero(b)):
-            product = multiply(a, b)
-            total = product if is_zero(total) else add(total, product)
+        total = _plus(total, _times(a, b))
     return total
 
 
@@ -35,17 +45,29 @@ def _minus(a, b):
 
 
 def _inner_first(k, first=0):
-    """Indices first..k of a product's terms, those with the latest coefficients last: the others are known earlier."""
+    """Indices first..k of a product's terms; terms with the highest coefficients, which come latest, are last."""
     return sorted(range(first, k + 1), key=lambda j: max(j, k - j))
 
 
 class Series:
     """A tape run on truncated power series, one coefficient at a time.
 
-    `inputs[i]` is the list of coefficients of input i; before `advance()` computes coefficient k, each
-    must hold at least k + 1 entries. `outputs[i]` are the coefficients of output i so far. Branches are taken by
-    coefficient 0 of what is compared; `decided` may give other values for nodes, at which to take them. With
-    `first` only so many of the tape's outputs are computed.
+    Parameters
+    ----------
+    tape : Tape
+    inputs : list of list
+        Coefficients of each input; before `advance()` computes coefficient k, at least k + 1 of them.
+    decided : dict of int to value, optional
+        Values of nodes by which branches are taken. Default: coefficient 0 of the compared nodes.
+    first : int, optional
+        How many of the tape's outputs are computed; default all.
+
+    Attributes
+    ----------
+    c : list of list
+        The coefficients of each node so far.
+    k : int
+        Their number.
     """
 
     def __init__(self, tape, inputs, decided=None, first=None):
@@ -56,10 +78,6 @@ class Series:
         self.k = 0
         self.decided = decided or {}
 
-    def _first(self, node):
-        """The value of a node by which branches are taken."""
-        return self.decided[node] if node in self.decided else self.c[node][0]
-
     @property
     def outputs(self):
         """The coefficients of each output so far (list of lists)."""
@@ -67,45 +85,12 @@ class Series:
 
     def advance(self):
         """Compute the next coefficient of every node."""
-        k, c = self.k, self.c
-        if k == 0:
-            self._start()
-        else:
-            for i, node in enumerate(self.nodes):
-                c[i].append(self._coefficient(node, i, k))
+        for i, node in enumerate(self.nodes):
+            self.c[i].append(self._coefficient(node, i, self.k))
         self.k += 1
 
-    def _start(self):
-        """Coefficient 0 of every node: its value, without the recurrences."""
-        c, inputs = self.c, self.inputs
-        for i, (kind, args, data) in enumerate(self.nodes):
-            if kind == "mul":
-                a, b = c[args[0]][0], c[args[1]][0]
-                value = 0.0 if is_zero(a) or is_zero(b) else multiply(a, b)
-            elif kind == "add":
-                value = _plus(c[args[0]][0], c[args[1]][0])
-            elif kind == "sub":
-                a, b = c[args[0]][0], c[args[1]][0]
-                value = _minus(a, b)
-            elif kind == "neg":
-                a = c[args[0]][0]
-                value = 0.0 if is_zero(a) else -a
-            elif kind == "input":
-                value = inputs[data][0]
-            elif kind == "const":
-                value = data
-            else:
-                value = self._coefficient(self.nodes[i], i, 0)
-            c[i].append(value)
-
     def replace_last(self, coefficients):
-        """Recompute the last coefficient after the inputs' last coefficients changed.
-
-        Parameters
-        ----------
-        coefficients : dict
-            Input index to its new last coefficient.
-        """
+        """Recompute the last coefficient with new last coefficients of inputs, a dict by index of the input."""
         for i, value in coefficients.items():
             self.inputs[i][self.k - 1] = value
         for c in self.c:
@@ -114,20 +99,31 @@ class Series:
         self.advance()
 
     def _coefficient(self, node, i, k):
-        c, kind = self.c, node.kind
+        """Coefficient k of node i from lower ones of all nodes and coefficients k of earlier nodes."""
+        c, (kind, args, data) = self.c, node
+        if kind in ("mul", "add", "sub", "div"):
+            a, b = c[args[0]], c[args[1]]
+            if kind == "mul":
+                return _dot((a[j], b[k - j]) for j in _inner_first(k)) if k else _times(a[0], b[0])
+            if kind == "add":
+                return _plus(a[k], b[k])
+            if kind == "sub":
+                return _minus(a[k], b[k])
+            rest = _minus(a[k], _dot((c[i][j], b[k - j]) for j in _inner_first(k) if j < k))
+            return 0.0 if is_zero(rest) else divide(rest, b[0])
         if kind == "input":
-            return self.inputs[node.data][k]
+            return self.inputs[data][k]
         if kind == "const":
-            return node.data if k == 0 else 0.0
+            return data if k == 0 else 0.0
         if kind == "quad":
             return self._quadrature(node, k)
         if kind == "constant":
-            return apply(node.data, *(self._first(j) for j in node.args)) if k == 0 else 0.0
-        a = c[node.args[0]]
+            return apply(data, *(self._deciding(j) for j in args)) if k == 0 else 0.0
+        a = c[args[0]]
         if kind == "neg":
             return 0.0 if is_zero(a[k]) else -a[k]
         if kind == "scale":
-            return multiply(a[k], node.data)
+            return multiply(a[k], data)
         if kind == "copy":
             return a[k]
         if kind == "sq":
@@ -135,37 +131,26 @@ class Series:
         if kind == "sqrt":
             return self._root(a, c[i], k)
         if kind == "power":
-            return self._constant_power(a, c[i], node.data, k)
-        if kind in ("fabs", "gate", "fmin", "fmax"):
-            return self._branch(node, k)
-        b = c[node.args[1]]
-        if kind == "add":
-            return _plus(a[k], b[k])
-        if kind == "sub":
-            return _minus(a[k], b[k])
-        if kind == "mul":
-            return _dot((a[j], b[k - j]) for j in _inner_first(k))
-        if kind == "div":
-            y = c[i]
-            rest = _minus(a[k], _dot((y[j], b[k - j]) for j in _inner_first(k) if j < k))
-            return 0.0 if is_zero(rest) else divide(rest, b[0])
-        raise TypeError(f"a tape holds a node of kind {kind!r}")
+            return self._constant_power(a, c[i], data, k)
+        return self._branch(node, k)
+
+    def _deciding(self, node):
+        """The value of a node by which branches are taken."""
+        return self.decided[node] if node in self.decided else self.c[node][0]
 
     def _branch(self, node, k):
-        """Coefficient k of an operation that takes one of its branches."""
+        """Coefficient k of an operation with branches: that of the branch taken."""
         a, b = (self.c[i] for i in (node.args[0], node.args[-1]))
         if node.kind == "fabs":
-            return select(self._first(node.args[0]) >= 0, a[k], -a[k])
+            return select(self._deciding(node.args[0]) >= 0, a[k], -a[k])
         if node.kind == "gate":
             return 0.0 if is_zero(b[k]) else select(a[0] != 0, b[k], 0.0)
-        first = self._first(node.args[0]) <= self._first(node.args[1])
-        return select(first, *((a[k], b[k]) if node.kind == "fmin" else (b[k], a[k])))
+        first_is_least = self._deciding(node.args[0]) <= self._deciding(node.args[1])
+        return select(first_is_least, *((a[k], b[k]) if node.kind == "fmin" else (b[k], a[k])))
 
     @staticmethod
     def _square(a, k):
-        if k == 0:
-            return 0.0 if is_zero(a[0]) else multiply(a[0], a[0])
-        inner = multiply(a[k // 2], a[k // 2]) if k % 2 == 0 and not is_zero(a[k // 2]) else 0.0
+        inner = 0.0 if k % 2 else _times(a[k // 2], a[k // 2])
         return _plus(inner, multiply(2.0, _dot((a[j], a[k - j]) for j in reversed(range((k + 1) // 2)))))
 
     @staticmethod
@@ -182,7 +167,8 @@ class Series:
         total = _dot((multiply(exponent * (k - j) - j, a[k - j]), y[j]) for j in range(k) if not is_zero(a[k - j]))
         if is_zero(total):
             return 0.0
-        vanishes = a[0] if k < exponent else sum(apply("fabs", c) for c in a)  # the power of a zero is zero
+        # The recurrence divides by a_0. Where a_0 = 0 coefficients below the exponent vanish, and all do where a = 0.
+        vanishes = a[0] if k < exponent else sum(apply("fabs", c) for c in a)
         return select(vanishes == 0, 0.0, divide(total, multiply(k, a[0])))
 
     def _quadrature(self, node, k):
@@ -194,3 +180,244 @@ class Series:
             a, g = self.c[argument], self.c[slope]
             total = _plus(total, _dot((multiply(j, a[j]), g[k - j]) for j in _inner_first(k, 1) if not is_zero(a[j])))
         return total if k == 1 or is_zero(total) else divide(total, k)
+
+
+class Motion:
+    """The normalised Taylor coefficients of every symbol along a motion.
+
+    Subclasses define `coordinate(i, j)`, coefficient j of q_i, and `velocity(i, l, j)`, coefficient j of γ_i^(l).
+
+    Parameters
+    ----------
+    q : Coordinates
+    """
+
+    def __init__(self, q):
+        self.q = q
+
+    def coefficient(self, symbol, j):
+        """Coefficient j of a symbol: q_[j], (γ^(l))_[j], t_[0] = t and t_[1] = 1; other symbols are constant."""
+        kind, level, i = self.q.where(symbol) or ("constant", 0, 0)
+        if kind == "q":
+            return self.coordinate(i, j)
+        if kind == "w":
+            return self.velocity(i, level, j)
+        return symbol if j == 0 else float(kind == "t" and j == 1)
+
+
+def shifted(c, level, j):
+    """(γ^(l))_[j] = γ_[l+j] (l + j)!/j!, from c = γ_[l+j]."""
+    return 0.0 if is_zero(c) else c * float(factorial(level + j) // factorial(j))
+
+
+class Flow:
+    """Rows along a motion: Taylor coefficients of the residuals, and their Jacobian in the jets.
+
+    Parameters
+    ----------
+    q : Coordinates
+    rows : list of Row
+        Each contributes its coefficients 0 .. level - order.
+    level : int
+        Highest level K of the jets.
+    points : Points
+        Its parameters, their values, and its book of scalars.
+    signals : dict, optional
+        Taylor coefficients of further symbols along the motion, by element hash: lists of (N,) arrays.
+    real : type
+        Type of the Jacobian; double precision is enough for Newton's method.
+    """
+
+    def __init__(self, q, rows, level, points, signals=None, real=float):
+        self.q, self.level, self.points, self.signals, self.real = q, level, points, signals or {}, real
+        orders = [row.order for row in rows]
+        self.equations = [(a, i) for a, order in enumerate(orders) for i in range(level - order + 1)]
+        self.levels = np.array([orders[a] + i for a, i in self.equations], dtype=int)
+        self.first = np.cumsum([0, *(max(level - order + 1, 0) for order in orders)])
+        self.rows, self._cache = rows, {}
+        self.members = {
+            order: np.array([a for a, row in enumerate(rows) if row.order == order], dtype=int)
+            for order in sorted({order for order in orders if order <= level})
+        }
+        if not q.plain:
+            moving = q.V @ q.jet(1) + q.h
+            parts = [ca.densify(ca.jacobian(moving, q.jet(0))), ca.densify(q.V)]
+            self.motion = self._scalars([*moving.elements(), *(e for p in parts for e in p.nonzeros())])
+
+    def at(self, points):
+        """The same rows with the parameters of other points, and the same cached tapes."""
+        flow = copy(self)
+        flow.points = points
+        return flow
+
+    def _scalars(self, expressions):
+        return Scalars(self.q, self.points.parameters, expressions, self.signals)
+
+    @property
+    def groups(self):
+        """The rows of each order with their gradients in q and all jets."""
+        if "groups" not in self._cache:
+            self._cache["groups"] = [self._group(order) for order in self.members]
+        return self._cache["groups"]
+
+    def _group(self, order):
+        """The rows of an order, the tape of their residuals and nonzero gradient entries, and places of the entries."""
+        members = self.members[order]
+        residuals = [self.rows[a].expression for a in members]
+        parts = [ca.jacobian(ca.vertcat(*residuals), self.q.jet(m)) for m in range(order + 1)]
+        places = [np.array(p.sparsity().get_triplet(), dtype=int) for p in parts]
+        return members, order, self._scalars([*residuals, *(e for p in parts for e in p.nonzeros())]), places
+
+    def leading(self, order, level):
+        """Residuals of an order and nonzero entries of their gradients in γ^(order), or in q itself for level 0.
+
+        Returns their places in the book of scalars, and the places (rows, columns) of the entries.
+        """
+        in_q = order == 0 and level == 0 and not self.q.plain
+        if (order, in_q) not in self._cache:
+            rows = [self.rows[a] for a in self.members[order]]
+            slopes = [ca.jacobian(row.expression, self.q.jet(0)) if in_q else row.gradient(self.q) for row in rows]
+            columns = [g.sparsity().get_triplet()[1] for g in slopes]
+            residuals, entries = [row.expression for row in rows], [e for g in slopes for e in g.nonzeros()]
+            in_book = self.points.book.find(self.q, self.points.parameters, [*residuals, *entries])
+            places = np.repeat(np.arange(len(rows)), [len(c) for c in columns]), np.array(sum(columns, []), dtype=int)
+            self._cache[order, in_q] = in_book, places
+        return self._cache[order, in_q]
+
+    def __call__(self, t, z):
+        """Coefficients (n_equations, N) and Jacobian (n_equations, nz, N) at times t (N,) and jets z (nz, N)."""
+        n_points = z.shape[1]
+        q_series, q_map = self._kinematics(t, z)
+        residual = np.zeros((len(self.equations), n_points), dtype=REAL)
+        jacobian = np.zeros((len(self.equations), len(z), n_points), dtype=self.real)
+        for members, order, scalars, places in self.groups:
+            depth = self.level - order
+            coefficients = self._run(scalars, t, z, q_series, depth)
+            for i in range(depth + 1):
+                residual[self.first[members] + i] = coefficients[: len(members), i]
+            offset = len(members)
+            for m, (rows, columns) in enumerate(places):
+                entries = coefficients[offset : offset + len(rows)].astype(self.real)
+                offset += len(rows)
+                for i in range(depth + 1):
+                    self._add_slopes(jacobian, self.first[members[rows]] + i, columns, m, entries[:, : i + 1], q_map)
+        return residual, jacobian
+
+    def _add_slopes(self, jacobian, equations, columns, m, entries, q_map):
+        """Add the contribution of ∂ψ/∂γ^(m), by its coefficients 0 .. i, to the slopes of coefficient i of ψ."""
+        nq, n, i = self.q.nq, self.q.n, entries.shape[1] - 1
+        for l in range(i + 1):
+            part = entries[:, i - l]
+            if m == 0 and not self.q.plain:
+                np.add.at(jacobian, equations, part[:, None, :] * q_map[l][columns])
+            elif m == 0:
+                jacobian[equations, columns + (nq + (l - 1) * n if l else 0)] += part
+            elif l + m <= self.level:
+                jacobian[equations, columns + nq + (l + m - 1) * n] += part * (factorial(l + m) / factorial(l))
+
+    def residual(self, t, z):
+        """The coefficients (n_equations, N) alone."""
+        q_series, _ = self._kinematics(t, z)
+        residual = np.zeros((len(self.equations), z.shape[1]), dtype=REAL)
+        for order, members in self.members.items():
+            in_book, _ = self.leading(order, self.level)
+            coefficients = self._residuals(in_book, members, t, z, q_series, self.level - order)
+            for i in range(coefficients.shape[1]):
+                residual[self.first[members] + i] = coefficients[:, i]
+        return residual
+
+    def at_level(self, t, z, level):
+        """The equations of a level: residuals (n_equations, N) and slopes in γ_[level] or q (n_equations, n, N).
+
+        Rows of other levels are zero. The slopes are those of the leading gradients.
+        """
+        q_series, _ = self._kinematics(t, z)
+        residual = np.zeros((len(self.equations), z.shape[1]), dtype=REAL)
+        slopes = np.zeros((len(self.equations), self.q.n if level else self.q.nq, z.shape[1]))
+        for order, members in self.members.items():
+            if order > level:
+                continue
+            in_book, (rows, columns) = self.leading(order, level)
+            depth, entries = level - order, np.empty((len(members) + len(rows), z.shape[1]), dtype=REAL)
+            for scalars, sources, targets in in_book:
+                entries[targets] = scalars.values(t, z, self.points.values)[sources]
+            if depth:
+                coefficients = self._residuals(in_book, members, t, z, q_series, depth)[:, depth]
+            else:
+                coefficients = entries[: len(members)]
+            residual[self.first[members] + depth] = coefficients
+            entries = entries[len(members) :] * (factorial(level) / factorial(depth))
+            slopes[self.first[members[rows]] + depth, columns] = entries
+        return residual, slopes
+
+    def _residuals(self, in_book, members, t, z, q_series, depth):
+        """Coefficients of the residuals of some rows, (rows, depth + 1, N)."""
+        result = np.empty((len(members), depth + 1, z.shape[1]), dtype=REAL)
+        for scalars, sources, targets in in_book:
+            pairs = [(i, a) for i, a in zip(sources, targets, strict=True) if a < len(members)]
+            if pairs and depth:
+                coefficients = self._run(scalars, t, z, q_series, depth, 1 + max(i for i, _ in pairs))
+            elif pairs:
+                coefficients = scalars.values(t, z, self.points.values)[:, None]
+            for i, a in pairs:
+                result[a] = coefficients[i]
+        return result
+
+    def series(self, expressions, t, z, depth):
+        """Taylor coefficients of expressions along a motion, (len, depth + 1, N)."""
+        return self._run(self._scalars(list(expressions)), t, z, self._kinematics(t, z)[0], depth)
+
+    def _kinematics(self, t, z):
+        """Taylor coefficients of q and, unless q' = γ', the derivative of each in z."""
+        nq, n, n_points = self.q.nq, self.q.n, z.shape[1]
+        if self.q.plain:
+            return [z[:nq], *(z[nq + k * n : nq + (k + 1) * n] for k in range(self.level))], None
+        first = np.zeros((nq, len(z), n_points), dtype=self.real)
+        first[np.arange(nq), np.arange(nq)] = 1.0
+        series, maps = [z[:nq]], [first]
+        for k in range(self.level):
+            c = self._run(self.motion, t, z, series, k)
+            slope = c[nq : nq + nq * nq].reshape(nq, nq, k + 1, n_points).astype(self.real)
+            frame = c[nq + nq * nq :].reshape(n, nq, k + 1, n_points).astype(self.real)
+            series.append(c[:nq, k] / (k + 1))
+            step = np.zeros_like(first)
+            for l in range(k + 1):
+                step += np.einsum("jip,jzp->izp", slope[:, :, k - l], maps[l])
+                start = nq + l * n
+                step[:, start : start + n] += (l + 1) * np.swapaxes(frame[:, :, k - l], 0, 1)
+            maps.append(step / (k + 1))
+        return series, maps
+
+    def _run(self, scalars, t, z, q_series, depth, first=None):
+        """Coefficients 0 .. depth of the first scalars, (first, depth + 1, N)."""
+        motion, values = _Numbers(self.q, z, q_series, self.level), scalars.inputs(t, z, self.points.values)
+        inputs = []
+        for symbol, value in zip(scalars.tape.symbols, values, strict=True):
+            higher = (motion.coefficient(symbol, k) for k in range(1, depth + 1))
+            inputs.append(self.signals.get(symbol.element_hash()) or [value, *higher])
+        series = Series(scalars.tape, inputs, first=first)
+        with np.errstate(all="ignore"):
+            for _ in range(depth + 1):
+                series.advance()
+        outputs = scalars.tape.outputs[:first]
+        result = np.zeros((len(outputs), depth + 1, z.shape[1]), dtype=REAL)
+        for i, node in enumerate(outputs):
+            for k, c in enumerate(series.c[node]):
+                result[i, k] = c
+        return result
+
+
+class _Numbers(Motion):
+    """The motion of jets z (nz, N); those above a level are zero."""
+
+    def __init__(self, q, z, q_series, level):
+        super().__init__(q)
+        self.z, self.q_series, self.level = z, q_series, level
+
+    def coordinate(self, i, j):
+        return self.q_series[j][i]
+
+    def velocity(self, i, level, j):
+        if level + j > self.level:
+            return np.zeros(self.z.shape[1], dtype=REAL)
+        return shifted(self.z[self.q.nq + (level + j - 1) * self.q.n + i], level, j)

@@ -1,13 +1,77 @@
-"""Tapes: the primitive operations of SX expressions, read once and run many times."""
+"""Tapes: the primitive operations of SX expressions, read once and evaluated at many points.
+
+Elementary functions of expressions or numbers come first, then the tape; below them its values at many points, with
+the sizes of the terms that made them.
+"""
 
 import math
+import operator
 from functools import cached_property
+from math import factorial
 from typing import NamedTuple
 
 import casadi as ca
+import numpy as np
 
 from servoctl.errors import SpecificationError
-from servoctl.jets.evaluation import Plan
+
+REAL = np.longdouble
+MOST_SQUARED = 64  # the largest whole exponent that is written as squares and products
+
+# Mode 0 is CasADi's default: NumPy's functions of symbols work, each with a warning. Mode -1 gives no warning.
+if ca.GlobalOptions.getNumpyMode() == 0:
+    ca.GlobalOptions.setNumpyMode(-1)
+
+_NUMPY = {
+    "sin": np.sin, "cos": np.cos, "tan": np.tan, "exp": np.exp, "log": np.log, "sqrt": np.sqrt,
+    "asin": np.arcsin, "acos": np.arccos, "atan": np.arctan, "sinh": np.sinh, "cosh": np.cosh,
+    "tanh": np.tanh, "asinh": np.arcsinh, "acosh": np.arccosh, "atanh": np.arctanh, "expm1": np.expm1,
+    "log1p": np.log1p, "sign": np.sign, "fabs": np.abs, "atan2": np.arctan2, "power": np.power,
+    "lt": lambda a, b: 1.0 * (a < b), "le": lambda a, b: 1.0 * (a <= b),
+    "eq": lambda a, b: 1.0 * (a == b), "ne": lambda a, b: 1.0 * (a != b),
+    "logic_and": lambda a, b: 1.0 * ((a != 0) & (b != 0)), "logic_or": lambda a, b: 1.0 * ((a != 0) | (b != 0)),
+    "logic_not": lambda a: 1.0 * (a == 0),
+}  # fmt: skip
+_CASADI = {name: getattr(ca, name) for name in _NUMPY} | {"erf": ca.erf}
+
+
+def _erf(x):
+    from scipy.special import erf
+
+    return erf(np.asarray(x, dtype=float))
+
+
+_NUMPY["erf"] = _erf
+
+
+def apply(name, *args):
+    """The function `name` of SX expressions, or of numbers and arrays."""
+    functions = _CASADI if any(isinstance(a, ca.SX) for a in args) else _NUMPY
+    return functions[name](*args)
+
+
+def _arithmetic(name, code):
+    """A binary operation on SX expressions, or on numbers and arrays."""
+    numeric, binary, symbolic = getattr(operator, name), ca.SX.binary, ca.SX
+
+    # SX.binary skips CasADi's search for a common type, which takes ten times as long as the operation.
+    def operation(a, b):
+        return binary(code, a, b) if a.__class__ is symbolic or b.__class__ is symbolic else numeric(a, b)
+
+    return operation
+
+
+add = _arithmetic("add", ca.OP_ADD)
+subtract = _arithmetic("sub", ca.OP_SUB)
+multiply = _arithmetic("mul", ca.OP_MUL)
+divide = _arithmetic("truediv", ca.OP_DIV)
+
+
+def select(condition, yes, no):
+    """`yes` where `condition` is not zero, else `no`; works on SX expressions and on arrays."""
+    if any(isinstance(a, ca.SX) for a in (condition, yes, no)):
+        return ca.if_else(condition, yes, no)
+    return np.where(condition, yes, no)
 
 
 class Node(NamedTuple):
@@ -19,9 +83,9 @@ class Node(NamedTuple):
 
 
 _BINARY = {ca.OP_FMIN: "fmin", ca.OP_FMAX: "fmax", ca.OP_IF_ELSE_ZERO: "gate"}
-_PLAIN = {ca.OP_ADD: "add", ca.OP_SUB: "sub", ca.OP_MUL: "mul", ca.OP_DIV: "div"}  # of two, without a branch
+_ARITHMETIC_NODES = {ca.OP_ADD: "add", ca.OP_SUB: "sub", ca.OP_MUL: "mul", ca.OP_DIV: "div"}
 _UNARY = {ca.OP_NEG: "neg", ca.OP_SQ: "sq", ca.OP_SQRT: "sqrt", ca.OP_FABS: "fabs", ca.OP_ASSIGN: "copy"}
-_CONSTANT = {
+_CONSTANT = {  # piecewise constant: their derivatives are zero
     ca.OP_LT: "lt", ca.OP_LE: "le", ca.OP_EQ: "eq", ca.OP_NE: "ne", ca.OP_AND: "logic_and", ca.OP_OR: "logic_or",
     ca.OP_NOT: "logic_not", ca.OP_SIGN: "sign",
 }  # fmt: skip
@@ -35,9 +99,7 @@ _REFUSED = {
     ca.OP_FLOOR: "floor", ca.OP_CEIL: "ceil", ca.OP_FMOD: "fmod", ca.OP_REMAINDER: "remainder",
     ca.OP_COPYSIGN: "copysign", ca.OP_ERFINV: "erfinv",
 }  # fmt: skip
-
-
-_OPTIONS = {"allow_free": True, "live_variables": False}  # every instruction has its own place
+_OPTIONS = {"allow_free": True, "live_variables": False}  # no place is reused: operations fill them in order
 
 
 class Tape:
@@ -46,7 +108,7 @@ class Tape:
     Parameters
     ----------
     symbols : sequence of SX scalars or None
-        The inputs, in the order of their values; None for all that the expressions hold.
+        The inputs, in the order of their values. Default: all symbols of the expressions.
     expressions : sequence of SX scalars
         The outputs.
 
@@ -84,7 +146,7 @@ class Tape:
         return Plan(self.nodes)
 
     def needed(self, first):
-        """How many nodes are needed for so many first outputs."""
+        """The number of leading nodes that compute the first outputs, so many of them."""
         count = i = 1 + max(self.outputs[:first], default=-1)
         while i:
             i -= 1
@@ -98,23 +160,23 @@ class Tape:
         return len(self.nodes) - 1
 
     def _read(self, function, symbols):
-        """Append the instructions; their symbols come in the order of `symbols`."""
+        """Append the instructions of a function, whose free symbols have the nodes `symbols`."""
         work, nodes, symbols = [], self.nodes, iter(symbols)
-        read, taken = function.instruction_id, function.instruction_input
+        code, operands = function.instruction_id, function.instruction_input
         for k in range(function.n_instructions()):
-            op = read(k)
-            if op in _PLAIN:
-                a, b = taken(k)
+            op = code(k)
+            if op in _ARITHMETIC_NODES:
+                a, b = operands(k)
                 work.append(len(nodes))
-                nodes.append(Node(_PLAIN[op], (work[a], work[b])))
+                nodes.append(Node(_ARITHMETIC_NODES[op], (work[a], work[b])))
             elif op == ca.OP_OUTPUT:
-                self.outputs[function.instruction_output(k)[0]] = work[taken(k)[0]]
+                self.outputs[function.instruction_output(k)[0]] = work[operands(k)[0]]
             elif op == ca.OP_PARAMETER:
                 work.append(next(symbols))
             elif op == ca.OP_CONST:
                 work.append(self._add("const", data=function.instruction_constant(k)))
             else:
-                work.append(self._operation(op, [work[i] for i in taken(k)]))
+                work.append(self._operation(op, [work[i] for i in operands(k)]))
 
     def _operation(self, op, a):
         if op in _BINARY:
@@ -143,10 +205,12 @@ class Tape:
             return self._add("quad", a[0], a[1], data=("atan2", (gy, gx)))
         if op in _FUNCTION:
             return self._function(_FUNCTION[op], a[0])
+        name = _REFUSED.get(op, f"CasADi operation {op}")
         raise SpecificationError(
-            f"The expression uses {_REFUSED.get(op, f'CasADi operation {op}')}.",
-            "A program or mechanism is differentiated in time; this operation has no derivative.",
-            do="Write it with if_else, fmin, fmax or fabs, whose branches are differentiated.",
+            f"The expression uses {name}.",
+            "Expressions of a program or mechanism are differentiated in time, and this operation has no derivative.",
+            do="Use if_else, fmin, fmax or fabs: each of their branches is differentiated.",
+            operation=name,
         )
 
     def _power(self, base, exponent):
@@ -155,10 +219,8 @@ class Tape:
             return self._symbolic_power(base, exponent)
         c = node.data
         if not math.isfinite(c):
-            raise SpecificationError(
-                f"The expression raises to the power {c}.", "An exponent is finite.", do="Check the expression."
-            )
-        if c != int(c) or abs(c) > 64:
+            raise SpecificationError(f"The expression has the exponent {c}.", "Exponents are finite.", exponent=c)
+        if c != int(c) or abs(c) > MOST_SQUARED:
             return self._add("power", base, data=c)
         result, square, n = None, base, abs(int(c))
         while n:
@@ -172,7 +234,7 @@ class Tape:
         return self._add("div", one, result) if c < 0 else result
 
     def _symbolic_power(self, base, exponent):
-        """y = a^b with y' = (b y/a) a' + (y ln a) b'; the logarithm does not enter where b does not change."""
+        """y = a^b with y' = (b y/a) a' + (y ln a) b'. Where b is constant, ln a has the factor zero and drops out."""
         n = len(self.nodes)
         y = self._add("quad", base, exponent, data=None)
         by_base = self._add("div", self._add("mul", exponent, y), base)
@@ -186,7 +248,8 @@ class Tape:
         if name in ("sin", "cos", "sinh", "cosh"):
             hyperbolic = name.endswith("h")
             s, c = ("sinh", "cosh") if hyperbolic else ("sin", "cos")
-            n = len(self.nodes)  # sin is node n, cos n + 1, and -sin n + 2: each uses the other's lower coefficients
+            # sin is node n, cos n + 1, and -sin n + 2: each uses lower coefficients of the other.
+            n = len(self.nodes)
             self._pairs[s, a] = self._add("quad", a, data=(s, (n + 1,)))
             self._pairs[c, a] = self._add("quad", a, data=(c, (n if hyperbolic else n + 2,)))
             if not hyperbolic:
@@ -198,7 +261,7 @@ class Tape:
         return y
 
     def _slope(self, name, a, y):
-        """The node of dy/da for y = name(a); it may use y itself."""
+        """The node of dy/da for y = name(a), which may refer to y."""
         one = self._add("const", data=1.0)
         if name == "exp":
             return y
@@ -223,3 +286,243 @@ class Tape:
         root = self._add("sqrt", self._add("add" if name == "asinh" else "sub", one, square))
         slope = self._add("div", one, root)
         return self._add("neg", slope) if name == "acos" else slope
+
+
+class Plan:
+    """An order of a tape's nodes in which each group of equal operations is evaluated by one call of NumPy.
+
+    Parameters
+    ----------
+    nodes : list of Node
+
+    Attributes
+    ----------
+    place : (n_nodes,) array of int
+        Place of each node in this order.
+    constants, inputs : (places, values) and (places, indices)
+    groups : list of (kind, data, slice, (operands, size) array)
+        Operation, its places, and the places of its operands. Squares are products here.
+    slopes : dict of int to list of (size,) arrays
+        For a group of kind "quad", by its first place: the places of dy/da for each operand.
+    """
+
+    def __init__(self, nodes):
+        sorts, sort, depth = {}, [], []
+        for kind, args, data in nodes:
+            if args:
+                a, b = depth[args[0]], depth[args[-1]]
+                depth.append(1 + (a if a > b else b))
+                key = ("mul", None) if kind == "sq" else (kind, data[0] if kind == "quad" else data)
+            else:
+                depth.append(0)
+                key = kind, None
+            sort.append(sorts.setdefault(key, len(sorts)))
+        order = np.lexsort((sort, depth))
+        self.place = np.empty(len(nodes), dtype=int)
+        self.place[order] = np.arange(len(nodes))
+        changes = np.diff(np.array([depth, sort])[:, order]).any(axis=0)
+        bounds = [0, *(1 + np.flatnonzero(changes)).tolist(), len(nodes)] if nodes else [0]
+        ends = [[args[k] if args else 0 for _, args, _ in nodes] for k in (0, -1)]
+        operands = self._places(ends)[:, order]
+        sorts, order = list(sorts), order.tolist()
+        self.constants, self.inputs, self.groups, self.slopes = ([], []), ([], []), [], {}
+        for first, last in zip(bounds[:-1], bounds[1:], strict=True):
+            kind, data = sorts[sort[order[first]]]
+            _, args, _ = nodes[order[first]]
+            if not args:
+                leaves = self.constants if kind == "const" else self.inputs
+                leaves[0].extend(range(first, last))
+                leaves[1].extend(nodes[i].data for i in order[first:last])
+                continue
+            count = 2 if kind == "mul" else len(args)
+            self.groups.append((kind, data, slice(first, last), operands[:count, first:last].copy()))
+            if kind == "quad":
+                slopes = zip(*(nodes[i].data[1] for i in order[first:last]), strict=True)
+                self.slopes[first] = [self._places(column) for column in slopes]
+
+    def _places(self, nodes):
+        return self.place[np.asarray(nodes, dtype=int)]
+
+    def values(self, inputs):
+        """Values of all nodes at N points, (n_nodes, N), from values of the inputs, (n_inputs, N)."""
+        v = np.empty((len(self.place), *inputs.shape[1:]), dtype=inputs.dtype)
+        places, constants = self.constants
+        v[places] = np.array(constants)[:, None]
+        places, indices = self.inputs
+        v[places] = inputs[indices]
+        for kind, data, here, operands in self.groups:
+            values = v.take(operands, axis=0)
+            if kind in _ARITHMETIC:
+                _ARITHMETIC[kind](*values, out=v[here])
+            else:
+                v[here] = _VALUE[kind](data, *values)
+        return v
+
+    def sizes(self, v):
+        """Sizes of the terms of all nodes, (n_nodes, N), from the values; see `evaluate`."""
+        magnitude = np.abs(v)
+        size = magnitude.copy()
+        for kind, data, here, operands in self.groups:
+            parts = size.take(operands, axis=0)
+            if kind in ("add", "sub"):
+                np.add(*parts, out=size[here])
+            elif kind == "mul":
+                a, b = magnitude.take(operands, axis=0)
+                np.add(a * parts[1], parts[0] * b, out=size[here])
+            elif kind == "quad":
+                for slope, part in zip(self.slopes[here.start], parts, strict=True):
+                    size[here] += np.nan_to_num(magnitude.take(slope, axis=0)) * part
+            elif kind != "constant":
+                size[here] = _SIZE[kind](data, magnitude[here], *v.take(operands, axis=0), *parts)
+        return size
+
+
+def _power_size(exponent, y, a, size):
+    return y * (1.0 + abs(exponent) * size / np.maximum(np.abs(a), np.finfo(float).tiny))
+
+
+_ARITHMETIC = {"add": np.add, "sub": np.subtract, "mul": np.multiply, "div": np.divide, "neg": np.negative}
+_VALUE = {
+    "copy": lambda _, a: a,
+    "scale": lambda factor, a: a * factor,
+    "sqrt": lambda _, a: np.sqrt(a),
+    "fabs": lambda _, a: np.abs(a),
+    "power": lambda exponent, a: a**exponent,
+    "gate": lambda _, a, b: np.where(a != 0, b, 0.0),
+    "fmin": lambda _, a, b: np.where(a <= b, a, b),
+    "fmax": lambda _, a, b: np.where(a <= b, b, a),
+    "constant": apply,
+    "quad": apply,
+}
+_SIZE = {  # from the magnitude of y, and values and sizes of the operands
+    "div": lambda _, y, a, b, size_a, size_b: (size_a + y * size_b) / np.abs(b),
+    "neg": lambda _, y, a, size: size,
+    "copy": lambda _, y, a, size: size,
+    "fabs": lambda _, y, a, size: size,
+    "scale": lambda factor, y, a, size: abs(factor) * size,
+    "sqrt": lambda _, y, a, size: _power_size(0.5, y, a, size),
+    "power": _power_size,
+    "gate": lambda _, y, a, b, size_a, size_b: np.where(a != 0, size_b, 0.0),
+    "fmin": lambda _, y, a, b, size_a, size_b: np.where(a <= b, size_a, size_b),
+    "fmax": lambda _, y, a, b, size_a, size_b: np.where(a <= b, size_b, size_a),
+}
+
+
+def evaluate(tape, inputs):
+    """Values of a tape's outputs and the sizes of their terms.
+
+    The size of a + b is size(a) + size(b), that of a b is |a| size(b) + size(a) |b|, and that of y = f(a) is
+    |y| + |f'(a)| size(a). Rounding errors are about the machine's epsilon times the size, so an output far below its
+    size is zero. The precision is that of `inputs`.
+
+    Parameters
+    ----------
+    tape : Tape
+    inputs : (n_inputs, N) array
+        Values of the inputs at N points.
+
+    Returns
+    -------
+    values, sizes : (n_outputs, N) arrays
+    """
+    outputs = tape.plan.place[tape.outputs]
+    with np.errstate(all="ignore"):
+        v = tape.plan.values(np.asarray(inputs))
+        return v[outputs], tape.plan.sizes(v)[outputs]
+
+
+class Scalars:
+    """SX scalars on one tape, with the places of their symbols in jet space.
+
+    Parameters
+    ----------
+    q : Coordinates
+    parameters : tuple of SX
+    expressions : sequence of SX scalars
+    others : collection of int, optional
+        Element hashes of symbols outside jet space, which are evaluated as zero.
+
+    Attributes
+    ----------
+    tape : Tape
+    places : list
+        What each symbol is; see `Coordinates.where`.
+    """
+
+    def __init__(self, q, parameters, expressions, others=()):
+        self.expressions, self.tape = expressions, Tape(None, expressions)
+        self._last = None, None  # inputs, and the values of all nodes
+        self.places = [q.where(s) for s in self.tape.symbols]
+        names = [p.element_hash() for p in parameters]
+        first = {"t": 1 + len(names), "q": 2 + len(names)}
+        self._rows, self._factors = [], np.ones((len(self.places), 1))
+        for i, (symbol, place) in enumerate(zip(self.tape.symbols, self.places, strict=True)):
+            if place is None:
+                key = symbol.element_hash()
+                self._rows.append(0 if key in others else 1 + names.index(key))
+            else:
+                kind, level, k = place
+                start = first["q"] + q.nq + (level - 1) * q.n if kind == "w" else first[kind]
+                self._rows.append(start + k)
+                self._factors[i] = factorial(level)
+
+    def inputs(self, t, z, values):
+        """Values of the symbols (n, N) at times t (N,) and jets z (nz, N). Jets of a higher level than z are zero."""
+        sources = np.empty((2 + len(values) + len(z), len(t)), dtype=REAL)
+        sources[0], sources[1 : 1 + len(values)] = 0.0, values[:, None]
+        sources[1 + len(values)], sources[2 + len(values) :] = t, z
+        return sources[[row if row < len(sources) else 0 for row in self._rows]] * self._factors
+
+    def values(self, t, z, values):
+        """Values of the scalars (len, N)."""
+        return self._nodes(t, z, values)[self.tape.plan.place[self.tape.outputs]]
+
+    def evaluate(self, t, z, values):
+        """Values and sizes of the scalars (2, len, N); see `evaluate`."""
+        nodes = self._nodes(t, z, values)
+        with np.errstate(all="ignore"):
+            sizes = self.tape.plan.sizes(nodes)
+        return np.array([nodes, sizes])[:, self.tape.plan.place[self.tape.outputs]]
+
+    def _nodes(self, t, z, values):
+        """Values of all nodes of the tape, cached for the last points."""
+        inputs = self.inputs(t, z, values)
+        last, nodes = self._last
+        if not np.array_equal(inputs, last):
+            with np.errstate(all="ignore"):
+                nodes = self.tape.plan.values(inputs)
+            self._last = inputs, nodes
+        return nodes
+
+
+class Book:
+    """The scalars of earlier calls: no expression is put on a second tape."""
+
+    def __init__(self):
+        self._places = {}  # element hash: its Scalars, and its index among them
+
+    def find(self, q, parameters, expressions):
+        """The scalars that hold expressions; expressions that no call has seen before share a new tape.
+
+        Parameters
+        ----------
+        q : Coordinates
+        parameters : tuple of SX
+        expressions : sequence of SX scalars
+
+        Returns
+        -------
+        list of (Scalars, list of int, list of int)
+            Scalars that hold some of the expressions, the indices among them, and the indices in `expressions`.
+        """
+        hashes = [e.element_hash() for e in expressions]
+        new = {h: e for h, e in zip(hashes, expressions, strict=True) if h not in self._places}
+        if new:
+            scalars = Scalars(q, parameters, list(new.values()))
+            self._places |= {h: (scalars, i) for i, h in enumerate(new)}
+        by_scalars = {}
+        for at, (scalars, i) in enumerate(map(self._places.get, hashes)):
+            sources, targets = by_scalars.setdefault(scalars, ([], []))
+            sources.append(i)
+            targets.append(at)
+        return [(scalars, *places) for scalars, places in by_scalars.items()]

@@ -1,9 +1,9 @@
-"""The rule by which an accuracy becomes a method: how an error is measured, and what reaches it.
+"""How `accuracy=` determines a method, and how the error of a motion is measured.
 
-Where something is left to integrate, the Taylor method needs the fewest evaluations at every accuracy, and it finds
-its steps itself; projection keeps its invariants at rounding (docs/work_precision.md, where a method of fixed step is
-faster on some scenes, once its step is known). A tolerance bounds the error of a step and not of the motion, so the
-rule does not trust it: the motion is computed with two tolerances, and their difference is the error.
+If something is left to integrate, the Taylor method needs the fewest evaluations at every accuracy and finds its own
+steps; projection keeps its invariants at rounding (docs/work_precision.md; on some scenes a fixed-step method is faster
+once its step is known). A tolerance bounds the error of a step, not of the motion. Therefore the motion is computed
+with two tolerances, and their difference is the error.
 """
 
 from dataclasses import replace
@@ -13,13 +13,12 @@ import numpy as np
 
 from servoctl.checks import is_number
 from servoctl.errors import LimitExceeded, SpecificationError
-from servoctl.methods.choice import Algebraic, Taylor
-from servoctl.methods.drift import Project
+from servoctl.methods.choice import Algebraic, Project, Taylor
 from servoctl.methods.taylor import order_for
 
-SMALLEST_SIZE = 1e-3  # of a component relative to the largest of its level: what is zero has rounding for its size
-MARGIN, FINER = 0.1, 1e-2  # first tolerance by the accuracy, and of each next one by the one before
-FINEST = 1e-15  # tolerance: below, steps shorten and rounding grows
+SMALLEST_SIZE = 1e-3  # of a component relative to the largest of its level; a zero component has only rounding
+MARGIN, FINER = 0.1, 1e-2  # first tolerance relative to the accuracy, and each next one relative to the last
+FINEST = 1e-15  # tolerance below which steps shorten and rounding grows
 COARSEST_ACCURACY, FINEST_ACCURACY = 1e-1, 1e-13  # accuracies that make sense in double precision
 
 
@@ -50,8 +49,8 @@ def component_sizes(values, levels):
     """The size of each component (n,) of values (n, N), as `relative_error` takes it."""
     size = np.abs(values).max(axis=1)
     for level in np.unique(levels):
-        own = levels == level
-        size[own] = np.maximum(size[own], SMALLEST_SIZE * size[own].max())
+        same = levels == level
+        size[same] = np.maximum(size[same], SMALLEST_SIZE * size[same].max())
     size[size == 0] = 1.0
     return size
 
@@ -80,19 +79,7 @@ def motion_error(model, jets, reference):
 
 
 def method_for(model, accuracy, jets=None):
-    """The method with which the rule begins for an accuracy of the motion.
-
-    Parameters
-    ----------
-    model : Model
-    accuracy : float
-    jets : int, optional
-        Highest derivative in the samples; the Taylor method gives it, also where nothing is integrated.
-
-    Returns
-    -------
-    Algebraic or Taylor
-    """
+    """The first method for an accuracy of the motion, with `jets` as the highest derivative in the samples."""
     if model.flat and jets is None:
         return Algebraic()
     rtol = max(MARGIN * accuracy, FINEST)
@@ -102,32 +89,32 @@ def method_for(model, accuracy, jets=None):
 def accurate(simulated, model, accuracy, method=None, drift=None):
     """The motion with an error of at most `accuracy`.
 
-    Where nothing is integrated, each instant is solved to rounding. Else the tolerance is lowered until two successive
+    A flat program is solved to rounding at each instant. Otherwise the tolerance is lowered until two successive
     motions agree to `accuracy`; the one of the lower tolerance is returned.
 
     Parameters
     ----------
     simulated : callable
-        From a method and a treatment of drift to a Run.
+        Run from a method and a treatment of drift.
     model : Model
     accuracy : float
         See `motion_error`.
     method : None or Taylor
-        `Taylor(jets=...)` asks for jets; order and tolerances follow from the accuracy.
+        `Taylor(jets=...)` sets the jets; order and tolerances follow from the accuracy.
     drift : None
         Follows from the accuracy.
 
     Returns
     -------
     Run
-        Its message tells the difference.
+        Its message states the difference.
 
     Raises
     ------
     SpecificationError
-        For an accuracy out of range, or together with what it determines.
+        If the accuracy is out of range, or combined with what it determines.
     LimitExceeded
-        Where rounding grows beyond it first; `.run` is the best motion.
+        If rounding errors exceed it; `.run` is the best motion.
     """
     accuracy, jets = require_accuracy(accuracy), _jets_alone(accuracy, method, drift)
     method = method_for(model, accuracy, jets)
@@ -148,10 +135,10 @@ def accurate(simulated, model, accuracy, method=None, drift=None):
             return replace(finer, message=f"finished; two tolerances agree to {difference:.1e}")
         best, run = min(best, difference), finer
     error = LimitExceeded(
-        f"accuracy={accuracy:g} was asked for.",
-        "Errors grow along an unstable motion, and rounding with them: no tolerance reaches what rounding has spoilt.",
+        f"accuracy={accuracy:g} was given.",
+        "Errors grow along an unstable motion; here rounding errors dominate, and a smaller tolerance cannot help.",
         nearest=f"accuracy={2 * best:.1g}: two tolerances agree to {best:.1e}.",
-        do="Ask for less, or for a shorter span.",
+        do="Use this accuracy, or a shorter span.",
         accuracy=accuracy,
         reached=best,
     )
@@ -160,21 +147,20 @@ def accurate(simulated, model, accuracy, method=None, drift=None):
 
 
 def require_accuracy(accuracy):
-    """An accuracy as a float, where it is one."""
+    """An accuracy as a float, or the error of one that is out of range."""
     low, high = FINEST_ACCURACY, COARSEST_ACCURACY
     if not (isinstance(accuracy, Real) and low <= accuracy <= high):
         raise SpecificationError(
             f"accuracy={accuracy!r} was given.",
             f"An accuracy is the largest relative error of the motion, from {low:g} to {high:g}.",
             nearest=f"{np.clip(accuracy, low, high):g}." if is_number(accuracy) else "",
-            do="Give 1e-6, or a number in this range.",
             accuracy=accuracy,
         )
     return float(accuracy)
 
 
 def _jets_alone(accuracy, method, drift):
-    """The jets that a method asks for beside an accuracy; anything else that the accuracy determines is refused."""
+    """The jets of a method that is combined with an accuracy; its other settings are refused."""
     if drift is None and method is None:
         return None
     if drift is None and isinstance(method, Taylor) and method.jets and method == Taylor(jets=method.jets):
@@ -182,8 +168,8 @@ def _jets_alone(accuracy, method, drift):
     chosen = {name: value for name, value in (("method", method), ("drift", drift)) if value is not None}
     raise SpecificationError(
         f"accuracy={accuracy!r} was given with {', '.join(f'{name}={value!r}' for name, value in chosen.items())}.",
-        "An accuracy determines the method, its settings and the treatment of drift; only jets may be asked for.",
+        "An accuracy determines the method, its settings and the treatment of drift; only jets may be set.",
         nearest=f"method=sv.Taylor(jets={method.jets})." if getattr(method, "jets", None) else "",
-        do="Leave one of them out.",
+        do=f"Leave out the accuracy, or {' and '.join(chosen)}.",
         **chosen,
     )

@@ -1,4 +1,4 @@
-"""Flat programs: a Newton solve at each instant, nothing is integrated."""
+"""Flat programs: a Newton solve at each instant, no integration."""
 
 import numpy as np
 
@@ -29,6 +29,8 @@ def algebraic(model, t0, x0, times, progress):
 
 
 class _Algebraic(Stepping):
+    rank_lost = "Newton's method finds no solution beyond"
+    advice = "Check whether the path leaves the reach of the mechanism."
     most = 4000  # instants per call of the loop: 0.2 ms compiled, 0.2 s where CasADi evaluates
 
     def _function(self, model, poles):
@@ -47,22 +49,22 @@ class _Algebraic(Stepping):
         """Solve at each of the times (N,) [s], from the solution x0 at t0."""
         with interruptible(self.motion):
             self._start(t0, x0, t0)
-            done, x, t = 0, x0, None  # of the last instant solved; the way from t0 to the first one is not inspected
+            done, x, t = 0, x0, None  # t of the last instant solved: between t0 and the first nothing is inspected
             while done < len(times) and self.motion.stop is None:
                 block = times[done : done + self.most]
                 q, y, iterations = self.f.newton(block, x[: self.model.nq], self.p)
                 self.motion.count(iterations=iterations)
                 state, top, pivots = _split(self.model, q, y)
                 ends = block[: q.shape[1]]
-                if t is None and len(ends):
-                    self.monitor.begin(pivots[:, 0])
-                    outcome, solved = self._inspect(ends, state, pivots[:, 1:]), 1
-                elif t is not None:
+                if t is not None:
                     outcome = self._inspect(np.append(t, ends), np.column_stack([x, state]), pivots)
-                    solved = 0
+                    solved = outcome.steps
+                elif len(ends):
+                    self.monitor.begin(pivots[:, 0])
+                    outcome = self._inspect(ends, state, pivots[:, 1:])
+                    solved = 1 + outcome.steps
                 else:
                     outcome, solved = Fine(0), 0
-                solved += outcome.steps
                 self.motion.add(self.model, ends[:solved], state[:, :solved], top[:, :solved])
                 done += solved
                 if solved:
@@ -71,22 +73,13 @@ class _Algebraic(Stepping):
                 if not isinstance(outcome, Fine):
                     self._follow(outcome)
                 elif len(ends) < len(block):
-                    self._fail(block[0] if t is None else t, x)
+                    why = "Newton's method finds no solution of the program beyond"
+                    self._fail(block[0] if t is None else t, x, why)
         return self.motion
 
     def _inspect(self, t, state, pivots):
-        """What the monitor says: an instant solved beyond a pivot's zero is as good as any other."""
+        """The monitor's outcome; an instant solved beyond a pivot's zero is as accurate as any other."""
         return self.monitor.inspect(Stretch(t, state, pivots[:, :, None], self._top, crosses=True))
-
-    def _fail(self, t, x):
-        self.motion.stop = self.monitor.failed(
-            t,
-            x,
-            "Newton's method finds no solution beyond",
-            f"The program has no solution that Newton's method finds after t = {t:.7g} s.",
-            "A flat program is solved for the coordinates at each instant.",
-            "Check whether the path leaves the reach of the mechanism.",
-        )
 
 
 def _split(model, q, y):

@@ -2,15 +2,15 @@
 
 import numpy as np
 
-from servoctl.methods.monitor import FRACTIONS, DenseStretch, Fine
+from servoctl.methods.monitor import FRACTIONS, DenseStretch, Fine, Repivot
 from servoctl.methods.motion import Stepping
 
 
 class BulkSteps(Stepping):
-    """An integration that takes many steps at once; `_steps` takes them.
+    """An integration that takes many steps at once, by `_steps`; `failure` is the reason if no further one succeeds.
 
-    They come as a value with the ends t (S + 1,) [s], states x (n_x, S + 1) there, `at(k, times)` and `within(theta)`
-    for the states in between, and `failed`, whether no step succeeds after them.
+    `_steps` returns an object with the ends t (S + 1,) [s], states x (n_x, S + 1) there, `at(k, times)` and
+    `within(theta)` for the states in between, and `failed`: whether no step succeeds after them.
     """
 
     def _piece(self, a, x, b, times):
@@ -20,19 +20,24 @@ class BulkSteps(Stepping):
         while t != b and self.motion.stop is None:
             steps = self._steps(t, x, b)
             outcome = self.monitor.inspect(self._stretch(steps))
-            self._record(steps, outcome.steps)
-            t, x = steps.t[outcome.steps], steps.x[:, outcome.steps].copy()
+            last = outcome.steps
+            # A step in which a pivot vanishes is sampled with the next pivots: its own lose digits near the zero.
+            before = max(last - 1, 0) if isinstance(outcome, Repivot) else last
+            self._record(steps, 0, before)
+            t, x = steps.t[last], steps.x[:, last].copy()
+            goes_on = isinstance(outcome, Fine) or self._follow(outcome)
+            if before < last:
+                self._record(steps, before, last)
             self.progress(t)
-            if not isinstance(outcome, Fine):
-                if not self._follow(outcome):
-                    self._keep_last(t, x)
-            elif steps.failed:
-                self._fail(t, x)
+            if isinstance(outcome, Fine) and steps.failed:
+                self._fail(t, x, self.failure)
+                goes_on = False
+            if not goes_on:
                 self._keep_last(t, x)
         return x
 
     def _stretch(self, steps):
-        """The steps; they have passed their test of error, and others begin where they end."""
+        """The steps for the monitor: they have passed their error test, and the next begin where they end."""
         inside = np.array([*FRACTIONS, 1.0])
         times = (steps.t[:-1, None] + np.outer(np.diff(steps.t), inside)).ravel()
         pivots = self.f.grid(times, steps.within(inside).reshape(self.n_x, -1), self.p)[self.n_x :]
@@ -48,21 +53,21 @@ class BulkSteps(Stepping):
             pivots_at=self._pivots,
         )
 
-    def _record(self, steps, stand):
-        """Record the pending samples within the first `stand` steps."""
+    def _record(self, steps, first, last):
+        """Record the pending samples from the start of step `first` to the start of step `last`."""
         direction = 1.0 if self.forward else -1.0
-        due = direction * self.pending <= direction * steps.t[stand]
+        due = direction * self.pending <= direction * steps.t[last]
         times, self.pending = self.pending[due], self.pending[~due]
         if not len(times):
             return
-        owner = np.searchsorted(direction * steps.t[: stand + 1], direction * times, "right") - 1
-        states = steps.x[:, np.clip(owner, 0, stand)]
-        for k in np.unique(owner[owner < stand]):
-            states[:, owner == k] = steps.at(k, times[owner == k])
+        step = first + np.searchsorted(direction * steps.t[first : last + 1], direction * times, "right") - 1
+        states = steps.x[:, np.clip(step, 0, last)]
+        for k in np.unique(step[step < last]):
+            states[:, step == k] = steps.at(k, times[step == k])
         states = self._settled(times, states)
         top = self.f.grid(times, states, self.p)[self.n_x - self.model.n : self.n_x]
         self.motion.add(self.model, times, states, top)
 
     def _settled(self, times, states):
-        """States of samples as they are recorded."""
+        """States of samples, projected if the method projects."""
         return states

@@ -1,68 +1,182 @@
-"""Methods as values: what `simulate(..., method=)` takes, its settings, and the treatments of drift it goes with."""
+"""What a user passes to `simulate`: methods with their settings, treatments of drift, and which go together."""
 
 from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
-from servoctl.checks import is_number, is_whole
+from servoctl.checks import is_whole, positive_number, whole_of
 from servoctl.errors import SpecificationError, unknown
-from servoctl.methods.drift import SHORT_FORMS, MinimalCoordinates, Poles, Project
-from servoctl.methods.radau import RADAU_ORDERS
-from servoctl.methods.runge_kutta import ORDERS
 
+ORDERS = {"RK1": 1, "RK2": 2, "RK4": 4, "RK5": 5, "RK8": 8}
+"""Order of each Runge-Kutta method: Euler's, the midpoint rule, the classical one of Kutta (1901), Dormand and
+Prince's of orders 5 (1980) and 8 (Prince and Dormand 1981)."""
+RADAU_ORDERS = (5, 9, 13)
 SCIPY = ("RK23", "RK45", "DOP853", "Radau", "BDF", "LSODA")
 EXPLICIT, MULTISTEP = ("RK23", "RK45", "DOP853"), ("BDF", "LSODA")
 SUNDIALS = ("CVODES", "IDAS")
-LEAST_RTOL = 100 * np.finfo(float).eps  # least rtol of scipy's methods but LSODA
+SMALLEST_RTOL = 100 * np.finfo(float).eps  # that scipy's methods except LSODA accept: they replace a smaller one
 HIGHEST = 40  # order of a series, and level of jets
+REAL = 1e-9  # imaginary part of a pole polynomial, relative to its largest coefficient, that is rounding
 
 PAST_STATES = "A multistep method carries past states, which projection would contradict."
-MOVING_CHART = (
-    "The choice of coordinates changes along the motion, which past states and compiled loops would not notice."
-)
+MOVING_CHART = "The integrated coordinates change along the motion, which invalidates past states and compiled loops."
 
 
-def _positive(name, value, most=np.inf):
-    if not (is_number(value) and 0 < value <= most):
-        bound = f", at most {most:g}" if np.isfinite(most) else ""
+# treatments of drift -------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Poles:
+    """Error dynamics Π(D - λ_i) ψ = 0 in place of D^ρ ψ = 0 in every row that was differentiated ρ times.
+
+    Parameters
+    ----------
+    values : float or dict of str to sequence of complex
+        One time constant T [s], which puts all poles at -1/T; or ρ poles [1/s] by row name, with ρ from
+        `model.raised`. Rows without an entry keep D^ρ ψ = 0.
+
+    Raises
+    ------
+    SpecificationError
+        If the time constant is not positive, the dict is empty, or poles are not finite or not in conjugate pairs.
+    """
+
+    values: object
+
+    def __post_init__(self):
+        checked = _poles_by_row(self.values) if isinstance(self.values, dict) else _time_constant(self.values)
+        object.__setattr__(self, "values", checked)
+
+    def __str__(self):
+        if isinstance(self.values, float):
+            return f"poles at {-1 / self.values:g} 1/s"
+        return f"poles of {', '.join(self.values)}"
+
+    def by_row(self, model):
+        """The poles [1/s] of every row of a model: {row name: (ρ,) array}."""
+        if isinstance(self.values, float):
+            return {row: np.full(count, -1.0 / self.values) for row, count in model.raised.items()}
+        for name in self.values:
+            if name not in model.raised:
+                raise unknown(name, model.raised, "row")
+        poles = {row: np.atleast_1d(self.values.get(row, np.zeros(rho))) for row, rho in model.raised.items()}
+        for row, rho in model.raised.items():
+            if len(poles[row]) != rho:
+                raise SpecificationError(
+                    f"The row {row!r} has {len(poles[row])} poles.",
+                    f"It is differentiated {rho} times, so its error dynamics have {rho} poles.",
+                    row=row,
+                    count=rho,
+                )
+        return poles
+
+    def coefficients(self, model):
+        """The coefficients c_0 .. c_(ρ-1) of each row's error dynamics, in the order of the model's pole inputs."""
+        rows = [np.atleast_1d(np.poly(poles)).real[:0:-1] for poles in self.by_row(model).values()]
+        return np.concatenate([*rows, np.zeros(0)])
+
+
+def _time_constant(value):
+    try:
+        constant = np.nan if isinstance(value, bool) else float(value)
+    except (TypeError, ValueError):
+        constant = np.nan
+    if not (np.isfinite(constant) and constant > 0):
         raise SpecificationError(
-            f"{name}={value!r} was given.",
-            f"{'A step' if name == 'step' else 'A tolerance'} is a positive number{bound}.",
-            nearest=f"{name}={most:g}." if is_number(value) and value > most else "",
-            do=f"Give another, or leave {name} out.",
-            **{name: value},
+            f"The time constant of the error dynamics is {value!r}.",
+            "It is a positive number of seconds.",
+            do="Pass a number such as 0.1, or poles by row name.",
+            value=value,
         )
-    return float(value)
+    return constant
 
 
-def _whole_number(name, value, low):
-    if not (is_whole(value) and low <= value <= HIGHEST):
+def _poles_by_row(values):
+    if not values:
         raise SpecificationError(
-            f"{name}={value!r} was given.",
-            f"It is a whole number from {low} to {HIGHEST}.",
-            nearest=f"{name}={int(np.clip(np.round(value), low, HIGHEST))}." if is_number(value) else "",
-            do=f"Give another, or leave {name} out.",
-            **{name: value},
+            "The dict of poles names no row.",
+            "Error dynamics belong to rows.",
+            do="Name a row of model.raised, or pass a time constant.",
+            values=values,
         )
-    return int(value)
+    return {row: _conjugate_poles(row, poles) for row, poles in values.items()}
 
 
-def _one_of(name, value, valid, method):
-    if not (is_whole(value) and value in valid):
+def _conjugate_poles(row, poles):
+    """The poles of a row as a tuple, finite and in conjugate pairs."""
+    try:
+        array = np.atleast_1d(np.asarray(poles, dtype=complex))
+    except (TypeError, ValueError):
+        array = np.full(1, np.nan)
+    if array.ndim != 1 or not np.all(np.isfinite(array)):
         raise SpecificationError(
-            f"{name}={value!r} was given to {method}.",
-            f"It has the orders {', '.join(map(str, valid))}.",
-            nearest=f"{name}={min(valid, key=lambda order: abs(order - value))}." if is_number(value) else "",
-            do="Give one of them.",
-            **{name: value},
+            f"The poles of {row!r} are {poles!r}.",
+            "Poles are finite numbers [1/s].",
+            do="Pass a list such as [-5.0, -5.0].",
+            row=row,
         )
-    return int(value)
+    polynomial = np.atleast_1d(np.poly(array))
+    if np.abs(polynomial.imag).max(initial=0.0) > REAL * np.abs(polynomial).max():
+        raise SpecificationError(
+            f"The poles {poles!r} of {row!r} are not in conjugate pairs.",
+            "Error dynamics have real coefficients.",
+            row=row,
+        )
+    return tuple(np.atleast_1d(poles).tolist())
+
+
+@dataclass(frozen=True)
+class Project:
+    """Projection onto the invariants: the least change of the jets in the metric M, after every `every`-th step.
+
+    Parameters
+    ----------
+    every : int
+        Steps between projections, at least 1.
+    """
+
+    every: int = 1
+
+    def __post_init__(self):
+        if not is_whole(self.every) or self.every < 1:
+            raise SpecificationError(
+                f"every={self.every!r} was given.", "It is a whole number of steps, at least 1.", every=self.every
+            )
+        object.__setattr__(self, "every", int(self.every))
+
+    def __str__(self):
+        return "projected after every step" if self.every == 1 else f"projected after every {self.every} steps"
+
+
+@dataclass(frozen=True)
+class MinimalCoordinates:
+    """Integration of as many values as the program leaves free; the others are solved from the constraints."""
+
+    def __str__(self):
+        return "minimal coordinates"
+
+
+SHORT_FORMS = {"none": None, "project": Project(), "minimal": MinimalCoordinates()}
+
+
+def as_drift(value):
+    """The treatment that `drift=` stands for: None, a short form, a time constant [s], or a value."""
+    if value is None or isinstance(value, (Poles, Project, MinimalCoordinates)):
+        return value
+    if isinstance(value, str):
+        if value not in SHORT_FORMS:
+            raise unknown(value, [*SHORT_FORMS, "a time constant [s]"], "drift treatment")
+        return SHORT_FORMS[value]
+    return Poles(value)
+
+
+# methods -------------------------------------------------------------------------------------------------------------
 
 
 class Method:
     """What all methods share: a short form, and the treatments of drift they refuse, with the reason."""
 
-    named_by = ()  # fields that the short form tells
+    named_by = ()  # fields that the short form contains
     refused = {}
 
     def __str__(self):
@@ -72,19 +186,30 @@ class Method:
         shown = [f.name for f in fields(self) if f.name in self.named_by or getattr(self, f.name) != f.default]
         return f"{type(self).__name__}({', '.join(f'{name}={getattr(self, name)!r}' for name in shown)})"
 
-    def _set(self, **checked):
-        for name, value in checked.items():
-            object.__setattr__(self, name, value)
+    def _check(self, **valid):
+        """Check the fields: whole numbers by the values that are valid, steps and tolerances by their ranges."""
+        for name, numbers in valid.items():
+            self._check_field(name, whole_of, numbers)
+        for name, most in (("step", np.inf), ("rtol", 1.0), ("atol", 1.0)):
+            if hasattr(self, name):
+                self._check_field(name, positive_number, most)
 
-    def _set_tolerances(self):
-        self._set(rtol=_positive("rtol", self.rtol, 1.0), atol=_positive("atol", self.atol, 1.0))
+    def _check_field(self, name, check, rule):
+        # None is valid where it is the default: the method then chooses
+        if getattr(self, name) is not None or getattr(type(self), name) is not None:
+            object.__setattr__(self, name, check(name, getattr(self, name), rule))
+
+    @property
+    def settings(self):
+        """Names of the fields that the short form does not contain."""
+        return [f.name for f in fields(self) if f.name not in self.named_by]
 
 
 @dataclass(frozen=True, repr=False)
 class Algebraic(Method):
     """Newton's method at each instant, for programs that determine the motion completely (Σ o_a = 0)."""
 
-    refused = dict.fromkeys((Project, Poles), "Where every instant is solved for itself nothing drifts.")
+    refused = dict.fromkeys((Project, Poles), "Every instant is solved separately, so that nothing drifts.")
 
     def __str__(self):
         return "algebraic"
@@ -92,15 +217,15 @@ class Algebraic(Method):
 
 @dataclass(frozen=True, repr=False)
 class Taylor(Method):
-    """Compiled series steps: the most accurate method, with derivatives of any order.
+    """Compiled Taylor series steps: the most accurate method, with derivatives of any order.
 
     Parameters
     ----------
     order : int, optional
-        Of the series, 2 to 40; default: that of least work for rtol.
+        Order of the series, 2 to 40; default: the order of least work for rtol.
     jets : int, optional
-        Highest derivative in the samples, 1 to 40: `run["d4theta"]`; default s̄. With more than s̄ rates of the
-        actuation follow: `run["dtrolley"]`.
+        Highest derivative in the samples, 1 to 40: `run["d4theta"]`; default s̄. Values above s̄ also give rates of
+        the actuation: `run["dtrolley"]`.
     rtol, atol : float
         Tolerances of a step. The defaults keep residuals near 1e-9 over tens of seconds.
     """
@@ -112,29 +237,24 @@ class Taylor(Method):
 
     refused = {
         Poles: "The series are those of the undisturbed rows; error dynamics would need series of their own.",
-        MinimalCoordinates: "The series give every jet from the rows themselves: nothing is solved for the others.",
+        MinimalCoordinates: "The series give every jet directly from the rows; there is nothing left to solve.",
     }
 
     def __post_init__(self):
-        order, jets = (
-            None if value is None else _whole_number(name, value, low)
-            for name, value, low in (("order", self.order, 2), ("jets", self.jets, 1))
-        )
-        self._set(order=order, jets=jets)
-        self._set_tolerances()
+        self._check(order=range(2, HIGHEST + 1), jets=range(1, HIGHEST + 1))
 
 
 @dataclass(frozen=True, repr=False)
 class RungeKutta(Method):
-    """Compiled explicit Runge-Kutta steps of fixed length; its short forms are "RK1" to "RK8".
+    """Compiled explicit Runge-Kutta steps of fixed length; the short forms are "RK1" to "RK8".
 
     Parameters
     ----------
     order : {1, 2, 4, 5, 8}
         Euler's method, the midpoint rule, the classical one of Kutta, and Dormand and Prince's of orders 5 and 8.
     step : float, optional
-        [s]; default (t1 - t0)/2000. Shortened so that steps end at the knots of paths; steps that do not resolve the
-        motion are warned about.
+        Step length [s]; default (t1 - t0)/2000. Steps are shortened to end at the knots of paths. A warning is
+        issued where they do not resolve the motion.
     """
 
     order: int = 8
@@ -143,8 +263,7 @@ class RungeKutta(Method):
     named_by = ("order",)
 
     def __post_init__(self):
-        self._set(order=_one_of("order", self.order, ORDERS.values(), "RungeKutta"))
-        self._set(step=None if self.step is None else _positive("step", self.step))
+        self._check(order=tuple(ORDERS.values()))
 
     def __str__(self):
         return f"RK{self.order}"
@@ -157,7 +276,7 @@ class RadauIIA(Method):
     Parameters
     ----------
     order : {5, 9, 13}, optional
-        Default: that of least work for rtol.
+        Default: the order of least work for rtol.
     step : float, optional
         Length of fixed steps [s], shortened to end at knots; default: steps follow from the tolerances.
     rtol, atol : float
@@ -172,9 +291,7 @@ class RadauIIA(Method):
     refused = {MinimalCoordinates: MOVING_CHART}
 
     def __post_init__(self):
-        self._set(order=None if self.order is None else _one_of("order", self.order, RADAU_ORDERS, "RadauIIA"))
-        self._set(step=None if self.step is None else _positive("step", self.step))
-        self._set_tolerances()
+        self._check(order=RADAU_ORDERS)
 
 
 @dataclass(frozen=True, repr=False)
@@ -186,7 +303,7 @@ class Adaptive(Method):
     name : {"RK23", "RK45", "DOP853", "Radau", "BDF", "LSODA"}
         As in `scipy.integrate`.
     rtol, atol : float
-        Tolerances of a step; rtol at least 2.2e-14 but for "LSODA".
+        Tolerances of a step; rtol at least 2.2e-14 except for "LSODA".
     """
 
     name: str = "DOP853"
@@ -198,13 +315,13 @@ class Adaptive(Method):
     def __post_init__(self):
         if self.name not in SCIPY:
             raise unknown(self.name, SCIPY, "method of scipy")
-        self._set_tolerances()
-        if self.rtol < LEAST_RTOL and self.name != "LSODA":
+        self._check()
+        if self.rtol < SMALLEST_RTOL and self.name != "LSODA":
             raise SpecificationError(
                 f"rtol={self.rtol:g} was given with method={self.name!r}.",
-                f"scipy's methods take {LEAST_RTOL:.3g} instead of less.",
-                nearest=f"rtol={1.01 * LEAST_RTOL:.3g}; method='Taylor' has no such limit.",
-                do="Change one of them.",
+                f"scipy replaces an rtol below {SMALLEST_RTOL:.3g} by this number.",
+                nearest=f"rtol={1.01 * SMALLEST_RTOL:.3g}.",
+                do="Use this rtol, or method='Taylor', which has no such limit.",
                 rtol=self.rtol,
             )
 
@@ -213,13 +330,13 @@ class Adaptive(Method):
 
     @property
     def refused(self):
-        """Treatments of drift that a method with a memory cannot take."""
+        """Treatments of drift that a multistep method cannot take, with the reason."""
         return {Project: PAST_STATES, MinimalCoordinates: MOVING_CHART} if self.name in MULTISTEP else {}
 
 
 @dataclass(frozen=True, repr=False)
 class Sundials(Method):
-    """The multistep methods of SUNDIALS, through CasADi: "IDAS" integrates the rows before elimination.
+    """The multistep methods of SUNDIALS, through CasADi; "IDAS" integrates the rows before elimination.
 
     Parameters
     ----------
@@ -238,7 +355,7 @@ class Sundials(Method):
     def __post_init__(self):
         if self.name not in SUNDIALS:
             raise unknown(self.name, SUNDIALS, "method of SUNDIALS")
-        self._set_tolerances()
+        self._check()
 
     def __str__(self):
         return self.name
@@ -251,14 +368,14 @@ METHODS = {str(method): method for method in _DEFAULTS}
 
 
 def as_method(value, **settings):
-    """The method that a designer's `method=` means.
+    """The method that `method=` stands for.
 
     Parameters
     ----------
     value : str or Method
-        The short form of a method stands for its value with the defaults.
+        A short form stands for the method with its defaults.
     **settings
-        In place of the defaults: rtol, atol, step, order, jets; None leaves the default.
+        Replace the defaults: rtol, atol, step, order, jets; None keeps the default.
 
     Returns
     -------
@@ -267,28 +384,28 @@ def as_method(value, **settings):
     Raises
     ------
     NameUnknown
-        For another name.
+        If the name is not one of `METHODS`.
     SpecificationError
-        For a setting that the method does not have, or that makes no sense.
+        If the method does not have the setting, or its value is out of range.
     """
     method = value if isinstance(value, Method) else METHODS.get(value) if isinstance(value, str) else None
     if method is None:
         raise unknown(value, METHODS, "method")
-    known, settings = setting_names(method), {name: s for name, s in settings.items() if s is not None}
+    settings = {name: setting for name, setting in settings.items() if setting is not None}
     for name, setting in settings.items():
-        if name not in known:
-            users = ", ".join(short for short, other in METHODS.items() if name in setting_names(other))
+        if name not in method.settings:
+            users = ", ".join(short for short, other in METHODS.items() if name in other.settings)
             raise SpecificationError(
                 f"{name}={setting!r} was given with method={str(method)!r}.",
-                f"{method} takes {', '.join(known) or 'no settings'}; {name} belongs to {users or 'none'}.",
-                do=f"Leave {name} out, or take a method that has it.",
+                f"{method} takes {', '.join(method.settings) or 'no settings'}.",
+                do=f"Leave {name} out, or choose a method that takes it: {users}." if users else f"Leave {name} out.",
                 **{name: setting},
             )
     return replace(method, **settings)
 
 
 def default_method(model):
-    """The method for a model where none is given."""
+    """The method for a model if the user names none."""
     return Algebraic() if model.flat else Adaptive()
 
 
@@ -308,35 +425,27 @@ def require_combination(model, method, drift):
     if isinstance(method, Algebraic) and not model.flat:
         raise SpecificationError(
             "method='algebraic' was given.",
-            f"The program leaves {model.free} initial values free: an internal dynamics remains to be integrated.",
+            f"The program leaves {model.free} initial values free, so that internal dynamics must be integrated.",
             nearest=f"{str(default_method(model))!r}.",
-            do="Leave the method out.",
             free=model.free,
         )
-    given = f"drift={drift!r} was given with method={str(method)!r}"
+    combination = f"drift={drift!r} was given with method={str(method)!r}"
     if isinstance(drift, MinimalCoordinates) and model.flat and not isinstance(method, Algebraic):
         raise SpecificationError(
-            f"{given} for a program that determines the motion completely.",
-            "Without free initial values nothing is left to integrate: each instant is a Newton solve.",
+            f"{combination} for a program that determines the motion completely.",
+            "Without free initial values there is nothing to integrate: each instant is a Newton solve.",
             nearest="method='algebraic'.",
-            do="Leave the method out.",
             free=0,
         )
     if type(drift) in method.refused:
         forms = {**{repr(form): type(value) for form, value in SHORT_FORMS.items()}, "a time constant": Poles}
-        taken = [form for form, treatment in forms.items() if treatment not in method.refused]
-        others = [name for name, other in METHODS.items() if type(drift) not in other.refused and name != "algebraic"]
+        possible = [form for form, treatment in forms.items() if treatment not in method.refused]
+        methods = [name for name, other in METHODS.items() if type(drift) not in other.refused and name != "algebraic"]
         raise SpecificationError(
-            f"{given}.",
+            f"{combination}.",
             method.refused[type(drift)],
-            nearest=f"with this method drift={', '.join(taken)}; with this treatment {', '.join(others)}.",
-            do="Change one of them.",
+            do=f"Choose drift={', '.join(possible)} for this method, or one of the methods {', '.join(methods)}.",
             method=str(method),
             drift=drift,
-            methods=others,
+            methods=methods,
         )
-
-
-def setting_names(method):
-    """Names of what may be set beside what the short form tells."""
-    return [f.name for f in fields(method) if f.name not in method.named_by]

@@ -1,8 +1,8 @@
-"""Minimal coordinates: only as many values are integrated as the program leaves free, the others are solved.
+"""Minimal coordinates: as many values are integrated as the program leaves free; the others are solved for.
 
-At level j the invariants ψ_a^(j-o_a) = 0 of all rows of order o_a <= j determine as many components of γ^(j) (at level
-0, with the kinematics' own invariants, of q) as there are rows; the others, Σ o_a in all, are integrated. Which ones is
-chosen by pivoted QR, and again when the choice degrades. Nothing is left to drift.
+At level j the invariants ψ_a^(j-o_a) = 0 of all rows of order o_a <= j determine as many components of γ^(j) as there
+are rows (at level 0, with the invariants of the kinematics, components of q). The others, Σ o_a in all, are integrated.
+Pivoted QR chooses them, and chooses again when the choice degrades. Nothing is left to drift.
 """
 
 import numpy as np
@@ -10,9 +10,9 @@ import numpy as np
 from servoctl.errors import IntegrationStopped
 from servoctl.reduction.ranks import equilibrate
 
-REACH = 2.0  # times as fast as the integrated values may the solved ones move before the choice is made again
-BETTER = 2.0  # by how much another choice must be slower
-GROWN = 10.0  # times as large must a slope be for the sizes to be taken again
+REACH = 2.0  # speed of the solved values relative to the integrated ones, above which the choice is reconsidered
+BETTER = 2.0  # factor by which another choice must be slower
+GROWN = 10.0  # growth of a slope after which sizes are updated
 ITERATIONS, HALVINGS = 12, 40
 CONVERGED = 1e-10  # relative: the Newton step after which the next is below rounding
 STALLED, SHRINKS = 1e-7, 0.3  # relative: steps below this that do not shrink to this part of the last are rounding
@@ -90,8 +90,8 @@ class Chart:
         self.choose(t, x)
 
     def _grow(self, t, x):
-        own = self._invariants(t, x, self.p)[self.m :].reshape(self.n_x, self.m).T
-        self.sizes.grow(self._model, x, own)
+        slopes = self._invariants(t, x, self.p)[self.m :].reshape(self.n_x, self.m).T
+        self.sizes.grow(self._model, x, slopes)
         self.columns, self.usual = self.sizes.columns, self.sizes.usual
 
     def invariants(self, t, x):
@@ -196,14 +196,14 @@ class Chart:
         def size(part):
             return np.nan_to_num(abs(self.ode(t + part * span, state(part), self.p)[self.n_x + pivot]))
 
-        found = minimize_scalar(size, bounds=(0.0, 1.0), method="bounded", options={"xatol": 1e-12})
-        part = found.x
+        least = minimize_scalar(size, bounds=(0.0, 1.0), method="bounded", options={"xatol": 1e-12})
+        part = least.x
         if not np.all(np.isfinite(state(part))):
-            part, beyond = 0.0, found.x
+            part, beyond = 0.0, least.x
             while beyond - part > 1e-12:
                 middle = (part + beyond) / 2
                 part, beyond = (middle, beyond) if np.all(np.isfinite(state(middle))) else (part, middle)
-        return t + part * span, state(part), found.fun
+        return t + part * span, state(part), least.fun
 
     def steps(self, t0, x, h, count, tableau):
         """Explicit Runge-Kutta steps, fewer than `count` where no state is found.
@@ -235,34 +235,28 @@ class Chart:
 
 
 class MinimalSolver:
-    """One of scipy's one-step methods on minimal coordinates, with the states X that the other solvers have.
+    """One of scipy's one-step methods on minimal coordinates; like scipy's solvers it has t, y, status and step().
 
     Parameters
     ----------
-    method : type
-        Of a scipy.integrate.OdeSolver.
-    model : Model
-    sizes : Sizes
-    t, x, bound : float, (n_x,) array, float
-        As of the method itself.
-    options : dict
-        Tolerances.
-    implicit : bool
-        Whether the method takes a Jacobian.
+    solver : callable
+        Solver of scipy for (y', t, y, ∂y'/∂y), with options by keyword.
+    chart : Chart
+    t : float
+    x : (n_x,) array
     """
 
-    def __init__(self, method, model, sizes, t, x, bound, options, implicit):
-        self.method, self.bound, self.options, self.implicit = method, bound, options, implicit
-        self.chart, self.changes, self.done = Chart(model, sizes, t, x), 0, np.zeros(3, dtype=int)
-        self.lost = False
-        self.t, self.y = t, self.chart.lift(t, x[self.chart.free], x)
+    def __init__(self, solver, chart, t, x):
+        self._new, self.chart = solver, chart
+        self.changes, self.done, self.lost = 0, np.zeros(3, dtype=int), False
+        self.t, self.y = t, chart.lift(t, x[chart.free], x)
         self._start()
 
-    def _start(self, **first):
-        chart = self.chart
-        exact = {"jac": lambda t, y: chart.jacobian(t, self._lift(t, y))} if self.implicit else {}
-        options = {**self.options, **exact, **first}
-        self.solver = self.method(self._rates, self.t, self.y[chart.free], self.bound, **options)
+    def _start(self, **options):
+        self.solver = self._new(self._rates, self.t, self.y[self.chart.free], self._jacobian, **options)
+
+    def _jacobian(self, t, y):
+        return self.chart.jacobian(t, self._lift(t, y))
 
     def _lift(self, t, y):
         return self.chart.lift(t, y, self.y)
@@ -272,7 +266,7 @@ class MinimalSolver:
 
     @property
     def status(self):
-        """Of the method; "failed" where no state is found after however short a step."""
+        """Status of scipy's solver; "failed" where even the shortest step leads to no state."""
         return "failed" if self.lost else self.solver.status
 
     @property
@@ -281,7 +275,7 @@ class MinimalSolver:
         return self.done + (self.solver.nfev, self.solver.njev, self.solver.nlu)
 
     def step(self):
-        """One step of the method, before it a change of coordinates where that is due; half as long where X is lost."""
+        """One step, after a change of coordinates where one is due; halved as long as its end has no state X."""
         if self.chart.improved(self.t, self.y):
             self.done, self.changes = self.work, self.changes + 1
             self._start()
@@ -298,7 +292,7 @@ class MinimalSolver:
             self.done = self.work
             self._start(first_step=abs(length) / 2)
         else:
-            self.lost, message = True, "the constraints have no solution that Newton's method finds"
+            self.lost, message = True, "Newton's method finds no solution of the constraints"
         return message
 
     def dense_output(self):
@@ -311,10 +305,9 @@ class MinimalSolver:
         x = self.chart.lift(t, y, near)
         if not np.all(np.isfinite(x)):
             raise IntegrationStopped(
-                f"The constraints have no solution that Newton's method finds at t = {t:.7g} s, within a step.",
+                f"Newton's method finds no solution of the constraints at t = {t:.7g} s, within a step.",
                 "The values that are not integrated are solved from the constraints.",
-                nearest="drift='project', which solves nothing inside a step.",
-                do="Tighten rtol, or project.",
+                do="Use a smaller rtol, or drift='project', which solves nothing within a step.",
                 t=float(t),
             )
         return x

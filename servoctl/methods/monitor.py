@@ -1,7 +1,7 @@
-"""The monitor of pivots: what becomes of them along a motion, and what follows from it.
+"""The rank monitor: inspects pivots along a motion and decides whether to go on, to repivot, or to stop.
 
 A pivot that changes its sign, touches zero, vanishes or stays at zero marks a state where the program is singular, or
-where only the choice of pivots fails; the equilibrated matrices L and B tell which. A pivot that degrades is replaced
+where only the choice of pivots fails; the equilibrated matrices L and B decide which. A pivot that degrades is replaced
 as soon as the matrices are far better than it.
 """
 
@@ -13,16 +13,16 @@ from servoctl.errors import IntegrationStopped, ServoError, SingularProgram
 from servoctl.reduction.ranks import column_sizes
 
 DEGRADED = 0.02  # of its reference: a pivot below this is replaced, if the matrix itself is better than that
-HELPS = 5.0  # by how much the matrix must be better
+HELPS = 5.0  # factor by which the matrix must be better
 NEGLIGIBLE = 1e-7  # of its reference: a pivot below this is zero
 HOPELESS = 1e-9  # an equilibrated singular value below this leaves no digits
-VANISHING = 0.03  # of its reference: a row whose gradient is below this has lost it
-LOST = 0.1  # of its best: a rank measure below this, and not the integrator, is why no step succeeds
-HIDES = 10.0  # times the root of a residual: a pivot that touches zero quadratically may be zero below this
-SHARE = 0.1  # of the largest entry of a null vector: what has less of it is not named
-LINGERS = 5.0  # times the way to its crossing that a pivot may stay at what the residual hides
+VANISHING = 0.03  # of its reference: a gradient or rank measure below this counts as lost
+LOST = 0.1  # of its best: below this, rank and not the integrator is why no step succeeds
+HIDES = 10.0  # times the root of a residual: a smaller pivot may be zero, as it touches zero quadratically
+SHARE = 0.1  # of the largest entry of a null vector: smaller entries are not named in the error
+LINGERS = 5.0  # times the extrapolated way to its zero, after which a pivot hidden by the residual is zero
 NO_CHOICE = "no choice of pivots leads on"
-FRACTIONS = (0.25, 0.5, 0.75)  # of a step with dense output: where pivots are inspected, beside its end
+FRACTIONS = (0.25, 0.5, 0.75)  # of a step with dense output at which pivots are inspected, beside its end
 
 
 @dataclass(frozen=True)
@@ -34,7 +34,7 @@ class Fine:
 
 @dataclass(frozen=True)
 class Singular:
-    """After `steps` whole steps the program is singular at t [s], X = x, for a reason."""
+    """After `steps` whole steps the program is singular at t [s], X = x; `why` is the reason."""
 
     steps: int
     t: float
@@ -52,9 +52,9 @@ class Repivot:
     t : float
     x : (n_x,) array
     variant : (Model, Monitor) or None
-        With other pivots; None where they are still to be chosen.
+        With other pivots; None if they are still to be chosen.
     otherwise : Singular
-        What holds where no other pivots lead on.
+        The outcome if no other pivots lead on.
     """
 
     steps: int
@@ -65,7 +65,7 @@ class Repivot:
 
 
 def _other_pivots(steps, t, x):
-    """The motion goes on from a state whose rank is there, with pivots that are still to be chosen."""
+    """The motion goes on from a state of full rank, with pivots that are still to be chosen."""
     return Repivot(steps, t, x, None, Singular(steps, t, x, NO_CHOICE))
 
 
@@ -80,11 +80,11 @@ class Stretch:
     x : (n_x, S + 1) array
         States there.
     pivots : (n_g, S, m) array
-        At m instants of each step, the last of which is its end.
+        At m instants of each step, the last of them its end.
     top : callable
         γ^(s̄) from (t, X).
     crosses : bool
-        Whether a step over a zero of a pivot is as good as any other, so that the motion goes on from its end.
+        Whether a step across a zero of a pivot is as accurate as any other, so that the motion goes on from its end.
     """
 
     t: np.ndarray
@@ -98,7 +98,7 @@ class Stretch:
         return self.t[k : k + 2]
 
     def inner_pivots(self, k):
-        """Pivots (n_g, N) at `instants` but for the start."""
+        """Pivots (n_g, N) at `instants` except the start."""
         return self.pivots[:, k]
 
     def state(self, k, t):
@@ -117,8 +117,8 @@ class Stretch:
         return instants[j], sizes[j]
 
     def ranks_at(self, k, t):
-        """Instants at which the matrices must have their rank for a zero at t to be one of the pivots only."""
-        return self.t[k], t, self.t[k + 1]  # where the zero lies is known but roughly
+        """Instants at which the matrices must have full rank if a zero at t is one of the pivots only."""
+        return self.t[k], t, self.t[k + 1]  # linear interpolation locates the zero only roughly
 
     def last_before(self, k, t):
         """The last instant before t from which the motion may go on."""
@@ -136,7 +136,7 @@ class DenseStretch(Stretch):
     pivots_at : callable
         Pivots from (t, X).
     resumes : bool
-        Whether the dense output is as good as the steps, so that the motion may go on from within a step.
+        Whether the dense output is as accurate as the steps, so that the motion may go on from within a step.
     """
 
     dense: object = None
@@ -144,19 +144,19 @@ class DenseStretch(Stretch):
     resumes: bool = False
 
     def instants(self, k):
-        """Instants of step k at which pivots are known, its start first."""
+        """The ends of step k and quarters between them."""
         a, b = self.t[k : k + 2]
         return np.array([a, *(a + s * (b - a) for s in FRACTIONS), b])
 
     def inner_pivots(self, k):
-        """Pivots (n_g, N) at `instants` but for the start."""
+        """Pivots (n_g, N) at `instants` except the start, evaluated if only those of the end are known."""
         if self.pivots.shape[2] > 1:
             return self.pivots[:, k]
         inner = [self.pivots_at(s, self.dense(k, s)) for s in self.instants(k)[1:-1]]
         return np.column_stack([*inner, self.pivots[:, k]])
 
     def state(self, k, t):
-        """X at an instant of step k."""
+        """X from the steps at their ends, from the dense output in between."""
         at = {self.t[k]: k, self.t[k + 1]: k + 1}.get(t)
         return self.dense(k, t) if at is None else self.x[:, at]
 
@@ -164,7 +164,7 @@ class DenseStretch(Stretch):
         return self.pivots_at(t, self.dense(k, t))[i]
 
     def zero(self, k, i, ends, sizes):
-        """Where pivot i, which has opposite signs at both ends, vanishes between them."""
+        """The root of pivot i between two instants."""
         from scipy.optimize import brentq
 
         a, b = (self._pivot(k, i, t) for t in ends)
@@ -173,21 +173,25 @@ class DenseStretch(Stretch):
         return brentq(lambda s: self._pivot(k, i, s), *ends, xtol=1e-14)
 
     def least(self, k, i, instants, sizes, scale):
-        """Where pivot i is least in step k, and its size there relative to a scale."""
+        """The instant in step k at which pivot i is least, and its size there relative to a scale."""
         from scipy.optimize import minimize_scalar
 
         low, high = sorted(self.t[k : k + 2])
-        found = minimize_scalar(lambda s: abs(self._pivot(k, i, s)), bounds=(low, high), method="bounded",
-                                options={"xatol": 1e-10 * max(high - low, 1e-12)})  # fmt: skip
-        best = min([*instants, float(found.x)], key=lambda s: abs(self._pivot(k, i, s)))
-        return best, abs(self._pivot(k, i, best)) / scale
+
+        def size(t):
+            return abs(self._pivot(k, i, t))
+
+        options = {"xatol": 1e-10 * max(high - low, 1e-12)}
+        least = minimize_scalar(size, bounds=(low, high), method="bounded", options=options)
+        best = min([*instants, float(least.x)], key=size)
+        return best, size(best) / scale
 
     def ranks_at(self, k, t):
-        """Instants at which the matrices must have their rank for a zero at t to be one of the pivots only."""
+        """The zero alone: dense output locates it to rounding."""
         return (t,)
 
     def last_before(self, k, t):
-        """The last instant before t from which the motion may go on."""
+        """The last inspected instant before t, or the start of step k if the motion resumes from steps only."""
         if not self.resumes:
             return self.t[k]
         instants = self.instants(k)
@@ -202,10 +206,10 @@ class Monitor:
     model : Model
     t : float
     x : (n_x,) array
-        Where references are taken; they grow along the motion.
+        State of the first references, which grow along the motion.
     before : Monitor, optional
-        The monitor of the variant that this one replaces: its references are kept for columns and for the rows that
-        both have, so that a row whose gradient has nearly vanished does not look new.
+        Monitor of the variant that this one replaces. Its references stay valid for columns and for rows that both
+        variants have, so that a gradient that has nearly vanished does not become its own reference.
     """
 
     def __init__(self, model, t, x, before=None):
@@ -263,12 +267,12 @@ class Monitor:
         return float(np.min(now / np.where(self.best > 0, self.best, 1.0)))
 
     def begin(self, pivots):
-        """Take the pivots (n_g,) at the start of a piece as what the first step is compared with."""
+        """Start a piece: the first step is compared with the pivots (n_g,) at its start."""
         self.sunk = None
         self.recent = self._relative(pivots[:, None])[0]
 
     def _relative(self, pivots):
-        """Pivots (n_g, N) relative to the largest size that each has had until then, and these sizes."""
+        """Pivots (n_g, N) relative to their largest sizes up to each instant, and these sizes."""
         sizes = np.abs(pivots)
         sizes = np.where(np.isfinite(sizes), sizes, 0.0)
         if self.reference is None:
@@ -280,7 +284,7 @@ class Monitor:
         return pivots / np.where(largest > 0, largest, 1.0), largest
 
     def inspect(self, stretch):
-        """Inspect the pivots along steps that follow those inspected before.
+        """Inspect the pivots along steps that continue the inspected ones.
 
         Parameters
         ----------
@@ -315,7 +319,7 @@ class Monitor:
         return Fine(count)
 
     def _step(self, stretch, k, before, scale):
-        """What one step leads to, None where all is well; `before` are relative pivots at and before its start."""
+        """The outcome of one step, None if it is fine; `before` are the relative pivots at and before its start."""
         instants, after = stretch.instants(k), stretch.inner_pivots(k) / scale[:, None]
         track = np.column_stack([before[:, -1], after])
         changed = np.argwhere(np.sign(track[:, :-1]) * np.sign(track[:, 1:]) < 0)
@@ -338,7 +342,7 @@ class Monitor:
         return _other_pivots(k + 1, t, x) if degraded else None
 
     def _touched(self, stretch, k, sizes, scale):
-        """Where a pivot is least within a step and the residual hides its zero, or None."""
+        """The instant in a step at which a pivot is least, if the residual may hide a zero there; else None."""
         middle = sizes[:, 1:-1]
         low = (middle < sizes[:, :-2]) & (middle <= sizes[:, 2:]) & (middle < DEGRADED)
         for i in np.argwhere(low.T)[:, 1]:
@@ -348,7 +352,7 @@ class Monitor:
         return None
 
     def _vanishing(self, stretch, k, t, why):
-        """What follows from a pivot that vanishes at t in step k: only the choice of pivots fails, or the program."""
+        """The outcome of a pivot that vanishes at t in step k: another choice of pivots, or a singular program."""
         if min(self.rank_measure(s, stretch.state(k, s)) for s in stretch.ranks_at(k, t)) > DEGRADED:
             if stretch.crosses:
                 return _other_pivots(k + 1, stretch.t[k + 1], stretch.x[:, k + 1])
@@ -361,7 +365,7 @@ class Monitor:
         return Repivot(k, before, start, variant, singular) if helps else singular
 
     def _lingers(self, k, instants, sizes, x):
-        """That the program is singular if a pivot sank into what the residual hides, was to cross zero, and stays."""
+        """Singular if a pivot sank below what the residual hides, should have crossed zero by now, and stays there."""
         t = instants[1]
         if sizes[1] >= DEGRADED or not self.hidden_zero(sizes[1], t, x):
             self.sunk = None
@@ -376,11 +380,11 @@ class Monitor:
         return None if self.pivots_only(sizes[1], t, x) else Singular(k, crossing, at, "a pivot stays at zero")
 
     def lost(self, t, x):
-        """Whether rank, not the integrator, is what fails at a state where no step succeeds."""
+        """Whether a loss of rank, not the integrator, explains that no step succeeds at a state."""
         return self.rank_measure(t, x) < LOST or float(self.best.min()) < HOPELESS
 
     def hidden_zero(self, relative, t, x):
-        """Whether a relative pivot, or the matrices themselves, are so small that the residual hides a zero."""
+        """Whether a relative pivot, or the rank measure, is so small that the residual may hide a zero."""
         values = self.invariants(t, x, self.model.parameters)[: self.m]
         residual = np.abs(values / self.gradients).max(initial=0.0)  # relative to the gradients at the start
         return min(relative, self.rank_measure(t, x)) < max(NEGLIGIBLE, HIDES * np.sqrt(residual))
@@ -390,19 +394,19 @@ class Monitor:
         return self.rank_measure(t, x) > HELPS * max(abs(relative), NEGLIGIBLE)
 
     def refuse_start(self, t, x, outputs):
-        """The error of a start at which the accelerations are not finite with any choice of pivots, or None."""
+        """The error of a start whose accelerations are not finite with any choice of pivots, or None."""
         return None if np.all(np.isfinite(outputs)) else self.singular(t, x, "the accelerations are not finite there")
 
     def bad_choice(self, outputs, pivots):
-        """Whether the outputs of a method's function at the start are not finite, or pivots far worse than matrices."""
+        """Whether outputs at the start are not finite, or pivots are far worse than the matrices."""
         if not np.all(np.isfinite(outputs)):
             return True
-        reference = self.model.guard_sizes
+        reference = self.model.pivot_sizes
         weakest = (np.abs(pivots) / np.where(reference > 0, reference, 1.0)).min(initial=1.0)
         return bool(weakest < DEGRADED and self.best.min() > HELPS * weakest)
 
     def repivoted(self, t, x, top):
-        """The model with pivots chosen at x with γ^(s̄) = top, as far as that is finite, and its monitor; or None."""
+        """The model with pivots chosen at x and γ^(s̄) = top, and its monitor; None if no choice succeeds."""
         sizes = {name: size for name, size in zip(self.model.state_names, self.largest, strict=True) if size > 0}
         try:
             model = self.model.near(t, np.append(x, np.nan_to_num(top)), sizes)
@@ -410,18 +414,22 @@ class Monitor:
         except ServoError:
             return None
 
-    def failed(self, t, x, why, *error):
-        """The error of a state from which no step leads on: rank is lost (`why`), or the method's own.
+    def failed(self, t, x, why, what, do):
+        """The error of a state from which no step succeeds: singular for the reason `why`, or the method's own.
 
-        `error` says what happened, the rule, and what to do.
+        The latter says `what` happened and what to `do`.
         """
         if self.lost(t, x):
             return self.singular(t, x, why)
-        what, rule, do = error
-        return IntegrationStopped(what, rule, f"The motion before t = {t:.6g} s, which is kept.", do, t=float(t))
+        return IntegrationStopped(
+            f"{what}.",
+            "A motion is integrated as far as its solution exists and steps succeed.",
+            do=f"{do} The run before this instant is in .run.",
+            t=float(t),
+        )
 
     def singular(self, t, x, why):
-        """The error that tells where, which row, and which jets are zero there."""
+        """The error that names the instant, the rows that lose rank, and the jets that are zero there."""
         matrices = self._matrices(t, x)
         measure = self.rank_measure(t, x)
         lost, zero, names = [], [], (self.l_names, self.b_names)
@@ -443,9 +451,8 @@ class Monitor:
             f"The program is singular at t = {t:.7g} s: {what}{where}; {why}.",
             f"The smallest equilibrated singular value is {measure:.1e} of its best along the motion; accelerations "
             f"are undetermined in the direction of {', '.join(direction)}.",
-            nearest=f"The motion before t = {t:.6g} s, which is kept.",
-            do="State the residual in a form whose gradient does not vanish (linear in velocities, not squared), "
-            "or plan around this state.",
+            do="Write the residual in a form whose gradient does not vanish (linear in velocities, not squared), or "
+            "plan around this state. The run before it is in .run.",
             t=float(t),
             measure=measure,
             rows=lost or dependent,

@@ -1,4 +1,4 @@
-"""What every integration shares: pieces of a motion, and other pivots where the monitor wants them."""
+"""What all integrations share: the pieces of a motion, and the change of pivots that the rank monitor requires."""
 
 import contextlib
 from dataclasses import dataclass, field
@@ -6,7 +6,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from servoctl.methods.drift import Poles
+from servoctl.methods.choice import Poles
 from servoctl.methods.monitor import VANISHING, Monitor, Repivot
 
 
@@ -26,7 +26,7 @@ class Motion:
             self.pieces.append((model, np.asarray(t), np.asarray(x), np.asarray(top)))
 
     def changes_pivots(self, t):
-        """Note a change of pivots at t; False where one was made at the same instant before: it did not help."""
+        """Note a change of pivots at t; False if one was made at this instant already and did not help."""
         again = t in self.changed
         self.changed.add(t)
         return not again
@@ -37,22 +37,21 @@ class Motion:
             self.counters[name] = self.counters.get(name, 0) + int(number)
 
     def samples(self):
-        """All samples, an instant that two pieces share once.
+        """All samples; an instant that two pieces share appears once.
 
         Returns
         -------
         t : (N,) array
         z : (n_z, N) array
         variants : list of (first, last + 1, model)
-            Which variant of the model holds for which samples.
+            The variant of the model that holds for each range of samples.
         """
         t = np.concatenate([piece[1] for piece in self.pieces])
         z = np.concatenate([np.vstack([piece[2], piece[3]]) for piece in self.pieces], axis=1)
         keep = np.append(True, np.diff(t) != 0)
-        owner = np.repeat(np.arange(len(self.pieces)), [len(piece[1]) for piece in self.pieces])[keep]
+        models = [piece[0] for piece in self.pieces for _ in piece[1]]
         variants = []
-        for i, number in enumerate(owner):
-            model = self.pieces[number][0]
+        for i, model in enumerate(models[k] for k in np.flatnonzero(keep)):
             if variants and variants[-1][2] is model:
                 variants[-1] = (variants[-1][0], i + 1, model)
             else:
@@ -62,7 +61,7 @@ class Motion:
 
 @contextlib.contextmanager
 def interruptible(motion):
-    """Ctrl-C ends the work and keeps what was computed."""
+    """Ctrl-C ends the integration; the motion so far remains."""
     try:
         yield
     except KeyboardInterrupt:
@@ -87,7 +86,8 @@ def equal_steps(a, b, step):
 class Stepping:
     """One integration: the model in use, the monitor of its pivots, and the motion so far.
 
-    A method takes the steps of a smooth piece in `_piece(a, x, b, times)` and returns the state at its end.
+    A method takes the steps of a smooth piece in `_piece(a, x, b, times)` and returns the state at its end. If a step
+    fails, `rank_lost` describes this for a singular program, and `advice` is for other failures.
 
     Parameters
     ----------
@@ -96,6 +96,9 @@ class Stepping:
     drift : None, Poles, Project or MinimalCoordinates
     progress : callable
     """
+
+    rank_lost = "the step of the integrator shrinks to nothing"
+    advice = "Use a larger rtol, or check whether the motion escapes."
 
     def __init__(self, model, method, drift, progress):
         self.method, self.drift, self.progress, self.motion = method, drift, progress, Motion()
@@ -137,7 +140,7 @@ class Stepping:
         return self.motion
 
     def _start(self, t, x, b):
-        """Choose other pivots at the start of the first piece, up to b, where the model's own are a bad choice."""
+        """Choose other pivots at the start of the first piece, up to b, if the model's are a bad choice there."""
         self.monitor = Monitor(self.model, t, x)
         if self.monitor.bad_choice(self._outputs(t, x), self._pivots(t, x)):
             variant = self.monitor.repivoted(t, x, self._top(t, x))
@@ -162,7 +165,7 @@ class Stepping:
         self.motion.count(pivot_changes=1)
 
     def _follow(self, outcome):
-        """Go on with other pivots where the monitor says so; False where the program is singular."""
+        """Go on with other pivots if the outcome requires them; False if the program is singular."""
         if isinstance(outcome, Repivot):
             t, x = outcome.t, outcome.x
             variant = None
@@ -175,7 +178,12 @@ class Stepping:
         self.motion.stop = self.monitor.singular(outcome.t, outcome.x, outcome.why)
         return False
 
+    def _fail(self, t, x, why):
+        """Stop because no step succeeds."""
+        what = f"{self.method} stopped at t = {t:.7g} s: {why}"
+        self.motion.stop = self.monitor.failed(t, x, self.rank_lost, what, self.advice)
+
     def _keep_last(self, t, x):
-        """Record the last state, whatever the samples; not so near a singularity that γ^(s̄) is lost."""
+        """Record the last state, unless it is so near a singularity that γ^(s̄) is lost."""
         if self.monitor.rank_measure(t, x) > VANISHING:
             self.motion.add(self.model, [t], x[:, None], self._top(t, x)[:, None])

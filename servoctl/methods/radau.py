@@ -11,18 +11,14 @@ from servoctl.codegen.loops import ROUNDING
 from servoctl.codegen.native import pointer
 from servoctl.errors import SpecificationError
 from servoctl.methods.bulk import BulkSteps
-from servoctl.methods.drift import Project
+from servoctl.methods.choice import RADAU_ORDERS, Project
 from servoctl.methods.motion import equal_steps
 
-RADAU_ORDERS = (5, 9, 13)
-LEAST_RTOL = {5: 1e-4, 9: 1e-7}  # above which an order needs less work than the next
+LEAST_RTOL = {5: 1e-4, 9: 1e-7}  # rtol above which an order needs less work than the next
 NEWTON_TOLERANCE = 1e-2  # of the Newton iteration, relative to the tolerance of a step
-TIGHT, PATIENT = 1e-4, 3  # the same where steps are fixed, and how many times more iterations they may take
+TIGHT, PATIENT = 1e-4, 3  # the same for fixed steps, and the factor of iterations that they may take
 NEWTON_ITERATIONS = {5: 7, 9: 12, 13: 17}  # at most, by order (Hairer and Wanner 1999)
-
-
-# Stages by order. All are L-stable; the matrix of an odd number of stages has one real eigenvalue.
-STAGES = {5: 3, 9: 5, 13: 7}
+STAGES = {5: 3, 9: 5, 13: 7}  # all L-stable; for an odd number of stages A has one real eigenvalue
 
 
 @functools.cache
@@ -38,7 +34,7 @@ def radau(order):
     c : (s,) array
         Nodes, the last of which is 1.
     rate : (s, s) array
-        A⁻¹: what takes increments of the stages to h times their rates, the derivative of the collocation polynomial.
+        A⁻¹, which maps increments of the stages to h times their rates (the collocation polynomial's derivative).
     from_pairs, to_pairs : (s, s) arrays
         Real and imaginary parts of the eigenvectors of A⁻¹ as columns, and their inverse.
     mu : ((s + 1)/2, 2) array
@@ -73,8 +69,8 @@ def basis(c, theta):
     """Lagrange polynomials of the nodes c, and 0, at theta (N,): an (s, N) array."""
     nodes = np.append(0.0, c)
     rows = [[k for k in range(len(nodes)) if k != j] for j in range(1, len(nodes))]
-    return np.array([np.prod([(theta - nodes[k]) / (nodes[j + 1] - nodes[k]) for k in r], axis=0)
-                     for j, r in enumerate(rows)])  # fmt: skip
+    factors = ([(theta - nodes[k]) / (nodes[j + 1] - nodes[k]) for k in row] for j, row in enumerate(rows))
+    return np.array([np.prod(row, axis=0) for row in factors])
 
 
 def radau_order(rtol):
@@ -132,12 +128,10 @@ def radau_steps(f, t0, x0, t1, p, h, settings, max_steps):
     ----------
     f : Compiled
         From `radau_loop`.
-    t0 : float
-        Start [s].
+    t0, t1 : float
+        [s]
     x0 : (n_x,) array
         State at t0, SI.
-    t1 : float
-        End [s].
     p : (n_p,) array
         Parameters, SI.
     h : float
@@ -148,7 +142,7 @@ def radau_steps(f, t0, x0, t1, p, h, settings, max_steps):
     Returns
     -------
     t : (S + 1,) array
-        Starts of the steps, and where the last one ended [s]; short of t1 where steps vanish.
+        Starts of the steps and the end of the last [s], which lies before t1 if steps vanish.
     x : (n_x, S + 1) array
         States there, SI.
     z : (S, s, n_x) array
@@ -200,7 +194,7 @@ def inside(order, theta, z):
 
 
 def first_step(f, t, x, p, span, settings):
-    """Length of a first step (Hairer, Nørsett and Wanner 1993, II.4); f is a Compiled with the outputs X', guards."""
+    """Length of a first step (Hairer, Nørsett and Wanner 1993, II.4); f is a Compiled with the outputs X', pivots."""
     n, power = len(x), 1.0 / (STAGES[settings.order] + 1)
     scale = settings.atol + settings.rtol * np.abs(x)
     slope = f(t, x, p)[:n]
@@ -271,9 +265,11 @@ class RadauSteps(BulkSteps):
     """
 
     most = 200  # steps per call of the compiled loop
+    advice = "Use a smaller step or none, use a larger rtol, or check whether the motion escapes."
 
     def __init__(self, model, drift, rtol, atol, order, step, progress):
         self.step, self.taken = step, []
+        self.failure = "its steps vanish" if step is None else "the Newton iteration does not solve a fixed step"
         self.every = drift.every if isinstance(drift, Project) else 0
         self.most = max(self.most - self.most % self.every, self.every) if self.every else self.most
         order = radau_order(rtol) if order is None else order
@@ -287,19 +283,20 @@ class RadauSteps(BulkSteps):
                 "method='RadauIIA' was given, and there is no C compiler.",
                 "The loop over its steps is C code.",
                 nearest="method='Radau', scipy's of order 5.",
-                do="Take that, or install a C compiler (gcc or clang).",
+                do="Use it, or install a C compiler (gcc or clang).",
+                method="RadauIIA",
             )
         return f
 
     def halved(self, model, t, x, h):
-        """States (n_x, 3) at t, t + h and t + 2 h by two steps; fewer where one fails."""
+        """States (n_x, 3) at t, t + h and t + 2 h by two steps; fewer if one fails."""
         self._use(model)
         return radau_steps(self.f, t, x, t + 2 * h, self.p, abs(h), self.settings, 2)[1]
 
-    def _record(self, steps, stand):
-        super()._record(steps, stand)
+    def _record(self, steps, first, last):
+        super()._record(steps, first, last)
         if self.step is not None:
-            self.taken.append((self.model, steps.t[: stand + 1], steps.x[:, : stand + 1]))
+            self.taken.append((self.model, steps.t[first : last + 1], steps.x[:, first : last + 1]))
 
     def _begin(self, a, x, b):
         if self.step is None:
@@ -319,16 +316,3 @@ class RadauSteps(BulkSteps):
 
     def _settled(self, times, states):
         return settle(self.f, times, states, self.p) if self.every else states
-
-    def _fail(self, t, x):
-        why = "its steps vanish" if self.step is None else "a fixed step is not solved by the Newton iteration"
-        self.motion.stop = self.monitor.failed(
-            t,
-            x,
-            "the step of the integrator shrinks to nothing",
-            f"RadauIIA stopped at t = {t:.7g} s: {why}.",
-            "A motion is integrated as far as its solution exists and steps can be solved.",
-            "Take a smaller step or none, loosen rtol, or see whether the motion escapes.",
-        )
-
-

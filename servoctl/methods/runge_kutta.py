@@ -3,19 +3,16 @@
 import numpy as np
 
 from servoctl.errors import unknown
-from servoctl.methods.drift import MinimalCoordinates, Project
+from servoctl.methods.choice import ORDERS, MinimalCoordinates, Project
 from servoctl.methods.minimal import Chart, Sizes
 from servoctl.methods.monitor import DEGRADED, Fine, Singular, Stretch
 from servoctl.methods.motion import Stepping, equal_steps
 
-NEARLY_ZERO = 0.3  # of its reference: below this the least size of a pivot is looked for within a step
-ORDERS = {"RK1": 1, "RK2": 2, "RK4": 4, "RK5": 5, "RK8": 8}
-"""Order of each method: Euler's, the midpoint rule, the classical one of Kutta (1901), Dormand and Prince's of orders
-5 (1980) and 8 (Prince and Dormand 1981), whose coefficients are scipy's."""
+NEARLY_ZERO = 0.3  # of its reference: below this a pivot's least size is searched for within steps
 
 
 def tableau(name):
-    """The tableau (a, b, c) of a method.
+    """The tableau (a, b, c) of a method; the coefficients of RK5 and RK8 are scipy's.
 
     Parameters
     ----------
@@ -50,7 +47,7 @@ def tableau(name):
 
 
 class RungeKuttaSteps(Stepping):
-    """One integration with steps of at most `step`, ending at every knot; every step is a sample.
+    """One integration with steps of at most `step` that end at the knots; every step is a sample.
 
     Parameters
     ----------
@@ -63,7 +60,9 @@ class RungeKuttaSteps(Stepping):
     progress : callable
     """
 
-    most, most_in_python = 2000, 100  # steps per call of the compiled loop, and of that on minimal coordinates
+    rank_lost = "the state is no longer finite"
+    advice = "Use a smaller step (stable below about 2.8 over the largest eigenvalue), slower poles, or 'DOP853'."
+    most, most_in_python = 2000, 100  # steps per call of the compiled loop, and of the one on minimal coordinates
 
     def __init__(self, model, method, drift, step, progress):
         self.tableau, self.step = tableau(method), step
@@ -80,8 +79,8 @@ class RungeKuttaSteps(Stepping):
         return self.motion.pieces
 
     def _piece(self, a, x, b, times):
-        """Steps of equal length from t = a to b; returns the last state."""
         h, count = equal_steps(a, b, self.step)
+        # each call ends with a projection where steps are projected, so that the next one counts from there
         most = self.most - self.most % self.every if 0 < self.every < self.most else self.every or self.most
         most, done = self.most_in_python if self.sizes else most, 0
         self.monitor.begin(self._pivots(a, x))
@@ -97,7 +96,7 @@ class RungeKuttaSteps(Stepping):
             if not isinstance(outcome, Fine):
                 self._follow(outcome)
             elif good < steps:
-                self._fail(t[good], x, h)
+                self._fail(t[good], x, f"a step of {abs(h):.3g} s leads to no finite state")
         return x
 
     def _record(self, t, states):
@@ -109,7 +108,7 @@ class RungeKuttaSteps(Stepping):
             self.motion.count(coordinate_changes=self._changed[:steps].sum())
 
     def halved(self, model, t, x, h):
-        """States (n_x, 3) at t, t + h and t + 2 h by two steps; fewer where one fails."""
+        """States (n_x, 3) at t, t + h and t + 2 h by two steps; fewer if one fails."""
         self._use(model)
         return self._steps(t, x, h, 2)[0]
 
@@ -118,7 +117,7 @@ class RungeKuttaSteps(Stepping):
         return self._outputs(t, x)[: self.n_x]
 
     def _steps(self, t, x, h, count):
-        """States (n_x, N + 1) of `count` steps and the pivots there; fewer where no state is finite."""
+        """States (n_x, N + 1) of `count` steps and the pivots there; fewer if a state is not finite."""
         if not self.sizes:
             return self.f.rk(t, x, h, count, self.p, self.tableau, 1, self.every)[1:]
         chart = Chart(self.model, self.sizes, t, x)
@@ -127,7 +126,7 @@ class RungeKuttaSteps(Stepping):
         return states, self.f.grid(t + np.arange(states.shape[1]) * h, states, self.p)[self.n_x :]
 
     def _inspect(self, t, states, pivots):
-        """What the monitor says: no test of error has looked at a step over a pivot's zero, which is taken again."""
+        """The monitor's outcome; a step across a pivot's zero has passed no error test and is repeated."""
         outcome = self.monitor.inspect(Stretch(t, states, pivots[:, 1:, None], self._top))
         if self.sizes and len(t) > 1 and len(pivots):
             touched = self._touched(t, states, pivots)
@@ -136,10 +135,10 @@ class RungeKuttaSteps(Stepping):
         return outcome
 
     def _touched(self, t, states, pivots):
-        """That the program is singular within a step, or None.
+        """Singular if a pivot touches zero within a step, else None.
 
-        Where the constraints are exact, a pivot that touches zero leaves no residual to be seen by: its least size is
-        looked for within the steps.
+        On minimal coordinates the constraints hold exactly, so that no residual reveals a pivot that touches zero: its
+        least size is searched for within the steps.
         """
         scale = np.where(self.monitor.reference > 0, self.monitor.reference, 1.0)
         sizes = np.abs(pivots) / scale[:, None]
@@ -153,13 +152,3 @@ class RungeKuttaSteps(Stepping):
             if hidden and self.monitor.rank_measure(at, x) < DEGRADED:
                 return Singular(first, at, x, "a pivot touches zero")
         return None
-
-    def _fail(self, t, x, h):
-        self.motion.stop = self.monitor.failed(
-            t,
-            x,
-            "the state is no longer finite",
-            f"{self.method} with steps of {abs(h):.3g} s has no finite state after t = {t:.7g} s.",
-            "Explicit methods are stable for steps below about 2.8 over the largest eigenvalue.",
-            "Take a smaller step, slower poles, or an adaptive method.",
-        )

@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from servoctl.methods.drift import MinimalCoordinates, Project
-from servoctl.methods.minimal import MinimalSolver, Sizes
+from servoctl.methods.choice import MinimalCoordinates, Project
+from servoctl.methods.minimal import Chart, MinimalSolver, Sizes
 from servoctl.methods.monitor import FRACTIONS, DenseStretch, Fine
 from servoctl.methods.motion import Stepping
 
@@ -22,6 +22,8 @@ class ScipySteps(Stepping):
     rtol, atol : float
     progress : callable
     """
+
+    advice = "Use a larger rtol or a method for stiff equations ('Radau'), or check whether the motion escapes."
 
     def __init__(self, model, method, drift, rtol, atol, progress):
         self.tolerances = {"rtol": rtol, "atol": atol}
@@ -43,11 +45,13 @@ class ScipySteps(Stepping):
     def _solver(self, a, x, b):
         import scipy.integrate
 
-        method = getattr(scipy.integrate, self.method)
+        def solver(rates, t, y, jacobian, **options):
+            exact = {"jac": jacobian} if self.slopes is not None else {}
+            return getattr(scipy.integrate, self.method)(rates, t, y, b, **self.tolerances, **exact, **options)
+
         if isinstance(self.drift, MinimalCoordinates):
-            return MinimalSolver(method, self.model, self.sizes, a, x, b, self.tolerances, self.slopes is not None)
-        exact = {} if self.slopes is None else {"jac": self._jacobian}
-        return method(self._rates, a, x, b, **self.tolerances, **exact)
+            return MinimalSolver(solver, Chart(self.model, self.sizes, a, x), a, x)
+        return solver(self._rates, a, x, self._jacobian)
 
     def _piece(self, a, x, b, times):
         self.pending, self.forward = list(times), b >= a
@@ -59,7 +63,8 @@ class ScipySteps(Stepping):
             with np.errstate(all="ignore"):
                 message = solver.step()
             if solver.status == "failed" or not np.all(np.isfinite(solver.y)):
-                self._fail(t, x, message)
+                self._fail(t, x, (message or "the state is no longer finite").rstrip("."))
+                self._keep_last(t, x)
                 break
             steps, dense = steps + 1, solver.dense_output()
             outcome = self.monitor.inspect(self._stretch(t, x, solver, dense))
@@ -71,8 +76,11 @@ class ScipySteps(Stepping):
                 continue
             if outcome.steps:
                 t, x = solver.t, solver.y
+            goes_on = self._follow(outcome)
+            # A step in which a pivot vanishes is sampled with the next pivots: its own lose digits near the zero.
+            if outcome.steps:
                 self._sample(t, dense, x)
-            if not self._follow(outcome):
+            if not goes_on:
                 self._keep_last(t, x)
                 break
             self._count(solver)
@@ -82,14 +90,13 @@ class ScipySteps(Stepping):
         return solver.y
 
     def _stretch(self, t, x, solver, dense):
-        """The last step; it has passed its test of error, and another begins where it ends."""
-        end, ends = (solver.t, solver.y), np.array([t, solver.t])
-        inside = [t + s * (end[0] - t) for s in FRACTIONS]
-        pivots = np.array([*(self._pivots(s, dense(s)) for s in inside), self._pivots(*end)]).T
+        """The last step for the monitor: it has passed its error test, and the next begins where it ends."""
+        inside = [t + s * (solver.t - t) for s in FRACTIONS]
+        pivots = np.array([*(self._pivots(s, dense(s)) for s in inside), self._pivots(solver.t, solver.y)]).T
         self.motion.count(watched=len(inside) + 1)
         return DenseStretch(
-            ends,
-            np.column_stack([x, end[1]]),
+            np.array([t, solver.t]),
+            np.column_stack([x, solver.y]),
             pivots[:, None],
             self._top,
             crosses=True,
@@ -111,24 +118,13 @@ class ScipySteps(Stepping):
             self.motion.counters["integrated"] = len(solver.chart.free)
             self.motion.count(coordinate_changes=solver.changes)
 
-    def _fail(self, t, x, message):
-        self.motion.stop = self.monitor.failed(
-            t,
-            x,
-            "the step of the integrator shrinks to nothing",
-            f"{self.method} stopped at t = {t:.7g} s: {message or 'the state is no longer finite'}.",
-            "A motion is integrated as far as its solution exists.",
-            "Loosen rtol, take a method for stiff equations (Radau), or see whether the motion escapes.",
-        )
-        self._keep_last(t, x)
-
     def _sample(self, t, dense, x):
-        """Record the samples that are pending up to t."""
+        """Record the pending samples up to t, the end of a step with state x; `dense` interpolates within it."""
         times, states = [], []
         while self.pending and (self.pending[0] <= t if self.forward else self.pending[0] >= t):
             s = self.pending.pop(0)
-            y = x if s == t and x is not None else dense(s)
-            if self.restore is not None and (x is None or s != t):
+            y = x if s == t else dense(s)
+            if self.restore is not None and s != t:
                 y = self.restore(s, y, self.p)
             times.append(s)
             states.append(y)

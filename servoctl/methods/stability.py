@@ -1,4 +1,4 @@
-"""How fast a pole may be, and whether steps resolve a motion: stability of integration, and of sampled feedback."""
+"""Stability of integration and of sampled feedback: how fast a pole may be, and whether steps resolve a motion."""
 
 import sys
 import warnings
@@ -8,21 +8,21 @@ from math import comb, factorial, inf, pi
 
 import numpy as np
 
-from servoctl.checks import is_whole
+from servoctl.checks import whole_of
 from servoctl.errors import SpecificationError, unknown
 from servoctl.methods.accuracy import component_sizes, state_levels
-from servoctl.methods.drift import Poles
+from servoctl.methods.choice import ORDERS, Poles
 from servoctl.methods.motion import breakpoints, equal_steps
-from servoctl.methods.runge_kutta import ORDERS, tableau
+from servoctl.methods.runge_kutta import tableau
 
 SAME = {"DOP853": "RK8", "RK45": "RK5"}  # scipy's adaptive methods that go on with the result of these tableaus
 STEP_MAPS = (*ORDERS, *SAME, "RK23", "Taylor", "RadauIIA", "Radau")
 WITH_ORDER = ("Taylor", "RadauIIA")
-BEYOND = 1e-10  # of |R| over 1: roots of |R|² = 1 that only touch 1 are told from those that cross it
-MANY_STEPS = 1e5  # of an adaptive method: each takes a part of a millisecond
-FASTEST, HALVINGS = 4.0, 50  # of p·h: every sampled loop of two or more integrators is unstable there
-POWERS, NUDGE = 6, 1e-6  # of the power iteration for the fastest rate: its length, and relative size of a deviation
-UNRESOLVED = 0.1  # of the state's size: what a step and two half steps differ by where they are too long
+BEYOND = 1e-10  # |R| - 1 that separates roots of |R|² = 1 where |R| crosses 1 from those where it touches 1
+MANY_STEPS = 1e5  # steps of an adaptive method in a span that deserve a warning: each takes part of a millisecond
+FASTEST, HALVINGS = 4.0, 50  # p·h at which every sampled loop of two or more integrators is unstable; bisections
+POWERS, NUDGE = 6, 1e-6  # power iterations for the fastest rate, and the relative size of their deviation
+UNRESOLVED = 0.1  # of the state's size: a larger difference of a step and two half steps means that it is too long
 
 
 @cache
@@ -34,7 +34,7 @@ def stability_function(method, order=None):
     method : str
         One of `STEP_MAPS`.
     order : int, optional
-        Of "Taylor" and "RadauIIA" (odd: 2s - 1 for s stages), which need it; no other method uses it.
+        Required by "Taylor" and "RadauIIA" (2s - 1 for s stages), not used by other methods.
 
     Returns
     -------
@@ -45,9 +45,9 @@ def stability_function(method, order=None):
     Raises
     ------
     NameUnknown
-        For a method without a step map of its own: a multistep method has none.
+        For a method without a step map, such as a multistep method.
     SpecificationError
-        If the order is missing, is none of the method's, or is given where it is not used.
+        If the order is missing, not available, or not used by the method.
     """
     if method not in STEP_MAPS:
         raise unknown(method, STEP_MAPS, "method")
@@ -55,8 +55,9 @@ def stability_function(method, order=None):
     if not (whole if method in WITH_ORDER else order is None):
         raise SpecificationError(
             f"order={order!r} was given with method={method!r}.",
-            "The order belongs to 'Taylor' and, an odd one, to 'RadauIIA'.",
-            do="Give order=12 with 'Taylor', 5 with 'RadauIIA', and none otherwise.",
+            "'Taylor' has any positive order, 'RadauIIA' an odd one; other methods take no order.",
+            method=method,
+            order=order,
         )
     if method in ("Radau", "RadauIIA"):
         stages = 3 if method == "Radau" else (order + 1) // 2
@@ -79,7 +80,7 @@ def _pade(k, m):
 
 
 def amplification(method, z, order=None):
-    """|R(z)|: by how much one step multiplies a mode.
+    """|R(z)|, the factor by which one step multiplies a mode.
 
     Parameters
     ----------
@@ -88,12 +89,12 @@ def amplification(method, z, order=None):
     z : array of complex
         Steps times eigenvalues, hλ.
     order : int, optional
-        Of "Taylor" and "RadauIIA".
+        Order of "Taylor" or "RadauIIA".
 
     Returns
     -------
     array
-        Of the shape of z.
+        Same shape as z.
     """
     above, below = stability_function(method, order)
     with np.errstate(over="ignore", invalid="ignore"):
@@ -109,14 +110,14 @@ def largest_explicit(method, order=None, direction=pi):
     method : str
         One of `STEP_MAPS`.
     order : int, optional
-        Of "Taylor" and "RadauIIA".
+        Order of "Taylor" or "RadauIIA".
     direction : float
         arg λ [rad]; default π, the negative real axis: 2, 2, 2.785, 3.307 for RK1, RK2, RK4, RK5.
 
     Returns
     -------
     float
-        inf for a mode that no step amplifies; 0 for one that every step amplifies.
+        inf if no step amplifies the mode; 0 if every step does.
 
     Notes
     -----
@@ -150,7 +151,7 @@ def sampled_bound(rho, delay=0):
     rho : int
         Number of integrators ρ, at least 1.
     delay : int
-        Samples by which the feedback is late: u_k = -K x_(k-delay).
+        Delay of the feedback in samples: u_k = -K x_(k-delay).
 
     Returns
     -------
@@ -160,7 +161,7 @@ def sampled_bound(rho, delay=0):
     Raises
     ------
     SpecificationError
-        If ρ is not a whole number from 1 to 12, or the delay not one from 0 to 12.
+        If ρ is not a whole number from 1 to 12, or the delay not from 0 to 12.
 
     Notes
     -----
@@ -168,11 +169,8 @@ def sampled_bound(rho, delay=0):
     E_k (Åström, Hagander and Sternby 1984), so that with z = 1 + p h s the characteristic polynomial is
     sᵖ z^delay + Σ_k binom(ρ, k) s^(ρ-k) E_k(z)/k!, of exponent ρ: (s + 1)^ρ for small p h.
     """
-    for name, value, low in (("rho", rho, 1), ("delay", delay, 0)):
-        if not (is_whole(value) and low <= value <= 12):
-            raise SpecificationError(
-                f"{name}={value!r} was given.", f"It is a whole number from {low} to 12.", do=f"Give {low + 1}."
-            )
+    whole_of("rho", rho, range(1, 13))
+    whole_of("delay", delay, range(13))
     steps = FASTEST * 2.0 ** (-np.arange(96)[::-1] / 8)
     unstable = next(p for p in steps if not _sampled_stable(p, rho, delay))
     low, high = unstable / 2 ** (1 / 8), unstable
@@ -196,36 +194,8 @@ def _eulerian(k):
     return [sum((-1) ** j * comb(k + 1, j) * (i + 1 - j) ** k for j in range(i + 1)) for i in range(k)]
 
 
-def row_poles(drift, model):
-    """The poles [1/s] of every row's error dynamics: {row name: (ρ,) array}.
-
-    Parameters
-    ----------
-    drift : Poles
-    model : Model
-    """
-    one = isinstance(drift.values, float)
-    given = {} if one else drift.values
-    return {
-        row: np.full(count, -1 / drift.values) if one else np.atleast_1d(given.get(row, np.zeros(count)))
-        for row, count in model.raised.items()
-    }
-
-
 def warn_fast_poles(method, poles, step):
-    """Warn where fixed steps amplify error dynamics that were meant to decay, with the largest step that does not.
-
-    The warning points to the first caller outside the package.
-
-    Parameters
-    ----------
-    method : str
-        A fixed-step method.
-    poles : dict of str to (ρ,) arrays of complex
-        Of each row [1/s].
-    step : float
-        [s]; negative where time runs backwards.
-    """
+    """Warn if steps [s] of a fixed-step method amplify error dynamics with poles [1/s] by row that should decay."""
     limits = [
         (limit / abs(pole), limit, pole, row)
         for row, values in poles.items()
@@ -234,86 +204,51 @@ def warn_fast_poles(method, poles, step):
         and abs(pole * step) > (limit := largest_explicit(method, None, float(np.angle(pole * step))))
     ]
     if limits:
-        largest, limit, pole, row = min(limits, key=lambda found: found[0])
+        largest, limit, pole, row = min(limits, key=lambda entry: entry[0])
         number = f"{pole.real:g}" if pole.imag == 0 else f"{pole:g}"
         warnings.warn(
             f"Steps of {abs(step):.4g} s by {method} amplify the error dynamics of {row!r}, which the pole {number} "
-            f"1/s was to damp: |λ|h = {abs(pole * step):.4g} exceeds {limit:.4g}. The largest stable step is "
-            f"{largest:.4g} s. Take it, slower poles, or drift='project'.",
+            f"1/s should damp: |λ|h = {abs(pole * step):.4g} exceeds {limit:.4g}. The largest stable step is "
+            f"{largest:.4g} s. Use it, slower poles, or drift='project'.",
             RuntimeWarning,
             stacklevel=_outside(),
         )
 
 
 def warn_many_steps(method, poles, length):
-    """Warn where error dynamics hold the steps of an explicit adaptive method far below the span, with their number.
-
-    Parameters
-    ----------
-    method : str
-        One of `STEP_MAPS`.
-    poles : dict of str to (ρ,) arrays of complex
-        Of each row [1/s].
-    length : float
-        Of the span [s]; negative where time runs backwards.
-    """
+    """Warn if poles [1/s] by row limit the steps of an explicit adaptive method to a tiny part of a span [s]."""
     steps = [
         (abs(pole) / limit, pole, row)
         for row, values in poles.items()
         for pole in values
         if 0 < (limit := largest_explicit(method, None, float(np.angle(pole * length)))) < inf
     ]
-    rate, pole, row = max(steps, key=lambda found: found[0], default=(0.0, 0.0, ""))
+    rate, pole, row = max(steps, key=lambda entry: entry[0], default=(0.0, 0.0, ""))
     count = rate * abs(length)
     if count > MANY_STEPS:
         warnings.warn(
-            f"The pole {pole:g} 1/s of {row!r} holds the steps of {method} below {1 / rate:.2g} s: {count:.1g} steps "
-            "over the span. Take slower poles, drift='project', or 'RadauIIA'.",
+            f"The pole {pole:g} 1/s of {row!r} limits the steps of {method} to {1 / rate:.2g} s: {count:.1g} steps "
+            "over the span. Use slower poles, drift='project', or 'RadauIIA'.",
             RuntimeWarning,
             stacklevel=_outside(),
         )
 
 
-def warn_unresolved(method, step, difference, stable=inf):
-    """Warn that steps do not resolve a motion, with the largest stable step where that is what fails.
-
-    Parameters
-    ----------
-    method : str
-        A fixed-step method.
-    step : (start, end)
-        That was compared with two of half its length [s].
-    difference : float
-        Of the two, relative to the size of the state.
-    stable : float
-        The largest stable step there [s]; NaN where it is not known.
-    """
-    start, length = step[0], abs(step[1] - step[0])
-    bound = f" The largest stable step there is about {stable:.2g} s." if stable < length else ""
-    warnings.warn(
-        f"Steps of {length:.4g} s by {method} do not resolve the motion: at t = {start:.6g} s one step and two of half "
-        f"its length differ by {difference:.2g} of the size of the state.{bound} Take shorter steps, 'RadauIIA' that "
-        "finds its own, or accuracy=1e-6.",
-        RuntimeWarning,
-        stacklevel=_outside(),
-    )
-
-
 def unresolved(pieces, halved):
-    """The last step of a motion, or else that of the fastest change, if two of half its length lead elsewhere.
+    """The last step of a motion, or else the one of the fastest change, if two half steps lead elsewhere.
 
     Parameters
     ----------
     pieces : list of (model, t, states, ...)
         Steps from t[k] to t[k + 1] [s] with states (n_x, N) by one variant of the model.
     halved : callable
-        (model, t, x, h) -> states (n_x, 3) at t, t + h and t + 2 h; fewer where a step fails.
+        (model, t, x, h) -> states (n_x, 3) at t, t + h and t + 2 h; fewer if a step fails.
 
     Returns
     -------
     ((start, end), x, difference, size) or None
-        Of the step [s]; the state (n_x,) at its start; by how much both ends differ, relative to the sizes (n_x,) of
-        the state's entries: (n_x,) array.
+        Start and end of the step [s], the state (n_x,) at its start, the difference of both ends relative to the sizes
+        of the state's entries (n_x,), and these sizes.
     """
     pieces = [(model, t, states) for model, t, states, *_ in pieces if len(t) > 1]
     if not pieces:
@@ -334,40 +269,38 @@ def unresolved(pieces, halved):
 
 
 def run_checked(stepping, t0, x0, t1, t_eval, knots):
-    """The motion by steps of fixed length, which are warned about where they amplify errors or do not resolve it.
-
-    Parameters
-    ----------
-    stepping : RungeKuttaSteps or RadauSteps
-        With a step.
-    t0 : float
-    x0 : (n_x,) array
-    t1 : float
-    t_eval, knots : sequences of float
-        See `Stepping.run`.
-
-    Returns
-    -------
-    Motion
-    """
+    """`stepping.run` for steps of fixed length, with warnings if they amplify errors or do not resolve the motion."""
     explicit = stepping.method in ORDERS
     if explicit and isinstance(stepping.drift, Poles):
         lengths = (equal_steps(a, b, stepping.step)[0] for a, b in pairwise(breakpoints((t0, t1), knots)))
-        warn_fast_poles(stepping.method, row_poles(stepping.drift, stepping.model), max(lengths, key=abs))
+        warn_fast_poles(stepping.method, stepping.drift.by_row(stepping.model), max(lengths, key=abs))
     motion = stepping.run(t0, x0, t1, t_eval, knots)
     if motion.stop is None and not motion.interrupted:
         with np.errstate(all="ignore"):
-            found = unresolved(stepping.taken, stepping.halved)
-            if found is not None:
-                step, x, difference, size = found
-                rate = _fastest_rate(stepping, step[0], x, difference, size) if explicit else 0.0
-                stable = largest_explicit(stepping.method) / rate if explicit else inf
-                warn_unresolved(stepping.method, step, np.abs(difference).max(), stable)
+            step = unresolved(stepping.taken, stepping.halved)
+            if step is not None:
+                _warn_unresolved(stepping, explicit, *step)
     return motion
 
 
+def _warn_unresolved(stepping, explicit, ends, x, difference, size):
+    """Warn about a step that two half steps contradict, with the largest stable step of an explicit method there."""
+    t, length, bound = ends[0], abs(ends[1] - ends[0]), ""
+    if explicit:
+        stable = largest_explicit(stepping.method) / _fastest_rate(stepping, t, x, difference, size)
+        if stable < length:
+            bound = f" The largest stable step there is about {stable:.2g} s."
+    warnings.warn(
+        f"Steps of {length:.4g} s by {stepping.method} do not resolve the motion: at t = {t:.6g} s one step and two of "
+        f"half its length differ by {np.abs(difference).max():.2g} of the size of the state.{bound} Use shorter steps, "
+        "'RadauIIA' with adaptive steps, or accuracy=1e-6.",
+        RuntimeWarning,
+        stacklevel=_outside(),
+    )
+
+
 def _fastest_rate(stepping, t, x, direction, size):
-    """|λ| of the mode that dominates in a direction, by power iteration; NaN where it is not finite."""
+    """|λ| of the mode that dominates in a direction, by power iteration; NaN if it is not finite."""
     rate = np.nan
     for _ in range(POWERS):
         direction = NUDGE * direction / np.abs(direction).max()

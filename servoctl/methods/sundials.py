@@ -13,9 +13,9 @@ import casadi as ca
 import numpy as np
 
 from servoctl.methods.bulk import BulkSteps
-from servoctl.methods.drift import Poles
+from servoctl.methods.choice import Poles
 
-WATCHED = 1000  # intervals of a span at whose ends pivots are looked at, beside the samples
+WATCHED = 1000  # intervals of a span at whose ends pivots are inspected, beside the samples
 MOST_STEPS = 20_000  # between two instants of the grid
 SOLVERS = {"CVODES": "cvodes", "IDAS": "idas"}
 COUNTS = {"steps": "nsteps", "nfev": "nfevals", "nlu": "nlinsetups"}
@@ -41,7 +41,7 @@ def rows_unsolved(equations, poles=False):
 
 @contextlib.contextmanager
 def _interrupts():
-    """A list that is no longer empty once Ctrl-C was pressed, which CasADi turns into a failure of the integrator."""
+    """A list that is not empty after Ctrl-C, which CasADi turns into a failure of the integrator."""
     pressed, before = [], signal.getsignal(signal.SIGINT)
     if threading.current_thread() is not threading.main_thread() or not callable(before):
         yield pressed
@@ -65,8 +65,8 @@ class Sundials:
     ----------
     equations : Equations
     solver : {"CVODES", "IDAS"}
-        CVODES integrates X' = f(t, X); IDAS integrates X' = (V γ' + h, γ'', ..., γ^(s̄)) with L γ^(s̄) + rest = 0 beside
-        it, which no elimination has touched.
+        CVODES integrates X' = f(t, X); IDAS integrates X' = (V γ' + h, γ'', ..., γ^(s̄)) together with
+        L γ^(s̄) + rest = 0, before elimination.
     poles : bool
         Whether rows carry error dynamics.
     """
@@ -76,10 +76,8 @@ class Sundials:
         e = equations
         f = e.ode(poles)
         self.n_x, t = f.numel_in(1), ca.SX.sym("t")
-        p, way = (
-            ca.SX.sym("p", f.numel_in(2)),
-            ca.SX.sym("way", 2),
-        )  # time is way[0] + way[1] t, so that it may run back
+        # SUNDIALS integrates forward: time is way[0] + way[1] t with way[1] = -1 for motions that run backwards
+        p, way = ca.SX.sym("p", f.numel_in(2)), ca.SX.sym("way", 2)
         parts = {"t": t, "x": e.state, "p": ca.vertcat(p, way)}
         if solver == "IDAS":
             z, residual = rows_unsolved(e, poles)
@@ -91,7 +89,7 @@ class Sundials:
             self.parts = parts | {"ode": way[1] * f(way[0] + way[1] * t, e.state, p)[: self.n_x]}
 
     def run(self, t, x0, top, p, rtol, atol):
-        """States at the instants of a grid, as far as the integrator comes.
+        """States at the instants of a grid, up to where the integrator fails.
 
         Parameters
         ----------
@@ -108,7 +106,7 @@ class Sundials:
         x : (n_x, M) array
             States at the first M instants; all N unless the integrator failed.
         counts : dict of str to int
-            Steps, evaluations of f or of the residual, decompositions, as far as the solver tells.
+            Steps, evaluations of f or of the residual, decompositions, as the solver reports them.
         """
         forward = np.sign(t[-1] - t[0])
         grid, p = forward * (t - t[0]), np.concatenate([p, [t[0], forward]])
@@ -117,7 +115,7 @@ class Sundials:
         if self.solver == "idas":  # γ^(s̄) starts without a rate, so that no first step would pass a test of its error
             inputs["z0"], options["suppress_algebraic"] = top, True
         low, high, states, counts = 0, len(t), None, {}
-        count = high  # the integrator returns nothing where it fails: the last good end is sought
+        count = high  # the integrator returns nothing if it fails: bisection finds the last end that it reaches
         while low + 1 < high or states is None:
             x, work = self._to(grid[:count], inputs, options) if count > 1 else (np.array(x0)[:, None], counts)
             if x is None:
@@ -153,7 +151,7 @@ def sundials_solver(model, solver, poles=False):
 
 @dataclass(frozen=True)
 class Grid:
-    """A motion on a grid t (S + 1,): states and rates (n_x, S + 1), cubics between them; whether it failed after it."""
+    """A motion on a grid t (S + 1,): states and rates (n_x, S + 1), cubics in between; `failed` after its end."""
 
     t: np.ndarray
     x: np.ndarray
@@ -191,6 +189,10 @@ class SundialsSteps(BulkSteps):
     progress : callable
     """
 
+    rank_lost = "the integrator finds no further step"
+    failure = f"no step succeeds, or {MOST_STEPS:,} reach no further sample"
+    advice = "Use a larger rtol, more t_eval or 'RadauIIA', or check whether the motion escapes."
+
     def __init__(self, model, method, drift, rtol, atol, span, progress):
         self.resolution, self.rtol, self.atol = abs(span) / WATCHED, rtol, atol
         super().__init__(model, method, drift, progress)
@@ -211,13 +213,3 @@ class SundialsSteps(BulkSteps):
         self.motion.count(**counts)
         t, failed = grid[: states.shape[1]], states.shape[1] < len(grid)
         return Grid(t, states, self.f.grid(t, states, self.p)[: self.n_x], failed)
-
-    def _fail(self, t, x):
-        self.motion.stop = self.monitor.failed(
-            t,
-            x,
-            "the integrator finds no further step",
-            f"{self.method} stopped at t = {t:.7g} s: no step succeeds, or {MOST_STEPS:,} reach no further sample.",
-            "A motion is integrated as far as its solution exists and steps can be solved.",
-            "Loosen rtol, give more t_eval, take 'RadauIIA', or see whether the motion escapes.",
-        )

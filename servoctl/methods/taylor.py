@@ -11,14 +11,12 @@ import casadi as ca
 import numpy as np
 
 from servoctl.codegen.function import compiled
-from servoctl.jets.motion import Motion, shifted
-from servoctl.jets.series import Series, is_zero
+from servoctl.jets.series import Motion, Series, is_zero, shifted
 from servoctl.jets.tape import Tape
-from servoctl.methods.drift import Project
+from servoctl.methods.choice import Project
 from servoctl.methods.monitor import DenseStretch, Fine, Repivot
 from servoctl.methods.motion import Stepping
-from servoctl.reduction.elimination import eliminate
-from servoctl.reduction.ranks import clean
+from servoctl.reduction.ranks import clean, eliminate
 
 LOWEST, HIGHEST = 4, 24  # orders: below, steps are too short; above, compiling grows faster than steps
 
@@ -34,7 +32,7 @@ class _Group:
         self.series = Series(tape, self.inputs, self._decided(tape))
 
     def _decided(self, tape):
-        """Values of what depends on time alone, at the instant by which branches are taken."""
+        """Values of the nodes that depend on time alone, at the instant that selects branches."""
         place = self.motion.q.where
         timed = [place(s) is None or place(s)[0] == "t" for s in self.symbols]
         at = [[self.motion.branch if (place(s) or ("",))[0] == "t" else s] for s in self.symbols]
@@ -42,7 +40,7 @@ class _Group:
         values.advance()
         for node in tape.nodes:
             alone.append(timed[node.data] if node.kind == "input" else all(alone[a] for a in node.args))
-        return {i: values.c[i][0] for i, own in enumerate(alone) if own}
+        return {i: values.c[i][0] for i, of_time in enumerate(alone) if of_time}
 
     def advance(self, k):
         """Coefficient k - order of the rows, from the motion's coefficients up to k."""
@@ -52,13 +50,13 @@ class _Group:
         return [c[-1] for c in self.series.outputs]
 
     def correct(self, k):
-        """The same again after γ_[k] was found."""
+        """Repeat the last coefficient with the solution γ_[k]."""
         j = k - self.order
         self.series.replace_last({i: self.motion.coefficient(s, j) for i, s in enumerate(self.symbols)})
 
 
 class _Motion(Motion):
-    """Coefficients of q and γ found so far."""
+    """Coefficients of q and γ up to an index."""
 
     def __init__(self, equations):
         super().__init__(equations.q)
@@ -78,12 +76,12 @@ class _Motion(Motion):
             self.coordinates[k] = [c if is_zero(c) else c / k for c in self.kinematics.advance(k)]
 
     def guess(self, k):
-        """γ_[k] = 0, and q_[k] as it then is."""
+        """Set γ_[k] = 0, and q_[k] with it."""
         self.gamma[k] = [0.0] * self.q.n
         self._move(k)
 
     def settle(self, k, gamma):
-        """γ_[k] as found, and q_[k] with it."""
+        """Set γ_[k] to the solution, and q_[k] with it."""
         self.gamma[k] = gamma
         if self.q.plain:
             self.coordinates[k] = gamma
@@ -110,8 +108,8 @@ def taylor_coefficients(equations, last):
     Returns
     -------
     casadi.Function
-        Of (t, X, p) with the instant by which paths take their branches appended to p; outputs q_[1], ..., q_[last]
-        (left out where q' = γ'), γ_[1], ..., γ_[last], guards.
+        Arguments t, X, p, where p ends with the instant that selects the branches of paths. Outputs q_[1], ...,
+        q_[last] (left out if q' = γ'), γ_[1], ..., γ_[last], pivots.
     """
     r, q = equations.r, equations.q
     motion = _Motion(equations)
@@ -135,7 +133,7 @@ def taylor_coefficients(equations, last):
             group.correct(k)
     coefficients = [] if q.plain else [ca.SX(c) for k in range(1, last + 1) for c in motion.coordinates[k]]
     coefficients += [ca.SX(c) for k in range(1, last + 1) for c in motion.gamma[k]]
-    outputs = [*coefficients, *(g for _, g in equations.guards)]
+    outputs = [*coefficients, *(g for _, g in equations.pivots)]
     return equations.function("taylor", equations.state, outputs, motion.branch)
 
 
@@ -180,13 +178,15 @@ class TaylorSteps(Stepping):
     drift : None or Project
     rtol, atol : float
     order : int or None
-        Of the method; None chooses it by `order_for`.
+        None chooses it by `order_for`.
     jets : int
         Highest level of the jets in the samples.
     progress : callable
     """
 
     most = 100  # steps per call of the compiled loop
+    rank_lost = "the radius of convergence shrinks to nothing"
+    advice = "Check whether the motion escapes or meets a point where it is not smooth."
 
     def __init__(self, model, drift, rtol, atol, order, jets, progress):
         self.rtol, self.atol = rtol, atol
@@ -211,7 +211,7 @@ class TaylorSteps(Stepping):
         return self._outputs(t, x)[self.n_c :]
 
     def _top(self, t, x):
-        """Zeros for γ^(s̄): it only starts the search for other pivots, and the series would give it at their cost."""
+        """Zeros for γ^(s̄): it only starts the search for other pivots, and its value would cost a series."""
         return np.zeros(self.n)
 
     def _piece(self, a, x, b, times):
@@ -220,22 +220,22 @@ class TaylorSteps(Stepping):
         while a != b and self.motion.stop is None:
             t, states, y = self.f.taylor(a, x, b, self.p, self.rtol, self.atol, self.most, self.every)
             outcome = self.monitor.inspect(self._stretch(t, states, y))
-            fine, stand = isinstance(outcome, Fine), outcome.steps
-            self.motion.count(steps=stand, nfev=stand)
-            times = self._sample(t, states, y, times, t[stand] if fine else outcome.t)
+            fine, steps = isinstance(outcome, Fine), outcome.steps
+            self.motion.count(steps=steps, nfev=steps)
+            times = self._sample(t, states, y, times, t[steps] if fine else outcome.t)
             go_on = isinstance(outcome, Repivot)
-            a, x = (outcome.t, outcome.x) if go_on else (t[stand], states[:, stand].copy())
+            a, x = (outcome.t, outcome.x) if go_on else (t[steps], states[:, steps].copy())
             self.progress(a)
             if not fine:
                 self._follow(outcome)
-            elif stand < self.most and a != b:
-                self._fail(a, x)
+            elif steps < self.most and a != b:
+                self._fail(a, x, "its steps vanish or are not finite")
         if len(times) and self.motion.stop is None:
             self._sample(np.array([a, a]), np.column_stack([x, x]), self._outputs(a, x)[:, None], times, a)
         return x
 
     def _stretch(self, t, states, y):
-        """The steps; between their ends pivots are evaluated only where one may vanish, at the cost of a step each."""
+        """The steps for the monitor; pivots inside them cost a series each, so only suspicious steps evaluate them."""
         ends = np.column_stack([y[self.n_c :, 1:], self._pivots(t[-1], states[:, -1])]) if len(t) > 1 else y[self.n_c :]
         return DenseStretch(
             t,
@@ -259,7 +259,7 @@ class TaylorSteps(Stepping):
         return np.concatenate([q, *(_level(of_gamma, j, h) for j in range(1, top + 1))])
 
     def _sample(self, t, states, y, pending, end):
-        """Record pending samples up to `end`; those that remain."""
+        """Record the pending samples up to `end` and return those that remain."""
         if not y.shape[1]:
             return pending
         direction = 1.0 if t[-1] >= t[0] else -1.0
@@ -274,16 +274,6 @@ class TaylorSteps(Stepping):
             n_x = len(states)
             self.motion.add(self.model, times, parts[:n_x], parts[n_x:])
         return pending[~due]
-
-    def _fail(self, t, x):
-        self.motion.stop = self.monitor.failed(
-            t,
-            x,
-            "the radius of convergence shrinks to nothing",
-            f"The Taylor method stopped at t = {t:.7g} s: its steps vanish or are not finite.",
-            "A step is as long as the series converges.",
-            "See whether the motion escapes or meets a point where it is not smooth.",
-        )
 
 
 def _level(c, j, h):

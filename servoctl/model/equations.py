@@ -1,4 +1,4 @@
-"""The functions of a motion as SX expressions: each is built at its first use."""
+"""The functions of a motion as SX expressions, each built at its first use."""
 
 from functools import cached_property
 
@@ -8,13 +8,12 @@ import numpy as np
 from servoctl.errors import SpecificationError
 from servoctl.model import saddle
 from servoctl.reduction.appell import plant_accelerations
-from servoctl.reduction.elimination import eliminate
-from servoctl.reduction.ranks import clean, column_sizes
+from servoctl.reduction.ranks import clean, column_sizes, eliminate
 from servoctl.spec.coordinates import jet_name
 
 
 class Invariants:
-    """What the state X = (q, γ', ..., γ^(s̄-1)) of a motion satisfies: its rows, and their derivatives, below γ^(s̄).
+    """Invariants of the state X = (q, γ', ..., γ^(s̄-1)): the rows and those of their derivatives without γ^(s̄).
 
     Parameters
     ----------
@@ -23,7 +22,7 @@ class Invariants:
     top : int
         s̄.
     points : Points
-        On the manifold of the rows: there pivots are chosen.
+        Points of the manifold of the rows, at which pivots are chosen.
     """
 
     def __init__(self, mechanism, rows, top, points):
@@ -35,7 +34,7 @@ class Invariants:
 
     @cached_property
     def levels(self):
-        """For each row its total derivatives of orders 0 .. s̄ - o_a."""
+        """For each row its total time derivatives of orders 0 .. s̄ - o_a."""
         return [
             [level[0] for level in self.q.derivatives([row.expression], count)]
             for row, count in zip(self.rows, self.raised, strict=True)
@@ -49,7 +48,7 @@ class Invariants:
 
     @cached_property
     def invariant_rows(self):
-        """(level, name, SX): what the state satisfies, ψ_a^(j) for j < s̄ - o_a and the kinematics' own invariants."""
+        """(level, name, SX) of each invariant: ψ_a^(j) for j < s̄ - o_a, and the invariants of the kinematics."""
         rows = [(0, name, e) for name, e in self.q.invariants.items()]
         for row, level in zip(self.rows, self.levels, strict=True):
             rows += [(row.order + j, _level_name(row.name, j), e) for j, e in enumerate(level[:-1])]
@@ -61,7 +60,7 @@ class Invariants:
         return self.function("invariants", self.state, [values, ca.vec(ca.densify(ca.jacobian(values, self.state)))])
 
     def project(self):
-        """The least change of the state in the metric M (δq = V δγ) that restores the invariants, level by level."""
+        """The change of the state, least in the metric M (δq = V δγ), that restores the invariants level by level."""
         q, mass, changes = self.q, self.mechanism.mass, []
         for level in range(self.top):
             rows = [a for a, row in enumerate(self.rows) if row.order <= level]
@@ -78,7 +77,7 @@ class Invariants:
         return self.function("project", self.state, changes)
 
     def _restore_kinematics(self):
-        """The least change of q that restores the kinematics' own invariants."""
+        """The least change of q that restores the invariants of the kinematics."""
         q = self.q
         if not q.invariants:
             return ca.SX.zeros(q.nq)
@@ -110,7 +109,7 @@ class Equations(Invariants):
 
     @property
     def sparse(self):
-        """Whether γ^(s̄) is taken from the sparse elimination of [M -B; G 0], and not from the rows of (3.18)."""
+        """Whether the sparse elimination of [M -B; G 0] gives γ^(s̄), instead of the rows of (3.18)."""
         return self.q.n > saddle.FEW and saddle.applies(self.r)
 
     @cached_property
@@ -119,7 +118,7 @@ class Equations(Invariants):
         return saddle.solve(self)
 
     def rest(self, rows, poles=False):
-        """What is left of some rows, raised to order s̄, without γ^(s̄); with their error dynamics if `poles`."""
+        """Some rows raised to order s̄, at γ^(s̄) = 0; with their error dynamics if `poles`."""
         top, zero = self.q.jet(self.top), ca.SX.zeros(self.q.n)
         rests = []
         for a in rows:
@@ -135,27 +134,27 @@ class Equations(Invariants):
         return self._solve(-ca.vertcat(*self.rest(range(len(self.levels)), poles)))[0]
 
     @cached_property
-    def guards(self):
-        """Pivots that a motion must not let vanish: a list of (name, SX)."""
-        pivots = self.saddle[2] if self.sparse else self._solve(ca.SX(self.q.n, 0))[1]
-        named = [*self.r.guards, *((f"leading matrix {i + 1}", p) for i, p in enumerate(pivots))]
-        return [(name, g) for name, g in named if any(self.q.where(s) is not None for s in ca.symvar(g))]
+    def pivots(self):
+        """Pivots that depend on the motion, which must not vanish: a list of (name, SX)."""
+        leading = self.saddle[2] if self.sparse else self._solve(ca.SX(self.q.n, 0))[1]
+        named = [*self.r.pivots, *((f"leading matrix {i + 1}", p) for i, p in enumerate(leading))]
+        return [(name, p) for name, p in named if any(self.q.where(s) is not None for s in ca.symvar(p))]
 
     @property
-    def guard_sizes(self):
-        """Largest size of each pivot at the points where they were chosen, (n_g,) array."""
-        values, _ = self.r.points.evaluate([g for _, g in self.guards])
+    def pivot_sizes(self):
+        """Largest size of each pivot at the points where the pivots were chosen, (n_g,) array."""
+        values, _ = self.r.points.evaluate([p for _, p in self.pivots])
         return np.abs(values).max(axis=1, initial=0.0).astype(float)
 
     @property
     def column_sizes(self):
-        """Column sizes (see `ranks.column_sizes`) of L and of Bᵀ where ranks were decided: two (n,) arrays."""
+        """Column sizes (n,) (see `ranks.column_sizes`) of L and of Bᵀ at the points where ranks were decided."""
         matrices = (self.r.points.matrix(m)[0] for m in (self.r.leading, self.r.realisation.B.T))
         return [column_sizes(m).max(axis=1, initial=0.0).astype(float) for m in matrices]
 
     @property
     def jet_sizes(self):
-        """Sizes of the jets by name: those that pivots were chosen with, else the largest at the points, at most 1."""
+        """Sizes of the jets by name: those given for the choice of pivots, else the largest at the points up to 1."""
         names = [name for k in range(self.top + 1) for name in self.q.jet_names(k)]
         largest = np.vstack([self.r.points.jet(k) for k in range(self.top + 1)])
         sizes = np.abs(largest).max(axis=1, initial=0.0).clip(max=1.0).astype(float)
@@ -167,14 +166,14 @@ class Equations(Invariants):
         return ca.vertcat(moving, *(s for k in range(2, self.top) for s in self.q.gamma(k)), top)
 
     def ode(self, poles=False):
-        """Outputs (X', guards): L γ^(s̄) = -(rest), or with the error dynamics Π(D - λ)ψ = 0 in place of D^ρψ = 0."""
+        """Outputs (X', pivots): D^ρψ = 0 for each row, or its error dynamics Π(D - λ)ψ = 0 if `poles`."""
         if self.sparse:
             solution = saddle.solve(self, poles)[0] if poles else self.saddle[0]
         else:
             solution = self.dense(poles)
         extra = ca.vertcat(*(c for row in self.coefficients for c in row)) if poles else None
         name = "ode_poles" if poles else "ode"
-        return self.function(name, self.state, [self.rates(solution), *(g for _, g in self.guards)], extra)
+        return self.function(name, self.state, [self.rates(solution), *(p for _, p in self.pivots)], extra)
 
     def ode_jacobian(self, poles=False):
         """∂X'/∂X, column by column, with the inputs of `ode`."""
@@ -188,10 +187,7 @@ class Equations(Invariants):
         )
 
     def path(self):
-        """For flat programs: a Newton step for q, then q', γ', γ'' and the guards, as functions of (t, q).
-
-        Outputs are (δq, q', γ', γ'', guards).
-        """
+        """For flat programs: outputs (δq, q', γ', γ'', pivots) as functions of (t, q), δq a Newton step."""
         q, n = self.q, self.q.n
         zero = ca.SX.zeros(n)
         w, dw = q.jet(1), q.jet(2)
@@ -201,8 +197,8 @@ class Equations(Invariants):
         acceleration, _ = self._solve(-ca.substitute(second, dw, zero))
         acceleration = ca.substitute(acceleration, w, velocity)
         rates = q.V @ velocity + q.h
-        guards = [ca.substitute(g, ca.vertcat(w, dw), ca.vertcat(velocity, acceleration)) for _, g in self.guards]
-        return self.function("path", q.jet(0), [self._newton(), rates, velocity, acceleration, *guards])
+        pivots = [ca.substitute(p, ca.vertcat(w, dw), ca.vertcat(velocity, acceleration)) for _, p in self.pivots]
+        return self.function("path", q.jet(0), [self._newton(), rates, velocity, acceleration, *pivots])
 
     def _newton(self):
         q = self.q
@@ -211,10 +207,13 @@ class Equations(Invariants):
             return q.V @ self._solve(-residual)[0]
         if len(q.invariants) != q.nq - q.n:
             raise SpecificationError(
-                f"{q.nq} coordinates are moved by {q.n} quasi-velocities, with {len(q.invariants)} invariants.",
+                f"{q.nq} coordinates have {q.n} quasi-velocities and {len(q.invariants)} invariants.",
                 f"A flat program is solved for all coordinates, which takes {q.nq - q.n} invariants of the kinematics.",
-                nearest='with_quasi_velocities(..., invariants={"unit": ca.dot(e, e) - 1}).',
-                do="Name them, or choose an integrating method.",
+                do='Pass them, such as with_quasi_velocities(..., invariants={"unit": ca.dot(e, e) - 1}), '
+                "or choose an integrating method.",
+                coordinates=q.nq,
+                velocities=q.n,
+                invariants=tuple(q.invariants),
             )
         residual = ca.vertcat(residual, *q.invariants.values())
         matrix = ca.jacobian(residual, q.jet(0))
@@ -222,18 +221,18 @@ class Equations(Invariants):
         return eliminate(matrix, -residual, clean(values, sizes))[0]
 
     def matrices(self):
-        """L and Bᵀ, column by column, and which rows they have: what must keep its rank."""
+        """L and Bᵀ, column by column: their ranks must not change."""
         L, B = self.r.leading, self.r.realisation.B.T
         return self.function("matrices", self.state, [ca.vec(ca.densify(L)), ca.vec(ca.densify(B))])
 
     def plant(self):
-        """(q', γ'') of the full mechanism as a function of (t, [q; γ'; inputs]), the inputs those of the program."""
+        """(q', γ'') of the full mechanism as a function of (t, [q; γ'; inputs of the program])."""
         r, q = self.r, self.q
         mechanism, acceleration = r.mechanism, q.jet(2)
         zero = ca.SX.zeros(q.n)
         inputs = ca.SX.sym("input", r.actuation.shape[0])
         driven = mechanism.E @ inputs if r.program.by == "actuators" else inputs
-        material = [row for row in r.given.values() if row.kind == "material"]
+        material = [row for row in r.original.values() if row.kind == "material"]
         second = [q.derivatives([row.expression], 2 - row.order)[-1][0] for row in material]
         second = ca.substitute(ca.vertcat(*second), acceleration, zero) if material else ca.SX(0, 1)
         force = driven - ca.substitute(mechanism.balance, acceleration, zero)
@@ -245,7 +244,7 @@ class Equations(Invariants):
         """Matrix and right side, column by column, of [M -B; C 0] [γ''; μ]: the form with multipliers."""
         r, q = self.r, self.q
         acceleration, zero = q.jet(2), ca.SX.zeros(q.n)
-        rows = [row for row in r.given.values() if row.order <= 1 or (row.order == 2 and row.affine)]
+        rows = [row for row in r.original.values() if row.order <= 1 or (row.order == 2 and row.affine)]
         second = ca.vertcat(*(q.derivatives([row.expression], 2 - row.order)[-1][0] for row in rows))
         B = r.realisation.B
         C = ca.jacobian(second, acceleration) if rows else ca.SX(0, q.n)
@@ -254,20 +253,9 @@ class Equations(Invariants):
         return self.function("multiplier_form", self.jets, [right, ca.vec(ca.densify(matrix))])
 
     def signals(self, kind, rate=0):
-        """A group of named signals, or their `rate`-th derivatives in time, as a function of (t, Z, p).
+        """Names of a group of `SIGNALS`, and their `rate`-th time derivatives as a function of (t, Z, p).
 
-        A derivative is a function of the jets up to the highest that it holds, which may lie above s̄.
-
-        Parameters
-        ----------
-        kind : str
-            One of `SIGNALS`.
-        rate : int
-
-        Returns
-        -------
-        names : list of str
-        function : casadi.Function
+        The jets Z of a derivative extend beyond s̄ as far as it depends on them.
         """
         names, expressions = SIGNALS[kind](self)
         if not rate:
@@ -289,7 +277,7 @@ class Equations(Invariants):
     def _multipliers(self):
         names = [*self.r.program.residuals, *self.r.mechanism.constraints]
         multipliers = self.r.multipliers
-        if self.r.program.by == "actuators":  # then those of the program are the actuation
+        if self.r.program.by == "actuators":  # the multipliers of the program are then the actuation
             names, multipliers = [*self.r.mechanism.constraints], multipliers[len(self.r.program.residuals) :]
         return [f"multiplier_{name}" for name in names], [multipliers]
 
@@ -300,7 +288,7 @@ class Equations(Invariants):
         return ["energy"], [self.r.mechanism.energy]
 
     def _inputs(self):
-        """What drives the plant: the actuation, or an ideal program's reaction."""
+        """Inputs of the plant: the actuation, or the reaction of an ideal program."""
         return ["inputs"], [self.r.actuation]
 
     def _all_multipliers(self):
@@ -308,7 +296,7 @@ class Equations(Invariants):
         return ["all_multipliers"], [self.r.multipliers]
 
     def _power(self):
-        """dE/dt, the power of forces without a potential, the size of its terms, what dE/dt owes to explicit time."""
+        """dE/dt, the power of forces without a potential, the size of its terms, the part of dE/dt by explicit time."""
         r, q = self.r, self.q
         w = q.jet(1)
         rate = q.dt(r.mechanism.energy)
@@ -317,7 +305,7 @@ class Equations(Invariants):
         return ["rate", "work", "size", "law"], [rate, ca.dot(w, force), ca.dot(ca.fabs(w), ca.fabs(force)), law]
 
     def _reach(self):
-        """An ideal program's reaction and the directions that actuators and material constraints have."""
+        """The reaction of an ideal program, and the directions of actuators and material constraints."""
         k = len(self.r.program.residuals)
         directions = ca.horzcat(self.r.mechanism.E, self.r.realisation.B[:, k:])
         return ["reach"], [self.r.actuation, ca.vec(ca.densify(directions))]
@@ -331,19 +319,17 @@ class Equations(Invariants):
         return names, [*self.q.d(1), *self.q.d(2)]
 
     def _residuals(self):
-        """Given residuals, material constraints and hidden rows at every level that the jets reach."""
+        """Given residuals, material constraints and hidden rows, at every level up to order s̄."""
         names, expressions = [], []
         for name, row in residual_rows(self.r).items():
             levels = self.q.derivatives([row.expression], max(0, self.top - row.order))
             names += [(name, j) for j in range(len(levels))]
             expressions += [level[0] for level in levels]
-        for name, expression in self.q.invariants.items():
-            names.append((name, 0))
-            expressions.append(expression)
-        return names, expressions
+        invariants = self.q.invariants
+        return [*names, *((name, 0) for name in invariants)], [*expressions, *invariants.values()]
 
 
-EQUATIONS = {  # what `compiled` makes of each: the function, its loops, its projection
+EQUATIONS = {  # arguments of `compiled`: the function, its loops, its projection
     "ode": lambda e: (e.ode(), ("rk",)),
     "ode_projected": lambda e: (e.ode(), ("rk",), e.project()),
     "ode_poles": lambda e: (e.ode(poles=True), ("rk",)),
@@ -381,7 +367,7 @@ def _level_name(name, j):
 def residual_rows(reduction):
     """Rows whose residuals a run reports, by name."""
     hidden = {f"hidden: {row.name}": row for row in reduction.rows if row.story}
-    return {**reduction.given, **hidden}
+    return {**reduction.original, **hidden}
 
 
 def leading_names(reduction):
@@ -396,7 +382,7 @@ def leading_names(reduction):
 def gradient_jets(reduction, name):
     """Names of the jets on which the leading gradient of a row depends."""
     q = reduction.mechanism.q
-    for row in (*reduction.rows, *reduction.given.values()):
+    for row in (*reduction.rows, *reduction.original.values()):
         if row.name == name:
             places = [q.where(s) for s in ca.symvar(row.gradient(q))]
             return [q.jet_names(level)[i] for kind, level, i in filter(None, places) if kind != "t"]

@@ -22,15 +22,15 @@ from servoctl.spec.program import Program
 
 
 def derive(mechanism: Mechanism, program: Program, guess: Mapping[str, float] | None = None) -> "Model":
-    """Derive reduced dynamics and required actuation from a mechanism and its program (3.18).
+    """Derive the reduced dynamics and the required actuation of a mechanism under its program (3.18).
 
     Parameters
     ----------
     mechanism : Mechanism
     program : Program
     guess : dict of str to float, optional
-        Values of coordinates or derivatives near the motion; points of the constraint manifold, at which ranks
-        are decided, are looked for about them. Seldom needed.
+        Values of coordinates or derivatives near the motion. Ranks are decided at points of the constraint manifold
+        near these values. Seldom needed.
 
     Returns
     -------
@@ -52,7 +52,7 @@ def derive(mechanism: Mechanism, program: Program, guess: Mapping[str, float] | 
 
 
 def _derived(*specification):
-    """The model of what `reduce` takes; what another process has reduced is read from disk."""
+    """The model of the arguments of `reduce`; its reduction is read from disk if another process has written it."""
     store = Store(*specification)
     return Model(store.reduction(reduce), store)
 
@@ -60,8 +60,8 @@ def _derived(*specification):
 class Model:
     """Reduced dynamics and required actuation of a program; made by `derive`.
 
-    Functions are derived, or read from disk, and compiled at their first use. A model is a value: it is equal to
-    another of the same specification and numbers, and pickles with these; its functions are built again.
+    Functions are derived, or read from disk, at their first use. A model is a value: models of the same specification
+    and numbers are equal. It pickles with both; the copy derives its functions again.
 
     Attributes
     ----------
@@ -82,8 +82,9 @@ class Model:
         self._knots = reduction.knots if knots is None else knots
         self.state_names = tuple(name for k in range(reduction.top) for name in q.jet_names(k))
         self.jet_names = (*self.state_names, *q.jet_names(reduction.top))
-        self._functions = {} if functions is None else functions  # shared by models that differ in numbers alone
-        self._knots_within = {}  # span: knots
+        # Models that differ only in numbers share their functions.
+        self._functions = {} if functions is None else functions
+        self._knots_within = {}  # by time span
 
     def __eq__(self, other):
         if not isinstance(other, Model):
@@ -99,7 +100,7 @@ class Model:
         return _unpickled, (mechanism, pack(self.reduction), choices, self.parameters, self._knots)
 
     def names_to(self, size):
-        """Names of the first `size` jets, which may be more than those up to γ^(s̄)."""
+        """Names of the first `size` jets, beyond γ^(s̄) if necessary."""
         q, names, k = self.reduction.mechanism.q, list(self.jet_names), self.reduction.top
         while len(names) < size:
             k += 1
@@ -107,9 +108,9 @@ class Model:
         return tuple(names[:size])
 
     def with_parameters(self, **changes: float) -> "Model":
-        """The same model with other numbers.
+        """The same model with other parameters.
 
-        Nothing is derived or compiled again, unless what was zero or of low rank at the old numbers no longer is.
+        It shares all functions, unless a decision about a zero or a rank is another one with the new numbers.
 
         Parameters
         ----------
@@ -125,7 +126,7 @@ class Model:
         NameUnknown
             For a name that is no parameter.
         SpecificationError
-            For a value that is no finite number, a path that is not smooth enough with it, or a negative mass.
+            For a value that is not finite, makes a mass negative, or makes a path less smooth than required.
         """
         r = self.reduction
         current = dict(zip(r.mechanism.parameters.names, self.parameters.tolist(), strict=True))
@@ -140,7 +141,7 @@ class Model:
         return Model(r, self._store, values, require_smooth(r.switches, values, r.smoothness), self._functions)
 
     def near(self, t, jets, sizes=()):
-        """The same motion with pivots chosen for a state; decisions are made again from the specification.
+        """The model of the same specification, derived with pivots chosen at an instant of the motion.
 
         Parameters
         ----------
@@ -148,22 +149,25 @@ class Model:
             [s]
         jets : (n_z,) array
         sizes : dict of str to float, optional
-            What a jet near zero is small against; default: its size where ranks were decided, at most 1.
+            Sizes relative to which jets are near zero; default: their sizes where ranks were decided, at most 1.
 
         Returns
         -------
         Model
         """
         guess = dict(zip(self.jet_names, map(float, jets), strict=True))
-        usual = self.once("jet sizes", lambda: self.equations.jet_sizes)
+        default = self.once("jet sizes", lambda: self.equations.jet_sizes)
         self._store.require_unchanged()
-        r, place = self.reduction, (float(t), guess, usual | dict(sizes))
+        r, place = self.reduction, (float(t), guess, default | dict(sizes))
         near = _derived(r.mechanism, r.program, None, place, self.parameters)
         if near.free != self.free:
             raise SpecificationError(
                 f"Near t = {t:.6g} s the program has {near.free} free initial values, elsewhere {self.free}.",
-                "A motion keeps its number of free initial values.",
-                do="Treat the two regimes as two models.",
+                "The number of free initial values is the same along a motion.",
+                do="Derive two models, one for each regime.",
+                t=float(t),
+                free=near.free,
+                expected=self.free,
             )
         return Model(near.reduction, near._store, self.parameters, self._knots)
 
@@ -174,7 +178,7 @@ class Model:
 
     @property
     def flat(self):
-        """Whether the program determines the motion completely: nothing is left to integrate."""
+        """Whether the program determines the motion completely, without internal dynamics."""
         return self.free == 0
 
     @property
@@ -199,7 +203,7 @@ class Model:
 
     @property
     def ideal(self):
-        """Whether an ideal reaction realises the program, and not the actuators."""
+        """Whether an ideal reaction realises the program, instead of the actuators."""
         return self.reduction.program.by == "ideal"
 
     @property
@@ -218,18 +222,14 @@ class Model:
         return self._knots.times
 
     def require_smooth(self, span):
-        """Refuse a path that is not smooth enough within a time span, and return its knots there.
-
-        Raises
-        ------
-        SpecificationError
-        """
+        """Knots of the paths within a time span; SpecificationError if a path is not smooth enough there."""
         r = self.reduction
         if r.timed and span not in self._knots_within:
 
             def build():
                 return require_smooth(r.switches, self.parameters, r.smoothness, span).times
 
+            # The entries of the store belong to the numbers of the specification.
             stored = np.array_equal(self.parameters, r.context.values)
             self._knots_within[span] = self._store.recall(f"knots {span}", build) if stored else build()
         return self._knots_within.get(span, ())
@@ -242,19 +242,17 @@ class Model:
     @cached_property
     def equations(self):
         """The model's equations as expressions."""
-        shared = self._functions
-        if "equations" not in shared:
-            shared["equations"] = Equations(self.reduction)
-        return shared["equations"]
+        if "equations" not in self._functions:
+            self._functions["equations"] = Equations(self.reduction)
+        return self._functions["equations"]
 
     def once(self, name, build):
-        """What was built under a name, by this process or another.
+        """The value of `build()`, which is called once for a name by all processes that share a cache.
 
         Parameters
         ----------
         name : str
         build : callable
-            Without arguments; called where there is nothing under the name yet.
         """
         if name not in self._functions:
             self._functions[name] = self._store.recall(name, build)
@@ -283,12 +281,12 @@ class Model:
         return self.once(name, build)
 
     def signals(self, kind, rate=0):
-        """Names of a group of signals and the compiled function (t, Z, p) of them, or of their `rate`-th derivatives.
+        """Names of a group of signals, and the compiled function (t, Z, p) of their `rate`-th time derivatives.
 
         Parameters
         ----------
         kind : str
-            One of `SIGNALS`.
+            A key of `SIGNALS`.
         rate : int
         """
         if kind not in SIGNALS:
@@ -302,7 +300,7 @@ class Model:
 
     @cached_property
     def signal_groups(self):
-        """Names of all signals beside the jets, each with the group that computes it."""
+        """The group of each signal that is no jet, {signal name: key of `SIGNALS`}."""
         mechanism, program = self.reduction.mechanism, self.reduction.program
         names = mechanism.q.names if mechanism.q.plain else mechanism.q.velocity_names
         groups = dict.fromkeys(mechanism.outputs, "outputs") | {"energy": "energy"}
@@ -313,9 +311,8 @@ class Model:
             groups |= dict.fromkeys((f"multiplier_{name}" for name in program.residuals), "multipliers")
         groups |= dict.fromkeys((f"multiplier_{name}" for name in mechanism.constraints), "multipliers")
         if not mechanism.q.plain:
-            groups |= dict.fromkeys(
-                (f"{d}{name}" for d in ("d", "d2") for name in mechanism.q.names), "coordinate_rates"
-            )
+            rates = (f"{d}{name}" for d in ("d", "d2") for name in mechanism.q.names)
+            groups |= dict.fromkeys(rates, "coordinate_rates")
         return groups
 
     def invariant_names(self):
@@ -323,7 +320,7 @@ class Model:
         return self.once("invariant names", lambda: [(level, name) for level, name, _ in self.equations.invariant_rows])
 
     def multiplier_form(self, t, jets):
-        """[M -B; C 0] and right sides of the form with multipliers.
+        """Matrices [M -B; C 0] and right sides of the equations with multipliers.
 
         Parameters
         ----------
@@ -342,21 +339,21 @@ class Model:
         return y[rows:].reshape(columns, rows, -1).swapaxes(0, 1), y[:rows]
 
     @cached_property
-    def guard_sizes(self):
-        """Largest size of each pivot at the points where they were chosen, (n_g,) array."""
-        return self.once("guard sizes", lambda: self.equations.guard_sizes)
+    def pivot_sizes(self):
+        """Largest size of each pivot at the points where the pivots were chosen, (n_g,) array."""
+        return self.once("pivot sizes", lambda: self.equations.pivot_sizes)
 
     @cached_property
     def column_sizes(self):
-        """Column sizes (see `ranks.column_sizes`) of L and of Bᵀ where ranks were decided: two (n,) arrays."""
+        """Column sizes (n,) (see `ranks.column_sizes`) of L and of Bᵀ at the points where ranks were decided."""
         return self.once("column sizes", lambda: self.equations.column_sizes)
 
     def row_stories(self):
-        """What was done to each row, by name; empty for the designer's own rows."""
+        """How each row was derived, by name; "" for rows of the specification."""
         return {row.name: row.story for row in self.reduction.rows}
 
     def leading_names(self):
-        """Names of the rows of the two matrices whose ranks carry the motion."""
+        """Names of the rows of L and of Bᵀ, whose ranks must not change."""
         return leading_names(self.reduction)
 
     def gradient_jets(self, row):
@@ -364,22 +361,22 @@ class Model:
         return gradient_jets(self.reduction, row)
 
     def operations(self):
-        """Operations of each function that has been built so far, by name."""
+        """Number of operations of each function built so far, by name."""
         signals = {value[1].name: value[1] for value in self._functions.values() if isinstance(value, tuple)}
         return {name: f.operations for name, f in (self._functions | signals).items() if hasattr(f, "operations")}
 
     def start(self, /, t: float = 0.0, guess: Mapping[str, float] | None = None, **held: float) -> State:
-        """A consistent state: held values fixed, the rest solved from every invariant at every level.
+        """Consistent initial values: those passed are fixed, the others follow from the constraints and their rates.
 
         Parameters
         ----------
         t : float
             Time of the start [s].
         guess : dict of str to float, optional
-            Where free values come from, and where the solution is looked for; other values are as near zero as the
-            invariants allow.
+            Approximate values: free ones start there if that is consistent. Values without a guess are as near to zero
+            as the invariants allow.
         **held : float
-            Values of coordinates and derivatives that the start has exactly.
+            Exact values of coordinates and derivatives.
 
         Returns
         -------
@@ -390,7 +387,7 @@ class Model:
         NameUnknown
             For a name that is no state.
         InconsistentStart
-            If a held value contradicts an invariant, or no consistent state is found.
+            If a held value contradicts an invariant, or the search for a consistent state fails.
         """
         return consistent(self, finite("t", t, "time"), held, guess)
 

@@ -1,20 +1,10 @@
-"""What was done to a specification, in at most twelve lines."""
+"""The printed form of a model."""
 
 WIDTH = 118
 
 
 def describe(model):
-    """The report that `print(model)` shows.
-
-    Parameters
-    ----------
-    model : Model
-
-    Returns
-    -------
-    str
-        At most twelve lines.
-    """
+    """What `print(model)` shows: how the specification was reduced, in at most twelve lines."""
     r = model.reduction
     lines = [
         f"Model: {' '.join(r.mechanism.q.names)}; program {', '.join(r.program.residuals)} by {_by(r)}",
@@ -23,9 +13,9 @@ def describe(model):
         f"  {_rule(r)}",
     ]
     if any(not row.affine for row in r.rows):
-        bent = ", ".join(row.name for row in r.rows if not row.affine)
-        lines.append(f"  {bent}: not linear in the highest derivative, differentiated once more")
-    lines.append(f"  margins: smallest pivot kept {r.rank.kept:.1e}, largest dropped {r.rank.dropped:.1e}")
+        nonlinear = ", ".join(row.name for row in r.rows if not row.affine)
+        lines.append(f"  {nonlinear}: not linear in the highest derivative, differentiated once more")
+    lines.append(f"  rank margins: smallest pivot {r.rank.kept:.1e}, largest dropped {r.rank.dropped:.1e}")
     if model.knots:
         lines.append(f"  paths switch at t = {', '.join(f'{k:g}' for k in model.knots[:8])} s")
     return "\n".join(line if len(line) <= WIDTH else line[: WIDTH - 3] + "..." for line in lines)
@@ -36,9 +26,9 @@ def _by(r):
 
 
 def _raised(r):
-    """How often the residuals are differentiated until the accelerations appear: 'X, Z differentiated 2x each'."""
+    """'X, Z (order 0) differentiated 2x each': until the accelerations appear."""
     groups = {}
-    for name, row in r.given.items():
+    for name, row in r.original.items():
         groups.setdefault((max(0, r.top - row.order), row.order), []).append(name)
     parts = []
     for (count, order), names in groups.items():
@@ -48,7 +38,7 @@ def _raised(r):
 
 
 def _hidden_and_free(model):
-    """Hidden constraints and free initial values, on one line where there is room."""
+    """Hidden constraints and free initial values, on one line if there is room."""
     r = model.reduction
     free = f"{model.free} free initial value{'s' * (model.free != 1)}"
     free += " (flat: nothing is integrated)" if model.flat else ""
@@ -65,8 +55,7 @@ def _rule(r):
     dependent = ", ".join(names[i] for i in r.realisation.dependent) or "none"
     if r.program.by == "actuators":
         return f"(3.18) with T from ker Eᵀ; dependent: {dependent}; no rule for the reaction is assumed"
-    bent = any(
-        row.order >= 2 or (row.order == 1 and not row.affine) for row in r.given.values() if row.kind == "program"
-    )
-    rule = "the generalised Chetaev rule, a postulate at this order" if bent else "d'Alembert's principle"
+    program = [row for row in r.original.values() if row.kind == "program"]
+    classical = all(row.order == 0 or (row.order == 1 and row.affine) for row in program)
+    rule = "d'Alembert's principle" if classical else "the generalised Chetaev rule, a postulate at this order"
     return f"(3.18) with T from ker G; dependent: {dependent}; under {rule}"

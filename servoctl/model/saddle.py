@@ -1,51 +1,28 @@
 """Accelerations and multipliers together: one sparse elimination of the balance and the constraints.
 
-The balance M γ'' + c = B μ and the constraints G γ'' + d = 0 form the matrix [M -B; G 0]. Eliminated by T first it is
-(3.18); pivots chosen by Markowitz counts over all of it keep the sparsity of many bodies, and the operations grow with
-their number. No multiplier is introduced numerically: γ'' is an expression of the state either way.
+The balance M γ'' + c = B μ and the constraints G γ'' + d = 0 have the matrix [M -B; G 0]. Elimination by T first gives
+(3.18); pivots chosen by Markowitz counts over the whole matrix preserve the sparsity of many bodies, and the number of
+operations grows with the number of bodies. Either way γ'' is an expression of the state, without numerical multipliers.
 """
 
 import casadi as ca
 
 from servoctl.codegen.emit import operations
 from servoctl.errors import SpecificationError
-from servoctl.reduction.elimination import eliminate
-from servoctl.reduction.ranks import clean
+from servoctl.reduction.ranks import clean, eliminate
 
-FEW = 8  # quasi-velocities: up to here (3.18) takes about as few operations
-CLOSE = 1.1  # times as many operations: up to here merging of common terms decides which are fewer
+FEW = 8  # quasi-velocities: up to this number (3.18) takes about as few operations
+CLOSE = 1.1  # ratio of operations up to which the forms are compared after common terms are merged
 
 
 def applies(reduction):
-    """Whether γ'' follows from the balance and the constraints as they are: s̄ = 2, no row of (3.18) differentiated.
-
-    Parameters
-    ----------
-    reduction : Reduction
-
-    Returns
-    -------
-    bool
-    """
+    """Whether the balance and the constraints determine γ'': s̄ = 2, and no row of (3.18) is differentiated."""
     dynamics = [row for row in reduction.rows if row.kind == "dynamics"]
     return reduction.top == 2 and all(row.order == 2 and not row.story for row in dynamics)
 
 
 def solve(equations, poles=False):
-    """γ'', the multipliers μ, and the pivots divided by.
-
-    Parameters
-    ----------
-    equations : Equations
-    poles : bool
-        With the error dynamics of the constraints.
-
-    Returns
-    -------
-    accelerations : (n,) SX
-    multipliers : (b,) SX
-    pivots : list of SX scalars
-    """
+    """γ'' (n,), the multipliers μ (b,) and the list of pivots; `poles` adds the constraints' error dynamics."""
     r, q = equations.r, equations.q
     constraints = [a for a, row in enumerate(r.rows) if row.kind != "dynamics"]
     B, size = r.realisation.B, len(constraints)
@@ -64,15 +41,17 @@ def accelerations(equations):
     Raises
     ------
     SpecificationError
-        If the motion needs the balance differentiated, or has an order above 2.
+        If the motion needs a derivative of the balance, or its order is above 2.
     """
     r, q = equations.r, equations.q
     if not applies(r):
         raise SpecificationError(
             f"The motion has order {r.top} and {len(r.hidden)} hidden constraints.",
-            "Accelerations and multipliers follow from a state (q, γ') where the program needs no derivative of the "
+            "A state (q, γ') determines accelerations and multipliers if the program needs no derivative of the "
             "balance and its residuals have orders up to 2.",
-            do="Simulate it; a run has both.",
+            do="Simulate the motion: its run has both.",
+            order=r.top,
+            hidden=[row.name for row in r.hidden],
         )
     sparse = ca.vertcat(*equations.saddle[:2])
     if equations.sparse:
@@ -87,5 +66,5 @@ def accelerations(equations):
 
 
 def _instructions(column):
-    """Operations of a column whose common terms are not yet merged."""
+    """Operations before common terms are merged."""
     return ca.Function("column", [], [column], {"allow_free": True}).n_instructions()

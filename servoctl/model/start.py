@@ -1,4 +1,4 @@
-"""Consistent starts: every invariant at every level, held values exact, the rest as near its guess as possible."""
+"""Consistent starts: held values exact, every invariant satisfied, the rest as near its guess as possible."""
 
 from dataclasses import dataclass, replace
 
@@ -8,14 +8,14 @@ from servoctl.checks import finite, mapping
 from servoctl.errors import InconsistentStart, ServoError, unknown
 from servoctl.values import Value
 
-TOLERANCE = 1e-10  # of a residual relative to its gradient times the state; Newton reaches rounding
-GUESSED = 1e3  # weight of a guessed value against one that is merely to stay near zero
-TRIES = 6  # starts of the iteration, the first at the reference
-FARTHER = 0.1  # of the state's size: how much farther from the reference each further start lies
-SEED = 1788  # of these starts
-REACHED = 1e-16  # a scaled residual below this is not improved
-REPEATED = 1e-12  # singular values below this fraction of the largest are no direction of a step
-SPANNED = 1e-9  # of a column of the Jacobian outside the span of others: below this it lies in it
+TOLERANCE = 1e-10  # largest residual relative to its gradient times the state; Newton's iteration reaches rounding
+GUESSED = 1e3  # weight of a guessed value relative to one without a guess
+TRIES = 6  # initial points of the iteration; the first is the reference
+FARTHER = 0.1  # distance of each further initial point from the reference, relative to the state's size
+SEED = 1788  # seed of these points
+REACHED = 1e-16  # scaled residual at which the iteration ends
+REPEATED = 1e-12  # singular values below this fraction of the largest count as zero
+SPANNED = 1e-9  # a column of the Jacobian with a smaller part outside the span of others lies in it
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,11 +29,11 @@ class State(Value):
     values : (n_x,) array
     names : tuple of str
     held : tuple of str
-        Names whose values were fixed.
+        Names of the fixed values.
     free : tuple of str
-        Names that the invariants left free, beside the held ones; their values come from the guess or are near zero.
+        Further names that the invariants leave free; their values come from the guess or are near zero.
     residual : float
-        Largest scaled residual that is left.
+        Largest scaled residual.
     """
 
     t: float
@@ -51,16 +51,15 @@ class State(Value):
     def __repr__(self):
         items = [f"{name} = {value:.6g}" for name, value in zip(self.names, self.values, strict=True)]
         shown = ", ".join(items[:12]) + (f", ... ({len(items)} in all)" if len(items) > 12 else "")
-        return "\n".join([
-            f"State at t = {self.t:g} s",
-            f"  {shown}",
-            f"  held: {', '.join(self.held) or 'nothing'}; left free: {', '.join(self.free) or 'nothing'}",
-            f"  largest residual {self.residual:.1e}",
-        ])  # fmt: skip
+        held, free = (", ".join(names) or "nothing" for names in (self.held, self.free))
+        return (
+            f"State at t = {self.t:g} s\n  {shown}\n  held: {held}; left free: {free}\n"
+            f"  largest residual {self.residual:.1e}"
+        )
 
 
 class _Invariants:
-    """Invariants of a model at one time, with rows scaled to their gradients."""
+    """Invariants of a model at one time: values (m,) and Jacobian (m, n_x)."""
 
     def __init__(self, model, t):
         self.f, self.t, self.p = model.function("invariants"), t, model.parameters
@@ -80,16 +79,12 @@ class _Invariants:
 
 @dataclass(frozen=True, eq=False)
 class _Aim:
-    """Where a start is looked for: near a reference, by weights, with some values movable; arrays (n_x,)."""
+    """The state nearest to a reference is sought, by weights, with some values movable; arrays (n_x,)."""
 
     names: tuple
     reference: np.ndarray
     weights: np.ndarray
     movable: np.ndarray
-
-    def moving(self, movable):
-        """The same aim with other movable values."""
-        return replace(self, movable=movable)
 
 
 @np.errstate(all="ignore")  # trial steps may leave the domain of the equations
@@ -113,7 +108,7 @@ def consistent(model, t, held, guess):
 
 
 def _solve(model, t, aim):
-    """The start by the model's own choice of pivots, or by one made at the reference or near the best state so far."""
+    """The start by the model's pivots, else by pivots chosen at the reference, else near the best state so far."""
     invariants = _Invariants(model, t)
     finite_there = np.all(np.isfinite(invariants(aim.reference)[0]))
     x, residual = _best(invariants, aim) if finite_there else (aim.reference, np.inf)
@@ -126,20 +121,20 @@ def _solve(model, t, aim):
             other = _Invariants(model.near(t, np.append(x if at is None else at, np.zeros(model.n))), t)
         except ServoError:
             continue
-        y, left = _best(other, aim)
-        if left < residual or not np.isfinite(residual):
-            invariants, x, residual = other, y, left
+        y, residual_there = _best(other, aim)
+        if residual_there < residual or not np.isfinite(residual):
+            invariants, x, residual = other, y, residual_there
     return invariants, x, residual
 
 
 def _at_guess(invariants, x, residual, aim, guessed):
-    """The start with some free values exactly as guessed, where that is consistent."""
+    """The start with free values exactly as guessed, if that is consistent."""
     guessed = np.array(guessed)
     if not guessed.any():
         return x, residual
-    moved = _settle(invariants, np.where(guessed, aim.reference, x), aim.moving(aim.movable & ~guessed))
-    left = np.abs(invariants.scaled(moved)).max(initial=0.0)
-    return (moved, float(left)) if left < TOLERANCE else (x, residual)
+    moved = _settle(invariants, np.where(guessed, aim.reference, x), replace(aim, movable=aim.movable & ~guessed))
+    residual_there = np.abs(invariants.scaled(moved)).max(initial=0.0)
+    return (moved, float(residual_there)) if residual_there < TOLERANCE else (x, residual)
 
 
 def _starts(aim, tries):
@@ -152,7 +147,7 @@ def _starts(aim, tries):
 
 
 def _best(invariants, aim, tries=TRIES):
-    """The projection of the reference onto the invariants, from perturbed starts where the first fails."""
+    """The projection of the reference onto the invariants; if it fails, from perturbed points."""
     best, smallest = aim.reference, np.inf
     for first in _starts(aim, tries):
         x = _nearest(invariants, _settle(invariants, first, aim), aim)
@@ -212,7 +207,7 @@ def _nearest(invariants, x, aim, iterations=40):
 
 
 def _free(invariants, x, aim, guess):
-    """Names that the invariants leave free: guessed ones where possible, and low derivatives."""
+    """Names that the invariants leave free: guessed ones if possible, then low derivatives."""
     _, jacobian = invariants(x)
     rows = np.sqrt((jacobian**2).sum(axis=1))
     scaled = jacobian / np.where(rows > 0, rows, 1.0)[:, None]
@@ -230,26 +225,28 @@ def _free(invariants, x, aim, guess):
 
 
 def _refuse(invariants, aim, held, x):
-    """Say which held value is against the invariants, or which invariant no state satisfies."""
-    left = np.abs(invariants.scaled(x))
-    worst = invariants.names[int(np.argmax(left))]
-    loosened, residual = _best(invariants, aim.moving(np.ones(len(aim.names), dtype=bool)), tries=2)
+    """Raise InconsistentStart: a held value contradicts an invariant, or no state satisfies one."""
+    residuals = np.abs(invariants.scaled(x))
+    worst, largest = invariants.names[int(np.argmax(residuals))], float(residuals.max())
+    loosened, residual = _best(invariants, replace(aim, movable=np.ones(len(aim.names), dtype=bool)), tries=2)
     if held and residual < TOLERANCE:
         moved = {n: float(loosened[aim.names.index(n)]) for n in held}
         change = max(moved, key=lambda n: abs(moved[n] - held[n]) / (1.0 + abs(held[n])))
         raise InconsistentStart(
-            f"{change} = {held[change]:g} is held, against the invariant {worst!r} (residual {left.max():.2e}).",
-            "Held values satisfy every constraint at every level.",
+            f"{change} = {held[change]:g} contradicts the invariant {worst!r} (residual {largest:.2e}).",
+            "Held values satisfy every constraint and its time derivatives.",
             nearest=f"{change} = {moved[change]:.9g}.",
-            do="Hold fewer values, or give it as a guess.",
+            do="Hold fewer values, or pass this one in guess={...}.",
             held=change,
+            value=float(held[change]),
             invariant=worst,
+            residual=largest,
             nearest_value=moved[change],
         )
     raise InconsistentStart(
-        f"No consistent start was found: the invariant {worst!r} keeps the residual {left.max():.2e}.",
-        "A start satisfies every constraint at every level.",
-        do="Give a guess={...} nearer the motion, or check that the program can hold at this time.",
+        f"The search for a consistent start ended with the residual {largest:.2e} of the invariant {worst!r}.",
+        "A start satisfies every constraint and its time derivatives.",
+        do="Pass a guess={...} nearer to the motion, or check that the program can hold at this time.",
         invariant=worst,
-        residual=float(left.max()),
+        residual=largest,
     )

@@ -1,8 +1,8 @@
-"""Derivations on disk: what one process derived, the next one reads.
+"""Derivations on disk, which the next process reads.
 
-Entries lie in ``derived`` under the directory of the compiled libraries (see `cache`), each under the hash of the
-specification with all its numbers, the name of what was derived, and the versions and sources that derived it. What
-cannot be read is derived; ``SERVOCTL_MEMO=none`` neither reads nor writes.
+An entry lies in ``derived`` under the cache directory; its file name is the hash of the specification with all numbers,
+the entry's name, and the versions and sources that derived it. An entry that cannot be read is derived again.
+``SERVOCTL_MEMO=none`` neither reads nor writes.
 """
 
 import contextlib
@@ -20,8 +20,7 @@ from pathlib import Path
 import casadi as ca
 import numpy as np
 
-from servoctl.codegen.cache import cache_directory, keeping, kept
-from servoctl.codegen.function import Compiled
+from servoctl.codegen.cache import cache_directory, read_cached, replacing
 from servoctl.errors import SpecificationError
 from servoctl.spec.coordinates import Coordinates
 from servoctl.spec.mechanism import Mechanism
@@ -29,26 +28,28 @@ from servoctl.spec.packing import packed, unpacked
 from servoctl.spec.parameters import Parameters
 from servoctl.spec.program import Program
 
-MOST_BYTES = 2**28  # of all entries: beyond it those that were not used for the longest time go, until half is left
-WRITES = 50  # of a process between two looks at that sum
-SETTLED = 1.0  # s: sources that changed later than this before they were loaded are not what runs
+MOST_BYTES = 2**28  # largest size of all entries: beyond it the least recently used are deleted until half is left
+WRITES = 50  # writes of a process from one check of that size to the next
+SETTLED = 1.0  # s: sources that are newer than this before they were loaded may have been loaded in another version
 
 _LOADED = time.time()
 _written = 0
 
 
 class Store:
-    """What was derived of one specification, by this process or another.
+    """The derivations of one specification on disk.
 
     Parameters
     ----------
     mechanism, program, guess, near, values
-        The specification, as `servoctl.reduction.reduce.reduce` takes it.
+        The arguments of `servoctl.reduction.reduce.reduce`.
 
     Attributes
     ----------
+    specification : tuple
+        These arguments.
     fingerprint : str or None
-        Of the specification; see `fingerprint`.
+        See `fingerprint`.
     """
 
     def __init__(self, mechanism, program, guess=None, near=None, values=None):
@@ -56,61 +57,45 @@ class Store:
         self.fingerprint = fingerprint(*self.specification)
 
     def recall(self, name, build):
-        """The entry of a name, or else what `build()` returns, which becomes the entry.
-
-        Parameters
-        ----------
-        name : str
-        build : callable
-            Without arguments.
+        """The entry of this name; if there is none, the value of `build()`, which is written.
 
         Raises
         ------
         SpecificationError
-            If it is to be built and the specification has become another.
+            If the value must be built after the specification was changed.
         """
         path = self._path(name)
-        content = _read(path)
-        if content is None:
+        entry = _read(path)
+        if entry is None:
             self.require_unchanged()
-            content = (build(),)
-            _write(path, content)
-        return content[0]
+            entry = (build(),)
+            _write(path, entry)
+        return entry[0]
 
     def reduction(self, reduce):
-        """The `Reduction` on disk, in the designer's own symbols, or else that of `reduce`, which is written.
-
-        Parameters
-        ----------
-        reduce : callable
-            Of the specification.
-        """
+        """The `Reduction` on disk, in the designer's symbols; if there is none, that of `reduce`, which is written."""
         mechanism, program, *_ = self.specification
         path = self._path("reduction")
-        content = _read(path)
-        if content is None:
-            reduction = reduce(*self.specification)
-            if path is not None:
-                _write(path, pack(reduction, program=program))
-            return reduction
-        return unpack(content, mechanism, program=program)
+        entry = _read(path)
+        if entry is not None:
+            return unpack(entry, mechanism, program=program)
+        reduction = reduce(*self.specification)
+        if path is not None:
+            _write(path, pack(reduction, program=program))
+        return reduction
 
     def require_unchanged(self):
-        """Refuse a specification that was changed since its model was derived.
-
-        Raises
-        ------
-        SpecificationError
-        """
+        """Raise SpecificationError if the specification was changed after its model was derived."""
         if fingerprint(*self.specification) != self.fingerprint:
             raise SpecificationError(
                 "The mechanism or the program was changed after its model was derived.",
-                "A specification is a value: what is derived of it later must fit what was derived before.",
-                do="Make another mechanism or program, and derive its model.",
+                "A model derives its functions when they are first used, from the specification that it was made of.",
+                do="Make another mechanism or program and derive its model.",
+                changed="specification",
             )
 
     def _path(self, name):
-        """Where an entry lies; None where nothing is read or written."""
+        """Path of an entry; None if nothing is to be read or written."""
         stamp = None if os.environ.get("SERVOCTL_MEMO") == "none" else _stamp()
         if stamp is None or self.fingerprint is None:
             return None
@@ -119,32 +104,29 @@ class Store:
 
 
 def pack(reduction, **shared):
-    """A reduction as what pickles, without its mechanism and what else is shared (see `packing.packed`)."""
+    """A reduction in a form that pickles, without its mechanism and the `shared` objects (see `packing.packed`)."""
     m = reduction.mechanism
     return packed(reduction, m.q, m.parameters, {"mechanism": m, **shared})
 
 
 def unpack(content, mechanism, **shared):
-    """The reduction that `pack` made, in the symbols of a mechanism."""
+    """The reduction that was packed, in the symbols of a mechanism."""
     reduction = unpacked(content, mechanism.q, mechanism.parameters, {"mechanism": mechanism, **shared})
     return replace(reduction, context=replace(reduction.context, book=reduction.points.book))
 
 
 def fingerprint(mechanism, program, guess=None, near=None, values=None):
-    """What a derivation follows from, as a hash.
-
-    Two specifications have the same one only if every expression that a derivation reads is made by the same operations
-    in the same order, and every name, number and choice is the same.
+    """Hash of all that a derivation depends on: operations in their order, names, numbers and choices.
 
     Parameters
     ----------
     mechanism, program, guess, near, values
-        As `servoctl.reduction.reduce.reduce` takes them.
+        The arguments of `servoctl.reduction.reduce.reduce`.
 
     Returns
     -------
     str or None
-        None for a value of another class, which may say more than its expressions: nothing of it goes to disk.
+        None if the specification cannot be hashed: instances of subclasses may hold more than their expressions.
     """
     if (type(mechanism), type(program)) != (Mechanism, Program):
         return None
@@ -164,14 +146,14 @@ def fingerprint(mechanism, program, guess=None, near=None, values=None):
         expressions = [*program.residuals.values(), *(w for w in program.weights.values() if isinstance(w, ca.SX))]
         function = mechanism.q.as_function(expressions, mechanism.parameters.symbols)
         text = "\n".join([json.dumps(facts, allow_nan=False), mechanism.as_text(), function.serialize()])
-    except Exception:  # the derivation says what is wrong; CasADi raises bare ones
+    except Exception:  # CasADi raises bare ones; the derivation says what is wrong
         return None
     return hashlib.sha256(text.encode()).hexdigest()
 
 
 @functools.cache
 def _stamp():
-    """Versions, and the places, sizes and times of the package's sources; None where others may have been loaded."""
+    """Hash of versions and of the package's sources; None if the sources changed after import."""
     sources, newest = [], 0.0
     try:
         for path, stat in _sources(Path(__file__).parents[1]):
@@ -196,32 +178,28 @@ def _sources(directory):
 
 
 def _read(path):
-    """The entry at a path, a tuple, or None if there is nothing that can be read."""
+    """The entry at a path, a tuple; None if it cannot be read."""
     if path is None:
         return None
     try:
-        content = kept(path)
+        content = read_cached(path)
         with contextlib.suppress(OSError):
             os.utime(path)
         return pickle.loads(content)
-    except Exception:  # what is whole can still be of a library that was built in another way
+    except Exception:  # an undamaged entry may hold objects of another build of a library
         return None
 
 
 def _write(path, entry):
-    """Keep a tuple, if it can be."""
     global _written
     if path is None:
         return
     try:
-        for part in entry[0] if isinstance(entry[0], tuple) else entry:
-            if isinstance(part, Compiled):
-                part.source()
         content = pickle.dumps(entry)
-    except Exception:  # what holds expressions does not pickle, which CasADi tells by a bare Exception
+    except Exception:  # expressions do not pickle: CasADi raises a bare Exception
         return
     with contextlib.suppress(OSError):
-        with keeping(path) as temporary:
+        with replacing(path) as temporary:
             Path(temporary).write_bytes(content)
         if _written % WRITES == 0:
             _prune(path.parent)
@@ -229,7 +207,7 @@ def _write(path, entry):
 
 
 def _prune(directory):
-    """Remove what was not used for the longest time, if all entries together are too large."""
+    """Delete the least recently used entries if all together are too large."""
     entries = []
     for entry in os.scandir(directory):
         with contextlib.suppress(OSError):  # another process removed it

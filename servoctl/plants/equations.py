@@ -9,11 +9,12 @@ import numpy as np
 from servoctl.codegen.folding import folded
 from servoctl.model.equations import Invariants
 from servoctl.reduction.appell import plant_accelerations, require_inertia
-from servoctl.reduction.hidden import as_rows, complete
+from servoctl.reduction.hidden import complete
 from servoctl.reduction.manifold import Context
+from servoctl.reduction.rows import as_rows
 
-LATEST = 32  # sets of equations that are held
-CLEAR = 1e-6  # least eigenvalue of a mass matrix with unit diagonal that needs no decision about its rank
+LATEST = 32  # plants whose equations stay in memory
+CLEAR = 1e-6  # a mass matrix with unit diagonal and a larger least eigenvalue is clearly positive definite
 
 
 class PlantEquations:
@@ -23,18 +24,18 @@ class PlantEquations:
     ----------
     mechanism : Mechanism
     forces : str
-        Further generalised forces, (n,): a serialised function (see `Coordinates.as_function`); "" without any.
+        Further generalised forces (n,) as a serialised function (see `Coordinates.as_function`); "" for none.
     damped : tuple of int
-        Velocities with viscous damping.
+        Indices of the velocities with viscous damping.
     lagged : tuple of int
-        Actuators that lag behind their command.
+        Indices of the actuators that lag behind their command.
 
     Attributes
     ----------
     choices : (str, tuple of int, tuple of int)
         Forces, damped velocities and lagging actuators.
     functions : dict of str to Compiled
-        What was compiled of them so far.
+        Compiled functions by name.
     """
 
     def __init__(self, mechanism, forces, damped, lagged):
@@ -63,7 +64,7 @@ class PlantEquations:
 
     @cached_property
     def _material(self):
-        """Rows of the material constraints, of full rank, and points on their manifold."""
+        """Rows of the material constraints, which have full rank, and points of their manifold."""
         m = self.mechanism
         context = Context(m.parameters.symbols, m.parameters.values(), (0.1, 1.1), {})
         rows, _, points, _ = complete(self.q, as_rows(self.q, m.constraints, "material", context), context)
@@ -71,13 +72,13 @@ class PlantEquations:
         return rows, points
 
     def require_inertia(self, values):
-        """Refuse parameters (n_p,) with which the mass matrix is singular or negative."""
+        """Raise SpecificationError if the mass matrix is not positive with these parameters (n_p,)."""
         rows, points = self._material
         if not self._clearly_positive(values):
             require_inertia(self.mechanism, rows, replace(points, values=values))
 
     def _clearly_positive(self, values):
-        """Whether the mass matrix is far from singular at the points at hand."""
+        """Whether the mass matrix is far from singular at all points."""
         M = np.array(self._masses(values)).reshape(self.q.n, -1, self.q.n).swapaxes(0, 1)
         size = np.sqrt(np.maximum(np.diagonal(M, axis1=1, axis2=2), 0.0))
         if not np.isfinite(M).all() or not size.all():
@@ -86,7 +87,7 @@ class PlantEquations:
 
     @cached_property
     def _masses(self):
-        """A function of the parameters: the mass matrices at the points at hand, side by side."""
+        """A function of the parameters: the mass matrices at all points, side by side."""
         points = self._material[1]
         symbols, state = ca.vertcat(*self.mechanism.parameters.symbols), ca.vertcat(*self.q, self.velocity)
         at = np.vstack([points.t, points.jet(0), points.jet(1)]).astype(float)
@@ -101,7 +102,7 @@ class PlantEquations:
 
     @cached_property
     def acceleration(self):
-        """γ'' from [M G_mᵀ; G_m 0] [γ''; -λ] = [forces; ...]: material constraints are held, ideally."""
+        """γ'' from [M G_mᵀ; G_m 0] [γ''; -λ] = [forces; ...] with ideal material constraints."""
         q, (rows, points) = self.q, self._material
         acceleration, zero = ca.vertcat(*q.gamma(2)), ca.SX.zeros(q.n)
         second = [q.derivatives([row.expression], 2 - row.order)[-1][0] for row in rows]
@@ -122,13 +123,13 @@ class PlantEquations:
         return self.function("plant", [self.state_rates])
 
     def ode_power(self):
-        """x' of the state and the power of all forces without a potential: the state grows by their work."""
+        """x' of the state, extended by the work of all forces without a potential."""
         x = ca.vertcat(self.state, ca.SX.sym("work"))
         return self.function("plant_power", [self.state_rates, ca.sum1(self._powers)], x)
 
     @property
     def _powers(self):
-        """Power of the inputs, of the disturbances, and of friction and other forces."""
+        """Powers of the inputs, of the disturbances, and of friction and other forces."""
         w = self.velocity
         other = self.mechanism.forces + self.forces + self.resisting
         return ca.vertcat(ca.dot(w, self.mechanism.E @ self.force), ca.dot(w, self.d), ca.dot(w, other))
@@ -139,21 +140,21 @@ class PlantEquations:
 
     @cached_property
     def unbalanced(self):
-        """Why dE/dt is not the power of inputs, disturbances and other forces; "" where it is."""
+        """Why dE/dt is not the power of inputs, disturbances and other forces; "" if it is."""
         q, m = self.q, self.mechanism
         inertial = q.dt(m.energy) - ca.dot(self.velocity, m.balance + m.forces)
         if not m.is_zero([inertial]):
             return "the inertia terms depend on time or on more than wᵀMw/2"
         for row in self._material[0]:
             rate = q.derivatives([row.expression], 1 - row.order)[-1][0]
-            if not m.is_zero([rate - ca.jtimes(rate, self.velocity, self.velocity)]):  # its reaction does work
+            if not m.is_zero([rate - ca.jtimes(rate, self.velocity, self.velocity)]):  # the reaction does work
                 return f"the material constraint {row.name!r} moves by itself"
         return ""
 
     def jacobian(self):
         """∂x'/∂x and ∂x'/∂u, column by column."""
-        parts = [ca.jacobian(self.state_rates, ca.vertcat(self.state, self.u))]
-        return self.function("jacobian", [ca.vec(ca.densify(parts[0]))])
+        matrix = ca.jacobian(self.state_rates, ca.vertcat(self.state, self.u))
+        return self.function("jacobian", [ca.vec(ca.densify(matrix))])
 
     def directions(self):
         """E and V, column by column."""
@@ -165,10 +166,9 @@ class PlantEquations:
 
     def outputs(self):
         """The mechanism's named outputs."""
-        values = [
-            ca.substitute(e, ca.vertcat(*self.q.gamma(2)), self.acceleration) for e in self.mechanism.outputs.values()
-        ]
-        return self.function("outputs", values)
+        acceleration = ca.vertcat(*self.q.gamma(2))
+        outputs = self.mechanism.outputs.values()
+        return self.function("outputs", [ca.substitute(e, acceleration, self.acceleration) for e in outputs])
 
     def constraints(self):
         """Names and values of the invariants of the state, level by level."""
@@ -183,12 +183,9 @@ class PlantEquations:
         return self.function("constraints_jacobian", [ca.vec(ca.densify(ca.jacobian(values, self.state)))])
 
     def project(self, extra=0):
-        """The least change of the state that restores its invariants; None where there are none.
+        """The least change of the state that restores its invariants; None without invariants.
 
-        Parameters
-        ----------
-        extra : int
-            Number of states behind those of the plant, which stay as they are.
+        `extra` further states behind those of the plant do not change.
         """
         if not self.constrained:
             return None
@@ -211,18 +208,7 @@ def _expression(forces, mechanism):
 
 
 def plant_equations(mechanism, *choices):
-    """The equations of a plant, derived once for all plants that differ in numbers alone.
-
-    Parameters
-    ----------
-    mechanism : Mechanism
-    *choices
-        Forces, damped velocities and lagging actuators, as `PlantEquations` takes them.
-
-    Returns
-    -------
-    PlantEquations
-    """
+    """The `PlantEquations` of a mechanism, derived once for all plants that differ only in numbers."""
     return _latest(_Identity(mechanism), choices)
 
 
@@ -232,7 +218,7 @@ def _latest(identity, choices):
 
 
 class _Identity:
-    """A value that equals itself alone: equations are written in the symbols of one mechanism, not of an equal one."""
+    """A value that equals only itself: equations hold the symbols of one mechanism, not those of an equal one."""
 
     def __init__(self, value):
         self.value = value

@@ -1,4 +1,4 @@
-"""The plant: the full mechanism with its own numbers, friction, actuators and their limits."""
+"""The plant: the full mechanism with its parameters, friction, actuators and their limits."""
 
 from dataclasses import dataclass, field, fields
 
@@ -17,9 +17,9 @@ def plant(
     mechanism: Mechanism, *, forces=None, damping=None, limits=None, rate_limits=None, lag=None, delay=0.0,
     **parameters: float,
 ) -> "Plant":  # fmt: skip
-    """Make the plant of a mechanism: what the controller acts on.
+    """Make the plant of a mechanism: the machine that a controller acts on.
 
-    The equations are derived once for a mechanism and a set of further forces; other numbers cost nothing.
+    Plants of the same mechanism and forces share their equations, so that other numbers take no time.
 
     Parameters
     ----------
@@ -30,11 +30,11 @@ def plant(
     damping : dict of str to float, optional
         Viscous coefficients by coordinate (or quasi-velocity) [N s/m or N m s].
     limits : dict of str to float or (low, high), optional
-        Of the actuators' inputs; a number c stands for (-c, c), None leaves a side open.
+        Limits of the actuators' inputs. A number c means (-c, c); None leaves a side open.
     rate_limits : dict of str to float, optional
-        Largest |du/dt| of the inputs [1/s]: from sample to sample an input changes by at most this times the period.
+        Largest |du/dt| of the inputs [1/s]. From sample to sample an input changes at most by this times the period.
     lag : dict of str to float, optional
-        Time constants of actuators that follow their input with first order [s]; each is a state of the plant.
+        Time constants [s] of actuators that follow their input with first order. Each adds a state to the plant.
     delay : float or dict of str to float
         Transport delay of all or of named inputs [s].
     **parameters : float
@@ -47,15 +47,16 @@ def plant(
     Raises
     ------
     NameUnknown
-        For a name of no parameter, actuator or coordinate.
+        For a name that is no parameter, actuator or coordinate.
     SpecificationError
-        For a value that makes no sense, or a mass matrix that is singular or negative.
+        For a value outside its range, or a mass matrix that is not positive definite.
     """
     if not isinstance(mechanism, Mechanism):
         raise SpecificationError(
             f"The first argument is a {type(mechanism).__name__}.",
             "A plant is made of a Mechanism and numbers.",
             do="Write sv.plant(mechanism, m_load=115.0).",
+            type=type(mechanism).__name__,
         )
     actuators = mechanism.actuators
     names = mechanism.q.names if mechanism.q.plain else mechanism.q.velocity_names
@@ -87,13 +88,13 @@ class Plant(Value):
     ----------
     mechanism : Mechanism
     parameters : (n_c,) array
-        Numbers: the mechanism's parameters, damping coefficients, 1/lag.
+        The mechanism's parameters, damping coefficients, 1/lag.
     state_names : tuple of str
         Names of the state x = (q, γ', lagged inputs).
     inputs : tuple of str
         Names of the actuators.
     disturbable : tuple of str
-        Names of the generalised forces that may be disturbed: those of the coordinates or quasi-velocities.
+        Names of the generalised forces that disturbances can act on: of the coordinates or quasi-velocities.
     limits : dict of str to (float, float)
     rate_limits, lag, delay, damping : dict of str to float
     """
@@ -126,12 +127,12 @@ class Plant(Value):
 
     @property
     def lagged(self):
-        """Names of the actuators that are states, in the order of the state."""
+        """Names of the actuators with a lag, in the order of the state."""
         return self.state_names[self.n_x - len(self.lag) :]
 
     @property
     def constrained(self):
-        """Whether the state has invariants: material constraints, or those of the kinematics."""
+        """Whether the state has invariants: material constraints or those of the kinematics."""
         return self.equations.constrained
 
     def p(self, u=None, d=None):
@@ -169,13 +170,13 @@ class Plant(Value):
         -------
         Compiled
         """
-        built = self.equations.functions
-        if name not in built:
-            if name not in FUNCTIONS:
-                raise unknown(name, list(FUNCTIONS), "function")
+        if name not in FUNCTIONS:
+            raise unknown(name, list(FUNCTIONS), "function")
+        functions = self.equations.functions
+        if name not in functions:
             f, *options = FUNCTIONS[name](self.equations)
-            built[name] = compiled(f, f.name(), *options)
-        return built[name]
+            functions[name] = compiled(f, f.name(), *options)
+        return functions[name]
 
     def constraint_names(self):
         """Names of the invariants in the order of the function "constraints"."""
@@ -221,7 +222,7 @@ class Plant(Value):
     def state(self, values) -> np.ndarray:
         """A full state: an array of (q, γ') or of all states, or values by name.
 
-        Lagged inputs without a value are NaN: `close` lets them start at the first input.
+        Lagged inputs without a value are NaN: `close` starts them at the first input.
 
         Parameters
         ----------
@@ -245,68 +246,63 @@ class Plant(Value):
             missing = [name for name in names[:n] if name not in values]
             if missing:
                 raise SpecificationError(
-                    f"The state has no {missing[0]}.", f"It is made of {', '.join(names)}.", do="Give all of them."
+                    f"The state has no {missing[0]}.",
+                    f"A state of this plant has the values {', '.join(names[:n])}.",
+                    do=f"Add {', '.join(missing)}.",
+                    missing=missing,
                 )
             return np.array([finite(k, values[k], "state") if k in values else np.nan for k in names])
         try:
             state = np.asarray(values, dtype=float).ravel()
         except (TypeError, ValueError) as error:
             raise SpecificationError(
-                f"The state is a {type(values).__name__}.", "It is an array or a dict of numbers.", do="Give one."
+                f"The state is a {type(values).__name__}.",
+                "A state is an array or a dict of numbers.",
+                do="Pass plan.state(0.0), an array or a dict.",
+                type=type(values).__name__,
             ) from error
         if state.size not in (n, self.n_x) or not np.isfinite(state).all():
             raise SpecificationError(
                 f"The state is {np.array2string(state, threshold=8)}.",
-                f"It has {n} finite numbers: {', '.join(names[:n])}"
+                f"A state of this plant is {n} finite numbers: {', '.join(names[:n])}"
                 + (f"; or {self.n_x}, with the inputs {', '.join(names[n:])}." if self.lag else "."),
-                nearest="plan.state(0.0).",
-                do="Give one number each.",
+                do="Pass one finite number for each, such as plan.state(0.0).",
                 names=names,
+                size=state.size,
             )
         return np.concatenate([state, np.full(self.n_x - state.size, np.nan)])
 
     def __repr__(self):
-        m = self.mechanism
-        changed = [
-            f"{n}={v:g}"
-            for n, v in zip(m.parameters.names, self.parameters, strict=False)
-            if v != m.parameters.defaults[n]
-        ]
-        lines = [
-            f"Plant: state {' '.join(self.state_names)}"[:118],
-            f"  inputs {', '.join(self.inputs) or '(none)'}"[:118],
-        ]
-        if m.constraints:
-            lines.append(f"  material constraints held: {', '.join(m.constraints)}"[:118])
-        if changed:
-            lines.append(f"  changed: {', '.join(changed)}"[:118])
-        for what, values in (
-            ("limits", {n: f"{a:g} .. {b:g}" for n, (a, b) in self.limits.items()}),
-            ("rate limits [1/s]", _short(self.rate_limits)),
-            ("lag [s]", _short(self.lag)),
-            ("delay [s]", _short(self.delay)),
-            ("damping", _short(self.damping)),
-        ):
-            if values:
-                lines.append(f"  {what}: {', '.join(f'{n} {v}' for n, v in values.items())}"[:118])
-        return "\n".join(lines)
+        names, defaults = self.mechanism.parameters.names, self.mechanism.parameters.defaults
+        numbers = zip(names, self.parameters, strict=False)  # damping and lag follow the parameters
+        entries = {
+            "Plant: state ": " ".join(self.state_names),
+            "  inputs ": ", ".join(self.inputs) or "(none)",
+            "  material constraints: ": ", ".join(self.mechanism.constraints),
+            "  changed: ": ", ".join(f"{n}={v:g}" for n, v in numbers if v != defaults[n]),
+            "  limits: ": ", ".join(f"{n} {a:g} .. {b:g}" for n, (a, b) in self.limits.items()),
+            "  rate limits [1/s]: ": _text(self.rate_limits),
+            "  lag [s]: ": _text(self.lag),
+            "  delay [s]: ": _text(self.delay),
+            "  damping: ": _text(self.damping),
+        }
+        return "\n".join(f"{what}{text}"[:118] for what, text in entries.items() if text)
 
 
-def _short(values):
-    return {name: f"{value:g}" for name, value in values.items()}
+def _text(values):
+    return ", ".join(f"{name} {value:g}" for name, value in values.items())
 
 
 def _limits(limits, actuators):
-    found = {}
-    for name, value in mapping(limits, "The limits").items():
+    limits = mapping(limits, "The limits")
+    for name in limits:
         if name not in actuators:
             raise unknown(name, actuators, "actuator")
-        found[name] = interval(name, value, "limit")
-    return found
+    return {name: interval(name, value, "limit") for name, value in limits.items()}
 
 
 def _forces(mechanism, forces, names):
-    """Further generalised forces, (n,), as a serialised function; "" without any."""
+    """Further generalised forces (n,) as a serialised function; "" for none."""
     q, total = mechanism.q, ca.SX.zeros(mechanism.q.n)
     for name, value in mapping(forces, "The forces").items():
         if name not in names:
@@ -317,8 +313,7 @@ def _forces(mechanism, forces, names):
             raise SpecificationError(
                 f"The force on {name!r} depends on accelerations.",
                 "Forces of a plant are functions of t, q and γ'.",
-                nearest="A mass in the Gibbs function.",
-                do="Put it into the mechanism.",
+                do="Describe it as a mass in the Gibbs function of the mechanism.",
                 name=name,
             )
         total[names.index(name)] = expression
@@ -329,7 +324,7 @@ def _unpickled(numbers, choices):
     return Plant(**numbers, equations=plant_equations(numbers["mechanism"], *choices))
 
 
-FUNCTIONS = {  # what `compiled` makes of each: the function, its loops, its projection
+FUNCTIONS = {  # arguments of `compiled`: the function, its loops, its projection
     "ode": lambda e: (e.ode(), ("closed",), e.project()),
     "ode_power": lambda e: (e.ode_power(), ("closed",), e.project(extra=1)),
     "jacobian": lambda e: (e.jacobian(),),

@@ -1,7 +1,7 @@
 """Eq. (3.18): the balance on the virtual displacements on which the unknown reaction does no work.
 
 The reaction is B μ. With the quasi-coordinates split into dependent ones D and independent ones I,
-A = ∂γ_D/∂γ_I = -B_D⁻ᵀ B_Iᵀ and T = [A; 1] spans ker Bᵀ; the rows of Tᵀ r = 0 are (3.18) as printed when B = Gᵀ.
+A = ∂γ_D/∂γ_I = -B_D⁻ᵀ B_Iᵀ and T = [A; 1] spans ker Bᵀ. For B = Gᵀ the rows of Tᵀ r = 0 are (3.18) as printed.
 """
 
 from dataclasses import dataclass
@@ -10,24 +10,23 @@ import casadi as ca
 import numpy as np
 
 from servoctl.errors import NotRealisable, SpecificationError, unknown
-from servoctl.reduction.elimination import eliminate
-from servoctl.reduction.ranks import clean, decide_all, decide_each, equilibrate
+from servoctl.reduction.ranks import clean, decide_all, decide_each, eliminate, equilibrate
 
-NEGATIVE = 1e-9  # of the size of its entries: eigenvalues of an inertia matrix below minus this are no rounding
-NAMED = 1e-6  # of its largest component: smaller ones of a direction are not named in an error
+NEGATIVE = 1e-9  # eigenvalues of a scaled inertia matrix below minus this are no rounding errors
+NAMED = 1e-6  # components of a direction below this fraction of the largest are not named in an error
 LONGEST_SEARCH = 2  # times n: no relative degree exceeds the number of plant states
 
 
 @dataclass(frozen=True)
 class Realisation:
-    """Who supplies the reaction B μ, and the choice of dependent coordinates that goes with it.
+    """Who supplies the reaction B μ, and which quasi-coordinates depend on the others.
 
     Attributes
     ----------
     B : (n, b) SX
-        Directions of the reaction: those of the program first, material ones last.
+        Directions of the reaction: the program's first, then those of material constraints.
     actuation : (m, k) SX or None
-        u = actuation · (first k multipliers); None for an ideal program.
+        Matrix by which the first k multipliers give u; None for an ideal program.
     dependent, independent : tuple of int
         Indices of the quasi-coordinates.
     numbers : (b, n, N) array
@@ -57,13 +56,13 @@ class Realisation:
         return ca.vertsplit(rows), [p for p in pivots if ca.symvar(p)]
 
     def multipliers(self, balance):
-        """μ with B_D μ = r_D, (b,) SX: they come for free, none was introduced."""
+        """μ with B_D μ = r_D, (b,) SX."""
         rows = list(self.dependent)
         return eliminate(self.B[rows, :], balance[rows], self.numbers[:, rows].swapaxes(0, 1))[0]
 
 
 def realisation(mechanism, program, constraints, points):
-    """Who realises the program, from its leading gradients and the mechanism's actuators.
+    """The realisation of a program by ideal reactions or by the mechanism's actuators.
 
     Parameters
     ----------
@@ -72,7 +71,7 @@ def realisation(mechanism, program, constraints, points):
     constraints : list of Row
         Program rows and material rows, the latter of full row rank.
     points : Points
-        On the manifold of the constraints.
+        Points on the manifold of the constraints.
 
     Returns
     -------
@@ -81,25 +80,29 @@ def realisation(mechanism, program, constraints, points):
     Raises
     ------
     NotRealisable
-        If there are fewer actuators than residuals, or they cannot move them.
+        If the residuals outnumber the independent actuators, or the actuators cannot move them independently.
     """
     q = mechanism.q
-    leading = {kind: [row.gradient(q) for row in constraints if row.kind == kind] for kind in ("program", "material")}
-    material = [g.T for g in leading["material"]]
+    G, G_m = (
+        ca.vertcat(ca.SX(0, q.n), *(row.gradient(q) for row in constraints if row.kind == kind))
+        for kind in ("program", "material")
+    )
     if program.by == "ideal":
-        directions, actuation = [g.T for g in leading["program"]], None
+        directions, actuation = G.T, None
     else:
-        direction, actuation = _actuator_directions(mechanism, program, constraints, points)
-        directions = [direction]
-    B = ca.horzcat(*directions, *material)
+        directions, actuation = _actuator_directions(mechanism, program, constraints, points)
+    B = ca.horzcat(directions, G_m.T)
     numbers, sizes = points.matrix(B.T)
     rank, best = decide_all(numbers, sizes)
     if rank.rank < B.shape[1]:
         raise NotRealisable(
             f"The directions of the actuators {', '.join(mechanism.actuators)} and of the material constraints are "
             f"dependent (rank {rank.rank} of {B.shape[1]}).",
-            "The directions of the actuators are independent of each other.",
+            "Actuators and material constraints act in independent directions.",
             do="Remove an actuator or a constraint.",
+            actuators=list(mechanism.actuators),
+            rank=rank.rank,
+            directions=B.shape[1],
         )
     dependent = tuple(sorted(rank.columns))
     independent = tuple(i for i in range(q.n) if i not in dependent)
@@ -115,17 +118,17 @@ def _actuator_directions(mechanism, program, constraints, points):
     material = [row for row in constraints if row.kind == "material"]
     both = ca.horzcat(mechanism.E, *(row.gradient(q).T for row in material))
     rank = decide_all(*points.matrix(both.T))[0].rank if both.shape[1] else 0
-    free = rank - len(material)
-    if k > free:
+    independent = rank - len(material)
+    if k > independent:
         raise NotRealisable(
-            f"The program has {k} residual{'s' * (k != 1)} ({', '.join(program.residuals)}) and the mechanism {free} "
-            "independent "
-            f"actuators ({', '.join(mechanism.actuators) or 'none'}).",
-            "There are at least as many independent actuators as residuals.",
-            nearest=f"{free} residuals, or by='ideal'." if free else "by='ideal'.",
+            f"The program has {k} residual{'s' * (k != 1)} ({', '.join(program.residuals)}), and the mechanism "
+            f"{independent} independent actuators ({', '.join(mechanism.actuators) or 'none'}).",
+            "A program needs at least as many independent actuators as residuals.",
+            nearest=f"{independent} residuals, or by='ideal'." if independent else "by='ideal'.",
             do="Add actuators or remove residuals.",
             residuals=list(program.residuals),
             actuators=list(mechanism.actuators),
+            independent=independent,
         )
     unknown_weights = [w for w in program.weights if w not in mechanism.actuators]
     if unknown_weights:
@@ -138,9 +141,11 @@ def _actuator_directions(mechanism, program, constraints, points):
     if rank_P < k:
         raise NotRealisable(
             f"The decoupling matrix has rank {rank_P} for {k} residuals and {m} actuators.",
-            "A pointwise least norm of redundant actuation needs a decoupling matrix of full row rank.",
-            nearest=f"Exactly {k} actuators: then hidden constraints are found.",
-            do="Leave out actuators, or choose other outputs.",
+            "Redundant actuators are weighted at each instant, which needs a decoupling matrix of full row rank.",
+            nearest=f"{k} actuators, for which hidden constraints are derived.",
+            do="Remove actuators, or program other outputs.",
+            residuals=list(program.residuals),
+            actuators=list(mechanism.actuators),
             rank=rank_P,
         )
     actuation = inverse_weights @ P.T
@@ -148,7 +153,7 @@ def _actuator_directions(mechanism, program, constraints, points):
 
 
 def decoupling(mechanism, rows, material, points):
-    """P = ∂φ^(r)/∂u (k, m): each residual differentiated along the plant until the actuation appears.
+    """P = ∂φ^(r)/∂u (k, m), with each residual differentiated along the plant until the actuation appears.
 
     For relative degree 2 P = G N E with N = M⁻¹, or T_m(T_mᵀMT_m)⁻¹T_mᵀ beside material rows.
     """
@@ -207,13 +212,13 @@ def require_inertia(mechanism, material, points):
         raise SpecificationError(
             f"The mass matrix is singular: a direction of {', '.join(names)} has no inertia.",
             "M = ∂²S/∂γ''² is positive definite on the displacements that material constraints allow.",
-            do="Check the masses and inertias and their numbers, or leave out a coordinate.",
+            do="Check the masses, the inertias and the values of their parameters, or remove a coordinate.",
             names=names,
         )
 
 
 def require_positive(mechanism, points):
-    """Refuse an inertia matrix that gives negative energy of acceleration to a direction.
+    """Refuse an inertia matrix by which S is negative in a direction.
 
     Raises
     ------
@@ -230,12 +235,14 @@ def require_positive(mechanism, points):
     k = int(np.argmin(values[:, 0]))
     direction = np.abs(directions[k, :, 0])
     names = [mechanism.q.jet_names(1)[i] for i in np.flatnonzero(direction > NAMED * direction.max())]
-    pairs = zip(points.parameters, points.values, strict=True)
-    negative = [f"{symbol.name()} = {value:g}" for symbol, value in pairs if value < 0]
+    parameters = zip(points.parameters, points.values, strict=True)
+    negative = {symbol.name(): float(value) for symbol, value in parameters if value < 0}
+    listed = ", ".join(f"{name} = {value:g}" for name, value in negative.items())
     raise SpecificationError(
         f"The mass matrix is negative in a direction of {', '.join(names)}"
-        + (f", with {', '.join(negative)}." if negative else "."),
+        + (f", with {listed}." if negative else "."),
         "M = ∂²S/∂γ''² is positive definite: masses and moments of inertia are positive.",
-        do="Check the masses and inertias and their numbers.",
+        do="Check the masses, the inertias and the values of their parameters.",
         names=names,
+        negative=negative,
     )

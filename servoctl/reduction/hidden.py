@@ -10,18 +10,10 @@ import casadi as ca
 import numpy as np
 
 from servoctl.errors import InconsistentStart, NotRealisable, SingularProgram, SpecificationError
-from servoctl.jets.flow import Flow
-from servoctl.reduction.elimination import eliminate
-from servoctl.reduction.manifold import POINTS_SEED, sample, solve
-from servoctl.reduction.orders import dependence, leading, settle, settle_alone
-from servoctl.reduction.ranks import clean, decide, decide_all, decide_each, generic
-from servoctl.reduction.row import Row, merge_uses
+from servoctl.reduction.manifold import sample
+from servoctl.reduction.ranks import clean, decide, decide_all, decide_each, eliminate, generic
+from servoctl.reduction.rows import Row, dependence, leading, merge_uses, settle, vanishing_gradient
 from servoctl.tolerances import NOISE, RESOLVED
-
-VANISHED = 1e-5  # of a row's gradient at random points: what is left of it on its solutions, if it is a square
-SQUARE_STEPS = 40  # of Newton's method towards them, which for a square only halves the way at each
-SOLVED = 1e-3  # scaled residual of points at which the gradient of a possible square is looked at
-BESIDE = 0.5  # relative distance of the points with which solutions are compared
 
 
 def complete(q, rows, context, starts=None):
@@ -34,30 +26,30 @@ def complete(q, rows, context, starts=None):
         At most n; each with its settled order.
     context : Context
     starts : Points, optional
-        Where to look for points.
+        Starts for points of the manifold.
 
     Returns
     -------
     rows : list of Row
     rank : Rank
-        Of the final leading matrix, with its margins.
+        Rank of the final leading matrix, with its margins.
     points : Points
-        On the final manifold.
-    guards : list of (str, SX)
-        Pivots by which the combinations divide.
+        Points of the final manifold.
+    pivots : list of (str, SX)
+        Pivots by which the combinations divide, each with a description.
 
     Raises
     ------
     SpecificationError
         If constraints depend on each other or contradict each other.
     NotRealisable
-        If the dependence involves the mechanism's dynamics.
+        If the dependence involves rows of (3.18).
     SingularProgram
         If a row's gradient vanishes on its own solutions, or a rank is undecided in double precision.
     InconsistentStart
         If no state satisfies the rows.
     """
-    rows, guards, points = list(rows), [], starts
+    rows, pivots, points = list(rows), [], starts
     while True:
         level = max([row.order for row in rows], default=0)
         points = sample(q, rows, level, context, starts=points)
@@ -70,60 +62,46 @@ def complete(q, rows, context, starts=None):
             raise _ill_conditioned(rows, rank)
         same = [p for p, other in enumerate(ranks) if other.rank == rank.rank]
         if rank.rank == len(rows):
-            return rows, rank, points.take(same), guards
+            return rows, rank, points.take(same), pivots
         combination = _lowest(q, rows, numbers[:, :, same], context, points)
         if combination.row.order < 0:
             raise _dependent(rows, combination)
         rows[combination.replaces] = combination.row
-        guards += [(f"combination of {combination.row.story}", pivot) for pivot in combination.pivots]
+        pivots += [(f"combination of {combination.row.story}", pivot) for pivot in combination.pivots]
 
 
 @dataclass(frozen=True)
 class _Combination:
-    """A combination of rows whose leading gradients cancel.
+    """A combination of rows whose leading gradients cancel."""
 
-    Attributes
-    ----------
-    row : Row
-        Settled; of order -1 where it depends on t alone.
-    replaces : int
-        The row of the highest order that it may replace.
-    support : list of int
-        The rows that were combined.
-    points : Points
-        On the manifold of all rows but the replaced one.
-    pivots : list of SX
-        By which the combination divides.
-    """
-
-    row: Row
-    replaces: int
-    support: list
-    points: object
-    pivots: list
+    row: Row  # with its true order, -1 if it depends on t alone
+    replaces: int  # index of the row that it replaces, one of the highest order in the support
+    support: list  # indices of the combined rows
+    points: object  # on the manifold of all rows but the replaced one
+    pivots: list  # SX by which the combination divides
 
 
 def _lowest(q, rows, numbers, context, starts=None):
-    """The combination of dependent rows that takes the place of one of them, of lower order than it."""
+    """The combination of dependent rows that replaces one of them by a row of lower order."""
+    # Rows of (3.18) come last, and are replaced first among those of highest order: where it can be, the designer's
+    # constraints stay as they are written.
     order = sorted(range(len(rows)), key=lambda a: (rows[a].kind == "dynamics", rows[a].order, a))
-    support, weights = dependence(q, [rows[a] for a in order], numbers[order])
+    support, weights = dependence(numbers[order])
     support = [order[i] for i in support]
     top = max(rows[a].order for a in support)
     highest = ((a, w) for a, w in zip(support, weights, strict=True) if rows[a].order == top)
     b = max((rows[a].kind == "dynamics", w, a) for a, w in highest)[2]
     combination = _combination(q, rows, b, support, numbers, context, starts)
     if combination.row.order >= top:
-        support, numbers = _about(q, rows, b, context)
-        if not support:
-            raise _vanishing_gradient(rows[b])
-        combination = _combination(q, rows, b, support, numbers, context)
-        if combination.row.order >= top:
-            raise _vanishing_gradient(rows[b])
+        support, numbers = _beside_manifold(q, rows, b, context)
+        combination = _combination(q, rows, b, support, numbers, context) if support else None
+        if combination is None or combination.row.order >= top:
+            raise vanishing_gradient(rows[b])
     return combination
 
 
 def _combination(q, rows, b, support, numbers, context, starts=None):
-    """Row b combined with the others of a support, settled on the manifold of all other rows."""
+    """Row b combined with the others of a support, with its order on the manifold of all other rows."""
     top = rows[b].order
     _require_affine(rows, support, top)
     others = [a for a in support if a != b]
@@ -138,17 +116,17 @@ def _combination(q, rows, b, support, numbers, context, starts=None):
     return _Combination(replace(row, story=story), b, support, points, pivots)
 
 
-def _about(q, rows, b, context):
-    """The rows that give row b's leading gradient at states of the others, where b itself need not hold, with L there.
+def _beside_manifold(q, rows, b, context):
+    """The rows whose combination is row b's leading gradient where all rows but b hold, and L at such points.
 
-    On the manifold of all rows coefficients may vanish that do not vanish about it: a load that is lifted straight up
-    never swings, and only about its motion is it seen that the combination forbids swinging.
+    Coefficients may vanish on the manifold of all rows and not beside it. A load that is lifted straight up never
+    swings; only beside its motion does the combination show that it forbids swinging.
     """
     order = [*(a for a in range(len(rows)) if a != b and rows[a].order <= rows[b].order), b]
     rest = [row for a, row in enumerate(rows) if a != b]
     points = sample(q, rest, max(row.order for row in rows), context)
     numbers, _ = leading(q, rows, points)
-    support, _ = dependence(q, [rows[a] for a in order], numbers[order])
+    support, _ = dependence(numbers[order])
     return ([order[i] for i in support] if support and support[-1] == len(order) - 1 else []), numbers
 
 
@@ -171,57 +149,51 @@ def _derivative_name(row, k):
 
 
 def _require_affine(rows, support, top):
-    bent = [rows[a].name for a in support if rows[a].order == top and not rows[a].affine]
-    if bent:
+    nonlinear = [rows[a].name for a in support if rows[a].order == top and not rows[a].affine]
+    if nonlinear:
         raise SpecificationError(
-            f"The residual {bent[0]!r} is not linear in its highest derivative and depends on other rows there.",
-            "Hidden constraints are found among rows that are linear in their highest derivatives.",
-            do=f"Give the time derivative of {bent[0]!r}, which is linear in its highest derivative, as the "
-            "residual, and hold the residual itself at the start.",
-            rows=bent,
+            f"The residual {nonlinear[0]!r} is nonlinear in its highest derivative and depends on other rows there.",
+            "Hidden constraints are derived from rows that are linear in their highest derivatives.",
+            do=f"Program the time derivative of {nonlinear[0]!r}, which is linear in its highest derivative, and start "
+            "where the residual is zero.",
+            rows=nonlinear,
         )
-
-
-def _vanishing_gradient(row):
-    return SingularProgram(
-        f"The gradient of row {row.name!r} vanishes on its own solutions.",
-        "A constraint is regular: a squared one, like φ² = 0, says nothing about the directions in which φ grows.",
-        do=f"Write {row.name!r} so that it changes sign where it is crossed: what was squared, not its square.",
-        row=row.name,
-    )
 
 
 def _dependent(rows, combination):
-    """What is wrong with rows of which a combination depends on t alone."""
+    """The error of rows whose combination depends on t alone."""
     names, story = [rows[a].name for a in combination.support], combination.row.story
     zero = not np.any(clean(*combination.points.evaluate([combination.row.expression])))
-    what = ", ".join(names)
+    listed = ", ".join(names)
     if any(rows[a].kind == "dynamics" for a in combination.support):
         program = [name for name in names if name != combination.row.name] or names
         return NotRealisable(
-            f"The actuation never reaches the program: the combination {story} "
-            + ("vanishes identically." if zero else "depends on nothing but t and is not zero."),
+            f"No derivative of the program contains the actuation: the combination {story} "
+            + ("vanishes identically." if zero else "depends on t alone and is not zero."),
             "Every residual needs an actuator that moves it.",
             do=f"Change the actuators or the rows {', '.join(program)}.",
             rows=names,
+            combination=story,
         )
     if zero:
         return SpecificationError(
-            f"The constraints {what} are dependent: the combination {story} vanishes identically.",
-            "Constraints are independent of each other.",
-            do=f"Leave out one of {what}.",
+            f"The constraints {listed} are dependent: the combination {story} vanishes identically.",
+            "Constraints must be independent of each other.",
+            do=f"Remove one of {listed}.",
             rows=names,
+            combination=story,
         )
     return SpecificationError(
-        f"The constraints {what} contradict each other: the combination {story} depends on t alone and is not zero.",
-        "Constraints have a common solution.",
-        do=f"Correct one of {what}.",
+        f"The constraints {listed} contradict each other: the combination {story} depends on t alone and is not zero.",
+        "Constraints must have a common solution.",
+        do=f"Correct one of {listed}.",
         rows=names,
+        combination=story,
     )
 
 
 def _no_common_state(q, rows, context):
-    """What is wrong with rows that no point satisfies: a contradiction among them, where there is one."""
+    """The error of rows that no point satisfies: a contradiction among them, where there is one."""
     points = sample(q, [], max(row.order for row in rows), context)
     numbers, sizes = leading(q, rows, points)
     rank, _ = decide_all(numbers, sizes)
@@ -235,76 +207,20 @@ def _no_common_state(q, rows, context):
 
 def _no_state(rows):
     return InconsistentStart(
-        f"No state was found that satisfies {', '.join(sorted({row.name for row in rows}))} with their derivatives.",
-        "Constraints have a common solution near the guess.",
-        do="Give derive a guess={...} near the motion, or correct the constraints.",
+        f"No state satisfies {', '.join(sorted({row.name for row in rows}))} and their time derivatives.",
+        "Newton's method searches for such states about the guess.",
+        do="Pass guess={...} near the motion to derive, or correct the constraints.",
         rows=[row.name for row in rows],
     )
 
 
 def _ill_conditioned(rows, rank):
     return SingularProgram(
-        f"Whether the rows {', '.join(row.name for row in rows)} are independent cannot be told in double precision: "
-        f"the smallest pivot that counts is {rank.kept:.2e}, the largest that does not {rank.dropped:.2e}.",
-        f"An equilibrated pivot is zero (below {NOISE:.0e}) or resolved (above {RESOLVED:.0e}).",
-        do="Move the parameters away from the singular case, or state the singular case exactly.",
+        f"Double precision cannot decide whether the rows {', '.join(row.name for row in rows)} are independent: the "
+        f"smallest pivot that counts is {rank.kept:.2e}, the largest that does not {rank.dropped:.2e}.",
+        f"An equilibrated pivot must be zero (below {NOISE:.0e}) or resolved (above {RESOLVED:.0e}).",
+        do="Move the parameters away from the singular case, or set them to the singular case exactly.",
+        rows=[row.name for row in rows],
         kept=rank.kept,
         dropped=rank.dropped,
     )
-
-
-def as_rows(q, named, kind, context):
-    """Rows of named residuals with their true orders."""
-    rows = [Row(e, max(q.order(e), 0), name, kind, uses={name: 0}) for name, e in named.items()]
-    settled = settle_alone(q, rows, context)
-    for row, slopes in settled:
-        if row.order < 0:
-            raise SpecificationError(
-                f"The residual {row.name!r} depends on no coordinate.",
-                "A constraint restricts the motion.",
-                do="Use the symbols of the mechanism's coordinates.",
-                name=row.name,
-            )
-        _refuse_square(q, row, context, slopes)
-    return [row for row, _ in settled]
-
-
-def _refuse_square(q, row, context, slopes=None):
-    """Refuse a residual whose gradient vanishes where the residual does: φ² = 0 and its like.
-
-    A gradient without the highest jets is as large on the solutions, which determine these alone, as elsewhere; and
-    so is an entry that holds no coordinate. `slopes` are the values of the gradient at the points, where known.
-    """
-    slope = row.gradient(q)
-    if row.order > 0 and q.order(slope) < row.order:
-        return
-    if slopes is not None:
-        sizes, columns = np.abs(slopes), slope.sparsity().get_triplet()[1]
-        clear = np.all(sizes > VANISHED * sizes.max(axis=0), axis=1)
-        if any(clear[i] and q.order(e) < 0 for i, e in zip(columns, slope.nonzeros(), strict=True)):
-            return
-    start = sample(q, [], row.order, context)
-    flow = Flow(q, [row], row.order, start)
-    z, residual = solve(flow, start.t, start.z, iterations=SQUARE_STEPS)
-    sizes = []
-    for jets in (start.z, z):
-        values, _ = replace(start, z=jets).matrix(row.gradient(q))
-        sizes.append(np.abs(values).max(axis=(0, 1)))
-    solved = residual < SOLVED
-    if solved.any() and np.all(sizes[1][solved] < VANISHED * sizes[0][solved]):
-        if not _regular_nearby(flow, start.t[solved], z[:, solved]):
-            raise _vanishing_gradient(row)
-
-
-def _regular_nearby(flow, t, z):
-    """Whether a gradient is small on a row's solutions z only as all is small there: it is no smaller than beside them.
-
-    Newton's method has converged at a regular solution; at that of a square its steps only halve the way.
-    """
-    residual, slopes = flow(t, z)
-    beside = z * (1.0 + np.random.default_rng(POINTS_SEED).uniform(-BESIDE, BESIDE, z.shape))
-    here, there = np.abs(slopes[0]).max(axis=0), np.abs(flow(t, beside)[1][0]).max(axis=0)
-    with np.errstate(all="ignore"):
-        steps = np.abs(residual[0] * slopes[0]) / (slopes[0] ** 2).sum(axis=0)
-    converged = np.all(steps <= VANISHED * np.abs(z), axis=0)
-    return bool(np.any(converged & (here > VANISHED * there)))

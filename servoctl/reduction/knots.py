@@ -1,4 +1,4 @@
-"""Where paths switch, and how smooth residuals are there, found from the expressions themselves."""
+"""Instants at which paths switch, and the smoothness of residuals there, from the expressions themselves."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -12,14 +12,14 @@ from servoctl.jets.series import Series
 from servoctl.jets.tape import Tape
 
 MOST_BRANCHES = 24  # affine pieces that are followed through one operation
-SCAN = 801  # instants at which switches that are not affine in t are looked for
-BISECTIONS = 60  # halvings of an interval between two of them: all digits of a double
-SAME_INSTANT = 1e-9  # of the time between the first and the last switch: closer ones are one
-WIDE, NARROW = 1e-4, 1e-7  # distances of series from an instant, of its neighbourhood
-JUMP = 1e-6  # of the largest value that a derivative takes nearby: smaller jumps are rounding
-STAYS = 0.5  # of the difference of far series is left between close ones at a jump; else it falls with the distance
-AROUND = np.setdiff1d(np.linspace(-1.0, 1.0, 41), [0.0])  # where a derivative's size is taken, of the neighbourhood
-EXTRA = 4  # coefficients beyond those needed, by which series are shifted to the instant itself
+SCAN = 801  # instants of a scan for switches that are not affine in t
+BISECTIONS = 60  # halvings of an interval of the scan: all digits of a double
+SAME_INSTANT = 1e-9  # switches closer than this fraction of the time from first to last are one
+WIDE, NARROW = 1e-4, 1e-7  # distances of far and close series from an instant, relative to its neighbourhood
+JUMP = 1e-6  # jumps below this fraction of the largest value of a derivative nearby are rounding errors
+STAYS = 0.5  # a jump keeps more than this fraction of its size from far to close series; other differences shrink
+AROUND = np.setdiff1d(np.linspace(-1.0, 1.0, 41), [0.0])  # places in the neighbourhood for the size of a derivative
+EXTRA = 4  # additional coefficients for shifting series to the instant itself
 ALONE = 0.5  # s, the neighbourhood of a single switch
 
 
@@ -32,7 +32,7 @@ class Knots:
     times : tuple of float
         Ascending [s].
     classes : dict of str to list of (float, int)
-        For each residual the instants at which it is not smooth, with the class C^k that it has there.
+        For each residual the instants at which it is not smooth, with its class C^k there.
     """
 
     times: tuple
@@ -40,7 +40,7 @@ class Knots:
 
 
 class Switches:
-    """The switches of residuals that depend on nothing but t and parameters.
+    """The switches in residuals that depend on t and parameters alone.
 
     Parameters
     ----------
@@ -48,11 +48,11 @@ class Switches:
     residuals : dict of str to SX
     parameters : tuple of SX
     timed : list of (int, int or None), optional
-        Sides of the switches, as nodes of the tape, where they are known.
+        Sides of the switches, as nodes of the tape; they are searched by default.
     """
 
     def __init__(self, q, residuals, parameters, timed=None):
-        self.q, self.residuals, self._given = q, residuals, (q, residuals, parameters)
+        self.q, self.residuals, self._arguments = q, residuals, (q, residuals, parameters)
         self.symbols = ca.symvar(ca.vertcat(*residuals.values()))
         self.parameters = [p.element_hash() for p in parameters]
         self.timed = timed
@@ -60,7 +60,7 @@ class Switches:
             self.timed = self._timed() if any(s.element_hash() == q.t.element_hash() for s in self.symbols) else []
 
     def __reduce__(self):
-        return Switches, (*self._given, self.timed)
+        return Switches, (*self._arguments, self.timed)
 
     @cached_property
     def tape(self):
@@ -68,7 +68,7 @@ class Switches:
         return Tape(self.symbols, list(self.residuals.values()))
 
     def _timed(self):
-        """Switches of the tape that depend on t, and not on jets."""
+        """The sides of switches that depend on t and not on jets."""
         depends = []
         for node in self.tape.nodes:
             if node.kind == "input":
@@ -89,11 +89,13 @@ class Switches:
         ----------
         values : (n_p,) array
         span : (t0, t1), optional
-            Also look there for switches that are not affine in t.
+            A span that is scanned for switches that are not affine in t.
         """
         if not self.timed:
             return []
-        pieces = self._affine(values)
+        pieces = []
+        for node in self.tape.nodes:
+            pieces.append(self._pieces(node, pieces, values))
         instants = set()
         for a, b in self.timed:
             for c0, c1 in pieces[a] or ():
@@ -107,14 +109,8 @@ class Switches:
         width = max(times[-1] - times[0], SAME_INSTANT) if times else 1.0
         return [t for i, t in enumerate(times) if i == 0 or t - times[i - 1] > SAME_INSTANT * width]
 
-    def _affine(self, values):
-        """For each node the affine pieces (c0, c1) that it may take, or None where one is not affine."""
-        pieces = []
-        for node in self.tape.nodes:
-            pieces.append(self._pieces(node, pieces, values))
-        return pieces
-
     def _pieces(self, node, pieces, values):
+        """The affine pieces c0 + c1 t that a node may take, from those of earlier nodes; None if one is not affine."""
         if node.kind == "input":
             place = self.q.where(self.symbols[node.data])
             if place is None:
@@ -140,7 +136,7 @@ class Switches:
         return result if 0 < len(result) <= MOST_BRANCHES else None
 
     def _scan(self, values, t0, t1, known):
-        """Instants between t0 and t1, beside the known ones, at which a switch changes sides, by bisection."""
+        """Instants between t0 and t1 at which a switch changes sides, except near known ones, by bisection."""
 
         def sides(t):
             c = self._run(t, values, 1).c
@@ -161,6 +157,7 @@ class Switches:
         return instants
 
     def _run(self, t, values, depth):
+        """The series of the residuals at times t, to so many coefficients."""
         t = np.asarray(t, dtype=np.longdouble)
         inputs = []
         for i, s in enumerate(self.symbols):
@@ -170,7 +167,8 @@ class Switches:
             elif place[0] == "t":
                 first = t
             else:
-                first = np.longdouble(0.3 + 0.1 * ((7 * i) % 10))  # of jets that no switch depends on: any number
+                # No switch depends on jets; these values keep divisions by them from zero.
+                first = np.longdouble(0.3 + 0.1 * ((7 * i) % 10))
             inputs.append([first, *(float(k == 1 and place is not None and place[0] == "t") for k in range(1, depth))])
         series = Series(self.tape, inputs)
         with np.errstate(all="ignore"):
@@ -184,12 +182,12 @@ class Switches:
         Parameters
         ----------
         needs : dict of str to int
-            Derivatives that are used of each residual; higher ones are not looked at.
+            Highest derivative of each residual that is inspected.
 
         Returns
         -------
         dict of str to list of (time, class)
-            Instants at which a derivative of order <= need jumps; the class is that order less one.
+            Instants at which such a derivative jumps; the class is the order of the lowest of them less one.
         """
         if not times:
             return {}
@@ -217,7 +215,7 @@ def jump(before, after, h):
     ------|--------------------|--------------------|------> t
          -h     shifted to     0     shifted to     h
 
-    Where the function is smooth, the two shifted series differ by what they leave out, which falls with h; a jump
+    Where the function is smooth, the shifted series differ by their truncation errors, which fall with h; a jump
     does not.
 
     Parameters
@@ -235,7 +233,7 @@ def jump(before, after, h):
 
 
 def _neighbourhood(times, i):
-    """How far to look on either side of an instant: to half the way to the nearest other, where there is one."""
+    """Width of the neighbourhood of an instant: half the distance of the nearest other instant, if there is one."""
     distances = [abs(times[j] - times[i]) for j in (i - 1, i + 1) if 0 <= j < len(times)]
     return 0.5 * min(distances) if distances else ALONE
 
@@ -267,31 +265,26 @@ _PIECE = {
 
 
 def require_smooth(switches, values, needs, span=None):
-    """The knots of a program, after refusing a path that is not smooth enough.
+    """The knots of paths that have the class that each residual needs, a dict by name.
 
     Raises
     ------
     SpecificationError
-        "needs C^4, has C^2 at t = 3.0".
+        If a path has a lower class at an instant, such as C^2 instead of C^4 at t = 3 s.
     """
     times = switches.times(values, span)
     classes = switches.classes(values, needs, times)
     for name, instants in classes.items():
         when, k = min(instants, key=lambda pair: pair[1])
         if k < needs.get(name, 0):
-            raise _too_rough(name, needs[name], k, when)
+            what = f"The path in {name!r}" if isinstance(name, str) else str(name).capitalize()
+            raise SpecificationError(
+                f"{what} needs C^{needs[name]}, has {f'C^{k}' if k >= 0 else 'a jump'} at t = {when:.6g}.",
+                f"The actuation contains its derivative {needs[name]}, which must be continuous.",
+                do=f"Use sv.paths.rest_to_rest(..., smoothness={needs[name]}), or a spline of that class.",
+                name=str(name),
+                needs=needs[name],
+                has=k,
+                t=when,
+            )
     return Knots(tuple(times), classes)
-
-
-def _too_rough(name, need, k, when):
-    what = f"The path in {name!r}" if isinstance(name, str) else str(name).capitalize()
-    has = f"C^{k}" if k >= 0 else "a jump"
-    return SpecificationError(
-        f"{what} needs C^{need}, has {has} at t = {when:.6g}.",
-        f"The actuation holds derivative {need} of it, which must be continuous.",
-        do=f"Give sv.paths.rest_to_rest(..., smoothness={need}), or a spline of that class.",
-        name=str(name),
-        needs=need,
-        has=k,
-        t=when,
-    )

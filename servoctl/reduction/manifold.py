@@ -1,8 +1,8 @@
-"""Points on the constraint manifold: jets that satisfy rows and their derivatives, to extended precision.
+"""Points on the constraint manifold: jets that satisfy rows and their derivatives, in extended precision.
 
-Ranks are decided here and not at arbitrary points, where equations look more independent than they are on
-their own solutions. A point is found by Gauss-Newton on all levels at once, from a seeded random start about
-the guess; residuals are evaluated by numerical Taylor arithmetic in extended precision.
+Ranks are decided at such points, since at arbitrary points equations look more independent than they are on their
+solutions. The Gauss-Newton method solves all levels at once, from seeded random starts about the guess; residuals
+are evaluated by numerical Taylor arithmetic in extended precision.
 """
 
 from dataclasses import dataclass, field, replace
@@ -11,20 +11,20 @@ from math import factorial
 import casadi as ca
 import numpy as np
 
-from servoctl.jets.flow import Flow
-from servoctl.jets.scalars import REAL, Book
+from servoctl.jets.series import Flow
+from servoctl.jets.tape import REAL, Book
 from servoctl.tolerances import CUTOFF
 
-ROUNDED = 8 * float(np.finfo(REAL).eps)  # a scaled residual below this is rounding
-ROUNDED_STEP = 1e-15  # a step from below this is worth one trial: shorter ones gain nothing
-WELL_CONDITIONED = 1e-3  # Cholesky pivots of A Aᵀ with unit diagonal above it: Newton's steps need no singular values
+ROUNDED = 8 * float(np.finfo(REAL).eps)  # a scaled residual below this is a rounding error
+ROUNDED_STEP = 1e-15  # a step from a residual below this is tried once; shortening it gains nothing
+WELL_CONDITIONED = 1e-3  # Cholesky pivots of A Aᵀ, of unit diagonal, above which steps need no singular values
 LEVEL_SOLVED = 1e-17  # relative step below which a level is solved
-ON_MANIFOLD = 1e-13  # scaled residual of a point that is kept: far below ENTRY, so that zeros show
-GAUSS_NEWTON_STEPS = 60  # Gauss-Newton steps on all levels together
+ON_MANIFOLD = 1e-13  # largest scaled residual of a point: far below ENTRY, so that zeros show
+GAUSS_NEWTON_STEPS = 60  # on all levels together
 COORDINATE_STEPS, JET_STEPS = 8, 2  # Newton steps for q, and for a level of jets, where rows are mostly affine
-SHORTENINGS = 12  # of a step, each to a quarter, before a point is given up
-SPREAD = 0.1  # relative width of starts about a guess, in its own size and in that usual for a value near zero
-POINTS = 5  # at which ranks are decided; as many starts again where one of the first fails
+SHORTENINGS = 12  # quarterings of a step before the search from a start ends
+SPREAD = 0.1  # relative width of starts about a guess, whose size is its value plus its usual size
+POINTS = 5  # at which ranks are decided; with as many further starts where one of the first fails
 POINTS_SEED = 1907  # of the random starts
 
 
@@ -41,9 +41,9 @@ class Points:
     parameters : tuple of SX
     values : (n_p,) array
     residual : (N,) array
-        Largest scaled residual that is left at each point.
+        Largest scaled residual at each point.
     book : Book
-        Of what was read.
+        Tapes of the scalars that were evaluated.
     """
 
     q: object
@@ -53,7 +53,7 @@ class Points:
     values: np.ndarray
     residual: np.ndarray
     book: Book = field(default_factory=Book, repr=False, compare=False)
-    _found: dict = field(default_factory=dict, init=False, repr=False, compare=False)
+    _values: dict = field(default_factory=dict, init=False, repr=False, compare=False)
 
     def __repr__(self):
         return f"Points({len(self.t)} points, jets up to order {self.level})"
@@ -76,13 +76,13 @@ class Points:
         """Values and sizes of SX scalars at the points: two arrays (len, N)."""
         result = np.empty((2, len(expressions), len(self.t)), dtype=REAL)
         for scalars, sources, targets in self.book.find(self.q, self.parameters, expressions):
-            if scalars not in self._found:
-                self._found[scalars] = scalars.evaluate(self.t, self.z, self.values)
-            result[:, targets] = self._found[scalars][:, sources]
+            if scalars not in self._values:
+                self._values[scalars] = scalars.evaluate(self.t, self.z, self.values)
+            result[:, targets] = self._values[scalars][:, sources]
         return result[0], result[1]
 
     def read(self, expressions):
-        """Read SX scalars together that will be needed one after the other."""
+        """Put SX scalars on one tape that will be evaluated one after the other."""
         self.book.find(self.q, self.parameters, expressions)
 
     def matrix(self, expression):
@@ -105,13 +105,13 @@ class Points:
     def take(self, keep):
         """Some of the points."""
         some = replace(self, t=self.t[keep], z=self.z[:, keep], residual=self.residual[keep])
-        some._found.update((scalars, values[:, :, keep]) for scalars, values in self._found.items())
+        some._values.update((scalars, values[:, :, keep]) for scalars, values in self._values.items())
         return some
 
 
 @np.errstate(all="ignore")  # trial steps may leave the domain of the rows: what is not finite is no improvement
 def solve(flow, t, z, iterations=GAUSS_NEWTON_STEPS):
-    """Move jets onto the manifold of a flow's rows: level by level, then by damped Gauss-Newton on all levels.
+    """Solve a flow's rows for jets: level by level, then by damped Gauss-Newton steps on all levels.
 
     Parameters
     ----------
@@ -123,7 +123,7 @@ def solve(flow, t, z, iterations=GAUSS_NEWTON_STEPS):
     -------
     z : (nz, N) array
     residual : (N,) array
-        Largest residual left, each relative to the size of its gradient times that of the jets.
+        Largest residual, each relative to the size of its gradient times that of the jets.
     """
     z, t = np.array(z, dtype=REAL), np.asarray(t, dtype=REAL)
     if not len(flow.equations):
@@ -153,7 +153,7 @@ def solve(flow, t, z, iterations=GAUSS_NEWTON_STEPS):
 
 
 def _search(flow, t, z, step, scale, residual):
-    """The longest of a sequence of shortened steps that lessens the residual, point by point."""
+    """For each point the longest of ever shorter steps that reduces the residual, and whether one does."""
     longest = np.max(np.abs(step) / (1.0 + np.abs(z)), axis=0)
     damping, before = 1.0 / np.maximum(1.0, longest), np.max(np.abs(residual) / scale, axis=0)
     trial, open_ = z + damping * step, np.arange(len(t))
@@ -171,9 +171,9 @@ def _search(flow, t, z, step, scale, residual):
 
 
 def _solve_level(flow, t, z, level, scales):
-    """Newton's method for γ^(level) alone, lower jets fixed: exact in a step where the rows are affine there.
+    """Newton's method for γ^(level) with fixed lower jets; one step is exact where the rows are affine in γ^(level).
 
-    Changes z, and the rows of `scales` that belong to the level: the size of their gradients times that of the jets.
+    Changes z, and the scales of the level's rows in place.
     """
     rows = np.flatnonzero(flow.levels == level)
     nq, n = flow.q.nq, flow.q.n
@@ -201,7 +201,7 @@ def _norms(residual, scales):
 
 
 def _least_steps(jacobian, residual):
-    """Steps of least length to where the linearised residual vanishes, (nz, N); zero where this is not finite."""
+    """Steps of least length to zeros of the linearised residual, (nz, N); zero where these are not finite."""
     a = np.moveaxis(jacobian, 2, 0)
     scale = np.sqrt((a**2).sum(axis=2))
     scale[~(scale > 0)] = 1.0
@@ -211,7 +211,7 @@ def _least_steps(jacobian, residual):
 
 
 def _least_step(a, b):
-    """The step of least length at one point, by singular values where the normal equations lose digits."""
+    """The step of least length at one point, by singular values if the normal equations are ill-conditioned."""
     if not (np.all(np.isfinite(a)) and np.all(np.isfinite(b))):
         return np.zeros(a.shape[1])
     steps = _normal_steps(a[None], b[None])
@@ -244,14 +244,14 @@ def sample(q, rows, level, context, starts=None, flow=None):
     context : Context
         Parameters and their values, the window of times, the guess.
     starts : Points, optional
-        Earlier points: their jets are starts, beside random ones.
+        Earlier points, whose jets are starts beside random ones.
     flow : Flow, optional
-        Of the same rows and level, from an earlier call.
+        A flow of the same rows and level.
 
     Returns
     -------
     Points
-        Those that were found, at most `POINTS`; none if no start converged.
+        At most `POINTS`; none if no start converges.
     """
     t, z = _random_starts(q, level, context)
     if starts is not None and len(starts.t):
@@ -282,7 +282,7 @@ def _random_starts(q, level, context):
 
 
 def _solved(starting, flow, some):
-    """Those of some starting points that Newton's method brings onto the manifold."""
+    """The points of the manifold to which Newton's method converges from some of the starting points."""
     z, residual = solve(flow, starting.t[some], starting.z[:, some])
     points = replace(starting, t=starting.t[some], z=z, residual=residual.astype(float))
     return points.take(np.flatnonzero(residual < ON_MANIFOLD))
@@ -290,22 +290,22 @@ def _solved(starting, flow, some):
 
 @dataclass(frozen=True)
 class Context:
-    """What sampling needs to know.
+    """Where points are sampled, and with which parameters.
 
     Attributes
     ----------
     parameters : tuple of SX
     values : (n_p,) array
     window : (t0, t1)
-        Times are drawn from it [s].
+        Window of the times [s].
     guess : dict of str to float
-        Values of jets about which points are looked for.
+        Values of jets about which points are searched.
     spread : float
-        Of the starts about guessed values, relative.
+        Relative width of the starts about guessed values.
     sizes : dict of str to float
-        What a guessed value near zero is small against; 1 where it is not given.
+        Usual sizes of jets, by which a guess near zero is spread; default 1 each.
     book : Book
-        Of what was read.
+        Tapes of the scalars that were evaluated.
     """
 
     parameters: tuple

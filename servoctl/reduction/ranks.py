@@ -1,17 +1,25 @@
-"""Rank decisions at points of the constraint manifold: zero is a number, and its size is known.
+"""Ranks at points of the constraint manifold, and symbolic elimination with pivots chosen at such points.
 
-Entries far below the size of the terms that made them are zero; the rest is equilibrated, so that units do not
-matter, and eliminated with complete pivoting in extended precision where the platform has it. A pivot is then
-zero (rounding of extended precision), or resolvable in double precision, or between: ill-conditioned.
+Entries far below the size of their terms are zero. The rest is equilibrated, so that units do not matter, and
+eliminated with complete pivoting, in extended precision where the platform has it. A pivot is then zero (rounding of
+extended precision), or resolved in double precision, or between these: ill-conditioned.
+
+Symbolic elimination keeps its pivots for all later instants: it takes the pivot with the least fill-in (Markowitz)
+among those of sufficient size at the points, and leaves out entries that vanish at all of them. It returns the
+pivots, whose size along a motion shows when the choice has become bad.
 """
 
 from dataclasses import dataclass
 
+import casadi as ca
 import numpy as np
 
+from servoctl.errors import SingularProgram
+from servoctl.jets.tape import divide, multiply, subtract
 from servoctl.tolerances import CUTOFF, ENTRY, NOISE, REFINEMENTS, RESOLVED, TINY
 
-SWEEPS = 6  # of equilibration, each takes the root of what is left: entries of 1e±30 come within a factor of 3
+THRESHOLD = 0.1  # least size of a pivot, relative to the largest entry of its equilibrated row
+SWEEPS = 6  # of equilibration; each takes the square root of the remaining factors: 1e±30 comes within a factor of 3
 
 
 @dataclass(frozen=True)
@@ -22,11 +30,11 @@ class Rank:
     ----------
     rank : int
     kept : float
-        Smallest equilibrated pivot that counts (inf if none).
+        Smallest equilibrated pivot that counts; inf if none does.
     dropped : float
-        Largest equilibrated pivot that does not count (0 if none).
+        Largest equilibrated pivot that does not count; 0 if all do.
     rows, columns : tuple of int
-        The pivots' places, best first.
+        Places of the pivots, largest first.
     """
 
     rank: int
@@ -42,7 +50,7 @@ class Rank:
 
 
 def clean(values, sizes):
-    """Values with every entry that is rounding in the size of its terms set to zero."""
+    """Values with zeros for all entries that are rounding errors of their terms, whose sizes are given."""
     return np.where(np.abs(values) <= ENTRY * sizes, 0.0, values)
 
 
@@ -70,34 +78,25 @@ def equilibrate(matrix):
 
 
 def column_sizes(matrix):
-    """Largest entries of the columns of a matrix (m, n, ...) whose rows are divided by their own: (n, ...) array."""
+    """Largest entries (n, ...) of the columns of a matrix (m, n, ...) whose rows are scaled to largest entry 1."""
     rows = np.abs(matrix).max(axis=1, keepdims=True, initial=0.0)
     return np.abs(matrix / np.where(rows > 0, rows, 1.0)).max(axis=0, initial=0.0)
 
 
 def decide(matrix, resolved=RESOLVED):
-    """The rank of one matrix, by equilibration and complete pivoting.
-
-    Parameters
-    ----------
-    matrix : (m, n) array, entries cleaned
-    resolved : float
-        Pivots above it count.
-
-    Returns
-    -------
-    Rank
-    """
+    """The rank of one matrix (m, n); see `decide_each`."""
     return decide_each(np.asarray(matrix)[:, :, None], resolved)[0]
 
 
 def decide_each(matrices, resolved=RESOLVED):
-    """The rank of each of N matrices (see `decide`).
+    """The rank of each of N matrices, by equilibration and complete pivoting.
 
     Parameters
     ----------
     matrices : (m, n, N) array
         With entries cleaned.
+    resolved : float, optional
+        Equilibrated pivots above it count.
 
     Returns
     -------
@@ -128,7 +127,7 @@ def decide_each(matrices, resolved=RESOLVED):
 
 
 def decide_all(values, sizes):
-    """The generic rank over several points: that of the point with the highest rank, then the clearest.
+    """The generic rank over several points: the highest rank, at the clearest point that has it.
 
     Parameters
     ----------
@@ -140,7 +139,7 @@ def decide_all(values, sizes):
     Rank
         `kept` is the smallest over the points of that rank, `dropped` the largest over all points.
     index : int
-        The point with the largest smallest kept pivot.
+        The point of that rank whose smallest kept pivot is largest.
     """
     return generic(decide_each(clean(values, sizes)))
 
@@ -156,7 +155,7 @@ def generic(ranks):
 
 
 def combination(rows, target):
-    """Coefficients c with c @ rows = target, and what is left over, relative to the target.
+    """Coefficients c with c @ rows = target, and the residual relative to the target.
 
     Parameters
     ----------
@@ -166,12 +165,12 @@ def combination(rows, target):
     Returns
     -------
     c : (m,) array
-    left : float
+    residual : float
     """
     scaled, row_factors, _ = equilibrate(np.vstack([rows, target[None, :]]))
-    c, left = refined(scaled[:-1], scaled[-1], CUTOFF)
+    c, residual = refined(scaled[:-1], scaled[-1], CUTOFF)
     largest = float(np.abs(scaled[-1].astype(float)).max(initial=0.0))
-    return c * (row_factors[:-1] / row_factors[-1]).astype(float), left / max(largest, TINY)
+    return c * (row_factors[:-1] / row_factors[-1]).astype(float), residual / max(largest, TINY)
 
 
 def refined(rows, target, cutoff):
@@ -184,9 +183,9 @@ def refined(rows, target, cutoff):
 
 
 def solve_clean(matrix, right):
-    """Solve A X = B in extended precision, with every difference that is rounding in its terms set to zero.
+    """Solve A X = B in extended precision, with zeros for all differences that are rounding errors of their terms.
 
-    What vanishes in exact arithmetic is then zero in the solution.
+    Entries that vanish in exact arithmetic are then zero in the solution.
 
     Parameters
     ----------
@@ -213,6 +212,134 @@ def solve_clean(matrix, right):
 
 
 def _difference(a, b):
-    """a - b, zero where it is rounding."""
+    """a - b, zero where it is a rounding error."""
     result = a - b
     return np.where(np.abs(result) <= ENTRY * (np.abs(a) + np.abs(b)), 0.0, result)
+
+
+def eliminate(matrix, right, numbers):
+    """Solve A X = B symbolically.
+
+    Parameters
+    ----------
+    matrix : (n, n) SX
+    right : (n, m) SX
+    numbers : (n, n, N) array
+        A at N points, cleaned of rounding.
+
+    Returns
+    -------
+    solution : (n, m) SX
+    pivots : list of SX scalars
+        In the order of elimination.
+
+    Raises
+    ------
+    SingularProgram
+        If A is singular at a point.
+    """
+    n, m = right.shape
+    system = _System(matrix, right, numbers)
+    order = [system.step() for _ in range(n)]
+    solution, rows, rhs = [None] * n, system.rows, system.rhs
+    for i, j in reversed(order):
+        others = [(a, solution[c]) for c, (a, _) in rows[i].items() if c != j]
+        solution[j] = [_back(rhs[i][k], [(a, x[k]) for a, x in others], rows[i][j][0]) for k in range(m)]
+    pivots = [rows[i][j][0] for i, j in order]
+    if m != 1:
+        return ca.vertcat(*(ca.horzcat(*row) for row in solution)) if m else ca.SX(n, 0), pivots
+    return ca.vertcat(*(row[0] for row in solution)), pivots
+
+
+class _System:
+    """A system under elimination.
+
+    `rows` has for each row its entries by column, an SX scalar with its equilibrated numbers, and `candidates` the
+    columns whose entries may be pivots; `open` lists the rows that were no pivot rows yet, `members` those of a column.
+    """
+
+    def __init__(self, matrix, right, numbers):
+        n = matrix.shape[0]
+        scaled = np.moveaxis(equilibrate(np.moveaxis(numbers, 2, 0))[0], 0, 2).astype(float)
+        entries = dict(zip(zip(*matrix.sparsity().get_triplet(), strict=True), matrix.nonzeros(), strict=True))
+        self.rows = [{} for _ in range(n)]
+        for i, j in zip(*(places.tolist() for places in np.nonzero(np.any(scaled, axis=2))), strict=True):
+            self.rows[i][j] = entries[i, j], scaled[i, j]
+        self.rhs = (
+            [right[i, :].elements() for i in range(n)] if right.shape[1] != 1 else [[b] for b in right.elements()]
+        )
+        self.open = dict.fromkeys(range(n))
+        self.members = [{} for _ in range(n)]
+        for i, row in enumerate(self.rows):
+            for j in row:
+                self.members[j][i] = None
+        self.candidates = [self._large(row) for row in self.rows]
+
+    @staticmethod
+    def _large(row):
+        """The candidates of a row: a size is the smallest over the points."""
+        if not row:
+            return []
+        sizes = np.abs([number for _, number in row.values()]).min(axis=1).tolist()
+        least = THRESHOLD * max(sizes)
+        return [(j, size) for j, size in zip(row, sizes, strict=True) if size >= least and size > 0.0]
+
+    def step(self):
+        """Eliminate by the pivot with the least fill-in, and return its row and column."""
+        i, j = self._pivot()
+        row = self.rows[i]
+        del self.open[i]
+        for c in row:
+            del self.members[c][i]
+        for r in self.members[j]:
+            self._subtract(r, row, self.rhs[i], j)
+            self.candidates[r] = self._large(self.rows[r])
+        self.members[j] = {}
+        return i, j
+
+    def _pivot(self):
+        least, place = None, None
+        for i in self.open:
+            fill = len(self.rows[i]) - 1
+            for j, size in self.candidates[i]:
+                key = (fill * (len(self.members[j]) - 1), -size)
+                if least is None or key < least:
+                    least, place = key, (i, j)
+        if place is None:
+            raise SingularProgram(
+                "A system of equations is singular at the points where its pivots are chosen.",
+                "Elimination needs equations of full rank.",
+                do="Pass guess={...} near the motion to derive.",
+                rows=list(self.open),
+            )
+        return place
+
+    def _subtract(self, r, pivot_row, pivot_right, j):
+        row, right, (pivot, number) = self.rows[r], self.rhs[r], pivot_row[j]
+        entry, entry_number = row.pop(j)
+        factor, factor_number = divide(entry, pivot), entry_number / number
+        for c, (a, a_number) in pivot_row.items():
+            if c == j:
+                continue
+            old, old_number = row.get(c, (_ZERO, 0.0))
+            change = factor_number * a_number
+            new = old_number - change
+            if (np.abs(new) <= ENTRY * (np.abs(old_number) + np.abs(change))).all():
+                if row.pop(c, None) is not None:
+                    del self.members[c][r]
+            else:
+                row[c] = (subtract(old, multiply(factor, a)), new)
+                self.members[c][r] = None
+        for k, b in enumerate(pivot_right):
+            if not b.is_zero():
+                right[k] = subtract(right[k], multiply(factor, b))
+
+
+_ZERO = ca.SX(0)
+
+
+def _back(value, terms, pivot):
+    for a, x in terms:
+        if not x.is_zero():
+            value = subtract(value, multiply(a, x))
+    return value if value.is_zero() else divide(value, pivot)

@@ -8,29 +8,28 @@ import numpy as np
 
 from servoctl.checks import finite, mapping
 from servoctl.errors import NotRealisable, SpecificationError, unknown
-from servoctl.jets.flow import Flow
+from servoctl.jets.series import Flow
 from servoctl.reduction.appell import Realisation, realisation, require_inertia
-from servoctl.reduction.hidden import as_rows, complete
+from servoctl.reduction.hidden import complete
 from servoctl.reduction.knots import Knots, Switches, require_smooth
 from servoctl.reduction.manifold import Context, Points, sample
-from servoctl.reduction.orders import settle_alone
 from servoctl.reduction.ranks import Rank, clean, decide, decide_all
-from servoctl.reduction.row import Balance, Row, merge_uses
+from servoctl.reduction.rows import Balance, Row, as_rows, merge_uses, settle_alone
 from servoctl.spec.mechanism import Mechanism, require_known
 from servoctl.spec.program import Program
 from servoctl.tolerances import TINY
 
-NEARBY = 0.01  # s about an instant for which pivots are chosen: at the instant alone, accidents look like laws
+NEARBY = 0.01  # s about an instant for which pivots are chosen; at that instant itself entries may vanish by accident
 NEAR_SPREAD = 1e-3  # relative width of the points about a state for which pivots are chosen
 WINDOW = (0.1, 1.1)  # s, where points are drawn if nothing switches; t = 0 is too often a special instant
 LONE_WINDOW = 1.0  # s on either side of a single switch
-INSET = 0.07  # of the time between the first and the last switch is left out at both ends, where paths begin and end
-HELD = 1e-9  # of the size of its terms: what may be left of a residual at points where the rows hold
+INSET = 0.07  # fraction of the time from first to last switch left out at both ends, where paths are nearly at rest
+HELD = 1e-9  # residual, relative to the size of its terms, at points where a reduction still holds
 
 
 @dataclass(frozen=True)
 class Reduction:
-    """The rows ψ_a = 0 of a motion, hidden constraints among them, and where the actuation comes from.
+    """The rows ψ_a = 0 of a motion, with its hidden constraints, and who realises the program.
 
     Attributes
     ----------
@@ -40,15 +39,15 @@ class Reduction:
         n rows, program rows first, then material ones, then those of (3.18).
     realisation : Realisation
     rank : Rank
-        Of the leading matrix of the rows, with its margins.
+        Rank of the leading matrix of the rows, with its margins.
     points : Points
         Seeded points on the manifold of the rows and their derivatives.
-    guards : tuple of (str, SX)
-        Pivots by which the rows divide.
+    pivots : tuple of (str, SX)
+        Pivots by which the rows divide, each with a description.
     knots : Knots
     switches : Switches
     context : Context
-    given : dict of str to Row
+    original : dict of str to Row
         Rows of the designer's residuals and material constraints, by name.
     """
 
@@ -58,11 +57,11 @@ class Reduction:
     realisation: Realisation
     rank: Rank
     points: Points
-    guards: tuple
+    pivots: tuple
     knots: Knots
     switches: Switches
     context: Context
-    given: dict
+    original: dict
 
     def __repr__(self):
         rows = ", ".join(f"{row.name} {row.order}" for row in self.rows)
@@ -70,7 +69,7 @@ class Reduction:
 
     @property
     def top(self):
-        """The common order s̄ to which every row is raised: 2 or more, and more than that of a bent row."""
+        """The common order s̄ of the differentiated rows: at least 2, and above the order of rows not affine in it."""
         return max([2, *(row.order + (not row.affine) for row in self.rows)])
 
     @property
@@ -80,17 +79,17 @@ class Reduction:
 
     @property
     def needs(self):
-        """Derivatives of each residual that the actuation holds."""
+        """The highest derivative of each residual that the actuation contains."""
         return {name: count for name, count in needs(self.rows).items() if name in self.program.residuals}
 
     @property
     def smoothness(self):
-        """The class that each residual, material constraint and force needs in time."""
+        """The class in time that each residual, material constraint and force needs."""
         return smoothness(self.switches, self.rows)
 
     @property
     def timed(self):
-        """Whether paths switch at instants."""
+        """Whether paths switch at some instants."""
         return bool(self.switches)
 
     @property
@@ -105,12 +104,12 @@ class Reduction:
 
     @cached_property
     def conditions(self):
-        """What `holds` looks at: L, Bᵀ, and then the residuals with their derivatives, and the balance."""
+        """What `holds` evaluates: entries of L and Bᵀ, the residuals with their derivatives, and the balance."""
         q, B = self.mechanism.q, self.realisation.B
-        levels = (q.derivatives([row.expression], max(0, self.top - row.order)) for row in self.given.values())
-        left = [level[0] for orders in levels for level in orders]
-        free = self.mechanism.balance - B @ self.multipliers
-        return [*self.leading.nonzeros(), *B.T.nonzeros(), *left, *free.elements()]
+        orders = (q.derivatives([row.expression], max(0, self.top - row.order)) for row in self.original.values())
+        residuals = [level[0] for levels in orders for level in levels]
+        balance = self.mechanism.balance - B @ self.multipliers
+        return [*self.leading.nonzeros(), *B.T.nonzeros(), *residuals, *balance.elements()]
 
     @cached_property
     def decided(self):
@@ -119,12 +118,12 @@ class Reduction:
 
     @cached_property
     def flow(self):
-        """The rows along a motion, as `holds` puts points on their manifold."""
+        """The rows along a motion."""
         return Flow(self.mechanism.q, self.rows, self.top, self.points)
 
     @cached_property
     def multipliers(self):
-        """Multipliers of the reaction, program first, (b,) SX of t, q, γ', γ''."""
+        """Multipliers of the reaction, those of the program first, (b,) SX of t, q, γ', γ''."""
         return self.realisation.multipliers(self.mechanism.balance)
 
     @cached_property
@@ -138,26 +137,17 @@ class Reduction:
 
 
 def needs(rows):
-    """Derivatives of each residual and of the balance that γ'', and so the actuation, holds."""
+    """The highest derivative of each residual and of the balance that γ'', and so the actuation, contains."""
     return merge_uses(*((row.uses, max(0, 2 - row.order)) for row in rows))
 
 
 def smoothness(switches, rows):
-    """The class in time that each expression of the switches needs; a force that no derivative is taken of may jump."""
+    """The class in time that each expression of the switches needs; an undifferentiated balance may jump."""
     total = needs(rows)
     forces = total.pop(Balance(), 0)
     if forces:
         total |= {name: forces for name in switches.residuals if isinstance(name, Balance)}
     return total
-
-
-def _idle(row, program):
-    return NotRealisable(
-        f"The {row.name} vanishes identically on the displacements that {', '.join(program.residuals)} allow.",
-        "Eq. (3.18) determines the motion beside the program.",
-        do="State another program: this one leaves the motion open.",
-        rows=[row.name, *program.residuals],
-    )
 
 
 def reduce(mechanism, program, guess=None, near=None, values=None):
@@ -168,11 +158,11 @@ def reduce(mechanism, program, guess=None, near=None, values=None):
     mechanism : Mechanism
     program : Program
     guess : dict of str to float, optional
-        Values of coordinates or derivatives about which points of the manifold are looked for.
+        Values of coordinates or derivatives about which points of the manifold are searched.
     near : (t, jets, sizes), optional
-        An instant and dicts of jets and of their sizes along the motion: pivots are chosen there.
+        An instant at which pivots are chosen, with dicts of jets and of their sizes along the motion.
     values : (n_p,) array, optional
-        Parameters at which ranks are decided; default: the mechanism's own.
+        Parameters at which ranks are decided; default: those of the mechanism.
 
     Returns
     -------
@@ -186,40 +176,39 @@ def reduce(mechanism, program, guess=None, near=None, values=None):
     _require_parts(mechanism, program, guess)
     q = mechanism.q
     names = q.names if q.plain else q.velocity_names
-    forces = {Balance(name): r for name, r in zip(names, mechanism.balance.elements(), strict=True)}
+    forces = dict(zip(map(Balance, names), mechanism.balance.elements(), strict=True))
     switches = Switches(q, {**program.residuals, **mechanism.constraints, **forces}, mechanism.parameters.symbols)
     context = _context(mechanism, switches, guess, near, values)
     original = [
         *as_rows(q, program.residuals, "program", context),
         *as_rows(q, mechanism.constraints, "material", context),
     ]
-    constraints, points, guards = _constraints(mechanism, program, original, context)
-    split = realisation(mechanism, program, constraints, points)
-    expressions, pivots = split.dynamics(mechanism.balance)
-    guards = [*guards, *((f"choice of dependent coordinates {i + 1}", p) for i, p in enumerate(pivots))]
+    constraints, points, of_constraints = _constraints(mechanism, program, original, context)
+    realised = realisation(mechanism, program, constraints, points)
+    dynamics, of_split = realised.dynamics(mechanism.balance)
     dynamics = [
         Row(e, max(q.order(e), 0), f"balance of {names[i]}", "dynamics", uses={Balance(): 0})
-        for i, e in zip(split.independent, expressions, strict=True)
+        for i, e in zip(realised.independent, dynamics, strict=True)
     ]
     dynamics = [row for row, _ in settle_alone(q, dynamics, context)]
-    for row in dynamics:
-        if row.order < 0:
-            raise _idle(row, program)
-    rows, rank, points, more = complete(q, [*constraints, *dynamics], context, points)
+    _require_motion(dynamics, program)
+    rows, rank, points, of_rows = complete(q, [*constraints, *dynamics], context, points)
     knots = require_smooth(switches, context.values, smoothness(switches, rows))
+    of_split = [(f"choice of dependent coordinates {i}", pivot) for i, pivot in enumerate(of_split, 1)]
+    pivots = (*of_constraints, *of_split, *of_rows)
     by_name = {row.name: row for row in original}
     reduction = Reduction(
-        mechanism, program, tuple(rows), split, rank, points, (*guards, *more), knots, switches, context, by_name
+        mechanism, program, tuple(rows), realised, rank, points, pivots, knots, switches, context, by_name
     )
     _require_outputs(reduction)
     return reduction
 
 
 def holds(reduction, values):
-    """Whether a reduction, which was decided at its own parameters, is right at others as well.
+    """Whether a reduction is valid at other parameters than those at which its ranks were decided.
 
-    At points that satisfy its rows with these parameters, the given residuals and the balance must hold, too; every
-    entry that was found to be zero must still be, and every rank must be kept.
+    At points that satisfy its rows with these parameters, the original residuals and the balance must hold, too; every
+    entry that is zero in the reduction must be zero there, and every rank must be the same.
 
     Parameters
     ----------
@@ -256,6 +245,8 @@ def _require_parts(mechanism, program, guess):
                 f"Expected a {kind.__name__}, got a {type(value).__name__}.",
                 "A model is derived from a mechanism and a program, in this order.",
                 do="Write sv.derive(mechanism, program).",
+                expected=kind.__name__,
+                type=type(value).__name__,
             )
     q = mechanism.q
     for name, expression in program.residuals.items():
@@ -265,7 +256,10 @@ def _require_parts(mechanism, program, guess):
     twice = [name for name in program.residuals if name in mechanism.constraints]
     if twice:
         raise SpecificationError(
-            f"{twice[0]!r} names a residual and a material constraint.", "Their names differ.", do="Rename one of them."
+            f"A residual and a material constraint are both named {twice[0]!r}.",
+            "Names of rows differ.",
+            do="Rename one of them.",
+            name=twice[0],
         )
     known = [*q.names, *(name for k in range(1, 8) for name in q.jet_names(k))]
     for name, value in mapping(guess, "The guesses").items():
@@ -274,21 +268,38 @@ def _require_parts(mechanism, program, guess):
         finite(name, value)
 
 
-def _constraints(mechanism, program, given, context):
-    """Program and material rows, the latter of full rank, ideal ones together; points on them; pivots divided by."""
+def _constraints(mechanism, program, original, context):
+    """Program and material rows, points on their manifold, and the pivots of hidden constraints among them.
+
+    Material rows have full rank; with an ideal program all rows together have.
+    """
     q = mechanism.q
-    program_rows = [row for row in given if row.kind == "program"]
-    material, _, points, guards = complete(q, [row for row in given if row.kind == "material"], context)
+    program_rows = [row for row in original if row.kind == "program"]
+    material, _, points, pivots = complete(q, [row for row in original if row.kind == "material"], context)
     require_inertia(mechanism, material, points)
-    if program.by == "ideal":
-        constraints, _, points, guards = complete(q, [*program_rows, *material], context)
-        return constraints, points, guards
     constraints = [*program_rows, *material]
-    points = _points_for(q, constraints, points, context)
+    if program.by == "ideal":
+        constraints, _, points, pivots = complete(q, constraints, context)
+        return constraints, points, pivots
+    common = sample(q, constraints, max([2, *(row.order for row in constraints)]), context)
+    points = common if len(common.t) else points
     G = ca.vertcat(*(row.gradient(q) for row in constraints))
     if decide_all(*points.matrix(G))[0].rank < len(constraints):
+        # Hidden constraints among these rows follow with those of (3.18); here they only show contradictions.
         complete(q, constraints, context, points)
-    return constraints, points, guards
+    return constraints, points, pivots
+
+
+def _require_motion(dynamics, program):
+    """Refuse a program on whose virtual displacements a row of (3.18) vanishes."""
+    for row in dynamics:
+        if row.order < 0:
+            raise NotRealisable(
+                f"The {row.name} vanishes identically on the displacements that {', '.join(program.residuals)} allow.",
+                "Together with the program, eq. (3.18) must determine the motion.",
+                do="Choose another program; this one leaves the motion undetermined.",
+                rows=[row.name, *program.residuals],
+            )
 
 
 def _require_outputs(reduction):
@@ -298,9 +309,11 @@ def _require_outputs(reduction):
         if q.order(expression) > top:
             raise SpecificationError(
                 f"The output {name!r} has order {q.order(expression)}.",
-                f"A motion of this program has jets up to order {top}.",
-                do="Give an output of lower order, and take its derivatives from a run by method=sv.Taylor(jets=...).",
+                f"Motions of this program have jets up to order {top}.",
+                do="Use an output of lower order; sv.Taylor(jets=...) gives its derivatives along a run.",
                 name=name,
+                order=q.order(expression),
+                limit=top,
             )
 
 
@@ -317,9 +330,3 @@ def _context(mechanism, switches, guess, near, values):
         width = times[-1] - times[0]
         window = (times[0] + INSET * width, times[-1] - INSET * width)
     return Context(mechanism.parameters.symbols, values, window, guess or {})
-
-
-def _points_for(q, constraints, points, context):
-    """Points on the manifold of all constraints, or on that of the material ones where there are none."""
-    common = sample(q, constraints, max([2, *(row.order for row in constraints)]), context)
-    return common if len(common.t) else points

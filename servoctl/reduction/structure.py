@@ -7,24 +7,24 @@ which changes no rank.
 
 from collections import Counter
 from dataclasses import dataclass, replace
+from math import factorial
 
 import casadi as ca
 import numpy as np
 
-from servoctl.jets.flow import Flow
+from servoctl.jets.series import Flow
 from servoctl.reduction.manifold import solve
-from servoctl.reduction.ranks import decide, solve_clean
-from servoctl.reduction.row import Row
-from servoctl.tolerances import ENTRY
+from servoctl.reduction.ranks import clean, decide, solve_clean
+from servoctl.reduction.rows import Row
 
 INDEPENDENT = 1e-7  # equilibrated pivots of J above this count
-AT_REST = 1e-13  # of the largest jet: below this a jet is zero, not small
-DEPTHS = (2, 4, 6, 8, 12, 16, 24, 32)  # N that are tried until all zeros at infinity are found
+AT_REST = 1e-13  # a jet below this fraction of the largest is zero, not small
+DEPTHS = (2, 4, 6, 8, 12, 16, 24, 32)  # values of N, tried until J_N shows all zeros at infinity
 
 
 @dataclass(frozen=True)
 class Local:
-    """The structure at one point of a motion; see `Structure` for the names."""
+    """The structure at one point of a motion; attributes as in `Structure`."""
 
     relative_degree: tuple
     decoupling_rank: int
@@ -42,20 +42,19 @@ class Structure:
     ----------
     residuals : tuple of str
     relative_degree : tuple of int
-        First derivative of each residual that holds the actuation.
+        For each residual the lowest derivative that contains the actuation.
     decoupling_rank : int
-        Rank of the decoupling matrix; k where a vector relative degree exists.
+        Rank of the decoupling matrix P; k where a vector relative degree exists.
     zeros_at_infinity : tuple of int
-        Their orders n'_i, ascending.
+        Orders n'_i of the zeros at infinity, ascending.
     essential_orders : tuple of int
         ε_i: the path of residual i needs class C^ε_i.
     index : int or None
         Differentiation index, 1 + max n'_i; None for residuals of order above 2.
     margin : float
-        Smallest equilibrated pivot that was counted in any rank.
-    realisation : str
-        "orthogonal", "mixed" or "tangential": rank of P full, between, or zero; "undecided" if not all zeros at
-        infinity were found; "ideal".
+        Smallest equilibrated pivot that counts in any of the ranks.
+    realisation : {"orthogonal", "mixed", "tangential", "undecided", "ideal"}
+        Rank of P full, between, or zero; "undecided" if the largest N does not show all zeros at infinity.
     at : tuple of (float, Local)
         The structure at each instant [s].
     """
@@ -78,7 +77,7 @@ class Structure:
     def __repr__(self):
         k = len(self.residuals)
         if self.index is None and not self.zeros_at_infinity:
-            return "Structure: not computed, index and relative degrees are those of residuals of order 0, 1 or 2"
+            return "Structure: not computed; index and relative degrees are defined for residuals of order 0, 1 or 2"
         vector = "a vector relative degree exists" if self.decoupling_rank == k else "no vector relative degree"
         pairs = ", ".join(f"{name} {r}" for name, r in zip(self.residuals, self.relative_degree, strict=False))
         essential = ", ".join(f"{name} {r}" for name, r in zip(self.residuals, self.essential_orders, strict=False))
@@ -90,15 +89,13 @@ class Structure:
             f"  smallest pivot counted {self.margin:.1e}",
         ]
         if not self.uniform:
-            other = [(t, a) for t, a in self.at if replace(a, margin=0.0) != replace(self._typical(), margin=0.0)]
+            typical = _most_common([local for _, local in self.at])
+            other = [(t, a) for t, a in self.at if replace(a, margin=0.0) != typical]
             lines.append(
                 f"  it differs at {len(other)} of {len(self.at)} instants, first t = {other[0][0]:.4g} s: relative "
                 f"degrees {other[0][1].relative_degree}, zeros at infinity {other[0][1].zeros_at_infinity}"
             )
         return "\n".join(lines)
-
-    def _typical(self):
-        return _most_common([local for _, local in self.at])
 
 
 def structure(reduction, t=None, jets=None, values=None):
@@ -119,7 +116,7 @@ def structure(reduction, t=None, jets=None, values=None):
     Structure
     """
     names = tuple(reduction.program.residuals)
-    orders = [reduction.given[name].order for name in names]
+    orders = [reduction.original[name].order for name in names]
     if reduction.program.by == "ideal" or max(orders) > 2:
         return _by_orders(reduction, names, orders)
     points = reduction.points if t is None else _points(reduction, t, jets, values)
@@ -137,8 +134,7 @@ def structure(reduction, t=None, jets=None, values=None):
 
 
 def _most_common(locals_):
-    counts = Counter(replace(local, margin=0.0) for local in locals_)
-    return counts.most_common(1)[0][0]
+    return Counter(replace(local, margin=0.0) for local in locals_).most_common(1)[0][0]
 
 
 def _by_orders(reduction, names, orders):
@@ -154,10 +150,7 @@ def _by_orders(reduction, names, orders):
 
 def _points(reduction, t, jets, values):
     """Points of a motion from its samples."""
-    from math import factorial
-
-    q, samples = reduction.mechanism.q, np.asarray(jets, dtype=np.longdouble)
-    z = samples.copy()
+    q, z = reduction.mechanism.q, np.array(jets, dtype=np.longdouble)
     for k in range(1, (len(z) - q.nq) // q.n + 1):
         z[q.nq + (k - 1) * q.n : q.nq + k * q.n] /= factorial(k)
     sample = reduction.points
@@ -184,14 +177,11 @@ def _at_depth(reduction, points, depth):
     z, _ = solve(flow, points.t, z)
     for part in (z[: q.nq], z[q.nq :]):
         part[np.abs(part) < AT_REST * np.maximum(1.0, np.abs(part).max(axis=0))] = 0.0
-    J, sizes = _input_jacobian(reduction, points, z, depth)
     result = []
-    for p in range(len(points.t)):
-        clean = np.where(np.abs(J[..., p]) <= ENTRY * sizes[..., p], 0.0, J[..., p])
-        local = _local(clean, k, depth)
-        if local is None:
+    for J in np.moveaxis(clean(*_input_jacobian(reduction, points, z, depth)), -1, 0):
+        result.append(_local(J, k, depth))
+        if result[-1] is None:
             return None
-        result.append(local)
     return result
 
 
@@ -201,8 +191,8 @@ def _input_jacobian(reduction, points, z, depth):
     k, level, n_points = len(reduction.program.residuals), depth + 2, len(points.t)
     B = reduction.realisation.B
     inputs = ca.SX.sym("u", B.shape[1])
-    material = [row for row in reduction.given.values() if row.kind == "material"]
-    program = [reduction.given[name] for name in reduction.program.residuals]
+    material = [row for row in reduction.original.values() if row.kind == "material"]
+    program = [reduction.original[name] for name in reduction.program.residuals]
     flow = Flow(q, [], level, points)
     series = flow.series(ca.vertcat(reduction.multipliers, ca.vec(ca.densify(B))).elements(), points.t, z, depth)
     u, b = series[: B.shape[1]], series[B.shape[1] :].reshape(B.shape[1], q.n, depth + 1, n_points)
@@ -260,28 +250,20 @@ def _response(jacobian, b, plant, bound, k, depth):
     return motion.reshape(n * size, k * size)
 
 
-def _rank(matrix):
-    rank = decide(matrix, INDEPENDENT)
-    return rank.rank, rank.kept
-
-
 def _local(J, k, depth):
+    """The structure from J (k, N+1, k, N+1) at one point, or None where N is too small."""
     size = depth + 1
-    ranks, kept = [], np.inf
-    for N in range(size):
-        rank, pivot = _rank(J[:, : N + 1, :, : N + 1].reshape(k * (N + 1), k * (N + 1)))
-        ranks.append(rank)
-        kept = min(kept, pivot)
-    sigma = np.diff([0, *ranks])
+    squares = [J[:, : N + 1, :, : N + 1].reshape(k * (N + 1), k * (N + 1)) for N in range(size)]
+    ranks = [decide(square, INDEPENDENT) for square in squares]
+    sigma = np.diff([0, *(rank.rank for rank in ranks)])
     if sigma[-1] < k:
         return None
-    counts = np.diff([0, *sigma])
-    zeros = tuple(j for j, c in enumerate(counts) for _ in range(int(c)))
+    zeros = tuple(j for j, count in enumerate(np.diff([0, *sigma])) for _ in range(int(count)))
     degrees = tuple(int(np.flatnonzero(np.abs(J[i]).max(axis=(1, 2)) > 0)[0]) for i in range(k))
-    decoupling = np.array([J[i, r, :, 0] for i, r in enumerate(degrees)])
-    rank, pivot = _rank(decoupling)
+    decoupling = decide(np.array([J[i, r, :, 0] for i, r in enumerate(degrees)]), INDEPENDENT)
     essential = tuple(_essential(J, i, k, size) for i in range(k))
-    return Local(degrees, rank, zeros, essential, 1 + max(zeros), float(min(kept, pivot)))
+    margin = min(rank.kept for rank in (*ranks, decoupling))
+    return Local(degrees, decoupling.rank, zeros, essential, 1 + max(zeros), float(margin))
 
 
 def _essential(J, i, k, size):
@@ -289,8 +271,8 @@ def _essential(J, i, k, size):
     first = np.zeros((k, k, size))
     first[np.arange(k), np.arange(k), 0] = 1.0
     for c in range(size):
-        rows = [J[a, j].ravel() for a in range(k) for j in range(size) if a != i or j <= c]
-        without = np.array(rows)
-        if _rank(np.vstack([without, first.reshape(k, -1)]))[0] == _rank(without)[0]:
+        without = np.array([J[a, j].ravel() for a in range(k) for j in range(size) if a != i or j <= c])
+        both = np.vstack([without, first.reshape(k, -1)])
+        if decide(both, INDEPENDENT).rank == decide(without, INDEPENDENT).rank:
             return c
     return size

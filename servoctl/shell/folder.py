@@ -1,4 +1,4 @@
-"""What a run leaves: the text that was printed, a folder with its files, and its facts as plain values."""
+"""What a run leaves: its printed report, the folder with its files, and its summary."""
 
 import contextlib
 import json
@@ -13,33 +13,29 @@ import servoctl as sv
 from servoctl.errors import ServoError
 from servoctl.study.table import machine
 
-COLUMNS = 120  # columns of what is printed
+COLUMNS = 120  # width of printed lines
 FILES = ("run.npz", "summary.json", "report.txt", "path.png", "coordinates.png", "actuation.png", "residuals.png")
 LOOP_FILES = ("closed_loop.npz", "closed_loop.png")
 
 
 class Report:
-    """What was printed, to be written as well."""
+    """Prints values, and keeps what it printed in `text`."""
 
     def __init__(self):
-        self.texts = []
-
-    @property
-    def text(self):
-        """All that was printed."""
-        return "\n".join(self.texts)
+        self.text = ""
 
     def say(self, value):
-        """Print a value, long lines wrapped, and remember it."""
-        self.texts.append("\n".join(_wrapped(line, "    ") for line in str(value).splitlines()) + "\n")
+        """Print a value, with long lines wrapped."""
+        text = "\n".join(_wrapped(line, "    ") for line in str(value).splitlines()) + "\n"
+        self.text = f"{self.text}\n{text}" if self.text else text
         try:
-            print(self.texts[-1], flush=True)
-        except BrokenPipeError:  # a reader that left, such as head, does not end the computation
+            print(text, flush=True)
+        except BrokenPipeError:  # a reader that stops reading, such as head, does not stop the computation
             sys.stdout = open(os.devnull, "w")
 
 
 def complain(*texts):
-    """Print texts to stderr in lines of readable length."""
+    """Print texts to stderr, with long lines wrapped."""
     for text in texts:
         print(_wrapped(text, "  "), file=sys.stderr)
 
@@ -51,13 +47,13 @@ def _wrapped(line, indent):
 
 
 class Folder:
-    """The folder of a run: tried before anything is computed, replaced by a temporary one where writing fails later.
+    """The folder of a run: checked before anything is computed, replaced by a temporary one if writing fails later.
 
-    Its `path` is where the files are; it has `moved` if that is a temporary folder in place of the one that was given.
+    `path` is where the files are; `moved` is true if that is the temporary folder.
     """
 
     def __init__(self, path, name):
-        self.path, self.name, self.moved, self._done = path, name, False, []
+        self.path, self.name, self.moved, self._actions = path, name, False, []
         self._made = [p for p in (path, *path.parents) if not p.exists()]
         try:
             path.mkdir(parents=True, exist_ok=True)
@@ -68,7 +64,7 @@ class Folder:
             reason = "it is a file" if path.is_file() else error.strerror or error
             raise ServoError(
                 f"The folder {path} cannot be written: {reason}.",
-                f"A run leaves its numbers and figures in a folder, by default {Path('servoctl-runs', name)}.",
+                f"Numbers and figures of a run are written to a folder, by default {Path('servoctl-runs', name)}.",
                 do="Give another folder by --out. Nothing has been computed yet.",
                 folder=str(path),
             ) from error
@@ -84,17 +80,17 @@ class Folder:
         self.write(lambda path: (path / name).write_text(text, encoding="utf-8"))
 
     def write_json(self, name, facts):
-        """Write facts as JSON; what is not finite becomes null."""
+        """Write facts as JSON; NaN and infinity become null."""
         text = json.dumps(jsonable(facts), indent=2, allow_nan=False, ensure_ascii=False)
         self.write_text(name, text + "\n")
 
     def write(self, action):
-        """Carry out `action(path)`, which writes files; where it fails, it and all before it go to a temporary folder.
+        """Call `action(path)`, which writes files; if it fails, all actions are repeated in a temporary folder.
 
-        The first action finds the files of earlier runs removed. A ServoError where no temporary folder can be written.
+        Before the first action the files of earlier runs are removed.
         """
         try:
-            if not self._done:
+            if not self._actions:
                 for name in (*FILES, *LOOP_FILES):
                     (self.path / name).unlink(missing_ok=True)
             action(self.path)
@@ -102,10 +98,10 @@ class Folder:
             if self.moved:
                 raise _nowhere(self.path, error) from error
             self._move(error)
-            for each in [*self._done, action]:
+            for each in [*self._actions, action]:
                 self.write(each)
         else:
-            self._done.append(action)
+            self._actions.append(action)
 
     def _move(self, error):
         try:
@@ -113,10 +109,10 @@ class Folder:
         except OSError as another:
             raise _nowhere(tempfile.gettempdir(), another) from error
         self._made.append(self.path)
-        complain(f"{self.name}: {error}", f"What was computed is kept: it is written to {self.path} instead.")
+        complain(f"{self.name}: {error}", f"Nothing is lost: it is written to {self.path} instead.")
 
     def _leave(self):
-        """Remove the folders that were made for this run and stayed empty."""
+        """Remove the folders made for this run that are still empty."""
         for path in self._made:
             with contextlib.suppress(OSError):
                 path.rmdir()
@@ -125,21 +121,21 @@ class Folder:
 def _nowhere(path, error):
     return ServoError(
         f"{path} cannot be written, either: {error}.",
-        "A run leaves its numbers and figures in a folder.",
-        do="Make room or set TMPDIR, and run again; what was printed is above.",
+        do="Free space on the disk or set TMPDIR, and run again; the report is above.",
+        path=str(path),
     )
 
 
 def folder_of(args, name, ending=""):
-    """The folder given by --out, or servoctl-runs/NAME and the ending."""
+    """The folder of --out, by default servoctl-runs/NAME with the ending."""
     return Folder(Path(args.out) if args.out else Path("servoctl-runs", name + ending), name)
 
 
 def summary(run, start, verification):
-    """Facts of a run, for JSON: versions, numbers, outcome, start, structure, extrema, residuals, verification."""
+    """A run as values for JSON."""
     model = run.model
     residuals = {name: [_worst(level) for level in run.residual[name].tolist()] for name in run.residual}
-    checked = verification is not None
+    verified = verification and {"passed": verification.passed, "numbers": verification.numbers}
     return {
         "versions": machine()["versions"],
         "parameters": dict(zip(model.reduction.mechanism.parameters.names, model.parameters, strict=True)),
@@ -163,7 +159,7 @@ def summary(run, start, verification):
         "operations": model.operations(),
         "extrema": {n: _extrema(run, n) for n in dict.fromkeys([*sv.figures.efforts(run), *model.outputs])},
         "residuals": {name: {"worst": _worst(levels), "levels": levels} for name, levels in residuals.items()},
-        "verification": {"passed": verification.passed, "numbers": verification.numbers} if checked else None,
+        "verification": verified,
     }
 
 
@@ -186,7 +182,7 @@ def _extrema(run, name):
 
 
 def jsonable(value):
-    """Numbers, texts, lists and dicts of them; what is not finite becomes None."""
+    """A value of numbers, texts, lists and dicts; NaN and infinity become None."""
     if isinstance(value, dict):
         return {str(key): jsonable(item) for key, item in value.items()}
     if isinstance(value, (list, tuple)):

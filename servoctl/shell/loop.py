@@ -1,4 +1,4 @@
-"""The closed loop of `servoctl run`: the plan under feedback, on a machine with other numbers."""
+"""The closed loop of `servoctl run`: the plan under feedback, on a machine with other parameters."""
 
 import math
 
@@ -14,21 +14,20 @@ RATE = 100.0  # Hz
 def add_loop(parser):
     """Add the options of the closed loop to a command."""
     loop = parser.add_argument_group("the closed loop, of programs realised by actuators")
-    loop.add_argument(
-        "--machine", type=assignment, metavar="NAME=VALUE", **MANY, help="parameters that the plan missed"
-    )
+    machine = "parameters of the machine that differ from those of the plan"
+    loop.add_argument("--machine", type=assignment, metavar="NAME=VALUE", **MANY, help=machine)
     loop.add_argument("--law", choices=LAWS, help="default: lqr, about the plan")
-    loop.add_argument("--integral", action="store_true", help="LQR: integrals of the residuals, too")
+    loop.add_argument("--integral", action="store_true", help="LQR: add integrals of the residuals")
     loop.add_argument("--rate", type=positive, metavar="HZ", help=f"samples per second; default {RATE:g}")
     loop.add_argument("--delay", type=whole, metavar="N", help="samples from the measurement to the input")
-    loop.add_argument("--noise", type=deviation, metavar="NAME=STD", **MANY, help="of measured states")
-    loop.add_argument("--seed", type=whole, help="of the noise")
-    loop.add_argument("--limit", type=limits, metavar="NAME=LOW:HIGH", **MANY, help="of actuators; or NAME=SIZE")
+    loop.add_argument("--noise", type=deviation, metavar="NAME=STD", **MANY, help="noise of measured states")
+    loop.add_argument("--seed", type=whole, help="seed of the noise")
+    loop.add_argument("--limit", type=limits, metavar="NAME=LOW:HIGH", **MANY, help="limits of actuators; or NAME=SIZE")
     loop.add_argument("--no-loop", action="store_true", help="leave out the closed loop")
 
 
 def require(args, model):
-    """Refuse options of the loop that contradict each other, and names that the mechanism does not have."""
+    """Refuse options of the loop that have no effect, and names that the mechanism does not have."""
     if args.no_loop:
         _refuse(used(args, GIVEN), "with --no-loop")
     if args.law not in (None, "lqr"):
@@ -53,27 +52,26 @@ def _refuse(options, why):
     if options:
         raise SpecificationError(
             f"{', '.join(options)} was given {why}.",
-            "Options of the closed loop are never ignored.",
+            "It would have no effect.",
             do="Leave one of them out.",
             options=options,
         )
 
 
 def closed_loop(args, model, plan, report):
-    """Close the loop about the plan, and print it: the Closed or None, and whether the options were followed."""
+    """Close the loop about the plan and print it: the Closed or None, and whether all that was requested is done."""
     if args.no_loop:
         return None, True
-    done = not used(args, GIVEN)  # nothing is missed where no option asks for a loop
+    requested = bool(used(args, GIVEN))
     if model.ideal or not plan.success:
         why = "a law commands actuators, not an ideal reaction" if model.ideal else "the motion ended early"
         report.say(f"Closed loop: left out, as {why}.")
-        return None, done
+        return None, not requested
     try:
         run = _closed(args, model, plan)
     except ServoError as error:
         report.say(f"Closed loop: {type(error).__name__}: {error}")
-        run = getattr(error, "run", None)
-        return run if run is not None and len(run.t) else None, done
+        return error.run if error.run is not None and len(error.run.t) else None, not requested
     report.say(run)
     if run.law.allocation:
         report.say(sv.limit_report(run))
@@ -82,10 +80,10 @@ def closed_loop(args, model, plan, report):
 
 def _closed(args, model, plan):
     mechanism = model.reduction.mechanism
-    believed = dict(zip(mechanism.parameters.names, model.parameters.tolist(), strict=True))
+    parameters = dict(zip(mechanism.parameters.names, model.parameters.tolist(), strict=True))
     limits, noise = by_name(args.limit, "--limit"), by_name(args.noise, "--noise")
-    nominal = sv.plant(mechanism, limits=limits, **believed)
-    machine = sv.plant(mechanism, limits=limits, **believed | by_name(args.machine, "--machine"))
+    nominal = sv.plant(mechanism, limits=limits, **parameters)
+    machine = sv.plant(mechanism, limits=limits, **parameters | by_name(args.machine, "--machine"))
     law = _law(args, plan, nominal)
     start, samples = float(plan.t[0]), math.floor((plan.t[-1] - plan.t[0]) * law.rate * (1 + 1e-12) + 1e-9)
     span = (start, start + samples / law.rate)
@@ -105,7 +103,7 @@ def _law(args, plan, nominal):
 
 
 def facts(closed):
-    """Worst and last errors of a closed loop, and what each actuator did, for the summary."""
+    """Errors and inputs of a closed loop as values for JSON."""
     if closed is None:
         return None
     names = closed.plant.mechanism.parameters.names

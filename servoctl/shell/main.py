@@ -1,4 +1,4 @@
-"""The command line: its parser, and the commands that compute no motion, `servoctl list` and `servoctl report`."""
+"""The command line: its parser, and the commands without a motion, `servoctl list` and `servoctl report`."""
 
 import argparse
 import sys
@@ -22,14 +22,14 @@ def main(argv=None):
     Returns
     -------
     int
-        0 done; 1 the motion stopped early, its verification failed, or files went to another folder than the one
-        given; 2 an error, explained on stderr; 130 interrupted.
+        0 done; 1 the motion stopped early, its verification failed, or files were written to another folder; 2 an
+        error, explained on stderr; 130 interrupted.
     """
     args = _parser().parse_args(argv)
     args.command_line = list(sys.argv[1:] if argv is None else argv)
     for stream in (sys.stdout, sys.stderr):
         if hasattr(stream, "reconfigure"):
-            stream.reconfigure(errors="replace")  # a terminal without Greek letters is no reason to lose a run
+            stream.reconfigure(errors="replace")  # a run must not fail because a terminal has no Greek letters
     try:
         return args.command(args)
     except ServoError as error:
@@ -53,7 +53,7 @@ def _parser():
     commands = parser.add_subparsers(required=True, metavar="command")
     listing = commands.add_parser("list", help="the gallery's scenes")
     listing.set_defaults(command=_list)
-    report = commands.add_parser("report", help="what is done to a specification, and its structure; no simulation")
+    report = commands.add_parser("report", help="the derivation of a model and its structure; no simulation")
     report.add_argument("scene", metavar="NAME_OR_FILE", help="a gallery name, a .py file, or the folder of a run")
     report.set_defaults(command=_report)
     for add in (run.add_run, tradeoff.add_tradeoff, sweep.add_sweep, export.add_export):
@@ -93,8 +93,7 @@ def _earlier_report(folder):
     except (OSError, UnicodeDecodeError) as error:
         raise ServoError(
             f"{folder} has no report.txt that can be read: {getattr(error, 'strerror', None) or error}.",
-            "The folder of a run holds the report that the run printed.",
-            do="Give the folder that servoctl run wrote, by default servoctl-runs/NAME, a gallery name, or a .py file "
-            "that defines scene().",
+            "Each folder that servoctl run writes, by default servoctl-runs/NAME, has one.",
+            do="Give such a folder, a gallery name, or a .py file that defines scene().",
             folder=str(folder),
         ) from error

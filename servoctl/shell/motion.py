@@ -1,4 +1,4 @@
-"""The motion that a command's scene and options describe."""
+"""The motion that a scene and options on the command line describe."""
 
 from dataclasses import dataclass
 
@@ -10,7 +10,7 @@ from servoctl.shell.options import by_name
 
 @dataclass(frozen=True)
 class Scenario:
-    """A derived model with its numbers, its start, and its time (t0, t1) [s]."""
+    """A model with its parameters, a start, and a time span (t0, t1) [s]."""
 
     model: object
     start: object
@@ -18,9 +18,9 @@ class Scenario:
 
 
 def described(args, scene, report, require=lambda model: None):
-    """Derive the model of a scene and find its start; print both.
+    """Derive the model of a scene and solve for its start; print both.
 
-    `require` is called with the model before anything is printed; it raises for options that do not fit.
+    `require(model)` is called before anything is printed; it raises for options that do not fit.
     """
     span = as_span(tuple(args.t_span or scene.t_span))
     changes, held, guess = (by_name(getattr(args, name), f"--{name}") for name in ("set", "hold", "guess"))
@@ -33,7 +33,7 @@ def described(args, scene, report, require=lambda model: None):
 
 
 def with_parameters(model, changes):
-    """A model with other numbers; a name that is no parameter is refused."""
+    """The model with other values of parameters."""
     valid = model.reduction.mechanism.parameters.names
     for name in changes:
         if name not in valid:
@@ -46,7 +46,7 @@ def _start(model, scene, t0, hold, guess):
     if both:
         raise SpecificationError(
             f"{', '.join(both)} is both held and guessed.",
-            "A value of the start is kept exactly, or is where the solution is looked for.",
+            "A value of the start is either held exactly, or a guess from which the solution starts.",
             do="Give it to --hold or to --guess.",
             names=both,
         )

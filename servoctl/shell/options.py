@@ -13,32 +13,29 @@ DRAWS = {"normal": "MEAN:STD", "uniform": "LOW:HIGH", "lognormal": "MEDIAN:LOG_S
 
 
 def add_motion(parser):
-    """Add what describes a motion of a scene: the scene, its time, parameters and start."""
+    """Add the arguments that describe a motion: the scene, its time span, parameters and start."""
     parser.add_argument("scene", metavar="NAME_OR_FILE", help=SCENE_HELP)
     parser.add_argument("--t-span", type=float, nargs=2, metavar=("T0", "T1"), help="[s]; default: the scene's")
     pairs = {"type": assignment, "metavar": "NAME=VALUE", **MANY}
-    parser.add_argument("--hold", **pairs, help="values that the start keeps, beside the scene's own")
-    parser.add_argument(
-        "--guess", **pairs, help="where the rest of the start is looked for; frees what the scene holds"
-    )
+    parser.add_argument("--hold", **pairs, help="values held at the start, in addition to the scene's")
+    parser.add_argument("--guess", **pairs, help="guess of values at the start; not held then, even if the scene does")
     parser.add_argument("--set", **pairs, help="parameters")
 
 
 def by_name(pairs, option):
-    """A dict of (name, value) pairs, each name once; the option is for the message."""
+    """A dict of (name, value) pairs, each name once; `option` is for the message."""
     values = {}
     for name, value in pairs:
         if name in values:
             both = " and ".join(f"{v:g}" if isinstance(v, float) else str(v) for v in (values[name], value))
-            raise SpecificationError(
-                f"{option} {name} was given twice: {both}.", "A name has one value.", do="Leave one out.", name=name
-            )
+            given = f"{option} {name} was given twice: {both}."
+            raise SpecificationError(given, do="Leave one out.", option=option, name=name, values=(values[name], value))
         values[name] = value
     return values
 
 
 def used(args, names):
-    """Those of these options that were given, as they are written; 0 counts as given."""
+    """The options among these names that were given, as written on the command line; 0 counts as given."""
     values = {f"--{name.replace('_', '-')}": getattr(args, name) for name in names}
     return [option for option, value in values.items() if value is not None and value is not False and value != []]
 
@@ -47,7 +44,7 @@ def used(args, names):
 
 
 def _typed(read, form):
-    """A type for argparse: what `read(text)` gives, refused with the form where that is None or fails."""
+    """A type for argparse: `read(text)`; an error that states the form if that is None or raises ValueError."""
 
     def parse(text):
         try:
@@ -72,23 +69,18 @@ def _named(read, form):
     return _typed(split, form)
 
 
-def _finite(text):
-    return float(text) if math.isfinite(float(text)) else None
-
-
-def _at_least(least):
-    def read(text):
-        return int(text) if text.isdecimal() and int(text) >= least else None
-
-    return _typed(read, f"not a whole number of at least {least}")
-
-
-def _positive(text):
-    return float(text) if 0 < float(text) < math.inf else None
+def _number(above=-math.inf):
+    """A reader of finite numbers greater than a bound."""
+    return lambda text: float(text) if above < float(text) < math.inf else None
 
 
 def _deviation(text):
     return float(text) if 0 <= float(text) < math.inf else None
+
+
+def _at_least(least):
+    form = f"not a whole number of at least {least}"
+    return _typed(lambda text: int(text) if text.isdecimal() and int(text) >= least else None, form)
 
 
 def _values(text):
@@ -120,25 +112,20 @@ def _drift(text):
 
 
 whole, count, samples = _at_least(0), _at_least(1), _at_least(2)
-positive = _typed(_positive, "not a positive number")
+positive = _typed(_number(above=0.0), "not a positive number")
 drift = _typed(_drift, "not none, project, minimal or a time constant [s]")
 shard = _typed(_shard, "not I/N with I from 1 to N, such as 1/4")
-assignment = _named(
-    _finite, "not NAME=VALUE with a number, such as theta=0.1; the scene's name comes before such options"
-)
-deviation = _named(_deviation, "not NAME=STD with a standard deviation that is not negative, such as theta=0.001")
+_pair = "not NAME=VALUE with a number, such as theta=0.1; the scene's name comes before such options"
+assignment = _named(_number(), _pair)
+deviation = _named(_deviation, "not NAME=STD with STD >= 0, such as theta=0.001")
 limits = _named(_limits, "neither NAME=LOW:HIGH nor NAME=SIZE, such as trolley=150")
-variation = _named(
-    _values, "neither NAME=LOW:HIGH:N with at least 2 values nor NAME=A,B,C, such as m_load=80:120:9"
-)
-draw = _named(
-    _draw,
-    f"none of {', '.join(f'NAME={kind}:{form}' for kind, form in DRAWS.items())}, such as m_load=normal:100:5",
-)
+variation = _named(_values, "neither NAME=LOW:HIGH:N with N >= 2 nor NAME=A,B,C, such as m_load=80:120:9")
+_forms = ", ".join(f"NAME={kind}:{form}" for kind, form in DRAWS.items())
+draw = _named(_draw, f"none of {_forms}, such as m_load=normal:100:5")
 
 
 def drawn(kind, *numbers):
-    """The function of a numpy Generator that draws what `draw` has read."""
+    """The function of a numpy Generator for a distribution that `draw` has read."""
     return {
         "normal": lambda rng: rng.normal(*numbers),
         "uniform": lambda rng: rng.uniform(*numbers),

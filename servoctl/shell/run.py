@@ -1,9 +1,8 @@
-"""`servoctl run`: derive, simulate, verify, close the loop, and leave figures and numbers in a folder."""
+"""`servoctl run`: derive, simulate, verify, close the loop; write figures and numbers to a folder."""
 
 import servoctl as sv
 from servoctl.errors import ServoError
-from servoctl.methods.choice import as_method, default_method
-from servoctl.methods.drift import as_drift
+from servoctl.methods.choice import as_drift, as_method, default_method
 from servoctl.methods.runge_kutta import ORDERS
 from servoctl.shell import loop
 from servoctl.shell.folder import FILES, LOOP_FILES, Report, complain, folder_of, summary
@@ -14,10 +13,10 @@ from servoctl.shell.scenes import find_scene
 
 def add_run(commands):
     """Add the command to the subparsers of the command line."""
-    run = commands.add_parser("run", help="derive, simulate, verify; leave figures and numbers in a folder")
+    run = commands.add_parser("run", help="derive, simulate, verify; write figures and numbers to a folder")
     add_motion(run)
-    run.add_argument("--out", metavar="DIR", help="folder; files of an earlier run in it are replaced")
-    run.add_argument("--accuracy", type=float, metavar="E", help="error of the motion, in place of method and settings")
+    run.add_argument("--out", metavar="DIR", help="folder; files of an earlier run are replaced")
+    run.add_argument("--accuracy", type=float, metavar="E", help="largest error of the motion; sets method and steps")
     run.add_argument("--method", help=METHODS_HELP)
     run.add_argument("--step", type=float, metavar="H", help=f"step of {', '.join(ORDERS)} and RadauIIA [s]")
     run.add_argument("--drift", type=drift, metavar="D", help="none, project, minimal, or a time constant [s]")
@@ -39,7 +38,9 @@ def _run(args):
 def _compute(args, name, scene, folder):
     """Derive, simulate, save, verify, close the loop and draw, in this order; returns the exit code."""
     report = Report()
-    _require_known(args)
+    as_drift(args.drift)  # refuse unknown names before anything is derived
+    if args.method is not None:
+        as_method(args.method)
     motion = described(args, scene, report, require=lambda model: loop.require(args, model))
     run = _simulate(motion, _options(args, motion), report)
     folder.write(lambda path: run.save(path / "run.npz"))
@@ -63,15 +64,8 @@ def _compute(args, name, scene, folder):
     return 0 if run.success and verified and done and not folder.moved else 1
 
 
-def _require_known(args):
-    """Refuse a method or a treatment of drift that no model has, before anything is derived."""
-    as_drift(args.drift)
-    if args.method is not None:
-        as_method(args.method)
-
-
 def _options(args, motion):
-    """Arguments of `simulate` that were given."""
+    """Arguments of `simulate` from the command line."""
     options = {} if args.accuracy is None else {"accuracy": args.accuracy}
     options |= {} if args.drift in (None, "none") else {"drift": args.drift}
     settings = {name: getattr(args, name) for name in ("step", "rtol", "atol") if getattr(args, name) is not None}
@@ -84,7 +78,7 @@ def _options(args, motion):
 
 
 def _simulate(motion, options, report):
-    """The run; where the motion stops, what was computed of it."""
+    """The run, or the part of it before the motion stopped."""
     try:
         run = sv.simulate(motion.model, motion.start, motion.span, **options)
         report.say(run)
@@ -98,7 +92,7 @@ def _simulate(motion, options, report):
 
 
 def _verify(model, run, report):
-    """The verification; None where there is none."""
+    """The verification, or None."""
     if not run.success:
         report.say("Verification: left out, as the motion ended early.")
         return None

@@ -9,31 +9,17 @@ from pathlib import Path
 
 from servoctl.errors import ServoError, SpecificationError, unknown
 
-_MODULE = "servoctl_scene"  # name under which a user's file is imported, so that it hides no other module
+_MODULE = "servoctl_scene"  # name of the module made from a user's file, so that it shadows no other module
 
 
 def find_scene(given):
-    """The scene of the gallery with this name, or that of a user's file.
+    """The name and the scene of a gallery name or of a user's file; errors in the file are reported with their line.
 
     Parameters
     ----------
     given : str
-        A name of the gallery, or the path of a .py file that defines `scene()` -> (Mechanism, Program), and, if
-        wanted, START, GUESS, T_SPAN and UNITS (see `servoctl.gallery`). Its docstring's first line describes it.
-
-    Returns
-    -------
-    name : str
-        Of the scene; of a file its name without suffix.
-    scene : Scene
-
-    Raises
-    ------
-    NameUnknown
-        If the gallery has no such scene.
-    SpecificationError
-        If the file is missing, raises, has no `scene()`, or holds values of other kinds. Errors in the file are
-        reported with their line.
+        A name of the gallery, or the path of a .py file that defines `scene()` -> (Mechanism, Program), and optionally
+        START, GUESS, T_SPAN and UNITS (see `servoctl.gallery`). The first line of its docstring is the description.
     """
     from servoctl.gallery import gallery
 
@@ -44,7 +30,7 @@ def find_scene(given):
         return path.stem, _from_file(path)
     error = unknown(given, gallery, "scene")
     if path.with_name(path.name + ".py").is_file():
-        error.add_note(f"There is a file {given}.py: give its name with the suffix.")
+        error.add_note(f"There is a file {given}.py: give the name with its suffix.")
     elif path.exists():
         error.add_note(f"{given} exists, but a scene's file ends in .py.")
     raise error
@@ -56,9 +42,8 @@ def _module(path):
         match = unknown(path.name, others, "file").details["match"]
         raise SpecificationError(
             f"There is no file {path}.",
-            "A scene is a name of the gallery or a Python file.",
             nearest=f"{path.parent / match}." if match else "",
-            do="Check the path, or see servoctl list.",
+            do="Give a Python file, or a name from servoctl list.",
             file=str(path),
         )
     return _reported(path, lambda: _import(path))
@@ -73,8 +58,7 @@ def _from_file(path):
         raise SpecificationError(
             f"{path} defines no scene().",
             "A scene's file defines scene(), a function without arguments that returns (Mechanism, Program).",
-            nearest=_nearest(module),
-            do="Define scene().",
+            do=_advice(module),
             file=str(path),
         )
     description = next(iter((module.__doc__ or "").strip().splitlines()), f"The scene of {path.name}.")
@@ -82,13 +66,13 @@ def _from_file(path):
 
 
 def stamp(given):
-    """What tells a scene from another one, and a file from what it was before it was changed: to be cached by."""
+    """A key for caches: a gallery name, or a file with the time of its last change."""
     path = Path(given)
     return (str(path.resolve()), path.stat().st_mtime_ns) if path.is_file() else given
 
 
 def own_case(given):
-    """The function `case` that a user's file defines for sweeps; None where there is none."""
+    """The function `case` of a user's file, for sweeps; None if it has none."""
     from servoctl.gallery import gallery
 
     path = Path(given)
@@ -114,7 +98,7 @@ def _import(path):
 
 
 def _reported(path, action):
-    """What `action()` returns; an exception in the user's file is reported with its line there."""
+    """The result of `action()`; an exception in the user's file is reported with its line."""
     try:
         return action()
     except ServoError as error:
@@ -126,8 +110,7 @@ def _reported(path, action):
         last = traceback.format_exception_only(error)[-1].strip()
         raise SpecificationError(
             f"{path} raised {last}, in line {line}: {text}",
-            "A scene's file is imported, and its scene() is called.",
-            do="Correct the file; run by python, it shows the whole traceback.",
+            do="Correct the file; python shows the whole traceback.",
             file=str(path),
             line=line,
             exception=last,
@@ -135,7 +118,7 @@ def _reported(path, action):
 
 
 def _place(error, path):
-    """Number and text of the last line of the file that the error passed through."""
+    """Number and text of the line in the file where the error was raised."""
     if isinstance(error, SyntaxError) and error.filename and Path(error.filename).resolve() == path.resolve():
         return error.lineno, (error.text or "").strip()
     frames = [f for f in traceback.extract_tb(error.__traceback__) if Path(f.filename).resolve() == path.resolve()]
@@ -145,55 +128,32 @@ def _place(error, path):
 def _built(path, scene):
     from servoctl.spec import Mechanism, Program
 
-    value = _reported(path, scene)
-    if not (
-        isinstance(value, (tuple, list))
-        and len(value) == 2
-        and isinstance(value[0], Mechanism)
-        and isinstance(value[1], Program)
-    ):
-        kinds = ", ".join(type(item).__name__ for item in value) if isinstance(value, (tuple, list)) else None
-        raise SpecificationError(
-            f"scene() of {path} returned {type(value).__name__ if kinds is None else f'({kinds})'}.",
-            "scene() returns a Mechanism and a Program, in this order.",
-            do="End it with: return mechanism, program.",
-            file=str(path),
-        )
-    return tuple(value)
+    match value := _reported(path, scene):
+        case [Mechanism(), Program()]:
+            return tuple(value)
+        case [*items]:
+            kinds = f"({', '.join(type(item).__name__ for item in items)})"
+        case _:
+            kinds = type(value).__name__
+    raise SpecificationError(
+        f"scene() of {path} returned {kinds}.",
+        "scene() returns a Mechanism and a Program, in this order.",
+        do="End it with: return mechanism, program.",
+        file=str(path),
+        returned=kinds,
+    )
 
 
-def _nearest(module):
-    """A function of the file that may be meant."""
+def _advice(module):
+    """What to do in a file without scene()."""
     from servoctl.spec import Mechanism, Program
 
     functions = [n for n, v in vars(module).items() if callable(v) and getattr(v, "__module__", "") == _MODULE]
     if functions:
-        return f"The file defines {', '.join(f'{name}()' for name in functions[:5])}."
+        return f"Define scene(). The file defines {', '.join(f'{name}()' for name in functions[:5])}."
     if any(isinstance(v, (Mechanism, Program)) for v in vars(module).values()):
-        return "The file makes a mechanism or program outside any function: return them from scene()."
-    return ""
-
-
-def _settings(path, module):
-    settings = {}
-    for name, check, form in (
-        ("START", _numbers, '{"theta": 0.1}'),
-        ("GUESS", _numbers, '{"theta": 0.1}'),
-        ("T_SPAN", _span, "(0.0, 2.0)"),
-        ("UNITS", _texts, '{"theta": "rad"}'),
-    ):
-        if hasattr(module, name):
-            value = getattr(module, name)
-            if not check(value):
-                raise SpecificationError(
-                    f"{path} sets {name} = {value!r}.",
-                    f"{name} has the form {form}.",
-                    do="Correct it, or leave it out.",
-                    file=str(path),
-                    name=name,
-                )
-            settings[name.lower()] = value
-    return settings
+        return "Return the mechanism and the program, which it makes outside any function, from scene()."
+    return "Define scene()."
 
 
 def _number(value):
@@ -204,9 +164,19 @@ def _numbers(value):
     return isinstance(value, dict) and all(isinstance(k, str) and _number(v) for k, v in value.items())
 
 
-def _span(value):
-    return isinstance(value, (tuple, list)) and len(value) == 2 and all(map(_number, value))
+SETTINGS = {  # of a scene's file: the check of a value, and an example
+    "START": (_numbers, '{"theta": 0.1}'),
+    "GUESS": (_numbers, '{"theta": 0.1}'),
+    "T_SPAN": (lambda v: isinstance(v, (tuple, list)) and len(v) == 2 and all(map(_number, v)), "(0.0, 2.0)"),
+    "UNITS": (lambda v: isinstance(v, dict) and all(isinstance(n, str) for n in (*v, *v.values())), '{"theta": "rad"}'),
+}
 
 
-def _texts(value):
-    return isinstance(value, dict) and all(isinstance(k, str) and isinstance(v, str) for k, v in value.items())
+def _settings(path, module):
+    settings = {name: getattr(module, name) for name in SETTINGS if hasattr(module, name)}
+    for name, value in settings.items():
+        check, example = SETTINGS[name]
+        if not check(value):
+            rule = f"{name} has the form {example}."
+            raise SpecificationError(f"{path} sets {name} = {value!r}.", rule, file=str(path), name=name)
+    return {name.lower(): value for name, value in settings.items()}

@@ -13,7 +13,7 @@ from servoctl.shell.options import MANY, METHODS_HELP, by_name, count, draw, dra
 from servoctl.shell.scenes import find_scene, own_case, stamp
 from servoctl.study.sweep import require_fitting
 
-# what computes, and has no place beside --merge
+# options without effect beside --merge
 COMPUTING = ("vary", "monte_carlo", "draw", "seed", "t_span", "method", "workers", "shard", "resume")
 
 
@@ -23,17 +23,18 @@ def add_sweep(commands):
     scene = "a gallery name, or a .py file with scene() or case(**parameters)"
     sweep.add_argument("scene", metavar="NAME_OR_FILE", nargs="?", help=scene)
     vary = {"type": variation, "metavar": "NAME=LOW:HIGH:N", **MANY}
-    sweep.add_argument("--vary", **vary, help="all combinations of such values")
-    sweep.add_argument("--monte-carlo", type=count, metavar="N", help="N random cases, of each combination")
-    sweep.add_argument("--draw", type=draw, metavar="NAME=normal:MEAN:STD", **MANY, help="what is random in them")
-    sweep.add_argument("--seed", type=whole, help="of everything random")
+    sweep.add_argument("--vary", **vary, help="all combinations of these values")
+    sweep.add_argument("--monte-carlo", type=count, metavar="N", help="N random cases of each combination")
+    distribution = {"type": draw, "metavar": "NAME=normal:MEAN:STD", **MANY}
+    sweep.add_argument("--draw", **distribution, help="distributions of random parameters")
+    sweep.add_argument("--seed", type=whole, help="seed of all random numbers")
     sweep.add_argument("--t-span", type=float, nargs=2, metavar=("T0", "T1"), help="[s]; default: the scene's")
     sweep.add_argument("--method", help=METHODS_HELP)
-    sweep.add_argument("--workers", type=count, metavar="N", help="processes; default: this one alone")
+    sweep.add_argument("--workers", type=count, metavar="N", help="processes; default: 1")
     sweep.add_argument("--shard", type=shard, metavar="I/N", help="only part I of N, for several machines")
-    sweep.add_argument("--resume", action="store_true", help="go on where an interrupted sweep ended")
+    sweep.add_argument("--resume", action="store_true", help="continue an interrupted sweep")
     sweep.add_argument("--out", metavar="DIR", help="folder; default servoctl-runs/NAME-sweep")
-    sweep.add_argument("--merge", metavar="DIR", nargs="+", help="no computation: join the shards in these folders")
+    sweep.add_argument("--merge", metavar="DIR", nargs="+", help="join the shards in these folders; computes nothing")
     sweep.set_defaults(command=_sweep)
 
 
@@ -41,11 +42,8 @@ def _sweep(args):
     if args.merge:
         return _merge(args)
     if args.scene is None:
-        raise SpecificationError(
-            "servoctl sweep was given no scene.",
-            "A sweep computes cases of a scene, or merges shards.",
-            do="Name a scene, as in servoctl sweep overhead-crane --vary m_load=80:120:9, or give --merge.",
-        )
+        do = "Name one, as in servoctl sweep overhead-crane --vary m_load=80:120:9, or give --merge."
+        raise SpecificationError("servoctl sweep was given no scene.", do=do, scene=None)
     name = Path(args.scene).stem if args.scene.endswith(".py") else find_scene(args.scene)[0]
     with folder_of(args, f"{name}-sweep") as folder:
         return _leave(_computed(args, folder), folder, _stem(args), _units(args.scene))
@@ -56,7 +54,7 @@ def _merge(args):
     if computing:
         raise SpecificationError(
             f"{', '.join(computing)} was given with --merge.",
-            "Merging joins what was computed, and computes nothing.",
+            "Merging computes nothing.",
             do="Leave one of them out.",
             options=computing,
         )
@@ -72,19 +70,20 @@ def _stem(args):
 def _computed(args, folder):
     cases, case = _cases(args), _case(args)
     random = "rng" in inspect.signature(case).parameters
-    surplus = [] if random or args.draw else used(args, ("seed", "monte_carlo"))
-    if surplus or (random or args.draw) and args.seed is None:
+    idle = [] if random or args.draw else used(args, ("seed", "monte_carlo"))
+    if idle or (random or args.draw) and args.seed is None:
         raise SpecificationError(
-            f"{', '.join(surplus)} was given, and nothing is random." if surplus else "There is no --seed.",
-            "Random cases, and a case(..., rng) that draws numbers, are repeated exactly from a seed.",
-            do="Leave it out, or give --draw." if surplus else "Give one, such as --seed 1.",
+            f"{', '.join(idle)} was given, and nothing is random." if idle else "There is no --seed.",
+            "The seed repeats random cases, and the numbers that a case(..., rng) draws.",
+            do="Leave it out, or give --draw." if idle else "Give one, such as --seed 1.",
+            options=idle,
+            seed=args.seed,
         )
     checkpoint = folder.path / f"{_stem(args)}.jsonl"
     if checkpoint.exists() and not args.resume:
         raise SpecificationError(
-            f"{checkpoint} holds the finished cases of a sweep that did not end.",
-            "Work that was done is not thrown away.",
-            do="Give --resume to go on where it ended, another folder by --out, or remove the file.",
+            f"{checkpoint} holds the finished cases of an interrupted sweep.",
+            do="Give --resume to continue it, another folder by --out, or remove the file.",
             checkpoint=str(checkpoint),
         )
     options = {"seed": args.seed if random else None, "checkpoint": checkpoint, "shard": args.shard}
@@ -102,11 +101,11 @@ def _cases(args):
     varied, random = by_name(args.vary, "--vary"), by_name(args.draw, "--draw")
     both = [name for name in varied if name in random]
     if both:
-        raise _unclear(f"{', '.join(both)} is both varied and drawn.")
+        raise _unclear(f"{', '.join(both)} is both varied and drawn.", names=both)
     if random and not args.monte_carlo:
-        raise _unclear("--draw was given without --monte-carlo N.")
+        raise _unclear("--draw was given without --monte-carlo N.", names=list(random))
     if not (varied or args.monte_carlo):
-        raise _unclear("Neither --vary nor --monte-carlo was given.")
+        raise _unclear("Neither --vary nor --monte-carlo was given.", names=[])
     grid = sv.grid(**varied)
     if not args.monte_carlo:
         return grid
@@ -115,18 +114,19 @@ def _cases(args):
     return [{**grid[i // args.monte_carlo], **case} for i, case in enumerate(draws)]
 
 
-def _unclear(given):
+def _unclear(given, **facts):
     return SpecificationError(
         given,
         "A sweep takes all combinations of the values of --vary, each with N draws of --monte-carlo.",
         do="Give --vary m_load=80:120:9, or --monte-carlo 100 --draw m_load=normal:100:5 --seed 1.",
+        **facts,
     )
 
 
 def _case(args):
-    """The function of one case; a file's own case() is found again by its file in every process."""
-    own = own_case(args.scene)
-    if own is None:
+    """The function of one case; every process imports a file's case() by the path of the file."""
+    file_case = own_case(args.scene)
+    if file_case is None:
         _require_names(args)
         options = {"t_span": tuple(args.t_span)} if args.t_span else {}
         options |= {"method": args.method} if args.method else {}
@@ -134,11 +134,12 @@ def _case(args):
     if args.t_span or args.method:
         raise SpecificationError(
             "--t-span or --method was given, and the file computes its cases by its own case().",
-            "Such options are for cases that simulate the scene.",
-            do="Leave them out, or use them inside of case().",
+            "These options are for cases that simulate the scene.",
+            do="Leave them out, or set them inside case().",
+            options=used(args, ("t_span", "method")),
         )
-    draws = "rng" in inspect.signature(own).parameters
-    require_fitting(own, {name: None for name, _ in (*args.vary, *args.draw)}, 0 if draws else None)
+    draws = "rng" in inspect.signature(file_case).parameters
+    require_fitting(file_case, {name: None for name, _ in (*args.vary, *args.draw)}, 0 if draws else None)
     return functools.partial(own_random_case if draws else own_plain_case, args.scene)
 
 
@@ -151,7 +152,7 @@ def _require_names(args):
 
 
 def _model(given):
-    """The model of a scene, derived once in each process."""
+    """The model of a scene, derived once in each process, and again when its file has changed."""
     return _derived(given, stamp(given))
 
 
@@ -161,7 +162,7 @@ def _derived(given, _):
 
 
 def scene_case(given, options, /, **values):
-    """Simulate the plan of a scene; `values` are parameters and held values, `options` those of `simulate`."""
+    """Simulate the plan of a scene; `values` are parameters and held values, `options` arguments of `simulate`."""
     scene, model = find_scene(given)[1], _model(given)
     options, parameters = dict(options), model.reduction.mechanism.parameters.names
     model = model.with_parameters(**{name: value for name, value in values.items() if name in parameters})
@@ -173,23 +174,23 @@ def scene_case(given, options, /, **values):
 
 
 def own_plain_case(given, /, **values):
-    """What case() of a user's file returns."""
+    """Call case() of a user's file."""
     return own_case(given)(**values)
 
 
 def own_random_case(given, /, rng, **values):
-    """What case() of a user's file returns, which draws random numbers."""
+    """Call case() of a user's file with a random generator."""
     return own_case(given)(rng=rng, **values)
 
 
 def _units(given):
-    """Units of states and of what a row has of a signal, by column."""
+    """Units of the columns that hold states and numbers of signals."""
     known = find_scene(given)[1].units if given and own_case(given) is None else {}
     return {f"{name}{end}": unit for name, unit in known.items() for end in ("", "_min", "_max", "_end")}
 
 
 def _leave(study, folder, stem, units):
-    """Print, save and draw; returns the exit code."""
+    """Print, save and draw a study; returns the exit code."""
     report = Report()
     report.say(study)
     failures = study.take([i for i, error in enumerate(study["error"].tolist()) if error])
@@ -214,13 +215,13 @@ def _leave(study, folder, stem, units):
 
 
 def _shards(folders):
-    found = {folder: sorted(Path(folder).glob("sweep-*-of-*.npz")) for folder in folders}
-    empty = [folder for folder, paths in found.items() if not paths]
+    shards = {folder: sorted(Path(folder).glob("sweep-*-of-*.npz")) for folder in folders}
+    empty = [folder for folder, paths in shards.items() if not paths]
     if empty:
         raise ServoError(
             f"There are no shards in {', '.join(empty)}.",
             "A shard is a file sweep-I-of-N.npz, written by servoctl sweep --shard I/N.",
-            do="Name the folders given by --out.",
+            do="Give the folders of these commands.",
             folders=empty,
         )
-    return [path for paths in found.values() for path in paths]
+    return [path for paths in shards.values() for path in paths]

@@ -1,4 +1,4 @@
-"""`servoctl tradeoff`: what methods and treatments of drift cost and reach on a scene, and which to take."""
+"""`servoctl tradeoff`: measure errors and costs of methods and treatments of drift on a scene, and recommend one."""
 
 import servoctl as sv
 from servoctl.shell.folder import Report, folder_of
@@ -11,15 +11,11 @@ FILES = ("tradeoff.npz", "tradeoff.csv", "tradeoff.png", "report.txt", "summary.
 
 def add_tradeoff(commands):
     """Add the command to the subparsers of the command line."""
-    trade = commands.add_parser("tradeoff", help="measure what each method and treatment of drift costs and reaches")
+    trade = commands.add_parser("tradeoff", help="measure errors and costs of methods and treatments of drift")
     add_motion(trade)
     trade.add_argument("--out", metavar="DIR", help="folder; default servoctl-runs/NAME-tradeoff")
-    trade.add_argument(
-        "--method", nargs="+", metavar="METHOD", help="methods to measure; default: all but RK1, RK2, RK23"
-    )
-    trade.add_argument(
-        "--drift", type=drift, nargs="+", metavar="D", help="none, project, minimal, a time constant [s]"
-    )
+    trade.add_argument("--method", nargs="+", metavar="M", help="methods to measure; default: all but RK1, RK2, RK23")
+    trade.add_argument("--drift", type=drift, nargs="+", metavar="D", help="none, project, minimal, time constants [s]")
     trade.add_argument("--limit", type=positive, metavar="S", help="seconds that one run may take; default 0.3")
     wanted = trade.add_mutually_exclusive_group()
     wanted.add_argument("--error", type=positive, metavar="E", help="recommend the fastest within this error")
@@ -28,13 +24,13 @@ def add_tradeoff(commands):
 
 
 def _tradeoff(args):
+    """Derive, measure, save, draw and recommend; returns the exit code."""
     name, scene = find_scene(args.scene)
     with folder_of(args, name, "-tradeoff") as folder:
-        return _measure(args, name, scene, folder)
+        return _measured(args, name, scene, folder)
 
 
-def _measure(args, name, scene, folder):
-    """Derive, measure, save, draw, recommend, in this order; returns the exit code."""
+def _measured(args, name, scene, folder):
     report = Report()
     motion = described(args, scene, report)
     limit = {} if args.limit is None else {"seconds": args.limit}
@@ -46,7 +42,7 @@ def _measure(args, name, scene, folder):
     folder.write(lambda path: figure.savefig(path / "tradeoff.png", dpi=100))
     try:
         best = _recommended(study, args, report)
-    finally:  # what was measured is kept where no setting is good enough
+    finally:  # also where no setting is good enough
         folder.write_text("report.txt", report.text)
     facts = {"scene": {"name": name, "given": args.scene}, "command": args.command_line, **study.meta}
     folder.write_json("summary.json", facts | {"recommended": best, "pareto": study.pareto().rows()})

@@ -63,18 +63,16 @@ def rigid_body(q: Coordinates, mass, inertia, position=None, rotation=None, rate
     """
     if (rotation is None) == (rates is None):
         raise SpecificationError(
-            f"rigid_body has {'neither' if rates is None else 'both'} of rotation and rates.",
-            "The body's rates come from one of them.",
-            do="Give rotation=R(q) or rates=ω(q, q').",
+            f"rigid_body got {'neither' if rates is None else 'both'} of rotation and rates.",
+            "The body rates follow from one of them.",
+            do="Pass rotation=R(q) or rates=ω(q, q').",
+            both=rates is not None,
         )
     _require_coordinates(q)
     omega = body_rates(q, rotation) if rates is None else ca.vertcat(*column(rates, "rates", 3))
-    alpha = q.dt(omega)
-    moment = _inertia(inertia) @ omega
-    spin = ca.dot(alpha, _inertia(inertia) @ alpha) / 2 + ca.dot(alpha, ca.cross(omega, moment))
-    if position is None:
-        return spin
-    return particle(q, mass, position) + spin
+    alpha, J = q.dt(omega), _inertia(inertia)
+    spin = ca.dot(alpha, J @ alpha) / 2 + ca.dot(alpha, ca.cross(omega, J @ omega))
+    return spin if position is None else particle(q, mass, position) + spin
 
 
 def body_rates(q: Coordinates, rotation):
@@ -93,7 +91,7 @@ def body_rates(q: Coordinates, rotation):
     rotation = matrix(rotation, "the rotation")
     if rotation.shape != (3, 3):
         raise SpecificationError(
-            f"The rotation has the shape {rotation.shape}.", "A rotation matrix is 3 by 3.", do="Give R(q), (3, 3)."
+            f"The rotation has the shape {rotation.shape}.", "A rotation matrix is 3 by 3.", shape=rotation.shape
         )
     spin = rotation.T @ ca.reshape(q.dt(ca.vec(rotation)), 3, 3)
     return ca.vertcat(spin[2, 1] - spin[1, 2], spin[0, 2] - spin[2, 0], spin[1, 0] - spin[0, 1]) / 2
@@ -104,14 +102,15 @@ def _acceleration(q, position, what):
     entries = column(position, what)
     if not 1 <= len(entries) <= 3:
         raise SpecificationError(
-            f"{what.capitalize()} has {len(entries)} entries.", "A position has one to three.", do="Give x, y, z."
+            f"{what.capitalize()} has {len(entries)} entries.", "A position has one to three.", entries=len(entries)
         )
     position = ca.vertcat(*entries)
     if q.order(position) > 0:
         raise SpecificationError(
             f"{what.capitalize()} depends on velocities.",
             "A position is a function of the coordinates and t.",
-            do="Give the position; velocities and accelerations are derived.",
+            do="Pass the position; velocities and accelerations are derived.",
+            order=q.order(position),
         )
     return q.dt(position, 2)
 
@@ -119,7 +118,10 @@ def _acceleration(q, position, what):
 def _require_coordinates(q):
     if not isinstance(q, Coordinates):
         raise SpecificationError(
-            f"q is a {type(q).__name__}.", "Bodies are described in coordinates.", do='Pass sv.coordinates("x y").'
+            f"Expected Coordinates, got a {type(q).__name__}.",
+            "The first argument of a body is its coordinates.",
+            do='Make them by sv.coordinates("x y").',
+            type=type(q).__name__,
         )
 
 
@@ -130,5 +132,5 @@ def _inertia(inertia):
     if inertia.shape == (3, 3):
         return inertia
     raise SpecificationError(
-        f"The inertia has the shape {inertia.shape}.", "It is (3, 3), or (3,) for a diagonal one.", do="Give J."
+        f"The inertia has the shape {inertia.shape}.", "It is (3, 3), or (3,) for a diagonal.", shape=inertia.shape
     )

@@ -9,10 +9,8 @@ import casadi as ca
 
 from servoctl.checks import column, mapping, matrix
 from servoctl.errors import SpecificationError
-from servoctl.jets.elementary import divide, multiply
-from servoctl.jets.motion import Motion
-from servoctl.jets.series import Series, is_zero
-from servoctl.jets.tape import Tape
+from servoctl.jets.series import Motion, Series, is_zero
+from servoctl.jets.tape import Tape, divide, multiply
 
 _lock = threading.Lock()
 
@@ -86,9 +84,9 @@ class Coordinates:
         if V.shape != (self.nq, len(names)):
             raise SpecificationError(
                 f"V has the shape {V.shape}.",
-                f"q' = V w + h with {self.nq} coordinates and {len(names)} quasi-velocities.",
-                f"A shape ({self.nq}, {len(names)}).",
-                "Give one row per coordinate and one column per quasi-velocity.",
+                f"In q' = V w + h there are {self.nq} coordinates and {len(names)} quasi-velocities.",
+                f"({self.nq}, {len(names)}).",
+                shape=V.shape,
             )
         other = Coordinates(self.names)
         other.t, other._q, other.plain = self.t, self._q, False
@@ -104,7 +102,7 @@ class Coordinates:
             for s in ca.symvar(expression):
                 if (self.where(s) or ("",))[0] == "w":
                     raise SpecificationError(
-                        f"{what} depends on {s.name()}.", "V and h are functions of q and t (3.1).", do="Remove it."
+                        f"{what} depends on {s.name()}.", "V and h are functions of q and t (3.1).", name=s.name()
                     )
         return other
 
@@ -167,7 +165,7 @@ class Coordinates:
         return self._index.get(symbol.element_hash())
 
     def order(self, expression):
-        """The highest k for which an expression holds γ^(k) (0 for q alone, -1 for neither)."""
+        """The highest k for which γ^(k) is in an expression; 0 for q alone, -1 for neither."""
         if not isinstance(expression, ca.SX):
             expression = ca.SX(ca.vertcat(*column(expression, "the expression")))
         places = [self.where(s) for s in ca.symvar(expression)]
@@ -185,14 +183,14 @@ class Coordinates:
         -------
         list of k + 1 lists of SX scalars
         """
-        expressions = [_as_sx(e) for e in expressions]
+        expressions = list(map(ca.SX, expressions))
         if k == 0:
             return [expressions]
         outputs = self._series(expressions, k).outputs[: len(expressions)]
-        return [[_as_sx(multiply(c[j], float(factorial(j)))) for c in outputs] for j in range(k + 1)]
+        return [[ca.SX(multiply(c[j], float(factorial(j)))) for c in outputs] for j in range(k + 1)]
 
     def as_function(self, expressions, parameters=()):
-        """Expressions of t, q, the jets and parameters as one function of these, which serialises and pickles.
+        """Expressions of t, q, jets and parameters as one CasADi function, which serialises and pickles.
 
         Parameters
         ----------
@@ -208,7 +206,7 @@ class Coordinates:
         return ca.Function("expressions", self._arguments(highest, parameters), list(expressions))
 
     def from_function(self, function, parameters=()):
-        """The expressions of a function that `as_function` made, here or in another process, in these symbols.
+        """The expressions of a function by `as_function`, perhaps of another process, in these symbols.
 
         Parameters
         ----------
@@ -233,14 +231,15 @@ class Coordinates:
         return _moved, (self.names, self.velocity_names, frame, tuple(self.invariants))
 
     def _series(self, expressions, k):
-        """Coefficients 0 to k of expressions, and behind them those of q' = V w + h where q itself is in them."""
-        symbols, moving = None, []
+        """Coefficients 0 to k of expressions, followed by those of q' = V w + h if these contain q and q' is not w."""
+        symbols, rates = None, []
         if not self.plain:
             symbols = ca.symvar(ca.vertcat(*expressions)) if expressions else []
             if any((self.where(s) or ("",))[0] == "q" for s in symbols):
-                symbols = _union(symbols, ca.symvar(ca.vertcat(ca.vec(self.V), self.h)), self._q, self.gamma(1))
-                moving = (self.V @ self.jet(1) + self.h).elements()
-        tape = Tape(symbols, [*expressions, *moving])
+                symbols = [*symbols, *ca.symvar(ca.vertcat(ca.vec(self.V), self.h)), *self._q, *self.gamma(1)]
+                symbols = list({s.element_hash(): s for s in symbols}.values())
+                rates = (self.V @ self.jet(1) + self.h).elements()
+        tape = Tape(symbols, [*expressions, *rates])
         inputs = [[] for _ in tape.symbols]
         series = Series(tape, inputs)
         motion = _SymbolicMotion(self, [series.c[node] for node in tape.outputs[len(expressions) :]])
@@ -252,7 +251,7 @@ class Coordinates:
 
 
 class _SymbolicMotion(Motion):
-    """The motion whose jets γ^(k) are symbols; `rates` are the coefficients of q', so far, where q' is not γ'."""
+    """The motion whose jets γ^(k) are symbols; `rates` lists the coefficients of q' so far, where q' is not γ'."""
 
     def __init__(self, q, rates):
         super().__init__(q)
@@ -271,7 +270,7 @@ class _SymbolicMotion(Motion):
 
 
 def _moved(names, velocity_names, frame, invariants):
-    """Coordinates with quasi-velocities, as another process described them."""
+    """Coordinates with quasi-velocities, unpickled."""
     q = Coordinates(names)
     V, h, *values = q.from_function(frame)
     return q.with_quasi_velocities(" ".join(velocity_names), V, h, dict(zip(invariants, values, strict=True)))
@@ -283,20 +282,9 @@ def _order(k):
             f"The order of a derivative is {k!r}.",
             "An order is a whole number, at least 0.",
             do="Write q.d(1), q.w(1) or q.dt(expression, 2).",
+            order=k,
         )
     return int(k)
-
-
-def _as_sx(c):
-    return c if isinstance(c, ca.SX) else ca.SX(c)
-
-
-def _union(*groups):
-    seen = {}
-    for group in groups:
-        for s in group:
-            seen.setdefault(s.element_hash(), s)
-    return list(seen.values())
 
 
 def jet_name(name, k, plain=True):
@@ -308,16 +296,19 @@ def jet_name(name, k, plain=True):
 def _identifiers(names, what):
     if not isinstance(names, str) or not names.split():
         raise SpecificationError(
-            f"The names of the {what} are {names!r}.", "They are one text of names separated by blanks.",
+            f"The names of the {what} are {names!r}.",
+            "Names are a text, separated by blanks.",
             do='Write, for example, "x y theta".',
-        )  # fmt: skip
+            names=names,
+        )
     names = tuple(names.split())
     for name in names:
         if not name.isidentifier() or name in ("t", "guess"):
             raise SpecificationError(
-                f"{name!r} is no name.",
-                "A name is a Python identifier other than t and guess, which are arguments of a start.",
+                f"{name!r} is no name of {what}.",
+                "Names are Python identifiers other than t and guess, which are arguments of a start.",
                 do="Rename it.",
+                name=name,
             )
     _refuse_clash(names)
     return names
@@ -325,24 +316,16 @@ def _identifiers(names, what):
 
 def _refuse_clash(names):
     """Refuse names that repeat, or that are names of derivatives of others."""
-    owner = {}
+    derivatives = {jet_name(name, k): name for name in names for k in range(1, 10)}
     for name in names:
-        if name in owner:
-            why = "it is given twice" if owner[name] == name else f"it is also a derivative of {owner[name]!r}"
-            raise _clash(name, why)
-        owner |= {jet_name(name, k): name for k in range(10)}
-    for name in names:
-        if owner[name] != name:
-            raise _clash(name, f"it is also a derivative of {owner[name]!r}")
-
-
-def _clash(name, why):
-    return SpecificationError(
-        f"The name {name!r} clashes: {why}.",
-        "Coordinates, quasi-velocities and derivatives (theta, dtheta, d2theta, ...) have different names.",
-        do="Rename one of them.",
-        name=name,
-    )
+        if names.count(name) > 1 or name in derivatives:
+            why = f"also names a derivative of {derivatives[name]!r}" if name in derivatives else "is used twice"
+            raise SpecificationError(
+                f"The name {name!r} {why}.",
+                "Coordinates, quasi-velocities and derivatives (theta, dtheta, d2theta, ...) have different names.",
+                do="Rename one of them.",
+                name=name,
+            )
 
 
 def coordinates(names: str | Iterable[str]) -> Coordinates:

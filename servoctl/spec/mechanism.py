@@ -8,20 +8,19 @@ import numpy as np
 
 from servoctl.checks import column, mapping
 from servoctl.errors import SpecificationError, unknown
-from servoctl.jets.evaluation import evaluate
-from servoctl.jets.tape import Tape
+from servoctl.jets.tape import Tape, evaluate
 from servoctl.spec.coordinates import Coordinates
 from servoctl.spec.packing import packed, unpacked
 from servoctl.spec.parameters import Parameters
 from servoctl.tolerances import ENTRY
 
 IDENTITY_SEED = 20021  # of the random points at which identities are tested
-RANDOM = (0.3, 1.3)  # where these lie, parameters in units of their defaults: of order one, and away from zero
-INTEGRABLE = 1e-9  # of the largest bracket of columns of V: what may lie outside their span
+RANDOM = (0.3, 1.3)  # range of these, with parameters in units of their defaults: of order one, and away from zero
+INTEGRABLE = 1e-9  # part of the brackets of V's columns outside their span, relative to the largest bracket
 
 
 class Mechanism:
-    """A mechanism under given forces, actuators and material constraints.
+    """A mechanism with forces, actuators and material constraints.
 
     Main arguments
 
@@ -46,7 +45,7 @@ class Mechanism:
     forces : dict of str to SX, or (n,) SX, optional
         Generalised forces by coordinate (or quasi-velocity) name.
     constraints : dict of str to SX, optional
-        Material constraints, of order 0, 1 or 2: realised by nature, ideally.
+        Material constraints of order 0, 1 or 2, realised by ideal reactions.
     outputs : dict of str to SX, optional
         Named outputs, expressions of t, q and jets.
 
@@ -75,22 +74,24 @@ class Mechanism:
     ):
         if not isinstance(q, Coordinates):
             raise SpecificationError(
-                f"The first argument is a {type(q).__name__}.",
-                "A mechanism starts from its coordinates.",
+                f"Expected Coordinates, got a {type(q).__name__}.",
+                "The first argument of a mechanism is its coordinates.",
                 do='Write Mechanism(sv.coordinates("x y"), ...).',
+                type=type(q).__name__,
             )
         self.q = q
         self.parameters = Parameters({}) if parameters is None else parameters
         if not isinstance(self.parameters, Parameters):
             raise SpecificationError(
-                f"parameters is a {type(parameters).__name__}.",
-                "Parameters are symbols with default numbers.",
-                do="Make them by sv.parameters(m=1.0, ...).",
+                f"Expected Parameters, got a {type(parameters).__name__}.",
+                "Parameters are symbols with default values.",
+                do="Write parameters=sv.parameters(m=1.0, ...).",
+                type=type(parameters).__name__,
             )
-        self._gibbs = self._scalar(gibbs, "the Gibbs function")
-        self._kinetic = self._scalar(kinetic, "the kinetic energy")
-        self._given = None if balance is None else self._column(balance, "the balance", q.n)
-        self.potential = ca.SX(0) if potential is None else self._scalar(potential, "the potential")
+        self._gibbs = None if gibbs is None else self._known(gibbs, "the Gibbs function")
+        self._kinetic = None if kinetic is None else self._known(kinetic, "the kinetic energy")
+        self._inverse_dynamics = None if balance is None else self._known(balance, "the balance", q.n)
+        self.potential = ca.SX(0) if potential is None else self._known(potential, "the potential")
         self.forces = self._forces(forces)
         self.actuators = tuple(mapping(actuators, "The actuators"))
         self.E = self._directions(actuators or {})
@@ -115,7 +116,7 @@ class Mechanism:
         return "\n".join(lines)
 
     def as_text(self):
-        """Names, numbers and expressions: the same for the same operations in the same order, and for no others."""
+        """Names, numbers and expressions as text, which is equal for equal mechanisms alone."""
         q, p = self.q, self.parameters
         names = [q.names, q.velocity_names, q.plain, list(q.invariants), self.actuators, list(self.constraints)]
         expressions = [
@@ -140,8 +141,8 @@ class Mechanism:
     @cached_property
     def balance(self):
         """r = ∂S/∂γ'' - Γ without actuation, (n,) SX in units of generalised force."""
-        if self._given is not None:
-            inertial = self._given
+        if self._inverse_dynamics is not None:
+            inertial = self._inverse_dynamics
         elif self._gibbs is not None:
             inertial = ca.gradient(self._gibbs, ca.vertcat(*self.q.gamma(2)))
         else:
@@ -155,7 +156,7 @@ class Mechanism:
 
     @cached_property
     def energy(self):
-        """Kinetic plus potential energy [J], SX; the kinetic energy is T where given, else wᵀMw/2."""
+        """Kinetic plus potential energy [J], SX; without a kinetic energy T it is taken as wᵀMw/2."""
         w = ca.vertcat(*self.q.gamma(1))
         kinetic = ca.dot(w, self.mass @ w) / 2 if self._kinetic is None else self._kinetic
         return kinetic + self.potential
@@ -177,11 +178,12 @@ class Mechanism:
         return q.V.T @ (q.dt(momentum) - slope)
 
     def _check_balance(self):
-        if self._gibbs is None and self._kinetic is None and self._given is None:
+        if self._gibbs is None and self._kinetic is None and self._inverse_dynamics is None:
             raise SpecificationError(
-                "Neither a Gibbs function nor a kinetic energy nor a balance was given.",
-                "A mechanism's inertia comes from one of them.",
-                do="Give gibbs=sv.particle(...) + ..., kinetic=T or balance=r.",
+                "The mechanism has no inertia.",
+                "Inertia comes from a Gibbs function, a kinetic energy or a balance.",
+                do="Pass gibbs=sv.particle(...) + ..., kinetic=T or balance=r.",
+                coordinates=list(self.q.names),
             )
         if self._kinetic is not None and self._gibbs is None and not self.q.plain and self.q.n < self.q.nq:
             self._refuse_nonholonomic_frame()
@@ -193,21 +195,22 @@ class Mechanism:
                 else "The balance is not linear in the accelerations.",
                 "S = Σ m a·a/2 is quadratic in γ'', so that ∂S/∂γ'' is linear (3.8).",
                 do="Build S by sv.particle and sv.rigid_body, or check the powers of the second derivatives.",
+                source="balance" if self._gibbs is None else "gibbs",
             )  # fmt: skip
         if self._gibbs is not None and self._kinetic is not None:
             difference = ca.gradient(self._gibbs, acceleration) - self._lagrange()
-            wrong = [
-                n for n, d in zip(self.q.jet_names(2), difference.elements(), strict=True) if not self.is_zero([d])
-            ]
-            if wrong:
+            components = zip(self.q.jet_names(2), difference.elements(), strict=True)
+            different = [name for name, component in components if not self.is_zero([component])]
+            if different:
                 raise SpecificationError(
-                    f"The Gibbs function and the kinetic energy give different balances in {', '.join(wrong)}.",
+                    f"The Gibbs function and the kinetic energy give different balances in {', '.join(different)}.",
                     "Both describe the same inertia: ∂S/∂γ'' = Vᵀ(d/dt ∂T/∂q' - ∂T/∂q).",
-                    do="Correct one of them, or give only one.",
-                    components=wrong,
+                    do="Correct one of them, or remove it.",
+                    components=different,
                 )
 
     def _refuse_nonholonomic_frame(self):
+        """Refuse a kinetic energy in quasi-velocities if brackets of the columns of V lie outside their span."""
         q = ca.vertcat(*self.q)
         columns = ca.horzsplit(self.q.V)
         brackets = [
@@ -223,12 +226,13 @@ class Mechanism:
                 raise SpecificationError(
                     "The kinetic energy is in quasi-velocities whose frame V is not integrable.",
                     "Lagrange's equations do not hold for velocities restricted by nonholonomic constraints.",
-                    do="Give a Gibbs function, which holds in any quasi-velocities (3.10), or all velocities with the "
-                    "constraints as material constraints.",
+                    do="Use a Gibbs function, which is valid in any quasi-velocities (3.10), or all velocities with "
+                    "material constraints.",
+                    velocities=list(self.q.velocity_names),
                 )
 
     def is_zero(self, items):
-        """Whether expressions vanish at seeded random points, to rounding in the size of their terms.
+        """Whether SX scalars vanish at seeded random points, up to rounding errors of their terms.
 
         Parameters
         ----------
@@ -255,31 +259,27 @@ class Mechanism:
                 points[i] *= self.parameters.defaults.get(s.name(), 1.0)
         return evaluate(Tape(symbols, items), points)
 
-    def _scalar(self, value, what):
-        return None if value is None else self._known(column(value, what, 1)[0], what)
-
-    def _column(self, value, what, size):
-        return self._known(ca.vertcat(*column(value, what, size)), what)
+    def _known(self, value, what, size=1):
+        """An SX scalar or column in symbols of the mechanism."""
+        expression = ca.vertcat(*column(value, what, size))
+        require_known(expression, self, what)
+        return expression
 
     def _named(self, values, what):
         named = mapping(values, f"The {what}s").items()
-        return {name: self._known(column(v, f"{what} {name!r}", 1)[0], f"{what} {name!r}") for name, v in named}
-
-    def _known(self, expression, what):
-        require_known(expression, self, what)
-        return expression
+        return {name: self._known(value, f"{what} {name!r}") for name, value in named}
 
     def _forces(self, forces):
         if forces is None:
             return ca.SX.zeros(self.q.n)
         if not isinstance(forces, dict):
-            return self._column(forces, "the forces", self.q.n)
+            return self._known(forces, "the forces", self.q.n)
         names = list(self.q.names if self.q.plain else self.q.velocity_names)
         total = ca.SX.zeros(self.q.n)
         for name, value in forces.items():
             if name not in names:
                 raise unknown(name, names, "coordinate" if self.q.plain else "quasi-velocity")
-            total[names.index(name)] += self._known(column(value, f"the force on {name!r}", 1)[0], "a force")
+            total[names.index(name)] += self._known(value, f"the force on {name!r}")
         return total
 
     def _directions(self, actuators):
@@ -288,47 +288,45 @@ class Mechanism:
             what = f"actuator {name!r}"
             items = column(value, what)
             if not items:
-                raise SpecificationError(f"{what} is empty.", "An actuator has a displacement or a direction.")
+                raise SpecificationError(
+                    f"{what} is empty.", "An actuator has a displacement or a direction.", name=name
+                )
             direction = isinstance(value, (list, tuple, np.ndarray)) or len(items) > 1
             if direction and len(items) != self.q.n:
                 rates = ", ".join(self.q.velocity_names)
                 raise SpecificationError(
                     f"{what} has {len(items)} entries.",
                     f"A direction has {self.q.n}, one for each of {rates}; a displacement is one scalar.",
-                    do="Give so many entries, or a scalar displacement.",
+                    do="Change the number of entries, or pass a scalar displacement.",
                     name=name,
+                    entries=len(items),
                 )
-            if direction:
-                columns.append(self._column(items, what, self.q.n))
-                continue
-            displacement = self._scalar(items[0], what)
-            if self.q.order(displacement) < 0:
+            expression = self._known(items, what, len(items))
+            order = self.q.order(expression)
+            if order > 0:
                 raise SpecificationError(
-                    f"The displacement of actuator {name!r} depends on no coordinate.",
-                    "An actuator is given by the displacement it works on, or by a direction of n entries.",
-                    do="Give a function of q, or a sequence.",
+                    f"The {'direction' if direction else 'displacement'} of {what} depends on velocities.",
+                    "Displacements and directions are functions of q and t.",
+                    do="Use the coordinates instead of the velocities.",
+                    name=name,
+                    order=order,
+                )
+            if not direction and order < 0:
+                raise SpecificationError(
+                    f"The displacement of {what} depends on no coordinate.",
+                    "An actuator works on a displacement, or along a direction of n entries.",
+                    do="Use a function of q, or a sequence.",
                     name=name,
                 )
-            columns.append(self.q.V.T @ ca.gradient(displacement, ca.vertcat(*self.q)))
-            self._refuse_velocities(displacement)
-        result = ca.horzcat(*columns) if columns else ca.SX(self.q.n, 0)
-        self._refuse_velocities(result)
-        return result
-
-    def _refuse_velocities(self, expression):
-        if self.q.order(expression) > 0:
-            raise SpecificationError(
-                "An actuator's displacement or direction depends on velocities.",
-                "E is a function of q and t.",
-                do="Give positions.",
-            )
+            columns.append(expression if direction else self.q.V.T @ ca.gradient(expression, self.q.jet(0)))
+        return ca.horzcat(*columns) if columns else ca.SX(self.q.n, 0)
 
     def _refuse_orders(self):
         for what, items, limit in (
             ("The potential", {"": self.potential}, 0),
             ("The kinetic energy", {"": self._kinetic}, 1),
             ("The Gibbs function", {"": self._gibbs}, 2),
-            ("The balance", {"": self._given}, 2),
+            ("The balance", {"": self._inverse_dynamics}, 2),
             ("The forces", {"": self.forces}, 2),
             ("The material constraint", self.constraints, 2),
         ):
@@ -337,7 +335,10 @@ class Mechanism:
                     raise SpecificationError(
                         f"{what}{f' {name!r}' if name else ''} has order {self.q.order(expression)} in the jets.",
                         f"Its order is at most {limit}.",
-                        do="Lower derivatives only; constraints of higher order are program constraints.",
+                        do="Use lower derivatives; constraints of higher order are program constraints.",
+                        name=name,
+                        order=self.q.order(expression),
+                        limit=limit,
                     )
 
     def _refuse_names(self):
@@ -351,8 +352,8 @@ class Mechanism:
             for name in names:
                 if name in seen:
                     raise SpecificationError(
-                        f"The name {name!r} is given to {what} and to {seen[name]}.",
-                        "Everything in a result has one name.",
+                        f"{what.capitalize()} and {seen[name]} are both named {name!r}.",
+                        "Names in a result are unique.",
                         do="Rename one of them.",
                         name=name,
                     )
@@ -367,7 +368,7 @@ def _unpickled(q, parameters, content):
 
 @lru_cache(32)
 def _latest(mechanism):
-    """An equal one of the last mechanisms from other processes, or else this one: what is derived of it is shared."""
+    """The first of equal mechanisms from other processes, so that models derived from it are shared."""
     return mechanism
 
 

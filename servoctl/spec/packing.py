@@ -1,7 +1,7 @@
-"""Values that hold expressions, on their way to another process.
+"""Pickling of values that hold CasADi expressions.
 
-CasADi's expressions do not pickle, but functions do: all expressions of a value become one function of t, q, the jets
-and the parameters, which the reader calls on symbols of its own. They come back operation by operation.
+Expressions do not pickle, but functions do: all expressions of a value become one function of t, q, the jets and the
+parameters, which is called on the symbols of the other process. They come back operation by operation.
 """
 
 import io
@@ -12,25 +12,25 @@ import casadi as ca
 
 
 def packed(value, q, parameters, shared=None):
-    """A value as what pickles.
+    """A value with expressions as a function and bytes, which pickle.
 
     Parameters
     ----------
     value : object
-        It may hold SX expressions at any depth. A dataclass travels as the fields that its constructor takes, without
-        those that do not count for its equality: what was computed from the others is computed again.
+        It may hold SX expressions at any depth. A dataclass is packed as those fields of its constructor that count
+        for its equality; cached fields are computed again.
     q : Coordinates
     parameters : Parameters
-        The expressions depend on their symbols alone.
+        Symbols of the expressions beside those of q.
     shared : dict of str to object, optional
-        What the reader has already, by name, beside q: it is referred to, and not packed.
+        Objects by name, beside q, that are referred to and not packed.
 
     Returns
     -------
     function : casadi.Function
-        Of the expressions.
+        Its outputs are the expressions.
     content : bytes
-        The rest.
+        Everything else.
     """
     stream = io.BytesIO()
     pickler = _Pickler(stream, {"q": q, **(shared or {})})
@@ -45,7 +45,7 @@ def unpacked(content, q, parameters, shared=None):
     ----------
     content : (casadi.Function, bytes)
     q, parameters, shared
-        As `packed` takes them; they may be those of another process.
+        As in `packed`, perhaps of another process.
     """
     function, rest = content
     unpickler = pickle.Unpickler(io.BytesIO(rest))
@@ -55,7 +55,7 @@ def unpacked(content, q, parameters, shared=None):
 
 
 class _Pickler(pickle.Pickler):
-    """Puts expressions aside, and refers by name to what the reader has."""
+    """Collects expressions, and refers to shared objects by name."""
 
     def __init__(self, stream, shared):
         super().__init__(stream, pickle.HIGHEST_PROTOCOL)

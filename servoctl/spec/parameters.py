@@ -1,6 +1,5 @@
 """Parameters: symbols in the equations, numbers at run time."""
 
-
 import casadi as ca
 import numpy as np
 
@@ -36,7 +35,7 @@ class Parameters:
 
     @property
     def names(self):
-        """The names, in the order given."""
+        """The names, in the order of their definition."""
         return tuple(self.defaults)
 
     @property
@@ -64,7 +63,9 @@ class Parameters:
         """
         numbers = dict(self.defaults)
         if changes is not None and not isinstance(changes, dict):
-            raise SpecificationError(f"Changes are {changes!r}.", "Parameters change by name.", do="Give a dict.")
+            raise SpecificationError(
+                f"The parameters are {changes!r}.", "Parameters change by name, in a dict.", values=changes
+            )
         for name, value in (changes or {}).items():
             if name not in numbers:
                 raise unknown(name, list(numbers), "parameter")
@@ -78,7 +79,7 @@ def parameters(**values: float) -> Parameters:
     Parameters
     ----------
     **values : float
-        Name and default, SI. They stay symbolic in every derivation and are given numbers at run time.
+        Default of each name, SI. Derivations keep the symbols; numbers enter at run time.
 
     Returns
     -------
@@ -91,5 +92,7 @@ def parameters(**values: float) -> Parameters:
     """
     for name in values:
         if name in ("t", "names", "values", "symbols", "defaults"):
-            raise SpecificationError(f"A parameter is named {name!r}.", "This name is taken.", do="Rename it.")
+            raise SpecificationError(
+                f"A parameter is named {name!r}.", "This name is reserved.", do="Rename it.", name=name
+            )
     return Parameters({name: finite(name, value, "parameter") for name, value in values.items()})

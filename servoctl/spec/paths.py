@@ -6,22 +6,22 @@ another scalar path, the *time law*::
     s = rest_to_rest(q.t, 0.0, 1.0, duration=6.0, smoothness=4)       # when: from 0 to 1 in 6 s
     path = circle(2 * ca.pi * s, centre=(0.0, 1.0), radius=0.5)       # where: one turn
 
-Pieces are joined by `fmin`, `fmax` and comparisons of the time alone, so that a derivative of any order is
-right on whichever side of a knot these are evaluated. A path of class C^k has k continuous derivatives; the
-docstrings state k for each function of a smooth first argument. A path along a time law has the lower class.
+Pieces are joined by `fmin`, `fmax` and comparisons of the time alone, so that derivatives of any order are right on
+either side of a knot. A path of class C^k has k continuous derivatives; the docstrings state k for smooth first
+arguments. A path along a time law has the lower of both classes.
 """
 
 import math
-import operator
 
 import casadi as ca
 import numpy as np
 
-from servoctl.checks import column
+from servoctl.checks import column, is_number, is_whole
 from servoctl.errors import SpecificationError, unknown
 
-MISSED = 1e-9  # of the largest point: a spline that passes its points farther away is refused
-ORTHONORMAL = 1e-9  # by which products of a circle's axes may differ from those of unit vectors at right angles
+MISSED = 1e-9  # largest distance of a spline from its points, relative to the largest point
+ORTHONORMAL = 1e-9  # largest difference of products of a circle's axes from those of orthonormal vectors
+
 
 def rest_to_rest(t, start, end, duration, smoothness=4, t_start=0.0):
     """Move from rest to rest along the polynomial of degree 2k + 1 whose first k derivatives vanish at both ends.
@@ -100,10 +100,10 @@ def trapezoid(t, distance, duration, ramp, smoothness=4, t_start=0.0):
     k = _smoothness(smoothness, least=1)
     if (2 * ramp > duration).is_one():
         raise SpecificationError(
-            f"Two ramps of {ramp} s do not fit in a duration of {duration} s",
-            "A trapezoid speeds up, cruises and slows down within its duration",
-            f"The longest ramp is {float(duration) / 2:g} s",
-            "Shorten the ramp or lengthen the duration",
+            f"Two ramps of {ramp} s do not fit in a duration of {duration} s.",
+            "A trapezoid speeds up, cruises and slows down within its duration.",
+            f"A ramp of {float(duration) / 2:g} s.",
+            "Shorten the ramp or lengthen the duration.",
             ramp=float(ramp),
             duration=float(duration),
         )
@@ -154,7 +154,7 @@ def circle(angle, centre, radius, axes=None):
         The radius [m], positive.
     axes : pair of sequences like `centre`, optional
         Orthonormal e1 (where the angle is zero) and e2 (where it is pi/2) that span the circle's plane; in
-        the plane (1, 0) and (0, 1) unless given.
+        the plane (1, 0) and (0, 1) by default.
 
     Returns
     -------
@@ -171,9 +171,9 @@ def circle(angle, centre, radius, axes=None):
     n = centre.numel()
     if n not in (2, 3) or (n == 3 and axes is None):
         raise SpecificationError(
-            f"The circle's centre has {n} entries and axes are {'not ' if axes is None else ''}given",
-            "A circle lies in the plane (2 entries), or in space (3) in the plane that two axes span",
-            do="Give a centre with 2 entries, or one with 3 and the axes.",
+            f"The circle has a centre with {n} entries and {'no' if axes is None else 'two'} axes.",
+            "A centre has 2 entries in the plane; in space it has 3, and two axes span the plane of the circle.",
+            do="Use a centre with 2 entries, or one with 3 and axes.",
             size=n,
         )
     e1, e2 = _orthonormal(((1, 0), (0, 1)) if axes is None else axes, centre)
@@ -227,11 +227,13 @@ def spline(t, times, points, smoothness=2, ends="rest"):
     vanishing = range(1, m + 1) if ends == "rest" else range(m + 1, 2 * m + 1)
     if ends == "natural" and len(times) <= m:
         raise SpecificationError(
-            f"A natural spline of smoothness {k} is given {len(times)} points",
-            f"Its degree is {2 * m + 1}, and {m + 1} points or more determine it",
-            f"smoothness = {2 * (len(times) - 1)}", "Give more points, a lower smoothness, or ends='rest'",
-            points=len(times), smoothness=k,
-        )  # fmt: skip
+            f"A natural spline of smoothness {k} has {len(times)} points.",
+            f"Its degree is {2 * m + 1}, which needs at least {m + 1} points.",
+            f"smoothness={2 * (len(times) - 1)}.",
+            "Use more points, a lower smoothness, or ends='rest'.",
+            points=len(times),
+            smoothness=k,
+        )
     pieces = _spline_pieces(times, points, 2 * m + 1, vanishing)
     if ends == "rest":
         t = ca.fmin(ca.fmax(t, times[0]), times[-1])
@@ -258,9 +260,9 @@ def _integral_of_step(sigma, k):
 
 
 def _spline_pieces(times, points, degree, vanishing):
-    """Coefficients (degree + 1, n - 1, dim) of the spline's polynomials, each in its own time from -1 to 1.
+    """Coefficients (degree + 1, n - 1, dim) of the spline's polynomials, each in a time from -1 to 1 on its piece.
 
-    About the middle of its piece a polynomial's coefficients stay of the size of its values.
+    Expanded about the middle of its piece a polynomial has coefficients of the size of its values.
     """
     from scipy.interpolate import make_interp_spline
 
@@ -270,7 +272,7 @@ def _spline_pieces(times, points, degree, vanishing):
     try:
         curve = make_interp_spline(x, points, k=degree, bc_type=(conditions, conditions) if conditions else None)
         taylor = [curve(middle, nu=order) / math.factorial(order) for order in range(degree + 1)]
-    except (ValueError, np.linalg.LinAlgError):  # intervals so uneven that its equations are singular
+    except (ValueError, np.linalg.LinAlgError):  # SciPy's equations are singular for very uneven intervals
         taylor = [np.full((len(half), points.shape[1]), np.nan)] * (degree + 1)
     pieces = np.array([c * half[:, None] ** order for order, c in enumerate(taylor)])
     starts, stops = pieces[::2].sum(axis=0) - pieces[1::2].sum(axis=0), pieces.sum(axis=0)
@@ -279,8 +281,8 @@ def _spline_pieces(times, points, degree, vanishing):
         ratio = half.max() / half.min()
         raise SpecificationError(
             f"The spline of degree {degree} misses its points by {miss:.1e}; its longest interval is {ratio:.3g} times "
-            "its shortest",
-            f"A spline passes through its points, within {MISSED:g} of the largest",
+            "its shortest.",
+            f"A spline passes through its points to within {MISSED:g} of the largest.",
             do="Choose intervals in proportion to the distances between the points, or a lower smoothness.",
             degree=degree,
             miss=miss,
@@ -290,7 +292,7 @@ def _spline_pieces(times, points, degree, vanishing):
 
 
 def _via_points(times, points):
-    """Return the times (n,) and points (n, dim) of a spline as arrays of numbers."""
+    """The times (n,) and points (n, dim) of a spline as arrays of numbers."""
     try:
         times, points = np.asarray(times, dtype=float), np.asarray(points, dtype=float)
         finite = np.isfinite(times).all() and np.isfinite(points).all()
@@ -298,17 +300,17 @@ def _via_points(times, points):
         finite = False
     if not finite:
         raise SpecificationError(
-            "The spline's times or points hold something other than finite numbers",
-            "Via points are numbers, not expressions, in arrays of shapes (n,) and (n,) or (n, dim)",
-            do="Give finite numbers, or a line or rest_to_rest, which take expressions.",
+            "The spline's times or points are not all finite numbers.",
+            "Times and points are arrays of numbers of shapes (n,) and (n,) or (n, dim).",
+            do="For expressions use line or rest_to_rest.",
             times=times,
             points=points,
         )
     if times.ndim != 1 or len(times) < 2 or points.ndim not in (1, 2) or len(points) != len(times) or not points.size:
         raise SpecificationError(
-            f"The spline's times have shape {times.shape} and its points {points.shape}",
-            "There are n >= 2 times, and one point for each",
-            do="Give one point for each time; points in rows, their entries in columns.",
+            f"The spline's times have the shape {times.shape}, its points {points.shape}.",
+            "There are at least two times, and one point for each.",
+            do="Put points in rows, and their entries in columns.",
             times=times.shape,
             points=points.shape,
         )
@@ -316,86 +318,84 @@ def _via_points(times, points):
     if falls.size:
         i = int(falls[0])
         raise SpecificationError(
-            f"The spline's times {i} and {i + 1} are {times[i]:g} and {times[i + 1]:g}",
-            "Times increase strictly", f"A time {i + 1} later than {times[i]:g}",
-            "Sort the points by time and drop repeated times", index=i + 1,
-        )  # fmt: skip
+            f"The spline's times {i} and {i + 1} are {times[i]:g} and {times[i + 1]:g}.",
+            "Times increase strictly.",
+            do="Sort the points by time and remove repeated times.",
+            index=i + 1,
+        )
     return times, points.reshape(len(times), -1)
 
 
 def _column(value, what):
-    """Return an SX column of expressions and finite numbers."""
+    """An SX column of expressions and finite numbers."""
     items = column(value, what)
     shape = getattr(value, "shape", ())
     if not items or (len(shape) == 2 and 1 not in shape):
         raise SpecificationError(
-            f"{what} has the shape {shape or (0,)}", "A point of a path is a number or a vector of one entry or more",
-            what=what, shape=shape,
-        )  # fmt: skip
+            f"{what} has the shape {shape or (0,)}.",
+            "A point of a path is a number or a vector with at least one entry.",
+            what=what,
+            shape=shape,
+        )
     return ca.vertcat(*items)
 
 
 def _scalar(value, what):
-    """Return an SX scalar: an expression, or a finite number."""
+    """An SX scalar: an expression, or a finite number."""
     value = _column(value, what)
     if value.numel() != 1:
         raise SpecificationError(
-            f"{what} has {value.numel()} entries", f"A path is an expression of one scalar {what}",
-            do="Give q.t, a scalar path, a parameter or a number; to tabulate a path, make a casadi.Function of it.",
-            what=what, size=value.numel(),
-        )  # fmt: skip
+            f"{what} has {value.numel()} entries.",
+            f"A path is an expression of one scalar {what}.",
+            do="Use q.t, a scalar path, a parameter or a number; a casadi.Function of a path tabulates it.",
+            what=what,
+            size=value.numel(),
+        )
     return value
 
 
 def _positive(value, what):
-    """Return an SX scalar that is an expression, or a number greater than zero."""
+    """An SX scalar that is an expression, or a number greater than zero."""
     value = _scalar(value, what)
     if value.is_constant() and float(value) <= 0:
+        nearest = f"{what} = {-float(value):g}." if float(value) < 0 else ""
         raise SpecificationError(
-            f"{what} = {value}", f"The {what} of a path is positive", f"{what} = {abs(float(value)) or 1.0:g}",
-            f"Give a {what} greater than zero", what=what, value=float(value),
-        )  # fmt: skip
+            f"{what} = {value}.", f"The {what} of a path is positive.", nearest, what=what, value=float(value)
+        )
     return value
 
 
 def _smoothness(k, least=0):
-    """Return the k of a class C^k as an int."""
-    try:
-        order = operator.index(k)
-    except TypeError:
-        order = None
-    if order is None or order < least or isinstance(k, bool):
-        is_number = isinstance(k, (int, float)) and math.isfinite(k)
+    """The k of a class C^k as an int."""
+    if not is_whole(k) or k < least:
         raise SpecificationError(
-            f"smoothness = {k!r}",
-            f"The smoothness is the k of class C^k, an integer of at least {least}",
-            f"smoothness = {max(least, math.ceil(k)) if is_number else 4}",
-            "Give as many continuous derivatives as the program needs of its path",
+            f"smoothness={k!r}.",
+            f"The smoothness k of a path of class C^k is a whole number, at least {least}.",
+            f"smoothness={max(least, math.ceil(k))}." if is_number(k) else "",
+            "The error for a path of too low a class names the class that a program needs.",
             smoothness=k,
         )
-    return order
+    return int(k)
 
 
 def _orthonormal(axes, centre):
-    """Return two unit vectors at right angles, of the size of `centre`."""
+    """Two orthonormal vectors of the size of `centre`."""
     if not isinstance(axes, (list, tuple, np.ndarray)) or len(axes) != 2:
         raise SpecificationError(
-            f"The circle's axes are {axes!r}", "Two orthonormal vectors span its plane",
-            do="Give a pair of vectors.", axes=axes,
-        )  # fmt: skip
+            f"The circle's axes are {axes!r}.", "A pair of orthonormal vectors spans its plane.", axes=axes
+        )
     e1, e2 = (_column(axis, f"axes[{i}]") for i, axis in enumerate(axes))
     _same_size(centre=centre, **{"axes[0]": e1, "axes[1]": e2})
     gram = ca.vertcat(ca.dot(e1, e1) - 1, ca.dot(e1, e2), ca.dot(e2, e2) - 1)
     if gram.is_constant() and np.abs(np.array(ca.DM(gram))).max() > ORTHONORMAL:
         raise SpecificationError(
-            f"The circle's axes are {axes!r}", "They are unit vectors at right angles",
-            nearest=_orthonormalised(e1, e2), axes=axes,
-        )  # fmt: skip
+            f"The circle's axes are {axes!r}.", "Axes are orthonormal.", _orthonormalised(e1, e2), axes=axes
+        )
     return e1, e2
 
 
 def _orthonormalised(e1, e2):
-    """Text of the orthonormal axes of the same plane, by Gram and Schmidt; empty for parallel vectors."""
+    """Text of orthonormal axes of the same plane, by Gram and Schmidt; empty for parallel vectors."""
     a, b = (np.array(ca.DM(e)).ravel() for e in (e1, e2))
     a = a / (np.linalg.norm(a) or 1.0)
     b = b - (a @ b) * a
@@ -409,7 +409,7 @@ def _same_size(**columns):
     sizes = {name: c.numel() for name, c in columns.items()}
     if len(set(sizes.values())) > 1:
         raise SpecificationError(
-            "Sizes differ: " + ", ".join(f"{name} has {n}" for name, n in sizes.items()),
-            "They are vectors of the same space", f"{max(sizes.values())} entries each",
-            "Give as many entries in each", **sizes,
-        )  # fmt: skip
+            ", ".join(f"{name} has {n} entries" for name, n in sizes.items()) + ".",
+            "They are vectors of the same space, and have the same number of entries.",
+            **sizes,
+        )

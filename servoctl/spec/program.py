@@ -17,14 +17,14 @@ class Program:
     Parameters
     ----------
     residuals : dict of str to SX scalar
-        φ_i(t, q, γ', ..., γ^(s_i)), to be kept at zero.
+        φ_i(t, q, γ', ..., γ^(s_i)), which the motion keeps at zero.
     by : {"ideal", "actuators"}
         "ideal": an ideal reaction, which does no work on the virtual displacements that the program's leading
         matrix allows (eq. (3.18) as printed; for residuals nonlinear in velocities or of order >= 2 this
-        generalised Chetaev rule is a postulate). "actuators": the mechanism's own actuators.
+        generalised Chetaev rule is a postulate). "actuators": the actuators of the mechanism.
     weights : dict of str to float or SX, optional
         Weights W of the actuators, for programs with fewer residuals than actuators: the actuation has least
-        uᵀWu. Default 1 each, in the actuators' own units.
+        uᵀWu. Default 1 each, in units of the actuators.
 
     Raises
     ------
@@ -36,19 +36,24 @@ class Program:
         if not isinstance(residuals, dict) or not residuals:
             raise SpecificationError(
                 f"The program's residuals are {residuals!r}.",
-                "A program names at least one residual.",
+                "A program has at least one residual, by name.",
                 do='Write {"X": expression, ...}.',
+                residuals=residuals,
             )
         if not isinstance(by, str) or by not in REALISATIONS:
             raise SpecificationError(
                 f"by={by!r}.",
                 "A program is realised by 'ideal' reactions or by the mechanism's 'actuators'.",
                 nearest="".join(map(repr, difflib.get_close_matches(str(by), REALISATIONS, 1))),
+                by=by,
             )
         mapping(residuals, "The residuals")
         if weights is not None and by != "actuators":
             raise SpecificationError(
-                "An ideal program has weights.", "Weights choose among actuators.", do="Leave them out."
+                f"The program with by={by!r} has weights.",
+                "Weights choose among actuators.",
+                do="Remove the weights, or write by='actuators'.",
+                by=by,
             )
         self.residuals = {name: _residual(name, value) for name, value in residuals.items()}
         self.by = by
@@ -72,7 +77,7 @@ class Program:
         factor : float
             σ > 0; below 1 the motion is quicker.
         at : float
-            The instant that stays where it is [s].
+            The fixed instant [s].
 
         Returns
         -------
@@ -86,20 +91,16 @@ class Program:
         sigma, instant = _number(factor), _number(at)
         if not sigma > 0:
             raise SpecificationError(
-                f"The factor by which a program is slowed is {factor!r}.",
-                "The factor is a positive number: 2.0 takes twice as long.",
-                do="Give a number above zero.",
-                factor=factor,
+                f"factor={factor!r}.", "The factor is positive; 2.0 takes twice as long.", factor=factor
             )
         if np.isnan(instant):
-            raise SpecificationError(
-                f"at={at!r}.", "The instant that stays where it is is a finite number [s]."
-            )
+            raise SpecificationError(f"at={at!r}.", "The fixed instant is a finite number [s].", at=at)
         if not q.plain and (not q.h.is_zero() or ca.depends_on(q.V, q.t)):
             raise SpecificationError(
                 "The kinematics q' = V w + h depend on time or drift by h.",
-                "Another time law would change them as well as the program.",
-                do="Write the slower program yourself.",
+                "A slower program has the same kinematics; these would have to change with it.",
+                do="Write the slower mechanism and program yourself.",
+                coordinates=list(q.names),
             )
         symbols, values = [q.t], [instant + (q.t - instant) / sigma]
         weights = {name: ca.SX(value) for name, value in self.weights.items()}
@@ -124,12 +125,13 @@ def _residual(name, value):
             "A residual is a scalar.",
             do="Name each component.",
             name=name,
+            entries=len(items),
         )
     if not ca.symvar(items[0]):
         raise SpecificationError(
             f"The residual {name!r} is the number {items[0]}.",
             "A residual is an expression of the coordinates, their derivatives and t.",
-            do="Write what is to be kept at zero.",
+            do="Write the expression that the motion keeps at zero.",
             name=name,
         )
     return items[0]
@@ -145,14 +147,15 @@ def _weight(name, value):
         raise SpecificationError(
             f"The weight of {name!r} is {value!r}.",
             "The actuation of least uᵀWu exists for positive weights.",
-            do="Give a positive number or an expression; the default is 1.",
+            do="Use a positive number or an expression; the default is 1.",
             name=name,
+            weight=value,
         )
     return number
 
 
 def _number(value):
-    """A finite number, or NaN for what is none."""
+    """A finite number, or NaN for anything else."""
     try:
         number = np.nan if isinstance(value, (str, bytes)) else float(value)
     except Exception:  # CasADi raises its own types for symbols

@@ -1,4 +1,4 @@
-"""Cases of a sweep: grids, random draws, tables of columns; plain dicts of parameters."""
+"""Cases of a sweep: dicts of parameters from grids, random draws or columns."""
 
 import itertools
 import math
@@ -7,8 +7,8 @@ from collections.abc import Mapping
 from servoctl.checks import plain, whole
 from servoctl.errors import SpecificationError
 
-DRAWS, CASES = 0, 1  # first spawn key: random numbers of the parameters, and those that a case draws for itself
-FAILURE = ("error", "message", "facts")  # columns of what went wrong
+DRAWS, CASES = 0, 1  # first spawn key: draws of the parameters, and draws inside a case
+FAILURE = ("error", "message", "facts")  # columns of cases that failed
 RESERVED = ("case", *FAILURE, "rng")
 
 
@@ -18,7 +18,7 @@ def grid(**values) -> list[dict]:
     Parameters
     ----------
     **values : sequence of float
-        Values of each parameter by name, SI; a single number is kept fixed.
+        Values of each parameter by name, SI; a single number is the same in all cases.
 
     Returns
     -------
@@ -34,17 +34,17 @@ def grid(**values) -> list[dict]:
 
 
 def monte_carlo(n: int, /, *, seed: int, **distributions) -> list[dict]:
-    """Random cases; case i depends on the seed and on i alone, so that more cases begin with the same ones.
+    """Random cases; case i depends on the seed and on i alone, so that a larger n adds cases and changes none.
 
     Parameters
     ----------
     n : int
         Number of cases.
     seed : int
-        Of the random numbers.
+        Seed of the random numbers.
     **distributions : number, callable or frozen distribution of scipy.stats
-        By parameter: a number is kept fixed, `rng -> number` is called with a numpy Generator, and a distribution is
-        drawn from. Each name has a stream of its own: one more name changes none of the others.
+        Distribution of each parameter by name: a number is the same in all cases; a callable is called with a numpy
+        Generator and returns a number. Each name has its own random stream: one more name changes none of the others.
 
     Returns
     -------
@@ -53,17 +53,21 @@ def monte_carlo(n: int, /, *, seed: int, **distributions) -> list[dict]:
     Raises
     ------
     SpecificationError
-        If n or the seed is no whole number, or a distribution is none of the above.
+        If n or the seed is not a whole number, or a distribution is none of the above.
     """
     n, seed = whole("n", n), whole("seed", seed)
     draws = {name: _draw(name, distribution) for name, distribution in distributions.items()}
-    return [{name: draw(generator(seed, DRAWS, i, name)) for name, draw in draws.items()} for i in range(n)]
+
+    def case(i):
+        return {name: _value(name, draw, generator(seed, DRAWS, i, name)) for name, draw in draws.items()}
+
+    return [case(i) for i in range(n)]
 
 
 def generator(seed, kind, index, name=""):
-    """The numpy Generator of one case, whatever cases come before it and wherever they run.
+    """A numpy Generator for each seed, kind (`DRAWS` or `CASES`), index of the case and name of the parameter.
 
-    A stream for each seed, kind (`DRAWS` or `CASES`), index of the case and name of the parameter.
+    It does not depend on other cases, their order, or where they run.
     """
     import numpy as np
 
@@ -71,54 +75,53 @@ def generator(seed, kind, index, name=""):
 
 
 def as_cases(cases):
-    """Cases in the order given, from dicts or from a dict of columns, each a dict of Python's own kinds of values."""
+    """Cases as dicts of Python's int, float, str and bool, from a sequence of dicts or a dict of columns."""
     if isinstance(cases, Mapping):
         columns = {name: _column(name, values) for name, values in cases.items()}
         lengths = {name: len(column) for name, column in columns.items()}
         if len(set(lengths.values())) > 1:
             raise SpecificationError(
                 f"The columns of the cases have the lengths {', '.join(f'{n}: {k}' for n, k in lengths.items())}.",
-                "A dict of columns has one value per case in each.",
-                do="Give columns of one length, or all combinations by grid(...).",
+                "All columns must have one value for each case.",
+                do="For all combinations of values use grid(...).",
                 lengths=lengths,
             )
         cases = [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]
     cases = [_case(i, case) for i, case in enumerate(cases)]
     if not cases:
-        raise SpecificationError(
-            "There is no case.", "A sweep needs at least one.", do="Add cases, as by grid(m=[1.0, 2.0])."
-        )
+        raise SpecificationError("There is no case.", do="Give at least one, as by grid(m=[1.0, 2.0]).", cases=0)
     for i, case in enumerate(cases):
         if set(case) != set(cases[0]):
             raise SpecificationError(
-                f"Case {i} has the parameters {', '.join(case)}, case 0 {', '.join(cases[0])}.",
-                "All cases of a sweep have the same parameters, so that they form one table.",
-                do="Give every case every parameter.",
+                f"Case {i} has the parameters {', '.join(case)}; case 0 has {', '.join(cases[0])}.",
+                "All cases of a sweep must have the same parameters, as they form one table.",
                 case=i,
+                parameters=list(case),
+                expected=list(cases[0]),
             )
     return cases
 
 
 def _case(i, case):
     if not isinstance(case, Mapping):
-        raise SpecificationError(
-            f"Case {i} is {case!r}.", "A case is a dict of parameters.", do='Give {"m_load": 100.0}.', case=i
-        )
+        rule, example = "A case must be a dict of parameters.", 'Give a dict such as {"m_load": 100.0}.'
+        raise SpecificationError(f"Case {i} is {case!r}.", rule, do=example, case=i)
     values = {}
     for name, value in case.items():
         if not isinstance(name, str) or not name.isidentifier() or name in RESERVED:
             raise SpecificationError(
                 f"Case {i} has a parameter named {name!r}.",
-                f"A parameter's name is a word, and none of {', '.join(RESERVED)}.",
+                f"Names of parameters must be identifiers; {', '.join(RESERVED)} are reserved.",
                 do="Choose another name.",
                 name=name,
+                case=i,
             )
         values[name] = plain(value)
         if values[name] is None or (isinstance(values[name], float) and not math.isfinite(values[name])):
             raise SpecificationError(
                 f"Parameter {name} of case {i} is {value!r}.",
-                "A parameter is a finite number, a text, or True or False: one cell of a table.",
-                do="Give an index or a name, and look up what it stands for inside the case.",
+                "A parameter must be a finite number, a text, or True or False.",
+                do="Give an index or a name, and look the object up inside the case.",
                 name=name,
                 case=i,
             )
@@ -130,41 +133,32 @@ def _column(name, values):
         return [values]
     column = list(values)
     if not column:
-        raise SpecificationError(
-            f"{name} has no values.", "Each parameter of a grid or table has at least one.", do="Add some.", name=name
-        )
+        raise SpecificationError(f"{name} has no values.", "Each parameter needs at least one.", name=name)
     return column
 
 
 def _draw(name, distribution):
+    """The function of a numpy Generator that draws one value."""
     if plain(distribution) is not None:
         return lambda rng: distribution
     if hasattr(distribution, "rvs"):
-        return _checked(name, lambda rng: plain(distribution.rvs(random_state=rng)))
+        return lambda rng: plain(distribution.rvs(random_state=rng))
     if hasattr(distribution, "sample"):
-        return _checked(name, lambda rng: plain(distribution.sample(rng=rng)))
+        return lambda rng: plain(distribution.sample(rng=rng))
     if callable(distribution):
-        return _checked(name, distribution)
+        return distribution
     raise SpecificationError(
         f"The distribution of {name} is {distribution!r}.",
-        "A distribution is a number, a function of a random generator, or a frozen distribution of scipy.stats.",
-        do="Give lambda rng: rng.normal(100.0, 5.0).",
+        "It must be a number, a function of a numpy Generator, or a frozen distribution of scipy.stats.",
+        do="Give a function such as lambda rng: rng.normal(100.0, 5.0).",
         name=name,
     )
 
 
-def _checked(name, draw):
-    """The same draw; what numpy or scipy refuse to draw from names the parameter."""
-
-    def draw_checked(rng):
-        try:
-            return draw(rng)
-        except (TypeError, ValueError) as error:
-            raise SpecificationError(
-                f"{name} cannot be drawn: {error}.",
-                "A distribution is drawn from with a numpy Generator, for each case.",
-                do="Correct its numbers.",
-                name=name,
-            ) from error
-
-    return draw_checked
+def _value(name, draw, rng):
+    """One value of a parameter; an error of numpy or scipy names the parameter."""
+    try:
+        return draw(rng)
+    except (TypeError, ValueError) as error:
+        rule = "Each case draws one number from the distribution with a numpy Generator."
+        raise SpecificationError(f"{name} cannot be drawn: {error}.", rule, name=name) from error

@@ -1,4 +1,4 @@
-"""The file in which a sweep keeps its rows while it runs: a line of JSON each, so that a killed process loses none."""
+"""Checkpoints: a sweep writes each finished row as a line of JSON, so that a killed process loses none."""
 
 import hashlib
 import json
@@ -11,15 +11,15 @@ FORMAT = 1
 
 
 def identity(name, cases, seed):
-    """What sweeps must share for their rows to belong together: a digest of the case's name, the cases, the seed."""
+    """A digest of the case's name, the cases and the seed: rows form one table if it is the same."""
     return hashlib.sha256(json.dumps([name, cases, seed]).encode()).hexdigest()
 
 
 class Checkpoint:
-    """Rows on disk: those of an earlier sweep are read, further ones appended and flushed as they come.
+    """Rows on disk: `rows` are those of an earlier sweep, further ones are appended and flushed as they come.
 
-    The path None keeps nothing. `rows` is what was there; a last line that was cut off is dropped. A file of another
-    sweep, or one that is no checkpoint, raises SpecificationError; one that cannot be opened ServoError.
+    With the path None nothing is written. A file of another sweep, or one that is no checkpoint, raises
+    SpecificationError; one that cannot be opened raises ServoError.
     """
 
     def __init__(self, path, key):
@@ -38,7 +38,7 @@ class Checkpoint:
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
             lines = path.read_text(encoding="utf-8").splitlines(keepends=True) if path.exists() else []
-            whole = [line for line in lines if line.endswith("\n")]
+            whole = [line for line in lines if line.endswith("\n")]  # a killed process leaves half a line
             self.rows = _rows(path, whole, key)
             self._file = open(path, "r+b" if whole else "wb")
             self._file.truncate(len("".join(whole).encode()))
@@ -48,7 +48,7 @@ class Checkpoint:
         except OSError as error:
             raise ServoError(
                 f"The checkpoint {path} cannot be opened: {error.strerror or error}.",
-                "A checkpoint is a file that can be read and appended to.",
+                "A checkpoint must be readable and writable.",
                 do="Choose another path; nothing has been computed yet.",
                 path=str(path),
             ) from error
@@ -65,7 +65,7 @@ def _rows(path, lines, key):
     """The rows of a checkpoint, if it belongs to the sweep with this identity."""
     try:
         header, *rows = (json.loads(line) for line in lines) if lines else ({"identity": key},)
-        identity_there = header["identity"]
+        written_for = header["identity"]
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise SpecificationError(
             f"{path} is no checkpoint of a sweep.",
@@ -73,10 +73,10 @@ def _rows(path, lines, key):
             do="Choose another path; the file was not changed.",
             path=str(path),
         ) from error
-    if identity_there != key:
+    if written_for != key:
         raise SpecificationError(
             f"The checkpoint {path} belongs to other cases, another seed or another case function.",
-            "A sweep goes on where its own checkpoint ends: rows of different sweeps form no table.",
+            "Rows of different sweeps form no table.",
             do="Give the same cases, seed and function, or another path; the file was not changed.",
             path=str(path),
             rows=len(rows),

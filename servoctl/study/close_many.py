@@ -1,8 +1,10 @@
-"""Thousands of closed loops of one plant and one law, with other numbers in each, in one compiled call."""
+"""Thousands of closed loops of one plant and one law with different numbers, in one compiled call."""
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from servoctl.checks import mapping, whole
 from servoctl.codegen.function import Compiled
@@ -15,7 +17,7 @@ from servoctl.errors import IntegrationStopped, ServoError, SpecificationError, 
 from servoctl.study.cases import CASES, as_cases, generator
 from servoctl.study.table import Study, machine, table
 
-SEEDS = 2**31  # the seed of a case is below
+SEEDS = 2**31  # seeds of cases are below this
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,22 +30,22 @@ class Batch:
     ----------
     study : Study
         A row per case: its numbers, the seed of its noise, and for each state, input and residual (order <= 1) the
-        largest size over all samples, the root mean square and the value at the end; "error" and "message" tell of
-        loops that ended early, whose results are NaN.
+        largest size over all samples, the root mean square and the value at the end. Results of loops that ended early
+        are NaN; "error" and "message" have the reason.
     t : (K,) array
         Instants of the traces [s].
     trace : dict of str to (K, N) array
-        The signals named by `record`.
+        Traces of the signals in `record`.
     """
 
     study: Study
     t: np.ndarray
-    trace: dict
+    trace: dict[str, np.ndarray]
 
-    def __len__(self):
+    def __len__(self) -> int:
         return len(self.study)
 
-    def __getitem__(self, name):
+    def __getitem__(self, name: str) -> np.ndarray:
         return self.study[name]
 
     def __repr__(self):
@@ -54,30 +56,32 @@ class Batch:
         return "\n".join([f"Batch: {summary}"[:120], traced[:120], *table(self.study, shown, most=5)])
 
 
-def close_many(run, cases, *, scale=None, record=(), every=1, threads=None):
-    """Run a closed loop again with other numbers in each case: what `close` does, thousands of times.
+def close_many(
+    run: Closed, cases: Mapping[str, ArrayLike] | Sequence[Mapping[str, float]], *,
+    scale: Mapping[str, str] | None = None, record: Sequence[str] = (), every: int = 1, threads: int | None = None,
+) -> Batch:  # fmt: skip
+    """Run a closed loop thousands of times, with different numbers in each case.
 
-    The loops run in compiled code, in the lanes of vectors and on threads; without a compiler one after the other. Each
-    equals `close` of its numbers to rounding, and depends neither on the cases beside it nor on threads. Integration
-    steps that `Timing` leaves open are those of the case that needs most.
+    The loops run in compiled code, in the lanes of vectors and on threads; without a compiler one after the other. The
+    result of a case equals that of `close` to rounding, and depends neither on other cases nor on threads. If `Timing`
+    leaves the substeps open, all cases take those of the case with the fastest eigenvalue.
 
     Parameters
     ----------
     run : Closed
-        One loop, made by `close`: its plant, law, start, span, sensors, timing, disturbances and plan are those of all
-        cases, where these do not say otherwise. Its law is one of the toolkit, an expression: neither a function of
-        Python nor a limited law; those go by `sweep`.
+        A loop run by `close`. Its plant, law, start, span, sensors, timing, disturbances and plan hold for all cases,
+        except for the numbers in `cases`. Its law must be compiled: functions and limited laws go by `sweep`.
     cases : dict of str to (N,) array, or sequence of dict
-        What differs, by name: parameters of the plant ("m_load", "damping x" where it has that damping), states at the
-        start ("theta"), and columns that `scale` names. `monte_carlo` and `grid` make them. With noise each case has a
-        seed of its own, from that of the run and its index alone: the column "seed", with which `close` repeats it. It
-        is what `rng.integers(2**31)` gives first in a `sweep` of this seed.
+        Numbers by name: parameters of the plant ("m_load", "damping x" if it has that damping), initial states
+        ("theta"), and columns for `scale`. `monte_carlo` and `grid` make them. With noise each case has a seed that
+        depends on that of the run and its index only: the column "seed", with which `close` repeats the case. It is the
+        first `rng.integers(2**31)` in a `sweep` with this seed.
     scale : dict of str to str, optional
-        By disturbance the column of the cases that it is multiplied by.
+        Column of `cases` whose values multiply a disturbance, by disturbance.
     record : sequence of str
-        States, inputs and residuals ("residual X") whose traces are kept.
+        States, inputs and residuals ("residual X") to trace.
     every : int
-        They are kept at every so many samples.
+        Traces have every n-th sample.
     threads : int, optional
         Default: one per core.
 
@@ -90,9 +94,9 @@ def close_many(run, cases, *, scale=None, record=(), every=1, threads=None):
     NameUnknown
         For a name that plant, law or cases do not have.
     SpecificationError
-        For a law that is no expression, and for values that make no sense.
+        For a law that is not compiled, and for invalid values.
     InconsistentStart
-        If material constraints do not hold at the start of a case.
+        If the initial state of a case violates a material constraint.
     """
     _require(run)
     columns = _columns(cases)
@@ -117,21 +121,22 @@ def close_many(run, cases, *, scale=None, record=(), every=1, threads=None):
 def _require(run):
     if not isinstance(run, Closed):
         raise SpecificationError(
-            f"A {type(run).__name__} was given as run.",
-            "Many loops are one loop with other numbers.",
-            do="Give the Closed of sv.close.",
+            f"Expected a Closed, got a {type(run).__name__}.",
+            "Cases are one closed loop with different numbers.",
+            do="Pass the Closed of sv.close.",
+            kind=type(run).__name__,
         )
     if not isinstance(run.law.step, Compiled):
         raise SpecificationError(
             f"The law {run.law.name!r} is computed in Python.",
-            "Loops run side by side in compiled code, laws among it.",
-            do="Use a law of the toolkit without allocation, or sv.sweep, whose cases may close any loop.",
+            "Many loops run in compiled code, with their law.",
+            do="Use a compiled law, as of sv.lqr without sv.limited, or sv.sweep, whose cases may close any loop.",
             name=run.law.name,
         )
 
 
 def _resolved(run, constants, starts):
-    """The numbers of the loop, with as many integration steps as the case with the fastest eigenvalue needs."""
+    """The loop with substeps for the case with the fastest eigenvalue."""
     plant, law, loop = run.plant, run.law, run.loop
     rest = np.zeros((len(plant.inputs) + len(plant.disturbable), starts.shape[1]))
     require_consistent(plant, loop.t0, starts, np.vstack([constants, rest]))
@@ -140,7 +145,7 @@ def _resolved(run, constants, starts):
     substeps = _most_steps(plant, law, loop, constants, starts)
     if substeps == loop.substeps:
         return loop
-    transport = steps(plant, law.period, substeps, loop.t0, loop.x0, loop.idle)[1]
+    transport = steps(plant, law.period, substeps, loop.t0, loop.x0, loop.initial_input)[1]
     forces = run.conditions.forces(loop.t0, law.period / substeps, loop.samples * substeps)
     return replace(loop, substeps=substeps, transport=transport, disturbance=forces)
 
@@ -159,7 +164,7 @@ def _seeds(sensors, n):
 
 
 def _noise(run, seeds):
-    """A function from the index of a case to its noise, (samples + 1, n_y); None without noise."""
+    """A function that maps the index of a case to its noise, (samples + 1, n_y); None without noise."""
     if seeds is None:
         return None
     sensors, measures, count = run.conditions.sensors, run.law.measures, run.loop.samples + 1
@@ -179,15 +184,17 @@ def _columns(cases):
     one = len(sizes) == 1 and all(len(shape) == 1 and shape[0] for shape in sizes)
     if not one or not all(np.isfinite(v).all() for v in columns.values()):
         raise SpecificationError(
-            f"The cases {', '.join(map(str, cases)) or '(none)'} are no columns of finite numbers of one length.",
-            "A batch has one finite number per case in each column.",
-            do='Give such columns, as {"m_load": np.linspace(90.0, 110.0, 1000)}, or dicts.',
+            f"The cases {', '.join(map(str, cases)) or '(none)'} are not columns of finite numbers of one length.",
+            "Each column has one finite number per case.",
+            do='Pass such columns, as {"m_load": np.linspace(90.0, 110.0, 1000)}, or dicts.',
+            names=tuple(map(str, cases)),
+            shapes=sorted(sizes),
         )
     return columns
 
 
 def _case_numbers(run, columns, scale):
-    """Parameters (n_c, N), states at the start (n_x, N) and factors of the disturbances (n_d, N)."""
+    """Parameters (n_c, N), initial states (n_x, N) and factors of the disturbances (n_d, N)."""
     plant, disturbance = run.plant, run.conditions.disturbance
     for name, column in scale.items():
         index(name, tuple(disturbance), "disturbance")
@@ -211,27 +218,29 @@ def _case_numbers(run, columns, scale):
 def _most_steps(plant, law, loop, constants, starts):
     """Integration steps per sample of the case with the fastest eigenvalue at the start."""
     n_x, n = starts.shape
-    inputs = np.repeat(loop.idle[:, None], n, axis=1)
+    inputs = np.repeat(loop.initial_input[:, None], n, axis=1)
     p = np.vstack([constants, inputs, np.zeros((len(plant.disturbable), n))])
     both = plant.function("jacobian").grid(loop.t0, starts, p).reshape(-1, n_x, n).transpose(2, 1, 0)
     A = np.where(np.isfinite(both[:, :, :n_x]), both[:, :, :n_x], 0.0)
     case = int(np.argmax(np.abs(np.linalg.eigvals(A)).max(axis=1)))
     slowest = replace(plant, parameters=constants[:, case])
-    return max(loop.substeps, steps(slowest, law.period, None, loop.t0, starts[:, case], loop.idle)[0])
+    return max(loop.substeps, steps(slowest, law.period, None, loop.t0, starts[:, case], loop.initial_input)[0])
 
 
 def _traced(record, names, every):
     if isinstance(record, str) or every != 1 and not len(record):
         raise SpecificationError(
             f"record={record!r} and every={every!r} were given.",
-            "Traced signals are named one by one; without any there is none to thin out.",
-            do='Name them: record=["theta"], every=10.',
+            "record is a sequence of names; every thins out their traces.",
+            do='Pass names: record=["theta"], every=10.',
+            record=record,
+            every=every,
         )
     return [index(name, names, "signal") for name in record], whole("every", every, least=1)
 
 
 def _one_by_one(run, derived, loop, numbers, seeds, traced, every):
-    """The same by `close`, where there is no compiler."""
+    """The same by `close`, for want of a compiler."""
     n, size = numbers[1].shape[1], len(derived.names)
     lost = np.full((2, n), np.inf)
     results = np.full((3, size, n), np.nan)
@@ -254,11 +263,11 @@ def _one_by_one(run, derived, loop, numbers, seeds, traced, every):
 
 def _one(run, loop, constants, start, factors, seed):
     """The loop of one case, by `close`."""
-    given = run.conditions
-    forces = zip(given.disturbance.items(), factors, strict=True)
+    conditions = run.conditions
+    forces = zip(conditions.disturbance.items(), factors, strict=True)
     return close(
         replace(run.plant, parameters=constants), run.law, start, (loop.t0, loop.t0 + loop.samples * loop.period),
-        sensors=replace(given.sensors, seed=seed), timing=Timing(delay=loop.delay, substeps=loop.substeps),
+        sensors=replace(conditions.sensors, seed=seed), timing=Timing(delay=loop.delay, substeps=loop.substeps),
         disturbance={name: _scaled(force, factor) for (name, force), factor in forces}, plan=run.plan,
     )  # fmt: skip
 
@@ -280,5 +289,5 @@ def _study(columns, seeds, names, gathered, meta):
     errors = np.where(ended, np.where(of_law, "ServoError", "IntegrationStopped"), "")
     what = np.where(of_law, "the law's answer", "the state")
     messages = [f"{w} is not finite at t = {t:.6g} s" if e else "" for w, t, e in zip(what, early, ended, strict=True)]
-    given = {"case": np.arange(len(early))} | columns | ({"seed": np.array(seeds)} if seeds else {})
-    return Study("batch", given | results | {"error": errors, "message": np.array(messages)}, meta)
+    numbers = {"case": np.arange(len(early))} | columns | ({"seed": np.array(seeds)} if seeds else {})
+    return Study("batch", numbers | results | {"error": errors, "message": np.array(messages)}, meta)

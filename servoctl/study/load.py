@@ -4,11 +4,11 @@ from servoctl import archive
 from servoctl.study.table import Study
 from servoctl.study.tradeoff import TradeOff
 
-KINDS = {"tradeoff": TradeOff}  # others are plain studies
+KINDS = {"tradeoff": TradeOff}  # all others are of class Study
 
 
 def load_study(path) -> Study:
-    """A study from a file that `Study.save` wrote.
+    """Read a study that `Study.save` wrote.
 
     Parameters
     ----------
@@ -17,12 +17,12 @@ def load_study(path) -> Study:
     Returns
     -------
     Study
-        A `TradeOff` if one was saved.
+        A `TradeOff` if that is what was saved.
 
     Raises
     ------
     ServoError
-        If the file is missing or was not written by `Study.save`.
+        If the file is missing or is no study.
     """
     return archive.read(path, "study", _from_archive)
 

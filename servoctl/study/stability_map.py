@@ -1,10 +1,10 @@
 """The largest stable step of every method along a plan, from the linearised step map.
 
-Near the manifold of the constraints the state splits in two. *Along* it move the Σ o_a internal states, as
-`internal_dynamics` linearises them. *Off* it, every row that was raised ρ times obeys
-the error dynamics that the drift treatment gives it, whatever the motion: D^ρ ψ = 0 (ρ neutral eigenvalues),
-Π(D - λ) ψ = 0 (the poles), or nothing at all (projection, minimal coordinates). One step multiplies a mode of
-eigenvalue λ by R(hλ), the method's stability function.
+Near the manifold of the constraints the state splits in two. *Along* it move the Σ o_a internal states, which
+`internal_dynamics` linearises. *Off* it, the residual ψ of a row that was differentiated ρ times obeys the error
+dynamics of the drift treatment, whatever the motion: D^ρ ψ = 0 (ρ neutral eigenvalues), Π(D - λ) ψ = 0 (the poles), or
+ψ = 0 (projection, minimal coordinates). One step multiplies a mode of eigenvalue λ by R(hλ), the method's stability
+function.
 """
 
 from dataclasses import dataclass
@@ -14,30 +14,35 @@ import numpy as np
 from servoctl.checks import positives
 from servoctl.errors import SpecificationError
 from servoctl.internal_dynamics import linearised
-from servoctl.methods.drift import Poles, as_drift
+from servoctl.methods.choice import Poles, as_drift
 from servoctl.methods.runge_kutta import ORDERS
-from servoctl.methods.stability import amplification, row_poles
+from servoctl.methods.stability import amplification
+from servoctl.model.model import Model
+from servoctl.run import Run
 
 MAPPED = (*ORDERS, "Taylor", "RadauIIA")
-RADAU_ORDER = 5  # unless it is given; all are L-stable
-PLAN_INSTANTS = 101  # of the plan, where eigenvalues are taken: adjacent ones are alike on plans of some smoothness
-GROWTH = 2.0  # by which counted errors may grow over the plan; neutral modes and rounding stay below that
-PER_DECADE, DECADES = 30, 7  # of steps tried below the length of the plan
+RADAU_ORDER = 5  # default; all orders are L-stable
+PLAN_INSTANTS = 101  # instants at which eigenvalues are computed: on smooth plans neighbours differ little
+GROWTH = 2.0  # growth of errors over the plan that counts as stable: neutral modes and rounding stay below it
+PER_DECADE, DECADES = 30, 7  # steps tried, below the length of the plan
 
 
 @dataclass(frozen=True, eq=False)
 class StabilityMap:
-    """Which steps are stable along a plan; made by `stability`.
+    """The stable steps along a plan; made by `stability`.
+
+    In all methods, `method` is "RK1" to "RK8", "RK23", "RK45", "DOP853", "Taylor", "RadauIIA" or "Radau", `drift` is a
+    treatment as in `simulate`, and `order` is that of "Taylor" (default: the map's) and of "RadauIIA" (default: 5).
 
     Attributes
     ----------
     t : (N,) array
         Instants of the plan [s].
     rates : (N, f) array of complex
-        Eigenvalues of the internal dynamics there [1/s], f = Σ o_a.
+        Eigenvalues of the internal dynamics at these instants [1/s], f = Σ o_a.
     model : Model
     order : int
-        Of "Taylor" where none is given.
+        Default order of "Taylor".
     """
 
     t: np.ndarray
@@ -51,36 +56,32 @@ class StabilityMap:
         Parameters
         ----------
         drift : None, "project", "minimal", float, `Project(...)` or `Poles(...)`, optional
-            As in `simulate`. Constraint violations count where poles govern them: without treatment they are neutral
-            under every method, and projection or minimal coordinates remove them.
+            Constraint violations count where poles govern them: without treatment they are neutral under every method,
+            and projection or minimal coordinates remove them.
         """
         drift = as_drift(drift)
         if not isinstance(drift, Poles):
             return self.rates
         drift.coefficients(self.model)  # refuses poles that do not fit the rows
-        poles = np.concatenate([*row_poles(drift, self.model).values(), np.zeros(0)])
+        poles = np.concatenate([*drift.by_row(self.model).values(), np.zeros(0)])
         return np.hstack([self.rates, np.broadcast_to(poles, (len(self.t), len(poles)))])
 
     def radius(self, method, step, drift=None, order=None):
-        """Spectral radius of the step map at each instant, relative to a mode's own growth.
+        """Spectral radius of the step map at each instant, relative to the growth of the motion itself.
 
         Parameters
         ----------
         method : str
-            "RK1" to "RK8", "RK23", "RK45", "DOP853", "Taylor", "RadauIIA" or "Radau".
         step : float or (K,) array
             [s]
-        drift : optional
-            As in `simulate`.
-        order : int, optional
-            Of "Taylor" and "RadauIIA"; default: the map's own, and 5.
+        drift, order : optional
 
         Returns
         -------
         (N,) or (K, N) array
-            max |R(hλ)| / max(1, |e^hλ|): a step is not blamed for what the motion does itself.
+            max |R(hλ)| / max(1, |e^hλ|)
         """
-        step = positives("step", step, do="Give 1e-3, in seconds.")
+        step = positives("step", step, do="Give it in seconds, such as 1e-3.")
         z = np.multiply.outer(step, self.eigenvalues(drift))
         if order is None:
             order = {"Taylor": self.order, "RadauIIA": RADAU_ORDER}.get(method)
@@ -88,50 +89,42 @@ class StabilityMap:
         return (amplification(method, z, order) / motion).max(axis=-1, initial=0.0)
 
     def growth(self, method, step, drift=None, order=None):
-        """By how much errors in the counted directions grow over the plan, at most and beyond the motion's own growth.
+        """Bound on the growth of errors over the plan, beyond that of the motion itself.
 
         Parameters
         ----------
         method : str
-            "RK1" to "RK8", "RK23", "RK45", "DOP853", "Taylor", "RadauIIA" or "Radau".
         step : float or (K,) array
             [s]
-        drift : optional
-            As in `simulate`.
-        order : int, optional
-            Of "Taylor" and "RadauIIA"; default: the map's own, and 5.
+        drift, order : optional
 
         Returns
         -------
         float or (K,) array
-            exp ∫ ln max(1, radius) dt / h.
+            exp ∫ ln max(1, radius) dt / h
         """
         with np.errstate(over="ignore"):
-            gained = np.log(np.maximum(self.radius(method, step, drift, order), 1.0))
-            return np.exp(np.trapezoid(gained, np.abs(self.t - self.t[0]), axis=-1) / step)
+            logarithm = np.log(np.maximum(self.radius(method, step, drift, order), 1.0))
+            return np.exp(np.trapezoid(logarithm, np.abs(self.t - self.t[0]), axis=-1) / step)
 
     def largest_step(self, method, drift=None, order=None):
-        """The largest stable step [s]: with it and all shorter ones counted errors grow at most twofold over the plan.
+        """The largest stable step [s]: with it and all shorter ones errors grow at most twofold over the plan.
 
         Parameters
         ----------
         method : str
-            "RK1" to "RK8", "RK23", "RK45", "DOP853", "Taylor", "RadauIIA" or "Radau"; of an adaptive method it is where
-            step control settles.
-        drift : None, "project", "minimal", float, `Project(...)` or `Poles(...)`, optional
-            As in `simulate`.
-        order : int, optional
-            Of "Taylor" and "RadauIIA"; default: the map's own, and 5.
+            The step control of an adaptive method settles near this step.
+        drift, order : optional
 
         Returns
         -------
         float
-            inf where no step up to the length of the plan is unstable.
+            inf if no step up to the length of the plan is unstable.
 
         Raises
         ------
         NameUnknown
-            For a method without a step map of its own.
+            For other methods.
         SpecificationError
             For poles that do not fit the rows.
         """
@@ -147,12 +140,12 @@ class StabilityMap:
         return float(low)
 
     def plot(self, method="RK4", poles=None):
-        """Draw largest steps over the poles, and the spectral radius of one method over poles and steps.
+        """Draw the largest steps over the poles, and the spectral radius of one method over poles and steps.
 
         Parameters
         ----------
         method : str
-            Whose spectral radius is drawn.
+            The method whose spectral radius is drawn.
         poles : (K,) array, optional
             Magnitudes 1/T of the poles [1/s], two or more; default: 3 to 3,000 per length of the plan.
 
@@ -163,23 +156,23 @@ class StabilityMap:
         from servoctl.figures.stability import draw_stability
 
         if poles is not None:
-            do = "Give numpy.geomspace(1, 100, 41), in 1/s."
+            do = "Give them in 1/s, such as numpy.geomspace(1, 100, 41)."
             poles = np.sort(np.ravel(positives("poles", poles, do, fewest=2)))
         return draw_stability(self, method, poles, (*ORDERS, "Taylor"))
 
     def __repr__(self):
-        raised = {row: count for row, count in self.model.raised.items() if count}
-        story = ", ".join(f"{row} {count}x" for row, count in raised.items()) or "none: no row was differentiated"
-        shown = [None, 1.0, 0.1, 0.01]
+        raised = ", ".join(f"{row} {count}x" for row, count in self.model.raised.items() if count)
+        raised = raised or "none: no row was differentiated"
+        drifts = [None, 1.0, 0.1, 0.01]  # time constants of poles [s]
         lines = [
             f"Stability along the plan: t = {self.t[0]:g} .. {self.t[-1]:g} s at {len(self.t)} instants",
             f"  along the manifold: {self._internal()}",
-            f"  off the manifold: {story}; neutral without treatment, at the poles with, removed by projection",
-            f"  largest step [s] {'no poles':>12}" + "".join(f"{f'T = {T:g} s':>12}" for T in shown[1:]),
+            f"  off the manifold: {raised}; neutral without treatment, at the poles with, removed by projection",
+            f"  largest step [s] {'no poles':>12}" + "".join(f"{f'T = {T:g} s':>12}" for T in drifts[1:]),
         ]
         for method in MAPPED:
             name = f"Taylor {self.order}" if method == "Taylor" else method
-            steps = (self.largest_step(method, drift) for drift in shown)
+            steps = (self.largest_step(method, drift) for drift in drifts)
             lines.append(f"  {name:<16} " + "".join(f"{_step_text(step):>12}" for step in steps))
         return "\n".join(lines)
 
@@ -191,8 +184,8 @@ class StabilityMap:
         return text + (f", growth {growing:.4g} 1/s is the motion's own" if growing > 1e-6 * (1 + fastest) else "")
 
 
-def stability(model, run, order: int = 12) -> StabilityMap:
-    """Find the largest stable step of each method and drift treatment along a plan.
+def stability(model: Model, run: Run, order: int = 12) -> StabilityMap:
+    """The largest stable steps of all methods and drift treatments along a plan.
 
     Parameters
     ----------
@@ -200,7 +193,7 @@ def stability(model, run, order: int = 12) -> StabilityMap:
     run : Run
         A motion of this model.
     order : int
-        Of the Taylor method.
+        Order of the Taylor method.
 
     Returns
     -------
@@ -209,26 +202,29 @@ def stability(model, run, order: int = 12) -> StabilityMap:
     Raises
     ------
     SpecificationError
-        If the run is no motion of this model, or its Jacobian is finite nowhere on it.
+        If the run is not a motion of this model, or the Jacobian is finite at fewer than two instants of it.
 
     Notes
     -----
-    Coefficients are frozen at each instant; eigenvalues of a motion that turns fast are uncertain by the rate at which
-    its manifold turns. Far from the imaginary axis, where steps become unstable, that is little.
+    Coefficients are frozen at each instant: eigenvalues are uncertain by the rate at which the manifold turns along the
+    motion. Far from the imaginary axis, where steps become unstable, this matters little.
     """
     names = tuple(getattr(run, "jet_names", ()))[: len(model.state_names)]
     if names != tuple(model.state_names) or len(run.t) < 2:
         raise SpecificationError(
             f"The run has {len(run.t)} samples of {', '.join(names)}." if names else f"run={run!r} was given.",
-            f"The plan is a motion of the model, whose state is {', '.join(model.state_names)}.",
+            f"The plan must be a motion of the model, whose state is {', '.join(model.state_names)}.",
             do="Give the run that simulate(model, ...) returned.",
+            names=names,
+            expected=tuple(model.state_names),
         )
     t, matrices, _ = linearised(model, run, PLAN_INSTANTS)
     if len(t) < 2:
         raise SpecificationError(
-            "The Jacobian of the motion is not finite along the run.",
-            "Stability is read off the linearised motion.",
+            f"The Jacobian of the motion is finite at {len(t)} instants of the run.",
+            "The linearised motion is needed at two instants or more.",
             do="Check the run by verify(model, run).",
+            instants=len(t),
         )
     return StabilityMap(t, np.linalg.eigvals(matrices).astype(complex), model, order)
 

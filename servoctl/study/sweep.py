@@ -1,4 +1,4 @@
-"""Many cases of one computation, on any executor: the same table whatever computes it, and no failure lost."""
+"""Sweeps: a function called for many cases, on any executor; the table does not depend on who computes it."""
 
 import contextlib
 import functools
@@ -8,8 +8,9 @@ import multiprocessing
 import pickle
 import signal
 import threading
-from collections.abc import Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import Executor, ProcessPoolExecutor, as_completed
+from os import PathLike
 
 import numpy as np
 
@@ -23,36 +24,45 @@ from servoctl.study.cases import CASES, FAILURE, RESERVED, as_cases, generator
 from servoctl.study.checkpoint import Checkpoint, identity
 from servoctl.study.table import Study, machine
 
-INTERRUPTED = 1  # status of a run that Ctrl-C ended
+INTERRUPTED = 1  # status of a Run that Ctrl-C ended
 
 
-def sweep(case, cases, *, executor=None, seed=None, checkpoint=None, shard=None, progress=None) -> Study:
+def sweep(
+    case: Callable,
+    cases: Sequence[Mapping] | Mapping[str, Sequence],
+    *,
+    executor: Executor | None = None,
+    seed: int | None = None,
+    checkpoint: str | PathLike | None = None,
+    shard: tuple[int, int] | None = None,
+    progress: bool | None = None,
+) -> Study:
     """Compute every case and gather the numbers in one table.
 
-    The table is the same, bit for bit, however many workers compute it and in whatever order, on processors of one
-    kind. A case that raises becomes a row with the error in place of its numbers.
+    On processors of one kind the table is the same, bit for bit, for any number of workers and any order. A case that
+    raises becomes a row with the error instead of numbers.
 
     Main arguments
 
     Parameters
     ----------
     case : callable
-        `case(**parameters)` returns a dict of numbers and texts, or a Run, of which the extrema and final values of
-        actuators and outputs and the largest residual are taken. Where it has a parameter `rng`, it is given a numpy
-        Generator that depends on the seed and the case's index alone. For processes it is a function of a module's
-        top level; it derives what it needs itself (`functools.cache` keeps models in each process).
+        `case(**parameters)` returns a dict of numbers and texts, or a Run, which gives the extrema and final values of
+        its actuators and outputs and its largest residual. If it has a parameter `rng`, that is a numpy Generator
+        which depends on the seed and the index of the case alone. For processes it must be at the top level of a
+        module, and derive its models itself (`functools.cache` holds them in each process).
     cases : sequence of dict, or dict of sequences
-        Parameters of each case, such as from `grid` or `monte_carlo`, or a column for each.
+        Parameters of each case, such as from `grid` or `monte_carlo`, or a column of values for each parameter.
     executor : concurrent.futures.Executor, optional
         Threads, processes, loky, or Dask's `client.get_executor()`; default: this process, one case after the other.
         It is not shut down.
     seed : int, optional
-        Of `rng`; needed where the case draws random numbers, refused where it does not.
+        Seed of `rng`; required if the case has a parameter `rng`, refused otherwise.
 
     Other arguments
 
     checkpoint : str or Path, optional
-        File to which finished rows are appended; a sweep of the same cases, seed and function goes on where it ends.
+        File to which finished rows are appended; a sweep of the same cases, seed and function continues after them.
     shard : (i, n), optional
         Compute only part i of n, i = 1 .. n: the cases with index i - 1, i - 1 + n, ... `merge` joins the parts.
     progress : bool, optional
@@ -61,32 +71,32 @@ def sweep(case, cases, *, executor=None, seed=None, checkpoint=None, shard=None,
     Returns
     -------
     Study
-        Columns case (the index), the parameters, the numbers, error, message and facts. Ctrl-C returns what is done;
-        a pool that dies leaves rows that say so.
+        Columns: case (the index), the parameters, the numbers, error, message and facts. After Ctrl-C it has the
+        finished cases; cases that a dead pool did not finish have that error.
 
     Raises
     ------
     SpecificationError
-        For cases that form no table, a seed that is missing or not used, a shard that does not exist, a case that
+        For cases that form no table, a seed that is missing or unused, a shard that does not exist, a case that
         cannot be sent to processes, a checkpoint of another sweep.
     ServoError
-        If the pool died before a single case was finished, or the checkpoint cannot be written.
+        If the pool died before the first case was finished, or the checkpoint cannot be written.
     """
     cases = as_cases(cases)
     seed = _seed(case, seed)
-    mine = range(len(cases)) if shard is None else _part(shard, len(cases))
+    part = range(len(cases)) if shard is None else _part(shard, len(cases))
     require_fitting(case, cases[0], seed)
     _require_sendable(case, executor)
     name = name_of(case)
     key = identity(f"{_module_of(case)}.{name}", cases, seed)
-    work = _in_turn if executor is None else functools.partial(_on, executor)
+    computed = _in_turn if executor is None else functools.partial(_on, executor)
     lost, interrupted = {}, False
     with Checkpoint(checkpoint, key) as disk:
-        rows = {row["case"]: row for row in disk.rows if row["case"] in mine}
-        todo = [(i, cases[i]) for i in mine if i not in rows]
-        with progress_bar("sweep", progress, len(mine), initial=len(rows), unit="case") as bar:
+        rows = {row["case"]: row for row in disk.rows if row["case"] in part}
+        todo = [(i, cases[i]) for i in part if i not in rows]
+        with progress_bar("sweep", progress, len(part), initial=len(rows), unit="case") as bar:
             try:
-                for i, row, finished in work(case, todo, seed):
+                for i, row, finished in computed(case, todo, seed):
                     (rows if finished else lost)[i] = row
                     if finished:
                         disk.add(row)
@@ -94,20 +104,20 @@ def sweep(case, cases, *, executor=None, seed=None, checkpoint=None, shard=None,
             except KeyboardInterrupt:
                 interrupted = True
     if lost and not rows:
-        raise _died(next(iter(lost.values())), len(mine))
+        raise _died(next(iter(lost.values())), len(part))
     meta = {"case": name, "identity": key, "seed": seed, "count": len(cases), "shard": list(shard) if shard else None}
     meta |= {"parameters": list(cases[0]), "lost": sorted(lost), "interrupted": interrupted, "machine": machine()}
     columns = _columns(cases, rows | lost)
-    return Study("sweep", columns, meta | {"message": _message(columns, meta, len(mine))})
+    return Study("sweep", columns, meta | {"message": _message(columns, meta, len(part))})
 
 
-def merge(studies) -> Study:
-    """The shards of a sweep as one table, in the order of the cases.
+def merge(studies: Study | Iterable[Study]) -> Study:
+    """Join the shards of a sweep in one table, in the order of the cases.
 
     Parameters
     ----------
     studies : sequence of Study
-        From `sweep` with the same cases, seed and function. Of a case that occurs twice the finished row is taken.
+        From `sweep` with the same cases, seed and function. If a case occurs twice, its finished row is taken.
 
     Returns
     -------
@@ -116,40 +126,38 @@ def merge(studies) -> Study:
     Raises
     ------
     SpecificationError
-        If there is none, or they belong to different sweeps.
+        If there are none, or they belong to different sweeps.
     """
     studies = [studies] if isinstance(studies, Study) else list(studies)
-    keys = {getattr(study, "meta", {}).get("identity") for study in studies}  # that only a sweep has
+    keys = {getattr(study, "meta", {}).get("identity") for study in studies}  # None for what is not a sweep
     if len(keys) != 1 or None in keys:
         raise SpecificationError(
-            f"{len(studies)} studies of {len(keys)} different sweeps are to be merged.",
-            "Shards of one sweep have the same cases, seed and function.",
-            do="Merge the shards of each sweep by themselves.",
+            f"{len(studies)} studies of {len(keys)} different sweeps were given.",
+            "Only shards of one sweep form a table: of the same cases, seed and function.",
+            do="Merge the shards of each sweep separately.",
+            studies=len(studies),
+            sweeps=len(keys),
         )
-    rows, lost = {}, set()
+    finished, lost = {}, {}
     for study in studies:
         for row in study.rows():
-            if row["case"] in study.meta["lost"]:
-                lost.add(row["case"])
-                rows.setdefault(row["case"], row)
-            else:
-                rows[row["case"]] = row
-    lost -= {i for study in studies for i in study["case"].tolist() if i not in study.meta["lost"]}
+            (lost if row["case"] in study.meta["lost"] else finished).setdefault(row["case"], row)
+    rows = lost | finished
     names = dict.fromkeys(name for study in studies for name in study.columns if name not in FAILURE)
     columns = {name: [rows[i].get(name) for i in sorted(rows)] for name in (*names, *FAILURE)}
-    meta = studies[0].meta | {"shard": None, "lost": sorted(lost)}
+    meta = studies[0].meta | {"shard": None, "lost": sorted(lost.keys() - finished.keys())}
     meta["interrupted"] = any(study.meta["interrupted"] for study in studies) and len(rows) < meta["count"]
     return Study("sweep", columns, meta | {"message": _message(columns, meta, meta["count"])})
 
 
 def evaluate(case, index, parameters, seed):
-    """One row: case (the index), and the numbers of a case, or how it failed: error, message, facts (JSON)."""
+    """One row: case (the index), with the numbers of the case or its error, message and facts (JSON)."""
     if multiprocessing.parent_process() is not None and threading.current_thread() is threading.main_thread():
-        signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the parent: a case is whole or not computed
-    drawn = {} if seed is None else {"rng": generator(seed, CASES, index)}
+        signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent handles Ctrl-C: workers finish the case they are at
+    random = {} if seed is None else {"rng": generator(seed, CASES, index)}
     try:
-        with compiling_at_once():  # compiled and interpreted results differ by rounding: all are compiled
-            numbers = _numbers(case(**parameters, **drawn), parameters)
+        with compiling_at_once():  # interpreted results differ by rounding, and so would the tables of other workers
+            numbers = _numbers(case(**parameters, **random), parameters)
     except (Exception, SystemExit) as error:
         facts = json.dumps(getattr(error, "details", {}), default=str)
         return {"case": index, "error": type(error).__name__, "message": str(error), "facts": facts}
@@ -162,30 +170,17 @@ def _numbers(result, parameters):
         if name in parameters or name in RESERVED or plain(value) is None:
             raise SpecificationError(
                 f"The case returned {name} = {value!r}.",
-                f"A case returns numbers and texts, by names other than its parameters' and {', '.join(RESERVED)}.",
-                do="Rename it, or take one number of it.",
+                f"A case returns numbers and texts. The names of its parameters and {', '.join(RESERVED)} are taken.",
+                do="Choose another name, or return single numbers instead of an array.",
                 name=name,
             )
     return {str(name): plain(value) for name, value in numbers.items()}
 
 
 def summary(run):
-    """Numbers of a run for a row.
+    """Numbers of a Run or Closed by name: NAME_min, NAME_max and NAME_end of actuators and outputs, and t_end [s].
 
-    Parameters
-    ----------
-    run : Run or Closed
-
-    Returns
-    -------
-    dict of str to float
-        NAME_min, NAME_max and NAME_end of actuators and outputs; of a plan the largest residual over all rows and
-        levels, of a closed loop the largest and the last one of each row, RESIDUAL_worst and RESIDUAL_last; t_end [s].
-
-    Raises
-    ------
-    SpecificationError
-        If it is neither.
+    A plan has `residual`, the largest over all rows and levels; a closed loop NAME_worst and NAME_last of each row.
     """
     if isinstance(run, Closed):
         numbers = _extrema(run, (*run.plant.inputs, *run.plant.mechanism.outputs))
@@ -199,37 +194,31 @@ def summary(run):
         numbers = _extrema(run, [name for name in known if name in run.names])
         numbers["residual"] = max((float(np.abs(run.residual[name]).max()) for name in run.residual), default=0.0)
     else:
-        raise SpecificationError(
-            f"The case returned {type(run).__name__}.",
-            "A case returns numbers by name, a Run, or the run of a closed loop.",
-            do="Return one of these.",
-        )
+        kind, rule = type(run).__name__, "A case returns a dict of numbers, a Run, or the run of a closed loop."
+        raise SpecificationError(f"The case returned {kind}.", rule, type=kind)
     return {**numbers, "t_end": float(run.t[-1])}
 
 
 def _extrema(run, names):
-    numbers = {}
-    for name in names:
-        values = run[name]
-        numbers |= {f"{name}_min": values.min(), f"{name}_max": values.max(), f"{name}_end": values[-1]}
-    return {name: float(value) for name, value in numbers.items()}
+    ends = {"min": np.min, "max": np.max, "end": lambda values: values[-1]}
+    return {f"{name}_{end}": float(of(run[name])) for name in names for end, of in ends.items()}
 
 
 # --- where cases are computed
 
 
 def _in_turn(case, todo, seed):
-    """Rows (index, row, finished) computed here."""
-    with _noticing() as pressed:
+    """Rows (index, row, finished) computed in this process."""
+    with _recorded_interrupts() as interrupts:
         for i, parameters in todo:
             row = evaluate(case, i, parameters, seed)
-            if pressed:
-                raise KeyboardInterrupt  # which the case took for the end of its own simulation
+            if interrupts:
+                raise KeyboardInterrupt  # which `simulate` inside the case caught: its row is that of half a run
             yield i, row, True
 
 
 def _on(executor, case, todo, seed):
-    """Rows as an executor finishes them; a case that it could not finish has a row that says why."""
+    """Rows (index, row, finished) as an executor finishes them; a case that it did not finish has its error."""
     futures, unsent = {}, {}
     try:
         for i, parameters in todo:
@@ -250,35 +239,35 @@ def _on(executor, case, todo, seed):
 
 
 def _lost(index, error):
-    message = f"The executor did not finish this case: {error}" if str(error) else "The executor did not finish this."
+    message = f"The executor did not finish this case{f': {error}' if str(error) else '.'}"
     return {"case": index, "error": type(error).__name__, "message": message, "facts": "{}"}
 
 
 @contextlib.contextmanager
-def _noticing():
-    """A list that is not empty once Ctrl-C was pressed, even where the interrupt is caught inside."""
-    pressed = []
+def _recorded_interrupts():
+    """A list to which every Ctrl-C is appended, also where the KeyboardInterrupt is caught inside."""
+    interrupts = []
     in_main = threading.current_thread() is threading.main_thread()
     if not in_main or signal.getsignal(signal.SIGINT) is not signal.default_int_handler:
-        yield pressed
+        yield interrupts
         return
 
-    def press(number, frame):
-        pressed.append(number)
+    def record(number, frame):
+        interrupts.append(number)
         signal.default_int_handler(number, frame)
 
-    signal.signal(signal.SIGINT, press)
+    signal.signal(signal.SIGINT, record)
     try:
-        yield pressed
+        yield interrupts
     finally:
         signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
-# --- what was given
+# --- checks of the input
 
 
 def name_of(case):
-    """The name of a case's function, with the arguments that functools.partial has bound."""
+    """The name of a case's function, with the arguments bound by functools.partial."""
     if isinstance(case, functools.partial):
         bound = [*map(repr, case.args), *(f"{k}={v!r}" for k, v in sorted(case.keywords.items()))]
         return f"{name_of(case.func)}({', '.join(bound)})"
@@ -294,17 +283,17 @@ def _seed(case, seed):
     try:
         draws = "rng" in inspect.signature(case).parameters
     except (TypeError, ValueError) as error:
-        raise SpecificationError(
-            f"The case is {case!r}.", "A case is a function of its parameters.", do="Give a function."
-        ) from error
+        rule = "A case must be a function of its parameters."
+        raise SpecificationError(f"The case is {case!r}.", rule, type=type(case).__name__) from error
     if draws == (seed is not None):
         return None if seed is None else whole("seed", seed)
     given = f"seed = {seed!r} was given" if seed is not None else "No seed was given"
     raise SpecificationError(
         f"{given}, and the case {name_of(case)} has {'a' if draws else 'no'} parameter rng.",
-        "A case that draws random numbers takes them from rng, a numpy Generator made of the seed and its index.",
+        "The seed is that of rng, the numpy Generator from which a case draws its random numbers.",
         do="Give a seed." if draws else "Leave the seed out, or draw from rng; monte_carlo(n, seed=...) has its own.",
         seed=seed,
+        draws=draws,
     )
 
 
@@ -314,34 +303,34 @@ def _part(shard, count):
     except (TypeError, ValueError):
         i = n = 0
     if not 1 <= i <= n:
-        raise SpecificationError(
-            f"shard = {shard!r}.", "A shard (i, n) is part i of n, from 1 to n.", do="Give (1, 4).", shard=shard
-        )
+        rule = "A shard (i, n) is part i of n parts, 1 <= i <= n."
+        raise SpecificationError(f"shard = {shard!r} was given.", rule, shard=shard)
     return range(i - 1, count, n)
 
 
 def require_fitting(case, parameters, seed):
-    """Refuse parameters that the case's function does not take, before all cases fail by them."""
-    drawn = {} if seed is None else {"rng": None}
+    """Refuse parameters that the case's function does not have."""
+    random = {} if seed is None else {"rng": None}
     try:
-        inspect.signature(case).bind(**parameters, **drawn)
+        inspect.signature(case).bind(**parameters, **random)
     except TypeError as error:
         call = f"{name_of(case)}{inspect.signature(case)}"
         raise SpecificationError(
             f"The cases have the parameters {', '.join(parameters)} for {call}: {error}.",
-            "A case is called with its parameters by name.",
-            do="Name the function's arguments as the parameters are named.",
+            "The function is called with the parameters by name.",
             parameters=list(parameters),
+            case=name_of(case),
         ) from error
 
 
 def _require_sendable(case, executor):
-    """Refuse, before anything is computed, what is no executor, and what processes could not receive."""
+    """Refuse what is not an executor, and a case that processes cannot receive, before anything is computed."""
     if not isinstance(executor, Executor | None):
         raise SpecificationError(
             f"executor={executor!r} was given.",
-            "Cases are computed here, or on an executor of concurrent.futures.",
-            do="Give an executor that is open, such as concurrent.futures.ThreadPoolExecutor(2).",
+            "It must be an executor of concurrent.futures, or None for this process.",
+            do="Give an open executor, such as concurrent.futures.ThreadPoolExecutor(2).",
+            type=type(executor).__name__,
         )
     if not isinstance(executor, ProcessPoolExecutor):
         return
@@ -350,13 +339,13 @@ def _require_sendable(case, executor):
     except Exception as error:
         raise SpecificationError(
             f"The case {name_of(case)} cannot be sent to another process: {error}.",
-            "A process receives a function by its name: it is at the top level of a module, and holds no model.",
-            do="Move it there, and derive the model inside of it, kept by functools.cache, or use loky or Dask.",
+            "A process imports the function by its name from a module.",
+            do="Move it to a module's top level and derive its model there (functools.cache), or use loky or Dask.",
             case=name_of(case),
         ) from error
 
 
-# --- what comes out
+# --- the table
 
 
 def _message(columns, meta, count):
@@ -364,16 +353,18 @@ def _message(columns, meta, count):
     parts = [f"{len(columns['case']) - failed} of {count} cases finished"]
     parts += [f"{failed - lost} failed"] if failed > lost else []
     parts += [f"{lost} not finished by the executor"] if lost else []
-    parts += ["interrupted: what was computed is kept"] if meta["interrupted"] else []
+    parts += ["interrupted"] if meta["interrupted"] else []
     return ", ".join(parts)
 
 
 def _died(row, count):
     return ServoError(
         f"The executor finished none of {count} cases. {row['error']}: {row['message']}",
-        "A worker imports the module of the case, computes it and sends its numbers back.",
-        do='Let a script start its work below if __name__ == "__main__", and check the memory that a case needs.',
+        "Each worker imports the module of the case and must have the memory that a case needs.",
+        do='Start the sweep of a script below if __name__ == "__main__".',
         error=row["error"],
+        message=row["message"],
+        cases=count,
     )
 
 

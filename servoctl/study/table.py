@@ -1,4 +1,4 @@
-"""A study: a table by column names, failures among its rows, with what it was made from and on which machine."""
+"""A study: a table by column names, failures among its rows, with its inputs and the machine that computed it."""
 
 import csv
 import functools
@@ -26,11 +26,11 @@ class Study:
     Attributes
     ----------
     kind : str
-        What was studied: "tradeoff", "sweep".
+        "tradeoff" or "sweep".
     columns : dict of str to (N,) array
-        Numbers or texts by name. What a row does not have is NaN among numbers, empty among texts.
+        Numbers or texts by name. A missing number is NaN, a missing text is empty.
     meta : dict
-        What was given, and the machine with its versions: texts, numbers, and lists and dicts of them.
+        The inputs, and the machine with its versions: texts, numbers, and lists and dicts of them.
     """
 
     kind: str
@@ -41,11 +41,8 @@ class Study:
         columns = {str(name): _array(values) for name, values in self.columns.items()}
         lengths = {name: len(values) for name, values in columns.items()}
         if len(set(lengths.values())) > 1:
-            raise SpecificationError(
-                f"The columns have the lengths {lengths}.",
-                "Each row has one entry in each column.",
-                do="Even them out.",
-            )
+            given, rule = f"The columns have the lengths {lengths}.", "All columns must have the same length."
+            raise SpecificationError(given, rule, lengths=lengths)
         object.__setattr__(self, "columns", columns)
 
     def __len__(self) -> int:
@@ -55,20 +52,7 @@ class Study:
         return self.column(name)
 
     def column(self, name: str) -> np.ndarray:
-        """The column with this name.
-
-        Parameters
-        ----------
-        name : str
-
-        Returns
-        -------
-        (N,) array
-
-        Raises
-        ------
-        NameUnknown
-        """
+        """The column with this name, (N,); NameUnknown if there is none."""
         if name not in self.columns:
             raise unknown(name, self.columns, "column")
         return self.columns[name]
@@ -79,38 +63,18 @@ class Study:
         return [dict(zip(plain, row, strict=True)) for row in zip(*plain.values(), strict=True)]
 
     def where(self, **values) -> "Study":
-        """The rows in which each column named has the value given.
-
-        Parameters
-        ----------
-        **values : float or str
-            By column name.
-
-        Returns
-        -------
-        Study
-        """
+        """The rows that have these values, numbers or texts by the names of their columns."""
         keep = np.ones(len(self), dtype=bool)
         for name, value in values.items():
             keep &= self.column(name) == value
         return self.take(np.flatnonzero(keep))
 
-    def take(self, rows):
-        """The rows with these indices, in this order.
-
-        Parameters
-        ----------
-        rows : sequence of int
-
-        Returns
-        -------
-        Study
-        """
-        rows = np.asarray(rows, dtype=int)
-        return replace(self, columns={name: values[rows] for name, values in self.columns.items()})
+    def take(self, rows) -> "Study":
+        """The rows with these indices (sequence of int), in this order, as a Study."""
+        return replace(self, columns={n: values[np.asarray(rows, dtype=int)] for n, values in self.columns.items()})
 
     def csv(self, path):
-        """Write the table as CSV: a line of names, then one line for each row; NaN for a number that is missing.
+        """Write the table as CSV: a line of names, then one line for each row; a missing number is NaN.
 
         Parameters
         ----------
@@ -137,7 +101,7 @@ class Study:
         Parameters
         ----------
         path : str or Path
-            A missing suffix .npz is added.
+            The suffix .npz is added if it is missing.
 
         Returns
         -------
@@ -152,12 +116,12 @@ class Study:
         return archive.save(path, "study", facts, {f"column_{i}": c for i, c in enumerate(self.columns.values())})
 
     def to_xarray(self):
-        """The study as an xarray.Dataset over its rows, where xarray is installed: `.to_netcdf(path)` writes it.
+        """The study as an xarray.Dataset over its rows; its method `to_netcdf(path)` writes netCDF.
 
         Returns
         -------
         xarray.Dataset
-            The meta is its attributes, lists and dicts among them as JSON.
+            Its attributes are the entries of `meta`, with lists and dicts as JSON.
 
         Raises
         ------
@@ -170,24 +134,24 @@ class Study:
     def __repr__(self):
         lines = [f"Study: {self.kind}, {len(self)} rows", "  " + ", ".join(self.columns)]
         lines += [f"  {self.meta['message']}"] if self.meta.get("message") else []
-        lines = [line if len(line) <= 120 else f"{line[:117]}..." for line in lines]
-        return "\n".join([*lines, *table(self, list(self.columns)[:MOST_COLUMNS])])
+        return "\n".join([*map(_clipped, lines), *table(self, list(self.columns)[:MOST_COLUMNS])])
 
 
 def table(study, names, most=SHOWN):
-    """Lines of readable width for some columns and the first rows of a study."""
+    """Lines of at most 120 characters for some columns and the first rows of a study."""
     texts = [[name, *(_short(value) for value in study[name][:most].tolist())] for name in names]
     widths = [max(map(len, column)) for column in texts]
-    lines = [
-        "  " + "  ".join(f"{text:{width}}" for text, width in zip(row, widths, strict=True)).rstrip()
-        for row in zip(*texts, strict=True)
-    ]
-    lines = [line if len(line) <= 120 else f"{line[:117]}..." for line in lines]
+    rows = (zip(row, widths, strict=True) for row in zip(*texts, strict=True))
+    lines = [_clipped("  " + "  ".join(f"{text:{width}}" for text, width in row).rstrip()) for row in rows]
     return [*lines, f"  ... {len(study) - most} more rows"] if len(study) > most else lines
 
 
+def _clipped(line):
+    return line if len(line) <= 120 else f"{line[:117]}..."
+
+
 def machine():
-    """What numbers are measured on: processor, cores, system, compiler and versions, as a dict of plain values."""
+    """The machine that computes: processor, cores, system, compiler and versions, as a dict of plain values."""
     versions = {name: _version(name) for name in ("casadi", "numpy", "scipy")}
     return {
         "processor": _processor(),
@@ -212,7 +176,7 @@ def _processor():
 
 
 def _array(values):
-    """An array of one kind: what is missing is NaN among numbers, empty among texts."""
+    """An array of numbers, None as NaN, or of texts, None as an empty one."""
     if isinstance(values, np.ndarray) and values.dtype != object:
         return values
     values = list(values)

@@ -1,8 +1,9 @@
-"""The measured trade: what each method, setting and treatment of drift costs and reaches on a motion."""
+"""The trade-off: measured errors and costs of methods, settings and treatments of drift on one motion."""
 
 import itertools
 import time
 import warnings
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -10,95 +11,38 @@ from servoctl.checks import as_span, is_number, mapping, positive, positives
 from servoctl.codegen.function import compiling_at_once
 from servoctl.errors import LimitExceeded, ServoError, SpecificationError, unknown
 from servoctl.methods.accuracy import motion_error, relative_error
-from servoctl.methods.choice import METHODS, Adaptive, Algebraic, RungeKutta, Taylor, as_method
-from servoctl.methods.drift import MinimalCoordinates, Poles, Project, as_drift
+from servoctl.methods.choice import (
+    METHODS,
+    Adaptive,
+    Algebraic,
+    MinimalCoordinates,
+    Poles,
+    Project,
+    RungeKutta,
+    Taylor,
+    as_drift,
+    as_method,
+)
+from servoctl.model.model import Model
+from servoctl.model.start import State
 from servoctl.progress import progress_bar
 from servoctl.simulation import consistent_state, simulate
 from servoctl.study.table import SHOWN, Study, machine, table
 
-MEASURED = tuple(name for name in METHODS if name not in ("RK1", "RK2", "RK23"))  # those need too many steps
+MEASURED = tuple(name for name in METHODS if name not in ("RK1", "RK2", "RK23"))  # which need too many steps
 TOLERANCES = (1e-3, 1e-5, 1e-7, 1e-9, 1e-11, 1e-13)
-STEP_COUNTS = tuple(5 * 4**k for k in range(7))  # of a fixed length, in the span
-INSTANTS, COMPARED = 51, 201  # instants that adaptive methods give, and at most so many of any run are compared
+STEP_COUNTS = tuple(5 * 4**k for k in range(7))  # steps of a fixed length in the span
+INSTANTS, COMPARED = 51, 201  # samples of adaptive methods; at most so many samples of any run are compared
 DENSE = 1001  # instants of the reference over which its power is integrated
-TIMED, ENOUGH = 3, 0.3  # calls timed after a warm-up, unless they take this part of `seconds` together
-FEW = 20  # steps: a run that takes too long for fewer has lost its way, and tells nothing of finer settings
-TIME_CONSTANT = 50  # of the default poles, in the span
-DRIFTS = ("none", "project", "minimal")  # others are time constants of poles
+TIMED, ENOUGH = 3, 0.3  # calls timed after a warm-up, fewer where they take this part of `seconds` together
+FEW = 20  # steps: a run that takes too long for fewer has diverged, and says nothing about finer settings
+TIME_CONSTANT = 50  # default time constants of the poles in the span
+DRIFTS = ("none", "project", "minimal")  # words of the column drift; others are time constants of poles
 COSTS = ("seconds", "evaluations", "steps")
 
 
-def tradeoff(model, x0, t_span, methods=None, drift=None, *, settings=None, seconds=0.3, progress=None):
-    """Measure error and cost of methods, settings and treatments of drift on one motion.
-
-    The reference is made here: the Taylor method of order 16 at a tolerance of 1e-15, or Newton's method at each
-    instant where nothing is integrated. A second method verifies it; their disagreement is the reference's own
-    uncertainty, and smaller errors than that are marked as not resolved.
-
-    Main arguments
-
-    Parameters
-    ----------
-    model : Model
-    x0 : State or (n_x,) array
-        From `model.start`.
-    t_span : (t0, t1)
-        [s]
-    methods : sequence of str, optional
-        Short forms of those that `simulate` has; default: all but "RK1", "RK2" and "RK23".
-    drift : sequence, optional
-        Treatments as `simulate` takes them; default: None, "project", "minimal" and poles at -50/(t1 - t0).
-
-    Other arguments
-
-    settings : dict of str to sequence of float, optional
-        "rtol": tolerances of the adaptive methods, default 1e-3 to 1e-13; atol is a hundredth. "step": steps of the
-        methods of fixed step, and spacings of the instants of "algebraic" [s]; default (t1 - t0)/5, and each next one
-        a quarter of the one before, down to (t1 - t0)/20,480.
-    seconds : float
-        That one run may take. One that takes longer is ended, and finer settings are skipped if it had taken more
-        than a few steps; their rows say so.
-    progress : bool, optional
-        Show a progress bar; default: on a terminal, for work of more than a second.
-
-    Returns
-    -------
-    TradeOff
-        Ctrl-C returns the rows measured so far; `meta["message"]` says so.
-
-    Raises
-    ------
-    ServoError
-        Where the reference cannot be had, such as SingularProgram where the motion ends.
-    InconsistentStart
-        For a start off the constraints: how a treatment leads back is no motion to measure others by.
-    SpecificationError
-        For settings that are none.
-    """
-    t0, t1 = as_span(t_span)
-    settings = _ladders(mapping(settings, "The settings"), abs(t1 - t0))
-    limit = positive("seconds", seconds)
-    drifts = (None, "project", "minimal", abs(t1 - t0) / TIME_CONSTANT) if drift is None else drift
-    combinations = _combinations(model, methods, drifts if isinstance(drifts, (list, tuple)) else [drifts])
-    total = sum(len(settings[_kind(method)]) for method, _ in combinations)
-    with compiling_at_once(), progress_bar("tradeoff", progress, total, unit="run") as bar, warnings.catch_warnings():
-        warnings.simplefilter("ignore", RuntimeWarning)  # of steps outside the stable range: the rows have what they do
-        reference, rows, interrupted = Reference(model, x0, (t0, t1), limit), [], False
-        try:
-            for method, treatment in combinations:
-                for row in _ladder(reference, method, treatment, settings[_kind(method)], limit):
-                    rows.append(row)
-                    bar.update()
-        except KeyboardInterrupt:
-            interrupted = True
-    columns = {name: [row.get(name) for row in rows] for name in TradeOff.COLUMNS}
-    meta = {"t_span": [t0, t1], "seconds": limit, "reference": reference.agreement, "machine": machine()}
-    meta |= {"message": "interrupted" if interrupted else "", "measured": time.strftime("%Y-%m-%d")}
-    return TradeOff("tradeoff", columns, meta)
-
-
 class Recommendation(dict):
-    """Arguments of `simulate`, and in `row` what was measured with them; made by `TradeOff.recommend`.
+    """Arguments of `simulate`, with the `row` that was measured with them; made by `TradeOff.recommend`.
 
     `sv.simulate(model, x0, t_span, **study.recommend(error=1e-6))`
     """
@@ -114,28 +58,28 @@ class TradeOff(Study):
     Columns: method; drift ("none", "project", "minimal", or the time constant of the poles in s); setting ("rtol" or
     "step") and its value; error of the motion: the largest deviation from the reference over all instants and
     components of the state, each relative to its largest magnitude (at least 1e-3 of the largest of its level);
-    actuation: the same of the required forces and moments; residual: the largest of any constraint at any level, in
+    actuation: the same for the required forces and moments; residual: the largest of any constraint at any level, in
     its unit; energy: energy gained less the work done along the reference, relative to the largest energy; power:
     dE/dt less the power of all forces, relative (NaN where it does not apply); evaluations of the right-hand side, or
-    of the series, or Newton steps; steps; seconds: the shortest call after a warm-up, with 51 samples by methods that
-    find their steps (more samples take longer), and one at each instant or step by the others; resolved: whether the
-    error exceeds the reference's own uncertainty; failure: why there is no number.
+    of the series, or Newton steps; steps; seconds: the shortest call after a warm-up, with 51 samples for adaptive
+    methods (more samples take longer), and one at each instant or step for the others; resolved: whether the error
+    exceeds the uncertainty of the reference; failure: why there are no numbers.
     """
 
     COLUMNS = (
-        "method", "drift", "setting", "value", "error", "actuation", "residual", "energy", "power", "evaluations",
-        "steps", "seconds", "resolved", "failure",
-    )  # fmt: skip
+        *("method", "drift", "setting", "value", "error", "actuation", "residual", "energy", "power"),
+        *("evaluations", "steps", "seconds", "resolved", "failure"),
+    )
 
     @property
-    def uncertainty(self):
-        """How far the reference and the method that verified it agree on the motion."""
+    def uncertainty(self) -> float:
+        """Relative difference between the reference and the method that verified it."""
         return self.meta["reference"]["error"]
 
-    def pareto(self, cost="seconds"):
-        """The rows that no other beats in both error and cost, from cheap to accurate.
+    def pareto(self, cost: str = "seconds") -> "TradeOff":
+        """The rows that no other row beats in both error and cost, from cheap to accurate.
 
-        Errors below the reference's uncertainty count as equal to it.
+        Errors below the uncertainty of the reference count as equal to it.
 
         Parameters
         ----------
@@ -153,8 +97,8 @@ class TradeOff(Study):
                 best = error[i]
         return self.take(front)
 
-    def recommend(self, *, error=None, seconds=None):
-        """What to give to `simulate`: the fastest within an error, or the most accurate within a time.
+    def recommend(self, *, error: float | None = None, seconds: float | None = None) -> Recommendation:
+        """Arguments of `simulate`: the fastest within an error, or the most accurate within a time.
 
         Parameters
         ----------
@@ -166,26 +110,27 @@ class TradeOff(Study):
         Returns
         -------
         Recommendation
-            A dict of arguments; `.row` has what was measured.
+            A dict of arguments; `.row` is the measured row.
 
         Raises
         ------
         SpecificationError
-            Unless one of the two is given.
+            Unless exactly one of the two is given, a positive number.
         LimitExceeded
-            Where nothing reaches it; the message names the nearest that does.
+            If no row reaches it; the message has the nearest one.
         """
         if (error is None) == (seconds is None):
             raise SpecificationError(
                 f"error={error!r} and seconds={seconds!r} were given.",
-                "A recommendation answers one question: the fastest within an error, or the best within a time.",
+                "Exactly one of the two bounds a recommendation.",
                 do="Give recommend(error=1e-6) or recommend(seconds=1e-3).",
+                error=error,
+                seconds=seconds,
             )
         wanted, limit = ("error", error) if seconds is None else ("seconds", seconds)
         if not (is_number(limit) and limit > 0):
-            raise SpecificationError(
-                f"{wanted}={limit!r} was given.", f"{wanted} is a positive number.", do="Give 1e-6.", **{wanted: limit}
-            )
+            given, rule = f"{wanted}={limit!r} was given.", "It must be a positive number."
+            raise SpecificationError(given, rule, **{wanted: limit})
         front = self.pareto()
         reached = front._errors() if wanted == "error" else front["seconds"]
         within = np.flatnonzero(reached <= limit)
@@ -199,20 +144,20 @@ class TradeOff(Study):
         if len(front):
             row = front.rows()[-1 if wanted == "error" else 0]
             best = max(row["error"], self.uncertainty)
-            nearest = f"{_name(row)}: error {best:.2g} in {row['seconds']:.2g} s"
-        rule = f"The reference is itself certain to {self.uncertainty:.1g} only" if wanted == "error" else ""
+            nearest = f"{row['method']}, drift {row['drift']}, {row['setting']} {row['value']:g}: "
+            nearest += f"error {best:.2g} in {row['seconds']:.2g} s"
+        reason = "no measured setting reaches it" if len(front) else "every run failed, see the column failure"
         return LimitExceeded(
-            f"{wanted}={limit:g} was given, which no setting that was measured reaches"
-            + ("." if len(front) else ": every run failed, see the column failure."),
-            rule or "A recommendation is one of the settings that were measured.",
+            f"{wanted}={limit:g} was given, and {reason}.",
+            f"The reference itself has the uncertainty {self.uncertainty:.1g}." if wanted == "error" else "",
             nearest=nearest,
-            do="Raise it, or measure other methods and settings by tradeoff(...).",
+            do=f"Raise {wanted}, or measure other methods and settings.",
             limit=limit,
             uncertainty=self.uncertainty,
         )
 
-    def plot(self, ax=None, cost="seconds", title=""):
-        """Draw the work-precision diagram: error of the motion over cost, a line for each method and treatment.
+    def plot(self, ax=None, cost: str = "seconds", title: str = ""):
+        """Draw the work-precision diagram: error of the motion over cost, with a line for each method and drift.
 
         Parameters
         ----------
@@ -232,7 +177,7 @@ class TradeOff(Study):
         return np.flatnonzero(np.isfinite(self["error"]) & np.isfinite(self["seconds"]))
 
     def _errors(self):
-        """Errors, those below the reference's uncertainty raised to it."""
+        """Errors, at least the uncertainty of the reference."""
         return np.maximum(self["error"], self.uncertainty)
 
     def __repr__(self):
@@ -252,18 +197,97 @@ class TradeOff(Study):
         return "\n".join([*lines, *table(front.take(shown), names, SHOWN)])
 
 
+def tradeoff(
+    model: Model,
+    x0: State | np.ndarray,
+    t_span: tuple[float, float],
+    methods: Sequence[str] | str | None = None,
+    drift: Sequence | None = None,
+    *,
+    settings: Mapping[str, Sequence[float]] | None = None,
+    seconds: float = 0.3,
+    progress: bool | None = None,
+) -> TradeOff:
+    """Measure error and cost of methods, settings and treatments of drift on one motion.
+
+    The reference is the Taylor method of order 16 at a tolerance of 1e-15, or, where nothing is integrated, Newton's
+    method at each instant. A second method verifies it. Their difference is the uncertainty of the reference; smaller
+    errors are marked as not resolved.
+
+    Main arguments
+
+    Parameters
+    ----------
+    model : Model
+    x0 : State or (n_x,) array
+        From `model.start`.
+    t_span : (t0, t1)
+        [s]
+    methods : sequence of str, optional
+        Names of methods as in `simulate`; default: all but "RK1", "RK2" and "RK23".
+    drift : sequence, optional
+        Treatments as in `simulate`; default: None, "project", "minimal" and poles at -50/(t1 - t0).
+
+    Other arguments
+
+    settings : dict of str to sequence of float, optional
+        "rtol": tolerances of the adaptive methods, default 1e-3 to 1e-13; atol is a hundredth of rtol. "step": steps
+        of the methods of fixed step, and spacings of the instants of "algebraic" [s]; default (t1 - t0)/(5·4ᵏ),
+        k = 0 .. 6.
+    seconds : float
+        Time that one run may take [s]. A longer one is stopped, and finer settings are skipped if it had taken more
+        than a few steps; the column failure says so.
+    progress : bool, optional
+        Show a progress bar; default: on a terminal, for work of more than a second.
+
+    Returns
+    -------
+    TradeOff
+        After Ctrl-C the rows measured so far, with `meta["message"]` "interrupted".
+
+    Raises
+    ------
+    ServoError
+        If the reference cannot be computed, such as SingularProgram where the motion ends.
+    InconsistentStart
+        For a start off the constraints.
+    SpecificationError
+        For invalid settings.
+    """
+    t0, t1 = as_span(t_span)
+    settings = _ladders(mapping(settings, "The settings"), abs(t1 - t0))
+    limit = positive("seconds", seconds)
+    drifts = (None, "project", "minimal", abs(t1 - t0) / TIME_CONSTANT) if drift is None else drift
+    combinations = _combinations(model, methods, drifts if isinstance(drifts, (list, tuple)) else [drifts])
+    total = sum(len(settings[_kind(method)]) for method, _ in combinations)
+    with compiling_at_once(), progress_bar("tradeoff", progress, total, unit="run") as bar, warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)  # steps outside the stable range: their errors are measured
+        reference, rows, interrupted = Reference(model, x0, (t0, t1), limit), [], False
+        try:
+            for method, treatment in combinations:
+                for row in _ladder(reference, method, treatment, settings[_kind(method)], limit):
+                    rows.append(row)
+                    bar.update()
+        except KeyboardInterrupt:
+            interrupted = True
+    columns = {name: [row.get(name) for row in rows] for name in TradeOff.COLUMNS}
+    meta = {"t_span": [t0, t1], "seconds": limit, "reference": reference.agreement, "machine": machine()}
+    meta |= {"message": "interrupted" if interrupted else "", "measured": time.strftime("%Y-%m-%d")}
+    return TradeOff("tradeoff", columns, meta)
+
+
 # --- the reference
 
 
 class Reference:
-    """The motion against which others are measured, at any instants.
+    """The motion with which others are compared, at any instants.
 
-    `agreement` has its method, the one that verified it (which may take ten times `seconds`), and how far they agree.
+    `agreement` has its method, the method that verified it within ten times `seconds`, and their difference.
     """
 
     def __init__(self, model, x0, t_span, seconds):
         consistent_state(model, x0, t_span[0])
-        self.model, self.start, self.span, self._known = model, x0, t_span, {}
+        self.model, self.start, self.span, self._runs = model, x0, t_span, {}
         self.knots = [k for k in model.require_smooth((min(t_span), max(t_span))) if min(t_span) < k < max(t_span)]
         self.times = np.union1d(np.linspace(*t_span, INSTANTS), self.knots)
         checks = [Adaptive("DOP853", 3e-14, 1e-15), Taylor(12, rtol=1e-14, atol=1e-14)]
@@ -273,7 +297,7 @@ class Reference:
         self.agreement = self._verified(checks, seconds)
 
     def _verified(self, checks, seconds):
-        """The agreement with the first other method that comes to the end in time."""
+        """The difference from the first of the other methods that ends in time."""
         exact = self.at(self.times)
         dense = np.union1d(np.linspace(*self.span, DENSE), self.knots)
         for method in checks:
@@ -284,8 +308,8 @@ class Reference:
                 failure = error
                 continue
             return {
-                "method": _said(self.method),
-                "verified by": _said(method),
+                "method": _text(self.method),
+                "verified by": _text(method),
                 "error": motion_error(self.model, run.jets, exact.jets),
                 "actuation": relative_error(actuation(run), actuation(exact)),
                 "energy": _energy_balance(self.at(dense), self.knots),
@@ -295,29 +319,29 @@ class Reference:
     def at(self, times):
         """The run with samples at these times (N,) [s]."""
         key = times.tobytes()
-        if key not in self._known:
+        if key not in self._runs:
             run = simulate(self.model, self.start, self.span, self.method, drift=self.drift, t_eval=times)
-            self._known[key] = _whole(run)
-        return self._known[key]
+            self._runs[key] = _whole(run)
+        return self._runs[key]
 
 
 class Deadline:
-    """What `simulate` takes as progress to end a run that takes more than some seconds from its first step on."""
+    """A `progress` for `simulate` that stops a run some seconds after its first step."""
 
     def __init__(self, seconds):
         self.seconds, self.since, self.steps = seconds, None, 0
 
     def __call__(self, t):
-        """Raise LimitExceeded where the time is over."""
+        """Raise LimitExceeded when the time is over."""
         now = time.perf_counter()
         self.since, self.steps = self.since or now, self.steps + 1
         if now - self.since > self.seconds:
             late = f"More than {self.seconds:g} s: ended at t = {t:.4g} s"
-            raise LimitExceeded(late, seconds=self.seconds, steps=self.steps)
+            raise LimitExceeded(late, seconds=self.seconds, steps=self.steps, t=t)
 
 
 def _whole(run):
-    """A run to its end; one that Ctrl-C ended is no measurement, and ends the study."""
+    """The run, if it reached its end; one that Ctrl-C stopped ends the study."""
     if not run.success:
         raise KeyboardInterrupt
     return run
@@ -332,24 +356,24 @@ def actuation(run):
 
 
 def _ladder(reference, method, treatment, settings, seconds):
-    """A row for each setting, from coarse to fine, until they are too slow or as exact as the reference."""
-    over, name = "", _kind(method)
+    """A row for each setting, from coarse to fine; those after the first too slow or unresolved one are skipped."""
+    skipped, name = "", _kind(method)
     for value in sorted(settings, reverse=True):
-        row = {"method": method, "drift": _drift_word(treatment), "setting": name, "value": value, "failure": over}
-        if not over:
+        row = {"method": method, "drift": _drift_word(treatment), "setting": name, "value": value, "failure": skipped}
+        if not skipped:
             try:
                 row |= _errors_and_cost(reference, method, treatment, value, seconds)
                 if not row["resolved"]:
-                    over = f"skipped: {name} = {value:g} reaches what the reference is certain to"
+                    skipped = f"skipped: {name} = {value:g} reaches the uncertainty of the reference"
                 elif row["seconds"] > seconds:
-                    over = f"skipped: {name} = {value:g} took {row['seconds']:.2g} s, more than {seconds:g} s"
-            except SpecificationError as error:  # no setting makes sense of this combination: one row says so
+                    skipped = f"skipped: {name} = {value:g} took {row['seconds']:.2g} s, more than {seconds:g} s"
+            except SpecificationError as error:  # the combination is invalid at every setting: one row is enough
                 yield row | {"value": np.nan, "failure": str(error)}
                 return
             except ServoError as error:
                 row["failure"] = f"{type(error).__name__}: {error}"
                 if error.details.get("steps", 0) > FEW:
-                    over = f"skipped: {name} = {value:g} took more than {seconds:g} s"
+                    skipped = f"skipped: {name} = {value:g} took more than {seconds:g} s"
         yield row
 
 
@@ -400,7 +424,7 @@ def _errors(reference, run):
 
 
 def _energy_balance(run, knots):
-    """Largest difference of the energy gained and the work of all forces, relative to the energy (splines)."""
+    """Largest difference between the energy gained and the work of all forces, relative to the energy (splines)."""
     from scipy.interpolate import make_interp_spline
 
     order = np.argsort(run.t)
@@ -415,11 +439,11 @@ def _energy_balance(run, knots):
     return float(np.abs(energy - energy[0] - gained).max() / max(np.abs(energy).max(), 1e-300))
 
 
-# --- what is measured
+# --- combinations to measure
 
 
 def _combinations(model, methods, drifts):
-    """Pairs of method and treatment; default methods are those that the model can have."""
+    """Pairs of method and treatment; "algebraic" has no treatment, and is a default only for flat programs."""
     if methods is None:
         methods = MEASURED if model.flat else [name for name in MEASURED if name != "algebraic"]
     methods = list(methods) if isinstance(methods, (list, tuple)) else [methods]
@@ -427,24 +451,24 @@ def _combinations(model, methods, drifts):
         if not (isinstance(method, str) and method in METHODS):
             raise unknown(method, METHODS, "method")
     treatments = [as_drift(value) for value in drifts]
-    for value in treatments:
-        if isinstance(value, Poles) and not isinstance(value.values, float):
-            raise SpecificationError(
-                "Poles by row were given.", "A row of the study names its drift in a word.", do="Give a time constant."
-            )
-    pairs = [(m, d) for m in methods for d in treatments if m != "algebraic"]
-    pairs = [*((m, None) for m in methods if m == "algebraic"), *pairs]
+    if any(isinstance(value, Poles) and not isinstance(value.values, float) for value in treatments):
+        rule, do = "A study names each treatment by one word or number.", "Give one time constant for all rows."
+        raise SpecificationError("Poles by row were given.", rule, do=do, drift=list(drifts))
+    pairs = [(m, None) for m in methods if m == "algebraic"]
+    pairs += [(m, d) for m in methods for d in treatments if m != "algebraic"]
     if not pairs:
         raise SpecificationError(
             f"methods={methods!r} and drift={drifts!r} were given.",
-            "A study measures at least one method with one treatment of drift.",
-            do="Leave both out to measure most, or give drift=[None].",
+            "A study needs at least one method and one treatment of drift.",
+            do="Leave both out for the defaults, or give drift=[None] for no treatment.",
+            methods=methods,
+            drift=list(drifts),
         )
     return pairs
 
 
 def _ladders(settings, length):
-    """Values of "rtol" and "step", the latter for a span of some length [s]."""
+    """Values of "rtol", and of "step" for a span of this length [s]."""
     for name in settings:
         if name not in ("rtol", "step"):
             raise unknown(name, ("rtol", "step"), "setting")
@@ -458,7 +482,7 @@ def _kind(method):
 
 
 def _drift_word(treatment):
-    """A word for a treatment from which `TradeOff.recommend` makes it again."""
+    """A treatment as a word, which `_arguments` reads."""
     if isinstance(treatment, Poles):
         return f"{treatment.values:g}"
     if isinstance(treatment, Project):
@@ -466,7 +490,7 @@ def _drift_word(treatment):
     return "minimal" if isinstance(treatment, MinimalCoordinates) else "none"
 
 
-def _said(method):
+def _text(method):
     order = f" of order {method.order}" if isinstance(method, Taylor) else ""
     return f"{method}{order}" + (f" at {method.rtol:g}" if hasattr(method, "rtol") else "")
 
@@ -475,7 +499,7 @@ def _said(method):
 
 
 def method_at(name, value):
-    """The method of a name with a step of `value` [s], or a tolerance: rtol is `value`, atol a hundredth."""
+    """The method of this name with a step [s] or a relative tolerance of `value`; atol is a hundredth of it."""
     method = as_method(name)
     if isinstance(method, Algebraic):
         return method
@@ -484,16 +508,12 @@ def method_at(name, value):
 
 
 def _arguments(row):
-    """The arguments of `simulate` that a row was measured with."""
+    """The arguments of `simulate` with which a row was measured."""
     options, drift = {"method": method_at(row["method"], row["value"])}, row["drift"]
     if drift != "none":
         word, _, every = drift.partition(" ")
         options["drift"] = Project(int(every)) if every else word if word in DRIFTS else float(drift)
     return options
-
-
-def _name(row):
-    return ", ".join([row["method"], f"drift {row['drift']}", f"{row['setting']} {row['value']:g}"])
 
 
 def _cost(name):

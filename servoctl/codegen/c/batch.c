@@ -66,7 +66,7 @@ INLINE void begin(const Loop *c, int64_t at, double *scratch, Cases *s)
     for (int i = 0; i < NX; i++) s->x[i] = w_load(c->x0 + i * c->columns + at);
     for (int i = 0; i < ND; i++) s->scale[i] = w_load(c->scale + i * c->columns + at);
     for (int i = 0; i < NZ; i++) s->y[NM + i] = ALL(c->z0[i]);
-    for (int i = 0; i < NU; i++) s->u[i] = ALL(c->idle[i]);
+    for (int i = 0; i < NU; i++) s->u[i] = ALL(c->initial_input[i]);
     for (int i = 0; i < NT; i++) s->largest[i] = s->squares[i] = ALL(0.0);
     s->state_lost = s->law_lost = ALL(INFINITY);
     s->commands = scratch;
@@ -76,7 +76,7 @@ INLINE void begin(const Loop *c, int64_t at, double *scratch, Cases *s)
     for (int i = 0; i < NV; i++) s->x[NX + i] = w[NW + i];
 }
 
-/* Sample k: measure, law, delay, limits; what is gathered there. */
+/* Sample k: measure, law, delay, limits; gathered quantities. */
 INLINE void sample(const Loop *c, int64_t k, int64_t at, const double *noise, Cases *s)
 {
     const double t = c->t0 + (double)k * c->period, *row = c->table + k * (NL + NS);
@@ -97,7 +97,7 @@ INLINE void sample(const Loop *c, int64_t k, int64_t at, const double *noise, Ca
         if (c->delay) {
             w_store(s->commands + (here * NU + i) * W_LANES, command);
             const int64_t sent = (k - c->delay + c->depth) % c->depth;
-            command = k < c->delay ? ALL(c->idle[i]) : w_load(s->commands + (sent * NU + i) * W_LANES);
+            command = k < c->delay ? ALL(c->initial_input[i]) : w_load(s->commands + (sent * NU + i) * W_LANES);
         }
         u[i] = limited(c, i, command, u[i]);
         if (c->transport) w_store(s->inputs + (here * NU + i) * W_LANES, u[i]);
@@ -115,12 +115,12 @@ INLINE void sample(const Loop *c, int64_t k, int64_t at, const double *noise, Ca
     for (int i = 0; i < NU; i++) s->p[NW + i] = u[i];
 }
 
-/* What arrives in one integration step after transport. */
+/* The inputs of one integration step, after the transport delay. */
 INLINE void transported(const Loop *c, int64_t step, Cases *s)
 {
     for (int i = 0; i < NU; i++) {
         const int64_t sent = step - c->transport[i], place = sent / c->substeps % c->depth;
-        s->p[NW + i] = sent < 0 ? ALL(c->idle[i]) : w_load(s->inputs + (place * NU + i) * W_LANES);
+        s->p[NW + i] = sent < 0 ? ALL(c->initial_input[i]) : w_load(s->inputs + (place * NU + i) * W_LANES);
     }
 }
 

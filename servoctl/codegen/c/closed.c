@@ -51,7 +51,8 @@ int64_t FN(closed)(Law *law, Loop *c)
         measure(c, k, x, y);
         law(t, y, c->table + row * c->n_row, out);
         for (int64_t i = 0; i < c->n_u + c->n_z; i++) if (!isfinite(out[i])) { c->status = 2; return k; }
-        const double *command = k < c->delay ? c->idle : out - c->delay * c->n_out, *before = k ? u - c->n_u : c->idle;
+        const double *command = k < c->delay ? c->initial_input : out - c->delay * c->n_out;
+        const double *before = k ? u - c->n_u : c->initial_input;
         for (int64_t i = 0; i < c->n_u; i++) u[i] = limited(c, i, command[i], before[i]);
         if (k == c->samples) return k + 1;
         for (int64_t i = 0; i < c->n_z; i++) y[c->n_y + c->n_z + c->n_y + i] = out[c->n_u + i];
@@ -60,7 +61,7 @@ int64_t FN(closed)(Law *law, Loop *c)
             const int64_t step = k * c->substeps + s;
             for (int64_t i = 0; c->transport && i < c->n_u; i++) {
                 const int64_t sent = step - c->transport[i];
-                p[c->at_u + i] = sent < 0 ? c->idle[i] : c->input[sent / c->substeps * c->n_u + i];
+                p[c->at_u + i] = sent < 0 ? c->initial_input[i] : c->input[sent / c->substeps * c->n_u + i];
             }
             advance(c, t + (double)s * h, h, c->disturbance + 3 * step * c->n_d, x, p);
             restore(t + (double)(s + 1) * h, x, p);

@@ -1,4 +1,4 @@
-/* One point, a grid of points, and what CasADi calls. */
+/* One point, a grid of points, and the interface for CasADi. */
 #include "unit.h"
 #ifdef WIDE
 #include "lanes.h"

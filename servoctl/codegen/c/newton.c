@@ -89,7 +89,7 @@ static inline double wide_relative_step(const W *x, const W *y)
 }
 
 /* The solutions at the eight times from t[k] on: predicted from three of the last eight by their values and rates, and
-   corrected together, by the first outputs alone until the correction is small. Returns whether all were found; then
+   corrected together, by the first outputs alone until the correction is small. Returns 1 if all converge; then
    the logs hold them. */
 static int block(int64_t n, int64_t k, const double *t, const W *p, double tol, double *x_log, double *y_log,
                  int64_t *count)

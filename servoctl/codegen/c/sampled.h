@@ -7,7 +7,8 @@ typedef struct {
     int64_t depth, every, n_traced, columns;                                               /* of many */
     int64_t status;                                                                        /* of one: how it ended */
     double t0, period;
-    const double *p, *x0, *z0, *table, *noise, *quantum, *low, *high, *change, *idle, *disturbance, *constants, *scale;
+    const double *p, *x0, *z0, *table, *noise, *quantum, *low, *high, *change, *initial_input, *disturbance;
+    const double *constants, *scale;
     const int64_t *measured, *transport, *disturbed, *traced;
     double *x, *law_x, *law_y, *input; /* logs of one loop */
     double *gathered, *trace;          /* and of many */
@@ -19,7 +20,7 @@ INLINE V quantised(const Loop *c, int64_t i, V value)
     return value;
 }
 
-/* The input of one sample: the command, kept within its limits and its limits of rate. */
+/* The input of one sample: the command, cut to its limits and its rate limits. */
 INLINE V limited(const Loop *c, int64_t i, V value, V before)
 {
     if (c->low) value = V_CALL(fmin)(V_CALL(fmax)(value, V_OF(c->low[i])), V_OF(c->high[i]));

@@ -17,7 +17,7 @@ static inline double largest_size(const double *v, int64_t n)
     return largest;
 }
 
-/* log2 of the step at which the last term stays below the tolerance at the first `levels` levels of the state, the
+/* log2 of the step at which the last term meets the tolerance at the first `levels` levels of the state, the
    terms taken to grow as the fastest of the upper half do: single coefficients may vanish. */
 static inline double length(const double *x, const double *c, int64_t n, int64_t levels, double log_rtol, double least)
 {
@@ -54,7 +54,7 @@ static inline void move(const double *x, const double *y, const double *c, doubl
 }
 
 /* Steps of the Taylor method from the start (t, x, p) towards t1. The function gives the coefficients of q (unless
-   plain), those of gamma, and guards. The log has a row (t, x, y) for each step, and one more for the end. Returns the
+   plain), those of gamma, and pivots. The log has a row (t, x, y) for each step, and one more for the end. Returns the
    number of steps, at most max_steps; fewer without reaching t1 where a step vanishes or is not finite. */
 int64_t FN(taylor)(const double *start, double t1, double rtol, double atol, int64_t project_every, int64_t max_steps,
            double *log)

@@ -1,4 +1,4 @@
-/* What every unit begins with. The emitter defines, before it includes a file of this folder,
+/* Head of every unit. The emitter defines, before it includes a file of this folder,
 
    NAME            the function: void NAME(double t, const double *x, const double *p, double *y), x -> y
    NX, NP, NY      the lengths of x, p and y

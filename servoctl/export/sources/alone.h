@@ -1,4 +1,4 @@
-/* What an exported file has before each of these: sizes, functions and tables; for compilers that see one alone. */
+/* Sizes, functions and tables of an exported file, for compilers that see one file of this folder alone. */
 #include <math.h>
 
 #define N 2

@@ -1,4 +1,4 @@
-"""An arm of n links with k of its joints guided: a family over n and k, for comparisons."""
+"""An arm of n links with k of its joints guided: the family over n and k on which formulations are compared."""
 
 import casadi as ca
 
@@ -28,14 +28,16 @@ def guided_arm(n=4, k=2, coordinates="joints"):
     SpecificationError
         If k constraints leave no motion, or there are fewer than two links.
     NameUnknown
-        If the coordinates are named otherwise.
+        For other coordinates.
     """
     mechanism, _ = planar_arm(n, coordinates)
     if not 1 <= k < n:
         raise SpecificationError(
-            f"k = {k} guided joints of {n}.",
-            "At least one is guided and one is not.",
+            f"k = {k} joints of {n} are guided.",
+            "At least one joint is guided and at least one is free.",
             nearest=f"k = {min(max(k, 1), n - 1)}.",
+            n=n,
+            k=k,
         )
     q, length = list(mechanism.q), mechanism.parameters.l
     inclinations = [sum(q[: i + 1]) for i in range(n)] if coordinates == "joints" else q[2::3]

@@ -1,0 +1,314 @@
+"""Rows ψ = 0, their orders on the manifold of other rows, and dependences among their leading gradients."""
+
+from dataclasses import dataclass, field, replace
+
+import casadi as ca
+import numpy as np
+
+from servoctl.errors import SingularProgram, SpecificationError
+from servoctl.jets.series import Flow
+from servoctl.reduction.manifold import POINTS_SEED, sample, solve
+from servoctl.reduction.ranks import clean, combination, decide, eliminate, equilibrate, refined
+from servoctl.tolerances import DEPENDENT, ENTRY
+
+TAKES_PART = 1e-12  # coefficient times the largest entry of a row: below this the row is no part of a combination
+SUPPORTS = 1e-9  # equilibrated coefficient, at any point, above which a row is part of a dependence
+BASIS_CUTOFF = 1e-12  # relative singular value of independent rows below which a direction is left out
+VANISHED = 1e-5  # gradient on a row's solutions, relative to random points, below which the row is a square
+SQUARE_STEPS = 40  # Newton steps towards these solutions; for a square each only halves the distance
+SOLVED = 1e-3  # scaled residual of points at which the gradient of a possible square is judged
+BESIDE = 0.5  # relative distance of the points with which solutions are compared
+
+
+@dataclass(frozen=True)
+class Balance:
+    """The key of the balance r, or of one component of it, beside the names of residuals.
+
+    Attributes
+    ----------
+    component : str
+        Name of a coordinate or quasi-velocity; empty for the whole balance.
+    """
+
+    component: str = ""
+
+    def __str__(self):
+        return f"the force on {self.component}" if self.component else "the balance"
+
+
+@dataclass(frozen=True)
+class Row:
+    """One scalar equation ψ(t, q, γ', ..., γ^(order)) = 0.
+
+    Attributes
+    ----------
+    expression : SX scalar
+    order : int
+        Highest k with ∂ψ/∂γ^(k) ≠ 0 on the manifold; 0 for q alone, -1 for t alone.
+    name : str
+    kind : {"program", "material", "dynamics"}
+        Its origin.
+    affine : bool
+        Whether it is affine in γ^(order).
+    story : str
+        The combination that it is, if it is a hidden constraint.
+    uses : dict of (str or Balance) to int
+        Highest derivative of each residual, and of the balance, that ψ contains.
+    """
+
+    expression: ca.SX
+    order: int
+    name: str
+    kind: str
+    affine: bool = True
+    story: str = ""
+    uses: dict = field(default_factory=dict)
+    _gradients: dict = field(default_factory=dict, repr=False, compare=False)
+
+    def gradient(self, q, level=None):
+        """∂ψ/∂γ^(level), (1, n) SX; for level 0 ∂ψ/∂q · V. Default level: the order, for the leading gradient."""
+        level = self.order if level is None else level
+        key = self.expression.element_hash(), level
+        if key not in self._gradients:
+            slopes = ca.jacobian(self.expression, q.jet(level))
+            self._gradients[key] = self.expression, slopes if level or q.plain else slopes @ q.V
+        return self._gradients[key][1]
+
+    def __repr__(self):
+        return f"Row({self.name}: {self.kind}, order {self.order}{', ' + self.story if self.story else ''})"
+
+
+def merge_uses(*parts):
+    """The highest number of differentiations of each residual among (uses, extra differentiations) pairs."""
+    total = {}
+    for uses, extra in parts:
+        for name, count in uses.items():
+            total[name] = max(total.get(name, 0), count + extra)
+    return total
+
+
+def as_rows(q, named, kind, context):
+    """Rows of residuals by name, of kind "program" or "material", with their true orders.
+
+    Raises
+    ------
+    SpecificationError
+        If a residual depends on no coordinate.
+    SingularProgram
+        If a residual is a square: its gradient vanishes wherever the residual does.
+    """
+    rows = [Row(e, max(q.order(e), 0), name, kind, uses={name: 0}) for name, e in named.items()]
+    settled = settle_alone(q, rows, context)
+    for row, slopes in settled:
+        if row.order < 0:
+            raise SpecificationError(
+                f"The residual {row.name!r} depends on no coordinate.",
+                "A constraint restricts the motion.",
+                do="Write it with the symbols of the mechanism's coordinates.",
+                name=row.name,
+            )
+        _refuse_square(q, row, context, slopes)
+    return [row for row, _ in settled]
+
+
+def _refuse_square(q, row, context, slopes=None):
+    """Refuse a residual whose gradient vanishes wherever the residual does, such as φ² = 0.
+
+    `slopes` are values of the gradient at points, where they are known.
+    """
+    gradient = row.gradient(q)
+    # The solutions determine only the highest jets: a gradient without these is as large there as anywhere,
+    if row.order > 0 and q.order(gradient) < row.order:
+        return
+    # and so is an entry without any coordinate.
+    if slopes is not None:
+        sizes, columns = np.abs(slopes), gradient.sparsity().get_triplet()[1]
+        clear = np.all(sizes > VANISHED * sizes.max(axis=0), axis=1)
+        if any(clear[i] and q.order(e) < 0 for i, e in zip(columns, gradient.nonzeros(), strict=True)):
+            return
+    start = sample(q, [], row.order, context)
+    flow = Flow(q, [row], row.order, start)
+    z, residual = solve(flow, start.t, start.z, iterations=SQUARE_STEPS)
+    sizes = []
+    for jets in (start.z, z):
+        values, _ = replace(start, z=jets).matrix(gradient)
+        sizes.append(np.abs(values).max(axis=(0, 1)))
+    solved = residual < SOLVED
+    if solved.any() and np.all(sizes[1][solved] < VANISHED * sizes[0][solved]):
+        if not _regular_nearby(flow, start.t[solved], z[:, solved]):
+            raise vanishing_gradient(row)
+
+
+def _regular_nearby(flow, t, z):
+    """Whether a row's gradient at its solutions z is no smaller than beside them, where all of it is small.
+
+    At a regular solution Newton's method has converged; towards that of a square its steps only halve the distance.
+    """
+    residual, slopes = flow(t, z)
+    beside = z * (1.0 + np.random.default_rng(POINTS_SEED).uniform(-BESIDE, BESIDE, z.shape))
+    here, there = np.abs(slopes[0]).max(axis=0), np.abs(flow(t, beside)[1][0]).max(axis=0)
+    with np.errstate(all="ignore"):
+        steps = np.abs(residual[0] * slopes[0]) / (slopes[0] ** 2).sum(axis=0)
+    converged = np.all(steps <= VANISHED * np.abs(z), axis=0)
+    return bool(np.any(converged & (here > VANISHED * there)))
+
+
+def vanishing_gradient(row):
+    """The error of a row whose gradient vanishes wherever the row holds."""
+    return SingularProgram(
+        f"The gradient of row {row.name!r} vanishes on its own solutions.",
+        "A constraint φ = 0 needs a gradient there; that of φ² = 0 is zero and determines no direction of the motion.",
+        do=f"Write {row.name!r} without the square, so that it changes sign at its solutions.",
+        row=row.name,
+    )
+
+
+def leading(q, rows, points):
+    """The leading matrix L at points, (rows, n, N), with rounding set to zero, and the sizes of its entries."""
+    values, sizes = points.matrix(ca.vertcat(*(row.gradient(q) for row in rows)))
+    return clean(values, sizes), sizes
+
+
+def settle_alone(q, rows, context):
+    """The true order of each row by itself; see `settle`.
+
+    For most rows one evaluation of all leading gradients decides, and `settle` treats the rest.
+
+    Returns
+    -------
+    list of (Row, (n, N) array or None)
+        Each row, and the values of its leading gradient at the points if that evaluation decided.
+    """
+    levels = [q.order(row.expression) for row in rows]
+    settled = [None] * len(rows)
+    for level in set(levels) - {-1}:
+        members = [a for a, order in enumerate(levels) if order == level and rows[a].order <= level]
+        points = sample(q, [], level, context)
+        gradients = [rows[a].gradient(q, level) for a in members]
+        points.read([*(rows[a].expression for a in members), *(e for g in gradients for e in g.nonzeros())])
+        values = clean(*points.matrix(ca.vertcat(*gradients)))
+        for a, slopes, numbers in zip(members, gradients, values, strict=True):
+            if np.any(numbers):
+                affine = q.order(slopes) < level or _affine(q, rows[a].expression, level, points)
+                settled[a] = replace(rows[a], order=level, affine=affine), numbers
+    return [pair or (settle(q, row, [], context)[0], None) for pair, row in zip(settled, rows, strict=True)]
+
+
+def settle(q, row, others, context, starts=None):
+    """Determine the order of a row on the manifold of other rows, and eliminate jets that it only seems to contain.
+
+    From the highest jet downwards: a jet with a zero gradient is set to zero, and a jet that the other rows
+    determine is replaced by their solution.
+
+    Parameters
+    ----------
+    q : Coordinates
+    row : Row
+        Its `order` is an upper bound.
+    others : list of Row
+    context : Context
+    starts : Points, optional
+        Starts for points of the manifold.
+
+    Returns
+    -------
+    Row or None
+        With its true order, -1 for none; None if no point satisfies the other rows.
+    points : Points
+    """
+    level = max([row.order, q.order(row.expression), 0, *(other.order for other in others)])
+    points = sample(q, others, level, context, starts=starts)
+    if not len(points.t):
+        return None, points
+    for j in range(q.order(row.expression), -1, -1):
+        values = clean(*points.matrix(row.gradient(q, j)))[0]
+        if np.any(values):
+            lower = [other for other in others if other.order < j or (other.order == j and other.affine and j > 0)]
+            eliminated = _eliminated(q, row, j, values, lower, points)
+            if eliminated is None:
+                return replace(row, order=j, affine=_affine(q, row.expression, j, points)), points
+            row = eliminated
+        elif j > 0:
+            row = _without(q, row, q.gamma(j), points)
+    if q.order(row.expression) == 0 and not np.any(clean(*points.matrix(row.gradient(q, 0)))):
+        return replace(row, order=-1), points
+    return replace(row, order=max(q.order(row.expression), -1)), points
+
+
+def _without(q, row, symbols, points):
+    """The row with jets set to zero, or the row itself if that changes its value at a point."""
+    expression = ca.substitute(row.expression, ca.vertcat(*symbols), ca.SX.zeros(len(symbols)))
+    values, sizes = points.evaluate([expression, row.expression])
+    same = np.abs(values[0] - values[1]) <= ENTRY * (sizes[0] + sizes[1])
+    return replace(row, expression=expression) if np.all(same) else row
+
+
+def _affine(q, expression, j, points):
+    """Whether an expression is affine in γ^(j); rows of order 0 count as affine."""
+    if j == 0:
+        return True
+    jets = q.jet(j)
+    second = ca.jacobian(ca.vec(ca.jacobian(expression, jets)), jets)
+    return not second.nnz() or not np.any(clean(*points.evaluate(second.nonzeros())))
+
+
+def _eliminated(q, row, j, values, lower, points):
+    """The row with γ^(j) replaced by the solution of lower rows, or None where these do not determine it."""
+    if not lower:
+        return None
+    numbers, _ = leading(q, lower, points)
+    support = set()
+    for p in range(values.shape[1]):
+        c, left = combination(numbers[:, :, p], values[:, p])
+        if left > DEPENDENT:
+            return None
+        support |= set(np.flatnonzero(np.abs(c * np.abs(numbers[:, :, p]).max(axis=1).astype(float)) > TAKES_PART))
+    basis = []
+    for a in sorted(support):
+        if decide(numbers[[*basis, a], :, 0]).rank == len(basis) + 1:
+            basis.append(a)
+    rows, numbers = [lower[a] for a in basis], numbers[basis]
+    if not rows or any(other.order == j and not other.affine for other in rows):
+        return None
+    columns = sorted(decide(numbers[:, :, 0]).columns)
+    jets = q.jet(j)
+    raised = ca.vertcat(*(q.derivatives([other.expression], j - other.order)[-1][0] for other in rows))
+    rest = ca.substitute(raised, jets, ca.SX.zeros(q.n))
+    matrix = ca.vertcat(*(other.gradient(q) for other in rows))[:, columns]
+    solution = ca.SX.zeros(q.n)
+    solution[columns], _ = eliminate(matrix, -rest, numbers[:, columns])
+    uses = merge_uses((row.uses, 0), *((other.uses, j - other.order) for other in rows))
+    return replace(row, expression=ca.cse(ca.substitute(row.expression, jets, solution)), uses=uses)
+
+
+def dependence(numbers):
+    """The first row whose leading gradient is a combination of those before it, and that combination.
+
+    Parameters
+    ----------
+    numbers : (rows, n, N) array
+        The leading matrix at points of the same rank.
+
+    Returns
+    -------
+    support : list of int
+        Indices of the rows of the combination, the dependent one last; empty if no row is dependent.
+    weights : (len(support),) array
+        Smallest size over the points of each equilibrated coefficient; 1 for the dependent row.
+    """
+    scaled = np.moveaxis(equilibrate(np.moveaxis(numbers, 2, 0))[0], 0, 2)
+    basis = []
+    for b in range(len(scaled)):
+        coefficients, left = [], []
+        for p in range(scaled.shape[2]):
+            c, rest = refined(scaled[basis, :, p], scaled[b, :, p], BASIS_CUTOFF)
+            coefficients.append(np.abs(c))
+            left.append(rest)
+        if max(left) > DEPENDENT:
+            basis.append(b)
+            continue
+        size = np.array(coefficients)
+        support = [a for i, a in enumerate(basis) if size[:, i].max(initial=0.0) > SUPPORTS]
+        weights = [size[:, i].min(initial=np.inf) for i, a in enumerate(basis) if a in support]
+        return [*support, b], np.array([*weights, 1.0])
+    return [], np.array([])
