@@ -1,0 +1,245 @@
+"""The verdict on a case: a plan that `verify` passes and the reference confirms, or a refusal that it confirms."""
+
+import re
+import signal
+import warnings
+from dataclasses import dataclass
+
+import casadi as ca
+import numpy as np
+from derivative_array import Reference
+
+import servoctl as sv
+
+AGREE = 1e-7  # of accelerations and actuation, relative to 1 plus the largest of them
+SPAN, SAMPLES = 0.4, 201  # s; verify interpolates the actuation between samples
+INSTANTS = (0, 70, 200)  # samples at which the reference is asked
+DOUBTFUL = 1e-5  # relative singular values below this confirm a refusal on rank
+SHARP = 1e5  # sensitivities of accelerations above this confirm a refusal as singular
+STEEPER = 30.0  # the growth of that sensitivity from start to stop that confirms a stop
+POWER = 0.3  # or it grows at least with this power of one over the time that is left
+LARGE = 1e4  # a motion that has grown so far may end
+PATIENCE = 40  # s of processor time for a case; a few tenths are usual
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """`outcome` is "right", "refused rightly", or "wrong: ..." with what is wrong; `detail` holds the numbers."""
+
+    outcome: str
+    detail: str = ""
+
+    @property
+    def wrong(self):
+        return self.outcome.startswith("wrong")
+
+
+class _OutOfTime(BaseException):
+    pass
+
+
+def specification(case):
+    """The mechanism and the program of a case, as a user of the package writes them."""
+    q = sv.coordinates(" ".join(f"q{i}" for i in range(case.n)))
+    functions = {"t": q.t, "sin": ca.sin, "cos": ca.cos, "exp": ca.exp} | {f"q{i}": s for i, s in enumerate(q)}
+    if case.V:
+        V = [[eval(e, {}, functions) for e in row] for row in case.V]
+        h = [eval(e, {}, functions) for e in case.h]
+        q = q.with_quasi_velocities(" ".join(f"w{i}" for i in range(case.n)), V, h)
+    for level in range(1, 8):
+        names = [f"w{i}" + (f"_{level - 1}" if level > 1 else "") for i in range(case.n)]
+        functions |= dict(zip(names, q.gamma(level), strict=True))
+    functions["D"] = lambda e: q.dt(ca.SX(e))
+    read = lambda text: ca.SX(eval(text, {}, functions))  # noqa: E731
+    positions = [read(text) for text in case.positions]
+    dynamics = {}
+    if case.form == "gibbs":
+        dynamics["gibbs"] = sum(sv.particle(q, m, x) for m, x in zip(case.masses, positions, strict=True))
+    elif case.form == "kinetic":
+        dynamics["kinetic"] = sum(m * q.dt(x) ** 2 / 2 for m, x in zip(case.masses, positions, strict=True))
+    else:
+        along = [(ca.jacobian(x, ca.vertcat(*q)) @ q.V).T for x in positions]
+        dynamics["balance"] = sum(m * a * q.dt(x, 2) for m, a, x in zip(case.masses, along, positions, strict=True))
+    actuators = {
+        f"u{i}": [read(e) for e in text] if isinstance(text, tuple) else read(text)
+        for i, text in enumerate(case.actuators)
+    }
+    mechanism = sv.Mechanism(
+        q,
+        potential=read(case.potential),
+        forces=ca.vertcat(*map(read, case.forces)),
+        actuators=actuators,
+        constraints={f"material{i}": read(text) for i, text in enumerate(case.material)},
+        **dynamics,
+    )
+    return mechanism, sv.Program({f"row{i}": read(text) for i, text in enumerate(case.rows)}, by=case.by)
+
+
+def judge(case):
+    """Run a case through the package and the reference."""
+    signal.signal(signal.SIGPROF, _out_of_time)
+    signal.setitimer(signal.ITIMER_PROF, PATIENCE)
+    try:
+        with warnings.catch_warnings(), np.errstate(all="ignore"):
+            warnings.simplefilter("ignore")
+            return _judge(case)
+    except _OutOfTime:
+        return Verdict(f"wrong: longer than {PATIENCE} s")
+    finally:
+        signal.setitimer(signal.ITIMER_PROF, 0)
+
+
+def _out_of_time(*_):
+    raise _OutOfTime
+
+
+def _judge(case):
+    reference, stage, model, run = Reference(case), "specification", None, None
+    speed = "w" if case.V else "dq"
+    guess = {f"q{i}": value for i, value in enumerate(case.guess)}
+    guess |= {f"{speed}{i}": value for i, value in enumerate(case.speeds)}
+    start = None
+    try:
+        mechanism, program = specification(case)
+        stage = "derive"
+        model = sv.derive(mechanism, program, guess=guess)
+        stage = "start"
+        start = model.start(guess=guess)
+        stage = "simulate"
+        method = None if model.flat else sv.Adaptive("DOP853", rtol=1e-12, atol=1e-13)
+        run = sv.simulate(model, start, (0.0, SPAN), method, t_eval=np.linspace(0.0, SPAN, SAMPLES))
+        stage = "verify"
+        proof = sv.verify(model, run, segments=1)
+    except sv.ServoError as error:
+        return _refused(reference, case, stage, error, start)
+    except _OutOfTime:
+        return Verdict(f"wrong: longer than {PATIENCE} s in {stage}")
+    except Exception as error:  # noqa: BLE001
+        return Verdict(f"wrong: {type(error).__name__} in {stage}", str(error))
+    return _compared(reference, case, model, run, proof)
+
+
+def _jets(run, k, n):
+    """q and the Taylor coefficients of w at a sample."""
+    jets = run.jets[n:, k].reshape(-1, n).T
+    factorials = np.cumprod([1.0, *range(1, jets.shape[1])])
+    return run.jets[:n, k], jets / factorials
+
+
+def _compared(reference, case, model, run, proof):
+    n, top = case.n, reference.top
+    force = run.signals("actuation")[1] if case.by != "ideal" else run.signals("balance")[1]
+    worst = {"acceleration": 0.0, "actuation": 0.0, "state": 0.0}
+    unclear, gains = "", []
+    for k in INSTANTS:
+        q, w = _jets(run, k, n)
+        solution = reference.determined(run.t[k], q, w[:, : min(w.shape[1], top)], near=True)
+        if solution is None or not solution.clear or solution.residual > AGREE:
+            numbers = "none" if solution is None else f"loose {solution.loose:.1e}, residual {solution.residual:.1e}"
+            unclear = f"at t = {run.t[k]:.2f}: {numbers}"
+            continue
+        gains.append(solution.gain)
+        level = min(top, w.shape[1])
+        here, there = w[:, :level], solution.w[:, :level]
+        size = 1 + np.abs(there).max()
+        worst["state"] = max(worst["state"], np.abs(solution.q - q).max() / size)
+        worst["acceleration"] = max(worst["acceleration"], np.abs(here - there).max() / size)
+        gap = np.abs(force[:, k] - solution.force).max(initial=0.0) / (1 + np.abs(solution.force).max(initial=0.0))
+        worst["actuation"] = max(worst["actuation"], gap)
+    numbers = ", ".join(f"{name} {value:.1e}" for name, value in worst.items())
+    numbers += f"; gain {max(gains, default=np.inf):.1e}; {unclear} {proof!r}"
+    if unclear:
+        return Verdict("wrong: a plan that the reference does not determine", numbers)
+    if max(worst.values()) > AGREE * max(1.0, max(gains) / SHARP):
+        what = "failed by verify" if not proof.passed else "verified"
+        return Verdict(f"wrong: another motion or force, {what}", numbers)
+    if not proof.passed:
+        return Verdict("wrong: verify fails a right plan (" + ", ".join(map(_kind, proof.failures)) + ")", numbers)
+    return Verdict("right", numbers)
+
+
+def _kind(failure):
+    return "residual" if failure.startswith("residual") else failure
+
+
+def _refused(reference, case, stage, error, start):
+    what = f"{type(error).__name__} in {stage}"
+    cause = _cause(reference, case, start, error)
+    if cause:
+        return Verdict("refused rightly", f"{what}: {cause} | {error}")
+    return Verdict(f"wrong: refusal without cause, {what}, {_sentence(error)}", str(error))
+
+
+def _growth(reference, run, t, last, end):
+    """Whether the sensitivity of the accelerations grows without bound towards the stop at t, in words."""
+    left = np.abs(t - run.t)
+    earlier = np.flatnonzero(left >= 2 * left[last] + 1e-3)
+    if not end.clear or end.gain > SHARP or not len(earlier):
+        return f"the sensitivity is {end.gain:.1e} at the stop" if not end.clear or end.gain > SHARP else ""
+    for k in (earlier[-1], 0):
+        before = reference.determined(run.t[k], *_jets(run, k, reference.n), near=True)
+        power = POWER if k else 0.0
+        if before is not None and end.gain > before.gain * max(STEEPER if not k else 1.5, (left[k] / left[last]) ** power):
+            return f"the sensitivity grows from {before.gain:.1e} at {run.t[k]:.3g} s to {end.gain:.1e} at {run.t[last]:.3g} s"
+    return ""
+
+
+def _sentence(error):
+    """The error's first words without names and numbers, for the table."""
+    return re.sub(r"[\d.e+-]+|'[^']*'", "…", str(error))[:60]
+
+
+def _cause(reference, case, start, error):
+    """What of the reference confirms a refusal; empty where nothing does."""
+    t, q, w, near = 0.0, np.array(case.guess), np.array(case.speeds)[:, None], False
+    run = error.run
+    if start is not None:
+        jets = start.values[case.n :].reshape(-1, case.n).T
+        q, near = start.values[: case.n], True
+        w = jets / np.cumprod([1.0, *range(1, jets.shape[1])])
+    if run is not None and len(run.t) and np.all(np.isfinite(run.jets[:, -1])):
+        t, (q, w) = run.t[-1], _jets(run, -1, case.n)
+        if np.abs(run.jets[:, -1]).max() > LARGE:
+            return f"the motion has grown to {np.abs(run.jets[:, -1]).max():.1e}"
+    points = [reference.determined(t, q, w[:, : reference.top - 1], near)]
+    for seed in range(1, 4 if start is None else 1):  # ranks may fall at one point by accident
+        rng = np.random.default_rng(seed)
+        points.append(reference.determined(0.1 * seed, q + rng.normal(0, 0.3, case.n), w[:, :1]))
+    points = [p for p in points if p is not None]
+    solved = [p for p in points if p.residual < 1e-9]
+    last = -1
+    while run is not None and not solved and 4 - last <= len(run.t):  # next to a stop the array may be singular
+        last -= 1
+        before = reference.determined(run.t[last], *_jets(run, last, case.n), near=True)
+        solved = [before] if before is not None and before.residual < 1e-9 else []
+        if last < -5:
+            break
+    if not solved and start is not None:  # there is one, and the reference has no verdict there
+        return ""
+    if not solved:
+        return f"no consistent point: residuals {', '.join(f'{p.residual:.1e}' for p in points)}"
+    if isinstance(error, sv.InconsistentStart):
+        return ""
+    if not any(p.clear for p in solved):
+        return f"accelerations or actuation undetermined at {len(solved)} points ({solved[0].loose:.1e})"
+    if run is not None and len(run.t):
+        growth = _growth(reference, run, float(error.details.get("t", t)), last, solved[0])
+        if growth:
+            return growth
+    elif min(p.gain for p in solved) > SHARP:
+        return f"accelerations and actuation have the sensitivity {min(p.gain for p in solved):.1e}"
+    ranks = [reference.ranks(t, p.q, p.w) for p in solved]
+    best = {key: max(rank[key] for rank in ranks) for key in ranks[0]}
+    k, m = len(case.rows), len(case.actuators)
+    if case.by != "ideal":
+        if best["reach"] < k:
+            return f"{best['reach']} independent actuators for {k} residuals"
+        if best["directions"] < DOUBTFUL:
+            return f"dependent directions ({best['directions']:.1e})"
+        if m > k and best["decoupling"] < DOUBTFUL:
+            return f"redundant, and the decoupling matrix lacks rank ({best['decoupling']:.1e})"
+    if isinstance(error, sv.SpecificationError) and "dependent" in case.kinds:
+        return "a row is a multiple of another"
+    if best["mass"] < DOUBTFUL:
+        return f"inertia of least singular value {best['mass']:.1e}"
+    return ""

@@ -1,0 +1,63 @@
+"""Random mechanisms and programs end in a plan that the reference confirms, or in a refusal that it confirms."""
+
+import numpy as np
+import pytest
+from derivative_array import Reference
+from hypothesis import HealthCheck, given, settings
+from judge import judge
+from machines import Case, cases, from_text, seeded
+
+from servoctl.codegen import compiler
+
+CASES = 200  # about 0.2 s each; run.py runs as many as one likes
+
+
+@pytest.fixture(autouse=True, scope="module")
+def uncompiled():
+    """Each model is evaluated too few times to be worth compiling."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("SERVOCTL_COMPILER", "none")
+        patch.setattr(compiler, "_warned", True)
+        yield
+
+
+@settings(max_examples=CASES, derandomize=True, deadline=None, database=None, suppress_health_check=list(HealthCheck))
+@given(case=cases(known=False))
+def test_plans_are_right_and_refusals_have_causes(case):
+    verdict = judge(case)
+    assert not verdict.wrong, f"{verdict.outcome}\n{verdict.detail}\n{case.as_text()}"
+
+
+def test_cases_survive_their_text():
+    for seed in range(20):
+        case = seeded(seed)
+        assert from_text(case.as_text()) == case
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_the_jacobian_of_the_array_is_its_derivative(seed):
+    reference = Reference(seeded(seed))
+    rng = np.random.default_rng(seed)
+    n, N, p = reference.n, reference.top + 1, reference.multipliers.numel()
+    x = rng.uniform(-0.4, 0.4, n * (2 * N + 3) + p * N)
+    _, J = reference.array(0.3, *reference._parts(x, N))
+    for j in rng.choice(len(x), 12, replace=False):
+        ends = []
+        for step in (1e-6, -1e-6):
+            moved = x.copy()
+            moved[j] += step
+            ends.append(reference.array(0.3, *reference._parts(moved, N))[0])
+        assert (ends[0] - ends[1]) / 2e-6 == pytest.approx(J[:, j], abs=1e-6 * (1 + np.abs(J[:, j]).max()))
+
+
+def test_series_solve_a_motion_of_known_derivatives():
+    """A particle that follows sin t on a spring: u = m x'' + k x, with x'' = −sin t."""
+    case = Case(
+        1, masses=(2.0,), positions=("q0",), potential="1.5*q0**2", forces=("0",), actuators=("q0",),
+        rows=("q0 - sin(t)",), plain=("q0 - sin(t)",), by="actuators",
+    )  # fmt: skip
+    solution = Reference(case).determined(0.7, np.array([0.5]), np.zeros((1, 1)))
+    assert solution.clear and solution.residual < 1e-14
+    assert solution.q == pytest.approx(np.sin([0.7]))
+    assert solution.w[0, :2] == pytest.approx([np.cos(0.7), -np.sin(0.7)])
+    assert solution.force == pytest.approx([(3.0 - 2.0) * np.sin(0.7)])
