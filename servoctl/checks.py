@@ -11,6 +11,7 @@ import numpy as np
 from servoctl.errors import SpecificationError, unknown
 
 ON_SAMPLE = 1e-6  # rounding of a sampling instant [periods], or of a count
+MOST_COUNT = 10**9  # samples, steps or rows: products of two such counts fit into the 64 bits of C
 MOST_MEMORY = 8e9  # bytes for all samples: the memory of common machines
 
 
@@ -75,8 +76,12 @@ def mapping(value, what):
 
 def is_number(value):
     """Whether a value is a finite number of Python or NumPy; True and False are not."""
-    numbers = (int, float, np.integer, np.floating)
-    return isinstance(value, numbers) and not isinstance(value, bool) and bool(np.isfinite(value))
+    if not isinstance(value, (int, float, np.integer, np.floating)) or isinstance(value, bool):
+        return False
+    try:
+        return math.isfinite(value)
+    except OverflowError:  # an int beyond the largest float
+        return False
 
 
 def is_whole(value):
@@ -123,15 +128,16 @@ def positives(name, values, do, fewest=1, most=np.inf):
     return numbers
 
 
-def whole(name, value, least=0):
-    """An int from a whole number that is at least `least`: from 1000.0, too, but not from True."""
+def whole(name, value, least=0, most=math.inf):
+    """An int from a whole number between `least` and `most`: from 1000.0, too, but not from True."""
     try:
         number = least - 1 if isinstance(value, (bool, str, bytes)) else int(value)
     except (TypeError, ValueError, OverflowError):
         number = least - 1
-    if number < least or number != value:
-        rule = f"It must be a whole number, at least {least}."
-        raise SpecificationError(f"{name}={value!r} was given.", rule, name=name, value=value, least=least)
+    if not least <= number <= most or number != value:
+        rule = f"It must be a whole number, at least {least}{f' and at most {most}' if most < math.inf else ''}."
+        said, nearest = f"{name}={value!r} was given."[:200], f"{name}={most}." if number > most else ""
+        raise SpecificationError(said, rule, nearest=nearest, name=name, value=value, least=least, most=most)
     return number
 
 
@@ -154,10 +160,15 @@ def whole_of(name, value, valid):
         raise SpecificationError(
             f"{name}={value!r} was given.",
             f"It is a whole number {span}.",
-            nearest=f"{name}={min(valid, key=lambda number: abs(number - value))}." if is_number(value) else "",
+            nearest=f"{name}={_nearest(valid, value)}." if is_number(value) else "",
             **{name: value},
         )
     return int(value)
+
+
+def _nearest(valid, value):
+    within = min(max(value, min(valid)), max(valid))
+    return min(valid, key=lambda number: abs(number - within))
 
 
 def whole_multiple(number, what, of):
@@ -217,13 +228,14 @@ def as_span(t_span, forward=False):
     """A time span as two different finite numbers [s]; with `forward`, t1 must exceed t0."""
     try:
         t0, t1 = map(float, t_span)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         t0 = t1 = np.nan
-    if not (np.isfinite(t0) and np.isfinite(t1)) or t0 == t1 or (forward and t1 < t0):
+    finite = math.isfinite(t0) and math.isfinite(t1)
+    if not finite or t0 == t1 or (forward and t1 < t0):
         raise SpecificationError(
             f"t_span={t_span!r} was given.",
             f"It must be two different finite times (t0, t1) [s]{', with t0 < t1' if forward else ''}.",
-            nearest=f"({t1:g}, {t0:g})." if t1 < t0 else "",
+            nearest=f"({t1:g}, {t0:g})." if finite and t1 < t0 else "",
             t_span=t_span,
         )
     return t0, t1

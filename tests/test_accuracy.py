@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import casadi as ca
 import numpy as np
 import pytest
 from refusals import refused
@@ -153,3 +154,19 @@ def test_the_command_passes_the_accuracy_on(tmp_path, monkeypatch):
     monkeypatch.setattr(sv, "simulate", simulate)
     assert main(["run", "appell-hamel", "--accuracy", "1e-6"]) == 2
     assert given == {"accuracy": 1e-6}
+
+
+@pytest.mark.parametrize("accuracy", [1e-2, 1e-4, 1e-6, 1e-7, 1e-8, 1e-10])
+def test_a_motion_is_never_compared_with_itself(accuracy):
+    """y'' = k (x - y) with x on a sine: y = 0.9 sin t is exact, errors grow as exp(3t)."""
+    q, k = sv.coordinates("x y"), 9.0
+    x, y = q
+    ddx, ddy = q.d(2)
+    mechanism = sv.Mechanism(q, gibbs=(ddx**2 + ddy**2) / 2, potential=-k * (x - y) ** 2 / 2, actuators={"F": x})
+    model = sv.derive(mechanism, sv.Program({"x": x - ca.sin(q.t)}))
+    start = model.start(y=0.0, dy=k / (k + 1))
+    with refused(LimitExceeded, accuracy=accuracy) as caught:
+        sv.simulate(model, start, (0.0, 15.0), accuracy=accuracy)
+    assert caught.value.details["growth"] > 1e10
+    run = sv.simulate(model, start, (0.0, 2.0), accuracy=accuracy)
+    assert run.success and np.abs(run["y"] - 0.9 * np.sin(run.t)).max() < accuracy

@@ -163,7 +163,7 @@ def test_loops_turn_unstable_where_the_bound_says_within_two_per_cent(rho, delay
     mechanism, program = build()
     model = sv.derive(mechanism, program)
     plan = sv.simulate(model, model.start(**held), (0.0, 8.0))
-    plant = sv.plant(mechanism)
+    plant = sv.plant(mechanism, lag=lag)
     law = sv.computed(plan, plant, rate=rate, poles=10.0)
     (name,) = law.info["orders"]
     assert law.info["orders"][name] == rho

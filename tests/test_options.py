@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from refusals import refused, warned
+from scenes import POINT, POINT_PROGRAM
 
 import servoctl as sv
 from benchmarks.literature import dae_comparison, formulation_cost
@@ -17,6 +18,11 @@ SPAN = (0.0, 0.2)
 @pytest.fixture(scope="module")
 def scene(wheel):
     return wheel
+
+
+def _point():
+    model = sv.derive(POINT, POINT_PROGRAM)
+    return model, model.start(), (0.0, 1.0)
 
 
 def stopped(fact, make):
@@ -169,3 +175,18 @@ def test_what_a_figure_of_stability_is_asked_for(scene):
     stopped("step=", lambda: found.growth("RK4", "abc"))
     left, right = found.plot("RK4", [100.0, 10.0]).axes[:2]
     assert list(left.lines[0].get_xdata()) == list(right.lines[0].get_xdata()) == [10.0, 100.0]
+
+
+@pytest.mark.parametrize("count", [2**63 + 10**6, 2**64, 1e300, 10**400, 10**9 + 1], ids=["2**63", "2**64", "1e300", "10**400", "1e9"])
+def test_counts_stay_within_what_the_loops_can_hold(count):
+    """Counts enter C as 64 bits: beyond them a loop would end the process, or do something else in silence."""
+    for name in ("delay", "substeps"):
+        with refused(sv.SpecificationError, name):
+            sv.Timing(**{name: count})
+    plan = sv.simulate(*_point())
+    run = sv.close(sv.plant(POINT), sv.feedforward(plan, sv.plant(POINT), rate=50.0), plan.state(0.0), (0.0, 0.2))
+    with refused(sv.SpecificationError, "every"):
+        sv.close_many(run, {"m": [2.0]}, record=["x"], every=count)
+    with refused(sv.SpecificationError, "integration steps", samples=20, substeps=10**9):
+        law = sv.feedforward(plan, sv.plant(POINT), rate=50.0)
+        sv.close(sv.plant(POINT), law, plan.state(0.0), (0.0, 0.4), timing=sv.Timing(substeps=10**9))

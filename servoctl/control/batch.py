@@ -78,7 +78,9 @@ def _derived(plant, law, disturbed, residuals):
     phi = ca.SX(0, 1)
     if residuals:
         places = [plant.mechanism.parameters.names.index(s.name()) for s in residuals.symbols]
-        phi = residuals.expression(t_k, x, plant.state_names, constants[places])
+        # a single parameter indexed by [] is a row in CasADi, not a column
+        numbers = ca.vertcat(ca.SX(0, 1), *(constants[i] for i in places))
+        phi = residuals.expression(t_k, x, plant.state_names, numbers)
     phi, s, s_values = _apart(phi, t_k)
     phi, v, v_values = _apart(phi, constants)
     sizes = {

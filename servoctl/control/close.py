@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from servoctl.checks import as_span, require_memory, whole_multiple
-from servoctl.control.conditions import Conditions, Sensors, Timing, index, limits, steps
+from servoctl.control.conditions import Conditions, Sensors, Timing, index, limits, require_few_steps, steps
 from servoctl.control.law import Law, UserStep
 from servoctl.control.loop import FINISHED, LAW_LOST, STATE_LOST, Loop, run_loop
 from servoctl.control.reference import Reference, require_plan, require_plant, resampled
@@ -90,6 +90,7 @@ def _loop(plant, law, x0, t_span, conditions):
     initial = initial if low is None else np.clip(initial, low, high)
     x0 = _initial_state(plant, t0, x0, initial)
     substeps, transport = steps(plant, law.period, timing.substeps, t0, x0, initial)
+    require_few_steps(samples, substeps)
     return Loop(
         samples=samples, substeps=substeps, delay=timing.delay, n_u=len(plant.inputs), n_out=law.n_out, first=first,
         at_u=len(plant.parameters), t0=t0, period=law.period, p=plant.p(), x0=x0, z0=law.state, table=law.schedule.T,

@@ -5,12 +5,13 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from servoctl.checks import ON_SAMPLE, mapping, numbers_by_name, positive, whole
+from servoctl.checks import MOST_COUNT, ON_SAMPLE, mapping, numbers_by_name, positive, whole
 from servoctl.control.disturbances import sampled
 from servoctl.errors import SpecificationError, unknown
 
 RESOLVED = 0.05  # largest |λ| h: the error of one Runge-Kutta step of order 4 is then 3e-9
 MOST_SUBSTEPS = 1000
+MOST_LOOP_STEPS = 10**10  # integration steps of one loop: some two minutes of compiled code
 WITHIN_STEP = 1e-9  # of a step: disturbances are sampled this far inside its ends, at which they may jump
 
 
@@ -39,7 +40,7 @@ class Sensors:
 
     def __post_init__(self):
         for what in ("noise", "quantisation"):
-            values = getattr(self, what) or {}
+            values = mapping(getattr(self, what), what)
             object.__setattr__(self, what, numbers_by_name(values, values, "measured state", what, low=0.0))
         if self.seed is None:
             return
@@ -101,11 +102,11 @@ class Timing:
     substeps: int | None = None
 
     def __post_init__(self):
-        object.__setattr__(self, "delay", whole("delay", self.delay))
+        object.__setattr__(self, "delay", whole("delay", self.delay, most=MOST_COUNT))
         if self.rate is not None:
             object.__setattr__(self, "rate", positive("rate", self.rate))
         if self.substeps is not None:
-            object.__setattr__(self, "substeps", whole("substeps", self.substeps, least=1))
+            object.__setattr__(self, "substeps", whole("substeps", self.substeps, least=1, most=MOST_COUNT))
 
 
 @dataclass(frozen=True)
@@ -167,6 +168,19 @@ def limits(plant, period):
     low, high, change = ranges(plant, period)
     low, high = (low, high) if plant.limits else (None, None)
     return low, high, change if plant.rate_limits else None
+
+
+def require_few_steps(samples, substeps):
+    """Refuse a loop that would integrate for hours."""
+    if samples * substeps > MOST_LOOP_STEPS:
+        raise SpecificationError(
+            f"{samples} samples with {substeps} substeps are {samples * substeps:.3g} integration steps.",
+            f"A loop takes at most {MOST_LOOP_STEPS:.0e}.",
+            nearest=f"substeps={max(MOST_LOOP_STEPS // samples, 1)}.",
+            do="Take fewer substeps, a lower rate or a shorter time.",
+            samples=samples,
+            substeps=substeps,
+        )
 
 
 def steps(plant, period, substeps, t0, x0, u0):

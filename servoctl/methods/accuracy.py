@@ -19,6 +19,7 @@ from servoctl.methods.taylor import order_for
 SMALLEST_SIZE = 1e-3  # of a component relative to the largest of its level; a zero component has only rounding
 MARGIN, FINER = 0.1, 1e-2  # first tolerance relative to the accuracy, and each next one relative to the last
 FINEST = 1e-15  # tolerance below which steps shorten and rounding grows
+SAME = 1.0 + 1e-9  # tolerances within this factor are one and the same, up to the rounding of their decades
 COARSEST_ACCURACY, FINEST_ACCURACY = 1e-1, 1e-13  # accuracies that make sense in double precision
 
 
@@ -123,24 +124,27 @@ def accurate(simulated, model, accuracy, method=None, drift=None):
     run = simulated(method, Project())
     if not run.success:
         return run
-    best = np.inf
-    while method.rtol > FINEST:
-        rtol = max(FINER * method.rtol, FINEST)
+    best, growth = np.inf, 0.0
+    while method.rtol > SAME * FINEST:
+        coarser, rtol = method, max(FINER * method.rtol, FINEST)
         method = replace(method, rtol=rtol, atol=rtol)
         finer = simulated(method, Project())
         if not finer.success:
             return finer
         difference = motion_error(model, run.jets, finer.jets)
+        growth = difference / coarser.rtol
         if difference <= accuracy:
             return replace(finer, message=f"finished; two tolerances agree to {difference:.1e}")
         best, run = min(best, difference), finer
+    nearest = f"accuracy={2 * best:.1g}: two tolerances agree to {best:.1e}."
     error = LimitExceeded(
-        f"accuracy={accuracy:g} was given.",
-        "Errors grow along an unstable motion; here rounding errors dominate, and a smaller tolerance cannot help.",
-        nearest=f"accuracy={2 * best:.1g}: two tolerances agree to {best:.1e}.",
-        do="Use this accuracy, or a shorter span.",
+        f"accuracy={accuracy:g} was given; the errors of steps grow by about {growth:.1e} along the motion.",
+        "Rounding errors grow with them, so that a smaller tolerance cannot help.",
+        nearest=nearest if 2 * best <= COARSEST_ACCURACY else "",
+        do="Use a larger accuracy or a shorter span.",
         accuracy=accuracy,
         reached=best,
+        growth=growth,
     )
     error.run = run
     raise error

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike
 
-from servoctl.checks import mapping, whole
+from servoctl.checks import MOST_COUNT, mapping, whole
 from servoctl.codegen.function import Compiled
 from servoctl.control.batch import Gathered, run_batch, unit
 from servoctl.control.close import close, require_consistent
@@ -236,7 +236,7 @@ def _traced(record, names, every):
             record=record,
             every=every,
         )
-    return [index(name, names, "signal") for name in record], whole("every", every, least=1)
+    return [index(name, names, "signal") for name in record], whole("every", every, least=1, most=MOST_COUNT)
 
 
 def _one_by_one(run, derived, loop, numbers, seeds, traced, every):
