@@ -120,7 +120,7 @@ def simulate(
     leads_back = isinstance(method, Algebraic) or isinstance(drift, (Poles, Project))
     x0 = (as_state if leads_back else consistent_state)(model, start, t0)
     knots = model.require_smooth((min(span), max(span)))
-    times = _times(t0, t1, t_eval, knots)
+    times = _sample_times(t0, t1, t_eval, knots)
     bar = Progress(span, progress)
     try:
         motion = _motion(model, method, drift, span, x0, times, knots, bar)
@@ -246,7 +246,7 @@ def consistent_state(model, start, t):
     return x
 
 
-def _times(t0, t1, t_eval, knots):
+def _sample_times(t0, t1, t_eval, knots):
     if t_eval is None:
         times = np.union1d(np.linspace(t0, t1, DEFAULT_SAMPLES), [k for k in knots if min(t0, t1) < k < max(t0, t1)])
     else:

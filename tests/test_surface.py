@@ -268,7 +268,7 @@ def defined(path):
 def test_no_name_is_defined_in_three_modules():
     homes = {}
     for path in FILES:
-        for name in {n for n in defined(path) if not n.startswith("_")}:
+        for name in {n for n in defined(path) if not n.startswith("__")}:
             homes.setdefault(name, []).append(relative(path))
     assert {name: places for name, places in homes.items() if len(places) > MOST_MODULES_OF_A_NAME} == {}
 

@@ -229,7 +229,7 @@ def _over_time(run, groups, ax, units, extrema=False):
         if len(group) > 1:
             panel.legend(**BESIDE)
         if extrema:
-            panel.set_title("\n".join(_extrema(run, name, units) for name in group), fontsize="small", loc="left")
+            panel.set_title("\n".join(_extrema_text(run, name, units) for name in group), fontsize="small", loc="left")
     axes[-1].set_xlabel("t [s]")
     axes[0].figure.align_ylabels(list(axes))
     _instants(run, axes)
@@ -263,7 +263,7 @@ def _frame(ax, run, names, largest):
         ax.set_ylim(early.min() - np.ptp(early) / 2, early.max() + np.ptp(early) / 2)
 
 
-def _extrema(run, name, units):
+def _extrema_text(run, name, units):
     if not np.all(np.isfinite(run[name])):
         return f"{name}: not finite at some instants"
     unit = unit_of(name, units)

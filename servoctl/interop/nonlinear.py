@@ -102,7 +102,7 @@ def _model(model, name):
     ode, symbols = model.function("ode"), model.reduction.mechanism.parameters.names
 
     def rates(t, x, _, params):
-        y = ode(t, x, _numbers(p, symbols, params))[:n_x]
+        y = ode(t, x, _parameter_values(p, symbols, params))[:n_x]
         if not np.isfinite(y).all():
             raise ServoError(
                 f"The reduced dynamics is not finite at t = {t:.6g} s.",
@@ -113,7 +113,7 @@ def _model(model, name):
         return y
 
     def outputs(t, x, u, params):
-        z, numbers = np.append(x, rates(t, x, u, params)[-n:]), _numbers(p, symbols, params)
+        z, numbers = np.append(x, rates(t, x, u, params)[-n:]), _parameter_values(p, symbols, params)
         return np.concatenate([x, *(f(t, z, numbers) for group, f in groups if group)])
 
     return control.nlsys(
@@ -122,7 +122,7 @@ def _model(model, name):
     )  # fmt: skip
 
 
-def _numbers(p, symbols, params):
+def _parameter_values(p, symbols, params):
     """The parameters p with the values of python-control's params."""
     return np.append([params[name] for name in symbols], p[len(symbols) :])
 
@@ -142,7 +142,7 @@ def _plant(plant, name, disturbed, rate, substeps, delay=0):
         d = np.zeros(len(plant.disturbable))
         d[forces] = u[m:]
         applied = limited(u[:m], None, *low_high, None)
-        return np.concatenate([_numbers(plant.parameters, symbols, params), applied, d])
+        return np.concatenate([_parameter_values(plant.parameters, symbols, params), applied, d])
 
     def rates(t, x, u, params):
         return ode(t, x, numbers(u, params))

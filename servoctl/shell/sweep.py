@@ -153,11 +153,11 @@ def _require_names(args):
 
 def _model(given):
     """The model of a scene, derived once in each process, and again when its file has changed."""
-    return _derived(given, stamp(given))
+    return _model_of(given, stamp(given))
 
 
 @functools.cache
-def _derived(given, _):
+def _model_of(given, _):
     return sv.derive(*find_scene(given)[1].build())
 
 

@@ -136,7 +136,7 @@ class Mechanism:
 
     def __reduce__(self):
         content = packed(vars(self), self.q, self.parameters, {"parameters": self.parameters})
-        return _unpickled, (self.q, self.parameters, content)
+        return _restored, (self.q, self.parameters, content)
 
     @cached_property
     def balance(self):
@@ -360,7 +360,7 @@ class Mechanism:
                 seen[name] = what
 
 
-def _unpickled(q, parameters, content):
+def _restored(q, parameters, content):
     mechanism = object.__new__(Mechanism)
     vars(mechanism).update(unpacked(content, q, parameters, {"parameters": parameters}))
     return _latest(mechanism)

@@ -88,7 +88,7 @@ class Program:
         SpecificationError
             If the factor is not positive, or the kinematics q' = V w + h depend on time or drift by h.
         """
-        sigma, instant = _number(factor), _number(at)
+        sigma, instant = _as_float(factor), _as_float(at)
         if not sigma > 0:
             raise SpecificationError(
                 f"factor={factor!r}.", "The factor is positive; 2.0 takes twice as long.", factor=factor
@@ -142,7 +142,7 @@ def _weight(name, value):
         items = column(value, f"the weight of {name!r}", 1)
         if ca.symvar(items[0]):
             return items[0]
-    number = _number(value)
+    number = _as_float(value)
     if not number > 0:
         raise SpecificationError(
             f"The weight of {name!r} is {value!r}.",
@@ -154,7 +154,7 @@ def _weight(name, value):
     return number
 
 
-def _number(value):
+def _as_float(value):
     """A finite number, or NaN for anything else."""
     try:
         number = np.nan if isinstance(value, (str, bytes)) else float(value)

@@ -157,14 +157,14 @@ def evaluate(case, index, parameters, seed):
     random = {} if seed is None else {"rng": generator(seed, CASES, index)}
     try:
         with compiling_at_once():  # interpreted results differ by rounding, and so would the tables of other workers
-            numbers = _numbers(case(**parameters, **random), parameters)
+            numbers = _results(case(**parameters, **random), parameters)
     except (Exception, SystemExit) as error:
         facts = json.dumps(getattr(error, "details", {}), default=str)
         return {"case": index, "error": type(error).__name__, "message": str(error), "facts": facts}
     return {"case": index, "numbers": numbers}
 
 
-def _numbers(result, parameters):
+def _results(result, parameters):
     numbers = dict(result) if isinstance(result, Mapping) else summary(result)
     for name, value in numbers.items():
         if name in parameters or name in RESERVED or plain(value) is None:
