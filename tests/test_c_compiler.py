@@ -137,3 +137,25 @@ def test_a_compiler_that_refuses_native_code_still_compiles(fresh, tmp_path, mon
     model = pendulum(("rk",))
     model.rk(0.0, [0.1, 0.0], 0.1, 5, [1.0], RK4)
     assert model.backend == "c" and fresh[-1][0] == str(script)
+
+
+@pytest.mark.parametrize(
+    ("script", "patience"),
+    [("exec sleep 60", 0.3), (r"printf '\377\376 not a text' >&2; exit 1", 60.0)],
+    ids=["hangs", "message that is no text"],
+)
+def test_a_compiler_that_does_not_serve_is_warned_about(fresh, tmp_path, monkeypatch, script, patience):
+    command = tmp_path / "odd-cc"
+    command.write_text(f"#!/bin/sh\n{script}\n")
+    command.chmod(0o755)
+    monkeypatch.setenv("SERVOCTL_COMPILER", str(command))
+    monkeypatch.setattr(compiler, "PATIENCE_WITH_COMPILER", patience)
+    model = pendulum(("rk",))
+    with warned("odd-cc"):
+        model.rk(0.0, [0.0, 0.0], 0.1, 1, [1.0], RK4)
+    assert model.backend == "casadi"
+
+
+def test_an_unclosed_quotation_mark_in_the_command_is_no_traceback(fresh, monkeypatch):
+    monkeypatch.setenv("CC", "nothing 'of this name")
+    pendulum(("rk",)).rk(0.0, [0.0, 0.0], 0.1, 1, [1.0], RK4)

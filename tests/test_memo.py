@@ -328,7 +328,9 @@ def test_what_another_user_wrote_is_not_read(derived, tmp_path, monkeypatch):
     (entry,) = entries(tmp_path)
     cache.read_cached(entry)
     with monkeypatch.context() as patched:
-        patched.setattr(os, "fstat", lambda _: SimpleNamespace(st_uid=os.geteuid() + 1))
+        status = os.stat(entry)
+        other = SimpleNamespace(st_uid=os.geteuid() + 1, st_mode=status.st_mode, st_size=status.st_size)
+        patched.setattr(os, "fstat", lambda _: other)
         with pytest.raises(PermissionError):
             cache.read_cached(entry)
         sv.derive(*pendulum())
@@ -378,3 +380,57 @@ def test_sources_that_changed_are_other_sources(monkeypatch, tmp_path):
     (tmp_path / "package" / "new.py").write_text("")
     found.add(stamp())
     assert len(found) == 4
+
+
+@pytest.mark.parametrize("umask", [0o000, 0o002, 0o022])
+def test_folders_are_made_for_this_user_alone(derived, tmp_path, monkeypatch, umask):
+    place = tmp_path / "a" / "b"
+    monkeypatch.setenv("SERVOCTL_CACHE", str(place))
+    before = os.umask(umask)
+    try:
+        sv.derive(*pendulum())
+    finally:
+        os.umask(before)
+    folders = [place.parent, place, *(path for path in place.rglob("*") if path.is_dir())]
+    assert len(folders) >= 3 and {path.stat().st_mode & 0o777 for path in folders} == {0o700}
+
+
+def test_a_folder_that_others_may_write_to_is_not_used(derived, tmp_path):
+    sv.derive(*pendulum())
+    (entry,) = entries(tmp_path)
+    entry.parent.chmod(0o777)
+    with pytest.raises(PermissionError):
+        cache.read_cached(entry)
+    sv.derive(*pendulum())
+    assert len(derived) == 2
+    entry.parent.chmod(0o1777)  # in a sticky folder nobody renames another's file
+    cache.read_cached(entry)
+
+
+def test_an_entry_under_the_name_of_another_is_not_read(derived, tmp_path):
+    sv.derive(*pendulum())
+    (entry,) = entries(tmp_path)
+    other = entry.with_name("0" * 64)
+    other.write_bytes(entry.read_bytes())
+    with pytest.raises(OSError):
+        cache.read_cached(other)
+
+
+def test_a_pipe_in_the_place_of_an_entry_is_not_waited_for(derived, tmp_path):
+    sv.derive(*pendulum())
+    (entry,) = entries(tmp_path)
+    entry.unlink()
+    os.mkfifo(entry)
+    sv.derive(*pendulum())
+    assert len(derived) == 2
+
+
+def test_without_a_home_the_temporary_directory_serves(tmp_path, monkeypatch):
+    def nowhere():
+        raise RuntimeError("Could not determine home directory.")
+
+    for name in ("SERVOCTL_CACHE", "XDG_CACHE_HOME"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setattr(Path, "home", nowhere)
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    assert cache.cache_directory().parent == tmp_path

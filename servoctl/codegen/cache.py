@@ -1,17 +1,19 @@
 """Files that one process leaves to the next: compiled libraries and derivations.
 
-Their content is loaded and run. Therefore a file is read only if this user or the administrator wrote it, and only with
-the digest at its end.
+Their content is loaded and run. Therefore a file is read only if this user or the administrator wrote it, in a folder
+where nobody else can replace it, and only with the digest of its name and content at its end.
 """
 
 import contextlib
 import hashlib
 import os
+import stat
 import sys
 import tempfile
 from pathlib import Path
 
 _DIGEST = hashlib.sha256().digest_size
+MOST_BYTES_READ = 2**30  # of one file: libraries of 100,000 operations take some megabytes
 
 
 def cache_directory():
@@ -20,8 +22,16 @@ def cache_directory():
     Returns
     -------
     pathlib.Path
-        ``SERVOCTL_CACHE`` if set, else ``servoctl`` under the user's cache directory; it need not exist.
+        ``SERVOCTL_CACHE`` if set, else ``servoctl`` under the user's cache directory, else a folder of this user under
+        the temporary directory; it need not exist.
     """
+    try:
+        return _chosen_directory()
+    except RuntimeError:  # no home directory, or none of the user that ~name means
+        return Path(tempfile.gettempdir()) / f"servoctl-{os.getuid() if hasattr(os, 'getuid') else 'cache'}"
+
+
+def _chosen_directory():
     if chosen := os.environ.get("SERVOCTL_CACHE"):
         return Path(chosen).expanduser().absolute()
     if base := os.environ.get("XDG_CACHE_HOME"):
@@ -39,15 +49,40 @@ def read_cached(path):
     Raises
     ------
     OSError
-        If the file is missing, is damaged, or belongs to another user.
+        If the file is missing, is damaged, or was written for another name; if another user wrote it or can replace it.
     """
-    with open(path, "rb") as file:
-        if hasattr(os, "geteuid") and os.fstat(file.fileno()).st_uid not in (os.geteuid(), 0):
+    _require_private(path.parent)
+    # without O_NONBLOCK opening a pipe would wait for its writer
+    with open(os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)), "rb") as file:
+        status = os.fstat(file.fileno())
+        if not stat.S_ISREG(status.st_mode) or status.st_size > MOST_BYTES_READ:
+            raise OSError(f"{path} is no file that was written here")
+        if hasattr(os, "geteuid") and status.st_uid not in (os.geteuid(), 0):
             raise PermissionError(f"{path} belongs to another user")
         content = file.read()
-    if hashlib.sha256(content[:-_DIGEST]).digest() != content[-_DIGEST:]:
-        raise OSError(f"{path} is damaged")
+    if _digest(path, content[:-_DIGEST]) != content[-_DIGEST:]:
+        raise OSError(f"{path} is damaged, or was written for another name")
     return content[:-_DIGEST]
+
+
+def _digest(path, content):
+    """Of the name, too: a file under another's name would be whole, and wrong."""
+    return hashlib.sha256(Path(path).name.encode() + b"\0" + content).digest()
+
+
+def _require_private(directory):
+    """Refuse a folder in which another user could replace files between their check and their use."""
+    status = os.stat(directory)
+    shared = status.st_mode & (stat.S_IWGRP | stat.S_IWOTH) and not status.st_mode & stat.S_ISVTX
+    if hasattr(os, "geteuid") and (shared or status.st_uid not in (os.geteuid(), 0)):
+        raise PermissionError(f"other users may write to {directory}")
+
+
+def _make_private(directory):
+    """Make a folder and its missing parents for this user alone, whatever the umask."""
+    if not directory.is_dir():
+        _make_private(directory.parent)
+        directory.mkdir(mode=0o700, exist_ok=True)
 
 
 @contextlib.contextmanager
@@ -59,13 +94,14 @@ def replacing(path):
     OSError
         If the file cannot be written.
     """
-    path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+    _make_private(path.parent)
+    _require_private(path.parent)
     handle, temporary = tempfile.mkstemp(dir=path.parent, suffix=".tmp")
     os.close(handle)
     try:
         yield temporary
         with open(temporary, "r+b") as file:
-            file.write(hashlib.sha256(file.read()).digest())
+            file.write(_digest(path, file.read()))
         os.replace(temporary, path)
     finally:
         Path(temporary).unlink(missing_ok=True)

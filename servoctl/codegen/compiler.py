@@ -26,6 +26,7 @@ from pathlib import Path
 from servoctl.codegen.cache import cache_directory, read_cached, replacing
 from servoctl.codegen.loops import SOURCES, digest
 
+PATIENCE_WITH_COMPILER = 600.0  # s: one that takes longer waits for something, such as a licence
 FLAGS = ("-fPIC", "-shared", "-w", "-fno-math-errno")
 
 _loaded = {}  # key -> ctypes.CDLL, or None where it could not be built
@@ -88,7 +89,10 @@ def _identified(chosen, cc, path):
     if chosen == "none":
         return None, None
     for candidate in (chosen, cc, "cc", "gcc", "clang"):
-        command = shlex.split(candidate or "")
+        try:
+            command = shlex.split(candidate or "")
+        except ValueError:  # a quotation mark that is not closed
+            command = (candidate or "").split()
         if command and (program := shutil.which(command[0], path=path)):
             files = [os.path.realpath(file) for word in command if (file := shutil.which(word, path=path))]
             stats = [(file, os.stat(file).st_mtime_ns, os.stat(file).st_size) for file in files]
@@ -140,14 +144,14 @@ def _build(text, level, file_name, command):
 def _compile(text, level, target, command):
     with replacing(target) as temporary:
         for flags in ((*FLAGS, *_optional_flags()), FLAGS):
-            done = subprocess.run(
-                [*command, level, *flags, f"-I{SOURCES}", "-x", "c", "-", "-o", temporary, "-lm"],
-                input=text,
-                text=True,
-                capture_output=True,
-                cwd=target.parent,
-                check=False,
-            )
+            try:
+                done = subprocess.run(
+                    [*command, level, *flags, f"-I{SOURCES}", "-x", "c", "-", "-o", temporary, "-lm"],
+                    input=text, encoding="utf-8", errors="replace", capture_output=True, cwd=target.parent,
+                    check=False, timeout=PATIENCE_WITH_COMPILER,
+                )  # fmt: skip
+            except subprocess.TimeoutExpired as error:
+                raise _CompilerFailed(f"no answer within {PATIENCE_WITH_COMPILER:g} s") from error
             if done.returncode == 0:
                 break
         else:
