@@ -49,13 +49,14 @@ class Motion:
         t = np.concatenate([piece[1] for piece in self.pieces])
         z = np.concatenate([np.vstack([piece[2], piece[3]]) for piece in self.pieces], axis=1)
         keep = np.append(True, np.diff(t) != 0)
-        models = [piece[0] for piece in self.pieces for _ in piece[1]]
-        variants = []
-        for i, model in enumerate(models[k] for k in np.flatnonzero(keep)):
-            if variants and variants[-1][2] is model:
-                variants[-1] = (variants[-1][0], i + 1, model)
-            else:
-                variants.append((i, i + 1, model))
+        counts = np.add.reduceat(keep, np.cumsum([0, *(len(piece[1]) for piece in self.pieces[:-1])]), dtype=int)
+        variants, end = [], 0
+        for (model, *_), count in zip(self.pieces, counts.tolist(), strict=True):
+            first, end = end, end + count
+            if count and variants and variants[-1][2] is model:
+                variants[-1] = (variants[-1][0], end, model)
+            elif count:
+                variants.append((first, end, model))
         return t[keep], z[:, keep], variants
 
 
