@@ -304,6 +304,8 @@ BAD = {
     "negative noise": (lambda: close(sensors=sv.Sensors(noise={"x": -0.1})), sv.SpecificationError, "-0.1"),
     "seed of nothing": (lambda: close(sensors=sv.Sensors(seed=3)), sv.SpecificationError, "seed"),
     "odd seed": (lambda: close(sensors=sv.Sensors(noise={"x": 0.1}, seed=0.5)), sv.SpecificationError, "seed=0.5"),
+    "noise of a number": (lambda: sv.Sensors(noise=0), sv.SpecificationError, "noise"),
+    "quantisation of a text": (lambda: sv.Sensors(quantisation=""), sv.SpecificationError, "quantisation"),
     "quantised nothing": (lambda: close(sensors=sv.Sensors(quantisation={"y": 0.1})), sv.NameUnknown, {"valid": ("x", "dx")}),
     "disturbance of nothing": (lambda: close(disturbance={"dx": LAW}), sv.NameUnknown, {"name": "dx"}),
     "disturbance of text": (lambda: close(disturbance={"x": "gust"}), sv.SpecificationError, {"name": "x"}),

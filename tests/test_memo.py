@@ -434,3 +434,16 @@ def test_without_a_home_the_temporary_directory_serves(tmp_path, monkeypatch):
     monkeypatch.setattr(Path, "home", nowhere)
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
     assert cache.cache_directory().parent == tmp_path
+
+
+def test_a_folder_in_the_place_of_an_entry_leaves_no_descriptor_open(derived, tmp_path):
+    sv.derive(*pendulum())
+    (entry,) = entries(tmp_path)
+    entry.unlink()
+    entry.mkdir()
+    here = Path("/dev/fd") if Path("/dev/fd").exists() else Path("/proc/self/fd")
+    before = len(list(here.iterdir()))
+    for _ in range(20):
+        with pytest.raises(OSError):
+            cache.read_cached(entry)
+    assert len(list(here.iterdir())) <= before

@@ -52,8 +52,7 @@ def read_cached(path):
         If the file is missing, is damaged, or was written for another name; if another user wrote it or can replace it.
     """
     _require_private(path.parent)
-    # without O_NONBLOCK opening a pipe would wait for its writer
-    with open(os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)), "rb") as file:
+    with open(path, "rb", opener=_at_once) as file:
         status = os.fstat(file.fileno())
         if not stat.S_ISREG(status.st_mode) or status.st_size > MOST_BYTES_READ:
             raise OSError(f"{path} is no file that was written here")
@@ -63,6 +62,11 @@ def read_cached(path):
     if _digest(path, content[:-_DIGEST]) != content[-_DIGEST:]:
         raise OSError(f"{path} is damaged, or was written for another name")
     return content[:-_DIGEST]
+
+
+def _at_once(path, flags):
+    """A descriptor; without O_NONBLOCK opening a pipe would wait for its writer."""
+    return os.open(path, flags | getattr(os, "O_NONBLOCK", 0))
 
 
 def _digest(path, content):

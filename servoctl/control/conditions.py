@@ -40,7 +40,7 @@ class Sensors:
 
     def __post_init__(self):
         for what in ("noise", "quantisation"):
-            values = mapping(getattr(self, what), what)
+            values = mapping(getattr(self, what), f"The values of the {what}")
             object.__setattr__(self, what, numbers_by_name(values, values, "measured state", what, low=0.0))
         if self.seed is None:
             return
