@@ -33,7 +33,7 @@ MEASURED = tuple(name for name in METHODS if name not in ("RK1", "RK2", "RK23"))
 TOLERANCES = (1e-3, 1e-5, 1e-7, 1e-9, 1e-11, 1e-13)
 STEP_COUNTS = tuple(5 * 4**k for k in range(7))  # steps of a fixed length in the span
 INSTANTS = 51  # samples of adaptive methods while they are timed
-COMPARED, BETWEEN = 400, 0.382  # instants at which motions are compared, in their intervals: off the steps of any method
+COMPARED, BETWEEN = 400, 0.382  # instants at which motions are compared, and where in its interval each lies
 DENSE = 1001  # instants of the reference over which its power is integrated
 TIMED, ENOUGH = 3, 0.3  # calls timed after a warm-up, fewer where they take this part of `seconds` together
 FEW = 20  # steps: a run that takes too long for fewer has diverged, and says nothing about finer settings
@@ -61,9 +61,9 @@ class TradeOff(Study):
     state, each relative to its largest magnitude (at least 1e-3 of the largest of its level), and over 402 instants
     that are the same for all methods: dense output counts, and Hermite interpolation between the steps of fixed-step
     methods; actuation: the same for the required forces and moments; residual: the largest of any constraint at any
-    level at these instants, in its unit; energy: energy gained less the work done along the reference, relative to the largest energy; power:
-    dE/dt less the power of all forces, relative (NaN where it does not apply); evaluations of the right-hand side, or
-    of the series, or Newton steps; steps; seconds: the shortest call after a warm-up, with 51 samples for adaptive
+    level at these instants, in its unit; energy: energy gained less the work done along the reference, relative to
+    the largest energy; power: dE/dt less the power of all forces, relative (NaN where it does not apply); evaluations
+    of the right-hand side, or of the series, or Newton steps; steps; seconds: the shortest call after a warm-up, with 51 samples for adaptive
     methods (more samples take longer), and one at each instant or step for the others; resolved: whether the error
     exceeds the uncertainty of the reference; failure: why there are no numbers.
     """
