@@ -63,9 +63,9 @@ class TradeOff(Study):
     methods; actuation: the same for the required forces and moments; residual: the largest of any constraint at any
     level at these instants, in its unit; energy: energy gained less the work done along the reference, relative to
     the largest energy; power: dE/dt less the power of all forces, relative (NaN where it does not apply); evaluations
-    of the right-hand side, or of the series, or Newton steps; steps; seconds: the shortest call after a warm-up, with 51 samples for adaptive
-    methods (more samples take longer), and one at each instant or step for the others; resolved: whether the error
-    exceeds the uncertainty of the reference; failure: why there are no numbers.
+    of the right-hand side, or of the series, or Newton steps; steps; seconds: the shortest call after a warm-up, with
+    51 samples for adaptive methods (more samples take longer), and one at each instant or step for the others;
+    resolved: whether the error exceeds the uncertainty of the reference; failure: why there are no numbers.
     """
 
     COLUMNS = (
