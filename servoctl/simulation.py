@@ -10,10 +10,12 @@ from servoctl.checks import as_span
 from servoctl.errors import InconsistentStart, SpecificationError
 from servoctl.methods.accuracy import accurate
 from servoctl.methods.algebraic import algebraic
+from servoctl.methods.bounded import bounded
 from servoctl.methods.choice import (
     EXPLICIT,
     Adaptive,
     Algebraic,
+    Bounded,
     Method,
     MinimalCoordinates,
     Poles,
@@ -117,10 +119,10 @@ def simulate(
         _require_decay(model, drift, t0, t1)
         if str(method) in EXPLICIT:
             warn_many_steps(str(method), drift.by_row(model), t1 - t0)
-    leads_back = isinstance(method, Algebraic) or isinstance(drift, (Poles, Project))
+    leads_back = isinstance(method, (Algebraic, Bounded)) or isinstance(drift, (Poles, Project))
     x0 = (as_state if leads_back else consistent_state)(model, start, t0)
     knots = model.require_smooth((min(span), max(span)))
-    times = _sample_times(t0, t1, t_eval, knots)
+    times = None if isinstance(method, Bounded) and t_eval is None else _sample_times(t0, t1, t_eval, knots)
     bar = Progress(span, progress)
     try:
         motion = _motion(model, method, drift, span, x0, times, knots, bar)
@@ -143,6 +145,8 @@ def _motion(model, method, drift, span, x0, times, knots, bar):
             return algebraic(model, t0, x0, times, bar)
         case Taylor(order, jets, rtol, atol):
             return TaylorSteps(model, drift, rtol, atol, order, jets or 0, bar).run(*arguments)
+        case Bounded():
+            return bounded(model, span, x0, method, times, knots, bar)
         case RadauIIA(order, step, rtol, atol):
             step = None if step is None else _step_length(step, t0, t1)
             stepping = RadauSteps(model, drift, rtol, atol, order, step, bar)
@@ -167,7 +171,7 @@ def _run(model, motion, method, drift, knots, span):
     elif motion.interrupted:
         status, message = 1, f"interrupted at {last} of {span[2]:g} s; what was computed is kept"
     else:
-        status, message = 0, "finished"
+        status, message = 0, f"finished; {motion.note}" if motion.note else "finished"
     facts = {"method": str(method), "drift": str(drift or ""), "counters": motion.counters, "knots": knots}
     facts |= {"success": status == 0, "status": status, "message": message, "variants": tuple(variants)}
     return Run(t, jets, model.names_to(len(jets)), model, **facts)

@@ -18,6 +18,7 @@ class Motion:
     pieces: list = field(default_factory=list)
     stop: object = None
     interrupted: bool = False
+    note: str = ""
     changed: set = field(default_factory=set)
 
     def add(self, model, t, x, top):
