@@ -4,6 +4,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 from functools import cached_property
 
+import casadi as ca
 import numpy as np
 
 from servoctl.checks import finite
@@ -365,8 +366,14 @@ class Model:
         signals = {value[1].name: value[1] for value in self._functions.values() if isinstance(value, tuple)}
         return {name: f.operations for name, f in (self._functions | signals).items() if hasattr(f, "operations")}
 
-    def start(self, /, t: float = 0.0, guess: Mapping[str, float] | None = None, **held: float) -> State:
+    def start(
+        self, /, t: float = 0.0, guess: Mapping[str, float] | None = None,
+        hold: Mapping[str, ca.SX] | None = None, **held: float,
+    ) -> State:  # fmt: skip
         """Consistent initial values: those passed are fixed, the others follow from the constraints and their rates.
+
+        Where several states have the held values, the one that Newton's method reaches from the guess is taken; the
+        printed state names others that a short search finds.
 
         Parameters
         ----------
@@ -375,8 +382,11 @@ class Model:
         guess : dict of str to float, optional
             Approximate values: free ones start there if that is consistent. Values without a guess are as near to zero
             as the invariants allow.
+        hold : dict of str to SX, optional
+            Further conditions by name: expressions of t, the coordinates and their derivatives of any order that are
+            zero at the start, such as `{"heading": ca.atan2(dy, dx) - 0.5}`.
         **held : float
-            Exact values of coordinates and derivatives.
+            Exact values of coordinates, derivatives and outputs.
 
         Returns
         -------
@@ -385,11 +395,13 @@ class Model:
         Raises
         ------
         NameUnknown
-            For a name that is no state.
+            For a name that is no state and no output.
+        SpecificationError
+            For a value that is no finite number, or a condition that is no expression of the mechanism's symbols.
         InconsistentStart
             If a held value contradicts an invariant, or the search for a consistent state fails.
         """
-        return consistent(self, finite("t", t, "time"), held, guess)
+        return consistent(self, finite("t", t, "time"), held, guess, hold)
 
     def structure(self, t=None, jets=None):
         """Index, relative degrees, zeros at infinity and essential orders (see `reduction.structure`).

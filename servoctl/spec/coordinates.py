@@ -303,10 +303,10 @@ def _identifiers(names, what):
         )
     names = tuple(names.split())
     for name in names:
-        if not name.isidentifier() or name in ("t", "guess"):
+        if not name.isidentifier() or name in ("t", "guess", "hold"):
             raise SpecificationError(
                 f"{name!r} is no name of {what}.",
-                "Names are Python identifiers other than t and guess, which are arguments of a start.",
+                "Names are Python identifiers other than t, guess and hold, which are arguments of a start.",
                 do="Rename it.",
                 name=name,
             )
