@@ -1,4 +1,6 @@
-"""The printed form of a model."""
+"""The printed form of a model, and what is said of a state at which its program is singular."""
+
+from servoctl.errors import ServoError, SingularProgram
 
 WIDTH = 118
 
@@ -59,3 +61,31 @@ def _rule(r):
     classical = all(row.order == 0 or (row.order == 1 and row.affine) for row in program)
     rule = "d'Alembert's principle" if classical else "the generalised Chetaev rule, a postulate at this order"
     return f"(3.18) with T from ker G; dependent: {dependent}; under {rule}"
+
+
+def lost_degrees(model, t, x, **facts):
+    """The error of a state (n_x,) at which the residuals have other relative degrees than in motion.
+
+    None where they are the same, or where the index is not defined.
+    """
+    try:
+        usual, there = (model.structure(), model.structure([t], x[:, None]))
+    except ServoError:
+        return None
+    if not there.zeros_at_infinity or there.zeros_at_infinity == usual.zeros_at_infinity:
+        return None
+    degrees = zip(usual.residuals, usual.relative_degree, there.relative_degree, strict=True)
+    changed = ", ".join(f"that of {name} is {local}, in motion {r}" for name, r, local in degrees if local != r)
+    zero = there.at[0][1].zero
+    where = f", where {' and '.join(f'{name} = 0' for name in zero)}" if zero else ""
+    lost = f"relative degrees differ there ({changed})" if changed else "zeros at infinity differ there"
+    return SingularProgram(
+        f"The program is singular at t = {t:.7g} s{where}: {lost}.",
+        "Such a state does not determine the actuation, and towards it the actuation may grow without bound.",
+        do=f"Start and plan away from it{f', by model.start({zero[0]}=...)' if zero else ''}, or program outputs whose "
+        "relative degrees stay the same. The run before it is in .run.",
+        t=float(t),
+        relative_degree=there.relative_degree,
+        in_motion=usual.relative_degree,
+        **facts | {"zero": list(zero)},
+    )
