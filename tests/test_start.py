@@ -166,6 +166,14 @@ def test_coordinates_do_not_take_names_of_a_starts_arguments():
         sv.coordinates("x hold")
 
 
+@pytest.mark.parametrize("names", ["x, y", "x,y", "x,y,", "x ,y"])
+def test_names_with_commas_are_refused_with_the_names_as_they_should_be(names):
+    with refused(sv.SpecificationError, "'x y'", "blanks", names=names):
+        sv.coordinates(names)
+    with refused(sv.SpecificationError, "'x y'", names=names):
+        sv.coordinates("a b").with_quasi_velocities(names, np.eye(2))
+
+
 @pytest.mark.parametrize(
     ("name", "valid", "nearest"),
     [
@@ -250,3 +258,110 @@ def test_a_quaternion_and_its_opposite_are_one_start():
     attitude = {"a": e1 * e0 - 0.1, "b": e2 * e0 - 0.2, "c": e3 * e0 + 0.1}
     start = sv.derive(mechanism, sv.Program(attitude), guess={"e0": 1.0}).start(guess={"e1": 0.1})
     assert len(start.branches) == 1 and start["e0"] * start["e2"] == pytest.approx(0.2)
+
+
+# machines that roll, at rest -----------------------------------------------------------------------------------------
+
+
+def path_from_rest(q, speed=0.0):
+    """3 s, sin 2s along s, which begins with the slope 2/3 and the curvature 0."""
+    s = sv.paths.rest_to_rest(q.t, (0.0,), (1.0,), duration=4.0, smoothness=5)[0] + speed * q.t
+    return 3 * s, ca.sin(2 * s)
+
+
+def wheels(speed=0.0):
+    """Two driven wheels: no slip across the heading psi."""
+    q = sv.coordinates("x y psi")
+    (x, y, psi), (dx, dy, dpsi) = q, q.d(1)
+    mechanism = sv.Mechanism(
+        q, gibbs=sv.rigid_body(q, 10.0, (0, 0, 1.0), position=(x, y), rates=(0, 0, dpsi)),
+        constraints={"slip": -dx * ca.sin(psi) + dy * ca.cos(psi)},
+        actuators={"push": ca.vertcat(ca.cos(psi), ca.sin(psi), 0), "turn": psi},
+    )  # fmt: skip
+    path = path_from_rest(q, speed)
+    return sv.derive(mechanism, sv.Program({"X": x - path[0], "Y": y - path[1]}))
+
+
+def bicycle(speed=0.0):
+    """Rear and front wheel, 1 m apart; the front one turns by delta."""
+    q = sv.coordinates("x y psi delta")
+    (x, y, psi, delta), (dx, dy, dpsi, _) = q, q.d(1)
+    rolling = {
+        "rear": -dx * ca.sin(psi) + dy * ca.cos(psi),
+        "front": -dx * ca.sin(psi + delta) + dy * ca.cos(psi + delta) + dpsi * ca.cos(delta),
+    }
+    gibbs = sv.rigid_body(q, 10.0, (0, 0, 1.0), position=(x, y), rates=(0, 0, dpsi)) + 0.05 * q.d(2)[3] ** 2
+    drive = ca.vertcat(ca.cos(psi), ca.sin(psi), 0, 0)
+    mechanism = sv.Mechanism(q, gibbs=gibbs, constraints=rolling, actuators={"drive": drive, "steer": delta})
+    path = path_from_rest(q, speed)
+    return sv.derive(mechanism, sv.Program({"X": x - path[0], "Y": y - path[1]}))
+
+
+def trailer(speed=0.0):
+    """Two wheels with a trailer, whose axle follows the path."""
+    q = sv.coordinates("x y psi theta")
+    (x, y, psi, theta), (dx, dy, dpsi, dtheta) = q, q.d(1)
+    behind = ca.vertcat(x - ca.cos(theta), y - ca.sin(theta))
+    vx, vy = q.dt(behind).elements()
+    rolling = {"slip": -dx * ca.sin(psi) + dy * ca.cos(psi), "trailer": -vx * ca.sin(theta) + vy * ca.cos(theta)}
+    gibbs = sv.rigid_body(q, 10.0, (0, 0, 1.0), position=(x, y), rates=(0, 0, dpsi))
+    gibbs += sv.rigid_body(q, 5.0, (0, 0, 0.5), position=(behind[0], behind[1]), rates=(0, 0, dtheta))
+    push = ca.vertcat(ca.cos(psi), ca.sin(psi), 0, 0)
+    mechanism = sv.Mechanism(q, gibbs=gibbs, constraints=rolling, actuators={"push": push, "turn": psi})
+    path = path_from_rest(q, speed)
+    program = sv.Program({"X": behind[0] - path[0], "Y": behind[1] - path[1]})
+    return sv.derive(mechanism, program, guess={"x": 1.0, "theta": 0.5, "psi": 0.5})
+
+
+ROLLING = {"wheels": (wheels, ("psi",)), "bicycle": (bicycle, ("psi", "delta")), "trailer": (trailer, ("psi", "theta"))}
+
+
+@pytest.mark.parametrize("name", ROLLING)
+def test_a_machine_that_rolls_starts_from_rest_at_the_limit_of_its_motion(name):
+    """The heading of the path, atan 2/3, and no curvature."""
+    build, open_at_rest = ROLLING[name]
+    start = build().start()
+    assert set(start.at_rest) == set(open_at_rest) and "at rest" in repr(start)
+    heading = {angle: np.arctan2(2, 3) for angle in ("psi", "theta")} | {"delta": 0.0}
+    assert [start[angle] for angle in open_at_rest] == pytest.approx([heading[a] for a in open_at_rest], abs=2e-7)
+    assert start.values[len(start.names) // 2 :] == pytest.approx(0.0, abs=1e-12) and start.residual < 1e-12
+
+
+@pytest.mark.parametrize("name", ROLLING)
+def test_a_machine_that_stays_at_rest_has_no_limit(name):
+    build, open_at_rest = ROLLING[name]
+    with refused(sv.SingularProgram, "stands still", *open_at_rest, t=5.0, nearest_time=None):
+        build().start(t=5.0)
+
+
+@pytest.mark.parametrize("name", ROLLING)
+def test_a_simulation_from_rest_says_that_the_machine_stands_still(name):
+    build, open_at_rest = ROLLING[name]
+    model = build()
+    with refused(sv.SingularProgram, "stands still", *open_at_rest, t=0.0) as caught:
+        sv.simulate(model, model.start(), (0.0, 3.0))
+    assert "square" not in str(caught.value) and 0 < caught.value.details["nearest_time"] < 0.3
+
+
+def test_the_motion_after_rest_begins_where_the_start_is():
+    model = wheels()
+    run = sv.simulate(model, model.start(t=0.01), (0.01, 3.9))
+    assert run["psi"][0] == pytest.approx(model.start()["psi"], abs=1e-9) and sv.verify(model, run).passed
+
+
+@pytest.mark.parametrize("name", ROLLING)
+def test_a_machine_in_motion_has_an_ordinary_start(name):
+    model = ROLLING[name][0](speed=0.2)
+    start = model.start(guess={"x": 1.0, "theta": 0.5, "psi": 0.5} if name == "trailer" else {"psi": 0.5})
+    assert start.at_rest == () and start["psi"] == pytest.approx(np.arctan2(2, 3), abs=1e-8)
+
+
+def test_a_heading_that_is_given_at_rest_is_kept():
+    start = wheels().start(psi=0.1)
+    assert start["psi"] == 0.1 and start.at_rest == ()
+
+
+@pytest.mark.parametrize("name", ["two-cars", "mass-on-car", "vtol", "crane-3d", "two-link-arm", "wheeled-robot"])
+def test_other_machines_at_rest_leave_nothing_open(name, gallery_model):
+    scene = gallery[name]
+    assert gallery_model(name).start(t=scene.t_span[0], guess=scene.guess, **scene.start).at_rest == ()

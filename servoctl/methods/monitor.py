@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from servoctl.errors import IntegrationStopped, ServoError, SingularProgram
-from servoctl.model.report import lost_degrees
+from servoctl.model.report import explain
 from servoctl.reduction.ranks import column_sizes
 
 DEGRADED = 0.02  # of its reference: a pivot below this is replaced, if the matrix itself is better than that
@@ -448,10 +448,9 @@ class Monitor:
         dependent = [] if lost else self._dependent_rows(matrices[0])
         facts = {"measure": measure, "rows": lost or dependent, "direction": direction}
         at_zero = np.where([name in zero for name in self.model.state_names], 0.0, x)
-        prescribed = [name for name in lost if name in self.model.reduction.original]
-        degrees = None if prescribed else lost_degrees(self.model, t, at_zero, **facts)
-        if degrees is not None:
-            return degrees
+        explained = explain(self.model, t, at_zero, lost, **facts)
+        if explained is not None:
+            return explained
         what = f"the gradient of row {', '.join(map(repr, lost))} vanishes"
         what = what if lost else f"the rows {', '.join(map(repr, dependent))} lose their rank"
         return SingularProgram(

@@ -12,7 +12,8 @@ from servoctl.codegen.function import compiled
 from servoctl.errors import ServoError, SpecificationError, unknown
 from servoctl.model.equations import EQUATIONS, SIGNALS, Equations, gradient_jets, leading_names, residual_rows
 from servoctl.model.report import describe
-from servoctl.model.start import State, consistent
+from servoctl.model.rest import started
+from servoctl.model.start import State
 from servoctl.model.store import Store, pack, unpack
 from servoctl.reduction.appell import require_positive
 from servoctl.reduction.knots import require_smooth
@@ -402,8 +403,10 @@ class Model:
             For a value that is no finite number, or a condition that is no expression of the mechanism's symbols.
         InconsistentStart
             If a held value contradicts an invariant, or the search for a consistent state fails.
+        SingularProgram
+            If the machine stands still, its constraints leave a coordinate open there, and the motion has no limit.
         """
-        return consistent(self, finite("t", t, "time"), held, guess, hold)
+        return started(self, finite("t", t, "time"), held, guess, hold)
 
     def structure(self, motion=None, jets=None):
         """Index, relative degrees, zeros at infinity and essential orders (see `reduction.structure`).

@@ -1,6 +1,9 @@
 """The printed form of a model, and what is said of a state at which its program is singular."""
 
+import numpy as np
+
 from servoctl.errors import ServoError, SingularProgram
+from servoctl.model.rest import first_motion, standstill
 
 WIDTH = 118
 
@@ -63,11 +66,21 @@ def _rule(r):
     return f"(3.18) with T from ker G; dependent: {dependent}; under {rule}"
 
 
-def lost_degrees(model, t, x, **facts):
-    """The error of a state (n_x,) at which the residuals have other relative degrees than in motion.
+def explain(model, t, x, lost, **facts):
+    """The error of a singular state (n_x,), of which `lost` rows lose their gradients, by its cause; None if unknown.
 
-    None where they are the same, or where the index is not defined.
+    Machines that roll may stand still there, or relative degrees be others than in motion.
     """
+    chosen = dict(zip(model.state_names, map(float, x), strict=True))
+    still = standstill(model, t, chosen)
+    if still is not None:
+        return still.error(t, first_motion(model, t, chosen, still), **facts)
+    prescribed = any(name in model.reduction.original for name in lost)
+    return None if prescribed else _lost_degrees(model, t, np.asarray(x, dtype=float), **facts)
+
+
+def _lost_degrees(model, t, x, **facts):
+    """The error of a state at which the residuals have other relative degrees than in motion, or None."""
     try:
         usual, there = (model.structure(), model.structure([t], x[:, None]))
     except ServoError:

@@ -44,6 +44,8 @@ class State(Value):
         Further names that the invariants leave free; their values come from the guess or are near zero.
     residual : float
         Largest scaled residual.
+    at_rest : tuple of str
+        Coordinates that the constraints determine in motion only; their values are the limit of the motion.
     branches : (b, n_x) array
         This state and others with the same held and free values that a short search found, between which neither
         the guess nor the distance from zero decides.
@@ -55,6 +57,7 @@ class State(Value):
     held: tuple
     free: tuple
     residual: float
+    at_rest: tuple = ()
     branches: np.ndarray = field(default_factory=lambda: np.zeros((0, 0)), compare=False)
 
     def __getitem__(self, name):
@@ -65,10 +68,12 @@ class State(Value):
     def __repr__(self):
         items = [f"{name} = {value:.6g}" for name, value in zip(self.names, self.values, strict=True)]
         shown = ", ".join(items[:12]) + (f", ... ({len(items)} in all)" if len(items) > 12 else "")
-        held, free = (", ".join(names) or "nothing" for names in (self.held, self.free))
+        held, free, rest = (", ".join(names) or "nothing" for names in (self.held, self.free, self.at_rest))
         return (
             f"State at t = {self.t:g} s\n  {shown}\n  held: {held}; left free: {free}\n"
-            f"  largest residual {self.residual:.1e}" + self._told_apart()
+            f"  largest residual {self.residual:.1e}"
+            + (f"\n  at rest; {rest} by the limit of the motion that follows" if self.at_rest else "")
+            + self._told_apart()
         )
 
     def _told_apart(self):
@@ -81,20 +86,20 @@ class State(Value):
         return f"\n  {len(each)} branches: {each[0]} (this one); {'; '.join(each[1:])}; a guess chooses"
 
 
-class _Equations:
+class JetEquations:
     """Invariants of a model at one time, followed by conditions of the start: values (m,) and Jacobian (m, n_z).
 
-    The jets are the state, and higher ones where a condition contains these.
+    The jets are the state, and higher ones where a condition contains these. `rows` replace those of the reduction.
     """
 
-    def __init__(self, model, t, conditions):
+    def __init__(self, model, t, conditions, rows=None):
         r, self.t, self.p = model.reduction, t, model.parameters
         q = r.mechanism.q
         top = max([r.top, *(q.order(e) + 1 for e in conditions.values())])
-        if top == r.top:
+        if top == r.top and rows is None:
             self.f, names = model.function("invariants"), [name for _, name in model.invariant_names()]
         else:
-            extended = Invariants(r.mechanism, r.rows, top, r.points)
+            extended = Invariants(r.mechanism, rows or r.rows, top, r.points)
             self.f, names = _numeric(extended.invariants()), [name for _, name, _ in extended.invariant_rows]
         self.invariants, self.rows, self.conditions = len(names), [*names, *conditions], None
         self.names = model.names_to(q.nq + (top - 1) * q.n)
@@ -105,6 +110,7 @@ class _Equations:
             self.conditions = _numeric(ca.Function("conditions", [q.t, jets, parameters], [outputs]))
 
     def __call__(self, x):
+        """Values (m,) and Jacobian (m, n_z) at jets (n_z,)."""
         with np.errstate(all="ignore"):
             parts = [self._split(self.f(self.t, x, self.p), self.invariants, x)]
             if self.conditions is not None:
@@ -124,10 +130,10 @@ class _Equations:
     def scaled(self, x):
         """Residuals relative to the size of their gradients times that of the jets."""
         value, jacobian = self(x)
-        return value / _sizes(jacobian, x)
+        return value / gradient_sizes(jacobian, x)
 
 
-def _sizes(jacobian, x):
+def gradient_sizes(jacobian, x):
     """The size of each gradient times that of the jets."""
     return np.maximum(np.sqrt((jacobian**2 * (1.0 + np.abs(x)) ** 2).sum(axis=1)), 1e-300)
 
@@ -138,13 +144,20 @@ def _numeric(f):
 
 
 @dataclass(frozen=True, eq=False)
-class _Aim:
+class Aim:
     """The state nearest to a reference is sought, by weights, with some values movable; arrays (n_x,)."""
 
     names: tuple
     reference: np.ndarray
     weights: np.ndarray
     movable: np.ndarray
+
+    @classmethod
+    def of(cls, names, guess, held):
+        """The state nearest to guessed values, with held ones."""
+        reference = np.array([held.get(name, guess.get(name, 0.0)) for name in names])
+        weights = np.array([GUESSED if name in guess and name not in held else 1.0 for name in names])
+        return cls(names, reference, weights, np.array([name not in held for name in names]))
 
 
 @np.errstate(all="ignore")  # trial steps may leave the domain of the equations
@@ -154,19 +167,17 @@ def consistent(model, t, held, guess, hold):
     n_x, states = len(model.state_names), model.state_names
     guess = {name: _known(name, value, states) for name, value in mapping(guess, "The guesses").items()}
     chosen = guess | values
-    names = _Equations(model, t, conditions).names
-    reference = np.array([chosen.get(name, 0.0) for name in names])
-    weights = np.array([GUESSED if name in guess and name not in values else 1.0 for name in names])
-    aim = _Aim(names, reference, weights, np.array([name not in values for name in names]))
+    names = JetEquations(model, t, conditions).names
+    aim = Aim.of(names, guess, values)
     equations, x, residual = _solve(model, t, aim, conditions)
     if not residual < TOLERANCE:
         _refuse(equations, aim, dict.fromkeys(conditions, 0.0) | held, x)
-    free = _free(equations, x, aim, chosen)
+    free = free_names(equations, x, aim, chosen)
     x, residual = _at_guess(equations, x, residual, aim, [name in free and name in chosen for name in names])
     sought = aim.movable & [name not in free for name in names]
     branches = _branches(equations, x, replace(aim, movable=sought), model)
-    left = tuple(name for name in free if name in states)
-    return State(t, x[:n_x], states, tuple(dict.fromkeys((*held, *conditions))), left, residual, branches[:, :n_x])
+    fixed, left = tuple(dict.fromkeys((*held, *conditions))), tuple(name for name in free if name in states)
+    return State(t, x[:n_x], states, fixed, left, residual, branches=branches[:, :n_x])
 
 
 def _split_held(model, held, hold):
@@ -203,7 +214,7 @@ def _known(name, value, names, what="state"):
 
 def _solve(model, t, aim, conditions):
     """The start by the model's pivots, else by pivots chosen at the reference, else near the best state so far."""
-    equations, n_x = _Equations(model, t, conditions), len(model.state_names)
+    equations, n_x = JetEquations(model, t, conditions), len(model.state_names)
     finite_there = np.all(np.isfinite(equations(aim.reference)[0][: equations.invariants]))
     x, residual = _best(equations, aim) if finite_there else (aim.reference, np.inf)
     for at in (aim.reference, None):
@@ -215,7 +226,7 @@ def _solve(model, t, aim, conditions):
             near = model.near(t, np.append((x if at is None else at)[:n_x], np.zeros(model.n)))
         except ServoError:
             continue
-        other = _Equations(near, t, conditions)
+        other = JetEquations(near, t, conditions)
         y, residual_there = _best(other, aim)
         if residual_there < residual or not np.isfinite(residual):
             equations, x, residual = other, y, residual_there
@@ -227,7 +238,7 @@ def _at_guess(equations, x, residual, aim, guessed):
     guessed = np.array(guessed)
     if not guessed.any():
         return x, residual
-    moved = _settle(equations, np.where(guessed, aim.reference, x), replace(aim, movable=aim.movable & ~guessed))
+    moved = settle(equations, np.where(guessed, aim.reference, x), replace(aim, movable=aim.movable & ~guessed))
     residual_there = np.abs(equations.scaled(moved)).max(initial=0.0)
     return (moved, float(residual_there)) if residual_there < TOLERANCE else (x, residual)
 
@@ -245,7 +256,7 @@ def _best(equations, aim):
     """The projection of the reference onto the solutions; if it fails, from perturbed points."""
     best, smallest = aim.reference, np.inf
     for first in _starts(aim):
-        x = _nearest(equations, _settle(equations, first, aim), aim)
+        x = _nearest(equations, settle(equations, first, aim), aim)
         residual = np.nan_to_num(np.abs(equations.scaled(x)), nan=np.inf).max(initial=0.0)
         if residual < smallest:
             best, smallest = x, residual
@@ -265,7 +276,7 @@ def _step(value, jacobian, aim):
     return full
 
 
-def _settle(equations, x, aim, iterations=60):
+def settle(equations, x, aim, iterations=60):
     """Damped Gauss-Newton with least steps.
 
     A step is judged by the gradients at its start: relative to gradients that shrink along it, residuals that fall
@@ -273,7 +284,7 @@ def _settle(equations, x, aim, iterations=60):
     """
     for _ in range(iterations):
         value, jacobian = equations(x)
-        size = _sizes(jacobian, x)
+        size = gradient_sizes(jacobian, x)
         norm = np.abs(value / size).max(initial=0.0)
         if norm < REACHED:
             break
@@ -296,7 +307,7 @@ def _nearest(equations, x, aim, iterations=40):
         value, jacobian = equations(x)
         with np.errstate(all="ignore"):
             trial = aim.reference + _step(-value - jacobian @ (aim.reference - x), jacobian, aim)
-        trial = _settle(equations, trial, aim, 12)
+        trial = settle(equations, trial, aim, 12)
         distance, before = (np.sum((aim.weights * (y - aim.reference)) ** 2) for y in (trial, x))
         if np.abs(equations.scaled(trial)).max(initial=0.0) > TOLERANCE or not distance < before * (1 - 1e-12):
             break
@@ -304,7 +315,7 @@ def _nearest(equations, x, aim, iterations=40):
     return x
 
 
-def _free(equations, x, aim, guess):
+def free_names(equations, x, aim, guess):
     """Names that the equations leave free: guessed ones if possible, then low derivatives."""
     _, jacobian = equations(x)
     rows = np.sqrt((jacobian**2).sum(axis=1))
@@ -331,7 +342,7 @@ def _branches(equations, x, aim, model):
     for attempt in range(SEARCHED if aim.movable.any() else 0):
         signs, far = rng.choice([-1.0, 1.0], len(x)), rng.uniform(-FAR, FAR, len(x)) * (1.0 + np.abs(x))
         first = np.where(aim.movable, x * signs + far if attempt else -x, x)
-        y = _settle(equations, first, aim, SEARCH_STEPS)
+        y = settle(equations, first, aim, SEARCH_STEPS)
         residual = np.nan_to_num(np.abs(equations.scaled(y)), nan=np.inf).max(initial=0.0)
         same = residual < TOLERANCE and any(_same_motion(y, z, model) for z in found)
         if residual < TOLERANCE and not same and not _clear_choice(x, y, aim, model):
@@ -368,7 +379,7 @@ def _refuse(equations, aim, held, x):
     alone, all_movable = equations.without_conditions(), replace(aim, movable=np.ones(len(aim.names), dtype=bool))
     loosened, residual = _best(alone, all_movable)
     if not residual < TOLERANCE:
-        loosened = _settle(alone, x, all_movable)
+        loosened = settle(alone, x, all_movable)
         residual = np.abs(alone.scaled(loosened)).max(initial=0.0)
     if held and residual < TOLERANCE:
         left = dict(zip(equations.rows, equations(loosened)[0], strict=True))

@@ -301,6 +301,13 @@ def _identifiers(names, what):
             do='Write, for example, "x y theta".',
             names=names,
         )
+    if "," in names:
+        raise SpecificationError(
+            f"The names of the {what} are {names!r}.",
+            "Separate names by blanks, without commas.",
+            nearest=repr(" ".join(names.replace(",", " ").split())) + ".",
+            names=names,
+        )
     names = tuple(names.split())
     for name in names:
         if not name.isidentifier() or name in ("t", "guess", "hold"):
