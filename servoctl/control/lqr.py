@@ -180,14 +180,14 @@ def _explained(error, augmented, basis, names, plant, varying):
     if mode:
         moves = np.abs(A[some] - np.eye(len(Q))).max(axis=(0, 1))
         alone = [names[i] for i in mode if moves[i] < UNREACHED and (Q[i, i] > 0 or not varying)]
-        return _out_of_reach(error, [names[i] for i in mode], alone, plant, varying)
+        return _beyond_inputs(error, [names[i] for i in mode], alone, plant, varying)
     k, T = some[-1], bases[-1]
     a = T.T @ A[k] @ T
     unreached, unseen = _fixed_modes(a, B[k].T @ T), _fixed_modes(a.T, Q @ T)
     if unreached.size:
-        return _out_of_reach(error, _named(T @ unreached, names), [], plant, varying)
+        return _beyond_inputs(error, _states_in(T @ unreached, names), [], plant, varying)
     if unseen.size:
-        mode = _named(T @ unseen, names)
+        mode = _states_in(T @ unseen, names)
         return ServoError(
             f"No weight sees a mode in {', '.join(mode)} that does not decay.",
             "The weights must see each unstable or marginal mode (Riccati).",
@@ -223,7 +223,7 @@ def _null_space(matrix):
     return rows[np.sum(sizes > UNREACHED) :].T
 
 
-def _named(modes, names):
+def _states_in(modes, names):
     """Names of the states in modes (n, number), by their share in the largest."""
     share = np.linalg.norm(modes, axis=1)
     return [name for name, size in zip(names, share, strict=True) if size > NAMED * share.max()]
@@ -239,7 +239,7 @@ def _fixed_modes(A, C):
     return modes[:, np.abs(modes).max(axis=0, initial=0.0) > UNREACHED]
 
 
-def _out_of_reach(error, mode, alone, plant, varying):
+def _beyond_inputs(error, mode, alone, plant, varying):
     """The error of a mode that no input reaches, with those of its states that may stay unweighted.
 
     These move no other state; without a weight, time-varying gains leave them alone.

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from servoctl.errors import InconsistentStart, SingularProgram
-from servoctl.model.start import SPANNED, TOLERANCE, Aim, JetEquations, State, consistent, free_names, settle
+from servoctl.model.start import SPANNED, TOLERANCE, Aim, JetEquations, State, consistent, free_names, gauss_newton
 from servoctl.reduction.ranks import equilibrate
 
 STANDS = 1e-9  # velocities below this, relative to the coordinates' size, are rest
@@ -82,7 +82,7 @@ def _at_rest(model, t, chosen):
     rows = tuple(model.reduction.original.values())
     equations = JetEquations(model, t, {}, rows)
     aim = Aim.of(equations.names, {name: v for name, v in chosen.items() if name in equations.names}, {})
-    return rows, equations, aim, settle(equations, aim.reference, aim)
+    return rows, equations, aim, gauss_newton(equations, aim.reference, aim)
 
 
 def standstill(model, t, chosen):
@@ -124,7 +124,7 @@ def _limit(model, t, held, chosen, still):
         if not error <= NEAR_LIMIT:
             raise still.error(t, moving)
     _, equations, aim, _ = _at_rest(model, t, limit)
-    x = settle(equations, aim.reference, aim)
+    x = gauss_newton(equations, aim.reference, aim)
     residual = np.abs(equations.scaled(x)).max(initial=0.0)
     return State(t, x, states[0].names, tuple(held), (), float(residual), at_rest=still.coordinates)
 

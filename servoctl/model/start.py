@@ -238,7 +238,7 @@ def _at_guess(equations, x, residual, aim, guessed):
     guessed = np.array(guessed)
     if not guessed.any():
         return x, residual
-    moved = settle(equations, np.where(guessed, aim.reference, x), replace(aim, movable=aim.movable & ~guessed))
+    moved = gauss_newton(equations, np.where(guessed, aim.reference, x), replace(aim, movable=aim.movable & ~guessed))
     residual_there = np.abs(equations.scaled(moved)).max(initial=0.0)
     return (moved, float(residual_there)) if residual_there < TOLERANCE else (x, residual)
 
@@ -256,7 +256,7 @@ def _best(equations, aim):
     """The projection of the reference onto the solutions; if it fails, from perturbed points."""
     best, smallest = aim.reference, np.inf
     for first in _starts(aim):
-        x = _nearest(equations, settle(equations, first, aim), aim)
+        x = _nearest(equations, gauss_newton(equations, first, aim), aim)
         residual = np.nan_to_num(np.abs(equations.scaled(x)), nan=np.inf).max(initial=0.0)
         if residual < smallest:
             best, smallest = x, residual
@@ -276,7 +276,7 @@ def _step(value, jacobian, aim):
     return full
 
 
-def settle(equations, x, aim, iterations=60):
+def gauss_newton(equations, x, aim, iterations=60):
     """Damped Gauss-Newton with least steps.
 
     A step is judged by the gradients at its start: relative to gradients that shrink along it, residuals that fall
@@ -307,7 +307,7 @@ def _nearest(equations, x, aim, iterations=40):
         value, jacobian = equations(x)
         with np.errstate(all="ignore"):
             trial = aim.reference + _step(-value - jacobian @ (aim.reference - x), jacobian, aim)
-        trial = settle(equations, trial, aim, 12)
+        trial = gauss_newton(equations, trial, aim, 12)
         distance, before = (np.sum((aim.weights * (y - aim.reference)) ** 2) for y in (trial, x))
         if np.abs(equations.scaled(trial)).max(initial=0.0) > TOLERANCE or not distance < before * (1 - 1e-12):
             break
@@ -342,7 +342,7 @@ def _branches(equations, x, aim, model):
     for attempt in range(SEARCHED if aim.movable.any() else 0):
         signs, far = rng.choice([-1.0, 1.0], len(x)), rng.uniform(-FAR, FAR, len(x)) * (1.0 + np.abs(x))
         first = np.where(aim.movable, x * signs + far if attempt else -x, x)
-        y = settle(equations, first, aim, SEARCH_STEPS)
+        y = gauss_newton(equations, first, aim, SEARCH_STEPS)
         residual = np.nan_to_num(np.abs(equations.scaled(y)), nan=np.inf).max(initial=0.0)
         same = residual < TOLERANCE and any(_same_motion(y, z, model) for z in found)
         if residual < TOLERANCE and not same and not _clear_choice(x, y, aim, model):
@@ -379,7 +379,7 @@ def _refuse(equations, aim, held, x):
     alone, all_movable = equations.without_conditions(), replace(aim, movable=np.ones(len(aim.names), dtype=bool))
     loosened, residual = _best(alone, all_movable)
     if not residual < TOLERANCE:
-        loosened = settle(alone, x, all_movable)
+        loosened = gauss_newton(alone, x, all_movable)
         residual = np.abs(alone.scaled(loosened)).max(initial=0.0)
     if held and residual < TOLERANCE:
         left = dict(zip(equations.rows, equations(loosened)[0], strict=True))

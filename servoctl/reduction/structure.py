@@ -157,7 +157,7 @@ def structure(reduction, t=None, jets=None, values=None, start=None):
     """
     names = tuple(reduction.program.residuals)
     orders = [reduction.original[name].order for name in names]
-    if reduction.program.by == "ideal" or max(orders) > 2:
+    if not names or reduction.program.by == "ideal" or max(orders) > 2:
         return _by_orders(reduction, names, orders)
     points = reduction.points if t is None else _points(reduction, t, jets, values)
     locals_ = _locals(reduction, points, t is not None)
@@ -182,7 +182,7 @@ def _most_common(locals_):
 def _by_orders(reduction, names, orders):
     """Ideal programs: the reaction acts through G, so residuals of order s <= 2 meet it after 2 - s derivatives."""
     degrees = tuple(max(0, 2 - s) for s in orders)
-    plain = reduction.program.by == "ideal" and max(orders) <= 2 and not reduction.hidden
+    plain = names and reduction.program.by == "ideal" and max(orders) <= 2 and not reduction.hidden
     index = 1 + max(degrees) if plain else None
     return Structure(
         names, degrees, len(names) if plain else 0, tuple(sorted(degrees)) if plain else (),
