@@ -248,6 +248,13 @@ def test_a_relative_degree_that_is_lost_on_the_way_is_told():
     assert along.relative_degree == (2,) and len(along.at) <= 50
 
 
+def test_the_place_of_a_lost_relative_degree_need_not_be_zero():
+    """The rope upside down."""
+    model = fixed_rope_crane()
+    with refused(sv.SingularProgram, "theta = 3.142", relative_degree=(4,), zero=[]):
+        sv.simulate(model, model.start(theta=np.pi), (0.0, 1.0))
+
+
 def test_a_swinging_load_has_the_degree_of_the_hanging_one():
     """Through theta = 0 no motion of this program passes; the degree there is that of the plant's own motion."""
     model = fixed_rope_crane(target=lambda t: 0.5 * ca.sin(t))

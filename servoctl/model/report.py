@@ -89,8 +89,10 @@ def _lost_degrees(model, t, x, **facts):
         return None
     degrees = zip(usual.residuals, usual.relative_degree, there.relative_degree, strict=True)
     changed = ", ".join(f"that of {name} is {local}, in motion {r}" for name, r, local in degrees if local != r)
-    zero = there.at[0][1].zero
-    where = f", where {' and '.join(f'{name} = 0' for name in zero)}" if zero else ""
+    zero, state = there.at[0][1].zero, dict(zip(model.state_names, x, strict=True))
+    decisive = zero or dict.fromkeys(jet for row in model.row_stories() for jet in model.gradient_jets(row))
+    values = [f"{name} = {state[name]:.4g}" for name in decisive if name in state]
+    where = f", where {' and '.join(values)}" if values else ""
     lost = f"relative degrees differ there ({changed})" if changed else "zeros at infinity differ there"
     return SingularProgram(
         f"The program is singular at t = {t:.7g} s{where}: {lost}.",
