@@ -9,8 +9,7 @@ import pytest
 from scenes import CRANE, CRANE_PROGRAM, POINT, POINT_PROGRAM
 
 import servoctl as sv
-from servoctl.codegen import compiler
-from servoctl.codegen.function import compiling_at_once
+from servoctl.codegen import compiler, function
 from servoctl.gallery import gallery
 from servoctl.model.model import derive
 
@@ -19,19 +18,12 @@ os.environ["SERVOCTL_MEMO"] = "none"  # tests derive themselves what they test
 
 @pytest.fixture(params=("c", "casadi"))
 def backend(request, monkeypatch):
-    """Compiled code at the first call, and CasADi where there is no compiler."""
+    """Compiled code in every grid and loop, and CasADi where there is no compiler."""
+    monkeypatch.setattr(function, "GRID_POINTS", 0)
     if request.param == "casadi":
         monkeypatch.setenv("SERVOCTL_COMPILER", "none")
         monkeypatch.setattr(compiler, "_warned", True)
-    with compiling_at_once():
-        yield request.param
-
-
-@pytest.fixture
-def at_once():
-    """Compiled code at the first call: what shares a model with other tests has the same bits in any order."""
-    with compiling_at_once():
-        yield
+    return request.param
 
 
 @pytest.fixture

@@ -9,8 +9,11 @@ import pytest
 from refusals import warned
 from test_compiled_functions import P1, RK4, X2, T, function, numpy_rk4, pendulum
 
+import servoctl as sv
 from servoctl.codegen import compiler
-from servoctl.codegen.function import GRID_POINTS, SCALAR_CALLS, SOLVED, compiled
+from servoctl.codegen import function as functions
+from servoctl.codegen.function import GRID_POINTS, compiled
+from servoctl.gallery import gallery
 
 
 @pytest.fixture
@@ -33,45 +36,93 @@ def new_process(monkeypatch):
     monkeypatch.setattr(compiler, "_warned", False)
 
 
-def test_nothing_is_compiled_before_it_pays(fresh):
-    model = pendulum(("rk",))
-    for _ in range(SCALAR_CALLS):
+def test_points_and_short_grids_are_not_compiled_however_many(fresh):
+    model = pendulum()
+    for _ in range(200):
         model(0.0, [0.1, 0.2], [1.0])
-    model.grid(0.0, np.zeros((2, GRID_POINTS)), [1.0])
+        model.grid(0.0, np.zeros((2, GRID_POINTS)), [1.0])
     assert not fresh and model.backend == "casadi"
-    before = model(0.3, [0.1, 0.2], [1.0])
+
+
+def test_a_long_grid_is_compiled(fresh):
+    model = pendulum()
+    model.grid(0.0, np.zeros((2, GRID_POINTS + 1)), [1.0])
     assert len(fresh) == 1 and model.backend == "c"
-    np.testing.assert_allclose(model(0.3, [0.1, 0.2], [1.0]), before, rtol=1e-15)
 
 
-@pytest.mark.parametrize("use", [lambda m: m.grid(0.0, np.zeros((2, GRID_POINTS + 1)), [1.0]),
+@pytest.mark.parametrize("use", [lambda m: m.grid(0.0, np.zeros((2, 1)), [1.0]),
+                                 lambda m: m.buffer(),
                                  lambda m: m.rk(0.0, [0.0, 0.0], 0.1, 1, [1.0], RK4),
-                                 lambda m: m.newton(np.zeros(GRID_POINTS), [0.0, 0.0], [1.0])])
-def test_a_long_grid_a_long_path_or_an_integration_compiles_at_once(fresh, use):
+                                 lambda m: m.newton(np.zeros(1), [0.0, 0.0], [1.0])])
+def test_what_an_integration_uses_is_compiled_at_its_first_use(fresh, use):
     model = pendulum_with_loops()
     use(model)
     assert len(fresh) == 1 and model.backend == "c"
-
-
-def test_a_short_path_is_solved_without_compiling(fresh):
-    model = pendulum_with_loops()
-    points = GRID_POINTS // SOLVED
-    model.newton(np.zeros(points), [0.0, 0.0], [1.0])
-    assert not fresh and model.backend == "casadi"
-    model.newton(np.zeros(1), [0.0, 0.0], [1.0])
-    assert len(fresh) == 1 and model.backend == "c"
-
-
-def test_a_kept_library_is_loaded_and_not_compiled(fresh, monkeypatch):
-    pendulum(("rk",)).rk(0.0, [0.0, 0.0], 0.1, 1, [1.0], RK4)
-    again = pendulum(("rk",))
-    again(0.0, [0.0, 0.0], [1.0])
-    assert again.backend == "c"
-    new_process(monkeypatch)
-    in_new_process = pendulum(("rk",))
-    in_new_process(0.0, [0.0, 0.0], [1.0])
-    assert in_new_process.backend == "c"
+    use(model)
     assert len(fresh) == 1
+
+
+def test_a_call_has_the_same_bits_whatever_was_called_before(fresh, monkeypatch):
+    rng = np.random.default_rng(4)
+    x, t = rng.normal(size=(2, 300)), np.linspace(0.0, 1.0, 300)
+    calls = {
+        "point": lambda m: m(0.3, x[:, 0], [1.3]), "short": lambda m: m.grid(t, x, [1.3]),
+        "long": lambda m: m.grid(0.3, np.tile(x, 80), [1.3]), "one": lambda m: m.grid(0.3, x[:, :1], [1.3]),
+    }  # fmt: skip
+    loops = {"steps": lambda m: m.rk(0.0, x[:, 0], 0.1, 50, [1.3], RK4)[1], "of rates": lambda m: m.grid(t, x, [1.3])}
+    for make, known in ((pendulum, calls), (lambda: pendulum(("rk",)), calls | loops)):
+        alone = {name: call(make()) for name, call in known.items()}
+        for _ in range(4):
+            new_process(monkeypatch)
+            model = make()
+            for name in rng.permutation([*known] * 3):
+                np.testing.assert_array_equal(known[name](model), alone[name], err_msg=name)
+
+
+@pytest.mark.parametrize("name", ["overhead-crane", "appell-hamel", "pendubot", "wheeled-robot"])
+@pytest.mark.parametrize("method", [None, "RK4", "Taylor", "RadauIIA", "DOP853"])
+def test_a_repeated_simulation_has_the_same_bits(fresh, name, method):
+    scene, model = gallery[name], sv.derive(*gallery[name].build())
+    start = model.start(**scene.start, guess=scene.guess)
+
+    def motion():
+        run = sv.simulate(model, start, (0.0, 0.3), method, t_eval=np.linspace(0.0, 0.3, 40), progress=False)
+        return [run.jets, *(run[signal] for signal in model.signal_groups)]
+
+    first = motion()
+    sv.simulate(model, start, (0.0, 0.2), t_eval=np.linspace(0.0, 0.2, 700), progress=False)
+    for _ in range(3):
+        for once, again in zip(first, motion(), strict=True):
+            np.testing.assert_array_equal(again, once)
+
+
+def test_a_grid_of_casadi_is_its_points(fresh):
+    rng = np.random.default_rng(5)
+    t, x, p = rng.normal(size=301), rng.normal(size=(2, 301)), rng.normal(size=(1, 301))
+    model = pendulum()
+    for numbers in (p, p[:, 0]):
+        columns = [model(t[k], x[:, k], numbers[:, k] if numbers.ndim == 2 else numbers) for k in range(301)]
+        np.testing.assert_array_equal(model.grid(t, x, numbers).T, columns)
+    assert not fresh
+
+
+def test_a_library_of_another_process_is_loaded_and_not_compiled(fresh, monkeypatch):
+    first = pendulum(("rk",)).rk(0.0, [0.1, 0.0], 0.1, 9, [1.0], RK4)[1]
+    new_process(monkeypatch)
+    again = pendulum(("rk",))
+    np.testing.assert_array_equal(again.rk(0.0, [0.1, 0.0], 0.1, 9, [1.0], RK4)[1], first)
+    assert again.backend == "c" and len(fresh) == 1
+
+
+def test_a_long_series_is_left_to_casadi(fresh, monkeypatch):
+    f, sizes = function(X2[1], -X2[0] / 2), {"nq": 1, "n": 1, "top": 2, "last": 2, "plain": 1}
+    runs = []
+    for limit in (9, 0):
+        monkeypatch.setattr(functions, "TAYLOR_COMPILED", limit)
+        model = compiled(f, "series", ("taylor",), sizes=sizes)
+        runs.append(model.taylor(0.0, [0.1, 0.2], 1e-3, [1.0], 1e-6, 1e-9, 5)[1][:, -1])
+        assert model.backend == ("c" if limit else "casadi")
+    np.testing.assert_allclose(*runs, rtol=1e-14)
 
 
 @pytest.mark.parametrize("damage", [lambda data: b"", lambda data: b"not a library", lambda data: data[:-1000],

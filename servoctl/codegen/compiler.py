@@ -39,36 +39,31 @@ class _CompilerFailed(Exception):
     """The compiler refused the text."""
 
 
-def library(text, build=True, level="-O1"):
+def library(text, level="-O1"):
     """Load the library of a C translation unit; compile it where it is neither loaded nor on disk.
 
     Parameters
     ----------
     text : str
         C text.
-    build : bool
-        Whether to compile at all.
     level : str
         Optimisation level. "-O1" compiles fastest, and its straight-line code is at most a quarter slower than "-O3".
 
     Returns
     -------
     ctypes.CDLL or None
-        None if the library does not exist and `build` is false, or if compiling failed (one warning per process).
+        None without a compiler, or if compiling failed (one warning per process).
     """
     command, identity = _compiler()
     if command is None:
-        return _without("No C compiler was found, or SERVOCTL_COMPILER is none") if build else None
+        return _without("No C compiler was found, or SERVOCTL_COMPILER is none")
     parts = (text, digest(), level, *FLAGS, *_optional_flags(), identity, platform.machine(), _processor())
     key = hashlib.sha256("\0".join(parts).encode()).hexdigest()
     with _guard:
         lock = _locks.setdefault(key, threading.Lock())
     with lock:
         if key not in _loaded:
-            loaded = _open(cache_directory() / f"{key}.so")
-            if loaded is None and not build:
-                return None
-            _loaded[key] = loaded or _build(text, level, f"{key}.so", command)
+            _loaded[key] = _open(cache_directory() / f"{key}.so") or _build(text, level, f"{key}.so", command)
         return _loaded[key]
 
 

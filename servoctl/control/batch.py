@@ -10,7 +10,7 @@ import casadi as ca
 import numpy as np
 
 from servoctl.codegen import compiler, emit
-from servoctl.codegen.function import Compiled, compiled, compiling_at_once
+from servoctl.codegen.function import Compiled, compiled
 from servoctl.codegen.native import pointer
 from servoctl.control.loop import Arguments
 
@@ -205,5 +205,4 @@ def _common(unit, loop):
     """The table of values that are common to all cases, a row per sample."""
     samples = np.arange(loop.samples + 1)
     rows = loop.table[np.minimum(loop.first + samples, len(loop.table) - 1)].T
-    with compiling_at_once():
-        return unit.table.grid(loop.t0 + samples * loop.period, np.zeros((0, len(samples))), rows).T
+    return unit.table.grid(loop.t0 + samples * loop.period, np.zeros((0, len(samples))), rows).T

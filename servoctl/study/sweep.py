@@ -15,7 +15,6 @@ from os import PathLike
 import numpy as np
 
 from servoctl.checks import plain, whole
-from servoctl.codegen.function import compiling_at_once
 from servoctl.control.result import Closed
 from servoctl.errors import ServoError, SpecificationError
 from servoctl.progress import progress_bar
@@ -156,8 +155,7 @@ def evaluate(case, index, parameters, seed):
         signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent handles Ctrl-C: workers finish the case they are at
     random = {} if seed is None else {"rng": generator(seed, CASES, index)}
     try:
-        with compiling_at_once():  # interpreted results differ by rounding, and so would the tables of other workers
-            numbers = _results(case(**parameters, **random), parameters)
+        numbers = _results(case(**parameters, **random), parameters)
     except (Exception, SystemExit) as error:
         facts = json.dumps(getattr(error, "details", {}), default=str)
         return {"case": index, "error": type(error).__name__, "message": str(error), "facts": facts}
