@@ -168,7 +168,16 @@ def test_the_cache_is_where_the_platform_keeps_caches(monkeypatch, tmp_path):
     assert compiler.cache_directory().name == "servoctl"
 
 
-@pytest.mark.parametrize(("name", "value"), [("SERVOCTL_COMPILER", "none"), ("CC", "false"), ("PATH", "")])
+def test_no_compiler_by_choice_needs_no_warning(fresh, monkeypatch):
+    monkeypatch.setenv("SERVOCTL_COMPILER", "none")
+    model = pendulum(("rk",))
+    model.rk(0.0, [0.1, 0.0], 0.1, 5, [1.0], RK4)
+    model.grid(0.0, np.zeros((2, GRID_POINTS + 1)), [1.0])
+    assert compiler.library("int one;") is None
+    assert model.backend == "casadi" and not fresh
+
+
+@pytest.mark.parametrize(("name", "value"), [("CC", "false"), ("PATH", "")])
 def test_without_a_compiler_one_warning_and_the_same_results(fresh, monkeypatch, name, value):
     expected = numpy_rk4(0.0, np.array([0.1, 0.0]), 0.1, 5, 1.0)
     monkeypatch.setenv(name, value)

@@ -2,8 +2,8 @@
 
 A library lies in the cache directory under the hash of its C text, the files that this may include, the flags, the
 compiler and the processor. The compiler is ``SERVOCTL_COMPILER``, else ``CC``, else the first of cc, gcc and clang;
-``SERVOCTL_COMPILER=none`` compiles nothing. Without a compiler, or where it fails, the process warns once and CasADi
-evaluates instead.
+``SERVOCTL_COMPILER=none`` compiles nothing. Without a compiler, or where it fails, CasADi evaluates instead, and the
+process warns once, unless none was chosen.
 
 The flags preserve IEEE arithmetic with one exception: a product and a sum may be contracted to one fused operation,
 which rounds once instead of twice.
@@ -52,11 +52,11 @@ def library(text, level="-O1"):
     Returns
     -------
     ctypes.CDLL or None
-        None without a compiler, or if compiling failed (one warning per process).
+        None without a compiler, or if compiling failed (one warning per process, unless none was chosen).
     """
     command, identity = _compiler()
     if command is None:
-        return _without("No C compiler was found, or SERVOCTL_COMPILER is none")
+        return None if os.environ.get("SERVOCTL_COMPILER") == "none" else _without("No C compiler was found")
     parts = (text, digest(), level, *FLAGS, *_optional_flags(), identity, platform.machine(), _processor())
     key = hashlib.sha256("\0".join(parts).encode()).hexdigest()
     with _guard:

@@ -6,6 +6,7 @@ first use, single points and short grids are left to CasADi, as is everything wh
 """
 
 import functools
+import os
 
 import casadi as ca
 import numpy as np
@@ -401,10 +402,7 @@ class Compiled:
         """Evaluator of loops and buffers: compiled code, or CasADi where nothing is compiled."""
         if "taylor" in self.loops and self.operations > TAYLOR_COMPILED:
             return self._interpreter
-        level = "-O1" if {*self.loops} <= {"rk"} or self.operations > FULLY_OPTIMISED else "-O3"
-        evaluator = self._loaded(self.source, level)
-        self._text = None
-        return evaluator
+        return self._loaded(self.source)
 
     @functools.cached_property
     def _lanes(self):
@@ -413,10 +411,17 @@ class Compiled:
             return self._library
         return self._loaded(lambda: emit.emit(self.expression, self._symbol), "-O1")
 
-    def _loaded(self, source, level):
+    def _loaded(self, source, level=None):
         """Evaluator by the library of a C text, which takes long to write and is not written without a compiler."""
-        library = compiler.library("" if compiler.compiler() is None else source(), level)
+        if os.environ.get("SERVOCTL_COMPILER") == "none":
+            return self._interpreter
+        library = compiler.library("" if compiler.compiler() is None else source(), level or self._level)
+        self._text = None
         return self._interpreter if library is None else Library(library, self._symbol, self.n_x, self.n_p, self.n_y)
+
+    @property
+    def _level(self):
+        return "-O1" if {*self.loops} <= {"rk"} or self.operations > FULLY_OPTIMISED else "-O3"
 
     def source(self):
         """C text of the library."""

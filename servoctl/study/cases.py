@@ -2,7 +2,7 @@
 
 import itertools
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 
 from servoctl.checks import plain, whole
 from servoctl.errors import SpecificationError
@@ -87,6 +87,13 @@ def as_cases(cases):
                 lengths=lengths,
             )
         cases = [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]
+    if not isinstance(cases, Iterable):
+        raise SpecificationError(
+            f"The cases are {cases!r}.",
+            "Cases are a sequence of dicts of parameters, or a dict of columns.",
+            do='Give them as grid(m=[1.0, 2.0]) or {"m": [1.0, 2.0]}.',
+            type=type(cases).__name__,
+        )
     cases = [_case(i, case) for i, case in enumerate(cases)]
     if not cases:
         raise SpecificationError("There is no case.", do="Give at least one, as by grid(m=[1.0, 2.0]).", cases=0)
