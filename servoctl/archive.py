@@ -9,6 +9,7 @@ import numpy as np
 from servoctl.errors import ServoError
 
 FORMAT, SUFFIX = 1, ".npz"
+MOST_LETTERS = 200  # of another package's message
 
 
 @contextlib.contextmanager
@@ -49,8 +50,9 @@ def read(path, what, build):
             require(facts["format"] == FORMAT, f"its format is {facts['format']!r}, not {FORMAT}")
             return build(facts, data)
     except Exception as error:  # of zip, zlib, numpy or json, or from what a damaged file says
+        why = " ".join(str(error).split()).rstrip(".") or type(error).__name__
         raise ServoError(
-            f"{path} cannot be read as a {what}: {error}.",
+            f"{path} cannot be read as a {what}: {why[:MOST_LETTERS]}.",
             f"A {what} is read from an npz file that {what.capitalize()}.save wrote.",
             path=str(path),
             what=what,

@@ -49,9 +49,11 @@ class Checkpoint:
             self._file.seek(0, os.SEEK_END)
             if not whole:
                 self.add({"servoctl_sweep": FORMAT, "identity": key})
-        except (OSError, UnicodeError) as error:
+        except SpecificationError:
+            raise
+        except (OSError, ValueError) as error:  # ValueError: a name that no file can have
             raise ServoError(
-                f"The checkpoint {path} cannot be opened: {getattr(error, 'strerror', None) or error}.",
+                f"The checkpoint {str(path)!r} cannot be opened: {getattr(error, 'strerror', None) or error}.",
                 "A checkpoint must be readable and writable.",
                 do="Choose another path; nothing has been computed yet.",
                 path=str(path),

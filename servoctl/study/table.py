@@ -14,7 +14,7 @@ from servoctl.codegen.compiler import compiler
 from servoctl.errors import SpecificationError, unknown
 from servoctl.version import __version__
 
-_FORMULA = ("=", "+", "-", "@", "\t", "\r", "\n")  # how texts begin that spreadsheets evaluate
+_FORMULA = ("=", "+", "-", "@", "\t", "\n")  # how texts begin that spreadsheets evaluate
 SHOWN, MOST_COLUMNS = 7, 12  # rows of a table in a repr, and columns
 
 
@@ -142,7 +142,10 @@ class Study:
 
 
 def _cell(value):
-    return f"'{value}" if isinstance(value, str) and value.startswith(_FORMULA) else value
+    if not isinstance(value, str):
+        return value
+    text = value.replace("\r\n", "\n").replace("\r", "\n")  # the csv module quotes no carriage return
+    return f"'{text}" if text.startswith(_FORMULA) else text
 
 
 def table(study, names, most=SHOWN):
