@@ -1,6 +1,7 @@
 """The command line: its parser, and the commands without a motion, `servoctl list` and `servoctl report`."""
 
 import argparse
+import os
 import sys
 from pathlib import Path
 
@@ -73,9 +74,8 @@ def _list(args):
 def _report(args):
     from servoctl.gallery import gallery
 
-    folder = Path(args.scene)
-    if args.scene not in gallery and folder.is_dir():
-        print(_earlier_report(folder), end="")
+    if args.scene not in gallery and os.path.isdir(args.scene):
+        print(_earlier_report(Path(args.scene)), end="")
         return 0
     report = Report()
     _, scene = find_scene(args.scene)
