@@ -1,6 +1,8 @@
 """When a function is compiled, where its library is kept, and what happens without a compiler."""
 
+import os
 import subprocess
+import time
 import warnings
 
 import casadi as ca
@@ -10,10 +12,11 @@ from refusals import warned
 from test_compiled_functions import P1, RK4, X2, T, function, numpy_rk4, pendulum
 
 import servoctl as sv
-from servoctl.codegen import compiler
+from servoctl.codegen import cache, compiler
 from servoctl.codegen import function as functions
 from servoctl.codegen.function import GRID_POINTS, compiled
 from servoctl.gallery import gallery
+from servoctl.shell.main import main
 
 
 @pytest.fixture
@@ -216,6 +219,88 @@ def test_a_compiler_that_does_not_serve_is_warned_about(fresh, tmp_path, monkeyp
     assert model.backend == "casadi"
 
 
-def test_an_unclosed_quotation_mark_in_the_command_is_no_traceback(fresh, monkeypatch):
-    monkeypatch.setenv("CC", "nothing 'of this name")
+@pytest.mark.parametrize("variable", ["SERVOCTL_COMPILER", "CC"])
+@pytest.mark.parametrize("command", ["nothing-of-this-name -O9", "nothing 'of this name", "/no/such/gcc"])
+def test_a_named_compiler_that_does_not_exist_is_warned_about(fresh, monkeypatch, variable, command):
+    compiler._identified.cache_clear()
+    monkeypatch.setenv(variable, command)
+    model = pendulum(("rk",))
+    with warned(variable, command.split()[0]):
+        model.rk(0.0, [0.0, 0.0], 0.1, 1, [1.0], RK4)
+    assert model.backend == "c" and len(fresh) == 1
+    pendulum(("rk",)).rk(0.0, [0.0, 0.0], 0.1, 1, [1.0], RK4)  # warned about once
+
+
+def test_a_cache_without_room_is_replaced_by_a_temporary_directory(fresh, tmp_path, monkeypatch):
+    script = tmp_path / "full-cc"
+    script.write_text(f'#!/bin/sh\ncase "$*" in *{tmp_path}/cache*) echo "No space left on device" >&2; exit 1;; esac\n'
+                      'exec cc "$@"\n')
+    script.chmod(0o755)
+    monkeypatch.setenv("CC", str(script))
+    model = pendulum(("rk",))
+    model.rk(0.0, [0.0, 0.0], 0.1, 1, [1.0], RK4)
+    assert model.backend == "c"
+
+
+# what is deleted -----------------------------------------------------------------------------------------------------
+
+
+def library_files(tmp_path):
+    return sorted((tmp_path / "cache").glob("*.so"))
+
+
+def test_libraries_are_pruned_by_size_and_age_and_abandoned_files_go(fresh, tmp_path, monkeypatch):
+    folder, now = tmp_path / "cache", time.time()
+    for k in range(4):
+        compiled(function(X2[1] * k, X2[0]), f"many_{k}", ("rk",)).rk(0.0, [0.0, 0.0], 0.1, 1, [1.0], RK4)
+    oldest, older, *new = library_files(tmp_path)
+    young, abandoned, foreign = (folder / name for name in ("tmpyoung.tmp", "tmpleft.tmp", "notes.txt"))
+    for path, age in ((oldest, 200 * 86400), (older, 100), (young, 10), (abandoned, 7200), (foreign, 10**9)):
+        path.touch()
+        os.utime(path, (now - age, now - age))
+    cache.prune(folder)
+    assert set(folder.iterdir()) == {older, *new, young, foreign}
+    monkeypatch.setattr(cache, "MOST_BYTES", older.stat().st_size)
+    cache.prune(folder)
+    assert older not in folder.iterdir() and {young, foreign} <= set(folder.iterdir())
+
+
+def test_a_library_that_is_used_stays_young(fresh, tmp_path, monkeypatch):
     pendulum(("rk",)).rk(0.0, [0.0, 0.0], 0.1, 1, [1.0], RK4)
+    (path,) = library_files(tmp_path)
+    os.utime(path, (1.0, 1.0))
+    new_process(monkeypatch)
+    pendulum(("rk",)).rk(0.0, [0.0, 0.0], 0.1, 1, [1.0], RK4)
+    assert path.stat().st_mtime > 1e9 and len(fresh) == 1
+
+
+def test_writes_prune_from_time_to_time(fresh, tmp_path, monkeypatch):
+    monkeypatch.setattr(cache, "WRITES", 1)
+    (tmp_path / "cache").mkdir(mode=0o700)
+    left = tmp_path / "cache" / "tmpleft.tmp"
+    left.touch()
+    os.utime(left, (1.0, 1.0))
+    pendulum(("rk",)).rk(0.0, [0.0, 0.0], 0.1, 1, [1.0], RK4)
+    assert not left.exists() and len(library_files(tmp_path)) == 1
+
+
+def test_the_command_says_what_the_cache_holds_and_clears_it(fresh, tmp_path, capsys, monkeypatch):
+    def said(*options):
+        assert main(["cache", *options]) == 0
+        place, *lines = capsys.readouterr().out.splitlines()
+        assert place == str(tmp_path / "cache")
+        return {line.split()[0]: int(line.split()[1]) for line in lines}
+
+    assert said() == {"libraries": 0, "derivations": 0, "temporary": 0}
+    monkeypatch.delenv("SERVOCTL_MEMO", raising=False)
+    model = sv.derive(*gallery["overhead-crane"].build())
+    sv.simulate(model, model.start(guess={"l": 4.0}), (0.0, 1.0))
+    (tmp_path / "cache" / "notes.txt").write_text("not of the cache")
+    held = said()
+    assert held["libraries"] == len(library_files(tmp_path)) > 0
+    assert said("--clear") == {"libraries": 0, "derivations": 0, "temporary": 0}
+    assert (tmp_path / "cache" / "notes.txt").exists()
+    new_process(monkeypatch)
+    again = sv.derive(*gallery["overhead-crane"].build())
+    sv.simulate(again, again.start(guess={"l": 4.0}), (0.0, 1.0))
+    assert said()["libraries"] == held["libraries"]

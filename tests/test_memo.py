@@ -354,8 +354,8 @@ def test_least_used_entries_go_first(derived, tmp_path, monkeypatch):
     old, new = entries(tmp_path)[:2], entries(tmp_path)[2:]
     for path in old:
         os.utime(path, (1.0, 1.0))
-    monkeypatch.setattr(store, "MOST_BYTES", sum(path.stat().st_size for path in old + new) - 1)
-    store._prune(tmp_path / "derived")
+    monkeypatch.setattr(cache, "MOST_BYTES", sum(path.stat().st_size for path in old + new) - 1)
+    cache.prune(tmp_path / "derived")
     assert set(entries(tmp_path)) <= set(new) and entries(tmp_path)
     sv.derive(*pendulum(length=0.8))
     assert not list((tmp_path / "derived").glob("*.tmp"))

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import servoctl as sv
 from servoctl.errors import ServoError
-from servoctl.shell import export, run, sweep, tradeoff
+from servoctl.shell import cache, export, run, sweep, tradeoff
 from servoctl.shell.folder import Report, complain
 from servoctl.shell.scenes import find_scene
 
@@ -57,7 +57,7 @@ def _parser():
     report = commands.add_parser("report", help="the derivation of a model and its structure; no simulation")
     report.add_argument("scene", metavar="NAME_OR_FILE", help="a gallery name, a .py file, or the folder of a run")
     report.set_defaults(command=_report)
-    for add in (run.add_run, tradeoff.add_tradeoff, sweep.add_sweep, export.add_export):
+    for add in (run.add_run, tradeoff.add_tradeoff, sweep.add_sweep, export.add_export, cache.add_cache):
         add(commands)
     return parser
 
