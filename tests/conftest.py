@@ -17,11 +17,22 @@ os.environ["SERVOCTL_MEMO"] = "none"  # tests derive themselves what they test
 compiler._warned = compiler.compiler() is None  # without one the whole suite runs in CasADi
 
 
+@pytest.fixture
+def c_compiler(monkeypatch):
+    """The system's compiler, also where the suite runs without one by choice."""
+    if os.environ.get("SERVOCTL_COMPILER") == "none":
+        monkeypatch.delenv("SERVOCTL_COMPILER")
+    if compiler.compiler() is None:
+        pytest.skip("needs a compiler")
+
+
 @pytest.fixture(params=("c", "casadi"))
 def backend(request, monkeypatch):
     """Compiled code in every grid and loop, and CasADi where there is no compiler."""
     monkeypatch.setattr(function, "GRID_POINTS", 0)
-    if request.param == "casadi":
+    if request.param == "c":
+        request.getfixturevalue("c_compiler")
+    else:
         monkeypatch.setenv("SERVOCTL_COMPILER", "none")
         monkeypatch.setattr(compiler, "_warned", True)
     return request.param

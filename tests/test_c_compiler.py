@@ -20,7 +20,7 @@ from servoctl.shell.main import main
 
 
 @pytest.fixture
-def fresh(tmp_path, monkeypatch):
+def fresh(tmp_path, monkeypatch, c_compiler):
     """As in a new process with an empty cache; the list holds the compiler's commands."""
     monkeypatch.setenv("SERVOCTL_CACHE", str(tmp_path / "cache"))
     new_process(monkeypatch)

@@ -70,7 +70,7 @@ def in_buffer(model, t, x, p):
     return y.copy()
 
 
-def test_every_operation_equals_casadi(monkeypatch):
+def test_every_operation_equals_casadi(monkeypatch, c_compiler):
     monkeypatch.setattr(functions, "GRID_POINTS", 0)
     a, b = X2[0], X2[1]
     expressions = [*(ca.SX.unary(getattr(ca, f"OP_{name.upper()}"), a) for name in UNARY),
@@ -95,7 +95,7 @@ def test_every_operation_equals_casadi(monkeypatch):
             np.testing.assert_array_max_ulp(row, expected, maxulp=2)
 
 
-def test_constants_are_exact(monkeypatch):
+def test_constants_are_exact(monkeypatch, c_compiler):
     monkeypatch.setattr(functions, "GRID_POINTS", 0)
     model = compiled(function(*CONSTANTS), "constants")
     y = model.grid(0.0, np.zeros((2, 20)), [0.0])
@@ -103,7 +103,7 @@ def test_constants_are_exact(monkeypatch):
     np.testing.assert_array_equal(y[:, -1], CONSTANTS)
 
 
-def test_chunks_equal_one_function_and_casadi_to_the_last_bit(monkeypatch):
+def test_chunks_equal_one_function_and_casadi_to_the_last_bit(monkeypatch, c_compiler):
     monkeypatch.setenv("CC", "cc -ffp-contract=off")
     f = random_function(2600)
     assert emit.operations(f) > 5000
@@ -358,7 +358,7 @@ def test_newton_keeps_what_it_solved_where_the_solution_ends(backend, count):
     assert model.newton(t, [1e9], [0.0], max_iter=3)[0].shape == (1, 0)
 
 
-def test_both_backends_count_the_same_iterations(monkeypatch):
+def test_both_backends_count_the_same_iterations(monkeypatch, c_compiler):
     x = ca.SX.sym("x")
     t = np.arange(0.0, 6.0, 0.5)
     results = []

@@ -46,7 +46,7 @@ LONG = [sv.RungeKutta(4, step=2e-6), sv.RungeKutta(8, step=2e-6), "Taylor", "Rad
 
 
 @pytest.mark.parametrize("method", LONG, ids=str)
-def test_an_integration_of_minutes_is_interrupted_and_kept(wheel_model, method, ctrl_c):
+def test_an_integration_of_minutes_is_interrupted_and_kept(wheel_model, method, ctrl_c, c_compiler):
     model, start = wheel_model
     short = sv.RungeKutta(method.order, step=1e-3) if isinstance(method, sv.RungeKutta) else method
     sv.simulate(model, start, (0.0, 0.1), short, progress=False)  # compiled
@@ -133,7 +133,7 @@ def test_pauses_change_no_bit(plan, what, steps, monkeypatch):
     assert paused.success
 
 
-def test_many_loops_are_interrupted_and_the_finished_ones_kept(plan, law, ctrl_c):
+def test_many_loops_are_interrupted_and_the_finished_ones_kept(plan, law, ctrl_c, c_compiler):
     run = sv.close(sv.plant(CRANE), law, plan.state(0.0), (0.0, 8.0), timing=sv.Timing(substeps=20))
     sv.close_many(run, {"m_load": np.linspace(90.0, 110.0, 16)})  # compiled
     loads = np.linspace(90.0, 110.0, 60_000)

@@ -18,8 +18,8 @@ from servoctl.codegen.native import Library
 from servoctl.errors import SpecificationError, unknown
 
 GRID_POINTS = 20_000  # CasADi takes some 0.3 us per point: a longer grid takes as long as compiling it
-FULLY_OPTIMISED = 12_000  # operations: up to here -O3 takes at most 1.5 s; with -O1 30,000 do
-TAYLOR_COMPILED = 30_000  # operations: beyond, compiling takes longer than 10,000 steps that CasADi evaluates
+FULLY_OPTIMISED = 6_000  # operations: up to here -O3 takes at most 1.5 s; with -O1 15,000 take no longer
+TAYLOR_COMPILED = 15_000  # operations: beyond, compiling takes as long as 50,000 steps that CasADi evaluates
 
 _OUTPUTS_PER_STATE = {"rk": 1, "newton": 2, "taylor": 1}
 
