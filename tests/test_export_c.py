@@ -20,6 +20,8 @@ from servoctl.export.c import export_c
 from servoctl.export.files import Array, Constant, Contents, Routine, Scalar, identifier, write
 from servoctl.gallery import gallery
 
+pytestmark = pytest.mark.usefixtures("c_compiler")
+
 STRICT = ("-std=c99", "-O1", "-Wall", "-Wextra", "-pedantic", "-Werror")
 TOLERANCE = 1e-12
 
