@@ -144,3 +144,10 @@ def signal(model, kind, t, jets):
     """A group of signals by name at one instant."""
     names, function = model.signals(kind)
     return dict(zip(names, function(t, jets, model.parameters), strict=True))
+
+
+def pytest_collection_modifyitems(items):
+    """Tests with "RadauIIA" among their parameters use the compiler: its steps are C code."""
+    for item in items:
+        if "RadauIIA" in item.name and hasattr(item, "fixturenames"):
+            item.fixturenames.append("c_compiler")

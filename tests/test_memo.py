@@ -73,7 +73,7 @@ CASES = [
 
 
 @pytest.mark.parametrize(("name", "options"), [c for c in CASES if c[0] in gallery])
-def test_the_memo_gives_the_same_run_to_the_bit_and_derives_nothing(derived, name, options):
+def test_the_memo_gives_the_same_run_to_the_bit_and_derives_nothing(derived, name, options, c_compiler):
     first, run = planned(name, **options)
     after_first = len(derived)
     again, repeated = planned(name, **options)
