@@ -218,13 +218,10 @@ class Monitor:
         self.l_names, self.b_names = model.leading_names()
         self.reference = None
         matrices = [np.nan_to_num(m, nan=0.0, posinf=0.0, neginf=0.0) for m in self._matrices(t, x)]
-        self.columns = [
-            np.where(now > 0, now, np.where(usual > 0, usual, 1.0))
-            for now, usual in zip(map(column_sizes, matrices), model.column_sizes, strict=True)
-        ]
-        if before is not None:
-            self.columns = before.columns
+        self.columns = self._columns(t, x, matrices) if before is None else before.columns
         self.rows = [np.linalg.norm(m / c, axis=1) for m, c in zip(matrices, self.columns, strict=True)]
+        for row, i in model.balances().items():  # TᵀM grows at the zeros of a pivot; √M_ii is its size with others
+            self.rows[0][row] = self.columns[0][i]
         self.stories = [model.row_stories(), {}]
         self.largest = np.abs(np.asarray(x, dtype=float))
         self.best, self.lift = self._smallest(matrices), 1.0
@@ -233,6 +230,24 @@ class Monitor:
         self.m = len(model.invariant_names())
         jacobian = self.invariants(t, x, model.parameters)[self.m :].reshape(len(x), self.m).T
         self.gradients = np.maximum(np.sqrt((jacobian**2 * (1.0 + np.abs(x)) ** 2).sum(axis=1)), 1e-300)
+
+    def _columns(self, t, x, matrices):
+        """√M_ii, with which the entries of a row have one unit; for columns without inertia the size of their entries.
+
+        That is the largest entry in rows scaled by their columns with inertia; where all of it is zero, the size at the
+        points at which ranks were decided.
+        """
+        inertia = self.f(t, x, self.model.parameters)[-self.model.n :]
+        metric = np.sqrt(np.where(inertia > 0, inertia, 0.0))
+        moves, result = metric > 0, []
+        for m, usual in zip(matrices, self.model.column_sizes, strict=True):
+            scaled = np.abs(m) / np.where(moves, metric, 1.0)
+            rows = scaled[:, moves].max(axis=1, initial=0.0)
+            rows = np.where(rows > 0, rows, scaled.max(axis=1, initial=0.0))[:, None]
+            now = (scaled / np.where(rows > 0, rows, 1.0)).max(axis=0, initial=0.0)
+            massless = np.where(now > 0, now, np.where(usual > 0, usual, 1.0))
+            result.append(np.where(moves, metric, massless))
+        return result
 
     def _inherit(self, before, matrices):
         for i, names in enumerate((self.l_names, self.b_names)):
@@ -249,7 +264,7 @@ class Monitor:
         n = self.model.n
         y = self.f(t, x, self.model.parameters)
         rows = len(self.l_names)
-        return y[: rows * n].reshape(n, rows).T, y[rows * n :].reshape(n, len(self.b_names)).T
+        return y[: rows * n].reshape(n, rows).T, y[rows * n : -n].reshape(n, len(self.b_names)).T
 
     def _smallest(self, matrices):
         result = []
