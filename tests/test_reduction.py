@@ -81,11 +81,94 @@ def test_orders_free_values_and_needs_of_the_gallery(name, gallery_model):
     assert sum(model.raised.values()) == model.reduction.top * model.n - model.free
 
 
-@pytest.mark.parametrize("alpha", [1e-5, 1e-6, *([1e-7] if EXTENDED else [])])  # sin²α is above the noise of pivots
+@pytest.mark.parametrize("alpha", [1e-5, 1e-6, *([2e-7] if EXTENDED else [])])  # sin²α is above the noise of pivots
 def test_a_nearly_singular_car_is_called_ill_conditioned(alpha):
     with refused(SingularProgram, "z", "balance of s", kept=pytest.approx(1.0, abs=1e-3)) as caught:
         derive(*mass_on_car(alpha=alpha))
     assert caught.value.details["dropped"] < 1e-10
+
+
+@pytest.mark.parametrize("alpha", [5e-8, 1e-8])
+def test_a_car_that_is_singular_up_to_rounding_is_level_and_its_margin_is_told(alpha):
+    """The pivot sin²α lies within the rounding of constants: the guide is level, and the report holds the pivot."""
+    model, level = derive(*mass_on_car(alpha=alpha)), derive(*mass_on_car(alpha=0.0))
+    assert orders(model) == orders(level) and model.free == level.free == 1
+    assert model.reduction.rank.dropped == pytest.approx(alpha**2, rel=0.02)
+    assert f"largest dropped {model.reduction.rank.dropped:.1e}" in repr(model)
+
+
+# decimal factors -----------------------------------------------------------------------------------------------------
+
+DECIMALS = [(0.7, 0.9, 0.31, 0.3), (0.63, 0.54, 0.56, 0.9), (0.28, 0.81, 0.67, 0.1), (0.853, 0.064, 0.917, 0.77)]
+
+
+def decimal_residual(q, a, b, c):
+    x, y, z = q
+    return a * x + b * y + c * z - 0.2 * ca.sin(q.t)
+
+
+@pytest.mark.parametrize("turned", [False, True])
+@pytest.mark.parametrize("order", [1, 2])
+@pytest.mark.parametrize("a, b, c, k", DECIMALS)
+def test_a_hidden_row_behind_decimal_factors_is_found(a, b, c, k, order, turned):
+    """k f^(order) + 0.7 f + 0.5 z - 0.1 t beside f: 0.5 z = 0.1 t is hidden, whatever the roundings of k a, k b, k c."""
+    q = sv.coordinates("x y z")
+    if turned:
+        z = list(q)[2]
+        q = q.with_quasi_velocities("u v w", [[ca.cos(z), -ca.sin(z), 0], [ca.sin(z), ca.cos(z), 0], [0, 0, 1]])
+    mechanism = sv.Mechanism(q, gibbs=sv.particle(q, 1.0, tuple(q)))
+    f = decimal_residual(q, a, b, c)
+    program = sv.Program({"f": f, "g": k * q.dt(f, order) + 0.7 * f + 0.5 * list(q)[2] - 0.1 * q.t}, by="ideal")
+    model = derive(mechanism, program)
+    assert model.free == 2 and len(model.reduction.hidden) == 1
+    jets = dict(zip(model.jet_names, motion(model, 0.4, x=0.1), strict=True))
+    assert jets["z"] == pytest.approx(0.08, abs=1e-13)
+    assert a * 0.1 + b * jets["y"] + c * 0.08 == pytest.approx(0.2 * np.sin(0.4), abs=1e-13)
+
+
+def test_decimal_factors_as_parameters_are_decided_again():
+    q = sv.coordinates("x y z")
+    p = sv.parameters(a=0.7, b=0.9, c=0.31, k=0.3)
+    mechanism = sv.Mechanism(q, gibbs=sv.particle(q, 1.0, tuple(q)), parameters=p)
+    f = decimal_residual(q, p.a, p.b, p.c)
+    model = derive(mechanism, sv.Program({"f": f, "g": p.k * q.dt(f) + 0.5 * list(q)[2] - 0.1 * q.t}, by="ideal"))
+    for a, b, c, k in DECIMALS:
+        assert model.with_parameters(a=a, b=b, c=c, k=k).free == 2
+
+
+@pytest.mark.parametrize("a, b, c, k", DECIMALS)
+def test_a_row_that_is_a_decimal_multiple_is_called_dependent(a, b, c, k):
+    q = sv.coordinates("x y z")
+    mechanism = sv.Mechanism(q, gibbs=sv.particle(q, 1.0, tuple(q)))
+    f = decimal_residual(q, a, b, c)
+    with refused(SpecificationError, "vanishes identically", rows=["f", "g"]):
+        derive(mechanism, sv.Program({"f": f, "g": k * f}, by="ideal"))
+    with refused(SpecificationError, "vanishes identically", rows=["f", "g"]):
+        derive(mechanism, sv.Program({"f": f, "g": k * q.dt(f)}, by="ideal"))
+
+
+@pytest.mark.parametrize("tilt", [5.0, 3.7, 11.3])
+def test_a_flat_point_given_as_a_number_is_flat(tilt):
+    """The point of the aircraft whose motion determines everything, its distance rounded to a double."""
+    q = sv.coordinates("x z theta")
+    x, z, theta = q
+    M, J, l, h, tilt = 50.0, 25.0, 1.0, 0.1, np.radians(tilt)
+    arm = l * np.cos(tilt) + h * np.sin(tilt)
+    across, along = ca.vertcat(ca.cos(theta), ca.sin(theta)), ca.vertcat(-ca.sin(theta), ca.cos(theta))
+    mechanism = sv.Mechanism(
+        q,
+        gibbs=sv.rigid_body(q, M, (0, 0, J), position=(x, z), rates=(0, 0, q.d(1)[2])),
+        potential=M * 9.81 * z,
+        actuators={
+            "u1": ca.vertcat(along + np.sin(tilt) * across, arm),
+            "u2": ca.vertcat(along - np.sin(tilt) * across, -arm),
+        },
+    )
+    distance = J * np.sin(tilt) / (M * arm)
+    for e in (distance, np.nextafter(distance, 1.0), np.nextafter(distance, 0.0)):
+        X, Z = x - e * ca.sin(theta), z + e * ca.cos(theta)
+        path = 0.3 * ca.sin(q.t)
+        assert derive(mechanism, sv.Program({"X": X - path, "Z": Z - path})).flat
 
 
 # programs with a turn ------------------------------------------------------------------------------------------------

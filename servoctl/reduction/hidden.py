@@ -12,7 +12,7 @@ import numpy as np
 from servoctl.errors import InconsistentStart, NotRealisable, SingularProgram, SpecificationError
 from servoctl.reduction.manifold import sample
 from servoctl.reduction.ranks import clean, decide, decide_all, decide_each, eliminate, generic
-from servoctl.reduction.rows import Row, dependence, leading, merge_uses, settle, vanishing_gradient
+from servoctl.reduction.rows import Row, dependence, leading, merge_uses, settle, values_and_sizes, vanishing_gradient
 from servoctl.tolerances import NOISE, RESOLVED
 
 
@@ -32,7 +32,7 @@ def complete(q, rows, context, starts=None):
     -------
     rows : list of Row
     rank : Rank
-        Rank of the final leading matrix, with its margins.
+        Rank of the final leading matrix, with its margins; `dropped` is the largest of all leading matrices before it.
     points : Points
         Points of the final manifold.
     pivots : list of (str, SX)
@@ -49,7 +49,7 @@ def complete(q, rows, context, starts=None):
     InconsistentStart
         If no state satisfies the rows.
     """
-    rows, pivots, points = list(rows), [], starts
+    rows, pivots, points, dropped = list(rows), [], starts, 0.0
     while True:
         level = max([row.order for row in rows], default=0)
         points = sample(q, rows, level, context, starts=points)
@@ -61,12 +61,13 @@ def complete(q, rows, context, starts=None):
         if not rank.clear:
             raise _ill_conditioned(rows, rank)
         same = [p for p, other in enumerate(ranks) if other.rank == rank.rank]
+        dropped = max(dropped, rank.dropped)
         if rank.rank == len(rows):
-            return rows, rank, points.take(same), pivots
+            return rows, replace(rank, dropped=dropped), points.take(same), pivots
         combination = _lowest(q, rows, numbers[:, :, same], context, points)
         if combination.row.order < 0:
             raise _dependent(rows, combination)
-        rows[combination.replaces] = combination.row
+        rows[combination.replaces] = replace(combination.row, parts=())
         pivots += [(f"combination of {combination.row.story}", pivot) for pivot in combination.pivots]
 
 
@@ -105,12 +106,13 @@ def _combination(q, rows, b, support, numbers, context, starts=None):
     top = rows[b].order
     _require_affine(rows, support, top)
     others = [a for a in support if a != b]
-    chi, pivots = _combine(q, rows, b, others, top, numbers)
+    parts, pivots = _combine(q, rows, b, others, top, numbers)
     names = [_derivative_name(rows[a], top - rows[a].order) for a in others]
     story = f"{rows[b].name} with {', '.join(names)}" if names else rows[b].name
     rest = [row for a, row in enumerate(rows) if a != b]
     uses = merge_uses(*((rows[a].uses, top - rows[a].order) for a in support))
-    row, points = settle(q, replace(rows[b], expression=chi, order=top, uses=uses), rest, context, starts)
+    chi = replace(rows[b], expression=ca.cse(sum(parts)), order=top, uses=uses, parts=tuple(parts))
+    row, points = settle(q, chi, rest, context, starts)
     if row is None:
         raise _no_state(rest)
     return _Combination(replace(row, story=story), b, support, points, pivots)
@@ -131,17 +133,16 @@ def _beside_manifold(q, rows, b, context):
 
 
 def _combine(q, rows, b, others, top, numbers):
-    """χ = ψ_b + Σ w_a D^(top - o_a) ψ_a with the w that cancels the leading gradient of row b."""
-    chi = q.derivatives([rows[b].expression], top - rows[b].order)[-1][0]
+    """The terms of χ = ψ_b + Σ w_a D^(top - o_a) ψ_a with the w that cancels the leading gradient of row b."""
     if not others:
-        return chi, []
+        return [rows[b].expression], []
     columns = sorted(decide(numbers[others, :, 0]).columns)
     matrix = ca.vertcat(*(rows[a].gradient(q) for a in others))[:, columns].T
     target = -rows[b].gradient(q)[:, columns].T
     w, pivots = eliminate(matrix, target, numbers[others][:, columns].swapaxes(0, 1))
-    for a, weight in zip(others, w.elements(), strict=True):
-        chi = chi + weight * q.derivatives([rows[a].expression], top - rows[a].order)[-1][0]
-    return ca.cse(chi), [p for p in pivots if ca.symvar(p)]
+    raised = (q.derivatives([rows[a].expression], top - rows[a].order)[-1][0] for a in others)
+    parts = [rows[b].expression, *(weight * e for weight, e in zip(w.elements(), raised, strict=True))]
+    return parts, [p for p in pivots if ca.symvar(p)]
 
 
 def _derivative_name(row, k):
@@ -163,7 +164,7 @@ def _require_affine(rows, support, top):
 def _dependent(rows, combination):
     """The error of rows whose combination depends on t alone."""
     names, story = [rows[a].name for a in combination.support], combination.row.story
-    zero = not np.any(clean(*combination.points.evaluate([combination.row.expression])))
+    zero = not np.any(clean(*values_and_sizes(combination.row, combination.points)))
     listed = ", ".join(names)
     if any(rows[a].kind == "dynamics" for a in combination.support):
         program = [name for name in names if name != combination.row.name] or names

@@ -54,6 +54,8 @@ class Row:
         The combination that it is, if it is a hidden constraint.
     uses : dict of (str or Balance) to int
         Highest derivative of each residual, and of the balance, that ψ contains.
+    parts : tuple of SX
+        Terms whose sum ψ is, where these may cancel: beside them rounding of folded constants is zero.
     """
 
     expression: ca.SX
@@ -63,6 +65,7 @@ class Row:
     affine: bool = True
     story: str = ""
     uses: dict = field(default_factory=dict)
+    parts: tuple = field(default=(), repr=False, compare=False)
     _gradients: dict = field(default_factory=dict, repr=False, compare=False)
 
     def gradient(self, q, level=None):
@@ -221,7 +224,7 @@ def settle(q, row, others, context, starts=None):
     if not len(points.t):
         return None, points
     for j in range(q.order(row.expression), -1, -1):
-        values = clean(*points.matrix(row.gradient(q, j)))[0]
+        values = _slopes(q, row, j, points)
         if np.any(values):
             lower = [other for other in others if other.order < j or (other.order == j and other.affine and j > 0)]
             eliminated = _eliminated(q, row, j, values, lower, points)
@@ -230,17 +233,37 @@ def settle(q, row, others, context, starts=None):
             row = eliminated
         elif j > 0:
             row = _without(q, row, q.gamma(j), points)
-    if q.order(row.expression) == 0 and not np.any(clean(*points.matrix(row.gradient(q, 0)))):
+    if q.order(row.expression) == 0 and not np.any(_slopes(q, row, 0, points)):
         return replace(row, order=-1), points
     return replace(row, order=max(q.order(row.expression), -1)), points
 
 
+def _slopes(q, row, j, points):
+    """∂ψ/∂γ^(j) at points (n, N), zero where it is rounding beside the slopes of the row's parts."""
+    values, sizes = points.matrix(row.gradient(q, j))
+    for part in row.parts:
+        slopes = ca.jacobian(part, q.jet(j))
+        sizes = np.maximum(sizes, np.abs(points.matrix(slopes if j or q.plain else slopes @ q.V)[0]))
+    return clean(values, sizes)[0]
+
+
+def values_and_sizes(row, points):
+    """Values and sizes (1, N) of a row at points, the sizes at least those of its parts."""
+    values, sizes = points.evaluate([row.expression])
+    return values, np.maximum(sizes, np.abs(points.evaluate(list(row.parts))[0]).max(axis=0, initial=0.0))
+
+
 def _without(q, row, symbols, points):
     """The row with jets set to zero, or the row itself if that changes its value at a point."""
-    expression = ca.substitute(row.expression, ca.vertcat(*symbols), ca.SX.zeros(len(symbols)))
-    values, sizes = points.evaluate([expression, row.expression])
-    same = np.abs(values[0] - values[1]) <= ENTRY * (sizes[0] + sizes[1])
-    return replace(row, expression=expression) if np.all(same) else row
+    expression, *parts = _substituted(row, symbols, ca.SX.zeros(len(symbols)))
+    (without,), _ = points.evaluate([expression])
+    (value,), (size,) = values_and_sizes(row, points)
+    return replace(row, expression=expression, parts=tuple(parts)) if np.all(np.abs(value - without) <= ENTRY * size) else row
+
+
+def _substituted(row, symbols, values):
+    """The expression and the parts of a row with symbols replaced."""
+    return ca.substitute([row.expression, *row.parts], [ca.vertcat(*symbols)], [values])
 
 
 def _affine(q, expression, j, points):
@@ -278,7 +301,8 @@ def _eliminated(q, row, j, values, lower, points):
     solution = ca.SX.zeros(q.n)
     solution[columns], _ = eliminate(matrix, -rest, numbers[:, columns])
     uses = merge_uses((row.uses, 0), *((other.uses, j - other.order) for other in rows))
-    return replace(row, expression=ca.cse(ca.substitute(row.expression, jets, solution)), uses=uses)
+    expression, *parts = _substituted(row, ca.vertsplit(jets), solution)
+    return replace(row, expression=ca.cse(expression), uses=uses, parts=tuple(parts))
 
 
 def dependence(numbers):
