@@ -12,6 +12,7 @@ from servoctl import spec as sv
 from servoctl.errors import InconsistentStart, NotRealisable, SingularProgram, SpecificationError
 from servoctl.gallery import cars, gallery, mass_on_car, overhead_crane, passive_arm, spiral
 from servoctl.model.model import derive
+from servoctl.simulation import simulate
 from servoctl.tolerances import EXTENDED
 
 
@@ -169,6 +170,111 @@ def test_a_flat_point_given_as_a_number_is_flat(tilt):
         X, Z = x - e * ca.sin(theta), z + e * ca.cos(theta)
         path = 0.3 * ca.sin(q.t)
         assert derive(mechanism, sv.Program({"X": X - path, "Z": Z - path})).flat
+
+
+# factors that vanish ------------------------------------------------------------------------------------------------
+
+
+CURVES = {  # points of the parameter u, and their heading
+    "wave": (lambda m, u: (u, m.sin(u)), lambda u: np.arctan(np.cos(u))),
+    "parabola": (lambda m, u: (u, u**2), lambda u: np.arctan(2 * u)),
+    "circle": (lambda m, u: (2 * m.cos(u), 2 * m.sin(u)), lambda u: u + np.pi / 2),
+}
+
+
+@pytest.mark.parametrize("speed", ["squared", "forward"])
+@pytest.mark.parametrize("kind", CURVES)
+def test_a_geometric_path_beside_rolling_is_followed(kind, speed):
+    """Rolling beside a path by its geometry leaves the speed times an angle; the angle is the hidden row."""
+    q = sv.coordinates("x y psi u")
+    (x, y, psi, u), (dx, dy, *_) = q, q.d(1)
+    curve, heading = CURVES[kind]
+    X, Y = curve(ca, u)
+    mechanism = sv.Mechanism(
+        q,
+        gibbs=sv.particle(q, 1.0, (x, y)) + sv.particle(q, 0.1, psi) + sv.particle(q, 1e-3, u),
+        constraints={"slip": dx * ca.sin(psi) - dy * ca.cos(psi)},
+    )
+    rate = dx**2 + dy**2 - 1.0 if speed == "squared" else dx * ca.cos(psi) + dy * ca.sin(psi) - 1.0
+    model = derive(mechanism, sv.Program({"X": x - X, "Y": y - Y, "speed": rate}, by="ideal"), guess={"du": 1.0})
+    assert model.free == 1 and [row.name for row in model.reduction.hidden] == ["slip"]
+    start = model.start(u=0.3, guess={"du": 0.8, "psi": heading(0.3)})
+    run = simulate(model, start, (0.0, 2.0))
+    assert run["psi"] == pytest.approx(heading(run["u"]), abs=1e-7)
+    assert np.hypot(run["dx"], run["dy"]) == pytest.approx(1.0, abs=1e-7)
+
+
+@pytest.mark.parametrize("expanded", [False, True])
+def test_a_residual_with_a_speed_for_a_factor_is_told_so(expanded):
+    q = sv.coordinates("u psi")
+    (u, psi), (du, _) = q, q.d(1)
+    mechanism = sv.Mechanism(q, gibbs=sv.particle(q, 1.0, (u, u**2)) + sv.particle(q, 0.1, psi))
+    slip = 2 * u * ca.cos(psi) - ca.sin(psi)
+    times_speed = 2 * du * u * ca.cos(psi) - du * ca.sin(psi) if expanded else du * slip
+    speed = du**2 * (1 + 4 * u**2) - 1.0
+    for guess in (None, {"du": 1.0}):
+        with refused(SingularProgram, "Divide 'slip' by du", row="slip", factor="du"):
+            derive(mechanism, sv.Program({"slip": times_speed, "speed": speed}, by="ideal"), guess=guess)
+    assert derive(mechanism, sv.Program({"slip": slip, "speed": speed}, by="ideal")).free == 1
+
+
+PRODUCTS = {  # residuals a and b of x, y, z and t; the factor of b that a keeps at zero
+    "two residuals": (lambda x, y, z, t: (x - t, (x - t) * (y - ca.sin(t))), "(x-t)"),
+    "in a fraction": (lambda x, y, z, t: (x - t, -2 * (x - t) * (y - t) / (2 + ca.cos(z))), "(x-t)"),
+    "a square": (lambda x, y, z, t: (x - t, (x - t) ** 2 * y), "(x-t)"),
+}
+
+
+@pytest.mark.parametrize("name", PRODUCTS)
+def test_a_residual_with_a_factor_that_another_keeps_at_zero_is_told_so(name):
+    q = sv.coordinates("x y z")
+    build, factor = PRODUCTS[name]
+    a, b = build(*q, q.t)
+    mechanism = sv.Mechanism(q, gibbs=sv.particle(q, 1.0, tuple(q)))
+    with refused(SpecificationError, f"Divide 'b' by {factor}", row="b", factor=factor):
+        derive(mechanism, sv.Program({"a": a, "b": b}, by="ideal"))
+
+
+def test_a_rate_that_another_residual_keeps_at_zero_is_named():
+    q = sv.coordinates("x y u")
+    (_, y, u), (dx, dy, du) = q, q.d(1)
+    mechanism = sv.Mechanism(q, gibbs=sv.particle(q, 1.0, tuple(q)))
+    for program, factor in (
+        ({"u": u - 1.0, "slip": du * (dx - 1.0)}, "du"),
+        ({"u": du - 1.0, "slip": (du - 1.0) * (dy - ca.sin(q.t))}, "(du-1)"),
+        ({"u": u - q.t, "slip": (du - 1.0) * (y - ca.sin(q.t))}, "(du-1)"),
+    ):
+        with refused(SpecificationError, "has the factor", row="slip", factor=factor):
+            derive(mechanism, sv.Program(program, by="ideal"))
+
+
+@pytest.mark.parametrize("power", [2, 3])
+def test_the_factor_of_a_square_is_named(power):
+    q = sv.coordinates("x y")
+    x, y = q
+    mechanism = sv.Mechanism(q, gibbs=sv.particle(q, 1.0, (x, y)))
+    with refused(SingularProgram, "Divide 'a' by (x-t)", row="a", factor="(x-t)"):
+        derive(mechanism, sv.Program({"a": (x - q.t) ** power}, by="ideal"))
+
+
+CONTRADICTIONS = {  # residuals that no state satisfies
+    "circles": lambda q, x, y: (x**2 + y**2 - 1, x**2 + y**2 - 4),
+    "a circle by its root": lambda q, x, y: (x**2 + y**2 - 1, ca.sqrt(x**2 + y**2) - 2),
+    "a rate": lambda q, x, y: (ca.sin(x) + y - ca.sin(q.t), q.dt(ca.sin(x) + y) - 2 * ca.cos(q.t)),
+    "a rate with the residual": lambda q, x, y: (
+        ca.sin(x) + y * x - ca.sin(q.t),
+        0.3 * q.dt(ca.sin(x) + y * x - ca.sin(q.t)) + 0.3 * (ca.sin(x) + y * x - ca.sin(q.t)) - 0.1 * q.t,
+    ),
+}
+
+
+@pytest.mark.parametrize("name", CONTRADICTIONS)
+def test_bent_constraints_that_contradict_each_other_are_told_so(name):
+    q = sv.coordinates("x y z")
+    a, b = CONTRADICTIONS[name](q, *list(q)[:2])
+    mechanism = sv.Mechanism(q, gibbs=sv.particle(q, 1.0, tuple(q)))
+    with refused(SpecificationError, "contradict", rows=["a", "b"]):
+        derive(mechanism, sv.Program({"a": a, "b": b}, by="ideal"))
 
 
 # programs with a turn ------------------------------------------------------------------------------------------------

@@ -221,7 +221,7 @@ class Equations(Invariants):
         return eliminate(matrix, -residual, clean(values, sizes))[0]
 
     def matrices(self):
-        """L and Bᵀ, column by column: their ranks must not change; and the diagonal of M, by which columns are scaled."""
+        """L and Bᵀ, column by column, whose ranks must not change, and the diagonal of M, which scales columns."""
         matrices = [ca.vec(ca.densify(m)) for m in (self.r.leading, self.r.realisation.B.T)]
         return self.function("matrices", self.state, [*matrices, ca.densify(ca.diag(self.r.mechanism.mass))])
 

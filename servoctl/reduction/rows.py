@@ -17,6 +17,7 @@ BASIS_CUTOFF = 1e-12  # relative singular value of independent rows below which 
 VANISHED = 1e-5  # gradient on a row's solutions, relative to random points, below which the row is a square
 SQUARE_STEPS = 40  # Newton steps towards these solutions; for a square each only halves the distance
 SOLVED = 1e-3  # scaled residual of points at which the gradient of a possible square is judged
+SAME_DEPTH = 20  # nested operations to which factors are compared
 BESIDE = 0.5  # relative distance of the points with which solutions are compared
 
 
@@ -139,7 +140,7 @@ def _refuse_square(q, row, context, slopes=None):
     solved = residual < SOLVED
     if solved.any() and np.all(sizes[1][solved] < VANISHED * sizes[0][solved]):
         if not _regular_nearby(flow, start.t[solved], z[:, solved]):
-            raise vanishing_gradient(row)
+            raise vanishing_gradient(row, _repeated(factors(row.expression)))
 
 
 def _regular_nearby(flow, t, z):
@@ -156,14 +157,38 @@ def _regular_nearby(flow, t, z):
     return bool(np.any(converged & (here > VANISHED * there)))
 
 
-def vanishing_gradient(row):
-    """The error of a row whose gradient vanishes wherever the row holds."""
+def vanishing_gradient(row, factor=None, others=()):
+    """The error of a row whose gradient vanishes wherever the row holds, by reason of a factor if one is known."""
+    because = "" if factor is None else f": it has the factor {factor}"
     return SingularProgram(
-        f"The gradient of row {row.name!r} vanishes on its own solutions.",
+        f"The gradient of row {row.name!r} vanishes on its own solutions{because}.",
         "A constraint φ = 0 needs a gradient there; that of φ² = 0 is zero and determines no direction of the motion.",
-        do=f"Write {row.name!r} without the square, so that it changes sign at its solutions.",
+        do=f"Write {row.name!r} without the square, so that it changes sign at its solutions."
+        if factor is None
+        else f"Divide {row.name!r} by {factor}.",
         row=row.name,
+        **({} if factor is None else {"factor": str(factor)}),
     )
+
+
+def _repeated(items):
+    """The first SX scalar that occurs twice, or None."""
+    return next((f for i, f in enumerate(items) if any(ca.is_equal(f, g, SAME_DEPTH) for g in items[:i])), None)
+
+
+def factors(expression):
+    """Factors of an SX scalar that are no constants, repeated ones as often as they occur."""
+    operation = expression.op()
+    inner = [expression.dep(i) for i in range(expression.n_dep())]
+    if operation == ca.OP_MUL:
+        return [f for e in inner for f in factors(e)]
+    if operation == ca.OP_SQ:
+        return 2 * factors(inner[0])
+    if operation in (ca.OP_NEG, ca.OP_TWICE, ca.OP_DIV):
+        return factors(inner[0])
+    if operation in (ca.OP_POW, ca.OP_CONSTPOW) and inner[1].is_constant() and float(inner[1]) >= 2:
+        return 2 * factors(inner[0])
+    return [expression] if ca.symvar(expression) else []
 
 
 def leading(q, rows, points):
@@ -224,7 +249,7 @@ def settle(q, row, others, context, starts=None):
     if not len(points.t):
         return None, points
     for j in range(q.order(row.expression), -1, -1):
-        values = _slopes(q, row, j, points)
+        values = slopes(q, row, j, points)
         if np.any(values):
             lower = [other for other in others if other.order < j or (other.order == j and other.affine and j > 0)]
             eliminated = _eliminated(q, row, j, values, lower, points)
@@ -233,17 +258,17 @@ def settle(q, row, others, context, starts=None):
             row = eliminated
         elif j > 0:
             row = _without(q, row, q.gamma(j), points)
-    if q.order(row.expression) == 0 and not np.any(_slopes(q, row, 0, points)):
+    if q.order(row.expression) == 0 and not np.any(slopes(q, row, 0, points)):
         return replace(row, order=-1), points
     return replace(row, order=max(q.order(row.expression), -1)), points
 
 
-def _slopes(q, row, j, points):
+def slopes(q, row, j, points):
     """∂ψ/∂γ^(j) at points (n, N), zero where it is rounding beside the slopes of the row's parts."""
     values, sizes = points.matrix(row.gradient(q, j))
     for part in row.parts:
-        slopes = ca.jacobian(part, q.jet(j))
-        sizes = np.maximum(sizes, np.abs(points.matrix(slopes if j or q.plain else slopes @ q.V)[0]))
+        gradient = ca.jacobian(part, q.jet(j))
+        sizes = np.maximum(sizes, np.abs(points.matrix(gradient if j or q.plain else gradient @ q.V)[0]))
     return clean(values, sizes)[0]
 
 
@@ -258,7 +283,8 @@ def _without(q, row, symbols, points):
     expression, *parts = _substituted(row, symbols, ca.SX.zeros(len(symbols)))
     (without,), _ = points.evaluate([expression])
     (value,), (size,) = values_and_sizes(row, points)
-    return replace(row, expression=expression, parts=tuple(parts)) if np.all(np.abs(value - without) <= ENTRY * size) else row
+    same = np.all(np.abs(value - without) <= ENTRY * size)
+    return replace(row, expression=expression, parts=tuple(parts)) if same else row
 
 
 def _substituted(row, symbols, values):
