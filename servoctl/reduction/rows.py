@@ -17,6 +17,7 @@ BASIS_CUTOFF = 1e-12  # relative singular value of independent rows below which 
 VANISHED = 1e-5  # gradient on a row's solutions, relative to random points, below which the row is a square
 SQUARE_STEPS = 40  # Newton steps towards these solutions; for a square each only halves the distance
 SOLVED = 1e-3  # scaled residual of points at which the gradient of a possible square is judged
+FELT = 1e-9  # a term above this fraction of a row's parts is not their rounding
 SAME_DEPTH = 20  # nested operations to which factors are compared
 BESIDE = 0.5  # relative distance of the points with which solutions are compared
 
@@ -266,10 +267,19 @@ def settle(q, row, others, context, starts=None):
 def slopes(q, row, j, points):
     """∂ψ/∂γ^(j) at points (n, N), zero where it is rounding beside the slopes of the row's parts."""
     values, sizes = points.matrix(row.gradient(q, j))
-    for part in row.parts:
-        gradient = ca.jacobian(part, q.jet(j))
-        sizes = np.maximum(sizes, np.abs(points.matrix(gradient if j or q.plain else gradient @ q.V)[0]))
-    return clean(values, sizes)[0]
+    values = clean(values, sizes)[0]
+    if not row.parts or not np.any(values) or _is_felt(q, row, j, values, points):
+        return values
+    gradients = [ca.jacobian(part, q.jet(j)) for part in row.parts]
+    parts, _ = points.matrix(ca.vertcat(*(g if j or q.plain else g @ q.V for g in gradients)))
+    return clean(values, np.abs(parts).max(axis=0))
+
+
+def _is_felt(q, row, j, values, points):
+    """Whether slopes times their jets are no rounding of the row's parts: then the slopes themselves are none."""
+    if values.shape != points.jet(j).shape:
+        return False
+    return bool(np.any(np.abs(values * points.jet(j)) > FELT * values_and_sizes(row, points)[1]))
 
 
 def values_and_sizes(row, points):
