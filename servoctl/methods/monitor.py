@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from servoctl.errors import IntegrationStopped, ServoError, SingularProgram
+from servoctl.methods.sizes import motion_sizes
 
 DEGRADED = 0.02  # of its reference: a pivot below this is replaced, if the matrix itself is better than that
 HELPS = 5.0  # factor by which the matrix must be better
@@ -228,7 +229,9 @@ class Monitor:
             self._inherit(before, matrices)
         self.m = len(model.invariant_names())
         jacobian = self.invariants(t, x, model.parameters)[self.m :].reshape(len(x), self.m).T
-        self.gradients = np.maximum(np.sqrt((jacobian**2 * (1.0 + np.abs(x)) ** 2).sum(axis=1)), 1e-300)
+        sizes = motion_sizes(model, np.array([t, t + 1.0]), np.column_stack([x, x]))
+        sizes = np.where(sizes > 0, sizes, 1.0) + np.abs(x)
+        self.gradients = np.maximum(np.sqrt((jacobian**2 * sizes**2).sum(axis=1)), 1e-300)
 
     def _columns(self, t, x, matrices):
         """√M_ii, with which the entries of a row have one unit; for columns without inertia the size of their entries.

@@ -25,6 +25,8 @@ from servoctl.reduction.rows import (
 )
 from servoctl.tolerances import NOISE, RESOLVED
 
+DIVIDES = 1e-3  # of its usual size: a combination is not divided by a jet that is smaller at a point
+
 
 def complete(q, rows, context, starts=None):
     """Replace rows by hidden constraints until their leading matrix has full row rank.
@@ -156,6 +158,9 @@ def _divided(q, rows, combination, context):
     level = whole.order
     beside = np.abs(_slopes_beside(q, rows, combination, context)).max(axis=1, initial=0.0)
     i = int(np.argmax(beside))
+    jet = q.jet_names(level)[i]
+    if not np.abs(combination.points.jet(level)[i]).min(initial=np.inf) > DIVIDES * context.sizes.get(jet, 1.0):
+        raise vanishing_gradient(rows[b])  # at rest a = 0 would follow from nothing
     rest = [row for a, row in enumerate(rows) if a != b]
     row = replace(whole, expression=ca.densify(whole.gradient(q, level))[i], parts=())
     row, points = settle(q, row, rest, context, combination.points)
@@ -164,7 +169,6 @@ def _divided(q, rows, combination, context):
     points = sample(q, [*rest, row], level, context, starts=points)
     if not len(points.t) or np.any(clean(*values_and_sizes(whole, points))):
         raise vanishing_gradient(rows[b])
-    jet = q.jet_names(level)[i]
     return replace(combination, row=replace(row, story=f"{combination.row.story}, divided by {jet}"), points=points)
 
 
