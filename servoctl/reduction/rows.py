@@ -289,12 +289,14 @@ def values_and_sizes(row, points):
 
 
 def _without(q, row, symbols, points):
-    """The row with jets set to zero, or the row itself if that changes its value at a point."""
-    expression, *parts = _substituted(row, symbols, ca.SX.zeros(len(symbols)))
-    (without,), _ = points.evaluate([expression])
+    """The row with jets set to zero, or to one where it divides by them; the row itself if that changes its value."""
     (value,), (size,) = values_and_sizes(row, points)
-    same = np.all(np.abs(value - without) <= ENTRY * size)
-    return replace(row, expression=expression, parts=tuple(parts)) if same else row
+    for constant in (ca.SX.zeros(len(symbols)), ca.SX.ones(len(symbols))):
+        expression, *parts = _substituted(row, symbols, constant)
+        (without,), _ = points.evaluate([expression])
+        if np.all(np.abs(value - without) <= ENTRY * size):
+            return replace(row, expression=expression, parts=tuple(parts))
+    return row
 
 
 def _substituted(row, symbols, values):
