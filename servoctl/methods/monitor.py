@@ -277,11 +277,11 @@ class Monitor:
         return np.array(result)
 
     def rank_measure(self, t, x):
-        """The smallest equilibrated singular value of L or of B, relative to the best so far."""
+        """The smallest scaled singular value of L or of B, relative to the best so far unless that is rounding."""
         self.largest = np.maximum(self.largest, np.abs(x))
         now = self._smallest(self._matrices(t, x))
         self.best = np.maximum(self.best, now)
-        return float(np.min(now / np.where(self.best > 0, self.best, 1.0)))
+        return float(np.min(now / np.where(self.best > HOPELESS, self.best, 1.0)))
 
     def begin(self, pivots):
         """Start a piece: the first step is compared with the pivots (n_g,) at its start."""
@@ -466,8 +466,9 @@ class Monitor:
         what = what if lost else f"the rows {', '.join(map(repr, dependent))} lose their rank"
         return SingularProgram(
             f"The program is singular at t = {t:.7g} s: {what}{where}; {why}.",
-            f"The smallest equilibrated singular value is {measure:.1e} of its best along the motion; accelerations "
-            f"are undetermined in the direction of {', '.join(direction)}.",
+            f"The smallest singular value, rows of size 1 in the metric of the inertia, is {measure:.1e} "
+            f"{'of its best along the motion' if self.best.min() > HOPELESS else 'from the start'}; "
+            f"accelerations are undetermined in the direction of {', '.join(direction)}.",
             do="Write the residual in a form whose gradient does not vanish (linear in velocities, not squared), or "
             "plan around this state. The run before it is in .run.",
             t=float(t),

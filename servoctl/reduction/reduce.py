@@ -151,6 +151,7 @@ def smoothness(switches, rows):
     return total
 
 
+@np.errstate(all="ignore")  # trial values may leave the domain of the rows: what is not finite is no point
 def reduce(mechanism, program, guess=None, near=None, values=None):
     """Derive the rows of a motion: eq. (3.18), hidden constraints, ranks on the manifold.
 
