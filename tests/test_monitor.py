@@ -51,7 +51,7 @@ def test_a_program_that_is_singular_at_its_start_says_by_how_much():
     monitor = Monitor(model, 0.0, state)
     error = monitor.singular(0.0, state, "its lever is zero")
     assert monitor.rank_measure(0.0, state) < 1e-9 and error.details["measure"] < 1e-9
-    assert "from the start" in str(error) and "1.0e+00" not in str(error)
+    assert "from the first instant on" in str(error) and "1.0e+00" not in str(error)
 
 
 def test_quiet_steps_are_fine(circle):
