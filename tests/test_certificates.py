@@ -146,7 +146,7 @@ def test_higher_jets_excuse_no_residual(gallery_model):
     ]
     assert np.abs(moved).max() > 100 * np.abs(short).max()
     assert found[0].numbers["residual string"] == found[1].numbers["residual string"] > 1e-6
-    assert found[0].failures == found[1].failures
+    assert all("residual string" in proof.failures for proof in found)
 
 
 def test_a_failure_tells_what_is_allowed(scene_run):

@@ -1,0 +1,502 @@
+"""Checks of a run against the full mechanism, at its samples and at instants between them."""
+
+from dataclasses import dataclass, replace
+from math import factorial
+
+import numpy as np
+
+from servoctl.checks import whole
+from servoctl.control.result import Closed
+from servoctl.errors import SpecificationError
+from servoctl.methods.taylor import series_loop
+from servoctl.model.model import Model
+from servoctl.model.store import fingerprint
+from servoctl.run import SAME_TIME, Run, require_model
+from servoctl.verification.between import Flow, Settings, between
+from servoctl.verification.loop import verify_loop
+from servoctl.verification.result import Verification, judged
+
+LIMITS = {
+    "samples": 0.0,
+    "signals": 1e-9,
+    "acceleration": 1e-9,
+    "segments": 1e-6,
+    "power": 1e-8,
+    "energy": 1e-5,
+    "multiplier form": 1e-9,
+    "higher jets": 1e-8,
+    "residual": 1e-6,
+    "outside": np.inf,
+}
+INTEGRATED = 1e-6  # limit for numbers that drift disturbs: γ'' is integrated itself, or rows are hidden
+ROUNDING = 1e-13  # relative change of states and inputs whose effect is rounding: some hundred roundings
+PROBE, PROBES = 1e-7, 3  # relative change by which a response is measured, and in how many directions
+FLOOR = 1e-3  # least size of a component, relative to what moves as much mass, and to what moves there in the span
+BLUNT = 1e-3  # effect of rounding, relative to the accelerations, above which these decide nothing
+OWN_INSTANTS, MOST_OWN = 200, 8  # instants between samples at which everything is checked, in all and of an interval
+BY_INPUTS = 1e-6  # part of the accelerations that rounding of the inputs may excuse
+MOST_ENTRIES = 2e6  # of matrices that are held at once
+
+
+def verify(model: Model | Closed, run: Run | None = None, segments: int = 20) -> Verification:
+    """Check a run against the full mechanism, not the reduced model.
+
+    At every sample, and at instants between samples, the mechanism's accelerations under the required actuation are
+    compared with the run's; residuals are evaluated at every level, dE/dt is compared with the power of all forces, and
+    (3.18) with the form that has multipliers. From each sample to the next the motion is integrated again, by steps
+    as short as it requires, so that the verdict does not depend on the distance of the samples.
+
+    An error is relative to the sizes of the terms that it is a sum of. It also passes if it is no larger than what
+    rounding of the state and of the inputs causes.
+
+    A closed loop is verified by `verify(closed)`: it is run again and all its signals are compared; its energy against
+    the work of inputs, disturbances and friction, with two lengths of step; material constraints; limits.
+
+    Parameters
+    ----------
+    model : Model or Closed
+    run : Run
+        Of this model; omitted for a closed loop.
+    segments : int
+        Number of steps along the run, at least 1; each interval between samples has at least one.
+
+    Returns
+    -------
+    Verification
+        Its verdict is "inconclusive" where a motion is too fast for the steps, or the run has a single sample.
+
+    Raises
+    ------
+    SpecificationError
+        If the run is not of this model, or segments is not a whole number of at least 1.
+    """
+    segments = whole("segments", segments, least=1)
+    if run is None and isinstance(model, Closed):
+        return verify_loop(model)
+    run, faulty = _required(model, run)
+    if faulty or not len(run.t):
+        return judged({"samples": float(faulty or 1)}, {"samples": LIMITS["samples"]})
+    checks = _Checks(model, run, segments)
+    numbers = {
+        "samples": 0.0,
+        "signals": checks.signals(),
+        "acceleration": checks.acceleration(),
+        **checks.balance(),
+        "multiplier form": checks.multiplier_form(),
+        **checks.higher_jets(),
+        **checks.outside(),
+        **checks.residuals(),
+    }
+    numbers |= {"segments": checks.segments()} if len(run.t) > 1 else {}
+    limits = {key: checks.limit("residual" if key.startswith("residual ") else key) for key in numbers}
+    return judged(numbers, limits, checks.notes, checks.doubts)
+
+
+# --- what is verified
+
+
+def _required(model, run):
+    """The run by this model, as far as its samples are finite, and the number of faulty samples.
+
+    A motion that stopped may end in samples without accelerations.
+    """
+    require_model(model, run, "verify")
+    _require_same(model, run.model)
+    try:
+        t, jets = np.asarray(run.t, dtype=float), np.asarray(run.jets, dtype=float)
+    except (TypeError, ValueError):
+        t = jets = np.zeros(0)
+    least = len(model.jet_names)
+    if t.ndim != 1 or jets.ndim != 2 or jets.shape != (len(run.jet_names), len(t)) or len(jets) < least:
+        raise SpecificationError(
+            f"The run has times of the shape {t.shape} and jets of the shape {jets.shape}.",
+            f"It has one time and at least {least} jets for each sample.",
+            do="Pass a run as sv.simulate returns it.",
+            times=t.shape,
+            jets=jets.shape,
+        )
+    good = np.isfinite(t) & np.all(np.isfinite(jets), axis=0)
+    count = len(t) if run.success or not good.any() else 1 + int(np.flatnonzero(good)[-1])
+    steps = np.diff(t[:count])
+    forward = t[count - 1] > t[0] if count else True
+    faulty = int(np.sum(~good[:count]) + np.sum((steps <= 0) if forward else (steps >= 0)))
+    variants = tuple((a, min(b, count), v) for a, b, v in run.variants if a < count and _same(model, v))
+    if [a for a, *_ in variants] != [0, *(b for _, b, _ in variants)][:-1] or not variants or variants[-1][1] != count:
+        variants = ((0, count, model),)
+    stored = {name: np.asarray(values[:count], dtype=float) for name, values in run.stored.items() if len(values) == len(t)}
+    return replace(run, t=t[:count], jets=jets[:, :count], model=model, variants=variants, stored=stored), faulty
+
+
+def _same(model, other):
+    """Whether two models have the same specification and numbers, up to the choice of pivots."""
+    marks = {fingerprint(m.reduction.mechanism, m.reduction.program, values=()) for m in (model, other)}
+    return model is other or (len(marks) == 1 and np.array_equal(model.parameters, other.parameters))
+
+
+def _require_same(model, other):
+    """Refuse a run whose model has other equations or parameters."""
+    if _same(model, other):
+        return
+    names = model.reduction.mechanism.parameters.names
+    pairs = zip(names, model.parameters, other.parameters, strict=False)
+    changed = [name for name, a, b in pairs if a != b]
+    which = f"other numbers of {', '.join(changed)}" if changed else "another mechanism or program"
+    raise SpecificationError(
+        f"sv.verify received a run of a model with {which}.",
+        "A run is verified against the model that it was simulated with.",
+        do="Pass run.model, or simulate this model.",
+        parameters=changed,
+    )
+
+
+@dataclass(frozen=True)
+class _Instants:
+    """Instants at which one variant of the model is evaluated: times (N,), jets (n_z, N) and inputs (m, N).
+
+    `first` is the index of the first in the run; None for instants between samples.
+    """
+
+    model: object
+    t: np.ndarray
+    z: np.ndarray
+    inputs: np.ndarray
+    first: int | None = None
+
+    def signals(self, kind):
+        f = self.model.signals(kind)[1]
+        return f.grid(self.t, self.z[: f.n_x], self.model.parameters)
+
+
+class _Checks:
+    """The checks of one run; `notes` and `doubts` collect what does not apply and what cannot be decided."""
+
+    def __init__(self, model, run, segments):
+        self.model, self.run, self.notes, self.doubts = model, run, [], []
+        self.drifts = run.method == "Taylor" or model.reduction.top > 2 or bool(model.reduction.hidden and not model.flat)
+        self.stored, self.fresh = run.stored, replace(run, stored={}, stored_residual={})
+        self.span = abs(run.t[-1] - run.t[0]) or 1.0
+        self.samples = [
+            _Instants(v, run.t[a:b], run.jets[:, a:b], inputs, a)
+            for (a, b, v), inputs in zip(run.variants, self._inputs(), strict=True)
+        ]
+        self.mass = self._mass()
+        self.sizes = self._sizes(self.samples)
+        self.balanced = self._balanced()
+        self.between, self.sampled, own = self._integrate(segments)
+        self.instants = [*self.samples, *own]
+        self.sizes = self._sizes(self.instants)
+        if not run.success:
+            self.notes.append("the run did not reach its end: errors grow near a singularity")
+
+    def limit(self, key):
+        """The limit of a number."""
+        drifts = self.drifts and key in ("acceleration", "power", "multiplier form")
+        return INTEGRATED if drifts else LIMITS[key]
+
+    def _inputs(self):
+        """The actuation, or the reaction of an ideal program, as the run gives it, by variant."""
+        names = self.model.signals("reaction" if self.model.ideal else "actuation")[0]
+        values = np.array([self.stored.get(name, self.fresh[name]) for name in names]).reshape(len(names), -1)
+        return [values[:, a:b] for a, b, _ in self.run.variants]
+
+    # sizes
+
+    def _mass(self):
+        """The largest inertia of each velocity along the run, (n,) array."""
+        model, few = self.samples[0].model, np.unique(np.linspace(0, len(self.samples[0].t) - 1, 16).astype(int))
+        matrices, _ = model.multiplier_form(*self._at(self.samples[0], few))
+        return np.abs(np.einsum("iik->ik", matrices[: model.n, : model.n])).max(axis=1)
+
+    def _at(self, instants, which):
+        return instants.t[which], instants.z[: len(self.model.jet_names), which]
+
+    def _sizes(self, instants):
+        """The size of each jet (n_z,): its largest value, at least FLOOR of what others of its level have.
+
+        Levels are compared through the inertia: what carries the same kinetic energy. A level is also at least FLOOR of
+        what the level below would change by in the span.
+        """
+        nq, n = self.model.nq, self.model.n
+        sizes = np.zeros(len(self.run.jets))
+        for at in instants:
+            sizes[: len(at.z)] = np.maximum(sizes[: len(at.z)], np.abs(at.z).max(axis=1))
+        weights, plain = np.sqrt(self.mass), self.model.reduction.mechanism.q.plain
+        for first in range(nq, len(sizes), n):
+            level = sizes[first : first + n]
+            below = sizes[first - n : first] / self.span if first > nq or plain else 0.0
+            level = np.maximum(level, FLOOR * below)
+            least = np.divide((weights * level).max(), weights, out=np.zeros(n), where=weights > 0)
+            sizes[first : first + n] = np.maximum(level, FLOOR * least)
+        moved = FLOOR * self.span * sizes[nq : nq + n] if plain else 0.0
+        sizes[:nq] = np.maximum(sizes[:nq], np.maximum(moved, FLOOR * FLOOR * sizes[:nq].max()))
+        return np.where(sizes > 0, sizes, 1.0)
+
+    def _response(self, f, t, x, y, steps):
+        """Change of f(t, x, p) = y if each entry of x changes by its step: root mean square over random directions."""
+        directions = np.random.default_rng(0).standard_normal((PROBES, len(x), 1))
+        with np.errstate(all="ignore"):
+            changes = [np.nan_to_num(f(t, x + PROBE * d * steps) - y) / PROBE for d in directions]
+        return np.sqrt(np.mean(np.square(changes), axis=0))
+
+    # between samples
+
+    def _integrate(self, segments):
+        """The intervals between samples and knots, which edges are samples, and instants inside."""
+        run, knots = self.run, np.asarray(self.run.knots)
+        if len(run.t) < 2:
+            self.doubts.append("one sample is no motion: simulate with more samples")
+            return None, None, []
+        near = np.abs(knots[:, None] - run.t).min(axis=1) <= SAME_TIME * (1 + np.abs(knots)) if len(knots) else []
+        knots = np.array([k for k, known in zip(knots, near, strict=True) if not known and self._inside(k)])
+        edges = np.union1d(run.t, knots)[:: 1 if run.t[-1] > run.t[0] else -1]
+        sampled = np.isin(edges, run.t)
+        flat = self.model.flat and run.method == "algebraic"
+        n_x = self.model.nq if flat else len(self.model.state_names)
+        x = np.full((n_x, len(edges)), np.nan)
+        x[:, sampled] = run.jets[:n_x]
+        count, sample = len(edges) - 1, np.cumsum(sampled) - 1
+        flows = {id(v): Flow(v, flat, self.balanced) for *_, v in run.variants}
+        steps = np.full(count, -(-segments // count))
+        watched = slice(None, None, max(1, count // OWN_INSTANTS))
+        steps[watched] = np.maximum(steps[watched], np.clip(-(-OWN_INSTANTS // count) + 1, 2, MOST_OWN))
+        settings = Settings(self.sizes[:n_x], LIMITS["segments"], steps)
+        found = between(lambda k: flows[id(run.variant(sample[k]))], edges, x, settings)
+        return found, sampled, self._own(found)
+
+    def _inside(self, t):
+        return min(self.run.t[0], self.run.t[-1]) < t < max(self.run.t[0], self.run.t[-1])
+
+    def _own(self, found):
+        """Instants inside the intervals, some OWN_INSTANTS of them, by variant."""
+        by_flow = {}
+        for flow, t, z in found.inside:
+            by_flow.setdefault(flow, []).append((t, z))
+        own = []
+        for flow, parts in by_flow.items():
+            t, z = (np.concatenate(values, axis=-1) for values in zip(*parts, strict=True))
+            few = np.unique(np.linspace(0, len(t) - 1, OWN_INSTANTS).astype(int))
+            instants = _Instants(flow.model, t[few], flow.corrected(t[few], z[:, few]), None)
+            own.append(replace(instants, inputs=instants.signals("inputs")))
+        return own
+
+    def segments(self):
+        """Largest difference of the states from those integrated from the sample before."""
+        found = self.between
+        unknown = np.flatnonzero(~found.resolved)
+        if len(unknown):
+            first = self.run.t[np.cumsum(self.sampled)[unknown[0]] - 1]
+            self.doubts.append(
+                f"in {len(unknown)} of {len(found.resolved)} intervals between samples, the first at t = {first:.6g} s, "
+                "the motion is too fast to follow, or singular: simulate with more samples (t_eval)"
+            )
+        known = found.defects[found.resolved]
+        return float(np.nanmax(known, initial=0.0))
+
+    # the equations
+
+    def acceleration(self):
+        """Largest error of the mechanism's γ'' under the inputs."""
+        n, nq = self.model.n, self.model.nq
+        worst, blunt, limit, size = 0.0, 0.0, self.limit("acceleration"), self.sizes[nq + n : nq + 2 * n, None]
+        for at in self.instants:
+
+            def f(t, x, model=at.model):
+                return model.function("plant").grid(t, x, model.parameters)[nq:]
+
+            def given(t, z, f=f, at=at):
+                inputs = at.model.signals("inputs")[1]
+                return f(t, np.vstack([z[: nq + n], inputs.grid(t, z[: inputs.n_x], at.model.parameters)]))
+
+            x = np.vstack([at.z[: nq + n], at.inputs])
+            accelerations = f(at.t, x)
+            rounding = ROUNDING * self._response(f, at.t, x, accelerations, np.abs(x))
+            of_inputs = ROUNDING * self._response(given, at.t, at.z, given(at.t, at.z), np.abs(at.z))
+            excused = rounding + np.minimum(of_inputs, BY_INPUTS * size)
+            errors = np.abs(accelerations - at.z[nq + n : nq + 2 * n]) / (size + excused / limit)
+            worst, blunt = max(worst, _largest(errors)), max(blunt, _largest(rounding / size))
+        if blunt > BLUNT:
+            self.doubts.append(
+                f"rounding changes the mechanism's accelerations by {blunt:.1e} of their size: scale the units, or "
+                "replace stiff springs and small masses by constraints"
+            )
+        return worst
+
+    def multiplier_form(self):
+        """Largest residual of [M -B; C 0] [γ''; μ] = ..., relative to the largest terms of each row."""
+        parts = [self._rows(at) for at in self.instants]
+        terms = np.max([terms for _, terms, _ in parts], axis=0)[:, None]
+        sizes = (terms + rounding / self.limit("multiplier form") for *_, rounding in parts)
+        return max(_largest(_ratio(rows, size)) for (rows, *_), size in zip(parts, sizes, strict=True))
+
+    def _rows(self, at):
+        """Residuals (rows, N), largest terms (rows,) and rounding (rows, N) of the equations with multipliers."""
+        n, nq, n_z = self.model.n, self.model.nq, len(self.model.jet_names)
+        z, f = at.z[:n_z], at.model.signals("all_multipliers")[1]
+
+        def multipliers(t, z):
+            return f.grid(t, z, at.model.parameters)
+
+        mu = multipliers(at.t, z)
+        d_mu = self._response(multipliers, at.t, z, mu, np.abs(z))
+        largest = np.concatenate([self.sizes[nq + n : nq + 2 * n], np.abs(mu).max(axis=1, initial=0.0)])
+        unknowns = np.concatenate([z[nq + n : nq + 2 * n], mu])
+        columns = len(unknowns)
+        few = max(1, int(MOST_ENTRIES / columns**2))
+        rows, terms, rounding = [], [], []
+        for a in range(0, len(at.t), few):
+            part = slice(a, a + few)
+
+            def residual(t, z, y=unknowns[:, part]):
+                matrix, right = at.model.multiplier_form(t, z)
+                return np.einsum("ijk,jk->ik", matrix, y) - right
+
+            matrix, right = at.model.multiplier_form(at.t[part], z[:, part])
+            matrix_size = np.abs(matrix)
+            rows.append(np.einsum("ijk,jk->ik", matrix, unknowns[:, part]) - right)
+            terms.append((np.einsum("ijk,j->ik", matrix_size, largest) + np.abs(right)).max(axis=1))
+            response = self._response(residual, at.t[part], z[:, part], rows[-1], np.abs(z[:, part]))
+            response += np.einsum("ijk,jk->ik", matrix_size[:, n:], d_mu[:, part])
+            rounding.append(ROUNDING * response)
+        return np.concatenate(rows, axis=1), np.max(terms, axis=0), np.concatenate(rounding, axis=1)
+
+    def residuals(self):
+        """Largest residual of each row at any level, by the relative change of the jets that would remove it."""
+        names, _ = self.model.signals("residuals")
+        worst = {f"residual {name}": 0.0 for name in self.run.residual}
+        for at in self.instants:
+            f = at.model.signals("residuals")[1]
+            z = at.z[: f.n_x]
+
+            def values(t, z, f=f, model=at.model):
+                return f.grid(t, z, model.parameters)
+
+            levels = values(at.t, z)
+            response = self._response(values, at.t, z, levels, self.sizes[: f.n_x, None])
+            response = np.maximum(response, FLOOR * np.median(response, axis=1, keepdims=True))
+            if at.first is not None:
+                levels = self._as_stored(np.abs(levels), names, at.first)
+            for (name, _), level, size in zip(names, levels, response, strict=True):
+                worst[f"residual {name}"] = max(worst[f"residual {name}"], _largest(_ratio(level, size)))
+        return worst
+
+    def _as_stored(self, levels, names, first):
+        """Levels, or those that the run has stored if these are larger."""
+        for i, (name, level) in enumerate(names):
+            stored = self.run.stored_residual.get(name)
+            if stored is not None and np.ndim(stored) == 2 and np.shape(stored)[1] >= first + levels.shape[1]:
+                levels[i] = np.fmax(levels[i], np.abs(stored[level, first : first + levels.shape[1]]))
+        return levels
+
+    def signals(self):
+        """Largest difference of a stored signal from its value at the samples, relative to its largest value."""
+        worst = 0.0
+        for name, values in self.stored.items():
+            if name in self.fresh.names:
+                again = self.fresh[name]
+                worst = max(worst, _largest(_ratio(values - again, np.abs(again).max())))
+        return worst
+
+    # energy
+
+    def _balanced(self):
+        """Whether dE/dt is the power of the forces; a note if not."""
+        rate, _, size, by_time = np.concatenate([at.signals("power") for at in self.samples], axis=1)
+        balanced = np.abs(by_time).max() < 1e-9 * max(np.abs(size).max(), np.abs(rate).max(), 1e-300)
+        balanced = balanced or not np.any(by_time)
+        if not balanced:
+            reason = "the inertia terms depend on time or on more than wᵀMw/2"
+            self.notes.append(f"power balance: not applicable, {reason}")
+        return balanced
+
+    def balance(self):
+        """Errors of power and of energy, if the balance applies."""
+        if not self.balanced:
+            return {}
+        n, nq = self.model.n, self.model.nq
+        speeds, accelerations = self.sizes[nq : nq + n], self.sizes[nq + n : nq + 2 * n]
+        scale = FLOOR * (self.mass * speeds * accelerations).max()
+        errors, roundings = [], []
+        for at in self.instants:
+            f = at.model.signals("power")[1]
+
+            def defect(t, z, f=f, model=at.model):
+                rate, work, *_ = f.grid(t, z, model.parameters)
+                return (rate - work)[None]
+
+            z = at.z[: f.n_x]
+            rate, work, size, _ = f.grid(at.t, z, at.model.parameters)
+            errors.append((rate - work)[None])
+            roundings.append(ROUNDING * self._response(defect, at.t, z, errors[-1], np.abs(z)))
+            inertial = np.abs(at.z[nq : nq + n] * at.z[nq + n : nq + 2 * n]).T @ self.mass
+            scale = max(scale, (np.abs(size) + np.abs(rate) + inertial).max())
+        sizes = (scale + rounding / self.limit("power") for rounding in roundings)
+        power = max(_largest(_ratio(error, size)) for error, size in zip(errors, sizes, strict=True))
+        return {"power": power} | self._energy(scale)
+
+    def _energy(self, power):
+        """Largest difference of the energy gained from the work, relative to the kinetic energy and the work done."""
+        if self.between is None or not self.between.resolved.all():
+            return {}
+        energies = []
+        for at in self.samples:
+            f = at.model.signals("energy")[1]
+
+            def energy(t, z, f=f, model=at.model):
+                return f.grid(t, z, model.parameters)
+
+            z = at.z[: f.n_x]
+            values = energy(at.t, z)
+            energies.append(np.vstack([values, ROUNDING * self._response(energy, at.t, z, values, np.abs(z))]))
+        energy, rounding = np.concatenate(energies, axis=1)
+        work = np.append(0.0, np.cumsum(self.between.work))[self.sampled]
+        kinetic = (self.mass * self.sizes[self.model.nq : self.model.nq + self.model.n] ** 2).max() / 2
+        scale = max(kinetic, np.ptp(energy), np.ptp(work)) + rounding.max() / LIMITS["energy"]
+        return {"energy": _largest((energy - energy[0] - work) / scale)}
+
+    # further signals
+
+    def higher_jets(self):
+        """Largest error of the jets above the order of the model."""
+        n, nq, top = self.model.n, self.model.nq, self.model.reduction.top
+        last, worst = (len(self.run.jets) - nq) // n, 0.0
+        if last <= top:
+            return {}
+        for at in self.samples:
+            f, p = series_loop(at.model, last), np.tile(at.model.parameters[:, None], len(at.t))
+
+            def jets(t, x, f=f, p=p, plain=at.model.reduction.mechanism.q.plain):
+                y = f.grid(t, x, np.vstack([p, t]))[0 if plain else nq * last :]
+                factorials = [factorial(k) for k in range(top + 1, last + 1)]
+                return y[top * n : last * n] * np.repeat(np.array(factorials, dtype=float), n)[:, None]
+
+            x = at.z[: len(self.model.state_names)]
+            again = jets(at.t, x)
+            rounding = ROUNDING * self._response(jets, at.t, x, again, np.abs(x))
+            sizes = self.sizes[nq + top * n :, None] + rounding / self.limit("higher jets")
+            worst = max(worst, _largest((at.z[nq + top * n :] - again) / sizes))
+        return {"higher jets": worst}
+
+    def outside(self):
+        """Largest part of an ideal reaction outside the actuators' directions, relative to the reaction."""
+        if not (self.model.ideal and self.model.actuators):
+            return {}
+        n, worst, largest = self.model.n, 0.0, 1e-300
+        for at in self.samples:
+            values = at.signals("reach")
+            largest = max(largest, np.abs(values[:n]).max())
+            for column in values.T:
+                reaction, E = column[:n], column[n:].reshape(-1, n).T
+                left = reaction - E @ np.linalg.lstsq(E, reaction, rcond=None)[0]
+                worst = max(worst, float(np.abs(left).max()))
+        return {"outside": worst / largest}
+
+
+def _ratio(errors, sizes):
+    """Errors relative to sizes; zero errors of zero size are zero."""
+    sizes = np.broadcast_to(sizes, np.shape(errors))
+    return np.divide(errors, sizes, out=np.where(errors == 0, 0.0, np.inf), where=sizes > 0)
+
+
+def _largest(values):
+    """The largest magnitude; NaN if a value is NaN."""
+    return float(np.abs(values).max(initial=0.0))
