@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 from servoctl.control.loop import FINISHED, run_loop
-from servoctl.verification.result import judged
+from servoctl.verification.result import judged, largest
 
 LOOP_LIMITS = {"loop power": 1e-3, "loop constraints": 1e-8, "loop limits": 1e-12, "loop repeated": 1e-9}  # relative
 CONVERGES, EXACT = 0.7, 1e-10  # largest defect with steps half as long, relative to the other; defect that is rounding
@@ -36,21 +36,23 @@ def verify_loop(closed):
         numbers["loop power halved"] = _defect(closed, 2)
         limits["loop power halved"] = max(CONVERGES * defect, EXACT)
     if plant.constrained:
-        largest = max(np.abs(closed.residual[name]).max() for name in plant.constraint_names())
-        numbers["loop constraints"] = float(largest / max(1.0, np.abs(closed.states).max()))
+        worst = max(largest(closed.residual[name]) for name in plant.constraint_names())
+        numbers["loop constraints"] = worst / max(1.0, np.abs(closed.states).max())
     if plant.limits or plant.rate_limits:
         numbers["loop limits"] = _excess(closed)
     return judged(numbers, {name: limits[name] for name in numbers}, notes)
 
 
 def _again(closed, finer=1):
-    """The loop with the disturbances of its conditions and steps shorter by a whole factor."""
-    loop = closed.loop
+    """The loop of the law under its conditions, with steps shorter by a whole factor."""
+    loop, law = closed.loop, closed.law
     substeps = loop.substeps * finer
     return replace(
         loop,
         samples=len(closed.t) - 1,
         substeps=substeps,
+        z0=law.state,
+        table=law.schedule.T,
         disturbance=closed.conditions.forces(loop.t0, loop.period / substeps, loop.samples * substeps),
         transport=None if loop.transport is None else loop.transport * finer,
     )
@@ -80,7 +82,7 @@ def _difference(given, again):
     if given.shape != again.shape:
         return np.inf
     size = np.abs(again).max(axis=1, initial=0.0, keepdims=True)
-    return float((np.abs(given - again) / np.where(size > 0, size, 1.0)).max(initial=0.0))
+    return largest((given - again) / np.where(size > 0, size, 1.0))
 
 
 def _defect(closed, finer):
@@ -93,7 +95,7 @@ def _defect(closed, finer):
     states, work = x[:, :-1].T, x[:, -1]
     energy = plant.function("power").grid(closed.t, states, closed.p)[0]
     scale = max(np.ptp(energy), np.ptp(work), 1e-6 * np.abs(energy).max(), 1e-12)
-    return float(np.abs(energy - energy[0] - work).max() / scale)
+    return largest((energy - energy[0] - work) / scale)
 
 
 def _excess(closed):

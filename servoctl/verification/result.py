@@ -87,3 +87,8 @@ def judged(numbers, limits, notes=(), doubts=()):
     """The verification of numbers with their limits; a number that is NaN fails."""
     failures = tuple(key for key, value in numbers.items() if not value <= limits[key])
     return Verification(numbers, failures, tuple(notes), limits, tuple(doubts))
+
+
+def largest(values):
+    """The largest magnitude; infinite if a value is NaN."""
+    return float(np.nan_to_num(np.abs(values), nan=np.inf, posinf=np.inf).max(initial=0.0))
