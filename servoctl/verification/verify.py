@@ -220,16 +220,20 @@ class _Checks:
         sizes = np.zeros(len(self.run.jets))
         for at in instants:
             sizes[: len(at.z)] = np.maximum(sizes[: len(at.z)], np.abs(at.z).max(axis=1))
-        weights, plain = np.sqrt(self.mass), self.model.reduction.mechanism.q.plain
+        plain = self.model.reduction.mechanism.q.plain
         for first in range(nq, len(sizes), n):
             level = sizes[first : first + n]
             below = sizes[first - n : first] / self.span if first > nq or plain else 0.0
             level = np.maximum(level, FLOOR * below)
-            least = np.divide((weights * level).max(), weights, out=np.zeros(n), where=weights > 0)
-            sizes[first : first + n] = np.maximum(level, FLOOR * least)
+            sizes[first : first + n] = np.maximum(level, FLOOR * self._alike(level))
         moved = FLOOR * self.span * sizes[nq : nq + n] if plain else 0.0
         sizes[:nq] = np.maximum(sizes[:nq], np.maximum(moved, FLOOR * FLOOR * sizes[:nq].max()))
         return np.where(sizes > 0, sizes, 1.0)
+
+    def _alike(self, level):
+        """For each component of a level of jets, what has as large an energy as the largest of them."""
+        weights = np.sqrt(self.mass)
+        return np.divide((weights * level).max(), weights, out=level.copy(), where=weights > 0)
 
     def _response(self, f, t, x, y, steps):
         """Change of f(t, x, p) = y if each entry of x changes by its step: root mean square over random directions."""
@@ -295,9 +299,10 @@ class _Checks:
     # the equations
 
     def acceleration(self):
-        """Largest error of the mechanism's γ'' under the inputs."""
+        """Largest error of the mechanism's γ'' under the inputs, relative to what has as large an energy."""
         n, nq = self.model.n, self.model.nq
-        worst, blunt, limit, size = 0.0, 0.0, self.limit("acceleration"), self.sizes[nq + n : nq + 2 * n, None]
+        worst, blunt, limit = 0.0, 0.0, self.limit("acceleration")
+        size = self._alike(self.sizes[nq + n : nq + 2 * n])[:, None]
         for at in self.instants:
 
             def f(t, x, model=at.model):
