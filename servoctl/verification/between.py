@@ -10,7 +10,7 @@ ITERATIONS = 25  # of a step, at most: an explicit iteration that takes more nee
 SETTLED = 1e-9  # change of the state, relative to its size, at which the iteration has converged
 CORRECTIONS = 3  # Newton steps from a state that was integrated, which is accurate to AGREES or better
 AGREES = 0.1  # of the limit: a difference from the next sample, or between two lengths of step, that decides
-MOST_STEPS = 1024  # between two samples
+FEW_STEPS, MOST_STEPS = 32, 1024  # between two samples, where other pivots may help, and else
 MOST_OPERATIONS, OVERHEAD = 5e9, 200  # of all steps together: seconds; what an evaluation takes besides its own
 
 
@@ -29,7 +29,8 @@ class Flow:
 
     model: object
     flat: bool
-    balanced: bool = True  # whether the power is to be integrated
+    balanced: bool  # whether the power is to be integrated
+    most: int  # steps between two samples
 
     @property
     def f(self):
@@ -107,13 +108,14 @@ class Interval:
     inside: list = field(default_factory=list)
 
 
-def between(flow, t, x, settings):
+def between(flows, t, x, settings):
     """Integrate from each edge to the next.
 
     Parameters
     ----------
-    flow : callable
-        The `Flow` to use from the edge of an index on.
+    flows : callable
+        Of the index of an edge: a sequence of `Flow`, each of which is tried if those before it did not lead to the
+        next edge, as pivots may vanish between edges.
     t : (K + 1,) array
         Edges, in the order of the motion [s].
     x : (n_x, K + 1) array
@@ -129,11 +131,17 @@ def between(flow, t, x, settings):
     sampled = np.all(np.isfinite(x), axis=0)
     targets, ready = x[:, 1:].copy(), np.flatnonzero(sampled[:-1])
     while ready.size:
-        flows = {}
-        for k in ready:
-            flows.setdefault((flow(k), settings.steps[k]), []).append(k)
-        for (of, _), ks in flows.items():
-            _integrate(of, (t[ks], np.diff(t)[ks], x[:, ks], targets[:, ks]), np.array(ks), settings, found, budget)
+        tried = {k: iter(flows(k)) for k in ready}
+        while tried:
+            groups = {}
+            for k, rest in tried.items():
+                flow = next(rest, None)
+                if flow is not None:
+                    groups.setdefault((flow, settings.steps[k]), []).append(k)
+            for (flow, _), ks in groups.items():
+                _integrate(flow, (t[ks], np.diff(t)[ks], x[:, ks], targets[:, ks]), np.array(ks), settings, found, budget)
+            left = [k for ks in groups.values() for k in ks if not found.resolved[k]]
+            tried = {k: tried[k] for k in left}
         on = ready[~sampled[ready + 1] & found.resolved[ready]]
         x[:, on + 1] = found.ends[:, on]
         ready = on + 1
@@ -145,7 +153,7 @@ def _integrate(flow, problem, numbers, settings, found, budget):
     """Integrate the intervals of these numbers with more and more steps, until the states at their ends are known."""
     left, steps = np.arange(len(numbers)), settings.steps[numbers[0]]
     least, cost = steps, flow.f.operations + OVERHEAD
-    while left.size and steps <= max(MOST_STEPS, least):
+    while left.size and steps <= max(flow.most, least):
         if steps > least and left.size * steps * STAGES * cost > budget[0]:
             break
         part = [values[..., left] for values in problem]

@@ -1,5 +1,6 @@
 """Checks of a run against the full mechanism, at its samples and at instants between them."""
 
+import contextlib
 from dataclasses import dataclass, replace
 from math import factorial
 
@@ -7,12 +8,12 @@ import numpy as np
 
 from servoctl.checks import whole
 from servoctl.control.result import Closed
-from servoctl.errors import SpecificationError
+from servoctl.errors import ServoError, SpecificationError
 from servoctl.methods.taylor import series_loop
 from servoctl.model.model import Model
 from servoctl.model.store import fingerprint
 from servoctl.run import SAME_TIME, Run, require_model
-from servoctl.verification.between import Flow, Settings, between
+from servoctl.verification.between import FEW_STEPS, MOST_STEPS, Flow, Settings, between
 from servoctl.verification.loop import verify_loop
 from servoctl.verification.result import Verification, judged, largest
 
@@ -35,6 +36,7 @@ FLOOR = 1e-3  # least size of a component, relative to what moves as much mass, 
 BLUNT = 1e-3  # effect of rounding, relative to the accelerations, above which these decide nothing
 OWN_INSTANTS, MOST_OWN = 200, 8  # instants between samples at which everything is checked, in all and of an interval
 BY_INPUTS = 1e-6  # part of the accelerations that rounding of the inputs may excuse
+MOST_OWN_PIVOTS = 3  # choices of pivots of its own, where those of the run vanish between samples
 MOST_ENTRIES = 2e6  # of matrices that are held at once
 
 
@@ -258,14 +260,32 @@ class _Checks:
         n_x = self.model.nq if flat else len(self.model.state_names)
         x = np.full((n_x, len(edges)), np.nan)
         x[:, sampled] = run.jets[:n_x]
-        count, sample = len(edges) - 1, np.cumsum(sampled) - 1
-        flows = {id(v): Flow(v, flat, self.balanced) for *_, v in run.variants}
+        count = len(edges) - 1
         steps = np.full(count, -(-segments // count))
         watched = slice(None, None, max(1, count // OWN_INSTANTS))
         steps[watched] = np.maximum(steps[watched], np.clip(-(-OWN_INSTANTS // count) + 1, 2, MOST_OWN))
         settings = Settings(self.sizes[:n_x], LIMITS["segments"], steps)
-        found = between(lambda k: flows[id(run.variant(sample[k]))], edges, x, settings)
+        found = between(self._flows(flat, np.cumsum(sampled) - 1), edges, x, settings)
         return found, sampled, self._own(found)
+
+    def _flows(self, flat, sample):
+        """The flows to try from an edge on: of the variants next to its sample, and of one with its own pivots."""
+        variants, firsts = [v for *_, v in self.run.variants], [a for a, *_ in self.run.variants]
+        allowance = [MOST_OWN_PIVOTS]
+
+        def flows(k):
+            i = int(np.searchsorted(firsts, sample[k], side="right")) - 1
+            near = range(i, min(i + 2, len(variants)))
+            for j in near:
+                yield Flow(variants[j], flat, self.balanced, FEW_STEPS)
+            if allowance[0]:
+                allowance[0] -= 1
+                with contextlib.suppress(ServoError):
+                    at = self.run.jets[: len(self.model.jet_names), sample[k]]
+                    yield Flow(self.model.near(self.run.t[sample[k]], at), flat, self.balanced, FEW_STEPS)
+            yield Flow(variants[i], flat, self.balanced, MOST_STEPS)
+
+        return flows
 
     def _inside(self, t):
         return min(self.run.t[0], self.run.t[-1]) < t < max(self.run.t[0], self.run.t[-1])
