@@ -34,10 +34,12 @@ class Flow:
 
     @property
     def f(self):
+        """The compiled function."""
         return self.model.function("path" if self.flat else "ode")
 
     @property
     def n_x(self):
+        """The number of states."""
         return self.model.nq if self.flat else len(self.model.state_names)
 
     def values(self, t, x):
@@ -65,7 +67,7 @@ class Flow:
 
 
 @dataclass(frozen=True)
-class Settings:
+class Integration:
     """How intervals are integrated.
 
     Attributes
@@ -120,7 +122,7 @@ def between(flows, t, x, settings):
         Edges, in the order of the motion [s].
     x : (n_x, K + 1) array
         States of the samples; NaN at edges between them, whose state is the one reached from the edge before.
-    settings : Settings
+    settings : Integration
 
     Returns
     -------
@@ -139,7 +141,8 @@ def between(flows, t, x, settings):
                 if flow is not None:
                     groups.setdefault((flow, settings.steps[k]), []).append(k)
             for (flow, _), ks in groups.items():
-                _integrate(flow, (t[ks], np.diff(t)[ks], x[:, ks], targets[:, ks]), np.array(ks), settings, found, budget)
+                problem = t[ks], np.diff(t)[ks], x[:, ks], targets[:, ks]
+                _integrate(flow, problem, np.array(ks), settings, found, budget)
             left = [k for ks in groups.values() for k in ks if not found.resolved[k]]
             tried = {k: tried[k] for k in left}
         on = ready[~sampled[ready + 1] & found.resolved[ready]]
@@ -172,7 +175,10 @@ def _integrate(flow, problem, numbers, settings, found, budget):
 
 
 def _stepped(flow, t, length, x, targets, steps, sizes):
-    """Take equal steps from t (K,) over lengths (K,); returns ends, whether all settled, work, instants, evaluations."""
+    """Take equal steps from t (K,) over lengths (K,).
+
+    Returns the ends, whether all steps settled, the work, instants with their jets, and the number of evaluations.
+    """
     h, (_, b, _) = length / steps, gauss(STAGES)
     settled, work, evaluations, inside = np.ones(len(t), dtype=bool), np.zeros(len(t)), 0, []
     for k in range(steps):

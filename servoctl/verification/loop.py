@@ -5,7 +5,8 @@ from dataclasses import replace
 import numpy as np
 
 from servoctl.control.loop import FINISHED, run_loop
-from servoctl.verification.result import judged, largest
+from servoctl.errors import SpecificationError
+from servoctl.verification.result import judged, largest, numbers
 
 LOOP_LIMITS = {"loop power": 1e-3, "loop constraints": 1e-8, "loop limits": 1e-12, "loop repeated": 1e-9}  # relative
 CONVERGES, EXACT = 0.7, 1e-10  # largest defect with steps half as long, relative to the other; defect that is rounding
@@ -27,20 +28,37 @@ def verify_loop(closed):
     -------
     Verification
     """
-    plant, numbers, limits, notes = closed.plant, {}, dict(LOOP_LIMITS), []
-    numbers["loop repeated"] = _repeated(closed)
+    plant, found, limits, notes = closed.plant, {}, dict(LOOP_LIMITS), []
+    _require_signals(closed)
+    found["loop repeated"] = _repeated(closed)
     if plant.equations.unbalanced:
         notes.append(f"power balance: not applicable, {plant.equations.unbalanced}")
-    elif numbers["loop repeated"] <= limits["loop repeated"]:
-        defect = numbers["loop power"] = _defect(closed, 1)
-        numbers["loop power halved"] = _defect(closed, 2)
+    elif found["loop repeated"] <= limits["loop repeated"]:
+        defect = found["loop power"] = _defect(closed, 1)
+        found["loop power halved"] = _defect(closed, 2)
         limits["loop power halved"] = max(CONVERGES * defect, EXACT)
     if plant.constrained:
         worst = max(largest(closed.residual[name]) for name in plant.constraint_names())
-        numbers["loop constraints"] = worst / max(1.0, np.abs(closed.states).max())
+        found["loop constraints"] = worst / max(1.0, np.abs(closed.states).max())
     if plant.limits or plant.rate_limits:
-        numbers["loop limits"] = _excess(closed)
-    return judged(numbers, {name: limits[name] for name in numbers}, notes)
+        found["loop limits"] = _excess(closed)
+    return judged(found, {name: limits[name] for name in found}, notes)
+
+
+def _require_signals(closed):
+    """Refuse signals that are not one column for each sample of the loop."""
+    names = ("states", "inputs", "commands", "measurements", "controller_states", "signals")
+    shapes = {name: np.shape(getattr(closed, name)) for name in names}
+    t, count = numbers(closed.t, 1), np.size(closed.t)
+    arrays = [numbers(getattr(closed, name), 2) for name in names]
+    if t is None or not 1 <= count <= closed.loop.samples + 1 or any(a is None or a.shape[1] != count for a in arrays):
+        raise SpecificationError(
+            f"The closed loop has {count} times of the shape {np.shape(closed.t)}, and signals of the shapes {shapes}.",
+            f"Each signal has a column for each sample, at most {closed.loop.samples + 1}.",
+            do="Pass a closed loop as sv.close returns it.",
+            times=np.shape(closed.t),
+            **shapes,
+        )
 
 
 def _again(closed, finer=1):

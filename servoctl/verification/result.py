@@ -58,7 +58,7 @@ class Verification:
 
     @property
     def verdict(self):
-        """ "failed" if a number exceeds its limit, else "inconclusive" if something could not be checked, or "passed"."""
+        """One of "failed" (a number exceeds its limit), "inconclusive" (something was not checked), and "passed"."""
         return FAILED if self.failures else INCONCLUSIVE if self.doubts else PASSED
 
     @property
@@ -92,3 +92,13 @@ def judged(numbers, limits, notes=(), doubts=()):
 def largest(values):
     """The largest magnitude; infinite if a value is NaN."""
     return float(np.nan_to_num(np.abs(values), nan=np.inf, posinf=np.inf).max(initial=0.0))
+
+
+def numbers(value, dimensions):
+    """An array of real numbers from what a run holds; None if it is none of so many dimensions."""
+    try:
+        array = np.asarray(value)
+        array = array if array.dtype.kind == "c" else array.astype(float)
+    except (TypeError, ValueError):
+        return None
+    return array if array.ndim == dimensions and array.dtype.kind == "f" else None

@@ -1,6 +1,7 @@
 """Checks of a run against the full mechanism, at its samples and at instants between them."""
 
 import contextlib
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from math import factorial
 
@@ -13,9 +14,9 @@ from servoctl.methods.taylor import series_loop
 from servoctl.model.model import Model
 from servoctl.model.store import fingerprint
 from servoctl.run import SAME_TIME, Run, require_model
-from servoctl.verification.between import FEW_STEPS, MOST_STEPS, Flow, Settings, between
+from servoctl.verification.between import FEW_STEPS, MOST_STEPS, Flow, Integration, between
 from servoctl.verification.loop import verify_loop
-from servoctl.verification.result import Verification, judged, largest
+from servoctl.verification.result import Verification, judged, largest, numbers
 
 LIMITS = {
     "samples": 0.0,
@@ -27,7 +28,6 @@ LIMITS = {
     "multiplier form": 1e-9,
     "higher jets": 1e-6,
     "residual": 1e-6,
-    "outside": np.inf,
 }
 INTEGRATED = 1e-6  # limit for numbers that drift disturbs: γ'' is integrated itself, or rows are hidden
 ROUNDING = 1e-13  # relative change of states and inputs whose effect is rounding: some hundred roundings
@@ -79,9 +79,8 @@ def verify(model: Model | Closed, run: Run | None = None, segments: int = 20) ->
     if faulty or not len(run.t):
         return judged({"samples": float(faulty or 1)}, {"samples": LIMITS["samples"]})
     checks = _Checks(model, run, segments)
-    numbers = {
-        "samples": 0.0,
-        "signals": checks.signals(),
+    found = {
+        **checks.signals(),
         "acceleration": checks.acceleration(),
         **checks.balance(),
         "multiplier form": checks.multiplier_form(),
@@ -89,9 +88,9 @@ def verify(model: Model | Closed, run: Run | None = None, segments: int = 20) ->
         **checks.outside(),
         **checks.residuals(),
     }
-    numbers |= {"segments": checks.segments()} if len(run.t) > 1 else {}
-    limits = {key: checks.limit("residual" if key.startswith("residual ") else key) for key in numbers}
-    return judged(numbers, limits, checks.notes, checks.doubts)
+    found |= {"segments": checks.segments()} if len(run.t) > 1 else {}
+    limits = {key: checks.limit("residual" if key.startswith("residual ") else key) for key in found}
+    return judged(found, limits, checks.notes, checks.doubts)
 
 
 # --- what is verified
@@ -102,31 +101,49 @@ def _required(model, run):
 
     A motion that stopped may end in samples without accelerations.
     """
-    require_model(model, run, "verify")
+    whose = getattr(run, "model", None)
+    whole_run = isinstance(run, Run) and isinstance(whose, Model) and isinstance(run.jet_names, tuple)
+    require_model(model if isinstance(model, Model) else None, run if whole_run else None, "verify")
     _require_same(model, run.model)
-    try:
-        t, jets = np.asarray(run.t, dtype=float), np.asarray(run.jets, dtype=float)
-    except (TypeError, ValueError):
-        t = jets = np.zeros(0)
-    least = len(model.jet_names)
-    if t.ndim != 1 or jets.ndim != 2 or jets.shape != (len(run.jet_names), len(t)) or len(jets) < least:
-        raise SpecificationError(
-            f"The run has times of the shape {t.shape} and jets of the shape {jets.shape}.",
-            f"It has one time and at least {least} jets for each sample.",
-            do="Pass a run as sv.simulate returns it.",
-            times=t.shape,
-            jets=jets.shape,
-        )
+    t, jets, knots = numbers(run.t, 1), numbers(run.jets, 2), numbers(run.knots, 1)
+    least, mappings = len(model.jet_names), (run.stored, run.stored_residual)
+    whole_levels = jets is not None and len(jets) >= least and (len(jets) - least) % model.n == 0
+    if t is None or knots is None or not whole_levels or jets.shape[1] != len(t):
+        raise _malformed(least, model.n, times=np.shape(run.t), jets=np.shape(run.jets))
+    plain = isinstance(run.variants, tuple) and isinstance(run.success, bool | np.bool) and isinstance(run.method, str)
+    if not plain or not all(isinstance(mapping, Mapping) for mapping in mappings):
+        raise _malformed(least, model.n, stored=[type(mapping).__name__ for mapping in mappings])
     good = np.isfinite(t) & np.all(np.isfinite(jets), axis=0)
     count = len(t) if run.success or not good.any() else 1 + int(np.flatnonzero(good)[-1])
     steps = np.diff(t[:count])
-    forward = t[count - 1] > t[0] if count else True
-    faulty = int(np.sum(~good[:count]) + np.sum((steps <= 0) if forward else (steps >= 0)))
-    variants = tuple((a, min(b, count), v) for a, b, v in run.variants if a < count and _same(model, v))
-    if [a for a, *_ in variants] != [0, *(b for _, b, _ in variants)][:-1] or not variants or variants[-1][1] != count:
-        variants = ((0, count, model),)
-    stored = {name: np.asarray(values[:count], dtype=float) for name, values in run.stored.items() if len(values) == len(t)}
-    return replace(run, t=t[:count], jets=jets[:, :count], model=model, variants=variants, stored=stored), faulty
+    backwards = count > 1 and t[count - 1] < t[0]
+    faulty = int(np.sum(~good[:count]) + np.sum((steps >= 0) if backwards else (steps <= 0)))
+    parts = {"variants": _variants(model, run, count), "knots": tuple(knots)}
+    parts["stored"] = {name: np.asarray(values)[:count] for name, values in run.stored.items() if np.ndim(values)}
+    return replace(run, t=t[:count], jets=jets[:, :count], jet_names=model.names_to(len(jets)), **parts), faulty
+
+
+def _malformed(least, n, **shapes):
+    found = ", ".join(f"{name} {shape}" for name, shape in shapes.items())
+    return SpecificationError(
+        f"The run has {found}.",
+        f"It has one time and {least} jets, or more by multiples of {n}, for each sample, and signals by name.",
+        do="Pass a run as sv.simulate returns it.",
+        **shapes,
+    )
+
+
+def _variants(model, run, count):
+    """The ranges of samples and their variants; the model alone if those of the run are not its own."""
+    ranges = []
+    for variant in run.variants:
+        if not (isinstance(variant, tuple) and len(variant) == 3 and isinstance(variant[2], Model)):
+            break
+        first, end, of = variant
+        if first >= count or first != (ranges[-1][1] if ranges else 0) or not _same(model, of):
+            break
+        ranges.append((first, min(end, count), of))
+    return tuple(ranges) if ranges and ranges[-1][1] == count else ((0, count, model),)
 
 
 def _same(model, other):
@@ -174,7 +191,8 @@ class _Checks:
 
     def __init__(self, model, run, segments):
         self.model, self.run, self.notes, self.doubts = model, run, [], []
-        self.drifts = run.method == "Taylor" or model.reduction.top > 2 or bool(model.reduction.hidden and not model.flat)
+        hidden = bool(model.reduction.hidden) and not model.flat
+        self.drifts = run.method == "Taylor" or model.reduction.top > 2 or hidden
         self.stored, self.fresh = run.stored, replace(run, stored={}, stored_residual={})
         self.span = abs(run.t[-1] - run.t[0]) or 1.0
         self.samples = [
@@ -193,12 +211,14 @@ class _Checks:
     def limit(self, key):
         """The limit of a number."""
         drifts = self.drifts and key in ("acceleration", "power", "multiplier form")
-        return INTEGRATED if drifts else LIMITS[key]
+        return INTEGRATED if drifts else LIMITS.get(key, np.inf)
 
     def _inputs(self):
         """The actuation, or the reaction of an ideal program, as the run gives it, by variant."""
         names = self.model.signals("reaction" if self.model.ideal else "actuation")[0]
-        values = np.array([self.stored.get(name, self.fresh[name]) for name in names]).reshape(len(names), -1)
+        stored = {name: numbers(self.stored.get(name, np.nan), 1) for name in names}
+        alike = {name: v for name, v in stored.items() if v is not None and v.shape == self.run.t.shape}
+        values = np.array([alike.get(name, self.fresh[name]) for name in names]).reshape(len(names), -1)
         return [values[:, a:b] for a, b, _ in self.run.variants]
 
     # sizes
@@ -264,7 +284,7 @@ class _Checks:
         steps = np.full(count, -(-segments // count))
         watched = slice(None, None, max(1, count // OWN_INSTANTS))
         steps[watched] = np.maximum(steps[watched], np.clip(-(-OWN_INSTANTS // count) + 1, 2, MOST_OWN))
-        settings = Settings(self.sizes[:n_x], LIMITS["segments"], steps)
+        settings = Integration(self.sizes[:n_x], LIMITS["segments"], steps)
         found = between(self._flows(flat, np.cumsum(sampled) - 1), edges, x, settings)
         return found, sampled, self._own(found)
 
@@ -309,12 +329,12 @@ class _Checks:
         unknown = np.flatnonzero(~found.resolved)
         if len(unknown):
             first = self.run.t[np.cumsum(self.sampled)[unknown[0]] - 1]
-            self.doubts.append(
-                f"in {len(unknown)} of {len(found.resolved)} intervals between samples, the first at t = {first:.6g} s, "
-                "the motion is too fast to follow, or singular: simulate with more samples (t_eval)"
-            )
-        known = found.defects[found.resolved]
-        return float(np.nanmax(known, initial=0.0))
+            where = f"{len(unknown)} of {len(found.resolved)} intervals between samples, first from t = {first:.6g} s on"
+            what = "the motion is too fast to follow, or singular: simulate with more samples (t_eval)"
+            self.doubts.append(f"in {where}, {what}")
+        known = np.flatnonzero(found.resolved & self.sampled[1:])
+        targets = self.run.jets[: len(found.ends), np.cumsum(self.sampled)[known]]
+        return largest((found.ends[:, known] - targets) / self.sizes[: len(found.ends), None])
 
     # the equations
 
@@ -407,19 +427,22 @@ class _Checks:
     def _as_stored(self, levels, names, first):
         """Levels, or those that the run has stored if these are larger."""
         for i, (name, level) in enumerate(names):
-            stored = self.run.stored_residual.get(name)
-            if stored is not None and np.ndim(stored) == 2 and np.shape(stored)[1] >= first + levels.shape[1]:
+            stored = numbers(self.run.stored_residual.get(name), 2)
+            if stored is not None and len(stored) > level and stored.shape[1] >= first + levels.shape[1]:
                 levels[i] = np.fmax(levels[i], np.abs(stored[level, first : first + levels.shape[1]]))
         return levels
 
     def signals(self):
         """Largest difference of a stored signal from its value at the samples, relative to its largest value."""
+        if not self.stored:
+            return {}
         worst = 0.0
         for name, values in self.stored.items():
             if name in self.fresh.names:
-                again = self.fresh[name]
-                worst = max(worst, largest(_ratio(values - again, np.abs(again).max())))
-        return worst
+                again, values = self.fresh[name], numbers(values, 1)
+                alike = values is not None and values.shape == again.shape
+                worst = max(worst, largest(_ratio(values - again, np.abs(again).max())) if alike else np.inf)
+        return {"signals": worst}
 
     # energy
 
