@@ -10,7 +10,7 @@ ITERATIONS = 25  # of a step, at most: an explicit iteration that takes more nee
 SETTLED = 1e-9  # change of the state, relative to its size, at which the iteration has converged
 CORRECTIONS = 3  # Newton steps from a state that was integrated, which is accurate to AGREES or better
 AGREES = 0.1  # of the limit: a difference from the next sample, or between two lengths of step, that decides
-FEW_STEPS, MOST_STEPS = 32, 1024  # between two samples, where other pivots may help, and else
+FEW_STEPS, ENOUGH_STEPS = 32, 1024  # between two samples, where other pivots may help, and else
 MOST_OPERATIONS, OVERHEAD = 5e9, 200  # of all steps together: seconds; what an evaluation takes besides its own
 
 

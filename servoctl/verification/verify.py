@@ -14,7 +14,7 @@ from servoctl.methods.taylor import series_loop
 from servoctl.model.model import Model
 from servoctl.model.store import fingerprint
 from servoctl.run import SAME_TIME, Run, require_model
-from servoctl.verification.between import FEW_STEPS, MOST_STEPS, Flow, Integration, between
+from servoctl.verification.between import FEW_STEPS, ENOUGH_STEPS, Flow, Integration, between
 from servoctl.verification.loop import verify_loop
 from servoctl.verification.result import Verification, judged, largest, numbers
 
@@ -303,7 +303,7 @@ class _Checks:
                 with contextlib.suppress(ServoError):
                     at = self.run.jets[: len(self.model.jet_names), sample[k]]
                     yield Flow(self.model.near(self.run.t[sample[k]], at), flat, self.balanced, FEW_STEPS)
-            yield Flow(variants[i], flat, self.balanced, MOST_STEPS)
+            yield Flow(variants[i], flat, self.balanced, ENOUGH_STEPS)
 
         return flows
 
@@ -329,9 +329,9 @@ class _Checks:
         unknown = np.flatnonzero(~found.resolved)
         if len(unknown):
             first = self.run.t[np.cumsum(self.sampled)[unknown[0]] - 1]
-            where = f"{len(unknown)} of {len(found.resolved)} intervals between samples, first from t = {first:.6g} s on"
+            where = f"{len(unknown)} of {len(found.resolved)} intervals between samples, the first from {first:.6g} s"
             what = "the motion is too fast to follow, or singular: simulate with more samples (t_eval)"
-            self.doubts.append(f"in {where}, {what}")
+            self.doubts.append(f"in {where} on, {what}")
         known = np.flatnonzero(found.resolved & self.sampled[1:])
         targets = self.run.jets[: len(found.ends), np.cumsum(self.sampled)[known]]
         return largest((found.ends[:, known] - targets) / self.sizes[: len(found.ends), None])
