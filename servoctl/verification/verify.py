@@ -14,7 +14,7 @@ from servoctl.methods.taylor import series_loop
 from servoctl.model.model import Model
 from servoctl.model.store import fingerprint
 from servoctl.run import SAME_TIME, Run, require_model
-from servoctl.verification.between import FEW_STEPS, ENOUGH_STEPS, Flow, Integration, between
+from servoctl.verification.between import ENOUGH_STEPS, FEW_STEPS, Flow, Integration, between
 from servoctl.verification.loop import verify_loop
 from servoctl.verification.result import Verification, judged, largest, numbers
 
