@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 STAGES = 4  # Gauss points of a step: order 8
-ITERATIONS = 25  # of a step, at most: an explicit iteration that takes more needs shorter steps
+FIXED_POINT_STEPS = 25  # of a step, at most: an explicit iteration that takes more needs shorter steps
 SETTLED = 1e-9  # change of the state, relative to its size, at which the iteration has converged
 CORRECTIONS = 3  # Newton steps from a state that was integrated, which is accurate to AGREES or better
 AGREES = 0.1  # of the limit: a difference from the next sample, or between two lengths of step, that decides
@@ -206,7 +206,7 @@ def _stages(flow, t, h, x, guess, sizes):
     rates = start[:, None] + c[:, None] * (end - start)[:, None]
     jets, left, evaluations = None, np.arange(len(t)), 0
     settled = np.zeros(len(t), dtype=bool)
-    for _ in range(ITERATIONS):
+    for _ in range(FIXED_POINT_STEPS):
         with np.errstate(all="ignore"):
             states = x[:, None, left] + h[left] * np.einsum("ij,njk->nik", A, rates[..., left])
             pair = flow.values(times[:, left].ravel(), states.reshape(len(x), -1))

@@ -35,6 +35,7 @@ PROBE, PROBES = 1e-7, 3  # relative change by which a response is measured, and 
 FLOOR = 1e-3  # least size of a component, relative to what moves as much mass, and to what moves there in the span
 BLUNT = 1e-3  # effect of rounding, relative to the accelerations, above which these decide nothing
 OWN_INSTANTS, MOST_OWN = 200, 8  # instants between samples at which everything is checked, in all and of an interval
+BALANCED = 1e-9  # part of dE/dt, relative to its terms, that does not follow from the forces: more is no rounding
 BY_INPUTS = 1e-6  # part of the accelerations that rounding of the inputs may excuse
 MOST_OWN_PIVOTS = 3  # choices of pivots of its own, where those of the run vanish between samples
 MOST_ENTRIES = 2e6  # of matrices that are held at once
@@ -449,8 +450,10 @@ class _Checks:
     def _balanced(self):
         """Whether dE/dt is the power of the forces; a note if not."""
         rate, _, size, by_time = np.concatenate([at.signals("power") for at in self.samples], axis=1)
-        balanced = np.abs(by_time).max() < 1e-9 * max(np.abs(size).max(), np.abs(rate).max(), 1e-300)
-        balanced = balanced or not np.any(by_time)
+        first, second = self.model.nq, self.model.nq + self.model.n
+        inertial = self.mass * self.sizes[first:second] * self.sizes[second : second + self.model.n]
+        largest_term = max(np.abs(size).max(), np.abs(rate).max(), inertial.max())
+        balanced = not np.any(np.abs(by_time) > BALANCED * largest_term)
         if not balanced:
             reason = "the inertia terms depend on time or on more than wᵀMw/2"
             self.notes.append(f"power balance: not applicable, {reason}")
