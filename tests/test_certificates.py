@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import casadi as ca
 import numpy as np
 import pytest
 from refusals import refused
@@ -159,7 +160,7 @@ def test_every_number_has_its_limit_beside_it(scene_run):
     assert lines[0] == "Verification: passed" and len({line.index(", limit ") for line in lines[1:]}) == 1
 
 
-@pytest.mark.parametrize("segments", [0, -1, "a", 2.5, True, None])
+@pytest.mark.parametrize("segments", [0, -1, "a", 2.5, True, None, 10_001, 1e300, 2**70, ca.SX.sym("n")], ids=str)
 def test_segments_that_check_nothing_are_refused(segments, scene_run):
     with refused(sv.SpecificationError, "segments"):
         sv.verify(*scene_run("overhead-crane"), segments=segments)

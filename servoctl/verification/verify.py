@@ -37,6 +37,7 @@ BLUNT = 1e-3  # effect of rounding, relative to the accelerations, above which t
 OWN_INSTANTS, MOST_OWN = 200, 8  # instants between samples at which everything is checked, in all and of an interval
 BALANCED = 1e-9  # part of dE/dt, relative to its terms, that does not follow from the forces: more is no rounding
 BY_INPUTS = 1e-6  # part of the accelerations that rounding of the inputs may excuse
+MOST_SEGMENTS = 10_000  # steps along the run that are accepted: seconds
 MOST_OWN_PIVOTS = 3  # choices of pivots of its own, where those of the run vanish between samples
 MOST_ENTRIES = 2e6  # of matrices that are held at once
 
@@ -61,7 +62,7 @@ def verify(model: Model | Closed, run: Run | None = None, segments: int = 20) ->
     run : Run
         Of this model; omitted for a closed loop.
     segments : int
-        Number of steps along the run, at least 1; each interval between samples has at least one.
+        Number of steps along the run, from 1 to 10,000; each interval between samples has at least one.
 
     Returns
     -------
@@ -71,9 +72,9 @@ def verify(model: Model | Closed, run: Run | None = None, segments: int = 20) ->
     Raises
     ------
     SpecificationError
-        If the run is not of this model, or segments is not a whole number of at least 1.
+        If the run is not of this model, or segments is not a whole number from 1 to 10,000.
     """
-    segments = whole("segments", segments, least=1)
+    segments = whole("segments", segments, least=1, most=MOST_SEGMENTS)
     if run is None and isinstance(model, Closed):
         return verify_loop(model)
     run, faulty = _required(model, run)
