@@ -10,6 +10,8 @@ from servoctl.shell.motion import described
 from servoctl.shell.options import METHODS_HELP, add_motion, drift, samples
 from servoctl.shell.scenes import find_scene
 
+INCONCLUSIVE = 3  # exit code where nothing failed and something could not be verified
+
 
 def add_run(commands):
     """Add the command to the subparsers of the command line."""
@@ -60,8 +62,10 @@ def _compute(args, name, scene, folder):
     print(f"{', '.join(f for f in (*FILES, *LOOP_FILES) if (folder.path / f).exists())} in {folder.path}")
     if not run.success:
         complain(f"The motion ended early, at t = {run.t[-1]:.6g} s; what was computed is kept.")
-    verified = args.no_verify or (verification is not None and verification.passed)
-    return 0 if run.success and verified and done and not folder.moved else 1
+    verdict = "passed" if args.no_verify else getattr(verification, "verdict", "failed")
+    if not (run.success and verdict != "failed" and done and not folder.moved):
+        return 1
+    return INCONCLUSIVE if verdict == "inconclusive" else 0
 
 
 def _options(args, motion):
