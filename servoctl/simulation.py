@@ -35,6 +35,7 @@ from servoctl.methods.sundials import SundialsSteps
 from servoctl.methods.taylor import TaylorSteps
 from servoctl.model.model import Model
 from servoctl.model.start import State
+from servoctl.model.switching import switching
 from servoctl.progress import Progress
 from servoctl.run import SAME_TIME, Run
 
@@ -138,22 +139,31 @@ def simulate(
 def _motion(model, method, drift, span, x0, times, knots, bar):
     """Integrate by a method; samples are taken at the times (N,), by `RungeKutta` at its steps."""
     (t0, t1), arguments = span, (span[0], x0, span[1], times, knots)
+    if isinstance(method, Algebraic):
+        return algebraic(model, t0, x0, times, bar)
+    family = switching(model)
+    if family is not None:
+        model = family.at(family.branches(t0, x0))
+    stepping = _stepping(model, method, drift, span, bar)
+    stepping.family = family
+    return run_checked(stepping, *arguments) if stepping.tolerances is None else stepping.run(*arguments)
+
+
+def _stepping(model, method, drift, span, bar):
+    """The integration by a method other than `Algebraic`."""
+    t0, t1 = span
     match method:
-        case Algebraic():
-            return algebraic(model, t0, x0, times, bar)
         case Taylor(order, jets, rtol, atol):
-            return TaylorSteps(model, drift, rtol, atol, order, jets or 0, bar).run(*arguments)
+            return TaylorSteps(model, drift, rtol, atol, order, jets or 0, bar)
         case RadauIIA(order, step, rtol, atol):
             step = None if step is None else _step_length(step, t0, t1)
-            stepping = RadauSteps(model, drift, rtol, atol, order, step, bar)
-            return run_checked(stepping, *arguments) if step else stepping.run(*arguments)
+            return RadauSteps(model, drift, rtol, atol, order, step, bar)
         case RungeKutta(_, step):
-            stepping = RungeKuttaSteps(model, str(method), drift, _step_length(step, t0, t1), bar)
-            return run_checked(stepping, *arguments)
+            return RungeKuttaSteps(model, str(method), drift, _step_length(step, t0, t1), bar)
         case Sundials(name, rtol, atol):
-            return SundialsSteps(model, name, drift, rtol, atol, t1 - t0, bar).run(*arguments)
+            return SundialsSteps(model, name, drift, rtol, atol, t1 - t0, bar)
         case Adaptive(name, rtol, atol):
-            return ScipySteps(model, name, drift, rtol, atol, bar).run(*arguments)
+            return ScipySteps(model, name, drift, rtol, atol, bar)
 
 
 def _run(model, motion, method, drift, knots, span):
@@ -168,7 +178,8 @@ def _run(model, motion, method, drift, knots, span):
         status, message = 1, f"interrupted at {last} of {span[2]:g} s; what was computed is kept"
     else:
         status, message = 0, "finished"
-    facts = {"method": str(method), "drift": str(drift or ""), "counters": motion.counters, "knots": knots}
+    facts = {"method": str(method), "drift": str(drift or ""), "counters": motion.counters}
+    facts["knots"] = tuple(sorted({*knots, *motion.switches}))
     facts |= {"success": status == 0, "status": status, "message": message, "variants": tuple(variants)}
     return Run(t, jets, model.names_to(len(jets)), model, **facts)
 

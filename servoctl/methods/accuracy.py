@@ -15,6 +15,7 @@ from servoctl.checks import is_number
 from servoctl.errors import LimitExceeded, SpecificationError
 from servoctl.methods.choice import Algebraic, Project, Taylor
 from servoctl.methods.taylor import order_for
+from servoctl.methods.watch import state_levels
 
 SMALLEST_SIZE = 1e-3  # of a component relative to the largest of its level; a zero component has only rounding
 MARGIN, FINER = 0.1, 1e-2  # first tolerance relative to the accuracy, and each next one relative to the last
@@ -54,12 +55,6 @@ def component_sizes(values, levels):
         size[same] = np.maximum(size[same], SMALLEST_SIZE * size[same].max())
     size[size == 0] = 1.0
     return size
-
-
-def state_levels(model):
-    """Level of each entry of the state X: 0 for q, k for γ^(k); (n_x,) array of int."""
-    n_x, nq, n = len(model.state_names), model.nq, model.n
-    return np.append(np.zeros(nq, dtype=int), 1 + np.arange(n_x - nq) // n)
 
 
 def motion_error(model, jets, reference):

@@ -6,6 +6,7 @@ from servoctl.methods.choice import MinimalCoordinates, Project
 from servoctl.methods.minimal import Chart, MinimalSolver, Sizes
 from servoctl.methods.monitor import FRACTIONS, DenseStretch, Fine
 from servoctl.methods.motion import Stepping
+from servoctl.methods.watch import End
 
 IMPLICIT = ("Radau", "BDF")
 
@@ -26,7 +27,7 @@ class ScipySteps(Stepping):
     advice = "Use a larger rtol or a method for stiff equations ('Radau'), or check whether the motion escapes."
 
     def __init__(self, model, method, drift, rtol, atol, progress):
-        self.tolerances = {"rtol": rtol, "atol": atol}
+        self.tolerances = rtol, atol
         self.sizes = Sizes(model) if isinstance(drift, MinimalCoordinates) else None
         super().__init__(model, method, drift, progress)
 
@@ -45,9 +46,11 @@ class ScipySteps(Stepping):
     def _solver(self, a, x, b):
         import scipy.integrate
 
+        rtol, atol = self.tolerances
+
         def solver(rates, t, y, jacobian, **options):
             exact = {"jac": jacobian} if self.slopes is not None else {}
-            return getattr(scipy.integrate, self.method)(rates, t, y, b, **self.tolerances, **exact, **options)
+            return getattr(scipy.integrate, self.method)(rates, t, y, b, rtol=rtol, atol=atol, **exact, **options)
 
         if isinstance(self.drift, MinimalCoordinates):
             return MinimalSolver(solver, Chart(self.model, self.sizes, a, x), a, x)
@@ -55,8 +58,9 @@ class ScipySteps(Stepping):
 
     def _piece(self, a, x, b, times):
         self.pending, self.forward = list(times), b >= a
-        solver, steps = self._solver(a, x, b), 0
+        solver, steps, outcome = self._solver(a, x, b), 0, None
         self.monitor.begin(self._pivots(a, x))
+        self.watch.begin(a)
         self._sample(a, None, x)
         while solver.status == "running":
             t, x = solver.t, solver.y.copy()
@@ -67,13 +71,17 @@ class ScipySteps(Stepping):
                 self._keep_last(t, x)
                 break
             steps, dense = steps + 1, solver.dense_output()
-            outcome = self.monitor.inspect(self._stretch(t, x, solver, dense))
+            outcome = self._inspected(self._stretch(t, x, solver, dense))
             if isinstance(outcome, Fine):
                 if self.restore is not None and (steps % self.drift.every == 0 or solver.status == "finished"):
                     self._project(solver)
                 self._sample(solver.t, dense, solver.y)
                 self.progress(solver.t)
                 continue
+            if isinstance(outcome, End):
+                self._sample(outcome.t, dense, outcome.x)
+                self._turn(outcome, b)
+                break
             if outcome.steps:
                 t, x = solver.t, solver.y
             goes_on = self._follow(outcome)
@@ -87,7 +95,7 @@ class ScipySteps(Stepping):
             solver = self._solver(t, x, b)
         self._count(solver)
         self.motion.count(steps=steps)
-        return solver.y
+        return (solver.t, solver.y) if outcome is None or isinstance(outcome, Fine) else (outcome.t, outcome.x)
 
     def _stretch(self, t, x, solver, dense):
         """The last step for the monitor: it has passed its error test, and the next begins where it ends."""

@@ -1,0 +1,212 @@
+"""Expressions with kinks and jumps, written as smooth expressions with a branch as a parameter.
+
+On either side of a switching function g = 0 an expression with |g|, sign g, min, max or a comparison is smooth. With a
+parameter b in place of the decision, 1 for g > 0 and 0 for g < 0, it is smooth everywhere, and equal to the original as
+long as b is right. The angle atan2(y, x) jumps by 2π behind the origin; written as b π + atan2((-1)ᵇ y, (-1)ᵇ x), with
+whole b, its jump lies opposite to the direction b π, and b follows the angle round and round.
+"""
+
+from typing import NamedTuple
+
+import casadi as ca
+
+_SIDES = {
+    ca.OP_FABS: lambda b, x, y: (2 * b - 1) * x,
+    ca.OP_SIGN: lambda b, x, y: 2 * b - 1,
+    ca.OP_FMIN: lambda b, x, y: ca.if_else(b, y, x),
+    ca.OP_FMAX: lambda b, x, y: ca.if_else(b, x, y),
+    ca.OP_LT: lambda b, x, y: 1 - b,
+    ca.OP_LE: lambda b, x, y: 1 - b,
+}  # the operation on x and y where b says whether x > y
+_SWITCHING = {*_SIDES, ca.OP_ATAN2}
+_IN_ORDER = {"allow_free": True, "live_variables": False}  # operations fill places in order
+_NARROW = 0.5**0.5  # an angle is followed up to 135° on either side of its branch
+
+
+class Switch(NamedTuple):
+    """A decision that the motion may change.
+
+    Attributes
+    ----------
+    branch : SX
+        The parameter b.
+    function : SX
+        The switching function, which is not negative where b is right.
+    other : SX
+        The branch beyond its zero.
+    text : str
+        Where it changes, in the designer's names.
+    angle : bool
+        Whether b counts half turns, instead of sides.
+    """
+
+    branch: ca.SX
+    function: ca.SX
+    other: ca.SX
+    text: str
+    angle: bool
+
+
+def has_switches(expressions):
+    """Whether expressions hold an operation with branches.
+
+    Parameters
+    ----------
+    expressions : SX column
+    """
+    f = ca.Function("branches", [], [expressions], {"allow_free": True})
+    return any(f.instruction_id(k) in _SWITCHING for k in range(f.n_instructions()))
+
+
+class Branches:
+    """Smooth expressions in place of ones with branches that depend on some of their symbols.
+
+    Parameters
+    ----------
+    moves : callable
+        Whether branches may change along a motion that changes a symbol (SX).
+    """
+
+    def __init__(self, moves):
+        self.moves, self.switches, self._known = moves, [], {}
+
+    def smooth(self, expressions, angles=False):
+        """The expressions with branches as parameters.
+
+        Parameters
+        ----------
+        expressions : sequence of SX scalars
+        angles : bool
+            Whether atan2 is a continuous angle; otherwise it stays as it is.
+
+        Returns
+        -------
+        list of SX scalars
+        """
+        if not expressions:
+            return []
+        merged = ca.densify(ca.cse(ca.vertcat(*expressions)))
+        f = ca.Function("branches", [], merged.elements(), _IN_ORDER)
+        free, work, moves, result = iter(f.free_sx()), [], [], [ca.SX(0)] * f.n_out()
+        original = []  # the same values with their decisions, by which switches are named
+        for k in range(f.n_instructions()):
+            op, operands = f.instruction_id(k), f.instruction_input(k)
+            if op == ca.OP_OUTPUT:
+                result[f.instruction_output(k)[0]] = work[operands[0]]
+                continue
+            if op == ca.OP_PARAMETER:
+                work.append(next(free))
+                original.append(work[-1])
+                moves.append(self.moves(work[-1]))
+                continue
+            if op == ca.OP_CONST:
+                work.append(ca.SX(f.instruction_constant(k)))
+                original.append(work[-1])
+                moves.append(False)
+                continue
+            a, *rest = operands
+            b = rest[0] if rest else None
+            moves.append(any(moves[i] for i in operands))
+            original.append(_apply(op, *(original[i] for i in operands)))
+            if moves[-1] and (op in _SIDES or (angles and op == ca.OP_ATAN2)):
+                decide = self._angle if op == ca.OP_ATAN2 else self._side
+                work.append(decide(op, *(None if i is None else (work[i], original[i]) for i in (a, b))))
+            else:
+                work.append(_apply(op, *(work[i] for i in operands)))
+        return result
+
+    def _side(self, op, x, y):
+        """|x|, sign x, or an operation that compares x with y; pairs of smooth and original expressions."""
+        (x, x0), (y, y0) = x, y if y is not None else (ca.SX(0), ca.SX(0))
+        if x.is_constant() and not y.is_constant():  # the same decision as that of y against the constant
+            return self._of_swapped(op, x, y, y0 - x0)
+        b = self._branch("side", x - y, x0 - y0)
+        return _SIDES[op](b, x, y)
+
+    def _of_swapped(self, op, x, y, original):
+        return _SIDES[op](1 - self._branch("side", y - x, original), x, y)
+
+    def _angle(self, op, y, x):
+        """The continuous angle of (x, y)."""
+        (y, y0), (x, x0) = y, x
+        key = ("angle", y.element_hash(), x.element_hash())
+        if key not in self._known:
+            b = ca.SX.sym(f"branch {len(self.switches)}")
+            sign = ca.cos(ca.pi * b)
+            ahead = sign * x + _NARROW * ca.sqrt(x**2 + y**2)
+            turned = b + ca.if_else(sign * y >= 0, 1, -1)
+            self.switches.append(Switch(b, ahead, turned, f"the angle of ({_text(x0)}, {_text(y0)})", True))
+            self._known[key] = b, sign
+        b, sign = self._known[key]
+        return ca.pi * b + ca.atan2(sign * y, sign * x)
+
+    def _branch(self, kind, g, original):
+        """The branch parameter of a switching function, one for equal functions."""
+        key = next((key for key in self._known if key[0] == kind and ca.is_equal(key[1], g, 3)), None)
+        if key is None:
+            b = ca.SX.sym(f"branch {len(self.switches)}")
+            self.switches.append(Switch(b, (2 * b - 1) * g, 1 - b, f"{_text(original)} = 0", False))
+            key = kind, g
+            self._known[key] = b
+        return self._known[key]
+
+
+_EDGES = {
+    ca.OP_ASIN: ("asin", (-1.0, 1.0)),
+    ca.OP_ACOS: ("acos", (-1.0, 1.0)),
+    ca.OP_ATANH: ("atanh", (-1.0, 1.0)),
+    ca.OP_ACOSH: ("acosh", (1.0,)),
+    ca.OP_SQRT: ("sqrt", (0.0,)),
+    ca.OP_LOG: ("log", (0.0,)),
+    ca.OP_POW: ("a power", (0.0,)),
+    ca.OP_CONSTPOW: ("a power", (0.0,)),
+}
+
+
+def domain_edges(expressions):
+    """Where functions in expressions cease to be smooth.
+
+    Parameters
+    ----------
+    expressions : sequence of SX scalars
+
+    Returns
+    -------
+    list of (str, SX, float)
+        What happens there in words, an argument, and its value at the edge of the domain.
+    """
+    f = ca.Function("edges", [], list(expressions), _IN_ORDER)
+    free, work, result = iter(f.free_sx()), [], []
+    for k in range(f.n_instructions()):
+        op, operands = f.instruction_id(k), f.instruction_input(k)
+        if op == ca.OP_OUTPUT:
+            continue
+        if op == ca.OP_PARAMETER:
+            work.append(next(free))
+        elif op == ca.OP_CONST:
+            work.append(ca.SX(f.instruction_constant(k)))
+        else:
+            arguments = [work[i] for i in operands]
+            work.append(_apply(op, *arguments))
+            name, edges = _EDGES.get(op, ("", ()))
+            words = f"the argument of {name}, {_text(arguments[0])}, reaches"
+            result += [(f"{words} {edge:g}, where its domain ends", arguments[0], edge) for edge in edges]
+            if op in (ca.OP_DIV, ca.OP_INV):
+                result.append((f"it divides by {_text(arguments[-1])}, which reaches zero", arguments[-1], 0.0))
+            if op == ca.OP_ATAN2:
+                angle = f"the angle atan2({', '.join(map(_text, arguments))}) passes pi"
+                result.append((angle, ca.fmax(ca.fabs(arguments[0]), arguments[1]), 0.0))
+    return result
+
+
+def _apply(op, *operands):
+    return ca.SX.unary(op, *operands) if len(operands) == 1 else ca.SX.binary(op, *operands)
+
+
+def _text(expression, longest=40):
+    """An expression in the designer's names; only the names where it is long."""
+    text = str(expression)
+    text = text[1:-1] if text.startswith("(") and text.endswith(")") and text.count("(") == 1 else text
+    if "@" in text or len(text) > longest:
+        text = f"a function of {', '.join(s.name() for s in ca.symvar(expression))}"
+    return text

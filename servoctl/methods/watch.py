@@ -1,0 +1,399 @@
+"""What ends a smooth piece of a motion: a kink or switch of the equations, or a residual that leaves its tolerance.
+
+The tolerance of a residual is what the tolerances of the state allow in it, |∂ψ/∂X| (atol + rtol |X|). Over a step a
+residual and its derivatives change as they extrapolate each other, since the last of them is kept at zero; what a step
+adds to that is its error. Where the program ends (an angle whose sine passes 1) or jumps, this is no small number.
+"""
+
+from dataclasses import dataclass
+from itertools import pairwise
+from math import factorial
+
+import casadi as ca
+import numpy as np
+
+from servoctl.errors import IntegrationStopped
+from servoctl.jets.branches import domain_edges
+from servoctl.tolerances import TINY
+
+LEAVES = 1e3  # times its tolerance, which no healthy step adds to a residual
+DEFAULT = 1e-9, 1e-11  # rtol and atol that judge steps of fixed length, until these are known to be coarser
+LEAST_RTOL = 1e-12  # rounding of residuals: smaller tolerances are not resolved
+EXPLAINED = 2.0  # times the extrapolation of a residual from earlier levels
+REMAINS = 0.75  # of the error of a step in two of half its length: it is a jump, since other errors shrink to a half
+LEARNED = 10.0  # times the error of a step of fixed length, which later ones may have
+MOST_INSPECTED = 128  # steps of a stretch whose residuals are evaluated
+BISECTIONS = 40  # halvings of a step that locate where a residual leaves: all digits
+EDGE = 1e-3  # distance of a function's argument from the edge of its domain that explains why a residual leaves
+AT_ONCE = 1e-9  # of the span: switches closer than this follow at once
+MOST_AT_ONCE = 2  # changes of one branch at once, after which the motion stays on the switch
+
+
+@dataclass(frozen=True)
+class End:
+    """The smooth piece ends at t [s], X = x, in the step after `steps` whole ones.
+
+    Attributes
+    ----------
+    steps : int
+    t : float
+    x : (n_x,) array
+    switched : tuple of int
+        The switches that the motion crosses there; none where it stops.
+    branches : tuple of float
+        All branches beyond.
+    error : ServoError or None
+        Why it stops.
+    """
+
+    steps: int
+    t: float
+    x: np.ndarray
+    switched: tuple = ()
+    branches: tuple = ()
+    error: object = None
+
+
+def state_levels(model):
+    """Level of each entry of the state X: 0 for q, k for γ^(k); (n_x,) array of int."""
+    n_x, nq, n = len(model.state_names), model.nq, model.n
+    return np.append(np.zeros(nq, dtype=int), 1 + np.arange(n_x - nq) // n)
+
+
+class Tolerance:
+    """The tolerances of the state along a motion, and of functions of it.
+
+    Parameters
+    ----------
+    model : Model
+    rtol, atol : float
+    """
+
+    def __init__(self, model, rtol, atol):
+        self.levels, self.rtol, self.atol = state_levels(model), max(rtol, LEAST_RTOL), atol
+        self.sizes = np.zeros(len(self.levels))
+
+    def of(self, slopes, x):
+        """Tolerances (m, N) of functions with derivatives (m, n_x, N) in X = x (n_x, N)."""
+        largest = np.nan_to_num(np.abs(x)).max(axis=1)
+        for level in np.unique(self.levels):
+            same = self.levels == level
+            self.sizes[same] = max(self.sizes[same].max(), largest[same].max())
+        return np.einsum("mxn,x->mn", np.abs(slopes), self.atol + self.rtol * self.sizes)
+
+
+class Switches:
+    """The switching functions of a motion.
+
+    Parameters
+    ----------
+    family : Switching
+    branches : tuple of float
+        Those that hold.
+    tolerance : Tolerance
+    parts : int
+        Parts of a step at whose ends the functions are evaluated.
+    """
+
+    def __init__(self, family, branches, tolerance, parts):
+        self.family, self.branches, self.tolerance, self.parts = family, branches, tolerance, parts
+        self.counts, self.start, self.span = {}, None, 0.0
+
+    def first(self, stretch, state):
+        """The first switch within steps as an `End`, or None; `state` gives X from (k, t)."""
+        t, x = self._instants(stretch, state)
+        functions, slopes, _ = self.family.values(self.branches, t, x)
+        wrong = functions < -self.tolerance.of(slopes, x)
+        if not wrong.any():
+            return None
+        j = max(int(np.argmax(wrong.any(axis=0))), 1)
+        k = (j - 1) // self.parts
+        roots = {i: self._root(i, t[j - 1], t[j], lambda s: state(k, s)) for i in np.flatnonzero(wrong[:, j])}
+        direction = np.copysign(1.0, t[j] - t[j - 1])
+        at = direction * min(direction * root for root in roots.values())
+        changed = tuple(int(i) for i, root in roots.items() if abs(root - at) <= AT_ONCE * self.span)
+        y = state(k, at) if at != t[0] else stretch.x[:, 0]
+        return End(k, float(at), y, changed, self._beyond(changed, at, y))
+
+    def _instants(self, stretch, state):
+        """Instants (N,) and states (n_x, N) at which the functions are evaluated: ends of steps, and parts of them."""
+        if self.parts == 1:
+            return stretch.t, stretch.x
+        inside = np.arange(1, self.parts) / self.parts
+        t, x = [stretch.t[:1]], [stretch.x[:, 0]]
+        for k, (a, b) in enumerate(pairwise(stretch.t)):
+            t += [a + (b - a) * inside, [b]]
+            x += [*(state(k, s) for s in t[-2]), stretch.x[:, k + 1]]
+        return np.concatenate(t), np.array(x).T
+
+    def _root(self, i, a, b, state):
+        from scipy.optimize import brentq
+
+        def function(s):
+            return self.family.values(self.branches, np.array([s]), state(s)[:, None])[0][i, 0]
+
+        low, high = function(a), function(b)
+        if not low > 0 > high:
+            return a
+        return brentq(function, a, b, xtol=1e-15, rtol=8.9e-16)
+
+    def _beyond(self, changed, t, x):
+        """All branches beyond a switch, with those that follow from it."""
+        result, open_ = list(self.branches), list(changed)
+        t, x = np.array([t]), x[:, None]
+        while open_:
+            others = self.family.values(tuple(result), t, x)[2]
+            for i in open_:
+                result[i] = float(others[i, 0])
+            changed = {*changed, *open_}
+            functions, slopes, _ = self.family.values(tuple(result), t, x)
+            wrong = np.flatnonzero(functions[:, 0] < -self.tolerance.of(slopes, x)[:, 0])
+            open_ = [i for i in wrong if i not in changed]
+        return tuple(result)
+
+    def sticks(self, end):
+        """The switches at which the motion stays: it is driven back to them from both sides."""
+        if abs(end.t - self.start) > AT_ONCE * self.span:
+            self.counts = {}
+        for i in end.switched:
+            self.counts[i] = self.counts.get(i, 0) + 1
+        stuck = [i for i, count in self.counts.items() if count > MOST_AT_ONCE]
+        return [self.family.switches[i].text for i in stuck]
+
+
+class Residuals:
+    """The residuals of a motion at all levels of its state.
+
+    Parameters
+    ----------
+    model : Model
+    tolerance : Tolerance
+    coefficients : sequence of array
+        Coefficients of the error dynamics of each row, empty without them.
+    """
+
+    def __init__(self, model, tolerance, coefficients=()):
+        self.model, self.tolerance, self.f = model, tolerance, model.function("invariants")
+        self.names = [name for _, name in model.invariant_names()]
+        self.m, self.coarse = len(self.names), np.zeros(len(self.names))
+        places = {name: i for i, name in enumerate(self.names)}
+        self.chains = []
+        for a, row in enumerate(model.reduction.rows):
+            levels = [row.name, f"D({row.name})", *(f"D{j}({row.name})" for j in range(2, len(places)))]
+            chain = [places[name] for name in levels if name in places]
+            self.chains.append((chain, np.abs(coefficients[a]) if len(coefficients) else np.zeros(len(chain))))
+
+    def values(self, t, x):
+        """Residuals (m, N) and their tolerances at times t (N,) and states x (n_x, N)."""
+        y = self.f.grid(t, x, self.model.parameters)
+        slopes = y[self.m :].reshape(len(x), self.m, -1).swapaxes(0, 1)
+        return y[: self.m], self.tolerance.of(slopes, x)
+
+    def explained(self, before, h):
+        """What residuals (m, N) may grow to in times h (N,), by the lower ones of their rows and the error dynamics."""
+        size, h = np.abs(before), np.abs(h)
+        result = size.copy()
+        for chain, coefficients in self.chains:
+            last = sum((c * size[i] for c, i in zip(coefficients, chain, strict=True)), 0.0 * h)
+            levels = [*(size[i] for i in chain), last]
+            for j, i in enumerate(chain):
+                result[i] = sum(level * h**k / factorial(k) for k, level in enumerate(levels[j:]))
+        return EXPLAINED * result
+
+    def off(self, t, x):
+        """Residuals (m, N - 1) beyond what they may be at successive instants, negative where all is well."""
+        with np.errstate(all="ignore"):
+            values, tolerances = self.values(t, x)
+            h = np.diff(t)
+            allowed = LEAVES * tolerances[:, 1:] + self.coarse[:, None] + self.explained(values[:, :-1], h)
+            over = np.abs(values[:, 1:]) - allowed
+        return np.where(np.isnan(values[:, 1:]), np.inf, np.nan_to_num(over, nan=-1.0, posinf=np.inf, neginf=-1.0))
+
+    def error(self, t, x, over):
+        """The error of the residual that is farthest beyond what it may be at t, X = x."""
+        values, tolerances = (part[:, 0] for part in self.values(np.array([t]), x[:, None]))
+        with np.errstate(all="ignore"):
+            worst = int(np.argmax(np.where(over > 0, over / np.maximum(tolerances, TINY), -1.0)))
+        name, value = self.names[worst], float(values[worst])
+        why = self._edge(name, t, x)
+        return IntegrationStopped(
+            f"The residual {name!r} leaves zero at t = {t:.7g} s, to {value:.3g} within a step{why and f': {why}'}.",
+            f"The tolerances of the method allow it {tolerances[worst]:.1e}; beyond, this is no motion of the program.",
+            do="Let the motion end before, or write the residual so that it is smooth along the motion. The run before "
+            "this instant is in .run.",
+            t=t,
+            residual=name,
+            value=value,
+            allowed=float(tolerances[worst]),
+            why=why,
+        )
+
+    def _edge(self, name, t, x):
+        """The function in a row that is at the edge of its domain, or jumps, at t, X = x; "" if there is none."""
+        rows = {row.name: row for row in self.model.reduction.rows}
+        base = next((row for row in rows if row in name), None)
+        places = domain_edges([rows[base].expression]) if base else []
+        if not places:
+            return ""
+        m = self.model.reduction.mechanism
+        state = ca.vertcat(*m.q, *(s for k in range(1, self.model.reduction.top) for s in m.q.gamma(k)))
+        arguments = ca.vertcat(*(argument for _, argument, _ in places))
+        f = ca.Function("arguments", [m.q.t, state, ca.vertcat(*m.parameters.symbols)], [arguments])
+        values = np.array(f(t, x, self.model.parameters)).ravel()
+        near = [(abs(v - edge), words) for v, (words, _, edge) in zip(values, places, strict=True)]
+        distance, words = min(near, key=lambda pair: np.nan_to_num(pair[0], nan=np.inf))
+        return words if distance < EDGE else ""
+
+
+class Watch:
+    """Finds where a smooth piece of a motion ends.
+
+    Parameters
+    ----------
+    tolerances : (rtol, atol) or None
+        Of the method; None for steps of fixed length.
+    span : float
+        Length of the whole motion [s].
+    family : Switching or None
+        The smooth models of a model with kinks or switches.
+    exact : bool
+        Whether the residuals are solved for, so that they need no watch.
+    parts : int
+        Parts of a step at whose ends switching functions are evaluated.
+    """
+
+    def __init__(self, tolerances, span, family, exact, parts):
+        self.parts = parts
+        self.tolerances, self.span, self.family, self.exact = tolerances or DEFAULT, span, family, exact
+        self.switches, self.model = None, None
+
+    def use(self, model, branches, coefficients=()):
+        """Watch the motion of a model, which is the one for these branches."""
+        tolerance, self.model = Tolerance(model, *self.tolerances), model
+        self.residuals = None if self.exact else Residuals(model, tolerance, coefficients)
+        if self.family is not None:
+            counts = {} if self.switches is None else self.switches.counts
+            self.switches = Switches(self.family, branches, tolerance, self.parts)
+            self.switches.counts, self.switches.span = counts, self.span
+
+    @property
+    def branches(self):
+        """The branches that hold."""
+        return () if self.switches is None else self.switches.branches
+
+    def texts(self, end):
+        """The switches that the motion crosses at an end, in words."""
+        return " and ".join(self.family.switches[i].text for i in end.switched)
+
+    def begin(self, t):
+        """Start a piece at t [s]."""
+        if self.switches is not None:
+            self.switches.start = t
+
+    def switch(self, stretch, state):
+        """The first switch within steps as an `End`, or None."""
+        return None if self.switches is None else self.switches.first(stretch, state)
+
+    def left(self, stretch, state, again=None):
+        """Where a residual leaves its tolerance within steps, as an `End`, or None.
+
+        Parameters
+        ----------
+        stretch : Stretch
+        state : callable
+            X from (k, t).
+        again : callable, optional
+            States at the ends of two steps of half the length, from (t, x, h); for steps of fixed length.
+        """
+        count = len(stretch.t) - 1
+        if self.residuals is None or not self.residuals.m or not count:
+            return None
+        picked = np.unique(np.linspace(0, count, min(count, MOST_INSPECTED) + 1).astype(int))
+        over = self.residuals.off(stretch.t[picked], stretch.x[:, picked])
+        for p in np.flatnonzero((over > 0).any(axis=0)):
+            for k in range(picked[p], picked[p + 1]):
+                ends = slice(k, k + 2)
+                off = self.residuals.off(stretch.t[ends], stretch.x[:, ends])[:, 0] > 0
+                if off.any() and (again is None or self._stays(off, stretch.t[ends], stretch.x[:, ends], again)):
+                    return self._end(stretch, k, state)
+        return None
+
+    def _stays(self, off, t, x, again):
+        """Whether a residual is as far off after two steps of half the length; if not, these steps are coarse."""
+        halves = again(t[0], x[:, 0], (t[1] - t[0]) / 2)
+        if halves.shape[1] < 3:
+            return True
+        values, _ = self.residuals.values(t[[0, 1, 1]], np.column_stack([x, halves[:, -1]]))
+        before, once, twice = np.abs(values[off].T)
+        explained = self.residuals.explained(values[:, :1], t[1:] - t[:1])[off, 0]
+        once, twice = once - explained, twice - explained
+        if np.any(~(twice <= REMAINS * once)):
+            return True
+        self.residuals.coarse[off] = np.maximum(self.residuals.coarse[off], LEARNED * once)
+        return False
+
+    def _end(self, stretch, k, state):
+        """The end within step k at which a residual leaves its tolerance, by bisection."""
+        start, low, high = stretch.t[k], stretch.t[k], stretch.t[k + 1]
+        x0 = stretch.x[:, k]
+
+        def off(t):
+            x = stretch.x[:, k + 1] if t == stretch.t[k + 1] else state(k, t)
+            return self.residuals.off(np.array([start, t]), np.column_stack([x0, x]))[:, 0]
+
+        for _ in range(BISECTIONS):
+            middle = (low + high) / 2
+            low, high = (low, middle) if np.any(off(middle) > 0) else (middle, high)
+        x = state(k, low) if low != start else x0
+        beyond = stretch.x[:, k + 1] if high == stretch.t[k + 1] else state(k, high)
+        return End(k, float(low), x, error=self.residuals.error(float(high), beyond, off(high)))
+
+    def jump(self, model, end):
+        """The error of a residual, or derivative of one, that jumps at a switch to another model; None if none does."""
+        t, x = np.array([end.t]), end.x[:, None]
+        sides = [Residuals(m, self.switches.tolerance) for m in (self.model, model)]
+        if sides[0].names != sides[1].names:
+            return None
+        (before, tolerance), (after, other) = (side.values(t, x) for side in sides)
+        over = np.abs(after - before)[:, 0] - LEAVES * np.maximum(tolerance, other)[:, 0]
+        if not np.any(over > 0):
+            return None
+        name, height = sides[0].names[int(np.argmax(over > 0))], float(np.abs(after - before)[np.argmax(over > 0), 0])
+        where = self.texts(end)
+        rate = name not in {row.name for row in model.reduction.rows}
+        what = "has a kink, so that velocities would jump" if rate else "jumps"
+        return IntegrationStopped(
+            f"The residual {name!r} {what} by {height:.3g} at t = {end.t:.7g} s, where {where}.",
+            "Coordinates and velocities are continuous along a motion, and the residual keeps them at zero on both sides.",
+            do="Write the residual with a smooth function, such as sqrt(y**2 + a**2) for |y|, or let the motion end "
+            "here. The run before this instant is in .run.",
+            t=end.t,
+            residual=name,
+            height=height,
+            switch=where,
+        )
+
+
+def sticks(method, t, switches):
+    """The error of a motion that cannot leave a switch."""
+    where = " and ".join(switches)
+    return IntegrationStopped(
+        f"{method} stopped at t = {t:.7g} s: the motion stays at the switch {where}, driven back from both sides.",
+        "On a switch the equations of neither side hold, as where dry friction sticks.",
+        do="Write the switch as a smooth function, such as tanh(v/v0) for sign(v), or let the motion end here. The run "
+        "before this instant is in .run.",
+        t=t,
+        switches=list(switches),
+    )
+
+
+def no_model(method, t, where, reason):
+    """The error of a motion that meets a switch beyond which its program has no model."""
+    return IntegrationStopped(
+        f"{method} stopped at t = {t:.7g} s, where {where}: {reason}",
+        "Beyond a switch the program needs a model of the same structure.",
+        do="Let the motion end here. The run before this instant is in .run.",
+        t=t,
+        switch=where,
+        reason=type(reason).__name__,
+    )
