@@ -19,6 +19,7 @@ from servoctl.tolerances import TINY
 LEAVES = 1e3  # times its tolerance, which no healthy step adds to a residual
 DEFAULT = 1e-9, 1e-11  # rtol and atol that judge steps of fixed length, until these are known to be coarser
 LEAST_RTOL = 1e-12  # rounding of residuals: smaller tolerances are not resolved
+SHARE = 1e-2  # of the terms of a residual, which it never reaches
 EXPLAINED = 2.0  # times the extrapolation of a residual from earlier levels
 REMAINS = 0.75  # of the error of a step in two of half its length: it is a jump, since other errors shrink to a half
 LEARNED = 10.0  # times the error of a step of fixed length, which later ones may have
@@ -88,16 +89,23 @@ class Switches:
     Parameters
     ----------
     family : Switching
+    span : float
+        Length of the whole motion [s].
+    parts : int
+        Parts of a step at whose ends the functions are evaluated.
+
+    Attributes
+    ----------
     branches : tuple of float
         Those that hold.
     tolerance : Tolerance
-    parts : int
-        Parts of a step at whose ends the functions are evaluated.
+    start : float
+        Of the piece [s].
     """
 
-    def __init__(self, family, branches, tolerance, parts):
-        self.family, self.branches, self.tolerance, self.parts = family, branches, tolerance, parts
-        self.counts, self.start, self.span = {}, None, 0.0
+    def __init__(self, family, span, parts):
+        self.family, self.span, self.parts = family, span, parts
+        self.counts, self.start, self.branches, self.tolerance = {}, 0.0, (), None
 
     def first(self, stretch, state):
         """The first switch within steps as an `End`, or None; `state` gives X from (k, t)."""
@@ -176,6 +184,10 @@ class Residuals:
         self.model, self.tolerance, self.f = model, tolerance, model.function("invariants")
         self.names = [name for _, name in model.invariant_names()]
         self.m, self.coarse = len(self.names), np.zeros(len(self.names))
+        # a residual and its rates depend on jets of their own level by the same gradient; one in q alone has no rate
+        levels = np.array([level for level, _ in model.invariant_names()])
+        self.own = (levels[:, None] == tolerance.levels) & (levels > 0)[:, None]
+        self.terms, self.first = np.where(levels > 0, 0.0, np.inf), None
         places = {name: i for i, name in enumerate(self.names)}
         self.chains = []
         for a, row in enumerate(model.reduction.rows):
@@ -184,10 +196,15 @@ class Residuals:
             self.chains.append((chain, np.abs(coefficients[a]) if len(coefficients) else np.zeros(len(chain))))
 
     def values(self, t, x):
-        """Residuals (m, N) and their tolerances at times t (N,) and states x (n_x, N)."""
+        """Residuals (m, N) at times t (N,) and states x (n_x, N), and what their tolerances and terms allow."""
         y = self.f.grid(t, x, self.model.parameters)
         slopes = y[self.m :].reshape(len(x), self.m, -1).swapaxes(0, 1)
-        return y[: self.m], self.tolerance.of(slopes, x)
+        allowed = LEAVES * self.tolerance.of(slopes, x)
+        if self.first is None:
+            self.first = allowed[:, 0]
+        terms = np.einsum("mx,mxn,xn->mn", self.own, np.abs(slopes), np.abs(x))
+        self.terms = np.maximum(self.terms, np.nan_to_num(terms).max(axis=1))
+        return y[: self.m], np.fmin(allowed, np.maximum(self.first, SHARE * self.terms)[:, None])
 
     def explained(self, before, h):
         """What residuals (m, N) may grow to in times h (N,), by the lower ones of their rows and the error dynamics."""
@@ -200,31 +217,37 @@ class Residuals:
                 result[i] = sum(level * h**k / factorial(k) for k, level in enumerate(levels[j:]))
         return EXPLAINED * result
 
-    def off(self, t, x):
-        """Residuals (m, N - 1) beyond what they may be at successive instants, negative where all is well."""
+    def off(self, t, before, after):
+        """How far residuals (m, N) exceed what they may be at the ends of steps, negative where all is well.
+
+        Parameters
+        ----------
+        t : (2, N) array
+            Starts and ends of the steps [s].
+        before, after : (n_x, N) arrays
+            States there.
+        """
         with np.errstate(all="ignore"):
-            values, tolerances = self.values(t, x)
-            h = np.diff(t)
-            allowed = LEAVES * tolerances[:, 1:] + self.coarse[:, None] + self.explained(values[:, :-1], h)
-            over = np.abs(values[:, 1:]) - allowed
-        return np.where(np.isnan(values[:, 1:]), np.inf, np.nan_to_num(over, nan=-1.0, posinf=np.inf, neginf=-1.0))
+            values, _ = self.values(t[0], before)
+            residuals, allowed = self.values(t[1], after)
+            over = np.abs(residuals) - allowed - self.coarse[:, None] - self.explained(values, t[1] - t[0])
+        return np.where(np.isnan(residuals), np.inf, np.nan_to_num(over, nan=-1.0, posinf=np.inf, neginf=-1.0))
 
     def error(self, t, x, over):
         """The error of the residual that is farthest beyond what it may be at t, X = x."""
-        values, tolerances = (part[:, 0] for part in self.values(np.array([t]), x[:, None]))
-        with np.errstate(all="ignore"):
-            worst = int(np.argmax(np.where(over > 0, over / np.maximum(tolerances, TINY), -1.0)))
+        values, allowed = (part[:, 0] for part in self.values(np.array([t]), x[:, None]))
+        worst = int(np.argmax(np.where(over > 0, over / np.maximum(allowed, TINY), -1.0)))
         name, value = self.names[worst], float(values[worst])
         why = self._edge(name, t, x)
         return IntegrationStopped(
             f"The residual {name!r} leaves zero at t = {t:.7g} s, to {value:.3g} within a step{why and f': {why}'}.",
-            f"The tolerances of the method allow it {tolerances[worst]:.1e}; beyond, this is no motion of the program.",
+            f"The tolerances of the method allow it {allowed[worst]:.1e}; beyond, this is no motion of the program.",
             do="Let the motion end before, or write the residual so that it is smooth along the motion. The run before "
             "this instant is in .run.",
             t=t,
             residual=name,
             value=value,
-            allowed=float(tolerances[worst]),
+            allowed=float(allowed[worst]),
             why=why,
         )
 
@@ -263,18 +286,15 @@ class Watch:
     """
 
     def __init__(self, tolerances, span, family, exact, parts):
-        self.parts = parts
-        self.tolerances, self.span, self.family, self.exact = tolerances or DEFAULT, span, family, exact
-        self.switches, self.model = None, None
+        self.tolerances, self.family, self.exact = tolerances or DEFAULT, family, exact
+        self.switches, self.model = None if family is None else Switches(family, span, parts), None
 
     def use(self, model, branches, coefficients=()):
         """Watch the motion of a model, which is the one for these branches."""
         tolerance, self.model = Tolerance(model, *self.tolerances), model
         self.residuals = None if self.exact else Residuals(model, tolerance, coefficients)
-        if self.family is not None:
-            counts = {} if self.switches is None else self.switches.counts
-            self.switches = Switches(self.family, branches, tolerance, self.parts)
-            self.switches.counts, self.switches.span = counts, self.span
+        if self.switches is not None:
+            self.switches.branches, self.switches.tolerance = branches, tolerance
 
     @property
     def branches(self):
@@ -309,24 +329,27 @@ class Watch:
         if self.residuals is None or not self.residuals.m or not count:
             return None
         picked = np.unique(np.linspace(0, count, min(count, MOST_INSPECTED) + 1).astype(int))
-        over = self.residuals.off(stretch.t[picked], stretch.x[:, picked])
+        t, x = stretch.t[picked], stretch.x[:, picked]
+        over = self.residuals.off(np.array([t[:-1], t[1:]]), x[:, :-1], x[:, 1:])
         for p in np.flatnonzero((over > 0).any(axis=0)):
             for k in range(picked[p], picked[p + 1]):
-                ends = slice(k, k + 2)
-                off = self.residuals.off(stretch.t[ends], stretch.x[:, ends])[:, 0] > 0
-                if off.any() and (again is None or self._stays(off, stretch.t[ends], stretch.x[:, ends], again)):
+                ends = stretch.t[k : k + 2], stretch.x[:, k], stretch.x[:, k + 1]
+                off = self._off(*ends) > 0
+                if off.any() and (again is None or self._stays(off, *ends, again)):
                     return self._end(stretch, k, state)
         return None
 
-    def _stays(self, off, t, x, again):
+    def _off(self, t, before, after):
+        return self.residuals.off(t[:, None], before[:, None], after[:, None])[:, 0]
+
+    def _stays(self, off, t, before, after, again):
         """Whether a residual is as far off after two steps of half the length; if not, these steps are coarse."""
-        halves = again(t[0], x[:, 0], (t[1] - t[0]) / 2)
+        halves = again(t[0], before, (t[1] - t[0]) / 2)
         if halves.shape[1] < 3:
             return True
-        values, _ = self.residuals.values(t[[0, 1, 1]], np.column_stack([x, halves[:, -1]]))
-        before, once, twice = np.abs(values[off].T)
-        explained = self.residuals.explained(values[:, :1], t[1:] - t[:1])[off, 0]
-        once, twice = once - explained, twice - explained
+        values, _ = self.residuals.values(t[[0, 1, 1]], np.column_stack([before, after, halves[:, -1]]))
+        explained = self.residuals.explained(values[:, :1], t[1:] - t[:1])[off]
+        once, twice = (np.abs(values[off, 1:]) - explained).T
         if np.any(~(twice <= REMAINS * once)):
             return True
         self.residuals.coarse[off] = np.maximum(self.residuals.coarse[off], LEARNED * once)
@@ -335,18 +358,18 @@ class Watch:
     def _end(self, stretch, k, state):
         """The end within step k at which a residual leaves its tolerance, by bisection."""
         start, low, high = stretch.t[k], stretch.t[k], stretch.t[k + 1]
-        x0 = stretch.x[:, k]
+        ends = {start: stretch.x[:, k], high: stretch.x[:, k + 1]}
+
+        def at(t):
+            return ends[t] if t in ends else state(k, t)
 
         def off(t):
-            x = stretch.x[:, k + 1] if t == stretch.t[k + 1] else state(k, t)
-            return self.residuals.off(np.array([start, t]), np.column_stack([x0, x]))[:, 0]
+            return self._off(np.array([start, t]), ends[start], at(t))
 
         for _ in range(BISECTIONS):
             middle = (low + high) / 2
             low, high = (low, middle) if np.any(off(middle) > 0) else (middle, high)
-        x = state(k, low) if low != start else x0
-        beyond = stretch.x[:, k + 1] if high == stretch.t[k + 1] else state(k, high)
-        return End(k, float(low), x, error=self.residuals.error(float(high), beyond, off(high)))
+        return End(k, float(low), at(low), error=self.residuals.error(float(high), at(high), off(high)))
 
     def jump(self, model, end):
         """The error of a residual, or derivative of one, that jumps at a switch to another model; None if none does."""
@@ -354,11 +377,12 @@ class Watch:
         sides = [Residuals(m, self.switches.tolerance) for m in (self.model, model)]
         if sides[0].names != sides[1].names:
             return None
-        (before, tolerance), (after, other) = (side.values(t, x) for side in sides)
-        over = np.abs(after - before)[:, 0] - LEAVES * np.maximum(tolerance, other)[:, 0]
-        if not np.any(over > 0):
+        (before, allowed), (after, other) = (side.values(t, x) for side in sides)
+        heights = np.abs(after - before)[:, 0]
+        jumps = np.flatnonzero(heights > np.maximum(allowed, other)[:, 0])
+        if not len(jumps):
             return None
-        name, height = sides[0].names[int(np.argmax(over > 0))], float(np.abs(after - before)[np.argmax(over > 0), 0])
+        name, height = sides[0].names[jumps[0]], float(heights[jumps[0]])
         where = self.texts(end)
         rate = name not in {row.name for row in model.reduction.rows}
         what = "has a kink, so that velocities would jump" if rate else "jumps"

@@ -42,7 +42,7 @@ class Switching:
                     switch=s.text,
                     order=q.order(s.function),
                 )
-        self._models = {}
+        self._models, self._sides = {}, {}  # by branches; by sides alone
 
     @cached_property
     def _function(self):
@@ -107,14 +107,26 @@ class Switching:
             If the specification has no model with them, or one of another structure.
         """
         if branches not in self._models:
-            if self._models:
-                numbers = zip(self._names, branches, strict=True)
-                model = next(iter(self._models.values())).with_parameters(**dict(numbers))
-            else:
-                model = derive(*self._with_numbers(branches), self.model.reduction.context.guess)
-            self._require_same(model, branches)
-            self._models[branches] = model
+            # half turns of an angle change no rank, so that they need no decision
+            sides = tuple(0.0 if s.angle else b for s, b in zip(self.switches, branches, strict=True))
+            if sides not in self._sides:
+                self._sides[sides] = self._derived(sides, branches)
+            model = self._sides[sides]
+            values = np.append(self.model.parameters, branches)
+            self._models[branches] = Model(model.reduction, model._store, values, model._knots, model._functions)
         return self._models[branches]
+
+    def _derived(self, sides, branches):
+        """The smooth model for a choice of sides."""
+        if self._sides:
+            model = next(iter(self._sides.values()))
+            now = model.parameters[len(self.model.parameters) :]
+            kept = [b if s.angle else side for s, b, side in zip(self.switches, now, sides, strict=True)]
+            model = model.with_parameters(**dict(zip(self._names, kept, strict=True)))
+        else:
+            model = derive(*self._with_numbers(branches), self.model.reduction.context.guess)
+        self._require_same(model, branches)
+        return model
 
     @property
     def _names(self):
