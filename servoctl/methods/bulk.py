@@ -31,6 +31,8 @@ class BulkSteps(Stepping):
             before = max(last - 1, 0) if isinstance(outcome, Repivot) else last
             self._record(steps, 0, before)
             t, x = steps.t[last], steps.x[:, last].copy()
+            if last < len(steps.t) - 1:
+                self._retake(steps.t[last + 1] - t)
             goes_on = isinstance(outcome, Fine) or self._follow(outcome)
             if before < last:
                 self._record(steps, before, last)
@@ -41,6 +43,9 @@ class BulkSteps(Stepping):
             if not goes_on:
                 self._keep_last(t, x)
         return t, x
+
+    def _retake(self, h):
+        """Go on from before a step of length h [s], which is repeated."""
 
     def _stretch(self, steps):
         """The steps for the monitor: they have passed their error test, and the next begin where they end."""

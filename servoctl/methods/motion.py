@@ -181,7 +181,9 @@ class Stepping:
     def _turn(self, end, b):
         """Stop at the end of a smooth piece, or go on beyond its switch towards b."""
         if end.error is not None:
-            self.motion.stop = end.error
+            why = "a residual leaves its tolerance"
+            singular = not end.error.details["why"] and self.monitor.lost(end.t, end.x)
+            self.motion.stop = self.monitor.singular(end.t, end.x, why) if singular else end.error
             return
         self.motion.switches.append(end.t)
         stuck = self.watch.switches.sticks(end)

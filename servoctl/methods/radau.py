@@ -312,6 +312,9 @@ class RadauSteps(BulkSteps):
         else:
             self.h = abs(equal_steps(a, b, self.step)[0])
 
+    def _retake(self, h):
+        self.h = abs(h)
+
     def _steps(self, t, x, b):
         t, x, z, self.h, counts = radau_steps(self.f, t, x, b, self.p, self.h, self.settings, self.most)
         self.motion.count(steps=len(z), **dict(zip(("rejected", "nfev", "njev", "nlu"), counts, strict=True)))

@@ -75,12 +75,20 @@ class Tolerance:
         self.sizes = np.zeros(len(self.levels))
 
     def of(self, slopes, x):
-        """Tolerances (m, N) of functions with derivatives (m, n_x, N) in X = x (n_x, N)."""
-        largest = np.nan_to_num(np.abs(x)).max(axis=1)
-        for level in np.unique(self.levels):
+        """Tolerances (m, N) of functions with derivatives (m, n_x, N) in X = x (n_x, N) along the motion."""
+        return np.einsum("mxn,xn->mn", np.abs(slopes), self.atol + self.rtol * self._sizes(x))
+
+    def accept(self, x):
+        """Take in states (n_x, N) as part of the motion."""
+        self.sizes = self._sizes(x)[:, -1]
+
+    def _sizes(self, x):
+        """The largest size of each entry's level so far, (n_x, N)."""
+        sizes = np.nan_to_num(np.abs(x))
+        for level in range(self.levels[-1] + 1):
             same = self.levels == level
-            self.sizes[same] = max(self.sizes[same].max(), largest[same].max())
-        return np.einsum("mxn,x->mn", np.abs(slopes), self.atol + self.rtol * self.sizes)
+            sizes[same] = sizes[same].max(axis=0)
+        return np.maximum.accumulate(np.maximum(sizes, self.sizes[:, None]), axis=1)
 
 
 class Switches:
@@ -202,9 +210,14 @@ class Residuals:
         allowed = LEAVES * self.tolerance.of(slopes, x)
         if self.first is None:
             self.first = allowed[:, 0]
-        terms = np.einsum("mx,mxn,xn->mn", self.own, np.abs(slopes), np.abs(x))
-        self.terms = np.maximum(self.terms, np.nan_to_num(terms).max(axis=1))
-        return y[: self.m], np.fmin(allowed, np.maximum(self.first, SHARE * self.terms)[:, None])
+        terms = np.nan_to_num(np.einsum("mx,mxn,xn->mn", self.own, np.abs(slopes), np.abs(x)))
+        terms = np.maximum.accumulate(np.maximum(terms, self.terms[:, None]), axis=1)
+        self.latest = terms[:, -1]
+        return y[: self.m], np.fmin(allowed, np.maximum(self.first[:, None], SHARE * terms))
+
+    def accept(self):
+        """Take in the states of the last evaluation as part of the motion."""
+        self.terms = self.latest
 
     def explained(self, before, h):
         """What residuals (m, N) may grow to in times h (N,), by the lower ones of their rows and the error dynamics."""
@@ -287,11 +300,14 @@ class Watch:
 
     def __init__(self, tolerances, span, family, exact, parts):
         self.tolerances, self.family, self.exact = tolerances or DEFAULT, family, exact
-        self.switches, self.model = None if family is None else Switches(family, span, parts), None
+        self.switches = None if family is None else Switches(family, span, parts)
+        self.model = self.tolerance = None
 
     def use(self, model, branches, coefficients=()):
         """Watch the motion of a model, which is the one for these branches."""
-        tolerance, self.model = Tolerance(model, *self.tolerances), model
+        if self.tolerance is None:
+            self.tolerance = Tolerance(model, *self.tolerances)
+        self.model, tolerance = model, self.tolerance
         self.residuals = None if self.exact else Residuals(model, tolerance, coefficients)
         if self.switches is not None:
             self.switches.branches, self.switches.tolerance = branches, tolerance
@@ -326,7 +342,10 @@ class Watch:
             States at the ends of two steps of half the length, from (t, x, h); for steps of fixed length.
         """
         count = len(stretch.t) - 1
-        if self.residuals is None or not self.residuals.m or not count:
+        if not count:
+            return None
+        if self.residuals is None or not self.residuals.m:
+            self.tolerance.accept(stretch.x)
             return None
         picked = np.unique(np.linspace(0, count, min(count, MOST_INSPECTED) + 1).astype(int))
         t, x = stretch.t[picked], stretch.x[:, picked]
@@ -337,6 +356,9 @@ class Watch:
                 off = self._off(*ends) > 0
                 if off.any() and (again is None or self._stays(off, *ends, again)):
                     return self._end(stretch, k, state)
+            self.residuals.values(t[-1:], x[:, -1:])
+        self.tolerance.accept(x)
+        self.residuals.accept()
         return None
 
     def _off(self, t, before, after):
