@@ -38,13 +38,16 @@ class Switch(NamedTuple):
         Where it changes, in the designer's names.
     angle : bool
         Whether b counts half turns, instead of sides.
+    rests : bool
+        Whether b = 1/2 stands for the zero of the switching function itself: |0| = 0 and sign 0 = 0.
     """
 
     branch: ca.SX
     function: ca.SX
     other: ca.SX
     text: str
-    angle: bool
+    angle: bool = False
+    rests: bool = False
 
 
 def has_switches(expressions):
@@ -68,7 +71,7 @@ class Branches:
     """
 
     def __init__(self, moves):
-        self.moves, self.switches, self._known = moves, [], {}
+        self.moves, self.switches, self._angles, self._functions = moves, [], {}, []
 
     def smooth(self, expressions, angles=False):
         """The expressions with branches as parameters.
@@ -118,37 +121,38 @@ class Branches:
     def _side(self, op, x, y):
         """|x|, sign x, or an operation that compares x with y; pairs of smooth and original expressions."""
         (x, x0), (y, y0) = x, y if y is not None else (ca.SX(0), ca.SX(0))
+        rests = op in (ca.OP_FABS, ca.OP_SIGN)
         if x.is_constant() and not y.is_constant():  # the same decision as that of y against the constant
-            return self._of_swapped(op, x, y, y0 - x0)
-        b = self._branch("side", x - y, x0 - y0)
-        return _SIDES[op](b, x, y)
-
-    def _of_swapped(self, op, x, y, original):
-        return _SIDES[op](1 - self._branch("side", y - x, original), x, y)
+            return _SIDES[op](1 - self._branch(y - x, y0 - x0, rests), x, y)
+        return _SIDES[op](self._branch(x - y, x0 - y0, rests), x, y)
 
     def _angle(self, op, y, x):
         """The continuous angle of (x, y)."""
         (y, y0), (x, x0) = y, x
-        key = ("angle", y.element_hash(), x.element_hash())
-        if key not in self._known:
+        key = y.element_hash(), x.element_hash()
+        if key not in self._angles:
             b = ca.SX.sym(f"branch {len(self.switches)}")
             sign = ca.cos(ca.pi * b)
             ahead = sign * x + _NARROW * ca.sqrt(x**2 + y**2)
             turned = b + ca.if_else(sign * y >= 0, 1, -1)
-            self.switches.append(Switch(b, ahead, turned, f"the angle of ({_text(x0)}, {_text(y0)})", True))
-            self._known[key] = b, sign
-        b, sign = self._known[key]
+            self.switches.append(Switch(b, ahead, turned, f"the angle of ({_text(x0)}, {_text(y0)})", angle=True))
+            self._angles[key] = b, sign
+        b, sign = self._angles[key]
         return ca.pi * b + ca.atan2(sign * y, sign * x)
 
-    def _branch(self, kind, g, original):
+    def _branch(self, g, original, rests):
         """The branch parameter of a switching function, one for equal functions."""
-        key = next((key for key in self._known if key[0] == kind and ca.is_equal(key[1], g, 3)), None)
-        if key is None:
-            b = ca.SX.sym(f"branch {len(self.switches)}")
-            self.switches.append(Switch(b, (2 * b - 1) * g, 1 - b, f"{_text(original)} = 0", False))
-            key = kind, g
-            self._known[key] = b
-        return self._known[key]
+        for i, known in self._functions:
+            if ca.is_equal(known, g, 3):
+                self.switches[i] = self.switches[i]._replace(rests=rests and self.switches[i].rests)
+                return self.switches[i].branch
+        b = ca.SX.sym(f"branch {len(self.switches)}")
+        at_zero = b == 0.5
+        function = ca.if_else(at_zero, -ca.fabs(g), (2 * b - 1) * g)
+        other = ca.if_else(at_zero, g > 0, 1 - b)
+        self._functions.append((len(self.switches), g))
+        self.switches.append(Switch(b, function, other, f"{_text(original)} = 0", rests=rests))
+        return b
 
 
 _EDGES = {

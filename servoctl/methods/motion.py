@@ -107,6 +107,7 @@ class Stepping:
     family = None  # the smooth models of a model with kinks or switches
     tolerances = None  # rtol and atol; None for steps of fixed length
     parts = 8  # of a step, at whose ends switching functions are evaluated; 1 where steps are short
+    projects = False  # whether ends of steps are projected before they are inspected
     again = None  # two steps of half the length, where steps are of fixed length
 
     def __init__(self, model, method, drift, progress):
@@ -169,7 +170,7 @@ class Stepping:
         if switch is not None:
             stretch = stretch.first(switch.steps)
         outcome = self.monitor.inspect(stretch) if len(stretch.t) > 1 else Fine(0)
-        left = self.watch.left(stretch.first(outcome.steps), state, self.again)
+        left = self.watch.left(stretch.first(outcome.steps), state, self.again, self.projects)
         if left is not None:
             return left
         return switch if switch is not None and isinstance(outcome, Fine) else outcome
@@ -185,21 +186,21 @@ class Stepping:
             singular = not end.error.details["why"] and self.monitor.lost(end.t, end.x)
             self.motion.stop = self.monitor.singular(end.t, end.x, why) if singular else end.error
             return
-        self.motion.switches.append(end.t)
-        stuck = self.watch.switches.sticks(end)
+        stuck, branches = self.watch.switches.stays(end)
         if stuck:
             self.motion.stop = sticks(self.method, end.t, stuck)
             return
         try:
-            model = self.family.at(end.branches)
+            model = self.family.at(branches)
         except ServoError as error:
             self.motion.stop = no_model(self.method, end.t, self.watch.texts(end), error)
             return
         self.motion.stop = self.watch.jump(model, end)
         if self.motion.stop is None:
+            self.motion.switches.append(end.t)
             self._use(model)
             self._start(end.t, end.x, b)
-            self.watch.use(model, end.branches, self._error_dynamics())
+            self.watch.use(model, branches, self._error_dynamics())
 
     def _start(self, t, x, b):
         """Choose other pivots at the start of the first piece, up to b, if the model's are a bad choice there."""

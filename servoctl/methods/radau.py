@@ -271,6 +271,7 @@ class RadauSteps(BulkSteps):
         self.step, self.taken = step, []
         self.failure = "its steps vanish" if step is None else "the Newton iteration does not solve a fixed step"
         self.every = drift.every if isinstance(drift, Project) else 0
+        self.projects = self.every > 0
         self.most = max(self.most - self.most % self.every, self.every) if self.every else self.most
         order = radau_order(rtol) if order is None else order
         self.settings = Settings(order, rtol, atol, step is not None, self.every)

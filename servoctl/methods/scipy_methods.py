@@ -9,6 +9,7 @@ from servoctl.methods.motion import Stepping
 from servoctl.methods.watch import End
 
 IMPLICIT = ("Radau", "BDF")
+SHORTENINGS, SHORTER = 8, 1e-2  # how often, and to which part, a first step is shortened that errs by far
 
 
 class ScipySteps(Stepping):
@@ -43,14 +44,14 @@ class ScipySteps(Stepping):
     def _jacobian(self, t, x):
         return self.slopes(t, x, self.p).reshape(self.n_x, self.n_x).T
 
-    def _solver(self, a, x, b):
+    def _solver(self, a, x, b, **first):
         import scipy.integrate
 
         rtol, atol = self.tolerances
 
         def solver(rates, t, y, jacobian, **options):
             exact = {"jac": jacobian} if self.slopes is not None else {}
-            return getattr(scipy.integrate, self.method)(rates, t, y, b, rtol=rtol, atol=atol, **exact, **options)
+            return getattr(scipy.integrate, self.method)(rates, t, y, b, rtol=rtol, atol=atol, **exact, **first, **options)
 
         if isinstance(self.drift, MinimalCoordinates):
             return MinimalSolver(solver, Chart(self.model, self.sizes, a, x), a, x)
@@ -58,7 +59,7 @@ class ScipySteps(Stepping):
 
     def _piece(self, a, x, b, times):
         self.pending, self.forward = list(times), b >= a
-        solver, steps, outcome = self._solver(a, x, b), 0, None
+        solver, steps, outcome, began, shortened = self._solver(a, x, b), 0, None, a, 0
         self.monitor.begin(self._pivots(a, x))
         self.watch.begin(a)
         self._sample(a, None, x)
@@ -79,6 +80,12 @@ class ScipySteps(Stepping):
                 self.progress(solver.t)
                 continue
             if isinstance(outcome, End):
+                if outcome.error is not None and t == began and shortened < SHORTENINGS:
+                    # from rest, scipy's first step may be as long as the span and pass its error test
+                    shortened, length = shortened + 1, abs(solver.t - t)
+                    self._count(solver)
+                    solver = self._solver(t, x, b, first_step=SHORTER * length)
+                    continue
                 self._sample(outcome.t, dense, outcome.x)
                 self._turn(outcome, b)
                 break

@@ -193,6 +193,7 @@ class TaylorSteps(Stepping):
         self.tolerances = rtol, atol
         self.order = order_for(rtol) if order is None else order
         self.every = drift.every if isinstance(drift, Project) else 0
+        self.projects = self.every > 0
         self.jets = max(jets, model.reduction.top)
         super().__init__(model, "Taylor", drift, progress)
 

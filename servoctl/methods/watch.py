@@ -113,7 +113,7 @@ class Switches:
 
     def __init__(self, family, span, parts):
         self.family, self.span, self.parts = family, span, parts
-        self.counts, self.start, self.branches, self.tolerance = {}, 0.0, (), None
+        self.counts, self.rested, self.start, self.branches, self.tolerance = {}, set(), 0.0, (), None
 
     def first(self, stretch, state):
         """The first switch within steps as an `End`, or None; `state` gives X from (k, t)."""
@@ -167,14 +167,20 @@ class Switches:
             open_ = [i for i in wrong if i not in changed]
         return tuple(result)
 
-    def sticks(self, end):
-        """The switches at which the motion stays: it is driven back to them from both sides."""
+    def stays(self, end):
+        """The switches from which the motion is driven back on both sides, in words, and the branches to go on with.
+
+        Where sign(0) = 0 and |0| = 0 are meant, the motion may rest on the switch: it is tried once.
+        """
         if abs(end.t - self.start) > AT_ONCE * self.span:
-            self.counts = {}
+            self.counts, self.rested = {}, set()
         for i in end.switched:
             self.counts[i] = self.counts.get(i, 0) + 1
         stuck = [i for i, count in self.counts.items() if count > MOST_AT_ONCE]
-        return [self.family.switches[i].text for i in stuck]
+        if stuck and not self.rested & {*stuck} and all(self.family.switches[i].rests for i in stuck):
+            self.rested |= {*stuck}
+            return [], tuple(0.5 if i in stuck else b for i, b in enumerate(end.branches))
+        return [self.family.switches[i].text for i in stuck], end.branches
 
 
 class Residuals:
@@ -330,7 +336,7 @@ class Watch:
         """The first switch within steps as an `End`, or None."""
         return None if self.switches is None else self.switches.first(stretch, state)
 
-    def left(self, stretch, state, again=None):
+    def left(self, stretch, state, again=None, projected=False):
         """Where a residual leaves its tolerance within steps, as an `End`, or None.
 
         Parameters
@@ -340,6 +346,8 @@ class Watch:
             X from (k, t).
         again : callable, optional
             States at the ends of two steps of half the length, from (t, x, h); for steps of fixed length.
+        projected : bool
+            Whether the ends of steps were projected: what `state` gives there was not.
         """
         count = len(stretch.t) - 1
         if not count:
@@ -349,13 +357,14 @@ class Watch:
             return None
         picked = np.unique(np.linspace(0, count, min(count, MOST_INSPECTED) + 1).astype(int))
         t, x = stretch.t[picked], stretch.x[:, picked]
-        over = self.residuals.off(np.array([t[:-1], t[1:]]), x[:, :-1], x[:, 1:])
+        ends = np.array([stretch.dense(k, stretch.t[k + 1]) for k in range(count)]).T if projected else stretch.x[:, 1:]
+        over = self.residuals.off(np.array([t[:-1], t[1:]]), x[:, :-1], ends[:, picked[1:] - 1])
         for p in np.flatnonzero((over > 0).any(axis=0)):
             for k in range(picked[p], picked[p + 1]):
-                ends = stretch.t[k : k + 2], stretch.x[:, k], stretch.x[:, k + 1]
-                off = self._off(*ends) > 0
-                if off.any() and (again is None or self._stays(off, *ends, again)):
-                    return self._end(stretch, k, state)
+                step = stretch.t[k : k + 2], stretch.x[:, k], ends[:, k]
+                off = self._off(*step) > 0
+                if off.any() and (again is None or self._stays(off, *step, again)):
+                    return self._end(k, *step, state)
             self.residuals.values(t[-1:], x[:, -1:])
         self.tolerance.accept(x)
         self.residuals.accept()
@@ -377,10 +386,10 @@ class Watch:
         self.residuals.coarse[off] = np.maximum(self.residuals.coarse[off], LEARNED * once)
         return False
 
-    def _end(self, stretch, k, state):
+    def _end(self, k, t, before, after, state):
         """The end within step k at which a residual leaves its tolerance, by bisection."""
-        start, low, high = stretch.t[k], stretch.t[k], stretch.t[k + 1]
-        ends = {start: stretch.x[:, k], high: stretch.x[:, k + 1]}
+        (start, high), low = t, t[0]
+        ends = {start: before, high: after}
 
         def at(t):
             return ends[t] if t in ends else state(k, t)
