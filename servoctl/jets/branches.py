@@ -6,6 +6,7 @@ long as b is right. The angle atan2(y, x) jumps by 2π behind the origin; writte
 whole b, its jump lies opposite to the direction b π, and b follows the angle round and round.
 """
 
+from itertools import count
 from typing import NamedTuple
 
 import casadi as ca
@@ -68,9 +69,12 @@ class Branches:
     ----------
     moves : callable
         Whether branches may change along a motion that changes a symbol (SX).
+    taken : sequence of str
+        Names that branches must not have.
     """
 
-    def __init__(self, moves):
+    def __init__(self, moves, taken=()):
+        self.taken = taken
         self.moves, self.switches, self._angles, self._functions = moves, [], {}, []
 
     def smooth(self, expressions, angles=False):
@@ -131,7 +135,7 @@ class Branches:
         (y, y0), (x, x0) = y, x
         key = y.element_hash(), x.element_hash()
         if key not in self._angles:
-            b = ca.SX.sym(f"branch {len(self.switches)}")
+            b = self._parameter()
             sign = ca.cos(ca.pi * b)
             ahead = sign * x + _NARROW * ca.sqrt(x**2 + y**2)
             turned = b + ca.if_else(sign * y >= 0, 1, -1)
@@ -140,13 +144,18 @@ class Branches:
         b, sign = self._angles[key]
         return ca.pi * b + ca.atan2(sign * y, sign * x)
 
+    def _parameter(self):
+        """A parameter for the next branch."""
+        names = (f"branch_{i}" for i in count(len(self.switches)))
+        return ca.SX.sym(next(name for name in names if name not in self.taken))
+
     def _branch(self, g, original, rests):
         """The branch parameter of a switching function, one for equal functions."""
         for i, known in self._functions:
             if ca.is_equal(known, g, 3):
                 self.switches[i] = self.switches[i]._replace(rests=rests and self.switches[i].rests)
                 return self.switches[i].branch
-        b = ca.SX.sym(f"branch {len(self.switches)}")
+        b = self._parameter()
         at_zero = b == 0.5
         function = ca.if_else(at_zero, -ca.fabs(g), (2 * b - 1) * g)
         other = ca.if_else(at_zero, g > 0, 1 - b)

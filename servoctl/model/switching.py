@@ -1,7 +1,6 @@
 """The smooth models between which the motion of a specification with kinks and switches changes."""
 
 from functools import cached_property, lru_cache
-from itertools import count
 
 import casadi as ca
 import numpy as np
@@ -30,7 +29,8 @@ class Switching:
     def __init__(self, model):
         r, q = model.reduction, model.reduction.mechanism.q
         self.model = model
-        branches = Branches(lambda s: (q.where(s) or ("t",))[0] != "t")
+        names = r.mechanism.parameters.names
+        branches = Branches(lambda s: (q.where(s) or ("t",))[0] != "t", names)
         self._specification = _smooth(r.mechanism, r.program, branches)
         self.switches = branches.switches
         for s in self.switches:
@@ -204,10 +204,8 @@ def _with(mechanism, **parts):
 
 def _extended(parameters, symbols):
     """The parameters with further symbols, whose numbers depend on the state."""
-    names = (name for name in (f"branch_{i}" for i in count()) if name not in parameters.names)
-    known = dict(zip(parameters.names, parameters.symbols, strict=True))
-    numbers = [*parameters.values(), *(1.0 for _ in symbols)]
-    return _parameters(known | {name: s for s, name in zip(symbols, names, strict=False)}, numbers)
+    known = dict(zip(parameters.names, parameters.symbols, strict=True)) | {s.name(): s for s in symbols}
+    return _parameters(known, [*parameters.values(), *(1.0 for _ in symbols)])
 
 
 def _parameters(symbols, numbers):
