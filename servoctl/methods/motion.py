@@ -2,7 +2,6 @@
 
 import contextlib
 from dataclasses import dataclass, field
-from itertools import pairwise
 
 import numpy as np
 
@@ -10,6 +9,8 @@ from servoctl.errors import ServoError
 from servoctl.methods.choice import MinimalCoordinates, Poles
 from servoctl.methods.monitor import VANISHING, Fine, Monitor, Repivot
 from servoctl.methods.watch import Watch, no_model, sticks
+
+ADVICE = "Use a smaller rtol, another method or drift='project', or check whether the program ends or jumps there."
 
 
 @dataclass
@@ -104,6 +105,7 @@ class Stepping:
 
     rank_lost = "the step of the integrator shrinks to nothing"
     advice = "Use a larger rtol, or check whether the motion escapes."
+    watch = None  # of the residuals and switches, while steps are taken
     family = None  # the smooth models of a model with kinks or switches
     tolerances = None  # rtol and atol; None for steps of fixed length
     parts = 8  # of a step, at whose ends switching functions are evaluated; 1 where steps are short
@@ -154,6 +156,7 @@ class Stepping:
         """Watch for the ends of smooth pieces, from the start on."""
         exact = isinstance(self.drift, MinimalCoordinates)
         self.watch = Watch(self.tolerances, abs(t1 - t), self.family, exact, self.parts)
+        self.watch.advice = self.advice if self.tolerances is None else ADVICE
         branches = () if self.family is None else self.family.branches(t, x)
         self.watch.use(self.model, branches, self._error_dynamics())
 
@@ -224,7 +227,8 @@ class Stepping:
     def _go_on(self, variant, t, x):
         model, self.monitor = variant
         self._use(model)
-        self.watch.use(model, self.watch.branches, self._error_dynamics())
+        if self.watch is not None:
+            self.watch.use(model, self.watch.branches, self._error_dynamics())
         self.monitor.begin(self._pivots(t, x))
         self.motion.count(pivot_changes=1)
 

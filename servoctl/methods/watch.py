@@ -18,7 +18,7 @@ from servoctl.tolerances import TINY
 
 LEAVES = 1e3  # times its tolerance, which no healthy step adds to a residual
 DEFAULT = 1e-9, 1e-11  # rtol and atol that judge steps of fixed length, until these are known to be coarser
-LEAST_RTOL = 1e-12  # rounding of residuals: smaller tolerances are not resolved
+LEAST_RTOL, LEAST_ATOL = 1e-12, 1e-14  # rounding of residuals: smaller tolerances are not resolved
 SHARE = 1e-2  # of the terms of a residual, which it never reaches
 EXPLAINED = 2.0  # times the extrapolation of a residual from earlier levels
 REMAINS = 0.75  # of the error of a step in two of half its length: it is a jump, since other errors shrink to a half
@@ -28,6 +28,8 @@ BISECTIONS = 40  # halvings of a step that locate where a residual leaves: all d
 EDGE = 1e-3  # distance of a function's argument from the edge of its domain that explains why a residual leaves
 AT_ONCE = 1e-9  # of the span: switches closer than this follow at once
 MOST_AT_ONCE = 2  # changes of one branch at once, after which the motion stays on the switch
+
+END_BEFORE = "Let the motion end before, or write the residual so that it is smooth along the motion."
 
 
 @dataclass(frozen=True)
@@ -71,7 +73,7 @@ class Tolerance:
     """
 
     def __init__(self, model, rtol, atol):
-        self.levels, self.rtol, self.atol = state_levels(model), max(rtol, LEAST_RTOL), atol
+        self.levels, self.rtol, self.atol = state_levels(model), max(rtol, LEAST_RTOL), max(atol, LEAST_ATOL)
         self.sizes = np.zeros(len(self.levels))
 
     def of(self, slopes, x):
@@ -252,8 +254,8 @@ class Residuals:
             over = np.abs(residuals) - allowed - self.coarse[:, None] - self.explained(values, t[1] - t[0])
         return np.where(np.isnan(residuals), np.inf, np.nan_to_num(over, nan=-1.0, posinf=np.inf, neginf=-1.0))
 
-    def error(self, t, x, over):
-        """The error of the residual that is farthest beyond what it may be at t, X = x."""
+    def error(self, t, x, over, advice):
+        """The error of the residual that is farthest beyond what it may be at t, X = x; `advice` where why is open."""
         values, allowed = (part[:, 0] for part in self.values(np.array([t]), x[:, None]))
         worst = int(np.argmax(np.where(over > 0, over / np.maximum(allowed, TINY), -1.0)))
         name, value = self.names[worst], float(values[worst])
@@ -261,8 +263,7 @@ class Residuals:
         return IntegrationStopped(
             f"The residual {name!r} leaves zero at t = {t:.7g} s, to {value:.3g} within a step{why and f': {why}'}.",
             f"The tolerances of the method allow it {allowed[worst]:.1e}; beyond, this is no motion of the program.",
-            do="Let the motion end before, or write the residual so that it is smooth along the motion. The run before "
-            "this instant is in .run.",
+            do=f"{END_BEFORE if why else advice} The run before this instant is in .run.",
             t=t,
             residual=name,
             value=value,
@@ -308,6 +309,7 @@ class Watch:
         self.tolerances, self.family, self.exact = tolerances or DEFAULT, family, exact
         self.switches = None if family is None else Switches(family, span, parts)
         self.model = self.tolerance = None
+        self.advice = ""
 
     def use(self, model, branches, coefficients=()):
         """Watch the motion of a model, which is the one for these branches."""
@@ -400,7 +402,7 @@ class Watch:
         for _ in range(BISECTIONS):
             middle = (low + high) / 2
             low, high = (low, middle) if np.any(off(middle) > 0) else (middle, high)
-        return End(k, float(low), at(low), error=self.residuals.error(float(high), at(high), off(high)))
+        return End(k, float(low), at(low), error=self.residuals.error(float(high), at(high), off(high), self.advice))
 
     def jump(self, model, end):
         """The error of a residual, or derivative of one, that jumps at a switch to another model; None if none does."""
@@ -415,15 +417,16 @@ class Watch:
             return None
         name, height = sides[0].names[jumps[0]], float(heights[jumps[0]])
         where = self.texts(end)
-        rate = name not in {row.name for row in model.reduction.rows}
-        what = "has a kink, so that velocities would jump" if rate else "jumps"
+        row = next((row.name for row in model.reduction.rows if name.endswith(f"({row.name})")), None)
+        what = f"{name!r} jumps" if row is None else f"{row!r} has a kink: its rate {name} jumps"
         return IntegrationStopped(
-            f"The residual {name!r} {what} by {height:.3g} at t = {end.t:.7g} s, where {where}.",
-            "Coordinates and velocities are continuous along a motion, and the residual keeps them at zero on both sides.",
+            f"The residual {what} by {height:.3g} at t = {end.t:.7g} s, where {where}.",
+            "To keep it at zero on both sides, coordinates or velocities would jump.",
             do="Write the residual with a smooth function, such as sqrt(y**2 + a**2) for |y|, or let the motion end "
             "here. The run before this instant is in .run.",
             t=end.t,
-            residual=name,
+            residual=row or name,
+            level=name,
             height=height,
             switch=where,
         )
