@@ -138,12 +138,12 @@ def simulate(
 
 def _motion(model, method, drift, span, x0, times, knots, bar):
     """Integrate by a method; samples are taken at the times (N,), by `RungeKutta` at its steps."""
-    (t0, t1), arguments = span, (span[0], x0, span[1], times, knots)
+    arguments = (span[0], x0, span[1], times, knots)
     if isinstance(method, Algebraic):
-        return algebraic(model, t0, x0, times, bar)
+        return algebraic(model, span[0], x0, times, bar)
     family = switching(model)
     if family is not None:
-        model = family.at(family.branches(t0, x0))
+        model = family.at(family.branches(span[0], x0))
     stepping = _stepping(model, method, drift, span, bar)
     stepping.family = family
     return run_checked(stepping, *arguments) if stepping.tolerances is None else stepping.run(*arguments)

@@ -20,7 +20,6 @@ _SIDES = {
     ca.OP_LE: lambda b, x, y: 1 - b,
 }  # the operation on x and y where b says whether x > y
 _SWITCHING = {*_SIDES, ca.OP_ATAN2}
-_IN_ORDER = {"allow_free": True, "live_variables": False}  # operations fill places in order
 _NARROW = 0.5**0.5  # an angle is followed up to 135° on either side of its branch
 
 
@@ -93,44 +92,33 @@ class Branches:
         if not expressions:
             return []
         merged = ca.densify(ca.cse(ca.vertcat(*expressions)))
-        f = ca.Function("branches", [], merged.elements(), _IN_ORDER)
-        free, work, moves, result = iter(f.free_sx()), [], [], [ca.SX(0)] * f.n_out()
-        original = []  # the same values with their decisions, by which switches are named
-        for k in range(f.n_instructions()):
-            op, operands = f.instruction_id(k), f.instruction_input(k)
-            if op == ca.OP_OUTPUT:
-                result[f.instruction_output(k)[0]] = work[operands[0]]
-                continue
-            if op == ca.OP_PARAMETER:
-                work.append(next(free))
-                original.append(work[-1])
-                moves.append(self.moves(work[-1]))
-                continue
-            if op == ca.OP_CONST:
-                work.append(ca.SX(f.instruction_constant(k)))
-                original.append(work[-1])
-                moves.append(False)
-                continue
-            a, *rest = operands
-            b = rest[0] if rest else None
-            moves.append(any(moves[i] for i in operands))
-            original.append(_apply(op, *(original[i] for i in operands)))
-            if moves[-1] and (op in _SIDES or (angles and op == ca.OP_ATAN2)):
-                decide = self._angle if op == ca.OP_ATAN2 else self._side
-                work.append(decide(op, *(None if i is None else (work[i], original[i]) for i in (a, b))))
-            else:
-                work.append(_apply(op, *(work[i] for i in operands)))
-        return result
+        work, original, moves = [], [], []  # smooth values, the same with their decisions, whether these may change
 
-    def _side(self, op, x, y):
+        def value(op, operands):
+            original.append(_apply(op, *(original[i] for i in operands)))
+            moves.append(any(moves[i] for i in operands))
+            decides = op in _SIDES or (angles and op == ca.OP_ATAN2)
+            if not (moves[-1] and decides):
+                return _apply(op, *(work[i] for i in operands))
+            pairs = [(work[i], original[i]) for i in operands]
+            return self._angle(*pairs) if op == ca.OP_ATAN2 else self._side(op, *pairs)
+
+        def leaf(expression, symbol):
+            original.append(expression)
+            moves.append(symbol and self.moves(expression))
+            return expression
+
+        return _replayed(merged.elements(), work, leaf, value)
+
+    def _side(self, op, x, y=(ca.SX(0), ca.SX(0))):
         """|x|, sign x, or an operation that compares x with y; pairs of smooth and original expressions."""
-        (x, x0), (y, y0) = x, y if y is not None else (ca.SX(0), ca.SX(0))
+        (x, x0), (y, y0) = x, y
         rests = op in (ca.OP_FABS, ca.OP_SIGN)
         if x.is_constant() and not y.is_constant():  # the same decision as that of y against the constant
             return _SIDES[op](1 - self._branch(y - x, y0 - x0, rests), x, y)
         return _SIDES[op](self._branch(x - y, x0 - y0, rests), x, y)
 
-    def _angle(self, op, y, x):
+    def _angle(self, y, x):
         """The continuous angle of (x, y)."""
         (y, y0), (x, x0) = y, x
         key = y.element_hash(), x.element_hash()
@@ -139,7 +127,7 @@ class Branches:
             sign = ca.cos(ca.pi * b)
             ahead = sign * x + _NARROW * ca.sqrt(x**2 + y**2)
             turned = b + ca.if_else(sign * y >= 0, 1, -1)
-            self.switches.append(Switch(b, ahead, turned, f"the angle of ({_text(x0)}, {_text(y0)})", angle=True))
+            self.switches.append(Switch(b, ahead, turned, f"the angle of ({_words(x0)}, {_words(y0)})", angle=True))
             self._angles[key] = b, sign
         b, sign = self._angles[key]
         return ca.pi * b + ca.atan2(sign * y, sign * x)
@@ -160,7 +148,7 @@ class Branches:
         function = ca.if_else(at_zero, -ca.fabs(g), (2 * b - 1) * g)
         other = ca.if_else(at_zero, g > 0, 1 - b)
         self._functions.append((len(self.switches), g))
-        self.switches.append(Switch(b, function, other, f"{_text(original)} = 0", rests=rests))
+        self.switches.append(Switch(b, function, other, f"{_words(original)} = 0", rests=rests))
         return b
 
 
@@ -188,35 +176,49 @@ def domain_edges(expressions):
     list of (str, SX, float)
         What happens there in words, an argument, and its value at the edge of the domain.
     """
-    f = ca.Function("edges", [], list(expressions), _IN_ORDER)
-    free, work, result = iter(f.free_sx()), [], []
+    work, result = [], []
+
+    def value(op, operands):
+        arguments = [work[i] for i in operands]
+        name, edges = _EDGES.get(op, ("", ()))
+        words = f"the argument of {name}, {_words(arguments[0])}, reaches"
+        result.extend((f"{words} {edge:g}, where its domain ends", arguments[0], edge) for edge in edges)
+        if op in (ca.OP_DIV, ca.OP_INV):
+            result.append((f"it divides by {_words(arguments[-1])}, which reaches zero", arguments[-1], 0.0))
+        if op == ca.OP_ATAN2:
+            angle = f"the angle atan2({', '.join(map(_words, arguments))}) passes pi"
+            result.append((angle, ca.fmax(ca.fabs(arguments[0]), arguments[1]), 0.0))
+        return _apply(op, *arguments)
+
+    _replayed(expressions, work, lambda expression, symbol: expression, value)
+    return result
+
+
+def _replayed(expressions, work, leaf, value):
+    """The outputs of expressions whose operations are taken one by one; `work` receives all values in their order.
+
+    `leaf` gives the value of a symbol (True) or a constant (False), `value` that of an operation on places of `work`.
+    """
+    f = ca.Function("operations", [], list(expressions), {"allow_free": True, "live_variables": False})
+    free, outputs = iter(f.free_sx()), [ca.SX(0)] * len(expressions)
     for k in range(f.n_instructions()):
         op, operands = f.instruction_id(k), f.instruction_input(k)
         if op == ca.OP_OUTPUT:
-            continue
-        if op == ca.OP_PARAMETER:
-            work.append(next(free))
+            outputs[f.instruction_output(k)[0]] = work[operands[0]]
+        elif op == ca.OP_PARAMETER:
+            work.append(leaf(next(free), True))
         elif op == ca.OP_CONST:
-            work.append(ca.SX(f.instruction_constant(k)))
+            work.append(leaf(ca.SX(f.instruction_constant(k)), False))
         else:
-            arguments = [work[i] for i in operands]
-            work.append(_apply(op, *arguments))
-            name, edges = _EDGES.get(op, ("", ()))
-            words = f"the argument of {name}, {_text(arguments[0])}, reaches"
-            result += [(f"{words} {edge:g}, where its domain ends", arguments[0], edge) for edge in edges]
-            if op in (ca.OP_DIV, ca.OP_INV):
-                result.append((f"it divides by {_text(arguments[-1])}, which reaches zero", arguments[-1], 0.0))
-            if op == ca.OP_ATAN2:
-                angle = f"the angle atan2({', '.join(map(_text, arguments))}) passes pi"
-                result.append((angle, ca.fmax(ca.fabs(arguments[0]), arguments[1]), 0.0))
-    return result
+            work.append(value(op, operands))
+    return outputs
 
 
 def _apply(op, *operands):
     return ca.SX.unary(op, *operands) if len(operands) == 1 else ca.SX.binary(op, *operands)
 
 
-def _text(expression, longest=40):
+def _words(expression, longest=40):
     """An expression in the designer's names; only the names where it is long."""
     text = str(expression)
     text = text[1:-1] if text.startswith("(") and text.endswith(")") and text.count("(") == 1 else text

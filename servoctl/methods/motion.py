@@ -8,7 +8,7 @@ import numpy as np
 from servoctl.errors import ServoError
 from servoctl.methods.choice import MinimalCoordinates, Poles
 from servoctl.methods.monitor import VANISHING, Fine, Monitor, Repivot
-from servoctl.methods.watch import Watch, no_model, sticks
+from servoctl.methods.watch import Watch, edge, no_model, sticks
 
 ADVICE = "Use a smaller rtol, another method or drift='project', or check whether the program ends or jumps there."
 
@@ -248,6 +248,7 @@ class Stepping:
 
     def _fail(self, t, x, why):
         """Stop because no step succeeds."""
+        why = "; ".join(filter(None, (why, edge(self.model, t, x))))
         what = f"{self.method} stopped at t = {t:.7g} s: {why}"
         self.motion.stop = self.monitor.failed(t, x, self.rank_lost, what, self.advice)
 

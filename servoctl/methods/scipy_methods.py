@@ -59,10 +59,7 @@ class ScipySteps(Stepping):
 
     def _piece(self, a, x, b, times):
         self.pending, self.forward = list(times), b >= a
-        solver, steps, outcome, began, shortened = self._solver(a, x, b), 0, None, a, 0
-        self.monitor.begin(self._pivots(a, x))
-        self.watch.begin(a)
-        self._sample(a, None, x)
+        solver, steps, outcome, shortened = self._begun(a, x, b), 0, None, 0
         while solver.status == "running":
             t, x = solver.t, solver.y.copy()
             with np.errstate(all="ignore"):
@@ -80,11 +77,8 @@ class ScipySteps(Stepping):
                 self.progress(solver.t)
                 continue
             if isinstance(outcome, End):
-                if outcome.error is not None and t == began and shortened < SHORTENINGS:
-                    # from rest, scipy's first step may be as long as the span and pass its error test
-                    shortened, length = shortened + 1, abs(solver.t - t)
-                    self._count(solver)
-                    solver = self._solver(t, x, b, first_step=SHORTER * length)
+                if outcome.error is not None and t == a and shortened < SHORTENINGS:
+                    solver, shortened = self._shortened(solver, t, x, b), shortened + 1
                     continue
                 self._sample(outcome.t, dense, outcome.x)
                 self._turn(outcome, b)
@@ -103,6 +97,20 @@ class ScipySteps(Stepping):
         self._count(solver)
         self.motion.count(steps=steps)
         return (solver.t, solver.y) if outcome is None or isinstance(outcome, Fine) else (outcome.t, outcome.x)
+
+    def _begun(self, t, x, b):
+        """The solver of a piece."""
+        self.monitor.begin(self._pivots(t, x))
+        self.watch.begin(t)
+        self._sample(t, None, x)
+        return self._solver(t, x, b)
+
+    def _shortened(self, solver, t, x, b):
+        """A solver with a shorter first step: from rest scipy's may be as long as the span, and pass its error test."""
+        length = abs(solver.t - t)
+        self._count(solver)
+        self.monitor.begin(self._pivots(t, x))
+        return self._solver(t, x, b, first_step=SHORTER * length)
 
     def _stretch(self, t, x, solver, dense):
         """The last step for the monitor: it has passed its error test, and the next begins where it ends."""

@@ -19,12 +19,12 @@ from servoctl.tolerances import TINY
 LEAVES = 1e3  # times its tolerance, which no healthy step adds to a residual
 DEFAULT = 1e-9, 1e-11  # rtol and atol that judge steps of fixed length, until these are known to be coarser
 LEAST_RTOL, LEAST_ATOL = 1e-12, 1e-14  # rounding of residuals: smaller tolerances are not resolved
-SHARE = 1e-2  # of the terms of a residual, which it never reaches
+OF_TERMS = 1e-2  # of the terms of a residual, which it never reaches
 EXPLAINED = 2.0  # times the extrapolation of a residual from earlier levels
 REMAINS = 0.75  # of the error of a step in two of half its length: it is a jump, since other errors shrink to a half
 LEARNED = 10.0  # times the error of a step of fixed length, which later ones may have
 MOST_INSPECTED = 128  # steps of a stretch whose residuals are evaluated
-BISECTIONS = 40  # halvings of a step that locate where a residual leaves: all digits
+LOCATED = 40  # halvings of a step that locate where a residual leaves: all digits
 EDGE = 1e-3  # distance of a function's argument from the edge of its domain that explains why a residual leaves
 AT_ONCE = 1e-9  # of the span: switches closer than this follow at once
 MOST_AT_ONCE = 2  # changes of one branch at once, after which the motion stays on the switch
@@ -221,7 +221,7 @@ class Residuals:
         terms = np.nan_to_num(np.einsum("mx,mxn,xn->mn", self.own, np.abs(slopes), np.abs(x)))
         terms = np.maximum.accumulate(np.maximum(terms, self.terms[:, None]), axis=1)
         self.latest = terms[:, -1]
-        return y[: self.m], np.fmin(allowed, np.maximum(self.first[:, None], SHARE * terms))
+        return y[: self.m], np.fmin(allowed, np.maximum(self.first[:, None], OF_TERMS * terms))
 
     def accept(self):
         """Take in the states of the last evaluation as part of the motion."""
@@ -259,33 +259,36 @@ class Residuals:
         values, allowed = (part[:, 0] for part in self.values(np.array([t]), x[:, None]))
         worst = int(np.argmax(np.where(over > 0, over / np.maximum(allowed, TINY), -1.0)))
         name, value = self.names[worst], float(values[worst])
-        why = self._edge(name, t, x)
+        row = next((row for row in self.model.reduction.rows if name.endswith(f"({row.name})")), None)
+        what = f"The residual {name!r}" if row is None else f"The rate {name} of the residual {row.name!r}"
+        why = edge(self.model, t, x)
         return IntegrationStopped(
-            f"The residual {name!r} leaves zero at t = {t:.7g} s, to {value:.3g} within a step{why and f': {why}'}.",
+            f"{what} leaves zero at t = {t:.7g} s, to {value:.3g} within a step{why and f': {why}'}.",
             f"The tolerances of the method allow it {allowed[worst]:.1e}; beyond, this is no motion of the program.",
             do=f"{END_BEFORE if why else advice} The run before this instant is in .run.",
             t=t,
-            residual=name,
+            residual=name if row is None else row.name,
+            level=name,
             value=value,
             allowed=float(allowed[worst]),
             why=why,
         )
 
-    def _edge(self, name, t, x):
-        """The function in a row that is at the edge of its domain, or jumps, at t, X = x; "" if there is none."""
-        rows = {row.name: row for row in self.model.reduction.rows}
-        base = next((row for row in rows if row in name), None)
-        places = domain_edges([rows[base].expression]) if base else []
-        if not places:
-            return ""
-        m = self.model.reduction.mechanism
-        state = ca.vertcat(*m.q, *(s for k in range(1, self.model.reduction.top) for s in m.q.gamma(k)))
-        arguments = ca.vertcat(*(argument for _, argument, _ in places))
-        f = ca.Function("arguments", [m.q.t, state, ca.vertcat(*m.parameters.symbols)], [arguments])
-        values = np.array(f(t, x, self.model.parameters)).ravel()
-        near = [(abs(v - edge), words) for v, (words, _, edge) in zip(values, places, strict=True)]
-        distance, words = min(near, key=lambda pair: np.nan_to_num(pair[0], nan=np.inf))
-        return words if distance < EDGE else ""
+
+def edge(model, t, x):
+    """The function in a residual that is at the edge of its domain, or jumps, at t, X = x; "" if there is none."""
+    r, m = model.reduction, model.reduction.mechanism
+    state = ca.vertcat(*m.q, *(s for k in range(1, r.top) for s in m.q.gamma(k)))
+    rows = [row.expression for row in r.original.values() if row.order < r.top]
+    places = domain_edges(rows) if rows else []
+    if not places:
+        return ""
+    arguments = ca.vertcat(*(argument for _, argument, _ in places))
+    f = ca.Function("arguments", [m.q.t, state, ca.vertcat(*m.parameters.symbols)], [arguments])
+    values = np.array(f(t, x, model.parameters)).ravel()
+    near = [(abs(v - bound), words) for v, (words, _, bound) in zip(values, places, strict=True)]
+    distance, words = min(near, key=lambda pair: np.nan_to_num(pair[0], nan=np.inf))
+    return words if distance < EDGE else ""
 
 
 class Watch:
@@ -399,7 +402,7 @@ class Watch:
         def off(t):
             return self._off(np.array([start, t]), ends[start], at(t))
 
-        for _ in range(BISECTIONS):
+        for _ in range(LOCATED):
             middle = (low + high) / 2
             low, high = (low, middle) if np.any(off(middle) > 0) else (middle, high)
         return End(k, float(low), at(low), error=self.residuals.error(float(high), at(high), off(high), self.advice))

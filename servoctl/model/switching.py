@@ -180,7 +180,6 @@ def _residuals(mechanism, program):
 
 def _smooth(mechanism, program, branches):
     """The mechanism and the program with branches as further parameters."""
-    q = mechanism.q
     residuals = dict(zip(program.residuals, branches.smooth(list(program.residuals.values()), True), strict=True))
     constraints = dict(
         zip(mechanism.constraints, branches.smooth(list(mechanism.constraints.values()), True), strict=True)
