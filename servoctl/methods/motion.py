@@ -248,7 +248,7 @@ class Stepping:
 
     def _fail(self, t, x, why):
         """Stop because no step succeeds."""
-        why = "; ".join(filter(None, (why, edge(self.model, t, x))))
+        why = "; ".join(dict.fromkeys(filter(None, (*why.split("; "), edge(self.model, t, x)))))
         what = f"{self.method} stopped at t = {t:.7g} s: {why}"
         self.motion.stop = self.monitor.failed(t, x, self.rank_lost, what, self.advice)
 

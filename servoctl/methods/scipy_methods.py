@@ -6,9 +6,10 @@ from servoctl.methods.choice import MinimalCoordinates, Project
 from servoctl.methods.minimal import Chart, MinimalSolver, Sizes
 from servoctl.methods.monitor import FRACTIONS, DenseStretch, Fine
 from servoctl.methods.motion import Stepping
-from servoctl.methods.watch import End
+from servoctl.methods.watch import End, edge
 
 IMPLICIT = ("Radau", "BDF")
+MANY, CREEPS = 200, 1e-5  # steps in which a motion near the edge of a domain passes this part of the span
 SHORTENINGS, SHORTER = 8, 1e-2  # how often, and to which part, a first step is shortened that errs by far
 
 
@@ -75,6 +76,8 @@ class ScipySteps(Stepping):
                     self._project(solver)
                 self._sample(solver.t, dense, solver.y)
                 self.progress(solver.t)
+                if steps % MANY == 0 and self._creeps(solver):
+                    break
                 continue
             if isinstance(outcome, End):
                 if outcome.error is not None and t == a and shortened < SHORTENINGS:
@@ -98,8 +101,17 @@ class ScipySteps(Stepping):
         self.motion.count(steps=steps)
         return (solver.t, solver.y) if outcome is None or isinstance(outcome, Fine) else (outcome.t, outcome.x)
 
+    def _creeps(self, solver):
+        """Whether the motion has stopped because it creeps towards the edge of a residual's domain."""
+        before, self.mark = self.mark, solver.t
+        why = edge(self.model, solver.t, solver.y) if abs(solver.t - before) < CREEPS * self.watch.span else ""
+        if why:
+            self._fail(solver.t, solver.y, f"its steps shrink; {why}")
+        return bool(why)
+
     def _begun(self, t, x, b):
         """The solver of a piece."""
+        self.mark = t
         self.monitor.begin(self._pivots(t, x))
         self.watch.begin(t)
         self._sample(t, None, x)

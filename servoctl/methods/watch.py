@@ -309,6 +309,7 @@ class Watch:
     """
 
     def __init__(self, tolerances, span, family, exact, parts):
+        self.span = span
         self.tolerances, self.family, self.exact = tolerances or DEFAULT, family, exact
         self.switches = None if family is None else Switches(family, span, parts)
         self.model = self.tolerance = None
