@@ -81,7 +81,7 @@ def test_velocity_rows_on_a_turntable(method):
     """A skate on a table that turns by 0.7 rad/s: across its blade it moves with the table."""
     rate = 0.7
     q = sv.coordinates("x y theta")
-    (x, y, theta), (dx, dy, dtheta) = q, q.d(1)
+    (x, y, theta), (dx, dy, _) = q, q.d(1)
     mechanism = sv.Mechanism(
         q,
         gibbs=sum(a**2 for a in q.d(2)) / 2,
@@ -112,7 +112,7 @@ def test_kinematics_that_depend_on_time(method):
     angle = plain.t**2 / 2
     c, s = ca.cos(angle), ca.sin(angle)
     q = plain.with_quasi_velocities("u v", [[c, -s], [s, c]], h=[0.2, 0.1 * plain.t])
-    (x, y), (u, v), (du, dv) = q, q.w(), q.w(1)
+    (x, y), (u, v) = q, q.w()
     velocity = q.V @ ca.vertcat(u, v) + q.h
     acceleration = q.dt(velocity)
     mechanism = sv.Mechanism(q, gibbs=ca.sumsqr(acceleration) / 2, potential=2 * (x**2 + y**2), actuators={"F": [1, 0]})
@@ -122,7 +122,7 @@ def test_kinematics_that_depend_on_time(method):
     def rates(t, state):
         """The balance across: the acceleration along the second axis of the frame is that of the spring."""
         x, y, v = state
-        c, s, u, du = np.cos(t**2 / 2), np.sin(t**2 / 2), np.sin(t), np.cos(t)
+        c, s, u = np.cos(t**2 / 2), np.sin(t**2 / 2), np.sin(t)
         force = -4 * (-s * x + c * y)
         return [c * u - s * v + 0.2, s * u + c * v + 0.1 * t, force - t * u - 0.1 * c]
 

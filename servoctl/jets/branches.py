@@ -110,9 +110,9 @@ class Branches:
 
         return _replayed(merged.elements(), work, leaf, value)
 
-    def _side(self, op, x, y=(ca.SX(0), ca.SX(0))):
+    def _side(self, op, x, y=None):
         """|x|, sign x, or an operation that compares x with y; pairs of smooth and original expressions."""
-        (x, x0), (y, y0) = x, y
+        (x, x0), (y, y0) = x, y or (ca.SX(0), ca.SX(0))
         rests = op in (ca.OP_FABS, ca.OP_SIGN)
         if x.is_constant() and not y.is_constant():  # the same decision as that of y against the constant
             return _SIDES[op](1 - self._branch(y - x, y0 - x0, rests), x, y)

@@ -52,7 +52,8 @@ class ScipySteps(Stepping):
 
         def solver(rates, t, y, jacobian, **options):
             exact = {"jac": jacobian} if self.slopes is not None else {}
-            return getattr(scipy.integrate, self.method)(rates, t, y, b, rtol=rtol, atol=atol, **exact, **first, **options)
+            options |= first | exact
+            return getattr(scipy.integrate, self.method)(rates, t, y, b, rtol=rtol, atol=atol, **options)
 
         if isinstance(self.drift, MinimalCoordinates):
             return MinimalSolver(solver, Chart(self.model, self.sizes, a, x), a, x)
@@ -60,7 +61,7 @@ class ScipySteps(Stepping):
 
     def _piece(self, a, x, b, times):
         self.pending, self.forward = list(times), b >= a
-        solver, steps, outcome, shortened = self._begun(a, x, b), 0, None, 0
+        solver, steps, outcome, shortened = self._begun(a, x, b), 0, Fine(0), 0
         while solver.status == "running":
             t, x = solver.t, solver.y.copy()
             with np.errstate(all="ignore"):
@@ -76,18 +77,17 @@ class ScipySteps(Stepping):
                     self._project(solver)
                 self._sample(solver.t, dense, solver.y)
                 self.progress(solver.t)
-                if steps % MANY == 0 and self._creeps(solver):
-                    break
-                continue
+                if steps % MANY or not self._creeps(solver):
+                    continue
+                break
             if isinstance(outcome, End):
-                if outcome.error is not None and t == a and shortened < SHORTENINGS:
+                if outcome.error and t == a and shortened < SHORTENINGS:
                     solver, shortened = self._shortened(solver, t, x, b), shortened + 1
                     continue
                 self._sample(outcome.t, dense, outcome.x)
                 self._turn(outcome, b)
                 break
-            if outcome.steps:
-                t, x = solver.t, solver.y
+            t, x = (solver.t, solver.y) if outcome.steps else (t, x)
             goes_on = self._follow(outcome)
             # A step in which a pivot vanishes is sampled with the next pivots: its own lose digits near the zero.
             if outcome.steps:
@@ -99,7 +99,7 @@ class ScipySteps(Stepping):
             solver = self._solver(t, x, b)
         self._count(solver)
         self.motion.count(steps=steps)
-        return (solver.t, solver.y) if outcome is None or isinstance(outcome, Fine) else (outcome.t, outcome.x)
+        return (solver.t, solver.y) if isinstance(outcome, Fine) else (outcome.t, outcome.x)
 
     def _creeps(self, solver):
         """Whether the motion has stopped because it creeps towards the edge of a residual's domain."""
