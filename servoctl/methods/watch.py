@@ -6,12 +6,14 @@ adds to that is its error. Where the program ends (an angle whose sine passes 1)
 """
 
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import pairwise
 from math import factorial
 
 import casadi as ca
 import numpy as np
 
+from servoctl.codegen.function import compiled
 from servoctl.errors import IntegrationStopped
 from servoctl.jets.branches import domain_edges
 from servoctl.tolerances import TINY
@@ -19,7 +21,8 @@ from servoctl.tolerances import TINY
 LEAVES = 1e3  # times its tolerance, which no healthy step adds to a residual
 DEFAULT = 1e-9, 1e-11  # rtol and atol that judge steps of fixed length, until these are known to be coarser
 LEAST_RTOL, LEAST_ATOL = 1e-12, 1e-14  # rounding of residuals: smaller tolerances are not resolved
-OF_TERMS = 1e-2  # of the terms of a residual, which it never reaches
+OF_TERMS = 1e-2  # of the terms of a residual, which it never reaches where it is sensitive
+SENSITIVE = 1e2  # times the first allowance of a residual, beyond which its terms bound it
 EXPLAINED = 2.0  # times the extrapolation of a residual from earlier levels
 REMAINS = 0.75  # of the error of a step in two of half its length: it is a jump, since other errors shrink to a half
 LEARNED = 10.0  # times the error of a step of fixed length, which later ones may have
@@ -200,10 +203,7 @@ class Residuals:
         self.model, self.tolerance, self.f = model, tolerance, model.function("invariants")
         self.names = [name for _, name in model.invariant_names()]
         self.m, self.coarse = len(self.names), np.zeros(len(self.names))
-        # a residual and its rates depend on jets of their own level by the same gradient; one in q alone has no rate
-        levels = np.array([level for level, _ in model.invariant_names()])
-        self.own = (levels[:, None] == tolerance.levels) & (levels > 0)[:, None]
-        self.terms, self.first = np.where(levels > 0, 0.0, np.inf), None
+        self.terms, self.first = np.zeros(self.m), None
         places = {name: i for i, name in enumerate(self.names)}
         self.chains = []
         for a, row in enumerate(model.reduction.rows):
@@ -218,10 +218,25 @@ class Residuals:
         allowed = LEAVES * self.tolerance.of(slopes, x)
         if self.first is None:
             self.first = allowed[:, 0]
-        terms = np.nan_to_num(np.einsum("mx,mxn,xn->mn", self.own, np.abs(slopes), np.abs(x)))
-        terms = np.maximum.accumulate(np.maximum(terms, self.terms[:, None]), axis=1)
-        self.latest = terms[:, -1]
-        return y[: self.m], np.fmin(allowed, np.maximum(self.first[:, None], OF_TERMS * terms))
+        first, self.latest = self.first[:, None], self.terms
+        if not np.all(allowed < SENSITIVE * first):  # near the edge of a domain slopes, and errors, grow without bound
+            terms = np.nan_to_num(self._terms.grid(t, x, self.model.parameters), posinf=0.0)
+            terms = np.maximum.accumulate(np.maximum(terms, self.terms[:, None]), axis=1)
+            allowed, self.latest = np.fmin(allowed, np.maximum(first, OF_TERMS * terms)), terms[:, -1]
+        return y[: self.m], allowed
+
+    @cached_property
+    def _terms(self):
+        """The sum of the magnitudes of each residual's terms."""
+
+        def size(expression):
+            if expression.op() in (ca.OP_ADD, ca.OP_SUB):
+                return size(expression.dep(0)) + size(expression.dep(1))
+            return ca.fabs(expression)
+
+        e = self.model.equations
+        sizes = [size(ca.densify(expression)) for _, _, expression in e.invariant_rows]
+        return compiled(e.function("terms", e.state, sizes), "terms")
 
     def accept(self):
         """Take in the states of the last evaluation as part of the motion."""
