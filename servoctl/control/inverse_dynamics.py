@@ -57,6 +57,9 @@ def linearise(plan, plant):
     """
     _require_invertible(plan.model.reduction, plant)
     extension = _Extension(plant, in_symbols_of(plant, plan.model), _points(plan, plant))
+    split = plan.model.reduction.realisation.actuation
+    if split.shape[0] > split.shape[1] and plan.model.reduction.mechanism.q.order(split) < 2:
+        extension.share(in_symbols_of(plant, plan.model, {"split": split})["split"])
     while extension.rank() < len(extension.names):
         extension.extend()
     return extension.law()
@@ -167,6 +170,12 @@ class _Extension:
     def rank(self):
         """The rank of the decoupling matrix at states about the plan."""
         return decide_all(*self.values(self.decoupling))[0].rank
+
+    def share(self, split):
+        """Make the multipliers μ the inputs: redundant actuators share as in the plan, u = split μ."""
+        v = ca.SX.sym("v", split.shape[1])
+        self._substitute(self.v, split @ v)
+        self.v = v
 
     def extend(self):
         """Make derivatives of ρ residuals inputs, with an integrator before those that other residuals depend on."""
