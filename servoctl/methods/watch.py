@@ -85,15 +85,15 @@ class Tolerance:
 
     def accept(self, x):
         """Take in states (n_x, N) as part of the motion."""
-        self.sizes = self._sizes(x)[:, -1]
+        self.sizes = np.fmax(self.sizes, np.abs(x).max(axis=1))
 
     def _sizes(self, x):
         """The largest size of each entry's level so far, (n_x, N)."""
-        sizes = np.nan_to_num(np.abs(x))
+        sizes = np.maximum(np.nan_to_num(np.abs(x)), self.sizes[:, None])
         for level in range(self.levels[-1] + 1):
             same = self.levels == level
             sizes[same] = sizes[same].max(axis=0)
-        return np.maximum.accumulate(np.maximum(sizes, self.sizes[:, None]), axis=1)
+        return np.maximum.accumulate(sizes, axis=1)
 
 
 class Switches:
@@ -224,6 +224,13 @@ class Residuals:
             terms = np.maximum.accumulate(np.maximum(terms, self.terms[:, None]), axis=1)
             allowed, self.latest = np.fmin(allowed, np.maximum(first, OF_TERMS * terms)), terms[:, -1]
         return y[: self.m], allowed
+
+    def small(self, t, x):
+        """Whether residuals at the ends of steps are what they may be at the start, which needs no slopes."""
+        if self.first is None:
+            self.values(t[:1], x[:, :1])
+        residuals = self.f.grid(t[1:], x[:, 1:], self.model.parameters)[: self.m]
+        return bool(np.all(np.abs(residuals) <= self.first[:, None]))
 
     @cached_property
     def _terms(self):
@@ -376,8 +383,13 @@ class Watch:
         if self.residuals is None or not self.residuals.m:
             self.tolerance.accept(stretch.x)
             return None
-        picked = np.unique(np.linspace(0, count, min(count, MOST_INSPECTED) + 1).astype(int))
+        picked = np.unique(np.linspace(0, count, MOST_INSPECTED + 1).astype(int)) if count > MOST_INSPECTED else (
+            np.arange(count + 1)
+        )
         t, x = stretch.t[picked], stretch.x[:, picked]
+        if not projected and self.residuals.small(t, x):
+            self.tolerance.accept(x)
+            return None
         ends = np.array([stretch.dense(k, stretch.t[k + 1]) for k in range(count)]).T if projected else stretch.x[:, 1:]
         over = self.residuals.off(np.array([t[:-1], t[1:]]), x[:, :-1], ends[:, picked[1:] - 1])
         for p in np.flatnonzero((over > 0).any(axis=0)):
