@@ -260,7 +260,7 @@ def test_a_program_that_ends_stops_the_motion_there(name, method, drift):
     late = 5e-3 if name == "asin" else 0.15
     assert caught.value.details["t"] == pytest.approx(end, abs=late)
     run = caught.value.run
-    assert 0.97 * end < run.t[-1] < end + late and np.abs(run.residual["p"][0]).max() < late / 2
+    assert 0.97 * end < run.t[-1] < end + late and np.abs(run.residual["p"][0]).max() < late
 
 
 @pytest.mark.parametrize("name", ["acos", "sqrt"])

@@ -64,8 +64,7 @@ class ScipySteps(Stepping):
         solver, steps, outcome, shortened = self._begun(a, x, b), 0, Fine(0), 0
         while solver.status == "running":
             t, x = solver.t, solver.y.copy()
-            with np.errstate(all="ignore"):
-                message = solver.step()
+            message = _step(solver)
             if solver.status == "failed" or not np.all(np.isfinite(solver.y)):
                 self._fail(t, x, (message or "the state is no longer finite").rstrip("."))
                 self._keep_last(t, x)
@@ -167,3 +166,13 @@ class ScipySteps(Stepping):
             states = np.array(states).T
             top = np.array([self._top(s, y) for s, y in zip(times, states.T, strict=True)]).T
             self.motion.add(self.model, times, states, top)
+
+
+def _step(solver):
+    """One step; scipy raises ValueError for a Jacobian that is not finite."""
+    try:
+        with np.errstate(all="ignore"):
+            return solver.step()
+    except ValueError:
+        getattr(solver, "solver", solver).status = "failed"
+        return "the Jacobian is not finite"
