@@ -11,9 +11,9 @@ import numpy as np
 from servoctl.jets.tape import REAL, VALUE, Tape, apply, evaluate
 from servoctl.tolerances import ENTRY
 
-SCALES = (0.3, 1.0, 1.0, 30.0)  # of the symbols at each point: small ones keep roots real, large ones lift weak terms
+SCALES = (0.3, 1.0, 0.3, 0.3, 3.0, 3.0, 30.0, 30.0)  # of the symbols at each point: small for roots, large for weak terms
 WIDTH = (0.5, 1.5)  # of the symbols relative to the scale, away from zero and from each other
-SIGNED = 2  # points, the last ones, at which symbols have random signs; parameters are positive as a rule
+POSITIVE = 2  # points, the first ones, where all symbols are positive; each pair of others has opposite random signs
 IN_DOMAIN = 2  # points that must be finite before an expression is called zero
 IDENTITY_POINTS_SEED = 1788
 LARGEST = 1e100  # sizes above it are no values: their products would leave the range of doubles
@@ -52,8 +52,9 @@ def spread(expressions):
     """
     tape, rng = Tape(None, expressions), np.random.default_rng(IDENTITY_POINTS_SEED)
     shape = len(tape.symbols), len(SCALES)
-    signs = rng.choice([-1.0, 1.0], shape)
-    signs[:, :-SIGNED] = 1.0
+    signs = np.repeat(rng.choice([-1.0, 1.0], (shape[0], shape[1] // 2)), 2, axis=1)
+    signs[:, 1::2] *= -1.0
+    signs[:, :POSITIVE] = 1.0
     inputs = (signs * rng.uniform(*WIDTH, shape) * SCALES).astype(REAL)
     values, sizes = evaluate(tape, inputs, OPERATIONS)
     values[~((sizes < LARGEST) & (np.abs(values) < LARGEST))] = np.nan
