@@ -27,6 +27,7 @@ from servoctl.methods.choice import (
     default_method,
     require_combination,
 )
+from servoctl.methods.orders import end_at_other_orders
 from servoctl.methods.radau import RadauSteps
 from servoctl.methods.runge_kutta import RungeKuttaSteps
 from servoctl.methods.scipy_methods import ScipySteps
@@ -126,6 +127,7 @@ def simulate(
         motion = _motion(model, method, drift, span, x0, times, knots, bar)
     finally:
         bar.close()
+    end_at_other_orders(motion)
     run = _run(model, motion, method, drift, knots, (t0, x0, t1))
     if t_eval is not None and isinstance(method, RungeKutta):
         run = _resample(run, times)

@@ -110,7 +110,9 @@ def _combination(q, rows, b, support, numbers, context, starts=None):
     story = f"{rows[b].name} with {', '.join(names)}" if names else rows[b].name
     rest = [row for a, row in enumerate(rows) if a != b]
     uses = merge_uses(*((rows[a].uses, top - rows[a].order) for a in support))
-    row, points = settle(q, replace(rows[b], expression=chi, order=top, uses=uses), rest, context, starts)
+    vanishing = sum((rows[a].vanishing for a in support), ())
+    chi = replace(rows[b], expression=chi, order=top, uses=uses, vanishing=vanishing)
+    row, points = settle(q, chi, rest, context, starts)
     if row is None:
         raise _no_state(rest)
     return _Combination(replace(row, story=story), b, support, points, pivots)
