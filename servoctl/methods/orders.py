@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from servoctl.errors import ServoError, SingularProgram
-from servoctl.reduction.orders import first_alive
+from servoctl.errors import ServoError
+from servoctl.reduction.orders import other_order
 
 
 def end_at_other_orders(motion):
@@ -16,10 +16,8 @@ def end_at_other_orders(motion):
     """
     for i, (model, t, x, top) in enumerate(motion.pieces):
         jets = np.vstack([x, top])
-        known = np.flatnonzero(np.isfinite(jets).all(axis=0))
-        k, name = first_alive(model.reduction, t[known], jets[:, known], model.parameters)
+        k, name = model.reduction.orders.first_change(t, jets, model.parameters)
         if k is not None:
-            k = known[k]
             motion.stop = _other_order(model, name, float(t[k]), jets[:, k])
             motion.pieces[i:] = [(model, t[:k], x[:, :k], top[:, :k])] if k else []
             return
@@ -31,13 +29,6 @@ def _other_order(model, name, t, jets):
         free = model.near(t, jets[: len(model.jet_names)]).free
     except ServoError as error:
         free = error.details.get("free")
-    other = f", and the program has {free} free initial values instead of {model.free}" * (free not in (None, model.free))
-    return SingularProgram(
-        f"The order of row {name!r} changes at t = {t:.6g} s: terms come alive that vanish where it was derived{other}.",
-        "The rows of a motion keep their orders along it.",
-        do="Derive two models, one for each regime, with guess={...} in each, and join their motions.",
-        t=t,
-        row=name,
-        free=free,
-        expected=model.free,
-    )
+    changes = free not in (None, model.free)
+    there = f", and the program has {free} free initial values instead of {model.free}" if changes else ""
+    return other_order(name, t, there, free=free, expected=model.free)

@@ -244,7 +244,7 @@ class Equations(Invariants):
         second = [q.derivatives([row.expression], 2 - row.order)[-1][0] for row in material]
         second = ca.substitute(ca.vertcat(*second), acceleration, zero) if material else ca.SX(0, 1)
         force = driven - ca.substitute(mechanism.balance, acceleration, zero)
-        solution = plant_accelerations(mechanism, material, force, -second, r.points)
+        solution, _ = plant_accelerations(mechanism, material, force, -second, r.points)
         x = ca.vertcat(*q, *q.gamma(1), inputs)
         return self.function("plant", x, [q.V @ q.jet(1) + q.h, solution])
 

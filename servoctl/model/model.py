@@ -142,7 +142,7 @@ class Model:
 
     def _constant_pivots_hold(self, values):
         f = self.once("constant pivots", lambda: self.equations.constant_pivots())
-        return strong(*(f(p).full() for p in (values, self.reduction.context.values)))
+        return bool(strong(*(f(p).full() for p in (values, self.reduction.context.values))).all())
 
     def near(self, t, jets, sizes=()):
         """The model of the same specification, derived with pivots chosen at an instant of the motion.

@@ -162,10 +162,9 @@ def decoupling(mechanism, rows, material, points):
     rest = ca.substitute(mechanism.balance, acceleration, ca.SX.zeros(q.n))
     second = ca.vertcat(*(q.derivatives([row.expression], 2 - row.order)[-1][0] for row in material))
     second = ca.substitute(second, acceleration, ca.SX.zeros(q.n)) if material else ca.SX(0, 1)
-    moves = plant_accelerations(
-        mechanism, material, mechanism.E, ca.SX.zeros(len(material), mechanism.E.shape[1]), points
-    )
-    drift = plant_accelerations(mechanism, material, -rest, -second, points)
+    still = ca.SX.zeros(len(material), mechanism.E.shape[1])
+    moves, _ = plant_accelerations(mechanism, material, mechanism.E, still, points)
+    drift, _ = plant_accelerations(mechanism, material, -rest, -second, points)
     result = []
     for row in rows:
         expression = q.derivatives([row.expression], max(0, 2 - row.order))[-1][0] if row.order < 2 else row.expression
@@ -187,10 +186,11 @@ def _saddle(mechanism, material):
 
 
 def plant_accelerations(mechanism, material, forces, second, points):
-    """γ'' of the plant: the upper part of [M G_mᵀ; G_m 0] [γ''; -λ] = [forces; second], (n, columns) SX."""
+    """γ'' of the plant, the upper part of [M G_mᵀ; G_m 0] [γ''; -λ] = [forces; second], (n, columns) SX; the pivots."""
     matrix = _saddle(mechanism, material)
     numbers = clean(*points.matrix(matrix))
-    return eliminate(matrix, ca.vertcat(forces, second), numbers)[0][: mechanism.q.n, :]
+    solution, pivots = eliminate(matrix, ca.vertcat(forces, second), numbers)
+    return solution[: mechanism.q.n, :], pivots
 
 
 def require_inertia(mechanism, material, points):

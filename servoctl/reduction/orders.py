@@ -5,96 +5,132 @@ alive: a gear that is blended in at 3 s, a coupling beyond x = 2, a parameter th
 terms of the row, times the size of the jet in which it is the slope.
 """
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from functools import cached_property
 from math import factorial
 
 import numpy as np
 
+from servoctl.errors import SingularProgram
 from servoctl.jets.series import Flow
-from servoctl.reduction.manifold import ON_MANIFOLD, solve
+from servoctl.reduction.manifold import ON_MANIFOLD, Points, solve
 from servoctl.tolerances import ENTRY
 
 DRIFTED = 1e-6  # of its terms: a slope below this may be due to the drift of a motion; above it is judged on the manifold
 
 
-def first_alive(reduction, t, jets, values):
-    """The first sample of a motion at which the order of a row is another one.
+@dataclass(frozen=True, eq=False)
+class Orders:
+    """The slopes on whose vanishing the orders of rows rest; false if there are none.
 
-    Parameters
+    Attributes
     ----------
-    reduction : Reduction
-    t : (N,) array
-        [s]
-    jets : (n_z, N) array
-        q, γ', ..., up to γ^(s̄) at least.
-    values : (n_p,) array
-
-    Returns
-    -------
-    int or None
-        The index of the sample.
-    str
-        Name of the row; empty if there is no such sample.
+    decided : tuple of Row
+        Rows whose orders were decided.
+    rows : tuple of Row
+        Rows of the manifold.
+    top : int
+        Highest order of jets on the manifold.
+    points : Points
+        Points of the manifold, where the slopes vanish.
     """
-    names, zeros = _vanishing(reduction)
-    if not names or not len(t):
-        return None, ""
-    q, level = reduction.mechanism.q, _level(reduction, zeros)
-    size = (len(jets) - q.nq) // q.n
-    factorials = np.concatenate([np.ones(q.nq), *(np.full(q.n, factorial(k)) for k in range(1, size + 1))])
-    points = replace(reduction.points, t=t, z=jets / factorials[:, None], values=values, residual=np.zeros(len(t)))
-    points = points if size >= level else _on_manifold(reduction, points, level)
-    usual = np.maximum(_largest(points, zeros), _largest(_on_manifold(reduction, reduction.points, level), zeros))
-    suspects = np.flatnonzero(_alive(points, zeros, usual, DRIFTED).any(axis=0))
-    if not len(suspects):
-        return None, ""
-    alive = _alive(_on_manifold(reduction, points.take(suspects), level), zeros, usual, DRIFTED, ENTRY)
-    confirmed = np.flatnonzero(alive.any(axis=0))
-    if not len(confirmed):
-        return None, ""
-    return int(suspects[confirmed[0]]), names[int(np.argmax(alive[:, confirmed[0]]))]
+
+    decided: tuple
+    rows: tuple
+    top: int
+    points: Points
+
+    def __bool__(self):
+        return any(row.vanishing for row in self.decided)
+
+    @cached_property
+    def _vanishing(self):
+        """The row's name of each slope; slopes, jets, and expressions that they are slopes of."""
+        each = {}
+        for row in self.decided:
+            for slope, jet, expression in row.vanishing:
+                each[slope.element_hash(), jet.element_hash()] = row.name, slope, jet, expression
+        names, *zeros = zip(*each.values(), strict=True)
+        return names, zeros
+
+    @cached_property
+    def _level(self):
+        order = self.points.q.order
+        return max(self.top, *(order(e) for part in self._vanishing[1] for e in part))
+
+    def hold(self, points):
+        """Whether the orders are the same at points of the manifold with other parameters."""
+        return not self or not self._alive(points, np.maximum(self._jets(points), 1.0), ENTRY, ENTRY).any()
+
+    def first_change(self, t, jets, values):
+        """The first sample of a motion at which the order of a row is another one.
+
+        Parameters
+        ----------
+        t : (N,) array
+            [s]
+        jets : (n_z, N) array
+            q, γ', and perhaps higher jets.
+        values : (n_p,) array
+
+        Returns
+        -------
+        int or None
+            The index of the sample.
+        str
+            Name of the row; empty if there is no such sample.
+        """
+        known = np.flatnonzero(np.isfinite(jets).all(axis=0))
+        if not self or not len(known):
+            return None, ""
+        points = self._sampled(t[known], jets[:, known], values)
+        usual = np.maximum(self._jets(points), self._jets(self._on_manifold(self.points)))
+        suspects = np.flatnonzero(self._alive(points, usual, DRIFTED, DRIFTED).any(axis=0))
+        if not len(suspects):
+            return None, ""
+        alive = self._alive(self._on_manifold(points.take(suspects)), usual, ENTRY, DRIFTED)
+        confirmed = np.flatnonzero(alive.any(axis=0))
+        if not len(confirmed):
+            return None, ""
+        return int(known[suspects[confirmed[0]]]), self._vanishing[0][int(np.argmax(alive[:, confirmed[0]]))]
+
+    def _sampled(self, t, jets, values):
+        """Points at samples of a motion; jets that it does not have follow from the rows."""
+        q = self.points.q
+        level = (len(jets) - q.nq) // q.n
+        factorials = np.concatenate([np.ones(q.nq), *(np.full(q.n, factorial(k)) for k in range(1, level + 1))])
+        points = replace(self.points, t=t, z=jets / factorials[:, None], values=values, residual=np.zeros(len(t)))
+        return points if level >= self._level else self._on_manifold(points)
+
+    def _jets(self, points):
+        """The largest size of each slope's jet at points, (slopes, 1)."""
+        sizes = np.nan_to_num(np.abs(points.evaluate(self._vanishing[1][1])[0]))
+        return sizes.max(axis=1, keepdims=True, initial=0.0)
+
+    def _alive(self, points, jets, rounding, share):
+        """Whether slopes (slopes, N) exceed their rounding, and times their jets a share of the terms of their row."""
+        slopes, _, expressions = self._vanishing[1]
+        (values, sizes), (_, terms) = points.evaluate(slopes), points.evaluate(expressions)
+        return (np.abs(values) > rounding * sizes) & (np.abs(values) * jets > share * terms)
+
+    def _on_manifold(self, points):
+        """The points of the manifold nearest to points; those without such stay."""
+        q = points.q
+        z = np.zeros((q.nq + self._level * q.n, len(points.t)), dtype=points.z.dtype)
+        shared = min(len(z), len(points.z))
+        z[:shared] = points.z[:shared]
+        start = replace(points, z=z)
+        solved, residual = solve(Flow(q, self.rows, self._level, start), start.t, z)
+        return replace(start, z=np.where(residual < ON_MANIFOLD, solved, z))
 
 
-def orders_hold(reduction, points):
-    """Whether all orders of a reduction are the same at points of its manifold with other parameters."""
-    names, zeros = _vanishing(reduction)
-    return not names or not _alive(points, zeros, np.maximum(_largest(points, zeros), 1.0), ENTRY).any()
-
-
-def _vanishing(reduction):
-    """The row's name of each vanishing slope; slopes, jets and expressions."""
-    each = {}
-    for row in (*reduction.original.values(), *reduction.rows):
-        for slope, jet, expression in row.vanishing:
-            each[slope.element_hash(), jet.element_hash()] = row.name, slope, jet, expression
-    names, *zeros = zip(*each.values(), strict=True) if each else ((), (), (), ())
-    return names, zeros
-
-
-def _level(reduction, zeros):
-    """The highest jets of the rows and of what vanishes."""
-    order = reduction.mechanism.q.order
-    return max(reduction.top, *(order(e) for part in zeros for e in part))
-
-
-def _largest(points, zeros):
-    """The largest size of each jet at points, (slopes, 1)."""
-    return np.nan_to_num(np.abs(points.evaluate(zeros[1])[0])).max(axis=1, keepdims=True, initial=0.0)
-
-
-def _alive(points, zeros, usual, share, drift=None):
-    """Whether slopes (slopes, N) exceed their rounding or drift, and with the usual jets a share of the row's terms."""
-    (slopes, sizes), (_, terms) = points.evaluate(zeros[0]), points.evaluate(zeros[2])
-    slopes = np.abs(slopes)
-    return (slopes > (share if drift is None else drift) * sizes) & (slopes * usual > share * terms)
-
-
-def _on_manifold(reduction, points, level):
-    """The points of the rows' manifold nearest to points, with jets up to a level; points without such stay."""
-    q = reduction.mechanism.q
-    z = np.zeros((q.nq + level * q.n, len(points.t)), dtype=points.z.dtype)
-    shared = min(len(z), len(points.z))
-    z[:shared] = points.z[:shared]
-    start = replace(points, z=z)
-    solved, residual = solve(Flow(q, reduction.rows, level, start), start.t, z)
-    return replace(start, z=np.where(residual < ON_MANIFOLD, solved, z))
+def other_order(row, t, there="", **facts):
+    """The error of a row whose order changes at t [s]; `there` says what else is different from then on."""
+    return SingularProgram(
+        f"The order of row {row!r} changes at t = {t:.6g} s: terms come alive that vanish where it was derived{there}.",
+        "The rows of a motion keep their orders along it.",
+        do="Derive two models, one for each regime, with guess={...} in each, and join their motions.",
+        t=t,
+        row=row,
+        **facts,
+    )

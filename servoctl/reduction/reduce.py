@@ -13,7 +13,7 @@ from servoctl.reduction.appell import Realisation, realisation, require_inertia
 from servoctl.reduction.hidden import complete
 from servoctl.reduction.knots import Knots, Switches, require_smooth
 from servoctl.reduction.manifold import Context, Points, sample
-from servoctl.reduction.orders import orders_hold
+from servoctl.reduction.orders import Orders
 from servoctl.reduction.ranks import Rank, clean, decide, decide_all
 from servoctl.reduction.rows import Balance, Row, as_rows, merge_uses, settle_alone
 from servoctl.spec.mechanism import Mechanism, require_known
@@ -25,7 +25,7 @@ NEAR_SPREAD = 1e-3  # relative width of the points about a state for which pivot
 WINDOW = (0.1, 1.1)  # s, where points are drawn if nothing switches; t = 0 is too often a special instant
 LONE_WINDOW = 1.0  # s on either side of a single switch
 INSET = 0.07  # fraction of the time from first to last switch left out at both ends, where paths are nearly at rest
-WEAKER = 1e-4  # relative to its size before: a pivot below this with other parameters is chosen again
+WEAKER = 1e-6  # relative to its size before: a pivot below this with other parameters is chosen again
 HELD = 1e-9  # residual, relative to the size of its terms, at points where a reduction still holds
 
 
@@ -98,6 +98,11 @@ class Reduction:
     def hidden(self):
         """The rows that are hidden constraints."""
         return tuple(row for row in self.rows if row.story)
+
+    @cached_property
+    def orders(self):
+        """What the orders of the rows rest on."""
+        return Orders((*self.original.values(), *self.rows), self.rows, self.top, self.points)
 
     @cached_property
     def leading(self):
@@ -219,22 +224,22 @@ def holds(reduction, values):
     q, r = reduction.mechanism.q, reduction
     context = replace(r.context, values=values)
     points = sample(q, r.rows, r.top, context, starts=r.points, flow=r.flow)
-    if not len(points.t) or not orders_hold(r, points):
+    if not len(points.t) or not r.orders.hold(points):
         return False
     for matrix in (r.leading, r.realisation.B.T):
         numbers = clean(*points.matrix(matrix))
         if decide(numbers[:, :, 0]).rank < len(numbers):
             return False
     before, now = (np.abs(p.evaluate([pivot for _, pivot in r.pivots])[0]) for p in (r.points, points))
-    if not strong(now.min(axis=1), before.min(axis=1)):
+    if not strong(now.min(axis=1), before.min(axis=1)).all():
         return False
     left, sizes = points.evaluate(r.conditions)
     return bool(np.all(np.abs(left) <= HELD * np.maximum(sizes, TINY)))
 
 
 def strong(pivots, before):
-    """Whether no pivot is far weaker with other parameters, from its sizes (n_g,) with either."""
-    return bool(np.all(np.abs(pivots) >= WEAKER * np.abs(before)))
+    """Whether pivots are not far weaker with other parameters, from their values with either."""
+    return np.abs(pivots) >= WEAKER * np.abs(before)
 
 
 def _require_parts(mechanism, program, guess):
