@@ -30,5 +30,5 @@ def _other_order(model, name, t, jets):
     except ServoError as error:
         free = error.details.get("free")
     changes = free not in (None, model.free)
-    there = f", and the program has {free} free initial values instead of {model.free}" if changes else ""
+    there = f", and from there on {free} initial values are free instead of {model.free}" if changes else ""
     return other_order(name, t, there, free=free, expected=model.free)

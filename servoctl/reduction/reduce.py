@@ -102,7 +102,8 @@ class Reduction:
     @cached_property
     def orders(self):
         """What the orders of the rows rest on."""
-        return Orders((*self.original.values(), *self.rows), self.rows, self.top, self.points)
+        decided = (*self.original.values(), *self.rows, *self.realisation.decided)
+        return Orders(decided, self.rows, self.top, self.points)
 
     @cached_property
     def leading(self):
