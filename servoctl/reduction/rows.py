@@ -260,9 +260,10 @@ def _of_order(q, row, j, points):
     if j == 0 or q.order(row.gradient(q)) < j:
         return row
     second = ca.jacobian(row.gradient(q).T, jets)
-    if np.any(clean(*points.evaluate(second.nonzeros()))):
+    resting = row.resting_on(second, jets @ jets.T)
+    if np.any(clean(*points.evaluate(second.nonzeros()))) or (j > 1 and resting is not row):
         return replace(row, affine=False)
-    return row.resting_on(second, jets @ jets.T)
+    return resting
 
 
 def _eliminated(q, row, j, values, lower, points):
