@@ -11,7 +11,7 @@ import numpy as np
 from servoctl.jets.tape import REAL, VALUE, Tape, apply, evaluate
 from servoctl.tolerances import ENTRY
 
-SCALES = (0.3, 1.0, 0.3, 0.3, 3.0, 3.0, 30.0, 30.0)  # of the symbols at each point: small for roots, large for weak terms
+SCALES = (0.3, 1.0, 0.3, 0.3, 3.0, 3.0, 30.0, 30.0)  # of the symbols at each point
 WIDTH = (0.5, 1.5)  # of the symbols relative to the scale, away from zero and from each other
 POSITIVE = 2  # points, the first ones, where all symbols are positive; each pair of others has opposite random signs
 IN_DOMAIN = 2  # points that must be finite before an expression is called zero

@@ -2,7 +2,7 @@
 
 A slope that vanishes where a row is derived lowers the row's order. If it does not vanish identically, it may come
 alive: a gear that is blended in at 3 s, a coupling beyond x = 2, a parameter that was zero. It then counts against the
-terms of the row, times the size of the jet in which it is the slope.
+terms of the row, times the size of the jet in which it is the slope, both the largest of the motion so far.
 """
 
 from dataclasses import dataclass, replace
@@ -16,7 +16,7 @@ from servoctl.jets.series import Flow
 from servoctl.reduction.manifold import ON_MANIFOLD, Points, solve
 from servoctl.tolerances import ENTRY
 
-DRIFTED = 1e-6  # of its terms: a slope below this may be due to the drift of a motion; above it is judged on the manifold
+DRIFTED = 1e-6  # of its terms: below this a slope may be due to drift; above, it is judged on the manifold
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,7 +60,10 @@ class Orders:
 
     def hold(self, points):
         """Whether the orders are the same at points of the manifold with other parameters."""
-        return not self or not self._alive(points, np.maximum(self._jets(points), 1.0), ENTRY, ENTRY).any()
+        if not self:
+            return True
+        jets, terms = self._usual(points)
+        return not self._alive(points, np.maximum(jets, 1.0), terms, ENTRY, ENTRY).any()
 
     def first_change(self, t, jets, values):
         """The first sample of a motion at which the order of a row is another one.
@@ -84,11 +87,15 @@ class Orders:
         if not self or not len(known):
             return None, ""
         points = self._sampled(t[known], jets[:, known], values)
-        usual = np.maximum(self._jets(points), self._jets(self._on_manifold(self.points)))
-        suspects = np.flatnonzero(self._alive(points, usual, DRIFTED, DRIFTED).any(axis=0))
+        jets, terms = (
+            np.maximum.accumulate(np.maximum(there, here), axis=1)
+            for there, here in zip(self._usual(self._on_manifold(self.points)), self._sizes(points), strict=True)
+        )
+        suspects = np.flatnonzero(self._alive(points, jets, terms, DRIFTED, DRIFTED).any(axis=0))
         if not len(suspects):
             return None, ""
-        alive = self._alive(self._on_manifold(points.take(suspects)), usual, ENTRY, DRIFTED)
+        there = self._on_manifold(points.take(suspects))
+        alive = self._alive(there, jets[:, suspects], terms[:, suspects], ENTRY, DRIFTED)
         confirmed = np.flatnonzero(alive.any(axis=0))
         if not len(confirmed):
             return None, ""
@@ -102,16 +109,19 @@ class Orders:
         points = replace(self.points, t=t, z=jets / factorials[:, None], values=values, residual=np.zeros(len(t)))
         return points if level >= self._level else self._on_manifold(points)
 
-    def _jets(self, points):
-        """The largest size of each slope's jet at points, (slopes, 1)."""
-        sizes = np.nan_to_num(np.abs(points.evaluate(self._vanishing[1][1])[0]))
-        return sizes.max(axis=1, keepdims=True, initial=0.0)
+    def _sizes(self, points):
+        """Sizes of each slope's jet, and of the terms of its row, at points: two arrays (slopes, N)."""
+        _, jets, expressions = self._vanishing[1]
+        return np.nan_to_num(np.abs(points.evaluate(jets)[0])), np.nan_to_num(points.evaluate(expressions)[1])
 
-    def _alive(self, points, jets, rounding, share):
+    def _usual(self, points):
+        """The largest of these sizes over points: two arrays (slopes, 1)."""
+        return [size.max(axis=1, keepdims=True, initial=0.0) for size in self._sizes(points)]
+
+    def _alive(self, points, jets, terms, rounding, share):
         """Whether slopes (slopes, N) exceed their rounding, and times their jets a share of the terms of their row."""
-        slopes, _, expressions = self._vanishing[1]
-        (values, sizes), (_, terms) = points.evaluate(slopes), points.evaluate(expressions)
-        return (np.abs(values) > rounding * sizes) & (np.abs(values) * jets > share * terms)
+        values, sizes = np.abs(points.evaluate(self._vanishing[1][0]))
+        return (values > rounding * sizes) & (values * jets > share * terms)
 
     def _on_manifold(self, points):
         """The points of the manifold nearest to points; those without such stay."""

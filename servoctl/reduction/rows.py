@@ -199,7 +199,7 @@ def settle_alone(q, rows, context):
         gradients = [rows[a].gradient(q, level) for a in members]
         points.read([*(rows[a].expression for a in members), *(e for g in gradients for e in g.nonzeros())])
         values = clean(*points.matrix(ca.vertcat(*gradients)))
-        for a, slopes, numbers in zip(members, gradients, values, strict=True):
+        for a, numbers in zip(members, values, strict=True):
             if np.any(numbers):
                 settled[a] = _of_order(q, rows[a], level, points), numbers
     return [pair or (settle(q, row, [], context)[0], None) for pair, row in zip(settled, rows, strict=True)]
