@@ -38,6 +38,7 @@ IDENTITIES = (
     (X + Y) ** 3 - X**3 - 3 * X**2 * Y - 3 * X * Y**2 - Y**3,
     X**2 / (X**2 + Y**2) + Y**2 / (X**2 + Y**2) - 1,
     ca.sqrt(1 + X**2) ** 2 - 1 - X**2,
+    (ca.sqrt(1 - X**2) + 1) ** 2 - 2 * ca.sqrt(1 - X**2) - 2 + X**2,
     ca.tan(X) * ca.cos(X) - ca.sin(X),
     ca.fmax(X, Y) * T - T * ca.fmax(X, Y),
     (ca.tanh(X) + Y) ** 2 - ca.tanh(X) ** 2 - 2 * Y * ca.tanh(X) - Y**2,
@@ -61,7 +62,7 @@ def test_what_comes_alive_does_not_vanish(name):
     [
         ca.fmax(0, T - 1e6), ca.fmin(0, X + 40), ca.sign(X) - 1, ca.fabs(X) - X, ca.exp(-(X**2) * 1e6), 1 - ca.tanh(9 + X**2),
         ca.log(X**2) - ca.log(X**2 + 1e-9), ca.sqrt(X - 50) * Y, ca.if_else(ca.logic_and(X > 7, Y > 7), X, 0),
-        ca.atan(1e9 * (X - 90)) + ca.pi / 2, 1e-9 * X * Y, X - Y, 1 - ca.cos(1e-5 * X),
+        ca.atan(1e9 * (X - 90)) + ca.pi / 2, 1e-9 * X * Y, X - Y, 1 - ca.cos(3e-7 * X),
     ],
 )  # fmt: skip
 def test_what_is_small_flat_or_without_a_value_at_most_points_does_not_vanish(expression):

@@ -12,7 +12,7 @@ from servoctl.jets.tape import REAL, VALUE, Tape, apply, evaluate
 from servoctl.tolerances import ENTRY
 
 SCALES = (0.3, 1.0, 0.3, 0.3, 3.0, 3.0, 30.0, 30.0)  # of the symbols at each point
-WIDTH = (0.5, 1.5)  # of the symbols relative to the scale, away from zero and from each other
+RANGE = (0.5, 1.5)  # of the symbols relative to the scale, away from zero and from each other
 POSITIVE = 2  # points, the first ones, where all symbols are positive; each pair of others has opposite random signs
 IN_DOMAIN = 2  # points that must be finite before an expression is called zero
 IDENTITY_POINTS_SEED = 1788
@@ -55,7 +55,7 @@ def spread(expressions):
     signs = np.repeat(rng.choice([-1.0, 1.0], (shape[0], shape[1] // 2)), 2, axis=1)
     signs[:, 1::2] *= -1.0
     signs[:, :POSITIVE] = 1.0
-    inputs = (signs * rng.uniform(*WIDTH, shape) * SCALES).astype(REAL)
+    inputs = (signs * rng.uniform(*RANGE, shape) * SCALES).astype(REAL)
     values, sizes = evaluate(tape, inputs, OPERATIONS)
     values[~((sizes < LARGEST) & (np.abs(values) < LARGEST))] = np.nan
     return np.where(np.abs(values) <= ENTRY * sizes, 0.0, values).astype(float)

@@ -112,7 +112,7 @@ class PlantEquations:
 
     def hold(self, values):
         """Whether orders and pivots may stay as they are with other parameters (n_p,) or (n_p, N)."""
-        values = _columns(values)
+        values = _cases(values)
         if np.array_equal(values, np.broadcast_to(self.values[:, None], values.shape)):
             return True
         if self.orders and not all(self.orders.hold(self._points(case)) for case in values.T):
@@ -256,7 +256,7 @@ def _expression(forces, mechanism):
     return mechanism.q.from_function(ca.Function.deserialize(forces), mechanism.parameters.symbols)[0]
 
 
-def _columns(values):
+def _cases(values):
     """Parameters (n_p,) or (n_p, N) as columns (n_p, N)."""
     values = np.asarray(values, dtype=float)
     return values if values.ndim == 2 else values[:, None]
@@ -277,7 +277,7 @@ def equations_at(equations, values):
     """
     if equations.hold(values):
         return equations
-    cases = _columns(values).T
+    cases = _cases(values).T
     case = next(case for case in cases if not equations.hold(case))
     again = plant_equations(equations.mechanism, *equations.choices[:-1], tuple(case.tolist()))
     if len(cases) > 1 and not again.hold(values):
