@@ -26,6 +26,7 @@ BLENDS = {  # of (t, x): zero, or below rounding, at first
     "tanh in place": lambda t, x: 0.2 * (1 + ca.tanh(40 * (x - 3))) * x,
     "logistic in place": lambda t, x: 0.4 * (1 - 1 / (1 + ca.exp(60 * (x - 3)))) * x,
     "bump in place": lambda t, x: 0.3 * ca.exp(-100 * (x - 5) ** 2),
+    "root far away in time": lambda t, x: 1e-3 * ((t - 40) + ca.sqrt((t - 40) ** 2 + 1e-10)) ** 3 * x,
     "root in place": lambda t, x: 0.1 * ((x - 3) + ca.sqrt((x - 3) ** 2 + 1e-20)) ** 3,
 }
 
@@ -39,6 +40,7 @@ IDENTITIES = (
     X**2 / (X**2 + Y**2) + Y**2 / (X**2 + Y**2) - 1,
     ca.sqrt(1 + X**2) ** 2 - 1 - X**2,
     (ca.sqrt(1 - X**2) + 1) ** 2 - 2 * ca.sqrt(1 - X**2) - 2 + X**2,
+    (X**2 + Y**2) ** 1.5 / ca.sqrt(X**2 + Y**2) - X**2 - Y**2,
     ca.tan(X) * ca.cos(X) - ca.sin(X),
     ca.fmax(X, Y) * T - T * ca.fmax(X, Y),
     (ca.tanh(X) + Y) ** 2 - ca.tanh(X) ** 2 - 2 * Y * ca.tanh(X) - Y**2,
@@ -62,7 +64,8 @@ def test_what_comes_alive_does_not_vanish(name):
     [
         ca.fmax(0, T - 1e6), ca.fmin(0, X + 40), ca.sign(X) - 1, ca.fabs(X) - X, ca.exp(-(X**2) * 1e6), 1 - ca.tanh(9 + X**2),
         ca.log(X**2) - ca.log(X**2 + 1e-9), ca.sqrt(X - 50) * Y, ca.if_else(ca.logic_and(X > 7, Y > 7), X, 0),
-        ca.atan(1e9 * (X - 90)) + ca.pi / 2, 1e-9 * X * Y, X - Y, 1 - ca.cos(3e-7 * X),
+        ca.atan(1e9 * (X - 90)) + ca.pi / 2, 1e-9 * X * Y, X - Y,
+        (X - 500) + ca.sqrt((X - 500) ** 2 + 1e-20), ((T - 6e3) ** 2 + 1e-12) ** 1.5 + (T - 6e3) ** 3, 1 - 1 / (1 + (X / 1e7) ** 8),
     ],
 )  # fmt: skip
 def test_what_is_small_flat_or_without_a_value_at_most_points_does_not_vanish(expression):
@@ -245,9 +248,10 @@ def blended(blend):
 def test_what_comes_alive_later_or_elsewhere_acts(name):
     model, f = blended(BLENDS[name])
     start = (1.0, 0.0) if "time" in name else (1.0, 6.0 if "bump" in name else 3.5)
-    run = sv.simulate(model, model.start(x=start[0], dx=start[1]), (0.0, 5.0))
+    span = (0.0, 42.0 if "far" in name else 5.0)
+    run = sv.simulate(model, model.start(x=start[0], dx=start[1]), span)
     reference = solve_ivp(
-        lambda t, s: f(t, s).full().ravel(), (0.0, 5.0), start, "DOP853", rtol=1e-10, atol=1e-12, max_step=0.02
+        lambda t, s: f(t, s).full().ravel(), span, start, "DOP853", rtol=1e-10, atol=1e-12, max_step=0.02
     )
     assert [run["x"][-1], run["dx"][-1]] == pytest.approx(reference.y[:, -1], abs=2e-6)
     assert np.abs(run.residual["Y"][0]).max() < 1e-7

@@ -3,7 +3,8 @@
 Values at points cannot tell. fmax(0, t - 4) is zero before 4 s, exp(-100 (t - 50)²) far from 50 s, and
 1 + tanh(40 (x - 3)) rounds to zero below x = 2. So functions with branches, flat ends or a bounded domain give way to
 a substitute without them, the same for equal arguments: what vanishes with the substitute vanishes whatever these
-functions are. Sines, cosines, roots and powers, whose identities mechanics needs, are evaluated as they are.
+functions are. Sines, cosines, roots and powers, whose identities mechanics needs, are evaluated as they are, roots on
+either branch.
 """
 
 import numpy as np
@@ -11,7 +12,7 @@ import numpy as np
 from servoctl.jets.tape import REAL, VALUE, Tape, apply, evaluate
 from servoctl.tolerances import ENTRY
 
-SCALES = (0.3, 1.0, 0.3, 0.3, 3.0, 3.0, 30.0, 30.0)  # of the symbols at each point
+SCALES = (0.3, 1.0, 0.3, 0.3, 3.0, 3.0, 30.0, 30.0, 1e6, 1e6)  # of the symbols at each point
 RANGE = (0.5, 1.5)  # of the symbols relative to the scale, away from zero and from each other
 POSITIVE = 2  # points, the first ones, where all symbols are positive; each pair of others has opposite random signs
 IN_DOMAIN = 2  # points that must be finite before an expression is called zero
@@ -28,7 +29,15 @@ def _substitute(name, *args):
     return 2.0 + np.cos(phase)
 
 
+def _power(exponent, a):
+    """A power, for odd multiples of 1/2 on either branch of the root: x + √(x²) does not vanish."""
+    branch = np.sign(_substitute("sqrt", a) - 2.0) if 2 * exponent % 2 == 1 else 1.0
+    return branch * a**exponent
+
+
 OPERATIONS = VALUE | {
+    "sqrt": lambda _, a: _power(0.5, a),
+    "power": _power,
     "quad": lambda name, *args: (apply if name in TRUE else _substitute)(name, *args),
     "constant": _substitute,
     "fabs": lambda _, a: _substitute("fabs", a),
