@@ -7,7 +7,7 @@ from refusals import refused
 from scipy.integrate import solve_ivp
 
 import servoctl as sv
-from servoctl.errors import SingularProgram
+from servoctl.errors import SingularProgram, SpecificationError
 from servoctl.gallery import gallery
 from servoctl.jets.identity import spread, vanish
 from servoctl.model import model as models
@@ -389,3 +389,16 @@ def test_a_flat_plan_presses_on_a_spring_stop(numbers):
     stop = 7 * 20.0 * 0.5**6
     assert run["F"][-1] == pytest.approx(stop, rel=1e-9)  # at rest on the stop: F = V'(b)
     assert run["a"][-1] == pytest.approx(1.0 + stop / 5.0, rel=1e-9)
+
+
+def test_many_loops_whose_constraint_could_change_its_order_are_judged_one_by_one():
+    mechanism = weighted()
+    x = next(iter(mechanism.q))
+    model = sv.derive(mechanism, sv.Program({"X": x - 0.1 * ca.sin(mechanism.q.t)}, by="actuators"))
+    plan = sv.simulate(model, model.start(), (0.0, 0.5))
+    run = sv.close(sv.plant(mechanism), sv.lqr(plan, sv.plant(mechanism), rate=50.0), plan.state(0.0), (0.0, 0.5))
+    assert run.plant.equations.orders
+    many = sv.close_many(run, {"a": [1.0, 1.0]}, record=["x"])
+    assert many.trace["x"][:, 0] == pytest.approx(run["x"], abs=1e-12)
+    with refused(SpecificationError):
+        sv.close_many(run, {"e": [0.0, 0.3]})
