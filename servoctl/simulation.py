@@ -27,6 +27,7 @@ from servoctl.methods.choice import (
     default_method,
     require_combination,
 )
+from servoctl.methods.orders import end_at_other_orders
 from servoctl.methods.radau import RadauSteps
 from servoctl.methods.runge_kutta import RungeKuttaSteps
 from servoctl.methods.scipy_methods import ScipySteps
@@ -133,6 +134,7 @@ def simulate(
             motion = again if again.stop is None or motion.stop is not None else motion
     finally:
         bar.close()
+    end_at_other_orders(motion)
     run = _run(model, motion, method, drift, knots, (t0, x0, t1))
     if t_eval is not None and isinstance(method, RungeKutta):
         run = _resample(run, times)

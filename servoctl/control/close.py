@@ -1,6 +1,7 @@
 """The sampled closed loop of a plant and a law."""
 
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -14,6 +15,7 @@ from servoctl.control.reference import Reference, require_plan, require_plant, r
 from servoctl.control.result import Closed
 from servoctl.errors import InconsistentStart, IntegrationStopped, ServoError, SpecificationError
 from servoctl.plants.plant import Plant
+from servoctl.reduction.orders import other_order
 from servoctl.run import Run
 
 CONSISTENT = 1e-6  # of the state: the largest residual of a material constraint at the start
@@ -162,9 +164,21 @@ def _finish(plant, law, plan, loop, conditions):
         plant, law, plan, loop, conditions, status == FINISHED, {FINISHED: 0, INTERRUPTED: 1}.get(status, -1), message,
     )  # fmt: skip
     if status in (FINISHED, INTERRUPTED):
-        return run
+        return _of_same_orders(run)
     error = status if isinstance(status, BaseException) else _stopped(law, loop, status, end)
     error.run = run
+    raise error
+
+
+def _of_same_orders(run):
+    """The loop, if its material constraints have the same orders at all of its samples."""
+    equations = run.plant.equations
+    states, values = run.states[: len(run.states) - len(run.plant.lag)], run.plant.parameters[: len(equations.values)]
+    k, row = equations.orders.first_change(run.t, states, values)
+    if k is None:
+        return run
+    error = other_order(row, float(run.t[k]))
+    error.run = replace(run, success=False, status=-1, message=f"stopped: {str(error).split('. ')[0]}")
     raise error
 
 

@@ -134,11 +134,19 @@ class Equations(Invariants):
         return self._solve(-ca.vertcat(*self.rest(range(len(self.levels)), poles)))[0]
 
     @cached_property
+    def _all_pivots(self):
+        leading = self.saddle[2] if self.sparse else self._solve(ca.SX(self.q.n, 0))[1]
+        return [*self.r.pivots, *((f"leading matrix {i + 1}", p) for i, p in enumerate(leading))]
+
+    @cached_property
     def pivots(self):
         """Pivots that depend on the motion, which must not vanish: a list of (name, SX)."""
-        leading = self.saddle[2] if self.sparse else self._solve(ca.SX(self.q.n, 0))[1]
-        named = [*self.r.pivots, *((f"leading matrix {i + 1}", p) for i, p in enumerate(leading))]
-        return [(name, p) for name, p in named if any(self.q.where(s) is not None for s in ca.symvar(p))]
+        return [(name, p) for name, p in self._all_pivots if any(self.q.where(s) is not None for s in ca.symvar(p))]
+
+    def constant_pivots(self):
+        """A function of the parameters: the pivots that depend on these alone."""
+        constant = [p for _, p in self._all_pivots if all(self.q.where(s) is None for s in ca.symvar(p))]
+        return ca.Function("constant_pivots", [self.parameters], [ca.vertcat(*constant)])
 
     @property
     def pivot_sizes(self):
@@ -236,7 +244,7 @@ class Equations(Invariants):
         second = [q.derivatives([row.expression], 2 - row.order)[-1][0] for row in material]
         second = ca.substitute(ca.vertcat(*second), acceleration, zero) if material else ca.SX(0, 1)
         force = driven - ca.substitute(mechanism.balance, acceleration, zero)
-        solution = plant_accelerations(mechanism, material, force, -second, r.points)
+        solution, _ = plant_accelerations(mechanism, material, force, -second, r.points)
         x = ca.vertcat(*q, *q.gamma(1), inputs)
         return self.function("plant", x, [q.V @ q.jet(1) + q.h, solution])
 

@@ -17,7 +17,7 @@ from servoctl.model.start import State
 from servoctl.model.store import Store, pack, unpack
 from servoctl.reduction.appell import require_positive
 from servoctl.reduction.knots import require_smooth
-from servoctl.reduction.reduce import holds, reduce
+from servoctl.reduction.reduce import holds, reduce, strong
 from servoctl.reduction.structure import structure
 from servoctl.spec.mechanism import Mechanism
 from servoctl.spec.program import Program
@@ -139,10 +139,14 @@ class Model:
                 raise unknown(name, list(current), "parameter")
         values = r.mechanism.parameters.values({**current, **changes})
         require_positive(r.mechanism, replace(r.points, values=values))
-        if not holds(r, values):
+        if not (holds(r, values) and self._constant_pivots_hold(values)):
             self._store.require_unchanged()
             return _derived(r.mechanism, r.program, r.context.guess, None, values)
         return Model(r, self._store, values, require_smooth(r.switches, values, r.smoothness), self._functions)
+
+    def _constant_pivots_hold(self, values):
+        f = self.once("constant pivots", lambda: self.equations.constant_pivots())
+        return bool(strong(*(f(p).full() for p in (values, self.reduction.context.values))).all())
 
     def near(self, t, jets, sizes=()):
         """The model of the same specification, derived with pivots chosen at an instant of the motion.

@@ -127,7 +127,9 @@ def _combination(q, rows, b, support, numbers, context, starts=None):
     names = [_derivative_name(rows[a], top - rows[a].order) for a in others]
     story = f"{rows[b].name} with {', '.join(names)}" if names else rows[b].name
     uses = merge_uses(*((rows[a].uses, top - rows[a].order) for a in support))
-    chi = replace(rows[b], expression=ca.cse(sum(parts)), order=top, uses=uses, parts=tuple(parts))
+    vanishing = sum((rows[a].vanishing for a in support), ())
+    expression = ca.cse(sum(parts))
+    chi = replace(rows[b], expression=expression, order=top, uses=uses, parts=tuple(parts), vanishing=vanishing)
     row, points = settle(q, chi, rows[:b] + rows[b + 1 :], context, starts)
     if row is None:
         raise _no_state(rows[:b] + rows[b + 1 :])

@@ -6,6 +6,7 @@ import casadi as ca
 import numpy as np
 
 from servoctl.errors import SingularProgram, SpecificationError
+from servoctl.jets.identity import spread, vanish
 from servoctl.jets.series import Flow
 from servoctl.reduction.manifold import POINTS_SEED, sample, solve
 from servoctl.reduction.ranks import clean, combination, decide, eliminate, equilibrate, refined
@@ -58,6 +59,9 @@ class Row:
         Highest derivative of each residual, and of the balance, that ψ contains.
     parts : tuple of SX
         Terms whose sum ψ is, where these may cancel: beside them rounding of folded constants is zero.
+    vanishing : tuple of (SX, SX, SX)
+        What the row's order rests on: slopes that vanish at the points of its derivation, but not identically; the jets
+        in which they are slopes, or products of two; and the expression ψ that they are slopes of.
     """
 
     expression: ca.SX
@@ -68,6 +72,7 @@ class Row:
     story: str = ""
     uses: dict = field(default_factory=dict)
     parts: tuple = field(default=(), repr=False, compare=False)
+    vanishing: tuple = field(default=(), repr=False)
     _gradients: dict = field(default_factory=dict, repr=False, compare=False)
 
     def gradient(self, q, level=None):
@@ -78,6 +83,13 @@ class Row:
             slopes = ca.jacobian(self.expression, q.jet(level))
             self._gradients[key] = self.expression, slopes if level or q.plain else slopes @ q.V
         return self._gradients[key][1]
+
+    def resting_on(self, slopes, jets):
+        """The row, with slopes in jets among `vanishing` that are zero at points, unless they vanish identically."""
+        pairs = [(e, jet) for e, jet in zip(slopes.elements(), jets.elements(), strict=True) if not e.is_zero()]
+        alive = ~vanish(spread([e for e, _ in pairs])) if pairs else []
+        some = tuple((e, jet, self.expression) for (e, jet), live in zip(pairs, alive, strict=True) if live)
+        return replace(self, vanishing=self.vanishing + some) if some else self
 
     def __repr__(self):
         return f"Row({self.name}: {self.kind}, order {self.order}{', ' + self.story if self.story else ''})"
@@ -216,10 +228,9 @@ def settle_alone(q, rows, context):
         gradients = [rows[a].gradient(q, level) for a in members]
         points.read([*(rows[a].expression for a in members), *(e for g in gradients for e in g.nonzeros())])
         values = clean(*points.matrix(ca.vertcat(*gradients)))
-        for a, slopes, numbers in zip(members, gradients, values, strict=True):
+        for a, numbers in zip(members, values, strict=True):
             if np.any(numbers):
-                affine = q.order(slopes) < level or _affine(q, rows[a].expression, level, points)
-                settled[a] = replace(rows[a], order=level, affine=affine), numbers
+                settled[a] = _of_order(q, rows[a], level, points), numbers
     return [pair or (settle(q, row, [], context)[0], None) for pair, row in zip(settled, rows, strict=True)]
 
 
@@ -255,10 +266,10 @@ def settle(q, row, others, context, starts=None):
             lower = [other for other in others if other.order < j or (other.order == j and other.affine and j > 0)]
             eliminated = _eliminated(q, row, j, values, lower, points)
             if eliminated is None:
-                return replace(row, order=j, affine=_affine(q, row.expression, j, points)), points
+                return _of_order(q, row, j, points), points
             row = eliminated
-        elif j > 0:
-            row = _without(q, row, q.gamma(j), points)
+        if j > 0:
+            row = _without(q, row.resting_on(row.gradient(q, j).T, q.jet(j)), q.gamma(j), points)
     if q.order(row.expression) == 0 and not np.any(slopes(q, row, 0, points)):
         return replace(row, order=-1), points
     return replace(row, order=max(q.order(row.expression), -1)), points
@@ -304,17 +315,20 @@ def _substituted(row, symbols, values):
     return ca.substitute([row.expression, *row.parts], [ca.vertcat(*symbols)], [values])
 
 
-def _affine(q, expression, j, points):
-    """Whether an expression is affine in γ^(j); rows of order 0 count as affine."""
-    if j == 0:
-        return True
-    jets = q.jet(j)
-    second = ca.jacobian(ca.vec(ca.jacobian(expression, jets)), jets)
-    return not second.nnz() or not np.any(clean(*points.evaluate(second.nonzeros())))
+def _of_order(q, row, j, points):
+    """The row with order j, and whether it is affine in γ^(j); rows of order 0 count as affine."""
+    row, jets = replace(row, order=j, affine=True), q.jet(j)
+    if j == 0 or q.order(row.gradient(q)) < j:
+        return row
+    second = ca.jacobian(row.gradient(q).T, jets)
+    resting = row.resting_on(second, jets @ jets.T)
+    if np.any(clean(*points.evaluate(second.nonzeros()))) or (j > 1 and resting is not row):
+        return replace(row, affine=False)
+    return resting
 
 
 def _eliminated(q, row, j, values, lower, points):
-    """The row with γ^(j) replaced by the solution of lower rows, or None where these do not determine it."""
+    """The row with jets γ^(j) replaced by the solution of lower rows, or None where these do not determine it."""
     if not lower:
         return None
     numbers, _ = leading(q, lower, points)
@@ -332,12 +346,11 @@ def _eliminated(q, row, j, values, lower, points):
     if not rows or any(other.order == j and not other.affine for other in rows):
         return None
     columns = sorted(decide(numbers[:, :, 0]).columns)
-    jets = q.jet(j)
+    jets = q.jet(j)[columns]
     raised = ca.vertcat(*(q.derivatives([other.expression], j - other.order)[-1][0] for other in rows))
-    rest = ca.substitute(raised, jets, ca.SX.zeros(q.n))
+    rest = ca.substitute(raised, jets, ca.SX.zeros(len(columns)))
     matrix = ca.vertcat(*(other.gradient(q) for other in rows))[:, columns]
-    solution = ca.SX.zeros(q.n)
-    solution[columns], _ = eliminate(matrix, -rest, numbers[:, columns])
+    solution, _ = eliminate(matrix, -rest, numbers[:, columns])
     uses = merge_uses((row.uses, 0), *((other.uses, j - other.order) for other in rows))
     expression, *parts = _substituted(row, ca.vertsplit(jets), solution)
     return replace(row, expression=ca.cse(expression), uses=uses, parts=tuple(parts))

@@ -9,6 +9,7 @@ import numpy as np
 
 from servoctl.checks import column, mapping
 from servoctl.errors import SpecificationError, unknown
+from servoctl.jets.identity import spread, vanish
 from servoctl.jets.tape import Tape, evaluate
 from servoctl.spec.coordinates import Coordinates
 from servoctl.spec.packing import packed, unpacked
@@ -234,7 +235,7 @@ class Mechanism:
         """What a given balance is at rest, such as gravity, (n,) SX; the rest is inertia and has a kinetic energy."""
         motion = ca.vertcat(*self.q.gamma(1), *self.q.gamma(2))
         static = ca.substitute(self._inverse_dynamics, motion, ca.SX.zeros(motion.numel()))
-        return ca.SX.zeros(self.q.n) if self.is_zero(static.elements()) else ca.cse(static)
+        return ca.SX.zeros(self.q.n) if vanish(spread(static.elements())).all() else ca.cse(static)
 
     def _refuse_nonholonomic_frame(self):
         """Refuse a kinetic energy in quasi-velocities if brackets of the columns of V lie outside their span."""
@@ -283,7 +284,7 @@ class Mechanism:
         points = np.random.default_rng(IDENTITY_SEED).uniform(*RANDOM, (len(symbols), 4)).astype(np.longdouble)
         for i, s in enumerate(symbols):
             if self.q.where(s) is None:
-                points[i] *= self.parameters.defaults.get(s.name(), 1.0)
+                points[i] *= self.parameters.defaults.get(s.name()) or 1.0  # what is zero by default may be set
         return evaluate(Tape(symbols, items), points)
 
     def _known(self, value, what, size=1):
