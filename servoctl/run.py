@@ -13,7 +13,7 @@ from servoctl.values import Value, same
 STENCIL = 9  # samples of the polynomial through which an extremum is refined: error of order h^9
 AS_SAMPLED = 1e-14  # relative: a refined extremum must exceed the sampled one by this
 SAME_TIME = 1e-12  # relative: rounding of an instant
-FACTS = ("method", "drift", "counters", "success", "status", "message", "knots", "jet_names")  # of a saved run
+FACTS = ("method", "drift", "counters", "success", "status", "message", "knots", "jet_names", "internal")  # of a saved run
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,6 +39,8 @@ class Run(Value):
         Whether the run finished, and if not, why.
     variants : tuple of (first, last + 1, model)
         The variant of the model, with its choice of pivots, for each range of samples; empty if there is only one.
+    internal : dict
+        The verdict on the internal dynamics along the run (`InternalDynamics.facts`); empty for flat programs.
     """
 
     t: np.ndarray
@@ -53,6 +55,7 @@ class Run(Value):
     message: str = ""
     knots: tuple = ()
     variants: tuple = ()
+    internal: dict = field(default_factory=dict)
     stored: dict = field(default_factory=dict, compare=False)
     stored_residual: dict = field(default_factory=dict, compare=False)
 
@@ -283,6 +286,7 @@ class Run(Value):
             f"Run: {len(self.t)} samples, t = {self.t[0]:g} .. {self.t[-1]:g} s; {self.message}",
             f"  method {self.method}" + (f", drift: {self.drift}" if self.drift else ""),
             "  " + ", ".join(f"{name} {count}" for name, count in self.counters.items() if count),
+            "  " + self.internal.get("text", ""),
             "  largest residuals over all levels: " + ", ".join(f"{name} {worst[name]:.1e}" for name in shown),
         ]
         signals = (*self.model.actuators, *self.model.outputs) if self.model is not None else ()

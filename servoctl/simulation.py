@@ -7,7 +7,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from servoctl.checks import as_span
-from servoctl.errors import InconsistentStart, SpecificationError
+from servoctl.errors import InconsistentStart, ServoError, SpecificationError
+from servoctl.internal_dynamics import TOLERANCE, internal_dynamics
 from servoctl.methods.accuracy import accurate
 from servoctl.methods.algebraic import algebraic
 from servoctl.methods.choice import (
@@ -30,7 +31,7 @@ from servoctl.methods.choice import (
 from servoctl.methods.radau import RadauSteps
 from servoctl.methods.runge_kutta import RungeKuttaSteps
 from servoctl.methods.scipy_methods import ScipySteps
-from servoctl.methods.stability import run_checked, warn_many_steps
+from servoctl.methods.stability import run_checked, warn_many_steps, warn_unstable
 from servoctl.methods.sundials import SundialsSteps
 from servoctl.methods.taylor import TaylorSteps
 from servoctl.model.model import Model
@@ -103,12 +104,22 @@ def simulate(
     SpecificationError
         If method and drift do not go together, or a path is not smooth enough.
     """
-    if accuracy is not None:
 
-        def simulated(method, drift):
-            return simulate(model, start, t_span, method, drift=drift, t_eval=t_eval, progress=progress)
+    def attempt(method, drift):
+        return simulated(model, start, t_span, method, drift=drift, t_eval=t_eval, progress=progress)
 
-        return accurate(simulated, model, accuracy, method, drift)
+    tolerance = getattr(method, "rtol", TOLERANCE)
+    try:
+        run = attempt(method, drift) if accuracy is None else accurate(attempt, model, accuracy, method, drift)
+    except ServoError as error:
+        if error.run is not None:
+            error.run = judged(error.run, _from_start(error.run, start, t_span), tolerance, warn=False)
+        raise
+    return judged(run, _from_start(run, start, t_span), tolerance)
+
+
+def simulated(model, start, t_span, method=None, *, drift=None, t_eval=None, progress=None):
+    """The run of `simulate`, without a verdict on its internal dynamics."""
     span = t0, t1 = as_span(t_span)
     method = default_method(model) if method is None else as_method(method)
     drift = as_drift(drift)
@@ -133,6 +144,36 @@ def simulate(
         motion.stop.run = run
         raise motion.stop
     return run
+
+
+def judged(run, along=None, tolerance=TOLERANCE, warn=True):
+    """A run with the verdict on its internal dynamics, and a warning if they are unstable.
+
+    Parameters
+    ----------
+    run : Run
+    along : Run, optional
+        The run from the start of its span on, if its samples begin later.
+    tolerance : float
+        Relative error of a step of its method.
+    warn : bool
+    """
+    if run.model.flat:
+        return run
+    internal = internal_dynamics(run.model, along or run)
+    if warn and internal.verdict == "unstable":
+        warn_unstable(internal.sentence(tolerance))
+    return replace(run, internal=internal.facts(tolerance))
+
+
+def _from_start(run, start, t_span):
+    """The run with the start as its first sample."""
+    t0, model = as_span(t_span)[0], run.model
+    if run.t[0] == t0 or model.flat:
+        return run
+    x0 = np.append(as_state(model, start, t0), np.full(len(run.jets) - len(model.state_names), np.nan))
+    variants = tuple((first + (first > 0), end + 1, variant) for first, end, variant in run.variants)
+    return replace(run, t=np.append(t0, run.t), jets=np.column_stack([x0, run.jets]), variants=variants)
 
 
 def _motion(model, method, drift, span, x0, times, knots, bar):

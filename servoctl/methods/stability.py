@@ -234,6 +234,16 @@ def warn_many_steps(method, poles, length):
         )
 
 
+def warn_unstable(verdict):
+    """Warn that the internal dynamics of a motion are unstable; the verdict says over which time, and how far."""
+    warnings.warn(
+        f"{verdict[0].upper()}{verdict[1:]}. The program does not determine this motion well. Take a shorter span or "
+        "another output; sv.lqr stabilises the whole state about a plan.",
+        RuntimeWarning,
+        stacklevel=_outside(),
+    )
+
+
 def unresolved(pieces, halved):
     """The last step of a motion, or else the one of the fastest change, if two half steps lead elsewhere.
 
