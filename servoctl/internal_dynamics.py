@@ -22,9 +22,10 @@ from servoctl.run import SAME_TIME, Run, require_model
 from servoctl.tolerances import TINY
 
 AT_ZERO = 1e-9  # size of a state relative to the largest, below which it is the rounding of zero
-GROWN = 10.0  # growth of an error along a motion above which the internal dynamics are unstable over it
-SHRUNK = 0.9  # of the errors of the start: with less than this left at the end, they are stable
-FEWEST, MOST = 32, 2**13  # instants of the linearisation, first and last try
+UNSTABLE = 10.0  # growth of an error along a motion above which the internal dynamics are unstable over it
+FASTER = 3.0  # growth over a time, relative to that over half of it, that is no drift of phases, which gives 2
+SHRUNK = 0.95  # of the errors of the start: with less than this left at the end, they are stable
+FEWEST, MOST = 32, 2**14  # instants of the linearisation, first and last try
 AGREE = 0.02  # of 1 + ln(growth): difference of its logarithm by steps twice as long that is accepted
 LOCAL, DECAYED = 0.2, 1e-3  # relative difference of one such step that is accepted; norm below which it counts less
 JITTER, GOLDEN = 0.5, 0.6180339887498949  # of their distance by which instants are irregular, by the golden ratio
@@ -32,8 +33,9 @@ TURNED = 0.5  # smallest cosine between tangent spaces at the ends of a segment 
 DEFECT = 1e-3  # of the sizes of the states: largest error, over an interval of samples, of states between them
 BLOCKS = 32  # instants between which growth is measured, as all pairs of them
 SWEEPS, BALANCED = 30, 0.01  # of balancing, at most; until sums of rows and of columns agree to one percent
+SHARED = 0.5  # of the largest part that is independent of states chosen before: with it a state is fit as the next one
 MATTERS = 1e-3  # of the states' scales: an error as large as this matters
-TOLERANCE = 1e-9  # of the steps of a motion, unless its method has another
+STEP_ERROR = 1e-9  # of the steps of a motion, unless its method has another
 PERIODIC = 1e-3  # of the largest linearisation: its change over a period that is accepted
 NEAR_ONE = 1e-3  # of a multiplier: within this of 1 it is neutral
 
@@ -55,8 +57,9 @@ class InternalDynamics:
         Frozen eigenvalues: of the linearisation at each instant [1/s], by descending real part. They decide nothing.
     verdict : {"none", "stable", "neutral", "unstable", "inconclusive"}
         "none" for flat programs. Over the time of the run, and no longer: "unstable" if an error grows more than
-        tenfold, "stable" if none does and all errors of the start have shrunk at its end, "neutral" otherwise. With a
-        period, which says something of all times, by the multipliers. "inconclusive" if the samples do not resolve it.
+        tenfold and faster than linearly, "stable" if none does and all errors of the start have shrunk at its end,
+        "neutral" otherwise, as where phases drift apart. With a period, which says something of all times, by the
+        multipliers. "inconclusive" if the samples do not resolve it.
     growth : float
         max ‖Φ(t, s)‖, s <= t: the largest growth of an error from any instant of the run to any later one.
     left : float
@@ -84,7 +87,7 @@ class InternalDynamics:
         """The time that was judged [s]."""
         return float(np.ptp(self.t)) if len(self.t) else 0.0
 
-    def good_for(self, tolerance=TOLERANCE):
+    def good_for(self, tolerance=STEP_ERROR):
         """The time [s] after which errors of a tolerance, relative to the states, have grown to 1e-3.
 
         Parameters
@@ -106,15 +109,25 @@ class InternalDynamics:
         part = (np.log(MATTERS / tolerance) - low) / (high - low) if high > low else 0.0
         return float(abs(t[k - 1] + np.clip(part, 0.0, 1.0) * (t[k] - t[k - 1]) - t[0]))
 
-    def sentence(self, tolerance=TOLERANCE):
-        """The verdict in words, with the numbers behind it."""
+    def sentence(self, tolerance=STEP_ERROR):
+        """The verdict in words, with the numbers behind it.
+
+        Parameters
+        ----------
+        tolerance : float
+            As for `good_for`.
+
+        Returns
+        -------
+        str
+        """
         if self.verdict == "none":
             return "internal dynamics: none (the program determines the motion)"
         if self.verdict == "inconclusive":
             return "internal dynamics inconclusive: the samples do not resolve it; simulate with more of them (t_eval)"
         facts = {
             "unstable": f"errors grow by {self.growth:.2g}",
-            "neutral": f"errors grow by at most {self.growth:.2g}, {self.left:.2g} of them is left",
+            "neutral": f"errors grow by at most {self.growth:.2g}",
             "stable": f"errors shrink to {self.left:.2g}, after growing by at most {self.growth:.2g}",
         }
         over = f"with a period of {self.period:.6g} s" if self.period else f"over these {self.length:.4g} s"
@@ -123,8 +136,18 @@ class InternalDynamics:
             text += f"; a forward integration, good for {good:.2g} s"
         return text
 
-    def facts(self, tolerance=TOLERANCE):
-        """The verdict with its numbers, {name: value}; `text` is the sentence."""
+    def facts(self, tolerance=STEP_ERROR):
+        """The verdict with its numbers: {name: value}, "text" the sentence.
+
+        Parameters
+        ----------
+        tolerance : float
+            As for `good_for`.
+
+        Returns
+        -------
+        dict
+        """
         return {
             "verdict": self.verdict,
             "growth": self.growth,
@@ -193,12 +216,11 @@ class _Tangents:
 
     def in_fours(self):
         """A multiple of four intervals of these instants: up to three of the last instants but one are left out."""
-        kept = np.delete(np.arange(len(self.t)), slice(-1 - (len(self.t) - 1) % 4, -1))
-        return replace(self, t=self.t[kept], N=self.N[kept], JN=self.JN[kept])
+        return self[np.delete(np.arange(len(self.t)), slice(-1 - (len(self.t) - 1) % 4, -1))]
 
-    def every(self, stride):
-        """Each of these instants that a stride reaches."""
-        return replace(self, t=self.t[::stride], N=self.N[::stride], JN=self.JN[::stride])
+    def __getitem__(self, picked):
+        """Some of these instants."""
+        return replace(self, t=self.t[picked], N=self.N[picked], JN=self.JN[picked])
 
     @property
     def frozen(self):
@@ -262,7 +284,7 @@ def _tangents(model, run, samples, t, x):
 def _bases(model, t, x, size):
     """N, the kernel of the invariants' Jacobian, and J N: (K, n_x, f) each, in scaled states; NaN where not finite."""
     p, n_x, m = model.parameters, len(size), len(model.invariant_names())
-    C = _grid(model.function("invariants").interpreted, t, x, p)[m:].T.reshape(-1, n_x, m).swapaxes(1, 2) * size
+    C = _grid(model.function("invariants").interpreted, t, x, p)[m:].T.reshape(len(t), n_x, m).swapaxes(1, 2) * size
     rows = np.linalg.norm(C, axis=2, keepdims=True)
     C = C / np.where(rows > 0, rows, 1.0)
     lost = ~np.isfinite(C).all(axis=(1, 2))[:, None, None]
@@ -285,17 +307,16 @@ def _grid(interpreter, t, x, p):
 
 
 def _resolved(model, run):
-    """Tangents and the propagators between them, at as many instants as needed; None if MOST do not do."""
+    """Tangents and the steps of the propagator along them, at as many instants as needed; None if MOST do not do."""
     finite, count = np.flatnonzero(np.isfinite(_states(model, run)).all(axis=0)), FEWEST
     while count <= MOST and len(finite) > 1:
         instants = _instants(model, run, finite, count)
         if instants is not None:
             tangents = _tangents(model, run, *instants).in_fours()
-            steps, longer = (_steps(tangents.every(stride)) for stride in (1, 2))
+            steps, longer = (_steps(tangents[::stride]) for stride in (1, 2))
             if steps is not None and longer is not None and _difference(steps, longer) < LOCAL:
-                propagators = _propagators(steps)
-                if _agree(propagators, _propagators(longer)):
-                    return tangents, propagators
+                if _agree(_propagators(steps), _propagators(longer)):
+                    return tangents, steps
         count *= 2
     return None
 
@@ -430,18 +451,39 @@ def _propagators(steps):
     return ends, Y, log
 
 
-def _growth(tangents, propagators):
-    """Instants (n,), and logarithms of ‖Φ(t, s)‖ (n, n) with the scaling of states that makes them smallest."""
-    ends, Y, log = propagators
+def _growth(tangents, steps, scale=None):
+    """Ends of blocks of steps (n,), ln ‖Φ(t, s)‖ between them (n, n), and the scale of the states, by default the best.
+    """
+    ends, Y, log = _propagators(steps)
     s, t = later = np.triu_indices(len(ends))
     N, Y, log = tangents.N[2 * ends], Y[later], log[later]
-    W = ((N[t] @ Y @ N[s].swapaxes(1, 2)) ** 2 * np.exp(2 * (log - log.max()))[:, None, None]).sum(axis=0)
-    d = _balance(W)
-    R = np.linalg.qr(N / d[:, None])[1]
+    if scale is None:
+        shares = np.exp(2 * (log - log.max()))[:, None, None]
+        scale = _balance((shares * (N[t] @ Y @ N[s].swapaxes(1, 2)) ** 2).sum(axis=0))
+    R = np.linalg.qr(N / scale[:, None])[1]
     norms = np.linalg.svd(R[t] @ Y @ np.linalg.inv(R)[s], compute_uv=False)[:, 0]
     logs = np.full((len(ends), len(ends)), -np.inf)
     logs[later] = log + np.log(np.maximum(norms, TINY))
-    return tangents.t[2 * ends], logs
+    return ends, logs, scale
+
+
+def _unstable(tangents, steps, ends, logs, scale):
+    """Whether errors grow more than tenfold, and faster than the linear growth of phases that drift apart.
+
+    Growth over a time is compared with that over half of it, and where a block has most of it, in that block.
+    """
+    t, limit = tangents.t[2 * ends], np.log(UNSTABLE)
+    ago = np.abs(t - t[:, None])
+    within = [logs[ago <= ago.max() / 2**k].max() for k in range(int(np.log2(len(t))))]
+    within.append(np.diag(logs, 1).max())
+    if logs.max() <= limit or np.diff(within).min(initial=0.0) < -np.log(FASTER):
+        return bool(logs.max() > limit)
+    j = int(np.argmax(np.diag(logs, 1)))
+    first, end = ends[j], ends[j + 1]
+    if logs[j, j + 1] <= limit or end == first + 1:
+        return bool(logs[j, j + 1] > limit)
+    block = tangents[2 * first : 2 * end + 1]
+    return _unstable(block, steps[first:end], *_growth(block, steps[first:end], scale))
 
 
 def _balance(W):
@@ -460,12 +502,13 @@ def _balance(W):
 
 
 @np.errstate(over="ignore")
-def _judged(model, tangents, propagators):
-    """The verdict on a motion from its propagators."""
-    t, logs = _growth(tangents, propagators)
-    growth, left = float(np.exp(logs.max())), float(np.exp(logs[0, -1]))
-    until = np.stack([t, np.exp(np.maximum.accumulate(logs.max(axis=0)))])
-    verdict = "unstable" if growth > GROWN else "stable" if left < SHRUNK else "neutral"
+def _judged(model, tangents, steps):
+    """The verdict on a motion from the steps of its propagator."""
+    ends, logs, scale = _growth(tangents, steps)
+    growth, left = (float(f"{np.exp(log):.3g}") for log in (logs.max(), logs[0, -1]))  # as many digits as are right
+    until = np.stack([tangents.t[2 * ends], np.exp(np.maximum.accumulate(logs.max(axis=0)))])
+    unstable = _unstable(tangents, steps, ends, logs, scale)
+    verdict = "unstable" if unstable else "stable" if left < SHRUNK else "neutral"
     names, eigenvalues = _independent(model, tangents), _eigenvalues(tangents)
     return InternalDynamics(tangents.t, names, eigenvalues, verdict, growth, left, until)
 
@@ -485,12 +528,13 @@ def _eigenvalues(tangents):
 
 
 def _independent(model, tangents):
-    """Names of states that serve as coordinates of the internal dynamics at all instants, by pivoting."""
+    """Names of states that serve as coordinates of the internal dynamics at all instants: the first fit ones."""
     bases = np.linalg.qr(tangents.size[:, None] * tangents.N)[0].transpose(1, 0, 2)
     rows, picked = bases.reshape(bases.shape[0], -1), []
     for _ in range(model.free):
-        picked.append(int(np.argmax(np.linalg.norm(rows, axis=1))))
-        pivot = rows[picked[-1]] / np.linalg.norm(rows[picked[-1]])
+        sizes = _norms(rows[:, None])
+        picked.append(int(np.argmax(sizes >= SHARED * sizes.max())))
+        pivot = rows[picked[-1]] / sizes[picked[-1]]
         rows = rows - np.outer(rows @ pivot, pivot)
     return tuple(model.state_names[i] for i in sorted(picked))
 
@@ -501,7 +545,7 @@ def _with_multipliers(model, run, period, judged):
     resolved = _resolved(model, first)
     if resolved is None:
         return replace(judged, verdict="inconclusive", period=period)
-    tangents, (_, Y, log) = resolved
+    tangents, (_, Y, log) = resolved[0], _propagators(resolved[1])
     back = tangents.N[0].T @ tangents.N[-1]
     _require_periodic(period, tangents, back)
     multipliers = np.exp(log[0, -1]) * np.linalg.eigvals(back @ Y[0, -1]).astype(complex)

@@ -55,9 +55,9 @@ class Run(Value):
     message: str = ""
     knots: tuple = ()
     variants: tuple = ()
-    internal: dict = field(default_factory=dict)
     stored: dict = field(default_factory=dict, compare=False)
     stored_residual: dict = field(default_factory=dict, compare=False)
+    internal: dict = field(default_factory=dict)
 
     def __eq__(self, other):
         if not super().__eq__(other):

@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike
 
 from servoctl.checks import as_span
 from servoctl.errors import InconsistentStart, ServoError, SpecificationError
-from servoctl.internal_dynamics import TOLERANCE, internal_dynamics
+from servoctl.internal_dynamics import STEP_ERROR, internal_dynamics
 from servoctl.methods.accuracy import accurate
 from servoctl.methods.algebraic import algebraic
 from servoctl.methods.choice import (
@@ -29,7 +29,7 @@ from servoctl.methods.choice import (
     require_combination,
 )
 from servoctl.methods.radau import RadauSteps
-from servoctl.methods.runge_kutta import RungeKuttaSteps
+from servoctl.methods.runge_kutta import ORDERS, RungeKuttaSteps
 from servoctl.methods.scipy_methods import ScipySteps
 from servoctl.methods.stability import run_checked, warn_many_steps, warn_unstable
 from servoctl.methods.sundials import SundialsSteps
@@ -104,18 +104,40 @@ def simulate(
     SpecificationError
         If method and drift do not go together, or a path is not smooth enough.
     """
+    times = dense = None if t_eval is None else _sample_times(*as_span(t_span), t_eval, ())
+    if times is not None and not model.flat:  # the verdict on internal dynamics needs more samples than a few
+        own = np.linspace(*as_span(t_span), DEFAULT_SAMPLES)
+        dense = None if _fixed_steps(method) else times if len(times) >= len(own) else np.union1d(times, own)
 
     def attempt(method, drift):
-        return simulated(model, start, t_span, method, drift=drift, t_eval=t_eval, progress=progress)
+        return simulated(model, start, t_span, method, drift=drift, t_eval=dense, progress=progress)
 
-    tolerance = getattr(method, "rtol", TOLERANCE)
+    tolerance = getattr(method, "rtol", STEP_ERROR)
     try:
         run = attempt(method, drift) if accuracy is None else accurate(attempt, model, accuracy, method, drift)
     except ServoError as error:
         if error.run is not None:
-            error.run = judged(error.run, _from_start(error.run, start, t_span), tolerance, warn=False)
+            error.run = _sampled(judged(error.run, tolerance, warn=False), times)
         raise
-    return judged(run, _from_start(run, start, t_span), tolerance)
+    return _sampled(judged(run, tolerance), times)
+
+
+def _fixed_steps(method):
+    """Whether all steps are samples."""
+    return method is not None and isinstance(as_method(method), RungeKutta)
+
+
+def _sampled(run, times):
+    """The run at its samples among some times; all of it without times, and the state in which it stopped anyway."""
+    if times is None or run.model.flat:
+        return run
+    if run.method in ORDERS:
+        return _resample(run, times)
+    picked = np.isin(run.t, times)
+    picked[-1] |= run.status < 0 or not picked.any()
+    index = np.append(0, np.cumsum(picked))
+    variants = tuple((index[a], index[b], variant) for a, b, variant in run.variants if index[b] > index[a])
+    return replace(run, t=run.t[picked], jets=run.jets[:, picked], variants=variants)
 
 
 def simulated(model, start, t_span, method=None, *, drift=None, t_eval=None, progress=None):
@@ -146,34 +168,22 @@ def simulated(model, start, t_span, method=None, *, drift=None, t_eval=None, pro
     return run
 
 
-def judged(run, along=None, tolerance=TOLERANCE, warn=True):
+def judged(run, tolerance=STEP_ERROR, warn=True):
     """A run with the verdict on its internal dynamics, and a warning if they are unstable.
 
     Parameters
     ----------
     run : Run
-    along : Run, optional
-        The run from the start of its span on, if its samples begin later.
     tolerance : float
         Relative error of a step of its method.
     warn : bool
     """
     if run.model.flat:
         return run
-    internal = internal_dynamics(run.model, along or run)
+    internal = internal_dynamics(run.model, run)
     if warn and internal.verdict == "unstable":
         warn_unstable(internal.sentence(tolerance))
     return replace(run, internal=internal.facts(tolerance))
-
-
-def _from_start(run, start, t_span):
-    """The run with the start as its first sample."""
-    t0, model = as_span(t_span)[0], run.model
-    if run.t[0] == t0 or model.flat:
-        return run
-    x0 = np.append(as_state(model, start, t0), np.full(len(run.jets) - len(model.state_names), np.nan))
-    variants = tuple((first + (first > 0), end + 1, variant) for first, end, variant in run.variants)
-    return replace(run, t=np.append(t0, run.t), jets=np.column_stack([x0, run.jets]), variants=variants)
 
 
 def _motion(model, method, drift, span, x0, times, knots, bar):
