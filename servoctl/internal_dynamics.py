@@ -52,8 +52,8 @@ class InternalDynamics:
     t : (N,) array
         Instants [s].
     names : tuple of str
-        Σ o_a states that may serve as its coordinates.
-    eigenvalues : (Σ o_a, N) complex array
+        f states that may serve as its coordinates.
+    eigenvalues : (f, N) complex array
         Frozen eigenvalues: of the linearisation at each instant [1/s], by descending real part. They decide nothing.
     verdict : {"none", "stable", "neutral", "unstable", "inconclusive"}
         "none" for flat programs. Over the time of the run, and no longer: "unstable" if an error grows more than
@@ -68,7 +68,7 @@ class InternalDynamics:
         Instants [s], and the growth up to each of them.
     period : float
         [s]; 0 if there was none.
-    multipliers : (Σ o_a,) complex array
+    multipliers : (f,) complex array
         Floquet's, the eigenvalues of the propagator over a period; none without a period.
     """
 
@@ -196,7 +196,7 @@ def internal_dynamics(model: Model, run: Run, period: float | None = None) -> In
     are too few, the motion is integrated between them.
     """
     require_model(model, run, "internal_dynamics")
-    if model.free == 0:
+    if model.flat:
         return InternalDynamics(run.t[:0], (), np.zeros((0, 0), complex), "none", 1.0)
     resolved = _resolved(model, run)
     if resolved is None:
@@ -244,11 +244,16 @@ def linearised(model, run, count):
     t : (N,) array
         [s]
     A : (N, f, f) array
-        Nᵀ J N [1/s], f = Σ o_a.
+        Nᵀ J N [1/s], f the number of states less that of invariants.
     """
     picked = np.unique(np.linspace(0, len(run.t) - 1, count).round().astype(int))
     tangents = _tangents(model, run, picked, run.t[picked], _states(model, run)[:, picked])
     return tangents.t, tangents.frozen
+
+
+def _dimension(model):
+    """f, the number of states less that of invariants: Σ o_a, and more where coordinates outnumber velocities."""
+    return len(model.state_names) - len(model.invariant_names())
 
 
 def _states(model, run):
@@ -272,7 +277,7 @@ def _by_variant(model, run, samples):
 
 def _tangents(model, run, samples, t, x):
     """Tangents at instants t (K,), states x (n_x, K), with the variants that hold at samples (K,)."""
-    size, f = _sizes(model, run), model.free
+    size, f = _sizes(model, run), _dimension(model)
     N, JN = np.full((2, len(t), len(size), f), np.nan)
     for variant, inside in _by_variant(model, run, samples):
         N[inside], JN[inside] = _bases(variant, t[inside], x[:, inside], size)
@@ -283,17 +288,17 @@ def _tangents(model, run, samples, t, x):
 @np.errstate(all="ignore")
 def _bases(model, t, x, size):
     """N, the kernel of the invariants' Jacobian, and J N: (K, n_x, f) each, in scaled states; NaN where not finite."""
-    p, n_x, m = model.parameters, len(size), len(model.invariant_names())
+    p, n_x, m, f = model.parameters, len(size), len(model.invariant_names()), _dimension(model)
     C = _grid(model.function("invariants").interpreted, t, x, p)[m:].T.reshape(len(t), n_x, m).swapaxes(1, 2) * size
     rows = np.linalg.norm(C, axis=2, keepdims=True)
     C = C / np.where(rows > 0, rows, 1.0)
     lost = ~np.isfinite(C).all(axis=(1, 2))[:, None, None]
-    N = np.linalg.svd(np.where(lost, 0.0, C))[2][:, n_x - model.free :].swapaxes(1, 2)
-    columns = np.repeat(np.arange(len(t)), model.free)
+    N = np.linalg.svd(np.where(lost, 0.0, C))[2][:, m:].swapaxes(1, 2)
+    columns = np.repeat(np.arange(len(t)), f)
     directions = (size[:, None] * N).swapaxes(1, 2).reshape(-1, n_x).T
     p = np.concatenate([np.broadcast_to(p[:, None], (len(p), len(columns))), directions])
     rates = _grid(model.function("ode").tangent, t[columns], x[:, columns], p)
-    JN = (rates / size[:, None]).T.reshape(len(t), model.free, n_x).swapaxes(1, 2)
+    JN = (rates / size[:, None]).T.reshape(len(t), f, n_x).swapaxes(1, 2)
     return N, np.where(lost, np.nan, JN)
 
 
@@ -336,8 +341,13 @@ def _instants(model, run, finite, count):
     a, b = (h * _rates(model, run, starts, run.t[i], x[:, i]) - chord for i in (starts, ends))
     t, z = run.t[starts] + s * h, x[:, starts] + s * chord + s * (1 - s) * ((1 - s) * a - s * b)
     slope = chord + (1 - s) * (1 - 3 * s) * a + s * (3 * s - 2) * b
-    gap = np.abs(slope - h * _rates(model, run, starts, t, z)) / _sizes(model, run)[:, None]
-    return (starts, t, z) if gap.max() <= DEFECT else None
+    gap = np.abs(slope - h * _rates(model, run, starts, t, z))
+    return (starts, t, z) if _small(model, run, gap) else None
+
+
+def _small(model, run, errors):
+    """Whether errors of the states (n_x, N) are small against their sizes, or those that integration leaves anyway."""
+    return bool(np.all(errors <= DEFECT * _sizes(model, run)[:, None] + STEP_ERROR))
 
 
 def _irregular(count):
@@ -355,8 +365,7 @@ def _stepped(model, run, finite, steps):
     states = [x[:, starts]]
     for a, h in zip(t[:-1], np.diff(t, axis=0), strict=True):
         states.append(_advanced(model, run, starts, a, states[-1], h))
-    gap = np.abs(states[-1] - x[:, ends]) / _sizes(model, run)[:, None]
-    if not gap.max() <= DEFECT:
+    if not _small(model, run, np.abs(states[-1] - x[:, ends])):
         return None
     between = np.array(states[:-1]).transpose(1, 2, 0).reshape(len(x), -1)
     samples, instants = np.append(np.repeat(starts, steps), ends[-1]), np.append(t[:-1].T, run.t[ends[-1]])
@@ -531,7 +540,7 @@ def _independent(model, tangents):
     """Names of states that serve as coordinates of the internal dynamics at all instants: the first fit ones."""
     bases = np.linalg.qr(tangents.size[:, None] * tangents.N)[0].transpose(1, 0, 2)
     rows, picked = bases.reshape(bases.shape[0], -1), []
-    for _ in range(model.free):
+    for _ in range(_dimension(model)):
         sizes = _norms(rows[:, None])
         picked.append(int(np.argmax(sizes >= SHARED * sizes.max())))
         pivot = rows[picked[-1]] / sizes[picked[-1]]
