@@ -1,12 +1,12 @@
 """The internal dynamics that a program leaves: how errors grow along a motion, by the variational equation.
 
-Deviations δ of a motion obey δ' = J δ, J = ∂X'/∂X, and stay in the tangent space of the manifold of the constraints. With
-orthonormal bases N(t) of it, and a fixed basis M = N(t_m) of the middle of a segment, z = Mᵀδ obeys z' = B(t) z,
+Deviations δ of a motion obey δ' = J δ, J = ∂X'/∂X, and stay in the tangent space of the manifold of the constraints.
+With orthonormal bases N(t) of it, and a fixed basis M = N(t_m) of the middle of a segment, z = Mᵀδ obeys z' = B(t) z,
 
     B = Mᵀ J N (Mᵀ N)⁻¹,    Y = (Mᵀ N_1)⁻¹ e^Ω (Mᵀ N_0),    Ω = ∫ B dt - h² [B_0, B_1] / 12,
 
-where Y takes coordinates of deviations from the start of the segment to its end: Magnus' series of order 4, whatever the
-bases. The products of all Y are the propagators Φ(t, s). Real parts of the eigenvalues of the frozen Nᵀ J N decide
+where Y takes coordinates of deviations from the start of the segment to its end: Magnus' series of order 4, whatever
+the bases. The products of all Y are the propagators Φ(t, s). Real parts of the eigenvalues of the frozen Nᵀ J N decide
 nothing: where J changes, x' = J x may grow though all of them are negative, and decay though some are positive.
 """
 
@@ -207,7 +207,7 @@ def internal_dynamics(model: Model, run: Run, period: float | None = None) -> In
 
 @dataclass(frozen=True)
 class _Tangents:
-    """Instants (K,) with orthonormal bases N of the tangent space, in scaled states, and their rates J N (K, n_x, f)."""
+    """Instants (K,), orthonormal bases N of the tangent space in scaled states, and their rates J N (K, n_x, f)."""
 
     t: np.ndarray
     size: np.ndarray
@@ -312,16 +312,17 @@ def _grid(interpreter, t, x, p):
 
 
 def _resolved(model, run):
-    """Tangents and the steps of the propagator along them, at as many instants as needed; None if MOST do not do."""
+    """Tangents, steps along them and propagators, at as many instants as needed; None if MOST do not do."""
     finite, count = np.flatnonzero(np.isfinite(_states(model, run)).all(axis=0)), FEWEST
     while count <= MOST and len(finite) > 1:
         instants = _instants(model, run, finite, count)
         if instants is not None:
             tangents = _tangents(model, run, *instants).in_fours()
             steps, longer = (_steps(tangents[::stride]) for stride in (1, 2))
-            if steps is not None and longer is not None and _difference(steps, longer) < LOCAL:
-                if _agree(_propagators(steps), _propagators(longer)):
-                    return tangents, steps
+            if steps is not None and longer is not None:
+                propagators = _propagators(steps)
+                if _difference(steps, longer) < LOCAL and _agree(propagators, _propagators(longer)):
+                    return tangents, steps, propagators
         count *= 2
     return None
 
@@ -397,10 +398,12 @@ def _difference(steps, longer):
     return float((_norms(pairs - longer) / np.maximum(np.maximum(_norms(pairs), _norms(longer)), DECAYED)).max())
 
 
-def _agree(fine, coarse):
+def _agree(propagators, longer):
     """Whether the logarithms of the growth, and of what is left at the end, are the same by steps twice as long."""
-    a, b = (np.array([log.max(), log[0, -1]]) for _, _, log in (fine, coarse))
-    return bool(np.all(np.abs(a - b) <= AGREE * (1 + np.abs(a))))
+    (ends, _, log), (half, _, other) = propagators, longer
+    fine, coarse = np.isin(ends, 2 * half), np.isin(2 * half, ends)  # between the same instants
+    a, b = log[np.ix_(fine, fine)], other[np.ix_(coarse, coarse)]
+    return all(abs(x - y) <= AGREE * (1 + abs(x)) for x, y in ((a.max(), b.max()), (a[0, -1], b[0, -1])))
 
 
 def _norms(matrices):
@@ -447,7 +450,7 @@ def _exponential(omega):
 @np.errstate(all="ignore")
 def _propagators(steps):
     """Ends of blocks of steps (n,), then propagators e^log Y between all of them, Y[s, t] (f, f) and log[s, t]."""
-    ends = np.unique(np.linspace(0, len(steps), BLOCKS + 1).round().astype(int))
+    ends = np.linspace(0, len(steps), min(BLOCKS, len(steps)) + 1).round().astype(int)
     n, f = len(ends), steps.shape[1]
     Y, log = np.zeros((n, n, f, f)), np.full((n, n), -np.inf)
     Y[range(n), range(n)], log[range(n), range(n)] = np.eye(f), 0.0
@@ -460,10 +463,9 @@ def _propagators(steps):
     return ends, Y, log
 
 
-def _growth(tangents, steps, scale=None):
-    """Ends of blocks of steps (n,), ln ‖Φ(t, s)‖ between them (n, n), and the scale of the states, by default the best.
-    """
-    ends, Y, log = _propagators(steps)
+def _growth(tangents, propagators, scale=None):
+    """Ends of blocks of steps (n,), ln ‖Φ(t, s)‖ between them (n, n), and the scale of the states (n_x,)."""
+    ends, Y, log = propagators
     s, t = later = np.triu_indices(len(ends))
     N, Y, log = tangents.N[2 * ends], Y[later], log[later]
     if scale is None:
@@ -492,7 +494,7 @@ def _unstable(tangents, steps, ends, logs, scale):
     if logs[j, j + 1] <= limit or end == first + 1:
         return bool(logs[j, j + 1] > limit)
     block = tangents[2 * first : 2 * end + 1]
-    return _unstable(block, steps[first:end], *_growth(block, steps[first:end], scale))
+    return _unstable(block, steps[first:end], *_growth(block, _propagators(steps[first:end]), scale))
 
 
 def _balance(W):
@@ -511,9 +513,9 @@ def _balance(W):
 
 
 @np.errstate(over="ignore")
-def _judged(model, tangents, steps):
-    """The verdict on a motion from the steps of its propagator."""
-    ends, logs, scale = _growth(tangents, steps)
+def _judged(model, tangents, steps, propagators):
+    """The verdict on a motion from its propagators."""
+    ends, logs, scale = _growth(tangents, propagators)
     growth, left = (float(f"{np.exp(log):.3g}") for log in (logs.max(), logs[0, -1]))  # as many digits as are right
     until = np.stack([tangents.t[2 * ends], np.exp(np.maximum.accumulate(logs.max(axis=0)))])
     unstable = _unstable(tangents, steps, ends, logs, scale)
@@ -554,7 +556,7 @@ def _with_multipliers(model, run, period, judged):
     resolved = _resolved(model, first)
     if resolved is None:
         return replace(judged, verdict="inconclusive", period=period)
-    tangents, (_, Y, log) = resolved[0], _propagators(resolved[1])
+    tangents, _, (_, Y, log) = resolved
     back = tangents.N[0].T @ tangents.N[-1]
     _require_periodic(period, tangents, back)
     multipliers = np.exp(log[0, -1]) * np.linalg.eigvals(back @ Y[0, -1]).astype(complex)

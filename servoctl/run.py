@@ -13,7 +13,8 @@ from servoctl.values import Value, same
 STENCIL = 9  # samples of the polynomial through which an extremum is refined: error of order h^9
 AS_SAMPLED = 1e-14  # relative: a refined extremum must exceed the sampled one by this
 SAME_TIME = 1e-12  # relative: rounding of an instant
-FACTS = ("method", "drift", "counters", "success", "status", "message", "knots", "jet_names", "internal")  # of a saved run
+# of a saved run
+FACTS = ("method", "drift", "counters", "success", "status", "message", "knots", "jet_names", "internal")
 
 
 @dataclass(frozen=True, eq=False)

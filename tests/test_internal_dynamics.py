@@ -182,6 +182,22 @@ def test_growth_is_that_of_the_motion_in_any_units(acceleration, length, verdict
     assert found.verdict == verdict and growth[0] <= found.growth <= growth[1]
 
 
+@pytest.mark.parametrize("growth, verdict", [(5.0, "neutral"), (20.0, "unstable")])
+def test_exponential_growth_is_unstable_above_ten(growth, verdict):
+    _, found = moved(passive(lambda x, v, t: 4 * x), np.log(growth) / 2)
+    assert found.verdict == verdict and found.growth == pytest.approx(growth, rel=0.03)
+
+
+def test_the_plan_of_a_parametric_resonance_is_refused_by_inverse_dynamics():
+    model = passive(mathieu(0.6))
+    run, found = moved(model, 120.0)
+    plant = sv.plant(model.reduction.mechanism)
+    with refused(sv.UnstableInternalDynamics, "lqr", verdict="unstable", growth=found.growth, states=("x", "dx")):
+        sv.computed(run, plant)
+    model = passive(mathieu(0.15))
+    assert sv.computed(moved(model, 120.0)[0], sv.plant(model.reduction.mechanism)).name == "computed"
+
+
 def test_stiff_and_backward_motions_are_judged():
     stiff, found = moved(passive(lambda x, v, t: -1e4 * v - 1e4 * (1 + 0.5 * ca.sin(t)) * x), 10.0, "RadauIIA")
     assert found.verdict == "stable" and found.growth < 1.1
@@ -207,7 +223,7 @@ def rtol_method():
 def test_phases_that_drift_apart_are_no_instability():
     """Errors of a speed grow linearly: 20 times in 20 s, and nothing is unstable."""
     q = sv.coordinates("x y")
-    (x, y), (dx, dy), (d2x, d2y) = q, q.d(1), q.d(2)
+    (x, y), (d2x, d2y) = q, q.d(2)
     mechanism = sv.Mechanism(q, gibbs=(d2x**2 + d2y**2) / 2, potential=(x**2 + y**2) ** 2 / 4)
     model = sv.derive(mechanism, sv.Program({"plane": 0.6 * x + 0.8 * y}, by="ideal"))
     with warnings.catch_warnings():

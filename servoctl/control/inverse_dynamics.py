@@ -327,7 +327,7 @@ def _require_stable(plan):
     facts = {"verdict": internal.verdict, "growth": internal.growth, "eigenvalue": worst, "states": internal.names}
     if internal.verdict == "inconclusive":
         raise UnstableInternalDynamics(
-            f"Whether the internal dynamics of {names} are stable along the plan is open: its samples do not resolve it.",
+            f"The samples of the plan do not resolve whether the internal dynamics of {names} are stable.",
             "Exact linearisation makes them unobservable and does not stabilise them.",
             do="Simulate the plan with more samples (t_eval), or use sv.lqr.",
             **facts,

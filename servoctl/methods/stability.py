@@ -322,6 +322,6 @@ def _fastest_rate(stepping, t, x, direction, size):
 def _outside():
     """The stacklevel, in the calling function, of the first caller outside the package."""
     level, frame = 1, sys._getframe(1)
-    while frame.f_back is not None and frame.f_globals["__name__"].split(".")[0] == __name__.split(".")[0]:
+    while frame.f_back is not None and frame.f_globals.get("__name__", "").split(".")[0] == __name__.split(".")[0]:
         level, frame = level + 1, frame.f_back
     return level
