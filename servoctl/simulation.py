@@ -104,17 +104,20 @@ def simulate(
     SpecificationError
         If method and drift do not go together, or a path is not smooth enough.
     """
-    times = dense = None if t_eval is None else _sample_times(*as_span(t_span), t_eval, ())
+    span, tolerance = as_span(t_span), getattr(method, "rtol", STEP_ERROR)
+    times = dense = None if t_eval is None else _sample_times(*span, t_eval, ())
     if times is not None and not model.flat:  # the verdict on internal dynamics needs more samples than a few
-        own = np.linspace(*as_span(t_span), DEFAULT_SAMPLES)
+        own = np.linspace(*span, DEFAULT_SAMPLES)
         dense = None if _fixed_steps(method) else times if len(times) >= len(own) else np.union1d(times, own)
 
-    def attempt(method, drift):
-        return simulated(model, start, t_span, method, drift=drift, t_eval=dense, progress=progress)
+    def attempt(method, drift, t_span=span, times=dense):
+        return simulated(model, start, t_span, method, drift=drift, t_eval=times, progress=progress)
 
-    tolerance = getattr(method, "rtol", STEP_ERROR)
     try:
-        run = attempt(method, drift) if accuracy is None else accurate(attempt, model, accuracy, method, drift)
+        if accuracy is None:
+            run = attempt(method, drift)
+        else:
+            run = accurate(attempt, model, accuracy, (span[0], as_state(model, start, span[0]), span[1]), method, drift)
     except ServoError as error:
         if error.run is not None:
             error.run = _sampled(judged(error.run, tolerance, warn=False), times)
