@@ -24,6 +24,8 @@ from servoctl.tolerances import TINY
 AT_ZERO = 1e-9  # size of a state relative to the largest, below which it is the rounding of zero
 UNSTABLE = 10.0  # growth of an error along a motion above which the internal dynamics are unstable over it
 FASTER = 3.0  # growth over a time, relative to that over half of it, that is no drift of phases, which gives 2
+EXPONENTIAL = 1.6  # its logarithm, relative to that over half of it: 2 for e^λt, less for powers of t
+GREAT = 1e4  # growth that is unstable even if it is a power of time
 SHRUNK = 0.95  # of the errors of the start: with less than this left at the end, they are stable
 FEWEST, MOST = 32, 2**14  # instants of the linearisation, first and last try
 AGREE = 0.02  # of 1 + ln(growth): difference of its logarithm by steps twice as long that is accepted
@@ -57,9 +59,9 @@ class InternalDynamics:
         Frozen eigenvalues: of the linearisation at each instant [1/s], by descending real part. They decide nothing.
     verdict : {"none", "stable", "neutral", "unstable", "inconclusive"}
         "none" for flat programs. Over the time of the run, and no longer: "unstable" if an error grows more than
-        tenfold and faster than linearly, "stable" if none does and all errors of the start have shrunk at its end,
-        "neutral" otherwise, as where phases drift apart. With a period, which says something of all times, by the
-        multipliers. "inconclusive" if the samples do not resolve it.
+        tenfold and exponentially, or 1e4-fold, "stable" if none does and all errors of the start have shrunk at its
+        end, "neutral" otherwise, as where phases drift apart. With a period, which says something of all times, by
+        the multipliers. "inconclusive" if the samples do not resolve it.
     growth : float
         max ‖Φ(t, s)‖, s <= t: the largest growth of an error from any instant of the run to any later one.
     left : float
@@ -395,7 +397,8 @@ def _rates(model, run, samples, t, x):
 def _difference(steps, longer):
     """Largest relative difference between a pair of steps and the step that is twice as long."""
     pairs = steps[1::2] @ steps[::2]
-    return float((_norms(pairs - longer) / np.maximum(np.maximum(_norms(pairs), _norms(longer)), DECAYED)).max())
+    size = np.maximum(_frobenius(pairs), _frobenius(longer))
+    return float((_frobenius(pairs - longer) / np.maximum(size, DECAYED)).max())
 
 
 def _agree(propagators, longer):
@@ -406,7 +409,7 @@ def _agree(propagators, longer):
     return all(abs(x - y) <= AGREE * (1 + abs(x)) for x, y in ((a.max(), b.max()), (a[0, -1], b[0, -1])))
 
 
-def _norms(matrices):
+def _frobenius(matrices):
     return np.sqrt((matrices**2).sum(axis=(-2, -1)))
 
 
@@ -429,7 +432,7 @@ def _steps(tangents):
     c = (t[m] - t[a])[:, None, None] / h
     w = 1 / (6 * c * (1 - c))  # of the quadratic through three values
     omega = h * ((0.5 - w * (1 - c)) * B0 + w * B + (0.5 - w * c) * B1)
-    small = _norms(omega)[:, None, None] < 1  # where the series converges
+    small = _frobenius(omega)[:, None, None] < 1  # where the series converges
     omega = omega - small * h**2 / 12 * (B0 @ B1 - B1 @ B0)
     return np.linalg.solve(G1, _exponential(omega) @ G0)
 
@@ -458,7 +461,7 @@ def _propagators(steps):
         Y[:j, j], log[:j, j] = Y[:j, j - 1], log[:j, j - 1]
         for step in steps[ends[j - 1] : ends[j]]:
             product = step @ Y[:j, j]
-            size = np.maximum(_norms(product), TINY)
+            size = np.maximum(_frobenius(product), TINY)
             Y[:j, j], log[:j, j] = product / size[:, None, None], log[:j, j] + np.log(size)
     return ends, Y, log
 
@@ -479,20 +482,23 @@ def _growth(tangents, propagators, scale=None):
 
 
 def _unstable(tangents, steps, ends, logs, scale):
-    """Whether errors grow more than tenfold, and faster than the linear growth of phases that drift apart.
+    """Whether errors grow more than tenfold and exponentially, not as a power of time like phases that drift apart.
 
     Growth over a time is compared with that over half of it, and where a block has most of it, in that block.
     """
     t, limit = tangents.t[2 * ends], np.log(UNSTABLE)
     ago = np.abs(t - t[:, None])
     within = [logs[ago <= ago.max() / 2**k].max() for k in range(int(np.log2(len(t))))]
-    within.append(np.diag(logs, 1).max())
-    if logs.max() <= limit or np.diff(within).min(initial=0.0) < -np.log(FASTER):
-        return bool(logs.max() > limit)
+    within = np.array([*within, np.diag(logs, 1).max()])
+    whole, half = within[:-1], within[1:]
+    exponential = (whole > limit) & (whole - half > np.log(FASTER)) & (whole > EXPONENTIAL * half)
+    exponential &= within.max() < EXPONENTIAL * whole  # most of the growth is that over this time
+    if exponential.any() or logs.max() > np.log(GREAT):
+        return True
     j = int(np.argmax(np.diag(logs, 1)))
     first, end = ends[j], ends[j + 1]
     if logs[j, j + 1] <= limit or end == first + 1:
-        return bool(logs[j, j + 1] > limit)
+        return False
     block = tangents[2 * first : 2 * end + 1]
     return _unstable(block, steps[first:end], *_growth(block, _propagators(steps[first:end]), scale))
 
@@ -543,7 +549,7 @@ def _independent(model, tangents):
     bases = np.linalg.qr(tangents.size[:, None] * tangents.N)[0].transpose(1, 0, 2)
     rows, picked = bases.reshape(bases.shape[0], -1), []
     for _ in range(_dimension(model)):
-        sizes = _norms(rows[:, None])
+        sizes = _frobenius(rows[:, None])
         picked.append(int(np.argmax(sizes >= SHARED * sizes.max())))
         pivot = rows[picked[-1]] / sizes[picked[-1]]
         rows = rows - np.outer(rows @ pivot, pivot)
@@ -591,7 +597,7 @@ def _require_periodic(period, tangents, back):
     """Refuse a period after which the tangent space or the linearisation is another one."""
     first, last = tangents.frozen[0], tangents.frozen[-1]
     turned = 1 - np.linalg.svd(back, compute_uv=False).min()
-    changed = _norms(back @ last @ back.T - first) / max(_norms(tangents.frozen).max(), TINY)
+    changed = _frobenius(back @ last @ back.T - first) / max(_frobenius(tangents.frozen).max(), TINY)
     if max(turned, changed) > PERIODIC:
         raise SpecificationError(
             f"The linearisation does not have the period {period:g} s: after it, it differs by {changed:.2g} of its "

@@ -13,7 +13,7 @@ from refusals import refused, warned
 from scipy.integrate import solve_ivp
 
 import servoctl as sv
-from servoctl.gallery import cars, gallery, mass_on_car, passive_arm, vtol
+from servoctl.gallery import cars, gallery, mass_on_car, passive_arm, spiral, vtol
 
 
 def internal(pair, span, start, **guess):
@@ -231,6 +231,18 @@ def test_phases_that_drift_apart_are_no_instability():
         run = sv.simulate(model, model.start(guess={"x": 0.8, "y": -0.6}, dx=0.0), (0.0, 40.0), drift="project")
     found = sv.internal_dynamics(model, run)
     assert found.verdict == "neutral" and 10 < found.growth < 100
+
+
+@pytest.mark.parametrize("order, verdict", [(4, "neutral"), (5, "neutral"), (7, "neutral"), (8, "unstable")])
+def test_high_derivatives_grow_as_powers_of_time(order, verdict):
+    """Up to 1e4 that is neutral."""
+    model = sv.derive(*spiral(order))
+    straight = {f"d{k}{axis}": 0.0 for k in range(2, order) for axis in "xy"}
+    start = model.start(x=0.0, y=0.0, dx=1.0, dy=0.0, guess=straight)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error" if verdict == "neutral" else "ignore", RuntimeWarning)
+        run = sv.simulate(model, start, (0.0, 2.0))
+    assert run.internal["verdict"] == verdict and run.internal["growth"] > 10
 
 
 # spaces that turn ----------------------------------------------------------------------------------------------------
