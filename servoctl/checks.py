@@ -133,7 +133,7 @@ def whole(name, value, least=0, most=math.inf):
     """An int from a whole number between `least` and `most`: from 1000.0, too, but not from True."""
     try:
         number = least - 1 if isinstance(value, (bool, str, bytes)) else int(value)
-    except (TypeError, ValueError, OverflowError):
+    except (TypeError, ValueError, OverflowError, RuntimeError):  # the last is CasADi's
         number = least - 1
     if not least <= number <= most or number != value:
         rule = f"It must be a whole number, at least {least}{f' and at most {most}' if most < math.inf else ''}."

@@ -36,6 +36,7 @@ from servoctl.methods.sundials import SundialsSteps
 from servoctl.methods.taylor import TaylorSteps
 from servoctl.model.model import Model
 from servoctl.model.start import State
+from servoctl.model.switching import switching
 from servoctl.progress import Progress
 from servoctl.run import SAME_TIME, Run
 
@@ -201,24 +202,32 @@ def _motion(model, method, drift, problem, bar, atol=None):
     `atol` (n_x,) replaces the default of the method.
     """
     t0, x0, t1, times, _ = problem
-    least = ATOL if atol is None else atol.min()
+    if isinstance(method, Algebraic):
+        return algebraic(model, t0, x0, times, bar)
+    family = switching(model)
+    if family is not None:
+        model = family.at(family.branches(t0, x0))
+    stepping = _stepping(model, method, drift, (t0, t1), bar, atol)
+    stepping.family = family
+    return run_checked(stepping, *problem) if stepping.tolerances is None else stepping.run(*problem)
+
+
+def _stepping(model, method, drift, span, bar, atol):
+    """The integration by a method other than `Algebraic`."""
+    (t0, t1), least = span, ATOL if atol is None else atol.min()
     match method:
-        case Algebraic():
-            return algebraic(model, t0, x0, times, bar)
         case Taylor(order, jets, rtol, given):
-            return TaylorSteps(model, drift, rtol, given or least, order, jets or 0, bar).run(*problem)
+            return TaylorSteps(model, drift, rtol, given or least, order, jets or 0, bar)
         case RadauIIA(order, step, rtol, given):
             step = None if step is None else _step_length(step, t0, t1)
-            stepping = RadauSteps(model, drift, rtol, given or least, order, step, bar)
-            return run_checked(stepping, *problem) if step else stepping.run(*problem)
+            return RadauSteps(model, drift, rtol, given or least, order, step, bar)
         case RungeKutta(_, step):
-            stepping = RungeKuttaSteps(model, str(method), drift, _step_length(step, t0, t1), bar)
-            return run_checked(stepping, *problem)
+            return RungeKuttaSteps(model, str(method), drift, _step_length(step, t0, t1), bar)
         case Sundials(name, rtol, given):
-            return SundialsSteps(model, name, drift, rtol, given or least, t1 - t0, bar).run(*problem)
+            return SundialsSteps(model, name, drift, rtol, given or least, t1 - t0, bar)
         case Adaptive(name, rtol, given):
             each = least if atol is None or isinstance(drift, MinimalCoordinates) else atol
-            return ScipySteps(model, name, drift, rtol, given or each, bar).run(*problem)
+            return ScipySteps(model, name, drift, rtol, given or each, bar)
 
 
 def _smaller_tolerances(model, method, motion):
@@ -244,7 +253,8 @@ def _run(model, motion, method, drift, knots, span):
         status, message = 1, f"interrupted at {last} of {span[2]:g} s; what was computed is kept"
     else:
         status, message = 0, "finished"
-    facts = {"method": str(method), "drift": str(drift or ""), "counters": motion.counters, "knots": knots}
+    facts = {"method": str(method), "drift": str(drift or ""), "counters": motion.counters}
+    facts["knots"] = tuple(sorted({*knots, *motion.switches}))
     facts |= {"success": status == 0, "status": status, "message": message, "variants": tuple(variants)}
     return Run(t, jets, model.names_to(len(jets)), model, **facts)
 

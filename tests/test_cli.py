@@ -356,11 +356,18 @@ def test_an_interrupted_verification_keeps_the_run(here, fall, capsys, monkeypat
 
 
 def test_a_failed_verification_is_seen_in_the_exit_code(here, fall, monkeypatch):
-    failed = SimpleNamespace(passed=False, numbers={"acceleration": float("nan")})
+    failed = SimpleNamespace(verdict="failed", passed=False, numbers={"acceleration": float("nan")})
     monkeypatch.setattr(servoctl, "verify", lambda *_: failed)
     assert main(["run", fall, "--no-figures"]) == 1
     verification = summary(here / "servoctl-runs" / "fall")["verification"]
-    assert verification == {"passed": False, "numbers": {"acceleration": None}}
+    assert verification == {"verdict": "failed", "passed": False, "numbers": {"acceleration": None}}
+
+
+def test_an_inconclusive_verification_has_an_exit_code_of_its_own(here, fall, monkeypatch):
+    doubtful = SimpleNamespace(verdict="inconclusive", passed=False, numbers={})
+    monkeypatch.setattr(servoctl, "verify", lambda *_: doubtful)
+    assert main(["run", fall, "--no-figures"]) == 3
+    assert summary(here / "servoctl-runs" / "fall")["verification"]["verdict"] == "inconclusive"
 
 
 # --- the other commands

@@ -5,7 +5,7 @@ where only the choice of pivots fails; the equilibrated matrices L and B decide 
 as soon as the matrices are far better than it.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -93,6 +93,12 @@ class Stretch:
     pivots: np.ndarray
     top: object
     crosses: bool = False
+
+    def first(self, count):
+        """The first steps alone."""
+        if count >= len(self.t) - 1:
+            return self
+        return replace(self, t=self.t[: count + 1], x=self.x[:, : count + 1], pivots=self.pivots[:, :count])
 
     def instants(self, k):
         """Instants of step k at which pivots are known, its start first."""

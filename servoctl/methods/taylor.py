@@ -16,6 +16,7 @@ from servoctl.jets.tape import Tape
 from servoctl.methods.choice import Project
 from servoctl.methods.monitor import DenseStretch, Fine, Repivot
 from servoctl.methods.motion import Stepping
+from servoctl.methods.watch import End
 from servoctl.reduction.ranks import clean, eliminate
 
 LOWEST, HIGHEST = 4, 24  # orders: below, steps are too short; above, compiling grows faster than steps
@@ -201,9 +202,10 @@ class TaylorSteps(Stepping):
     advice = "Check whether the motion escapes or meets a point where it is not smooth."
 
     def __init__(self, model, drift, rtol, atol, order, jets, progress):
-        self.rtol, self.atol = rtol, atol
+        self.tolerances = rtol, atol
         self.order = order_for(rtol) if order is None else order
         self.every = drift.every if isinstance(drift, Project) else 0
+        self.projects = self.every > 0
         self.jets = max(jets, model.reduction.top)
         super().__init__(model, "Taylor", drift, progress)
 
@@ -229,12 +231,16 @@ class TaylorSteps(Stepping):
     def _piece(self, a, x, b, times):
         self.p = np.append(self.model.parameters, (a + b) / 2)  # paths take the branches of this piece
         self.monitor.begin(self._pivots(a, x))
+        self.watch.begin(a)
         while a != b and self.motion.stop is None:
-            t, states, y = self.f.taylor(a, x, b, self.p, self.rtol, self.atol, self.most, self.every)
-            outcome = self.monitor.inspect(self._stretch(t, states, y))
+            t, states, y = self.f.taylor(a, x, b, self.p, *self.tolerances, self.most, self.every)
+            outcome = self._inspected(self._stretch(t, states, y))
             fine, steps = isinstance(outcome, Fine), outcome.steps
             self.motion.count(steps=steps, nfev=steps)
             times = self._sample(t, states, y, times, t[steps] if fine else outcome.t)
+            if isinstance(outcome, End):
+                self._turn(outcome, b)
+                return outcome.t, outcome.x
             go_on = isinstance(outcome, Repivot)
             a, x = (outcome.t, outcome.x) if go_on else (t[steps], states[:, steps].copy())
             self.progress(a)
@@ -244,7 +250,7 @@ class TaylorSteps(Stepping):
                 self._fail(a, x, "its steps vanish or are not finite")
         if len(times) and self.motion.stop is None:
             self._sample(np.array([a, a]), np.column_stack([x, x]), self._outputs(a, x)[:, None], times, a)
-        return x
+        return a, x
 
     def _stretch(self, t, states, y):
         """The steps for the monitor; pivots inside them cost a series each, so only suspicious steps evaluate them."""

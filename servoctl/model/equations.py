@@ -326,7 +326,23 @@ class Equations(Invariants):
             names += [(name, j) for j in range(len(levels))]
             expressions += [level[0] for level in levels]
         invariants = self.q.invariants
-        return [*names, *((name, 0) for name in invariants)], [*expressions, *invariants.values()]
+        expressions = [*map(self._without_higher, expressions), *invariants.values()]
+        return [*names, *((name, 0) for name in invariants)], expressions
+
+    def _without_higher(self, expression):
+        """An expression with the jets above s̄, which the rows determine, replaced by their values.
+
+        A row of the program that hidden rows replace may have an order above s̄.
+        """
+        places = filter(None, map(self.q.where, ca.symvar(expression)))
+        highest = max((level for of, level, _ in places if of not in ("t", "q")), default=0)
+        for k in range(highest, self.top, -1):
+            jet = self.q.jet(k)
+            pairs = zip(self.r.rows, self.raised, strict=True)
+            raised = ca.vertcat(*(self.q.derivatives([r.expression], n + k - self.top)[-1][0] for r, n in pairs))
+            solution, _ = self._solve(-ca.substitute(raised, jet, ca.SX.zeros(self.q.n)))
+            expression = ca.substitute(expression, jet, solution)
+        return expression
 
 
 EQUATIONS = {  # arguments of `compiled`: the function, its loops, its projection

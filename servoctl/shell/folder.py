@@ -136,7 +136,7 @@ def summary(run, start, verification):
     """A run as values for JSON."""
     model = run.model
     residuals = {name: [_worst(level) for level in run.residual[name].tolist()] for name in run.residual}
-    verified = verification and {"passed": verification.passed, "numbers": verification.numbers}
+    verified = verification and {name: getattr(verification, name) for name in ("verdict", "passed", "numbers")}
     return {
         "versions": machine()["versions"],
         "parameters": dict(zip(model.reduction.mechanism.parameters.names, model.parameters, strict=True)),

@@ -24,7 +24,7 @@ def main(argv=None):
     -------
     int
         0 done; 1 the motion stopped early, its verification failed, or files were written to another folder; 2 an
-        error, explained on stderr; 130 interrupted.
+        error, explained on stderr; 3 the verification is inconclusive; 130 interrupted.
     """
     args = _parser().parse_args(argv)
     args.command_line = list(sys.argv[1:] if argv is None else argv)

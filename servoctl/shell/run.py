@@ -12,6 +12,8 @@ from servoctl.shell.motion import described
 from servoctl.shell.options import METHODS_HELP, add_motion, drift, samples
 from servoctl.shell.scenes import find_scene
 
+INCONCLUSIVE = 3  # exit code where nothing failed and something could not be verified
+
 
 def add_run(commands):
     """Add the command to the subparsers of the command line."""
@@ -65,8 +67,10 @@ def _compute(args, name, scene, folder):
     unstable = run.internal.get("verdict") == "unstable"
     if unstable:
         complain(f"The plan is not to be trusted: {run.internal['text']}.")
-    verified = args.no_verify or (verification is not None and verification.passed)
-    return 0 if run.success and verified and done and not unstable and not folder.moved else 1
+    verdict = "passed" if args.no_verify else getattr(verification, "verdict", "failed")
+    if unstable or not (run.success and verdict != "failed" and done and not folder.moved):
+        return 1
+    return INCONCLUSIVE if verdict == "inconclusive" else 0
 
 
 def _options(args, motion):
