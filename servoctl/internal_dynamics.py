@@ -323,7 +323,7 @@ def _resolved(model, run):
             steps, longer = (_steps(tangents[::stride]) for stride in (1, 2))
             if steps is not None and longer is not None:
                 propagators = _propagators(steps)
-                if _difference(steps, longer) < LOCAL and _agree(propagators, _propagators(longer)):
+                if _mismatch(steps, longer) < LOCAL and _agree(propagators, _propagators(longer)):
                     return tangents, steps, propagators
         count *= 2
     return None
@@ -394,7 +394,7 @@ def _rates(model, run, samples, t, x):
     return y
 
 
-def _difference(steps, longer):
+def _mismatch(steps, longer):
     """Largest relative difference between a pair of steps and the step that is twice as long."""
     pairs = steps[1::2] @ steps[::2]
     size = np.maximum(_frobenius(pairs), _frobenius(longer))
