@@ -15,7 +15,7 @@ AS_SAMPLED = 1e-14  # relative: a refined extremum must exceed the sampled one b
 SAME_TIME = 1e-12  # relative: rounding of an instant
 FACTS = {
     "method": str, "drift": str, "counters": dict, "success": bool, "status": int, "message": str, "knots": list,
-    "jet_names": list,
+    "jet_names": list, "internal": dict,
 }  # of a saved run
 
 
@@ -42,6 +42,8 @@ class Run(Value):
         Whether the run finished, and if not, why.
     variants : tuple of (first, last + 1, model)
         The variant of the model, with its choice of pivots, for each range of samples; empty if there is only one.
+    internal : dict
+        The verdict on the internal dynamics along the run (`InternalDynamics.facts`); empty for flat programs.
     """
 
     t: np.ndarray
@@ -58,6 +60,7 @@ class Run(Value):
     variants: tuple = ()
     stored: dict = field(default_factory=dict, compare=False)
     stored_residual: dict = field(default_factory=dict, compare=False)
+    internal: dict = field(default_factory=dict)
 
     def __eq__(self, other):
         if not super().__eq__(other):
@@ -286,6 +289,7 @@ class Run(Value):
             f"Run: {len(self.t)} samples, t = {self.t[0]:g} .. {self.t[-1]:g} s; {self.message}",
             f"  method {self.method}" + (f", drift: {self.drift}" if self.drift else ""),
             "  " + ", ".join(f"{name} {count}" for name, count in self.counters.items() if count),
+            "  " + self.internal.get("text", ""),
             "  largest residuals over all levels: " + ", ".join(f"{name} {worst[name]:.1e}" for name in shown),
         ]
         signals = (*self.model.actuators, *self.model.outputs) if self.model is not None else ()

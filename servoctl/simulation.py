@@ -7,7 +7,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from servoctl.checks import as_span
-from servoctl.errors import InconsistentStart, SpecificationError
+from servoctl.errors import InconsistentStart, ServoError, SpecificationError
+from servoctl.internal_dynamics import STEP_ERROR, internal_dynamics
 from servoctl.methods.accuracy import ATOL, absolute_tolerances, accurate, large_tolerances
 from servoctl.methods.algebraic import algebraic
 from servoctl.methods.choice import (
@@ -29,9 +30,9 @@ from servoctl.methods.choice import (
 )
 from servoctl.methods.orders import end_at_other_orders
 from servoctl.methods.radau import RadauSteps
-from servoctl.methods.runge_kutta import RungeKuttaSteps
+from servoctl.methods.runge_kutta import ORDERS, RungeKuttaSteps
 from servoctl.methods.scipy_methods import ScipySteps
-from servoctl.methods.stability import run_checked, warn_many_steps
+from servoctl.methods.stability import run_checked, warn_many_steps, warn_unstable
 from servoctl.methods.sundials import SundialsSteps
 from servoctl.methods.taylor import TaylorSteps
 from servoctl.model.model import Model
@@ -105,13 +106,48 @@ def simulate(
     SpecificationError
         If method and drift do not go together, or a path is not smooth enough.
     """
+    span, tolerance = as_span(t_span), getattr(method, "rtol", STEP_ERROR)
+    times = dense = None if t_eval is None else _sample_times(*span, t_eval, ())
+    if times is not None and not model.flat:  # the verdict on internal dynamics needs more samples than a few
+        own = np.linspace(*span, DEFAULT_SAMPLES)
+        dense = None if _fixed_steps(method) else times if len(times) >= len(own) else np.union1d(times, own)
+
+    def attempt(method, drift, t_span=span, times=dense):
+        return simulated(model, start, t_span, method, drift=drift, t_eval=times, progress=progress)
+
+    try:
+        if accuracy is None:
+            run = attempt(method, drift)
+        else:
+            run = accurate(attempt, model, accuracy, (span[0], as_state(model, start, span[0]), span[1]), method, drift)
+    except ServoError as error:
+        if error.run is not None:
+            error.run = _sampled(judged(error.run, tolerance, warn=False), times)
+        raise
+    return _sampled(judged(run, tolerance), times)
+
+
+def _fixed_steps(method):
+    """Whether all steps are samples."""
+    return method is not None and isinstance(as_method(method), RungeKutta)
+
+
+def _sampled(run, times):
+    """The run at its samples among some times; all of it without times, and the state in which it stopped anyway."""
+    if times is None or run.model.flat:
+        return run
+    if run.method in ORDERS:
+        return _resample(run, times)
+    picked = np.isin(run.t, times)
+    picked[-1] |= run.status < 0 or not picked.any()
+    index = np.append(0, np.cumsum(picked))
+    variants = tuple((index[a], index[b], variant) for a, b, variant in run.variants if index[b] > index[a])
+    return replace(run, t=run.t[picked], jets=run.jets[:, picked], variants=variants)
+
+
+def simulated(model, start, t_span, method=None, *, drift=None, t_eval=None, progress=None):
+    """The run of `simulate`, without a verdict on its internal dynamics."""
     span = t0, t1 = as_span(t_span)
-    if accuracy is not None:
-
-        def simulated(method, drift, t_span=span, times=t_eval):
-            return simulate(model, start, t_span, method, drift=drift, t_eval=times, progress=progress)
-
-        return accurate(simulated, model, accuracy, (t0, as_state(model, start, t0), t1), method, drift)
     method = default_method(model) if method is None else as_method(method)
     drift = as_drift(drift)
     require_combination(model, method, drift)
@@ -142,6 +178,24 @@ def simulate(
         motion.stop.run = run
         raise motion.stop
     return run
+
+
+def judged(run, tolerance=STEP_ERROR, warn=True):
+    """A run with the verdict on its internal dynamics, and a warning if they are unstable.
+
+    Parameters
+    ----------
+    run : Run
+    tolerance : float
+        Relative error of a step of its method.
+    warn : bool
+    """
+    if run.model.flat:
+        return run
+    internal = internal_dynamics(run.model, run)
+    if warn and internal.verdict == "unstable":
+        warn_unstable(internal.sentence(tolerance))
+    return replace(run, internal=internal.facts(tolerance))
 
 
 def _motion(model, method, drift, problem, bar, atol=None):

@@ -6,6 +6,7 @@ import platform
 import shutil
 import subprocess
 import sys
+import warnings
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -90,6 +91,18 @@ def test_run_leaves_numbers_figures_and_the_report(here, capsys):
     assert facts["versions"]["servoctl"] == servoctl.__version__
     assert facts["versions"]["python"] == platform.python_version()
     assert set(facts["versions"]) == {"servoctl", "casadi", "numpy", "scipy", "python"}
+
+
+def test_a_plan_with_unstable_internal_dynamics_is_kept_and_fails(here, capsys):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", RuntimeWarning)  # said once, by the command itself
+        assert main(["run", "vtol-centre", "--no-loop", "--no-figures", "--no-verify"]) == 1
+    printed = capsys.readouterr()
+    assert "internal dynamics unstable over these 1 s: errors grow by" in printed.out
+    assert "internal dynamics unstable" in printed.err
+    facts = summary(here / "servoctl-runs" / "vtol-centre")
+    assert facts["success"] and facts["internal_dynamics"]["verdict"] == "unstable"
+    assert facts["internal_dynamics"]["growth"] > 100 and facts["internal_dynamics"]["seconds"] == 1.0
 
 
 def test_a_motion_that_stops_is_kept_drawn_and_explained(here, capsys):

@@ -1,5 +1,6 @@
 """C export: the files compile without a warning as C99, and compute what Python computes, to 1e-12."""
 
+import contextlib
 import ctypes
 import re
 import shlex
@@ -10,7 +11,7 @@ from types import SimpleNamespace
 import casadi as ca
 import numpy as np
 import pytest
-from refusals import refused
+from refusals import refused, warned
 
 import servoctl as sv
 from servoctl.codegen.compiler import compiler
@@ -81,7 +82,8 @@ def test_feedforward_of_internal_dynamics_is_the_runge_kutta_run(name, gallery_m
     scene, model = gallery[name], gallery_model(name)
     start = model.start(**scene.start, guess=scene.guess)
     steps, end = 50, 0.5
-    run = sv.simulate(model, start, (0.0, end), method=sv.RungeKutta(4, step=end / steps))
+    with warned("unstable") if name == "vtol-centre" else contextlib.nullcontext():
+        run = sv.simulate(model, start, (0.0, end), method=sv.RungeKutta(4, step=end / steps))
     plan = exported(model, tmp_path, start=start)
     names, _ = model.signals("reaction" if model.ideal else "actuation")
     x, p = start.values.copy(), model.parameters

@@ -31,7 +31,6 @@ RANK_POINTS, AWAY, SEED = 8, 0.02, 20240229  # states for the ranks, and their d
 SHARE = 1e-9  # of the largest entry, in rows and columns of like size: smaller ones are rounding
 MOST_DELAY = 1000  # samples: the poles of a delayed loop are eigenvalues of a matrix of that size
 MOST_DERIVATIVES = 4  # of the number of states: derivatives of a residual until an input appears
-GROWN = 2.0  # growth of errors along the plan up to which unstable internal dynamics pass: they hardly show in it
 TIME_CONSTANT = 0.25  # s: several poles there rise in about a second, as suits cranes and arms of human size
 
 
@@ -332,16 +331,24 @@ def _require_smooth(plan, orders):
 
 def _require_stable(plan):
     internal = internal_dynamics(plan.model, plan)
-    if internal.verdict == "unstable" and internal.growth > GROWN:
-        worst = float(internal.eigenvalues.real.max())
+    if internal.verdict not in ("unstable", "inconclusive"):
+        return
+    worst, names = float(internal.eigenvalues.real.max(initial=-np.inf)), ", ".join(internal.names)
+    facts = {"verdict": internal.verdict, "growth": internal.growth, "eigenvalue": worst, "states": internal.names}
+    if internal.verdict == "inconclusive":
         raise UnstableInternalDynamics(
-            f"The internal dynamics of {', '.join(internal.names)} have an eigenvalue of {worst:.6g} 1/s on the plan.",
+            f"The samples of the plan do not resolve whether the internal dynamics of {names} are stable.",
             "Exact linearisation makes them unobservable and does not stabilise them.",
-            do="Use sv.lqr, which stabilises the whole state about the plan, or choose another output.",
-            eigenvalue=worst,
-            growth=float(internal.growth),
-            states=internal.names,
+            do="Simulate the plan with more samples (t_eval), or use sv.lqr.",
+            **facts,
         )
+    raise UnstableInternalDynamics(
+        f"The internal dynamics of {names} are unstable: along the plan errors grow by {internal.growth:.3g} in "
+        f"{internal.length:.3g} s (frozen eigenvalues up to {worst:.6g} 1/s).",
+        "Exact linearisation makes them unobservable and does not stabilise them.",
+        do="Use sv.lqr, which stabilises the whole state about the plan, or choose another output.",
+        **facts,
+    )
 
 
 def _poles(poles, orders):

@@ -149,6 +149,7 @@ def summary(run, start, verification):
         "samples": len(run.t),
         "counters": run.counters,
         "free_initial_values": model.free,
+        "internal_dynamics": {name.replace(" ", "_"): value for name, value in run.internal.items()} or None,
         "start": {
             "t": start.t,
             "values": dict(zip(start.names, start.values, strict=True)),

@@ -1,5 +1,7 @@
 """`servoctl run`: derive, simulate, verify, close the loop; write figures and numbers to a folder."""
 
+import warnings
+
 import servoctl as sv
 from servoctl.errors import ServoError
 from servoctl.methods.choice import as_drift, as_method, default_method
@@ -62,8 +64,11 @@ def _compute(args, name, scene, folder):
     print(f"{', '.join(f for f in (*FILES, *LOOP_FILES) if (folder.path / f).exists())} in {folder.path}")
     if not run.success:
         complain(f"The motion ended early, at t = {run.t[-1]:.6g} s; what was computed is kept.")
+    unstable = run.internal.get("verdict") == "unstable"
+    if unstable:
+        complain(f"The plan is not to be trusted: {run.internal['text']}.")
     verdict = "passed" if args.no_verify else getattr(verification, "verdict", "failed")
-    if not (run.success and verdict != "failed" and done and not folder.moved):
+    if unstable or not (run.success and verdict != "failed" and done and not folder.moved):
         return 1
     return INCONCLUSIVE if verdict == "inconclusive" else 0
 
@@ -84,7 +89,9 @@ def _options(args, motion):
 def _simulate(motion, options, report):
     """The run, or the part of it before the motion stopped."""
     try:
-        run = sv.simulate(motion.model, motion.start, motion.span, **options)
+        with warnings.catch_warnings():  # the report and the exit code say this
+            warnings.filterwarnings("ignore", "Internal dynamics unstable")
+            run = sv.simulate(motion.model, motion.start, motion.span, **options)
         report.say(run)
         return run
     except ServoError as error:

@@ -25,7 +25,7 @@ from servoctl.methods.choice import (
 from servoctl.model.model import Model
 from servoctl.model.start import State
 from servoctl.progress import progress_bar
-from servoctl.simulation import consistent_state, simulate
+from servoctl.simulation import consistent_state, simulated
 from servoctl.study.table import SHOWN, Study, machine, table
 
 MEASURED = tuple(name for name in METHODS if name not in ("RK1", "RK2", "RK23"))  # which need too many steps
@@ -308,7 +308,7 @@ class Reference:
         for method in checks:
             options = {"drift": Project(), "t_eval": self.times, "progress": Deadline(10 * seconds)}
             try:
-                run = _whole(simulate(self.model, self.start, self.span, method, **options))
+                run = _whole(simulated(self.model, self.start, self.span, method, **options))
             except ServoError as error:
                 failure = error
                 continue
@@ -325,7 +325,7 @@ class Reference:
         """The run with samples at these times (N,) [s]."""
         key = times.tobytes()
         if key not in self._runs:
-            run = simulate(self.model, self.start, self.span, self.method, drift=self.drift, t_eval=times)
+            run = simulated(self.model, self.start, self.span, self.method, drift=self.drift, t_eval=times)
             self._runs[key] = _whole(run)
         return self._runs[key]
 
@@ -393,7 +393,7 @@ def _errors_and_cost(reference, name, treatment, value, seconds):
 
     def at(times):
         options = {"drift": treatment, "t_eval": times, "progress": Deadline(seconds)}
-        return _whole(simulate(model, reference.start, reference.span, method, **options))
+        return _whole(simulated(model, reference.start, reference.span, method, **options))
 
     run, timed = at(times), []
     for _ in range(TIMED):
