@@ -140,7 +140,7 @@ def _motion(model, method, drift, span, x0, times, knots, bar):
     (t0, t1), arguments = span, (span[0], x0, span[1], times, knots)
     match method:
         case Algebraic():
-            return algebraic(model, t0, x0, times, bar)
+            return algebraic(model, span, x0, times, knots, bar)
         case Taylor(order, jets, rtol, atol):
             return TaylorSteps(model, drift, rtol, atol, order, jets or 0, bar).run(*arguments)
         case RadauIIA(order, step, rtol, atol):
