@@ -132,7 +132,7 @@ def along_the_path():
     q0, p = start.values[:3], model.parameters
 
     def call():
-        nodes, _ = path.continuation(TIMES[[0, -1]], q0, p, T / 100, 1000)
+        nodes, _ = path.continuation(TIMES[[0, -1]], q0, p, T / 50, 1000)
         x, y, _ = path.newton(TIMES, nodes, p)
         return actuation.grid(TIMES, np.vstack([x, y[3:9]]), p)  # of q, q', q''
 

@@ -255,7 +255,7 @@ class _Path:
         for _ in range(CORRECTIONS + 1):
             y, delta, defect = self._at(t, x)
             first = defect if first is None else first
-            if defect <= CORRECTED:
+            if defect <= CORRECTED or (before <= QUADRATIC and CONTRACTION * before < defect < np.inf):  # or rounding
                 break
             if not np.isfinite(defect) or defect > factor * before:
                 return None, first

@@ -9,7 +9,7 @@ CORRECTED = 1e-13  # a Newton correction this small relative to 1 + |x| ends the
 ROUNDING = 2.0**-52  # a Newton correction this small relative to 1 + |x| cannot be reduced by another
 QUADRATIC = 1e-8  # a Newton correction this small leaves an error of the order of rounding
 CONTRACTION = 0.25  # largest ratio of two Newton corrections at one instant: another solution is four times as far away
-FOLLOWED = 0.01  # largest error of a step's prediction, relative to the way of the step
+FOLLOWED = 0.02  # largest error of a step's prediction, relative to the way of the step
 STEADY = 0.25  # smallest ratio of a pivot to itself in a step: none is jumped over, none loses its digits in one step
 SHORTEST = 2.0**-32  # of the longest step: the path ends where a shorter one would be needed
 

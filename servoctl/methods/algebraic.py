@@ -9,7 +9,7 @@ import numpy as np
 from servoctl.methods.monitor import Fine, Repivot, Stretch
 from servoctl.methods.motion import Stepping, breakpoints, interruptible
 
-STEPS = 100  # at least, in a span: shorter movements between two rests are overlooked where there are no samples
+STEPS = 50  # at least, in a span: shorter movements between two rests are overlooked where there are no samples
 NODES = 1000  # steps per call of the loop: 0.3 ms compiled, 50 ms where CasADi evaluates
 INSTANTS = 4000  # samples per call of the loop: 0.2 ms compiled, 0.2 s where CasADi evaluates
 
@@ -88,7 +88,8 @@ class _Algebraic(Stepping):
         outcome = self.monitor.inspect(Stretch(t, states, pivots[:, 1:, None], self._top))
         last = self._resumption(t, outcome.steps) if isinstance(outcome, Repivot) else outcome.steps
         self._sample(nodes[: last + 1], states[:, last], t[last] == cuts[-1])
-        self.progress(t[last])
+        if self.motion.stop is None:
+            self.progress(t[last])
         if self.motion.stop is None and not isinstance(outcome, Fine):
             self._follow(outcome)
         elif self.motion.stop is None and len(nodes) < NODES and t[last] != cuts[-1]:
@@ -113,3 +114,5 @@ class _Algebraic(Stepping):
             self.motion.add(self.model, block[:solved], state, top)
             if solved < len(block):
                 return self._fail(block[solved], x, "Newton's method finds no solution of the program there")
+            if solved:
+                self.progress(block[-1])

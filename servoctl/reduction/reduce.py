@@ -321,7 +321,8 @@ def _context(mechanism, switches, guess, near, values):
     values = mechanism.parameters.values() if values is None else np.asarray(values, dtype=float)
     if near is not None:
         t, guess, sizes = near
-        return Context(mechanism.parameters.symbols, values, (t - NEARBY, t + NEARBY), guess, NEAR_SPREAD, sizes)
+        width = NEARBY * min(1.0, _time_scale(mechanism.q, guess))
+        return Context(mechanism.parameters.symbols, values, (t - width, t + width), guess, NEAR_SPREAD, sizes)
     times = switches.times(values)
     window = WINDOW
     if len(times) == 1:
@@ -330,3 +331,9 @@ def _context(mechanism, switches, guess, near, values):
         width = times[-1] - times[0]
         window = (times[0] + INSET * width, times[-1] - INSET * width)
     return Context(mechanism.parameters.symbols, values, window, guess or {})
+
+
+def _time_scale(q, jets):
+    """The time [s] in which a state changes by 1 + |q|: near a singularity a motion is quick."""
+    place, rate, second = (max((abs(jets.get(name, 0.0)) for name in q.jet_names(k)), default=0.0) for k in range(3))
+    return 1.0 / max(rate / (1.0 + place), np.sqrt(second / (1.0 + place)), TINY)

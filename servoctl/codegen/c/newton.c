@@ -29,8 +29,9 @@ static int correct(double t, double *x, const double *p, double factor, double *
         ++*count;
         defect = relative(x, y);
         if (!iteration) *first = defect;
-        if (defect <= CORRECTED) break;
-        if (!isfinite(defect) || defect > factor * before || iteration == CORRECTIONS) return 0;
+        if (!isfinite(defect)) return 0;
+        if (defect <= CORRECTED || (before <= QUADRATIC && defect > CONTRACTION * before)) break; /* or rounding */
+        if (defect > factor * before || iteration == CORRECTIONS) return 0;
         for (int64_t i = 0; i < NX; i++) x[i] += y[i];
     }
     if (defect <= ROUNDING) return 1;
@@ -183,8 +184,8 @@ static inline double wide_relative(const W *x, const W *y)
 /* The solutions at the eight times from t[k] on, each between the nodes a and b: as `point` predicts them, corrected
    together, by the first outputs alone until the correction is small. Returns 1 if all converge; then the logs hold
    them. */
-static int block(int64_t n, int64_t k, const double *t, const double *const *a, const double *const *b, const W *p,
-                 double *x_log, double *y_log, int64_t *count)
+static int block(int64_t n, int64_t k, const double *t, const double *const *a, const double *const *b, double allowed,
+                 const W *p, double *x_log, double *y_log, int64_t *count)
 {
     W x[NX + 1], y[NY + 1];
     const W now = w_load(t + k), start = gather(a, 0), h = gather(b, 0) - start;
@@ -195,13 +196,11 @@ static int block(int64_t n, int64_t k, const double *t, const double *const *a, 
     for (int64_t i = 0; i < NX; i++)
         x[i] = at_a * gather(a, 1 + i) + rate_a * gather(a, 1 + 2 * NX + i) + second_a * gather(a, 1 + 3 * NX + i)
              + at_b * gather(b, 1 + i) - rate_b * gather(b, 1 + 2 * NX + i) + second_b * gather(b, 1 + 3 * NX + i);
-    double before = INFINITY, largest = INFINITY;
-    for (int64_t l = 0; l < 8; l += a[l] == a[7] ? 8 : 1) largest = fmin(largest, tolerance(a[l] + 1, b[l] + 1));
-    for (double defect = INFINITY; !(defect <= QUADRATIC); before = CONTRACTION * defect) {
+    for (double defect = INFINITY, before = allowed; !(defect <= QUADRATIC); before = CONTRACTION * defect) {
         FN(wide_step)(now, x, p, y);
         *count += 8;
         defect = wide_relative(x, y);
-        if (!(defect <= fmin(before, largest))) return 0;
+        if (!(defect <= before)) return 0;
         for (int64_t i = 0; i < NX; i++) x[i] += y[i];
     }
     FN(wide)(now, x, p, y);
@@ -209,8 +208,7 @@ static int block(int64_t n, int64_t k, const double *t, const double *const *a, 
     if (!(wide_relative(x, y) <= CORRECTED)) return 0;
     for (int64_t i = NY - PIVOTS; i < NY; i++) {
         const W other = gather(a, 1 + NX + i), product = y[i] * other;
-        const W least = STEADY * w_fmax(y[i] * y[i], other * other);
-        for (int64_t l = 0; l < 8; l++) if (!(product[l] >= least[l])) return 0;
+        if (w_any(~((product >= STEADY * y[i] * y[i]) & (product >= STEADY * other * other)))) return 0;
     }
     for (int64_t i = 0; i < NX; i++) w_store(x_log + i * n + k, x[i]);
     for (int64_t i = 0; i < NY; i++) w_store(y_log + i * n + k, y[i]);
@@ -229,19 +227,24 @@ int64_t FN(newton)(int64_t n, const double *t, int64_t n_nodes, const double *no
     *count = 0;
 #ifdef WIDE
     W wide_p[NP + 1];
-    const double *from[8], *to[8];
+    const double *from[8] = {0}, *to[8];
+    double allowed = 0;
     for (int64_t i = 0; i < NP; i++) wide_p[i] = ALL(p[i]);
 #endif
     for (int64_t k = 0, alone = 0; k < n; k++) {
         while (a < final && (t[k] - a[NODE]) * direction > 0) a += NODE;
 #ifdef WIDE
         if (k >= alone && k + 8 <= n && direction != 0) {
+            if (from[7] != a) allowed = tolerance(a + 1, a + NODE + 1);
             for (int64_t l = 0; l < 8; l++) {
                 from[l] = l ? from[l - 1] : a;
-                while (from[l] < final && (t[k + l] - from[l][NODE]) * direction > 0) from[l] += NODE;
+                while (from[l] < final && (t[k + l] - from[l][NODE]) * direction > 0) {
+                    from[l] += NODE;
+                    allowed = fmin(allowed, tolerance(from[l] + 1, from[l] + NODE + 1));
+                }
                 to[l] = from[l] + NODE;
             }
-            if (block(n, k, t, from, to, wide_p, x_log, y_log, count)) {
+            if (block(n, k, t, from, to, allowed, wide_p, x_log, y_log, count)) {
                 k += 7;
                 continue;
             }
