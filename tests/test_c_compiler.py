@@ -25,7 +25,7 @@ def fresh(tmp_path, monkeypatch):
 
 def pendulum_with_loops():
     """Rates of a pendulum; as a Newton step they vanish at once where it hangs."""
-    return compiled(function(X2[1], -P1 * ca.sin(X2[0]), 0, 0), "hanging", ("rk", "newton"))
+    return compiled(function(X2[1], -P1 * ca.sin(X2[0]), 0, 0, 0, 0), "hanging", ("rk", "newton"))
 
 
 def new_process(monkeypatch):
@@ -46,7 +46,7 @@ def test_nothing_is_compiled_before_it_pays(fresh):
 
 @pytest.mark.parametrize("use", [lambda m: m.grid(0.0, np.zeros((2, GRID_POINTS + 1)), [1.0]),
                                  lambda m: m.rk(0.0, [0.0, 0.0], 0.1, 1, [1.0], RK4),
-                                 lambda m: m.newton(np.zeros(GRID_POINTS), [0.0, 0.0], [1.0])])
+                                 lambda m: m.newton(np.zeros(GRID_POINTS), np.zeros((1, 9)), [1.0])])
 def test_a_long_grid_a_long_path_or_an_integration_compiles_at_once(fresh, use):
     model = pendulum_with_loops()
     use(model)
@@ -56,9 +56,9 @@ def test_a_long_grid_a_long_path_or_an_integration_compiles_at_once(fresh, use):
 def test_a_short_path_is_solved_without_compiling(fresh):
     model = pendulum_with_loops()
     points = GRID_POINTS // SOLVED
-    model.newton(np.zeros(points), [0.0, 0.0], [1.0])
+    model.newton(np.zeros(points), np.zeros((1, 9)), [1.0])
     assert not fresh and model.backend == "casadi"
-    model.newton(np.zeros(1), [0.0, 0.0], [1.0])
+    model.newton(np.zeros(1), np.zeros((1, 9)), [1.0])
     assert len(fresh) == 1 and model.backend == "c"
 
 
