@@ -32,15 +32,23 @@ def writing(path, what, folder=False):
 
 def save(path, what, facts, arrays):
     """Write arrays and JSON-able facts as npz and return the path; a missing suffix is added."""
-    path = Path(path)
-    path = path if path.suffix == SUFFIX else path.with_name(path.name + SUFFIX)
+    path = _suffixed(path)
     with writing(path, what):
         np.savez_compressed(path, meta=np.array(json.dumps({"format": FORMAT, **facts})), **arrays)
     return path
 
 
+def _suffixed(path):
+    path = Path(path)
+    return path if path.suffix == SUFFIX else path.with_name(path.name + SUFFIX)
+
+
 def read(path, what, build):
-    """`build(facts, arrays)` of an archive; `ServoError` if the file is not one of this kind."""
+    """`build(facts, arrays)` of an archive; `ServoError` if the file is not one of this kind.
+
+    A missing suffix is added where there is no file without it.
+    """
+    path = Path(path) if Path(path).is_file() else _suffixed(path)
     try:
         with np.load(path, allow_pickle=False) as data:
             return build(json.loads(str(data["meta"])), data)

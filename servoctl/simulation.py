@@ -127,6 +127,7 @@ def simulate(
     finally:
         bar.close()
     run = _run(model, motion, method, drift, knots, (t0, x0, t1))
+    run = replace(run, start=_as_started(model, start, t0, x0 if motion.start is None else motion.start))
     if t_eval is not None and isinstance(method, RungeKutta):
         run = _resample(run, times)
     if motion.stop is not None:
@@ -226,14 +227,28 @@ def as_state(model, start, t0):
     return values
 
 
-def consistent_state(model, start, t):
-    """The state that a start gives, which must satisfy the invariants: nothing would lead the motion back to them."""
-    x = as_state(model, start, t)
+def _as_started(model, start, t, x):
+    """The state from which a motion was computed: `start`, or what the method has made of it."""
+    if isinstance(start, State) and np.array_equal(start.values, x):
+        return start
+    off = np.abs(_scaled_residuals(model, t, x)[2]).max(initial=0.0)
+    facts = {"held": start.held, "free": start.free} if isinstance(start, State) else {"held": (), "free": ()}
+    return State(float(t), np.array(x), tuple(model.state_names), residual=float(off), **facts)
+
+
+def _scaled_residuals(model, t, x):
+    """Names of the invariants, their values, and these relative to their gradients times the state."""
     names = [name for _, name in model.invariant_names()]
     y = model.function("invariants")(t, x, model.parameters)
     values, slopes = y[: len(names)], y[len(names) :].reshape(len(x), len(names)).T
     sizes = np.sqrt((slopes**2 * (1.0 + np.abs(x)) ** 2).sum(axis=1))
-    off = np.nan_to_num(np.abs(values) / np.where(sizes > 0, sizes, 1.0))
+    return names, values, np.nan_to_num(np.abs(values) / np.where(sizes > 0, sizes, 1.0))
+
+
+def consistent_state(model, start, t):
+    """The state that a start gives, which must satisfy the invariants: nothing would lead the motion back to them."""
+    x = as_state(model, start, t)
+    names, values, off = _scaled_residuals(model, t, x)
     if off.max(initial=0.0) > OFF:
         worst = int(np.argmax(off))
         raise InconsistentStart(
