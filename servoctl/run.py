@@ -18,8 +18,25 @@ AGREES = 1e-6  # relative: difference of a signal in a file from that of a model
 FACTS = ("method", "drift", "counters", "success", "status", "message", "knots", "jet_names")  # of a saved run
 
 
+class ByName:
+    """A value that has signals under its `names`: `list`, `len`, `in` and `dict` go by these."""
+
+    def keys(self) -> tuple[str, ...]:
+        """Names of all signals."""
+        return self.names
+
+    def __iter__(self):
+        return iter(self.names)
+
+    def __len__(self):
+        return len(self.names)
+
+    def __contains__(self, name):
+        return name in self.names
+
+
 @dataclass(frozen=True, eq=False)
-class Run(Value):
+class Run(ByName, Value):
     """A motion with its actuation and its residuals; made by `simulate`, `close` or `load`.
 
     `run["theta"]`, `run["dtheta"]`, `run["trolley"]` are (N,) arrays, SI. Time derivatives of an actuation, output or
@@ -58,9 +75,9 @@ class Run(Value):
     message: str = ""
     knots: tuple = ()
     variants: tuple = ()
-    start: State | None = None
     stored: dict = field(default_factory=dict, compare=False)
     stored_residual: dict = field(default_factory=dict, compare=False)
+    start: State | None = None
 
     def __eq__(self, other):
         if not super().__eq__(other):
@@ -80,19 +97,6 @@ class Run(Value):
     def names(self) -> tuple[str, ...]:
         """Names of all signals."""
         return tuple(dict.fromkeys([*self.jet_names, *self._groups, *self.stored]))
-
-    def keys(self) -> tuple[str, ...]:
-        """Names of all signals."""
-        return self.names
-
-    def __iter__(self):
-        return iter(self.names)
-
-    def __len__(self):
-        return len(self.names)
-
-    def __contains__(self, name):
-        return name in self.names
 
     def __getitem__(self, name: str) -> np.ndarray:
         if name in self.jet_names:
