@@ -307,8 +307,9 @@ class Run(ByName, Value):
             f"Run: {len(self.t)} samples, t = {self.t[0]:g} .. {self.t[-1]:g} s; {self.message}",
             f"  method {self.method}" + (f", drift: {self.drift}" if self.drift else ""),
             "  " + ", ".join(f"{name} {count}" for name, count in self.counters.items() if count),
-            "  largest residuals over all levels: " + ", ".join(f"{name} {worst[name]:.1e}" for name in shown),
         ]
+        if shown:
+            lines.append("  largest residuals over all levels: " + ", ".join(f"{n} {worst[n]:.1e}" for n in shown))
         if self.start is not None and self.model is not None and self.model.flat:
             q = (f"{name} = {self.start[name]:.4g}" for name in self.model.coordinate_names[:6])
             lines.insert(2, f"  branch of {', '.join(q)} at t = {self.start.t:g} s")

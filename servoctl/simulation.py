@@ -1,6 +1,6 @@
 """From a model and a start to a run."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -35,6 +35,8 @@ from servoctl.methods.sundials import SundialsSteps
 from servoctl.methods.taylor import TaylorSteps
 from servoctl.model.model import Model
 from servoctl.model.start import State
+from servoctl.plants.driven import driven
+from servoctl.plants.plant import Plant
 from servoctl.progress import Progress
 from servoctl.run import SAME_TIME, Run
 
@@ -45,25 +47,26 @@ OFF = 1e-5  # residual relative to its gradient times the state, above which a s
 
 
 def simulate(
-    model: Model,
-    start: State | ArrayLike,
+    model: Model | Plant,
+    start: State | ArrayLike | Mapping[str, float],
     t_span: Sequence[float],
     method: Method | str | None = None,
     *,
+    inputs: Mapping[str, object] | None = None,
     drift: Project | Poles | MinimalCoordinates | str | float | None = None,
     accuracy: float | None = None,
     t_eval: ArrayLike | None = None,
     progress: bool | Callable[[float], object] | None = None,
 ) -> Run:
-    """Simulate the motion that a program prescribes.
+    """Simulate the motion that a program prescribes, or that of a plant under inputs.
 
     Main arguments
 
     Parameters
     ----------
-    model : Model
-    start : State or (n_x,) array
-        From `model.start`.
+    model : Model or Plant
+    start : State, (n_x,) array or dict of str to float
+        From `model.start`; for a plant (q, γ'), also by name.
     t_span : (t0, t1)
         [s]; t1 < t0 runs backwards.
     method : Algebraic, Taylor, RadauIIA, RungeKutta, Adaptive, Sundials, or a short form, optional
@@ -81,6 +84,9 @@ def simulate(
 
     Other arguments
 
+    inputs : dict of str to float, SX or callable, optional
+        Of a plant, by actuator, default 0: numbers, expressions of `q.t` such as paths, or functions that give these
+        of `q.t`. They act at once, within the plant's limits of magnitude.
     t_eval : (N,) array, optional
         Times of the samples [s], within t_span. Default: 1001 instants and the knots; all steps of `RungeKutta`.
     progress : bool or callable, optional
@@ -103,6 +109,7 @@ def simulate(
     SpecificationError
         If method and drift do not go together, or a path is not smooth enough.
     """
+    model, start = _model_and_start(model, start, inputs)
     if accuracy is not None:
 
         def simulated(method, drift):
@@ -134,6 +141,22 @@ def simulate(
         motion.stop.run = run
         raise motion.stop
     return run
+
+
+def _model_and_start(model, start, inputs):
+    """The model of a plant under inputs, and its start as an array; a model and its start as they are."""
+    if isinstance(model, Plant):
+        return driven(model, inputs), start if isinstance(start, State) else model.state(start)
+    if not isinstance(model, Model) or inputs is not None:
+        given = f"a {type(model).__name__}" + (" and inputs" if inputs is not None else "")
+        raise SpecificationError(
+            f"simulate received {given}.",
+            "It takes a Model, whose program determines the inputs, or a Plant and its inputs.",
+            do="Write sv.simulate(sv.derive(mechanism, program), start, t_span), or "
+            "sv.simulate(sv.plant(mechanism), x0, t_span, inputs={...}).",
+            type=type(model).__name__,
+        )
+    return model, start
 
 
 def _motion(model, method, drift, span, x0, times, knots, bar):
