@@ -61,14 +61,11 @@ def moved(path, t_eval=None, elbow=1, span=(0.0, 3.0)):
     return sv.simulate(arm(path)[0], begin(path, elbow, span[0]), span, t_eval=t_eval)
 
 
-SAMPLES = [
-    [3.0], [0.0, 3.0], [1.7, 1.701, 3.0], np.linspace(0, 3, 51), np.linspace(0, 3, 1001),
-    np.append(np.arange(0, 3, 0.45), 3.0), np.append(np.arange(0, 3, 0.4), 3.0), np.append(np.arange(0, 3, 0.3), 3.0),
-]  # fmt: skip
+SAMPLES = [[3.0], [1.7, 1.701, 3.0], np.linspace(0, 3, 1001), *(np.append(np.arange(0, 3, h), 3.0) for h in (0.45, 0.3))]
+BRANCHES = [("spiral", 1), ("spiral", -1), ("circle", 1), ("beside", -1), ("near", 1), ("nearer", -1), ("knots", 1)]
 
 
-@pytest.mark.parametrize("elbow", [1, -1])
-@pytest.mark.parametrize("path", ["spiral", "circle", "beside", "near", "nearer", "knots"])
+@pytest.mark.parametrize(("path", "elbow"), BRANCHES)
 def test_samples_do_not_decide_the_branch(path, elbow):
     fine = np.linspace(0.0, 3.0, 13)
     end = angles(path, fine, elbow)[:, -1]

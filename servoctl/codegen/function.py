@@ -53,8 +53,9 @@ def compiled(f, name, loops=(), project=None, others=None, sizes=None):
     others : dict of str to casadi.Function, optional
         Further functions of the same form in the same library, called by `Compiled.native`.
     sizes : dict of str to int, optional
-        Constants of the loops. That of "newton": the number of "pivots" (default: 0). Those of "taylor": the numbers of coordinates "nq" and of quasi-velocities "n", the
-        order s̄ "top", the highest index of coefficients "last", and "plain" (1 if q' = γ', else 0).
+        Constants of the loops. That of "newton": the number of "pivots" (default: 0). Those of "taylor": the numbers
+        of coordinates "nq" and of quasi-velocities "n", the order s̄ "top", the highest index of coefficients "last",
+        and "plain" (1 if q' = γ', else 0).
 
     Returns
     -------

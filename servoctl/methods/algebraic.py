@@ -11,7 +11,7 @@ from servoctl.methods.motion import Stepping, breakpoints, interruptible
 
 STEPS = 50  # at least, in a span: shorter movements between two rests are overlooked where there are no samples
 NODES = 1000  # steps per call of the loop: 0.3 ms compiled, 50 ms where CasADi evaluates
-INSTANTS = 4000  # samples per call of the loop: 0.2 ms compiled, 0.2 s where CasADi evaluates
+BLOCK = 4000  # samples per call of the loop: 0.2 ms compiled, 0.2 s where CasADi evaluates
 
 
 def algebraic(model, span, x0, times, knots, progress):
@@ -49,7 +49,7 @@ class _Algebraic(Stepping):
         return self.f(t, x[: self.model.nq], self.p)
 
     def _split(self, q, y):
-        """State (q, γ'), γ'' and pivots from q and the outputs (δq, q', q'', pivots) or (δq, q', q'', γ', γ'', pivots)."""
+        """State (q, γ'), γ'' and pivots from q and the outputs of `Equations.path`."""
         nq, n = self.model.nq, self.model.n
         first = nq if self.model.reduction.mechanism.q.plain else 3 * nq
         velocity, top, pivots = np.split(y[first:], [n, 2 * n])
@@ -106,7 +106,7 @@ class _Algebraic(Stepping):
         """Solve at the pending instants up to the last node, whose state is x; at all of them if the motion ends."""
         count = len(self.pending) if ends else int(np.sum((self.pending - nodes[-1, 0]) * self.direction <= 0))
         now, self.pending = np.split(self.pending, [count])
-        for block in np.split(now, range(INSTANTS, count, INSTANTS)):
+        for block in np.split(now, range(BLOCK, count, BLOCK)):
             q, y, iterations = self.f.newton(block, nodes, self.p)
             self.motion.count(iterations=iterations)
             state, top, _ = self._split(q, y)

@@ -139,7 +139,15 @@ class Mechanism:
         return _restored, (self.q, self.parameters, content)
 
     def under(self, inputs, forces):
-        """The mechanism under inputs by actuator and further forces (n,), all expressions; inputs become outputs."""
+        """The mechanism without actuators, whose inputs are forces and outputs instead.
+
+        Parameters
+        ----------
+        inputs : dict of str to SX
+            By actuator.
+        forces : (n,) SX
+            Further generalised forces.
+        """
         driving = self.E @ ca.vertcat(*(inputs[name] for name in self.actuators)) if self.actuators else 0
         return Mechanism(
             self.q, self._gibbs, self.potential, None, self.parameters, kinetic=self._kinetic,
