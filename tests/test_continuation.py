@@ -13,7 +13,7 @@ from servoctl.codegen import loops
 from servoctl.codegen.function import compiled, compiling_at_once
 
 TIP = {  # paths of the tip of an arm with two links of length 1
-    "spiral": lambda t: (1.5 * ca.cos(np.pi * t), (1 + 0.1 * t) * ca.sin(np.pi * t)),
+    "spiral": lambda t: (1.5 * ca.cos(np.pi * t), 1.5 * (1 + 0.1 * t) * ca.sin(np.pi * t)),
     "circle": lambda t: (1.2 * ca.cos(2 * np.pi * t), 1.2 * ca.sin(2 * np.pi * t)),
     "beside": lambda t: (0.3 + 1.2 * ca.cos(2 * np.pi * t), 0.2 + 1.2 * ca.sin(2 * np.pi * t)),
     "near": lambda t: (0.02, 1.5 * ca.cos(2 * t)),
@@ -26,13 +26,13 @@ TIP = {  # paths of the tip of an arm with two links of length 1
 
 @cache
 def arm(path):
-    """Model of an arm, masses 1 kg at the middle of its first link and at its tip, and the path of the tip."""
+    """Model of an arm with two masses of 1 kg, at the middle of the first link and, heavy, at the tip; its tip's path."""
     q = sv.coordinates("a b")
     a, b = q
     middle = ca.vertcat(ca.cos(a), ca.sin(a)) / 2
     tip = 2 * middle + ca.vertcat(ca.cos(a + b), ca.sin(a + b))
     mechanism = sv.Mechanism(
-        q, gibbs=sv.particle(q, 1.0, middle) + sv.particle(q, 1.0, tip), potential=9.81 * (middle[1] + tip[1]),
+        q, gibbs=sv.particle(q, 1.0, middle) + sv.particle(q, 1.0, tip), potential=9.81 * tip[1],
         actuators={"u": a, "v": b},
     )  # fmt: skip
     x, y = (ca.SX(p) for p in TIP[path](q.t)) if path != "knots" else ca.vertsplit(TIP[path](q.t))
@@ -82,7 +82,7 @@ def test_the_arm_near_its_base_ends_on_its_own_elbow():
         assert run.counters["steps"] == moved("near", [3.0]).counters["steps"]
 
 
-@pytest.mark.parametrize("path", ["spiral", "beside", "nearer"])
+@pytest.mark.parametrize("path", ["spiral", "nearer"])
 def test_samples_are_output_only(path):
     """The same motion at other instants: the forces, too."""
     whole = moved(path, np.linspace(0, 3, 601))
@@ -103,7 +103,7 @@ def test_irregular_samples_are_those_of_the_closed_form():
         assert run["b"] == pytest.approx(2 * np.arccos(np.hypot(x, y) / 2), abs=1e-12)
 
 
-@pytest.mark.parametrize("path", ["spiral", "beside", "near"])
+@pytest.mark.parametrize("path", ["spiral", "near"])
 def test_backwards(path):
     forward = moved(path)
     model, state = forward.model, forward.state(3.0)
@@ -112,22 +112,32 @@ def test_backwards(path):
     assert state == pytest.approx(forward.jets[:4, -1], abs=1e-12)
 
 
-def test_no_sample_falls_on_the_zero_of_a_pivot():
+def torque(path, t, elbow, h=1e-3):
+    """The moment of the forces on both masses about the base; their accelerations by differences."""
+    x, y = np.array(arm(path)[1].map(5)(t + h * np.arange(-2.0, 3.0)[None]))
+    first = np.arctan2(y, x) - elbow * np.arccos(np.hypot(x, y) / 2)
+    second = np.array([-1.0, 16.0, -30.0, 16.0, -1.0]) / (12 * h**2)
+    masses = (x, y, 9.81), (np.cos(first) / 2, np.sin(first) / 2, 0.0)
+    return sum(x[2] * (y @ second + g) - y[2] * (x @ second) for x, y, g in masses)
+
+
+@pytest.mark.parametrize("elbow", [1, -1])
+def test_no_sample_falls_on_the_zero_of_a_pivot(elbow):
     """The tip crosses the axes at samples, where pivots of one choice vanish."""
-    run = moved("spiral", span=(0.0, 2.0))
+    run = moved("spiral", elbow=elbow, span=(0.0, 2.0))
     for name in ("u", "v"):
-        smooth = np.abs(np.diff(run[name], 3))
-        assert smooth.max() < 1e-3  # garbage at one sample would be 1 or more
-    at = np.flatnonzero(run.t == 1.0)[0]
-    for elbow, u in ((1, -18.63974), (-1, -16.05336)):  # Newton and Euler, with the accelerations by differences
-        assert moved("spiral", elbow=elbow, span=(0.0, 2.0))["u"][at] == pytest.approx(u, abs=1e-4)
+        assert np.abs(np.diff(run[name], 3)).max() < 1e-3  # garbage at one sample would be 1 or more
+    for t in (0.5, 1.0, 1.5):
+        assert run["u"][run.t == t] == pytest.approx([torque("spiral", t, elbow)], abs=1e-6)
+    if elbow > 0:
+        assert -12.56 < run["u"][run.t == 1.0] < -12.55
     assert sv.verify(run.model, run).passed
 
 
 def test_a_law_made_of_such_a_plan_holds_the_tip():
     run = moved("spiral", span=(0.0, 2.0))
     plant = sv.plant(run.model.reduction.mechanism)
-    for rate, most in ((1000, 5e-6), (100, 5e-4)):
+    for rate, most in ((1000, 1e-6), (100, 1e-4)):
         closed = sv.close(plant, sv.lqr(run, plant, rate=rate), run.state(0.0), (0.0, 2.0), plan=run)
         assert max(np.abs(values[0]).max() for values in closed.residual.values()) < most
 
