@@ -110,13 +110,13 @@ def simulate(
         If method and drift do not go together, or a path is not smooth enough.
     """
     model, start = _model_and_start(model, start, inputs)
+    span = t0, t1 = as_span(t_span)
     if accuracy is not None:
 
-        def simulated(method, drift):
-            return simulate(model, start, t_span, method, drift=drift, t_eval=t_eval, progress=progress)
+        def simulated(method, drift, t_span=span, times=t_eval):
+            return simulate(model, start, t_span, method, drift=drift, t_eval=times, progress=progress)
 
-        return accurate(simulated, model, accuracy, method, drift)
-    span = t0, t1 = as_span(t_span)
+        return accurate(simulated, model, accuracy, (t0, as_state(model, start, t0), t1), method, drift)
     method = default_method(model) if method is None else as_method(method)
     drift = as_drift(drift)
     require_combination(model, method, drift)

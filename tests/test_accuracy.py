@@ -132,13 +132,13 @@ def test_where_rounding_hides_the_motion_the_accuracy_is_refused(gallery_model):
     start = model.start(guess=scene.guess, **scene.start)
     random, asked = np.random.default_rng(3), []
 
-    def spoilt(method, drift):
+    def spoilt(method, drift, *_):
         asked.append(method.rtol)
         run = sv.simulate(model, start, (0.0, 0.5), method, drift=drift, t_eval=[0.0, 0.5])
         return replace(run, jets=run.jets * (1.0 + 1e-6 * random.standard_normal(run.jets.shape)))
 
     with refused(LimitExceeded, accuracy=1e-9) as error:
-        rule.accurate(spoilt, model, 1e-9)
+        rule.accurate(spoilt, model, 1e-9, (0.0, start.values, 0.5))
     assert asked == sorted(asked, reverse=True) and asked[-1] == rule.FINEST and len(set(asked)) == len(asked)
     assert 1e-8 < error.value.details["reached"] < 1e-5 and error.value.run is not None
 
@@ -170,3 +170,46 @@ def test_a_motion_is_never_compared_with_itself(accuracy):
     assert caught.value.details["growth"] > 1e10
     run = sv.simulate(model, start, (0.0, 2.0), accuracy=accuracy)
     assert run.success and np.abs(run["y"] - 0.9 * np.sin(run.t)).max() < accuracy
+
+
+def damped(damping, stiffness):
+    """A mass on a spring and a damper on a driven cart: y'' + d y' + k y = -x'', x = sin 2t, linear with constants."""
+    q = sv.coordinates("x y")
+    (x, y), (ddx, ddy), dy = q, q.d(2), q.d(1)[1]
+    mechanism = sv.Mechanism(
+        q, gibbs=(ddx**2 + (ddx + ddy) ** 2) / 2, potential=stiffness * y**2 / 2, forces={"y": -damping * dy},
+        actuators={"F": x},
+    )  # fmt: skip
+    return sv.derive(mechanism, sv.Program({"x": x - ca.sin(2 * q.t)}))
+
+
+def elongation(t, damping, stiffness, y0):
+    """The closed form of y from y(0) = y0 at rest."""
+    roots = np.roots([1.0, damping, stiffness]).astype(complex)
+    forced = 4.0 / ((2j) ** 2 + damping * 2j + stiffness)  # of 4 exp(2it), whose imaginary part is the force
+    first = np.array([y0 - forced.imag, -(2j * forced).imag])
+    free = np.linalg.solve(np.vstack([np.ones(2), roots]), first)
+    return (np.exp(np.outer(t, roots)) @ free).real + (forced * np.exp(2j * t)).imag
+
+
+@pytest.mark.parametrize(
+    "damping, stiffness, end, method",
+    [
+        (1e3, 1.0, 10.0, "RadauIIA"),
+        (1e5, 1e3, 10.0, "RadauIIA"),
+        (3e3, 1e6, 10.0, "RadauIIA"),
+        (0.1, 1.0, 10.0, "Taylor"),
+        (0.0, 1e4, 10.0, "Taylor"),
+        (3.0, 1e6, 2.0, "Taylor"),
+        (10.0, 1.0, 100.0, "Taylor"),
+    ],
+)
+def test_stiff_motions_are_integrated_implicitly(damping, stiffness, end, method):
+    model = damped(damping, stiffness)
+    run = sv.simulate(model, model.start(y=0.1, dy=0.0), (0.0, end), accuracy=1e-8)
+    assert run.method == method
+    expected = elongation(run.t, damping, stiffness, 0.1)
+    assert np.abs(run["y"] - expected).max() <= 1e-8 * np.abs(expected).max()
+    if method == "RadauIIA":
+        explicit = sv.simulate(model, run.state(0.0), (0.0, end), sv.Taylor(rtol=1e-9, atol=1e-9), drift="project")
+        assert explicit.counters["steps"] > 10 * run.counters["steps"]

@@ -92,6 +92,37 @@ def test_exponentials_are_those_of_scipy():
         assert found == pytest.approx(wanted, rel=1e-11, abs=1e-12 * np.abs(wanted).max())
 
 
+def held_spring(stiffness, damping, mass, period):
+    """[A B; 0 0] Ts of a mass on a spring, driven by a held force."""
+    return period * np.array([[0.0, 1.0, 0.0], [-stiffness / mass, -damping / mass, 1 / mass], [0.0, 0.0, 0.0]])
+
+
+@pytest.mark.parametrize(
+    "stiffness, damping, mass, period",
+    [
+        (1e9, 0.0, 1.0, 1e-2),
+        (1e9, 1e2, 1.0, 1e-2),
+        (1e10, 0.0, 1.0, 1e-2),
+        (1e6, 0.0, 1e-3, 1e-2),
+        (1e3, 1e8, 1.0, 1e-2),
+        (2e8, 2e8, 1.0, 1e-1),
+        (-1e4, 0.0, 1.0, 1e-2),
+        (1e7, 0.0, 1e9, 1.0),
+        (1e4, 1e-2, 1e-9, 1e-5),
+    ],
+)
+def test_exponentials_of_stiff_springs_are_exact_in_every_entry(stiffness, damping, mass, period):
+    """Against 80 digits; norms up to 1e8, of which most is the difference between m and m/s."""
+    mpmath = pytest.importorskip("mpmath")
+    matrix = held_spring(stiffness, damping, mass, period)
+    with mpmath.workdps(80):
+        wanted = np.array(mpmath.expm(mpmath.matrix(matrix.tolist()), method="taylor").tolist()).astype(float)
+    units = np.array([1.0, max(1.0, np.sqrt(abs(stiffness) / mass)), 1.0])
+    rounding = 1e-16 * units[:, None] / units  # of entries that decay to nothing beside those of order one
+    for found in exponentials(np.stack([matrix, np.zeros((3, 3)), matrix]))[::2]:
+        assert (np.abs(found - wanted) <= 1e-12 * np.abs(wanted) + rounding).all()
+
+
 def at_sample(plan, plant, k, rate=100.0):
     reference = Reference(plan, plant, rate)
     A, B = discretised(*reference.linearised(), 1 / rate)

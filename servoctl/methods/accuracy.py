@@ -2,8 +2,9 @@
 
 If something is left to integrate, the Taylor method needs the fewest evaluations at every accuracy and finds its own
 steps; projection keeps its invariants at rounding (docs/work_precision.md; on some scenes a fixed-step method is faster
-once its step is known). A tolerance bounds the error of a step, not of the motion. Therefore the motion is computed
-with two tolerances, and their difference is the error.
+once its step is known). Where stability limits its steps, the motion is stiff, and Radau IIA is faster. A tolerance
+bounds the error of a step, not of the motion. Therefore the motion is computed with two tolerances, and their
+difference is the error.
 """
 
 from dataclasses import replace
@@ -13,13 +14,16 @@ import numpy as np
 
 from servoctl.checks import is_number
 from servoctl.errors import LimitExceeded, SpecificationError
-from servoctl.methods.choice import Algebraic, Project, Taylor
+from servoctl.methods.choice import Algebraic, Project, RadauIIA, Taylor
 from servoctl.methods.taylor import order_for
 
 SMALLEST_SIZE = 1e-3  # of a component relative to the largest of its level; a zero component has only rounding
 MARGIN, FINER = 0.1, 1e-2  # first tolerance relative to the accuracy, and each next one relative to the last
 FINEST = 1e-15  # tolerance below which steps shorten and rounding grows
 SAME = 1.0 + 1e-9  # tolerances within this factor are one and the same, up to the rounding of their decades
+FIRST_STEPS = 40  # longest stable steps of the part of a motion on which it is decided whether the motion is stiff
+STIFF_STEPS = 150  # longest stable steps in the span that make an implicit method worth compiling
+LIMITED = 1.2  # times the longest stable steps: more of them are taken where accuracy limits them, not stability
 COARSEST_ACCURACY, FINEST_ACCURACY = 1e-1, 1e-13  # accuracies that make sense in double precision
 
 
@@ -87,7 +91,34 @@ def method_for(model, accuracy, jets=None):
     return Taylor(order_for(rtol), jets, rtol, rtol)
 
 
-def accurate(simulated, model, accuracy, method=None, drift=None):
+def is_stiff(simulated, model, method, t0, x0, t1):
+    """Whether stability, not accuracy, limits the steps of a series, decided on the first steps of a motion.
+
+    The series of order p damps a mode of rate λ on the negative real axis for steps up to about p/(e |λ|).
+
+    Parameters
+    ----------
+    simulated : callable
+        Run from a method, a treatment of drift, a span and the times of the samples.
+    model : Model
+    method : Taylor
+    t0, x0, t1 : float, (n_x,) array, float
+        Span [s] and start.
+    """
+    n_x, length = len(x0), t1 - t0
+    jacobian = model.function("ode_jacobian")(t0, x0, model.parameters).reshape(n_x, n_x)
+    if not np.isfinite(jacobian).all():
+        return False
+    decay = np.linalg.eigvals(jacobian * np.sign(length))
+    fastest = -decay.real[np.abs(decay.imag) < -decay.real].min(initial=0.0)
+    if fastest * abs(length) * np.e < STIFF_STEPS * method.order:
+        return False
+    end = t0 + np.sign(length) * FIRST_STEPS * method.order / (np.e * fastest)
+    first = simulated(method, Project(), (t0, end), [end])
+    return first.success and first.counters["steps"] < LIMITED * FIRST_STEPS
+
+
+def accurate(simulated, model, accuracy, start, method=None, drift=None):
     """The motion with an error of at most `accuracy`.
 
     A flat program is solved to rounding at each instant. Otherwise the tolerance is lowered until two successive
@@ -96,10 +127,12 @@ def accurate(simulated, model, accuracy, method=None, drift=None):
     Parameters
     ----------
     simulated : callable
-        Run from a method and a treatment of drift.
+        Run from a method and a treatment of drift, and optionally another span and times of samples.
     model : Model
     accuracy : float
         See `motion_error`.
+    start : (t0, x0, t1)
+        Span [s] and state (n_x,) at t0.
     method : None or Taylor
         `Taylor(jets=...)` sets the jets; order and tolerances follow from the accuracy.
     drift : None
@@ -121,6 +154,8 @@ def accurate(simulated, model, accuracy, method=None, drift=None):
     method = method_for(model, accuracy, jets)
     if isinstance(method, Algebraic):
         return simulated(method, None)
+    if jets is None and is_stiff(simulated, model, method, *start):
+        method = RadauIIA(rtol=method.rtol, atol=method.atol)
     run = simulated(method, Project())
     if not run.success:
         return run
@@ -136,6 +171,10 @@ def accurate(simulated, model, accuracy, method=None, drift=None):
         if difference <= accuracy:
             return replace(finer, message=f"finished; two tolerances agree to {difference:.1e}")
         best, run = min(best, difference), finer
+    raise _out_of_reach(accuracy, best, growth, run)
+
+
+def _out_of_reach(accuracy, best, growth, run):
     nearest = f"accuracy={2 * best:.1g}: two tolerances agree to {best:.1e}."
     error = LimitExceeded(
         f"accuracy={accuracy:g} was given; the errors of steps grow by about {growth:.1e} along the motion.",
@@ -147,7 +186,7 @@ def accurate(simulated, model, accuracy, method=None, drift=None):
         growth=growth,
     )
     error.run = run
-    raise error
+    return error
 
 
 def require_accuracy(accuracy):

@@ -1,5 +1,6 @@
 """The mechanism: its balance r = ∂S/∂γ'' - Γ, its actuators and its material constraints."""
 
+import itertools
 import json
 from functools import cached_property, lru_cache
 
@@ -41,7 +42,9 @@ class Mechanism:
     kinetic : SX, optional
         Kinetic energy T(q, γ') [J], for Lagrange's equations. With `gibbs` as well, both must give the same balance.
     balance : (n,) SX, optional
-        The balance itself, r(t, q, γ', γ''), without `forces` and `potential`: inverse dynamics from elsewhere.
+        The balance itself, r(t, q, γ', γ''), without `forces` and `potential`: inverse dynamics from elsewhere. Its
+        mass matrix is symmetric. What is left of it at rest, r(t, q, 0, 0), such as gravity, counts as forces -r;
+        energy includes gravity only as `potential`.
     forces : dict of str to SX, or (n,) SX, optional
         Generalised forces by coordinate (or quasi-velocity) name.
     constraints : dict of str to SX, optional
@@ -53,7 +56,7 @@ class Mechanism:
     ------
     SpecificationError
         If an expression names a symbol that is no coordinate, parameter or t; if S is not quadratic in γ''; if S
-        and T disagree; if there is nothing to take the balance from.
+        and T disagree; if there is nothing to take the balance from; if the mass matrix of `balance` is not symmetric.
     NameUnknown
         If a force names no coordinate.
     """
@@ -92,7 +95,7 @@ class Mechanism:
         self._kinetic = None if kinetic is None else self._known(kinetic, "the kinetic energy")
         self._inverse_dynamics = None if balance is None else self._known(balance, "the balance", q.n)
         self.potential = ca.SX(0) if potential is None else self._known(potential, "the potential")
-        self.forces = self._forces(forces)
+        self._applied = self.forces = self._forces(forces)
         self.actuators = tuple(mapping(actuators, "The actuators"))
         self.E = self._directions(actuators or {})
         self.constraints = self._named(constraints, "constraint")
@@ -100,6 +103,8 @@ class Mechanism:
         self._refuse_orders()
         self._refuse_names()
         self._check_balance()
+        if self._inverse_dynamics is not None:
+            self.forces = self._applied - self._static_forces()
 
     def __repr__(self):
         lines = [f"Mechanism: {' '.join(self.q.names)}"]
@@ -164,7 +169,7 @@ class Mechanism:
             inertial = ca.gradient(self._gibbs, ca.vertcat(*self.q.gamma(2)))
         else:
             inertial = self._lagrange()
-        return ca.cse(inertial - self.forces + self.q.V.T @ ca.gradient(self.potential, ca.vertcat(*self.q)))
+        return ca.cse(inertial - self._applied + self.q.V.T @ ca.gradient(self.potential, ca.vertcat(*self.q)))
 
     @cached_property
     def mass(self):
@@ -214,6 +219,7 @@ class Mechanism:
                 do="Build S by sv.particle and sv.rigid_body, or check the powers of the second derivatives.",
                 source="balance" if self._gibbs is None else "gibbs",
             )  # fmt: skip
+        self._refuse_asymmetry()
         if self._gibbs is not None and self._kinetic is not None:
             difference = ca.gradient(self._gibbs, acceleration) - self._lagrange()
             components = zip(self.q.jet_names(2), difference.elements(), strict=True)
@@ -225,6 +231,27 @@ class Mechanism:
                     do="Correct one of them, or remove it.",
                     components=different,
                 )
+
+    def _refuse_asymmetry(self):
+        """Refuse a given balance whose mass matrix is not symmetric."""
+        if self._inverse_dynamics is None:
+            return
+        names = self.q.jet_names(2)
+        for i, j in itertools.combinations(range(self.q.n), 2):
+            if not self.is_zero([self.mass[i, j] - self.mass[j, i]]):
+                raise SpecificationError(
+                    f"The balance has {names[j]} in row {i} and {names[i]} in row {j} with different factors.",
+                    "The mass matrix ∂r/∂γ'' is symmetric where the rows are generalised forces of the coordinates; "
+                    "kinetic energy and ideal reactions need it.",
+                    do="Undo combinations of rows, such as a partial linearisation, or pass gibbs= or kinetic=.",
+                    components=[names[i], names[j]],
+                )
+
+    def _static_forces(self):
+        """What a given balance is at rest, such as gravity, (n,) SX; the rest is inertia and has a kinetic energy."""
+        motion = ca.vertcat(*self.q.gamma(1), *self.q.gamma(2))
+        static = ca.substitute(self._inverse_dynamics, motion, ca.SX.zeros(motion.numel()))
+        return ca.SX.zeros(self.q.n) if self.is_zero(static.elements()) else ca.cse(static)
 
     def _refuse_nonholonomic_frame(self):
         """Refuse a kinetic energy in quasi-velocities if brackets of the columns of V lie outside their span."""

@@ -32,7 +32,8 @@ from servoctl.study.table import SHOWN, Study, machine, table
 MEASURED = tuple(name for name in METHODS if name not in ("RK1", "RK2", "RK23"))  # which need too many steps
 TOLERANCES = (1e-3, 1e-5, 1e-7, 1e-9, 1e-11, 1e-13)
 STEP_COUNTS = tuple(5 * 4**k for k in range(7))  # steps of a fixed length in the span
-INSTANTS, COMPARED = 51, 201  # samples of adaptive methods; at most so many samples of any run are compared
+INSTANTS = 51  # samples of adaptive methods while they are timed
+COMPARED, BETWEEN = 400, 0.382  # instants at which motions are compared, and where in its interval each lies
 DENSE = 1001  # instants of the reference over which its power is integrated
 TIMED, ENOUGH = 3, 0.3  # calls timed after a warm-up, fewer where they take this part of `seconds` together
 FEW = 20  # steps: a run that takes too long for fewer has diverged, and says nothing about finer settings
@@ -56,14 +57,15 @@ class TradeOff(Study):
     """Errors and costs of methods, settings and treatments of drift on one motion; made by `tradeoff`.
 
     Columns: method; drift ("none", "project", "minimal", or the time constant of the poles in s); setting ("rtol" or
-    "step") and its value; error of the motion: the largest deviation from the reference over all instants and
-    components of the state, each relative to its largest magnitude (at least 1e-3 of the largest of its level);
-    actuation: the same for the required forces and moments; residual: the largest of any constraint at any level, in
-    its unit; energy: energy gained less the work done along the reference, relative to the largest energy; power:
-    dE/dt less the power of all forces, relative (NaN where it does not apply); evaluations of the right-hand side, or
-    of the series, or Newton steps; steps; seconds: the shortest call after a warm-up, with 51 samples for adaptive
-    methods (more samples take longer), and one at each instant or step for the others; resolved: whether the error
-    exceeds the uncertainty of the reference; failure: why there are no numbers.
+    "step") and its value; error of the motion: the largest deviation from the reference over the components of the
+    state, each relative to its largest magnitude (at least 1e-3 of the largest of its level), and over 402 instants
+    that are the same for all methods: dense output counts, and Hermite interpolation between the steps of fixed-step
+    methods; actuation: the same for the required forces and moments; residual: the largest of any constraint at any
+    level at these instants, in its unit; energy: energy gained less the work done along the reference, relative to
+    the largest energy; power: dE/dt less the power of all forces, relative (NaN where it does not apply); evaluations
+    of the right-hand side, or of the series, or Newton steps; steps; seconds: the shortest call after a warm-up, with
+    51 samples for adaptive methods (more samples take longer), and one at each instant or step for the others;
+    resolved: whether the error exceeds the uncertainty of the reference; failure: why there are no numbers.
     """
 
     COLUMNS = (
@@ -224,7 +226,8 @@ def tradeoff(
     t_span : (t0, t1)
         [s]
     methods : sequence of str, optional
-        Names of methods as in `simulate`; default: all but "RK1", "RK2" and "RK23".
+        Names of methods as in `simulate`; default: "algebraic" where the program determines the motion completely, so
+        that nothing is integrated, else all but "RK1", "RK2" and "RK23".
     drift : sequence, optional
         Treatments as in `simulate`; default: None, "project", "minimal" and poles at -50/(t1 - t0).
 
@@ -289,7 +292,10 @@ class Reference:
         consistent_state(model, x0, t_span[0])
         self.model, self.start, self.span, self._runs = model, x0, t_span, {}
         self.knots = [k for k in model.require_smooth((min(t_span), max(t_span))) if min(t_span) < k < max(t_span)]
-        self.times = np.union1d(np.linspace(*t_span, INSTANTS), self.knots)
+        t0, t1 = t_span
+        self.few = np.union1d(np.linspace(t0, t1, INSTANTS), self.knots)
+        between = t0 + (t1 - t0) * (np.arange(COMPARED) + BETWEEN) / COMPARED
+        self.times = np.unique([t0, *between, t1, *self.knots])
         checks = [Adaptive("DOP853", 3e-14, 1e-15), Taylor(12, rtol=1e-14, atol=1e-14)]
         self.method, self.drift = Taylor(16, rtol=1e-15, atol=1e-15), Project()
         if model.flat:
@@ -380,24 +386,24 @@ def _ladder(reference, method, treatment, settings, seconds):
 def _errors_and_cost(reference, name, treatment, value, seconds):
     """Errors, counts and time of one setting."""
     model, (t0, t1) = reference.model, reference.span
-    method, times = method_at(name, value), reference.times
+    method, times = method_at(name, value), reference.few
     if isinstance(method, Algebraic):
         times = np.union1d(np.linspace(t0, t1, 1 + round(abs(t1 - t0) / value)), reference.knots)
     elif isinstance(method, RungeKutta):
         times = None
 
-    def once():
+    def at(times):
         options = {"drift": treatment, "t_eval": times, "progress": Deadline(seconds)}
         return _whole(simulate(model, reference.start, reference.span, method, **options))
 
-    run, timed = once(), []
+    run, timed = at(times), []
     for _ in range(TIMED):
         since = time.perf_counter()
-        once()
+        at(times)
         timed.append(time.perf_counter() - since)
         if sum(timed) > ENOUGH * seconds:
             break
-    return _errors(reference, run) | {
+    return _errors(reference, at(reference.times)) | {
         "evaluations": run.counters.get("nfev", run.counters.get("iterations", 0)),
         "steps": run.counters.get("steps", len(run.t)),
         "seconds": min(timed),
@@ -405,17 +411,17 @@ def _errors_and_cost(reference, name, treatment, value, seconds):
 
 
 def _errors(reference, run):
-    some = np.unique(np.linspace(0, len(run.t) - 1, COMPARED).round().astype(int))
-    exact = reference.at(np.sort(run.t[some]))
-    error = motion_error(reference.model, run.jets[:, some], exact.jets)
+    """Errors of a run at the times of the reference."""
+    exact = reference.at(reference.times)
+    error = motion_error(reference.model, run.jets, exact.jets)
     rate, work, size, law = run.signals("power")[1]
     largest = max(np.abs(size).max(), np.abs(rate).max(), 1e-300)
     lawful = np.abs(law).max() < 1e-9 * largest
-    energy, exact_energy = run["energy"][some], exact["energy"]
+    energy, exact_energy = run["energy"], exact["energy"]
     drifted = np.abs((energy - energy[0]) - (exact_energy - exact_energy[0])).max()
     return {
         "error": error,
-        "actuation": relative_error(actuation(run)[:, some], actuation(exact)),
+        "actuation": relative_error(actuation(run), actuation(exact)),
         "residual": max((float(np.abs(levels).max(initial=0.0)) for levels in run.residual.values()), default=0.0),
         "energy": float(drifted / max(np.abs(exact_energy).max(), 1e-300)),
         "power": float(np.abs(rate - work).max() / largest) if lawful else np.nan,
@@ -443,9 +449,9 @@ def _energy_balance(run, knots):
 
 
 def _combinations(model, methods, drifts):
-    """Pairs of method and treatment; "algebraic" has no treatment, and is a default only for flat programs."""
+    """Pairs of method and treatment; "algebraic", which has no treatment, is the default for flat programs."""
     if methods is None:
-        methods = MEASURED if model.flat else [name for name in MEASURED if name != "algebraic"]
+        methods = ["algebraic"] if model.flat else [name for name in MEASURED if name != "algebraic"]
     methods = list(methods) if isinstance(methods, (list, tuple)) else [methods]
     for method in methods:
         if not (isinstance(method, str) and method in METHODS):
