@@ -434,7 +434,7 @@ def _of_model(run, facts, model):
 
 def _agree(values, others):
     """Whether signals agree; below 1 in size up to the same difference, as residuals are rounding errors."""
-    size = np.maximum(1.0, np.nanmax(np.abs(values), initial=0.0))
+    size = np.abs(values[np.isfinite(values)]).max(initial=1.0)
     return np.allclose(values, others, rtol=0.0, atol=AGREES * size, equal_nan=True)
 
 
