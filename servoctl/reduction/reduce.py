@@ -130,7 +130,7 @@ class Reduction:
     def actuation(self):
         """Required actuation u (m,) SX, or for an ideal program the reaction of the program, (n,) SX."""
         k = len(self.program.residuals)
-        multipliers = ca.vertcat(*self.multipliers.elements()[:k])
+        multipliers = self.multipliers[:k] if k else ca.SX(0, 1)
         if self.program.by == "actuators":
             return ca.cse(self.realisation.actuation @ multipliers)
         return ca.cse(self.realisation.B[:, :k] @ multipliers)
