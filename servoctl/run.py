@@ -15,7 +15,10 @@ STENCIL = 9  # samples of the polynomial through which an extremum is refined: e
 AS_SAMPLED = 1e-14  # relative: a refined extremum must exceed the sampled one by this
 SAME_TIME = 1e-12  # relative: rounding of an instant
 AGREES = 1e-6  # relative: difference of a signal in a file from that of a model, below which the run is of this model
-FACTS = ("method", "drift", "counters", "success", "status", "message", "knots", "jet_names")  # of a saved run
+FACTS = {
+    "method": str, "drift": str, "counters": dict, "success": bool, "status": int, "message": str, "knots": list,
+    "jet_names": list,
+}  # of a saved run
 
 
 class ByName:
@@ -396,15 +399,20 @@ def _facts_of_model(run):
 
 
 def _from_archive(facts, arrays):
-    signals = {name: arrays[f"signal_{i}"] for i, name in enumerate(facts["signals"])}
-    residuals = {name: arrays[f"residual_{i}"] for i, name in enumerate(facts["residuals"])}
+    for name, kind in FACTS.items():
+        archive.require(type(facts[name]) is kind, f"its {name} is {facts[name]!r}")
+    t = archive.numbers(arrays, "t", None)
+    archive.require(np.isfinite(t).all() and abs(np.sign(np.diff(t)).sum()) == len(t) - 1, "its times are in no order")
+    jets = archive.numbers(arrays, "jets", len(archive.named(facts["jet_names"])), len(t))
+    names, rows = archive.named(facts["signals"]), archive.named(facts["residuals"])
+    signals = {name: archive.numbers(arrays, f"signal_{i}", len(t)) for i, name in enumerate(names)}
+    residuals = {name: archive.numbers(arrays, f"residual_{i}", None, len(t)) for i, name in enumerate(rows)}
     start = facts.get("start")
     if start is not None:
         values, lists = start["values"], {name: tuple(start[name]) for name in ("held", "free")}
         start = State(start["t"], np.array([*values.values()]), tuple(values), residual=start["residual"], **lists)
-    own = {name: tuple(facts[name]) if isinstance(facts[name], list) else facts[name] for name in FACTS}
-    run = Run(arrays["t"], arrays["jets"], stored=signals, stored_residual=residuals, start=start, **own)
-    return run, facts
+    own = {name: tuple(facts[name]) if kind is list else facts[name] for name, kind in FACTS.items()}
+    return Run(t, jets, stored=signals, stored_residual=residuals, start=start, **own), facts
 
 
 def _of_model(run, facts, model):

@@ -10,7 +10,7 @@ from test_compiled_functions import T, function
 
 import servoctl as sv
 from servoctl.codegen import loops
-from servoctl.codegen.function import compiled, compiling_at_once
+from servoctl.codegen.function import compiled
 
 TIP = {  # paths of the tip of an arm with two links of length 1
     "spiral": lambda t: (1.5 * ca.cos(np.pi * t), 1.5 * (1 + 0.1 * t) * ca.sin(np.pi * t)),
@@ -96,9 +96,6 @@ def test_irregular_samples_are_those_of_the_closed_form():
     t = np.sort(np.random.default_rng(3).uniform(0.0, 3.0, 700))
     for path in ("spiral", "near"):
         run = moved(path, t)
-        with compiling_at_once():
-            again = moved(path, t)
-        assert again.jets == pytest.approx(run.jets, rel=1e-10, abs=1e-10)
         x, y = np.array(arm(path)[1].map(len(t))(t[None]))
         assert run["b"] == pytest.approx(2 * np.arccos(np.hypot(x, y) / 2), abs=1e-12)
 

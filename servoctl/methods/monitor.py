@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from servoctl.errors import IntegrationStopped, ServoError, SingularProgram
+from servoctl.model.report import explain
 from servoctl.reduction.ranks import column_sizes
 
 DEGRADED = 0.02  # of its reference: a pivot below this is replaced, if the matrix itself is better than that
@@ -445,12 +446,17 @@ class Monitor:
         direction = self._null_direction(matrices)
         where = f", where {' and '.join(f'{name} = 0' for name in zero)}" if zero else ""
         dependent = [] if lost else self._dependent_rows(matrices[0])
+        facts = {"measure": measure, "rows": lost or dependent, "direction": direction}
+        at_zero = np.where([name in zero for name in self.model.state_names], 0.0, x)
+        explained = explain(self.model, t, at_zero, lost, **facts)
+        if explained is not None:
+            return explained
         what = f"the gradient of row {', '.join(map(repr, lost))} vanishes"
         what = what if lost else f"the rows {', '.join(map(repr, dependent))} lose their rank"
         return SingularProgram(
             f"The program is singular at t = {t:.7g} s: {what}{where}; {why}.",
-            f"The smallest equilibrated singular value is {measure:.1e} of its best along the motion; accelerations "
-            f"are undetermined in the direction of {', '.join(direction)}.",
+            f"The smallest equilibrated singular value is {self._how_small(measure)}; accelerations are undetermined "
+            f"in the direction of {', '.join(direction)}.",
             do="Write the residual in a form whose gradient does not vanish (linear in velocities, not squared), or "
             "plan around this state. The run before it is in .run.",
             t=float(t),
@@ -459,6 +465,11 @@ class Monitor:
             zero=zero,
             direction=direction,
         )
+
+    def _how_small(self, measure):
+        """The rank measure in words; a motion that begins at a singular state has no better one."""
+        best = float(self.best.min())
+        return f"{best:.1e} from the first instant on" if best < HOPELESS else f"{measure:.1e} of its best so far"
 
     def _dependent_rows(self, leading):
         """Names of the rows of L that depend on each other: its left null vector."""

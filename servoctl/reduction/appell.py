@@ -112,7 +112,11 @@ def realisation(mechanism, program, constraints, points):
 
 
 def _actuator_directions(mechanism, program, constraints, points):
-    """E, or E W⁻¹Pᵀ where there are more actuators than residuals."""
+    """E, or E W⁻¹Pᵀ where there are more actuators than residuals.
+
+    With as many independent actuators as residuals, as for two motors on one trolley, the program determines E u; P is
+    then any matrix with the row space of E, and W⁻¹Pᵀμ the u of least norm.
+    """
     q = mechanism.q
     k, m = len(program.residuals), len(mechanism.actuators)
     material = [row for row in constraints if row.kind == "material"]
@@ -136,6 +140,9 @@ def _actuator_directions(mechanism, program, constraints, points):
     if k == m:
         return mechanism.E, ca.SX.eye(m)
     inverse_weights = ca.diag(ca.vertcat(*(1 / ca.SX(program.weights.get(name, 1.0)) for name in mechanism.actuators)))
+    if k == independent:
+        actuation = inverse_weights @ _row_space(mechanism, material, points, k).T
+        return mechanism.E @ actuation, actuation
     P = decoupling(mechanism, [row for row in constraints if row.kind == "program"], material, points)
     rank_P = decide_all(*points.matrix(P))[0].rank
     if rank_P < k:
@@ -150,6 +157,14 @@ def _actuator_directions(mechanism, program, constraints, points):
         )
     actuation = inverse_weights @ P.T
     return mechanism.E @ actuation, actuation
+
+
+def _row_space(mechanism, material, points, k):
+    """k independent rows of E, beside material rows of N E: what the inputs do to the motion, (k, m) SX."""
+    rows = mechanism.E
+    if material:
+        rows = plant_accelerations(mechanism, material, rows, ca.SX.zeros(len(material), rows.shape[1]), points)
+    return rows[sorted(decide_all(*points.matrix(rows))[0].rows[:k]), :]
 
 
 def decoupling(mechanism, rows, material, points):

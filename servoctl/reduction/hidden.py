@@ -87,6 +87,8 @@ def _lowest(q, rows, numbers, context, starts=None):
     # constraints stay as they are written.
     order = sorted(range(len(rows)), key=lambda a: (rows[a].kind == "dynamics", rows[a].order, a))
     support, weights = dependence(numbers[order])
+    if not support:  # the ranks at single points and the dependence at all of them disagree
+        raise _ill_conditioned(rows, generic(decide_each(numbers))[0])
     support = [order[i] for i in support]
     top = max(rows[a].order for a in support)
     highest = ((a, w) for a, w in zip(support, weights, strict=True) if rows[a].order == top)
