@@ -1,6 +1,6 @@
 """From a model and a start to a run."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -38,6 +38,8 @@ from servoctl.methods.taylor import TaylorSteps
 from servoctl.model.model import Model
 from servoctl.model.start import State
 from servoctl.model.switching import switching
+from servoctl.plants.driven import driven
+from servoctl.plants.plant import Plant
 from servoctl.progress import Progress
 from servoctl.run import SAME_TIME, Run
 
@@ -48,25 +50,26 @@ OFF = 1e-5  # residual relative to its gradient times the state, above which a s
 
 
 def simulate(
-    model: Model,
-    start: State | ArrayLike,
+    model: Model | Plant,
+    start: State | ArrayLike | Mapping[str, float],
     t_span: Sequence[float],
     method: Method | str | None = None,
     *,
+    inputs: Mapping[str, object] | None = None,
     drift: Project | Poles | MinimalCoordinates | str | float | None = None,
     accuracy: float | None = None,
     t_eval: ArrayLike | None = None,
     progress: bool | Callable[[float], object] | None = None,
 ) -> Run:
-    """Simulate the motion that a program prescribes.
+    """Simulate the motion that a program prescribes, or that of a plant under inputs.
 
     Main arguments
 
     Parameters
     ----------
-    model : Model
-    start : State or (n_x,) array
-        From `model.start`.
+    model : Model or Plant
+    start : State, (n_x,) array or dict of str to float
+        From `model.start`; for a plant (q, γ'), also by name.
     t_span : (t0, t1)
         [s]; t1 < t0 runs backwards.
     method : Algebraic, Taylor, RadauIIA, RungeKutta, Adaptive, Sundials, or a short form, optional
@@ -84,6 +87,9 @@ def simulate(
 
     Other arguments
 
+    inputs : dict of str to float, SX or callable, optional
+        Of a plant, by actuator, default 0: numbers, expressions of `q.t` such as paths, or functions that give these
+        of `q.t`. They act at once, within the plant's limits of magnitude.
     t_eval : (N,) array, optional
         Times of the samples [s], within t_span. Default: 1001 instants and the knots; all steps of `RungeKutta`.
     progress : bool or callable, optional
@@ -106,6 +112,7 @@ def simulate(
     SpecificationError
         If method and drift do not go together, or a path is not smooth enough.
     """
+    model, start = _model_and_start(model, start, inputs)
     span, tolerance = as_span(t_span), getattr(method, "rtol", STEP_ERROR)
     times = dense = None if t_eval is None else _sample_times(*span, t_eval, ())
     if times is not None and not model.flat:  # the verdict on internal dynamics needs more samples than a few
@@ -172,6 +179,7 @@ def simulated(model, start, t_span, method=None, *, drift=None, t_eval=None, pro
         bar.close()
     end_at_other_orders(motion)
     run = _run(model, motion, method, drift, knots, (t0, x0, t1))
+    run = replace(run, start=_as_started(model, start, t0, x0 if motion.start is None else motion.start))
     if t_eval is not None and isinstance(method, RungeKutta):
         run = _resample(run, times)
     if motion.stop is not None:
@@ -198,14 +206,30 @@ def judged(run, tolerance=STEP_ERROR, warn=True):
     return replace(run, internal=internal.facts(tolerance))
 
 
+def _model_and_start(model, start, inputs):
+    """The model of a plant under inputs, and its start as an array; a model and its start as they are."""
+    if isinstance(model, Plant):
+        return driven(model, inputs), start if isinstance(start, State) else model.state(start)
+    if not isinstance(model, Model) or inputs is not None:
+        given = f"a {type(model).__name__}" + (" and inputs" if inputs is not None else "")
+        raise SpecificationError(
+            f"simulate received {given}.",
+            "It takes a Model, whose program determines the inputs, or a Plant and its inputs.",
+            do="Write sv.simulate(sv.derive(mechanism, program), start, t_span), or "
+            "sv.simulate(sv.plant(mechanism), x0, t_span, inputs={...}).",
+            type=type(model).__name__,
+        )
+    return model, start
+
+
 def _motion(model, method, drift, problem, bar, atol=None):
     """Integrate (t0, x0, t1, times, knots) by a method; samples are taken at the times (N,), by `RungeKutta` at steps.
 
     `atol` (n_x,) replaces the default of the method.
     """
-    t0, x0, t1, times, _ = problem
+    t0, x0, t1, times, knots = problem
     if isinstance(method, Algebraic):
-        return algebraic(model, t0, x0, times, bar)
+        return algebraic(model, (t0, t1), x0, times, knots, bar)
     family = switching(model)
     if family is not None:
         model = family.at(family.branches(t0, x0))
@@ -314,14 +338,28 @@ def as_state(model, start, t0):
     return values
 
 
-def consistent_state(model, start, t):
-    """The state that a start gives, which must satisfy the invariants: nothing would lead the motion back to them."""
-    x = as_state(model, start, t)
+def _as_started(model, start, t, x):
+    """The state from which a motion was computed: `start`, or what the method has made of it."""
+    if isinstance(start, State) and np.array_equal(start.values, x):
+        return start
+    off = np.abs(_scaled_residuals(model, t, x)[2]).max(initial=0.0)
+    facts = {"held": start.held, "free": start.free} if isinstance(start, State) else {"held": (), "free": ()}
+    return State(float(t), np.array(x), tuple(model.state_names), residual=float(off), **facts)
+
+
+def _scaled_residuals(model, t, x):
+    """Names of the invariants, their values, and these relative to their gradients times the state."""
     names = [name for _, name in model.invariant_names()]
     y = model.function("invariants")(t, x, model.parameters)
     values, slopes = y[: len(names)], y[len(names) :].reshape(len(x), len(names)).T
     sizes = np.sqrt((slopes**2 * (1.0 + np.abs(x)) ** 2).sum(axis=1))
-    off = np.nan_to_num(np.abs(values) / np.where(sizes > 0, sizes, 1.0))
+    return names, values, np.nan_to_num(np.abs(values) / np.where(sizes > 0, sizes, 1.0))
+
+
+def consistent_state(model, start, t):
+    """The state that a start gives, which must satisfy the invariants: nothing would lead the motion back to them."""
+    x = as_state(model, start, t)
+    names, values, off = _scaled_residuals(model, t, x)
     if off.max(initial=0.0) > OFF:
         worst = int(np.argmax(off))
         raise InconsistentStart(

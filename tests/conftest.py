@@ -131,7 +131,8 @@ def motion(model, t=0.0, guess=None, **held):
     state = model.start(t, guess=guess, **held)
     if model.flat and model.reduction.top == 2:
         y = model.function("path")(t, state.values[: model.nq], model.parameters)
-        return np.concatenate([state.values, y[2 * model.nq + model.n :][: model.n]])
+        first = model.nq if model.reduction.mechanism.q.plain else 3 * model.nq  # of γ' (see `Equations.path`)
+        return np.concatenate([state.values, y[first + model.n :][: model.n]])
     n_x = len(state.values)
     rates = model.function("ode")(t, state.values, model.parameters)[:n_x]
     if not np.all(np.isfinite(rates)):

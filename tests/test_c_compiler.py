@@ -31,7 +31,7 @@ def fresh(tmp_path, monkeypatch, c_compiler):
 
 def pendulum_with_loops():
     """Rates of a pendulum; as a Newton step they vanish at once where it hangs."""
-    return compiled(function(X2[1], -P1 * ca.sin(X2[0]), 0, 0), "hanging", ("rk", "newton"))
+    return compiled(function(X2[1], -P1 * ca.sin(X2[0]), 0, 0, 0, 0), "hanging", ("rk", "newton"))
 
 
 def new_process(monkeypatch):
@@ -56,7 +56,7 @@ def test_a_long_grid_is_compiled(fresh):
 @pytest.mark.parametrize("use", [lambda m: m.grid(0.0, np.zeros((2, 1)), [1.0]),
                                  lambda m: m.buffer(),
                                  lambda m: m.rk(0.0, [0.0, 0.0], 0.1, 1, [1.0], RK4),
-                                 lambda m: m.newton(np.zeros(1), [0.0, 0.0], [1.0])])
+                                 lambda m: m.newton(np.zeros(1), np.zeros((1, 9)), [1.0])])
 def test_what_an_integration_uses_is_compiled_at_its_first_use(fresh, use):
     model = pendulum_with_loops()
     use(model)

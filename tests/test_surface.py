@@ -26,7 +26,7 @@ LAYERS = (
 WITHOUT_CASADI = ("study", "figures", "interop", "shell")
 LATE = ("scipy", "matplotlib", "control", "tqdm", "xarray", "dask")
 MOST_IN_A_FUNCTION, MOST_PARAMETERS, MOST_MODULES_OF_A_NAME, MOST_IN_A_REPR = 40, 8, 2, 12
-SHEETS = ("Mechanism.__init__",)  # a designer's sheet, filled in by keyword
+SHEETS = ("Mechanism.__init__", "simulate")  # filled in by keyword
 
 
 def relative(path):

@@ -14,7 +14,7 @@ from itertools import chain, count
 
 import casadi as ca
 
-from servoctl.codegen.loops import BISECTIONS, INLINE_SINES, LOOPS, NEAR, QUADRATIC, ROUNDING
+from servoctl.codegen.loops import INLINE_SINES, LOOPS, NEWTON
 
 CHUNK = 350  # statements per C function: compile time is least, and flat, between 250 and 500
 WIDE = 3000  # operations: up to here a function is emitted for eight points at once as well
@@ -174,6 +174,7 @@ def emit(f, name, loops=(), *, project=None, others=None, sizes=None, wide=True,
     constants = {"NAME": name, "NX": f.numel_in(1), "NP": f.numel_in(2), "NY": f.numel_out(0)}
     constants |= {"PROJECTED": ""} if project is not None else {}
     constants |= {"WIDE": ""} if wide else {}
+    constants |= {"PIVOTS": 0} if "newton" in loops else {}
     constants |= {key.upper(): int(value) for key, value in (sizes or {}).items()}
     files = ["grid.c", *(f"{loop}.c" for loop in LOOPS if loop in loops)]
     return "".join((unit(constants), *parts, *map(include, files)))
@@ -181,8 +182,7 @@ def emit(f, name, loops=(), *, project=None, others=None, sizes=None, wide=True,
 
 def unit(constants):
     """Head of a translation unit: #define lines of constants by name, and `unit.h`."""
-    tolerances = {"ROUNDING": ROUNDING, "BISECTIONS": BISECTIONS, "NEAR": NEAR, "QUADRATIC": QUADRATIC}
-    lines = (f"#define {key} {value}\n" for key, value in (tolerances | constants).items())
+    lines = (f"#define {key} {value}\n" for key, value in (NEWTON | constants).items())
     return "".join(("#include <math.h>\n#include <stdint.h>\n", *lines, include("unit.h")))
 
 

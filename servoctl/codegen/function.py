@@ -21,7 +21,7 @@ GRID_POINTS = 20_000  # CasADi takes some 0.3 us per point: a longer grid takes 
 FULLY_OPTIMISED = 6_000  # operations: up to here -O3 takes at most 1.5 s; with -O1 15,000 take no longer
 TAYLOR_COMPILED = 15_000  # operations: beyond, compiling takes as long as 50,000 steps that CasADi evaluates
 
-_OUTPUTS_PER_STATE = {"rk": 1, "newton": 2, "taylor": 1}
+_OUTPUTS_PER_STATE = {"rk": 1, "newton": 3, "taylor": 1}
 
 
 def compiled(f, name, loops=(), project=None, others=None, sizes=None):
@@ -40,8 +40,9 @@ def compiled(f, name, loops=(), project=None, others=None, sizes=None):
     others : dict of str to casadi.Function, optional
         Further functions of the same form in the same library, called by `Compiled.native`.
     sizes : dict of str to int, optional
-        Constants of the loops. Those of "taylor": the numbers of coordinates "nq" and of quasi-velocities "n", the
-        order s̄ "top", the highest index of coefficients "last", and "plain" (1 if q' = γ', else 0).
+        Constants of the loops. That of "newton": the number of "pivots" (default: 0). Those of "taylor": the numbers
+        of coordinates "nq" and of quasi-velocities "n", the order s̄ "top", the highest index of coefficients "last",
+        and "plain" (1 if q' = γ', else 0).
 
     Returns
     -------
@@ -302,33 +303,31 @@ class Compiled:
         n = 1 + self._library.rk(float(t0), x0, float(h), counts, p, tableau, states, outputs)
         return t0 + log[:n] * h, states[:, :n], outputs[:, :n]
 
-    def newton(self, t, x0, p, tol=1e-13, max_iter=30):
-        """Solve delta = 0 at each time in order; the outputs are the Newton step delta (n_x), dx/dt (n_x) and others.
+    def continuation(self, cuts, x0, p, longest, most):
+        """Follow a path by steps of its own; the outputs are the Newton step delta, dx/dt, d²x/dt², others, pivots.
 
-        A point is predicted from the last one by its rate and corrected until every |delta_i| <= tol (1 + |x_i|), then
-        once more if that still reduces delta. If the correction fails, the step in time is halved, up to 20 times.
-        Points in blocks are predicted by Hermite's interpolation and corrected together; they are solved one by one
-        if the prediction is off by more than 1e-3. Compiled code takes eight points at once, CasADi 128.
+        A step is predicted by the rates and corrected. It is halved until Newton's corrections shrink quickly, the
+        predictions from both its ends are right up to a small part of the way, and no pivot (the last
+        ``sizes["pivots"]`` outputs) changes its sign or its size by more than a factor of 4: the path cannot change to
+        another branch of the solution.
 
         Parameters
         ----------
-        t : (N,) array
-            Times [s].
+        cuts : (C,) array
+            Start, instants at which steps end, and end [s]; in order, also backwards.
         x0 : (n_x,) array
-            Start of the iteration at t[0], SI.
+            Start of the iteration at cuts[0], SI.
         p : (n_p,) array
             Parameters, SI.
-        tol : float
-            Tolerance relative to 1 + |x_i|.
-        max_iter : int
-            Corrections per point.
+        longest : float
+            Longest step [s].
+        most : int
+            Largest number of nodes.
 
         Returns
         -------
-        x : (n_x, M) array
-            Solutions at the first M times; M < N if the iteration fails at t[M].
-        y : (n_y, M) array
-            Outputs at these times.
+        nodes : (M, 1 + n_x + n_y) array
+            t, x and outputs at the ends of the steps. If M < most, the path ends where the last node lies.
         iterations : int
             Number of evaluations.
 
@@ -338,10 +337,42 @@ class Compiled:
             If the function has no loop "newton", or an array has another shape.
         """
         self._require_loop("newton")
-        t = self._array("t", t, (np.size(t),))
+        cuts = self._array("cuts", cuts, (np.size(cuts),))
         x0, p = self._array("x0", x0, self._x_shape), self._array("p", p, self._p_shape)
+        nodes = np.empty((most, 1 + self.n_x + self.n_y))
+        n, iterations = self._library.continuation(cuts, x0, p, float(longest), nodes)
+        return nodes[:n], iterations
+
+    def newton(self, t, nodes, p):
+        """Solve at times along the path of a `continuation`.
+
+        A point is predicted by Hermite's interpolation between two nodes and corrected until every
+        |delta_i| <= 1e-13 (1 + |x_i|); by further steps of the path from the node before it, where that fails.
+        Compiled code takes eight points at once, CasADi 128.
+
+        Parameters
+        ----------
+        t : (N,) array
+            Times in the order of the nodes [s].
+        nodes : (M, 1 + n_x + n_y) array
+            From `continuation`.
+        p : (n_p,) array
+            Parameters, SI.
+
+        Returns
+        -------
+        x : (n_x, K) array
+            Solutions at the first K times; K < N if the iteration fails at t[K].
+        y : (n_y, K) array
+            Outputs at these times.
+        iterations : int
+            Number of evaluations.
+        """
+        self._require_loop("newton")
+        t, p = self._array("t", t, (np.size(t),)), self._array("p", p, self._p_shape)
+        nodes = self._array("nodes", nodes, (len(nodes), 1 + self.n_x + self.n_y))
         x, y = np.empty((self.n_x, t.size)), np.empty((self.n_y, t.size))
-        n, iterations = self._library.newton(t, x0, p, float(tol), int(max_iter), x, y)
+        n, iterations = self._library.newton(t, nodes, p, x, y)
         return x[:, :n], y[:, :n], iterations
 
     def taylor(self, t0, x0, t1, p, rtol, atol, max_steps, project_every=0):

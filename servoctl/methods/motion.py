@@ -23,6 +23,7 @@ class Motion:
     interrupted: bool = False
     changed: set = field(default_factory=set)
     switches: list = field(default_factory=list)
+    start: object = None  # X at t0, if it is not the given one
 
     def add(self, model, t, x, top):
         """Append samples t (N,), X (n_x, N) and γ^(s̄) (n, N) computed with one variant of the model."""

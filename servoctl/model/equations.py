@@ -195,7 +195,10 @@ class Equations(Invariants):
         )
 
     def path(self):
-        """For flat programs: outputs (δq, q', γ', γ'', pivots) as functions of (t, q), δq a Newton step."""
+        """For flat programs: outputs (δq, q', q'', pivots) as functions of (t, q), δq a Newton step.
+
+        With quasi-velocities (δq, q', q'', γ', γ'', pivots).
+        """
         q, n = self.q, self.q.n
         zero = ca.SX.zeros(n)
         w, dw = q.jet(1), q.jet(2)
@@ -204,9 +207,12 @@ class Equations(Invariants):
         velocity, _ = self._solve(-ca.substitute(first, w, zero))
         acceleration, _ = self._solve(-ca.substitute(second, dw, zero))
         acceleration = ca.substitute(acceleration, w, velocity)
-        rates = q.V @ velocity + q.h
-        pivots = [ca.substitute(p, ca.vertcat(w, dw), ca.vertcat(velocity, acceleration)) for _, p in self.pivots]
-        return self.function("path", q.jet(0), [self._newton(), rates, velocity, acceleration, *pivots])
+        jets = [] if q.plain else [velocity, acceleration]
+        moving = [ca.vertcat(*q.d(1)), ca.vertcat(*q.d(2)), *(p for _, p in self.pivots)]
+        rate, second, *pivots = (
+            ca.substitute(e, ca.vertcat(w, dw), ca.vertcat(velocity, acceleration)) for e in moving
+        )
+        return self.function("path", q.jet(0), [self._newton(), rate, second, *jets, *pivots])
 
     def _newton(self):
         q = self.q
@@ -359,7 +365,7 @@ EQUATIONS = {  # arguments of `compiled`: the function, its loops, its projectio
     "ode_poles": lambda e: (e.ode(poles=True), ("rk",)),
     "ode_jacobian": lambda e: (e.ode_jacobian(),),
     "ode_poles_jacobian": lambda e: (e.ode_jacobian(poles=True),),
-    "path": lambda e: (e.path(), ("newton",)),
+    "path": lambda e: (e.path(), ("newton",), None, None, {"pivots": len(e.pivots)}),
     "invariants": lambda e: (e.invariants(),),
     "matrices": lambda e: (e.matrices(),),
     "plant": lambda e: (e.plant(),),

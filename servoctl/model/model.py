@@ -133,7 +133,7 @@ class Model:
             For a value that is not finite, makes a mass negative, or makes a path less smooth than required.
         """
         r = self.reduction
-        current = dict(zip(r.mechanism.parameters.names, self.parameters.tolist(), strict=True))
+        current = self.numbers
         for name in changes:
             if name not in current:
                 raise unknown(name, list(current), "parameter")
@@ -178,6 +178,23 @@ class Model:
                 expected=self.free,
             )
         return Model(near.reduction, near._store, self.parameters, self._knots)
+
+    @property
+    def place(self):
+        """(t, jets, sizes) near which pivots were chosen by `near`; None if they were by `derive`."""
+        return self._store.specification[3]
+
+    def at(self, place):
+        """The variant of a `place`; this model if that is None."""
+        if place is None:
+            return self
+        t, jets, sizes = place
+        return self.near(t, [jets[name] for name in self.jet_names], sizes)
+
+    @property
+    def numbers(self):
+        """Values of the parameters by name, SI."""
+        return dict(zip(self.reduction.mechanism.parameters.names, self.parameters.tolist(), strict=True))
 
     @property
     def free(self):

@@ -11,9 +11,11 @@ WIDTH = 118
 def describe(model):
     """What `print(model)` shows: how the specification was reduced, in at most twelve lines."""
     r = model.reduction
+    program = f"program {', '.join(r.program.residuals)} by {_by(r)}" if r.program.residuals else "no program"
+    raised = _raised(r)
     lines = [
-        f"Model: {' '.join(r.mechanism.q.names)}; program {', '.join(r.program.residuals)} by {_by(r)}",
-        f"  {_raised(r)}",
+        f"Model: {' '.join(r.mechanism.q.names)}; {program}",
+        *([f"  {raised}"] if raised else []),
         *_hidden_and_free(model),
         f"  {_rule(r)}",
     ]

@@ -214,10 +214,12 @@ class PlantEquations:
         return self.function("accelerations", [self.acceleration])
 
     def outputs(self):
-        """The mechanism's named outputs."""
-        acceleration = ca.vertcat(*self.q.gamma(2))
-        outputs = self.mechanism.outputs.values()
-        return self.function("outputs", [ca.substitute(e, acceleration, self.acceleration) for e in outputs])
+        """The mechanism's named outputs; for those of order 3 and above inputs and disturbances are held."""
+        outputs, jets = list(self.mechanism.outputs.values()), [self.acceleration]
+        for _ in range(2, max(map(self.q.order, outputs), default=0)):
+            jets.append(ca.jacobian(jets[-1], self.q.t) + ca.jtimes(jets[-1], self.state, self.state_rates))
+        symbols = ca.vertcat(*(s for k in range(2, 2 + len(jets)) for s in self.q.gamma(k)))
+        return self.function("outputs", [ca.substitute(e, symbols, ca.vertcat(*jets)) for e in outputs])
 
     def constraints(self):
         """Names and values of the invariants of the state, level by level."""

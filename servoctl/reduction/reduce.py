@@ -134,7 +134,7 @@ class Reduction:
     def actuation(self):
         """Required actuation u (m,) SX, or for an ideal program the reaction of the program, (n,) SX."""
         k = len(self.program.residuals)
-        multipliers = self.multipliers[:k]
+        multipliers = self.multipliers[:k] if k else ca.SX(0, 1)
         if self.program.by == "actuators":
             return ca.cse(self.realisation.actuation @ multipliers)
         return ca.cse(self.realisation.B[:, :k] @ multipliers)
@@ -328,7 +328,8 @@ def _context(mechanism, switches, guess, near, values):
     values = mechanism.parameters.values() if values is None else np.asarray(values, dtype=float)
     if near is not None:
         t, guess, sizes = near
-        return Context(mechanism.parameters.symbols, values, (t - NEARBY, t + NEARBY), guess, NEAR_SPREAD, sizes)
+        width = NEARBY * min(1.0, _time_scale(mechanism.q, guess))
+        return Context(mechanism.parameters.symbols, values, (t - width, t + width), guess, NEAR_SPREAD, sizes)
     times = switches.times(values)
     window = WINDOW
     if len(times) == 1:
@@ -360,3 +361,9 @@ def _lengths(mechanism, guess, values):
     size = float((metric * known).max())
     size *= SPREAD
     return tuple(float(size / m) if m > 0 and size > 0 else max(k, 1.0) for m, k in zip(metric, known, strict=True))
+
+
+def _time_scale(q, jets):
+    """The time [s] in which a state changes by 1 + |q|: near a singularity a motion is quick."""
+    place, rate, second = (max((abs(jets.get(name, 0.0)) for name in q.jet_names(k)), default=0.0) for k in range(3))
+    return 1.0 / max(rate / (1.0 + place), np.sqrt(second / (1.0 + place)), TINY)

@@ -144,6 +144,23 @@ class Mechanism:
         content = packed(vars(self), self.q, self.parameters, {"parameters": self.parameters})
         return _restored, (self.q, self.parameters, content)
 
+    def under(self, inputs, forces):
+        """The mechanism without actuators, whose inputs are forces and outputs instead.
+
+        Parameters
+        ----------
+        inputs : dict of str to SX
+            By actuator.
+        forces : (n,) SX
+            Further generalised forces.
+        """
+        driving = self.E @ ca.vertcat(*(inputs[name] for name in self.actuators)) if self.actuators else 0
+        return Mechanism(
+            self.q, self._gibbs, self.potential, None, self.parameters, kinetic=self._kinetic,
+            balance=self._inverse_dynamics, forces=self.forces + forces + driving, constraints=self.constraints,
+            outputs={**self.outputs, **inputs},
+        )  # fmt: skip
+
     @cached_property
     def balance(self):
         """r = ∂S/∂γ'' - Γ without actuation, (n,) SX in units of generalised force."""
