@@ -13,7 +13,10 @@ from servoctl.values import Value, same
 STENCIL = 9  # samples of the polynomial through which an extremum is refined: error of order h^9
 AS_SAMPLED = 1e-14  # relative: a refined extremum must exceed the sampled one by this
 SAME_TIME = 1e-12  # relative: rounding of an instant
-FACTS = ("method", "drift", "counters", "success", "status", "message", "knots", "jet_names")  # of a saved run
+FACTS = {
+    "method": str, "drift": str, "counters": dict, "success": bool, "status": int, "message": str, "knots": list,
+    "jet_names": list,
+}  # of a saved run
 
 
 @dataclass(frozen=True, eq=False)
@@ -349,10 +352,16 @@ def load(path) -> Run:
 
 
 def _from_archive(facts, arrays):
-    signals = {name: arrays[f"signal_{i}"] for i, name in enumerate(facts["signals"])}
-    residuals = {name: arrays[f"residual_{i}"] for i, name in enumerate(facts["residuals"])}
-    facts = {name: tuple(facts[name]) if isinstance(facts[name], list) else facts[name] for name in FACTS}
-    return Run(arrays["t"], arrays["jets"], stored=signals, stored_residual=residuals, **facts)
+    for name, kind in FACTS.items():
+        archive.require(type(facts[name]) is kind, f"its {name} is {facts[name]!r}")
+    t = archive.numbers(arrays, "t", None)
+    archive.require(np.isfinite(t).all() and abs(np.sign(np.diff(t)).sum()) == len(t) - 1, "its times are in no order")
+    jets = archive.numbers(arrays, "jets", len(archive.named(facts["jet_names"])), len(t))
+    names, rows = archive.named(facts["signals"]), archive.named(facts["residuals"])
+    signals = {name: archive.numbers(arrays, f"signal_{i}", len(t)) for i, name in enumerate(names)}
+    residuals = {name: archive.numbers(arrays, f"residual_{i}", None, len(t)) for i, name in enumerate(rows)}
+    facts = {name: tuple(facts[name]) if kind is list else facts[name] for name, kind in FACTS.items()}
+    return Run(t, jets, stored=signals, stored_residual=residuals, **facts)
 
 
 def require_model(model, run, what):

@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike
 
 from servoctl.checks import as_span
 from servoctl.errors import InconsistentStart, SpecificationError
-from servoctl.methods.accuracy import accurate
+from servoctl.methods.accuracy import ATOL, absolute_tolerances, accurate, large_tolerances
 from servoctl.methods.algebraic import algebraic
 from servoctl.methods.choice import (
     EXPLICIT,
@@ -124,7 +124,13 @@ def simulate(
     times = _sample_times(t0, t1, t_eval, knots)
     bar = Progress(span, progress)
     try:
-        motion = _motion(model, method, drift, span, x0, times, knots, bar)
+        default = getattr(method, "atol", 0.0) is None
+        first = large_tolerances(model, span, x0) if default else None
+        motion = _motion(model, method, drift, (t0, x0, t1, times, knots), bar, first)
+        tolerances = _smaller_tolerances(model, method, motion)
+        if tolerances is not None:
+            again = _motion(model, method, drift, (t0, x0, t1, times, knots), bar, tolerances)
+            motion = again if again.stop is None or motion.stop is not None else motion
     finally:
         bar.close()
     run = _run(model, motion, method, drift, knots, (t0, x0, t1))
@@ -136,34 +142,49 @@ def simulate(
     return run
 
 
-def _motion(model, method, drift, span, x0, times, knots, bar):
-    """Integrate by a method; samples are taken at the times (N,), by `RungeKutta` at its steps."""
-    arguments = (span[0], x0, span[1], times, knots)
+def _motion(model, method, drift, problem, bar, atol=None):
+    """Integrate (t0, x0, t1, times, knots) by a method; samples are taken at the times (N,), by `RungeKutta` at steps.
+
+    `atol` (n_x,) replaces the default of the method.
+    """
+    t0, x0, t1, times, _ = problem
     if isinstance(method, Algebraic):
-        return algebraic(model, span[0], x0, times, bar)
+        return algebraic(model, t0, x0, times, bar)
     family = switching(model)
     if family is not None:
-        model = family.at(family.branches(span[0], x0))
-    stepping = _stepping(model, method, drift, span, bar)
+        model = family.at(family.branches(t0, x0))
+    stepping = _stepping(model, method, drift, (t0, t1), bar, atol)
     stepping.family = family
-    return run_checked(stepping, *arguments) if stepping.tolerances is None else stepping.run(*arguments)
+    return run_checked(stepping, *problem) if stepping.tolerances is None else stepping.run(*problem)
 
 
-def _stepping(model, method, drift, span, bar):
+def _stepping(model, method, drift, span, bar, atol):
     """The integration by a method other than `Algebraic`."""
-    t0, t1 = span
+    (t0, t1), least = span, ATOL if atol is None else atol.min()
     match method:
-        case Taylor(order, jets, rtol, atol):
-            return TaylorSteps(model, drift, rtol, atol, order, jets or 0, bar)
-        case RadauIIA(order, step, rtol, atol):
+        case Taylor(order, jets, rtol, given):
+            return TaylorSteps(model, drift, rtol, given or least, order, jets or 0, bar)
+        case RadauIIA(order, step, rtol, given):
             step = None if step is None else _step_length(step, t0, t1)
-            return RadauSteps(model, drift, rtol, atol, order, step, bar)
+            return RadauSteps(model, drift, rtol, given or least, order, step, bar)
         case RungeKutta(_, step):
             return RungeKuttaSteps(model, str(method), drift, _step_length(step, t0, t1), bar)
-        case Sundials(name, rtol, atol):
-            return SundialsSteps(model, name, drift, rtol, atol, t1 - t0, bar)
-        case Adaptive(name, rtol, atol):
-            return ScipySteps(model, name, drift, rtol, atol, bar)
+        case Sundials(name, rtol, given):
+            return SundialsSteps(model, name, drift, rtol, given or least, t1 - t0, bar)
+        case Adaptive(name, rtol, given):
+            each = least if atol is None or isinstance(drift, MinimalCoordinates) else atol
+            return ScipySteps(model, name, drift, rtol, given or each, bar)
+
+
+def _smaller_tolerances(model, method, motion):
+    """Absolute tolerances with which a motion is computed again, as the default is no small part of it; else None."""
+    if getattr(method, "atol", 0.0) is not None or motion.interrupted or not motion.pieces:
+        return None
+    if isinstance(method, RadauIIA) and method.step is not None:
+        return None
+    t, jets, _ = motion.samples()
+    x = jets[: len(model.state_names), np.all(np.isfinite(jets), axis=0)]
+    return absolute_tolerances(model, t, x, method.rtol) if x.shape[1] > 1 else None
 
 
 def _run(model, motion, method, drift, knots, span):

@@ -67,7 +67,7 @@ def worst_of_3_18(run):
         x = jets[: len(model.state_names)]
         matrices = model.function("matrices")(run.t[k], x, model.parameters)
         rows = len(model.leading_names()[0])
-        T = null_space(matrices[rows * n :].reshape(n, -1).T)
+        T = null_space(matrices[rows * n : -n].reshape(n, -1).T)
         worst = max(worst, np.abs(T.T @ balance[:, k]).max(initial=0.0))
     return worst / np.abs(balance).max()
 

@@ -20,6 +20,8 @@ from servoctl.export.c import export_c
 from servoctl.export.files import Array, Constant, Contents, Routine, Scalar, identifier, write
 from servoctl.gallery import gallery
 
+pytestmark = pytest.mark.usefixtures("c_compiler")
+
 STRICT = ("-std=c99", "-O1", "-Wall", "-Wextra", "-pedantic", "-Werror")
 TOLERANCE = 1e-12
 
@@ -252,3 +254,13 @@ def test_a_folder_that_is_a_file_is_refused(gallery_model, tmp_path):
     (tmp_path / "taken").write_text("")
     with refused(ServoError, path=str(tmp_path / "taken")):
         export_c(gallery_model("two-cars"), tmp_path / "taken")
+
+
+def test_marks_that_turn_or_hide_what_follows_reach_no_file(tmp_path):
+    t, x, p = ca.SX.sym("t"), ca.SX.sym("x", 1), ca.SX.sym("p", 0)
+    odd = "a\u202eb\u200b\u2028c\ud800\0d"
+    array, no = Array("x", f"Any {odd}", (odd,)), Array("p", "None", ())
+    routine = Routine("f", f"Any {odd}.", (Scalar("t"), array.input(), no.input(), array.output("y")))
+    contents = Contents([array, no], [Constant("half", 0.5, odd)], {"f": ca.Function("f", [t, x, p], [2 * x])}, [routine])
+    for file in write(tmp_path, "any", contents):
+        assert all(letter.isprintable() or letter == "\n" for letter in Path(file).read_text(encoding="utf-8"))

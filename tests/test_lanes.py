@@ -7,21 +7,26 @@ import pytest
 from test_compiled_functions import P1, X2, T, function, newton_model
 
 from servoctl.codegen import emit
+from servoctl.codegen import function as functions
 from servoctl.codegen.emit import SHARED, WIDE
-from servoctl.codegen.function import compiled, compiling_at_once
+from servoctl.codegen.function import compiled
 
 TINY, LAST_SMALL = 1e-300, np.nextafter(1e5, 0)
 
 
 @pytest.fixture(autouse=True)
-def at_once():
-    with compiling_at_once():
-        yield
+def grids_compile(monkeypatch):
+    monkeypatch.setattr(functions, "GRID_POINTS", 0)
 
 
 def points(model, t, x, p):
-    """Outputs (n_y, N) point by point."""
-    return np.array([model(now, column, p) for now, column in zip(t, x.T, strict=True)]).T
+    """Outputs (n_y, N) point by point, in compiled code."""
+    at, state, parameters, y, call = model.buffer()
+    parameters[:], columns = p, []
+    for at[0], state[:] in zip(t, x.T, strict=True):
+        call()
+        columns.append(y.copy())
+    return np.array(columns).T
 
 
 def at_points(model, x):

@@ -12,8 +12,6 @@ from servoctl.control.reference import Reference
 from servoctl.control.sampling import discretised, exponentials
 from servoctl.gallery import gallery
 
-pytestmark = pytest.mark.usefixtures("at_once")
-
 GUST = {"theta": sv.disturbances.gust(60.0, 2.0, 2.5)}
 WEIGHTS = {"Q": [1e3] * 3 + [1e2] * 3, "R": 1e-3}
 

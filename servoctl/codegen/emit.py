@@ -124,7 +124,13 @@ LANES_COMMON = Dialect("W", "ALL({})", "w_", common=True, linkage="static ")
 
 def operations(f):
     """Number of arithmetic instructions of an SX function: all but constants, inputs, outputs and copies."""
-    return sum(f.instruction_id(k) not in _NOT_ARITHMETIC for k in range(f.n_instructions()))
+    instructions = ((f.instruction_id(k), f.instruction_input(k)) for k in range(f.n_instructions()))
+    return sum(code not in _NOT_ARITHMETIC and not _copies(code, source) for code, source in instructions)
+
+
+def _copies(operation, source):
+    """Whether an instruction gives its first operand unchanged; copysign(c, c) keeps CasADi from rewriting c."""
+    return operation in _COPIES or (operation == ca.OP_COPYSIGN and source[0] == source[1])
 
 
 def emit(f, name, loops=(), *, project=None, others=None, sizes=None, wide=True, chunk=CHUNK):
@@ -225,7 +231,7 @@ def _statements(f, dialect, suffix=""):
             register[target[0]] = dialect.constant(f.instruction_constant(k))
         elif operation == ca.OP_OUTPUT:
             statements.append((f"y{suffix}[{target[1]}]", ca.OP_ASSIGN, (register[source[0]],)))
-        elif operation in _COPIES:
+        elif _copies(operation, source):
             register[target[0]] = register[source[0]]
         else:
             statements.append((values, operation, tuple(register[i] for i in source)))

@@ -1,5 +1,6 @@
 """Evaluations and loops of a function by CasADi and NumPy: for short motions, and where there is no compiler."""
 
+import functools
 import threading
 from itertools import pairwise
 
@@ -66,8 +67,25 @@ class Interpreter:
 
     def grid(self, t, x, p, y):
         """Fill y (n_y, N) with the outputs at t (N,) and the columns of x, and of p if that is a matrix."""
-        for k, t_k in enumerate(t):
-            y[:, k] = self._value(t_k, x[:, k], p[:, k] if p.ndim == 2 else p)
+        whole = t.size - t.size % BLOCK
+        parts = [np.empty((BLOCK, size)) for size in (1, self._n_x, self._f.numel_in(2), len(y))]
+        if whole:
+            parts[2][:] = 0.0 if p.ndim == 2 else p
+            run, alive = connected(self._block, parts)  # the buffer lives as long as its name
+        for k in range(0, whole, BLOCK):
+            here = slice(k, k + BLOCK)
+            parts[0][:, 0], parts[1][:] = t[here], x[:, here].T
+            if p.ndim == 2:
+                parts[2][:] = p[:, here].T
+            run()
+            y[:, here] = parts[3].T
+        for k in range(whole, t.size):
+            y[:, k] = self._value(t[k], x[:, k], p[:, k] if p.ndim == 2 else p)
+
+    @functools.cached_property
+    def _block(self):
+        """The function at `BLOCK` points; the bits are those of single points."""
+        return self._f.map(BLOCK)
 
     @np.errstate(all="ignore")
     def rk(self, t0, x0, h, counts, p, tableau, states, outputs):
@@ -126,7 +144,7 @@ class Interpreter:
         """Fill columns of x and y; return the numbers of points solved and of evaluations. See `Compiled.newton`."""
         solve, k, alone = _Newton(self._value, p, self._n_x, tol, max_iter), 0, 1
         parts = np.zeros(BLOCK), np.zeros((BLOCK, len(x))), np.tile(p, (BLOCK, 1)), np.zeros((BLOCK, len(y)))
-        block = (parts, *connected(self._f.map(BLOCK), parts)) if t.size > BLOCK else None
+        block = (parts, *connected(self._block, parts)) if t.size > BLOCK else None
         while k < t.size:
             point = (x[:, k - 1].copy(), y[:, k - 1].copy()) if k else None
             if alone <= k <= t.size - BLOCK:

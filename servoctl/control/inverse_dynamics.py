@@ -29,6 +29,7 @@ from servoctl.run import Run
 
 RANK_POINTS, AWAY, SEED = 8, 0.02, 20240229  # states for the ranks, and their distance from the plan
 SHARE = 1e-9  # of the largest entry, in rows and columns of like size: smaller ones are rounding
+MOST_DELAY = 1000  # samples: the poles of a delayed loop are eigenvalues of a matrix of that size
 MOST_DERIVATIVES = 4  # of the number of states: derivatives of a residual until an input appears
 GROWN = 2.0  # growth of errors along the plan up to which unstable internal dynamics pass: they hardly show in it
 TIME_CONSTANT = 0.25  # s: several poles there rise in about a second, as suits cranes and arms of human size
@@ -302,7 +303,7 @@ def computed(
     rate = positive("rate", rate)
     require_plan(plan, plant)
     refuse_transport(plant, "The linearisation is")
-    delay = whole("delay", delay)
+    delay = whole("delay", delay, most=MOST_DELAY)
     _require_stable(plan)
     linear = linearise(plan, plant)
     _require_smooth(plan, linear.orders)

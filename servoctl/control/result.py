@@ -50,7 +50,7 @@ class Closed(Value):
         Sensors, timing and disturbances, by name.
     success : bool
     status : int
-        0 finished, -1 stopped.
+        0 finished, 1 interrupted, -1 stopped.
     message : str
     """
 

@@ -51,9 +51,12 @@ class Motion:
             The variant of the model that holds for each range of samples.
         """
         t = np.concatenate([piece[1] for piece in self.pieces])
-        z = np.concatenate([np.vstack([piece[2], piece[3]]) for piece in self.pieces], axis=1)
         keep = np.append(True, np.diff(t) != 0)
-        counts = np.add.reduceat(keep, np.cumsum([0, *(len(piece[1]) for piece in self.pieces[:-1])]), dtype=int)
+        starts = np.cumsum([0, *(len(piece[1]) for piece in self.pieces[:-1])])
+        counts = np.add.reduceat(keep, starts, dtype=int)
+        z = np.empty((sum(map(len, self.pieces[0][2:])), counts.sum()))  # filled by piece: one large copy takes seconds
+        for (_, of_piece, *parts), start, end, count in zip(self.pieces, starts, counts.cumsum(), counts, strict=True):
+            z[:, end - count : end] = np.vstack(parts)[:, keep[start : start + len(of_piece)]]
         variants, end = [], 0
         for (model, *_), count in zip(self.pieces, counts.tolist(), strict=True):
             first, end = end, end + count
@@ -61,7 +64,7 @@ class Motion:
                 variants[-1] = (variants[-1][0], end, model)
             elif count:
                 variants.append((first, end, model))
-        return t[keep], z[:, keep], variants
+        return t[keep], z, variants
 
 
 @contextlib.contextmanager

@@ -16,6 +16,7 @@ import numpy as np
 from servoctl.codegen.function import compiled
 from servoctl.errors import IntegrationStopped
 from servoctl.jets.branches import domain_edges
+from servoctl.methods.sizes import state_levels
 from servoctl.tolerances import TINY
 
 LEAVES = 1e3  # times its tolerance, which no healthy step adds to a residual
@@ -60,12 +61,6 @@ class End:
     error: object = None
 
 
-def state_levels(model):
-    """Level of each entry of the state X: 0 for q, k for γ^(k); (n_x,) array of int."""
-    n_x, nq, n = len(model.state_names), model.nq, model.n
-    return np.append(np.zeros(nq, dtype=int), 1 + np.arange(n_x - nq) // n)
-
-
 class Tolerance:
     """The tolerances of the state along a motion, and of functions of it.
 
@@ -76,12 +71,12 @@ class Tolerance:
     """
 
     def __init__(self, model, rtol, atol):
-        self.levels, self.rtol, self.atol = state_levels(model), max(rtol, LEAST_RTOL), max(atol, LEAST_ATOL)
+        self.levels, self.rtol, self.atol = state_levels(model), max(rtol, LEAST_RTOL), np.maximum(atol, LEAST_ATOL)
         self.sizes = np.zeros(len(self.levels))
 
     def of(self, slopes, x):
         """Tolerances (m, N) of functions with derivatives (m, n_x, N) in X = x (n_x, N) along the motion."""
-        return np.einsum("mxn,xn->mn", np.abs(slopes), self.atol + self.rtol * self._sizes(x))
+        return np.einsum("mxn,xn->mn", np.abs(slopes), np.reshape(self.atol, (-1, 1)) + self.rtol * self._sizes(x))
 
     def accept(self, x):
         """Take in states (n_x, N) as part of the motion."""

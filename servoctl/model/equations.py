@@ -221,9 +221,9 @@ class Equations(Invariants):
         return eliminate(matrix, -residual, clean(values, sizes))[0]
 
     def matrices(self):
-        """L and Bᵀ, column by column: their ranks must not change."""
-        L, B = self.r.leading, self.r.realisation.B.T
-        return self.function("matrices", self.state, [ca.vec(ca.densify(L)), ca.vec(ca.densify(B))])
+        """L and Bᵀ, column by column, whose ranks must not change, and the diagonal of M, which scales columns."""
+        matrices = [ca.vec(ca.densify(m)) for m in (self.r.leading, self.r.realisation.B.T)]
+        return self.function("matrices", self.state, [*matrices, ca.densify(ca.diag(self.r.mechanism.mass))])
 
     def plant(self):
         """(q', γ'') of the full mechanism as a function of (t, [q; γ'; inputs of the program])."""

@@ -356,6 +356,13 @@ class Model:
         """How each row was derived, by name; "" for rows of the specification."""
         return {row.name: row.story for row in self.reduction.rows}
 
+    def balances(self):
+        """The coordinate or quasi-velocity, by index, of each row of L that is a row TᵀM of (3.18), by index."""
+        q = self.reduction.mechanism.q
+        names = [f"balance of {name}" for name in (q.names if q.plain else q.velocity_names)]
+        rows = enumerate(self.reduction.rows)
+        return {a: names.index(row.name) for a, row in rows if row.name in names and row.order == 2 and not row.story}
+
     def leading_names(self):
         """Names of the rows of L and of Bᵀ, whose ranks must not change."""
         return leading_names(self.reduction)

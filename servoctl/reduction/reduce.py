@@ -12,7 +12,7 @@ from servoctl.jets.series import Flow
 from servoctl.reduction.appell import Realisation, realisation, require_inertia
 from servoctl.reduction.hidden import complete
 from servoctl.reduction.knots import Knots, Switches, require_smooth
-from servoctl.reduction.manifold import Context, Points, sample
+from servoctl.reduction.manifold import SPREAD, Context, Points, sample
 from servoctl.reduction.ranks import Rank, clean, decide, decide_all
 from servoctl.reduction.rows import Balance, Row, as_rows, merge_uses, settle_alone
 from servoctl.spec.mechanism import Mechanism, require_known
@@ -24,6 +24,7 @@ NEAR_SPREAD = 1e-3  # relative width of the points about a state for which pivot
 WINDOW = (0.1, 1.1)  # s, where points are drawn if nothing switches; t = 0 is too often a special instant
 LONE_WINDOW = 1.0  # s on either side of a single switch
 INSET = 0.07  # fraction of the time from first to last switch left out at both ends, where paths are nearly at rest
+ORDINARY = 100.0  # factor from 1 within which the size of a guess leaves points spread by 1
 HELD = 1e-9  # residual, relative to the size of its terms, at points where a reduction still holds
 
 
@@ -150,6 +151,7 @@ def smoothness(switches, rows):
     return total
 
 
+@np.errstate(all="ignore")  # trial values may leave the domain of the rows: what is not finite is no point
 def reduce(mechanism, program, guess=None, near=None, values=None):
     """Derive the rows of a motion: eq. (3.18), hidden constraints, ranks on the manifold.
 
@@ -329,4 +331,27 @@ def _context(mechanism, switches, guess, near, values):
     elif times:
         width = times[-1] - times[0]
         window = (times[0] + INSET * width, times[-1] - INSET * width)
-    return Context(mechanism.parameters.symbols, values, window, guess or {})
+    lengths = _lengths(mechanism, guess or {}, values)
+    return Context(mechanism.parameters.symbols, values, window, guess or {}, lengths=lengths)
+
+
+def _ordinary(size):
+    """Whether points spread by 1 serve for this size, too."""
+    return 1 / ORDINARY < abs(size) < ORDINARY
+
+
+def _lengths(mechanism, guess, values):
+    """Usual sizes of the coordinates where guesses are far from 1: of equal √M_ii |q_i|; else nothing."""
+    q = mechanism.q
+    known = np.array([abs(guess.get(name, 0.0)) for name in q.names])
+    if not q.plain or all(map(_ordinary, known[known > 0])):
+        return ()
+    symbols = [q.t, q.jet(0), *mechanism.parameters.symbols]
+    inertia = ca.Function("inertia", symbols, [ca.densify(ca.diag(mechanism.mass))], {"allow_free": True})
+    if inertia.has_free():
+        return ()
+    metric = np.sqrt(np.maximum(np.ravel(inertia(0.0, [guess.get(name, 0.0) for name in q.names], *values)), 0.0))
+    metric = np.where(np.isfinite(metric), metric, 0.0)
+    size = float((metric * known).max())
+    size *= SPREAD
+    return tuple(float(size / m) if m > 0 and size > 0 else max(k, 1.0) for m, k in zip(metric, known, strict=True))

@@ -17,6 +17,8 @@ BASIS_CUTOFF = 1e-12  # relative singular value of independent rows below which 
 VANISHED = 1e-5  # gradient on a row's solutions, relative to random points, below which the row is a square
 SQUARE_STEPS = 40  # Newton steps towards these solutions; for a square each only halves the distance
 SOLVED = 1e-3  # scaled residual of points at which the gradient of a possible square is judged
+FELT = 1e-9  # a term above this fraction of a row's parts is not their rounding
+SAME_DEPTH = 20  # nested operations to which factors are compared
 BESIDE = 0.5  # relative distance of the points with which solutions are compared
 
 
@@ -54,6 +56,8 @@ class Row:
         The combination that it is, if it is a hidden constraint.
     uses : dict of (str or Balance) to int
         Highest derivative of each residual, and of the balance, that ψ contains.
+    parts : tuple of SX
+        Terms whose sum ψ is, where these may cancel: beside them rounding of folded constants is zero.
     """
 
     expression: ca.SX
@@ -63,6 +67,7 @@ class Row:
     affine: bool = True
     story: str = ""
     uses: dict = field(default_factory=dict)
+    parts: tuple = field(default=(), repr=False, compare=False)
     _gradients: dict = field(default_factory=dict, repr=False, compare=False)
 
     def gradient(self, q, level=None):
@@ -136,7 +141,7 @@ def _refuse_square(q, row, context, slopes=None):
     solved = residual < SOLVED
     if solved.any() and np.all(sizes[1][solved] < VANISHED * sizes[0][solved]):
         if not _regular_nearby(flow, start.t[solved], z[:, solved]):
-            raise vanishing_gradient(row)
+            raise vanishing_gradient(row, _repeated(factors(row.expression)))
 
 
 def _regular_nearby(flow, t, z):
@@ -153,14 +158,38 @@ def _regular_nearby(flow, t, z):
     return bool(np.any(converged & (here > VANISHED * there)))
 
 
-def vanishing_gradient(row):
-    """The error of a row whose gradient vanishes wherever the row holds."""
+def vanishing_gradient(row, factor=None, others=()):
+    """The error of a row whose gradient vanishes wherever the row holds, by reason of a factor if one is known."""
+    because = "" if factor is None else f": it has the factor {factor}"
     return SingularProgram(
-        f"The gradient of row {row.name!r} vanishes on its own solutions.",
+        f"The gradient of row {row.name!r} vanishes on its own solutions{because}.",
         "A constraint φ = 0 needs a gradient there; that of φ² = 0 is zero and determines no direction of the motion.",
-        do=f"Write {row.name!r} without the square, so that it changes sign at its solutions.",
+        do=f"Write {row.name!r} without the square, so that it changes sign at its solutions."
+        if factor is None
+        else f"Divide {row.name!r} by {factor}.",
         row=row.name,
+        **({} if factor is None else {"factor": str(factor)}),
     )
+
+
+def _repeated(items):
+    """The first SX scalar that occurs twice, or None."""
+    return next((f for i, f in enumerate(items) if any(ca.is_equal(f, g, SAME_DEPTH) for g in items[:i])), None)
+
+
+def factors(expression):
+    """Factors of an SX scalar that are no constants, repeated ones as often as they occur."""
+    operation = expression.op()
+    inner = [expression.dep(i) for i in range(expression.n_dep())]
+    if operation == ca.OP_MUL:
+        return [f for e in inner for f in factors(e)]
+    if operation == ca.OP_SQ:
+        return 2 * factors(inner[0])
+    if operation in (ca.OP_NEG, ca.OP_TWICE, ca.OP_DIV):
+        return factors(inner[0])
+    if operation in (ca.OP_POW, ca.OP_CONSTPOW) and inner[1].is_constant() and float(inner[1]) >= 2:
+        return 2 * factors(inner[0])
+    return [expression] if ca.symvar(expression) else []
 
 
 def leading(q, rows, points):
@@ -221,7 +250,7 @@ def settle(q, row, others, context, starts=None):
     if not len(points.t):
         return None, points
     for j in range(q.order(row.expression), -1, -1):
-        values = clean(*points.matrix(row.gradient(q, j)))[0]
+        values = slopes(q, row, j, points)
         if np.any(values):
             lower = [other for other in others if other.order < j or (other.order == j and other.affine and j > 0)]
             eliminated = _eliminated(q, row, j, values, lower, points)
@@ -230,17 +259,49 @@ def settle(q, row, others, context, starts=None):
             row = eliminated
         elif j > 0:
             row = _without(q, row, q.gamma(j), points)
-    if q.order(row.expression) == 0 and not np.any(clean(*points.matrix(row.gradient(q, 0)))):
+    if q.order(row.expression) == 0 and not np.any(slopes(q, row, 0, points)):
         return replace(row, order=-1), points
     return replace(row, order=max(q.order(row.expression), -1)), points
 
 
+def slopes(q, row, j, points):
+    """∂ψ/∂γ^(j) at points (n, N), zero where it is rounding beside the slopes of the row's parts."""
+    values, sizes = points.matrix(row.gradient(q, j))
+    values = clean(values, sizes)[0]
+    if not row.parts or not np.any(values) or _is_felt(q, row, j, values, points):
+        return values
+    gradients = [ca.jacobian(part, q.jet(j)) for part in row.parts]
+    parts, _ = points.matrix(ca.vertcat(*(g if j or q.plain else g @ q.V for g in gradients)))
+    return clean(values, np.abs(parts).max(axis=0))
+
+
+def _is_felt(q, row, j, values, points):
+    """Whether slopes times their jets are no rounding of the row's parts: then the slopes themselves are none."""
+    if values.shape != points.jet(j).shape:
+        return False
+    return bool(np.any(np.abs(values * points.jet(j)) > FELT * values_and_sizes(row, points)[1]))
+
+
+def values_and_sizes(row, points):
+    """Values and sizes (1, N) of a row at points, the sizes at least those of its parts."""
+    values, sizes = points.evaluate([row.expression])
+    return values, np.maximum(sizes, np.abs(points.evaluate(list(row.parts))[0]).max(axis=0, initial=0.0))
+
+
 def _without(q, row, symbols, points):
-    """The row with jets set to zero, or the row itself if that changes its value at a point."""
-    expression = ca.substitute(row.expression, ca.vertcat(*symbols), ca.SX.zeros(len(symbols)))
-    values, sizes = points.evaluate([expression, row.expression])
-    same = np.abs(values[0] - values[1]) <= ENTRY * (sizes[0] + sizes[1])
-    return replace(row, expression=expression) if np.all(same) else row
+    """The row with jets set to zero, or to one where it divides by them; the row itself if that changes its value."""
+    (value,), (size,) = values_and_sizes(row, points)
+    for constant in (ca.SX.zeros(len(symbols)), ca.SX.ones(len(symbols))):
+        expression, *parts = _substituted(row, symbols, constant)
+        (without,), _ = points.evaluate([expression])
+        if np.all(np.abs(value - without) <= ENTRY * size):
+            return replace(row, expression=expression, parts=tuple(parts))
+    return row
+
+
+def _substituted(row, symbols, values):
+    """The expression and the parts of a row with symbols replaced."""
+    return ca.substitute([row.expression, *row.parts], [ca.vertcat(*symbols)], [values])
 
 
 def _affine(q, expression, j, points):
@@ -278,7 +339,8 @@ def _eliminated(q, row, j, values, lower, points):
     solution = ca.SX.zeros(q.n)
     solution[columns], _ = eliminate(matrix, -rest, numbers[:, columns])
     uses = merge_uses((row.uses, 0), *((other.uses, j - other.order) for other in rows))
-    return replace(row, expression=ca.cse(ca.substitute(row.expression, jets, solution)), uses=uses)
+    expression, *parts = _substituted(row, ca.vertsplit(jets), solution)
+    return replace(row, expression=ca.cse(expression), uses=uses, parts=tuple(parts))
 
 
 def dependence(numbers):

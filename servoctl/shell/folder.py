@@ -54,16 +54,17 @@ class Folder:
 
     def __init__(self, path, name):
         self.path, self.name, self.moved, self._actions = path, name, False, []
-        self._made = [p for p in (path, *path.parents) if not p.exists()]
+        self._made = []
         try:
+            self._made = [p for p in (path, *path.parents) if not p.exists()]
             path.mkdir(parents=True, exist_ok=True)
             with tempfile.TemporaryFile(dir=path):
                 pass
-        except OSError as error:
+        except (OSError, ValueError) as error:  # ValueError: a name that no file can have
             self._leave()
-            reason = "it is a file" if path.is_file() else error.strerror or error
+            reason = "it is a file" if os.path.isfile(path) else getattr(error, "strerror", None) or error
             raise ServoError(
-                f"The folder {path} cannot be written: {reason}.",
+                f"The folder {str(path).encode(errors='backslashreplace').decode()} cannot be written: {reason}.",
                 f"Numbers and figures of a run are written to a folder, by default {Path('servoctl-runs', name)}.",
                 do="Give another folder by --out. Nothing has been computed yet.",
                 folder=str(path),
@@ -114,7 +115,7 @@ class Folder:
     def _leave(self):
         """Remove the folders made for this run that are still empty."""
         for path in self._made:
-            with contextlib.suppress(OSError):
+            with contextlib.suppress(OSError, ValueError):
                 path.rmdir()
 
 

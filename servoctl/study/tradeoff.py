@@ -8,7 +8,6 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from servoctl.checks import as_span, is_number, mapping, positive, positives
-from servoctl.codegen.function import compiling_at_once
 from servoctl.errors import LimitExceeded, ServoError, SpecificationError, unknown
 from servoctl.methods.accuracy import motion_error, relative_error
 from servoctl.methods.choice import (
@@ -263,7 +262,7 @@ def tradeoff(
     drifts = (None, "project", "minimal", abs(t1 - t0) / TIME_CONSTANT) if drift is None else drift
     combinations = _combinations(model, methods, drifts if isinstance(drifts, (list, tuple)) else [drifts])
     total = sum(len(settings[_kind(method)]) for method, _ in combinations)
-    with compiling_at_once(), progress_bar("tradeoff", progress, total, unit="run") as bar, warnings.catch_warnings():
+    with progress_bar("tradeoff", progress, total, unit="run") as bar, warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)  # steps outside the stable range: their errors are measured
         reference, rows, interrupted = Reference(model, x0, (t0, t1), limit), [], False
         try:

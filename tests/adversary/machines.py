@@ -71,8 +71,6 @@ def draw(pick, known=True):
     - Paths linear in time: a motion without acceleration, which `verify` measures against itself.
     - A row of order three or above that a combination of lower order replaces: `verify` does not know its derivatives.
     - Rows that differ by 1e-3 or less: `verify` compares forms without regard to their condition.
-    - A combination of rows by a decimal factor: its coefficients, folded in double precision, do not cancel to the last
-      digit, and are refused as neither zero nor resolved. Powers of two cancel.
     """
     n = pick(2, 5)
     ideal = pick(0, 1)
@@ -175,7 +173,7 @@ def _program(pick, n, k, ideal, known):
         if twist == 9:  # the top of the row before, and a row of lower order that it hides
             order = pick(0, orders[-1])
             core = _row(pick, n, a, order, known)
-            factor = _decimal(pick) if known else (-0.5, 0.5, 1.0, 2.0)[pick(0, 3)]
+            factor = _decimal(pick)
             rows.append(f"{factor}*D({plain[-1]}) + {core}")
             kinds.append("hidden program row")
         elif twist == 8:
