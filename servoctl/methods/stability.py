@@ -14,7 +14,7 @@ from servoctl.methods.accuracy import component_sizes
 from servoctl.methods.choice import ORDERS, Poles
 from servoctl.methods.motion import breakpoints, equal_steps
 from servoctl.methods.runge_kutta import tableau
-from servoctl.methods.watch import state_levels
+from servoctl.methods.sizes import state_levels
 
 SAME = {"DOP853": "RK8", "RK45": "RK5"}  # scipy's adaptive methods that go on with the result of these tableaus
 STEP_MAPS = (*ORDERS, *SAME, "RK23", "Taylor", "RadauIIA", "Radau")
