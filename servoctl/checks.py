@@ -11,6 +11,7 @@ import numpy as np
 from servoctl.errors import SpecificationError, unknown
 
 ON_SAMPLE = 1e-6  # rounding of a sampling instant [periods], or of a count
+MOST_CASES = 10**6  # of one sweep: some gigabytes of parameters and rows
 MOST_COUNT = 10**9  # samples, steps or rows: products of two such counts fit into the 64 bits of C
 MOST_MEMORY = 8e9  # bytes for all samples: the memory of common machines
 
@@ -132,7 +133,7 @@ def whole(name, value, least=0, most=math.inf):
     """An int from a whole number between `least` and `most`: from 1000.0, too, but not from True."""
     try:
         number = least - 1 if isinstance(value, (bool, str, bytes)) else int(value)
-    except (TypeError, ValueError, OverflowError):
+    except (TypeError, ValueError, OverflowError, RuntimeError):  # the last is CasADi's
         number = least - 1
     if not least <= number <= most or number != value:
         rule = f"It must be a whole number, at least {least}{f' and at most {most}' if most < math.inf else ''}."

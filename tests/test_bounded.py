@@ -192,6 +192,17 @@ def test_a_program_that_does_not_stand_still_outside_its_span_is_refused(path, e
         sv.simulate(model, start, (0.0, end), sv.Bounded())
 
 
+def test_switches_of_the_state_are_refused():
+    q = sv.coordinates("x a")
+    x, a = q
+    S = sv.particle(q, 1.0, (x, 0)) + sv.particle(q, 0.2, (x + 0.5 * ca.sin(a), 0.5 * ca.cos(a)))
+    U = 0.2 * 9.81 * 0.5 * ca.cos(a)
+    mechanism = sv.Mechanism(q, gibbs=S, potential=U, forces={"a": -0.1 * ca.sign(q.d(1)[1])}, actuators={"F": x})
+    model = sv.derive(mechanism, sv.Program({"x": x - step()(q.t)}))
+    with refused(SpecificationError, "kinks or switches"):
+        sv.simulate(model, model.start(a=0.0, da=0.0), (0.0, 1.0), sv.Bounded())
+
+
 def test_what_bounded_motions_do_not_take_is_refused(gallery_model):
     model, start = cart_pole(step())
     with refused(SpecificationError, "(0, 1)", t_span=(1.0, 0.0)):

@@ -17,6 +17,7 @@ from servoctl.errors import IntegrationStopped, SingularProgram, SpecificationEr
 from servoctl.methods.accuracy import state_levels
 from servoctl.methods.motion import Motion, breakpoints
 from servoctl.methods.radau import basis, radau
+from servoctl.model.switching import switching
 
 ORDER = 13  # of the collocation: seven nodes
 LONGEST = 1.0  # interval of the first mesh, in time constants of the fastest mode
@@ -31,7 +32,7 @@ BETWEEN = (0.15, 0.5, 0.9)  # places within an interval where the defect is meas
 SAMPLES = 1001
 
 
-def bounded(model, span, guess, method, times, knots, progress):
+def bounded(model, span, guess, method, instants, progress):
     """The bounded motion of a program.
 
     Parameters
@@ -42,10 +43,9 @@ def bounded(model, span, guess, method, times, knots, progress):
     guess : (n_x,) array
         Where Newton's method for the first equilibrium begins.
     method : Bounded
-    times : (N,) array or None
-        Of the samples [s]; None for 1001 instants of the whole window, and the knots.
-    knots : sequence of float
-        Instants where the program is not smooth [s].
+    instants : (times, knots)
+        Times of the samples [s], None for 1001 instants of the whole window and the knots; and the instants where the
+        program is not smooth [s].
     progress : callable
 
     Returns
@@ -62,12 +62,19 @@ def bounded(model, span, guess, method, times, knots, progress):
     IntegrationStopped, SingularProgram
         If there is no equilibrium, Newton's method does not converge, or a pivot vanishes.
     """
+    times, knots = instants
     if span[1] < span[0]:
         raise SpecificationError(
             f"t_span=({span[0]:g}, {span[1]:g}) was given with method='bounded'.",
             "A bounded motion joins the rest before the program to the rest after it.",
             nearest=f"({span[1]:g}, {span[0]:g}).",
             t_span=span,
+        )
+    if switching(model) is not None:
+        raise SpecificationError(
+            "method='bounded' was given for a mechanism or program with kinks or switches of the state.",
+            "A bounded motion is solved for at all instants at once, on one smooth branch.",
+            do="Smooth the switch, such as tanh(v/v0) for sign(v).",
         )
     problem = Problem(model, span, guess)
     window = problem.window(method.window)
