@@ -22,7 +22,7 @@ from servoctl.model.switching import switching
 ORDER = 13  # of the collocation: seven nodes
 LONGEST = 1.0  # interval of the first mesh, in time constants of the fastest mode
 MOST_INTERVALS = 4000
-NEWTON_STEPS, SETTLED, STALLED = 40, 1e-12, 1e-9  # of Newton's method; relative size of its last step
+NEWTON_STEPS, NEWTON_ENDS, STALLED = 40, 1e-12, 1e-9  # of Newton's method; relative size of its last step
 REFINEMENTS, MOST_PIECES = 10, 4  # of the mesh; and into how many an interval is cut at most
 AIM = 0.1  # defect that refinement aims at, relative to the tolerance
 HYPERBOLIC = 1e-6  # real part of an eigenvalue, relative to the largest eigenvalue, below which it lies on the axis
@@ -187,7 +187,7 @@ class Problem:
                 return np.full_like(x, np.nan)
             largest = np.abs(change / self.size).max(axis=1, initial=0.0)
             x += (change * np.minimum(1.0, 1.0 / np.maximum(largest, 1e-300))[:, None]).T
-            if not largest.max(initial=0.0) > SETTLED:
+            if not largest.max(initial=0.0) > NEWTON_ENDS:
                 break
         return x
 
@@ -293,7 +293,7 @@ class Problem:
             if not np.isfinite(size):
                 break
             x = x + step
-            if size <= SETTLED or 0.1 * last < size <= STALLED:
+            if size <= NEWTON_ENDS or 0.1 * last < size <= STALLED:
                 return x
             last = size
         raise self._failure("Newton's method for the bounded motion does not converge.", self.span[0])
