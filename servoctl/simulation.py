@@ -34,7 +34,7 @@ from servoctl.methods.orders import end_at_other_orders
 from servoctl.methods.radau import RadauSteps
 from servoctl.methods.runge_kutta import ORDERS, RungeKuttaSteps
 from servoctl.methods.scipy_methods import ScipySteps
-from servoctl.methods.stability import run_checked, warn_many_steps, warn_unstable
+from servoctl.methods.stability import run_checked, warn_drifted, warn_many_steps, warn_unstable
 from servoctl.methods.sundials import SundialsSteps
 from servoctl.methods.taylor import TaylorSteps
 from servoctl.model.model import Model
@@ -48,6 +48,7 @@ from servoctl.run import SAME_TIME, Run
 DEFAULT_SAMPLES = 1001  # without t_eval: smooth curves, and extrema refined to rounding
 STEPS_IN_SPAN = 2000  # steps of fixed length in a span if the method has no step
 MOST_STEPS = 10**8  # of fixed length: more would fill the memory with samples
+DRIFTED = 1e-3  # the same at the end of a motion that deserves a warning
 OFF = 1e-5  # residual relative to its gradient times the state, above which a start is inconsistent
 
 
@@ -187,7 +188,18 @@ def simulated(model, start, t_span, method=None, *, drift=None, t_eval=None, pro
     if motion.stop is not None:
         motion.stop.run = run
         raise motion.stop
+    if run.success and not model.flat:
+        _warn_drifted(run)
     return run
+
+
+def _warn_drifted(run):
+    """Warn where the last state violates a constraint more than any start may."""
+    model, x = run.variant(len(run.t) - 1), run.jets[: len(run.model.state_names), -1]
+    names, values, off = _scaled_residuals(model, run.t[-1], x)
+    if off.max(initial=0.0) > DRIFTED:
+        worst = int(np.argmax(off))
+        warn_drifted(names[worst], float(values[worst]), float(run.t[-1]), run.method)
 
 
 def judged(run, tolerance=STEP_ERROR, warn=True):

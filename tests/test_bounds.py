@@ -219,3 +219,18 @@ def test_steps_over_a_singularity_are_warned_about():
     for drift in (None, 0.5, "project"):
         with warned("RK4", "resolve"):
             sv.simulate(model, start, (0.0, 1.5), method=sv.RungeKutta(4, step=0.3), drift=drift)
+
+
+@pytest.mark.parametrize("step, span", [(None, 50.0), (0.05, 20.0)])
+def test_fixed_steps_that_drift_off_the_program_are_warned_about(step, span):
+    """A pendulum of 1 m as a circle that is kept by its second derivative alone."""
+    q = sv.coordinates("x y")
+    x, y = q
+    mechanism = sv.Mechanism(q, gibbs=sv.particle(q, 1.0, (x, y)), potential=9.81 * y)
+    model = sv.derive(mechanism, sv.Program({"rod": x**2 + y**2 - 1}, by="ideal"))
+    start = model.start(x=1.0, y=0.0, dx=0.0, dy=0.0)
+    with warned("'rod'", "drift='project'"):
+        run = sv.simulate(model, start, (0.0, span), sv.RungeKutta(4, step))
+    assert np.abs(run.residual["rod"]).max() > 0.01
+    kept = sv.simulate(model, start, (0.0, span), sv.RungeKutta(4, step), drift="project")
+    assert np.abs(kept.residual["rod"]).max() < 1e-12

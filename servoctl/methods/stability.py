@@ -245,6 +245,16 @@ def warn_unstable(verdict):
     )
 
 
+def warn_drifted(name, residual, t, method):
+    """Warn that the residual of a constraint has drifted away from zero by the end of a motion at t [s]."""
+    warnings.warn(
+        f"The residual of {name!r} has drifted to {residual:.2g} at t = {t:.6g} s: {method} does not keep the program "
+        "so long. Use drift='project', poles by a time constant, shorter steps or a smaller rtol.",
+        RuntimeWarning,
+        stacklevel=_outside(),
+    )
+
+
 def unresolved(pieces, halved):
     """The last step of a motion, or else the one of the fastest change, if two half steps lead elsewhere.
 

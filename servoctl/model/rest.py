@@ -61,8 +61,12 @@ def started(model, t, held, guess, hold):
         failure = error
     chosen = {**(guess or {}), **held}
     still = standstill(model, t, chosen)
-    if still is not None and not hold and not set(still.coordinates) <= set(chosen):
-        return _limit(model, t, held, chosen, still)
+    if still is not None and not hold and not set(still.coordinates) <= set(held):
+        try:
+            return _limit(model, t, held, chosen, still)
+        except SingularProgram:  # without a limit a guess chooses
+            if state is None or not set(still.coordinates) <= set(chosen):
+                raise
     if state is None:
         raise failure
     return state
