@@ -148,7 +148,7 @@ def _sampled(run, times):
     picked = np.isin(run.t, times)
     picked[-1] |= run.status < 0 or not picked.any()
     index = np.append(0, np.cumsum(picked))
-    variants = tuple((index[a], index[b], variant) for a, b, variant in run.variants if index[b] > index[a])
+    variants = tuple((int(index[a]), int(index[b]), v) for a, b, v in run.variants if index[b] > index[a])
     return replace(run, t=run.t[picked], jets=run.jets[:, picked], variants=variants)
 
 

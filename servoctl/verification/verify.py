@@ -220,7 +220,7 @@ class _Checks:
         names = self.model.signals("reaction" if self.model.ideal else "actuation")[0]
         stored = {name: numbers(self.stored.get(name, np.nan), 1) for name in names}
         alike = {name: v for name, v in stored.items() if v is not None and v.shape == self.run.t.shape}
-        values = np.array([alike.get(name, self.fresh[name]) for name in names]).reshape(len(names), -1)
+        values = np.array([alike.get(name, self.fresh[name]) for name in names]).reshape(len(names), len(self.run.t))
         return [values[:, a:b] for a, b, _ in self.run.variants]
 
     # sizes
