@@ -62,7 +62,8 @@ class Run(ByName, Value):
     variants : tuple of (first, last + 1, model)
         The variant of the model, with its choice of pivots, for each range of samples; empty if there is only one.
     internal : dict
-        The verdict on the internal dynamics along the run (`InternalDynamics.facts`); empty for flat programs.
+        The verdict on the internal dynamics along the run (`InternalDynamics.facts`); empty for flat programs and
+        for plants under inputs.
     start : State or None
         From which the motion was computed. It also says which branch of its solutions a flat program follows:
         `simulate(model, run.start, ...)` repeats it.

@@ -115,7 +115,7 @@ def simulate(
     model, start = _model_and_start(model, start, inputs)
     span, tolerance = as_span(t_span), getattr(method, "rtol", STEP_ERROR)
     times = dense = None if t_eval is None else _sample_times(*span, t_eval, ())
-    if times is not None and not model.flat:  # the verdict on internal dynamics needs more samples than a few
+    if times is not None and _has_internal_dynamics(model):  # whose verdict needs more samples than a few
         own = np.linspace(*span, DEFAULT_SAMPLES)
         dense = None if _fixed_steps(method) else times if len(times) >= len(own) else np.union1d(times, own)
 
@@ -141,7 +141,7 @@ def _fixed_steps(method):
 
 def _sampled(run, times):
     """The run at its samples among some times; all of it without times, and the state in which it stopped anyway."""
-    if times is None or run.model.flat:
+    if times is None or not _has_internal_dynamics(run.model):
         return run
     if run.method in ORDERS:
         return _resample(run, times)
@@ -188,8 +188,13 @@ def simulated(model, start, t_span, method=None, *, drift=None, t_eval=None, pro
     return run
 
 
+def _has_internal_dynamics(model):
+    """Whether a program leaves something free; a plant under inputs has no program."""
+    return bool(model.reduction.program.residuals) and not model.flat
+
+
 def judged(run, tolerance=STEP_ERROR, warn=True):
-    """A run with the verdict on its internal dynamics, and a warning if they are unstable.
+    """A run with the verdict on its internal dynamics, if it has any, and a warning if they are unstable.
 
     Parameters
     ----------
@@ -198,7 +203,7 @@ def judged(run, tolerance=STEP_ERROR, warn=True):
         Relative error of a step of its method.
     warn : bool
     """
-    if run.model.flat:
+    if not _has_internal_dynamics(run.model):
         return run
     internal = internal_dynamics(run.model, run)
     if warn and internal.verdict == "unstable":
