@@ -13,6 +13,7 @@ from servoctl.errors import ServoError, SpecificationError
 from servoctl.methods.taylor import series_loop
 from servoctl.model.model import Model
 from servoctl.model.store import fingerprint
+from servoctl.model.switching import switching
 from servoctl.run import SAME_TIME, Run, require_model
 from servoctl.verification.between import ENOUGH_STEPS, FEW_STEPS, Flow, Integration, between
 from servoctl.verification.loop import verify_loop
@@ -28,6 +29,7 @@ LIMITS = {
     "multiplier form": 1e-9,
     "higher jets": 1e-6,
     "residual": 1e-6,
+    "switches": 1e-6,
 }
 INTEGRATED = 1e-6  # limit for numbers that drift disturbs: γ'' is integrated itself, or rows are hidden
 ROUNDING = 1e-13  # relative change of states and inputs whose effect is rounding: some hundred roundings
@@ -88,6 +90,7 @@ def verify(model: Model | Closed, run: Run | None = None, segments: int = 20) ->
         "multiplier form": checks.multiplier_form(),
         **checks.higher_jets(),
         **checks.outside(),
+        **checks.switches(),
         **checks.residuals(),
     }
     found |= {"segments": checks.segments()} if len(run.t) > 1 else {}
@@ -142,10 +145,24 @@ def _variants(model, run, count):
         if not (isinstance(variant, tuple) and len(variant) == 3 and isinstance(variant[2], Model)):
             break
         first, end, of = variant
-        if first >= count or first != (ranges[-1][1] if ranges else 0) or not _same(model, of):
+        if first >= count or first != (ranges[-1][1] if ranges else 0) or not _same(_on_side(model, of), of):
             break
         ranges.append((first, min(end, count), of))
     return tuple(ranges) if ranges and ranges[-1][1] == count else ((0, count, model),)
+
+
+def _branches(model, variant):
+    """The branches of switches that a variant of a model takes, which are its last parameters."""
+    return tuple(variant.parameters[len(model.parameters) :])
+
+
+def _on_side(model, variant):
+    """The model on the side of its switches on which a variant is; the model itself if there is none."""
+    branches, family = _branches(model, variant), None
+    with contextlib.suppress(ServoError):
+        family = switching(model) if branches else None
+        return family.at(branches) if family and len(branches) == len(family.switches) else model
+    return model
 
 
 def _same(model, other):
@@ -201,6 +218,8 @@ class _Checks:
             _Instants(v, run.t[a:b], run.jets[:, a:b], inputs, a)
             for (a, b, v), inputs in zip(run.variants, self._inputs(), strict=True)
         ]
+        switched = any(_branches(model, v) for *_, v in run.variants)
+        self.family = switching(model) if switched else None
         self.mass = self._mass()
         self.sizes = self._sizes(self.samples)
         self.balanced = self._balanced()
@@ -291,8 +310,12 @@ class _Checks:
         return found, sampled, self._own(found)
 
     def _flows(self, flat, sample):
-        """The flows to try from an edge on: of the variants next to its sample, and of one with its own pivots."""
-        variants, firsts = [v for *_, v in self.run.variants], [a for a, *_ in self.run.variants]
+        """The flows to try from an edge on: of the variants next to its sample, and of one with its own pivots.
+
+        Edges lie on all switches, so that the model itself is smooth between them.
+        """
+        variants = [self.model if self.family else v for *_, v in self.run.variants]
+        firsts = [a for a, *_ in self.run.variants]
         allowance = [MOST_OWN_PIVOTS]
 
         def flows(k):
@@ -321,9 +344,24 @@ class _Checks:
         for flow, parts in by_flow.items():
             t, z = (np.concatenate(values, axis=-1) for values in zip(*parts, strict=True))
             few = np.unique(np.linspace(0, len(t) - 1, OWN_INSTANTS).astype(int))
-            instants = _Instants(flow.model, t[few], flow.corrected(t[few], z[:, few]), None)
-            own.append(replace(instants, inputs=instants.signals("inputs")))
+            t, z = t[few], flow.corrected(t[few], z[:, few])
+            for model, which in self._sides(flow.model, t, z):
+                instants = _Instants(model, t[which], z[:, which], None)
+                own.append(replace(instants, inputs=instants.signals("inputs")))
         return own
+
+    def _sides(self, model, t, z):
+        """The models on the sides of the switches on which instants lie, with the indices of these instants."""
+        if self.family is None:
+            return [(model, slice(None))]
+        forward = self.run.t[-1] > self.run.t[0]
+        before = np.searchsorted(self.run.t if forward else -self.run.t, t if forward else -t, side="right") - 1
+        sides = {}
+        for k, sample in enumerate(before):
+            known = _branches(self.model, self.run.variant(sample))
+            branches = self.family.branches(t[k], z[: len(self.model.state_names), k], known)
+            sides.setdefault(branches, []).append(k)
+        return [(self.family.at(branches), which) for branches, which in sides.items()]
 
     def segments(self):
         """Largest difference of the states from those integrated from the sample before."""
@@ -527,6 +565,17 @@ class _Checks:
             sizes = self.sizes[nq + top * n :, None] + rounding / self.limit("higher jets")
             worst = max(worst, largest((at.z[nq + top * n :] - again) / sizes))
         return {"higher jets": worst}
+
+    def switches(self):
+        """Largest change of a state, relative to its size, that leads it back to its side of a switch."""
+        if self.family is None:
+            return {}
+        n_x, worst = len(self.model.state_names), 0.0
+        for at in self.samples:
+            functions, slopes, _ = self.family.values(_branches(self.model, at.model), at.t, at.z[:n_x])
+            reach = np.abs(slopes * self.sizes[:n_x, None]).sum(axis=1)
+            worst = max(worst, largest(_ratio(np.minimum(functions, 0.0), reach)))
+        return {"switches": worst}
 
     def outside(self):
         """Largest part of an ideal reaction outside the actuators' directions, relative to the reaction."""
