@@ -291,15 +291,22 @@ def _run(model, motion, method, drift, knots, span):
 
 
 def _resample(run, times):
-    """The run at other times, each with the variant of the nearest step."""
+    """The run at other times: states between steps by interpolation, and their highest derivatives by the equations."""
+    direction = np.sign(run.t[-1] - run.t[0]) or 1.0
     low, high = min(run.t[0], run.t[-1]), max(run.t[0], run.t[-1])
     times = times[(times >= low) & (times <= high)]
-    if len(run.variants) == 1:
-        variants = ((0, len(times), run.variants[0][2]),)
-    else:
-        nearest = (int(np.argmin(np.abs(run.t - t))) for t in times)
-        variants = tuple((i, i + 1, run.variant(step)) for i, step in enumerate(nearest))
-    return replace(run, t=times, jets=np.array([run.at(t) for t in times]).T, variants=variants)
+    steps = np.searchsorted(direction * run.t, direction * times - SAME_TIME * (1 + abs(high - low)))
+    jets = np.array([run.at(t) for t in times]).T.reshape(len(run.jets), len(times))
+    variants = []
+    for first, end, variant in run.variants or ((0, len(run.t), run.model),):
+        inside = np.flatnonzero((steps >= first) & (steps < end))  # the variant of a step's end holds within the step
+        if len(inside):
+            a, b, n_x, n = int(inside[0]), int(inside[-1]) + 1, len(variant.state_names), variant.n
+            rates = variant.function("ode").grid(times[a:b], jets[:n_x, a:b], variant.parameters)[n_x - n : n_x]
+            highest = jets[n_x : n_x + n, a:b]
+            highest[:] = np.where(np.isfinite(highest), rates, highest)
+            variants.append((a, b, variant))
+    return replace(run, t=times, jets=jets, variants=tuple(variants))
 
 
 def _require_decay(model, drift, t0, t1):

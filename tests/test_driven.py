@@ -88,6 +88,7 @@ def test_inputs_stay_within_their_limits(machine):
     run = sv.simulate(plant, START, (0.0, 6.0), inputs={"trolley": 5 * ca.sin(machine.mechanism.q.t)})
     assert run["trolley"] == pytest.approx(np.clip(5 * np.sin(run.t), -1.0, 2.0), abs=1e-14)
     assert ends(run) == pytest.approx(reference(plant, lambda t: np.clip(5 * np.sin(t), -1.0, 2.0), 6.0), abs=1e-5)
+    assert sv.verify(run.model, run).passed
 
 
 @pytest.mark.parametrize("method", [None, "Taylor", "RK4"])

@@ -14,7 +14,7 @@ from servoctl.methods.taylor import series_loop
 from servoctl.model.model import Model
 from servoctl.model.store import fingerprint
 from servoctl.model.switching import switching
-from servoctl.run import SAME_TIME, Run, require_model
+from servoctl.run import SAME_TIME, Run, on_side, require_model, sides
 from servoctl.verification.between import ENOUGH_STEPS, FEW_STEPS, Flow, Integration, between
 from servoctl.verification.loop import verify_loop
 from servoctl.verification.result import Verification, judged, largest, numbers
@@ -145,30 +145,23 @@ def _variants(model, run, count):
         if not (isinstance(variant, tuple) and len(variant) == 3 and isinstance(variant[2], Model)):
             break
         first, end, of = variant
-        if first >= count or first != (ranges[-1][1] if ranges else 0) or not _same(_on_side(model, of), of):
+        if first >= count or first != (ranges[-1][1] if ranges else 0) or not _same_or_smooth(model, of):
             break
         ranges.append((first, min(end, count), of))
     return tuple(ranges) if ranges and ranges[-1][1] == count else ((0, count, model),)
-
-
-def _branches(model, variant):
-    """The branches of switches that a variant of a model takes, which are its last parameters."""
-    return tuple(variant.parameters[len(model.parameters) :])
-
-
-def _on_side(model, variant):
-    """The model on the side of its switches on which a variant is; the model itself if there is none."""
-    branches, family = _branches(model, variant), None
-    with contextlib.suppress(ServoError):
-        family = switching(model) if branches else None
-        return family.at(branches) if family and len(branches) == len(family.switches) else model
-    return model
 
 
 def _same(model, other):
     """Whether two models have the same specification and numbers, up to the choice of pivots."""
     marks = {fingerprint(m.reduction.mechanism, m.reduction.program, values=()) for m in (model, other)}
     return model is other or (len(marks) == 1 and np.array_equal(model.parameters, other.parameters))
+
+
+def _same_or_smooth(model, variant):
+    """Whether a variant is the same model, or the smooth one of its own branches of switches."""
+    with contextlib.suppress(ServoError):
+        return _same(on_side(model, sides(model, variant)), variant)
+    return False
 
 
 def _require_same(model, other):
@@ -218,7 +211,7 @@ class _Checks:
             _Instants(v, run.t[a:b], run.jets[:, a:b], inputs, a)
             for (a, b, v), inputs in zip(run.variants, self._inputs(), strict=True)
         ]
-        switched = any(_branches(model, v) for *_, v in run.variants)
+        switched = any(sides(model, v) for *_, v in run.variants)
         self.family = switching(model) if switched else None
         self.mass = self._mass()
         self.sizes = self._sizes(self.samples)
@@ -356,12 +349,12 @@ class _Checks:
             return [(model, slice(None))]
         forward = self.run.t[-1] > self.run.t[0]
         before = np.searchsorted(self.run.t if forward else -self.run.t, t if forward else -t, side="right") - 1
-        sides = {}
+        groups = {}
         for k, sample in enumerate(before):
-            known = _branches(self.model, self.run.variant(sample))
+            known = sides(self.model, self.run.variant(sample))
             branches = self.family.branches(t[k], z[: len(self.model.state_names), k], known)
-            sides.setdefault(branches, []).append(k)
-        return [(self.family.at(branches), which) for branches, which in sides.items()]
+            groups.setdefault(branches, []).append(k)
+        return [(self.family.at(branches), which) for branches, which in groups.items()]
 
     def segments(self):
         """Largest difference of the states from those integrated from the sample before."""
@@ -572,7 +565,7 @@ class _Checks:
             return {}
         n_x, worst = len(self.model.state_names), 0.0
         for at in self.samples:
-            functions, slopes, _ = self.family.values(_branches(self.model, at.model), at.t, at.z[:n_x])
+            functions, slopes, _ = self.family.values(sides(self.model, at.model), at.t, at.z[:n_x])
             reach = np.abs(slopes * self.sizes[:n_x, None]).sum(axis=1)
             worst = max(worst, largest(_ratio(np.minimum(functions, 0.0), reach)))
         return {"switches": worst}
