@@ -358,7 +358,10 @@ def _resolved(model, run):
         instants = _instants(model, run, finite, count)
         if instants is not None:
             tangents = _tangents(model, run, *instants).in_fours()
-            steps, longer = (_steps(tangents[::stride]) for stride in (1, 2))
+            try:
+                steps, longer = (_steps(tangents[::stride]) for stride in (1, 2))
+            except np.linalg.LinAlgError:  # of rates near a singular state, which steps as long as these do not resolve
+                steps = longer = None
             if steps is not None and longer is not None:
                 propagators = _propagators(steps)
                 if _mismatch(steps, longer) < LOCAL and _agree(propagators, _propagators(longer)):
