@@ -33,7 +33,7 @@ AGREE = 0.02  # of 1 + ln(growth): difference of its logarithm by steps twice as
 LOCAL, DECAYED = 0.2, 1e-3  # relative difference of one such step that is accepted; norm below which it counts less
 JITTER, GOLDEN = 0.5, 0.6180339887498949  # of their distance by which instants are irregular, by the golden ratio
 TURNED = 0.75  # squared sines of the angles between tangent spaces at an end of a segment and at its middle, summed
-DENSE = 4  # samples for each instant, with which instants are samples
+DENSE = 3  # samples for each instant, with which instants are samples
 DEFECT = 1e-3  # of the sizes of the states: largest error, over an interval of samples, of states between them
 BLOCKS = 32  # instants between which growth is measured, as all pairs of them
 SWEEPS, BALANCED = 30, 0.01  # of balancing, at most; until sums of rows and of columns agree to one percent
@@ -498,16 +498,24 @@ def _exponential(omega):
 def _propagators(steps):
     """Ends of blocks of steps (n,), then propagators e^log Y between all of them, Y[s, t] (f, f) and log[s, t]."""
     ends = np.linspace(0, len(steps), min(BLOCKS, len(steps)) + 1).round().astype(int)
-    n, f = len(ends), steps.shape[1]
+    n, f, longest = len(ends), steps.shape[1], np.diff(ends).max()
+    block, of_block = np.tile(np.eye(f), (n - 1, 1, 1)), np.zeros(n - 1)
+    for k in range(longest):
+        inside = np.flatnonzero(ends[:-1] + k < ends[1:])
+        block[inside], size = _normalised(steps[ends[inside] + k] @ block[inside])
+        of_block[inside] += size
     Y, log = np.zeros((n, n, f, f)), np.full((n, n), -np.inf)
     Y[range(n), range(n)], log[range(n), range(n)] = np.eye(f), 0.0
     for j in range(1, n):
-        Y[:j, j], log[:j, j] = Y[:j, j - 1], log[:j, j - 1]
-        for step in steps[ends[j - 1] : ends[j]]:
-            product = step @ Y[:j, j]
-            size = np.maximum(_frobenius(product), TINY)
-            Y[:j, j], log[:j, j] = product / size[:, None, None], log[:j, j] + np.log(size)
+        Y[:j, j], size = _normalised(block[j - 1] @ Y[:j, j - 1])
+        log[:j, j] = log[:j, j - 1] + of_block[j - 1] + size
     return ends, Y, log
+
+
+def _normalised(matrices):
+    """Matrices of norm 1, and the logarithms of the norms that they had."""
+    size = np.maximum(_frobenius(matrices), TINY)
+    return matrices / size[:, None, None], np.log(size)
 
 
 def _growth(tangents, propagators, scale=None):
