@@ -11,6 +11,7 @@ nothing: where J changes, x' = J x may grow though all of them are negative, and
 """
 
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -31,7 +32,8 @@ FEWEST, MOST = 32, 2**14  # instants of the linearisation, first and last try
 AGREE = 0.02  # of 1 + ln(growth): difference of its logarithm by steps twice as long that is accepted
 LOCAL, DECAYED = 0.2, 1e-3  # relative difference of one such step that is accepted; norm below which it counts less
 JITTER, GOLDEN = 0.5, 0.6180339887498949  # of their distance by which instants are irregular, by the golden ratio
-TURNED = 0.5  # smallest cosine between tangent spaces at the ends of a segment and at its middle
+TURNED = 0.75  # squared sines of the angles between tangent spaces at an end of a segment and at its middle, summed
+DENSE = 3  # samples for each instant, with which instants are samples
 DEFECT = 1e-3  # of the sizes of the states: largest error, over an interval of samples, of states between them
 BLOCKS = 32  # instants between which growth is measured, as all pairs of them
 SWEEPS, BALANCED = 30, 0.01  # of balancing, at most; until sums of rows and of columns agree to one percent
@@ -51,12 +53,8 @@ class InternalDynamics:
 
     Attributes
     ----------
-    t : (N,) array
-        Instants [s].
-    names : tuple of str
-        f states that may serve as its coordinates.
-    eigenvalues : (f, N) complex array
-        Frozen eigenvalues: of the linearisation at each instant [1/s], by descending real part. They decide nothing.
+    tangents : Tangents
+        The linearisation.
     verdict : {"none", "stable", "neutral", "unstable", "inconclusive"}
         "none" for flat programs. Over the time of the run, and no longer: "unstable" if an error grows more than
         tenfold and exponentially, or 1e4-fold, "stable" if none does and all errors of the start have shrunk at its
@@ -74,15 +72,31 @@ class InternalDynamics:
         Floquet's, the eigenvalues of the propagator over a period; none without a period.
     """
 
-    t: np.ndarray
-    names: tuple
-    eigenvalues: np.ndarray
+    tangents: "Tangents" = field(repr=False)
     verdict: str
     growth: float
     left: float = 1.0
     until: np.ndarray = field(default_factory=lambda: np.ones((2, 0)))
     period: float = 0.0
     multipliers: np.ndarray = field(default_factory=lambda: np.zeros(0, complex))
+
+    @property
+    def t(self):
+        """Instants [s], (N,) array."""
+        return self.tangents.t
+
+    @property
+    def names(self):
+        """Names of f states that may serve as its coordinates, tuple of str."""
+        return self.tangents.independent
+
+    @property
+    def eigenvalues(self):
+        """Frozen eigenvalues [1/s], (f, N) complex array: of the linearisation at each instant, by real part.
+
+        They decide nothing.
+        """
+        return self.tangents.eigenvalues
 
     @property
     def length(self):
@@ -199,18 +213,22 @@ def internal_dynamics(model: Model, run: Run, period: float | None = None) -> In
     """
     require_model(model, run, "internal_dynamics")
     if model.flat:
-        return InternalDynamics(run.t[:0], (), np.zeros((0, 0), complex), "none", 1.0)
+        return InternalDynamics(Tangents((), run.t[:0], np.ones(0), *np.zeros((2, 0, 0, 0))), "none", 1.0)
     resolved = _resolved(model, run)
     if resolved is None:
         return _inconclusive(model, run)
-    judged = _judged(model, *resolved)
+    judged = _judged(*resolved)
     return judged if period is None else _with_multipliers(model, run, positive("period", period), judged)
 
 
 @dataclass(frozen=True)
-class _Tangents:
-    """Instants (K,), orthonormal bases N of the tangent space in scaled states, and their rates J N (K, n_x, f)."""
+class Tangents:
+    """Names of the states (n_x,), instants (K,), and sizes of the states along a motion (n_x,).
 
+    Orthonormal bases N of the tangent space in scaled states, and their rates J N, (K, n_x, f).
+    """
+
+    states: tuple
     t: np.ndarray
     size: np.ndarray
     N: np.ndarray
@@ -228,6 +246,26 @@ class _Tangents:
     def frozen(self):
         """Nᵀ J N, (K, f, f)."""
         return self.N.swapaxes(1, 2) @ self.JN
+
+    @cached_property
+    def eigenvalues(self):
+        """Of Nᵀ J N at each instant, (f, K), by descending real part."""
+        values = np.linalg.eigvals(self.frozen).astype(complex)
+        return np.take_along_axis(values, np.argsort(-values.real, axis=1, kind="stable"), axis=1).T
+
+    @cached_property
+    def independent(self):
+        """Names of states that serve as coordinates of the internal dynamics at all instants: the first fit ones."""
+        if not len(self.t):
+            return ()
+        bases = np.linalg.qr(self.size[:, None] * self.N)[0].transpose(1, 0, 2)
+        rows, picked = bases.reshape(bases.shape[0], -1), []
+        for _ in range(self.N.shape[2]):
+            sizes = _frobenius(rows[:, None])
+            picked.append(int(np.argmax(sizes >= SHARED * sizes.max())))
+            pivot = rows[picked[-1]] / sizes[picked[-1]]
+            rows = rows - np.outer(rows @ pivot, pivot)
+        return tuple(self.states[i] for i in sorted(picked))
 
 
 def linearised(model, run, count):
@@ -284,7 +322,7 @@ def _tangents(model, run, samples, t, x):
     for variant, inside in _by_variant(model, run, samples):
         N[inside], JN[inside] = _bases(variant, t[inside], x[:, inside], size)
     finite = np.isfinite(JN).all(axis=(1, 2))
-    return _Tangents(t[finite], size, N[finite], JN[finite])
+    return Tangents(model.state_names, t[finite], size, N[finite], JN[finite])
 
 
 @np.errstate(all="ignore")
@@ -295,7 +333,7 @@ def _bases(model, t, x, size):
     rows = np.linalg.norm(C, axis=2, keepdims=True)
     C = C / np.where(rows > 0, rows, 1.0)
     lost = ~np.isfinite(C).all(axis=(1, 2))[:, None, None]
-    N = np.linalg.svd(np.where(lost, 0.0, C))[2][:, m:].swapaxes(1, 2)
+    N = np.linalg.qr(np.where(lost, 0.0, C).swapaxes(1, 2), mode="complete")[0][:, :, m:]
     columns = np.repeat(np.arange(len(t)), f)
     directions = (size[:, None] * N).swapaxes(1, 2).reshape(-1, n_x).T
     p = np.concatenate([np.broadcast_to(p[:, None], (len(p), len(columns))), directions])
@@ -320,7 +358,10 @@ def _resolved(model, run):
         instants = _instants(model, run, finite, count)
         if instants is not None:
             tangents = _tangents(model, run, *instants).in_fours()
-            steps, longer = (_steps(tangents[::stride]) for stride in (1, 2))
+            try:
+                steps, longer = (_steps(tangents[::stride]) for stride in (1, 2))
+            except np.linalg.LinAlgError:  # of rates near a singular state, which steps as long as these do not resolve
+                steps = longer = None
             if steps is not None and longer is not None:
                 propagators = _propagators(steps)
                 if _mismatch(steps, longer) < LOCAL and _agree(propagators, _propagators(longer)):
@@ -335,6 +376,9 @@ def _instants(model, run, finite, count):
     States between samples are those of Hermite's cubic, or of steps where instants are denser than samples. Instants
     at equal distances would see a periodic linearisation at one phase only.
     """
+    if DENSE * count < len(finite):
+        samples = finite[((len(finite) - 1) * _irregular(count)).round().astype(int)]
+        return samples, run.t[samples], _states(model, run)[:, samples]
     if count > 4 * (len(finite) - 1):
         return _stepped(model, run, finite, 4 * -(-count // (4 * (len(finite) - 1))))
     last, x, place = len(finite) - 1, _states(model, run), (len(finite) - 1) * _irregular(count)
@@ -425,7 +469,7 @@ def _steps(tangents):
         return None
     M = N[m].swapaxes(1, 2)
     G0, G1 = M @ N[a], M @ N[b]
-    if min(np.linalg.svd(G, compute_uv=False).min() for G in (G0, G1)) < TURNED:
+    if max((G.shape[1] - (G**2).sum(axis=(1, 2))).max() for G in (G0, G1)) > TURNED:
         return None
     B0, B, B1 = M @ JN[a] @ np.linalg.inv(G0), M @ JN[m], M @ JN[b] @ np.linalg.inv(G1)
     h = (t[b] - t[a])[:, None, None]
@@ -454,16 +498,24 @@ def _exponential(omega):
 def _propagators(steps):
     """Ends of blocks of steps (n,), then propagators e^log Y between all of them, Y[s, t] (f, f) and log[s, t]."""
     ends = np.linspace(0, len(steps), min(BLOCKS, len(steps)) + 1).round().astype(int)
-    n, f = len(ends), steps.shape[1]
+    n, f, longest = len(ends), steps.shape[1], np.diff(ends).max()
+    block, of_block = np.tile(np.eye(f), (n - 1, 1, 1)), np.zeros(n - 1)
+    for k in range(longest):
+        inside = np.flatnonzero(ends[:-1] + k < ends[1:])
+        block[inside], size = _normalised(steps[ends[inside] + k] @ block[inside])
+        of_block[inside] += size
     Y, log = np.zeros((n, n, f, f)), np.full((n, n), -np.inf)
     Y[range(n), range(n)], log[range(n), range(n)] = np.eye(f), 0.0
     for j in range(1, n):
-        Y[:j, j], log[:j, j] = Y[:j, j - 1], log[:j, j - 1]
-        for step in steps[ends[j - 1] : ends[j]]:
-            product = step @ Y[:j, j]
-            size = np.maximum(_frobenius(product), TINY)
-            Y[:j, j], log[:j, j] = product / size[:, None, None], log[:j, j] + np.log(size)
+        Y[:j, j], size = _normalised(block[j - 1] @ Y[:j, j - 1])
+        log[:j, j] = log[:j, j - 1] + of_block[j - 1] + size
     return ends, Y, log
+
+
+def _normalised(matrices):
+    """Matrices of norm 1, and the logarithms of the norms that they had."""
+    size = np.maximum(_frobenius(matrices), TINY)
+    return matrices / size[:, None, None], np.log(size)
 
 
 def _growth(tangents, propagators, scale=None):
@@ -475,7 +527,8 @@ def _growth(tangents, propagators, scale=None):
         shares = np.exp(2 * (log - log.max()))[:, None, None]
         scale = _balance((shares * (N[t] @ Y @ N[s].swapaxes(1, 2)) ** 2).sum(axis=0))
     R = np.linalg.qr(N / scale[:, None])[1]
-    norms = np.linalg.svd(R[t] @ Y @ np.linalg.inv(R)[s], compute_uv=False)[:, 0]
+    scaled = R[t] @ Y @ np.linalg.inv(R)[s]
+    norms = np.sqrt(np.linalg.eigvalsh(scaled.swapaxes(1, 2) @ scaled)[:, -1])
     logs = np.full((len(ends), len(ends)), -np.inf)
     logs[later] = log + np.log(np.maximum(norms, TINY))
     return ends, logs, scale
@@ -519,41 +572,21 @@ def _balance(W):
 
 
 @np.errstate(over="ignore")
-def _judged(model, tangents, steps, propagators):
+def _judged(tangents, steps, propagators):
     """The verdict on a motion from its propagators."""
     ends, logs, scale = _growth(tangents, propagators)
     growth, left = (float(f"{np.exp(log):.3g}") for log in (logs.max(), logs[0, -1]))  # as many digits as are right
     until = np.stack([tangents.t[2 * ends], np.exp(np.maximum.accumulate(logs.max(axis=0)))])
     unstable = _unstable(tangents, steps, ends, logs, scale)
     verdict = "unstable" if unstable else "stable" if left < SHRUNK else "neutral"
-    names, eigenvalues = _independent(model, tangents), _eigenvalues(tangents)
-    return InternalDynamics(tangents.t, names, eigenvalues, verdict, growth, left, until)
+    return InternalDynamics(tangents, verdict, growth, left, until)
 
 
 def _inconclusive(model, run):
     """No verdict, as no number of instants resolves the growth; with frozen eigenvalues at samples."""
     samples = np.unique(np.linspace(0, len(run.t) - 1, FEWEST).round().astype(int))
     tangents = _tangents(model, run, samples, run.t[samples], _states(model, run)[:, samples])
-    names = _independent(model, tangents) if len(tangents.t) else ()
-    return InternalDynamics(tangents.t, names, _eigenvalues(tangents), "inconclusive", np.nan, np.nan)
-
-
-def _eigenvalues(tangents):
-    """Of Nᵀ J N at each instant, (f, K), by descending real part."""
-    values = np.linalg.eigvals(tangents.frozen).astype(complex)
-    return np.take_along_axis(values, np.argsort(-values.real, axis=1, kind="stable"), axis=1).T
-
-
-def _independent(model, tangents):
-    """Names of states that serve as coordinates of the internal dynamics at all instants: the first fit ones."""
-    bases = np.linalg.qr(tangents.size[:, None] * tangents.N)[0].transpose(1, 0, 2)
-    rows, picked = bases.reshape(bases.shape[0], -1), []
-    for _ in range(_dimension(model)):
-        sizes = _frobenius(rows[:, None])
-        picked.append(int(np.argmax(sizes >= SHARED * sizes.max())))
-        pivot = rows[picked[-1]] / sizes[picked[-1]]
-        rows = rows - np.outer(rows @ pivot, pivot)
-    return tuple(model.state_names[i] for i in sorted(picked))
+    return InternalDynamics(tangents, "inconclusive", np.nan, np.nan)
 
 
 def _with_multipliers(model, run, period, judged):

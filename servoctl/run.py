@@ -9,6 +9,7 @@ import numpy as np
 from servoctl import archive
 from servoctl.errors import SpecificationError, unknown
 from servoctl.model.start import State
+from servoctl.model.switching import switching
 from servoctl.values import Value, same
 
 STENCIL = 9  # samples of the polynomial through which an extremum is refined: error of order h^9
@@ -62,7 +63,8 @@ class Run(ByName, Value):
     variants : tuple of (first, last + 1, model)
         The variant of the model, with its choice of pivots, for each range of samples; empty if there is only one.
     internal : dict
-        The verdict on the internal dynamics along the run (`InternalDynamics.facts`); empty for flat programs.
+        The verdict on the internal dynamics along the run (`InternalDynamics.facts`); empty for flat programs and
+        for plants under inputs.
     start : State or None
         From which the motion was computed. It also says which branch of its solutions a flat program follows:
         `simulate(model, run.start, ...)` repeats it.
@@ -208,17 +210,30 @@ class Run(ByName, Value):
     def _hermite(self, t, i, j):
         from scipy.interpolate import BPoly
 
-        model, ends = self.model, [self.t[i], self.t[j]]
+        model, ends, jets = self.model, [self.t[i], self.t[j]], self._ends(i, j)
         nq, n = model.nq, model.n
-        top = (len(self.jets) - nq) // n
-        levels = [self.jets[nq + k * n : nq + (k + 1) * n, [i, j]] for k in range(top)]
+        top = (len(jets) - nq) // n
+        levels = [jets[nq + k * n : nq + (k + 1) * n] for k in range(top)]
         plain = "coordinate_rates" not in model.signal_groups.values()
         rates = levels if plain else self._coordinate_rates([i, j])
-        q = BPoly.from_derivatives(ends, np.stack([self.jets[:nq, [i, j]], *rates], axis=1).transpose(2, 1, 0))
+        q = BPoly.from_derivatives(ends, np.stack([jets[:nq], *rates], axis=1).transpose(2, 1, 0))
         if plain:
             return np.concatenate([q(t, nu=k) for k in range(top + 1)])
         w = BPoly.from_derivatives(ends, np.stack(levels, axis=1).transpose(2, 1, 0))
         return np.concatenate([q(t), *(w(t, nu=k) for k in range(top))])
+
+    def _ends(self, i, j):
+        """Jets at two neighbouring samples, with the accelerations of the variant that holds between them.
+
+        Accelerations may jump where another variant begins.
+        """
+        jets, first, last = self.jets[:, [i, j]], min(i, j), max(i, j)
+        variant = self.variant(last)
+        if variant is not self.variant(first) and not variant.flat:
+            n_x, n, column = len(variant.state_names), variant.n, int(i > j)
+            rates = variant.function("ode")(self.t[first], jets[:n_x, column], variant.parameters)
+            jets[n_x : n_x + n, column] = rates[n_x - n : n_x]
+        return jets
 
     def _coordinate_rates(self, columns):
         _, f = self.model.signals("coordinate_rates")
@@ -397,8 +412,8 @@ def _facts_of_start(start):
 
 
 def _facts_of_model(run):
-    """Parameters of a run's model, and the places near which the pivots of its variants were chosen."""
-    variants = [(first, end, model.place) for first, end, model in run.variants]
+    """Parameters of a run's model; of its variants the places near which pivots were chosen, and sides of switches."""
+    variants = [(first, end, variant.place, sides(run.model, variant)) for first, end, variant in run.variants]
     return {"parameters": run.model.numbers, "variants": variants}
 
 
@@ -435,7 +450,7 @@ def _of_model(run, facts, model):
         raise _other_model("parameters", off or (None if numbers is None else sorted(numbers)))
     if run.jet_names != names or list(run.residual) != list(model.residual_names):
         raise _other_model("names", [*run.jet_names, *run.residual])
-    variants = tuple((first, end, model.at(place)) for first, end, place in facts["variants"])
+    variants = tuple((first, end, on_side(model, tuple(b)).at(place)) for first, end, place, b in facts["variants"])
     full = replace(run, model=model, variants=variants, stored={}, stored_residual={})
     for of_file, of_model, what in ((run.stored, full, "signals"), (run.stored_residual, full.residual, "residuals")):
         differing = [name for name, values in of_file.items() if not _agree(values, of_model[name])]
@@ -457,6 +472,17 @@ def _other_model(what, facts):
         do="Derive the model of the run, use with_parameters(...), or load the run without a model.",
         **{what: facts},
     )
+
+
+def sides(model, variant):
+    """The branches of switches that a variant of a model takes: its last parameters."""
+    return tuple(variant.parameters[len(model.parameters) :].tolist())
+
+
+def on_side(model, branches):
+    """The smooth model of these branches of switches; the model itself if it has no such switches."""
+    family = switching(model) if branches else None
+    return family.at(branches) if family and len(branches) == len(family.switches) else model
 
 
 def require_model(model, run, what):

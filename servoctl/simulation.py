@@ -118,7 +118,7 @@ def simulate(
     model, start = _model_and_start(model, start, inputs)
     span, tolerance = as_span(t_span), getattr(method, "rtol", STEP_ERROR)
     times = dense = None if t_eval is None else _sample_times(*span, t_eval, ())
-    if times is not None and not model.flat:  # the verdict on internal dynamics needs more samples than a few
+    if times is not None and _has_internal_dynamics(model):  # whose verdict needs more samples than a few
         own = np.linspace(*span, DEFAULT_SAMPLES)
         dense = None if _fixed_steps(method) else times if len(times) >= len(own) else np.union1d(times, own)
 
@@ -144,14 +144,14 @@ def _fixed_steps(method):
 
 def _sampled(run, times):
     """The run at its samples among some times; all of it without times, and the state in which it stopped anyway."""
-    if times is None or run.model.flat:
+    if times is None or not _has_internal_dynamics(run.model):
         return run
     if run.method in ORDERS:
         return _resample(run, times)
     picked = np.isin(run.t, times)
     picked[-1] |= run.status < 0 or not picked.any()
     index = np.append(0, np.cumsum(picked))
-    variants = tuple((index[a], index[b], variant) for a, b, variant in run.variants if index[b] > index[a])
+    variants = tuple((int(index[a]), int(index[b]), v) for a, b, v in run.variants if index[b] > index[a])
     return replace(run, t=run.t[picked], jets=run.jets[:, picked], variants=variants)
 
 
@@ -202,8 +202,13 @@ def _warn_drifted(run):
         warn_drifted(names[worst], float(values[worst]), float(run.t[-1]), run.method)
 
 
+def _has_internal_dynamics(model):
+    """Whether a program leaves something free; a plant under inputs has no program."""
+    return bool(model.reduction.program.residuals) and not model.flat
+
+
 def judged(run, tolerance=STEP_ERROR, warn=True):
-    """A run with the verdict on its internal dynamics, and a warning if they are unstable.
+    """A run with the verdict on its internal dynamics, if it has any, and a warning if they are unstable.
 
     Parameters
     ----------
@@ -212,7 +217,7 @@ def judged(run, tolerance=STEP_ERROR, warn=True):
         Relative error of a step of its method.
     warn : bool
     """
-    if run.model.flat or run.method == str(Bounded()):  # which is no forward integration
+    if not _has_internal_dynamics(run.model) or run.method == str(Bounded()):  # which is no forward integration
         return run
     internal = internal_dynamics(run.model, run)
     if warn and internal.verdict == "unstable":
@@ -302,15 +307,22 @@ def _run(model, motion, method, drift, knots, span):
 
 
 def _resample(run, times):
-    """The run at other times, each with the variant of the nearest step."""
+    """The run at other times: states between steps by interpolation, and their highest derivatives by the equations."""
+    direction = np.sign(run.t[-1] - run.t[0]) or 1.0
     low, high = min(run.t[0], run.t[-1]), max(run.t[0], run.t[-1])
     times = times[(times >= low) & (times <= high)]
-    if len(run.variants) == 1:
-        variants = ((0, len(times), run.variants[0][2]),)
-    else:
-        nearest = (int(np.argmin(np.abs(run.t - t))) for t in times)
-        variants = tuple((i, i + 1, run.variant(step)) for i, step in enumerate(nearest))
-    return replace(run, t=times, jets=np.array([run.at(t) for t in times]).T, variants=variants)
+    steps = np.searchsorted(direction * run.t, direction * times - SAME_TIME * (1 + abs(high - low)))
+    jets = np.array([run.at(t) for t in times]).T.reshape(len(run.jets), len(times))
+    variants = []
+    for first, end, variant in run.variants or ((0, len(run.t), run.model),):
+        inside = np.flatnonzero((steps >= first) & (steps < end))  # the variant of a step's end holds within the step
+        if len(inside):
+            a, b, n_x, n = int(inside[0]), int(inside[-1]) + 1, len(variant.state_names), variant.n
+            rates = variant.function("ode").grid(times[a:b], jets[:n_x, a:b], variant.parameters)[n_x - n : n_x]
+            highest = jets[n_x : n_x + n, a:b]
+            highest[:] = np.where(np.isfinite(highest), rates, highest)
+            variants.append((a, b, variant))
+    return replace(run, t=times, jets=jets, variants=tuple(variants))
 
 
 def _require_decay(model, drift, t0, t1):

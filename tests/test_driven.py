@@ -1,6 +1,8 @@
 """A plant under inputs that are functions of time, by every method."""
 
 import math
+import warnings
+from dataclasses import replace
 
 import casadi as ca
 import numpy as np
@@ -86,6 +88,38 @@ def test_inputs_stay_within_their_limits(machine):
     run = sv.simulate(plant, START, (0.0, 6.0), inputs={"trolley": 5 * ca.sin(machine.mechanism.q.t)})
     assert run["trolley"] == pytest.approx(np.clip(5 * np.sin(run.t), -1.0, 2.0), abs=1e-14)
     assert ends(run) == pytest.approx(reference(plant, lambda t: np.clip(5 * np.sin(t), -1.0, 2.0), 6.0), abs=1e-5)
+    assert sv.verify(run.model, run).passed
+
+
+@pytest.mark.parametrize("method", [None, "Taylor", "RK4"])
+def test_a_plant_that_falls_has_no_internal_dynamics(machine, method):
+    """Errors grow near upright, but no program leaves that motion free."""
+    times = np.linspace(0.0, 4.0, 41)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        run = sv.simulate(machine, START | {"theta": 3.1}, (0.0, 4.0), method, inputs={"trolley": 0.0}, t_eval=times)
+    assert run.internal == {} and np.array_equal(run.t, times)
+    assert sv.internal_dynamics(run.model, run).verdict == "unstable", "of errors near upright"
+    assert sv.verify(run.model, run).passed
+
+
+@pytest.mark.parametrize("part", ["a force", "an input", "states", "parameters"])
+def test_wrong_runs_of_a_plant_do_not_pass(machine, part):
+    t = machine.mechanism.q.t
+    run = sv.simulate(machine, START, (0.0, 2.0), inputs={"trolley": 5 * ca.sin(t)})
+    model, others = run.model, {
+        "a force": sv.plant(machine.mechanism, m=1.5, damping={"theta": 0.3}), "parameters": machine.mechanism,
+    }  # fmt: skip
+    if part in others:
+        plant = others[part] if part == "a force" else sv.plant(others[part], damping={"theta": 0.3})
+        model = sv.simulate(plant, START, (0.0, 0.1), inputs={"trolley": 5 * ca.sin(t)}).model
+    if part == "an input":
+        model = sv.simulate(machine, START, (0.0, 0.1), inputs={"trolley": 5.01 * ca.sin(t)}).model
+    if part != "states":
+        with refused(sv.SpecificationError):
+            sv.verify(model, run)
+    jets = run.jets if part != "states" else run.jets * np.where(np.arange(len(run.t)) == 500, 1.001, 1.0)
+    assert not sv.verify(model, replace(run, model=model, jets=jets, variants=(), stored={}, stored_residual={})).passed
 
 
 def test_material_constraints_hold_in_a_driven_plant():

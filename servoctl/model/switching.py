@@ -191,7 +191,7 @@ def _smooth(mechanism, program, branches):
     }
     parameters = _extended(mechanism.parameters, [s.branch for s in branches.switches])
     smooth = _with(mechanism, **columns, constraints=constraints, energy=mechanism.energy, parameters=parameters)
-    return smooth, Program(residuals, program.by, weights or None)
+    return smooth, Program(residuals, program.by, weights or None) if residuals else program
 
 
 def _with(mechanism, **parts):

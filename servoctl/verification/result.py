@@ -15,6 +15,7 @@ WORDS = {
     "energy": "energy against the integrated power",
     "multiplier form": "(3.18) against the form with multipliers",
     "higher jets": "jets above the order of the model",
+    "switches": "states beyond the switches of their sides",
     "outside": "part of the ideal reaction outside the actuators' reach",
     "loop power": "energy gained less the work of all forces",
     "loop power halved": "the same with steps half as long",
@@ -38,6 +39,7 @@ class Verification:
         "power": largest error of dE/dt = Σ force·velocity; "energy": of its integral;
         "multiplier form": largest residual of the equations with multipliers, relative to their terms;
         "higher jets": largest error of jets above the order of the model, relative to their sizes;
+        "switches": largest relative change of a state that leads it back to its side of kinks and switches;
         "outside": part of an ideal reaction that the mechanism's actuators cannot exert;
         "residual NAME": largest residual at any level, as a relative change of the jets that would remove it.
     failures : tuple of str

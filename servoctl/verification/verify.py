@@ -13,7 +13,8 @@ from servoctl.errors import ServoError, SpecificationError
 from servoctl.methods.taylor import series_loop
 from servoctl.model.model import Model
 from servoctl.model.store import fingerprint
-from servoctl.run import SAME_TIME, Run, require_model
+from servoctl.model.switching import switching
+from servoctl.run import SAME_TIME, Run, on_side, require_model, sides
 from servoctl.verification.between import ENOUGH_STEPS, FEW_STEPS, Flow, Integration, between
 from servoctl.verification.loop import verify_loop
 from servoctl.verification.result import Verification, judged, largest, numbers
@@ -28,6 +29,7 @@ LIMITS = {
     "multiplier form": 1e-9,
     "higher jets": 1e-6,
     "residual": 1e-6,
+    "switches": 1e-6,
 }
 INTEGRATED = 1e-6  # limit for numbers that drift disturbs: γ'' is integrated itself, or rows are hidden
 ROUNDING = 1e-13  # relative change of states and inputs whose effect is rounding: some hundred roundings
@@ -88,6 +90,7 @@ def verify(model: Model | Closed, run: Run | None = None, segments: int = 20) ->
         "multiplier form": checks.multiplier_form(),
         **checks.higher_jets(),
         **checks.outside(),
+        **checks.switches(),
         **checks.residuals(),
     }
     found |= {"segments": checks.segments()} if len(run.t) > 1 else {}
@@ -142,7 +145,7 @@ def _variants(model, run, count):
         if not (isinstance(variant, tuple) and len(variant) == 3 and isinstance(variant[2], Model)):
             break
         first, end, of = variant
-        if first >= count or first != (ranges[-1][1] if ranges else 0) or not _same(model, of):
+        if first >= count or first != (ranges[-1][1] if ranges else 0) or not _same_or_smooth(model, of):
             break
         ranges.append((first, min(end, count), of))
     return tuple(ranges) if ranges and ranges[-1][1] == count else ((0, count, model),)
@@ -152,6 +155,13 @@ def _same(model, other):
     """Whether two models have the same specification and numbers, up to the choice of pivots."""
     marks = {fingerprint(m.reduction.mechanism, m.reduction.program, values=()) for m in (model, other)}
     return model is other or (len(marks) == 1 and np.array_equal(model.parameters, other.parameters))
+
+
+def _same_or_smooth(model, variant):
+    """Whether a variant is the same model, or the smooth one of its own branches of switches."""
+    with contextlib.suppress(ServoError):
+        return _same(on_side(model, sides(model, variant)), variant)
+    return False
 
 
 def _require_same(model, other):
@@ -193,7 +203,7 @@ class _Checks:
 
     def __init__(self, model, run, segments):
         self.model, self.run, self.notes, self.doubts = model, run, [], []
-        hidden = bool(model.reduction.hidden) and not model.flat
+        hidden = bool(model.reduction.hidden) and run.method != "algebraic"
         self.drifts = run.method == "Taylor" or model.reduction.top > 2 or hidden
         self.stored, self.fresh = run.stored, replace(run, stored={}, stored_residual={})
         self.span = abs(run.t[-1] - run.t[0]) or 1.0
@@ -201,6 +211,8 @@ class _Checks:
             _Instants(v, run.t[a:b], run.jets[:, a:b], inputs, a)
             for (a, b, v), inputs in zip(run.variants, self._inputs(), strict=True)
         ]
+        switched = any(sides(model, v) for *_, v in run.variants)
+        self.family = switching(model) if switched else None
         self.mass = self._mass()
         self.sizes = self._sizes(self.samples)
         self.balanced = self._balanced()
@@ -220,7 +232,7 @@ class _Checks:
         names = self.model.signals("reaction" if self.model.ideal else "actuation")[0]
         stored = {name: numbers(self.stored.get(name, np.nan), 1) for name in names}
         alike = {name: v for name, v in stored.items() if v is not None and v.shape == self.run.t.shape}
-        values = np.array([alike.get(name, self.fresh[name]) for name in names]).reshape(len(names), -1)
+        values = np.array([alike.get(name, self.fresh[name]) for name in names]).reshape(len(names), len(self.run.t))
         return [values[:, a:b] for a, b, _ in self.run.variants]
 
     # sizes
@@ -291,8 +303,12 @@ class _Checks:
         return found, sampled, self._own(found)
 
     def _flows(self, flat, sample):
-        """The flows to try from an edge on: of the variants next to its sample, and of one with its own pivots."""
-        variants, firsts = [v for *_, v in self.run.variants], [a for a, *_ in self.run.variants]
+        """The flows to try from an edge on: of the variants next to its sample, and of one with its own pivots.
+
+        Edges lie on all switches, so that the model itself is smooth between them.
+        """
+        variants = [self.model if self.family else v for *_, v in self.run.variants]
+        firsts = [a for a, *_ in self.run.variants]
         allowance = [MOST_OWN_PIVOTS]
 
         def flows(k):
@@ -321,9 +337,24 @@ class _Checks:
         for flow, parts in by_flow.items():
             t, z = (np.concatenate(values, axis=-1) for values in zip(*parts, strict=True))
             few = np.unique(np.linspace(0, len(t) - 1, OWN_INSTANTS).astype(int))
-            instants = _Instants(flow.model, t[few], flow.corrected(t[few], z[:, few]), None)
-            own.append(replace(instants, inputs=instants.signals("inputs")))
+            t, z = t[few], flow.corrected(t[few], z[:, few])
+            for model, which in self._sides(flow.model, t, z):
+                instants = _Instants(model, t[which], z[:, which], None)
+                own.append(replace(instants, inputs=instants.signals("inputs")))
         return own
+
+    def _sides(self, model, t, z):
+        """The models on the sides of the switches on which instants lie, with the indices of these instants."""
+        if self.family is None:
+            return [(model, slice(None))]
+        forward = self.run.t[-1] > self.run.t[0]
+        before = np.searchsorted(self.run.t if forward else -self.run.t, t if forward else -t, side="right") - 1
+        groups = {}
+        for k, sample in enumerate(before):
+            known = sides(self.model, self.run.variant(sample))
+            branches = self.family.branches(t[k], z[: len(self.model.state_names), k], known)
+            groups.setdefault(branches, []).append(k)
+        return [(self.family.at(branches), which) for branches, which in groups.items()]
 
     def segments(self):
         """Largest difference of the states from those integrated from the sample before."""
@@ -527,6 +558,17 @@ class _Checks:
             sizes = self.sizes[nq + top * n :, None] + rounding / self.limit("higher jets")
             worst = max(worst, largest((at.z[nq + top * n :] - again) / sizes))
         return {"higher jets": worst}
+
+    def switches(self):
+        """Largest change of a state, relative to its size, that leads it back to its side of a switch."""
+        if self.family is None:
+            return {}
+        n_x, worst = len(self.model.state_names), 0.0
+        for at in self.samples:
+            functions, slopes, _ = self.family.values(sides(self.model, at.model), at.t, at.z[:n_x])
+            reach = np.abs(slopes * self.sizes[:n_x, None]).sum(axis=1)
+            worst = max(worst, largest(_ratio(np.minimum(functions, 0.0), reach)))
+        return {"switches": worst}
 
     def outside(self):
         """Largest part of an ideal reaction outside the actuators' directions, relative to the reaction."""
