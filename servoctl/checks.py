@@ -1,9 +1,11 @@
-"""Checks of input: expressions first, numbers below. Each returns the value in one form or raises.
+"""Checks of input: expressions, kinds and names first, numbers below. Each returns the value in one form or raises.
 
 All raise `SpecificationError`, with the name and the value in its `details`.
 """
 
 import math
+import os
+from pathlib import Path
 
 import casadi as ca
 import numpy as np
@@ -12,6 +14,7 @@ from servoctl.errors import SpecificationError, unknown
 
 ON_SAMPLE = 1e-6  # rounding of a sampling instant [periods], or of a count
 MOST_COUNT = 10**9  # samples, steps or rows: products of two such counts fit into the 64 bits of C
+LONGEST_NAME = 255  # bytes of a file's name in common file systems
 MOST_MEMORY = 8e9  # bytes for all samples: the memory of common machines
 
 
@@ -74,6 +77,54 @@ def mapping(value, what):
     return value
 
 
+def require(kind, name, value, source):
+    """The value, if it is of a kind: a class, made by `source` ("sv.derive(...)")."""
+    if not isinstance(value, kind):
+        article = "an" if type(value).__name__[0] in "aeiouAEIOU" else "a"
+        raise SpecificationError(
+            f"{name} is {article} {type(value).__name__}.",
+            f"It must be a {kind.__name__}.",
+            do=f"Make one by {source}.",
+            name=name,
+            type=type(value).__name__,
+        )
+    return value
+
+
+def named(value, names, what):
+    """One of the names, or `NameUnknown`; `what` they name: "signal"."""
+    if not (isinstance(value, str) and value in names):
+        raise unknown(value, names, what)
+    return value
+
+
+def as_path(value, what="The path"):
+    """A `Path` from text or a path that file systems accept."""
+    try:
+        path = Path(value)
+        fits = all(len(os.fsencode(part)) <= LONGEST_NAME and "\0" not in part for part in path.parts)
+    except (TypeError, UnicodeEncodeError):
+        fits = False
+    if not fits or isinstance(value, str) and not value.strip():
+        raise SpecificationError(
+            f"{what} is {value!r}"[:200] + ".",
+            f"It is text or a path whose parts have at most {LONGEST_NAME} bytes and no null character.",
+            path=value,
+        )
+    return path
+
+
+def as_numbers(value):
+    """An array of float from a number or an array-like of numbers; NaN from anything else, text among it."""
+    try:
+        array = np.asarray(value)
+        if array.dtype.kind == "O":
+            array = np.array([x if is_number(x) else math.nan for x in array.ravel()]).reshape(array.shape)
+        return array.astype(float) if array.dtype.kind in "iuf" else np.full(array.shape, math.nan)
+    except Exception:  # CasADi raises types of its own for symbols
+        return np.array(math.nan)
+
+
 def is_number(value):
     """Whether a value is a finite number of Python or NumPy; True and False are not."""
     if not isinstance(value, (int, float, np.integer, np.floating)) or isinstance(value, bool):
@@ -117,10 +168,7 @@ def positive(name, value):
 
 def positives(name, values, do, fewest=1, most=np.inf):
     """An array of at least `fewest` positive numbers, none above `most`, from a number or an array-like."""
-    try:
-        numbers = np.asarray(values, dtype=float)
-    except (TypeError, ValueError):
-        numbers = np.zeros(1)
+    numbers = as_numbers(values)
     if numbers.size < fewest or not np.all(np.isfinite(numbers) & (numbers > 0) & (numbers <= most)):
         count = "It must be a positive number, or several" if fewest == 1 else f"Give at least {fewest}, all positive"
         rule = count + ("." if most == np.inf else f", each at most {most:g}.")
@@ -130,10 +178,7 @@ def positives(name, values, do, fewest=1, most=np.inf):
 
 def whole(name, value, least=0, most=math.inf):
     """An int from a whole number between `least` and `most`: from 1000.0, too, but not from True."""
-    try:
-        number = least - 1 if isinstance(value, (bool, str, bytes)) else int(value)
-    except (TypeError, ValueError, OverflowError):
-        number = least - 1
+    number = int(value) if is_number(value) or is_whole(value) else least - 1
     if not least <= number <= most or number != value:
         rule = f"It must be a whole number, at least {least}{f' and at most {most}' if most < math.inf else ''}."
         said, nearest = f"{name}={value!r} was given."[:200], f"{name}={most}." if number > most else ""
@@ -194,7 +239,7 @@ def interval(name, value, what):
     try:
         low, high = (-value, value) if np.ndim(value) == 0 else value
         low, high = -np.inf if low is None else float(low), np.inf if high is None else float(high)
-    except (TypeError, ValueError):
+    except Exception:  # CasADi raises types of its own for symbols
         low = high = np.nan
     if not low < high or np.isinf([low, high]).all():
         raise SpecificationError(
@@ -226,10 +271,8 @@ def numbers_by_name(values, names, what, meaning, low=-np.inf, positive=False):
 
 def as_span(t_span, forward=False):
     """A time span as two different finite numbers [s]; with `forward`, t1 must exceed t0."""
-    try:
-        t0, t1 = map(float, t_span)
-    except (TypeError, ValueError, OverflowError):
-        t0 = t1 = np.nan
+    ends = as_numbers(t_span)
+    t0, t1 = map(float, ends) if ends.shape == (2,) else (np.nan, np.nan)
     finite = math.isfinite(t0) and math.isfinite(t1)
     if not finite or t0 == t1 or (forward and t1 < t0):
         raise SpecificationError(

@@ -53,6 +53,9 @@ class Sensors:
                 seed=self.seed,
             )
 
+    def __hash__(self):
+        return hash((frozenset(self.noise.items()), frozenset(self.quantisation.items()), self.seed))
+
     def noisy(self, measures, count):
         """Normally distributed noise of the measurement at each sample.
 

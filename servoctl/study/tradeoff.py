@@ -490,7 +490,7 @@ def _kind(method):
 def _drift_word(treatment):
     """A treatment as a word, which `_arguments` reads."""
     if isinstance(treatment, Poles):
-        return f"{treatment.values:g}"
+        return repr(treatment.values)
     if isinstance(treatment, Project):
         return "project" if treatment.every == 1 else f"project {treatment.every}"
     return "minimal" if isinstance(treatment, MinimalCoordinates) else "none"
