@@ -132,8 +132,9 @@ def along_the_path():
     q0, p = start.values[:3], model.parameters
 
     def call():
-        x, y, _ = path.newton(TIMES, q0, p)
-        return actuation.grid(TIMES, np.vstack([x, y[6:12]]), p)  # of q, q', q''
+        nodes, _ = path.continuation(TIMES[[0, -1]], q0, p, T / 50, 1000)
+        x, y, _ = path.newton(TIMES, nodes, p)
+        return actuation.grid(TIMES, np.vstack([x, y[3:9]]), p)  # of q, q', q''
 
     return call
 

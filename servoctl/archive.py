@@ -9,6 +9,7 @@ import numpy as np
 from servoctl.errors import ServoError
 
 FORMAT, SUFFIX = 1, ".npz"
+MOST_LETTERS = 200  # of another package's message
 
 
 @contextlib.contextmanager
@@ -19,11 +20,13 @@ def writing(path, what, folder=False):
     """
     path = Path(path)
     try:
+        if "\0" in str(path):
+            raise OSError("its name has a null character")
         (path if folder else path.parent).mkdir(parents=True, exist_ok=True)
         yield path
-    except OSError as error:
+    except (OSError, UnicodeError) as error:
         raise ServoError(
-            f"The {what} cannot be written to {path}: {error.strerror or error}.",
+            f"The {what} cannot be written to {str(path)!r}: {getattr(error, 'strerror', None) or error}.",
             do="Choose another path; nothing that was computed is lost.",
             path=str(path),
             what=what,
@@ -32,25 +35,58 @@ def writing(path, what, folder=False):
 
 def save(path, what, facts, arrays):
     """Write arrays and JSON-able facts as npz and return the path; a missing suffix is added."""
-    path = Path(path)
-    path = path if path.suffix == SUFFIX else path.with_name(path.name + SUFFIX)
+    path = _suffixed(path)
     with writing(path, what):
         np.savez_compressed(path, meta=np.array(json.dumps({"format": FORMAT, **facts})), **arrays)
     return path
 
 
+def _suffixed(path):
+    path = Path(path)
+    return path if path.suffix == SUFFIX else Path(f"{path}{SUFFIX}")
+
+
 def read(path, what, build):
-    """`build(facts, arrays)` of an archive; `ServoError` if the file is not one of this kind."""
+    """`build(facts, arrays)` of an archive; `ServoError` if the file is damaged or not one of this kind.
+
+    A missing suffix is added where there is no file without it.
+    """
     try:
+        path = Path(path) if Path(path).is_file() else _suffixed(path)
         with np.load(path, allow_pickle=False) as data:
-            return build(json.loads(str(data["meta"])), data)
-    except (OSError, KeyError, ValueError) as error:
+            facts = json.loads(str(data["meta"]))
+            require(facts["format"] == FORMAT, f"its format is {facts['format']!r}, not {FORMAT}")
+            return build(facts, data)
+    except Exception as error:  # of zip, zlib, numpy or json, or from what a damaged file says
+        why = " ".join(str(error).split()).rstrip(".") or type(error).__name__
         raise ServoError(
-            f"{path} cannot be read as a {what}: {error}.",
+            f"{path} cannot be read as a {what}: {why[:MOST_LETTERS]}.",
             f"A {what} is read from an npz file that {what.capitalize()}.save wrote.",
             path=str(path),
             what=what,
         ) from error
+
+
+def require(holds, otherwise):
+    """Raise ValueError with a text unless something holds of an archive."""
+    if not holds:
+        raise ValueError(otherwise)
+
+
+def named(names):
+    """A list of distinct texts from an archive."""
+    require(isinstance(names, list) and all(isinstance(name, str) for name in names), f"its names are {names!r}")
+    require(len(set(names)) == len(names), "a name occurs twice")
+    return names
+
+
+def numbers(arrays, name, *sizes):
+    """An array of real numbers from an archive, of these sizes; None stands for any."""
+    array = arrays[name]
+    right = array.ndim == len(sizes) and all(n in (None, m) for n, m in zip(sizes, array.shape, strict=True))
+    require(right, f"{name} has the shape {array.shape}")
+    require(array.dtype.kind in "fiub", f"{name} has the type {array.dtype}")
+    return array
 
 
 def dataset(variables, coordinates, attributes):

@@ -13,6 +13,7 @@ import numpy as np
 from servoctl.errors import SpecificationError, unknown
 
 ON_SAMPLE = 1e-6  # rounding of a sampling instant [periods], or of a count
+MOST_CASES = 10**6  # of one sweep: some gigabytes of parameters and rows
 MOST_COUNT = 10**9  # samples, steps or rows: products of two such counts fit into the 64 bits of C
 LONGEST_NAME = 255  # bytes of a file's name in common file systems
 MOST_MEMORY = 8e9  # bytes for all samples: the memory of common machines

@@ -5,6 +5,9 @@ also in `details`.
 """
 
 import difflib
+import re
+
+DERIVATIVE = re.compile(r"d([2-9]?)([A-Za-z_]\w*)")  # dx, d2x: names that may be those of derivatives
 
 
 class ServoError(ValueError):
@@ -79,7 +82,7 @@ def unknown(name, valid, what):
     valid = tuple(str(candidate) for candidate in valid)
     by_lower_case = {candidate.lower(): candidate for candidate in reversed(valid)}
     matches = difflib.get_close_matches(str(name).lower(), by_lower_case, n=1)
-    nearest = by_lower_case[matches[0]] if matches else None
+    nearest = _next_derivative(str(name), valid) or (by_lower_case[matches[0]] if matches else None)
     return NameUnknown(
         f"No {what} is named {name!r}",
         f"The names are: {', '.join(valid)}" if valid else f"There is no {what} at all",
@@ -88,3 +91,13 @@ def unknown(name, valid, what):
         valid=valid,
         match=nearest,
     )
+
+
+def _next_derivative(name, valid):
+    """Of the valid names of derivatives of the same quantity, that of the nearest order; None if there is none."""
+    found = DERIVATIVE.fullmatch(name)
+    if not found:
+        return None
+    order, base = int(found[1] or 1), found[2]
+    orders = {base: 0, f"d{base}": 1} | {f"d{k}{base}": k for k in range(2, order)}
+    return min((other for other in valid if other in orders), key=lambda other: order - orders[other], default=None)

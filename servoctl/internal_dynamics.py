@@ -1,38 +1,77 @@
-"""The internal dynamics that a program leaves: its linearisation and eigenvalues along a motion.
+"""The internal dynamics that a program leaves: how errors grow along a motion, by the variational equation.
 
-Deviations on the manifold of the constraints are N y. The frame N is orthonormal in the tangent space and does not turn
-within it (Nᵀ N' = 0), so that y' = Nᵀ J N y with J = ∂X'/∂X. States are scaled by their sizes along the motion.
+Deviations δ of a motion obey δ' = J δ, J = ∂X'/∂X, and stay in the tangent space of the manifold of the constraints.
+With orthonormal bases N(t) of it, and a fixed basis M = N(t_m) of the middle of a segment, z = Mᵀδ obeys z' = B(t) z,
+
+    B = Mᵀ J N (Mᵀ N)⁻¹,    Y = (Mᵀ N_1)⁻¹ e^Ω (Mᵀ N_0),    Ω = ∫ B dt - h² [B_0, B_1] / 12,
+
+where Y takes coordinates of deviations from the start of the segment to its end: Magnus' series of order 4, whatever
+the bases. The products of all Y are the propagators Φ(t, s). Real parts of the eigenvalues of the frozen Nᵀ J N decide
+nothing: where J changes, x' = J x may grow though all of them are negative, and decay though some are positive.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from servoctl.checks import positive
+from servoctl.errors import SpecificationError
+from servoctl.methods.stability import stability_function
 from servoctl.model.model import Model
-from servoctl.run import Run, require_model
+from servoctl.run import SAME_TIME, Run, require_model
+from servoctl.tolerances import TINY
 
-INSTANTS = 41  # instants along a run at which the internal dynamics is linearised
 AT_ZERO = 1e-9  # size of a state relative to the largest, below which it is the rounding of zero
-NEUTRAL = 1e-7  # of the largest entry of the linearisation: a smaller real part counts as zero
+UNSTABLE = 10.0  # growth of an error along a motion above which the internal dynamics are unstable over it
+FASTER = 3.0  # growth over a time, relative to that over half of it, that is no drift of phases, which gives 2
+EXPONENTIAL = 1.6  # its logarithm, relative to that over half of it: 2 for e^λt, less for powers of t
+GREAT = 1e4  # growth that is unstable even if it is a power of time
+SHRUNK = 0.95  # of the errors of the start: with less than this left at the end, they are stable
+FEWEST, MOST = 32, 2**14  # instants of the linearisation, first and last try
+AGREE = 0.02  # of 1 + ln(growth): difference of its logarithm by steps twice as long that is accepted
+LOCAL, DECAYED = 0.2, 1e-3  # relative difference of one such step that is accepted; norm below which it counts less
+JITTER, GOLDEN = 0.5, 0.6180339887498949  # of their distance by which instants are irregular, by the golden ratio
+TURNED = 0.5  # smallest cosine between tangent spaces at the ends of a segment and at its middle
+DEFECT = 1e-3  # of the sizes of the states: largest error, over an interval of samples, of states between them
+BLOCKS = 32  # instants between which growth is measured, as all pairs of them
+SWEEPS, BALANCED = 30, 0.01  # of balancing, at most; until sums of rows and of columns agree to one percent
+SHARED = 0.5  # of the largest part that is independent of states chosen before: with it a state is fit as the next one
+MATTERS = 1e-3  # of the states' scales: an error as large as this matters
+STEP_ERROR = 1e-9  # of the steps of a motion, unless its method has another
+PERIODIC = 1e-3  # of the largest linearisation: its change over a period that is accepted
+NEAR_ONE = 1e-3  # of a multiplier: within this of 1 it is neutral
 
 
 @dataclass(frozen=True, eq=False)
 class InternalDynamics:
-    """Eigenvalues of the internal dynamics, frozen at instants; made by `internal_dynamics`.
+    """How errors in the internal dynamics of a program grow along a motion; made by `internal_dynamics`.
+
+    Growth is measured in the states' norm after one scaling of each state, the one with the smallest propagators
+    (balancing, Osborne 1960), so that it depends neither on units nor on coordinates that are at rest.
 
     Attributes
     ----------
     t : (N,) array
-        [s]
+        Instants [s].
     names : tuple of str
-        Σ o_a states that may serve as its coordinates.
-    eigenvalues : (Σ o_a, N) complex array
-        [1/s], by descending real part.
-    verdict : {"none", "stable", "neutral", "unstable"}
-        "none" for flat programs; "neutral" has eigenvalues on the imaginary axis (symmetries, undamped oscillations),
-        "unstable" some to the right of it at some instant.
+        f states that may serve as its coordinates.
+    eigenvalues : (f, N) complex array
+        Frozen eigenvalues: of the linearisation at each instant [1/s], by descending real part. They decide nothing.
+    verdict : {"none", "stable", "neutral", "unstable", "inconclusive"}
+        "none" for flat programs. Over the time of the run, and no longer: "unstable" if an error grows more than
+        tenfold and exponentially, or 1e4-fold, "stable" if none does and all errors of the start have shrunk at its
+        end, "neutral" otherwise, as where phases drift apart. With a period, which says something of all times, by
+        the multipliers. "inconclusive" if the samples do not resolve it.
     growth : float
-        exp of the integral of the largest positive real part over the run: the growth of initial errors.
+        max ‖Φ(t, s)‖, s <= t: the largest growth of an error from any instant of the run to any later one.
+    left : float
+        ‖Φ(t_1, t_0)‖, what is left of the errors of the start at the end.
+    until : (2, K) array
+        Instants [s], and the growth up to each of them.
+    period : float
+        [s]; 0 if there was none.
+    multipliers : (f,) complex array
+        Floquet's, the eigenvalues of the propagator over a period; none without a period.
     """
 
     t: np.ndarray
@@ -40,15 +79,155 @@ class InternalDynamics:
     eigenvalues: np.ndarray
     verdict: str
     growth: float
+    left: float = 1.0
+    until: np.ndarray = field(default_factory=lambda: np.ones((2, 0)))
+    period: float = 0.0
+    multipliers: np.ndarray = field(default_factory=lambda: np.zeros(0, complex))
+
+    @property
+    def length(self):
+        """The time that was judged [s]."""
+        return float(np.ptp(self.t)) if len(self.t) else 0.0
+
+    def good_for(self, tolerance=STEP_ERROR):
+        """The time [s] after which errors of a tolerance, relative to the states, have grown to 1e-3.
+
+        Parameters
+        ----------
+        tolerance : float
+            Relative error of a step.
+
+        Returns
+        -------
+        float
+            The length of the run if they stay below.
+        """
+        t, growth = self.until
+        beyond = np.flatnonzero(growth * tolerance > MATTERS)
+        if not len(beyond):
+            return self.length
+        k = max(int(beyond[0]), 1)
+        low, high = np.log(np.minimum(growth[k - 1 : k + 1], np.finfo(float).max))
+        part = (np.log(MATTERS / tolerance) - low) / (high - low) if high > low else 0.0
+        return float(abs(t[k - 1] + np.clip(part, 0.0, 1.0) * (t[k] - t[k - 1]) - t[0]))
+
+    def sentence(self, tolerance=STEP_ERROR):
+        """The verdict in words, with the numbers behind it.
+
+        Parameters
+        ----------
+        tolerance : float
+            As for `good_for`.
+
+        Returns
+        -------
+        str
+        """
+        if self.verdict == "none":
+            return "internal dynamics: none (the program determines the motion)"
+        if self.verdict == "inconclusive":
+            return "internal dynamics inconclusive: the samples do not resolve it; simulate with more of them (t_eval)"
+        facts = {
+            "unstable": f"errors grow by {self.growth:.2g}",
+            "neutral": f"errors grow by at most {self.growth:.2g}",
+            "stable": f"errors shrink to {self.left:.2g}, after growing by at most {self.growth:.2g}",
+        }
+        over = f"with a period of {self.period:.6g} s" if self.period else f"over these {self.length:.4g} s"
+        text = f"internal dynamics {self.verdict} {over}: {facts[self.verdict]}"
+        if self.verdict == "unstable" and (good := self.good_for(tolerance)) < self.length:
+            text += f"; a forward integration, good for {good:.2g} s"
+        return text
+
+    def facts(self, tolerance=STEP_ERROR):
+        """The verdict with its numbers: {name: value}, "text" the sentence.
+
+        Parameters
+        ----------
+        tolerance : float
+            As for `good_for`.
+
+        Returns
+        -------
+        dict
+        """
+        return {
+            "verdict": self.verdict,
+            "growth": self.growth,
+            "left": self.left,
+            "seconds": self.length,
+            "good for": self.good_for(tolerance),
+            "text": self.sentence(tolerance),
+        }
 
     def __repr__(self):
-        if self.verdict == "none":
-            return "InternalDynamics: none (the program determines the motion)"
-        low, high = self.eigenvalues.real.min(), self.eigenvalues.real.max()
-        return (
-            f"InternalDynamics: {self.verdict}; {len(self.names)} states ({', '.join(self.names)})\n"
-            f"  real parts {low:.4g} .. {high:.4g} 1/s along the motion; errors grow by {self.growth:.2g}"
-        )
+        lines = ["InternalDynamics: " + self.sentence().removeprefix("internal dynamics").lstrip(": ")]
+        if self.names:
+            lines.append(f"  {len(self.names)} states: {', '.join(self.names)}")
+        if len(self.multipliers):
+            sizes = ", ".join(f"{size:.4g}" for size in np.sort(np.abs(self.multipliers))[::-1])
+            lines.append(f"  multipliers of a period of {self.period:.6g} s: {sizes}")
+        if self.eigenvalues.size:
+            low, high = self.eigenvalues.real.min(), self.eigenvalues.real.max()
+            lines.append(f"  frozen eigenvalues: real parts {low:.4g} .. {high:.4g} 1/s, which decide nothing")
+        return "\n".join(lines)
+
+
+def internal_dynamics(model: Model, run: Run, period: float | None = None) -> InternalDynamics:
+    """Measure how errors in the internal dynamics grow along a run.
+
+    Parameters
+    ----------
+    model : Model
+    run : Run
+        A motion of it.
+    period : float, optional
+        Of the linearisation along the motion [s], for Floquet's multipliers over its first period.
+
+    Returns
+    -------
+    InternalDynamics
+
+    Raises
+    ------
+    SpecificationError
+        If the run is not of this model (a loaded run has none), is shorter than the period, or does not have it.
+
+    Notes
+    -----
+    Instants are taken from the samples, more and more until growth by steps twice as long agrees; where the samples
+    are too few, the motion is integrated between them.
+    """
+    require_model(model, run, "internal_dynamics")
+    if model.flat:
+        return InternalDynamics(run.t[:0], (), np.zeros((0, 0), complex), "none", 1.0)
+    resolved = _resolved(model, run)
+    if resolved is None:
+        return _inconclusive(model, run)
+    judged = _judged(model, *resolved)
+    return judged if period is None else _with_multipliers(model, run, positive("period", period), judged)
+
+
+@dataclass(frozen=True)
+class _Tangents:
+    """Instants (K,), orthonormal bases N of the tangent space in scaled states, and their rates J N (K, n_x, f)."""
+
+    t: np.ndarray
+    size: np.ndarray
+    N: np.ndarray
+    JN: np.ndarray
+
+    def in_fours(self):
+        """A multiple of four intervals of these instants: up to three of the last instants but one are left out."""
+        return self[np.delete(np.arange(len(self.t)), slice(-1 - (len(self.t) - 1) % 4, -1))]
+
+    def __getitem__(self, picked):
+        """Some of these instants."""
+        return replace(self, t=self.t[picked], N=self.N[picked], JN=self.JN[picked])
+
+    @property
+    def frozen(self):
+        """Nᵀ J N, (K, f, f)."""
+        return self.N.swapaxes(1, 2) @ self.JN
 
 
 def linearised(model, run, count):
@@ -67,67 +246,364 @@ def linearised(model, run, count):
     t : (N,) array
         [s]
     A : (N, f, f) array
-        Nᵀ J N [1/s], f = Σ o_a.
-    N : (N, n_x, f) array
-        Bases of the kernel of the invariants' Jacobian, SI.
+        Nᵀ J N [1/s], f the number of states less that of invariants.
     """
-    n_x, size = len(model.state_names), np.abs(run.jets[: len(model.state_names)]).max(axis=1)
-    size[size <= AT_ZERO * size.max()] = 1.0
     picked = np.unique(np.linspace(0, len(run.t) - 1, count).round().astype(int))
-    J, C = (np.concatenate(parts) for parts in zip(*_jacobians(model, run, picked, n_x), strict=True))
-    finite = np.isfinite(J).all(axis=(1, 2)) & np.isfinite(C).all(axis=(1, 2))
-    first = min(C.shape[1], n_x - model.free)
-    transposed = np.linalg.svd(C[finite] * size)[2][:, first : first + model.free]
-    N = transposed.swapaxes(1, 2)
-    return run.t[picked][finite], transposed @ (J[finite] * size / size[:, None]) @ N, size[:, None] * N
+    tangents = _tangents(model, run, picked, run.t[picked], _states(model, run)[:, picked])
+    return tangents.t, tangents.frozen
 
 
-def _jacobians(model, run, picked, n_x):
-    """∂X'/∂X (N, n_x, n_x) and the invariants' Jacobian (N, m, n_x) at samples, by variant of the model."""
+def _dimension(model):
+    """f, the number of states less that of invariants: Σ o_a, and more where coordinates outnumber velocities."""
+    return len(model.state_names) - len(model.invariant_names())
+
+
+def _states(model, run):
+    return run.jets[: len(model.state_names)]
+
+
+def _sizes(model, run):
+    """Largest magnitude of each state along a run (n_x,), 1 where it stays at zero."""
+    x = _states(model, run)
+    size = np.abs(x).max(axis=1, where=np.isfinite(x), initial=0.0)
+    return np.where(size > AT_ZERO * size.max(), size, 1.0)
+
+
+def _by_variant(model, run, samples):
+    """(variant of the model, whether it holds at the samples)."""
     for first, end, variant in run.variants or ((0, len(run.t), model),):
-        samples = picked[(picked >= first) & (picked < end)]
-        if len(samples):
-            t, x, p, m = run.t[samples], run.jets[:n_x, samples], variant.parameters, len(variant.invariant_names())
-            J = variant.function("ode_jacobian").grid(t, x, p).T.reshape(-1, n_x, n_x).swapaxes(1, 2)
-            C = variant.function("invariants").grid(t, x, p)[m:].T.reshape(-1, n_x, m).swapaxes(1, 2)
-            yield J, C
+        inside = (samples >= first) & (samples < end)
+        if inside.any():
+            yield variant, inside
 
 
-def internal_dynamics(model: Model, run: Run) -> InternalDynamics:
-    """Find the eigenvalues of the internal dynamics along a run.
+def _tangents(model, run, samples, t, x):
+    """Tangents at instants t (K,), states x (n_x, K), with the variants that hold at samples (K,)."""
+    size, f = _sizes(model, run), _dimension(model)
+    N, JN = np.full((2, len(t), len(size), f), np.nan)
+    for variant, inside in _by_variant(model, run, samples):
+        N[inside], JN[inside] = _bases(variant, t[inside], x[:, inside], size)
+    finite = np.isfinite(JN).all(axis=(1, 2))
+    return _Tangents(t[finite], size, N[finite], JN[finite])
 
-    Parameters
-    ----------
-    model : Model
-    run : Run
-        A motion of it.
 
-    Returns
-    -------
-    InternalDynamics
+@np.errstate(all="ignore")
+def _bases(model, t, x, size):
+    """N, the kernel of the invariants' Jacobian, and J N: (K, n_x, f) each, in scaled states; NaN where not finite."""
+    p, n_x, m, f = model.parameters, len(size), len(model.invariant_names()), _dimension(model)
+    C = _grid(model.function("invariants").interpreted, t, x, p)[m:].T.reshape(len(t), n_x, m).swapaxes(1, 2) * size
+    rows = np.linalg.norm(C, axis=2, keepdims=True)
+    C = C / np.where(rows > 0, rows, 1.0)
+    lost = ~np.isfinite(C).all(axis=(1, 2))[:, None, None]
+    N = np.linalg.svd(np.where(lost, 0.0, C))[2][:, m:].swapaxes(1, 2)
+    columns = np.repeat(np.arange(len(t)), f)
+    directions = (size[:, None] * N).swapaxes(1, 2).reshape(-1, n_x).T
+    p = np.concatenate([np.broadcast_to(p[:, None], (len(p), len(columns))), directions])
+    rates = _grid(model.function("ode").tangent, t[columns], x[:, columns], p)
+    JN = (rates / size[:, None]).T.reshape(len(t), f, n_x).swapaxes(1, 2)
+    return N, np.where(lost, np.nan, JN)
 
-    Raises
-    ------
-    SpecificationError
-        If the run is not of this model; a loaded run has none.
+
+def _grid(interpreter, t, x, p):
+    y = np.empty((interpreter.workspace.buffer[3].size, len(t)))
+    interpreter.grid(t, x, p, y)
+    return y
+
+
+# --- instants that resolve the growth ---------------------------------------------------------------------------------
+
+
+def _resolved(model, run):
+    """Tangents, steps along them and propagators, at as many instants as needed; None if MOST do not do."""
+    finite, count = np.flatnonzero(np.isfinite(_states(model, run)).all(axis=0)), FEWEST
+    while count <= MOST and len(finite) > 1:
+        instants = _instants(model, run, finite, count)
+        if instants is not None:
+            tangents = _tangents(model, run, *instants).in_fours()
+            steps, longer = (_steps(tangents[::stride]) for stride in (1, 2))
+            if steps is not None and longer is not None:
+                propagators = _propagators(steps)
+                if _mismatch(steps, longer) < LOCAL and _agree(propagators, _propagators(longer)):
+                    return tangents, steps, propagators
+        count *= 2
+    return None
+
+
+def _instants(model, run, finite, count):
+    """Samples, instants and states at `count` + 1 irregular instants or more; None if the states fail.
+
+    States between samples are those of Hermite's cubic, or of steps where instants are denser than samples. Instants
+    at equal distances would see a periodic linearisation at one phase only.
     """
-    require_model(model, run, "internal_dynamics")
-    if model.free == 0:
-        return InternalDynamics(run.t[:0], (), np.zeros((0, 0), complex), "none", 1.0)
-    times, matrices, bases = linearised(model, run, INSTANTS)
-    eigenvalues = np.linalg.eigvals(matrices).astype(complex)
-    order = np.argsort(-eigenvalues.real, axis=1, kind="stable")
-    eigenvalues = np.take_along_axis(eigenvalues, order, axis=1).T
-    largest, rounding = eigenvalues.real.max(axis=0), NEUTRAL * np.abs(matrices).max()
-    verdict = "unstable" if largest.max() > rounding else "stable" if largest.max() < -rounding else "neutral"
-    growth = float(np.exp(np.trapezoid(np.maximum(largest, 0.0), np.abs(times - times[0]))))
-    return InternalDynamics(times, _independent(model, bases), eigenvalues, verdict, growth)
+    if count > 4 * (len(finite) - 1):
+        return _stepped(model, run, finite, 4 * -(-count // (4 * (len(finite) - 1))))
+    last, x, place = len(finite) - 1, _states(model, run), (len(finite) - 1) * _irregular(count)
+    k = np.minimum(place.astype(int), last - 1)
+    starts, ends, s = finite[k], finite[k + 1], place - k
+    h, chord = run.t[ends] - run.t[starts], x[:, ends] - x[:, starts]
+    a, b = (h * _rates(model, run, starts, run.t[i], x[:, i]) - chord for i in (starts, ends))
+    t, z = run.t[starts] + s * h, x[:, starts] + s * chord + s * (1 - s) * ((1 - s) * a - s * b)
+    slope = chord + (1 - s) * (1 - 3 * s) * a + s * (3 * s - 2) * b
+    gap = np.abs(slope - h * _rates(model, run, starts, t, z))
+    return (starts, t, z) if _small(model, run, gap) else None
 
 
-def _independent(model, bases):
-    """Names of states that serve as coordinates of the internal dynamics at all instants."""
-    from scipy.linalg import qr
+def _small(model, run, errors):
+    """Whether errors of the states (n_x, N) are small against their sizes, or those that integration leaves anyway."""
+    return bool(np.all(errors <= DEFECT * _sizes(model, run)[:, None] + STEP_ERROR))
 
-    tangents = np.linalg.qr(bases)[0]
-    _, _, pivots = qr(np.concatenate(tangents.swapaxes(1, 2)), pivoting=True)
-    return tuple(model.state_names[i] for i in np.sort(pivots[: model.free]))
+
+def _irregular(count):
+    """`count` + 1 increasing fractions from 0 to 1 with irregular distances."""
+    k = np.arange(count + 1)
+    beside = JITTER * ((GOLDEN * k) % 1 - 0.5)
+    beside[[0, -1]] = 0.0
+    return (k + beside) / count
+
+
+def _stepped(model, run, finite, steps):
+    """Samples, instants and states of RK4 steps from each sample to the next; None if they do not lead there."""
+    starts, ends, x = finite[:-1], finite[1:], _states(model, run)
+    t = run.t[starts] + np.multiply.outer(_irregular(steps), run.t[ends] - run.t[starts])
+    states = [x[:, starts]]
+    for a, h in zip(t[:-1], np.diff(t, axis=0), strict=True):
+        states.append(_advanced(model, run, starts, a, states[-1], h))
+    if not _small(model, run, np.abs(states[-1] - x[:, ends])):
+        return None
+    between = np.array(states[:-1]).transpose(1, 2, 0).reshape(len(x), -1)
+    samples, instants = np.append(np.repeat(starts, steps), ends[-1]), np.append(t[:-1].T, run.t[ends[-1]])
+    return samples, instants, np.column_stack([between, x[:, ends[-1]]])
+
+
+@np.errstate(all="ignore")
+def _advanced(model, run, samples, t, x, h):
+    """States after a step of RK4 from each state (n_x, N)."""
+    k1 = _rates(model, run, samples, t, x)
+    k2 = _rates(model, run, samples, t + h / 2, x + h / 2 * k1)
+    k3 = _rates(model, run, samples, t + h / 2, x + h / 2 * k2)
+    k4 = _rates(model, run, samples, t + h, x + h * k3)
+    return x + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
+
+
+def _rates(model, run, samples, t, x):
+    """X' at instants t (N,) and states x (n_x, N), with the variants that hold at samples (N,)."""
+    y = np.empty_like(x)
+    for variant, inside in _by_variant(model, run, samples):
+        f = variant.function("ode").interpreted
+        y[:, inside] = _grid(f, t[inside], x[:, inside], variant.parameters)[: len(x)]
+    return y
+
+
+def _mismatch(steps, longer):
+    """Largest relative difference between a pair of steps and the step that is twice as long."""
+    pairs = steps[1::2] @ steps[::2]
+    size = np.maximum(_frobenius(pairs), _frobenius(longer))
+    return float((_frobenius(pairs - longer) / np.maximum(size, DECAYED)).max())
+
+
+def _agree(propagators, longer):
+    """Whether the logarithms of the growth, and of what is left at the end, are the same by steps twice as long."""
+    (ends, _, log), (half, _, other) = propagators, longer
+    fine, coarse = np.isin(ends, 2 * half), np.isin(2 * half, ends)  # between the same instants
+    a, b = log[np.ix_(fine, fine)], other[np.ix_(coarse, coarse)]
+    return all(abs(x - y) <= AGREE * (1 + abs(x)) for x, y in ((a.max(), b.max()), (a[0, -1], b[0, -1])))
+
+
+def _frobenius(matrices):
+    return np.sqrt((matrices**2).sum(axis=(-2, -1)))
+
+
+# --- propagators ------------------------------------------------------------------------------------------------------
+
+
+@np.errstate(all="ignore")
+def _steps(tangents):
+    """Y of each segment, which has an instant within it, (S, f, f); None if a tangent space turns too far in one."""
+    t, N, JN = tangents.t, tangents.N, tangents.JN
+    a, m, b = slice(0, -2, 2), slice(1, -1, 2), slice(2, None, 2)
+    if len(t) < 3:
+        return None
+    M = N[m].swapaxes(1, 2)
+    G0, G1 = M @ N[a], M @ N[b]
+    if min(np.linalg.svd(G, compute_uv=False).min() for G in (G0, G1)) < TURNED:
+        return None
+    B0, B, B1 = M @ JN[a] @ np.linalg.inv(G0), M @ JN[m], M @ JN[b] @ np.linalg.inv(G1)
+    h = (t[b] - t[a])[:, None, None]
+    c = (t[m] - t[a])[:, None, None] / h
+    w = 1 / (6 * c * (1 - c))  # of the quadratic through three values
+    omega = h * ((0.5 - w * (1 - c)) * B0 + w * B + (0.5 - w * c) * B1)
+    small = _frobenius(omega)[:, None, None] < 1  # where the series converges
+    omega = omega - small * h**2 / 12 * (B0 @ B1 - B1 @ B0)
+    return np.linalg.solve(G1, _exponential(omega) @ G0)
+
+
+def _exponential(omega):
+    """e^Ω by Radau's fraction (2, 3) of Ω/4, which vanishes at -∞ like it."""
+    above, below = stability_function("RadauIIA", 5)
+    z, one = omega / 4, np.eye(omega.shape[1])
+    square = z @ z
+    fraction = np.linalg.solve(
+        below[0] * one + below[1] * z + below[2] * square + below[3] * square @ z,
+        above[0] * one + above[1] * z + above[2] * square,
+    )
+    fraction = fraction @ fraction
+    return fraction @ fraction
+
+
+@np.errstate(all="ignore")
+def _propagators(steps):
+    """Ends of blocks of steps (n,), then propagators e^log Y between all of them, Y[s, t] (f, f) and log[s, t]."""
+    ends = np.linspace(0, len(steps), min(BLOCKS, len(steps)) + 1).round().astype(int)
+    n, f = len(ends), steps.shape[1]
+    Y, log = np.zeros((n, n, f, f)), np.full((n, n), -np.inf)
+    Y[range(n), range(n)], log[range(n), range(n)] = np.eye(f), 0.0
+    for j in range(1, n):
+        Y[:j, j], log[:j, j] = Y[:j, j - 1], log[:j, j - 1]
+        for step in steps[ends[j - 1] : ends[j]]:
+            product = step @ Y[:j, j]
+            size = np.maximum(_frobenius(product), TINY)
+            Y[:j, j], log[:j, j] = product / size[:, None, None], log[:j, j] + np.log(size)
+    return ends, Y, log
+
+
+def _growth(tangents, propagators, scale=None):
+    """Ends of blocks of steps (n,), ln ‖Φ(t, s)‖ between them (n, n), and the scale of the states (n_x,)."""
+    ends, Y, log = propagators
+    s, t = later = np.triu_indices(len(ends))
+    N, Y, log = tangents.N[2 * ends], Y[later], log[later]
+    if scale is None:
+        shares = np.exp(2 * (log - log.max()))[:, None, None]
+        scale = _balance((shares * (N[t] @ Y @ N[s].swapaxes(1, 2)) ** 2).sum(axis=0))
+    R = np.linalg.qr(N / scale[:, None])[1]
+    norms = np.linalg.svd(R[t] @ Y @ np.linalg.inv(R)[s], compute_uv=False)[:, 0]
+    logs = np.full((len(ends), len(ends)), -np.inf)
+    logs[later] = log + np.log(np.maximum(norms, TINY))
+    return ends, logs, scale
+
+
+def _unstable(tangents, steps, ends, logs, scale):
+    """Whether errors grow more than tenfold and exponentially, not as a power of time like phases that drift apart.
+
+    Growth over a time is compared with that over half of it, and where a block has most of it, in that block.
+    """
+    t, limit = tangents.t[2 * ends], np.log(UNSTABLE)
+    ago = np.abs(t - t[:, None])
+    within = [logs[ago <= ago.max() / 2**k].max() for k in range(int(np.log2(len(t))))]
+    within = np.array([*within, np.diag(logs, 1).max()])
+    whole, half = within[:-1], within[1:]
+    exponential = (whole > limit) & (whole - half > np.log(FASTER)) & (whole > EXPONENTIAL * half)
+    exponential &= within.max() < EXPONENTIAL * whole  # most of the growth is that over this time
+    if exponential.any() or logs.max() > np.log(GREAT):
+        return True
+    j = int(np.argmax(np.diag(logs, 1)))
+    first, end = ends[j], ends[j + 1]
+    if logs[j, j + 1] <= limit or end == first + 1:
+        return False
+    block = tangents[2 * first : 2 * end + 1]
+    return _unstable(block, steps[first:end], *_growth(block, _propagators(steps[first:end]), scale))
+
+
+def _balance(W):
+    """d (n,) that makes Σ W_ij d_j²/d_i² smallest: sums of rows and of columns are then the same (Osborne 1960)."""
+    square = np.ones(len(W))
+    for _ in range(SWEEPS):
+        rows, columns = W @ square / square, square * ((1 / square) @ W)
+        ratios = np.where((rows > TINY) & (columns > TINY), rows / np.maximum(columns, TINY), 1.0)
+        if np.abs(np.log(ratios)).max() < BALANCED:
+            break
+        square *= ratios**0.25
+    return np.sqrt(square)
+
+
+# --- verdicts ---------------------------------------------------------------------------------------------------------
+
+
+@np.errstate(over="ignore")
+def _judged(model, tangents, steps, propagators):
+    """The verdict on a motion from its propagators."""
+    ends, logs, scale = _growth(tangents, propagators)
+    growth, left = (float(f"{np.exp(log):.3g}") for log in (logs.max(), logs[0, -1]))  # as many digits as are right
+    until = np.stack([tangents.t[2 * ends], np.exp(np.maximum.accumulate(logs.max(axis=0)))])
+    unstable = _unstable(tangents, steps, ends, logs, scale)
+    verdict = "unstable" if unstable else "stable" if left < SHRUNK else "neutral"
+    names, eigenvalues = _independent(model, tangents), _eigenvalues(tangents)
+    return InternalDynamics(tangents.t, names, eigenvalues, verdict, growth, left, until)
+
+
+def _inconclusive(model, run):
+    """No verdict, as no number of instants resolves the growth; with frozen eigenvalues at samples."""
+    samples = np.unique(np.linspace(0, len(run.t) - 1, FEWEST).round().astype(int))
+    tangents = _tangents(model, run, samples, run.t[samples], _states(model, run)[:, samples])
+    names = _independent(model, tangents) if len(tangents.t) else ()
+    return InternalDynamics(tangents.t, names, _eigenvalues(tangents), "inconclusive", np.nan, np.nan)
+
+
+def _eigenvalues(tangents):
+    """Of Nᵀ J N at each instant, (f, K), by descending real part."""
+    values = np.linalg.eigvals(tangents.frozen).astype(complex)
+    return np.take_along_axis(values, np.argsort(-values.real, axis=1, kind="stable"), axis=1).T
+
+
+def _independent(model, tangents):
+    """Names of states that serve as coordinates of the internal dynamics at all instants: the first fit ones."""
+    bases = np.linalg.qr(tangents.size[:, None] * tangents.N)[0].transpose(1, 0, 2)
+    rows, picked = bases.reshape(bases.shape[0], -1), []
+    for _ in range(_dimension(model)):
+        sizes = _frobenius(rows[:, None])
+        picked.append(int(np.argmax(sizes >= SHARED * sizes.max())))
+        pivot = rows[picked[-1]] / sizes[picked[-1]]
+        rows = rows - np.outer(rows @ pivot, pivot)
+    return tuple(model.state_names[i] for i in sorted(picked))
+
+
+def _with_multipliers(model, run, period, judged):
+    """The verdict by Floquet's multipliers over the first period of a run."""
+    first = _first(model, run, period)
+    resolved = _resolved(model, first)
+    if resolved is None:
+        return replace(judged, verdict="inconclusive", period=period)
+    tangents, _, (_, Y, log) = resolved
+    back = tangents.N[0].T @ tangents.N[-1]
+    _require_periodic(period, tangents, back)
+    multipliers = np.exp(log[0, -1]) * np.linalg.eigvals(back @ Y[0, -1]).astype(complex)
+    largest = np.abs(multipliers).max()
+    verdict = "unstable" if largest > 1 + NEAR_ONE else "stable" if largest < 1 - NEAR_ONE else "neutral"
+    order = np.argsort(-np.abs(multipliers), kind="stable")
+    return replace(judged, verdict=verdict, period=period, multipliers=multipliers[order])
+
+
+def _first(model, run, period):
+    """The run up to the end of its first period."""
+    length, direction = abs(run.t[-1] - run.t[0]), np.sign(run.t[-1] - run.t[0])
+    if not period <= length * (1 + SAME_TIME):
+        raise SpecificationError(
+            f"period={period:g} s was given for a run of {length:g} s.",
+            "Multipliers are those of the first period of a run.",
+            do="Simulate for a whole period, or leave it out.",
+            period=period,
+            length=length,
+        )
+    inside = np.flatnonzero(np.abs(run.t - run.t[0]) < period * (1 - SAME_TIME))
+    last, instants = inside[-1:], np.linspace(run.t[inside[-1]], run.t[0] + direction * period, FEWEST + 1)
+    x = _states(model, run)[:, last]
+    for t, h in zip(instants[:-1], np.diff(instants), strict=True):
+        x = _advanced(model, run, last, np.array([t]), x, h)
+    variants = tuple((a, min(b, len(inside) + 1), variant) for a, b, variant in run.variants if a <= len(inside))
+    states = np.column_stack([_states(model, run)[:, inside], x])
+    return replace(run, t=np.append(run.t[inside], instants[-1]), jets=states, variants=variants)
+
+
+def _require_periodic(period, tangents, back):
+    """Refuse a period after which the tangent space or the linearisation is another one."""
+    first, last = tangents.frozen[0], tangents.frozen[-1]
+    turned = 1 - np.linalg.svd(back, compute_uv=False).min()
+    changed = _frobenius(back @ last @ back.T - first) / max(_frobenius(tangents.frozen).max(), TINY)
+    if max(turned, changed) > PERIODIC:
+        raise SpecificationError(
+            f"The linearisation does not have the period {period:g} s: after it, it differs by {changed:.2g} of its "
+            f"largest value, and its tangent space by {turned:.2g}.",
+            "Multipliers belong to a motion along which the linearisation is periodic.",
+            do="Give its period, or leave it out.",
+            period=period,
+            differs=float(max(turned, changed)),
+        )

@@ -2,22 +2,44 @@
 
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from servoctl import archive
 from servoctl.errors import SpecificationError, unknown
+from servoctl.model.start import State
 from servoctl.values import Value, same
 
 STENCIL = 9  # samples of the polynomial through which an extremum is refined: error of order h^9
 AS_SAMPLED = 1e-14  # relative: a refined extremum must exceed the sampled one by this
 SAME_TIME = 1e-12  # relative: rounding of an instant
-FACTS = ("method", "drift", "counters", "success", "status", "message", "knots", "jet_names")  # of a saved run
+AGREES = 1e-6  # relative: difference of a signal in a file from that of a model, below which the run is of this model
+FACTS = {
+    "method": str, "drift": str, "counters": dict, "success": bool, "status": int, "message": str, "knots": list,
+    "jet_names": list, "internal": dict,
+}  # of a saved run
+
+
+class ByName:
+    """A value that has signals under its `names`: `list`, `len`, `in` and `dict` go by these."""
+
+    def keys(self) -> tuple[str, ...]:
+        """Names of all signals."""
+        return self.names
+
+    def __iter__(self):
+        return iter(self.names)
+
+    def __len__(self):
+        return len(self.names)
+
+    def __contains__(self, name):
+        return name in self.names
 
 
 @dataclass(frozen=True, eq=False)
-class Run(Value):
+class Run(ByName, Value):
     """A motion with its actuation and its residuals; made by `simulate`, `close` or `load`.
 
     `run["theta"]`, `run["dtheta"]`, `run["trolley"]` are (N,) arrays, SI. Time derivatives of an actuation, output or
@@ -39,6 +61,11 @@ class Run(Value):
         Whether the run finished, and if not, why.
     variants : tuple of (first, last + 1, model)
         The variant of the model, with its choice of pivots, for each range of samples; empty if there is only one.
+    internal : dict
+        The verdict on the internal dynamics along the run (`InternalDynamics.facts`); empty for flat programs.
+    start : State or None
+        From which the motion was computed. It also says which branch of its solutions a flat program follows:
+        `simulate(model, run.start, ...)` repeats it.
     """
 
     t: np.ndarray
@@ -55,6 +82,8 @@ class Run(Value):
     variants: tuple = ()
     stored: dict = field(default_factory=dict, compare=False)
     stored_residual: dict = field(default_factory=dict, compare=False)
+    internal: dict = field(default_factory=dict)
+    start: State | None = None
 
     def __eq__(self, other):
         if not super().__eq__(other):
@@ -256,6 +285,7 @@ class Run(Value):
         """
         signals = [name for name in self.names if name not in self.jet_names]
         facts = {name: getattr(self, name) for name in FACTS} | {"signals": signals, "residuals": list(self.residual)}
+        facts |= {"start": _facts_of_start(self.start)} | ({} if self.model is None else _facts_of_model(self))
         arrays = {"t": self.t, "jets": self.jets} | {f"signal_{i}": self[name] for i, name in enumerate(signals)}
         arrays |= {f"residual_{i}": self.residual[name] for i, name in enumerate(self.residual)}
         return archive.save(path, "run", facts, arrays)
@@ -283,8 +313,13 @@ class Run(Value):
             f"Run: {len(self.t)} samples, t = {self.t[0]:g} .. {self.t[-1]:g} s; {self.message}",
             f"  method {self.method}" + (f", drift: {self.drift}" if self.drift else ""),
             "  " + ", ".join(f"{name} {count}" for name, count in self.counters.items() if count),
-            "  largest residuals over all levels: " + ", ".join(f"{name} {worst[name]:.1e}" for name in shown),
+            "  " + self.internal.get("text", ""),
         ]
+        if shown:
+            lines.append("  largest residuals over all levels: " + ", ".join(f"{n} {worst[n]:.1e}" for n in shown))
+        if self.start is not None and self.model is not None and self.model.flat:
+            q = (f"{name} = {self.start[name]:.4g}" for name in self.model.coordinate_names[:6])
+            lines.insert(2, f"  branch of {', '.join(q)} at t = {self.start.t:g} s")
         signals = (*self.model.actuators, *self.model.outputs) if self.model is not None else ()
         signals = [name for name in signals if name in self.names and np.isfinite(self[name]).any()]
         for name in signals[:7]:
@@ -328,31 +363,100 @@ class _Residuals(Mapping):
         return stored[name]
 
 
-def load(path) -> Run:
+def load(path, model=None) -> Run:
     """A run from a file that `Run.save` wrote.
 
     Parameters
     ----------
     path : str or Path
+        A missing suffix .npz is added.
+    model : Model, optional
+        The model of the run, derived again: with it the run can be verified, interpolated, and made a law of.
 
     Returns
     -------
     Run
-        With its samples, signals and residuals; without its model.
+        With its samples, signals and residuals, and with the model.
 
     Raises
     ------
     ServoError
         If the file is missing or was not written by `Run.save`.
+    SpecificationError
+        If the run is not of this model: names, parameters, or values of signals differ.
     """
-    return archive.read(path, "run", _from_archive)
+    run, facts = archive.read(path, "run", _from_archive)
+    return run if model is None else _of_model(run, facts, model)
+
+
+def _facts_of_start(start):
+    if start is None:
+        return None
+    values = dict(zip(start.names, np.asarray(start.values, dtype=float).tolist(), strict=True))
+    return {"t": start.t, "values": values, "held": start.held, "free": start.free, "residual": start.residual}
+
+
+def _facts_of_model(run):
+    """Parameters of a run's model, and the places near which the pivots of its variants were chosen."""
+    variants = [(first, end, model.place) for first, end, model in run.variants]
+    return {"parameters": run.model.numbers, "variants": variants}
 
 
 def _from_archive(facts, arrays):
-    signals = {name: arrays[f"signal_{i}"] for i, name in enumerate(facts["signals"])}
-    residuals = {name: arrays[f"residual_{i}"] for i, name in enumerate(facts["residuals"])}
-    facts = {name: tuple(facts[name]) if isinstance(facts[name], list) else facts[name] for name in FACTS}
-    return Run(arrays["t"], arrays["jets"], stored=signals, stored_residual=residuals, **facts)
+    for name, kind in FACTS.items():
+        archive.require(type(facts[name]) is kind, f"its {name} is {facts[name]!r}")
+    t = archive.numbers(arrays, "t", None)
+    archive.require(np.isfinite(t).all() and abs(np.sign(np.diff(t)).sum()) == len(t) - 1, "its times are in no order")
+    jets = archive.numbers(arrays, "jets", len(archive.named(facts["jet_names"])), len(t))
+    names, rows = archive.named(facts["signals"]), archive.named(facts["residuals"])
+    signals = {name: archive.numbers(arrays, f"signal_{i}", len(t)) for i, name in enumerate(names)}
+    residuals = {name: archive.numbers(arrays, f"residual_{i}", None, len(t)) for i, name in enumerate(rows)}
+    start = facts.get("start")
+    if start is not None:
+        values, lists = start["values"], {name: tuple(start[name]) for name in ("held", "free")}
+        start = State(start["t"], np.array([*values.values()]), tuple(values), residual=start["residual"], **lists)
+    own = {name: tuple(facts[name]) if kind is list else facts[name] for name, kind in FACTS.items()}
+    return Run(t, jets, stored=signals, stored_residual=residuals, start=start, **own), facts
+
+
+def _of_model(run, facts, model):
+    """A loaded run with its model, which must give the signals of the file."""
+    if not hasattr(model, "signal_groups"):
+        raise SpecificationError(
+            f"load received model={type(model).__name__}.",
+            "A run is loaded with its model, or without one.",
+            do="Pass the value of sv.derive(mechanism, program).",
+            model=type(model).__name__,
+        )
+    numbers, names = facts.get("parameters"), model.names_to(len(run.jets))
+    off = {name: (value, model.numbers.get(name)) for name, value in (numbers or {}).items()}
+    off = {name: pair for name, pair in off.items() if pair[0] != pair[1]}
+    if numbers is None or off or numbers.keys() != model.numbers.keys():
+        raise _other_model("parameters", off or (None if numbers is None else sorted(numbers)))
+    if run.jet_names != names or list(run.residual) != list(model.residual_names):
+        raise _other_model("names", [*run.jet_names, *run.residual])
+    variants = tuple((first, end, model.at(place)) for first, end, place in facts["variants"])
+    full = replace(run, model=model, variants=variants, stored={}, stored_residual={})
+    for of_file, of_model, what in ((run.stored, full, "signals"), (run.stored_residual, full.residual, "residuals")):
+        differing = [name for name, values in of_file.items() if not _agree(values, of_model[name])]
+        if differing:
+            raise _other_model(what, differing)
+    return full
+
+
+def _agree(values, others):
+    """Whether signals agree; below 1 in size up to the same difference, as residuals are rounding errors."""
+    size = np.abs(values[np.isfinite(values)]).max(initial=1.0)
+    return np.allclose(values, others, rtol=0.0, atol=AGREES * size, equal_nan=True)
+
+
+def _other_model(what, facts):
+    return SpecificationError(
+        f"The run in the file is not of this model: its {what} differ.",
+        "A run belongs to one specification and its numbers.",
+        do="Derive the model of the run, use with_parameters(...), or load the run without a model.",
+        **{what: facts},
+    )
 
 
 def require_model(model, run, what):

@@ -1,14 +1,15 @@
 """From a model and a start to a run."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from servoctl.checks import as_span
-from servoctl.errors import InconsistentStart, SpecificationError
-from servoctl.methods.accuracy import accurate
+from servoctl.errors import InconsistentStart, ServoError, SpecificationError
+from servoctl.internal_dynamics import STEP_ERROR, internal_dynamics
+from servoctl.methods.accuracy import ATOL, absolute_tolerances, accurate, large_tolerances
 from servoctl.methods.algebraic import algebraic
 from servoctl.methods.choice import (
     EXPLICIT,
@@ -27,14 +28,18 @@ from servoctl.methods.choice import (
     default_method,
     require_combination,
 )
+from servoctl.methods.orders import end_at_other_orders
 from servoctl.methods.radau import RadauSteps
-from servoctl.methods.runge_kutta import RungeKuttaSteps
+from servoctl.methods.runge_kutta import ORDERS, RungeKuttaSteps
 from servoctl.methods.scipy_methods import ScipySteps
-from servoctl.methods.stability import run_checked, warn_many_steps
+from servoctl.methods.stability import run_checked, warn_many_steps, warn_unstable
 from servoctl.methods.sundials import SundialsSteps
 from servoctl.methods.taylor import TaylorSteps
 from servoctl.model.model import Model
 from servoctl.model.start import State
+from servoctl.model.switching import switching
+from servoctl.plants.driven import driven
+from servoctl.plants.plant import Plant
 from servoctl.progress import Progress
 from servoctl.run import SAME_TIME, Run
 
@@ -45,25 +50,26 @@ OFF = 1e-5  # residual relative to its gradient times the state, above which a s
 
 
 def simulate(
-    model: Model,
-    start: State | ArrayLike,
+    model: Model | Plant,
+    start: State | ArrayLike | Mapping[str, float],
     t_span: Sequence[float],
     method: Method | str | None = None,
     *,
+    inputs: Mapping[str, object] | None = None,
     drift: Project | Poles | MinimalCoordinates | str | float | None = None,
     accuracy: float | None = None,
     t_eval: ArrayLike | None = None,
     progress: bool | Callable[[float], object] | None = None,
 ) -> Run:
-    """Simulate the motion that a program prescribes.
+    """Simulate the motion that a program prescribes, or that of a plant under inputs.
 
     Main arguments
 
     Parameters
     ----------
-    model : Model
-    start : State or (n_x,) array
-        From `model.start`.
+    model : Model or Plant
+    start : State, (n_x,) array or dict of str to float
+        From `model.start`; for a plant (q, γ'), also by name.
     t_span : (t0, t1)
         [s]; t1 < t0 runs backwards.
     method : Algebraic, Taylor, RadauIIA, RungeKutta, Adaptive, Sundials, or a short form, optional
@@ -81,6 +87,9 @@ def simulate(
 
     Other arguments
 
+    inputs : dict of str to float, SX or callable, optional
+        Of a plant, by actuator, default 0: numbers, expressions of `q.t` such as paths, or functions that give these
+        of `q.t`. They act at once, within the plant's limits of magnitude.
     t_eval : (N,) array, optional
         Times of the samples [s], within t_span. Default: 1001 instants and the knots; all steps of `RungeKutta`.
     progress : bool or callable, optional
@@ -103,13 +112,49 @@ def simulate(
     SpecificationError
         If method and drift do not go together, or a path is not smooth enough.
     """
+    model, start = _model_and_start(model, start, inputs)
+    span, tolerance = as_span(t_span), getattr(method, "rtol", STEP_ERROR)
+    times = dense = None if t_eval is None else _sample_times(*span, t_eval, ())
+    if times is not None and not model.flat:  # the verdict on internal dynamics needs more samples than a few
+        own = np.linspace(*span, DEFAULT_SAMPLES)
+        dense = None if _fixed_steps(method) else times if len(times) >= len(own) else np.union1d(times, own)
+
+    def attempt(method, drift, t_span=span, times=dense):
+        return simulated(model, start, t_span, method, drift=drift, t_eval=times, progress=progress)
+
+    try:
+        if accuracy is None:
+            run = attempt(method, drift)
+        else:
+            run = accurate(attempt, model, accuracy, (span[0], as_state(model, start, span[0]), span[1]), method, drift)
+    except ServoError as error:
+        if error.run is not None:
+            error.run = _sampled(judged(error.run, tolerance, warn=False), times)
+        raise
+    return _sampled(judged(run, tolerance), times)
+
+
+def _fixed_steps(method):
+    """Whether all steps are samples."""
+    return method is not None and isinstance(as_method(method), RungeKutta)
+
+
+def _sampled(run, times):
+    """The run at its samples among some times; all of it without times, and the state in which it stopped anyway."""
+    if times is None or run.model.flat:
+        return run
+    if run.method in ORDERS:
+        return _resample(run, times)
+    picked = np.isin(run.t, times)
+    picked[-1] |= run.status < 0 or not picked.any()
+    index = np.append(0, np.cumsum(picked))
+    variants = tuple((index[a], index[b], variant) for a, b, variant in run.variants if index[b] > index[a])
+    return replace(run, t=run.t[picked], jets=run.jets[:, picked], variants=variants)
+
+
+def simulated(model, start, t_span, method=None, *, drift=None, t_eval=None, progress=None):
+    """The run of `simulate`, without a verdict on its internal dynamics."""
     span = t0, t1 = as_span(t_span)
-    if accuracy is not None:
-
-        def simulated(method, drift, t_span=span, times=t_eval):
-            return simulate(model, start, t_span, method, drift=drift, t_eval=times, progress=progress)
-
-        return accurate(simulated, model, accuracy, (t0, as_state(model, start, t0), t1), method, drift)
     method = default_method(model) if method is None else as_method(method)
     drift = as_drift(drift)
     require_combination(model, method, drift)
@@ -123,10 +168,18 @@ def simulate(
     times = _sample_times(t0, t1, t_eval, knots)
     bar = Progress(span, progress)
     try:
-        motion = _motion(model, method, drift, span, x0, times, knots, bar)
+        default = getattr(method, "atol", 0.0) is None
+        first = large_tolerances(model, span, x0) if default else None
+        motion = _motion(model, method, drift, (t0, x0, t1, times, knots), bar, first)
+        tolerances = _smaller_tolerances(model, method, motion)
+        if tolerances is not None:
+            again = _motion(model, method, drift, (t0, x0, t1, times, knots), bar, tolerances)
+            motion = again if again.stop is None or motion.stop is not None else motion
     finally:
         bar.close()
+    end_at_other_orders(motion)
     run = _run(model, motion, method, drift, knots, (t0, x0, t1))
+    run = replace(run, start=_as_started(model, start, t0, x0 if motion.start is None else motion.start))
     if t_eval is not None and isinstance(method, RungeKutta):
         run = _resample(run, times)
     if motion.stop is not None:
@@ -135,25 +188,83 @@ def simulate(
     return run
 
 
-def _motion(model, method, drift, span, x0, times, knots, bar):
-    """Integrate by a method; samples are taken at the times (N,), by `RungeKutta` at its steps."""
-    (t0, t1), arguments = span, (span[0], x0, span[1], times, knots)
+def judged(run, tolerance=STEP_ERROR, warn=True):
+    """A run with the verdict on its internal dynamics, and a warning if they are unstable.
+
+    Parameters
+    ----------
+    run : Run
+    tolerance : float
+        Relative error of a step of its method.
+    warn : bool
+    """
+    if run.model.flat:
+        return run
+    internal = internal_dynamics(run.model, run)
+    if warn and internal.verdict == "unstable":
+        warn_unstable(internal.sentence(tolerance))
+    return replace(run, internal=internal.facts(tolerance))
+
+
+def _model_and_start(model, start, inputs):
+    """The model of a plant under inputs, and its start as an array; a model and its start as they are."""
+    if isinstance(model, Plant):
+        return driven(model, inputs), start if isinstance(start, State) else model.state(start)
+    if not isinstance(model, Model) or inputs is not None:
+        given = f"a {type(model).__name__}" + (" and inputs" if inputs is not None else "")
+        raise SpecificationError(
+            f"simulate received {given}.",
+            "It takes a Model, whose program determines the inputs, or a Plant and its inputs.",
+            do="Write sv.simulate(sv.derive(mechanism, program), start, t_span), or "
+            "sv.simulate(sv.plant(mechanism), x0, t_span, inputs={...}).",
+            type=type(model).__name__,
+        )
+    return model, start
+
+
+def _motion(model, method, drift, problem, bar, atol=None):
+    """Integrate (t0, x0, t1, times, knots) by a method; samples are taken at the times (N,), by `RungeKutta` at steps.
+
+    `atol` (n_x,) replaces the default of the method.
+    """
+    t0, x0, t1, times, knots = problem
+    if isinstance(method, Algebraic):
+        return algebraic(model, (t0, t1), x0, times, knots, bar)
+    family = switching(model)
+    if family is not None:
+        model = family.at(family.branches(t0, x0))
+    stepping = _stepping(model, method, drift, (t0, t1), bar, atol)
+    stepping.family = family
+    return run_checked(stepping, *problem) if stepping.tolerances is None else stepping.run(*problem)
+
+
+def _stepping(model, method, drift, span, bar, atol):
+    """The integration by a method other than `Algebraic`."""
+    (t0, t1), least = span, ATOL if atol is None else atol.min()
     match method:
-        case Algebraic():
-            return algebraic(model, t0, x0, times, bar)
-        case Taylor(order, jets, rtol, atol):
-            return TaylorSteps(model, drift, rtol, atol, order, jets or 0, bar).run(*arguments)
-        case RadauIIA(order, step, rtol, atol):
+        case Taylor(order, jets, rtol, given):
+            return TaylorSteps(model, drift, rtol, given or least, order, jets or 0, bar)
+        case RadauIIA(order, step, rtol, given):
             step = None if step is None else _step_length(step, t0, t1)
-            stepping = RadauSteps(model, drift, rtol, atol, order, step, bar)
-            return run_checked(stepping, *arguments) if step else stepping.run(*arguments)
+            return RadauSteps(model, drift, rtol, given or least, order, step, bar)
         case RungeKutta(_, step):
-            stepping = RungeKuttaSteps(model, str(method), drift, _step_length(step, t0, t1), bar)
-            return run_checked(stepping, *arguments)
-        case Sundials(name, rtol, atol):
-            return SundialsSteps(model, name, drift, rtol, atol, t1 - t0, bar).run(*arguments)
-        case Adaptive(name, rtol, atol):
-            return ScipySteps(model, name, drift, rtol, atol, bar).run(*arguments)
+            return RungeKuttaSteps(model, str(method), drift, _step_length(step, t0, t1), bar)
+        case Sundials(name, rtol, given):
+            return SundialsSteps(model, name, drift, rtol, given or least, t1 - t0, bar)
+        case Adaptive(name, rtol, given):
+            each = least if atol is None or isinstance(drift, MinimalCoordinates) else atol
+            return ScipySteps(model, name, drift, rtol, given or each, bar)
+
+
+def _smaller_tolerances(model, method, motion):
+    """Absolute tolerances with which a motion is computed again, as the default is no small part of it; else None."""
+    if getattr(method, "atol", 0.0) is not None or motion.interrupted or not motion.pieces:
+        return None
+    if isinstance(method, RadauIIA) and method.step is not None:
+        return None
+    t, jets, _ = motion.samples()
+    x = jets[: len(model.state_names), np.all(np.isfinite(jets), axis=0)]
+    return absolute_tolerances(model, t, x, method.rtol) if x.shape[1] > 1 else None
 
 
 def _run(model, motion, method, drift, knots, span):
@@ -168,7 +279,8 @@ def _run(model, motion, method, drift, knots, span):
         status, message = 1, f"interrupted at {last} of {span[2]:g} s; what was computed is kept"
     else:
         status, message = 0, "finished"
-    facts = {"method": str(method), "drift": str(drift or ""), "counters": motion.counters, "knots": knots}
+    facts = {"method": str(method), "drift": str(drift or ""), "counters": motion.counters}
+    facts["knots"] = tuple(sorted({*knots, *motion.switches}))
     facts |= {"success": status == 0, "status": status, "message": message, "variants": tuple(variants)}
     return Run(t, jets, model.names_to(len(jets)), model, **facts)
 
@@ -226,14 +338,28 @@ def as_state(model, start, t0):
     return values
 
 
-def consistent_state(model, start, t):
-    """The state that a start gives, which must satisfy the invariants: nothing would lead the motion back to them."""
-    x = as_state(model, start, t)
+def _as_started(model, start, t, x):
+    """The state from which a motion was computed: `start`, or what the method has made of it."""
+    if isinstance(start, State) and np.array_equal(start.values, x):
+        return start
+    off = np.abs(_scaled_residuals(model, t, x)[2]).max(initial=0.0)
+    facts = {"held": start.held, "free": start.free} if isinstance(start, State) else {"held": (), "free": ()}
+    return State(float(t), np.array(x), tuple(model.state_names), residual=float(off), **facts)
+
+
+def _scaled_residuals(model, t, x):
+    """Names of the invariants, their values, and these relative to their gradients times the state."""
     names = [name for _, name in model.invariant_names()]
     y = model.function("invariants")(t, x, model.parameters)
     values, slopes = y[: len(names)], y[len(names) :].reshape(len(x), len(names)).T
     sizes = np.sqrt((slopes**2 * (1.0 + np.abs(x)) ** 2).sum(axis=1))
-    off = np.nan_to_num(np.abs(values) / np.where(sizes > 0, sizes, 1.0))
+    return names, values, np.nan_to_num(np.abs(values) / np.where(sizes > 0, sizes, 1.0))
+
+
+def consistent_state(model, start, t):
+    """The state that a start gives, which must satisfy the invariants: nothing would lead the motion back to them."""
+    x = as_state(model, start, t)
+    names, values, off = _scaled_residuals(model, t, x)
     if off.max(initial=0.0) > OFF:
         worst = int(np.argmax(off))
         raise InconsistentStart(

@@ -9,29 +9,33 @@ import pytest
 from scenes import CRANE, CRANE_PROGRAM, POINT, POINT_PROGRAM
 
 import servoctl as sv
-from servoctl.codegen import compiler
-from servoctl.codegen.function import compiling_at_once
+from servoctl.codegen import compiler, function
 from servoctl.gallery import gallery
 from servoctl.model.model import derive
 
 os.environ["SERVOCTL_MEMO"] = "none"  # tests derive themselves what they test
+compiler._warned = compiler.compiler() is None  # without one the whole suite runs in CasADi
+
+
+@pytest.fixture
+def c_compiler(monkeypatch):
+    """The system's compiler, also where the suite runs without one by choice."""
+    if os.environ.get("SERVOCTL_COMPILER") == "none":
+        monkeypatch.delenv("SERVOCTL_COMPILER")
+    if compiler.compiler() is None:
+        pytest.skip("needs a compiler")
 
 
 @pytest.fixture(params=("c", "casadi"))
 def backend(request, monkeypatch):
-    """Compiled code at the first call, and CasADi where there is no compiler."""
-    if request.param == "casadi":
+    """Compiled code in every grid and loop, and CasADi where there is no compiler."""
+    monkeypatch.setattr(function, "GRID_POINTS", 0)
+    if request.param == "c":
+        request.getfixturevalue("c_compiler")
+    else:
         monkeypatch.setenv("SERVOCTL_COMPILER", "none")
         monkeypatch.setattr(compiler, "_warned", True)
-    with compiling_at_once():
-        yield request.param
-
-
-@pytest.fixture
-def at_once():
-    """Compiled code at the first call: what shares a model with other tests has the same bits in any order."""
-    with compiling_at_once():
-        yield
+    return request.param
 
 
 @pytest.fixture
@@ -127,7 +131,8 @@ def motion(model, t=0.0, guess=None, **held):
     state = model.start(t, guess=guess, **held)
     if model.flat and model.reduction.top == 2:
         y = model.function("path")(t, state.values[: model.nq], model.parameters)
-        return np.concatenate([state.values, y[2 * model.nq + model.n :][: model.n]])
+        first = model.nq if model.reduction.mechanism.q.plain else 3 * model.nq  # of γ' (see `Equations.path`)
+        return np.concatenate([state.values, y[first + model.n :][: model.n]])
     n_x = len(state.values)
     rates = model.function("ode")(t, state.values, model.parameters)[:n_x]
     if not np.all(np.isfinite(rates)):
@@ -140,3 +145,10 @@ def signal(model, kind, t, jets):
     """A group of signals by name at one instant."""
     names, function = model.signals(kind)
     return dict(zip(names, function(t, jets, model.parameters), strict=True))
+
+
+def pytest_collection_modifyitems(items):
+    """Tests with "RadauIIA" among their parameters use the compiler: its steps are C code."""
+    for item in items:
+        if "RadauIIA" in item.name and hasattr(item, "fixturenames"):
+            item.fixturenames.append("c_compiler")

@@ -161,7 +161,7 @@ def test_no_choice_within_the_bound_is_warned_about(sine):
 
 
 @pytest.mark.parametrize(("method", "step"), [("RK1", 0.1), ("RK4", 0.05), ("RK8", 0.1), ("RK4", 0.02)])
-def test_steps_too_long_for_the_internal_dynamics_are_warned_about(method, step):
+def test_steps_too_long_for_the_internal_dynamics_are_warned_about(method, step, c_compiler):
     model = sv.derive(*mass_on_car(damping=1000.0))
     start = model.start(s=0.0, ds=0.0)
     largest = sv.stability(model, sv.simulate(model, start, (0.0, 1.0), method="RadauIIA")).largest_step(method)
@@ -175,7 +175,7 @@ def test_steps_too_long_for_the_internal_dynamics_are_warned_about(method, step)
         sv.simulate(model, start, (0.0, 1.0), method=as_method(method, step=0.9 * largest))
 
 
-def test_stable_steps_that_do_not_resolve_the_motion_are_warned_about():
+def test_stable_steps_that_do_not_resolve_the_motion_are_warned_about(c_compiler):
     """Radau IIA of order 5 is stable with any step; steps of 3 s are wrong by six times the motion."""
     model, span = sv.derive(*mass_on_car()), (0.0, 6.0)
     exact = sv.simulate(model, model.start(), span, accuracy=1e-9)

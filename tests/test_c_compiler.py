@@ -1,6 +1,8 @@
 """When a function is compiled, where its library is kept, and what happens without a compiler."""
 
+import os
 import subprocess
+import time
 import warnings
 
 import casadi as ca
@@ -9,12 +11,16 @@ import pytest
 from refusals import warned
 from test_compiled_functions import P1, RK4, X2, T, function, numpy_rk4, pendulum
 
-from servoctl.codegen import compiler
-from servoctl.codegen.function import GRID_POINTS, SCALAR_CALLS, SOLVED, compiled
+import servoctl as sv
+from servoctl.codegen import cache, compiler
+from servoctl.codegen import function as functions
+from servoctl.codegen.function import GRID_POINTS, compiled
+from servoctl.gallery import gallery
+from servoctl.shell.main import main
 
 
 @pytest.fixture
-def fresh(tmp_path, monkeypatch):
+def fresh(tmp_path, monkeypatch, c_compiler):
     """As in a new process with an empty cache; the list holds the compiler's commands."""
     monkeypatch.setenv("SERVOCTL_CACHE", str(tmp_path / "cache"))
     new_process(monkeypatch)
@@ -25,7 +31,7 @@ def fresh(tmp_path, monkeypatch):
 
 def pendulum_with_loops():
     """Rates of a pendulum; as a Newton step they vanish at once where it hangs."""
-    return compiled(function(X2[1], -P1 * ca.sin(X2[0]), 0, 0), "hanging", ("rk", "newton"))
+    return compiled(function(X2[1], -P1 * ca.sin(X2[0]), 0, 0, 0, 0), "hanging", ("rk", "newton"))
 
 
 def new_process(monkeypatch):
@@ -33,45 +39,93 @@ def new_process(monkeypatch):
     monkeypatch.setattr(compiler, "_warned", False)
 
 
-def test_nothing_is_compiled_before_it_pays(fresh):
-    model = pendulum(("rk",))
-    for _ in range(SCALAR_CALLS):
+def test_points_and_short_grids_are_not_compiled_however_many(fresh):
+    model = pendulum()
+    for _ in range(200):
         model(0.0, [0.1, 0.2], [1.0])
-    model.grid(0.0, np.zeros((2, GRID_POINTS)), [1.0])
+        model.grid(0.0, np.zeros((2, GRID_POINTS)), [1.0])
     assert not fresh and model.backend == "casadi"
-    before = model(0.3, [0.1, 0.2], [1.0])
+
+
+def test_a_long_grid_is_compiled(fresh):
+    model = pendulum()
+    model.grid(0.0, np.zeros((2, GRID_POINTS + 1)), [1.0])
     assert len(fresh) == 1 and model.backend == "c"
-    np.testing.assert_allclose(model(0.3, [0.1, 0.2], [1.0]), before, rtol=1e-15)
 
 
-@pytest.mark.parametrize("use", [lambda m: m.grid(0.0, np.zeros((2, GRID_POINTS + 1)), [1.0]),
+@pytest.mark.parametrize("use", [lambda m: m.grid(0.0, np.zeros((2, 1)), [1.0]),
+                                 lambda m: m.buffer(),
                                  lambda m: m.rk(0.0, [0.0, 0.0], 0.1, 1, [1.0], RK4),
-                                 lambda m: m.newton(np.zeros(GRID_POINTS), [0.0, 0.0], [1.0])])
-def test_a_long_grid_a_long_path_or_an_integration_compiles_at_once(fresh, use):
+                                 lambda m: m.newton(np.zeros(1), np.zeros((1, 9)), [1.0])])
+def test_what_an_integration_uses_is_compiled_at_its_first_use(fresh, use):
     model = pendulum_with_loops()
     use(model)
     assert len(fresh) == 1 and model.backend == "c"
-
-
-def test_a_short_path_is_solved_without_compiling(fresh):
-    model = pendulum_with_loops()
-    points = GRID_POINTS // SOLVED
-    model.newton(np.zeros(points), [0.0, 0.0], [1.0])
-    assert not fresh and model.backend == "casadi"
-    model.newton(np.zeros(1), [0.0, 0.0], [1.0])
-    assert len(fresh) == 1 and model.backend == "c"
-
-
-def test_a_kept_library_is_loaded_and_not_compiled(fresh, monkeypatch):
-    pendulum(("rk",)).rk(0.0, [0.0, 0.0], 0.1, 1, [1.0], RK4)
-    again = pendulum(("rk",))
-    again(0.0, [0.0, 0.0], [1.0])
-    assert again.backend == "c"
-    new_process(monkeypatch)
-    in_new_process = pendulum(("rk",))
-    in_new_process(0.0, [0.0, 0.0], [1.0])
-    assert in_new_process.backend == "c"
+    use(model)
     assert len(fresh) == 1
+
+
+def test_a_call_has_the_same_bits_whatever_was_called_before(fresh, monkeypatch):
+    rng = np.random.default_rng(4)
+    x, t = rng.normal(size=(2, 300)), np.linspace(0.0, 1.0, 300)
+    calls = {
+        "point": lambda m: m(0.3, x[:, 0], [1.3]), "short": lambda m: m.grid(t, x, [1.3]),
+        "long": lambda m: m.grid(0.3, np.tile(x, 80), [1.3]), "one": lambda m: m.grid(0.3, x[:, :1], [1.3]),
+    }  # fmt: skip
+    loops = {"steps": lambda m: m.rk(0.0, x[:, 0], 0.1, 50, [1.3], RK4)[1], "of rates": lambda m: m.grid(t, x, [1.3])}
+    for make, known in ((pendulum, calls), (lambda: pendulum(("rk",)), calls | loops)):
+        alone = {name: call(make()) for name, call in known.items()}
+        for _ in range(4):
+            new_process(monkeypatch)
+            model = make()
+            for name in rng.permutation([*known] * 3):
+                np.testing.assert_array_equal(known[name](model), alone[name], err_msg=name)
+
+
+@pytest.mark.parametrize("name", ["overhead-crane", "appell-hamel", "pendubot"])
+@pytest.mark.parametrize("method", [None, "RK4", "Taylor", "RadauIIA", "DOP853"])
+def test_a_repeated_simulation_has_the_same_bits(fresh, name, method):
+    scene, model = gallery[name], sv.derive(*gallery[name].build())
+    start = model.start(**scene.start, guess=scene.guess)
+
+    def motion():
+        run = sv.simulate(model, start, (0.0, 0.3), method, t_eval=np.linspace(0.0, 0.3, 40), progress=False)
+        return [run.jets, *(run[signal] for signal in model.signal_groups)]
+
+    first = motion()
+    sv.simulate(model, start, (0.0, 0.2), t_eval=np.linspace(0.0, 0.2, 700), progress=False)
+    for _ in range(3):
+        for once, again in zip(first, motion(), strict=True):
+            np.testing.assert_array_equal(again, once)
+
+
+def test_a_grid_of_casadi_is_its_points(fresh):
+    rng = np.random.default_rng(5)
+    t, x, p = rng.normal(size=301), rng.normal(size=(2, 301)), rng.normal(size=(1, 301))
+    model = pendulum()
+    for numbers in (p, p[:, 0]):
+        columns = [model(t[k], x[:, k], numbers[:, k] if numbers.ndim == 2 else numbers) for k in range(301)]
+        np.testing.assert_array_equal(model.grid(t, x, numbers).T, columns)
+    assert not fresh
+
+
+def test_a_library_of_another_process_is_loaded_and_not_compiled(fresh, monkeypatch):
+    first = pendulum(("rk",)).rk(0.0, [0.1, 0.0], 0.1, 9, [1.0], RK4)[1]
+    new_process(monkeypatch)
+    again = pendulum(("rk",))
+    np.testing.assert_array_equal(again.rk(0.0, [0.1, 0.0], 0.1, 9, [1.0], RK4)[1], first)
+    assert again.backend == "c" and len(fresh) == 1
+
+
+def test_a_long_series_is_left_to_casadi(fresh, monkeypatch):
+    f, sizes = function(X2[1], -X2[0] / 2), {"nq": 1, "n": 1, "top": 2, "last": 2, "plain": 1}
+    runs = []
+    for limit in (9, 0):
+        monkeypatch.setattr(functions, "TAYLOR_COMPILED", limit)
+        model = compiled(f, "series", ("taylor",), sizes=sizes)
+        runs.append(model.taylor(0.0, [0.1, 0.2], 1e-3, [1.0], 1e-6, 1e-9, 5)[1][:, -1])
+        assert model.backend == ("c" if limit else "casadi")
+    np.testing.assert_allclose(*runs, rtol=1e-14)
 
 
 @pytest.mark.parametrize("damage", [lambda data: b"", lambda data: b"not a library", lambda data: data[:-1000],
@@ -117,7 +171,16 @@ def test_the_cache_is_where_the_platform_keeps_caches(monkeypatch, tmp_path):
     assert compiler.cache_directory().name == "servoctl"
 
 
-@pytest.mark.parametrize(("name", "value"), [("SERVOCTL_COMPILER", "none"), ("CC", "false"), ("PATH", "")])
+def test_no_compiler_by_choice_needs_no_warning(fresh, monkeypatch):
+    monkeypatch.setenv("SERVOCTL_COMPILER", "none")
+    model = pendulum(("rk",))
+    model.rk(0.0, [0.1, 0.0], 0.1, 5, [1.0], RK4)
+    model.grid(0.0, np.zeros((2, GRID_POINTS + 1)), [1.0])
+    assert compiler.library("int one;") is None
+    assert model.backend == "casadi" and not fresh
+
+
+@pytest.mark.parametrize(("name", "value"), [("CC", "false"), ("PATH", "")])
 def test_without_a_compiler_one_warning_and_the_same_results(fresh, monkeypatch, name, value):
     expected = numpy_rk4(0.0, np.array([0.1, 0.0]), 0.1, 5, 1.0)
     monkeypatch.setenv(name, value)
@@ -156,6 +219,88 @@ def test_a_compiler_that_does_not_serve_is_warned_about(fresh, tmp_path, monkeyp
     assert model.backend == "casadi"
 
 
-def test_an_unclosed_quotation_mark_in_the_command_is_no_traceback(fresh, monkeypatch):
-    monkeypatch.setenv("CC", "nothing 'of this name")
+@pytest.mark.parametrize("variable", ["SERVOCTL_COMPILER", "CC"])
+@pytest.mark.parametrize("command", ["nothing-of-this-name -O9", "nothing 'of this name", "/no/such/gcc"])
+def test_a_named_compiler_that_does_not_exist_is_warned_about(fresh, monkeypatch, variable, command):
+    compiler._identified.cache_clear()
+    monkeypatch.setenv(variable, command)
+    model = pendulum(("rk",))
+    with warned(variable, command.split()[0]):
+        model.rk(0.0, [0.0, 0.0], 0.1, 1, [1.0], RK4)
+    assert model.backend == "c" and len(fresh) == 1
+    pendulum(("rk",)).rk(0.0, [0.0, 0.0], 0.1, 1, [1.0], RK4)  # warned about once
+
+
+def test_a_cache_without_room_is_replaced_by_a_temporary_directory(fresh, tmp_path, monkeypatch):
+    script = tmp_path / "full-cc"
+    script.write_text(f'#!/bin/sh\ncase "$*" in *{tmp_path}/cache*) echo "No space left on device" >&2; exit 1;; esac\n'
+                      'exec cc "$@"\n')
+    script.chmod(0o755)
+    monkeypatch.setenv("CC", str(script))
+    model = pendulum(("rk",))
+    model.rk(0.0, [0.0, 0.0], 0.1, 1, [1.0], RK4)
+    assert model.backend == "c"
+
+
+# what is deleted -----------------------------------------------------------------------------------------------------
+
+
+def library_files(tmp_path):
+    return sorted((tmp_path / "cache").glob("*.so"))
+
+
+def test_libraries_are_pruned_by_size_and_age_and_abandoned_files_go(fresh, tmp_path, monkeypatch):
+    folder, now = tmp_path / "cache", time.time()
+    for k in range(4):
+        compiled(function(X2[1] * k, X2[0]), f"many_{k}", ("rk",)).rk(0.0, [0.0, 0.0], 0.1, 1, [1.0], RK4)
+    oldest, older, *new = library_files(tmp_path)
+    young, abandoned, foreign = (folder / name for name in ("tmpyoung.tmp", "tmpleft.tmp", "notes.txt"))
+    for path, age in ((oldest, 200 * 86400), (older, 100), (young, 10), (abandoned, 7200), (foreign, 10**9)):
+        path.touch()
+        os.utime(path, (now - age, now - age))
+    cache.prune(folder)
+    assert set(folder.iterdir()) == {older, *new, young, foreign}
+    monkeypatch.setattr(cache, "MOST_BYTES", older.stat().st_size)
+    cache.prune(folder)
+    assert older not in folder.iterdir() and {young, foreign} <= set(folder.iterdir())
+
+
+def test_a_library_that_is_used_stays_young(fresh, tmp_path, monkeypatch):
     pendulum(("rk",)).rk(0.0, [0.0, 0.0], 0.1, 1, [1.0], RK4)
+    (path,) = library_files(tmp_path)
+    os.utime(path, (1.0, 1.0))
+    new_process(monkeypatch)
+    pendulum(("rk",)).rk(0.0, [0.0, 0.0], 0.1, 1, [1.0], RK4)
+    assert path.stat().st_mtime > 1e9 and len(fresh) == 1
+
+
+def test_writes_prune_from_time_to_time(fresh, tmp_path, monkeypatch):
+    monkeypatch.setattr(cache, "WRITES", 1)
+    (tmp_path / "cache").mkdir(mode=0o700)
+    left = tmp_path / "cache" / "tmpleft.tmp"
+    left.touch()
+    os.utime(left, (1.0, 1.0))
+    pendulum(("rk",)).rk(0.0, [0.0, 0.0], 0.1, 1, [1.0], RK4)
+    assert not left.exists() and len(library_files(tmp_path)) == 1
+
+
+def test_the_command_says_what_the_cache_holds_and_clears_it(fresh, tmp_path, capsys, monkeypatch):
+    def said(*options):
+        assert main(["cache", *options]) == 0
+        place, *lines = capsys.readouterr().out.splitlines()
+        assert place == str(tmp_path / "cache")
+        return {line.split()[0]: int(line.split()[1]) for line in lines}
+
+    assert said() == {"libraries": 0, "derivations": 0, "temporary": 0}
+    monkeypatch.delenv("SERVOCTL_MEMO", raising=False)
+    model = sv.derive(*gallery["overhead-crane"].build())
+    sv.simulate(model, model.start(guess={"l": 4.0}), (0.0, 1.0))
+    (tmp_path / "cache" / "notes.txt").write_text("not of the cache")
+    held = said()
+    assert held["libraries"] == len(library_files(tmp_path)) > 0
+    assert said("--clear") == {"libraries": 0, "derivations": 0, "temporary": 0}
+    assert (tmp_path / "cache" / "notes.txt").exists()
+    new_process(monkeypatch)
+    again = sv.derive(*gallery["overhead-crane"].build())
+    sv.simulate(again, again.start(guess={"l": 4.0}), (0.0, 1.0))
+    assert said()["libraries"] == held["libraries"]

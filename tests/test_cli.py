@@ -6,6 +6,7 @@ import platform
 import shutil
 import subprocess
 import sys
+import warnings
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -90,6 +91,18 @@ def test_run_leaves_numbers_figures_and_the_report(here, capsys):
     assert facts["versions"]["servoctl"] == servoctl.__version__
     assert facts["versions"]["python"] == platform.python_version()
     assert set(facts["versions"]) == {"servoctl", "casadi", "numpy", "scipy", "python"}
+
+
+def test_a_plan_with_unstable_internal_dynamics_is_kept_and_fails(here, capsys):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", RuntimeWarning)  # said once, by the command itself
+        assert main(["run", "vtol-centre", "--no-loop", "--no-figures", "--no-verify"]) == 1
+    printed = capsys.readouterr()
+    assert "internal dynamics unstable over these 1 s: errors grow by" in printed.out
+    assert "internal dynamics unstable" in printed.err
+    facts = summary(here / "servoctl-runs" / "vtol-centre")
+    assert facts["success"] and facts["internal_dynamics"]["verdict"] == "unstable"
+    assert facts["internal_dynamics"]["growth"] > 100 and facts["internal_dynamics"]["seconds"] == 1.0
 
 
 def test_a_motion_that_stops_is_kept_drawn_and_explained(here, capsys):
@@ -343,11 +356,18 @@ def test_an_interrupted_verification_keeps_the_run(here, fall, capsys, monkeypat
 
 
 def test_a_failed_verification_is_seen_in_the_exit_code(here, fall, monkeypatch):
-    failed = SimpleNamespace(passed=False, numbers={"acceleration": float("nan")})
+    failed = SimpleNamespace(verdict="failed", passed=False, numbers={"acceleration": float("nan")})
     monkeypatch.setattr(servoctl, "verify", lambda *_: failed)
     assert main(["run", fall, "--no-figures"]) == 1
     verification = summary(here / "servoctl-runs" / "fall")["verification"]
-    assert verification == {"passed": False, "numbers": {"acceleration": None}}
+    assert verification == {"verdict": "failed", "passed": False, "numbers": {"acceleration": None}}
+
+
+def test_an_inconclusive_verification_has_an_exit_code_of_its_own(here, fall, monkeypatch):
+    doubtful = SimpleNamespace(verdict="inconclusive", passed=False, numbers={})
+    monkeypatch.setattr(servoctl, "verify", lambda *_: doubtful)
+    assert main(["run", fall, "--no-figures"]) == 3
+    assert summary(here / "servoctl-runs" / "fall")["verification"]["verdict"] == "inconclusive"
 
 
 # --- the other commands
@@ -406,3 +426,50 @@ def test_a_reader_that_leaves_does_not_end_the_computation(here, fall):
         "summary.json",
         "report.txt",
     }
+
+
+LONG = "n" * 300
+
+
+@pytest.mark.parametrize(
+    "argv",
+    [
+        ["run", ""], ["run", LONG], ["run", "a\0b"], ["run", "a\0.py"], ["run", "\ud800.py"], ["report", ""],
+        ["report", LONG], ["report", "a\0b"], ["sweep", "a\0.py", "--vary", "m=1:2:3"],
+        ["sweep", "--merge", "a\0b"], ["sweep", "--merge", LONG], ["export-c", "overhead-crane", "--out", LONG],
+        ["export-c", "overhead-crane", "--out", "a\0b"],
+        *(["run", "overhead-crane", "--out", out] for out in (LONG, "a\0b", "\ud800", f"{LONG}/{LONG}")),
+        *([command, "overhead-crane", "--out", "a\0b"] for command in ("tradeoff", "run")),
+        ["sweep", "overhead-crane", "--vary", "m_load=1:2:99999", "l=1:2:99999"],
+        ["sweep", "overhead-crane", "--vary", "m_load=1:2:99999", "--monte-carlo", "99999", "--draw", "l=normal:1:1",
+         "--seed", "1"],
+    ],
+    ids=lambda argv: " ".join(word[:12] for word in argv).encode("ascii", "backslashreplace").decode(),
+)  # fmt: skip
+def test_odd_names_and_too_many_cases_are_explained(argv, capsys):
+    assert main(argv) == 2
+    said = capsys.readouterr().err
+    assert "Error" in said or "NameUnknown" in said
+    assert list(Path.cwd().iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    "argv",
+    [
+        ["run", "overhead-crane", "--samples", "99999999999"], ["run", "overhead-crane", "--samples", "1" * 5000],
+        ["sweep", "overhead-crane", "--vary", "m_load=1:2:999999999999"],
+        ["sweep", "overhead-crane", "--vary", "m_load=1:2:" + "9" * 5000],
+        ["sweep", "overhead-crane", "--monte-carlo", "99999999999", "--draw", "m_load=normal:100:5", "--seed", "1"],
+    ],
+    ids=lambda argv: " ".join(argv[2:4])[:30],
+)  # fmt: skip
+def test_options_beyond_their_bounds_are_refused(argv, capsys):
+    with pytest.raises(SystemExit) as ended:
+        main(argv)
+    assert ended.value.code == 2 and argv[2] in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("delay", ["9999999", "999999999999999999999999999999", "1001"])
+def test_a_delay_beyond_its_bound_is_a_sentence(delay, capsys):
+    assert main(["run", "overhead-crane", "--no-figures", "--law", "computed", "--delay", delay]) in (1, 2)
+    assert "delay" in capsys.readouterr().out

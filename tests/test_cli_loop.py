@@ -17,7 +17,7 @@ from servoctl.shell.main import main
 UNITS = gallery["overhead-crane"].units
 
 
-pytestmark = pytest.mark.usefixtures("here", "at_once")
+pytestmark = pytest.mark.usefixtures("here")
 
 
 def crane(*options):

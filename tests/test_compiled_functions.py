@@ -12,7 +12,8 @@ import pytest
 from refusals import refused
 
 from servoctl.codegen import compiler, emit
-from servoctl.codegen.function import compiled, compiling_at_once
+from servoctl.codegen import function as functions
+from servoctl.codegen.function import compiled
 from servoctl.errors import NameUnknown, SpecificationError
 from servoctl.methods.runge_kutta import tableau
 
@@ -61,7 +62,16 @@ EDGES = (0.0, -0.0, 1.0, -1.0, 0.5, -0.5, 0.7, -0.7, 2.0, -2.0, 3.0, np.inf, -np
          -1e308, 1e-8, 1 - 2**-53, 2**-53 - 1, 1 + 2**-52, 1e5, 700.0, -750.0)
 
 
-def test_every_operation_equals_casadi():
+def in_buffer(model, t, x, p):
+    """Outputs (n_y,) at a point, in compiled code."""
+    at, state, parameters, y, call = model.buffer()
+    at[0], state[:], parameters[:] = t, x, p
+    call()
+    return y.copy()
+
+
+def test_every_operation_equals_casadi(monkeypatch, c_compiler):
+    monkeypatch.setattr(functions, "GRID_POINTS", 0)
     a, b = X2[0], X2[1]
     expressions = [*(ca.SX.unary(getattr(ca, f"OP_{name.upper()}"), a) for name in UNARY),
                    *(ca.SX.binary(getattr(ca, f"OP_{name.upper()}"), a, b) for name in BINARY),
@@ -76,25 +86,24 @@ def test_every_operation_equals_casadi():
     n = x.shape[1]
     reference = np.asarray(f.map(n)(np.full((1, n), 2.5), x, np.full((1, n), 1.5)))
     model = compiled(f, "operations")
-    with compiling_at_once():
-        y = model.grid(2.5, x, [1.5])
+    y = model.grid(2.5, x, [1.5])
     assert model.backend == "c"
-    alone = np.array([model(2.5, column, [1.5]) for column in x.T]).T
+    alone = np.array([in_buffer(model, 2.5, column, [1.5]) for column in x.T]).T
     for values in (y, alone):
         for row, expected, expression in zip(values, reference, expressions, strict=True):
             np.testing.assert_array_equal(np.isnan(row), np.isnan(expected), err_msg=str(expression))
             np.testing.assert_array_max_ulp(row, expected, maxulp=2)
 
 
-def test_constants_are_exact():
+def test_constants_are_exact(monkeypatch, c_compiler):
+    monkeypatch.setattr(functions, "GRID_POINTS", 0)
     model = compiled(function(*CONSTANTS), "constants")
-    with compiling_at_once():
-        y = model.grid(0.0, np.zeros((2, 20)), [0.0])
+    y = model.grid(0.0, np.zeros((2, 20)), [0.0])
     assert model.backend == "c"
     np.testing.assert_array_equal(y[:, -1], CONSTANTS)
 
 
-def test_chunks_equal_one_function_and_casadi_to_the_last_bit(monkeypatch):
+def test_chunks_equal_one_function_and_casadi_to_the_last_bit(monkeypatch, c_compiler):
     monkeypatch.setenv("CC", "cc -ffp-contract=off")
     f = random_function(2600)
     assert emit.operations(f) > 5000
@@ -168,7 +177,7 @@ def test_a_buffer_is_written_called_and_read(backend):
         t[0], x[:], p[:] = now, (0.3, -0.2), 2.0
         call()
         kept = y.copy()
-        np.testing.assert_array_equal(kept, model(now, [0.3, -0.2], [2.0]))
+        np.testing.assert_allclose(kept, model(now, [0.3, -0.2], [2.0]), rtol=1e-15)
     assert model.backend == backend
 
 
@@ -205,7 +214,7 @@ def test_threads_do_not_share_memory(backend):
     lambda m: m.grid([0.0, 1.0], np.zeros((2, 3)), [1.0]), lambda m: m.grid(0.0, np.zeros((3, 2)), [1.0]),
     lambda m: m.grid(0.0, np.zeros((2, 3)), np.zeros((1, 2))), lambda m: m.rk(0.0, [1.0], 0.1, 5, [1.0], RK4),
     lambda m: m.rk(0.0, [1.0, 0.0], 0.1, -1, [1.0], RK4), lambda m: m.rk(0.0, [1.0, 0.0], 0.1, 5, [1.0], RK4, every=0),
-    lambda m: m.newton([0.0], [1.0, 0.0], [1.0]),
+    lambda m: m.continuation([0.0], [1.0, 0.0], [1.0], 1.0, 1),
 ])
 def test_wrong_arguments_are_refused(call):
     with pytest.raises(SpecificationError):
@@ -293,22 +302,34 @@ def test_rk_ends_at_the_last_finite_state(backend):
 # --- Newton along a path
 
 
-def newton_model(residual, x, name, *others):
+def newton_model(residual, x, name, *others, pivots=0):
     jacobian = ca.jacobian(residual, x)
     delta, rate = -ca.solve(jacobian, residual), -ca.solve(jacobian, ca.jacobian(residual, T))
-    return compiled(function(delta, rate, *others, x=x), name, ("newton",))
+    second = ca.jacobian(rate, T) + ca.jtimes(rate, x, rate)
+    return compiled(function(delta, rate, second, *others, x=x), name, ("newton",), sizes={"pivots": pivots})
+
+
+def along(model, t, x0, p, most=4000):
+    """Solutions at t (N,), outputs there, and all evaluations, from x0 at t[0]."""
+    span = [t[0], t[-1]] if t[0] != t[-1] else [t[0]]
+    nodes, first = model.continuation(span, x0, p, abs(t[-1] - t[0]) / 50, most)
+    if not len(nodes):
+        return np.empty((model.n_x, 0)), np.empty((model.n_y, 0)), first
+    solved = t[np.abs(t - t[0]) <= abs(nodes[-1, 0] - t[0])]
+    x, y, second = model.newton(solved, nodes, p)
+    return x, y, first + second
 
 
 def test_newton_on_a_cubic(backend):
     x = ca.SX.sym("x")
     model = newton_model(x**3 + P1 * x - ca.sin(T), x, "cubic", x**2)
     t = np.linspace(0, 10, 501)
-    solution, y, iterations = model.newton(t, [0.3], [3.0])
+    solution, y, iterations = along(model, t, [0.3], [3.0])
     assert model.backend == backend
     expected = 2 * np.sinh(np.arcsinh(np.sin(t) / 2) / 3)
     np.testing.assert_allclose(solution[0], expected, rtol=0, atol=4e-16)
     np.testing.assert_allclose(y[1], np.cos(t) / (3 * expected**2 + 3), rtol=1e-14, atol=1e-14)
-    np.testing.assert_allclose(y[2], expected**2, rtol=1e-14, atol=1e-15)
+    np.testing.assert_allclose(y[3], expected**2, rtol=1e-14, atol=1e-15)
     assert iterations <= 4 * t.size
 
 
@@ -321,16 +342,16 @@ def test_newton_on_three_equations(backend):
 
     model = newton_model(mixed(x) - mixed(path), x, "three")
     t = np.linspace(0, 2, 101)
-    solution, y, _ = model.newton(t, [1.1, 1.9, 0.9], [0.0])
+    solution, y, _ = along(model, t, [1.1, 1.9, 0.9], [0.0])
     np.testing.assert_allclose(solution, [np.cos(t), 2 + np.sin(2 * t), np.exp(-t)], rtol=0, atol=1e-14)
-    np.testing.assert_allclose(y[3:], [-np.sin(t), 2 * np.cos(2 * t), -np.exp(-t)], rtol=0, atol=1e-12)
+    np.testing.assert_allclose(y[3:6], [-np.sin(t), 2 * np.cos(2 * t), -np.exp(-t)], rtol=0, atol=1e-12)
 
 
 def test_newton_halves_a_step_that_is_too_long(backend):
     x = ca.SX.sym("x")
     model = newton_model(ca.atan(x - 50 * ca.sin(T)), x, "narrow")       # Newton converges within 1.39 of the root only
     t = np.arange(0.0, 6.0, 0.5)
-    solution, _, iterations = model.newton(t, [0.1], [0.0])
+    solution, _, iterations = along(model, t, [0.1], [0.0])
     np.testing.assert_allclose(solution[0], 50 * np.sin(t), rtol=0, atol=1e-13)
     assert iterations > 10 * t.size
 
@@ -340,16 +361,16 @@ def test_newton_keeps_what_it_solved_where_the_solution_ends(backend, count):
     x = ca.SX.sym("x")
     model = newton_model(x**2 - (1 - T), x, "fold")
     t = np.linspace(0, 2, count)
-    solution, y, _ = model.newton(t, [0.9], [0.0])
+    solution, y, _ = along(model, t, [0.9], [0.0])
     solved = int(np.sum(t < 1 - 1e-9))
-    assert solution.shape[1] in (solved, solved + 1) and y.shape == (2, solution.shape[1])
+    assert solution.shape[1] in (solved, solved + 1) and y.shape == (3, solution.shape[1])
     exact = np.sqrt(1 - t[:solved])
     assert np.all(np.abs(solution[0, :solved] - exact) <= 1e-15 / exact)
-    assert model.newton(t, [np.nan], [0.0])[0].shape == (1, 0)
-    assert model.newton(t, [1e9], [0.0], max_iter=3)[0].shape == (1, 0)
+    assert along(model, t, [np.nan], [0.0])[0].shape == (1, 0)
+    assert along(model, t, [1e12], [0.0])[0].shape == (1, 0)
 
 
-def test_both_backends_count_the_same_iterations(monkeypatch):
+def test_both_backends_count_the_same_iterations(monkeypatch, c_compiler):
     x = ca.SX.sym("x")
     t = np.arange(0.0, 6.0, 0.5)
     results = []
@@ -357,8 +378,7 @@ def test_both_backends_count_the_same_iterations(monkeypatch):
         monkeypatch.setenv("SERVOCTL_COMPILER", chosen)
         monkeypatch.setattr(compiler, "_warned", True)
         model = newton_model(ca.atan(x - 50 * ca.sin(T)), x, "narrow")
-        with compiling_at_once():
-            results.append((model.newton(t, [0.1], [0.0])[2], model.backend))
+        results.append((along(model, t, [0.1], [0.0])[2], model.backend))
     (in_c, _), (in_python, _) = results
     assert [backend for _, backend in results] == ["c", "casadi"]
     assert abs(in_c - in_python) <= 0.02 * in_c

@@ -14,6 +14,8 @@ import servoctl as sv
 from servoctl.codegen.compiler import compiler
 from servoctl.errors import SpecificationError
 
+pytestmark = pytest.mark.usefixtures("c_compiler")
+
 STRICT = ("-std=c99", "-O1", "-Wall", "-Wextra", "-pedantic", "-Werror")
 SENSORS = {"x": 1e-3, "l": 1e-3, "theta": 1e-3}
 

@@ -13,6 +13,8 @@ from servoctl.gallery import gallery
 from servoctl.methods.choice import as_method
 from servoctl.methods.radau import basis, radau
 
+pytestmark = pytest.mark.usefixtures("c_compiler")
+
 STATE = ("x", "y", "z", "phi", "theta", "dphi", "dtheta")
 ZERO = {"x": 0.0, "y": 0.0, "phi": 0.0, "theta": 0.0}
 ORDERS = (5, 9, 13)

@@ -1,13 +1,19 @@
-"""Internal dynamics: eigenvalues against closed forms, whatever the coordinates."""
+"""Internal dynamics: growth against the variational equation and closed forms, whatever the coordinates and samples."""
 
+import runpy
+import warnings
+from dataclasses import replace
 from math import pi
+from pathlib import Path
 
+import casadi as ca
 import numpy as np
 import pytest
-from refusals import refused
+from refusals import refused, warned
+from scipy.integrate import solve_ivp
 
 import servoctl as sv
-from servoctl.gallery import cars, gallery, mass_on_car, passive_arm, vtol
+from servoctl.gallery import cars, gallery, mass_on_car, passive_arm, spiral, vtol
 
 
 def internal(pair, span, start, **guess):
@@ -26,28 +32,36 @@ def internal(pair, span, start, **guess):
 )
 def test_mass_on_car(pair, start, poles):
     found = internal(pair, (0.0, 1.0), start)
-    assert found.verdict == "stable" and found.growth == 1.0
+    assert found.verdict == "stable" and found.growth == 1.0 and found.left < 0.95
     for pole in poles:
         assert np.abs(found.eigenvalues - pole).min(axis=0).max() < 1e-7
 
 
 def test_the_aircrafts_centre_of_mass_is_unstable():
     """Theory: ±15.0405993 1/s at rest, and errors grow by exp of their integral."""
-    found = internal(vtol("centre"), (0.0, 0.2), {"theta": 0.0, "dtheta": 0.0})
+    with warned("unstable over these 0.2 s", "grow by 20"):
+        found = internal(vtol("centre"), (0.0, 0.2), {"theta": 0.0, "dtheta": 0.0})
     assert found.verdict == "unstable"
-    assert found.eigenvalues[:, 0] == pytest.approx([15.0405993, -15.0405993], abs=1e-6)
+    assert found.eigenvalues[0, 0] == pytest.approx(15.0405993, abs=1e-6)
+    assert found.eigenvalues[1, 0] == pytest.approx(-15.0405993, abs=1e-6)
     assert found.growth == pytest.approx(np.exp(0.2 * 15.04), rel=0.02)
 
 
 def test_the_passive_arm_turns_unstable_above_0_4():
-    verdicts = [internal(passive_arm(G), (0.0, 0.02), {"q2": 0.0, "dq2": 0.0}).verdict for G in (0.2, 0.39, 0.41, 0.6)]
-    assert verdicts == ["stable", "stable", "unstable", "unstable"]
+    """Its frozen eigenvalues say so at once; a verdict takes the time in which errors grow."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)
+        found = [internal(passive_arm(G), (0.0, 0.02), {"q2": 0.0, "dq2": 0.0}) for G in (0.2, 0.39, 0.41, 0.6)]
+        longer = [internal(passive_arm(G), (0.0, T), {"q2": 0.0, "dq2": 0.0}) for G, T in ((0.2, 1.0), (0.6, 0.3))]
+    assert [one.eigenvalues.real.max() > 0 for one in found] == [False, False, True, True]
+    assert [one.verdict for one in found] == ["neutral", "neutral", "unstable", "neutral"]
+    assert [one.verdict for one in longer] == ["stable", "unstable"]
 
 
 def test_symmetries_are_neutral_and_flat_programs_have_none():
     scene = gallery["wheeled-robot"]
     found = internal(scene.build(), (0.0, 5.0), scene.start, v=1.0)
-    assert (found.verdict, found.names) == ("neutral", ("x", "y", "psi"))
+    assert (found.verdict, found.names) == ("neutral", ("x", "y", "psi", "r"))
     flat = internal(cars(), (0.0, 0.5), {})
     assert flat.verdict == "none" and "determines" in repr(flat)
 
@@ -58,3 +72,251 @@ def test_a_run_without_its_model_is_refused(tmp_path):
     for other, kind in ((sv.load(run.save(tmp_path / "run")), "Run"), (None, "NoneType")):
         with refused(sv.SpecificationError, "internal_dynamics", kind):
             sv.internal_dynamics(model, other)
+
+
+# a body of which the program says nothing: its motion is the internal dynamics --------------------------------------
+
+
+def passive(acceleration, scale=1.0):
+    """The model of a body x'' = acceleration(x, x', t), in units of 1/scale m, beside another one that is driven."""
+    q = sv.coordinates("x y")
+    (x, y), (dx, _), (d2x, d2y) = q, q.d(1), q.d(2)
+    mechanism = sv.Mechanism(
+        q,
+        gibbs=(d2x**2 + d2y**2) / 2,
+        forces={"x": scale * acceleration(x / scale, dx / scale, q.t)},
+        actuators={"F": y},
+    )
+    return sv.derive(mechanism, sv.Program({"y": y - ca.sin(q.t)}))
+
+
+def moved(model, length, *method, x=1e-3, **options):
+    """A run of a length [s] from x, with its internal dynamics."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)
+        run = sv.simulate(model, model.start(x=x, dx=0.0), (0.0, length), *method, **options)
+    return run, sv.internal_dynamics(model, run)
+
+
+def mathieu(depth, damping=0.1):
+    return lambda x, v, t: -damping * v - (1 + depth * ca.cos(2 * t)) * x
+
+
+def fundamental(length, depth, damping=0.1):
+    """The propagator of Mathieu's equation, integrated by itself."""
+
+    def rates(t, Y):
+        return np.concatenate([Y[2:], -damping * Y[2:] - (1 + depth * np.cos(2 * t)) * Y[:2]])
+
+    return solve_ivp(rates, (0.0, length), np.eye(2).ravel(), rtol=1e-11, atol=1e-13).y[:, -1].reshape(2, 2)
+
+
+@pytest.mark.parametrize(
+    "samples",
+    [
+        None,
+        np.linspace(0.0, 120.0, 4),
+        np.linspace(0.0, 120.0, 131),
+        pi * np.arange(39),  # one phase of the period alone
+        [100.0, 120.0],
+        [120.0],
+    ],
+    ids=["default", "few", "some", "one phase", "late", "last"],
+)
+def test_parametric_resonance_is_unstable_though_all_frozen_eigenvalues_are_stable(samples):
+    run, found = moved(passive(mathieu(0.6)), 120.0, t_eval=samples)
+    assert run.internal["verdict"] == "unstable"
+    exact = np.linalg.norm(fundamental(120.0, 0.6), 2)
+    assert exact / 1.3 < run.internal["growth"] < exact * 1.3
+    if samples is None:
+        assert np.abs(run["x"]).max() == pytest.approx(84.0, rel=0.01)
+        assert found.verdict == "unstable" and found.eigenvalues.real.max() < -0.04
+        assert "frozen eigenvalues" in repr(found) and "over these 120 s" in repr(found)
+
+
+def test_spans_of_whole_periods_are_judged_like_others():
+    verdicts = {moved(passive(mathieu(depth)), 32 * pi)[1].verdict for depth in (0.6, 0.8)}
+    assert verdicts == {"unstable"}
+
+
+@pytest.mark.parametrize("depth, verdict", [(0.6, "unstable"), (0.15, "stable"), (0.0, "stable")])
+def test_multipliers_are_those_of_the_propagator_over_a_period(depth, verdict):
+    model = passive(mathieu(depth))
+    run, _ = moved(model, 20.0)
+    found = sv.internal_dynamics(model, run, period=pi)
+    expected = np.linalg.eigvals(fundamental(pi, depth))
+    expected = expected[np.argsort(-np.abs(expected))]
+    assert np.sort(np.abs(found.multipliers)) == pytest.approx(np.sort(np.abs(expected)), rel=2e-3)
+    assert np.prod(found.multipliers) == pytest.approx(np.exp(-0.1 * pi), rel=2e-3)  # Liouville
+    assert found.verdict == verdict and "multipliers" in repr(found)
+
+
+def test_a_period_that_is_none_is_refused():
+    model = passive(mathieu(0.6))
+    run, _ = moved(model, 20.0)
+    with refused(sv.SpecificationError, "3 s", period=3.0):
+        sv.internal_dynamics(model, run, period=3.0)
+    with refused(sv.SpecificationError, "30 s", period=30.0):
+        sv.internal_dynamics(model, run, period=30.0)
+    with refused(sv.SpecificationError, "period"):
+        sv.internal_dynamics(model, run, period=-1.0)
+
+
+@pytest.mark.parametrize("scale", [1e-6, 1.0, 1e6])
+@pytest.mark.parametrize(
+    "acceleration, length, verdict, growth",
+    [
+        (lambda x, v, t: 0 * x, 50.0, "neutral", (1.0, 2.0)),  # adrift
+        (lambda x, v, t: -1e4 * x, 3.0, "neutral", (1.0, 1.1)),  # quick
+        (lambda x, v, t: -1e-4 * x, 10.0, "neutral", (1.0, 2.0)),  # slow
+        (lambda x, v, t: -0.3 * v - x, 40.0, "stable", (1.0, 1.1)),
+        (lambda x, v, t: 4 * x, 5.0, "unstable", (np.exp(10.0) / 1.05, np.exp(10.0) * 1.05)),
+        (lambda x, v, t: 4 * x, 0.1, "neutral", (1.0, 1.5)),  # for so short a time nothing grows
+        (lambda x, v, t: -0.3 * v - (-1 + 34 * ca.cos(15 * t)) * x, 40.0, "stable", (1.0, 10.0)),  # Kapitza's pendulum
+        (lambda x, v, t: -2 * v - (3 - 6 / (1 + ca.exp(-2 * (t - 10)))) * x, 20.0, "unstable", (8e3, 2e4)),  # later
+        (lambda x, v, t: -0.3 * v - x + 25 * ca.exp(-(((t - 50) / 0.5) ** 8)) * x, 100.0, "unstable", (20, 100)),  # once
+    ],
+)
+def test_growth_is_that_of_the_motion_in_any_units(acceleration, length, verdict, growth, scale):
+    _, found = moved(passive(acceleration, scale), length, x=scale)
+    assert found.verdict == verdict and growth[0] <= found.growth <= growth[1]
+
+
+@pytest.mark.parametrize("growth, verdict", [(5.0, "neutral"), (20.0, "unstable")])
+def test_exponential_growth_is_unstable_above_ten(growth, verdict):
+    _, found = moved(passive(lambda x, v, t: 4 * x), np.log(growth) / 2)
+    assert found.verdict == verdict and found.growth == pytest.approx(growth, rel=0.03)
+
+
+def test_the_plan_of_a_parametric_resonance_is_refused_by_inverse_dynamics():
+    model = passive(mathieu(0.6))
+    run, found = moved(model, 120.0)
+    plant = sv.plant(model.reduction.mechanism)
+    with refused(sv.UnstableInternalDynamics, "lqr", verdict="unstable", growth=found.growth, states=("x", "dx")):
+        sv.computed(run, plant)
+    model = passive(mathieu(0.15))
+    assert sv.computed(moved(model, 120.0)[0], sv.plant(model.reduction.mechanism)).name == "computed"
+
+
+def test_stiff_and_backward_motions_are_judged():
+    stiff, found = moved(passive(lambda x, v, t: -1e4 * v - 1e4 * (1 + 0.5 * ca.sin(t)) * x), 10.0, "RadauIIA")
+    assert found.verdict == "stable" and found.growth < 1.1
+    model = passive(lambda x, v, t: -v - x)
+    with warned("unstable"):  # what decays forwards grows backwards
+        sv.simulate(model, model.start(t=10.0, x=1e-3, dx=0.0), (10.0, 0.0))
+
+
+def test_growth_is_that_of_a_perturbed_twin():
+    model = sv.derive(*vtol("centre"))
+    runs = []
+    for theta in (0.0, 1e-7):
+        with warned("unstable"):
+            runs.append(sv.simulate(model, model.start(theta=theta, dtheta=0.0), (0.0, 0.5), rtol_method()))
+    apart = np.abs(runs[1]["theta"] - runs[0]["theta"])
+    assert runs[0].internal["growth"] / 3 < apart.max() / 1e-7 < runs[0].internal["growth"] * 1.1
+
+
+def rtol_method():
+    return sv.Adaptive("DOP853", 1e-13, 1e-15)
+
+
+def test_phases_that_drift_apart_are_no_instability():
+    """Errors of a speed grow linearly: 20 times in 20 s, and nothing is unstable."""
+    q = sv.coordinates("x y")
+    (x, y), (d2x, d2y) = q, q.d(2)
+    mechanism = sv.Mechanism(q, gibbs=(d2x**2 + d2y**2) / 2, potential=(x**2 + y**2) ** 2 / 4)
+    model = sv.derive(mechanism, sv.Program({"plane": 0.6 * x + 0.8 * y}, by="ideal"))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", RuntimeWarning)
+        run = sv.simulate(model, model.start(guess={"x": 0.8, "y": -0.6}, dx=0.0), (0.0, 40.0), drift="project")
+    found = sv.internal_dynamics(model, run)
+    assert found.verdict == "neutral" and 10 < found.growth < 100
+
+
+@pytest.mark.parametrize("order, verdict", [(4, "neutral"), (5, "neutral"), (7, "neutral"), (8, "unstable")])
+def test_high_derivatives_grow_as_powers_of_time(order, verdict):
+    """Up to 1e4 that is neutral."""
+    model = sv.derive(*spiral(order))
+    straight = {f"d{k}{axis}": 0.0 for k in range(2, order) for axis in "xy"}
+    start = model.start(x=0.0, y=0.0, dx=1.0, dy=0.0, guess=straight)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error" if verdict == "neutral" else "ignore", RuntimeWarning)
+        run = sv.simulate(model, start, (0.0, 2.0), drift="project")
+    assert run.internal["verdict"] == verdict and run.internal["growth"] > 10
+
+
+# spaces that turn ----------------------------------------------------------------------------------------------------
+
+
+def ball_on_a_table(radius=0.1, mass=1.0, table=2.0):
+    """A ball that rolls on a turning table: unit quaternion and angular velocity in space. It is exactly neutral."""
+    names = sv.coordinates("X Y phi e0 e1 e2 e3")
+    X, Y, _, e0, e1, e2, e3 = names
+    spin = ca.vertcat(ca.horzcat(-e1, -e2, -e3), ca.horzcat(e0, e3, -e2), ca.horzcat(-e3, e0, e1), ca.horzcat(e2, -e1, e0))
+    V = ca.diagcat(ca.SX.eye(3), spin / 2)
+    unit = e0**2 + e1**2 + e2**2 + e3**2 - 1
+    q = names.with_quasi_velocities("vx vy s w1 w2 w3", V, invariants={"unit": unit})
+    (vx, vy, s, w1, w2, _), a = q.w(), q.gamma(2)
+    gibbs = mass * (a[0] ** 2 + a[1] ** 2) / 2 + table * a[2] ** 2 / 2
+    gibbs += 0.2 * mass * radius**2 * (a[3] ** 2 + a[4] ** 2 + a[5] ** 2)
+    rolling = {"roll x": vx - radius * w2 + s * Y, "roll y": vy + radius * w1 - s * X}
+    mechanism = sv.Mechanism(q, gibbs=gibbs, actuators={"motor": (0, 0, 1, 0, 0, 0)}, constraints=rolling)
+    return sv.derive(mechanism, sv.Program({"table": s - 1.4}))
+
+
+@pytest.mark.parametrize("length", [10.0, 60.0])
+def test_a_ball_on_a_turning_table_is_neutral(length):
+    model = ball_on_a_table()
+    start = model.start(X=0.5, Y=0.0, phi=0.0, e0=1.0, e1=0.0, e2=0.0, e3=0.0, vx=0.0, vy=0.3, w3=0.2)
+    run = sv.simulate(model, start, (0.0, length), drift="project")
+    found = sv.internal_dynamics(model, run)
+    assert run["e0"].min() < 0 < run["e0"].max()
+    assert found.verdict == "neutral" and found.growth < 3
+
+
+@pytest.mark.parametrize("length", [5.0, 10.0, 60.0])
+def test_a_spinning_satellite_is_neutral(length):
+    example = runpy.run_path(str(Path(__file__).parents[1] / "examples" / "quaternion.py"), run_name="example")
+    model = sv.derive(example["mechanism"], example["program"])
+    run = sv.simulate(model, model.start(w3=0.5, guess={"e0": 1.0}), (0.0, length), drift="project")
+    found = sv.internal_dynamics(model, run)
+    assert found.verdict == "neutral" and found.growth < 3
+
+
+# what carries the verdict --------------------------------------------------------------------------------------------
+
+
+def test_runs_carry_the_verdict_and_flat_ones_need_none(tmp_path, gallery_model):
+    model = gallery_model("vtol-centre")
+    with warned("unstable over these 1 s"):
+        run = sv.simulate(model, model.start(**gallery["vtol-centre"].start), (0.0, 1.0))
+    assert "internal dynamics unstable over these 1 s: errors grow by" in repr(run)
+    assert run.internal["growth"] == sv.internal_dynamics(model, run).growth > 100
+    loaded = sv.load(run.save(tmp_path / "run"))
+    assert loaded.internal == run.internal and loaded.internal["text"] in repr(loaded)
+    flat = sv.derive(*cars())
+    assert sv.simulate(flat, flat.start(), (0.0, 0.5)).internal == {}
+
+
+def test_a_motion_that_grows_beyond_its_tolerance_says_how_long_it_is_good():
+    model = passive(lambda x, v, t: 4 * x)
+    with warned("good for 6.9 s"):  # 1e-9 e^(2 t) = 1e-3
+        run = sv.simulate(model, model.start(x=1e-3, dx=0.0), (0.0, 12.0))
+    assert run.internal["good for"] == pytest.approx(np.log(1e6) / 2, rel=0.02)
+    assert sv.internal_dynamics(model, run).good_for(1e-12) == pytest.approx(np.log(1e9) / 2, rel=0.02)
+
+
+def test_a_stopped_motion_carries_the_verdict_too():
+    model = sv.derive(*passive_arm(0.6))
+    with pytest.raises(sv.SingularProgram) as caught:
+        sv.simulate(model, model.start(q2=0.0, dq2=0.0), (0.0, 1.0))
+    assert caught.value.run.internal["verdict"] == "unstable"
+
+
+def test_samples_that_resolve_nothing_are_inconclusive():
+    model = passive(mathieu(0.6))
+    run, _ = moved(model, 120.0)
+    jets = run.jets.copy()
+    jets[:, ::2] *= 1.5  # no motion
+    found = sv.internal_dynamics(model, replace(run, jets=jets))
+    assert found.verdict == "inconclusive" and np.isnan(found.growth) and "t_eval" in repr(found)

@@ -4,24 +4,29 @@ import casadi as ca
 import mpmath
 import numpy as np
 import pytest
-from test_compiled_functions import P1, X2, T, function, newton_model
+from test_compiled_functions import P1, X2, T, along, function, newton_model
 
 from servoctl.codegen import emit
+from servoctl.codegen import function as functions
 from servoctl.codegen.emit import SHARED, WIDE
-from servoctl.codegen.function import compiled, compiling_at_once
+from servoctl.codegen.function import compiled
 
 TINY, LAST_SMALL = 1e-300, np.nextafter(1e5, 0)
 
 
 @pytest.fixture(autouse=True)
-def at_once():
-    with compiling_at_once():
-        yield
+def grids_compile(monkeypatch):
+    monkeypatch.setattr(functions, "GRID_POINTS", 0)
 
 
 def points(model, t, x, p):
-    """Outputs (n_y, N) point by point."""
-    return np.array([model(now, column, p) for now, column in zip(t, x.T, strict=True)]).T
+    """Outputs (n_y, N) point by point, in compiled code."""
+    at, state, parameters, y, call = model.buffer()
+    parameters[:], columns = p, []
+    for at[0], state[:] in zip(t, x.T, strict=True):
+        call()
+        columns.append(y.copy())
+    return np.array(columns).T
 
 
 def at_points(model, x):
@@ -111,23 +116,22 @@ SCATTERED = np.sort(np.append(0, np.random.default_rng(5).uniform(0, 1, 200)))
 def test_blocks_equal_points(t, backend):
     model = kepler()
     x0 = [1.2, 1.4] if t[0] else [0.0, 0.5]
-    x, y, iterations = model.newton(t, x0, [0.4])
+    x, y, iterations = along(model, t, x0, [0.4])
     assert x.shape[1] == t.size and model.backend == backend
     at = x0
     for k, now in enumerate(t):
-        alone, rest, _ = model.newton([now], at, [0.4])
+        alone, rest, _ = along(model, np.array([now]), at, [0.4])
         at = alone[:, 0]
-        np.testing.assert_allclose(x[:, k], at, rtol=0, atol=5e-16 * (1 + np.abs(at).max()))
+        conditions = 1 + np.abs([at[0], at[1] * np.tan(at[0])])  # x1 = 1 / (2 cos x0)
+        assert np.all(np.abs(x[:, k] - at) <= 5e-16 * conditions)
         np.testing.assert_allclose(y[2:, k], rest[2:, 0], rtol=1e-14, atol=1e-14)
     np.testing.assert_allclose(x[0] - 0.4 * np.sin(x[0]), t, rtol=0, atol=5e-16)
 
 
-@pytest.mark.parametrize("backend", ["c"], indirect=True)  # blocks are solved together in compiled code alone
-def test_blocks_need_fewer_evaluations_than_points(backend):
-    t = np.linspace(0, 1, 801)
-    model = kepler()
-    apart = model.newton(t[::114], [0.0, 0.5], [0.4])[2] / t[::114].size
-    assert model.newton(t, [0.0, 0.5], [0.4])[2] <= 2.1 * t.size < apart * t.size
+def test_points_between_nodes_take_two_evaluations(backend):
+    t, model = np.linspace(0, 1, 801), kepler()
+    nodes, _ = model.continuation([0.0, 1.0], [0.0, 0.5], [0.4], 0.02, 1000)
+    assert model.newton(t, nodes, [0.4])[2] <= 2.1 * t.size
 
 
 @pytest.mark.parametrize("last", range(190, 199))
@@ -135,7 +139,7 @@ def test_a_block_ends_where_its_solution_ends(last, backend):
     x = ca.SX.sym("x")
     model = newton_model(x**2 - (1 - T), x, "fold_in_block")
     t = np.append(np.linspace(0, 0.6, last), np.linspace(1.01, 1.6, 150))
-    solution, y, _ = model.newton(t, [0.9], [0.0])
+    solution, y, _ = along(model, t, [0.9], [0.0])
     assert solution.shape[1] == y.shape[1] == last
     np.testing.assert_allclose(solution[0], np.sqrt(1 - t[:last]), rtol=1e-14)
 
@@ -145,7 +149,7 @@ def test_a_kink_within_a_block_is_followed(backend):
     path = ca.fabs(T - 0.5)
     model = newton_model(x + x**3 - path - path**3, x, "kink")
     for t in (np.linspace(0, 1, 200), np.linspace(0, 1, 23)):
-        solution, _, _ = model.newton(t, [0.5], [0.0])
+        solution, _, _ = along(model, t, [0.5], [0.0])
         np.testing.assert_allclose(solution[0], np.abs(t - 0.5), rtol=0, atol=1e-15)
 
 
@@ -153,5 +157,5 @@ def test_far_predictions_are_not_trusted(backend):
     x = ca.SX.sym("x")
     model = newton_model(ca.sin(x - 40 * ca.sin(7 * T)), x, "many_roots")  # a root every pi
     t = np.linspace(0, 2, 2001)
-    solution, _, _ = model.newton(t, [0.0], [0.0])
+    solution, _, _ = along(model, t, [0.0], [0.0])
     np.testing.assert_allclose(solution[0], 40 * np.sin(7 * t), rtol=0, atol=1e-13)

@@ -1,5 +1,6 @@
 """LQR about a plan: Riccati equation, discretisation, weights, and the crane of the design."""
 
+import casadi as ca
 import numpy as np
 import pytest
 from refusals import refused
@@ -10,8 +11,6 @@ from servoctl.control.lqr import weights
 from servoctl.control.reference import Reference
 from servoctl.control.sampling import discretised, exponentials
 from servoctl.gallery import gallery
-
-pytestmark = pytest.mark.usefixtures("at_once")
 
 GUST = {"theta": sv.disturbances.gust(60.0, 2.0, 2.5)}
 WEIGHTS = {"Q": [1e3] * 3 + [1e2] * 3, "R": 1e-3}
@@ -263,3 +262,62 @@ def test_a_residual_of_accelerations_is_not_fed_back():
         sv.lqr(plan, sv.plant(mechanism), integral=True)
     with refused(sv.SpecificationError, "order 2", name="A"):
         sv.lqr(plan, sv.plant(mechanism), integral={"A": 1.0})
+
+
+# modes out of reach --------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def trailer():
+    """A robot whose wheels' angles are coordinates, with a trailer: 0.1 (φ_r - φ_l) - 0.6 ψ stays as it was."""
+    q = sv.coordinates("x y psi theta phi_l phi_r")
+    (x, y, psi, theta, _, _), (dx, dy, dpsi, dtheta, dl, dr) = q, q.d(1)
+    behind = ca.vertcat(x - ca.cos(theta), y - ca.sin(theta))
+    vx, vy = q.dt(behind).elements()
+    forward = dx * ca.cos(psi) + dy * ca.sin(psi)
+    rolling = {
+        "slip": -dx * ca.sin(psi) + dy * ca.cos(psi), "left": forward - 0.3 * dpsi - 0.1 * dl,
+        "right": forward + 0.3 * dpsi - 0.1 * dr, "trailer": -vx * ca.sin(theta) + vy * ca.cos(theta),
+    }  # fmt: skip
+    gibbs = sv.rigid_body(q, 20.0, (0, 0, 2.0), position=(x, y), rates=(0, 0, dpsi))
+    gibbs += sv.rigid_body(q, 10.0, (0, 0, 1.0), position=(behind[0], behind[1]), rates=(0, 0, dtheta))
+    gibbs += 0.005 * (q.d(2)[4] ** 2 + q.d(2)[5] ** 2)
+    mechanism = sv.Mechanism(
+        q, gibbs=gibbs, constraints=rolling, actuators={"left motor": q.d(0)[4], "right motor": q.d(0)[5]}
+    )
+    model = sv.derive(mechanism, sv.Program({"X": behind[0] - q.t, "Y": behind[1] - 0.3 * ca.sin(q.t)}))
+    start = model.start(guess={"x": 1.0, "dx": 1.0, "psi": 0.3, "theta": 0.3})
+    return sv.simulate(model, start, (0.0, 6.0)), sv.plant(mechanism)
+
+
+OUT_OF_REACH = {
+    "one integral": {"integral": {"X": 1e6}},
+    "a stiffer one": {"integral": {"X": 1e8}},
+    "frozen time": {"varying": False},
+    "frozen time with integrals": {"varying": False, "integral": True},
+}
+
+
+@pytest.mark.parametrize("how", OUT_OF_REACH)
+def test_the_mode_that_no_input_reaches_is_named_with_what_may_stay_unweighted(how, trailer):
+    names = {"mode": ["psi", "phi_l", "phi_r"], "unweighted": ["phi_l", "phi_r"]}
+    with refused(sv.ServoError, "psi, phi_l, phi_r", "left motor", "'phi_l': 0", **names):
+        sv.lqr(*trailer, **OUT_OF_REACH[how])
+    advised = OUT_OF_REACH[how] | {"Q": {"phi_l": 0.0, "phi_r": 0.0}, "varying": True}
+    law = sv.lqr(*trailer, **advised)
+    loop = sv.close(trailer[1], law, trailer[0].state(0.0), (0.0, 6.0))
+    assert max(np.abs(loop.residual[name][0]).max() for name in "XY") < 1e-5
+
+
+@pytest.mark.parametrize(("stiffness", "mode"), [(-4.0, {"y", "dy"}), (-0.5, {"y", "dy"})])
+def test_a_growing_mode_out_of_reach_is_named(stiffness, mode):
+    with refused(sv.ServoError, "force", unweighted=[]) as caught:
+        sv.lqr(*two_masses(stiffness))
+    assert set(caught.value.details["mode"]) == mode
+
+
+def test_a_mode_that_no_weight_sees_is_named(plan):
+    """An unweighted crane: nothing asks for its place or its swing."""
+    with refused(sv.ServoError, "weight") as caught:
+        sv.lqr(plan, sv.plant(CRANE), Q=0.0, varying=False)
+    assert "x" in caught.value.details["mode"]

@@ -73,7 +73,7 @@ CASES = [
 
 
 @pytest.mark.parametrize(("name", "options"), [c for c in CASES if c[0] in gallery])
-def test_the_memo_gives_the_same_run_to_the_bit_and_derives_nothing(derived, name, options):
+def test_the_memo_gives_the_same_run_to_the_bit_and_derives_nothing(derived, name, options, c_compiler):
     first, run = planned(name, **options)
     after_first = len(derived)
     again, repeated = planned(name, **options)
@@ -354,8 +354,8 @@ def test_least_used_entries_go_first(derived, tmp_path, monkeypatch):
     old, new = entries(tmp_path)[:2], entries(tmp_path)[2:]
     for path in old:
         os.utime(path, (1.0, 1.0))
-    monkeypatch.setattr(store, "MOST_BYTES", sum(path.stat().st_size for path in old + new) - 1)
-    store._prune(tmp_path / "derived")
+    monkeypatch.setattr(cache, "MOST_BYTES", sum(path.stat().st_size for path in old + new) - 1)
+    cache.prune(tmp_path / "derived")
     assert set(entries(tmp_path)) <= set(new) and entries(tmp_path)
     sv.derive(*pendulum(length=0.8))
     assert not list((tmp_path / "derived").glob("*.tmp"))

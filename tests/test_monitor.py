@@ -40,6 +40,20 @@ def sampled(model, t, x, **options):
     return Stretch(t, x, values[:, :, None], top, **options)
 
 
+def test_a_program_that_is_singular_at_its_start_says_by_how_much():
+    """The actuator moves x by its lever sin(y - 0.4) alone, which is zero at the start."""
+    q = sv.coordinates("x y")
+    x, y = q
+    mechanism = sv.Mechanism(q, gibbs=sv.particle(q, 1.0, (x, y)), actuators={"f": (ca.sin(y - 0.4), 1.0)})
+    model = sv.derive(mechanism, sv.Program({"a": x - 0.1 * q.t**2}), guess={"y": 0.4})
+    state = np.zeros(len(model.state_names))
+    state[model.state_names.index("y")] = 0.4
+    monitor = Monitor(model, 0.0, state)
+    error = monitor.singular(0.0, state, "its lever is zero")
+    assert monitor.rank_measure(0.0, state) < 1e-9 and error.details["measure"] < 1e-9
+    assert "from the first instant on" in str(error) and "1.0e+00" not in str(error)
+
+
 def test_quiet_steps_are_fine(circle):
     t = np.linspace(0.0, 0.7, 15)
     assert begun(circle, 0.0, round_the_circle(0.0)).inspect(sampled(circle, t, round_the_circle(t))) == Fine(14)

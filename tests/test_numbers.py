@@ -78,7 +78,7 @@ def test_entry_a_difference_is_zero_below_1e_12_of_its_terms(difference, zero):
     assert np.all(entries[0, 1] == 0.0) == zero
 
 
-@pytest.mark.parametrize("pivot, rank", [(3e-10, 2), (3e-11, 1)])
+@pytest.mark.parametrize("pivot, rank", [(3e-9, 2), (3e-10, 2), (3e-11, 1)])
 def test_resolved_a_pivot_counts_above_1e_10(pivot, rank):
     """Rows (1, 1) and (1, 1 + pivot): elimination leaves the pivot."""
     found = decide(np.array([[1.0, 1.0], [1.0, 1.0 + pivot]]))
@@ -87,10 +87,11 @@ def test_resolved_a_pivot_counts_above_1e_10(pivot, rank):
 
 
 @pytest.mark.skipif(not EXTENDED, reason="without extended precision the noise is that of double precision")
-def test_noise_a_pivot_between_3e_17_and_1e_10_is_neither_zero_nor_resolved():
-    matrix = np.array([[1, 1], [1, 1]], dtype=np.longdouble)
-    matrix[1, 1] += np.longdouble(2) ** -54  # 5.6e-17
-    assert not decide(matrix).clear
+@pytest.mark.parametrize("pivot, zero", [(8e-15, True), (2e-14, False), (8e-13, False), (8e-11, False)])
+def test_noise_a_pivot_below_1e_14_is_zero_and_up_to_1e_10_undecided(pivot, zero):
+    """Rows (1, 1) and (1, 1 + pivot)."""
+    found = decide(np.array([[1, 1], [1, 1 + np.longdouble(pivot)]], dtype=np.longdouble))
+    assert found.rank == 1 and found.clear == zero
 
 
 @pytest.mark.skipif(not EXTENDED, reason="without extended precision the noise is that of double precision")

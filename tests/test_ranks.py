@@ -8,7 +8,7 @@ from refusals import refused
 
 from servoctl.errors import SingularProgram
 from servoctl.reduction.ranks import clean, combination, decide, decide_all, eliminate, equilibrate
-from servoctl.tolerances import NOISE
+from servoctl.tolerances import EXTENDED, NOISE
 
 LONG = np.longdouble
 
@@ -46,6 +46,16 @@ def test_rank_margins_are_reported():
     exact = decide(np.array([[1.0, 2.0], [3.0, 6.0]], dtype=LONG))
     assert exact.rank == 1 and exact.clear and exact.dropped < NOISE / 30
     assert decide(np.diag([1.0, 1e-30])).rank == 2
+
+
+@pytest.mark.skipif(not EXTENDED, reason="without extended precision the noise is that of double precision")
+@pytest.mark.parametrize("pivot, rank, clear", [(5e-15, 1, True), (5e-13, 1, False), (5e-11, 1, False), (5e-10, 2, True)])
+def test_a_pivot_is_rounding_undecided_or_resolved(pivot, rank, clear):
+    """Below 1e-14 it is the rounding of constants folded in double; above 1e-10 a division by it leaves six digits."""
+    for rows, columns in ((1.0, 1.0), (1e6, 1e-9)):
+        matrix = np.array([[1, 1], [1, 1 + LONG(pivot)]], dtype=LONG) * np.array([[1.0], [rows]]) * [1.0, columns]
+        found = decide(matrix)
+        assert (found.rank, found.clear) == (rank, clear)
 
 
 def test_equilibration_brings_entries_near_one_and_returns_its_factors():

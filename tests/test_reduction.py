@@ -12,6 +12,7 @@ from servoctl import spec as sv
 from servoctl.errors import InconsistentStart, NotRealisable, SingularProgram, SpecificationError
 from servoctl.gallery import cars, gallery, mass_on_car, overhead_crane, passive_arm, spiral
 from servoctl.model.model import derive
+from servoctl.simulation import simulate
 from servoctl.tolerances import EXTENDED
 
 
@@ -81,11 +82,199 @@ def test_orders_free_values_and_needs_of_the_gallery(name, gallery_model):
     assert sum(model.raised.values()) == model.reduction.top * model.n - model.free
 
 
-@pytest.mark.parametrize("alpha", [1e-5, 1e-6, *([1e-7] if EXTENDED else [])])  # sin²α is above the noise of pivots
+@pytest.mark.parametrize("alpha", [1e-5, 1e-6, *([2e-7] if EXTENDED else [])])  # sin²α is above the noise of pivots
 def test_a_nearly_singular_car_is_called_ill_conditioned(alpha):
     with refused(SingularProgram, "z", "balance of s", kept=pytest.approx(1.0, abs=1e-3)) as caught:
         derive(*mass_on_car(alpha=alpha))
     assert caught.value.details["dropped"] < 1e-10
+
+
+@pytest.mark.parametrize("alpha", [5e-8, 1e-8])
+def test_a_car_that_is_singular_up_to_rounding_is_level_and_its_margin_is_told(alpha):
+    """The pivot sin²α lies within the rounding of constants: the guide is level, and the report holds the pivot."""
+    model, level = derive(*mass_on_car(alpha=alpha)), derive(*mass_on_car(alpha=0.0))
+    assert orders(model) == orders(level) and model.free == level.free == 1
+    assert model.reduction.rank.dropped == pytest.approx(alpha**2, rel=0.02)
+    assert f"largest dropped {model.reduction.rank.dropped:.1e}" in repr(model)
+
+
+# decimal factors -----------------------------------------------------------------------------------------------------
+
+DECIMALS = [(0.7, 0.9, 0.31, 0.3), (0.63, 0.54, 0.56, 0.9), (0.28, 0.81, 0.67, 0.1), (0.853, 0.064, 0.917, 0.77)]
+
+
+def decimal_residual(q, a, b, c):
+    x, y, z = q
+    return a * x + b * y + c * z - 0.2 * ca.sin(q.t)
+
+
+@pytest.mark.parametrize("turned", [False, True])
+@pytest.mark.parametrize("order", [1, 2])
+@pytest.mark.parametrize("a, b, c, k", DECIMALS)
+def test_a_hidden_row_behind_decimal_factors_is_found(a, b, c, k, order, turned):
+    """k f^(order) + 0.7 f + 0.5 z - 0.1 t beside f: 0.5 z = 0.1 t is hidden, whatever the roundings of k a, k b, k c."""
+    q = sv.coordinates("x y z")
+    if turned:
+        z = list(q)[2]
+        q = q.with_quasi_velocities("u v w", [[ca.cos(z), -ca.sin(z), 0], [ca.sin(z), ca.cos(z), 0], [0, 0, 1]])
+    mechanism = sv.Mechanism(q, gibbs=sv.particle(q, 1.0, tuple(q)))
+    f = decimal_residual(q, a, b, c)
+    program = sv.Program({"f": f, "g": k * q.dt(f, order) + 0.7 * f + 0.5 * list(q)[2] - 0.1 * q.t}, by="ideal")
+    model = derive(mechanism, program)
+    assert model.free == 2 and len(model.reduction.hidden) == 1
+    jets = dict(zip(model.jet_names, motion(model, 0.4, x=0.1), strict=True))
+    assert jets["z"] == pytest.approx(0.08, abs=1e-13)
+    assert a * 0.1 + b * jets["y"] + c * 0.08 == pytest.approx(0.2 * np.sin(0.4), abs=1e-13)
+
+
+def test_decimal_factors_as_parameters_are_decided_again():
+    q = sv.coordinates("x y z")
+    p = sv.parameters(a=0.7, b=0.9, c=0.31, k=0.3)
+    mechanism = sv.Mechanism(q, gibbs=sv.particle(q, 1.0, tuple(q)), parameters=p)
+    f = decimal_residual(q, p.a, p.b, p.c)
+    model = derive(mechanism, sv.Program({"f": f, "g": p.k * q.dt(f) + 0.5 * list(q)[2] - 0.1 * q.t}, by="ideal"))
+    for a, b, c, k in DECIMALS:
+        assert model.with_parameters(a=a, b=b, c=c, k=k).free == 2
+
+
+@pytest.mark.parametrize("a, b, c, k", DECIMALS)
+def test_a_row_that_is_a_decimal_multiple_is_called_dependent(a, b, c, k):
+    q = sv.coordinates("x y z")
+    mechanism = sv.Mechanism(q, gibbs=sv.particle(q, 1.0, tuple(q)))
+    f = decimal_residual(q, a, b, c)
+    with refused(SpecificationError, "vanishes identically", rows=["f", "g"]):
+        derive(mechanism, sv.Program({"f": f, "g": k * f}, by="ideal"))
+    with refused(SpecificationError, "vanishes identically", rows=["f", "g"]):
+        derive(mechanism, sv.Program({"f": f, "g": k * q.dt(f)}, by="ideal"))
+
+
+@pytest.mark.parametrize("tilt", [5.0, 3.7, 11.3])
+def test_a_flat_point_given_as_a_number_is_flat(tilt):
+    """The point of the aircraft whose motion determines everything, its distance rounded to a double."""
+    q = sv.coordinates("x z theta")
+    x, z, theta = q
+    M, J, l, h, tilt = 50.0, 25.0, 1.0, 0.1, np.radians(tilt)
+    arm = l * np.cos(tilt) + h * np.sin(tilt)
+    across, along = ca.vertcat(ca.cos(theta), ca.sin(theta)), ca.vertcat(-ca.sin(theta), ca.cos(theta))
+    mechanism = sv.Mechanism(
+        q,
+        gibbs=sv.rigid_body(q, M, (0, 0, J), position=(x, z), rates=(0, 0, q.d(1)[2])),
+        potential=M * 9.81 * z,
+        actuators={
+            "u1": ca.vertcat(along + np.sin(tilt) * across, arm),
+            "u2": ca.vertcat(along - np.sin(tilt) * across, -arm),
+        },
+    )
+    distance = J * np.sin(tilt) / (M * arm)
+    for e in (distance, np.nextafter(distance, 1.0), np.nextafter(distance, 0.0)):
+        X, Z = x - e * ca.sin(theta), z + e * ca.cos(theta)
+        path = 0.3 * ca.sin(q.t)
+        assert derive(mechanism, sv.Program({"X": X - path, "Z": Z - path})).flat
+
+
+# factors that vanish ------------------------------------------------------------------------------------------------
+
+
+CURVES = {  # points of the parameter u, and their heading
+    "wave": (lambda m, u: (u, m.sin(u)), lambda u: np.arctan(np.cos(u))),
+    "parabola": (lambda m, u: (u, u**2), lambda u: np.arctan(2 * u)),
+    "circle": (lambda m, u: (2 * m.cos(u), 2 * m.sin(u)), lambda u: u + np.pi / 2),
+}
+
+
+@pytest.mark.parametrize("speed", ["squared", "forward"])
+@pytest.mark.parametrize("kind", CURVES)
+def test_a_geometric_path_beside_rolling_is_followed(kind, speed):
+    """Rolling beside a path by its geometry leaves the speed times an angle; the angle is the hidden row."""
+    q = sv.coordinates("x y psi u")
+    (x, y, psi, u), (dx, dy, *_) = q, q.d(1)
+    curve, heading = CURVES[kind]
+    X, Y = curve(ca, u)
+    mechanism = sv.Mechanism(
+        q,
+        gibbs=sv.particle(q, 1.0, (x, y)) + sv.particle(q, 0.1, psi) + sv.particle(q, 1e-3, u),
+        constraints={"slip": dx * ca.sin(psi) - dy * ca.cos(psi)},
+    )
+    rate = dx**2 + dy**2 - 1.0 if speed == "squared" else dx * ca.cos(psi) + dy * ca.sin(psi) - 1.0
+    model = derive(mechanism, sv.Program({"X": x - X, "Y": y - Y, "speed": rate}, by="ideal"), guess={"du": 1.0})
+    assert model.free == 1 and [row.name for row in model.reduction.hidden] == ["slip"]
+    start = model.start(u=0.3, guess={"du": 0.8, "psi": heading(0.3)})
+    run = simulate(model, start, (0.0, 2.0))
+    assert run["psi"] == pytest.approx(heading(run["u"]), abs=1e-7)
+    assert np.hypot(run["dx"], run["dy"]) == pytest.approx(1.0, abs=1e-7)
+
+
+@pytest.mark.parametrize("expanded", [False, True])
+def test_a_residual_with_a_speed_for_a_factor_is_told_so(expanded):
+    q = sv.coordinates("u psi")
+    (u, psi), (du, _) = q, q.d(1)
+    mechanism = sv.Mechanism(q, gibbs=sv.particle(q, 1.0, (u, u**2)) + sv.particle(q, 0.1, psi))
+    slip = 2 * u * ca.cos(psi) - ca.sin(psi)
+    times_speed = 2 * du * u * ca.cos(psi) - du * ca.sin(psi) if expanded else du * slip
+    speed = du**2 * (1 + 4 * u**2) - 1.0
+    for guess in (None, {"du": 1.0}):
+        with refused(SingularProgram, "Divide 'slip' by du", row="slip", factor="du"):
+            derive(mechanism, sv.Program({"slip": times_speed, "speed": speed}, by="ideal"), guess=guess)
+    assert derive(mechanism, sv.Program({"slip": slip, "speed": speed}, by="ideal")).free == 1
+
+
+PRODUCTS = {  # residuals a and b of x, y, z and t; the factor of b that a keeps at zero
+    "two residuals": (lambda x, y, z, t: (x - t, (x - t) * (y - ca.sin(t))), "(x-t)"),
+    "in a fraction": (lambda x, y, z, t: (x - t, -2 * (x - t) * (y - t) / (2 + ca.cos(z))), "(x-t)"),
+    "a square": (lambda x, y, z, t: (x - t, (x - t) ** 2 * y), "(x-t)"),
+}
+
+
+@pytest.mark.parametrize("name", PRODUCTS)
+def test_a_residual_with_a_factor_that_another_keeps_at_zero_is_told_so(name):
+    q = sv.coordinates("x y z")
+    build, factor = PRODUCTS[name]
+    a, b = build(*q, q.t)
+    mechanism = sv.Mechanism(q, gibbs=sv.particle(q, 1.0, tuple(q)))
+    with refused(SpecificationError, f"Divide 'b' by {factor}", row="b", factor=factor):
+        derive(mechanism, sv.Program({"a": a, "b": b}, by="ideal"))
+
+
+def test_a_rate_that_another_residual_keeps_at_zero_is_named():
+    q = sv.coordinates("x y u")
+    (_, y, u), (dx, dy, du) = q, q.d(1)
+    mechanism = sv.Mechanism(q, gibbs=sv.particle(q, 1.0, tuple(q)))
+    for program, factor in (
+        ({"u": u - 1.0, "slip": du * (dx - 1.0)}, "du"),
+        ({"u": du - 1.0, "slip": (du - 1.0) * (dy - ca.sin(q.t))}, "(du-1)"),
+        ({"u": u - q.t, "slip": (du - 1.0) * (y - ca.sin(q.t))}, "(du-1)"),
+    ):
+        with refused(SpecificationError, "has the factor", row="slip", factor=factor):
+            derive(mechanism, sv.Program(program, by="ideal"))
+
+
+@pytest.mark.parametrize("power", [2, 3])
+def test_the_factor_of_a_square_is_named(power):
+    q = sv.coordinates("x y")
+    x, y = q
+    mechanism = sv.Mechanism(q, gibbs=sv.particle(q, 1.0, (x, y)))
+    with refused(SingularProgram, "Divide 'a' by (x-t)", row="a", factor="(x-t)"):
+        derive(mechanism, sv.Program({"a": (x - q.t) ** power}, by="ideal"))
+
+
+CONTRADICTIONS = {  # residuals that no state satisfies
+    "circles": lambda q, x, y: (x**2 + y**2 - 1, x**2 + y**2 - 4),
+    "a circle by its root": lambda q, x, y: (x**2 + y**2 - 1, ca.sqrt(x**2 + y**2) - 2),
+    "a rate": lambda q, x, y: (ca.sin(x) + y - ca.sin(q.t), q.dt(ca.sin(x) + y) - 2 * ca.cos(q.t)),
+    "a rate with the residual": lambda q, x, y: (
+        ca.sin(x) + y * x - ca.sin(q.t),
+        0.3 * q.dt(ca.sin(x) + y * x - ca.sin(q.t)) + 0.3 * (ca.sin(x) + y * x - ca.sin(q.t)) - 0.1 * q.t,
+    ),
+}
+
+
+@pytest.mark.parametrize("name", CONTRADICTIONS)
+def test_bent_constraints_that_contradict_each_other_are_told_so(name):
+    q = sv.coordinates("x y z")
+    a, b = CONTRADICTIONS[name](q, *list(q)[:2])
+    mechanism = sv.Mechanism(q, gibbs=sv.particle(q, 1.0, tuple(q)))
+    with refused(SpecificationError, "contradict", rows=["a", "b"]):
+        derive(mechanism, sv.Program({"a": a, "b": b}, by="ideal"))
 
 
 # programs with a turn ------------------------------------------------------------------------------------------------

@@ -6,6 +6,7 @@ import pytest
 from conftest import motion, numbers, signal
 from refusals import refused
 
+from servoctl import close, computed, lqr, plant, simulate, verify
 from servoctl import spec as sv
 from servoctl.errors import NameUnknown, NotRealisable, SpecificationError
 from servoctl.gallery import overhead_crane
@@ -163,18 +164,109 @@ def test_an_actuator_that_reaches_the_program_later_than_another_rests():
 
 
 def test_redundant_actuators_without_full_decoupling_are_refused():
-    """A crane with two trolley drives: its decoupling matrix has rank 1 for 2 residuals."""
+    """A crane beside a cart of its own: three independent actuators, and a decoupling matrix of rank 1 for X and Z."""
+    q = sv.coordinates("x l theta s")
+    x, l, theta, s = q
+    load = ca.vertcat(x + l * ca.sin(theta), l * ca.cos(theta))
+    S = sv.particle(q, 10.0, x) + sv.particle(q, 2.0, load) + sv.particle(q, 1.0, s)
+    mechanism = sv.Mechanism(
+        q, gibbs=S, potential=-2 * 9.81 * load[1], actuators={"trolley": x, "hoist": l, "cart": s}
+    )  # fmt: skip
+    program = sv.Program({"X": load[0] - 0.3 * ca.sin(q.t), "Z": load[1] - 4 - 0.3 * ca.cos(q.t)})
+    with refused(NotRealisable, rank=1):
+        derive(mechanism, program, guess={"l": 4.0})
+
+
+# as many independent actuators as residuals: E u is determined, and u of least norm ----------------------------------
+
+
+def doubled_crane(weights=None, **motors):
+    """The overhead crane with other motors, by their share in the trolley's and the hoist's force."""
     mechanism, program = overhead_crane()
     x, l, _ = mechanism.q
-    doubled = sv.Mechanism(
-        mechanism.q,
-        balance=mechanism.balance,
-        parameters=mechanism.parameters,
-        actuators={"one": x, "two": 2 * x, "hoist": l},
+    actuators = {name: a * x + b * l for name, (a, b) in motors.items()}
+    mechanism = sv.Mechanism(
+        mechanism.q, balance=mechanism.balance, parameters=mechanism.parameters, actuators=actuators
     )
-    with refused(NotRealisable, rank=1) as caught:
-        derive(doubled, program)
-    assert caught.value.details["rank"] == 1
+    return derive(mechanism, sv.Program(program.residuals, weights=weights))
+
+
+MOTORS = {
+    "two on the trolley": {"one": (1, 0), "two": (2, 0), "hoist": (0, 1)},
+    "two alike": {"one": (1, 0), "two": (1, 0), "hoist": (0, 1)},
+    "two on each": {"one": (1, 0), "two": (1, 0), "left": (0, 1), "right": (0, 3)},
+    "opposed": {"one": (1, 0), "two": (-1, 0), "hoist": (0, 1)},
+    "geared": {"one": (1, 0), "two": (1, 1), "three": (1, -1)},
+    "five": {"one": (1, 0), "two": (1, 1), "three": (1, -1), "four": (0, 2), "five": (2, 3)},
+}
+
+
+@pytest.mark.parametrize("weights", [None, {"one": 4.0}, {"one": 0.2, "two": 3.0}])
+@pytest.mark.parametrize("name", MOTORS)
+def test_motors_in_dependent_directions_share_by_least_weighted_norm(name, weights, crane_plan):
+    """W⁻¹Eᵀ(E W⁻¹Eᵀ)⁻¹ of the single trolley's and hoist's forces."""
+    model = doubled_crane(weights, **MOTORS[name])
+    run = simulate(model, model.start(guess={"l": 4.0}), (0.0, 8.0), t_eval=crane_plan.t)
+    E = np.array(list(MOTORS[name].values()), dtype=float).T
+    inverse = np.diag([1 / (weights or {}).get(motor, 1.0) for motor in MOTORS[name]])
+    forces = np.array([crane_plan["trolley"], crane_plan["hoist"]])
+    expected = inverse @ E.T @ np.linalg.solve(E @ inverse @ E.T, forces)
+    found = np.array([run[motor] for motor in MOTORS[name]])
+    assert found == pytest.approx(expected, rel=1e-9, abs=1e-8 * np.abs(expected).max())
+    assert verify(model, run).passed and model.structure().index == 5
+
+
+def test_laws_share_between_two_motors_as_the_plan_does():
+    model = doubled_crane({"one": 4.0}, **MOTORS["two on the trolley"])
+    run = simulate(model, model.start(guess={"l": 4.0}), (0.0, 8.0))
+    machine = plant(model.reduction.mechanism)
+    for law in (lqr(run, machine), computed(run, machine)):
+        loop = close(machine, law, run.state(0.0), (0.0, 8.0))
+        assert max(np.abs(values[0]).max() for values in loop.residual.values()) < 1e-4
+        assert loop["two"] / 8 == pytest.approx(loop["one"], rel=1e-2, abs=0.05)
+        assert verify(loop).passed
+
+
+def test_three_ropes_hold_a_load_in_the_plane():
+    """Directions that change with the place, three for two residuals: the pseudoinverse of E."""
+    q = sv.coordinates("x y")
+    x, y = q
+    ends = {"left": (-3.0, 4.0), "middle": (0.0, 5.0), "right": (3.0, 4.0)}
+    ropes = {name: -ca.sqrt((x - a) ** 2 + (y - b) ** 2) for name, (a, b) in ends.items()}
+    mechanism = sv.Mechanism(q, gibbs=sv.particle(q, 2.0, ca.vertcat(x, y)), potential=2 * 9.81 * y, actuators=ropes)
+    model = derive(mechanism, sv.Program({"X": x - ca.sin(q.t), "Y": y - 0.5 * ca.cos(q.t)}, weights={"middle": 2.0}))
+    assert model.flat
+    for t in (0.0, 0.7, 2.0):
+        place = np.array([np.sin(t), 0.5 * np.cos(t)])
+        E = np.array([(np.array(end) - place) / np.linalg.norm(np.array(end) - place) for end in ends.values()]).T
+        W = np.diag([1.0, 0.5, 1.0])
+        force = 2 * (-place + np.array([0.0, 9.81]))
+        u = signal(model, "actuation", t, motion(model, t))
+        assert list(u.values()) == pytest.approx(W @ E.T @ np.linalg.solve(E @ W @ E.T, force), rel=1e-11)
+
+
+def test_two_motors_beside_a_guide_leave_its_multiplier_true():
+    """One motor pulls along the guide x = y, the other askew: the guide takes what is across, the sum is determined."""
+    q = sv.coordinates("x y")
+    x, y = q
+    mechanism = sv.Mechanism(
+        q, gibbs=sv.particle(q, 2.0, ca.vertcat(x, y)), potential=3.0 * y, constraints={"guide": x - y},
+        actuators={"along": (1, 1), "askew": (1, 0)},
+    )  # fmt: skip
+    model = derive(mechanism, sv.Program({"X": x - ca.sin(q.t)}, weights={"askew": 2.0}))
+    t = 0.6
+    jets = motion(model, t)
+    u, acceleration = signal(model, "actuation", t, jets), -np.sin(t)
+    assert 2 * u["along"] + u["askew"] == pytest.approx(4 * acceleration + 3.0)
+    assert u["askew"] * 2 / u["along"] == pytest.approx(1 / 2)
+    guide = signal(model, "multipliers", t, jets)["multiplier_guide"]
+    assert abs(2 * acceleration - u["along"] - u["askew"]) == pytest.approx(abs(guide))
+
+
+def test_fewer_independent_actuators_than_residuals_are_refused():
+    """Two motors on the trolley and none on the hoist, for X and Z."""
+    with refused(NotRealisable, independent=1):
+        doubled_crane(one=(1, 0), two=(2, 0))
 
 
 def test_weights_that_name_no_actuator_show_the_nearest():

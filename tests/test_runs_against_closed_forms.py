@@ -1,5 +1,6 @@
 """Runs against motions and forces known in closed form (theory, section 7)."""
 
+import contextlib
 from functools import cache, partial
 
 import casadi as ca
@@ -7,6 +8,7 @@ import closed_forms as cf
 import numpy as np
 import pytest
 from conftest import relative
+from refusals import warned
 from scipy.optimize import brentq, minimize_scalar
 
 import servoctl as sv
@@ -63,7 +65,8 @@ def spiral_start(order):
 def test_spirals_end_at_one_radian(order, method):
     model, start = spiral_start(order)
     assert model.free == order + 2  # the program's order, and 2 of (3.18)
-    run = sv.simulate(model, start, (0.0, 2.0), method, t_eval=np.linspace(0, 2, 9))
+    with warned("errors grow by") if order >= 8 else contextlib.nullcontext():
+        run = sv.simulate(model, start, (0.0, 2.0), method, t_eval=np.linspace(0, 2, 9))
     reference = cf.spiral(run.t, order)
     for name in ("x", "y", "dx", "dy"):
         assert np.max(np.abs(run[name] - reference[name])) < 1e-9

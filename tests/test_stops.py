@@ -1,10 +1,12 @@
 """Motions that end where a program is singular, motions that must not, and pivots that change on the way."""
 
+import contextlib
+
 import casadi as ca
 import closed_forms as cf
 import numpy as np
 import pytest
-from refusals import refused
+from refusals import refused, warned
 from scipy.integrate import solve_ivp
 
 import servoctl as sv
@@ -171,7 +173,8 @@ def test_no_false_alarm(name, method, gallery_model):
     span = (t0, t1 if method in ("DOP853", "Taylor", "RK4") else t0 + 0.2 * (t1 - t0))
     step = {"step": (t1 - t0) / 500} if method == "RK4" else {"rtol": 1e-6, "atol": 1e-8}
     order = {"order": 8} if method == "Taylor" else {}
-    run = sv.simulate(model, start, span, method=as_method(method, **step, **order), t_eval=np.linspace(*span, 11))
+    with warned("unstable") if name == "vtol-centre" else contextlib.nullcontext():
+        run = sv.simulate(model, start, span, method=as_method(method, **step, **order), t_eval=np.linspace(*span, 11))
     assert run.success and run.t[-1] == span[1]
     assert np.all(np.isfinite(run.jets))
 

@@ -182,3 +182,133 @@ def test_the_margin_of_the_critical_arm_is_small():
     regular, critical = (sv.derive(*passive_arm(Gamma)) for Gamma in (0.3, 0.4))
     assert critical.reduction.rank.kept < 0.02 < 0.2 < regular.reduction.rank.kept
     assert "smallest pivot 3" in repr(critical) or f"{critical.reduction.rank.kept:.1e}" in repr(critical)
+
+
+# states at which relative degrees are lost ---------------------------------------------------------------------------
+
+
+def fixed_rope_crane(length=1.0, target=None, damping=0.0):
+    """A cart with a pendulum, and X the load's place: X'' contains the force times sin² theta."""
+    q = sv.coordinates("x theta")
+    x, theta = q
+    load = ca.vertcat(x + length * ca.sin(theta), -length * ca.cos(theta))
+    path = sv.paths.rest_to_rest(q.t, (0.0,), (3.0,), duration=4.0, smoothness=4)[0] if target is None else target(q.t)
+    mechanism = sv.Mechanism(
+        q, gibbs=sv.particle(q, 10.0, x) + sv.particle(q, 2.0, load), potential=2.0 * 9.81 * load[1],
+        forces={"x": -damping * q.dt(x)}, actuators={"force": x},
+    )  # fmt: skip
+    return sv.derive(mechanism, sv.Program({"X": load[0] - path}))
+
+
+def ball_and_beam():
+    """r'' = r θ'² - g sin θ: degree 3 in motion by r θ'², 4 where the beam rests."""
+    q = sv.coordinates("r theta")
+    r, theta = q
+    ball = ca.vertcat(r * ca.cos(theta), r * ca.sin(theta))
+    gibbs = sv.particle(q, 0.05, ball) + 0.02 * q.d(2)[1] ** 2 / 2
+    mechanism = sv.Mechanism(q, gibbs=gibbs, potential=0.05 * 9.81 * ball[1], actuators={"torque": theta})
+    return sv.derive(mechanism, sv.Program({"r": r - 0.3 - 0.1 * ca.sin(q.t)}))
+
+
+LOST = {  # the model, degrees in motion and at the start, a jet that is zero there
+    "crane": (fixed_rope_crane, 2, 4, "theta"),
+    "crane with friction": (partial(fixed_rope_crane, damping=3.0), 2, 4, "theta"),
+    "crane in mm": (partial(fixed_rope_crane, 1000.0), 2, 4, "theta"),
+    "short crane": (partial(fixed_rope_crane, 0.01), 2, 4, "theta"),
+    "crane on a sine": (partial(fixed_rope_crane, 1.0, lambda t: 0.3 * ca.sin(t)), 2, 4, "theta"),
+    "ball and beam": (ball_and_beam, 3, 4, "dtheta"),
+}
+
+
+@pytest.mark.parametrize("name", LOST)
+def test_a_relative_degree_that_is_lost_at_the_start_is_told_with_that_of_the_motion(name):
+    build, moving, resting, zero = LOST[name]
+    model = build()
+    structure = model.structure()
+    assert structure.relative_degree == (moving,) and structure.uniform
+    t, local = structure.start
+    assert local.relative_degree == local.zeros_at_infinity == (resting,) and zero in local.zero
+    assert f"{zero} = 0" in repr(structure) and f" {resting}" in repr(structure) and "lost" in repr(structure)
+    start = model.start()
+    assert model.structure(start).at == ((0.0, local),)
+    with refused(sv.SingularProgram, f"{zero} = 0", relative_degree=(resting,), in_motion=(moving,)) as caught:
+        sv.simulate(model, start, (0.0, 4.0))
+    assert "square" not in str(caught.value) and caught.value.details["t"] == 0.0
+
+
+def test_a_relative_degree_that_is_lost_on_the_way_is_told():
+    """The pendulum swings down: theta = 0 at t = 0.78 s."""
+    model = fixed_rope_crane(target=lambda t: 0.5 * ca.sin(t))
+    start = model.start(t=0.7, theta=0.2, dtheta=0.3)
+    with refused(sv.SingularProgram, "theta = 0", relative_degree=(4,), in_motion=(2,), zero=["theta"]) as caught:
+        sv.simulate(model, start, (0.7, 4.0))
+    run = caught.value.run
+    assert 0 < run["theta"][-1] < 0.1 and caught.value.details["t"] == pytest.approx(0.7786, abs=1e-3)
+    along = model.structure(run)
+    assert along.relative_degree == (2,) and len(along.at) <= 50
+
+
+def test_the_place_of_a_lost_relative_degree_need_not_be_zero():
+    """The rope upside down."""
+    model = fixed_rope_crane()
+    with refused(sv.SingularProgram, "theta = 3.142", relative_degree=(4,), zero=[]):
+        sv.simulate(model, model.start(theta=np.pi), (0.0, 1.0))
+
+
+def test_a_swinging_load_has_the_degree_of_the_hanging_one():
+    """Through theta = 0 no motion of this program passes; the degree there is that of the plant's own motion."""
+    model = fixed_rope_crane(target=lambda t: 0.5 * ca.sin(t))
+    for rate in (0.0, 0.3, -1.0):
+        structure = model.structure(model.start(t=0.7, theta=0.0, dtheta=rate))
+        assert structure.relative_degree == (4,) and structure.at[0][1].zero == ("theta",)
+
+
+def test_an_entry_that_cancels_to_rounding_is_no_relative_degree():
+    """The ball's inertia is uncoupled, -r cos sin + r sin cos = 0: every instant of its motion has the degree 3."""
+    assert {local.relative_degree for _, local in ball_and_beam().structure().at} == {(3,)}
+
+
+def test_the_structure_of_a_run_and_of_a_start(gallery_model, crane_plan):
+    model = crane_plan.model
+    structure = model.structure(crane_plan)
+    assert 40 <= len(structure.at) <= 50 and structure.at[0][0] == 0.0 and structure.at[-1][0] == 8.0
+    assert structure.zeros_at_infinity == (2, 4) and not structure.uniform
+    assert structure.at[0][1].relative_degree == (4, 2) and structure.at[0][1].zero == ("theta",)
+    start = model.start(guess={"l": 4.0})
+    assert model.structure(start).relative_degree == (4, 2)
+
+
+@pytest.mark.parametrize(
+    "motion",
+    [
+        lambda m, run: ("run",),
+        lambda m, run: (run.t,),
+        lambda m, run: (run.t, run.jets[:3]),
+        lambda m, run: (run.t[:5], run.jets),
+        lambda m, run: (run.t, run.jets * np.nan),
+        lambda m, run: ([], np.zeros((9, 0))),
+    ],
+)
+def test_what_is_no_motion_is_refused(motion, crane_plan):
+    with refused(sv.SpecificationError, "run.jets"):
+        crane_plan.model.structure(*motion(crane_plan.model, crane_plan))
+
+
+def test_the_structure_of_a_run_of_another_model_is_refused(gallery_model, crane_plan):
+    with refused(sv.SpecificationError):
+        gallery_model("two-cars").structure(crane_plan)
+
+
+@pytest.mark.parametrize("alpha", [1e-2, 1e-3, 1e-4])
+def test_the_structure_has_the_margin_of_the_reduction(alpha):
+    model = sv.derive(*mass_on_car(alpha))
+    assert model.structure().margin <= model.reduction.rank.kept == pytest.approx(alpha**2, rel=0.1)
+
+
+def test_a_structure_without_all_zeros_at_infinity_says_so(monkeypatch):
+    monkeypatch.setattr("servoctl.reduction.structure.DEPTHS", (2, 3))
+    model = sv.derive(*gallery["two-cars"].build())
+    structure = model.structure()
+    assert structure.index is None and structure.realisation == "undecided" and structure.zeros_at_infinity == ()
+    assert "not decided" in repr(structure) and "two" not in repr(structure)
+    assert repr(model)

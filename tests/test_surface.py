@@ -20,13 +20,13 @@ ENTRIES = ("__init__.py", "__main__.py")  # of the package itself: they gather t
 
 LAYERS = (
     "version", "errors", "values", "tolerances", "checks", "archive", "progress", "jets", "spec", "reduction", "codegen",
-    "model", "plants", "run", "methods", "simulation", "internal_dynamics", "figures", "control", "verification", "study",
+    "model", "plants", "run", "methods", "internal_dynamics", "simulation", "figures", "control", "verification", "study",
     "interop", "export", "gallery", "shell",
 )  # fmt: skip
 WITHOUT_CASADI = ("study", "figures", "interop", "shell")
 LATE = ("scipy", "matplotlib", "control", "tqdm", "xarray", "dask")
 MOST_IN_A_FUNCTION, MOST_PARAMETERS, MOST_MODULES_OF_A_NAME, MOST_IN_A_REPR = 40, 8, 2, 12
-SHEETS = ("Mechanism.__init__",)  # a designer's sheet, filled in by keyword
+SHEETS = ("Mechanism.__init__", "simulate")  # filled in by keyword
 
 
 def relative(path):

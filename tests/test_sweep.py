@@ -513,3 +513,11 @@ def test_export_c_writes_two_files(here, capsys):
     assert sorted(p.name for p in Path("c").iterdir()) == ["two_cars.c", "two_cars.h"]
     assert "two_cars.c, two_cars.h in c" in capsys.readouterr().out
     assert main(["export-c", "two-cars", "--out", "c", "--name", "int"]) == 2
+
+
+def test_more_cases_than_fit_into_memory_are_refused():
+    assert len(sv.grid(m=range(1000), k=range(1000))) == 10**6
+    for make in (lambda: sv.grid(m=range(1001), k=range(1000)), lambda: sv.grid(m=range(10**15)),
+                 lambda: sv.monte_carlo(10**6 + 1, seed=1, m=1.0), lambda: sv.monte_carlo(10**30, seed=1, m=1.0)):
+        with refused(sv.SpecificationError, most=10**6):
+            make()

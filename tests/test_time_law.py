@@ -78,7 +78,7 @@ def test_motions_that_cease_to_exist_before_a_limit_are_no_fastest_ones(monkeypa
             raise sv.IntegrationStopped("No motion is quicker than 1.5 s.")
         return sv.simulate(model, start, span, **options)
 
-    monkeypatch.setattr("servoctl.control.time_law.simulate", simulated)
+    monkeypatch.setattr("servoctl.control.time_law.simulated", simulated)
     with refused(sv.LimitExceeded, factor=pytest.approx(0.75, abs=1e-4)):
         sv.fastest(*cars(), {"force": 3000.0}, (0.0, 2.0))
 

@@ -35,7 +35,7 @@ def crane():
 
 
 @pytest.mark.parametrize("name", SCENES)
-def test_a_model_that_travelled_is_equal_and_computes_the_same_bits(name, at_once):
+def test_a_model_that_travelled_is_equal_and_computes_the_same_bits(name):
     scene = gallery[name]
     model = sv.derive(*scene.build())
     sent = again(model)

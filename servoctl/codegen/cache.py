@@ -6,14 +6,23 @@ where nobody else can replace it, and only with the digest of its name and conte
 
 import contextlib
 import hashlib
+import itertools
 import os
+import re
 import stat
 import sys
 import tempfile
+import time
 from pathlib import Path
 
 _DIGEST = hashlib.sha256().digest_size
+_ENTRY = re.compile(r"[0-9a-f]{64}(\.so)?|tmp\w+\.tmp")  # names of the files that are written here
 MOST_BYTES_READ = 2**30  # of one file: libraries of 100,000 operations take some megabytes
+MOST_BYTES = 2**28  # of a folder: beyond it the least recently used entries are deleted until half is left
+OLDEST = 180 * 86400.0  # s since an entry was used, after which it is deleted
+ABANDONED = 3600.0  # s after which a temporary file belongs to no living process
+WRITES = 50  # writes of a process from one look for entries to delete to the next
+_writes = itertools.count()
 
 
 def cache_directory():
@@ -59,6 +68,8 @@ def read_cached(path):
         if hasattr(os, "geteuid") and status.st_uid not in (os.geteuid(), 0):
             raise PermissionError(f"{path} belongs to another user")
         content = file.read()
+    with contextlib.suppress(OSError):
+        os.utime(path)
     if _digest(path, content[:-_DIGEST]) != content[-_DIGEST:]:
         raise OSError(f"{path} is damaged, or was written for another name")
     return content[:-_DIGEST]
@@ -109,3 +120,41 @@ def replacing(path):
         os.replace(temporary, path)
     finally:
         Path(temporary).unlink(missing_ok=True)
+    if next(_writes) % WRITES == 0:
+        prune(path.parent)
+
+
+def entries(directory):
+    """(time of the last use, bytes, path) of each file in a folder of the cache, the least recently used first."""
+    found = []
+    with contextlib.suppress(OSError), os.scandir(directory) as files:
+        for file in files:
+            with contextlib.suppress(OSError):  # another process removed it
+                if _ENTRY.fullmatch(file.name) and file.is_file(follow_symlinks=False):
+                    found.append((file.stat().st_mtime, file.stat().st_size, file.path))
+    return sorted(found)
+
+
+def prune(directory):
+    """Delete what nobody uses: abandoned temporary files, old entries, and the oldest where they are too many."""
+    found, now = entries(directory), time.time()
+    total = sum(size for _, size, _ in found)
+    least = MOST_BYTES / 2 if total > MOST_BYTES else MOST_BYTES
+    for used, size, path in found:
+        if now - used > (ABANDONED if path.endswith(".tmp") else OLDEST) or (total > least and path[-4:] != ".tmp"):
+            with contextlib.suppress(OSError):
+                os.unlink(path)
+            total -= size
+
+
+def clear():
+    """Delete all entries of the cache, and nothing else; what could not be deleted stays."""
+    for directory in folders():
+        for _, _, path in entries(directory):
+            with contextlib.suppress(OSError):
+                os.unlink(path)
+
+
+def folders():
+    """The folders of the cache: of libraries, and of derivations."""
+    return cache_directory(), cache_directory() / "derived"

@@ -1,9 +1,10 @@
 """Libraries from C text: compiled by the system's compiler, stored on disk by content, loaded.
 
 A library lies in the cache directory under the hash of its C text, the files that this may include, the flags, the
-compiler and the processor. The compiler is ``SERVOCTL_COMPILER``, else ``CC``, else the first of cc, gcc and clang;
-``SERVOCTL_COMPILER=none`` compiles nothing. Without a compiler, or where it fails, the process warns once and CasADi
-evaluates instead.
+compiler and the processor. The compiler is ``SERVOCTL_COMPILER``, else ``CC``, else the first of cc, gcc and clang; a
+warning says where a named one does not exist.
+``SERVOCTL_COMPILER=none`` compiles nothing. Without a compiler, or where it fails, CasADi evaluates instead, and the
+process warns once, unless none was chosen.
 
 The flags preserve IEEE arithmetic with one exception: a product and a sum may be contracted to one fused operation,
 which rounds once instead of twice.
@@ -27,6 +28,7 @@ from servoctl.codegen.cache import cache_directory, read_cached, replacing
 from servoctl.codegen.loops import SOURCES, digest
 
 PATIENCE_WITH_COMPILER = 600.0  # s: one that takes longer waits for something, such as a licence
+USUAL = ("cc", "gcc", "clang")  # compilers that are looked for
 FLAGS = ("-fPIC", "-shared", "-w", "-fno-math-errno")
 
 _loaded = {}  # key -> ctypes.CDLL, or None where it could not be built
@@ -39,36 +41,31 @@ class _CompilerFailed(Exception):
     """The compiler refused the text."""
 
 
-def library(text, build=True, level="-O1"):
+def library(text, level="-O1"):
     """Load the library of a C translation unit; compile it where it is neither loaded nor on disk.
 
     Parameters
     ----------
     text : str
         C text.
-    build : bool
-        Whether to compile at all.
     level : str
         Optimisation level. "-O1" compiles fastest, and its straight-line code is at most a quarter slower than "-O3".
 
     Returns
     -------
     ctypes.CDLL or None
-        None if the library does not exist and `build` is false, or if compiling failed (one warning per process).
+        None without a compiler, or if compiling failed (one warning per process, unless none was chosen).
     """
     command, identity = _compiler()
     if command is None:
-        return _without("No C compiler was found, or SERVOCTL_COMPILER is none") if build else None
+        return None if os.environ.get("SERVOCTL_COMPILER") == "none" else _without("No C compiler was found")
     parts = (text, digest(), level, *FLAGS, *_optional_flags(), identity, platform.machine(), _processor())
     key = hashlib.sha256("\0".join(parts).encode()).hexdigest()
     with _guard:
         lock = _locks.setdefault(key, threading.Lock())
     with lock:
         if key not in _loaded:
-            loaded = _open(cache_directory() / f"{key}.so")
-            if loaded is None and not build:
-                return None
-            _loaded[key] = loaded or _build(text, level, f"{key}.so", command)
+            _loaded[key] = _open(cache_directory() / f"{key}.so") or _build(text, level, f"{key}.so", command)
         return _loaded[key]
 
 
@@ -88,7 +85,7 @@ def _identified(chosen, cc, path):
     # Place, time and size of the program identify it: calling it for its version takes longer than loading a library.
     if chosen == "none":
         return None, None
-    for candidate in (chosen, cc, "cc", "gcc", "clang"):
+    for variable, candidate in (("SERVOCTL_COMPILER", chosen), ("CC", cc), *(("", name) for name in USUAL)):
         try:
             command = shlex.split(candidate or "")
         except ValueError:  # a quotation mark that is not closed
@@ -97,6 +94,9 @@ def _identified(chosen, cc, path):
             files = [os.path.realpath(file) for word in command if (file := shutil.which(word, path=path))]
             stats = [(file, os.stat(file).st_mtime_ns, os.stat(file).st_size) for file in files]
             return (os.path.abspath(program), *command[1:]), repr((command, stats))
+        if command and variable:
+            what = f"{variable}={candidate!r} names no program: the next of CC, {', '.join(USUAL)} is taken."
+            warnings.warn(what, RuntimeWarning, stacklevel=2)
     return None, None
 
 
@@ -131,27 +131,26 @@ def _scratch():
 
 
 def _build(text, level, file_name, command):
-    """Compile into the cache, or into a temporary directory if the cache cannot be written."""
-    try:
+    """Compile into the cache, or into a temporary directory if that fails, as where the cache's disk is full."""
+    for directory in (cache_directory, _scratch):
         try:
-            return _compile(text, level, cache_directory() / file_name, command)
-        except OSError:
-            return _compile(text, level, _scratch() / file_name, command)
-    except (OSError, _CompilerFailed) as error:
-        return _without(f"{' '.join(command)} failed: {error}")
+            return _compile(text, level, directory() / file_name, command)
+        except (OSError, _CompilerFailed) as error:
+            failed = error
+        except subprocess.TimeoutExpired:
+            failed = f"no answer within {PATIENCE_WITH_COMPILER:g} s"
+            break
+    return _without(f"{' '.join(command)} failed: {failed}")
 
 
 def _compile(text, level, target, command):
     with replacing(target) as temporary:
         for flags in ((*FLAGS, *_optional_flags()), FLAGS):
-            try:
-                done = subprocess.run(
-                    [*command, level, *flags, f"-I{SOURCES}", "-x", "c", "-", "-o", temporary, "-lm"],
-                    input=text, encoding="utf-8", errors="replace", capture_output=True, cwd=target.parent,
-                    check=False, timeout=PATIENCE_WITH_COMPILER,
-                )  # fmt: skip
-            except subprocess.TimeoutExpired as error:
-                raise _CompilerFailed(f"no answer within {PATIENCE_WITH_COMPILER:g} s") from error
+            done = subprocess.run(
+                [*command, level, *flags, f"-I{SOURCES}", "-x", "c", "-", "-o", temporary, "-lm"],
+                input=text, encoding="utf-8", errors="replace", capture_output=True, cwd=target.parent,
+                check=False, timeout=PATIENCE_WITH_COMPILER,
+            )  # fmt: skip
             if done.returncode == 0:
                 break
         else:

@@ -14,7 +14,7 @@ from itertools import chain, count
 
 import casadi as ca
 
-from servoctl.codegen.loops import BISECTIONS, INLINE_SINES, LOOPS, NEAR, QUADRATIC, ROUNDING
+from servoctl.codegen.loops import INLINE_SINES, LOOPS, NEWTON
 
 CHUNK = 350  # statements per C function: compile time is least, and flat, between 250 and 500
 WIDE = 3000  # operations: up to here a function is emitted for eight points at once as well
@@ -124,7 +124,13 @@ LANES_COMMON = Dialect("W", "ALL({})", "w_", common=True, linkage="static ")
 
 def operations(f):
     """Number of arithmetic instructions of an SX function: all but constants, inputs, outputs and copies."""
-    return sum(f.instruction_id(k) not in _NOT_ARITHMETIC for k in range(f.n_instructions()))
+    instructions = ((f.instruction_id(k), f.instruction_input(k)) for k in range(f.n_instructions()))
+    return sum(code not in _NOT_ARITHMETIC and not _copies(code, source) for code, source in instructions)
+
+
+def _copies(operation, source):
+    """Whether an instruction gives its first operand unchanged; copysign(c, c) keeps CasADi from rewriting c."""
+    return operation in _COPIES or (operation == ca.OP_COPYSIGN and source[0] == source[1])
 
 
 def emit(f, name, loops=(), *, project=None, others=None, sizes=None, wide=True, chunk=CHUNK):
@@ -168,6 +174,7 @@ def emit(f, name, loops=(), *, project=None, others=None, sizes=None, wide=True,
     constants = {"NAME": name, "NX": f.numel_in(1), "NP": f.numel_in(2), "NY": f.numel_out(0)}
     constants |= {"PROJECTED": ""} if project is not None else {}
     constants |= {"WIDE": ""} if wide else {}
+    constants |= {"PIVOTS": 0} if "newton" in loops else {}
     constants |= {key.upper(): int(value) for key, value in (sizes or {}).items()}
     files = ["grid.c", *(f"{loop}.c" for loop in LOOPS if loop in loops)]
     return "".join((unit(constants), *parts, *map(include, files)))
@@ -175,8 +182,7 @@ def emit(f, name, loops=(), *, project=None, others=None, sizes=None, wide=True,
 
 def unit(constants):
     """Head of a translation unit: #define lines of constants by name, and `unit.h`."""
-    tolerances = {"ROUNDING": ROUNDING, "BISECTIONS": BISECTIONS, "NEAR": NEAR, "QUADRATIC": QUADRATIC}
-    lines = (f"#define {key} {value}\n" for key, value in (tolerances | constants).items())
+    lines = (f"#define {key} {value}\n" for key, value in (NEWTON | constants).items())
     return "".join(("#include <math.h>\n#include <stdint.h>\n", *lines, include("unit.h")))
 
 
@@ -225,7 +231,7 @@ def _statements(f, dialect, suffix=""):
             register[target[0]] = dialect.constant(f.instruction_constant(k))
         elif operation == ca.OP_OUTPUT:
             statements.append((f"y{suffix}[{target[1]}]", ca.OP_ASSIGN, (register[source[0]],)))
-        elif operation in _COPIES:
+        elif _copies(operation, source):
             register[target[0]] = register[source[0]]
         else:
             statements.append((values, operation, tuple(register[i] for i in source)))

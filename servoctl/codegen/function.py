@@ -1,10 +1,10 @@
 """A function of (t, x, p) on NumPy arrays: single points, grids, Runge-Kutta, Taylor, and Newton along a path.
 
-CasADi evaluates it until compiling pays, and wherever there is no compiler; the two agree to rounding.
+Compiled code and CasADi agree to rounding only. Which of the two evaluates depends on the call alone, never on earlier
+calls or on the cache, so that a repeated call has the same bits: loops, buffers and long grids are compiled at their
+first use, single points and short grids are left to CasADi, as is everything where there is no compiler.
 """
 
-import contextlib
-import contextvars
 import functools
 import os
 
@@ -17,24 +17,11 @@ from servoctl.codegen.loops import LOOPS
 from servoctl.codegen.native import Library
 from servoctl.errors import SpecificationError, unknown
 
-# Compiling takes 0.1 s or more. A consistent start makes tens of calls, an integration thousands; a grid costs CasADi
-# some 3 us per point, and a point of a path, solved by Newton's iteration in Python, as much as SOLVED of them.
-SCALAR_CALLS = 50
-GRID_POINTS = 20_000
-SOLVED = 5
+GRID_POINTS = 20_000  # CasADi takes some 0.3 us per point: a longer grid takes as long as compiling it
+FULLY_OPTIMISED = 6_000  # operations: up to here -O3 takes at most 1.5 s; with -O1 15,000 take no longer
+TAYLOR_COMPILED = 15_000  # operations: beyond, compiling takes as long as 50,000 steps that CasADi evaluates
 
-_AT_ONCE = contextvars.ContextVar("compiling at once", default=False)
-_OUTPUTS_PER_STATE = {"rk": 1, "newton": 2, "taylor": 1}
-
-
-@contextlib.contextmanager
-def compiling_at_once():
-    """Let functions compile at their first call, so that their last bits do not depend on earlier calls."""
-    token = _AT_ONCE.set(True)
-    try:
-        yield
-    finally:
-        _AT_ONCE.reset(token)
+_OUTPUTS_PER_STATE = {"rk": 1, "newton": 3, "taylor": 1}
 
 
 def compiled(f, name, loops=(), project=None, others=None, sizes=None):
@@ -53,8 +40,9 @@ def compiled(f, name, loops=(), project=None, others=None, sizes=None):
     others : dict of str to casadi.Function, optional
         Further functions of the same form in the same library, called by `Compiled.native`.
     sizes : dict of str to int, optional
-        Constants of the loops. Those of "taylor": the numbers of coordinates "nq" and of quasi-velocities "n", the
-        order s̄ "top", the highest index of coefficients "last", and "plain" (1 if q' = γ', else 0).
+        Constants of the loops. That of "newton": the number of "pivots" (default: 0). Those of "taylor": the numbers
+        of coordinates "nq" and of quasi-velocities "n", the order s̄ "top", the highest index of coefficients "last",
+        and "plain" (1 if q' = γ', else 0).
 
     Returns
     -------
@@ -129,7 +117,7 @@ def _name_of(operation):
 
 
 class Compiled:
-    """A function y = f(t, x, p) that compiles as soon as it pays; made by `compiled`.
+    """A function y = f(t, x, p) whose loops and long grids are compiled; made by `compiled`.
 
     Several threads may call it and its loops at once. It pickles: the copy loads its library from the cache, or builds
     it again.
@@ -151,14 +139,14 @@ class Compiled:
         self.n_x, self.n_p, self.n_y = f.numel_in(1), f.numel_in(2), f.numel_out(0)
         self.expression, self._symbol = f, f"servoctl_{name}"
         self._x_shape, self._p_shape = (self.n_x,), (self.n_p,)
-        self._evaluator = Interpreter(f, project, self._sizes)
-        self._settled, self._looked, self._text, self._calls, self._points = False, False, None, 0, 0
+        self._interpreter = Interpreter(f, project, self._sizes)
+        self._text = None
 
     def __reduce__(self):
         parts = (self.expression, self.name, self.loops, self._project, self._others, self._sizes)
         # Emitting takes longer than reading: the C text travels until the library is loaded, where it can be compiled.
-        text = None if self._settled or compiler.compiler() is None else self.source()
-        return Compiled, parts, {"_text": text}
+        travels = self.loops and "_library" not in self.__dict__ and compiler.compiler() is not None
+        return Compiled, parts, {"_text": self.source() if travels else None}
 
     def __eq__(self, other):
         return self is other or (isinstance(other, Compiled) and self.source() == other.source())
@@ -175,10 +163,23 @@ class Compiled:
         """Number of arithmetic operations of one evaluation."""
         return emit.operations(self.expression)
 
+    @functools.cached_property
+    def interpreted(self):
+        """Evaluation by CasADi, whether or not a library is loaded: a few points do not pay for one."""
+        return Interpreter(self.expression)
+
+    @functools.cached_property
+    def tangent(self):
+        """Evaluation of (∂y/∂x) v, y the first n_x outputs, by CasADi as a function of t, x and [p; v]."""
+        t, x, p, v = map(ca.SX.sym, "txpv", (1, self.n_x, self.n_p, self.n_x))
+        along = ca.densify(ca.cse(ca.jtimes(self.expression(t, x, p)[: self.n_x], x, v)))
+        return Interpreter(ca.Function("tangent", [t, x, ca.vertcat(p, v)], [along]))
+
     @property
     def backend(self):
         """``"c"`` once the library is loaded, ``"casadi"`` until then."""
-        return self.__dict__.get("_lanes", self._evaluator).backend
+        loaded = self.__dict__
+        return loaded.get("_lanes", loaded.get("_library", self._interpreter)).backend
 
     def __call__(self, t, x, p):
         """Evaluate at one point.
@@ -202,10 +203,7 @@ class Compiled:
         SpecificationError
             If x or p has another shape.
         """
-        if not self._settled:
-            self._calls += 1
-            self._settle(self._calls > SCALAR_CALLS or _AT_ONCE.get())
-        row_y, run = self._place(t, x, p)
+        row_y, run = self._place(self._interpreter, t, x, p)
         run()
         return row_y.copy()
 
@@ -220,8 +218,7 @@ class Compiled:
         call : callable
             Computes y from t, x and p.
         """
-        self._settle(build=True)
-        return self._evaluator.workspace.buffer
+        return self._library.workspace.buffer
 
     def grid(self, t, x, p):
         """Evaluate at N points.
@@ -248,10 +245,8 @@ class Compiled:
         x = self._array("x", x, (self.n_x, n))
         t = self._array("t", np.broadcast_to(t, (n,)) if np.ndim(t) == 0 else t, (n,))
         p = self._array("p", p, (self.n_p, n) if np.ndim(p) == 2 else self._p_shape)
-        self._points += n
-        self._settle(build=False)
         y = np.empty((self.n_y, n))
-        (self._lanes if self._points > GRID_POINTS or _AT_ONCE.get() else self._evaluator).grid(t, x, p, y)
+        (self._lanes if n > GRID_POINTS else self._library if self.loops else self._interpreter).grid(t, x, p, y)
         return y
 
     def rk(self, t0, x0, h, n_steps, p, tableau, every=1, project_every=0):
@@ -292,7 +287,7 @@ class Compiled:
         SpecificationError
             If the function has no loop "rk", an array has another shape, or a count is out of range.
         """
-        self._settle_loop("rk")
+        self._require_loop("rk")
         x0, p = self._array("x0", x0, self._x_shape), self._array("p", p, self._p_shape)
         if n_steps < 0 or every < 1:
             raise SpecificationError(
@@ -305,36 +300,34 @@ class Compiled:
         log = np.append(np.arange(0, n_steps, every), n_steps)
         states, outputs = np.empty((self.n_x, log.size)), np.empty((self.n_y - self.n_x, log.size))
         counts = (int(n_steps), int(every), int(project_every) if self._project is not None else 0)
-        n = 1 + self._evaluator.rk(float(t0), x0, float(h), counts, p, tableau, states, outputs)
+        n = 1 + self._library.rk(float(t0), x0, float(h), counts, p, tableau, states, outputs)
         return t0 + log[:n] * h, states[:, :n], outputs[:, :n]
 
-    def newton(self, t, x0, p, tol=1e-13, max_iter=30):
-        """Solve delta = 0 at each time in order; the outputs are the Newton step delta (n_x), dx/dt (n_x) and others.
+    def continuation(self, cuts, x0, p, longest, most):
+        """Follow a path by steps of its own; the outputs are the Newton step delta, dx/dt, d²x/dt², others, pivots.
 
-        A point is predicted from the last one by its rate and corrected until every |delta_i| <= tol (1 + |x_i|), then
-        once more if that still reduces delta. If the correction fails, the step in time is halved, up to 20 times.
-        Points in blocks are predicted by Hermite's interpolation and corrected together; they are solved one by one
-        if the prediction is off by more than 1e-3. Compiled code takes eight points at once, CasADi 128.
+        A step is predicted by the rates and corrected. It is halved until Newton's corrections shrink quickly, the
+        predictions from both its ends are right up to a small part of the way, and no pivot (the last
+        ``sizes["pivots"]`` outputs) changes its sign or its size by more than a factor of 4: the path cannot change to
+        another branch of the solution.
 
         Parameters
         ----------
-        t : (N,) array
-            Times [s].
+        cuts : (C,) array
+            Start, instants at which steps end, and end [s]; in order, also backwards.
         x0 : (n_x,) array
-            Start of the iteration at t[0], SI.
+            Start of the iteration at cuts[0], SI.
         p : (n_p,) array
             Parameters, SI.
-        tol : float
-            Tolerance relative to 1 + |x_i|.
-        max_iter : int
-            Corrections per point.
+        longest : float
+            Longest step [s].
+        most : int
+            Largest number of nodes.
 
         Returns
         -------
-        x : (n_x, M) array
-            Solutions at the first M times; M < N if the iteration fails at t[M].
-        y : (n_y, M) array
-            Outputs at these times.
+        nodes : (M, 1 + n_x + n_y) array
+            t, x and outputs at the ends of the steps. If M < most, the path ends where the last node lies.
         iterations : int
             Number of evaluations.
 
@@ -343,12 +336,43 @@ class Compiled:
         SpecificationError
             If the function has no loop "newton", or an array has another shape.
         """
-        self._points += SOLVED * np.size(t)
-        self._settle_loop("newton", self._points > GRID_POINTS or _AT_ONCE.get())
-        t = self._array("t", t, (np.size(t),))
+        self._require_loop("newton")
+        cuts = self._array("cuts", cuts, (np.size(cuts),))
         x0, p = self._array("x0", x0, self._x_shape), self._array("p", p, self._p_shape)
+        nodes = np.empty((most, 1 + self.n_x + self.n_y))
+        n, iterations = self._library.continuation(cuts, x0, p, float(longest), nodes)
+        return nodes[:n], iterations
+
+    def newton(self, t, nodes, p):
+        """Solve at times along the path of a `continuation`.
+
+        A point is predicted by Hermite's interpolation between two nodes and corrected until every
+        |delta_i| <= 1e-13 (1 + |x_i|); by further steps of the path from the node before it, where that fails.
+        Compiled code takes eight points at once, CasADi 128.
+
+        Parameters
+        ----------
+        t : (N,) array
+            Times in the order of the nodes [s].
+        nodes : (M, 1 + n_x + n_y) array
+            From `continuation`.
+        p : (n_p,) array
+            Parameters, SI.
+
+        Returns
+        -------
+        x : (n_x, K) array
+            Solutions at the first K times; K < N if the iteration fails at t[K].
+        y : (n_y, K) array
+            Outputs at these times.
+        iterations : int
+            Number of evaluations.
+        """
+        self._require_loop("newton")
+        t, p = self._array("t", t, (np.size(t),)), self._array("p", p, self._p_shape)
+        nodes = self._array("nodes", nodes, (len(nodes), 1 + self.n_x + self.n_y))
         x, y = np.empty((self.n_x, t.size)), np.empty((self.n_y, t.size))
-        n, iterations = self._evaluator.newton(t, x0, p, float(tol), int(max_iter), x, y)
+        n, iterations = self._library.newton(t, nodes, p, x, y)
         return x[:, :n], y[:, :n], iterations
 
     def taylor(self, t0, x0, t1, p, rtol, atol, max_steps, project_every=0):
@@ -385,10 +409,10 @@ class Compiled:
         SpecificationError
             If the function has no loop "taylor", or an array has another shape.
         """
-        self._settle_loop("taylor")
-        self._place(t0, x0, p)
+        self._require_loop("taylor")
+        self._place(self._library, t0, x0, p)
         every = project_every if self._project is not None else 0
-        log = self._evaluator.taylor(t1, rtol, atol, every, max_steps)
+        log = self._library.taylor(t1, rtol, atol, every, max_steps)
         return log[:, 0], log[:, 1 : 1 + self.n_x].T, log[:-1, 1 + self.n_x :].T
 
     def restore(self, t, x, p):
@@ -403,10 +427,9 @@ class Compiled:
         suffix : str
             Name after ``servoctl_NAME_``: "point", "grid", a key of `others`, or a function of a loop's file.
         """
-        self._settle(build=True)
-        return self._evaluator.native(suffix)
+        return self._library.native(suffix)
 
-    def _settle_loop(self, loop, build=True):
+    def _require_loop(self, loop):
         if loop not in self.loops:
             raise SpecificationError(
                 f"{self.name!r} has no loop {loop!r}.",
@@ -416,22 +439,32 @@ class Compiled:
                 loop=loop,
                 loops=self.loops,
             )
-        self._settle(build)
 
-    def _settle(self, build):
-        """Change from CasADi to the library: to one on disk at the first call, to a new one if `build`."""
-        if self._settled or (self._looked and not build):
-            return
-        self._looked = True
-        if not build and os.environ.get("SERVOCTL_COMPILER") == "none":
-            return  # without the emission of C text, which takes longer than a short motion
-        level = "-O1" if {*self.loops} <= {"rk"} else "-O3"
-        text = "" if compiler.compiler() is None else self.source()
-        library = compiler.library(text, build, level)
-        if library is not None:
-            self._evaluator = Library(library, self._symbol, self.n_x, self.n_p, self.n_y)
-        self._settled = build or library is not None
-        self._text = None if self._settled else self._text
+    @functools.cached_property
+    def _library(self):
+        """Evaluator of loops and buffers: compiled code, or CasADi where nothing is compiled."""
+        if "taylor" in self.loops and self.operations > TAYLOR_COMPILED:
+            return self._interpreter
+        return self._loaded(self.source)
+
+    @functools.cached_property
+    def _lanes(self):
+        """Evaluator of long grids: a separate library, because twice the code takes twice the time to compile."""
+        if "newton" in self.loops:
+            return self._library
+        return self._loaded(lambda: emit.emit(self.expression, self._symbol), "-O1")
+
+    def _loaded(self, source, level=None):
+        """Evaluator by the library of a C text, which takes long to write and is not written without a compiler."""
+        if os.environ.get("SERVOCTL_COMPILER") == "none":
+            return self._interpreter
+        library = compiler.library("" if compiler.compiler() is None else source(), level or self._level)
+        self._text = None
+        return self._interpreter if library is None else Library(library, self._symbol, self.n_x, self.n_p, self.n_y)
+
+    @property
+    def _level(self):
+        return "-O1" if {*self.loops} <= {"rk"} or self.operations > FULLY_OPTIMISED else "-O3"
 
     def source(self):
         """C text of the library."""
@@ -440,19 +473,9 @@ class Compiled:
             self._text = emit.emit(self.expression, self._symbol, self.loops, **parts, wide="newton" in self.loops)
         return self._text
 
-    @functools.cached_property
-    def _lanes(self):
-        """Evaluator of long grids: a separate library, because twice the code takes twice the time to compile."""
-        if "newton" not in self.loops:
-            library = compiler.library(emit.emit(self.expression, self._symbol), level="-O1")
-            if library is not None:
-                return Library(library, self._symbol, self.n_x, self.n_p, self.n_y)
-        self._settle(build=True)
-        return self._evaluator
-
-    def _place(self, t, x, p):
-        """Write t, x and p into the thread's workspace; return its y and its call."""
-        row_t, row_x, row_p, row_y, run = self._evaluator.workspace.row
+    def _place(self, evaluator, t, x, p):
+        """Write t, x and p into an evaluator's workspace of this thread; return its y and its call."""
+        row_t, row_x, row_p, row_y, run = evaluator.workspace.row
         row_t[0] = t
         try:
             row_x[:], row_p[:] = x, p

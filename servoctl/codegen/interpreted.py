@@ -1,13 +1,22 @@
 """Evaluations and loops of a function by CasADi and NumPy: for short motions, and where there is no compiler."""
 
+import functools
 import threading
-from itertools import pairwise
 
 import numpy as np
 
-from servoctl.codegen.loops import BISECTIONS, NEAR, QUADRATIC, ROUNDING
+from servoctl.codegen.loops import (
+    CONTRACTION,
+    CORRECTED,
+    CORRECTIONS,
+    FOLLOWED,
+    QUADRATIC,
+    ROUNDING,
+    SHORTEST,
+    STEADY,
+)
 
-BLOCK, STRIDE = 128, 16  # instants of a path that are solved together; from one that is solved alone to the next
+BLOCK = 128  # instants of a path that are solved together
 
 _guard = threading.Lock()
 
@@ -66,8 +75,25 @@ class Interpreter:
 
     def grid(self, t, x, p, y):
         """Fill y (n_y, N) with the outputs at t (N,) and the columns of x, and of p if that is a matrix."""
-        for k, t_k in enumerate(t):
-            y[:, k] = self._value(t_k, x[:, k], p[:, k] if p.ndim == 2 else p)
+        whole = t.size - t.size % BLOCK
+        parts = [np.empty((BLOCK, size)) for size in (1, self._n_x, self._f.numel_in(2), len(y))]
+        if whole:
+            parts[2][:] = 0.0 if p.ndim == 2 else p
+            run, alive = connected(self._block, parts)  # the buffer lives as long as its name
+        for k in range(0, whole, BLOCK):
+            here = slice(k, k + BLOCK)
+            parts[0][:, 0], parts[1][:] = t[here], x[:, here].T
+            if p.ndim == 2:
+                parts[2][:] = p[:, here].T
+            run()
+            y[:, here] = parts[3].T
+        for k in range(whole, t.size):
+            y[:, k] = self._value(t[k], x[:, k], p[:, k] if p.ndim == 2 else p)
+
+    @functools.cached_property
+    def _block(self):
+        """The function at `BLOCK` points; the bits are those of single points."""
+        return self._f.map(BLOCK)
 
     @np.errstate(all="ignore")
     def rk(self, t0, x0, h, counts, p, tableau, states, outputs):
@@ -122,25 +148,49 @@ class Interpreter:
     def _restore(self, t, x, p):
         return restored(self._project, t, x, p)
 
-    def newton(self, t, x0, p, tol, max_iter, x, y):
+    def _path(self, p):
+        return _Path(self._value, p, self._n_x, (self._sizes or {}).get("pivots", 0))
+
+    @np.errstate(all="ignore")
+    def continuation(self, cuts, x0, p, longest, nodes):
+        """Fill rows of nodes; return their number and that of evaluations. See `Compiled.continuation`."""
+        path, k, h = self._path(p), 0, longest
+        point, _ = path.correct(cuts[0], x0, np.inf)
+        t, following = cuts[0], iter(cuts[1:])
+        end = next(following, None)
+        while point is not None:
+            nodes[k] = np.concatenate([[t], *point])
+            k += 1
+            if k == len(nodes) or end is None:
+                break
+            t, h, point = path.step(t, end, h, longest * SHORTEST, point)
+            h, end = min(h, longest), next(following, None) if t == end else end
+        return k, path.count
+
+    @np.errstate(all="ignore")
+    def newton(self, t, nodes, p, x, y):
         """Fill columns of x and y; return the numbers of points solved and of evaluations. See `Compiled.newton`."""
-        solve, k, alone = _Newton(self._value, p, self._n_x, tol, max_iter), 0, 1
+        path, k, alone = self._path(p), 0, 0
         parts = np.zeros(BLOCK), np.zeros((BLOCK, len(x))), np.tile(p, (BLOCK, 1)), np.zeros((BLOCK, len(y)))
-        block = (parts, *connected(self._f.map(BLOCK), parts)) if t.size > BLOCK else None
+        call = connected(self._block, parts) if t.size >= BLOCK else None
+        forward = nodes[-1, 0] >= nodes[0, 0]
+        ends = nodes[1:, 0] if forward else -nodes[1:, 0]
+        first = np.minimum(np.searchsorted(ends, t if forward else -t), max(len(nodes) - 2, 0))
+        last = np.minimum(first + 1, len(nodes) - 1)
         while k < t.size:
-            point = (x[:, k - 1].copy(), y[:, k - 1].copy()) if k else None
+            block = slice(k, k + BLOCK)
             if alone <= k <= t.size - BLOCK:
-                if solve.together(t[k - 1 : k + BLOCK], point, block):
-                    x[:, k : k + BLOCK], y[:, k : k + BLOCK] = parts[1].T, parts[3].T
+                if path.together(t[block], nodes[first[block]], nodes[last[block]], parts, call[0]):
+                    x[:, block], y[:, block] = parts[1].T, parts[3].T
                     k += BLOCK
                     continue
                 alone = k + BLOCK
-            point = solve.advance(t[k - 1], t[k], *point) if k else solve.correct(t[k], x0)
+            point = path.between(t[k], nodes[first[k]], nodes[last[k]])
             if point is None:
                 break
             x[:, k], y[:, k] = point
             k += 1
-        return k, solve.count
+        return k, path.count
 
 
 def restored(project, t, x, p):
@@ -181,12 +231,34 @@ def step_length(x, c, shape, rtol, atol):
     return h
 
 
-class _Newton:
-    """Newton's iteration along a path; a solution is a pair (x, y), and None where the iteration fails."""
+def _distance(x, other):
+    """The largest difference of two points, relative to 1 + |x|."""
+    return np.max(np.abs(other - x) / (1 + np.maximum(np.abs(x), np.abs(other))), axis=-1, initial=0.0)
 
-    def __init__(self, value, p, n_x, tol, max_iter):
-        self._value, self._p, self._n_x, self._tol, self._max_iter = value, p, n_x, tol, max_iter
-        self.count = 0
+
+def _tolerance(x, other):
+    """Largest error of a prediction on the way between two points of a path."""
+    return np.maximum(FOLLOWED * _distance(x, other), QUADRATIC)
+
+
+def _hermite(t, a, b, n_x):
+    """x at times (N,) between nodes (N, ...), by Hermite's interpolation of x, x' and x''."""
+    cuts = [1, 1 + n_x, 1 + 2 * n_x, 1 + 3 * n_x, 1 + 4 * n_x]
+    (start, *of_a), (end, *of_b) = (np.split(node, cuts, -1)[:5] for node in (a, b))
+    h = end - start
+    s = np.divide(t[..., None] - start, h, out=np.zeros_like(h), where=h != 0)
+
+    def part(s, h, x, _, rate, second):
+        return (1 - s) ** 3 * ((1 + s * (3 + 6 * s)) * x + s * h * ((1 + 3 * s) * rate + s / 2 * h * second))
+
+    return part(s, h, *of_a) + part(1 - s, -h, *of_b)
+
+
+class _Path:
+    """Points of a path by Newton's method, as in newton.c; a point is a pair (x, y), None where the iteration fails."""
+
+    def __init__(self, value, p, n_x, pivots):
+        self._value, self._p, self._n_x, self._pivots, self.count = value, p, n_x, pivots, 0
 
     def _at(self, t, x):
         self.count += 1
@@ -195,69 +267,77 @@ class _Newton:
         defect = (np.abs(delta) / (1 + np.abs(x))).max(initial=0.0)  # a NaN or inf of delta shows here, an inf of x not
         return y, delta, defect if defect < np.inf and np.isfinite(x).all() else np.inf
 
-    @np.errstate(all="ignore")
-    def correct(self, t, x):
-        """The solution at time t, from x."""
-        for _ in range(self._max_iter + 1):
+    def correct(self, t, x, factor):
+        """The solution at time t from x, by corrections that shrink by a factor; and the size of the first."""
+        first, before = None, np.inf
+        for _ in range(CORRECTIONS + 1):
             y, delta, defect = self._at(t, x)
-            if defect <= self._tol:
+            first = defect if first is None else first
+            if defect <= CORRECTED or (before <= QUADRATIC and CONTRACTION * before < defect < np.inf):  # or rounding
                 break
-            if not np.isfinite(defect):
-                return None
-            x = x + delta
+            if not np.isfinite(defect) or defect > factor * before:
+                return None, first
+            x, before = x + delta, defect
         else:
-            return None
+            return None, first
         if defect > ROUNDING:
             y_next, _, defect_next = self._at(t, x + delta)
             if defect_next < defect:
-                return x + delta, y_next
-        return x, y
+                return (x + delta, y_next), first
+        return (x, y), first
 
-    @np.errstate(all="ignore")
-    def advance(self, a, b, x, y):
-        """The solution at b from x, y at a: predicted by the rate; the step is halved where the correction fails."""
-        t, done, pieces = a, 0, 1
-        while done < pieces:
-            following = b if done + 1 == pieces else a + (b - a) * ((done + 1) / pieces)
-            point = self.correct(following, x + (following - t) * y[self._n_x : 2 * self._n_x])
-            if point is not None:
-                (x, y), t, done = point, following, done + 1
-                while pieces > 1 and done % 2 == 0:
-                    done, pieces = done // 2, pieces // 2
-            elif pieces == 2**BISECTIONS:
-                return None
-            else:
-                done, pieces = 2 * done, 2 * pieces
-        return x, y
+    def _predict(self, h, x, y):
+        n = self._n_x
+        return x + h * (y[n : 2 * n] + h / 2 * y[2 * n : 3 * n])
 
-    @np.errstate(all="ignore")
-    def together(self, t, point, block):
-        """Fill the block with the solutions at t[1:], from the one at t[0]; False where the iteration fails.
+    def _steady(self, y, other):
+        """Whether no pivot changes its sign, or its size by more than a factor."""
+        size = y.shape[-1] - self._pivots
+        a, b = y[..., size:], other[..., size:]
+        return bool(np.all(a * b >= STEADY * np.maximum(a * a, b * b)))
 
-        Every `STRIDE`-th instant is solved alone; the others start from Hermite's cubic interpolation between these.
-        """
-        (instants, x, _, y), run, _ = block
-        n_x, nodes = self._n_x, [point]
-        for a, b in pairwise(t[::STRIDE]):
-            if (point := self.advance(a, b, *nodes[-1])) is None:
-                return False
-            nodes.append(point)
-        z = np.array([x for x, _ in nodes])[:, None]
-        rate = np.array([y[n_x : 2 * n_x] for _, y in nodes])[:, None]
-        instants[:], h = t[1:], np.diff(t[::STRIDE])[:, None, None]
-        s = (t[1:].reshape(-1, STRIDE, 1) - t[:-1:STRIDE, None, None]) / h
-        r = 1 - s
-        start = r * r * ((1 + 2 * s) * z[:-1] + s * h * rate[:-1]) + s * s * ((1 + 2 * r) * z[1:] - r * h * rate[1:])
-        x[:], defect = start.reshape(BLOCK, n_x), NEAR
+    def step(self, t, end, h, least, point):
+        """One step of at most the length h: the time reached, the next length and the point, None if h vanishes."""
+        while True:
+            left = abs(end - t)
+            length, now = (left, end) if h >= left else (min(h, left / 2), t + np.copysign(min(h, left / 2), end - t))
+            if now == t or h < min(least, left):
+                return t, h, None
+            following, first = self.correct(now, self._predict(now - t, *point), CONTRACTION)
+            if following is not None and self._steady(point[1], following[1]):
+                allowed = _tolerance(point[0], following[0])
+                error = max(first, _distance(point[0], self._predict(t - now, *following)))
+                if error <= allowed:
+                    growth = min(2.0, 0.9 * np.sqrt(allowed / (error + ROUNDING)))
+                    return now, max(growth, 0.5) * length if growth < 1 else max(h, growth * length), following
+            h = length / 2
+
+    def between(self, t, a, b):
+        """The point at t between two nodes: predicted by both, else reached by steps from the first."""
+        x, y = np.split(a[1:], [self._n_x])
+        point, first = self.correct(t, _hermite(np.asarray(t), a, b, self._n_x), CONTRACTION)
+        if point is not None and first <= _tolerance(x, b[1 : 1 + self._n_x]) and self._steady(y, point[1]):
+            return point
+        now, h, point = a[0], abs(t - a[0]), (x, y)
+        while now != t and point is not None:
+            now, h, point = self.step(now, t, h, abs(b[0] - a[0]) * SHORTEST, point)
+        return point
+
+    def together(self, t, a, b, parts, run):
+        """Fill the parts with the points at times (N,) between nodes (N, ...); False where the iteration fails."""
+        (instants, x, _, y), n = parts, self._n_x
+        instants[:], x[:] = t, _hermite(t, a, b, n)
+        before, largest = np.inf, np.min(_tolerance(a[:, 1 : 1 + n], b[:, 1 : 1 + n]))
 
         def correction():
             run()
-            self.count += BLOCK
-            return np.max(np.abs(y[:, :n_x]) / (1 + np.abs(x)))
+            self.count += len(t)
+            return np.max(np.abs(y[:, :n]) / (1 + np.abs(x)))
 
-        while not defect <= QUADRATIC:
-            before, defect = defect, correction()
-            if not defect < before:  # the interpolation was too far off, or the iteration does not converge
+        while not before <= CONTRACTION * QUADRATIC:
+            defect = correction()
+            if not defect <= min(before, largest):
                 return False
-            x += y[:, :n_x]
-        return correction() <= self._tol
+            x += y[:, :n]
+            before = CONTRACTION * defect
+        return correction() <= CORRECTED and self._steady(a[:, 1 + n :], y)

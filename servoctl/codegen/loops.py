@@ -4,10 +4,25 @@ import functools
 import hashlib
 from importlib import resources
 
-BISECTIONS = 20  # halvings of one time step in newton: a millionth of it is a lost solution, not a long step
+CORRECTIONS = 30  # of one point by Newton's method, at most
+CORRECTED = 1e-13  # a Newton correction this small relative to 1 + |x| ends the iteration
 ROUNDING = 2.0**-52  # a Newton correction this small relative to 1 + |x| cannot be reduced by another
-NEAR = 1e-3  # largest error of a prediction for several points at once, relative to 1 + |x|
 QUADRATIC = 1e-8  # a Newton correction this small leaves an error of the order of rounding
+CONTRACTION = 0.25  # largest ratio of two Newton corrections at one instant: another solution is four times as far away
+FOLLOWED = 0.02  # largest error of a step's prediction, relative to the way of the step
+STEADY = 0.25  # smallest ratio of a pivot to itself in a step: none is jumped over, none loses its digits in one step
+SHORTEST = 2.0**-32  # of the longest step: the path ends where a shorter one would be needed
+
+NEWTON = {  # constants that C needs by name
+    "CORRECTIONS": CORRECTIONS,
+    "CORRECTED": CORRECTED,
+    "ROUNDING": ROUNDING,
+    "QUADRATIC": QUADRATIC,
+    "CONTRACTION": CONTRACTION,
+    "FOLLOWED": FOLLOWED,
+    "STEADY": STEADY,
+    "SHORTEST": SHORTEST,
+}
 
 LOOPS = ("rk", "newton", "taylor", "radau", "closed", "law")  # files of these names; rk.c defines NAME_rk
 INLINE_SINES = {"radau", "closed", "law"}  # loops with inlined sin and cos, within 2 units in the last place

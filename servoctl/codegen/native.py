@@ -63,19 +63,20 @@ class Library:
         run.argtypes = (ctypes.c_void_p, *3 * [ctypes.c_double], *2 * [ctypes.c_int64], ctypes.c_void_p)
         return run
 
-    def newton(self, t, x0, p, tol, max_iter, x, y):
+    def continuation(self, cuts, x0, p, longest, nodes):
+        """Fill rows of nodes; return their number and that of evaluations. See `Compiled.continuation`."""
+        run, count = self.native("continuation"), ctypes.c_int64()
+        run.restype = ctypes.c_int64
+        size, most = ctypes.c_int64(cuts.size), ctypes.c_int64(len(nodes))
+        arrays = map(pointer, (cuts, x0, p))
+        return run(size, *arrays, ctypes.c_double(longest), most, pointer(nodes), ctypes.byref(count)), count.value
+
+    def newton(self, t, nodes, p, x, y):
         """See `Compiled.newton`."""
         run, count = self.native("newton"), ctypes.c_int64()
         run.restype = ctypes.c_int64
-        n = run(
-            ctypes.c_int64(t.size),
-            *map(pointer, (t, x0, p)),
-            ctypes.c_double(tol),
-            ctypes.c_int64(max_iter),
-            pointer(x),
-            pointer(y),
-            ctypes.byref(count),
-        )
+        sizes = ctypes.c_int64(t.size), ctypes.c_int64(len(nodes))
+        n = run(sizes[0], pointer(t), sizes[1], *map(pointer, (nodes, p, x, y)), ctypes.byref(count))
         return n, count.value
 
 

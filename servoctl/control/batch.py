@@ -10,7 +10,7 @@ import casadi as ca
 import numpy as np
 
 from servoctl.codegen import compiler, emit
-from servoctl.codegen.function import Compiled, compiled, compiling_at_once
+from servoctl.codegen.function import Compiled, compiled
 from servoctl.codegen.native import pointer
 from servoctl.control.loop import Arguments
 
@@ -142,7 +142,8 @@ class Gathered:
 
     `state_lost` and `law_lost` (N,) are the instants [s] at which the state, or the law's output, is first not finite,
     else infinite; `largest`, `rms` and `last` (n, N) the largest size over all samples, the root of the mean square and
-    the value at the end; `trace` (K, n_traced, N) the values at every n-th sample.
+    the value at the end; `trace` (K, n_traced, N) the values at every n-th sample. After Ctrl-C `state_lost` is NaN in
+    the cases that were not finished.
     """
 
     state_lost: np.ndarray
@@ -169,7 +170,7 @@ def run_batch(unit, loop, cases, noise=None, traced=(), every=1, threads=None):
     count, width, size = cases[1].shape[1], 2 * n, len(unit.names)
     blocks = -(-count // width)
     columns = np.minimum(np.arange(blocks * width), count - 1)
-    gathered = np.empty((2 + 3 * size, blocks * width))
+    gathered = np.full((2 + 3 * size, blocks * width), np.nan)
     trace = np.empty((loop.samples // every + 1 if len(traced) else 0, len(traced), blocks * width))
     late = 0 if loop.transport is None else int(np.max(loop.transport)) // loop.substeps + 1
     depth = 1 + max(loop.delay, late)
@@ -190,7 +191,10 @@ def run_batch(unit, loop, cases, noise=None, traced=(), every=1, threads=None):
     length = 1 if noise is not None else -(-blocks // (threads * PER_THREAD))
     starts = range(0, blocks, length)
     with ThreadPoolExecutor(threads) as pool:
-        list(pool.map(run, starts, (min(first + length, blocks) for first in starts)))
+        try:
+            list(pool.map(run, starts, (min(first + length, blocks) for first in starts)))
+        except KeyboardInterrupt:
+            arguments.stop = 1  # which the threads read at each integration step
     lost, largest, squares, last = np.split(gathered[:, :count], [2, 2 + size, 2 + 2 * size])
     return Gathered(*lost, largest, np.sqrt(squares / (loop.samples + 1)), last, trace[:, :, :count])
 
@@ -205,5 +209,4 @@ def _common(unit, loop):
     """The table of values that are common to all cases, a row per sample."""
     samples = np.arange(loop.samples + 1)
     rows = loop.table[np.minimum(loop.first + samples, len(loop.table) - 1)].T
-    with compiling_at_once():
-        return unit.table.grid(loop.t0 + samples * loop.period, np.zeros((0, len(samples))), rows).T
+    return unit.table.grid(loop.t0 + samples * loop.period, np.zeros((0, len(samples))), rows).T

@@ -1,6 +1,7 @@
 """The sampled closed loop of a plant and a law."""
 
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -9,11 +10,12 @@ from numpy.typing import ArrayLike
 from servoctl.checks import as_span, require_memory, whole_multiple
 from servoctl.control.conditions import Conditions, Sensors, Timing, index, limits, require_few_steps, steps
 from servoctl.control.law import Law, UserStep
-from servoctl.control.loop import FINISHED, LAW_LOST, STATE_LOST, Loop, run_loop
+from servoctl.control.loop import FINISHED, INTERRUPTED, LAW_LOST, STATE_LOST, Loop, run_loop
 from servoctl.control.reference import Reference, require_plan, require_plant, resampled
 from servoctl.control.result import Closed
 from servoctl.errors import InconsistentStart, IntegrationStopped, ServoError, SpecificationError
 from servoctl.plants.plant import Plant
+from servoctl.reduction.orders import other_order
 from servoctl.run import Run
 
 CONSISTENT = 1e-6  # of the state: the largest residual of a material constraint at the start
@@ -54,6 +56,7 @@ def close(
     Returns
     -------
     Closed
+        After Ctrl-C it holds what was computed, with `success` False.
 
     Raises
     ------
@@ -145,6 +148,8 @@ def require_consistent(plant, t0, starts, p):
 def _finish(plant, law, plan, loop, conditions):
     """Run a loop; return its `Closed`, or raise the error that ended it, with the motion so far."""
     status, x, law_x, law_y, inputs = run_loop(plant.function("ode"), law.begin(), loop)
+    if status == INTERRUPTED and not len(x):
+        raise KeyboardInterrupt
     t = loop.t0 + np.arange(len(x)) * loop.period
     m, n_y, n_z = loop.n_u, len(law.measures), len(law.state)
     end = loop.t0 + len(x) * loop.period
@@ -152,15 +157,28 @@ def _finish(plant, law, plan, loop, conditions):
         FINISHED: "finished",
         STATE_LOST: f"the state is not finite at t = {end:.6g} s",
         LAW_LOST: f"the law's answer is not finite at t = {end:.6g} s",
+        INTERRUPTED: f"interrupted at t = {end - loop.period:.7g} s; what was computed is kept",
     }.get(status, f"the law raised {type(status).__name__} at t = {end:.6g} s")
     run = Closed(
         t, x.T, inputs.T, law_y[:, :m].T, law_x[: len(x), :n_y].T, law_x[: len(x), n_y:].T, law_y[:, m + n_z :].T,
-        plant, law, plan, loop, conditions, status == FINISHED, 0 if status == FINISHED else -1, message,
+        plant, law, plan, loop, conditions, status == FINISHED, {FINISHED: 0, INTERRUPTED: 1}.get(status, -1), message,
     )  # fmt: skip
-    if status == FINISHED:
-        return run
+    if status in (FINISHED, INTERRUPTED):
+        return _of_same_orders(run)
     error = status if isinstance(status, BaseException) else _stopped(law, loop, status, end)
     error.run = run
+    raise error
+
+
+def _of_same_orders(run):
+    """The loop, if its material constraints have the same orders at all of its samples."""
+    equations = run.plant.equations
+    states, values = run.states[: len(run.states) - len(run.plant.lag)], run.plant.parameters[: len(equations.values)]
+    k, row = equations.orders.first_change(run.t, states, values)
+    if k is None:
+        return run
+    error = other_order(row, float(run.t[k]))
+    error.run = replace(run, success=False, status=-1, message=f"stopped: {str(error).split('. ')[0]}")
     raise error
 
 

@@ -29,8 +29,8 @@ from servoctl.run import Run
 
 RANK_POINTS, AWAY, SEED = 8, 0.02, 20240229  # states for the ranks, and their distance from the plan
 SHARE = 1e-9  # of the largest entry, in rows and columns of like size: smaller ones are rounding
+MOST_DELAY = 1000  # samples: the poles of a delayed loop are eigenvalues of a matrix of that size
 MOST_DERIVATIVES = 4  # of the number of states: derivatives of a residual until an input appears
-GROWN = 2.0  # growth of errors along the plan up to which unstable internal dynamics pass: they hardly show in it
 TIME_CONSTANT = 0.25  # s: several poles there rise in about a second, as suits cranes and arms of human size
 
 
@@ -57,6 +57,9 @@ def linearise(plan, plant):
     """
     _require_invertible(plan.model.reduction, plant)
     extension = _Extension(plant, in_symbols_of(plant, plan.model), _points(plan, plant))
+    split = plan.model.reduction.realisation.actuation
+    if split.shape[0] > split.shape[1] and plan.model.reduction.mechanism.q.order(split) < 2:
+        extension.share(in_symbols_of(plant, plan.model, {"split": split})["split"])
     while extension.rank() < len(extension.names):
         extension.extend()
     return extension.law()
@@ -167,6 +170,12 @@ class _Extension:
     def rank(self):
         """The rank of the decoupling matrix at states about the plan."""
         return decide_all(*self.values(self.decoupling))[0].rank
+
+    def share(self, split):
+        """Make the multipliers μ the inputs: redundant actuators share as in the plan, u = split μ."""
+        v = ca.SX.sym("v", split.shape[1])
+        self._substitute(self.v, split @ v)
+        self.v = v
 
     def extend(self):
         """Make derivatives of ρ residuals inputs, with an integrator before those that other residuals depend on."""
@@ -293,7 +302,7 @@ def computed(
     rate = positive("rate", rate)
     require_plan(plan, plant)
     refuse_transport(plant, "The linearisation is")
-    delay = whole("delay", delay)
+    delay = whole("delay", delay, most=MOST_DELAY)
     _require_stable(plan)
     linear = linearise(plan, plant)
     _require_smooth(plan, linear.orders)
@@ -322,16 +331,24 @@ def _require_smooth(plan, orders):
 
 def _require_stable(plan):
     internal = internal_dynamics(plan.model, plan)
-    if internal.verdict == "unstable" and internal.growth > GROWN:
-        worst = float(internal.eigenvalues.real.max())
+    if internal.verdict not in ("unstable", "inconclusive"):
+        return
+    worst, names = float(internal.eigenvalues.real.max(initial=-np.inf)), ", ".join(internal.names)
+    facts = {"verdict": internal.verdict, "growth": internal.growth, "eigenvalue": worst, "states": internal.names}
+    if internal.verdict == "inconclusive":
         raise UnstableInternalDynamics(
-            f"The internal dynamics of {', '.join(internal.names)} have an eigenvalue of {worst:.6g} 1/s on the plan.",
+            f"The samples of the plan do not resolve whether the internal dynamics of {names} are stable.",
             "Exact linearisation makes them unobservable and does not stabilise them.",
-            do="Use sv.lqr, which stabilises the whole state about the plan, or choose another output.",
-            eigenvalue=worst,
-            growth=float(internal.growth),
-            states=internal.names,
+            do="Simulate the plan with more samples (t_eval), or use sv.lqr.",
+            **facts,
         )
+    raise UnstableInternalDynamics(
+        f"The internal dynamics of {names} are unstable: along the plan errors grow by {internal.growth:.3g} in "
+        f"{internal.length:.3g} s (frozen eigenvalues up to {worst:.6g} 1/s).",
+        "Exact linearisation makes them unobservable and does not stabilise them.",
+        do="Use sv.lqr, which stabilises the whole state about the plan, or choose another output.",
+        **facts,
+    )
 
 
 def _poles(poles, orders):

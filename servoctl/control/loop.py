@@ -1,6 +1,8 @@
 """The sampled closed loop around a plant: one C loop that calls the law through a pointer, and the same in Python."""
 
 import ctypes
+import enum
+import time
 from dataclasses import dataclass
 
 import numpy as np
@@ -8,7 +10,11 @@ import numpy as np
 from servoctl.codegen.native import pointer
 from servoctl.values import Value
 
-FINISHED, STATE_LOST, LAW_LOST = 0, 1, 2  # how a loop ends
+FINISHED, STATE_LOST, LAW_LOST, INTERRUPTED, PAUSED = enum.IntEnum(
+    "Ending", "FINISHED STATE_LOST LAW_LOST INTERRUPTED PAUSED", start=0
+)  # how a loop ends; the first three as in closed.c
+PIECE = 0.03  # s that the compiled loop runs before it looks for Ctrl-C
+FIRST_PIECE = 1000  # integration steps: at most some hundredths of a second
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,10 +48,10 @@ class Loop(Value):
 
 _FIELDS = {
     ctypes.c_int64: "samples substeps delay n_y n_z n_u n_out n_row rows first n_d at_u depth every n_traced columns "
-    "status",
+    "stop status sample step steps",
     ctypes.c_double: "t0 period",
     ctypes.c_void_p: "p x0 z0 table noise quantum low high change initial_input disturbance constants scale measured "
-    "transport disturbed traced x law_x law_y input gathered trace",
+    "transport disturbed traced state x law_x law_y input gathered trace",
 }
 _WHOLE = {"measured", "transport", "disturbed", "traced"}  # arrays of whole numbers
 
@@ -80,8 +86,9 @@ def run_loop(ode, law, loop):
 
     `ode` are the plant's rates, compiled with the loop "closed"; `law` maps (t, [y; z], row of the schedule) to
     [u; z+; signals]. Returns the status (FINISHED; STATE_LOST or LAW_LOST if the state or the law's output is not
-    finite at the next sample; or the error that the law raised there), and at the N completed samples the states
-    (N, n_x), measurements and controller states (N, n_y + n_z), outputs of the law (N, n_out) and inputs (N, n_u).
+    finite at the next sample; INTERRUPTED by Ctrl-C; or the error that the law raised), and at the N completed samples
+    the states (N, n_x), measurements and controller states (N, n_y + n_z), outputs of the law (N, n_out) and inputs
+    (N, n_u).
     """
     n, n_y, n_z = loop.samples + 1, len(loop.measured), len(loop.z0)
     logs = {
@@ -101,12 +108,22 @@ def _native(native, law, loop, logs):
     step = law.native("step") if hasattr(law, "native") else None
     failures = []
     if step is None:
+        logs["law_y"][:] = np.nan  # ctypes drops an interruption at the entry to the law, and with it the law's answer
         step = _STEP(_called_back(law, loop, logs["law_x"].shape[1], failures))
     rows, n_row = loop.table.shape
     sizes = {"n_y": len(loop.measured), "n_z": len(loop.z0), "n_d": len(loop.disturbed), "rows": rows, "n_row": n_row}
-    arguments = Arguments(**vars(loop) | sizes | logs, status=FINISHED)
+    goes_on = {"state": loop.x0.copy(), "steps": FIRST_PIECE, "status": PAUSED}
+    arguments = Arguments(**vars(loop) | sizes | logs | goes_on)
     native.restype = ctypes.c_int64
-    done = native(ctypes.cast(step, ctypes.c_void_p), ctypes.byref(arguments))
+    call, done = (ctypes.cast(step, ctypes.c_void_p), ctypes.byref(arguments)), 0
+    try:
+        while arguments.status == PAUSED:
+            begun = time.perf_counter()
+            done = native(*call)
+            faster = PIECE / max(time.perf_counter() - begun, PIECE / 10)
+            arguments.steps = max(1, int(arguments.steps * faster))
+    except KeyboardInterrupt:
+        return done, INTERRUPTED
     return done, failures[0] if failures else arguments.status
 
 
@@ -118,12 +135,11 @@ def _called_back(law, loop, n_in, failures):
         return np.ctypeslib.as_array((ctypes.c_double * size).from_address(address)) if size else np.empty(0)
 
     def step(t, x, row, y):
-        out = view(y, n_out)
         try:
-            out[:] = law(t, view(x, n_in).copy(), view(row, n_row).copy())
+            view(y, n_out)[:] = law(t, view(x, n_in).copy(), view(row, n_row).copy())
         except BaseException as error:  # an exception cannot cross C
-            failures.append(error)
-            out[:] = np.nan
+            failures.append(INTERRUPTED if isinstance(error, KeyboardInterrupt) else error)
+            view(y, n_out)[:] = np.nan
 
     return step
 
@@ -191,7 +207,7 @@ def _interpreted(ode, law, c, x_log, law_x, law_y, inputs):
         try:
             law_y[k] = law(t, law_x[k].copy(), c.table[min(c.first + k, len(c.table) - 1)])
         except BaseException as error:  # as in C: the motion so far is returned
-            return k, error
+            return k, INTERRUPTED if isinstance(error, KeyboardInterrupt) else error
         if not np.isfinite(law_y[k, : n_u + n_z]).all():
             return k, LAW_LOST
         command = law_y[k - c.delay, :n_u] if k >= c.delay else c.initial_input
@@ -199,5 +215,8 @@ def _interpreted(ode, law, c, x_log, law_x, law_y, inputs):
         if k == c.samples:
             break
         law_x[k + 1, n_y:] = law_y[k, n_u : n_u + n_z]
-        x = hold(ode, t, c.period / c.substeps, x, _steps(c, k, inputs))
+        try:
+            x = hold(ode, t, c.period / c.substeps, x, _steps(c, k, inputs))
+        except KeyboardInterrupt:
+            return k + 1, INTERRUPTED
     return c.samples + 1, FINISHED

@@ -17,6 +17,9 @@ from servoctl.plants.plant import Plant
 from servoctl.run import Run
 
 MARGINAL = 1 + 1e-6  # spectral radius up to which a mode that no input reaches neither decays nor grows
+UNREACHED = 1e-7  # product of a mode with the inputs' directions, each of size 1, below which no input reaches it
+NAMED = 0.05  # share of a state in a mode, of the largest, above which an error names it
+COMPARED = 8  # samples along the plan at which a combination of states must be conserved
 DOUBLINGS, CONVERGED = 60, 1e-12  # of the horizon of the Riccati equation; relative change at convergence
 Q_POSITION, Q_VELOCITY, R_INPUT, Q_INTEGRAL = 1e3, 1e2, 1e-3, 1e4
 
@@ -83,7 +86,11 @@ def lqr(
     A, B = discretised(*reference.linearised(), reference.period)
     augmented = _with_integrals(A, B, Q, residuals, Q_i, reference) if residuals else (A, B, Q)
     basis = tangents(reference, 0 if residuals is None else len(Q_i))
-    K = _varying(*augmented, R, basis) if varying else steady(*augmented, R, basis)[0]
+    names = (*plant.state_names, *(f"integral of {name}" for name in (residuals.names if residuals else ())))
+    try:
+        K = _varying(*augmented, R, basis) if varying else steady(*augmented, R, basis)[0]
+    except ServoError as error:
+        raise _explained(error, augmented, basis, names, plant, varying) from None
     radii = spectral_radii(_reduced(augmented[0] - augmented[1] @ K, basis))
     K_x, K_i = np.split(K, [plant.n_x], axis=2)
     integrated = residuals.names if residuals else ()
@@ -162,6 +169,89 @@ def steady(A, B, Q, R, basis):
             radius=float(radii.max()),
         )
     return K @ left, T[-1] @ P[-1] @ T[-1].T
+
+
+def _explained(error, augmented, basis, names, plant, varying):
+    """The error of a Riccati equation without a solution, with the mode that inputs do not reach or weights not see."""
+    A, B, Q = augmented
+    some = np.unique(np.linspace(0, len(A) - 1, COMPARED).round().astype(int))
+    bases = [np.eye(A.shape[1]) if basis is None else basis[k] for k in some]
+    mode = _conserved(A[some], B[some], bases, plant.mechanism.q.nq)
+    if mode:
+        moves = np.abs(A[some] - np.eye(len(Q))).max(axis=(0, 1))
+        alone = [names[i] for i in mode if moves[i] < UNREACHED and (Q[i, i] > 0 or not varying)]
+        return _beyond_inputs(error, [names[i] for i in mode], alone, plant, varying)
+    k, T = some[-1], bases[-1]
+    a = T.T @ A[k] @ T
+    unreached, unseen = _fixed_modes(a, B[k].T @ T), _fixed_modes(a.T, Q @ T)
+    if unreached.size:
+        return _beyond_inputs(error, _states_in(T @ unreached, names), [], plant, varying)
+    if unseen.size:
+        mode = _states_in(T @ unseen, names)
+        return ServoError(
+            f"No weight sees a mode in {', '.join(mode)} that does not decay.",
+            "The weights must see each unstable or marginal mode (Riccati).",
+            do=f"Weigh {' or '.join(mode)}.",
+            **error.details | {"mode": mode},
+        )
+    return error
+
+
+def _conserved(A, B, bases, nq):
+    """Places of the fewest states of which a combination c, the same at all samples, is conserved; [] if none is.
+
+    On the tangent spaces, no sample and no input changes it: cᵀ(A - 1)T = 0 and cᵀB = 0 at all samples. Velocities and
+    integrals are left out first, then coordinates that move others, as long as a combination remains.
+    """
+    eye = np.eye(A.shape[1])
+    changes = [(a - eye) @ T for a, T in zip(A, bases, strict=True)]
+    conditions = np.hstack([*changes, *(B / max(np.abs(B).max(), 1e-300))]).T
+    moves = np.abs(A - eye).max(axis=(0, 1))
+    support = list(range(len(eye)))
+    combinations = _null_space(conditions)
+    for i in sorted(support, key=lambda i: (i < nq, moves[i] < UNREACHED)):
+        fewer = [j for j in support if j != i]
+        null = _null_space(conditions[:, fewer])
+        if null.size and max(np.abs(T[fewer].T @ null).max() for T in bases) > NAMED:
+            support, combinations = fewer, null
+    left = combinations.size and max(np.abs(T[support].T @ combinations).max() for T in bases) > NAMED
+    return support if left else []
+
+
+def _null_space(matrix):
+    _, sizes, rows = np.linalg.svd(matrix)
+    return rows[np.sum(sizes > UNREACHED) :].T
+
+
+def _states_in(modes, names):
+    """Names of the states in modes (n, number), by their share in the largest."""
+    share = np.linalg.norm(modes, axis=1)
+    return [name for name, size in zip(names, share, strict=True) if size > NAMED * share.max()]
+
+
+def _fixed_modes(A, C):
+    """Vectors w, (n, number), with wᵀA = λwᵀ and C w = 0 for an eigenvalue λ that does not decay (Popov, Hautus)."""
+    C = C / max(np.abs(C).max(initial=0.0), 1e-300)
+    modes = np.zeros((len(A), 0))
+    for value in (value for value in np.linalg.eigvals(A) if abs(value) > 1 / MARGINAL):
+        null = _null_space(np.vstack([A.T - value * np.eye(len(A)), C])).conj()
+        modes = np.hstack([modes, null.real, null.imag])
+    return modes[:, np.abs(modes).max(axis=0, initial=0.0) > UNREACHED]
+
+
+def _beyond_inputs(error, mode, alone, plant, varying):
+    """The error of a mode that no input reaches, with those of its states that may stay unweighted.
+
+    These move no other state; without a weight, time-varying gains leave them alone.
+    """
+    weights_ = "Q={" + ", ".join(f"{name!r}: 0" for name in alone) + "}"
+    do = f"Pass {weights_}{'' if varying else ' and varying=True'}, or leave these coordinates out of the mechanism."
+    return ServoError(
+        f"A mode in {', '.join(mode)} that does not decay is out of reach of {', '.join(plant.inputs)}.",
+        "The inputs must reach each unstable or marginal mode that has a weight (Riccati).",
+        do=do if alone else "Choose other actuators, or integrate fewer residuals than there are inputs.",
+        **error.details | {"mode": mode, "unweighted": alone},
+    )
 
 
 def _varying(A, B, Q, R, basis):

@@ -116,18 +116,19 @@ class Residuals:
         return jacobian
 
 
-def in_symbols_of(plant, model):
-    """The residuals of a model's program as expressions of the plant's symbols, by name.
+def in_symbols_of(plant, model, expressions=None):
+    """Expressions of a model's mechanism, by default its program's residuals, in the plant's symbols, by name.
 
     Equal mechanisms, such as copies that were pickled apart, have different symbols of the same names.
     """
-    program, mechanism = model.reduction.program, model.reduction.mechanism
+    mechanism = model.reduction.mechanism
+    expressions = model.reduction.program.residuals if expressions is None else expressions
     if mechanism.q is plant.mechanism.q and mechanism.parameters is plant.mechanism.parameters:
-        return dict(program.residuals)
+        return dict(expressions)
     new = {symbol.name(): symbol for symbol in _symbols(plant.mechanism)}
     old = [symbol for symbol in _symbols(mechanism) if symbol.name() in new]
     values = ca.vertcat(*(new[symbol.name()] for symbol in old))
-    return {name: ca.substitute(e, ca.vertcat(*old), values) for name, e in program.residuals.items()}
+    return {name: ca.substitute(e, ca.vertcat(*old), values) for name, e in expressions.items()}
 
 
 def _symbols(mechanism):

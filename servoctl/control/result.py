@@ -15,14 +15,14 @@ from servoctl.control.reference import resampled
 from servoctl.control.residuals import Residuals
 from servoctl.errors import SpecificationError, unknown
 from servoctl.plants.plant import Plant
-from servoctl.run import Run
+from servoctl.run import ByName, Run
 from servoctl.values import Value
 
 NONE, LOWER, UPPER, FALLING, RISING = 0, -1, 1, -2, 2  # which limit an input has met
 
 
 @dataclass(frozen=True, eq=False)
-class Closed(Value):
+class Closed(ByName, Value):
     """The motion of a plant under a law; made by `close`.
 
     `run["theta"]`, `run["dtheta"]`, `run["d2theta"]`, `run["trolley"]` are (N,) arrays at the samples, SI. The
@@ -50,7 +50,7 @@ class Closed(Value):
         Sensors, timing and disturbances, by name.
     success : bool
     status : int
-        0 finished, -1 stopped.
+        0 finished, 1 interrupted, -1 stopped.
     message : str
     """
 

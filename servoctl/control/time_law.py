@@ -12,7 +12,7 @@ from servoctl.errors import InconsistentStart, IntegrationStopped, LimitExceeded
 from servoctl.model.model import derive
 from servoctl.progress import progress_bar
 from servoctl.run import Run
-from servoctl.simulation import simulate
+from servoctl.simulation import judged, simulated
 from servoctl.spec.mechanism import Mechanism
 from servoctl.spec.program import Program
 
@@ -121,7 +121,7 @@ def fastest(
             factor=factor,
             slow=slow,
         )
-    return TimeLaw(factor, slower, plan, binding)
+    return TimeLaw(factor, slower, judged(plan), binding)
 
 
 @dataclass(frozen=True)
@@ -159,7 +159,7 @@ class _Scene:
             model = model.with_parameters(**self.parameters) if self.parameters else model
             values = {name: value / factor ** _level(model, name) for name, value in self.start.items()}
             start = model.start(t0, guess=self.guess, **values)
-            plan = simulate(model, start, (t0, t0 + (t1 - t0) * factor), progress=False)
+            plan = simulated(model, start, (t0, t0 + (t1 - t0) * factor), progress=False)
         except (SingularProgram, InconsistentStart, IntegrationStopped):
             return np.inf, ("", "", t0), slower, None
         return *_worst(plan, self.limits), slower, plan

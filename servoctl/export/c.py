@@ -172,7 +172,9 @@ def _algebraic(model, x, z, p, u):
         "fails: z and u are then unchanged, and x must be set again."
     )
     arguments = (TIME, x.output(), p.input(), z.output(), u.output())
-    sizes = {"N": model.n, "NQ": model.nq, "NY": f.numel_out(0), "ITERATIONS": ITERATIONS, "TOLERANCE": TOLERANCE}
+    first = model.nq if model.reduction.mechanism.q.plain else 3 * model.nq  # of γ' in the outputs of `path`
+    sizes = {"N": model.n, "NQ": model.nq, "NY": f.numel_out(0), "FIRST": first}
+    sizes |= {"ITERATIONS": ITERATIONS, "TOLERANCE": TOLERANCE}
     return {"path": f}, [Routine("feedforward", about, arguments, "int")], ("newton.c",), sizes
 
 

@@ -222,7 +222,8 @@ def _wrapped(text):
 
 
 def _harmless(text):
-    """Text that neither ends a C comment nor begins another."""
+    """Text that neither ends a C comment nor begins another, without marks that turn or hide what follows."""
+    text = "".join(letter if letter.isprintable() else "?" for letter in text)
     return text.replace("*/", "* /").replace("/*", "/ *").replace("\\", "/")
 
 

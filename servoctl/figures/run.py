@@ -44,7 +44,7 @@ def path(run, x=None, y=None, ax=None, units=None):
     """
     groups, names = planes(run), coordinates(run)
     if x is None and y is None and not groups and along_one_axis(names):
-        return signals(run, names, panels(1, 4.2)[0] if ax is None else ax, units)
+        return signals(run, names, ax=panels(1, 4.2)[0] if ax is None else ax, units=units)
     first, second, *_ = groups[0] if groups else dict.fromkeys([*names, *run.names])
     x = (first if y != first else second) if x is None else x
     y = (second if x != second else first) if y is None else y
@@ -64,13 +64,13 @@ def path(run, x=None, y=None, ax=None, units=None):
     return ax
 
 
-def signals(run, names=None, ax=None, units=None):
+def signals(run, *names, ax=None, units=None):
     """Draw signals over time, by default the coordinates.
 
     Parameters
     ----------
     run : Run
-    names : sequence of str, optional
+    *names : str or sequence of str
     ax : Axes or sequence of Axes, optional
         One Axes for all signals, or one for each panel. Default: a new figure with one panel for all signals of the
         same unit, and one for each signal of unknown unit.
@@ -89,7 +89,7 @@ def signals(run, names=None, ax=None, units=None):
         If the number of Axes is not that of the panels.
     """
     units = units or {}
-    names = coordinates(run) if names is None else [names] if isinstance(names, str) else list(names)
+    names = [name for given in names or coordinates(run) for name in ([given] if isinstance(given, str) else given)]
     groups = {}
     for name in names:
         groups.setdefault(unit_of(name, units) or (name,), []).append(name)

@@ -343,8 +343,12 @@ class Plan:
     def _places(self, nodes):
         return self.place[np.asarray(nodes, dtype=int)]
 
-    def values(self, inputs):
-        """Values of all nodes at N points, (n_nodes, N), from values of the inputs, (n_inputs, N)."""
+    def values(self, inputs, operations=None):
+        """Values of all nodes at N points, (n_nodes, N), from values of the inputs, (n_inputs, N).
+
+        `operations` are functions by kind of node; default: `VALUE`.
+        """
+        operations = VALUE if operations is None else operations
         v = np.empty((len(self.place), *inputs.shape[1:]), dtype=inputs.dtype)
         places, constants = self.constants
         v[places] = np.array(constants)[:, None]
@@ -355,7 +359,7 @@ class Plan:
             if kind in _ARITHMETIC:
                 _ARITHMETIC[kind](*values, out=v[here])
             else:
-                v[here] = _VALUE[kind](data, *values)
+                v[here] = operations[kind](data, *values)
         return v
 
     def sizes(self, v):
@@ -382,7 +386,7 @@ def _power_size(exponent, y, a, size):
 
 
 _ARITHMETIC = {"add": np.add, "sub": np.subtract, "mul": np.multiply, "div": np.divide, "neg": np.negative}
-_VALUE = {
+VALUE = {
     "copy": lambda _, a: a,
     "scale": lambda factor, a: a * factor,
     "sqrt": lambda _, a: np.sqrt(a),
@@ -408,7 +412,7 @@ _SIZE = {  # from the magnitude of y, and values and sizes of the operands
 }
 
 
-def evaluate(tape, inputs):
+def evaluate(tape, inputs, operations=None):
     """Values of a tape's outputs and the sizes of their terms.
 
     The size of a + b is size(a) + size(b), that of a b is |a| size(b) + size(a) |b|, and that of y = f(a) is
@@ -420,6 +424,8 @@ def evaluate(tape, inputs):
     tape : Tape
     inputs : (n_inputs, N) array
         Values of the inputs at N points.
+    operations : dict of str to callable, optional
+        Functions by kind of node; default: `VALUE`.
 
     Returns
     -------
@@ -427,7 +433,7 @@ def evaluate(tape, inputs):
     """
     outputs = tape.plan.place[tape.outputs]
     with np.errstate(all="ignore"):
-        v = tape.plan.values(np.asarray(inputs))
+        v = tape.plan.values(np.asarray(inputs), operations)
         return v[outputs], tape.plan.sizes(v)[outputs]
 
 

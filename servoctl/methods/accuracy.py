@@ -15,10 +15,14 @@ import numpy as np
 from servoctl.checks import is_number
 from servoctl.errors import LimitExceeded, SpecificationError
 from servoctl.methods.choice import Algebraic, Project, RadauIIA, Taylor
+from servoctl.methods.sizes import motion_sizes, state_levels
 from servoctl.methods.taylor import order_for
 
 SMALLEST_SIZE = 1e-3  # of a component relative to the largest of its level; a zero component has only rounding
 MARGIN, FINER = 0.1, 1e-2  # first tolerance relative to the accuracy, and each next one relative to the last
+ATOL = 1e-11  # default absolute tolerance, for motions whose sizes are neither far below nor far above 1
+COARSE = 10.0  # times rtol: an absolute tolerance above this part of a size decides about its error
+LARGE = 1e3  # size above which the default absolute tolerance comes near rounding and grows with the size
 FINEST = 1e-15  # tolerance below which steps shorten and rounding grows
 SAME = 1.0 + 1e-9  # tolerances within this factor are one and the same, up to the rounding of their decades
 FIRST_STEPS = 40  # longest stable steps of the part of a motion on which it is decided whether the motion is stiff
@@ -60,10 +64,37 @@ def component_sizes(values, levels):
     return size
 
 
-def state_levels(model):
-    """Level of each entry of the state X: 0 for q, k for γ^(k); (n_x,) array of int."""
-    n_x, nq, n = len(model.state_names), model.nq, model.n
-    return np.append(np.zeros(nq, dtype=int), 1 + np.arange(n_x - nq) // n)
+def large_tolerances(model, t, x):
+    """Absolute tolerances (n_x,) for a motion that starts so large that the default is rounding of it; else None.
+
+    Parameters
+    ----------
+    model : Model
+    t : (t0, t1)
+        Span of the motion [s].
+    x : (n_x,) array
+        State at its start.
+    """
+    sizes = motion_sizes(model, np.asarray(t, dtype=float), np.column_stack([x, x]))
+    return ATOL * np.where(sizes > LARGE, sizes, 1.0) if sizes.max() > LARGE else None
+
+
+def absolute_tolerances(model, t, x, rtol):
+    """Absolute tolerances (n_x,) for a motion of which the default is no small part; None where it is.
+
+    Parameters
+    ----------
+    model : Model
+    t : (N,) array
+        [s]
+    x : (n_x, N) array
+    rtol : float
+    """
+    sizes = motion_sizes(model, t, x)
+    moves = sizes > 0
+    if not np.any(ATOL > COARSE * rtol * sizes[moves]):
+        return None
+    return np.where(moves, np.minimum(ATOL, FINER * rtol * sizes), ATOL)
 
 
 def motion_error(model, jets, reference):

@@ -1,37 +1,46 @@
-"""Flat programs: a Newton solve at each instant, no integration."""
+"""Flat programs: the solution at t0, followed by continuation; no integration.
+
+The continuation takes steps of its own, so that samples decide neither the branch of the solution nor where the motion
+ends. Samples are solved between the ends of these steps.
+"""
 
 import numpy as np
 
-from servoctl.methods.monitor import Fine, Stretch
-from servoctl.methods.motion import Stepping, interruptible
+from servoctl.methods.monitor import Fine, Repivot, Stretch
+from servoctl.methods.motion import Stepping, breakpoints, interruptible
+
+STEPS = 50  # at least, in a span: shorter movements between two rests are overlooked where there are no samples
+NODES = 1000  # steps per call of the loop: 0.3 ms compiled, 50 ms where CasADi evaluates
+BLOCK = 4000  # samples per call of the loop: 0.2 ms compiled, 0.2 s where CasADi evaluates
 
 
-def algebraic(model, t0, x0, times, progress):
+def algebraic(model, span, x0, times, knots, progress):
     """Solve a flat program for q, γ' and γ'' at each time.
 
     Parameters
     ----------
     model : Model
         With Σ o_a = 0.
-    t0 : float
+    span : (t0, t1)
         [s]
     x0 : (n_x,) array
-        Consistent state at t0.
+        State at t0; Newton's method starts from its q.
     times : (N,) array
         In the order of the motion [s].
+    knots : sequence of float
+        At which steps end [s].
     progress : callable
 
     Returns
     -------
     Motion
     """
-    return _Algebraic(model, "algebraic", None, progress).run(t0, np.asarray(x0), np.asarray(times, dtype=float))
+    return _Algebraic(model, "algebraic", None, progress).run(span[0], x0, span[1], times, knots)
 
 
 class _Algebraic(Stepping):
     rank_lost = "Newton's method finds no solution beyond"
     advice = "Check whether the path leaves the reach of the mechanism."
-    most = 4000  # instants per call of the loop: 0.2 ms compiled, 0.2 s where CasADi evaluates
 
     def _function(self, model, poles):
         return model.function("path")
@@ -39,50 +48,71 @@ class _Algebraic(Stepping):
     def _outputs(self, t, x):
         return self.f(t, x[: self.model.nq], self.p)
 
+    def _split(self, q, y):
+        """State (q, γ'), γ'' and pivots from q and the outputs of `Equations.path`."""
+        nq, n = self.model.nq, self.model.n
+        first = nq if self.model.reduction.mechanism.q.plain else 3 * nq
+        velocity, top, pivots = np.split(y[first:], [n, 2 * n])
+        return np.concatenate([q, velocity]), top, pivots
+
     def _pivots(self, t, x):
-        return _split(self.model, x[: self.model.nq], self._outputs(t, x))[2]
+        return self._split(x[: self.model.nq], self._outputs(t, x))[2]
 
     def _top(self, t, x):
-        return _split(self.model, x[: self.model.nq], self._outputs(t, x))[1]
+        return self._split(x[: self.model.nq], self._outputs(t, x))[1]
 
-    def run(self, t0, x0, times):
-        """Solve at each of the times (N,) [s], from the solution x0 at t0."""
+    def run(self, t0, x0, t1, times, knots):
+        """Follow the solution from x0 at t0 to t1 [s], and solve at each of the times (N,) [s]."""
         with interruptible(self.motion):
-            self._start(t0, x0, t0)
-            done, x, t = 0, x0, None  # t of the last instant solved: between t0 and the first nothing is inspected
-            while done < len(times) and self.motion.stop is None:
-                block = times[done : done + self.most]
-                q, y, iterations = self.f.newton(block, x[: self.model.nq], self.p)
-                self.motion.count(iterations=iterations)
-                state, top, pivots = _split(self.model, q, y)
-                ends = block[: q.shape[1]]
-                if t is not None:
-                    outcome = self._inspect(np.append(t, ends), np.column_stack([x, state]), pivots)
-                    solved = outcome.steps
-                elif len(ends):
-                    self.monitor.begin(pivots[:, 0])
-                    outcome = self._inspect(ends, state, pivots[:, 1:])
-                    solved = 1 + outcome.steps
-                else:
-                    outcome, solved = Fine(0), 0
-                self.motion.add(self.model, ends[:solved], state[:, :solved], top[:, :solved])
-                done += solved
-                if solved:
-                    t, x = ends[solved - 1], state[:, solved - 1]
-                    self.progress(t)
-                if not isinstance(outcome, Fine):
-                    self._follow(outcome)
-                elif len(ends) < len(block):
-                    why = "Newton's method finds no solution of the program beyond"
-                    self._fail(block[0] if t is None else t, x, why)
+            self._start(t0, x0, t1)
+            cuts = np.array(breakpoints((t0, t1), knots))
+            self.longest, self.direction = abs(t1 - t0) / STEPS, np.sign(t1 - t0)
+            self.pending, self.resumed = times, None
+            t, x = t0, x0
+            while t != t1 and self.motion.stop is None:
+                t, x = self._advance(np.append(t, cuts[(cuts - t) * self.direction > 0]), x)
         return self.motion
 
-    def _inspect(self, t, state, pivots):
-        """The monitor's outcome; an instant solved beyond a pivot's zero is as accurate as any other."""
-        return self.monitor.inspect(Stretch(t, state, pivots[:, :, None], self._top, crosses=True))
+    def _advance(self, cuts, x):
+        """Follow the solution as far as the pivots allow; the instant and the state from which it goes on."""
+        nodes, iterations = self.f.continuation(cuts, x[: self.model.nq], self.p, self.longest, NODES)
+        self.motion.count(iterations=iterations, steps=max(len(nodes) - 1, 0))
+        if not len(nodes):
+            self._fail(cuts[0], x, "Newton's method finds no solution of the program from the start")
+            return cuts[0], x
+        t, nq = nodes[:, 0], self.model.nq
+        states, _, pivots = self._split(nodes[:, 1 : 1 + nq].T, nodes[:, 1 + nq :].T)
+        if self.motion.start is None:
+            self.motion.start = states[:, 0]
+            self.monitor.begin(pivots[:, 0])
+        outcome = self.monitor.inspect(Stretch(t, states, pivots[:, 1:, None], self._top))
+        last = self._resumption(t, outcome.steps) if isinstance(outcome, Repivot) else outcome.steps
+        self._sample(nodes[: last + 1], states[:, last], t[last] == cuts[-1])
+        if self.motion.stop is None:
+            self.progress(t[last])
+        if self.motion.stop is None and not isinstance(outcome, Fine):
+            self._follow(outcome)
+        elif self.motion.stop is None and len(nodes) < NODES and t[last] != cuts[-1]:
+            self._fail(t[last], states[:, last], "Newton's method finds no solution of the program beyond")
+        return t[last], states[:, last]
 
+    def _resumption(self, t, last):
+        """The node before one with bad pivots, from which others lead on; that node, if they did so before."""
+        good = last - 1 if last and t[last - 1] != self.resumed else last
+        self.resumed = t[good]
+        return good
 
-def _split(model, q, y):
-    """State (q, γ'), γ'' and pivots from the outputs (δq, q', γ', γ'', pivots)."""
-    nq, n = model.nq, model.n
-    return np.concatenate([q, y[2 * nq : 2 * nq + n]]), y[2 * nq + n : 2 * nq + 2 * n], y[2 * nq + 2 * n :]
+    def _sample(self, nodes, x, ends):
+        """Solve at the pending instants up to the last node, whose state is x; at all of them if the motion ends."""
+        count = len(self.pending) if ends else int(np.sum((self.pending - nodes[-1, 0]) * self.direction <= 0))
+        now, self.pending = np.split(self.pending, [count])
+        for block in np.split(now, range(BLOCK, count, BLOCK)):
+            q, y, iterations = self.f.newton(block, nodes, self.p)
+            self.motion.count(iterations=iterations)
+            state, top, _ = self._split(q, y)
+            solved = q.shape[1]
+            self.motion.add(self.model, block[:solved], state, top)
+            if solved < len(block):
+                return self._fail(block[solved], x, "Newton's method finds no solution of the program there")
+            if solved:
+                self.progress(block[-1])

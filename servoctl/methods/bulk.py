@@ -4,6 +4,7 @@ import numpy as np
 
 from servoctl.methods.monitor import FRACTIONS, DenseStretch, Fine, Repivot
 from servoctl.methods.motion import Stepping
+from servoctl.methods.watch import End
 
 
 class BulkSteps(Stepping):
@@ -17,14 +18,21 @@ class BulkSteps(Stepping):
         self.pending, self.forward, t = times, b >= a, a
         self._begin(a, x, b)
         self.monitor.begin(self._pivots(a, x))
+        self.watch.begin(a)
         while t != b and self.motion.stop is None:
             steps = self._steps(t, x, b)
-            outcome = self.monitor.inspect(self._stretch(steps))
+            outcome = self._inspected(self._stretch(steps))
             last = outcome.steps
+            if isinstance(outcome, End):
+                self._record(steps, 0, last, outcome)
+                self._turn(outcome, b)
+                return outcome.t, outcome.x
             # A step in which a pivot vanishes is sampled with the next pivots: its own lose digits near the zero.
             before = max(last - 1, 0) if isinstance(outcome, Repivot) else last
             self._record(steps, 0, before)
             t, x = steps.t[last], steps.x[:, last].copy()
+            if last < len(steps.t) - 1:
+                self._retake(steps.t[last + 1] - t)
             goes_on = isinstance(outcome, Fine) or self._follow(outcome)
             if before < last:
                 self._record(steps, before, last)
@@ -34,7 +42,10 @@ class BulkSteps(Stepping):
                 goes_on = False
             if not goes_on:
                 self._keep_last(t, x)
-        return x
+        return t, x
+
+    def _retake(self, h):
+        """Go on from before a step of length h [s], which is repeated."""
 
     def _stretch(self, steps):
         """The steps for the monitor: they have passed their error test, and the next begin where they end."""
@@ -53,16 +64,16 @@ class BulkSteps(Stepping):
             pivots_at=self._pivots,
         )
 
-    def _record(self, steps, first, last):
-        """Record the pending samples from the start of step `first` to the start of step `last`."""
+    def _record(self, steps, first, last, end=None):
+        """Record the pending samples from the start of step `first` to the start of step `last`, or an end within."""
         direction = 1.0 if self.forward else -1.0
-        due = direction * self.pending <= direction * steps.t[last]
+        due = direction * self.pending <= direction * (steps.t[last] if end is None else end.t)
         times, self.pending = self.pending[due], self.pending[~due]
         if not len(times):
             return
         step = first + np.searchsorted(direction * steps.t[first : last + 1], direction * times, "right") - 1
         states = steps.x[:, np.clip(step, 0, last)]
-        for k in np.unique(step[step < last]):
+        for k in np.unique(step[step < last + (end is not None)]):
             states[:, step == k] = steps.at(k, times[step == k])
         states = self._settled(times, states)
         top = self.f.grid(times, states, self.p)[self.n_x - self.model.n : self.n_x]

@@ -226,13 +226,14 @@ class Taylor(Method):
         Highest derivative in the samples, 1 to 40: `run["d4theta"]`; default s̄. Values above s̄ also give rates of
         the actuation: `run["dtrolley"]`.
     rtol, atol : float
-        Tolerances of a step. The defaults keep residuals near 1e-9 over tens of seconds.
+        Tolerances of a step. The defaults keep residuals near 1e-9 over tens of seconds. Default atol: 1e-11; a motion
+        that turns out to be so small that this is no small part of it is computed again with a smaller one.
     """
 
     order: int | None = None
     jets: int | None = None
     rtol: float = 1e-9
-    atol: float = 1e-11
+    atol: float | None = None
 
     refused = {
         Poles: "The series are those of the undisturbed rows; error dynamics would need series of their own.",
@@ -279,13 +280,13 @@ class RadauIIA(Method):
     step : float, optional
         Length of fixed steps [s], shortened to end at knots; default: steps follow from the tolerances.
     rtol, atol : float
-        Tolerances of a step, and of the equations solved in it.
+        Tolerances of a step, and of the equations solved in it; default atol as for `Taylor`.
     """
 
     order: int | None = None
     step: float | None = None
     rtol: float = 1e-9
-    atol: float = 1e-11
+    atol: float | None = None
 
     refused = {MinimalCoordinates: MOVING_CHART}
 
@@ -302,12 +303,12 @@ class Adaptive(Method):
     name : {"RK23", "RK45", "DOP853", "Radau", "BDF", "LSODA"}
         As in `scipy.integrate`.
     rtol, atol : float
-        Tolerances of a step; rtol at least 2.2e-14 except for "LSODA".
+        Tolerances of a step; rtol at least 2.2e-14 except for "LSODA"; default atol as for `Taylor`.
     """
 
     name: str = "DOP853"
     rtol: float = 1e-9
-    atol: float = 1e-11
+    atol: float | None = None
 
     named_by = ("name",)
 
@@ -340,12 +341,12 @@ class Sundials(Method):
     ----------
     name : {"CVODES", "IDAS"}
     rtol, atol : float
-        Tolerances of a step.
+        Tolerances of a step; default atol as for `Taylor`.
     """
 
     name: str = "CVODES"
     rtol: float = 1e-9
-    atol: float = 1e-11
+    atol: float | None = None
 
     named_by = ("name",)
     refused = {Project: PAST_STATES, MinimalCoordinates: MOVING_CHART}

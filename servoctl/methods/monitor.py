@@ -5,12 +5,13 @@ where only the choice of pivots fails; the equilibrated matrices L and B decide 
 as soon as the matrices are far better than it.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from servoctl.errors import IntegrationStopped, ServoError, SingularProgram
-from servoctl.reduction.ranks import column_sizes
+from servoctl.methods.sizes import motion_sizes
+from servoctl.model.report import explain
 
 DEGRADED = 0.02  # of its reference: a pivot below this is replaced, if the matrix itself is better than that
 HELPS = 5.0  # factor by which the matrix must be better
@@ -92,6 +93,12 @@ class Stretch:
     pivots: np.ndarray
     top: object
     crosses: bool = False
+
+    def first(self, count):
+        """The first steps alone."""
+        if count >= len(self.t) - 1:
+            return self
+        return replace(self, t=self.t[: count + 1], x=self.x[:, : count + 1], pivots=self.pivots[:, :count])
 
     def instants(self, k):
         """Instants of step k at which pivots are known, its start first."""
@@ -218,13 +225,10 @@ class Monitor:
         self.l_names, self.b_names = model.leading_names()
         self.reference = None
         matrices = [np.nan_to_num(m, nan=0.0, posinf=0.0, neginf=0.0) for m in self._matrices(t, x)]
-        self.columns = [
-            np.where(now > 0, now, np.where(usual > 0, usual, 1.0))
-            for now, usual in zip(map(column_sizes, matrices), model.column_sizes, strict=True)
-        ]
-        if before is not None:
-            self.columns = before.columns
+        self.columns = self._columns(t, x, matrices) if before is None else before.columns
         self.rows = [np.linalg.norm(m / c, axis=1) for m, c in zip(matrices, self.columns, strict=True)]
+        for row, i in model.balances().items():  # TᵀM grows at the zeros of a pivot; √M_ii is its size with others
+            self.rows[0][row] = self.columns[0][i]
         self.stories = [model.row_stories(), {}]
         self.largest = np.abs(np.asarray(x, dtype=float))
         self.best, self.lift = self._smallest(matrices), 1.0
@@ -232,7 +236,27 @@ class Monitor:
             self._inherit(before, matrices)
         self.m = len(model.invariant_names())
         jacobian = self.invariants(t, x, model.parameters)[self.m :].reshape(len(x), self.m).T
-        self.gradients = np.maximum(np.sqrt((jacobian**2 * (1.0 + np.abs(x)) ** 2).sum(axis=1)), 1e-300)
+        sizes = motion_sizes(model, np.array([t, t + 1.0]), np.column_stack([x, x]))
+        sizes = np.where(sizes > 0, sizes, 1.0) + np.abs(x)
+        self.gradients = np.maximum(np.sqrt((jacobian**2 * sizes**2).sum(axis=1)), 1e-300)
+
+    def _columns(self, t, x, matrices):
+        """√M_ii, with which the entries of a row have one unit; for columns without inertia the size of their entries.
+
+        That is the largest entry in rows scaled by their columns with inertia; where all of it is zero, the size at the
+        points at which ranks were decided.
+        """
+        inertia = self.f(t, x, self.model.parameters)[-self.model.n :]
+        metric = np.sqrt(np.where(inertia > 0, inertia, 0.0))
+        moves, result = metric > 0, []
+        for m, usual in zip(matrices, self.model.column_sizes, strict=True):
+            scaled = np.abs(m) / np.where(moves, metric, 1.0)
+            rows = scaled[:, moves].max(axis=1, initial=0.0)
+            rows = np.where(rows > 0, rows, scaled.max(axis=1, initial=0.0))[:, None]
+            now = (scaled / np.where(rows > 0, rows, 1.0)).max(axis=0, initial=0.0)
+            massless = np.where(now > 0, now, np.where(usual > 0, usual, 1.0))
+            result.append(np.where(moves, metric, massless))
+        return result
 
     def _inherit(self, before, matrices):
         for i, names in enumerate((self.l_names, self.b_names)):
@@ -249,7 +273,7 @@ class Monitor:
         n = self.model.n
         y = self.f(t, x, self.model.parameters)
         rows = len(self.l_names)
-        return y[: rows * n].reshape(n, rows).T, y[rows * n :].reshape(n, len(self.b_names)).T
+        return y[: rows * n].reshape(n, rows).T, y[rows * n : -n].reshape(n, len(self.b_names)).T
 
     def _smallest(self, matrices):
         result = []
@@ -260,11 +284,11 @@ class Monitor:
         return np.array(result)
 
     def rank_measure(self, t, x):
-        """The smallest equilibrated singular value of L or of B, relative to the best so far."""
+        """The smallest scaled singular value of L or of B, relative to the best so far unless that is rounding."""
         self.largest = np.maximum(self.largest, np.abs(x))
         now = self._smallest(self._matrices(t, x))
         self.best = np.maximum(self.best, now)
-        return float(np.min(now / np.where(self.best > 0, self.best, 1.0)))
+        return float(np.min(now / np.where(self.best > HOPELESS, self.best, 1.0)))
 
     def begin(self, pivots):
         """Start a piece: the first step is compared with the pivots (n_g,) at its start."""
@@ -445,12 +469,17 @@ class Monitor:
         direction = self._null_direction(matrices)
         where = f", where {' and '.join(f'{name} = 0' for name in zero)}" if zero else ""
         dependent = [] if lost else self._dependent_rows(matrices[0])
+        facts = {"measure": measure, "rows": lost or dependent, "direction": direction}
+        at_zero = np.where([name in zero for name in self.model.state_names], 0.0, x)
+        explained = explain(self.model, t, at_zero, lost, **facts)
+        if explained is not None:
+            return explained
         what = f"the gradient of row {', '.join(map(repr, lost))} vanishes"
         what = what if lost else f"the rows {', '.join(map(repr, dependent))} lose their rank"
         return SingularProgram(
             f"The program is singular at t = {t:.7g} s: {what}{where}; {why}.",
-            f"The smallest equilibrated singular value is {measure:.1e} of its best along the motion; accelerations "
-            f"are undetermined in the direction of {', '.join(direction)}.",
+            f"The smallest singular value, rows of size 1 in the metric of the inertia, is {self._how_small(measure)}; "
+            f"accelerations are undetermined in the direction of {', '.join(direction)}.",
             do="Write the residual in a form whose gradient does not vanish (linear in velocities, not squared), or "
             "plan around this state. The run before it is in .run.",
             t=float(t),
@@ -459,6 +488,11 @@ class Monitor:
             zero=zero,
             direction=direction,
         )
+
+    def _how_small(self, measure):
+        """The rank measure in words; a motion that begins at a singular state has no better one."""
+        best = float(self.best.min())
+        return f"{best:.1e} from the first instant on" if best < HOPELESS else f"{measure:.1e} of its best so far"
 
     def _dependent_rows(self, leading):
         """Names of the rows of L that depend on each other: its left null vector."""

@@ -2,12 +2,15 @@
 
 import contextlib
 from dataclasses import dataclass, field
-from itertools import pairwise
 
 import numpy as np
 
-from servoctl.methods.choice import Poles
-from servoctl.methods.monitor import VANISHING, Monitor, Repivot
+from servoctl.errors import ServoError
+from servoctl.methods.choice import MinimalCoordinates, Poles
+from servoctl.methods.monitor import VANISHING, Fine, Monitor, Repivot
+from servoctl.methods.watch import Watch, edge, no_model, sticks
+
+ADVICE = "Use a smaller rtol, another method or drift='project', or check whether the program ends or jumps there."
 
 
 @dataclass
@@ -19,6 +22,8 @@ class Motion:
     stop: object = None
     interrupted: bool = False
     changed: set = field(default_factory=set)
+    switches: list = field(default_factory=list)
+    start: object = None  # X at t0, if it is not the given one
 
     def add(self, model, t, x, top):
         """Append samples t (N,), X (n_x, N) and γ^(s̄) (n, N) computed with one variant of the model."""
@@ -47,9 +52,12 @@ class Motion:
             The variant of the model that holds for each range of samples.
         """
         t = np.concatenate([piece[1] for piece in self.pieces])
-        z = np.concatenate([np.vstack([piece[2], piece[3]]) for piece in self.pieces], axis=1)
         keep = np.append(True, np.diff(t) != 0)
-        counts = np.add.reduceat(keep, np.cumsum([0, *(len(piece[1]) for piece in self.pieces[:-1])]), dtype=int)
+        starts = np.cumsum([0, *(len(piece[1]) for piece in self.pieces[:-1])])
+        counts = np.add.reduceat(keep, starts, dtype=int)
+        z = np.empty((sum(map(len, self.pieces[0][2:])), counts.sum()))  # filled by piece: one large copy takes seconds
+        for (_, of_piece, *parts), start, end, count in zip(self.pieces, starts, counts.cumsum(), counts, strict=True):
+            z[:, end - count : end] = np.vstack(parts)[:, keep[start : start + len(of_piece)]]
         variants, end = [], 0
         for (model, *_), count in zip(self.pieces, counts.tolist(), strict=True):
             first, end = end, end + count
@@ -57,7 +65,7 @@ class Motion:
                 variants[-1] = (variants[-1][0], end, model)
             elif count:
                 variants.append((first, end, model))
-        return t[keep], z[:, keep], variants
+        return t[keep], z, variants
 
 
 @contextlib.contextmanager
@@ -87,8 +95,9 @@ def equal_steps(a, b, step):
 class Stepping:
     """One integration: the model in use, the monitor of its pivots, and the motion so far.
 
-    A method takes the steps of a smooth piece in `_piece(a, x, b, times)` and returns the state at its end. If a step
-    fails, `rank_lost` describes this for a singular program, and `advice` is for other failures.
+    A method takes the steps of a smooth piece in `_piece(a, x, b, times)` and returns the instant and the state at its
+    end, which lies before b where a switching function vanishes. If a step fails, `rank_lost` describes this for a
+    singular program, and `advice` is for other failures.
 
     Parameters
     ----------
@@ -100,6 +109,12 @@ class Stepping:
 
     rank_lost = "the step of the integrator shrinks to nothing"
     advice = "Use a larger rtol, or check whether the motion escapes."
+    watch = None  # of the residuals and switches, while steps are taken
+    family = None  # the smooth models of a model with kinks or switches
+    tolerances = None  # rtol and atol; None for steps of fixed length
+    parts = 8  # of a step, at whose ends switching functions are evaluated; 1 where steps are short
+    projects = False  # whether ends of steps are projected before they are inspected
+    again = None  # two steps of half the length, where steps are of fixed length
 
     def __init__(self, model, method, drift, progress):
         self.method, self.drift, self.progress, self.motion = method, drift, progress, Motion()
@@ -132,13 +147,67 @@ class Stepping:
         Motion
         """
         with interruptible(self.motion):
-            x, cuts = x0, breakpoints((t0, t1), knots)
-            self._start(t0, x0, cuts[1])
-            for a, b in pairwise(cuts):
-                if self.motion.stop is not None:
-                    break
-                x = self._piece(a, x, b, t_eval[(t_eval >= min(a, b)) & (t_eval <= max(a, b))])
+            self._watch(t0, x0, t1)
+            t, x, cuts = t0, x0, breakpoints((t0, t1), knots)
+            self._start(t, x, cuts[1])
+            for b in cuts[1:]:
+                while t != b and self.motion.stop is None:
+                    due = (t_eval >= min(t, b)) & (t_eval <= max(t, b)) & ((t_eval != t) | (t == t0))
+                    t, x = self._piece(t, x, b, t_eval[due])
         return self.motion
+
+    def _watch(self, t, x, t1):
+        """Watch for the ends of smooth pieces, from the start on."""
+        exact = isinstance(self.drift, MinimalCoordinates)
+        self.watch = Watch(self.tolerances, abs(t1 - t), self.family, exact, self.parts)
+        self.watch.advice = self.advice if self.tolerances is None else ADVICE
+        branches = () if self.family is None else self.family.branches(t, x)
+        self.watch.use(self.model, branches, self._error_dynamics())
+
+    def _error_dynamics(self):
+        """Coefficients of the error dynamics of each row; none without poles."""
+        if not isinstance(self.drift, Poles):
+            return ()
+        return [np.atleast_1d(np.poly(poles)).real[:0:-1] for poles in self.drift.by_row(self.model).values()]
+
+    def _inspected(self, stretch):
+        """The outcome of steps: that of the monitor, or the `End` of the smooth piece if it comes first."""
+        state = self._state_within(stretch)
+        switch = self.watch.switch(stretch, state)
+        if switch is not None:
+            stretch = stretch.first(switch.steps)
+        outcome = self.monitor.inspect(stretch) if len(stretch.t) > 1 else Fine(0)
+        left = self.watch.left(stretch.first(outcome.steps), state, self.again, self.projects)
+        if left is not None:
+            return left
+        return switch if switch is not None and isinstance(outcome, Fine) else outcome
+
+    def _state_within(self, stretch):
+        """X from (k, t) within steps."""
+        return stretch.state
+
+    def _turn(self, end, b):
+        """Stop at the end of a smooth piece, or go on beyond its switch towards b."""
+        if end.error is not None:
+            why = "a residual leaves its tolerance"
+            singular = not end.error.details["why"] and self.monitor.lost(end.t, end.x)
+            self.motion.stop = self.monitor.singular(end.t, end.x, why) if singular else end.error
+            return
+        stuck, branches = self.watch.switches.stays(end)
+        if stuck:
+            self.motion.stop = sticks(self.method, end.t, stuck)
+            return
+        try:
+            model = self.family.at(branches)
+        except ServoError as error:
+            self.motion.stop = no_model(self.method, end.t, self.watch.texts(end), error)
+            return
+        self.motion.stop = self.watch.jump(model, end)
+        if self.motion.stop is None:
+            self.motion.switches.append(end.t)
+            self._use(model)
+            self._start(end.t, end.x, b)
+            self.watch.use(model, branches, self._error_dynamics())
 
     def _start(self, t, x, b):
         """Choose other pivots at the start of the first piece, up to b, if the model's are a bad choice there."""
@@ -162,6 +231,8 @@ class Stepping:
     def _go_on(self, variant, t, x):
         model, self.monitor = variant
         self._use(model)
+        if self.watch is not None:
+            self.watch.use(model, self.watch.branches, self._error_dynamics())
         self.monitor.begin(self._pivots(t, x))
         self.motion.count(pivot_changes=1)
 
@@ -181,6 +252,7 @@ class Stepping:
 
     def _fail(self, t, x, why):
         """Stop because no step succeeds."""
+        why = "; ".join(dict.fromkeys(filter(None, (*why.split("; "), edge(self.model, t, x)))))
         what = f"{self.method} stopped at t = {t:.7g} s: {why}"
         self.motion.stop = self.monitor.failed(t, x, self.rank_lost, what, self.advice)
 

@@ -271,9 +271,14 @@ class RadauSteps(BulkSteps):
         self.step, self.taken = step, []
         self.failure = "its steps vanish" if step is None else "the Newton iteration does not solve a fixed step"
         self.every = drift.every if isinstance(drift, Project) else 0
+        self.projects = self.every > 0
         self.most = max(self.most - self.most % self.every, self.every) if self.every else self.most
         order = radau_order(rtol) if order is None else order
         self.settings = Settings(order, rtol, atol, step is not None, self.every)
+        if step is None:
+            self.tolerances = rtol, atol
+        else:
+            self.again = self._two_steps
         super().__init__(model, "RadauIIA", drift, progress)
 
     def _function(self, model, poles):
@@ -291,10 +296,13 @@ class RadauSteps(BulkSteps):
     def halved(self, model, t, x, h):
         """States (n_x, 3) at t, t + h and t + 2 h by two steps; fewer if one fails."""
         self._use(model)
+        return self._two_steps(t, x, h)
+
+    def _two_steps(self, t, x, h):
         return radau_steps(self.f, t, x, t + 2 * h, self.p, abs(h), self.settings, 2)[1]
 
-    def _record(self, steps, first, last):
-        super()._record(steps, first, last)
+    def _record(self, steps, first, last, end=None):
+        super()._record(steps, first, last, end)
         if self.step is not None:
             self.taken.append((self.model, steps.t[first : last + 1], steps.x[:, first : last + 1]))
 
@@ -304,6 +312,9 @@ class RadauSteps(BulkSteps):
             self.motion.count(nfev=2)
         else:
             self.h = abs(equal_steps(a, b, self.step)[0])
+
+    def _retake(self, h):
+        self.h = abs(h)
 
     def _steps(self, t, x, b):
         t, x, z, self.h, counts = radau_steps(self.f, t, x, b, self.p, self.h, self.settings, self.most)

@@ -7,6 +7,7 @@ from servoctl.methods.choice import ORDERS, MinimalCoordinates, Project
 from servoctl.methods.minimal import Chart, Sizes
 from servoctl.methods.monitor import DEGRADED, Fine, Singular, Stretch
 from servoctl.methods.motion import Stepping, equal_steps
+from servoctl.methods.watch import End
 
 NEARLY_ZERO = 0.3  # of its reference: below this a pivot's least size is searched for within steps
 
@@ -62,6 +63,7 @@ class RungeKuttaSteps(Stepping):
 
     rank_lost = "the state is no longer finite"
     advice = "Use a smaller step (stable below about 2.8 over the largest eigenvalue), slower poles, or 'DOP853'."
+    parts = 1
     most, most_in_python = 2000, 100  # steps per call of the compiled loop, and of the one on minimal coordinates
 
     def __init__(self, model, method, drift, step, progress):
@@ -84,12 +86,18 @@ class RungeKuttaSteps(Stepping):
         most = self.most - self.most % self.every if 0 < self.every < self.most else self.every or self.most
         most, done = self.most_in_python if self.sizes else most, 0
         self.monitor.begin(self._pivots(a, x))
+        self.watch.begin(a)
         while done < count and self.motion.stop is None:
             steps = min(most, count - done)
             states, pivots = self._steps(a + done * h, x, h, steps)
             t = a + (done + np.arange(states.shape[1])) * h
             outcome = self._inspect(t, states, pivots)
             good = outcome.steps
+            if isinstance(outcome, End):
+                inside = np.append(t[: good + 1], outcome.t), np.column_stack([states[:, : good + 1], outcome.x])
+                self._record(*inside)
+                self._turn(outcome, b)
+                return outcome.t, outcome.x
             self._record(t[: good + 1], states[:, : good + 1])
             x, done = states[:, good].copy(), done + good
             self.progress(t[good])
@@ -97,7 +105,7 @@ class RungeKuttaSteps(Stepping):
                 self._follow(outcome)
             elif good < steps:
                 self._fail(t[good], x, f"a step of {abs(h):.3g} s leads to no finite state")
-        return x
+        return b, x
 
     def _record(self, t, states):
         steps, top = len(t) - 1, slice(self.n_x - self.model.n, self.n_x)
@@ -110,7 +118,7 @@ class RungeKuttaSteps(Stepping):
     def halved(self, model, t, x, h):
         """States (n_x, 3) at t, t + h and t + 2 h by two steps; fewer if one fails."""
         self._use(model)
-        return self._steps(t, x, h, 2)[0]
+        return self.again(t, x, h)
 
     def rates(self, t, x):
         """X' at a state."""
@@ -127,12 +135,20 @@ class RungeKuttaSteps(Stepping):
 
     def _inspect(self, t, states, pivots):
         """The monitor's outcome; a step across a pivot's zero has passed no error test and is repeated."""
-        outcome = self.monitor.inspect(Stretch(t, states, pivots[:, 1:, None], self._top))
+        outcome = self._inspected(Stretch(t, states, pivots[:, 1:, None], self._top))
         if self.sizes and len(t) > 1 and len(pivots):
             touched = self._touched(t, states, pivots)
             if touched is not None and touched.steps <= outcome.steps + 1:
                 return touched
         return outcome
+
+    def _state_within(self, stretch):
+        """X from (k, t) within steps, by a shorter step from their start."""
+        return lambda k, t: self._steps(stretch.t[k], stretch.x[:, k], t - stretch.t[k], 1)[0][:, -1]
+
+    def again(self, t, x, h):
+        """States (n_x, 3) at t, t + h and t + 2 h by two steps; fewer if one fails."""
+        return self._steps(t, x, h, 2)[0]
 
     def _touched(self, t, states, pivots):
         """Singular if a pivot touches zero within a step, else None.

@@ -6,8 +6,11 @@ from servoctl.methods.choice import MinimalCoordinates, Project
 from servoctl.methods.minimal import Chart, MinimalSolver, Sizes
 from servoctl.methods.monitor import FRACTIONS, DenseStretch, Fine
 from servoctl.methods.motion import Stepping
+from servoctl.methods.watch import End, edge
 
 IMPLICIT = ("Radau", "BDF")
+MANY, CREEPS = 200, 1e-5  # steps in which a motion near the edge of a domain passes this part of the span
+SHORTENINGS, SHORTER = 8, 1e-2  # how often, and to which part, a first step is shortened that errs by far
 
 
 class ScipySteps(Stepping):
@@ -26,7 +29,7 @@ class ScipySteps(Stepping):
     advice = "Use a larger rtol or a method for stiff equations ('Radau'), or check whether the motion escapes."
 
     def __init__(self, model, method, drift, rtol, atol, progress):
-        self.tolerances = {"rtol": rtol, "atol": atol}
+        self.tolerances = rtol, atol
         self.sizes = Sizes(model) if isinstance(drift, MinimalCoordinates) else None
         super().__init__(model, method, drift, progress)
 
@@ -42,12 +45,15 @@ class ScipySteps(Stepping):
     def _jacobian(self, t, x):
         return self.slopes(t, x, self.p).reshape(self.n_x, self.n_x).T
 
-    def _solver(self, a, x, b):
+    def _solver(self, a, x, b, **first):
         import scipy.integrate
+
+        rtol, atol = self.tolerances
 
         def solver(rates, t, y, jacobian, **options):
             exact = {"jac": jacobian} if self.slopes is not None else {}
-            return getattr(scipy.integrate, self.method)(rates, t, y, b, **self.tolerances, **exact, **options)
+            options |= first | exact
+            return getattr(scipy.integrate, self.method)(rates, t, y, b, rtol=rtol, atol=atol, **options)
 
         if isinstance(self.drift, MinimalCoordinates):
             return MinimalSolver(solver, Chart(self.model, self.sizes, a, x), a, x)
@@ -55,27 +61,32 @@ class ScipySteps(Stepping):
 
     def _piece(self, a, x, b, times):
         self.pending, self.forward = list(times), b >= a
-        solver, steps = self._solver(a, x, b), 0
-        self.monitor.begin(self._pivots(a, x))
-        self._sample(a, None, x)
+        solver, steps, outcome, shortened = self._begun(a, x, b), 0, Fine(0), 0
         while solver.status == "running":
             t, x = solver.t, solver.y.copy()
-            with np.errstate(all="ignore"):
-                message = solver.step()
+            message = _step(solver)
             if solver.status == "failed" or not np.all(np.isfinite(solver.y)):
                 self._fail(t, x, (message or "the state is no longer finite").rstrip("."))
                 self._keep_last(t, x)
                 break
             steps, dense = steps + 1, solver.dense_output()
-            outcome = self.monitor.inspect(self._stretch(t, x, solver, dense))
+            outcome = self._inspected(self._stretch(t, x, solver, dense))
             if isinstance(outcome, Fine):
                 if self.restore is not None and (steps % self.drift.every == 0 or solver.status == "finished"):
                     self._project(solver)
                 self._sample(solver.t, dense, solver.y)
                 self.progress(solver.t)
-                continue
-            if outcome.steps:
-                t, x = solver.t, solver.y
+                if steps % MANY or not self._creeps(solver):
+                    continue
+                break
+            if isinstance(outcome, End):
+                if outcome.error and t == a and shortened < SHORTENINGS:
+                    solver, shortened = self._shortened(solver, t, x, b), shortened + 1
+                    continue
+                self._sample(outcome.t, dense, outcome.x)
+                self._turn(outcome, b)
+                break
+            t, x = (solver.t, solver.y) if outcome.steps else (t, x)
             goes_on = self._follow(outcome)
             # A step in which a pivot vanishes is sampled with the next pivots: its own lose digits near the zero.
             if outcome.steps:
@@ -87,7 +98,30 @@ class ScipySteps(Stepping):
             solver = self._solver(t, x, b)
         self._count(solver)
         self.motion.count(steps=steps)
-        return solver.y
+        return (solver.t, solver.y) if isinstance(outcome, Fine) else (outcome.t, outcome.x)
+
+    def _creeps(self, solver):
+        """Whether the motion has stopped because it creeps towards the edge of a residual's domain."""
+        before, self.mark = self.mark, solver.t
+        why = edge(self.model, solver.t, solver.y) if abs(solver.t - before) < CREEPS * self.watch.span else ""
+        if why:
+            self._fail(solver.t, solver.y, f"its steps shrink; {why}")
+        return bool(why)
+
+    def _begun(self, t, x, b):
+        """The solver of a piece."""
+        self.mark = t
+        self.monitor.begin(self._pivots(t, x))
+        self.watch.begin(t)
+        self._sample(t, None, x)
+        return self._solver(t, x, b)
+
+    def _shortened(self, solver, t, x, b):
+        """A solver with a shorter first step: from rest scipy's may be as long as the span, and pass its error test."""
+        length = abs(solver.t - t)
+        self._count(solver)
+        self.monitor.begin(self._pivots(t, x))
+        return self._solver(t, x, b, first_step=SHORTER * length)
 
     def _stretch(self, t, x, solver, dense):
         """The last step for the monitor: it has passed its error test, and the next begins where it ends."""
@@ -132,3 +166,13 @@ class ScipySteps(Stepping):
             states = np.array(states).T
             top = np.array([self._top(s, y) for s, y in zip(times, states.T, strict=True)]).T
             self.motion.add(self.model, times, states, top)
+
+
+def _step(solver):
+    """One step; scipy raises ValueError for a Jacobian that is not finite."""
+    try:
+        with np.errstate(all="ignore"):
+            return solver.step()
+    except ValueError:
+        getattr(solver, "solver", solver).status = "failed"
+        return "the Jacobian is not finite"

@@ -10,10 +10,11 @@ import numpy as np
 
 from servoctl.checks import whole_of
 from servoctl.errors import SpecificationError, unknown
-from servoctl.methods.accuracy import component_sizes, state_levels
+from servoctl.methods.accuracy import component_sizes
 from servoctl.methods.choice import ORDERS, Poles
 from servoctl.methods.motion import breakpoints, equal_steps
 from servoctl.methods.runge_kutta import tableau
+from servoctl.methods.sizes import state_levels
 
 SAME = {"DOP853": "RK8", "RK45": "RK5"}  # scipy's adaptive methods that go on with the result of these tableaus
 STEP_MAPS = (*ORDERS, *SAME, "RK23", "Taylor", "RadauIIA", "Radau")
@@ -234,6 +235,16 @@ def warn_many_steps(method, poles, length):
         )
 
 
+def warn_unstable(verdict):
+    """Warn that the internal dynamics of a motion are unstable; the verdict says over which time, and how far."""
+    warnings.warn(
+        f"{verdict[0].upper()}{verdict[1:]}. The program does not determine this motion well. Take a shorter span or "
+        "another output; sv.lqr stabilises the whole state about a plan.",
+        RuntimeWarning,
+        stacklevel=_outside(),
+    )
+
+
 def unresolved(pieces, halved):
     """The last step of a motion, or else the one of the fastest change, if two half steps lead elsewhere.
 
@@ -312,6 +323,6 @@ def _fastest_rate(stepping, t, x, direction, size):
 def _outside():
     """The stacklevel, in the calling function, of the first caller outside the package."""
     level, frame = 1, sys._getframe(1)
-    while frame.f_back is not None and frame.f_globals["__name__"].split(".")[0] == __name__.split(".")[0]:
+    while frame.f_back is not None and frame.f_globals.get("__name__", "").split(".")[0] == __name__.split(".")[0]:
         level, frame = level + 1, frame.f_back
     return level

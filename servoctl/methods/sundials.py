@@ -189,12 +189,14 @@ class SundialsSteps(BulkSteps):
     progress : callable
     """
 
+    parts = 1
     rank_lost = "the integrator finds no further step"
     failure = f"no step succeeds, or {MOST_STEPS:,} reach no further sample"
     advice = "Use a larger rtol, more t_eval or 'RadauIIA', or check whether the motion escapes."
 
     def __init__(self, model, method, drift, rtol, atol, span, progress):
-        self.resolution, self.rtol, self.atol = abs(span) / WATCHED, rtol, atol
+        self.resolution = abs(span) / WATCHED
+        self.tolerances = rtol, atol
         super().__init__(model, method, drift, progress)
 
     def _use(self, model):
@@ -204,12 +206,21 @@ class SundialsSteps(BulkSteps):
     def _begin(self, a, x, b):
         """Nothing to prepare."""
 
+    def _state_within(self, stretch):
+        """X from (k, t), integrated from the start of an interval: the cubics between instants are less accurate."""
+
+        def state(k, t):
+            x = stretch.x[:, k]
+            return self.solver.run(np.array([stretch.t[k], t]), x, self._top(t, x), self.p, *self.tolerances)[0][:, -1]
+
+        return state
+
     def _steps(self, t, x, b):
         direction = np.sign(b - t)
         marks = np.linspace(t, b, 2 + int(abs(b - t) / self.resolution))
         grid = np.unique(direction * np.concatenate([marks, self.pending]))
         grid = direction * grid[(grid >= direction * t) & (grid <= direction * b)]
-        states, counts = self.solver.run(grid, x, self._top(t, x), self.p, self.rtol, self.atol)
+        states, counts = self.solver.run(grid, x, self._top(t, x), self.p, *self.tolerances)
         self.motion.count(**counts)
         t, failed = grid[: states.shape[1]], states.shape[1] < len(grid)
         return Grid(t, states, self.f.grid(t, states, self.p)[: self.n_x], failed)

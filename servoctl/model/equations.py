@@ -134,11 +134,19 @@ class Equations(Invariants):
         return self._solve(-ca.vertcat(*self.rest(range(len(self.levels)), poles)))[0]
 
     @cached_property
+    def _all_pivots(self):
+        leading = self.saddle[2] if self.sparse else self._solve(ca.SX(self.q.n, 0))[1]
+        return [*self.r.pivots, *((f"leading matrix {i + 1}", p) for i, p in enumerate(leading))]
+
+    @cached_property
     def pivots(self):
         """Pivots that depend on the motion, which must not vanish: a list of (name, SX)."""
-        leading = self.saddle[2] if self.sparse else self._solve(ca.SX(self.q.n, 0))[1]
-        named = [*self.r.pivots, *((f"leading matrix {i + 1}", p) for i, p in enumerate(leading))]
-        return [(name, p) for name, p in named if any(self.q.where(s) is not None for s in ca.symvar(p))]
+        return [(name, p) for name, p in self._all_pivots if any(self.q.where(s) is not None for s in ca.symvar(p))]
+
+    def constant_pivots(self):
+        """A function of the parameters: the pivots that depend on these alone."""
+        constant = [p for _, p in self._all_pivots if all(self.q.where(s) is None for s in ca.symvar(p))]
+        return ca.Function("constant_pivots", [self.parameters], [ca.vertcat(*constant)])
 
     @property
     def pivot_sizes(self):
@@ -187,7 +195,10 @@ class Equations(Invariants):
         )
 
     def path(self):
-        """For flat programs: outputs (δq, q', γ', γ'', pivots) as functions of (t, q), δq a Newton step."""
+        """For flat programs: outputs (δq, q', q'', pivots) as functions of (t, q), δq a Newton step.
+
+        With quasi-velocities (δq, q', q'', γ', γ'', pivots).
+        """
         q, n = self.q, self.q.n
         zero = ca.SX.zeros(n)
         w, dw = q.jet(1), q.jet(2)
@@ -196,9 +207,12 @@ class Equations(Invariants):
         velocity, _ = self._solve(-ca.substitute(first, w, zero))
         acceleration, _ = self._solve(-ca.substitute(second, dw, zero))
         acceleration = ca.substitute(acceleration, w, velocity)
-        rates = q.V @ velocity + q.h
-        pivots = [ca.substitute(p, ca.vertcat(w, dw), ca.vertcat(velocity, acceleration)) for _, p in self.pivots]
-        return self.function("path", q.jet(0), [self._newton(), rates, velocity, acceleration, *pivots])
+        jets = [] if q.plain else [velocity, acceleration]
+        moving = [ca.vertcat(*q.d(1)), ca.vertcat(*q.d(2)), *(p for _, p in self.pivots)]
+        rate, second, *pivots = (
+            ca.substitute(e, ca.vertcat(w, dw), ca.vertcat(velocity, acceleration)) for e in moving
+        )
+        return self.function("path", q.jet(0), [self._newton(), rate, second, *jets, *pivots])
 
     def _newton(self):
         q = self.q
@@ -221,9 +235,9 @@ class Equations(Invariants):
         return eliminate(matrix, -residual, clean(values, sizes))[0]
 
     def matrices(self):
-        """L and Bᵀ, column by column: their ranks must not change."""
-        L, B = self.r.leading, self.r.realisation.B.T
-        return self.function("matrices", self.state, [ca.vec(ca.densify(L)), ca.vec(ca.densify(B))])
+        """L and Bᵀ, column by column, whose ranks must not change, and the diagonal of M, which scales columns."""
+        matrices = [ca.vec(ca.densify(m)) for m in (self.r.leading, self.r.realisation.B.T)]
+        return self.function("matrices", self.state, [*matrices, ca.densify(ca.diag(self.r.mechanism.mass))])
 
     def plant(self):
         """(q', γ'') of the full mechanism as a function of (t, [q; γ'; inputs of the program])."""
@@ -236,7 +250,7 @@ class Equations(Invariants):
         second = [q.derivatives([row.expression], 2 - row.order)[-1][0] for row in material]
         second = ca.substitute(ca.vertcat(*second), acceleration, zero) if material else ca.SX(0, 1)
         force = driven - ca.substitute(mechanism.balance, acceleration, zero)
-        solution = plant_accelerations(mechanism, material, force, -second, r.points)
+        solution, _ = plant_accelerations(mechanism, material, force, -second, r.points)
         x = ca.vertcat(*q, *q.gamma(1), inputs)
         return self.function("plant", x, [q.V @ q.jet(1) + q.h, solution])
 
@@ -326,7 +340,23 @@ class Equations(Invariants):
             names += [(name, j) for j in range(len(levels))]
             expressions += [level[0] for level in levels]
         invariants = self.q.invariants
-        return [*names, *((name, 0) for name in invariants)], [*expressions, *invariants.values()]
+        expressions = [*map(self._without_higher, expressions), *invariants.values()]
+        return [*names, *((name, 0) for name in invariants)], expressions
+
+    def _without_higher(self, expression):
+        """An expression with the jets above s̄, which the rows determine, replaced by their values.
+
+        A row of the program that hidden rows replace may have an order above s̄.
+        """
+        places = filter(None, map(self.q.where, ca.symvar(expression)))
+        highest = max((level for of, level, _ in places if of not in ("t", "q")), default=0)
+        for k in range(highest, self.top, -1):
+            jet = self.q.jet(k)
+            pairs = zip(self.r.rows, self.raised, strict=True)
+            raised = ca.vertcat(*(self.q.derivatives([r.expression], n + k - self.top)[-1][0] for r, n in pairs))
+            solution, _ = self._solve(-ca.substitute(raised, jet, ca.SX.zeros(self.q.n)))
+            expression = ca.substitute(expression, jet, solution)
+        return expression
 
 
 EQUATIONS = {  # arguments of `compiled`: the function, its loops, its projection
@@ -335,7 +365,7 @@ EQUATIONS = {  # arguments of `compiled`: the function, its loops, its projectio
     "ode_poles": lambda e: (e.ode(poles=True), ("rk",)),
     "ode_jacobian": lambda e: (e.ode_jacobian(),),
     "ode_poles_jacobian": lambda e: (e.ode_jacobian(poles=True),),
-    "path": lambda e: (e.path(), ("newton",)),
+    "path": lambda e: (e.path(), ("newton",), None, None, {"pivots": len(e.pivots)}),
     "invariants": lambda e: (e.invariants(),),
     "matrices": lambda e: (e.matrices(),),
     "plant": lambda e: (e.plant(),),

@@ -4,21 +4,25 @@ from collections.abc import Mapping
 from dataclasses import replace
 from functools import cached_property
 
+import casadi as ca
 import numpy as np
 
 from servoctl.checks import finite
 from servoctl.codegen.function import compiled
-from servoctl.errors import SpecificationError, unknown
+from servoctl.errors import ServoError, SpecificationError, unknown
 from servoctl.model.equations import EQUATIONS, SIGNALS, Equations, gradient_jets, leading_names, residual_rows
 from servoctl.model.report import describe
-from servoctl.model.start import State, consistent
+from servoctl.model.rest import started
+from servoctl.model.start import State
 from servoctl.model.store import Store, pack, unpack
 from servoctl.reduction.appell import require_positive
 from servoctl.reduction.knots import require_smooth
-from servoctl.reduction.reduce import holds, reduce
+from servoctl.reduction.reduce import holds, reduce, strong
 from servoctl.reduction.structure import structure
 from servoctl.spec.mechanism import Mechanism
 from servoctl.spec.program import Program
+
+SAMPLED = 50  # samples of a run at which its structure is decided; each takes tens of milliseconds
 
 
 def derive(mechanism: Mechanism, program: Program, guess: Mapping[str, float] | None = None) -> "Model":
@@ -129,16 +133,20 @@ class Model:
             For a value that is not finite, makes a mass negative, or makes a path less smooth than required.
         """
         r = self.reduction
-        current = dict(zip(r.mechanism.parameters.names, self.parameters.tolist(), strict=True))
+        current = self.numbers
         for name in changes:
             if name not in current:
                 raise unknown(name, list(current), "parameter")
         values = r.mechanism.parameters.values({**current, **changes})
         require_positive(r.mechanism, replace(r.points, values=values))
-        if not holds(r, values):
+        if not (holds(r, values) and self._constant_pivots_hold(values)):
             self._store.require_unchanged()
             return _derived(r.mechanism, r.program, r.context.guess, None, values)
         return Model(r, self._store, values, require_smooth(r.switches, values, r.smoothness), self._functions)
+
+    def _constant_pivots_hold(self, values):
+        f = self.once("constant pivots", lambda: self.equations.constant_pivots())
+        return bool(strong(*(f(p).full() for p in (values, self.reduction.context.values))).all())
 
     def near(self, t, jets, sizes=()):
         """The model of the same specification, derived with pivots chosen at an instant of the motion.
@@ -170,6 +178,23 @@ class Model:
                 expected=self.free,
             )
         return Model(near.reduction, near._store, self.parameters, self._knots)
+
+    @property
+    def place(self):
+        """(t, jets, sizes) near which pivots were chosen by `near`; None if they were by `derive`."""
+        return self._store.specification[3]
+
+    def at(self, place):
+        """The variant of a `place`; this model if that is None."""
+        if place is None:
+            return self
+        t, jets, sizes = place
+        return self.near(t, [jets[name] for name in self.jet_names], sizes)
+
+    @property
+    def numbers(self):
+        """Values of the parameters by name, SI."""
+        return dict(zip(self.reduction.mechanism.parameters.names, self.parameters.tolist(), strict=True))
 
     @property
     def free(self):
@@ -352,6 +377,13 @@ class Model:
         """How each row was derived, by name; "" for rows of the specification."""
         return {row.name: row.story for row in self.reduction.rows}
 
+    def balances(self):
+        """The coordinate or quasi-velocity, by index, of each row of L that is a row TᵀM of (3.18), by index."""
+        q = self.reduction.mechanism.q
+        names = [f"balance of {name}" for name in (q.names if q.plain else q.velocity_names)]
+        rows = enumerate(self.reduction.rows)
+        return {a: names.index(row.name) for a, row in rows if row.name in names and row.order == 2 and not row.story}
+
     def leading_names(self):
         """Names of the rows of L and of Bᵀ, whose ranks must not change."""
         return leading_names(self.reduction)
@@ -365,8 +397,14 @@ class Model:
         signals = {value[1].name: value[1] for value in self._functions.values() if isinstance(value, tuple)}
         return {name: f.operations for name, f in (self._functions | signals).items() if hasattr(f, "operations")}
 
-    def start(self, /, t: float = 0.0, guess: Mapping[str, float] | None = None, **held: float) -> State:
+    def start(
+        self, /, t: float = 0.0, guess: Mapping[str, float] | None = None,
+        hold: Mapping[str, ca.SX] | None = None, **held: float,
+    ) -> State:  # fmt: skip
         """Consistent initial values: those passed are fixed, the others follow from the constraints and their rates.
+
+        Where several states have the held values, the one that Newton's method reaches from the guess is taken; the
+        printed state names others that a short search finds.
 
         Parameters
         ----------
@@ -375,8 +413,11 @@ class Model:
         guess : dict of str to float, optional
             Approximate values: free ones start there if that is consistent. Values without a guess are as near to zero
             as the invariants allow.
+        hold : dict of str to SX, optional
+            Further conditions by name: expressions of t, the coordinates and their derivatives of any order that are
+            zero at the start, such as `{"heading": ca.atan2(dy, dx) - 0.5}`.
         **held : float
-            Exact values of coordinates and derivatives.
+            Exact values of coordinates, derivatives and outputs.
 
         Returns
         -------
@@ -385,31 +426,71 @@ class Model:
         Raises
         ------
         NameUnknown
-            For a name that is no state.
+            For a name that is no state and no output.
+        SpecificationError
+            For a value that is no finite number, or a condition that is no expression of the mechanism's symbols.
         InconsistentStart
             If a held value contradicts an invariant, or the search for a consistent state fails.
+        SingularProgram
+            If the machine stands still, its constraints leave a coordinate open there, and the motion has no limit.
         """
-        return consistent(self, finite("t", t, "time"), held, guess)
+        return started(self, finite("t", t, "time"), held, guess, hold)
 
-    def structure(self, t=None, jets=None):
+    def structure(self, motion=None, jets=None):
         """Index, relative degrees, zeros at infinity and essential orders (see `reduction.structure`).
 
         Parameters
         ----------
-        t : (N,) array, optional
-            Times [s] along a motion; by default at seeded points of the manifold.
+        motion : Run, State or (N,) array, optional
+            A run, of which at most 50 samples are taken, a start, or times [s]. Default: seeded points of the manifold
+            and the start nearest to zero, where there is one.
         jets : (n_z, N) array, optional
+            At these times.
 
         Returns
         -------
         Structure
         """
-        if t is None:
-            return self.once("structure", lambda: structure(self.reduction))
-        return structure(self.reduction, np.atleast_1d(t), np.asarray(jets), self.parameters)
+        if motion is None:
+            return self.once("structure", lambda: structure(self.reduction, start=self._default_start()))
+        t, jets = _samples(self, motion, jets)
+        return structure(self.reduction, t, jets, self.parameters)
+
+    def _default_start(self):
+        """The time and the values of the start without held or guessed values; None if there is none."""
+        try:
+            start = self.start()
+        except ServoError:
+            return None
+        return start.t, start.values
 
     def __repr__(self):
         return describe(self)
+
+
+def _samples(model, motion, jets):
+    """Times (N,) and jets (n_z, N) of a run, at most `SAMPLED` of them, of a start, or as given."""
+    names, count = model.jet_names, 0
+    if isinstance(motion, State):
+        motion, names, jets = [motion.t], motion.names, motion.values[:, None]
+    elif hasattr(motion, "jet_names"):
+        some = np.unique(np.linspace(0, len(motion.t) - 1, SAMPLED).round().astype(int))
+        motion, names, jets = motion.t[some], motion.jet_names, motion.jets[:, some]
+    try:
+        t, jets = np.atleast_1d(np.asarray(motion, dtype=float)), np.asarray(jets, dtype=float)
+        count = len(jets)
+    except (TypeError, ValueError):
+        t, jets = np.zeros(0), np.zeros((0, 0))
+    fits = t.ndim == 1 and len(t) and jets.shape == (count, len(t)) and names[:count] == model.names_to(count)
+    if not (fits and count >= len(model.state_names) and np.isfinite(t).all() and np.isfinite(jets).all()):
+        raise SpecificationError(
+            f"The motion has times of shape {t.shape} and jets of shape {jets.shape}.",
+            f"Of each instant it has the finite jets {', '.join(model.state_names)} of this model.",
+            do="Write model.structure(run), model.structure(start) or model.structure(run.t, run.jets).",
+            times=t.shape,
+            jets=jets.shape,
+        )
+    return t, jets
 
 
 def _unpickled(mechanism, content, choices, parameters, knots):

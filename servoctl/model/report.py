@@ -1,4 +1,9 @@
-"""The printed form of a model."""
+"""The printed form of a model, and what is said of a state at which its program is singular."""
+
+import numpy as np
+
+from servoctl.errors import ServoError, SingularProgram
+from servoctl.model.rest import first_motion, standstill
 
 WIDTH = 118
 
@@ -6,9 +11,11 @@ WIDTH = 118
 def describe(model):
     """What `print(model)` shows: how the specification was reduced, in at most twelve lines."""
     r = model.reduction
+    program = f"program {', '.join(r.program.residuals)} by {_by(r)}" if r.program.residuals else "no program"
+    raised = _raised(r)
     lines = [
-        f"Model: {' '.join(r.mechanism.q.names)}; program {', '.join(r.program.residuals)} by {_by(r)}",
-        f"  {_raised(r)}",
+        f"Model: {' '.join(r.mechanism.q.names)}; {program}",
+        *([f"  {raised}"] if raised else []),
         *_hidden_and_free(model),
         f"  {_rule(r)}",
     ]
@@ -59,3 +66,43 @@ def _rule(r):
     classical = all(row.order == 0 or (row.order == 1 and row.affine) for row in program)
     rule = "d'Alembert's principle" if classical else "the generalised Chetaev rule, a postulate at this order"
     return f"(3.18) with T from ker G; dependent: {dependent}; under {rule}"
+
+
+def explain(model, t, x, lost, **facts):
+    """The error of a singular state (n_x,), of which `lost` rows lose their gradients, by its cause; None if unknown.
+
+    Machines that roll may stand still there, or relative degrees be others than in motion.
+    """
+    chosen = dict(zip(model.state_names, map(float, x), strict=True))
+    still = standstill(model, t, chosen)
+    if still is not None:
+        return still.error(t, first_motion(model, t, chosen, still), **facts)
+    prescribed = any(name in model.reduction.original for name in lost)
+    return None if prescribed else _lost_degrees(model, t, np.asarray(x, dtype=float), **facts)
+
+
+def _lost_degrees(model, t, x, **facts):
+    """The error of a state at which the residuals have other relative degrees than in motion, or None."""
+    try:
+        usual, there = (model.structure(), model.structure([t], x[:, None]))
+    except ServoError:
+        return None
+    if not there.zeros_at_infinity or there.zeros_at_infinity == usual.zeros_at_infinity:
+        return None
+    degrees = zip(usual.residuals, usual.relative_degree, there.relative_degree, strict=True)
+    changed = ", ".join(f"that of {name} is {local}, in motion {r}" for name, r, local in degrees if local != r)
+    zero, state = there.at[0][1].zero, dict(zip(model.state_names, x, strict=True))
+    decisive = zero or dict.fromkeys(jet for row in model.row_stories() for jet in model.gradient_jets(row))
+    values = [f"{name} = {state[name]:.4g}" for name in decisive if name in state]
+    where = f", where {' and '.join(values)}" if values else ""
+    lost = f"relative degrees differ there ({changed})" if changed else "zeros at infinity differ there"
+    return SingularProgram(
+        f"The program is singular at t = {t:.7g} s{where}: {lost}.",
+        "Such a state does not determine the actuation, and towards it the actuation may grow without bound.",
+        do=f"Start and plan away from it{f', by model.start({zero[0]}=...)' if zero else ''}, or program outputs whose "
+        "relative degrees stay the same. The run before it is in .run.",
+        t=float(t),
+        relative_degree=there.relative_degree,
+        in_motion=usual.relative_degree,
+        **facts | {"zero": list(zero)},
+    )

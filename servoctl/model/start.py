@@ -1,11 +1,15 @@
 """Consistent starts: held values exact, every invariant satisfied, the rest as near its guess as possible."""
 
-from dataclasses import dataclass, replace
+from copy import copy
+from dataclasses import dataclass, field, replace
 
+import casadi as ca
 import numpy as np
 
-from servoctl.checks import finite, mapping
-from servoctl.errors import InconsistentStart, ServoError, unknown
+from servoctl.checks import column, finite, mapping
+from servoctl.errors import InconsistentStart, ServoError, SpecificationError, unknown
+from servoctl.model.equations import Invariants
+from servoctl.spec.mechanism import require_known
 from servoctl.values import Value
 
 TOLERANCE = 1e-10  # largest residual relative to its gradient times the state; Newton's iteration reaches rounding
@@ -16,6 +20,12 @@ SEED = 1788  # seed of these points
 REACHED = 1e-16  # scaled residual at which the iteration ends
 REPEATED = 1e-12  # singular values below this fraction of the largest count as zero
 SPANNED = 1e-9  # a column of the Jacobian with a smaller part outside the span of others lies in it
+SEARCHED = 6  # points from which other states with the same held and free values are sought
+FAR = 3.0  # largest distance of these points, relative to the state's size: half a turn
+SEARCH_STEPS = 20  # of Newton's method from each
+NEARER = 0.25  # of the way from one such state to another: a reference before it is clearly nearer the first
+DISTINCT = 1e-3  # difference of two such states, relative to their size
+SHOWN = 3  # values by which a printed state tells branches apart
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,11 +39,16 @@ class State(Value):
     values : (n_x,) array
     names : tuple of str
     held : tuple of str
-        Names of the fixed values.
+        Names of the fixed values, outputs and conditions.
     free : tuple of str
         Further names that the invariants leave free; their values come from the guess or are near zero.
     residual : float
         Largest scaled residual.
+    at_rest : tuple of str
+        Coordinates that the constraints determine in motion only; their values are the limit of the motion.
+    branches : (b, n_x) array
+        This state and others with the same held and free values that a short search found, between which neither
+        the guess nor the distance from zero decides.
     """
 
     t: float
@@ -42,6 +57,8 @@ class State(Value):
     held: tuple
     free: tuple
     residual: float
+    at_rest: tuple = ()
+    branches: np.ndarray = field(default_factory=lambda: np.zeros((0, 0)), compare=False)
 
     def __getitem__(self, name):
         if name not in self.names:
@@ -51,34 +68,83 @@ class State(Value):
     def __repr__(self):
         items = [f"{name} = {value:.6g}" for name, value in zip(self.names, self.values, strict=True)]
         shown = ", ".join(items[:12]) + (f", ... ({len(items)} in all)" if len(items) > 12 else "")
-        held, free = (", ".join(names) or "nothing" for names in (self.held, self.free))
+        held, free, rest = (", ".join(names) or "nothing" for names in (self.held, self.free, self.at_rest))
         return (
             f"State at t = {self.t:g} s\n  {shown}\n  held: {held}; left free: {free}\n"
             f"  largest residual {self.residual:.1e}"
+            + (f"\n  at rest; {rest} by the limit of the motion that follows" if self.at_rest else "")
+            + self._told_apart()
         )
 
+    def _told_apart(self):
+        """The line of a printed state on its branches: the first values in which they differ."""
+        if len(self.branches) < 2:
+            return ""
+        spread = np.ptp(self.branches, axis=0) > DISTINCT * (1.0 + np.abs(self.values))
+        shown = np.flatnonzero(spread)[:SHOWN]
+        each = [", ".join(f"{self.names[i]} = {branch[i]:.4g}" for i in shown) for branch in self.branches]
+        return f"\n  {len(each)} branches: {each[0]} (this one); {'; '.join(each[1:])}; a guess chooses"
 
-class _Invariants:
-    """Invariants of a model at one time: values (m,) and Jacobian (m, n_x)."""
 
-    def __init__(self, model, t):
-        self.f, self.t, self.p = model.function("invariants"), t, model.parameters
-        self.names = [name for _, name in model.invariant_names()]
-        self.m = len(self.names)
+class JetEquations:
+    """Invariants of a model at one time, followed by conditions of the start: values (m,) and Jacobian (m, n_z).
+
+    The jets are the state, and higher ones where a condition contains these. `rows` replace those of the reduction.
+    """
+
+    def __init__(self, model, t, conditions, rows=None):
+        r, self.t, self.p = model.reduction, t, model.parameters
+        q = r.mechanism.q
+        top = max([r.top, *(q.order(e) + 1 for e in conditions.values())])
+        if top == r.top and rows is None:
+            self.f, names = model.function("invariants"), [name for _, name in model.invariant_names()]
+        else:
+            extended = Invariants(r.mechanism, rows or r.rows, top, r.points)
+            self.f, names = _numeric(extended.invariants()), [name for _, name, _ in extended.invariant_rows]
+        self.invariants, self.rows, self.conditions = len(names), [*names, *conditions], None
+        self.names = model.names_to(q.nq + (top - 1) * q.n)
+        if conditions:
+            jets, values = ca.vertcat(*(q.jet(k) for k in range(top))), ca.vertcat(*conditions.values())
+            outputs = ca.densify(ca.vertcat(values, ca.vec(ca.jacobian(values, jets))))
+            parameters = ca.vertcat(*r.mechanism.parameters.symbols)
+            self.conditions = _numeric(ca.Function("conditions", [q.t, jets, parameters], [outputs]))
 
     def __call__(self, x):
+        """Values (m,) and Jacobian (m, n_z) at jets (n_z,)."""
         with np.errstate(all="ignore"):
-            y = self.f(self.t, x, self.p)
-        return y[: self.m], y[self.m :].reshape(len(x), self.m).T
+            parts = [self._split(self.f(self.t, x, self.p), self.invariants, x)]
+            if self.conditions is not None:
+                parts.append(self._split(self.conditions(self.t, x, self.p), len(self.rows) - self.invariants, x))
+        return tuple(map(np.concatenate, zip(*parts, strict=True)))
+
+    @staticmethod
+    def _split(y, m, x):
+        return y[:m], y[m:].reshape(len(x), m).T
+
+    def without_conditions(self):
+        """The invariants alone, of the same jets."""
+        alone = copy(self)
+        alone.rows, alone.conditions = self.rows[: self.invariants], None
+        return alone
 
     def scaled(self, x):
-        """Residuals relative to the size of their gradients times that of the state."""
+        """Residuals relative to the size of their gradients times that of the jets."""
         value, jacobian = self(x)
-        return value / np.maximum(np.sqrt((jacobian**2 * (1.0 + np.abs(x)) ** 2).sum(axis=1)), 1e-300)
+        return value / gradient_sizes(jacobian, x)
+
+
+def gradient_sizes(jacobian, x):
+    """The size of each gradient times that of the jets."""
+    return np.maximum(np.sqrt((jacobian**2 * (1.0 + np.abs(x)) ** 2).sum(axis=1)), 1e-300)
+
+
+def _numeric(f):
+    """A CasADi function of columns as one of arrays."""
+    return lambda *x: f(*x).full().ravel()
 
 
 @dataclass(frozen=True, eq=False)
-class _Aim:
+class Aim:
     """The state nearest to a reference is sought, by weights, with some values movable; arrays (n_x,)."""
 
     names: tuple
@@ -86,72 +152,112 @@ class _Aim:
     weights: np.ndarray
     movable: np.ndarray
 
+    @classmethod
+    def of(cls, names, guess, held):
+        """The state nearest to guessed values, with held ones."""
+        reference = np.array([held.get(name, guess.get(name, 0.0)) for name in names])
+        weights = np.array([GUESSED if name in guess and name not in held else 1.0 for name in names])
+        return cls(names, reference, weights, np.array([name not in held for name in names]))
+
 
 @np.errstate(all="ignore")  # trial steps may leave the domain of the equations
-def consistent(model, t, held, guess):
+def consistent(model, t, held, guess, hold):
     """See `Model.start`."""
-    names = model.state_names
-    chosen = {**mapping(guess, "The guesses"), **held}
-    for name in chosen:
-        if name not in names:
-            raise unknown(name, names, "state")
-    chosen = {name: finite(name, value) for name, value in chosen.items()}
-    reference = np.array([chosen.get(name, 0.0) for name in names])
-    weights = np.array([GUESSED if name in chosen and name not in held else 1.0 for name in names])
-    aim = _Aim(names, reference, weights, np.array([name not in held for name in names]))
-    invariants, x, residual = _solve(model, t, aim)
+    values, conditions = _split_held(model, held, hold)
+    n_x, states = len(model.state_names), model.state_names
+    guess = {name: _known(name, value, states) for name, value in mapping(guess, "The guesses").items()}
+    chosen = guess | values
+    names = JetEquations(model, t, conditions).names
+    aim = Aim.of(names, guess, values)
+    equations, x, residual = _solve(model, t, aim, conditions)
     if not residual < TOLERANCE:
-        _refuse(invariants, aim, held, x)
-    free = _free(invariants, x, aim, chosen)
-    x, residual = _at_guess(invariants, x, residual, aim, [name in free and name in chosen for name in names])
-    return State(t, x, names, tuple(held), free, residual)
+        _refuse(equations, aim, dict.fromkeys(conditions, 0.0) | held, x)
+    free = free_names(equations, x, aim, chosen)
+    x, residual = _at_guess(equations, x, residual, aim, [name in free and name in chosen for name in names])
+    sought = aim.movable & [name not in free for name in names]
+    branches = _branches(equations, x, replace(aim, movable=sought), model)
+    fixed, left = tuple(dict.fromkeys((*held, *conditions))), tuple(name for name in free if name in states)
+    return State(t, x[:n_x], states, fixed, left, residual, branches=branches[:, :n_x])
 
 
-def _solve(model, t, aim):
+def _split_held(model, held, hold):
+    """Held states by name, and conditions by name: outputs less their held values, and expressions that are zero."""
+    mechanism, names = model.reduction.mechanism, model.state_names
+    known, what = (*names, *mechanism.outputs), "state or output" if mechanism.outputs else "state"
+    values = {name: _known(name, value, known, what) for name, value in held.items()}
+    conditions = {name: mechanism.outputs[name] - value for name, value in values.items() if name not in names}
+    for name, expression in mapping(hold, "The conditions").items():
+        conditions[name] = _condition(name, expression, mechanism, known)
+    return {name: value for name, value in values.items() if name in names}, conditions
+
+
+def _condition(name, expression, mechanism, known):
+    """A condition of a start as an SX scalar."""
+    scalar = column(expression, f"The condition {name!r}", 1)[0]
+    require_known(scalar, mechanism, f"The condition {name!r}")
+    if name in known or mechanism.q.order(scalar) < 0:
+        said = "has the name of a state or an output" if name in known else "contains no coordinate and no derivative"
+        raise SpecificationError(
+            f"The condition {name!r} {said}.",
+            "A condition is an expression that is zero at the start, under a name of its own.",
+            do=f"Write model.start({name}=...)." if name in known else "Write it with the mechanism's symbols.",
+            name=name,
+        )
+    return scalar
+
+
+def _known(name, value, names, what="state"):
+    if name not in names:
+        raise unknown(name, names, what)
+    return finite(name, value)
+
+
+def _solve(model, t, aim, conditions):
     """The start by the model's pivots, else by pivots chosen at the reference, else near the best state so far."""
-    invariants = _Invariants(model, t)
-    finite_there = np.all(np.isfinite(invariants(aim.reference)[0]))
-    x, residual = _best(invariants, aim) if finite_there else (aim.reference, np.inf)
+    equations, n_x = JetEquations(model, t, conditions), len(model.state_names)
+    finite_there = np.all(np.isfinite(equations(aim.reference)[0][: equations.invariants]))
+    x, residual = _best(equations, aim) if finite_there else (aim.reference, np.inf)
     for at in (aim.reference, None):
         if residual < TOLERANCE:
             break
         if at is None and not finite_there:
-            x, residual = _best(invariants, aim)
+            x, residual = _best(equations, aim)
         try:  # a pivot of the model may vanish there
-            other = _Invariants(model.near(t, np.append(x if at is None else at, np.zeros(model.n))), t)
+            near = model.near(t, np.append((x if at is None else at)[:n_x], np.zeros(model.n)))
         except ServoError:
             continue
+        other = JetEquations(near, t, conditions)
         y, residual_there = _best(other, aim)
         if residual_there < residual or not np.isfinite(residual):
-            invariants, x, residual = other, y, residual_there
-    return invariants, x, residual
+            equations, x, residual = other, y, residual_there
+    return equations, x, residual
 
 
-def _at_guess(invariants, x, residual, aim, guessed):
+def _at_guess(equations, x, residual, aim, guessed):
     """The start with free values exactly as guessed, if that is consistent."""
     guessed = np.array(guessed)
     if not guessed.any():
         return x, residual
-    moved = _settle(invariants, np.where(guessed, aim.reference, x), replace(aim, movable=aim.movable & ~guessed))
-    residual_there = np.abs(invariants.scaled(moved)).max(initial=0.0)
+    moved = gauss_newton(equations, np.where(guessed, aim.reference, x), replace(aim, movable=aim.movable & ~guessed))
+    residual_there = np.abs(equations.scaled(moved)).max(initial=0.0)
     return (moved, float(residual_there)) if residual_there < TOLERANCE else (x, residual)
 
 
-def _starts(aim, tries):
+def _starts(aim):
     """The reference, then points farther and farther from it."""
     yield aim.reference
     spread = (1.0 + np.abs(aim.reference)) * aim.movable / np.sqrt(aim.weights)
     rng = np.random.default_rng(SEED)
-    for attempt in range(1, tries):
+    for attempt in range(1, TRIES):
         yield aim.reference + attempt * FARTHER * rng.uniform(-1.0, 1.0, len(spread)) * spread
 
 
-def _best(invariants, aim, tries=TRIES):
-    """The projection of the reference onto the invariants; if it fails, from perturbed points."""
+def _best(equations, aim):
+    """The projection of the reference onto the solutions; if it fails, from perturbed points."""
     best, smallest = aim.reference, np.inf
-    for first in _starts(aim, tries):
-        x = _nearest(invariants, _settle(invariants, first, aim), aim)
-        residual = np.nan_to_num(np.abs(invariants.scaled(x)), nan=np.inf).max(initial=0.0)
+    for first in _starts(aim):
+        x = _nearest(equations, gauss_newton(equations, first, aim), aim)
+        residual = np.nan_to_num(np.abs(equations.scaled(x)), nan=np.inf).max(initial=0.0)
         if residual < smallest:
             best, smallest = x, residual
         if smallest < TOLERANCE:
@@ -170,45 +276,48 @@ def _step(value, jacobian, aim):
     return full
 
 
-def _settle(invariants, x, aim, iterations=60):
-    """Damped Gauss-Newton with least steps."""
-    value, jacobian = invariants(x)
-    norm = np.abs(invariants.scaled(x)).max(initial=0.0)
+def gauss_newton(equations, x, aim, iterations=60):
+    """Damped Gauss-Newton with least steps.
+
+    A step is judged by the gradients at its start: relative to gradients that shrink along it, residuals that fall
+    would seem to rise.
+    """
     for _ in range(iterations):
+        value, jacobian = equations(x)
+        size = gradient_sizes(jacobian, x)
+        norm = np.abs(value / size).max(initial=0.0)
         if norm < REACHED:
             break
         step = _step(-value, jacobian, aim)
         damping = 1.0 / max(1.0, np.max(np.abs(step) / (1.0 + np.abs(x)), initial=0.0))
         for _ in range(15):
             trial = x + damping * step
-            new = np.abs(invariants.scaled(trial)).max(initial=0.0)
-            if new < norm:
+            if np.abs(equations(trial)[0] / size).max(initial=0.0) < norm:
                 break
             damping /= 3
         else:
-            break
-        x, norm = trial, new
-        value, jacobian = invariants(x)
-    return x
-
-
-def _nearest(invariants, x, aim, iterations=40):
-    """The point of the invariants nearest the reference, by successive projection."""
-    for _ in range(iterations):
-        value, jacobian = invariants(x)
-        with np.errstate(all="ignore"):
-            trial = aim.reference + _step(-value - jacobian @ (aim.reference - x), jacobian, aim)
-        trial = _settle(invariants, trial, aim, 12)
-        distance, before = (np.sum((aim.weights * (y - aim.reference)) ** 2) for y in (trial, x))
-        if np.abs(invariants.scaled(trial)).max(initial=0.0) > TOLERANCE or not distance < before * (1 - 1e-12):
             break
         x = trial
     return x
 
 
-def _free(invariants, x, aim, guess):
-    """Names that the invariants leave free: guessed ones if possible, then low derivatives."""
-    _, jacobian = invariants(x)
+def _nearest(equations, x, aim, iterations=40):
+    """The solution nearest the reference, by successive projection."""
+    for _ in range(iterations):
+        value, jacobian = equations(x)
+        with np.errstate(all="ignore"):
+            trial = aim.reference + _step(-value - jacobian @ (aim.reference - x), jacobian, aim)
+        trial = gauss_newton(equations, trial, aim, 12)
+        distance, before = (np.sum((aim.weights * (y - aim.reference)) ** 2) for y in (trial, x))
+        if np.abs(equations.scaled(trial)).max(initial=0.0) > TOLERANCE or not distance < before * (1 - 1e-12):
+            break
+        x = trial
+    return x
+
+
+def free_names(equations, x, aim, guess):
+    """Names that the equations leave free: guessed ones if possible, then low derivatives."""
+    _, jacobian = equations(x)
     rows = np.sqrt((jacobian**2).sum(axis=1))
     scaled = jacobian / np.where(rows > 0, rows, 1.0)[:, None]
     movable = np.flatnonzero(aim.movable)
@@ -224,29 +333,78 @@ def _free(invariants, x, aim, guess):
     return tuple(aim.names[i] for i in movable if i not in determined)
 
 
-def _refuse(invariants, aim, held, x):
-    """Raise InconsistentStart: a held value contradicts an invariant, or no state satisfies one."""
-    residuals = np.abs(invariants.scaled(x))
-    worst, largest = invariants.names[int(np.argmax(residuals))], float(residuals.max())
-    loosened, residual = _best(invariants, replace(aim, movable=np.ones(len(aim.names), dtype=bool)), tries=2)
+def _branches(equations, x, aim, model):
+    """A state and others with the same held and free values that guess and reference do not exclude, (b, n_z).
+
+    Newton's method starts at the mirror image of the values that are sought, and at a few random points.
+    """
+    found, rng = [x], np.random.default_rng(SEED)
+    for attempt in range(SEARCHED if aim.movable.any() else 0):
+        signs, far = rng.choice([-1.0, 1.0], len(x)), rng.uniform(-FAR, FAR, len(x)) * (1.0 + np.abs(x))
+        first = np.where(aim.movable, x * signs + far if attempt else -x, x)
+        y = gauss_newton(equations, first, aim, SEARCH_STEPS)
+        residual = np.nan_to_num(np.abs(equations.scaled(y)), nan=np.inf).max(initial=0.0)
+        same = residual < TOLERANCE and any(_same_motion(y, z, model) for z in found)
+        if residual < TOLERANCE and not same and not _clear_choice(x, y, aim, model):
+            found.append(y)
+    return np.array(found)
+
+
+def _clear_choice(x, y, aim, model):
+    """Whether a guessed value tells two states apart, or the reference is much nearer the first of them.
+
+    Nearness is judged by the lowest derivatives in which they differ.
+    """
+    differ = np.abs(y - x) > DISTINCT * (1.0 + np.abs(x))
+    levels = np.maximum(0, np.arange(len(x)) - model.nq + model.n) // model.n
+    lowest = differ & (levels == levels[differ].min())
+    between, way = (y - x)[lowest], (aim.reference - x)[lowest]
+    return bool(np.any(differ & (aim.weights > 1.0)) or way @ between < NEARER * (between @ between))
+
+
+def _same_motion(x, y, model):
+    """Whether states differ by whole turns of coordinates only, or by the sign of a quaternion."""
+    nq, small = model.nq, DISTINCT * (1.0 + np.abs(y))
+    if np.any(np.abs(x - y)[nq:] > small[nq:]):
+        return False
+    turned = x[:nq] - y[:nq]
+    turned -= 2 * np.pi * np.round(turned / (2 * np.pi))
+    opposite = bool(model.reduction.mechanism.q.invariants) and np.all(np.abs(x + y)[:nq] <= small[:nq])
+    return opposite or bool(np.all(np.abs(turned) <= small[:nq]))
+
+
+def _refuse(equations, aim, held, x):
+    """Raise InconsistentStart: a held value contradicts an equation, or no state satisfies one."""
+    residuals = np.abs(equations.scaled(x))
+    alone, all_movable = equations.without_conditions(), replace(aim, movable=np.ones(len(aim.names), dtype=bool))
+    loosened, residual = _best(alone, all_movable)
+    if not residual < TOLERANCE:
+        loosened = gauss_newton(alone, x, all_movable)
+        residual = np.abs(alone.scaled(loosened)).max(initial=0.0)
     if held and residual < TOLERANCE:
-        moved = {n: float(loosened[aim.names.index(n)]) for n in held}
+        left = dict(zip(equations.rows, equations(loosened)[0], strict=True))
+        states = dict(zip(aim.names, loosened, strict=True))
+        moved = {name: float(states[name] if name in states else held[name] + left[name]) for name in held}
         change = max(moved, key=lambda n: abs(moved[n] - held[n]) / (1.0 + abs(held[n])))
+        largest, worst = max(zip(residuals, equations.rows, strict=True))
+        by_others = "the constraints together with the other held values"
+        what = f"the invariant {worst!r} (residual {largest:.2e})" if worst in alone.rows else by_others
         raise InconsistentStart(
-            f"{change} = {held[change]:g} contradicts the invariant {worst!r} (residual {largest:.2e}).",
+            f"{change} = {held[change]:g} contradicts {what}.",
             "Held values satisfy every constraint and its time derivatives.",
             nearest=f"{change} = {moved[change]:.9g}.",
-            do="Hold fewer values, or pass this one in guess={...}.",
+            do=f"Hold fewer values{', or pass this one in guess={...}' if change in states else ''}.",
             held=change,
             value=float(held[change]),
             invariant=worst,
-            residual=largest,
+            residual=float(largest),
             nearest_value=moved[change],
         )
+    largest, worst = max(zip(residuals, equations.rows, strict=True))
     raise InconsistentStart(
         f"The search for a consistent start ended with the residual {largest:.2e} of the invariant {worst!r}.",
         "A start satisfies every constraint and its time derivatives.",
         do="Pass a guess={...} nearer to the motion, or check that the program can hold at this time.",
         invariant=worst,
-        residual=largest,
+        residual=float(largest),
     )

@@ -28,12 +28,9 @@ from servoctl.spec.packing import packed, unpacked
 from servoctl.spec.parameters import Parameters
 from servoctl.spec.program import Program
 
-MOST_BYTES = 2**28  # largest size of all entries: beyond it the least recently used are deleted until half is left
-WRITES = 50  # writes of a process from one check of that size to the next
 SETTLED = 1.0  # s: sources that are newer than this before they were loaded may have been loaded in another version
 
 _LOADED = time.time()
-_written = 0
 
 
 class Store:
@@ -182,42 +179,17 @@ def _read(path):
     if path is None:
         return None
     try:
-        content = read_cached(path)
-        with contextlib.suppress(OSError):
-            os.utime(path)
-        return pickle.loads(content)
+        return pickle.loads(read_cached(path))
     except Exception:  # an undamaged entry may hold objects of another build of a library
         return None
 
 
 def _write(path, entry):
-    global _written
     if path is None:
         return
     try:
         content = pickle.dumps(entry)
     except Exception:  # expressions do not pickle: CasADi raises a bare Exception
         return
-    with contextlib.suppress(OSError):
-        with replacing(path) as temporary:
-            Path(temporary).write_bytes(content)
-        if _written % WRITES == 0:
-            _prune(path.parent)
-        _written += 1
-
-
-def _prune(directory):
-    """Delete the least recently used entries if all together are too large."""
-    entries = []
-    for entry in os.scandir(directory):
-        with contextlib.suppress(OSError):  # another process removed it
-            entries.append((entry.stat().st_mtime, entry.stat().st_size, entry.path))
-    total = sum(size for _, size, _ in entries)
-    if total <= MOST_BYTES:
-        return
-    for _, size, path in sorted(entries):
-        if total <= MOST_BYTES / 2:
-            break
-        with contextlib.suppress(OSError):
-            os.unlink(path)
-        total -= size
+    with contextlib.suppress(OSError), replacing(path) as temporary:
+        Path(temporary).write_bytes(content)

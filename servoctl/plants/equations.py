@@ -7,10 +7,13 @@ import casadi as ca
 import numpy as np
 
 from servoctl.codegen.folding import folded
+from servoctl.errors import SpecificationError
 from servoctl.model.equations import Invariants
 from servoctl.reduction.appell import plant_accelerations, require_inertia
 from servoctl.reduction.hidden import complete
-from servoctl.reduction.manifold import Context
+from servoctl.reduction.manifold import Context, sample
+from servoctl.reduction.orders import Orders
+from servoctl.reduction.reduce import WINDOW, strong
 from servoctl.reduction.rows import as_rows
 
 LATEST = 32  # plants whose equations stay in memory
@@ -29,18 +32,21 @@ class PlantEquations:
         Indices of the velocities with viscous damping.
     lagged : tuple of int
         Indices of the actuators that lag behind their command.
+    values : tuple of float, optional
+        Parameters at which orders and pivots are decided; default: those of the mechanism.
 
     Attributes
     ----------
-    choices : (str, tuple of int, tuple of int)
-        Forces, damped velocities and lagging actuators.
+    choices : (str, tuple of int, tuple of int, tuple of float or None)
+        Forces, damped velocities, lagging actuators and parameters.
     functions : dict of str to Compiled
         Compiled functions by name.
     """
 
-    def __init__(self, mechanism, forces, damped, lagged):
+    def __init__(self, mechanism, forces, damped, lagged, values=None):
         q = self.q = mechanism.q
-        self.mechanism, self.choices, self.lagged = mechanism, (forces, damped, lagged), lagged
+        self.mechanism, self.choices, self.lagged = mechanism, (forces, damped, lagged, values), lagged
+        self.values = mechanism.parameters.values() if values is None else np.array(values)
         self.functions = {}
         self.forces = _expression(forces, mechanism)
         self.velocity = ca.vertcat(*q.gamma(1))
@@ -66,7 +72,7 @@ class PlantEquations:
     def _material(self):
         """Rows of the material constraints, which have full rank, and points of their manifold."""
         m = self.mechanism
-        context = Context(m.parameters.symbols, m.parameters.values(), (0.1, 1.1), {})
+        context = Context(m.parameters.symbols, self.values, WINDOW, {})
         rows, _, points, _ = complete(self.q, as_rows(self.q, m.constraints, "material", context), context)
         require_inertia(m, rows, points)
         return rows, points
@@ -79,7 +85,7 @@ class PlantEquations:
 
     def _clearly_positive(self, values):
         """Whether the mass matrix is far from singular at all points."""
-        M = np.array(self._masses(values)).reshape(self.q.n, -1, self.q.n).swapaxes(0, 1)
+        M = self._masses(values).full().reshape(self.q.n, -1, self.q.n).swapaxes(0, 1)
         size = np.sqrt(np.maximum(np.diagonal(M, axis1=1, axis2=2), 0.0))
         if not np.isfinite(M).all() or not size.all():
             return False
@@ -88,28 +94,71 @@ class PlantEquations:
     @cached_property
     def _masses(self):
         """A function of the parameters: the mass matrices at all points, side by side."""
+        return self._at_points(self.mechanism.mass)
+
+    def _at_points(self, matrix):
+        """A function of the parameters: the values of a matrix at all points, side by side."""
         points = self._material[1]
         symbols, state = ca.vertcat(*self.mechanism.parameters.symbols), ca.vertcat(*self.q, self.velocity)
         at = np.vstack([points.t, points.jet(0), points.jet(1)]).astype(float)
-        mass = ca.Function("mass", [self.q.t, state, symbols], [ca.densify(self.mechanism.mass)])
-        sides = [mass(x[0], x[1:], symbols) for x in at.T]
-        return ca.Function("masses", [symbols], [ca.horzcat(*sides)])
+        f = ca.Function("at_points", [self.q.t, state, symbols], [ca.densify(matrix)])
+        return ca.Function("at_points", [symbols], [ca.horzcat(*(f(x[0], x[1:], symbols) for x in at.T))])
+
+    @cached_property
+    def orders(self):
+        """What the orders of the material constraints rest on."""
+        rows, points = self._material
+        return Orders(tuple(rows), tuple(rows), 2, points)
+
+    def hold(self, values):
+        """Whether orders and pivots may stay as they are with other parameters (n_p,) or (n_p, N)."""
+        values = _cases(values)
+        if np.array_equal(values, np.broadcast_to(self.values[:, None], values.shape)):
+            return True
+        if self.orders and not all(self.orders.hold(self._points(case)) for case in values.T):
+            return False
+        return bool(strong(self._pivot_sizes(values), self._usual_pivots).all())
+
+    @cached_property
+    def _usual_pivots(self):
+        return self._pivot_sizes(self.values[:, None])
+
+    def _pivot_sizes(self, values):
+        """Least sizes of the pivots over all points (pivots, N) with parameters (n_p, N)."""
+        pivots = np.abs(self._pivots(values).full())
+        return pivots.reshape(len(pivots), values.shape[1], -1).min(axis=2, initial=np.inf)
+
+    def _points(self, values):
+        """Points of the material constraints with other parameters."""
+        rows, points = self._material
+        return sample(self.q, rows, 2, Context(points.parameters, values, WINDOW, {}), starts=points)
+
+    @cached_property
+    def _pivots(self):
+        """A function of the parameters: the pivots of the accelerations at all points, side by side."""
+        return self._at_points(ca.vertcat(*self._solved[1]))
 
     @property
     def constrained(self):
         """Whether the state has invariants: material constraints or those of the kinematics."""
         return bool(self.mechanism.constraints or self.q.invariants)
 
-    @cached_property
+    @property
     def acceleration(self):
-        """γ'' from [M G_mᵀ; G_m 0] [γ''; -λ] = [forces; ...] with ideal material constraints."""
+        """γ'' with ideal material constraints."""
+        return self._solved[0]
+
+    @cached_property
+    def _solved(self):
+        """γ'' from [M G_mᵀ; G_m 0] [γ''; -λ] = [forces; ...], and the pivots."""
         q, (rows, points) = self.q, self._material
         acceleration, zero = ca.vertcat(*q.gamma(2)), ca.SX.zeros(q.n)
         second = [q.derivatives([row.expression], 2 - row.order)[-1][0] for row in rows]
         second = ca.substitute(ca.vertcat(*second), acceleration, zero) if rows else ca.SX(0, 1)
         driven = self.mechanism.E @ self.force + self.d + self.forces + self.resisting
         force = driven - ca.substitute(self.mechanism.balance, acceleration, zero)
-        return ca.cse(plant_accelerations(self.mechanism, rows, force, -second, points))
+        solution, pivots = plant_accelerations(self.mechanism, rows, force, -second, points)
+        return ca.cse(solution), pivots
 
     @cached_property
     def state_rates(self):
@@ -165,10 +214,12 @@ class PlantEquations:
         return self.function("accelerations", [self.acceleration])
 
     def outputs(self):
-        """The mechanism's named outputs."""
-        acceleration = ca.vertcat(*self.q.gamma(2))
-        outputs = self.mechanism.outputs.values()
-        return self.function("outputs", [ca.substitute(e, acceleration, self.acceleration) for e in outputs])
+        """The mechanism's named outputs; for those of order 3 and above inputs and disturbances are held."""
+        outputs, jets = list(self.mechanism.outputs.values()), [self.acceleration]
+        for _ in range(2, max(map(self.q.order, outputs), default=0)):
+            jets.append(ca.jacobian(jets[-1], self.q.t) + ca.jtimes(jets[-1], self.state, self.state_rates))
+        symbols = ca.vertcat(*(s for k in range(2, 2 + len(jets)) for s in self.q.gamma(k)))
+        return self.function("outputs", [ca.substitute(e, symbols, ca.vertcat(*jets)) for e in outputs])
 
     def constraints(self):
         """Names and values of the invariants of the state, level by level."""
@@ -207,9 +258,39 @@ def _expression(forces, mechanism):
     return mechanism.q.from_function(ca.Function.deserialize(forces), mechanism.parameters.symbols)[0]
 
 
+def _cases(values):
+    """Parameters (n_p,) or (n_p, N) as columns (n_p, N)."""
+    values = np.asarray(values, dtype=float)
+    return values if values.ndim == 2 else values[:, None]
+
+
 def plant_equations(mechanism, *choices):
     """The `PlantEquations` of a mechanism, derived once for all plants that differ only in numbers."""
     return _latest(_Identity(mechanism), choices)
+
+
+def equations_at(equations, values):
+    """The same equations with parameters (n_p,) or (n_p, N), derived again at the first case that requires it.
+
+    Raises
+    ------
+    SpecificationError
+        If the cases need different equations.
+    """
+    if equations.hold(values):
+        return equations
+    cases = _cases(values).T
+    case = next(case for case in cases if not equations.hold(case))
+    again = plant_equations(equations.mechanism, *equations.choices[:-1], tuple(case.tolist()))
+    if len(cases) > 1 and not again.hold(values):
+        names = equations.mechanism.parameters.names
+        raise SpecificationError(
+            "The orders of material constraints, or the pivots, of some cases are not those of the others.",
+            "The cases of one call share the equations of the plant.",
+            do="Run the cases in groups of similar numbers, or one by one with sv.sweep.",
+            case=dict(zip(names, case.tolist(), strict=True)),
+        )
+    return again
 
 
 @lru_cache(LATEST)

@@ -8,7 +8,7 @@ import numpy as np
 from servoctl.checks import column, finite, interval, mapping, numbers_by_name
 from servoctl.codegen.function import compiled
 from servoctl.errors import SpecificationError, unknown
-from servoctl.plants.equations import PlantEquations, plant_equations
+from servoctl.plants.equations import PlantEquations, equations_at, plant_equations
 from servoctl.spec.mechanism import Mechanism, require_known
 from servoctl.values import Value
 
@@ -19,7 +19,8 @@ def plant(
 ) -> "Plant":  # fmt: skip
     """Make the plant of a mechanism: the machine that a controller acts on.
 
-    Plants of the same mechanism and forces share their equations, so that other numbers take no time.
+    Plants of the same mechanism and forces share their equations, so that other numbers take no time, unless with these
+    a material constraint has another order or a pivot vanishes.
 
     Parameters
     ----------
@@ -69,8 +70,9 @@ def plant(
     delay = numbers_by_name(delay, actuators, "actuator", "delay", low=0.0)
     damped = tuple(i for i, name in enumerate(names) if name in damping)
     lagged = tuple(i for i, name in enumerate(actuators) if name in lag)
-    equations = plant_equations(mechanism, _forces(mechanism, forces, names), damped, lagged)
+    equations = plant_equations(mechanism, _forces(mechanism, forces, names), damped, lagged, None)
     equations.require_inertia(values)
+    equations = equations_at(equations, values)
     rates = [1.0 / lag[actuators[i]] for i in lagged]
     numbers = np.concatenate([values, [damping[names[i]] for i in damped], rates])
     state_names = (*mechanism.q.names, *mechanism.q.jet_names(1), *(actuators[i] for i in lagged))

@@ -31,6 +31,8 @@ class Realisation:
         Indices of the quasi-coordinates.
     numbers : (b, n, N) array
         Bᵀ at the points where the split was chosen.
+    decided : tuple of Row
+        Rows whose relative degrees weight redundant actuators.
     """
 
     B: ca.SX
@@ -38,6 +40,7 @@ class Realisation:
     dependent: tuple
     independent: tuple
     numbers: np.ndarray
+    decided: tuple = ()
 
     def __repr__(self):
         return f"Realisation({self.B.shape[1]} directions, dependent coordinates {self.dependent})"
@@ -88,9 +91,9 @@ def realisation(mechanism, program, constraints, points):
         for kind in ("program", "material")
     )
     if program.by == "ideal":
-        directions, actuation = G.T, None
+        directions, actuation, decided = G.T, None, ()
     else:
-        directions, actuation = _actuator_directions(mechanism, program, constraints, points)
+        directions, actuation, decided = _actuator_directions(mechanism, program, constraints, points)
     B = ca.horzcat(directions, G_m.T)
     numbers, sizes = points.matrix(B.T)
     rank, best = decide_all(numbers, sizes)
@@ -108,11 +111,15 @@ def realisation(mechanism, program, constraints, points):
     independent = tuple(i for i in range(q.n) if i not in dependent)
     cleaned = clean(numbers, sizes)
     regular = [p for p, rank in enumerate(decide_each(cleaned[:, list(dependent)])) if rank.rank == len(cleaned)]
-    return Realisation(B, actuation, dependent, independent, cleaned[:, :, regular or [best]])
+    return Realisation(B, actuation, dependent, independent, cleaned[:, :, regular or [best]], decided)
 
 
 def _actuator_directions(mechanism, program, constraints, points):
-    """E, or E W⁻¹Pᵀ where there are more actuators than residuals."""
+    """E, or E W⁻¹Pᵀ where there are more actuators than residuals; the matrix of the actuation; the rows behind P.
+
+    With as many independent actuators as residuals, as for two motors on one trolley, the program determines E u; P is
+    then any matrix with the row space of E, and W⁻¹Pᵀμ the u of least norm.
+    """
     q = mechanism.q
     k, m = len(program.residuals), len(mechanism.actuators)
     material = [row for row in constraints if row.kind == "material"]
@@ -134,9 +141,12 @@ def _actuator_directions(mechanism, program, constraints, points):
     if unknown_weights:
         raise unknown(unknown_weights[0], mechanism.actuators, "actuator")
     if k == m:
-        return mechanism.E, ca.SX.eye(m)
+        return mechanism.E, ca.SX.eye(m), ()
     inverse_weights = ca.diag(ca.vertcat(*(1 / ca.SX(program.weights.get(name, 1.0)) for name in mechanism.actuators)))
-    P = decoupling(mechanism, [row for row in constraints if row.kind == "program"], material, points)
+    if k == independent:
+        actuation = inverse_weights @ _row_space(mechanism, material, points, k).T
+        return mechanism.E @ actuation, actuation, ()
+    P, decided = decoupling(mechanism, [row for row in constraints if row.kind == "program"], material, points)
     rank_P = decide_all(*points.matrix(P))[0].rank
     if rank_P < k:
         raise NotRealisable(
@@ -149,11 +159,19 @@ def _actuator_directions(mechanism, program, constraints, points):
             rank=rank_P,
         )
     actuation = inverse_weights @ P.T
-    return mechanism.E @ actuation, actuation
+    return mechanism.E @ actuation, actuation, decided
+
+
+def _row_space(mechanism, material, points, k):
+    """k independent rows of E, beside material rows of N E: what the inputs do to the motion, (k, m) SX."""
+    rows = mechanism.E
+    if material:
+        rows, _ = plant_accelerations(mechanism, material, rows, ca.SX.zeros(len(material), rows.shape[1]), points)
+    return rows[sorted(decide_all(*points.matrix(rows))[0].rows[:k]), :]
 
 
 def decoupling(mechanism, rows, material, points):
-    """P = ∂φ^(r)/∂u (k, m), with each residual differentiated along the plant until the actuation appears.
+    """P = ∂φ^(r)/∂u (k, m), with each residual differentiated along the plant until the actuation appears; the rows.
 
     For relative degree 2 P = G N E with N = M⁻¹, or T_m(T_mᵀMT_m)⁻¹T_mᵀ beside material rows.
     """
@@ -162,11 +180,10 @@ def decoupling(mechanism, rows, material, points):
     rest = ca.substitute(mechanism.balance, acceleration, ca.SX.zeros(q.n))
     second = ca.vertcat(*(q.derivatives([row.expression], 2 - row.order)[-1][0] for row in material))
     second = ca.substitute(second, acceleration, ca.SX.zeros(q.n)) if material else ca.SX(0, 1)
-    moves = plant_accelerations(
-        mechanism, material, mechanism.E, ca.SX.zeros(len(material), mechanism.E.shape[1]), points
-    )
-    drift = plant_accelerations(mechanism, material, -rest, -second, points)
-    result = []
+    still = ca.SX.zeros(len(material), mechanism.E.shape[1])
+    moves, _ = plant_accelerations(mechanism, material, mechanism.E, still, points)
+    drift, _ = plant_accelerations(mechanism, material, -rest, -second, points)
+    result, decided = [], []
     for row in rows:
         expression = q.derivatives([row.expression], max(0, 2 - row.order))[-1][0] if row.order < 2 else row.expression
         level = max(row.order, 2)
@@ -174,9 +191,11 @@ def decoupling(mechanism, rows, material, points):
             coefficients = ca.jacobian(expression, q.jet(level)) @ moves
             if np.any(clean(*points.matrix(coefficients))) or level > 2:
                 break
+            row = row.resting_on(coefficients.T, ca.SX.ones(coefficients.numel()))
             expression = q.derivatives([ca.substitute(expression, acceleration, drift)], 1)[-1][0]
         result.append(coefficients)
-    return ca.cse(ca.vertcat(*result))
+        decided.append(row)
+    return ca.cse(ca.vertcat(*result)), tuple(decided)
 
 
 def _saddle(mechanism, material):
@@ -187,10 +206,11 @@ def _saddle(mechanism, material):
 
 
 def plant_accelerations(mechanism, material, forces, second, points):
-    """γ'' of the plant: the upper part of [M G_mᵀ; G_m 0] [γ''; -λ] = [forces; second], (n, columns) SX."""
+    """γ'' of the plant, the upper part of [M G_mᵀ; G_m 0] [γ''; -λ] = [forces; second], (n, columns) SX; the pivots."""
     matrix = _saddle(mechanism, material)
     numbers = clean(*points.matrix(matrix))
-    return eliminate(matrix, ca.vertcat(forces, second), numbers)[0][: mechanism.q.n, :]
+    solution, pivots = eliminate(matrix, ca.vertcat(forces, second), numbers)
+    return solution[: mechanism.q.n, :], pivots
 
 
 def require_inertia(mechanism, material, points):

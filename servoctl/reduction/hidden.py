@@ -10,10 +10,22 @@ import casadi as ca
 import numpy as np
 
 from servoctl.errors import InconsistentStart, NotRealisable, SingularProgram, SpecificationError
-from servoctl.reduction.manifold import sample
-from servoctl.reduction.ranks import clean, decide, decide_all, decide_each, eliminate, generic
-from servoctl.reduction.rows import Row, dependence, leading, merge_uses, settle, vanishing_gradient
+from servoctl.reduction.manifold import POINTS_SEED, SPREAD, sample
+from servoctl.reduction.ranks import clean, decide, decide_each, eliminate, generic
+from servoctl.reduction.rows import (
+    Row,
+    dependence,
+    factors,
+    leading,
+    merge_uses,
+    settle,
+    slopes,
+    values_and_sizes,
+    vanishing_gradient,
+)
 from servoctl.tolerances import NOISE, RESOLVED
+
+DIVIDES = 1e-3  # of its usual size: a combination is not divided by a jet that is smaller at a point
 
 
 def complete(q, rows, context, starts=None):
@@ -32,7 +44,7 @@ def complete(q, rows, context, starts=None):
     -------
     rows : list of Row
     rank : Rank
-        Rank of the final leading matrix, with its margins.
+        Rank of the final leading matrix, with its margins; `dropped` is the largest of all leading matrices before it.
     points : Points
         Points of the final manifold.
     pivots : list of (str, SX)
@@ -49,7 +61,7 @@ def complete(q, rows, context, starts=None):
     InconsistentStart
         If no state satisfies the rows.
     """
-    rows, pivots, points = list(rows), [], starts
+    rows, pivots, points, dropped = list(rows), [], starts, 0.0
     while True:
         level = max([row.order for row in rows], default=0)
         points = sample(q, rows, level, context, starts=points)
@@ -61,12 +73,13 @@ def complete(q, rows, context, starts=None):
         if not rank.clear:
             raise _ill_conditioned(rows, rank)
         same = [p for p, other in enumerate(ranks) if other.rank == rank.rank]
+        dropped = max(dropped, rank.dropped)
         if rank.rank == len(rows):
-            return rows, rank, points.take(same), pivots
+            return rows, replace(rank, dropped=dropped), points.take(same), pivots
         combination = _lowest(q, rows, numbers[:, :, same], context, points)
         if combination.row.order < 0:
-            raise _dependent(rows, combination)
-        rows[combination.replaces] = combination.row
+            raise _dependent(q, rows, combination, context)
+        rows[combination.replaces] = replace(combination.row, parts=())
         pivots += [(f"combination of {combination.row.story}", pivot) for pivot in combination.pivots]
 
 
@@ -79,6 +92,7 @@ class _Combination:
     support: list  # indices of the combined rows
     points: object  # on the manifold of all rows but the replaced one
     pivots: list  # SX by which the combination divides
+    whole: Row  # the combination itself, before its order was settled
 
 
 def _lowest(q, rows, numbers, context, starts=None):
@@ -87,33 +101,110 @@ def _lowest(q, rows, numbers, context, starts=None):
     # constraints stay as they are written.
     order = sorted(range(len(rows)), key=lambda a: (rows[a].kind == "dynamics", rows[a].order, a))
     support, weights = dependence(numbers[order])
+    if not support:  # the ranks at single points and the dependence at all of them disagree
+        raise _ill_conditioned(rows, generic(decide_each(numbers))[0])
     support = [order[i] for i in support]
     top = max(rows[a].order for a in support)
     highest = ((a, w) for a, w in zip(support, weights, strict=True) if rows[a].order == top)
     b = max((rows[a].kind == "dynamics", w, a) for a, w in highest)[2]
-    combination = _combination(q, rows, b, support, numbers, context, starts)
-    if combination.row.order >= top:
-        support, numbers = _beside_manifold(q, rows, b, context)
-        combination = _combination(q, rows, b, support, numbers, context) if support else None
-        if combination is None or combination.row.order >= top:
-            raise vanishing_gradient(rows[b])
-    return combination
+    first = _combination(q, rows, b, support, numbers, context, starts)
+    if first.row.order < top and not _slopes_beside(q, rows, first, context).any():
+        return first
+    support, numbers = _beside_manifold(q, rows, b, context)
+    if support and all(rows[a].affine or rows[a].order < top for a in support):
+        combination = _combination(q, rows, b, support, numbers, context)
+        if combination.row.order < top:
+            return combination
+    return _divided(q, rows, first, context)
 
 
 def _combination(q, rows, b, support, numbers, context, starts=None):
     """Row b combined with the others of a support, with its order on the manifold of all other rows."""
     top = rows[b].order
-    _require_affine(rows, support, top)
+    _require_affine(q, rows, support, top, context)
     others = [a for a in support if a != b]
-    chi, pivots = _combine(q, rows, b, others, top, numbers)
+    parts, pivots = _combine(q, rows, b, others, top, numbers)
     names = [_derivative_name(rows[a], top - rows[a].order) for a in others]
     story = f"{rows[b].name} with {', '.join(names)}" if names else rows[b].name
-    rest = [row for a, row in enumerate(rows) if a != b]
     uses = merge_uses(*((rows[a].uses, top - rows[a].order) for a in support))
-    row, points = settle(q, replace(rows[b], expression=chi, order=top, uses=uses), rest, context, starts)
+    vanishing = sum((rows[a].vanishing for a in support), ())
+    expression = ca.cse(sum(parts))
+    chi = replace(rows[b], expression=expression, order=top, uses=uses, parts=tuple(parts), vanishing=vanishing)
+    row, points = settle(q, chi, rows[:b] + rows[b + 1 :], context, starts)
     if row is None:
-        raise _no_state(rest)
-    return _Combination(replace(row, story=story), b, support, points, pivots)
+        raise _no_state(rows[:b] + rows[b + 1 :])
+    return _Combination(replace(row, story=story), b, support, points, pivots, chi)
+
+
+def _slopes_beside(q, rows, combination, context):
+    """Slopes (n, N) of a combination in its highest jets where the other rows hold and the replaced one need not.
+
+    Where the slopes vanish beside the manifold of the other rows, too, they vanish identically.
+    """
+    level, points = combination.whole.order, combination.points
+    spread = 1.0 + SPREAD * np.random.default_rng(POINTS_SEED).uniform(-1.0, 1.0, points.z.shape)
+    values = slopes(q, combination.whole, level, replace(points, z=points.z * spread))
+    if not np.any(values):
+        return values
+    rest = [row for a, row in enumerate(rows) if a != combination.replaces]
+    return slopes(q, combination.whole, level, sample(q, rest, points.level, context))
+
+
+def _divided(q, rows, combination, context):
+    """A combination a γ_i^(k) whose jet is not zero at the solutions, divided by it: the row a = 0.
+
+    A path by its geometry and a wheel that rolls along it give such a combination: the speed times the angle between
+    the wheel and the path.
+    """
+    b, whole = combination.replaces, combination.whole
+    if len(combination.support) == 1:
+        raise vanishing_gradient(rows[b], *_factor(q, rows, b, context))
+    level = whole.order
+    beside = np.abs(_slopes_beside(q, rows, combination, context)).max(axis=1, initial=0.0)
+    i = int(np.argmax(beside))
+    jet = q.jet_names(level)[i]
+    if not np.abs(combination.points.jet(level)[i]).min(initial=np.inf) > DIVIDES * context.sizes.get(jet, 1.0):
+        raise vanishing_gradient(rows[b])  # at rest a = 0 would follow from nothing
+    rest = [row for a, row in enumerate(rows) if a != b]
+    row = replace(whole, expression=ca.densify(whole.gradient(q, level))[i], parts=())
+    row, points = settle(q, row, rest, context, combination.points)
+    if row is None or not 0 <= row.order < level:
+        raise vanishing_gradient(rows[b])
+    points = sample(q, [*rest, row], level, context, starts=points)
+    if not len(points.t) or np.any(clean(*values_and_sizes(whole, points))):
+        raise vanishing_gradient(rows[b])
+    return replace(combination, row=replace(row, story=f"{combination.row.story}, divided by {jet}"), points=points)
+
+
+def _factor(q, rows, b, context):
+    """A factor of row b, and the rows on whose solutions it vanishes; of others the one to divide by; else nothing."""
+    row, rest = rows[b], [row for a, row in enumerate(rows) if a != b]
+    level = max([row.order, q.order(row.expression), *(other.order for other in rest)])
+    found = factors(row.expression)
+    points = sample(q, rest, level, context)
+    if len(found) > 1 and len(points.t):
+        zero = [not np.any(clean(*points.evaluate([f]))) for f in found]
+        if any(zero):
+            left = ca.SX(1)
+            for f, vanishes in zip(found, zero, strict=True):
+                left = left if vanishes else left * f
+            other = replace(row, expression=left, order=max(q.order(left), 0))
+            soluble = ca.symvar(left) and len(sample(q, [*rest, other], level, context).t)
+            return (found[zero.index(True)], [other.name for other in rest]) if soluble else ()
+    points = sample(q, rows, level, context)
+    if len(found) > 1 and len(points.t):
+        return max(found, key=lambda f: np.abs(points.evaluate([f])[0]).min()), []
+    jets = [jet for jet in q.gamma(row.order) if _vanishes_with(row, jet, points)] if row.order else []
+    return (jets[0], []) if jets else ()
+
+
+def _vanishes_with(row, jet, points):
+    """Whether a row is a multiple of a jet."""
+    beside = replace(points, z=points.z + SPREAD * np.random.default_rng(POINTS_SEED).uniform(-1, 1, points.z.shape))
+    without = ca.substitute(row.expression, jet, 0)
+    return jet.element_hash() in {s.element_hash() for s in ca.symvar(row.expression)} and not np.any(
+        clean(*beside.evaluate([without]))
+    )
 
 
 def _beside_manifold(q, rows, b, context):
@@ -131,26 +222,27 @@ def _beside_manifold(q, rows, b, context):
 
 
 def _combine(q, rows, b, others, top, numbers):
-    """χ = ψ_b + Σ w_a D^(top - o_a) ψ_a with the w that cancels the leading gradient of row b."""
-    chi = q.derivatives([rows[b].expression], top - rows[b].order)[-1][0]
+    """The terms of χ = ψ_b + Σ w_a D^(top - o_a) ψ_a with the w that cancels the leading gradient of row b."""
     if not others:
-        return chi, []
+        return [rows[b].expression], []
     columns = sorted(decide(numbers[others, :, 0]).columns)
     matrix = ca.vertcat(*(rows[a].gradient(q) for a in others))[:, columns].T
     target = -rows[b].gradient(q)[:, columns].T
     w, pivots = eliminate(matrix, target, numbers[others][:, columns].swapaxes(0, 1))
-    for a, weight in zip(others, w.elements(), strict=True):
-        chi = chi + weight * q.derivatives([rows[a].expression], top - rows[a].order)[-1][0]
-    return ca.cse(chi), [p for p in pivots if ca.symvar(p)]
+    raised = (q.derivatives([rows[a].expression], top - rows[a].order)[-1][0] for a in others)
+    parts = [rows[b].expression, *(weight * e for weight, e in zip(w.elements(), raised, strict=True))]
+    return parts, [p for p in pivots if ca.symvar(p)]
 
 
 def _derivative_name(row, k):
     return row.name if k == 0 else f"D{'' if k == 1 else k}({row.name})"
 
 
-def _require_affine(rows, support, top):
-    nonlinear = [rows[a].name for a in support if rows[a].order == top and not rows[a].affine]
+def _require_affine(q, rows, support, top, context):
+    indices = [a for a in support if rows[a].order == top and not rows[a].affine]
+    nonlinear = [rows[a].name for a in indices]
     if nonlinear:
+        _refuse_factor(q, rows, indices, context)
         raise SpecificationError(
             f"The residual {nonlinear[0]!r} is nonlinear in its highest derivative and depends on other rows there.",
             "Hidden constraints are derived from rows that are linear in their highest derivatives.",
@@ -160,10 +252,25 @@ def _require_affine(rows, support, top):
         )
 
 
-def _dependent(rows, combination):
+def _refuse_factor(q, rows, indices, context):
+    """Refuse a row with a factor that vanishes on the solutions of the others: it follows from them."""
+    for b in indices:
+        factor, others = (*_factor(q, rows, b, context), None, None)[:2]
+        if others:
+            raise SpecificationError(
+                f"The residual {rows[b].name!r} has the factor {factor}, zero by {', '.join(map(repr, others))}.",
+                "Each residual restricts the motion beyond the others.",
+                do=f"Divide {rows[b].name!r} by {factor}.",
+                row=rows[b].name,
+                factor=str(factor),
+                rows=others,
+            )
+
+
+def _dependent(q, rows, combination, context):
     """The error of rows whose combination depends on t alone."""
     names, story = [rows[a].name for a in combination.support], combination.row.story
-    zero = not np.any(clean(*combination.points.evaluate([combination.row.expression])))
+    zero = not np.any(clean(*values_and_sizes(combination.row, combination.points)))
     listed = ", ".join(names)
     if any(rows[a].kind == "dynamics" for a in combination.support):
         program = [name for name in names if name != combination.row.name] or names
@@ -176,6 +283,7 @@ def _dependent(rows, combination):
             combination=story,
         )
     if zero:
+        _refuse_factor(q, rows, combination.support, context)
         return SpecificationError(
             f"The constraints {listed} are dependent: the combination {story} vanishes identically.",
             "Constraints must be independent of each other.",
@@ -194,15 +302,21 @@ def _dependent(rows, combination):
 
 def _no_common_state(q, rows, context):
     """The error of rows that no point satisfies: a contradiction among them, where there is one."""
-    points = sample(q, [], max(row.order for row in rows), context)
-    numbers, sizes = leading(q, rows, points)
-    rank, _ = decide_all(numbers, sizes)
-    if rank.clear and rank.rank < len(rows):
-        same = [p for p, other in enumerate(decide_each(numbers)) if other.rank == rank.rank]
-        combination = _lowest(q, rows, numbers[:, :, same], context)
+    given, points = rows, sample(q, [], max(row.order for row in rows), context)
+    while True:
+        numbers, sizes = leading(q, rows, points)
+        ranks = decide_each(clean(numbers, sizes))
+        rank, _ = generic(ranks)
+        if not rank.clear or rank.rank == len(rows):
+            return _no_state(given)
+        same = [p for p, other in enumerate(ranks) if other.rank == rank.rank]
+        try:
+            combination = _lowest(q, rows, numbers[:, :, same], context)
+        except InconsistentStart:  # some of the rows alone have no common state
+            return _no_state(given)
         if combination.row.order < 0:
-            return _dependent(rows, combination)
-    return _no_state(rows)
+            return _dependent(q, rows, combination, context)
+        rows = [combination.row if a == combination.replaces else row for a, row in enumerate(rows)]
 
 
 def _no_state(rows):

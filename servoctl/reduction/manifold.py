@@ -268,14 +268,16 @@ def sample(q, rows, level, context, starts=None, flow=None):
 
 
 def _random_starts(q, level, context):
-    """Times (2 POINTS,) in the window and jets (nz, 2 POINTS) about the guess, in [-1, 1] where there is none."""
+    """Times (2 POINTS,) in the window and jets (nz, 2 POINTS) about the guess, about zero where there is none."""
     rng, nz = np.random.default_rng(POINTS_SEED), q.nq + level * q.n
-    centre, spread = np.zeros(nz), np.ones(nz)
+    centre = np.zeros(nz)
+    usual = np.tile(context.lengths, level + 1) if context.lengths else np.ones(nz)
+    spread = usual.copy()
     for name, value in context.guess.items():
         for k in range(level + 1):
             if name in q.jet_names(k):
                 i = q.jet_names(k).index(name) + (q.nq + (k - 1) * q.n if k else 0)
-                size = abs(value) + SPREAD * context.sizes.get(name, 1.0)
+                size = abs(value) + SPREAD * context.sizes.get(name, usual[i])
                 centre[i], spread[i] = value / factorial(k), context.spread * size / factorial(k)
     z = centre[:, None] + spread[:, None] * rng.uniform(-1.0, 1.0, (nz, 2 * POINTS))
     return np.asarray(rng.uniform(*context.window, 2 * POINTS), dtype=REAL), z
@@ -303,7 +305,9 @@ class Context:
     spread : float
         Relative width of the starts about guessed values.
     sizes : dict of str to float
-        Usual sizes of jets, by which a guess near zero is spread; default 1 each.
+        Usual sizes of jets, by which a guess near zero is spread; default `lengths`.
+    lengths : tuple of float
+        Usual sizes of the coordinates, about which jets without a guess are spread; default 1 each.
     book : Book
         Tapes of the scalars that were evaluated.
     """
@@ -314,4 +318,5 @@ class Context:
     guess: dict
     spread: float = SPREAD
     sizes: dict = field(default_factory=dict)
+    lengths: tuple = ()
     book: Book = field(default_factory=Book, repr=False, compare=False)

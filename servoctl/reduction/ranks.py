@@ -5,8 +5,8 @@ eliminated with complete pivoting, in extended precision where the platform has 
 extended precision), or resolved in double precision, or between these: ill-conditioned.
 
 Symbolic elimination keeps its pivots for all later instants: it takes the pivot with the least fill-in (Markowitz)
-among those of sufficient size at the points, and leaves out entries that vanish at all of them. It returns the
-pivots, whose size along a motion shows when the choice has become bad.
+among those of sufficient size at the points, and leaves out entries that vanish identically. It returns the pivots,
+whose size along a motion shows when the choice has become bad.
 """
 
 from dataclasses import dataclass
@@ -15,6 +15,7 @@ import casadi as ca
 import numpy as np
 
 from servoctl.errors import SingularProgram
+from servoctl.jets.identity import spread, vanish
 from servoctl.jets.tape import divide, multiply, subtract
 from servoctl.tolerances import CUTOFF, ENTRY, NOISE, REFINEMENTS, RESOLVED, TINY
 
@@ -225,7 +226,7 @@ def eliminate(matrix, right, numbers):
     matrix : (n, n) SX
     right : (n, m) SX
     numbers : (n, n, N) array
-        A at N points, cleaned of rounding.
+        A at N points, cleaned of rounding, where pivots are chosen.
 
     Returns
     -------
@@ -240,7 +241,8 @@ def eliminate(matrix, right, numbers):
     """
     n, m = right.shape
     system = _System(matrix, right, numbers)
-    order = [system.step() for _ in range(n)]
+    with np.errstate(all="ignore"):  # at some random points a pivot has no value
+        order = [system.step() for _ in range(n)]
     solution, rows, rhs = [None] * n, system.rows, system.rhs
     for i, j in reversed(order):
         others = [(a, solution[c]) for c, (a, _) in rows[i].items() if c != j]
@@ -254,17 +256,21 @@ def eliminate(matrix, right, numbers):
 class _System:
     """A system under elimination.
 
-    `rows` has for each row its entries by column, an SX scalar with its equilibrated numbers, and `candidates` the
-    columns whose entries may be pivots; `open` lists the rows that were no pivot rows yet, `members` those of a column.
+    `rows` has for each row its entries by column: an SX scalar, its equilibrated numbers at the points where pivots are
+    chosen, and behind these its values at random points, where it is zero only if it vanishes identically.
+    `candidates` are the columns whose entries may be pivots; `open` lists the rows that were no pivot rows yet,
+    `members` those of a column.
     """
 
     def __init__(self, matrix, right, numbers):
         n = matrix.shape[0]
         scaled = np.moveaxis(equilibrate(np.moveaxis(numbers, 2, 0))[0], 0, 2).astype(float)
-        entries = dict(zip(zip(*matrix.sparsity().get_triplet(), strict=True), matrix.nonzeros(), strict=True))
+        self.points = scaled.shape[2]
+        entries, anywhere = matrix.nonzeros(), spread(matrix.nonzeros())
         self.rows = [{} for _ in range(n)]
-        for i, j in zip(*(places.tolist() for places in np.nonzero(np.any(scaled, axis=2))), strict=True):
-            self.rows[i][j] = entries[i, j], scaled[i, j]
+        for i, j, entry, values in zip(*matrix.sparsity().get_triplet(), entries, anywhere, strict=True):
+            if scaled[i, j].any() or not vanish(values):
+                self.rows[i][j] = entry, np.append(scaled[i, j], values)
         self.rhs = (
             [right[i, :].elements() for i in range(n)] if right.shape[1] != 1 else [[b] for b in right.elements()]
         )
@@ -275,12 +281,11 @@ class _System:
                 self.members[j][i] = None
         self.candidates = [self._large(row) for row in self.rows]
 
-    @staticmethod
-    def _large(row):
+    def _large(self, row):
         """The candidates of a row: a size is the smallest over the points."""
         if not row:
             return []
-        sizes = np.abs([number for _, number in row.values()]).min(axis=1).tolist()
+        sizes = np.abs([number[: self.points] for _, number in row.values()]).min(axis=1).tolist()
         least = THRESHOLD * max(sizes)
         return [(j, size) for j, size in zip(row, sizes, strict=True) if size >= least and size > 0.0]
 
@@ -323,8 +328,8 @@ class _System:
                 continue
             old, old_number = row.get(c, (_ZERO, 0.0))
             change = factor_number * a_number
-            new = old_number - change
-            if (np.abs(new) <= ENTRY * (np.abs(old_number) + np.abs(change))).all():
+            new = _difference(old_number, change)
+            if not new[: self.points].any() and vanish(new[self.points :]):
                 if row.pop(c, None) is not None:
                     del self.members[c][r]
             else:

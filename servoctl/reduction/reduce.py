@@ -12,7 +12,8 @@ from servoctl.jets.series import Flow
 from servoctl.reduction.appell import Realisation, realisation, require_inertia
 from servoctl.reduction.hidden import complete
 from servoctl.reduction.knots import Knots, Switches, require_smooth
-from servoctl.reduction.manifold import Context, Points, sample
+from servoctl.reduction.manifold import SPREAD, Context, Points, sample
+from servoctl.reduction.orders import Orders
 from servoctl.reduction.ranks import Rank, clean, decide, decide_all
 from servoctl.reduction.rows import Balance, Row, as_rows, merge_uses, settle_alone
 from servoctl.spec.mechanism import Mechanism, require_known
@@ -24,6 +25,8 @@ NEAR_SPREAD = 1e-3  # relative width of the points about a state for which pivot
 WINDOW = (0.1, 1.1)  # s, where points are drawn if nothing switches; t = 0 is too often a special instant
 LONE_WINDOW = 1.0  # s on either side of a single switch
 INSET = 0.07  # fraction of the time from first to last switch left out at both ends, where paths are nearly at rest
+ORDINARY = 100.0  # factor from 1 within which the size of a guess leaves points spread by 1
+WEAKER = 1e-6  # relative to its size before: a pivot below this with other parameters is chosen again
 HELD = 1e-9  # residual, relative to the size of its terms, at points where a reduction still holds
 
 
@@ -98,23 +101,24 @@ class Reduction:
         return tuple(row for row in self.rows if row.story)
 
     @cached_property
+    def orders(self):
+        """What the orders of the rows rest on."""
+        decided = (*self.original.values(), *self.rows, *self.realisation.decided)
+        return Orders(decided, self.rows, self.top, self.points)
+
+    @cached_property
     def leading(self):
         """The leading matrix L, (n, n) SX."""
         return ca.vertcat(*(row.gradient(self.mechanism.q) for row in self.rows))
 
     @cached_property
     def conditions(self):
-        """What `holds` evaluates: entries of L and Bᵀ, the residuals with their derivatives, and the balance."""
+        """What must vanish on the manifold: the residuals with their derivatives, and the balance with the reaction."""
         q, B = self.mechanism.q, self.realisation.B
         orders = (q.derivatives([row.expression], max(0, self.top - row.order)) for row in self.original.values())
         residuals = [level[0] for levels in orders for level in levels]
         balance = self.mechanism.balance - B @ self.multipliers
-        return [*self.leading.nonzeros(), *B.T.nonzeros(), *residuals, *balance.elements()]
-
-    @cached_property
-    def decided(self):
-        """Values and sizes of the conditions at the points of the reduction."""
-        return self.points.evaluate(self.conditions)
+        return [*residuals, *balance.elements()]
 
     @cached_property
     def flow(self):
@@ -130,7 +134,7 @@ class Reduction:
     def actuation(self):
         """Required actuation u (m,) SX, or for an ideal program the reaction of the program, (n,) SX."""
         k = len(self.program.residuals)
-        multipliers = self.multipliers[:k]
+        multipliers = self.multipliers[:k] if k else ca.SX(0, 1)
         if self.program.by == "actuators":
             return ca.cse(self.realisation.actuation @ multipliers)
         return ca.cse(self.realisation.B[:, :k] @ multipliers)
@@ -150,6 +154,7 @@ def smoothness(switches, rows):
     return total
 
 
+@np.errstate(all="ignore")  # trial values may leave the domain of the rows: what is not finite is no point
 def reduce(mechanism, program, guess=None, near=None, values=None):
     """Derive the rows of a motion: eq. (3.18), hidden constraints, ranks on the manifold.
 
@@ -208,7 +213,7 @@ def holds(reduction, values):
     """Whether a reduction is valid at other parameters than those at which its ranks were decided.
 
     At points that satisfy its rows with these parameters, the original residuals and the balance must hold, too; every
-    entry that is zero in the reduction must be zero there, and every rank must be the same.
+    slope on whose vanishing an order rests must vanish there, every rank must be the same, and no pivot far weaker.
 
     Parameters
     ----------
@@ -222,20 +227,22 @@ def holds(reduction, values):
     q, r = reduction.mechanism.q, reduction
     context = replace(r.context, values=values)
     points = sample(q, r.rows, r.top, context, starts=r.points, flow=r.flow)
-    if not len(points.t):
+    if not len(points.t) or not r.orders.hold(points):
         return False
-    after, start = points.evaluate(r.conditions), 0
-    for sparsity in (r.leading.sparsity(), r.realisation.B.T.sparsity()):
-        entries = slice(start, start + sparsity.nnz())
-        old, new = (
-            clean(*p.placed(sparsity, *(part[entries] for part in values_and_sizes)))
-            for p, values_and_sizes in ((r.points, r.decided), (points, after))
-        )
-        if np.any(np.any(new, axis=2) & ~np.any(old, axis=2)) or decide(new[:, :, 0]).rank < len(new):
+    for matrix in (r.leading, r.realisation.B.T):
+        numbers = clean(*points.matrix(matrix))
+        if decide(numbers[:, :, 0]).rank < len(numbers):
             return False
-        start = entries.stop
-    left, sizes = (part[start:] for part in after)
+    before, now = (np.abs(p.evaluate([pivot for _, pivot in r.pivots])[0]) for p in (r.points, points))
+    if not strong(now.min(axis=1), before.min(axis=1)).all():
+        return False
+    left, sizes = points.evaluate(r.conditions)
     return bool(np.all(np.abs(left) <= HELD * np.maximum(sizes, TINY)))
+
+
+def strong(pivots, before):
+    """Whether pivots are not far weaker with other parameters, from their values with either."""
+    return np.abs(pivots) >= WEAKER * np.abs(before)
 
 
 def _require_parts(mechanism, program, guess):
@@ -321,7 +328,8 @@ def _context(mechanism, switches, guess, near, values):
     values = mechanism.parameters.values() if values is None else np.asarray(values, dtype=float)
     if near is not None:
         t, guess, sizes = near
-        return Context(mechanism.parameters.symbols, values, (t - NEARBY, t + NEARBY), guess, NEAR_SPREAD, sizes)
+        width = NEARBY * min(1.0, _time_scale(mechanism.q, guess))
+        return Context(mechanism.parameters.symbols, values, (t - width, t + width), guess, NEAR_SPREAD, sizes)
     times = switches.times(values)
     window = WINDOW
     if len(times) == 1:
@@ -329,4 +337,33 @@ def _context(mechanism, switches, guess, near, values):
     elif times:
         width = times[-1] - times[0]
         window = (times[0] + INSET * width, times[-1] - INSET * width)
-    return Context(mechanism.parameters.symbols, values, window, guess or {})
+    lengths = _lengths(mechanism, guess or {}, values)
+    return Context(mechanism.parameters.symbols, values, window, guess or {}, lengths=lengths)
+
+
+def _ordinary(size):
+    """Whether points spread by 1 serve for this size, too."""
+    return 1 / ORDINARY < abs(size) < ORDINARY
+
+
+def _lengths(mechanism, guess, values):
+    """Usual sizes of the coordinates where guesses are far from 1: of equal √M_ii |q_i|; else nothing."""
+    q = mechanism.q
+    known = np.array([abs(guess.get(name, 0.0)) for name in q.names])
+    if not q.plain or all(map(_ordinary, known[known > 0])):
+        return ()
+    symbols = [q.t, q.jet(0), *mechanism.parameters.symbols]
+    inertia = ca.Function("inertia", symbols, [ca.densify(ca.diag(mechanism.mass))], {"allow_free": True})
+    if inertia.has_free():
+        return ()
+    metric = np.sqrt(np.maximum(np.ravel(inertia(0.0, [guess.get(name, 0.0) for name in q.names], *values)), 0.0))
+    metric = np.where(np.isfinite(metric), metric, 0.0)
+    size = float((metric * known).max())
+    size *= SPREAD
+    return tuple(float(size / m) if m > 0 and size > 0 else max(k, 1.0) for m, k in zip(metric, known, strict=True))
+
+
+def _time_scale(q, jets):
+    """The time [s] in which a state changes by 1 + |q|: near a singularity a motion is quick."""
+    place, rate, second = (max((abs(jets.get(name, 0.0)) for name in q.jet_names(k)), default=0.0) for k in range(3))
+    return 1.0 / max(rate / (1.0 + place), np.sqrt(second / (1.0 + place)), TINY)

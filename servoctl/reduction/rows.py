@@ -6,6 +6,7 @@ import casadi as ca
 import numpy as np
 
 from servoctl.errors import SingularProgram, SpecificationError
+from servoctl.jets.identity import spread, vanish
 from servoctl.jets.series import Flow
 from servoctl.reduction.manifold import POINTS_SEED, sample, solve
 from servoctl.reduction.ranks import clean, combination, decide, eliminate, equilibrate, refined
@@ -17,6 +18,8 @@ BASIS_CUTOFF = 1e-12  # relative singular value of independent rows below which 
 VANISHED = 1e-5  # gradient on a row's solutions, relative to random points, below which the row is a square
 SQUARE_STEPS = 40  # Newton steps towards these solutions; for a square each only halves the distance
 SOLVED = 1e-3  # scaled residual of points at which the gradient of a possible square is judged
+FELT = 1e-9  # a term above this fraction of a row's parts is not their rounding
+SAME_DEPTH = 20  # nested operations to which factors are compared
 BESIDE = 0.5  # relative distance of the points with which solutions are compared
 
 
@@ -54,6 +57,11 @@ class Row:
         The combination that it is, if it is a hidden constraint.
     uses : dict of (str or Balance) to int
         Highest derivative of each residual, and of the balance, that ψ contains.
+    parts : tuple of SX
+        Terms whose sum ψ is, where these may cancel: beside them rounding of folded constants is zero.
+    vanishing : tuple of (SX, SX, SX)
+        What the row's order rests on: slopes that vanish at the points of its derivation, but not identically; the jets
+        in which they are slopes, or products of two; and the expression ψ that they are slopes of.
     """
 
     expression: ca.SX
@@ -63,6 +71,8 @@ class Row:
     affine: bool = True
     story: str = ""
     uses: dict = field(default_factory=dict)
+    parts: tuple = field(default=(), repr=False, compare=False)
+    vanishing: tuple = field(default=(), repr=False)
     _gradients: dict = field(default_factory=dict, repr=False, compare=False)
 
     def gradient(self, q, level=None):
@@ -73,6 +83,13 @@ class Row:
             slopes = ca.jacobian(self.expression, q.jet(level))
             self._gradients[key] = self.expression, slopes if level or q.plain else slopes @ q.V
         return self._gradients[key][1]
+
+    def resting_on(self, slopes, jets):
+        """The row, with slopes in jets among `vanishing` that are zero at points, unless they vanish identically."""
+        pairs = [(e, jet) for e, jet in zip(slopes.elements(), jets.elements(), strict=True) if not e.is_zero()]
+        alive = ~vanish(spread([e for e, _ in pairs])) if pairs else []
+        some = tuple((e, jet, self.expression) for (e, jet), live in zip(pairs, alive, strict=True) if live)
+        return replace(self, vanishing=self.vanishing + some) if some else self
 
     def __repr__(self):
         return f"Row({self.name}: {self.kind}, order {self.order}{', ' + self.story if self.story else ''})"
@@ -136,7 +153,7 @@ def _refuse_square(q, row, context, slopes=None):
     solved = residual < SOLVED
     if solved.any() and np.all(sizes[1][solved] < VANISHED * sizes[0][solved]):
         if not _regular_nearby(flow, start.t[solved], z[:, solved]):
-            raise vanishing_gradient(row)
+            raise vanishing_gradient(row, _repeated(factors(row.expression)))
 
 
 def _regular_nearby(flow, t, z):
@@ -153,14 +170,38 @@ def _regular_nearby(flow, t, z):
     return bool(np.any(converged & (here > VANISHED * there)))
 
 
-def vanishing_gradient(row):
-    """The error of a row whose gradient vanishes wherever the row holds."""
+def vanishing_gradient(row, factor=None, others=()):
+    """The error of a row whose gradient vanishes wherever the row holds, by reason of a factor if one is known."""
+    because = "" if factor is None else f": it has the factor {factor}"
     return SingularProgram(
-        f"The gradient of row {row.name!r} vanishes on its own solutions.",
+        f"The gradient of row {row.name!r} vanishes on its own solutions{because}.",
         "A constraint φ = 0 needs a gradient there; that of φ² = 0 is zero and determines no direction of the motion.",
-        do=f"Write {row.name!r} without the square, so that it changes sign at its solutions.",
+        do=f"Write {row.name!r} without the square, so that it changes sign at its solutions."
+        if factor is None
+        else f"Divide {row.name!r} by {factor}.",
         row=row.name,
+        **({} if factor is None else {"factor": str(factor)}),
     )
+
+
+def _repeated(items):
+    """The first SX scalar that occurs twice, or None."""
+    return next((f for i, f in enumerate(items) if any(ca.is_equal(f, g, SAME_DEPTH) for g in items[:i])), None)
+
+
+def factors(expression):
+    """Factors of an SX scalar that are no constants, repeated ones as often as they occur."""
+    operation = expression.op()
+    inner = [expression.dep(i) for i in range(expression.n_dep())]
+    if operation == ca.OP_MUL:
+        return [f for e in inner for f in factors(e)]
+    if operation == ca.OP_SQ:
+        return 2 * factors(inner[0])
+    if operation in (ca.OP_NEG, ca.OP_TWICE, ca.OP_DIV):
+        return factors(inner[0])
+    if operation in (ca.OP_POW, ca.OP_CONSTPOW) and inner[1].is_constant() and float(inner[1]) >= 2:
+        return 2 * factors(inner[0])
+    return [expression] if ca.symvar(expression) else []
 
 
 def leading(q, rows, points):
@@ -187,10 +228,9 @@ def settle_alone(q, rows, context):
         gradients = [rows[a].gradient(q, level) for a in members]
         points.read([*(rows[a].expression for a in members), *(e for g in gradients for e in g.nonzeros())])
         values = clean(*points.matrix(ca.vertcat(*gradients)))
-        for a, slopes, numbers in zip(members, gradients, values, strict=True):
+        for a, numbers in zip(members, values, strict=True):
             if np.any(numbers):
-                affine = q.order(slopes) < level or _affine(q, rows[a].expression, level, points)
-                settled[a] = replace(rows[a], order=level, affine=affine), numbers
+                settled[a] = _of_order(q, rows[a], level, points), numbers
     return [pair or (settle(q, row, [], context)[0], None) for pair, row in zip(settled, rows, strict=True)]
 
 
@@ -221,39 +261,74 @@ def settle(q, row, others, context, starts=None):
     if not len(points.t):
         return None, points
     for j in range(q.order(row.expression), -1, -1):
-        values = clean(*points.matrix(row.gradient(q, j)))[0]
+        values = slopes(q, row, j, points)
         if np.any(values):
             lower = [other for other in others if other.order < j or (other.order == j and other.affine and j > 0)]
             eliminated = _eliminated(q, row, j, values, lower, points)
             if eliminated is None:
-                return replace(row, order=j, affine=_affine(q, row.expression, j, points)), points
+                return _of_order(q, row, j, points), points
             row = eliminated
-        elif j > 0:
-            row = _without(q, row, q.gamma(j), points)
-    if q.order(row.expression) == 0 and not np.any(clean(*points.matrix(row.gradient(q, 0)))):
+        if j > 0:
+            row = _without(q, row.resting_on(row.gradient(q, j).T, q.jet(j)), q.gamma(j), points)
+    if q.order(row.expression) == 0 and not np.any(slopes(q, row, 0, points)):
         return replace(row, order=-1), points
     return replace(row, order=max(q.order(row.expression), -1)), points
 
 
+def slopes(q, row, j, points):
+    """∂ψ/∂γ^(j) at points (n, N), zero where it is rounding beside the slopes of the row's parts."""
+    values, sizes = points.matrix(row.gradient(q, j))
+    values = clean(values, sizes)[0]
+    if not row.parts or not np.any(values) or _is_felt(q, row, j, values, points):
+        return values
+    gradients = [ca.jacobian(part, q.jet(j)) for part in row.parts]
+    parts, _ = points.matrix(ca.vertcat(*(g if j or q.plain else g @ q.V for g in gradients)))
+    return clean(values, np.abs(parts).max(axis=0))
+
+
+def _is_felt(q, row, j, values, points):
+    """Whether slopes times their jets are no rounding of the row's parts: then the slopes themselves are none."""
+    if values.shape != points.jet(j).shape:
+        return False
+    return bool(np.any(np.abs(values * points.jet(j)) > FELT * values_and_sizes(row, points)[1]))
+
+
+def values_and_sizes(row, points):
+    """Values and sizes (1, N) of a row at points, the sizes at least those of its parts."""
+    values, sizes = points.evaluate([row.expression])
+    return values, np.maximum(sizes, np.abs(points.evaluate(list(row.parts))[0]).max(axis=0, initial=0.0))
+
+
 def _without(q, row, symbols, points):
-    """The row with jets set to zero, or the row itself if that changes its value at a point."""
-    expression = ca.substitute(row.expression, ca.vertcat(*symbols), ca.SX.zeros(len(symbols)))
-    values, sizes = points.evaluate([expression, row.expression])
-    same = np.abs(values[0] - values[1]) <= ENTRY * (sizes[0] + sizes[1])
-    return replace(row, expression=expression) if np.all(same) else row
+    """The row with jets set to zero, or to one where it divides by them; the row itself if that changes its value."""
+    (value,), (size,) = values_and_sizes(row, points)
+    for constant in (ca.SX.zeros(len(symbols)), ca.SX.ones(len(symbols))):
+        expression, *parts = _substituted(row, symbols, constant)
+        (without,), _ = points.evaluate([expression])
+        if np.all(np.abs(value - without) <= ENTRY * size):
+            return replace(row, expression=expression, parts=tuple(parts))
+    return row
 
 
-def _affine(q, expression, j, points):
-    """Whether an expression is affine in γ^(j); rows of order 0 count as affine."""
-    if j == 0:
-        return True
-    jets = q.jet(j)
-    second = ca.jacobian(ca.vec(ca.jacobian(expression, jets)), jets)
-    return not second.nnz() or not np.any(clean(*points.evaluate(second.nonzeros())))
+def _substituted(row, symbols, values):
+    """The expression and the parts of a row with symbols replaced."""
+    return ca.substitute([row.expression, *row.parts], [ca.vertcat(*symbols)], [values])
+
+
+def _of_order(q, row, j, points):
+    """The row with order j, and whether it is affine in γ^(j); rows of order 0 count as affine."""
+    row, jets = replace(row, order=j, affine=True), q.jet(j)
+    if j == 0 or q.order(row.gradient(q)) < j:
+        return row
+    second = ca.jacobian(row.gradient(q).T, jets)
+    resting = row.resting_on(second, jets @ jets.T)
+    if np.any(clean(*points.evaluate(second.nonzeros()))) or (j > 1 and resting is not row):
+        return replace(row, affine=False)
+    return resting
 
 
 def _eliminated(q, row, j, values, lower, points):
-    """The row with γ^(j) replaced by the solution of lower rows, or None where these do not determine it."""
+    """The row with jets γ^(j) replaced by the solution of lower rows, or None where these do not determine it."""
     if not lower:
         return None
     numbers, _ = leading(q, lower, points)
@@ -271,14 +346,14 @@ def _eliminated(q, row, j, values, lower, points):
     if not rows or any(other.order == j and not other.affine for other in rows):
         return None
     columns = sorted(decide(numbers[:, :, 0]).columns)
-    jets = q.jet(j)
+    jets = q.jet(j)[columns]
     raised = ca.vertcat(*(q.derivatives([other.expression], j - other.order)[-1][0] for other in rows))
-    rest = ca.substitute(raised, jets, ca.SX.zeros(q.n))
+    rest = ca.substitute(raised, jets, ca.SX.zeros(len(columns)))
     matrix = ca.vertcat(*(other.gradient(q) for other in rows))[:, columns]
-    solution = ca.SX.zeros(q.n)
-    solution[columns], _ = eliminate(matrix, -rest, numbers[:, columns])
+    solution, _ = eliminate(matrix, -rest, numbers[:, columns])
     uses = merge_uses((row.uses, 0), *((other.uses, j - other.order) for other in rows))
-    return replace(row, expression=ca.cse(ca.substitute(row.expression, jets, solution)), uses=uses)
+    expression, *parts = _substituted(row, ca.vertsplit(jets), solution)
+    return replace(row, expression=ca.cse(expression), uses=uses, parts=tuple(parts))
 
 
 def dependence(numbers):

@@ -13,18 +13,27 @@ import casadi as ca
 import numpy as np
 
 from servoctl.jets.series import Flow
+from servoctl.reduction.appell import Realisation
 from servoctl.reduction.manifold import solve
-from servoctl.reduction.ranks import clean, decide, solve_clean
+from servoctl.reduction.ranks import clean, decide, decide_all, solve_clean
 from servoctl.reduction.rows import Row
+from servoctl.tolerances import ENTRY
 
 INDEPENDENT = 1e-7  # equilibrated pivots of J above this count
 AT_REST = 1e-13  # a jet below this fraction of the largest is zero, not small
+LEAVES = 1e-6  # change of a state, relative to its size, beyond which no motion of the program passes through it
 DEPTHS = (2, 4, 6, 8, 12, 16, 24, 32)  # values of N, tried until J_N shows all zeros at infinity
 
 
 @dataclass(frozen=True)
 class Local:
-    """The structure at one point of a motion; attributes as in `Structure`."""
+    """The structure at one point of a motion; attributes as in `Structure`.
+
+    Attributes
+    ----------
+    zero : tuple of str
+        Jets that vanish there, of those on which the ranks depend.
+    """
 
     relative_degree: tuple
     decoupling_rank: int
@@ -32,6 +41,20 @@ class Local:
     essential_orders: tuple
     index: int
     margin: float
+    zero: tuple = ()
+
+    @property
+    def decided(self):
+        """The structure without what varies from point to point."""
+        return replace(self, margin=0.0, zero=())
+
+    def named(self, residuals):
+        """How a printed structure names the values at this point."""
+        pairs = zip(residuals, self.relative_degree, strict=False)
+        degrees = ", ".join(f"{name} {r}" for name, r in pairs) or "not decided"
+        zeros = ", ".join(map(str, self.zeros_at_infinity)) or "not decided"
+        where = f" (where {' and '.join(f'{name} = 0' for name in self.zero)})" if self.zero else ""
+        return f"relative degrees {degrees}, zeros at infinity {zeros}{where}"
 
 
 @dataclass(frozen=True)
@@ -52,11 +75,13 @@ class Structure:
     index : int or None
         Differentiation index, 1 + max n'_i; None for residuals of order above 2.
     margin : float
-        Smallest equilibrated pivot that counts in any of the ranks.
+        Smallest equilibrated pivot that counts in any of the ranks, those of the reduction among them.
     realisation : {"orthogonal", "mixed", "tangential", "undecided", "ideal"}
         Rank of P full, between, or zero; "undecided" if the largest N does not show all zeros at infinity.
     at : tuple of (float, Local)
         The structure at each instant [s].
+    start : (float, Local) or None
+        The structure at a start, where that was asked for.
     """
 
     residuals: tuple
@@ -68,16 +93,22 @@ class Structure:
     margin: float
     realisation: str
     at: tuple
+    start: tuple | None = None
 
     @property
     def uniform(self):
         """Whether the structure is the same at every instant."""
-        return len({replace(local, margin=0.0) for _, local in self.at}) <= 1
+        return len({local.decided for _, local in self.at}) <= 1
 
     def __repr__(self):
         k = len(self.residuals)
-        if self.index is None and not self.zeros_at_infinity:
+        if not self.at and not self.zeros_at_infinity:
             return "Structure: not computed; index and relative degrees are defined for residuals of order 0, 1 or 2"
+        if not self.zeros_at_infinity:
+            return (
+                f"Structure: not decided; J_N shows fewer than {k} zeros at infinity up to N = {DEPTHS[-1]}, or its "
+                f"ranks are below {INDEPENDENT:.0e}"
+            )
         vector = "a vector relative degree exists" if self.decoupling_rank == k else "no vector relative degree"
         pairs = ", ".join(f"{name} {r}" for name, r in zip(self.residuals, self.relative_degree, strict=False))
         essential = ", ".join(f"{name} {r}" for name, r in zip(self.residuals, self.essential_orders, strict=False))
@@ -88,17 +119,24 @@ class Structure:
             f"  essential orders (class that each path needs): {essential or 'not computed'}",
             f"  smallest pivot counted {self.margin:.1e}",
         ]
-        if not self.uniform:
-            typical = _most_common([local for _, local in self.at])
-            other = [(t, a) for t, a in self.at if replace(a, margin=0.0) != typical]
-            lines.append(
-                f"  it differs at {len(other)} of {len(self.at)} instants, first t = {other[0][0]:.4g} s: relative "
-                f"degrees {other[0][1].relative_degree}, zeros at infinity {other[0][1].zeros_at_infinity}"
-            )
-        return "\n".join(lines)
+        return "\n".join([*lines, *self._differences()])
+
+    def _differences(self):
+        """Lines on the instants at which the structure is another one."""
+        typical, lines = _most_common([local for _, local in self.at]) if self.at else None, []
+        other = [(t, a) for t, a in self.at if a.decided != typical]
+        if other:
+            (t, first), count = other[0], f"{len(other)} of {len(self.at)} instants"
+            lines.append(f"  it differs at {count}, first t = {t:.4g} s: {first.named(self.residuals)}")
+        if self.start is not None and self.start[1].decided != typical:
+            t, local = self.start
+            lost = local.zeros_at_infinity != self.zeros_at_infinity
+            lines.append(f"  at the start nearest zero, t = {t:.4g} s: {local.named(self.residuals)}")
+            lines += ["    the motion's relative degrees are lost there: the program is singular"] if lost else []
+        return lines
 
 
-def structure(reduction, t=None, jets=None, values=None):
+def structure(reduction, t=None, jets=None, values=None, start=None):
     """Decide index, relative degrees, zeros at infinity and essential orders at points of a motion.
 
     Parameters
@@ -110,6 +148,8 @@ def structure(reduction, t=None, jets=None, values=None):
         q, γ', ..., γ^(s̄) there.
     values : (n_p,) array, optional
         Parameters.
+    start : (float, (n_x,) array), optional
+        A time [s] and a state at which the structure is decided as well.
 
     Returns
     -------
@@ -117,30 +157,32 @@ def structure(reduction, t=None, jets=None, values=None):
     """
     names = tuple(reduction.program.residuals)
     orders = [reduction.original[name].order for name in names]
-    if reduction.program.by == "ideal" or max(orders) > 2:
+    if not names or reduction.program.by == "ideal" or max(orders) > 2:
         return _by_orders(reduction, names, orders)
     points = reduction.points if t is None else _points(reduction, t, jets, values)
-    locals_ = _locals(reduction, points)
+    locals_ = _locals(reduction, points, t is not None)
+    if start is not None:
+        start = start[0], _locals(reduction, _points(reduction, [start[0]], start[1][:, None], values), True)[0]
     typical = _most_common(locals_)
     rank_P = typical.decoupling_rank if any(r <= 2 for r in typical.relative_degree) else 0
     kind = "orthogonal" if rank_P == len(names) else "tangential" if rank_P == 0 else "mixed"
     kind = kind if typical.relative_degree else "undecided"
-    margin = min(local.margin for local in locals_)
+    margin = min(reduction.rank.kept, *(local.margin for local in locals_))
     at = tuple(zip(np.asarray(points.t, dtype=float).tolist(), locals_, strict=True))
     return Structure(
         names, typical.relative_degree, typical.decoupling_rank, typical.zeros_at_infinity, typical.essential_orders,
-        typical.index, margin, kind, at,
+        typical.index, margin, kind, at, start,
     )  # fmt: skip
 
 
 def _most_common(locals_):
-    return Counter(replace(local, margin=0.0) for local in locals_).most_common(1)[0][0]
+    return Counter(local.decided for local in locals_).most_common(1)[0][0]
 
 
 def _by_orders(reduction, names, orders):
     """Ideal programs: the reaction acts through G, so residuals of order s <= 2 meet it after 2 - s derivatives."""
     degrees = tuple(max(0, 2 - s) for s in orders)
-    plain = reduction.program.by == "ideal" and max(orders) <= 2 and not reduction.hidden
+    plain = names and reduction.program.by == "ideal" and max(orders) <= 2 and not reduction.hidden
     index = 1 + max(degrees) if plain else None
     return Structure(
         names, degrees, len(names) if plain else 0, tuple(sorted(degrees)) if plain else (),
@@ -158,31 +200,80 @@ def _points(reduction, t, jets, values):
     return replace(sample, t=np.asarray(t, dtype=np.longdouble), z=z, values=values, residual=np.zeros(len(t)))
 
 
-def _locals(reduction, points):
-    for depth in DEPTHS:
-        locals_ = _at_depth(reduction, points, depth)
-        if locals_ is not None:
-            return locals_
-    return [Local((), 0, (), (), None, 0.0)] * len(points.t)
+def _locals(reduction, points, states):
+    """The structure at each point, by the smallest N that shows all zeros at infinity there.
 
-
-def _at_depth(reduction, points, depth):
-    """The structure at each point from J_N with N = depth, or None where N is too small."""
-    q, k = reduction.mechanism.q, len(reduction.program.residuals)
-    level = depth + 2
-    z = np.zeros((q.nq + level * q.n, len(points.t)), dtype=np.longdouble)
-    shared = min(len(z), len(points.z))
-    z[:shared] = points.z[:shared]
-    flow = Flow(q, reduction.rows, level, points)
-    z, _ = solve(flow, points.t, z)
-    for part in (z[: q.nq], z[q.nq :]):
-        part[np.abs(part) < AT_REST * np.maximum(1.0, np.abs(part).max(axis=0))] = 0.0
-    result = []
-    for J in np.moveaxis(clean(*_input_jacobian(reduction, points, z, depth)), -1, 0):
-        result.append(_local(J, k, depth))
-        if result[-1] is None:
-            return None
+    Points are starts of the search for a motion, or `states` of one.
+    """
+    zero = _vanishing_jets(reduction, points)
+    result = [Local((), 0, (), (), None, 0.0, names) for names in zero]
+    left = np.arange(len(points.t))
+    enough = sum(depth < 2 * reduction.mechanism.q.n for depth in DEPTHS) + 1  # no order exceeds the plant's states
+    for depth in DEPTHS[:enough]:
+        if not len(left):
+            break
+        locals_ = _at_depth(reduction, points.take(left), depth, states)
+        for p, local in zip(left, locals_, strict=True):
+            if local is not None:
+                result[p] = replace(local, zero=zero[p])
+        left = left[[local is None for local in locals_]]
     return result
+
+
+def _vanishing_jets(reduction, points):
+    """For each point the names of those jets in L and B that are zero there."""
+    q = reduction.mechanism.q
+    entries = ca.vertcat(ca.vec(ca.densify(reduction.leading)), ca.vec(ca.densify(reduction.realisation.B)))
+    places = [q.where(s) for s in ca.symvar(entries)]
+    places = sorted((level, i) for kind, level, i in filter(None, places) if kind != "t")
+    values = {q.jet_names(level)[i]: points.jet(level)[i] for level, i in places}
+    limits = {name: AT_REST * max(1.0, float(np.abs(v).max())) for name, v in values.items()}
+    return [tuple(name for name, v in values.items() if abs(v[p]) <= limits[name]) for p in range(len(points.t))]
+
+
+def _at_depth(reduction, points, depth, states):
+    """The structure at each point from J_N with N = depth, None where N is too small."""
+    k = len(reduction.program.residuals)
+    z = _jets(reduction, points, depth + 2, states)
+    return [_local(J, k, depth) for J in np.moveaxis(clean(*_input_jacobian(reduction, points, z, depth)), -1, 0)]
+
+
+def _jets(reduction, points, level, states):
+    """Jets of the program's motion near each point up to a level, (nz, N); through it, where points are states.
+
+    Through a state at which the program is singular there may be no motion; the jets there are those of the plant under
+    constant inputs.
+    """
+    q = reduction.mechanism.q
+    z = np.zeros((q.nq + level * q.n, len(points.t)), dtype=np.longdouble)
+    shared, state = min(len(z), len(points.z)), q.nq + q.n
+    z[:shared] = points.z[:shared]
+    solved, residual = solve(Flow(q, reduction.rows, level, points), points.t, z)
+    change = np.abs(solved[:state] - z[:state]) / (1.0 + np.abs(z[:state]))
+    for p in np.flatnonzero(~(np.maximum(change.max(axis=0), residual) < LEAVES)) if states else ():
+        solved[:, p] = _plant_jets(reduction, points.take([p]), z[:, [p]], level)[:, 0]
+    for part in (solved[: q.nq], solved[q.nq :]):
+        part[np.abs(part) < AT_REST * np.maximum(1.0, np.abs(part).max(axis=0))] = 0.0
+    return solved
+
+
+def _plant_jets(reduction, point, z, level):
+    """Jets of the plant at one point, under the constant inputs nearest to those of an equilibrium."""
+    q, k, balance = reduction.mechanism.q, len(reduction.program.residuals), reduction.mechanism.balance
+    z = z.copy()
+    z[q.nq + q.n :] = 0.0
+    point = replace(point, z=z)
+    B = reduction.realisation.B
+    numbers, static = point.matrix(B)[0][:, :, 0], point.evaluate(balance.elements())[0][:, 0]
+    u = np.linalg.lstsq(numbers.astype(float), static.astype(float), rcond=None)[0][:k]
+    material = [row for row in reduction.original.values() if row.kind == "material"]
+    G = B[:, k:].T
+    dependent = sorted(decide_all(*point.matrix(G))[0].columns) if material else []
+    independent = [i for i in range(q.n) if i not in dependent]
+    split = Realisation(G.T, None, tuple(dependent), tuple(independent), clean(*point.matrix(G)))
+    forced, _ = split.dynamics(balance - B[:, :k] @ u) if material else ((balance - B[:, :k] @ u).elements(), ())
+    dynamics = [Row(e, 2, f"balance {i}", "dynamics") for i, e in enumerate(forced)]
+    return solve(Flow(q, [*material, *dynamics], level, point), point.t, z)[0]
 
 
 def _input_jacobian(reduction, points, z, depth):
@@ -204,8 +295,8 @@ def _input_jacobian(reduction, points, z, depth):
         *program,
     ]
     flow = Flow(q, rows, level, points, signals, real=np.longdouble)
-    _, jacobian = flow(points.t, z)
     columns = slice(q.nq + q.n, None)
+    jacobian = _without_rounding(flow(points.t, z)[1][:, columns])
     place = {equation: e for e, equation in enumerate(flow.equations)}
     plant = [place[a, i] for i in range(depth + 1) for a in range(q.n)]
     bound = [place[q.n + m, i + 2 - row.order] for i in range(depth + 1) for m, row in enumerate(material)]
@@ -213,14 +304,23 @@ def _input_jacobian(reduction, points, z, depth):
     J = np.zeros((k, depth + 1, k, depth + 1, n_points), dtype=np.longdouble)
     sizes = np.zeros_like(J)
     for p in range(n_points):
-        motion = _response(jacobian[:, columns, p], b[..., p], plant, bound, k, depth)
+        motion = _response(jacobian[..., p], b[..., p], plant, bound, k, depth)
         for i in range(k):
             for j in range(depth + 1):
                 if (first + i, j) in place:
-                    row = jacobian[place[first + i, j], columns, p]
+                    row = jacobian[place[first + i, j], :, p]
                     J[i, j, ..., p] = (row @ motion).reshape(k, depth + 1)
                     sizes[i, j, ..., p] = (np.abs(row) @ np.abs(motion)).reshape(k, depth + 1)
     return J, sizes
+
+
+def _without_rounding(matrices):
+    """Matrices (m, n, N) without entries that are rounding errors beside the others of their rows and columns."""
+    scaled = np.abs(matrices).astype(float)
+    for axis in (1, 0):
+        largest = scaled.max(axis=axis, keepdims=True)
+        scaled /= np.where(largest > 0, largest, 1.0)
+    return np.where(scaled <= ENTRY, 0.0, matrices)
 
 
 def _response(jacobian, b, plant, bound, k, depth):

@@ -54,16 +54,17 @@ class Folder:
 
     def __init__(self, path, name):
         self.path, self.name, self.moved, self._actions = path, name, False, []
-        self._made = [p for p in (path, *path.parents) if not p.exists()]
+        self._made = []
         try:
+            self._made = [p for p in (path, *path.parents) if not p.exists()]
             path.mkdir(parents=True, exist_ok=True)
             with tempfile.TemporaryFile(dir=path):
                 pass
-        except OSError as error:
+        except (OSError, ValueError) as error:  # ValueError: a name that no file can have
             self._leave()
-            reason = "it is a file" if path.is_file() else error.strerror or error
+            reason = "it is a file" if os.path.isfile(path) else getattr(error, "strerror", None) or error
             raise ServoError(
-                f"The folder {path} cannot be written: {reason}.",
+                f"The folder {str(path).encode(errors='backslashreplace').decode()} cannot be written: {reason}.",
                 f"Numbers and figures of a run are written to a folder, by default {Path('servoctl-runs', name)}.",
                 do="Give another folder by --out. Nothing has been computed yet.",
                 folder=str(path),
@@ -114,7 +115,7 @@ class Folder:
     def _leave(self):
         """Remove the folders made for this run that are still empty."""
         for path in self._made:
-            with contextlib.suppress(OSError):
+            with contextlib.suppress(OSError, ValueError):
                 path.rmdir()
 
 
@@ -135,7 +136,7 @@ def summary(run, start, verification):
     """A run as values for JSON."""
     model = run.model
     residuals = {name: [_worst(level) for level in run.residual[name].tolist()] for name in run.residual}
-    verified = verification and {"passed": verification.passed, "numbers": verification.numbers}
+    verified = verification and {name: getattr(verification, name) for name in ("verdict", "passed", "numbers")}
     return {
         "versions": machine()["versions"],
         "parameters": dict(zip(model.reduction.mechanism.parameters.names, model.parameters, strict=True)),
@@ -148,6 +149,7 @@ def summary(run, start, verification):
         "samples": len(run.t),
         "counters": run.counters,
         "free_initial_values": model.free,
+        "internal_dynamics": {name.replace(" ", "_"): value for name, value in run.internal.items()} or None,
         "start": {
             "t": start.t,
             "values": dict(zip(start.names, start.values, strict=True)),

@@ -75,7 +75,7 @@ def closed_loop(args, model, plan, report):
     report.say(run)
     if run.law.allocation:
         report.say(sv.limit_report(run))
-    return run, True
+    return run, run.success or not requested
 
 
 def _closed(args, model, plan):

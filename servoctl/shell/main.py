@@ -1,12 +1,13 @@
 """The command line: its parser, and the commands without a motion, `servoctl list` and `servoctl report`."""
 
 import argparse
+import os
 import sys
 from pathlib import Path
 
 import servoctl as sv
 from servoctl.errors import ServoError
-from servoctl.shell import export, run, sweep, tradeoff
+from servoctl.shell import cache, export, run, sweep, tradeoff
 from servoctl.shell.folder import Report, complain
 from servoctl.shell.scenes import find_scene
 
@@ -23,7 +24,7 @@ def main(argv=None):
     -------
     int
         0 done; 1 the motion stopped early, its verification failed, or files were written to another folder; 2 an
-        error, explained on stderr; 130 interrupted.
+        error, explained on stderr; 3 the verification is inconclusive; 130 interrupted.
     """
     args = _parser().parse_args(argv)
     args.command_line = list(sys.argv[1:] if argv is None else argv)
@@ -56,7 +57,7 @@ def _parser():
     report = commands.add_parser("report", help="the derivation of a model and its structure; no simulation")
     report.add_argument("scene", metavar="NAME_OR_FILE", help="a gallery name, a .py file, or the folder of a run")
     report.set_defaults(command=_report)
-    for add in (run.add_run, tradeoff.add_tradeoff, sweep.add_sweep, export.add_export):
+    for add in (run.add_run, tradeoff.add_tradeoff, sweep.add_sweep, export.add_export, cache.add_cache):
         add(commands)
     return parser
 
@@ -73,9 +74,8 @@ def _list(args):
 def _report(args):
     from servoctl.gallery import gallery
 
-    folder = Path(args.scene)
-    if args.scene not in gallery and folder.is_dir():
-        print(_earlier_report(folder), end="")
+    if args.scene not in gallery and os.path.isdir(args.scene):
+        print(_earlier_report(Path(args.scene)), end="")
         return 0
     report = Report()
     _, scene = find_scene(args.scene)

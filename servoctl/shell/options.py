@@ -3,9 +3,11 @@
 import argparse
 import math
 
+from servoctl.checks import MOST_CASES
 from servoctl.errors import SpecificationError
 from servoctl.methods.choice import METHODS
 
+MOST_SAMPLES = 10**7  # of a run: some gigabytes
 METHODS_HELP = f"{', '.join(METHODS)}; default: by the model"
 SCENE_HELP = "a gallery name, or a .py file that defines scene()"
 MANY = {"nargs": "+", "action": "extend", "default": []}  # options that take several values, and may be repeated
@@ -78,9 +80,9 @@ def _deviation(text):
     return float(text) if 0 <= float(text) < math.inf else None
 
 
-def _at_least(least):
-    form = f"not a whole number of at least {least}"
-    return _typed(lambda text: int(text) if text.isdecimal() and int(text) >= least else None, form)
+def _at_least(least, most=math.inf):
+    form = f"not a whole number of at least {least}{f' and at most {most}' if most < math.inf else ''}"
+    return _typed(lambda text: int(text) if text.isdecimal() and least <= int(text) <= most else None, form)
 
 
 def _values(text):
@@ -88,7 +90,9 @@ def _values(text):
         return [float(part) for part in text.split(",")]
     low, high, count = text.split(":")
     low, high, count = float(low), float(high), int(count)
-    return [low + (high - low) * i / (count - 1) for i in range(count - 1)] + [high] if count >= 2 else None
+    if not 2 <= count <= MOST_CASES:
+        return None
+    return [low + (high - low) * i / (count - 1) for i in range(count - 1)] + [high]
 
 
 def _draw(text):
@@ -111,7 +115,8 @@ def _drift(text):
     return text if text in ("none", "project", "minimal") else float(text)
 
 
-whole, count, samples = _at_least(0), _at_least(1), _at_least(2)
+whole, count = _at_least(0), _at_least(1)
+draws, samples = _at_least(1, MOST_CASES), _at_least(2, MOST_SAMPLES)
 positive = _typed(_number(above=0.0), "not a positive number")
 drift = _typed(_drift, "not none, project, minimal or a time constant [s]")
 shard = _typed(_shard, "not I/N with I from 1 to N, such as 1/4")
@@ -119,7 +124,8 @@ _pair = "not NAME=VALUE with a number, such as theta=0.1; the scene's name comes
 assignment = _named(_number(), _pair)
 deviation = _named(_deviation, "not NAME=STD with STD >= 0, such as theta=0.001")
 limits = _named(_limits, "neither NAME=LOW:HIGH nor NAME=SIZE, such as trolley=150")
-variation = _named(_values, "neither NAME=LOW:HIGH:N with N >= 2 nor NAME=A,B,C, such as m_load=80:120:9")
+_varied = f"neither NAME=LOW:HIGH:N with N from 2 to {MOST_CASES} nor NAME=A,B,C, such as m_load=80:120:9"
+variation = _named(_values, _varied)
 _forms = ", ".join(f"NAME={kind}:{form}" for kind, form in DRAWS.items())
 draw = _named(_draw, f"none of {_forms}, such as m_load=normal:100:5")
 

@@ -1,5 +1,7 @@
 """`servoctl run`: derive, simulate, verify, close the loop; write figures and numbers to a folder."""
 
+import warnings
+
 import servoctl as sv
 from servoctl.errors import ServoError
 from servoctl.methods.choice import as_drift, as_method, default_method
@@ -9,6 +11,8 @@ from servoctl.shell.folder import FILES, LOOP_FILES, Report, complain, folder_of
 from servoctl.shell.motion import described
 from servoctl.shell.options import METHODS_HELP, add_motion, drift, samples
 from servoctl.shell.scenes import find_scene
+
+INCONCLUSIVE = 3  # exit code where nothing failed and something could not be verified
 
 
 def add_run(commands):
@@ -60,8 +64,13 @@ def _compute(args, name, scene, folder):
     print(f"{', '.join(f for f in (*FILES, *LOOP_FILES) if (folder.path / f).exists())} in {folder.path}")
     if not run.success:
         complain(f"The motion ended early, at t = {run.t[-1]:.6g} s; what was computed is kept.")
-    verified = args.no_verify or (verification is not None and verification.passed)
-    return 0 if run.success and verified and done and not folder.moved else 1
+    unstable = run.internal.get("verdict") == "unstable"
+    if unstable:
+        complain(f"The plan is not to be trusted: {run.internal['text']}.")
+    verdict = "passed" if args.no_verify else getattr(verification, "verdict", "failed")
+    if unstable or not (run.success and verdict != "failed" and done and not folder.moved):
+        return 1
+    return INCONCLUSIVE if verdict == "inconclusive" else 0
 
 
 def _options(args, motion):
@@ -80,7 +89,9 @@ def _options(args, motion):
 def _simulate(motion, options, report):
     """The run, or the part of it before the motion stopped."""
     try:
-        run = sv.simulate(motion.model, motion.start, motion.span, **options)
+        with warnings.catch_warnings():  # the report and the exit code say this
+            warnings.filterwarnings("ignore", "Internal dynamics unstable")
+            run = sv.simulate(motion.model, motion.start, motion.span, **options)
         report.say(run)
         return run
     except ServoError as error:

@@ -3,6 +3,7 @@
 import functools
 import importlib.util
 import math
+import os
 import sys
 import traceback
 from pathlib import Path
@@ -29,15 +30,15 @@ def find_scene(given):
     if path.suffix == ".py":
         return path.stem, _from_file(path)
     error = unknown(given, gallery, "scene")
-    if path.with_name(path.name + ".py").is_file():
+    if os.path.isfile(f"{given}.py"):
         error.add_note(f"There is a file {given}.py: give the name with its suffix.")
-    elif path.exists():
+    elif os.path.exists(given):
         error.add_note(f"{given} exists, but a scene's file ends in .py.")
     raise error
 
 
 def _module(path):
-    if not path.is_file():
+    if not os.path.isfile(path):
         others = [p.name for p in path.parent.glob("*.py")]
         match = unknown(path.name, others, "file").details["match"]
         raise SpecificationError(
@@ -68,7 +69,7 @@ def _from_file(path):
 def stamp(given):
     """A key for caches: a gallery name, or a file with the time of its last change."""
     path = Path(given)
-    return (str(path.resolve()), path.stat().st_mtime_ns) if path.is_file() else given
+    return (str(path.resolve()), path.stat().st_mtime_ns) if os.path.isfile(path) else given
 
 
 def own_case(given):

@@ -3,13 +3,14 @@
 import functools
 import inspect
 import multiprocessing
+import os
 from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 
 import servoctl as sv
 from servoctl.errors import ServoError, SpecificationError, unknown
 from servoctl.shell.folder import Report, complain, folder_of
-from servoctl.shell.options import MANY, METHODS_HELP, by_name, count, draw, drawn, shard, used, variation, whole
+from servoctl.shell.options import MANY, METHODS_HELP, by_name, count, draw, drawn, draws, shard, used, variation, whole
 from servoctl.shell.scenes import find_scene, own_case, stamp
 from servoctl.study.sweep import require_fitting
 
@@ -24,7 +25,7 @@ def add_sweep(commands):
     sweep.add_argument("scene", metavar="NAME_OR_FILE", nargs="?", help=scene)
     vary = {"type": variation, "metavar": "NAME=LOW:HIGH:N", **MANY}
     sweep.add_argument("--vary", **vary, help="all combinations of these values")
-    sweep.add_argument("--monte-carlo", type=count, metavar="N", help="N random cases of each combination")
+    sweep.add_argument("--monte-carlo", type=draws, metavar="N", help="N random cases of each combination")
     distribution = {"type": draw, "metavar": "NAME=normal:MEAN:STD", **MANY}
     sweep.add_argument("--draw", **distribution, help="distributions of random parameters")
     sweep.add_argument("--seed", type=whole, help="seed of all random numbers")
@@ -215,7 +216,8 @@ def _leave(study, folder, stem, units):
 
 
 def _shards(folders):
-    shards = {folder: sorted(Path(folder).glob("sweep-*-of-*.npz")) for folder in folders}
+    there = {folder: os.path.isdir(folder) for folder in folders}
+    shards = {folder: sorted(Path(folder).glob("sweep-*-of-*.npz")) if there[folder] else [] for folder in folders}
     empty = [folder for folder, paths in shards.items() if not paths]
     if empty:
         raise ServoError(

@@ -301,12 +301,19 @@ def _identifiers(names, what):
             do='Write, for example, "x y theta".',
             names=names,
         )
+    if "," in names:
+        raise SpecificationError(
+            f"The names of the {what} are {names!r}.",
+            "Separate names by blanks, without commas.",
+            nearest=repr(" ".join(names.replace(",", " ").split())) + ".",
+            names=names,
+        )
     names = tuple(names.split())
     for name in names:
-        if not name.isidentifier() or name in ("t", "guess"):
+        if not name.isidentifier() or name in ("t", "guess", "hold"):
             raise SpecificationError(
                 f"{name!r} is no name of {what}.",
-                "Names are Python identifiers other than t and guess, which are arguments of a start.",
+                "Names are Python identifiers other than t, guess and hold, which are arguments of a start.",
                 do="Rename it.",
                 name=name,
             )

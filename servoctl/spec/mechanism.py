@@ -9,6 +9,7 @@ import numpy as np
 
 from servoctl.checks import column, mapping
 from servoctl.errors import SpecificationError, unknown
+from servoctl.jets.identity import spread, vanish
 from servoctl.jets.tape import Tape, evaluate
 from servoctl.spec.coordinates import Coordinates
 from servoctl.spec.packing import packed, unpacked
@@ -143,6 +144,23 @@ class Mechanism:
         content = packed(vars(self), self.q, self.parameters, {"parameters": self.parameters})
         return _restored, (self.q, self.parameters, content)
 
+    def under(self, inputs, forces):
+        """The mechanism without actuators, whose inputs are forces and outputs instead.
+
+        Parameters
+        ----------
+        inputs : dict of str to SX
+            By actuator.
+        forces : (n,) SX
+            Further generalised forces.
+        """
+        driving = self.E @ ca.vertcat(*(inputs[name] for name in self.actuators)) if self.actuators else 0
+        return Mechanism(
+            self.q, self._gibbs, self.potential, None, self.parameters, kinetic=self._kinetic,
+            balance=self._inverse_dynamics, forces=self.forces + forces + driving, constraints=self.constraints,
+            outputs={**self.outputs, **inputs},
+        )  # fmt: skip
+
     @cached_property
     def balance(self):
         """r = ∂S/∂γ'' - Γ without actuation, (n,) SX in units of generalised force."""
@@ -234,7 +252,7 @@ class Mechanism:
         """What a given balance is at rest, such as gravity, (n,) SX; the rest is inertia and has a kinetic energy."""
         motion = ca.vertcat(*self.q.gamma(1), *self.q.gamma(2))
         static = ca.substitute(self._inverse_dynamics, motion, ca.SX.zeros(motion.numel()))
-        return ca.SX.zeros(self.q.n) if self.is_zero(static.elements()) else ca.cse(static)
+        return ca.SX.zeros(self.q.n) if vanish(spread(static.elements())).all() else ca.cse(static)
 
     def _refuse_nonholonomic_frame(self):
         """Refuse a kinetic energy in quasi-velocities if brackets of the columns of V lie outside their span."""
@@ -283,7 +301,7 @@ class Mechanism:
         points = np.random.default_rng(IDENTITY_SEED).uniform(*RANDOM, (len(symbols), 4)).astype(np.longdouble)
         for i, s in enumerate(symbols):
             if self.q.where(s) is None:
-                points[i] *= self.parameters.defaults.get(s.name(), 1.0)
+                points[i] *= self.parameters.defaults.get(s.name()) or 1.0  # what is zero by default may be set
         return evaluate(Tape(symbols, items), points)
 
     def _known(self, value, what, size=1):

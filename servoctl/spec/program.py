@@ -115,6 +115,13 @@ class Program:
         return f"Program({', '.join(self.residuals)}; by {self.by})"
 
 
+def no_program():
+    """The program without residuals: forces alone determine the motion."""
+    program = object.__new__(Program)
+    program.residuals, program.by, program.weights = {}, "actuators", {}
+    return program
+
+
 def _residual(name, value):
     if isinstance(value, (bool, str)) or (isinstance(value, np.ndarray) and value.dtype != object):
         value = [value]

@@ -2,9 +2,9 @@
 
 import itertools
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sized
 
-from servoctl.checks import plain, whole
+from servoctl.checks import MOST_CASES, plain, whole
 from servoctl.errors import SpecificationError
 
 DRAWS, CASES = 0, 1  # first spawn key: draws of the parameters, and draws inside a case
@@ -27,8 +27,10 @@ def grid(**values) -> list[dict]:
     Raises
     ------
     SpecificationError
-        For an empty sequence.
+        For an empty sequence, and for more than `MOST_CASES` combinations.
     """
+    sized = [len(value) for value in values.values() if isinstance(value, Sized) and not isinstance(value, str)]
+    _require_few(math.prod(sized))
     columns = {name: _column(name, value) for name, value in values.items()}
     return [dict(zip(columns, row, strict=True)) for row in itertools.product(*columns.values())]
 
@@ -53,15 +55,27 @@ def monte_carlo(n: int, /, *, seed: int, **distributions) -> list[dict]:
     Raises
     ------
     SpecificationError
-        If n or the seed is not a whole number, or a distribution is none of the above.
+        If n or the seed is not a whole number, n is larger than `MOST_CASES`, or a distribution is none of the above.
     """
     n, seed = whole("n", n), whole("seed", seed)
+    _require_few(n)
     draws = {name: _draw(name, distribution) for name, distribution in distributions.items()}
 
     def case(i):
         return {name: _value(name, draw, generator(seed, DRAWS, i, name)) for name, draw in draws.items()}
 
     return [case(i) for i in range(n)]
+
+
+def _require_few(n):
+    if n > MOST_CASES:
+        raise SpecificationError(
+            f"{n:.4g} cases were requested.",
+            f"At most {MOST_CASES:,} cases form one table: each is held in memory.",
+            do="Take fewer values, or several sweeps.",
+            cases=n,
+            most=MOST_CASES,
+        )
 
 
 def generator(seed, kind, index, name=""):
@@ -87,6 +101,13 @@ def as_cases(cases):
                 lengths=lengths,
             )
         cases = [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]
+    if not isinstance(cases, Iterable):
+        raise SpecificationError(
+            f"The cases are {cases!r}.",
+            "Cases are a sequence of dicts of parameters, or a dict of columns.",
+            do='Give them as grid(m=[1.0, 2.0]) or {"m": [1.0, 2.0]}.',
+            type=type(cases).__name__,
+        )
     cases = [_case(i, case) for i, case in enumerate(cases)]
     if not cases:
         raise SpecificationError("There is no case.", do="Give at least one, as by grid(m=[1.0, 2.0]).", cases=0)

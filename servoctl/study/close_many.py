@@ -14,6 +14,7 @@ from servoctl.control.conditions import Timing, index, steps
 from servoctl.control.residuals import Residuals
 from servoctl.control.result import Closed
 from servoctl.errors import IntegrationStopped, ServoError, SpecificationError, unknown
+from servoctl.plants.equations import equations_at
 from servoctl.study.cases import CASES, as_cases, generator
 from servoctl.study.table import Study, machine, table
 
@@ -88,6 +89,7 @@ def close_many(
     Returns
     -------
     Batch
+        After Ctrl-C it holds the finished cases, with `meta["interrupted"]` True.
 
     Raises
     ------
@@ -101,19 +103,22 @@ def close_many(
     _require(run)
     columns = _columns(cases)
     numbers = _case_numbers(run, columns, mapping(scale, "The scales"))
+    run = _at_all(run, numbers[0])
     loop = _resolved(run, *numbers[:2])
     derived = _unit(run)
     traced, every = _traced(record, derived.names, every)
     seeds = _seeds(run.conditions.sensors, len(columns[next(iter(columns))]))
     threads = threads if threads is None else whole("threads", threads, least=1)
-    gathered = run_batch(derived, loop, numbers, _noise(run, seeds), traced, every, threads)
+    gathered = None
+    if not run.plant.equations.orders:  # else each loop is judged by itself
+        gathered = run_batch(derived, loop, numbers, _noise(run, seeds), traced, every, threads)
     if gathered is None:
         gathered = _one_by_one(run, derived, loop, numbers, seeds, traced, every)
     meta = {
         "t_span": [loop.t0, loop.t0 + loop.samples * loop.period], "law": run.law.name, "rate": run.law.rate,
         "substeps": loop.substeps, "delay": loop.delay, "machine": machine(),
     }  # fmt: skip
-    study = _study(columns, seeds, derived.names, gathered, meta)
+    study, gathered = _study(columns, seeds, derived.names, gathered, meta)
     t = loop.t0 + np.arange(len(gathered.trace)) * every * loop.period
     return Batch(study, t, dict(zip(record, np.moveaxis(gathered.trace, 1, 0), strict=True)))
 
@@ -133,6 +138,13 @@ def _require(run):
             do="Use a compiled law, as of sv.lqr without sv.limited, or sv.sweep, whose cases may close any loop.",
             name=run.law.name,
         )
+
+
+def _at_all(run, constants):
+    """The loop of a plant whose equations hold for the constants (n_c, N) of all cases."""
+    equations = run.plant.equations
+    again = equations_at(equations, constants[: len(equations.values)])
+    return run if again is equations else replace(run, plant=replace(run.plant, equations=again))
 
 
 def _resolved(run, constants, starts):
@@ -242,7 +254,7 @@ def _traced(record, names, every):
 def _one_by_one(run, derived, loop, numbers, seeds, traced, every):
     """The same by `close`, for want of a compiler."""
     n, size = numbers[1].shape[1], len(derived.names)
-    lost = np.full((2, n), np.inf)
+    lost = np.full((2, n), np.nan)
     results = np.full((3, size, n), np.nan)
     trace = np.full((loop.samples // every + 1 if traced else 0, len(traced), n), np.nan)
     for i in range(n):
@@ -252,8 +264,14 @@ def _one_by_one(run, derived, loop, numbers, seeds, traced, every):
         except ServoError as error:
             if error.run is None:
                 raise
+            lost[:, i] = np.inf
             lost[0 if isinstance(error, IntegrationStopped) else 1, i] = error.details["t"]
             continue
+        except KeyboardInterrupt:
+            break
+        if not one.success:  # interrupted
+            break
+        lost[:, i] = np.inf
         residuals = [one.residual[name][0] for name in (derived.residuals.names if derived.residuals else ())]
         values = np.vstack([one.states, one.inputs, *residuals])
         results[:, :, i] = np.abs(values).max(axis=1), np.sqrt(np.mean(values**2, axis=1)), values[:, -1]
@@ -277,7 +295,14 @@ def _scaled(f, factor):
 
 
 def _study(columns, seeds, names, gathered, meta):
-    """The table; results of a loop that ended early are NaN."""
+    """The table, of the finished cases; results of a loop that ended early are NaN."""
+    finished = ~np.isnan(gathered.state_lost)
+    meta["interrupted"] = not finished.all()
+    if not finished.any():
+        raise KeyboardInterrupt
+    numbers = {"case": np.arange(len(finished))} | columns | ({"seed": np.array(seeds)} if seeds else {})
+    numbers = {name: values[finished] for name, values in numbers.items()}
+    gathered = Gathered(**{name: values[..., finished] for name, values in vars(gathered).items()})
     early = np.minimum(gathered.state_lost, gathered.law_lost)
     ended = np.isfinite(early)
     of_law = gathered.law_lost < gathered.state_lost
@@ -289,5 +314,4 @@ def _study(columns, seeds, names, gathered, meta):
     errors = np.where(ended, np.where(of_law, "ServoError", "IntegrationStopped"), "")
     what = np.where(of_law, "the law's answer", "the state")
     messages = [f"{w} is not finite at t = {t:.6g} s" if e else "" for w, t, e in zip(what, early, ended, strict=True)]
-    numbers = {"case": np.arange(len(early))} | columns | ({"seed": np.array(seeds)} if seeds else {})
-    return Study("batch", numbers | results | {"error": errors, "message": np.array(messages)}, meta)
+    return Study("batch", numbers | results | {"error": errors, "message": np.array(messages)}, meta), gathered

@@ -22,11 +22,15 @@ def load_study(path) -> Study:
     Raises
     ------
     ServoError
-        If the file is missing or is no study.
+        If the file is missing, damaged or no study.
     """
     return archive.read(path, "study", _from_archive)
 
 
 def _from_archive(facts, arrays):
-    columns = {name: arrays[f"column_{i}"] for i, name in enumerate(facts["names"])}
-    return KINDS.get(facts["kind"], Study)(facts["kind"], columns, facts["meta"])
+    kind, meta = facts["kind"], facts["meta"]
+    archive.require(isinstance(kind, str) and isinstance(meta, dict), "its kind or its facts are damaged")
+    columns = {name: arrays[f"column_{i}"] for i, name in enumerate(archive.named(facts["names"]))}
+    for name, column in columns.items():
+        archive.require(column.ndim == 1 and column.dtype.kind in "fiubU", f"its column {name!r} is damaged")
+    return KINDS.get(kind, Study)(kind, columns, meta)

@@ -218,7 +218,7 @@ def stability(model: Model, run: Run, order: int = 12) -> StabilityMap:
             names=names,
             expected=tuple(model.state_names),
         )
-    t, matrices, _ = linearised(model, run, PLAN_INSTANTS)
+    t, matrices = linearised(model, run, PLAN_INSTANTS)
     if len(t) < 2:
         raise SpecificationError(
             f"The Jacobian of the motion is finite at {len(t)} instants of the run.",

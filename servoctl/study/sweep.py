@@ -7,6 +7,7 @@ import json
 import multiprocessing
 import pickle
 import signal
+import sys
 import threading
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import Executor, ProcessPoolExecutor, as_completed
@@ -15,16 +16,15 @@ from os import PathLike
 import numpy as np
 
 from servoctl.checks import plain, whole
-from servoctl.codegen.function import compiling_at_once
 from servoctl.control.result import Closed
 from servoctl.errors import ServoError, SpecificationError
 from servoctl.progress import progress_bar
 from servoctl.run import Run
 from servoctl.study.cases import CASES, FAILURE, RESERVED, as_cases, generator
-from servoctl.study.checkpoint import Checkpoint, identity
+from servoctl.study.checkpoint import Checkpoint, by_case, identity
 from servoctl.study.table import Study, machine
 
-INTERRUPTED = 1  # status of a Run that Ctrl-C ended
+INTERRUPTED = 1  # status of a Run or Closed that Ctrl-C ended
 
 
 def sweep(
@@ -91,7 +91,7 @@ def sweep(
     key = identity(f"{_module_of(case)}.{name}", cases, seed)
     computed = _in_turn if executor is None else functools.partial(_on, executor)
     lost, interrupted = {}, False
-    with Checkpoint(checkpoint, key) as disk:
+    with Checkpoint(checkpoint, key, len(cases)) as disk:
         rows = {row["case"]: row for row in disk.rows if row["case"] in part}
         todo = [(i, cases[i]) for i in part if i not in rows]
         with progress_bar("sweep", progress, len(part), initial=len(rows), unit="case") as bar:
@@ -126,9 +126,9 @@ def merge(studies: Study | Iterable[Study]) -> Study:
     Raises
     ------
     SpecificationError
-        If there are none, or they belong to different sweeps.
+        If there are none, if they belong to different sweeps, or if finished rows of one case differ.
     """
-    studies = [studies] if isinstance(studies, Study) else list(studies)
+    studies = [studies] if isinstance(studies, Study) else list(studies) if isinstance(studies, Iterable) else []
     keys = {getattr(study, "meta", {}).get("identity") for study in studies}  # None for what is not a sweep
     if len(keys) != 1 or None in keys:
         raise SpecificationError(
@@ -138,10 +138,9 @@ def merge(studies: Study | Iterable[Study]) -> Study:
             studies=len(studies),
             sweeps=len(keys),
         )
-    finished, lost = {}, {}
-    for study in studies:
-        for row in study.rows():
-            (lost if row["case"] in study.meta["lost"] else finished).setdefault(row["case"], row)
+    every = [(row["case"] in study.meta["lost"], row) for study in studies for row in study.rows()]
+    finished = by_case([row for is_lost, row in every if not is_lost], "A sweep")
+    lost = {row["case"]: row for is_lost, row in every if is_lost}
     rows = lost | finished
     names = dict.fromkeys(name for study in studies for name in study.columns if name not in FAILURE)
     columns = {name: [rows[i].get(name) for i in sorted(rows)] for name in (*names, *FAILURE)}
@@ -156,20 +155,30 @@ def evaluate(case, index, parameters, seed):
         signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent handles Ctrl-C: workers finish the case they are at
     random = {} if seed is None else {"rng": generator(seed, CASES, index)}
     try:
-        with compiling_at_once():  # interpreted results differ by rounding, and so would the tables of other workers
-            numbers = _results(case(**parameters, **random), parameters)
-    except (Exception, SystemExit) as error:
-        facts = json.dumps(getattr(error, "details", {}), default=str)
-        return {"case": index, "error": type(error).__name__, "message": str(error), "facts": facts}
+        numbers = _results(case(**parameters, **random), parameters)
+    except KeyboardInterrupt:
+        raise
+    except BaseException as error:  # SystemExit and GeneratorExit, too: no case ends the sweep
+        return {"case": index, "error": type(error).__name__, **_said(error)}
     return {"case": index, "numbers": numbers}
+
+
+def _said(error):
+    """Message and facts (JSON) of an error, empty where they cannot be written."""
+    said = {"message": "", "facts": "{}"}
+    with contextlib.suppress(Exception):
+        said["message"] = str(error)
+    with contextlib.suppress(Exception):
+        said["facts"] = json.dumps(getattr(error, "details", {}), default=str)
+    return said
 
 
 def _results(result, parameters):
     numbers = dict(result) if isinstance(result, Mapping) else summary(result)
     for name, value in numbers.items():
-        if name in parameters or name in RESERVED or plain(value) is None:
+        if name in parameters or name in RESERVED or plain(value) is None or _beyond(value):
             raise SpecificationError(
-                f"The case returned {name} = {value!r}.",
+                f"The case returned {name} = {'a whole number beyond 1e308' if _beyond(value) else repr(value)}.",
                 f"A case returns numbers and texts. The names of its parameters and {', '.join(RESERVED)} are taken.",
                 do="Choose another name, or return single numbers instead of an array.",
                 name=name,
@@ -177,19 +186,24 @@ def _results(result, parameters):
     return {str(name): plain(value) for name, value in numbers.items()}
 
 
+def _beyond(value):
+    """Whether a whole number is too large for any array of numbers."""
+    return isinstance(value, int) and abs(value) > sys.float_info.max
+
+
 def summary(run):
     """Numbers of a Run or Closed by name: NAME_min, NAME_max and NAME_end of actuators and outputs, and t_end [s].
 
     A plan has `residual`, the largest over all rows and levels; a closed loop NAME_worst and NAME_last of each row.
     """
+    if getattr(run, "status", None) == INTERRUPTED:
+        raise KeyboardInterrupt
     if isinstance(run, Closed):
         numbers = _extrema(run, (*run.plant.inputs, *run.plant.mechanism.outputs))
         errors = {name: np.abs(levels[0]) for name, levels in run.residual.items()}
         numbers |= {f"{name}_worst": float(error.max()) for name, error in errors.items()}
         numbers |= {f"{name}_last": float(error[-1]) for name, error in errors.items()}
     elif isinstance(run, Run):
-        if run.status == INTERRUPTED:
-            raise KeyboardInterrupt
         known = run.names if run.model is None else (*run.model.actuators, *run.model.outputs)
         numbers = _extrema(run, [name for name in known if name in run.names])
         numbers["residual"] = max((float(np.abs(run.residual[name]).max()) for name in run.residual), default=0.0)

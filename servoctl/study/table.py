@@ -14,6 +14,7 @@ from servoctl.codegen.compiler import compiler
 from servoctl.errors import SpecificationError, unknown
 from servoctl.version import __version__
 
+_FORMULA = ("=", "+", "-", "@", "\t", "\n")  # how texts begin that spreadsheets evaluate
 SHOWN, MOST_COLUMNS = 7, 12  # rows of a table in a repr, and columns
 
 
@@ -76,6 +77,8 @@ class Study:
     def csv(self, path):
         """Write the table as CSV: a line of names, then one line for each row; a missing number is NaN.
 
+        A text that spreadsheets would take for a formula, as it begins with =, +, - or @, has a ' before it.
+
         Parameters
         ----------
         path : str or Path
@@ -89,10 +92,11 @@ class Study:
         ServoError
             If the file cannot be written.
         """
-        with archive.writing(path, "study") as path, open(path, "w", newline="", encoding="utf-8") as file:
-            lines = csv.writer(file, lineterminator="\n")
-            lines.writerow(self.columns)
-            lines.writerows(zip(*(values.tolist() for values in self.columns.values()), strict=True))
+        rows = zip(*(values.tolist() for values in self.columns.values()), strict=True)
+        with archive.writing(path, "study") as path:
+            with open(path, "w", newline="", encoding="utf-8", errors="backslashreplace") as file:
+                lines = csv.writer(file, lineterminator="\n")
+                lines.writerows([_cell(value) for value in row] for row in (self.columns, *rows))
         return path
 
     def save(self, path):
@@ -135,6 +139,13 @@ class Study:
         lines = [f"Study: {self.kind}, {len(self)} rows", "  " + ", ".join(self.columns)]
         lines += [f"  {self.meta['message']}"] if self.meta.get("message") else []
         return "\n".join([*map(_clipped, lines), *table(self, list(self.columns)[:MOST_COLUMNS])])
+
+
+def _cell(value):
+    if not isinstance(value, str):
+        return value
+    text = value.replace("\r\n", "\n").replace("\r", "\n")  # the csv module quotes no carriage return
+    return f"'{text}" if text.startswith(_FORMULA) else text
 
 
 def table(study, names, most=SHOWN):
@@ -182,7 +193,8 @@ def _array(values):
     values = list(values)
     if any(isinstance(value, str) for value in values):
         return np.array(["" if value is None else str(value) for value in values])
-    return np.array([np.nan if value is None else value for value in values])
+    array = np.array([np.nan if value is None else value for value in values])
+    return array.astype(float) if array.dtype == object else array  # whole numbers beyond 64 bits
 
 
 def _short(value):

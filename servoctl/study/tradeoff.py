@@ -8,7 +8,6 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from servoctl.checks import as_span, is_number, mapping, positive, positives
-from servoctl.codegen.function import compiling_at_once
 from servoctl.errors import LimitExceeded, ServoError, SpecificationError, unknown
 from servoctl.methods.accuracy import motion_error, relative_error
 from servoctl.methods.choice import (
@@ -26,7 +25,7 @@ from servoctl.methods.choice import (
 from servoctl.model.model import Model
 from servoctl.model.start import State
 from servoctl.progress import progress_bar
-from servoctl.simulation import consistent_state, simulate
+from servoctl.simulation import consistent_state, simulated
 from servoctl.study.table import SHOWN, Study, machine, table
 
 MEASURED = tuple(name for name in METHODS if name not in ("RK1", "RK2", "RK23"))  # which need too many steps
@@ -263,7 +262,7 @@ def tradeoff(
     drifts = (None, "project", "minimal", abs(t1 - t0) / TIME_CONSTANT) if drift is None else drift
     combinations = _combinations(model, methods, drifts if isinstance(drifts, (list, tuple)) else [drifts])
     total = sum(len(settings[_kind(method)]) for method, _ in combinations)
-    with compiling_at_once(), progress_bar("tradeoff", progress, total, unit="run") as bar, warnings.catch_warnings():
+    with progress_bar("tradeoff", progress, total, unit="run") as bar, warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)  # steps outside the stable range: their errors are measured
         reference, rows, interrupted = Reference(model, x0, (t0, t1), limit), [], False
         try:
@@ -309,7 +308,7 @@ class Reference:
         for method in checks:
             options = {"drift": Project(), "t_eval": self.times, "progress": Deadline(10 * seconds)}
             try:
-                run = _whole(simulate(self.model, self.start, self.span, method, **options))
+                run = _whole(simulated(self.model, self.start, self.span, method, **options))
             except ServoError as error:
                 failure = error
                 continue
@@ -326,7 +325,7 @@ class Reference:
         """The run with samples at these times (N,) [s]."""
         key = times.tobytes()
         if key not in self._runs:
-            run = simulate(self.model, self.start, self.span, self.method, drift=self.drift, t_eval=times)
+            run = simulated(self.model, self.start, self.span, self.method, drift=self.drift, t_eval=times)
             self._runs[key] = _whole(run)
         return self._runs[key]
 
@@ -394,7 +393,7 @@ def _errors_and_cost(reference, name, treatment, value, seconds):
 
     def at(times):
         options = {"drift": treatment, "t_eval": times, "progress": Deadline(seconds)}
-        return _whole(simulate(model, reference.start, reference.span, method, **options))
+        return _whole(simulated(model, reference.start, reference.span, method, **options))
 
     run, timed = at(times), []
     for _ in range(TIMED):

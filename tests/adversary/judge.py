@@ -12,7 +12,7 @@ from derivative_array import Reference
 import servoctl as sv
 
 AGREE = 1e-7  # of accelerations and actuation, relative to 1 plus the largest of them
-SPAN, SAMPLES = 0.4, 201  # s; verify interpolates the actuation between samples
+SPAN, SAMPLES = 0.4, 201  # s
 INSTANTS = (0, 70, 200)  # samples at which the reference is asked
 DOUBTFUL = 1e-5  # relative singular values below this confirm a refusal on rank
 SHARP = 1e5  # sensitivities of accelerations above this confirm a refusal as singular

@@ -66,14 +66,7 @@ def cases(known=True):
 
 
 def draw(pick, known=True):
-    """A case from a source of whole numbers; not `known`: without kinds of case that are known to end wrongly.
-
-    - Paths linear in time: a motion without acceleration, which `verify` measures against itself.
-    - A row of order three or above that a combination of lower order replaces: `verify` does not know its derivatives.
-    - Rows that differ by 1e-3 or less: `verify` compares forms without regard to their condition.
-    - A combination of rows by a decimal factor: its coefficients, folded in double precision, do not cancel to the last
-      digit, and are refused as neither zero nor resolved. Powers of two cancel.
-    """
+    """A case from a source of whole numbers; not `known`: several rows by actuators have orders up to 2 alone."""
     n = pick(2, 5)
     ideal = pick(0, 1)
     frame = pick(0, 2) == 2
@@ -110,8 +103,8 @@ def _term(pick, n):
     return f"{_decimal(pick, 6)}*{shape}"
 
 
-def _wave(pick, linear=True):
-    kind = pick(0 if linear else 1, 2)
+def _wave(pick):
+    kind = pick(0, 2)
     return f"{_decimal(pick, 6)}*" + ("t", f"sin({pick(5, 20) / 10}*t)", f"cos({pick(5, 20) / 10}*t)")[kind]
 
 
@@ -170,17 +163,15 @@ def _program(pick, n, k, ideal, known):
         lowly = not (known or ideal or k == 1)  # actuators may hide any row
         order = (0, 0, 0, 1, 1, 2, 2, 3, 4)[pick(0, 6 if lowly else 8)]
         twist = pick(0, 9) if a else 0
-        if twist == 9 and orders[-1] > 1 and not known:
-            twist = 0
         if twist == 9:  # the top of the row before, and a row of lower order that it hides
             order = pick(0, orders[-1])
-            core = _row(pick, n, a, order, known)
-            factor = _decimal(pick) if known else (-0.5, 0.5, 1.0, 2.0)[pick(0, 3)]
+            core = _row(pick, n, a, order)
+            factor = _decimal(pick)
             rows.append(f"{factor}*D({plain[-1]}) + {core}")
             kinds.append("hidden program row")
         elif twist == 8:
             order = orders[-1]
-            small, factor, core = pick(1, 5 if known else 2), _decimal(pick), _row(pick, n, a, order, known)
+            small, factor, core = pick(1, 5), _decimal(pick), _row(pick, n, a, order)
             rows.append(f"{factor}*({plain[-1]}) + 1e-{small}*({core})")
             kinds.append("nearly dependent")
         elif twist == 7 and pick(0, 3) == 3:
@@ -188,7 +179,7 @@ def _program(pick, n, k, ideal, known):
             rows.append(core)
             kinds.append("dependent")
         else:
-            core = _row(pick, n, a, order, known)
+            core = _row(pick, n, a, order)
             rows.append(core)
         plain.append(core)
         orders.append(order)
@@ -196,7 +187,7 @@ def _program(pick, n, k, ideal, known):
     return tuple(rows), tuple(plain), tuple(kinds)
 
 
-def _row(pick, n, lead, order, known):
+def _row(pick, n, lead, order):
     """A residual of an order, led by the coordinate `lead`."""
     other = pick(0, n - 1)
     terms = [_jet(lead, order)]
@@ -210,7 +201,7 @@ def _row(pick, n, lead, order, known):
     if order:
         low = pick(0, order - 1)
         terms.append(f"{_decimal(pick)}*{_jet(pick(0, n - 1), low)}")
-    terms.append(_wave(pick, linear=known))
+    terms.append(_wave(pick))
     return " + ".join(terms)
 
 

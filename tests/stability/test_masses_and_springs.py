@@ -107,13 +107,23 @@ def test_steps_too_long_for_a_stiff_spring_are_told(method, swinging_cars):
 # the guide of the mass on a car --------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("alpha", [1e-8, 1e-6, 1e-5])
+@pytest.mark.parametrize("alpha", [2e-7, 1e-6, 1e-5])
 @pytest.mark.parametrize("how", ["derived", "changed"])
 def test_a_guide_that_is_nearly_level_is_refused(how, alpha, slider):
     """Relative degree 3 or 2 is not for double precision to say: sin²α is 1e-10 or less."""
     with refused(sv.SingularProgram, "z", "balance of s") as caught:
         sv.derive(*mass_on_car(alpha, 1.0)) if how == "derived" else slider.with_parameters(alpha=alpha)
     assert "Move the parameters" in str(caught.value)
+
+
+@pytest.mark.parametrize("alpha", [1e-8, 5e-8])
+@pytest.mark.parametrize("how", ["derived", "changed"])
+def test_a_guide_that_is_level_up_to_rounding_is_level(how, alpha, slider):
+    """What sin²α changes of the motion lies below its rounding, too."""
+    model = sv.derive(*mass_on_car(alpha, 1.0)) if how == "derived" else slider.with_parameters(alpha=alpha)
+    run = sv.simulate(model, model.start(s=0.0), (0.0, 3.0), method=sv.Adaptive(rtol=1e-11, atol=1e-13))
+    level = cf.mass_on_car(run.t, 0.0, 1.0)
+    assert relative(run["s"], level["s"]) < 1e-9 and relative(run["force"], level["force"]) < 1e-9
 
 
 @pytest.mark.parametrize("alpha", [1e-4, 1e-3])

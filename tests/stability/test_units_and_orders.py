@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 from conftest import pendulum
 from refusals import refused
+from units import in_units, scale
 
 import servoctl as sv
-from servoctl.gallery import spiral
+from servoctl.gallery import gallery, spiral
 from servoctl.methods.choice import as_method
 
 UNITS = (1e-6, 1e6)  # units per metre: megametres to micrometres
@@ -79,6 +80,98 @@ def test_a_pendulum_goes_round_in_any_unit(unit, guess):
         assert run.success and run.counters["pivot_changes"] > 3
         for name in ("x", "y"):
             assert run[name] / unit == pytest.approx(plain[name], abs=1e-7)
+
+
+def rod(length, guess=None):
+    """A point mass on a rod, ideal, in x and y; gravity grows with the length, so that its period is the same."""
+    q = sv.coordinates("x y")
+    x, y = q
+    mechanism = sv.Mechanism(q, gibbs=sv.particle(q, 1.0, (x, y)), potential=9.81 * length * y)
+    return sv.derive(mechanism, sv.Program({"rod": x**2 + y**2 - length**2}, by="ideal"), guess=guess)
+
+
+ROD_STARTS = [{"x": 1.0, "dy": 0.0}, {"x": 1.0, "dy": 0.5}, {"y": 0.0, "dy": 0.0}, {"x": 0.0, "dx": 7.0}]
+
+
+@pytest.mark.parametrize("start", ROD_STARTS, ids=str)
+@pytest.mark.parametrize("guessed", [False, True])
+def test_the_rank_of_a_rod_does_not_depend_on_its_length(start, guessed):
+    """Rows of (3.18) hold quotients of pivots, which go to infinity each time the rod is level or upright."""
+    ends = []
+    for length in (1.0, 100.0, 1e3, 1e-3, 1e6):
+        model = rod(length, {"y": -length} if guessed else None)
+        below = {"x": 0.5 * length, "y": -0.5 * length}
+        state = model.start(guess=below, **{name: value * length for name, value in start.items()})
+        run = sv.simulate(model, state, (0.0, 3.0), t_eval=[1.354, 3.0])
+        energy = (run["dx"] ** 2 + run["dy"] ** 2) / 2 + 9.81 * length * run["y"]
+        assert energy[1] == pytest.approx(energy[0], rel=1e-6, abs=1e-6 * length**2)
+        ends.append(np.abs([run["x"], run["y"]]) / length)
+    for end in ends[1:]:
+        assert end == pytest.approx(ends[0], abs=1e-6)
+
+
+@pytest.mark.parametrize("length", [1e-9, 1e-6, 1e6])
+@pytest.mark.parametrize("method", ["DOP853", "LSODA", "Taylor", "RadauIIA", "CVODES"])
+def test_motions_of_any_size_have_the_same_relative_error(method, length):
+    """At the defaults: absolute tolerances follow the size of the motion."""
+    runs = []
+    for unit in (1.0, length):
+        model = rod(unit, {"y": -unit})
+        start = model.start(x=0.6 * unit, dy=0.0, guess={"y": -0.8 * unit})
+        runs.append(sv.simulate(model, start, (0.0, 3.0), method, t_eval=np.linspace(0.0, 3.0, 31))["x"] / unit)
+    assert runs[1] == pytest.approx(runs[0], abs=1e-7)
+
+
+def test_an_absolute_tolerance_of_the_user_is_kept():
+    model = rod(1e-9, {"y": -1e-9})
+    start = model.start(x=0.6e-9, dy=0.0, guess={"y": -0.8e-9})
+    loose, default = (sv.simulate(model, start, (0.0, 3.0), sv.Adaptive(atol=atol)) for atol in (1e-11, None))
+    assert loose.counters["steps"] < default.counters["steps"]
+
+
+SCALES = [(1e6, 1.0), (1e-6, 1.0), (1.0, 1e3), (1e6, 1e3), (1e-6, 1e-3)]  # units per metre and per kilogram
+REFUSED = {  # Newton's methods for flat programs and for starts compare their steps with 1 + |q|: refused, not wrong
+    ("winch-crane", 1e-6),
+    ("crane-3d", 1e6),
+    ("spiral", 1e-6),
+}
+
+
+@pytest.mark.parametrize("name", gallery)
+def test_every_scene_moves_alike_in_any_unit(name):
+    """From micrometres to megametres, grams to tonnes, along the whole motion, at the defaults."""
+    scene = gallery[name]
+    mechanism, program = scene.build()
+    q, t = mechanism.q, np.linspace(*scene.t_span, 51)
+
+    def moved(length, mass):
+        guess = scaled(scene.guess, length)
+        changed = sv.derive(*in_units(mechanism, program, scene.units, length, mass), guess=guess)
+        start = changed.start(scene.t_span[0], guess=guess, **scaled(scene.start, length))
+        return sv.simulate(changed, start, scene.t_span, t_eval=t)
+
+    def scaled(values, length):
+        return {key: value * scale(key, q, scene.units, length) for key, value in values.items()}
+
+    try:
+        reference = moved(1.0, 1.0)
+    except sv.SingularProgram as error:  # some scenes end by design
+        reference = error.run
+    for length, mass in SCALES:
+        if (name, length) in REFUSED:
+            with pytest.raises(sv.ServoError):
+                moved(length, mass)
+            continue
+        try:
+            run = moved(length, mass)
+        except sv.SingularProgram as error:
+            run = error.run
+        assert abs(len(run.t) - len(reference.t)) <= 1, (length, mass)
+        count = min(len(run.t), len(reference.t)) - (not reference.success)  # the last sample is next to the stop
+        for key in q.names:
+            expected = reference[key][:count]
+            found = run[key][:count] / scale(key, q, scene.units, length)
+            assert found == pytest.approx(expected, abs=1e-6 * max(np.abs(expected).max(), 1e-3)), (key, length, mass)
 
 
 @pytest.mark.parametrize("unit", [1e-6, 1.0])

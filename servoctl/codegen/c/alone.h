@@ -2,14 +2,21 @@
 #define NAME example
 #define NX 4
 #define NP 3
-#define NY 9
+#define NY 13
 #define PROJECTED
 #define WIDE
 
+#define CORRECTIONS 30
+#define CORRECTED 1e-13
 #define ROUNDING 0x1p-52
-#define BISECTIONS 20
-#define NEAR 1e-3
 #define QUADRATIC 1e-8
+#define CONTRACTION 0.25
+#define FOLLOWED 0.01
+#define STEADY 0.25
+#define SHORTEST 0x1p-32
+
+/* newton.c */
+#define PIVOTS 1
 
 /* taylor.c */
 #define NQ 2

@@ -155,7 +155,7 @@ INLINE void end(const Loop *c, int64_t at, const Cases *s)
     }
 }
 
-/* The loops of one block, two vectors of cases; the last commands and inputs, as many as the delays need, are in
+/* The loops of one block, two vectors of cases, unless they are stopped: then nothing is gathered. The last commands and inputs, as many as the delays need, are in
    scratch. */
 static void block(const Loop *c, int64_t at, const double *noise, double *scratch)
 {
@@ -166,6 +166,7 @@ static void block(const Loop *c, int64_t at, const double *noise, double *scratc
         for (int g = 0; g < 2; g++) sample(c, k, at + g * W_LANES, noise ? noise + g * W_LANES : 0, s + g);
         if (k == c->samples) break;
         for (int64_t i = 0; i < c->substeps; i++) {
+            if (*(const volatile int64_t *)&c->stop) return;
             const double t = c->t0 + (double)k * c->period + (double)i * h;
             const int64_t step = k * c->substeps + i;
             if (c->transport) for (int g = 0; g < 2; g++) transported(c, step, s + g);
@@ -181,7 +182,7 @@ static void block(const Loop *c, int64_t at, const double *noise, double *scratc
 void batch(const Loop *c, int64_t first, int64_t last, const double *noise, double *scratch)
 {
     const int64_t width = 2 * W_LANES;
-    for (int64_t b = first; b < last; b++) {
+    for (int64_t b = first; b < last && !*(const volatile int64_t *)&c->stop; b++) {
         block(c, b * width, noise ? noise + (b - first) * (c->samples + 1) * NM * width : 0, scratch);
     }
 }

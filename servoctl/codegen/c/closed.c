@@ -33,31 +33,35 @@ static void advance(const Loop *c, double t, double h, const double *d, double *
 #include "rk4.h"
 }
 
-/* The loop; sample k at t0 + k period: measure, call the law, delay, limit, hold. Returns the samples completed. */
+/* The loop; sample k at t0 + k period: measure, call the law, delay, limit, hold. It goes on at a step of a sample, and
+   pauses after some steps, as an interruption waits for it. Returns the samples completed. */
 __attribute__((optimize("no-tree-vectorize")))
 int64_t FN(closed)(Law *law, Loop *c)
 {
     double x[NX + 1], p[NP + 1];
     const double h = c->period / (double)c->substeps;
-    for (int i = 0; i < NX; i++) x[i] = c->x0[i];
+    int64_t left = c->steps;
+    for (int i = 0; i < NX; i++) x[i] = c->state[i];
     for (int i = 0; i < NP; i++) p[i] = c->p[i];
-    for (int64_t i = 0; i < c->n_z; i++) c->law_x[c->n_y + i] = c->z0[i];
-    for (int64_t k = 0; ; k++) {
+    if (c->sample + c->step == 0) for (int64_t i = 0; i < c->n_z; i++) c->law_x[c->n_y + i] = c->z0[i];
+    for (int64_t k = c->sample; ; k++, c->step = 0) {
         const double t = c->t0 + (double)k * c->period;
         const int64_t row = c->first + k < c->rows ? c->first + k : c->rows - 1;
         double *y = c->law_x + k * (c->n_y + c->n_z), *out = c->law_y + k * c->n_out, *u = c->input + k * c->n_u;
-        for (int i = 0; i < NX; i++) if (!isfinite(x[i])) { c->status = 1; return k; }
-        for (int i = 0; i < NX; i++) c->x[k * NX + i] = x[i];
-        measure(c, k, x, y);
-        law(t, y, c->table + row * c->n_row, out);
-        for (int64_t i = 0; i < c->n_u + c->n_z; i++) if (!isfinite(out[i])) { c->status = 2; return k; }
-        const double *command = k < c->delay ? c->initial_input : out - c->delay * c->n_out;
-        const double *before = k ? u - c->n_u : c->initial_input;
-        for (int64_t i = 0; i < c->n_u; i++) u[i] = limited(c, i, command[i], before[i]);
-        if (k == c->samples) return k + 1;
-        for (int64_t i = 0; i < c->n_z; i++) y[c->n_y + c->n_z + c->n_y + i] = out[c->n_u + i];
+        if (c->step == 0) {
+            for (int i = 0; i < NX; i++) if (!isfinite(x[i])) { c->status = 1; return k; }
+            for (int i = 0; i < NX; i++) c->x[k * NX + i] = x[i];
+            measure(c, k, x, y);
+            law(t, y, c->table + row * c->n_row, out);
+            for (int64_t i = 0; i < c->n_u + c->n_z; i++) if (!isfinite(out[i])) { c->status = 2; return k; }
+            const double *command = k < c->delay ? c->initial_input : out - c->delay * c->n_out;
+            const double *before = k ? u - c->n_u : c->initial_input;
+            for (int64_t i = 0; i < c->n_u; i++) u[i] = limited(c, i, command[i], before[i]);
+            if (k == c->samples) { c->status = 0; return k + 1; }
+            for (int64_t i = 0; i < c->n_z; i++) y[c->n_y + c->n_z + c->n_y + i] = out[c->n_u + i];
+        }
         for (int64_t i = 0; i < c->n_u; i++) p[c->at_u + i] = u[i];
-        for (int64_t s = 0; s < c->substeps; s++) {
+        for (int64_t s = c->step; s < c->substeps; s++) {
             const int64_t step = k * c->substeps + s;
             for (int64_t i = 0; c->transport && i < c->n_u; i++) {
                 const int64_t sent = step - c->transport[i];
@@ -65,6 +69,11 @@ int64_t FN(closed)(Law *law, Loop *c)
             }
             advance(c, t + (double)s * h, h, c->disturbance + 3 * step * c->n_d, x, p);
             restore(t + (double)(s + 1) * h, x, p);
+            if (--left > 0) continue;
+            for (int i = 0; i < NX; i++) c->state[i] = x[i];
+            c->sample = k + (s + 1) / c->substeps;
+            c->step = (s + 1) % c->substeps;
+            return k + 1;
         }
     }
 }

@@ -1,79 +1,172 @@
-/* Newton's iteration along a path. */
+/* A path by continuation, and its points between. The outputs are the Newton correction delta of x, the rates x' and x''
+   along the path, others, and at last the pivots of the elimination. A node is a row of t, x and these outputs. */
 #include "unit.h"
 #ifdef WIDE
 #include "lanes.h"
 #endif
 
-/* The largest |delta_i| / (1 + |x_i|). */
-static double relative_step(const double *x, const double *y)
+#define NODE (1 + NX + NY)
+
+/* The largest |change_i| / (1 + |x_i|). */
+static double relative(const double *x, const double *change)
 {
     double largest = 0;
     for (int64_t i = 0; i < NX; i++) {
-        const double e = fabs(y[i]) / (1 + fabs(x[i]));
-        if (!isfinite(x[i]) || !isfinite(y[i])) return INFINITY;
+        const double e = fabs(change[i]) / (1 + fabs(x[i]));
+        if (!isfinite(x[i]) || !isfinite(change[i])) return INFINITY;
         if (e > largest) largest = e;
     }
     return largest;
 }
 
-/* Newton's iteration at time t from x; y is the function at the x it leaves. */
-static int correct(double t, double *x, const double *p, double tol, int64_t max_iter, double *y, int64_t *count)
+/* Newton's iteration at time t from x, whose corrections shrink by a factor; y is the function at the x it leaves, and
+   `first` the size of the first correction. */
+static int correct(double t, double *x, const double *p, double factor, double *y, double *first, int64_t *count)
 {
-    double x_next[NX + 1], y_next[NY + 1], defect;
-    for (int64_t iteration = 0; ; iteration++) {
+    double x_next[NX + 1], y_next[NY + 1], defect, before = INFINITY;
+    for (int64_t iteration = 0; ; iteration++, before = defect) {
         NAME(t, x, p, y);
         ++*count;
-        defect = relative_step(x, y);
-        if (defect <= tol) break;
-        if (!isfinite(defect) || iteration == max_iter) return 0;
+        defect = relative(x, y);
+        if (!iteration) *first = defect;
+        if (!isfinite(defect)) return 0;
+        if (defect <= CORRECTED || (before <= QUADRATIC && defect > CONTRACTION * before)) break; /* or rounding */
+        if (defect > factor * before || iteration == CORRECTIONS) return 0;
         for (int64_t i = 0; i < NX; i++) x[i] += y[i];
     }
     if (defect <= ROUNDING) return 1;
     for (int64_t i = 0; i < NX; i++) x_next[i] = x[i] + y[i];
     NAME(t, x_next, p, y_next);
     ++*count;
-    if (relative_step(x_next, y_next) < defect) {
+    if (relative(x_next, y_next) < defect) {
         for (int64_t i = 0; i < NX; i++) x[i] = x_next[i];
         for (int64_t i = 0; i < NY; i++) y[i] = y_next[i];
     }
     return 1;
 }
 
-/* From the solution x, y at time a to the one at b: predicted by the rate and corrected; halves the step where that
-   fails. */
-static int advance(double a, double b, double *x, const double *p, double tol, int64_t max_iter, double *y,
-                   int64_t *count)
+/* x after a time h, by its rates in y. */
+static void predict(double h, const double *x, const double *y, double *x_next)
 {
-    double x_next[NX + 1], y_next[NY + 1], t = a;
-    for (int64_t done = 0, pieces = 1; done < pieces; ) {
-        const double next = done + 1 == pieces ? b : a + (b - a) * ((double)(done + 1) / (double)pieces);
-        for (int64_t i = 0; i < NX; i++) x_next[i] = x[i] + (next - t) * y[NX + i];
-        if (correct(next, x_next, p, tol, max_iter, y_next, count)) {
-            for (int64_t i = 0; i < NX; i++) x[i] = x_next[i];
-            for (int64_t i = 0; i < NY; i++) y[i] = y_next[i];
-            t = next;
-            for (done++; pieces > 1 && done % 2 == 0; done /= 2) pieces /= 2;
-        } else {
-            if (pieces == (int64_t)1 << BISECTIONS) return 0;
-            done *= 2;
-            pieces *= 2;
-        }
+    for (int64_t i = 0; i < NX; i++) x_next[i] = x[i] + h * (y[NX + i] + h / 2 * y[2 * NX + i]);
+}
+
+/* The largest difference of two points, relative to 1 + |x|. */
+static double distance(const double *x, const double *other)
+{
+    double change[NX + 1], size[NX + 1];
+    for (int64_t i = 0; i < NX; i++) {
+        change[i] = other[i] - x[i];
+        size[i] = fmax(fabs(x[i]), fabs(other[i]));
+    }
+    return relative(size, change);
+}
+
+/* Largest error of a prediction on the way between two points. */
+static double tolerance(const double *x, const double *other)
+{
+    return fmax(FOLLOWED * distance(x, other), QUADRATIC);
+}
+
+/* Whether no pivot changes its sign, or its size by more than a factor. */
+static int steady(const double *y, const double *other)
+{
+    for (int64_t i = NY - PIVOTS; i < NY; i++) {
+        const double product = y[i] * other[i];
+        if (!(product >= STEADY * y[i] * y[i] && product >= STEADY * other[i] * other[i])) return 0;
     }
     return 1;
 }
 
-#ifdef WIDE
-/* Weights of a node's value and rate in Hermite's interpolation at the times t, by its distances to two other nodes. */
-static inline void weights(W t, double node, double other, double another, W *value, W *rate)
+/* One step from x, y at time t towards the end, of at most the length h, which becomes that of the next. It is halved
+   until the predictions from both its ends miss the other one by a small part of the way, and all pivots are steady.
+   Returns 0 if it vanishes. */
+static int step(double *t, double end, double *h, double least, double *x, double *y, const double *p, int64_t *count)
 {
-    const double a = 1 / (node - other), b = 1 / (node - another);
-    const W d = t - node, basis = (t - other) * (t - another) * (a * b), square = basis * basis;
-    *value = square * (1 - 2 * (a + b) * d);
-    *rate = square * d;
+    double x_next[NX + 1], y_next[NY + 1], back[NX + 1], first;
+    for (;;) {
+        const double left = fabs(end - *t), length = *h >= left ? left : fmin(*h, left / 2);
+        const double now = *h >= left ? end : *t + copysign(length, end - *t);
+        if (now == *t || *h < fmin(least, left)) return 0;
+        predict(now - *t, x, y, x_next);
+        if (correct(now, x_next, p, CONTRACTION, y_next, &first, count) && steady(y, y_next)) {
+            predict(*t - now, x_next, y_next, back);
+            const double allowed = tolerance(x, x_next), error = fmax(first, distance(x, back));
+            if (error <= allowed) {
+                const double growth = fmin(2, 0.9 * sqrt(allowed / (error + ROUNDING)));
+                *h = growth < 1 ? fmax(growth, 0.5) * length : fmax(*h, growth * length);
+                *t = now;
+                for (int64_t i = 0; i < NX; i++) x[i] = x_next[i];
+                for (int64_t i = 0; i < NY; i++) y[i] = y_next[i];
+                return 1;
+            }
+        }
+        *h = length / 2;
+    }
+}
+
+static void record(double t, const double *x, const double *y, double *node)
+{
+    *node++ = t;
+    for (int64_t i = 0; i < NX; i++) *node++ = x[i];
+    for (int64_t i = 0; i < NY; i++) *node++ = y[i];
+}
+
+/* The path through n instants from x0, in steps of at most a length; returns the number of nodes, at most `most`. */
+int64_t FN(continuation)(int64_t n, const double *instants, const double *x0, const double *p, double longest,
+                         int64_t most, double *nodes, int64_t *count)
+{
+    double x[NX + 1], y[NY + 1], first, t = instants[0], h = longest;
+    int64_t k = 0;
+    *count = 0;
+    for (int64_t i = 0; i < NX; i++) x[i] = x0[i];
+    if (!correct(t, x, p, INFINITY, y, &first, count)) return 0;
+    record(t, x, y, nodes);
+    for (int64_t next = 1; next < n && ++k < most; next += t == instants[next]) {
+        if (!step(&t, instants[next], &h, longest * SHORTEST, x, y, p, count)) return k;
+        h = fmin(h, longest);
+        record(t, x, y, nodes + NODE * k);
+    }
+    return k < most ? k + 1 : most;
+}
+
+/* Where a time lies between two nodes: 0 at the first, 1 at the second. */
+static inline double between(double t, const double *a, const double *b)
+{
+    return *b == *a ? 0 : (t - *a) / (*b - *a);
+}
+
+/* The solution at t between two nodes: by Hermite's interpolation of x, x' and x'', else by steps from the first. */
+static int point(double t, const double *a, const double *b, const double *p, double *x, double *y, int64_t *count)
+{
+    const double h = *b - *a, s = between(t, a, b), r = 1 - s, s3 = s * s * s, r3 = r * r * r;
+    double first;
+    for (int64_t i = 0; i < NX; i++)
+        x[i] = r3 * ((1 + s * (3 + 6 * s)) * a[1 + i] + s * h * ((1 + 3 * s) * a[1 + 2 * NX + i]
+                                                                 + s / 2 * h * a[1 + 3 * NX + i]))
+             + s3 * ((1 + r * (3 + 6 * r)) * b[1 + i] - r * h * ((1 + 3 * r) * b[1 + 2 * NX + i]
+                                                                 - r / 2 * h * b[1 + 3 * NX + i]));
+    if (correct(t, x, p, CONTRACTION, y, &first, count) && first <= tolerance(a + 1, b + 1) && steady(a + 1 + NX, y)) return 1;
+    double now = *a, length = fabs(t - now);
+    for (int64_t i = 0; i < NX; i++) x[i] = a[1 + i];
+    for (int64_t i = 0; i < NY; i++) y[i] = a[1 + NX + i];
+    while (now != t)
+        if (!step(&now, t, &length, fabs(h) * SHORTEST, x, y, p, count)) return 0;
+    return 1;
+}
+
+#ifdef WIDE
+/* A number of eight nodes; the offset counts from their first numbers. */
+static inline W gather(const double *const *node, int64_t offset)
+{
+    if (node[0] == node[7]) return ALL(node[0][offset]);
+    W value;
+    for (int64_t l = 0; l < 8; l++) value[l] = node[l][offset];
+    return value;
 }
 
 /* The largest |delta_i| / (1 + |x_i|) of eight points. */
-static inline double wide_relative_step(const W *x, const W *y)
+static inline double wide_relative(const W *x, const W *y)
 {
     double defect = 0;
     W largest = ALL(0.0);
@@ -88,64 +181,77 @@ static inline double wide_relative_step(const W *x, const W *y)
     return defect;
 }
 
-/* The solutions at the eight times from t[k] on: predicted from three of the last eight by their values and rates, and
-   corrected together, by the first outputs alone until the correction is small. Returns 1 if all converge; then
-   the logs hold them. */
-static int block(int64_t n, int64_t k, const double *t, const W *p, double tol, double *x_log, double *y_log,
-                 int64_t *count)
+/* The solutions at the eight times from t[k] on, each between the nodes a and b: as `point` predicts them, corrected
+   together, by the first outputs alone until the correction is small. Returns 1 if all converge; then the logs hold
+   them. */
+static int block(int64_t n, int64_t k, const double *t, const double *const *a, const double *const *b, double allowed,
+                 const W *p, double *x_log, double *y_log, int64_t *count)
 {
-    W x[NX + 1], y[NY + 1], value[3], rate[3];
-    const W now = w_load(t + k);
-    const int64_t nodes[3] = {k - 8, k - 4, k - 1};
-    for (int64_t m = 0; m < 3; m++)
-        weights(now, t[nodes[m]], t[nodes[(m + 1) % 3]], t[nodes[(m + 2) % 3]], value + m, rate + m);
-    for (int64_t i = 0; i < NX; i++) {
-        x[i] = ALL(0.0);
-        for (int64_t m = 0; m < 3; m++)
-            x[i] += value[m] * x_log[i * n + nodes[m]] + rate[m] * y_log[(NX + i) * n + nodes[m]];
-    }
-    for (double defect = INFINITY, before = NEAR; !(defect <= QUADRATIC); before = defect) {
+    W x[NX + 1], y[NY + 1];
+    const W now = w_load(t + k), start = gather(a, 0), h = gather(b, 0) - start;
+    const W s = (now - start) / h, r = 1.0 - s, s3 = s * s * s, r3 = r * r * r;
+    const W at_a = r3 * (1.0 + s * (3.0 + 6.0 * s)), rate_a = r3 * s * (1.0 + 3.0 * s) * h;
+    const W at_b = s3 * (1.0 + r * (3.0 + 6.0 * r)), rate_b = s3 * r * (1.0 + 3.0 * r) * h;
+    const W second_a = r3 * s * s * 0.5 * h * h, second_b = s3 * r * r * 0.5 * h * h;
+    for (int64_t i = 0; i < NX; i++)
+        x[i] = at_a * gather(a, 1 + i) + rate_a * gather(a, 1 + 2 * NX + i) + second_a * gather(a, 1 + 3 * NX + i)
+             + at_b * gather(b, 1 + i) - rate_b * gather(b, 1 + 2 * NX + i) + second_b * gather(b, 1 + 3 * NX + i);
+    for (double defect = INFINITY, before = allowed; !(defect <= QUADRATIC); before = CONTRACTION * defect) {
         FN(wide_step)(now, x, p, y);
         *count += 8;
-        defect = wide_relative_step(x, y);
-        if (!(defect < before)) return 0;
+        defect = wide_relative(x, y);
+        if (!(defect <= before)) return 0;
         for (int64_t i = 0; i < NX; i++) x[i] += y[i];
     }
     FN(wide)(now, x, p, y);
     *count += 8;
-    if (!(wide_relative_step(x, y) <= tol)) return 0;
+    if (!(wide_relative(x, y) <= CORRECTED)) return 0;
+    for (int64_t i = NY - PIVOTS; i < NY; i++) {
+        const W other = gather(a, 1 + NX + i), product = y[i] * other;
+        if (w_any(~((product >= STEADY * y[i] * y[i]) & (product >= STEADY * other * other)))) return 0;
+    }
     for (int64_t i = 0; i < NX; i++) w_store(x_log + i * n + k, x[i]);
     for (int64_t i = 0; i < NY; i++) w_store(y_log + i * n + k, y[i]);
     return 1;
 }
 #endif
 
-/* The solution at each of n times in order; the logs hold n columns. Returns the number of points solved. */
-int64_t FN(newton)(int64_t n, const double *t, const double *x0, const double *p, double tol, int64_t max_iter,
-           double *x_log, double *y_log, int64_t *count)
+/* The solution at each of n times, in the order of the nodes; the logs hold n columns. Returns the number of points
+   solved. */
+int64_t FN(newton)(int64_t n, const double *t, int64_t n_nodes, const double *nodes, const double *p, double *x_log,
+                   double *y_log, int64_t *count)
 {
     double x[NX + 1], y[NY + 1];
-    int64_t alone = 9;
+    const double *a = nodes, *const last = nodes + NODE * (n_nodes - 1), *const final = n_nodes > 1 ? last - NODE : last;
+    const double direction = *last - *nodes;
     *count = 0;
-    for (int64_t i = 0; i < NX; i++) x[i] = x0[i];
 #ifdef WIDE
     W wide_p[NP + 1];
+    const double *from[8] = {0}, *to[8];
+    double allowed = 0;
     for (int64_t i = 0; i < NP; i++) wide_p[i] = ALL(p[i]);
 #endif
-    for (int64_t k = 0; k < n; k++) {
+    for (int64_t k = 0, alone = 0; k < n; k++) {
+        while (a < final && (t[k] - a[NODE]) * direction > 0) a += NODE;
 #ifdef WIDE
-        if (k >= alone && k + 8 <= n) {
-            if (block(n, k, t, wide_p, tol, x_log, y_log, count)) {
-                for (int64_t i = 0; i < NX; i++) x[i] = x_log[i * n + k + 7];
-                for (int64_t i = 0; i < NY; i++) y[i] = y_log[i * n + k + 7];
+        if (k >= alone && k + 8 <= n && direction != 0) {
+            if (from[7] != a) allowed = tolerance(a + 1, a + NODE + 1);
+            for (int64_t l = 0; l < 8; l++) {
+                from[l] = l ? from[l - 1] : a;
+                while (from[l] < final && (t[k + l] - from[l][NODE]) * direction > 0) {
+                    from[l] += NODE;
+                    allowed = fmin(allowed, tolerance(from[l] + 1, from[l] + NODE + 1));
+                }
+                to[l] = from[l] + NODE;
+            }
+            if (block(n, k, t, from, to, allowed, wide_p, x_log, y_log, count)) {
                 k += 7;
                 continue;
             }
             alone = k + 8;
         }
 #endif
-        if (!(k ? advance(t[k - 1], t[k], x, p, tol, max_iter, y, count)
-                : correct(t[k], x, p, tol, max_iter, y, count))) return k;
+        if (!point(t[k], a, a == last ? a : a + NODE, p, x, y, count)) return k;
         for (int64_t i = 0; i < NX; i++) x_log[i * n + k] = x[i];
         for (int64_t i = 0; i < NY; i++) y_log[i * n + k] = y[i];
     }

@@ -4,13 +4,13 @@
 /* Mirrored by servoctl/control/loop.py; arrays that are not used are null. */
 typedef struct {
     int64_t samples, substeps, delay, n_y, n_z, n_u, n_out, n_row, rows, first, n_d, at_u; /* of any loop */
-    int64_t depth, every, n_traced, columns;                                               /* of many */
-    int64_t status;                                                                        /* of one: how it ended */
+    int64_t depth, every, n_traced, columns, stop;                                         /* of many */
+    int64_t status, sample, step, steps; /* of one: how it ended, where it goes on, integration steps until it pauses */
     double t0, period;
     const double *p, *x0, *z0, *table, *noise, *quantum, *low, *high, *change, *initial_input, *disturbance;
     const double *constants, *scale;
     const int64_t *measured, *transport, *disturbed, *traced;
-    double *x, *law_x, *law_y, *input; /* logs of one loop */
+    double *state, *x, *law_x, *law_y, *input; /* the state and logs of one loop */
     double *gathered, *trace;          /* and of many */
 } Loop;
 

@@ -4,7 +4,7 @@
    NX, NP, NY      the lengths of x, p and y
    PROJECTED       where there is NAME_project, the change of x that restores invariants
    WIDE            where there are NAME_wide and NAME_wide_step, the same for eight points at once
-   ROUNDING, BISECTIONS, NEAR, QUADRATIC    tolerances of Newton's iterations
+   CORRECTIONS, ...    the tolerances of Newton's method and of continuation in loops.py
 
    and what the file itself names. A file that is read alone takes them from alone.h. */
 #ifndef UNIT_H

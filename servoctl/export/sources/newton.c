@@ -13,7 +13,7 @@ static int feedforward(double t, double *x, const double *p, double *z, double *
         }
         if (defect <= TOLERANCE) {
             for (int i = 0; i < NQ; i++) z[i] = x[i];
-            for (int i = 0; i < 2 * N; i++) z[NQ + i] = y[2 * NQ + i];
+            for (int i = 0; i < 2 * N; i++) z[NQ + i] = y[FIRST + i];
             for (int i = 0; i < N; i++) x[NQ + i] = z[NQ + i];
             actuation(t, z, p, u);
             return iteration;

@@ -1,0 +1,227 @@
+"""Expressions with kinks and jumps, written as smooth expressions with a branch as a parameter.
+
+On either side of a switching function g = 0 an expression with |g|, sign g, min, max or a comparison is smooth. With a
+parameter b in place of the decision, 1 for g > 0 and 0 for g < 0, it is smooth everywhere, and equal to the original as
+long as b is right. The angle atan2(y, x) jumps by 2π behind the origin; written as b π + atan2((-1)ᵇ y, (-1)ᵇ x), with
+whole b, its jump lies opposite to the direction b π, and b follows the angle round and round.
+"""
+
+from itertools import count
+from typing import NamedTuple
+
+import casadi as ca
+
+_SIDES = {
+    ca.OP_FABS: lambda b, x, y: (2 * b - 1) * x,
+    ca.OP_SIGN: lambda b, x, y: 2 * b - 1,
+    ca.OP_FMIN: lambda b, x, y: ca.if_else(b, y, x),
+    ca.OP_FMAX: lambda b, x, y: ca.if_else(b, x, y),
+    ca.OP_LT: lambda b, x, y: 1 - b,
+    ca.OP_LE: lambda b, x, y: 1 - b,
+}  # the operation on x and y where b says whether x > y
+_SWITCHING = {*_SIDES, ca.OP_ATAN2}
+_NARROW = 0.5**0.5  # an angle is followed up to 135° on either side of its branch
+
+
+class Switch(NamedTuple):
+    """A decision that the motion may change.
+
+    Attributes
+    ----------
+    branch : SX
+        The parameter b.
+    function : SX
+        The switching function, which is not negative where b is right.
+    other : SX
+        The branch beyond its zero.
+    text : str
+        Where it changes, in the designer's names.
+    angle : bool
+        Whether b counts half turns, instead of sides.
+    rests : bool
+        Whether b = 1/2 stands for the zero of the switching function itself: |0| = 0 and sign 0 = 0.
+    """
+
+    branch: ca.SX
+    function: ca.SX
+    other: ca.SX
+    text: str
+    angle: bool = False
+    rests: bool = False
+
+
+def has_switches(expressions):
+    """Whether expressions hold an operation with branches.
+
+    Parameters
+    ----------
+    expressions : SX column
+    """
+    f = ca.Function("branches", [], [expressions], {"allow_free": True})
+    return any(f.instruction_id(k) in _SWITCHING for k in range(f.n_instructions()))
+
+
+class Branches:
+    """Smooth expressions in place of ones with branches that depend on some of their symbols.
+
+    Parameters
+    ----------
+    moves : callable
+        Whether branches may change along a motion that changes a symbol (SX).
+    taken : sequence of str
+        Names that branches must not have.
+    """
+
+    def __init__(self, moves, taken=()):
+        self.taken = taken
+        self.moves, self.switches, self._angles, self._functions = moves, [], {}, []
+
+    def smooth(self, expressions, angles=False):
+        """The expressions with branches as parameters.
+
+        Parameters
+        ----------
+        expressions : sequence of SX scalars
+        angles : bool
+            Whether atan2 is a continuous angle; otherwise it stays as it is.
+
+        Returns
+        -------
+        list of SX scalars
+        """
+        if not expressions:
+            return []
+        merged = ca.densify(ca.cse(ca.vertcat(*expressions)))
+        work, original, moves = [], [], []  # smooth values, the same with their decisions, whether these may change
+
+        def value(op, operands):
+            original.append(_apply(op, *(original[i] for i in operands)))
+            moves.append(any(moves[i] for i in operands))
+            decides = op in _SIDES or (angles and op == ca.OP_ATAN2)
+            if not (moves[-1] and decides):
+                return _apply(op, *(work[i] for i in operands))
+            pairs = [(work[i], original[i]) for i in operands]
+            return self._angle(*pairs) if op == ca.OP_ATAN2 else self._side(op, *pairs)
+
+        def leaf(expression, symbol):
+            original.append(expression)
+            moves.append(symbol and self.moves(expression))
+            return expression
+
+        return _replayed(merged.elements(), work, leaf, value)
+
+    def _side(self, op, x, y=None):
+        """|x|, sign x, or an operation that compares x with y; pairs of smooth and original expressions."""
+        (x, x0), (y, y0) = x, y or (ca.SX(0), ca.SX(0))
+        rests = op in (ca.OP_FABS, ca.OP_SIGN)
+        if x.is_constant() and not y.is_constant():  # the same decision as that of y against the constant
+            return _SIDES[op](1 - self._branch(y - x, y0 - x0, rests), x, y)
+        return _SIDES[op](self._branch(x - y, x0 - y0, rests), x, y)
+
+    def _angle(self, y, x):
+        """The continuous angle of (x, y)."""
+        (y, y0), (x, x0) = y, x
+        key = y.element_hash(), x.element_hash()
+        if key not in self._angles:
+            b = self._parameter()
+            sign = ca.cos(ca.pi * b)
+            ahead = sign * x + _NARROW * ca.sqrt(x**2 + y**2)
+            turned = b + ca.if_else(sign * y >= 0, 1, -1)
+            self.switches.append(Switch(b, ahead, turned, f"the angle of ({_words(x0)}, {_words(y0)})", angle=True))
+            self._angles[key] = b, sign
+        b, sign = self._angles[key]
+        return ca.pi * b + ca.atan2(sign * y, sign * x)
+
+    def _parameter(self):
+        """A parameter for the next branch."""
+        names = (f"branch_{i}" for i in count(len(self.switches)))
+        return ca.SX.sym(next(name for name in names if name not in self.taken))
+
+    def _branch(self, g, original, rests):
+        """The branch parameter of a switching function, one for equal functions."""
+        for i, known in self._functions:
+            if ca.is_equal(known, g, 3):
+                self.switches[i] = self.switches[i]._replace(rests=rests and self.switches[i].rests)
+                return self.switches[i].branch
+        b = self._parameter()
+        at_zero = b == 0.5
+        function = ca.if_else(at_zero, -ca.fabs(g), (2 * b - 1) * g)
+        other = ca.if_else(at_zero, g > 0, 1 - b)
+        self._functions.append((len(self.switches), g))
+        self.switches.append(Switch(b, function, other, f"{_words(original)} = 0", rests=rests))
+        return b
+
+
+_EDGES = {
+    ca.OP_ASIN: ("asin", (-1.0, 1.0)),
+    ca.OP_ACOS: ("acos", (-1.0, 1.0)),
+    ca.OP_ATANH: ("atanh", (-1.0, 1.0)),
+    ca.OP_ACOSH: ("acosh", (1.0,)),
+    ca.OP_SQRT: ("sqrt", (0.0,)),
+    ca.OP_LOG: ("log", (0.0,)),
+    ca.OP_POW: ("a power", (0.0,)),
+    ca.OP_CONSTPOW: ("a power", (0.0,)),
+}
+
+
+def domain_edges(expressions):
+    """Where functions in expressions cease to be smooth.
+
+    Parameters
+    ----------
+    expressions : sequence of SX scalars
+
+    Returns
+    -------
+    list of (str, SX, float)
+        What happens there in words, an argument, and its value at the edge of the domain.
+    """
+    work, result = [], []
+
+    def value(op, operands):
+        arguments = [work[i] for i in operands]
+        name, edges = _EDGES.get(op, ("", ()))
+        words = f"the argument of {name}, {_words(arguments[0])}, reaches"
+        result.extend((f"{words} {edge:g}, where its domain ends", arguments[0], edge) for edge in edges)
+        if op in (ca.OP_DIV, ca.OP_INV):
+            result.append((f"it divides by {_words(arguments[-1])}, which reaches zero", arguments[-1], 0.0))
+        if op == ca.OP_ATAN2:
+            angle = f"the angle atan2({', '.join(map(_words, arguments))}) passes pi"
+            result.append((angle, ca.fmax(ca.fabs(arguments[0]), arguments[1]), 0.0))
+        return _apply(op, *arguments)
+
+    _replayed(expressions, work, lambda expression, symbol: expression, value)
+    return result
+
+
+def _replayed(expressions, work, leaf, value):
+    """The outputs of expressions whose operations are taken one by one; `work` receives all values in their order.
+
+    `leaf` gives the value of a symbol (True) or a constant (False), `value` that of an operation on places of `work`.
+    """
+    f = ca.Function("operations", [], list(expressions), {"allow_free": True, "live_variables": False})
+    free, outputs = iter(f.free_sx()), [ca.SX(0)] * len(expressions)
+    for k in range(f.n_instructions()):
+        op, operands = f.instruction_id(k), f.instruction_input(k)
+        if op == ca.OP_OUTPUT:
+            outputs[f.instruction_output(k)[0]] = work[operands[0]]
+        elif op == ca.OP_PARAMETER:
+            work.append(leaf(next(free), True))
+        elif op == ca.OP_CONST:
+            work.append(leaf(ca.SX(f.instruction_constant(k)), False))
+        else:
+            work.append(value(op, operands))
+    return outputs
+
+
+def _apply(op, *operands):
+    return ca.SX.unary(op, *operands) if len(operands) == 1 else ca.SX.binary(op, *operands)
+
+
+def _words(expression, longest=40):
+    """An expression in the designer's names; only the names where it is long."""
+    text = str(expression)
+    text = text[1:-1] if text.startswith("(") and text.endswith(")") and text.count("(") == 1 else text
+    if "@" in text or len(text) > longest:
+        text = f"a function of {', '.join(s.name() for s in ca.symvar(expression))}"
+    return text

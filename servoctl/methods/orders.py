@@ -1,0 +1,34 @@
+"""A motion ends where a row takes another order than the one that it was derived with."""
+
+import numpy as np
+
+from servoctl.errors import ServoError
+from servoctl.reduction.orders import other_order
+
+
+def end_at_other_orders(motion):
+    """Cut a motion before the first sample at which a row has another order, and set the error as its stop.
+
+    Parameters
+    ----------
+    motion : Motion
+        Its samples are cut in place.
+    """
+    for i, (model, t, x, top) in enumerate(motion.pieces):
+        jets = np.vstack([x, top])
+        k, name = model.reduction.orders.first_change(t, jets, model.parameters)
+        if k is not None:
+            motion.stop = _other_order(model, name, float(t[k]), jets[:, k])
+            motion.pieces[i:] = [(model, t[:k], x[:, :k], top[:, :k])] if k else []
+            return
+
+
+def _other_order(model, name, t, jets):
+    """The error of a row whose order changes, with the number of free initial values on either side."""
+    try:
+        free = model.near(t, jets[: len(model.jet_names)]).free
+    except ServoError as error:
+        free = error.details.get("free")
+    changes = free not in (None, model.free)
+    there = f", and from there on {free} initial values are free instead of {model.free}" if changes else ""
+    return other_order(name, t, there, free=free, expected=model.free)

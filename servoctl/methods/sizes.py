@@ -1,0 +1,36 @@
+"""How large the entries of a state are along a motion, in the metric of the inertia."""
+
+import numpy as np
+
+
+def state_levels(model):
+    """Level of each entry of the state X: 0 for q, k for γ^(k); (n_x,) array of int."""
+    n_x, nq, n = len(model.state_names), model.nq, model.n
+    return np.append(np.zeros(nq, dtype=int), 1 + np.arange(n_x - nq) // n)
+
+
+def motion_sizes(model, t, x):
+    """Sizes (n_x,) of the entries of X along a motion, in the metric of the inertia, with which no unit matters.
+
+    A level is as large as its largest √M_ii |γ_i^(k)|, and at least as large as the level below over the time; what a
+    coordinate at rest has of it is rounding. Coordinates without inertia, and q of another frame than γ', have their
+    own largest magnitude.
+
+    Parameters
+    ----------
+    model : Model
+    t : (N,) array
+        [s]
+    x : (n_x, N) array
+    """
+    inertia = model.function("matrices")(t[0], x[:, 0], model.parameters)[-model.n :]
+    metric, levels = np.sqrt(np.maximum(inertia, 0.0)), state_levels(model)
+    largest, duration = np.abs(x).max(axis=1), max(abs(t[-1] - t[0]), 1e-300)
+    sizes, below = largest.copy(), 0.0
+    for level in range(levels.max() + 1):
+        here = levels == level
+        if level == 0 and not model.reduction.mechanism.q.plain:
+            continue
+        below = max(float((metric * largest[here]).max()), below / duration)
+        sizes[here] = np.where(metric > 0, below / np.where(metric > 0, metric, 1.0), largest[here])
+    return sizes

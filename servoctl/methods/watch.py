@@ -1,0 +1,485 @@
+"""What ends a smooth piece of a motion: a kink or switch of the equations, or a residual that leaves its tolerance.
+
+The tolerance of a residual is what the tolerances of the state allow in it, |∂ψ/∂X| (atol + rtol |X|). Over a step a
+residual and its derivatives change as they extrapolate each other, since the last of them is kept at zero; what a step
+adds to that is its error. Where the program ends (an angle whose sine passes 1) or jumps, this is no small number.
+"""
+
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import pairwise
+from math import factorial
+
+import casadi as ca
+import numpy as np
+
+from servoctl.codegen.function import compiled
+from servoctl.errors import IntegrationStopped
+from servoctl.jets.branches import domain_edges
+from servoctl.methods.sizes import state_levels
+from servoctl.tolerances import TINY
+
+LEAVES = 1e3  # times its tolerance, which no healthy step adds to a residual
+DEFAULT = 1e-9, 1e-11  # rtol and atol that judge steps of fixed length, until these are known to be coarser
+LEAST_RTOL, LEAST_ATOL = 1e-12, 1e-14  # rounding of residuals: smaller tolerances are not resolved
+OF_TERMS = 1e-2  # of the terms of a residual, which it never reaches where it is sensitive
+SENSITIVE = 1e2  # times the first allowance of a residual, beyond which its terms bound it
+EXPLAINED = 2.0  # times the extrapolation of a residual from earlier levels
+REMAINS = 0.75  # of the error of a step in two of half its length: it is a jump, since other errors shrink to a half
+LEARNED = 10.0  # times the error of a step of fixed length, which later ones may have
+MOST_INSPECTED = 128  # steps of a stretch whose residuals are evaluated
+LOCATED = 40  # halvings of a step that locate where a residual leaves: all digits
+EDGE = 1e-3  # distance of a function's argument from the edge of its domain that explains why a residual leaves
+AT_ONCE = 1e-9  # of the span: switches closer than this follow at once
+MOST_AT_ONCE = 2  # changes of one branch at once, after which the motion stays on the switch
+
+END_BEFORE = "Let the motion end before, or write the residual so that it is smooth along the motion."
+
+
+@dataclass(frozen=True)
+class End:
+    """The smooth piece ends at t [s], X = x, in the step after `steps` whole ones.
+
+    Attributes
+    ----------
+    steps : int
+    t : float
+    x : (n_x,) array
+    switched : tuple of int
+        The switches that the motion crosses there; none where it stops.
+    branches : tuple of float
+        All branches beyond.
+    error : ServoError or None
+        Why it stops.
+    """
+
+    steps: int
+    t: float
+    x: np.ndarray
+    switched: tuple = ()
+    branches: tuple = ()
+    error: object = None
+
+
+class Tolerance:
+    """The tolerances of the state along a motion, and of functions of it.
+
+    Parameters
+    ----------
+    model : Model
+    rtol : float
+    atol : float or (n_x,) array
+    """
+
+    def __init__(self, model, rtol, atol):
+        self.levels, self.rtol = state_levels(model), max(rtol, LEAST_RTOL)
+        self.atol = np.broadcast_to(np.maximum(atol, LEAST_ATOL), len(self.levels))[:, None]
+        self.sizes = np.zeros(len(self.levels))
+
+    def of(self, slopes, x):
+        """Tolerances (m, N) of functions with derivatives (m, n_x, N) in X = x (n_x, N) along the motion."""
+        return np.einsum("mxn,xn->mn", np.abs(slopes), self.atol + self.rtol * self._sizes(x))
+
+    def accept(self, x):
+        """Take in states (n_x, N) as part of the motion."""
+        self.sizes = np.fmax(self.sizes, np.abs(x).max(axis=1))
+
+    def _sizes(self, x):
+        """The largest size of each entry's level so far, (n_x, N)."""
+        sizes = np.maximum(np.nan_to_num(np.abs(x)), self.sizes[:, None])
+        for level in range(self.levels[-1] + 1):
+            same = self.levels == level
+            sizes[same] = sizes[same].max(axis=0)
+        return np.maximum.accumulate(sizes, axis=1)
+
+
+class Switches:
+    """The switching functions of a motion.
+
+    Parameters
+    ----------
+    family : Switching
+    span : float
+        Length of the whole motion [s].
+    parts : int
+        Parts of a step at whose ends the functions are evaluated.
+
+    Attributes
+    ----------
+    branches : tuple of float
+        Those that hold.
+    tolerance : Tolerance
+    start : float
+        Of the piece [s].
+    """
+
+    def __init__(self, family, span, parts):
+        self.family, self.span, self.parts = family, span, parts
+        self.counts, self.rested, self.start, self.branches, self.tolerance = {}, set(), 0.0, (), None
+
+    def first(self, stretch, state):
+        """The first switch within steps as an `End`, or None; `state` gives X from (k, t)."""
+        t, x = self._instants(stretch, state)
+        functions, slopes, _ = self.family.values(self.branches, t, x)
+        wrong = functions < -self.tolerance.of(slopes, x)
+        if not wrong.any():
+            return None
+        j = max(int(np.argmax(wrong.any(axis=0))), 1)
+        k = (j - 1) // self.parts
+        roots = {i: self._root(i, t[j - 1], t[j], lambda s: state(k, s)) for i in np.flatnonzero(wrong[:, j])}
+        direction = np.copysign(1.0, t[j] - t[j - 1])
+        at = direction * min(direction * root for root in roots.values())
+        changed = tuple(int(i) for i, root in roots.items() if abs(root - at) <= AT_ONCE * self.span)
+        y = state(k, at) if at != t[0] else stretch.x[:, 0]
+        return End(k, float(at), y, changed, self._beyond(changed, at, y))
+
+    def _instants(self, stretch, state):
+        """Instants (N,) and states (n_x, N) at which the functions are evaluated: ends of steps, and parts of them."""
+        if self.parts == 1:
+            return stretch.t, stretch.x
+        inside = np.arange(1, self.parts) / self.parts
+        t, x = [stretch.t[:1]], [stretch.x[:, 0]]
+        for k, (a, b) in enumerate(pairwise(stretch.t)):
+            t += [a + (b - a) * inside, [b]]
+            x += [*(state(k, s) for s in t[-2]), stretch.x[:, k + 1]]
+        return np.concatenate(t), np.array(x).T
+
+    def _root(self, i, a, b, state):
+        from scipy.optimize import brentq
+
+        def function(s):
+            return self.family.values(self.branches, np.array([s]), state(s)[:, None])[0][i, 0]
+
+        low, high = function(a), function(b)
+        if not low > 0 > high:
+            return a
+        return brentq(function, a, b, xtol=1e-15, rtol=8.9e-16)
+
+    def _beyond(self, changed, t, x):
+        """All branches beyond a switch, with those that follow from it."""
+        result, open_ = list(self.branches), list(changed)
+        t, x = np.array([t]), x[:, None]
+        while open_:
+            others = self.family.values(tuple(result), t, x)[2]
+            for i in open_:
+                result[i] = float(others[i, 0])
+            changed = {*changed, *open_}
+            functions, slopes, _ = self.family.values(tuple(result), t, x)
+            wrong = np.flatnonzero(functions[:, 0] < -self.tolerance.of(slopes, x)[:, 0])
+            open_ = [i for i in wrong if i not in changed]
+        return tuple(result)
+
+    def stays(self, end):
+        """The switches from which the motion is driven back on both sides, in words, and the branches to go on with.
+
+        Where sign(0) = 0 and |0| = 0 are meant, the motion may rest on the switch: it is tried once.
+        """
+        if abs(end.t - self.start) > AT_ONCE * self.span:
+            self.counts, self.rested = {}, set()
+        for i in end.switched:
+            self.counts[i] = self.counts.get(i, 0) + 1
+        stuck = [i for i, count in self.counts.items() if count > MOST_AT_ONCE]
+        if stuck and not self.rested & {*stuck} and all(self.family.switches[i].rests for i in stuck):
+            self.rested |= {*stuck}
+            return [], tuple(0.5 if i in stuck else b for i, b in enumerate(end.branches))
+        return [self.family.switches[i].text for i in stuck], end.branches
+
+
+class Residuals:
+    """The residuals of a motion at all levels of its state.
+
+    Parameters
+    ----------
+    model : Model
+    tolerance : Tolerance
+    coefficients : sequence of array
+        Coefficients of the error dynamics of each row, empty without them.
+    """
+
+    def __init__(self, model, tolerance, coefficients=()):
+        self.model, self.tolerance, self.f = model, tolerance, model.function("invariants")
+        self.names = [name for _, name in model.invariant_names()]
+        self.m, self.coarse = len(self.names), np.zeros(len(self.names))
+        self.terms, self.first = np.zeros(self.m), None
+        places = {name: i for i, name in enumerate(self.names)}
+        self.chains = []
+        for a, row in enumerate(model.reduction.rows):
+            levels = [row.name, f"D({row.name})", *(f"D{j}({row.name})" for j in range(2, len(places)))]
+            chain = [places[name] for name in levels if name in places]
+            self.chains.append((chain, np.abs(coefficients[a]) if len(coefficients) else np.zeros(len(chain))))
+
+    def values(self, t, x):
+        """Residuals (m, N) at times t (N,) and states x (n_x, N), and what their tolerances and terms allow."""
+        y = self.f.grid(t, x, self.model.parameters)
+        slopes = y[self.m :].reshape(len(x), self.m, -1).swapaxes(0, 1)
+        allowed = LEAVES * self.tolerance.of(slopes, x)
+        if self.first is None:
+            self.first = allowed[:, 0]
+        first, self.latest = self.first[:, None], self.terms
+        if not np.all(allowed < SENSITIVE * first):  # near the edge of a domain slopes, and errors, grow without bound
+            terms = np.nan_to_num(self._terms.grid(t, x, self.model.parameters), posinf=0.0)
+            terms = np.maximum.accumulate(np.maximum(terms, self.terms[:, None]), axis=1)
+            allowed, self.latest = np.fmin(allowed, np.maximum(first, OF_TERMS * terms)), terms[:, -1]
+        return y[: self.m], allowed
+
+    def small(self, t, x):
+        """Whether residuals at the ends of steps are what they may be at the start, which needs no slopes."""
+        if self.first is None:
+            self.values(t[:1], x[:, :1])
+        residuals = self.f.grid(t[1:], x[:, 1:], self.model.parameters)[: self.m]
+        return bool(np.all(np.abs(residuals) <= self.first[:, None]))
+
+    @cached_property
+    def _terms(self):
+        """The sum of the magnitudes of each residual's terms."""
+
+        def size(expression):
+            if expression.op() in (ca.OP_ADD, ca.OP_SUB):
+                return size(expression.dep(0)) + size(expression.dep(1))
+            return ca.fabs(expression)
+
+        e = self.model.equations
+        sizes = [size(ca.densify(expression)) for _, _, expression in e.invariant_rows]
+        return compiled(e.function("terms", e.state, sizes), "terms")
+
+    def accept(self):
+        """Take in the states of the last evaluation as part of the motion."""
+        self.terms = self.latest
+
+    def explained(self, before, h):
+        """What residuals (m, N) may grow to in times h (N,), by the lower ones of their rows and the error dynamics."""
+        size, h = np.abs(before), np.abs(h)
+        result = size.copy()
+        for chain, coefficients in self.chains:
+            last = sum((c * size[i] for c, i in zip(coefficients, chain, strict=True)), 0.0 * h)
+            levels = [*(size[i] for i in chain), last]
+            for j, i in enumerate(chain):
+                result[i] = sum(level * h**k / factorial(k) for k, level in enumerate(levels[j:]))
+        return EXPLAINED * result
+
+    def off(self, t, before, after):
+        """How far residuals (m, N) exceed what they may be at the ends of steps, negative where all is well.
+
+        Parameters
+        ----------
+        t : (2, N) array
+            Starts and ends of the steps [s].
+        before, after : (n_x, N) arrays
+            States there.
+        """
+        with np.errstate(all="ignore"):
+            values, _ = self.values(t[0], before)
+            residuals, allowed = self.values(t[1], after)
+            over = np.abs(residuals) - allowed - self.coarse[:, None] - self.explained(values, t[1] - t[0])
+        return np.where(np.isnan(residuals), np.inf, np.nan_to_num(over, nan=-1.0, posinf=np.inf, neginf=-1.0))
+
+    def error(self, t, x, over, advice):
+        """The error of the residual that is farthest beyond what it may be at t, X = x; `advice` where why is open."""
+        values, allowed = (part[:, 0] for part in self.values(np.array([t]), x[:, None]))
+        worst = int(np.argmax(np.where(over > 0, over / np.maximum(allowed, TINY), -1.0)))
+        name, value = self.names[worst], float(values[worst])
+        row = next((row for row in self.model.reduction.rows if name.endswith(f"({row.name})")), None)
+        what = f"The residual {name!r}" if row is None else f"The rate {name} of the residual {row.name!r}"
+        why = edge(self.model, t, x)
+        return IntegrationStopped(
+            f"{what} leaves zero at t = {t:.7g} s, to {value:.3g} within a step{why and f': {why}'}.",
+            f"The tolerances of the method allow it {allowed[worst]:.1e}; beyond, this is no motion of the program.",
+            do=f"{END_BEFORE if why else advice} The run before this instant is in .run.",
+            t=t,
+            residual=name if row is None else row.name,
+            level=name,
+            value=value,
+            allowed=float(allowed[worst]),
+            why=why,
+        )
+
+
+def edge(model, t, x):
+    """The function in a residual that is at the edge of its domain, or jumps, at t, X = x; "" if there is none."""
+    r, m = model.reduction, model.reduction.mechanism
+    state = ca.vertcat(*m.q, *(s for k in range(1, r.top) for s in m.q.gamma(k)))
+    rows = [row.expression for row in r.original.values() if row.order < r.top]
+    places = domain_edges(rows) if rows else []
+    if not places:
+        return ""
+    arguments = ca.vertcat(*(argument for _, argument, _ in places))
+    f = ca.Function("arguments", [m.q.t, state, ca.vertcat(*m.parameters.symbols)], [arguments])
+    values = np.array(f(t, x, model.parameters)).ravel()
+    near = [(abs(v - bound), words) for v, (words, _, bound) in zip(values, places, strict=True)]
+    distance, words = min(near, key=lambda pair: np.nan_to_num(pair[0], nan=np.inf))
+    return words if distance < EDGE else ""
+
+
+class Watch:
+    """Finds where a smooth piece of a motion ends.
+
+    Parameters
+    ----------
+    tolerances : (rtol, atol) or None
+        Of the method; None for steps of fixed length.
+    span : float
+        Length of the whole motion [s].
+    family : Switching or None
+        The smooth models of a model with kinks or switches.
+    exact : bool
+        Whether the residuals are solved for, so that they need no watch.
+    parts : int
+        Parts of a step at whose ends switching functions are evaluated.
+    """
+
+    def __init__(self, tolerances, span, family, exact, parts):
+        self.span = span
+        self.tolerances, self.family, self.exact = tolerances or DEFAULT, family, exact
+        self.switches = None if family is None else Switches(family, span, parts)
+        self.model = self.tolerance = None
+        self.advice = ""
+
+    def use(self, model, branches, coefficients=()):
+        """Watch the motion of a model, which is the one for these branches."""
+        if self.tolerance is None:
+            self.tolerance = Tolerance(model, *self.tolerances)
+        self.model, tolerance = model, self.tolerance
+        self.residuals = None if self.exact else Residuals(model, tolerance, coefficients)
+        if self.switches is not None:
+            self.switches.branches, self.switches.tolerance = branches, tolerance
+
+    @property
+    def branches(self):
+        """The branches that hold."""
+        return () if self.switches is None else self.switches.branches
+
+    def texts(self, end):
+        """The switches that the motion crosses at an end, in words."""
+        return " and ".join(self.family.switches[i].text for i in end.switched)
+
+    def begin(self, t):
+        """Start a piece at t [s]."""
+        if self.switches is not None:
+            self.switches.start = t
+
+    def switch(self, stretch, state):
+        """The first switch within steps as an `End`, or None."""
+        return None if self.switches is None else self.switches.first(stretch, state)
+
+    def left(self, stretch, state, again=None, projected=False):
+        """Where a residual leaves its tolerance within steps, as an `End`, or None.
+
+        Parameters
+        ----------
+        stretch : Stretch
+        state : callable
+            X from (k, t).
+        again : callable, optional
+            States at the ends of two steps of half the length, from (t, x, h); for steps of fixed length.
+        projected : bool
+            Whether the ends of steps were projected: what `state` gives there was not.
+        """
+        count = len(stretch.t) - 1
+        if not count:
+            return None
+        if self.residuals is None or not self.residuals.m:
+            self.tolerance.accept(stretch.x)
+            return None
+        picked = np.unique(np.linspace(0, count, MOST_INSPECTED + 1).astype(int)) if count > MOST_INSPECTED else (
+            np.arange(count + 1)
+        )
+        t, x = stretch.t[picked], stretch.x[:, picked]
+        if not projected and self.residuals.small(t, x):
+            self.tolerance.accept(x)
+            return None
+        ends = np.array([stretch.dense(k, stretch.t[k + 1]) for k in range(count)]).T if projected else stretch.x[:, 1:]
+        over = self.residuals.off(np.array([t[:-1], t[1:]]), x[:, :-1], ends[:, picked[1:] - 1])
+        for p in np.flatnonzero((over > 0).any(axis=0)):
+            for k in range(picked[p], picked[p + 1]):
+                step = stretch.t[k : k + 2], stretch.x[:, k], ends[:, k]
+                off = self._off(*step) > 0
+                if off.any() and (again is None or self._stays(off, *step, again)):
+                    return self._end(k, *step, state)
+            self.residuals.values(t[-1:], x[:, -1:])
+        self.tolerance.accept(x)
+        self.residuals.accept()
+        return None
+
+    def _off(self, t, before, after):
+        return self.residuals.off(t[:, None], before[:, None], after[:, None])[:, 0]
+
+    def _stays(self, off, t, before, after, again):
+        """Whether a residual is as far off after two steps of half the length; if not, these steps are coarse."""
+        halves = again(t[0], before, (t[1] - t[0]) / 2)
+        if halves.shape[1] < 3:
+            return True
+        values, _ = self.residuals.values(t[[0, 1, 1]], np.column_stack([before, after, halves[:, -1]]))
+        explained = self.residuals.explained(values[:, :1], t[1:] - t[:1])[off]
+        once, twice = (np.abs(values[off, 1:]) - explained).T
+        if np.any(~(twice <= REMAINS * once)):
+            return True
+        self.residuals.coarse[off] = np.maximum(self.residuals.coarse[off], LEARNED * once)
+        return False
+
+    def _end(self, k, t, before, after, state):
+        """The end within step k at which a residual leaves its tolerance, by bisection."""
+        (start, high), low = t, t[0]
+        ends = {start: before, high: after}
+
+        def at(t):
+            return ends[t] if t in ends else state(k, t)
+
+        def off(t):
+            return self._off(np.array([start, t]), ends[start], at(t))
+
+        for _ in range(LOCATED):
+            middle = (low + high) / 2
+            low, high = (low, middle) if np.any(off(middle) > 0) else (middle, high)
+        return End(k, float(low), at(low), error=self.residuals.error(float(high), at(high), off(high), self.advice))
+
+    def jump(self, model, end):
+        """The error of a residual, or derivative of one, that jumps at a switch to another model; None if none does."""
+        t, x = np.array([end.t]), end.x[:, None]
+        sides = [Residuals(m, self.switches.tolerance) for m in (self.model, model)]
+        if sides[0].names != sides[1].names:
+            return None
+        (before, allowed), (after, other) = (side.values(t, x) for side in sides)
+        heights = np.abs(after - before)[:, 0]
+        jumps = np.flatnonzero(heights > np.maximum(allowed, other)[:, 0])
+        if not len(jumps):
+            return None
+        name, height = sides[0].names[jumps[0]], float(heights[jumps[0]])
+        where = self.texts(end)
+        row = next((row.name for row in model.reduction.rows if name.endswith(f"({row.name})")), None)
+        what = f"{name!r} jumps" if row is None else f"{row!r} has a kink: its rate {name} jumps"
+        return IntegrationStopped(
+            f"The residual {what} by {height:.3g} at t = {end.t:.7g} s, where {where}.",
+            "To keep it at zero on both sides, coordinates or velocities would jump.",
+            do="Write the residual with a smooth function, such as sqrt(y**2 + a**2) for |y|, or let the motion end "
+            "here. The run before this instant is in .run.",
+            t=end.t,
+            residual=row or name,
+            level=name,
+            height=height,
+            switch=where,
+        )
+
+
+def sticks(method, t, switches):
+    """The error of a motion that cannot leave a switch."""
+    where = " and ".join(switches)
+    return IntegrationStopped(
+        f"{method} stopped at t = {t:.7g} s: the motion stays at the switch {where}, driven back from both sides.",
+        "On a switch the equations of neither side hold, as where dry friction sticks.",
+        do="Write the switch as a smooth function, such as tanh(v/v0) for sign(v), or let the motion end here. The run "
+        "before this instant is in .run.",
+        t=t,
+        switches=list(switches),
+    )
+
+
+def no_model(method, t, where, reason):
+    """The error of a motion that meets a switch beyond which its program has no model."""
+    return IntegrationStopped(
+        f"{method} stopped at t = {t:.7g} s, where {where}: {reason}",
+        "Beyond a switch the program needs a model of the same structure.",
+        do="Let the motion end here. The run before this instant is in .run.",
+        t=t,
+        switch=where,
+        reason=type(reason).__name__,
+    )

@@ -1,0 +1,160 @@
+"""Starts of machines that stand still: what their constraints determine in motion only, and the limit of the motion.
+
+A rolling machine at rest satisfies its constraints with any heading. Where the motion that follows has a limit as it
+begins, its start is that limit.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from servoctl.errors import InconsistentStart, SingularProgram
+from servoctl.model.start import SPANNED, TOLERANCE, Aim, JetEquations, State, consistent, free_names, gauss_newton
+from servoctl.reduction.ranks import equilibrate
+
+STANDS = 1e-9  # velocities below this, relative to the coordinates' size, are rest
+MOVES = 1e-5  # velocities above this, likewise, leave six digits of directions that depend on their squares
+LATER = tuple(1e-3 * 2.0**k for k in range(11))  # s after the start, where the motion may have begun: 1 ms to 1 s
+NEAR_LIMIT = 1e-2  # rad or m: distance of the first value from the limit up to which extrapolation is trusted
+EQUAL = 1e-12  # difference of values at two instants that is rounding
+
+
+@dataclass(frozen=True)
+class Standstill:
+    """What is open while a machine stands still.
+
+    Attributes
+    ----------
+    coordinates : tuple of str
+        Those that the constraints determine in motion only.
+    rows : tuple of str
+        These constraints.
+    """
+
+    coordinates: tuple
+    rows: tuple
+
+    def error(self, t, nearest=None, **facts):
+        """The error of a program that is singular because its machine stands still at t [s]."""
+        rows, names = (", ".join(parts) for parts in (map(repr, self.rows), self.coordinates))
+        leave = "leaves" if len(self.rows) == 1 else "leave"
+        return SingularProgram(
+            f"At t = {t:.7g} s the machine stands still: {rows} {leave} {names} open there.",
+            "Constraints that are linear in velocities determine directions in motion only.",
+            nearest="" if nearest is None else f"t = {nearest:g} s, where it moves.",
+            do="Begin after the standstill and end before the next, or give the path a speed there.",
+            t=float(t),
+            coordinates=self.coordinates,
+            nearest_time=nearest,
+            **facts | {"rows": list(self.rows)},
+        )
+
+
+def started(model, t, held, guess, hold):
+    """See `Model.start`: a consistent state, at a standstill the limit of the motion that follows."""
+    state = failure = None
+    try:
+        state = consistent(model, t, held, guess, hold)
+        if _determined(model, state):
+            return state
+    except InconsistentStart as error:
+        failure = error
+    chosen = {**(guess or {}), **held}
+    still = standstill(model, t, chosen)
+    if still is not None and not hold and not set(still.coordinates) <= set(chosen):
+        return _limit(model, t, held, chosen, still)
+    if state is None:
+        raise failure
+    return state
+
+
+def _determined(model, state):
+    """Whether the invariants leave as many values free at a state as elsewhere."""
+    jacobian = JetEquations(model, state.t, {})(state.values)[1]
+    if not np.all(np.isfinite(jacobian)):
+        return False
+    sizes = np.linalg.svd(equilibrate(jacobian)[0].astype(float), compute_uv=False)
+    return len(state.values) - np.sum(sizes > SPANNED) <= model.free
+
+
+def _at_rest(model, t, chosen):
+    """The constraints as they were written, and the state nearest the chosen values that satisfies them."""
+    rows = tuple(model.reduction.original.values())
+    equations = JetEquations(model, t, {}, rows)
+    aim = Aim.of(equations.names, {name: v for name, v in chosen.items() if name in equations.names}, {})
+    return rows, equations, aim, gauss_newton(equations, aim.reference, aim)
+
+
+def standstill(model, t, chosen):
+    """What is open at t [s] while the machine stands still, about the chosen values; None if it moves."""
+    rows, equations, aim, x = _at_rest(model, t, chosen)
+    q = model.reduction.mechanism.q
+    still = np.abs(x[q.nq :]).max(initial=0.0) <= STANDS * (1.0 + np.abs(x[: q.nq]).max())
+    if not (still and np.abs(equations.scaled(x)).max(initial=0.0) < TOLERANCE):
+        return None
+    directions = {row.name: model.gradient_jets(row.name) for row in rows if row.order > 0}
+    directions = {row: [name for name in names if name in q.names] for row, names in directions.items()}
+    free = free_names(equations, x, aim, {name for names in directions.values() for name in names})
+    open_ = {row: [name for name in names if name in free] for row, names in directions.items()}
+    coordinates = tuple(dict.fromkeys(name for names in open_.values() for name in names))
+    return Standstill(coordinates, tuple(row for row, names in open_.items() if names)) if coordinates else None
+
+
+def _limit(model, t, held, chosen, still):
+    """The start that the motion after t has as its limit.
+
+    Raises
+    ------
+    SingularProgram
+        If there is no motion after t, or it has no limit.
+    """
+    moving = first_motion(model, t, chosen, still)
+    if moving is None:
+        raise still.error(t)
+    states, guess, later = [], chosen, moving - t
+    try:
+        for tau in (later, 2 * later, 4 * later):
+            states.append(consistent(model, t + tau, {}, guess, None))
+            guess = {name: states[-1][name] for name in states[-1].names}
+    except InconsistentStart:
+        raise still.error(t, moving) from None
+    limit = dict(zip(states[0].names[: model.nq], states[0].values, strict=False))
+    for name in still.coordinates:
+        limit[name], error = _extrapolated(*(state[name] for state in states))
+        if not error <= NEAR_LIMIT:
+            raise still.error(t, moving)
+    _, equations, aim, _ = _at_rest(model, t, limit)
+    x = gauss_newton(equations, aim.reference, aim)
+    residual = np.abs(equations.scaled(x)).max(initial=0.0)
+    return State(t, x, states[0].names, tuple(held), (), float(residual), at_rest=still.coordinates)
+
+
+def _extrapolated(first, second, third):
+    """The limit at 0 of a value at τ, 2τ and 4τ, exact for c + a τ^m (Aitken), and its distance from the first."""
+    near, far = second - first, third - second
+    if abs(near) <= EQUAL:
+        return first, abs(near)
+    if not abs(far) > abs(near):
+        return first, np.inf
+    limit = first - near**2 / (far - near)
+    return limit, abs(limit - first)
+
+
+def first_motion(model, t, chosen, still):
+    """A time [s] shortly after t at which the constraints determine a machine that stands still at t; None if none."""
+    return next((t + tau for tau in LATER if _moves(model, t + tau, chosen, still)), None)
+
+
+def _moves(model, t, guess, still):
+    """Whether a machine has a start at t [s] at which it is fast enough for its constraints to determine it.
+
+    Rates of what is open at rest are no measure: just after it they are rounding errors.
+    """
+    try:
+        state = consistent(model, t, {}, guess, None)
+    except InconsistentStart:
+        return False
+    q = model.reduction.mechanism.q
+    measured = [not q.plain or name not in still.coordinates for name in q.names[: q.n]]
+    speed = np.abs(state.values[q.nq : q.nq + q.n][measured]).max(initial=0.0)
+    return bool(speed > MOVES * (1.0 + np.abs(state.values[: q.nq]).max())) and _determined(model, state)

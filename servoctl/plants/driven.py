@@ -1,0 +1,68 @@
+"""A plant under inputs that are functions of time: a mechanism without a program."""
+
+import casadi as ca
+
+from servoctl.checks import column, mapping
+from servoctl.errors import SpecificationError, unknown
+from servoctl.model.model import derive
+from servoctl.spec.program import no_program
+
+
+def driven(plant, inputs=None):
+    """The model of a plant under given inputs, within its limits of magnitude.
+
+    Parameters
+    ----------
+    plant : Plant
+        Without lag, transport delay and limits of rate.
+    inputs : dict of str to float, SX or callable, optional
+        Inputs by actuator, default 0: numbers, expressions of `q.t` such as paths, or functions that give them of
+        `q.t`.
+
+    Returns
+    -------
+    Model
+        Its free initial values are all states that the material constraints leave; its outputs include the inputs.
+
+    Raises
+    ------
+    NameUnknown
+        For a name that is no actuator.
+    SpecificationError
+        For a plant with lag, delay or limits of rate, or an input that is no expression.
+    """
+    for what, value in (("lag", plant.lag), ("delay", plant.delay), ("rate_limits", plant.rate_limits)):
+        if value:
+            raise SpecificationError(
+                f"The plant has {what}={value}.",
+                "simulate lets inputs act at once.",
+                do="Use sv.close, which has actuators with lag, delay and limits of rate, or make the plant without.",
+                name=what,
+                value=value,
+            )
+    mechanism, t, values = plant.mechanism, plant.mechanism.q.t, mapping(inputs, "The inputs")
+    for name in values:
+        if name not in plant.inputs:
+            raise unknown(name, plant.inputs, "actuator")
+    expressions = {name: _expression(name, values.get(name, 0.0), t) for name in plant.inputs}
+    for name, (low, high) in plant.limits.items():
+        expressions[name] = ca.fmin(ca.fmax(expressions[name], low), high)
+    count = len(mechanism.parameters.names)
+    damping = ca.SX(list(plant.parameters[count : count + plant.equations.damping.numel()]))
+    further = plant.equations.forces + ca.substitute(plant.equations.resisting, plant.equations.damping, damping)
+    model = derive(mechanism.under(expressions, further), no_program())
+    return model.with_parameters(**dict(zip(mechanism.parameters.names, plant.parameters[:count], strict=True)))
+
+
+def _expression(name, value, t):
+    """An input as an expression."""
+    try:
+        value = value(t) if callable(value) else value
+    except Exception as error:  # the function's own
+        raise SpecificationError(
+            f"The input {name!r} is a function that takes no symbol ({type(error).__name__}).",
+            "A function of an input is evaluated once, at q.t: by arithmetic and CasADi's functions.",
+            do="Lay sv.paths.spline(q.t, times, points) through samples, or use CasADi's functions.",
+            name=name,
+        ) from error
+    return column(value, f"the input {name!r}", 1)[0]

@@ -1,0 +1,222 @@
+"""The motion between samples: integrated from each sample to the next, all at once, by collocation at Gauss points."""
+
+import functools
+from dataclasses import dataclass, field
+
+import numpy as np
+
+STAGES = 4  # Gauss points of a step: order 8
+FIXED_POINT_STEPS = 25  # of a step, at most: an explicit iteration that takes more needs shorter steps
+SETTLED = 1e-9  # change of the state, relative to its size, at which the iteration has converged
+CORRECTIONS = 3  # Newton steps from a state that was integrated, which is accurate to AGREES or better
+AGREES = 0.1  # of the limit: a difference from the next sample, or between two lengths of step, that decides
+FEW_STEPS, ENOUGH_STEPS = 32, 1024  # between two samples, where other pivots may help, and else
+MOST_OPERATIONS, OVERHEAD = 5e9, 200  # of all steps together: seconds; what an evaluation takes besides its own
+
+
+@functools.cache
+def gauss(stages):
+    """Nodes c (s,), weights b (s,) and matrix A (s, s) of the Gauss method, of order 2s (Hairer and Wanner, IV.5)."""
+    nodes, weights = np.polynomial.legendre.leggauss(stages)
+    c, powers = (nodes + 1) / 2, np.arange(stages)
+    integrals = c[:, None] ** (powers + 1) / (powers + 1)
+    return c, weights / 2, integrals @ np.linalg.inv(c[:, None] ** powers)
+
+
+@dataclass(frozen=True)
+class Flow:
+    """The motion of a model as x' = F(t, x): of q for a flat program, else of the state (q, γ', ..., γ^(s̄-1))."""
+
+    model: object
+    flat: bool
+    balanced: bool  # whether the power is to be integrated
+    most: int  # steps between two samples
+
+    @property
+    def f(self):
+        """The compiled function."""
+        return self.model.function("path" if self.flat else "ode")
+
+    @property
+    def n_x(self):
+        """The number of states."""
+        return self.model.nq if self.flat else len(self.model.state_names)
+
+    def values(self, t, x):
+        """Rates (n_x, N) and jets (n_z, N) at states (n_x, N)."""
+        y, (nq, n) = self.f.grid(t, x, self.model.parameters), (self.model.nq, self.model.n)
+        if self.flat:
+            return y[nq : 2 * nq], np.concatenate([x, y[2 * nq : 2 * nq + 2 * n]])
+        return y[: self.n_x], np.concatenate([x, y[self.n_x - n : self.n_x]])
+
+    def corrected(self, t, z):
+        """Jets at instants, those of a flat program solved for q by Newton's method."""
+        if not self.flat:
+            return z
+        q = z[: self.model.nq]
+        for _ in range(CORRECTIONS):
+            q = q + self.f.grid(t, q, self.model.parameters)[: self.model.nq]
+        return self.values(t, q)[1]
+
+    def power(self, t, z):
+        """Power of the forces without a potential at times (N,) and jets (n_z, N)."""
+        if not self.balanced:
+            return np.zeros(len(t))
+        power = self.model.signals("power")[1]
+        return power.grid(t, z[: power.n_x], self.model.parameters)[1]
+
+
+@dataclass(frozen=True)
+class Integration:
+    """How intervals are integrated.
+
+    Attributes
+    ----------
+    sizes : (n_x,) array
+        Of the components of the state.
+    limit : float
+        Largest difference from the next sample that passes, relative to the sizes.
+    steps : (K,) array of int
+        Steps of each interval, at least; at the ends of all steps but the last jets are returned.
+    """
+
+    sizes: np.ndarray
+    limit: float
+    steps: np.ndarray
+
+
+@dataclass(frozen=True)
+class Interval:
+    """What was found in one or many intervals, one entry for each.
+
+    Attributes
+    ----------
+    ends : (n_x, K) array
+        States reached.
+    defects : (K,) array
+        Largest differences from the samples at the ends, relative to the sizes; NaN without such a sample.
+    resolved : (K,) array of bool
+        Whether the steps were short enough to decide.
+    work : (K,) array
+        Integrals of the power.
+    inside : list of (flow, t, z)
+        Instants inside and jets there, with the flow that led to them.
+    """
+
+    ends: np.ndarray
+    defects: np.ndarray
+    resolved: np.ndarray
+    work: np.ndarray
+    inside: list = field(default_factory=list)
+
+
+def between(flows, t, x, settings):
+    """Integrate from each edge to the next.
+
+    Parameters
+    ----------
+    flows : callable
+        Of the index of an edge: a sequence of `Flow`, each of which is tried if those before it did not lead to the
+        next edge, as pivots may vanish between edges.
+    t : (K + 1,) array
+        Edges, in the order of the motion [s].
+    x : (n_x, K + 1) array
+        States of the samples; NaN at edges between them, whose state is the one reached from the edge before.
+    settings : Integration
+
+    Returns
+    -------
+    Interval
+    """
+    count, budget, x = len(t) - 1, [MOST_OPERATIONS], x.copy()
+    found = Interval(np.full((len(x), count), np.nan), *(np.full(count, v) for v in (np.nan, False, np.nan)))
+    sampled = np.all(np.isfinite(x), axis=0)
+    targets, ready = x[:, 1:].copy(), np.flatnonzero(sampled[:-1])
+    while ready.size:
+        tried = {k: iter(flows(k)) for k in ready}
+        while tried:
+            groups = {}
+            for k, rest in tried.items():
+                flow = next(rest, None)
+                if flow is not None:
+                    groups.setdefault((flow, settings.steps[k]), []).append(k)
+            for (flow, _), ks in groups.items():
+                problem = t[ks], np.diff(t)[ks], x[:, ks], targets[:, ks]
+                _integrate(flow, problem, np.array(ks), settings, found, budget)
+            left = [k for ks in groups.values() for k in ks if not found.resolved[k]]
+            tried = {k: tried[k] for k in left}
+        on = ready[~sampled[ready + 1] & found.resolved[ready]]
+        x[:, on + 1] = found.ends[:, on]
+        ready = on + 1
+        ready = ready[ready < count]
+    return found
+
+
+def _integrate(flow, problem, numbers, settings, found, budget):
+    """Integrate the intervals of these numbers with more and more steps, until the states at their ends are known."""
+    left, steps = np.arange(len(numbers)), settings.steps[numbers[0]]
+    least, cost = steps, flow.f.operations + OVERHEAD
+    while left.size and steps <= max(flow.most, least):
+        if steps > least and left.size * steps * STAGES * cost > budget[0]:
+            break
+        part = [values[..., left] for values in problem]
+        ks = numbers[left]
+        before = found.ends[:, ks]
+        ends, settled, work, inside, evaluations = _stepped(flow, *part, steps, settings.sizes)
+        budget[0] -= evaluations * cost
+        with np.errstate(invalid="ignore"):
+            defects = (np.abs(ends - part[3]) / settings.sizes[:, None]).max(axis=0)
+            changes = (np.abs(ends - before) / settings.sizes[:, None]).max(axis=0)
+        enough = AGREES * np.fmax(defects, settings.limit)
+        done = settled & ((defects <= AGREES * settings.limit) | (changes <= enough))
+        found.ends[:, ks], found.defects[ks], found.work[ks], found.resolved[ks] = ends, defects, work, done
+        found.inside.extend((flow, t[done], z[:, done]) for t, z in inside if done.any())
+        left, steps = left[~done], 2 * steps
+
+
+def _stepped(flow, t, length, x, targets, steps, sizes):
+    """Take equal steps from t (K,) over lengths (K,).
+
+    Returns the ends, whether all steps settled, the work, instants with their jets, and the number of evaluations.
+    """
+    h, (_, b, _) = length / steps, gauss(STAGES)
+    settled, work, evaluations, inside = np.ones(len(t), dtype=bool), np.zeros(len(t)), 0, []
+    for k in range(steps):
+        start, jets = flow.values(t + k * h, x)
+        inside += [(t + k * h, jets)] * (k > 0)
+        goal = flow.values(t + h, np.where(np.isfinite(targets), targets, x))[0] if steps == 1 else start
+        times, rates, jets, converged, count = _stages(flow, t + k * h, h, x, (start, goal), sizes)
+        x = x + h * np.einsum("j,njk->nk", b, rates)
+        settled &= converged & np.all(np.isfinite(x), axis=0)
+        power = flow.power(times.ravel(), jets.reshape(len(jets), -1)).reshape(times.shape)
+        work += h * (b @ power)
+        evaluations += count + times.size + 2 * len(t)
+        if not settled.any():
+            break
+    return x, settled, work, inside, evaluations
+
+
+def _stages(flow, t, h, x, guess, sizes):
+    """Times (s, K), rates (n_x, s, K) and jets (n_z, s, K) at the Gauss points of a step; who settled; evaluations.
+
+    `guess` are the rates at the start and at the end.
+    """
+    c, _, A = gauss(STAGES)
+    times, (start, end) = t + c[:, None] * h, guess
+    rates = start[:, None] + c[:, None] * (end - start)[:, None]
+    jets, left, evaluations = None, np.arange(len(t)), 0
+    settled = np.zeros(len(t), dtype=bool)
+    for _ in range(FIXED_POINT_STEPS):
+        with np.errstate(all="ignore"):
+            states = x[:, None, left] + h[left] * np.einsum("ij,njk->nik", A, rates[..., left])
+            pair = flow.values(times[:, left].ravel(), states.reshape(len(x), -1))
+            new, z = (values.reshape(len(values), STAGES, -1) for values in pair)
+            change = (np.abs(h[left] * (new - rates[..., left])) / sizes[:, None, None]).max(axis=(0, 1))
+        jets = np.zeros((len(z), STAGES, len(t))) if jets is None else jets
+        rates[..., left], jets[..., left] = new, z
+        evaluations += times[:, left].size
+        settled[left[change <= SETTLED]] = True
+        left = left[change > SETTLED]  # without those that are no longer finite
+        if not left.size:
+            break
+    return times, rates, jets, settled, evaluations

@@ -1,0 +1,104 @@
+"""The result of a verification: numbers, their limits, and a verdict."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+PASSED, FAILED, INCONCLUSIVE = "passed", "failed", "inconclusive"
+MOST_LINES = 12  # of a printed verification
+WORDS = {
+    "samples": "samples that are not finite or out of order",
+    "signals": "stored signals against those of the samples",
+    "acceleration": "accelerations of the full mechanism under the actuation",
+    "segments": "states after the motion was integrated from each sample to the next",
+    "power": "power balance dE/dt = sum of force times velocity",
+    "energy": "energy against the integrated power",
+    "multiplier form": "(3.18) against the form with multipliers",
+    "higher jets": "jets above the order of the model",
+    "outside": "part of the ideal reaction outside the actuators' reach",
+    "loop power": "energy gained less the work of all forces",
+    "loop power halved": "the same with steps half as long",
+    "loop constraints": "material constraints, values and rates",
+    "loop limits": "inputs beyond their limits",
+    "loop repeated": "all signals of the loop when it is run again",
+}
+
+
+@dataclass(frozen=True)
+class Verification:
+    """Errors of a run against the full mechanism, all of them relative.
+
+    Attributes
+    ----------
+    numbers : dict of str to float
+        "samples": number of samples that are not finite or out of order;
+        "signals": largest difference of a stored signal from its value at the samples, relative to its size;
+        "acceleration": largest error of γ'' of the mechanism under the actuation;
+        "segments": largest difference of the state from the one integrated from the sample before;
+        "power": largest error of dE/dt = Σ force·velocity; "energy": of its integral;
+        "multiplier form": largest residual of the equations with multipliers, relative to their terms;
+        "higher jets": largest error of jets above the order of the model, relative to their sizes;
+        "outside": part of an ideal reaction that the mechanism's actuators cannot exert;
+        "residual NAME": largest residual at any level, as a relative change of the jets that would remove it.
+    failures : tuple of str
+        Names of numbers that exceed their limits.
+    notes : tuple of str
+        Checks that do not apply, and why.
+    limits : dict of str to float
+        Largest value of each number that passes.
+    doubts : tuple of str
+        What could not be checked, why, and what to do.
+    """
+
+    numbers: dict
+    failures: tuple = ()
+    notes: tuple = ()
+    limits: dict = field(default_factory=dict)
+    doubts: tuple = ()
+
+    @property
+    def verdict(self):
+        """One of "failed" (a number exceeds its limit), "inconclusive" (something was not checked), and "passed"."""
+        return FAILED if self.failures else INCONCLUSIVE if self.doubts else PASSED
+
+    @property
+    def passed(self):
+        """Whether everything was checked and is within its limit."""
+        return self.verdict == PASSED
+
+    def __repr__(self):
+        residuals = {k: v for k, v in self.numbers.items() if k.startswith("residual ")}
+        worst = max(residuals, key=lambda key: np.nan_to_num(residuals[key], nan=np.inf), default=None)
+        said = {FAILED: f"FAILED: {', '.join(self.failures)}"}.get(self.verdict, self.verdict)
+        lines = [f"Verification: {said}", *(f"  {doubt}" for doubt in self.doubts)]
+        lines += [self._line(key, WORDS[key]) for key in WORDS if key in self.numbers]
+        if worst:
+            lines.append(self._line(worst, f"largest residual at any level ({worst.removeprefix('residual ')})"))
+        lines += [f"  {note}" for note in self.notes]
+        return "\n".join(lines[:MOST_LINES])
+
+    def _line(self, key, words):
+        limit = self.limits.get(key, np.inf)
+        allowed = f"limit {limit:7.1e}" if np.isfinite(limit) else "no limit     "
+        return f"  {self.numbers[key]:7.1e}, {allowed}: {words}{'  FAILED' * (key in self.failures)}"
+
+
+def judged(numbers, limits, notes=(), doubts=()):
+    """The verification of numbers with their limits; a number that is NaN fails."""
+    failures = tuple(key for key, value in numbers.items() if not value <= limits[key])
+    return Verification(numbers, failures, tuple(notes), limits, tuple(doubts))
+
+
+def largest(values):
+    """The largest magnitude; infinite if a value is NaN."""
+    return float(np.nan_to_num(np.abs(values), nan=np.inf, posinf=np.inf).max(initial=0.0))
+
+
+def numbers(value, dimensions):
+    """An array of real numbers from what a run holds; None if it is none of so many dimensions."""
+    try:
+        array = np.asarray(value)
+        array = array if array.dtype.kind == "c" else array.astype(float)
+    except (TypeError, ValueError):
+        return None
+    return array if array.ndim == dimensions and array.dtype.kind == "f" else None

@@ -1,0 +1,550 @@
+"""Checks of a run against the full mechanism, at its samples and at instants between them."""
+
+import contextlib
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from math import factorial
+
+import numpy as np
+
+from servoctl.checks import whole
+from servoctl.control.result import Closed
+from servoctl.errors import ServoError, SpecificationError
+from servoctl.methods.taylor import series_loop
+from servoctl.model.model import Model
+from servoctl.model.store import fingerprint
+from servoctl.run import SAME_TIME, Run, require_model
+from servoctl.verification.between import ENOUGH_STEPS, FEW_STEPS, Flow, Integration, between
+from servoctl.verification.loop import verify_loop
+from servoctl.verification.result import Verification, judged, largest, numbers
+
+LIMITS = {
+    "samples": 0.0,
+    "signals": 1e-9,
+    "acceleration": 1e-9,
+    "segments": 1e-6,
+    "power": 1e-8,
+    "energy": 1e-5,
+    "multiplier form": 1e-9,
+    "higher jets": 1e-6,
+    "residual": 1e-6,
+}
+INTEGRATED = 1e-6  # limit for numbers that drift disturbs: γ'' is integrated itself, or rows are hidden
+ROUNDING = 1e-13  # relative change of states and inputs whose effect is rounding: some hundred roundings
+PROBE, PROBES = 1e-7, 3  # relative change by which a response is measured, and in how many directions
+FLOOR = 1e-3  # least size of a component, relative to what moves as much mass, and to what moves there in the span
+BLUNT = 1e-3  # effect of rounding, relative to the accelerations, above which these decide nothing
+OWN_INSTANTS, MOST_OWN = 200, 8  # instants between samples at which everything is checked, in all and of an interval
+BALANCED = 1e-9  # part of dE/dt, relative to its terms, that does not follow from the forces: more is no rounding
+BY_INPUTS = 1e-6  # part of the accelerations that rounding of the inputs may excuse
+MOST_SEGMENTS = 10_000  # steps along the run that are accepted: seconds
+MOST_OWN_PIVOTS = 3  # choices of pivots of its own, where those of the run vanish between samples
+MOST_ENTRIES = 2e6  # of matrices that are held at once
+
+
+def verify(model: Model | Closed, run: Run | None = None, segments: int = 20) -> Verification:
+    """Check a run against the full mechanism, not the reduced model.
+
+    At every sample, and at instants between samples, the mechanism's accelerations under the required actuation are
+    compared with the run's; residuals are evaluated at every level, dE/dt is compared with the power of all forces, and
+    (3.18) with the form that has multipliers. From each sample to the next the motion is integrated again, by steps
+    as short as it requires, so that the verdict does not depend on the distance of the samples.
+
+    An error is relative to the sizes of the terms that it is a sum of. It also passes if it is no larger than what
+    rounding of the state and of the inputs causes.
+
+    A closed loop is verified by `verify(closed)`: it is run again and all its signals are compared; its energy against
+    the work of inputs, disturbances and friction, with two lengths of step; material constraints; limits.
+
+    Parameters
+    ----------
+    model : Model or Closed
+    run : Run
+        Of this model; omitted for a closed loop.
+    segments : int
+        Number of steps along the run, from 1 to 10,000; each interval between samples has at least one.
+
+    Returns
+    -------
+    Verification
+        Its verdict is "inconclusive" where a motion is too fast for the steps, or the run has a single sample.
+
+    Raises
+    ------
+    SpecificationError
+        If the run is not of this model, or segments is not a whole number from 1 to 10,000.
+    """
+    segments = whole("segments", segments, least=1, most=MOST_SEGMENTS)
+    if run is None and isinstance(model, Closed):
+        return verify_loop(model)
+    run, faulty = _required(model, run)
+    if faulty or not len(run.t):
+        return judged({"samples": float(faulty or 1)}, {"samples": LIMITS["samples"]})
+    checks = _Checks(model, run, segments)
+    found = {
+        **checks.signals(),
+        "acceleration": checks.acceleration(),
+        **checks.balance(),
+        "multiplier form": checks.multiplier_form(),
+        **checks.higher_jets(),
+        **checks.outside(),
+        **checks.residuals(),
+    }
+    found |= {"segments": checks.segments()} if len(run.t) > 1 else {}
+    limits = {key: checks.limit("residual" if key.startswith("residual ") else key) for key in found}
+    return judged(found, limits, checks.notes, checks.doubts)
+
+
+# --- what is verified
+
+
+def _required(model, run):
+    """The run by this model, as far as its samples are finite, and the number of faulty samples.
+
+    A motion that stopped may end in samples without accelerations.
+    """
+    whose = getattr(run, "model", None)
+    whole_run = isinstance(run, Run) and isinstance(whose, Model) and isinstance(run.jet_names, tuple)
+    require_model(model if isinstance(model, Model) else None, run if whole_run else None, "verify")
+    _require_same(model, run.model)
+    t, jets, knots = numbers(run.t, 1), numbers(run.jets, 2), numbers(run.knots, 1)
+    least, mappings = len(model.jet_names), (run.stored, run.stored_residual)
+    whole_levels = jets is not None and len(jets) >= least and (len(jets) - least) % model.n == 0
+    if t is None or knots is None or not whole_levels or jets.shape[1] != len(t):
+        raise _malformed(least, model.n, times=np.shape(run.t), jets=np.shape(run.jets))
+    plain = isinstance(run.variants, tuple) and isinstance(run.success, bool | np.bool) and isinstance(run.method, str)
+    if not plain or not all(isinstance(mapping, Mapping) for mapping in mappings):
+        raise _malformed(least, model.n, stored=[type(mapping).__name__ for mapping in mappings])
+    good = np.isfinite(t) & np.all(np.isfinite(jets), axis=0)
+    count = len(t) if run.success or not good.any() else 1 + int(np.flatnonzero(good)[-1])
+    steps = np.diff(t[:count])
+    backwards = count > 1 and t[count - 1] < t[0]
+    faulty = int(np.sum(~good[:count]) + np.sum((steps >= 0) if backwards else (steps <= 0)))
+    parts = {"variants": _variants(model, run, count), "knots": tuple(knots)}
+    parts["stored"] = {name: np.asarray(values)[:count] for name, values in run.stored.items() if np.ndim(values)}
+    return replace(run, t=t[:count], jets=jets[:, :count], jet_names=model.names_to(len(jets)), **parts), faulty
+
+
+def _malformed(least, n, **shapes):
+    found = ", ".join(f"{name} {shape}" for name, shape in shapes.items())
+    return SpecificationError(
+        f"The run has {found}.",
+        f"It has one time and {least} jets, or more by multiples of {n}, for each sample, and signals by name.",
+        do="Pass a run as sv.simulate returns it.",
+        **shapes,
+    )
+
+
+def _variants(model, run, count):
+    """The ranges of samples and their variants; the model alone if those of the run are not its own."""
+    ranges = []
+    for variant in run.variants:
+        if not (isinstance(variant, tuple) and len(variant) == 3 and isinstance(variant[2], Model)):
+            break
+        first, end, of = variant
+        if first >= count or first != (ranges[-1][1] if ranges else 0) or not _same(model, of):
+            break
+        ranges.append((first, min(end, count), of))
+    return tuple(ranges) if ranges and ranges[-1][1] == count else ((0, count, model),)
+
+
+def _same(model, other):
+    """Whether two models have the same specification and numbers, up to the choice of pivots."""
+    marks = {fingerprint(m.reduction.mechanism, m.reduction.program, values=()) for m in (model, other)}
+    return model is other or (len(marks) == 1 and np.array_equal(model.parameters, other.parameters))
+
+
+def _require_same(model, other):
+    """Refuse a run whose model has other equations or parameters."""
+    if _same(model, other):
+        return
+    names = model.reduction.mechanism.parameters.names
+    pairs = zip(names, model.parameters, other.parameters, strict=False)
+    changed = [name for name, a, b in pairs if a != b]
+    which = f"other numbers of {', '.join(changed)}" if changed else "another mechanism or program"
+    raise SpecificationError(
+        f"sv.verify received a run of a model with {which}.",
+        "A run is verified against the model that it was simulated with.",
+        do="Pass run.model, or simulate this model.",
+        parameters=changed,
+    )
+
+
+@dataclass(frozen=True)
+class _Instants:
+    """Instants at which one variant of the model is evaluated: times (N,), jets (n_z, N) and inputs (m, N).
+
+    `first` is the index of the first in the run; None for instants between samples.
+    """
+
+    model: object
+    t: np.ndarray
+    z: np.ndarray
+    inputs: np.ndarray
+    first: int | None = None
+
+    def signals(self, kind):
+        f = self.model.signals(kind)[1]
+        return f.grid(self.t, self.z[: f.n_x], self.model.parameters)
+
+
+class _Checks:
+    """The checks of one run; `notes` and `doubts` collect what does not apply and what cannot be decided."""
+
+    def __init__(self, model, run, segments):
+        self.model, self.run, self.notes, self.doubts = model, run, [], []
+        hidden = bool(model.reduction.hidden) and not model.flat
+        self.drifts = run.method == "Taylor" or model.reduction.top > 2 or hidden
+        self.stored, self.fresh = run.stored, replace(run, stored={}, stored_residual={})
+        self.span = abs(run.t[-1] - run.t[0]) or 1.0
+        self.samples = [
+            _Instants(v, run.t[a:b], run.jets[:, a:b], inputs, a)
+            for (a, b, v), inputs in zip(run.variants, self._inputs(), strict=True)
+        ]
+        self.mass = self._mass()
+        self.sizes = self._sizes(self.samples)
+        self.balanced = self._balanced()
+        self.between, self.sampled, own = self._integrate(segments)
+        self.instants = [*self.samples, *own]
+        self.sizes = self._sizes(self.instants)
+        if not run.success:
+            self.notes.append("the run did not reach its end: errors grow near a singularity")
+
+    def limit(self, key):
+        """The limit of a number."""
+        drifts = self.drifts and key in ("acceleration", "power", "multiplier form")
+        return INTEGRATED if drifts else LIMITS.get(key, np.inf)
+
+    def _inputs(self):
+        """The actuation, or the reaction of an ideal program, as the run gives it, by variant."""
+        names = self.model.signals("reaction" if self.model.ideal else "actuation")[0]
+        stored = {name: numbers(self.stored.get(name, np.nan), 1) for name in names}
+        alike = {name: v for name, v in stored.items() if v is not None and v.shape == self.run.t.shape}
+        values = np.array([alike.get(name, self.fresh[name]) for name in names]).reshape(len(names), -1)
+        return [values[:, a:b] for a, b, _ in self.run.variants]
+
+    # sizes
+
+    def _mass(self):
+        """The largest inertia of each velocity along the run, (n,) array."""
+        model, few = self.samples[0].model, np.unique(np.linspace(0, len(self.samples[0].t) - 1, 16).astype(int))
+        matrices, _ = model.multiplier_form(*self._at(self.samples[0], few))
+        return np.abs(np.einsum("iik->ik", matrices[: model.n, : model.n])).max(axis=1)
+
+    def _at(self, instants, which):
+        return instants.t[which], instants.z[: len(self.model.jet_names), which]
+
+    def _sizes(self, instants):
+        """The size of each jet (n_z,): its largest value, at least FLOOR of what others of its level have.
+
+        Levels are compared through the inertia: what carries the same kinetic energy. A level is also at least FLOOR of
+        what the level below would change by in the span.
+        """
+        nq, n = self.model.nq, self.model.n
+        sizes = np.zeros(len(self.run.jets))
+        for at in instants:
+            sizes[: len(at.z)] = np.maximum(sizes[: len(at.z)], np.abs(at.z).max(axis=1))
+        plain = self.model.reduction.mechanism.q.plain
+        for first in range(nq, len(sizes), n):
+            level = sizes[first : first + n]
+            below = sizes[first - n : first] / self.span if first > nq or plain else 0.0
+            level = np.maximum(level, FLOOR * below)
+            sizes[first : first + n] = np.maximum(level, FLOOR * self._alike(level))
+        moved = FLOOR * self.span * sizes[nq : nq + n] if plain else 0.0
+        sizes[:nq] = np.maximum(sizes[:nq], np.maximum(moved, FLOOR * FLOOR * sizes[:nq].max()))
+        return np.where(sizes > 0, sizes, 1.0)
+
+    def _alike(self, level):
+        """For each component of a level of jets, what has as large an energy as the largest of them."""
+        weights = np.sqrt(self.mass)
+        return np.divide((weights * level).max(), weights, out=level.copy(), where=weights > 0)
+
+    def _response(self, f, t, x, y, steps):
+        """Change of f(t, x, p) = y if each entry of x changes by its step: root mean square over random directions."""
+        directions = np.random.default_rng(0).standard_normal((PROBES, len(x), 1))
+        with np.errstate(all="ignore"):
+            changes = [np.nan_to_num(f(t, x + PROBE * d * steps) - y) / PROBE for d in directions]
+        return np.sqrt(np.mean(np.square(changes), axis=0))
+
+    # between samples
+
+    def _integrate(self, segments):
+        """The intervals between samples and knots, which edges are samples, and instants inside."""
+        run, knots = self.run, np.asarray(self.run.knots)
+        if len(run.t) < 2:
+            self.doubts.append("one sample is no motion: simulate with more samples")
+            return None, None, []
+        near = np.abs(knots[:, None] - run.t).min(axis=1) <= SAME_TIME * (1 + np.abs(knots)) if len(knots) else []
+        knots = np.array([k for k, known in zip(knots, near, strict=True) if not known and self._inside(k)])
+        edges = np.union1d(run.t, knots)[:: 1 if run.t[-1] > run.t[0] else -1]
+        sampled = np.isin(edges, run.t)
+        flat = self.model.flat and run.method == "algebraic"
+        n_x = self.model.nq if flat else len(self.model.state_names)
+        x = np.full((n_x, len(edges)), np.nan)
+        x[:, sampled] = run.jets[:n_x]
+        count = len(edges) - 1
+        steps = np.full(count, -(-segments // count))
+        watched = slice(None, None, max(1, count // OWN_INSTANTS))
+        steps[watched] = np.maximum(steps[watched], np.clip(-(-OWN_INSTANTS // count) + 1, 2, MOST_OWN))
+        settings = Integration(self.sizes[:n_x], LIMITS["segments"], steps)
+        found = between(self._flows(flat, np.cumsum(sampled) - 1), edges, x, settings)
+        return found, sampled, self._own(found)
+
+    def _flows(self, flat, sample):
+        """The flows to try from an edge on: of the variants next to its sample, and of one with its own pivots."""
+        variants, firsts = [v for *_, v in self.run.variants], [a for a, *_ in self.run.variants]
+        allowance = [MOST_OWN_PIVOTS]
+
+        def flows(k):
+            i = int(np.searchsorted(firsts, sample[k], side="right")) - 1
+            near = range(i, min(i + 2, len(variants)))
+            for j in near:
+                yield Flow(variants[j], flat, self.balanced, FEW_STEPS)
+            if allowance[0]:
+                allowance[0] -= 1
+                with contextlib.suppress(ServoError):
+                    at = self.run.jets[: len(self.model.jet_names), sample[k]]
+                    yield Flow(self.model.near(self.run.t[sample[k]], at), flat, self.balanced, FEW_STEPS)
+            yield Flow(variants[i], flat, self.balanced, ENOUGH_STEPS)
+
+        return flows
+
+    def _inside(self, t):
+        return min(self.run.t[0], self.run.t[-1]) < t < max(self.run.t[0], self.run.t[-1])
+
+    def _own(self, found):
+        """Instants inside the intervals, some OWN_INSTANTS of them, by variant."""
+        by_flow = {}
+        for flow, t, z in found.inside:
+            by_flow.setdefault(flow, []).append((t, z))
+        own = []
+        for flow, parts in by_flow.items():
+            t, z = (np.concatenate(values, axis=-1) for values in zip(*parts, strict=True))
+            few = np.unique(np.linspace(0, len(t) - 1, OWN_INSTANTS).astype(int))
+            instants = _Instants(flow.model, t[few], flow.corrected(t[few], z[:, few]), None)
+            own.append(replace(instants, inputs=instants.signals("inputs")))
+        return own
+
+    def segments(self):
+        """Largest difference of the states from those integrated from the sample before."""
+        found = self.between
+        unknown = np.flatnonzero(~found.resolved)
+        if len(unknown):
+            first = self.run.t[np.cumsum(self.sampled)[unknown[0]] - 1]
+            where = f"{len(unknown)} of {len(found.resolved)} intervals between samples, the first from {first:.6g} s"
+            what = "the motion is too fast to follow, or singular: simulate with more samples (t_eval)"
+            self.doubts.append(f"in {where} on, {what}")
+        known = np.flatnonzero(found.resolved & self.sampled[1:])
+        targets = self.run.jets[: len(found.ends), np.cumsum(self.sampled)[known]]
+        return largest((found.ends[:, known] - targets) / self.sizes[: len(found.ends), None])
+
+    # the equations
+
+    def acceleration(self):
+        """Largest error of the mechanism's γ'' under the inputs, relative to what has as large an energy."""
+        n, nq = self.model.n, self.model.nq
+        worst, blunt, limit = 0.0, 0.0, self.limit("acceleration")
+        size = self._alike(self.sizes[nq + n : nq + 2 * n])[:, None]
+        for at in self.instants:
+
+            def f(t, x, model=at.model):
+                return model.function("plant").grid(t, x, model.parameters)[nq:]
+
+            def given(t, z, f=f, at=at):
+                inputs = at.model.signals("inputs")[1]
+                return f(t, np.vstack([z[: nq + n], inputs.grid(t, z[: inputs.n_x], at.model.parameters)]))
+
+            x = np.vstack([at.z[: nq + n], at.inputs])
+            accelerations = f(at.t, x)
+            rounding = ROUNDING * self._response(f, at.t, x, accelerations, np.abs(x))
+            of_inputs = ROUNDING * self._response(given, at.t, at.z, given(at.t, at.z), np.abs(at.z))
+            excused = rounding + np.minimum(of_inputs, BY_INPUTS * size)
+            errors = np.abs(accelerations - at.z[nq + n : nq + 2 * n]) / (size + excused / limit)
+            worst, blunt = max(worst, largest(errors)), max(blunt, largest(rounding / size))
+        if blunt > BLUNT:
+            self.doubts.append(
+                f"rounding changes the mechanism's accelerations by {blunt:.1e} of their size: scale the units, or "
+                "replace stiff springs and small masses by constraints"
+            )
+        return worst
+
+    def multiplier_form(self):
+        """Largest residual of [M -B; C 0] [γ''; μ] = ..., relative to the largest terms of each row."""
+        parts = [self._rows(at) for at in self.instants]
+        terms = np.max([terms for _, terms, _ in parts], axis=0)[:, None]
+        sizes = (terms + rounding / self.limit("multiplier form") for *_, rounding in parts)
+        return max(largest(_ratio(rows, size)) for (rows, *_), size in zip(parts, sizes, strict=True))
+
+    def _rows(self, at):
+        """Residuals (rows, N), largest terms (rows,) and rounding (rows, N) of the equations with multipliers."""
+        n, nq, n_z = self.model.n, self.model.nq, len(self.model.jet_names)
+        z, f = at.z[:n_z], at.model.signals("all_multipliers")[1]
+
+        def multipliers(t, z):
+            return f.grid(t, z, at.model.parameters)
+
+        mu = multipliers(at.t, z)
+        d_mu = self._response(multipliers, at.t, z, mu, np.abs(z))
+        most = np.concatenate([self.sizes[nq + n : nq + 2 * n], np.abs(mu).max(axis=1, initial=0.0)])
+        unknowns = np.concatenate([z[nq + n : nq + 2 * n], mu])
+        columns = len(unknowns)
+        few = max(1, int(MOST_ENTRIES / columns**2))
+        rows, terms, rounding = [], [], []
+        for a in range(0, len(at.t), few):
+            part = slice(a, a + few)
+
+            def residual(t, z, y=unknowns[:, part]):
+                matrix, right = at.model.multiplier_form(t, z)
+                return np.einsum("ijk,jk->ik", matrix, y) - right
+
+            matrix, right = at.model.multiplier_form(at.t[part], z[:, part])
+            matrix_size = np.abs(matrix)
+            rows.append(np.einsum("ijk,jk->ik", matrix, unknowns[:, part]) - right)
+            terms.append((np.einsum("ijk,j->ik", matrix_size, most) + np.abs(right)).max(axis=1))
+            response = self._response(residual, at.t[part], z[:, part], rows[-1], np.abs(z[:, part]))
+            response += np.einsum("ijk,jk->ik", matrix_size[:, n:], d_mu[:, part])
+            rounding.append(ROUNDING * response)
+        return np.concatenate(rows, axis=1), np.max(terms, axis=0), np.concatenate(rounding, axis=1)
+
+    def residuals(self):
+        """Largest residual of each row at any level, by the relative change of the jets that would remove it."""
+        names, _ = self.model.signals("residuals")
+        worst = {f"residual {name}": 0.0 for name in self.run.residual}
+        for at in self.instants:
+            f = at.model.signals("residuals")[1]
+            z = at.z[: f.n_x]
+
+            def values(t, z, f=f, model=at.model):
+                return f.grid(t, z, model.parameters)
+
+            levels = values(at.t, z)
+            response = self._response(values, at.t, z, levels, self.sizes[: f.n_x, None])
+            response = np.maximum(response, FLOOR * np.median(response, axis=1, keepdims=True))
+            if at.first is not None:
+                levels = self._as_stored(np.abs(levels), names, at.first)
+            for (name, _), level, size in zip(names, levels, response, strict=True):
+                worst[f"residual {name}"] = max(worst[f"residual {name}"], largest(_ratio(level, size)))
+        return worst
+
+    def _as_stored(self, levels, names, first):
+        """Levels, or those that the run has stored if these are larger."""
+        for i, (name, level) in enumerate(names):
+            stored = numbers(self.run.stored_residual.get(name), 2)
+            if stored is not None and len(stored) > level and stored.shape[1] >= first + levels.shape[1]:
+                levels[i] = np.fmax(levels[i], np.abs(stored[level, first : first + levels.shape[1]]))
+        return levels
+
+    def signals(self):
+        """Largest difference of a stored signal from its value at the samples, relative to its largest value."""
+        if not self.stored:
+            return {}
+        worst = 0.0
+        for name, values in self.stored.items():
+            if name in self.fresh.names:
+                again, values = self.fresh[name], numbers(values, 1)
+                alike = values is not None and values.shape == again.shape
+                worst = max(worst, largest(_ratio(values - again, np.abs(again).max())) if alike else np.inf)
+        return {"signals": worst}
+
+    # energy
+
+    def _balanced(self):
+        """Whether dE/dt is the power of the forces; a note if not."""
+        rate, _, size, by_time = np.concatenate([at.signals("power") for at in self.samples], axis=1)
+        first, second = self.model.nq, self.model.nq + self.model.n
+        inertial = self.mass * self.sizes[first:second] * self.sizes[second : second + self.model.n]
+        largest_term = max(np.abs(size).max(), np.abs(rate).max(), inertial.max())
+        balanced = not np.any(np.abs(by_time) > BALANCED * largest_term)
+        if not balanced:
+            reason = "the inertia terms depend on time or on more than wᵀMw/2"
+            self.notes.append(f"power balance: not applicable, {reason}")
+        return balanced
+
+    def balance(self):
+        """Errors of power and of energy, if the balance applies."""
+        if not self.balanced:
+            return {}
+        n, nq = self.model.n, self.model.nq
+        speeds, accelerations = self.sizes[nq : nq + n], self.sizes[nq + n : nq + 2 * n]
+        scale = FLOOR * (self.mass * speeds * accelerations).max()
+        errors, roundings = [], []
+        for at in self.instants:
+            f = at.model.signals("power")[1]
+
+            def defect(t, z, f=f, model=at.model):
+                rate, work, *_ = f.grid(t, z, model.parameters)
+                return (rate - work)[None]
+
+            z = at.z[: f.n_x]
+            rate, work, size, _ = f.grid(at.t, z, at.model.parameters)
+            errors.append((rate - work)[None])
+            roundings.append(ROUNDING * self._response(defect, at.t, z, errors[-1], np.abs(z)))
+            inertial = np.abs(at.z[nq : nq + n] * at.z[nq + n : nq + 2 * n]).T @ self.mass
+            scale = max(scale, (np.abs(size) + np.abs(rate) + inertial).max())
+        sizes = (scale + rounding / self.limit("power") for rounding in roundings)
+        power = max(largest(_ratio(error, size)) for error, size in zip(errors, sizes, strict=True))
+        return {"power": power} | self._energy(scale)
+
+    def _energy(self, power):
+        """Largest difference of the energy gained from the work, relative to the kinetic energy and the work done."""
+        if self.between is None or not self.between.resolved.all():
+            return {}
+        energies = []
+        for at in self.samples:
+            f = at.model.signals("energy")[1]
+
+            def energy(t, z, f=f, model=at.model):
+                return f.grid(t, z, model.parameters)
+
+            z = at.z[: f.n_x]
+            values = energy(at.t, z)
+            energies.append(np.vstack([values, ROUNDING * self._response(energy, at.t, z, values, np.abs(z))]))
+        energy, rounding = np.concatenate(energies, axis=1)
+        work = np.append(0.0, np.cumsum(self.between.work))[self.sampled]
+        kinetic = (self.mass * self.sizes[self.model.nq : self.model.nq + self.model.n] ** 2).max() / 2
+        scale = max(kinetic, np.ptp(energy), np.ptp(work)) + rounding.max() / LIMITS["energy"]
+        return {"energy": largest((energy - energy[0] - work) / scale)}
+
+    # further signals
+
+    def higher_jets(self):
+        """Largest error of the jets above the order of the model."""
+        n, nq, top = self.model.n, self.model.nq, self.model.reduction.top
+        last, worst = (len(self.run.jets) - nq) // n, 0.0
+        if last <= top:
+            return {}
+        for at in self.samples:
+            f, p = series_loop(at.model, last), np.tile(at.model.parameters[:, None], len(at.t))
+
+            def jets(t, x, f=f, p=p, plain=at.model.reduction.mechanism.q.plain):
+                y = f.grid(t, x, np.vstack([p, t]))[0 if plain else nq * last :]
+                factorials = [factorial(k) for k in range(top + 1, last + 1)]
+                return y[top * n : last * n] * np.repeat(np.array(factorials, dtype=float), n)[:, None]
+
+            x = at.z[: len(self.model.state_names)]
+            again = jets(at.t, x)
+            rounding = ROUNDING * self._response(jets, at.t, x, again, np.abs(x))
+            sizes = self.sizes[nq + top * n :, None] + rounding / self.limit("higher jets")
+            worst = max(worst, largest((at.z[nq + top * n :] - again) / sizes))
+        return {"higher jets": worst}
+
+    def outside(self):
+        """Largest part of an ideal reaction outside the actuators' directions, relative to the reaction."""
+        if not (self.model.ideal and self.model.actuators):
+            return {}
+        n, worst, size = self.model.n, 0.0, 1e-300
+        for at in self.samples:
+            values = at.signals("reach")
+            size = max(size, np.abs(values[:n]).max())
+            for column in values.T:
+                reaction, E = column[:n], column[n:].reshape(-1, n).T
+                left = reaction - E @ np.linalg.lstsq(E, reaction, rcond=None)[0]
+                worst = max(worst, float(np.abs(left).max()))
+        return {"outside": worst / size}
+
+
+def _ratio(errors, sizes):
+    """Errors relative to sizes; zero errors of zero size are zero."""
+    sizes = np.broadcast_to(sizes, np.shape(errors))
+    return np.divide(errors, sizes, out=np.where(errors == 0, 0.0, np.inf), where=sizes > 0)
+

@@ -1,0 +1,158 @@
+"""A plant under inputs that are functions of time, by every method."""
+
+import math
+
+import casadi as ca
+import numpy as np
+import pytest
+from refusals import refused
+from scipy.integrate import solve_ivp
+
+import servoctl as sv
+
+START = {"x": 0.0, "theta": 0.3, "dx": 0.0, "dtheta": 0.0}
+
+
+@pytest.fixture(scope="module")
+def crane():
+    q, p = sv.coordinates("x theta"), sv.parameters(m=1.0, l=2.0)
+    x, theta = q
+    load = ca.vertcat(x + p.l * ca.sin(theta), -p.l * ca.cos(theta))
+    return sv.Mechanism(
+        q, gibbs=sv.particle(q, 3.0, x) + sv.particle(q, p.m, load), potential=9.81 * p.m * load[1], parameters=p,
+        actuators={"trolley": x}, outputs={"X": load[0], "jerk": q.d(3)[0], "snap": q.d(4)[1]},
+    )  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def machine(crane):
+    """With other numbers, damping and a force."""
+    simple = sv.Mechanism(
+        crane.q, gibbs=crane._gibbs, potential=crane.potential, parameters=crane.parameters,
+        actuators={"trolley": list(crane.q)[0]}, outputs={"X": crane.outputs["X"]},
+    )  # fmt: skip
+    return sv.plant(simple, m=1.5, damping={"theta": 0.3}, forces={"x": -0.2 * crane.q.d(1)[0]})
+
+
+def reference(plant, force, t=2.0):
+    solution = solve_ivp(
+        lambda t, x: plant.rates(t, x, [force(t)]), (0.0, t), [*START.values()], "DOP853", rtol=1e-12, atol=1e-13
+    )
+    return solution.y[:, -1]
+
+
+def ends(run):
+    return [run[name][-1] for name in START]
+
+
+@pytest.mark.parametrize("method", [None, "Taylor", "RadauIIA", "RK8", "LSODA", "CVODES"])
+def test_every_method_moves_a_plant(machine, method):
+    t = machine.mechanism.q.t
+    run = sv.simulate(machine, START, (0.0, 2.0), method, inputs={"trolley": 5 * ca.sin(t)})
+    assert ends(run) == pytest.approx(reference(machine, lambda t: 5 * np.sin(t)), abs=1e-7)
+    assert run["trolley"] == pytest.approx(5 * np.sin(run.t), abs=1e-14)
+    assert run["X"] == pytest.approx(run["x"] + 2.0 * np.sin(run["theta"]), abs=1e-14)
+    states = np.array([run[name] for name in START])
+    rates = [machine.rates(t, x, [u]) for t, x, u in zip(run.t, states.T, run["trolley"], strict=True)]
+    assert [run["d2x"], run["d2theta"]] == pytest.approx(np.array(rates).T[2:], abs=1e-6)
+    assert "trolley" in repr(run) and "no program" in repr(run.model)
+    if method is None:
+        assert sv.verify(run.model, run).passed
+
+
+FORCES = {
+    "number": (lambda t: -1.5, lambda t: -1.5),
+    "function": (lambda t: lambda s: 2 * s - ca.cos(s), lambda t: 2 * t - np.cos(t)),
+    "path": (lambda t: sv.paths.rest_to_rest(t, 0.0, 3.0, 1.5), None),
+    "none": (lambda t: None, lambda t: 0.0),
+}
+
+
+@pytest.mark.parametrize("kind", FORCES)
+def test_inputs_are_numbers_expressions_paths_or_functions(machine, kind):
+    make, force = FORCES[kind]
+    t = machine.mechanism.q.t
+    value = make(t)
+    if force is None:
+        f = ca.Function("f", [t], [ca.SX(value)])
+        force = lambda s: float(f(s))  # noqa: E731
+    inputs = {} if value is None else {"trolley": value}
+    run = sv.simulate(machine, [*START.values()], (0.0, 2.0), inputs=inputs)
+    assert ends(run) == pytest.approx(reference(machine, force), abs=1e-7)
+
+
+def test_inputs_stay_within_their_limits(machine):
+    plant = sv.plant(machine.mechanism, limits={"trolley": (-1.0, 2.0)})
+    run = sv.simulate(plant, START, (0.0, 6.0), inputs={"trolley": 5 * ca.sin(machine.mechanism.q.t)})
+    assert run["trolley"] == pytest.approx(np.clip(5 * np.sin(run.t), -1.0, 2.0), abs=1e-14)
+    assert ends(run) == pytest.approx(reference(plant, lambda t: np.clip(5 * np.sin(t), -1.0, 2.0), 6.0), abs=1e-5)
+
+
+def test_material_constraints_hold_in_a_driven_plant():
+    q = sv.coordinates("x y")
+    x, y = q
+    mechanism = sv.Mechanism(
+        q, gibbs=sv.particle(q, 1.0, ca.vertcat(x, y)), potential=9.81 * y, constraints={"rod": x**2 + y**2 - 1},
+        actuators={"push": x},
+    )  # fmt: skip
+    plant = sv.plant(mechanism)
+    run = sv.simulate(plant, [1.0, 0.0, 0.0, 0.0], (0.0, 2.0), drift="project", inputs={"push": 0.5})
+
+    def swing(t, s):
+        return [s[1], -0.5 * np.sin(s[0]) - 9.81 * np.cos(s[0])]
+
+    angle = solve_ivp(swing, (0.0, 2.0), [0.0, 0.0], "DOP853", rtol=1e-12, atol=1e-13).y[0, -1]
+    assert [run["x"][-1], run["y"][-1]] == pytest.approx([np.cos(angle), np.sin(angle)], abs=1e-6)
+    assert sv.verify(run.model, run).passed
+    with refused(sv.InconsistentStart, "rod"):
+        sv.simulate(plant, [1.1, 0.0, 0.0, 0.0], (0.0, 2.0))
+
+
+@pytest.mark.parametrize(("inputs", "kind", "details"), [
+    ({"winch": 1.0}, sv.NameUnknown, {"name": "winch"}),
+    ({"trolley": lambda t: math.floor(t)}, sv.SpecificationError, {}),
+    ({"trolley": "full"}, sv.SpecificationError, {"type": "str"}),
+    ({"trolley": np.nan}, sv.SpecificationError, {"what": "the input 'trolley'"}),
+    ({"trolley": [1.0, 2.0]}, sv.SpecificationError, {"entries": 2}),
+    (7.0, sv.SpecificationError, {}),
+])  # fmt: skip
+def test_other_inputs_are_refused(machine, inputs, kind, details):
+    with refused(kind, **details):
+        sv.simulate(machine, START, (0.0, 1.0), inputs=inputs)
+
+
+@pytest.mark.parametrize("option", [{"lag": {"trolley": 0.1}}, {"delay": 0.1}, {"rate_limits": {"trolley": 1.0}}])
+def test_actuators_that_do_not_act_at_once_are_refused(machine, option):
+    with refused(sv.SpecificationError, name=next(iter(option))):
+        sv.simulate(sv.plant(machine.mechanism, **option), START, (0.0, 1.0))
+
+
+def test_simulate_says_what_it_takes(machine, gallery_model):
+    for other in (machine.mechanism, 3, None):
+        with refused(sv.SpecificationError, type=type(other).__name__):
+            sv.simulate(other, START, (0.0, 1.0))
+    model = gallery_model("overhead-crane")
+    with refused(sv.SpecificationError, "inputs", type="Model"):
+        sv.simulate(model, model.start(), (0.0, 1.0), inputs={"trolley": 0.0})
+
+
+def test_outputs_of_higher_order_in_a_closed_loop(crane):
+    """With the input held, jerk and snap are total derivatives of the accelerations."""
+    model = sv.derive(
+        sv.Mechanism(crane.q, gibbs=crane._gibbs, potential=crane.potential, parameters=crane.parameters,
+                     actuators={"trolley": list(crane.q)[0]}),
+        sv.Program({"x": list(crane.q)[0] - sv.paths.rest_to_rest(crane.q.t, 0.0, 1.0, 2.0)}),
+    )  # fmt: skip
+    plan = sv.simulate(model, model.start(theta=0.1, dtheta=0.0), (0.0, 2.0), t_eval=np.linspace(0, 2, 201))
+    plant = sv.plant(crane)
+    closed = sv.close(plant, sv.lqr(plan, plant, rate=100), plan.state(0.0), (0.0, 2.0), plan=plan)
+    k, h = 70, 1e-4
+    x, u = closed.states[:, k], closed.inputs[:, k]
+
+    def accelerations(s):  # on the motion with this input, near the sample
+        solution = solve_ivp(lambda t, x: plant.rates(t, x, u), (0.0, s), x, "DOP853", rtol=1e-13, atol=1e-14)
+        return plant.rates(0.0, solution.y[:, -1], u)[2:]
+
+    before, now, after = (accelerations(s) for s in (-h, 0.0, h))
+    assert closed["jerk"][k] == pytest.approx((after[0] - before[0]) / (2 * h), abs=1e-5)
+    assert closed["snap"][k] == pytest.approx((after[1] - 2 * now[1] + before[1]) / h**2, abs=1e-2)

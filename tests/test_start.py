@@ -1,0 +1,367 @@
+"""Consistent starts: held values, outputs and conditions; other states with the same held values; refusals."""
+
+import casadi as ca
+import numpy as np
+import pytest
+from refusals import refused
+
+import servoctl as sv
+from servoctl.errors import unknown
+from servoctl.gallery import gallery
+
+
+def two_link_arm():
+    """Unit links with unit masses at the elbow and the tip; S, the position of the tip, and q."""
+    q = sv.coordinates("q1 q2")
+    a, b = q
+    elbow = ca.vertcat(ca.cos(a), ca.sin(a))
+    tip = elbow + ca.vertcat(ca.cos(a + b), ca.sin(a + b))
+    mechanism = sv.Mechanism(
+        q, gibbs=sv.particle(q, 1.0, elbow) + sv.particle(q, 1.0, tip), potential=9.81 * (elbow[1] + tip[1]),
+        actuators={"shoulder": a, "elbow": b}, outputs={"X": tip[0], "Y": tip[1]},
+    )  # fmt: skip
+    return mechanism, tip
+
+
+def curvature(q, position):
+    (vx, vy), (ax, ay) = (q.dt(position, k).elements() for k in (1, 2))
+    return (vx * ay - vy * ax) / (vx**2 + vy**2) ** 1.5
+
+
+@pytest.fixture(scope="module")
+def clothoid_arm():
+    """The tip's curvature changes at a constant rate per length, ideally: order 3, one linear equation in q''."""
+    mechanism, tip = two_link_arm()
+    kappa = curvature(mechanism.q, tip)
+    speed = ca.sqrt(ca.sumsqr(mechanism.q.dt(tip)))
+    model = sv.derive(mechanism, sv.Program({"clothoid": mechanism.q.dt(kappa) - 0.1 * speed}, by="ideal"))
+    jets = [mechanism.q.jet(k) for k in range(3)]
+    slope = ca.jacobian(kappa, jets[2])
+    return model, ca.Function("work", jets, [mechanism.balance[0] * slope[1] - mechanism.balance[1] * slope[0]])
+
+
+@pytest.mark.parametrize("guess", [{"d2q1": 0.0}, {}, {"d2q2": 0.0}])
+def test_every_start_of_an_arm_with_given_positions_and_velocities_exists(clothoid_arm, guess):
+    """The reaction r is along the gradient of the curvature in q'': r1 G2 - r2 G1 = 0."""
+    model, work = clothoid_arm
+    rng = np.random.default_rng(1)
+    for _ in range(261):
+        held = dict(zip(("q1", "q2", "dq1", "dq2"), rng.uniform(-3.0, 3.0, 4), strict=True))
+        start = model.start(guess=guess, **held)
+        assert {name: start[name] for name in held} == held and start.residual < 1e-12
+        parts = np.split(start.values, 3)
+        scale = np.abs(parts[2]).max() + np.abs(parts[1]).max() ** 2 + 9.81
+        assert abs(float(work(*parts))) < 1e-8 * scale**2 and len(start.branches) == 1
+
+
+# outputs and conditions ----------------------------------------------------------------------------------------------
+
+
+def free_point(program, by="ideal"):
+    """A particle of 2 kg in the plane with its speed, heading and curvature as outputs."""
+    q = sv.coordinates("x y")
+    (x, y), (dx, dy) = q, q.d(1)
+    outputs = {"speed": ca.sqrt(dx**2 + dy**2), "heading": ca.atan2(dy, dx), "kappa": curvature(q, ca.vertcat(x, y))}
+    mechanism = sv.Mechanism(q, gibbs=sv.particle(q, 2.0, ca.vertcat(x, y)), outputs=outputs | {"east": x})
+    return sv.derive(mechanism, sv.Program(program(q, outputs), by=by))
+
+
+@pytest.fixture(scope="module")
+def clothoid():
+    return free_point(lambda q, outputs: {"clothoid": q.dt(outputs["kappa"]) - 0.2 * outputs["speed"]})
+
+
+@pytest.fixture(scope="module")
+def constant_speed():
+    return free_point(lambda q, outputs: {"speed of 4": outputs["speed"] ** 2 - 16})
+
+
+@pytest.mark.parametrize("degrees", [30.0, 143.0, 175.0, -90.0, 0.0])
+@pytest.mark.parametrize("kappa", [0.5, -2.0, 0.0])
+def test_a_start_holds_outputs_by_name(clothoid, degrees, kappa):
+    """The ideal reaction is across the path: x'' = v² κ n."""
+    angle = np.radians(degrees)
+    start = clothoid.start(east=1.0, y=2.0, speed=3.0, heading=angle, kappa=kappa)
+    along, across = np.array([np.cos(angle), np.sin(angle)]), np.array([-np.sin(angle), np.cos(angle)])
+    assert start.values == pytest.approx([1.0, 2.0, *(3 * along), *(9 * kappa * across)], abs=1e-12)
+    assert start.held == ("east", "y", "speed", "heading", "kappa") and start.free == ()
+
+
+def test_a_start_holds_expressions_by_name(clothoid):
+    q = clothoid.reduction.mechanism.q
+    dx, dy = q.d(1)
+    conditions = {"momentum": 2 * dx - 3.0, "diagonal": dy - dx, "turn": curvature(q, ca.vertcat(*q)) - 0.5}
+    start = clothoid.start(x=0.0, y=0.0, hold=conditions)
+    assert start.values[2:4] == pytest.approx([1.5, 1.5]) and start.held[2:] == ("momentum", "diagonal", "turn")
+    assert start.values[4:] == pytest.approx(0.5 * 4.5 / np.sqrt(2) * np.array([-1.0, 1.0]))  # v² κ n
+
+
+def test_momentum_zero_in_an_actuated_program():
+    """A cart whose pendulum follows a path: the start at which both together have no momentum along x."""
+    q = sv.coordinates("x theta")
+    x, theta = q
+    load = ca.vertcat(x + ca.sin(theta), -ca.cos(theta))
+    momentum = 2.0 * q.dt(x) + q.dt(load)[0]
+    mechanism = sv.Mechanism(
+        q, gibbs=sv.particle(q, 2.0, x) + sv.particle(q, 1.0, load), potential=9.81 * load[1],
+        actuators={"force": x}, outputs={"momentum": momentum},
+    )  # fmt: skip
+    model = sv.derive(mechanism, sv.Program({"swing": theta - 0.3 * ca.sin(q.t)}))
+    start = model.start(t=0.5, x=0.1, momentum=0.0)
+    rate = 0.3 * np.cos(0.5) * np.cos(0.3 * np.sin(0.5))
+    assert start["dx"] == pytest.approx(-rate / 3, rel=1e-12)
+
+
+def test_conditions_may_contain_higher_derivatives_than_the_state():
+    """A damped spring: its acceleration and its jerk are no entries of the state."""
+    q = sv.coordinates("x theta")
+    x, theta = q
+    mechanism = sv.Mechanism(
+        q, gibbs=sv.particle(q, 2.0, x) + sv.particle(q, 1.0, theta), actuators={"force": x},
+        forces={"theta": -0.8 * q.dt(theta) - 3.0 * theta}, outputs={"second": q.dt(theta, 2)},
+    )  # fmt: skip
+    model = sv.derive(mechanism, sv.Program({"X": x - ca.sin(q.t)}))
+    start = model.start(theta=0.2, second=0.4)
+    assert start["dtheta"] == pytest.approx(-(0.4 + 3 * 0.2) / 0.8) and start.names == model.state_names
+    start = model.start(theta=0.2, hold={"jerk": q.dt(theta, 3) - 1.0})
+    assert -0.8 * (-0.8 * start["dtheta"] - 0.6) - 3 * start["dtheta"] == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize(
+    ("kind", "arguments", "details"),
+    [
+        (sv.NameUnknown, {"spead": 1.0}, {"match": "speed"}),
+        (sv.NameUnknown, {"d3x": 1.0}, {"match": "d2x"}),
+        (sv.NameUnknown, {"d9y": 1.0}, {"match": "d2y"}),
+        (sv.SpecificationError, {"speed": np.nan}, {"name": "speed"}),
+        (sv.SpecificationError, {"hold": [1.0]}, {"what": "The conditions"}),
+        (sv.SpecificationError, {"hold": {"a": 3.0}}, {"name": "a"}),
+        (sv.SpecificationError, {"hold": {"a": "x"}}, {"type": "str"}),
+        (sv.SpecificationError, {"hold": {"a": ca.SX.sym("z")}}, {"name": "z"}),
+        (sv.InconsistentStart, {"x": 1.0, "east": 0.0}, {"held": "east", "nearest_value": 1.0}),
+        (sv.InconsistentStart, {"x": 0.0, "speed": -1.0}, {"held": "speed", "value": -1.0}),
+    ],
+)
+def test_what_cannot_be_held_is_refused(clothoid, kind, arguments, details):
+    with refused(kind, **details):
+        clothoid.start(**arguments)
+
+
+@pytest.mark.parametrize("name", ["speed", "x"])
+def test_a_condition_does_not_take_the_name_of_a_state_or_an_output(clothoid, name):
+    x, _ = clothoid.reduction.mechanism.q
+    with refused(sv.SpecificationError, f"{name}=", name=name):
+        clothoid.start(hold={name: x - 1.0})
+
+
+def test_an_output_that_the_dynamics_forbid_is_refused(constant_speed):
+    """A free particle of constant speed goes straight on."""
+    with refused(sv.InconsistentStart, "kappa = 0.5", held="kappa") as caught:
+        constant_speed.start(x=0.0, y=0.0, kappa=0.5)
+    assert caught.value.details["nearest_value"] == pytest.approx(0.0, abs=1e-9)
+
+
+def test_coordinates_do_not_take_names_of_a_starts_arguments():
+    with refused(sv.SpecificationError, "hold", name="hold"):
+        sv.coordinates("x hold")
+
+
+@pytest.mark.parametrize("names", ["x, y", "x,y", "x,y,", "x ,y"])
+def test_names_with_commas_are_refused_with_the_names_as_they_should_be(names):
+    with refused(sv.SpecificationError, "'x y'", "blanks", names=names):
+        sv.coordinates(names)
+    with refused(sv.SpecificationError, "'x y'", names=names):
+        sv.coordinates("a b").with_quasi_velocities(names, np.eye(2))
+
+
+@pytest.mark.parametrize(
+    ("name", "valid", "nearest"),
+    [
+        ("d3q1", ("q1", "dq1", "d2q1", "d2q2"), "d2q1"),
+        ("d2q1", ("q1", "dq1", "dq2"), "dq1"),
+        ("dq1", ("q1", "q2"), "q1"),
+        ("delta", ("beta", "deltas"), "deltas"),
+    ],
+)
+def test_the_nearest_name_of_a_derivative_has_the_nearest_order(name, valid, nearest):
+    assert unknown(name, valid, "state").details["match"] == nearest
+
+
+# other states with the same held values ------------------------------------------------------------------------------
+
+
+def test_both_signs_of_a_speed_are_named(constant_speed):
+    start = constant_speed.start(x=0.0, y=0.0, dx=0.0)
+    assert sorted(start.branches[:, 3]) == pytest.approx([-4.0, 4.0]) and start.branches[0, 3] == start["dy"]
+    assert "dy = -4" in repr(start) and "2 branches" in repr(start)
+    for guess in (3.0, -3.0):
+        chosen = constant_speed.start(x=0.0, y=0.0, dx=0.0, guess={"dy": guess})
+        assert chosen["dy"] == pytest.approx(np.copysign(4.0, guess)) and "branches" not in repr(chosen)
+
+
+def test_both_elbows_of_an_arm_are_named():
+    mechanism, tip = two_link_arm()
+    t = mechanism.q.t
+    model = sv.derive(mechanism, sv.Program({"X": tip[0] - 1.2 - 0.1 * t, "Y": tip[1] - 0.5}))
+    start = model.start()
+    bend = np.arccos((1.2**2 + 0.5**2 - 2) / 2)
+    assert sorted(start.branches[:, 1]) == pytest.approx([-bend, bend])
+    for branch in start.branches:  # the tip's velocity is (0.1, 0) on both
+        a, b, da, db = branch[:4]
+        J = np.array([[-np.sin(a) - np.sin(a + b), -np.sin(a + b)], [np.cos(a) + np.cos(a + b), np.cos(a + b)]])
+        assert J @ [da, db] == pytest.approx([0.1, 0.0], abs=1e-9)
+
+
+def line(polynomial):
+    """x at a root of a polynomial, and y = x."""
+    q = sv.coordinates("x y")
+    x, y = q
+    mechanism = sv.Mechanism(q, gibbs=sv.particle(q, 1.0, ca.vertcat(x, y)), actuators={"a": x, "b": y})
+    return sv.derive(mechanism, sv.Program({"root": polynomial(x), "line": y - x}), guess={"x": 1.1})
+
+
+def test_only_roots_that_are_about_as_near_zero_are_named():
+    start = line(lambda x: (x**2 - 1) * (x - 3)).start()
+    assert sorted(start.branches[:, 0]) == pytest.approx([-1.0, 1.0], abs=1e-12)
+    assert start.branches[:, 1] == pytest.approx(start.branches[:, 0])
+
+
+def test_a_root_at_zero_is_a_clear_choice():
+    start = line(lambda x: x * (x - 1) * (x + 2)).start()
+    assert start["x"] == pytest.approx(0.0, abs=1e-12) and len(start.branches) == 1
+
+
+@pytest.mark.parametrize("name", ["appell-hamel", "two-cars", "three-cars", "mass-on-car", "vtol", "overhead-crane"])
+def test_no_branches_where_the_guess_or_the_equations_leave_one(name, gallery_model):
+    scene = gallery[name]
+    start = gallery_model(name).start(t=scene.t_span[0], guess=scene.guess, **scene.start)
+    assert len(start.branches) == 1 and "branches" not in repr(start)
+
+
+def test_turns_of_an_angle_are_no_branches():
+    q = sv.coordinates("x theta")
+    x, theta = q
+    mechanism = sv.Mechanism(q, gibbs=sv.particle(q, 1.0, ca.vertcat(x, theta)), actuators={"a": x, "b": theta})
+    start = sv.derive(mechanism, sv.Program({"X": x + ca.sin(theta), "angle": ca.cos(theta) - 0.2})).start()
+    assert sorted(np.cos(start.branches[:, 1])) == pytest.approx([0.2, 0.2]) and len(start.branches) == 2
+
+
+def test_a_quaternion_and_its_opposite_are_one_start():
+    """e and -e are the same attitude."""
+    q = sv.coordinates("e0 e1 e2 e3")
+    e = ca.vertcat(*q)
+    e0, e1, e2, e3 = q
+    V = [[-e1, -e2, -e3], [e0, -e3, e2], [e3, e0, -e1], [-e2, e1, e0]]
+    q = q.with_quasi_velocities("p q r", [[v / 2 for v in row] for row in V], invariants={"unit": ca.dot(e, e) - 1})
+    gibbs = ca.sumsqr(ca.vertcat(*q.w(1)) * ca.DM([1.0, 1.1, 1.2])) / 2
+    mechanism = sv.Mechanism(q, gibbs=gibbs, actuators={f"torque {k}": ca.SX.eye(3)[:, k] for k in range(3)})
+    attitude = {"a": e1 * e0 - 0.1, "b": e2 * e0 - 0.2, "c": e3 * e0 + 0.1}
+    start = sv.derive(mechanism, sv.Program(attitude), guess={"e0": 1.0}).start(guess={"e1": 0.1})
+    assert len(start.branches) == 1 and start["e0"] * start["e2"] == pytest.approx(0.2)
+
+
+# machines that roll, at rest -----------------------------------------------------------------------------------------
+
+
+def path_from_rest(q, speed=0.0):
+    """3 s, sin 2s along s, which begins with the slope 2/3 and the curvature 0."""
+    s = sv.paths.rest_to_rest(q.t, (0.0,), (1.0,), duration=4.0, smoothness=5)[0] + speed * q.t
+    return 3 * s, ca.sin(2 * s)
+
+
+def wheels(speed=0.0):
+    """Two driven wheels: no slip across the heading psi."""
+    q = sv.coordinates("x y psi")
+    (x, y, psi), (dx, dy, dpsi) = q, q.d(1)
+    mechanism = sv.Mechanism(
+        q, gibbs=sv.rigid_body(q, 10.0, (0, 0, 1.0), position=(x, y), rates=(0, 0, dpsi)),
+        constraints={"slip": -dx * ca.sin(psi) + dy * ca.cos(psi)},
+        actuators={"push": ca.vertcat(ca.cos(psi), ca.sin(psi), 0), "turn": psi},
+    )  # fmt: skip
+    path = path_from_rest(q, speed)
+    return sv.derive(mechanism, sv.Program({"X": x - path[0], "Y": y - path[1]}))
+
+
+def bicycle(speed=0.0):
+    """Rear and front wheel, 1 m apart; the front one turns by delta."""
+    q = sv.coordinates("x y psi delta")
+    (x, y, psi, delta), (dx, dy, dpsi, _) = q, q.d(1)
+    rolling = {
+        "rear": -dx * ca.sin(psi) + dy * ca.cos(psi),
+        "front": -dx * ca.sin(psi + delta) + dy * ca.cos(psi + delta) + dpsi * ca.cos(delta),
+    }
+    gibbs = sv.rigid_body(q, 10.0, (0, 0, 1.0), position=(x, y), rates=(0, 0, dpsi)) + 0.05 * q.d(2)[3] ** 2
+    drive = ca.vertcat(ca.cos(psi), ca.sin(psi), 0, 0)
+    mechanism = sv.Mechanism(q, gibbs=gibbs, constraints=rolling, actuators={"drive": drive, "steer": delta})
+    path = path_from_rest(q, speed)
+    return sv.derive(mechanism, sv.Program({"X": x - path[0], "Y": y - path[1]}))
+
+
+def trailer(speed=0.0):
+    """Two wheels with a trailer, whose axle follows the path."""
+    q = sv.coordinates("x y psi theta")
+    (x, y, psi, theta), (dx, dy, dpsi, dtheta) = q, q.d(1)
+    behind = ca.vertcat(x - ca.cos(theta), y - ca.sin(theta))
+    vx, vy = q.dt(behind).elements()
+    rolling = {"slip": -dx * ca.sin(psi) + dy * ca.cos(psi), "trailer": -vx * ca.sin(theta) + vy * ca.cos(theta)}
+    gibbs = sv.rigid_body(q, 10.0, (0, 0, 1.0), position=(x, y), rates=(0, 0, dpsi))
+    gibbs += sv.rigid_body(q, 5.0, (0, 0, 0.5), position=(behind[0], behind[1]), rates=(0, 0, dtheta))
+    push = ca.vertcat(ca.cos(psi), ca.sin(psi), 0, 0)
+    mechanism = sv.Mechanism(q, gibbs=gibbs, constraints=rolling, actuators={"push": push, "turn": psi})
+    path = path_from_rest(q, speed)
+    program = sv.Program({"X": behind[0] - path[0], "Y": behind[1] - path[1]})
+    return sv.derive(mechanism, program, guess={"x": 1.0, "theta": 0.5, "psi": 0.5})
+
+
+ROLLING = {"wheels": (wheels, ("psi",)), "bicycle": (bicycle, ("psi", "delta")), "trailer": (trailer, ("psi", "theta"))}
+
+
+@pytest.mark.parametrize("name", ROLLING)
+def test_a_machine_that_rolls_starts_from_rest_at_the_limit_of_its_motion(name):
+    """The heading of the path, atan 2/3, and no curvature."""
+    build, open_at_rest = ROLLING[name]
+    start = build().start()
+    assert set(start.at_rest) == set(open_at_rest) and "at rest" in repr(start)
+    heading = {angle: np.arctan2(2, 3) for angle in ("psi", "theta")} | {"delta": 0.0}
+    assert [start[angle] for angle in open_at_rest] == pytest.approx([heading[a] for a in open_at_rest], abs=2e-7)
+    assert start.values[len(start.names) // 2 :] == pytest.approx(0.0, abs=1e-12) and start.residual < 1e-12
+
+
+@pytest.mark.parametrize("name", ROLLING)
+def test_a_machine_that_stays_at_rest_has_no_limit(name):
+    build, open_at_rest = ROLLING[name]
+    with refused(sv.SingularProgram, "stands still", *open_at_rest, t=5.0, nearest_time=None):
+        build().start(t=5.0)
+
+
+@pytest.mark.parametrize("name", ROLLING)
+def test_a_simulation_from_rest_says_that_the_machine_stands_still(name):
+    build, open_at_rest = ROLLING[name]
+    model = build()
+    with refused(sv.SingularProgram, "stands still", *open_at_rest, t=0.0) as caught:
+        sv.simulate(model, model.start(), (0.0, 3.0))
+    assert "square" not in str(caught.value) and 0 < caught.value.details["nearest_time"] < 0.3
+
+
+def test_the_motion_after_rest_begins_where_the_start_is():
+    model = wheels()
+    run = sv.simulate(model, model.start(t=0.01), (0.01, 3.9))
+    assert run["psi"][0] == pytest.approx(model.start()["psi"], abs=1e-9) and sv.verify(model, run).passed
+
+
+@pytest.mark.parametrize("name", ROLLING)
+def test_a_machine_in_motion_has_an_ordinary_start(name):
+    model = ROLLING[name][0](speed=0.2)
+    start = model.start(guess={"x": 1.0, "theta": 0.5, "psi": 0.5} if name == "trailer" else {"psi": 0.5})
+    assert start.at_rest == () and start["psi"] == pytest.approx(np.arctan2(2, 3), abs=1e-8)
+
+
+def test_a_heading_that_is_given_at_rest_is_kept():
+    start = wheels().start(psi=0.1)
+    assert start["psi"] == 0.1 and start.at_rest == ()
+
+
+@pytest.mark.parametrize("name", ["two-cars", "mass-on-car", "vtol", "crane-3d", "two-link-arm", "wheeled-robot"])
+def test_other_machines_at_rest_leave_nothing_open(name, gallery_model):
+    scene = gallery[name]
+    assert gallery_model(name).start(t=scene.t_span[0], guess=scene.guess, **scene.start).at_rest == ()

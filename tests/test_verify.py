@@ -1,0 +1,317 @@
+"""Verdicts: what is right passes, what is wrong fails or is refused, what cannot be followed is inconclusive."""
+
+import pickle
+from dataclasses import replace
+
+import casadi as ca
+import numpy as np
+import pytest
+from refusals import refused
+
+import servoctl as sv
+from servoctl.gallery import gallery
+from servoctl.methods.choice import as_method
+
+CHANGE = 1.001
+
+
+def verdict(model, run):
+    """The verdict, or "refused"."""
+    try:
+        return sv.verify(model, run).verdict
+    except sv.ServoError:
+        return "refused"
+
+
+def edited(run, **parts):
+    return replace(run, **{"stored": {}, "stored_residual": {}} | parts)
+
+
+def scaled(values, which=slice(None)):
+    values = values.copy()
+    values[which] *= CHANGE
+    return values
+
+
+# what is right --------------------------------------------------------------------------------------------------------
+
+
+def rod():
+    """A pendulum under an ideal program, released at rest at the height where its energy is zero."""
+    q = sv.coordinates("x y")
+    x, y = q
+    mechanism = sv.Mechanism(q, gibbs=sv.particle(q, 1.0, (x, y)), potential=9.81 * y)
+    model = sv.derive(mechanism, sv.Program({"rod": x**2 + y**2 - 1}, by="ideal"))
+    return model, model.start(x=1.0, y=0.0, dx=0.0, dy=0.0), (0.0, 2.0)
+
+
+def uniform(by):
+    """An arm whose joints turn with constant speeds: no acceleration at all."""
+    q = sv.coordinates("a b")
+    a, b = q
+    middle, tip = (ca.cos(a) / 2, ca.sin(a) / 2), (ca.cos(a) + ca.cos(b), ca.sin(a) + ca.sin(b))
+    gibbs = sv.particle(q, 1.0, middle) + sv.particle(q, 1.0, tip)
+    motors = {"actuators": {"u": a, "v": b}} if by == "actuators" else {}
+    mechanism = sv.Mechanism(q, gibbs=gibbs, potential=9.81 * (middle[1] + tip[1]), **motors)
+    model = sv.derive(mechanism, sv.Program({"a": a - 0.3 * q.t, "b": b - 0.7 * q.t}, by=by))
+    return model, model.start(), (0.0, 5.0)
+
+
+def acceleration(free):
+    """The magnitude of the acceleration is given, and one coordinate has no force."""
+    q = sv.coordinates("x y")
+    x, y = q
+    d2 = q.d(2)
+    mechanism = sv.Mechanism(q, gibbs=sv.particle(q, 1.0, (x, y)), potential=free * x**2, actuators={"F": x})
+    model = sv.derive(mechanism, sv.Program({"a": d2[0] ** 2 + d2[1] ** 2 - 100}))
+    return model, model.start(guess={"d2x": 10.0}), (0.0, 0.5)
+
+
+def ropes(stiffness):
+    """Two trolleys carry a load by two ropes that stretch."""
+    q = sv.coordinates("a b x z")
+    a, b, x, z = q
+    lengths = (ca.sqrt((x - s) ** 2 + z**2) for s in (a, b))
+    gibbs = sum(sv.particle(q, 20.0, (s,)) for s in (a, b)) + sv.particle(q, 100.0, (x, z))
+    potential = sum(stiffness * (length - 5) ** 2 / 2 for length in lengths) + 981.0 * z
+    mechanism = sv.Mechanism(q, gibbs=gibbs, potential=potential, actuators={"A": a, "B": b})
+    program = sv.Program({"x": x - 0.1 * ca.sin(q.t), "z": z + 4 + 0.05 * ca.cos(q.t)})
+    guess = {"a": -3.0, "b": 3.0, "z": -4.0}
+    model = sv.derive(mechanism, program, guess=guess)
+    return model, model.start(guess=guess), (0.0, 5.0)
+
+
+def chain(k=2.0, path=lambda t: ca.sin(t), by="actuators", program=None):
+    """Two masses joined by a spring; the motor moves the first, the program the second."""
+    q = sv.coordinates("x y")
+    x, y = q
+    p = sv.parameters(k=k, pace=1.0)
+    motor = {"actuators": {"F": x}} if by == "actuators" else {}
+    gibbs = sv.particle(q, 1.0, (x,)) + sv.particle(q, 1.0, (y,))
+    mechanism = sv.Mechanism(q, gibbs=gibbs, potential=p.k * (x - y) ** 2 / 2, parameters=p, **motor)
+    rows = {"y": y - path(p.pace * q.t)} if program is None else program(q)
+    model = sv.derive(mechanism, sv.Program(rows, by=by))
+    return model, model.start(guess={"x": 0.0}), (0.0, 2.0)
+
+
+def nearly(q):
+    """Two programs that differ by a thousandth."""
+    x, y = q
+    row = x - ca.sin(q.t)
+    return {"a": row, "b": 0.7 * row + 1e-3 * (y - 0.3 * ca.cos(q.t))}
+
+
+RIGHT = {
+    "rod": (rod, None),
+    "rod, Taylor": (rod, "Taylor"),
+    "uniform": (lambda: uniform("actuators"), None),
+    "uniform, integrated": (lambda: uniform("actuators"), "DOP853"),
+    "uniform, ideal": (lambda: uniform("ideal"), None),
+    "acceleration": (lambda: acceleration(0.0), None),
+    "acceleration beside a spring": (lambda: acceleration(1.0), "Taylor"),
+    "ropes": (lambda: ropes(4e6), None),
+    "stiffer ropes": (lambda: ropes(4e8), None),
+    "stiff spring": (lambda: chain(1e10), None),
+    "nearly dependent": (lambda: chain(by="ideal", program=nearly), None),
+}
+
+
+@pytest.mark.parametrize("name", RIGHT)
+def test_what_is_right_passes(name):
+    build, method = RIGHT[name]
+    model, start, span = build()
+    proof = sv.verify(model, sv.simulate(model, start, span, method))
+    assert proof.verdict == "passed" and proof.passed, proof
+
+
+@pytest.mark.parametrize("samples", [2, 3, 11, 2001])
+@pytest.mark.parametrize("name", ["appell-hamel", "overhead-crane", "vtol", "spiral"])
+def test_the_verdict_does_not_depend_on_the_samples(name, samples, gallery_model):
+    model, scene = gallery_model(name), gallery[name]
+    start, t_eval = model.start(**scene.start, guess=scene.guess), np.linspace(*scene.t_span, samples)
+    run = sv.simulate(model, start, scene.t_span, t_eval=t_eval)
+    proof = sv.verify(model, run)
+    assert proof.passed and {"segments", "energy"} <= set(proof.numbers), proof
+
+
+@pytest.mark.parametrize("samples", [201, 1001, 4001])
+def test_pivots_that_vanish_between_samples_are_replaced(samples):
+    """A load under an aircraft that turns over: pivots change many times."""
+    q = sv.coordinates("x z theta phi")
+    x, z, theta, phi = q
+    load = (x + ca.sin(phi), z - ca.cos(phi))
+    gibbs = sv.particle(q, 1.0, (x, z)) + sv.particle(q, 0.3, load) + 0.02 * q.d(2)[2] ** 2 / 2
+    thrust = {"thrust": [-ca.sin(theta), ca.cos(theta), 0, 0], "moment": theta}
+    mechanism = sv.Mechanism(q, gibbs=gibbs, potential=9.81 * (z + 0.3 * load[1]), actuators=thrust)
+    w = ca.pi / 2
+    program = sv.Program({"X": load[0] - 1.5 * ca.sin(w * q.t), "Z": load[1] - ca.sin(2 * w * q.t)})
+    model = sv.derive(mechanism, program, guess={"z": 1.0})
+    run = sv.simulate(model, model.start(guess={"z": 1.0}), (0.0, 4.0), t_eval=np.linspace(0.0, 4.0, samples))
+    assert len(run.variants) > 3
+    assert sv.verify(model, run).passed
+
+
+@pytest.mark.parametrize("order", [2, 3, 4])
+@pytest.mark.parametrize("by", ["actuators", "ideal"])
+def test_a_row_above_the_order_of_the_motion_has_a_residual(order, by):
+    q = sv.coordinates("x y z")
+    x, y, z = q
+    motors = {"actuators": {"u": x, "v": y}} if by == "actuators" else {}
+    gibbs = sum(sv.particle(q, 1.0, (s,)) for s in q)
+    mechanism = sv.Mechanism(q, gibbs=gibbs, potential=x * y + y * z + z**2, **motors)
+    path = x - ca.sin(q.t)
+    model = sv.derive(mechanism, sv.Program({"p": path, "s": q.dt(path, order) + y - 0.1 * q.t}, by=by))
+    run = sv.simulate(model, model.start(z=0.1), (0.0, 2.0))
+    assert "s " in repr(run) and np.abs(run.residual["s"]).max() < 1e-9
+    assert run["y"] == pytest.approx(0.1 * run.t, abs=1e-9)
+    assert sv.verify(model, run).passed
+    moved = edited(run, jets=scaled(run.jets, 1))
+    assert {"residual s", "residual hidden: s"} & set(sv.verify(model, moved).failures)
+
+
+# what is wrong --------------------------------------------------------------------------------------------------------
+
+
+def test_a_run_of_another_program_or_other_numbers_is_refused():
+    (model, start, span), (other, *_) = chain(), chain(path=lambda t: 0.5 * ca.sin(2 * t))
+    run = sv.simulate(model, start, span)
+    for wrong, changed in ((other, []), *((model.with_parameters(**{n: v}), [n]) for n, v in (("k", 2.1), ("pace", 1.1)))):
+        with refused(sv.SpecificationError, "sv.verify", *changed, parameters=changed):
+            sv.verify(wrong, run)
+        assert verdict(wrong, edited(run, model=wrong)) == "failed"
+        assert verdict(wrong, edited(run, model=wrong, variants=())) == "failed"
+    assert sv.verify(model.with_parameters(k=2.0), run).passed
+    assert sv.verify(chain()[0], pickle.loads(pickle.dumps(run))).passed
+
+
+EDITS = {
+    "a row of samples": lambda run, row, k: edited(run, jets=scaled(run.jets, row)),
+    "one number": lambda run, row, k: edited(run, jets=scaled(run.jets, (row, k))),
+    "times": lambda run, row, k: edited(run, t=CHANGE * run.t),
+    "one time": lambda run, row, k: edited(run, t=np.where(np.arange(len(run.t)) == k, run.t + 0.4 * run.t[1], run.t)),
+    "the order of times": lambda run, row, k: edited(run, t=run.t[::-1]),
+}
+
+
+@pytest.mark.parametrize("edit", EDITS)
+@pytest.mark.parametrize("name", ["overhead-crane", "appell-hamel", "spiral", "vtol-centre"])
+def test_changed_samples_fail(name, edit, gallery_model):
+    model, scene = gallery_model(name), gallery[name]
+    run = sv.simulate(model, model.start(**scene.start, guess=scene.guess), scene.t_span, t_eval=np.linspace(*scene.t_span, 201))
+    for row in range(len(run.jets)) if "times" not in edit and "time" not in edit else [0]:
+        k = int(np.argmax(np.abs(run.jets[row])))
+        if "time" in edit:
+            k = int(np.argmax(np.abs(run.jets[model.nq : model.nq + model.n]).max(axis=0)))
+        if run.jets[row].any():
+            assert verdict(model, EDITS[edit](run, row, k)) == "failed", (row, k)
+
+
+@pytest.mark.parametrize("which", [(slice(None), slice(1, None)), (0, 5), (-1, -1), (slice(None), slice(None))])
+def test_samples_that_are_no_numbers_fail(which, plan):
+    jets = plan.jets.copy()
+    jets[which] = np.nan
+    proof = sv.verify(plan.model, edited(plan, jets=jets))
+    assert proof.failures == ("samples",) and proof.numbers["samples"] >= 1
+
+
+@pytest.mark.parametrize("name", ["trolley", "hoist", "energy"])
+@pytest.mark.parametrize("which", [slice(None), 100])
+def test_changed_forces_fail(name, which, plan):
+    values = scaled(plan[name], which)
+    proof = sv.verify(plan.model, edited(plan, stored={name: values}))
+    assert "signals" in proof.failures and ("acceleration" in proof.failures) == (name != "energy")
+
+
+def test_forces_of_a_mechanism_without_a_coupling_fail():
+    (model, start, span), (loose, *_) = chain(2.0), chain(1.9)
+    run = sv.simulate(model, start, span)
+    forces = replace(run, model=loose, variants=(), stored={})["F"]
+    assert "acceleration" in sv.verify(model, edited(run, stored={"F": forces})).failures
+
+
+def test_the_other_elbow_fails():
+    q = sv.coordinates("a b")
+    a, b = q
+    tip = (ca.cos(a) + ca.cos(a + b), ca.sin(a) + ca.sin(a + b))
+    mechanism = sv.Mechanism(q, gibbs=sv.particle(q, 1.0, tip), potential=9.81 * tip[1], actuators={"u": a, "v": b})
+    program = sv.Program({"X": tip[0] - 1.2 * ca.cos(q.t), "Y": tip[1] - 1.2 * ca.sin(q.t)})
+    guess = {"a": -0.9, "b": 1.8}
+    model = sv.derive(mechanism, program, guess=guess)
+    run = sv.simulate(model, model.start(guess=guess), (0.0, 3.0), t_eval=np.linspace(0.0, 3.0, 101))
+    bend = run["b"]
+    flipped = np.array([run["a"] + 2 * np.arctan2(np.sin(bend), 1 + np.cos(bend)), -bend])
+    y = model.function("path").grid(run.t, flipped, model.parameters)
+    other = np.concatenate([flipped, y[4:8]])
+    assert sv.verify(model, run).passed
+    assert sv.verify(model, edited(run, jets=other, variants=())).passed, "a motion of its own"
+    for mixed in ([50], range(50, 101), range(0, 101, 2), [0], [100]):
+        jets = run.jets.copy()
+        jets[:, list(mixed)] = other[:, list(mixed)]
+        assert "segments" in sv.verify(model, edited(run, jets=jets, variants=())).failures
+
+
+def test_changed_jets_of_higher_order_fail():
+    model, start, span = chain(by="ideal")
+    run = sv.simulate(model, start, span, sv.Taylor(jets=5))
+    assert sv.verify(model, run).passed
+    for which in (slice(None), 700):
+        assert sv.verify(model, edited(run, jets=scaled(run.jets, (-1, which)))).failures == ("higher jets",)
+
+
+@pytest.mark.parametrize("what", ["t", "states", "inputs", "commands", "measurements", "controller_states"])
+def test_changed_signals_of_a_closed_loop_fail(what, plan):
+    plant = sv.plant(plan.model.reduction.mechanism)
+    law = sv.lqr(plan, plant, integral=True)
+    run = sv.close(plant, law, plan.state(0.0) + 0.01, (0.0, 2.0), timing=sv.Timing(delay=1))
+    assert sv.verify(run).passed
+    values = getattr(run, what)
+    largest = np.unravel_index(int(np.argmax(np.abs(values))), values.shape)
+    assert sv.verify(replace(run, **{what: CHANGE * values})).failures == ("loop repeated",)
+    for wrong in (CHANGE * values[largest], np.nan):
+        one = values.copy()
+        one[largest] = wrong
+        assert sv.verify(replace(run, **{what: one})).failures == ("loop repeated",)
+    with refused(sv.SpecificationError, "sample"):
+        sv.verify(replace(run, **{what: values[..., :-1]}))
+
+
+# what cannot be decided -----------------------------------------------------------------------------------------------
+
+
+def test_what_cannot_be_followed_is_inconclusive():
+    model, start, span = chain(1e13, by="ideal")
+    run = sv.simulate(model, start, span, as_method("RadauIIA"), t_eval=[0.0, 1.0, 2.0])
+    proof = sv.verify(model, run)
+    assert (proof.verdict, proof.passed, proof.failures) == ("inconclusive", False, ())
+    assert "t_eval" in proof.doubts[0] and "Verification: inconclusive" in repr(proof)
+
+
+def test_one_sample_is_inconclusive(plan):
+    one = edited(plan, t=plan.t[:1], jets=plan.jets[:, :1], variants=())
+    proof = sv.verify(plan.model, one)
+    assert proof.verdict == "inconclusive" and "segments" not in proof.numbers
+
+
+MALFORMED = {
+    "no run": lambda run: None,
+    "jets without a row": lambda run: replace(run, jets=run.jets[:-1]),
+    "no jets": lambda run: replace(run, jets=None),
+    "texts": lambda run: replace(run, t=np.array(["a"] * len(run.t))),
+    "complex": lambda run: replace(run, jets=run.jets * 1j),
+    "fewer times": lambda run: replace(run, t=run.t[1:]),
+    "names": lambda run: replace(run, jet_names=3),
+    "stored": lambda run: replace(run, stored=[1.0]),
+    "model": lambda run: replace(run, model="model"),
+    "knots": lambda run: replace(run, knots=None),
+}
+
+
+@pytest.mark.parametrize("what", MALFORMED)
+def test_what_is_no_run_of_the_model_is_refused(what, plan):
+    with refused(sv.SpecificationError):
+        sv.verify(plan.model, MALFORMED[what](plan))
+
+
+@pytest.mark.parametrize("values", [None, "x", [1.0], 1j, object()])
+def test_stored_signals_that_are_no_samples_fail_or_are_left_out(values, plan):
+    assert verdict(plan.model, edited(plan, stored={"energy": values})) in ("failed", "passed")
