@@ -46,7 +46,8 @@ class Flow:
         """Rates (n_x, N) and jets (n_z, N) at states (n_x, N)."""
         y, (nq, n) = self.f.grid(t, x, self.model.parameters), (self.model.nq, self.model.n)
         if self.flat:
-            return y[nq : 2 * nq], np.concatenate([x, y[2 * nq : 2 * nq + 2 * n]])
+            first = nq if self.model.reduction.mechanism.q.plain else 3 * nq  # of γ' and γ'' (see `Equations.path`)
+            return y[nq : 2 * nq], np.concatenate([x, y[first : first + 2 * n]])
         return y[: self.n_x], np.concatenate([x, y[self.n_x - n : self.n_x]])
 
     def corrected(self, t, z):
