@@ -5,6 +5,7 @@ All raise `SpecificationError`, with the name and the value in its `details`.
 
 import math
 import os
+from collections.abc import Iterable, Mapping, Set
 from pathlib import Path
 
 import casadi as ca
@@ -14,6 +15,7 @@ from servoctl.errors import SpecificationError, unknown
 
 ON_SAMPLE = 1e-6  # rounding of a sampling instant [periods], or of a count
 MOST_CASES = 10**6  # of one sweep: some gigabytes of parameters and rows
+MOST_JETS = 40  # level of jets, and order of a series: higher ones are functions too large to build
 MOST_COUNT = 10**9  # samples, steps or rows: products of two such counts fit into the 64 bits of C
 LONGEST_NAME = 255  # bytes of a file's name in common file systems
 MOST_MEMORY = 8e9  # bytes for all samples: the memory of common machines
@@ -23,7 +25,8 @@ def column(value, what, size=None):
     """A list of SX scalars from a scalar, a sequence, or an SX column, of length `size` if that is given."""
     try:
         if isinstance(value, (list, tuple)):
-            value = ca.vertcat(*value) if value else ca.SX(0, 1)
+            value = ca.vertcat(*map(_not_truth, value)) if value else ca.SX(0, 1)
+        _not_truth(value)
         flat = ca.densify(ca.vec(ca.SX(value)))
         items = flat.elements()
     except Exception as error:  # CasADi raises several types here, none of which helps the designer
@@ -46,6 +49,13 @@ def column(value, what, size=None):
             what=what,
         )
     return items
+
+
+def _not_truth(value):
+    """The value; TypeError for True and False, which CasADi takes for numbers."""
+    if isinstance(value, (bool, np.bool)):
+        raise TypeError("a truth value is no number")
+    return value
 
 
 def matrix(value, what):
@@ -78,7 +88,7 @@ def mapping(value, what):
     return value
 
 
-def require(kind, name, value, source):
+def require_kind(kind, name, value, source):
     """The value, if it is of a kind: a class, made by `source` ("sv.derive(...)")."""
     if not isinstance(value, kind):
         article = "an" if type(value).__name__[0] in "aeiouAEIOU" else "a"
@@ -90,6 +100,41 @@ def require(kind, name, value, source):
             type=type(value).__name__,
         )
     return value
+
+
+def text(name, value):
+    """The value, if it is a text of whole characters."""
+    if not isinstance(value, str) or any("\ud800" <= letter <= "\udfff" for letter in value):
+        said = f"{name}={repr(value)[:150]} was given."
+        raise SpecificationError(said, "It is a text of whole characters.", name=name, value=value)
+    return value
+
+
+def texts(value, what):
+    """A tuple of texts from one text or a sequence of texts; `what` begins the message: "The names of signals"."""
+    value = (value,) if isinstance(value, str) else value
+    if not isinstance(value, (list, tuple)) or not all(isinstance(text, str) for text in value):
+        rule, do = "They are a text, or a list of texts.", 'Write "x" or ["x", "y"].'
+        raise SpecificationError(f"{what} are {repr(value)[:150]}.", rule, do=do, what=what, value=value)
+    return tuple(value)
+
+
+def as_units(units):
+    """Units by name, texts, from a dict or None."""
+    if not all(isinstance(unit, str) for unit in mapping(units, "The units").values()):
+        rule, do = "A unit is a text.", 'Write {"x": "m", "theta": "rad"}.'
+        raise SpecificationError(f"The units are {repr(units)[:150]}.", rule, do=do, units=units)
+    return units or {}
+
+
+def as_list(value):
+    """A list from an iterable in order; None from anything else: text, symbols, dicts, sets."""
+    if isinstance(value, (str, bytes, Mapping, Set)) or not isinstance(value, Iterable):
+        return None
+    try:
+        return list(value)
+    except Exception:  # CasADi's symbols have __iter__, which raises
+        return None
 
 
 def named(value, names, what):
@@ -126,6 +171,31 @@ def as_numbers(value):
         return np.array(math.nan)
 
 
+def as_complex(values):
+    """An array (k,) or more of complex numbers, as poles, from a number or an array-like; NaN from anything else."""
+    try:
+        array = np.atleast_1d(np.asarray(values))
+    except Exception:  # CasADi raises types of its own for symbols
+        array = np.full(1, np.nan)
+    return array.astype(complex) if array.dtype.kind in "iufc" else np.full(array.shape, complex(math.nan))
+
+
+def array_of(name, value, *sizes):
+    """An array of finite numbers with these sizes, None for any; a new array, or `value` itself."""
+    array = as_numbers(value)
+    right = array.ndim == len(sizes) and all(n in (None, m) for n, m in zip(sizes, array.shape, strict=True))
+    if not right or not np.isfinite(array).all():
+        shape = ", ".join("N" if n is None else str(n) for n in sizes) + ("," if len(sizes) == 1 else "")
+        raise SpecificationError(
+            f"{name} is {repr(value)[:150]}, of the shape {array.shape}.",
+            f"It is an array of finite numbers of the shape ({shape}).",
+            name=name,
+            shape=array.shape,
+            expected=sizes,
+        )
+    return array
+
+
 def is_number(value):
     """Whether a value is a finite number of Python or NumPy; True and False are not."""
     if not isinstance(value, (int, float, np.integer, np.floating)) or isinstance(value, bool):
@@ -134,6 +204,11 @@ def is_number(value):
         return math.isfinite(value)
     except OverflowError:  # an int beyond the largest float
         return False
+
+
+def _is_real(value):
+    """Whether a value is a finite or infinite number of Python or NumPy."""
+    return is_number(value) or isinstance(value, (float, np.floating)) and not math.isnan(value)
 
 
 def is_whole(value):
@@ -150,7 +225,7 @@ def plain(value):
 def finite(name, value, what="value"):
     """A finite float from a number; `what` it is, in the singular: "limit", "noise"."""
     try:
-        number = math.nan if isinstance(value, (str, bytes, complex)) else float(value)
+        number = math.nan if isinstance(value, (str, bytes, complex, bool, np.bool)) else float(value)
     except Exception:  # CasADi raises its own types for symbols
         number = math.nan
     if not math.isfinite(number):
@@ -237,11 +312,10 @@ def interval(name, value, what):
 
     A number c means (-c, c); None leaves a side open.
     """
-    try:
-        low, high = (-value, value) if np.ndim(value) == 0 else value
-        low, high = -np.inf if low is None else float(low), np.inf if high is None else float(high)
-    except Exception:  # CasADi raises types of its own for symbols
-        low = high = np.nan
+    sides = [-value, value] if is_number(value) else as_list(value)
+    if sides is None or len(sides) != 2 or not all(side is None or _is_real(side) for side in sides):
+        sides = [np.nan, np.nan]
+    low, high = (open if side is None else float(side) for side, open in zip(sides, (-np.inf, np.inf), strict=True))
     if not low < high or np.isinf([low, high]).all():
         raise SpecificationError(
             f"The {what} of {name!r} is {value!r}.",

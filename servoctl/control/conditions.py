@@ -5,9 +5,9 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from servoctl.checks import MOST_COUNT, ON_SAMPLE, mapping, numbers_by_name, positive, whole
+from servoctl.checks import MOST_COUNT, ON_SAMPLE, mapping, named, numbers_by_name, positive, whole
 from servoctl.control.disturbances import sampled
-from servoctl.errors import SpecificationError, unknown
+from servoctl.errors import SpecificationError
 
 RESOLVED = 0.05  # largest |λ| h: the error of one Runge-Kutta step of order 4 is then 3e-9
 MOST_SUBSTEPS = 1000
@@ -155,9 +155,7 @@ def _by_measure(values, measures):
 
 def index(name, names, what):
     """The index of a name; `what` the names stand for, in the singular."""
-    if name not in names:
-        raise unknown(name, names, what)
-    return names.index(name)
+    return names.index(named(name, names, what))
 
 
 def ranges(plant, period):

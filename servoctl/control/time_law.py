@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from servoctl.checks import as_span, interval, mapping
+from servoctl.checks import as_span, finite, interval, mapping
 from servoctl.errors import InconsistentStart, IntegrationStopped, LimitExceeded, SingularProgram, SpecificationError
 from servoctl.model.model import derive
 from servoctl.progress import progress_bar
@@ -96,7 +96,7 @@ def fastest(
         program,
         {name: interval(name, value, "limit") for name, value in mapping(limits, "The limits").items()},
         as_span(t_span, forward=True),
-        mapping(start, "Values of the start"),
+        {name: finite(name, value, "start value") for name, value in mapping(start, "The start values").items()},
         guess,
         mapping(parameters, "The parameters"),
     )

@@ -4,7 +4,7 @@ from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
-from servoctl.checks import is_number, is_whole, named, positive_number, whole_of
+from servoctl.checks import MOST_JETS, as_complex, is_number, is_whole, mapping, named, positive_number, whole_of
 from servoctl.errors import SpecificationError, unknown
 
 ORDERS = {"RK1": 1, "RK2": 2, "RK4": 4, "RK5": 5, "RK8": 8}
@@ -15,7 +15,6 @@ SCIPY = ("RK23", "RK45", "DOP853", "Radau", "BDF", "LSODA")
 EXPLICIT, MULTISTEP = ("RK23", "RK45", "DOP853"), ("BDF", "LSODA")
 SUNDIALS = ("CVODES", "IDAS")
 SMALLEST_RTOL = 100 * np.finfo(float).eps  # that scipy's methods except LSODA accept: they replace a smaller one
-HIGHEST = 40  # order of a series, and level of jets
 REAL = 1e-9  # imaginary part of a pole polynomial, relative to its largest coefficient, that is rounding
 
 PAST_STATES = "A multistep method carries past states, which projection would contradict."
@@ -98,15 +97,12 @@ def _poles_by_row(values):
             do="Name a row of model.raised, or pass a time constant.",
             values=values,
         )
-    return {row: _conjugate_poles(row, poles) for row, poles in values.items()}
+    return {row: _conjugate_poles(row, poles) for row, poles in mapping(values, "The poles").items()}
 
 
 def _conjugate_poles(row, poles):
     """The poles of a row as a tuple, finite and in conjugate pairs."""
-    try:
-        array = np.atleast_1d(np.asarray(poles, dtype=complex))
-    except Exception:  # CasADi raises types of its own for symbols
-        array = np.full(1, np.nan)
+    array = as_complex(poles)
     if array.ndim != 1 or not np.all(np.isfinite(array)):
         raise SpecificationError(
             f"The poles of {row!r} are {poles!r}.",
@@ -241,7 +237,7 @@ class Taylor(Method):
     }
 
     def __post_init__(self):
-        self._check(order=range(2, HIGHEST + 1), jets=range(1, HIGHEST + 1))
+        self._check(order=range(2, MOST_JETS + 1), jets=range(1, MOST_JETS + 1))
 
 
 @dataclass(frozen=True, repr=False)

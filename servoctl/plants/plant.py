@@ -5,7 +5,7 @@ from dataclasses import dataclass, field, fields
 import casadi as ca
 import numpy as np
 
-from servoctl.checks import column, finite, interval, mapping, numbers_by_name
+from servoctl.checks import array_of, as_numbers, column, finite, interval, mapping, numbers_by_name
 from servoctl.codegen.function import compiled
 from servoctl.errors import SpecificationError, unknown
 from servoctl.plants.equations import PlantEquations, equations_at, plant_equations
@@ -199,7 +199,9 @@ class Plant(Value):
         -------
         (n_x,) array
         """
-        return self.function("ode")(t, x, self.p(u, d))
+        x = array_of("x", x, self.n_x)
+        u, d = array_of("u", u, len(self.inputs)), None if d is None else array_of("d", d, len(self.disturbable))
+        return self.function("ode")(finite("t", t, "time"), x, self.p(u, d))
 
     def linearised(self, t, x, u):
         """A = ∂x'/∂x and B = ∂x'/∂u at points.
@@ -216,7 +218,8 @@ class Plant(Value):
         A : (N, n_x, n_x) array
         B : (N, n_x, m) array
         """
-        t, x, u = np.atleast_1d(t), np.asarray(x, dtype=float), np.asarray(u, dtype=float)
+        t = array_of("t", np.atleast_1d(as_numbers(t)), None)
+        x, u = array_of("x", x, self.n_x, len(t)), array_of("u", u, len(self.inputs), len(t))
         y = self.function("jacobian").grid(t, x, self.p(u))
         both = y.reshape(-1, self.n_x, len(t)).transpose(2, 1, 0)
         return both[:, :, : self.n_x], both[:, :, self.n_x :]
@@ -254,15 +257,7 @@ class Plant(Value):
                     missing=missing,
                 )
             return np.array([finite(k, values[k], "state") if k in values else np.nan for k in names])
-        try:
-            state = np.asarray(values, dtype=float).ravel()
-        except (TypeError, ValueError) as error:
-            raise SpecificationError(
-                f"The state is a {type(values).__name__}.",
-                "A state is an array or a dict of numbers.",
-                do="Pass plan.state(0.0), an array or a dict.",
-                type=type(values).__name__,
-            ) from error
+        state = as_numbers(values).ravel()
         if state.size not in (n, self.n_x) or not np.isfinite(state).all():
             raise SpecificationError(
                 f"The state is {np.array2string(state, threshold=8)}.",

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from servoctl.checks import as_span, is_number, mapping, positive, positives
+from servoctl.checks import as_span, is_number, mapping, named, positive, positives, require_kind, text
 from servoctl.errors import LimitExceeded, ServoError, SpecificationError, unknown
 from servoctl.methods.accuracy import motion_error, relative_error
 from servoctl.methods.choice import (
@@ -172,7 +172,7 @@ class TradeOff(Study):
         """
         from servoctl.figures.work_precision import draw_tradeoff
 
-        return draw_tradeoff(self, ax, _cost(cost), title)
+        return draw_tradeoff(self, ax, _cost(cost), text("title", title))
 
     def _good(self):
         return np.flatnonzero(np.isfinite(self["error"]) & np.isfinite(self["seconds"]))
@@ -256,6 +256,7 @@ def tradeoff(
     SpecificationError
         For invalid settings.
     """
+    require_kind(Model, "model", model, "sv.derive(mechanism, program)")
     t0, t1 = as_span(t_span)
     settings = _ladders(mapping(settings, "The settings"), abs(t1 - t0))
     limit = positive("seconds", seconds)
@@ -522,6 +523,4 @@ def _arguments(row):
 
 
 def _cost(name):
-    if name not in COSTS:
-        raise unknown(name, COSTS, "cost")
-    return name
+    return named(name, COSTS, "cost")
