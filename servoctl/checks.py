@@ -163,7 +163,8 @@ def as_path(value, what="The path"):
 def as_numbers(value):
     """An array of float from a number or an array-like of numbers; NaN from anything else, text among it."""
     try:
-        array = np.asarray(value)
+        truths = isinstance(value, (list, tuple)) and any(isinstance(x, (bool, np.bool)) for x in value)
+        array = np.asarray(value, dtype=object if truths else None)
         if array.dtype.kind == "O":
             array = np.array([x if is_number(x) else math.nan for x in array.ravel()]).reshape(array.shape)
         return array.astype(float) if array.dtype.kind in "iuf" else np.full(array.shape, math.nan)

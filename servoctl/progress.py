@@ -48,7 +48,8 @@ def _shown(wanted):
     if not (wanted is None or isinstance(wanted, bool)):
         rule = "It is True, False, or None for a bar on a terminal; `simulate` also takes a function of the time."
         raise SpecificationError(f"progress={repr(wanted)[:150]} was given.", rule, progress=wanted)
-    return sys.stderr.isatty() if wanted is None else wanted
+    on_terminal = sys.stderr is not None and sys.stderr.isatty()  # pythonw has no stderr
+    return on_terminal if wanted is None else wanted
 
 
 def _require_one_argument(function):

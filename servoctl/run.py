@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from servoctl import archive
-from servoctl.checks import MOST_JETS, finite, whole
+from servoctl.checks import finite, whole
 from servoctl.errors import SpecificationError, unknown
 from servoctl.model.start import State
 from servoctl.values import Value, same
@@ -141,7 +141,7 @@ class Run(ByName, Value):
                 do="Use run[name] for what is stored, or sv.load(path, model).",
                 kind=kind,
             )
-        rate, parts = whole("rate", rate, most=MOST_JETS), []
+        parts = []
         for first, end, model in self.variants or ((0, len(self.t), self.model),):
             names, f = model.signals(kind, rate)
             if f.n_x > len(self.jets):
@@ -158,6 +158,7 @@ class Run(ByName, Value):
 
     def variant(self, i: int):
         """The variant of the model that holds at sample i."""
+        i = whole("i", i, most=max(len(self.t) - 1, 0))
         return next((model for first, end, model in self.variants if first <= i < end), self.model)
 
     @property
@@ -365,6 +366,8 @@ class _Residuals(Mapping):
 
     def __getitem__(self, name):
         stored = self._run.stored_residual
+        if not isinstance(name, str):
+            raise unknown(name, self._names(), "residual")
         if name not in stored:
             if name not in self._names():
                 raise unknown(name, self._names(), "residual")

@@ -5,7 +5,17 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from servoctl.checks import MOST_COUNT, ON_SAMPLE, mapping, named, numbers_by_name, positive, whole
+from servoctl.checks import (
+    MOST_COUNT,
+    ON_SAMPLE,
+    mapping,
+    named,
+    numbers_by_name,
+    positive,
+    require_memory,
+    texts,
+    whole,
+)
 from servoctl.control.disturbances import sampled
 from servoctl.errors import SpecificationError
 
@@ -71,12 +81,14 @@ class Sensors:
         (count, n_y) array or None
             None without noise.
         """
-        std = _by_measure(self.noise, measures)
+        std = _by_measure(self.noise, texts(measures, "The measured states"))
+        count = whole("count", count, most=MOST_COUNT)
+        require_memory(count, len(self.noise), f"Noise of {count} samples")
         return None if std is None else np.random.default_rng(self.seed or 0).standard_normal((count, len(std))) * std
 
     def quantum(self, measures):
         """The quantisation in the order of `measures`, (n_y,), 0 for a state without; None if no state has any."""
-        return _by_measure(self.quantisation, measures)
+        return _by_measure(self.quantisation, texts(measures, "The measured states"))
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,7 @@ from functools import cached_property
 import casadi as ca
 import numpy as np
 
-from servoctl.checks import as_numbers, finite, named
+from servoctl.checks import MOST_JETS, as_numbers, finite, named, whole
 from servoctl.codegen.function import compiled
 from servoctl.errors import ServoError, SpecificationError, unknown
 from servoctl.model.equations import EQUATIONS, SIGNALS, Equations, gradient_jets, leading_names, residual_rows
@@ -296,8 +296,7 @@ class Model:
         -------
         Compiled
         """
-        if name not in EQUATIONS:
-            raise unknown(name, list(EQUATIONS), "function")
+        named(name, EQUATIONS, "function")
 
         def build():
             f, *options = EQUATIONS[name](self.equations)
@@ -315,6 +314,7 @@ class Model:
         rate : int
         """
         named(kind, SIGNALS, "group of signals")
+        rate = whole("rate", rate, most=MOST_JETS)
 
         def build():
             names, f = self.equations.signals(kind, rate)

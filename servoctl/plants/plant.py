@@ -5,7 +5,7 @@ from dataclasses import dataclass, field, fields
 import casadi as ca
 import numpy as np
 
-from servoctl.checks import array_of, as_numbers, column, finite, interval, mapping, numbers_by_name
+from servoctl.checks import array_of, as_numbers, column, finite, interval, mapping, named, numbers_by_name
 from servoctl.codegen.function import compiled
 from servoctl.errors import SpecificationError, unknown
 from servoctl.plants.equations import PlantEquations, equations_at, plant_equations
@@ -151,12 +151,12 @@ class Plant(Value):
         -------
         (n_p,) or (n_p, N) array
         """
-        u = np.zeros(len(self.inputs)) if u is None else np.asarray(u, dtype=float)
-        d = np.zeros(len(self.disturbable)) if d is None else np.asarray(d, dtype=float)
+        u = np.zeros(len(self.inputs)) if u is None else _sized("u", u, len(self.inputs))
+        d = np.zeros(len(self.disturbable)) if d is None else _sized("d", d, len(self.disturbable))
         if u.ndim == 1:
-            return np.concatenate([self.parameters, u, d])
+            return np.concatenate([self.parameters, u, array_of("d", d, len(self.disturbable))])
         fixed = np.repeat(self.parameters[:, None], u.shape[1], axis=1)
-        d = d if d.ndim == 2 else np.repeat(d[:, None], u.shape[1], axis=1)
+        d = np.repeat(d[:, None], u.shape[1], axis=1) if d.ndim == 1 else _sized("d", d, len(d), u.shape[1])
         return np.concatenate([fixed, u, d])
 
     def function(self, name):
@@ -172,8 +172,7 @@ class Plant(Value):
         -------
         Compiled
         """
-        if name not in FUNCTIONS:
-            raise unknown(name, list(FUNCTIONS), "function")
+        named(name, FUNCTIONS, "function")
         functions = self.equations.functions
         if name not in functions:
             f, *options = FUNCTIONS[name](self.equations)
@@ -200,8 +199,7 @@ class Plant(Value):
         (n_x,) array
         """
         x = array_of("x", x, self.n_x)
-        u, d = array_of("u", u, len(self.inputs)), None if d is None else array_of("d", d, len(self.disturbable))
-        return self.function("ode")(finite("t", t, "time"), x, self.p(u, d))
+        return self.function("ode")(finite("t", t, "time"), x, self.p(array_of("u", u, len(self.inputs)), d))
 
     def linearised(self, t, x, u):
         """A = ∂x'/∂x and B = ∂x'/∂u at points.
@@ -284,6 +282,14 @@ class Plant(Value):
             "  damping: ": _text(self.damping),
         }
         return "\n".join(f"{what}{text}"[:118] for what, text in entries.items() if text)
+
+
+def _sized(name, value, size, count=None):
+    """Values (size,) or (size, N), NaN where a motion ended; N is `count`, if that is given."""
+    array = as_numbers(value)
+    if array.ndim == 2 and len(array) == size and count in (None, array.shape[1]):
+        return array
+    return array_of(name, value, size) if count is None else array_of(name, value, size, count)
 
 
 def _text(values):

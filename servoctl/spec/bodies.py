@@ -69,6 +69,7 @@ def rigid_body(q: Coordinates, mass, inertia, position=None, rotation=None, rate
             both=rates is not None,
         )
     _require_coordinates(q)
+    column(mass, "the mass", 1)
     omega = body_rates(q, rotation) if rates is None else ca.vertcat(*column(rates, "rates", 3))
     alpha, J = q.dt(omega), _inertia(inertia)
     spin = ca.dot(alpha, J @ alpha) / 2 + ca.dot(alpha, ca.cross(omega, J @ omega))

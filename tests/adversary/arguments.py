@@ -6,6 +6,7 @@
 import argparse
 import contextlib
 import functools
+import io
 import math
 import os
 import signal
@@ -21,7 +22,9 @@ from scipy import stats
 
 import servoctl as sv
 from servoctl.errors import ServoError
+from servoctl.shell.main import main
 
+WORDS = ("accepted", "refused")
 SECONDS = 10  # of a call before it counts as hanging
 
 ODD = {
@@ -183,6 +186,136 @@ def calls():
     }  # fmt: skip
 
 
+def specifications():
+    """Calls by which a designer writes a mechanism and a program."""
+    s = scene()
+    q, symbols = s["q"], sv.parameters(m=2.0)
+    x, y = q
+    plain = {"gibbs": sv.particle(q, symbols.m, (x, y)), "parameters": symbols}
+    turn = sv.coordinates("a b c")
+    angle, *_ = turn
+    about_z = ca.vertcat(
+        ca.horzcat(ca.cos(angle), -ca.sin(angle), 0), ca.horzcat(ca.sin(angle), ca.cos(angle), 0),
+        ca.horzcat(0, 0, 1),
+    )  # fmt: skip
+    velocity = ca.vertcat(*q.d())
+    return {
+        "coordinates": (sv.coordinates, dict(names="x y")),
+        "parameters": (lambda m: sv.parameters(m=m), dict(m=2.0)),
+        "Parameters.values": (symbols.values, dict(changes={"m": 3.0})),
+        "quasi-velocities": (lambda names, V, h, invariants: sv.coordinates("x y").with_quasi_velocities(
+            names, V, h, invariants), dict(names="u v", V=ca.SX.eye(2), h=None, invariants=None)),
+        "q.w": (q.w, dict(k=0)),
+        "q.gamma": (q.gamma, dict(k=1)),
+        "q.jet": (q.jet, dict(k=1)),
+        "q.jet_names": (q.jet_names, dict(k=1)),
+        "q.d": (q.d, dict(k=1)),
+        "q.dt": (q.dt, dict(expression=x, k=1)),
+        "q.order": (q.order, dict(expression=x)),
+        "q.derivatives": (q.derivatives, dict(expressions=[x], k=1)),
+        "q.where": (q.where, dict(symbol=x)),
+        "particle": (sv.particle, dict(q=q, mass=2.0, position=(x, y))),
+        "rigid_body": (sv.rigid_body, dict(q=turn, mass=2.0, inertia=(1.0, 1.0, 2.0), position=None, rotation=about_z)),
+        "rigid_body rates": (sv.rigid_body, dict(q=turn, mass=2.0, inertia=(1.0, 1.0, 2.0), rates=turn.d())),
+        "body_rates": (sv.body_rates, dict(q=turn, rotation=about_z)),
+        "Mechanism": (sv.Mechanism, dict(q=q, potential=x**2, actuators={"pull": x, "lift": y}, forces={"x": -x},
+                                         constraints={"rail": y}, outputs={"far": x + y}, **plain)),
+        "Mechanism entries": (lambda actuator, force, output: sv.Mechanism(
+            q, actuators={"pull": actuator}, forces={"x": force}, outputs={"far": output}, **plain),
+            dict(actuator=x, force=-x, output=x + y)),
+        "Mechanism kinetic": (sv.Mechanism, dict(q=q, kinetic=ca.dot(velocity, velocity) / 2)),
+        "Mechanism balance": (sv.Mechanism, dict(q=q, balance=ca.vertcat(*q.d(2)))),
+        "Program": (sv.Program, dict(residuals={"X": x - ca.sin(q.t)}, by="ideal", weights=None)),
+        "Program residual": (lambda residual: sv.Program({"X": residual}), dict(residual=x - ca.sin(q.t))),
+        "Program weight": (lambda weight: sv.Program({"X": x}, weights={"pull": weight}), dict(weight=2.0)),
+        "derive": (sv.derive, dict(mechanism=s["mechanism"], program=s["program"], guess=None)),
+    }  # fmt: skip
+
+
+def further():
+    """Calls on models, plants, laws, studies and systems of python-control."""
+    s = scene()
+    plan, plant, law, ideal = (s[k] for k in ("plan", "plant", "law", "ideal"))
+    (_, y), saved, span = s["q"], plan.save(os.path.join(s["folder"], "loaded.npz")), (0.0, 0.2)
+    x0 = {"x": 0.1, "y": 0.0, "dx": 0.0, "dy": 0.0}
+    steps = {"step": [0.1, 0.05]}
+    trade = sv.tradeoff(ideal, ideal.start(y=0.1, dy=0.0), span, ["RK4"], [None], settings=steps, progress=False)
+    linear = sv.interop.linearise(plant, 0.0, plan.state(0.0), rate=100.0), sv.interop.linearise(law, 0.0)
+    return {
+        "simulate accuracy": (sv.simulate, dict(model=ideal, start=ideal.start(y=0.1, dy=0.0), t_span=span,
+                                                accuracy=1e-6)),
+        "simulate plant": (sv.simulate, dict(model=plant, start=x0, t_span=span, method="RK4", inputs={"pull": 1.0},
+                                             t_eval=[0.0, 0.1])),
+        "simulate input": (lambda value: sv.simulate(plant, x0, span, "RK4", inputs={"pull": value}), dict(value=1.0)),
+        "Bounded": (sv.Bounded, dict(window=10.0, rtol=1e-6)),
+        "start hold": (lambda hold: ideal.start(hold=hold), dict(hold={"apart": y - 0.1})),
+        "start held value": (lambda value: ideal.start(guess={"y": value}), dict(value=0.1)),
+        "start held expression": (lambda value: ideal.start(hold={"apart": value}), dict(value=y - 0.1)),
+        "load with model": (sv.load, dict(path=saved, model=s["model"])),
+        "internal_dynamics period": (sv.internal_dynamics, dict(model=ideal, run=s["free"], period=1.0)),
+        "model.function": (ideal.function, dict(name="ode")),
+        "model.signals": (ideal.signals, dict(kind="outputs", rate=0)),
+        "run.variant": (plan.variant, dict(i=0)),
+        "run.residual": (plan.residual.__getitem__, dict(name="X")),
+        "plant.p": (plant.p, dict(u=np.zeros(2), d=np.zeros(2))),
+        "plant.function": (plant.function, dict(name="ode")),
+        "Sensors.noisy": (sv.Sensors({"x": 1e-3}, seed=1).noisy, dict(measures=("x",), count=3)),
+        "Controller": (sv.Controller, dict(law=law)),
+        "lqr varying": (sv.lqr, dict(plan=plan, plant=plant, rate=50.0, Q=None, R=None, integral=None)),
+        "map.growth": (s["map"].growth, dict(method="RK4", step=0.1, drift=None, order=None)),
+        "TradeOff.pareto": (trade.pareto, dict(cost="seconds")),
+        "TradeOff.recommend": (lambda error: trade.recommend(error=error), dict(error=1.0)),
+        "TradeOff.recommend time": (lambda seconds: trade.recommend(seconds=seconds), dict(seconds=10.0)),
+        "TradeOff.plot": (trade.plot, dict(ax=None, cost="seconds", title="")),
+        "plots.efforts": (sv.plots.efforts, dict(run=plan)),
+        "disturbances.gust": (sv.disturbances.gust, dict(size=1.0, start=0.0, end=1.0, rise=0.1)),
+        "disturbances.step": (sv.disturbances.step, dict(size=1.0, at=0.1)),
+        "disturbances.noise": (sv.disturbances.noise, dict(std=1.0, bandwidth=10.0, seed=0)),
+        "interop.nlsys": (sv.interop.nlsys, dict(thing=plant, rate=50.0, substeps=2, disturbed=("x",), name="system")),
+        "interop.linearise": (sv.interop.linearise, dict(thing=plant, t=0.0, x=plan.state(0.0), u=np.zeros(2),
+                                                         rate=None, disturbed=("x",), name=None)),
+        "interop.linearise law": (sv.interop.linearise, dict(thing=law, t=0.0, x=None, controller_state=None)),
+        "interop.linearise model": (sv.interop.linearise, dict(thing=ideal, t=0.0, x=ideal.start(y=0.1))),
+        "interop.along": (lambda **options: list(sv.interop.along(**options)),
+                          dict(thing=plant, run=plan, times=[0.0, 0.5])),
+        "interop.loop_gain": (sv.interop.loop_gain, dict(plant=linear[0], law=linear[1], at="pull")),
+        "interop.start": (sv.interop.start, dict(closed=s["closed"])),
+        "sweep case": (sv.sweep, dict(case=doubled, cases=[{"a": 1.0}])),
+    }  # fmt: skip
+
+
+COMMANDS = {  # arguments of the command, each with one place for an odd text
+    "report": ["report", "?"],
+    "run set": ["run", "constant-speed", "--set", "?"],
+    "run hold": ["run", "constant-speed", "--hold", "?"],
+    "run span": ["run", "constant-speed", "--t-span", "0", "?"],
+    "run method": ["run", "constant-speed", "--method", "?"],
+    "run rtol": ["run", "constant-speed", "--rtol", "?"],
+    "run out": ["run", "constant-speed", "--no-figures", "--no-verify", "--out", "?"],
+    "export": ["export", "constant-speed", "--out", "c", "--name", "?"],
+    "cache": ["cache", "?"],
+}
+TEXTS = ("", "abc", "x=", "x=nan", "=1", "a\0b", "\ud800", "nan", "1e400", "-1", "-", "--", "n" * 300, "\n")
+
+
+def commands():
+    """Calls of the command line by name."""
+
+    def command(arguments):
+        def call(text):
+            with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()):
+                try:
+                    code = main([text if part == "?" else part for part in arguments])
+                except SystemExit as error:
+                    code = error.code
+            if code == 2:
+                raise ServoError("refused")
+
+        return call
+
+    return {f"servoctl {name}": command(arguments) for name, arguments in COMMANDS.items()}
+
+
 def doubled(a):
     """A case of a sweep."""
     return {"b": 2.0 * a}
@@ -216,7 +349,7 @@ def outcome(call, arguments):
 def fuzz(only=()):
     """Outcomes by (call, argument, odd value)."""
     outcomes = {}
-    for name, (call, arguments) in calls().items():
+    for name, (call, arguments) in (calls() | specifications() | further()).items():
         if only and not any(word in name for word in only):
             continue
         good = outcome(call, arguments)
@@ -225,23 +358,31 @@ def fuzz(only=()):
             for odd, value in ODD.items():
                 with contextlib.redirect_stdout(None):
                     outcomes[name, argument, odd] = outcome(call, {**arguments, argument: value})
+    for name, call in commands().items():
+        if not only or any(word in name for word in only):
+            outcomes |= {(name, "text", repr(text)[:20]): outcome(call, {"text": text}) for text in TEXTS}
     return outcomes
 
 
-def main():
+def leaks(outcomes):
+    """Outcomes in which an argument was neither accepted nor refused in words."""
+    return {f"{name}({argument}={odd})": text for (name, argument, odd), text in outcomes.items() if text not in WORDS}
+
+
+def script():
     """Print leaks and hangs, and how often each outcome came."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--only", nargs="*", default=())
     parser.add_argument("--accepted", action="store_true", help="print what is accepted, too")
     args = parser.parse_args()
     matplotlib.use("Agg")
+    os.chdir(tempfile.mkdtemp())
     outcomes = fuzz(args.only)
     for (name, argument, odd), text in outcomes.items():
-        if text not in ("accepted", "refused") or (args.accepted and text == "accepted"):
+        if text not in WORDS or (args.accepted and text == "accepted"):
             print(f"{name}({argument}={odd}): {text}")
-    known = ("accepted", "refused", "hangs")
-    print(Counter(text if text in known else "leak" for text in outcomes.values()))
+    print(Counter(text if text in (*WORDS, "hangs") else "leak" for text in outcomes.values()))
 
 
 if __name__ == "__main__":
-    main()
+    script()
