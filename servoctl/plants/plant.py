@@ -5,7 +5,17 @@ from dataclasses import dataclass, field, fields
 import casadi as ca
 import numpy as np
 
-from servoctl.checks import array_of, as_numbers, column, finite, interval, mapping, named, numbers_by_name
+from servoctl.checks import (
+    array_of,
+    as_numbers,
+    column,
+    finite,
+    interval,
+    mapping,
+    named,
+    numbers_by_name,
+    require_kind,
+)
 from servoctl.codegen.function import compiled
 from servoctl.errors import SpecificationError, unknown
 from servoctl.plants.equations import PlantEquations, equations_at, plant_equations
@@ -52,13 +62,7 @@ def plant(
     SpecificationError
         For a value outside its range, or a mass matrix that is not positive definite.
     """
-    if not isinstance(mechanism, Mechanism):
-        raise SpecificationError(
-            f"The first argument is a {type(mechanism).__name__}.",
-            "A plant is made of a Mechanism and numbers.",
-            do="Write sv.plant(mechanism, m_load=115.0).",
-            type=type(mechanism).__name__,
-        )
+    require_kind(Mechanism, "mechanism", mechanism, "sv.Mechanism(q, gibbs, ...)")
     actuators = mechanism.actuators
     names = mechanism.q.names if mechanism.q.plain else mechanism.q.velocity_names
     values = mechanism.parameters.values(parameters)
