@@ -16,6 +16,7 @@ from servoctl.errors import SpecificationError, unknown
 ON_SAMPLE = 1e-6  # rounding of a sampling instant [periods], or of a count
 MOST_CASES = 10**6  # of one sweep: some gigabytes of parameters and rows
 MOST_JETS = 40  # level of jets, and order of a series: higher ones are functions too large to build
+LEAST_TOLERANCE = 1e-30  # of an integrator: far below the rounding of doubles, and its square is one
 MOST_COUNT = 10**9  # samples, steps or rows: products of two such counts fit into the 64 bits of C
 LONGEST_NAME = 255  # bytes of a file's name in common file systems
 MOST_MEMORY = 8e9  # bytes for all samples: the memory of common machines
@@ -261,6 +262,14 @@ def whole(name, value, least=0, most=math.inf):
         said, nearest = f"{name}={value!r} was given."[:200], f"{name}={most}." if number > most else ""
         raise SpecificationError(said, rule, nearest=nearest, name=name, value=value, least=least, most=most)
     return number
+
+
+def tolerance(name, value, most):
+    """A positive number up to `most` that is not below what integrators can compute with."""
+    if positive_number(name, value, most) < LEAST_TOLERANCE:
+        given, rule = f"{name}={value:g} was given.", f"A tolerance is at least {LEAST_TOLERANCE:g}."
+        raise SpecificationError(given, rule, nearest=f"{name}={LEAST_TOLERANCE:g}.", **{name: value})
+    return float(value)
 
 
 def positive_number(name, value, most=np.inf):

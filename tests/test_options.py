@@ -33,7 +33,7 @@ def stopped(fact, make):
 @pytest.mark.parametrize("method", ADAPTIVE)
 @pytest.mark.parametrize("name", ["rtol", "atol"])
 def test_tolerances(method, name, scene):
-    for value in (0.0, -1e-6, np.nan, np.inf, 2.0, "1e-6", [1e-6], True):
+    for value in (0.0, 1e-300, -1e-6, np.nan, np.inf, 2.0, "1e-6", [1e-6], True):
         stopped(f"{name}=", lambda value=value: sv.simulate(*scene, SPAN, method=as_method(method, **{name: value})))
 
 

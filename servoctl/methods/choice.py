@@ -4,7 +4,17 @@ from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
-from servoctl.checks import MOST_JETS, as_complex, is_number, is_whole, mapping, named, positive_number, whole_of
+from servoctl.checks import (
+    MOST_JETS,
+    as_complex,
+    is_number,
+    is_whole,
+    mapping,
+    named,
+    positive_number,
+    tolerance,
+    whole_of,
+)
 from servoctl.errors import SpecificationError, unknown
 
 ORDERS = {"RK1": 1, "RK2": 2, "RK4": 4, "RK5": 5, "RK8": 8}
@@ -185,9 +195,10 @@ class Method:
         """Check the fields: whole numbers by the values that are valid, steps and tolerances by their ranges."""
         for name, numbers in valid.items():
             self._check_field(name, whole_of, numbers)
-        for name, most in (("step", np.inf), ("rtol", 1.0), ("atol", 1.0)):
+        checks = {"step": (positive_number, np.inf), "rtol": (tolerance, 1.0), "atol": (tolerance, 1.0)}
+        for name, (check, most) in checks.items():
             if hasattr(self, name):
-                self._check_field(name, positive_number, most)
+                self._check_field(name, check, most)
 
     def _check_field(self, name, check, rule):
         # None is valid where it is the default: the method then chooses
