@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
+from servoctl.checks import as_path
 from servoctl.errors import ServoError
 
 FORMAT, SUFFIX = 1, ".npz"
@@ -18,10 +19,8 @@ def writing(path, what, folder=False):
 
     `what` names the content: "run", "study", "figures".
     """
-    path = Path(path)
+    path = as_path(path, f"The path of the {what}")
     try:
-        if "\0" in str(path):
-            raise OSError("its name has a null character")
         (path if folder else path.parent).mkdir(parents=True, exist_ok=True)
         yield path
     except (OSError, UnicodeError) as error:
@@ -35,14 +34,13 @@ def writing(path, what, folder=False):
 
 def save(path, what, facts, arrays):
     """Write arrays and JSON-able facts as npz and return the path; a missing suffix is added."""
-    path = _suffixed(path)
+    path = _suffixed(as_path(path, f"The path of the {what}"))
     with writing(path, what):
         np.savez_compressed(path, meta=np.array(json.dumps({"format": FORMAT, **facts})), **arrays)
     return path
 
 
 def _suffixed(path):
-    path = Path(path)
     return path if path.suffix == SUFFIX else Path(f"{path}{SUFFIX}")
 
 
@@ -51,8 +49,9 @@ def read(path, what, build):
 
     A missing suffix is added where there is no file without it.
     """
+    path = as_path(path, f"The path of the {what}")
     try:
-        path = Path(path) if Path(path).is_file() else _suffixed(path)
+        path = path if path.is_file() else _suffixed(path)
         with np.load(path, allow_pickle=False) as data:
             facts = json.loads(str(data["meta"]))
             require(facts["format"] == FORMAT, f"its format is {facts['format']!r}, not {FORMAT}")

@@ -1,9 +1,12 @@
-"""Checks of input: expressions first, numbers below. Each returns the value in one form or raises.
+"""Checks of input: expressions, kinds and names first, numbers below. Each returns the value in one form or raises.
 
 All raise `SpecificationError`, with the name and the value in its `details`.
 """
 
 import math
+import os
+from collections.abc import Iterable, Mapping, Set
+from pathlib import Path
 
 import casadi as ca
 import numpy as np
@@ -12,7 +15,10 @@ from servoctl.errors import SpecificationError, unknown
 
 ON_SAMPLE = 1e-6  # rounding of a sampling instant [periods], or of a count
 MOST_CASES = 10**6  # of one sweep: some gigabytes of parameters and rows
+MOST_JETS = 40  # level of jets, and order of a series: higher ones are functions too large to build
+LEAST_TOLERANCE = 1e-30  # of an integrator: far below the rounding of doubles, and its square is one
 MOST_COUNT = 10**9  # samples, steps or rows: products of two such counts fit into the 64 bits of C
+LONGEST_NAME = 255  # bytes of a file's name in common file systems
 MOST_MEMORY = 8e9  # bytes for all samples: the memory of common machines
 
 
@@ -20,7 +26,8 @@ def column(value, what, size=None):
     """A list of SX scalars from a scalar, a sequence, or an SX column, of length `size` if that is given."""
     try:
         if isinstance(value, (list, tuple)):
-            value = ca.vertcat(*value) if value else ca.SX(0, 1)
+            value = ca.vertcat(*map(_not_truth, value)) if value else ca.SX(0, 1)
+        _not_truth(value)
         flat = ca.densify(ca.vec(ca.SX(value)))
         items = flat.elements()
     except Exception as error:  # CasADi raises several types here, none of which helps the designer
@@ -43,6 +50,13 @@ def column(value, what, size=None):
             what=what,
         )
     return items
+
+
+def _not_truth(value):
+    """The value; TypeError for True and False, which CasADi takes for numbers."""
+    if isinstance(value, (bool, np.bool)):
+        raise TypeError("a truth value is no number")
+    return value
 
 
 def matrix(value, what):
@@ -75,6 +89,115 @@ def mapping(value, what):
     return value
 
 
+def require_kind(kind, name, value, source):
+    """The value, if it is of a kind: a class, made by `source` ("sv.derive(...)")."""
+    if not isinstance(value, kind):
+        article = "an" if type(value).__name__[0] in "aeiouAEIOU" else "a"
+        raise SpecificationError(
+            f"{name} is {article} {type(value).__name__}.",
+            f"It must be a {kind.__name__}.",
+            do=f"Make one by {source}.",
+            name=name,
+            type=type(value).__name__,
+        )
+    return value
+
+
+def text(name, value):
+    """The value, if it is a text of whole characters."""
+    if not isinstance(value, str) or any("\ud800" <= letter <= "\udfff" for letter in value):
+        said = f"{name}={repr(value)[:150]} was given."
+        raise SpecificationError(said, "It is a text of whole characters.", name=name, value=value)
+    return value
+
+
+def texts(value, what):
+    """A tuple of texts from one text or a sequence of texts; `what` begins the message: "The names of signals"."""
+    value = (value,) if isinstance(value, str) else value
+    if not isinstance(value, (list, tuple)) or not all(isinstance(text, str) for text in value):
+        rule, do = "They are a text, or a list of texts.", 'Write "x" or ["x", "y"].'
+        raise SpecificationError(f"{what} are {repr(value)[:150]}.", rule, do=do, what=what, value=value)
+    return tuple(value)
+
+
+def as_units(units):
+    """Units by name, texts, from a dict or None."""
+    if not all(isinstance(unit, str) for unit in mapping(units, "The units").values()):
+        rule, do = "A unit is a text.", 'Write {"x": "m", "theta": "rad"}.'
+        raise SpecificationError(f"The units are {repr(units)[:150]}.", rule, do=do, units=units)
+    return units or {}
+
+
+def as_list(value):
+    """A list from an iterable in order; None from anything else: text, symbols, dicts, sets."""
+    if isinstance(value, (str, bytes, Mapping, Set)) or not isinstance(value, Iterable):
+        return None
+    try:
+        return list(value)
+    except Exception:  # CasADi's symbols have __iter__, which raises
+        return None
+
+
+def named(value, names, what):
+    """One of the names, or `NameUnknown`; `what` they name: "signal"."""
+    if not (isinstance(value, str) and value in names):
+        raise unknown(value, names, what)
+    return value
+
+
+def as_path(value, what="The path"):
+    """A `Path` from text or a path that file systems accept."""
+    try:
+        path = Path(value)
+        fits = all(len(os.fsencode(part)) <= LONGEST_NAME and "\0" not in part for part in path.parts)
+    except (TypeError, UnicodeEncodeError):
+        fits = False
+    if not fits or isinstance(value, str) and not value.strip():
+        raise SpecificationError(
+            f"{what} is {value!r}"[:200] + ".",
+            f"It is text or a path whose parts have at most {LONGEST_NAME} bytes and no null character.",
+            path=value,
+        )
+    return path
+
+
+def as_numbers(value):
+    """An array of float from a number or an array-like of numbers; NaN from anything else, text among it."""
+    try:
+        truths = isinstance(value, (list, tuple)) and any(isinstance(x, (bool, np.bool)) for x in value)
+        array = np.asarray(value, dtype=object if truths else None)
+        if array.dtype.kind == "O":
+            array = np.array([x if is_number(x) else math.nan for x in array.ravel()]).reshape(array.shape)
+        return array.astype(float) if array.dtype.kind in "iuf" else np.full(array.shape, math.nan)
+    except Exception:  # CasADi raises types of its own for symbols
+        return np.array(math.nan)
+
+
+def as_complex(values):
+    """An array (k,) or more of complex numbers, as poles, from a number or an array-like; NaN from anything else."""
+    try:
+        array = np.atleast_1d(np.asarray(values))
+    except Exception:  # CasADi raises types of its own for symbols
+        array = np.full(1, np.nan)
+    return array.astype(complex) if array.dtype.kind in "iufc" else np.full(array.shape, complex(math.nan))
+
+
+def array_of(name, value, *sizes):
+    """An array of finite numbers with these sizes, None for any; a new array, or `value` itself."""
+    array = as_numbers(value)
+    right = array.ndim == len(sizes) and all(n in (None, m) for n, m in zip(sizes, array.shape, strict=True))
+    if not right or not np.isfinite(array).all():
+        shape = ", ".join("N" if n is None else str(n) for n in sizes) + ("," if len(sizes) == 1 else "")
+        raise SpecificationError(
+            f"{name} is {repr(value)[:150]}, of the shape {array.shape}.",
+            f"It is an array of finite numbers of the shape ({shape}).",
+            name=name,
+            shape=array.shape,
+            expected=sizes,
+        )
+    return array
+
+
 def is_number(value):
     """Whether a value is a finite number of Python or NumPy; True and False are not."""
     if not isinstance(value, (int, float, np.integer, np.floating)) or isinstance(value, bool):
@@ -83,6 +206,11 @@ def is_number(value):
         return math.isfinite(value)
     except OverflowError:  # an int beyond the largest float
         return False
+
+
+def _is_real(value):
+    """Whether a value is a finite or infinite number of Python or NumPy."""
+    return is_number(value) or isinstance(value, (float, np.floating)) and not math.isnan(value)
 
 
 def is_whole(value):
@@ -99,7 +227,7 @@ def plain(value):
 def finite(name, value, what="value"):
     """A finite float from a number; `what` it is, in the singular: "limit", "noise"."""
     try:
-        number = math.nan if isinstance(value, (str, bytes, complex)) else float(value)
+        number = math.nan if isinstance(value, (str, bytes, complex, bool, np.bool)) else float(value)
     except Exception:  # CasADi raises its own types for symbols
         number = math.nan
     if not math.isfinite(number):
@@ -118,10 +246,7 @@ def positive(name, value):
 
 def positives(name, values, do, fewest=1, most=np.inf):
     """An array of at least `fewest` positive numbers, none above `most`, from a number or an array-like."""
-    try:
-        numbers = np.asarray(values, dtype=float)
-    except (TypeError, ValueError):
-        numbers = np.zeros(1)
+    numbers = as_numbers(values)
     if numbers.size < fewest or not np.all(np.isfinite(numbers) & (numbers > 0) & (numbers <= most)):
         count = "It must be a positive number, or several" if fewest == 1 else f"Give at least {fewest}, all positive"
         rule = count + ("." if most == np.inf else f", each at most {most:g}.")
@@ -131,15 +256,20 @@ def positives(name, values, do, fewest=1, most=np.inf):
 
 def whole(name, value, least=0, most=math.inf):
     """An int from a whole number between `least` and `most`: from 1000.0, too, but not from True."""
-    try:
-        number = least - 1 if isinstance(value, (bool, str, bytes)) else int(value)
-    except (TypeError, ValueError, OverflowError, RuntimeError):  # the last is CasADi's
-        number = least - 1
+    number = int(value) if is_number(value) or is_whole(value) else least - 1
     if not least <= number <= most or number != value:
         rule = f"It must be a whole number, at least {least}{f' and at most {most}' if most < math.inf else ''}."
         said, nearest = f"{name}={value!r} was given."[:200], f"{name}={most}." if number > most else ""
         raise SpecificationError(said, rule, nearest=nearest, name=name, value=value, least=least, most=most)
     return number
+
+
+def tolerance(name, value, most):
+    """A positive number up to `most` that is not below what integrators can compute with."""
+    if positive_number(name, value, most) < LEAST_TOLERANCE:
+        given, rule = f"{name}={value:g} was given.", f"A tolerance is at least {LEAST_TOLERANCE:g}."
+        raise SpecificationError(given, rule, nearest=f"{name}={LEAST_TOLERANCE:g}.", **{name: value})
+    return float(value)
 
 
 def positive_number(name, value, most=np.inf):
@@ -192,11 +322,10 @@ def interval(name, value, what):
 
     A number c means (-c, c); None leaves a side open.
     """
-    try:
-        low, high = (-value, value) if np.ndim(value) == 0 else value
-        low, high = -np.inf if low is None else float(low), np.inf if high is None else float(high)
-    except (TypeError, ValueError):
-        low = high = np.nan
+    sides = [-value, value] if is_number(value) else as_list(value)
+    if sides is None or len(sides) != 2 or not all(side is None or _is_real(side) for side in sides):
+        sides = [np.nan, np.nan]
+    low, high = (open if side is None else float(side) for side, open in zip(sides, (-np.inf, np.inf), strict=True))
     if not low < high or np.isinf([low, high]).all():
         raise SpecificationError(
             f"The {what} of {name!r} is {value!r}.",
@@ -227,10 +356,8 @@ def numbers_by_name(values, names, what, meaning, low=-np.inf, positive=False):
 
 def as_span(t_span, forward=False):
     """A time span as two different finite numbers [s]; with `forward`, t1 must exceed t0."""
-    try:
-        t0, t1 = map(float, t_span)
-    except (TypeError, ValueError, OverflowError):
-        t0 = t1 = np.nan
+    ends = as_numbers(t_span)
+    t0, t1 = map(float, ends) if ends.shape == (2,) else (np.nan, np.nan)
     finite = math.isfinite(t0) and math.isfinite(t1)
     if not finite or t0 == t1 or (forward and t1 < t0):
         raise SpecificationError(

@@ -1,7 +1,10 @@
 """Progress bars, which appear where work takes long."""
 
+import inspect
 import sys
 import time
+
+from servoctl.errors import SpecificationError
 
 PATIENCE = 1.0  # s before a bar appears
 
@@ -17,9 +20,11 @@ class Progress:
     """Progress over a span [s], as a bar or as calls of a function of time; `wanted` None means a bar on a terminal."""
 
     def __init__(self, span, wanted):
+        if callable(wanted):
+            _require_one_argument(wanted)
         self.t0, self.total = span[0], abs(span[1] - span[0])
         self.call = wanted if callable(wanted) else None
-        self.wanted = _shown(wanted)
+        self.wanted = self.call is None and _shown(wanted)
         self.since, self.bar, self.done = time.monotonic(), None, 0.0
 
     def __call__(self, t):
@@ -40,4 +45,20 @@ class Progress:
 
 
 def _shown(wanted):
-    return sys.stderr.isatty() if wanted is None else wanted
+    if not (wanted is None or isinstance(wanted, bool)):
+        rule = "It is True, False, or None for a bar on a terminal; `simulate` also takes a function of the time."
+        raise SpecificationError(f"progress={repr(wanted)[:150]} was given.", rule, progress=wanted)
+    on_terminal = sys.stderr is not None and sys.stderr.isatty()  # pythonw has no stderr
+    return on_terminal if wanted is None else wanted
+
+
+def _require_one_argument(function):
+    """Refuse a function that takes no time; those of C have no signature and pass."""
+    try:
+        inspect.signature(function).bind(0.0)
+    except ValueError:
+        return
+    except TypeError as error:
+        rule = "A function that follows the progress receives the time reached [s]."
+        do = "Write progress=lambda t: print(t)."
+        raise SpecificationError(f"progress={function!r} was given.", rule, do=do, progress=function) from error

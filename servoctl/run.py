@@ -7,6 +7,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from servoctl import archive
+from servoctl.checks import finite, whole
 from servoctl.errors import SpecificationError, unknown
 from servoctl.model.start import State
 from servoctl.model.switching import switching
@@ -107,6 +108,8 @@ class Run(ByName, Value):
         return tuple(dict.fromkeys([*self.jet_names, *self._groups, *self.stored]))
 
     def __getitem__(self, name: str) -> np.ndarray:
+        if not isinstance(name, str):
+            raise unknown(name, self.names, "signal")
         if name in self.jet_names:
             return self.jets[self.jet_names.index(name)]
         if name not in self.stored:
@@ -133,6 +136,13 @@ class Run(ByName, Value):
         SpecificationError
             If the run does not hold the jets that the derivative needs.
         """
+        if self.model is None:
+            raise SpecificationError(
+                "The run was loaded from a file, without its model.",
+                "Groups of signals and their derivatives need the model.",
+                do="Use run[name] for what is stored, or sv.load(path, model).",
+                kind=kind,
+            )
         parts = []
         for first, end, model in self.variants or ((0, len(self.t), self.model),):
             names, f = model.signals(kind, rate)
@@ -150,6 +160,7 @@ class Run(ByName, Value):
 
     def variant(self, i: int):
         """The variant of the model that holds at sample i."""
+        i = whole("i", i, most=max(len(self.t) - 1, 0))
         return next((model for first, end, model in self.variants if first <= i < end), self.model)
 
     @property
@@ -184,12 +195,13 @@ class Run(ByName, Value):
         SpecificationError
             If t lies outside the run.
         """
+        t = finite("t", t, "time")
         low, high = min(self.t[0], self.t[-1]), max(self.t[0], self.t[-1])
         if not low - SAME_TIME * (1 + abs(low)) <= t <= high + SAME_TIME * (1 + abs(high)):
             raise SpecificationError(
                 f"t = {t:g} s lies outside the run.",
                 f"It covers {low:g} to {high:g} s.",
-                nearest=f"t = {low if t < low else high:g} s." if np.isfinite(t) else "",
+                nearest=f"t = {low if t < low else high:g} s.",
                 t=t,
                 span=(low, high),
             )
@@ -369,6 +381,8 @@ class _Residuals(Mapping):
 
     def __getitem__(self, name):
         stored = self._run.stored_residual
+        if not isinstance(name, str):
+            raise unknown(name, self._names(), "residual")
         if name not in stored:
             if name not in self._names():
                 raise unknown(name, self._names(), "residual")

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import ArrayLike
 
-from servoctl.checks import as_span
+from servoctl.checks import as_numbers, as_span
 from servoctl.errors import InconsistentStart, ServoError, SpecificationError
 from servoctl.internal_dynamics import STEP_ERROR, internal_dynamics
 from servoctl.methods.accuracy import ATOL, absolute_tolerances, accurate, large_tolerances
@@ -342,10 +342,7 @@ def _require_decay(model, drift, t0, t1):
 
 def as_state(model, start, t0):
     """The state X (n_x,) that a start gives at t0."""
-    try:
-        values = np.asarray(start if isinstance(start, dict) else getattr(start, "values", start), dtype=float)
-    except (TypeError, ValueError):
-        values = np.zeros(0)
+    values = as_numbers(start if isinstance(start, dict) else getattr(start, "values", start))
     if values.shape != (len(model.state_names),) or not np.all(np.isfinite(values)):
         raise SpecificationError(
             f"The start has the shape {values.shape}.",
@@ -404,13 +401,10 @@ def _sample_times(t0, t1, t_eval, knots):
     if t_eval is None:
         times = np.union1d(np.linspace(t0, t1, DEFAULT_SAMPLES), [k for k in knots if min(t0, t1) < k < max(t0, t1)])
     else:
-        try:
-            times = np.unique(np.asarray(t_eval, dtype=float))
-        except (TypeError, ValueError):
-            times = np.array([np.nan])
+        times = np.unique(as_numbers(t_eval))
         if not np.all(np.isfinite(times)):
             raise SpecificationError(
-                f"t_eval={t_eval!r} was given.", "It is a sequence of finite times [s].", t_eval=t_eval
+                f"t_eval={repr(t_eval)[:150]} was given.", "It is a sequence of finite times [s].", t_eval=t_eval
             )
         if not times.size or times[0] < min(t0, t1) - SAME_TIME or times[-1] > max(t0, t1) + SAME_TIME:
             covered = f"covers {times[0]:g} to {times[-1]:g} s" if times.size else "is empty"

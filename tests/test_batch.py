@@ -246,6 +246,9 @@ def test_laws_in_python_are_sent_to_sweep(plan):
 BAD = {
     "unknown column": (sv.NameUnknown, {"mload": [1.0]}, {}, {"match": "m_load"}),
     "other lengths": (sv.SpecificationError, {"m_load": [1.0, 2.0], "theta": [0.0]}, {}, "cases"),
+    "a negative mass": (sv.SpecificationError, {"m_load": [90.0, -90.0, 110.0]}, {}, "m_load = -90"),
+    "a truth value": (sv.SpecificationError, {"m_load": [90.0, True]}, {}, "cases"),
+    "texts": (sv.SpecificationError, {"m_load": ["90.0"]}, {}, "cases"),
     "not finite": (sv.SpecificationError, {"m_load": [np.nan]}, {}, "cases"),
     "no case": (sv.SpecificationError, {}, {}, "cases"),
     "empty columns": (sv.SpecificationError, {"m_load": []}, {}, "cases"),

@@ -1,5 +1,6 @@
 """Checks of what a designer gives: values in one form, refusals with the facts and with what is nearest."""
 
+import casadi as ca
 import numpy as np
 import pytest
 
@@ -50,3 +51,46 @@ def test_spans():
     assert "Nearest: (1, 2)." in str(error_of(checks.as_span, (2, 1), forward=True))
     for given in (3, (1, 1), (0, np.inf), "ab", None):
         assert error_of(checks.as_span, given).details["t_span"] == given
+
+
+def test_arrays_hold_numbers_alone():
+    for array in ([1.0, True], ["1.0"], np.array([True]), [1.0, None], b"1", 10**400, [10**400, 1.0], [1j], object()):
+        assert np.isnan(checks.as_numbers(array)).any()
+        error_of(checks.array_of, "x", array, None)
+    assert checks.array_of("x", range(3), 3).tolist() == [0.0, 1.0, 2.0]
+    error = error_of(checks.array_of, "x", np.ones((2, 3)), 2, None, None)
+    assert (error.details["shape"], error.details["expected"]) == ((2, 3), (2, None, None))
+
+
+def test_lists_have_an_order():
+    assert checks.as_list(iter([1, 2])) == [1, 2] and checks.as_list(np.arange(2)) == [0, 1]
+    for value in ("ab", b"ab", {"a": 1}, {1}, 3, None, ca.SX.sym("x"), ca.MX.sym("x", 2)):
+        assert checks.as_list(value) is None
+
+
+def test_kinds_texts_and_units():
+    assert checks.require_kind(dict, "columns", {}, "dict()") == {}
+    assert error_of(checks.require_kind, dict, "columns", [], "dict()").details == {"name": "columns", "type": "list"}
+    assert checks.texts("x", "The names") == ("x",) and checks.texts(["x", "y"], "The names") == ("x", "y")
+    for value in (["x", 1], {"x"}, None, 3):
+        assert error_of(checks.texts, value, "The names").details["value"] == value
+    for value in (None, 3, b"x", "\ud800"):
+        assert error_of(checks.text, "title", value).details["value"] == value
+    assert checks.as_units(None) == {} and checks.as_units({"x": "m"}) == {"x": "m"}
+    for units in ({"x": 1}, {1: "m"}, ["m"], "m"):
+        error_of(checks.as_units, units)
+
+
+def test_expressions_hold_no_truth_values():
+    for value in (True, np.True_, [1.0, True]):
+        assert error_of(checks.column, value, "the mass").details["what"] == "the mass"
+
+
+@pytest.mark.parametrize("progress", ["yes", 1, [True], lambda: None, lambda t, x: None])
+def test_progress_is_a_switch_or_a_function_of_the_time(wheel, progress):
+    assert error_of(sv.simulate, *wheel, (0.0, 0.1), "RK4", progress=progress).details["progress"] is progress
+
+
+def test_bars_work_without_a_terminal(monkeypatch):
+    monkeypatch.setattr("sys.stderr", None)
+    assert len(sv.sweep(lambda a: {"b": a}, [{"a": 1.0}])) == 1

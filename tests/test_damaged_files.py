@@ -69,7 +69,7 @@ def test_files_of_other_kinds_are_refused(load, content, tmp_path):
         with refused(sv.ServoError):
             load(tmp_path / name)
     for odd in (None, 3, object()):
-        with refused(sv.ServoError):
+        with refused(sv.SpecificationError, path=odd):
             load(odd)
 
 
@@ -195,8 +195,11 @@ def test_equal_rows_of_a_checkpoint_are_one_and_different_ones_are_told(checkpoi
 
 
 def test_a_checkpoint_that_is_no_file_is_refused(tmp_path):
-    for path in (tmp_path, "/dev/null", tmp_path / "rows\0.jsonl"):
-        with refused(sv.ServoError):
+    for path in (tmp_path, "/dev/null"):
+        with refused(sv.ServoError, path=str(path)):
+            sv.sweep(squares, CASES, checkpoint=path)
+    for path in (tmp_path / "rows\0.jsonl", 3, b"rows"):
+        with refused(sv.SpecificationError, path=path):
             sv.sweep(squares, CASES, checkpoint=path)
 
 
@@ -266,7 +269,7 @@ def test_texts_of_a_csv_are_no_formulas(tmp_path):
 def test_paths_that_no_file_can_have_are_refused(tmp_path, point_plan):
     for name in ("a\0b", "n" * 300, "\ud800"):
         for write in (STUDY.csv, STUDY.save, point_plan.save):
-            with refused(sv.ServoError):
+            with refused(sv.SpecificationError, path=tmp_path / name):
                 write(tmp_path / name)
 
 

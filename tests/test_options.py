@@ -33,7 +33,7 @@ def stopped(fact, make):
 @pytest.mark.parametrize("method", ADAPTIVE)
 @pytest.mark.parametrize("name", ["rtol", "atol"])
 def test_tolerances(method, name, scene):
-    for value in (0.0, -1e-6, np.nan, np.inf, 2.0, "1e-6", [1e-6], True):
+    for value in (0.0, 1e-300, -1e-6, np.nan, np.inf, 2.0, "1e-6", [1e-6], True):
         stopped(f"{name}=", lambda value=value: sv.simulate(*scene, SPAN, method=as_method(method, **{name: value})))
 
 
@@ -190,3 +190,14 @@ def test_counts_stay_within_what_the_loops_can_hold(count):
     with refused(sv.SpecificationError, "integration steps", samples=20, substeps=10**9):
         law = sv.feedforward(plan, sv.plant(POINT), rate=50.0)
         sv.close(sv.plant(POINT), law, plan.state(0.0), (0.0, 0.4), timing=sv.Timing(substeps=10**9))
+
+
+def test_values_of_a_call_hash_like_they_compare():
+    pairs = [
+        (sv.Poles({"X": [-5.0, -6.0]}), sv.Poles({"X": [-5.0, -6.0]}), sv.Poles({"X": [-5.0, -7.0]})),
+        (sv.Poles(0.1), sv.Poles(0.1), sv.Poles(0.2)),
+        (sv.Sensors({"x": 1e-3}, seed=1), sv.Sensors({"x": 1e-3}, seed=1), sv.Sensors({"x": 1e-3}, seed=2)),
+        (sv.Timing(100.0, 1), sv.Timing(100.0, 1), sv.Timing(100.0, 2)),
+    ]
+    for first, same, other in pairs:
+        assert first == same and hash(first) == hash(same) and len({first, same, other}) == 2

@@ -234,3 +234,17 @@ def test_bad_input_is_refused_with_the_facts(make, facts):
 def test_unknown_spline_end_shows_the_nearest():
     with refused(NameUnknown, name="naturl", match="natural"):
         paths.spline(T, [0, 1], [0, 1], ends="naturl")
+
+
+@pytest.mark.parametrize("smoothness", [101, 2**63, 10**400])
+def test_smoothness_has_a_largest_value(smoothness):
+    makers = (
+        lambda: paths.rest_to_rest(T, 0, 1, duration=1.0, smoothness=smoothness),
+        lambda: paths.trapezoid(T, 1.0, 1.0, 0.2, smoothness=smoothness),
+        lambda: paths.spline(T, [0.0, 1.0], [0.0, 1.0], smoothness=smoothness),
+    )
+    for make in makers:
+        with pytest.raises(SpecificationError) as caught:
+            make()
+        assert caught.value.details["smoothness"] == smoothness and "100" in str(caught.value)
+    assert ca.symvar(paths.rest_to_rest(T, 0, 1, duration=1.0, smoothness=100))

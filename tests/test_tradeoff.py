@@ -197,6 +197,12 @@ def test_the_fastest_within_an_error_and_the_best_within_a_time():
             made.recommend(**given)
 
 
+def test_a_recommended_time_constant_is_the_measured_one(scene):
+    constant = 1 / 7
+    study = sv.tradeoff(*scene, SPAN, "RK4", [constant], settings={"step": [0.01]}, seconds=20.0)
+    assert study.recommend(error=1.0)["drift"] == constant
+
+
 @pytest.mark.parametrize("drift", ["none", "project", "project 5", "0.05", "minimal"])
 def test_a_recommended_treatment_is_the_measured_one(drift):
     options = synthetic([1e-6], [1.0], drift=[drift]).recommend(error=1e-3)

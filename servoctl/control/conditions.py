@@ -5,9 +5,19 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from servoctl.checks import MOST_COUNT, ON_SAMPLE, mapping, numbers_by_name, positive, whole
+from servoctl.checks import (
+    MOST_COUNT,
+    ON_SAMPLE,
+    mapping,
+    named,
+    numbers_by_name,
+    positive,
+    require_memory,
+    texts,
+    whole,
+)
 from servoctl.control.disturbances import sampled
-from servoctl.errors import SpecificationError, unknown
+from servoctl.errors import SpecificationError
 
 RESOLVED = 0.05  # largest |λ| h: the error of one Runge-Kutta step of order 4 is then 3e-9
 MOST_SUBSTEPS = 1000
@@ -53,6 +63,9 @@ class Sensors:
                 seed=self.seed,
             )
 
+    def __hash__(self):
+        return hash((frozenset(self.noise.items()), frozenset(self.quantisation.items()), self.seed))
+
     def noisy(self, measures, count):
         """Normally distributed noise of the measurement at each sample.
 
@@ -68,12 +81,14 @@ class Sensors:
         (count, n_y) array or None
             None without noise.
         """
-        std = _by_measure(self.noise, measures)
+        std = _by_measure(self.noise, texts(measures, "The measured states"))
+        count = whole("count", count, most=MOST_COUNT)
+        require_memory(count, len(self.noise), f"Noise of {count} samples")
         return None if std is None else np.random.default_rng(self.seed or 0).standard_normal((count, len(std))) * std
 
     def quantum(self, measures):
         """The quantisation in the order of `measures`, (n_y,), 0 for a state without; None if no state has any."""
-        return _by_measure(self.quantisation, measures)
+        return _by_measure(self.quantisation, texts(measures, "The measured states"))
 
 
 @dataclass(frozen=True)
@@ -152,9 +167,7 @@ def _by_measure(values, measures):
 
 def index(name, names, what):
     """The index of a name; `what` the names stand for, in the singular."""
-    if name not in names:
-        raise unknown(name, names, what)
-    return names.index(name)
+    return names.index(named(name, names, what))
 
 
 def ranges(plant, period):

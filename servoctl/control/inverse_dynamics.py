@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import casadi as ca
 import numpy as np
 
-from servoctl.checks import positive, whole
+from servoctl.checks import as_complex, is_number, positive, whole
 from servoctl.control.feedback import law_step
 from servoctl.control.law import Law
 from servoctl.control.reference import Reference, refuse_transport, require_plan
@@ -353,12 +353,12 @@ def _require_stable(plan):
 
 def _poles(poles, orders):
     """Poles of each residual by name."""
-    if poles is None or np.ndim(poles) == 0 and not isinstance(poles, dict):
+    if poles is None or is_number(poles):
         constant = TIME_CONSTANT if poles is None else positive("time constant", poles)
         return {name: np.full(order, -1.0 / constant) for name, order in orders.items()}
     if not isinstance(poles, dict):
         raise SpecificationError(
-            f"poles is {poles!r}.",
+            f"poles is {repr(poles)[:150]}.",
             "It is one time constant [s], or poles by residual.",
             do="Pass {" + ", ".join(f"{name!r}: {order} poles" for name, order in orders.items()) + "}.",
             orders=orders,
@@ -368,10 +368,7 @@ def _poles(poles, orders):
             raise unknown(name, orders, "residual")
     by_residual = {}
     for name, order in orders.items():
-        try:
-            values = np.atleast_1d(poles.get(name, ())).astype(complex)
-        except (TypeError, ValueError):
-            values = np.full(order, np.nan)
+        values = as_complex(poles.get(name, ()))
         if values.shape != (order,) or not np.isfinite(values).all() or not _paired(values):
             raise SpecificationError(
                 f"The poles of {name!r} are {poles.get(name)!r}.",

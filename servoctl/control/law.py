@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from servoctl.checks import ON_SAMPLE, finite, positive
+from servoctl.checks import ON_SAMPLE, finite, positive, require_kind
 from servoctl.codegen.function import Compiled
 from servoctl.errors import SpecificationError, unknown
 from servoctl.run import Run
@@ -266,6 +266,7 @@ class Controller:
     """
 
     def __init__(self, law):
+        require_kind(Law, "law", law, "sv.lqr(plan, plant)")
         self.law, self.state, self.signals, self._step = law, np.array(law.state, dtype=float), {}, law.begin()
 
     def __call__(self, t: float, measurement: ArrayLike | Mapping[str, float]) -> np.ndarray:
@@ -343,8 +344,9 @@ def ordered(values, names, what, exactly=True):
                 raise unknown(name, values, what)
         numbers = [values[name] for name in names]
     try:
-        numbers = np.array([float(number) for number in np.ravel(numbers)])
-    except (TypeError, ValueError):
+        entries = np.asarray(numbers).ravel()
+        numbers = np.zeros(0) if entries.dtype.kind in "USbc" else np.array([float(number) for number in entries])
+    except Exception:  # CasADi raises types of its own for symbols
         numbers = np.zeros(0)
     if numbers.shape != (len(names),):
         raise SpecificationError(

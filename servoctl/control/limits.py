@@ -10,7 +10,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from servoctl.checks import ON_SAMPLE, interval, mapping, numbers_by_name, positive
+from servoctl.checks import ON_SAMPLE, as_list, interval, mapping, named, numbers_by_name, positive
 from servoctl.codegen.function import compiled
 from servoctl.control.close import require_names
 from servoctl.control.conditions import ranges
@@ -389,11 +389,12 @@ class Allocation(Value):
 def _weights(names, weights, priority):
     """The residuals' weights, (k,)."""
     weights = numbers_by_name(weights, names, "residual", "weight", positive=True)
-    if not priority:
+    order = [] if priority is None else as_list(priority)
+    if order == []:
         return np.array([weights.get(name, 1.0) for name in names])
-    if isinstance(priority, str) or not np.iterable(priority) or len({*priority}) < len(priority):
+    if order is None or not all(isinstance(name, str) for name in order) or len({*order}) < len(order):
         raise SpecificationError(
-            f"The priority is {priority!r}.",
+            f"The priority is {repr(priority)[:150]}.",
             "It is a sequence of residuals, each once, the most important first.",
             do=f"Pass some of {', '.join(names)}.",
             names=names,
@@ -404,12 +405,11 @@ def _weights(names, weights, priority):
             "A priority sets the weights of all residuals.",
             do="Leave out one of them.",
             weights=weights,
-            priority=tuple(priority),
+            priority=tuple(order),
         )
-    for name in priority:
-        if name not in names:
-            raise unknown(name, names, "residual")
-    order = [*priority, *(n for n in names if n not in priority)]
+    for name in order:
+        named(name, names, "residual")
+    order += [name for name in names if name not in order]
     return np.array([FALLING ** order.index(name) for name in names])
 
 

@@ -1,12 +1,13 @@
 """LQR about a plan: time-varying by the discrete Riccati equation along it, or frozen at each instant."""
 
+import contextlib
 from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from servoctl.checks import numbers_by_name
+from servoctl.checks import as_numbers, numbers_by_name
 from servoctl.control.feedback import StateFeedback, affine
 from servoctl.control.law import Law
 from servoctl.control.reference import Reference, refuse_transport
@@ -152,7 +153,8 @@ def steady(A, B, Q, R, basis):
     left = T.swapaxes(1, 2)
     A, B, eye = left @ A @ T, left @ B, np.eye(T.shape[2])
     a, G, P = A, B @ np.linalg.solve(R, B.swapaxes(1, 2)), np.broadcast_to(left @ Q @ T, A.shape)
-    with np.errstate(all="ignore"):
+    radii = np.full(1, np.inf)
+    with np.errstate(all="ignore"), contextlib.suppress(np.linalg.LinAlgError):  # of weights beyond the range of floats
         for _ in range(DOUBLINGS):
             before, half = P, np.linalg.inv(eye + G @ P)
             a, G, P = a @ half @ a, G + a @ half @ G @ a.swapaxes(1, 2), P + a.swapaxes(1, 2) @ P @ half @ a
@@ -160,7 +162,7 @@ def steady(A, B, Q, R, basis):
             if not change > CONVERGED:
                 break
         K = np.linalg.solve(R + B.swapaxes(1, 2) @ P @ B, B.swapaxes(1, 2) @ P @ A)
-    radii = spectral_radii(A - B @ K) if change <= CONVERGED else np.full(1, np.inf)
+        radii = spectral_radii(A - B @ K) if change <= CONVERGED else radii
     if not radii.max() < 1:
         raise ServoError(
             "The steady Riccati equation has no stabilising solution.",
@@ -294,10 +296,7 @@ def weights(values, default, names, what, symbol, positive=False):
         for name, weight in numbers_by_name(values, names, what, "weight").items():
             entries[names.index(name)] = weight
     elif values is not None:
-        try:
-            entries = np.asarray(values, dtype=float)
-        except (TypeError, ValueError):
-            entries = np.empty((0, 0))
+        entries = as_numbers(values)
         entries = np.full(n, float(entries)) if entries.ndim == 0 else entries
     matrix = np.diag(entries) if entries.shape == (n,) else entries
     if matrix.shape != (n, n):
@@ -314,7 +313,7 @@ def weights(values, default, names, what, symbol, positive=False):
     scale = np.abs(matrix).max(initial=0.0) if symmetric else 1.0
     if least < (1e-14 if positive else -1e-12) * max(scale, 1e-300):
         raise SpecificationError(
-            f"{symbol} is {np.array2string(np.asarray(values), threshold=9)}.",
+            f"{symbol} is {repr(values)[:150]}.",
             f"It is finite, symmetric and positive {'definite' if positive else 'semidefinite'}.",
             do="Pass positive weights.",
             name=symbol,

@@ -57,8 +57,11 @@ def _norms(matrices):
 
 
 def spectral_radii(matrices):
-    """Largest absolute eigenvalue of each matrix, (N,)."""
-    return np.abs(np.linalg.eigvals(matrices)).max(axis=-1, initial=0.0)
+    """Largest absolute eigenvalue of each matrix, (N,); infinite where an entry is not finite."""
+    radii = np.full(len(matrices), np.inf)
+    finite = np.isfinite(matrices).all(axis=(1, 2))
+    radii[finite] = np.abs(np.linalg.eigvals(matrices[finite])).max(axis=-1, initial=0.0)
+    return radii
 
 
 def sampled_radii(A, B, K, period, delays):

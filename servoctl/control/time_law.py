@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from servoctl.checks import as_span, interval, mapping
+from servoctl.checks import as_span, finite, interval, mapping, require_kind
 from servoctl.errors import InconsistentStart, IntegrationStopped, LimitExceeded, SingularProgram, SpecificationError
 from servoctl.model.model import derive
 from servoctl.progress import progress_bar
@@ -96,7 +96,7 @@ def fastest(
         program,
         {name: interval(name, value, "limit") for name, value in mapping(limits, "The limits").items()},
         as_span(t_span, forward=True),
-        mapping(start, "Values of the start"),
+        {name: finite(name, value, "start value") for name, value in mapping(start, "The start values").items()},
         guess,
         mapping(parameters, "The parameters"),
     )
@@ -141,14 +141,8 @@ class _Scene:
             raise SpecificationError(
                 "There are no limits.", "The fastest time law reaches a limit.", do='Pass some, as {"trolley": 100.0}.'
             )
-        for value, kind in ((self.mechanism, Mechanism), (self.program, Program)):
-            if not isinstance(value, kind):
-                raise SpecificationError(
-                    f"The {kind.__name__.lower()} is a {type(value).__name__}.",
-                    "A time law belongs to a Program of a Mechanism.",
-                    do="Write sv.fastest(mechanism, program, ...).",
-                    kind=type(value).__name__,
-                )
+        require_kind(Mechanism, "mechanism", self.mechanism, "sv.Mechanism(q, gibbs, ...)")
+        require_kind(Program, "program", self.program, "sv.Program({...})")
 
     def slowed(self, factor):
         """(largest excess, binding, program, plan) of a time law; the excess is infinite if there is no motion."""

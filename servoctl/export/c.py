@@ -98,7 +98,7 @@ def _require_name(name):
         raise SpecificationError(
             f"The name of the export is {name!r}.",
             "A name has letters, digits and underscores, begins with a letter, and is no keyword of C or C++.",
-            nearest=f"{identifier(str(name))!r}." if identifier(str(name)) != name else "",
+            nearest=f"{identifier(name)!r}." if isinstance(name, str) and identifier(name) != name else "",
             do="Choose another name.",
             name=name,
         )

@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from servoctl.checks import as_units, texts
 from servoctl.errors import SpecificationError
 from servoctl.figures import style
 
@@ -39,7 +40,8 @@ def sweep(study, names=None, against=None, units=None):
         raise SpecificationError(f"A {kind} was given.", do="Give a study from sv.sweep or sv.merge.", kind=kind)
     parameters = [name for name in study.meta["parameters"] if _varies(study, name)]
     results = [name for name in study.columns if name not in ("case", *study.meta["parameters"])]
-    names = [name for name in results if _varies(study, name)][:MOST_RESULTS] if names is None else list(names)
+    varying = [name for name in results if _varies(study, name)]
+    names = varying[:MOST_RESULTS] if names is None else texts(names, "The columns")
     if not names:
         raise SpecificationError(
             f"No result varies among the {len(study)} rows.",
@@ -49,7 +51,7 @@ def sweep(study, names=None, against=None, units=None):
         )
     if against is not None:
         study.column(against)
-    units = units or {}
+    units = as_units(units)
     figure, rows = style.figure(0.6 + 2.5 * len(names), rows=len(names), columns=2)
     for name, axes in zip(names, rows, strict=True):
         values = np.asarray(study[name], dtype=float)

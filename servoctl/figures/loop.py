@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from servoctl.checks import as_units
 from servoctl.errors import SpecificationError
 from servoctl.figures.style import BESIDE, COLOURS, label, look, panels
 
@@ -31,7 +32,7 @@ def closed(run, units=None):
         raise SpecificationError(f"A {kind} was given.", do="Give a closed loop from sv.close.", type=kind)
     if not len(run.t):
         raise SpecificationError("The loop ended before its first sample.", do="See run.message.", samples=0)
-    units = units or {}
+    units = as_units(units)
     errors = _errors(run, units)
     count = len(errors) + len(run.plant.inputs)
     axes = panels(count, 1.0 + 1.9 * count)

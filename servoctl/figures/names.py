@@ -2,11 +2,14 @@
 
 import re
 
+from servoctl.checks import require_kind
 from servoctl.figures import style
+from servoctl.run import Run
 
 
 def efforts(run):
     """Names of the run's actuators or of the components of its ideal reaction; for a loaded run with the outputs."""
+    require_kind(Run, "run", run, "sv.simulate(...) or sv.load(path)")
     reaction = [name for name in run.names if name.startswith("reaction_")]
     if reaction:
         return reaction

@@ -8,10 +8,13 @@ outside pyplot, which leaves the user's backend unchanged: `ax.figure.savefig(..
 import numpy as np
 
 from servoctl.archive import writing
+from servoctl.checks import as_units, require_kind, text, texts
 from servoctl.errors import SpecificationError
 from servoctl.figures.names import along_one_axis, coordinates, efforts, label_of, planes, unit_of
-from servoctl.figures.style import BESIDE, COLOURS, STYLES, look, panels
+from servoctl.figures.style import BESIDE, COLOURS, STYLES, as_axes, as_single_axes, look, panels
+from servoctl.run import Run
 
+SOURCE = "sv.simulate(...) or sv.load(path)"
 LEAST = 1e-18  # residual drawn for exact zeros on the logarithmic scale
 BINS = 100  # bins of time, each drawn by the greatest magnitude in it: rounding becomes a line
 LAST, UNBOUNDED = 0.01, 2.0  # a signal that doubles its range in the last hundredth of a stopped run leaves the frame
@@ -42,15 +45,16 @@ def path(run, x=None, y=None, ax=None, units=None):
     NameUnknown
         If there is no such signal.
     """
-    groups, names = planes(run), coordinates(run)
+    require_kind(Run, "run", run, SOURCE)
+    groups, names, units = planes(run), coordinates(run), as_units(units)
     if x is None and y is None and not groups and along_one_axis(names):
-        return signals(run, names, ax=panels(1, 4.2)[0] if ax is None else ax, units=units)
+        return signals(run, names, ax=as_single_axes(ax, 4.2), units=units)
     first, second, *_ = groups[0] if groups else dict.fromkeys([*names, *run.names])
+    across, up = (None if name is None else run[name] for name in (x, y))
     x = (first if y != first else second) if x is None else x
     y = (second if x != second else first) if y is None else y
-    units = units or {}
     across, up = run[x], run[y]
-    ax = panels(1, 6.0)[0] if ax is None else ax
+    ax = as_single_axes(ax, 6.0)
     ax.plot(across, up, color=COLOURS[0])
     ax.plot(across[0], up[0], "o", color=COLOURS[0], markerfacecolor="white", label=f"start, t = {run.t[0]:.4g} s")
     word = _ending(run)
@@ -88,8 +92,11 @@ def signals(run, *names, ax=None, units=None):
     SpecificationError
         If the number of Axes is not that of the panels.
     """
-    units = units or {}
-    names = [name for given in names or coordinates(run) for name in ([given] if isinstance(given, str) else given)]
+    require_kind(Run, "run", run, SOURCE)
+    units = as_units(units)
+    names = [name for given in names or coordinates(run) for name in texts(given, "The names of signals")]
+    if not names:
+        raise SpecificationError("No signal was named.", do="Leave names out for the coordinates.", names=names)
     groups = {}
     for name in names:
         groups.setdefault(unit_of(name, units) or (name,), []).append(name)
@@ -122,11 +129,12 @@ def actuation(run, ax=None, units=None, names=None):
     SpecificationError
         If there is no actuation, or the number of Axes is not that of the panels.
     """
-    names = efforts(run) if names is None else [names] if isinstance(names, str) else list(names)
+    require_kind(Run, "run", run, SOURCE)
+    names = efforts(run) if names is None else texts(names, "The names of signals")
     if not names:
         rule = "It needs a model, or stored signals."
         raise SpecificationError("The run has no actuation.", rule, do="Give names of signals.", names=run.names)
-    return _over_time(run, [[name] for name in names], ax, units or {}, extrema=True)
+    return _over_time(run, [[name] for name in names], ax, as_units(units), extrema=True)
 
 
 def residuals(run, ax=None):
@@ -144,7 +152,8 @@ def residuals(run, ax=None):
     -------
     Axes
     """
-    ax = panels(1, 5.0)[0] if ax is None else ax
+    require_kind(Run, "run", run, SOURCE)
+    ax = as_single_axes(ax, 5.0)
     bins = np.array_split(np.arange(len(run.t)), min(BINS, len(run.t)))
     t = np.array([run.t[rows].mean() for rows in bins])
     levels, top = 0, LEAST
@@ -186,6 +195,8 @@ def save_figures(run, folder, units=None, title=""):
     ServoError
         If the folder cannot be written.
     """
+    require_kind(Run, "run", run, SOURCE)
+    text("title", title)
     drawn = {"path": path(run, units=units), "coordinates": signals(run, units=units)}
     if efforts(run):
         drawn["actuation"] = actuation(run, units=units)
@@ -203,12 +214,11 @@ def save_figures(run, folder, units=None, title=""):
 
 def _over_time(run, groups, ax, units, extrema=False):
     """Draw groups of signals: one panel for each, or all in `ax` if that is a single Axes."""
-    from matplotlib.axes import Axes
-
-    single = isinstance(ax, Axes)
+    given = as_axes(ax)
+    single = len(given) == 1 and given[0] is ax
     if single:
         groups = [[name for group in groups for name in group]]
-    axes = np.ravel(panels(len(groups), max(4.2, 1.0 + 1.9 * len(groups))) if ax is None else ax)
+    axes = np.ravel(panels(len(groups), max(4.2, 1.0 + 1.9 * len(groups))) if ax is None else given)
     if len(axes) != len(groups):
         raise SpecificationError(
             f"{len(axes)} Axes were given.",

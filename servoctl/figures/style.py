@@ -1,5 +1,11 @@
 """Shared by all figures: colours, line styles, panels, legends, labels."""
 
+import numpy as np
+
+from servoctl.checks import as_list, require_kind
+
+SOURCE = "matplotlib.pyplot.subplots()"
+
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")  # Okabe and Ito
 MORE = ("#8C6D31", "#7F7F7F", "#5E3C99", "#882255", "#44AA99", "#B5BD00", "#FF7F9F")  # for more curves
 STYLES = ("-", "--", ":", "-.")
@@ -15,9 +21,24 @@ def figure(height, rows=1, columns=1, width=FIGURE_WIDTH, **options):
     return empty, empty.subplots(rows, columns, squeeze=False, **options)
 
 
-def panels(count, height):
+def panels(count, height, **options):
     """Axes one above the other in a new figure, with one time axis."""
-    return figure(height, rows=count, sharex=True)[1][:, 0]
+    return figure(height, rows=count, sharex=True, **options)[1][:, 0]
+
+
+def as_axes(ax):
+    """An (n,) array of Axes from one or a sequence of them; (0,) from None."""
+    from matplotlib.axes import Axes
+
+    several = [] if ax is None else as_list(ax.ravel() if isinstance(ax, np.ndarray) else ax)
+    return [require_kind(Axes, "ax", one, SOURCE) for one in ([ax] if several is None else several)]
+
+
+def as_single_axes(ax, height, **options):
+    """A given Axes, or one in a new figure."""
+    from matplotlib.axes import Axes
+
+    return panels(1, height, **options)[0] if ax is None else require_kind(Axes, "ax", ax, SOURCE)
 
 
 def look(i):

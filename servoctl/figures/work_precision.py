@@ -15,7 +15,7 @@ FRONT, UNRESOLVED, GREY = "#BBBBBB", "#EEEEEE", "#555555"
 
 def draw_tradeoff(study, ax, cost, title):
     """Draw errors over a cost, with a line for each method and treatment, and the Pareto front."""
-    ax = style.figure(5.0, width=8.0)[1][0, 0] if ax is None else ax
+    ax = style.as_single_axes(ax, 5.0, width=8.0)
     good = np.isfinite(study["error"]) & np.isfinite(study["seconds"])
     methods, drifts = (list(dict.fromkeys(study[name][good].tolist())) for name in ("method", "drift"))
     colours = {method: COLOURS[i % len(COLOURS)] for i, method in enumerate(methods)}

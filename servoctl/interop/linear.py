@@ -2,16 +2,17 @@
 
 import numpy as np
 
-from servoctl.checks import finite, positive
+from servoctl.checks import array_of, as_list, as_numbers, finite, named, positive
 from servoctl.codegen.jacobians import differentiable, jacobian
 from servoctl.control.law import Law, ordered
 from servoctl.control.reference import resampled
 from servoctl.control.result import Closed
 from servoctl.control.sampling import discretised
-from servoctl.errors import SpecificationError, unknown
-from servoctl.interop.names import connected, force_names, output_names, signal_names, stranger
+from servoctl.errors import SpecificationError
+from servoctl.interop.names import connected, force_names, output_names, signal_names, stranger, system_name
 from servoctl.model.model import Model
 from servoctl.plants.plant import Plant
+from servoctl.run import Run
 
 OPTIONS = {Plant: ("x", "u", "rate", "disturbed"), Law: ("x", "controller_state"), Closed: (), Model: ("x",)}
 
@@ -51,17 +52,18 @@ def linearise(thing, t, x=None, u=None, *, controller_state=None, rate=None, dis
     """
     _require_applicable(
         thing, x=x is not None, u=u is not None, controller_state=controller_state is not None, rate=rate is not None,
-        disturbed=bool(disturbed),
+        disturbed=as_list(disturbed) != [],
     )  # fmt: skip
     t = finite("t", t, "time")
     if isinstance(thing, Plant):
-        return _linear_plant(thing, t, thing.state(x), u, rate, disturbed, name or "plant")
+        return _linear_plant(thing, t, thing.state(x), u, rate, disturbed, system_name(name, "plant"))
     if isinstance(thing, Law):
-        return _linear_law(thing, t, x, controller_state, name or "law")
+        return _linear_law(thing, t, x, controller_state, system_name(name, "law"))
     if isinstance(thing, Closed):
-        return _linear_closed(thing, t, name or "loop")
+        return _linear_closed(thing, t, system_name(name, "loop"))
     if isinstance(thing, Model):
-        return _linear_model(thing, t, np.asarray(getattr(x, "values", x), dtype=float), name or "model")
+        state = ordered(x if isinstance(x, dict) else getattr(x, "values", x), thing.state_names, "state")
+        return _linear_model(thing, t, state, system_name(name, "model"))
     raise stranger(thing)
 
 
@@ -102,7 +104,9 @@ def along(thing, run, times=None, **options):
     SpecificationError
         For times outside the run, and as `linearise`.
     """
-    times = run.t if times is None else np.atleast_1d(np.asarray(times, dtype=float))
+    if not isinstance(run, (Run, Closed)):
+        raise stranger(run, "Systems are linearised along a Run or a Closed.")
+    times = run.t if times is None else array_of("times", np.atleast_1d(as_numbers(times)), None)
     if isinstance(run, Closed):
         picked = [int(np.argmin(np.abs(run.t - t))) for t in times]
         [run.state(t) for t in times]  # refuses what is no sample
@@ -182,8 +186,7 @@ def loop_gain(plant, law, at):
             plant_dt=plant.dt,
             law_dt=law.dt,
         )
-    if at not in law.output_labels:
-        raise unknown(at, law.output_labels, "actuator")
+    named(at, law.output_labels, "actuator")
     plant, law = plant.copy("plant", use_prefix_suffix=False), law.copy("law", use_prefix_suffix=False)
     wires = [[f"plant.{a}", f"law.{a}"] for a in law.output_labels if a != at]
     wires += [[f"law.{y}", f"plant.{y}"] for y in law.input_labels]
@@ -240,7 +243,7 @@ def _linear_law(law, t, x, controller_state, name):
         at = resampled(law.plan, np.clip([float(t)], law.plan.t[0], law.plan.t[-1]))
         x = {measure: at[measure][0] for measure in law.measures}
     y, m, n_z = ordered(x, law.measures, "measurement", exactly=False), len(law.inputs), len(law.state)
-    z = np.asarray(law.state if controller_state is None else controller_state, dtype=float)
+    z = as_numbers(law.state if controller_state is None else controller_state)
     if z.shape != (n_z,):
         raise SpecificationError(
             f"The controller state has the shape {z.shape}.",

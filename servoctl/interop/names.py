@@ -1,6 +1,7 @@
 """Names of signals in python-control, and the loop of a plant and a law by them."""
 
-from servoctl.errors import SpecificationError, unknown
+from servoctl.checks import named, text, texts
+from servoctl.errors import SpecificationError
 
 RULE = "A system of python-control is made of a Model, a Plant, a Law or the Closed of sv.close."
 
@@ -17,11 +18,19 @@ def signal_names(names, inputs):
 
 def force_names(plant, disturbed):
     """Names of disturbed generalised forces, from one name or several, and their indices."""
-    names = (disturbed,) if isinstance(disturbed, str) else tuple(disturbed)
+    names = texts(disturbed, "The disturbed forces")
     for name in names:
-        if name not in plant.disturbable:
-            raise unknown(name, plant.disturbable, "generalised force")
+        named(name, plant.disturbable, "generalised force")
     return names, [plant.disturbable.index(name) for name in names]
+
+
+def system_name(name, default):
+    """A name that python-control accepts for a system, or the default for None."""
+    if name is None:
+        return default
+    if not text("name", name).strip() or "." in name:
+        raise SpecificationError(f"name={name!r} was given.", "A system's name is a text without dots.", name=name)
+    return name
 
 
 def connected(system, law_system, plant, law, name):

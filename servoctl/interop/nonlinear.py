@@ -4,13 +4,13 @@ import math
 
 import numpy as np
 
-from servoctl.checks import positive
+from servoctl.checks import MOST_COUNT, as_list, positive, whole
 from servoctl.control.conditions import limits, steps
 from servoctl.control.law import Law
 from servoctl.control.loop import hold, limited, quantised, samples_ago
 from servoctl.control.result import Closed
 from servoctl.errors import ServoError, SpecificationError
-from servoctl.interop.names import connected, force_names, output_names, signal_names, stranger
+from servoctl.interop.names import connected, force_names, output_names, signal_names, stranger, system_name
 from servoctl.model.model import Model
 from servoctl.plants.plant import Plant
 
@@ -52,7 +52,8 @@ def nlsys(thing, *, rate=None, substeps=None, disturbed=(), name=None):
     NameUnknown
         For a disturbance of an unknown generalised force.
     """
-    if not isinstance(thing, Plant) and (rate is not None or substeps is not None or disturbed):
+    given = as_list(disturbed) != []
+    if not isinstance(thing, Plant) and (rate is not None or substeps is not None or given):
         raise SpecificationError(
             f"rate, substeps or disturbed was given for a {type(thing).__name__}.",
             "They apply to plants: laws and loops have a rate, models are continuous.",
@@ -60,13 +61,13 @@ def nlsys(thing, *, rate=None, substeps=None, disturbed=(), name=None):
             kind=type(thing).__name__,
         )
     if isinstance(thing, Plant):
-        return _plant(thing, name or "plant", disturbed, rate, substeps)
+        return _plant(thing, system_name(name, "plant"), disturbed, rate, substeps)
     if isinstance(thing, Model):
-        return _model(thing, name or "model")
+        return _model(thing, system_name(name, "model"))
     if isinstance(thing, Law):
-        return _law(thing, name or "law")
+        return _law(thing, system_name(name, "law"))
     if isinstance(thing, Closed):
-        return _closed(thing, name or "loop")
+        return _closed(thing, system_name(name, "loop"))
     raise stranger(thing)
 
 
@@ -132,6 +133,7 @@ def _plant(plant, name, disturbed, rate, substeps, delay=0):
 
     disturbed, forces = force_names(plant, disturbed)
     period = None if rate is None else 1.0 / positive("rate", rate)
+    substeps = None if substeps is None else whole("substeps", substeps, least=1, most=MOST_COUNT)
     if period is None:
         _require_continuous(plant, substeps)
     inputs = [*plant.inputs, *(f"disturbance {force}" for force in disturbed)]

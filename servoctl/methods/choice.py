@@ -4,7 +4,17 @@ from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
-from servoctl.checks import is_whole, positive_number, whole_of
+from servoctl.checks import (
+    MOST_JETS,
+    as_complex,
+    is_number,
+    is_whole,
+    mapping,
+    named,
+    positive_number,
+    tolerance,
+    whole_of,
+)
 from servoctl.errors import SpecificationError, unknown
 
 ORDERS = {"RK1": 1, "RK2": 2, "RK4": 4, "RK5": 5, "RK8": 8}
@@ -15,7 +25,6 @@ SCIPY = ("RK23", "RK45", "DOP853", "Radau", "BDF", "LSODA")
 EXPLICIT, MULTISTEP = ("RK23", "RK45", "DOP853"), ("BDF", "LSODA")
 SUNDIALS = ("CVODES", "IDAS")
 SMALLEST_RTOL = 100 * np.finfo(float).eps  # that scipy's methods except LSODA accept: they replace a smaller one
-HIGHEST = 40  # order of a series, and level of jets
 REAL = 1e-9  # imaginary part of a pole polynomial, relative to its largest coefficient, that is rounding
 
 PAST_STATES = "A multistep method carries past states, which projection would contradict."
@@ -47,6 +56,9 @@ class Poles:
         checked = _poles_by_row(self.values) if isinstance(self.values, dict) else _time_constant(self.values)
         object.__setattr__(self, "values", checked)
 
+    def __hash__(self):
+        return hash(self.values if isinstance(self.values, float) else frozenset(self.values.items()))
+
     def __str__(self):
         if isinstance(self.values, float):
             return f"poles at {-1 / self.values:g} 1/s"
@@ -77,18 +89,14 @@ class Poles:
 
 
 def _time_constant(value):
-    try:
-        constant = np.nan if isinstance(value, bool) else float(value)
-    except (TypeError, ValueError):
-        constant = np.nan
-    if not (np.isfinite(constant) and constant > 0):
+    if not (is_number(value) and value > 0):
         raise SpecificationError(
             f"The time constant of the error dynamics is {value!r}.",
             "It is a positive number of seconds.",
             do="Pass a number such as 0.1, or poles by row name.",
             value=value,
         )
-    return constant
+    return float(value)
 
 
 def _poles_by_row(values):
@@ -99,15 +107,12 @@ def _poles_by_row(values):
             do="Name a row of model.raised, or pass a time constant.",
             values=values,
         )
-    return {row: _conjugate_poles(row, poles) for row, poles in values.items()}
+    return {row: _conjugate_poles(row, poles) for row, poles in mapping(values, "The poles").items()}
 
 
 def _conjugate_poles(row, poles):
     """The poles of a row as a tuple, finite and in conjugate pairs."""
-    try:
-        array = np.atleast_1d(np.asarray(poles, dtype=complex))
-    except (TypeError, ValueError):
-        array = np.full(1, np.nan)
+    array = as_complex(poles)
     if array.ndim != 1 or not np.all(np.isfinite(array)):
         raise SpecificationError(
             f"The poles of {row!r} are {poles!r}.",
@@ -190,9 +195,10 @@ class Method:
         """Check the fields: whole numbers by the values that are valid, steps and tolerances by their ranges."""
         for name, numbers in valid.items():
             self._check_field(name, whole_of, numbers)
-        for name, most in (("step", np.inf), ("rtol", 1.0), ("atol", 1.0)):
+        checks = {"step": (positive_number, np.inf), "rtol": (tolerance, 1.0), "atol": (tolerance, 1.0)}
+        for name, (check, most) in checks.items():
             if hasattr(self, name):
-                self._check_field(name, positive_number, most)
+                self._check_field(name, check, most)
 
     def _check_field(self, name, check, rule):
         # None is valid where it is the default: the method then chooses
@@ -242,7 +248,7 @@ class Taylor(Method):
     }
 
     def __post_init__(self):
-        self._check(order=range(2, HIGHEST + 1), jets=range(1, HIGHEST + 1))
+        self._check(order=range(2, MOST_JETS + 1), jets=range(1, MOST_JETS + 1))
 
 
 @dataclass(frozen=True, repr=False)
@@ -344,8 +350,7 @@ class Adaptive(Method):
     named_by = ("name",)
 
     def __post_init__(self):
-        if self.name not in SCIPY:
-            raise unknown(self.name, SCIPY, "method of scipy")
+        named(self.name, SCIPY, "method of scipy")
         self._check()
         if self.rtol < SMALLEST_RTOL and self.name != "LSODA":
             raise SpecificationError(
@@ -384,8 +389,7 @@ class Sundials(Method):
     refused = {Project: PAST_STATES, MinimalCoordinates: MOVING_CHART}
 
     def __post_init__(self):
-        if self.name not in SUNDIALS:
-            raise unknown(self.name, SUNDIALS, "method of SUNDIALS")
+        named(self.name, SUNDIALS, "method of SUNDIALS")
         self._check()
 
     def __str__(self):

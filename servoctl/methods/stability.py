@@ -8,8 +8,8 @@ from math import comb, factorial, inf, pi
 
 import numpy as np
 
-from servoctl.checks import whole_of
-from servoctl.errors import SpecificationError, unknown
+from servoctl.checks import MOST_JETS, is_whole, named, whole_of
+from servoctl.errors import SpecificationError
 from servoctl.methods.accuracy import component_sizes
 from servoctl.methods.choice import ORDERS, Poles
 from servoctl.methods.motion import breakpoints, equal_steps
@@ -26,7 +26,6 @@ POWERS, NUDGE = 6, 1e-6  # power iterations for the fastest rate, and the relati
 UNRESOLVED = 0.1  # of the state's size: a larger difference of a step and two half steps means that it is too long
 
 
-@cache
 def stability_function(method, order=None):
     """The factor R(z), z = hλ, by which one step multiplies a solution of x' = λx.
 
@@ -50,16 +49,20 @@ def stability_function(method, order=None):
     SpecificationError
         If the order is missing, not available, or not used by the method.
     """
-    if method not in STEP_MAPS:
-        raise unknown(method, STEP_MAPS, "method")
-    whole = isinstance(order, (int, np.integer)) and order >= 1 and (method == "Taylor" or order % 2 == 1)
+    named(method, STEP_MAPS, "method")
+    whole = is_whole(order) and 1 <= order <= MOST_JETS and (method == "Taylor" or order % 2 == 1)
     if not (whole if method in WITH_ORDER else order is None):
         raise SpecificationError(
             f"order={order!r} was given with method={method!r}.",
-            "'Taylor' has any positive order, 'RadauIIA' an odd one; other methods take no order.",
+            f"'Taylor' has any order up to {MOST_JETS}, 'RadauIIA' an odd one; other methods take no order.",
             method=method,
             order=order,
         )
+    return _fraction(method, order)
+
+
+@cache
+def _fraction(method, order):
     if method in ("Radau", "RadauIIA"):
         stages = 3 if method == "Radau" else (order + 1) // 2
         return _pade(stages - 1, stages), _pade(stages, stages - 1) * (-1.0) ** np.arange(stages + 1)
@@ -140,7 +143,6 @@ def largest_explicit(method, order=None, direction=pi):
     return inf
 
 
-@cache
 def sampled_bound(rho, delay=0):
     """The fastest poles that sampled feedback may place on a chain of integrators, as p·h.
 
@@ -170,8 +172,11 @@ def sampled_bound(rho, delay=0):
     E_k (Åström, Hagander and Sternby 1984), so that with z = 1 + p h s the characteristic polynomial is
     sᵖ z^delay + Σ_k binom(ρ, k) s^(ρ-k) E_k(z)/k!, of exponent ρ: (s + 1)^ρ for small p h.
     """
-    whole_of("rho", rho, range(1, 13))
-    whole_of("delay", delay, range(13))
+    return _sampled_bound(whole_of("rho", rho, range(1, 13)), whole_of("delay", delay, range(13)))
+
+
+@cache
+def _sampled_bound(rho, delay):
     steps = FASTEST * 2.0 ** (-np.arange(96)[::-1] / 8)
     unstable = next(p for p in steps if not _sampled_stable(p, rho, delay))
     low, high = unstable / 2 ** (1 / 8), unstable

@@ -7,7 +7,7 @@ from functools import cached_property
 import casadi as ca
 import numpy as np
 
-from servoctl.checks import finite
+from servoctl.checks import MOST_JETS, as_numbers, finite, named, whole
 from servoctl.codegen.function import compiled
 from servoctl.errors import ServoError, SpecificationError, unknown
 from servoctl.model.equations import EQUATIONS, SIGNALS, Equations, gradient_jets, leading_names, residual_rows
@@ -296,8 +296,7 @@ class Model:
         -------
         Compiled
         """
-        if name not in EQUATIONS:
-            raise unknown(name, list(EQUATIONS), "function")
+        named(name, EQUATIONS, "function")
 
         def build():
             f, *options = EQUATIONS[name](self.equations)
@@ -314,8 +313,8 @@ class Model:
             A key of `SIGNALS`.
         rate : int
         """
-        if kind not in SIGNALS:
-            raise unknown(kind, list(SIGNALS), "group of signals")
+        named(kind, SIGNALS, "group of signals")
+        rate = whole("rate", rate, most=MOST_JETS)
 
         def build():
             names, f = self.equations.signals(kind, rate)
@@ -470,17 +469,14 @@ class Model:
 
 def _samples(model, motion, jets):
     """Times (N,) and jets (n_z, N) of a run, at most `SAMPLED` of them, of a start, or as given."""
-    names, count = model.jet_names, 0
+    names = model.jet_names
     if isinstance(motion, State):
         motion, names, jets = [motion.t], motion.names, motion.values[:, None]
     elif hasattr(motion, "jet_names"):
         some = np.unique(np.linspace(0, len(motion.t) - 1, SAMPLED).round().astype(int))
         motion, names, jets = motion.t[some], motion.jet_names, motion.jets[:, some]
-    try:
-        t, jets = np.atleast_1d(np.asarray(motion, dtype=float)), np.asarray(jets, dtype=float)
-        count = len(jets)
-    except (TypeError, ValueError):
-        t, jets = np.zeros(0), np.zeros((0, 0))
+    t, jets = np.atleast_1d(as_numbers(motion)), np.atleast_1d(as_numbers(jets))
+    count = len(jets)
     fits = t.ndim == 1 and len(t) and jets.shape == (count, len(t)) and names[:count] == model.names_to(count)
     if not (fits and count >= len(model.state_names) and np.isfinite(t).all() and np.isfinite(jets).all()):
         raise SpecificationError(

@@ -78,18 +78,21 @@ class PlantEquations:
         return rows, points
 
     def require_inertia(self, values):
-        """Raise SpecificationError if the mass matrix is not positive with these parameters (n_p,)."""
+        """Raise SpecificationError if the mass matrix is not positive with parameters (n_p,) or (n_p, N)."""
         rows, points = self._material
-        if not self._clearly_positive(values):
-            require_inertia(self.mechanism, rows, replace(points, values=values))
+        cases = _cases(values)
+        for case in cases.T[~self._clearly_positive(cases)]:
+            require_inertia(self.mechanism, rows, replace(points, values=case))
 
-    def _clearly_positive(self, values):
-        """Whether the mass matrix is far from singular at all points."""
-        M = self._masses(values).full().reshape(self.q.n, -1, self.q.n).swapaxes(0, 1)
+    def _clearly_positive(self, cases):
+        """Whether the mass matrix of each case (n_p, N) is far from singular at all points."""
+        M = self._masses(cases).full().reshape(self.q.n, -1, self.q.n).swapaxes(0, 1)
         size = np.sqrt(np.maximum(np.diagonal(M, axis1=1, axis2=2), 0.0))
-        if not np.isfinite(M).all() or not size.all():
-            return False
-        return np.linalg.eigvalsh(M / (size[:, :, None] * size[:, None, :])).min() > CLEAR
+        sound = np.isfinite(M).all(axis=(1, 2)) & size.all(axis=1)
+        least = np.full(len(M), -np.inf)
+        M, size = M[sound], size[sound]
+        least[sound] = np.linalg.eigvalsh(M / (size[:, :, None] * size[:, None, :])).min(axis=1)
+        return (least.reshape(cases.shape[1], -1) > CLEAR).all(axis=1)
 
     @cached_property
     def _masses(self):

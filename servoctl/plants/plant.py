@@ -5,7 +5,17 @@ from dataclasses import dataclass, field, fields
 import casadi as ca
 import numpy as np
 
-from servoctl.checks import column, finite, interval, mapping, numbers_by_name
+from servoctl.checks import (
+    array_of,
+    as_numbers,
+    column,
+    finite,
+    interval,
+    mapping,
+    named,
+    numbers_by_name,
+    require_kind,
+)
 from servoctl.codegen.function import compiled
 from servoctl.errors import SpecificationError, unknown
 from servoctl.plants.equations import PlantEquations, equations_at, plant_equations
@@ -52,13 +62,7 @@ def plant(
     SpecificationError
         For a value outside its range, or a mass matrix that is not positive definite.
     """
-    if not isinstance(mechanism, Mechanism):
-        raise SpecificationError(
-            f"The first argument is a {type(mechanism).__name__}.",
-            "A plant is made of a Mechanism and numbers.",
-            do="Write sv.plant(mechanism, m_load=115.0).",
-            type=type(mechanism).__name__,
-        )
+    require_kind(Mechanism, "mechanism", mechanism, "sv.Mechanism(q, gibbs, ...)")
     actuators = mechanism.actuators
     names = mechanism.q.names if mechanism.q.plain else mechanism.q.velocity_names
     values = mechanism.parameters.values(parameters)
@@ -151,12 +155,12 @@ class Plant(Value):
         -------
         (n_p,) or (n_p, N) array
         """
-        u = np.zeros(len(self.inputs)) if u is None else np.asarray(u, dtype=float)
-        d = np.zeros(len(self.disturbable)) if d is None else np.asarray(d, dtype=float)
+        u = np.zeros(len(self.inputs)) if u is None else _sized("u", u, len(self.inputs))
+        d = np.zeros(len(self.disturbable)) if d is None else _sized("d", d, len(self.disturbable))
         if u.ndim == 1:
-            return np.concatenate([self.parameters, u, d])
+            return np.concatenate([self.parameters, u, array_of("d", d, len(self.disturbable))])
         fixed = np.repeat(self.parameters[:, None], u.shape[1], axis=1)
-        d = d if d.ndim == 2 else np.repeat(d[:, None], u.shape[1], axis=1)
+        d = np.repeat(d[:, None], u.shape[1], axis=1) if d.ndim == 1 else _sized("d", d, len(d), u.shape[1])
         return np.concatenate([fixed, u, d])
 
     def function(self, name):
@@ -172,8 +176,7 @@ class Plant(Value):
         -------
         Compiled
         """
-        if name not in FUNCTIONS:
-            raise unknown(name, list(FUNCTIONS), "function")
+        named(name, FUNCTIONS, "function")
         functions = self.equations.functions
         if name not in functions:
             f, *options = FUNCTIONS[name](self.equations)
@@ -199,7 +202,8 @@ class Plant(Value):
         -------
         (n_x,) array
         """
-        return self.function("ode")(t, x, self.p(u, d))
+        x = array_of("x", x, self.n_x)
+        return self.function("ode")(finite("t", t, "time"), x, self.p(array_of("u", u, len(self.inputs)), d))
 
     def linearised(self, t, x, u):
         """A = ∂x'/∂x and B = ∂x'/∂u at points.
@@ -216,7 +220,8 @@ class Plant(Value):
         A : (N, n_x, n_x) array
         B : (N, n_x, m) array
         """
-        t, x, u = np.atleast_1d(t), np.asarray(x, dtype=float), np.asarray(u, dtype=float)
+        t = array_of("t", np.atleast_1d(as_numbers(t)), None)
+        x, u = array_of("x", x, self.n_x, len(t)), array_of("u", u, len(self.inputs), len(t))
         y = self.function("jacobian").grid(t, x, self.p(u))
         both = y.reshape(-1, self.n_x, len(t)).transpose(2, 1, 0)
         return both[:, :, : self.n_x], both[:, :, self.n_x :]
@@ -254,15 +259,7 @@ class Plant(Value):
                     missing=missing,
                 )
             return np.array([finite(k, values[k], "state") if k in values else np.nan for k in names])
-        try:
-            state = np.asarray(values, dtype=float).ravel()
-        except (TypeError, ValueError) as error:
-            raise SpecificationError(
-                f"The state is a {type(values).__name__}.",
-                "A state is an array or a dict of numbers.",
-                do="Pass plan.state(0.0), an array or a dict.",
-                type=type(values).__name__,
-            ) from error
+        state = as_numbers(values).ravel()
         if state.size not in (n, self.n_x) or not np.isfinite(state).all():
             raise SpecificationError(
                 f"The state is {np.array2string(state, threshold=8)}.",
@@ -289,6 +286,14 @@ class Plant(Value):
             "  damping: ": _text(self.damping),
         }
         return "\n".join(f"{what}{text}"[:118] for what, text in entries.items() if text)
+
+
+def _sized(name, value, size, count=None):
+    """Values (size,) or (size, N), NaN where a motion ended; N is `count`, if that is given."""
+    array = as_numbers(value)
+    if array.ndim == 2 and len(array) == size and count in (None, array.shape[1]):
+        return array
+    return array_of(name, value, size) if count is None else array_of(name, value, size, count)
 
 
 def _text(values):

@@ -255,7 +255,7 @@ def _require_parts(mechanism, program, guess):
                 expected=kind.__name__,
                 type=type(value).__name__,
             )
-    q = mechanism.q
+    q, guess = mechanism.q, mapping(guess, "The guesses")
     for name, expression in program.residuals.items():
         require_known(expression, mechanism, f"the residual {name!r}")
     for name, weight in program.weights.items():
@@ -269,7 +269,7 @@ def _require_parts(mechanism, program, guess):
             name=twice[0],
         )
     known = [*q.names, *(name for k in range(1, 8) for name in q.jet_names(k))]
-    for name, value in mapping(guess, "The guesses").items():
+    for name, value in guess.items():
         if name not in known:
             raise unknown(name, known, "coordinate or derivative")
         finite(name, value)

@@ -10,6 +10,7 @@ import textwrap
 from pathlib import Path
 
 import servoctl as sv
+from servoctl.checks import as_path
 from servoctl.errors import ServoError
 from servoctl.study.table import machine
 
@@ -129,7 +130,7 @@ def _nowhere(path, error):
 
 def folder_of(args, name, ending=""):
     """The folder of --out, by default servoctl-runs/NAME with the ending."""
-    return Folder(Path(args.out) if args.out else Path("servoctl-runs", name + ending), name)
+    return Folder(Path("servoctl-runs", name + ending) if args.out is None else as_path(args.out, "--out"), name)
 
 
 def summary(run, start, verification):

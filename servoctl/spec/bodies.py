@@ -2,7 +2,7 @@
 
 import casadi as ca
 
-from servoctl.checks import column, matrix
+from servoctl.checks import column, matrix, require_kind
 from servoctl.errors import SpecificationError
 from servoctl.spec.coordinates import Coordinates
 
@@ -68,7 +68,8 @@ def rigid_body(q: Coordinates, mass, inertia, position=None, rotation=None, rate
             do="Pass rotation=R(q) or rates=ω(q, q').",
             both=rates is not None,
         )
-    _require_coordinates(q)
+    require_kind(Coordinates, "q", q, 'sv.coordinates("x y")')
+    column(mass, "the mass", 1)
     omega = body_rates(q, rotation) if rates is None else ca.vertcat(*column(rates, "rates", 3))
     alpha, J = q.dt(omega), _inertia(inertia)
     spin = ca.dot(alpha, J @ alpha) / 2 + ca.dot(alpha, ca.cross(omega, J @ omega))
@@ -87,7 +88,7 @@ def body_rates(q: Coordinates, rotation):
     -------
     (3,) SX
     """
-    _require_coordinates(q)
+    require_kind(Coordinates, "q", q, 'sv.coordinates("x y")')
     rotation = matrix(rotation, "the rotation")
     if rotation.shape != (3, 3):
         raise SpecificationError(
@@ -98,7 +99,7 @@ def body_rates(q: Coordinates, rotation):
 
 
 def _acceleration(q, position, what):
-    _require_coordinates(q)
+    require_kind(Coordinates, "q", q, 'sv.coordinates("x y")')
     entries = column(position, what)
     if not 1 <= len(entries) <= 3:
         raise SpecificationError(
@@ -113,16 +114,6 @@ def _acceleration(q, position, what):
             order=q.order(position),
         )
     return q.dt(position, 2)
-
-
-def _require_coordinates(q):
-    if not isinstance(q, Coordinates):
-        raise SpecificationError(
-            f"Expected Coordinates, got a {type(q).__name__}.",
-            "The first argument of a body is its coordinates.",
-            do='Make them by sv.coordinates("x y").',
-            type=type(q).__name__,
-        )
 
 
 def _inertia(inertia):

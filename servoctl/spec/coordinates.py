@@ -3,16 +3,17 @@
 import threading
 from collections.abc import Iterable
 from math import factorial
-from numbers import Integral
 
 import casadi as ca
 
-from servoctl.checks import column, mapping, matrix
+from servoctl.checks import as_list, column, is_whole, mapping, matrix, require_kind
 from servoctl.errors import SpecificationError
 from servoctl.jets.series import Motion, Series, is_zero
 from servoctl.jets.tape import Tape, divide, multiply
 
 _lock = threading.Lock()
+
+MOST_ORDER = 100  # of a derivative: k! of higher ones leaves the range of doubles soon
 
 
 class Coordinates:
@@ -112,6 +113,7 @@ class Coordinates:
 
     def gamma(self, k):
         """Symbols of γ^(k), k >= 1: a tuple of n SX scalars. γ' are the quasi-velocities."""
+        k = _order(k, least=1)
         if k not in self._w:
             with _lock:  # threads that derive from one mechanism share its symbols
                 if k not in self._w:
@@ -122,11 +124,11 @@ class Coordinates:
 
     def jet(self, k):
         """γ^(k), k >= 1, or q for k = 0, as a column: (n,) or (nq,) SX."""
-        return ca.vertcat(*(self.gamma(k) if k else self._q))
+        return ca.vertcat(*(self.gamma(k) if _order(k) else self._q))
 
     def jet_names(self, k: int) -> tuple[str, ...]:
         """Names of γ^(k), k >= 1, or of q for k = 0."""
-        if k == 0:
+        if _order(k) == 0:
             return self.names
         base = self.names if self.plain else self.velocity_names
         return tuple(jet_name(name, k, self.plain) for name in base)
@@ -162,7 +164,7 @@ class Coordinates:
 
     def where(self, symbol):
         """What a symbol is: ("t", 0, 0), ("q", 0, i), ("w", k, i) for γ_i^(k), or None."""
-        return self._index.get(symbol.element_hash())
+        return self._index.get(require_kind(ca.SX, "symbol", symbol, "q.d(1)").element_hash())
 
     def order(self, expression):
         """The highest k for which γ^(k) is in an expression; 0 for q alone, -1 for neither."""
@@ -183,8 +185,8 @@ class Coordinates:
         -------
         list of k + 1 lists of SX scalars
         """
-        expressions = list(map(ca.SX, expressions))
-        if k == 0:
+        expressions = column(as_list(expressions), "the expressions")
+        if _order(k) == 0:
             return [expressions]
         outputs = self._series(expressions, k).outputs[: len(expressions)]
         return [[ca.SX(multiply(c[j], float(factorial(j)))) for c in outputs] for j in range(k + 1)]
@@ -276,11 +278,11 @@ def _moved(names, velocity_names, frame, invariants):
     return q.with_quasi_velocities(" ".join(velocity_names), V, h, dict(zip(invariants, values, strict=True)))
 
 
-def _order(k):
-    if isinstance(k, bool) or not isinstance(k, Integral) or k < 0:
+def _order(k, least=0):
+    if not is_whole(k) or not least <= k <= MOST_ORDER:
         raise SpecificationError(
-            f"The order of a derivative is {k!r}.",
-            "An order is a whole number, at least 0.",
+            f"The order of a derivative is {k!r}."[:150],
+            f"An order is a whole number from {least} to {MOST_ORDER}.",
             do="Write q.d(1), q.w(1) or q.dt(expression, 2).",
             order=k,
         )

@@ -7,7 +7,7 @@ from functools import cached_property, lru_cache
 import casadi as ca
 import numpy as np
 
-from servoctl.checks import column, mapping
+from servoctl.checks import column, mapping, require_kind
 from servoctl.errors import SpecificationError, unknown
 from servoctl.jets.identity import spread, vanish
 from servoctl.jets.tape import Tape, evaluate
@@ -76,22 +76,9 @@ class Mechanism:
         constraints=None,
         outputs=None,
     ):
-        if not isinstance(q, Coordinates):
-            raise SpecificationError(
-                f"Expected Coordinates, got a {type(q).__name__}.",
-                "The first argument of a mechanism is its coordinates.",
-                do='Write Mechanism(sv.coordinates("x y"), ...).',
-                type=type(q).__name__,
-            )
-        self.q = q
-        self.parameters = Parameters({}) if parameters is None else parameters
-        if not isinstance(self.parameters, Parameters):
-            raise SpecificationError(
-                f"Expected Parameters, got a {type(parameters).__name__}.",
-                "Parameters are symbols with default values.",
-                do="Write parameters=sv.parameters(m=1.0, ...).",
-                type=type(parameters).__name__,
-            )
+        self.q = require_kind(Coordinates, "q", q, 'sv.coordinates("x y")')
+        parameters = Parameters({}) if parameters is None else parameters
+        self.parameters = require_kind(Parameters, "parameters", parameters, "sv.parameters(m=1.0, ...)")
         self._gibbs = None if gibbs is None else self._known(gibbs, "the Gibbs function")
         self._kinetic = None if kinetic is None else self._known(kinetic, "the kinetic energy")
         self._inverse_dynamics = None if balance is None else self._known(balance, "the balance", q.n)

@@ -16,9 +16,10 @@ import math
 import casadi as ca
 import numpy as np
 
-from servoctl.checks import column, is_number, is_whole
-from servoctl.errors import SpecificationError, unknown
+from servoctl.checks import as_numbers, column, is_number, is_whole, named
+from servoctl.errors import SpecificationError
 
+SMOOTHEST = 100  # class of a path, beyond which the terms of its polynomials leave the range of a double
 MISSED = 1e-9  # largest distance of a spline from its points, relative to the largest point
 ORTHONORMAL = 1e-9  # largest difference of products of a circle's axes from those of orthonormal vectors
 
@@ -219,8 +220,7 @@ def spline(t, times, points, smoothness=2, ends="rest"):
     NameUnknown
         If `ends` is neither "rest" nor "natural".
     """
-    if ends not in ("rest", "natural"):
-        raise unknown(ends, ("rest", "natural"), "spline end")
+    named(ends, ("rest", "natural"), "spline end")
     t, k = _scalar(t, "t"), _smoothness(smoothness)
     times, points = _via_points(times, points)
     m = k if ends == "rest" else (k + 1) // 2
@@ -293,12 +293,8 @@ def _spline_pieces(times, points, degree, vanishing):
 
 def _via_points(times, points):
     """The times (n,) and points (n, dim) of a spline as arrays of numbers."""
-    try:
-        times, points = np.asarray(times, dtype=float), np.asarray(points, dtype=float)
-        finite = np.isfinite(times).all() and np.isfinite(points).all()
-    except (TypeError, ValueError, RuntimeError):
-        finite = False
-    if not finite:
+    times, points = as_numbers(times), as_numbers(points)
+    if not (np.isfinite(times).all() and np.isfinite(points).all()):
         raise SpecificationError(
             "The spline's times or points are not all finite numbers.",
             "Times and points are arrays of numbers of shapes (n,) and (n,) or (n, dim).",
@@ -367,11 +363,11 @@ def _positive(value, what):
 
 def _smoothness(k, least=0):
     """The k of a class C^k as an int."""
-    if not is_whole(k) or k < least:
+    if not is_whole(k) or not least <= k <= SMOOTHEST:
         raise SpecificationError(
-            f"smoothness={k!r}.",
-            f"The smoothness k of a path of class C^k is a whole number, at least {least}.",
-            f"smoothness={max(least, math.ceil(k))}." if is_number(k) else "",
+            f"smoothness={k!r}."[:200],
+            f"The smoothness k of a path of class C^k is a whole number, at least {least} and at most {SMOOTHEST}.",
+            f"smoothness={min(max(least, math.ceil(k)), SMOOTHEST)}." if is_number(k) else "",
             "The error for a path of too low a class names the class that a program needs.",
             smoothness=k,
         )

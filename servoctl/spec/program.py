@@ -5,8 +5,9 @@ import difflib
 import casadi as ca
 import numpy as np
 
-from servoctl.checks import column, mapping
+from servoctl.checks import column, mapping, require_kind
 from servoctl.errors import SpecificationError
+from servoctl.spec.coordinates import Coordinates
 
 REALISATIONS = ("ideal", "actuators")
 
@@ -88,6 +89,7 @@ class Program:
         SpecificationError
             If the factor is not positive, or the kinematics q' = V w + h depend on time or drift by h.
         """
+        require_kind(Coordinates, "q", q, "sv.coordinates(...)")
         sigma, instant = _as_float(factor), _as_float(at)
         if not sigma > 0:
             raise SpecificationError(
@@ -164,7 +166,7 @@ def _weight(name, value):
 def _as_float(value):
     """A finite number, or NaN for anything else."""
     try:
-        number = np.nan if isinstance(value, (str, bytes)) else float(value)
+        number = np.nan if isinstance(value, (str, bytes, bool, np.bool)) else float(value)
     except Exception:  # CasADi raises its own types for symbols
         number = np.nan
     return number if np.isfinite(number) else np.nan

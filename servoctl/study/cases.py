@@ -2,9 +2,9 @@
 
 import itertools
 import math
-from collections.abc import Iterable, Mapping, Sized
+from collections.abc import Mapping
 
-from servoctl.checks import MOST_CASES, plain, whole
+from servoctl.checks import MOST_CASES, as_list, plain, whole
 from servoctl.errors import SpecificationError
 
 DRAWS, CASES = 0, 1  # first spawn key: draws of the parameters, and draws inside a case
@@ -29,9 +29,9 @@ def grid(**values) -> list[dict]:
     SpecificationError
         For an empty sequence, and for more than `MOST_CASES` combinations.
     """
-    sized = [len(value) for value in values.values() if isinstance(value, Sized) and not isinstance(value, str)]
-    _require_few(math.prod(sized))
+    _require_few(math.prod(len(value) for value in values.values() if isinstance(value, range)))
     columns = {name: _column(name, value) for name, value in values.items()}
+    _require_few(math.prod(map(len, columns.values())))
     return [dict(zip(columns, row, strict=True)) for row in itertools.product(*columns.values())]
 
 
@@ -70,7 +70,7 @@ def monte_carlo(n: int, /, *, seed: int, **distributions) -> list[dict]:
 def _require_few(n):
     if n > MOST_CASES:
         raise SpecificationError(
-            f"{n:.4g} cases were requested.",
+            f"{min(n, 1e300):.4g} cases were requested.",
             f"At most {MOST_CASES:,} cases form one table: each is held in memory.",
             do="Take fewer values, or several sweeps.",
             cases=n,
@@ -101,14 +101,15 @@ def as_cases(cases):
                 lengths=lengths,
             )
         cases = [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]
-    if not isinstance(cases, Iterable):
+    rows = as_list(cases)
+    if rows is None:
         raise SpecificationError(
             f"The cases are {cases!r}.",
             "Cases are a sequence of dicts of parameters, or a dict of columns.",
             do='Give them as grid(m=[1.0, 2.0]) or {"m": [1.0, 2.0]}.',
             type=type(cases).__name__,
         )
-    cases = [_case(i, case) for i, case in enumerate(cases)]
+    cases = [_case(i, case) for i, case in enumerate(rows)]
     if not cases:
         raise SpecificationError("There is no case.", do="Give at least one, as by grid(m=[1.0, 2.0]).", cases=0)
     for i, case in enumerate(cases):
@@ -137,22 +138,27 @@ def _case(i, case):
                 name=name,
                 case=i,
             )
-        values[name] = plain(value)
-        if values[name] is None or (isinstance(values[name], float) and not math.isfinite(values[name])):
-            raise SpecificationError(
-                f"Parameter {name} of case {i} is {value!r}.",
-                "A parameter must be a finite number, a text, or True or False.",
-                do="Give an index or a name, and look the object up inside the case.",
-                name=name,
-                case=i,
-            )
+        values[name] = _entry(name, value, f" of case {i}", case=i)
     return values
 
 
+def _entry(name, value, where="", **details):
+    """The value of a parameter as Python's int, float, str or bool."""
+    entry = plain(value)
+    if entry is None or (isinstance(entry, float) and not math.isfinite(entry)):
+        raise SpecificationError(
+            f"Parameter {name}{where} is {repr(value)[:150]}.",
+            "A parameter must be a finite number, a text, or True or False.",
+            do="Give an index or a name, and look the object up inside the case.",
+            name=name,
+            **details,
+        )
+    return entry
+
+
 def _column(name, values):
-    if isinstance(values, str) or not hasattr(values, "__iter__"):
-        return [values]
-    column = list(values)
+    column = as_list(values)
+    column = [_entry(name, value) for value in ([values] if column is None else column)]
     if not column:
         raise SpecificationError(f"{name} has no values.", "Each parameter needs at least one.", name=name)
     return column
@@ -161,7 +167,8 @@ def _column(name, values):
 def _draw(name, distribution):
     """The function of a numpy Generator that draws one value."""
     if plain(distribution) is not None:
-        return lambda rng: distribution
+        value = _entry(name, distribution)
+        return lambda rng: value
     if hasattr(distribution, "rvs"):
         return lambda rng: plain(distribution.rvs(random_state=rng))
     if hasattr(distribution, "sample"):

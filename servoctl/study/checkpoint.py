@@ -3,8 +3,8 @@
 import hashlib
 import json
 import os
-from pathlib import Path
 
+from servoctl.checks import as_path
 from servoctl.errors import ServoError, SpecificationError
 from servoctl.study.cases import FAILURE
 
@@ -27,7 +27,7 @@ class Checkpoint:
     def __init__(self, path, key, count):
         self.rows, self._file = [], None
         if path is not None:
-            self._open(Path(path), key, count)
+            self._open(as_path(path, "The path of the checkpoint"), key, count)
 
     def __enter__(self):
         return self

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike
 
-from servoctl.checks import MOST_COUNT, mapping, whole
+from servoctl.checks import MOST_COUNT, as_numbers, mapping, whole
 from servoctl.codegen.function import Compiled
 from servoctl.control.batch import Gathered, run_batch, unit
 from servoctl.control.close import close, require_consistent
@@ -143,7 +143,9 @@ def _require(run):
 def _at_all(run, constants):
     """The loop of a plant whose equations hold for the constants (n_c, N) of all cases."""
     equations = run.plant.equations
-    again = equations_at(equations, constants[: len(equations.values)])
+    parameters = constants[: len(equations.values)]
+    equations.require_inertia(np.unique(parameters, axis=1))
+    again = equations_at(equations, parameters)
     return run if again is equations else replace(run, plant=replace(run.plant, equations=again))
 
 
@@ -188,10 +190,7 @@ def _columns(cases):
     if not isinstance(cases, dict):
         rows = as_cases(cases)
         cases = {name: [row[name] for row in rows] for name in rows[0]}
-    try:
-        columns = {name: np.array(values, dtype=float) for name, values in cases.items()}
-    except (TypeError, ValueError):
-        columns = {}
+    columns = {name: as_numbers(values) for name, values in mapping(cases, "The cases").items()}
     sizes = {values.shape for values in columns.values()}
     one = len(sizes) == 1 and all(len(shape) == 1 and shape[0] for shape in sizes)
     if not one or not all(np.isfinite(v).all() for v in columns.values()):
@@ -240,7 +239,8 @@ def _most_steps(plant, law, loop, constants, starts):
 
 
 def _traced(record, names, every):
-    if isinstance(record, str) or every != 1 and not len(record):
+    every = whole("every", every, least=1, most=MOST_COUNT)
+    if not isinstance(record, (list, tuple)) or every != 1 and not len(record):
         raise SpecificationError(
             f"record={record!r} and every={every!r} were given.",
             "record is a sequence of names; every thins out their traces.",
@@ -248,7 +248,7 @@ def _traced(record, names, every):
             record=record,
             every=every,
         )
-    return [index(name, names, "signal") for name in record], whole("every", every, least=1, most=MOST_COUNT)
+    return [index(name, names, "signal") for name in record], every
 
 
 def _one_by_one(run, derived, loop, numbers, seeds, traced, every):

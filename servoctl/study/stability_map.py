@@ -11,12 +11,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from servoctl.checks import positives
+from servoctl.checks import named, positives, require_kind
 from servoctl.errors import SpecificationError
 from servoctl.internal_dynamics import linearised
 from servoctl.methods.choice import Poles, as_drift
 from servoctl.methods.runge_kutta import ORDERS
-from servoctl.methods.stability import amplification
+from servoctl.methods.stability import STEP_MAPS, amplification, stability_function
 from servoctl.model.model import Model
 from servoctl.run import Run
 
@@ -81,6 +81,7 @@ class StabilityMap:
         (N,) or (K, N) array
             max |R(hλ)| / max(1, |e^hλ|)
         """
+        named(method, STEP_MAPS, "method")
         step = positives("step", step, do="Give it in seconds, such as 1e-3.")
         z = np.multiply.outer(step, self.eigenvalues(drift))
         if order is None:
@@ -155,6 +156,7 @@ class StabilityMap:
         """
         from servoctl.figures.stability import draw_stability
 
+        named(method, STEP_MAPS, "method")
         if poles is not None:
             do = "Give them in 1/s, such as numpy.geomspace(1, 100, 41)."
             poles = np.sort(np.ravel(positives("poles", poles, do, fewest=2)))
@@ -209,6 +211,8 @@ def stability(model: Model, run: Run, order: int = 12) -> StabilityMap:
     Coefficients are frozen at each instant: eigenvalues are uncertain by the rate at which the manifold turns along the
     motion. Far from the imaginary axis, where steps become unstable, this matters little.
     """
+    require_kind(Model, "model", model, "sv.derive(mechanism, program)")
+    stability_function("Taylor", order)
     names = tuple(getattr(run, "jet_names", ()))[: len(model.state_names)]
     if names != tuple(model.state_names) or len(run.t) < 2:
         raise SpecificationError(

@@ -15,7 +15,7 @@ from os import PathLike
 
 import numpy as np
 
-from servoctl.checks import plain, whole
+from servoctl.checks import as_list, plain, whole
 from servoctl.control.result import Closed
 from servoctl.errors import ServoError, SpecificationError
 from servoctl.progress import progress_bar
@@ -128,7 +128,7 @@ def merge(studies: Study | Iterable[Study]) -> Study:
     SpecificationError
         If there are none, if they belong to different sweeps, or if finished rows of one case differ.
     """
-    studies = [studies] if isinstance(studies, Study) else list(studies) if isinstance(studies, Iterable) else []
+    studies = [studies] if isinstance(studies, Study) else as_list(studies) or []
     keys = {getattr(study, "meta", {}).get("identity") for study in studies}  # None for what is not a sweep
     if len(keys) != 1 or None in keys:
         raise SpecificationError(

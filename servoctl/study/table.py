@@ -4,14 +4,16 @@ import csv
 import functools
 import os
 import platform
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from importlib import metadata
 
 import numpy as np
 
 from servoctl import archive
+from servoctl.checks import as_numbers, is_number, mapping, named, require_kind, text
 from servoctl.codegen.compiler import compiler
-from servoctl.errors import SpecificationError, unknown
+from servoctl.errors import SpecificationError
 from servoctl.version import __version__
 
 _FORMULA = ("=", "+", "-", "@", "\t", "\n")  # how texts begin that spreadsheets evaluate
@@ -39,7 +41,10 @@ class Study:
     meta: dict = field(default_factory=dict)
 
     def __post_init__(self):
-        columns = {str(name): _array(values) for name, values in self.columns.items()}
+        text("kind", self.kind)
+        require_kind(Mapping, "columns", self.columns, "a dict of lists by name")
+        columns = {name: _array(name, values) for name, values in mapping(self.columns, "The columns").items()}
+        object.__setattr__(self, "meta", mapping(self.meta, "The facts"))
         lengths = {name: len(values) for name, values in columns.items()}
         if len(set(lengths.values())) > 1:
             given, rule = f"The columns have the lengths {lengths}.", "All columns must have the same length."
@@ -54,9 +59,7 @@ class Study:
 
     def column(self, name: str) -> np.ndarray:
         """The column with this name, (N,); NameUnknown if there is none."""
-        if name not in self.columns:
-            raise unknown(name, self.columns, "column")
-        return self.columns[name]
+        return self.columns[named(name, self.columns, "column")]
 
     def rows(self) -> list[dict]:
         """All rows as dicts of plain values."""
@@ -67,12 +70,24 @@ class Study:
         """The rows that have these values, numbers or texts by the names of their columns."""
         keep = np.ones(len(self), dtype=bool)
         for name, value in values.items():
+            if not isinstance(value, str) and not is_number(value) and not isinstance(value, bool | np.bool):
+                rule = "A row has a number or a text."
+                raise SpecificationError(f"{name}={repr(value)[:150]} was given.", rule, name=name, value=value)
             keep &= self.column(name) == value
         return self.take(np.flatnonzero(keep))
 
     def take(self, rows) -> "Study":
         """The rows with these indices (sequence of int), in this order, as a Study."""
-        return replace(self, columns={n: values[np.asarray(rows, dtype=int)] for n, values in self.columns.items()})
+        index = as_numbers(rows)
+        if index.ndim != 1 or not np.all((index == np.round(index)) & (np.abs(index + 0.5) < len(self))):
+            raise SpecificationError(
+                f"rows={repr(rows)[:150]} was given.",
+                f"They are indices of the {len(self)} rows: whole numbers in a list or an array.",
+                do="Write study.take([0, 2]).",
+                rows=rows,
+                count=len(self),
+            )
+        return replace(self, columns={name: values[index.astype(int)] for name, values in self.columns.items()})
 
     def csv(self, path):
         """Write the table as CSV: a line of names, then one line for each row; a missing number is NaN.
@@ -186,15 +201,28 @@ def _processor():
         return platform.processor() or platform.machine()
 
 
-def _array(values):
+def _array(name, values):
     """An array of numbers, None as NaN, or of texts, None as an empty one."""
-    if isinstance(values, np.ndarray) and values.dtype != object:
-        return values
+    array = values if isinstance(values, np.ndarray) else None
+    known = isinstance(values, (list, tuple, range)) or array is not None and array.ndim == 1
+    if not known or not (array is not None and array.dtype.kind in "biufU" or all(map(_is_entry, values))):
+        raise SpecificationError(
+            f"The column {name!r} is {repr(values)[:150]}.",
+            "A column is a list or an array of numbers or texts, None where one is missing.",
+            name=name,
+            type=type(values).__name__,
+        )
+    if array is not None and array.dtype != object:
+        return array
     values = list(values)
     if any(isinstance(value, str) for value in values):
         return np.array(["" if value is None else str(value) for value in values])
     array = np.array([np.nan if value is None else value for value in values])
     return array.astype(float) if array.dtype == object else array  # whole numbers beyond 64 bits
+
+
+def _is_entry(value):
+    return value is None or isinstance(value, (bool, int, float, str, np.number, np.bool))
 
 
 def _short(value):

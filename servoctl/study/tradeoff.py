@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from servoctl.checks import as_span, is_number, mapping, positive, positives
+from servoctl.checks import as_span, is_number, mapping, named, positive, positives, require_kind, text
 from servoctl.errors import LimitExceeded, ServoError, SpecificationError, unknown
 from servoctl.methods.accuracy import motion_error, relative_error
 from servoctl.methods.choice import (
@@ -173,7 +173,7 @@ class TradeOff(Study):
         """
         from servoctl.figures.work_precision import draw_tradeoff
 
-        return draw_tradeoff(self, ax, _cost(cost), title)
+        return draw_tradeoff(self, ax, _cost(cost), text("title", title))
 
     def _good(self):
         return np.flatnonzero(np.isfinite(self["error"]) & np.isfinite(self["seconds"]))
@@ -257,6 +257,7 @@ def tradeoff(
     SpecificationError
         For invalid settings.
     """
+    require_kind(Model, "model", model, "sv.derive(mechanism, program)")
     t0, t1 = as_span(t_span)
     settings = _ladders(mapping(settings, "The settings"), abs(t1 - t0))
     limit = positive("seconds", seconds)
@@ -490,7 +491,7 @@ def _kind(method):
 def _drift_word(treatment):
     """A treatment as a word, which `_arguments` reads."""
     if isinstance(treatment, Poles):
-        return f"{treatment.values:g}"
+        return repr(treatment.values)
     if isinstance(treatment, Project):
         return "project" if treatment.every == 1 else f"project {treatment.every}"
     return "minimal" if isinstance(treatment, MinimalCoordinates) else "none"
@@ -523,6 +524,4 @@ def _arguments(row):
 
 
 def _cost(name):
-    if name not in COSTS:
-        raise unknown(name, COSTS, "cost")
-    return name
+    return named(name, COSTS, "cost")
