@@ -187,8 +187,8 @@ def test_entries_that_cancel_are_not_eliminated_again():
 
 def test_a_small_pivot_is_not_taken_for_its_fill_in():
     """The entry 1e-6 has the least fill-in; eliminating with it loses six digits."""
-    chosen = np.array([[1e-6, 1.0, 0.0], [1.0, 1.0, 1.0], [0.0, 1.0, -1.0]])
+    chosen = np.array([[1e-6, 1, 0, 0], [1, 0.9, 0.8, -0.7], [0, 0.8, -0.6, 1], [0, 0.7, 1, 0.9]])
     A = symbolic("a", chosen != 0)
-    _, pivots = eliminate(A, ca.SX([1, 2, 3]), chosen[:, :, None])
-    values = {f"a{i}_{j}": chosen[i, j] for i in range(3) for j in range(3)}
+    _, pivots = eliminate(A, ca.SX([1, 2, 3, 4]), chosen[:, :, None])
+    values = {f"a{i}_{j}": chosen[i, j] for i in range(4) for j in range(4)}
     assert min(abs(numbers(pivots, values))) > 0.05
