@@ -17,6 +17,7 @@ INSTANTS = (0, 70, 200)  # samples at which the reference is asked
 DOUBTFUL = 1e-5  # relative singular values below this confirm a refusal on rank
 SHARP = 1e5  # sensitivities of accelerations above this confirm a refusal as singular
 STEEPER = 30.0  # the growth of that sensitivity from start to stop that confirms a stop
+POLE, FURTHER = 0.9, 1.2  # or with this power, as a pole does, where the start is this factor farther from the stop
 BESIDE = 0.03  # distance of the farther of two states beside one at which the reference has no verdict
 POWER = 0.3  # or it grows at least with this power of one over the time that is left
 LARGE = 1e4  # a motion that has grown so far may end
@@ -174,13 +175,12 @@ def _refused(reference, case, stage, error, start, model):
 def _growth(reference, run, t, last, end):
     """Whether the sensitivity of the accelerations grows without bound towards the stop at t, in words."""
     left = np.abs(t - run.t)
-    earlier = np.flatnonzero(left >= 2 * left[last] + 1e-3)
-    if not end.clear or end.gain > SHARP or not len(earlier):
+    earlier = np.flatnonzero((left >= 2 * left[last] + 1e-3) | (left >= 4 * left[last]))
+    if not end.clear or end.gain > SHARP or left[0] < FURTHER * left[last]:
         return f"the sensitivity is {end.gain:.1e} at the stop" if not end.clear or end.gain > SHARP else ""
-    for k in (earlier[-1], 0):
+    for k, least, power in (*((k, 1.5, POWER) for k in earlier[-1:]), (0, STEEPER, 0.0), (0, FURTHER, POLE)):
         before = reference.determined(run.t[k], *_jets(run, k, reference.n), near=True)
-        power = POWER if k else 0.0
-        if before is not None and end.gain > before.gain * max(STEEPER if not k else 1.5, (left[k] / left[last]) ** power):
+        if before is not None and end.gain > before.gain * max(least, (left[k] / left[last]) ** power):
             return f"the sensitivity grows from {before.gain:.1e} at {run.t[k]:.3g} s to {end.gain:.1e} at {run.t[last]:.3g} s"
     return ""
 
