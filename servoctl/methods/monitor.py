@@ -488,8 +488,8 @@ class Monitor:
         what = what if lost else f"the rows {', '.join(map(repr, dependent))} lose their rank"
         return SingularProgram(
             f"The program is singular at t = {t:.7g} s: {what}{where}; {why}.",
-            f"{self._how_small(measure)}{'The actuation or a reaction is' if forces else 'Accelerations are'} undetermined "
-            f"in the direction of {', '.join(direction)}.",
+            f"{self._how_small(measure)}{'The actuation or a reaction is' if forces else 'Accelerations are'} "
+            f"undetermined in the direction of {', '.join(direction)}.",
             do="Write the residual in a form whose gradient does not vanish (linear in velocities, not squared), or "
             "plan around this state. The run before it is in .run.",
             t=float(t),
@@ -500,7 +500,7 @@ class Monitor:
         )
 
     def _how_small(self, measure):
-        """The rank measure as a sentence; a motion that begins at a singular state has no better one, or none at all."""
+        """The rank measure as a sentence; a motion that begins at a singular state has no better one, or none."""
         best = float(self.best.min())
         small = f"{best:.1e} from the first instant on" if best < HOPELESS else f"{measure:.1e} of its best so far"
         sentence = f"The smallest singular value, rows of size 1 in the metric of the inertia, is {small}. "
