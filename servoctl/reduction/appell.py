@@ -47,6 +47,8 @@ class Realisation:
 
     def dynamics(self, balance):
         """Tᵀ r, one SX scalar per independent coordinate, and the pivots divided by, here and in the multipliers."""
+        if not self.dependent:
+            return ca.vertsplit(balance[list(self.independent)]), []
         transposed = self.B.T
         a, pivots = eliminate(
             transposed[:, list(self.dependent)],
@@ -59,6 +61,8 @@ class Realisation:
     def multipliers(self, balance):
         """μ with B_D μ = r_D, (b,) SX."""
         rows = list(self.dependent)
+        if not rows:
+            return ca.SX(0, 1)
         return eliminate(self.B[rows, :], balance[rows], self.numbers[:, rows].swapaxes(0, 1))[0]
 
 
