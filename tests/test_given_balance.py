@@ -51,3 +51,13 @@ def test_a_balance_whose_mass_matrix_is_not_symmetric_is_refused():
     combined = ca.vertcat(right.balance[0] + right.balance[1], right.balance[1])
     with refused(SpecificationError, components=["d2x", "d2theta"]):
         sv.Mechanism(right.q, balance=combined, parameters=right.parameters)
+
+
+def test_products_of_decimals_in_either_order_are_symmetric():
+    """0.8·0.1·0.3 and 0.8·0.3·0.1 differ by a rounding error."""
+    q = sv.coordinates("a b")
+    a, b = q
+    weight, along = 0.8, ca.vertcat(0.1, 0.3)
+    assert weight * 0.1 * 0.3 != weight * 0.3 * 0.1
+    balance = ca.vertcat(*q.d(2)) + weight * along * q.dt(0.1 * a + 0.3 * b, 2)
+    assert sv.Mechanism(q, balance=balance).mass.shape == (2, 2)

@@ -172,3 +172,23 @@ def test_elimination_without_right_hand_sides_returns_the_pivots():
 def test_elimination_of_a_singular_matrix_is_refused(matrix):
     with refused(SingularProgram, "singular"):
         eliminate(symbolic("a", np.ones((2, 2))), ca.SX([1, 1]), np.array(matrix)[:, :, None])
+
+
+def test_entries_that_cancel_are_not_eliminated_again():
+    """Rows 0 and 1 agree in their first two columns, so that each is eliminated from the other with one pivot."""
+    a, b, c, d, e, f = symbols = [ca.SX.sym(name) for name in "abcdef"]
+    A = ca.vertcat(ca.horzcat(a, b, 0), ca.horzcat(a, b, c), ca.horzcat(d, e, f))
+    values = np.array([1.0, 0.9, 0.5, 0.7, -0.8, 0.6])
+    dense = np.array(ca.Function("A", symbols, [A])(*values))
+    solution, _ = eliminate(A, ca.SX([1, 2, 3]), dense[:, :, None])
+    found = numbers([solution], dict(zip("abcdef", values, strict=True)))
+    assert found == pytest.approx(np.linalg.solve(dense, [1.0, 2.0, 3.0]), rel=1e-13)
+
+
+def test_a_small_pivot_is_not_taken_for_its_fill_in():
+    """The entry 1e-6 has the least fill-in; eliminating with it loses six digits."""
+    chosen = np.array([[1e-6, 1, 0, 0], [1, 0.9, 0.8, -0.7], [0, 0.8, -0.6, 1], [0, 0.7, 1, 0.9]])
+    A = symbolic("a", chosen != 0)
+    _, pivots = eliminate(A, ca.SX([1, 2, 3, 4]), chosen[:, :, None])
+    values = {f"a{i}_{j}": chosen[i, j] for i in range(4) for j in range(4)}
+    assert min(abs(numbers(pivots, values))) > 0.05

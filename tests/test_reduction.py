@@ -582,3 +582,18 @@ def test_a_load_lifted_straight_up_hides_the_constraint_that_it_does_not_swing()
         force = signal(model, "actuation", t, jets)
         assert force["trolley"] == pytest.approx(0.0, abs=1e-9)
         assert force["hoist"] == pytest.approx(105.0 * named["d2l"] - 100.0 * 9.81, abs=1e-9)
+
+
+@pytest.mark.parametrize("names", ["a b", "b a"])
+def test_a_hidden_row_replaces_one_of_the_dynamics_and_not_the_residual(names):
+    """A mass b is moved by a spring from a: the acceleration of b is that of the residual if k (a - b) = m b''."""
+    q = sv.coordinates(names)
+    position, acceleration = (dict(zip(names.split(), symbols, strict=True)) for symbols in (q, q.d(2)))
+    a, b = position["a"], position["b"]
+    gibbs = sv.particle(q, 1.0, a) + sv.particle(q, 2.0, b)
+    mechanism = sv.Mechanism(q, gibbs=gibbs, potential=3.0 * (a - b) ** 2 / 2, actuators={"f": a})
+    r = derive(mechanism, sv.Program({"B": acceleration["b"] + ca.sin(q.t)})).reduction
+    written, hidden = r.rows
+    assert (written.name, written.order, written.story) == ("B", 2, "")
+    assert (hidden.kind, hidden.order) == ("dynamics", 0) and "B" in hidden.story
+    assert r.free == 2

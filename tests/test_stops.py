@@ -324,3 +324,39 @@ def test_where_no_other_pivots_are_found_the_motion_is_kept(method, derived, mon
     run = caught.value.run
     assert 0.3 < run.t[-1] <= caught.value.details["t"] < 1.7  # within the first half turn
     assert np.hypot(run["x"] - np.cos(2 * run.t), run["y"] - np.sin(2 * run.t)).max() < 1e-8
+
+
+LEVERS = {  # direction of g (a, b), and where it has no lever on b
+    "crank": (lambda a, b: [ca.sin(a), ca.cos(b)], np.pi / 2),
+    "moving lever": (lambda a, b: [0.0, 1.2 - b], 1.2),
+    "lever of both": (lambda a, b: [0.3, ca.cos(b) - 0.1 * ca.sin(b)], np.arctan(10.0)),
+}
+
+
+def lifted(name, start=0.0):
+    """Two masses, each driven by its own actuator, the second lifted at 1 m/s by a lever; and its start."""
+    q = sv.coordinates("a b")
+    a, b = q
+    actuators = {"f": [1.0, 0.0], "g": LEVERS[name][0](a, b)}
+    mechanism = sv.Mechanism(q, gibbs=sum(x**2 for x in q.d(2)) / 2, potential=b, actuators=actuators)
+    program = sv.Program({"A": a - 0.2 * ca.sin(q.t), "B": q.d(1)[1] - 1.0}, by="actuators")
+    model = sv.derive(mechanism, program)
+    return model, model.start(b=start)
+
+
+@pytest.mark.parametrize("method", [None, "RK4", "DOP853", "Taylor", "RadauIIA"])
+@pytest.mark.parametrize("name", LEVERS)
+def test_a_motion_of_all_coordinates_stops_where_an_actuator_has_no_lever(name, method):
+    """The accelerations are finite there, and the force 1/lever is not."""
+    dead = LEVERS[name][1]
+    model, start = lifted(name)
+    run = sv.simulate(model, start, (0.0, dead - 0.05), method)
+    lever = model.reduction.mechanism.E[1, 1]
+    values = ca.Function("lever", [*model.reduction.mechanism.q], [lever]).map(len(run.t))(run["a"], run["b"])
+    assert run["g"] == pytest.approx(1.0 / np.ravel(values), rel=1e-6)
+    with refused(sv.SingularProgram, direction=["d2b"]) as caught:
+        sv.simulate(model, start, (0.0, dead + 0.5), method)
+    assert caught.value.details["t"] == pytest.approx(dead, abs=1e-6)
+    assert caught.value.details["measure"] < 1e-6 and "actuation" in str(caught.value)
+    with refused(sv.SingularProgram, direction=["d2b"], t=0.0):
+        sv.simulate(*lifted(name, dead), (0.0, 0.3), method)

@@ -53,7 +53,7 @@ def test_a_structure_that_is_not_found_says_so():
     """On x y = 0 and (x - t) y = 0, that is y = 0, the residuals determine no input."""
     structure = sv.derive(*point(AWKWARD["two products"])).structure()
     assert structure.index is None and structure.relative_degree == ()
-    assert structure.realisation == "undecided" and "not computed" in repr(structure)
+    assert structure.realisation == "undecided" and "not decided" in repr(structure)
 
 
 @pytest.mark.parametrize("function", [np.sin, np.sqrt, np.abs, np.exp, np.tanh])

@@ -192,7 +192,9 @@ def test_a_pivot_that_other_parameters_nearly_cancel_is_chosen_again():
     for a in (0.0, 1e-9, 1e-13):
         model = sv.derive(mechanism, program).with_parameters(a=a)
         run = sv.simulate(model, model.start(guess={"x": 0.0, "y": 0.0}), (0.0, 0.5), "DOP853")
-        assert sv.verify(model, run).passed and np.abs(run.residual["A"]).max() < 1e-12
+        fastest = np.abs(run.jets[4:]).max()  # 8e6 m/s² near t = 0, where rounding of b y'' leaves A'' no smaller
+        limits = 1e-12 + np.array([0.0, 0.0, np.finfo(float).eps * 0.01 * fastest])
+        assert sv.verify(model, run).passed and np.all(np.abs(run.residual["A"]).max(axis=1) < limits)
 
 
 def weighted(a=1.0, e=0.0):

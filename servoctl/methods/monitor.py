@@ -12,6 +12,7 @@ import numpy as np
 from servoctl.errors import IntegrationStopped, ServoError, SingularProgram
 from servoctl.methods.sizes import motion_sizes
 from servoctl.model.report import explain
+from servoctl.tolerances import ENTRY
 
 DEGRADED = 0.02  # of its reference: a pivot below this is replaced, if the matrix itself is better than that
 HELPS = 5.0  # factor by which the matrix must be better
@@ -417,17 +418,25 @@ class Monitor:
         """Whether a degraded pivot is only badly chosen: the matrices themselves are far better."""
         return self.rank_measure(t, x) > HELPS * max(abs(relative), NEGLIGIBLE)
 
-    def refuse_start(self, t, x, outputs):
-        """The error of a start whose accelerations are not finite with any choice of pivots, or None."""
-        return None if np.all(np.isfinite(outputs)) else self.singular(t, x, "the accelerations are not finite there")
+    def refuse_start(self, t, x, outputs, pivots):
+        """The error of a start whose accelerations or pivots have no value with any choice of pivots, or None."""
+        if not np.all(np.isfinite(outputs)):
+            return self.singular(t, x, "the accelerations are not finite there")
+        weakest = self._weakest(pivots)
+        why = f"a pivot is {weakest:.1e} of its size nearby"
+        return self.singular(t, x, why) if weakest < ENTRY else None
 
     def bad_choice(self, outputs, pivots):
-        """Whether outputs at the start are not finite, or pivots are far worse than the matrices."""
+        """Whether outputs at the start are not finite, or pivots are zero or far worse than the matrices."""
         if not np.all(np.isfinite(outputs)):
             return True
+        weakest = self._weakest(pivots)
+        return weakest < ENTRY or bool(weakest < DEGRADED and self.best.min() > HELPS * weakest)
+
+    def _weakest(self, pivots):
+        """The smallest pivot, each relative to its size where pivots were chosen."""
         reference = self.model.pivot_sizes
-        weakest = (np.abs(pivots) / np.where(reference > 0, reference, 1.0)).min(initial=1.0)
-        return bool(weakest < DEGRADED and self.best.min() > HELPS * weakest)
+        return float((np.abs(pivots) / np.where(reference > 0, reference, 1.0)).min(initial=1.0))
 
     def repivoted(self, t, x, top):
         """The model with pivots chosen at x and γ^(s̄) = top, and its monitor; None if no choice succeeds."""
@@ -466,20 +475,21 @@ class Monitor:
                 value, largest = state.get(name, (1.0, 1.0))
                 if abs(value) < VANISHING * max(largest, 1e-12) and name not in zero:
                     zero.append(name)
-        direction = self._null_direction(matrices)
+        forces = self._smallest(matrices)[0] > LOST * self.best[0]  # L keeps its rank, and Bᵀ has lost its own
+        direction = self._null_direction(matrices, int(forces))
         where = f", where {' and '.join(f'{name} = 0' for name in zero)}" if zero else ""
-        dependent = [] if lost else self._dependent_rows(matrices[0])
+        dependent = [] if lost else self._dependent_rows(matrices, int(forces))
         facts = {"measure": measure, "rows": lost or dependent, "direction": direction}
         at_zero = np.where([name in zero for name in self.model.state_names], 0.0, x)
         explained = explain(self.model, t, at_zero, lost, **facts)
         if explained is not None:
             return explained
-        what = f"the gradient of row {', '.join(map(repr, lost))} vanishes"
+        what = f"the {'direction' if forces else 'gradient'} of row {', '.join(map(repr, lost))} vanishes"
         what = what if lost else f"the rows {', '.join(map(repr, dependent))} lose their rank"
         return SingularProgram(
             f"The program is singular at t = {t:.7g} s: {what}{where}; {why}.",
-            f"The smallest singular value, rows of size 1 in the metric of the inertia, is {self._how_small(measure)}; "
-            f"accelerations are undetermined in the direction of {', '.join(direction)}.",
+            f"{self._how_small(measure)}{'The actuation or a reaction is' if forces else 'Accelerations are'} "
+            f"undetermined in the direction of {', '.join(direction)}.",
             do="Write the residual in a form whose gradient does not vanish (linear in velocities, not squared), or "
             "plan around this state. The run before it is in .run.",
             t=float(t),
@@ -490,23 +500,26 @@ class Monitor:
         )
 
     def _how_small(self, measure):
-        """The rank measure in words; a motion that begins at a singular state has no better one."""
+        """The rank measure as a sentence; a motion that begins at a singular state has no better one, or none."""
         best = float(self.best.min())
-        return f"{best:.1e} from the first instant on" if best < HOPELESS else f"{measure:.1e} of its best so far"
+        small = f"{best:.1e} from the first instant on" if best < HOPELESS else f"{measure:.1e} of its best so far"
+        sentence = f"The smallest singular value, rows of size 1 in the metric of the inertia, is {small}. "
+        return sentence if min(best, measure) < LOST else ""
 
-    def _dependent_rows(self, leading):
-        """Names of the rows of L that depend on each other: its left null vector."""
-        if not np.all(np.isfinite(leading)):
-            return list(self.l_names)
-        scaled = leading / self.columns[0]
+    def _dependent_rows(self, matrices, i):
+        """Names of the rows of L, or of Bᵀ for i = 1, that depend on each other: its left null vector."""
+        names = (self.l_names, self.b_names)[i]
+        if not np.all(np.isfinite(matrices[i])):
+            return list(names)
+        scaled = matrices[i] / self.columns[i]
         norms = np.linalg.norm(scaled, axis=1)[:, None]
         scaled = scaled / np.where(norms > 0, norms, 1.0)
         weights = np.abs(np.linalg.svd(scaled)[0][:, -1])
-        return [self.l_names[j] for j in np.flatnonzero(weights > SHARE * weights.max())]
+        return [names[j] for j in np.flatnonzero(weights > SHARE * weights.max())]
 
-    def _null_direction(self, matrices):
-        """Names of the accelerations that the rows leave open: the right null vector of L."""
-        leading, columns = matrices[0], self.columns[0]
+    def _null_direction(self, matrices, i):
+        """Names of the accelerations that the rows leave open: the right null vector of L, or of Bᵀ for i = 1."""
+        leading, columns = matrices[i], self.columns[i]
         names = self.model.jet_names[-self.model.n :]
         if not np.all(np.isfinite(leading)):
             return list(names)

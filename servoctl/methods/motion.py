@@ -217,7 +217,7 @@ class Stepping:
             variant = self.monitor.repivoted(t, x, self._top(t, x))
             if variant is not None:
                 self._go_on(variant, t, x)
-            self.motion.stop = self.monitor.refuse_start(t, x, self._outputs(t, x))
+            self.motion.stop = self.monitor.refuse_start(t, x, self._outputs(t, x), self._pivots(t, x))
 
     def _outputs(self, t, x):
         return self.f(t, x, self.p)

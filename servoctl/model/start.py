@@ -267,11 +267,13 @@ def _best(equations, aim):
 
 def _step(value, jacobian, aim):
     """The least weighted change of the movable values that solves the linearised invariants."""
+    full = np.zeros(jacobian.shape[1])
+    if not (np.all(np.isfinite(jacobian)) and np.all(np.isfinite(value))):
+        return full
     rows = np.sqrt((jacobian**2).sum(axis=1))
     rows = np.where(rows > 0, rows, 1.0)
     a = (jacobian / rows[:, None])[:, aim.movable] / aim.weights[aim.movable]
-    full = np.zeros(jacobian.shape[1])
-    if a.size and np.all(np.isfinite(a)) and np.all(np.isfinite(value)):
+    if a.size:
         full[aim.movable] = np.linalg.lstsq(a, value / rows, rcond=REPEATED)[0] / aim.weights[aim.movable]
     return full
 

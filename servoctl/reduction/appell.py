@@ -46,9 +46,7 @@ class Realisation:
         return f"Realisation({self.B.shape[1]} directions, dependent coordinates {self.dependent})"
 
     def dynamics(self, balance):
-        """Tᵀ r, one SX scalar per independent coordinate, and the pivots divided by."""
-        if not self.independent:
-            return [], []
+        """Tᵀ r, one SX scalar per independent coordinate, and the pivots divided by, here and in the multipliers."""
         if not self.dependent:
             return ca.vertsplit(balance[list(self.independent)]), []
         transposed = self.B.T
@@ -57,8 +55,8 @@ class Realisation:
             -transposed[:, list(self.independent)],
             self.numbers[:, list(self.dependent)],
         )
-        rows = balance[list(self.independent)] + a.T @ balance[list(self.dependent)]
-        return ca.vertsplit(rows), [p for p in pivots if ca.symvar(p)]
+        virtual = zip(self.independent, (a.T @ balance[list(self.dependent)]).elements(), strict=True)
+        return [balance[i] + reaction for i, reaction in virtual], [p for p in pivots if ca.symvar(p)]
 
     def multipliers(self, balance):
         """μ with B_D μ = r_D, (b,) SX."""

@@ -110,7 +110,7 @@ class Points:
 
 
 @np.errstate(all="ignore")  # trial steps may leave the domain of the rows: what is not finite is no improvement
-def solve(flow, t, z, iterations=GAUSS_NEWTON_STEPS):
+def solve(flow, t, z, iterations=GAUSS_NEWTON_STEPS, natural=False):
     """Solve a flow's rows for jets: level by level, then by damped Gauss-Newton steps on all levels.
 
     Parameters
@@ -118,6 +118,11 @@ def solve(flow, t, z, iterations=GAUSS_NEWTON_STEPS):
     flow : Flow
     t : (N,) array
     z : (nz, N) array
+    iterations : int, optional
+        Damped steps on all levels.
+    natural : bool, optional
+        Whether damped steps are judged by the Newton correction at their end instead of the residual: that is the same
+        for all combinations of the rows, and leads on where rows are nearly dependent and curved.
 
     Returns
     -------
@@ -145,8 +150,10 @@ def solve(flow, t, z, iterations=GAUSS_NEWTON_STEPS):
         active, start, residual, scale = active[rough], start[:, rough], residual[:, rough], scale[:, rough]
         if not len(active):
             break
-        step = _least_steps(jacobian[:, :, rough], residual)
-        trial, better = _search(flow, t[active], start, step, scale, residual)
+        jacobian = jacobian[:, :, rough]
+        step = _least_steps(jacobian, residual)
+        search = _natural_search if natural else _search
+        trial, better = search(flow, t[active], start, step, jacobian if natural else scale, residual)
         active = active[better]
         z[:, active] = trial[:, better]
     return z, norm
@@ -168,6 +175,23 @@ def _search(flow, t, z, step, scale, residual):
         damping[open_] /= 4
         trial[:, open_] = z[:, open_] + damping[open_] * step[:, open_]
     return trial, better
+
+
+def _natural_search(flow, t, z, step, jacobian, _):
+    """For each point the longest of ever shorter steps that shortens the Newton correction, and whether one does.
+
+    The correction J⁺ψ of the end is taken with the Jacobian of the start (the natural monotonicity test of Deuflhard).
+    """
+    longest = np.max(np.abs(step) / (1.0 + np.abs(z)), axis=0)
+    damping, trial, open_ = 1.0 / np.maximum(1.0, longest), z.copy(), np.arange(len(t))
+    for _ in range(SHORTENINGS):
+        trial[:, open_] = z[:, open_] + damping[open_] * step[:, open_]
+        left = _least_steps(jacobian[:, :, open_], flow.residual(t[open_], trial[:, open_]))
+        open_ = open_[~(np.max(np.abs(left) / (1.0 + np.abs(z[:, open_])), axis=0) < longest[open_])]
+        if not len(open_):
+            break
+        damping[open_] /= 4
+    return trial, ~np.isin(np.arange(len(t)), open_)
 
 
 def _solve_level(flow, t, z, level, scales):
@@ -264,7 +288,8 @@ def sample(q, rows, level, context, starts=None, flow=None):
     points = _solved(starting, flow, slice(POINTS))
     if len(points.t) == POINTS:
         return points
-    return points.joined(_solved(starting, flow, slice(POINTS, None))).take(slice(POINTS))
+    points = points.joined(_solved(starting, flow, slice(POINTS, None))).take(slice(POINTS))
+    return points if len(points.t) else _solved(starting, flow, slice(POINTS), natural=True)
 
 
 def _random_starts(q, level, context):
@@ -283,9 +308,9 @@ def _random_starts(q, level, context):
     return np.asarray(rng.uniform(*context.window, 2 * POINTS), dtype=REAL), z
 
 
-def _solved(starting, flow, some):
+def _solved(starting, flow, some, natural=False):
     """The points of the manifold to which Newton's method converges from some of the starting points."""
-    z, residual = solve(flow, starting.t[some], starting.z[:, some])
+    z, residual = solve(flow, starting.t[some], starting.z[:, some], natural=natural)
     points = replace(starting, t=starting.t[some], z=z, residual=residual.astype(float))
     return points.take(np.flatnonzero(residual < ON_MANIFOLD))
 

@@ -136,6 +136,7 @@ class Structure:
         return lines
 
 
+@np.errstate(all="ignore")  # a residual may have no value at a point: nothing is decided there
 def structure(reduction, t=None, jets=None, values=None, start=None):
     """Decide index, relative degrees, zeros at infinity and essential orders at points of a motion.
 
@@ -351,7 +352,9 @@ def _response(jacobian, b, plant, bound, k, depth):
 
 
 def _local(J, k, depth):
-    """The structure from J (k, N+1, k, N+1) at one point, or None where N is too small."""
+    """The structure from J (k, N+1, k, N+1) at one point, or None where N is too small or J has no value."""
+    if not np.all(np.isfinite(J)):
+        return None
     size = depth + 1
     squares = [J[:, : N + 1, :, : N + 1].reshape(k * (N + 1), k * (N + 1)) for N in range(size)]
     ranks = [decide(square, INDEPENDENT) for square in squares]

@@ -21,6 +21,8 @@ LEVELS = 8  # derivatives of w that formulas may name
 CUTOFF = 1e-11  # singular values below this fraction of the largest count as zero
 HELD = 1e-11  # a state that leaves equations no more than this, relative to the coefficients, is consistent
 MOVED = 1e-6  # of the state: farther than this no drift has taken it
+HOLDS = 1e-9  # residuals below this are zero
+UNITS = (1.0, 0.1, 1e-2, 1e-3, 1e-4)  # s, of time: coefficients of a quick motion are of one size in a short one
 ITERATIONS = 25
 
 
@@ -212,8 +214,10 @@ class Reference:
                 J[starts[row] + k, first + j] += P[k - (j - level)] * (factorial(j) / factorial(j - level))
         return residual, J
 
-    def solve(self, t, q0, w0, more=0, near=False):
+    def solve(self, t, q0, w0, more=0, near=False, unit=1.0):
         """The array at an instant from a state: q0 (n,), w0 (n, coefficients).
+
+        Its columns are scaled to a unit of time [s].
 
         A state that is `near` a consistent one is held until the higher coefficients fit it, and moved then.
         """
@@ -225,35 +229,43 @@ class Reference:
         state = np.zeros(len(x), dtype=bool)
         q_state, w_state, _ = self._parts(state, N)
         q_state[:, 0], w_state[:, : self.top - 1] = True, True
-        everything = np.ones(len(x), dtype=bool)
-        if not self._newton(t, x, N, ~state if near else everything):
+        sizes, everything = np.ones(len(x)), np.ones(len(x), dtype=bool)
+        for part in self._parts(sizes, N):
+            part[:] = unit ** -np.arange(part.shape[1])
+        if not self._newton(t, x, N, ~state if near else everything, sizes):
             return None
         if near:
             residual, J = self.array(t, q, w, multipliers)
-            off = np.abs(residual / np.maximum(np.abs(J).max(axis=1), 1e-300)).max()
+            off = np.abs(residual * self._row_scales(J * sizes)).max()
             held = x.copy()
-            if off > HELD * (1 + np.abs(x).max()) and not self._newton(t, x, N, everything):
+            if off > HELD * (1 + np.abs(x / sizes).max()) and not self._newton(t, x, N, everything, sizes):
                 return None
             if np.abs(x - held)[state].max() > MOVED * (1 + np.abs(held[state]).max()):
                 x[:] = held  # Newton's method has left for another motion, next to a singular one
         residual, J = self.array(t, q, w, multipliers)
-        scale = 1 / np.maximum(np.abs(J).max(axis=1), 1e-300)
-        clear, gain, loose = self._determined(J[:, ~state] * scale[:, None], state, N)
+        J *= sizes
+        scale = self._row_scales(J)
+        clear, gain, loose = self._determined(J[:, ~state] * scale[:, None], state, N, sizes)
         reaction = np.array(self._force(t, q, w, multipliers))
         return Solution(q[:, 0], w.copy(), reaction, clear, gain, float(np.abs(residual * scale).max()), loose)
 
-    def _newton(self, t, x, N, free):
+    @staticmethod
+    def _row_scales(J):
+        return 1 / np.maximum(np.abs(J).max(axis=1), 1e-300)
+
+    def _newton(self, t, x, N, free, sizes):
         """Gauss-Newton steps of least norm on the free coefficients of x, in place; False where numbers end."""
         size = np.inf
         for _ in range(ITERATIONS):
             residual, J = self.array(t, *self._parts(x, N))
             if not np.all(np.isfinite(J)):
                 return False
-            scale = 1 / np.maximum(np.abs(J).max(axis=1), 1e-300)
+            J *= sizes
+            scale = self._row_scales(J)
             step = self._least(J[:, free] * scale[:, None], residual * scale)
-            length = np.abs(step).max()
-            x[free] -= step * min(1.0, 3.0 * (1 + np.abs(x).max()) / max(length, 1e-300))
-            length /= 1 + np.abs(x).max()
+            length, largest = np.abs(step).max(), 1 + np.abs(x / sizes).max()
+            x[free] -= step * sizes[free] * min(1.0, 3.0 * largest / max(length, 1e-300))
+            length /= 1 + np.abs(x / sizes).max()
             if length < 1e-13 or (length < 1e-9 and length > 0.5 * size):
                 break
             size = length
@@ -269,17 +281,17 @@ class Reference:
         """The step of least norm; a complete orthogonal factorisation, several times faster than an SVD."""
         return lstsq(J, r, cond=CUTOFF, lapack_driver="gelsy", check_finite=False)[0]
 
-    def _determined(self, J, state, N):
+    def _determined(self, J, state, N, sizes):
         key = np.zeros(len(state), dtype=bool)
         _, w, multipliers = self._parts(key, N)
         w[:, self.top - 1] = True
         multipliers[: self.count, 0] = True
-        key = key[~state]
+        key, sizes = key[~state], sizes[~state]
         _, s, v = np.linalg.svd(J, full_matrices=True)
         s = np.append(s, np.zeros(len(v) - len(s)))
         live = s > CUTOFF * s[0]
         loose = float(np.linalg.norm(v[~live][:, key])) if not live.all() else 0.0
-        gain = float(np.linalg.norm(v[live][:, key] / s[live, None]))
+        gain = float(np.linalg.norm(v[live][:, key] * sizes[key] / s[live, None]))
         return loose < 1e-6, gain, loose
 
     def _force(self, t, q, w, multipliers):
@@ -295,12 +307,14 @@ class Reference:
 
     def determined(self, t, q0, w0, near=False):
         """The solution of the shortest array that determines accelerations and actuation, else of the longest."""
-        solution = None
-        for more in dict.fromkeys((1, 3, 5, 2 * self.n + 1)):
-            solution = self.solve(t, q0, w0, more, near)
-            if solution is not None and (solution.clear and solution.residual < 1e-9):
-                break
-        return solution
+        first = None
+        for unit in UNITS if near else UNITS[:1]:
+            for more in dict.fromkeys((1, 3, 5, 2 * self.n + 1)):
+                solution = self.solve(t, q0, w0, more, near, unit)
+                if solution is not None and (solution.clear and solution.residual < HOLDS):
+                    return solution
+            first = first or solution
+        return first
 
     def ranks(self, t, q0, w):
         """Singular values that decide who can realise the program, at a state: a dict of arrays."""

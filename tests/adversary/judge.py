@@ -17,6 +17,8 @@ INSTANTS = (0, 70, 200)  # samples at which the reference is asked
 DOUBTFUL = 1e-5  # relative singular values below this confirm a refusal on rank
 SHARP = 1e5  # sensitivities of accelerations above this confirm a refusal as singular
 STEEPER = 30.0  # the growth of that sensitivity from start to stop that confirms a stop
+POLE, FURTHER = 0.9, 1.2  # or with this power, as a pole does, where the start is this factor farther from the stop
+BESIDE = 0.03  # distance of the farther of two states beside one at which the reference has no verdict
 POWER = 0.3  # or it grows at least with this power of one over the time that is left
 LARGE = 1e4  # a motion that has grown so far may end
 PATIENCE = 40  # s of processor time for a case; a few tenths are usual
@@ -111,7 +113,7 @@ def _judge(case):
         stage = "verify"
         proof = sv.verify(model, run, segments=1)
     except sv.ServoError as error:
-        return _refused(reference, case, stage, error, start)
+        return _refused(reference, case, stage, error, start, model)
     except _OutOfTime:
         return Verdict(f"wrong: longer than {PATIENCE} s in {stage}")
     except Exception as error:  # noqa: BLE001
@@ -162,9 +164,9 @@ def _kind(failure):
     return "residual" if failure.startswith("residual") else failure
 
 
-def _refused(reference, case, stage, error, start):
+def _refused(reference, case, stage, error, start, model):
     what = f"{type(error).__name__} in {stage}"
-    cause = _cause(reference, case, start, error)
+    cause = _cause(reference, case, start, error, model)
     if cause:
         return Verdict("refused rightly", f"{what}: {cause} | {error}")
     return Verdict(f"wrong: refusal without cause, {what}, {_sentence(error)}", str(error))
@@ -173,13 +175,12 @@ def _refused(reference, case, stage, error, start):
 def _growth(reference, run, t, last, end):
     """Whether the sensitivity of the accelerations grows without bound towards the stop at t, in words."""
     left = np.abs(t - run.t)
-    earlier = np.flatnonzero(left >= 2 * left[last] + 1e-3)
-    if not end.clear or end.gain > SHARP or not len(earlier):
+    earlier = np.flatnonzero((left >= 2 * left[last] + 1e-3) | (left >= 4 * left[last]))
+    if not end.clear or end.gain > SHARP or left[0] < FURTHER * left[last]:
         return f"the sensitivity is {end.gain:.1e} at the stop" if not end.clear or end.gain > SHARP else ""
-    for k in (earlier[-1], 0):
+    for k, least, power in (*((k, 1.5, POWER) for k in earlier[-1:]), (0, STEEPER, 0.0), (0, FURTHER, POLE)):
         before = reference.determined(run.t[k], *_jets(run, k, reference.n), near=True)
-        power = POWER if k else 0.0
-        if before is not None and end.gain > before.gain * max(STEEPER if not k else 1.5, (left[k] / left[last]) ** power):
+        if before is not None and end.gain > before.gain * max(least, (left[k] / left[last]) ** power):
             return f"the sensitivity grows from {before.gain:.1e} at {run.t[k]:.3g} s to {end.gain:.1e} at {run.t[last]:.3g} s"
     return ""
 
@@ -189,14 +190,32 @@ def _sentence(error):
     return re.sub(r"[\d.e+-]+|'[^']*'", "…", str(error))[:60]
 
 
-def _cause(reference, case, start, error):
+def _state(start, n):
+    """q and the Taylor coefficients of w at a start."""
+    jets = start.values[n:].reshape(-1, n).T
+    return start.values[:n], jets / np.cumprod([1.0, *range(1, jets.shape[1])])
+
+
+def _beside(reference, start, model):
+    """Whether accelerations and actuation grow without bound towards a start, in words."""
+    rng, gains = np.random.default_rng(1), []
+    directions = dict(zip(start.names, rng.uniform(-1, 1, len(start.names)), strict=True))
+    for distance in (BESIDE, BESIDE / 3):
+        near = model.start(guess={name: start[name] + distance * d for name, d in directions.items()})
+        solution = reference.determined(0.0, *_state(near, reference.n), near=True)
+        if solution is None or not solution.clear or solution.residual > 1e-9:
+            return ""
+        gains.append(solution.gain)
+    grows = gains[1] > max(STEEPER, 2 * gains[0])
+    return f"next to the start the sensitivity is {gains[0]:.1e}, nearer {gains[1]:.1e}" if grows else ""
+
+
+def _cause(reference, case, start, error, model):
     """What of the reference confirms a refusal; empty where nothing does."""
     t, q, w, near = 0.0, np.array(case.guess), np.array(case.speeds)[:, None], False
     run = error.run
     if start is not None:
-        jets = start.values[case.n :].reshape(-1, case.n).T
-        q, near = start.values[: case.n], True
-        w = jets / np.cumprod([1.0, *range(1, jets.shape[1])])
+        (q, w), near = _state(start, case.n), True
     if run is not None and len(run.t) and np.all(np.isfinite(run.jets[:, -1])):
         t, (q, w) = run.t[-1], _jets(run, -1, case.n)
         if np.abs(run.jets[:, -1]).max() > LARGE:
@@ -215,7 +234,7 @@ def _cause(reference, case, start, error):
         if last < -5:
             break
     if not solved and start is not None:  # there is one, and the reference has no verdict there
-        return ""
+        return _beside(reference, start, model)
     if not solved:
         return f"no consistent point: residuals {', '.join(f'{p.residual:.1e}' for p in points)}"
     if isinstance(error, sv.InconsistentStart):
