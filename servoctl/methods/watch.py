@@ -15,7 +15,7 @@ import numpy as np
 
 from servoctl.codegen.function import compiled
 from servoctl.errors import IntegrationStopped
-from servoctl.jets.branches import domain_edges
+from servoctl.jets.branches import domain_edges, size_of_terms
 from servoctl.methods.sizes import state_levels
 from servoctl.tolerances import TINY
 
@@ -232,14 +232,8 @@ class Residuals:
     @cached_property
     def _terms(self):
         """The sum of the magnitudes of each residual's terms."""
-
-        def size(expression):
-            if expression.op() in (ca.OP_ADD, ca.OP_SUB):
-                return size(expression.dep(0)) + size(expression.dep(1))
-            return ca.fabs(expression)
-
         e = self.model.equations
-        sizes = [size(ca.densify(expression)) for _, _, expression in e.invariant_rows]
+        sizes = [size_of_terms(ca.densify(expression)) for _, _, expression in e.invariant_rows]
         return compiled(e.function("terms", e.state, sizes), "terms")
 
     def accept(self):
