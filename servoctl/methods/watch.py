@@ -25,7 +25,8 @@ LEAST_RTOL, LEAST_ATOL = 1e-12, 1e-14  # rounding of residuals: smaller toleranc
 OF_TERMS = 1e-2  # of the terms of a residual, which it never reaches where it is sensitive
 SENSITIVE = 1e2  # times the first allowance of a residual, beyond which its terms bound it
 EXPLAINED = 2.0  # times the extrapolation of a residual from earlier levels
-REMAINS = 0.75  # of the error of a step in two of half its length: it is a jump, since other errors shrink to a half
+FINER = 16  # equal steps in place of one of fixed length that errs by far
+REMAINS = 0.75  # of its error in these: it is a jump, since other errors shrink, at least to a half with each halving
 LEARNED = 10.0  # times the error of a step of fixed length, which later ones may have
 MOST_INSPECTED = 128  # steps of a stretch whose residuals are evaluated
 LOCATED = 40  # halvings of a step that locate where a residual leaves: all digits
@@ -364,7 +365,7 @@ class Watch:
         state : callable
             X from (k, t).
         again : callable, optional
-            States at the ends of two steps of half the length, from (t, x, h); for steps of fixed length.
+            States at the ends of equal steps, from (t, x, h, count); for steps of fixed length.
         projected : bool
             Whether the ends of steps were projected: what `state` gives there was not.
         """
@@ -398,16 +399,16 @@ class Watch:
         return self.residuals.off(t[:, None], before[:, None], after[:, None])[:, 0]
 
     def _stays(self, off, t, before, after, again):
-        """Whether a residual is as far off after two steps of half the length; if not, these steps are coarse."""
-        halves = again(t[0], before, (t[1] - t[0]) / 2)
-        if halves.shape[1] < 3:
+        """Whether a residual is as far off after steps that are far shorter; if not, this one is coarse."""
+        shorter = again(t[0], before, (t[1] - t[0]) / FINER, FINER)
+        if shorter.shape[1] <= FINER:
             return True
-        values, _ = self.residuals.values(t[[0, 1, 1]], np.column_stack([before, after, halves[:, -1]]))
+        values, _ = self.residuals.values(t[[0, 1, 1]], np.column_stack([before, after, shorter[:, -1]]))
         explained = self.residuals.explained(values[:, :1], t[1:] - t[:1])[off]
-        once, twice = (np.abs(values[off, 1:]) - explained).T
-        if np.any(~(twice <= REMAINS * once)):
+        long, short = (np.abs(values[off, 1:]) - explained).T
+        if np.any(~(short <= REMAINS * long)):
             return True
-        self.residuals.coarse[off] = np.maximum(self.residuals.coarse[off], LEARNED * once)
+        self.residuals.coarse[off] = np.maximum(self.residuals.coarse[off], LEARNED * long)
         return False
 
     def _end(self, k, t, before, after, state):
