@@ -331,3 +331,11 @@ def test_an_accuracy_holds_beyond_a_half_turn():
     model, start = ideal(lambda t, x, y, dx, dy: ca.atan2(dy, dx) - t, dx=1.0, x=0.0, y=0.0)
     run = sv.simulate(model, start, (0.0, 8.0), accuracy=1e-8)
     assert np.abs(run["x"] - np.sin(run.t)).max() < 1e-8
+
+
+def test_rates_of_powers_have_no_switches():
+    """They ask whether the base is zero, which is no kink."""
+    q = sv.coordinates("x y")
+    (dx, dy), (d2x, d2y) = q.d(1), q.d(2)
+    bend = q.dt((dx * d2y - dy * d2x) / (dx**2 + dy**2) ** 1.5, 2)
+    assert switching(sv.derive(sv.Mechanism(q, gibbs=sv.particle(q, 1.0, q)), sv.Program({"b": bend}, by="ideal"))) is None
