@@ -9,6 +9,7 @@ from refusals import refused
 from scipy.integrate import solve_ivp
 
 import servoctl as sv
+from servoctl.model.switching import switching
 
 ONE_STEP = ("DOP853", "RK45", "Radau", "LSODA", "Taylor", "RadauIIA", "RK4", "RK8")
 MULTISTEP = ("BDF", "CVODES", "IDAS")  # at their default rtol of 1e-9 the smooth motion itself errs by 1e-7
@@ -338,4 +339,5 @@ def test_rates_of_powers_have_no_switches():
     q = sv.coordinates("x y")
     (dx, dy), (d2x, d2y) = q.d(1), q.d(2)
     bend = q.dt((dx * d2y - dy * d2x) / (dx**2 + dy**2) ** 1.5, 2)
-    assert switching(sv.derive(sv.Mechanism(q, gibbs=sv.particle(q, 1.0, q)), sv.Program({"b": bend}, by="ideal"))) is None
+    mechanism = sv.Mechanism(q, gibbs=sv.particle(q, 1.0, tuple(q)))
+    assert switching(sv.derive(mechanism, sv.Program({"bend": bend}, by="ideal"))) is None
