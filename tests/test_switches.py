@@ -257,8 +257,8 @@ def test_a_program_that_ends_stops_the_motion_there(name, method, drift):
         sv.simulate(model, start, (0.0, 1.3 * end), method, drift=drift)
     assert type(caught.value) in (sv.IntegrationStopped, sv.SingularProgram)
     assert why in str(caught.value) or type(caught.value) is sv.SingularProgram
-    # a rate jumps where x reaches 1; where dx does, the residual itself leaves slowly, up to 1 % of its terms
-    late = 5e-3 if name == "asin" else 0.15
+    # a rate jumps where x reaches 1; where dx does, the residual itself leaves slowly, up to 1e-3 of its terms
+    late = 5e-3 if name == "asin" else 0.05 if method == "LSODA" else 0.02  # LSODA fails before
     assert caught.value.details["t"] == pytest.approx(end, abs=late)
     run = caught.value.run
     assert 0.97 * end < run.t[-1] < end + late and np.abs(run.residual["p"][0]).max() < late

@@ -265,6 +265,17 @@ def test_what_comes_alive_later_or_elsewhere_acts(name, method):
     assert np.abs(run.residual["Y"][0]).max() < (5e-7 if method == "Taylor" else 1e-7)
 
 
+@pytest.mark.parametrize("method", ["DOP853", "RK45", "Radau", "BDF", "LSODA", "Taylor"])
+def test_a_bump_while_the_motion_rests_is_not_stepped_over(method):
+    """The steps of a motion at rest are the longest; the bump, 0.03 s of 40 s, is narrower than any of them."""
+    model, f = blended(lambda t, x: 0.3 * ca.exp(-((100 * (t - 33.3)) ** 2)) * x)
+    run = sv.simulate(model, model.start(x=0.0, dx=0.0), (0.0, 40.0), method)
+    reference = solve_ivp(
+        lambda t, s: f(t, s).full().ravel(), (33.0, 40.0), (0.0, 0.0), "DOP853", rtol=1e-10, atol=1e-13, max_step=0.005
+    )
+    assert abs(reference.y[0, -1]) > 1e-3 and abs(run["x"][-1] - reference.y[0, -1]) < 1e-8
+
+
 @pytest.mark.parametrize("blend", [lambda t: ca.fmax(0, t - 3) ** 5, lambda t: (1 + ca.tanh(40 * (t - 3))) / 2])
 def test_a_force_that_turns_drives_what_it_turns_to(blend):
     q = sv.coordinates("x y z")

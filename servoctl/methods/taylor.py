@@ -325,7 +325,7 @@ class TaylorSteps(Stepping):
 
 
 def _level(c, j, h):
-    """The j-th derivative at times h (N,) of the series with coefficients c (last, n, N), less the constant for j = 0."""
+    """The j-th derivative at times h (N,) of series with coefficients c (last, n, N), less the constant for j = 0."""
     total = np.zeros(c.shape[1:])
     for k in range(len(c), max(j, 1) - 1, -1):
         total = total * h + float(factorial(k) // factorial(k - j)) * c[k - 1]

@@ -22,7 +22,7 @@ from servoctl.tolerances import TINY
 LEAVES = 1e3  # times its tolerance, which no healthy step adds to a residual
 DEFAULT = 1e-9, 1e-11  # rtol and atol that judge steps of fixed length, until these are known to be coarser
 LEAST_RTOL, LEAST_ATOL = 1e-12, 1e-14  # rounding of residuals: smaller tolerances are not resolved
-OF_TERMS = 1e-2  # of the terms of a residual, which it never reaches where it is sensitive
+OF_TERMS = 1e-3  # of the terms of a residual, which it never reaches where it is sensitive
 SENSITIVE = 1e2  # times the first allowance of a residual, beyond which its terms bound it
 EXPLAINED = 2.0  # times the extrapolation of a residual from earlier levels
 FINER = 16  # equal steps in place of one of fixed length that errs by far
@@ -201,7 +201,7 @@ class Residuals:
         self.model, self.tolerance, self.f = model, tolerance, model.function("invariants")
         self.names = [name for _, name in model.invariant_names()]
         self.m, self.coarse = len(self.names), np.zeros(len(self.names))
-        self.terms, self.first = np.zeros(self.m), None
+        self.terms, self.first, self.led_back = np.zeros(self.m), None, len(coefficients) > 0
         places = {name: i for i, name in enumerate(self.names)}
         self.chains = []
         for a, row in enumerate(model.reduction.rows):
@@ -216,11 +216,12 @@ class Residuals:
         allowed = LEAVES * self.tolerance.of(slopes, x)
         if self.first is None:
             self.first = allowed[:, 0]
-        first, self.latest = self.first[:, None], self.terms
+        first, self.latest, self.bound = self.first[:, None], self.terms, np.inf
         if not np.all(allowed < SENSITIVE * first):  # near the edge of a domain slopes, and errors, grow without bound
             terms = np.nan_to_num(self._terms.grid(t, x, self.model.parameters), posinf=0.0)
             terms = np.maximum.accumulate(np.maximum(terms, self.terms[:, None]), axis=1)
             allowed, self.latest = np.fmin(allowed, np.maximum(first, OF_TERMS * terms)), terms[:, -1]
+            self.bound = np.maximum(first, OF_TERMS * terms)
         return y[: self.m], allowed
 
     def small(self, t, x):
@@ -265,7 +266,10 @@ class Residuals:
         with np.errstate(all="ignore"):
             values, _ = self.values(t[0], before)
             residuals, allowed = self.values(t[1], after)
-            over = np.abs(residuals) - allowed - self.coarse[:, None] - self.explained(values, t[1] - t[0])
+            limit = allowed + self.explained(values, t[1] - t[0])
+            if not self.led_back:
+                limit = np.fmin(limit, self.bound)
+            over = np.abs(residuals) - limit - self.coarse[:, None]
         return np.where(np.isnan(residuals), np.inf, np.nan_to_num(over, nan=-1.0, posinf=np.inf, neginf=-1.0))
 
     def error(self, t, x, over, advice):
