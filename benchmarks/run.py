@@ -7,6 +7,7 @@ from pathlib import Path
 
 import appell_hamel
 import arms
+import bounded
 import compiling
 import crane
 import derivation
@@ -15,7 +16,7 @@ import loop
 import monte_carlo
 import process
 
-GROUPS = (appell_hamel, crane, arms, loop, monte_carlo, derivation, compiling, process)
+GROUPS = (appell_hamel, crane, bounded, arms, loop, monte_carlo, derivation, compiling, process)
 ROWS = {name: row for group in GROUPS for name, row in group.ROWS.items()}
 HERE = Path(__file__).parent
 RESULTS, README = HERE / "results.json", HERE / "README.md"

@@ -34,6 +34,7 @@ from servoctl.internal_dynamics import InternalDynamics, internal_dynamics
 from servoctl.methods.choice import (
     Adaptive,
     Algebraic,
+    Bounded,
     MinimalCoordinates,
     Poles,
     Project,
@@ -73,6 +74,7 @@ __all__ = [
     "Adaptive",
     "Algebraic",
     "Batch",
+    "Bounded",
     "Closed",
     "Controller",
     "Coordinates",

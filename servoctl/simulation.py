@@ -11,10 +11,12 @@ from servoctl.errors import InconsistentStart, ServoError, SpecificationError
 from servoctl.internal_dynamics import STEP_ERROR, internal_dynamics
 from servoctl.methods.accuracy import ATOL, absolute_tolerances, accurate, large_tolerances
 from servoctl.methods.algebraic import algebraic
+from servoctl.methods.bounded import bounded
 from servoctl.methods.choice import (
     EXPLICIT,
     Adaptive,
     Algebraic,
+    Bounded,
     Method,
     MinimalCoordinates,
     Poles,
@@ -162,10 +164,10 @@ def simulated(model, start, t_span, method=None, *, drift=None, t_eval=None, pro
         _require_decay(model, drift, t0, t1)
         if str(method) in EXPLICIT:
             warn_many_steps(str(method), drift.by_row(model), t1 - t0)
-    leads_back = isinstance(method, Algebraic) or isinstance(drift, (Poles, Project))
+    leads_back = isinstance(method, (Algebraic, Bounded)) or isinstance(drift, (Poles, Project))
     x0 = (as_state if leads_back else consistent_state)(model, start, t0)
     knots = model.require_smooth((min(span), max(span)))
-    times = _sample_times(t0, t1, t_eval, knots)
+    times = None if isinstance(method, Bounded) and t_eval is None else _sample_times(t0, t1, t_eval, knots)
     bar = Progress(span, progress)
     try:
         default = getattr(method, "atol", 0.0) is None
@@ -198,7 +200,7 @@ def judged(run, tolerance=STEP_ERROR, warn=True):
         Relative error of a step of its method.
     warn : bool
     """
-    if run.model.flat:
+    if run.model.flat or run.method == str(Bounded()):  # which is no forward integration
         return run
     internal = internal_dynamics(run.model, run)
     if warn and internal.verdict == "unstable":
@@ -230,6 +232,8 @@ def _motion(model, method, drift, problem, bar, atol=None):
     t0, x0, t1, times, knots = problem
     if isinstance(method, Algebraic):
         return algebraic(model, (t0, t1), x0, times, knots, bar)
+    if isinstance(method, Bounded):
+        return bounded(model, (t0, t1), x0, method, (times, knots), bar)
     family = switching(model)
     if family is not None:
         model = family.at(family.branches(t0, x0))
@@ -278,7 +282,7 @@ def _run(model, motion, method, drift, knots, span):
     elif motion.interrupted:
         status, message = 1, f"interrupted at {last} of {span[2]:g} s; what was computed is kept"
     else:
-        status, message = 0, "finished"
+        status, message = 0, f"finished; {motion.note}" if motion.note else "finished"
     facts = {"method": str(method), "drift": str(drift or ""), "counters": motion.counters}
     facts["knots"] = tuple(sorted({*knots, *motion.switches}))
     facts |= {"success": status == 0, "status": status, "message": message, "variants": tuple(variants)}

@@ -11,6 +11,7 @@ from test_compiled_functions import T, function
 import servoctl as sv
 from servoctl.codegen import loops
 from servoctl.codegen.function import compiled
+from servoctl.gallery import gallery
 
 TIP = {  # paths of the tip of an arm with two links of length 1
     "spiral": lambda t: (1.5 * ca.cos(np.pi * t), 1.5 * (1 + 0.1 * t) * ca.sin(np.pi * t)),
@@ -177,3 +178,12 @@ def test_followed_decides_how_many_steps_a_circle_takes():
     nodes, _ = f.continuation([0.0, 10.0], [0.0], [0.0], 1.0, 1000)
     expected = 10 * w / np.sqrt(6 * loops.FOLLOWED)
     assert expected / 2 < len(nodes) < 3 * expected
+
+
+def test_a_short_path_in_a_long_span_is_followed(gallery_model):
+    """The load moves for 6 s of a thousand million."""
+    model, scene = gallery_model("overhead-crane"), gallery["overhead-crane"]
+    times = np.linspace(0.0, 7.0, 29)
+    expected = sv.simulate(model, model.start(guess=scene.guess), (0.0, 7.0), t_eval=times)
+    run = sv.simulate(model, model.start(guess=scene.guess), (0.0, 1e9), t_eval=[*times, 1e9])
+    assert run.jets[:, :-1] == pytest.approx(expected.jets, abs=1e-10) and run["x"][-1] == pytest.approx(5.0, abs=1e-12)

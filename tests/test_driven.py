@@ -156,3 +156,14 @@ def test_outputs_of_higher_order_in_a_closed_loop(crane):
     before, now, after = (accelerations(s) for s in (-h, 0.0, h))
     assert closed["jerk"][k] == pytest.approx((after[0] - before[0]) / (2 * h), abs=1e-5)
     assert closed["snap"][k] == pytest.approx((after[1] - 2 * now[1] + before[1]) / h**2, abs=1e-2)
+
+
+def test_a_plant_of_one_coordinate_moves():
+    q = sv.coordinates("x")
+    (x,), (dx,) = q, q.d(1)
+    mechanism = sv.Mechanism(q, gibbs=q.d(2)[0] ** 2, potential=x**2, forces={"x": -0.1 * dx}, actuators={"F": x})
+    run = sv.simulate(sv.plant(mechanism), [0.5, 1.0], (0.0, 3.0), inputs={"F": 0.3})
+    decay, rate = 0.025, np.sqrt(1.0 - 0.025**2)  # of 2 x'' + 0.1 x' + 2 x = 0.3
+    a, t = 0.35, run.t
+    expected = 0.15 + np.exp(-decay * t) * (a * np.cos(rate * t) + (1.0 + decay * a) / rate * np.sin(rate * t))
+    assert run["x"] == pytest.approx(expected, abs=1e-8)

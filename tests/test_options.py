@@ -72,7 +72,7 @@ def test_what_a_study_is_asked_for(scene):
 
 
 def test_ctrl_c_ends_a_study_and_keeps_its_rows(scene, monkeypatch):
-    real = module.simulate
+    real = module.simulated
 
     def interrupted(*given, **options):
         if given[3] == sv.RungeKutta(4, step=0.02):
@@ -83,7 +83,7 @@ def test_ctrl_c_ends_a_study_and_keeps_its_rows(scene, monkeypatch):
             options["progress"] = stop
         return real(*given, **options)
 
-    monkeypatch.setattr(module, "simulate", interrupted)
+    monkeypatch.setattr(module, "simulated", interrupted)
     study = sv.tradeoff(*scene, SPAN, ["RK4", "RK8"], [None], settings={"step": [0.1, 0.05, 0.02]}, seconds=20.0)
     assert study.rows()[0]["method"] == "RK4" and study["value"].tolist() == [0.1, 0.05]
     assert np.all(np.isfinite(study["error"])) and study.meta["message"] == "interrupted"

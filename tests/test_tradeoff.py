@@ -289,7 +289,7 @@ def test_a_figure_of_failures_only_says_so(scene, tmp_path):
 
 
 def test_every_method_has_its_own_colour():
-    assert len(set(COLOURS)) == len(COLOURS) >= len(ALL_METHODS) - 2  # RK1 and RK2 are not measured by default
+    assert len(set(COLOURS)) == len(COLOURS) >= len(ALL_METHODS) - 3  # RK1, RK2 and bounded: not measured by default
 
 
 # --- the command

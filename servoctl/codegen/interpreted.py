@@ -2,6 +2,7 @@
 
 import functools
 import threading
+from itertools import pairwise
 
 import numpy as np
 
@@ -156,15 +157,16 @@ class Interpreter:
         """Fill rows of nodes; return their number and that of evaluations. See `Compiled.continuation`."""
         path, k, h = self._path(p), 0, longest
         point, _ = path.correct(cuts[0], x0, np.inf)
-        t, following = cuts[0], iter(cuts[1:])
-        end = next(following, None)
+        t, pieces = cuts[0], iter(pairwise(cuts))
+        begin, end = next(pieces, (None, None))
         while point is not None:
             nodes[k] = np.concatenate([[t], *point])
             k += 1
             if k == len(nodes) or end is None:
                 break
-            t, h, point = path.step(t, end, h, longest * SHORTEST, point)
-            h, end = min(h, longest), next(following, None) if t == end else end
+            least = SHORTEST * min(longest, abs(end - begin))
+            t, h, point = path.step(t, end, max(h, least) if t == begin else h, least, point)
+            h, (begin, end) = min(h, longest), next(pieces, (None, None)) if t == end else (begin, end)
         return k, path.count
 
     @np.errstate(all="ignore")

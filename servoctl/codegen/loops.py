@@ -11,7 +11,7 @@ QUADRATIC = 1e-8  # a Newton correction this small leaves an error of the order 
 CONTRACTION = 0.25  # largest ratio of two Newton corrections at one instant: another solution is four times as far away
 FOLLOWED = 0.02  # largest error of a step's prediction, relative to the way of the step
 STEADY = 0.25  # smallest ratio of a pivot to itself in a step: none is jumped over, none loses its digits in one step
-SHORTEST = 2.0**-32  # of the longest step: the path ends where a shorter one would be needed
+SHORTEST = 2.0**-32  # of the longest step in a piece: the path ends where a shorter one would be needed
 
 NEWTON = {  # constants that C needs by name
     "CORRECTIONS": CORRECTIONS,

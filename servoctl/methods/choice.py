@@ -271,6 +271,36 @@ class RungeKutta(Method):
 
 
 @dataclass(frozen=True, repr=False)
+class Bounded(Method):
+    """The bounded motion of unstable internal dynamics, from rest to rest: stable inversion by collocation.
+
+    The run begins before the span and ends after it: the mechanism moves ahead of the program.
+
+    Parameters
+    ----------
+    window : float
+        By how much the run exceeds the span, in time constants of the slowest unstable mode before it and of the
+        slowest stable mode after it. The motion is cut off where it is about exp(-window) of its size.
+    rtol : float
+        Largest defect of the collocation in an interval, relative to the sizes of the state's entries.
+    """
+
+    window: float = 10.0
+    rtol: float = 1e-9
+
+    refused = dict.fromkeys(
+        (Project, Poles, MinimalCoordinates), "The constraints hold at every node, so that nothing drifts."
+    )
+
+    def __post_init__(self):
+        self._check()
+        self._check_field("window", positive_number, 1e3)
+
+    def __str__(self):
+        return "bounded"
+
+
+@dataclass(frozen=True, repr=False)
 class RadauIIA(Method):
     """Compiled implicit steps, for stiff motions.
 
@@ -363,7 +393,8 @@ class Sundials(Method):
 
 
 _FAMILIES = ((RungeKutta, ORDERS.values()), (Adaptive, SCIPY), (Sundials, SUNDIALS))
-_DEFAULTS = (Algebraic(), Taylor(), RadauIIA(), *(family(name) for family, names in _FAMILIES for name in names))
+_NAMED = (family(name) for family, names in _FAMILIES for name in names)
+_DEFAULTS = (Algebraic(), Taylor(), RadauIIA(), Bounded(), *_NAMED)
 METHODS = {str(method): method for method in _DEFAULTS}
 """The methods with their defaults, by their short forms."""
 
@@ -429,6 +460,13 @@ def require_combination(model, method, drift):
             f"The program leaves {model.free} initial values free, so that internal dynamics must be integrated.",
             nearest=f"{str(default_method(model))!r}.",
             free=model.free,
+        )
+    if isinstance(method, Bounded) and model.flat:
+        raise SpecificationError(
+            "method='bounded' was given for a program that determines the motion completely.",
+            "Without internal dynamics there is nothing to keep bounded: each instant is a Newton solve.",
+            nearest="method='algebraic'.",
+            free=0,
         )
     combination = f"drift={drift!r} was given with method={str(method)!r}"
     if isinstance(drift, MinimalCoordinates) and model.flat and not isinstance(method, Algebraic):

@@ -22,6 +22,7 @@ class Motion:
     pieces: list = field(default_factory=list)
     stop: object = None
     interrupted: bool = False
+    note: str = ""
     changed: set = field(default_factory=set)
     switches: list = field(default_factory=list)
     start: object = None  # X at t0, if it is not the given one

@@ -49,6 +49,8 @@ class Realisation:
         """Tᵀ r, one SX scalar per independent coordinate, and the pivots divided by."""
         if not self.independent:
             return [], []
+        if not self.dependent:
+            return ca.vertsplit(balance[list(self.independent)]), []
         transposed = self.B.T
         a, pivots = eliminate(
             transposed[:, list(self.dependent)],
@@ -61,6 +63,8 @@ class Realisation:
     def multipliers(self, balance):
         """μ with B_D μ = r_D, (b,) SX."""
         rows = list(self.dependent)
+        if not rows:
+            return ca.SX(0, 1)
         return eliminate(self.B[rows, :], balance[rows], self.numbers[:, rows].swapaxes(0, 1))[0]
 
 

@@ -123,7 +123,9 @@ int64_t FN(continuation)(int64_t n, const double *instants, const double *x0, co
     if (!correct(t, x, p, INFINITY, y, &first, count)) return 0;
     record(t, x, y, nodes);
     for (int64_t next = 1; next < n && ++k < most; next += t == instants[next]) {
-        if (!step(&t, instants[next], &h, longest * SHORTEST, x, y, p, count)) return k;
+        const double least = SHORTEST * fmin(longest, fabs(instants[next] - instants[next - 1]));
+        if (t == instants[next - 1]) h = fmax(h, least);
+        if (!step(&t, instants[next], &h, least, x, y, p, count)) return k;
         h = fmin(h, longest);
         record(t, x, y, nodes + NODE * k);
     }

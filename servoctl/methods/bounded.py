@@ -1,0 +1,446 @@
+"""Bounded motions where forward integration diverges: stable inversion as a two-point boundary value problem.
+
+Σ o_a entries z of the state are free, the invariants determine the others, and z' = f(t, z). Before and after its span
+the program stands still, so that f is autonomous there, with equilibria. The bounded motion leaves the first one along
+its unstable manifold and arrives at the other along its stable one: the components of z along the stable eigenspace
+are zero at the begin of a window that exceeds the span, those along the unstable one at its end (Devasia, Chen and
+Paden 1996; Chen 1993). Collocation at the nodes of Radau IIA of order 13 turns this into equations for one banded
+Newton iteration with exact Jacobians; a mesh is refined until the defect between the nodes is below the tolerance.
+"""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import casadi as ca
+import numpy as np
+
+from servoctl.codegen.function import compiled
+from servoctl.errors import IntegrationStopped, SingularProgram, SpecificationError, UnstableInternalDynamics
+from servoctl.methods.accuracy import state_levels
+from servoctl.methods.motion import Motion, breakpoints
+from servoctl.methods.radau import basis, radau
+from servoctl.model.switching import switching
+
+ORDER = 13  # of the collocation: seven nodes
+LONGEST = 1.0  # interval of the first mesh, in time constants of the fastest mode
+MOST_INTERVALS = 4000
+NEWTON_STEPS, NEWTON_ENDS, STALLED = 40, 1e-12, 1e-9  # of Newton's method; relative size of its last step
+REFINEMENTS, MOST_PIECES = 10, 4  # of the mesh; and into how many an interval is cut at most
+LIFTED = 2  # Newton steps to the invariants from a polynomial between nodes, which is accurate to the defect
+AIM = 0.1  # defect that refinement aims at, relative to the tolerance
+HYPERBOLIC = 1e-6  # real part of an eigenvalue, relative to the largest eigenvalue, below which it lies on the axis
+STANDS = 1e-6  # relative change of the equilibrium before or after the span: the program does not stand still
+REGULAR = 1e-6  # smallest singular value of the free entries' part of the tangent space
+BETWEEN = (0.15, 0.5, 0.9)  # places within an interval where the defect is measured
+SAMPLES = 1001
+
+
+def bounded(model, span, guess, method, instants, progress):
+    """The bounded motion of a program.
+
+    Parameters
+    ----------
+    model : Model
+    span : (t0, t1)
+        Outside it the program stands still [s].
+    guess : (n_x,) array
+        Where Newton's method for the first equilibrium begins.
+    method : Bounded
+    instants : (times, knots)
+        Times of the samples [s], None for 1001 instants of the whole window and the knots; and the instants where the
+        program is not smooth [s].
+    progress : callable
+
+    Returns
+    -------
+    Motion
+        Its `note` has the window and the error of its truncation.
+
+    Raises
+    ------
+    UnstableInternalDynamics
+        If an eigenvalue lies on the imaginary axis at an end, or the ends differ in the number of unstable ones.
+    SpecificationError
+        If the program does not stand still outside the span.
+    IntegrationStopped, SingularProgram
+        If there is no equilibrium, Newton's method does not converge, or a pivot vanishes.
+    """
+    times, knots = instants
+    if span[1] < span[0]:
+        raise SpecificationError(
+            f"t_span=({span[0]:g}, {span[1]:g}) was given with method='bounded'.",
+            "A bounded motion joins the rest before the program to the rest after it.",
+            nearest=f"({span[1]:g}, {span[0]:g}).",
+            t_span=span,
+        )
+    if switching(model) is not None:
+        raise SpecificationError(
+            "method='bounded' was given for a mechanism or program with kinks or switches of the state.",
+            "A bounded motion is solved for at all instants at once, on one smooth branch.",
+            do="Smooth the switch, such as tanh(v/v0) for sign(v).",
+        )
+    problem = Problem(model, span, guess)
+    window = problem.window(method.window)
+    mesh, x = problem.solve(window, knots, method.rtol)
+    progress(window[0])
+    reference = problem.solve(problem.window(2 * method.window), knots, np.inf, (mesh, x))
+    progress(span[1])
+    if times is None:
+        times = np.union1d(np.linspace(*window, SAMPLES), [k for k in (*span, *knots) if window[0] < k < window[1]])
+    motion = Motion()
+    motion.count(intervals=len(mesh) - 1, iterations=problem.iterations)
+    samples = problem.at(times, mesh, x)
+    inside = times[(times >= window[0]) & (times <= window[1])]
+    truncation = problem.distance(problem.at(inside, mesh, x), problem.at(inside, *reference))
+    outputs = model.function("ode").grid(times, samples, model.parameters)
+    problem.require_pivots(times, outputs[problem.n_x :])
+    motion.add(model, times, samples, outputs[problem.n_x - model.n : problem.n_x])
+    motion.note = f"bounded from t = {window[0]:.4g} to {window[1]:.4g} s; a window of twice the length changes the "
+    motion.note += f"motion by {truncation:.1e}"
+    return motion
+
+
+@dataclass(frozen=True)
+class End:
+    """An equilibrium: its instant [s], state (n_x,) and linearisation A (f, f) in the free entries."""
+
+    t: float
+    x: np.ndarray
+    A: np.ndarray
+
+    @cached_property
+    def eigenvalues(self):
+        """Eigenvalues of A [1/s]."""
+        return np.linalg.eigvals(self.A)
+
+    def left_space(self, unstable):
+        """An orthonormal basis (k, f) of the left eigenspace of the unstable, or of the stable eigenvalues."""
+        from scipy.linalg import schur
+
+        _, vectors, count = schur(self.A.T, output="real", sort="rhp" if unstable else "lhp")
+        return vectors[:, :count].T
+
+
+class Problem:
+    """The boundary value problem of a program along a span; see `bounded` for the parameters."""
+
+    def __init__(self, model, span, guess):
+        self.model, self.span, self.p, self.iterations = model, span, model.parameters, 0
+        self._equations = model.once("bounded", lambda: _equations(model))
+        self.n_x, self.m = len(model.state_names), len(model.invariant_names())
+        self.c, self.derivative, *_ = radau(ORDER)
+        (t0, t1), count = span, self.n_x - self.m
+        self.size = np.maximum(np.abs(guess), 1.0)
+        self._choose(np.array([t0]), np.asarray(guess, dtype=float)[:, None], count)
+        first = self._equilibrium(t0, guess)
+        last = self._equilibrium(t1, first)
+        times = np.linspace(t0, t1, 41)
+        along = self._quasi_static(times, first[:, None] + np.linspace(0, 1, 41) * (last - first)[:, None])
+        self.size = _level_sizes(along, state_levels(model))
+        self._choose(times, along, count)
+        self.first, self.last = (End(t, x, self._linearised(t, x)) for t, x in ((t0, first), (t1, last)))
+        self._require_splitting()
+
+    # the internal dynamics
+
+    def local(self, t, x):
+        """The linearisation at states x (n_x, N): z' (N, f) and A (N, f, f) on the invariants, step back and tangent.
+
+        x + step (N, n_x) satisfies the invariants to first order with the same z; tangent (N, n_x, f) is ∂x/∂z.
+        """
+        f, J, g, G = self._evaluated(t, x)
+        J = J[:, self.free]
+        solved = np.linalg.solve(G[:, :, self.solved], np.concatenate([g[:, :, None], G[:, :, self.free]], axis=2))
+        step, tangent = np.zeros((len(t), self.n_x)), np.zeros((len(t), self.n_x, len(self.free)))
+        step[:, self.solved], tangent[:, self.solved] = -solved[:, :, 0], -solved[:, :, 1:]
+        tangent[:, self.free] = np.eye(len(self.free))
+        return f[:, self.free] + (J @ step[:, :, None])[:, :, 0], J @ tangent, step, tangent
+
+    def _evaluated(self, t, x):
+        """X' (N, n_x), ∂X'/∂X (N, n_x, n_x), the invariants (N, m), their Jacobian (N, m, n_x) at states (n_x, N)."""
+        n, m = self.n_x, self.m
+        y = self._equations.grid(t, x, self.p).T
+        f, J, g, G = np.split(y, np.cumsum([n, n * n, m]), axis=1)
+        return f, J.reshape(-1, n, n).swapaxes(1, 2), g, G.reshape(-1, n, m).swapaxes(1, 2)
+
+    def _choose(self, t, x, count):
+        """Choose the free entries: those that span the tangent space at all these states best."""
+        from scipy.linalg import qr
+
+        G = self._evaluated(t, x)[3]
+        if not np.isfinite(G).all():
+            raise self._failure("The invariants are not finite near the guess.", t[0])
+        tangents = np.linalg.svd(G * self.size)[2][:, self.m :]
+        self.free = np.sort(qr(np.concatenate(tangents), pivoting=True)[2][:count])
+        self.solved = np.setdiff1d(np.arange(self.n_x), self.free)
+        least = np.linalg.svd(tangents[:, :, self.free], compute_uv=False)[:, -1] if count else np.ones(1)
+        if least.min() < REGULAR:
+            k = int(np.argmin(least))
+            raise self._failure("No entries of the state are coordinates of the internal dynamics throughout.", t[k])
+
+    def _linearised(self, t, x):
+        return self.local(np.array([t]), x[:, None])[1][0]
+
+    # equilibria
+
+    def _quasi_static(self, t, x):
+        """States (n_x, N) on the invariants at which z' = 0, each by Newton's method."""
+        x = x.copy()
+        for _ in range(NEWTON_STEPS):
+            rate, A, step, tangent = self.local(t, x)
+            try:
+                change = step - (tangent @ np.linalg.solve(A, rate[:, :, None]))[:, :, 0]
+            except np.linalg.LinAlgError:
+                return np.full_like(x, np.nan)
+            largest = np.abs(change / self.size).max(axis=1, initial=0.0)
+            x += (change * np.minimum(1.0, 1.0 / np.maximum(largest, 1e-300))[:, None]).T
+            if not largest.max(initial=0.0) > NEWTON_ENDS:
+                break
+        return x
+
+    def _equilibrium(self, t, x):
+        x = self._quasi_static(np.array([t]), np.asarray(x, dtype=float)[:, None])[:, 0]
+        if not np.isfinite(x).all() or np.abs(self.local(np.array([t]), x[:, None])[0]).max(initial=0.0) > STANDS:
+            raise self._failure("Newton's method finds no equilibrium of the internal dynamics.", t)
+        return x
+
+    def _require_splitting(self):
+        """Refuse eigenvalues on the imaginary axis, and ends with different numbers of unstable ones."""
+        for end, where in ((self.first, "begin"), (self.last, "end")):
+            values = end.eigenvalues
+            on_axis = values[np.abs(values.real) <= HYPERBOLIC * np.abs(values).max(initial=0.0)]
+            if len(on_axis):
+                raise UnstableInternalDynamics(
+                    f"The internal dynamics have the eigenvalue {on_axis[0]:.4g} 1/s at the {where} of the program.",
+                    "The bounded motion is unique only where no eigenvalue lies on the imaginary axis.",
+                    do="Choose another output, or add damping.",
+                    t=end.t,
+                    eigenvalues=values.tolist(),
+                )
+        unstable = [int((end.eigenvalues.real > 0).sum()) for end in (self.first, self.last)]
+        if unstable[0] != unstable[1]:
+            raise UnstableInternalDynamics(
+                f"The internal dynamics have {unstable[0]} unstable modes at the begin, {unstable[1]} at the end.",
+                "An isolated bounded motion has as many at both ends.",
+                do="Begin and end in equilibria of the same kind.",
+                unstable=unstable,
+            )
+
+    def window(self, length):
+        """Begin and end [s] of a window that exceeds the span by `length` time constants, rounded up to two digits."""
+        (t0, t1), before, after = self.span, self.first.eigenvalues.real, self.last.eigenvalues.real
+        begin = t0 - _two_digits(length / before[before > 0].min(initial=np.inf))
+        end = t1 + _two_digits(length / -after[after < 0].max(initial=-np.inf))
+        for end_state, t in ((self.first, begin), (self.last, end)):
+            self._require_rest(end_state, t)
+        return float(begin), float(end)
+
+    def _require_rest(self, end, t):
+        """Refuse a program that does not stand still between an end of its span and t."""
+        times = np.linspace(end.t, t, 6)[1:]
+        x = self._quasi_static(times, np.repeat(end.x[:, None], len(times), axis=1))
+        change = np.abs((x - end.x[:, None])[self.free] / self.size[self.free, None]).max(axis=0, initial=0.0)
+        if not change.max(initial=0.0) <= STANDS:
+            moved = times[int(np.argmax(~(change <= STANDS)))]
+            raise SpecificationError(
+                f"The internal dynamics have another equilibrium at t = {moved:.4g} s than at t = {end.t:.4g} s.",
+                "Outside the span the program stands still, so that the bounded motion has a rest to leave or reach.",
+                do="Choose the span of the whole transition, paths that rest outside it, or a shorter window.",
+                t=float(moved),
+                span=self.span,
+            )
+
+    # collocation
+
+    def solve(self, window, knots, rtol, near=None):
+        """The mesh (N + 1,) [s] and the states (n_x, 1 + N s) at its begin and at all nodes.
+
+        The mesh begins with that of a solution for a shorter window, or is as fine as the fastest mode requires.
+        """
+        mesh = self._first_mesh(window, near[0] if near else [*self.span, *knots])
+        x = self.at(self._nodes(mesh), *near) if near else self._guess(mesh)
+        for _ in range(REFINEMENTS):
+            x = self._newton(mesh, x)
+            defect = self._defect(mesh, x) if rtol < np.inf else np.zeros(1)
+            if defect.max() <= rtol:
+                return mesh, x
+            pieces = np.ceil((defect / (AIM * rtol)) ** (1 / len(self.c))).astype(int)
+            finer = _cut(mesh, np.where(defect > AIM * rtol, np.clip(pieces, 2, MOST_PIECES), 1))
+            if len(finer) > MOST_INTERVALS:
+                break
+            x = self.at(self._nodes(finer), mesh, x)
+            mesh = finer
+        worst = mesh[int(np.argmax(defect))]
+        raise self._failure(f"The defect is still {defect.max():.1e} with {len(mesh) - 1} intervals.", worst)
+
+    def _guess(self, mesh):
+        """Equilibria at frozen instants; the straight line between the ends where there is none."""
+        nodes = self._nodes(mesh)
+        part = np.clip((nodes - self.span[0]) / (self.span[1] - self.span[0]), 0.0, 1.0)
+        straight = self.first.x[:, None] + (self.last.x - self.first.x)[:, None] * part
+        x = self._quasi_static(nodes, straight)
+        return np.where(np.isfinite(x).all(axis=0), x, straight)
+
+    def _first_mesh(self, window, corners):
+        fastest = max(np.abs(end.eigenvalues).max(initial=0.0) for end in (self.first, self.last))
+        corners = np.array(breakpoints(window, sorted(set(corners))))
+        counts = np.maximum(1, np.ceil(np.diff(corners) * fastest / LONGEST)).astype(int)
+        return _cut(corners, np.minimum(counts, MOST_INTERVALS // len(counts)))
+
+    def _nodes(self, mesh):
+        return np.append(mesh[0], (mesh[:-1, None] + np.diff(mesh)[:, None] * self.c).ravel())
+
+    def _newton(self, mesh, x):
+        """Solve the collocation equations from an approximation x (n_x, 1 + N s)."""
+        nodes, last = self._nodes(mesh), np.inf
+        for _ in range(NEWTON_STEPS):
+            self.iterations += 1
+            step = self._newton_step(nodes, np.diff(mesh), x)
+            size = np.abs(step / self.size[:, None]).max()
+            if not np.isfinite(size):
+                break
+            x = x + step
+            if size <= NEWTON_ENDS or 0.1 * last < size <= STALLED:
+                return x
+            last = size
+        raise self._failure("Newton's method for the bounded motion does not converge.", self.span[0])
+
+    def _newton_step(self, nodes, h, x):
+        """The Newton step (n_x, 1 + N s): stages are eliminated interval by interval, then the ends are solved for."""
+        rate, A, step, tangent = self.local(nodes, x)
+        count, s, f = len(h), len(self.c), len(self.free)
+        z = x[self.free].T
+        stages, begin = z[1:].reshape(count, s, f), z[:-1:s]
+        # D (ζ - z) - h z' = 0 with the increments ζ of the stages over the begin of their interval
+        length = h[:, None, None]
+        values = self.derivative @ (stages - begin[:, None]) - length * rate[1:].reshape(count, s, f)
+        K = np.tile(np.kron(self.derivative, np.eye(f)), (count, 1, 1)).reshape(count, s, f, s, f)
+        inside = A[1:].reshape(count, s, f, f)
+        for j in range(s):
+            K[:, j, :, j] -= length * inside[:, j]
+        onto_begin = np.tile(np.kron(self.derivative.sum(axis=1)[:, None], np.eye(f)), (count, 1, 1))
+        right = np.concatenate([-values.reshape(count, s * f, 1), onto_begin], axis=2)
+        eliminated = np.linalg.solve(K.reshape(count, s * f, s * f), right)
+        ends = self._solve_ends(eliminated[:, -f:, 0], eliminated[:, -f:, 1:], z)
+        inner = eliminated[:, :, 0] + (eliminated[:, :, 1:] @ ends[:-1, :, None])[:, :, 0]
+        dz = np.concatenate([ends[:1], inner.reshape(count * s, f)])
+        return (step + (tangent @ dz[:, :, None])[:, :, 0]).T
+
+    def _solve_ends(self, constants, factors, z):
+        """Steps (N + 1, f) at the mesh points: dz_(i+1) = constants_i + factors_i dz_i between the boundary rows."""
+        from scipy.linalg import solve_banded
+
+        before, after = self.first.left_space(unstable=False), self.last.left_space(unstable=True)
+        count, f, k = len(constants), z.shape[1], len(before)
+        matrix, right = np.zeros((4 * f + 1, (count + 1) * f)), np.zeros((count + 1) * f)
+
+        def put(rows, columns, values):
+            matrix[2 * f + rows - columns, columns] = values
+
+        i, j = np.indices((k, f))
+        put(i, j, before)
+        right[:k] = -before @ (z[0] - self.first.x[self.free])
+        n, i, j = np.indices((count, f, f))
+        put(k + n * f + i, n * f + j, -factors)
+        n, i = np.indices((count, f))
+        put(k + n * f + i, (n + 1) * f + i, 1.0)
+        right[k : k + count * f] = constants.ravel()
+        i, j = np.indices((f - k, f))
+        put(k + count * f + i, count * f + j, after)
+        right[k + count * f :] = -after @ (z[-1] - self.last.x[self.free])
+        return solve_banded((2 * f, 2 * f), matrix, right).reshape(count + 1, f)
+
+    # between the nodes
+
+    def at(self, t, mesh, x):
+        """States (n_x, N) at times within the mesh; before and after it the equilibria."""
+        k = np.clip(np.searchsorted(mesh, t, side="right") - 1, 0, len(mesh) - 2)
+        theta = (t - mesh[k]) / (mesh[k + 1] - mesh[k])
+        values = self._polynomial(x, k, basis(self.c, theta))
+        values = self._on_invariants(t, values)
+        values[:, t < mesh[0]], values[:, t > mesh[-1]] = self.first.x[:, None], self.last.x[:, None]
+        return values
+
+    def _polynomial(self, x, k, weights):
+        """Values (n_x, N) in intervals k (N,) from the weights (s, N) of the increments over their begins."""
+        s = len(self.c)
+        begin = x[:, k * s]
+        stages = x[:, 1:].reshape(self.n_x, -1, s)[:, k]
+        return begin + np.einsum("xns,sn->xn", stages - begin[:, :, None], weights)
+
+    def _on_invariants(self, t, x):
+        for _ in range(LIFTED):
+            _, _, g, G = self._evaluated(t, x)
+            x = x.copy()
+            x[self.solved] -= np.linalg.solve(G[:, :, self.solved], g[:, :, None])[:, :, 0].T
+        return x
+
+    def _defect(self, mesh, x):
+        """Largest h (z' - f) between the nodes of each interval, relative to the sizes of z, (N,)."""
+        count, h, free = len(mesh) - 1, np.diff(mesh), self.free
+        k, theta = np.repeat(np.arange(count), len(BETWEEN)), np.tile(BETWEEN, count)
+        t = mesh[k] + theta * h[k]
+        change = self._polynomial(x, k, _basis_rates(self.c, theta)) - x[:, k * len(self.c)]
+        values = self._on_invariants(t, self._polynomial(x, k, basis(self.c, theta)))
+        rates = self.local(t, values)[0].T
+        defect = np.abs(change[free] - h[k] * rates) / self.size[free, None]
+        return defect.max(axis=0, initial=0.0).reshape(count, -1).max(axis=1)
+
+    def distance(self, x, y):
+        """Largest difference of two motions (n_x, N), relative to the sizes of the state's entries."""
+        return float(np.abs((x - y) / self.size[:, None]).max(initial=0.0))
+
+    def require_pivots(self, t, pivots):
+        """Refuse a motion along which a pivot changes its sign."""
+        turned = (pivots * pivots[:, :1] <= 0).any(axis=0)
+        if turned.any():
+            k = int(np.argmax(turned))
+            raise SingularProgram(
+                f"A pivot of the equations vanishes at about t = {t[k]:.6g} s along the bounded motion.",
+                "The equations of motion lose rank there, or need other pivots.",
+                do="Choose a guess near this instant in derive(..., guess=), a slower path or another output.",
+                t=float(t[k]),
+            )
+
+    def _failure(self, what, t):
+        return IntegrationStopped(
+            what,
+            "The bounded motion joins two equilibria of the internal dynamics.",
+            do="Give a start near the first equilibrium, or a smaller or slower path.",
+            t=float(t),
+        )
+
+
+def _equations(model):
+    """One compiled function: X', ∂X'/∂X, the invariants and their Jacobian, both by columns."""
+    rates, slopes, invariants = (model.function(name).expression for name in ("ode", "ode_jacobian", "invariants"))
+    t, x, p = (ca.SX.sym(name, rates.size1_in(i)) for i, name in enumerate("txp"))
+    values = [rates(t, x, p)[: rates.size1_in(1)], slopes(t, x, p), invariants(t, x, p)]
+    f = ca.Function("bounded", [t, x, p], [ca.densify(ca.cse(ca.vertcat(*values)))])
+    return compiled(f, "bounded", ("rk",))  # which is called at many points, and therefore compiled
+
+
+def _two_digits(length):
+    """A length rounded up to two digits, so that windows hold whole samples."""
+    digit = 10.0 ** (np.floor(np.log10(length)) - 1) if length > 0 else 1.0
+    return float(np.round(np.ceil(length / digit * (1 - 1e-12)) * digit, 12))
+
+
+def _cut(mesh, counts):
+    """The mesh with each interval cut into so many, (N,) int."""
+    pieces = [np.linspace(a, b, n + 1)[:-1] for a, b, n in zip(mesh[:-1], mesh[1:], counts, strict=True)]
+    return np.append(np.concatenate(pieces), mesh[-1])
+
+
+def _level_sizes(values, levels):
+    """Size of each entry (n_x,): the largest value at its level, of values (n_x, N); 1 where a level is zero."""
+    largest = np.array([np.abs(values[levels == level]).max() for level in levels])
+    return np.where(largest > 0, largest, 1.0)
+
+
+def _basis_rates(c, theta):
+    """Derivatives of `basis` (s, N) at theta (N,)."""
+    nodes = np.append(0.0, c)
+    powers = np.arange(1, len(nodes))
+    coefficients = np.linalg.inv(np.vander(nodes, increasing=True))[1:, 1:]
+    return coefficients.T @ (powers[:, None] * theta ** (powers[:, None] - 1))

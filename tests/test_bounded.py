@@ -1,0 +1,220 @@
+"""Bounded motions of programs with unstable internal dynamics: known answers, a second opinion, refusals."""
+
+from math import pi
+
+import casadi as ca
+import numpy as np
+import pytest
+from refusals import refused
+
+import servoctl as sv
+from servoctl.errors import IntegrationStopped, SpecificationError, UnstableInternalDynamics
+from servoctl.gallery import gallery
+
+
+def arm(Gamma, duration=2.0, **numbers):
+    """Two equal homogeneous links in the plane, a torque on the first, a spring and a damper in the second joint."""
+    p = sv.parameters(m=6.875, l=1.0, I=0.57, c=50.0, d=0.25, Gamma=Gamma)
+    q = sv.coordinates("q1 q2")
+    (q1, q2), (dq1, dq2) = q, q.d(1)
+    links = [ca.vertcat(ca.cos(a), ca.sin(a)) for a in (q1, q1 + q2)]
+    S = sv.rigid_body(q, p.m, (0, 0, p.I), position=p.l / 2 * links[0], rates=(0, 0, dq1))
+    S += sv.rigid_body(q, p.m, (0, 0, p.I), position=p.l * links[0] + p.l / 2 * links[1], rates=(0, 0, dq1 + dq2))
+    mechanism = sv.Mechanism(
+        q, gibbs=S, potential=p.c * q2**2 / 2, forces={"q2": -p.d * dq2}, actuators={"torque": q1}, parameters=p
+    )
+    path = sv.paths.rest_to_rest(q.t, 0.0, pi / 2, duration=duration, smoothness=4)
+    return sv.derive(mechanism, sv.Program({"angle": q1 + p.Gamma * q2 - path})).with_parameters(**numbers)
+
+
+def aircraft():
+    """The centre of mass of the gallery's aircraft, from (0, 0) to (10, 5) m in 3 s."""
+    mechanism, _ = gallery["vtol-centre"].build()
+    x, z, _ = mechanism.q
+    path = sv.paths.rest_to_rest(mechanism.q.t, (0.0, 0.0), (10.0, 5.0), duration=3.0, smoothness=4)
+    return sv.derive(mechanism, sv.Program({"X": x - path[0], "Z": z - path[1]}))
+
+
+def cart_pole(path, start=0.0, damping=0.0):
+    """A pole on a cart that follows a path; the pole stands upright at 0."""
+    q = sv.coordinates("x a")
+    x, a = q
+    S = sv.particle(q, 1.0, (x, 0)) + sv.particle(q, 0.2, (x + 0.5 * ca.sin(a), 0.5 * ca.cos(a)))
+    mechanism = sv.Mechanism(
+        q, gibbs=S, potential=0.2 * 9.81 * 0.5 * ca.cos(a), forces={"a": -damping * q.d(1)[1]}, actuators={"F": x}
+    )
+    model = sv.derive(mechanism, sv.Program({"x": x - path(q.t)}))
+    return model, model.start(a=start, da=0.0)
+
+
+def step(duration=1.0):
+    return lambda t: sv.paths.rest_to_rest(t, 0.0, 1.0, duration=duration, smoothness=4)
+
+
+def test_the_passive_arm_of_known_numbers():
+    model = arm(0.5)
+    run = sv.simulate(model, model.start(), (0.0, 2.0), sv.Bounded())
+    assert run.state(0.5)[1] == pytest.approx(-0.308555247, abs=1e-9)
+    assert run.state(1.5)[1] == pytest.approx(0.312284407, abs=1e-9)
+    fine = sv.simulate(model, model.start(), (0.0, 2.0), sv.Bounded(), t_eval=np.linspace(0.0, 2.0, 20001))
+    assert np.degrees(np.abs(fine["q2"]).max()) == pytest.approx(19.303385, abs=1e-6)
+    assert fine["torque"].min() == pytest.approx(-48.83509, abs=1e-5)
+    assert fine["torque"].max() == pytest.approx(48.88454, abs=1e-5)
+    assert run.t[0] < -1.0 and run.t[-1] > 3.0 and abs(run["torque"][0]) < 1e-2  # moves ahead of the program
+    assert sv.verify(model, run).passed
+
+
+def test_the_aircraft_of_known_numbers():
+    model = aircraft()
+    run = sv.simulate(model, model.start(), (0.0, 3.0), "bounded")
+    assert run.state(0.75)[2] == pytest.approx(-0.563010398, abs=1e-9)
+    assert run.state(2.25)[2] == pytest.approx(1.033108370, abs=1e-9)
+    fine = sv.simulate(model, model.start(), (0.0, 3.0), "bounded", t_eval=np.linspace(0.0, 3.0, 20001))
+    assert np.degrees(np.abs(fine["theta"]).max()) == pytest.approx(64.8117, abs=1e-4)
+    thrusts = np.stack([fine["u1"], fine["u2"]])
+    assert thrusts.min() == pytest.approx(131.3045, abs=1e-4) and thrusts.max() == pytest.approx(485.9057, abs=1e-4)
+    assert sv.verify(model, run).passed
+
+
+def test_a_general_solver_finds_the_same_motion():
+    """scipy's solve_bvp on the pole's own equation, a'' = (g sin a - x'' cos a)/l, over a window of 3 s beside it."""
+    from scipy.integrate import solve_bvp
+
+    model, start = cart_pole(step())
+    run = sv.simulate(model, start, (0.0, 1.0), sv.Bounded())
+    t = ca.SX.sym("t")
+    jerk = ca.Function("a", [t], [ca.jacobian(ca.jacobian(step()(t), t), t)])
+    rate = np.sqrt(9.81 / 0.5)
+
+    def rates(t, y):
+        return np.array([y[1], (9.81 * np.sin(y[0]) - np.array(jerk(t[None])).ravel() * np.cos(y[0])) / 0.5])
+
+    def ends(left, right):  # the stable component is zero before the program, the unstable one after it
+        return np.array([left[1] - rate * left[0], right[1] + rate * right[0]])
+
+    times = np.linspace(-3.0, 4.0, 1401)
+    other = solve_bvp(rates, ends, times, np.zeros((2, len(times))), tol=1e-9, max_nodes=100000)
+    assert other.success
+    inside = (run.t > -1.0) & (run.t < 2.0)
+    assert run["a"][inside] == pytest.approx(other.sol(run.t[inside])[0], abs=1e-8)
+
+
+def test_it_is_a_forward_motion_where_the_internal_dynamics_are_stable():
+    model = sv.derive(*gallery["passive-arm"].build())
+    run = sv.simulate(model, model.start(), (0.0, 2.0), sv.Bounded(), t_eval=np.linspace(0.0, 2.0, 101))
+    exact, start = sv.Taylor(rtol=1e-13, atol=1e-13), model.start(q2=0.0, dq2=0.0)
+    forward = sv.simulate(model, start, (0.0, 2.0), exact, t_eval=run.t)
+    assert run.jets == pytest.approx(forward.jets, abs=1e-8)
+    whole = sv.simulate(model, model.start(), (0.0, 2.0), sv.Bounded())
+    assert whole.t[0] == 0.0 and whole.t[-1] > 3.0  # nothing to do ahead of it
+
+
+@pytest.mark.parametrize("make, span", [(lambda: arm(0.5), (0.0, 2.0)), (aircraft, (0.0, 3.0))], ids=["arm", "aircraft"])
+def test_the_error_of_the_window_falls_with_its_length(make, span):
+    model = make()
+    errors, said = [], []
+    exact = sv.simulate(model, model.start(), span, sv.Bounded(25.0), t_eval=np.linspace(*span, 201))
+    for window in (1.0, 1.5, 2.0, 2.5, 3.0):
+        run = sv.simulate(model, model.start(), span, sv.Bounded(window), t_eval=exact.t)
+        errors.append(np.abs((run.jets - exact.jets)[: len(model.state_names)]).max())
+        said.append(float(run.message.split()[-1]))
+    falls = -np.diff(np.log(errors)) / 0.5
+    assert falls.min() > 1.0  # exp(-window), or faster
+    assert (np.array(said) > 0.05 * np.array(errors)).all() and (np.array(said) < 5 * np.array(errors)).all()
+
+
+@pytest.mark.parametrize("duration", [1.0, 0.5, 0.2, 0.1])
+def test_quick_steps_of_a_cart_pole(duration):
+    model, start = cart_pole(step(duration))
+    run = sv.simulate(model, start, (0.0, duration), sv.Bounded())
+    assert run["a"][0] > 0 > run["a"][-1] and sv.verify(model, run).passed  # leans forward before the cart moves
+    assert np.abs(run["x"][run.t <= 0]).max() < 1e-12
+
+
+def test_material_constraints_and_quasi_velocities_change_nothing():
+    model, start = cart_pole(step())
+    expected = sv.simulate(model, start, (0.0, 1.0), sv.Bounded(), t_eval=np.linspace(0.0, 1.0, 101))
+    q = sv.coordinates("x X Z")  # the pole's tip by its position, on a rod
+    x, X, Z = q
+    S = sv.particle(q, 1.0, (x, 0)) + sv.particle(q, 0.2, (X, Z))
+    mechanism = sv.Mechanism(
+        q, gibbs=S, potential=0.2 * 9.81 * Z, actuators={"F": x}, constraints={"rod": (X - x) ** 2 + Z**2 - 0.25}
+    )
+    absolute = sv.derive(mechanism, sv.Program({"x": x - step()(q.t)}), guess={"Z": 0.5})
+    run = sv.simulate(absolute, absolute.start(guess={"Z": 0.5}), (0.0, 1.0), sv.Bounded(), t_eval=expected.t)
+    assert run["X"] == pytest.approx(expected["x"] + 0.5 * np.sin(expected["a"]), abs=1e-9)
+    assert run["F"] == pytest.approx(expected["F"], abs=1e-7)
+    q = sv.coordinates("x a").with_quasi_velocities("u v", [[1, 0], [-2 * ca.cos(0.3), 1]])
+    x, a = q
+    S = sv.particle(q, 1.0, (x, 0)) + sv.particle(q, 0.2, (x + 0.5 * ca.sin(a), 0.5 * ca.cos(a)))
+    mechanism = sv.Mechanism(q, gibbs=S, potential=0.2 * 9.81 * 0.5 * ca.cos(a), actuators={"F": x})
+    other = sv.derive(mechanism, sv.Program({"x": x - step()(q.t)}))
+    run = sv.simulate(other, other.start(guess={"a": 0.0}), (0.0, 1.0), sv.Bounded(), t_eval=expected.t)
+    assert run["a"] == pytest.approx(expected["a"], abs=1e-9) and run["F"] == pytest.approx(expected["F"], abs=1e-7)
+
+
+def test_a_law_follows_the_bounded_plan():
+    model = arm(0.5)
+    plan = sv.simulate(model, model.start(), (0.0, 2.0), sv.Bounded(15.0), t_eval=None)
+    plant = sv.plant(model.reduction.mechanism)
+    law = sv.lqr(plan, plant, rate=1000.0)
+    run = sv.close(plant, law, plan.state(plan.t[0]), (plan.t[0], plan.t[-1]))
+    angle = run["q1"] + 0.5 * run["q2"]
+    planned = np.interp(run.t, plan.t, plan["q1"] + 0.5 * plan["q2"])
+    assert np.abs(angle - planned).max() < 1e-5 * pi / 2
+
+
+# refusals -------------------------------------------------------------------------------------------------------------
+
+
+def test_internal_dynamics_on_the_imaginary_axis_are_refused():
+    model, start = cart_pole(step(), start=pi)
+    with refused(UnstableInternalDynamics, "imaginary axis", t=0.0):
+        sv.simulate(model, start, (0.0, 1.0), sv.Bounded())
+
+
+def test_ends_that_differ_in_their_unstable_modes_are_refused():
+    """A pole on a cart under a spring that its position switches: upright is stable at one end alone."""
+    q = sv.coordinates("x a")
+    x, a = q
+    S = sv.particle(q, 1.0, (x, 0)) + sv.particle(q, 0.2, (x + 0.5 * ca.sin(a), 0.5 * ca.cos(a)))
+    U = 0.2 * 9.81 * 0.5 * ca.cos(a) + (1 - x) * 5.0 * a**2 / 2
+    mechanism = sv.Mechanism(q, gibbs=S, potential=U, forces={"a": -0.2 * q.d(1)[1]}, actuators={"F": x})
+    model = sv.derive(mechanism, sv.Program({"x": x - step()(q.t)}))
+    with refused(UnstableInternalDynamics, unstable=[0, 1]):
+        sv.simulate(model, model.start(a=0.0, da=0.0), (0.0, 1.0), sv.Bounded())
+
+
+@pytest.mark.parametrize("path, end", [(lambda t: ca.sin(3 * t), 1.0), (step(), 0.6)], ids=["oscillates", "cut short"])
+def test_a_program_that_does_not_stand_still_outside_its_span_is_refused(path, end):
+    model, start = cart_pole(path)
+    with refused(SpecificationError, "stands still", span=(0.0, end)):
+        sv.simulate(model, start, (0.0, end), sv.Bounded())
+
+
+def test_switches_of_the_state_are_refused():
+    q = sv.coordinates("x a")
+    x, a = q
+    S = sv.particle(q, 1.0, (x, 0)) + sv.particle(q, 0.2, (x + 0.5 * ca.sin(a), 0.5 * ca.cos(a)))
+    U = 0.2 * 9.81 * 0.5 * ca.cos(a)
+    mechanism = sv.Mechanism(q, gibbs=S, potential=U, forces={"a": -0.1 * ca.sign(q.d(1)[1])}, actuators={"F": x})
+    model = sv.derive(mechanism, sv.Program({"x": x - step()(q.t)}))
+    with refused(SpecificationError, "kinks or switches"):
+        sv.simulate(model, model.start(a=0.0, da=0.0), (0.0, 1.0), sv.Bounded())
+
+
+def test_what_bounded_motions_do_not_take_is_refused(gallery_model):
+    model, start = cart_pole(step())
+    with refused(SpecificationError, "(0, 1)", t_span=(1.0, 0.0)):
+        sv.simulate(model, model.start(t=1.0, a=0.0, da=0.0), (1.0, 0.0), sv.Bounded())
+    with refused(SpecificationError, "Project", method="bounded"):
+        sv.simulate(model, start, (0.0, 1.0), sv.Bounded(), drift="project")
+    crane = gallery_model("overhead-crane")
+    with refused(SpecificationError, "algebraic", free=0):
+        sv.simulate(crane, crane.start(guess=gallery["overhead-crane"].guess), (0.0, 8.0), sv.Bounded())
+    wheel = gallery_model("appell-hamel")
+    with refused(IntegrationStopped, "equilibrium"):
+        sv.simulate(wheel, wheel.start(**gallery["appell-hamel"].start), (0.0, 1.0), sv.Bounded())
+    for window in (0.0, -1.0, 1e4, "long", None):
+        with refused(SpecificationError, "window", window=window):
+            sv.Bounded(window)
