@@ -64,8 +64,7 @@ class ScipySteps(Stepping):
 
     def _piece(self, a, x, b, times):
         self.pending, self.forward = np.asarray(times), 1.0 if b >= a else -1.0
-        solver, steps, outcome, shortened, again = self._begun(a, x, b), 0, Fine(0), 0, 0
-        self.tried = None
+        solver, steps, outcome, shortened = self._begun(a, x, b), 0, Fine(0), 0
         while solver.status == "running":
             t, x = solver.t, solver.y.copy()
             message = _step(solver)
@@ -74,11 +73,9 @@ class ScipySteps(Stepping):
                 self._keep_last(t, x)
                 break
             steps, dense = steps + 1, solver.dense_output()
-            if self._doubted(t, x, solver.t, dense):
-                again = again + 1 if t == self.tried else 0
-                if again < SHORTENINGS:
-                    self.tried, solver = t, self._shortened(solver, t, x, b)
-                    continue
+            if self._repeats(t, solver.t, dense):
+                solver = self._shortened(solver, t, x, b)
+                continue
             outcome = self._inspected(self._stretch(t, x, solver, dense))
             if isinstance(outcome, Fine):
                 if self.restore is not None and (steps % self.drift.every == 0 or solver.status == "finished"):
@@ -119,7 +116,7 @@ class ScipySteps(Stepping):
 
     def _begun(self, t, x, b):
         """The solver of a piece."""
-        self.mark = t
+        self.mark, self.tried = t, (t, 0)
         self.monitor.begin(self._pivots(t, x))
         self.watch.begin(t)
         self._sample(t, None, x)
@@ -132,7 +129,12 @@ class ScipySteps(Stepping):
         self.monitor.begin(self._pivots(t, x))
         return self._solver(t, x, b, first_step=SHORTER * length)
 
-    def _doubted(self, t, x, end, dense):
+    def _repeats(self, t, end, dense):
+        """Whether a step from t is repeated, since a shorter one may meet the equations."""
+        self.tried = t, self.tried[1] + 1 if self.tried[0] == t else 0
+        return self.tried[1] < SHORTENINGS and self._doubted(t, end, dense)
+
+    def _doubted(self, t, end, dense):
         """Whether a long step does not meet the equations at the samples within it.
 
         Its stages know nothing of what is flat at all of them, such as a narrow bump.
