@@ -67,10 +67,7 @@ class ScipySteps(Stepping):
         solver, steps, outcome, shortened = self._begun(a, x, b), 0, Fine(0), 0
         while solver.status == "running":
             t, x = solver.t, solver.y.copy()
-            message = _step(solver)
-            if solver.status == "failed" or not np.all(np.isfinite(solver.y)):
-                self._fail(t, x, (message or "the state is no longer finite").rstrip("."))
-                self._keep_last(t, x)
+            if not self._stepped(solver, t, x):
                 break
             steps, dense = steps + 1, solver.dense_output()
             if self._repeats(t, solver.t, dense):
@@ -128,6 +125,15 @@ class ScipySteps(Stepping):
         self._count(solver)
         self.monitor.begin(self._pivots(t, x))
         return self._solver(t, x, b, first_step=SHORTER * length)
+
+    def _stepped(self, solver, t, x):
+        """Whether a step from t, X = x succeeds; the motion stops if not."""
+        message = _step(solver)
+        if solver.status != "failed" and np.all(np.isfinite(solver.y)):
+            return True
+        self._fail(t, x, (message or "the state is no longer finite").rstrip("."))
+        self._keep_last(t, x)
+        return False
 
     def _repeats(self, t, end, dense):
         """Whether a step from t is repeated, since a shorter one may meet the equations."""
