@@ -370,6 +370,7 @@ def _resolved(model, run):
     return None
 
 
+@np.errstate(all="ignore")
 def _instants(model, run, finite, count):
     """Samples, instants and states at `count` + 1 irregular instants or more; None if the states fail.
 
@@ -478,7 +479,10 @@ def _steps(tangents):
     omega = h * ((0.5 - w * (1 - c)) * B0 + w * B + (0.5 - w * c) * B1)
     small = _frobenius(omega)[:, None, None] < 1  # where the series converges
     omega = omega - small * h**2 / 12 * (B0 @ B1 - B1 @ B0)
-    return np.linalg.solve(G1, _exponential(omega) @ G0)
+    try:
+        return np.linalg.solve(G1, _exponential(omega) @ G0)
+    except np.linalg.LinAlgError:  # Ω so large that e^Ω is lost to rounding
+        return None
 
 
 def _exponential(omega):

@@ -204,8 +204,8 @@ def test_steps_that_do_not_resolve_the_motion_before_a_knot_are_warned_about():
         sv.simulate(model, start, span, method=sv.RungeKutta(4, step=0.15))
 
 
-def test_steps_over_a_singularity_are_warned_about():
-    """A point on a circle follows x = t, which ends at t = 1 s; long explicit steps jump over that."""
+def test_steps_over_a_singularity_end_there():
+    """A point on a circle follows x = t, which ends at t = 1 s; long explicit steps do not jump over that."""
     q = sv.coordinates("s x y")
     s, x, y = q
     mechanism = sv.Mechanism(
@@ -217,8 +217,9 @@ def test_steps_over_a_singularity_are_warned_about():
     model = sv.derive(mechanism, sv.Program({"path": x - q.t}), guess={"y": -1.0})
     start = model.start(s=0.0, ds=1.0, guess={"y": -1.0})
     for drift in (None, 0.5, "project"):
-        with warned("RK4", "resolve"):
+        with refused(sv.SingularProgram, rows=["path", "circle"]) as caught:
             sv.simulate(model, start, (0.0, 1.5), method=sv.RungeKutta(4, step=0.3), drift=drift)
+        assert caught.value.details["t"] == pytest.approx(1.0, abs=0.02)
 
 
 @pytest.mark.parametrize("step, span", [(None, 50.0), (0.05, 20.0)])

@@ -9,6 +9,7 @@ from refusals import refused
 from scipy.integrate import solve_ivp
 
 import servoctl as sv
+from servoctl.model.switching import switching
 
 ONE_STEP = ("DOP853", "RK45", "Radau", "LSODA", "Taylor", "RadauIIA", "RK4", "RK8")
 MULTISTEP = ("BDF", "CVODES", "IDAS")  # at their default rtol of 1e-9 the smooth motion itself errs by 1e-7
@@ -256,8 +257,8 @@ def test_a_program_that_ends_stops_the_motion_there(name, method, drift):
         sv.simulate(model, start, (0.0, 1.3 * end), method, drift=drift)
     assert type(caught.value) in (sv.IntegrationStopped, sv.SingularProgram)
     assert why in str(caught.value) or type(caught.value) is sv.SingularProgram
-    # a rate jumps where x reaches 1; where dx does, the residual itself leaves slowly, up to 1 % of its terms
-    late = 5e-3 if name == "asin" else 0.15
+    # a rate jumps where x reaches 1; where dx does, the residual itself leaves slowly, up to 1e-3 of its terms
+    late = 5e-3 if name == "asin" else 0.05 if method == "LSODA" else 0.02  # LSODA fails before
     assert caught.value.details["t"] == pytest.approx(end, abs=late)
     run = caught.value.run
     assert 0.97 * end < run.t[-1] < end + late and np.abs(run.residual["p"][0]).max() < late
@@ -331,3 +332,12 @@ def test_an_accuracy_holds_beyond_a_half_turn():
     model, start = ideal(lambda t, x, y, dx, dy: ca.atan2(dy, dx) - t, dx=1.0, x=0.0, y=0.0)
     run = sv.simulate(model, start, (0.0, 8.0), accuracy=1e-8)
     assert np.abs(run["x"] - np.sin(run.t)).max() < 1e-8
+
+
+def test_rates_of_powers_have_no_switches():
+    """They ask whether the base is zero, which is no kink."""
+    q = sv.coordinates("x y")
+    (dx, dy), (d2x, d2y) = q.d(1), q.d(2)
+    bend = q.dt((dx * d2y - dy * d2x) / (dx**2 + dy**2) ** 1.5, 2)
+    mechanism = sv.Mechanism(q, gibbs=sv.particle(q, 1.0, tuple(q)))
+    assert switching(sv.derive(mechanism, sv.Program({"bend": bend}, by="ideal"))) is None

@@ -246,17 +246,36 @@ def blended(blend):
     return model, ca.Function("f", [T, ca.vertcat(X, v)], [ca.vertcat(v, acceleration)])
 
 
-@pytest.mark.parametrize("name", BLENDS)
-def test_what_comes_alive_later_or_elsewhere_acts(name):
-    model, f = blended(BLENDS[name])
-    start = (1.0, 0.0) if "time" in name else (1.0, 6.0 if "bump" in name else 3.5)
+FLAT = {  # where a motion starts: even their rates are zero to all digits there
+    "narrow bump": lambda t, x: 0.3 * ca.exp(-((100 * (t - 3)) ** 2)) * x,
+    "steep in time": lambda t, x: 0.3 * (1 + ca.tanh(200 * (t - 4))) * x,
+}
+
+
+@pytest.mark.parametrize("name", [*BLENDS, *FLAT])
+@pytest.mark.parametrize("method", [None, "Taylor", {"accuracy": 1e-7}], ids=["default", "Taylor", "accuracy"])
+def test_what_comes_alive_later_or_elsewhere_acts(name, method):
+    model, f = blended({**BLENDS, **FLAT}[name])
+    start = (1.0, 0.0) if "place" not in name and "dwell" not in name else (1.0, 6.0 if "bump" in name else 3.5)
     span = (0.0, 42.0 if "far" in name else 5.0)
-    run = sv.simulate(model, model.start(x=start[0], dx=start[1]), span)
+    settings = method if isinstance(method, dict) else {"method": method}
+    run = sv.simulate(model, model.start(x=start[0], dx=start[1]), span, **settings)
     reference = solve_ivp(
-        lambda t, s: f(t, s).full().ravel(), span, start, "DOP853", rtol=1e-10, atol=1e-12, max_step=0.02
+        lambda t, s: f(t, s).full().ravel(), span, start, "DOP853", rtol=1e-10, atol=1e-12, max_step=0.005
     )
     assert [run["x"][-1], run["dx"][-1]] == pytest.approx(reference.y[:, -1], abs=2e-6)
-    assert np.abs(run.residual["Y"][0]).max() < 1e-7
+    assert np.abs(run.residual["Y"][0]).max() < (5e-7 if method == "Taylor" else 1e-7)
+
+
+@pytest.mark.parametrize("method", ["DOP853", "RK45", "Radau", "BDF", "LSODA", "Taylor"])
+def test_a_bump_while_the_motion_rests_is_not_stepped_over(method):
+    """The steps of a motion at rest are the longest; the bump, 0.03 s of 40 s, is narrower than any of them."""
+    model, f = blended(lambda t, x: 0.3 * ca.exp(-((100 * (t - 33.3)) ** 2)) * x)
+    run = sv.simulate(model, model.start(x=0.0, dx=0.0), (0.0, 40.0), method)
+    reference = solve_ivp(
+        lambda t, s: f(t, s).full().ravel(), (33.0, 40.0), (0.0, 0.0), "DOP853", rtol=1e-10, atol=1e-13, max_step=0.005
+    )
+    assert abs(reference.y[0, -1]) > 1e-3 and abs(run["x"][-1] - reference.y[0, -1]) < 1e-8
 
 
 @pytest.mark.parametrize("blend", [lambda t: ca.fmax(0, t - 3) ** 5, lambda t: (1 + ca.tanh(40 * (t - 3))) / 2])

@@ -194,6 +194,42 @@ def domain_edges(expressions):
     return result
 
 
+_SIZES = {
+    ca.OP_ADD: lambda a, b: a + b,
+    ca.OP_SUB: lambda a, b: a + b,
+    ca.OP_MUL: lambda a, b: a * b,
+    ca.OP_NEG: lambda a: a,
+    ca.OP_TWICE: lambda a: 2 * a,
+    ca.OP_SQ: lambda a: a**2,
+}  # magnitudes of sums and products from those of their operands
+
+
+def size_of_terms(expression):
+    """The sum of the magnitudes of an expression's terms, multiplied out.
+
+    Parameters
+    ----------
+    expression : SX scalar
+
+    Returns
+    -------
+    SX scalar
+    """
+    values, sizes = [], []
+
+    def size(op, operands):
+        values.append(_apply(op, *(values[i] for i in operands)))
+        if op == ca.OP_DIV:
+            return sizes[operands[0]] / ca.fabs(values[operands[1]])
+        return _SIZES[op](*(sizes[i] for i in operands)) if op in _SIZES else ca.fabs(values[-1])
+
+    def leaf(expression, symbol):
+        values.append(expression)
+        return ca.fabs(expression)
+
+    return _replayed([expression], sizes, leaf, size)[0]
+
+
 def _replayed(expressions, work, leaf, value):
     """The outputs of expressions whose operations are taken one by one; `work` receives all values in their order.
 

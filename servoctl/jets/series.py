@@ -10,7 +10,7 @@ A `Motion` gives the coefficients of every symbol of an expression; a `Flow` is 
 """
 
 from copy import copy
-from math import factorial
+from math import factorial, prod
 
 import casadi as ca
 import numpy as np
@@ -168,8 +168,8 @@ class Series:
         if is_zero(total):
             return 0.0
         # The recurrence divides by a_0. Where a_0 = 0 coefficients below the exponent vanish, and all do where a = 0.
-        vanishes = a[0] if k < exponent else sum(apply("fabs", c) for c in a)
-        return select(vanishes == 0, 0.0, divide(total, multiply(k, a[0])))
+        zero = [1.0 * (c == 0) for c in (a[:1] if k < exponent else a) if not is_zero(c)]
+        return select(prod(zero), 0.0, divide(total, multiply(k, a[0])))
 
     def _quadrature(self, node, k):
         name, slopes = node.data

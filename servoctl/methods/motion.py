@@ -9,6 +9,7 @@ from servoctl.errors import ServoError
 from servoctl.methods.choice import MinimalCoordinates, Poles
 from servoctl.methods.monitor import VANISHING, Fine, Monitor, Repivot
 from servoctl.methods.watch import Watch, edge, no_model, sticks
+from servoctl.reduction.orders import other_order
 
 ADVICE = "Use a smaller rtol, another method or drift='project', or check whether the program ends or jumps there."
 
@@ -115,7 +116,7 @@ class Stepping:
     tolerances = None  # rtol and atol; None for steps of fixed length
     parts = 8  # of a step, at whose ends switching functions are evaluated; 1 where steps are short
     projects = False  # whether ends of steps are projected before they are inspected
-    again = None  # two steps of half the length, where steps are of fixed length
+    again = None  # shorter equal steps, where steps are of fixed length
 
     def __init__(self, model, method, drift, progress):
         self.method, self.drift, self.progress, self.motion = method, drift, progress, Motion()
@@ -201,7 +202,11 @@ class Stepping:
         try:
             model = self.family.at(branches)
         except ServoError as error:
-            self.motion.stop = no_model(self.method, end.t, self.watch.texts(end), error)
+            row, free, expected = (error.details.get(name) for name in ("row", "free", "expected"))
+            if row and expected is not None:
+                self.motion.stop = other_order(row, end.t, free, expected)
+            else:
+                self.motion.stop = no_model(self.method, end.t, self.watch.texts(end), error)
             return
         self.motion.stop = self.watch.jump(model, end)
         if self.motion.stop is None:

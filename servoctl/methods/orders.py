@@ -24,11 +24,9 @@ def end_at_other_orders(motion):
 
 
 def _other_order(model, name, t, jets):
-    """The error of a row whose order changes, with the number of free initial values on either side."""
+    """The error of a row whose order changes at t and jets."""
     try:
         free = model.near(t, jets[: len(model.jet_names)]).free
     except ServoError as error:
         free = error.details.get("free")
-    changes = free not in (None, model.free)
-    there = f", and from there on {free} initial values are free instead of {model.free}" if changes else ""
-    return other_order(name, t, there, free=free, expected=model.free)
+    return other_order(name, t, free, model.free)

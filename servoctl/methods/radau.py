@@ -278,7 +278,7 @@ class RadauSteps(BulkSteps):
         if step is None:
             self.tolerances = rtol, atol
         else:
-            self.again = self._two_steps
+            self.again = self._equal_steps
         super().__init__(model, "RadauIIA", drift, progress)
 
     def _function(self, model, poles):
@@ -296,10 +296,10 @@ class RadauSteps(BulkSteps):
     def halved(self, model, t, x, h):
         """States (n_x, 3) at t, t + h and t + 2 h by two steps; fewer if one fails."""
         self._use(model)
-        return self._two_steps(t, x, h)
+        return self._equal_steps(t, x, h, 2)
 
-    def _two_steps(self, t, x, h):
-        return radau_steps(self.f, t, x, t + 2 * h, self.p, abs(h), self.settings, 2)[1]
+    def _equal_steps(self, t, x, h, count):
+        return radau_steps(self.f, t, x, t + count * h, self.p, abs(h), self.settings, count)[1]
 
     def _record(self, steps, first, last, end=None):
         super()._record(steps, first, last, end)

@@ -118,7 +118,7 @@ class RungeKuttaSteps(Stepping):
     def halved(self, model, t, x, h):
         """States (n_x, 3) at t, t + h and t + 2 h by two steps; fewer if one fails."""
         self._use(model)
-        return self.again(t, x, h)
+        return self.again(t, x, h, 2)
 
     def rates(self, t, x):
         """X' at a state."""
@@ -146,9 +146,9 @@ class RungeKuttaSteps(Stepping):
         """X from (k, t) within steps, by a shorter step from their start."""
         return lambda k, t: self._steps(stretch.t[k], stretch.x[:, k], t - stretch.t[k], 1)[0][:, -1]
 
-    def again(self, t, x, h):
-        """States (n_x, 3) at t, t + h and t + 2 h by two steps; fewer if one fails."""
-        return self._steps(t, x, h, 2)[0]
+    def again(self, t, x, h, count):
+        """States (n_x, count + 1) at the ends of equal steps from t; fewer if one fails."""
+        return self._steps(t, x, h, count)[0]
 
     def _touched(self, t, states, pivots):
         """Singular if a pivot touches zero within a step, else None.

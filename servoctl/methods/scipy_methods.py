@@ -10,7 +10,10 @@ from servoctl.methods.watch import End, edge
 
 IMPLICIT = ("Radau", "BDF")
 MANY, CREEPS = 200, 1e-5  # steps in which a motion near the edge of a domain passes this part of the span
-SHORTENINGS, SHORTER = 8, 1e-2  # how often, and to which part, a first step is shortened that errs by far
+SHORTENINGS, SHORTER = 8, 1e-2  # how often, and to which part, a step is shortened that errs by far
+LONG = 4  # samples in a step that is checked at them
+SPACING = 1e-3  # of a step, between the points by which its dense output is differentiated
+OFF = 1e3  # times the tolerance, which the equations may add to a step
 
 
 class ScipySteps(Stepping):
@@ -60,16 +63,16 @@ class ScipySteps(Stepping):
         return solver(self._rates, a, x, self._jacobian)
 
     def _piece(self, a, x, b, times):
-        self.pending, self.forward = list(times), b >= a
+        self.pending, self.forward = np.asarray(times), 1.0 if b >= a else -1.0
         solver, steps, outcome, shortened = self._begun(a, x, b), 0, Fine(0), 0
         while solver.status == "running":
             t, x = solver.t, solver.y.copy()
-            message = _step(solver)
-            if solver.status == "failed" or not np.all(np.isfinite(solver.y)):
-                self._fail(t, x, (message or "the state is no longer finite").rstrip("."))
-                self._keep_last(t, x)
+            if not self._stepped(solver, t, x):
                 break
             steps, dense = steps + 1, solver.dense_output()
+            if self._repeats(t, solver.t, dense):
+                solver = self._shortened(solver, t, x, b)
+                continue
             outcome = self._inspected(self._stretch(t, x, solver, dense))
             if isinstance(outcome, Fine):
                 if self.restore is not None and (steps % self.drift.every == 0 or solver.status == "finished"):
@@ -110,7 +113,7 @@ class ScipySteps(Stepping):
 
     def _begun(self, t, x, b):
         """The solver of a piece."""
-        self.mark = t
+        self.mark, self.tried = t, (t, 0)
         self.monitor.begin(self._pivots(t, x))
         self.watch.begin(t)
         self._sample(t, None, x)
@@ -122,6 +125,41 @@ class ScipySteps(Stepping):
         self._count(solver)
         self.monitor.begin(self._pivots(t, x))
         return self._solver(t, x, b, first_step=SHORTER * length)
+
+    def _stepped(self, solver, t, x):
+        """Whether a step from t, X = x succeeds; the motion stops if not."""
+        message = _step(solver)
+        if solver.status != "failed" and np.all(np.isfinite(solver.y)):
+            return True
+        self._fail(t, x, (message or "the state is no longer finite").rstrip("."))
+        self._keep_last(t, x)
+        return False
+
+    def _repeats(self, t, end, dense):
+        """Whether a step from t is repeated, since a shorter one may meet the equations."""
+        self.tried = t, self.tried[1] + 1 if self.tried[0] == t else 0
+        return self.tried[1] < SHORTENINGS and self._doubted(t, end, dense)
+
+    def _doubted(self, t, end, dense):
+        """Whether a long step does not meet the equations at the samples within it.
+
+        Its stages know nothing of what is flat at all of them, such as a narrow bump.
+        """
+        if self.sizes is not None:
+            return False
+        times = self.pending[: self._due(end)]
+        times = times[(times != t) & (times != end)]
+        if len(times) < LONG:
+            return False
+        h = end - t
+        x = dense(times)
+        two, one, next_one, next_two = (dense(times + k * SPACING * h) for k in (-2, -1, 1, 2))
+        change = (8 * (next_one - one) - (next_two - two)) / (12 * SPACING)
+        with np.errstate(all="ignore"):
+            error = np.abs(h * self.f.grid(times, x, self.p)[: self.n_x] - change)
+            rtol, atol = self.tolerances
+            allowed = OFF * (atol + rtol * np.maximum(np.abs(x).max(axis=1), np.abs(change).max(axis=1)))
+            return bool(np.any(error > allowed[:, None]))
 
     def _stretch(self, t, x, solver, dense):
         """The last step for the monitor: it has passed its error test, and the next begins where it ends."""
@@ -154,18 +192,24 @@ class ScipySteps(Stepping):
 
     def _sample(self, t, dense, x):
         """Record the pending samples up to t, the end of a step with state x; `dense` interpolates within it."""
-        times, states = [], []
-        while self.pending and (self.pending[0] <= t if self.forward else self.pending[0] >= t):
-            s = self.pending.pop(0)
-            y = x if s == t else dense(s)
-            if self.restore is not None and s != t:
-                y = self.restore(s, y, self.p)
-            times.append(s)
-            states.append(y)
-        if times:
-            states = np.array(states).T
-            top = np.array([self._top(s, y) for s, y in zip(times, states.T, strict=True)]).T
-            self.motion.add(self.model, times, states, top)
+        due = self._due(t)
+        times, self.pending = self.pending[:due], self.pending[due:]
+        if not due:
+            return
+        if self.sizes is None and due > 1:
+            states = dense(times)
+        else:
+            states = np.array([x if s == t else dense(s) for s in times]).T
+        states[:, times == t] = x[:, None]
+        if self.restore is not None:
+            for i in np.flatnonzero(times != t):
+                states[:, i] = self.restore(times[i], states[:, i], self.p)
+        top = self.f.grid(times, states, self.p)[self.n_x - self.model.n : self.n_x]
+        self.motion.add(self.model, times, states, top)
+
+    def _due(self, t):
+        """The number of pending samples up to t."""
+        return int(np.searchsorted(self.forward * self.pending, self.forward * t, "right"))
 
 
 def _step(solver):

@@ -20,6 +20,9 @@ from servoctl.methods.watch import End
 from servoctl.reduction.ranks import clean, eliminate
 
 LOWEST, HIGHEST = 4, 24  # orders: below, steps are too short; above, compiling grows faster than steps
+INSIDE = np.array([0.07, 0.19, 0.34, 0.53, 0.71, 0.86, 0.98])  # parts of a step at which its series is checked
+FAR_OFF = 30.0  # times the tolerance, which the equations may add to a series over its step
+SMALLEST = 1e-12  # of a piece: shorter steps are not halved, so that a jump of the equations is passed
 
 
 class _Branches(Series):
@@ -212,7 +215,7 @@ class TaylorSteps(Stepping):
     def _use(self, model):
         self.model, self.n_x = model, len(model.state_names)
         last = max(self.order + model.reduction.top - 1, self.jets + 1)
-        self.f = series_loop(model, last)
+        self.f, self.rates = series_loop(model, last), model.function("ode")
         self.nq, self.n, self.top, self.last = model.nq, model.n, model.reduction.top, last
         self.plain = model.reduction.mechanism.q.plain
         self.n_c = (0 if self.plain else self.nq * last) + self.n * last
@@ -232,8 +235,16 @@ class TaylorSteps(Stepping):
         self.p = np.append(self.model.parameters, (a + b) / 2)  # paths take the branches of this piece
         self.monitor.begin(self._pivots(a, x))
         self.watch.begin(a)
+        until = b
         while a != b and self.motion.stop is None:
-            t, states, y = self.f.taylor(a, x, b, self.p, *self.tolerances, self.most, self.every)
+            t, states, y = self.f.taylor(a, x, until, self.p, *self.tolerances, self.most, self.every)
+            taken, good = y.shape[1], self._believed(t, states, y, times, abs(b - a))
+            if good < taken:
+                until = (t[good] + t[good + 1]) / 2  # the next step ends there
+                t, states, y = t[: good + 1], states[:, : good + 1], y[:, :good]
+            failed, until = good == taken < self.most and t[-1] != until, until if good < taken else b
+            if not (good or failed):
+                continue
             outcome = self._inspected(self._stretch(t, states, y))
             fine, steps = isinstance(outcome, Fine), outcome.steps
             self.motion.count(steps=steps, nfev=steps)
@@ -246,11 +257,33 @@ class TaylorSteps(Stepping):
             self.progress(a)
             if not fine:
                 self._follow(outcome)
-            elif steps < self.most and a != b:
+            elif failed:
                 self._fail(a, x, "its steps vanish or are not finite")
         if len(times) and self.motion.stop is None:
             self._sample(np.array([a, a]), np.column_stack([x, x]), self._outputs(a, x)[:, None], times, a)
         return a, x
+
+    def _believed(self, t, states, y, times, span):
+        """The number of steps whose series meet the equations, at samples within them and at further instants.
+
+        A series at one state knows nothing of what is flat there, such as exp(-(100 (t - 3))²) at t = 0.
+        """
+        h, n = np.diff(t), self.n
+        if not len(h):
+            return 0
+        at = (t[:-1, None] + INSIDE * h[:, None]).ravel()
+        forward = np.copysign(1.0, h[0])
+        at = np.concatenate([at, times[(forward * times > forward * t[0]) & (forward * times < forward * t[-1])]])
+        k = np.clip(np.searchsorted(forward * t, forward * at, "right") - 1, 0, len(h) - 1)
+        within = at != t[k]  # where paths have other branches
+        at, k = at[within], k[within]
+        jets = self._jets(states[:, k], y[:, k], at - t[k], self.top)
+        rates = self.rates.grid(at, jets[: self.n_x], self.model.parameters)[self.n_x - n : self.n_x]
+        rtol, atol = self.tolerances
+        sizes = np.maximum(np.abs(states[-n:]).max(), np.abs(h[k] * jets[-n:]).max(axis=0))
+        error = np.abs(h[k] * (rates - jets[-n:])).max(axis=0)
+        wrong = (error > FAR_OFF * (atol + rtol * sizes)) & (np.abs(h[k]) > SMALLEST * span)
+        return int(k[wrong].min(initial=len(h)))
 
     def _stretch(self, t, states, y):
         """The steps for the monitor; pivots inside them cost a series each, so only suspicious steps evaluate them."""
@@ -260,20 +293,20 @@ class TaylorSteps(Stepping):
             states,
             ends[:, :, None],
             self._top,
-            dense=lambda k, s: self._jets(states[:, k], y[:, k], np.array([s - t[k]]), self.top - 1)[:, 0],
+            dense=lambda k, s: self._jets(states[:, [k]], y[:, [k]], np.array([s - t[k]]), self.top - 1)[:, 0],
             pivots_at=self._pivots,
             resumes=True,
         )
 
     def _coefficients(self, y):
         """Coefficients of q and of γ with index 1 .. last."""
-        of_q = y[: self.nq * self.last].reshape(self.last, self.nq)
-        return of_q, of_q if self.plain else y[self.nq * self.last : self.n_c].reshape(self.last, self.n)
+        of_q = y[: self.nq * self.last].reshape(self.last, self.nq, -1)
+        return of_q, of_q if self.plain else y[self.nq * self.last : self.n_c].reshape(self.last, self.n, -1)
 
     def _jets(self, x, y, h, top):
-        """Jets q, γ', ..., γ^(top) at times h (N,) after a step's start, (nq + top n, N)."""
+        """Jets q, γ', ..., γ^(top) at times h (N,) after the starts of steps, (nq + top n, N)."""
         of_q, of_gamma = self._coefficients(y)
-        q = x[: self.nq, None] + _level(of_q, 0, h)
+        q = x[: self.nq] + _level(of_q, 0, h)
         return np.concatenate([q, *(_level(of_gamma, j, h) for j in range(1, top + 1))])
 
     def _sample(self, t, states, y, pending, end):
@@ -285,18 +318,15 @@ class TaylorSteps(Stepping):
         times = pending[due]
         if len(times):
             k = np.clip(np.searchsorted(direction * t, direction * times, "right") - 1, 0, y.shape[1] - 1)
-            parts = np.empty((self.nq + self.jets * self.n, len(times)))
-            for step in np.unique(k):
-                here = k == step
-                parts[:, here] = self._jets(states[:, step], y[:, step], times[here] - t[step], self.jets)
+            parts = self._jets(states[:, k], y[:, k], times - t[k], self.jets)
             n_x = len(states)
             self.motion.add(self.model, times, parts[:n_x], parts[n_x:])
         return pending[~due]
 
 
 def _level(c, j, h):
-    """The j-th derivative at times h (N,) of the series with coefficients c (last, n), less the constant for j = 0."""
-    total = np.zeros((c.shape[1], len(h)))
+    """The j-th derivative at times h (N,) of series with coefficients c (last, n, N), less the constant for j = 0."""
+    total = np.zeros(c.shape[1:])
     for k in range(len(c), max(j, 1) - 1, -1):
-        total = total * h + float(factorial(k) // factorial(k - j)) * c[k - 1][:, None]
+        total = total * h + float(factorial(k) // factorial(k - j)) * c[k - 1]
     return total * h if j == 0 else total

@@ -15,17 +15,18 @@ import numpy as np
 
 from servoctl.codegen.function import compiled
 from servoctl.errors import IntegrationStopped
-from servoctl.jets.branches import domain_edges
+from servoctl.jets.branches import domain_edges, size_of_terms
 from servoctl.methods.sizes import state_levels
 from servoctl.tolerances import TINY
 
 LEAVES = 1e3  # times its tolerance, which no healthy step adds to a residual
 DEFAULT = 1e-9, 1e-11  # rtol and atol that judge steps of fixed length, until these are known to be coarser
 LEAST_RTOL, LEAST_ATOL = 1e-12, 1e-14  # rounding of residuals: smaller tolerances are not resolved
-OF_TERMS = 1e-2  # of the terms of a residual, which it never reaches where it is sensitive
+OF_TERMS = 1e-3  # of the terms of a residual, which it never reaches where it is sensitive
 SENSITIVE = 1e2  # times the first allowance of a residual, beyond which its terms bound it
 EXPLAINED = 2.0  # times the extrapolation of a residual from earlier levels
-REMAINS = 0.75  # of the error of a step in two of half its length: it is a jump, since other errors shrink to a half
+FINER = 16  # equal steps in place of one of fixed length that errs by far
+REMAINS = 0.75  # of its error in these: it is a jump, since other errors shrink, at least to a half with each halving
 LEARNED = 10.0  # times the error of a step of fixed length, which later ones may have
 MOST_INSPECTED = 128  # steps of a stretch whose residuals are evaluated
 LOCATED = 40  # halvings of a step that locate where a residual leaves: all digits
@@ -200,7 +201,7 @@ class Residuals:
         self.model, self.tolerance, self.f = model, tolerance, model.function("invariants")
         self.names = [name for _, name in model.invariant_names()]
         self.m, self.coarse = len(self.names), np.zeros(len(self.names))
-        self.terms, self.first = np.zeros(self.m), None
+        self.terms, self.first, self.led_back = np.zeros(self.m), None, len(coefficients) > 0
         places = {name: i for i, name in enumerate(self.names)}
         self.chains = []
         for a, row in enumerate(model.reduction.rows):
@@ -215,11 +216,12 @@ class Residuals:
         allowed = LEAVES * self.tolerance.of(slopes, x)
         if self.first is None:
             self.first = allowed[:, 0]
-        first, self.latest = self.first[:, None], self.terms
+        first, self.latest, self.bound = self.first[:, None], self.terms, np.inf
         if not np.all(allowed < SENSITIVE * first):  # near the edge of a domain slopes, and errors, grow without bound
             terms = np.nan_to_num(self._terms.grid(t, x, self.model.parameters), posinf=0.0)
             terms = np.maximum.accumulate(np.maximum(terms, self.terms[:, None]), axis=1)
             allowed, self.latest = np.fmin(allowed, np.maximum(first, OF_TERMS * terms)), terms[:, -1]
+            self.bound = np.maximum(first, OF_TERMS * terms)
         return y[: self.m], allowed
 
     def small(self, t, x):
@@ -232,14 +234,8 @@ class Residuals:
     @cached_property
     def _terms(self):
         """The sum of the magnitudes of each residual's terms."""
-
-        def size(expression):
-            if expression.op() in (ca.OP_ADD, ca.OP_SUB):
-                return size(expression.dep(0)) + size(expression.dep(1))
-            return ca.fabs(expression)
-
         e = self.model.equations
-        sizes = [size(ca.densify(expression)) for _, _, expression in e.invariant_rows]
+        sizes = [size_of_terms(ca.densify(expression)) for _, _, expression in e.invariant_rows]
         return compiled(e.function("terms", e.state, sizes), "terms")
 
     def accept(self):
@@ -270,7 +266,10 @@ class Residuals:
         with np.errstate(all="ignore"):
             values, _ = self.values(t[0], before)
             residuals, allowed = self.values(t[1], after)
-            over = np.abs(residuals) - allowed - self.coarse[:, None] - self.explained(values, t[1] - t[0])
+            limit = allowed + self.explained(values, t[1] - t[0])
+            if not self.led_back:
+                limit = np.fmin(limit, self.bound)
+            over = np.abs(residuals) - limit - self.coarse[:, None]
         return np.where(np.isnan(residuals), np.inf, np.nan_to_num(over, nan=-1.0, posinf=np.inf, neginf=-1.0))
 
     def error(self, t, x, over, advice):
@@ -370,7 +369,7 @@ class Watch:
         state : callable
             X from (k, t).
         again : callable, optional
-            States at the ends of two steps of half the length, from (t, x, h); for steps of fixed length.
+            States at the ends of equal steps, from (t, x, h, count); for steps of fixed length.
         projected : bool
             Whether the ends of steps were projected: what `state` gives there was not.
         """
@@ -404,16 +403,16 @@ class Watch:
         return self.residuals.off(t[:, None], before[:, None], after[:, None])[:, 0]
 
     def _stays(self, off, t, before, after, again):
-        """Whether a residual is as far off after two steps of half the length; if not, these steps are coarse."""
-        halves = again(t[0], before, (t[1] - t[0]) / 2)
-        if halves.shape[1] < 3:
+        """Whether a residual is as far off after steps that are far shorter; if not, this one is coarse."""
+        shorter = again(t[0], before, (t[1] - t[0]) / FINER, FINER)
+        if shorter.shape[1] <= FINER:
             return True
-        values, _ = self.residuals.values(t[[0, 1, 1]], np.column_stack([before, after, halves[:, -1]]))
+        values, _ = self.residuals.values(t[[0, 1, 1]], np.column_stack([before, after, shorter[:, -1]]))
         explained = self.residuals.explained(values[:, :1], t[1:] - t[:1])[off]
-        once, twice = (np.abs(values[off, 1:]) - explained).T
-        if np.any(~(twice <= REMAINS * once)):
+        long, short = (np.abs(values[off, 1:]) - explained).T
+        if np.any(~(short <= REMAINS * long)):
             return True
-        self.residuals.coarse[off] = np.maximum(self.residuals.coarse[off], LEARNED * once)
+        self.residuals.coarse[off] = np.maximum(self.residuals.coarse[off], LEARNED * long)
         return False
 
     def _end(self, k, t, before, after, state):

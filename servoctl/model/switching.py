@@ -145,12 +145,14 @@ class Switching:
         r, s = self.model.reduction, model.reduction
         if (r.top, r.free, list(self.model.residual_names)) == (s.top, s.free, list(model.residual_names)):
             return
+        changed = [a.name for a, b in zip(r.rows, s.rows, strict=False) if (a.name, a.order) != (b.name, b.order)]
         raise SpecificationError(
             f"Beyond a kink or switch the program has {s.free} free initial values, and {r.free} where it was derived.",
             "The number of free initial values is the same along a motion.",
             do="Derive two models, one for each side, and continue one motion by the other.",
             free=s.free,
             expected=r.free,
+            row=changed[0] if changed else None,
             branches=branches,
         )
 

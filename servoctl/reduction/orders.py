@@ -134,13 +134,16 @@ class Orders:
         return replace(start, z=np.where(residual < ON_MANIFOLD, solved, z))
 
 
-def other_order(row, t, there="", **facts):
-    """The error of a row whose order changes at t [s]; `there` says what else is different from then on."""
+def other_order(row, t, free=None, expected=None):
+    """The error of a row whose order changes at t [s], with the numbers of free initial values beyond and before."""
+    changes = free not in (None, expected)
+    there = f", and from there on {free} initial values are free instead of {expected}" if changes else ""
     return SingularProgram(
         f"The order of row {row!r} changes at t = {t:.6g} s: terms come alive that vanish where it was derived{there}.",
         "The rows of a motion keep their orders along it.",
         do="Derive two models, one for each regime, with guess={...} in each, and join their motions.",
         t=t,
         row=row,
-        **facts,
+        free=free,
+        expected=expected,
     )
