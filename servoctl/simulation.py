@@ -48,7 +48,7 @@ from servoctl.run import SAME_TIME, Run
 DEFAULT_SAMPLES = 1001  # without t_eval: smooth curves, and extrema refined to rounding
 STEPS_IN_SPAN = 2000  # steps of fixed length in a span if the method has no step
 MOST_STEPS = 10**8  # of fixed length: more would fill the memory with samples
-DRIFTED = 1e-3  # the same at the end of a motion that deserves a warning
+DRIFTED = 1e-2  # the same at the end of a motion that deserves a warning
 OFF = 1e-5  # residual relative to its gradient times the state, above which a start is inconsistent
 
 

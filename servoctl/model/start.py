@@ -278,6 +278,7 @@ def _step(value, jacobian, aim):
     return full
 
 
+@np.errstate(all="ignore")  # what is not finite is no solution
 def gauss_newton(equations, x, aim, iterations=60):
     """Damped Gauss-Newton with least steps.
 
