@@ -341,3 +341,22 @@ def test_rates_of_powers_have_no_switches():
     bend = q.dt((dx * d2y - dy * d2x) / (dx**2 + dy**2) ** 1.5, 2)
     mechanism = sv.Mechanism(q, gibbs=sv.particle(q, 1.0, tuple(q)))
     assert switching(sv.derive(mechanism, sv.Program({"bend": bend}, by="ideal"))) is None
+
+
+@pytest.mark.parametrize("method", ["DOP853", "RK45", "LSODA", "RadauIIA", "Taylor"])
+def test_a_grazing_contact_is_found(method):
+    """A ball that is thrown up by 0.5 m touches a stiff ceiling at 0.4999 m for some milliseconds."""
+    q = sv.coordinates("x y")
+    x, y = q
+    S = (q.d(2)[0] ** 2 + q.d(2)[1] ** 2) / 2
+    mechanism = sv.Mechanism(q, gibbs=S, potential=y, forces={"y": -1e4 * ca.fmax(y - 0.4999, 0)}, actuators={"F": x})
+    model = sv.derive(mechanism, sv.Program({"x": x - q.t}))
+    run = sv.simulate(model, model.start(y=0.0, dy=1.0), (0.0, 2.0), method, t_eval=[0.0, 1.0, 2.0])
+    from scipy.integrate import solve_ivp
+
+    touch = 1.0 - np.sqrt(2e-4)  # y = t - t^2/2 = 0.4999
+    bounce = solve_ivp(
+        lambda t, z: [z[1], -1.0 - 1e4 * max(z[0] - 0.4999, 0.0)], (touch, 2.0), [0.4999, 1.0 - touch],
+        rtol=1e-11, atol=1e-13, max_step=1e-4,
+    )  # fmt: skip
+    assert run["y"][-1] == pytest.approx(bounce.y[0, -1], abs=1e-6)

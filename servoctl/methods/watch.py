@@ -32,6 +32,8 @@ MOST_INSPECTED = 128  # steps of a stretch whose residuals are evaluated
 LOCATED = 40  # halvings of a step that locate where a residual leaves: all digits
 EDGE = 1e-3  # distance of a function's argument from the edge of its domain that explains why a residual leaves
 AT_ONCE = 1e-9  # of the span: switches closer than this follow at once
+BESIDE_ENDS = 1e-3  # of a step: instants next to its ends, which show where a function has its least value across steps
+NEAR_ZERO = 0.2  # of a function's values beside its least one: a vertex below this is looked at closely
 MOST_AT_ONCE = 2  # changes of one branch at once, after which the motion stays on the switch
 
 END_BEFORE = "Let the motion end before, or write the residual so that it is smooth along the motion."
@@ -122,23 +124,60 @@ class Switches:
         """The first switch within steps as an `End`, or None; `state` gives X from (k, t)."""
         t, x = self._instants(stretch, state)
         functions, slopes, _ = self.family.values(self.branches, t, x)
-        wrong = functions < -self.tolerance.of(slopes, x)
-        if not wrong.any():
+        allowed = self.tolerance.of(slopes, x)
+        wrong = functions < -allowed
+        last = max(int(np.argmax(wrong.any(axis=0))), 1) if wrong.any() else len(t)
+        direction = np.copysign(1.0, t[-1] - t[0])
+
+        def step(s):
+            return int(np.clip(np.searchsorted(direction * stretch.t, direction * s) - 1, 0, len(stretch.t) - 2))
+
+        crossing = self._grazed(t[:last], functions[:, :last], allowed, lambda s: state(step(s), s))
+        if crossing is None and not wrong.any():
             return None
-        j = max(int(np.argmax(wrong.any(axis=0))), 1)
-        k = (j - 1) // self.parts
-        roots = {i: self._root(i, t[j - 1], t[j], lambda s: state(k, s)) for i in np.flatnonzero(wrong[:, j])}
-        direction = np.copysign(1.0, t[j] - t[j - 1])
+        begin, end, rows = crossing or (t[last - 1], t[last], np.flatnonzero(wrong[:, last]))
+        roots = {i: self._root(i, begin, end, lambda s: state(step(s), s)) for i in rows}
         at = direction * min(direction * root for root in roots.values())
         changed = tuple(int(i) for i, root in roots.items() if abs(root - at) <= AT_ONCE * self.span)
+        k = step(at)
         y = state(k, at) if at != t[0] else stretch.x[:, 0]
         return End(k, float(at), y, changed, self._beyond(changed, at, y))
+
+    def _grazed(self, t, functions, allowed, state):
+        """The first interval in which a function dips below zero between instants: its ends and the function; or None.
+
+        Where a function has a least value among three instants, the parabola through them shows whether it comes near
+        zero between them; its true minimum decides.
+        """
+        if self.parts == 1 or len(t) < 3:
+            return None
+        before, here, after = functions[:, :-2], functions[:, 1:-1], functions[:, 2:]
+        with np.errstate(all="ignore"):
+            left, right = (here - before) / (t[1:-1] - t[:-2]), (after - here) / (t[2:] - t[1:-1])
+            bend = (right - left) / (t[2:] - t[:-2])
+            vertex = here - (left + bend * (t[1:-1] - t[:-2])) ** 2 / (4 * bend)
+        low = (here <= before) & (here <= after) & (bend > 0) & (vertex < NEAR_ZERO * np.minimum(before, after))
+        for j, i in np.argwhere(low.T):
+            begin, end = t[j], t[j + 2]
+            least, value = self._least(i, begin, end, state)
+            if value < -allowed[i, j + 1]:
+                return begin, least, np.array([i])
+        return None
+
+    def _least(self, i, a, b, state):
+        from scipy.optimize import minimize_scalar
+
+        def function(s):
+            return self.family.values(self.branches, np.array([s]), state(s)[:, None])[0][i, 0]
+
+        found = minimize_scalar(function, bounds=sorted((a, b)), method="bounded", options={"xatol": 1e-9 * abs(b - a)})
+        return found.x, found.fun
 
     def _instants(self, stretch, state):
         """Instants (N,) and states (n_x, N) at which the functions are evaluated: ends of steps, and parts of them."""
         if self.parts == 1:
             return stretch.t, stretch.x
-        inside = np.arange(1, self.parts) / self.parts
+        inside = np.array([BESIDE_ENDS, *(np.arange(1, self.parts) / self.parts), 1 - BESIDE_ENDS])
         t, x = [stretch.t[:1]], [stretch.x[:, 0]]
         for k, (a, b) in enumerate(pairwise(stretch.t)):
             t += [a + (b - a) * inside, [b]]
