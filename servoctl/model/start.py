@@ -130,7 +130,8 @@ class JetEquations:
     def scaled(self, x):
         """Residuals relative to the size of their gradients times that of the jets."""
         value, jacobian = self(x)
-        return value / gradient_sizes(jacobian, x)
+        with np.errstate(invalid="ignore"):  # a residual without a value has no size
+            return value / gradient_sizes(jacobian, x)
 
 
 def gradient_sizes(jacobian, x):
