@@ -266,6 +266,8 @@ def _plant_jets(reduction, point, z, level):
     point = replace(point, z=z)
     B = reduction.realisation.B
     numbers, static = point.matrix(B)[0][:, :, 0], point.evaluate(balance.elements())[0][:, 0]
+    if not (np.isfinite(numbers).all() and np.isfinite(static).all()):
+        return z  # no force is defined there: the point keeps its velocities
     u = np.linalg.lstsq(numbers.astype(float), static.astype(float), rcond=None)[0][:k]
     material = [row for row in reduction.original.values() if row.kind == "material"]
     G = B[:, k:].T
