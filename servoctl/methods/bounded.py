@@ -326,11 +326,16 @@ class Problem:
         dz = np.concatenate([ends[:1], inner.reshape(count * s, f)])
         return (step + (tangent @ dz[:, :, None])[:, :, 0]).T
 
+    @cached_property
+    def _boundary_rows(self):
+        """Left eigenvectors of the stable modes at the begin (k, f), and of the unstable ones at the end (f - k, f)."""
+        return self.first.left_space(unstable=False), self.last.left_space(unstable=True)
+
     def _solve_ends(self, constants, factors, z):
         """Steps (N + 1, f) at the mesh points: dz_(i+1) = constants_i + factors_i dz_i between the boundary rows."""
         from scipy.linalg import solve_banded
 
-        before, after = self.first.left_space(unstable=False), self.last.left_space(unstable=True)
+        before, after = self._boundary_rows
         count, f, k = len(constants), z.shape[1], len(before)
         matrix, right = np.zeros((4 * f + 1, (count + 1) * f)), np.zeros((count + 1) * f)
 
