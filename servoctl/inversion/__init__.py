@@ -1,0 +1,1 @@
+"""Which inverse of a program exists, and the plan that it gives."""
