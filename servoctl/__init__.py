@@ -31,6 +31,7 @@ from servoctl.errors import (
 )
 from servoctl.export.c import export_c
 from servoctl.internal_dynamics import InternalDynamics, internal_dynamics
+from servoctl.inversion.report import Report, report
 from servoctl.methods.choice import (
     Adaptive,
     Algebraic,
@@ -95,6 +96,7 @@ __all__ = [
     "Program",
     "Project",
     "RadauIIA",
+    "Report",
     "Run",
     "RungeKutta",
     "Sensors",
@@ -138,6 +140,7 @@ __all__ = [
     "pd",
     "plant",
     "plots",
+    "report",
     "rigid_body",
     "sampled_bound",
     "simulate",

@@ -13,8 +13,7 @@ from servoctl.internal_dynamics import InternalDynamics, internal_dynamics
 from servoctl.methods.bounded import End, FreeEntries
 from servoctl.model.model import Model
 from servoctl.model.start import State
-from servoctl.reduction.ranks import clean, decide
-from servoctl.reduction.structure import INDEPENDENT, points_of
+from servoctl.reduction.structure import margins
 from servoctl.run import Run
 
 FLAT, MINIMUM, MARGINAL, SINGULAR = "flat", "minimum phase", "marginal", "singular at rest"
@@ -59,8 +58,13 @@ class Verdict:
     def __post_init__(self):
         object.__setattr__(self, "dynamics", self.dynamics or self.word)
 
+    @property
+    def growth(self):
+        """How errors grow along the run, in words; "" without one."""
+        return f"along the run {self.internal.sentence().removeprefix('internal dynamics ')}" if self.internal else ""
+
     def __str__(self):
-        return f"{self.word}: {self.reason}" + (f"; {self.do}" if self.do else "")
+        return f"{self.word}: " + "; ".join(dict.fromkeys(filter(None, (self.reason, self.growth, self.do))))
 
 
 def verdict(model: Model, motion: Run | State | None = None) -> Verdict:
@@ -88,7 +92,7 @@ def verdict(model: Model, motion: Run | State | None = None) -> Verdict:
 def _of_motion(model, motion):
     """The verdict, whatever the number of actuators."""
     try:
-        states = _ends(model, motion)
+        states = _starting(model, motion)
     except SingularProgram as error:
         return Verdict(SINGULAR, _first_sentence(error))
     except ServoError as error:
@@ -116,7 +120,7 @@ def _first_sentence(error):
     return str(error).split(". ")[0].rstrip(".")
 
 
-def _ends(model, motion):
+def _starting(model, motion):
     """(t, state (n_x,)) where the motion begins and, for a run, where it ends."""
     n_x = len(model.state_names)
     if isinstance(motion, Run):
@@ -126,12 +130,27 @@ def _ends(model, motion):
     return [(start.t, np.asarray(start.values, dtype=float))]
 
 
+def endpoints(model, motion):
+    """(t, state (n_x,)) where a run, or the motion from a start, begins and ends as far as known; none if no start is.
+
+    Parameters
+    ----------
+    model : Model
+    motion : Run, State or None
+
+    Returns
+    -------
+    list of (float, array)
+    """
+    try:
+        return _starting(model, motion)
+    except ServoError:
+        return []
+
+
 def _lost(model, t, x):
     """What is lost where the equations have not the rank that they have in motion; "" if nothing is."""
-    reduction = model.reduction
-    points = points_of(reduction, [t], x[:, None], model.parameters)
-    leading = clean(*points.matrix(reduction.leading))[:, :, 0]
-    if not np.isfinite(leading).all() or decide(leading, INDEPENDENT).rank == len(leading):
+    if margins(model.reduction, [t], x[:, None], model.parameters)[0] != 0:
         return ""
     there, usual = model.structure([t], x[:, None]), model.structure()
     if not (there.zeros_at_infinity and usual.zeros_at_infinity):
@@ -179,18 +198,18 @@ def _reach(end, length):
 
 def _judged(rest, internal, why):
     """The verdict from eigenvalues at rest and the growth along a run."""
-    grows = internal is not None and internal.verdict == "unstable"
-    along = "" if internal is None else f"; along the run {internal.sentence().removeprefix('internal dynamics ')}"
-    said = "; ".join(f"at {name} {eigenvalues(end)}" for name, end in rest.items()) + along
-    facts = {"rest": rest, "internal": internal}
+    facts, grows = {"rest": rest, "internal": internal}, internal is not None and internal.verdict == "unstable"
     if not rest:
         return _along(internal, why, facts)
+    said = {name: eigenvalues(end) for name, end in rest.items()}
+    same = len(said) == 2 and len({*said.values()}) == 1
+    reason = f"at both ends {said['start']}" if same else "; ".join(f"at the {name} {of}" for name, of in said.items())
     if any(len(end.on_axis) for end in rest.values()):
-        return Verdict(MARGINAL, said, **facts)
+        return Verdict(MARGINAL, reason, **facts)
     counts = {end.unstable for end in rest.values()}
     if counts == {0}:
-        return Verdict(GROWS if grows else MINIMUM, said, **facts)
-    return Verdict(HYPERBOLIC_ZEROS if len(counts) == 1 else GROWS, said, **facts)
+        return Verdict(GROWS if grows else MINIMUM, reason, **facts)
+    return Verdict(HYPERBOLIC_ZEROS if len(counts) == 1 else GROWS, reason, **facts)
 
 
 def _along(internal, why, facts):
@@ -200,7 +219,7 @@ def _along(internal, why, facts):
     words = {"stable": MINIMUM, "neutral": MARGINAL, "unstable": GROWS}
     word = words.get(internal.verdict, OPEN)
     do = "simulate with more samples (t_eval)" if word == OPEN else ""
-    return Verdict(word, f"along the run {internal.sentence().removeprefix('internal dynamics ')}", do, **facts)
+    return Verdict(word, f"no rest ({why})", do, **facts)
 
 
 def eigenvalues(end):

@@ -15,7 +15,7 @@ import numpy as np
 from servoctl.jets.series import Flow
 from servoctl.reduction.appell import Realisation
 from servoctl.reduction.manifold import solve
-from servoctl.reduction.ranks import clean, decide, decide_all, solve_clean
+from servoctl.reduction.ranks import clean, decide, decide_all, decide_each, solve_clean
 from servoctl.reduction.rows import Row
 from servoctl.tolerances import ENTRY, TINY
 
@@ -192,6 +192,28 @@ def directions(reduction, t, jets, values):
     matrices = (mechanism.mass, mechanism.E, *(ca.vertcat(ca.SX(0, q.n), *group).T for group in groups))
     numbers = [np.moveaxis(clean(*points.matrix(matrix)), -1, 0).astype(float) for matrix in matrices]
     return [_directions(mechanism, reduction.program.names, *each) for each in zip(*numbers, strict=True)]
+
+
+def margins(reduction, t, jets, values):
+    """Smallest equilibrated pivot of the leading matrix at each instant of a motion, (N,).
+
+    It is 0 where the matrix is singular, and NaN where it has no value.
+    Where it is regular, orders and zeros at infinity are those of the reduction.
+
+    Parameters
+    ----------
+    reduction : Reduction
+    t : (N,) array
+        [s]
+    jets : (n_z, N) array
+    values : (n_p,) array
+        Parameters.
+    """
+    numbers = clean(*points_of(reduction, t, jets, values).matrix(reduction.leading))
+    known = np.isfinite(numbers).all(axis=(0, 1))
+    ranks = decide_each(np.where(known, numbers, 0.0), INDEPENDENT)
+    smallest = np.array([rank.kept if rank.rank == len(numbers) else 0.0 for rank in ranks])
+    return np.where(known, smallest, np.nan)
 
 
 def _directions(mechanism, names, mass, E, G, G_m):
