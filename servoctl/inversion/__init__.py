@@ -1,1 +1,1 @@
-"""Which inverse of a program exists, and the plan that it gives."""
+"""Which actuation moves the mechanism as the program asks: exactly, or as well as actuators and limits allow."""

@@ -442,7 +442,7 @@ class Problem(FreeEntries):
         count, h, free = len(mesh) - 1, np.diff(mesh), self.free
         k, theta = np.repeat(np.arange(count), len(BETWEEN)), np.tile(BETWEEN, count)
         t = mesh[k] + theta * h[k]
-        change = self._polynomial(x, k, _basis_rates(self.c, theta)) - x[:, k * len(self.c)]
+        change = self._polynomial(x, k, basis_rates(self.c, theta)) - x[:, k * len(self.c)]
         values = self._on_invariants(t, self._polynomial(x, k, basis(self.c, theta)))
         rates = self.local(t, values)[0].T
         defect = np.abs(change[free] - h[k] * rates) / self.size[free, None]
@@ -492,7 +492,7 @@ def _level_sizes(values, levels):
     return np.where(largest > 0, largest, 1.0)
 
 
-def _basis_rates(c, theta):
+def basis_rates(c, theta):
     """Derivatives of `basis` (s, N) at theta (N,)."""
     nodes = np.append(0.0, c)
     powers = np.arange(1, len(nodes))
