@@ -31,6 +31,8 @@ from servoctl.errors import (
 )
 from servoctl.export.c import export_c
 from servoctl.internal_dynamics import InternalDynamics, internal_dynamics
+from servoctl.inversion.choice import inverse
+from servoctl.inversion.relaxed import relaxed
 from servoctl.inversion.report import Report, report
 from servoctl.methods.choice import (
     Adaptive,
@@ -125,6 +127,7 @@ __all__ = [
     "figures",
     "grid",
     "internal_dynamics",
+    "inverse",
     "interop",
     "limit_report",
     "limited",
@@ -140,6 +143,7 @@ __all__ = [
     "pd",
     "plant",
     "plots",
+    "relaxed",
     "report",
     "rigid_body",
     "sampled_bound",

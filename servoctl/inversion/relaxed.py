@@ -15,7 +15,14 @@ import casadi as ca
 import numpy as np
 
 from servoctl.checks import as_span, finite, interval, mapping, positive_number, require_kind
-from servoctl.errors import InconsistentStart, IntegrationStopped, LimitExceeded, ServoError, SpecificationError, unknown
+from servoctl.errors import (
+    InconsistentStart,
+    IntegrationStopped,
+    LimitExceeded,
+    ServoError,
+    SpecificationError,
+    unknown,
+)
 from servoctl.inversion.equilibrium import RANK, Equilibria
 from servoctl.inversion.transcription import Mesh, Node, Transcription
 from servoctl.methods.motion import breakpoints
@@ -32,6 +39,7 @@ from servoctl.spec.program import Program
 ORDER = 9  # of the collocation: five nodes
 INTERVALS = 24  # of the first mesh at least
 FIRST = 1e-3  # first weight, relative to that for which standing still costs as much as the program
+DEFAULT = 1e-6  # default weight, relative to the same
 FACTOR = 100.0  # between the weights of two successive solutions
 DEFECT = 1e-9  # of the states between nodes, relative to their sizes, above which the mesh is refined
 BETWEEN = (0.12, 0.4, 0.75)  # places within an interval where the defect is measured
@@ -43,7 +51,7 @@ SOLVED = ("Solve_Succeeded", "Solved_To_Acceptable_Level")
 
 
 def relaxed(
-    plant: Plant, program: Program, t_span: Sequence[float], *, weight: float | Mapping[str, float],
+    plant: Plant, program: Program, t_span: Sequence[float], *, weight: float | Mapping[str, float] | None = None,
     limits: Mapping[str, object] | None = None, bounds: Mapping[str, object] | None = None,
     start: State | Mapping[str, float] | None = None, end: str | Mapping[str, float] = "rest",
 ) -> Run:  # fmt: skip
@@ -60,8 +68,9 @@ def relaxed(
         W are its `weights` of the actuators, 1 by default.
     t_span : (t0, t1)
         [s]
-    weight : float or dict of str to float
-        β of all or of each residual, in (unit of φ)²/(unit of u)²: m²/N² for a position by a force.
+    weight : float or dict of str to float, optional
+        β of all or of each residual, in (unit of φ)²/(unit of u)²: m²/N² for a position by a force. Default: 1e-6 of
+        that for which standing still costs as much as the program.
     limits : dict of str to float or (low, high), optional
         Further limits of actuators and of their rates: {"trolley": 100.0, "dtrolley": 500.0}. They hold at all instants.
     bounds : dict of str to float or (low, high), optional
@@ -98,7 +107,9 @@ def relaxed(
 
 
 def _weights(weight, program):
-    """β of each residual, (k,)."""
+    """β of each residual, (k,); None for the default."""
+    if weight is None:
+        return None
     if not isinstance(weight, Mapping):
         return np.full(len(program.names), positive_number("weight", weight))
     for name in weight:
@@ -345,7 +356,8 @@ class Task:
     # solutions
 
     def run(self, beta):
-        """The run of weights (k,)."""
+        """The run of weights (k,), by default a small part of the usual ones."""
+        beta = DEFAULT * self._usual_weights() if beta is None else beta
         plan = self._continued(self._mesh(), beta)
         for _ in range(REFINEMENTS):
             finer = self._finer(plan)

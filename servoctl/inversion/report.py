@@ -339,18 +339,35 @@ def _typical(local, structure):
 
 def _effort(run, name, limits):
     """An `Effort` from a signal of a run."""
-    low, high = run.extrema(name)
-    peak_at, peak = max(low, high, key=lambda extremum: abs(extremum[1]))
+    (low, t_low), (high, t_high) = extremes(run, name)
+    peak, peak_at = max(((low, t_low), (high, t_high)), key=lambda extreme: abs(extreme[0]))
     rates = _rates(run, name)
-    k = int(np.nanargmax(np.abs(rates))) if np.isfinite(rates).any() else 0
+    rate, rate_at = max(_sampled_extremes(run.t, rates), key=lambda extreme: abs(extreme[0]))
     nearest = {}
     if limits is not None:
-        sides = ((low[1] - limits[0], low[0], limits[0]), (limits[1] - high[1], high[0], limits[1]))
-        room, at, limit = min(sides)
-        nearest = {"limit": limit, "limit_at": at, "room": room}
-    rms = (_rms(run.t, values) for values in (run[name], rates))
-    rms, rate_rms = rms
-    return Effort(peak, peak_at, rms, float(rates[k]), float(run.t[k]), rate_rms, **nearest)
+        room, limit_at, limit = min((low - limits[0], t_low, limits[0]), (limits[1] - high, t_high, limits[1]))
+        nearest = {"limit": limit, "limit_at": limit_at, "room": room}
+    return Effort(peak, peak_at, _rms(run.t, run[name]), rate, rate_at, _rms(run.t, rates), **nearest)
+
+
+def extremes(run, name):
+    """(value, instant [s]) of the least and the greatest value of a signal, or of the rate of one, along a run.
+
+    Parameters
+    ----------
+    run : Run
+    name : str
+        A signal, or d and the name of one.
+    """
+    if name not in run and name[:1] == "d" and name[1:] in run:
+        return _sampled_extremes(run.t, _rates(run, name[1:]))
+    return tuple((value, t) for t, value in run.extrema(name))
+
+
+def _sampled_extremes(t, values):
+    if not np.isfinite(values).any():
+        return (np.nan, float(t[0])), (np.nan, float(t[0]))
+    return tuple((float(values[k]), float(t[k])) for k in (int(np.nanargmin(values)), int(np.nanargmax(values))))
 
 
 def _rms(t, values):
