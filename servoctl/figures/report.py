@@ -68,7 +68,7 @@ def _angles(ax, report, _):
     degrees = np.degrees(np.arccos(np.clip(report.directions.cosines, 0.0, 1.0)))
     ax.bar(range(1, len(degrees) + 1), degrees, color=style.COLOURS[2], width=0.6)
     for place, value in enumerate(degrees, 1):
-        ax.annotate(f"{value:.3g}°", (place, value), ha="center", va="bottom")
+        ax.annotate(f"{round(value, 2):g}°", (place, value), ha="center", va="bottom")
     ax.set(xlabel="principal angle", ylabel="[°]", ylim=(0, 105), yticks=(0, 30, 60, 90))
     ax.set_xticks(range(1, len(degrees) + 1))
     ax.set_title("angles between actuators and normals of the program", fontsize=10)

@@ -86,7 +86,7 @@ def inverse(
         facts = error.details
         if method not in (None, RELAXED) or not {"needs", "has"} <= facts.keys():
             raise
-        return task.relaxed(f"{facts['name']} is of class C^{facts['has']} and the exact inverse needs C^{facts['needs']}")
+        return task.relaxed(f"{facts['name']} has class C^{facts['has']} and the exact inverse needs C^{facts['needs']}")
     begin = start if isinstance(start, State) else _start(model, task.span[0], known)
     found = verdict(model, begin)
     chosen = _chosen(model, found)
@@ -179,7 +179,13 @@ def _by_hand(task, model, begin, found, chosen, method):
             RuntimeWarning,
             stacklevel=3,
         )
-    return task.relaxed(found) if method == RELAXED else _told(task.exact(model, begin, found, method), found)
+    if method == RELAXED:
+        return task.relaxed(found)
+    run = task.exact(model, begin, found, method)
+    excess = _excess(run, {**task.ranges[0], **task.ranges[1]})
+    if excess:
+        warnings.warn(f"method={str(method)!r} was chosen, and {excess}.", RuntimeWarning, stacklevel=3)
+    return _told(run, found)
 
 
 def _excess(run, ranges):
@@ -195,5 +201,5 @@ def _excess(run, ranges):
 def _told(run, why):
     """The run, whose message says which inverse it is and why."""
     kind = {"algebraic": "instant by instant", "bounded": "bounded", RELAXED: "relaxed"}.get(run.method, "forward")
-    reason = f"the program is {why}" if isinstance(why, Verdict) else why
+    reason = f"the program is {why.word} ({why.reason})" if isinstance(why, Verdict) else why
     return replace(run, message=f"{run.message}; inverse: {kind}, as {reason}")

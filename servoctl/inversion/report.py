@@ -11,13 +11,14 @@ from servoctl.errors import NotRealisable, SpecificationError, unknown
 from servoctl.figures.names import efforts
 from servoctl.inversion.verdict import UNREALISABLE, Verdict, endpoints, verdict
 from servoctl.model.model import SAMPLED, Model, derive
+from servoctl.model.report import WIDTH
 from servoctl.model.start import State
 from servoctl.reduction.structure import Directions, Local, directions, margins
 from servoctl.run import Run, require_model
 from servoctl.spec.mechanism import Mechanism
 from servoctl.spec.program import Program
 
-WIDTH, MOST_LINES = 118, 12  # of a printed report
+MOST_LINES = 12  # of a printed report
 FEWEST_OF_A_SPLINE = 4  # samples between two knots through which a spline of order 3 is laid
 
 
@@ -99,27 +100,16 @@ class Report:
 
     def as_dict(self) -> dict:
         """The report as numbers, texts, lists and dicts, for JSON; eigenvalues as pairs [real part, imaginary part]."""
-        v = self.verdict
-        rest = {
-            name: {"t": end.t, "state": end.x.tolist(), "eigenvalues": [[z.real, z.imag] for z in end.eigenvalues]}
-            for name, end in v.rest.items()
-        }
-        internal = v.internal.facts() if v.internal is not None else {}
         return {
-            "verdict": v.word,
-            "reason": v.reason,
-            "do": v.do,
-            "dynamics": v.dynamics,
+            **self.verdict.as_dict(),
             "residuals": {name: dict(facts) for name, facts in self.residuals.items()},
             "index": self.index,
             "realisation": self.realisation,
             "directions": None if self.directions is None else _plain(self.directions),
             "hidden": list(self.hidden),
             "free": self.free,
-            "margin": None if self.margin is None else list(self.margin),
             "ranks": {place: _plain(local) for place, local in self.ranks.items()},
-            "rest": rest,
-            "growth": {name: float(v) if isinstance(v, (int, float)) else v for name, v in internal.items()},
+            "margin": None if self.margin is None else list(self.margin),
             "efforts": {name: _plain(effort) for name, effort in self.efforts.items()},
         }
 
@@ -159,7 +149,9 @@ class Report:
 
 
 def _plain(value):
-    return {name: list(v) if isinstance(v, tuple) else v for name, v in vars(value).items()}
+    """The fields of a value, as JSON has them."""
+    kept = {name: list(v) if isinstance(v, tuple) else v for name, v in vars(value).items()}
+    return {name: None if isinstance(v, float) and not np.isfinite(v) else v for name, v in kept.items()}
 
 
 def _of_residuals(residuals):
@@ -341,7 +333,7 @@ def _effort(run, name, limits):
     """An `Effort` from a signal of a run."""
     (low, t_low), (high, t_high) = extremes(run, name)
     peak, peak_at = max(((low, t_low), (high, t_high)), key=lambda extreme: abs(extreme[0]))
-    rates = _rates(run, name)
+    rates = _slopes(run, name)
     rate, rate_at = max(_sampled_extremes(run.t, rates), key=lambda extreme: abs(extreme[0]))
     nearest = {}
     if limits is not None:
@@ -360,7 +352,7 @@ def extremes(run, name):
         A signal, or d and the name of one.
     """
     if name not in run and name[:1] == "d" and name[1:] in run:
-        return _sampled_extremes(run.t, _rates(run, name[1:]))
+        return _sampled_extremes(run.t, _slopes(run, name[1:]))
     return tuple((value, t) for t, value in run.extrema(name))
 
 
@@ -377,7 +369,7 @@ def _rms(t, values):
     return float(np.sqrt(np.trapezoid(values**2, t) / (t[-1] - t[0]))) if len(t) > 1 else np.nan
 
 
-def _rates(run, name):
+def _slopes(run, name):
     """The derivative of a signal at the samples: exact if the run has the jets, else of splines between knots."""
     from scipy.interpolate import CubicSpline
 

@@ -20,7 +20,7 @@ FLAT, MINIMUM, MARGINAL, SINGULAR = "flat", "minimum phase", "marginal", "singul
 HYPERBOLIC_ZEROS, GROWS = "non-minimum phase (hyperbolic)", "non-minimum phase"
 UNDETERMINED, UNREALISABLE, OPEN = "undetermined", "not realisable", "inconclusive"
 LOOKS = 5  # instants beside a path at which the program must stand still for its end to be a rest
-BESIDE = 0.25  # of the path's length: how far beside it they lie
+ASIDE = 0.25  # of the path's length: how far beside it they lie
 NEAR = 0.1  # of the sizes of the free entries: distance within which a run begins or ends in an unstable rest
 
 
@@ -61,10 +61,26 @@ class Verdict:
     @property
     def growth(self):
         """How errors grow along the run, in words; "" without one."""
-        return f"along the run {self.internal.sentence().removeprefix('internal dynamics ')}" if self.internal else ""
+        said = "" if self.internal is None else self.internal.sentence().split("; ")[0]
+        return said and f"along the run {said.removeprefix('internal dynamics ')}"
+
+    def as_dict(self) -> dict:
+        """The verdict as numbers, texts, lists and dicts, for JSON; eigenvalues are pairs [real, imaginary part]."""
+        rest = {
+            name: {"t": end.t, "state": end.x.tolist(), "eigenvalues": [[z.real, z.imag] for z in end.eigenvalues]}
+            for name, end in self.rest.items()
+        }
+        growth = {} if self.internal is None else {n: _finite(v) for n, v in self.internal.facts().items()}
+        facts = {"verdict": self.word, "reason": self.reason, "do": self.do, "dynamics": self.dynamics}
+        return facts | {"rest": rest, "growth": growth}
 
     def __str__(self):
         return f"{self.word}: " + "; ".join(dict.fromkeys(filter(None, (self.reason, self.growth, self.do))))
+
+
+def _finite(value):
+    """A text, or a number that JSON has; None for others."""
+    return value if isinstance(value, str) else float(value) if np.isfinite(value) else None
 
 
 def verdict(model: Model, motion: Run | State | None = None) -> Verdict:
@@ -101,7 +117,7 @@ def _of_motion(model, motion):
     if lost:
         return Verdict(SINGULAR, lost[0])
     if model.flat:
-        return Verdict(FLAT, "the program determines the motion")
+        return Verdict(FLAT, "no free initial value")
     rest, why = _rests(model, states, isinstance(motion, Run))
     internal = internal_dynamics(model, motion) if isinstance(motion, Run) else None
     lost = "" if rest or internal else _lost_at_default_start(model, states[0][0])
@@ -193,7 +209,7 @@ def _rests(model, states, along):
 def _reach(end, length):
     """How far beside a rest the program must stand still [s]: a part of the path, or the time constant of a mode."""
     fastest = np.abs(end.eigenvalues).max(initial=0.0)
-    return BESIDE * abs(length) or (1 / fastest if fastest else 1.0)
+    return ASIDE * abs(length) or (1 / fastest if fastest else 1.0)
 
 
 def _judged(rest, internal, why):

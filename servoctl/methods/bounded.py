@@ -20,7 +20,7 @@ from servoctl.methods.accuracy import state_levels
 from servoctl.methods.motion import Motion, breakpoints
 from servoctl.methods.radau import basis, radau
 from servoctl.model.switching import switching
-from servoctl.tolerances import CUTOFF
+from servoctl.tolerances import CUTOFF, NOISE
 
 ORDER = 13  # of the collocation: seven nodes
 LONGEST = 1.0  # interval of the first mesh, in time constants of the fastest mode
@@ -103,11 +103,12 @@ def bounded(model, span, guess, method, instants, progress):
 
 @dataclass(frozen=True)
 class End:
-    """An equilibrium: its instant [s], state (n_x,) and linearisation A (f, f) in the free entries."""
+    """An equilibrium: its instant [s], state (n_x,), linearisation A (f, f) in the free entries, and their sizes (f,)."""
 
     t: float
     x: np.ndarray
     A: np.ndarray
+    size: np.ndarray
 
     @cached_property
     def eigenvalues(self):
@@ -119,11 +120,13 @@ class End:
     def on_axis(self):
         """The eigenvalues on the imaginary axis: A is as near to a matrix with one there as rounding is.
 
-        The real parts of multiple eigenvalues are far larger than the rounding that splits them.
+        Real parts alone do not tell: those of multiple eigenvalues are far larger than the rounding that splits them.
         """
         from scipy.linalg import matrix_balance
 
-        balanced, one = matrix_balance(self.A, permute=False)[0], np.eye(len(self.A))
+        scaled = self.A * self.size / self.size[:, None]
+        scaled = np.where(np.abs(scaled) > NOISE * np.abs(scaled).max(initial=0.0), scaled, 0.0)
+        balanced, one = matrix_balance(scaled, permute=False)[0], np.eye(len(scaled))
         size = np.linalg.norm(balanced)
         near = [np.linalg.svd(balanced - 1j * b * one, compute_uv=False)[-1] for b in self.eigenvalues.imag]
         return self.eigenvalues[np.array(near) <= HYPERBOLIC * size]
@@ -226,7 +229,7 @@ class FreeEntries:
         # where z are no coordinates, z' = 0 for motions that do not stand still
         if not (still and np.abs(tangent[0] * size / self.size[:, None]).max(initial=0.0) < 1 / REGULAR):
             raise self._failure("Newton's method finds no equilibrium of the internal dynamics.", t[0])
-        return End(t[0], x[:, 0], A[0])
+        return End(t[0], x[:, 0], A[0], size)
 
     def _scaled(self, A):
         """Magnitudes of the entries of matrices A (..., f, f) for z in its sizes."""
@@ -302,10 +305,17 @@ class Problem(FreeEntries):
             raise SpecificationError(
                 f"The internal dynamics have another equilibrium at t = {moved:.4g} s than at t = {end.t:.4g} s.",
                 "Outside the span the program stands still, so that the bounded motion has a rest to leave or reach.",
+                nearest=self._wider(),
                 do="Choose the span of the whole transition, paths that rest outside it, or a shorter window.",
                 t=moved,
                 span=self.span,
             )
+
+    def _wider(self):
+        """The span that all knots of the paths lie in; "" if they lie in the present one."""
+        (t0, t1), knots = self.span, self.model.knots
+        low, high = min(t0, *knots, t1), max(t0, *knots, t1)
+        return f"({low:g}, {high:g}), which holds all knots of the paths." if (low, high) != (t0, t1) else ""
 
     # collocation
 
