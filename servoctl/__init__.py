@@ -31,6 +31,7 @@ from servoctl.errors import (
 )
 from servoctl.export.c import export_c
 from servoctl.internal_dynamics import InternalDynamics, internal_dynamics
+from servoctl.inversion.relaxed import relaxed
 from servoctl.methods.choice import (
     Adaptive,
     Algebraic,
@@ -138,6 +139,7 @@ __all__ = [
     "pd",
     "plant",
     "plots",
+    "relaxed",
     "rigid_body",
     "sampled_bound",
     "simulate",
