@@ -41,9 +41,9 @@ INTERVALS = 24  # of the first mesh at least
 FIRST = 1e-3  # first weight, relative to that for which standing still costs as much as the program
 DEFAULT = 1e-6  # default weight, relative to the same
 FACTOR = 100.0  # between the weights of two successive solutions
-DEFECT = 1e-9  # of the states between nodes, relative to their sizes, above which the mesh is refined
+DEFECT, AIM = 1e-8, 0.1  # of the states between nodes, relative to their sizes; and what refinement aims at of it
 BETWEEN = (0.12, 0.4, 0.75)  # places within an interval where the defect is measured
-REFINEMENTS, MOST_PIECES, MOST_INTERVALS = 6, 4, 1000  # of the mesh; pieces of an interval; intervals
+REFINEMENTS, MOST_PIECES, MOST_INTERVALS = 6, 8, 1000  # of the mesh; pieces of an interval; intervals
 SAMPLES = 1000  # of the run, at least
 GUESS = 241  # instants of the guess
 STANDING = 1e-6  # rate of a program that stands still, relative to its largest
@@ -209,12 +209,12 @@ class Task:
 
     def _held(self, rest, where):
         """Inputs that hold a rest within the limits of magnitude."""
-        from scipy.optimize import lsq_linear
-
         (q, u), t = rest, self.span[where == "end"]
         low, high = np.array([self.limits.get(name, (-np.inf, np.inf)) for name in self.plant.inputs]).reshape(-1, 2).T
         if np.all((u >= low) & (u <= high)):
             return u
+        from scipy.optimize import lsq_linear
+
         B = self.equilibria.slopes(t, q, u)[:, self.nq :]
         found = lsq_linear(B, B @ u, (low, high), tol=1e-12)
         if np.abs(B @ (found.x - u)).max() <= 1e-6 * np.abs(B @ u).max():
@@ -458,7 +458,7 @@ class Task:
         defect = mesh.states(x, t, 1) - np.array(f(t[None], mesh.states(x, t), v))
         defect *= np.repeat(mesh.h, len(theta)) / _sizes(x, self.nq, self.span)[:, None]
         defect = np.abs(defect).max(axis=0).reshape(count, -1).max(axis=1)
-        pieces = np.ceil((defect / DEFECT) ** (1 / (1 + len(mesh.c)))).astype(int)
+        pieces = np.ceil((defect / (AIM * DEFECT)) ** (1 / (1 + len(mesh.c)))).astype(int)
         pieces = np.where(defect > DEFECT, np.clip(pieces, 2, MOST_PIECES), 1)
         if pieces.max() == 1 or pieces.sum() > MOST_INTERVALS:
             return None

@@ -11,7 +11,6 @@ from math import comb
 
 import casadi as ca
 import numpy as np
-from scipy.sparse import block_diag
 
 from servoctl.methods.bounded import basis_rates
 from servoctl.methods.radau import basis, radau
@@ -20,6 +19,9 @@ IPOPT = {
     "print_level": 0,
     "sb": "yes",
     "tol": 1e-8,
+    "acceptable_tol": 1e-6,  # rounding of φ²/β for small β
+    "acceptable_iter": 2,
+    "acceptable_constr_viol_tol": 1e-9,
     "max_iter": 300,
     "nlp_scaling_method": "none",
     "mu_strategy": "adaptive",
@@ -192,6 +194,8 @@ class Transcription:
     @cached_property
     def _problem(self):
         """Variables, weights, the objective, and the constraints by kind."""
+        from scipy.sparse import block_diag
+
         node, mesh, K, s = self.node, self.mesh, self.count, len(self.mesh.c)
         w, beta = ca.MX.sym("w", (self.n + self.m) * (1 + K)), ca.MX.sym("beta", node.residuals.numel())
         x, points = self._split(w)
