@@ -114,7 +114,7 @@ def test_limits_beyond_which_the_exact_plan_lies_give_a_relaxed_one():
     limit = 0.95 * max(abs(value) for _, value in exact.extrema("F"))
     run = sv.inverse(mechanism, program, limits={"F": limit}, **upright)
     assert exact.method == "bounded" and run.method == "relaxed" and "the exact plan needs F = " in said(run)
-    assert np.abs(run["F"]).max() <= limit * (1 + 1e-9)
+    assert np.abs(run["F"]).max() <= limit * (1 + 1e-7)  # IPOPT widens bounds by 1e-8
 
 
 # a method by hand -----------------------------------------------------------------------------------------------------

@@ -170,6 +170,21 @@ def test_a_program_that_oscillates_is_judged_along_its_run():
     assert verdict(model, sv.simulate(model, model.start(), (0.0, 20.0))).word == "marginal"
 
 
+@pytest.mark.parametrize("angle", [0.5, 2.0, 2.5])
+def test_a_run_is_not_judged_by_an_unstable_rest_far_from_it(angle):
+    """An undamped pendulum swings about its lower rest, also from above the horizontal."""
+    model = sv.derive(*crane(cart))
+    run = sv.simulate(model, model.start(theta=angle, dtheta=0.0), (0.0, 20.0))
+    assert verdict(model, run).word == "marginal"
+
+
+def test_a_run_from_an_unstable_rest_is():
+    model = sv.derive(*crane(cart))
+    with warned("unstable"):
+        run = sv.simulate(model, model.start(theta=pi, dtheta=0.0), (0.0, 6.0))
+    assert verdict(model, run).word == "non-minimum phase (hyperbolic)"
+
+
 def test_more_actuators_than_residuals_are_undetermined():
     q = sv.coordinates("x")
     (x,) = q
@@ -216,7 +231,8 @@ STIFF = np.array([[0.0, 1.0], [-1e9, -1.0]])
         (np.diag([1e3, 1.0], k=1) + 1e-17 * np.eye(3, k=-2), 1.0, 3),
         (np.array([[0.0, 1.0], [1e-17, 0.0]]), 1.0, 2),
         (np.array([[0.0, 1.0], [-1.0, 0.0]]), 1.0, 2),
-        (np.array([[0.0, 1.0], [-1.0, -1e-7]]), 1.0, 0),
+        (np.array([[0.0, 1.0], [-1.0, -1e-10]]), 1.0, 2),
+        (np.array([[0.0, 1.0], [-1.0, -1e-9]]), 1.0, 0),
         (np.array([[0.0, 1e7], [-1e-7, -1e-7]]), np.array([1e7, 1.0]), 0),
         (np.diag([1.0, -1e-8]), 1.0, 0),
         (STIFF, 1.0, 0),
@@ -238,6 +254,13 @@ def test_the_angle_between_actuator_and_normal(alpha):
         found = sv.report(sv.derive(*mass_on_car(alpha, coordinates=coordinates))).directions
         assert found.cosines == pytest.approx([expected], rel=1e-12)
         assert found.actuators == found.residuals == ()
+
+
+@pytest.mark.parametrize(("alpha", "idle"), [(6e-4, ()), (1.9e-4, ("force",))])
+def test_weak_directions_act_above_1e_7(alpha, idle):
+    """cos = √2 α²: 5.1e-7 and 5.1e-8."""
+    found = sv.report(sv.derive(*mass_on_car(alpha))).directions
+    assert found.cosines == pytest.approx([np.sqrt(2) * alpha**2], rel=1e-5) and found.actuators == idle
 
 
 def test_directions_without_effect_are_named(gallery_model):
