@@ -8,6 +8,7 @@ from the solution before, on a mesh that is refined until its motion is that of 
 """
 
 from collections.abc import Mapping, Sequence
+from copy import copy
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -41,12 +42,17 @@ INTERVALS = 24  # of the first mesh at least
 FIRST = 1e-3  # first weight, relative to that for which standing still costs as much as the program
 DEFAULT = 1e-6  # default weight, relative to the same
 FACTOR = 100.0  # between the weights of two successive solutions
-DEFECT, AIM = 1e-8, 0.1  # of the states between nodes, relative to their sizes; and what refinement aims at of it
+DEFECT, AIM = 1e-7, 0.1  # of the states between nodes, relative to their sizes; and what refinement aims at of it
 BETWEEN = (0.12, 0.4, 0.75)  # places within an interval where the defect is measured
-REFINEMENTS, MOST_PIECES, MOST_INTERVALS = 6, 8, 1000  # of the mesh; pieces of an interval; intervals
+REFINEMENTS, MOST_PIECES, MOST_INTERVALS = 6, 8, 400  # of the mesh; pieces of an interval; intervals
 SAMPLES = 1000  # of the run, at least
 GUESS = 241  # instants of the guess
 STANDING = 1e-6  # rate of a program that stands still, relative to its largest
+STATUS = {
+    "Infeasible_Problem_Detected": "finds no motion",
+    "Maximum_Iterations_Exceeded": "does not converge in 300 iterations",
+    "Restoration_Failed": "finds no way back to the equations of motion",
+}
 SOLVED = ("Solve_Succeeded", "Solved_To_Acceptable_Level")
 
 
@@ -147,9 +153,10 @@ def _limits(plant, limits):
 
 @dataclass(frozen=True)
 class Plan:
-    """A solution: states (n_x, 1 + N s), control points of the inputs (m, 1 + N s), and counts of the iterations."""
+    """A solution: states (n_x, 1 + N s), control points of the inputs (m, 1 + P s), and counts of the iterations."""
 
     mesh: Mesh
+    pieces: Mesh
     x: np.ndarray
     points: np.ndarray
     iterations: tuple = ()
@@ -334,7 +341,9 @@ class Task:
         rests = np.array([np.interp(times, times[known], row[known]) for row in rests])
         q, u = rests[: self.nq], rests[self.nq :]
         kinematics = self.node.function("kinematics", self.node.q.V, self.node.q.h)
-        motion = self.node.function("motion", self.node.acceleration, ca.jacobian(self.node.acceleration, self.node.v))
+        mechanism = self.plant.mechanism
+        forces = self.node.known(mechanism.mass), self.node.known(mechanism.E)
+        motion = self.node.function("motion", self.node.acceleration, *forces)
         rate, zero = np.gradient(q, times, axis=1), np.zeros(self.m * self.node.depth)
         w = np.zeros((self.n - self.nq, len(times)))
         for k, t in enumerate(times):
@@ -343,15 +352,16 @@ class Task:
         accelerations = np.gradient(w, times, axis=1)
         for k, t in enumerate(times):
             x, v = np.concatenate([q[:, k], w[:, k]]), np.append(u[:, k], zero)
-            present, B = (np.array(part) for part in motion(t, x, v))
-            u[:, k] += np.linalg.lstsq(B[:, : self.m], accelerations[:, k] - present.ravel(), rcond=None)[0]
+            present, M, E = (np.array(part) for part in motion(t, x, v))
+            inertial = M @ (accelerations[:, k] - present.ravel())
+            u[:, k] += np.linalg.lstsq(E, inertial, rcond=None)[0]
         return np.vstack([q, w]), u
 
     def _first(self, mesh):
         """The guess on a mesh."""
         times, nodes = np.linspace(*self.span, GUESS), np.append(mesh.edges[0], mesh.nodes)
         x, u = (np.array([np.interp(nodes, times, row) for row in part]) for part in (self.states, self.inputs))
-        return Plan(mesh, x, mesh.control_points(u[:, 1:], u[:, 0]))
+        return Plan(mesh, mesh, x, mesh.control_points(u[:, 1:], u[:, 0]))
 
     # solutions
 
@@ -359,12 +369,22 @@ class Task:
         """The run of weights (k,), by default a small part of the usual ones."""
         beta = DEFAULT * self._usual_weights() if beta is None else beta
         plan = self._continued(self._mesh(), beta)
-        for _ in range(REFINEMENTS):
+        for _ in range(REFINEMENTS):  # of the mesh
             finer = self._finer(plan)
             if finer is None:
-                break
+                return self._as_run(plan)
             plan = self._solved(finer, [beta], finer.iterations)
-        return self._as_run(plan, beta)
+        worst = self._defects(plan)
+        if worst.max() > 10 * DEFECT:
+            k = int(np.argmax(worst))
+            raise IntegrationStopped(
+                f"Between the nodes at t = {plan.mesh.edges[k]:.4g} s the plan misses the equations of motion by "
+                f"{worst[k]:.1e}, with {len(worst)} intervals.",
+                f"Relative to the states' sizes a plan misses them by at most {10 * DEFECT:g}.",
+                do="Choose a greater weight, wider limits or a shorter span.",
+                t=float(plan.mesh.edges[k]), defect=float(worst[k]), intervals=len(worst),
+            )  # fmt: skip
+        return self._as_run(plan)
 
     def _mesh(self):
         """Intervals of about the same length between the knots of the program."""
@@ -398,18 +418,18 @@ class Task:
 
     def _solved(self, plan, weights, iterations=()):
         """The plan of the last of falling weights, each solved from the one before."""
-        nlp = Transcription(self.node, plan.mesh, self.sizes, self.target[2])
+        nlp = Transcription(self.node, plan.mesh, plan.pieces, self.sizes, self.target[2])
         bounds, w, multipliers, iterations = self._sides(nlp), nlp.joined(plan.x, plan.points), None, list(iterations)
         for beta in weights:
             w, multipliers, stats = nlp.solve(w, beta, bounds, multipliers)
             iterations.append(stats["iter_count"])
             if stats["return_status"] not in SOLVED:
-                raise self._failed(nlp, w, stats)
-        return Plan(plan.mesh, *nlp.apart(w), tuple(iterations))
+                raise self._failed(nlp, (w, beta, bounds), stats["return_status"], plan)
+        return Plan(plan.mesh, plan.pieces, *nlp.apart(w), tuple(iterations))
 
     def _sides(self, nlp):
         """Bounds of the variables and of the constraints by kind."""
-        K, s = 1 + nlp.count, len(nlp.mesh.c)
+        K, P = 1 + nlp.count, 1 + len(nlp.pieces.nodes)
         x = np.repeat([[-np.inf], [np.inf]], self.n * K, axis=1).reshape(2, self.n, K)
         for name, sides in self.bounds.items():
             if name in self.plant.state_names:
@@ -417,8 +437,8 @@ class Task:
         x[:, :, 0] = self.begin
         fixed = np.isfinite(self.target[0])
         x[:, fixed, -1] = self.target[0][fixed]
-        u = np.repeat([[-np.inf], [np.inf]], self.m * K, axis=1).reshape(2, self.m, K)
-        slopes = np.repeat([[-np.inf], [np.inf]], self.m * (K - 1), axis=1).reshape(2, self.m, K - 1)
+        u = np.repeat([[-np.inf], [np.inf]], self.m * P, axis=1).reshape(2, self.m, P)
+        slopes = np.repeat([[-np.inf], [np.inf]], self.m * (P - 1), axis=1).reshape(2, self.m, P - 1)
         jump = np.zeros((2, self.m, 1))
         for i, name in enumerate(self.plant.inputs):
             if name in self.limits:
@@ -445,32 +465,85 @@ class Task:
             name=name, weight=float(beta[i]), most=float(usual[i]),
         )  # fmt: skip
 
-    def _failed(self, nlp, w, stats):
-        return IntegrationStopped(f"IPOPT: {stats['return_status']}")
+    def _failed(self, nlp, solution, status, plan):
+        """The error of an iteration that ends without a solution: what would be exceeded without limits, and where."""
+        w, beta, bounds = solution
+        said = STATUS.get(status, status)
+        row, t, value, side = self._violation(nlp, w, bounds)
+        facts = {"status": status, "weights": beta.tolist()}
+        free = copy(self)
+        free.limits, free.rates, free.bounds = {}, {}, dict.fromkeys(self.bounds, (-np.inf, np.inf))
+        limited = self.limits or self.rates or self.bounds
+        without = nlp.solve(nlp.joined(plan.x, plan.points), beta, free._sides(nlp)) if limited else None
+        if without is None or without[2]["return_status"] not in SOLVED:
+            return IntegrationStopped(
+                f"IPOPT {said}; the largest violation is that of {row} at t = {t:.4g} s, {abs(value - side):.3g}.",
+                "A plan satisfies the equations of motion and the conditions at both ends.",
+                do="Choose a longer span, another end or start nearer to the program.",
+                row=row, t=t, violation=float(abs(value - side)), **facts,
+            )  # fmt: skip
+        row, t, value, side = self._violation(nlp, without[0], bounds)
+        kind = LimitExceeded if status == "Infeasible_Problem_Detected" else IntegrationStopped
+        return kind(
+            f"IPOPT {said} within the limits and bounds; without them {row} is {value:.5g} at t = {t:.4g} s, "
+            f"beyond {side:.5g}.",
+            "A plan keeps all limits from end to end.",
+            do="Widen this limit, or give the transition more time.",
+            row=row, t=t, value=value, limit=side, **facts,
+        )  # fmt: skip
 
-    def _finer(self, plan):
-        """The plan on a finer mesh where its motion is not that of the plant; None where it is."""
-        mesh, (x, u) = plan.mesh, (plan.x, plan.points)
-        theta, count = np.array(BETWEEN), len(plan.mesh.h)
+    def _violation(self, nlp, w, bounds):
+        """Name, instant [s], value and side of what violates its bounds most, relative to its size, in SI."""
+        lower, upper, limits = bounds
+        mesh, pieces, (x_size, u_size) = nlp.mesh, nlp.pieces, self.sizes[:2]
+        instants, of_inputs = (np.append(each.edges[0], each.nodes) for each in (mesh, pieces))
+        parts = [*zip(nlp.apart(w), nlp.apart(lower), nlp.apart(upper), strict=True)]
+        states, inputs = self.plant.state_names, self.plant.inputs
+        entries = [(states, x_size, instants, *parts[0]), (inputs, u_size, of_inputs, *parts[1])]
+        rates = [f"d{name}" for name in inputs]
+        names = {"motion": [f"the motion of {name}" for name in states], "begin": inputs, "slope": rates}
+        names |= {"bound": [*self.node.bounds], "rest": ["rest at the end"] * len(limits["rest"][0])}
+        scales = {"motion": x_size, "begin": u_size, "slope": u_size}
+        for kind, value in nlp.constraints(w).items():
+            scale = scales.get(kind, np.ones(len(value)))[:, None]
+            at = {"begin": mesh.edges[:1], "rest": mesh.edges[-1:], "slope": pieces.nodes}.get(kind, mesh.nodes)
+            low, high = limits[kind]
+            entries.append((names[kind], np.maximum(scale[:, 0], _largest(value * scale)), at, *(scale * part for part in (value, low, high))))
+        found = []
+        for label, size, at, value, low, high in entries:
+            if not value.size:
+                continue
+            excess = np.maximum(low - value, value - high) / np.where(size > 0, size, 1.0)[:, None]
+            i, k = np.unravel_index(np.argmax(excess), excess.shape)
+            side = low[i, k] if low[i, k] - value[i, k] > value[i, k] - high[i, k] else high[i, k]
+            found.append((excess[i, k], (label[i], float(at[k]), float(value[i, k]), float(side))))
+        return max(found, key=lambda entry: entry[0])[1]
+
+    def _defects(self, plan):
+        """Largest defect h (x' - f) between the nodes of each interval, relative to the sizes of the states, (N,)."""
+        mesh, (x, u), theta = plan.mesh, (plan.x, plan.points), np.array(BETWEEN)
         t = (mesh.edges[:-1, None] + mesh.h[:, None] * theta).ravel()
         f = self.node.function("rates", self.node.rates).map(len(t))
-        v = np.vstack([mesh.inputs(u, t, rate) for rate in range(self.node.depth + 1)])
+        v = np.vstack([plan.pieces.inputs(u, t, rate) for rate in range(self.node.depth + 1)])
         defect = mesh.states(x, t, 1) - np.array(f(t[None], mesh.states(x, t), v))
         defect *= np.repeat(mesh.h, len(theta)) / _sizes(x, self.nq, self.span)[:, None]
-        defect = np.abs(defect).max(axis=0).reshape(count, -1).max(axis=1)
+        return np.abs(defect).max(axis=0).reshape(len(mesh.h), -1).max(axis=1)
+
+    def _finer(self, plan):
+        """The plan on a finer mesh where its motion is not that of the plant; None where it is, or at the finest."""
+        mesh, defect = plan.mesh, self._defects(plan)
         pieces = np.ceil((defect / (AIM * DEFECT)) ** (1 / (1 + len(mesh.c)))).astype(int)
         pieces = np.where(defect > DEFECT, np.clip(pieces, 2, MOST_PIECES), 1)
         if pieces.max() == 1 or pieces.sum() > MOST_INTERVALS:
             return None
         finer = Mesh(_cut(mesh.edges, pieces), mesh.order)
         nodes = np.append(mesh.edges[0], finer.nodes)
-        values = mesh.inputs(u, nodes)
-        return Plan(finer, mesh.states(x, nodes), finer.control_points(values[:, 1:], values[:, 0]), plan.iterations)
+        return replace(plan, mesh=finer, x=mesh.states(plan.x, nodes))
 
-    def _as_run(self, plan, beta):
+    def _as_run(self, plan):
         """The run of the plant under the plan's inputs."""
         mesh, mechanism = plan.mesh, self.plant.mechanism
-        u = ca.vertcat(piecewise(mechanism.q.t, mesh.edges, mesh.power_coefficients(plan.points)))
+        u = piecewise(mechanism.q.t, plan.pieces.edges, plan.pieces.power_coefficients(plan.points))
         inputs = dict(zip(self.plant.inputs, ca.vertsplit(u), strict=True))
         model = driven(self.plant, inputs, self.program.residuals)
         parts = max(1, -(-SAMPLES // len(mesh.h)))
@@ -479,7 +552,7 @@ class Task:
         jets = np.vstack([x, model.function("ode").grid(t, x, model.parameters)[self.nq : self.n]])
         start = State(float(t[0]), x[:, 0].copy(), tuple(model.state_names), (), (), 0.0)
         counters = {"iterations": sum(plan.iterations), "intervals": len(mesh.h), "solves": len(plan.iterations)}
-        run = Run(t, jets, tuple(model.jet_names), model, "relaxed", counters=counters, knots=tuple(mesh.edges[1:-1].tolist()), start=start)
+        run = Run(t, jets, tuple(model.jet_names), model, "relaxed", counters=counters, knots=tuple(plan.pieces.edges[1:-1].tolist()), start=start)
         missed = ", ".join(f"{name} {np.abs(run.residual[name]).max():.2g}" for name in self.program.names)
         return replace(run, message=f"finished; the program is missed by at most {missed}")
 
@@ -518,3 +591,8 @@ def _no_equilibrium(t, worst, speeds):
         do="Leave start= out, or write end='free' or the values of states at the end.",
         t=float(t), row=row, value=value, speeds=moving,
     )  # fmt: skip
+
+
+def _largest(values):
+    """Largest magnitude of each row (rows,)."""
+    return np.abs(values).max(axis=1, initial=0.0)

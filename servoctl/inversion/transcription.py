@@ -23,6 +23,7 @@ IPOPT = {
     "acceptable_iter": 2,
     "acceptable_constr_viol_tol": 1e-9,
     "max_iter": 300,
+    "bound_relax_factor": 0.0,
     "nlp_scaling_method": "none",
     "mu_strategy": "adaptive",
 }
@@ -52,7 +53,7 @@ class Node:
 
     def __init__(self, plant, program, bounded):
         e = plant.equations
-        self.q, self.plant = e.q, plant
+        self.q, self.bounds = e.q, tuple(bounded)
         residuals, effort = ca.vertcat(*program.residuals.values()), ca.SX(0)
         for name, u in zip(plant.inputs, e.u.elements(), strict=True):
             effort += program.weights.get(name, 1.0) * u**2
@@ -173,22 +174,25 @@ def bernstein(s, theta, rate=0):
 class Transcription:
     """The nonlinear program of one mesh; weights, bounds and the ends are data of each solution.
 
-    Unknowns are states at the begin and all nodes (n_x, 1 + N s) and control points of the inputs (m, 1 + N s), each in
+    Unknowns are states at the begin and all nodes (n_x, 1 + N s) and control points of the inputs (m, 1 + P s), each in
     units of its size. Constraints by kind: "motion" (n_x, N s), collocation; "begin" (m, 1), the highest coefficient of
-    the inputs on the first interval, whose begin is no node; "slope" (m, N s), control points of u'; "bound" (b, N s);
+    the inputs on the first interval, whose begin is no node; "slope" (m, P s), control points of u'; "bound" (b, N s);
     "rest" (r, 1).
 
     Parameters
     ----------
     node : Node
     mesh : Mesh
+        Of the states, N intervals.
+    pieces : Mesh
+        Of the inputs, P intervals, each of one or several of the states'.
     sizes : (x, u, effort) of (n_x,), (m,) arrays and float
     rest : Function, optional
         Of (t, x, v): what vanishes at the end.
     """
 
-    def __init__(self, node, mesh, sizes, rest=None):
-        self.node, self.mesh, self.sizes, self.rest = node, mesh, sizes, rest
+    def __init__(self, node, mesh, pieces, sizes, rest=None):
+        self.node, self.mesh, self.pieces, self.sizes, self.rest = node, mesh, pieces, sizes, rest
         self.n, self.m, self.count = len(sizes[0]), len(sizes[1]), len(mesh.nodes)
 
     @cached_property
@@ -197,10 +201,11 @@ class Transcription:
         from scipy.sparse import block_diag
 
         node, mesh, K, s = self.node, self.mesh, self.count, len(self.mesh.c)
-        w, beta = ca.MX.sym("w", (self.n + self.m) * (1 + K)), ca.MX.sym("beta", node.residuals.numel())
+        count = self.n * (1 + K) + self.m * (1 + len(self.pieces.nodes))
+        w, beta = ca.MX.sym("w", count), ca.MX.sym("beta", node.residuals.numel())
         x, points = self._split(w)
         f = node.function("node", node.rates, node.residuals, node.effort, node.bounded).map(K)
-        v = ca.vertcat(*(points @ _matrix(_at_nodes(mesh, k)) for k in range(node.depth + 1)))
+        v = ca.vertcat(*(points @ _matrix(_at(self.pieces, mesh.nodes, k)) for k in range(node.depth + 1)))
         rates, residuals, effort, bounded = f(ca.DM(mesh.nodes).T, x[:, 1:], v)
         begins = np.repeat(np.arange(0, K, s), s).tolist()
         increments = (x[:, 1:] - x[:, begins]) @ _matrix(block_diag([radau(mesh.order)[1].T] * len(mesh.h)))
@@ -211,7 +216,7 @@ class Transcription:
         constraints = {
             "motion": (increments - h * rates) / ca.repmat(ca.DM(self.sizes[0]), 1, K),
             "begin": points[:, : s + 1] @ highest / ca.DM(self.sizes[1]),
-            "slope": points @ _matrix(_slopes(mesh)) / ca.repmat(ca.DM(self.sizes[1]), 1, K),
+            "slope": points @ _matrix(_slopes(self.pieces)) / ca.DM(self.sizes[1]),
             "bound": bounded,
             "rest": self.rest(mesh.edges[-1], x[:, -1], v[:, -1]) if self.rest else ca.MX(0, 1),
         }
@@ -219,12 +224,12 @@ class Transcription:
 
     def _split(self, w):
         """States and control points, in SI, of the variables."""
-        K = 1 + self.count
-        x, points = (ca.reshape(part, -1, K) for part in ca.vertsplit(w, [0, self.n * K, (self.n + self.m) * K]))
+        x, points = ca.vertsplit(w, [0, self.n * (1 + self.count), w.numel()])
+        x, points = ca.reshape(x, self.n, -1), ca.reshape(points, self.m, -1)
         return ca.diag(ca.DM(self.sizes[0])) @ x, ca.diag(ca.DM(self.sizes[1])) @ points
 
     def joined(self, x, points):
-        """The variables (n_w,) of states (n_x, 1 + N s) and control points (m, 1 + N s)."""
+        """The variables (n_w,) of states (n_x, 1 + N s) and control points (m, 1 + P s)."""
         parts = x / self.sizes[0][:, None], points / self.sizes[1][:, None]
         return np.concatenate([part.ravel(order="F") for part in parts])
 
@@ -281,23 +286,23 @@ class Transcription:
         return self._solvers[warm]
 
 
-def _at_nodes(mesh, rate):
-    """The matrix (1 + N s, N s) from control points to derivatives of the inputs at the nodes."""
-    from scipy.sparse import lil_matrix
+def _at(pieces, t, rate):
+    """The matrix (1 + P s, M) from control points to derivatives of the inputs at instants (M,)."""
+    from scipy.sparse import csc_matrix
 
-    s, count = len(mesh.c), len(mesh.h)
-    matrix, at = lil_matrix((1 + count * s, count * s)), bernstein(s, mesh.c, rate).T
-    for i, h in enumerate(mesh.h):
-        matrix[i * s : (i + 1) * s + 1, i * s : (i + 1) * s] = at / h**rate
-    return matrix
+    k, theta = pieces.place(t)
+    s = len(pieces.c)
+    values = bernstein(s, theta, rate) / pieces.h[k, None] ** rate
+    rows, columns = k[:, None] * s + np.arange(s + 1), np.repeat(np.arange(len(t)), s + 1)
+    return csc_matrix((values.ravel(), (rows.ravel(), columns)), shape=(1 + len(pieces.nodes), len(t)))
 
 
-def _slopes(mesh):
-    """The matrix (1 + N s, N s) from control points to those of the derivative."""
+def _slopes(pieces):
+    """The matrix (1 + P s, P s) from control points to those of the derivative."""
     from scipy.sparse import diags
 
-    s, count = len(mesh.c), len(mesh.nodes)
-    slopes = s / np.repeat(mesh.h, s)
+    s, count = len(pieces.c), len(pieces.nodes)
+    slopes = s / np.repeat(pieces.h, s)
     return diags([-slopes, slopes], [0, -1], shape=(1 + count, count))
 
 
