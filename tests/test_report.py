@@ -243,6 +243,30 @@ def test_eigenvalues_on_the_axis(A, size, count):
     assert len(End(0.0, np.zeros(len(A)), A, size * np.ones(len(A))).on_axis) == count
 
 
+def test_a_run_backwards_has_the_same_rests():
+    model = sv.derive(*gallery["passive-arm"].build())
+    run = sv.simulate(model, model.start(t=2.0, q2=0.0, dq2=0.0), (2.0, 1.9))
+    found = verdict(model, run)
+    assert [end.t for end in found.rest.values()] == [2.0] and "start" in found.rest
+
+
+def test_a_plant_under_inputs_has_no_verdict():
+    plant = sv.plant(crane()[0])
+    run = sv.simulate(plant, {"x": 0.0, "theta": 0.1, "dx": 0.0, "dtheta": 0.0}, (0.0, 1.0), inputs={"F": 1.0})
+    report = sv.report(run.model, run)
+    assert report.verdict.word == "inconclusive" and len(repr(report).splitlines()) <= 12
+
+
+@pytest.mark.parametrize("name", ["winch-crane", "crane-3d"])
+def test_samples_near_a_rest_claim_no_other_zeros_at_infinity(name, gallery_model):
+    """At 0.12 s of 6 s the rope's angle is about 1e-10: its relative error makes matrices of low rank regular."""
+    model = gallery_model(name)
+    run = sv.simulate(model, scene_start(name, model), gallery[name].t_span)
+    structure = model.structure(run)
+    assert {local.zeros_at_infinity for _, local in structure.at} <= {structure.zeros_at_infinity, ()}
+    assert structure.zeros_at_infinity == ((2, 4) if name == "winch-crane" else (2, 4, 4))
+
+
 # what a report holds --------------------------------------------------------------------------------------------------
 
 

@@ -164,7 +164,7 @@ def _of_residuals(residuals):
         text = f"{', '.join(names)}: order {order}" + (f", raised {raised}x" if raised else "")
         text += "" if degree is None else f", relative degree {degree}"
         texts.append(text + ("" if smoothness is None else f", path C{smoothness}"))
-    return [texts[0], *(["; ".join(texts[1:])] if texts[1:] else [])]
+    return [*texts[:1], *(["; ".join(texts[1:])] if texts[1:] else [])]
 
 
 def _of_directions(found):

@@ -96,8 +96,10 @@ def verdict(model: Model, motion: Run | State | None = None) -> Verdict:
     -------
     Verdict
     """
-    found = _of_motion(model, motion)
     program, actuators = model.reduction.program, model.actuators
+    if not program.residuals:
+        return Verdict(OPEN, "this is a plant under inputs", "pass the model of a mechanism and its program")
+    found = _of_motion(model, motion)
     if program.by == "ideal" or len(actuators) <= len(program.residuals):
         return found
     numbers = f"{len(actuators)} actuators ({', '.join(actuators)}), the program determines {len(program.residuals)}"
@@ -184,7 +186,7 @@ def _rests(model, states, along):
     """
     (t0, first), (t1, last) = states[0], states[-1]
     t1 = t1 if along else max((knot for knot in model.knots if knot > t0), default=t0)
-    sides = np.linspace(-1.0, 1.0, 2 * LOOKS + 1)
+    sides = np.linspace(-1.0, 1.0, 2 * LOOKS + 1) * (-1.0 if t1 < t0 else 1.0)
     places = [("start", t0, first, sides[:LOOKS] if t1 != t0 else sides), ("end", t1, last, sides[LOOKS + 1 :])]
     rest, why = {}, ""
     try:

@@ -209,6 +209,7 @@ def margins(reduction, t, jets, values):
     values : (n_p,) array
         Parameters.
     """
+    t, jets = np.asarray(t, dtype=float), np.asarray(jets, dtype=float)
     numbers = clean(*points_of(reduction, t, jets, values).matrix(reduction.leading))
     known = np.isfinite(numbers).all(axis=(0, 1))
     ranks = decide_each(np.where(known, numbers, 0.0), INDEPENDENT)
@@ -275,6 +276,8 @@ def structure(reduction, t=None, jets=None, values=None, start=None):
     if start is not None:
         start = start[0], _locals(reduction, points_of(reduction, [start[0]], start[1][:, None], values), True)[0]
     typical = _most_common(locals_)
+    if t is not None:
+        locals_ = _without_rounded(locals_, typical, margins(reduction, t, jets, values))
     rank_P = typical.decoupling_rank if any(r <= 2 for r in typical.relative_degree) else 0
     kind = "orthogonal" if rank_P == len(names) else "tangential" if rank_P == 0 else "mixed"
     kind = kind if typical.relative_degree else "undecided"
@@ -284,6 +287,19 @@ def structure(reduction, t=None, jets=None, values=None, start=None):
         names, typical.relative_degree, typical.decoupling_rank, typical.zeros_at_infinity, typical.essential_orders,
         typical.index, margin, kind, at, start,
     )  # fmt: skip
+
+
+def _without_rounded(locals_, typical, pivots):
+    """The structure at points of a motion, undecided where rounding has decided.
+
+    Where the leading matrix is regular, zeros at infinity are those of the reduction everywhere. Near a rest, relative
+    errors of small jets are large, and ranks of the large matrices J_N may come out too high.
+    """
+    kept = []
+    for local, pivot in zip(locals_, pivots, strict=True):
+        rounded = pivot > 0 and local.zeros_at_infinity != typical.zeros_at_infinity
+        kept.append(Local((), 0, (), (), None, local.margin, local.zero) if rounded else local)
+    return kept
 
 
 def _most_common(locals_):

@@ -54,7 +54,7 @@ def _parser():
     commands = parser.add_subparsers(required=True, metavar="command")
     listing = commands.add_parser("list", help="the gallery's scenes")
     listing.set_defaults(command=_list)
-    report = commands.add_parser("report", help="the derivation of a model, its structure and its verdict; no simulation")
+    report = commands.add_parser("report", help="the derivation of a model, its structure, its verdict; no simulation")
     report.add_argument("scene", metavar="NAME_OR_FILE", help="a gallery name, a .py file, or the folder of a run")
     report.set_defaults(command=_report)
     for add in (run.add_run, tradeoff.add_tradeoff, sweep.add_sweep, export.add_export, cache.add_cache):
