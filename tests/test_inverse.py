@@ -98,7 +98,7 @@ def test_a_rough_path_gets_a_relaxed_plan():
     path = sv.paths.rest_to_rest(mechanism.q.t, (0.0, 4.0), (5.0, 2.0), duration=6.0, smoothness=2)
     program = sv.Program({"X": x + l * ca.sin(theta) - path[0], "Z": l * ca.cos(theta) - path[1]})
     run = sv.inverse(mechanism, program, (0.0, 6.0), start={"l": 4.0})
-    assert run.method == "relaxed" and "C^2" in said(run) and "C^4" in said(run)
+    assert run.method == "relaxed" and "C^2" in said(run) and "needs 4" in said(run)
     assert np.abs(run.residual["X"][0]).max() < 1e-2
 
 

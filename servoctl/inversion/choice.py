@@ -86,7 +86,7 @@ def inverse(
         facts = error.details
         if method not in (None, RELAXED) or not {"needs", "has"} <= facts.keys():
             raise
-        return task.relaxed(f"{facts['name']} has class C^{facts['has']} and the exact inverse needs C^{facts['needs']}")
+        return task.relaxed(f"{facts['name']} has class C^{facts['has']}, and the exact inverse needs {facts['needs']}")
     begin = start if isinstance(start, State) else _start(model, task.span[0], known)
     found = verdict(model, begin)
     chosen = _chosen(model, found)
