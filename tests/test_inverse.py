@@ -78,7 +78,8 @@ def test_a_program_that_is_singular_at_rest_gets_a_relaxed_plan():
     load = run["x"] + 4 * np.sin(run["theta"])
     assert np.abs(load - target).max() < 1e-3 * 5.0
     assert np.abs(run["theta"][[0, -1]]).max() < 1e-9 and np.abs(run["dtheta"][[0, -1]]).max() < 1e-9
-    assert np.abs(run["F"]).max() < 132.98 and np.degrees(np.abs(run["theta"]).max()) < 7.665
+    assert np.abs(run["F"]).max() == pytest.approx(132.98, rel=1e-2)  # of the limit of small weights
+    assert np.degrees(np.abs(run["theta"]).max()) == pytest.approx(7.665, rel=1e-2)
 
 
 def test_a_marginal_program_gets_a_relaxed_plan_that_ends_at_rest():
@@ -166,9 +167,23 @@ def test_a_span_that_cuts_a_bounded_motion_short_names_the_one_of_the_path():
         ({"bounds": {"tensions": (0, None)}}, sv.NameUnknown),
         ({"method": "Tailor"}, sv.NameUnknown),
         ({"start": {"rope": 4.0}}, sv.NameUnknown),
+        ({"start": "hanging"}, sv.SpecificationError),
+        ({"start": {"l": "long"}}, sv.SpecificationError),
+        ({"start": arm(0.5).start()}, sv.SpecificationError),
+        ({"weight": -1.0}, sv.SpecificationError),
+        ({"weight": {"Y": 1.0}}, sv.NameUnknown),
+        ({"method": np.ones(3)}, sv.NameUnknown),
+        ({"mechanism": None}, sv.SpecificationError),
+        ({"program": "path"}, sv.SpecificationError),
     ],
 )
 def test_bad_arguments_are_refused(options, kind):
     mechanism, program = overhead_crane()
+    given = {"mechanism": mechanism, "program": program, "t_span": (0.0, 8.0), "start": {"l": 4.0}}
     with refused(kind):
-        sv.inverse(mechanism, program, **{"t_span": (0.0, 8.0), "start": {"l": 4.0}} | options)
+        sv.inverse(**given | options)
+
+
+def test_a_program_without_a_start_says_why():
+    with refused(sv.InconsistentStart):
+        sv.inverse(*gallery["spiral"].build(), (0.0, 1.0))
