@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from refusals import refused, warned
 from test_bounded import aircraft, arm
-from test_report import DRIFTING, FLAT, RESTING, cart, crane
+from test_report import DRIFTING, FLAT, RESTING, cart, crane, mathieu
 
 import servoctl as sv
 from servoctl.gallery import gallery, overhead_crane
@@ -116,6 +116,14 @@ def test_limits_beyond_which_the_exact_plan_lies_give_a_relaxed_one():
     run = sv.inverse(mechanism, program, limits={"F": limit}, **upright)
     assert exact.method == "bounded" and run.method == "relaxed" and "the exact plan needs F = " in said(run)
     assert np.abs(run["F"]).max() <= limit * (1 + 1e-7)  # IPOPT widens bounds by 1e-8
+
+
+def test_growth_along_a_forward_plan_is_not_silent():
+    """Beside the driven mass x'' + 0.1 x' + (1 + 0.6 cos 2t) x = 0; an ideal reaction has no other inverse."""
+    mechanism, program = specification(mathieu())
+    with warned("errors grow by"):
+        run = sv.inverse(mechanism, sv.Program(program.residuals, by="ideal"), (0.0, 60.0), start={"x": 1e-3})
+    assert "non-minimum phase" in said(run) and run.internal["verdict"] == "unstable"
 
 
 # a method by hand -----------------------------------------------------------------------------------------------------

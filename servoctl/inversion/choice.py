@@ -118,10 +118,13 @@ class Task:
         excess = _excess(run, {**self.ranges[0], **self.ranges[1]})
         if excess:
             return self.relaxed(excess)
-        if found.dynamics == OPEN:
+        if found.dynamics == OPEN or run.internal.get("verdict") == "unstable":
             found = verdict(model, run)
-            if found.dynamics == GROWS:
-                return self.relaxed(found, begin)
+        if found.dynamics != GROWS:
+            return _told(run, found)
+        if not model.ideal:
+            return self.relaxed(found, begin)
+        warnings.warn(f"An ideal program has no other inverse, and this is {found}.", RuntimeWarning, stacklevel=3)
         return _told(run, found)
 
     def exact(self, model, begin, found, method):
