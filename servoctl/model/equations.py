@@ -296,7 +296,14 @@ class Equations(Invariants):
         return [f"multiplier_{name}" for name in names], [multipliers]
 
     def _outputs(self):
-        return list(self.r.mechanism.outputs), list(self.r.mechanism.outputs.values())
+        mechanism = self.r.mechanism
+        outputs = {name: e for name, e in mechanism.outputs.items() if name not in mechanism.inputs}
+        return list(outputs), list(outputs.values())
+
+    def _given_inputs(self):
+        """Inputs that drive the mechanism as functions of time."""
+        mechanism = self.r.mechanism
+        return list(mechanism.inputs), [mechanism.outputs[name] for name in mechanism.inputs]
 
     def _energy(self):
         return ["energy"], [self.r.mechanism.energy]
@@ -381,6 +388,7 @@ SIGNALS = {  # names and expressions of each group
     "reaction": Equations._reaction,
     "multipliers": Equations._multipliers,
     "outputs": Equations._outputs,
+    "given_inputs": Equations._given_inputs,
     "energy": Equations._energy,
     "balance": Equations._balance,
     "coordinate_rates": Equations._coordinate_rates,
