@@ -1,4 +1,4 @@
-"""A crane with a fixed rope: no exact inverse moves its load from rest to rest; relaxed plans do, as closely as wished."""
+"""A crane with a fixed rope: no exact inverse moves its load from rest to rest; relaxed plans do."""
 
 import sys
 
