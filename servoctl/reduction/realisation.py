@@ -195,7 +195,7 @@ def _require_enough(mechanism, program, independent):
 
 
 def _require_choices(mechanism, program):
-    """Refuse weights and wishes of unknown actuators, wishes of accelerations, and wishes where no actuation is open."""
+    """Refuse unknown actuators, wishes of accelerations, and wishes where no actuation is open."""
     for name in (*program.weights, *program.toward):
         if name not in mechanism.actuators:
             raise unknown(name, mechanism.actuators, "actuator")
