@@ -31,6 +31,7 @@ from servoctl.errors import (
 )
 from servoctl.export.c import export_c
 from servoctl.internal_dynamics import InternalDynamics, internal_dynamics
+from servoctl.inversion.output import MinimumPhase, minimum_phase
 from servoctl.methods.choice import (
     Adaptive,
     Algebraic,
@@ -86,6 +87,7 @@ __all__ = [
     "LimitReport",
     "Mechanism",
     "MinimalCoordinates",
+    "MinimumPhase",
     "Model",
     "NameUnknown",
     "NotRealisable",
@@ -130,6 +132,7 @@ __all__ = [
     "load_study",
     "lqr",
     "merge",
+    "minimum_phase",
     "monte_carlo",
     "output_feedback",
     "parameters",

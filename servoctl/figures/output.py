@@ -13,8 +13,10 @@ def draw_output(result):
     figure, ((ax,),) = style.figure(4.4)
     magnitude = np.concatenate([np.abs(roots) for roots in result.roots])
     limit = CLIP * float(np.median(magnitude)) if magnitude.size else 1.0
-    for r in result.ranges:
-        ax.axvspan(r.low, r.high, color=SHADES[r.verdict], alpha=0.15, lw=0, label=None)
+    for verdict in dict.fromkeys(r.verdict for r in result.ranges):
+        for i, r in enumerate(r for r in result.ranges if r.verdict == verdict):
+            label = "_" if i else verdict
+            ax.axvspan(r.low, r.high, color=SHADES[verdict], alpha=0.15, lw=0, label=label)
     points = [(v, root.real) for v, roots in zip(result.values, result.roots, strict=True) for root in roots]
     if points:
         x, y = np.array(points).T
@@ -22,14 +24,10 @@ def draw_output(result):
         ax.plot(x[inside], y[inside], ".", color=style.COLOURS[0], markersize=3, label="real parts of the eigenvalues")
     for c in result.critical:
         ax.axvline(c.value, color="black", lw=1, ls=":", label="flat" if c.flat else "relative degree lost")
-    ax.axvline(result.current, color=style.COLOURS[3], lw=1, ls="--", label="the model's own value")
+    ax.axvline(result.own, color=style.COLOURS[3], lw=1, ls="--", label="the model's own value")
     ax.axhline(0.0, color="black", lw=0.8)
     ax.set(xlim=(result.values[0], result.values[-1]), ylim=(-limit, limit), xlabel=result.parameter)
     ax.set_ylabel("real part [1/s]")
-    verdicts = dict.fromkeys(r.verdict for r in result.ranges)
-    ax.set_title("Internal dynamics at the equilibrium: " + ", ".join(f"{v} shaded {_COLOUR[v]}" for v in verdicts), fontsize=11)
+    ax.set_title("Internal dynamics at the equilibrium", fontsize=11)
     ax.legend(fontsize=9)
     return figure
-
-
-_COLOUR = {"stable": "green", "marginal": "yellow", "unstable": "red"}
