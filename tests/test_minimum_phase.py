@@ -366,3 +366,23 @@ def test_a_flat_scene_has_no_internal_states_for_any_value():
     result = sv.minimum_phase(model, "m_load", (50.0, 150.0), at=model.start(guess={"l": 4.0}))
     assert [r.states for r in result.ranges] == [0] and result.ranges[0].verdict == "stable"
     assert "no internal states" in repr(result)
+
+
+def test_moved_states_within_1e_6_are_equilibria(arm):
+    near = sv.minimum_phase(arm, "Gamma", (0.1, 0.2), at=arm.start(q2=5e-7))
+    assert near.stable == ((0.1, 0.2),)
+    with refused(sv.InconsistentStart):
+        sv.minimum_phase(arm, "Gamma", (0.1, 0.2), at=arm.start(q2=5e-6))
+
+
+@pytest.mark.parametrize(("mass", "states"), [(1e-9, 2), (1e-13, 1)])
+def test_a_coefficient_counts_above_1e_11(mass, states):
+    """m y'' + d y' + k y with d² >> m k: beside d and k, of the size of one, the inertia is seen above 1e-11."""
+    p = sv.parameters(w=0.1)
+    q = sv.coordinates("x y")
+    (x, y), (_, dy) = q, q.d(1)
+    S = sv.particle(q, 1.0, x) + sv.particle(q, mass, y)
+    mechanism = sv.Mechanism(q, gibbs=S, potential=y**2 / 2, forces=(0, -dy), actuators={"a": x}, parameters=p)
+    path = sv.paths.rest_to_rest(q.t, 0.0, 1.0, 1.0, smoothness=4)
+    model = sv.derive(mechanism, sv.Program({"X": x + p.w * ca.sin(y) ** 2 - path}))
+    assert sv.minimum_phase(model, "w", (0.05, 0.15)).eigenvalues(0.1).size == states
