@@ -31,7 +31,10 @@ from servoctl.errors import (
 )
 from servoctl.export.c import export_c
 from servoctl.internal_dynamics import InternalDynamics, internal_dynamics
+from servoctl.inversion.choice import inverse
 from servoctl.inversion.output import MinimumPhase, minimum_phase
+from servoctl.inversion.relaxed import relaxed
+from servoctl.inversion.report import Report, report
 from servoctl.methods.choice import (
     Adaptive,
     Algebraic,
@@ -97,6 +100,7 @@ __all__ = [
     "Program",
     "Project",
     "RadauIIA",
+    "Report",
     "Run",
     "RungeKutta",
     "Sensors",
@@ -126,6 +130,7 @@ __all__ = [
     "grid",
     "internal_dynamics",
     "interop",
+    "inverse",
     "limit_report",
     "limited",
     "load",
@@ -141,6 +146,8 @@ __all__ = [
     "pd",
     "plant",
     "plots",
+    "relaxed",
+    "report",
     "rigid_body",
     "sampled_bound",
     "simulate",

@@ -339,7 +339,9 @@ class Equations(Invariants):
             levels = self.q.derivatives([row.expression], max(0, self.top - row.order))
             names += [(name, j) for j in range(len(levels))]
             expressions += [level[0] for level in levels]
-        invariants = self.q.invariants
+        reported, invariants = self.r.mechanism.reported, self.q.invariants
+        names += [(name, 0) for name in reported]
+        expressions += reported.values()
         expressions = [*map(self._without_higher, expressions), *invariants.values()]
         return [*names, *((name, 0) for name in invariants)], expressions
 
