@@ -43,6 +43,7 @@ from servoctl.methods.choice import (
     Sundials,
     Taylor,
 )
+from servoctl.methods.events import Event
 from servoctl.methods.stability import sampled_bound
 from servoctl.model.model import Model, derive
 from servoctl.plants.plant import Plant, plant
@@ -78,6 +79,7 @@ __all__ = [
     "Closed",
     "Controller",
     "Coordinates",
+    "Event",
     "InconsistentStart",
     "IntegrationStopped",
     "InternalDynamics",
