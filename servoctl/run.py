@@ -353,7 +353,8 @@ class Run(ByName, Value):
             f"  method {self.method}" + (f", drift: {self.drift}" if self.drift else ""),
             "  " + ", ".join(f"{name} {count}" for name, count in self.counters.items() if count),
             "  " + self.internal.get("text", ""),
-            "  events: " * bool(self.events) + "; ".join(f"{name} {_times_in_words(t)}" for name, t in self.t_events.items()),
+            "  events: " * bool(self.events)
+            + "; ".join(f"{name} {_times_in_words(t)}" for name, t in self.t_events.items()),
         ]
         if shown:
             lines.append("  largest residuals over all levels: " + ", ".join(f"{n} {worst[n]:.1e}" for n in shown))
