@@ -48,6 +48,7 @@ from servoctl.methods.stability import sampled_bound
 from servoctl.model.model import Model, derive
 from servoctl.plants.plant import Plant, plant
 from servoctl.run import Run, load
+from servoctl.sensitivities.sensitivity import Sensitivity, sensitivity
 from servoctl.simulation import simulate
 from servoctl.spec import (
     Coordinates,
@@ -99,6 +100,7 @@ __all__ = [
     "RadauIIA",
     "Run",
     "RungeKutta",
+    "Sensitivity",
     "Sensors",
     "ServoError",
     "SingularProgram",
@@ -142,6 +144,7 @@ __all__ = [
     "plots",
     "rigid_body",
     "sampled_bound",
+    "sensitivity",
     "simulate",
     "spec",
     "stability",
