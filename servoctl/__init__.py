@@ -47,10 +47,12 @@ from servoctl.methods.choice import (
     Sundials,
     Taylor,
 )
+from servoctl.methods.events import Event
 from servoctl.methods.stability import sampled_bound
 from servoctl.model.model import Model, derive
 from servoctl.plants.plant import Plant, plant
 from servoctl.run import Run, load
+from servoctl.sensitivities.sensitivity import Sensitivity, sensitivity
 from servoctl.simulation import simulate
 from servoctl.spec import (
     Coordinates,
@@ -82,6 +84,7 @@ __all__ = [
     "Closed",
     "Controller",
     "Coordinates",
+    "Event",
     "InconsistentStart",
     "IntegrationStopped",
     "InternalDynamics",
@@ -103,6 +106,7 @@ __all__ = [
     "Report",
     "Run",
     "RungeKutta",
+    "Sensitivity",
     "Sensors",
     "ServoError",
     "SingularProgram",
@@ -150,6 +154,7 @@ __all__ = [
     "report",
     "rigid_body",
     "sampled_bound",
+    "sensitivity",
     "simulate",
     "spec",
     "stability",

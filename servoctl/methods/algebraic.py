@@ -6,7 +6,7 @@ ends. Samples are solved between the ends of these steps.
 
 import numpy as np
 
-from servoctl.methods.monitor import Fine, Repivot, Stretch
+from servoctl.methods.monitor import Fine, Repivot, Singular, Stretch
 from servoctl.methods.motion import Stepping, breakpoints, interruptible
 
 STEPS = 50  # at least, in a span: shorter movements between two rests are overlooked where there are no samples
@@ -14,7 +14,7 @@ NODES = 1000  # steps per call of the loop: 0.3 ms compiled, 50 ms where CasADi 
 BLOCK = 4000  # samples per call of the loop: 0.2 ms compiled, 0.2 s where CasADi evaluates
 
 
-def algebraic(model, span, x0, times, knots, progress):
+def algebraic(model, span, x0, times, knots, progress, events=None):
     """Solve a flat program for q, γ' and γ'' at each time.
 
     Parameters
@@ -30,12 +30,15 @@ def algebraic(model, span, x0, times, knots, progress):
     knots : sequence of float
         At which steps end [s].
     progress : callable
+    events : Events, optional
 
     Returns
     -------
     Motion
     """
-    return _Algebraic(model, "algebraic", None, progress).run(span[0], x0, span[1], times, knots)
+    continuation = _Algebraic(model, "algebraic", None, progress)
+    continuation.events = events
+    return continuation.run(span[0], x0, span[1], times, knots)
 
 
 class _Algebraic(Stepping):
@@ -69,7 +72,7 @@ class _Algebraic(Stepping):
             self.longest, self.direction = abs(t1 - t0) / STEPS, np.sign(t1 - t0)
             self.pending, self.resumed = times, None
             t, x = t0, x0
-            while t != t1 and self.motion.stop is None:
+            while t != t1 and self.motion.stop is None and not self.motion.ended:
                 t, x = self._advance(np.append(t, cuts[(cuts - t) * self.direction > 0]), x)
         return self.motion
 
@@ -87,6 +90,9 @@ class _Algebraic(Stepping):
             self.monitor.begin(pivots[:, 0])
         outcome = self.monitor.inspect(Stretch(t, states, pivots[:, 1:, None], self._top))
         last = self._resumption(t, outcome.steps) if isinstance(outcome, Repivot) else outcome.steps
+        stops = isinstance(outcome, Singular) or (len(nodes) < NODES and t[-1] != cuts[-1])
+        if self.events is not None and self._meets_event(nodes if stops else nodes[: last + 1], stops):
+            return t[last], states[:, last]
         self._sample(nodes[: last + 1], states[:, last], t[last] == cuts[-1])
         if self.motion.stop is None:
             self.progress(t[last])
@@ -101,6 +107,25 @@ class _Algebraic(Stepping):
         good = last - 1 if last and t[last - 1] != self.resumed else last
         self.resumed = t[good]
         return good
+
+    def _meets_event(self, nodes, stops):
+        """Whether a terminal event ends the motion between nodes; the samples up to it are then recorded."""
+
+        def solved(t):
+            state, top, _ = self._split(*self.f.newton(t, nodes, self.p)[:2])
+            return np.concatenate([state, top])
+
+        t = self.events.instants(nodes[:, 0])[1]
+        jets = solved(t)
+        t = t[: jets.shape[1]]
+        found = self.events.first(self.model, t, jets, lambda s: solved(np.array([s]))[:, 0], stops)
+        if found is not None:
+            x, top = np.split(found.jets[:, None], [len(self.model.state_names)])
+            self.pending = self.pending[self.direction * self.pending < self.direction * min(found.t, t[-1])]
+            self._sample(nodes, x[:, 0], True)
+            self.motion.add(self.model, [found.t], x, top)
+            self.motion.ended = found.name
+        return found is not None
 
     def _sample(self, nodes, x, ends):
         """Solve at the pending instants up to the last node, whose state is x; at all of them if the motion ends."""
