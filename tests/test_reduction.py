@@ -257,6 +257,45 @@ def test_the_factor_of_a_square_is_named(power):
         derive(mechanism, sv.Program({"a": (x - q.t) ** power}, by="ideal"))
 
 
+EXTREMA = {  # residuals of x, y, their rates and t, with an extremum or a kink where they hold; their terms that vanish there
+    "a cosine": (lambda x, y, dx, dy, t: 1 - ca.cos(y - t), ["(y-t)"]),
+    "a cosine of a multiple": (lambda x, y, dx, dy, t: 1 - ca.cos(2 * (y - t)), ["(y-t)"]),
+    "a hyperbolic cosine at zero": (lambda x, y, dx, dy, t: ca.cosh(y) - 1, ["y"]),
+    "an exponential": (lambda x, y, dx, dy, t: ca.exp(y**2) - 1, ["y"]),
+    "a logarithm": (lambda x, y, dx, dy, t: ca.log(1 + (y - t) ** 2), ["(y-t)"]),
+    "a root": (lambda x, y, dx, dy, t: ca.sqrt((y - t) ** 2), ["(y-t)"]),
+    "a distance": (lambda x, y, dx, dy, t: ca.sqrt((x - t) ** 2 + (y - 2) ** 2), ["(x-t)", "(y-2)"]),
+    "a length less a coordinate": (lambda x, y, dx, dy, t: ca.sqrt(1 + (y - t) ** 2) - 1, ["(y-t)"]),
+    "an absolute value": (lambda x, y, dx, dy, t: ca.fabs(y - t), ["(y-t)"]),
+    "a sum of squares": (lambda x, y, dx, dy, t: (x - t) ** 2 + (y - t) ** 2, ["(x-t)", "(y-t)"]),
+    "a curve and a path": (lambda x, y, dx, dy, t: (y - ca.sin(x)) ** 2 + (x - t) ** 2, ["(x-t)", "(y-sin(x))"]),
+    "an inflection": (lambda x, y, dx, dy, t: x - ca.sin(x), ["x"]),
+    "a cosine of a speed": (lambda x, y, dx, dy, t: 1 - ca.cos(dy - 0.5), ["(dy-0.5)"]),
+    "squares of speeds": (lambda x, y, dx, dy, t: (dx - 1) ** 2 + (dy - 1) ** 2, ["(dx-1)", "(dy-1)"]),
+    "a long path": (lambda x, y, dx, dy, t: 1 - ca.cos(y - (t + t**2 + ca.sin(t) + t * ca.cos(3 * t) * ca.exp(t))), ["(y-f(t))"]),
+}
+
+
+@pytest.mark.parametrize("name", EXTREMA)
+def test_a_residual_without_a_gradient_at_its_solutions_says_which_terms_vanish_there(name):
+    q = sv.coordinates("x y")
+    build, terms = EXTREMA[name]
+    mechanism = sv.Mechanism(q, gibbs=sv.particle(q, 1.0, tuple(q)))
+    with refused(SingularProgram, "'a'", *terms, row="a") as caught:
+        derive(mechanism, sv.Program({"a": build(*q, *q.d(1), q.t)}, by="ideal"))
+    assert sorted(caught.value.details["zeros"]) == terms
+
+
+@pytest.mark.parametrize("level", [1e-6, 1e-3, 0.1])
+def test_a_residual_near_an_extremum_has_a_gradient(level):
+    """cosh y = 1 + level: y = ±arcosh(1 + level)."""
+    q = sv.coordinates("x y")
+    x, y = q
+    mechanism = sv.Mechanism(q, gibbs=sv.particle(q, 1.0, (x, y)))
+    model = derive(mechanism, sv.Program({"a": ca.cosh(y) - 1 - level}, by="ideal"))
+    assert abs(model.start()["y"]) == pytest.approx(np.arccosh(1 + level), rel=1e-9)
+
+
 CONTRADICTIONS = {  # residuals that no state satisfies
     "circles": lambda q, x, y: (x**2 + y**2 - 1, x**2 + y**2 - 4),
     "a circle by its root": lambda q, x, y: (x**2 + y**2 - 1, ca.sqrt(x**2 + y**2) - 2),
