@@ -256,14 +256,15 @@ def _require_affine(q, rows, support, top, context):
 def _refuse_factor(q, rows, indices, context):
     """Refuse a row with a factor that vanishes on the solutions of the others: it follows from them."""
     for b in indices:
-        factor, others = (*_factor(q, rows, b, context), None, None)[:2]
+        found, others = (*_factor(q, rows, b, context), None, None)[:2]
         if others:
+            factor = shown(found)
             raise SpecificationError(
-                f"The residual {rows[b].name!r} has the factor {shown(factor)}, zero by {', '.join(map(repr, others))}.",
+                f"The residual {rows[b].name!r} has the factor {factor}, zero by {', '.join(map(repr, others))}.",
                 "Each residual restricts the motion beyond the others.",
-                do=f"Divide {rows[b].name!r} by {shown(factor)}.",
+                do=f"Divide {rows[b].name!r} by {factor}.",
                 row=rows[b].name,
-                factor=shown(factor),
+                factor=factor,
                 rows=others,
             )
 

@@ -299,10 +299,10 @@ class _Checks:
         watched = slice(None, None, max(1, count // OWN_INSTANTS))
         steps[watched] = np.maximum(steps[watched], np.clip(-(-OWN_INSTANTS // count) + 1, 2, MOST_OWN))
         settings = Integration(self.sizes[:n_x], LIMITS["segments"], steps)
-        found = between(self._flows(flat, np.cumsum(sampled) - 1), edges, x, settings)
+        found = between(self._flows(flat, edges, np.cumsum(sampled) - 1), edges, x, settings)
         return found, sampled, self._own(found)
 
-    def _flows(self, flat, sample):
+    def _flows(self, flat, edges, sample):
         """The flows to try from an edge on: of the variants next to its sample, and of one with its own pivots.
 
         Edges lie on all switches, so that the model itself is smooth between them.
@@ -312,6 +312,8 @@ class _Checks:
         allowance = [MOST_OWN_PIVOTS]
 
         def flows(k):
+            if flat and self.family:  # whose residuals count, in which angles may have turned round
+                yield Flow(self._side_after(edges[k : k + 2].mean(), sample[k]), flat, self.balanced, ENOUGH_STEPS)
             i = int(np.searchsorted(firsts, sample[k], side="right")) - 1
             near = range(i, min(i + 2, len(variants)))
             for j in near:
@@ -324,6 +326,14 @@ class _Checks:
             yield Flow(variants[i], flat, self.balanced, ENOUGH_STEPS)
 
         return flows
+
+    def _side_after(self, t, sample):
+        """The variant of a run with switches at t [s], after a sample."""
+        before, after = (self.run.variant(k) for k in (sample, min(sample + 1, len(self.run.t) - 1)))
+        if before is after:
+            return before
+        x = self.run.at(t)[: len(self.model.state_names)]
+        return self.family.at(self.family.branches(t, x, sides(self.model, before)))
 
     def _inside(self, t):
         return min(self.run.t[0], self.run.t[-1]) < t < max(self.run.t[0], self.run.t[-1])
