@@ -76,7 +76,7 @@ def explain(model, t, x, lost, **facts):
     chosen = dict(zip(model.state_names, map(float, x), strict=True))
     still = standstill(model, t, chosen)
     if still is not None:
-        return still.error(t, first_motion(model, t, chosen, still), **facts)
+        return still.error(t, first_motion(model, t, chosen, still), chosen, **facts)
     prescribed = any(name in model.reduction.original for name in lost)
     return None if prescribed else _lost_degrees(model, t, np.asarray(x, dtype=float), **facts)
 
