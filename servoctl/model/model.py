@@ -14,7 +14,7 @@ from servoctl.errors import ServoError, SpecificationError, unknown
 from servoctl.jets.series import Flow
 from servoctl.jets.tape import REAL
 from servoctl.model.equations import EQUATIONS, SIGNALS, Equations, gradient_jets, leading_names, residual_rows
-from servoctl.model.report import describe
+from servoctl.model.report import describe, warn_of_products
 from servoctl.model.rest import started
 from servoctl.model.start import State
 from servoctl.model.store import Store, pack, unpack
@@ -55,11 +55,18 @@ def derive(mechanism: Mechanism, program: Program, guess: Mapping[str, float] | 
         If a residual's gradient vanishes on its own solutions, or a rank cannot be decided.
     InconsistentStart
         If no state satisfies the constraints.
+
+    Warns
+    -----
+    RuntimeWarning
+        For a residual that is a product and vanishes about the guess by more than one of its factors.
     """
-    return _derived(mechanism, program, guess)
+    model = derived(mechanism, program, guess)
+    warn_of_products(model.reduction)
+    return model
 
 
-def _derived(*specification):
+def derived(*specification):
     """The model of the arguments of `reduce`; its reduction is read from disk if another process has written it."""
     store = Store(*specification)
     return Model(store.reduction(reduce), store)
@@ -145,7 +152,7 @@ class Model:
         require_positive(r.mechanism, replace(r.points, values=values))
         if not (holds(r, values) and self._constant_pivots_hold(values)):
             self._store.require_unchanged()
-            return _derived(r.mechanism, r.program, r.context.guess, None, values)
+            return derived(r.mechanism, r.program, r.context.guess, None, values)
         return Model(r, self._store, values, require_smooth(r.switches, values, r.smoothness), self._functions)
 
     def _constant_pivots_hold(self, values):
@@ -171,7 +178,7 @@ class Model:
         default = self.once("jet sizes", lambda: self.equations.jet_sizes)
         self._store.require_unchanged()
         r, place = self.reduction, (float(t), guess, default | dict(sizes))
-        near = _derived(r.mechanism, r.program, None, place, self.parameters)
+        near = derived(r.mechanism, r.program, None, place, self.parameters)
         if near.free != self.free:
             raise SpecificationError(
                 f"Near t = {t:.6g} s the program has {near.free} free initial values, elsewhere {self.free}.",

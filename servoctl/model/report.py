@@ -1,9 +1,12 @@
 """The printed form of a model, and what is said of a state at which its program is singular."""
 
+import warnings
+
 import numpy as np
 
 from servoctl.errors import ServoError, SingularProgram
 from servoctl.model.rest import first_motion, standstill
+from servoctl.reduction.rows import alternatives
 
 WIDTH = 118
 
@@ -66,6 +69,20 @@ def _rule(r):
     classical = all(row.order == 0 or (row.order == 1 and row.affine) for row in program)
     rule = "d'Alembert's principle" if classical else "the generalised Chetaev rule, a postulate at this order"
     return f"(3.18) with T from ker G; dependent: {dependent}; under {rule}"
+
+
+def warn_of_products(r):
+    """Warn of each residual that holds by more than one of its factors: a start decides which, and both may be zero."""
+    for row in r.original.values():
+        zeros = alternatives(r.mechanism.q, row, r.context)
+        if zeros:
+            warnings.warn(
+                f"The residual {row.name!r} is a product, and holds wherever {' or '.join(zeros)} is zero: a start "
+                f"decides by which, and where both are zero its gradient vanishes. Divide {row.name!r} by the factor "
+                "that is not meant, or pass guess={...} to derive, far from the zeros of that factor.",
+                RuntimeWarning,
+                stacklevel=3,
+            )
 
 
 def explain(model, t, x, lost, **facts):

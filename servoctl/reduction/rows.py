@@ -1,6 +1,7 @@
 """Rows ψ = 0, their orders on the manifold of other rows, and dependences among their leading gradients."""
 
 from dataclasses import dataclass, field, replace
+from functools import reduce
 
 import casadi as ca
 import numpy as np
@@ -9,7 +10,7 @@ from servoctl.errors import SingularProgram, SpecificationError
 from servoctl.jets.branches import shown
 from servoctl.jets.identity import spread, vanish
 from servoctl.jets.series import Flow
-from servoctl.reduction.manifold import POINTS_SEED, ROUNDED, sample, solve
+from servoctl.reduction.manifold import POINTS_SEED, ROUNDED, anywhere, sample, solve
 from servoctl.reduction.ranks import clean, combination, decide, eliminate, equilibrate, refined
 from servoctl.tolerances import DEPENDENT, ENTRY
 
@@ -246,6 +247,21 @@ def factors(expression):
     if operation in (ca.OP_POW, ca.OP_CONSTPOW) and inner[1].is_constant() and float(inner[1]) >= 2:
         return 2 * factors(inner[0])
     return [expression] if ca.symvar(expression) else []
+
+
+def alternatives(q, row, context):
+    """Factors of a row that have zeros about the guess, in words, where there are several: it holds by any of them."""
+    found = [f for f in factors(row.expression) if q.order(f) >= 0]
+    found = [f for i, f in enumerate(found) if not any(ca.is_equal(f, g, SAME_DEPTH) for g in found[:i])]
+    words = [shown(f) for f in found]
+    if len(found) == 1:  # perhaps a sum whose terms have a jet in common
+        jets = [s for s in ca.symvar(found[0]) if q.order(s) >= 0 and ca.substitute(found[0], s, 0).is_zero()]
+        found, words = [*jets, reduce(ca.SX.__truediv__, jets, found[0])], [*map(shown, jets), "the rest"]
+    if len(found) < 2:
+        return []
+    values = anywhere(q, max(map(q.order, found)), context).evaluate(found)[0]
+    crossed = [word for word, v in zip(words, values, strict=True) if v.min() < 0 < v.max()]
+    return crossed if len(crossed) > 1 else []
 
 
 def leading(q, rows, points):
