@@ -4,7 +4,7 @@ import casadi as ca
 
 from servoctl.checks import column, mapping
 from servoctl.errors import SpecificationError, unknown
-from servoctl.model.model import derived
+from servoctl.model.model import derive
 from servoctl.spec.program import no_program
 
 
@@ -50,7 +50,7 @@ def driven(plant, inputs=None):
     count = len(mechanism.parameters.names)
     damping = ca.SX(list(plant.parameters[count : count + plant.equations.damping.numel()]))
     further = plant.equations.forces + ca.substitute(plant.equations.resisting, plant.equations.damping, damping)
-    model = derived(mechanism.under(expressions, further), no_program(), None)
+    model = derive(mechanism.under(expressions, further), no_program())
     return model.with_parameters(**dict(zip(mechanism.parameters.names, plant.parameters[:count], strict=True)))
 
 

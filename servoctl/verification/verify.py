@@ -289,7 +289,7 @@ class _Checks:
         near = np.abs(knots[:, None] - run.t).min(axis=1) <= SAME_TIME * (1 + np.abs(knots)) if len(knots) else []
         knots = np.array([k for k, known in zip(knots, near, strict=True) if not known and self._inside(k)])
         edges = np.union1d(run.t, knots)[:: 1 if run.t[-1] > run.t[0] else -1]
-        sampled = np.isin(edges, run.t)
+        sampled, self.edges = np.isin(edges, run.t), edges
         flat = self.model.flat and run.method == "algebraic"
         n_x = self.model.nq if flat else len(self.model.state_names)
         x = np.full((n_x, len(edges)), np.nan)
@@ -299,10 +299,10 @@ class _Checks:
         watched = slice(None, None, max(1, count // OWN_INSTANTS))
         steps[watched] = np.maximum(steps[watched], np.clip(-(-OWN_INSTANTS // count) + 1, 2, MOST_OWN))
         settings = Integration(self.sizes[:n_x], LIMITS["segments"], steps)
-        found = between(self._flows(flat, edges, np.cumsum(sampled) - 1), edges, x, settings)
+        found = between(self._flows(flat, np.cumsum(sampled) - 1), edges, x, settings)
         return found, sampled, self._own(found)
 
-    def _flows(self, flat, edges, sample):
+    def _flows(self, flat, sample):
         """The flows to try from an edge on: of the variants next to its sample, and of one with its own pivots.
 
         Edges lie on all switches, so that the model itself is smooth between them.
@@ -313,7 +313,7 @@ class _Checks:
 
         def flows(k):
             if flat and self.family:  # whose residuals count, in which angles may have turned round
-                yield Flow(self._side_after(edges[k : k + 2].mean(), sample[k]), flat, self.balanced, ENOUGH_STEPS)
+                yield Flow(self._side_after(self.edges[k : k + 2].mean(), sample[k]), flat, self.balanced, ENOUGH_STEPS)
             i = int(np.searchsorted(firsts, sample[k], side="right")) - 1
             near = range(i, min(i + 2, len(variants)))
             for j in near:
