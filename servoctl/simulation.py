@@ -247,13 +247,13 @@ def _motion(model, method, drift, problem, bar, atol=None):
     `atol` (n_x,) replaces the default of the method.
     """
     t0, x0, t1, times, knots = problem
+    if isinstance(method, Algebraic):
+        return algebraic(model, (t0, t1), x0, times, knots, bar)
     if isinstance(method, Bounded):
         return bounded(model, (t0, t1), x0, method, (times, knots), bar)
     family = switching(model)
     if family is not None:
         model = family.at(family.branches(t0, x0))
-    if isinstance(method, Algebraic):
-        return algebraic(model, (t0, t1), x0, times, knots, bar, family)
     stepping = _stepping(model, method, drift, (t0, t1), bar, atol)
     stepping.family = family
     return run_checked(stepping, *problem) if stepping.tolerances is None else stepping.run(*problem)

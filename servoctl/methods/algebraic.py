@@ -9,13 +9,14 @@ import numpy as np
 from servoctl.methods.monitor import Fine, Repivot, Stretch
 from servoctl.methods.motion import Stepping, breakpoints, interruptible
 from servoctl.methods.watch import Watch
+from servoctl.model.switching import switching
 
 STEPS = 50  # at least, in a span: shorter movements between two rests are overlooked where there are no samples
 NODES = 1000  # steps per call of the loop: 0.3 ms compiled, 50 ms where CasADi evaluates
 BLOCK = 4000  # samples per call of the loop: 0.2 ms compiled, 0.2 s where CasADi evaluates
 
 
-def algebraic(model, span, x0, times, knots, progress, family=None):
+def algebraic(model, span, x0, times, knots, progress):
     """Solve a flat program for q, γ' and γ'' at each time.
 
     Parameters
@@ -31,16 +32,12 @@ def algebraic(model, span, x0, times, knots, progress, family=None):
     knots : sequence of float
         At which steps end [s].
     progress : callable
-    family : Switching, optional
-        The smooth models of a model with kinks or switches, of which `model` is the one at the start.
 
     Returns
     -------
     Motion
     """
-    stepping = _Algebraic(model, "algebraic", None, progress)
-    stepping.family = family
-    return stepping.run(span[0], x0, span[1], times, knots)
+    return _Algebraic(model, "algebraic", None, progress).run(span[0], x0, span[1], times, knots)
 
 
 class _Algebraic(Stepping):
@@ -69,9 +66,7 @@ class _Algebraic(Stepping):
     def run(self, t0, x0, t1, times, knots):
         """Follow the solution from x0 at t0 to t1 [s], and solve at each of the times (N,) [s]."""
         with interruptible(self.motion):
-            if self.family is not None:
-                self.watch = Watch(None, abs(t1 - t0), self.family, exact=True, parts=1)
-                self.watch.use(self.model, self.family.branches(t0, x0))
+            self._watch(t0, x0, t1)
             self._start(t0, x0, t1)
             cuts = np.array(breakpoints((t0, t1), knots))
             self.longest, self.direction = abs(t1 - t0) / STEPS, np.sign(t1 - t0)
@@ -80,6 +75,15 @@ class _Algebraic(Stepping):
             while t != t1 and self.motion.stop is None:
                 t, x = self._advance(np.append(t, cuts[(cuts - t) * self.direction > 0]), x)
         return self.motion
+
+    def _watch(self, t, x, t1):
+        """Watch for kinks and switches, where there are any, with the smooth model that holds at the start."""
+        self.family = switching(self.model)
+        if self.family is not None:
+            branches = self.family.branches(t, x)
+            self._use(self.family.at(branches))
+            self.watch = Watch(None, abs(t1 - t), self.family, exact=True, parts=1)
+            self.watch.use(self.model, branches)
 
     def _advance(self, cuts, x):
         """Follow the solution as far as the pivots allow; the instant and the state from which it goes on."""

@@ -66,7 +66,12 @@ def derive(mechanism: Mechanism, program: Program, guess: Mapping[str, float] | 
     return model
 
 
-def derived(*specification):
+def derived(mechanism, program, guess=None):
+    """The model of `derive`, without its warnings."""
+    return _derived(mechanism, program, guess)
+
+
+def _derived(*specification):
     """The model of the arguments of `reduce`; its reduction is read from disk if another process has written it."""
     store = Store(*specification)
     return Model(store.reduction(reduce), store)
@@ -152,7 +157,7 @@ class Model:
         require_positive(r.mechanism, replace(r.points, values=values))
         if not (holds(r, values) and self._constant_pivots_hold(values)):
             self._store.require_unchanged()
-            return derived(r.mechanism, r.program, r.context.guess, None, values)
+            return _derived(r.mechanism, r.program, r.context.guess, None, values)
         return Model(r, self._store, values, require_smooth(r.switches, values, r.smoothness), self._functions)
 
     def _constant_pivots_hold(self, values):
@@ -178,7 +183,7 @@ class Model:
         default = self.once("jet sizes", lambda: self.equations.jet_sizes)
         self._store.require_unchanged()
         r, place = self.reduction, (float(t), guess, default | dict(sizes))
-        near = derived(r.mechanism, r.program, None, place, self.parameters)
+        near = _derived(r.mechanism, r.program, None, place, self.parameters)
         if near.free != self.free:
             raise SpecificationError(
                 f"Near t = {t:.6g} s the program has {near.free} free initial values, elsewhere {self.free}.",
