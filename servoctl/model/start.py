@@ -17,7 +17,7 @@ GUESSED = 1e3  # weight of a guessed value relative to one without a guess
 TRIES = 6  # initial points of the iteration; the first is the reference
 FARTHER = 0.1  # distance of each further initial point from the reference, relative to the state's size
 SEED = 1788  # seed of these points
-SHORTENINGS = 15  # of a step to a third, until the residual falls
+THIRDS = 15  # of a step to a third, until the residual falls
 LEAPS = 3  # whole steps along which it may rise, as over a kink
 REACHED = 1e-16  # scaled residual at which the iteration ends
 REPEATED = 1e-12  # singular values below this fraction of the largest count as zero
@@ -298,7 +298,7 @@ def gauss_newton(equations, x, aim, iterations=60):
             break
         step = _step(-value, jacobian, aim)
         longest = 1.0 / max(1.0, np.max(np.abs(step) / (1.0 + np.abs(x)), initial=0.0))
-        trials = (x + longest / 3**k * step for k in range(SHORTENINGS))
+        trials = (x + longest / 3**k * step for k in range(THIRDS))
         better = (y for y in trials if np.abs(equations(y)[0] / size).max(initial=0.0) < norm)
         trial = next(better, None)
         if trial is None:
