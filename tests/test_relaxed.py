@@ -130,6 +130,18 @@ def test_laws_follow_a_plan(plan, crane):
     assert feedforward["x"][-1] == pytest.approx(5.0, abs=5e-3)
 
 
+def test_the_default_weight_keeps_the_program_to_a_thousandth(crane):
+    run = sv.relaxed(*crane, (0.0, 6.0))
+    assert 1e-6 < np.abs(run.residual["X"]).max() / 5.0 < 1e-3
+
+
+def test_effort_is_counted_from_the_wish(crane, coarse):
+    plant, program = crane
+    wish = sv.Program(program.residuals, toward={"cart": 100.0})
+    run = sv.relaxed(plant, wish, (0.0, 6.0), weight=1e-6)
+    assert run["cart"][0] > coarse["cart"][0] + 10.0 and run["cart"][-1] > coarse["cart"][-1] + 10.0
+
+
 # --- limits and bounds
 
 

@@ -41,6 +41,7 @@ from servoctl.study.table import Study, machine
 ORDER = 9  # of the collocation: five nodes
 INTERVALS = 24  # of the first mesh at least
 FIRST = 1e-3  # first weight, relative to that for which standing still costs as much as the program
+DEFAULT = 1e-6  # default weight, relative to the same
 FACTOR = 100.0  # between the weights of two successive solutions
 EXCEEDED = 1e-6  # of a bound: excess between the instants of bounds that a run tells
 COARSE = 1e-6  # defect with which no plan is returned
@@ -59,7 +60,8 @@ SOLVED = ("Solve_Succeeded", "Solved_To_Acceptable_Level")
 
 
 def relaxed(
-    plant: Plant, program: Program, t_span: Sequence[float], *, weight: float | Mapping[str, float] | Sequence[float],
+    plant: Plant, program: Program, t_span: Sequence[float], *,
+    weight: float | Mapping[str, float] | Sequence[float] | None = None,
     limits: Mapping[str, object] | None = None, bounds: Mapping[str, object] | None = None,
     start: State | Mapping[str, float] | None = None, end: str | Mapping[str, float] = "rest",
 ) -> Run | Study:  # fmt: skip
@@ -73,12 +75,13 @@ def relaxed(
     plant : Plant
         Its limits of magnitude and of rate hold; lag and delay are left to the laws.
     program : Program
-        W are its `weights` of the actuators, 1 by default.
+        W are its `weights` of the actuators, 1 by default; with `toward` the effort is that of the difference.
     t_span : (t0, t1)
         [s]
-    weight : float, dict of str to float, or sequence of float
+    weight : float, dict of str to float, or sequence of float, optional
         β of all or of each residual, in (unit of φ)²/(unit of u)²: m²/N² for a position by a force. Several values
-        give a Study of the front between error and actuation.
+        give a Study of the front between error and actuation. Default: 1e-6 of that for which standing still costs as
+        much as the program.
     limits : dict of str to float or (low, high), optional
         Further limits of actuators and of their rates, {"trolley": 100.0, "dtrolley": 500.0}. They hold at all
         instants.
@@ -120,7 +123,9 @@ def relaxed(
 
 
 def _weights(weight, program):
-    """β of each residual, (k,)."""
+    """β of each residual, (k,); None for the default."""
+    if weight is None:
+        return None
     if not isinstance(weight, Mapping):
         return np.full(len(program.names), positive_number("weight", weight))
     for name in weight:
@@ -373,7 +378,10 @@ class Task:
     # solutions
 
     def run(self, beta):
-        """The run of weights (k,)."""
+        """The run of weights (k,), by default a small part of the usual ones."""
+        if beta is None:
+            usual = self._usual_weights()
+            beta = DEFAULT * np.where(np.isfinite(usual), usual, 1.0 / self.sizes[2])
         return self._as_run(self._plan(beta))
 
     def front(self, weights):

@@ -57,7 +57,7 @@ class Node:
         self.q, self.bounds = e.q, tuple(bounded)
         residuals, effort = ca.vertcat(*program.residuals.values()), ca.SX(0)
         for name, u in zip(plant.inputs, e.u.elements(), strict=True):
-            effort += program.weights.get(name, 1.0) * u**2
+            effort += program.weights.get(name, 1.0) * (u - program.toward.get(name, 0.0)) ** 2
         quantities = ca.vertcat(residuals, effort, *bounded.values())
         self.depth = max(0, max((self.q.order(x) for x in quantities.elements()), default=0) - 2)
         jets = [e.u, *(ca.SX.sym(f"u{k}", e.u.numel()) for k in range(1, self.depth + 1))]
