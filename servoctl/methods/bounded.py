@@ -36,7 +36,7 @@ BETWEEN = (0.15, 0.5, 0.9)  # places within an interval where the defect is meas
 SAMPLES = 1001
 
 
-def bounded(model, span, guess, method, instants, progress):
+def bounded(model, span, guess, method, instants, progress, events=None):
     """The bounded motion of a program.
 
     Parameters
@@ -51,6 +51,7 @@ def bounded(model, span, guess, method, instants, progress):
         Times of the samples [s], None for 1001 instants of the whole window and the knots; and the instants where the
         program is not smooth [s].
     progress : callable
+    events : Events, optional
 
     Returns
     -------
@@ -90,6 +91,8 @@ def bounded(model, span, guess, method, instants, progress):
         times = np.union1d(np.linspace(*window, SAMPLES), [k for k in (*span, *knots) if window[0] < k < window[1]])
     motion = Motion()
     motion.count(intervals=len(mesh) - 1, iterations=problem.iterations)
+    if events is not None:
+        times, motion.ended = _to_event(problem, events, (mesh, x), times)
     samples = problem.at(times, mesh, x)
     inside = times[(times >= window[0]) & (times <= window[1])]
     truncation = problem.distance(problem.at(inside, mesh, x), problem.at(inside, *reference))
@@ -99,6 +102,19 @@ def bounded(model, span, guess, method, instants, progress):
     motion.note = f"bounded from t = {window[0]:.4g} to {window[1]:.4g} s; a window of twice the length changes the "
     motion.note += f"motion by {truncation:.1e}"
     return motion
+
+
+def _to_event(problem, events, solution, times):
+    """The samples (N,) up to a terminal event of a motion, and its name; all of them and "" without one."""
+    model, n_x = problem.model, problem.n_x
+
+    def jets(t):
+        x = problem.at(t, *solution)
+        return np.vstack([x, model.function("ode").grid(t, x, problem.p)[n_x - model.n : n_x]])
+
+    t = events.instants(np.union1d(times, solution[0]))[1]
+    found = events.first(model, t, jets(t), lambda s: jets(np.array([s]))[:, 0])
+    return (times, "") if found is None else (np.append(times[times < found.t], found.t), found.name)
 
 
 @dataclass(frozen=True)

@@ -263,23 +263,23 @@ class Equations(Invariants):
         B = r.realisation.B
         C = ca.jacobian(second, acceleration) if rows else ca.SX(0, q.n)
         matrix = ca.vertcat(ca.horzcat(r.mechanism.mass, -B), ca.horzcat(C, ca.SX.zeros(len(rows), B.shape[1])))
-        right = -ca.substitute(ca.vertcat(r.mechanism.balance, second), acceleration, zero)
+        right = -ca.substitute(ca.vertcat(r.balance, second), acceleration, zero)
         return self.function("multiplier_form", self.jets, [right, ca.vec(ca.densify(matrix))])
 
     def signals(self, kind, rate=0):
         """Names of a group of `SIGNALS`, and their `rate`-th time derivatives as a function of (t, Z, p).
 
-        The jets Z of a derivative extend beyond s̄ as far as it depends on them.
+        The jets Z extend beyond s̄ as far as these depend on them.
         """
         names, expressions = SIGNALS[kind](self)
-        if not rate:
-            return names, self.function(kind, self.jets, expressions)
-        expressions = self.q.derivatives(ca.vertcat(*expressions).elements(), rate)[rate]
+        expressions = ca.vertcat(*expressions).elements()
+        if rate:
+            expressions = self.q.derivatives(expressions, rate)[rate]
+            names, kind = [jet_name(name, rate) for name in names], f"{kind}_rate{rate}"
         places = filter(None, map(self.q.where, ca.symvar(ca.vertcat(*expressions))))
         highest = max((level for of, level, _ in places if of not in ("t", "q")), default=0)
         above = (s for k in range(self.top + 1, highest + 1) for s in self.q.gamma(k))
-        names = [jet_name(name, rate) for name in names]
-        return names, self.function(f"{kind}_rate{rate}", ca.vertcat(self.jets, *above), expressions)
+        return names, self.function(kind, ca.vertcat(self.jets, *above), expressions)
 
     def _actuation(self):
         return list(self.r.mechanism.actuators), [self.r.actuation]
@@ -296,7 +296,14 @@ class Equations(Invariants):
         return [f"multiplier_{name}" for name in names], [multipliers]
 
     def _outputs(self):
-        return list(self.r.mechanism.outputs), list(self.r.mechanism.outputs.values())
+        mechanism = self.r.mechanism
+        outputs = {name: e for name, e in mechanism.outputs.items() if name not in mechanism.inputs}
+        return list(outputs), list(outputs.values())
+
+    def _given_inputs(self):
+        """Inputs that drive the mechanism as functions of time."""
+        mechanism = self.r.mechanism
+        return list(mechanism.inputs), [mechanism.outputs[name] for name in mechanism.inputs]
 
     def _energy(self):
         return ["energy"], [self.r.mechanism.energy]
@@ -314,7 +321,7 @@ class Equations(Invariants):
         r, q = self.r, self.q
         w = q.jet(1)
         rate = q.dt(r.mechanism.energy)
-        force = r.mechanism.forces + r.realisation.B @ r.multipliers
+        force = r.mechanism.forces + r.mechanism.balance - r.balance + r.realisation.B @ r.multipliers
         law = rate - ca.dot(w, r.mechanism.balance + r.mechanism.forces)
         return ["rate", "work", "size", "law"], [rate, ca.dot(w, force), ca.dot(ca.fabs(w), ca.fabs(force)), law]
 
@@ -381,6 +388,7 @@ SIGNALS = {  # names and expressions of each group
     "reaction": Equations._reaction,
     "multipliers": Equations._multipliers,
     "outputs": Equations._outputs,
+    "given_inputs": Equations._given_inputs,
     "energy": Equations._energy,
     "balance": Equations._balance,
     "coordinate_rates": Equations._coordinate_rates,

@@ -16,7 +16,7 @@ from servoctl.jets.series import Flow
 from servoctl.reduction.appell import Realisation
 from servoctl.reduction.manifold import solve
 from servoctl.reduction.ranks import clean, decide, decide_all, decide_each, solve_clean
-from servoctl.reduction.rows import Row
+from servoctl.reduction.rows import Row, balances
 from servoctl.tolerances import ENTRY, TINY
 
 INDEPENDENT = 1e-7  # equilibrated pivots of J above this count
@@ -386,7 +386,7 @@ def _jets(reduction, points, level, states):
 
 def _plant_jets(reduction, point, z, level):
     """Jets of the plant at one point, under the constant inputs nearest to those of an equilibrium."""
-    q, k, balance = reduction.mechanism.q, len(reduction.program.residuals), reduction.mechanism.balance
+    q, k, balance = reduction.mechanism.q, len(reduction.program.residuals), reduction.balance
     z = z.copy()
     z[q.nq + q.n :] = 0.0
     point = replace(point, z=z)
@@ -400,15 +400,13 @@ def _plant_jets(reduction, point, z, level):
     dependent = sorted(decide_all(*point.matrix(G))[0].columns) if material else []
     independent = [i for i in range(q.n) if i not in dependent]
     split = Realisation(G.T, None, tuple(dependent), tuple(independent), clean(*point.matrix(G)))
-    forced, _ = split.dynamics(balance - B[:, :k] @ u) if material else ((balance - B[:, :k] @ u).elements(), ())
-    dynamics = [Row(e, 2, f"balance {i}", "dynamics") for i, e in enumerate(forced)]
-    return solve(Flow(q, [*material, *dynamics], level, point), point.t, z)[0]
+    forced, _ = split.dynamics(balance - B[:, :k] @ u)
+    return solve(Flow(q, [*material, *balances(q, forced)], level, point), point.t, z)[0]
 
 
 def _input_jacobian(reduction, points, z, depth):
     """J and the sizes of its entries, (k, N+1, k, N+1, points): coefficient j of row i by coefficient l of input a."""
-    mechanism, q = reduction.mechanism, reduction.mechanism.q
-    k, level, n_points = len(reduction.program.residuals), depth + 2, len(points.t)
+    q, k, level, n_points = reduction.mechanism.q, len(reduction.program.residuals), depth + 2, len(points.t)
     B = reduction.realisation.B
     inputs = ca.SX.sym("u", B.shape[1])
     material = [row for row in reduction.original.values() if row.kind == "material"]
@@ -417,7 +415,7 @@ def _input_jacobian(reduction, points, z, depth):
     series = flow.series(ca.vertcat(reduction.multipliers, ca.vec(ca.densify(B))).elements(), points.t, z, depth)
     u, b = series[: B.shape[1]], series[B.shape[1] :].reshape(B.shape[1], q.n, depth + 1, n_points)
     signals = {s.element_hash(): [u[i, j] for j in range(depth + 1)] for i, s in enumerate(inputs.elements())}
-    balance = (mechanism.balance - B @ inputs).elements()
+    balance = (reduction.balance - B @ inputs).elements()
     rows = [
         *(Row(e, 2, name, "dynamics") for name, e in zip(q.jet_names(1), balance, strict=True)),
         *material,
