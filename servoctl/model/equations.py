@@ -276,10 +276,11 @@ class Equations(Invariants):
         if rate:
             expressions = self.q.derivatives(expressions, rate)[rate]
             names, kind = [jet_name(name, rate) for name in names], f"{kind}_rate{rate}"
-        places = filter(None, map(self.q.where, ca.symvar(ca.vertcat(*expressions))))
+        values = ca.vertcat(ca.SX(0, 1), *expressions)  # SX without expressions, too
+        places = filter(None, map(self.q.where, ca.symvar(values)))
         highest = max((level for of, level, _ in places if of not in ("t", "q")), default=0)
         above = (s for k in range(self.top + 1, highest + 1) for s in self.q.gamma(k))
-        return names, self.function(kind, ca.vertcat(self.jets, *above), expressions)
+        return names, self.function(kind, ca.vertcat(self.jets, *above), [values])
 
     def _actuation(self):
         return list(self.r.mechanism.actuators), [self.r.actuation]
