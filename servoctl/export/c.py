@@ -84,7 +84,7 @@ def export_c(
     found = None if law or source.flat else verdict(source, start)
     if found is not None and found.dynamics in (HYPERBOLIC_ZEROS, GROWS):
         warnings.warn(
-            f"{name}_advance integrates forward what this program leaves free, and that is {found}. Export a law about a "
+            f"{name}_advance integrates forward what this program leaves free, which is {found}. Export a law about a "
             "plan of sv.inverse instead, or steer the state by feedback.",
             RuntimeWarning,
             stacklevel=2,
