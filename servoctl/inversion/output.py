@@ -10,8 +10,8 @@ from dataclasses import dataclass, field
 import casadi as ca
 import numpy as np
 
-from servoctl.checks import finite, interval, require_kind
-from servoctl.errors import NotRealisable, SingularProgram, SpecificationError, UnstableInternalDynamics, unknown
+from servoctl.checks import finite, interval, named, require_kind
+from servoctl.errors import NotRealisable, SingularProgram, SpecificationError, UnstableInternalDynamics
 from servoctl.inversion.zeros import AT_REST, NEWTON, NO_COEFFICIENT, ZeroPolynomial
 from servoctl.model.model import Model
 from servoctl.model.start import State
@@ -272,8 +272,7 @@ def minimum_phase(model: Model, parameter: str, values, at: State | None = None)
     ones may be missed. Boundaries are accurate to rounding.
     """
     require_kind(Model, "model", model, "sv.derive(mechanism, program)")
-    if parameter not in model.numbers:
-        raise unknown(parameter, list(model.numbers), "parameter")
+    named(parameter, list(model.numbers), "parameter")
     ends = [finite(parameter, end, "range") for end in interval(parameter, values, "range")]
     _require_program(model)
     at = model.start() if at is None else require_kind(State, "at", at, "model.start(...)")
