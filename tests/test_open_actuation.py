@@ -465,6 +465,29 @@ def test_wishes_hold_parameters_that_change():
         assert u["b"] == pytest.approx(-d * 0.3)
 
 
+def test_parameters_that_make_the_decoupling_singular_and_back():
+    """A mass on an inclined guide of a driven car, a second car beside: level, the relative degree is 4, else 2."""
+
+    def cars(alpha):
+        p = sv.parameters(alpha=alpha)
+        q = sv.coordinates("x s c")
+        x, s, c = q
+        mass = ca.vertcat(x + s * ca.cos(p.alpha), s * ca.sin(p.alpha))
+        S = sv.particle(q, 1.0, x) + sv.particle(q, 2.0, mass) + sv.particle(q, 1.5, c)
+        U = 5 * s**2 / 2 + 3 * (c - x) ** 2 / 2
+        actuators = {"F": x, "G": c, "H": x - 0.5 * c}
+        mechanism = sv.Mechanism(q, gibbs=S, potential=U, actuators=actuators, parameters=p)
+        return mechanism, sv.Program({"Z": mass[0] - ca.sin(q.t)}, toward={"G": -0.4 * q.d(1)[2]})
+
+    for first, then, free in ((0.0, 0.8, 4), (0.8, 0.0, 2)):
+        changed, fresh = sv.derive(*cars(first)).with_parameters(alpha=then), sv.derive(*cars(then))
+        start = {"c": 0.2, "dc": 0.1} | ({"s": 0.1, "ds": 0.05} if free == 4 else {})
+        runs = [sv.simulate(m, m.start(**start), (0.0, 2.0), t_eval=np.linspace(0, 2, 21)) for m in (changed, fresh)]
+        assert changed.free == fresh.free == free and sv.verify(changed, runs[0]).passed
+        for name in "FGH":
+            assert runs[0][name] == pytest.approx(runs[1][name], rel=1e-9, abs=1e-9)
+
+
 def test_slower_programs_slow_the_time_of_wishes_alone():
     q = sv.coordinates("x")
     (x,), (dx,) = q, q.d(1)
