@@ -8,7 +8,7 @@ import numpy as np
 from servoctl.codegen.function import compiled
 from servoctl.errors import SpecificationError
 from servoctl.jets.branches import Branches, has_switches
-from servoctl.model.model import Model, derive
+from servoctl.model.model import Model, derived
 from servoctl.spec.mechanism import Mechanism
 from servoctl.spec.parameters import Parameters
 from servoctl.spec.program import Program
@@ -124,7 +124,7 @@ class Switching:
             kept = [b if s.angle else side for s, b, side in zip(self.switches, now, sides, strict=True)]
             model = model.with_parameters(**dict(zip(self._names, kept, strict=True)))
         else:
-            model = derive(*self._with_numbers(branches), self.model.reduction.context.guess)
+            model = derived(*self._with_numbers(branches), self.model.reduction.context.guess)
         self._require_same(model, branches)
         return model
 

@@ -204,11 +204,7 @@ def reduce(mechanism, program, guess=None, near=None, values=None):
     of_split = [(f"choice of dependent coordinates {i}", pivot) for i, pivot in enumerate(of_split, 1)]
     pivots = (*of_constraints, *of_sharing, *of_split, *of_rows)
     by_name = {row.name: row for row in original}
-    reduction = Reduction(
-        mechanism, program, tuple(rows), realised, rank, points, pivots, knots, switches, context, by_name
-    )
-    _require_outputs(reduction)
-    return reduction
+    return Reduction(mechanism, program, tuple(rows), realised, rank, points, pivots, knots, switches, context, by_name)
 
 
 def holds(reduction, values):
@@ -312,15 +308,15 @@ def _require_motion(dynamics, program):
             )
 
 
-def _require_outputs(reduction):
-    """Refuse an output of higher order than the jets of a motion."""
+def require_outputs(reduction):
+    """Refuse an output of higher order than the jets of a motion, for what computes outputs from these alone."""
     q, top = reduction.mechanism.q, reduction.top
     for name, expression in reduction.mechanism.outputs.items():
         if q.order(expression) > top:
             raise SpecificationError(
                 f"The output {name!r} has order {q.order(expression)}.",
                 f"Motions of this program have jets up to order {top}.",
-                do="Use an output of lower order; sv.Taylor(jets=...) gives its derivatives along a run.",
+                do=f"Leave it out of the mechanism's outputs; run[{name!r}] has it along a run.",
                 name=name,
                 order=q.order(expression),
                 limit=top,
