@@ -285,6 +285,8 @@ def test_two_forces_normal_to_the_body_are_flat_after_extension():
     assert "no vector relative degree" in repr(structure) and "flat" in repr(model)
     run = sv.simulate(model, model.start(guess={"theta": 0.0}), (0.0, 4.0))
     assert sv.verify(model, run).passed
+    told = repr(sv.report(model, run))
+    assert told.startswith("Report: flat") and "index 5; mixed realisation" in told
     # tanθ = -X''/(Z'' + g), u1 + u2 = M |(X'', Z'' + g)|
     assert np.tan(run["theta"]) == pytest.approx(-run["d2x"] / (run["d2z"] + 9.81), abs=1e-9)
     assert run["u1"] + run["u2"] == pytest.approx(50.0 * np.hypot(run["d2x"], run["d2z"] + 9.81), rel=1e-9)
