@@ -48,6 +48,7 @@ from servoctl.methods.stability import sampled_bound
 from servoctl.model.model import Model, derive
 from servoctl.plants.plant import Plant, plant
 from servoctl.run import Run, load
+from servoctl.sensitivities.identification import Identification, identify
 from servoctl.sensitivities.sensitivity import Sensitivity, sensitivity
 from servoctl.simulation import simulate
 from servoctl.spec import (
@@ -81,6 +82,7 @@ __all__ = [
     "Controller",
     "Coordinates",
     "Event",
+    "Identification",
     "InconsistentStart",
     "IntegrationStopped",
     "InternalDynamics",
@@ -126,6 +128,7 @@ __all__ = [
     "feedforward",
     "figures",
     "grid",
+    "identify",
     "internal_dynamics",
     "interop",
     "limit_report",

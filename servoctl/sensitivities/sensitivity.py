@@ -205,12 +205,20 @@ def sensitivity(
 
 def _require_run(model, run):
     """Refuse a run with other numbers, and one with switches of the state."""
+    if run.method == str(Bounded()):
+        raise SpecificationError(
+            "The run is a bounded motion.",
+            "Its derivatives solve a boundary value problem, which the variational equation from its start is not.",
+            do="Take differences of runs of model.with_parameters(...).",
+            method=run.method,
+        )
     switches = switching(model) is not None
     if switches or run.model.numbers != model.numbers:
+        smooth = "Smooth the switch, such as tanh(v/v0) for sign(v)."
         raise SpecificationError(
             "The motion has kinks or switches of the state." if switches else "The run is of other parameters.",
             "Derivatives are those along one smooth motion of the model.",
-            do="Smooth the switch, such as tanh(v/v0) for sign(v)." if switches else "Pass run.model, or simulate again.",
+            do=smooth if switches else "Pass run.model, or simulate again.",
             run=run.model.numbers,
             model=model.numbers,
         )
