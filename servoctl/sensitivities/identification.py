@@ -25,7 +25,7 @@ from servoctl.values import Value
 TOLERANCE = 1e-10  # of least squares: relative changes of the sum, the unknowns and the gradient
 PRIOR = 1e-3  # weight of relative changes of the parameters, beside residuals near 1: it decides what is not seen
 UNSEEN = 1.0  # relative standard deviation above which the data do not tell the size of a combination of parameters
-NAMED = 0.1  # of the largest component: parameters that take part in a combination
+NAMED = 0.1  # of a direction's length: parameters that take part in a combination
 PIECES = (16, 4, 1)  # into which a run is cut, one after the other: over long times a first guess leads far away
 SHORTER = 4  # times as many pieces, where the motion is not finite in these
 ROUGH = 1e-4  # `TOLERANCE` while there are pieces
