@@ -22,13 +22,13 @@ from servoctl.sensitivities.records import as_records
 from servoctl.tolerances import TINY
 from servoctl.values import Value
 
-TOLERANCE = 1e-10  # of least squares: relative changes of the sum, the unknowns and the gradient
+CONVERGES = 1e-10  # of least squares: relative changes of the sum, the unknowns and the gradient
 PRIOR = 1e-3  # weight of relative changes of the parameters, beside residuals near 1: it decides what is not seen
 UNSEEN = 1.0  # relative standard deviation above which the data do not tell the size of a combination of parameters
-NAMED = 0.1  # of a direction's length: parameters that take part in a combination
+TAKES_PART = 0.1  # of a direction's length: parameters that take part in a combination
 PIECES = (16, 4, 1)  # into which a run is cut, one after the other: over long times a first guess leads far away
 SHORTER = 4  # times as many pieces, where the motion is not finite in these
-ROUGH = 1e-4  # `TOLERANCE` while there are pieces
+ROUGH = 1e-4  # `CONVERGES` while there are pieces
 WORSE = 2.0  # misfit of longer pieces relative to that of shorter ones, which are then the result
 MISFIT = 1.25  # times the noise: larger residuals than these say that plant or noise levels are wrong
 
@@ -147,7 +147,7 @@ def identify(
     """
     require_kind(Plant, "plant", plant, "sv.plant(mechanism)")
     _require_free(plant)
-    names, theta = _first(plant, parameters)
+    names, theta = _first_values(plant, parameters)
     records, noise = as_records(plant, measured, noise, start)
     sizes, best = np.abs(theta), None
     for count in (SHORTER * PIECES[0], *PIECES):
@@ -183,7 +183,7 @@ def _places(plant):
     return {name: i for i, name in enumerate([*names, *(f"lag_{name}" for name in plant.lagged)])}
 
 
-def _first(plant, parameters):
+def _first_values(plant, parameters):
     """Names (k,) and first values (k,) of the parameters."""
     places = _places(plant)
     given = parameters if isinstance(parameters, Mapping) else {}
@@ -366,7 +366,7 @@ def _fitted(problem, theta, first):
     if not np.isfinite(problem.residuals(unknowns)).all():
         return None
     k, scale = problem.k, PRIOR / np.where(first != 0, np.abs(first), 1.0)
-    tolerance, form = (ROUGH, csr_array) if problem.count > 1 else (TOLERANCE, np.asarray)
+    tolerance, form = (ROUGH, csr_array) if problem.count > 1 else (CONVERGES, np.asarray)
     options = {"x_scale": "jac", "xtol": tolerance, "ftol": tolerance, "gtol": tolerance}
     prior = np.column_stack([np.diag(scale), np.zeros((k, len(unknowns) - k))])
 
@@ -422,8 +422,8 @@ def _told(names, by_parameters, by_starts):
     seen = deviations <= UNSEEN
     parts = directions[seen] * deviations[seen, None]
     covariance = parts.T @ parts
-    parts = [{n: float(d) for n, d in zip(names, v, strict=True) if abs(d) > NAMED} for v in directions[~seen]]
-    lost = (np.abs(directions[~seen]) > NAMED).any(axis=0)
+    parts = [{n: float(d) for n, d in zip(names, v, strict=True) if abs(d) > TAKES_PART} for v in directions[~seen]]
+    lost = (np.abs(directions[~seen]) > TAKES_PART).any(axis=0)
     return covariance, np.where(lost, np.inf, np.sqrt(np.diag(covariance))), tuple(parts)
 
 

@@ -79,11 +79,11 @@ def as_records(plant, measured, noise, start):
             do='Pass sv.close(...), {"t": ..., "trolley": ..., "theta": ...}, or several of them.',
             type=type(measured).__name__,
         )
-    noise = _noise(plant, listed, noise)
+    noise = _levels(plant, listed, noise)
     return [_record(plant, one, noise, start) for one in listed], noise
 
 
-def _noise(plant, listed, noise):
+def _levels(plant, listed, noise):
     """Standard deviations by measured name: those that were given, or those of the sensors of closed loops."""
     states = [name for name in plant.state_names if name not in plant.lagged]  # which are named like their inputs
     names = (*states, *plant.mechanism.outputs)

@@ -13,6 +13,7 @@ from servoctl.methods.sizes import motion_sizes
 from servoctl.model.model import Model
 from servoctl.model.switching import switching
 from servoctl.run import STENCIL, ByName, Run, require_model
+from servoctl.sensitivities.boundary import bounded_tangent
 from servoctl.sensitivities.tangent import along_state, determined, invariants_by, variational
 from servoctl.values import Value
 
@@ -128,14 +129,14 @@ class Sensitivity(ByName, Value):
         for of in self.of[:8]:
             sizes = {to: np.nanmax(np.abs(self[of, to])) * self.change(to) for to in self.to}
             largest = sorted(sizes, key=sizes.get, reverse=True)[:3]
-            shown = ", ".join(f"{to} ({_step(self.number(to))}): {sizes[to]:.3g}" for to in largest)
+            shown = ", ".join(f"{to} ({_growth_in_words(self.number(to))}): {sizes[to]:.3g}" for to in largest)
             lines.append(f"  {of} changes at most with {shown}")
         if self.independent:
             lines.append(f"  constant else at the start: {', '.join(self.independent)}")
         return "\n".join(line[:118] for line in lines)
 
 
-def _step(number):
+def _growth_in_words(number):
     return "1 %" if number else "0.01"
 
 
@@ -145,7 +146,7 @@ def sensitivity(
     """Derivatives of a run's signals by parameters and initial values, without differences.
 
     Where the program determines the motion they follow from the implicit function theorem at each sample, otherwise
-    from the variational equation along the run.
+    from the variational equation along the run; for bounded motions from its boundary value problem.
 
     Parameters
     ----------
@@ -205,13 +206,6 @@ def sensitivity(
 
 def _require_run(model, run):
     """Refuse a run with other numbers, and one with switches of the state."""
-    if run.method == str(Bounded()):
-        raise SpecificationError(
-            "The run is a bounded motion.",
-            "Its derivatives solve a boundary value problem, which the variational equation from its start is not.",
-            do="Take differences of runs of model.with_parameters(...).",
-            method=run.method,
-        )
     switches = switching(model) is not None
     if switches or run.model.numbers != model.numbers:
         smooth = "Smooth the switch, such as tanh(v/v0) for sign(v)."
@@ -257,14 +251,18 @@ def _by_rows(model, y, columns, kinds):
 def _along(model, run, to, kinds):
     """Tangents (rows, K, N) along a run, and the names of its independent initial values."""
     names, initial = to
-    S, independent = _start(run, names, initial)
-    tangents = _integrated(model, run, names, S)
+    if run.method == str(Bounded()):
+        _require_free(model, initial, ())
+        tangents, independent = bounded_tangent(model, run, names), ()
+    else:
+        S, independent = _start(run, names, initial)
+        tangents = _integrated(model, run, names, S)
     parts = []
     for first, end, variant in _variants(run):
         jets = run.jets[: len(model.jet_names), first:end]
         x = np.concatenate([jets, tangents[:, :, first:end].swapaxes(0, 1).reshape(-1, end - first)])
         y = along_state(variant, names, len(initial), kinds).grid(run.t[first:end], x, variant.parameters)
-        parts.append(_by_rows(model, y, S.shape[1], kinds))
+        parts.append(_by_rows(model, y, tangents.shape[1], kinds))
     return np.concatenate(parts, axis=2), independent
 
 
@@ -315,10 +313,10 @@ def _require_free(model, initial, independent):
         if name not in independent:
             raise SpecificationError(
                 f"The derivative by the initial value of {name!r} was named.",
-                f"Of this program {model.free} initial values are free, the others follow from the constraints.",
+                f"{len(independent)} initial values of this motion are free, the others follow from its constraints.",
                 do=f"Name others, such as {', '.join(independent)}." if independent else "Name parameters.",
                 name=name,
-                free=model.free,
+                free=independent,
             )
 
 
