@@ -12,7 +12,7 @@ from functools import partial
 import casadi as ca
 import numpy as np
 
-from servoctl.checks import numbers_by_name, require_kind, texts
+from servoctl.checks import named, numbers_by_name, require_kind, texts
 from servoctl.control.result import Closed
 from servoctl.errors import IntegrationStopped, SpecificationError, unknown
 from servoctl.plants.equations import equations_at
@@ -75,9 +75,7 @@ class Identification(ByName, Value):
     message: str = ""
 
     def __getitem__(self, name):
-        if name not in self.names:
-            raise unknown(name, self.names, "parameter")
-        return float(self.values[self.names.index(name)])
+        return float(self.values[self.names.index(named(name, self.names, "parameter"))])
 
     def deviation(self, name: str) -> float:
         """The standard deviation of a parameter.
@@ -86,8 +84,7 @@ class Identification(ByName, Value):
         ----------
         name : str
         """
-        self[name]
-        return float(self.deviations[self.names.index(name)])
+        return float(self.deviations[self.names.index(named(name, self.names, "parameter"))])
 
     def __repr__(self):
         count = sum(len(values) for run in self.residuals for values in run.values())
@@ -363,7 +360,9 @@ def _fitted(problem, theta, first):
     from scipy.sparse import csr_array
 
     unknowns = problem.first(theta)
-    if not np.isfinite(problem.residuals(unknowns)).all():
+    with np.errstate(over="ignore", invalid="ignore"):
+        sizes = [(values**2).sum() for values in (problem.residuals(unknowns), problem.jacobian(unknowns))]
+    if not np.isfinite(sizes).all():
         return None
     k, scale = problem.k, PRIOR / np.where(first != 0, np.abs(first), 1.0)
     tolerance, form = (ROUGH, csr_array) if problem.count > 1 else (CONVERGES, np.asarray)

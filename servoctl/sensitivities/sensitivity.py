@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from servoctl.checks import texts
+from servoctl.checks import named, texts
 from servoctl.errors import IntegrationStopped, SpecificationError, unknown
 from servoctl.methods.choice import Bounded
 from servoctl.methods.motion import breakpoints
@@ -60,10 +60,7 @@ class Sensitivity(ByName, Value):
 
     def __getitem__(self, pair):
         of, to = pair if isinstance(pair, tuple) and len(pair) == 2 else (pair, None)
-        for name, names in ((of, self.of), (to, self.to)):
-            if name not in names:
-                raise unknown(name, names, "derivative")
-        return self.values[of, to]
+        return self.values[named(of, self.of, "signal"), named(to, self.to, "parameter or initial value")]
 
     def number(self, name: str) -> float:
         """The value of a parameter, or an initial value.
@@ -73,7 +70,7 @@ class Sensitivity(ByName, Value):
         name : str
             One of `to`.
         """
-        numbers = self.run.model.numbers
+        numbers, name = self.run.model.numbers, named(name, self.to, "parameter or initial value")
         return numbers[name] if name in numbers else float(self.run[name][0])
 
     def change(self, name: str) -> float:
@@ -102,7 +99,7 @@ class Sensitivity(ByName, Value):
         -----
         At an extremum the signal does not change with time, so that d max y/dp = ∂y/∂p there.
         """
-        times = [t for t, _ in self.run.extrema(of)]
+        times = [t for t, _ in self.run.extrema(named(of, self.of, "signal"))]
         return {to: tuple(_between(self.run, self[of, to], t) for t in times) for to in self.to}
 
     def plot(self, ax=None, units=None):
@@ -184,6 +181,8 @@ def sensitivity(
     of = tuple(dict.fromkeys(default if of is None else texts(of, "The names of signals")))
     to = tuple(dict.fromkeys(list(model.numbers) if to is None else texts(to, "The names of parameters")))
     known = (*model.jet_names, *model.signal_groups)
+    if not of or not to:
+        raise SpecificationError("Nothing was named.", "A derivative is of a signal by a number.", of=of, to=to)
     for name in of:
         if name not in known:
             raise unknown(name, known, "signal")
