@@ -31,6 +31,10 @@ from servoctl.errors import (
 )
 from servoctl.export.c import export_c
 from servoctl.internal_dynamics import InternalDynamics, internal_dynamics
+from servoctl.inversion.choice import inverse
+from servoctl.inversion.output import MinimumPhase, minimum_phase
+from servoctl.inversion.relaxed import relaxed
+from servoctl.inversion.report import Report, report
 from servoctl.methods.choice import (
     Adaptive,
     Algebraic,
@@ -91,6 +95,7 @@ __all__ = [
     "LimitReport",
     "Mechanism",
     "MinimalCoordinates",
+    "MinimumPhase",
     "Model",
     "NameUnknown",
     "NotRealisable",
@@ -100,6 +105,7 @@ __all__ = [
     "Program",
     "Project",
     "RadauIIA",
+    "Report",
     "Run",
     "RungeKutta",
     "Sensitivity",
@@ -131,12 +137,14 @@ __all__ = [
     "identify",
     "internal_dynamics",
     "interop",
+    "inverse",
     "limit_report",
     "limited",
     "load",
     "load_study",
     "lqr",
     "merge",
+    "minimum_phase",
     "monte_carlo",
     "output_feedback",
     "parameters",
@@ -145,6 +153,8 @@ __all__ = [
     "pd",
     "plant",
     "plots",
+    "relaxed",
+    "report",
     "rigid_body",
     "sampled_bound",
     "sensitivity",

@@ -150,7 +150,10 @@ class Run(ByName, Value):
         parts = []
         for first, end, model in self.variants or ((0, len(self.t), self.model),):
             names, f = model.signals(kind, rate)
-            if f.n_x > len(self.jets):
+            jets = self.jets[: f.n_x, first:end]
+            if f.n_x > len(jets) and not rate:  # outputs of higher order than the motion
+                jets = model.extended(self.t[first:end], jets, f.n_x)
+            if f.n_x > len(jets):
                 present, needed = ((size - model.nq) // model.n for size in (len(self.jets), f.n_x))
                 raise SpecificationError(
                     f"The run has jets up to order {present}, too few for {', '.join(names)}.",
@@ -159,7 +162,7 @@ class Run(ByName, Value):
                     names=names,
                     jets=needed,
                 )
-            parts.append(f.grid(self.t[first:end], self.jets[: f.n_x, first:end], model.parameters))
+            parts.append(f.grid(self.t[first:end], jets, model.parameters))
         return names, np.concatenate(parts, axis=1)
 
     def variant(self, i: int):

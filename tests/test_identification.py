@@ -19,13 +19,13 @@ def crane(gallery_model):
     """A function from seed and noise to a measured run at 100 Hz of a crane that is not the planned one; its guess."""
     model = gallery_model("overhead-crane")
     mechanism = model.reduction.mechanism
-    plan = sv.simulate(model, model.start(guess={"l": 4.0}), (0.0, 2.0))
+    plan = sv.simulate(model, model.start(guess={"l": 4.0}), (0.0, 1.5))
     law = sv.lqr(plan, sv.plant(mechanism), rate=100.0, integral=True)
     machine = sv.plant(mechanism, m_load=TRUE["m_load"], damping={"x": TRUE["damping_x"]})
 
     def run(seed, noise=NOISE):
         sensors = sv.Sensors(noise=noise, seed=seed) if noise else None
-        return sv.close(machine, law, plan.state(0.0), (0.0, 2.0), sensors=sensors)
+        return sv.close(machine, law, plan.state(0.0), (0.0, 1.5), sensors=sensors)
 
     return run, sv.plant(mechanism, damping={"x": 1.0})
 

@@ -7,7 +7,6 @@ import numpy as np
 
 from servoctl.checks import named, texts
 from servoctl.errors import IntegrationStopped, SpecificationError, unknown
-from servoctl.methods.choice import Bounded
 from servoctl.methods.motion import breakpoints
 from servoctl.methods.sizes import motion_sizes
 from servoctl.model.model import Model
