@@ -113,7 +113,7 @@ def _record(plant, one, noise, start):
     data = _checked(plant, data, noise)
     t = data["t"]
     inputs = np.array([data[name] for name in plant.inputs]).reshape(len(plant.inputs), len(t))
-    states = _states(plant, data, guess, start)
+    states = _guesses(plant, data, guess, start)
     if isinstance(one, Closed):
         substeps, late, before = one.loop.substeps, one.loop.transport, one.loop.initial_input
     else:
@@ -139,7 +139,7 @@ def _require_states(plant, loop):
             )
 
 
-def _states(plant, data, guess, start):
+def _guesses(plant, data, guess, start):
     """Guesses of the states (n_x, N): what is measured, slopes of what is, inputs for lagged ones, else the start's."""
     if isinstance(start, Mapping):
         values = numbers_by_name(dict(start), plant.state_names, "state", "first value")
@@ -152,11 +152,11 @@ def _states(plant, data, guess, start):
         if name in data:
             states[i] = data[name]
         elif name in velocities and velocities[name] in data and plant.mechanism.q.plain:
-            states[i] = _slopes(data["t"], data[velocities[name]])
+            states[i] = _line_slopes(data["t"], data[velocities[name]])
     return states
 
 
-def _slopes(t, values):
+def _line_slopes(t, values):
     """Slopes (N,) of straight lines through the samples around each one."""
     result = np.empty(len(t))
     for k in range(len(t)):

@@ -7,6 +7,7 @@ import numpy as np
 
 from servoctl.checks import named, texts
 from servoctl.errors import IntegrationStopped, SpecificationError, unknown
+from servoctl.methods.choice import Bounded
 from servoctl.methods.motion import breakpoints
 from servoctl.methods.sizes import motion_sizes
 from servoctl.model.model import Model
@@ -193,7 +194,7 @@ def sensitivity(
     kinds = tuple(dict.fromkeys(model.signal_groups[name] for name in of if name not in model.jet_names))
     if model.flat:
         _require_free(model, initial, ())
-        tangents, independent = _determined(run, names, kinds), ()
+        tangents, independent = _by_theorem(run, names, kinds), ()
     else:
         tangents, independent = _along(model, run, (names, initial), kinds)
     rows = dict(zip(_rows(model, kinds), tangents, strict=True))
@@ -225,7 +226,7 @@ def _variants(run):
     return run.variants or ((0, len(run.t), run.model),)
 
 
-def _determined(run, names, kinds):
+def _by_theorem(run, names, kinds):
     """Tangents (rows, k, N) of the jets and signals of a flat program."""
     parts = []
     for first, end, model in _variants(run):
@@ -253,7 +254,7 @@ def _along(model, run, to, kinds):
         _require_free(model, initial, ())
         tangents, independent = bounded_tangent(model, run, names), ()
     else:
-        S, independent = _start(run, names, initial)
+        S, independent = _tangent_at_start(run, names, initial)
         tangents = _integrated(model, run, names, S)
     parts = []
     for first, end, variant in _variants(run):
@@ -264,7 +265,7 @@ def _along(model, run, to, kinds):
     return np.concatenate(parts, axis=2), independent
 
 
-def _start(run, names, initial):
+def _tangent_at_start(run, names, initial):
     """The tangent (n_x, K) of the first state, and the names of the initial values that do not depend on others."""
     model = run.variant(0)
     t, x = run.t[0], run.jets[: len(model.state_names), 0]
@@ -339,7 +340,7 @@ def _integrated(model, run, names, S):
             rtol=RTOL, atol=atol,
         )  # fmt: skip
         if solved.status:
-            raise _lost(float(solved.t[-1]), solved.message)
+            raise _ended(float(solved.t[-1]), solved.message)
         result[:, :, inside] = solved.sol(run.t[inside])[n_x:].reshape(K, n_x, -1).swapaxes(0, 1)
         y = solved.y[:, -1].copy()
     return result
@@ -359,7 +360,7 @@ def _absolute(model, run, names, S):
     return RTOL * np.concatenate([sizes, *(sizes / number for number in [*numbers, *initial])])
 
 
-def _lost(t, why):
+def _ended(t, why):
     return IntegrationStopped(
         f"The variational equation could not be integrated beyond t = {t:.6g} s: {why.rstrip('.')}.",
         "Derivatives follow the motion from its start.",
