@@ -210,7 +210,7 @@ def test_a_run_across_switches_is_a_value():
 # residuals -----------------------------------------------------------------------------------------------------------
 
 
-def test_a_coupling_that_comes_alive_is_followed():
+def test_a_coupling_that_comes_alive_is_followed(c_compiler):
     """A cam with a dwell, y = 0.1 max(0, φ - 2)⁴ for φ = x: its mass takes speed only beyond x = 2."""
     model, start = ideal(lambda t, x, y, dx, dy: y - 0.1 * ca.fmax(0, x - 2) ** 4, x=0.0, dx=2.0, y=0.0)
     for method in ("DOP853", "Taylor", "RK8", "RadauIIA"):
