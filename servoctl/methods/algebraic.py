@@ -7,7 +7,7 @@ ends. Samples are solved between the ends of these steps.
 import numpy as np
 
 from servoctl.jets.branches import Branches
-from servoctl.methods.monitor import Fine, Repivot, Stretch
+from servoctl.methods.monitor import Fine, Repivot, Singular, Stretch
 from servoctl.methods.motion import Stepping, breakpoints, interruptible
 from servoctl.methods.watch import Watch
 from servoctl.model.switching import switching
@@ -17,7 +17,7 @@ NODES = 1000  # steps per call of the loop: 0.3 ms compiled, 50 ms where CasADi 
 BLOCK = 4000  # samples per call of the loop: 0.2 ms compiled, 0.2 s where CasADi evaluates
 
 
-def algebraic(model, span, x0, times, knots, progress):
+def algebraic(model, span, x0, times, knots, progress, events=None):
     """Solve a flat program for q, γ' and γ'' at each time.
 
     Parameters
@@ -33,12 +33,15 @@ def algebraic(model, span, x0, times, knots, progress):
     knots : sequence of float
         At which steps end [s].
     progress : callable
+    events : Events, optional
 
     Returns
     -------
     Motion
     """
-    return _Algebraic(model, "algebraic", None, progress).run(span[0], x0, span[1], times, knots)
+    continuation = _Algebraic(model, "algebraic", None, progress)
+    continuation.events = events
+    return continuation.run(span[0], x0, span[1], times, knots)
 
 
 class _Algebraic(Stepping):
@@ -73,7 +76,7 @@ class _Algebraic(Stepping):
             self.longest, self.direction = abs(t1 - t0) / STEPS, np.sign(t1 - t0)
             self.pending, self.resumed = times, None
             t, x = t0, x0
-            while t != t1 and self.motion.stop is None:
+            while t != t1 and self.motion.stop is None and not self.motion.ended:
                 t, x = self._advance(np.append(t, cuts[(cuts - t) * self.direction > 0]), x)
         return self.motion
 
@@ -108,6 +111,8 @@ class _Algebraic(Stepping):
         outcome = self.monitor.inspect(stretch)
         last = self._resumption(t, outcome.steps) if isinstance(outcome, Repivot) else outcome.steps
         switch = self._switch(stretch.first(last), nodes)
+        if self.events is not None and self._meets_event(*self._reached(nodes, last, switch, outcome, cuts[-1])):
+            return t[last], states[:, last]
         if switch is not None:
             return self._turned(switch, nodes[: switch.steps + 2], cuts[-1])
         self._sample(nodes[: last + 1], states[:, last], t[last], cuts[-1])
@@ -144,6 +149,34 @@ class _Algebraic(Stepping):
         good = last - 1 if last and t[last - 1] != self.resumed else last
         self.resumed = t[good]
         return good
+
+    @staticmethod
+    def _reached(nodes, last, switch, outcome, t1):
+        """The nodes up to a switch, a stop or the last one that leads on, the instant, and whether it is a stop."""
+        if switch is not None:
+            return nodes[: switch.steps + 2], switch.t, False
+        stops = isinstance(outcome, Singular) or (len(nodes) < NODES and nodes[-1, 0] != t1)
+        reached = nodes if stops else nodes[: last + 1]
+        return reached, reached[-1, 0], stops
+
+    def _meets_event(self, nodes, end, stops):
+        """Whether a terminal event ends the motion between nodes; the samples up to it are then recorded."""
+
+        def solved(t):
+            state, top, _ = self._split(*self.f.newton(t, nodes, self.p)[:2])
+            return np.concatenate([state, top])
+
+        t = self.events.instants(np.append(nodes[:-1, 0], end))[1]
+        jets = solved(t)
+        t = t[: jets.shape[1]]
+        found = self.events.first(self.model, t, jets, lambda s: solved(np.array([s]))[:, 0], stops)
+        if found is not None:
+            x, top = np.split(found.jets[:, None], [len(self.model.state_names)])
+            self.pending = self.pending[self.direction * self.pending < self.direction * min(found.t, t[-1])]
+            self._sample(nodes, x[:, 0], end, end)
+            self.motion.add(self.model, [found.t], x, top)
+            self.motion.ended = found.name
+        return found is not None
 
     def _sample(self, nodes, x, t, t1):
         """Solve at the pending instants up to t, where the state is x; at all of them if the motion ends there."""

@@ -239,8 +239,8 @@ class Model:
 
     @property
     def actuators(self):
-        """Names of the mechanism's actuators."""
-        return self.reduction.mechanism.actuators
+        """Names of the mechanism's actuators, or of the inputs that drive it."""
+        return self.reduction.mechanism.actuators or self.reduction.mechanism.inputs
 
     @property
     def ideal(self):
@@ -250,12 +250,14 @@ class Model:
     @property
     def outputs(self):
         """Names of the mechanism's outputs."""
-        return tuple(self.reduction.mechanism.outputs)
+        mechanism = self.reduction.mechanism
+        return tuple(name for name in mechanism.outputs if name not in mechanism.inputs)
 
     @property
     def residual_names(self):
         """Names of the rows whose residuals a run reports."""
-        return (*residual_rows(self.reduction), *self.reduction.mechanism.q.invariants)
+        mechanism = self.reduction.mechanism
+        return (*residual_rows(self.reduction), *mechanism.reported, *mechanism.q.invariants)
 
     @property
     def knots(self):

@@ -7,6 +7,7 @@ import numpy as np
 from servoctl.errors import ServoError, SingularProgram
 from servoctl.model.rest import first_motion, standstill
 from servoctl.reduction.rows import alternatives
+from servoctl.reduction.self_motion import self_motion
 
 WIDTH = 118
 
@@ -21,6 +22,7 @@ def describe(model):
         *([f"  {raised}"] if raised else []),
         *_hidden_and_free(model),
         f"  {_rule(r)}",
+        *_open(r),
     ]
     if any(not row.affine for row in r.rows):
         nonlinear = ", ".join(row.name for row in r.rows if not row.affine)
@@ -69,6 +71,15 @@ def _rule(r):
     classical = all(row.order == 0 or (row.order == 1 and row.affine) for row in program)
     rule = "d'Alembert's principle" if classical else "the generalised Chetaev rule, a postulate at this order"
     return f"(3.18) with T from ker G; dependent: {dependent}; under {rule}"
+
+
+def _open(r):
+    """How actuation that the program leaves open is chosen, and the self-motion that goes with it."""
+    m, k = len(r.mechanism.actuators), len(r.program.residuals)
+    if r.program.by == "ideal" or not 0 < k < m:
+        return []
+    chosen = "nearest to the wishes" if r.program.toward else "of least norm"
+    return [f"  {m} actuators for {k} residuals: {chosen}; {self_motion(r) or 'no self-motion'}"]
 
 
 def warn_of_products(r):

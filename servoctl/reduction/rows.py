@@ -97,6 +97,15 @@ class Row:
         return f"Row({self.name}: {self.kind}, order {self.order}{', ' + self.story if self.story else ''})"
 
 
+def balances(q, expressions):
+    """Rows of (3.18) from their expressions by index of the independent quasi-coordinate."""
+    names = q.names if q.plain else q.velocity_names
+    return [
+        Row(e, max(q.order(e), 0), f"balance of {names[i]}", "dynamics", uses={Balance(): 0})
+        for i, e in expressions.items()
+    ]
+
+
 def merge_uses(*parts):
     """The highest number of differentiations of each residual among (uses, extra differentiations) pairs."""
     total = {}
