@@ -276,7 +276,7 @@ class Equations(Invariants):
         if rate:
             expressions = self.q.derivatives(expressions, rate)[rate]
             names, kind = [jet_name(name, rate) for name in names], f"{kind}_rate{rate}"
-        places = filter(None, map(self.q.where, ca.symvar(ca.vertcat(*expressions))))
+        places = filter(None, map(self.q.where, ca.symvar(ca.SX(ca.vertcat(*expressions)))))
         highest = max((level for of, level, _ in places if of not in ("t", "q")), default=0)
         above = (s for k in range(self.top + 1, highest + 1) for s in self.q.gamma(k))
         return names, self.function(kind, ca.vertcat(self.jets, *above), expressions)
