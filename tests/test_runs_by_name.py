@@ -132,3 +132,11 @@ def test_files_and_systems_refuse_outputs_beyond_the_jets(tmp_path):
     model = sv.derive(mechanism(actuators={"a": x, "b": y}), sv.Program({"X": x - ca.sin(q.t), "Y": y}))
     with refused(sv.SpecificationError, "jerk", name="jerk", order=3, limit=2):
         sv.export_c(model, tmp_path)
+
+
+def test_a_mechanism_without_outputs_has_an_empty_group_of_them():
+    q = sv.coordinates("x")
+    mechanism = sv.Mechanism(q, gibbs=sv.particle(q, 1.0, *q), actuators={"u": q.jet(0)})
+    model = sv.derive(mechanism, sv.Program({"X": q.jet(0) - q.t}))
+    names, f = model.signals("outputs")
+    assert names == [] and f(0.0, np.zeros(f.n_x), []).size == 0

@@ -210,7 +210,7 @@ def test_a_run_across_switches_is_a_value():
 # residuals -----------------------------------------------------------------------------------------------------------
 
 
-def test_a_coupling_that_comes_alive_is_followed():
+def test_a_coupling_that_comes_alive_is_followed(c_compiler):
     """A cam with a dwell, y = 0.1 max(0, φ - 2)⁴ for φ = x: its mass takes speed only beyond x = 2."""
     model, start = ideal(lambda t, x, y, dx, dy: y - 0.1 * ca.fmax(0, x - 2) ** 4, x=0.0, dx=2.0, y=0.0)
     for method in ("DOP853", "Taylor", "RK8", "RadauIIA"):
@@ -422,12 +422,32 @@ def test_a_flat_angle_turns_round_and_round(span):
     assert sv.verify(model, run).passed
 
 
-def test_dry_friction_along_a_flat_program():
-    """u = 2 x'' + 0.3 sign x', x = 1 + sin t."""
+def rubbed(path):
+    """A driven mass on x along a path of t, with dry friction of 0.3 N."""
     q = sv.coordinates("x")
     (x,), (dx,) = q, q.d(1)
     mechanism = sv.Mechanism(q, gibbs=sv.particle(q, 2.0, x), actuators={"u": x}, forces={"x": -0.3 * ca.sign(dx)})
-    model = sv.derive(mechanism, sv.Program({"X": x - 1 - ca.sin(q.t)}))
+    return sv.derive(mechanism, sv.Program({"X": x - path(q.t)}))
+
+
+def test_dry_friction_along_a_flat_program():
+    """u = 2 x'' + 0.3 sign x', x = 1 + sin t."""
+    model = rubbed(lambda t: 1 + ca.sin(t))
     run = sv.simulate(model, model.start(), (0.0, 10.0), t_eval=np.linspace(0.0, 10.0, 777))
     assert run["u"] == pytest.approx(-2 * np.sin(run.t) + 0.3 * np.sign(np.cos(run.t)), abs=1e-9)
-    assert len(run.knots) == 3 and sv.verify(model, run).passed
+    assert sv.verify(model, run).passed
+
+
+@pytest.mark.parametrize("samples", [15, 1001])
+def test_dry_friction_does_not_act_where_a_flat_program_rests(samples):
+    """To and fro between rests, at which sign 0 = 0."""
+
+    def path(t):
+        there, back = (sv.paths.rest_to_rest(t, 0.0, 1.0, duration=2.0, t_start=s, smoothness=4) for s in (1.0, 4.0))
+        return there - back
+
+    model = rubbed(path)
+    run = sv.simulate(model, model.start(), (0.0, 7.0), t_eval=np.linspace(0.0, 7.0, samples))
+    direction = np.where((run.t > 1) & (run.t < 3), 1.0, np.where((run.t > 4) & (run.t < 6), -1.0, 0.0))
+    assert run["u"] - 2 * run["d2x"] == pytest.approx(0.3 * direction, abs=1e-12)
+    assert sv.verify(model, run).passed

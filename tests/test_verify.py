@@ -352,7 +352,7 @@ def test_changed_signals_of_a_closed_loop_fail(what, plan):
 # what cannot be decided -----------------------------------------------------------------------------------------------
 
 
-def test_what_cannot_be_followed_is_inconclusive():
+def test_what_cannot_be_followed_is_inconclusive(c_compiler):
     model, start, span = chain(1e13, by="ideal")
     run = sv.simulate(model, start, span, as_method("RadauIIA"), t_eval=[0.0, 1.0, 2.0])
     proof = sv.verify(model, run)

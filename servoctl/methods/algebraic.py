@@ -6,6 +6,7 @@ ends. Samples are solved between the ends of these steps.
 
 import numpy as np
 
+from servoctl.jets.branches import Branches
 from servoctl.methods.monitor import Fine, Repivot, Singular, Stretch
 from servoctl.methods.motion import Stepping, breakpoints, interruptible
 from servoctl.methods.watch import Watch
@@ -80,8 +81,14 @@ class _Algebraic(Stepping):
         return self.motion
 
     def _watch(self, t, x, t1):
-        """Watch for kinks and switches, where there are any, with the smooth model that holds at the start."""
-        self.family = switching(self.model)
+        """Watch for kinks and switches of the motion, if it has any, with the smooth model that holds at the start.
+
+        Those of forces alone change the actuation, not the motion.
+        """
+        r = self.model.reduction
+        of_motion = Branches(lambda s: (r.mechanism.q.where(s) or ("t",))[0] != "t")
+        of_motion.smooth([row.expression for row in r.rows], angles=True)
+        self.family = switching(self.model) if of_motion.switches else None
         if self.family is not None:
             branches = self.family.branches(t, x)
             self._use(self.family.at(branches))

@@ -21,6 +21,7 @@ VANISHED = 1e-5  # gradient on a row's solutions, relative to random points, bel
 SQUARE_STEPS = 40  # Newton steps towards these solutions; for a square each only halves the distance
 SOLVED = 1e-3  # scaled residual of points at which the gradient of a possible square is judged
 FELT = 1e-9  # a term above this fraction of a row's parts is not their rounding
+MOSTLY = 0.5  # of the solutions at which a term vanishes: 1 - cos φ is zero at φ = 2π, too
 SAME_DEPTH = 20  # nested operations to which factors are compared
 BESIDE = 0.5  # relative distance of the points with which solutions are compared
 
@@ -193,7 +194,7 @@ def _zeros(q, row, context):
     starts, solutions = starts.take(solved), replace(starts, z=z).take(solved)
     terms = [e for e in _terms(row.expression)[1:] if q.order(e) >= 0]
     before, after = (np.abs(points.evaluate(terms)[0]) for points in (starts, solutions))
-    vanishing = zip(terms, np.all(after <= SOLVED * before, axis=1), strict=True)
+    vanishing = zip(terms, (after <= SOLVED * before).mean(axis=1) > MOSTLY, strict=True)
     found = [e for e, zero in vanishing if zero and len(solved) and _has_gradient(q, e, starts, solutions)]
     hashes = {e.element_hash() for e in found}
     return [e for e in found if not hashes & {inner.element_hash() for inner in _terms(e)[1:]}]
