@@ -275,6 +275,49 @@ def test_a_flat_plan_tends_to_the_exact_inverse_in_proportion_to_the_weight():
     assert np.log10(errors[:-1] / errors[1:])[:, 0] == pytest.approx(1.0, abs=0.2)
 
 
+def test_a_minimum_phase_plan_tends_to_the_exact_inverse_in_proportion_to_the_weight():
+    """A passive joint between two links: error and internal dynamics alike."""
+    q, p = sv.coordinates("q1 q2"), sv.parameters(m=6.875, l=1.0, I=0.57, c=50.0, d=5.0)
+    first, second = q
+    (dd1, dd2), along = q.d(2), [ca.vertcat(ca.cos(a), ca.sin(a)) for a in (first, first + second)]
+    centres = [p.l / 2 * along[0], p.l * along[0] + p.l / 2 * along[1]]
+    mechanism = sv.Mechanism(
+        q, gibbs=sum(sv.particle(q, p.m, c) for c in centres) + p.I * (dd1**2 + (dd1 + dd2) ** 2) / 2, parameters=p,
+        potential=p.c * second**2 / 2, forces={"q2": -p.d * q.d(1)[1]}, actuators={"motor": first},
+    )  # fmt: skip
+    program = sv.Program({"y": first + 0.3 * second - rest_to_rest(q.t, 0.0, np.pi / 2, 2.0)})
+    model = sv.derive(mechanism, program)
+    exact = sv.simulate(model, model.start(), (0.0, 6.0))
+    errors = []
+    for weight in (1e-8, 1e-9):
+        run = sv.relaxed(sv.plant(mechanism), program, (0.0, 6.0), weight=weight)
+        moving = (run.t > 0.5) & (run.t < 3.0)
+        swing = run["q2"] - np.interp(run.t, exact.t, exact["q2"])
+        errors.append([np.abs(values[moving]).max() for values in (run.residual["y"][0], swing)])
+    assert np.log10(np.divide(*errors)) == pytest.approx(np.ones(2), abs=0.1)
+
+
+def test_two_trolleys_with_hoists_carry_a_beam():
+    q, p = sv.coordinates("x1 x2 X Z phi"), sv.parameters(mt=20.0, M=200.0, J=60.0, b=1.5, g=9.81)
+    x1, x2, X, Z, phi = q
+    half = p.b * ca.vertcat(ca.cos(phi), ca.sin(phi))
+    ropes = [ca.norm_2(ca.vertcat(X, Z) + side * half - ca.vertcat(x, 0)) for side, x in ((-1, x1), (1, x2))]
+    masses = sv.particle(q, p.mt, x1) + sv.particle(q, p.mt, x2) + sv.particle(q, p.M, ca.vertcat(X, Z))
+    mechanism = sv.Mechanism(
+        q, gibbs=masses + p.J * q.d(2)[4] ** 2 / 2, potential=-p.M * p.g * Z, parameters=p,
+        actuators={"trolley1": x1, "trolley2": x2, "hoist1": ropes[0], "hoist2": ropes[1]},
+    )  # fmt: skip
+    path = rest_to_rest(q.t, (0.0, 5.0, 0.0), (4.0, 4.0, 0.3), 5.0)
+    program = sv.Program({"X": X - path[0], "Z": Z - path[1], "phi": phi - path[2], "gap": x2 - x1 - 3.0})
+    start = {"x1": -1.5, "x2": 1.5, "X": 0.0, "Z": 5.0, "phi": 0.0}
+    run = sv.relaxed(sv.plant(mechanism), program, (0.0, 5.0), weight=1e-10, start=start)
+    assert sv.verify(run.model, run).passed
+    assert max(np.abs(run.residual[name]).max() for name in program.names) < 2e-5
+    assert run["hoist1"][0] + run["hoist2"][0] == pytest.approx(-200.0 * 9.81, rel=1e-3)
+    again = sv.simulate(run.model, run.start, (0.0, 5.0), sv.Taylor(), t_eval=run.t)
+    assert again["X"] == pytest.approx(run["X"], abs=1e-6)
+
+
 # --- bad input
 
 

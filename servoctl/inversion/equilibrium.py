@@ -3,7 +3,7 @@
 import casadi as ca
 import numpy as np
 
-STEPS, RESTS = 60, 1e-9  # of Newton's method; largest residual, relative to its slope times the state
+MOST_STEPS_TO_REST, RESTS = 60, 1e-9  # of Newton's method; largest residual, relative to its slope times the state
 RANK = 1e-8  # of the equations of a rest: smallest singular value relative to the largest
 
 
@@ -42,7 +42,7 @@ class Equilibria:
         z = np.concatenate([q, u]).astype(float)
         rows = [i for i, name in enumerate(self.names) if name not in without]
         free = np.setdiff1d(np.arange(len(z)), fixed)
-        for _ in range(STEPS):
+        for _ in range(MOST_STEPS_TO_REST):
             values, slopes, off = self._measured(t, z, rows)
             if not np.isfinite(off).all() or off.max(initial=0.0) <= RESTS**1.3:
                 break
