@@ -216,8 +216,9 @@ def _beside_manifold(q, rows, b, context):
     """
     order = [*(a for a in range(len(rows)) if a != b and rows[a].order <= rows[b].order), b]
     rest = [row for a, row in enumerate(rows) if a != b]
-    for some in (rest, [row for row in rest if row.kind != "dynamics"]):
-        points = sample(q, some, max(row.order for row in rows), context)
+    wide = replace(context, spread=SPREAD)  # products of coefficients that vanish on the manifold are felt there
+    for some, place in ((rest, context), ([row for row in rest if row.kind != "dynamics"], wide)):
+        points = sample(q, some, max(row.order for row in rows), place)
         numbers, _ = leading(q, rows, points)
         support, _ = dependence(numbers[order], first=len(order) - 1)
         yield [order[i] for i in support], numbers

@@ -209,12 +209,16 @@ def _reduced(mechanism, program, switches, forces, context):
     names = list(forces)
     constraints, points, of_constraints = _constraints(mechanism, program, original, context)
     realised = realisation(mechanism, program, constraints, points)
-    dynamics, of_split = realised.dynamics(mechanism.balance)
-    dynamics = [
-        Row(e, max(q.order(e), 0), f"balance of {names[i].component}", "dynamics", uses={Balance(): 0})
-        for i, e in zip(realised.independent, dynamics, strict=True)
-    ]
-    dynamics = [row for row, _ in settle_alone(q, dynamics, context)]
+    for split in realised.splits():
+        dynamics, of_split = split.dynamics(mechanism.balance)
+        dynamics = [
+            Row(e, max(q.order(e), 0), f"balance of {names[i].component}", "dynamics", uses={Balance(): 0})
+            for i, e in zip(split.independent, dynamics, strict=True)
+        ]
+        dynamics = [row for row, _ in settle_alone(q, dynamics, context)]
+        if not any(_contradicts(row, points) for row in dynamics):
+            realised = split
+            break
     _require_motion(dynamics, program)
     rows, rank, points, of_rows = complete(q, [*constraints, *dynamics], context, points)
     knots = require_smooth(switches, context.values, smoothness(switches, rows))
@@ -314,6 +318,14 @@ def _constraints(mechanism, program, original, context):
         # Hidden constraints among these rows follow with those of (3.18); here they only show contradictions.
         complete(q, constraints, context, points)
     return constraints, points, pivots
+
+
+def _contradicts(row, points):
+    """Whether a row depends on t alone and is not zero.
+
+    It may have been divided by a jet that is zero in every motion, which is a factor of it with another split.
+    """
+    return row.order < 0 and bool(np.any(clean(*points.evaluate([row.expression]))))
 
 
 def _require_motion(dynamics, program):
