@@ -11,7 +11,7 @@ import casadi as ca
 import numpy as np
 
 from servoctl.errors import SpecificationError
-from servoctl.reduction.ranks import clean, decide_all, eliminate, equilibrate
+from servoctl.reduction.ranks import clean, decide_all, decide_each, eliminate, equilibrate
 
 NEGATIVE = 1e-9  # eigenvalues of a scaled inertia matrix below minus this are no rounding errors
 NAMED = 1e-6  # components of a direction below this fraction of the largest are not named in an error
