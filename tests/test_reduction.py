@@ -12,9 +12,11 @@ from refusals import refused, warned
 from servoctl import spec as sv
 from servoctl.errors import InconsistentStart, NotRealisable, SingularProgram, SpecificationError
 from servoctl.gallery import cars, gallery, mass_on_car, overhead_crane, passive_arm, spiral
+from servoctl.methods.choice import Adaptive
 from servoctl.model.model import derive
 from servoctl.simulation import simulate
 from servoctl.tolerances import EXTENDED
+from servoctl.verification import verify
 
 
 def orders(model):
@@ -697,3 +699,45 @@ def test_a_hidden_row_replaces_one_of_the_dynamics_and_not_the_residual(names):
     assert (written.name, written.order, written.story) == ("B", 2, "")
     assert (hidden.kind, hidden.order) == ("dynamics", 0) and "B" in hidden.story
     assert r.free == 2
+
+
+@pytest.mark.parametrize("turned", [0.0, 0.7, np.pi / 2])
+def test_a_jet_that_is_zero_in_every_motion_divides_no_row(turned):
+    """A force along φ_γ'' cannot carry a weight across it: of d2x² + d2y² = 100 only motions along gravity are left.
+
+    M γ'' + (0, m g) = μ (2 x'', 2 y'') has x'' (m - 2 μ) = 0, and y'' (m - 2 μ) = -m g rules out m = 2 μ.
+    """
+    q = sv.coordinates("x y")
+    x, y = q
+    cosine, sine = np.cos(turned), np.sin(turned)
+    mechanism = sv.Mechanism(q, gibbs=sv.particle(q, 2.0, (x, y)), potential=2.0 * 9.81 * (cosine * y - sine * x))
+    guess = {"d2x": -10 * sine, "d2y": 10 * cosine}
+    model = derive(mechanism, sv.Program({"a": q.d(2)[0] ** 2 + q.d(2)[1] ** 2 - 100.0}, by="ideal"), guess=guess)
+    run = simulate(model, model.start(x=0.0, y=0.0, dx=1.0, dy=0.0, guess=guess), (0.0, 1.0))
+    assert run["x"] == pytest.approx(run.t - 5 * sine * run.t**2, abs=1e-9)
+    assert run["y"] == pytest.approx(5 * cosine * run.t**2, abs=1e-9)
+    assert verify(model, run).passed
+
+
+def test_a_ball_rolls_from_the_identity():
+    """On a table that turns by Ω, a ball with J = 2/5 m r² moves on a circle at 2/7 Ω; half the pivots are zero here."""
+    plain = sv.coordinates("x y e0 e1 e2 e3")
+    x, y, e0, e1, e2, e3 = plain
+    turn = [[-e1, -e2, -e3], [e0, -e3, e2], [e3, e0, -e1], [-e2, e1, e0]]
+    V = [[1, 0, 0, 0, 0], [0, 1, 0, 0, 0], *([0, 0, *(c / 2 for c in row)] for row in turn)]
+    unit = {"unit": e0**2 + e1**2 + e2**2 + e3**2 - 1}
+    q = plain.with_quasi_velocities("vx vy w1 w2 w3", V, invariants=unit)
+    vx, vy, *w = q.w()
+    rows = [
+        [1 - 2 * (e2**2 + e3**2), 2 * (e1 * e2 - e0 * e3), 2 * (e1 * e3 + e0 * e2)],
+        [2 * (e1 * e2 + e0 * e3), 1 - 2 * (e1**2 + e3**2), 2 * (e2 * e3 - e0 * e1)],
+    ]
+    W = [sum(r * s for r, s in zip(row, w, strict=True)) for row in rows]
+    rates = q.w(1)
+    gibbs = (rates[0] ** 2 + rates[1] ** 2) / 2 + 0.4 * (rates[2] ** 2 + rates[3] ** 2 + rates[4] ** 2) / 2
+    program = sv.Program({"rx": vx - W[1] + 0.7 * y, "ry": vy + W[0] - 0.7 * x}, by="ideal")
+    model = derive(sv.Mechanism(q, gibbs=gibbs), program)
+    start = model.start(x=1.0, y=0.0, vx=0.0, vy=0.3, e1=0.0, e2=0.0, e3=0.0, w3=0.0, guess={"e0": 1.0})
+    run = simulate(model, start, (0.0, 5.0), Adaptive(rtol=1e-10, atol=1e-12))
+    velocity = run["vx"] + 1j * run["vy"]
+    assert velocity == pytest.approx(0.3j * np.exp(0.2j * run.t), abs=1e-7)

@@ -162,10 +162,13 @@ class Equations(Invariants):
 
     @property
     def jet_sizes(self):
-        """Sizes of the jets by name: those given for the choice of pivots, else the largest at the points up to 1."""
+        """Sizes of the jets by name: those given for the choice of pivots, else the largest at the points.
+
+        The latter up to their usual sizes.
+        """
         names = [name for k in range(self.top + 1) for name in self.q.jet_names(k)]
         largest = np.vstack([self.r.points.jet(k) for k in range(self.top + 1)])
-        sizes = np.abs(largest).max(axis=1, initial=0.0).clip(max=1.0).astype(float)
+        sizes = np.minimum(np.abs(largest).max(axis=1, initial=0.0), self.r.points.sizes(self.top)).astype(float)
         return {name: size for name, size in zip(names, sizes, strict=True) if size > 0} | self.r.context.sizes
 
     def rates(self, top):

@@ -183,7 +183,8 @@ class Model:
         default = self.once("jet sizes", lambda: self.equations.jet_sizes)
         self._store.require_unchanged()
         r, place = self.reduction, (float(t), guess, default | dict(sizes))
-        near = _derived(r.mechanism, r.program, None, place, self.parameters)
+        guess = None if r.context.scales is None else self._store.specification[2] or {}
+        near = _derived(r.mechanism, r.program, guess, place, self.parameters)
         if near.free != self.free:
             raise SpecificationError(
                 f"Near t = {t:.6g} s the program has {near.free} free initial values, elsewhere {self.free}.",

@@ -91,7 +91,7 @@ def _determined(model, state):
 
 def _at_rest(model, t, chosen):
     """The constraints as they were written, and the state nearest the chosen values that satisfies them."""
-    rows = tuple(model.reduction.original.values())
+    rows = tuple(row for row in model.reduction.original.values() if row.order <= model.reduction.top)
     equations = JetEquations(model, t, {}, rows)
     aim = Aim.of(equations.names, {name: v for name, v in chosen.items() if name in equations.names}, {})
     return rows, equations, aim, gauss_newton(equations, aim.reference, aim)

@@ -111,11 +111,11 @@ def _lowest(q, rows, numbers, context, starts=None):
     first = _combination(q, rows, b, support, numbers, context, starts)
     if first.row.order < top and not _slopes_beside(q, rows, first, context).any():
         return first
-    support, numbers = _beside_manifold(q, rows, b, context)
-    if support and all(rows[a].affine or rows[a].order < top for a in support):
-        combination = _combination(q, rows, b, support, numbers, context)
-        if combination.row.order < top:
-            return combination
+    for support, numbers in _beside_manifold(q, rows, b, context):
+        if support and all(rows[a].affine or rows[a].order < top for a in support):
+            combination = _combination(q, rows, b, support, numbers, context)
+            if combination.row.order < top:
+                return combination
     return _divided(q, rows, first, context)
 
 
@@ -209,17 +209,20 @@ def _vanishes_with(row, jet, points):
 
 
 def _beside_manifold(q, rows, b, context):
-    """The rows whose combination is row b's leading gradient where all rows but b hold, and L at such points.
+    """The rows whose combination is row b's leading gradient, and L, beside the manifold of all rows.
 
-    Coefficients may vanish on the manifold of all rows and not beside it. A load that is lifted straight up never
-    swings; only beside its motion does the combination show that it forbids swinging.
+    Coefficients may vanish on the manifold and not beside it. A load that is lifted straight up never swings; only
+    beside its motion does the combination show that it forbids swinging. First all rows but b hold, then those alone
+    that are no balances.
     """
     order = [*(a for a in range(len(rows)) if a != b and rows[a].order <= rows[b].order), b]
     rest = [row for a, row in enumerate(rows) if a != b]
-    points = sample(q, rest, max(row.order for row in rows), context)
-    numbers, _ = leading(q, rows, points)
-    support, _ = dependence(numbers[order])
-    return ([order[i] for i in support] if support and support[-1] == len(order) - 1 else []), numbers
+    wide = replace(context, spread=SPREAD)  # products of coefficients that vanish on the manifold are felt there
+    for some, place in ((rest, context), ([row for row in rest if row.kind != "dynamics"], wide)):
+        points = sample(q, some, max(row.order for row in rows), place)
+        numbers, _ = leading(q, rows, points)
+        support, _ = dependence(numbers[order], first=len(order) - 1)
+        yield [order[i] for i in support], numbers
 
 
 def _combine(q, rows, b, others, top, numbers):

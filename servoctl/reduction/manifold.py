@@ -44,6 +44,8 @@ class Points:
         Largest scaled residual at each point.
     book : Book
         Tapes of the scalars that were evaluated.
+    scales : Scales, optional
+        Usual sizes of jets, by which steps and residuals are measured; default 1 each.
     """
 
     q: object
@@ -53,6 +55,7 @@ class Points:
     values: np.ndarray
     residual: np.ndarray
     book: Book = field(default_factory=Book, repr=False, compare=False)
+    scales: object = None
     _values: dict = field(default_factory=dict, init=False, repr=False, compare=False)
 
     def __repr__(self):
@@ -62,6 +65,10 @@ class Points:
     def level(self):
         """The highest level K of the jets."""
         return (len(self.z) - self.q.nq) // self.q.n
+
+    def sizes(self, level):
+        """Usual sizes (nz,) of q and of normalised Taylor coefficients up to a level."""
+        return np.ones(self.q.nq + level * self.q.n) if self.scales is None else self.scales.jets(level)
 
     def jet(self, k):
         """q for k = 0, else γ^(k): (nq, N) or (n, N) array; zero beyond the level."""
@@ -133,9 +140,9 @@ def solve(flow, t, z, iterations=GAUSS_NEWTON_STEPS, natural=False):
     z, t = np.array(z, dtype=REAL), np.asarray(t, dtype=REAL)
     if not len(flow.equations):
         return z, np.zeros(len(t), dtype=REAL)
-    scales = np.ones((len(flow.equations), len(t)))
+    scales, sizes = np.ones((len(flow.equations), len(t))), flow.points.sizes(flow.level)[:, None]
     for level in range(flow.level + 1):
-        _solve_level(flow, t, z, level, scales)
+        _solve_level(flow, t, z, level, scales, sizes)
     residual = flow.residual(t, z)
     norm = _norms(residual, scales)
     active = np.flatnonzero(norm > ROUNDED)
@@ -144,14 +151,14 @@ def solve(flow, t, z, iterations=GAUSS_NEWTON_STEPS, natural=False):
             break
         start = z[:, active]
         residual, jacobian = flow(t[active], start)
-        scale = _scales(jacobian, start)
+        scale = _scales(jacobian, start, sizes)
         norm[active] = _norms(residual, scale)
         rough = norm[active] > ROUNDED
         active, start, residual, scale = active[rough], start[:, rough], residual[:, rough], scale[:, rough]
         if not len(active):
             break
         jacobian = jacobian[:, :, rough]
-        step = _least_steps(jacobian, residual)
+        step = _least_steps(jacobian, residual, sizes)
         search = _natural_search if natural else _search
         trial, better = search(flow, t[active], start, step, jacobian if natural else scale, residual)
         active = active[better]
@@ -161,7 +168,7 @@ def solve(flow, t, z, iterations=GAUSS_NEWTON_STEPS, natural=False):
 
 def _search(flow, t, z, step, scale, residual):
     """For each point the longest of ever shorter steps that reduces the residual, and whether one does."""
-    longest = np.max(np.abs(step) / (1.0 + np.abs(z)), axis=0)
+    longest = np.max(np.abs(step) / (flow.points.sizes(flow.level)[:, None] + np.abs(z)), axis=0)
     damping, before = 1.0 / np.maximum(1.0, longest), np.max(np.abs(residual) / scale, axis=0)
     trial, open_ = z + damping * step, np.arange(len(t))
     better = np.zeros(len(t), dtype=bool)
@@ -182,19 +189,20 @@ def _natural_search(flow, t, z, step, jacobian, _):
 
     The correction J⁺ψ of the end is taken with the Jacobian of the start (the natural monotonicity test of Deuflhard).
     """
-    longest = np.max(np.abs(step) / (1.0 + np.abs(z)), axis=0)
+    sizes = flow.points.sizes(flow.level)[:, None]
+    longest = np.max(np.abs(step) / (sizes + np.abs(z)), axis=0)
     damping, trial, open_ = 1.0 / np.maximum(1.0, longest), z.copy(), np.arange(len(t))
     for _ in range(SHORTENINGS):
         trial[:, open_] = z[:, open_] + damping[open_] * step[:, open_]
-        left = _least_steps(jacobian[:, :, open_], flow.residual(t[open_], trial[:, open_]))
-        open_ = open_[~(np.max(np.abs(left) / (1.0 + np.abs(z[:, open_])), axis=0) < longest[open_])]
+        left = _least_steps(jacobian[:, :, open_], flow.residual(t[open_], trial[:, open_]), sizes)
+        open_ = open_[~(np.max(np.abs(left) / (sizes + np.abs(z[:, open_])), axis=0) < longest[open_])]
         if not len(open_):
             break
         damping[open_] /= 4
     return trial, ~np.isin(np.arange(len(t)), open_)
 
 
-def _solve_level(flow, t, z, level, scales):
+def _solve_level(flow, t, z, level, scales, sizes):
     """Newton's method for γ^(level) with fixed lower jets; one step is exact where the rows are affine in γ^(level).
 
     Changes z, and the scales of the level's rows in place.
@@ -202,20 +210,21 @@ def _solve_level(flow, t, z, level, scales):
     rows = np.flatnonzero(flow.levels == level)
     nq, n = flow.q.nq, flow.q.n
     columns = slice(0, nq) if level == 0 else slice(nq + (level - 1) * n, nq + level * n)
+    sizes = sizes[columns]
     for _ in range((COORDINATE_STEPS if level == 0 else JET_STEPS) if len(rows) else 0):
         residual, slopes = flow.at_level(t, z, level)
         residual, slopes = residual[rows], slopes[rows]
-        step = _least_steps(slopes, residual)
-        longest = np.max(np.abs(step) / (1.0 + np.abs(z[columns])), axis=0)
+        step = _least_steps(slopes, residual, sizes)
+        longest = np.max(np.abs(step) / (sizes + np.abs(z[columns])), axis=0)
         z[columns] += step / np.maximum(1.0, longest) if level == 0 else step
-        scales[rows] = _scales(slopes, z[columns])
-        if np.all(np.abs(step) <= LEVEL_SOLVED * (1.0 + np.abs(z[columns]))):
+        scales[rows] = _scales(slopes, z[columns], sizes)
+        if np.all(np.abs(step) <= LEVEL_SOLVED * (sizes + np.abs(z[columns]))):
             break
 
 
-def _scales(jacobian, z):
+def _scales(jacobian, z, sizes):
     """Size of each residual's gradient times that of the jets, (equations, N)."""
-    scale = np.sqrt((jacobian**2 * (1.0 + np.abs(z.astype(float))) ** 2).sum(axis=1))
+    scale = np.sqrt((jacobian**2 * (sizes + np.abs(z.astype(float))) ** 2).sum(axis=1))
     return np.where(scale > 0, scale, 1.0)
 
 
@@ -224,14 +233,15 @@ def _norms(residual, scales):
     return np.where(np.isfinite(norm), norm, np.inf)
 
 
-def _least_steps(jacobian, residual):
-    """Steps of least length to zeros of the linearised residual, (nz, N); zero where these are not finite."""
-    a = np.moveaxis(jacobian, 2, 0)
+def _least_steps(jacobian, residual, sizes):
+    """Steps, least relative to `sizes`, to zeros of the linearised residual, (nz, N); zero where not finite."""
+    a = np.moveaxis(jacobian * sizes, 2, 0)
     scale = np.sqrt((a**2).sum(axis=2))
     scale[~(scale > 0)] = 1.0
     a, b = a / scale[:, :, None], (residual.T / scale).astype(float)
     steps = _normal_steps(a, b)
-    return (np.array([_least_step(*one) for one in zip(a, b, strict=True)]) if steps is None else steps).T.astype(REAL)
+    steps = np.array([_least_step(*one) for one in zip(a, b, strict=True)]) if steps is None else steps
+    return steps.T.astype(REAL) * sizes
 
 
 def _least_step(a, b):
@@ -283,7 +293,9 @@ def sample(q, rows, level, context, starts=None, flow=None):
         for i in range(POINTS):
             again, p = divmod(i, len(starts.t))
             t[i], z[:shared, i] = starts.t[p], starts.z[:shared, p] + again * SPREAD * z[:shared, i]
-    starting = Points(q, t, z.astype(REAL), context.parameters, context.values, np.zeros(len(t)), context.book)
+    starting = Points(
+        q, t, z.astype(REAL), context.parameters, context.values, np.zeros(len(t)), context.book, context.scales
+    )
     flow = flow.at(starting) if flow else Flow(q, rows, level, starting)
     points = _solved(starting, flow, slice(POINTS))
     if len(points.t) == POINTS:
@@ -302,7 +314,7 @@ def _random_starts(q, level, context):
     """Times (2 POINTS,) in the window and jets (nz, 2 POINTS) about the guess, about zero where there is none."""
     rng, nz = np.random.default_rng(POINTS_SEED), q.nq + level * q.n
     centre = np.zeros(nz)
-    usual = np.tile(context.lengths, level + 1) if context.lengths else np.ones(nz)
+    usual = np.ones(nz) if context.scales is None else context.scales.jets(level)
     spread = usual.copy()
     for name, value in context.guess.items():
         for k in range(level + 1):
@@ -336,9 +348,9 @@ class Context:
     spread : float
         Relative width of the starts about guessed values.
     sizes : dict of str to float
-        Usual sizes of jets, by which a guess near zero is spread; default `lengths`.
-    lengths : tuple of float
-        Usual sizes of the coordinates, about which jets without a guess are spread; default 1 each.
+        Usual sizes of jets, by which a guess near zero is spread; default `scales`.
+    scales : Scales, optional
+        Usual sizes of jets, by which jets without a guess are spread; default 1 each.
     book : Book
         Tapes of the scalars that were evaluated.
     """
@@ -349,5 +361,5 @@ class Context:
     guess: dict
     spread: float = SPREAD
     sizes: dict = field(default_factory=dict)
-    lengths: tuple = ()
+    scales: object = None
     book: Book = field(default_factory=Book, repr=False, compare=False)

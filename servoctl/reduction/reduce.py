@@ -1,22 +1,23 @@
 """From a mechanism and a program to the rows that determine the motion and its actuation."""
 
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 
 import casadi as ca
 import numpy as np
 
 from servoctl.checks import finite, mapping
-from servoctl.errors import NotRealisable, SpecificationError, unknown
+from servoctl.errors import NotRealisable, ServoError, SpecificationError, unknown
 from servoctl.jets.series import Flow
 from servoctl.reduction.appell import Realisation, require_inertia
 from servoctl.reduction.hidden import complete
 from servoctl.reduction.knots import Knots, Switches, require_smooth
-from servoctl.reduction.manifold import SPREAD, Context, Points, sample
+from servoctl.reduction.manifold import Context, Points, sample
 from servoctl.reduction.orders import Orders
 from servoctl.reduction.ranks import Rank, clean, decide, decide_all
 from servoctl.reduction.realisation import realisation, wished
 from servoctl.reduction.rows import Balance, as_rows, balances, merge_uses, settle_alone
+from servoctl.reduction.scales import ORDINARY, usual
 from servoctl.spec.mechanism import Mechanism, require_known
 from servoctl.spec.program import Program
 from servoctl.tolerances import TINY
@@ -26,7 +27,6 @@ NEAR_SPREAD = 1e-3  # relative width of the points about a state for which pivot
 WINDOW = (0.1, 1.1)  # s, where points are drawn if nothing switches; t = 0 is too often a special instant
 LONE_WINDOW = 1.0  # s on either side of a single switch
 INSET = 0.07  # fraction of the time from first to last switch left out at both ends, where paths are nearly at rest
-ORDINARY = 100.0  # factor from 1 within which the size of a guess leaves points spread by 1
 WEAKER = 1e-6  # relative to its size before: a pivot below this with other parameters is chosen again
 HELD = 1e-9  # residual, relative to the size of its terms, at points where a reduction still holds
 
@@ -168,9 +168,11 @@ def reduce(mechanism, program, guess=None, near=None, values=None):
     mechanism : Mechanism
     program : Program
     guess : dict of str to float, optional
-        Values of coordinates or derivatives about which points of the manifold are searched.
+        Values of coordinates or derivatives about which points of the manifold are searched. Where they are not
+        ordinary numbers, or points of ordinary size lead to no reduction, points have the usual sizes of jets.
     near : (t, jets, sizes), optional
-        An instant at which pivots are chosen, with dicts of jets and of their sizes along the motion.
+        An instant at which pivots are chosen, with dicts of jets and of their sizes along the motion; points have the
+        usual sizes of jets if there is a guess.
     values : (n_p,) array, optional
         Parameters at which ranks are decided; default: those of the mechanism.
 
@@ -189,15 +191,35 @@ def reduce(mechanism, program, guess=None, near=None, values=None):
     balance = mechanism.balance - mechanism.E @ wished(mechanism, program)
     forces = dict(zip(map(Balance, names), balance.elements(), strict=True))
     switches = Switches(q, {**program.residuals, **mechanism.constraints, **forces}, mechanism.parameters.symbols)
-    context = _context(mechanism, switches, guess, near, values)
+    values = mechanism.parameters.values() if values is None else np.asarray(values, dtype=float)
+    times = switches.times(values)
+    if guess is None if near else all(map(_ordinary, filter(None, (guess or {}).values()))):
+        try:
+            return _reduced(mechanism, program, switches, balance, _context(mechanism, times, guess, near, values))
+        except ServoError:
+            scales = None if near else usual(mechanism, program, guess or {}, values, partial(_window, times))
+            if scales is None or scales.ordinary:
+                raise
+    else:
+        scales = usual(mechanism, program, guess, values, partial(_window, times))
+    return _reduced(mechanism, program, switches, balance, _context(mechanism, times, guess, near, values, scales))
+
+
+def _reduced(mechanism, program, switches, balance, context):
+    """The reduction by points of a context."""
+    q = mechanism.q
     original = [
         *as_rows(q, program.residuals, "program", context),
         *as_rows(q, mechanism.constraints, "material", context),
     ]
     constraints, points, of_constraints = _constraints(mechanism, program, original, context)
     realised, points, of_sharing = realisation(mechanism, program, constraints, points, context)
-    dynamics, of_split = realised.dynamics(balance)
-    dynamics = [row for row, _ in settle_alone(q, balances(q, dynamics), context)]
+    for split in realised.splits():
+        dynamics, of_split = split.dynamics(balance)
+        dynamics = [row for row, _ in settle_alone(q, balances(q, dynamics), context)]
+        if not any(_contradicts(row, points) for row in dynamics):
+            realised = split
+            break
     _require_motion(dynamics, program)
     rows, rank, points, of_rows = complete(q, [*(realised.settled or constraints), *dynamics], context, points)
     knots = require_smooth(switches, context.values, smoothness(switches, rows))
@@ -296,6 +318,14 @@ def _constraints(mechanism, program, original, context):
     return constraints, points, pivots
 
 
+def _contradicts(row, points):
+    """Whether a row depends on t alone and is not zero.
+
+    It may have been divided by a jet that is zero in every motion, which is a factor of it with another split.
+    """
+    return row.order < 0 and bool(np.any(clean(*points.evaluate([row.expression]))))
+
+
 def _require_motion(dynamics, program):
     """Refuse a program on whose virtual displacements a row of (3.18) vanishes."""
     for row in dynamics:
@@ -323,21 +353,23 @@ def require_outputs(reduction):
             )
 
 
-def _context(mechanism, switches, guess, near, values):
-    values = mechanism.parameters.values() if values is None else np.asarray(values, dtype=float)
-    if near is not None:
-        t, guess, sizes = near
-        width = NEARBY * min(1.0, _time_scale(mechanism.q, guess))
-        return Context(mechanism.parameters.symbols, values, (t - width, t + width), guess, NEAR_SPREAD, sizes)
-    times = switches.times(values)
-    window = WINDOW
+def _context(mechanism, times, guess, near, values, scales=None):
+    symbols, unit = mechanism.parameters.symbols, 1.0 if scales is None else scales.time
+    if near is None:
+        return Context(symbols, values, _window(times, unit), guess or {}, scales=scales)
+    t, guess, sizes = near
+    width = NEARBY * min(unit, _time_scale(mechanism.q, guess, scales))
+    return Context(symbols, values, (t - width, t + width), guess, NEAR_SPREAD, sizes, scales)
+
+
+def _window(times, scale=1.0):
+    """The window (t0, t1) [s] in which points are drawn, from the instants of switches and a time scale [s]."""
+    if not times:
+        return WINDOW[0] * scale, WINDOW[1] * scale
     if len(times) == 1:
-        window = (times[0] - LONE_WINDOW, times[0] + LONE_WINDOW)
-    elif times:
-        width = times[-1] - times[0]
-        window = (times[0] + INSET * width, times[-1] - INSET * width)
-    lengths = _lengths(mechanism, guess or {}, values)
-    return Context(mechanism.parameters.symbols, values, window, guess or {}, lengths=lengths)
+        return times[0] - LONE_WINDOW * scale, times[0] + LONE_WINDOW * scale
+    width = times[-1] - times[0]
+    return times[0] + INSET * width, times[-1] - INSET * width
 
 
 def _ordinary(size):
@@ -345,24 +377,12 @@ def _ordinary(size):
     return 1 / ORDINARY < abs(size) < ORDINARY
 
 
-def _lengths(mechanism, guess, values):
-    """Usual sizes of the coordinates where guesses are far from 1: of equal √M_ii |q_i|; else nothing."""
-    q = mechanism.q
-    known = np.array([abs(guess.get(name, 0.0)) for name in q.names])
-    if not q.plain or all(map(_ordinary, known[known > 0])):
-        return ()
-    symbols = [q.t, q.jet(0), *mechanism.parameters.symbols]
-    inertia = ca.Function("inertia", symbols, [ca.densify(ca.diag(mechanism.mass))], {"allow_free": True})
-    if inertia.has_free():
-        return ()
-    metric = np.sqrt(np.maximum(np.ravel(inertia(0.0, [guess.get(name, 0.0) for name in q.names], *values)), 0.0))
-    metric = np.where(np.isfinite(metric), metric, 0.0)
-    size = float((metric * known).max())
-    size *= SPREAD
-    return tuple(float(size / m) if m > 0 and size > 0 else max(k, 1.0) for m, k in zip(metric, known, strict=True))
-
-
-def _time_scale(q, jets):
-    """The time [s] in which a state changes by 1 + |q|: near a singularity a motion is quick."""
-    place, rate, second = (max((abs(jets.get(name, 0.0)) for name in q.jet_names(k)), default=0.0) for k in range(3))
-    return 1.0 / max(rate / (1.0 + place), np.sqrt(second / (1.0 + place)), TINY)
+def _time_scale(q, jets, scales):
+    """The time [s] in which a state changes by its size: near a singularity a motion is quick."""
+    size = np.ones(q.nq + 2 * q.n) if scales is None else scales.jets(2)
+    place, rate, second = (
+        max((abs(jets.get(name, 0.0)) / size[i] for i, name in zip(places, q.jet_names(k), strict=True)), default=0.0)
+        for k, places in enumerate(np.split(np.arange(len(size)), [q.nq, q.nq + q.n]))
+    )
+    unit = 1.0 if scales is None else scales.time
+    return unit / max(rate / (1.0 + place), np.sqrt(second / (1.0 + place)), TINY)

@@ -15,7 +15,7 @@ from servoctl.reduction.ranks import clean, combination, decide, eliminate, equi
 from servoctl.tolerances import DEPENDENT, ENTRY
 
 TAKES_PART = 1e-12  # coefficient times the largest entry of a row: below this the row is no part of a combination
-SUPPORTS = 1e-9  # equilibrated coefficient, at any point, above which a row is part of a dependence
+SUPPORTS = 1e-13  # equilibrated coefficient, at any point, above which a row is part of a dependence
 BASIS_CUTOFF = 1e-12  # relative singular value of independent rows below which a direction is left out
 VANISHED = 1e-5  # gradient on a row's solutions, relative to random points, below which the row is a square
 SQUARE_STEPS = 40  # Newton steps towards these solutions; for a square each only halves the distance
@@ -426,13 +426,15 @@ def _eliminated(q, row, j, values, lower, points):
     return replace(row, expression=ca.cse(expression), uses=uses, parts=tuple(parts))
 
 
-def dependence(numbers):
+def dependence(numbers, first=0):
     """The first row whose leading gradient is a combination of those before it, and that combination.
 
     Parameters
     ----------
     numbers : (rows, n, N) array
         The leading matrix at points of the same rank.
+    first : int, optional
+        Dependent rows before it are left out.
 
     Returns
     -------
@@ -451,6 +453,8 @@ def dependence(numbers):
             left.append(rest)
         if max(left) > DEPENDENT:
             basis.append(b)
+            continue
+        if b < first:
             continue
         size = np.array(coefficients)
         support = [a for i, a in enumerate(basis) if size[:, i].max(initial=0.0) > SUPPORTS]

@@ -33,6 +33,7 @@ MENDED = {  # seeds of cases that once ended wrongly, and how they end
     "coefficients grow quickly": ("right", (20153, 700083, 310194)),
     "factors of a balance in either order": ("right", (20148, 20360)),
     "an actuator without a lever at the start": ("refused rightly", (1529,)),
+    "a residual of higher order than the motion's jets": ("refused rightly", (1000230,)),
     "a pole of the actuation": ("refused rightly", (320344,)),
 }
 
