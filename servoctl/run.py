@@ -1,8 +1,10 @@
 """A run: what a simulation computed, by name."""
 
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
+from functools import cached_property
+from types import MappingProxyType
 
 import numpy as np
 
@@ -63,9 +65,8 @@ class Run(ByName, Value):
         Whether the run finished, and if not, why.
     variants : tuple of (first, last + 1, model)
         The variant of the model, with its choice of pivots, for each range of samples; empty if there is only one.
-    internal : dict
-        The verdict on the internal dynamics along the run (`InternalDynamics.facts`); empty for flat programs and
-        for plants under inputs.
+    verdict : mapping or callable
+        What `internal` gives, or the function of this run that computes it at the first access.
     start : State or None
         From which the motion was computed. It also says which branch of its solutions a flat program follows:
         `simulate(model, run.start, ...)` repeats it.
@@ -85,7 +86,7 @@ class Run(ByName, Value):
     variants: tuple = ()
     stored: dict = field(default_factory=dict, compare=False)
     stored_residual: dict = field(default_factory=dict, compare=False)
-    internal: dict = field(default_factory=dict)
+    verdict: Mapping | Callable = field(default_factory=dict, compare=False, repr=False)
     start: State | None = None
 
     def __eq__(self, other):
@@ -96,6 +97,18 @@ class Run(ByName, Value):
         return self.model is not None or same(*signals)
 
     __hash__ = Value.__hash__
+
+    @property
+    def internal(self) -> Mapping[str, object]:
+        """The verdict on the internal dynamics along the run (`InternalDynamics.facts`), computed at the first access.
+
+        Empty for flat programs, for plants under inputs, and for bounded motions, which are not integrated forward.
+        """
+        return MappingProxyType(self._internal)
+
+    @cached_property
+    def _internal(self):
+        return dict(self.verdict(self) if callable(self.verdict) else self.verdict)
 
     @property
     def _groups(self):
@@ -311,7 +324,8 @@ class Run(ByName, Value):
             If the file cannot be written.
         """
         signals = [name for name in self.names if name not in self.jet_names]
-        facts = {name: getattr(self, name) for name in FACTS} | {"signals": signals, "residuals": list(self.residual)}
+        facts = {name: kind(getattr(self, name)) for name, kind in FACTS.items()}
+        facts |= {"signals": signals, "residuals": list(self.residual)}
         facts |= {"start": _facts_of_start(self.start)} | ({} if self.model is None else _facts_of_model(self))
         arrays = {"t": self.t, "jets": self.jets} | {f"signal_{i}": self[name] for i, name in enumerate(signals)}
         arrays |= {f"residual_{i}": self.residual[name] for i, name in enumerate(self.residual)}
@@ -445,6 +459,7 @@ def _from_archive(facts, arrays):
         values, lists = start["values"], {name: tuple(start[name]) for name in ("held", "free")}
         start = State(start["t"], np.array([*values.values()]), tuple(values), residual=start["residual"], **lists)
     own = {name: tuple(facts[name]) if kind is list else facts[name] for name, kind in FACTS.items()}
+    own["verdict"] = own.pop("internal")
     return Run(t, jets, stored=signals, stored_residual=residuals, start=start, **own), facts
 
 
