@@ -7,6 +7,7 @@ import numpy as np
 
 from servoctl.checks import column, mapping, require_kind
 from servoctl.errors import SpecificationError
+from servoctl.jets.branches import without_turns
 from servoctl.spec.coordinates import Coordinates
 
 REALISATIONS = ("ideal", "actuators")
@@ -18,7 +19,7 @@ class Program:
     Parameters
     ----------
     residuals : dict of str to SX scalar
-        φ_i(t, q, γ', ..., γ^(s_i)), which the motion keeps at zero.
+        φ_i(t, q, γ', ..., γ^(s_i)), which the motion keeps at zero; one with angles atan2(y, x) up to whole turns.
     by : {"ideal", "actuators"}
         "ideal": an ideal reaction, which does no work on the virtual displacements that the program's leading
         matrix allows (eq. (3.18) as printed; for residuals nonlinear in velocities or of order >= 2 this
@@ -143,7 +144,7 @@ def _residual(name, value):
             do="Write the expression that the motion keeps at zero.",
             name=name,
         )
-    return items[0]
+    return without_turns(items[0])
 
 
 def _weight(name, value):
