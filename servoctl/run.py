@@ -13,7 +13,7 @@ from servoctl.checks import finite, whole
 from servoctl.errors import SpecificationError, unknown
 from servoctl.model.start import State
 from servoctl.model.switching import switching
-from servoctl.values import Value, same
+from servoctl.values import Value, read_only, same
 
 STENCIL = 9  # samples of the polynomial through which an extremum is refined: error of order h^9
 AS_SAMPLED = 1e-14  # relative: a refined extremum must exceed the sampled one by this
@@ -88,6 +88,15 @@ class Run(ByName, Value):
     stored_residual: dict = field(default_factory=dict, compare=False)
     verdict: Mapping | Callable = field(default_factory=dict, compare=False, repr=False)
     start: State | None = None
+
+    def __post_init__(self):
+        for name in ("t", "jets"):
+            if isinstance(getattr(self, name), np.ndarray):
+                object.__setattr__(self, name, read_only(getattr(self, name)))
+
+    def __setstate__(self, state):
+        vars(self).update(state)
+        self.__post_init__()
 
     def __eq__(self, other):
         if not super().__eq__(other):

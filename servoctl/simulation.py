@@ -31,6 +31,7 @@ from servoctl.methods.choice import (
     default_method,
     require_combination,
 )
+from servoctl.methods.motion import DEFAULT_SAMPLES
 from servoctl.methods.orders import end_at_other_orders
 from servoctl.methods.radau import RadauSteps
 from servoctl.methods.runge_kutta import ORDERS, RungeKuttaSteps
@@ -46,7 +47,6 @@ from servoctl.plants.plant import Plant
 from servoctl.progress import Progress
 from servoctl.run import SAME_TIME, Run
 
-DEFAULT_SAMPLES = 1001  # without t_eval: smooth curves, and extrema refined to rounding
 STEPS_IN_SPAN = 2000  # steps of fixed length in a span if the method has no step
 MOST_STEPS = 10**8  # of fixed length: more would fill the memory with samples
 DRIFTED = 1e-2  # the same at the end of a motion that deserves a warning

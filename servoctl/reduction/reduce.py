@@ -17,6 +17,7 @@ from servoctl.reduction.orders import Orders
 from servoctl.reduction.ranks import Rank, clean, decide, decide_all
 from servoctl.reduction.rows import Balance, Row, as_rows, merge_uses, settle_alone
 from servoctl.spec.mechanism import Mechanism, require_known
+from servoctl.spec.packing import Packed
 from servoctl.spec.program import Program
 from servoctl.tolerances import TINY
 
@@ -31,7 +32,7 @@ HELD = 1e-9  # residual, relative to the size of its terms, at points where a re
 
 
 @dataclass(frozen=True)
-class Reduction:
+class Reduction(Packed):
     """The rows ψ_a = 0 of a motion, with its hidden constraints, and who realises the program.
 
     Attributes

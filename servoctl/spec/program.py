@@ -9,11 +9,12 @@ from servoctl.checks import column, mapping, require_kind
 from servoctl.errors import SpecificationError
 from servoctl.jets.branches import without_turns
 from servoctl.spec.coordinates import Coordinates
+from servoctl.spec.packing import Packed
 
 REALISATIONS = ("ideal", "actuators")
 
 
-class Program:
+class Program(Packed):
     """Program constraints: named residuals of any, mixed order, and who realises them.
 
     Parameters
