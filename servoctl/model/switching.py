@@ -177,12 +177,12 @@ def _switching(model):
 
 def _residuals(mechanism, program):
     weights = [w for w in program.weights.values() if isinstance(w, ca.SX)]
-    return [*program.residuals.values(), *mechanism.constraints.values(), *weights, *mechanism.E.elements()]
+    return [*program.with_turns.values(), *mechanism.constraints.values(), *weights, *mechanism.E.elements()]
 
 
 def _smooth(mechanism, program, branches):
     """The mechanism and the program with branches as further parameters."""
-    residuals = dict(zip(program.residuals, branches.smooth(list(program.residuals.values()), True), strict=True))
+    residuals = dict(zip(program.with_turns, branches.smooth(list(program.with_turns.values()), True), strict=True))
     constraints = dict(
         zip(mechanism.constraints, branches.smooth(list(mechanism.constraints.values()), True), strict=True)
     )

@@ -29,6 +29,11 @@ class Program(Packed):
         Weights W of the actuators, for programs with fewer residuals than actuators: the actuation has least
         uᵀWu. Default 1 each, in units of the actuators.
 
+    Attributes
+    ----------
+    with_turns : dict of str to SX scalar
+        The residuals as they were written: their angles jump by 2π.
+
     Raises
     ------
     SpecificationError
@@ -58,7 +63,8 @@ class Program(Packed):
                 do="Remove the weights, or write by='actuators'.",
                 by=by,
             )
-        self.residuals = {name: _residual(name, value) for name, value in residuals.items()}
+        self.with_turns = {name: _residual(name, value) for name, value in residuals.items()}
+        self.residuals = {name: without_turns(value) for name, value in self.with_turns.items()}
         self.by = by
         self.weights = {name: _weight(name, value) for name, value in mapping(weights, "The weights").items()}
 
@@ -108,10 +114,10 @@ class Program(Packed):
             )
         symbols, values = [q.t], [instant + (q.t - instant) / sigma]
         weights = {name: ca.SX(value) for name, value in self.weights.items()}
-        for k in range(1, max(map(q.order, (*self.residuals.values(), *weights.values()))) + 1):
+        for k in range(1, max(map(q.order, (*self.with_turns.values(), *weights.values()))) + 1):
             symbols += q.gamma(k)
             values += [sigma**k * s for s in q.gamma(k)]
-        slower = iter(ca.substitute([*self.residuals.values(), *weights.values()], symbols, values))
+        slower = iter(ca.substitute([*self.with_turns.values(), *weights.values()], symbols, values))
         residuals = {name: next(slower) for name in self.residuals}
         return Program(residuals, self.by, {name: next(slower) for name in weights} or None)
 
@@ -122,7 +128,7 @@ class Program(Packed):
 def no_program():
     """The program without residuals: forces alone determine the motion."""
     program = object.__new__(Program)
-    program.residuals, program.by, program.weights = {}, "actuators", {}
+    program.with_turns, program.residuals, program.by, program.weights = {}, {}, "actuators", {}
     return program
 
 
@@ -145,7 +151,7 @@ def _residual(name, value):
             do="Write the expression that the motion keeps at zero.",
             name=name,
         )
-    return without_turns(items[0])
+    return items[0]
 
 
 def _weight(name, value):
