@@ -277,6 +277,28 @@ def test_a_ball_on_a_turning_table_is_neutral(length):
     assert found.verdict == "neutral" and found.growth < 3
 
 
+@pytest.mark.parametrize("tilt", [(0.0, 0.0, 0.0), (0.3, 0.2, 0.1), (-0.6, 0.1, 0.7)], ids=str)
+@pytest.mark.parametrize("samples", [5, 1001])
+def test_a_tilted_ball_in_its_own_axes_is_neutral(tilt, samples):
+    """With body-fixed angular velocities: its centre moves in a circle at constant speed, at 2/7 of the table's rate."""
+    table, names = 0.7, sv.coordinates("X Y e0 e1 e2 e3")
+    X, Y, e0, e1, e2, e3 = names
+    spin = ca.vertcat(ca.horzcat(-e1, -e2, -e3), ca.horzcat(e0, -e3, e2), ca.horzcat(e3, e0, -e1), ca.horzcat(-e2, e1, e0))
+    unit = e0**2 + e1**2 + e2**2 + e3**2 - 1
+    q = names.with_quasi_velocities("vx vy w1 w2 w3", ca.diagcat(ca.SX.eye(2), spin / 2), invariants={"unit": unit})
+    vx, vy, *w = q.w()
+    Wx = ca.dot(ca.vertcat(1 - 2 * (e2**2 + e3**2), 2 * (e1 * e2 - e0 * e3), 2 * (e1 * e3 + e0 * e2)), ca.vertcat(*w))
+    Wy = ca.dot(ca.vertcat(2 * (e1 * e2 + e0 * e3), 1 - 2 * (e1**2 + e3**2), 2 * (e2 * e3 - e0 * e1)), ca.vertcat(*w))
+    gibbs = sum(weight * a**2 / 2 for weight, a in zip((1, 1, 0.4, 0.4, 0.4), q.gamma(2), strict=True))
+    rolling = {"roll x": vx - Wy + table * Y, "roll y": vy + Wx - table * X}
+    model = sv.derive(sv.Mechanism(q, gibbs=gibbs), sv.Program(rolling, by="ideal"))
+    values = dict(zip(("e1", "e2", "e3"), tilt, strict=True))
+    start = model.start(X=1.0, Y=0.0, vx=0.0, vy=0.3, w3=0.0, guess={"e0": 1.0}, **values)
+    run = sv.simulate(model, start, (0.0, 30.0), t_eval=np.linspace(0.0, 30.0, samples))
+    assert run["vx"] + 1j * run["vy"] == pytest.approx(0.3j * np.exp(2j / 7 * table * run.t), abs=1e-7)
+    assert run.internal["verdict"] == sv.internal_dynamics(model, run).verdict == "neutral"
+
+
 @pytest.mark.parametrize("length", [5.0, 10.0, 60.0])
 def test_a_spinning_satellite_is_neutral(length):
     example = runpy.run_path(str(Path(__file__).parents[1] / "examples" / "quaternion.py"), run_name="example")

@@ -540,13 +540,14 @@ class _Checks:
         scale = max(kinetic, np.ptp(energy), *np.abs(np.cumsum(self.between.work))) + rounding.max() / LIMITS["energy"]
         work = self._work(np.diff(energy), AGREES * LIMITS["energy"] * scale)
         if not np.isfinite(work).all():
-            peak = f"t = {self.run.t[int(np.argmin(np.isfinite(work)))]:.6g} s"
-            self.doubts.append(f"power peaks after {peak} are too narrow to integrate: simulate with more samples (t_eval)")
+            first = self.run.t[int(np.argmin(np.isfinite(work)))]
+            what = f"peaks of power after t = {first:.6g} s are too narrow to integrate"
+            self.doubts.append(f"{what}: simulate with more samples (t_eval)")
             return {}
         return {"energy": largest((energy - energy[0] - np.append(0.0, np.cumsum(work))) / scale)}
 
     def _work(self, gained, allowed):
-        """Work between samples (N - 1,), once more with shorter steps where it is not the energy gained; NaN if unknown.
+        """Work between samples (N - 1,), by shorter steps where it is not the energy gained; NaN where it is not known.
 
         `allowed` is an error of the sum.
         """
