@@ -54,6 +54,8 @@ class End:
         All branches beyond.
     error : ServoError or None
         Why it stops.
+    event : str
+        The terminal event that ends the motion there.
     """
 
     steps: int
@@ -62,6 +64,7 @@ class End:
     switched: tuple = ()
     branches: tuple = ()
     error: object = None
+    event: str = ""
 
 
 class Tolerance:
