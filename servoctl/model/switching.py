@@ -177,7 +177,7 @@ def _switching(model):
 
 
 def _angles(model):
-    """The residuals of a program by name: where a motion is integrated, with angles that are followed round and round."""
+    """The residuals of a program by name: angles jump by 2π where a motion is integrated, which follows their turns."""
     program = model.reduction.program
     return program.residuals if model.flat else program.with_turns
 
