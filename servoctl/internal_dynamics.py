@@ -37,6 +37,7 @@ DENSE = 3  # samples for each instant, with which instants are samples
 DEFECT = 1e-3  # of the sizes of the states: largest error, over an interval of samples, of states between them
 BLOCKS = 32  # instants between which growth is measured, as all pairs of them
 SWEEPS, BALANCED = 30, 0.01  # of balancing, at most; until sums of rows and of columns agree to one percent
+BOUNDED_AT, BOUNDED_IN = 16, 4  # intervals between the instants of a bound of the growth; sweeps of its balancing
 SHARED = 0.5  # of the largest part that is independent of states chosen before: with it a state is fit as the next one
 MATTERS = 1e-3  # of the states' scales: an error as large as this matters
 STEP_ERROR = 1e-9  # of the steps of a motion, unless its method has another
@@ -221,6 +222,60 @@ def internal_dynamics(model: Model, run: Run, period: float | None = None) -> In
     return judged if period is None else _with_multipliers(model, run, positive("period", period), judged)
 
 
+@np.errstate(all="ignore")
+def growth_bound(model, run):
+    """A bound of the growth of errors along a run, by the logarithmic norm of its linearisation.
+
+    Parameters
+    ----------
+    model : Model
+    run : Run
+        A motion of it, with internal dynamics.
+
+    Returns
+    -------
+    float
+        exp max ∫ μ dt over all parts of the run, μ = λ_max(A + Aᵀ)/2 with A = Nᵀ J N in scaled states (Söderlind 2006,
+        eq. (2.5)), times the difference of the integral by every other instant; inf where A is not finite.
+
+    Notes
+    -----
+    The scale of the states is one for the whole run, the one that balances the mean of (J N Nᵀ)². There are few
+    instants, at equal parts of the run's time and of the way of its state, so that it takes a part of the time of a
+    motion. A large bound says nothing: where A turns, an error may stay small though μ is large.
+    """
+    x = _states(model, run)
+    if len(run.t) <= BOUNDED_AT // 2 or not np.isfinite(x).all():
+        return np.inf
+    samples = _spread(run.t, x / _sizes(model, run)[:, None])
+    tangents = _tangents(model, run, samples, run.t[samples], x[:, samples])
+    t, N, JN = np.abs(tangents.t - run.t[0]), tangents.N, tangents.JN
+    if len(t) < len(samples):
+        return np.inf
+    slopes = JN @ N.swapaxes(1, 2)
+    scale = _balance((slopes**2).mean(axis=0) + np.eye(len(x)) / t[-1] ** 2, BOUNDED_IN)[:, None]
+    Q, R = np.linalg.qr(N / scale)
+    A = np.sign(run.t[-1] - run.t[0]) * Q.swapaxes(1, 2) @ (JN / scale) @ np.linalg.inv(R)
+    mu = np.linalg.eigvalsh((A + A.swapaxes(1, 2)) / 2)[:, -1]
+    fine, coarse = (_largest_integral(t[::stride], mu[::stride]) for stride in (1, 2))
+    return float(np.exp(fine + abs(fine - coarse)))
+
+
+def _spread(t, x):
+    """BOUNDED_AT + 1 samples at equal parts of the time and of the way of the states x (n_x, N), first and last too."""
+    way, time = np.abs(np.diff(x)).sum(axis=0), np.abs(np.diff(t))
+    part = np.cumsum(time / time.sum() + way / max(way.sum(), TINY))
+    samples = np.searchsorted(part, np.linspace(0.0, part[-1], BOUNDED_AT + 1))
+    samples[-1] = len(part)
+    return samples
+
+
+def _largest_integral(t, mu):
+    """The largest integral of mu from one instant to a later one, by the trapezoidal rule; 0 at least."""
+    along = np.append(0.0, np.cumsum(np.diff(t) * (mu[1:] + mu[:-1]) / 2))
+    return (along - np.minimum.accumulate(along)).max()
+
+
 @dataclass(frozen=True)
 class Tangents:
     """Names of the states (n_x,), instants (K,), and sizes of the states along a motion (n_x,).
@@ -328,18 +383,20 @@ def _tangents(model, run, samples, t, x):
 @np.errstate(all="ignore")
 def _bases(model, t, x, size):
     """N, the kernel of the invariants' Jacobian, and J N: (K, n_x, f) each, in scaled states; NaN where not finite."""
-    p, n_x, m, f = model.parameters, len(size), len(model.invariant_names()), _dimension(model)
-    C = _grid(model.function("invariants").interpreted, t, x, p)[m:].T.reshape(len(t), n_x, m).swapaxes(1, 2) * size
-    rows = np.linalg.norm(C, axis=2, keepdims=True)
+    n_x, m = len(size), len(model.invariant_names())
+    J = _slopes(model, "ode_jacobian", t, x, n_x) * size / size[:, None]
+    C = _slopes(model, "invariants", t, x, m) * size
+    rows = np.sqrt((C**2).sum(axis=2, keepdims=True))
     C = C / np.where(rows > 0, rows, 1.0)
     lost = ~np.isfinite(C).all(axis=(1, 2))[:, None, None]
     N = np.linalg.qr(np.where(lost, 0.0, C).swapaxes(1, 2), mode="complete")[0][:, :, m:]
-    columns = np.repeat(np.arange(len(t)), f)
-    directions = (size[:, None] * N).swapaxes(1, 2).reshape(-1, n_x).T
-    p = np.concatenate([np.broadcast_to(p[:, None], (len(p), len(columns))), directions])
-    rates = _grid(model.function("ode").tangent, t[columns], x[:, columns], p)
-    JN = (rates / size[:, None]).T.reshape(len(t), f, n_x).swapaxes(1, 2)
-    return N, np.where(lost, np.nan, JN)
+    return N, np.where(lost, np.nan, J @ N)
+
+
+def _slopes(model, name, t, x, rows):
+    """The Jacobian of `rows` values by the state at N points, (N, rows, n_x): the last outputs of a function."""
+    values = _grid(model.function(name).interpreted, t, x, model.parameters)[-rows * len(x) :]
+    return values.T.reshape(len(t), len(x), rows).swapaxes(1, 2)
 
 
 def _grid(interpreter, t, x, p):
@@ -560,10 +617,10 @@ def _unstable(tangents, steps, ends, logs, scale):
     return _unstable(block, steps[first:end], *_growth(block, _propagators(steps[first:end]), scale))
 
 
-def _balance(W):
+def _balance(W, sweeps=SWEEPS):
     """d (n,) that makes Σ W_ij d_j²/d_i² smallest: sums of rows and of columns are then the same (Osborne 1960)."""
     square = np.ones(len(W))
-    for _ in range(SWEEPS):
+    for _ in range(sweeps):
         rows, columns = W @ square / square, square * ((1 / square) @ W)
         ratios = np.where((rows > TINY) & (columns > TINY), rows / np.maximum(columns, TINY), 1.0)
         if np.abs(np.log(ratios)).max() < BALANCED:

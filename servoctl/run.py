@@ -1,8 +1,10 @@
 """A run: what a simulation computed, by name."""
 
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
+from functools import cached_property
+from types import MappingProxyType
 
 import numpy as np
 
@@ -11,7 +13,7 @@ from servoctl.checks import finite, whole
 from servoctl.errors import SpecificationError, unknown
 from servoctl.model.start import State
 from servoctl.model.switching import switching
-from servoctl.values import Value, same
+from servoctl.values import Value, read_only, same
 
 STENCIL = 9  # samples of the polynomial through which an extremum is refined: error of order h^9
 AS_SAMPLED = 1e-14  # relative: a refined extremum must exceed the sampled one by this
@@ -63,9 +65,8 @@ class Run(ByName, Value):
         Whether the run finished, and if not, why.
     variants : tuple of (first, last + 1, model)
         The variant of the model, with its choice of pivots, for each range of samples; empty if there is only one.
-    internal : dict
-        The verdict on the internal dynamics along the run (`InternalDynamics.facts`); empty for flat programs and
-        for plants under inputs.
+    verdict : mapping or callable
+        What `internal` gives, or the function of this run that computes it at the first access.
     events : dict of str to Run
         The motion at the instants of each event: `run.events["slack"].t` are its times [s],
         `run.events["slack"]["theta"]` the values of a signal there.
@@ -88,9 +89,18 @@ class Run(ByName, Value):
     variants: tuple = ()
     stored: dict = field(default_factory=dict, compare=False)
     stored_residual: dict = field(default_factory=dict, compare=False)
-    internal: dict = field(default_factory=dict)
+    verdict: Mapping | Callable = field(default_factory=dict, compare=False, repr=False)
     start: State | None = None
     events: dict = field(default_factory=dict)
+
+    def __post_init__(self):
+        for name in ("t", "jets"):
+            if isinstance(getattr(self, name), np.ndarray):
+                object.__setattr__(self, name, read_only(getattr(self, name)))
+
+    def __setstate__(self, state):
+        vars(self).update(state)
+        self.__post_init__()
 
     def __eq__(self, other):
         if not super().__eq__(other):
@@ -100,6 +110,18 @@ class Run(ByName, Value):
         return self.model is not None or same(*signals)
 
     __hash__ = Value.__hash__
+
+    @property
+    def internal(self) -> Mapping[str, object]:
+        """The verdict on the internal dynamics along the run (`InternalDynamics.facts`), computed at the first access.
+
+        Empty for flat programs, for plants under inputs, and for bounded motions, which are not integrated forward.
+        """
+        return MappingProxyType(self._internal)
+
+    @cached_property
+    def _internal(self):
+        return dict(self.verdict(self) if callable(self.verdict) else self.verdict)
 
     @property
     def _groups(self):
@@ -323,7 +345,8 @@ class Run(ByName, Value):
             If the file cannot be written.
         """
         signals = [name for name in self.names if name not in self.jet_names]
-        facts = {name: getattr(self, name) for name in FACTS} | {"signals": signals, "residuals": list(self.residual)}
+        facts = {name: kind(getattr(self, name)) for name, kind in FACTS.items()}
+        facts |= {"signals": signals, "residuals": list(self.residual)}
         facts |= {"start": _facts_of_start(self.start)} | ({} if self.model is None else _facts_of_model(self))
         arrays = {"t": self.t, "jets": self.jets} | {f"signal_{i}": self[name] for i, name in enumerate(signals)}
         arrays |= {f"residual_{i}": self.residual[name] for i, name in enumerate(self.residual)}
@@ -468,6 +491,7 @@ def _from_archive(facts, arrays):
         values, lists = start["values"], {name: tuple(start[name]) for name in ("held", "free")}
         start = State(start["t"], np.array([*values.values()]), tuple(values), residual=start["residual"], **lists)
     own = {name: tuple(facts[name]) if kind is list else facts[name] for name, kind in FACTS.items()}
+    own["verdict"] = own.pop("internal")
     events = {name: _event_at(arrays, i, own["jet_names"]) for i, name in enumerate(archive.named(facts["events"]))}
     return Run(t, jets, stored=signals, stored_residual=residuals, start=start, events=events, **own), facts
 

@@ -2,13 +2,14 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from servoctl.checks import as_numbers, as_span
 from servoctl.errors import InconsistentStart, ServoError, SpecificationError
-from servoctl.internal_dynamics import STEP_ERROR, internal_dynamics
+from servoctl.internal_dynamics import FEWEST, STEP_ERROR, UNSTABLE, growth_bound, internal_dynamics
 from servoctl.methods.accuracy import ATOL, absolute_tolerances, accurate, large_tolerances
 from servoctl.methods.algebraic import algebraic
 from servoctl.methods.bounded import bounded
@@ -31,6 +32,7 @@ from servoctl.methods.choice import (
     require_combination,
 )
 from servoctl.methods.events import Event, Events, as_events, occurrences
+from servoctl.methods.motion import DEFAULT_SAMPLES
 from servoctl.methods.orders import end_at_other_orders
 from servoctl.methods.radau import RadauSteps
 from servoctl.methods.runge_kutta import ORDERS, RungeKuttaSteps
@@ -46,7 +48,6 @@ from servoctl.plants.plant import Plant
 from servoctl.progress import Progress
 from servoctl.run import SAME_TIME, Run
 
-DEFAULT_SAMPLES = 1001  # without t_eval: smooth curves, and extrema refined to rounding
 STEPS_IN_SPAN = 2000  # steps of fixed length in a span if the method has no step
 MOST_STEPS = 10**8  # of fixed length: more would fill the memory with samples
 DRIFTED = 1e-2  # the same at the end of a motion that deserves a warning
@@ -122,46 +123,60 @@ def simulate(
         If method and drift do not go together, or a path is not smooth enough.
     """
     model, start = _model_and_start(model, start, inputs)
-    span, tolerance = as_span(t_span), getattr(method, "rtol", STEP_ERROR)
-    times = dense = None if t_eval is None else _sample_times(*span, t_eval, ())
-    if times is not None and _has_internal_dynamics(model):  # whose verdict needs more samples than a few
-        own = np.linspace(*span, DEFAULT_SAMPLES)
-        dense = None if _fixed_steps(method) else times if len(times) >= len(own) else np.union1d(times, own)
-
+    span = as_span(t_span)
+    times = None if t_eval is None else _sample_times(*span, t_eval, ())
     events = as_events(events)
 
-    def attempt(method, drift, t_span=span, times=dense):
-        of_span = events if t_span is span else {}
-        return simulated(model, start, t_span, method, drift=drift, t_eval=times, events=of_span, progress=progress)
+    def motion(times):
+        def attempt(method, drift, t_span=span, times=times):
+            of_span = events if t_span is span else {}
+            return simulated(model, start, t_span, method, drift=drift, t_eval=times, events=of_span, progress=progress)
 
-    try:
         if accuracy is None:
-            run = attempt(method, drift)
-        else:
-            run = accurate(attempt, model, accuracy, (span[0], as_state(model, start, span[0]), span[1]), method, drift)
+            return attempt(method, drift)
+        return accurate(attempt, model, accuracy, (span[0], as_state(model, start, span[0]), span[1]), method, drift)
+
+    if not _has_internal_dynamics(model) or not _integrates(method):
+        return motion(times)
+    tolerance, own = getattr(method, "rtol", STEP_ERROR), partial(_with_own, method, span, times)
+    try:
+        run = motion(own(FEWEST + 1))
     except ServoError as error:
         if error.run is not None:
-            error.run = _sampled(judged(error.run, tolerance, warn=False), times)
+            error.run = _sampled(replace(error.run, verdict=partial(_verdict, tolerance=tolerance)), times)
         raise
-    return _sampled(judged(run, tolerance), times)
+    dense = own(DEFAULT_SAMPLES)
+    return _sampled(judged(run, tolerance, None if dense is None else partial(motion, dense)), times)
 
 
-def _fixed_steps(method):
-    """Whether all steps are samples."""
-    return method is not None and isinstance(as_method(method), RungeKutta)
+def _integrates(method):
+    """Whether a method goes forward from its start, so that its errors grow with time."""
+    return method is None or as_method(method).forward
+
+
+def _with_own(method, span, times, count):
+    """Times of samples and `count` more along the span; None where the samples are all steps or the default."""
+    fixed_steps = method is not None and isinstance(as_method(method), RungeKutta)
+    if times is None or fixed_steps:
+        return None
+    return np.union1d(times, np.linspace(*span, count))[:: 1 if span[1] > span[0] else -1]
 
 
 def _sampled(run, times):
-    """The run at its samples among some times; all of it without times, and the state in which it stopped anyway."""
-    if times is None or not _has_internal_dynamics(run.model):
+    """The run at its samples among some times; all of it without times, and the state in which it stopped anyway.
+
+    Its verdict remains that of all its samples.
+    """
+    if times is None:
         return run
+    verdict = partial(run.verdict, run) if callable(run.verdict) else run.verdict
     if run.method in ORDERS:
-        return _resample(run, times)
+        return replace(_resample(run, times), verdict=verdict)
     picked = np.isin(run.t, times)
     picked[-1] |= run.status != 0 or not picked.any()
     index = np.append(0, np.cumsum(picked))
     variants = tuple((int(index[a]), int(index[b]), v) for a, b, v in run.variants if index[b] > index[a])
-    return replace(run, t=run.t[picked], jets=run.jets[:, picked], variants=variants)
+    return replace(run, t=run.t[picked], jets=run.jets[:, picked], variants=variants, verdict=verdict)
 
 
 def simulated(model, start, t_span, method=None, *, drift=None, t_eval=None, events=None, progress=None):
@@ -216,22 +231,36 @@ def _has_internal_dynamics(model):
     return bool(model.reduction.program.residuals) and not model.flat
 
 
-def judged(run, tolerance=STEP_ERROR, warn=True):
-    """A run with the verdict on its internal dynamics, if it has any, and a warning if they are unstable.
+def judged(run, tolerance=STEP_ERROR, again=None):
+    """A run that gives the verdict on its internal dynamics when it is read; warns at once if they are unstable.
+
+    Most motions need no propagators to know that there is nothing to warn of.
 
     Parameters
     ----------
     run : Run
+        With internal dynamics.
     tolerance : float
         Relative error of a step of its method.
-    warn : bool
+    again : callable, optional
+        Returns the same motion with more samples, where the run has few of them.
+
+    Returns
+    -------
+    Run
     """
-    if not _has_internal_dynamics(run.model) or run.method == str(Bounded()):  # which is no forward integration
-        return run
+    if growth_bound(run.model, run) <= UNSTABLE:
+        return replace(run, verdict=partial(_verdict, tolerance=tolerance))
+    run = run if again is None else again()
     internal = internal_dynamics(run.model, run)
-    if warn and internal.verdict == "unstable":
+    if internal.verdict == "unstable":
         warn_unstable(internal.sentence(tolerance))
-    return replace(run, internal=internal.facts(tolerance))
+    return replace(run, verdict=internal.facts(tolerance))
+
+
+def _verdict(run, _=None, *, tolerance):
+    """The verdict on the internal dynamics of a run, for those of its samples that are left."""
+    return internal_dynamics(run.model, run).facts(tolerance)
 
 
 def _model_and_start(model, start, inputs):

@@ -1,5 +1,6 @@
 """Internal dynamics: growth against the variational equation and closed forms, whatever the coordinates and samples."""
 
+import pickle
 import runpy
 import warnings
 from dataclasses import replace
@@ -13,7 +14,9 @@ from refusals import refused, warned
 from scipy.integrate import solve_ivp
 
 import servoctl as sv
+from servoctl import simulation
 from servoctl.gallery import cars, gallery, mass_on_car, passive_arm, spiral, vtol
+from servoctl.internal_dynamics import growth_bound
 
 
 def internal(pair, span, start, **guess):
@@ -274,6 +277,28 @@ def test_a_ball_on_a_turning_table_is_neutral(length):
     assert found.verdict == "neutral" and found.growth < 3
 
 
+@pytest.mark.parametrize("tilt", [(0.0, 0.0, 0.0), (0.3, 0.2, 0.1), (-0.6, 0.1, 0.7)], ids=str)
+@pytest.mark.parametrize("samples", [5, 1001])
+def test_a_tilted_ball_in_its_own_axes_is_neutral(tilt, samples):
+    """With body-fixed angular velocities: its centre moves in a circle at constant speed, at 2/7 of the table's rate."""
+    table, names = 0.7, sv.coordinates("X Y e0 e1 e2 e3")
+    X, Y, e0, e1, e2, e3 = names
+    spin = ca.vertcat(ca.horzcat(-e1, -e2, -e3), ca.horzcat(e0, -e3, e2), ca.horzcat(e3, e0, -e1), ca.horzcat(-e2, e1, e0))
+    unit = e0**2 + e1**2 + e2**2 + e3**2 - 1
+    q = names.with_quasi_velocities("vx vy w1 w2 w3", ca.diagcat(ca.SX.eye(2), spin / 2), invariants={"unit": unit})
+    vx, vy, *w = q.w()
+    Wx = ca.dot(ca.vertcat(1 - 2 * (e2**2 + e3**2), 2 * (e1 * e2 - e0 * e3), 2 * (e1 * e3 + e0 * e2)), ca.vertcat(*w))
+    Wy = ca.dot(ca.vertcat(2 * (e1 * e2 + e0 * e3), 1 - 2 * (e1**2 + e3**2), 2 * (e2 * e3 - e0 * e1)), ca.vertcat(*w))
+    gibbs = sum(weight * a**2 / 2 for weight, a in zip((1, 1, 0.4, 0.4, 0.4), q.gamma(2), strict=True))
+    rolling = {"roll x": vx - Wy + table * Y, "roll y": vy + Wx - table * X}
+    model = sv.derive(sv.Mechanism(q, gibbs=gibbs), sv.Program(rolling, by="ideal"))
+    values = dict(zip(("e1", "e2", "e3"), tilt, strict=True))
+    start = model.start(X=1.0, Y=0.0, vx=0.0, vy=0.3, w3=0.0, guess={"e0": 1.0}, **values)
+    run = sv.simulate(model, start, (0.0, 30.0), t_eval=np.linspace(0.0, 30.0, samples))
+    assert run["vx"] + 1j * run["vy"] == pytest.approx(0.3j * np.exp(2j / 7 * table * run.t), abs=1e-7)
+    assert run.internal["verdict"] == sv.internal_dynamics(model, run).verdict == "neutral"
+
+
 @pytest.mark.parametrize("length", [5.0, 10.0, 60.0])
 def test_a_spinning_satellite_is_neutral(length):
     example = runpy.run_path(str(Path(__file__).parents[1] / "examples" / "quaternion.py"), run_name="example")
@@ -320,3 +345,83 @@ def test_samples_that_resolve_nothing_are_inconclusive():
     jets[:, ::2] *= 1.5  # no motion
     found = sv.internal_dynamics(model, replace(run, jets=jets))
     assert found.verdict == "inconclusive" and np.isnan(found.growth) and "t_eval" in repr(found)
+
+
+# the bound that settles whether there is anything to warn of ----------------------------------------------------------
+
+
+QUIET = sorted(set(gallery) - {"vtol-centre", "appell-hamel-squared", "constant-speed-horizontal"})
+
+
+@pytest.mark.parametrize("name", QUIET)
+def test_a_bound_of_the_growth_settles_what_is_quiet(name, gallery_model, monkeypatch):
+    """No propagators in `simulate`; the verdict when it is read is that of `sv.internal_dynamics`."""
+    model, scene, calls = gallery_model(name), gallery[name], []
+    real = simulation.internal_dynamics
+    monkeypatch.setattr(simulation, "internal_dynamics", lambda *a: calls.append(a) or real(*a))
+    run = sv.simulate(model, model.start(**scene.start, guess=scene.guess), scene.t_span)
+    assert not calls and (model.flat or growth_bound(model, run) < 10)
+    if not model.flat:
+        assert dict(run.internal) == real(model, run).facts() and run.internal == run.internal and len(calls) == 1
+        assert run.internal["growth"] < 10
+
+
+def bursts(rate, at, width):
+    """Deviations grow at a rate near one instant, and shrink slowly at others."""
+    return lambda x, v, t: (rate * ca.exp(-(((t - at) / width) ** 2)) - 1) * x - 0.5 * v
+
+
+LOUD = {
+    "unstable": (lambda x, v, t: x, 10.0),
+    "parametric resonance": (mathieu(0.6), 120.0),
+    "resonance at a low depth": (mathieu(0.4), 200.0),
+    "a burst": (bursts(60.0, 4.0, 1.0), 12.0),
+    "a late burst": (bursts(300.0, 11.0, 0.4), 12.0),
+    "negative damping": (lambda x, v, t: -4 * x + 0.5 * v, 20.0),
+    "of fast oscillations": (lambda x, v, t: -400 * x + 0.4 * v, 30.0),
+}
+
+
+@pytest.mark.parametrize("name", LOUD)
+@pytest.mark.parametrize("samples", [None, 2, 5, 50], ids=str)
+def test_what_is_unstable_is_warned_of_whatever_the_samples(name, samples):
+    acceleration, length = LOUD[name]
+    model = passive(acceleration)
+    times = None if samples is None else np.linspace(0.0, length, samples)
+    with warned("Internal dynamics unstable"):
+        run = sv.simulate(model, model.start(x=1e-3, dx=0.0), (0.0, length), t_eval=times)
+    assert run.internal["verdict"] == "unstable"
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_the_bound_is_one_of_the_propagator(seed):
+    """Random linear motions of two coordinates, forth and back: exp ∫ μ is above the norm in the balanced states."""
+    random = np.random.default_rng(seed)
+    K, D, B = random.normal(size=(3, 2, 2))
+    K, rate = K @ K.T + np.eye(2), random.uniform(0.5, 3.0)
+    q = sv.coordinates("x y z")
+    (x, y, z), (dx, dy, _) = q, q.d(1)
+    force = -(K + 0.3 * ca.cos(rate * q.t) * B) @ ca.vertcat(x, y) - 0.2 * D @ ca.vertcat(dx, dy)
+    mechanism = sv.Mechanism(
+        q, gibbs=sum(a**2 for a in q.d(2)) / 2, forces={"x": force[0], "y": force[1]}, actuators={"F": z}
+    )
+    model = sv.derive(mechanism, sv.Program({"z": z - ca.sin(q.t)}))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)
+        for span in ((0.0, 2.0), (2.0, 0.0)):
+            start = model.start(t=span[0], x=1.0, y=0.5, dx=0.0, dy=0.0)
+            run = sv.simulate(model, start, span, t_eval=np.linspace(*span, 41))
+            assert run.internal["growth"] <= 1.05 * growth_bound(model, run)
+
+
+def test_the_verdict_is_computed_when_it_is_read(tmp_path, gallery_model):
+    model, start = gallery_model("pendubot"), gallery["pendubot"].start
+    run = sv.simulate(model, model.start(**start), (0.0, 1.0), t_eval=[0.5, 1.0])
+    assert "_internal" not in vars(run)
+    copied = pickle.loads(pickle.dumps(run))
+    assert copied.internal == run.internal and run.internal["verdict"] == "stable"  # that of the whole motion
+    assert pickle.loads(pickle.dumps(run)).internal == run.internal
+    assert run.internal["seconds"] == 1.0 and sv.load(run.save(tmp_path / "run")).internal == run.internal
+    with pytest.raises(TypeError):
+        run.internal["verdict"] = "unstable"
+    assert sv.simulate(model, model.start(**start), (0.0, 1.0)).internal["verdict"] == "stable"

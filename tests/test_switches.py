@@ -328,6 +328,60 @@ def test_other_headings(method):
     assert np.abs(np.cos(2 * run.t) * run["y"] - np.sin(2 * run.t) * run["x"]).max() < 1e-6 * np.abs(run["x"]).max()
 
 
+def polar(angle, factor=1.0):
+    """A point on the unit circle whose angle, times a factor, is a function of t: its program determines the motion."""
+    q = sv.coordinates("x y")
+    x, y = q
+    mechanism = sv.Mechanism(q, gibbs=sv.particle(q, 1.0, (x, y)), actuators={"fx": x, "fy": y})
+    rows = {"r": ca.sqrt(x**2 + y**2) - 1, "a": factor * (ca.atan2(y, x) - angle(q.t))}
+    return sv.derive(mechanism, sv.Program(rows))
+
+
+ANGLES = {
+    "forth": lambda t: 5 * t,
+    "back": lambda t: 1 - 3 * t,
+    "from beyond pi": lambda t: 3.5 + t,
+    "from far beyond": lambda t: -20 - t,
+    "with a jump of its own": lambda t: ca.atan2(ca.sin(3 * t), ca.cos(3 * t)),
+}
+
+
+@pytest.mark.parametrize("name", ANGLES)
+@pytest.mark.parametrize("factor", [1.0, -2.0, 0.5], ids=str)
+@pytest.mark.parametrize("samples", [5, 101])
+def test_angles_count_up_to_whole_turns(name, factor, samples):
+    t = ca.SX.sym("t")
+    angle = ca.Function("angle", [t], [ANGLES[name](t)])
+    model, first = polar(ANGLES[name], factor), float(angle(0.0))
+    start = model.start(guess={"x": np.cos(first), "y": np.sin(first)})
+    for method in ("algebraic", "DOP853"):
+        run = sv.simulate(model, start, (0.0, 4.0), method, t_eval=np.linspace(0.0, 4.0, samples))
+        exact = np.exp(1j * np.array(angle(run.t[None])).ravel())
+        assert np.abs(run["x"] + 1j * run["y"] - exact).max() < 1e-7
+        assert np.abs(run.residual["a"]).max() < 1e-6 and sv.verify(model, run).passed
+
+
+def test_a_difference_of_headings_counts_up_to_whole_turns():
+    """Two points on circles: one turns twice, and the other once more than half as fast the other way."""
+    q = sv.coordinates("x y u v")
+    x, y, u, v = q
+    S = sv.particle(q, 1.0, (x, y)) + sv.particle(q, 1.0, (u, v))
+    mechanism = sv.Mechanism(q, gibbs=S, actuators={"fx": x, "fy": y, "fu": u, "fv": v})
+    one, other = ca.atan2(y, x), ca.atan2(v, u)
+    rows = {"r": x**2 + y**2 - 1, "s": u**2 + v**2 - 4, "one": one - 3 * q.t, "difference": one + 2 * other + q.t}
+    model = sv.derive(mechanism, sv.Program(rows))
+    run = sv.simulate(model, model.start(guess={"x": 1.0, "u": 2.0}), (0.0, 5.0))
+    assert np.abs(run["u"] + 1j * run["v"] - 2 * np.exp(-2j * run.t)).max() < 1e-9
+    assert sv.verify(model, run).passed
+
+
+def test_angles_that_are_no_summands_remain():
+    q = sv.coordinates("x y")
+    x, y = q
+    for residual in (x * ca.atan2(y, x) - q.t, ca.sin(ca.atan2(y, x)) - q.t, ca.atan2(1.0, 2.0) * x - q.t):
+        assert ca.is_equal(sv.Program({"p": residual}).residuals["p"], residual, 20)
+
+
 def test_an_accuracy_holds_beyond_a_half_turn():
     model, start = ideal(lambda t, x, y, dx, dy: ca.atan2(dy, dx) - t, dx=1.0, x=0.0, y=0.0)
     run = sv.simulate(model, start, (0.0, 8.0), accuracy=1e-8)

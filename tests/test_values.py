@@ -9,6 +9,7 @@ from concurrent.futures import ProcessPoolExecutor
 import casadi as ca
 import numpy as np
 import pytest
+from refusals import refused
 
 import servoctl as sv
 from servoctl.gallery import gallery
@@ -173,3 +174,20 @@ def test_nothing_is_written_into_a_specification():
     for value, attributes in before.items():
         assert list(vars(value)) == list(attributes)
         assert all(vars(value)[name] is attributes[name] for name in attributes)
+
+
+def test_arrays_of_values_cannot_be_written(gallery_model):
+    model = gallery_model("overhead-crane")
+    run = sv.simulate(model, model.start(), (0.0, 1.0), t_eval=[0.0, 0.5, 1.0])
+    for value in (run, pickle.loads(pickle.dumps(run))):
+        for array in (value.t, value.jets, value["x"], value.model.parameters):
+            with pytest.raises(ValueError, match="read-only"):
+                array[0] = 7.0
+
+
+def test_parts_of_a_model_say_how_they_pickle(gallery_model):
+    model = gallery_model("overhead-crane")
+    for part in (model.reduction, model.reduction.program):
+        with refused(sv.SpecificationError, "sv.derive(mechanism, program)", type=type(part).__name__):
+            pickle.dumps(part)
+    assert pickle.loads(pickle.dumps(model)) == model

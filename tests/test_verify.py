@@ -389,3 +389,33 @@ def test_what_is_no_run_of_the_model_is_refused(what, plan):
 @pytest.mark.parametrize("values", [None, "x", [1.0], 1j, object()])
 def test_stored_signals_that_are_no_samples_fail_or_are_left_out(values, plan):
     assert verdict(plan.model, edited(plan, stored={"energy": values})) in ("failed", "passed")
+
+
+# peaks of power -------------------------------------------------------------------------------------------------------
+
+
+def jerky(steepness, at, height=0.01):
+    """A mass that moves evenly but for a quick jump."""
+    q = sv.coordinates("x")
+    (x,) = q
+    mechanism = sv.Mechanism(q, gibbs=sv.particle(q, 1.0, (x, 0.0)), actuators={"F": x})
+    return sv.derive(mechanism, sv.Program({"x": x - q.t - height * ca.tanh(steepness * (q.t - at))}))
+
+
+@pytest.mark.parametrize("samples", [3, 11, 101, 1001])
+@pytest.mark.parametrize("steepness, at", [(50.0, 0.77), (200.0, 1.003), (2000.0, 1.003), (1000.0, 1.0), (2e4, 1.234)])
+def test_narrow_peaks_of_power_do_not_fail(steepness, at, samples):
+    model = jerky(steepness, at)
+    run = sv.simulate(model, model.start(), (0.0, 2.0), t_eval=np.linspace(0.0, 2.0, samples))
+    found = sv.verify(model, run)
+    assert not found.failures
+    assert found.passed or (steepness >= 1000.0 and samples < 1001 and "t_eval" in repr(found))
+
+
+@pytest.mark.parametrize("samples", [11, 101])
+def test_wrong_forces_at_narrow_peaks_fail(samples):
+    model = jerky(200.0, 1.003)
+    run = sv.simulate(model, model.start(), (0.0, 2.0), t_eval=np.linspace(0.0, 2.0, samples))
+    jets = run.jets.copy()
+    jets[0, samples // 2 :] += 1e-4
+    assert sv.verify(model, replace(run, jets=jets)).verdict == "failed"

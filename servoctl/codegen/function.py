@@ -168,13 +168,6 @@ class Compiled:
         """Evaluation by CasADi, whether or not a library is loaded: a few points do not pay for one."""
         return Interpreter(self.expression)
 
-    @functools.cached_property
-    def tangent(self):
-        """Evaluation of (∂y/∂x) v, y the first n_x outputs, by CasADi as a function of t, x and [p; v]."""
-        t, x, p, v = map(ca.SX.sym, "txpv", (1, self.n_x, self.n_p, self.n_x))
-        along = ca.densify(ca.cse(ca.jtimes(self.expression(t, x, p)[: self.n_x], x, v)))
-        return Interpreter(ca.Function("tangent", [t, x, ca.vertcat(p, v)], [along]))
-
     @property
     def backend(self):
         """``"c"`` once the library is loaded, ``"casadi"`` until then."""

@@ -93,7 +93,7 @@ def _loop(plant, law, x0, t_span, conditions):
     initial = initial if low is None else np.clip(initial, low, high)
     x0 = _initial_state(plant, t0, x0, initial)
     substeps, transport = steps(plant, law.period, timing.substeps, t0, x0, initial)
-    require_few_steps(samples, substeps)
+    require_few_steps(samples, substeps, plant.function("ode").operations)
     return Loop(
         samples=samples, substeps=substeps, delay=timing.delay, n_u=len(plant.inputs), n_out=law.n_out, first=first,
         at_u=len(plant.parameters), t0=t0, period=law.period, p=plant.p(), x0=x0, z0=law.state, table=law.schedule.T,

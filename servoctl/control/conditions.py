@@ -21,7 +21,8 @@ from servoctl.errors import SpecificationError
 
 RESOLVED = 0.05  # largest |λ| h: the error of one Runge-Kutta step of order 4 is then 3e-9
 MOST_SUBSTEPS = 1000
-MOST_LOOP_STEPS = 10**10  # integration steps of one loop: some two minutes of compiled code
+MOST_LOOP_OPERATIONS = 10**12  # of all steps of one loop, four evaluations each: some ten minutes of compiled code
+STEP_OPERATIONS = 50  # of an evaluation besides its own: what a step of Runge-Kutta costs
 WITHIN_STEP = 1e-9  # of a step: disturbances are sampled this far inside its ends, at which they may jump
 
 
@@ -183,16 +184,19 @@ def limits(plant, period):
     return low, high, change if plant.rate_limits else None
 
 
-def require_few_steps(samples, substeps):
-    """Refuse a loop that would integrate for hours."""
-    if samples * substeps > MOST_LOOP_STEPS:
+def require_few_steps(samples, substeps, operations):
+    """Refuse a loop that would integrate for hours; `operations` of one evaluation of the plant."""
+    most = max(MOST_LOOP_OPERATIONS // (4 * (operations + STEP_OPERATIONS)), 1)
+    if samples * substeps > most:
+        fitting = {"nearest": f"substeps={most // samples}."} if most >= samples else {}
         raise SpecificationError(
             f"{samples} samples with {substeps} substeps are {samples * substeps:.3g} integration steps.",
-            f"A loop takes at most {MOST_LOOP_STEPS:.0e}.",
-            nearest=f"substeps={max(MOST_LOOP_STEPS // samples, 1)}.",
+            f"A loop of this plant takes at most {most:.1e}, which is some ten minutes.",
             do="Take fewer substeps, a lower rate or a shorter time.",
             samples=samples,
             substeps=substeps,
+            most=most,
+            **fitting,
         )
 
 

@@ -121,7 +121,7 @@ def fastest(
             factor=factor,
             slow=slow,
         )
-    return TimeLaw(factor, slower, judged(plan), binding)
+    return TimeLaw(factor, slower, plan if plan.model.flat else judged(plan), binding)
 
 
 @dataclass(frozen=True)

@@ -10,6 +10,7 @@ from itertools import count
 from typing import NamedTuple
 
 import casadi as ca
+import numpy as np
 
 _SIDES = {
     ca.OP_FABS: lambda b, x, y: (2 * b - 1) * x,
@@ -20,6 +21,7 @@ _SIDES = {
     ca.OP_LE: lambda b, x, y: 1 - b,
 }  # the operation on x and y where b says whether x > y
 _SWITCHING = {*_SIDES, ca.OP_ATAN2}
+MOST_TURNS = 4  # of an angle's factor, relative to the smallest: beyond, products of vectors grow long
 _NARROW = 0.5**0.5  # an angle is followed up to 135° on either side of its branch
 
 
@@ -150,6 +152,51 @@ class Branches:
         self._functions.append((len(self.switches), g))
         self.switches.append(Switch(b, function, other, f"{_words(original)} = 0", rests=rests))
         return b
+
+
+def without_turns(expression):
+    """An expression that is a sum with angles atan2(y, x), zero also where it differs from zero by whole turns.
+
+    φ = c (θ_1 + k_2 θ_2 + ...) + r with whole k_j is c times the angle of the vector e^(i r/c) z_1 z_2^(k_2) ..., where
+    z = x + i y. Written as that angle, φ has the same derivatives, and jumps only opposite to its zeros.
+
+    Parameters
+    ----------
+    expression : SX scalar
+
+    Returns
+    -------
+    SX scalar
+        The expression itself if it is no such sum.
+    """
+    work, angles = [], []  # symbols in place of angles, with y and x
+
+    def value(op, operands):
+        arguments = [work[i] for i in operands]
+        if op != ca.OP_ATAN2 or not any(map(ca.symvar, arguments)):
+            return _apply(op, *arguments)
+        angles.append((ca.SX.sym(f"angle_{len(angles)}"), *arguments))
+        return angles[-1][0]
+
+    (whole,) = _replayed([ca.cse(expression)], work, lambda leaf, symbol: leaf, value)
+    slopes = [ca.simplify(ca.jacobian(whole, angle)) for angle, *_ in angles]
+    if not all(c.is_constant() for c in slopes) or all(c.is_zero() for c in slopes):
+        return expression
+    factors = np.array([float(c) for c in slopes])
+    factor = factors[np.argmin(np.where(factors == 0, np.inf, np.abs(factors)))]
+    turns = factors / factor
+    if np.any(turns % 1) or np.abs(turns).max() > MOST_TURNS:
+        return expression
+    symbols = ca.vertcat(*(angle for angle, *_ in angles))
+    rest = ca.substitute(whole, symbols, ca.SX.zeros(len(angles))) / factor
+    x, y = ca.cos(rest), ca.sin(rest)
+    for (_, sine, cosine), k in zip(angles, turns, strict=True):
+        for _ in range(abs(int(k))):
+            x, y = x * cosine - np.sign(k) * y * sine, y * cosine + np.sign(k) * x * sine
+    result = 2 * factor * ca.atan(y / (x + ca.sqrt(x**2 + y**2)))
+    for symbol, sine, cosine in reversed(angles):  # of angles inside other angles
+        result = ca.substitute(result, symbol, ca.atan2(sine, cosine))
+    return result
 
 
 _EDGES = {

@@ -17,7 +17,7 @@ import numpy as np
 from servoctl.codegen.function import compiled
 from servoctl.errors import IntegrationStopped, SingularProgram, SpecificationError, UnstableInternalDynamics
 from servoctl.methods.accuracy import state_levels
-from servoctl.methods.motion import Motion, breakpoints
+from servoctl.methods.motion import DEFAULT_SAMPLES, Motion, breakpoints
 from servoctl.methods.radau import basis, radau
 from servoctl.model.switching import switching
 from servoctl.tolerances import CUTOFF, NOISE
@@ -33,7 +33,6 @@ HYPERBOLIC = 1e-10  # distance to a matrix with an eigenvalue on the imaginary a
 STANDS = 1e-6  # relative change of the equilibrium before or after the span: the program does not stand still
 REGULAR = 1e-6  # smallest singular value of the free entries' part of the tangent space
 BETWEEN = (0.15, 0.5, 0.9)  # places within an interval where the defect is measured
-SAMPLES = 1001
 
 
 def bounded(model, span, guess, method, instants, progress, events=None):
@@ -88,7 +87,8 @@ def bounded(model, span, guess, method, instants, progress, events=None):
     reference = problem.solve(problem.window(2 * method.window), knots, np.inf, (mesh, x))
     progress(span[1])
     if times is None:
-        times = np.union1d(np.linspace(*window, SAMPLES), [k for k in (*span, *knots) if window[0] < k < window[1]])
+        edges = [k for k in (*span, *knots) if window[0] < k < window[1]]
+        times = np.union1d(np.linspace(*window, DEFAULT_SAMPLES), edges)
     motion = Motion()
     motion.count(intervals=len(mesh) - 1, iterations=problem.iterations)
     if events is not None:

@@ -181,6 +181,7 @@ def as_drift(value):
 class Method:
     """What all methods share: a short form, and the treatments of drift they refuse, with the reason."""
 
+    forward = True  # integrates from the start on, so that errors grow like those of the internal dynamics
     named_by = ()  # fields that the short form contains
     refused = {}
 
@@ -294,6 +295,7 @@ class Bounded(Method):
     window: float = 10.0
     rtol: float = 1e-9
 
+    forward = False
     refused = dict.fromkeys(
         (Project, Poles, MinimalCoordinates), "The constraints hold at every node, so that nothing drifts."
     )

@@ -11,6 +11,7 @@ from servoctl.methods.monitor import VANISHING, Fine, Monitor, Repivot, Singular
 from servoctl.methods.watch import End, Watch, edge, no_model, sticks
 from servoctl.reduction.orders import other_order
 
+DEFAULT_SAMPLES = 1001  # without t_eval: smooth curves, and extrema refined to rounding
 ADVICE = "Use a smaller rtol, another method or drift='project', or check whether the program ends or jumps there."
 
 

@@ -25,6 +25,7 @@ from servoctl.reduction.reduce import holds, reduce, strong
 from servoctl.reduction.structure import structure
 from servoctl.spec.mechanism import Mechanism
 from servoctl.spec.program import Program
+from servoctl.values import read_only
 
 SAMPLED = 50  # samples of a run at which its structure is decided; each takes tens of milliseconds
 
@@ -98,7 +99,7 @@ class Model:
     def __init__(self, reduction, store, values=None, knots=None, functions=None):
         q = reduction.mechanism.q
         self.reduction, self._store = reduction, store
-        self.parameters = reduction.context.values.copy() if values is None else values
+        self.parameters = read_only(reduction.context.values.copy() if values is None else values)
         self._knots = reduction.knots if knots is None else knots
         self.state_names = tuple(name for k in range(reduction.top) for name in q.jet_names(k))
         self.jet_names = (*self.state_names, *q.jet_names(reduction.top))

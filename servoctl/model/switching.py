@@ -31,7 +31,7 @@ class Switching:
         self.model = model
         names = r.mechanism.parameters.names
         branches = Branches(lambda s: (q.where(s) or ("t",))[0] != "t", names)
-        self._specification = _smooth(r.mechanism, r.program, branches)
+        self._specification = _smooth(r.mechanism, r.program, _angles(model), branches)
         self.switches = branches.switches
         for s in self.switches:
             if q.order(s.function) >= r.top:
@@ -162,7 +162,8 @@ def switching(model: Model) -> Switching | None:
     r = model.reduction
 
     def branched():
-        return has_switches(ca.vertcat(r.mechanism.balance, *_residuals(r.mechanism, r.program)))
+        rows = _residuals(r.mechanism, r.program, _angles(model))
+        return has_switches(ca.vertcat(r.mechanism.balance, *rows))
 
     if not model.once("branches", branched):
         return None
@@ -175,14 +176,20 @@ def _switching(model):
     return Switching(model)
 
 
-def _residuals(mechanism, program):
+def _angles(model):
+    """The residuals of a program by name: angles jump by 2π where a motion is integrated, which follows their turns."""
+    program = model.reduction.program
+    return program.residuals if model.flat else program.with_turns
+
+
+def _residuals(mechanism, program, residuals):
     chosen = [w for w in (*program.weights.values(), *program.toward.values()) if isinstance(w, ca.SX)]
-    return [*program.residuals.values(), *mechanism.constraints.values(), *chosen, *mechanism.E.elements()]
+    return [*residuals.values(), *mechanism.constraints.values(), *chosen, *mechanism.E.elements()]
 
 
-def _smooth(mechanism, program, branches):
+def _smooth(mechanism, program, residuals, branches):
     """The mechanism and the program with branches as further parameters."""
-    residuals = dict(zip(program.residuals, branches.smooth(list(program.residuals.values()), True), strict=True))
+    residuals = dict(zip(residuals, branches.smooth(list(residuals.values()), True), strict=True))
     constraints = dict(
         zip(mechanism.constraints, branches.smooth(list(mechanism.constraints.values()), True), strict=True)
     )

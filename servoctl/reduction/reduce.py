@@ -19,6 +19,7 @@ from servoctl.reduction.realisation import realisation, wished
 from servoctl.reduction.rows import Balance, as_rows, balances, merge_uses, settle_alone
 from servoctl.reduction.scales import ORDINARY, usual
 from servoctl.spec.mechanism import Mechanism, require_known
+from servoctl.spec.packing import Packed
 from servoctl.spec.program import Program
 from servoctl.tolerances import TINY
 
@@ -32,7 +33,7 @@ HELD = 1e-9  # residual, relative to the size of its terms, at points where a re
 
 
 @dataclass(frozen=True)
-class Reduction:
+class Reduction(Packed):
     """The rows ψ_a = 0 of a motion, with its hidden constraints, and who realises the program.
 
     Attributes

@@ -4,11 +4,26 @@ Expressions do not pickle, but functions do: all expressions of a value become o
 parameters, which is called on the symbols of the other process. They come back operation by operation.
 """
 
+import copyreg
 import io
 import pickle
 from dataclasses import fields, is_dataclass
 
 import casadi as ca
+
+from servoctl.errors import SpecificationError
+
+
+class Packed:
+    """Base of values whose expressions hold a mechanism's symbols: they pickle as parts of a model."""
+
+    def __reduce__(self):
+        raise SpecificationError(
+            f"A {type(self).__name__} was pickled or copied by itself.",
+            "Its expressions hold the symbols of a mechanism, so that it pickles with them.",
+            do="Pickle the model, the value of sv.derive(mechanism, program); it holds both.",
+            type=type(self).__name__,
+        )
 
 
 def packed(value, q, parameters, shared=None):
@@ -68,6 +83,8 @@ class _Pickler(pickle.Pickler):
         return len(self.expressions) - 1
 
     def reducer_override(self, value):
+        if isinstance(value, Packed) and not is_dataclass(value):
+            return copyreg.__newobj__, (type(value),), vars(value)
         if not is_dataclass(value) or isinstance(value, type):
             return NotImplemented
         return _made, (type(value), {f.name: getattr(value, f.name) for f in fields(value) if f.init and f.compare})

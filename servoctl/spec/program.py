@@ -7,18 +7,20 @@ import numpy as np
 
 from servoctl.checks import column, mapping, require_kind
 from servoctl.errors import SpecificationError
+from servoctl.jets.branches import without_turns
 from servoctl.spec.coordinates import Coordinates
+from servoctl.spec.packing import Packed
 
 REALISATIONS = ("ideal", "actuators")
 
 
-class Program:
+class Program(Packed):
     """Program constraints: named residuals of any, mixed order, and who realises them.
 
     Parameters
     ----------
     residuals : dict of str to SX scalar
-        φ_i(t, q, γ', ..., γ^(s_i)), which the motion keeps at zero.
+        φ_i(t, q, γ', ..., γ^(s_i)), which the motion keeps at zero; one with angles atan2(y, x) up to whole turns.
     by : {"ideal", "actuators"}
         "ideal": an ideal reaction, which does no work on the virtual displacements that the program's leading
         matrix allows (eq. (3.18) as printed; for residuals nonlinear in velocities or of order >= 2 this
@@ -29,6 +31,11 @@ class Program:
     toward : dict of str to float or SX, optional
         The wish u_wish by actuator: expressions of t, q and γ', such as a spring that draws a redundant arm towards a
         posture, or a brake that damps its self-motion. Default 0 each.
+
+    Attributes
+    ----------
+    with_turns : dict of str to SX scalar
+        The residuals as they were written: their angles jump by 2π.
 
     Raises
     ------
@@ -60,7 +67,8 @@ class Program:
                     do=f"Remove the {what}, or write by='actuators'.",
                     by=by,
                 )
-        self.residuals = {name: _residual(name, value) for name, value in residuals.items()}
+        self.with_turns = {name: _residual(name, value) for name, value in residuals.items()}
+        self.residuals = {name: without_turns(value) for name, value in self.with_turns.items()}
         self.by = by
         self.weights = {name: _weight(name, value) for name, value in mapping(weights, "The weights").items()}
         self.toward = {name: _wish(name, value) for name, value in mapping(toward, "The wishes").items()}
@@ -111,10 +119,10 @@ class Program:
             )
         symbols, values = [q.t], [instant + (q.t - instant) / sigma]
         weights = {name: ca.SX(value) for name, value in self.weights.items()}
-        for k in range(1, max(map(q.order, (*self.residuals.values(), *weights.values()))) + 1):
+        for k in range(1, max(map(q.order, (*self.with_turns.values(), *weights.values()))) + 1):
             symbols += q.gamma(k)
             values += [sigma**k * s for s in q.gamma(k)]
-        slower = iter(ca.substitute([*self.residuals.values(), *weights.values()], symbols, values))
+        slower = iter(ca.substitute([*self.with_turns.values(), *weights.values()], symbols, values))
         residuals = {name: next(slower) for name in self.residuals}
         weights = {name: next(slower) for name in weights}
         toward = {name: ca.substitute(ca.SX(wish), q.t, values[0]) for name, wish in self.toward.items()}
@@ -127,7 +135,7 @@ class Program:
 def no_program():
     """The program without residuals: forces alone determine the motion."""
     program = object.__new__(Program)
-    program.residuals, program.by, program.weights, program.toward = {}, "actuators", {}, {}
+    program.by, program.residuals, program.with_turns, program.weights, program.toward = "actuators", {}, {}, {}, {}
     return program
 
 

@@ -50,13 +50,17 @@ class Flow:
             return y[nq : 2 * nq], np.concatenate([x, y[first : first + 2 * n]])
         return y[: self.n_x], np.concatenate([x, y[self.n_x - n : self.n_x]])
 
+    def newton(self, t, x):
+        """The Newton step (n_x, N) that leads states back to the constraints; none where the states are integrated."""
+        return self.f.grid(t, x, self.model.parameters)[: self.n_x] if self.flat else np.zeros_like(x)
+
     def corrected(self, t, z):
         """Jets at instants, those of a flat program solved for q by Newton's method."""
         if not self.flat:
             return z
         q = z[: self.model.nq]
         for _ in range(CORRECTIONS):
-            q = q + self.f.grid(t, q, self.model.parameters)[: self.model.nq]
+            q = q + self.newton(t, q)
         return self.values(t, q)[1]
 
     def power(self, t, z):
@@ -79,11 +83,14 @@ class Integration:
         Largest difference from the next sample that passes, relative to the sizes.
     steps : (K,) array of int
         Steps of each interval, at least; at the ends of all steps but the last jets are returned.
+    work : (K,) array
+        Largest difference of the integrals of the power between two lengths of step.
     """
 
     sizes: np.ndarray
     limit: float
     steps: np.ndarray
+    work: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -162,14 +169,16 @@ def _integrate(flow, problem, numbers, settings, found, budget):
             break
         part = [values[..., left] for values in problem]
         ks = numbers[left]
-        before = found.ends[:, ks]
-        ends, settled, work, inside, evaluations = _stepped(flow, *part, steps, settings.sizes)
+        before, work_before = found.ends[:, ks], found.work[ks]
+        ends, led_back, work, inside, evaluations = _stepped(flow, *part, steps, settings.sizes)
         budget[0] -= evaluations * cost
         with np.errstate(invalid="ignore"):
             defects = (np.abs(ends - part[3]) / settings.sizes[:, None]).max(axis=0)
             changes = (np.abs(ends - before) / settings.sizes[:, None]).max(axis=0)
         enough = AGREES * np.fmax(defects, settings.limit)
-        done = settled & ((defects <= AGREES * settings.limit) | (changes <= enough))
+        done = (defects <= AGREES * settings.limit) | ((changes <= enough) & (led_back <= enough))
+        done &= np.isfinite(led_back) & ~(np.abs(work - work_before) > settings.work[ks])
+        done &= np.isinf(settings.work[ks]) | np.isfinite(work_before)
         found.ends[:, ks], found.defects[ks], found.work[ks], found.resolved[ks] = ends, defects, work, done
         found.inside.extend((flow, t[done], z[:, done]) for t, z in inside if done.any())
         left, steps = left[~done], 2 * steps
@@ -178,23 +187,28 @@ def _integrate(flow, problem, numbers, settings, found, budget):
 def _stepped(flow, t, length, x, targets, steps, sizes):
     """Take equal steps from t (K,) over lengths (K,).
 
-    Returns the ends, whether all steps settled, the work, instants with their jets, and the number of evaluations.
+    Returns the ends; the largest Newton step, relative to the sizes, that leads a flat motion back to its constraints
+    at the end of a step, infinite where a step did not settle; the work; instants with their jets; and the number of
+    evaluations.
     """
     h, (_, b, _) = length / steps, gauss(STAGES)
-    settled, work, evaluations, inside = np.ones(len(t), dtype=bool), np.zeros(len(t)), 0, []
+    back, led_back, work, evaluations, inside = 0.0, np.zeros(len(t)), np.zeros(len(t)), 0, []
     for k in range(steps):
+        x = x + back
         start, jets = flow.values(t + k * h, x)
         inside += [(t + k * h, jets)] * (k > 0)
         goal = flow.values(t + h, np.where(np.isfinite(targets), targets, x))[0] if steps == 1 else start
         times, rates, jets, converged, count = _stages(flow, t + k * h, h, x, (start, goal), sizes)
         x = x + h * np.einsum("j,njk->nk", b, rates)
-        settled &= converged & np.all(np.isfinite(x), axis=0)
+        back = flow.newton(t + (k + 1) * h, x)
+        led_back = np.fmax(led_back, (np.abs(back) / sizes[:, None]).max(axis=0))
+        led_back[~(converged & np.all(np.isfinite(x), axis=0))] = np.inf
         power = flow.power(times.ravel(), jets.reshape(len(jets), -1)).reshape(times.shape)
         work += h * (b @ power)
-        evaluations += count + times.size + 2 * len(t)
-        if not settled.any():
+        evaluations += count + times.size + 3 * len(t)
+        if np.isinf(led_back).all():
             break
-    return x, settled, work, inside, evaluations
+    return x, led_back, work, inside, evaluations
 
 
 def _stages(flow, t, h, x, guess, sizes):

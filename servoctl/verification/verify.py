@@ -3,6 +3,7 @@
 import contextlib
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 from math import factorial
 
 import numpy as np
@@ -15,7 +16,7 @@ from servoctl.model.model import Model
 from servoctl.model.store import fingerprint
 from servoctl.model.switching import switching
 from servoctl.run import SAME_TIME, Run, on_side, require_model, sides
-from servoctl.verification.between import ENOUGH_STEPS, FEW_STEPS, Flow, Integration, between
+from servoctl.verification.between import AGREES, ENOUGH_STEPS, FEW_STEPS, Flow, Integration, between
 from servoctl.verification.loop import verify_loop
 from servoctl.verification.result import Verification, judged, largest, numbers
 
@@ -216,7 +217,7 @@ class _Checks:
         self.mass = self._mass()
         self.sizes = self._sizes(self.samples)
         self.balanced = self._balanced()
-        self.between, self.sampled, own = self._integrate(segments)
+        self.between, self.sampled, own, self.integrated = self._integrate(segments)
         self.instants = [*self.samples, *own]
         self.sizes = self._sizes(self.instants)
         if not run.success:
@@ -285,7 +286,7 @@ class _Checks:
         run, knots = self.run, np.asarray(self.run.knots)
         if len(run.t) < 2:
             self.doubts.append("one sample is no motion: simulate with more samples")
-            return None, None, []
+            return None, None, [], None
         near = np.abs(knots[:, None] - run.t).min(axis=1) <= SAME_TIME * (1 + np.abs(knots)) if len(knots) else []
         knots = np.array([k for k, known in zip(knots, near, strict=True) if not known and self._inside(k)])
         edges = np.union1d(run.t, knots)[:: 1 if run.t[-1] > run.t[0] else -1]
@@ -298,9 +299,13 @@ class _Checks:
         steps = np.full(count, -(-segments // count))
         watched = slice(None, None, max(1, count // OWN_INSTANTS))
         steps[watched] = np.maximum(steps[watched], np.clip(-(-OWN_INSTANTS // count) + 1, 2, MOST_OWN))
-        settings = Integration(self.sizes[:n_x], LIMITS["segments"], steps)
-        found = between(self._flows(flat, np.cumsum(sampled) - 1), edges, x, settings)
-        return found, sampled, self._own(found)
+        settings = Integration(self.sizes[:n_x], LIMITS["segments"], steps, np.full(count, np.inf))
+        again = partial(self._between, flat, np.cumsum(sampled) - 1, edges, x, settings)
+        found = again()
+        return found, sampled, self._own(found), again
+
+    def _between(self, flat, sample, edges, x, settings, **changes):
+        return between(self._flows(flat, sample), edges, x, replace(settings, **changes))
 
     def _flows(self, flat, sample):
         """The flows to try from an edge on: of the variants next to its sample, and of one with its own pivots.
@@ -544,10 +549,28 @@ class _Checks:
             values = energy(at.t, z)
             energies.append(np.vstack([values, ROUNDING * self._response(energy, at.t, z, values, np.abs(z))]))
         energy, rounding = np.concatenate(energies, axis=1)
-        work = np.append(0.0, np.cumsum(self.between.work))[self.sampled]
         kinetic = (self.mass * self.sizes[self.model.nq : self.model.nq + self.model.n] ** 2).max() / 2
-        scale = max(kinetic, np.ptp(energy), np.ptp(work)) + rounding.max() / LIMITS["energy"]
-        return {"energy": largest((energy - energy[0] - work) / scale)}
+        scale = max(kinetic, np.ptp(energy), *np.abs(np.cumsum(self.between.work))) + rounding.max() / LIMITS["energy"]
+        work = self._work(np.diff(energy), AGREES * LIMITS["energy"] * scale)
+        if not np.isfinite(work).all():
+            first = self.run.t[int(np.argmin(np.isfinite(work)))]
+            what = f"peaks of power after t = {first:.6g} s are too narrow to integrate"
+            self.doubts.append(f"{what}: simulate with more samples (t_eval)")
+            return {}
+        return {"energy": largest((energy - energy[0] - np.append(0.0, np.cumsum(work))) / scale)}
+
+    def _work(self, gained, allowed):
+        """Work between samples (N - 1,), by shorter steps where it is not the energy gained; NaN where it is not known.
+
+        `allowed` is an error of the sum.
+        """
+        whose = np.cumsum(self.sampled)[:-1] - 1  # the sample before an edge
+        work = np.bincount(whose, self.between.work, len(gained))
+        doubtful = np.abs(work - gained) > allowed / len(gained)
+        if np.abs(np.cumsum(work - gained)).max() <= allowed or not doubtful.any():
+            return work
+        found = self.integrated(work=np.where(doubtful, allowed / doubtful.sum(), np.inf)[whose])
+        return np.bincount(whose, np.where(found.resolved, found.work, np.nan), len(gained))
 
     # further signals
 
