@@ -94,6 +94,30 @@ def equal_steps(a, b, step):
     return (b - a) / count, count
 
 
+@dataclass(frozen=True)
+class Cubics:
+    """A motion through states x (n_x, S + 1) with rates (n_x, S + 1) at times t (S + 1,), by Hermite's polynomials."""
+
+    t: np.ndarray
+    x: np.ndarray
+    rates: np.ndarray
+
+    def at(self, k, times):
+        """States (n_x, N) at times (N,) in the intervals k (N,)."""
+        h = np.diff(self.t)[k]
+        s = (times - self.t[k]) / h
+        rise = (3.0 - 2.0 * s) * s**2
+        bend = (1.0 - s) * self.rates[:, k] - s * self.rates[:, k + 1]
+        return self.x[:, k] + rise * (self.x[:, k + 1] - self.x[:, k]) + h * s * (1.0 - s) * bend
+
+    def slope(self, k, times):
+        """Their derivatives."""
+        h = np.diff(self.t)[k]
+        s = (times - self.t[k]) / h
+        bend = (1.0 - s) * (1.0 - 3.0 * s) * self.rates[:, k] - s * (2.0 - 3.0 * s) * self.rates[:, k + 1]
+        return 6.0 * s * (1.0 - s) * (self.x[:, k + 1] - self.x[:, k]) / h + bend
+
+
 class Stepping:
     """One integration: the model in use, the monitor of its pivots, and the motion so far.
 
@@ -175,7 +199,7 @@ class Stepping:
     def _inspected(self, stretch):
         """The outcome of steps: that of the monitor, or the `End` of the smooth piece if it comes first."""
         state = self._state_within(stretch)
-        switch = self.watch.switch(stretch, state)
+        switch = self.watch.switch(stretch, self._states_within(stretch), state) if self.family is not None else None
         if switch is not None:
             stretch = stretch.first(switch.steps)
         outcome = self.monitor.inspect(stretch) if len(stretch.t) > 1 else Fine(0)
@@ -184,8 +208,12 @@ class Stepping:
             return left
         return switch if switch is not None and isinstance(outcome, Fine) else outcome
 
+    def _states_within(self, stretch):
+        """X (n_x, N) from steps (N,) and times (N,), where switches are looked for."""
+        return stretch.dense
+
     def _state_within(self, stretch):
-        """X from (k, t) within steps."""
+        """X from (k, t) within steps, where ends of smooth pieces are located."""
         return stretch.state
 
     def _turn(self, end, b):

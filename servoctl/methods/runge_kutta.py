@@ -6,7 +6,7 @@ from servoctl.errors import unknown
 from servoctl.methods.choice import ORDERS, MinimalCoordinates, Project
 from servoctl.methods.minimal import Chart, Sizes
 from servoctl.methods.monitor import DEGRADED, Fine, Singular, Stretch
-from servoctl.methods.motion import Stepping, equal_steps
+from servoctl.methods.motion import Cubics, Stepping, equal_steps
 from servoctl.methods.watch import End
 
 NEARLY_ZERO = 0.3  # of its reference: below this a pivot's least size is searched for within steps
@@ -141,6 +141,11 @@ class RungeKuttaSteps(Stepping):
             if touched is not None and touched.steps <= outcome.steps + 1:
                 return touched
         return outcome
+
+    def _states_within(self, stretch):
+        """X from steps and times within them, by cubics."""
+        rates = self.f.grid(stretch.t, stretch.x, self.p)[: self.n_x]
+        return Cubics(stretch.t, stretch.x, rates).at
 
     def _state_within(self, stretch):
         """X from (k, t) within steps, by a shorter step from their start."""

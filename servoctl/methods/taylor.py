@@ -293,7 +293,7 @@ class TaylorSteps(Stepping):
             states,
             ends[:, :, None],
             self._top,
-            dense=lambda k, s: self._jets(states[:, [k]], y[:, [k]], np.array([s - t[k]]), self.top - 1)[:, 0],
+            dense=lambda k, s: self._jets(states[:, k], y[:, k], s - t[k], self.top - 1),
             pivots_at=self._pivots,
             resumes=True,
         )

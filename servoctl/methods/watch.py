@@ -7,7 +7,6 @@ adds to that is its error. Where the program ends (an angle whose sine passes 1)
 
 from dataclasses import dataclass
 from functools import cached_property
-from itertools import pairwise
 from math import factorial
 
 import casadi as ca
@@ -32,6 +31,7 @@ MOST_INSPECTED = 128  # steps of a stretch whose residuals are evaluated
 LOCATED = 40  # halvings of a step that locate where a residual leaves: all digits
 EDGE = 1e-3  # distance of a function's argument from the edge of its domain that explains why a residual leaves
 AT_ONCE = 1e-9  # of the span: switches closer than this follow at once
+RESOLUTION = 1000  # instants of a span, at least, at which switching functions and equations are inspected within steps
 BESIDE_ENDS = 1e-3  # of a step: instants next to its ends, which show where a function has its least value across steps
 NEAR_ZERO = 0.2  # of a function's values beside its least one: a vertex below this is looked at closely
 MOST_AT_ONCE = 2  # changes of one branch at once, after which the motion stays on the switch
@@ -62,6 +62,27 @@ class End:
     switched: tuple = ()
     branches: tuple = ()
     error: object = None
+
+
+def net(t, distance, least):
+    """Instants within steps with ends t (S + 1,), in at least so many equal parts, no longer than a distance [s].
+
+    Returns
+    -------
+    k : (N,) array of int
+        Their steps.
+    at : (N,) array
+        In the order of the motion, ends of steps included [s].
+    common : (N,) array of bool
+        Ends of the least parts, which all steps have.
+    """
+    h = np.diff(t)
+    parts = least * np.maximum(np.ceil(np.abs(h) / (least * distance)), 1).astype(int)
+    k, last = np.repeat(np.arange(len(h)), parts), np.cumsum(parts) - 1
+    j = 1 + np.arange(len(k)) - np.repeat(last - parts + 1, parts)
+    at = t[k] + h[k] * (j / parts[k])
+    at[last] = t[1:]
+    return k, at, j * least % parts[k] == 0
 
 
 class Tolerance:
@@ -120,9 +141,13 @@ class Switches:
         self.family, self.span, self.parts = family, span, parts
         self.counts, self.rested, self.start, self.branches, self.tolerance = {}, set(), 0.0, (), None
 
-    def first(self, stretch, state):
-        """The first switch within steps as an `End`, or None; `state` gives X from (k, t)."""
-        t, x = self._instants(stretch, state)
+    def first(self, stretch, states, state):
+        """The first switch within steps as an `End`, or None.
+
+        `states` gives X (n_x, N) from steps (N,) and times (N,), where switches are looked for; `state` from (k, t),
+        where one is located.
+        """
+        t, x = self._instants(stretch, states)
         functions, slopes, _ = self.family.values(self.branches, t, x)
         allowed = self.tolerance.of(slopes, x)
         wrong = functions < -allowed
@@ -149,7 +174,7 @@ class Switches:
         Where a function has a least value among three instants, the parabola through them shows whether it comes near
         zero between them; its true minimum decides.
         """
-        if self.parts == 1 or len(t) < 3:
+        if len(t) < 3:
             return None
         before, here, after = functions[:, :-2], functions[:, 1:-1], functions[:, 2:]
         with np.errstate(all="ignore"):
@@ -173,16 +198,17 @@ class Switches:
         found = minimize_scalar(function, bounds=sorted((a, b)), method="bounded", options={"xatol": 1e-9 * abs(b - a)})
         return found.x, found.fun
 
-    def _instants(self, stretch, state):
+    def _instants(self, stretch, states):
         """Instants (N,) and states (n_x, N) at which the functions are evaluated: ends of steps, and parts of them."""
-        if self.parts == 1:
-            return stretch.t, stretch.x
-        inside = np.array([BESIDE_ENDS, *(np.arange(1, self.parts) / self.parts), 1 - BESIDE_ENDS])
-        t, x = [stretch.t[:1]], [stretch.x[:, 0]]
-        for k, (a, b) in enumerate(pairwise(stretch.t)):
-            t += [a + (b - a) * inside, [b]]
-            x += [*(state(k, s) for s in t[-2]), stretch.x[:, k + 1]]
-        return np.concatenate(t), np.array(x).T
+        k, at, _ = net(stretch.t, self.span / RESOLUTION, self.parts)
+        h, every = np.diff(stretch.t), np.arange(len(stretch.t) - 1)
+        beside = np.concatenate([stretch.t[:-1] + BESIDE_ENDS * h, stretch.t[1:] - BESIDE_ENDS * h])
+        k, at = np.concatenate([k, every, every]), np.concatenate([at, beside])
+        order = np.lexsort((at if h[0] > 0 else -at, k))
+        k, at = k[order], at[order]
+        x, last = states(k, at), np.append(k[1:] > k[:-1], True)
+        x[:, last] = stretch.x[:, 1:]
+        return np.append(stretch.t[:1], at), np.column_stack([stretch.x[:, :1], x])
 
     def _root(self, i, a, b, state):
         from scipy.optimize import brentq
@@ -395,9 +421,9 @@ class Watch:
         if self.switches is not None:
             self.switches.start = t
 
-    def switch(self, stretch, state):
-        """The first switch within steps as an `End`, or None."""
-        return None if self.switches is None else self.switches.first(stretch, state)
+    def switch(self, stretch, states, state):
+        """The first switch within steps as an `End`, or None; see `Switches.first`."""
+        return None if self.switches is None else self.switches.first(stretch, states, state)
 
     def left(self, stretch, state, again=None, projected=False):
         """Where a residual leaves its tolerance within steps, as an `End`, or None.
@@ -425,7 +451,7 @@ class Watch:
         if not projected and self.residuals.small(t, x):
             self.tolerance.accept(x)
             return None
-        ends = np.array([stretch.dense(k, stretch.t[k + 1]) for k in range(count)]).T if projected else stretch.x[:, 1:]
+        ends = stretch.dense(np.arange(count), stretch.t[1:]) if projected else stretch.x[:, 1:]
         over = self.residuals.off(np.array([t[:-1], t[1:]]), x[:, :-1], ends[:, picked[1:] - 1])
         for p in np.flatnonzero((over > 0).any(axis=0)):
             for k in range(picked[p], picked[p + 1]):
