@@ -11,7 +11,7 @@ import numpy as np
 from servoctl.methods.monitor import FRACTIONS, DenseStretch, Fine, Repivot
 from servoctl.methods.motion import Stepping
 from servoctl.methods.narrow import arguments, centres
-from servoctl.methods.watch import RESOLUTION, End, net
+from servoctl.methods.watch import RESOLUTION, End, net, steps_of
 
 OFF = 1e3  # times the tolerance, which the equations may add to a step
 REPEATS = 8  # of a step at one instant, after which it is believed
@@ -110,8 +110,8 @@ class BulkSteps(Stepping):
         if steep is not None:
             first = stretch.t[:1], stretch.x[:, :1]
             parts = np.append(first[0], at), np.column_stack([first[1], x])
-            more = centres(steep, self.model.parameters, *parts, lambda s: stretch.dense(stretch.step(s), s))
-            k, at = np.append(k, stretch.step(more)), np.append(at, more)
+            more = centres(steep, self.model.parameters, *parts, lambda s: stretch.dense(steps_of(stretch.t, s), s))
+            k, at = np.append(k, steps_of(stretch.t, more)), np.append(at, more)
             added = stretch.dense(k[len(self.net[0]) :], more)
             x = np.column_stack([x, added])
             rates = np.column_stack([rates, self.f.grid(more, added, self.p)[: self.n_x]])

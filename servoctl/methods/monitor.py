@@ -132,12 +132,6 @@ class Stretch:
         """The last instant before t from which the motion may go on."""
         return self.t[k]
 
-    def step(self, times):
-        """The steps in which times (N,) lie; those of ends of steps are the following ones."""
-        forward = 1.0 if self.t[-1] >= self.t[0] else -1.0
-        k = np.searchsorted(forward * self.t, forward * times, "right") - 1
-        return np.clip(k, 0, len(self.t) - 2)
-
 
 @dataclass(frozen=True)
 class DenseStretch(Stretch):

@@ -87,6 +87,7 @@ class Sundials:
             form = ca.Function("form", [e.q.t, e.state, z, ca.vertcat(e.parameters, *extra)], [e.rates(z), residual])
             rates, rows = form(way[0] + way[1] * t, e.state, z, p)
             self.parts = parts | {"z": z, "ode": way[1] * rates, "alg": rows}
+            self.rates = ca.Function("rates", [e.state, z, parts["p"]], [ca.substitute(way[1] * rates, t, 0.0)])
         else:
             self.parts = parts | {"ode": way[1] * f(way[0] + way[1] * t, e.state, p)[: self.n_x]}
 
@@ -116,6 +117,7 @@ class Sundials:
         inputs = {"x0": x0, "p": p}
         if self.solver == "idas":  # γ^(s̄) starts without a rate, so that no first step would pass a test of its error
             inputs["z0"], options["suppress_algebraic"] = top, True
+            options |= {"calc_ic": False, "init_xdot": self.rates(x0, top, p).full().ravel().tolist()}
         low, high, states, counts = 0, len(t), None, {}
         count = high  # the integrator returns nothing if it fails: bisection finds the last end that it reaches
         while low + 1 < high or states is None:
