@@ -11,6 +11,8 @@ from servoctl.methods.monitor import VANISHING, Fine, Monitor, Repivot
 from servoctl.methods.watch import Watch, edge, no_model, sticks
 from servoctl.reduction.orders import other_order
 
+SAME_INSTANT = 1e-12  # of the time: instants closer than this are one
+BESIDE_KNOTS = 0.1  # of that: how far before and after a knot a piece ends and begins, with all stages on its own side
 ADVICE = "Use a smaller rtol, another method or drift='project', or check whether the program ends or jumps there."
 
 
@@ -79,12 +81,16 @@ def interruptible(motion):
         motion.interrupted = True
 
 
+def margin_at(t):
+    """Distance from an instant [s] within which another is the same."""
+    return SAME_INSTANT * max(1.0, abs(t))
+
+
 def breakpoints(span, knots):
     """The span cut at the knots inside it, in the direction of integration."""
     t0, t1 = span
     low, high = min(span), max(span)
-    margin = 1e-12 * max(1.0, abs(low), abs(high))
-    inside = [k for k in knots if low + margin < k < high - margin]
+    inside = [k for k in knots if low + margin_at(low) < k < high - margin_at(high)]
     return [t0, *(inside if t1 >= t0 else reversed(inside)), t1]
 
 
@@ -140,6 +146,7 @@ class Stepping:
     tolerances = None  # rtol and atol; None for steps of fixed length
     parts = 8  # of a step, at whose ends switching functions are evaluated; 1 where steps are short
     projects = False  # whether ends of steps are projected before they are inspected
+    knots = frozenset()  # inside the span
     again = None  # shorter equal steps, where steps are of fixed length
 
     def __init__(self, model, method, drift, progress):
@@ -175,12 +182,18 @@ class Stepping:
         with interruptible(self.motion):
             self._watch(t0, x0, t1)
             t, x, cuts = t0, x0, breakpoints((t0, t1), knots)
+            self.knots = {c for c in cuts if any(abs(c - k) <= margin_at(c) for k in knots)}
             self._start(t, x, cuts[1])
             for b in cuts[1:]:
                 while t != b and self.motion.stop is None:
                     due = (t_eval >= min(t, b)) & (t_eval <= max(t, b)) & ((t_eval != t) | (t == t0))
                     t, x = self._piece(t, x, b, t_eval[due])
         return self.motion
+
+    def _beside(self, a, b):
+        """The ends of a piece, moved inwards where they are knots: on a knot a jump has the value beyond, or before."""
+        forward = np.copysign(BESIDE_KNOTS, b - a)
+        return a + forward * margin_at(a) * (a in self.knots), b - forward * margin_at(b) * (b in self.knots)
 
     def _watch(self, t, x, t1):
         """Watch for the ends of smooth pieces, from the start on."""

@@ -326,7 +326,9 @@ class RadauSteps(BulkSteps):
         self.h = abs(h)
 
     def _steps(self, t, x, b):
-        t, x, z, self.h, counts = radau_steps(self.f, t, x, b, self.p, self.h, self.settings, self.most)
+        first, last = self._beside(t, b)
+        times, x, z, self.h, counts = radau_steps(self.f, first, x, last, self.p, self.h, self.settings, self.most)
+        t = np.concatenate([[t], times[1:-1], [b if times[-1] == last else times[-1]]])[: len(times)]
         self.motion.count(steps=len(z), **dict(zip(("rejected", "nfev", "njev", "nlu"), counts, strict=True)))
         if self.every:
             self.motion.count(projections=len(z) // self.every)

@@ -82,6 +82,8 @@ class RungeKuttaSteps(Stepping):
 
     def _piece(self, a, x, b, times):
         h, count = equal_steps(a, b, self.step)
+        first, last = self._beside(a, b)
+        inner = (last - first) / count
         # each call ends with a projection where steps are projected, so that the next one counts from there
         most = self.most - self.most % self.every if 0 < self.every < self.most else self.every or self.most
         most, done = self.most_in_python if self.sizes else most, 0
@@ -89,7 +91,7 @@ class RungeKuttaSteps(Stepping):
         self.watch.begin(a)
         while done < count and self.motion.stop is None:
             steps = min(most, count - done)
-            states, pivots = self._steps(a + done * h, x, h, steps)
+            states, pivots = self._steps(first + done * inner, x, inner, steps)
             t = a + (done + np.arange(states.shape[1])) * h
             outcome = self._inspect(t, states, pivots)
             good = outcome.steps

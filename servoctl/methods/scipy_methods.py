@@ -81,7 +81,7 @@ class ScipySteps(BulkSteps):
         name = f"{self.f.name}_jacobian"
         self.slopes = model.function(name) if self.method in IMPLICIT else None
         self.projection = model.function("ode_projected") if self.projects else None
-        self.solver, self.first = None, {}
+        self.solver = None
 
     def _rates(self, t, x):
         return self.f(t, x, self.p)[: self.n_x]
@@ -90,7 +90,7 @@ class ScipySteps(BulkSteps):
         return self.slopes(t, x, self.p).reshape(self.n_x, self.n_x).T
 
     def _begin(self, a, x, b):
-        self.solver, self.first, self.most = None, {}, 1
+        self.solver, self.most = None, 1
         self.taken, self.mark = 0, a
 
     def _retake(self, h):
@@ -111,13 +111,13 @@ class ScipySteps(BulkSteps):
 
     def _continued(self, t, x, b):
         """The solver that goes on from t, X = x towards b."""
-        s = self.solver
-        if s is None or s.status != "running" or s.t != t or s.t_bound != b or not np.array_equal(s.y, x):
-            self.solver = self._solver(t, x, b)
+        (first, last), s = self._beside(t, b), self.solver
+        if s is None or s.status != "running" or s.t != first or s.t_bound != last or not np.array_equal(s.y, x):
+            self.solver, self.counted = self._solver(first, x, last), np.zeros(4, dtype=int)
         return self.solver
 
     def _steps(self, t, x, b):
-        solver, before, self.failure = self._continued(t, x, b), self._work(), ""
+        solver, self.failure = self._continued(t, x, b), ""
         t, x, dense = [t], [solver.y.copy()], []
         while solver.status == "running" and len(dense) < self.most:
             message = _step(solver)
@@ -127,10 +127,10 @@ class ScipySteps(BulkSteps):
             dense.append(solver.dense_output())
             if self.projects and ((self.taken + len(dense)) % self.drift.every == 0 or solver.status == "finished"):
                 self._project()
-            t.append(solver.t)
+            t.append(b if solver.t == solver.t_bound else solver.t)
             x.append(solver.y.copy())
         self.most = min(2 * self.most, AT_ONCE) if self.sizes is None else 1
-        self._count(before, len(dense))
+        self._count(len(dense))
         if not self.failure and self._creeps(len(dense)):
             self.failure = "its steps shrink"
         return Steps(np.array(t), np.array(x).T, bool(self.failure), dense)
@@ -159,8 +159,9 @@ class ScipySteps(BulkSteps):
         s = self.solver
         return np.array([*s.work, s.changes] if self.sizes is not None else [s.nfev, s.njev, s.nlu, 0])
 
-    def _count(self, before, steps):
-        nfev, njev, nlu, changes = self._work() - before
+    def _count(self, steps):
+        before, self.counted = self.counted, self._work()
+        nfev, njev, nlu, changes = self.counted - before
         self.motion.count(steps=steps, nfev=nfev, njev=njev, nlu=nlu)
         if self.sizes is not None:
             self.motion.counters["integrated"] = len(self.solver.chart.free)

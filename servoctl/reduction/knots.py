@@ -156,6 +156,7 @@ class Switches:
                 return float(sides(np.array([t]))[s][0])
 
             decided = np.flatnonzero(g != 0)
+            instants |= {float(end) for end, value in zip(grid[[0, -1]], g[[0, -1]], strict=True) if value == 0}
             t, g = grid[decided], g[decided].astype(float)
             pairs = [(t[i], t[i + 1], g[i]) for i in np.flatnonzero(g[:-1] * g[1:] < 0)]
             for i in np.flatnonzero(_grazes(t, g)):
