@@ -199,7 +199,7 @@ class Stepping:
         """Watch for the ends of smooth pieces, from the start on."""
         exact = isinstance(self.drift, MinimalCoordinates)
         self.watch = Watch(self.tolerances, abs(t1 - t), self.family, exact, self.parts)
-        self.watch.advice = self.advice if self.tolerances is None else ADVICE
+        self.watch.method, self.watch.advice = self.method, self.advice if self.tolerances is None else ADVICE
         branches = () if self.family is None else self.family.branches(t, x)
         self.watch.use(self.model, branches, self._error_dynamics())
 

@@ -11,7 +11,7 @@ import numpy as np
 from servoctl.codegen.function import compiled
 from servoctl.jets.branches import steep_arguments
 
-REFINEMENTS = 4  # of a zero between two instants, by the secant; to 1e-8 of their distance where arguments are smooth
+SECANTS = 4  # of a zero between two instants, by the secant; to 1e-8 of their distance where arguments are smooth
 
 
 def arguments(model):
@@ -74,7 +74,7 @@ def centres(f, p, t, x, dense):
 def _zeros(function, a, b, left, right):
     """Zeros of functions between a and b (M,), where they have values of opposite signs, by the Illinois method."""
     s = a
-    for _ in range(REFINEMENTS if len(a) else 0):
+    for _ in range(SECANTS if len(a) else 0):
         s = b - right * (b - a) / (right - left)
         s = np.where(np.isfinite(s), s, (a + b) / 2)
         value = function(s)

@@ -343,8 +343,11 @@ class Residuals:
             over = np.abs(residuals) - limit - self.coarse[:, None]
         return np.where(np.isnan(residuals), np.inf, np.nan_to_num(over, nan=-1.0, posinf=np.inf, neginf=-1.0))
 
-    def error(self, t, x, over, advice):
-        """The error of the residual that is farthest beyond what it may be at t, X = x; `advice` where why is open."""
+    def error(self, t, x, over, step, advice):
+        """The error of the residual that is farthest beyond what it may be at t, X = x, in a `step`, in words.
+
+        `advice` is for where why is open.
+        """
         values, allowed = (part[:, 0] for part in self.values(np.array([t]), x[:, None]))
         worst = int(np.argmax(np.where(over > 0, over / np.maximum(allowed, TINY), -1.0)))
         name, value = self.names[worst], float(values[worst])
@@ -352,7 +355,7 @@ class Residuals:
         what = f"The residual {name!r}" if row is None else f"The rate {name} of the residual {row.name!r}"
         why = edge(self.model, t, x)
         return IntegrationStopped(
-            f"{what} leaves zero at t = {t:.7g} s, to {value:.3g} within a step{why and f': {why}'}.",
+            f"{what} leaves zero at t = {t:.7g} s, to {value:.3g} within a step {step}{why and f': {why}'}.",
             f"The tolerances of the method allow it {allowed[worst]:.1e}; beyond, this is no motion of the program.",
             do=f"{END_BEFORE if why else advice} The run before this instant is in .run.",
             t=t,
@@ -402,7 +405,7 @@ class Watch:
         self.tolerances, self.family, self.exact = tolerances or DEFAULT, family, exact
         self.switches = None if family is None else Switches(family, span, parts)
         self.model = self.tolerance = None
-        self.advice = ""
+        self.method, self.advice = "", ""
 
     def use(self, model, branches, coefficients=()):
         """Watch the motion of a model, which is the one for these branches."""
@@ -500,7 +503,9 @@ class Watch:
         for _ in range(LOCATED):
             middle = (low + high) / 2
             low, high = (low, middle) if np.any(off(middle) > 0) else (middle, high)
-        return End(k, float(low), at(low), error=self.residuals.error(float(high), at(high), off(high), self.advice))
+        step = f"of {abs(t[1] - t[0]):.3g} s by {self.method}"
+        error = self.residuals.error(float(high), at(high), off(high), step, self.advice)
+        return End(k, float(low), at(low), error=error)
 
     def jump(self, model, end):
         """The error of a residual, or derivative of one, that jumps at a switch to another model; None if none does."""
