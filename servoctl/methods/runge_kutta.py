@@ -7,7 +7,7 @@ from servoctl.methods.choice import ORDERS, MinimalCoordinates, Project
 from servoctl.methods.minimal import Chart, Sizes
 from servoctl.methods.monitor import DEGRADED, Fine, Singular, Stretch
 from servoctl.methods.motion import Cubics, Stepping, equal_steps
-from servoctl.methods.watch import End
+from servoctl.methods.watch import FINER, End
 
 NEARLY_ZERO = 0.3  # of its reference: below this a pivot's least size is searched for within steps
 
@@ -138,6 +138,10 @@ class RungeKuttaSteps(Stepping):
     def _inspect(self, t, states, pivots):
         """The monitor's outcome; a step across a pivot's zero has passed no error test and is repeated."""
         outcome = self._inspected(Stretch(t, states, pivots[:, 1:, None], self._top))
+        if (self.sizes or self.every) and outcome.steps:
+            first = slice(outcome.steps + 1)
+            torn = self.watch.torn(t[first], states[:, first], self._all_rates(t[first], states[:, first]), self._finer)
+            outcome = outcome if torn is None else torn
         if self.sizes and len(t) > 1 and len(pivots):
             touched = self._touched(t, states, pivots)
             if touched is not None and touched.steps <= outcome.steps + 1:
@@ -156,6 +160,15 @@ class RungeKuttaSteps(Stepping):
     def again(self, t, x, h, count):
         """States (n_x, count + 1) at the ends of equal steps from t; fewer if one fails."""
         return self._steps(t, x, h, count)[0]
+
+    def _all_rates(self, t, states):
+        return self.f.grid(t, states, self.p)[: self.n_x]
+
+    def _finer(self, t, x, end):
+        """Instants, states and rates of shorter steps."""
+        states = self._steps(t, x, (end - t) / FINER, FINER)[0]
+        times = np.linspace(t, end, FINER + 1)[: states.shape[1]]
+        return times, states, self._all_rates(times, states)
 
     def _touched(self, t, states, pivots):
         """Singular if a pivot touches zero within a step, else None.

@@ -28,6 +28,7 @@ FINER = 16  # equal steps in place of one of fixed length that errs by far
 REMAINS = 0.75  # of its error in these: it is a jump, since other errors shrink, at least to a half with each halving
 LEARNED = 10.0  # times the error of a step of fixed length, which later ones may have
 MOST_INSPECTED = 128  # steps of a stretch whose residuals are evaluated
+LOCATED_BY_PARTS = 8  # divisions into `FINER` parts that locate where states jump
 LOCATED = 40  # halvings of a step that locate where a residual leaves: all digits
 EDGE = 1e-3  # distance of a function's argument from the edge of its domain that explains why a residual leaves
 AT_ONCE = 1e-9  # of the span: switches closer than this follow at once
@@ -109,6 +110,10 @@ class Tolerance:
     def of(self, slopes, x):
         """Tolerances (m, N) of functions with derivatives (m, n_x, N) in X = x (n_x, N) along the motion."""
         return np.einsum("mxn,xn->mn", np.abs(slopes), self.atol + self.rtol * self._sizes(x))
+
+    def of_states(self, x):
+        """Tolerances (n_x, N) of states X (n_x, N) along the motion."""
+        return self.atol + self.rtol * self._sizes(x)
 
     def accept(self, x):
         """Take in states (n_x, N) as part of the motion."""
@@ -404,13 +409,14 @@ class Watch:
         self.span = span
         self.tolerances, self.family, self.exact = tolerances or DEFAULT, family, exact
         self.switches = None if family is None else Switches(family, span, parts)
-        self.model = self.tolerance = None
+        self.model = self.tolerance = self.rough = None
         self.method, self.advice = "", ""
 
     def use(self, model, branches, coefficients=()):
         """Watch the motion of a model, which is the one for these branches."""
         if self.tolerance is None:
             self.tolerance = Tolerance(model, *self.tolerances)
+            self.rough = np.zeros(len(model.state_names))
         self.model, tolerance = model, self.tolerance
         self.residuals = None if self.exact else Residuals(model, tolerance, coefficients)
         if self.switches is not None:
@@ -472,6 +478,51 @@ class Watch:
         self.tolerance.accept(x)
         self.residuals.accept()
         return None
+
+    def torn(self, t, x, rates, finer):
+        """Where states that are solved for, or projected, jump although their rates do not, as an `End`, or None.
+
+        Parameters
+        ----------
+        t : (S + 1,) array
+            [s]
+        x, rates : (n_x, S + 1) arrays
+            States, and X' there.
+        finer : callable
+            The same (t, x, rates) at more instants from (t0, x0, t1).
+        """
+        beyond = self._beyond_rates(t, x, rates)
+        for k in np.flatnonzero((beyond > self.rough[:, None]).any(axis=0)):
+            i = int(np.argmax(beyond[:, k] - self.rough))
+            height, place = beyond[i, k], (t[k], x[:, k], t[k + 1])
+            for _ in range(LOCATED_BY_PARTS):
+                parts = finer(*place)
+                within = self._beyond_rates(*parts)[i]
+                j = int(np.argmax(within))
+                if not within[j] > REMAINS * height:
+                    self.rough[i] = max(self.rough[i], LEARNED * height)
+                    break
+                place = parts[0][j], parts[1][:, j], parts[0][j + 1]
+            else:
+                return self._torn_at(k, t[k + 1] - t[k], parts[2][:, j], *place)
+        return None
+
+    def _beyond_rates(self, t, x, rates):
+        """How much more states change from instant to instant than their rates there explain, (n_x, S)."""
+        h = np.diff(t)
+        with np.errstate(all="ignore"):
+            change = np.abs(np.diff(x) - h * (rates[:, 1:] + rates[:, :-1]) / 2)
+            beyond = change - np.abs(h * np.diff(rates)) - LEAVES * self.tolerance.of_states(x)[:, 1:]
+        return np.nan_to_num(beyond, nan=-1.0, posinf=-1.0, neginf=-1.0)
+
+    def _torn_at(self, k, h, rates, t, x, after):
+        """The end at t, X = x, before a jump of the states; carried over it, they leave a residual."""
+        carried, residuals = x + (after - t) * rates, Residuals(self.model, self.tolerance)
+        values, allowed = residuals.values(np.array([after]), carried[:, None])
+        over = (np.abs(values) - allowed)[:, 0]
+        step = f"of {abs(h):.3g} s by {self.method}"
+        error = residuals.error(float(after), carried, np.where(over > 0, over, 0.0), step, self.advice)
+        return End(k, float(t), x, error=error)
 
     def _off(self, t, before, after):
         return self.residuals.off(t[:, None], before[:, None], after[:, None])[:, 0]
