@@ -290,6 +290,8 @@ def test_coarse_steps_are_no_jump():
     for order, step in ((1, 1e-3), (2, 0.02), (4, 0.2)):
         run = sv.simulate(model, start, (0.0, 6.0), sv.RungeKutta(order, step=step))
         assert run.success and np.abs(run.residual["p"][0]).max() > 1e-6
+        for drift in ("project", sv.Project(5), "minimal"):
+            assert sv.simulate(model, start, (0.0, 6.0), sv.RungeKutta(order, step=step), drift=drift).success
 
 
 def test_a_first_step_as_long_as_the_span_is_not_believed(gallery_model):

@@ -165,7 +165,8 @@ class RungeKuttaSteps(Stepping):
         return self.f.grid(t, states, self.p)[: self.n_x]
 
     def _finer(self, t, x, end):
-        """Instants, states and rates of shorter steps."""
+        """Instants, states and rates of shorter steps; what a state has drifted since its projection is no jump."""
+        x = self.f.restore(t, x, self.p) if self.every else x
         states = self._steps(t, x, (end - t) / FINER, FINER)[0]
         times = np.linspace(t, end, FINER + 1)[: states.shape[1]]
         return times, states, self._all_rates(times, states)

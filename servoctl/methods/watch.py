@@ -504,7 +504,9 @@ class Watch:
                     break
                 place = parts[0][j], parts[1][:, j], parts[0][j + 1]
             else:
-                return self._torn_at(k, t[k + 1] - t[k], parts[2][:, j], *place)
+                end = self._torn_at(k, t[k + 1] - t[k], parts[2][:, j], *place)
+                if end is not None:
+                    return end
         return None
 
     def _beyond_rates(self, t, x, rates):
@@ -516,12 +518,14 @@ class Watch:
         return np.nan_to_num(beyond, nan=-1.0, posinf=-1.0, neginf=-1.0)
 
     def _torn_at(self, k, h, rates, t, x, after):
-        """The end at t, X = x, before a jump of the states; carried over it, they leave a residual."""
+        """The end at t, X = x, before a jump of the states; None if they leave no residual, carried over it."""
         carried, residuals = x + (after - t) * rates, Residuals(self.model, self.tolerance)
         values, allowed = residuals.values(np.array([after]), carried[:, None])
         over = (np.abs(values) - allowed)[:, 0]
+        if not np.any(over > 0):
+            return None
         step = f"of {abs(h):.3g} s by {self.method}"
-        error = residuals.error(float(after), carried, np.where(over > 0, over, 0.0), step, self.advice)
+        error = residuals.error(float(after), carried, over, step, self.advice)
         return End(k, float(t), x, error=error)
 
     def _off(self, t, before, after):
