@@ -31,6 +31,10 @@ from servoctl.errors import (
 )
 from servoctl.export.c import export_c
 from servoctl.internal_dynamics import InternalDynamics, internal_dynamics
+from servoctl.inversion.choice import inverse
+from servoctl.inversion.output import MinimumPhase, minimum_phase
+from servoctl.inversion.relaxed import relaxed
+from servoctl.inversion.report import Report, report
 from servoctl.methods.choice import (
     Adaptive,
     Algebraic,
@@ -43,10 +47,12 @@ from servoctl.methods.choice import (
     Sundials,
     Taylor,
 )
+from servoctl.methods.events import Event
 from servoctl.methods.stability import sampled_bound
 from servoctl.model.model import Model, derive
 from servoctl.plants.plant import Plant, plant
 from servoctl.run import Run, load
+from servoctl.sensitivities.sensitivity import Sensitivity, sensitivity
 from servoctl.simulation import simulate
 from servoctl.spec import (
     Coordinates,
@@ -78,6 +84,7 @@ __all__ = [
     "Closed",
     "Controller",
     "Coordinates",
+    "Event",
     "InconsistentStart",
     "IntegrationStopped",
     "InternalDynamics",
@@ -86,6 +93,7 @@ __all__ = [
     "LimitReport",
     "Mechanism",
     "MinimalCoordinates",
+    "MinimumPhase",
     "Model",
     "NameUnknown",
     "NotRealisable",
@@ -95,8 +103,10 @@ __all__ = [
     "Program",
     "Project",
     "RadauIIA",
+    "Report",
     "Run",
     "RungeKutta",
+    "Sensitivity",
     "Sensors",
     "ServoError",
     "SingularProgram",
@@ -124,12 +134,14 @@ __all__ = [
     "grid",
     "internal_dynamics",
     "interop",
+    "inverse",
     "limit_report",
     "limited",
     "load",
     "load_study",
     "lqr",
     "merge",
+    "minimum_phase",
     "monte_carlo",
     "output_feedback",
     "parameters",
@@ -138,8 +150,11 @@ __all__ = [
     "pd",
     "plant",
     "plots",
+    "relaxed",
+    "report",
     "rigid_body",
     "sampled_bound",
+    "sensitivity",
     "simulate",
     "spec",
     "stability",

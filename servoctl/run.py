@@ -58,7 +58,7 @@ class Run(ByName, Value):
         nfev, njev, nlu, steps, iterations, projections, pivot_changes, as the method counts them.
     success : bool
     status : int
-        0 finished, 1 interrupted, -1 stopped.
+        0 finished, 1 ended by an event, or interrupted (then without success), -1 stopped.
     message : str
         Whether the run finished, and if not, why.
     variants : tuple of (first, last + 1, model)
@@ -66,6 +66,9 @@ class Run(ByName, Value):
     internal : dict
         The verdict on the internal dynamics along the run (`InternalDynamics.facts`); empty for flat programs and
         for plants under inputs.
+    events : dict of str to Run
+        The motion at the instants of each event: `run.events["slack"].t` are its times [s],
+        `run.events["slack"]["theta"]` the values of a signal there.
     start : State or None
         From which the motion was computed. It also says which branch of its solutions a flat program follows:
         `simulate(model, run.start, ...)` repeats it.
@@ -87,6 +90,7 @@ class Run(ByName, Value):
     stored_residual: dict = field(default_factory=dict, compare=False)
     internal: dict = field(default_factory=dict)
     start: State | None = None
+    events: dict = field(default_factory=dict)
 
     def __eq__(self, other):
         if not super().__eq__(other):
@@ -146,7 +150,10 @@ class Run(ByName, Value):
         parts = []
         for first, end, model in self.variants or ((0, len(self.t), self.model),):
             names, f = model.signals(kind, rate)
-            if f.n_x > len(self.jets):
+            jets = self.jets[: f.n_x, first:end]
+            if f.n_x > len(jets) and not rate:  # outputs of higher order than the motion
+                jets = model.extended(self.t[first:end], jets, f.n_x)
+            if f.n_x > len(jets):
                 present, needed = ((size - model.nq) // model.n for size in (len(self.jets), f.n_x))
                 raise SpecificationError(
                     f"The run has jets up to order {present}, too few for {', '.join(names)}.",
@@ -155,7 +162,7 @@ class Run(ByName, Value):
                     names=names,
                     jets=needed,
                 )
-            parts.append(f.grid(self.t[first:end], self.jets[: f.n_x, first:end], model.parameters))
+            parts.append(f.grid(self.t[first:end], jets, model.parameters))
         return names, np.concatenate(parts, axis=1)
 
     def variant(self, i: int):
@@ -167,6 +174,11 @@ class Run(ByName, Value):
     def residual(self) -> Mapping[str, np.ndarray]:
         """Residuals of every constraint at every level: a mapping of names to (levels, N) arrays."""
         return _Residuals(self)
+
+    @property
+    def t_events(self) -> dict[str, np.ndarray]:
+        """Instants of the events by name, (K,) arrays [s]."""
+        return {name: at.t for name, at in self.events.items()}
 
     def state(self, t: float) -> np.ndarray:
         """The state (q, γ') of the mechanism at an instant, between samples by Hermite interpolation.
@@ -315,6 +327,9 @@ class Run(ByName, Value):
         facts |= {"start": _facts_of_start(self.start)} | ({} if self.model is None else _facts_of_model(self))
         arrays = {"t": self.t, "jets": self.jets} | {f"signal_{i}": self[name] for i, name in enumerate(signals)}
         arrays |= {f"residual_{i}": self.residual[name] for i, name in enumerate(self.residual)}
+        facts["events"] = list(self.events)
+        for i, at in enumerate(self.events.values()):
+            arrays |= {f"event_{i}": at.t, f"event_jets_{i}": at.jets}
         return archive.save(path, "run", facts, arrays)
 
     def to_xarray(self):
@@ -341,6 +356,8 @@ class Run(ByName, Value):
             f"  method {self.method}" + (f", drift: {self.drift}" if self.drift else ""),
             "  " + ", ".join(f"{name} {count}" for name, count in self.counters.items() if count),
             "  " + self.internal.get("text", ""),
+            "  events: " * bool(self.events)
+            + "; ".join(f"{name} {_times_in_words(t)}" for name, t in self.t_events.items()),
         ]
         if shown:
             lines.append("  largest residuals over all levels: " + ", ".join(f"{n} {worst[n]:.1e}" for n in shown))
@@ -353,6 +370,12 @@ class Run(ByName, Value):
             (t_low, low), (t_high, high) = self.extrema(name)
             lines.append(f"  {name}: {low:.6g} (t = {t_low:.4g} s) .. {high:.6g} (t = {t_high:.4g} s)")
         return "\n".join(line for line in lines if line.strip())
+
+
+def _times_in_words(t):
+    """The first instants of an event in words."""
+    shown = ", ".join(f"{s:.7g}" for s in t[:4])
+    return f"at t = {shown} s" + (f" and {len(t) - 4} more" if len(t) > 4 else "") if len(t) else "never"
 
 
 def _split(name):
@@ -445,7 +468,15 @@ def _from_archive(facts, arrays):
         values, lists = start["values"], {name: tuple(start[name]) for name in ("held", "free")}
         start = State(start["t"], np.array([*values.values()]), tuple(values), residual=start["residual"], **lists)
     own = {name: tuple(facts[name]) if kind is list else facts[name] for name, kind in FACTS.items()}
-    return Run(t, jets, stored=signals, stored_residual=residuals, start=start, **own), facts
+    events = {name: _event_at(arrays, i, own["jet_names"]) for i, name in enumerate(archive.named(facts["events"]))}
+    return Run(t, jets, stored=signals, stored_residual=residuals, start=start, events=events, **own), facts
+
+
+def _event_at(arrays, i, names):
+    """The motion at the instants of the i-th event of an archive."""
+    t = archive.numbers(arrays, f"event_{i}", None)
+    jets = archive.numbers(arrays, f"event_jets_{i}", None, len(t))
+    return Run(t, jets, names[: len(jets)])
 
 
 def _of_model(run, facts, model):
@@ -465,7 +496,8 @@ def _of_model(run, facts, model):
     if run.jet_names != names or list(run.residual) != list(model.residual_names):
         raise _other_model("names", [*run.jet_names, *run.residual])
     variants = tuple((first, end, on_side(model, tuple(b)).at(place)) for first, end, place, b in facts["variants"])
-    full = replace(run, model=model, variants=variants, stored={}, stored_residual={})
+    events = {name: replace(at, model=model) for name, at in run.events.items()}
+    full = replace(run, model=model, variants=variants, events=events, stored={}, stored_residual={})
     for of_file, of_model, what in ((run.stored, full, "signals"), (run.stored_residual, full.residual, "residuals")):
         differing = [name for name, values in of_file.items() if not _agree(values, of_model[name])]
         if differing:

@@ -30,6 +30,7 @@ from servoctl.methods.choice import (
     default_method,
     require_combination,
 )
+from servoctl.methods.events import Event, Events, as_events, occurrences
 from servoctl.methods.orders import end_at_other_orders
 from servoctl.methods.radau import RadauSteps
 from servoctl.methods.runge_kutta import ORDERS, RungeKuttaSteps
@@ -62,6 +63,7 @@ def simulate(
     drift: Project | Poles | MinimalCoordinates | str | float | None = None,
     accuracy: float | None = None,
     t_eval: ArrayLike | None = None,
+    events: Mapping[str, object] | Sequence[object] | Event | Callable[..., float] | str | None = None,
     progress: bool | Callable[[float], object] | None = None,
 ) -> Run:
     """Simulate the motion that a program prescribes, or that of a plant under inputs.
@@ -95,6 +97,10 @@ def simulate(
         of `q.t`. They act at once, within the plant's limits of magnitude.
     t_eval : (N,) array, optional
         Times of the samples [s], within t_span. Default: 1001 instants and the knots; all steps of `RungeKutta`.
+    events : Event, dict of str to Event, or a sequence, optional
+        Signals whose crossings are located, such as `{"slack": sv.Event("tension", terminal=True, direction=-1)}`. A
+        terminal event ends the motion: it is the last sample, `status` is 1 and `message` names it. Names of signals
+        stand for their zeros; functions event(t, x) may have SciPy's attributes `terminal` and `direction`.
     progress : bool or callable, optional
         Whether to show a bar; default: on a terminal, after a second. A callable receives the time reached [s]; an
         exception that it raises ends the simulation.
@@ -122,8 +128,11 @@ def simulate(
         own = np.linspace(*span, DEFAULT_SAMPLES)
         dense = None if _fixed_steps(method) else times if len(times) >= len(own) else np.union1d(times, own)
 
+    events = as_events(events)
+
     def attempt(method, drift, t_span=span, times=dense):
-        return simulated(model, start, t_span, method, drift=drift, t_eval=times, progress=progress)
+        of_span = events if t_span is span else {}
+        return simulated(model, start, t_span, method, drift=drift, t_eval=times, events=of_span, progress=progress)
 
     try:
         if accuracy is None:
@@ -149,13 +158,13 @@ def _sampled(run, times):
     if run.method in ORDERS:
         return _resample(run, times)
     picked = np.isin(run.t, times)
-    picked[-1] |= run.status < 0 or not picked.any()
+    picked[-1] |= run.status != 0 or not picked.any()
     index = np.append(0, np.cumsum(picked))
     variants = tuple((int(index[a]), int(index[b]), v) for a, b, v in run.variants if index[b] > index[a])
     return replace(run, t=run.t[picked], jets=run.jets[:, picked], variants=variants)
 
 
-def simulated(model, start, t_span, method=None, *, drift=None, t_eval=None, progress=None):
+def simulated(model, start, t_span, method=None, *, drift=None, t_eval=None, events=None, progress=None):
     """The run of `simulate`, without a verdict on its internal dynamics."""
     span = t0, t1 = as_span(t_span)
     method = default_method(model) if method is None else as_method(method)
@@ -173,10 +182,10 @@ def simulated(model, start, t_span, method=None, *, drift=None, t_eval=None, pro
     try:
         default = getattr(method, "atol", 0.0) is None
         first = large_tolerances(model, span, x0) if default else None
-        motion = _motion(model, method, drift, (t0, x0, t1, times, knots), bar, first)
+        motion = _motion(model, method, drift, (t0, x0, t1, times, knots, events), bar, first)
         tolerances = _smaller_tolerances(model, method, motion)
         if tolerances is not None:
-            again = _motion(model, method, drift, (t0, x0, t1, times, knots), bar, tolerances)
+            again = _motion(model, method, drift, (t0, x0, t1, times, knots, events), bar, tolerances)
             motion = again if again.stop is None or motion.stop is not None else motion
     finally:
         bar.close()
@@ -242,21 +251,31 @@ def _model_and_start(model, start, inputs):
 
 
 def _motion(model, method, drift, problem, bar, atol=None):
-    """Integrate (t0, x0, t1, times, knots) by a method; samples are taken at the times (N,), by `RungeKutta` at steps.
+    """Integrate (t0, x0, t1, times, knots, events) by a method; samples are taken at the times (N,), or at all steps.
 
     `atol` (n_x,) replaces the default of the method.
     """
-    t0, x0, t1, times, knots = problem
+    t0, x0, t1, times, knots, events = problem
+    watched = None if times is None or not events else Events(events, model, times)
     if isinstance(method, Algebraic):
-        return algebraic(model, (t0, t1), x0, times, knots, bar)
+        return _with_events(algebraic(model, (t0, t1), x0, times, knots, bar, watched), watched)
     if isinstance(method, Bounded):
-        return bounded(model, (t0, t1), x0, method, (times, knots), bar)
+        watched = Events(events, model, np.zeros(0)) if events else None
+        return _with_events(bounded(model, (t0, t1), x0, method, (times, knots), bar, watched), watched)
     family = switching(model)
     if family is not None:
         model = family.at(family.branches(t0, x0))
     stepping = _stepping(model, method, drift, (t0, t1), bar, atol)
-    stepping.family = family
-    return run_checked(stepping, *problem) if stepping.tolerances is None else stepping.run(*problem)
+    stepping.family, stepping.events = family, watched
+    motion = run_checked(stepping, *problem[:5]) if stepping.tolerances is None else stepping.run(*problem[:5])
+    return _with_events(motion, watched)
+
+
+def _with_events(motion, events):
+    """The motion with the occurrences of its events up to its end."""
+    if events is not None and motion.pieces:
+        motion.occurrences = events.until(motion.pieces[-1][1][-1])
+    return motion
 
 
 def _stepping(model, method, drift, span, bar, atol):
@@ -298,11 +317,15 @@ def _run(model, motion, method, drift, knots, span):
         status, message = -1, f"stopped: {str(motion.stop).split('. ')[0]}"
     elif motion.interrupted:
         status, message = 1, f"interrupted at {last} of {span[2]:g} s; what was computed is kept"
+    elif motion.ended:
+        status, message = 1, f"ended by the event {motion.ended!r} at t = {t[-1]:.9g} s"
     else:
         status, message = 0, f"finished; {motion.note}" if motion.note else "finished"
     facts = {"method": str(method), "drift": str(drift or ""), "counters": motion.counters}
     facts["knots"] = tuple(sorted({*knots, *motion.switches}))
-    facts |= {"success": status == 0, "status": status, "message": message, "variants": tuple(variants)}
+    facts["events"] = occurrences(motion.occurrences, model.names_to)
+    facts |= {"success": status == 0 or bool(motion.ended), "status": status, "message": message}
+    facts["variants"] = tuple(variants)
     return Run(t, jets, model.names_to(len(jets)), model, **facts)
 
 
@@ -311,6 +334,8 @@ def _resample(run, times):
     direction = np.sign(run.t[-1] - run.t[0]) or 1.0
     low, high = min(run.t[0], run.t[-1]), max(run.t[0], run.t[-1])
     times = times[(times >= low) & (times <= high)]
+    if run.status == 1 and run.t[-1] not in times:  # at the event that ends it
+        times = np.append(times, run.t[-1])
     steps = np.searchsorted(direction * run.t, direction * times - SAME_TIME * (1 + abs(high - low)))
     jets = np.array([run.at(t) for t in times]).T.reshape(len(run.jets), len(times))
     variants = []

@@ -164,6 +164,57 @@ def test_a_law_follows_the_bounded_plan():
     assert np.abs(angle - planned).max() < 1e-5 * pi / 2
 
 
+@pytest.fixture(scope="module")
+def arm_plan():
+    """The bounded motion of the passive arm, with the rests before and after it."""
+    model = arm(0.5)
+    return sv.simulate(model, model.start(), (0.0, 2.0), sv.Bounded(15.0))
+
+
+def test_feedforward_of_a_bounded_plan_holds_as_long_as_errors_are_small(arm_plan):
+    """Errors of the hold grow like e^(9.55 t): the law is the plan's input at mid-sample."""
+    plant = sv.plant(arm_plan.model.reduction.mechanism)
+    law = sv.feedforward(arm_plan, plant, rate=1000.0)
+    run = sv.close(plant, law, arm_plan.state(arm_plan.t[0]), (arm_plan.t[0], 0.5))
+    assert abs(run["q2"][-1] - arm_plan.state(0.5)[1]) < 1e-3
+    k = 600
+    middle = arm_plan.t[0] + (k + 0.5) * 1e-3
+    assert run.input["torque"][k] == pytest.approx(np.interp(middle, arm_plan.t, arm_plan["torque"]), abs=1e-2)
+
+
+def test_a_law_of_a_bounded_plan_in_c_and_under_limits(arm_plan, tmp_path):
+    plant = sv.plant(arm_plan.model.reduction.mechanism, limits={"torque": 60.0})
+    law = sv.lqr(arm_plan, plant, rate=100.0)
+    assert [file.name for file in sv.export_c(law, tmp_path)] == ["law.c", "law.h"]
+    span = (arm_plan.t[0], arm_plan.t[0] + 5.0)
+    run = sv.close(plant, sv.limited(law, plant), arm_plan.state(span[0]), span)
+    assert np.abs(run.input["torque"]).max() < 60.0 and not sv.limit_report(run).rows
+
+
+def test_a_bounded_plan_in_files_verdicts_and_loops_of_many_cases(arm_plan, tmp_path):
+    assert sv.load(arm_plan.save(tmp_path / "plan"), arm_plan.model) == arm_plan
+    assert sv.internal_dynamics(arm_plan.model, arm_plan).verdict == "unstable"  # open loop, and the plan is exact
+    plant = sv.plant(arm_plan.model.reduction.mechanism)
+    law = sv.lqr(arm_plan, plant, rate=100.0)
+    run = sv.close(plant, law, arm_plan.state(arm_plan.t[0]), (arm_plan.t[0], arm_plan.t[0] + 5.0))
+    batch = sv.close_many(run, {"c": [49.0, 50.0, 51.0]})
+    worst = batch["max |residual angle|"]
+    assert worst[1] == pytest.approx(np.abs(run.residual["angle"][0]).max(), rel=1e-6) and worst.max() < 0.05
+
+
+def bounded_case(c):
+    """The peak torque of a bounded motion with another stiffness of the joint."""
+    model = arm(0.5, c=c)
+    run = sv.simulate(model, model.start(), (0.0, 2.0), sv.Bounded())
+    return {"peak": run.extrema("torque")[1][1]}
+
+
+def test_bounded_plans_in_a_sweep():
+    study = sv.sweep(bounded_case, {"c": [40.0, 50.0, 60.0]})
+    peaks = np.asarray(study["peak"], dtype=float)
+    assert peaks[1] == pytest.approx(48.88454, abs=1e-4) and np.ptp(peaks) > 0.1
+
+
 # refusals -------------------------------------------------------------------------------------------------------------
 
 

@@ -96,13 +96,53 @@ def test_run_leaves_numbers_figures_and_the_report(here, capsys):
 def test_a_plan_with_unstable_internal_dynamics_is_kept_and_fails(here, capsys):
     with warnings.catch_warnings():
         warnings.simplefilter("error", RuntimeWarning)  # said once, by the command itself
-        assert main(["run", "vtol-centre", "--no-loop", "--no-figures", "--no-verify"]) == 1
+        assert main(["run", "vtol-centre", "--method", "DOP853", "--no-loop", "--no-figures", "--no-verify"]) == 1
     printed = capsys.readouterr()
     assert "internal dynamics unstable over these 1 s: errors grow by" in printed.out
     assert "internal dynamics unstable" in printed.err
     facts = summary(here / "servoctl-runs" / "vtol-centre")
     assert facts["success"] and facts["internal_dynamics"]["verdict"] == "unstable"
     assert facts["internal_dynamics"]["growth"] > 100 and facts["internal_dynamics"]["seconds"] == 1.0
+
+
+def test_unstable_internal_dynamics_get_the_bounded_plan(here, capsys):
+    assert main(["run", "vtol-centre", "--no-figures"]) == 0
+    printed = words(capsys.readouterr().out)
+    assert "Verdict: non-minimum phase (hyperbolic): at both ends eigenvalues 15.0406" in printed
+    facts = summary(here / "servoctl-runs" / "vtol-centre")
+    assert facts["method"] == "bounded" and facts["t_span"] == [0.0, 4.0] and facts["t_end"] > 4.0
+    assert facts["verdict"]["verdict"] == "non-minimum phase (hyperbolic)" and facts["verification"]["passed"]
+    assert facts["verdict"]["rest"]["end"]["eigenvalues"][0] == pytest.approx([15.0405993, 0.0], abs=1e-7)
+    thrusts = [facts["extrema"][name][side]["value"] for name in ("u1", "u2") for side in ("min", "max")]
+    assert 200.0 < min(thrusts) and max(thrusts) < 300.0  # its weight is 490.5 N
+    assert max(r["worst"] for r in facts["closed_loop"]["residuals"].values()) < 1e-5 * 5.0
+
+
+def test_where_there_is_no_bounded_plan_the_forward_one_says_so(here, capsys):
+    line = "run vtol-centre --t-span 0 1 --no-loop --no-figures --no-verify"
+    assert main(line.split()) == 1
+    printed = capsys.readouterr()
+    assert "There is no bounded motion" in printed.out and "(0, 4)" in words(printed.out)
+    assert "not to be trusted" in words(printed.err)
+
+
+def test_the_verdict_of_a_run_is_printed_and_kept(here, capsys):
+    assert main("run passive-arm --no-loop --no-figures --no-verify".split()) == 0
+    assert "Verdict: minimum phase: at both ends eigenvalues -6 ± 9.16515i 1/s" in words(capsys.readouterr().out)
+    assert summary(here / "servoctl-runs" / "passive-arm")["verdict"]["verdict"] == "minimum phase"
+
+
+def test_a_program_that_cannot_be_realised_is_reported(here, capsys):
+    (here / "free.py").write_text(
+        "import servoctl as sv\n"
+        "def scene():\n"
+        "    q = sv.coordinates('x y')\n"
+        "    x, y = q\n"
+        "    mechanism = sv.Mechanism(q, gibbs=sv.particle(q, 1.0, (x, y)), actuators={'F': x})\n"
+        "    return mechanism, sv.Program({'x': x - q.t, 'y': y})\n"
+    )
+    assert main(["report", "free.py"]) == 0
+    assert "Report: not realisable" in capsys.readouterr().out
 
 
 def test_a_motion_that_stops_is_kept_drawn_and_explained(here, capsys):

@@ -85,10 +85,11 @@ def test_spiral(numbers):
 
 def test_redundant_thrusters(numbers):
     result = numbers("redundant_thrusters")
-    for case in ("equal", "weak bow"):
-        assert result[f"{case} against the least norm"] < 1e-12
+    for case in ("equal", "weak bow", "wish"):
+        assert result[f"{case} against the least norm"] < 1e-12 and result[f"{case} verified"]
     assert result["weak bow bow"] < result["equal bow"] / 3
     assert result["weak bow stern"] > result["equal stern"]
+    assert result["wish bow"] > result["equal bow"] + 1.0
 
 
 def test_quaternion(numbers):

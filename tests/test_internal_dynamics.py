@@ -198,7 +198,7 @@ def test_the_plan_of_a_parametric_resonance_is_refused_by_inverse_dynamics():
     assert sv.computed(moved(model, 120.0)[0], sv.plant(model.reduction.mechanism)).name == "computed"
 
 
-def test_stiff_and_backward_motions_are_judged():
+def test_stiff_and_backward_motions_are_judged(c_compiler):
     stiff, found = moved(passive(lambda x, v, t: -1e4 * v - 1e4 * (1 + 0.5 * ca.sin(t)) * x), 10.0, "RadauIIA")
     assert found.verdict == "stable" and found.growth < 1.1
     model = passive(lambda x, v, t: -v - x)

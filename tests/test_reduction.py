@@ -1,12 +1,13 @@
 """Final orders, hidden constraints, dependent and contradictory rows, squares; who acts."""
 
+import warnings
 from functools import partial
 
 import casadi as ca
 import numpy as np
 import pytest
 from conftest import motion, signal
-from refusals import refused
+from refusals import refused, warned
 
 from servoctl import spec as sv
 from servoctl.errors import InconsistentStart, NotRealisable, SingularProgram, SpecificationError
@@ -255,6 +256,105 @@ def test_the_factor_of_a_square_is_named(power):
     mechanism = sv.Mechanism(q, gibbs=sv.particle(q, 1.0, (x, y)))
     with refused(SingularProgram, "Divide 'a' by (x-t)", row="a", factor="(x-t)"):
         derive(mechanism, sv.Program({"a": (x - q.t) ** power}, by="ideal"))
+
+
+EXTREMA = {  # residuals of x, y, their rates and t, with an extremum or a kink where they hold; their terms that vanish there
+    "a cosine": (lambda x, y, dx, dy, t: 1 - ca.cos(y - t), ["(y-t)"]),
+    "a cosine of a multiple": (lambda x, y, dx, dy, t: 1 - ca.cos(2 * (y - t)), ["(y-t)"]),
+    "a hyperbolic cosine at zero": (lambda x, y, dx, dy, t: ca.cosh(y) - 1, ["y"]),
+    "an exponential": (lambda x, y, dx, dy, t: ca.exp(y**2) - 1, ["y"]),
+    "a logarithm": (lambda x, y, dx, dy, t: ca.log(1 + (y - t) ** 2), ["(y-t)"]),
+    "a root": (lambda x, y, dx, dy, t: ca.sqrt((y - t) ** 2), ["(y-t)"]),
+    "a distance": (lambda x, y, dx, dy, t: ca.sqrt((x - t) ** 2 + (y - 2) ** 2), ["(x-t)", "(y-2)"]),
+    "a length less a coordinate": (lambda x, y, dx, dy, t: ca.sqrt(1 + (y - t) ** 2) - 1, ["(y-t)"]),
+    "an absolute value": (lambda x, y, dx, dy, t: ca.fabs(y - t), ["(y-t)"]),
+    "a sum of squares": (lambda x, y, dx, dy, t: (x - t) ** 2 + (y - t) ** 2, ["(x-t)", "(y-t)"]),
+    "a curve and a path": (lambda x, y, dx, dy, t: (y - ca.sin(x)) ** 2 + (x - t) ** 2, ["(x-t)", "(y-sin(x))"]),
+    "an inflection": (lambda x, y, dx, dy, t: x - ca.sin(x), ["x"]),
+    "a cosine of a speed": (lambda x, y, dx, dy, t: 1 - ca.cos(dy - 0.5), ["(dy-0.5)"]),
+    "squares of speeds": (lambda x, y, dx, dy, t: (dx - 1) ** 2 + (dy - 1) ** 2, ["(dx-1)", "(dy-1)"]),
+    "a long path": (lambda x, y, dx, dy, t: 1 - ca.cos(y - (t + t**2 + ca.sin(t) + t * ca.cos(3 * t) * ca.exp(t))), ["(y-f(t))"]),
+}
+
+
+@pytest.mark.parametrize("name", EXTREMA)
+def test_a_residual_without_a_gradient_at_its_solutions_says_which_terms_vanish_there(name):
+    q = sv.coordinates("x y")
+    build, terms = EXTREMA[name]
+    mechanism = sv.Mechanism(q, gibbs=sv.particle(q, 1.0, tuple(q)))
+    with refused(SingularProgram, "'a'", *terms, row="a") as caught:
+        derive(mechanism, sv.Program({"a": build(*q, *q.d(1), q.t)}, by="ideal"))
+    assert sorted(caught.value.details["zeros"]) == terms
+
+
+@pytest.mark.parametrize("level", [1e-6, 1e-3, 0.1])
+def test_a_residual_near_an_extremum_has_a_gradient(level):
+    """cosh y = 1 + level: y = ±arcosh(1 + level)."""
+    q = sv.coordinates("x y")
+    x, y = q
+    mechanism = sv.Mechanism(q, gibbs=sv.particle(q, 1.0, (x, y)))
+    model = derive(mechanism, sv.Program({"a": ca.cosh(y) - 1 - level}, by="ideal"))
+    assert abs(model.start()["y"]) == pytest.approx(np.arccosh(1 + level), rel=1e-9)
+
+
+def plane_products():
+    """A free point in the plane, with x, y, dx, dy and t."""
+    q = sv.coordinates("x y")
+    return sv.Mechanism(q, gibbs=sv.particle(q, 1.0, tuple(q))), (*q, *q.d(1), q.t)
+
+
+SEVERAL_ZEROS = {  # residuals that are products, and the factors that have zeros near x = y = 0
+    "coordinates": (lambda x, y, dx, dy, t: x * y, ("x", "y")),
+    "a speed": (lambda x, y, dx, dy, t: dx * (dy - 0.1), ("dx", "(dy-0.1)")),
+    "multiplied out": (lambda x, y, dx, dy, t: 2 * dx * dy - 0.1 * dx + dx * x, ("dx", "the rest")),
+    "with a constant and a quotient": (lambda x, y, dx, dy, t: -x * (y - t / 4) / 2, ("x", "(y-(t/4))")),
+    "a square among them": (lambda x, y, dx, dy, t: x**2 * (y - t), ("x", "(y-t)")),
+    "a function": (lambda x, y, dx, dy, t: ca.sin(x) * (y - t), ("sin(x)", "(y-t)")),
+}
+
+
+@pytest.mark.parametrize("name", SEVERAL_ZEROS)
+def test_a_residual_that_holds_by_either_of_its_factors_is_told_with_them(name):
+    mechanism, symbols = plane_products()
+    residual, factors = SEVERAL_ZEROS[name]
+    with warned("'a'", "product", *factors):
+        derive(mechanism, sv.Program({"a": residual(*symbols)}, by="ideal"))
+
+
+ONE_ZERO = {  # residuals of which one factor alone has zeros near x = y = 0
+    "a cosine": lambda x, y, dx, dy, t: ca.cos(x) * (y - t),
+    "a positive factor": lambda x, y, dx, dy, t: (1 + x**2) * (y - t),
+    "a speed without direction": lambda x, y, dx, dy, t: ca.sqrt(dx**2 + dy**2) * (y - t),
+    "a number": lambda x, y, dx, dy, t: -2 * (y - t),
+    "a time": lambda x, y, dx, dy, t: (t + 1) * (y - ca.sin(t)),
+    "a quotient": lambda x, y, dx, dy, t: (y - t) / (3 + x),
+    "a jet that all terms share": lambda x, y, dx, dy, t: x + x * y**2,
+    "no product": lambda x, y, dx, dy, t: dx * ca.sin(x) - dy * ca.cos(x),
+}
+
+
+@pytest.mark.parametrize("name", ONE_ZERO)
+def test_a_residual_that_holds_by_one_factor_is_no_cause_for_a_warning(name):
+    mechanism, symbols = plane_products()
+    with warnings.catch_warnings(action="error"):
+        derive(mechanism, sv.Program({"a": ONE_ZERO[name](*symbols)}, by="ideal"))
+
+
+def test_a_guess_far_from_the_zeros_of_a_factor_decides():
+    """A rope of about 4 m times the angle that follows a path."""
+    mechanism, (length, angle, *_, t) = plane_products()
+    program = sv.Program({"a": length * (angle - ca.sin(t))}, by="ideal")
+    with warned("'a'", "x or (y-sin(t))"):
+        derive(mechanism, program)
+    with warnings.catch_warnings(action="error"):
+        derive(mechanism, program, guess={"x": 4.0})
+
+
+@pytest.mark.parametrize("name", gallery)
+def test_no_scene_of_the_gallery_has_a_residual_that_holds_by_either_of_two_factors(name):
+    with warnings.catch_warnings(action="error"):
+        scene = gallery[name]
+        derive(*scene.build())
 
 
 CONTRADICTIONS = {  # residuals that no state satisfies

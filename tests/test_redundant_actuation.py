@@ -163,20 +163,6 @@ def test_an_actuator_that_reaches_the_program_later_than_another_rests():
     assert u["far"] == pytest.approx(0, abs=1e-12) and abs(u["near"]) > 0.1
 
 
-def test_redundant_actuators_without_full_decoupling_are_refused():
-    """A crane beside a cart of its own: three independent actuators, and a decoupling matrix of rank 1 for X and Z."""
-    q = sv.coordinates("x l theta s")
-    x, l, theta, s = q
-    load = ca.vertcat(x + l * ca.sin(theta), l * ca.cos(theta))
-    S = sv.particle(q, 10.0, x) + sv.particle(q, 2.0, load) + sv.particle(q, 1.0, s)
-    mechanism = sv.Mechanism(
-        q, gibbs=S, potential=-2 * 9.81 * load[1], actuators={"trolley": x, "hoist": l, "cart": s}
-    )  # fmt: skip
-    program = sv.Program({"X": load[0] - 0.3 * ca.sin(q.t), "Z": load[1] - 4 - 0.3 * ca.cos(q.t)})
-    with refused(NotRealisable, rank=1):
-        derive(mechanism, program, guess={"l": 4.0})
-
-
 # as many independent actuators as residuals: E u is determined, and u of least norm ----------------------------------
 
 

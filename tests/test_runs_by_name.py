@@ -1,5 +1,8 @@
 """A run by its names: as a mapping, in files, with its model again."""
 
+from math import comb
+
+import casadi as ca
 import numpy as np
 import pytest
 from refusals import refused
@@ -72,3 +75,60 @@ def test_signals_are_drawn_by_several_names(run):
     units = {"a": "rad", "b": "rad"}
     (ax,) = plots.signals(run, "a", "b", units=units)
     assert len(ax.lines) == len(plots.signals(run, ["a", "b"], units=units)[0].lines) == 2
+
+
+# outputs of higher order than the motion ------------------------------------------------------------------------------
+
+
+def driven_points():
+    """A driven point on x, and one beside it on y that a damped spring of rate 3 and damping 0.8 holds."""
+    q = sv.coordinates("x y")
+    (x, y), (d3x, d3y) = q, q.d(3)
+    outputs = {"jerk": d3x, "snap": q.dt(x * y, 4), "second jerk": d3y}
+    return q, lambda **parts: sv.Mechanism(
+        q, gibbs=sv.particle(q, 2.0, x) + sv.particle(q, 1.0, y), outputs=outputs, **parts
+    )
+
+
+def product(x, y, order):
+    """The derivative of x y from those of both, by Leibniz' rule."""
+    return sum(comb(order, k) * x[k] * y[order - k] for k in range(order + 1))
+
+
+@pytest.mark.parametrize("samples", [7, 1001])
+def test_outputs_of_any_order_along_a_flat_program(samples, tmp_path):
+    """x = sin 2t, y = e^-t."""
+    q, mechanism = driven_points()
+    x, y = q
+    program = sv.Program({"X": x - ca.sin(2 * q.t), "Y": y - ca.exp(-q.t)})
+    model = sv.derive(mechanism(actuators={"a": x, "b": y}), program)
+    run = sv.simulate(model, model.start(), (0.0, 3.0), t_eval=np.linspace(0.0, 3.0, samples))
+    X = [2.0**k * np.sin(2 * run.t + k * np.pi / 2) for k in range(5)]
+    Y = [(-1.0) ** k * np.exp(-run.t) for k in range(5)]
+    expected = {"jerk": X[3], "snap": product(X, Y, 4), "second jerk": Y[3]}
+    for name, values in expected.items():
+        assert run[name] == pytest.approx(values, abs=1e-11)
+    assert sv.verify(model, run).passed
+    assert sv.load(run.save(tmp_path / "run.npz"))["snap"] == pytest.approx(expected["snap"], abs=1e-11)
+
+
+@pytest.mark.parametrize("method", ["DOP853", "Taylor", "RK8"])
+def test_outputs_of_any_order_along_an_integrated_motion(method):
+    """y''' = -0.8 y'' - 3 y'."""
+    q, mechanism = driven_points()
+    x, y = q
+    parts = {"actuators": {"a": x}, "forces": {"y": -0.8 * q.dt(y) - 3.0 * y}}
+    model = sv.derive(mechanism(**parts), sv.Program({"X": x - ca.sin(2 * q.t)}))
+    run = sv.simulate(model, model.start(y=0.3, dy=-0.1), (0.0, 3.0), method)
+    assert run["second jerk"] == pytest.approx(-0.8 * run["d2y"] - 3.0 * run["dy"], abs=1e-10)
+    Y = [run["y"], run["dy"], run["d2y"], run["second jerk"], -0.8 * run["second jerk"] - 3.0 * run["d2y"]]
+    X = [2.0**k * np.sin(2 * run.t + k * np.pi / 2) for k in range(5)]
+    assert run["snap"] == pytest.approx(product(X, Y, 4), abs=1e-5)
+
+
+def test_files_and_systems_refuse_outputs_beyond_the_jets(tmp_path):
+    q, mechanism = driven_points()
+    x, y = q
+    model = sv.derive(mechanism(actuators={"a": x, "b": y}), sv.Program({"X": x - ca.sin(q.t), "Y": y}))
+    with refused(sv.SpecificationError, "jerk", name="jerk", order=3, limit=2):
+        sv.export_c(model, tmp_path)

@@ -343,6 +343,38 @@ def test_a_simulation_from_rest_says_that_the_machine_stands_still(name):
     assert "square" not in str(caught.value) and 0 < caught.value.details["nearest_time"] < 0.3
 
 
+def rolled(path, duration=4.0):
+    """The bicycle of `bicycle` along a path of smoothness 6 from rest."""
+    model = bicycle()
+    q = model.reduction.mechanism.q
+    x, y, *_ = q
+    s = sv.paths.rest_to_rest(q.t, (0.0,), (1.0,), duration=duration, smoothness=6)[0]
+    X, Y = path(s)
+    return sv.derive(model.reduction.mechanism, sv.Program({"X": x - X, "Y": y - Y}))
+
+
+ROLLED = {  # the path and its duration; heading and steering angle at rest, tan δ = curvature times 1 m
+    "an eight": (lambda s: (3 * ca.sin(2 * np.pi * s), ca.sin(4 * np.pi * s)), 4.0, (np.arctan2(2, 3), 0.0)),
+    "an arc": (lambda s: (3 * ca.sin(s), 3 - 3 * ca.cos(s)), 4.0, (0.0, np.arctan(1 / 3))),
+    "a slow arc": (lambda s: (3 * ca.sin(s), 3 - 3 * ca.cos(s)), 60.0, (0.0, np.arctan(1 / 3))),
+    "backwards": (lambda s: (-3 * s, -s), 4.0, (np.arctan2(1, 3), 0.0)),
+}
+
+
+@pytest.mark.parametrize("name", ROLLED)
+def test_a_machine_starts_and_moves_as_the_refusal_says(name):
+    path, duration, angles = ROLLED[name]
+    model = rolled(path, duration)
+    start = model.start()
+    assert [start["psi"], start["delta"]] == pytest.approx(angles, abs=1e-5) and "once it moves" in repr(start)
+    with refused(sv.SingularProgram, "model.start(t=", "guess=", t=0.0) as caught:
+        sv.simulate(model, start, (0.0, 0.9 * duration))
+    t = caught.value.details["nearest_time"]
+    moving = model.start(t=t, guess={"psi": start["psi"], "delta": start["delta"]})
+    run = sv.simulate(model, moving, (t, 0.9 * duration))
+    assert sv.verify(model, run).passed and run["psi"][0] == pytest.approx(start["psi"], abs=1e-3)
+
+
 def test_the_motion_after_rest_begins_where_the_start_is():
     model = wheels()
     run = sv.simulate(model, model.start(t=0.01), (0.01, 3.9))

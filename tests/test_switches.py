@@ -453,3 +453,74 @@ def test_a_square_wave_switches_every_time():
     for method in ("DOP853", "Taylor", "RadauIIA", "RK4", "CVODES"):
         run = sv.simulate(model, start, (0.0, 2.0), method)
         assert run["dy"][-1] == pytest.approx(np.pi / 40 - (2 - 25 * np.pi / 40), abs=1e-7)
+
+
+# flat programs -------------------------------------------------------------------------------------------------------
+
+
+def flat(residuals, **parts):
+    """A driven point in the plane whose motion residuals of (t, x, y) determine, with its start near (1, 0)."""
+    q = sv.coordinates("x y")
+    x, y = q
+    mechanism = sv.Mechanism(q, gibbs=sv.particle(q, 2.0, (x, y)), actuators={"a": x, "b": y}, **parts)
+    model = sv.derive(mechanism, sv.Program(residuals(q.t, x, y)), guess={"x": 1.0})
+    return model, lambda t: model.start(t=t, guess={"x": 1.0, "y": 0.0})
+
+
+FLAT_STOPS = {  # residuals beside x = t; the row, the level that jumps at x = 0.5 or y = 0.5, and by how much
+    "a sign": (lambda t, x, y: {"X": x - t, "Y": y - 0.1 * ca.sign(x - 0.5)}, ("Y", "Y", 0.2)),
+    "a choice": (lambda t, x, y: {"X": x - t, "Y": y - ca.if_else(x > 0.5, 0.4, 0.1)}, ("Y", "Y", 0.3)),
+    "a sign in the other row": (lambda t, x, y: {"X": x - t - 0.1 * ca.sign(y - 0.5), "Y": y - t}, ("X", "X", 0.2)),
+    "an absolute value": (lambda t, x, y: {"X": x - t, "Y": y - ca.fabs(x - 0.5)}, ("Y", "D(Y)", 2.0)),
+    "a larger of two": (lambda t, x, y: {"X": x - t, "Y": y - ca.fmax(x, 0.5)}, ("Y", "D(Y)", 1.0)),
+    "a smaller of two": (lambda t, x, y: {"X": x - t, "Y": y - ca.fmin(x, 1 - x)}, ("Y", "D(Y)", 2.0)),
+}
+
+
+@pytest.mark.parametrize("span", [(0.0, 1.0), (1.0, 0.0), (0.2, 7.3)])
+@pytest.mark.parametrize("name", FLAT_STOPS)
+def test_a_flat_program_stops_where_a_residual_or_its_rate_jumps(name, span):
+    residuals, (row, level, height) = FLAT_STOPS[name]
+    model, start = flat(residuals)
+    with refused(sv.IntegrationStopped, "jumps", "t = 0.5 s", residual=row, level=level) as caught:
+        sv.simulate(model, start(span[0]), span)
+    details = caught.value.details
+    assert details["t"] == pytest.approx(0.5) and details["height"] == pytest.approx(height)
+    off = np.abs(caught.value.run["x"] - caught.value.run.t)
+    assert off == pytest.approx(0.1 if row == "X" else 0.0, abs=1e-12) and len(off) > 1
+
+
+@pytest.mark.parametrize("samples", [5, 1001])
+@pytest.mark.parametrize(
+    ("curve", "bend"),
+    [
+        (lambda s: ca.fmax(s, 0) ** 2, lambda s: 2.0 * (s > 0)),
+        (lambda s: ca.fmax(s, 0) ** 3, lambda s: 6.0 * s * (s > 0)),
+        (lambda s: s * ca.fabs(s), lambda s: 2.0 * np.sign(s)),
+        (lambda s: ca.if_else(s > 0, 1 - ca.cos(s), s**3), lambda s: np.where(s > 0, np.cos(s), 6.0 * s)),
+    ],
+)
+def test_a_flat_program_whose_acceleration_jumps_goes_on(curve, bend, samples):
+    """x = t, so that y'' is the second derivative of the curve, on either side."""
+    model, start = flat(lambda t, x, y: {"X": x - t, "Y": y - curve(x - 0.4305)})
+    run = sv.simulate(model, start(0.0), (0.0, 1.0), t_eval=np.linspace(0.0, 1.0, samples))
+    assert run["b"] == pytest.approx(2.0 * bend(run.t - 0.4305), abs=1e-9) and sv.verify(model, run).passed
+
+
+@pytest.mark.parametrize("span", [(0.0, 20.0), (0.0, -20.0)])
+def test_a_flat_angle_turns_round_and_round(span):
+    model, start = flat(lambda t, x, y: {"R": x**2 + y**2 - 1, "angle": ca.atan2(y, x) - t})
+    run = sv.simulate(model, start(0.0), span)
+    assert np.abs(run["x"] - np.cos(run.t)).max() < 1e-12 and np.abs(run["b"] + 2 * np.sin(run.t)).max() < 1e-10
+    assert sv.verify(model, run).passed
+
+
+def test_dry_friction_along_a_flat_program():
+    """u = 2 x'' + 0.3 sign x', x = 1 + sin t."""
+    q = sv.coordinates("x")
+    (x,), (dx,) = q, q.d(1)
+    mechanism = sv.Mechanism(q, gibbs=sv.particle(q, 2.0, x), actuators={"u": x}, forces={"x": -0.3 * ca.sign(dx)})
+    model = sv.derive(mechanism, sv.Program({"X": x - 1 - ca.sin(q.t)}))
+    run = sv.simulate(model, model.start(), (0.0, 10.0), t_eval=np.linspace(0.0, 10.0, 777))
+    assert run["u"] == pytest.approx(-2 * np.sin(run.t) + 0.3 * np.sign(np.cos(run.t)), abs=1e-9)
+    assert len(run.knots) == 3 and sv.verify(model, run).passed

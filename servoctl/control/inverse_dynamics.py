@@ -25,6 +25,7 @@ from servoctl.methods.stability import sampled_bound
 from servoctl.plants.plant import Plant
 from servoctl.reduction.knots import require_smooth
 from servoctl.reduction.ranks import clean, decide, decide_all, eliminate
+from servoctl.reduction.realisation import wished
 from servoctl.run import Run
 
 RANK_POINTS, AWAY, SEED = 8, 0.02, 20240229  # states for the ranks, and their distance from the plan
@@ -57,9 +58,10 @@ def linearise(plan, plant):
     """
     _require_invertible(plan.model.reduction, plant)
     extension = _Extension(plant, in_symbols_of(plant, plan.model), _points(plan, plant))
-    split = plan.model.reduction.realisation.actuation
-    if split.shape[0] > split.shape[1] and plan.model.reduction.mechanism.q.order(split) < 2:
-        extension.share(in_symbols_of(plant, plan.model, {"split": split})["split"])
+    reduction = plan.model.reduction
+    split, wish = reduction.realisation.actuation, wished(reduction.mechanism, reduction.program)
+    if split.shape[0] > split.shape[1] and reduction.mechanism.q.order(split) < 2:
+        extension.share(**in_symbols_of(plant, plan.model, {"split": split, "wish": wish}))
     while extension.rank() < len(extension.names):
         extension.extend()
     return extension.law()
@@ -171,10 +173,10 @@ class _Extension:
         """The rank of the decoupling matrix at states about the plan."""
         return decide_all(*self.values(self.decoupling))[0].rank
 
-    def share(self, split):
-        """Make the multipliers μ the inputs: redundant actuators share as in the plan, u = split μ."""
+    def share(self, split, wish):
+        """Make the multipliers μ the inputs: redundant actuators share as in the plan, u = u_wish + split μ."""
         v = ca.SX.sym("v", split.shape[1])
-        self._substitute(self.v, split @ v)
+        self._substitute(self.v, wish + split @ v)
         self.v = v
 
     def extend(self):

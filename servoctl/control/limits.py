@@ -17,7 +17,7 @@ from servoctl.control.conditions import ranges
 from servoctl.control.law import Law
 from servoctl.control.lqr import Q_POSITION, R_INPUT, steady, tangents
 from servoctl.control.reference import Reference, require_plant
-from servoctl.control.residuals import Residuals, in_symbols_of
+from servoctl.control.residuals import Residuals, in_symbols_of, program_residuals
 from servoctl.control.result import Closed
 from servoctl.control.sampling import discretised
 from servoctl.control.time_law import fastest
@@ -234,13 +234,13 @@ def _require_law(law, plant):
 def _predicted(reference, horizon):
     """Names of residuals, their deviation after the horizon per unit of input (N, k, m), immediate effects by name."""
     plan, plant = reference.plan, reference.plant
-    program, q = plan.model.reduction.program, plan.model.reduction.mechanism.q
+    program, q = program_residuals(plan.model), plan.model.reduction.mechanism.q
     residuals = Residuals(plan.model, plant)
     _, B = discretised(*reference.linearised(), horizon)
     D = dict(zip(residuals.names, np.moveaxis(residuals.jacobian(reference.t, reference.x) @ B, 1, 0), strict=True))
     second = {name: e for name, e in in_symbols_of(plant, plan.model).items() if name not in D}
     for name in second:
-        if (order := q.order(program.residuals[name])) > 2:
+        if (order := q.order(program[name])) > 2:
             raise SpecificationError(
                 f"The residual {name!r} has order {order}.",
                 "Slack is given to residuals of order 2 at most, which the state and the inputs determine.",
@@ -251,7 +251,7 @@ def _predicted(reference, horizon):
     effects = Effects(plant, second)
     slopes = np.array([effects(t, x)[1] for t, x in zip(reference.t, reference.x.T, strict=True)])
     at_once = {name: slopes[:, i] for i, name in enumerate(second)}
-    names = tuple(program.residuals)
+    names = tuple(program)
     return names, np.stack([(D | at_once)[name] for name in names], axis=1), at_once
 
 

@@ -11,7 +11,7 @@ from servoctl.checks import as_numbers, numbers_by_name
 from servoctl.control.feedback import StateFeedback, affine
 from servoctl.control.law import Law
 from servoctl.control.reference import Reference, refuse_transport
-from servoctl.control.residuals import Residuals
+from servoctl.control.residuals import Residuals, program_residuals
 from servoctl.control.sampling import discretised, spectral_radii
 from servoctl.errors import ServoError, SpecificationError
 from servoctl.plants.plant import Plant
@@ -333,7 +333,7 @@ def _integrals(integral, plan, plant):
             "The program has no residual of order 0 or 1.",
             "A residual that is fed back is a function of the state (q, γ').",
             do="Leave out integral.",
-            names=tuple(plan.model.reduction.program.residuals),
+            names=tuple(program_residuals(plan.model)),
         )
     weighted = None if integral is True else integral
     names = residuals.names

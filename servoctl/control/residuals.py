@@ -25,9 +25,9 @@ class Residuals:
     """
 
     def __init__(self, model, plant, names=None, order=1):
-        mechanism, program = model.reduction.mechanism, model.reduction.program
+        mechanism, residuals = model.reduction.mechanism, program_residuals(model)
         self._q = mechanism.q
-        orders = {name: self._q.order(e) for name, e in program.residuals.items()}
+        orders = {name: self._q.order(e) for name, e in residuals.items()}
         for name in names or ():
             if name not in orders:
                 raise unknown(name, orders, "residual")
@@ -42,7 +42,7 @@ class Residuals:
                 )
         self.names = tuple(name for name in orders if orders[name] <= order and (names is None or name in names))
         self.orders = tuple(max(orders[name], 0) for name in self.names)
-        self.expressions = ca.vertcat(*(program.residuals[name] for name in self.names))
+        self.expressions = ca.vertcat(*(residuals[name] for name in self.names))
         valid = plant.mechanism.parameters.names
         self.symbols = [s for s in mechanism.parameters.symbols if _depends(self.expressions, s)]
         for s in self.symbols:
@@ -116,13 +116,18 @@ class Residuals:
         return jacobian
 
 
+def program_residuals(model):
+    """Residuals of the program of a model, by name; of a plant under inputs those that it reports."""
+    return model.reduction.program.residuals or model.reduction.mechanism.reported
+
+
 def in_symbols_of(plant, model, expressions=None):
     """Expressions of a model's mechanism, by default its program's residuals, in the plant's symbols, by name.
 
     Equal mechanisms, such as copies that were pickled apart, have different symbols of the same names.
     """
     mechanism = model.reduction.mechanism
-    expressions = model.reduction.program.residuals if expressions is None else expressions
+    expressions = program_residuals(model) if expressions is None else expressions
     if mechanism.q is plant.mechanism.q and mechanism.parameters is plant.mechanism.parameters:
         return dict(expressions)
     new = {symbol.name(): symbol for symbol in _symbols(plant.mechanism)}

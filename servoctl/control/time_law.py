@@ -9,7 +9,7 @@ import numpy as np
 
 from servoctl.checks import as_span, finite, interval, mapping, require_kind
 from servoctl.errors import InconsistentStart, IntegrationStopped, LimitExceeded, SingularProgram, SpecificationError
-from servoctl.model.model import derive
+from servoctl.model.model import derived
 from servoctl.progress import progress_bar
 from servoctl.run import Run
 from servoctl.simulation import judged, simulated
@@ -149,7 +149,7 @@ class _Scene:
         t0, t1 = self.t_span
         slower = self.program.slowed(self.mechanism.q, factor, at=t0)
         try:
-            model = derive(self.mechanism, slower, self.guess)
+            model = derived(self.mechanism, slower, self.guess)
             model = model.with_parameters(**self.parameters) if self.parameters else model
             values = {name: value / factor ** _level(model, name) for name, value in self.start.items()}
             start = model.start(t0, guess=self.guess, **values)

@@ -16,6 +16,7 @@ from servoctl.errors import SpecificationError
 from servoctl.export.files import Array, Constant, Contents, Routine, Scalar, identifier, write
 from servoctl.model.model import Model
 from servoctl.model.start import State
+from servoctl.reduction.reduce import require_outputs
 
 ITERATIONS, TOLERANCE = 30, 1e-13  # of Newton's method, as in `Compiled.newton`
 TIME = Scalar("t")
@@ -135,6 +136,7 @@ def _without_expressions(source):
 def _of_model(model, start):
     actuation, control = model.signals("reaction" if model.ideal else "actuation")
     places, residual = model.signals("residuals")
+    require_outputs(model.reduction)
     outputs, output = model.signals("outputs")
     levels = [f"D{level} {row}" if level else row for row, level in places]
     p = Array("p", "Parameters p, SI", model.reduction.mechanism.parameters.names)

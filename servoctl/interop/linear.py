@@ -12,6 +12,7 @@ from servoctl.errors import SpecificationError
 from servoctl.interop.names import connected, force_names, output_names, signal_names, stranger, system_name
 from servoctl.model.model import Model
 from servoctl.plants.plant import Plant
+from servoctl.reduction.reduce import require_outputs
 from servoctl.run import Run
 
 OPTIONS = {Plant: ("x", "u", "rate", "disturbed"), Law: ("x", "controller_state"), Closed: (), Model: ("x",)}
@@ -314,6 +315,7 @@ def _linear_model(model, t, x, name):
     ode = model.function("ode")
     A = jacobian(ode, "x", t, x, p)[:n_x]
     z, to_jets = np.append(x, ode(t, x, p)[n_x - n : n_x]), np.vstack([np.eye(n_x), A[-n:]])
+    require_outputs(model.reduction)
     groups = [model.signals("reaction" if model.ideal else "actuation"), model.signals("outputs")]
     C = [np.eye(n_x), *(jacobian(f, "x", t, z, p) @ to_jets for group, f in groups if group)]
     names = [*model.state_names, *(name for group, _ in groups for name in group)]

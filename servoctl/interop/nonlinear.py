@@ -13,6 +13,7 @@ from servoctl.errors import ServoError, SpecificationError
 from servoctl.interop.names import connected, force_names, output_names, signal_names, stranger, system_name
 from servoctl.model.model import Model
 from servoctl.plants.plant import Plant
+from servoctl.reduction.reduce import require_outputs
 
 SUBSTEPS = 10  # Runge-Kutta steps per sample: 1 ms at 100 Hz
 
@@ -98,6 +99,7 @@ def _model(model, name):
     import control
 
     n, n_x, p = model.n, len(model.state_names), model.parameters
+    require_outputs(model.reduction)
     groups = [model.signals("reaction" if model.ideal else "actuation"), model.signals("outputs")]
     names = [name for group, _ in groups for name in group]
     ode, symbols = model.function("ode"), model.reduction.mechanism.parameters.names

@@ -287,10 +287,34 @@ def _apply(op, *operands):
     return ca.SX.unary(op, *operands) if len(operands) == 1 else ca.SX.binary(op, *operands)
 
 
-def _words(expression, longest=40):
-    """An expression in the designer's names; only the names where it is long."""
-    text = str(expression)
-    text = text[1:-1] if text.startswith("(") and text.endswith(")") and text.count("(") == 1 else text
-    if "@" in text or len(text) > longest:
-        text = f"a function of {', '.join(s.name() for s in ca.symvar(expression))}"
-    return text
+def _words(expression):
+    """An expression as in `shown`, without the brackets around it."""
+    text = shown(expression)
+    return text[1:-1] if text.startswith("(") and text.endswith(")") and text.count("(") == 1 else text
+
+
+def shown(expression, longest=40):
+    """An SX scalar in the designer's names.
+
+    Where that is long, functions of t alone are f(t); where it is still long, the names are left.
+    """
+    for text in (str(expression), str(_without_paths(expression))):
+        if "@" not in text and len(text) <= longest:
+            return text
+    return f"a function of {', '.join(s.name() for s in ca.symvar(expression))}"
+
+
+def _without_paths(expression):
+    """An SX scalar with f(t) in place of functions of t alone."""
+    work, timed, path = [], [], ca.SX.sym("f(t)")  # for each value whether it depends on t alone; None for a number
+
+    def leaf(value, symbol):
+        timed.append(value.name() == "t" if symbol else None)
+        return value
+
+    def value(op, operands):
+        moves = any(timed[i] is False for i in operands)
+        timed.append(False if moves else True if any(timed[i] for i in operands) else None)
+        return _apply(op, *(path if moves and timed[i] and work[i].n_dep() else work[i] for i in operands))
+
+    return _replayed([expression], work, leaf, value)[0]

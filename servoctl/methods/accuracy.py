@@ -197,12 +197,20 @@ def accurate(simulated, model, accuracy, start, method=None, drift=None):
         finer = simulated(method, Project())
         if not finer.success:
             return finer
-        difference = motion_error(model, run.jets, finer.jets)
+        difference = _disagreement(model, run, finer)
         growth = difference / coarser.rtol
         if difference <= accuracy:
-            return replace(finer, message=f"finished; two tolerances agree to {difference:.1e}")
+            return replace(finer, message=f"{finer.message}; two tolerances agree to {difference:.1e}")
         best, run = min(best, difference), finer
     raise _out_of_reach(accuracy, best, growth, run)
+
+
+def _disagreement(model, run, finer):
+    """`motion_error` between two motions at the samples of both; infinite where an event ends one of them alone."""
+    if run.status != finer.status:
+        return np.inf
+    _, here, there = np.intersect1d(run.t, finer.t, return_indices=True)
+    return motion_error(model, run.jets[:, here], finer.jets[:, there])
 
 
 def _out_of_reach(accuracy, best, growth, run):

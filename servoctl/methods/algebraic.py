@@ -6,15 +6,17 @@ ends. Samples are solved between the ends of these steps.
 
 import numpy as np
 
-from servoctl.methods.monitor import Fine, Repivot, Stretch
+from servoctl.methods.monitor import Fine, Repivot, Singular, Stretch
 from servoctl.methods.motion import Stepping, breakpoints, interruptible
+from servoctl.methods.watch import Watch
+from servoctl.model.switching import switching
 
 STEPS = 50  # at least, in a span: shorter movements between two rests are overlooked where there are no samples
 NODES = 1000  # steps per call of the loop: 0.3 ms compiled, 50 ms where CasADi evaluates
 BLOCK = 4000  # samples per call of the loop: 0.2 ms compiled, 0.2 s where CasADi evaluates
 
 
-def algebraic(model, span, x0, times, knots, progress):
+def algebraic(model, span, x0, times, knots, progress, events=None):
     """Solve a flat program for q, γ' and γ'' at each time.
 
     Parameters
@@ -30,12 +32,15 @@ def algebraic(model, span, x0, times, knots, progress):
     knots : sequence of float
         At which steps end [s].
     progress : callable
+    events : Events, optional
 
     Returns
     -------
     Motion
     """
-    return _Algebraic(model, "algebraic", None, progress).run(span[0], x0, span[1], times, knots)
+    continuation = _Algebraic(model, "algebraic", None, progress)
+    continuation.events = events
+    return continuation.run(span[0], x0, span[1], times, knots)
 
 
 class _Algebraic(Stepping):
@@ -64,14 +69,24 @@ class _Algebraic(Stepping):
     def run(self, t0, x0, t1, times, knots):
         """Follow the solution from x0 at t0 to t1 [s], and solve at each of the times (N,) [s]."""
         with interruptible(self.motion):
+            self._watch(t0, x0, t1)
             self._start(t0, x0, t1)
             cuts = np.array(breakpoints((t0, t1), knots))
             self.longest, self.direction = abs(t1 - t0) / STEPS, np.sign(t1 - t0)
             self.pending, self.resumed = times, None
             t, x = t0, x0
-            while t != t1 and self.motion.stop is None:
+            while t != t1 and self.motion.stop is None and not self.motion.ended:
                 t, x = self._advance(np.append(t, cuts[(cuts - t) * self.direction > 0]), x)
         return self.motion
+
+    def _watch(self, t, x, t1):
+        """Watch for kinks and switches, where there are any, with the smooth model that holds at the start."""
+        self.family = switching(self.model)
+        if self.family is not None:
+            branches = self.family.branches(t, x)
+            self._use(self.family.at(branches))
+            self.watch = Watch(None, abs(t1 - t), self.family, exact=True, parts=1)
+            self.watch.use(self.model, branches)
 
     def _advance(self, cuts, x):
         """Follow the solution as far as the pivots allow; the instant and the state from which it goes on."""
@@ -85,9 +100,15 @@ class _Algebraic(Stepping):
         if self.motion.start is None:
             self.motion.start = states[:, 0]
             self.monitor.begin(pivots[:, 0])
-        outcome = self.monitor.inspect(Stretch(t, states, pivots[:, 1:, None], self._top))
+        stretch = Stretch(t, states, pivots[:, 1:, None], self._top)
+        outcome = self.monitor.inspect(stretch)
         last = self._resumption(t, outcome.steps) if isinstance(outcome, Repivot) else outcome.steps
-        self._sample(nodes[: last + 1], states[:, last], t[last] == cuts[-1])
+        switch = self._switch(stretch.first(last), nodes)
+        if self.events is not None and self._meets_event(*self._reached(nodes, last, switch, outcome, cuts[-1])):
+            return t[last], states[:, last]
+        if switch is not None:
+            return self._turned(switch, nodes[: switch.steps + 2], cuts[-1])
+        self._sample(nodes[: last + 1], states[:, last], t[last], cuts[-1])
         if self.motion.stop is None:
             self.progress(t[last])
         if self.motion.stop is None and not isinstance(outcome, Fine):
@@ -96,15 +117,64 @@ class _Algebraic(Stepping):
             self._fail(t[last], states[:, last], "Newton's method finds no solution of the program beyond")
         return t[last], states[:, last]
 
+    def _switch(self, stretch, nodes):
+        """The first switch within steps between nodes, or None."""
+        if self.watch is None or len(stretch.t) < 2:
+            return None
+
+        def states(_, times):
+            found = self._split(*self.f.newton(times, nodes, self.p)[:2])[0]
+            return np.pad(found, ((0, 0), (0, len(times) - found.shape[1])), constant_values=np.nan)
+
+        self.watch.begin(stretch.t[0])
+        return self.watch.switch(stretch, states, lambda k, t: states(k, np.array([t]))[:, 0])
+
+    def _turned(self, switch, nodes, t1):
+        """Go on beyond a switch, or stop there; its instant and the state."""
+        self._sample(nodes, switch.x, switch.t, t1)
+        if self.motion.stop is None:
+            self._turn(switch, t1)
+        if self.motion.stop is None:
+            self.monitor.begin(self._pivots(switch.t, switch.x))
+        return switch.t, switch.x
+
     def _resumption(self, t, last):
         """The node before one with bad pivots, from which others lead on; that node, if they did so before."""
         good = last - 1 if last and t[last - 1] != self.resumed else last
         self.resumed = t[good]
         return good
 
-    def _sample(self, nodes, x, ends):
-        """Solve at the pending instants up to the last node, whose state is x; at all of them if the motion ends."""
-        count = len(self.pending) if ends else int(np.sum((self.pending - nodes[-1, 0]) * self.direction <= 0))
+    @staticmethod
+    def _reached(nodes, last, switch, outcome, t1):
+        """The nodes up to a switch, a stop or the last one that leads on, the instant, and whether it is a stop."""
+        if switch is not None:
+            return nodes[: switch.steps + 2], switch.t, False
+        stops = isinstance(outcome, Singular) or (len(nodes) < NODES and nodes[-1, 0] != t1)
+        reached = nodes if stops else nodes[: last + 1]
+        return reached, reached[-1, 0], stops
+
+    def _meets_event(self, nodes, end, stops):
+        """Whether a terminal event ends the motion between nodes; the samples up to it are then recorded."""
+
+        def solved(t):
+            state, top, _ = self._split(*self.f.newton(t, nodes, self.p)[:2])
+            return np.concatenate([state, top])
+
+        t = self.events.instants(np.append(nodes[:-1, 0], end))[1]
+        jets = solved(t)
+        t = t[: jets.shape[1]]
+        found = self.events.first(self.model, t, jets, lambda s: solved(np.array([s]))[:, 0], stops)
+        if found is not None:
+            x, top = np.split(found.jets[:, None], [len(self.model.state_names)])
+            self.pending = self.pending[self.direction * self.pending < self.direction * min(found.t, t[-1])]
+            self._sample(nodes, x[:, 0], end, end)
+            self.motion.add(self.model, [found.t], x, top)
+            self.motion.ended = found.name
+        return found is not None
+
+    def _sample(self, nodes, x, t, t1):
+        """Solve at the pending instants up to t, where the state is x; at all of them if the motion ends there."""
+        count = len(self.pending) if t == t1 else int(np.sum((self.pending - t) * self.direction <= 0))
         now, self.pending = np.split(self.pending, [count])
         for block in np.split(now, range(BLOCK, count, BLOCK)):
             q, y, iterations = self.f.newton(block, nodes, self.p)

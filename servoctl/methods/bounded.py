@@ -20,6 +20,7 @@ from servoctl.methods.accuracy import state_levels
 from servoctl.methods.motion import Motion, breakpoints
 from servoctl.methods.radau import basis, radau
 from servoctl.model.switching import switching
+from servoctl.tolerances import CUTOFF, NOISE
 
 ORDER = 13  # of the collocation: seven nodes
 LONGEST = 1.0  # interval of the first mesh, in time constants of the fastest mode
@@ -28,14 +29,14 @@ NEWTON_STEPS, NEWTON_ENDS, STALLED = 40, 1e-12, 1e-9  # of Newton's method; rela
 REFINEMENTS, MOST_PIECES = 10, 4  # of the mesh; and into how many an interval is cut at most
 LIFTED = 2  # Newton steps to the invariants from a polynomial between nodes, which is accurate to the defect
 AIM = 0.1  # defect that refinement aims at, relative to the tolerance
-HYPERBOLIC = 1e-6  # real part of an eigenvalue, relative to the largest eigenvalue, below which it lies on the axis
+HYPERBOLIC = 1e-10  # distance to a matrix with an eigenvalue on the imaginary axis, relative to A, that is rounding
 STANDS = 1e-6  # relative change of the equilibrium before or after the span: the program does not stand still
 REGULAR = 1e-6  # smallest singular value of the free entries' part of the tangent space
 BETWEEN = (0.15, 0.5, 0.9)  # places within an interval where the defect is measured
 SAMPLES = 1001
 
 
-def bounded(model, span, guess, method, instants, progress):
+def bounded(model, span, guess, method, instants, progress, events=None):
     """The bounded motion of a program.
 
     Parameters
@@ -50,6 +51,7 @@ def bounded(model, span, guess, method, instants, progress):
         Times of the samples [s], None for 1001 instants of the whole window and the knots; and the instants where the
         program is not smooth [s].
     progress : callable
+    events : Events, optional
 
     Returns
     -------
@@ -89,6 +91,8 @@ def bounded(model, span, guess, method, instants, progress):
         times = np.union1d(np.linspace(*window, SAMPLES), [k for k in (*span, *knots) if window[0] < k < window[1]])
     motion = Motion()
     motion.count(intervals=len(mesh) - 1, iterations=problem.iterations)
+    if events is not None:
+        times, motion.ended = _to_event(problem, events, (mesh, x), times)
     samples = problem.at(times, mesh, x)
     inside = times[(times >= window[0]) & (times <= window[1])]
     truncation = problem.distance(problem.at(inside, mesh, x), problem.at(inside, *reference))
@@ -100,18 +104,53 @@ def bounded(model, span, guess, method, instants, progress):
     return motion
 
 
+def _to_event(problem, events, solution, times):
+    """The samples (N,) up to a terminal event of a motion, and its name; all of them and "" without one."""
+    model, n_x = problem.model, problem.n_x
+
+    def jets(t):
+        x = problem.at(t, *solution)
+        return np.vstack([x, model.function("ode").grid(t, x, problem.p)[n_x - model.n : n_x]])
+
+    t = events.instants(np.union1d(times, solution[0]))[1]
+    found = events.first(model, t, jets(t), lambda s: jets(np.array([s]))[:, 0])
+    return (times, "") if found is None else (np.append(times[times < found.t], found.t), found.name)
+
+
 @dataclass(frozen=True)
 class End:
-    """An equilibrium: its instant [s], state (n_x,) and linearisation A (f, f) in the free entries."""
+    """An equilibrium: its instant [s], state (n_x,), linearisation A (f, f) in the free entries, and their sizes (f,)."""
 
     t: float
     x: np.ndarray
     A: np.ndarray
+    size: np.ndarray
 
     @cached_property
     def eigenvalues(self):
-        """Eigenvalues of A [1/s]."""
-        return np.linalg.eigvals(self.A)
+        """Eigenvalues of A [1/s], by descending real part."""
+        values = np.linalg.eigvals(self.A).astype(complex)
+        return values[np.lexsort((-values.imag, -values.real))]
+
+    @cached_property
+    def on_axis(self):
+        """The eigenvalues on the imaginary axis: A is as near to a matrix with one there as rounding is.
+
+        Real parts alone do not tell: those of multiple eigenvalues are far larger than the rounding that splits them.
+        """
+        from scipy.linalg import matrix_balance
+
+        scaled = self.A * self.size / self.size[:, None]
+        scaled = np.where(np.abs(scaled) > NOISE * np.abs(scaled).max(initial=0.0), scaled, 0.0)
+        balanced, one = matrix_balance(scaled, permute=False)[0], np.eye(len(scaled))
+        size = np.linalg.norm(balanced)
+        near = [np.linalg.svd(balanced - 1j * b * one, compute_uv=False)[-1] for b in self.eigenvalues.imag]
+        return self.eigenvalues[np.array(near) <= HYPERBOLIC * size]
+
+    @property
+    def unstable(self):
+        """The number of unstable eigenvalues."""
+        return int((self.eigenvalues.real > 0).sum())
 
     def left_space(self, unstable):
         """An orthonormal basis (k, f) of the left eigenspace of the unstable, or of the stable eigenvalues."""
@@ -121,25 +160,24 @@ class End:
         return vectors[:, :count].T
 
 
-class Problem:
-    """The boundary value problem of a program along a span; see `bounded` for the parameters."""
+class FreeEntries:
+    """The internal dynamics z' = f(t, z) in entries z of the state that the invariants leave free.
 
-    def __init__(self, model, span, guess):
-        self.model, self.span, self.p, self.iterations = model, span, model.parameters, 0
+    Parameters
+    ----------
+    model : Model
+    t : float
+        [s]
+    guess : (n_x,) array
+        A state near which the entries are chosen.
+    """
+
+    def __init__(self, model, t, guess):
+        self.model, self.p = model, model.parameters
         self._equations = model.once("bounded", lambda: _equations(model))
         self.n_x, self.m = len(model.state_names), len(model.invariant_names())
-        self.c, self.derivative, *_ = radau(ORDER)
-        (t0, t1), count = span, self.n_x - self.m
         self.size = np.maximum(np.abs(guess), 1.0)
-        self._choose(np.array([t0]), np.asarray(guess, dtype=float)[:, None], count)
-        first = self._equilibrium(t0, guess)
-        last = self._equilibrium(t1, first)
-        times = np.linspace(t0, t1, 41)
-        along = self._quasi_static(times, first[:, None] + np.linspace(0, 1, 41) * (last - first)[:, None])
-        self.size = _level_sizes(along, state_levels(model))
-        self._choose(times, along, count)
-        self.first, self.last = (End(t, x, self._linearised(t, x)) for t, x in ((t0, first), (t1, last)))
-        self._require_splitting()
+        self._choose(np.array([t]), np.asarray(guess, dtype=float)[:, None], self.n_x - self.m)
 
     # the internal dynamics
 
@@ -178,46 +216,87 @@ class Problem:
             k = int(np.argmin(least))
             raise self._failure("No entries of the state are coordinates of the internal dynamics throughout.", t[k])
 
-    def _linearised(self, t, x):
-        return self.local(np.array([t]), x[:, None])[1][0]
-
     # equilibria
 
-    def _quasi_static(self, t, x):
-        """States (n_x, N) on the invariants at which z' = 0, each by Newton's method."""
-        x = x.copy()
+    def _quasi_static(self, t, x, continuum=False):
+        """States (n_x, N) on the invariants at which z' = 0, each by Newton's method; the nearest of a continuum."""
+        x, size = x.copy(), self.size[self.free]
         for _ in range(NEWTON_STEPS):
             rate, A, step, tangent = self.local(t, x)
+            A, right = A * size / size[:, None], (rate / size)[:, :, None]
             try:
-                change = step - (tangent @ np.linalg.solve(A, rate[:, :, None]))[:, :, 0]
+                solution = np.linalg.pinv(A, CUTOFF) @ right if continuum else np.linalg.solve(A, right)
             except np.linalg.LinAlgError:
                 return np.full_like(x, np.nan)
+            change = step - (tangent @ (size[:, None] * solution))[:, :, 0]
             largest = np.abs(change / self.size).max(axis=1, initial=0.0)
             x += (change * np.minimum(1.0, 1.0 / np.maximum(largest, 1e-300))[:, None]).T
             if not largest.max(initial=0.0) > NEWTON_ENDS:
                 break
         return x
 
-    def _equilibrium(self, t, x):
-        x = self._quasi_static(np.array([t]), np.asarray(x, dtype=float)[:, None])[:, 0]
-        if not np.isfinite(x).all() or np.abs(self.local(np.array([t]), x[:, None])[0]).max(initial=0.0) > STANDS:
-            raise self._failure("Newton's method finds no equilibrium of the internal dynamics.", t)
-        return x
+    def equilibrium(self, t, x):
+        """The equilibrium that Newton's method finds from a state (n_x,); IntegrationStopped if it finds none."""
+        t, guess, size = np.array([float(t)]), np.asarray(x, dtype=float)[:, None], self.size[self.free]
+        x = self._quasi_static(t, guess, continuum=True)
+        rate, A, _, tangent = self.local(t, x)
+        fastest = self._scaled(self.local(t, guess)[1]).max(initial=1.0)
+        still = np.isfinite(x).all() and np.abs(rate / size).max(initial=0.0) <= STANDS * fastest
+        # where z are no coordinates, z' = 0 for motions that do not stand still
+        if not (still and np.abs(tangent[0] * size / self.size[:, None]).max(initial=0.0) < 1 / REGULAR):
+            raise self._failure("Newton's method finds no equilibrium of the internal dynamics.", t[0])
+        return End(t[0], x[:, 0], A[0], size)
+
+    def _scaled(self, A):
+        """Magnitudes of the entries of matrices A (..., f, f) for z in its sizes."""
+        size = self.size[self.free]
+        return np.abs(A) * size / size[:, None]
+
+    def moved(self, end, times):
+        """The first of these times [s] at which an equilibrium or its linearisation is another one, or None."""
+        x = self._quasi_static(times, np.repeat(end.x[:, None], len(times), axis=1), continuum=True)
+        change = np.abs((x - end.x[:, None])[self.free] / self.size[self.free, None]).max(axis=0, initial=0.0)
+        of_A = self._scaled(self.local(times, x)[1] - end.A).max(axis=(1, 2), initial=0.0)
+        still = (change <= STANDS) & (of_A <= STANDS * self._scaled(end.A).max(initial=1.0))
+        return None if still.all() else float(times[np.argmin(still)])
+
+    def _failure(self, what, t):
+        return IntegrationStopped(
+            what,
+            "The bounded motion joins two equilibria of the internal dynamics.",
+            do="Give a start near the first equilibrium, or a smaller or slower path.",
+            t=float(t),
+        )
+
+
+class Problem(FreeEntries):
+    """The boundary value problem of a program along a span; see `bounded` for the parameters."""
+
+    def __init__(self, model, span, guess):
+        super().__init__(model, span[0], guess)
+        self.span, self.iterations = span, 0
+        self.c, self.derivative, *_ = radau(ORDER)
+        first = self.equilibrium(span[0], guess)
+        last = self.equilibrium(span[1], first.x)
+        times = np.linspace(*span, 41)
+        along = self._quasi_static(times, first.x[:, None] + np.linspace(0, 1, 41) * (last.x - first.x)[:, None])
+        self.size = _level_sizes(along, state_levels(model))
+        self._choose(times, along, self.n_x - self.m)
+        self.first, self.last = (self.equilibrium(end.t, end.x) for end in (first, last))
+        self._require_splitting()
 
     def _require_splitting(self):
         """Refuse eigenvalues on the imaginary axis, and ends with different numbers of unstable ones."""
         for end, where in ((self.first, "begin"), (self.last, "end")):
-            values = end.eigenvalues
-            on_axis = values[np.abs(values.real) <= HYPERBOLIC * np.abs(values).max(initial=0.0)]
-            if len(on_axis):
+            for value in end.on_axis[:1]:
                 raise UnstableInternalDynamics(
-                    f"The internal dynamics have the eigenvalue {on_axis[0]:.4g} 1/s at the {where} of the program.",
+                    f"The internal dynamics have the eigenvalue {value:.4g} 1/s at the {where} of the program.",
                     "The bounded motion is unique only where no eigenvalue lies on the imaginary axis.",
                     do="Choose another output, or add damping.",
                     t=end.t,
-                    eigenvalues=values.tolist(),
+                    eigenvalues=end.eigenvalues.tolist(),
                 )
-        unstable = [int((end.eigenvalues.real > 0).sum()) for end in (self.first, self.last)]
+        unstable = [end.unstable for end in (self.first, self.last)]
         if unstable[0] != unstable[1]:
             raise UnstableInternalDynamics(
                 f"The internal dynamics have {unstable[0]} unstable modes at the begin, {unstable[1]} at the end.",
@@ -237,18 +316,22 @@ class Problem:
 
     def _require_rest(self, end, t):
         """Refuse a program that does not stand still between an end of its span and t."""
-        times = np.linspace(end.t, t, 6)[1:]
-        x = self._quasi_static(times, np.repeat(end.x[:, None], len(times), axis=1))
-        change = np.abs((x - end.x[:, None])[self.free] / self.size[self.free, None]).max(axis=0, initial=0.0)
-        if not change.max(initial=0.0) <= STANDS:
-            moved = times[int(np.argmax(~(change <= STANDS)))]
+        moved = self.moved(end, np.linspace(end.t, t, 6)[1:])
+        if moved is not None:
             raise SpecificationError(
                 f"The internal dynamics have another equilibrium at t = {moved:.4g} s than at t = {end.t:.4g} s.",
                 "Outside the span the program stands still, so that the bounded motion has a rest to leave or reach.",
+                nearest=self._wider(),
                 do="Choose the span of the whole transition, paths that rest outside it, or a shorter window.",
-                t=float(moved),
+                t=moved,
                 span=self.span,
             )
+
+    def _wider(self):
+        """The span that all knots of the paths lie in; "" if they lie in the present one."""
+        (t0, t1), knots = self.span, self.model.knots
+        low, high = min(t0, *knots, t1), max(t0, *knots, t1)
+        return f"({low:g}, {high:g}), which holds all knots of the paths." if (low, high) != (t0, t1) else ""
 
     # collocation
 
@@ -385,7 +468,7 @@ class Problem:
         count, h, free = len(mesh) - 1, np.diff(mesh), self.free
         k, theta = np.repeat(np.arange(count), len(BETWEEN)), np.tile(BETWEEN, count)
         t = mesh[k] + theta * h[k]
-        change = self._polynomial(x, k, _basis_rates(self.c, theta)) - x[:, k * len(self.c)]
+        change = self._polynomial(x, k, basis_rates(self.c, theta)) - x[:, k * len(self.c)]
         values = self._on_invariants(t, self._polynomial(x, k, basis(self.c, theta)))
         rates = self.local(t, values)[0].T
         defect = np.abs(change[free] - h[k] * rates) / self.size[free, None]
@@ -406,14 +489,6 @@ class Problem:
                 do="Choose a guess near this instant in derive(..., guess=), a slower path or another output.",
                 t=float(t[k]),
             )
-
-    def _failure(self, what, t):
-        return IntegrationStopped(
-            what,
-            "The bounded motion joins two equilibria of the internal dynamics.",
-            do="Give a start near the first equilibrium, or a smaller or slower path.",
-            t=float(t),
-        )
 
 
 def _equations(model):
@@ -443,7 +518,7 @@ def _level_sizes(values, levels):
     return np.where(largest > 0, largest, 1.0)
 
 
-def _basis_rates(c, theta):
+def basis_rates(c, theta):
     """Derivatives of `basis` (s, N) at theta (N,)."""
     nodes = np.append(0.0, c)
     powers = np.arange(1, len(nodes))

@@ -7,8 +7,8 @@ import numpy as np
 
 from servoctl.errors import ServoError
 from servoctl.methods.choice import MinimalCoordinates, Poles
-from servoctl.methods.monitor import VANISHING, Fine, Monitor, Repivot
-from servoctl.methods.watch import Watch, edge, no_model, sticks
+from servoctl.methods.monitor import VANISHING, Fine, Monitor, Repivot, Singular
+from servoctl.methods.watch import End, Watch, edge, no_model, sticks
 from servoctl.reduction.orders import other_order
 
 SAME_INSTANT = 1e-12  # of the time: instants closer than this are one
@@ -24,6 +24,8 @@ class Motion:
     pieces: list = field(default_factory=list)
     stop: object = None
     interrupted: bool = False
+    ended: str = ""  # by this terminal event
+    occurrences: dict = field(default_factory=dict)  # of events, by name
     note: str = ""
     changed: set = field(default_factory=set)
     switches: list = field(default_factory=list)
@@ -143,6 +145,7 @@ class Stepping:
     advice = "Use a larger rtol, or check whether the motion escapes."
     watch = None  # of the residuals and switches, while steps are taken
     family = None  # the smooth models of a model with kinks or switches
+    events = None  # that are looked for
     tolerances = None  # rtol and atol; None for steps of fixed length
     parts = 8  # of a step, at whose ends switching functions are evaluated; 1 where steps are short
     projects = False  # whether ends of steps are projected before they are inspected
@@ -185,7 +188,7 @@ class Stepping:
             self.knots = {c for c in cuts if any(abs(c - k) <= margin_at(c) for k in knots)}
             self._start(t, x, cuts[1])
             for b in cuts[1:]:
-                while t != b and self.motion.stop is None:
+                while t != b and self.motion.stop is None and not self.motion.ended:
                     due = (t_eval >= min(t, b)) & (t_eval <= max(t, b)) & ((t_eval != t) | (t == t0))
                     t, x = self._piece(t, x, b, t_eval[due])
         return self.motion
@@ -210,6 +213,41 @@ class Stepping:
         return [np.atleast_1d(np.poly(poles)).real[:0:-1] for poles in self.drift.by_row(self.model).values()]
 
     def _inspected(self, stretch):
+        """The outcome of steps: that of the monitor, or the `End` of the piece if it comes first."""
+        outcome = self._smooth(stretch)
+        return outcome if self.events is None else self._event(stretch, outcome) or outcome
+
+    def _event(self, stretch, outcome):
+        """The `End` at a terminal event within steps before their outcome; None without."""
+        state, fine = self._state_within(stretch), isinstance(outcome, Fine)
+        steps, t = self.events.instants(stretch.t, self.parts)
+        end = stretch.t[outcome.steps] if fine else outcome.t
+        before = self.events.forward * t <= self.events.forward * end
+        steps, t = steps[before], t[before]
+        ends = dict(zip(stretch.t.tolist(), stretch.x.T, strict=True))
+        states = [ends[s] if s in ends else state(k, s) for k, s in zip(steps.tolist(), t.tolist(), strict=True)]
+        if t[-1] != end:
+            steps, t, states = np.append(steps, outcome.steps), np.append(t, end), [*states, outcome.x]
+
+        def at(s):
+            k = int(steps[min(np.searchsorted(self.events.forward * t, self.events.forward * s), len(t) - 1)])
+            return self._with_top(np.array([s]), (ends[s] if s in ends else state(k, s))[:, None])[:, 0]
+
+        stops = isinstance(outcome, Singular)
+        found = self.events.first(self.model, t, self._with_top(t, np.array(states).T), at, stops)
+        if found is None:
+            return None
+        k = max(int(np.searchsorted(self.events.forward * stretch.t, self.events.forward * found.t)) - 1, 0)
+        return End(k, found.t, found.jets[: self.n_x], event=found.name)
+
+    def _with_top(self, t, x):
+        """The jets (n_z, N) at times t (N,) and states x (n_x, N)."""
+        poles = isinstance(self.drift, Poles)
+        f = self.model.function("ode_poles" if poles else "ode")
+        p = self.p if poles else self.model.parameters
+        return np.concatenate([x, f.grid(t, x, p)[self.n_x - self.model.n : self.n_x]])
+
+    def _smooth(self, stretch):
         """The outcome of steps: that of the monitor, or the `End` of the smooth piece if it comes first."""
         state = self._state_within(stretch)
         switch = self.watch.switch(stretch, self._states_within(stretch), state) if self.family is not None else None
@@ -231,6 +269,11 @@ class Stepping:
 
     def _turn(self, end, b):
         """Stop at the end of a smooth piece, or go on beyond its switch towards b."""
+        if end.event:
+            self.motion.ended = end.event
+            if not self.motion.pieces or self.motion.pieces[-1][1][-1] != end.t:
+                self.motion.add(self.model, [end.t], end.x[:, None], self._top(end.t, end.x)[:, None])
+            return
         if end.error is not None:
             why = "a residual leaves its tolerance"
             singular = not end.error.details["why"] and self.monitor.lost(end.t, end.x)

@@ -249,6 +249,8 @@ class TaylorSteps(Stepping):
             outcome = self._inspected(self._stretch(t, states, y))
             fine, steps = isinstance(outcome, Fine), outcome.steps
             self.motion.count(steps=steps, nfev=steps)
+            if isinstance(outcome, End) and outcome.event:  # which is the last sample
+                times = np.union1d(times, outcome.t)[:: 1 if t[-1] >= t[0] else -1]
             times = self._sample(t, states, y, times, t[steps] if fine else outcome.t)
             if isinstance(outcome, End):
                 self._turn(outcome, b)

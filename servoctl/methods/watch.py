@@ -55,6 +55,8 @@ class End:
         All branches beyond.
     error : ServoError or None
         Why it stops.
+    event : str
+        The terminal event that ends the motion there.
     """
 
     steps: int
@@ -63,6 +65,7 @@ class End:
     switched: tuple = ()
     branches: tuple = ()
     error: object = None
+    event: str = ""
 
 
 def steps_of(t, times):

@@ -263,23 +263,23 @@ class Equations(Invariants):
         B = r.realisation.B
         C = ca.jacobian(second, acceleration) if rows else ca.SX(0, q.n)
         matrix = ca.vertcat(ca.horzcat(r.mechanism.mass, -B), ca.horzcat(C, ca.SX.zeros(len(rows), B.shape[1])))
-        right = -ca.substitute(ca.vertcat(r.mechanism.balance, second), acceleration, zero)
+        right = -ca.substitute(ca.vertcat(r.balance, second), acceleration, zero)
         return self.function("multiplier_form", self.jets, [right, ca.vec(ca.densify(matrix))])
 
     def signals(self, kind, rate=0):
         """Names of a group of `SIGNALS`, and their `rate`-th time derivatives as a function of (t, Z, p).
 
-        The jets Z of a derivative extend beyond s̄ as far as it depends on them.
+        The jets Z extend beyond s̄ as far as these depend on them.
         """
         names, expressions = SIGNALS[kind](self)
-        if not rate:
-            return names, self.function(kind, self.jets, expressions)
-        expressions = self.q.derivatives(ca.vertcat(*expressions).elements(), rate)[rate]
+        expressions = ca.vertcat(*expressions).elements()
+        if rate:
+            expressions = self.q.derivatives(expressions, rate)[rate]
+            names, kind = [jet_name(name, rate) for name in names], f"{kind}_rate{rate}"
         places = filter(None, map(self.q.where, ca.symvar(ca.vertcat(*expressions))))
         highest = max((level for of, level, _ in places if of not in ("t", "q")), default=0)
         above = (s for k in range(self.top + 1, highest + 1) for s in self.q.gamma(k))
-        names = [jet_name(name, rate) for name in names]
-        return names, self.function(f"{kind}_rate{rate}", ca.vertcat(self.jets, *above), expressions)
+        return names, self.function(kind, ca.vertcat(self.jets, *above), expressions)
 
     def _actuation(self):
         return list(self.r.mechanism.actuators), [self.r.actuation]
@@ -314,7 +314,7 @@ class Equations(Invariants):
         r, q = self.r, self.q
         w = q.jet(1)
         rate = q.dt(r.mechanism.energy)
-        force = r.mechanism.forces + r.realisation.B @ r.multipliers
+        force = r.mechanism.forces + r.mechanism.balance - r.balance + r.realisation.B @ r.multipliers
         law = rate - ca.dot(w, r.mechanism.balance + r.mechanism.forces)
         return ["rate", "work", "size", "law"], [rate, ca.dot(w, force), ca.dot(ca.fabs(w), ca.fabs(force)), law]
 
@@ -339,7 +339,9 @@ class Equations(Invariants):
             levels = self.q.derivatives([row.expression], max(0, self.top - row.order))
             names += [(name, j) for j in range(len(levels))]
             expressions += [level[0] for level in levels]
-        invariants = self.q.invariants
+        reported, invariants = self.r.mechanism.reported, self.q.invariants
+        names += [(name, 0) for name in reported]
+        expressions += reported.values()
         expressions = [*map(self._without_higher, expressions), *invariants.values()]
         return [*names, *((name, 0) for name in invariants)], expressions
 

@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import replace
 from functools import cached_property
+from math import factorial
 
 import casadi as ca
 import numpy as np
@@ -10,13 +11,16 @@ import numpy as np
 from servoctl.checks import MOST_JETS, as_numbers, finite, named, whole
 from servoctl.codegen.function import compiled
 from servoctl.errors import ServoError, SpecificationError, unknown
+from servoctl.jets.series import Flow
+from servoctl.jets.tape import REAL
 from servoctl.model.equations import EQUATIONS, SIGNALS, Equations, gradient_jets, leading_names, residual_rows
-from servoctl.model.report import describe
+from servoctl.model.report import describe, warn_of_products
 from servoctl.model.rest import started
 from servoctl.model.start import State
 from servoctl.model.store import Store, pack, unpack
 from servoctl.reduction.appell import require_positive
 from servoctl.reduction.knots import require_smooth
+from servoctl.reduction.manifold import ON_MANIFOLD, solve
 from servoctl.reduction.reduce import holds, reduce, strong
 from servoctl.reduction.structure import structure
 from servoctl.spec.mechanism import Mechanism
@@ -51,7 +55,19 @@ def derive(mechanism: Mechanism, program: Program, guess: Mapping[str, float] | 
         If a residual's gradient vanishes on its own solutions, or a rank cannot be decided.
     InconsistentStart
         If no state satisfies the constraints.
+
+    Warns
+    -----
+    RuntimeWarning
+        For a residual that is a product and vanishes about the guess by more than one of its factors.
     """
+    model = derived(mechanism, program, guess)
+    warn_of_products(model.reduction)
+    return model
+
+
+def derived(mechanism, program, guess=None):
+    """The model of `derive`, without its warnings."""
     return _derived(mechanism, program, guess)
 
 
@@ -223,8 +239,8 @@ class Model:
 
     @property
     def actuators(self):
-        """Names of the mechanism's actuators."""
-        return self.reduction.mechanism.actuators
+        """Names of the mechanism's actuators, or of the inputs that drive it."""
+        return self.reduction.mechanism.actuators or self.reduction.mechanism.inputs
 
     @property
     def ideal(self):
@@ -234,12 +250,14 @@ class Model:
     @property
     def outputs(self):
         """Names of the mechanism's outputs."""
-        return tuple(self.reduction.mechanism.outputs)
+        mechanism = self.reduction.mechanism
+        return tuple(name for name in mechanism.outputs if name not in mechanism.inputs)
 
     @property
     def residual_names(self):
         """Names of the rows whose residuals a run reports."""
-        return (*residual_rows(self.reduction), *self.reduction.mechanism.q.invariants)
+        mechanism = self.reduction.mechanism
+        return (*residual_rows(self.reduction), *mechanism.reported, *mechanism.q.invariants)
 
     @property
     def knots(self):
@@ -338,6 +356,34 @@ class Model:
             rates = (f"{d}{name}" for d in ("d", "d2") for name in mechanism.q.names)
             groups |= dict.fromkeys(rates, "coordinate_rates")
         return groups
+
+    def extended(self, t, jets, size):
+        """Jets of a motion beyond those known, from derivatives of its rows (`reduction.manifold.solve`).
+
+        Parameters
+        ----------
+        t : (N,) array
+            [s]
+        jets : (n, N) array
+            At least the state.
+        size : int
+            Number of the jets.
+
+        Returns
+        -------
+        (size, N) array
+            NaN where the rows do not determine them.
+        """
+        r, q = self.reduction, self.reduction.mechanism.q
+        level = (size - q.nq) // q.n
+        scale = np.repeat([1.0, *(factorial(k) for k in range(1, level + 1))], [q.nq, *level * [q.n]])[:, None]
+        z = np.zeros((size, len(t)), dtype=REAL)
+        z[: len(jets)] = jets / scale[: len(jets)]
+        points = replace(r.points, t=np.asarray(t), z=z, values=self.parameters, residual=np.zeros(len(t)))
+        solved, residual = solve(Flow(q, r.rows, level, points), t, z)
+        result = np.where(residual < ON_MANIFOLD, (solved * scale).astype(float), np.nan)
+        result[: len(jets)] = jets
+        return result
 
     def invariant_names(self):
         """(level, name) of each invariant of the state, in the order of the function "invariants"."""

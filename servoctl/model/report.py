@@ -1,9 +1,13 @@
 """The printed form of a model, and what is said of a state at which its program is singular."""
 
+import warnings
+
 import numpy as np
 
 from servoctl.errors import ServoError, SingularProgram
 from servoctl.model.rest import first_motion, standstill
+from servoctl.reduction.rows import alternatives
+from servoctl.reduction.self_motion import self_motion
 
 WIDTH = 118
 
@@ -18,6 +22,7 @@ def describe(model):
         *([f"  {raised}"] if raised else []),
         *_hidden_and_free(model),
         f"  {_rule(r)}",
+        *_open(r),
     ]
     if any(not row.affine for row in r.rows):
         nonlinear = ", ".join(row.name for row in r.rows if not row.affine)
@@ -68,6 +73,29 @@ def _rule(r):
     return f"(3.18) with T from ker G; dependent: {dependent}; under {rule}"
 
 
+def _open(r):
+    """How actuation that the program leaves open is chosen, and the self-motion that goes with it."""
+    m, k = len(r.mechanism.actuators), len(r.program.residuals)
+    if r.program.by == "ideal" or not 0 < k < m:
+        return []
+    chosen = "nearest to the wishes" if r.program.toward else "of least norm"
+    return [f"  {m} actuators for {k} residuals: {chosen}; {self_motion(r) or 'no self-motion'}"]
+
+
+def warn_of_products(r):
+    """Warn of each residual that holds by more than one of its factors: a start decides which, and both may be zero."""
+    for row in r.original.values():
+        zeros = alternatives(r.mechanism.q, row, r.context)
+        if zeros:
+            warnings.warn(
+                f"The residual {row.name!r} is a product, and holds wherever {' or '.join(zeros)} is zero: a start "
+                f"decides by which, and where both are zero its gradient vanishes. Divide {row.name!r} by the factor "
+                "that is not meant, or pass guess={...} to derive, far from the zeros of that factor.",
+                RuntimeWarning,
+                stacklevel=3,
+            )
+
+
 def explain(model, t, x, lost, **facts):
     """The error of a singular state (n_x,), of which `lost` rows lose their gradients, by its cause; None if unknown.
 
@@ -76,7 +104,7 @@ def explain(model, t, x, lost, **facts):
     chosen = dict(zip(model.state_names, map(float, x), strict=True))
     still = standstill(model, t, chosen)
     if still is not None:
-        return still.error(t, first_motion(model, t, chosen, still), **facts)
+        return still.error(t, first_motion(model, t, chosen, still), chosen, **facts)
     prescribed = any(name in model.reduction.original for name in lost)
     return None if prescribed else _lost_degrees(model, t, np.asarray(x, dtype=float), **facts)
 

@@ -14,9 +14,9 @@ from servoctl.reduction.ranks import equilibrate
 
 STANDS = 1e-9  # velocities below this, relative to the coordinates' size, are rest
 MOVES = 1e-5  # velocities above this, likewise, leave six digits of directions that depend on their squares
-LATER = tuple(1e-3 * 2.0**k for k in range(11))  # s after the start, where the motion may have begun: 1 ms to 1 s
+LATER = tuple(1e-3 * 2.0**k for k in range(9))  # of the time to the next knot, where the motion may have begun
 NEAR_LIMIT = 1e-2  # rad or m: distance of the first value from the limit up to which extrapolation is trusted
-EQUAL = 1e-12  # difference of values at two instants that is rounding
+EQUAL = 1e-9  # difference of values at two instants that is rounding, at velocities of MOVES
 
 
 @dataclass(frozen=True)
@@ -34,15 +34,23 @@ class Standstill:
     coordinates: tuple
     rows: tuple
 
-    def error(self, t, nearest=None, **facts):
-        """The error of a program that is singular because its machine stands still at t [s]."""
+    def error(self, t, nearest=None, values=None, **facts):
+        """The error of a program that is singular because its machine stands still at t [s].
+
+        `nearest` is an instant at which it moves [s], `values` (dict) are states from which a guess there may come.
+        """
         rows, names = (", ".join(parts) for parts in (map(repr, self.rows), self.coordinates))
         leave = "leaves" if len(self.rows) == 1 else "leave"
+        guess = {name: round(float(values[name]), 4) for name in self.coordinates if name in (values or {})}
+        begin = f"model.start(t={nearest}{f', guess={guess}' if guess else ''})"
         return SingularProgram(
             f"At t = {t:.7g} s the machine stands still: {rows} {leave} {names} open there.",
-            "Constraints that are linear in velocities determine directions in motion only.",
+            "Constraints that are linear in velocities determine directions in motion only, so that no motion can be "
+            "computed through a standstill.",
             nearest="" if nearest is None else f"t = {nearest:g} s, where it moves.",
-            do="Begin after the standstill and end before the next, or give the path a speed there.",
+            do="End the motion before this instant, or give the path a speed there."
+            if nearest is None
+            else f"Simulate from {begin} on, and end before the next standstill; or give the path a speed there.",
             t=float(t),
             coordinates=self.coordinates,
             nearest_time=nearest,
@@ -126,7 +134,7 @@ def _limit(model, t, held, chosen, still):
     for name in still.coordinates:
         limit[name], error = _extrapolated(*(state[name] for state in states))
         if not error <= NEAR_LIMIT:
-            raise still.error(t, moving)
+            raise still.error(t, moving, dict(zip(states[0].names, states[0].values, strict=True)))
     _, equations, aim, _ = _at_rest(model, t, limit)
     x = gauss_newton(equations, aim.reference, aim)
     residual = np.abs(equations.scaled(x)).max(initial=0.0)
@@ -146,7 +154,8 @@ def _extrapolated(first, second, third):
 
 def first_motion(model, t, chosen, still):
     """A time [s] shortly after t at which the constraints determine a machine that stands still at t; None if none."""
-    return next((t + tau for tau in LATER if _moves(model, t + tau, chosen, still)), None)
+    length = min((knot - t for knot in model.knots if knot > t), default=1.0)
+    return next((t + tau * length for tau in LATER if _moves(model, t + tau * length, chosen, still)), None)
 
 
 def _moves(model, t, guess, still):

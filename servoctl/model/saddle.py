@@ -29,7 +29,7 @@ def solve(equations, poles=False):
     G = ca.vertcat(*(r.rows[a].gradient(q) for a in constraints))
     matrix = ca.vertcat(ca.horzcat(r.mechanism.mass, -B), ca.horzcat(G, ca.SX(size, B.shape[1])))
     acceleration = q.jet(2)
-    rest = ca.substitute(r.mechanism.balance, acceleration, ca.SX.zeros(q.n))
+    rest = ca.substitute(r.balance, acceleration, ca.SX.zeros(q.n))
     right = -ca.vertcat(rest, *equations.rest(constraints, poles))
     solution, pivots = eliminate(matrix, right, clean(*r.points.matrix(matrix)))
     return solution[: q.n], solution[q.n :], pivots

@@ -17,6 +17,8 @@ GUESSED = 1e3  # weight of a guessed value relative to one without a guess
 TRIES = 6  # initial points of the iteration; the first is the reference
 FARTHER = 0.1  # distance of each further initial point from the reference, relative to the state's size
 SEED = 1788  # seed of these points
+THIRDS = 15  # of a step to a third, until the residual falls
+LEAPS = 3  # whole steps along which it may rise, as over a kink
 REACHED = 1e-16  # scaled residual at which the iteration ends
 REPEATED = 1e-12  # singular values below this fraction of the largest count as zero
 SPANNED = 1e-9  # a column of the Jacobian with a smaller part outside the span of others lies in it
@@ -72,7 +74,8 @@ class State(Value):
         return (
             f"State at t = {self.t:g} s\n  {shown}\n  held: {held}; left free: {free}\n"
             f"  largest residual {self.residual:.1e}"
-            + (f"\n  at rest; {rest} by the limit of the motion that follows" if self.at_rest else "")
+            + (f"\n  at rest; {rest} by the limit of the motion that follows, which can be simulated once it moves"
+               if self.at_rest else "")
             + self._told_apart()
         )
 
@@ -258,12 +261,12 @@ def _best(equations, aim):
     best, smallest = aim.reference, np.inf
     for first in _starts(aim):
         x = _nearest(equations, gauss_newton(equations, first, aim), aim)
-        residual = np.nan_to_num(np.abs(equations.scaled(x)), nan=np.inf).max(initial=0.0)
+        residual = _largest(equations, x)
         if residual < smallest:
             best, smallest = x, residual
         if smallest < TOLERANCE:
             break
-    return best, float(smallest)
+    return best, smallest
 
 
 def _step(value, jacobian, aim):
@@ -284,8 +287,9 @@ def gauss_newton(equations, x, aim, iterations=60):
     """Damped Gauss-Newton with least steps.
 
     A step is judged by the gradients at its start: relative to gradients that shrink along it, residuals that fall
-    would seem to rise.
+    would seem to rise. Where no part of a step helps, as before a kink, a few whole steps are tried.
     """
+    left = []
     for _ in range(iterations):
         value, jacobian = equations(x)
         size = gradient_sizes(jacobian, x)
@@ -293,16 +297,22 @@ def gauss_newton(equations, x, aim, iterations=60):
         if norm < REACHED:
             break
         step = _step(-value, jacobian, aim)
-        damping = 1.0 / max(1.0, np.max(np.abs(step) / (1.0 + np.abs(x)), initial=0.0))
-        for _ in range(15):
-            trial = x + damping * step
-            if np.abs(equations(trial)[0] / size).max(initial=0.0) < norm:
+        longest = 1.0 / max(1.0, np.max(np.abs(step) / (1.0 + np.abs(x)), initial=0.0))
+        trials = (x + longest / 3**k * step for k in range(THIRDS))
+        better = (y for y in trials if np.abs(equations(y)[0] / size).max(initial=0.0) < norm)
+        trial = next(better, None)
+        if trial is None:
+            left.append(x)
+            if len(left) > LEAPS:
                 break
-            damping /= 3
-        else:
-            break
+            trial = x + longest * step
         x = trial
-    return x
+    return min([x, *left], key=lambda y: _largest(equations, y)) if left else x
+
+
+def _largest(equations, x):
+    """The largest scaled residual; inf where one has no value."""
+    return float(np.nan_to_num(np.abs(equations.scaled(x)), nan=np.inf).max(initial=0.0))
 
 
 def _nearest(equations, x, aim, iterations=40):
@@ -347,7 +357,7 @@ def _branches(equations, x, aim, model):
         signs, far = rng.choice([-1.0, 1.0], len(x)), rng.uniform(-FAR, FAR, len(x)) * (1.0 + np.abs(x))
         first = np.where(aim.movable, x * signs + far if attempt else -x, x)
         y = gauss_newton(equations, first, aim, SEARCH_STEPS)
-        residual = np.nan_to_num(np.abs(equations.scaled(y)), nan=np.inf).max(initial=0.0)
+        residual = _largest(equations, y)
         same = residual < TOLERANCE and any(_same_motion(y, z, model) for z in found)
         if residual < TOLERANCE and not same and not _clear_choice(x, y, aim, model):
             found.append(y)

@@ -134,13 +134,17 @@ def fingerprint(mechanism, program, guess=None, near=None, values=None):
         facts = [
             list(program.residuals),
             program.by,
-            [(name, None if isinstance(weight, ca.SX) else float(weight)) for name, weight in program.weights.items()],
+            *(
+                [(name, None if isinstance(e, ca.SX) else float(e)) for name, e in chosen.items()]
+                for chosen in (program.weights, program.toward)
+            ),
             [(name, float(value)) for name, value in (guess or {}).items()],
             None if near is None else float(t),
             *([(name, float(value)) for name, value in some.items()] for some in (state, sizes)),
             np.asarray(mechanism.parameters.values() if values is None else values, dtype=float).tolist(),
         ]
-        expressions = [*program.residuals.values(), *(w for w in program.weights.values() if isinstance(w, ca.SX))]
+        chosen = (*program.weights.values(), *program.toward.values())
+        expressions = [*program.residuals.values(), *(e for e in chosen if isinstance(e, ca.SX))]
         function = mechanism.q.as_function(expressions, mechanism.parameters.symbols)
         text = "\n".join([json.dumps(facts, allow_nan=False), mechanism.as_text(), function.serialize()])
     except Exception:  # CasADi raises bare ones; the derivation says what is wrong

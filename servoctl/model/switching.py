@@ -8,7 +8,7 @@ import numpy as np
 from servoctl.codegen.function import compiled
 from servoctl.errors import SpecificationError
 from servoctl.jets.branches import Branches, has_switches
-from servoctl.model.model import Model, derive
+from servoctl.model.model import Model, derived
 from servoctl.spec.mechanism import Mechanism
 from servoctl.spec.parameters import Parameters
 from servoctl.spec.program import Program
@@ -124,7 +124,7 @@ class Switching:
             kept = [b if s.angle else side for s, b, side in zip(self.switches, now, sides, strict=True)]
             model = model.with_parameters(**dict(zip(self._names, kept, strict=True)))
         else:
-            model = derive(*self._with_numbers(branches), self.model.reduction.context.guess)
+            model = derived(*self._with_numbers(branches), self.model.reduction.context.guess)
         self._require_same(model, branches)
         return model
 
@@ -176,8 +176,8 @@ def _switching(model):
 
 
 def _residuals(mechanism, program):
-    weights = [w for w in program.weights.values() if isinstance(w, ca.SX)]
-    return [*program.residuals.values(), *mechanism.constraints.values(), *weights, *mechanism.E.elements()]
+    chosen = [w for w in (*program.weights.values(), *program.toward.values()) if isinstance(w, ca.SX)]
+    return [*program.residuals.values(), *mechanism.constraints.values(), *chosen, *mechanism.E.elements()]
 
 
 def _smooth(mechanism, program, branches):
@@ -186,14 +186,17 @@ def _smooth(mechanism, program, branches):
     constraints = dict(
         zip(mechanism.constraints, branches.smooth(list(mechanism.constraints.values()), True), strict=True)
     )
-    weights = {name: branches.smooth([ca.SX(w)])[0] for name, w in program.weights.items()}
+    weights, toward = (
+        {name: branches.smooth([ca.SX(e)])[0] for name, e in chosen.items()} or None
+        for chosen in (program.weights, program.toward)
+    )
     columns = {
         name: ca.reshape(ca.vertcat(*branches.smooth(m.elements())), *m.shape) if m.numel() else m
         for name, m in (("balance", mechanism.balance), ("forces", mechanism.forces), ("E", mechanism.E))
     }
     parameters = _extended(mechanism.parameters, [s.branch for s in branches.switches])
     smooth = _with(mechanism, **columns, constraints=constraints, energy=mechanism.energy, parameters=parameters)
-    return smooth, Program(residuals, program.by, weights or None) if residuals else program
+    return smooth, Program(residuals, program.by, weights, toward) if residuals else program
 
 
 def _with(mechanism, **parts):

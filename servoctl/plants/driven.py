@@ -1,14 +1,17 @@
 """A plant under inputs that are functions of time: a mechanism without a program."""
 
+from dataclasses import replace
+
 import casadi as ca
 
 from servoctl.checks import column, mapping
 from servoctl.errors import SpecificationError, unknown
 from servoctl.model.model import derive
+from servoctl.plants.equations import plant_equations
 from servoctl.spec.program import no_program
 
 
-def driven(plant, inputs=None):
+def driven(plant, inputs=None, residuals=None):
     """The model of a plant under given inputs, within its limits of magnitude.
 
     Parameters
@@ -18,6 +21,8 @@ def driven(plant, inputs=None):
     inputs : dict of str to float, SX or callable, optional
         Inputs by actuator, default 0: numbers, expressions of `q.t` such as paths, or functions that give them of
         `q.t`.
+    residuals : dict of str to SX, optional
+        Residuals of a program that the inputs realise approximately; runs report them.
 
     Returns
     -------
@@ -50,7 +55,7 @@ def driven(plant, inputs=None):
     count = len(mechanism.parameters.names)
     damping = ca.SX(list(plant.parameters[count : count + plant.equations.damping.numel()]))
     further = plant.equations.forces + ca.substitute(plant.equations.resisting, plant.equations.damping, damping)
-    model = derive(mechanism.under(expressions, further), no_program())
+    model = derive(mechanism.under(expressions, further, residuals), no_program())
     return model.with_parameters(**dict(zip(mechanism.parameters.names, plant.parameters[:count], strict=True)))
 
 
@@ -66,3 +71,13 @@ def _expression(name, value, t):
             name=name,
         ) from error
     return column(value, f"the input {name!r}", 1)[0]
+
+
+def at_once(plant):
+    """The plant with actuators that act at once, without limits."""
+    forces, damped, _, values = plant.equations.choices
+    count = len(plant.parameters) - len(plant.lag)
+    names = plant.state_names[: plant.n_x - len(plant.lag)]
+    equations = plant_equations(plant.mechanism, forces, damped, (), values) if plant.lag else plant.equations
+    numbers = {"parameters": plant.parameters[:count], "state_names": names, "equations": equations}
+    return replace(plant, limits={}, rate_limits={}, lag={}, delay={}, **numbers)

@@ -9,12 +9,11 @@ from dataclasses import dataclass
 import casadi as ca
 import numpy as np
 
-from servoctl.errors import NotRealisable, SpecificationError, unknown
-from servoctl.reduction.ranks import clean, decide_all, decide_each, eliminate, equilibrate
+from servoctl.errors import SpecificationError
+from servoctl.reduction.ranks import clean, decide_all, eliminate, equilibrate
 
 NEGATIVE = 1e-9  # eigenvalues of a scaled inertia matrix below minus this are no rounding errors
 NAMED = 1e-6  # components of a direction below this fraction of the largest are not named in an error
-LONGEST_SEARCH = 2  # times n: no relative degree exceeds the number of plant states
 
 
 @dataclass(frozen=True)
@@ -26,13 +25,15 @@ class Realisation:
     B : (n, b) SX
         Directions of the reaction: the program's first, then those of material constraints.
     actuation : (m, k) SX or None
-        Matrix by which the first k multipliers give u; None for an ideal program.
+        Matrix A by which the first k multipliers give u = u_wish + A μ; None for an ideal program.
     dependent, independent : tuple of int
         Indices of the quasi-coordinates.
     numbers : (b, n, N) array
         Bᵀ at the points where the split was chosen.
-    decided : tuple of Row
-        Rows whose relative degrees weight redundant actuators.
+    settled : tuple of Row
+        Where the program leaves actuation open, the rows that hold whichever is taken; else none.
+    unreached : tuple of int
+        Independent quasi-coordinates whose balance no actuator enters: the settled rows contain it.
     """
 
     B: ca.SX
@@ -40,15 +41,16 @@ class Realisation:
     dependent: tuple
     independent: tuple
     numbers: np.ndarray
-    decided: tuple = ()
+    settled: tuple = ()
+    unreached: tuple = ()
 
     def __repr__(self):
         return f"Realisation({self.B.shape[1]} directions, dependent coordinates {self.dependent})"
 
     def dynamics(self, balance):
-        """Tᵀ r, one SX scalar per independent coordinate, and the pivots divided by, here and in the multipliers."""
+        """Tᵀ r by independent coordinate, without unreached ones, and the pivots divided by, as in the multipliers."""
         if not self.dependent:
-            return ca.vertsplit(balance[list(self.independent)]), []
+            return {i: balance[i] for i in self.independent}, []
         transposed = self.B.T
         a, pivots = eliminate(
             transposed[:, list(self.dependent)],
@@ -56,7 +58,8 @@ class Realisation:
             self.numbers[:, list(self.dependent)],
         )
         virtual = zip(self.independent, (a.T @ balance[list(self.dependent)]).elements(), strict=True)
-        return [balance[i] + reaction for i, reaction in virtual], [p for p in pivots if ca.symvar(p)]
+        rows = {i: balance[i] + reaction for i, reaction in virtual if i not in self.unreached}
+        return rows, [p for p in pivots if ca.symvar(p)]
 
     def multipliers(self, balance):
         """μ with B_D μ = r_D, (b,) SX."""
@@ -64,140 +67,6 @@ class Realisation:
         if not rows:
             return ca.SX(0, 1)
         return eliminate(self.B[rows, :], balance[rows], self.numbers[:, rows].swapaxes(0, 1))[0]
-
-
-def realisation(mechanism, program, constraints, points):
-    """The realisation of a program by ideal reactions or by the mechanism's actuators.
-
-    Parameters
-    ----------
-    mechanism : Mechanism
-    program : Program
-    constraints : list of Row
-        Program rows and material rows, the latter of full row rank.
-    points : Points
-        Points on the manifold of the constraints.
-
-    Returns
-    -------
-    Realisation
-
-    Raises
-    ------
-    NotRealisable
-        If the residuals outnumber the independent actuators, or the actuators cannot move them independently.
-    """
-    q = mechanism.q
-    G, G_m = (
-        ca.vertcat(ca.SX(0, q.n), *(row.gradient(q) for row in constraints if row.kind == kind))
-        for kind in ("program", "material")
-    )
-    if program.by == "ideal":
-        directions, actuation, decided = G.T, None, ()
-    else:
-        directions, actuation, decided = _actuator_directions(mechanism, program, constraints, points)
-    B = ca.horzcat(directions, G_m.T)
-    numbers, sizes = points.matrix(B.T)
-    rank, best = decide_all(numbers, sizes)
-    if rank.rank < B.shape[1]:
-        raise NotRealisable(
-            f"The directions of the actuators {', '.join(mechanism.actuators)} and of the material constraints are "
-            f"dependent (rank {rank.rank} of {B.shape[1]}).",
-            "Actuators and material constraints act in independent directions.",
-            do="Remove an actuator or a constraint.",
-            actuators=list(mechanism.actuators),
-            rank=rank.rank,
-            directions=B.shape[1],
-        )
-    dependent = tuple(sorted(rank.columns))
-    independent = tuple(i for i in range(q.n) if i not in dependent)
-    cleaned = clean(numbers, sizes)
-    regular = [p for p, rank in enumerate(decide_each(cleaned[:, list(dependent)])) if rank.rank == len(cleaned)]
-    return Realisation(B, actuation, dependent, independent, cleaned[:, :, regular or [best]], decided)
-
-
-def _actuator_directions(mechanism, program, constraints, points):
-    """E, or E W⁻¹Pᵀ where there are more actuators than residuals; the matrix of the actuation; the rows behind P.
-
-    With as many independent actuators as residuals, as for two motors on one trolley, the program determines E u; P is
-    then any matrix with the row space of E, and W⁻¹Pᵀμ the u of least norm.
-    """
-    q = mechanism.q
-    k, m = len(program.residuals), len(mechanism.actuators)
-    material = [row for row in constraints if row.kind == "material"]
-    both = ca.horzcat(mechanism.E, *(row.gradient(q).T for row in material))
-    rank = decide_all(*points.matrix(both.T))[0].rank if both.shape[1] else 0
-    independent = rank - len(material)
-    if k > independent:
-        raise NotRealisable(
-            f"The program has {k} residual{'s' * (k != 1)} ({', '.join(program.residuals)}), and the mechanism "
-            f"{independent} independent actuators ({', '.join(mechanism.actuators) or 'none'}).",
-            "A program needs at least as many independent actuators as residuals.",
-            nearest=f"{independent} residuals, or by='ideal'." if independent else "by='ideal'.",
-            do="Add actuators or remove residuals.",
-            residuals=list(program.residuals),
-            actuators=list(mechanism.actuators),
-            independent=independent,
-        )
-    unknown_weights = [w for w in program.weights if w not in mechanism.actuators]
-    if unknown_weights:
-        raise unknown(unknown_weights[0], mechanism.actuators, "actuator")
-    if k == m:
-        return mechanism.E, ca.SX.eye(m), ()
-    inverse_weights = ca.diag(ca.vertcat(*(1 / ca.SX(program.weights.get(name, 1.0)) for name in mechanism.actuators)))
-    if k == independent:
-        actuation = inverse_weights @ _row_space(mechanism, material, points, k).T
-        return mechanism.E @ actuation, actuation, ()
-    P, decided = decoupling(mechanism, [row for row in constraints if row.kind == "program"], material, points)
-    rank_P = decide_all(*points.matrix(P))[0].rank
-    if rank_P < k:
-        raise NotRealisable(
-            f"The decoupling matrix has rank {rank_P} for {k} residuals and {m} actuators.",
-            "Redundant actuators are weighted at each instant, which needs a decoupling matrix of full row rank.",
-            nearest=f"{k} actuators, for which hidden constraints are derived.",
-            do="Remove actuators, or program other outputs.",
-            residuals=list(program.residuals),
-            actuators=list(mechanism.actuators),
-            rank=rank_P,
-        )
-    actuation = inverse_weights @ P.T
-    return mechanism.E @ actuation, actuation, decided
-
-
-def _row_space(mechanism, material, points, k):
-    """k independent rows of E, beside material rows of N E: what the inputs do to the motion, (k, m) SX."""
-    rows = mechanism.E
-    if material:
-        rows, _ = plant_accelerations(mechanism, material, rows, ca.SX.zeros(len(material), rows.shape[1]), points)
-    return rows[sorted(decide_all(*points.matrix(rows))[0].rows[:k]), :]
-
-
-def decoupling(mechanism, rows, material, points):
-    """P = ∂φ^(r)/∂u (k, m), with each residual differentiated along the plant until the actuation appears; the rows.
-
-    For relative degree 2 P = G N E with N = M⁻¹, or T_m(T_mᵀMT_m)⁻¹T_mᵀ beside material rows.
-    """
-    q = mechanism.q
-    acceleration = q.jet(2)
-    rest = ca.substitute(mechanism.balance, acceleration, ca.SX.zeros(q.n))
-    second = ca.vertcat(*(q.derivatives([row.expression], 2 - row.order)[-1][0] for row in material))
-    second = ca.substitute(second, acceleration, ca.SX.zeros(q.n)) if material else ca.SX(0, 1)
-    still = ca.SX.zeros(len(material), mechanism.E.shape[1])
-    moves, _ = plant_accelerations(mechanism, material, mechanism.E, still, points)
-    drift, _ = plant_accelerations(mechanism, material, -rest, -second, points)
-    result, decided = [], []
-    for row in rows:
-        expression = q.derivatives([row.expression], max(0, 2 - row.order))[-1][0] if row.order < 2 else row.expression
-        level = max(row.order, 2)
-        for _ in range(LONGEST_SEARCH * q.n):
-            coefficients = ca.jacobian(expression, q.jet(level)) @ moves
-            if np.any(clean(*points.matrix(coefficients))) or level > 2:
-                break
-            row = row.resting_on(coefficients.T, ca.SX.ones(coefficients.numel()))
-            expression = q.derivatives([ca.substitute(expression, acceleration, drift)], 1)[-1][0]
-        result.append(coefficients)
-        decided.append(row)
-    return ca.cse(ca.vertcat(*result)), tuple(decided)
 
 
 def _saddle(mechanism, material):

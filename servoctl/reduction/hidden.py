@@ -10,6 +10,7 @@ import casadi as ca
 import numpy as np
 
 from servoctl.errors import InconsistentStart, NotRealisable, SingularProgram, SpecificationError
+from servoctl.jets.branches import shown
 from servoctl.reduction.manifold import POINTS_SEED, SPREAD, sample
 from servoctl.reduction.ranks import clean, decide, decide_each, eliminate, generic
 from servoctl.reduction.rows import (
@@ -158,21 +159,21 @@ def _divided(q, rows, combination, context):
     """
     b, whole = combination.replaces, combination.whole
     if len(combination.support) == 1:
-        raise vanishing_gradient(rows[b], *_factor(q, rows, b, context))
+        raise vanishing_gradient(q, rows[b], context, *_factor(q, rows, b, context))
     level = whole.order
     beside = np.abs(_slopes_beside(q, rows, combination, context)).max(axis=1, initial=0.0)
     i = int(np.argmax(beside))
     jet = q.jet_names(level)[i]
     if not np.abs(combination.points.jet(level)[i]).min(initial=np.inf) > DIVIDES * context.sizes.get(jet, 1.0):
-        raise vanishing_gradient(rows[b])  # at rest a = 0 would follow from nothing
+        raise vanishing_gradient(q, rows[b], context)  # at rest a = 0 would follow from nothing
     rest = [row for a, row in enumerate(rows) if a != b]
     row = replace(whole, expression=ca.densify(whole.gradient(q, level))[i], parts=())
     row, points = settle(q, row, rest, context, combination.points)
     if row is None or not 0 <= row.order < level:
-        raise vanishing_gradient(rows[b])
+        raise vanishing_gradient(q, rows[b], context)
     points = sample(q, [*rest, row], level, context, starts=points)
     if not len(points.t) or np.any(clean(*values_and_sizes(whole, points))):
-        raise vanishing_gradient(rows[b])
+        raise vanishing_gradient(q, rows[b], context)
     return replace(combination, row=replace(row, story=f"{combination.row.story}, divided by {jet}"), points=points)
 
 
@@ -255,14 +256,15 @@ def _require_affine(q, rows, support, top, context):
 def _refuse_factor(q, rows, indices, context):
     """Refuse a row with a factor that vanishes on the solutions of the others: it follows from them."""
     for b in indices:
-        factor, others = (*_factor(q, rows, b, context), None, None)[:2]
+        found, others = (*_factor(q, rows, b, context), None, None)[:2]
         if others:
+            factor = shown(found)
             raise SpecificationError(
                 f"The residual {rows[b].name!r} has the factor {factor}, zero by {', '.join(map(repr, others))}.",
                 "Each residual restricts the motion beyond the others.",
                 do=f"Divide {rows[b].name!r} by {factor}.",
                 row=rows[b].name,
-                factor=str(factor),
+                factor=factor,
                 rows=others,
             )
 

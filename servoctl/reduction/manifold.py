@@ -292,6 +292,12 @@ def sample(q, rows, level, context, starts=None, flow=None):
     return points if len(points.t) else _solved(starting, flow, slice(POINTS), natural=True)
 
 
+def anywhere(q, level, context):
+    """The random points about the guess from which points of a manifold are sought."""
+    t, z = _random_starts(q, level, context)
+    return Points(q, t, z.astype(REAL), context.parameters, context.values, np.zeros(len(t)), context.book)
+
+
 def _random_starts(q, level, context):
     """Times (2 POINTS,) in the window and jets (nz, 2 POINTS) about the guess, about zero where there is none."""
     rng, nz = np.random.default_rng(POINTS_SEED), q.nq + level * q.n

@@ -9,13 +9,14 @@ import numpy as np
 from servoctl.checks import finite, mapping
 from servoctl.errors import NotRealisable, SpecificationError, unknown
 from servoctl.jets.series import Flow
-from servoctl.reduction.appell import Realisation, realisation, require_inertia
+from servoctl.reduction.appell import Realisation, require_inertia
 from servoctl.reduction.hidden import complete
 from servoctl.reduction.knots import Knots, Switches, require_smooth
 from servoctl.reduction.manifold import SPREAD, Context, Points, sample
 from servoctl.reduction.orders import Orders
 from servoctl.reduction.ranks import Rank, clean, decide, decide_all
-from servoctl.reduction.rows import Balance, Row, as_rows, merge_uses, settle_alone
+from servoctl.reduction.realisation import realisation, wished
+from servoctl.reduction.rows import Balance, as_rows, balances, merge_uses, settle_alone
 from servoctl.spec.mechanism import Mechanism, require_known
 from servoctl.spec.program import Program
 from servoctl.tolerances import TINY
@@ -103,7 +104,7 @@ class Reduction:
     @cached_property
     def orders(self):
         """What the orders of the rows rest on."""
-        decided = (*self.original.values(), *self.rows, *self.realisation.decided)
+        decided = (*self.original.values(), *self.rows, *self.realisation.settled)
         return Orders(decided, self.rows, self.top, self.points)
 
     @cached_property
@@ -117,8 +118,12 @@ class Reduction:
         q, B = self.mechanism.q, self.realisation.B
         orders = (q.derivatives([row.expression], max(0, self.top - row.order)) for row in self.original.values())
         residuals = [level[0] for levels in orders for level in levels]
-        balance = self.mechanism.balance - B @ self.multipliers
-        return [*residuals, *balance.elements()]
+        return [*residuals, *(self.balance - B @ self.multipliers).elements()]
+
+    @cached_property
+    def balance(self):
+        """The balance under the wished actuation, r - E u_wish, (n,) SX: what the reaction B μ holds."""
+        return self.mechanism.balance - self.mechanism.E @ wished(self.mechanism, self.program)
 
     @cached_property
     def flow(self):
@@ -128,7 +133,7 @@ class Reduction:
     @cached_property
     def multipliers(self):
         """Multipliers of the reaction, those of the program first, (b,) SX of t, q, γ', γ''."""
-        return self.realisation.multipliers(self.mechanism.balance)
+        return self.realisation.multipliers(self.balance)
 
     @cached_property
     def actuation(self):
@@ -136,7 +141,7 @@ class Reduction:
         k = len(self.program.residuals)
         multipliers = self.multipliers[:k] if k else ca.SX(0, 1)
         if self.program.by == "actuators":
-            return ca.cse(self.realisation.actuation @ multipliers)
+            return ca.cse(wished(self.mechanism, self.program) + self.realisation.actuation @ multipliers)
         return ca.cse(self.realisation.B[:, :k] @ multipliers)
 
 
@@ -181,7 +186,8 @@ def reduce(mechanism, program, guess=None, near=None, values=None):
     _require_parts(mechanism, program, guess)
     q = mechanism.q
     names = q.names if q.plain else q.velocity_names
-    forces = dict(zip(map(Balance, names), mechanism.balance.elements(), strict=True))
+    balance = mechanism.balance - mechanism.E @ wished(mechanism, program)
+    forces = dict(zip(map(Balance, names), balance.elements(), strict=True))
     switches = Switches(q, {**program.residuals, **mechanism.constraints, **forces}, mechanism.parameters.symbols)
     context = _context(mechanism, switches, guess, near, values)
     original = [
@@ -189,24 +195,16 @@ def reduce(mechanism, program, guess=None, near=None, values=None):
         *as_rows(q, mechanism.constraints, "material", context),
     ]
     constraints, points, of_constraints = _constraints(mechanism, program, original, context)
-    realised = realisation(mechanism, program, constraints, points)
-    dynamics, of_split = realised.dynamics(mechanism.balance)
-    dynamics = [
-        Row(e, max(q.order(e), 0), f"balance of {names[i]}", "dynamics", uses={Balance(): 0})
-        for i, e in zip(realised.independent, dynamics, strict=True)
-    ]
-    dynamics = [row for row, _ in settle_alone(q, dynamics, context)]
+    realised, points, of_sharing = realisation(mechanism, program, constraints, points, context)
+    dynamics, of_split = realised.dynamics(balance)
+    dynamics = [row for row, _ in settle_alone(q, balances(q, dynamics), context)]
     _require_motion(dynamics, program)
-    rows, rank, points, of_rows = complete(q, [*constraints, *dynamics], context, points)
+    rows, rank, points, of_rows = complete(q, [*(realised.settled or constraints), *dynamics], context, points)
     knots = require_smooth(switches, context.values, smoothness(switches, rows))
     of_split = [(f"choice of dependent coordinates {i}", pivot) for i, pivot in enumerate(of_split, 1)]
-    pivots = (*of_constraints, *of_split, *of_rows)
+    pivots = (*of_constraints, *of_sharing, *of_split, *of_rows)
     by_name = {row.name: row for row in original}
-    reduction = Reduction(
-        mechanism, program, tuple(rows), realised, rank, points, pivots, knots, switches, context, by_name
-    )
-    _require_outputs(reduction)
-    return reduction
+    return Reduction(mechanism, program, tuple(rows), realised, rank, points, pivots, knots, switches, context, by_name)
 
 
 def holds(reduction, values):
@@ -258,8 +256,9 @@ def _require_parts(mechanism, program, guess):
     q, guess = mechanism.q, mapping(guess, "The guesses")
     for name, expression in program.residuals.items():
         require_known(expression, mechanism, f"the residual {name!r}")
-    for name, weight in program.weights.items():
-        require_known(ca.SX(weight), mechanism, f"the weight of {name!r}")
+    for what, chosen in (("weight", program.weights), ("wish", program.toward)):
+        for name, expression in chosen.items():
+            require_known(ca.SX(expression), mechanism, f"the {what} of {name!r}")
     twice = [name for name in program.residuals if name in mechanism.constraints]
     if twice:
         raise SpecificationError(
@@ -309,15 +308,15 @@ def _require_motion(dynamics, program):
             )
 
 
-def _require_outputs(reduction):
-    """Refuse an output of higher order than the jets of a motion."""
+def require_outputs(reduction):
+    """Refuse an output of higher order than the jets of a motion, for what computes outputs from these alone."""
     q, top = reduction.mechanism.q, reduction.top
     for name, expression in reduction.mechanism.outputs.items():
         if q.order(expression) > top:
             raise SpecificationError(
                 f"The output {name!r} has order {q.order(expression)}.",
                 f"Motions of this program have jets up to order {top}.",
-                do="Use an output of lower order; sv.Taylor(jets=...) gives its derivatives along a run.",
+                do=f"Leave it out of the mechanism's outputs; run[{name!r}] has it along a run.",
                 name=name,
                 order=q.order(expression),
                 limit=top,

@@ -1,14 +1,16 @@
 """Rows ψ = 0, their orders on the manifold of other rows, and dependences among their leading gradients."""
 
 from dataclasses import dataclass, field, replace
+from functools import reduce
 
 import casadi as ca
 import numpy as np
 
 from servoctl.errors import SingularProgram, SpecificationError
+from servoctl.jets.branches import shown
 from servoctl.jets.identity import spread, vanish
 from servoctl.jets.series import Flow
-from servoctl.reduction.manifold import POINTS_SEED, sample, solve
+from servoctl.reduction.manifold import POINTS_SEED, ROUNDED, anywhere, sample, solve
 from servoctl.reduction.ranks import clean, combination, decide, eliminate, equilibrate, refined
 from servoctl.tolerances import DEPENDENT, ENTRY
 
@@ -95,6 +97,15 @@ class Row:
         return f"Row({self.name}: {self.kind}, order {self.order}{', ' + self.story if self.story else ''})"
 
 
+def balances(q, expressions):
+    """Rows of (3.18) from their expressions by index of the independent quasi-coordinate."""
+    names = q.names if q.plain else q.velocity_names
+    return [
+        Row(e, max(q.order(e), 0), f"balance of {names[i]}", "dynamics", uses={Balance(): 0})
+        for i, e in expressions.items()
+    ]
+
+
 def merge_uses(*parts):
     """The highest number of differentiations of each residual among (uses, extra differentiations) pairs."""
     total = {}
@@ -152,35 +163,78 @@ def _refuse_square(q, row, context, slopes=None):
         sizes.append(np.abs(values).max(axis=(0, 1)))
     solved = residual < SOLVED
     if solved.any() and np.all(sizes[1][solved] < VANISHED * sizes[0][solved]):
-        if not _regular_nearby(flow, start.t[solved], z[:, solved]):
-            raise vanishing_gradient(row, _repeated(factors(row.expression)))
+        if not _regular_nearby(flow, row, replace(start, z=z).take(np.flatnonzero(solved))):
+            raise vanishing_gradient(q, row, context, _repeated(factors(row.expression)))
 
 
-def _regular_nearby(flow, t, z):
-    """Whether a row's gradient at its solutions z is no smaller than beside them, where all of it is small.
+def _regular_nearby(flow, row, points):
+    """Whether a row's gradient at its solutions is no smaller than beside them, where all of it is small.
 
-    At a regular solution Newton's method has converged; towards that of a square its steps only halve the distance.
+    At a regular solution Newton's method has converged, as far as the rounding of the row's terms allows; towards that
+    of a square its steps only halve the distance.
     """
+    t, z = points.t, points.z
     residual, slopes = flow(t, z)
     beside = z * (1.0 + np.random.default_rng(POINTS_SEED).uniform(-BESIDE, BESIDE, z.shape))
     here, there = np.abs(slopes[0]).max(axis=0), np.abs(flow(t, beside)[1][0]).max(axis=0)
+    left = np.maximum(np.abs(residual[0]), ROUNDED * values_and_sizes(row, points)[1][0])
     with np.errstate(all="ignore"):
-        steps = np.abs(residual[0] * slopes[0]) / (slopes[0] ** 2).sum(axis=0)
+        steps = np.abs(left * slopes[0]) / (slopes[0] ** 2).sum(axis=0)
     converged = np.all(steps <= VANISHED * np.abs(z), axis=0)
     return bool(np.any(converged & (here > VANISHED * there)))
 
 
-def vanishing_gradient(row, factor=None, others=()):
-    """The error of a row whose gradient vanishes wherever the row holds, by reason of a factor if one is known."""
-    because = "" if factor is None else f": it has the factor {factor}"
+def _zeros(q, row, context):
+    """The innermost terms of a row that vanish on its solutions with a gradient: y - x in 1 - cos(y - x)."""
+    starts = sample(q, [], max(q.order(row.expression), row.order), context)
+    flow = Flow(q, [row], starts.level, starts)
+    z, residual = solve(flow, starts.t, starts.z, iterations=SQUARE_STEPS)
+    solved = np.flatnonzero(residual < SOLVED)
+    starts, solutions = starts.take(solved), replace(starts, z=z).take(solved)
+    terms = [e for e in _terms(row.expression)[1:] if q.order(e) >= 0]
+    before, after = (np.abs(points.evaluate(terms)[0]) for points in (starts, solutions))
+    vanishing = zip(terms, np.all(after <= SOLVED * before, axis=1), strict=True)
+    found = [e for e, zero in vanishing if zero and len(solved) and _has_gradient(q, e, starts, solutions)]
+    hashes = {e.element_hash() for e in found}
+    return [e for e in found if not hashes & {inner.element_hash() for inner in _terms(e)[1:]}]
+
+
+def _terms(expression):
+    """The subexpressions of an SX scalar, itself first."""
+    known, open_ = {}, [expression]
+    while open_:
+        e = open_.pop()
+        if e.element_hash() not in known:
+            known[e.element_hash()] = e
+            open_ += [e.dep(i) for i in range(e.n_dep())]
+    return list(known.values())
+
+
+def _has_gradient(q, term, *points):
+    """Whether the gradient of a term in its highest jets is not far smaller at solutions than at random points."""
+    gradient = ca.jacobian(term, q.jet(q.order(term)))
+    anywhere, there = (np.abs(p.matrix(gradient)[0]).max(axis=(0, 1)) for p in points)
+    return bool(np.all(there > VANISHED * anywhere))
+
+
+def vanishing_gradient(q, row, context, factor=None, others=()):
+    """The error of a row without a gradient where it holds, by reason of a factor or of terms that vanish there."""
+    zeros = [shown(e) for e in ([] if factor is not None else _zeros(q, row, context))]
+    because, listed = "", " and ".join(zeros)
+    do = f"Write {row.name!r} so that it changes sign, with a gradient, at its solutions."
+    if factor is not None:
+        because, do = f": it has the factor {shown(factor)}", f"Divide {row.name!r} by {shown(factor)}."
+    elif zeros:
+        because, residuals = f", where {listed} = 0", "the residual" if len(zeros) == 1 else "separate residuals"
+        do = f"Write {listed} as {residuals} in place of {row.name!r}."
     return SingularProgram(
-        f"The gradient of row {row.name!r} vanishes on its own solutions{because}.",
-        "A constraint φ = 0 needs a gradient there; that of φ² = 0 is zero and determines no direction of the motion.",
-        do=f"Write {row.name!r} without the square, so that it changes sign at its solutions."
-        if factor is None
-        else f"Divide {row.name!r} by {factor}.",
+        f"The gradient of row {row.name!r} vanishes on its own solutions, or has no value there{because}.",
+        "A constraint φ = 0 needs a gradient there; φ², |φ| and 1 - cos φ have none, and determine no direction of the "
+        "motion.",
+        do=do,
         row=row.name,
-        **({} if factor is None else {"factor": str(factor)}),
+        **({} if factor is None else {"factor": shown(factor)}),
+        **({"zeros": zeros} if zeros else {}),
     )
 
 
@@ -202,6 +256,21 @@ def factors(expression):
     if operation in (ca.OP_POW, ca.OP_CONSTPOW) and inner[1].is_constant() and float(inner[1]) >= 2:
         return 2 * factors(inner[0])
     return [expression] if ca.symvar(expression) else []
+
+
+def alternatives(q, row, context):
+    """Factors of a row that have zeros about the guess, in words, where there are several: it holds by any of them."""
+    found = [f for f in factors(row.expression) if q.order(f) >= 0]
+    found = [f for i, f in enumerate(found) if not any(ca.is_equal(f, g, SAME_DEPTH) for g in found[:i])]
+    words = [shown(f) for f in found]
+    if len(found) == 1:  # perhaps a sum whose terms have a jet in common
+        jets = [s for s in ca.symvar(found[0]) if q.order(s) >= 0 and ca.substitute(found[0], s, 0).is_zero()]
+        found, words = [*jets, reduce(ca.SX.__truediv__, jets, found[0])], [*map(shown, jets), "the rest"]
+    if len(found) < 2:
+        return []
+    values = anywhere(q, max(map(q.order, found)), context).evaluate(found)[0]
+    crossed = [word for word, v in zip(words, values, strict=True) if v.min() < 0 < v.max()]
+    return crossed if len(crossed) > 1 else []
 
 
 def leading(q, rows, points):

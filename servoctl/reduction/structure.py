@@ -15,11 +15,12 @@ import numpy as np
 from servoctl.jets.series import Flow
 from servoctl.reduction.appell import Realisation
 from servoctl.reduction.manifold import solve
-from servoctl.reduction.ranks import clean, decide, decide_all, solve_clean
-from servoctl.reduction.rows import Row
-from servoctl.tolerances import ENTRY
+from servoctl.reduction.ranks import clean, decide, decide_all, decide_each, solve_clean
+from servoctl.reduction.rows import Row, balances
+from servoctl.tolerances import ENTRY, TINY
 
 INDEPENDENT = 1e-7  # equilibrated pivots of J above this count
+ACTS = 1e-7  # cosine of an angle between actuators and normals above which it is no right angle
 AT_REST = 1e-13  # a jet below this fraction of the largest is zero, not small
 LEAVES = 1e-6  # change of a state, relative to its size, beyond which no motion of the program passes through it
 DEPTHS = (2, 4, 6, 8, 12, 16, 24, 32)  # values of N, tried until J_N shows all zeros at infinity
@@ -136,6 +137,116 @@ class Structure:
         return lines
 
 
+@dataclass(frozen=True)
+class Directions:
+    """What the actuators do to the program at one instant, in the inertia metric.
+
+    Attributes
+    ----------
+    cosines : tuple of float
+        Of the principal angles between the directions of the actuators and the normals of the program, beside material
+        constraints; descending. They are singular values of the decoupling matrix of residuals of relative degree 2 in
+        orthonormal directions, and free of units: all 1 for an orthogonal realisation, 0 for a tangential one.
+    actuators : tuple of str
+        Actuators in the directions that change no residual.
+    residuals : tuple of str
+        Residuals in the directions that no actuator changes.
+    """
+
+    cosines: tuple
+    actuators: tuple
+    residuals: tuple
+
+    @property
+    def angle(self):
+        """The largest angle between the actuators and the normals [rad]."""
+        return float(np.arccos(np.clip(min(self.cosines, default=1.0), 0.0, 1.0)))
+
+    @property
+    def margin(self):
+        """The smallest cosine that counts."""
+        return min((c for c in self.cosines if c > ACTS), default=0.0)
+
+
+def directions(reduction, t, jets, values):
+    """The directions of actuators and of the program at each instant of a motion.
+
+    Parameters
+    ----------
+    reduction : Reduction
+        Of a program realised by actuators.
+    t : (N,) array
+        [s]
+    jets : (n_z, N) array
+    values : (n_p,) array
+        Parameters.
+
+    Returns
+    -------
+    list of Directions
+    """
+    mechanism, q = reduction.mechanism, reduction.mechanism.q
+    points = points_of(reduction, t, jets, values)
+    rows = reduction.original.values()
+    groups = [[row.gradient(q) for row in rows if row.kind == kind] for kind in ("program", "material")]
+    matrices = (mechanism.mass, mechanism.E, *(ca.vertcat(ca.SX(0, q.n), *group).T for group in groups))
+    numbers = [np.moveaxis(clean(*points.matrix(matrix)), -1, 0).astype(float) for matrix in matrices]
+    return [_directions(mechanism, reduction.program.names, *each) for each in zip(*numbers, strict=True)]
+
+
+def margins(reduction, t, jets, values):
+    """Smallest equilibrated pivot of the leading matrix at each instant of a motion, (N,).
+
+    It is 0 where the matrix is singular, and NaN where it has no value.
+    Where it is regular, orders and zeros at infinity are those of the reduction.
+
+    Parameters
+    ----------
+    reduction : Reduction
+    t : (N,) array
+        [s]
+    jets : (n_z, N) array
+    values : (n_p,) array
+        Parameters.
+    """
+    t, jets = np.asarray(t, dtype=float), np.asarray(jets, dtype=float)
+    numbers = clean(*points_of(reduction, t, jets, values).matrix(reduction.leading))
+    known = np.isfinite(numbers).all(axis=(0, 1))
+    ranks = decide_each(np.where(known, numbers, 0.0), INDEPENDENT)
+    smallest = np.array([rank.kept if rank.rank == len(numbers) else 0.0 for rank in ranks])
+    return np.where(known, smallest, np.nan)
+
+
+def _directions(mechanism, names, mass, E, G, G_m):
+    """The directions at one instant, from M (n, n), E (n, m), Gᵀ (n, k) and G_mᵀ (n, k_m)."""
+    if not all(np.isfinite(matrix).all() for matrix in (mass, E, G, G_m)):
+        return Directions((), (), ())
+    values, vectors = np.linalg.eigh(mass)
+    root = np.where(values > 0, 1 / np.sqrt(np.maximum(values, TINY)), 0.0)[:, None] * vectors.T
+    tied = _basis(root @ G_m)[0]
+    (U, of_actuators), (N, of_residuals) = (_basis(A - tied @ (tied.T @ A)) for A in (root @ E, root @ G))
+    left, cosines, right = np.linalg.svd(U.T @ N)
+    count = int((cosines > ACTS).sum())
+    idle, open_ = of_actuators @ left[:, count:], of_residuals @ right[count:].T
+    padded = np.append(cosines, np.zeros(max(N.shape[1] - len(cosines), 0)))
+    return Directions(tuple(padded.tolist()), _taking_part(mechanism.actuators, idle), _taking_part(names, open_))
+
+
+def _basis(A):
+    """Q (n, r) orthonormal, and C (m, r) with A C = Q, for the columns of A (n, m) scaled to length one."""
+    lengths = np.linalg.norm(A, axis=0)
+    scaled = A / np.where(lengths > 0, lengths, 1.0)
+    U, s, V = np.linalg.svd(scaled, full_matrices=False)
+    count = int((s > INDEPENDENT * s.max(initial=0.0)).sum()) if s.size else 0
+    return U[:, :count], V[:count].T / s[:count]
+
+
+def _taking_part(names, combinations):
+    """The names whose rows of the combinations (len, j), of unit vectors, are not zero."""
+    sizes = np.abs(combinations).max(axis=1, initial=0.0)
+    return tuple(name for name, size in zip(names, sizes, strict=True) if size > LEAVES * sizes.max())
+
+
 @np.errstate(all="ignore")  # a residual may have no value at a point: nothing is decided there
 def structure(reduction, t=None, jets=None, values=None, start=None):
     """Decide index, relative degrees, zeros at infinity and essential orders at points of a motion.
@@ -160,11 +271,13 @@ def structure(reduction, t=None, jets=None, values=None, start=None):
     orders = [reduction.original[name].order for name in names]
     if not names or reduction.program.by == "ideal" or max(orders) > 2:
         return _by_orders(reduction, names, orders)
-    points = reduction.points if t is None else _points(reduction, t, jets, values)
+    points = reduction.points if t is None else points_of(reduction, t, jets, values)
     locals_ = _locals(reduction, points, t is not None)
     if start is not None:
-        start = start[0], _locals(reduction, _points(reduction, [start[0]], start[1][:, None], values), True)[0]
+        start = start[0], _locals(reduction, points_of(reduction, [start[0]], start[1][:, None], values), True)[0]
     typical = _most_common(locals_)
+    if t is not None:
+        locals_ = _without_rounded(locals_, typical, margins(reduction, t, jets, values))
     rank_P = typical.decoupling_rank if any(r <= 2 for r in typical.relative_degree) else 0
     kind = "orthogonal" if rank_P == len(names) else "tangential" if rank_P == 0 else "mixed"
     kind = kind if typical.relative_degree else "undecided"
@@ -174,6 +287,19 @@ def structure(reduction, t=None, jets=None, values=None, start=None):
         names, typical.relative_degree, typical.decoupling_rank, typical.zeros_at_infinity, typical.essential_orders,
         typical.index, margin, kind, at, start,
     )  # fmt: skip
+
+
+def _without_rounded(locals_, typical, pivots):
+    """The structure at points of a motion, undecided where rounding has decided.
+
+    Where the leading matrix is regular, zeros at infinity are those of the reduction everywhere. Near a rest, relative
+    errors of small jets are large, and ranks of the large matrices J_N may come out too high.
+    """
+    kept = []
+    for local, pivot in zip(locals_, pivots, strict=True):
+        rounded = pivot > 0 and local.zeros_at_infinity != typical.zeros_at_infinity
+        kept.append(Local((), 0, (), (), None, local.margin, local.zero) if rounded else local)
+    return kept
 
 
 def _most_common(locals_):
@@ -191,7 +317,7 @@ def _by_orders(reduction, names, orders):
     )  # fmt: skip
 
 
-def _points(reduction, t, jets, values):
+def points_of(reduction, t, jets, values):
     """Points of a motion from its samples."""
     q, z = reduction.mechanism.q, np.array(jets, dtype=np.longdouble)
     for k in range(1, (len(z) - q.nq) // q.n + 1):
@@ -260,7 +386,7 @@ def _jets(reduction, points, level, states):
 
 def _plant_jets(reduction, point, z, level):
     """Jets of the plant at one point, under the constant inputs nearest to those of an equilibrium."""
-    q, k, balance = reduction.mechanism.q, len(reduction.program.residuals), reduction.mechanism.balance
+    q, k, balance = reduction.mechanism.q, len(reduction.program.residuals), reduction.balance
     z = z.copy()
     z[q.nq + q.n :] = 0.0
     point = replace(point, z=z)
@@ -274,15 +400,13 @@ def _plant_jets(reduction, point, z, level):
     dependent = sorted(decide_all(*point.matrix(G))[0].columns) if material else []
     independent = [i for i in range(q.n) if i not in dependent]
     split = Realisation(G.T, None, tuple(dependent), tuple(independent), clean(*point.matrix(G)))
-    forced, _ = split.dynamics(balance - B[:, :k] @ u) if material else ((balance - B[:, :k] @ u).elements(), ())
-    dynamics = [Row(e, 2, f"balance {i}", "dynamics") for i, e in enumerate(forced)]
-    return solve(Flow(q, [*material, *dynamics], level, point), point.t, z)[0]
+    forced, _ = split.dynamics(balance - B[:, :k] @ u)
+    return solve(Flow(q, [*material, *balances(q, forced)], level, point), point.t, z)[0]
 
 
 def _input_jacobian(reduction, points, z, depth):
     """J and the sizes of its entries, (k, N+1, k, N+1, points): coefficient j of row i by coefficient l of input a."""
-    mechanism, q = reduction.mechanism, reduction.mechanism.q
-    k, level, n_points = len(reduction.program.residuals), depth + 2, len(points.t)
+    q, k, level, n_points = reduction.mechanism.q, len(reduction.program.residuals), depth + 2, len(points.t)
     B = reduction.realisation.B
     inputs = ca.SX.sym("u", B.shape[1])
     material = [row for row in reduction.original.values() if row.kind == "material"]
@@ -291,7 +415,7 @@ def _input_jacobian(reduction, points, z, depth):
     series = flow.series(ca.vertcat(reduction.multipliers, ca.vec(ca.densify(B))).elements(), points.t, z, depth)
     u, b = series[: B.shape[1]], series[B.shape[1] :].reshape(B.shape[1], q.n, depth + 1, n_points)
     signals = {s.element_hash(): [u[i, j] for j in range(depth + 1)] for i, s in enumerate(inputs.elements())}
-    balance = (mechanism.balance - B @ inputs).elements()
+    balance = (reduction.balance - B @ inputs).elements()
     rows = [
         *(Row(e, 2, name, "dynamics") for name, e in zip(q.jet_names(1), balance, strict=True)),
         *material,

@@ -6,7 +6,7 @@ import sys
 from pathlib import Path
 
 import servoctl as sv
-from servoctl.errors import ServoError
+from servoctl.errors import NotRealisable, ServoError
 from servoctl.shell import cache, export, run, sweep, tradeoff
 from servoctl.shell.folder import Report, complain
 from servoctl.shell.scenes import find_scene
@@ -54,7 +54,7 @@ def _parser():
     commands = parser.add_subparsers(required=True, metavar="command")
     listing = commands.add_parser("list", help="the gallery's scenes")
     listing.set_defaults(command=_list)
-    report = commands.add_parser("report", help="the derivation of a model and its structure; no simulation")
+    report = commands.add_parser("report", help="the derivation of a model, its structure, its verdict; no simulation")
     report.add_argument("scene", metavar="NAME_OR_FILE", help="a gallery name, a .py file, or the folder of a run")
     report.set_defaults(command=_report)
     for add in (run.add_run, tradeoff.add_tradeoff, sweep.add_sweep, export.add_export, cache.add_cache):
@@ -81,10 +81,23 @@ def _report(args):
     _, scene = find_scene(args.scene)
     mechanism, program = scene.build()
     report.say(mechanism)
-    model = sv.derive(mechanism, program)
+    try:
+        model = sv.derive(mechanism, program)
+    except NotRealisable:
+        report.say(sv.report(mechanism, program))
+        return 0
     report.say(model)
     report.say(model.structure())
+    report.say(sv.report(model, _start_of(model, scene)))
     return 0
+
+
+def _start_of(model, scene):
+    """The scene's start; None if there is none, which the report then says."""
+    try:
+        return model.start(t=scene.t_span[0], guess=scene.guess, **scene.start)
+    except ServoError:
+        return None
 
 
 def _earlier_report(folder):

@@ -1,17 +1,20 @@
 """`servoctl run`: derive, simulate, verify, close the loop; write figures and numbers to a folder."""
 
 import warnings
+from dataclasses import replace
 
 import servoctl as sv
 from servoctl.errors import ServoError
+from servoctl.inversion.verdict import HYPERBOLIC_ZEROS, verdict
 from servoctl.methods.choice import as_drift, as_method, default_method
 from servoctl.methods.runge_kutta import ORDERS
 from servoctl.shell import loop
 from servoctl.shell.folder import FILES, LOOP_FILES, Report, complain, folder_of, summary
 from servoctl.shell.motion import described
-from servoctl.shell.options import METHODS_HELP, add_motion, drift, samples
+from servoctl.shell.options import METHODS_HELP, add_motion, drift, samples, used
 from servoctl.shell.scenes import find_scene
 
+SETTINGS = ("method", "drift", "accuracy", "step", "rtol", "atol")  # options that decide how a motion is computed
 INCONCLUSIVE = 3  # exit code where nothing failed and something could not be verified
 
 
@@ -46,7 +49,9 @@ def _compute(args, name, scene, folder):
     if args.method is not None:
         as_method(args.method)
     motion = described(args, scene, report, require=lambda model: loop.require(args, model))
-    run = _simulate(motion, _options(args, motion), report)
+    motion, run = _planned(args, motion, report)
+    found = verdict(motion.model, run)
+    report.say(f"Verdict: {found}")
     folder.write(lambda path: run.save(path / "run.npz"))
     verification = None if args.no_verify else _verify(motion.model, run, report)
     closed, done = loop.closed_loop(args, motion.model, run, report)
@@ -54,7 +59,8 @@ def _compute(args, name, scene, folder):
         folder.write(lambda path: closed.save(path / "closed_loop.npz"))
     about = {"name": name, "given": args.scene, "description": scene.description}
     facts = {"scene": about, "command": args.command_line, "t_span": motion.span}
-    facts |= {**summary(run, motion.start, verification), "closed_loop": loop.facts(closed)}
+    facts |= {"verdict": found.as_dict(), **summary(run, motion.start, verification)}
+    facts["closed_loop"] = loop.facts(closed)
     folder.write_json("summary.json", facts)
     folder.write_text("report.txt", report.text)
     if not args.no_figures:
@@ -67,10 +73,25 @@ def _compute(args, name, scene, folder):
     unstable = run.internal.get("verdict") == "unstable"
     if unstable:
         complain(f"The plan is not to be trusted: {run.internal['text']}.")
-    verdict = "passed" if args.no_verify else getattr(verification, "verdict", "failed")
-    if unstable or not (run.success and verdict != "failed" and done and not folder.moved):
+    verified = "passed" if args.no_verify else getattr(verification, "verdict", "failed")
+    if unstable or not (run.success and verified != "failed" and done and not folder.moved):
         return 1
-    return INCONCLUSIVE if verdict == "inconclusive" else 0
+    return INCONCLUSIVE if verified == "inconclusive" else 0
+
+
+def _planned(args, motion, report):
+    """The motion and its run: the bounded one of unstable internal dynamics, unless a method or settings are given."""
+    options = _options(args, motion)
+    if used(args, SETTINGS) or verdict(motion.model, motion.start).dynamics != HYPERBOLIC_ZEROS:
+        return motion, _simulate(motion, options, report)
+    t0, t1 = motion.span
+    span = motion.span if args.t_span else (min(t0, *motion.model.knots, t1), max(t0, *motion.model.knots, t1))
+    whole = replace(motion, span=span)
+    try:
+        return whole, _simulate(whole, _options(args, whole) | {"method": "bounded"}, report)
+    except ServoError as error:
+        report.say(f"There is no bounded motion: {error}")
+        return motion, _simulate(motion, options, report)
 
 
 def _options(args, motion):

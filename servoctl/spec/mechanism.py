@@ -88,6 +88,7 @@ class Mechanism:
         self.E = self._directions(actuators or {})
         self.constraints = self._named(constraints, "constraint")
         self.outputs = self._named(outputs, "output")
+        self.inputs, self.reported = (), {}
         self._refuse_orders()
         self._refuse_names()
         self._check_balance()
@@ -116,8 +117,8 @@ class Mechanism:
             q.V, q.h, *q.invariants.values(), self.balance, self.energy, self.forces, self.E,
             *self.constraints.values(), *self.outputs.values(),
         ]  # fmt: skip
-        function = q.as_function(expressions, p.symbols).serialize()
-        return json.dumps([names, list(self.outputs), p.defaults]) + "\n" + function
+        function = q.as_function([*expressions, *self.reported.values()], p.symbols).serialize()
+        return json.dumps([names, list(self.outputs), self.inputs, list(self.reported), p.defaults]) + "\n" + function
 
     def __eq__(self, other):
         if type(other) is not type(self):
@@ -131,7 +132,7 @@ class Mechanism:
         content = packed(vars(self), self.q, self.parameters, {"parameters": self.parameters})
         return _restored, (self.q, self.parameters, content)
 
-    def under(self, inputs, forces):
+    def under(self, inputs, forces, reported=None):
         """The mechanism without actuators, whose inputs are forces and outputs instead.
 
         Parameters
@@ -140,13 +141,17 @@ class Mechanism:
             By actuator.
         forces : (n,) SX
             Further generalised forces.
+        reported : dict of str to SX, optional
+            Residuals that runs report: those of a program that the inputs realise approximately.
         """
         driving = self.E @ ca.vertcat(*(inputs[name] for name in self.actuators)) if self.actuators else 0
-        return Mechanism(
+        driven = Mechanism(
             self.q, self._gibbs, self.potential, None, self.parameters, kinetic=self._kinetic,
             balance=self._inverse_dynamics, forces=self.forces + forces + driving, constraints=self.constraints,
             outputs={**self.outputs, **inputs},
         )  # fmt: skip
+        driven.inputs, driven.reported = tuple(inputs), driven._named(reported, "residual")
+        return driven
 
     @cached_property
     def balance(self):

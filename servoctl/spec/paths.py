@@ -237,13 +237,33 @@ def spline(t, times, points, smoothness=2, ends="rest"):
     pieces = _spline_pieces(times, points, 2 * m + 1, vanishing)
     if ends == "rest":
         t = ca.fmin(ca.fmax(t, times[0]), times[-1])
+    return piecewise(t, times, pieces)
+
+
+def piecewise(t, times, coefficients):
+    """Polynomials of time, piece after piece; the first and the last go on outside.
+
+    Parameters
+    ----------
+    t : SX or float
+        Time [s], or a time law.
+    times : (n,) array
+        Strictly increasing ends of the pieces [s].
+    coefficients : (degree + 1, n - 1, dim) array
+        Of the powers 0, 1, ... of a time that goes from -1 to 1 on each piece, SI.
+
+    Returns
+    -------
+    SX
+        Scalar, or (dim, 1) column.
+    """
     begun = ca.vertcat(1, *(t >= knot for knot in times[1:-1]), 0)
     inside = begun[:-1] - begun[1:]
     middle, half = (times[:-1] + times[1:]) / 2, (times[1:] - times[:-1]) / 2
     tau = (t - ca.dot(inside, middle)) * ca.dot(inside, 1 / half)
-    value = ca.SX(points.shape[1], 1)
-    for coefficients in pieces[::-1]:
-        value = value * tau + ca.mtimes(ca.DM(coefficients.T), inside)
+    value = ca.SX(coefficients.shape[2], 1)
+    for power in coefficients[::-1]:
+        value = value * tau + ca.mtimes(ca.DM(power.T), inside)
     return value
 
 

@@ -25,7 +25,10 @@ class Program:
         generalised Chetaev rule is a postulate). "actuators": the actuators of the mechanism.
     weights : dict of str to float or SX, optional
         Weights W of the actuators, for programs with fewer residuals than actuators: the actuation has least
-        uᵀWu. Default 1 each, in units of the actuators.
+        (u - u_wish)ᵀW(u - u_wish). Default 1 each, in units of the actuators.
+    toward : dict of str to float or SX, optional
+        The wish u_wish by actuator: expressions of t, q and γ', such as a spring that draws a redundant arm towards a
+        posture, or a brake that damps its self-motion. Default 0 each.
 
     Raises
     ------
@@ -33,7 +36,7 @@ class Program:
         If there is no residual, one is no scalar expression, or `by` is another word.
     """
 
-    def __init__(self, residuals, by="actuators", weights=None):
+    def __init__(self, residuals, by="actuators", weights=None, toward=None):
         if not isinstance(residuals, dict) or not residuals:
             raise SpecificationError(
                 f"The program's residuals are {residuals!r}.",
@@ -49,16 +52,18 @@ class Program:
                 by=by,
             )
         mapping(residuals, "The residuals")
-        if weights is not None and by != "actuators":
-            raise SpecificationError(
-                f"The program with by={by!r} has weights.",
-                "Weights choose among actuators.",
-                do="Remove the weights, or write by='actuators'.",
-                by=by,
-            )
+        for what, chosen in (("weights", weights), ("wishes", toward)):
+            if chosen is not None and by != "actuators":
+                raise SpecificationError(
+                    f"The program with by={by!r} has {what}.",
+                    "Weights and wishes choose among actuators.",
+                    do=f"Remove the {what}, or write by='actuators'.",
+                    by=by,
+                )
         self.residuals = {name: _residual(name, value) for name, value in residuals.items()}
         self.by = by
         self.weights = {name: _weight(name, value) for name, value in mapping(weights, "The weights").items()}
+        self.toward = {name: _wish(name, value) for name, value in mapping(toward, "The wishes").items()}
 
     @property
     def names(self):
@@ -69,7 +74,7 @@ class Program:
         """The program of the same motion along a slower time: q_s(t) = q(at + (t - at)/σ).
 
         Residuals are written for the slowed jets, φ(at + (t - at)/σ, q, σγ', σ²γ'', ...) = 0: paths and rates alike
-        take σ times as long.
+        take σ times as long. Weights are slowed alike; wishes are forces, of which time alone is slowed.
 
         Parameters
         ----------
@@ -111,7 +116,9 @@ class Program:
             values += [sigma**k * s for s in q.gamma(k)]
         slower = iter(ca.substitute([*self.residuals.values(), *weights.values()], symbols, values))
         residuals = {name: next(slower) for name in self.residuals}
-        return Program(residuals, self.by, {name: next(slower) for name in weights} or None)
+        weights = {name: next(slower) for name in weights}
+        toward = {name: ca.substitute(ca.SX(wish), q.t, values[0]) for name, wish in self.toward.items()}
+        return Program(residuals, self.by, weights or None, toward or None)
 
     def __repr__(self):
         return f"Program({', '.join(self.residuals)}; by {self.by})"
@@ -120,7 +127,7 @@ class Program:
 def no_program():
     """The program without residuals: forces alone determine the motion."""
     program = object.__new__(Program)
-    program.residuals, program.by, program.weights = {}, "actuators", {}
+    program.residuals, program.by, program.weights, program.toward = {}, "actuators", {}, {}
     return program
 
 
@@ -159,6 +166,21 @@ def _weight(name, value):
             do="Use a positive number or an expression; the default is 1.",
             name=name,
             weight=value,
+        )
+    return number
+
+
+def _wish(name, value):
+    if isinstance(value, ca.SX):
+        return column(value, f"the wish of {name!r}", 1)[0]
+    number = _as_float(value)
+    if np.isnan(number):
+        raise SpecificationError(
+            f"The wish of {name!r} is {value!r}.",
+            "A wish is an actuation: an expression of t, q and γ', or a number.",
+            do="Use an expression or a number; the default is 0.",
+            name=name,
+            wish=value,
         )
     return number
 

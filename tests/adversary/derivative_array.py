@@ -153,7 +153,7 @@ class Reference:
             reaction, unknown = self.G.T @ force, [force, nu]
         elif redundant:  # u = W⁻¹Pᵀμ = Eᵀy, y = N Gᵀμ, with W = 1
             force, mu, y, z = (ca.SX.sym(name, size) for name, size in (("u", m), ("mu", k), ("y", n), ("z", km)))
-            extra = [force - self.E.T @ y, self.mass @ y + self.Gm.T @ z - self.G_given.T @ mu, self.Gm @ y]
+            extra = [force - self.E.T @ y, self.mass @ y + self.Gm.T @ z - self.G.T @ mu, self.Gm @ y]
             reaction, unknown = self.E @ force, [force, nu, mu, y, z]
         else:
             force = ca.SX.sym("u", m)

@@ -50,11 +50,12 @@ MUTANTS = {  # name: (file, old text, new text, tests)
         'max((rows[a].kind != "dynamics", w, a) for a, w in highest)', REDUCTION,
     ),
     "least norm without weights": (
-        "reduction/appell.py", "actuation = inverse_weights @ P.T", "actuation = P.T", ("test_redundant_actuation.py",),
+        "reduction/realisation.py", "A = _inverse_weights(mechanism, program) @ P.T", "A = P.T",
+        ("test_redundant_actuation.py",),
     ),
-    "decoupling without the drift": (
-        "reduction/appell.py", "ca.substitute(expression, acceleration, drift)",
-        "ca.substitute(expression, acceleration, 0 * drift)", ("test_redundant_actuation.py", "test_structure.py"),
+    "wishes with another sign": (
+        "reduction/reduce.py", "self.mechanism.balance - self.mechanism.E @ wished(",
+        "self.mechanism.balance + self.mechanism.E @ wished(", ("test_redundant_actuation.py",),
     ),
     "squares lose their middle term": (
         "jets/series.py", "inner = 0.0 if k % 2 else", "inner = 0.0 if k % 4 else",

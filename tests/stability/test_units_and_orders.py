@@ -65,7 +65,7 @@ def test_a_crane_in_any_unit(unit):
 
 @pytest.mark.parametrize("guess", [True, False])
 @pytest.mark.parametrize("unit", [1e-6, 1e-3, 1e6])
-def test_a_pendulum_goes_round_in_any_unit(unit, guess):
+def test_a_pendulum_goes_round_in_any_unit(unit, guess, c_compiler):
     """Pivots change each time the rod passes a horizontal or a vertical, however long it is."""
     model = pendulum(unit, guess)
     assert model.free == 2 and "2 free" in repr(model)

@@ -1,0 +1,205 @@
+"""The inverse of a program, chosen by its verdict."""
+
+import warnings
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+from servoctl.checks import as_span, interval, mapping
+from servoctl.errors import ServoError, SpecificationError, unknown
+from servoctl.inversion.relaxed import relaxed
+from servoctl.inversion.report import extremes
+from servoctl.inversion.verdict import (
+    FLAT,
+    GROWS,
+    HYPERBOLIC_ZEROS,
+    MARGINAL,
+    MINIMUM,
+    OPEN,
+    SINGULAR,
+    Verdict,
+    verdict,
+)
+from servoctl.methods.choice import Algebraic, Bounded, Method, as_method
+from servoctl.model.model import derive
+from servoctl.model.start import State
+from servoctl.plants.plant import plant
+from servoctl.run import Run
+from servoctl.simulation import simulate
+from servoctl.spec.mechanism import Mechanism
+from servoctl.spec.program import Program
+
+RELAXED = "relaxed"  # the word for the inverse that is no method of `simulate`
+
+
+def inverse(
+    mechanism: Mechanism, program: Program, t_span: Sequence[float], *,
+    start: State | Mapping[str, float] | None = None, method: Method | str | None = None,
+    limits: Mapping[str, object] | None = None, bounds: Mapping[str, object] | None = None,
+    weight: float | Mapping[str, float] | None = None,
+) -> Run:  # fmt: skip
+    """The motion and the actuation of a program by the inverse that its verdict allows.
+
+    Flat programs are solved instant by instant, minimum-phase ones are integrated forward, hyperbolic ones get the
+    bounded motion (`Bounded`), and marginal ones, those singular at rest, rough paths and limits that the exact plan
+    exceeds the relaxed one (`relaxed`). The message of the run says which, and why.
+
+    Parameters
+    ----------
+    mechanism : Mechanism
+    program : Program
+    t_span : (t0, t1)
+        [s]; the bounded motion begins before and ends after it.
+    start : State or dict of str to float, optional
+        A state of the model, or values near the start by name. Default: near zero. Motions that may begin at rest do.
+    method : Method or str, optional
+        A method of `simulate`, or "relaxed", instead of the one that the verdict chooses; where it is another one, a
+        warning says what speaks against it.
+    limits : dict of str to float or (low, high), optional
+        Limits of actuators and of their rates, {"trolley": 100.0, "dtrolley": 500.0}. An exact plan beyond them is
+        replaced by the relaxed one.
+    bounds : dict of str to float or (low, high), optional
+        Bounds of other signals, such as {"tension": (0, None)}, likewise.
+    weight : float or dict of str to float, optional
+        Of the relaxed inverse; default: 1e-6 of that for which standing still costs as much as the program.
+
+    Returns
+    -------
+    Run
+
+    Raises
+    ------
+    NotRealisable
+        If no actuation can realise the program.
+    SpecificationError, SingularProgram, IntegrationStopped, LimitExceeded
+        As by `derive`, `simulate` and `relaxed`.
+
+    Warns
+    -----
+    RuntimeWarning
+        If a method is given that is not the one of the verdict.
+    """
+    task = Task(mechanism, program, as_span(t_span, forward=True), start, _ranges(mechanism, limits, bounds), weight)
+    known = {name: value for name, value in mapping(start, "The start").items()} if isinstance(start, dict) else None
+    try:
+        model = derive(mechanism, program, known)
+    except SpecificationError as error:
+        facts = error.details
+        if method not in (None, RELAXED) or not {"needs", "has"} <= facts.keys():
+            raise
+        return task.relaxed(f"{facts['name']} has class C^{facts['has']} and the exact inverse needs C^{facts['needs']}")
+    begin = start if isinstance(start, State) else _start(model, task.span[0], known)
+    found = verdict(model, begin)
+    chosen = _chosen(model, found)
+    if method is not None:
+        return _by_hand(task, model, begin, found, chosen, method)
+    return task.run(model, begin, found, chosen)
+
+
+@dataclass(frozen=True)
+class Task:
+    """What `inverse` received; `ranges` are limits and bounds, {signal: (low, high)} each."""
+
+    mechanism: Mechanism
+    program: Program
+    span: tuple
+    start: object
+    ranges: tuple
+    weight: object
+
+    def run(self, model, begin, found, chosen):
+        """The run by the method that the verdict chooses; the relaxed one where that is beyond limits or grows."""
+        if chosen == RELAXED:
+            return self.relaxed(found)
+        run = self.exact(model, begin, found, chosen)
+        excess = _excess(run, {**self.ranges[0], **self.ranges[1]})
+        if excess:
+            return self.relaxed(excess)
+        if found.dynamics == OPEN:
+            found = verdict(model, run)
+            if found.dynamics == GROWS:
+                return self.relaxed(found, begin)
+        return _told(run, found)
+
+    def exact(self, model, begin, found, method):
+        """The run of an exact inverse; integrated forward from the rest where the program begins, if there is one."""
+        if method is None and begin is not None and not isinstance(self.start, State) and "start" in found.rest:
+            guess = dict(zip(model.state_names, found.rest["start"].x.tolist(), strict=True))
+            begin = model.start(self.span[0], guess=guess)
+        with warnings.catch_warnings():  # growth is part of the verdict
+            warnings.filterwarnings("ignore", "Internal dynamics unstable")
+            return simulate(model, begin, self.span, method)
+
+    def relaxed(self, why, begin=None):
+        """The run of the relaxed inverse; from a state in motion its end is free."""
+        ends = {"start": begin, "end": "free"} if begin is not None else {"start": self.start}
+        limits, bounds = self.ranges
+        run = relaxed(
+            plant(self.mechanism), self.program, self.span, weight=self.weight, limits=limits, bounds=bounds, **ends
+        )
+        return _told(run, why)
+
+
+def _ranges(mechanism, limits, bounds):
+    """Limits of actuators and their rates, and bounds of other signals, {name: (low, high)} each."""
+    actuators = [*mechanism.actuators, *(f"d{name}" for name in mechanism.actuators)]
+    for name in mapping(limits, "The limits"):
+        if name not in actuators:
+            raise unknown(name, actuators, "actuator or rate")
+    return tuple(
+        {name: interval(name, value, what) for name, value in mapping(values, f"The {what}s").items()}
+        for values, what in ((limits, "limit"), (bounds, "bound"))
+    )
+
+
+def _start(model, t, known):
+    """The start near known values; None where there is none, as at a singular rest."""
+    try:
+        return model.start(t, guess={name: v for name, v in (known or {}).items() if name in model.state_names})
+    except ServoError:
+        return None
+
+
+def _chosen(model, found):
+    """The method of the exact inverse, None for the default of `simulate`, or `RELAXED`."""
+    if found.dynamics == HYPERBOLIC_ZEROS:
+        return Bounded()
+    relaxes = found.dynamics in (MARGINAL, SINGULAR, GROWS) and not model.ideal
+    return RELAXED if relaxes else None
+
+
+def _by_hand(task, model, begin, found, chosen, method):
+    """The run of a method that was given, with a warning if the verdict speaks against it."""
+    method = method if method == RELAXED else as_method(method)
+    expected = {FLAT: Algebraic, MINIMUM: Method}.get(found.dynamics, Bounded if isinstance(chosen, Bounded) else ())
+    fits = method == RELAXED or isinstance(method, expected)
+    if not fits:
+        warnings.warn(
+            f"method={str(method)!r} was chosen for a program that is {found}. sv.inverse without method takes "
+            f"{'the bounded motion' if isinstance(chosen, Bounded) else 'the relaxed inverse'}.",
+            RuntimeWarning,
+            stacklevel=3,
+        )
+    if method == RELAXED:
+        return task.relaxed(found)
+    run = task.exact(model, begin, found, method)
+    excess = _excess(run, {**task.ranges[0], **task.ranges[1]})
+    if excess:
+        warnings.warn(f"method={str(method)!r} was chosen, and {excess}.", RuntimeWarning, stacklevel=3)
+    return _told(run, found)
+
+
+def _excess(run, ranges):
+    """What of a run lies beyond its ranges, in words; "" if nothing does."""
+    for name, (low, high) in ranges.items():
+        for value, t in extremes(run, name):
+            if not low <= value <= high:
+                limit = low if value < low else high
+                return f"the exact plan needs {name} = {value:.6g} at t = {t:.4g} s, and the limit is {limit:g}"
+    return ""
+
+
+def _told(run, why):
+    """The run, whose message says which inverse it is and why."""
+    kind = {"algebraic": "instant by instant", "bounded": "bounded", RELAXED: "relaxed"}.get(run.method, "forward")
+    reason = f"the program is {why.word} ({why.reason})" if isinstance(why, Verdict) else why
+    return replace(run, message=f"{run.message}; inverse: {kind}, as {reason}")

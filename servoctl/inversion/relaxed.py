@@ -1,0 +1,598 @@
+"""The relaxed inverse: the program as well as actuators and limits allow.
+
+    minimise ∫ Σ φ_i²/β_i + uᵀWu dt   subject to   x' = f(t, x, u), limits, bounds, the ends.
+
+The weights β lead from the least actuation to the exact inverse. A solution exists for every β > 0, also where the
+exact inverse is singular, unbounded, or outside the limits. The nonlinear program is solved for falling weights, each
+from the solution before, on a mesh that is refined until its motion is that of the plant.
+"""
+
+from collections.abc import Mapping, Sequence
+from copy import copy
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import casadi as ca
+import numpy as np
+
+from servoctl.checks import as_span, finite, interval, mapping, positive_number, require_kind
+from servoctl.errors import (
+    InconsistentStart,
+    IntegrationStopped,
+    LimitExceeded,
+    ServoError,
+    SpecificationError,
+    unknown,
+)
+from servoctl.inversion.equilibrium import RANK, Equilibria
+from servoctl.inversion.transcription import Mesh, Node, Transcription
+from servoctl.methods.motion import breakpoints
+from servoctl.model.model import derive
+from servoctl.model.start import State
+from servoctl.plants.driven import at_once, driven
+from servoctl.plants.plant import Plant
+from servoctl.reduction.knots import Switches
+from servoctl.run import Run
+from servoctl.simulation import simulated
+from servoctl.spec.paths import piecewise
+from servoctl.spec.program import Program
+
+ORDER = 9  # of the collocation: five nodes
+INTERVALS = 24  # of the first mesh at least
+FIRST = 1e-3  # first weight, relative to that for which standing still costs as much as the program
+DEFAULT = 1e-6  # default weight, relative to the same
+FACTOR = 100.0  # between the weights of two successive solutions
+DEFECT, AIM = 1e-7, 0.1  # of the states between nodes, relative to their sizes; and what refinement aims at of it
+BETWEEN = (0.12, 0.4, 0.75)  # places within an interval where the defect is measured
+REFINEMENTS, MOST_PIECES, MOST_INTERVALS = 6, 8, 400  # of the mesh; pieces of an interval; intervals
+SAMPLES = 1000  # of the run, at least
+GUESS = 241  # instants of the guess
+STANDING = 1e-6  # rate of a program that stands still, relative to its largest
+STATUS = {
+    "Infeasible_Problem_Detected": "finds no motion",
+    "Maximum_Iterations_Exceeded": "does not converge in 300 iterations",
+    "Restoration_Failed": "finds no way back to the equations of motion",
+}
+SOLVED = ("Solve_Succeeded", "Solved_To_Acceptable_Level")
+
+
+def relaxed(
+    plant: Plant, program: Program, t_span: Sequence[float], *, weight: float | Mapping[str, float] | None = None,
+    limits: Mapping[str, object] | None = None, bounds: Mapping[str, object] | None = None,
+    start: State | Mapping[str, float] | None = None, end: str | Mapping[str, float] = "rest",
+) -> Run:  # fmt: skip
+    """The actuation that trades a program against effort: min ∫ Σ φ_i²/β_i + uᵀWu dt over all motions of the plant.
+
+    As β falls, the motion tends to the exact inverse where there is one; where there is none, as for a program that is
+    singular at rest, beyond the limits, or not smooth, the plan misses it as little as its weights say.
+
+    Parameters
+    ----------
+    plant : Plant
+        Its limits of magnitude and of rate hold; lag and delay are left to the laws.
+    program : Program
+        W are its `weights` of the actuators, 1 by default.
+    t_span : (t0, t1)
+        [s]
+    weight : float or dict of str to float, optional
+        β of all or of each residual, in (unit of φ)²/(unit of u)²: m²/N² for a position by a force. Default: 1e-6 of
+        that for which standing still costs as much as the program.
+    limits : dict of str to float or (low, high), optional
+        Further limits of actuators and of their rates: {"trolley": 100.0, "dtrolley": 500.0}. They hold at all instants.
+    bounds : dict of str to float or (low, high), optional
+        Bounds of states, accelerations, outputs of the mechanism and residuals: {"tension": (0, None)}. They hold at
+        the nodes, some 120 instants.
+    start : State, array or dict of str to float, optional
+        Default: the rest at which the program is met. A dict may name some coordinates of a rest, or a whole state.
+    end : "rest", "free", or dict of str to float
+        "rest": a rest at which the program is met; the start is at rest then, too. Or values of states at the end.
+
+    Returns
+    -------
+    Run
+        Of the plant under these inputs, piecewise polynomials of time; `run.residual` is how far the program is missed.
+
+    Raises
+    ------
+    LimitExceeded
+        If limits or bounds admit no motion between the ends.
+    InconsistentStart
+        If there is no rest, or the start is none.
+    SpecificationError
+        For a weight above which standing still is cheaper than the program, and for a program that moves at an end
+        where the plant rests.
+    IntegrationStopped
+        If the iteration fails otherwise.
+    NameUnknown
+        For a name that is no residual, actuator, state or output.
+    """
+    require_kind(Plant, "plant", plant, "sv.plant(mechanism)")
+    require_kind(Program, "program", program, "sv.Program({...})")
+    task = Task(at_once(plant), program, as_span(t_span, forward=True), _limits(plant, limits), bounds, start, end)
+    return task.run(_weights(weight, program))
+
+
+def _weights(weight, program):
+    """β of each residual, (k,); None for the default."""
+    if weight is None:
+        return None
+    if not isinstance(weight, Mapping):
+        return np.full(len(program.names), positive_number("weight", weight))
+    for name in weight:
+        if name not in program.names:
+            raise unknown(name, program.names, "residual")
+    for name in program.names:
+        if name not in weight:
+            raise SpecificationError(
+                f"The residual {name!r} has no weight.", "Each residual has one.", do=f"Add {name!r}.", name=name
+            )
+    return np.array([positive_number(name, weight[name]) for name in program.names])
+
+
+def _limits(plant, limits):
+    """The limits of magnitude and of rate, {actuator: (low, high)} each: those of the plant and further ones."""
+    magnitudes = dict(plant.limits)
+    rates = {name: (-rate, rate) for name, rate in plant.rate_limits.items()}
+    names = {name: (magnitudes, name) for name in plant.inputs} | {f"d{name}": (rates, name) for name in plant.inputs}
+    for name, value in mapping(limits, "The limits").items():
+        if name not in names:
+            raise unknown(name, names, "actuator or rate")
+        sides, actuator = names[name]
+        low, high = interval(name, value, "limit")
+        before = sides.get(actuator, (-np.inf, np.inf))
+        sides[actuator] = max(low, before[0]), min(high, before[1])
+        if not sides[actuator][0] < sides[actuator][1]:
+            raise SpecificationError(
+                f"The limit of {name!r} is ({low:g}, {high:g}), that of the plant ({before[0]:g}, {before[1]:g}).",
+                "Both hold.",
+                do="Choose limits within those of the plant.",
+                name=name,
+            )
+    return magnitudes, rates
+
+
+@dataclass(frozen=True)
+class Plan:
+    """A solution: states (n_x, 1 + N s), control points of the inputs (m, 1 + P s), and counts of the iterations."""
+
+    mesh: Mesh
+    pieces: Mesh
+    x: np.ndarray
+    points: np.ndarray
+    iterations: tuple = ()
+
+
+class Task:
+    """A plant, a program, and what limits the plan; `run` solves for weights."""
+
+    def __init__(self, plant, program, span, limits, bounds, start, end):
+        self.plant, self.program, self.span, self.end = plant, program, span, end
+        self.limits, self.rates = limits
+        self.n, self.m, self.nq = plant.n_x, len(plant.inputs), plant.mechanism.q.nq
+        self.bounds = {name: interval(name, value, "bound") for name, value in mapping(bounds, "The bounds").items()}
+        self.node = Node(plant, program, self._bounded())
+        self.equilibria = Equilibria(plant, program, self.node)
+        self.begin, self.held = self._begin(start)
+        self.target = self._target()
+        self.states, self.inputs, self.sizes = self._guess()
+
+    def _bounded(self):
+        """Bounded quantities that are no states, as expressions."""
+        mechanism, q = self.plant.mechanism, self.plant.mechanism.q
+        accelerations = dict(zip(q.jet_names(2), q.gamma(2), strict=True))
+        known = accelerations | self.program.residuals | mechanism.outputs
+        for name in self.bounds:
+            if name not in known and name not in self.plant.state_names:
+                raise unknown(name, (*self.plant.state_names, *known), "state, output or residual")
+        return {name: known[name] for name in self.bounds if name not in self.plant.state_names}
+
+    # the ends
+
+    def _begin(self, start):
+        """The state at t0, and the inputs that hold it at rest; None if it may move."""
+        nq, t0 = self.nq, self.span[0]
+        zero = np.zeros(nq + self.m)
+        if start is None or isinstance(start, dict) and set(start) <= set(self.plant.mechanism.q.names):
+            self._require_standing(t0, "start")
+            names, guess = list(self.plant.mechanism.q.names), zero[:nq].copy()
+            if self._exact is not None:
+                guess = self._exact.jets[:nq, 0].copy()
+            fixed = [names.index(name) for name in start or ()]
+            guess[fixed] = [start[name] for name in start or ()]
+            rest, worst = self.equilibria.at(t0, guess, zero[nq:], fixed)
+            if rest is None:
+                raise _no_rest("start", t0, worst)
+            return np.concatenate([rest[0], np.zeros(self.n - nq)]), self._held(rest, "start")
+        values = getattr(start, "values", start) if not isinstance(start, dict) else start
+        x = self.plant.state(values if isinstance(values, dict) else np.ravel(values)[: self.n])
+        if self.end != "rest":
+            return x, None
+        self._require_standing(t0, "start")
+        rest, worst = self.equilibria.at(t0, x[:nq], zero[nq:], range(nq), self.equilibria.program)
+        speeds = dict(zip(self.plant.state_names[nq:], x[nq:].tolist(), strict=True))
+        if rest is None or np.any(x[nq:]):
+            raise _no_equilibrium(t0, worst, speeds)
+        return x, self._held(rest, "start")
+
+    def _held(self, rest, where):
+        """Inputs that hold a rest within the limits of magnitude."""
+        (q, u), t = rest, self.span[where == "end"]
+        low, high = np.array([self.limits.get(name, (-np.inf, np.inf)) for name in self.plant.inputs]).reshape(-1, 2).T
+        if np.all((u >= low) & (u <= high)):
+            return u
+        from scipy.optimize import lsq_linear
+
+        B = self.equilibria.slopes(t, q, u)[:, self.nq :]
+        found = lsq_linear(B, B @ u, (low, high), tol=1e-12)
+        if np.abs(B @ (found.x - u)).max() <= 1e-6 * np.abs(B @ u).max():
+            return np.clip(found.x, low, high)
+        worst = int(np.argmax(np.maximum(low - u, u - high)))
+        name = self.plant.inputs[worst]
+        raise LimitExceeded(
+            f"At rest at the {where}, t = {t:g} s, {name} = {u[worst]:.6g}; its limits are {low[worst]:g} and "
+            f"{high[worst]:g}.",
+            "The inputs that hold the machine at rest lie within the limits.",
+            nearest=f"A limit of at least {abs(u[worst]):.6g}.",
+            name=name, t=t, value=float(u[worst]), limit=(float(low[worst]), float(high[worst])),
+        )  # fmt: skip
+
+    def _require_standing(self, t, where):
+        """Refuse a program that moves at an instant at which the plant rests."""
+        q = self.node.q
+        moving = ca.vertcat(*q.gamma(1), *(s for k in range(2, 3 + self.node.depth) for s in q.gamma(k)))
+        orders = {name: q.order(e) for name, e in self.program.residuals.items()}
+        rates = [ca.jacobian(e, q.t) if orders[name] <= 0 else e for name, e in self.program.residuals.items()]
+        values = ca.substitute(self.node.known(ca.vertcat(*rates)), moving, ca.SX.zeros(moving.numel()))
+        f = ca.Function("rates", [q.t, ca.vertcat(*q)], [values])
+        some = np.full(self.nq, 0.3)  # a place where expressions of the coordinates have values
+        times = np.linspace(*self.span, 101)
+        along = np.hstack([np.array(f(s, some)) for s in times])
+        at = np.array(f(t, some)).ravel()
+        moved = np.abs(at) > STANDING * np.abs(along).max(axis=1)
+        if moved.any():
+            name = list(orders)[int(np.argmax(moved))]
+            raise SpecificationError(
+                f"The program's residual {name!r} moves at the {where}, t = {t:g} s: at rest it "
+                f"{'changes by' if orders[name] <= 0 else 'is'} {at[np.argmax(moved)]:.4g}"
+                f"{' 1/s' if orders[name] <= 0 else ''}.",
+                "Where the plant rests, the program does, too.",
+                do="Choose a span between rests of the program, or end='free' and a start with its velocities.",
+                name=name, t=float(t), rate=float(at[np.argmax(moved)]),
+            )  # fmt: skip
+
+    def _target(self):
+        """What is fixed at the end: (state with NaN where open, inputs or None, function that vanishes or None)."""
+        open_ = np.full(self.n, np.nan)
+        if self.end == "free":
+            return open_, None, None
+        if isinstance(self.end, Mapping):
+            for name, value in self.end.items():
+                if name not in self.plant.state_names:
+                    raise unknown(name, self.plant.state_names, "state")
+                open_[self.plant.state_names.index(name)] = finite(name, value, "value at the end")
+            return open_, None, None
+        if self.end != "rest":
+            raise SpecificationError(
+                f"end={self.end!r}.", "It is 'rest', 'free', or values of states by name.", end=self.end
+            )
+        t1 = self.span[1]
+        self._require_standing(t1, "end")
+        rests = self.equilibria.along(np.linspace(*self.span, 101)[1:], self.begin[: self.nq], self.held)
+        known = rests[:, np.isfinite(rests).all(axis=0)]
+        last = known[:, -1] if known.size else np.concatenate([self.begin[: self.nq], self.held])
+        rest, worst = self.equilibria.at(t1, last[: self.nq], last[self.nq :])
+        if rest is None:
+            raise _no_rest("end", t1, worst)
+        held = self._held(rest, "end")
+        slopes = self.equilibria.slopes(t1, *rest)
+        slopes = slopes / np.maximum(np.abs(slopes).max(axis=1, keepdims=True), 1e-300)
+        open_directions = np.linalg.svd(slopes)[2][np.linalg.matrix_rank(slopes, RANK) :, : self.nq]
+        if np.abs(open_directions).max(initial=0.0) < RANK:  # the rest is isolated
+            return np.concatenate([rest[0], np.zeros(self.n - self.nq)]), held, None
+        open_[self.nq :] = 0.0
+        return open_, held, self._independent(rest)
+
+    def _independent(self, rest):
+        """A function of (t, x, v) whose values vanish at rests near this one, without dependent rows."""
+        from scipy.linalg import qr
+
+        slopes = self.equilibria.slopes(self.span[1], *rest)
+        scaled = slopes / np.maximum(np.abs(slopes).max(axis=1, keepdims=True), 1e-300)
+        order = qr(scaled.T, pivoting=True)[2][: np.linalg.matrix_rank(scaled, RANK)]
+        rows = self.equilibria.rows(self.node.q.t, self.node.state[: self.nq], self.node.v[: self.m])
+        return self.node.function("rest", rows[np.sort(order).tolist()])
+
+    # where the iteration begins
+
+    @cached_property
+    def _exact(self):
+        """The exact plan of a program that determines the motion completely; None if there is none."""
+        try:
+            model = derive(self.plant.mechanism, self.program)
+            names = self.plant.mechanism.parameters.names
+            model = model.with_parameters(**dict(zip(names, self.plant.parameters, strict=False)))
+            if not model.flat:
+                return None
+            return simulated(model, model.start(self.span[0]), self.span, progress=False)
+        except ServoError:
+            return None
+
+    def _guess(self):
+        """States (n_x, G) and inputs (m, G) at equal instants, and sizes of states, inputs and effort."""
+        times = np.linspace(*self.span, GUESS)
+        if self._exact is not None:
+            x = np.array([np.interp(times, self._exact.t, self._exact[name]) for name in self.plant.state_names])
+            u = np.array([np.interp(times, self._exact.t, self._exact[name]) for name in self.plant.inputs])
+        else:
+            x, u = self._quasi_static(times)
+        x_size = _sizes(x, self.nq, self.span)
+        effort = self.node.function("effort", self.node.effort)
+        u_size = np.abs(u).max(axis=1)
+        u_size = np.where(u_size > 1e-6 * u_size.max(), u_size, u_size.max() or 1.0)
+        v = np.concatenate([u_size, np.zeros(self.m * self.node.depth)])
+        return x, u, (x_size, u_size, float(effort(self.span[0], self.begin, v)) or 1.0)
+
+    def _quasi_static(self, times):
+        """Rests at frozen instants, with the speeds and the inertia of moving through them slowly."""
+        held = np.zeros(self.m) if self.held is None else self.held
+        rests = self.equilibria.along(times, self.begin[: self.nq], held)
+        rests[:, 0] = np.concatenate([self.begin[: self.nq], held])
+        known = np.isfinite(rests).all(axis=0)
+        rests = np.array([np.interp(times, times[known], row[known]) for row in rests])
+        q, u = rests[: self.nq], rests[self.nq :]
+        kinematics = self.node.function("kinematics", self.node.q.V, self.node.q.h)
+        mechanism = self.plant.mechanism
+        forces = self.node.known(mechanism.mass), self.node.known(mechanism.E)
+        motion = self.node.function("motion", self.node.acceleration, *forces)
+        rate, zero = np.gradient(q, times, axis=1), np.zeros(self.m * self.node.depth)
+        w = np.zeros((self.n - self.nq, len(times)))
+        for k, t in enumerate(times):
+            V, h = (np.array(part) for part in kinematics(t, np.concatenate([q[:, k], w[:, k]]), np.append(u[:, k], zero)))
+            w[:, k] = np.linalg.lstsq(V, rate[:, k] - h.ravel(), rcond=None)[0]
+        accelerations = np.gradient(w, times, axis=1)
+        for k, t in enumerate(times):
+            x, v = np.concatenate([q[:, k], w[:, k]]), np.append(u[:, k], zero)
+            present, M, E = (np.array(part) for part in motion(t, x, v))
+            inertial = M @ (accelerations[:, k] - present.ravel())
+            u[:, k] += np.linalg.lstsq(E, inertial, rcond=None)[0]
+        return np.vstack([q, w]), u
+
+    def _first(self, mesh):
+        """The guess on a mesh."""
+        times, nodes = np.linspace(*self.span, GUESS), np.append(mesh.edges[0], mesh.nodes)
+        x, u = (np.array([np.interp(nodes, times, row) for row in part]) for part in (self.states, self.inputs))
+        return Plan(mesh, mesh, x, mesh.control_points(u[:, 1:], u[:, 0]))
+
+    # solutions
+
+    def run(self, beta):
+        """The run of weights (k,), by default a small part of the usual ones."""
+        beta = DEFAULT * self._usual_weights() if beta is None else beta
+        plan = self._continued(self._mesh(), beta)
+        for _ in range(REFINEMENTS):  # of the mesh
+            finer = self._finer(plan)
+            if finer is None:
+                return self._as_run(plan)
+            plan = self._solved(finer, [beta], finer.iterations)
+        worst = self._defects(plan)
+        if worst.max() > 10 * DEFECT:
+            k = int(np.argmax(worst))
+            raise IntegrationStopped(
+                f"Between the nodes at t = {plan.mesh.edges[k]:.4g} s the plan misses the equations of motion by "
+                f"{worst[k]:.1e}, with {len(worst)} intervals.",
+                f"Relative to the states' sizes a plan misses them by at most {10 * DEFECT:g}.",
+                do="Choose a greater weight, wider limits or a shorter span.",
+                t=float(plan.mesh.edges[k]), defect=float(worst[k]), intervals=len(worst),
+            )  # fmt: skip
+        return self._as_run(plan)
+
+    def _mesh(self):
+        """Intervals of about the same length between the knots of the program."""
+        switches = Switches(self.node.q, self.program.residuals, self.plant.mechanism.parameters.symbols)
+        knots = switches.times(self.plant.parameters, self.span)
+        corners = np.array(breakpoints(self.span, sorted(knots)))
+        counts = np.maximum(1, np.ceil(np.diff(corners) * INTERVALS / np.ptp(corners) * (1 - 1e-9))).astype(int)
+        return Mesh(_cut(corners, counts), ORDER)
+
+    def _continued(self, mesh, beta):
+        """The plan of weights, from the guess over greater weights."""
+        usual = self._usual_weights()
+        if np.any(beta > usual):
+            raise self._useless(beta, usual)
+        factor = 1.0 if self._exact is not None else max(1.0, float(np.min(FIRST * usual / beta)))
+        factor = factor if np.isfinite(factor) else 1.0
+        steps = int(np.ceil(np.log(factor) / np.log(FACTOR)))
+        return self._solved(self._first(mesh), [beta * factor ** (1 - k / max(steps, 1)) for k in range(steps + 1)])
+
+    def _usual_weights(self):
+        """Weights (k,) for which standing still costs as much as the actuation of the program."""
+        f = self.node.function("residuals", self.node.residuals)
+        v = np.concatenate([self.begin_inputs, np.zeros(self.m * self.node.depth)])
+        still = np.hstack([np.array(f(t, self.begin, v)) for t in np.linspace(*self.span, GUESS)])
+        moved = np.abs(still).max(axis=1)
+        return np.where(moved > 0, moved**2 / self.sizes[2], np.inf)
+
+    @property
+    def begin_inputs(self):
+        return np.zeros(self.m) if self.held is None else self.held
+
+    def _solved(self, plan, weights, iterations=()):
+        """The plan of the last of falling weights, each solved from the one before."""
+        nlp = Transcription(self.node, plan.mesh, plan.pieces, self.sizes, self.target[2])
+        bounds, w, multipliers, iterations = self._sides(nlp), nlp.joined(plan.x, plan.points), None, list(iterations)
+        for beta in weights:
+            w, multipliers, stats = nlp.solve(w, beta, bounds, multipliers)
+            iterations.append(stats["iter_count"])
+            if stats["return_status"] not in SOLVED:
+                raise self._failed(nlp, (w, beta, bounds), stats["return_status"], plan)
+        return Plan(plan.mesh, plan.pieces, *nlp.apart(w), tuple(iterations))
+
+    def _sides(self, nlp):
+        """Bounds of the variables and of the constraints by kind."""
+        K, P = 1 + nlp.count, 1 + len(nlp.pieces.nodes)
+        x = np.repeat([[-np.inf], [np.inf]], self.n * K, axis=1).reshape(2, self.n, K)
+        for name, sides in self.bounds.items():
+            if name in self.plant.state_names:
+                x[:, self.plant.state_names.index(name)] = np.array(sides)[:, None]
+        x[:, :, 0] = self.begin
+        fixed = np.isfinite(self.target[0])
+        x[:, fixed, -1] = self.target[0][fixed]
+        u = np.repeat([[-np.inf], [np.inf]], self.m * P, axis=1).reshape(2, self.m, P)
+        slopes = np.repeat([[-np.inf], [np.inf]], self.m * (P - 1), axis=1).reshape(2, self.m, P - 1)
+        jump = np.zeros((2, self.m, 1))
+        for i, name in enumerate(self.plant.inputs):
+            if name in self.limits:
+                u[:, i] = np.array(self.limits[name])[:, None]
+            if name in self.rates:
+                slopes[:, i] = np.array(self.rates[name])[:, None] / self.sizes[1][i]
+                jump[:, i] = [[-np.inf], [np.inf]]
+                u[:, i, 0] = self.begin_inputs[i] if self.held is not None else u[:, i, 0]
+                u[:, i, -1] = self.target[1][i] if self.target[1] is not None and not self.target[2] else u[:, i, -1]
+        bounded = [sides for name, sides in self.bounds.items() if name not in self.plant.state_names]
+        bounded = np.array(bounded).reshape(-1, 2).T[:, :, None].repeat(K - 1, axis=2)
+        rest = np.zeros((2, 0 if self.target[2] is None else self.target[2].numel_out(0), 1))
+        limits = {"motion": np.zeros((2, self.n, K - 1)), "begin": jump, "slope": slopes, "bound": bounded, "rest": rest}
+        return nlp.joined(x[0], u[0]), nlp.joined(x[1], u[1]), limits
+
+    def _useless(self, beta, usual):
+        i = int(np.argmax(beta / usual))
+        name = self.program.names[i]
+        return SpecificationError(
+            f"The weight of {name!r} is {beta[i]:.3g}.",
+            f"Above {usual[i]:.3g} standing still costs less than the program.",
+            nearest=f"{FIRST * usual[i]:.1g}.",
+            do="A weight is in (unit of the residual)²/(unit of the inputs)², such as m²/N²; choose a smaller one.",
+            name=name, weight=float(beta[i]), most=float(usual[i]),
+        )  # fmt: skip
+
+    def _failed(self, nlp, solution, status, plan):
+        """The error of an iteration that ends without a solution: what would be exceeded without limits, and where."""
+        w, beta, bounds = solution
+        said = STATUS.get(status, status)
+        row, t, value, side = self._violation(nlp, w, bounds)
+        facts = {"status": status, "weights": beta.tolist()}
+        free = copy(self)
+        free.limits, free.rates, free.bounds = {}, {}, dict.fromkeys(self.bounds, (-np.inf, np.inf))
+        limited = self.limits or self.rates or self.bounds
+        without = nlp.solve(nlp.joined(plan.x, plan.points), beta, free._sides(nlp)) if limited else None
+        if without is None or without[2]["return_status"] not in SOLVED:
+            return IntegrationStopped(
+                f"IPOPT {said}; the largest violation is that of {row} at t = {t:.4g} s, {abs(value - side):.3g}.",
+                "A plan satisfies the equations of motion and the conditions at both ends.",
+                do="Choose a longer span, another end or start nearer to the program.",
+                row=row, t=t, violation=float(abs(value - side)), **facts,
+            )  # fmt: skip
+        row, t, value, side = self._violation(nlp, without[0], bounds)
+        kind = LimitExceeded if status == "Infeasible_Problem_Detected" else IntegrationStopped
+        return kind(
+            f"IPOPT {said} within the limits and bounds; without them {row} is {value:.5g} at t = {t:.4g} s, "
+            f"beyond {side:.5g}.",
+            "A plan keeps all limits from end to end.",
+            do="Widen this limit, or give the transition more time.",
+            row=row, t=t, value=value, limit=side, **facts,
+        )  # fmt: skip
+
+    def _violation(self, nlp, w, bounds):
+        """Name, instant [s], value and side of what violates its bounds most, relative to its size, in SI."""
+        lower, upper, limits = bounds
+        mesh, pieces, (x_size, u_size) = nlp.mesh, nlp.pieces, self.sizes[:2]
+        instants, of_inputs = (np.append(each.edges[0], each.nodes) for each in (mesh, pieces))
+        parts = [*zip(nlp.apart(w), nlp.apart(lower), nlp.apart(upper), strict=True)]
+        states, inputs = self.plant.state_names, self.plant.inputs
+        entries = [(states, x_size, instants, *parts[0]), (inputs, u_size, of_inputs, *parts[1])]
+        rates = [f"d{name}" for name in inputs]
+        names = {"motion": [f"the motion of {name}" for name in states], "begin": inputs, "slope": rates}
+        names |= {"bound": [*self.node.bounds], "rest": ["rest at the end"] * len(limits["rest"][0])}
+        scales = {"motion": x_size, "begin": u_size, "slope": u_size}
+        for kind, value in nlp.constraints(w).items():
+            scale = scales.get(kind, np.ones(len(value)))[:, None]
+            at = {"begin": mesh.edges[:1], "rest": mesh.edges[-1:], "slope": pieces.nodes}.get(kind, mesh.nodes)
+            low, high = limits[kind]
+            entries.append((names[kind], np.maximum(scale[:, 0], _largest(value * scale)), at, *(scale * part for part in (value, low, high))))
+        found = []
+        for label, size, at, value, low, high in entries:
+            if not value.size:
+                continue
+            excess = np.maximum(low - value, value - high) / np.where(size > 0, size, 1.0)[:, None]
+            i, k = np.unravel_index(np.argmax(excess), excess.shape)
+            side = low[i, k] if low[i, k] - value[i, k] > value[i, k] - high[i, k] else high[i, k]
+            found.append((excess[i, k], (label[i], float(at[k]), float(value[i, k]), float(side))))
+        return max(found, key=lambda entry: entry[0])[1]
+
+    def _defects(self, plan):
+        """Largest defect h (x' - f) between the nodes of each interval, relative to the sizes of the states, (N,)."""
+        mesh, (x, u), theta = plan.mesh, (plan.x, plan.points), np.array(BETWEEN)
+        t = (mesh.edges[:-1, None] + mesh.h[:, None] * theta).ravel()
+        f = self.node.function("rates", self.node.rates).map(len(t))
+        v = np.vstack([plan.pieces.inputs(u, t, rate) for rate in range(self.node.depth + 1)])
+        defect = mesh.states(x, t, 1) - np.array(f(t[None], mesh.states(x, t), v))
+        defect *= np.repeat(mesh.h, len(theta)) / _sizes(x, self.nq, self.span)[:, None]
+        return np.abs(defect).max(axis=0).reshape(len(mesh.h), -1).max(axis=1)
+
+    def _finer(self, plan):
+        """The plan on a finer mesh where its motion is not that of the plant; None where it is, or at the finest."""
+        mesh, defect = plan.mesh, self._defects(plan)
+        pieces = np.ceil((defect / (AIM * DEFECT)) ** (1 / (1 + len(mesh.c)))).astype(int)
+        pieces = np.where(defect > DEFECT, np.clip(pieces, 2, MOST_PIECES), 1)
+        if pieces.max() == 1 or pieces.sum() > MOST_INTERVALS:
+            return None
+        finer = Mesh(_cut(mesh.edges, pieces), mesh.order)
+        nodes = np.append(mesh.edges[0], finer.nodes)
+        return replace(plan, mesh=finer, x=mesh.states(plan.x, nodes))
+
+    def _as_run(self, plan):
+        """The run of the plant under the plan's inputs."""
+        mesh, mechanism = plan.mesh, self.plant.mechanism
+        u = piecewise(mechanism.q.t, plan.pieces.edges, plan.pieces.power_coefficients(plan.points))
+        inputs = dict(zip(self.plant.inputs, ca.vertsplit(u), strict=True))
+        model = driven(self.plant, inputs, self.program.residuals)
+        parts = max(1, -(-SAMPLES // len(mesh.h)))
+        t = _cut(mesh.edges, np.full(len(mesh.h), parts))
+        x = mesh.states(plan.x, t)
+        jets = np.vstack([x, model.function("ode").grid(t, x, model.parameters)[self.nq : self.n]])
+        start = State(float(t[0]), x[:, 0].copy(), tuple(model.state_names), (), (), 0.0)
+        counters = {"iterations": sum(plan.iterations), "intervals": len(mesh.h), "solves": len(plan.iterations)}
+        run = Run(t, jets, tuple(model.jet_names), model, "relaxed", counters=counters, knots=tuple(plan.pieces.edges[1:-1].tolist()), start=start)
+        missed = ", ".join(f"{name} {np.abs(run.residual[name]).max():.2g}" for name in self.program.names)
+        return replace(run, message=f"finished; the program is missed by at most {missed}")
+
+
+def _sizes(x, nq, span):
+    """Size of each state (n_x,): its range, at least a part of that of others at its level."""
+    ranges = np.ptp(x, axis=1)
+    for level, floor in ((slice(nq), 1.0), (slice(nq, None), 1.0 / (span[1] - span[0]))):
+        ranges[level] = np.maximum(ranges[level], 1e-2 * (ranges[level].max(initial=0.0) or floor))
+    return ranges
+
+
+def _cut(edges, counts):
+    """Edges with each interval cut into so many, (N,) int."""
+    pieces = [np.linspace(a, b, n + 1)[:-1] for a, b, n in zip(edges[:-1], edges[1:], counts, strict=True)]
+    return np.append(np.concatenate(pieces), edges[-1])
+
+
+def _no_rest(where, t, worst):
+    row, value = worst
+    return InconsistentStart(
+        f"There is no rest at the {where}, t = {t:g} s, at which the program is met: {row} remains {value:.3g}.",
+        "The plan begins and ends at rest where start or end do not say otherwise.",
+        do="Give coordinates near the rest in start={...}, or end='free'.",
+        where=where, t=float(t), row=row, value=value,
+    )  # fmt: skip
+
+
+def _no_equilibrium(t, worst, speeds):
+    row, value = worst
+    moving = {name: speed for name, speed in speeds.items() if speed}
+    what = ", ".join(f"{name} = {speed:g}" for name, speed in moving.items()) or f"{row} = {value:.4g}"
+    return InconsistentStart(
+        f"The start at t = {t:g} s is no equilibrium: {what}.",
+        "With end='rest' the plan leaves a rest, at which inputs hold the machine.",
+        do="Leave start= out, or write end='free' or the values of states at the end.",
+        t=float(t), row=row, value=value, speeds=moving,
+    )  # fmt: skip
+
+
+def _largest(values):
+    """Largest magnitude of each row (rows,)."""
+    return np.abs(values).max(axis=1, initial=0.0)

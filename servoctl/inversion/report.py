@@ -1,0 +1,388 @@
+"""What a program asks of its mechanism, in one value: orders, ranks, directions, what is left free, the actuation."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from types import SimpleNamespace
+
+import numpy as np
+
+from servoctl.checks import interval, mapping
+from servoctl.errors import NotRealisable, SpecificationError, unknown
+from servoctl.figures.names import efforts
+from servoctl.inversion.verdict import UNREALISABLE, Verdict, endpoints, verdict
+from servoctl.model.model import SAMPLED, Model, derive
+from servoctl.model.report import WIDTH
+from servoctl.model.start import State
+from servoctl.reduction.structure import Directions, Local, directions, margins
+from servoctl.run import Run, require_model
+from servoctl.spec.mechanism import Mechanism
+from servoctl.spec.program import Program
+
+MOST_LINES = 12  # of a printed report
+FEWEST_OF_A_SPLINE = 4  # samples between two knots through which a spline of order 3 is laid
+
+
+@dataclass(frozen=True)
+class Effort:
+    """What one actuator, or one component of an ideal reaction, does along a run.
+
+    Attributes
+    ----------
+    peak, peak_at : float
+        The value of largest magnitude, and its instant [s].
+    rms : float
+    rate, rate_at, rate_rms : float
+        The same of its derivative in time [1/s].
+    limit, limit_at, room : float or None
+        The nearest limit, the instant [s] at which the actuator is nearest to it, and how far it is then from it:
+        negative beyond it. None without a limit.
+    """
+
+    peak: float
+    peak_at: float
+    rms: float
+    rate: float
+    rate_at: float
+    rate_rms: float
+    limit: float | None = None
+    limit_at: float | None = None
+    room: float | None = None
+
+    def __str__(self):
+        text = f"peak {self.peak:.6g} (t = {self.peak_at:.4g} s), rms {self.rms:.4g}; "
+        text += f"rate {self.rate:.4g} 1/s (t = {self.rate_at:.4g} s), rms {self.rate_rms:.4g}"
+        if self.room is not None:
+            text += f"; {abs(self.room):.4g} {'within' if self.room >= 0 else 'beyond'} the limit {self.limit:g}"
+        return text
+
+
+@dataclass(frozen=True, eq=False)
+class Report:
+    """What a program asks of its mechanism, and which inverse it has; made by `report`.
+
+    Attributes
+    ----------
+    verdict : Verdict
+    residuals : dict of str to dict
+        For each residual its "order", how often it is "raised" until accelerations appear, its "relative degree", and
+        the "class" C^k that its path needs.
+    index : int or None
+        Differentiation index; None where it is not defined.
+    realisation : {"orthogonal", "mixed", "tangential", "undecided", "ideal"}
+        The class: rank of the decoupling matrix full, between, or zero.
+    directions : Directions or None
+        Actuators and normals of the program at the start; None for ideal programs and where there is no start.
+    hidden : tuple of str
+        How each hidden constraint was derived.
+    free : int
+        Dimension of the internal dynamics, Σ o_a.
+    ranks : dict of str to Local
+        Relative degrees, zeros at infinity and index: at seeded points, at the start, in the middle of a run, and
+        where the leading matrix loses rank along it.
+    margin : (float, float) or None
+        The smallest pivot of the leading matrix along a run, equilibrated, and its instant [s].
+    efforts : dict of str to Effort
+        Actuation along a run.
+    run : Run or None
+    """
+
+    verdict: Verdict
+    residuals: dict
+    index: int | None = None
+    realisation: str = "undecided"
+    directions: Directions | None = None
+    hidden: tuple = ()
+    free: int = 0
+    ranks: dict[str, Local] = field(default_factory=dict)
+    margin: tuple[float, float] | None = None
+    efforts: dict[str, Effort] = field(default_factory=dict)
+    run: Run | None = None
+
+    def as_dict(self) -> dict:
+        """The report as numbers, texts, lists and dicts, for JSON; eigenvalues as pairs [real part, imaginary part]."""
+        return {
+            **self.verdict.as_dict(),
+            "residuals": {name: dict(facts) for name, facts in self.residuals.items()},
+            "index": self.index,
+            "realisation": self.realisation,
+            "directions": None if self.directions is None else _plain(self.directions),
+            "hidden": list(self.hidden),
+            "free": self.free,
+            "ranks": {place: _plain(local) for place, local in self.ranks.items()},
+            "margin": None if self.margin is None else list(self.margin),
+            "efforts": {name: _plain(effort) for name, effort in self.efforts.items()},
+        }
+
+    def plot(self):
+        """A figure: eigenvalues at rest, growth of errors, directions, and the actuation with its limits.
+
+        Returns
+        -------
+        matplotlib.figure.Figure
+        """
+        from servoctl.figures.report import draw_report
+
+        return draw_report(self)
+
+    def __repr__(self):
+        v, lines = self.verdict, [f"Report: {self.verdict.word}"]
+        lines += [f"  {text}" for text in (v.reason, v.growth, v.do) if text]
+        lines += [f"  {text}" for text in _of_residuals(self.residuals)]
+        if self.verdict.word != UNREALISABLE:
+            index = "not defined" if self.index is None else self.index
+            lines.append(f"  index {index}; {self.realisation} realisation{_of_directions(self.directions)}")
+            hidden = f"hidden: {'; '.join(self.hidden)}" if self.hidden else "no hidden constraint"
+            lines.append(f"  {hidden}; {self.free} free initial value{'s' * (self.free != 1)}")
+        if self.margin is not None:
+            lines.append(f"  smallest pivot along the run {self.margin[0]:.2g} (t = {self.margin[1]:.4g} s)")
+        lines += [f"  {place}: {local.named(self.residuals)}" for place, local in self._differing()]
+        efforts = [f"  {name}: {effort}" for name, effort in self.efforts.items()]
+        room = MOST_LINES - len(lines)
+        if len(efforts) > room:
+            efforts = [*efforts[: room - 1], f"  and {len(efforts) - room + 1} more: report.efforts"]
+        return "\n".join(line if len(line) <= WIDTH else line[: WIDTH - 3] + "..." for line in [*lines, *efforts])
+
+    def _differing(self):
+        """The places whose ranks are printed: the first of those with the same ranks, none where all are the same."""
+        first = {local.decided: (place, local) for place, local in reversed(self.ranks.items())}
+        return list(reversed(first.values()))[:3] if len(first) > 1 else []
+
+
+def _plain(value):
+    """The fields of a value, as JSON has them."""
+    kept = {name: list(v) if isinstance(v, tuple) else v for name, v in vars(value).items()}
+    return {name: None if isinstance(v, float) and not np.isfinite(v) else v for name, v in kept.items()}
+
+
+def _of_residuals(residuals):
+    """Lines on the residuals, those with equal facts together: at most two."""
+    groups = {}
+    for name, facts in residuals.items():
+        groups.setdefault(tuple(facts.values()), []).append(name)
+    texts = []
+    for (order, raised, degree, smoothness), names in groups.items():
+        text = f"{', '.join(names)}: order {order}" + (f", raised {raised}x" if raised else "")
+        text += "" if degree is None else f", relative degree {degree}"
+        texts.append(text + ("" if smoothness is None else f", path C{smoothness}"))
+    return [*texts[:1], *(["; ".join(texts[1:])] if texts[1:] else [])]
+
+
+def _of_directions(found):
+    if found is None or not found.cosines:
+        return ""
+    text = f", actuators and normals up to {round(np.degrees(found.angle), 3):g}° apart"
+    if found.margin:
+        text += f" (least cosine {found.margin:.2g})"
+    if found.residuals:
+        text += f"; {', '.join(found.actuators) or 'no actuator'} without effect on {', '.join(found.residuals)}"
+    return text
+
+
+def report(
+    model: Model | Mechanism, run: Run | State | Program | None = None, limits: Mapping[str, float] | None = None
+) -> Report:
+    """What a program asks of its mechanism, and the verdict: which inverse it has.
+
+    Parameters
+    ----------
+    model : Model or Mechanism
+        Of a mechanism and its program the model is derived; where no actuation realises it, the report says so.
+    run : Run, State or Program, optional
+        A run, along which ranks, growth and actuation are reported; or a start; or the program of a mechanism. Default:
+        the start nearest to zero.
+    limits : dict of str to float or (float, float), optional
+        Limits of actuators, as in `plant`: c means (-c, c).
+
+    Returns
+    -------
+    Report
+
+    Raises
+    ------
+    SpecificationError
+        If the run is not of this model, there are limits without a run, or a limit is no interval.
+    NameUnknown
+        For a limit of no actuator.
+    """
+    if isinstance(model, Mechanism):
+        try:
+            model, run = derive(model, run), None
+        except NotRealisable as error:
+            return _not_realisable(model, run, error)
+    _require_motion(model, run)
+    limits = {name: interval(name, value, "limit") for name, value in mapping(limits, "The limits").items()}
+    along = run if isinstance(run, Run) else None
+    _require_limits(model, along, limits)
+    judged, structure, ends = verdict(model, run), model.structure(), endpoints(model, run)
+    margin, ranks = _ranks(model, structure, along, ends)
+    return Report(
+        judged,
+        _residuals(model, structure),
+        structure.index,
+        structure.realisation,
+        _directions(model, ends),
+        tuple(row.story for row in model.reduction.hidden),
+        model.free,
+        ranks,
+        margin,
+        {} if along is None else {name: _effort(along, name, limits.get(name)) for name in efforts(along)},
+        along,
+    )
+
+
+def _not_realisable(mechanism, program, error):
+    """The report of a program that no actuation can realise."""
+    orders = {name: max(mechanism.q.order(e), 0) for name, e in program.residuals.items()}
+    facts = {
+        name: {"order": order, "raised": max(0, 2 - order), "relative degree": None, "class": None}
+        for name, order in orders.items()
+    }
+    return Report(Verdict(UNREALISABLE, str(error).rstrip(".")), facts)
+
+
+def _require_motion(model, run):
+    """Refuse what is no model, and a motion of another one."""
+    if not isinstance(model, Model) or not (run is None or isinstance(run, (Run, State))):
+        raise SpecificationError(
+            f"sv.report received a {type(model).__name__} and a {type(run).__name__}.",
+            "It takes a model, and a run or a start of it; or a mechanism and its program.",
+            do="Write sv.report(model, run), or sv.report(mechanism, program).",
+            model=type(model).__name__,
+            run=type(run).__name__,
+        )
+    if isinstance(run, Run):
+        require_model(model, run, "report")
+    elif run is not None and tuple(run.names) != model.state_names:
+        require_model(model, SimpleNamespace(model=model, jets=(), jet_names=run.names), "report")
+
+
+def _require_limits(model, run, limits):
+    for name in limits:
+        if name not in model.actuators:
+            raise unknown(name, model.actuators, "actuator")
+    if limits and run is None:
+        raise SpecificationError(
+            f"Limits of {', '.join(limits)} were given without a run.",
+            "Limits are compared with the actuation along a run.",
+            do="Pass the run, or leave out the limits.",
+            limits=limits,
+        )
+
+
+def _residuals(model, structure):
+    reduction = model.reduction
+    degrees, classes = (
+        dict(zip(structure.residuals, of, strict=False))
+        for of in (structure.relative_degree, structure.essential_orders)
+    )
+    return {
+        name: {
+            "order": reduction.original[name].order,
+            "raised": max(0, reduction.top - reduction.original[name].order),
+            "relative degree": degrees.get(name) if reduction.original[name].order <= 2 else None,
+            "class": classes.get(name, reduction.needs.get(name)),
+        }
+        for name in reduction.program.residuals
+    }
+
+
+def _directions(model, ends):
+    """The directions where the motion begins."""
+    if model.ideal or not ends:
+        return None
+    t, x = ends[0]
+    return directions(model.reduction, [t], x[:, None], model.parameters)[0]
+
+
+def _ranks(model, structure, run, ends):
+    """The margin along a run, and the structure by place: seeded points, the start, and instants of the run."""
+    if not structure.at:
+        return None, {}
+    places = {"seeded points": next(local for _, local in structure.at if _typical(local, structure))}
+    for t, x in ends[:1]:
+        places[f"at the start, t = {t:.4g} s"] = model.structure([t], x[:, None]).at[0][1]
+    if run is None:
+        return None, places
+    n_x = len(model.state_names)
+    some = np.flatnonzero(np.isfinite(run.jets[:n_x]).all(axis=0))
+    some = some[np.unique(np.linspace(0, len(some) - 1, SAMPLED).round().astype(int))]
+    along = np.concatenate([_margins(run, some, part) for part in run.variants or ((0, len(run.t), model),)])
+    if np.isnan(along).all():
+        return None, places
+    worst = int(np.nanargmin(along))
+    for k in {int(some[len(some) // 2]), *([int(some[worst])] if along[worst] == 0 else [])}:
+        places[f"at t = {run.t[k]:.4g} s"] = model.structure(run.t[[k]], run.jets[:, [k]]).at[0][1]
+    return (float(along[worst]), float(run.t[some[worst]])), places
+
+
+def _margins(run, some, part):
+    """Margins of the variant (first, end, model) at those of some samples that it holds for."""
+    first, end, variant = part
+    inside = some[(some >= first) & (some < end)]
+    return margins(variant.reduction, run.t[inside], run.jets[:, inside], variant.parameters) if len(inside) else []
+
+
+def _typical(local, structure):
+    return (local.relative_degree, local.zeros_at_infinity) == (structure.relative_degree, structure.zeros_at_infinity)
+
+
+# actuation ------------------------------------------------------------------------------------------------------------
+
+
+def _effort(run, name, limits):
+    """An `Effort` from a signal of a run."""
+    (low, t_low), (high, t_high) = extremes(run, name)
+    peak, peak_at = max(((low, t_low), (high, t_high)), key=lambda extreme: abs(extreme[0]))
+    rates = _slopes(run, name)
+    rate, rate_at = max(_sampled_extremes(run.t, rates), key=lambda extreme: abs(extreme[0]))
+    nearest = {}
+    if limits is not None:
+        room, limit_at, limit = min((low - limits[0], t_low, limits[0]), (limits[1] - high, t_high, limits[1]))
+        nearest = {"limit": limit, "limit_at": limit_at, "room": room}
+    return Effort(peak, peak_at, _rms(run.t, run[name]), rate, rate_at, _rms(run.t, rates), **nearest)
+
+
+def extremes(run, name):
+    """(value, instant [s]) of the least and the greatest value of a signal, or of the rate of one, along a run.
+
+    Parameters
+    ----------
+    run : Run
+    name : str
+        A signal, or d and the name of one.
+    """
+    if name not in run and name[:1] == "d" and name[1:] in run:
+        return _sampled_extremes(run.t, _slopes(run, name[1:]))
+    return tuple((value, t) for t, value in run.extrema(name))
+
+
+def _sampled_extremes(t, values):
+    if not np.isfinite(values).any():
+        return (np.nan, float(t[0])), (np.nan, float(t[0]))
+    return tuple((float(values[k]), float(t[k])) for k in (int(np.nanargmin(values)), int(np.nanargmax(values))))
+
+
+def _rms(t, values):
+    """The root of the mean square over time, of finite samples."""
+    known = np.isfinite(values)
+    t, values = t[known], values[known]
+    return float(np.sqrt(np.trapezoid(values**2, t) / (t[-1] - t[0]))) if len(t) > 1 else np.nan
+
+
+def _slopes(run, name):
+    """The derivative of a signal at the samples: exact if the run has the jets, else of splines between knots."""
+    from scipy.interpolate import CubicSpline
+
+    try:
+        return run[f"d{name}"]
+    except SpecificationError:
+        values, rates = run[name], np.full(len(run.t), np.nan)
+    edges = [-np.inf, *sorted(run.knots), np.inf]
+    direction = 1 if run.t[-1] >= run.t[0] else -1
+    for a, b in zip(edges[:-1], edges[1:], strict=True):
+        inside = np.flatnonzero((run.t >= a) & (run.t <= b) & np.isfinite(values))[::direction]
+        if len(inside) >= FEWEST_OF_A_SPLINE:
+            slopes = CubicSpline(run.t[inside], values[inside])(run.t[inside], 1)
+            larger = ~(np.abs(rates[inside]) >= np.abs(slopes))  # at a knot the rate may jump
+            rates[inside[larger]] = slopes[larger]
+    return rates

@@ -1,0 +1,1 @@
+"""Derivatives of motions by parameters and initial values, and parameters from measurements."""

@@ -1,0 +1,403 @@
+"""Derivatives of a run's signals by parameters and initial values."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from servoctl.checks import texts
+from servoctl.errors import IntegrationStopped, SpecificationError, unknown
+from servoctl.methods.motion import breakpoints
+from servoctl.methods.sizes import motion_sizes
+from servoctl.model.model import Model
+from servoctl.model.switching import switching
+from servoctl.run import STENCIL, ByName, Run, require_model
+from servoctl.sensitivities.tangent import along_state, determined, invariants_by, variational
+from servoctl.values import Value
+
+RTOL = 1e-11  # of a step of the variational equation
+STIFF = ("Radau", "BDF", "RadauIIA", "CVODES", "IDAS")  # methods of runs whose variational equation is stiff, too
+DEPENDS = 1e-8  # of a column of the invariants' Jacobian: what is left beside others, below which it depends on them
+BESIDE_KNOT = 1e-9  # of the span: instants before and after a knot at which rates are compared
+JUMPS = 1e-6  # of the rates: a larger difference there is a jump
+SHIFT = 1e-4  # of a parameter, by which the instants of knots are differentiated
+
+
+@dataclass(frozen=True, eq=False)
+class Sensitivity(ByName, Value):
+    """Derivatives of signals along a run by parameters and initial values; made by `sensitivity`.
+
+    `s["trolley", "m_load"]` is ∂trolley/∂m_load at the samples, (N,), SI. `list`, `len` and `in` go by these pairs.
+
+    Attributes
+    ----------
+    run : Run
+    of, to : tuple of str
+        Names of the signals, and of the parameters and initial values.
+    values : dict of (str, str) to (N,) array
+    independent : tuple of str
+        Initial values that do not depend on others: the derivative by a parameter, or by one of them, is taken with
+        the rest of them constant. Empty where the program determines the motion.
+    """
+
+    run: Run = field(repr=False)
+    of: tuple
+    to: tuple
+    values: dict = field(repr=False)
+    independent: tuple = ()
+
+    @property
+    def t(self):
+        """Samples [s], (N,) array."""
+        return self.run.t
+
+    @property
+    def names(self):
+        """All pairs (signal, parameter or initial value)."""
+        return tuple(self.values)
+
+    def __getitem__(self, pair):
+        of, to = pair if isinstance(pair, tuple) and len(pair) == 2 else (pair, None)
+        for name, names in ((of, self.of), (to, self.to)):
+            if name not in names:
+                raise unknown(name, names, "derivative")
+        return self.values[of, to]
+
+    def number(self, name: str) -> float:
+        """The value of a parameter, or an initial value.
+
+        Parameters
+        ----------
+        name : str
+            One of `to`.
+        """
+        numbers = self.run.model.numbers
+        return numbers[name] if name in numbers else float(self.run[name][0])
+
+    def change(self, name: str) -> float:
+        """One percent of a number, 0.01 of its unit where that is zero: the change to which figures refer.
+
+        Parameters
+        ----------
+        name : str
+            One of `to`.
+        """
+        return 0.01 * (abs(self.number(name)) or 1.0)
+
+    def extrema(self, of: str) -> dict[str, tuple[float, float]]:
+        """Derivatives of the least and of the greatest value of a signal, refined between samples.
+
+        Parameters
+        ----------
+        of : str
+
+        Returns
+        -------
+        dict of str to (float, float)
+            By parameter or initial value: of the minimum and of the maximum.
+
+        Notes
+        -----
+        At an extremum the signal does not change with time, so that d max y/dp = ∂y/∂p there.
+        """
+        times = [t for t, _ in self.run.extrema(of)]
+        return {to: tuple(_between(self.run, self[of, to], t) for t in times) for to in self.to}
+
+    def plot(self, ax=None, units=None):
+        """Draw how each signal changes if each number grows by one percent.
+
+        Parameters
+        ----------
+        ax : Axes or sequence of Axes, optional
+            One for each signal; default: a new figure.
+        units : dict of str to str, optional
+            Units of the signals by name.
+
+        Returns
+        -------
+        (n,) array of Axes
+        """
+        from servoctl.figures.sensitivity import draw_sensitivity
+
+        return draw_sensitivity(self, ax, units)
+
+    def __repr__(self):
+        t = self.t
+        lines = [f"Sensitivity: {len(self.of)} signals by {len(self.to)} numbers, t = {t[0]:g} .. {t[-1]:g} s"]
+        for of in self.of[:8]:
+            sizes = {to: np.nanmax(np.abs(self[of, to])) * self.change(to) for to in self.to}
+            largest = sorted(sizes, key=sizes.get, reverse=True)[:3]
+            shown = ", ".join(f"{to} ({_step(self.number(to))}): {sizes[to]:.3g}" for to in largest)
+            lines.append(f"  {of} changes at most with {shown}")
+        if self.independent:
+            lines.append(f"  constant else at the start: {', '.join(self.independent)}")
+        return "\n".join(line[:118] for line in lines)
+
+
+def _step(number):
+    return "1 %" if number else "0.01"
+
+
+def sensitivity(
+    model: Model, run: Run, of: str | Sequence[str] | None = None, to: str | Sequence[str] | None = None
+) -> Sensitivity:
+    """Derivatives of a run's signals by parameters and initial values, without differences.
+
+    Where the program determines the motion they follow from the implicit function theorem at each sample, otherwise
+    from the variational equation along the run.
+
+    Parameters
+    ----------
+    model : Model
+    run : Run
+        A motion of it.
+    of : str or sequence of str, optional
+        Names of signals: coordinates, their derivatives up to γ^(s̄), actuation, outputs, multipliers. Default: the
+        actuation, or the reaction of an ideal program.
+    to : str or sequence of str, optional
+        Names of parameters, and of coordinates and velocities for their initial values. Default: all parameters.
+
+    Returns
+    -------
+    Sensitivity
+
+    Raises
+    ------
+    NameUnknown
+        For a name that model or run do not have.
+    SpecificationError
+        If the run is not of this model and its numbers, an initial value follows from the others, or the motion
+        crosses kinks or switches of the state.
+    IntegrationStopped
+        If the variational equation cannot be integrated along the run.
+
+    Notes
+    -----
+    Initial values that the constraints determine change with the others. Those that `model.start` held are constant
+    where they are not differentiated by.
+    """
+    require_model(model, run, "sensitivity")
+    _require_run(model, run)
+    default = [name for name, kind in model.signal_groups.items() if kind in ("actuation", "reaction")]
+    of = tuple(dict.fromkeys(default if of is None else texts(of, "The names of signals")))
+    to = tuple(dict.fromkeys(list(model.numbers) if to is None else texts(to, "The names of parameters")))
+    known = (*model.jet_names, *model.signal_groups)
+    for name in of:
+        if name not in known:
+            raise unknown(name, known, "signal")
+    initial = tuple(name for name in to if name not in model.numbers)
+    for name in initial:
+        if name not in model.state_names:
+            raise unknown(name, (*model.numbers, *model.state_names), "parameter or initial value")
+    names = tuple(name for name in to if name in model.numbers)
+    kinds = tuple(dict.fromkeys(model.signal_groups[name] for name in of if name not in model.jet_names))
+    if model.flat:
+        _require_free(model, initial, ())
+        tangents, independent = _determined(run, names, kinds), ()
+    else:
+        tangents, independent = _along(model, run, (names, initial), kinds)
+    rows = dict(zip(_rows(model, kinds), tangents, strict=True))
+    columns = (*names, *initial)
+    values = {(a, b): rows[a][columns.index(b)] for a in of for b in to}
+    return Sensitivity(run, of, to, values, independent)
+
+
+def _require_run(model, run):
+    """Refuse a run with other numbers, and one with switches of the state."""
+    switches = switching(model) is not None
+    if switches or run.model.numbers != model.numbers:
+        raise SpecificationError(
+            "The motion has kinks or switches of the state." if switches else "The run is of other parameters.",
+            "Derivatives are those along one smooth motion of the model.",
+            do="Smooth the switch, such as tanh(v/v0) for sign(v)." if switches else "Pass run.model, or simulate again.",
+            run=run.model.numbers,
+            model=model.numbers,
+        )
+
+
+def _rows(model, kinds):
+    """Names of the rows of a tangent: jets, then the signals of each group."""
+    return [*model.jet_names, *(name for kind in kinds for name in model.signals(kind)[0])]
+
+
+def _variants(run):
+    return run.variants or ((0, len(run.t), run.model),)
+
+
+def _determined(run, names, kinds):
+    """Tangents (rows, k, N) of the jets and signals of a flat program."""
+    parts = []
+    for first, end, model in _variants(run):
+        jets = run.jets[: len(model.jet_names), first:end]
+        y = determined(model, names, kinds).grid(run.t[first:end], jets, model.parameters)
+        parts.append(_by_rows(model, y, len(names), kinds))
+    return np.concatenate(parts, axis=2)
+
+
+def _by_rows(model, y, columns, kinds):
+    """Tangents (rows, K, N) from outputs y whose matrices are stacked column by column."""
+    sizes = [len(model.jet_names), *(len(model.signals(kind)[0]) for kind in kinds)]
+    parts = np.split(y, np.cumsum([size * columns for size in sizes])[:-1])
+    pairs = zip(parts, sizes, strict=True)
+    return np.concatenate([part.reshape(columns, size, y.shape[1]).swapaxes(0, 1) for part, size in pairs])
+
+
+# --- programs that leave something to integrate -----------------------------------------------------------------------
+
+
+def _along(model, run, to, kinds):
+    """Tangents (rows, K, N) along a run, and the names of its independent initial values."""
+    names, initial = to
+    S, independent = _start(run, names, initial)
+    tangents = _integrated(model, run, names, S)
+    parts = []
+    for first, end, variant in _variants(run):
+        jets = run.jets[: len(model.jet_names), first:end]
+        x = np.concatenate([jets, tangents[:, :, first:end].swapaxes(0, 1).reshape(-1, end - first)])
+        y = along_state(variant, names, len(initial), kinds).grid(run.t[first:end], x, variant.parameters)
+        parts.append(_by_rows(model, y, S.shape[1], kinds))
+    return np.concatenate(parts, axis=2), independent
+
+
+def _start(run, names, initial):
+    """The tangent (n_x, K) of the first state, and the names of the initial values that do not depend on others."""
+    model = run.variant(0)
+    t, x = run.t[0], run.jets[: len(model.state_names), 0]
+    m, n_x = len(model.invariant_names()), len(x)
+    y = invariants_by(model, names)(t, x, model.parameters)
+    G = y[m:].reshape(n_x + len(names), m).T
+    G, by_parameters = G[:, :n_x], G[:, n_x:]
+    held = run.start.held if run.start is not None else ()
+    rank = {name: 2 if name in initial else int(name in held) for name in model.state_names}
+    dependent = _dependent(G, [rank[name] for name in model.state_names])
+    free = np.setdiff1d(np.arange(n_x), dependent)
+    independent = tuple(model.state_names[i] for i in free)
+    _require_free(model, initial, independent)
+    S = np.zeros((n_x, len(names) + len(initial)))
+    for k, name in enumerate(initial):
+        S[model.state_names.index(name), len(names) + k] = 1.0
+    right = -np.column_stack([by_parameters, G @ S[:, len(names) :]])
+    S[dependent] = np.linalg.solve(G[:, dependent], right) if m else 0.0
+    return S, independent
+
+
+def _dependent(G, ranks):
+    """Indices (m,) of the entries that the Jacobian G (m, n_x) of the invariants determines, of low rank first."""
+    size = np.linalg.norm(G, axis=1, keepdims=True)
+    rest, chosen = G / np.where(size > 0, size, 1.0), []
+    original = np.linalg.norm(rest, axis=0)
+    for rank in sorted(set(ranks)):
+        columns = [i for i, r in enumerate(ranks) if r == rank]
+        while columns and len(chosen) < len(G):
+            norms = np.linalg.norm(rest[:, columns], axis=0) / np.where(original[columns] > 0, original[columns], 1.0)
+            if norms.max() < DEPENDS:
+                break
+            i = columns[int(np.argmax(np.linalg.norm(rest[:, columns], axis=0)))]
+            direction = rest[:, i] / np.linalg.norm(rest[:, i])
+            rest = rest - np.outer(direction, direction @ rest)
+            chosen.append(i)
+            columns.remove(i)
+    return np.sort(chosen).astype(int)
+
+
+def _require_free(model, initial, independent):
+    """Refuse initial values that follow from others."""
+    for name in initial:
+        if name not in independent:
+            raise SpecificationError(
+                f"The derivative by the initial value of {name!r} was named.",
+                f"Of this program {model.free} initial values are free, the others follow from the constraints.",
+                do=f"Name others, such as {', '.join(independent)}." if independent else "Name parameters.",
+                name=name,
+                free=model.free,
+            )
+
+
+def _integrated(model, run, names, S):
+    """The tangent (n_x, K, N) of the state at the samples of a run."""
+    from scipy.integrate import solve_ivp
+
+    n_x, K = S.shape
+    method = "Radau" if run.method in STIFF else "DOP853"
+    y, result = np.concatenate([run.jets[:n_x, 0], S.T.ravel()]), np.empty((n_x, K, len(run.t)))
+    atol = _absolute(model, run, names, S)
+    cuts = breakpoints((run.t[0], run.t[-1]), run.knots)
+    forward = np.sign(run.t[-1] - run.t[0]) or 1.0
+    for k, (a, b) in enumerate(zip(cuts[:-1], cuts[1:], strict=True)):
+        if k:
+            y[n_x:] += _shifted(model, run, names, a, y[:n_x], K).T.ravel()
+        variant = _variant_at(run, a, b)
+        f = variational(variant, names, K - len(names))
+        inside = np.flatnonzero((forward * run.t >= forward * a) & (forward * run.t <= forward * b))
+        solved = solve_ivp(
+            lambda t, z, f=f, p=variant.parameters: f(t, z, p), (a, b), y, method, dense_output=True,
+            rtol=RTOL, atol=atol,
+        )  # fmt: skip
+        if solved.status:
+            raise _lost(float(solved.t[-1]), solved.message)
+        result[:, :, inside] = solved.sol(run.t[inside])[n_x:].reshape(K, n_x, -1).swapaxes(0, 1)
+        y = solved.y[:, -1].copy()
+    return result
+
+
+def _variant_at(run, a, b):
+    """The variant of the model in the middle of a piece."""
+    return run.variant(int(np.argmin(np.abs(run.t - (a + b) / 2))))
+
+
+def _absolute(model, run, names, S):
+    """Absolute tolerances of the state and of its tangent, from the sizes of the motion and of the numbers."""
+    sizes = motion_sizes(model, run.t, run.jets[: len(S)])
+    sizes = np.where(sizes > 0, sizes, 1.0)
+    numbers = [abs(model.numbers[name]) or 1.0 for name in names]
+    initial = [sizes[np.argmax(column != 0)] for column in S.T[len(names) :]]
+    return RTOL * np.concatenate([sizes, *(sizes / number for number in [*numbers, *initial])])
+
+
+def _lost(t, why):
+    return IntegrationStopped(
+        f"The variational equation could not be integrated beyond t = {t:.6g} s: {why.rstrip('.')}.",
+        "Derivatives follow the motion from its start.",
+        do="Check whether the run ends near a singularity there, or take a shorter one.",
+        t=t,
+    )
+
+
+def _shifted(model, run, names, t, x, columns):
+    """The jump (n_x, K) of the tangent at a knot t that moves with parameters, where the rates jump."""
+    length, f = abs(run.t[-1] - run.t[0]), model.function("ode")
+    sides = [f(t + side * BESIDE_KNOT * length, x, model.parameters)[: len(x)] for side in (-1.0, 1.0)]
+    before, after = sides if run.t[-1] > run.t[0] else sides[::-1]
+    jump = np.zeros((len(x), columns))
+    if np.abs(after - before).max() > JUMPS * np.abs(sides).max():
+        for j, name in enumerate(names):
+            jump[:, j] = (before - after) * _knot_rate(model, run, name, t)
+    return jump
+
+
+def _knot_rate(model, run, name, t):
+    """Derivative of the instant of a knot by a parameter."""
+    value, span = model.numbers[name], (float(run.t.min()), float(run.t.max()))
+    shift = SHIFT * (abs(value) or 1.0)
+    knots = [np.array(model.with_parameters(**{name: value + h}).require_smooth(span)) for h in (-shift, shift)]
+    nearest = [k[np.argmin(np.abs(k - t))] if len(k) else np.nan for k in knots]
+    return (nearest[1] - nearest[0]) / (2 * shift)
+
+
+# --- between samples --------------------------------------------------------------------------------------------------
+
+
+def _between(run, values, t):
+    """A signal (N,) at t [s], by the polynomial through the samples around it between two knots."""
+    if not np.isfinite(t):
+        return float("nan")
+    times, i = run.t, int(np.argmin(np.abs(run.t - t)))
+    low = max((knot for knot in run.knots if knot <= t), default=-np.inf)
+    high = min((knot for knot in run.knots if knot >= t), default=np.inf)
+    inside = np.flatnonzero((times >= low) & (times <= high) & np.isfinite(values))
+    if times[i] == t or len(inside) < 2:
+        return float(values[i])
+    first = int(np.clip(np.searchsorted(inside, i) - STENCIL // 2, 0, max(0, len(inside) - STENCIL)))
+    window = inside[first : first + STENCIL]
+    s = (times[window] - t) / np.ptp(times[window])
+    return float(np.polynomial.Polynomial.fit(s, values[window], len(s) - 1, domain=[-1, 1])(0.0))

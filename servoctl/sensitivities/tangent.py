@@ -1,0 +1,151 @@
+"""The tangent of a motion as functions of (t, x, p): derivatives of jets and signals by parameters.
+
+The rows ψ_a and their time derivatives vanish along every motion, whatever the parameters. With z' = ∂z/∂p for the jets
+z_j = γ^(j) and D for the time derivative, differentiation by p gives level by level
+
+    L z'_j = -∂(D^j ψ)/∂p - Σ_{i<j} ∂(D^j ψ)/∂z_i z'_i,
+
+with the same matrix L of highest derivatives at every level: the implicit function theorem. All levels follow so where
+the program determines the motion. Otherwise the tangent S of the state obeys the variational equation
+S' = ∂f/∂X S + ∂f/∂p, and the highest level alone follows from L.
+"""
+
+import casadi as ca
+import numpy as np
+
+from servoctl.codegen.function import compiled
+from servoctl.model.equations import SIGNALS
+from servoctl.reduction.ranks import clean, eliminate
+
+
+def parameter_symbols(equations, names):
+    """The symbols (k,) of parameters by name."""
+    parameters = equations.r.mechanism.parameters
+    return ca.vertcat(ca.SX(0, 1), *(parameters.symbols[parameters.names.index(name)] for name in names))
+
+
+class Tangent:
+    """The tangent of the jets Z = (q, γ', ..., γ^(s̄)) of a model in the direction of its parameters.
+
+    Parameters
+    ----------
+    equations : Equations
+    names : sequence of str
+        Of the k parameters.
+    S : (n_x, K) SX, optional
+        Tangent of the state, its first k columns by the parameters; default: as the program determines it.
+
+    Attributes
+    ----------
+    jets : (n_z, K) SX
+        ∂Z by parameters, then by initial values.
+    """
+
+    def __init__(self, equations, names, S=None):
+        self.e, self.symbols = equations, parameter_symbols(equations, names)
+        levels = range(equations.top + 1)
+        if S is None:
+            known = []
+            for j in levels:
+                known.append(self._level(j, known))
+            self.jets = ca.vertcat(*known)
+        else:
+            sizes = [equations.q.nq, *[equations.q.n] * (equations.top - 1)]
+            known = ca.vertsplit(S, np.cumsum([0, *sizes]).tolist())
+            self.jets = ca.vertcat(S, self._level(equations.top, known))
+
+    def _level(self, j, known):
+        """∂γ^(j), or ∂q, from the tangents of the jets below."""
+        e = self.e
+        rows = ca.vertcat(*(level[j - e.top + ρ] for level, ρ in zip(e.levels, e.raised, strict=True)))
+        if j:
+            return e._solve(-self.along(rows, [e.q.jet(i) for i in range(j)], known))[0]
+        rows = ca.vertcat(rows, *e.q.invariants.values())
+        matrix = ca.jacobian(rows, e.q.jet(0))
+        return eliminate(matrix, -self.along(rows, [], []), clean(*e.r.points.matrix(matrix)))[0]
+
+    def along(self, expressions, jets, tangents):
+        """The derivatives (m, K) of expressions (m,) along tangents of jets, and by the parameters."""
+        columns = tangents[0].shape[1] if tangents else self.symbols.numel()
+        by_parameters = ca.horzcat(
+            ca.SX.eye(self.symbols.numel()), ca.SX.zeros(self.symbols.numel(), columns - self.symbols.numel())
+        )
+        result = ca.SX.zeros(expressions.numel(), columns)
+        for symbols, tangent in [*zip(jets, tangents, strict=True), (self.symbols, by_parameters)]:
+            if symbols.numel():
+                result += ca.jacobian(expressions, symbols) @ tangent
+        return result
+
+    def of(self, expressions):
+        """The derivatives (m, K) of signals (m,)."""
+        return self.along(expressions, [self.e.jets], [self.jets])
+
+
+def determined(model, names, kinds):
+    """The compiled tangent of a flat model's jets and groups of signals by parameters, and its sizes (m,).
+
+    Outputs ∂Z/∂p, then those of the signals of each group, column by column.
+    """
+
+    def build():
+        e = model.equations
+        tangent = Tangent(e, names)
+        parts = [tangent.jets, *(tangent.of(ca.vertcat(*SIGNALS[kind](e)[1])) for kind in kinds)]
+        f = e.function("tangent", e.jets, [ca.vec(ca.densify(part)) for part in parts])
+        return compiled(f, "tangent", ("rk",))  # which is evaluated at many points, and therefore compiled
+
+    return model.once(f"tangent of {' '.join(kinds)} by {' '.join(names)}", build)
+
+
+def along_state(model, names, initial, kinds):
+    """The tangent of jets and signals at a state and its tangent S: a function of t, (Z, S), p.
+
+    Parameters
+    ----------
+    model : Model
+    names : tuple of str
+        Of the parameters.
+    initial : int
+        Number of initial values, whose columns of S follow those of the parameters.
+    kinds : tuple of str
+        Groups of signals.
+    """
+
+    def build():
+        e = model.equations
+        S = ca.SX.sym("S", e.state.numel(), len(names) + initial)
+        tangent = Tangent(e, names, S)
+        parts = [tangent.jets, *(tangent.of(ca.vertcat(*SIGNALS[kind](e)[1])) for kind in kinds)]
+        x = ca.vertcat(e.jets, ca.vec(S))
+        return compiled(e.function("tangent_at", x, [ca.vec(ca.densify(part)) for part in parts]), "tangent_at")
+
+    return model.once(f"tangent at {' '.join(kinds)} by {' '.join(names)} and {initial}", build)
+
+
+def variational(model, names, initial):
+    """X' and S' as a function of t, (X, S), p: the equations of motion with their variational equations."""
+
+    def build():
+        e = model.equations
+        S = ca.SX.sym("S", e.state.numel(), len(names) + initial)
+        tangent, top = Tangent(e, names, S), ca.vertcat(*e.q.gamma(e.top))
+        rates = e.rates(top)
+        state_rates = e.ode()(e.q.t, e.state, e.parameters)[: e.state.numel()]
+        tangent_rates = ca.substitute(tangent.of(rates), top, state_rates[-e.q.n :])
+        x = ca.vertcat(e.state, ca.vec(S))
+        return compiled(e.function("variational", x, [state_rates, ca.vec(ca.densify(tangent_rates))]), "variational")
+
+    return model.once(f"variational by {' '.join(names)} and {initial}", build)
+
+
+def invariants_by(model, names):
+    """The invariants of the state, and their Jacobian in X and in parameters, as a function of (t, X, p)."""
+
+    def build():
+        e = model.equations
+        values = ca.vertcat(ca.SX(0, 1), *(expression for _, _, expression in e.invariant_rows))
+        both = ca.vertcat(e.state, parameter_symbols(e, names))
+        slopes = ca.vec(ca.densify(ca.jacobian(values, both)))
+        return compiled(e.function("invariants_by", e.state, [values, slopes]), "invariants_by")
+
+    return model.once(f"invariants by {' '.join(names)}", build)

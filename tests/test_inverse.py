@@ -1,0 +1,174 @@
+"""The inverse that the verdict chooses: which one, why, and that no unstable plan comes in silence."""
+
+import contextlib
+from math import pi
+
+import casadi as ca
+import closed_forms as cf
+import numpy as np
+import pytest
+from refusals import refused, warned
+from test_bounded import aircraft, arm
+from test_report import DRIFTING, FLAT, RESTING, cart, crane
+
+import servoctl as sv
+from servoctl.gallery import gallery, overhead_crane
+
+
+def specification(model):
+    return model.reduction.mechanism, model.reduction.program
+
+
+def said(run):
+    """What a run's message says of the choice: which inverse and why."""
+    return run.message.split("; inverse: ")[1]
+
+
+SINGULAR_LATER = ("appell-hamel-squared", "constant-speed-horizontal")  # these motions end in a singular state
+
+
+@pytest.mark.parametrize("name", [*FLAT, *RESTING, *DRIFTING])
+def test_every_scene_has_an_inverse_or_an_end(name):
+    scene = gallery[name]
+    mechanism, program = scene.build()
+    span = (0.0, 4.0) if name == "vtol-centre" else scene.t_span
+    ends = refused(sv.SingularProgram) if name in SINGULAR_LATER else contextlib.nullcontext()
+    with ends:
+        run = sv.inverse(mechanism, program, span, start={**scene.guess, **scene.start})
+        way = "instant by instant" if name in FLAT else "bounded" if name == "vtol-centre" else "forward"
+        assert said(run).startswith(f"{way}, as the program is ")
+        assert run.success and run.internal.get("verdict") != "unstable"
+        assert sv.verify(run.model, run).passed
+
+
+def test_a_flat_program_is_solved_instant_by_instant():
+    run = sv.inverse(*overhead_crane(), (0.0, 8.0), start={"l": 4.0})
+    exact = cf.overhead_crane(run.t)
+    assert run.method == "algebraic"
+    for name in ("trolley", "hoist"):
+        assert run[name] == pytest.approx(exact[name], abs=1e-6)
+
+
+def test_a_minimum_phase_program_is_integrated_from_its_rest():
+    mechanism, program = gallery["mass-on-car"].build()
+    run = sv.inverse(mechanism, program, (0.0, 6.0))
+    assert "minimum phase" in said(run) and run.start["s"] == pytest.approx(0.0, abs=1e-12)
+    exact = cf.mass_on_car(run.t, pi / 4, 1.0)
+    assert run["force"] == pytest.approx(exact["force"], abs=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("make", "span", "name", "value"),
+    [(lambda: arm(0.5), (0.0, 2.0), "torque", 48.88454), (aircraft, (0.0, 3.0), "u1", 485.9057)],
+    ids=["arm", "aircraft"],
+)
+def test_a_hyperbolic_program_gets_its_bounded_motion(make, span, name, value):
+    run = sv.inverse(*specification(make()), span)
+    assert run.method == "bounded" and "hyperbolic" in said(run)
+    peaks = [v for signal in run.model.actuators for _, v in run.extrema(signal)]
+    assert max(peaks) == pytest.approx(value, abs=1e-4)
+    assert sv.verify(run.model, run).passed
+
+
+def test_a_program_that_is_singular_at_rest_gets_a_relaxed_plan():
+    mechanism, program = crane()
+    run = sv.inverse(mechanism, program, (0.0, 6.0))
+    assert said(run).startswith("relaxed, as the program is singular at rest")
+    target = cf.rest_to_rest(run.t, 0, 0.0, 5.0, 6.0, 4)
+    load = run["x"] + 4 * np.sin(run["theta"])
+    assert np.abs(load - target).max() < 1e-3 * 5.0
+    assert np.abs(run["theta"][[0, -1]]).max() < 1e-9 and np.abs(run["dtheta"][[0, -1]]).max() < 1e-9
+    assert np.abs(run["F"]).max() < 132.98 and np.degrees(np.abs(run["theta"]).max()) < 7.665
+
+
+def test_a_marginal_program_gets_a_relaxed_plan_that_ends_at_rest():
+    """The cart's path leaves the load swinging; the relaxed plan does not."""
+    mechanism, program = crane(cart)
+    run = sv.inverse(mechanism, program, (0.0, 6.0))
+    assert said(run).startswith("relaxed, as the program is marginal")
+    assert abs(run["theta"][-1]) < 1e-9 and abs(run["dtheta"][-1]) < 1e-9
+    with warned("marginal"):
+        exact = sv.inverse(mechanism, program, (0.0, 6.0), method="DOP853")
+    assert abs(exact["theta"][-1]) + abs(exact["dtheta"][-1]) > 1e-3
+
+
+def test_a_rough_path_gets_a_relaxed_plan():
+    mechanism, _ = overhead_crane()
+    x, l, theta = mechanism.q
+    path = sv.paths.rest_to_rest(mechanism.q.t, (0.0, 4.0), (5.0, 2.0), duration=6.0, smoothness=2)
+    program = sv.Program({"X": x + l * ca.sin(theta) - path[0], "Z": l * ca.cos(theta) - path[1]})
+    run = sv.inverse(mechanism, program, (0.0, 6.0), start={"l": 4.0})
+    assert run.method == "relaxed" and "C^2" in said(run) and "C^4" in said(run)
+    assert np.abs(run.residual["X"][0]).max() < 1e-2
+
+
+def test_limits_within_which_the_exact_plan_lies_change_nothing():
+    run = sv.inverse(*overhead_crane(), (0.0, 8.0), start={"l": 4.0}, limits={"trolley": 140.0}, bounds={"tension": (0, None)})
+    assert run.method == "algebraic"
+
+
+def test_limits_beyond_which_the_exact_plan_lies_give_a_relaxed_one():
+    mechanism, program = crane(cart)
+    upright = {"start": {"theta": pi}, "t_span": (0.0, 6.0)}
+    exact = sv.inverse(mechanism, program, **upright)
+    limit = 0.95 * max(abs(value) for _, value in exact.extrema("F"))
+    run = sv.inverse(mechanism, program, limits={"F": limit}, **upright)
+    assert exact.method == "bounded" and run.method == "relaxed" and "the exact plan needs F = " in said(run)
+    assert np.abs(run["F"]).max() <= limit * (1 + 1e-7)  # IPOPT widens bounds by 1e-8
+
+
+# a method by hand -----------------------------------------------------------------------------------------------------
+
+
+def test_a_forward_integration_of_an_unstable_program_is_warned_about_with_its_number():
+    mechanism, program = gallery["vtol-centre"].build()
+    with warned("DOP853", "hyperbolic", "15.0406", "the bounded motion"):
+        run = sv.inverse(mechanism, program, (0.0, 1.0), method="DOP853")
+    assert run.method == "DOP853" and run.internal["verdict"] == "unstable"
+
+
+def test_the_method_of_the_verdict_by_hand_is_not_warned_about(recwarn):
+    mechanism, program = gallery["passive-arm"].build()
+    sv.inverse(mechanism, program, (0.0, 2.0), method="Taylor")
+    sv.inverse(mechanism, program, (0.0, 2.0), method=sv.Bounded())
+    assert not [w for w in recwarn if issubclass(w.category, RuntimeWarning)]
+
+
+def test_limits_are_compared_with_a_method_by_hand():
+    mechanism, program = gallery["passive-arm"].build()
+    with warned("RadauIIA", "torque", "the limit is -5"):
+        sv.inverse(mechanism, program, (0.0, 2.0), method="RadauIIA", limits={"torque": 5.0})
+
+
+# refusals -------------------------------------------------------------------------------------------------------------
+
+
+def test_what_has_no_inverse_is_refused():
+    q = sv.coordinates("x y")
+    x, y = q
+    mechanism = sv.Mechanism(q, gibbs=sv.particle(q, 1.0, (x, y)), actuators={"F": x})
+    with refused(sv.NotRealisable, residuals=["x", "y"]):
+        sv.inverse(mechanism, sv.Program({"x": x - q.t, "y": y}), (0.0, 1.0))
+
+
+def test_a_span_that_cuts_a_bounded_motion_short_names_the_one_of_the_path():
+    mechanism, program = gallery["vtol-centre"].build()
+    with refused(sv.SpecificationError, "(0, 4)", span=(0.0, 1.0)):
+        sv.inverse(mechanism, program, (0.0, 1.0))
+
+
+@pytest.mark.parametrize(
+    ("options", "kind"),
+    [
+        ({"t_span": (1.0, 0.0)}, sv.SpecificationError),
+        ({"limits": {"trolly": 1.0}}, sv.NameUnknown),
+        ({"limits": {"trolley": -1.0}}, sv.SpecificationError),
+        ({"bounds": {"tensions": (0, None)}}, sv.NameUnknown),
+        ({"method": "Tailor"}, sv.NameUnknown),
+        ({"start": {"rope": 4.0}}, sv.NameUnknown),
+    ],
+)
+def test_bad_arguments_are_refused(options, kind):
+    mechanism, program = overhead_crane()
+    with refused(kind):
+        sv.inverse(mechanism, program, **{"t_span": (0.0, 8.0), "start": {"l": 4.0}} | options)

@@ -1,0 +1,361 @@
+"""Verdicts and reports: every scene of the gallery against values derived by hand, traps, refusals."""
+
+import contextlib
+import json
+from math import pi
+
+import casadi as ca
+import closed_forms as cf
+import numpy as np
+import pytest
+from refusals import refused, warned
+
+import servoctl as sv
+from servoctl.gallery import gallery, mass_on_car
+from servoctl.inversion.verdict import verdict
+from servoctl.methods.bounded import End
+
+# The internal dynamics of every scene, by hand:
+# - cranes, cars, the flat point, the driven arm: the load, the first car, the point or the hand determines all.
+# - mass on car at 45°: m₂ sin²α s'' + d s' + k s = forcing, section by section of Seifried and Blajer.
+# - two cars, ideal: the reaction acts on car 1, and car 2 swings on its spring, ω² = k/m₂.
+# - passive arm: Γ < 0.4; centre of mass of the aircraft: θ'' = ω² sin θ with ω from the tilt.
+# - pendubot: the second link hangs from the elbow, (I₂ + m₂ l₂²/4) δ'' + d δ' + m₂ g l₂/2 δ = 0, at both ends.
+# - Appell-Hamel: φ'' = A θ'² - B, θ'' = -C φ'θ' conserve an energy; x, y and the angles only drift.
+# - constant speed: positions and heading drift; the horizontal thrust leaves the free fall y'' = -g.
+# - spiral and wheeled robot: place, heading and speed of the path drift.
+PENDULUM = 0.07 + 3.0 * 0.5**2 / 4
+HANGING = np.roots([PENDULUM, 0.05, 3.0 * 9.81 * 0.5 / 2])
+AIRCRAFT = np.array([1.0, -1.0]) * cf.vtol_rate()
+FLAT = (
+    "overhead-crane", "overhead-crane-redundant", "winch-crane", "winch-crane-redundant", "crane-3d",
+    "crane-3d-redundant", "two-cars", "three-cars", "vtol", "two-link-arm",
+)  # fmt: skip
+RESTING = {
+    "mass-on-car": ("minimum phase", cf.mass_on_car_poles(pi / 4)),
+    "mass-on-car-absolute": ("minimum phase", cf.mass_on_car_poles(pi / 4)),
+    "two-cars-ideal": ("marginal", np.array([1j, -1j]) * np.sqrt(1.0 / 2.0)),
+    "passive-arm": ("minimum phase", cf.passive_arm_poles(0.3, 10.0, 1.0)),
+    "pendubot": ("minimum phase", HANGING),
+    "vtol-centre": ("non-minimum phase (hyperbolic)", AIRCRAFT),
+}
+DRIFTING = (
+    "appell-hamel", "appell-hamel-squared", "spiral", "constant-speed", "constant-speed-horizontal", "wheeled-robot",
+)  # fmt: skip
+
+
+def scene_start(name, model):
+    return model.start(guess=gallery[name].guess, **gallery[name].start)
+
+
+def scene_run(name, model):
+    """The run of a scene, up to its stop."""
+    try:
+        with warned("unstable") if name == "vtol-centre" else contextlib.nullcontext():
+            return sv.simulate(model, scene_start(name, model), gallery[name].t_span)
+    except sv.SingularProgram as error:
+        return error.run
+
+
+def test_every_scene_has_a_verdict_by_hand():
+    assert {*FLAT, *RESTING, *DRIFTING} == {*gallery}
+
+
+@pytest.mark.parametrize("name", FLAT)
+def test_flat_scenes(name, gallery_model):
+    model = gallery_model(name)
+    assert verdict(model, scene_start(name, model)).word == "flat"
+
+
+@pytest.mark.parametrize("name", RESTING)
+def test_scenes_that_rest(name, gallery_model):
+    word, expected = RESTING[name]
+    found = verdict(gallery_model(name), scene_start(name, gallery_model(name)))
+    assert found.word == word and {*found.rest} == {"start", "end"}
+    for end in found.rest.values():
+        assert np.sort_complex(end.eigenvalues) == pytest.approx(np.sort_complex(expected), abs=1e-7)
+
+
+@pytest.mark.parametrize("name", DRIFTING)
+def test_scenes_that_never_rest_are_judged_along_a_run(name, gallery_model):
+    model = gallery_model(name)
+    before = verdict(model, scene_start(name, model))
+    assert before.word == "inconclusive" and "run" in before.do and not before.rest
+    found = verdict(model, scene_run(name, model))
+    assert found.word == "marginal" and found.internal.verdict == "neutral"
+
+
+# traps ----------------------------------------------------------------------------------------------------------------
+
+
+def crane(output=lambda x, theta: x + 4 * ca.sin(theta), path=None):
+    """A cart of 10 kg with a load of 100 kg on a rope of 4 m; by default the load's x goes to 5 m in 6 s."""
+    q = sv.coordinates("x theta")
+    x, theta = q
+    S = sv.particle(q, 10.0, (x, 0)) + sv.particle(q, 100.0, (x + 4 * ca.sin(theta), 4 * ca.cos(theta)))
+    mechanism = sv.Mechanism(q, gibbs=S, potential=-3924.0 * ca.cos(theta), actuators={"F": x})
+    path = path or (lambda t: sv.paths.rest_to_rest(t, 0.0, 5.0, duration=6.0, smoothness=4))
+    return mechanism, sv.Program({"X": output(x, theta) - path(q.t)})
+
+
+def cart(x, _):
+    return x
+
+
+def test_a_crane_of_fixed_rope_is_singular_at_rest():
+    """X'' = x'' sin²θ - g sin θ cos θ - L θ'² sin θ: relative degree 2 in motion; 4 of the linearisation at θ = 0."""
+    model = sv.derive(*crane())
+    for start in (None, model.start(), model.start(theta=0.1, dtheta=0.0)):
+        found = verdict(model, start)
+        assert found.word == "singular at rest"
+        assert "X 4" in found.reason and "X 2" in found.reason and "theta = 0" in found.reason
+    ranks = sv.report(model).ranks
+    assert [local.zeros_at_infinity for local in ranks.values()] == [(2,), (4,)]
+
+
+def test_ball_and_beam_is_singular_at_rest():
+    """r'' = r a'² - g sin a: the torque appears in r''' with the factor 2 r a', and at rest in r'''' alone."""
+    q = sv.coordinates("r a")
+    r, a = q
+    S = sv.particle(q, 0.1, (r * ca.cos(a), r * ca.sin(a))) + 0.02 * q.d(2)[1] ** 2 / 2
+    mechanism = sv.Mechanism(q, gibbs=S, potential=0.981 * r * ca.sin(a), actuators={"torque": a})
+    path = sv.paths.rest_to_rest(q.t, 0.1, 0.4, duration=3.0, smoothness=4)
+    found = verdict(sv.derive(mechanism, sv.Program({"r": r - path})))
+    assert found.word == "singular at rest" and "r 4" in found.reason and "r 3" in found.reason
+
+
+@pytest.mark.parametrize(
+    ("pose", "word", "rate"), [(0.0, "marginal", 1j), (pi, "non-minimum phase (hyperbolic)", 1.0)], ids=["down", "up"]
+)
+def test_the_pose_of_a_pendulum_on_a_cart_decides(pose, word, rate):
+    model = sv.derive(*crane(cart))
+    found = verdict(model, model.start(theta=pose, dtheta=0.0))
+    expected = np.sort_complex(np.array([1.0, -1.0]) * rate * np.sqrt(9.81 / 4))
+    assert found.word == word
+    assert np.sort_complex(found.rest["end"].eigenvalues) == pytest.approx(expected, abs=1e-9)
+
+
+def test_a_double_zero_eigenvalue_is_on_the_axis():
+    """The angle of the rope is programmed: the cart may stand anywhere, x'' = f(θ), and runs away where θ stays."""
+
+    def tilt(t):
+        return sv.paths.rest_to_rest(t, 0.0, 0.3, duration=6.0, smoothness=4)
+
+    found = verdict(sv.derive(*crane(lambda x, theta: theta, tilt)))
+    assert found.word == "marginal" and {*found.rest} == {"start"}
+
+
+def mathieu():
+    """A driven mass, and beside it x'' + 0.1 x' + (1 + 0.6 cos 2t) x = 0, whose frozen eigenvalues are all stable."""
+    q = sv.coordinates("y x")
+    y, x = q
+    forces = {"x": -0.1 * q.d(1)[1] - (1 + 0.6 * ca.cos(2 * q.t)) * x}
+    S = sv.particle(q, 1.0, (y, 0)) + sv.particle(q, 1.0, (x, 0))
+    path = sv.paths.rest_to_rest(q.t, 0.0, 1.0, duration=1.0, smoothness=4)
+    return sv.derive(sv.Mechanism(q, gibbs=S, forces=forces, actuators={"F": y}), sv.Program({"y": y - path}))
+
+
+def test_frozen_eigenvalues_are_no_verdict():
+    model = mathieu()
+    start = model.start(x=1e-3, dx=0.0)
+    assert verdict(model, start).word == "inconclusive"
+    with warned("unstable"):
+        run = sv.simulate(model, start, (0.0, 120.0))
+    assert verdict(model, run).word == "non-minimum phase"
+
+
+def test_a_program_that_oscillates_is_judged_along_its_run():
+    model = sv.derive(*crane(cart, lambda t: 0.1 * ca.sin(3 * t)))
+    assert verdict(model).word == "inconclusive"
+    assert verdict(model, sv.simulate(model, model.start(), (0.0, 20.0))).word == "marginal"
+
+
+@pytest.mark.parametrize("angle", [0.5, 2.0, 2.5])
+def test_a_run_is_not_judged_by_an_unstable_rest_far_from_it(angle):
+    """An undamped pendulum swings about its lower rest, also from above the horizontal."""
+    model = sv.derive(*crane(cart))
+    run = sv.simulate(model, model.start(theta=angle, dtheta=0.0), (0.0, 20.0))
+    assert verdict(model, run).word == "marginal"
+
+
+def test_a_run_from_an_unstable_rest_is():
+    model = sv.derive(*crane(cart))
+    with warned("unstable"):
+        run = sv.simulate(model, model.start(theta=pi, dtheta=0.0), (0.0, 6.0))
+    assert verdict(model, run).word == "non-minimum phase (hyperbolic)"
+
+
+def test_more_actuators_than_residuals_are_undetermined():
+    q = sv.coordinates("x")
+    (x,) = q
+    mechanism = sv.Mechanism(q, gibbs=sv.particle(q, 2.0, (x, 0, 0)), actuators={"left": x, "right": x})
+    path = sv.paths.rest_to_rest(q.t, 0.0, 1.0, duration=1.0, smoothness=4)
+    found = verdict(sv.derive(mechanism, sv.Program({"x": x - path})))
+    assert found.word == "undetermined" and found.dynamics == "flat" and "left, right" in found.reason
+
+
+def test_a_program_without_actuators_is_not_realisable():
+    q = sv.coordinates("x y")
+    x, y = q
+    mechanism = sv.Mechanism(q, gibbs=sv.particle(q, 1.0, (x, y)), actuators={"F": x})
+    report = sv.report(mechanism, sv.Program({"x": x - q.t, "y": y}))
+    assert report.verdict.word == "not realisable" and "F" in report.verdict.reason
+    assert set(report.residuals) == {"x", "y"} and report.as_dict()["verdict"] == "not realisable"
+
+
+@pytest.mark.parametrize("unit", [1e-6, 1.0, 1e6])
+@pytest.mark.parametrize("upright", [True, False])
+def test_units_change_no_verdict(unit, upright):
+    q = sv.coordinates("x a")
+    x, a = q
+    S = sv.particle(q, 1.0, (x, 0)) + sv.particle(q, 0.2, (x + 0.5 * unit * ca.sin(a), 0.5 * unit * ca.cos(a)))
+    sign = 1 if upright else -1
+    mechanism = sv.Mechanism(
+        q, gibbs=S, potential=sign * 0.2 * 9.81 * unit * 0.5 * unit * ca.cos(a), actuators={"F": x},
+        forces={"a": -0.01 * unit**2 * q.d(1)[1]},
+    )  # fmt: skip
+    path = unit * sv.paths.rest_to_rest(q.t, 0.0, 1.0, duration=1.0, smoothness=4)
+    found = verdict(sv.derive(mechanism, sv.Program({"x": x - path})))
+    expected = np.roots([1.0, 0.2, -sign * 9.81 / 0.5])
+    assert found.word == ("non-minimum phase (hyperbolic)" if upright else "minimum phase")
+    assert np.sort_complex(found.rest["start"].eigenvalues) == pytest.approx(np.sort_complex(expected), rel=1e-8)
+
+
+STIFF = np.array([[0.0, 1.0], [-1e9, -1.0]])
+
+
+@pytest.mark.parametrize(
+    ("A", "size", "count"),
+    [
+        (np.eye(4, k=1) + 1e-16 * np.eye(4, k=-3), 1.0, 4),  # a chain of integrators, which rounding splits by 1e-4
+        (np.diag([1e3, 1.0], k=1) + 1e-17 * np.eye(3, k=-2), 1.0, 3),
+        (np.array([[0.0, 1.0], [1e-17, 0.0]]), 1.0, 2),
+        (np.array([[0.0, 1.0], [-1.0, 0.0]]), 1.0, 2),
+        (np.array([[0.0, 1.0], [-1.0, -1e-10]]), 1.0, 2),
+        (np.array([[0.0, 1.0], [-1.0, -1e-9]]), 1.0, 0),
+        (np.array([[0.0, 1e7], [-1e-7, -1e-7]]), np.array([1e7, 1.0]), 0),
+        (np.diag([1.0, -1e-8]), 1.0, 0),
+        (STIFF, 1.0, 0),
+    ],
+)
+def test_eigenvalues_on_the_axis(A, size, count):
+    """One on the axis within rounding, however rounding has split it; slow, stiff or slightly damped modes are not."""
+    assert len(End(0.0, np.zeros(len(A)), A, size * np.ones(len(A))).on_axis) == count
+
+
+def test_a_run_backwards_has_the_same_rests():
+    model = sv.derive(*gallery["passive-arm"].build())
+    run = sv.simulate(model, model.start(t=2.0, q2=0.0, dq2=0.0), (2.0, 1.9))
+    found = verdict(model, run)
+    assert [end.t for end in found.rest.values()] == [2.0] and "start" in found.rest
+
+
+def test_a_plant_under_inputs_has_no_verdict():
+    plant = sv.plant(crane()[0])
+    run = sv.simulate(plant, {"x": 0.0, "theta": 0.1, "dx": 0.0, "dtheta": 0.0}, (0.0, 1.0), inputs={"F": 1.0})
+    report = sv.report(run.model, run)
+    assert report.verdict.word == "inconclusive" and len(repr(report).splitlines()) <= 12
+
+
+@pytest.mark.parametrize("name", ["winch-crane", "crane-3d"])
+def test_samples_near_a_rest_claim_no_other_zeros_at_infinity(name, gallery_model):
+    """At 0.12 s of 6 s the rope's angle is about 1e-10: its relative error makes matrices of low rank regular."""
+    model = gallery_model(name)
+    run = sv.simulate(model, scene_start(name, model), gallery[name].t_span)
+    structure = model.structure(run)
+    assert {local.zeros_at_infinity for _, local in structure.at} <= {structure.zeros_at_infinity, ()}
+    assert structure.zeros_at_infinity == ((2, 4) if name == "winch-crane" else (2, 4, 4))
+
+
+# what a report holds --------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("alpha", [pi / 6, pi / 4, 1.2])
+def test_the_angle_between_actuator_and_normal(alpha):
+    """cos = (G M⁻¹ E)/√((G M⁻¹ Gᵀ)(Eᵀ M⁻¹ E)) = m₂ sin²α/√(m₂ (m₂ sin²α + m₁ cos²α)), in any coordinates."""
+    expected = 2 * np.sin(alpha) ** 2 / np.sqrt(2 * (2 * np.sin(alpha) ** 2 + np.cos(alpha) ** 2))
+    for coordinates in ("relative", "absolute"):
+        found = sv.report(sv.derive(*mass_on_car(alpha, coordinates=coordinates))).directions
+        assert found.cosines == pytest.approx([expected], rel=1e-12)
+        assert found.actuators == found.residuals == ()
+
+
+@pytest.mark.parametrize(("alpha", "idle"), [(6e-4, ()), (1.9e-4, ("force",))])
+def test_weak_directions_act_above_1e_7(alpha, idle):
+    """cos = √2 α²: 5.1e-7 and 5.1e-8."""
+    found = sv.report(sv.derive(*mass_on_car(alpha))).directions
+    assert found.cosines == pytest.approx([np.sqrt(2) * alpha**2], rel=1e-5) and found.actuators == idle
+
+
+def test_directions_without_effect_are_named(gallery_model):
+    model = gallery_model("crane-3d")
+    found = sv.report(model, scene_start("crane-3d", model)).directions
+    assert found.cosines == pytest.approx([1.0, 0.0, 0.0], abs=1e-12)  # the hoist lifts; a hanging load does not move aside
+    assert found.actuators == ("bridge", "trolley") and found.residuals == ("X", "Y")
+
+
+def test_the_report_of_a_crane(crane_plan):
+    report = sv.report(crane_plan.model, crane_plan, {"trolley": (-200.0, 140.0)})
+    assert (report.verdict.word, report.index, report.realisation, report.free) == ("flat", 5, "mixed", 0)
+    expected = {"order": 0, "raised": 2, "relative degree": 2, "class": 4}
+    assert report.residuals == {"X": expected, "Z": expected}
+    trolley = report.efforts["trolley"]
+    assert trolley.peak == pytest.approx(-137.991607, abs=1e-6) and trolley.peak_at == pytest.approx(4.155, abs=1e-3)
+    assert trolley.limit == 140.0 and trolley.room == pytest.approx(140.0 - 134.331943, abs=1e-6)
+    t = np.linspace(0.0, 8.0, 20001)
+    exact = cf.overhead_crane(t)["trolley"]
+    assert trolley.rms == pytest.approx(np.sqrt(np.trapezoid(exact**2, t) / 8.0), rel=1e-5)
+    assert trolley.rate == pytest.approx(-np.abs(np.gradient(exact, t)).max(), rel=1e-3)
+    assert report.margin[0] > 0.5 and len(report.ranks) == 3
+    degrees = [local.relative_degree for local in report.ranks.values()]
+    assert degrees == [(2, 2), (4, 2), (2, 2)]  # hanging at the start, and moving
+
+
+def test_rates_are_exact_where_the_run_has_the_jets(crane_plan):
+    model = crane_plan.model
+    run = sv.simulate(model, crane_plan.start, (0.0, 8.0), sv.Algebraic())
+    sampled = sv.report(model, run).efforts["trolley"]
+    finer = sv.simulate(model, crane_plan.start, (0.0, 8.0), t_eval=np.linspace(0.0, 8.0, 8001))
+    assert sampled.rate == pytest.approx(sv.report(model, finer).efforts["trolley"].rate, rel=1e-4)
+
+
+@pytest.mark.parametrize("name", gallery)
+def test_reports_are_short_and_serve_json(name, gallery_model):
+    model = gallery_model(name)
+    for motion in (None, scene_run(name, model)):
+        report = sv.report(model, motion)
+        lines = repr(report).splitlines()
+        assert 1 <= len(lines) <= 12 and max(map(len, lines)) <= 118
+        assert json.loads(json.dumps(report.as_dict(), allow_nan=False)) == report.as_dict()
+
+
+@pytest.mark.parametrize("name", ["vtol-centre", "overhead-crane", "two-cars-ideal"])
+def test_the_figure_of_a_report(name, gallery_model, tmp_path):
+    model = gallery_model(name)
+    for motion in (None, scene_run(name, model)):
+        report = sv.report(model, motion)
+        figure = report.plot()
+        drawn = [ax for ax in figure.axes if ax.axison]
+        assert len(drawn) >= len(report.efforts) and report.verdict.word in figure.get_suptitle()
+        figure.savefig(tmp_path / "report.png")
+
+
+# refusals -------------------------------------------------------------------------------------------------------------
+
+
+def test_what_is_no_specification_is_refused(gallery_model, crane_plan):
+    model = gallery_model("two-cars")
+    for given in ((None,), ("two-cars",), (model, 3.0), (model, crane_plan), (model, crane_plan.start)):
+        with refused(sv.SpecificationError):
+            sv.report(*given)
+    with refused(sv.SpecificationError, "sv.derive(mechanism, program)"):
+        sv.report(gallery["two-cars"].build()[0])
+
+
+def test_limits_need_a_run_and_an_actuator(crane_plan):
+    with refused(sv.SpecificationError, "trolley"):
+        sv.report(crane_plan.model, None, {"trolley": 100.0})
+    with refused(sv.NameUnknown, match="trolley"):
+        sv.report(crane_plan.model, crane_plan, {"troley": 100.0})
+    with refused(sv.SpecificationError, name="trolley"):
+        sv.report(crane_plan.model, crane_plan, {"trolley": -1.0})

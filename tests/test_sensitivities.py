@@ -1,0 +1,169 @@
+"""Derivatives of motions by parameters and initial values, against closed forms and differences."""
+
+from functools import partial
+
+import casadi as ca
+import closed_forms as known
+import numpy as np
+import pytest
+from refusals import refused
+
+import servoctl as sv
+from servoctl.errors import NameUnknown, SpecificationError
+from servoctl.gallery import gallery
+
+NUMBERS = {"m_trolley": 10.0, "m_hoist": 5.0, "m_load": 100.0, "g": 9.81}
+
+
+@pytest.fixture(scope="module")
+def crane(gallery_model):
+    model = gallery_model("overhead-crane")
+    return model, sv.simulate(model, model.start(guess={"l": 4.0}), (0.0, 8.0))
+
+
+def crane_forces(t, m_trolley, m_hoist, m_load, g):
+    """Forces of the crane (2, N) from its closed form, for complex numbers, too."""
+    p = partial(known.rest_to_rest, t, start=(0.0, 4.0), end=(5.0, 2.0), duration=6.0, smoothness=4)
+    x, z = ([p(k)[i] for k in range(5)] for i in range(2))
+    lean = [-x[2 + j] for j in range(3)], [g * (j == 0) - z[2 + j] for j in range(3)]
+    w = lean[0][0] / lean[1][0]
+    dw = (lean[0][1] - w * lean[1][1]) / lean[1][0]
+    d2w = (lean[0][2] - 2 * dw * lean[1][1] - w * lean[1][2]) / lean[1][0]
+    rope = [z[0] * w, z[1] * w + z[0] * dw, z[2] * w + 2 * z[1] * dw + z[0] * d2w]
+    length = np.sqrt(rope[0] ** 2 + z[0] ** 2)
+    rate = (rope[0] * rope[1] + z[0] * z[1]) / length
+    d2length = (rope[1] ** 2 + z[1] ** 2 + rope[0] * rope[2] + z[0] * z[2] - rate**2) / length
+    tension = m_load * np.sqrt(lean[0][0] ** 2 + lean[1][0] ** 2)
+    return np.array([m_trolley * (x[2] - rope[2]) + m_load * x[2], m_hoist * d2length - tension])
+
+
+def test_forces_of_the_crane_by_four_parameters(crane):
+    """The closed form is differentiated by a complex step, without rounding."""
+    model, run = crane
+    s = sv.sensitivity(model, run, to=list(NUMBERS))
+    plan = crane_forces(run.t, **NUMBERS)
+    assert np.abs(plan - [run["trolley"], run["hoist"]]).max() < 1e-9
+    for name, value in NUMBERS.items():
+        exact = crane_forces(run.t, **NUMBERS | {name: value + 1e-30j}).imag / 1e-30
+        assert np.abs(exact - [s["trolley", name], s["hoist", name]]).max() < 1e-11
+        h = 1e-4 * value
+        ends = [model.with_parameters(**{name: value + d}) for d in (h, -h)]
+        ends = [sv.simulate(m, m.start(guess={"l": 4.0}), (0.0, 8.0)) for m in ends]
+        for of in ("trolley", "hoist"):
+            difference = (ends[0][of] - ends[1][of]) / (2 * h)
+            assert np.abs(difference - s[of, name]).max() < 1e-6 * max(1.0, np.abs(s[of, name]).max())
+
+
+def test_extrema_of_the_crane(crane):
+    model, run = crane
+    s = sv.sensitivity(model, run, to="m_load")
+    h = 0.01
+    ends = [model.with_parameters(m_load=100.0 + d) for d in (h, -h)]
+    ends = [sv.simulate(m, m.start(guess={"l": 4.0}), (0.0, 8.0)) for m in ends]
+    for of in ("trolley", "hoist"):
+        for side in (0, 1):
+            difference = (ends[0].extrema(of)[side][1] - ends[1].extrema(of)[side][1]) / (2 * h)
+            assert s.extrema(of)["m_load"][side] == pytest.approx(difference, abs=1e-8)
+
+
+SCENES = ("passive-arm", "appell-hamel", "mass-on-car-absolute", "wheeled-robot", "spiral", "winch-crane")
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_scenes_against_differences(name, gallery_model):
+    """All jets and signals by all parameters and the held initial values; differences of order 4, from other starts."""
+    scene, model = gallery[name], gallery_model(name)
+    start = model.start(**scene.start, guess=scene.guess)
+    method = None if model.flat else sv.Taylor(rtol=1e-13, atol=1e-14)
+    span, times = (0.0, 1.0), np.linspace(0.0, 1.0, 21)
+
+    def run(m, **values):
+        x = m.start(**scene.start, guess=scene.guess) if m.flat else m.start(**values, guess=start_guess)
+        return sv.simulate(m, x, span, method, t_eval=times)
+
+    start_guess = dict(zip(start.names, start.values, strict=True))
+    motion = sv.simulate(model, start, span, method, t_eval=times)
+    of = [*model.jet_names, *model.signal_groups]
+    s = sv.sensitivity(model, motion, of, [*model.numbers, *(n for n in start.held if n in model.state_names)])
+    free = {n: start[n] for n in s.independent}
+    for to in s.to:
+        value, h = s.number(to), 1e-4 * (abs(s.number(to)) or 1.0)
+        ends = []
+        for k in (-2, -1, 1, 2):
+            parameter = to in model.numbers
+            other = model.with_parameters(**{to: value + k * h}) if parameter else model
+            ends.append(run(other, **free | ({} if parameter else {to: value + k * h})))
+        for signal in of:
+            a, b, c, d = (end[signal] for end in ends)
+            difference = (a - 8 * b + 8 * c - d) / (12 * h)
+            size = np.abs(motion[signal]).max() / (abs(value) or 1.0) + np.abs(difference).max() + 1e-4
+            assert np.abs(s[signal, to] - difference).max() < 1e-7 * size, (signal, to)
+
+
+@pytest.mark.parametrize("method", ["DOP853", "Taylor", "RadauIIA", "RK8", "CVODES"])
+def test_a_damped_mass(method):
+    """x = v0 m/c (1 - e^(-c t/m)), a plant without inputs."""
+    p = sv.parameters(m=2.0, c=0.5)
+    q = sv.coordinates("x")
+    (x,) = q
+    plant = sv.plant(sv.Mechanism(q, gibbs=sv.particle(q, p.m, x), forces={"x": -p.c * q.d(1)[0]}, parameters=p))
+    run = sv.simulate(plant, {"x": 1.0, "dx": 3.0}, (0.0, 4.0), method)
+    s = sv.sensitivity(run.model, run, ["x", "dx", "d2x"], ["m", "c", "x", "dx"])
+    t, decay = run.t, np.exp(-run.t / 4)
+    assert s.independent == ("x", "dx")
+    assert s["x", "x"] == pytest.approx(np.ones(len(t)), abs=1e-9)
+    assert s["x", "dx"] == pytest.approx(4 * (1 - decay), abs=1e-9)
+    assert s["dx", "dx"] == pytest.approx(decay, abs=1e-9)
+    assert s["x", "m"] == pytest.approx(3 / 0.5 * (1 - decay) - 3 * t / 2 * decay, abs=1e-8)
+    assert s["dx", "c"] == pytest.approx(-3 * t / 2 * decay, abs=1e-8)
+    assert s["d2x", "c"] == pytest.approx(-3 / 2 * decay * (1 - t / 4), abs=1e-8)
+
+
+def test_a_force_that_ends_at_a_parameter():
+    """x'' = F until T: x = F T (t - T/2) afterwards, so that ∂x/∂T = F (t - T) and ∂x'/∂T = F."""
+    p = sv.parameters(T=1.3, F=2.0)
+    q = sv.coordinates("x")
+    (x,) = q
+    force = {"x": ca.if_else(q.t < p.T, p.F, 0.0)}
+    plant = sv.plant(sv.Mechanism(q, gibbs=sv.particle(q, 1.0, x), forces=force, parameters=p))
+    for span in ((0.0, 3.0), (3.0, 0.0)):
+        run = sv.simulate(plant, {"x": 0.0, "dx": 0.0}, span, "DOP853")
+        s = sv.sensitivity(run.model, run, ["x", "dx"])
+        after = (run.t > 1.3) if span[0] == 0.0 else (run.t < 1.3)
+        sign = 1.0 if span[0] == 0.0 else -1.0
+        assert s["dx", "T"][after] == pytest.approx(sign * 2.0, abs=1e-8)
+        assert s["x", "T"][after] == pytest.approx(sign * 2.0 * (run.t[after] - 1.3), abs=1e-8)
+        assert np.abs(s["dx", "T"][~after][:-1]).max() < 1e-9
+
+
+def test_initial_values_that_follow_from_others(gallery_model):
+    model = gallery_model("passive-arm")
+    run = sv.simulate(model, model.start(q2=0.0, dq2=0.0), (0.0, 0.5))
+    assert sv.sensitivity(model, run, to="q2").independent == ("q2", "dq2")
+    with refused(SpecificationError, "q1", name="dq1"):
+        sv.sensitivity(model, run, to=["q2", "dq2", "dq1"])
+
+
+def test_what_is_refused(crane, gallery_model):
+    model, run = crane
+    with refused(NameUnknown, "trolly"):
+        sv.sensitivity(model, run, of="trolly")
+    with refused(NameUnknown, "mass"):
+        sv.sensitivity(model, run, to="mass")
+    with refused(SpecificationError, name="theta"):
+        sv.sensitivity(model, run, to="theta")
+    with refused(SpecificationError, run=model.numbers):
+        sv.sensitivity(model.with_parameters(m_load=90.0), run)
+    with refused(SpecificationError):
+        sv.sensitivity(gallery_model("passive-arm"), run)
+    with refused(NameUnknown):
+        sv.sensitivity(model, run)["trolley", "m"]
+
+
+def test_what_it_prints_and_draws(crane):
+    model, run = crane
+    s = sv.sensitivity(model, run)
+    assert len(s) == 8 and ("trolley", "g") in s and len(repr(s).splitlines()) <= 12
+    axes = s.plot(units={"trolley": "N", "hoist": "N"})
+    assert len(axes) == 2 and len(axes[0].lines) == 4
+    assert axes[0].lines[2].get_ydata() == pytest.approx(s.change("m_load") * s["trolley", "m_load"])
