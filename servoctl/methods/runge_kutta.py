@@ -64,6 +64,7 @@ class RungeKuttaSteps(Stepping):
     rank_lost = "the state is no longer finite"
     advice = "Use a smaller step (stable below about 2.8 over the largest eigenvalue), slower poles, or 'DOP853'."
     parts = 1
+    _changed = np.zeros(0, dtype=bool)  # before which of the last steps coordinates were chosen again
     most, most_in_python = 2000, 100  # steps per call of the compiled loop, and of the one on minimal coordinates
 
     def __init__(self, model, method, drift, step, progress):
@@ -155,11 +156,14 @@ class RungeKuttaSteps(Stepping):
 
     def _state_within(self, stretch):
         """X from (k, t) within steps, by a shorter step from their start."""
-        return lambda k, t: self._steps(stretch.t[k], stretch.x[:, k], t - stretch.t[k], 1)[0][:, -1]
+        return lambda k, t: self.again(stretch.t[k], stretch.x[:, k], t - stretch.t[k], 1)[:, -1]
 
     def again(self, t, x, h, count):
         """States (n_x, count + 1) at the ends of equal steps from t; fewer if one fails."""
-        return self._steps(t, x, h, count)[0]
+        changed = self._changed
+        states = self._steps(t, x, h, count)[0]
+        self._changed = changed
+        return states
 
     def _all_rates(self, t, states):
         return self.f.grid(t, states, self.p)[: self.n_x]
@@ -167,7 +171,7 @@ class RungeKuttaSteps(Stepping):
     def _finer(self, t, x, end):
         """Instants, states and rates of shorter steps; what a state has drifted since its projection is no jump."""
         x = self.f.restore(t, x, self.p) if self.every else x
-        states = self._steps(t, x, (end - t) / FINER, FINER)[0]
+        states = self.again(t, x, (end - t) / FINER, FINER)
         times = np.linspace(t, end, FINER + 1)[: states.shape[1]]
         return times, states, self._all_rates(times, states)
 
