@@ -52,6 +52,7 @@ from servoctl.methods.stability import sampled_bound
 from servoctl.model.model import Model, derive
 from servoctl.plants.plant import Plant, plant
 from servoctl.run import Run, load
+from servoctl.sensitivities.identification import Identification, identify
 from servoctl.sensitivities.sensitivity import Sensitivity, sensitivity
 from servoctl.simulation import simulate
 from servoctl.spec import (
@@ -85,6 +86,7 @@ __all__ = [
     "Controller",
     "Coordinates",
     "Event",
+    "Identification",
     "InconsistentStart",
     "IntegrationStopped",
     "InternalDynamics",
@@ -132,6 +134,7 @@ __all__ = [
     "feedforward",
     "figures",
     "grid",
+    "identify",
     "internal_dynamics",
     "interop",
     "inverse",

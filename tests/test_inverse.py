@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from refusals import refused, warned
 from test_bounded import aircraft, arm
-from test_report import DRIFTING, FLAT, RESTING, cart, crane
+from test_report import DRIFTING, FLAT, RESTING, cart, crane, mathieu
 
 import servoctl as sv
 from servoctl.gallery import gallery, overhead_crane
@@ -78,7 +78,8 @@ def test_a_program_that_is_singular_at_rest_gets_a_relaxed_plan():
     load = run["x"] + 4 * np.sin(run["theta"])
     assert np.abs(load - target).max() < 1e-3 * 5.0
     assert np.abs(run["theta"][[0, -1]]).max() < 1e-9 and np.abs(run["dtheta"][[0, -1]]).max() < 1e-9
-    assert np.abs(run["F"]).max() < 132.98 and np.degrees(np.abs(run["theta"]).max()) < 7.665
+    assert np.abs(run["F"]).max() == pytest.approx(132.98, rel=1e-2)  # of the limit of small weights
+    assert np.degrees(np.abs(run["theta"]).max()) == pytest.approx(7.665, rel=1e-2)
 
 
 def test_a_marginal_program_gets_a_relaxed_plan_that_ends_at_rest():
@@ -98,7 +99,7 @@ def test_a_rough_path_gets_a_relaxed_plan():
     path = sv.paths.rest_to_rest(mechanism.q.t, (0.0, 4.0), (5.0, 2.0), duration=6.0, smoothness=2)
     program = sv.Program({"X": x + l * ca.sin(theta) - path[0], "Z": l * ca.cos(theta) - path[1]})
     run = sv.inverse(mechanism, program, (0.0, 6.0), start={"l": 4.0})
-    assert run.method == "relaxed" and "C^2" in said(run) and "C^4" in said(run)
+    assert run.method == "relaxed" and "C^2" in said(run) and "needs 4" in said(run)
     assert np.abs(run.residual["X"][0]).max() < 1e-2
 
 
@@ -115,6 +116,14 @@ def test_limits_beyond_which_the_exact_plan_lies_give_a_relaxed_one():
     run = sv.inverse(mechanism, program, limits={"F": limit}, **upright)
     assert exact.method == "bounded" and run.method == "relaxed" and "the exact plan needs F = " in said(run)
     assert np.abs(run["F"]).max() <= limit * (1 + 1e-7)  # IPOPT widens bounds by 1e-8
+
+
+def test_growth_along_a_forward_plan_is_not_silent():
+    """Beside the driven mass x'' + 0.1 x' + (1 + 0.6 cos 2t) x = 0; an ideal reaction has no other inverse."""
+    mechanism, program = specification(mathieu())
+    with warned("errors grow by"):
+        run = sv.inverse(mechanism, sv.Program(program.residuals, by="ideal"), (0.0, 60.0), start={"x": 1e-3})
+    assert "non-minimum phase" in said(run) and run.internal["verdict"] == "unstable"
 
 
 # a method by hand -----------------------------------------------------------------------------------------------------
@@ -166,9 +175,23 @@ def test_a_span_that_cuts_a_bounded_motion_short_names_the_one_of_the_path():
         ({"bounds": {"tensions": (0, None)}}, sv.NameUnknown),
         ({"method": "Tailor"}, sv.NameUnknown),
         ({"start": {"rope": 4.0}}, sv.NameUnknown),
+        ({"start": "hanging"}, sv.SpecificationError),
+        ({"start": {"l": "long"}}, sv.SpecificationError),
+        ({"start": arm(0.5).start()}, sv.SpecificationError),
+        ({"weight": -1.0}, sv.SpecificationError),
+        ({"weight": {"Y": 1.0}}, sv.NameUnknown),
+        ({"method": np.ones(3)}, sv.NameUnknown),
+        ({"mechanism": None}, sv.SpecificationError),
+        ({"program": "path"}, sv.SpecificationError),
     ],
 )
 def test_bad_arguments_are_refused(options, kind):
     mechanism, program = overhead_crane()
+    given = {"mechanism": mechanism, "program": program, "t_span": (0.0, 8.0), "start": {"l": 4.0}}
     with refused(kind):
-        sv.inverse(mechanism, program, **{"t_span": (0.0, 8.0), "start": {"l": 4.0}} | options)
+        sv.inverse(**given | options)
+
+
+def test_a_program_without_a_start_says_why():
+    with refused(sv.InconsistentStart):
+        sv.inverse(*gallery["spiral"].build(), (0.0, 1.0))

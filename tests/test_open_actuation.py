@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from conftest import motion, signal
 from refusals import refused
+from test_export_c import exported
 from test_redundant_actuation import constrained_minimum, ship
 
 import servoctl as sv
@@ -228,6 +229,52 @@ def test_the_least_norm_by_the_derivative_array_of_the_plant(weights):
         assert max(least_norm_gap(rows, run.t[k], run.jets[:8, k], other, wish, w)) > 1e-3
 
 
+def hovercraft(weights=None, toward=None):
+    """Thrust along the heading, a yaw motor against the ground and a reaction wheel, on an ellipse."""
+    q = sv.coordinates("x y psi phi")
+    x, y, psi, phi = q
+    S = sv.rigid_body(q, 3.0, (0, 0, 0.4), position=(x, y), rates=(0, 0, q.d(1)[2]))
+    S += sv.rigid_body(q, 1.0, (0, 0, 0.05), position=(x, y), rates=(0, 0, q.d(1)[2] + q.d(1)[3]))
+    actuators = {"thrust": (ca.cos(psi), ca.sin(psi), 0, 0), "yaw": psi, "wheel": phi}
+    program = {"X": x - 2 * ca.cos(q.t), "Y": y - ca.sin(q.t)}
+    return sv.Mechanism(q, gibbs=S, actuators=actuators), sv.Program(program, weights=weights, toward=toward(q))
+
+
+def test_the_determined_combinations_change_along_a_turn():
+    """The heading follows the acceleration all around: X and Y in turn see no thrust, and other rows are chosen.
+
+    Thrust 4 |a|; yaw - wheel = 0.4 ψ'', and least yaw² + 3 (wheel - w)² gives wheel = (3 w - 0.4 ψ'')/4.
+    """
+    model = sv.derive(*hovercraft({"wheel": 3.0}, lambda q: {"wheel": -0.3 * q.d(1)[3]}), guess={"psi": 3.1, "x": 2.0})
+    start = model.start(guess={"psi": 3.14, "dpsi": 0.5, "x": 2.0}, phi=0.1, dphi=2.0)
+    run = sv.simulate(model, start, (0.0, 10.0))
+    assert sv.verify(model, run).passed and run["psi"][-1] > 12.0
+    a = np.array([-2 * np.cos(run.t), -np.sin(run.t)])
+    assert np.cos(run["psi"]) * a[1] - np.sin(run["psi"]) * a[0] == pytest.approx(np.zeros(len(run.t)), abs=1e-7)
+    assert run["thrust"] == pytest.approx(4 * np.hypot(*a), rel=1e-7)
+    wheel = (-0.9 * run["dphi"] - 0.4 * run["d2psi"]) / 4
+    assert run["wheel"] == pytest.approx(wheel, abs=1e-9)
+    assert run["yaw"] == pytest.approx(wheel + 0.4 * run["d2psi"], abs=1e-9)
+    assert model.structure(run).zeros_at_infinity == (2, 4)
+    machine = sv.plant(model.reduction.mechanism)
+    for law in (sv.lqr(run, machine, rate=200.0), sv.feedforward(run, machine)):
+        loop = sv.close(machine, law, run.state(0.0), (0.0, 10.0))
+        assert max(np.abs(values[0]).max() for values in loop.residual.values()) < 1e-3
+
+
+def test_exact_linearisation_extends_and_shares():
+    """Before the turn ends: orders 4 and 4 by an integrator of the thrust, the wheel shares as in the plan."""
+    model = sv.derive(*hovercraft({"wheel": 3.0}, lambda q: {"wheel": -0.3 * q.d(1)[3]}), guess={"psi": 3.1, "x": 2.0})
+    start = model.start(0.3, guess={"psi": 3.3, "dpsi": 0.5, "x": 2.0})
+    run = sv.simulate(model, start, (0.3, 1.2))
+    machine = sv.plant(model.reduction.mechanism)
+    law = sv.computed(run, machine, rate=200.0)
+    assert sorted(law.info["orders"].values()) == [4, 4]
+    loop = sv.close(machine, law, run.state(0.3), (0.3, 1.2))
+    assert max(np.abs(values[0]).max() for values in loop.residual.values()) < 1e-4
+    assert np.abs(np.interp(loop.t, run.t, run["wheel"]) - loop["wheel"]).max() < 0.02
+
+
 def test_two_forces_normal_to_the_body_are_flat_after_extension():
     """Without tilt and lift of the thrusters: X and Z see the sum of the thrusts alone, along the body's normal."""
     mechanism, program = vtol("centre")
@@ -238,6 +285,8 @@ def test_two_forces_normal_to_the_body_are_flat_after_extension():
     assert "no vector relative degree" in repr(structure) and "flat" in repr(model)
     run = sv.simulate(model, model.start(guess={"theta": 0.0}), (0.0, 4.0))
     assert sv.verify(model, run).passed
+    told = repr(sv.report(model, run))
+    assert told.startswith("Report: flat") and "index 5; mixed realisation" in told
     # tanθ = -X''/(Z'' + g), u1 + u2 = M |(X'', Z'' + g)|
     assert np.tan(run["theta"]) == pytest.approx(-run["d2x"] / (run["d2z"] + 9.81), abs=1e-9)
     assert run["u1"] + run["u2"] == pytest.approx(50.0 * np.hypot(run["d2x"], run["d2z"] + 9.81), rel=1e-9)
@@ -391,20 +440,15 @@ def test_feedforward_sweeps_and_files_know_wishes(reaching, tmp_path):
     reaching.save(tmp_path / "run.npz")
     loaded = sv.load(tmp_path / "run.npz", model=model)
     assert sv.verify(model, loaded).passed
-    sv.export_c(model, tmp_path, name="arm", start=elbow_up(model))
-    assert "arm_actuation" in (tmp_path / "arm.h").read_text()
 
 
-def test_exported_actuation_has_the_wish(reaching, tmp_path, c_compiler):
-    import ctypes
-    import subprocess
-
+def test_the_exported_feedforward_has_the_wish(reaching, tmp_path, c_compiler):
     model = reaching.model
-    source, header = sv.export_c(model, tmp_path, name="arm", start=elbow_up(model))
-    library = tmp_path / "arm.so"
-    subprocess.run(["cc", "-shared", "-fPIC", "-O1", str(source), "-lm", "-o", str(library)], check=True)
-    f = ctypes.CDLL(str(library)).arm_actuation
-    assert "arm_actuation" in header.read_text() and f is not None
+    plan = exported(model, tmp_path, start=elbow_up(model))
+    p, z, u = model.parameters, np.empty(len(model.jet_names)), np.empty(3)
+    for k in (0, 400, 1000):
+        plan("feedforward", reaching.t[k], reaching.jets[: len(model.state_names), k].copy(), p, z, u)
+        assert u == pytest.approx([reaching[name][k] for name in JOINTS], rel=1e-9, abs=1e-9)
 
 
 def test_wishes_hold_parameters_that_change():
@@ -421,6 +465,29 @@ def test_wishes_hold_parameters_that_change():
         force = -2 * np.sin(0.7)  # P = [1, 0, 1]: a = μ, c = μ/w
         assert u["a"] + u["c"] == pytest.approx(force) and u["c"] == pytest.approx(u["a"] / w)
         assert u["b"] == pytest.approx(-d * 0.3)
+
+
+def test_parameters_that_make_the_decoupling_singular_and_back():
+    """A mass on an inclined guide of a driven car, a second car beside: level, the relative degree is 4, else 2."""
+
+    def cars(alpha):
+        p = sv.parameters(alpha=alpha)
+        q = sv.coordinates("x s c")
+        x, s, c = q
+        mass = ca.vertcat(x + s * ca.cos(p.alpha), s * ca.sin(p.alpha))
+        S = sv.particle(q, 1.0, x) + sv.particle(q, 2.0, mass) + sv.particle(q, 1.5, c)
+        U = 5 * s**2 / 2 + 3 * (c - x) ** 2 / 2
+        actuators = {"F": x, "G": c, "H": x - 0.5 * c}
+        mechanism = sv.Mechanism(q, gibbs=S, potential=U, actuators=actuators, parameters=p)
+        return mechanism, sv.Program({"Z": mass[0] - ca.sin(q.t)}, toward={"G": -0.4 * q.d(1)[2]})
+
+    for first, then, free in ((0.0, 0.8, 4), (0.8, 0.0, 2)):
+        changed, fresh = sv.derive(*cars(first)).with_parameters(alpha=then), sv.derive(*cars(then))
+        start = {"c": 0.2, "dc": 0.1} | ({"s": 0.1, "ds": 0.05} if free == 4 else {})
+        runs = [sv.simulate(m, m.start(**start), (0.0, 2.0), t_eval=np.linspace(0, 2, 21)) for m in (changed, fresh)]
+        assert changed.free == fresh.free == free and sv.verify(changed, runs[0]).passed
+        for name in "FGH":
+            assert runs[0][name] == pytest.approx(runs[1][name], rel=1e-9, abs=1e-9)
 
 
 def test_slower_programs_slow_the_time_of_wishes_alone():

@@ -66,7 +66,7 @@ def test_extrema_of_the_crane(crane):
             assert s.extrema(of)["m_load"][side] == pytest.approx(difference, abs=1e-8)
 
 
-SCENES = ("passive-arm", "appell-hamel", "mass-on-car-absolute", "wheeled-robot", "spiral", "winch-crane")
+SCENES = ("passive-arm", "appell-hamel", "mass-on-car-absolute", "wheeled-robot", "winch-crane")
 
 
 @pytest.mark.parametrize("name", SCENES)
@@ -167,3 +167,36 @@ def test_what_it_prints_and_draws(crane):
     axes = s.plot(units={"trolley": "N", "hoist": "N"})
     assert len(axes) == 2 and len(axes[0].lines) == 4
     assert axes[0].lines[2].get_ydata() == pytest.approx(s.change("m_load") * s["trolley", "m_load"])
+
+
+def test_bounded_motions_against_differences():
+    from test_bounded import aircraft, arm
+
+    for model, span, names in ((arm(0.5), (0.0, 2.0), ("c", "d", "Gamma", "m")), (aircraft(), (0.0, 3.0), None)):
+        times = np.linspace(*span, 23)[1:-1]
+        names = names or list(model.numbers)
+        run = sv.simulate(model, model.start(), span, sv.Bounded(window=14.0, rtol=1e-11))
+        within = [int(np.argmin(np.abs(run.t - t))) for t in times]
+        of = [*model.jet_names, *model.actuators]
+        s = sv.sensitivity(model, run, of, names)
+        for to in names:
+            h = 1e-3 * (abs(model.numbers[to]) or 1.0)
+            ends = []
+            for k in (-2, -1, 1, 2):
+                other = model.with_parameters(**{to: model.numbers[to] + k * h})
+                method = sv.Bounded(window=14.0, rtol=1e-11)
+                ends.append(sv.simulate(other, other.start(), span, method, t_eval=run.t[within]))
+            for signal in of:
+                a, b, c, d = (end[signal] for end in ends)
+                difference = (a - 8 * b + 8 * c - d) / (12 * h)
+                size = np.abs(run[signal]).max() / (abs(model.numbers[to]) or 1.0) + np.abs(difference).max() + 1e-4
+                assert np.abs(s[signal, to][within] - difference).max() < 1e-6 * size, (signal, to)
+
+
+def test_a_bounded_motion_has_no_free_initial_values():
+    from test_bounded import arm
+
+    model = arm(0.5)
+    run = sv.simulate(model, model.start(), (0.0, 2.0), sv.Bounded())
+    with refused(SpecificationError, name="q2"):
+        sv.sensitivity(model, run, to="q2")

@@ -5,6 +5,7 @@ The header has an enum of the indices of every array.
 
 import os
 import re
+import warnings
 from pathlib import Path
 
 import casadi as ca
@@ -14,6 +15,7 @@ from servoctl.codegen.function import Compiled
 from servoctl.control.law import Law
 from servoctl.errors import SpecificationError
 from servoctl.export.files import Array, Constant, Contents, Routine, Scalar, identifier, write
+from servoctl.inversion.verdict import GROWS, HYPERBOLIC_ZEROS, verdict
 from servoctl.model.model import Model
 from servoctl.model.start import State
 from servoctl.reduction.reduce import require_outputs
@@ -60,6 +62,11 @@ def export_c(
         If the name is no C identifier, the source has no expressions, or a law has a start.
     ServoError
         If the files cannot be written.
+
+    Warns
+    -----
+    RuntimeWarning
+        If `NAME_advance` would integrate unstable internal dynamics.
     """
     law = hasattr(source, "schedule") and isinstance(source.step, Compiled)
     if not law and not hasattr(source, "reduction"):
@@ -73,6 +80,14 @@ def export_c(
             "The files are written into a folder.",
             do="Pass its path, a str or a Path.",
             folder=folder,
+        )
+    found = None if law or source.flat else verdict(source, start)
+    if found is not None and found.dynamics in (HYPERBOLIC_ZEROS, GROWS):
+        warnings.warn(
+            f"{name}_advance integrates forward what this program leaves free, which is {found}. Export a law about a "
+            "plan of sv.inverse instead, or steer the state by feedback.",
+            RuntimeWarning,
+            stacklevel=2,
         )
     return write(folder, name, _of_law(source) if law else _of_model(source, start))
 

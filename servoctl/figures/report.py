@@ -19,8 +19,8 @@ def draw_report(report):
     matplotlib.figure.Figure
     """
     parts = [(_effort, name) for name in list(report.efforts)[:MOST_EFFORTS]]
-    parts += [(_growth, None)] if report.verdict.internal is not None and report.verdict.internal.until.size else []
-    parts += [(_eigenvalues, None)] if report.verdict.rest else []
+    parts += [(_growth, None)] if report.basis.internal is not None and report.basis.internal.until.size else []
+    parts += [(_eigenvalues, None)] if report.basis.rest else []
     parts += [(_angles, None)] if report.directions is not None and report.directions.cosines else []
     parts = parts or [(_orders, None)]
     rows = -(-len(parts) // 2)
@@ -29,7 +29,7 @@ def draw_report(report):
         draw(ax, report, name)
     for ax in list(axes.flat)[len(parts) :]:
         ax.set_axis_off()
-    figure.suptitle(f"{', '.join(report.residuals)}: {report.verdict.word}", fontsize=12)
+    figure.suptitle(f"{', '.join(report.residuals)}: {report.verdict}", fontsize=12)
     return figure
 
 
@@ -45,7 +45,7 @@ def _effort(ax, report, name):
 
 
 def _growth(ax, report, _):
-    t, growth = report.verdict.internal.until
+    t, growth = report.basis.internal.until
     ax.semilogy(t, growth, color=style.COLOURS[0])
     ax.set(xlabel="t [s]", ylabel="growth of errors")
     ax.set_title("largest growth of an error up to t", fontsize=10)
@@ -53,11 +53,11 @@ def _growth(ax, report, _):
 
 
 def _eigenvalues(ax, report, _):
-    for (name, end), mark, colour in zip(report.verdict.rest.items(), "ox", style.COLOURS, strict=False):
+    for (name, end), mark, colour in zip(report.basis.rest.items(), "ox", style.COLOURS, strict=False):
         label = f"at the {name}, t = {end.t:.4g} s"
         ax.plot(end.eigenvalues.real, end.eigenvalues.imag, mark, color=colour, label=label)
     ax.axvline(0.0, color=style.COLOURS[6], linewidth=1.0)
-    reach = 1.2 * max(max(np.abs(end.eigenvalues).max(initial=0.0) for end in report.verdict.rest.values()), 1e-300)
+    reach = 1.2 * max(max(np.abs(end.eigenvalues).max(initial=0.0) for end in report.basis.rest.values()), 1e-300)
     ax.set(xlim=(-reach, reach), ylim=(-reach, reach), xlabel="real part [1/s]", ylabel="imaginary part [1/s]")
     ax.set_title("eigenvalues of the internal dynamics at rest", fontsize=10)
     ax.grid(alpha=0.3)

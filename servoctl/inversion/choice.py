@@ -4,7 +4,7 @@ import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
-from servoctl.checks import as_span, interval, mapping
+from servoctl.checks import as_span, interval, mapping, numbers_by_name, positive_number, require_kind
 from servoctl.errors import ServoError, SpecificationError, unknown
 from servoctl.inversion.relaxed import relaxed
 from servoctl.inversion.report import extremes
@@ -24,7 +24,7 @@ from servoctl.model.model import derive
 from servoctl.model.start import State
 from servoctl.plants.plant import plant
 from servoctl.run import Run
-from servoctl.simulation import simulate
+from servoctl.simulation import as_state, simulate
 from servoctl.spec.mechanism import Mechanism
 from servoctl.spec.program import Program
 
@@ -78,20 +78,24 @@ def inverse(
     RuntimeWarning
         If a method is given that is not the one of the verdict.
     """
-    task = Task(mechanism, program, as_span(t_span, forward=True), start, _ranges(mechanism, limits, bounds), weight)
-    known = {name: value for name, value in mapping(start, "The start").items()} if isinstance(start, dict) else None
+    require_kind(Mechanism, "mechanism", mechanism, "sv.Mechanism(q, gibbs, ...)")
+    require_kind(Program, "program", program, "sv.Program({...})")
+    span, ranges = as_span(t_span, forward=True), _ranges(mechanism, limits, bounds)
+    task = Task(mechanism, program, span, start, ranges, _checked(weight, program))
+    known = None if isinstance(start, State) else mapping(start, "The start")
+    by_hand = method if method is None or isinstance(method, str) and method == RELAXED else as_method(method)
     try:
         model = derive(mechanism, program, known)
     except SpecificationError as error:
         facts = error.details
-        if method not in (None, RELAXED) or not {"needs", "has"} <= facts.keys():
+        if by_hand not in (None, RELAXED) or not {"needs", "has"} <= facts.keys():
             raise
-        return task.relaxed(f"{facts['name']} has class C^{facts['has']} and the exact inverse needs C^{facts['needs']}")
-    begin = start if isinstance(start, State) else _start(model, task.span[0], known)
+        return task.relaxed(f"{facts['name']} has class C^{facts['has']}, and the exact inverse needs {facts['needs']}")
+    begin = _begin(model, start, span[0])
     found = verdict(model, begin)
     chosen = _chosen(model, found)
-    if method is not None:
-        return _by_hand(task, model, begin, found, chosen, method)
+    if by_hand is not None:
+        return _by_hand(task, model, begin, found, chosen, by_hand)
     return task.run(model, begin, found, chosen)
 
 
@@ -114,17 +118,21 @@ class Task:
         excess = _excess(run, {**self.ranges[0], **self.ranges[1]})
         if excess:
             return self.relaxed(excess)
-        if found.dynamics == OPEN:
+        if found.dynamics == OPEN or run.internal.get("verdict") == "unstable":
             found = verdict(model, run)
-            if found.dynamics == GROWS:
-                return self.relaxed(found, begin)
+        if found.dynamics != GROWS:
+            return _told(run, found)
+        if not model.ideal:
+            return self.relaxed(found, begin)
+        warnings.warn(f"An ideal program has no other inverse, and this is {found}.", RuntimeWarning, stacklevel=3)
         return _told(run, found)
 
     def exact(self, model, begin, found, method):
         """The run of an exact inverse; integrated forward from the rest where the program begins, if there is one."""
-        if method is None and begin is not None and not isinstance(self.start, State) and "start" in found.rest:
-            guess = dict(zip(model.state_names, found.rest["start"].x.tolist(), strict=True))
-            begin = model.start(self.span[0], guess=guess)
+        if not isinstance(self.start, State) and (begin is None or method is None and "start" in found.rest):
+            rest = found.rest["start"].x.tolist() if "start" in found.rest else ()
+            guess = dict(zip(model.state_names, rest, strict=False)) or _of_states(model, self.start or {})
+            begin = model.start(self.span[0], guess=guess)  # or the error that tells why there is no start
         with warnings.catch_warnings():  # growth is part of the verdict
             warnings.filterwarnings("ignore", "Internal dynamics unstable")
             return simulate(model, begin, self.span, method)
@@ -151,12 +159,27 @@ def _ranges(mechanism, limits, bounds):
     )
 
 
-def _start(model, t, known):
-    """The start near known values; None where there is none, as at a singular rest."""
+def _checked(weight, program):
+    """A weight, or weights by residual, that are positive."""
+    if isinstance(weight, Mapping):
+        return numbers_by_name(weight, program.names, "residual", "weight", positive=True)
+    return None if weight is None else positive_number("weight", weight)
+
+
+def _begin(model, start, t):
+    """The given start, or one near its values; None where there is none, as at a singular rest."""
+    if isinstance(start, State):
+        as_state(model, start, t)
+        return start
     try:
-        return model.start(t, guess={name: v for name, v in (known or {}).items() if name in model.state_names})
+        return model.start(t, guess=_of_states(model, start or {}))
     except ServoError:
         return None
+
+
+def _of_states(model, known):
+    """Those of the known values that are states of the model."""
+    return {name: value for name, value in known.items() if name in model.state_names}
 
 
 def _chosen(model, found):
@@ -169,7 +192,6 @@ def _chosen(model, found):
 
 def _by_hand(task, model, begin, found, chosen, method):
     """The run of a method that was given, with a warning if the verdict speaks against it."""
-    method = method if method == RELAXED else as_method(method)
     expected = {FLAT: Algebraic, MINIMUM: Method}.get(found.dynamics, Bounded if isinstance(chosen, Bounded) else ())
     fits = method == RELAXED or isinstance(method, expected)
     if not fits:

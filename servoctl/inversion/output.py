@@ -10,8 +10,8 @@ from dataclasses import dataclass, field
 import casadi as ca
 import numpy as np
 
-from servoctl.checks import finite, interval, require_kind
-from servoctl.errors import NotRealisable, SingularProgram, SpecificationError, UnstableInternalDynamics, unknown
+from servoctl.checks import finite, interval, named, require_kind
+from servoctl.errors import NotRealisable, SingularProgram, SpecificationError, UnstableInternalDynamics
 from servoctl.inversion.zeros import AT_REST, NEWTON, NO_COEFFICIENT, ZeroPolynomial
 from servoctl.model.model import Model
 from servoctl.model.start import State
@@ -20,7 +20,7 @@ from servoctl.simulation import simulate
 VALUES = 257  # of the parameter, spread over its range, at which roots are computed
 TOUCHES = 1e-9  # of its largest value: a coefficient whose smallest value is below has a root there
 BISECTIONS = 60  # halvings of an interval of the parameter: all digits of a double
-STEP, STEPS = 0.02, 500  # along the rests of a program, relative to the size of the state; on either side
+CURVE_STEP, CURVE_STEPS = 0.02, 500  # along the rests of a program, relative to the size of the state; on either side
 SHOWN_RANGES, SHOWN_VALUES = 6, 3  # in the printed form
 
 
@@ -157,7 +157,7 @@ class MinimumPhase:
         """
         value, polynomial = finite(self.parameter, value), self.polynomial
         model = polynomial.model.with_parameters(**{self.parameter: value})
-        return _lost(model, polynomial.t, polynomial.equilibrium(value)[: model.nq])
+        return _losses(model, polynomial.t, polynomial.equilibrium(value)[: model.nq])
 
     def cost(self, value, t_span, **options):
         """What following the output with this value costs in the output with the model's own value.
@@ -272,8 +272,7 @@ def minimum_phase(model: Model, parameter: str, values, at: State | None = None)
     ones may be missed. Boundaries are accurate to rounding.
     """
     require_kind(Model, "model", model, "sv.derive(mechanism, program)")
-    if parameter not in model.numbers:
-        raise unknown(parameter, list(model.numbers), "parameter")
+    named(parameter, list(model.numbers), "parameter")
     ends = [finite(parameter, end, "range") for end in interval(parameter, values, "range")]
     _require_program(model)
     at = model.start() if at is None else require_kind(State, "at", at, "model.start(...)")
@@ -374,7 +373,7 @@ def _edge(polynomial, a, b, first, last):
     return (a + b) / 2
 
 
-def _lost(model, t, q0):
+def _losses(model, t, q0):
     """Rests of a program at which its leading matrix is singular, on either side of a rest q0."""
     r, q = model.reduction, model.reduction.mechanism.q
     held = [row for row in r.rows if row.order == 0]
@@ -402,10 +401,10 @@ def _lost(model, t, q0):
 def _first_loss(at, q0, side):
     """The first rest along a curve at which det L has another sign; None if there is none."""
     x, before, sign = np.array(q0, dtype=float), None, np.linalg.slogdet(at(q0)[2])[0]
-    for _ in range(STEPS):
+    for _ in range(CURVE_STEPS):
         tangent = np.linalg.svd(at(x)[1])[2][-1]
         before = tangent * (side if before is None else np.sign(tangent @ before or 1.0))
-        low, high = 0.0, STEP * (1.0 + np.abs(x).max())
+        low, high = 0.0, CURVE_STEP * (1.0 + np.abs(x).max())
         if np.linalg.slogdet(at(_onto(at, x + high * before))[2])[0] == sign:
             x = _onto(at, x + high * before)
             continue

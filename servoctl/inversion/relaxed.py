@@ -15,7 +15,7 @@ from functools import cached_property
 import casadi as ca
 import numpy as np
 
-from servoctl.checks import as_span, finite, interval, mapping, positive_number, require_kind
+from servoctl.checks import as_list, as_span, finite, interval, mapping, positive_number, positives, require_kind
 from servoctl.errors import (
     InconsistentStart,
     IntegrationStopped,
@@ -36,31 +36,35 @@ from servoctl.run import Run
 from servoctl.simulation import simulated
 from servoctl.spec.paths import piecewise
 from servoctl.spec.program import Program
+from servoctl.study.table import Study, machine
 
 ORDER = 9  # of the collocation: five nodes
 INTERVALS = 24  # of the first mesh at least
 FIRST = 1e-3  # first weight, relative to that for which standing still costs as much as the program
 DEFAULT = 1e-6  # default weight, relative to the same
 FACTOR = 100.0  # between the weights of two successive solutions
+EXCEEDED = 1e-6  # of a bound: excess between the instants of bounds that a run tells
+COARSE = 1e-6  # defect with which no plan is returned
 DEFECT, AIM = 1e-7, 0.1  # of the states between nodes, relative to their sizes; and what refinement aims at of it
-BETWEEN = (0.12, 0.4, 0.75)  # places within an interval where the defect is measured
-REFINEMENTS, MOST_PIECES, MOST_INTERVALS = 6, 8, 400  # of the mesh; pieces of an interval; intervals
+PLACES = (0.12, 0.4, 0.75)  # places within an interval where the defect is measured
+ROUNDS, MOST_PIECES, MOST_INTERVALS = 6, 8, 400  # of the mesh; pieces of an interval; intervals
 SAMPLES = 1000  # of the run, at least
 GUESS = 241  # instants of the guess
 STANDING = 1e-6  # rate of a program that stands still, relative to its largest
 STATUS = {
     "Infeasible_Problem_Detected": "finds no motion",
-    "Maximum_Iterations_Exceeded": "does not converge in 300 iterations",
+    "Maximum_Iterations_Exceeded": "does not converge in 200 iterations",
     "Restoration_Failed": "finds no way back to the equations of motion",
 }
 SOLVED = ("Solve_Succeeded", "Solved_To_Acceptable_Level")
 
 
 def relaxed(
-    plant: Plant, program: Program, t_span: Sequence[float], *, weight: float | Mapping[str, float] | None = None,
+    plant: Plant, program: Program, t_span: Sequence[float], *,
+    weight: float | Mapping[str, float] | Sequence[float] | None = None,
     limits: Mapping[str, object] | None = None, bounds: Mapping[str, object] | None = None,
     start: State | Mapping[str, float] | None = None, end: str | Mapping[str, float] = "rest",
-) -> Run:  # fmt: skip
+) -> Run | Study:  # fmt: skip
     """The actuation that trades a program against effort: min ∫ Σ φ_i²/β_i + uᵀWu dt over all motions of the plant.
 
     As β falls, the motion tends to the exact inverse where there is one; where there is none, as for a program that is
@@ -71,17 +75,19 @@ def relaxed(
     plant : Plant
         Its limits of magnitude and of rate hold; lag and delay are left to the laws.
     program : Program
-        W are its `weights` of the actuators, 1 by default.
+        W are its `weights` of the actuators, 1 by default; with `toward` the effort is that of the difference.
     t_span : (t0, t1)
         [s]
-    weight : float or dict of str to float, optional
-        β of all or of each residual, in (unit of φ)²/(unit of u)²: m²/N² for a position by a force. Default: 1e-6 of
-        that for which standing still costs as much as the program.
+    weight : float, dict of str to float, or sequence of float, optional
+        β of all or of each residual, in (unit of φ)²/(unit of u)²: m²/N² for a position by a force. Several values
+        give a Study of the front between error and actuation. Default: 1e-6 of that for which standing still costs as
+        much as the program.
     limits : dict of str to float or (low, high), optional
-        Further limits of actuators and of their rates: {"trolley": 100.0, "dtrolley": 500.0}. They hold at all instants.
+        Further limits of actuators and of their rates, {"trolley": 100.0, "dtrolley": 500.0}. They hold at all
+        instants.
     bounds : dict of str to float or (low, high), optional
         Bounds of states, accelerations, outputs of the mechanism and residuals: {"tension": (0, None)}. They hold at
-        the nodes, some 120 instants.
+        some 300 instants; `run.message` has what exceeds them between these.
     start : State, array or dict of str to float, optional
         Default: the rest at which the program is met. A dict may name some coordinates of a rest, or a whole state.
     end : "rest", "free", or dict of str to float
@@ -89,8 +95,9 @@ def relaxed(
 
     Returns
     -------
-    Run
-        Of the plant under these inputs, piecewise polynomials of time; `run.residual` is how far the program is missed.
+    Run or Study
+        The motion of the plant under these inputs, piecewise polynomials of time; `run.residual` is how far the program
+        is missed. For several weights a table of largest and root mean square errors and inputs.
 
     Raises
     ------
@@ -108,8 +115,11 @@ def relaxed(
     """
     require_kind(Plant, "plant", plant, "sv.plant(mechanism)")
     require_kind(Program, "program", program, "sv.Program({...})")
-    task = Task(at_once(plant), program, as_span(t_span, forward=True), _limits(plant, limits), bounds, start, end)
-    return task.run(_weights(weight, program))
+    task = Task(at_once(plant), program, as_span(t_span, forward=True), _all_limits(plant, limits), bounds, start, end)
+    several = None if isinstance(weight, Mapping) else as_list(weight)
+    if several is None:
+        return task.run(_weights(weight, program))
+    return task.front(positives("weight", several, "Write weight=[1e-6, 1e-8].").tolist())
 
 
 def _weights(weight, program):
@@ -129,7 +139,7 @@ def _weights(weight, program):
     return np.array([positive_number(name, weight[name]) for name in program.names])
 
 
-def _limits(plant, limits):
+def _all_limits(plant, limits):
     """The limits of magnitude and of rate, {actuator: (low, high)} each: those of the plant and further ones."""
     magnitudes = dict(plant.limits)
     rates = {name: (-rate, rate) for name, rate in plant.rate_limits.items()}
@@ -160,6 +170,7 @@ class Plan:
     x: np.ndarray
     points: np.ndarray
     iterations: tuple = ()
+    beta: np.ndarray | None = None
 
 
 class Task:
@@ -177,14 +188,14 @@ class Task:
         self.states, self.inputs, self.sizes = self._guess()
 
     def _bounded(self):
-        """Bounded quantities that are no states, as expressions."""
+        """Bounded quantities as expressions."""
         mechanism, q = self.plant.mechanism, self.plant.mechanism.q
-        accelerations = dict(zip(q.jet_names(2), q.gamma(2), strict=True))
-        known = accelerations | self.program.residuals | mechanism.outputs
+        jets = {name: s for k in range(3) for name, s in zip(q.jet_names(k), ca.vertsplit(q.jet(k)), strict=True)}
+        known = jets | self.program.residuals | mechanism.outputs
         for name in self.bounds:
-            if name not in known and name not in self.plant.state_names:
-                raise unknown(name, (*self.plant.state_names, *known), "state, output or residual")
-        return {name: known[name] for name in self.bounds if name not in self.plant.state_names}
+            if name not in known:
+                raise unknown(name, known, "state, output or residual")
+        return {name: known[name] for name in self.bounds}
 
     # the ends
 
@@ -325,7 +336,7 @@ class Task:
             u = np.array([np.interp(times, self._exact.t, self._exact[name]) for name in self.plant.inputs])
         else:
             x, u = self._quasi_static(times)
-        x_size = _sizes(x, self.nq, self.span)
+        x_size = _state_sizes(x, self.nq, self.span)
         effort = self.node.function("effort", self.node.effort)
         u_size = np.abs(u).max(axis=1)
         u_size = np.where(u_size > 1e-6 * u_size.max(), u_size, u_size.max() or 1.0)
@@ -347,7 +358,8 @@ class Task:
         rate, zero = np.gradient(q, times, axis=1), np.zeros(self.m * self.node.depth)
         w = np.zeros((self.n - self.nq, len(times)))
         for k, t in enumerate(times):
-            V, h = (np.array(part) for part in kinematics(t, np.concatenate([q[:, k], w[:, k]]), np.append(u[:, k], zero)))
+            x, v = np.concatenate([q[:, k], w[:, k]]), np.append(u[:, k], zero)
+            V, h = (np.array(part) for part in kinematics(t, x, v))
             w[:, k] = np.linalg.lstsq(V, rate[:, k] - h.ravel(), rcond=None)[0]
         accelerations = np.gradient(w, times, axis=1)
         for k, t in enumerate(times):
@@ -367,24 +379,52 @@ class Task:
 
     def run(self, beta):
         """The run of weights (k,), by default a small part of the usual ones."""
-        beta = DEFAULT * self._usual_weights() if beta is None else beta
-        plan = self._continued(self._mesh(), beta)
-        for _ in range(REFINEMENTS):  # of the mesh
+        if beta is None:
+            usual = self._usual_weights()
+            beta = DEFAULT * np.where(np.isfinite(usual), usual, 1.0 / self.sizes[2])
+        return self._as_run(self._plan(beta))
+
+    def front(self, weights):
+        """A Study of weights, each for all residuals: how far the program is missed, against the actuation."""
+        plan, rows = None, {}
+        for weight in sorted(set(weights), reverse=True):
+            plan = self._plan(np.full(len(self.program.names), weight), plan)
+            rows[weight] = {"weight": weight, **self._measured(plan)}
+        columns = {name: [rows[weight][name] for weight in weights] for name in rows[weights[0]]}
+        facts = {"residuals": list(self.program.names), "actuators": list(self.plant.inputs), "t_span": list(self.span)}
+        return Study("relaxed", columns, facts | {"machine": machine()})
+
+    def _measured(self, plan):
+        """Largest and root mean square values of residuals and inputs, the effort, and how well it is solved."""
+        t = np.linspace(*self.span, SAMPLES + 1)
+        f = self.node.function("signals", self.node.residuals, self.node.effort).map(len(t))
+        v = np.vstack([plan.pieces.inputs(plan.points, t, rate) for rate in range(self.node.depth + 1)])
+        residuals, effort = (np.array(part) for part in f(t[None], plan.mesh.states(plan.x, t), v))
+        signals = dict(zip((*self.program.names, *self.plant.inputs), (*residuals, *v[: self.m]), strict=True))
+        largest = {f"largest {name}": np.abs(values).max() for name, values in signals.items()}
+        rms = {f"rms {name}": np.sqrt(np.mean(values**2)) for name, values in signals.items()}
+        facts = {"effort": np.mean(effort) * np.ptp(self.span), "iterations": max(plan.iterations)}
+        return largest | rms | facts | {"intervals": len(plan.mesh.h), "defect": self._defects(plan).max()}
+
+    def _plan(self, beta, near=None):
+        """The plan of weights (k,), from one of greater weights or from the guess, on a mesh that is fine enough."""
+        plan = self._continued(beta, near)
+        for _ in range(ROUNDS):  # of the mesh
             finer = self._finer(plan)
             if finer is None:
-                return self._as_run(plan)
+                break
             plan = self._solved(finer, [beta], finer.iterations)
         worst = self._defects(plan)
-        if worst.max() > 10 * DEFECT:
+        if worst.max() > COARSE:
             k = int(np.argmax(worst))
             raise IntegrationStopped(
                 f"Between the nodes at t = {plan.mesh.edges[k]:.4g} s the plan misses the equations of motion by "
                 f"{worst[k]:.1e}, with {len(worst)} intervals.",
-                f"Relative to the states' sizes a plan misses them by at most {10 * DEFECT:g}.",
+                f"Relative to the states' sizes a plan misses them by at most {COARSE:g}.",
                 do="Choose a greater weight, wider limits or a shorter span.",
                 t=float(plan.mesh.edges[k]), defect=float(worst[k]), intervals=len(worst),
             )  # fmt: skip
-        return self._as_run(plan)
+        return replace(plan, beta=beta)
 
     def _mesh(self):
         """Intervals of about the same length between the knots of the program."""
@@ -394,15 +434,19 @@ class Task:
         counts = np.maximum(1, np.ceil(np.diff(corners) * INTERVALS / np.ptp(corners) * (1 - 1e-9))).astype(int)
         return Mesh(_cut(corners, counts), ORDER)
 
-    def _continued(self, mesh, beta):
-        """The plan of weights, from the guess over greater weights."""
+    def _continued(self, beta, near):
+        """The plan of weights from one of greater weights, or from the guess, over weights between."""
         usual = self._usual_weights()
         if np.any(beta > usual):
             raise self._useless(beta, usual)
-        factor = 1.0 if self._exact is not None else max(1.0, float(np.min(FIRST * usual / beta)))
-        factor = factor if np.isfinite(factor) else 1.0
-        steps = int(np.ceil(np.log(factor) / np.log(FACTOR)))
-        return self._solved(self._first(mesh), [beta * factor ** (1 - k / max(steps, 1)) for k in range(steps + 1)])
+        if near is not None:
+            first = near.beta / beta
+        else:
+            first = FIRST * usual / beta if self._exact is None else np.ones(1)
+        factor = max(1.0, float(np.min(first[np.isfinite(first)], initial=np.inf)))
+        steps = int(np.ceil(np.log(factor) / np.log(FACTOR))) if np.isfinite(factor) else 0
+        weights = [beta * factor ** (1 - k / max(steps, 1)) for k in range(near is not None and steps > 0, steps + 1)]
+        return self._solved(self._first(self._mesh()) if near is None else near, weights)
 
     def _usual_weights(self):
         """Weights (k,) for which standing still costs as much as the actuation of the program."""
@@ -414,6 +458,7 @@ class Task:
 
     @property
     def begin_inputs(self):
+        """Inputs that hold the start at rest (m,), or zeros."""
         return np.zeros(self.m) if self.held is None else self.held
 
     def _solved(self, plan, weights, iterations=()):
@@ -431,9 +476,6 @@ class Task:
         """Bounds of the variables and of the constraints by kind."""
         K, P = 1 + nlp.count, 1 + len(nlp.pieces.nodes)
         x = np.repeat([[-np.inf], [np.inf]], self.n * K, axis=1).reshape(2, self.n, K)
-        for name, sides in self.bounds.items():
-            if name in self.plant.state_names:
-                x[:, self.plant.state_names.index(name)] = np.array(sides)[:, None]
         x[:, :, 0] = self.begin
         fixed = np.isfinite(self.target[0])
         x[:, fixed, -1] = self.target[0][fixed]
@@ -448,10 +490,10 @@ class Task:
                 jump[:, i] = [[-np.inf], [np.inf]]
                 u[:, i, 0] = self.begin_inputs[i] if self.held is not None else u[:, i, 0]
                 u[:, i, -1] = self.target[1][i] if self.target[1] is not None and not self.target[2] else u[:, i, -1]
-        bounded = [sides for name, sides in self.bounds.items() if name not in self.plant.state_names]
-        bounded = np.array(bounded).reshape(-1, 2).T[:, :, None].repeat(K - 1, axis=2)
+        bounded = np.array([*self.bounds.values()]).reshape(-1, 2).T[:, :, None].repeat(len(nlp.watched), axis=2)
         rest = np.zeros((2, 0 if self.target[2] is None else self.target[2].numel_out(0), 1))
-        limits = {"motion": np.zeros((2, self.n, K - 1)), "begin": jump, "slope": slopes, "bound": bounded, "rest": rest}
+        motion = np.zeros((2, self.n, K - 1))
+        limits = {"motion": motion, "begin": jump, "slope": slopes, "bound": bounded, "rest": rest}
         return nlp.joined(x[0], u[0]), nlp.joined(x[1], u[1]), limits
 
     def _useless(self, beta, usual):
@@ -494,39 +536,44 @@ class Task:
 
     def _violation(self, nlp, w, bounds):
         """Name, instant [s], value and side of what violates its bounds most, relative to its size, in SI."""
-        lower, upper, limits = bounds
-        mesh, pieces, (x_size, u_size) = nlp.mesh, nlp.pieces, self.sizes[:2]
-        instants, of_inputs = (np.append(each.edges[0], each.nodes) for each in (mesh, pieces))
-        parts = [*zip(nlp.apart(w), nlp.apart(lower), nlp.apart(upper), strict=True)]
-        states, inputs = self.plant.state_names, self.plant.inputs
-        entries = [(states, x_size, instants, *parts[0]), (inputs, u_size, of_inputs, *parts[1])]
-        rates = [f"d{name}" for name in inputs]
-        names = {"motion": [f"the motion of {name}" for name in states], "begin": inputs, "slope": rates}
-        names |= {"bound": [*self.node.bounds], "rest": ["rest at the end"] * len(limits["rest"][0])}
-        scales = {"motion": x_size, "begin": u_size, "slope": u_size}
-        for kind, value in nlp.constraints(w).items():
-            scale = scales.get(kind, np.ones(len(value)))[:, None]
-            at = {"begin": mesh.edges[:1], "rest": mesh.edges[-1:], "slope": pieces.nodes}.get(kind, mesh.nodes)
-            low, high = limits[kind]
-            entries.append((names[kind], np.maximum(scale[:, 0], _largest(value * scale)), at, *(scale * part for part in (value, low, high))))
         found = []
-        for label, size, at, value, low, high in entries:
-            if not value.size:
-                continue
-            excess = np.maximum(low - value, value - high) / np.where(size > 0, size, 1.0)[:, None]
-            i, k = np.unravel_index(np.argmax(excess), excess.shape)
-            side = low[i, k] if low[i, k] - value[i, k] > value[i, k] - high[i, k] else high[i, k]
-            found.append((excess[i, k], (label[i], float(at[k]), float(value[i, k]), float(side))))
+        for names, at, size, *sides in self._checked(nlp, w, bounds):
+            value, low, high = (part * size[:, None] for part in sides)
+            scale = np.maximum(size, np.abs(np.where(np.isfinite(value), value, 0.0)).max(axis=1, initial=0.0))
+            excess = np.maximum(low - value, value - high) / scale[:, None]
+            if excess.size:
+                i, k = np.unravel_index(np.argmax(excess), excess.shape)
+                side = low[i, k] if value[i, k] < low[i, k] else high[i, k]
+                found.append((excess[i, k], (names[i], float(at[k]), float(value[i, k]), float(side))))
         return max(found, key=lambda entry: entry[0])[1]
+
+    def _checked(self, nlp, w, bounds):
+        """What has bounds: names, instants, sizes, and in these the values and the lower and upper sides."""
+        mesh, pieces, (x_size, u_size) = nlp.mesh, nlp.pieces, self.sizes[:2]
+        states, inputs = self.plant.state_names, self.plant.inputs
+        of_variables = zip(*(nlp.apart(part) for part in (w, *bounds[:2])), strict=True)
+        for names, each, parts in zip((states, inputs), (mesh, pieces), of_variables, strict=True):
+            yield names, np.append(each.edges[0], each.nodes), np.ones(len(names)), *parts
+        rows = {
+            "motion": ([f"the motion of {name}" for name in states], mesh.nodes, x_size),
+            "begin": (inputs, mesh.edges[:1], u_size),
+            "slope": ([f"d{name}" for name in inputs], pieces.nodes, u_size),
+            "bound": (self.node.bounds, nlp.watched, np.ones(len(self.bounds))),
+        }
+        values, limits = nlp.constraints(w), bounds[2]
+        count = len(values["rest"])
+        rows["rest"] = (["the rest at the end"] * count, mesh.edges[-1:], np.ones(count))
+        for kind, (names, at, size) in rows.items():
+            yield names, at, size, values[kind], *limits[kind]
 
     def _defects(self, plan):
         """Largest defect h (x' - f) between the nodes of each interval, relative to the sizes of the states, (N,)."""
-        mesh, (x, u), theta = plan.mesh, (plan.x, plan.points), np.array(BETWEEN)
+        mesh, (x, u), theta = plan.mesh, (plan.x, plan.points), np.array(PLACES)
         t = (mesh.edges[:-1, None] + mesh.h[:, None] * theta).ravel()
         f = self.node.function("rates", self.node.rates).map(len(t))
         v = np.vstack([plan.pieces.inputs(u, t, rate) for rate in range(self.node.depth + 1)])
         defect = mesh.states(x, t, 1) - np.array(f(t[None], mesh.states(x, t), v))
-        defect *= np.repeat(mesh.h, len(theta)) / _sizes(x, self.nq, self.span)[:, None]
+        defect *= np.repeat(mesh.h, len(theta)) / _state_sizes(x, self.nq, self.span)[:, None]
         return np.abs(defect).max(axis=0).reshape(len(mesh.h), -1).max(axis=1)
 
     def _finer(self, plan):
@@ -550,14 +597,27 @@ class Task:
         t = _cut(mesh.edges, np.full(len(mesh.h), parts))
         x = mesh.states(plan.x, t)
         jets = np.vstack([x, model.function("ode").grid(t, x, model.parameters)[self.nq : self.n]])
-        start = State(float(t[0]), x[:, 0].copy(), tuple(model.state_names), (), (), 0.0)
         counters = {"iterations": sum(plan.iterations), "intervals": len(mesh.h), "solves": len(plan.iterations)}
-        run = Run(t, jets, tuple(model.jet_names), model, "relaxed", counters=counters, knots=tuple(plan.pieces.edges[1:-1].tolist()), start=start)
+        run = Run(
+            t, jets, tuple(model.jet_names), model, "relaxed", counters=counters,
+            knots=tuple(plan.pieces.edges[1:-1].tolist()),
+            start=State(float(t[0]), x[:, 0].copy(), tuple(model.state_names), (), (), 0.0),
+        )  # fmt: skip
         missed = ", ".join(f"{name} {np.abs(run.residual[name]).max():.2g}" for name in self.program.names)
-        return replace(run, message=f"finished; the program is missed by at most {missed}")
+        return replace(run, message=f"finished; the program is missed by at most {missed}{self._exceeded(run)}")
+
+    def _exceeded(self, run):
+        """How far samples between the instants of bounds exceed these, for the message; "" if they do not."""
+        text = ""
+        for name, (low, high) in self.bounds.items():
+            values = run.residual[name][0] if name in self.program.names else run[name]
+            excess = float(np.max(np.maximum(low - values, values - high)))
+            if excess > EXCEEDED * max(abs(side) for side in (low, high) if np.isfinite(side)):
+                text += f"; between its instants {name} exceeds its bound by {excess:.2g}"
+        return text
 
 
-def _sizes(x, nq, span):
+def _state_sizes(x, nq, span):
     """Size of each state (n_x,): its range, at least a part of that of others at its level."""
     ranges = np.ptp(x, axis=1)
     for level, floor in ((slice(nq), 1.0), (slice(nq, None), 1.0 / (span[1] - span[0]))):
@@ -591,8 +651,3 @@ def _no_equilibrium(t, worst, speeds):
         do="Leave start= out, or write end='free' or the values of states at the end.",
         t=float(t), row=row, value=value, speeds=moving,
     )  # fmt: skip
-
-
-def _largest(values):
-    """Largest magnitude of each row (rows,)."""
-    return np.abs(values).max(axis=1, initial=0.0)

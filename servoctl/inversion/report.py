@@ -62,7 +62,8 @@ class Report:
 
     Attributes
     ----------
-    verdict : Verdict
+    basis : Verdict
+        The verdict with what it rests on: eigenvalues at rest and growth along a run.
     residuals : dict of str to dict
         For each residual its "order", how often it is "raised" until accelerations appear, its "relative degree", and
         the "class" C^k that its path needs.
@@ -86,7 +87,7 @@ class Report:
     run : Run or None
     """
 
-    verdict: Verdict
+    basis: Verdict
     residuals: dict
     index: int | None = None
     realisation: str = "undecided"
@@ -98,10 +99,25 @@ class Report:
     efforts: dict[str, Effort] = field(default_factory=dict)
     run: Run | None = None
 
+    @property
+    def verdict(self) -> str:
+        """The verdict in a word; see `servoctl.inversion.verdict.Verdict`."""
+        return self.basis.word
+
+    @property
+    def reason(self) -> str:
+        """The number or the fact that decides the verdict."""
+        return self.basis.reason
+
+    @property
+    def eigenvalues(self) -> dict[str, np.ndarray]:
+        """Eigenvalues of the internal dynamics [1/s] at the rests "start" and "end", as far as there are any."""
+        return {name: end.eigenvalues for name, end in self.basis.rest.items()}
+
     def as_dict(self) -> dict:
         """The report as numbers, texts, lists and dicts, for JSON; eigenvalues as pairs [real part, imaginary part]."""
         return {
-            **self.verdict.as_dict(),
+            **self.basis.as_dict(),
             "residuals": {name: dict(facts) for name, facts in self.residuals.items()},
             "index": self.index,
             "realisation": self.realisation,
@@ -125,10 +141,10 @@ class Report:
         return draw_report(self)
 
     def __repr__(self):
-        v, lines = self.verdict, [f"Report: {self.verdict.word}"]
+        v, lines = self.basis, [f"Report: {self.basis.word}"]
         lines += [f"  {text}" for text in (v.reason, v.growth, v.do) if text]
         lines += [f"  {text}" for text in _of_residuals(self.residuals)]
-        if self.verdict.word != UNREALISABLE:
+        if self.basis.word != UNREALISABLE:
             index = "not defined" if self.index is None else self.index
             lines.append(f"  index {index}; {self.realisation} realisation{_of_directions(self.directions)}")
             hidden = f"hidden: {'; '.join(self.hidden)}" if self.hidden else "no hidden constraint"

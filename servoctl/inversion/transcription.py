@@ -15,6 +15,7 @@ import numpy as np
 from servoctl.methods.bounded import basis_rates
 from servoctl.methods.radau import basis, radau
 
+WATCHED = 12  # instants of bounds in an interval of the inputs
 IPOPT = {
     "print_level": 0,
     "sb": "yes",
@@ -22,7 +23,7 @@ IPOPT = {
     "acceptable_tol": 1e-6,  # rounding of φ²/β for small β
     "acceptable_iter": 2,
     "acceptable_constr_viol_tol": 1e-9,
-    "max_iter": 300,
+    "max_iter": 200,
     "bound_relax_factor": 0.0,
     "nlp_scaling_method": "none",
     "mu_strategy": "adaptive",
@@ -56,7 +57,7 @@ class Node:
         self.q, self.bounds = e.q, tuple(bounded)
         residuals, effort = ca.vertcat(*program.residuals.values()), ca.SX(0)
         for name, u in zip(plant.inputs, e.u.elements(), strict=True):
-            effort += program.weights.get(name, 1.0) * u**2
+            effort += program.weights.get(name, 1.0) * (u - program.toward.get(name, 0.0)) ** 2
         quantities = ca.vertcat(residuals, effort, *bounded.values())
         self.depth = max(0, max((self.q.order(x) for x in quantities.elements()), default=0) - 2)
         jets = [e.u, *(ca.SX.sym(f"u{k}", e.u.numel()) for k in range(1, self.depth + 1))]
@@ -176,7 +177,7 @@ class Transcription:
 
     Unknowns are states at the begin and all nodes (n_x, 1 + N s) and control points of the inputs (m, 1 + P s), each in
     units of its size. Constraints by kind: "motion" (n_x, N s), collocation; "begin" (m, 1), the highest coefficient of
-    the inputs on the first interval, whose begin is no node; "slope" (m, P s), control points of u'; "bound" (b, N s);
+    the inputs on the first interval, whose begin is no node; "slope" (m, P s), control points of u'; "bound" (b, P w);
     "rest" (r, 1).
 
     Parameters
@@ -196,6 +197,12 @@ class Transcription:
         self.n, self.m, self.count = len(sizes[0]), len(sizes[1]), len(mesh.nodes)
 
     @cached_property
+    def watched(self):
+        """Instants of the bounds, (P w,) array [s]: more than an interval of the inputs has control points."""
+        inside = np.arange(1, WATCHED + 1) / WATCHED
+        return (self.pieces.edges[:-1, None] + self.pieces.h[:, None] * inside).ravel()
+
+    @cached_property
     def _problem(self):
         """Variables, weights, the objective, and the constraints by kind."""
         from scipy.sparse import block_diag
@@ -204,9 +211,9 @@ class Transcription:
         count = self.n * (1 + K) + self.m * (1 + len(self.pieces.nodes))
         w, beta = ca.MX.sym("w", count), ca.MX.sym("beta", node.residuals.numel())
         x, points = self._split(w)
-        f = node.function("node", node.rates, node.residuals, node.effort, node.bounded).map(K)
+        f = node.function("node", node.rates, node.residuals, node.effort).map(K)
         v = ca.vertcat(*(points @ _matrix(_at(self.pieces, mesh.nodes, k)) for k in range(node.depth + 1)))
-        rates, residuals, effort, bounded = f(ca.DM(mesh.nodes).T, x[:, 1:], v)
+        rates, residuals, effort = f(ca.DM(mesh.nodes).T, x[:, 1:], v)
         begins = np.repeat(np.arange(0, K, s), s).tolist()
         increments = (x[:, 1:] - x[:, begins]) @ _matrix(block_diag([radau(mesh.order)[1].T] * len(mesh.h)))
         h = ca.repmat(ca.DM(np.repeat(mesh.h, s)).T, self.n, 1)
@@ -217,10 +224,19 @@ class Transcription:
             "motion": (increments - h * rates) / ca.repmat(ca.DM(self.sizes[0]), 1, K),
             "begin": points[:, : s + 1] @ highest / ca.DM(self.sizes[1]),
             "slope": points @ _matrix(_slopes(self.pieces)) / ca.DM(self.sizes[1]),
-            "bound": bounded,
+            "bound": self._bounded(x, points),
             "rest": self.rest(mesh.edges[-1], x[:, -1], v[:, -1]) if self.rest else ca.MX(0, 1),
         }
         return w, beta, ca.dot(cost, ca.DM(mesh.weights).T) / scale, constraints
+
+    def _bounded(self, x, points):
+        """Bounded quantities (b, P w) at instants that do not change with the mesh of the states."""
+        node, t = self.node, self.watched
+        if not node.bounds:
+            return ca.MX(0, len(t))
+        f = node.function("bounded", node.bounded).map(len(t))
+        v = ca.vertcat(*(points @ _matrix(_at(self.pieces, t, k)) for k in range(node.depth + 1)))
+        return f(ca.DM(t).T, x @ _matrix(_states_at(self.mesh, t)), v)
 
     def _split(self, w):
         """States and control points, in SI, of the variables."""
@@ -295,6 +311,18 @@ def _at(pieces, t, rate):
     values = bernstein(s, theta, rate) / pieces.h[k, None] ** rate
     rows, columns = k[:, None] * s + np.arange(s + 1), np.repeat(np.arange(len(t)), s + 1)
     return csc_matrix((values.ravel(), (rows.ravel(), columns)), shape=(1 + len(pieces.nodes), len(t)))
+
+
+def _states_at(mesh, t):
+    """The matrix (1 + N s, M) from states at the begin and all nodes to those at instants (M,)."""
+    from scipy.sparse import csc_matrix
+
+    k, theta = mesh.place(t)
+    s = len(mesh.c)
+    of_stages = basis(mesh.c, theta).T
+    values = np.hstack([1.0 - of_stages.sum(axis=1, keepdims=True), of_stages])
+    rows, columns = k[:, None] * s + np.arange(s + 1), np.repeat(np.arange(len(t)), s + 1)
+    return csc_matrix((values.ravel(), (rows.ravel(), columns)), shape=(1 + len(mesh.nodes), len(t)))
 
 
 def _slopes(pieces):

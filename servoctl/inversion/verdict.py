@@ -115,7 +115,7 @@ def _of_motion(model, motion):
         return Verdict(SINGULAR, _first_sentence(error))
     except ServoError as error:
         return Verdict(OPEN, f"no start was found: {_first_sentence(error)}", "pass model.start(...) or a run")
-    lost = [reason for t, x in states if (reason := _lost(model, t, x))]
+    lost = [reason for t, x in states if (reason := _lost_rank(model, t, x))]
     if lost:
         return Verdict(SINGULAR, lost[0])
     if model.flat:
@@ -127,9 +127,9 @@ def _of_motion(model, motion):
 
 
 def _lost_at_default_start(model, t):
-    """As `_lost`, of the start nearest to zero: a motion from elsewhere may have its rest there."""
+    """As `_lost_rank`, of the start nearest to zero: a motion from elsewhere may have its rest there."""
     try:
-        return _lost(model, t, np.asarray(model.start(t=t).values, dtype=float))
+        return _lost_rank(model, t, np.asarray(model.start(t=t).values, dtype=float))
     except ServoError:
         return ""
 
@@ -166,7 +166,7 @@ def endpoints(model, motion):
         return []
 
 
-def _lost(model, t, x):
+def _lost_rank(model, t, x):
     """What is lost where the equations have not the rank that they have in motion; "" if nothing is."""
     if margins(model.reduction, [t], x[:, None], model.parameters)[0] != 0:
         return ""
@@ -201,7 +201,7 @@ def _rests(model, states, along):
             continue
         moved = entries.moved(end, t + _reach(end, t1 - t0) * beside)
         far = along and end.unstable and np.abs((end.x - x) / entries.size)[entries.free].max() > NEAR
-        if moved is None and not far and not _lost(model, t, end.x):
+        if moved is None and not far and not _lost_rank(model, t, end.x):
             rest[name] = end
         elif moved is not None:
             why = why or f"at t = {moved:.4g} s the program does not stand still"

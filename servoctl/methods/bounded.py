@@ -119,7 +119,7 @@ def _to_event(problem, events, solution, times):
 
 @dataclass(frozen=True)
 class End:
-    """An equilibrium: its instant [s], state (n_x,), linearisation A (f, f) in the free entries, and their sizes (f,)."""
+    """An equilibrium: instant [s], state (n_x,), linearisation A (f, f) in the free entries, and their sizes (f,)."""
 
     t: float
     x: np.ndarray

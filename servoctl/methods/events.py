@@ -6,7 +6,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from servoctl.checks import as_list, finite, whole
+from servoctl.checks import as_list, finite, mapping, whole
 from servoctl.errors import SpecificationError
 from servoctl.methods.watch import BESIDE_ENDS
 from servoctl.run import Run
@@ -70,14 +70,27 @@ class Event:
             values = run.residual[self.signal][0] if residual else run[self.signal]
         else:
             states = run.jets[: len(run.model.state_names)].T
-            values = np.array([finite("event", self.signal(t, x)) for t, x in zip(run.t, states, strict=True)])
+            values = np.array([self._called(t, x) for t, x in zip(run.t, states, strict=True)])
         return values - self.value
+
+    def _called(self, t, x):
+        try:
+            value = self.signal(t, x)
+        except Exception as error:  # the function's own
+            raise SpecificationError(
+                f"The event {self.name!r} raises {type(error).__name__} at t = {t:.7g} s: {error}.",
+                "A function of an event takes the time [s] and the state (n_x,), and returns a number.",
+                do="Check the function, or name a signal.",
+                name=self.name,
+                t=float(t),
+            ) from error
+        return finite(self.name, value, "value of the event")
 
 
 def as_events(events):
     """Events by name: from a dict, a sequence or a single one of events, functions and names of signals."""
     if isinstance(events, Mapping):
-        return {name: _as_event(event) for name, event in events.items()}
+        return {name: _as_event(event) for name, event in mapping(events, "The events").items()}
     listed = [] if events is None else as_list(events)
     listed = [_as_event(event) for event in ([events] if listed is None else listed)]
     named = {event.name: event for event in listed}

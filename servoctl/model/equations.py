@@ -276,10 +276,11 @@ class Equations(Invariants):
         if rate:
             expressions = self.q.derivatives(expressions, rate)[rate]
             names, kind = [jet_name(name, rate) for name in names], f"{kind}_rate{rate}"
-        places = filter(None, map(self.q.where, ca.symvar(ca.vertcat(*expressions))))
+        values = ca.vertcat(ca.SX(0, 1), *expressions)  # SX without expressions, too
+        places = filter(None, map(self.q.where, ca.symvar(values)))
         highest = max((level for of, level, _ in places if of not in ("t", "q")), default=0)
         above = (s for k in range(self.top + 1, highest + 1) for s in self.q.gamma(k))
-        return names, self.function(kind, ca.vertcat(self.jets, *above), expressions)
+        return names, self.function(kind, ca.vertcat(self.jets, *above), [values])
 
     def _actuation(self):
         return list(self.r.mechanism.actuators), [self.r.actuation]
@@ -296,7 +297,14 @@ class Equations(Invariants):
         return [f"multiplier_{name}" for name in names], [multipliers]
 
     def _outputs(self):
-        return list(self.r.mechanism.outputs), list(self.r.mechanism.outputs.values())
+        mechanism = self.r.mechanism
+        outputs = {name: e for name, e in mechanism.outputs.items() if name not in mechanism.inputs}
+        return list(outputs), list(outputs.values())
+
+    def _given_inputs(self):
+        """Inputs that drive the mechanism as functions of time."""
+        mechanism = self.r.mechanism
+        return list(mechanism.inputs), [mechanism.outputs[name] for name in mechanism.inputs]
 
     def _energy(self):
         return ["energy"], [self.r.mechanism.energy]
@@ -381,6 +389,7 @@ SIGNALS = {  # names and expressions of each group
     "reaction": Equations._reaction,
     "multipliers": Equations._multipliers,
     "outputs": Equations._outputs,
+    "given_inputs": Equations._given_inputs,
     "energy": Equations._energy,
     "balance": Equations._balance,
     "coordinate_rates": Equations._coordinate_rates,

@@ -345,7 +345,8 @@ class Model:
         """The group of each signal that is no jet, {signal name: key of `SIGNALS`}."""
         mechanism, program = self.reduction.mechanism, self.reduction.program
         names = mechanism.q.names if mechanism.q.plain else mechanism.q.velocity_names
-        groups = dict.fromkeys(mechanism.outputs, "outputs") | {"energy": "energy"}
+        groups = dict.fromkeys(mechanism.outputs, "outputs") | dict.fromkeys(mechanism.inputs, "given_inputs")
+        groups |= {"energy": "energy"}
         if program.by == "actuators":
             groups = dict.fromkeys(mechanism.actuators, "actuation") | groups
         else:

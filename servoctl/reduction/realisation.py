@@ -105,7 +105,7 @@ def _shared(mechanism, program, constraints, independent, points, context):
     rows = [*constraints, *(row for row, _ in settle_alone(q, balances(q, unreached), context))]
     rows, _, points, pivots = complete(q, rows, context, points)
     pivots = [*((f"choice of unreached balances {i}", p) for i, p in enumerate(of_split, 1)), *pivots]
-    P = _determined(mechanism, rows, material, points, k)
+    P = _determined_rows(mechanism, rows, material, points, k)
     A = _inverse_weights(mechanism, program) @ P.T
     realised = _realised(
         mechanism, constraints, mechanism.E @ A, A, points, reached.dependent,
@@ -114,7 +114,7 @@ def _shared(mechanism, program, constraints, independent, points, context):
     return realised, points, pivots
 
 
-def _determined(mechanism, rows, material, points, k):
+def _determined_rows(mechanism, rows, material, points, k):
     """P: k independent rows of L N, (k, m) SX."""
     q = mechanism.q
     L = ca.vertcat(*(row.gradient(q) for row in rows))

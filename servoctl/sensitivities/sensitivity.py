@@ -5,13 +5,15 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from servoctl.checks import texts
+from servoctl.checks import named, texts
 from servoctl.errors import IntegrationStopped, SpecificationError, unknown
+from servoctl.methods.choice import Bounded
 from servoctl.methods.motion import breakpoints
 from servoctl.methods.sizes import motion_sizes
 from servoctl.model.model import Model
 from servoctl.model.switching import switching
 from servoctl.run import STENCIL, ByName, Run, require_model
+from servoctl.sensitivities.boundary import bounded_tangent
 from servoctl.sensitivities.tangent import along_state, determined, invariants_by, variational
 from servoctl.values import Value
 
@@ -58,10 +60,7 @@ class Sensitivity(ByName, Value):
 
     def __getitem__(self, pair):
         of, to = pair if isinstance(pair, tuple) and len(pair) == 2 else (pair, None)
-        for name, names in ((of, self.of), (to, self.to)):
-            if name not in names:
-                raise unknown(name, names, "derivative")
-        return self.values[of, to]
+        return self.values[named(of, self.of, "signal"), named(to, self.to, "parameter or initial value")]
 
     def number(self, name: str) -> float:
         """The value of a parameter, or an initial value.
@@ -71,7 +70,7 @@ class Sensitivity(ByName, Value):
         name : str
             One of `to`.
         """
-        numbers = self.run.model.numbers
+        numbers, name = self.run.model.numbers, named(name, self.to, "parameter or initial value")
         return numbers[name] if name in numbers else float(self.run[name][0])
 
     def change(self, name: str) -> float:
@@ -100,7 +99,7 @@ class Sensitivity(ByName, Value):
         -----
         At an extremum the signal does not change with time, so that d max y/dp = ∂y/∂p there.
         """
-        times = [t for t, _ in self.run.extrema(of)]
+        times = [t for t, _ in self.run.extrema(named(of, self.of, "signal"))]
         return {to: tuple(_between(self.run, self[of, to], t) for t in times) for to in self.to}
 
     def plot(self, ax=None, units=None):
@@ -127,14 +126,14 @@ class Sensitivity(ByName, Value):
         for of in self.of[:8]:
             sizes = {to: np.nanmax(np.abs(self[of, to])) * self.change(to) for to in self.to}
             largest = sorted(sizes, key=sizes.get, reverse=True)[:3]
-            shown = ", ".join(f"{to} ({_step(self.number(to))}): {sizes[to]:.3g}" for to in largest)
+            shown = ", ".join(f"{to} ({_growth_in_words(self.number(to))}): {sizes[to]:.3g}" for to in largest)
             lines.append(f"  {of} changes at most with {shown}")
         if self.independent:
             lines.append(f"  constant else at the start: {', '.join(self.independent)}")
         return "\n".join(line[:118] for line in lines)
 
 
-def _step(number):
+def _growth_in_words(number):
     return "1 %" if number else "0.01"
 
 
@@ -144,7 +143,7 @@ def sensitivity(
     """Derivatives of a run's signals by parameters and initial values, without differences.
 
     Where the program determines the motion they follow from the implicit function theorem at each sample, otherwise
-    from the variational equation along the run.
+    from the variational equation along the run; for bounded motions from its boundary value problem.
 
     Parameters
     ----------
@@ -182,6 +181,8 @@ def sensitivity(
     of = tuple(dict.fromkeys(default if of is None else texts(of, "The names of signals")))
     to = tuple(dict.fromkeys(list(model.numbers) if to is None else texts(to, "The names of parameters")))
     known = (*model.jet_names, *model.signal_groups)
+    if not of or not to:
+        raise SpecificationError("Nothing was named.", "A derivative is of a signal by a number.", of=of, to=to)
     for name in of:
         if name not in known:
             raise unknown(name, known, "signal")
@@ -193,7 +194,7 @@ def sensitivity(
     kinds = tuple(dict.fromkeys(model.signal_groups[name] for name in of if name not in model.jet_names))
     if model.flat:
         _require_free(model, initial, ())
-        tangents, independent = _determined(run, names, kinds), ()
+        tangents, independent = _by_theorem(run, names, kinds), ()
     else:
         tangents, independent = _along(model, run, (names, initial), kinds)
     rows = dict(zip(_rows(model, kinds), tangents, strict=True))
@@ -206,10 +207,11 @@ def _require_run(model, run):
     """Refuse a run with other numbers, and one with switches of the state."""
     switches = switching(model) is not None
     if switches or run.model.numbers != model.numbers:
+        smooth = "Smooth the switch, such as tanh(v/v0) for sign(v)."
         raise SpecificationError(
             "The motion has kinks or switches of the state." if switches else "The run is of other parameters.",
             "Derivatives are those along one smooth motion of the model.",
-            do="Smooth the switch, such as tanh(v/v0) for sign(v)." if switches else "Pass run.model, or simulate again.",
+            do=smooth if switches else "Pass run.model, or simulate again.",
             run=run.model.numbers,
             model=model.numbers,
         )
@@ -224,7 +226,7 @@ def _variants(run):
     return run.variants or ((0, len(run.t), run.model),)
 
 
-def _determined(run, names, kinds):
+def _by_theorem(run, names, kinds):
     """Tangents (rows, k, N) of the jets and signals of a flat program."""
     parts = []
     for first, end, model in _variants(run):
@@ -248,18 +250,22 @@ def _by_rows(model, y, columns, kinds):
 def _along(model, run, to, kinds):
     """Tangents (rows, K, N) along a run, and the names of its independent initial values."""
     names, initial = to
-    S, independent = _start(run, names, initial)
-    tangents = _integrated(model, run, names, S)
+    if run.method == str(Bounded()):
+        _require_free(model, initial, ())
+        tangents, independent = bounded_tangent(model, run, names), ()
+    else:
+        S, independent = _tangent_at_start(run, names, initial)
+        tangents = _integrated(model, run, names, S)
     parts = []
     for first, end, variant in _variants(run):
         jets = run.jets[: len(model.jet_names), first:end]
         x = np.concatenate([jets, tangents[:, :, first:end].swapaxes(0, 1).reshape(-1, end - first)])
         y = along_state(variant, names, len(initial), kinds).grid(run.t[first:end], x, variant.parameters)
-        parts.append(_by_rows(model, y, S.shape[1], kinds))
+        parts.append(_by_rows(model, y, tangents.shape[1], kinds))
     return np.concatenate(parts, axis=2), independent
 
 
-def _start(run, names, initial):
+def _tangent_at_start(run, names, initial):
     """The tangent (n_x, K) of the first state, and the names of the initial values that do not depend on others."""
     model = run.variant(0)
     t, x = run.t[0], run.jets[: len(model.state_names), 0]
@@ -306,10 +312,10 @@ def _require_free(model, initial, independent):
         if name not in independent:
             raise SpecificationError(
                 f"The derivative by the initial value of {name!r} was named.",
-                f"Of this program {model.free} initial values are free, the others follow from the constraints.",
+                f"{len(independent)} initial values of this motion are free, the others follow from its constraints.",
                 do=f"Name others, such as {', '.join(independent)}." if independent else "Name parameters.",
                 name=name,
-                free=model.free,
+                free=independent,
             )
 
 
@@ -334,7 +340,7 @@ def _integrated(model, run, names, S):
             rtol=RTOL, atol=atol,
         )  # fmt: skip
         if solved.status:
-            raise _lost(float(solved.t[-1]), solved.message)
+            raise _ended(float(solved.t[-1]), solved.message)
         result[:, :, inside] = solved.sol(run.t[inside])[n_x:].reshape(K, n_x, -1).swapaxes(0, 1)
         y = solved.y[:, -1].copy()
     return result
@@ -354,7 +360,7 @@ def _absolute(model, run, names, S):
     return RTOL * np.concatenate([sizes, *(sizes / number for number in [*numbers, *initial])])
 
 
-def _lost(t, why):
+def _ended(t, why):
     return IntegrationStopped(
         f"The variational equation could not be integrated beyond t = {t:.6g} s: {why.rstrip('.')}.",
         "Derivatives follow the motion from its start.",

@@ -59,7 +59,7 @@ def _compute(args, name, scene, folder):
         folder.write(lambda path: closed.save(path / "closed_loop.npz"))
     about = {"name": name, "given": args.scene, "description": scene.description}
     facts = {"scene": about, "command": args.command_line, "t_span": motion.span}
-    facts |= {"verdict": found.as_dict(), **summary(run, motion.start, verification)}
+    facts |= {"verdict": found.word, "verdict_facts": found.as_dict(), **summary(run, motion.start, verification)}
     facts["closed_loop"] = loop.facts(closed)
     folder.write_json("summary.json", facts)
     folder.write_text("report.txt", report.text)

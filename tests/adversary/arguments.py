@@ -99,6 +99,7 @@ def calls():
         "verify": (sv.verify, dict(model=s["ideal"], run=s["free"], segments=3)),
         "verify closed": (sv.verify, dict(model=closed)),
         "internal_dynamics": (sv.internal_dynamics, dict(model=s["ideal"], run=s["free"])),
+        "minimum_phase": (sv.minimum_phase, dict(model=s["model"], parameter="m", values=(1.5, 2.5), at=s["model"].start())),
         "stability": (sv.stability, dict(model=s["ideal"], run=s["free"], order=12)),
         "tradeoff": (sv.tradeoff, dict(model=s["ideal"], x0=near, t_span=span, methods=["RK4"], drift=[None],
                                        settings={"step": [0.1]}, seconds=0.1, progress=False)),
@@ -225,9 +226,10 @@ def specifications():
             dict(actuator=x, force=-x, output=x + y)),
         "Mechanism kinetic": (sv.Mechanism, dict(q=q, kinetic=ca.dot(velocity, velocity) / 2)),
         "Mechanism balance": (sv.Mechanism, dict(q=q, balance=ca.vertcat(*q.d(2)))),
-        "Program": (sv.Program, dict(residuals={"X": x - ca.sin(q.t)}, by="ideal", weights=None)),
+        "Program": (sv.Program, dict(residuals={"X": x - ca.sin(q.t)}, by="ideal", weights=None, toward=None)),
         "Program residual": (lambda residual: sv.Program({"X": residual}), dict(residual=x - ca.sin(q.t))),
         "Program weight": (lambda weight: sv.Program({"X": x}, weights={"pull": weight}), dict(weight=2.0)),
+        "Program wish": (lambda wish: sv.Program({"X": x}, toward={"pull": wish}), dict(wish=2.0)),
         "derive": (sv.derive, dict(mechanism=s["mechanism"], program=s["program"], guess=None)),
     }  # fmt: skip
 
