@@ -1,6 +1,7 @@
 """Kinks and switches: steps end where they are crossed; programs that end, jump, stick or turn round say so."""
 
 import pickle
+from functools import lru_cache
 
 import casadi as ca
 import numpy as np
@@ -274,9 +275,7 @@ def test_other_ends_of_programs(name):
         assert caught.value.details["t"] == pytest.approx(end, abs=1e-3)
 
 
-@pytest.mark.parametrize(
-    ("method", "drift"), [(m, d) for m, d in PAIRS if d != "minimal" and (m, d) != ("RK4", "project")]
-)
+@pytest.mark.parametrize(("method", "drift"), [*PAIRS, ("RK4", "minimal"), ("RK8", "project")])
 def test_a_jump_without_a_switch_is_found(method, drift):
     """atan(1/z) jumps by π at z = 0, and its rates do not."""
     model, start = ideal(lambda t, x, y, dx, dy: y - 0.1 * ca.atan(1 / (x - 0.5)), x=0.0, dx=1.0)
@@ -291,6 +290,8 @@ def test_coarse_steps_are_no_jump():
     for order, step in ((1, 1e-3), (2, 0.02), (4, 0.2)):
         run = sv.simulate(model, start, (0.0, 6.0), sv.RungeKutta(order, step=step))
         assert run.success and np.abs(run.residual["p"][0]).max() > 1e-6
+        for drift in ("project", sv.Project(5), "minimal"):
+            assert sv.simulate(model, start, (0.0, 6.0), sv.RungeKutta(order, step=step), drift=drift).success
 
 
 def test_a_first_step_as_long_as_the_span_is_not_believed(gallery_model):
@@ -414,6 +415,98 @@ def test_a_grazing_contact_is_found(method):
         rtol=1e-11, atol=1e-13, max_step=1e-4,
     )  # fmt: skip
     assert run["y"][-1] == pytest.approx(bounce.y[0, -1], abs=1e-6)
+
+
+# what a step might not see --------------------------------------------------------------------------------------------
+
+ADAPTIVE = (*(m for m in METHODS if not m.startswith("RK")), "RK45", "RK23")
+NARROW = {  # force(t, x, y), start (y, dy), span; x = t moves past what depends on it
+    "a bump in time": (lambda t, x, y: 10 * ca.exp(-((100 * (t - 3)) ** 2)), (0.0, 0.0), (0.0, 5.0)),
+    "a bump late in a long rest": (lambda t, x, y: 10 * ca.exp(-((100 * (t - 33.3)) ** 2)), (0.0, 0.0), (0.0, 40.0)),
+    "a bump of 30 us": (lambda t, x, y: 1e4 * ca.exp(-((1e5 * (t - 3)) ** 2)), (0.0, 0.0), (0.0, 5.0)),
+    "a bump in place": (lambda t, x, y: 100 * ca.exp(-((300 * (x - 1)) ** 2)), (0.0, 0.0), (0.0, 2.0)),
+    "a bump in what is free": (lambda t, x, y: 100 * ca.exp(-((300 * (y - 1)) ** 2)), (0.0, 1.0), (0.0, 2.0)),
+    "a pulse of two blends": (
+        lambda t, x, y: (ca.tanh(200 * (t - 3)) - ca.tanh(200 * (t - 3.01))) / 2, (0.0, 0.0), (0.0, 5.0)
+    ),
+    "a pole nearby": (lambda t, x, y: 1e-3 / ((x - 1) ** 2 + 1e-6), (0.0, 0.0), (0.0, 2.0)),
+    "a logistic pulse": (
+        lambda t, x, y: 1 / (1 + ca.exp(-500 * (t - 1))) - 1 / (1 + ca.exp(-500 * (t - 1.01))), (0.0, 0.0), (0.0, 2.0)
+    ),
+    "backwards": (lambda t, x, y: 10 * ca.exp(-((100 * (t + 3)) ** 2)), (0.0, 0.0), (0.0, -5.0)),
+}  # fmt: skip
+
+
+def pushed(force, y, dy):
+    """A mass on y under force(t, x, y) beside one that is driven on x = t, and its start."""
+    q = sv.coordinates("x y")
+    x, y_ = q
+    gibbs = ca.sumsqr(ca.vertcat(*q.d(2))) / 2
+    mechanism = sv.Mechanism(q, gibbs=gibbs, forces={"y": force(q.t, x, y_)}, actuators={"F": x})
+    model = sv.derive(mechanism, sv.Program({"x": x - q.t}))
+    return model, model.start(y=y, dy=dy)
+
+
+@lru_cache
+def narrow_reference(name):
+    """(y, dy) at the end, by steps that end at the narrow place and are short about it."""
+    force, start, (a, b) = NARROW[name]
+    t, y = ca.SX.sym("t"), ca.SX.sym("y")
+    f = ca.Function("f", [t, y], [force(t, t, y)])
+    where = {"a bump late in a long rest": 33.3, "backwards": -3.0}.get(name, 3.0 if b == 5.0 else 1.0)
+    state, wide = np.array(start), 1e-3 if "us" in name else 0.1
+    for low, high in ((a, where - np.sign(b) * wide), (where - np.sign(b) * wide, where + np.sign(b) * wide),
+                      (where + np.sign(b) * wide, b)):  # fmt: skip
+        settings = {"method": "DOP853", "rtol": 1e-12, "atol": 1e-14, "max_step": abs(high - low) / 2000}
+        state = solve_ivp(lambda s, z: [z[1], float(f(s, z[0]))], (low, high), state, **settings).y[:, -1]
+    return state
+
+
+@pytest.mark.parametrize("method", ADAPTIVE)
+@pytest.mark.parametrize("name", NARROW)
+def test_no_method_steps_over_a_narrow_force(name, method):
+    force, start, span = NARROW[name]
+    run = sv.simulate(*pushed(force, *start), span, method, t_eval=span)
+    assert [run["y"][-1], run["dy"][-1]] == pytest.approx(narrow_reference(name), abs=2e-6)
+
+
+@pytest.mark.parametrize("settings", [{"method": "DOP853", "drift": "minimal"}, {"method": "RadauIIA", "drift": "project"},
+                                      {"method": "RadauIIA", "drift": 0.1}, {"accuracy": 1e-8},
+                                      {"method": sv.RadauIIA(5)}, {"method": sv.RadauIIA(13)}], ids=str)  # fmt: skip
+def test_no_setting_steps_over_a_narrow_force(settings):
+    for name in ("a bump in time", "a bump in place"):
+        force, start, span = NARROW[name]
+        run = sv.simulate(*pushed(force, *start), span, **settings)
+        assert [run["y"][-1], run["dy"][-1]] == pytest.approx(narrow_reference(name), abs=2e-6)
+
+
+PULSES = {  # of time alone, or of the place x = t: their impulse is 1, about t = 1
+    "by fabs": lambda t: ca.if_else(ca.fabs(t - 1) < 0.002, 250.0, 0.0),
+    "by a square": lambda t: ca.if_else((t - 1.00037) ** 2 < 4e-6, 250.0, 0.0),
+    "of 20 us by a square": lambda t: ca.if_else((t - 1.00037) ** 2 < 1e-10, 5e4, 0.0),
+    "by both sides": lambda t: ca.if_else(ca.logic_and(t > 0.998, t < 1.002), 250.0, 0.0),
+}
+
+
+@pytest.mark.parametrize("of", ["time", "place"])
+@pytest.mark.parametrize("name", PULSES)
+def test_two_switches_within_a_step_are_both_met(name, of):
+    pulse = PULSES[name]
+    for method in (*METHODS, "RK1"):
+        model, start = pushed(lambda t, x, y: pulse(t if of == "time" else x), 0.0, 0.0)
+        run = sv.simulate(model, start, (0.0, 2.0), method, t_eval=[0.0, 2.0])
+        middle = 1.00037 if "square" in name else 1.0
+        assert run["dy"][-1] == pytest.approx(1.0, abs=1e-6)
+        assert run["y"][-1] == pytest.approx(2.0 - middle, abs=2e-3 if method == "RK1" else 1e-6)
+        assert len(run.knots) >= 2
+
+
+def test_a_square_wave_switches_every_time():
+    """The triangle of its impulse ends at 2 - 25 π/40, with 26 changes of the sign of sin 40 t up to 2 s."""
+    model, start = pushed(lambda t, x, y: ca.sign(ca.sin(40 * t)), 0.0, 0.0)
+    for method in ("DOP853", "Taylor", "RadauIIA", "RK4", "CVODES"):
+        run = sv.simulate(model, start, (0.0, 2.0), method)
+        assert run["dy"][-1] == pytest.approx(np.pi / 40 - (2 - 25 * np.pi / 40), abs=1e-7)
 
 
 # flat programs -------------------------------------------------------------------------------------------------------

@@ -12,7 +12,7 @@ import casadi as ca
 import numpy as np
 
 from servoctl.codegen import compiler, emit
-from servoctl.codegen.interpreted import Interpreter, restored
+from servoctl.codegen.interpreted import Interpreter, restored, restored_grid
 from servoctl.codegen.loops import LOOPS
 from servoctl.codegen.native import Library
 from servoctl.errors import SpecificationError, unknown
@@ -411,6 +411,17 @@ class Compiled:
     def restore(self, t, x, p):
         """The state (n_x,) with its invariants restored by `project`, by CasADi; x if there is no `project`."""
         return x if self._project is None else restored(self._project, t, x, p)
+
+    def restore_grid(self, t, x, p):
+        """States (n_x, N) at times (N,), each restored in the same way."""
+        if self._project is None or not len(t):
+            return x
+        t, p = np.ascontiguousarray(t, dtype=float), np.ascontiguousarray(p[: self._project.numel_in(2)], dtype=float)
+        return restored_grid(self._projection, t, x, p)
+
+    @functools.cached_property
+    def _projection(self):
+        return Interpreter(self._project)
 
     def native(self, suffix):
         """A C function of the library, which is compiled if necessary; None without a compiler.

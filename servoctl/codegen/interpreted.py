@@ -207,6 +207,22 @@ def restored(project, t, x, p):
     return x
 
 
+def restored_grid(project, t, x, p):
+    """States x (n_x, N) at times t (N,), each restored in the same way; `project` is an `Interpreter`."""
+    x, left = np.array(x, dtype=float), np.arange(len(t))
+    for _ in range(6):
+        d = np.empty((len(x), len(left)))
+        project.grid(t[left], x[:, left], p, d)
+        finite = np.isfinite(d).all(axis=0)
+        left, d = left[finite], d[:, finite]
+        largest = np.max(np.abs(d) / (1 + np.abs(x[:, left])), axis=0, initial=0.0)
+        x[:, left] += d
+        left = left[largest > ROUNDING]
+        if not left.size:
+            break
+    return x
+
+
 def jet(c, j, h):
     """Change (n,) of the j-th derivative in a time h, from Taylor coefficients c (last, n) of index 1 .. last."""
     k = np.arange(1, len(c) + 1)

@@ -241,6 +241,39 @@ def domain_edges(expressions):
     return result
 
 
+_STEEP = {
+    *(ca.OP_SQ, ca.OP_POW, ca.OP_CONSTPOW, ca.OP_SQRT, ca.OP_EXP, ca.OP_LOG, ca.OP_SINH, ca.OP_COSH, ca.OP_TANH),
+    *(ca.OP_ATAN, ca.OP_ASINH, ca.OP_ERF, ca.OP_ATAN2, ca.OP_HYPOT, ca.OP_DIV, ca.OP_INV, ca.OP_EXPM1, ca.OP_LOG1P),
+}  # not sin and cos, which are as steep everywhere
+
+
+def steep_arguments(expressions):
+    """The arguments near whose zeros, or least magnitudes, functions in expressions may change much in a short time.
+
+    A bump exp(-(k z)²), a blend tanh(k z) or a pole 1/(z² + a²) is narrow about z = 0.
+
+    Parameters
+    ----------
+    expressions : sequence of SX scalars
+
+    Returns
+    -------
+    list of SX scalars
+        Each once.
+    """
+    work, result = [], {}
+
+    def value(op, operands):
+        arguments = [work[i] for i in operands]
+        if op in _STEEP:
+            steep = arguments[1:] if op == ca.OP_DIV else arguments
+            result.update((a.element_hash(), a) for a in steep if not a.is_constant())
+        return _apply(op, *arguments)
+
+    _replayed(expressions, work, lambda expression, symbol: expression, value)
+    return list(result.values())
+
+
 _SIZES = {
     ca.OP_ADD: lambda a, b: a + b,
     ca.OP_SUB: lambda a, b: a + b,

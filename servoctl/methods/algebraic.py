@@ -129,11 +129,12 @@ class _Algebraic(Stepping):
         if self.watch is None or len(stretch.t) < 2:
             return None
 
-        def state(_, t):
-            return self._split(*self.f.newton(np.array([t]), nodes, self.p)[:2])[0][:, 0]
+        def states(_, times):
+            found = self._split(*self.f.newton(times, nodes, self.p)[:2])[0]
+            return np.pad(found, ((0, 0), (0, len(times) - found.shape[1])), constant_values=np.nan)
 
         self.watch.begin(stretch.t[0])
-        return self.watch.switch(stretch, state)
+        return self.watch.switch(stretch, states, lambda k, t: states(k, np.array([t]))[:, 0])
 
     def _turned(self, switch, nodes, t1):
         """Go on beyond a switch, or stop there; its instant and the state."""

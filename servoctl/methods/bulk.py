@@ -1,27 +1,49 @@
-"""Methods that take many steps at once: pivots are inspected and samples recorded afterwards."""
+"""Methods with dense output: many steps at once, of which pivots, switches, residuals and equations are then inspected.
+
+A test of a step's error knows the equations at its stages alone. Therefore they are compared with the dense output at
+instants in between: quarters of each step, instants at most a thousandth of the span apart, and those at which a
+function in the equations may be narrow. Steps up to the first one that does not meet them count; the next one ends at
+that instant, so that its stages see what it stepped over.
+"""
+
+from dataclasses import replace
 
 import numpy as np
 
+from servoctl.methods.choice import MinimalCoordinates
 from servoctl.methods.monitor import FRACTIONS, DenseStretch, Fine, Repivot
 from servoctl.methods.motion import Stepping
-from servoctl.methods.watch import End
+from servoctl.methods.narrow import arguments, centres
+from servoctl.methods.watch import FINER, RESOLUTION, End, net, steps_of
+
+OFF = 1e3  # times the tolerance, which the equations may add to a step
+REPEATS = 8  # of a step at one instant, after which it is believed
+SHORTER = 1e-2  # to which part a first step is shortened that errs by far
+SHORTEST = 1e-12  # of the span: shorter steps are not repeated, so that a jump of the equations is passed
+SPACING = 1e-3  # of a step, between the points by which its dense output is differentiated
 
 
 class BulkSteps(Stepping):
     """An integration that takes many steps at once, by `_steps`; `failure` is the reason if no further one succeeds.
 
-    `_steps` returns an object with the ends t (S + 1,) [s], states x (n_x, S + 1) there, `at(k, times)` and
-    `within(theta)` for the states in between, and `failed`: whether no step succeeds after them.
+    `_steps` returns an object with the ends t (S + 1,) [s], states x (n_x, S + 1) there, states `at(k, times)` in
+    between, from steps k (N,) and times (N,), their derivatives `slope(k, times)`, NaN for entries that are not
+    integrated, and `failed`: whether no step succeeds after them.
     """
+
+    off = OFF
 
     def _piece(self, a, x, b, times):
         self.pending, self.forward, t = times, b >= a, a
         self._begin(a, x, b)
         self.monitor.begin(self._pivots(a, x))
         self.watch.begin(a)
+        until, repeats = b, 0
         while t != b and self.motion.stop is None:
-            steps = self._steps(t, x, b)
-            outcome = self._inspected(self._stretch(steps))
+            steps = self._steps(t, x, until)
+            stretch = self._stretch(steps)
+            outcome, doubt = self._outcome(stretch, repeats < REPEATS, t == a)
+            until, repeats = (b, 0) if doubt is None else (doubt, 0 if outcome.steps else repeats + 1)
             last = outcome.steps
             if isinstance(outcome, End):
                 self._record(steps, 0, last, outcome)
@@ -32,37 +54,111 @@ class BulkSteps(Stepping):
             self._record(steps, 0, before)
             t, x = steps.t[last], steps.x[:, last].copy()
             if last < len(steps.t) - 1:
-                self._retake(steps.t[last + 1] - t)
+                self._retake(steps.t[last + 1] - t if doubt is None else doubt - t)
             goes_on = isinstance(outcome, Fine) or self._follow(outcome)
             if before < last:
                 self._record(steps, before, last)
             self.progress(t)
-            if isinstance(outcome, Fine) and steps.failed:
+            if isinstance(outcome, Fine) and steps.failed and last == len(steps.t) - 1:
                 self._fail(t, x, self.failure)
                 goes_on = False
             if not goes_on:
                 self._keep_last(t, x)
         return t, x
 
+    def _outcome(self, stretch, doubts, first):
+        """The outcome of steps, and the instant at which the next one must end as it does not meet the equations there.
+
+        `doubts` says whether the first step may be repeated, `first` whether it is the first of its piece.
+        """
+        good, doubt = self._doubted(stretch) if len(stretch.t) > 1 else (0, None)
+        if doubt is not None and not good and not doubts:
+            good, doubt = 1, None
+            stretch = stretch.first(1)
+        if doubt is not None and not good:
+            return Fine(0), doubt
+        outcome = self._inspected(stretch.first(good) if doubt is not None else stretch)
+        if isinstance(self.drift, MinimalCoordinates) and outcome.steps:
+            torn = self._torn(stretch, outcome.steps)
+            outcome = outcome if torn is None else torn
+        if isinstance(outcome, End) and outcome.error and first and doubts and not outcome.steps:
+            return Fine(0), stretch.t[0] + SHORTER * (stretch.t[1] - stretch.t[0])
+        return outcome, doubt if isinstance(outcome, Fine) else None
     def _retake(self, h):
         """Go on from before a step of length h [s], which is repeated."""
 
     def _stretch(self, steps):
         """The steps for the monitor: they have passed their error test, and the next begin where they end."""
-        inside = np.array([*FRACTIONS, 1.0])
-        times = (steps.t[:-1, None] + np.outer(np.diff(steps.t), inside)).ravel()
-        pivots = self.f.grid(times, steps.within(inside).reshape(self.n_x, -1), self.p)[self.n_x :]
+        k, at, quarters = net(steps.t, self.watch.span / RESOLUTION, len(FRACTIONS) + 1)
+        states = steps.at(k, at)
+        y = self.f.grid(at, states, self.p)
+        self.net = k, at, states, y[: self.n_x]
+        pivots = y[self.n_x :, quarters]
         if len(pivots):
-            self.motion.count(watched=times.size)
+            self.motion.count(watched=pivots.shape[1])
         return DenseStretch(
             steps.t,
             steps.x,
-            pivots.reshape(len(pivots), len(steps.t) - 1, len(inside)),
+            pivots.reshape(len(pivots), len(steps.t) - 1, len(FRACTIONS) + 1),
             self._top,
             crosses=True,
-            dense=lambda k, t: steps.at(k, np.array([t]))[:, 0],
+            dense=steps.at,
             pivots_at=self._pivots,
+            slope=steps.slope,
         )
+
+    def _doubted(self, stretch):
+        """The number of steps that meet the equations, and the instant at which the next one does not, or None."""
+        if self.tolerances is None:
+            return len(stretch.t) - 1, None
+        k, at, x, rates = self.net
+        steep = arguments(self.model)
+        if steep is not None:
+            first = stretch.t[:1], stretch.x[:, :1]
+            parts = np.append(first[0], at), np.column_stack([first[1], x])
+            more = centres(steep, self.model.parameters, *parts, lambda s: stretch.dense(steps_of(stretch.t, s), s))
+            k, at = np.append(k, steps_of(stretch.t, more)), np.append(at, more)
+            added = stretch.dense(k[len(self.net[0]) :], more)
+            x = np.column_stack([x, added])
+            rates = np.column_stack([rates, self.f.grid(more, added, self.p)[: self.n_x]])
+        h = np.diff(stretch.t)
+        inside = (at != stretch.t[k]) & (at != stretch.t[k + 1]) & (np.abs(h[k]) > SHORTEST * self.watch.span)
+        return self._defect(stretch, h, k[inside], at[inside], x[:, inside], rates[:, inside])
+
+    def _defect(self, stretch, h, k, at, x, rates):
+        rtol, atol = self.tolerances
+        with np.errstate(all="ignore"):
+            change = h[k] * stretch.slope(k, at)
+            sizes = np.zeros((len(x), len(h)))
+            np.maximum.at(sizes, (slice(None), k), np.fmax(np.abs(x), np.abs(change)))
+            allowed = self.off * (np.reshape(atol, (-1, 1)) + rtol * sizes[:, k]) + self._slack(k, h)
+            excess = np.nan_to_num(np.abs(h[k] * rates - change) / allowed, posinf=np.inf).max(axis=0, initial=0.0)
+        wrong = np.flatnonzero(excess > 1.0)
+        if not len(wrong):
+            return len(h), None
+        good = k[wrong].min()
+        worst = wrong[k[wrong] == good]
+        return int(good), float(at[worst[np.argmax(excess[worst])]])
+
+    def _torn(self, stretch, steps):
+        """Where states that are solved for jump within the first steps, as an `End`, or None."""
+        k, at, x, rates = self.net
+        count = int(np.searchsorted(k, steps))
+        t, states = np.append(stretch.t[0], at[:count]), np.column_stack([stretch.x[:, 0], x[:, :count]])
+        start = self.f(t[0], states[:, 0], self.p)[: self.n_x]
+
+        def finer(a, x, b):
+            times = np.linspace(a, b, FINER + 1)
+            inside = stretch.dense(steps_of(stretch.t, times[1:]), times[1:])
+            both = np.column_stack([x, inside])
+            return times, both, self.f.grid(times, both, self.p)[: self.n_x]
+
+        end = self.watch.torn(t, states, np.column_stack([start, rates[:, :count]]), finer)
+        return end if end is None else replace(end, steps=int(steps_of(stretch.t, np.array([end.t]))[0]))
+
+    def _slack(self, k, h):
+        """How far the dense output of steps k (N,) of lengths h may be beyond the tolerance."""
+        return 0.0
 
     def _record(self, steps, first, last, end=None):
         """Record the pending samples from the start of step `first` to the start of step `last`, or an end within."""
@@ -73,12 +169,20 @@ class BulkSteps(Stepping):
             return
         step = first + np.searchsorted(direction * steps.t[first : last + 1], direction * times, "right") - 1
         states = steps.x[:, np.clip(step, 0, last)]
-        for k in np.unique(step[step < last + (end is not None)]):
-            states[:, step == k] = steps.at(k, times[step == k])
-        states = self._settled(times, states)
+        inside = (step < last + (end is not None)) & (times != steps.t[np.clip(step, 0, last)])
+        states[:, inside] = self._settled(times[inside], steps.at(step[inside], times[inside]))
         top = self.f.grid(times, states, self.p)[self.n_x - self.model.n : self.n_x]
         self.motion.add(self.model, times, states, top)
 
     def _settled(self, times, states):
         """States of samples, projected if the method projects."""
         return states
+
+
+def differentiated(dense, t, k, times):
+    """Derivatives of dense output (k, times) -> (n_x, N) by central differences within steps of ends t (S + 1,)."""
+    h, n = np.diff(t)[k], len(times)
+    offsets = np.array([-2, -1, 1, 2])
+    around = (times + (SPACING * offsets)[:, None] * h).ravel()
+    two, one, next_one, next_two = np.split(dense(np.tile(k, len(offsets)), around), np.arange(1, 4) * n, axis=1)
+    return (8 * (next_one - one) - (next_two - two)) / (12 * SPACING * h)

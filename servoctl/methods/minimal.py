@@ -5,6 +5,9 @@ are rows (at level 0, with the invariants of the kinematics, components of q). T
 Pivoted QR chooses them, and chooses again when the choice degrades. Nothing is left to drift.
 """
 
+from copy import copy
+from dataclasses import dataclass
+
 import numpy as np
 
 from servoctl.errors import IntegrationStopped
@@ -270,6 +273,11 @@ class MinimalSolver:
         return "failed" if self.lost else self.solver.status
 
     @property
+    def t_bound(self):
+        """The end of the integration [s]."""
+        return self.solver.t_bound
+
+    @property
     def work(self):
         """(nfev, njev, nlu) over all choices of coordinates."""
         return self.done + (self.solver.nfev, self.solver.njev, self.solver.nlu)
@@ -296,18 +304,36 @@ class MinimalSolver:
         return message
 
     def dense_output(self):
-        """X as a function of time within the last step."""
-        inner, (t0, x0), t1, x1 = self._dense, self._before, self.t, self.y
-        slope = (x1 - x0) / (t1 - t0) if t1 != t0 else np.zeros_like(x1)
-        return lambda s: self._between(s, inner(s), x0 + (s - t0) * slope)
+        """X as a function of times (N,) within the last step."""
+        return Dense(copy(self.chart), self._dense, (*self._before, self.t, self.y))
 
-    def _between(self, t, y, near):
-        x = self.chart.lift(t, y, near)
-        if not np.all(np.isfinite(x)):
-            raise IntegrationStopped(
-                f"Newton's method finds no solution of the constraints at t = {t:.7g} s, within a step.",
-                "The values that are not integrated are solved from the constraints.",
-                do="Use a smaller rtol, or drift='project', which solves nothing within a step.",
-                t=float(t),
-            )
-        return x
+
+@dataclass(frozen=True)
+class Dense:
+    """States within a step from (t0, x0) to (t1, x1), solved from its dense output for the integrated values."""
+
+    chart: Chart
+    inner: object
+    ends: tuple
+
+    def __call__(self, times):
+        """States (n_x, N)."""
+        return np.array([self._state(t) for t in times]).reshape(len(times), -1).T
+
+    def integrated(self, times):
+        """The integrated values at their places (n_x, N), NaN at others."""
+        states = np.full((len(self.ends[1]), len(times)), np.nan)
+        states[self.chart.free] = self.inner(times)
+        return states
+
+    def _state(self, t):
+        t0, x0, t1, x1 = self.ends
+        x = self.chart.lift(t, self.inner(t), x0 + (t - t0) * (x1 - x0) / (t1 - t0))
+        if np.all(np.isfinite(x)):
+            return x
+        raise IntegrationStopped(
+            f"Newton's method finds no solution of the constraints at t = {t:.7g} s, within a step.",
+            "The values that are not integrated are solved from the constraints.",
+            do="Use a smaller rtol, or drift='project', which solves nothing within a step.",
+            t=float(t),
+        )

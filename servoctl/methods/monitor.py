@@ -140,15 +140,18 @@ class DenseStretch(Stretch):
     Attributes
     ----------
     dense : callable
-        X from (k, t).
+        States (n_x, N) from steps k (N,) and times (N,).
     pivots_at : callable
         Pivots from (t, X).
+    slope : callable or None
+        Its derivatives, from steps and times as well; NaN for entries that the method does not integrate.
     resumes : bool
         Whether the dense output is as accurate as the steps, so that the motion may go on from within a step.
     """
 
     dense: object = None
     pivots_at: object = None
+    slope: object = None
     resumes: bool = False
 
     def instants(self, k):
@@ -160,16 +163,19 @@ class DenseStretch(Stretch):
         """Pivots (n_g, N) at `instants` except the start, evaluated if only those of the end are known."""
         if self.pivots.shape[2] > 1:
             return self.pivots[:, k]
-        inner = [self.pivots_at(s, self.dense(k, s)) for s in self.instants(k)[1:-1]]
+        inner = [self.pivots_at(s, self._inside(k, s)) for s in self.instants(k)[1:-1]]
         return np.column_stack([*inner, self.pivots[:, k]])
 
     def state(self, k, t):
         """X from the steps at their ends, from the dense output in between."""
         at = {self.t[k]: k, self.t[k + 1]: k + 1}.get(t)
-        return self.dense(k, t) if at is None else self.x[:, at]
+        return self._inside(k, t) if at is None else self.x[:, at]
+
+    def _inside(self, k, t):
+        return self.dense(np.array([k]), np.array([t]))[:, 0]
 
     def _pivot(self, k, i, t):
-        return self.pivots_at(t, self.dense(k, t))[i]
+        return self.pivots_at(t, self._inside(k, t))[i]
 
     def zero(self, k, i, ends, sizes):
         """The root of pivot i between two instants."""

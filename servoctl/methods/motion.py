@@ -12,6 +12,8 @@ from servoctl.methods.watch import End, Watch, edge, no_model, sticks
 from servoctl.reduction.orders import other_order
 
 DEFAULT_SAMPLES = 1001  # without t_eval: smooth curves, and extrema refined to rounding
+SAME_INSTANT = 1e-12  # of the time: instants closer than this are one
+BESIDE_KNOTS = 0.1  # of that: how far before and after a knot a piece ends and begins, with all stages on its own side
 ADVICE = "Use a smaller rtol, another method or drift='project', or check whether the program ends or jumps there."
 
 
@@ -82,12 +84,16 @@ def interruptible(motion):
         motion.interrupted = True
 
 
+def margin_at(t):
+    """Distance from an instant [s] within which another is the same."""
+    return SAME_INSTANT * max(1.0, abs(t))
+
+
 def breakpoints(span, knots):
     """The span cut at the knots inside it, in the direction of integration."""
     t0, t1 = span
     low, high = min(span), max(span)
-    margin = 1e-12 * max(1.0, abs(low), abs(high))
-    inside = [k for k in knots if low + margin < k < high - margin]
+    inside = [k for k in knots if low + margin_at(low) < k < high - margin_at(high)]
     return [t0, *(inside if t1 >= t0 else reversed(inside)), t1]
 
 
@@ -95,6 +101,30 @@ def equal_steps(a, b, step):
     """Length [s] and number of equal steps from a to b, the longest that are at most `step`; negative backwards."""
     count = max(1, int(np.ceil(abs(b - a) / step * (1 - 1e-12))))
     return (b - a) / count, count
+
+
+@dataclass(frozen=True)
+class Cubics:
+    """A motion through states x (n_x, S + 1) with rates (n_x, S + 1) at times t (S + 1,), by Hermite's polynomials."""
+
+    t: np.ndarray
+    x: np.ndarray
+    rates: np.ndarray
+
+    def at(self, k, times):
+        """States (n_x, N) at times (N,) in the intervals k (N,)."""
+        h = np.diff(self.t)[k]
+        s = (times - self.t[k]) / h
+        rise = (3.0 - 2.0 * s) * s**2
+        bend = (1.0 - s) * self.rates[:, k] - s * self.rates[:, k + 1]
+        return self.x[:, k] + rise * (self.x[:, k + 1] - self.x[:, k]) + h * s * (1.0 - s) * bend
+
+    def slope(self, k, times):
+        """Their derivatives."""
+        h = np.diff(self.t)[k]
+        s = (times - self.t[k]) / h
+        bend = (1.0 - s) * (1.0 - 3.0 * s) * self.rates[:, k] - s * (2.0 - 3.0 * s) * self.rates[:, k + 1]
+        return 6.0 * s * (1.0 - s) * (self.x[:, k + 1] - self.x[:, k]) / h + bend
 
 
 class Stepping:
@@ -120,6 +150,7 @@ class Stepping:
     tolerances = None  # rtol and atol; None for steps of fixed length
     parts = 8  # of a step, at whose ends switching functions are evaluated; 1 where steps are short
     projects = False  # whether ends of steps are projected before they are inspected
+    knots = frozenset()  # inside the span
     again = None  # shorter equal steps, where steps are of fixed length
 
     def __init__(self, model, method, drift, progress):
@@ -155,6 +186,7 @@ class Stepping:
         with interruptible(self.motion):
             self._watch(t0, x0, t1)
             t, x, cuts = t0, x0, breakpoints((t0, t1), knots)
+            self.knots = {c for c in cuts if any(abs(c - k) <= margin_at(c) for k in knots)}
             self._start(t, x, cuts[1])
             for b in cuts[1:]:
                 while t != b and self.motion.stop is None and not self.motion.ended:
@@ -162,11 +194,16 @@ class Stepping:
                     t, x = self._piece(t, x, b, t_eval[due])
         return self.motion
 
+    def _beside(self, a, b):
+        """The ends of a piece, moved inwards where they are knots: on a knot a jump has the value beyond, or before."""
+        forward = np.copysign(BESIDE_KNOTS, b - a)
+        return a + forward * margin_at(a) * (a in self.knots), b - forward * margin_at(b) * (b in self.knots)
+
     def _watch(self, t, x, t1):
         """Watch for the ends of smooth pieces, from the start on."""
         exact = isinstance(self.drift, MinimalCoordinates)
         self.watch = Watch(self.tolerances, abs(t1 - t), self.family, exact, self.parts)
-        self.watch.advice = self.advice if self.tolerances is None else ADVICE
+        self.watch.method, self.watch.advice = self.method, self.advice if self.tolerances is None else ADVICE
         branches = () if self.family is None else self.family.branches(t, x)
         self.watch.use(self.model, branches, self._error_dynamics())
 
@@ -214,7 +251,7 @@ class Stepping:
     def _smooth(self, stretch):
         """The outcome of steps: that of the monitor, or the `End` of the smooth piece if it comes first."""
         state = self._state_within(stretch)
-        switch = self.watch.switch(stretch, state)
+        switch = self.watch.switch(stretch, self._states_within(stretch), state) if self.family is not None else None
         if switch is not None:
             stretch = stretch.first(switch.steps)
         outcome = self.monitor.inspect(stretch) if len(stretch.t) > 1 else Fine(0)
@@ -223,8 +260,12 @@ class Stepping:
             return left
         return switch if switch is not None and isinstance(outcome, Fine) else outcome
 
+    def _states_within(self, stretch):
+        """X (n_x, N) from steps (N,) and times (N,), where switches are looked for."""
+        return stretch.dense
+
     def _state_within(self, stretch):
-        """X from (k, t) within steps."""
+        """X from (k, t) within steps, where ends of smooth pieces are located."""
         return stretch.state
 
     def _turn(self, end, b):

@@ -188,9 +188,15 @@ def settle(f, t, x, p):
     return rows.T
 
 
-def inside(order, theta, z):
-    """Increments at fractions theta (N,) of steps from their stages z (..., s, n_x): (..., N, n_x)."""
-    return np.einsum("jm,...jl->...ml", basis(radau(order)[0], np.asarray(theta)), z)
+def basis_slopes(c, theta):
+    """Derivatives of these polynomials."""
+    nodes = np.append(0.0, c)
+    result = []
+    for j in range(1, len(nodes)):
+        others = np.delete(nodes, j)
+        products = (np.prod(theta - np.delete(others, i)[:, None], axis=0) for i in range(len(others)))
+        result.append(sum(products) / np.prod(nodes[j] - others))
+    return np.array(result)
 
 
 def first_step(f, t, x, p, span, settings):
@@ -235,13 +241,16 @@ class Steps:
     z: np.ndarray
 
     def at(self, k, times):
-        """States (n_x, N) at times (N,) within step k, by the collocation polynomial."""
-        theta = (times - self.t[k]) / (self.t[k + 1] - self.t[k])
-        return self.x[:, [k]] + inside(self.order, theta, self.z[k]).T
+        """States (n_x, N) at times (N,) within steps k (N,), by the collocation polynomials."""
+        return self.x[:, k] + self._sum(basis, k, times)
 
-    def within(self, theta):
-        """States (n_x, S, N) at fractions theta (N,) of all steps."""
-        return self.x[:, :-1, None] + np.moveaxis(inside(self.order, theta, self.z), 2, 0)
+    def slope(self, k, times):
+        """Their derivatives."""
+        return self._sum(basis_slopes, k, times) / np.diff(self.t)[k]
+
+    def _sum(self, weights, k, times):
+        theta = (times - self.t[k]) / np.diff(self.t)[k]
+        return np.einsum("jm,mjl->lm", weights(radau(self.order)[0], theta), self.z[k])
 
 
 class RadauSteps(BulkSteps):
@@ -317,7 +326,9 @@ class RadauSteps(BulkSteps):
         self.h = abs(h)
 
     def _steps(self, t, x, b):
-        t, x, z, self.h, counts = radau_steps(self.f, t, x, b, self.p, self.h, self.settings, self.most)
+        first, last = self._beside(t, b)
+        times, x, z, self.h, counts = radau_steps(self.f, first, x, last, self.p, self.h, self.settings, self.most)
+        t = np.concatenate([[t], times[1:-1], [b if times[-1] == last else times[-1]]])[: len(times)]
         self.motion.count(steps=len(z), **dict(zip(("rejected", "nfev", "njev", "nlu"), counts, strict=True)))
         if self.every:
             self.motion.count(projections=len(z) // self.every)

@@ -6,8 +6,8 @@ from servoctl.errors import unknown
 from servoctl.methods.choice import ORDERS, MinimalCoordinates, Project
 from servoctl.methods.minimal import Chart, Sizes
 from servoctl.methods.monitor import DEGRADED, Fine, Singular, Stretch
-from servoctl.methods.motion import Stepping, equal_steps
-from servoctl.methods.watch import End
+from servoctl.methods.motion import Cubics, Stepping, equal_steps
+from servoctl.methods.watch import FINER, End
 
 NEARLY_ZERO = 0.3  # of its reference: below this a pivot's least size is searched for within steps
 
@@ -64,6 +64,7 @@ class RungeKuttaSteps(Stepping):
     rank_lost = "the state is no longer finite"
     advice = "Use a smaller step (stable below about 2.8 over the largest eigenvalue), slower poles, or 'DOP853'."
     parts = 1
+    _changed = np.zeros(0, dtype=bool)  # before which of the last steps coordinates were chosen again
     most, most_in_python = 2000, 100  # steps per call of the compiled loop, and of the one on minimal coordinates
 
     def __init__(self, model, method, drift, step, progress):
@@ -82,6 +83,8 @@ class RungeKuttaSteps(Stepping):
 
     def _piece(self, a, x, b, times):
         h, count = equal_steps(a, b, self.step)
+        first, last = self._beside(a, b)
+        inner = (last - first) / count
         # each call ends with a projection where steps are projected, so that the next one counts from there
         most = self.most - self.most % self.every if 0 < self.every < self.most else self.every or self.most
         most, done = self.most_in_python if self.sizes else most, 0
@@ -89,7 +92,7 @@ class RungeKuttaSteps(Stepping):
         self.watch.begin(a)
         while done < count and self.motion.stop is None:
             steps = min(most, count - done)
-            states, pivots = self._steps(a + done * h, x, h, steps)
+            states, pivots = self._steps(first + done * inner, x, inner, steps)
             t = a + (done + np.arange(states.shape[1])) * h
             outcome = self._inspect(t, states, pivots)
             good = outcome.steps
@@ -136,19 +139,41 @@ class RungeKuttaSteps(Stepping):
     def _inspect(self, t, states, pivots):
         """The monitor's outcome; a step across a pivot's zero has passed no error test and is repeated."""
         outcome = self._inspected(Stretch(t, states, pivots[:, 1:, None], self._top))
+        if (self.sizes or self.every) and outcome.steps:
+            first = slice(outcome.steps + 1)
+            torn = self.watch.torn(t[first], states[:, first], self._all_rates(t[first], states[:, first]), self._finer)
+            outcome = outcome if torn is None else torn
         if self.sizes and len(t) > 1 and len(pivots):
             touched = self._touched(t, states, pivots)
             if touched is not None and touched.steps <= outcome.steps + 1:
                 return touched
         return outcome
 
+    def _states_within(self, stretch):
+        """X from steps and times within them, by cubics."""
+        rates = self.f.grid(stretch.t, stretch.x, self.p)[: self.n_x]
+        return Cubics(stretch.t, stretch.x, rates).at
+
     def _state_within(self, stretch):
         """X from (k, t) within steps, by a shorter step from their start."""
-        return lambda k, t: self._steps(stretch.t[k], stretch.x[:, k], t - stretch.t[k], 1)[0][:, -1]
+        return lambda k, t: self.again(stretch.t[k], stretch.x[:, k], t - stretch.t[k], 1)[:, -1]
 
     def again(self, t, x, h, count):
         """States (n_x, count + 1) at the ends of equal steps from t; fewer if one fails."""
-        return self._steps(t, x, h, count)[0]
+        changed = self._changed
+        states = self._steps(t, x, h, count)[0]
+        self._changed = changed
+        return states
+
+    def _all_rates(self, t, states):
+        return self.f.grid(t, states, self.p)[: self.n_x]
+
+    def _finer(self, t, x, end):
+        """Instants, states and rates of shorter steps; what a state has drifted since its projection is no jump."""
+        x = self.f.restore(t, x, self.p) if self.every else x
+        states = self.again(t, x, (end - t) / FINER, FINER)
+        times = np.linspace(t, end, FINER + 1)[: states.shape[1]]
+        return times, states, self._all_rates(times, states)
 
     def _touched(self, t, states, pivots):
         """Singular if a pivot touches zero within a step, else None.

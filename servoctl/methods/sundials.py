@@ -14,8 +14,10 @@ import numpy as np
 
 from servoctl.methods.bulk import BulkSteps
 from servoctl.methods.choice import Poles
+from servoctl.methods.motion import Cubics
 
 WATCHED = 1000  # intervals of a span at whose ends pivots are inspected, beside the samples
+SLACK = 0.5  # times the change of the rates over an interval, by which its cubic may miss them
 MOST_STEPS = 20_000  # between two instants of the grid
 SOLVERS = {"CVODES": "cvodes", "IDAS": "idas"}
 COUNTS = {"steps": "nsteps", "nfev": "nfevals", "nlu": "nlinsetups"}
@@ -85,6 +87,7 @@ class Sundials:
             form = ca.Function("form", [e.q.t, e.state, z, ca.vertcat(e.parameters, *extra)], [e.rates(z), residual])
             rates, rows = form(way[0] + way[1] * t, e.state, z, p)
             self.parts = parts | {"z": z, "ode": way[1] * rates, "alg": rows}
+            self.rates = ca.Function("rates", [e.state, z, parts["p"]], [ca.substitute(way[1] * rates, t, 0.0)])
         else:
             self.parts = parts | {"ode": way[1] * f(way[0] + way[1] * t, e.state, p)[: self.n_x]}
 
@@ -114,6 +117,7 @@ class Sundials:
         inputs = {"x0": x0, "p": p}
         if self.solver == "idas":  # γ^(s̄) starts without a rate, so that no first step would pass a test of its error
             inputs["z0"], options["suppress_algebraic"] = top, True
+            options |= {"calc_ic": False, "init_xdot": self.rates(x0, top, p).full().ravel().tolist()}
         low, high, states, counts = 0, len(t), None, {}
         count = high  # the integrator returns nothing if it fails: bisection finds the last end that it reaches
         while low + 1 < high or states is None:
@@ -150,29 +154,10 @@ def sundials_solver(model, solver, poles=False):
 
 
 @dataclass(frozen=True)
-class Grid:
-    """A motion on a grid t (S + 1,): states and rates (n_x, S + 1), cubics in between; `failed` after its end."""
+class Grid(Cubics):
+    """A motion on a grid; `failed` after its end."""
 
-    t: np.ndarray
-    x: np.ndarray
-    rates: np.ndarray
     failed: bool
-
-    def at(self, k, times):
-        """States (n_x, N) at times (N,) between instants k and k + 1."""
-        theta = (times - self.t[k]) / (self.t[k + 1] - self.t[k])
-        return self._cubic(theta, *(v[:, [i]] for v in (self.x, self.rates) for i in (k, k + 1)), np.diff(self.t)[k])
-
-    def within(self, theta):
-        """States (n_x, S, N) at fractions theta (N,) of all intervals."""
-        ends = (v[:, part, None] for v in (self.x, self.rates) for part in (slice(None, -1), slice(1, None)))
-        return self._cubic(theta, *ends, np.diff(self.t)[:, None])
-
-    @staticmethod
-    def _cubic(s, x0, x1, slope0, slope1, h):
-        """Hermite's polynomial of degree 3."""
-        rise = (3.0 - 2.0 * s) * s**2
-        return x0 + rise * (x1 - x0) + h * s * (1.0 - s) * ((1.0 - s) * slope0 - s * slope1)
 
 
 class SundialsSteps(BulkSteps):
@@ -223,4 +208,8 @@ class SundialsSteps(BulkSteps):
         states, counts = self.solver.run(grid, x, self._top(t, x), self.p, *self.tolerances)
         self.motion.count(**counts)
         t, failed = grid[: states.shape[1]], states.shape[1] < len(grid)
-        return Grid(t, states, self.f.grid(t, states, self.p)[: self.n_x], failed)
+        self.grid = Grid(t, states, self.f.grid(t, states, self.p)[: self.n_x], failed)
+        return self.grid
+
+    def _slack(self, k, h):
+        return SLACK * np.abs(np.diff(self.grid.rates)[:, k] * h[k])

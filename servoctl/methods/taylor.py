@@ -16,7 +16,8 @@ from servoctl.jets.tape import Tape
 from servoctl.methods.choice import Project
 from servoctl.methods.monitor import DenseStretch, Fine, Repivot
 from servoctl.methods.motion import Stepping
-from servoctl.methods.watch import End
+from servoctl.methods.narrow import arguments, centres
+from servoctl.methods.watch import RESOLUTION, End, net, steps_of
 from servoctl.reduction.ranks import clean, eliminate
 
 LOWEST, HIGHEST = 4, 24  # orders: below, steps are too short; above, compiling grows faster than steps
@@ -238,7 +239,7 @@ class TaylorSteps(Stepping):
         until = b
         while a != b and self.motion.stop is None:
             t, states, y = self.f.taylor(a, x, until, self.p, *self.tolerances, self.most, self.every)
-            taken, good = y.shape[1], self._believed(t, states, y, times, abs(b - a))
+            taken, good = y.shape[1], self._believed(t, states, y, abs(b - a))
             if good < taken:
                 until = (t[good] + t[good + 1]) / 2  # the next step ends there
                 t, states, y = t[: good + 1], states[:, : good + 1], y[:, :good]
@@ -265,20 +266,15 @@ class TaylorSteps(Stepping):
             self._sample(np.array([a, a]), np.column_stack([x, x]), self._outputs(a, x)[:, None], times, a)
         return a, x
 
-    def _believed(self, t, states, y, times, span):
-        """The number of steps whose series meet the equations, at samples within them and at further instants.
+    def _believed(self, t, states, y, span):
+        """The number of steps whose series meet the equations, at instants within them.
 
         A series at one state knows nothing of what is flat there, such as exp(-(100 (t - 3))²) at t = 0.
         """
         h, n = np.diff(t), self.n
         if not len(h):
             return 0
-        at = (t[:-1, None] + INSIDE * h[:, None]).ravel()
-        forward = np.copysign(1.0, h[0])
-        at = np.concatenate([at, times[(forward * times > forward * t[0]) & (forward * times < forward * t[-1])]])
-        k = np.clip(np.searchsorted(forward * t, forward * at, "right") - 1, 0, len(h) - 1)
-        within = at != t[k]  # where paths have other branches
-        at, k = at[within], k[within]
+        k, at = self._instants(t, states, y)
         jets = self._jets(states[:, k], y[:, k], at - t[k], self.top)
         rates = self.rates.grid(at, jets[: self.n_x], self.model.parameters)[self.n_x - n : self.n_x]
         rtol, atol = self.tolerances
@@ -286,6 +282,26 @@ class TaylorSteps(Stepping):
         error = np.abs(h[k] * (rates - jets[-n:])).max(axis=0)
         wrong = (error > FAR_OFF * (atol + rtol * sizes)) & (np.abs(h[k]) > SMALLEST * span)
         return int(k[wrong].min(initial=len(h)))
+
+    def _instants(self, t, states, y):
+        """Steps and instants within them at which series are compared with the equations."""
+        h = np.diff(t)
+        each, further, ends = net(t, self.watch.span / RESOLUTION, 1)
+        k = np.concatenate([np.repeat(np.arange(len(h)), len(INSIDE)), each[~ends]])
+        at = np.concatenate([(t[:-1, None] + INSIDE * h[:, None]).ravel(), further[~ends]])
+        steep = arguments(self.model)
+        if steep is not None:
+            order = np.lexsort((at * np.sign(h[0]), k))
+            parts = np.append(t[:1], at[order]), np.append(0, k[order])
+
+            def dense(s):
+                i = steps_of(t, s)
+                return self._jets(states[:, i], y[:, i], s - t[i], self.top - 1)
+
+            more = centres(steep, self.model.parameters, parts[0], dense(parts[0]), dense)
+            k, at = np.append(k, steps_of(t, more)), np.append(at, more)
+        within = at != t[k]  # where paths have other branches
+        return k[within], at[within]
 
     def _stretch(self, t, states, y):
         """The steps for the monitor; pivots inside them cost a series each, so only suspicious steps evaluate them."""
@@ -295,7 +311,7 @@ class TaylorSteps(Stepping):
             states,
             ends[:, :, None],
             self._top,
-            dense=lambda k, s: self._jets(states[:, [k]], y[:, [k]], np.array([s - t[k]]), self.top - 1)[:, 0],
+            dense=lambda k, s: self._jets(states[:, k], y[:, k], s - t[k], self.top - 1),
             pivots_at=self._pivots,
             resumes=True,
         )

@@ -7,7 +7,6 @@ adds to that is its error. Where the program ends (an angle whose sine passes 1)
 
 from dataclasses import dataclass
 from functools import cached_property
-from itertools import pairwise
 from math import factorial
 
 import casadi as ca
@@ -29,9 +28,11 @@ FINER = 16  # equal steps in place of one of fixed length that errs by far
 REMAINS = 0.75  # of its error in these: it is a jump, since other errors shrink, at least to a half with each halving
 LEARNED = 10.0  # times the error of a step of fixed length, which later ones may have
 MOST_INSPECTED = 128  # steps of a stretch whose residuals are evaluated
+LOCATED_BY_PARTS = 8  # divisions into `FINER` parts that locate where states jump
 LOCATED = 40  # halvings of a step that locate where a residual leaves: all digits
 EDGE = 1e-3  # distance of a function's argument from the edge of its domain that explains why a residual leaves
 AT_ONCE = 1e-9  # of the span: switches closer than this follow at once
+RESOLUTION = 1000  # instants of a span, at least, at which switching functions and equations are inspected within steps
 BESIDE_ENDS = 1e-3  # of a step: instants next to its ends, which show where a function has its least value across steps
 NEAR_ZERO = 0.2  # of a function's values beside its least one: a vertex below this is looked at closely
 MOST_AT_ONCE = 2  # changes of one branch at once, after which the motion stays on the switch
@@ -67,6 +68,33 @@ class End:
     event: str = ""
 
 
+def steps_of(t, times):
+    """The steps with ends t (S + 1,) in which times (N,) lie; an end belongs to the following step."""
+    forward = 1.0 if t[-1] >= t[0] else -1.0
+    return np.clip(np.searchsorted(forward * t, forward * times, "right") - 1, 0, len(t) - 2)
+
+
+def net(t, distance, least):
+    """Instants within steps with ends t (S + 1,), in at least so many equal parts, no longer than a distance [s].
+
+    Returns
+    -------
+    k : (N,) array of int
+        Their steps.
+    at : (N,) array
+        In the order of the motion, ends of steps included [s].
+    common : (N,) array of bool
+        Ends of the least parts, which all steps have.
+    """
+    h = np.diff(t)
+    parts = least * np.maximum(np.ceil(np.abs(h) / (least * distance)), 1).astype(int)
+    k, last = np.repeat(np.arange(len(h)), parts), np.cumsum(parts) - 1
+    j = 1 + np.arange(len(k)) - np.repeat(last - parts + 1, parts)
+    at = t[k] + h[k] * (j / parts[k])
+    at[last] = t[1:]
+    return k, at, j * least % parts[k] == 0
+
+
 class Tolerance:
     """The tolerances of the state along a motion, and of functions of it.
 
@@ -85,6 +113,10 @@ class Tolerance:
     def of(self, slopes, x):
         """Tolerances (m, N) of functions with derivatives (m, n_x, N) in X = x (n_x, N) along the motion."""
         return np.einsum("mxn,xn->mn", np.abs(slopes), self.atol + self.rtol * self._sizes(x))
+
+    def of_states(self, x):
+        """Tolerances (n_x, N) of states X (n_x, N) along the motion."""
+        return self.atol + self.rtol * self._sizes(x)
 
     def accept(self, x):
         """Take in states (n_x, N) as part of the motion."""
@@ -123,9 +155,13 @@ class Switches:
         self.family, self.span, self.parts = family, span, parts
         self.counts, self.rested, self.start, self.branches, self.tolerance = {}, set(), 0.0, (), None
 
-    def first(self, stretch, state):
-        """The first switch within steps as an `End`, or None; `state` gives X from (k, t)."""
-        t, x = self._instants(stretch, state)
+    def first(self, stretch, states, state):
+        """The first switch within steps as an `End`, or None.
+
+        `states` gives X (n_x, N) from steps (N,) and times (N,), where switches are looked for; `state` from (k, t),
+        where one is located.
+        """
+        t, x = self._instants(stretch, states)
         functions, slopes, _ = self.family.values(self.branches, t, x)
         allowed = self.tolerance.of(slopes, x)
         wrong = functions < -allowed
@@ -152,7 +188,7 @@ class Switches:
         Where a function has a least value among three instants, the parabola through them shows whether it comes near
         zero between them; its true minimum decides.
         """
-        if self.parts == 1 or len(t) < 3:
+        if len(t) < 3:
             return None
         before, here, after = functions[:, :-2], functions[:, 1:-1], functions[:, 2:]
         with np.errstate(all="ignore"):
@@ -176,16 +212,17 @@ class Switches:
         found = minimize_scalar(function, bounds=sorted((a, b)), method="bounded", options={"xatol": 1e-9 * abs(b - a)})
         return found.x, found.fun
 
-    def _instants(self, stretch, state):
+    def _instants(self, stretch, states):
         """Instants (N,) and states (n_x, N) at which the functions are evaluated: ends of steps, and parts of them."""
-        if self.parts == 1:
-            return stretch.t, stretch.x
-        inside = np.array([BESIDE_ENDS, *(np.arange(1, self.parts) / self.parts), 1 - BESIDE_ENDS])
-        t, x = [stretch.t[:1]], [stretch.x[:, 0]]
-        for k, (a, b) in enumerate(pairwise(stretch.t)):
-            t += [a + (b - a) * inside, [b]]
-            x += [*(state(k, s) for s in t[-2]), stretch.x[:, k + 1]]
-        return np.concatenate(t), np.array(x).T
+        k, at, _ = net(stretch.t, self.span / RESOLUTION, self.parts)
+        h, every = np.diff(stretch.t), np.arange(len(stretch.t) - 1)
+        beside = np.concatenate([stretch.t[:-1] + BESIDE_ENDS * h, stretch.t[1:] - BESIDE_ENDS * h])
+        k, at = np.concatenate([k, every, every]), np.concatenate([at, beside])
+        order = np.lexsort((at if h[0] > 0 else -at, k))
+        k, at = k[order], at[order]
+        x, last = states(k, at), np.append(k[1:] > k[:-1], True)
+        x[:, last] = stretch.x[:, 1:]
+        return np.append(stretch.t[:1], at), np.column_stack([stretch.x[:, :1], x])
 
     def _root(self, i, a, b, state):
         from scipy.optimize import brentq
@@ -314,8 +351,11 @@ class Residuals:
             over = np.abs(residuals) - limit - self.coarse[:, None]
         return np.where(np.isnan(residuals), np.inf, np.nan_to_num(over, nan=-1.0, posinf=np.inf, neginf=-1.0))
 
-    def error(self, t, x, over, advice):
-        """The error of the residual that is farthest beyond what it may be at t, X = x; `advice` where why is open."""
+    def error(self, t, x, over, step, advice):
+        """The error of the residual that is farthest beyond what it may be at t, X = x, in a `step`, in words.
+
+        `advice` is for where why is open.
+        """
         values, allowed = (part[:, 0] for part in self.values(np.array([t]), x[:, None]))
         worst = int(np.argmax(np.where(over > 0, over / np.maximum(allowed, TINY), -1.0)))
         name, value = self.names[worst], float(values[worst])
@@ -323,7 +363,7 @@ class Residuals:
         what = f"The residual {name!r}" if row is None else f"The rate {name} of the residual {row.name!r}"
         why = edge(self.model, t, x)
         return IntegrationStopped(
-            f"{what} leaves zero at t = {t:.7g} s, to {value:.3g} within a step{why and f': {why}'}.",
+            f"{what} leaves zero at t = {t:.7g} s, to {value:.3g} within a step {step}{why and f': {why}'}.",
             f"The tolerances of the method allow it {allowed[worst]:.1e}; beyond, this is no motion of the program.",
             do=f"{END_BEFORE if why else advice} The run before this instant is in .run.",
             t=t,
@@ -372,13 +412,14 @@ class Watch:
         self.span = span
         self.tolerances, self.family, self.exact = tolerances or DEFAULT, family, exact
         self.switches = None if family is None else Switches(family, span, parts)
-        self.model = self.tolerance = None
-        self.advice = ""
+        self.model = self.tolerance = self.rough = None
+        self.method, self.advice = "", ""
 
     def use(self, model, branches, coefficients=()):
         """Watch the motion of a model, which is the one for these branches."""
         if self.tolerance is None:
             self.tolerance = Tolerance(model, *self.tolerances)
+            self.rough = np.zeros(len(model.state_names))
         self.model, tolerance = model, self.tolerance
         self.residuals = None if self.exact else Residuals(model, tolerance, coefficients)
         if self.switches is not None:
@@ -398,9 +439,9 @@ class Watch:
         if self.switches is not None:
             self.switches.start = t
 
-    def switch(self, stretch, state):
-        """The first switch within steps as an `End`, or None."""
-        return None if self.switches is None else self.switches.first(stretch, state)
+    def switch(self, stretch, states, state):
+        """The first switch within steps as an `End`, or None; see `Switches.first`."""
+        return None if self.switches is None else self.switches.first(stretch, states, state)
 
     def left(self, stretch, state, again=None, projected=False):
         """Where a residual leaves its tolerance within steps, as an `End`, or None.
@@ -428,7 +469,7 @@ class Watch:
         if not projected and self.residuals.small(t, x):
             self.tolerance.accept(x)
             return None
-        ends = np.array([stretch.dense(k, stretch.t[k + 1]) for k in range(count)]).T if projected else stretch.x[:, 1:]
+        ends = stretch.dense(np.arange(count), stretch.t[1:]) if projected else stretch.x[:, 1:]
         over = self.residuals.off(np.array([t[:-1], t[1:]]), x[:, :-1], ends[:, picked[1:] - 1])
         for p in np.flatnonzero((over > 0).any(axis=0)):
             for k in range(picked[p], picked[p + 1]):
@@ -440,6 +481,55 @@ class Watch:
         self.tolerance.accept(x)
         self.residuals.accept()
         return None
+
+    def torn(self, t, x, rates, finer):
+        """Where states that are solved for, or projected, jump although their rates do not, as an `End`, or None.
+
+        Parameters
+        ----------
+        t : (S + 1,) array
+            [s]
+        x, rates : (n_x, S + 1) arrays
+            States, and X' there.
+        finer : callable
+            The same (t, x, rates) at more instants from (t0, x0, t1).
+        """
+        beyond = self._beyond_rates(t, x, rates)
+        for k in np.flatnonzero((beyond > self.rough[:, None]).any(axis=0)):
+            i = int(np.argmax(beyond[:, k] - self.rough))
+            height, place = beyond[i, k], (t[k], x[:, k], t[k + 1])
+            for _ in range(LOCATED_BY_PARTS):
+                parts = finer(*place)
+                within = self._beyond_rates(*parts)[i]
+                j = int(np.argmax(within))
+                if not within[j] > REMAINS * height:
+                    self.rough[i] = max(self.rough[i], LEARNED * height)
+                    break
+                place = parts[0][j], parts[1][:, j], parts[0][j + 1]
+            else:
+                end = self._torn_at(k, t[k + 1] - t[k], parts[2][:, j], *place)
+                if end is not None:
+                    return end
+        return None
+
+    def _beyond_rates(self, t, x, rates):
+        """How much more states change from instant to instant than their rates there explain, (n_x, S)."""
+        h = np.diff(t)
+        with np.errstate(all="ignore"):
+            change = np.abs(np.diff(x) - h * (rates[:, 1:] + rates[:, :-1]) / 2)
+            beyond = change - np.abs(h * np.diff(rates)) - LEAVES * self.tolerance.of_states(x)[:, 1:]
+        return np.nan_to_num(beyond, nan=-1.0, posinf=-1.0, neginf=-1.0)
+
+    def _torn_at(self, k, h, rates, t, x, after):
+        """The end at t, X = x, before a jump of the states; None if they leave no residual, carried over it."""
+        carried, residuals = x + (after - t) * rates, Residuals(self.model, self.tolerance)
+        values, allowed = residuals.values(np.array([after]), carried[:, None])
+        over = (np.abs(values) - allowed)[:, 0]
+        if not np.any(over > 0):
+            return None
+        step = f"of {abs(h):.3g} s by {self.method}"
+        error = residuals.error(float(after), carried, over, step, self.advice)
+        return End(k, float(t), x, error=error)
 
     def _off(self, t, before, after):
         return self.residuals.off(t[:, None], before[:, None], after[:, None])[:, 0]
@@ -471,7 +561,9 @@ class Watch:
         for _ in range(LOCATED):
             middle = (low + high) / 2
             low, high = (low, middle) if np.any(off(middle) > 0) else (middle, high)
-        return End(k, float(low), at(low), error=self.residuals.error(float(high), at(high), off(high), self.advice))
+        step = f"of {abs(t[1] - t[0]):.3g} s by {self.method}"
+        error = self.residuals.error(float(high), at(high), off(high), step, self.advice)
+        return End(k, float(low), at(low), error=error)
 
     def jump(self, model, end):
         """The error of a residual, or derivative of one, that jumps at a switch to another model; None if none does."""

@@ -15,6 +15,7 @@ MOST_BRANCHES = 24  # affine pieces that are followed through one operation
 SCAN = 801  # instants of a scan for switches that are not affine in t
 BISECTIONS = 60  # halvings of an interval of the scan: all digits of a double
 SAME_INSTANT = 1e-9  # switches closer than this fraction of the time from first to last are one
+NEAR_ZERO = 0.5  # of the values beside it: a parabola's least value below this is looked at closely
 WIDE, NARROW = 1e-4, 1e-7  # distances of far and close series from an instant, relative to its neighbourhood
 JUMP = 1e-6  # jumps below this fraction of the largest value of a derivative nearby are rounding errors
 STAYS = 0.5  # a jump keeps more than this fraction of its size from far to close series; other differences shrink
@@ -96,15 +97,16 @@ class Switches:
         pieces = []
         for node in self.tape.nodes:
             pieces.append(self._pieces(node, pieces, values))
-        instants = set()
+        instants, others = set(), []
         for a, b in self.timed:
-            for c0, c1 in pieces[a] or ():
-                for d0, d1 in (pieces[b] or ()) if b is not None else ((0.0, 0.0),):
-                    if c1 != d1:
-                        instants.add((d0 - c0) / (c1 - d1))
+            first, second = pieces[a], pieces[b] if b is not None else ((0.0, 0.0),)
+            if first is None or second is None:
+                others.append((a, b))
+                continue
+            instants |= {(d0 - c0) / (c1 - d1) for c0, c1 in first for d0, d1 in second if c1 != d1}
         window = [*instants, *(span or ())]
-        if window and max(window) > min(window):
-            instants |= self._scan(values, min(window), max(window), instants)
+        if others and window and max(window) > min(window):
+            instants |= self._scan(values, min(window), max(window), others)
         times = sorted(instants)
         width = max(times[-1] - times[0], SAME_INSTANT) if times else 1.0
         return [t for i, t in enumerate(times) if i == 0 or t - times[i - 1] > SAME_INSTANT * width]
@@ -129,31 +131,40 @@ class Switches:
             return None
         if node.kind in ("fmin", "fmax"):
             result = {*args[0], *args[1]}
+        elif node.kind == "fabs":
+            result = {*args[0], *((-c0, -c1) for c0, c1 in args[0])}
         else:
             options = [(a,) for a in args[0]] if len(args) == 1 else [(a, b) for a in args[0] for b in args[1]]
             result = {_PIECE[node.kind](node.data, *o) for o in options}
         result = tuple(r for r in result if r is not None)
         return result if 0 < len(result) <= MOST_BRANCHES else None
 
-    def _scan(self, values, t0, t1, known):
-        """Instants between t0 and t1 at which a switch changes sides, except near known ones, by bisection."""
+    def _scan(self, values, t0, t1, switches):
+        """Instants between t0 and t1 at which switches, the sides of each, change sides, by bisection.
+
+        Between three instants a side may change twice: the parabola through them shows where, if it comes near zero.
+        """
 
         def sides(t):
             c = self._run(t, values, 1).c
-            return [np.broadcast_to(c[a][0] - (c[b][0] if b is not None else 0.0), t.shape) for a, b in self.timed]
+            return [np.broadcast_to(c[a][0] - (c[b][0] if b is not None else 0.0), t.shape) for a, b in switches]
 
-        grid = np.linspace(t0, t1, SCAN)
-        instants = set()
+        grid, instants = np.linspace(t0, t1, SCAN), set()
         for s, g in enumerate(sides(grid)):
+
+            def side(t, s=s):
+                return float(sides(np.array([t]))[s][0])
+
             decided = np.flatnonzero(g != 0)
-            for i, j in zip(decided[:-1], decided[1:], strict=True):
-                low, high = grid[i], grid[j]
-                if g[i] * g[j] > 0 or any(low <= k <= high for k in known):
-                    continue
-                for _ in range(BISECTIONS):
-                    middle = (low + high) / 2
-                    low, high = (middle, high) if sides(np.array([middle]))[s][0] * g[i] > 0 else (low, middle)
-                instants.add(float((low + high) / 2))
+            instants |= {float(end) for end, value in zip(grid[[0, -1]], g[[0, -1]], strict=True) if value == 0}
+            t, g = grid[decided], g[decided].astype(float)
+            pairs = [(t[i], t[i + 1], g[i]) for i in np.flatnonzero(g[:-1] * g[1:] < 0)]
+            for i in np.flatnonzero(_grazes(t, g)):
+                sign = np.sign(g[i])
+                least = _least(lambda t, f=side, sign=sign: sign * f(t), t[i - 1], t[i + 1])
+                if sign * side(least) < 0:
+                    pairs += [(t[i - 1], least, g[i - 1]), (least, t[i + 1], -g[i - 1])]
+            instants |= {_changes(side, *pair) for pair in pairs}
         return instants
 
     def _run(self, t, values, depth):
@@ -206,6 +217,34 @@ class Switches:
                 if rough.size and rough[0] <= needs.get(name, -1):
                     result.setdefault(name, []).append((when, int(rough[0]) - 1))
         return result
+
+
+def _grazes(t, g):
+    """Whether values g (N,) at times t (N,) have a least magnitude there, of one sign, and may come to zero nearby."""
+    result = np.zeros(len(t), dtype=bool)
+    if len(t) < 3:
+        return result
+    size, same = np.abs(g), (g[:-2] * g[1:-1] > 0) & (g[1:-1] * g[2:] > 0)
+    left, right = np.diff(size)[:-1] / np.diff(t)[:-1], np.diff(size)[1:] / np.diff(t)[1:]
+    with np.errstate(all="ignore"):
+        bend = (right - left) / (t[2:] - t[:-2])
+        vertex = size[1:-1] - (left + bend * np.diff(t)[:-1]) ** 2 / (4 * bend)
+    result[1:-1] = same & (left <= 0) & (right >= 0) & (vertex < NEAR_ZERO * np.minimum(size[:-2], size[2:]))
+    return result
+
+
+def _least(function, a, b):
+    from scipy.optimize import minimize_scalar
+
+    return minimize_scalar(function, bounds=(a, b), method="bounded", options={"xatol": 1e-9 * (b - a)}).x
+
+
+def _changes(side, low, high, first):
+    """The instant between low and high at which a side changes its sign, which is that of `first` at low."""
+    for _ in range(BISECTIONS):
+        middle = (low + high) / 2
+        low, high = (middle, high) if side(middle) * first > 0 else (low, middle)
+    return float((low + high) / 2)
 
 
 def jump(before, after, h):

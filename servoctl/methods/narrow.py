@@ -1,0 +1,94 @@
+"""Where the equations may change much within a step: at zeros and least magnitudes of the arguments of functions.
+
+The stages of a step see nothing of a bump or a blend between them, and no test of its error does. The arguments of the
+functions in the equations show where these can be: along the dense output of a step they are located, and there the
+equations are evaluated.
+"""
+
+import casadi as ca
+import numpy as np
+
+from servoctl.codegen.function import compiled
+from servoctl.jets.branches import steep_arguments
+
+SECANTS = 4  # of a zero between two instants, by the secant; to 1e-8 of their distance where arguments are smooth
+
+
+def arguments(model):
+    """The compiled arguments of steep functions in a model's equations, of (t, X, p); None if there are none."""
+
+    def build():
+        m, program = model.reduction.mechanism, model.reduction.program
+        weights = [w for w in program.weights.values() if isinstance(w, ca.SX)]
+        rows = [*program.residuals.values(), *m.constraints.values(), *weights, *m.E.elements()]
+        found = steep_arguments([ca.SX(e) for e in (*m.balance.elements(), *rows)])
+        top = model.reduction.top
+        state = ca.vertcat(*m.q, *(s for k in range(1, top) for s in m.q.gamma(k)))
+        known = {s.element_hash() for s in (m.q.t, *state.elements(), *m.parameters.symbols)}
+        moving = [a for a in found if _moves(a, known, m.q)]
+        if not moving:
+            return None
+        f = ca.Function("steep", [m.q.t, state, ca.vertcat(*m.parameters.symbols)], [ca.densify(ca.vertcat(*moving))])
+        return compiled(f, "steep")
+
+    return model.once("steep arguments", build)
+
+
+def _moves(argument, known, q):
+    """Whether an argument is known with the state, and changes with it or with time."""
+    symbols = ca.symvar(argument)
+    return all(s.element_hash() in known for s in symbols) and any(q.where(s) is not None for s in symbols)
+
+
+def centres(f, p, t, x, dense):
+    """Instants at which an argument is zero, or its magnitude least.
+
+    Parameters
+    ----------
+    f : Compiled
+        From `arguments`.
+    p : (n_p,) array
+    t : (N,) array
+        Instants in the order of the motion [s].
+    x : (n_x, N) array
+        States there.
+    dense : callable
+        States (n_x, M) at times (M,) between the first and the last instant.
+
+    Returns
+    -------
+    (M,) array
+        Not in order.
+    """
+    with np.errstate(all="ignore"):
+        g = f.grid(t, x, p)
+        i, j = np.nonzero(g[:, :-1] * g[:, 1:] < 0)
+        zeros = _zeros(lambda s: f.grid(s, dense(s), p)[i, np.arange(len(s))], t[j], t[j + 1], g[i, j], g[i, j + 1])
+        size = np.abs(g)
+        before, here, after = size[:, :-2], size[:, 1:-1], size[:, 2:]
+        least = (here < before) & (here <= after) & (g[:, :-2] * g[:, 2:] > 0)
+        i, j = np.nonzero(least)
+        return np.concatenate([zeros, _vertices(t, size, i, j + 1)])
+
+
+def _zeros(function, a, b, left, right):
+    """Zeros of functions between a and b (M,), where they have values of opposite signs, by the Illinois method."""
+    s = a
+    for _ in range(SECANTS if len(a) else 0):
+        s = b - right * (b - a) / (right - left)
+        s = np.where(np.isfinite(s), s, (a + b) / 2)
+        value = function(s)
+        beyond = value * right < 0
+        a, left = np.where(beyond, b, a), np.where(beyond, right, left / 2)
+        b, right = s, value
+        if not np.any(value):
+            break
+    return s
+
+
+def _vertices(t, size, i, j):
+    """Where the parabola through three instants about j (M,) is least."""
+    h0, h1 = t[j] - t[j - 1], t[j + 1] - t[j]
+    d0, d1 = (size[i, j] - size[i, j - 1]) / h0, (size[i, j + 1] - size[i, j]) / h1
+    s = t[j] - (d0 * h1 + d1 * h0) / (2 * (d1 - d0))
+    return np.where(np.isfinite(s), s, t[j])
