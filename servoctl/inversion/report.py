@@ -349,7 +349,7 @@ def _effort(run, name, limits):
     """An `Effort` from a signal of a run."""
     (low, t_low), (high, t_high) = extremes(run, name)
     peak, peak_at = max(((low, t_low), (high, t_high)), key=lambda extreme: abs(extreme[0]))
-    rates = _slopes(run, name)
+    rates = _derivative(run, name)
     rate, rate_at = max(_sampled_extremes(run.t, rates), key=lambda extreme: abs(extreme[0]))
     nearest = {}
     if limits is not None:
@@ -368,7 +368,7 @@ def extremes(run, name):
         A signal, or d and the name of one.
     """
     if name not in run and name[:1] == "d" and name[1:] in run:
-        return _sampled_extremes(run.t, _slopes(run, name[1:]))
+        return _sampled_extremes(run.t, _derivative(run, name[1:]))
     return tuple((value, t) for t, value in run.extrema(name))
 
 
@@ -385,7 +385,7 @@ def _rms(t, values):
     return float(np.sqrt(np.trapezoid(values**2, t) / (t[-1] - t[0]))) if len(t) > 1 else np.nan
 
 
-def _slopes(run, name):
+def _derivative(run, name):
     """The derivative of a signal at the samples: exact if the run has the jets, else of splines between knots."""
     from scipy.interpolate import CubicSpline
 
