@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from refusals import refused, warned
 from test_bounded import aircraft, arm
-from test_report import DRIFTING, FLAT, RESTING, cart, crane, mathieu
+from test_report import DRIFTING, FLAT, KINKS, RESTING, beside, cart, crane, mathieu
 
 import servoctl as sv
 from servoctl.gallery import gallery, overhead_crane
@@ -85,7 +85,8 @@ def test_a_program_that_is_singular_at_rest_gets_a_relaxed_plan():
 def test_a_marginal_program_gets_a_relaxed_plan_that_ends_at_rest():
     """The cart's path leaves the load swinging; the relaxed plan does not."""
     mechanism, program = crane(cart)
-    run = sv.inverse(mechanism, program, (0.0, 6.0))
+    with warned("misses X", "%", "dwell", "DOP853"):
+        run = sv.inverse(mechanism, program, (0.0, 6.0))
     assert said(run).startswith("relaxed, as the program is marginal")
     assert abs(run["theta"][-1]) < 1e-9 and abs(run["dtheta"][-1]) < 1e-9
     with warned("marginal"):
@@ -113,7 +114,8 @@ def test_limits_beyond_which_the_exact_plan_lies_give_a_relaxed_one():
     upright = {"start": {"theta": pi}, "t_span": (0.0, 6.0)}
     exact = sv.inverse(mechanism, program, **upright)
     limit = 0.95 * max(abs(value) for _, value in exact.extrema("F"))
-    run = sv.inverse(mechanism, program, limits={"F": limit}, **upright)
+    with warned("misses X", "wider limits"):
+        run = sv.inverse(mechanism, program, limits={"F": limit}, **upright)
     assert exact.method == "bounded" and run.method == "relaxed" and "the exact plan needs F = " in said(run)
     assert np.abs(run["F"]).max() <= limit * (1 + 1e-7)  # IPOPT widens bounds by 1e-8
 
@@ -124,6 +126,80 @@ def test_growth_along_a_forward_plan_is_not_silent():
     with warned("errors grow by"):
         run = sv.inverse(mechanism, sv.Program(program.residuals, by="ideal"), (0.0, 60.0), start={"x": 1e-3})
     assert "non-minimum phase" in said(run) and run.internal["verdict"] == "unstable"
+
+
+# plans that miss their program ----------------------------------------------------------------------------------------
+
+
+def hanging():
+    """A cart of 2 kg with a hanging pole of 0.5 kg and 0.7 m; the cart moves by 1 m in 2 s."""
+    q = sv.coordinates("x a")
+    x, a = q
+    S = sv.particle(q, 2.0, (x, 0)) + sv.particle(q, 0.5, (x + 0.7 * ca.sin(a), -0.7 * ca.cos(a)))
+    mechanism = sv.Mechanism(q, gibbs=S, potential=-0.5 * 9.81 * 0.7 * ca.cos(a), actuators={"F": x})
+    return mechanism, sv.Program({"X": x - sv.paths.rest_to_rest(q.t, 0.0, 1.0, duration=2.0, smoothness=4)})
+
+
+def test_a_marginal_plan_that_is_forced_to_rest_says_how_far_it_misses():
+    """A longer dwell leaves less; the exact forward plan needs 6 N and swings on."""
+    with warned("misses X by 0.153", "15 %", "dwell", "DOP853"):
+        short = sv.inverse(*hanging(), (0.0, 2.0))
+    with warned("misses X by 0.0356"):
+        long = sv.inverse(*hanging(), (-3.0, 5.0))
+    assert "misses X by 0.153" in short.message and "misses X by 0.0356" in long.message
+    with warned("marginal"):
+        exact = sv.inverse(*hanging(), (0.0, 2.0), method="DOP853")
+    assert np.abs(exact.residual["X"][0]).max() < 1e-8 and np.abs(exact["F"]).max() < 7.0
+
+
+def test_a_plan_between_rests_of_other_stability_says_how_far_it_misses():
+    mechanism, program = beside(lambda x, y, v: -y + (0.5 - y**2) * v - x)
+    with warned("misses X by 1.46", "dwell"):
+        run = sv.inverse(mechanism, program, (0.0, 2.0))
+    assert "non-minimum phase" in said(run)
+
+
+def test_plans_that_meet_their_program_are_not_warned_about(recwarn):
+    sv.inverse(*crane(), (0.0, 6.0))
+    mechanism, _ = beside(lambda x, y, v: -y - 0.2 * v - x)
+    path = sv.paths.rest_to_rest(mechanism.q.t, 0.0, 1.0, duration=2.0, smoothness=4)
+    run = sv.inverse(mechanism, sv.Program({"V": mechanism.q.d(1)[0] - path}), (0.0, 2.0))
+    assert not [w for w in recwarn if issubclass(w.category, RuntimeWarning)]
+    assert "its end is free" in said(run) and run["dx"][-1] == pytest.approx(1.0, abs=1e-4)
+
+
+def test_an_unstable_program_that_never_rests_gets_a_plan_that_does_not_grow():
+    """y'' = 4 y + x with x = sin t has the bounded motion y = -sin t / 5, which begins with dy = -1/5."""
+    mechanism, _ = beside(lambda x, y, v: 4 * y + x)
+    x, _ = mechanism.q
+    program = sv.Program({"X": x - ca.sin(mechanism.q.t)})
+    run = sv.inverse(mechanism, program, (0.0, 10.0), start={"dy": -0.2})
+    assert said(run).startswith("relaxed, as the program is non-minimum phase")
+    begin = run.t < 5.0
+    assert run["y"][begin] == pytest.approx(-np.sin(run.t[begin]) / 5, abs=2e-3)
+
+
+def test_an_unstable_program_without_a_plan_names_its_verdict():
+    mechanism, _ = beside(lambda x, y, v: 25 * y + x)
+    x, _ = mechanism.q
+    program = sv.Program({"X": x - ca.sin(mechanism.q.t)})
+    with refused(sv.IntegrationStopped, "non-minimum phase", "errors grow", verdict="non-minimum phase"):
+        sv.inverse(mechanism, program, (0.0, 10.0), start={"dy": -1 / 26})
+
+
+def test_an_aircraft_that_never_rests_gets_a_plan_that_does_not_grow(recwarn):
+    mechanism, _ = gallery["vtol-centre"].build()
+    x, z, _ = mechanism.q
+    run = sv.inverse(mechanism, sv.Program({"X": x - 2 * ca.sin(mechanism.q.t), "Z": z}), (0.0, 3.0))
+    assert "non-minimum phase" in said(run) and "free" in said(run)
+    assert np.abs(run.residual["X"][0]).max() < 4e-3 and np.abs(run.residual["Z"][0]).max() < 4e-3
+    assert not [w for w in recwarn if issubclass(w.category, RuntimeWarning)]
+
+
+@pytest.mark.parametrize("name", KINKS)
+def test_plans_from_a_rest_on_a_kink_are_not_called_stable(name):
+    run = sv.inverse(*beside(KINKS[name]), (0.0, 2.0))
+    assert "minimum phase" not in said(run) and "on a switch" in said(run)
 
 
 # a method by hand -----------------------------------------------------------------------------------------------------

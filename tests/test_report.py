@@ -359,3 +359,65 @@ def test_limits_need_a_run_and_an_actuator(crane_plan):
         sv.report(crane_plan.model, crane_plan, {"troley": 100.0})
     with refused(sv.SpecificationError, name="trolley"):
         sv.report(crane_plan.model, crane_plan, {"trolley": -1.0})
+
+
+# kinks ----------------------------------------------------------------------------------------------------------------
+
+
+def beside(force, path=None):
+    """A driven mass beside a free one, y'' = force(x, y, y')."""
+    q = sv.coordinates("x y")
+    (x, y), (_, dy) = q, q.d(1)
+    S = sv.particle(q, 1.0, x) + sv.particle(q, 1.0, y)
+    mechanism = sv.Mechanism(q, gibbs=S, actuators={"F": x}, forces=ca.vertcat(0, force(x, y, dy)))
+    path = path if path is not None else sv.paths.rest_to_rest(q.t, 0.0, 1.0, duration=2.0, smoothness=4)
+    return mechanism, sv.Program({"X": x - path})
+
+
+KINKS = {
+    "one-sided spring": lambda x, y, v: -ca.fmax(y, 0) - 0.2 * v - 0.3 * x,
+    "modulus": lambda x, y, v: -ca.fabs(y) - 0.2 * v,
+    "Coulomb friction": lambda x, y, v: -y - 0.1 * ca.sign(v),
+    "two stiffnesses": lambda x, y, v: -ca.if_else(y > 0, y, 2 * y) - 0.2 * v,
+    "a spring that unloads": lambda x, y, v: -ca.fmax(y + 1, 0) + 1 - ca.fmax(y, 0) - 0.2 * v,
+}
+SMOOTH_THERE = {
+    "Hertz": (lambda x, y, v: -y - ca.fmax(y, 0) ** 2 - 0.2 * v, [-0.1 + 0.99499j, -0.1 - 0.99499j]),
+    "stop away": (lambda x, y, v: -y - ca.fmax(y - 0.5, 0) - 0.2 * v, [-0.1 + 0.99499j, -0.1 - 0.99499j]),
+    "saturation": (lambda x, y, v: -ca.fmin(ca.fmax(y, -1), 1) - 0.2 * v, [-0.1 + 0.99499j, -0.1 - 0.99499j]),
+    "drag": (lambda x, y, v: -y - ca.fabs(v) * v, [1j, -1j]),
+    "of the driven mass": (lambda x, y, v: -y - 0.2 * v + ca.fabs(x), [-0.1 + 0.99499j, -0.1 - 0.99499j]),
+}
+
+
+@pytest.mark.parametrize("name", KINKS)
+def test_a_rest_on_a_kink_has_no_eigenvalues(name):
+    found = verdict(sv.derive(*beside(KINKS[name])))
+    assert found.word == "inconclusive" and not found.rest
+    assert "on a switch" in found.reason and "tanh" in found.do and "run" in found.do
+
+
+@pytest.mark.parametrize("name", SMOOTH_THERE)
+def test_a_rest_on_a_switch_without_a_kink_has_eigenvalues(name):
+    force, expected = SMOOTH_THERE[name]
+    found = verdict(sv.derive(*beside(force)))
+    assert found.word == ("marginal" if name == "drag" else "minimum phase")
+    assert found.rest["start"].eigenvalues == pytest.approx(expected, abs=1e-5)
+
+
+def test_a_smoothed_kink_has_a_verdict():
+    found = verdict(sv.derive(*beside(lambda x, y, v: -y - 0.1 * ca.tanh(v / 0.1))))
+    assert found.word == "minimum phase"
+    assert found.rest["start"].eigenvalues == pytest.approx(np.roots([1, 1, 1]), abs=1e-9)
+
+
+def test_output_redefinition_refuses_an_equilibrium_on_a_kink():
+    p = sv.parameters(a=0.5)
+    q = sv.coordinates("x y")
+    (x, y), (_, dy) = q, q.d(1)
+    S = sv.particle(q, 1.0, x) + sv.particle(q, 1.0, y)
+    mechanism = sv.Mechanism(
+        q, gibbs=S, actuators={"F": x}, forces=ca.vertcat(0, -p.a * ca.fmax(y, 0) - dy), parameters=p
+    )
+    with refused(sv.InconsistentStart, switch="y = 0"):
+        sv.minimum_phase(sv.derive(mechanism, sv.Program({"X": x})), "a", (0.1, 1.0))

@@ -4,8 +4,11 @@ import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
+import casadi as ca
+import numpy as np
+
 from servoctl.checks import as_span, interval, mapping, numbers_by_name, positive_number, require_kind
-from servoctl.errors import ServoError, SpecificationError, unknown
+from servoctl.errors import IntegrationStopped, ServoError, SingularProgram, SpecificationError, unknown
 from servoctl.inversion.relaxed import relaxed
 from servoctl.inversion.report import extremes
 from servoctl.inversion.verdict import (
@@ -29,6 +32,14 @@ from servoctl.spec.mechanism import Mechanism
 from servoctl.spec.program import Program
 
 RELAXED = "relaxed"  # the word for the inverse that is no method of `simulate`
+END_MOVES = "; its end is free, as the program moves there"
+DWELL = "Add a dwell before and after the path (a longer t_span)"
+REMEDIES = {
+    MARGINAL: f"{DWELL}, or take the exact forward plan by method='DOP853', whose internal motion goes on after the path.",
+    GROWS: f"{DWELL}.",
+    OPEN: "Begin and end the program with a dwell, or pass a start=... nearer to its bounded motion.",
+}  # of a relaxed plan that misses its program, by verdict
+MISSED = 1e-3  # of the stroke of a residual, by which a plan misses it with a warning
 
 
 def inverse(
@@ -41,7 +52,8 @@ def inverse(
 
     Flat programs are solved instant by instant, minimum-phase ones are integrated forward, hyperbolic ones get the
     bounded motion (`Bounded`), and marginal ones, those singular at rest, rough paths and limits that the exact plan
-    exceeds the relaxed one (`relaxed`). The message of the run says which, and why.
+    exceeds the relaxed one (`relaxed`), which rests at both ends unless the program moves there. The message of the run
+    says which, and why.
 
     Parameters
     ----------
@@ -76,7 +88,8 @@ def inverse(
     Warns
     -----
     RuntimeWarning
-        If a method is given that is not the one of the verdict.
+        If a method is given that is not the one of the verdict, or a relaxed plan misses the program by more than a
+        thousandth of what its residual moves.
     """
     require_kind(Mechanism, "mechanism", mechanism, "sv.Mechanism(q, gibbs, ...)")
     require_kind(Program, "program", program, "sv.Program({...})")
@@ -90,13 +103,14 @@ def inverse(
         facts = error.details
         if by_hand not in (None, RELAXED) or not {"needs", "has"} <= facts.keys():
             raise
-        return task.relaxed(f"{facts['name']} has class C^{facts['has']}, and the exact inverse needs {facts['needs']}")
+        rough = f"{facts['name']} has class C^{facts['has']}, and the exact inverse needs {facts['needs']}"
+        return _measured(task.relaxed(rough), program, "")
     begin = _begin(model, start, span[0])
     found = verdict(model, begin)
     chosen = _chosen(model, found)
     if by_hand is not None:
-        return _by_hand(task, model, begin, found, chosen, by_hand)
-    return task.run(model, begin, found, chosen)
+        return _measured(_by_hand(task, model, begin, found, chosen, by_hand), program, found.dynamics)
+    return _measured(task.run(model, begin, found, chosen), program, found.dynamics)
 
 
 @dataclass(frozen=True)
@@ -113,17 +127,24 @@ class Task:
     def run(self, model, begin, found, chosen):
         """The run by the method that the verdict chooses; the relaxed one where that is beyond limits or grows."""
         if chosen == RELAXED:
-            return self.relaxed(found)
-        run = self.exact(model, begin, found, chosen)
+            return self.relaxed(found, begin)
+        try:
+            run = self.exact(model, begin, found, chosen)
+        except (IntegrationStopped, SingularProgram) as error:
+            run = getattr(error, "run", None)
+            found = found if run is None else verdict(model, run)
+            if found.dynamics != GROWS or model.ideal:
+                raise
+            return self.relaxed(found, begin, moving=True)
         excess = _excess(run, {**self.ranges[0], **self.ranges[1]})
         if excess:
-            return self.relaxed(excess)
+            return self.relaxed(excess, begin)
         if found.dynamics == OPEN or run.internal.get("verdict") == "unstable":
             found = verdict(model, run)
         if found.dynamics != GROWS:
             return _told(run, found)
         if not model.ideal:
-            return self.relaxed(found, begin)
+            return self.relaxed(found, begin, moving=not found.rest)
         warnings.warn(f"An ideal program has no other inverse, and this is {found}.", RuntimeWarning, stacklevel=3)
         return _told(run, found)
 
@@ -137,14 +158,36 @@ class Task:
             warnings.filterwarnings("ignore", "Internal dynamics unstable")
             return simulate(model, begin, self.span, method)
 
-    def relaxed(self, why, begin=None):
-        """The run of the relaxed inverse; from a state in motion its end is free."""
-        ends = {"start": begin, "end": "free"} if begin is not None else {"start": self.start}
+    def relaxed(self, why, begin=None, moving=False):
+        """The run of the relaxed inverse: from rest to rest, and free where the program moves.
+
+        `moving` says that it begins in motion, with the state `begin`.
+        """
+        tries = [] if moving else [({"start": self.start}, ""), ({"start": self.start, "end": "free"}, END_MOVES)]
+        tries += [({"start": begin, "end": "free"}, END_MOVES)] if begin is not None else []
         limits, bounds = self.ranges
-        run = relaxed(
-            plant(self.mechanism), self.program, self.span, weight=self.weight, limits=limits, bounds=bounds, **ends
-        )
-        return _told(run, why)
+        for k, (ends, note) in enumerate(tries):
+            try:
+                run = relaxed(
+                    plant(self.mechanism), self.program, self.span, weight=self.weight, limits=limits, bounds=bounds,
+                    **ends,
+                )  # fmt: skip
+            except SpecificationError as error:
+                if "rate" not in error.details or k + 1 == len(tries):
+                    raise
+            except IntegrationStopped as error:
+                raise _no_plan(why, error) if moving else error
+            else:
+                return _told(run, why, note)
+
+
+def _no_plan(why, error):
+    return IntegrationStopped(
+        f"The program is {why}, and the iteration of the relaxed inverse failed: {str(error).split('; ')[0]}.",
+        "Motions that grow are not integrated forward.",
+        do="Begin and end the program with a dwell, take a shorter span, or another start.",
+        **error.details | {"verdict": why.word},
+    )
 
 
 def _ranges(mechanism, limits, bounds):
@@ -220,8 +263,38 @@ def _excess(run, ranges):
     return ""
 
 
-def _told(run, why):
+def _told(run, why, note=""):
     """The run, whose message says which inverse it is and why."""
     kind = {"algebraic": "instant by instant", "bounded": "bounded", RELAXED: "relaxed"}.get(run.method, "forward")
     reason = f"the program is {why.word} ({why.reason})" if isinstance(why, Verdict) else why
-    return replace(run, message=f"{run.message}; inverse: {kind}, as {reason}")
+    return replace(run, message=f"{run.message}; inverse: {kind}, as {reason}{note}")
+
+
+def _measured(run, program, dynamics):
+    """The run, with a warning if it is a relaxed plan that misses its program."""
+    if run.method != RELAXED:
+        return run
+    largest = {name: float(np.abs(run.residual[name][0]).max()) for name in program.names}
+    strokes = {name: _stroke(run, program.residuals[name]) for name in largest}
+    usual = max(strokes.values())
+    parts = {name: largest[name] / (stroke or usual) for name, stroke in strokes.items() if stroke or usual}
+    if not parts:
+        return run
+    name = max(parts, key=parts.get)
+    if parts[name] <= MISSED:
+        return run
+    missed = f"the plan misses {name} by {largest[name]:.3g}, {100 * parts[name]:.2g} % of its stroke"
+    do = REMEDIES.get(dynamics, "Allow more time or wider limits, or a smaller weight.")
+    warnings.warn(f"{missed[0].upper()}{missed[1:]}. {do}", RuntimeWarning, stacklevel=3)
+    return replace(run, message=f"{run.message}; {missed}")
+
+
+def _stroke(run, residual):
+    """How far time moves a residual at the first state of a run."""
+    q = run.model.reduction.mechanism.q
+    orders = range(max(q.order(residual), 0) + 1)
+    names = [name for k in orders for name in q.jet_names(k)]
+    jets = [run[name][0] if name in run.jet_names else 0.0 for name in names]
+    symbols = ca.vertcat(*run.model.reduction.mechanism.parameters.symbols)
+    f = ca.Function("residual", [q.t, ca.vertcat(*(q.jet(k) for k in orders)), symbols], [residual])
+    return float(np.ptp([float(f(t, jets, run.model.parameters)) for t in run.t]))

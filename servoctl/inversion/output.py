@@ -11,7 +11,14 @@ import casadi as ca
 import numpy as np
 
 from servoctl.checks import finite, interval, named, require_kind
-from servoctl.errors import NotRealisable, SingularProgram, SpecificationError, UnstableInternalDynamics
+from servoctl.errors import (
+    InconsistentStart,
+    NotRealisable,
+    SingularProgram,
+    SpecificationError,
+    UnstableInternalDynamics,
+)
+from servoctl.inversion.kinks import SMOOTHER, kink
 from servoctl.inversion.zeros import AT_REST, NEWTON, NO_COEFFICIENT, ZeroPolynomial
 from servoctl.model.model import Model
 from servoctl.model.start import State
@@ -19,6 +26,7 @@ from servoctl.simulation import simulate
 
 VALUES = 257  # of the parameter, spread over its range, at which roots are computed
 TOUCHES = 1e-9  # of its largest value: a coefficient whose smallest value is below has a root there
+HALVINGS = 24  # of a step of the values, towards a value at which roots come closest to the axis
 BISECTIONS = 60  # halvings of an interval of the parameter: all digits of a double
 CURVE_STEP, CURVE_STEPS = 0.02, 500  # along the rests of a program, relative to the size of the state; on either side
 SHOWN_RANGES, SHOWN_VALUES = 6, 3  # in the printed form
@@ -262,14 +270,15 @@ def minimum_phase(model: Model, parameter: str, values, at: State | None = None)
     NameUnknown
         For a name that is no parameter.
     InconsistentStart
-        If the state is no equilibrium, the program does not stand still there, or a value has no equilibrium.
+        If the state is no equilibrium or lies on a switch, the program does not stand still there, or a value has no
+        equilibrium.
     NotRealisable
         If the residuals determine no motion at the equilibrium, for any value.
 
     Notes
     -----
-    Ranges are sought between 257 values, and at the smallest distances of roots from the axis between these; narrower
-    ones may be missed. Boundaries are accurate to rounding.
+    Ranges are sought between 257 values, and at and beside the smallest distances of roots from the axis between these;
+    narrower ones may be missed. Boundaries are accurate to rounding.
     """
     require_kind(Model, "model", model, "sv.derive(mechanism, program)")
     named(parameter, list(model.numbers), "parameter")
@@ -277,6 +286,7 @@ def minimum_phase(model: Model, parameter: str, values, at: State | None = None)
     _require_program(model)
     at = model.start() if at is None else require_kind(State, "at", at, "model.start(...)")
     polynomial, grid = ZeroPolynomial(model, parameter, at), np.linspace(*ends, VALUES)
+    _require_linearisation(model, at)
     polynomial.follow(grid)
     critical = tuple(_critical(polynomial, value) for value in _infinite(polynomial, grid))
     ranges = _ranges(polynomial, grid, [c.value for c in critical])
@@ -294,6 +304,17 @@ def _require_program(model):
             "Outputs are redefined where actuators realise a program.",
             do='Write sv.Program(..., by="actuators").',
             by=model.reduction.program.by,
+        )
+
+
+def _require_linearisation(model, at):
+    switch = kink(model, at.t, np.asarray(at.values, dtype=float))
+    if switch:
+        raise InconsistentStart(
+            f"The equilibrium lies on a switch, {switch}.",
+            "Internal dynamics are linearised at an equilibrium, with one linearisation on all sides.",
+            do=f"{SMOOTHER[0].upper()}{SMOOTHER[1:]}, or pass another equilibrium.",
+            switch=switch,
         )
 
 
@@ -356,12 +377,17 @@ def _refined(polynomial, grid):
 
     away = np.array([polynomial.distance(value) for value in grid])
     near = (away[1:-1] > 0) & (away[1:-1] <= np.minimum(away[:-2], away[2:])) & (away[:-2] + away[2:] > 2 * away[1:-1])
-    options = {"xatol": TOUCHES * (grid[1] - grid[0])}
+    step = grid[1] - grid[0]
     closest = [
-        minimize_scalar(polynomial.distance, bounds=(grid[i - 1], grid[i + 1]), method="bounded", options=options).x
+        minimize_scalar(
+            polynomial.distance, bounds=(grid[i - 1], grid[i + 1]), method="bounded", options={"xatol": TOUCHES * step}
+        ).x
         for i in np.flatnonzero(near) + 1
     ]
-    return np.unique([*grid, *closest]).tolist()
+    # where roots cross there and back between two values, one of these lies between the crossings
+    offsets = step * np.concatenate([s * 0.5 ** np.arange(1, HALVINGS) for s in (1.0, -1.0)])
+    beside = [v for c in closest for v in c + offsets if grid[0] < v < grid[-1] and not polynomial.kind(v)[1]]
+    return np.unique([*grid, *closest, *beside]).tolist()
 
 
 def _edge(polynomial, a, b, first, last):

@@ -10,6 +10,7 @@ import numpy as np
 
 from servoctl.errors import IntegrationStopped, ServoError, SingularProgram
 from servoctl.internal_dynamics import InternalDynamics, internal_dynamics
+from servoctl.inversion.kinks import SMOOTHER, kink
 from servoctl.methods.bounded import End, FreeEntries
 from servoctl.model.model import Model
 from servoctl.model.start import State
@@ -121,6 +122,9 @@ def _of_motion(model, motion):
     if model.flat:
         return Verdict(FLAT, "no free initial value")
     rest, why = _rests(model, states, isinstance(motion, Run))
+    switch = next(filter(None, (kink(model, end.t, end.x) for end in rest.values())), "")
+    if switch:
+        return _on_switch(model, motion, f"the rest lies on a switch, {switch}, and has no linearisation")
     internal = internal_dynamics(model, motion) if isinstance(motion, Run) else None
     lost = "" if rest or internal else _lost_at_default_start(model, states[0][0])
     return Verdict(SINGULAR, lost) if lost else _judged(rest, internal, why)
@@ -228,6 +232,19 @@ def _judged(rest, internal, why):
     if counts == {0}:
         return Verdict(GROWS if grows else MINIMUM, reason, **facts)
     return Verdict(HYPERBOLIC_ZEROS if len(counts) == 1 else GROWS, reason, **facts)
+
+
+def _on_switch(model, motion, why):
+    """The verdict where the program rests on a kink: by the growth along a run that leaves it."""
+    if not isinstance(motion, Run):
+        return Verdict(OPEN, why, f"pass a run that leaves it, along which errors are measured, or {SMOOTHER}")
+    x = motion.jets[: len(model.state_names)]
+    known = np.flatnonzero(np.isfinite(x).all(axis=0))
+    some = known[np.linspace(0, len(known) - 1, LOOKS).round().astype(int)]
+    if all(kink(model, motion.t[k], x[:, k]) for k in some):
+        return Verdict(OPEN, f"{why}; the run stays there", f"{SMOOTHER}, or begin beside it")
+    internal = internal_dynamics(model, motion)
+    return _along(internal, why, {"internal": internal})
 
 
 def _along(internal, why, facts):
