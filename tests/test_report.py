@@ -421,3 +421,66 @@ def test_output_redefinition_refuses_an_equilibrium_on_a_kink():
     )
     with refused(sv.InconsistentStart, switch="y = 0"):
         sv.minimum_phase(sv.derive(mechanism, sv.Program({"X": x})), "a", (0.1, 1.0))
+
+
+def test_output_redefinition_takes_an_equilibrium_beside_a_kink():
+    p = sv.parameters(a=0.5)
+    q = sv.coordinates("x y")
+    (x, y), (_, dy) = q, q.d(1)
+    S = sv.particle(q, 1.0, x) + sv.particle(q, 1.0, y)
+    forces = ca.vertcat(0, -p.a * y - ca.fmax(y - 0.5, 0) - dy)
+    mechanism = sv.Mechanism(q, gibbs=S, actuators={"F": x}, forces=forces, parameters=p)
+    result = sv.minimum_phase(sv.derive(mechanism, sv.Program({"X": x})), "a", (0.1, 1.0))
+    assert [r.verdict for r in result.ranges] == ["stable"]
+
+
+# constants of constraints on velocities -------------------------------------------------------------------------------
+
+
+def ballbot(roll, gravity=9.81):
+    """A ball of radius 0.2 m under a body that stands on it, driven by the torque between both."""
+    q = sv.coordinates("x phi a")
+    x, phi, a = q
+    S = sv.particle(q, 1.0, x) + 0.01 * q.d(2)[1] ** 2 + sv.particle(q, 1.0, (x + 0.6 * ca.sin(a), 0.6 * ca.cos(a)))
+    mechanism = sv.Mechanism(
+        q, gibbs=S, potential=gravity * 0.6 * ca.cos(a), actuators={"T": phi - a}, constraints={"roll": roll(q)}
+    )
+    path = sv.paths.rest_to_rest(q.t, 0.0, 1.0, duration=2.0, smoothness=4)
+    return sv.derive(mechanism, sv.Program({"X": x - path}))
+
+
+def on_velocities(q):
+    return q.d(1)[0] - 0.2 * q.d(1)[1]
+
+
+def on_coordinates(q):
+    x, phi, _ = q
+    return x - 0.2 * phi
+
+
+@pytest.mark.parametrize("gravity", [9.81, -9.81])
+def test_the_constant_of_a_rolling_constraint_is_named(gravity):
+    written, integrated = verdict(ballbot(on_velocities, gravity)), verdict(ballbot(on_coordinates, gravity))
+    assert written.word == "marginal" and "0 is the constant of roll" in written.reason and "coordinates" in written.do
+    assert integrated.word == ("marginal" if gravity < 0 else "non-minimum phase (hyperbolic)")
+    assert "constant" not in integrated.reason
+    others = [z for z in written.rest["start"].eigenvalues if abs(z) > 1e-6]
+    assert others == pytest.approx(list(integrated.rest["start"].eigenvalues), abs=1e-6)
+
+
+def test_a_drift_that_no_constraint_explains_has_no_constant():
+    found = verdict(sv.derive(*beside(lambda x, y, v: -0.2 * v - x)))
+    assert found.word == "marginal" and "constant" not in found.reason
+    mechanism, _ = beside(lambda x, y, v: -0.2 * v)
+    found = verdict(sv.derive(mechanism, sv.Program({"V": mechanism.q.d(1)[0]})))
+    assert found.word == "marginal" and "constant" not in found.reason
+
+
+def test_an_angle_of_90_degrees_has_no_cosine_of_1():
+    """The force on x moves the first residual directly, and the second, y, through its spring alone."""
+    q = sv.coordinates("x y z")
+    x, y, z = q
+    S = sv.particle(q, 1.0, x) + sv.particle(q, 1.0, y) + sv.particle(q, 1.0, z)
+    mechanism = sv.Mechanism(q, gibbs=S, potential=(y - z) ** 2 / 2, actuators={"F": x, "G": y})
+    text = repr(sv.report(sv.derive(mechanism, sv.Program({"X": x, "Z": z}))))
+    assert "90° apart (least cosine of the others 1)" in text

@@ -35,7 +35,7 @@ RELAXED = "relaxed"  # the word for the inverse that is no method of `simulate`
 END_MOVES = "; its end is free, as the program moves there"
 DWELL = "Add a dwell before and after the path (a longer t_span)"
 REMEDIES = {
-    MARGINAL: f"{DWELL}, or take the exact forward plan by method='DOP853', whose internal motion goes on after the path.",
+    MARGINAL: f"{DWELL}, or take the exact forward plan by method='DOP853', whose internal motion goes on after it.",
     GROWS: f"{DWELL}.",
     OPEN: "Begin and end the program with a dwell, or pass a start=... nearer to its bounded motion.",
 }  # of a relaxed plan that misses its program, by verdict
@@ -176,7 +176,9 @@ class Task:
                 if "rate" not in error.details or k + 1 == len(tries):
                     raise
             except IntegrationStopped as error:
-                raise _no_plan(why, error) if moving else error
+                if not moving:
+                    raise
+                raise _no_plan(why, error) from error
             else:
                 return _told(run, why, note)
 

@@ -188,7 +188,8 @@ def _of_directions(found):
         return ""
     text = f", actuators and normals up to {round(np.degrees(found.angle), 3):g}° apart"
     if found.margin:
-        text += f" (least cosine {found.margin:.2g})"
+        which = "least cosine" if found.margin <= min(found.cosines) else "least cosine of the others"
+        text += f" ({which} {found.margin:.2g})"
     if found.residuals:
         text += f"; {', '.join(found.actuators) or 'no actuator'} without effect on {', '.join(found.residuals)}"
     return text
