@@ -67,7 +67,7 @@ def relaxed(
 ) -> Run | Study:  # fmt: skip
     """The actuation that trades a program against effort: min ∫ Σ φ_i²/β_i + uᵀWu dt over all motions of the plant.
 
-    As β falls, the motion tends to the exact inverse where there is one; where there is none, as for a program that is
+    As β falls, the motion tends to the exact inverse where one satisfies the ends; where none does, as for a program that is
     singular at rest, beyond the limits, or not smooth, the plan misses it as little as its weights say.
 
     Parameters

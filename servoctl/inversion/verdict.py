@@ -223,7 +223,7 @@ def _reach(end, length):
 def _constants(model, rest):
     """Constraints on velocities at a rest whose constants are eigenvalues 0, by name.
 
-    Where a(q)·γ' = b is linearised at a rest, a·δq is constant: an eigenvalue 0 for each independent row on free entries.
+    Where a(q)·γ' = b is linearised at a rest, a·δq is constant: an eigenvalue 0 for each independent row a.
     """
     r, q = model.reduction, model.reduction.mechanism.q
     rows = {**r.mechanism.constraints, **r.program.residuals}
