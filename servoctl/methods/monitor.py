@@ -19,7 +19,7 @@ HELPS = 5.0  # factor by which the matrix must be better
 NEGLIGIBLE = 1e-7  # of its reference: a pivot below this is zero
 HOPELESS = 1e-9  # an equilibrated singular value below this leaves no digits
 VANISHING = 0.03  # of its reference: a gradient or rank measure below this counts as lost
-LOST = 0.1  # of its best: below this, rank and not the integrator is why no step succeeds
+LOST = 0.1  # of its best, or beside a zero: below this, rank is why no step succeeds or a pivot is zero
 HIDES = 10.0  # times the root of a residual: a smaller pivot may be zero, as it touches zero quadratically
 SHARE = 0.1  # of the largest entry of a null vector: smaller entries are not named in the error
 LINGERS = 5.0  # times the extrapolated way to its zero, after which a pivot hidden by the residual is zero
@@ -384,7 +384,8 @@ class Monitor:
 
     def _vanishing(self, stretch, k, t, why):
         """The outcome of a pivot that vanishes at t in step k: another choice of pivots, or a singular program."""
-        if min(self.rank_measure(s, stretch.state(k, s)) for s in stretch.ranks_at(k, t)) > DEGRADED:
+        measure = min(self.rank_measure(s, stretch.state(k, s)) for s in stretch.ranks_at(k, t))
+        if measure > DEGRADED or self._as_beside(stretch, k, t):
             if stretch.crosses:
                 return _other_pivots(k + 1, stretch.t[k + 1], stretch.x[:, k + 1])
             before = stretch.last_before(k, t)
@@ -394,6 +395,25 @@ class Monitor:
         variant = self.repivoted(before, start, stretch.top(before, start))
         helps = variant is not None and variant[1].rank_measure(t, x) > DEGRADED
         return Repivot(k, before, start, variant, singular) if helps else singular
+
+    def _as_beside(self, stretch, k, t):
+        """Whether rows at the zero of a pivot are as large and independent as beside it; if so they are references.
+
+        Gradients may fall along the whole motion, as 1/r where a row is an angle or its rate.
+        """
+        x = stretch.state(k, t)
+        if self.hidden_zero(1.0, t, x):
+            return False
+        beside = [self._matrices(s, stretch.state(k, s)) for s in stretch.t[k : k + 2]]
+        before, self.rows = self.rows, [
+            np.max([np.linalg.norm(m[i] / c, axis=1) for m in beside], axis=0) for i, c in enumerate(self.columns)
+        ]
+        now, ends = self._smallest(self._matrices(t, x)), [self._smallest(m) for m in beside]
+        if np.any(now <= LOST * np.min(ends, axis=0)):
+            self.rows = before
+            return False
+        self.best = now
+        return True
 
     def _lingers(self, k, instants, sizes, x):
         """Singular if a pivot sank below what the residual hides, should have crossed zero by now, and stays there."""
