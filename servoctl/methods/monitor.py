@@ -357,11 +357,16 @@ class Monitor:
         ends = np.abs(stretch.pivots[:, :, -1])
         largest = np.maximum(self.reference, self.model.pivot_sizes)[:, None]
         before = np.maximum.accumulate(np.column_stack([largest, ends]), axis=1)[:, :-1]
-        grown = np.flatnonzero(np.any(NEGLIGIBLE * ends > before, axis=0))
-        if not len(grown):
-            return None
-        k = int(grown[0])
-        return Singular(k, stretch.t[k + 1], stretch.x[:, k + 1], "a pivot grows without bound")
+        for k in np.flatnonzero(np.any(NEGLIGIBLE * ends > before, axis=0)):
+            t, x = stretch.t[k + 1], stretch.x[:, k + 1]
+            if self._unbounded(self._matrices(t, x)):  # else an earlier pivot vanishes, by which this one is divided
+                return Singular(int(k), t, x, "a pivot grows without bound")
+        return None
+
+    def _unbounded(self, matrices):
+        """Whether rows are far larger than ever, or not finite."""
+        sizes = [np.linalg.norm(m / c, axis=1) for m, c in zip(matrices, self.columns, strict=True)]
+        return any(np.any(~(NEGLIGIBLE * a <= np.where(b > 0, b, 1.0))) for a, b in zip(sizes, self.rows, strict=True))
 
     def _step(self, stretch, k, before, scale):
         """The outcome of one step, None if it is fine; `before` are the relative pivots at and before its start."""
