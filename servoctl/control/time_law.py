@@ -9,7 +9,15 @@ import numpy as np
 
 from servoctl.checks import as_span, finite, interval, mapping, require_kind
 from servoctl.control.time_optimal import Curve, Inverse, Problem, smooth
-from servoctl.errors import InconsistentStart, IntegrationStopped, LimitExceeded, SingularProgram, SpecificationError
+from servoctl.errors import (
+    InconsistentStart,
+    IntegrationStopped,
+    LimitExceeded,
+    SingularProgram,
+    SpecificationError,
+    UnstableInternalDynamics,
+)
+from servoctl.internal_dynamics import internal_dynamics
 from servoctl.model.model import derived
 from servoctl.progress import progress_bar
 from servoctl.run import Run
@@ -20,7 +28,8 @@ from servoctl.spec.program import Program
 
 REACH = 12  # doublings of the time, after which a motion is nearly static, or halvings
 BELOW = 1e-6  # of a limit: distance that the fastest time law keeps from it
-ROUNDS, TIGHTER = 5, 1.2  # of the time-optimal law; and limits are tightened by this multiple of their excess
+TIGHTENED, TIGHTER = 5, 1.2  # how often a time-optimal law is solved; limits at nodes give way by this many excesses
+STILL = 1e-9  # of its size: a signal that changes less along a path reaches no limit by going faster
 SHORT = 1e-6  # of the span: intervals of samples that are too short for a difference quotient
 REACHED = 1e-4  # of a limit: largest distance at which it counts as reached
 
@@ -62,8 +71,8 @@ def fastest(
 ) -> TimeLaw:  # fmt: skip
     """The fastest time law along the path of a program under which signals keep their limits.
 
-    By default the time is stretched evenly, q(t0 + (t - t0)/σ): the geometry of the motion stays; speeds scale with 1/σ,
-    accelerations with 1/σ²; static loads stay. If several σ reach a limit, the result is the one next to σ = 1.
+    By default the time is stretched evenly, q(t0 + (t - t0)/σ): the geometry of the motion stays; speeds scale with
+    1/σ, accelerations with 1/σ²; static loads stay. If several σ reach a limit, the result is the one next to σ = 1.
 
     With `shape=True` the law s(t) along the path is free, from rest to rest: a local minimum of the duration by the
     exact inverse, for programs that are flat or minimum phase. Its derivative that the actuation contains is
@@ -98,6 +107,8 @@ def fastest(
     SpecificationError
         For limits that are no interval, and a span that does not go forward; with `shape=True` for a program that is
         no curve, or turns sharply.
+    UnstableInternalDynamics
+        With `shape=True`, if what the program leaves free is unstable.
     IntegrationStopped
         If the optimisation with `shape=True` finds no minimum.
     NameUnknown
@@ -152,12 +163,15 @@ def _optimal(scene, bar):
         step = rest_to_rest(t - t0, 0.0, 1.0, law.duration, inverse.order)
         excess, _, _, plan = attempt = scene.along(curve, step, law.duration)
         bar.update()
+        _require_stable(plan)
         if excess <= 0:
             break
     else:
         raise _exceeded(attempt, 2.0**exponent)
+    if all(np.ptp(_values(plan, name)[1]) <= STILL * np.abs(_values(plan, name)[1]).max() for name in scene.limits):
+        raise _unchanged(list(scene.limits))
     sides = np.array([*scene.limits.values()]).T
-    for _ in range(ROUNDS):
+    for _ in range(TIGHTENED):
         law = Problem(inverse, sides, law, plan).solved()
         excess, binding, program, plan = scene.along(curve, law.expression(t, t0), law.duration)
         bar.update()
@@ -167,8 +181,10 @@ def _optimal(scene, bar):
             break
         beyond = [[max(0.0, e) for e in _excesses(plan, name, *scene.limits[name])] for name in scene.limits]
         sides += TIGHTER * np.array(beyond).T * [[1.0], [-1.0]]
+        if np.any(sides[0] >= sides[1]):
+            break
     raise LimitExceeded(
-        f"After {ROUNDS} solutions {binding[0] or 'a signal'} exceeds its limit between the nodes by {excess:.2g} of it.",
+        f"Between the nodes {binding[0] or 'a signal'} exceeds its limit by {excess:.2g} of it.",
         "A time-optimal law keeps its limits at all instants.",
         do="Add a limit of rates, as {'dtrolley': ...}, or choose shape=False.",
         name=binding[0], excess=float(excess),
@@ -232,7 +248,7 @@ def _worst(plan, limits):
     """Largest excess over the limits, relative to their size, and its (signal, side, instant)."""
     excesses = []
     for name, (low, high) in limits.items():
-        (t_low, least), (t_high, most) = _extrema(plan, name)
+        (t_low, least), (t_high, most) = _extrema_of(plan, name)
         size = max(abs(v) for v in (low, high) if np.isfinite(v)) or max(abs(least), abs(most)) or 1.0
         below, above = _excesses(plan, name, low, high)
         excesses += [(below / size, (name, "lower", t_low)), (above / size, (name, "upper", t_high))]
@@ -241,18 +257,30 @@ def _worst(plan, limits):
 
 def _excesses(plan, name, low, high):
     """By how much a signal exceeds its lower and its upper limit."""
-    (_, least), (_, most) = _extrema(plan, name)
+    (_, least), (_, most) = _extrema_of(plan, name)
     return low - least, most - high
 
 
-def _extrema(plan, name):
-    """((t, least), (t, most)) of a signal, or of a rate, from its values at both ends of sampled intervals."""
-    if name in plan.names or name[:1] != "d" or name[1:] not in plan.names:
+def _extrema_of(plan, name):
+    """((t, least), (t, most)) of a signal or a rate."""
+    if not _differenced(plan, name):
         return plan.extrema(name)
+    t, rates = _values(plan, name)
+    return tuple((float(t[i]), float(rates[i])) for i in (np.argmin(rates), np.argmax(rates)))
+
+
+def _differenced(plan, name):
+    """Whether a name is that of a rate that is taken from the samples at both ends of intervals."""
+    return name not in plan.names and name[:1] == "d" and name[1:] in plan.names
+
+
+def _values(plan, name):
+    """Times and values of a signal or a rate."""
+    if not _differenced(plan, name):
+        return plan.t, plan[name]
     whole = np.append(True, np.diff(plan.t) > SHORT * np.ptp(plan.t))
     t, values = plan.t[whole], plan[name[1:]][whole]
-    rates = np.diff(values) / np.diff(t)
-    return tuple((float(t[i]), float(rates[i])) for i in (np.argmin(rates), np.argmax(rates)))
+    return t[:-1], np.diff(values) / np.diff(t)
 
 
 def _level(model, name):
@@ -267,6 +295,29 @@ def _unreached(factor):
         "The fastest time law reaches a limit.",
         do="Pass limits of the actuators that the motion uses.",
         factor=factor,
+    )
+
+
+def _require_stable(plan):
+    """Refuse a plan, if there is one, along which errors of the internal dynamics grow."""
+    if plan is None or plan.model.flat:
+        return
+    internal = internal_dynamics(plan.model, plan)
+    if internal.verdict == "unstable":
+        raise UnstableInternalDynamics(
+            f"Along the curve {internal.sentence()}.",
+            "A time-optimal law by the exact inverse is for programs that are flat or minimum phase.",
+            do="Use sv.relaxed(plant, program, t_span, limits=...) for a given duration, or choose another output.",
+            growth=float(internal.growth),
+        )
+
+
+def _unchanged(names):
+    return SpecificationError(
+        f"Along the curve {', '.join(names)} {'do' if len(names) > 1 else 'does'} not change.",
+        "A time-optimal law is bounded by limits.",
+        do="Pass limits of the actuators that the motion uses.",
+        names=names,
     )
 
 

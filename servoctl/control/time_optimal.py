@@ -1,8 +1,8 @@
 """The time-optimal law s(t) along the curve of a program: a nonlinear program with the exact inverse at its nodes.
 
-A program follows a curve, φ(q, s) = 0 for s from 0 to 1. Its rows, hidden ones included, are algebraic equations between
-the jets of the motion and s, s', ..., s^(k). On N intervals s^(k) is continuous and linear; the unknowns are the duration
-T, the jets of s at the ends of the intervals, and those of the motion at the nodes in them:
+A program follows a curve, φ(q, s) = 0 for s from 0 to 1. Its rows, hidden ones included, are algebraic equations
+between the jets of the motion and s, s', ..., s^(k). On N intervals s^(k) is continuous and linear; the unknowns are
+the duration T, the jets of s at the ends of the intervals, and those of the motion at the nodes in them:
 
     minimise T   subject to   the rows and low <= signals <= high at the nodes,   s' >= 0,   rest at both ends.
 
@@ -26,7 +26,7 @@ from servoctl.spec.program import Program
 
 JETS = 14  # s, s', ..., among which are those that the rows contain
 INTERVALS = 80
-ORDER = 5  # of the collocation: three nodes
+COLLOCATION = 5  # of the collocation: three nodes
 REGULAR = 1e-3  # least speed along a curve, of the largest, with which time itself is its parameter
 DEGREES = (1, 2, 4, 8, 12, 16, 20)  # of the polynomial of the arc length that a curve is, or else
 SPLINE = (9, 80)  # the degree and the intervals of its spline
@@ -43,8 +43,7 @@ IPOPT = {
     "nlp_scaling_method": "none",
     "mu_strategy": "adaptive",
 }
-LEAST = 1e-3  # duration, relative to that of the first motion, below which no limit is reached
-SOLVED = ("Solve_Succeeded", "Solved_To_Acceptable_Level")
+LEAST = 1e-4  # duration, relative to that of the first motion
 
 
 class Curve:
@@ -66,7 +65,8 @@ class Curve:
         self.moving = self._moving()
         q, p = mechanism.q, mechanism.parameters
         offsets = [e - ca.substitute(e, q.t, t_span[0]) for e in self.moving.values()]
-        offsets = ca.substitute(ca.vertcat(*offsets), ca.vertcat(*q, *p.symbols), ca.DM([0.5] * q.nq + [*p.values(values)]))
+        anywhere = ca.vertcat(*q, *p.symbols), ca.DM([0.5] * q.nq + [*p.values(values)])
+        offsets = ca.substitute(ca.vertcat(*offsets), *anywhere)
         self._offsets = ca.Function("curve", [q.t], [ca.densify(offsets), ca.densify(ca.jacobian(offsets, q.t))])
         t = np.linspace(*t_span, PANELS + 1)
         self.extent = np.ptp(self._along(t)[0], axis=1)
@@ -99,7 +99,7 @@ class Curve:
         return SpecificationError(
             f"{name!r} {what}." if name in self.program.residuals else f"{name.capitalize()} {what}.",
             "A time-optimal law runs along a curve, h(q) = p(s); only its time law is open.",
-            do="Write residuals h(q) - p(t), or choose shape=False, which stretches the time evenly.",
+            do="Write residuals h(q) - p(t), with via points by spline(..., ends='natural'), or choose shape=False.",
             name=name,
         )
 
@@ -201,9 +201,9 @@ class Inverse:
         rows = ca.vertcat(*q.invariants.values(), *(row for level in levels for row in level))
         values = ca.vertcat(*(f(t, self.jets[: f.size1_in(1)], e.parameters)[i] for i, f in found))
         parts = [ca.vertcat(*(level[-1 - self.extra] for level in levels)), rows, values, e.rates(q.jet(top))]
-        known = ca.vertcat(t, *e.parameters.elements()[:-JETS]), ca.vertcat(0, ca.DM(model.parameters[:-JETS]))
-        top_rows, *parts = ca.substitute(parts, [known[0]], [ca.SX(known[1])])
-        self.order, highest = (max(j for j in range(JETS) if ca.depends_on(row, c[j])) for row in (top_rows, ca.vertcat(*parts)))
+        numbers = ca.DM([0.0, *model.parameters[:-JETS]])
+        tops, *parts = ca.substitute(parts, [ca.vertcat(t, *e.parameters.elements()[:-JETS])], [ca.SX(numbers)])
+        self.order, highest = (max(j for j in range(JETS) if ca.depends_on(x, c[j])) for x in (tops, parts[0]))
         self.c, self.state, self.free = ca.vertcat(*c[: highest + 1]), e.state.numel(), model.free
         self.function = ca.Function("inverse", [self.jets, self.c], [ca.densify(ca.cse(part)) for part in parts])
 
@@ -240,8 +240,8 @@ class Law:
     def expression(self, t, t0):
         """s as an SX of a time that begins at t0 [s]; before and after it rests."""
         k, count = len(self.jets) - 1, self.jets.shape[1] - 1
-        taylor = np.vstack([self.jets[:, :-1], np.diff(self.jets[-1:]) * count])
-        powers = np.array([taylor[j] / (count**j * factorial(j)) for j in range(k + 2)])
+        begins = np.vstack([self.jets[:, :-1], np.diff(self.jets[-1:]) * count])
+        powers = np.array([begins[j] / (count**j * factorial(j)) for j in range(k + 2)])
         about_middle = np.array([[comb(j, i) / 2**j if i <= j else 0.0 for j in range(k + 2)] for i in range(k + 2)])
         times = t0 + self.duration * np.linspace(0.0, 1.0, count + 1)
         return piecewise(ca.fmin(ca.fmax(t, times[0]), times[-1]), times, (about_middle @ powers)[:, :, None])
@@ -249,7 +249,8 @@ class Law:
 
 def taylor(rows, k, step):
     """The matrix (rows, k + 2) from (s, ..., s^(k+1)) at the begin of an interval to s, s', ... a step later."""
-    return np.array([[step ** (j - i) / factorial(j - i) if j >= i else 0.0 for j in range(k + 2)] for i in range(rows)])
+    powers = [step**j / factorial(j) for j in range(k + 2)]
+    return np.array([[powers[j - i] if j >= i else 0.0 for j in range(k + 2)] for i in range(rows)])
 
 
 def resting(top, k):
@@ -277,7 +278,7 @@ def resting(top, k):
     return jets
 
 
-def _columns(sizes, count):
+def _each(sizes, count):
     return ca.repmat(ca.DM(sizes), 1, count)
 
 
@@ -293,8 +294,8 @@ def smooth(duration, k):
 class Problem:
     """The nonlinear program of a curve.
 
-    Unknowns: the duration, the jets of s at the ends of the intervals (k + 1, N + 1), the jets of the motion at all nodes
-    (n_z, N S), each in units of its size.
+    Unknowns: the duration, the jets of s at the ends of the intervals (k + 1, N + 1), the jets of the motion at all
+    nodes (n_z, N S), each in units of its size.
 
     Parameters
     ----------
@@ -309,7 +310,7 @@ class Problem:
 
     def __init__(self, inverse, limits, law, plan):
         self.inverse, self.limits, self.law, self.k = inverse, np.array(limits), law, inverse.order
-        self.c, self.rate, *_ = radau(ORDER)
+        self.c, self.rate, *_ = radau(COLLOCATION)
         self.count = law.jets.shape[1] - 1
         begins = np.arange(self.count)[:, None]
         nodes = plan.t[0] + law.duration * (begins + self.c).ravel() / self.count
@@ -329,8 +330,8 @@ class Problem:
         largest = np.abs(z).max(axis=1)
         self.z_size = np.where(largest > 1e-6 * largest.max(), largest, 1.0)
         at = self._places(self.law)
-        f = inverse.function
-        J = ca.Function("J", [inverse.jets, inverse.c], [ca.densify(ca.jacobian(f(inverse.jets, inverse.c)[0], inverse.jets))])
+        f, of = inverse.function, (inverse.jets, inverse.c)
+        J = ca.Function("slopes", [*of], [ca.densify(ca.jacobian(f(*of)[0], inverse.jets))])
         slopes = np.array([np.array(J(z[:, i], at[:, i])) * self.z_size for i in range(z.shape[1])])
         self.row_size = np.abs(slopes).max(axis=(0, 2))
         values = np.array(f.map(z.shape[1])(z, at)[1])
@@ -370,22 +371,23 @@ class Problem:
             ubg=np.concatenate([zeros, sides[1]]),
         )
         w, stats = np.array(result["x"]).ravel(), solver.stats()
-        if stats["return_status"] not in SOLVED or w[0] < 2 * LEAST:
-            raise self._failed(stats, w[0])
-        return Law(w[0] * self.law.duration, resting(w[1 : 1 + s.numel()].reshape(s.shape, order="F")[k] * self.sizes[k], k))
+        if not stats["success"]:
+            raise _failed(stats)
+        top = w[1 : 1 + s.numel()].reshape(s.shape, order="F")[k] * self.sizes[k]
+        return Law(w[0] * self.law.duration, resting(top, k))
 
     def _constraints(self, duration, jets, motion):
         """What vanishes, and the signals in their sizes, all as columns."""
         N, S, k = self.count, len(self.c), self.k
         slopes = (jets[k, 1:] - jets[k, :-1]) * N
         moved = ca.DM(taylor(k, k, 1.0 / N)) @ ca.vertcat(jets[:, :-1], slopes)
-        equal, values, rates = [(jets[:k, 1:] - moved) / _columns(self.sizes[:k], N)], [], []
+        equal, values, rates = [(jets[:k, 1:] - moved) / _each(self.sizes[:k], N)], [], []
         powers = ca.vertcat(*(duration**i for i in range(self.inverse.c.numel())))
         f = self.inverse.function.map(N)
         for j, place in enumerate(self._stages(jets)):
             rows, value, rate = f(motion[:, j::S], place / ca.repmat(powers, 1, N))
-            equal.append(rows / _columns(self.row_size, N))
-            values.append(value / _columns(self.value_size, N))
+            equal.append(rows / _each(self.row_size, N))
+            values.append(value / _each(self.value_size, N))
             rates.append(rate)
         for i in self.free.tolist():
             x = ca.vertcat(*(motion[i, j::S] for j in range(S)))
@@ -393,21 +395,6 @@ class Problem:
             rate = ca.vertcat(*(rate[i, :] for rate in rates))
             equal.append((ca.DM(self.rate) @ (x - ca.repmat(begin, S, 1)) - duration / N * rate) / self.z_size[i])
         return ca.veccat(*equal), ca.veccat(*values)
-
-    def _failed(self, stats, duration):
-        if duration < 2 * LEAST:
-            return SpecificationError(
-                f"No limit is reached even {1 / LEAST:g} times as fast.",
-                "A time-optimal law reaches limits.",
-                do="Pass limits of the actuators that the motion uses.",
-            )
-        status = stats["return_status"]
-        return IntegrationStopped(
-            f"IPOPT ends with {status} after {stats['iter_count']} iterations.",
-            "A time-optimal law is a minimum of the duration.",
-            do="Choose wider limits, a simpler curve, or shape=False.",
-            status=status, iterations=stats["iter_count"],
-        )  # fmt: skip
 
     def _sides(self, upper):
         """Lower or upper bounds of the jets of s."""
@@ -418,3 +405,13 @@ class Problem:
         bound[:, 0] = 0.0
         bound[:, -1] = np.eye(self.k + 1)[0]
         return (bound / self.sizes[:, None]).ravel("F")
+
+
+def _failed(stats):
+    status = stats["return_status"]
+    return IntegrationStopped(
+        f"IPOPT ends with {status} after {stats['iter_count']} iterations.",
+        "A time-optimal law is a minimum of the duration.",
+        do="Choose wider limits, a simpler curve, or shape=False.",
+        status=status, iterations=stats["iter_count"],
+    )  # fmt: skip
