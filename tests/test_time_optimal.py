@@ -115,7 +115,7 @@ def test_stable_internal_dynamics_take_part():
 
 def test_two_cars_with_a_force_of_the_fourth_derivative():
     law = sv.fastest(*cars(), {"force": 200.0}, (0.0, 2.0), shape=True)
-    assert law.factor < 0.9 * 0.953  # of S13 stretched evenly
+    assert law.factor < 0.76 * 1.1170918  # of S13 stretched evenly, by its closed form
     assert active(law, {"force": 200.0}) > 0.8 and np.abs(law.plan["force"]).max() <= 200.0
 
 
