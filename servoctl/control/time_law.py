@@ -36,7 +36,7 @@ REACHED = 1e-4  # of a limit: largest distance at which it counts as reached
 
 @dataclass(frozen=True, eq=False)
 class TimeLaw:
-    """A program whose time is scaled until a signal reaches its limit; made by `fastest`.
+    """A program whose time is stretched evenly, or runs by an optimal law, up to a limit; made by `fastest`.
 
     Attributes
     ----------
