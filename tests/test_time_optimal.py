@@ -79,7 +79,7 @@ def test_the_crane_is_faster_than_by_any_polynomial_and_at_a_limit_nearly_throug
     assert law.plan["X"][-1] == pytest.approx(5.0) and abs(law.plan["trolley"][-1]) < 1e-6
 
 
-@pytest.mark.parametrize("path, span", [(S7, (0.0, 5.0)), (lambda t: 3.0 * t, (0.0, 1.0))])
+@pytest.mark.parametrize("path, span", [(S7, (0.0, 5.0)), (lambda t: 0.06 * t, (0.0, 50.0))])
 def test_a_mass_takes_the_time_of_full_thrust_and_one_interval_of_ramps(path, span):
     """Thrust ±F takes 2√(dm/F); reversal and both ends take an interval each, whatever the pace of the path given."""
     law = sv.fastest(*mass(path), {"push": 4.0}, span, shape=True)
@@ -170,7 +170,7 @@ def test_limits_without_a_time_law_are_refused():
     q = sv.coordinates("x y")
     x, y = q
     mechanism = sv.Mechanism(q, gibbs=sv.particle(q, 2.0, ca.vertcat(x, y)), actuators={"fx": x, "fy": y})
-    with refused(sv.SpecificationError, names=["fy"]):
+    with refused(sv.SpecificationError, factor=2.0**-12):
         sv.fastest(mechanism, sv.Program({"X": x - S7(q.t), "Y": y}), {"fy": 3.0}, (0.0, 5.0), shape=True)
 
 

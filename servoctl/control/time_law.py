@@ -29,7 +29,6 @@ from servoctl.spec.program import Program
 REACH = 12  # doublings of the time, after which a motion is nearly static, or halvings
 BELOW = 1e-6  # of a limit: distance that the fastest time law keeps from it
 TIGHTENED, TIGHTER = 5, 1.2  # how often a time-optimal law is solved; limits at nodes give way by this many excesses
-STILL = 1e-9  # of its size: a signal that changes less along a path reaches no limit by going faster
 SHORT = 1e-6  # of the span: intervals of samples that are too short for a difference quotient
 REACHED = 1e-4  # of a limit: largest distance at which it counts as reached
 
@@ -158,18 +157,17 @@ def _optimal(scene, bar):
     curve = Curve(scene.mechanism, scene.program, scene.t_span, scene.parameters)
     inverse = Inverse(curve, tuple(scene.limits), scene.parameters, scene.guess)
     (t0, t1), t = scene.t_span, scene.mechanism.q.t
-    for exponent in range(REACH + 1):
-        law = smooth((t1 - t0) * 2.0**exponent, inverse.order)
-        step = rest_to_rest(t - t0, 0.0, 1.0, law.duration, inverse.order)
-        excess, _, _, plan = attempt = scene.along(curve, step, law.duration)
+
+    @functools.cache
+    def attempt(factor):
+        step = rest_to_rest(t - t0, 0.0, 1.0, (t1 - t0) * factor, inverse.order)
+        found = scene.along(curve, step, (t1 - t0) * factor)
         bar.update()
-        _require_stable(plan)
-        if excess <= 0:
-            break
-    else:
-        raise _exceeded(attempt, 2.0**exponent)
-    if all(np.ptp(_values(plan, name)[1]) <= STILL * np.abs(_values(plan, name)[1]).max() for name in scene.limits):
-        raise _unchanged(list(scene.limits))
+        _require_stable(found[-1])
+        return found
+
+    _, slow = _bracket(attempt)
+    law, plan = smooth((t1 - t0) * slow, inverse.order), attempt(slow)[-1]
     sides = np.array([*scene.limits.values()]).T
     for _ in range(TIGHTENED):
         law = Problem(inverse, sides, law, plan).solved()
@@ -310,15 +308,6 @@ def _require_stable(plan):
             do="Use sv.relaxed(plant, program, t_span, limits=...) for a given duration, or choose another output.",
             growth=float(internal.growth),
         )
-
-
-def _unchanged(names):
-    return SpecificationError(
-        f"Along the curve {', '.join(names)} {'do' if len(names) > 1 else 'does'} not change.",
-        "A time-optimal law is bounded by limits.",
-        do="Pass limits of the actuators that the motion uses.",
-        names=names,
-    )
 
 
 def _exceeded(last, factor):
