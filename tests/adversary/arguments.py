@@ -133,7 +133,7 @@ def calls():
         "close_many case": (lambda m: sv.close_many(closed, [{"m": m}]), dict(m=2.1)),
         "limit_report": (sv.limit_report, dict(run=sv.close(bounded, sv.limited(law, bounded), x0, span), scene=None)),
         "fastest": (sv.fastest, dict(mechanism=s["mechanism"], program=s["program"], limits={"pull": 50.0}, t_span=(0.0, 1.0),
-                                     start=None, guess=None, parameters=None, progress=False)),
+                                     start=None, guess=None, parameters=None, shape=False)),
         "slowed": (s["program"].slowed, dict(q=q, factor=2.0, at=0.0)),
         "grid": (lambda a: sv.grid(a=a), dict(a=[1.0, 2.0])),
         "monte_carlo": (lambda n, seed, a: sv.monte_carlo(n, seed=seed, a=a), dict(n=3, seed=1, a=stats.uniform(1.0, 2.0))),
