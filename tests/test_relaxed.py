@@ -6,12 +6,13 @@ import pytest
 from refusals import refused
 from scipy.integrate import solve_ivp
 from scipy.optimize import approx_fprime
+from test_bounded import flexible_link
 
 import servoctl as sv
 from servoctl.control.reference import resampled
-from servoctl.errors import InconsistentStart, LimitExceeded, NameUnknown, SpecificationError
-from servoctl.inversion.relaxed import DEFECT, FACTOR, FIRST
-from servoctl.inversion.transcription import WATCHED, Mesh, Transcription, bernstein
+from servoctl.errors import InconsistentStart, IntegrationStopped, LimitExceeded, NameUnknown, SpecificationError
+from servoctl.inversion.relaxed import DEFECT, FACTOR, FIRST, Task
+from servoctl.inversion.transcription import IPOPT, LONGEST, WATCHED, Mesh, Transcription, bernstein
 from servoctl.run import load
 
 rest_to_rest = sv.paths.rest_to_rest
@@ -257,6 +258,14 @@ def test_the_plant_follows_the_plan(scene):
     assert sv.verify(run.model, run).passed
 
 
+def test_stiff_machines_are_solved_in_a_few_iterations():
+    """Eight segments, the first solution, with modes of 650 rad/s in intervals of 0.09 s."""
+    mechanism, program = flexible_link(8)
+    task = Task(sv.plant(mechanism), program, (0.0, 2.2), ({}, {}), None, None, "rest")
+    plan = task._solved(task._first(task._mesh()), [FIRST * task._usual_weights()])
+    assert plan.iterations[0] <= 5
+
+
 # --- towards the exact inverse
 
 
@@ -364,6 +373,12 @@ def test_infeasible_limits_say_which_where_and_by_how_much(crane):
         sv.relaxed(*crane, (0.0, 6.0), weight=1e-6, limits={"cart": 10.0})
     assert caught.value.details["value"] == pytest.approx(127.8, abs=2.0)
     assert caught.value.details["t"] == pytest.approx(1.8, abs=0.1) or caught.value.details["t"] > 4.0
+
+
+def test_a_solution_that_takes_too_long_says_so(crane, monkeypatch):
+    monkeypatch.setitem(IPOPT, "max_wall_time", 1e-3)
+    with refused(IntegrationStopped, f"IPOPT does not converge in {LONGEST:g} s", status="Maximum_WallTime_Exceeded"):
+        sv.relaxed(*crane, (0.0, 6.0), weight=1e-8)
 
 
 # --- the parts

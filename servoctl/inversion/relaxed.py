@@ -25,7 +25,7 @@ from servoctl.errors import (
     unknown,
 )
 from servoctl.inversion.equilibrium import RANK, Equilibria
-from servoctl.inversion.transcription import Mesh, Node, Transcription
+from servoctl.inversion.transcription import LONGEST, Mesh, Node, Transcription
 from servoctl.methods.motion import breakpoints
 from servoctl.model.model import derive
 from servoctl.model.start import State
@@ -54,6 +54,7 @@ STANDING = 1e-6  # rate of a program that stands still, relative to its largest
 STATUS = {
     "Infeasible_Problem_Detected": "finds no motion",
     "Maximum_Iterations_Exceeded": "does not converge in 200 iterations",
+    "Maximum_WallTime_Exceeded": f"does not converge in {LONGEST:g} s",
     "Restoration_Failed": "finds no way back to the equations of motion",
 }
 SOLVED = ("Solve_Succeeded", "Solved_To_Acceptable_Level")

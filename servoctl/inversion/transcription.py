@@ -16,6 +16,8 @@ from servoctl.methods.bounded import basis_rates
 from servoctl.methods.radau import basis, radau
 
 WATCHED = 12  # instants of bounds in an interval of the inputs
+PIVOTS = 0.1  # threshold of MUMPS: with smaller ones rounding hides the inertia of stiff machines
+LONGEST = 120.0  # of a solution [s]
 IPOPT = {
     "print_level": 0,
     "sb": "yes",
@@ -27,6 +29,8 @@ IPOPT = {
     "bound_relax_factor": 0.0,
     "nlp_scaling_method": "none",
     "mu_strategy": "adaptive",
+    "mumps_pivtol": PIVOTS,
+    "max_wall_time": LONGEST,
 }
 WARM = {
     "warm_start_init_point": "yes",
@@ -84,7 +88,8 @@ class Node:
 
     def function(self, name, *outputs):
         """A function of (t, x, v)."""
-        return ca.Function(name, [self.q.t, self.state, self.v], [ca.densify(ca.cse(o)) for o in outputs])
+        outputs = [ca.densify(ca.cse(o)) for o in outputs]
+        return ca.Function(name, [self.q.t, self.state, self.v], outputs, {"der_options": {"cse": True}})
 
 
 @dataclass(frozen=True)
