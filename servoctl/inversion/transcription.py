@@ -192,7 +192,7 @@ class Transcription:
         Of the states, N intervals.
     pieces : Mesh
         Of the inputs, P intervals, each of one or several of the states'.
-    sizes : (x, u, effort) of (n_x,), (m,) arrays and float
+    sizes : (x, u, bounded, effort) of (n_x,), (m,), (b,) arrays and float
     rest : Function, optional
         Of (t, x, v): what vanishes at the end.
     """
@@ -223,7 +223,7 @@ class Transcription:
         increments = (x[:, 1:] - x[:, begins]) @ _matrix(block_diag([radau(mesh.order)[1].T] * len(mesh.h)))
         h = ca.repmat(ca.DM(np.repeat(mesh.h, s)).T, self.n, 1)
         cost = ca.sum1(residuals**2 / ca.repmat(beta, 1, K)) + effort
-        scale = self.sizes[2] * np.sum(mesh.h)
+        scale = self.sizes[3] * np.sum(mesh.h)
         highest = ca.DM([(-1.0) ** (s - j) * comb(s, j) for j in range(s + 1)])
         constraints = {
             "motion": (increments - h * rates) / ca.repmat(ca.DM(self.sizes[0]), 1, K),
@@ -241,7 +241,7 @@ class Transcription:
             return ca.MX(0, len(t))
         f = node.function("bounded", node.bounded).map(len(t))
         v = ca.vertcat(*(points @ _matrix(_at(self.pieces, t, k)) for k in range(node.depth + 1)))
-        return f(ca.DM(t).T, x @ _matrix(_states_at(self.mesh, t)), v)
+        return f(ca.DM(t).T, x @ _matrix(_states_at(self.mesh, t)), v) / ca.repmat(ca.DM(self.sizes[2]), 1, len(t))
 
     def _split(self, w):
         """States and control points, in SI, of the variables."""
