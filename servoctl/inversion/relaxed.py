@@ -502,11 +502,18 @@ class Task:
         nlp = Transcription(self.node, plan.mesh, plan.pieces, self.sizes, self.target[2])
         bounds, w, multipliers, iterations = self._sides(nlp), nlp.joined(plan.x, plan.points), None, list(iterations)
         for beta in weights:
-            w, multipliers, stats = nlp.solve(w, beta, bounds, multipliers)
+            w, multipliers, stats = self._solution(nlp, w, beta, bounds, multipliers)
             iterations.append(stats["iter_count"])
             if stats["return_status"] not in SOLVED:
                 raise self._failed(nlp, (w, beta, bounds), stats["return_status"], plan)
         return Plan(plan.mesh, plan.pieces, *nlp.apart(w), tuple(iterations))
+
+    def _solution(self, nlp, w, beta, bounds, multipliers):
+        """A solution from one of greater weights; without its multipliers where these mislead, as beside bounds."""
+        found = nlp.solve(w, beta, bounds, multipliers)
+        if multipliers is None or found[2]["return_status"] in SOLVED:
+            return found
+        return nlp.solve(w, beta, bounds)
 
     def _sides(self, nlp):
         """Bounds of the variables and of the constraints by kind."""
@@ -635,6 +642,8 @@ class Task:
         x = mesh.states(plan.x, t)
         v = np.vstack([plan.pieces.inputs(plan.points, t, rate) for rate in range(self.node.depth + 1)])
         jets = np.vstack([x, np.array(self.node.function("motion", self.node.acceleration).map(len(t))(t[None], x, v))])
+        if not np.isfinite(model.function("ode").grid(t, x, model.parameters)).all():
+            model = model.near(t[0], jets[:, 0])  # material constraints whose pivot vanishes at the rest
         counters = {"iterations": sum(plan.iterations), "intervals": len(mesh.h), "solves": len(plan.iterations)}
         run = Run(
             t, jets, tuple(model.jet_names), model, "relaxed", counters=counters,
