@@ -478,7 +478,8 @@ class Task:
         if near is not None:
             first = near.beta / beta
         else:
-            first = FIRST * usual / beta if self._exact is None else np.ones(1)
+            near_rest = FIRST * (FACTOR if self.bounds else 1.0)  # bounds are met sooner by plans of little motion
+            first = near_rest * usual / beta if self._exact is None else np.ones(1)
         factor = max(1.0, float(np.min(first[np.isfinite(first)], initial=np.inf)))
         steps = int(np.ceil(np.log(factor) / np.log(FACTOR))) if np.isfinite(factor) else 0
         weights = [beta * factor ** (1 - k / max(steps, 1)) for k in range(near is not None and steps > 0, steps + 1)]
@@ -502,18 +503,11 @@ class Task:
         nlp = Transcription(self.node, plan.mesh, plan.pieces, self.sizes, self.target[2])
         bounds, w, multipliers, iterations = self._sides(nlp), nlp.joined(plan.x, plan.points), None, list(iterations)
         for beta in weights:
-            w, multipliers, stats = self._solution(nlp, w, beta, bounds, multipliers)
+            w, multipliers, stats = nlp.solve(w, beta, bounds, None if self.bounds else multipliers)
             iterations.append(stats["iter_count"])
             if stats["return_status"] not in SOLVED:
                 raise self._failed(nlp, (w, beta, bounds), stats["return_status"], plan)
         return Plan(plan.mesh, plan.pieces, *nlp.apart(w), tuple(iterations))
-
-    def _solution(self, nlp, w, beta, bounds, multipliers):
-        """A solution from one of greater weights; without its multipliers where these mislead, as beside bounds."""
-        found = nlp.solve(w, beta, bounds, multipliers)
-        if multipliers is None or found[2]["return_status"] in SOLVED:
-            return found
-        return nlp.solve(w, beta, bounds)
 
     def _sides(self, nlp):
         """Bounds of the variables and of the constraints by kind."""
@@ -565,7 +559,7 @@ class Task:
             return IntegrationStopped(
                 f"IPOPT {said}; the largest violation is that of {row} at t = {t:.4g} s, {abs(value - side):.3g}.",
                 "A plan satisfies the equations of motion and the conditions at both ends.",
-                do="Choose a longer span, another end or start nearer to the program.",
+                do="Choose a greater weight, a longer span, or a start and an end nearer to the program.",
                 row=row, t=t, violation=float(abs(value - side)), **facts,
             )  # fmt: skip
         row, t, value, side = self._violation(nlp, without[0], bounds)
@@ -574,7 +568,7 @@ class Task:
             f"IPOPT {said} within the limits and bounds; without them {row} is {value:.5g} at t = {t:.4g} s, "
             f"beyond {side:.5g}.",
             "A plan keeps all limits from end to end.",
-            do="Widen this limit, or give the transition more time.",
+            do="Widen this limit, choose a greater weight, or give the transition more time.",
             row=row, t=t, value=value, limit=side, **facts,
         )  # fmt: skip
 
