@@ -1,5 +1,7 @@
 """Relaxed plans against closed forms, the exact inverse, other integrators, and what limits allow."""
 
+from dataclasses import replace
+
 import casadi as ca
 import numpy as np
 import pytest
@@ -170,7 +172,11 @@ def test_bounds_hold_at_their_instants(crane, coarse, bounds, values):
     run = sv.relaxed(*crane, (0.0, 6.0), weight=1e-6, bounds=bounds)
     edges = np.array([0.0, *run.knots, 6.0])
     instants = (edges[:-1, None] + np.diff(edges)[:, None] * np.arange(WATCHED) / WATCHED).ravel()
-    assert values(resampled(run, instants)) <= 1.0 + 1e-6
+    there, plant = resampled(run, instants), crane[0]
+    u = ca.Function("u", [plant.mechanism.q.t], [run.model.reduction.mechanism.outputs["cart"]])
+    states = there.jets[:4]  # interpolated accelerations have errors where inputs have corners
+    rates = [plant.rates(t, x, [float(u(t))]) for t, x in zip(instants, states.T, strict=True)]
+    assert values(replace(there, jets=np.vstack([states, np.transpose(rates)[2:]]))) <= 1.0 + 1e-6
     excess = values(run) - 1.0
     assert excess < 1e-2
     assert ("exceeds its bound" in run.message) == (excess > 1e-6)
@@ -182,7 +188,7 @@ def test_a_bound_keeps_the_rope_of_a_flat_crane_taut():
     x, l, theta = mechanism.q
     path = rest_to_rest(mechanism.q.t, (0.0, 2.0), (1.0, 5.0), 1.2)
     program = sv.Program({"X": x + l * ca.sin(theta) - path[0], "Z": l * ca.cos(theta) - path[1]})
-    task = {"start": {"l": 2.0}, "bounds": {"tension": (100.0, None)}, "weight": 1e-8}
+    task = {"start": {"l": 2.0}, "bounds": {"tension": (100.0, None)}, "weight": 2e-8}
     run = sv.inverse(mechanism, program, (0.0, 1.2), **task)
     assert "relaxed, as the exact plan ends: The program is singular at t = 0.2" in run.message
     assert 95.0 < run["tension"].min() < 101.0 and sv.verify(run.model, run).passed

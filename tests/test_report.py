@@ -375,5 +375,5 @@ def test_self_motion_is_reported_and_whether_it_is_damped(friction, said):
 
 
 def test_a_program_for_each_actuator_leaves_no_self_motion():
-    report = sv.report(gallery["overhead-crane"].model())
+    report = sv.report(*gallery["overhead-crane"].build())
     assert report.self_motion is None and "self-motion" not in str(report)
