@@ -355,7 +355,7 @@ class Task:
             return None
 
     def _guess(self):
-        """States (n_x, G) and inputs (m, G) at equal instants, and sizes of states, inputs, bounded values and effort."""
+        """States (n_x, G) and inputs (m, G) at equal instants, and the sizes that `Transcription` takes."""
         times = np.linspace(*self.span, GUESS)
         if self._exact is not None:
             x = np.array([np.interp(times, self._exact.t, self._exact[name]) for name in self.plant.state_names])
