@@ -331,6 +331,9 @@ class Monitor:
         n_g, count, m = stretch.pivots.shape
         if not stretch.pivots.size:
             return Fine(count)
+        pole = self._pole(stretch)
+        if pole is not None:
+            return pole
         relative, largest = self._relative(stretch.pivots.reshape(n_g, -1))
         track = np.column_stack([self.recent, relative])
         first = self.recent.shape[1] - 1
@@ -351,6 +354,17 @@ class Monitor:
             self.sunk = None
         self.recent = track[:, -2:]
         return Fine(count)
+
+    def _pole(self, stretch):
+        """Singular where a pivot grows without bound in one step, as that of a row divided by a speed that vanishes."""
+        ends = np.abs(stretch.pivots[:, :, -1])
+        largest = np.maximum(self.reference, self.model.pivot_sizes)[:, None]
+        before = np.maximum.accumulate(np.column_stack([largest, ends]), axis=1)[:, :-1]
+        grown = np.flatnonzero(np.any(NEGLIGIBLE * ends > before, axis=0))
+        if not len(grown):
+            return None
+        k = int(grown[0])
+        return Singular(k, stretch.t[k + 1], stretch.x[:, k + 1], "a pivot grows without bound")
 
     def _step(self, stretch, k, before, scale):
         """The outcome of one step, None if it is fine; `before` are the relative pivots at and before its start."""

@@ -114,7 +114,7 @@ def pendulum(speed):
     )  # fmt: skip
 
 
-@pytest.mark.parametrize("method", ["DOP853", "Radau", "Taylor", "RK4"])
+@pytest.mark.parametrize("method", ["DOP853", "Radau", "Taylor", "RK4", "RadauIIA", "CVODES"])
 def test_a_curvature_ends_where_the_speed_does(method):
     model, reference = circling(), pendulum(2.0)
     start = model.start(x=0.0, y=0.0, dx=2.0, dy=0.0)
