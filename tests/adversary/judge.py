@@ -19,6 +19,7 @@ SHARP = 1e5  # sensitivities of accelerations above this confirm a refusal as si
 STEEPER = 30.0  # the growth of that sensitivity from start to stop that confirms a stop
 POLE, FURTHER = 0.9, 1.2  # or with this power, as a pole does, where the start is this factor farther from the stop
 BESIDE = (3.0, 1.0, 0.3, 0.1, 0.03, 0.01)  # distances [s, too] from a state at which the reference has no verdict
+NEARLY = 0.99  # of the way to a stop before the first sample, which is followed again
 POWER = 0.3  # or it grows at least with this power of one over the time that is left
 LARGE = 1e4  # a motion that has grown so far may end
 PATIENCE = 40  # s of processor time for a case; a few tenths are usual
@@ -190,6 +191,16 @@ def _sentence(error):
     return re.sub(r"[\d.e+-]+|'[^']*'", "…", str(error))[:60]
 
 
+def _towards(model, start, stop, run):
+    """The motion to a stop that came before the first sample, sampled; the run itself where there is none."""
+    times = stop * np.linspace(0.0, NEARLY, 21)
+    try:
+        method = None if model.flat else sv.Adaptive("DOP853", rtol=1e-12, atol=1e-13)
+        return sv.simulate(model, start, (0.0, times[-1]), method, t_eval=times)
+    except sv.ServoError:
+        return run
+
+
 def _state(start, n):
     """q and the Taylor coefficients of w at a start."""
     jets = start.values[n:].reshape(-1, n).T
@@ -221,6 +232,8 @@ def _cause(reference, case, start, error, model):
     """What of the reference confirms a refusal; empty where nothing does."""
     t, q, w, near = 0.0, np.array(case.guess), np.array(case.speeds)[:, None], False
     run = error.run
+    if run is not None and len(run.t) == 1 and model is not None and error.details.get("t", 0.0) > 0.0:
+        run = _towards(model, start, error.details["t"], run)
     if start is not None:
         (q, w), near = _state(start, case.n), True
     if run is not None and len(run.t) and np.all(np.isfinite(run.jets[:, -1])):
