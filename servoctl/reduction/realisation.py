@@ -91,14 +91,14 @@ def _realised(mechanism, constraints, directions, actuation, points, among=None,
         )
     cleaned = clean(numbers, sizes)
     inertia = clean(*points.matrix(ca.diag(mechanism.mass)))[candidates, 0, best]
-    columns = _columns(cleaned[:, candidates, best], inertia, list(rank.columns))
+    columns = _sizeable_columns(cleaned[:, candidates, best], inertia, list(rank.columns))
     dependent = tuple(sorted(candidates[i] for i in columns))
     regular = [p for p, rank in enumerate(decide_each(cleaned[:, list(dependent)])) if rank.rank == len(cleaned)]
     independent = tuple(i for i in range(n) if i not in dependent)
     return Realisation(B, actuation, dependent, independent, cleaned[:, :, regular or [best]], **settled)
 
 
-def _columns(matrix, inertia, columns):
+def _sizeable_columns(matrix, inertia, columns):
     """Independent columns of a matrix (b, n) at a point: the given ones, or others in the metric of the inertia (n,).
 
     Equilibration makes a column that is about to vanish as large as any other; with the inertia of its coordinate it is
