@@ -431,6 +431,11 @@ def test_refusals(crane):
         sv.relaxed(plant, program, (1.0, 6.0), weight=1e-8)
     with refused(SpecificationError, "'stop'", end="stop"):
         sv.relaxed(plant, program, span, weight=1e-8, end="stop")
+    for start in ({"x": "0.5"}, {"x": [1.0]}, [[0.0, 0.0], [0.0]]):
+        with refused(SpecificationError):
+            sv.relaxed(*crane, (0.0, 6.0), weight=1e-6, start=start)
+    with refused(SpecificationError, name="weight", expected=(None,)):
+        sv.relaxed(*crane, (0.0, 6.0), weight=[[1e-6, 1e-8]])
     with refused(SpecificationError, name="plant"):
         sv.relaxed(plant.mechanism, program, span, weight=1e-8)
 

@@ -15,7 +15,18 @@ from functools import cached_property
 import casadi as ca
 import numpy as np
 
-from servoctl.checks import as_list, as_span, finite, interval, mapping, positive_number, positives, require_kind
+from servoctl.checks import (
+    array_of,
+    as_list,
+    as_span,
+    finite,
+    interval,
+    mapping,
+    numbers_by_name,
+    positive_number,
+    positives,
+    require_kind,
+)
 from servoctl.errors import (
     InconsistentStart,
     IntegrationStopped,
@@ -120,7 +131,8 @@ def relaxed(
     several = None if isinstance(weight, Mapping) else as_list(weight)
     if several is None:
         return task.run(_weights(weight, program))
-    return task.front(positives("weight", several, "Write weight=[1e-6, 1e-8].").tolist())
+    weights = positives("weight", several, "Write weight=[1e-6, 1e-8].")
+    return task.front(array_of("weight", weights, None).tolist())
 
 
 def _weights(weight, program):
@@ -208,6 +220,10 @@ class Task:
 
     # the ends
 
+    @property
+    def _to_rest(self):
+        return isinstance(self.end, str) and self.end == "rest"
+
     def _begin(self, start):
         """The state at t0, and the inputs that hold it at rest; None if it may move."""
         nq, t0 = self.nq, self.span[0]
@@ -217,15 +233,16 @@ class Task:
             names, guess = list(self.plant.mechanism.q.names), zero[:nq].copy()
             if self._exact is not None:
                 guess = self._exact.jets[:nq, 0].copy()
-            fixed = [names.index(name) for name in start or ()]
-            guess[fixed] = [start[name] for name in start or ()]
+            given = numbers_by_name(start, names, "coordinate", "start")
+            fixed = [names.index(name) for name in given]
+            guess[fixed] = list(given.values())
             rest, worst = self.equilibria.at(t0, guess, zero[nq:], fixed)
             if rest is None:
                 raise _no_rest("start", t0, worst)
             return np.concatenate([rest[0], np.zeros(self.n - nq)]), self._held(rest, "start")
-        values = getattr(start, "values", start) if not isinstance(start, dict) else start
-        x = self.plant.state(values if isinstance(values, dict) else np.ravel(values)[: self.n])
-        if self.end != "rest":
+        values = start.values[: self.n] if isinstance(start, State) else start
+        x = self.plant.state(values)
+        if not self._to_rest:
             return x, None
         self._require_standing(t0, "start")
         rest, worst = self.equilibria.at(t0, x[:nq], zero[nq:], range(nq), self.equilibria.program)
@@ -283,7 +300,7 @@ class Task:
     def _target(self):
         """What is fixed at the end: (state with NaN where open, inputs or None, function that vanishes or None)."""
         open_ = np.full(self.n, np.nan)
-        if self.end == "free":
+        if isinstance(self.end, str) and self.end == "free":
             return open_, None, None
         if isinstance(self.end, Mapping):
             for name, value in self.end.items():
@@ -291,7 +308,7 @@ class Task:
                     raise unknown(name, self.plant.state_names, "state")
                 open_[self.plant.state_names.index(name)] = finite(name, value, "value at the end")
             return open_, None, None
-        if self.end != "rest":
+        if not self._to_rest:
             raise SpecificationError(
                 f"end={self.end!r}.", "It is 'rest', 'free', or values of states by name.", end=self.end
             )

@@ -302,7 +302,8 @@ class Transcription:
         if warm not in self._solvers:
             w, beta, objective, constraints = self._problem
             g = ca.vertcat(*(ca.vec(value) for value in constraints.values()))
-            options = {"print_time": False, "ipopt": IPOPT | (WARM if warm else {})}
+            quiet = {"print_time": False, "show_eval_warnings": False, "calc_lam_p": False}
+            options = quiet | {"ipopt": IPOPT | (WARM if warm else {})}
             self._solvers[warm] = ca.nlpsol("relaxed", "ipopt", {"x": w, "p": beta, "f": objective, "g": g}, options)
         return self._solvers[warm]
 

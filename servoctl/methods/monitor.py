@@ -17,6 +17,7 @@ from servoctl.tolerances import ENTRY
 DEGRADED = 0.02  # of its reference: a pivot below this is replaced, if the matrix itself is better than that
 HELPS = 5.0  # factor by which the matrix must be better
 NEGLIGIBLE = 1e-7  # of its reference: a pivot below this is zero
+SINGULAR = 1e-3  # at a zero of a pivot that dense output has located: a rank measure below this counts as lost
 HOPELESS = 1e-9  # an equilibrated singular value below this leaves no digits
 VANISHING = 0.03  # of its reference: a gradient or rank measure below this counts as lost
 LOST = 0.1  # of its best, or beside a zero: below this, rank is why no step succeeds or a pivot is zero
@@ -94,6 +95,7 @@ class Stretch:
     pivots: np.ndarray
     top: object
     crosses: bool = False
+    lost = DEGRADED  # rank measure at a zero as roughly located as here, below which the program is singular
 
     def first(self, count):
         """The first steps alone."""
@@ -153,6 +155,7 @@ class DenseStretch(Stretch):
     pivots_at: object = None
     slope: object = None
     resumes: bool = False
+    lost = SINGULAR
 
     def instants(self, k):
         """The ends of step k and quarters between them."""
@@ -404,7 +407,7 @@ class Monitor:
     def _vanishing(self, stretch, k, t, why):
         """The outcome of a pivot that vanishes at t in step k: another choice of pivots, or a singular program."""
         measure = min(self.rank_measure(s, stretch.state(k, s)) for s in stretch.ranks_at(k, t))
-        if measure > DEGRADED or self._as_beside(stretch, k, t):
+        if measure > stretch.lost or self._as_beside(stretch, k, t):
             if stretch.crosses:
                 return _other_pivots(k + 1, stretch.t[k + 1], stretch.x[:, k + 1])
             before = stretch.last_before(k, t)
@@ -412,7 +415,7 @@ class Monitor:
         x, before = stretch.state(k, t), stretch.last_before(k, t)
         singular, start = Singular(k, t, x, why), stretch.state(k, before)
         variant = self.repivoted(before, start, stretch.top(before, start))
-        helps = variant is not None and variant[1].rank_measure(t, x) > DEGRADED
+        helps = variant is not None and variant[1].rank_measure(t, x) > stretch.lost
         return Repivot(k, before, start, variant, singular) if helps else singular
 
     def _as_beside(self, stretch, k, t):
