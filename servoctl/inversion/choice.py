@@ -70,7 +70,8 @@ def inverse(
         Limits of actuators and of their rates, {"trolley": 100.0, "dtrolley": 500.0}. An exact plan beyond them is
         replaced by the relaxed one.
     bounds : dict of str to float or (low, high), optional
-        Bounds of other signals, such as {"tension": (0, None)}, likewise.
+        Bounds of other signals, such as {"tension": (0, None)}, likewise. With limits or bounds, an exact plan that
+        reaches a singular state is replaced, too.
     weight : float or dict of str to float, optional
         Of the relaxed inverse; default: 1e-6 of that for which standing still costs as much as the program.
 
@@ -128,15 +129,21 @@ class Task:
         """The run by the method that the verdict chooses; the relaxed one where that is beyond limits or grows."""
         if chosen == RELAXED:
             return self.relaxed(found, begin)
+        ranges = {**self.ranges[0], **self.ranges[1]}
         try:
             run = self.exact(model, begin, found, chosen)
         except (IntegrationStopped, SingularProgram) as error:
-            run = getattr(error, "run", None)
-            found = found if run is None else verdict(model, run)
-            if found.dynamics != GROWS or model.ideal:
+            if model.ideal:
                 raise
-            return self.relaxed(found, begin, moving=True)
-        excess = _excess(run, {**self.ranges[0], **self.ranges[1]})
+            run = getattr(error, "run", None)
+            judged = found if run is None else verdict(model, run)
+            if judged.dynamics == GROWS:
+                return self.relaxed(judged, begin, moving=True)
+            if not (ranges and isinstance(error, SingularProgram)):
+                raise
+            # as at a rope without tension, which a bound excludes
+            return self.relaxed(f"the exact plan ends: {str(error).split('; ')[0]}", begin)
+        excess = _excess(run, ranges)
         if excess:
             return self.relaxed(excess, begin)
         if found.dynamics == OPEN or run.internal.get("verdict") == "unstable":
@@ -144,7 +151,7 @@ class Task:
         if found.dynamics != GROWS:
             return _told(run, found)
         if not model.ideal:
-            return self.relaxed(found, begin, moving=not found.rest)
+            return self.relaxed(found, begin, moving=True)
         warnings.warn(f"An ideal program has no other inverse, and this is {found}.", RuntimeWarning, stacklevel=3)
         return _told(run, found)
 
