@@ -39,7 +39,7 @@ REMEDIES = {
     GROWS: f"{DWELL}.",
     OPEN: "Begin and end the program with a dwell, or pass a start=... nearer to its bounded motion.",
 }  # of a relaxed plan that misses its program, by verdict
-MISSED = 1e-3  # of the stroke of a residual, by which a plan misses it with a warning
+MISS = 1e-3  # of the stroke of a residual, by which a plan misses it with a warning
 
 
 def inverse(
@@ -290,7 +290,7 @@ def _measured(run, program, dynamics):
     if not parts:
         return run
     name = max(parts, key=parts.get)
-    if parts[name] <= MISSED:
+    if parts[name] <= MISS:
         return run
     missed = f"the plan misses {name} by {largest[name]:.3g}, {100 * parts[name]:.2g} % of its stroke"
     do = REMEDIES.get(dynamics, "Allow more time or wider limits, or a smaller weight.")

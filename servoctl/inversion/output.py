@@ -26,7 +26,7 @@ from servoctl.simulation import simulate
 
 VALUES = 257  # of the parameter, spread over its range, at which roots are computed
 TOUCHES = 1e-9  # of its largest value: a coefficient whose smallest value is below has a root there
-HALVINGS = 24  # of a step of the values, towards a value at which roots come closest to the axis
+NARROWEST = 24  # of a step of the values, towards a value at which roots come closest to the axis
 BISECTIONS = 60  # halvings of an interval of the parameter: all digits of a double
 CURVE_STEP, CURVE_STEPS = 0.02, 500  # along the rests of a program, relative to the size of the state; on either side
 SHOWN_RANGES, SHOWN_VALUES = 6, 3  # in the printed form
@@ -385,7 +385,7 @@ def _refined(polynomial, grid):
         for i in np.flatnonzero(near) + 1
     ]
     # where roots cross there and back between two values, one of these lies between the crossings
-    offsets = step * np.concatenate([s * 0.5 ** np.arange(1, HALVINGS) for s in (1.0, -1.0)])
+    offsets = step * np.concatenate([s * 0.5 ** np.arange(1, NARROWEST) for s in (1.0, -1.0)])
     beside = [v for c in closest for v in c + offsets if grid[0] < v < grid[-1] and not polynomial.kind(v)[1]]
     return np.unique([*grid, *closest, *beside]).tolist()
 
