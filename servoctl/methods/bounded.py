@@ -109,8 +109,8 @@ def bounded(model, span, guess, method, instants, progress, events=None):
     outputs = model.function("ode").grid(times, samples, model.parameters)
     problem.require_pivots(times, outputs[problem.n_x :])
     motion.add(model, times, samples, outputs[problem.n_x - model.n : problem.n_x])
-    motion.note = f"bounded from t = {window[0]:.4g} to {window[1]:.4g} s; a window of twice the length changes the "
-    motion.note += f"motion by {truncation:.1e}{left_out}"
+    motion.note = f"bounded from t = {window[0]:.4g} to {window[1]:.4g} s{left_out}; "
+    motion.note += f"a window of twice the length changes the motion by {truncation:.1e}"
     return motion
 
 
