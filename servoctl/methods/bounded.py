@@ -30,7 +30,7 @@ from servoctl.model.switching import switching
 from servoctl.tolerances import CUTOFF, NOISE
 
 ORDER = 13  # of the collocation: seven nodes
-LONGEST = 1.0  # interval of the first mesh, in time constants of the fastest mode
+LONGEST = 4.0  # interval of the first mesh beside corners, in time constants of the fastest mode
 FIRST_INTERVALS = 1000  # of a first mesh that need not resolve its fastest modes everywhere
 COARSEST = 10.0  # interval in time constants of the fastest unstable mode, up to which the collocation lets it grow
 MOST_INTERVALS = 4000
@@ -407,23 +407,27 @@ class Problem(FreeEntries):
     def _first_mesh(self, window, knots):
         """A mesh of the window that is graded between the ends of the span and the knots."""
         shortest, longest = self._lengths(window)
+        self._require_resolved(window, longest)
         corners = breakpoints(window, sorted({*self.span, *knots}))
         while True:
             mesh = np.unique([t for a, b in pairwise(corners) for t in _graded(a, b, shortest, longest)])
-            if len(mesh) <= MOST_INTERVALS + 1:
+            if len(mesh) <= MOST_INTERVALS or shortest == longest:
                 return mesh
-            if shortest == longest:
-                break
-            shortest = min(2 * shortest, longest)  # many knots: layers are left to refinement
-        unstable = max(self.first.fastest, self.last.fastest)
-        raise LimitExceeded(
-            f"The bounded motion from t = {window[0]:.4g} to {window[1]:.4g} s has {len(corners) - 2} knots and "
-            f"an unstable mode of {unstable:.4g} 1/s.",
-            f"It needs {len(mesh) - 1} intervals, and a mesh has at most {MOST_INTERVALS}.",
-            do="Leave the quickest modes out of the mechanism, or take a shorter window, such as sv.Bounded(5).",
-            intervals=len(mesh) - 1,
-            most=MOST_INTERVALS,
-        )
+            shortest = min(2 * shortest, longest)  # beside many knots, layers are left to refinement
+
+    def _require_resolved(self, window, longest):
+        """Refuse a window in which the unstable modes need intervals too short for a mesh."""
+        count = int(np.ceil((window[1] - window[0]) / longest))
+        if count > MOST_INTERVALS:
+            unstable = max(self.first.fastest, self.last.fastest)
+            raise LimitExceeded(
+                f"The bounded motion from t = {window[0]:.4g} to {window[1]:.4g} s has an unstable mode of "
+                f"{unstable:.4g} 1/s.",
+                f"It needs {count} intervals, and a mesh has at most {MOST_INTERVALS}.",
+                do="Leave this mode out of the mechanism, or take a shorter window, such as sv.Bounded(5).",
+                intervals=count,
+                most=MOST_INTERVALS,
+            )
 
     def _wider_mesh(self, window, mesh):
         """A mesh continued to a wider window."""
