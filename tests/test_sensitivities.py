@@ -136,6 +136,78 @@ def test_a_force_that_ends_at_a_parameter():
         assert np.abs(s["dx", "T"][~after][:-1]).max() < 1e-9
 
 
+SAMPLES = {"late": [1.0, 2.0, 3.0], "between": [0.7, 1.31, 2.0], "one": [2.5], "the first alone": [0.0], "the end": [3.0]}
+
+
+@pytest.mark.parametrize("times", SAMPLES.values(), ids=SAMPLES)
+@pytest.mark.parametrize("method", ["DOP853", "Taylor", "RadauIIA", "RK8", "CVODES"])
+def test_samples_that_begin_after_the_start(method, times):
+    """A damped mass, x = x0 + v0 m/c (1 - e^(-c t/m)), forwards and backwards: derivatives are those from its start."""
+    p = sv.parameters(m=2.0, c=0.5)
+    q = sv.coordinates("x")
+    (x,) = q
+    plant = sv.plant(sv.Mechanism(q, gibbs=sv.particle(q, p.m, x), forces={"x": -p.c * q.d(1)[0]}, parameters=p))
+    for sign in (1.0, -1.0):
+        run = sv.simulate(plant, {"x": 1.0, "dx": 3.0}, (0.0, sign * 3.0), method, t_eval=sign * np.array(times))
+        s = sv.sensitivity(run.model, run, ["x", "dx"], ["m", "c", "x", "dx"])
+        t, decay = run.t, np.exp(-run.t / 4)
+        assert s["x", "x"] == pytest.approx(np.ones(len(t)), abs=1e-9) and s.number("dx") == 3.0
+        assert s["x", "dx"] == pytest.approx(4 * (1 - decay), abs=1e-8)
+        assert s["x", "m"] == pytest.approx(6 * (1 - decay) - 1.5 * t * decay, abs=1e-8)
+        assert s["dx", "c"] == pytest.approx(-1.5 * t * decay, abs=1e-8)
+
+
+@pytest.mark.parametrize("times", [[2.0, 3.0], [1.31], [0.5, 2.0]])
+def test_a_knot_before_the_first_sample(times):
+    """x'' = F until T, as above; a knot may lie between the start and the first sample, or between two samples."""
+    p = sv.parameters(T=1.3, F=2.0)
+    q = sv.coordinates("x")
+    (x,) = q
+    force = {"x": ca.if_else(q.t < p.T, p.F, 0.0)}
+    plant = sv.plant(sv.Mechanism(q, gibbs=sv.particle(q, 1.0, x), forces=force, parameters=p))
+    run = sv.simulate(plant, {"x": 0.0, "dx": 0.0}, (0.0, 3.0), "DOP853", t_eval=times)
+    s, after = sv.sensitivity(run.model, run, ["x", "dx"]), run.t > 1.3
+    assert s["dx", "T"] == pytest.approx(np.where(after, 2.0, 0.0), abs=1e-8)
+    assert s["x", "T"] == pytest.approx(np.where(after, 2.0 * (run.t - 1.3), 0.0), abs=1e-8)
+    assert s["dx", "F"] == pytest.approx(np.minimum(run.t, 1.3), abs=1e-8)
+
+
+def two_masses():
+    """A driven mass with a second one, which the program leaves free, on a spring and a damper."""
+    p = sv.parameters(k=5.0, d=0.4)
+    x, y = q = sv.coordinates("x y")
+    force = p.k * (x - y) + p.d * (q.d(1)[0] - q.d(1)[1])
+    S = sv.particle(q, 1.0, x) + sv.particle(q, 2.0, y)
+    mechanism = sv.Mechanism(q, S, actuators={"F": x}, forces=ca.vertcat(-force, force), parameters=p)
+    return sv.derive(mechanism, sv.Program({"X": x - 0.5 * ca.sin(q.t)}))
+
+
+@pytest.mark.parametrize("drift", [None, "project", "minimal", 0.1])
+def test_internal_motion_sampled_after_the_start(drift):
+    """2 y'' = k (x - y) + d (x' - y') with x = sin(t)/2, against the same motion for complex k, d and y0."""
+    model = two_masses()
+    run = sv.simulate(model, model.start(y=0.1, dy=0.0), (0.0, 3.0), drift=drift, t_eval=[1.0, 2.0, 3.0])
+    s = sv.sensitivity(model, run, ["y", "dy"], ["k", "d", "y", "dy"])
+
+    def motion(k=5.0, d=0.4, y=0.1, dy=0.0):
+        i = (k + 1j * d) / (k - 2 + 1j * d)  # of a forcing (k + d D)/2 e^(it): y = Im(i e^(it))/2, for complex numbers
+        j = (k - 1j * d) / (k - 2 - 1j * d)
+        part = [(i * (1j) ** n * np.exp(1j * run.t) - j * (-1j) ** n * np.exp(-1j * run.t)) / 4j for n in (0, 1)]
+        at_0 = [(i - j) / 4j, (i + j) / 4]
+        root = np.sqrt(0j + (d / 4) ** 2 - k / 2)
+        r1, r2 = -d / 4 + root, -d / 4 - root
+        c2 = (dy - at_0[1] - r1 * (y - at_0[0])) / (r2 - r1)
+        c1 = y - at_0[0] - c2
+        return [part[n] + c1 * r1**n * np.exp(r1 * run.t) + c2 * r2**n * np.exp(r2 * run.t) for n in (0, 1)]
+
+    assert [run["y"], run["dy"]] == pytest.approx(np.real(motion()), abs=1e-7)
+    for name, value in {"k": 5.0, "d": 0.4, "y": 0.1, "dy": 0.0}.items():
+        h = 1e-4
+        a, b, c, e = (np.real(motion(**{name: value + n * h})) for n in (-2, -1, 1, 2))
+        exact = (a - 8 * b + 8 * c - e) / (12 * h)
+        assert np.abs(exact - [s["y", name], s["dy", name]]).max() < 1e-9, name
+
+
 def test_initial_values_that_follow_from_others(gallery_model):
     model = gallery_model("passive-arm")
     run = sv.simulate(model, model.start(q2=0.0, dq2=0.0), (0.0, 0.5))

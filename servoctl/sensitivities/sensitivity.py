@@ -71,7 +71,7 @@ class Sensitivity(ByName, Value):
             One of `to`.
         """
         numbers, name = self.run.model.numbers, named(name, self.to, "parameter or initial value")
-        return numbers[name] if name in numbers else float(self.run[name][0])
+        return numbers[name] if name in numbers else float(_first(self.run)[1][self.run.jet_names.index(name)])
 
     def change(self, name: str) -> float:
         """One percent of a number, 0.01 of its unit where that is zero: the change to which figures refer.
@@ -222,6 +222,13 @@ def _rows(model, kinds):
     return [*model.jet_names, *(name for kind in kinds for name in model.signals(kind)[0])]
 
 
+def _first(run):
+    """The instant [s] and the state (n_x,) from which a run was computed, which need not be its first sample."""
+    if run.start is None:
+        return float(run.t[0]), run.jets[: len(run.model.state_names), 0]
+    return float(run.start.t), np.asarray(run.start.values, dtype=float)
+
+
 def _variants(run):
     return run.variants or ((0, len(run.t), run.model),)
 
@@ -268,7 +275,7 @@ def _along(model, run, to, kinds):
 def _tangent_at_start(run, names, initial):
     """The tangent (n_x, K) of the first state, and the names of the initial values that do not depend on others."""
     model = run.variant(0)
-    t, x = run.t[0], run.jets[: len(model.state_names), 0]
+    t, x = _first(run)
     m, n_x = len(model.invariant_names()), len(x)
     y = invariants_by(model, names)(t, x, model.parameters)
     G = y[m:].reshape(n_x + len(names), m).T
@@ -320,15 +327,15 @@ def _require_free(model, initial, independent):
 
 
 def _integrated(model, run, names, S):
-    """The tangent (n_x, K, N) of the state at the samples of a run."""
+    """The tangent (n_x, K, N) of the state at the samples of a run, from its start S (n_x, K) on."""
     from scipy.integrate import solve_ivp
 
-    n_x, K = S.shape
+    (n_x, K), (t, x) = S.shape, _first(run)
     method = "Radau" if run.method in STIFF else "DOP853"
-    y, result = np.concatenate([run.jets[:n_x, 0], S.T.ravel()]), np.empty((n_x, K, len(run.t)))
+    y, result = np.concatenate([x, S.T.ravel()]), np.repeat(S[:, :, None], len(run.t), axis=2)
     atol = _absolute(model, run, names, S)
-    cuts = breakpoints((run.t[0], run.t[-1]), run.knots)
-    forward = np.sign(run.t[-1] - run.t[0]) or 1.0
+    cuts = breakpoints((t, float(run.t[-1])), run.knots) if run.t[-1] != t else []
+    forward = np.sign(run.t[-1] - t)
     for k, (a, b) in enumerate(zip(cuts[:-1], cuts[1:], strict=True)):
         if k:
             y[n_x:] += _shifted(model, run, names, a, y[:n_x], K).T.ravel()
@@ -341,7 +348,8 @@ def _integrated(model, run, names, S):
         )  # fmt: skip
         if solved.status:
             raise _ended(float(solved.t[-1]), solved.message)
-        result[:, :, inside] = solved.sol(run.t[inside])[n_x:].reshape(K, n_x, -1).swapaxes(0, 1)
+        if len(inside):
+            result[:, :, inside] = solved.sol(run.t[inside])[n_x:].reshape(K, n_x, -1).swapaxes(0, 1)
         y = solved.y[:, -1].copy()
     return result
 
@@ -353,7 +361,8 @@ def _variant_at(run, a, b):
 
 def _absolute(model, run, names, S):
     """Absolute tolerances of the state and of its tangent, from the sizes of the motion and of the numbers."""
-    sizes = motion_sizes(model, run.t, run.jets[: len(S)])
+    t, x = _first(run)
+    sizes = motion_sizes(model, np.append(t, run.t), np.column_stack([x, run.jets[: len(S)]]))
     sizes = np.where(sizes > 0, sizes, 1.0)
     numbers = [abs(model.numbers[name]) or 1.0 for name in names]
     initial = [sizes[np.argmax(column != 0)] for column in S.T[len(names) :]]
@@ -371,9 +380,10 @@ def _ended(t, why):
 
 def _shifted(model, run, names, t, x, columns):
     """The jump (n_x, K) of the tangent at a knot t that moves with parameters, where the rates jump."""
-    length, f = abs(run.t[-1] - run.t[0]), model.function("ode")
+    first = _first(run)[0]
+    length, f = abs(run.t[-1] - first), model.function("ode")
     sides = [f(t + side * BESIDE_KNOT * length, x, model.parameters)[: len(x)] for side in (-1.0, 1.0)]
-    before, after = sides if run.t[-1] > run.t[0] else sides[::-1]
+    before, after = sides if run.t[-1] > first else sides[::-1]
     jump = np.zeros((len(x), columns))
     if np.abs(after - before).max() > JUMPS * np.abs(sides).max():
         for j, name in enumerate(names):
@@ -383,7 +393,8 @@ def _shifted(model, run, names, t, x, columns):
 
 def _knot_rate(model, run, name, t):
     """Derivative of the instant of a knot by a parameter."""
-    value, span = model.numbers[name], (float(run.t.min()), float(run.t.max()))
+    value, ends = model.numbers[name], (_first(run)[0], float(run.t[-1]))
+    span = min(ends), max(ends)
     shift = SHIFT * (abs(value) or 1.0)
     knots = [np.array(model.with_parameters(**{name: value + h}).require_smooth(span)) for h in (-shift, shift)]
     nearest = [k[np.argmin(np.abs(k - t))] if len(k) else np.nan for k in knots]
