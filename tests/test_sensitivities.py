@@ -1,5 +1,6 @@
 """Derivatives of motions by parameters and initial values, against closed forms and differences."""
 
+from dataclasses import replace
 from functools import partial
 
 import casadi as ca
@@ -272,3 +273,54 @@ def test_a_bounded_motion_has_no_free_initial_values():
     run = sv.simulate(model, model.start(), (0.0, 2.0), sv.Bounded())
     with refused(SpecificationError, name="q2"):
         sv.sensitivity(model, run, to="q2")
+
+
+BOUNDED_SAMPLES = {"between": [0.5, 1.0, 1.5], "one": [1.0], "late": [1.7, 2.0], "ends": [0.0, 2.0], "start": [0.0, 0.3]}
+
+
+@pytest.mark.parametrize("times", BOUNDED_SAMPLES.values(), ids=BOUNDED_SAMPLES)
+def test_samples_do_not_change_the_derivatives_of_a_bounded_motion(times):
+    """Against the samples of the whole window, whose derivatives are compared with differences above."""
+    from test_bounded import arm
+
+    model = arm(0.5)
+    full = sv.simulate(model, model.start(), (0.0, 2.0), sv.Bounded(), t_eval=np.linspace(0.0, 2.0, 1001))
+    whole = sv.simulate(model, model.start(), (0.0, 2.0), sv.Bounded())
+    run = sv.simulate(model, model.start(), (0.0, 2.0), sv.Bounded(), t_eval=times)
+    exact, s = (sv.sensitivity(model, one, ["q2", "torque"]) for one in (full, run))
+    beyond = sv.sensitivity(model, whole, ["q2", "torque"])
+    for pair in s.names:
+        size = np.abs(exact[pair]).max() + 1e-9
+        assert np.abs(np.interp(run.t, full.t, exact[pair]) - s[pair]).max() < 1e-5 * size
+        at = [int(np.argmin(np.abs(whole.t - t))) for t in full.t]
+        same = np.abs(whole.t[at] - full.t) < 1e-12
+        assert same.sum() > 10 and np.abs(exact[pair] - beyond[pair][at])[same].max() < 1e-8 * size
+
+
+def test_bounded_motions_whose_window_the_samples_do_not_tell():
+    """y'' = k (y - x) has the bounded motion y = ∫ √k/2 e^(-√k |t - s|) x(s) ds; x has no knots."""
+    p = sv.parameters(k=9.0)
+    x, y = q = sv.coordinates("x y")
+    S = sv.particle(q, 1.0, x) + sv.particle(q, 1.0, y)
+    mechanism = sv.Mechanism(q, S, actuators={"F": x}, forces={"y": p.k * (y - x)}, parameters=p)
+    model = sv.derive(mechanism, sv.Program({"X": x - (1 + ca.tanh(4 * (q.t - 3))) / 2}))
+    span = (-3.0, 9.0)
+
+    def run(**settings):
+        return sv.simulate(model, model.start(t=span[0]), span, "bounded", **settings)
+
+    u = np.linspace(-12.0, 12.0, 48001)
+    both = [np.sqrt(k) / 2 * np.exp(-np.sqrt(k) * np.abs(u)) for k in (9.001, 8.999)]
+    weights = (both[0] - both[1]) / 0.002
+    for times in (None, [2.5, 8.0], [-2.0, 3.0, 9.0]):
+        s = sv.sensitivity(model, run(t_eval=times), "y")
+        near = np.abs(s.t - 3.0) < 6.0
+        exact = [np.trapezoid(weights * (1 + np.tanh(4 * (t - u - 3))) / 2, u) for t in s.t[near]]
+        assert s["y", "k"][near] == pytest.approx(exact, abs=1e-7)
+    for times in ([2.5, 3.1], [3.0]):  # after which the program moves on, without a knot
+        with refused(SpecificationError, samples=(times[0], times[-1])):
+            sv.sensitivity(model, run(t_eval=times), "y")
+    whole = run()
+    assert len(sv.sensitivity(model, replace(whole, jets=1.0001 * whole.jets), "y")) == 1
+    with refused(SpecificationError, samples=(whole.t[0], whole.t[-1])):
+        sv.sensitivity(model, replace(whole, jets=1.004 * whole.jets), "y")

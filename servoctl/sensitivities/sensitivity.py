@@ -14,7 +14,7 @@ from servoctl.model.model import Model
 from servoctl.model.switching import switching
 from servoctl.run import STENCIL, ByName, Run, require_model
 from servoctl.sensitivities.boundary import bounded_tangent
-from servoctl.sensitivities.tangent import along_state, determined, invariants_by, variational
+from servoctl.sensitivities.tangent import along_state, determined, invariants_by, start_of, variational
 from servoctl.values import Value
 
 RTOL = 1e-11  # of a step of the variational equation
@@ -71,7 +71,7 @@ class Sensitivity(ByName, Value):
             One of `to`.
         """
         numbers, name = self.run.model.numbers, named(name, self.to, "parameter or initial value")
-        return numbers[name] if name in numbers else float(_first(self.run)[1][self.run.jet_names.index(name)])
+        return numbers[name] if name in numbers else float(start_of(self.run)[1][self.run.jet_names.index(name)])
 
     def change(self, name: str) -> float:
         """One percent of a number, 0.01 of its unit where that is zero: the change to which figures refer.
@@ -222,13 +222,6 @@ def _rows(model, kinds):
     return [*model.jet_names, *(name for kind in kinds for name in model.signals(kind)[0])]
 
 
-def _first(run):
-    """The instant [s] and the state (n_x,) from which a run was computed, which need not be its first sample."""
-    if run.start is None:
-        return float(run.t[0]), run.jets[: len(run.model.state_names), 0]
-    return float(run.start.t), np.asarray(run.start.values, dtype=float)
-
-
 def _variants(run):
     return run.variants or ((0, len(run.t), run.model),)
 
@@ -275,7 +268,7 @@ def _along(model, run, to, kinds):
 def _tangent_at_start(run, names, initial):
     """The tangent (n_x, K) of the first state, and the names of the initial values that do not depend on others."""
     model = run.variant(0)
-    t, x = _first(run)
+    t, x = start_of(run)
     m, n_x = len(model.invariant_names()), len(x)
     y = invariants_by(model, names)(t, x, model.parameters)
     G = y[m:].reshape(n_x + len(names), m).T
@@ -330,7 +323,7 @@ def _integrated(model, run, names, S):
     """The tangent (n_x, K, N) of the state at the samples of a run, from its start S (n_x, K) on."""
     from scipy.integrate import solve_ivp
 
-    (n_x, K), (t, x) = S.shape, _first(run)
+    (n_x, K), (t, x) = S.shape, start_of(run)
     method = "Radau" if run.method in STIFF else "DOP853"
     y, result = np.concatenate([x, S.T.ravel()]), np.repeat(S[:, :, None], len(run.t), axis=2)
     atol = _absolute(model, run, names, S)
@@ -361,7 +354,7 @@ def _variant_at(run, a, b):
 
 def _absolute(model, run, names, S):
     """Absolute tolerances of the state and of its tangent, from the sizes of the motion and of the numbers."""
-    t, x = _first(run)
+    t, x = start_of(run)
     sizes = motion_sizes(model, np.append(t, run.t), np.column_stack([x, run.jets[: len(S)]]))
     sizes = np.where(sizes > 0, sizes, 1.0)
     numbers = [abs(model.numbers[name]) or 1.0 for name in names]
@@ -380,7 +373,7 @@ def _ended(t, why):
 
 def _shifted(model, run, names, t, x, columns):
     """The jump (n_x, K) of the tangent at a knot t that moves with parameters, where the rates jump."""
-    first = _first(run)[0]
+    first = start_of(run)[0]
     length, f = abs(run.t[-1] - first), model.function("ode")
     sides = [f(t + side * BESIDE_KNOT * length, x, model.parameters)[: len(x)] for side in (-1.0, 1.0)]
     before, after = sides if run.t[-1] > first else sides[::-1]
@@ -393,7 +386,7 @@ def _shifted(model, run, names, t, x, columns):
 
 def _knot_rate(model, run, name, t):
     """Derivative of the instant of a knot by a parameter."""
-    value, ends = model.numbers[name], (_first(run)[0], float(run.t[-1]))
+    value, ends = model.numbers[name], (start_of(run)[0], float(run.t[-1]))
     span = min(ends), max(ends)
     shift = SHIFT * (abs(value) or 1.0)
     knots = [np.array(model.with_parameters(**{name: value + h}).require_smooth(span)) for h in (-shift, shift)]
