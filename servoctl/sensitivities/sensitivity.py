@@ -1,5 +1,6 @@
 """Derivatives of a run's signals by parameters and initial values."""
 
+import textwrap
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
@@ -122,7 +123,8 @@ class Sensitivity(ByName, Value):
 
     def __repr__(self):
         t = self.t
-        lines = [f"Sensitivity: {len(self.of)} signals by {len(self.to)} numbers, t = {t[0]:g} .. {t[-1]:g} s"]
+        what = f"{_counted(self.of, 'signal')} by {_counted(self.to, 'number')}"
+        lines = [f"Sensitivity: {what}, t = {t[0]:g} .. {t[-1]:g} s"]
         for of in self.of[:8]:
             sizes = {to: np.nanmax(np.abs(self[of, to])) * self.change(to) for to in self.to}
             largest = sorted(sizes, key=sizes.get, reverse=True)[:3]
@@ -130,7 +132,11 @@ class Sensitivity(ByName, Value):
             lines.append(f"  {of} changes at most with {shown}")
         if self.independent:
             lines.append(f"  constant else at the start: {', '.join(self.independent)}")
-        return "\n".join(line[:118] for line in lines)
+        return "\n".join(textwrap.fill(line, 118, subsequent_indent="    ") for line in lines)
+
+
+def _counted(names, what):
+    return f"{len(names)} {what}{'s' * (len(names) != 1)}"
 
 
 def _growth_in_words(number):
@@ -182,7 +188,13 @@ def sensitivity(
     to = tuple(dict.fromkeys(list(model.numbers) if to is None else texts(to, "The names of parameters")))
     known = (*model.jet_names, *model.signal_groups)
     if not of or not to:
-        raise SpecificationError("Nothing was named.", "A derivative is of a signal by a number.", of=of, to=to)
+        raise SpecificationError(
+            f"The derivatives are of {len(of)} signals by {len(to)} numbers.",
+            "They are of at least one signal by at least one parameter or initial value.",
+            do=f"Name {'initial values' if of else 'signals'}, such as {(model.state_names if of else known)[0]!r}.",
+            of=of,
+            to=to,
+        )
     for name in of:
         if name not in known:
             raise unknown(name, known, "signal")
