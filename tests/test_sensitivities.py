@@ -173,14 +173,14 @@ def test_a_knot_before_the_first_sample(times):
     assert s["dx", "F"] == pytest.approx(np.minimum(run.t, 1.3), abs=1e-8)
 
 
-def two_masses():
+def two_masses(path=lambda t: 0.5 * ca.sin(t)):
     """A driven mass with a second one, which the program leaves free, on a spring and a damper."""
     p = sv.parameters(k=5.0, d=0.4)
     x, y = q = sv.coordinates("x y")
     force = p.k * (x - y) + p.d * (q.d(1)[0] - q.d(1)[1])
     S = sv.particle(q, 1.0, x) + sv.particle(q, 2.0, y)
     mechanism = sv.Mechanism(q, S, actuators={"F": x}, forces=ca.vertcat(-force, force), parameters=p)
-    return sv.derive(mechanism, sv.Program({"X": x - 0.5 * ca.sin(q.t)}))
+    return sv.derive(mechanism, sv.Program({"X": x - path(q.t)}))
 
 
 @pytest.mark.parametrize("drift", [None, "project", "minimal", 0.1])
@@ -231,6 +231,19 @@ def test_what_is_refused(crane, gallery_model):
         sv.sensitivity(gallery_model("passive-arm"), run)
     with refused(NameUnknown):
         sv.sensitivity(model, run)["trolley", "m"]
+
+
+def test_a_plan_of_the_plant_is_no_motion_of_the_program():
+    """A relaxed plan is a motion under inputs; the derivatives of its own model hold these."""
+    model = two_masses(lambda t: sv.paths.rest_to_rest(t, 0.0, 1.0, 2.0))
+    r = model.reduction
+    plan = sv.relaxed(sv.plant(r.mechanism), r.program, (0.0, 2.0))
+    with refused(SpecificationError, model=("X",), run=()):
+        sv.sensitivity(model, plan, "y", "k")
+    s = sv.sensitivity(plan.model, plan, "y", "k")
+    ends = [plan.model.with_parameters(k=5.0 + h) for h in (-1e-3, 1e-3)]
+    below, above = (sv.simulate(m, plan.start.values, (0.0, 2.0), t_eval=plan.t)["y"] for m in ends)
+    assert np.abs((above - below) / 2e-3 - s["y", "k"]).max() < 1e-6 * np.abs(s["y", "k"]).max() + 1e-9
 
 
 def test_what_it_prints_and_draws(crane):

@@ -216,8 +216,18 @@ def sensitivity(
 
 
 def _require_run(model, run):
-    """Refuse a run with other numbers, and one with switches of the state."""
+    """Refuse a run with other numbers or of another program, and one with switches of the state."""
     switches = switching(model) is not None
+    programs = [tuple(one.reduction.program.residuals) for one in (model, run.model)]
+    if not switches and programs[0] != programs[1]:
+        names, other = (", ".join(names) or "no program" for names in programs)
+        raise SpecificationError(
+            f"The model is of {names}, the run of {other}.",
+            "Derivatives are those of the motion that the model determines.",
+            do="Pass run.model: a relaxed plan is a motion of the plant under inputs, which are then held.",
+            model=programs[0],
+            run=programs[1],
+        )
     if switches or run.model.numbers != model.numbers:
         smooth = "Smooth the switch, such as tanh(v/v0) for sign(v)."
         raise SpecificationError(
