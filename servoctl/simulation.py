@@ -234,7 +234,7 @@ def _has_internal_dynamics(model):
 def judged(run, tolerance=STEP_ERROR, again=None):
     """A run that gives the verdict on its internal dynamics when it is read; warns at once if they are unstable.
 
-    Most motions need no propagators to know that there is nothing to warn of.
+    Most motions need no propagators to know that there is nothing to warn of. Who interrupts a motion does not wait.
 
     Parameters
     ----------
@@ -249,7 +249,8 @@ def judged(run, tolerance=STEP_ERROR, again=None):
     -------
     Run
     """
-    if growth_bound(run.model, run) <= UNSTABLE:
+    interrupted = not run.success
+    if interrupted or growth_bound(run.model, run) <= UNSTABLE:
         return replace(run, verdict=partial(_verdict, tolerance=tolerance))
     run = run if again is None else again()
     internal = internal_dynamics(run.model, run)

@@ -10,6 +10,7 @@ from refusals import refused
 import servoctl as sv
 from servoctl.errors import IntegrationStopped, SpecificationError, UnstableInternalDynamics
 from servoctl.gallery import gallery
+from servoctl.methods.bounded import LONGEST, Problem
 
 
 def arm(Gamma, duration=2.0, **numbers):
@@ -33,6 +34,21 @@ def aircraft():
     x, z, _ = mechanism.q
     path = sv.paths.rest_to_rest(mechanism.q.t, (0.0, 0.0), (10.0, 5.0), duration=3.0, smoothness=4)
     return sv.derive(mechanism, sv.Program({"X": x - path[0], "Z": z - path[1]}))
+
+
+def flexible_link(n, m=0.1, l=0.15, k=60.0, d=0.05, J=0.05):
+    """n segments with springs and dampers between them, a torque on the hub, and a path of their mean angle."""
+    q = sv.coordinates(" ".join(f"q{i}" for i in range(n)))
+    hub, *joints = q
+    angles, end, S = np.cumsum([hub, *joints]), ca.SX.zeros(2), J * q.d(2)[0] ** 2 / 2
+    for angle in angles:
+        along = l * ca.vertcat(ca.cos(angle), ca.sin(angle))
+        S, end = S + sv.particle(q, m, end + along / 2), end + along
+    dampers = {f"q{i}": -d * q.d(1)[i] for i in range(1, n)}
+    springs = sum(k * angle**2 / 2 for angle in joints)
+    mechanism = sv.Mechanism(q, gibbs=S, potential=springs, forces=dampers, actuators={"hub": hub})
+    path = sv.paths.rest_to_rest(q.t, 0.0, 0.5, 1.5, t_start=0.3)
+    return mechanism, sv.Program({"tip": sum(angles) / n - path})
 
 
 def cart_pole(path, start=0.0, damping=0.0):
@@ -216,6 +232,17 @@ def test_bounded_plans_in_a_sweep():
 
 
 # refusals -------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("count", [3, 2500, 5000])
+def test_a_mesh_keeps_all_corners_and_follows_the_fastest_mode(count):
+    """Of a longer window, too, whose corners are the mesh of a shorter one."""
+    problem, corners = Problem(arm(0.5), (0.0, 2.0), np.zeros(4)), np.linspace(0.0, 2.0, count)
+    mesh = problem._first_mesh((-5.0, 7.0), corners)
+    assert np.isin(corners, mesh).all() and np.all(np.diff(mesh) > 0)
+    assert (mesh[0], mesh[-1]) == (-5.0, 7.0)
+    fastest = np.abs(problem.first.eigenvalues).max()
+    assert np.diff(mesh).max() * fastest <= LONGEST * 4
 
 
 def test_internal_dynamics_on_the_imaginary_axis_are_refused():

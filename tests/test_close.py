@@ -11,6 +11,7 @@ from refusals import refused
 from scenes import CRANE, POINT, ROPE
 
 import servoctl as sv
+from servoctl.errors import InconsistentStart
 from servoctl.gallery import gallery
 
 # the loop against a recursion -----------------------------------------------------------------------------------------
@@ -259,6 +260,22 @@ def test_the_balance_knows_what_it_applies_to():
     proof = sv.verify(run)
     assert run["y"] == pytest.approx(0.5 * np.sin(run.t), abs=1e-9)
     assert proof.passed and "constraint 'belt' moves by itself" in proof.notes[0] and "loop power" not in proof.numbers
+
+
+def test_a_loop_starts_on_its_material_constraints():
+    """Next to them as far as measured states are, and no farther; relative to states larger than 1."""
+    q = sv.coordinates("x y")
+    belt = {"belt": q.d(1)[1] - 0.5 * ca.cos(q.t)}
+    mechanism = sv.Mechanism(q, gibbs=sv.particle(q, 1.0, list(q)), actuators={"force": [1, 0]}, constraints=belt)
+    plant, timing = sv.plant(mechanism), sv.Timing(rate=100.0)
+
+    def started(x, off):
+        return sv.close(plant, lambda t, y: [0.0], [x, 0.0, 0.0, 0.5 + off], (0.0, 0.1), timing=timing)
+
+    for x, off in ((0.0, 5e-7), (10.0, 5e-6)):
+        assert started(x, off).success
+        with refused(InconsistentStart, "belt", name="belt"):
+            started(x, 10 * off)
 
 
 def test_a_balance_that_does_not_close_is_found(crane_plan):

@@ -3,6 +3,7 @@
 import os
 import signal
 import threading
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import numpy as np
@@ -11,6 +12,7 @@ from scenes import CRANE
 
 import servoctl as sv
 from servoctl.codegen import compiler
+from servoctl.control import batch
 from servoctl.control import loop as loops
 from servoctl.gallery import gallery
 
@@ -133,12 +135,18 @@ def test_pauses_change_no_bit(plan, what, steps, monkeypatch):
     assert paused.success
 
 
-def test_many_loops_are_interrupted_and_the_finished_ones_kept(plan, law, ctrl_c, c_compiler):
+def test_many_loops_are_interrupted_and_the_finished_ones_kept(plan, law, ctrl_c, c_compiler, monkeypatch):
     run = sv.close(sv.plant(CRANE), law, plan.state(0.0), (0.0, 8.0), timing=sv.Timing(substeps=20))
     sv.close_many(run, {"m_load": np.linspace(90.0, 110.0, 16)})  # compiled
     loads = np.linspace(90.0, 110.0, 60_000)
-    ctrl_c(1.0)
-    many = sv.close_many(run, {"m_load": loads}, record=["theta"], every=100, threads=2)
+
+    def threads(number):  # from here on the loops run
+        ctrl_c(0.5)
+        return ThreadPoolExecutor(number)
+
+    with monkeypatch.context() as patched:
+        patched.setattr(batch, "ThreadPoolExecutor", threads)
+        many = sv.close_many(run, {"m_load": loads}, record=["theta"], every=100, threads=2)
     assert many.study.meta["interrupted"] and 0 < len(many) < len(loads)
     case = many["case"]
     np.testing.assert_array_equal(many["m_load"], loads[case])

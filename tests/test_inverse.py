@@ -8,7 +8,7 @@ import closed_forms as cf
 import numpy as np
 import pytest
 from refusals import refused, warned
-from test_bounded import aircraft, arm
+from test_bounded import aircraft, arm, flexible_link
 from test_report import DRIFTING, FLAT, RESTING, cart, crane, mathieu
 
 import servoctl as sv
@@ -68,6 +68,26 @@ def test_a_hyperbolic_program_gets_its_bounded_motion(make, span, name, value):
     peaks = [v for signal in run.model.actuators for _, v in run.extrema(signal)]
     assert max(peaks) == pytest.approx(value, abs=1e-4)
     assert sv.verify(run.model, run).passed
+
+
+def test_a_flexible_link_of_eight_segments_gets_its_bounded_motion():
+    """Its mean angle as output; eigenvalues from the linear equations about the straight link, written down by hand."""
+    n, m, l, k, d = 8, 0.1, 0.15, 60.0, 0.05
+    mechanism, program = flexible_link(n, m, l, k, d)
+    lever = np.maximum(0.0, l * (np.arange(n)[:, None] - np.arange(n) + 0.5))  # of segment i about joint j
+    M = m * lever.T @ lever
+    onto = np.vstack([-(n - np.arange(1, n)) / n, np.eye(n - 1)])  # joints from the free ones, the mean angle at rest
+    inertia = np.linalg.inv(M[1:] @ onto)
+    A = np.block([[np.zeros((n - 1, n - 1)), np.eye(n - 1)], [-k * inertia, -d * inertia]])
+    report = sv.report(sv.derive(mechanism, program))
+    assert report.verdict == "non-minimum phase (hyperbolic)"
+    exact = np.sort(np.linalg.eigvals(A).real)
+    assert np.sort(report.eigenvalues["start"].real) == pytest.approx(exact, rel=1e-6)
+
+    run = sv.inverse(mechanism, program, (0.0, 2.2))
+    assert run.method == "bounded" and run.counters["intervals"] < 2000
+    assert sv.verify(run.model, run).passed
+    assert np.abs([run[f"q{i}"][0] for i in range(n)]).max() < 1e-6
 
 
 def test_a_program_that_is_singular_at_rest_gets_a_relaxed_plan():

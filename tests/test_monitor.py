@@ -107,3 +107,36 @@ def test_a_lost_rank_is_singular_where_it_is_lost(gallery_model):
     assert isinstance(outcome, Singular) and run.t[outcome.steps] <= outcome.t <= run.t[outcome.steps + 1]
     assert abs(outcome.t - cf.WHEEL_STOPS) < 1e-3
     assert abs(outcome.x[names.index("dphi")]) < 1e-2
+
+
+OUTWARD = {  # angular speed of a bead, whose gradient falls as 1/r, and the same row with a further factor
+    "speed 2": (lambda x, y, dx, dy: (x * dy - y * dx) / (x**2 + y**2) - 2.0, 2.0, 3.5),
+    "speed 5": (lambda x, y, dx, dy: (x * dy - y * dx) / (x**2 + y**2) - 5.0, 5.0, 3.0),
+    "over r²": (lambda x, y, dx, dy: ((x * dy - y * dx) / (x**2 + y**2) - 2.0) / (x**2 + y**2), 2.0, 1.8),
+}
+
+
+@pytest.mark.parametrize("method", ["DOP853", "Taylor", "RK8", "RadauIIA"])
+@pytest.mark.filterwarnings("ignore:Internal dynamics unstable")
+@pytest.mark.parametrize("row", OUTWARD)
+def test_a_gradient_that_falls_along_the_motion_is_no_lost_rank(row, method):
+    """r'' = w² r from r = 1 with r' = 1/2; the pivots change their signs at every half turn."""
+    q = sv.coordinates("x y")
+    residual, w, end = OUTWARD[row]
+    mechanism = sv.Mechanism(q, gibbs=ca.sumsqr(ca.vertcat(*q.d(2))) / 2)
+    model = sv.derive(mechanism, sv.Program({"p": residual(*q, *q.d(1))}, by="ideal"))
+    run = sv.simulate(model, model.start(x=1.0, y=0.0, dx=0.5), (0.0, end), method, t_eval=[0.0, end])
+    radius = np.cosh(w * end) + 0.5 / w * np.sinh(w * end)
+    assert np.hypot(run["x"], run["y"])[-1] == pytest.approx(radius, rel=1e-7)
+
+
+@pytest.mark.parametrize("method", ["DOP853", "Taylor", "RK8", "RadauIIA"])
+def test_a_rank_that_is_lost_after_a_long_way_is_lost(method):
+    """(x - 20) y' = cos t at x = 1 + 8 t: a gradient that falls to zero linearly, at 19/8 s."""
+    q = sv.coordinates("x y")
+    mechanism = sv.Mechanism(q, gibbs=ca.sumsqr(ca.vertcat(*q.d(2))) / 2)
+    program = sv.Program({"p": (q.jet(0)[0] - 20.0) * q.jet(1)[1] - ca.cos(q.t)}, by="ideal")
+    model = sv.derive(mechanism, program)
+    with pytest.raises(sv.SingularProgram) as error:
+        sv.simulate(model, model.start(x=1.0, y=0.0, dx=8.0), (0.0, 4.0), method)
+    assert error.value.details["t"] == pytest.approx(19 / 8, abs=1e-3)

@@ -275,6 +275,43 @@ def test_exact_linearisation_extends_and_shares():
     assert np.abs(np.interp(loop.t, run.t, run["wheel"]) - loop["wheel"]).max() < 0.02
 
 
+def single():
+    """The same vehicle without a wheel: as many inputs as residuals."""
+    q = sv.coordinates("x y psi")
+    x, y, psi = q
+    S = sv.rigid_body(q, 4.0, (0, 0, 0.45), position=(x, y), rates=(0, 0, q.d(1)[2]))
+    mechanism = sv.Mechanism(q, gibbs=S, actuators={"thrust": (ca.cos(psi), ca.sin(psi), 0), "yaw": psi})
+    return mechanism, sv.Program({"X": x - 2 * ca.cos(q.t), "Y": y - ca.sin(q.t)})
+
+
+@pytest.mark.parametrize("span", [(0.0, 7.0), (0.0, 3.0), (1.0, 9.0)])
+@pytest.mark.parametrize("machine", ["single", "wheel", "weights"])
+def test_exact_linearisation_goes_round_a_full_turn(machine, span):
+    """Neither X nor Y sees the thrust all the way round: the thrust gets the integrators, from the plan's values on."""
+    if machine == "single":
+        mechanism, program = single()
+    else:
+        weights = {"wheel": 3.0} if machine == "wheel" else {"yaw": 0.2}
+        mechanism, program = hovercraft(weights, lambda q: {"wheel": -0.3 * q.d(1)[3]})
+    heading = np.arctan2(-np.sin(span[0]), -2 * np.cos(span[0])) % (2 * np.pi)
+    guess = {"psi": heading, "dpsi": 0.5, "x": 2 * np.cos(span[0])}
+    model = sv.derive(mechanism, program, guess={"psi": 3.1, "x": 2.0})
+    run = sv.simulate(model, model.start(span[0], guess=guess), span)
+    plant = sv.plant(mechanism)
+    law = sv.computed(run, plant, rate=200.0)
+    assert law.info["orders"] == {"X": 4, "Y": 4}
+    a, jerk = 4 * np.array([-2 * np.cos(span[0]), -np.sin(span[0])]), 4 * np.array([2 * np.sin(span[0]), -np.cos(span[0])])
+    assert law.state == pytest.approx([np.hypot(*a), a @ jerk / np.hypot(*a)], abs=1e-6)
+    loop = sv.close(plant, law, run.state(span[0]), span)
+    assert max(np.abs(values[0]).max() for values in loop.residual.values()) < 1e-3
+    for name in plant.inputs:
+        assert np.abs(np.interp(loop.t, run.t, run[name]) - loop[name])[:-1].max() < 0.02 * np.abs(run["thrust"]).max()
+    beside = run.state(span[0]).copy()
+    beside[0] += 0.02
+    errors = sv.close(plant, law, beside, span).residual
+    assert max(np.abs(values[0][-200:]).max() for values in errors.values()) < 2e-3
+
+
 def test_two_forces_normal_to_the_body_are_flat_after_extension():
     """Without tilt and lift of the thrusters: X and Z see the sum of the thrusts alone, along the body's normal."""
     mechanism, program = vtol("centre")

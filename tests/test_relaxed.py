@@ -1,17 +1,21 @@
 """Relaxed plans against closed forms, the exact inverse, other integrators, and what limits allow."""
 
+from dataclasses import replace
+
 import casadi as ca
 import numpy as np
 import pytest
 from refusals import refused
 from scipy.integrate import solve_ivp
 from scipy.optimize import approx_fprime
+from test_bounded import flexible_link
 
 import servoctl as sv
 from servoctl.control.reference import resampled
-from servoctl.errors import InconsistentStart, LimitExceeded, NameUnknown, SpecificationError
-from servoctl.inversion.relaxed import DEFECT, FACTOR, FIRST
-from servoctl.inversion.transcription import WATCHED, Mesh, Transcription, bernstein
+from servoctl.errors import InconsistentStart, IntegrationStopped, LimitExceeded, NameUnknown, SpecificationError
+from servoctl.gallery import overhead_crane
+from servoctl.inversion.relaxed import DEFECT, FACTOR, FIRST, Task
+from servoctl.inversion.transcription import IPOPT, LONGEST, WATCHED, Mesh, Transcription, bernstein
 from servoctl.run import load
 
 rest_to_rest = sv.paths.rest_to_rest
@@ -168,10 +172,91 @@ def test_bounds_hold_at_their_instants(crane, coarse, bounds, values):
     run = sv.relaxed(*crane, (0.0, 6.0), weight=1e-6, bounds=bounds)
     edges = np.array([0.0, *run.knots, 6.0])
     instants = (edges[:-1, None] + np.diff(edges)[:, None] * np.arange(WATCHED) / WATCHED).ravel()
-    assert values(resampled(run, instants)) <= 1.0 + 1e-6
+    there, plant = resampled(run, instants), crane[0]
+    u = ca.Function("u", [plant.mechanism.q.t], [run.model.reduction.mechanism.outputs["cart"]])
+    states = there.jets[:4]  # interpolated accelerations have errors where inputs have corners
+    rates = [plant.rates(t, x, [float(u(t))]) for t, x in zip(instants, states.T, strict=True)]
+    assert values(replace(there, jets=np.vstack([states, np.transpose(rates)[2:]]))) <= 1.0 + 1e-6
     excess = values(run) - 1.0
     assert excess < 1e-2
     assert ("exceeds its bound" in run.message) == (excess > 1e-6)
+
+
+def test_a_bound_keeps_the_rope_of_a_flat_crane_taut():
+    """3 m down in 1.2 s: more than free fall for a while, where the exact inverse is singular."""
+    mechanism, _ = overhead_crane()
+    x, l, theta = mechanism.q
+    path = rest_to_rest(mechanism.q.t, (0.0, 2.0), (1.0, 5.0), 1.2)
+    program = sv.Program({"X": x + l * ca.sin(theta) - path[0], "Z": l * ca.cos(theta) - path[1]})
+    task = {"start": {"l": 2.0}, "bounds": {"tension": (100.0, None)}, "weight": 2e-8}
+    run = sv.inverse(mechanism, program, (0.0, 1.2), **task)
+    assert "relaxed, as the exact plan ends: The program is singular at t = 0.2" in run.message
+    assert 95.0 < run["tension"].min() < 101.0 and sv.verify(run.model, run).passed
+    Z = run["l"] * np.cos(run["theta"])
+    fall = np.gradient(np.gradient(Z, run.t), run.t)[2:-2]
+    assert fall.max() < 9.81  # a load on a taut rope falls less than freely
+    with refused(sv.SingularProgram):
+        sv.inverse(mechanism, program, (0.0, 1.2), start={"l": 2.0})
+
+
+def test_a_speed_within_its_bound(crane, coarse):
+    speed = 0.97 * np.abs(coarse["dx"]).max()
+    run = sv.relaxed(*crane, (0.0, 6.0), weight=1e-6, bounds={"dx": speed})
+    assert 0.99 * speed < np.abs(run["dx"]).max() < 1.001 * speed
+
+
+@pytest.mark.parametrize("options, kind, facts", [
+    ({"bounds": {"cart": 10.0}}, SpecificationError, {"name": "cart"}),
+    ({"bounds": {"dcart": 10.0}}, SpecificationError, {"name": "dcart"}),
+    ({"bounds": {"x": (0.1, None)}}, LimitExceeded, {"name": "x", "t": 0.0, "value": 0.0}),
+    ({"bounds": {"x": (None, 4.0)}}, LimitExceeded, {"name": "x", "t": 6.0, "limit": (-np.inf, 4.0)}),
+    ({"bounds": {"dtheta": (0.1, 1.0)}}, LimitExceeded, {"name": "dtheta", "value": 0.0}),
+])  # fmt: skip
+def test_bounds_that_no_input_can_keep_are_refused_at_once(crane, options, kind, facts):
+    with refused(kind, facts["name"], **facts):
+        sv.relaxed(*crane, (0.0, 6.0), weight=1e-6, **options)
+
+
+def test_material_constraints_and_quasi_velocities_change_nothing(plan):
+    q = sv.coordinates("x X Z")  # the load by its position
+    x, X, Z = q
+    S = sv.particle(q, 10.0, x) + sv.particle(q, 100.0, ca.vertcat(X, Z))
+    rope = ((X - x) ** 2 + Z**2 - 16.0) / 2
+    absolute = sv.Mechanism(q, gibbs=S, potential=981.0 * Z, actuators={"cart": x}, constraints={"rope": rope})
+    program = sv.Program({"X": X - rest_to_rest(q.t, 0.0, 5.0, 6.0)})
+    run = sv.relaxed(sv.plant(absolute), program, (0.0, 6.0), weight=1e-8, start={"Z": -4.0})
+    assert resampled(run, plan.t)["cart"] == pytest.approx(plan["cart"], abs=1e-3)
+    assert (run["X"] - run["x"]) ** 2 + run["Z"] ** 2 == pytest.approx(16.0, abs=1e-8)
+    assert sv.verify(run.model, run).passed
+
+    q = sv.coordinates("x theta").with_quasi_velocities("u v", [[1, 0], [-2 * ca.cos(0.3), 1]])
+    x, theta = q
+    load = ca.vertcat(x + 4.0 * ca.sin(theta), -4.0 * ca.cos(theta))
+    S = sv.particle(q, 10.0, x) + sv.particle(q, 100.0, load)
+    other = sv.Mechanism(q, gibbs=S, potential=981.0 * load[1], actuators={"cart": x})
+    program = sv.Program({"X": load[0] - rest_to_rest(q.t, 0.0, 5.0, 6.0)})
+    run = sv.relaxed(sv.plant(other), program, (0.0, 6.0), weight=1e-8)
+    assert resampled(run, plan.t)["cart"] == pytest.approx(plan["cart"], abs=1e-3)
+    assert sv.verify(run.model, run).passed
+
+
+def test_a_residual_of_third_order(crane):
+    """The cart's jerk follows a path, with the states at the end given."""
+    plant, _ = crane
+    q = plant.mechanism.q
+    jerk = rest_to_rest(q.t, 0.0, 5.0, 6.0)
+    for _ in range(3):
+        jerk = ca.jacobian(jerk, q.t)
+    end, largest = {"x": 5.0, "theta": 0.0, "dx": 0.0, "dtheta": 0.0}, []
+    for weight in (1e-3, 1e-4):
+        run = sv.relaxed(plant, sv.Program({"jerk": q.d(3)[0] - jerk}), (0.0, 6.0), weight=weight, end=end)
+        missed = run.residual["jerk"][0]
+        measured = np.gradient(run["d2x"], run.t)
+        target = np.array(ca.Function("j", [q.t], [jerk]).map(len(run.t))(run.t[None])).ravel()
+        assert np.percentile(np.abs(measured - target - missed), 95) < 0.01  # the input has corners
+        assert run["x"][-1] == pytest.approx(5.0, abs=1e-9) and sv.verify(run.model, run).passed
+        largest.append(np.sqrt(np.mean(missed**2)))
+    assert largest[1] < largest[0]
 
 
 def test_limits_and_friction_of_the_plant_hold():
@@ -257,11 +342,19 @@ def test_the_plant_follows_the_plan(scene):
     assert sv.verify(run.model, run).passed
 
 
+def test_stiff_machines_are_solved_in_a_few_iterations():
+    """Eight segments, the first solution, with modes of 650 rad/s in intervals of 0.09 s."""
+    mechanism, program = flexible_link(8)
+    task = Task(sv.plant(mechanism), program, (0.0, 2.2), ({}, {}), None, None, "rest")
+    plan = task._solved(task._first(task._mesh()), [FIRST * task._usual_weights()])
+    assert plan.iterations[0] <= 5
+
+
 # --- towards the exact inverse
 
 
 def test_a_flat_plan_tends_to_the_exact_inverse_in_proportion_to_the_weight():
-    mechanism, program = sv.gallery.overhead_crane()
+    mechanism, program = overhead_crane()
     model = sv.derive(mechanism, program)
     exact = sv.simulate(model, model.start(guess={"l": 4.0}), (0.0, 6.0))
     plant = sv.plant(mechanism)
@@ -338,6 +431,11 @@ def test_refusals(crane):
         sv.relaxed(plant, program, (1.0, 6.0), weight=1e-8)
     with refused(SpecificationError, "'stop'", end="stop"):
         sv.relaxed(plant, program, span, weight=1e-8, end="stop")
+    for start in ({"x": "0.5"}, {"x": [1.0]}, [[0.0, 0.0], [0.0]]):
+        with refused(SpecificationError):
+            sv.relaxed(*crane, (0.0, 6.0), weight=1e-6, start=start)
+    with refused(SpecificationError, name="weight", expected=(None,)):
+        sv.relaxed(*crane, (0.0, 6.0), weight=[[1e-6, 1e-8]])
     with refused(SpecificationError, name="plant"):
         sv.relaxed(plant.mechanism, program, span, weight=1e-8)
 
@@ -364,6 +462,12 @@ def test_infeasible_limits_say_which_where_and_by_how_much(crane):
         sv.relaxed(*crane, (0.0, 6.0), weight=1e-6, limits={"cart": 10.0})
     assert caught.value.details["value"] == pytest.approx(127.8, abs=2.0)
     assert caught.value.details["t"] == pytest.approx(1.8, abs=0.1) or caught.value.details["t"] > 4.0
+
+
+def test_a_solution_that_takes_too_long_says_so(crane, monkeypatch):
+    monkeypatch.setitem(IPOPT, "max_wall_time", 1e-3)
+    with refused(IntegrationStopped, f"IPOPT does not converge in {LONGEST:g} s", status="Maximum_WallTime_Exceeded"):
+        sv.relaxed(*crane, (0.0, 6.0), weight=1e-8)
 
 
 # --- the parts

@@ -359,3 +359,21 @@ def test_limits_need_a_run_and_an_actuator(crane_plan):
         sv.report(crane_plan.model, crane_plan, {"troley": 100.0})
     with refused(sv.SpecificationError, name="trolley"):
         sv.report(crane_plan.model, crane_plan, {"trolley": -1.0})
+
+
+@pytest.mark.parametrize("friction, said", [(0.0, "undamped at rest"), (3.0, "decays with at least 1.5 1/s at rest")])
+def test_self_motion_is_reported_and_whether_it_is_damped(friction, said):
+    """A mass of 2 kg in a plane with a force along each axis, of which the program prescribes one."""
+    q = sv.coordinates("x y")
+    x, y = q
+    S, forces = sv.particle(q, 2.0, ca.vertcat(x, y)), {"y": -friction * q.d(1)[1]}
+    mechanism = sv.Mechanism(q, gibbs=S, forces=forces, actuators={"Fx": x, "Fy": y})
+    report = sv.report(mechanism, sv.Program({"x": x - sv.paths.rest_to_rest(q.t, 0.0, 1.0, 1.0)}))
+    assert f"self-motion of 1 velocity, {said}" in str(report)
+    facts = report.as_dict()["self_motion"]
+    assert facts["velocities"] == 1 and facts["rate"] == pytest.approx(-friction / 2)
+
+
+def test_a_program_for_each_actuator_leaves_no_self_motion():
+    report = sv.report(*gallery["overhead-crane"].build())
+    assert report.self_motion is None and "self-motion" not in str(report)

@@ -2,14 +2,18 @@
 
 import pickle
 from functools import lru_cache
+from itertools import pairwise
 
 import casadi as ca
 import numpy as np
 import pytest
 from refusals import refused
-from scipy.integrate import solve_ivp
+from scipy.integrate import quad, solve_ivp
+from scipy.special import expit
 
 import servoctl as sv
+from servoctl.jets.series import Series
+from servoctl.jets.tape import REAL, Tape
 from servoctl.model.switching import switching
 
 ONE_STEP = ("DOP853", "RK45", "Radau", "LSODA", "Taylor", "RadauIIA", "RK4", "RK8")
@@ -478,6 +482,49 @@ def test_no_setting_steps_over_a_narrow_force(settings):
         force, start, span = NARROW[name]
         run = sv.simulate(*pushed(force, *start), span, **settings)
         assert [run["y"][-1], run["dy"][-1]] == pytest.approx(narrow_reference(name), abs=2e-6)
+
+
+STEEP = {  # of k (t - 1): as the designer writes them, where exp leaves the range of doubles, and without overflow
+    "logistic": (lambda s: 1 / (1 + ca.exp(-s)), expit),
+    "one less logistic": (lambda s: 1 - 1 / (1 + ca.exp(s)), expit),
+    "powers": (lambda s: (1 + ca.exp(-s)) ** -2, lambda s: expit(s) ** 2),
+    "tanh": (lambda s: (1 + ca.tanh(s)) / 2, lambda s: expit(2 * s)),
+    "sech": (lambda s: 1 / ca.cosh(s), lambda s: 2 * np.exp(-np.abs(s)) / (1 + np.exp(-2 * np.abs(s)))),
+}
+
+
+@pytest.mark.parametrize("slope", [500.0, 2e3, 1e4, 1e5])
+@pytest.mark.parametrize("method", ["Taylor", "DOP853"])
+@pytest.mark.parametrize("name", STEEP)
+def test_steep_blends_neither_overflow_nor_are_stepped_over(name, method, slope):
+    """y'' = f - y from y = 0.3 at rest: y(2) = 0.3 cos 2 + the integral of f(s) sin(2 - s)."""
+    symbolic, numeric = STEEP[name]
+    model, start = beside(force=lambda t, y, dy: symbolic(slope * (t - 1)) - y, y=0.3, dy=0.0)
+    run = sv.simulate(model, start, (0.0, 2.0), method, t_eval=[0.0, 2.0])
+    cuts = [0.0, *(1 + np.array([-50.0, -5.0, 0.0, 5.0, 50.0]) / slope), 2.0]
+    parts = (
+        quad(lambda s: numeric(slope * (s - 1)) * np.sin(2 - s), a, b, epsabs=1e-13)[0] for a, b in pairwise(cuts)
+    )
+    assert run["y"][-1] == pytest.approx(0.3 * np.cos(2.0) + sum(parts), abs=1e-7)
+
+
+def test_quotients_that_overflow_keep_their_derivatives_and_others_none():
+    """Coefficients at a = -1000: of 1/(1 + e^(-a)) all zero; of e^(-a)/(1 + e^(-a)) and of softplus unknown."""
+    a = ca.SX.sym("a")
+    e = ca.exp(-a)
+    tape = Tape([a], [1 / (1 + e), (1 + e) ** -3, 1 / ca.cosh(a), e / (1 + e), 1 / (1 + ca.sqrt(a + 1000))])
+    for number in (np.float64, REAL):
+        far = -1000.0 if number is np.float64 else -2e4
+        series = Series(tape, [[np.array([far], dtype=number), np.ones(1, dtype=number), *([0.0] * 8)]])
+        with np.errstate(all="ignore"):
+            for _ in range(6):
+                series.advance()
+        quotients = np.array([[np.asarray(c).item() for c in output] for output in series.outputs])
+        assert np.all(quotients[:3] == 0.0) and not np.any(np.isfinite(quotients[3]))
+    near = Series(tape, [[np.array([-1000.0]), np.ones(1), *([0.0] * 8)]])
+    with np.errstate(all="ignore"):
+        near.advance(), near.advance()
+    assert not np.isfinite(near.outputs[4][1])  # an infinite slope is no overflow
 
 
 PULSES = {  # of time alone, or of the place x = t: their impulse is 1, about t = 1

@@ -45,9 +45,11 @@ def test_slowed_rates_and_curvatures_leave_the_path_where_it_is():
 
 def test_the_motions_tried_are_shown(capsys, monkeypatch):
     monkeypatch.setattr("servoctl.progress.PATIENCE", 0)
-    sv.fastest(*cars(), {"force": 200.0}, (0.0, 2.0), progress=True)
+    monkeypatch.setattr("sys.stderr.isatty", lambda: True, raising=False)
+    sv.fastest(*cars(), {"force": 200.0}, (0.0, 2.0))
     printed = capsys.readouterr().err
     assert "fastest" in printed and "motions" in printed and "simulate" not in printed
+    monkeypatch.setattr("sys.stderr.isatty", lambda: False, raising=False)
     sv.fastest(*cars(), {"force": 200.0}, (0.0, 2.0))
     assert not capsys.readouterr().err
 

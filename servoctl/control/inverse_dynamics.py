@@ -3,7 +3,8 @@
 A residual is differentiated along the plant until an input appears, φ^(r) = b + D v. If the decoupling matrix D has
 rank ρ < k, regular feedback makes ρ of these derivatives inputs. Those on which the other rows depend get an integrator
 and become controller states, and the others are differentiated further: the dynamic extension algorithm of Descusse and
-Moog. Ranks are decided by numbers, at states about a plan.
+Moog. Where these rows change along the plan, as on a full turn of a vehicle, inputs get the integrators instead. Ranks
+are decided by numbers, at states about a plan.
 """
 
 from collections.abc import Mapping, Sequence
@@ -28,6 +29,9 @@ from servoctl.reduction.ranks import clean, decide, decide_all, eliminate
 from servoctl.reduction.realisation import wished
 from servoctl.run import Run
 
+PLAN_POINTS = 129  # states of the plan at which a choice of rows must be regular
+WEAK = 0.05  # of its largest size along the plan: a smaller determinant is no choice of rows
+LEVEL_STEPS = 12  # Newton steps for the controller states on the plan
 RANK_POINTS, AWAY, SEED = 8, 0.02, 20240229  # states for the ranks, and their distance from the plan
 SHARE = 1e-9  # of the largest entry, in rows and columns of like size: smaller ones are rounding
 MOST_DELAY = 1000  # samples: the poles of a delayed loop are eigenvalues of a matrix of that size
@@ -41,13 +45,15 @@ class Linearisation:
 
     `orders` are those of the error dynamics by residual, i.e. relative degrees with the extension, `relative_degree`
     those without. The controller state ξ, with the names `state_names`, are derivatives of residuals behind
-    integrators. `step` maps (t, [x; ξ], column) to [u; ξ+]; the column is [plant's parameters; Ts; increment of u;
+    integrators, or inputs; `start` (n_ξ,) are their values on the plan. `step` maps (t, [x; ξ], column) to [u; ξ+]; the
+    column is [plant's parameters; Ts; increment of u;
     coefficients of the error dynamics].
     """
 
     orders: dict
     relative_degree: dict
     state_names: tuple
+    start: np.ndarray
     step: object
 
 
@@ -57,11 +63,15 @@ def linearise(plan, plant):
     Refuses residuals of an order above 2, a plant of another mechanism, and residuals that depend on no input.
     """
     _require_invertible(plan.model.reduction, plant)
-    extension = _Extension(plant, in_symbols_of(plant, plan.model), _points(plan, plant))
+    along = np.linspace(plan.t[0], plan.t[-1], PLAN_POINTS)
+    points = _points(plan, plant), (along, _plant_states(plan, plant, along))
+    extension = _Extension(plant, in_symbols_of(plant, plan.model), *points)
     reduction = plan.model.reduction
     split, wish = reduction.realisation.actuation, wished(reduction.mechanism, reduction.program)
     if split.shape[0] > split.shape[1] and reduction.mechanism.q.order(split) < 2:
-        extension.share(**in_symbols_of(plant, plan.model, {"split": split, "wish": wish}))
+        weights = [ca.SX(reduction.program.weights.get(name, 1.0)) for name in reduction.mechanism.actuators]
+        parts = {"split": split, "wish": wish, "weights": ca.vertcat(*weights)}
+        extension.share(**in_symbols_of(plant, plan.model, parts))
     while extension.rank() < len(extension.names):
         extension.extend()
     return extension.law()
@@ -92,12 +102,15 @@ def _points(plan, plant):
     """Times (N,), states of the plan (N, n_x), and states somewhat beside it."""
     random = np.random.default_rng(SEED)
     times = np.linspace(plan.t[0], plan.t[-1], RANK_POINTS + 2)[1:-1]
-    states = np.array([plan.state(t) for t in times])
+    states = _plant_states(plan, plant, times)
     sizes = np.maximum(np.abs(states).max(axis=0), 1.0)
-    lagging = [np.interp(times, plan.t, plan[name]) for name in plant.lagged]
-    states = np.column_stack([states, *lagging])
-    sizes = np.concatenate([sizes, [max(np.abs(values).max(), 1.0) for values in lagging]])
     return times, states, states + AWAY * sizes * random.uniform(-1, 1, states.shape)
+
+
+def _plant_states(plan, plant, times):
+    """States of a plant (N, n_x) along a plan."""
+    lagging = [np.interp(times, plan.t, plan[name]) for name in plant.lagged]
+    return np.column_stack([np.array([plan.state(t) for t in times]), *lagging])
 
 
 def _without_units(matrices):
@@ -114,15 +127,17 @@ def _without_units(matrices):
 class _Extension:
     """A plant with integrators before some of its inputs, and its program's residuals differentiated along it."""
 
-    def __init__(self, plant, residuals, points):
+    def __init__(self, plant, residuals, points, along):
         e = plant.equations
         q, self.parameters = e.q, plant.parameters
-        self.t, self.x, self.names, self.points = q.t, e.state, tuple(residuals), points
+        self.t, self.x, self.names, self.points, self.along = q.t, e.state, tuple(residuals), points, along
         self.numbers = e.p[: e.p.numel() - e.u.numel() - q.n]
         undisturbed = [ca.substitute(part, e.d, ca.SX.zeros(q.n)) for part in (e.state_rates, e.acceleration)]
         self.x_rate, acceleration = undisturbed
         self.v, self.u = ca.SX(e.u), ca.SX(e.u)  # new inputs, and the plant's inputs by them
         self.xi, self.xi_rate, self.state_names = ca.SX(0, 1), ca.SX(0, 1), []
+        self.weights = None  # of inputs that share at the end
+        self.turns = False  # whether the rows that see some inputs change along the plan
         jets = ca.vertcat(*q.gamma(2))
         self.levels = [[ca.substitute(ca.SX(residual), jets, acceleration)] for residual in residuals.values()]
         for level in self.levels:
@@ -153,9 +168,10 @@ class _Extension:
     def values(self, matrix, beside=True):
         """Values of a matrix at states beside the plan, or on it, and their sizes: (rows, columns, N) each."""
         times, on, off = self.points
-        states = off if beside else on
-        random = np.random.default_rng(SEED + 1)
-        xi = random.uniform(-1, 1, (len(times), self.xi.numel())) * beside
+        random = np.random.default_rng(SEED + 1).uniform(-1, 1, (len(times), self.xi.numel()))
+        return self._at(matrix, times, *((off, random) if beside else (on, self.controller_states(times, on))))
+
+    def _at(self, matrix, times, states, xi):
         v = np.zeros((len(times), self.v.numel()))
         numbers = np.tile(self.parameters, (len(times), 1))
         inputs = np.concatenate([times[:, None], states, xi, v, numbers], axis=1).T
@@ -163,6 +179,19 @@ class _Extension:
         tape = Tape(symbols, ca.densify(ca.vec(matrix)).elements())
         shape = (matrix.shape[1], matrix.shape[0], len(times))
         return tuple(a.reshape(shape).swapaxes(0, 1) for a in evaluate(tape, inputs.astype(np.longdouble)))
+
+    def controller_states(self, times, states):
+        """ξ (N, n_ξ) at states (N, n_x) of the plan, where all residuals and their derivatives vanish."""
+        xi = np.zeros((len(times), self.xi.numel()))
+        if self.turns:
+            levels = ca.vertcat(*(e for level in self.levels for e in level[:-1]))
+            symbols = [self.t, self.x, self.xi, self.numbers]
+            f = ca.Function("levels", symbols, [levels, ca.densify(ca.jacobian(levels, self.xi))])
+            for k, (t, x) in enumerate(zip(times, states, strict=True)):
+                for _ in range(LEVEL_STEPS):
+                    values, slopes = f(t, x, xi[k], self.parameters)
+                    xi[k] -= np.linalg.lstsq(np.array(slopes), np.array(values)[:, 0], rcond=None)[0]
+        return xi
 
     @property
     def decoupling(self):
@@ -173,22 +202,36 @@ class _Extension:
         """The rank of the decoupling matrix at states about the plan."""
         return decide_all(*self.values(self.decoupling))[0].rank
 
-    def share(self, split, wish):
-        """Make the multipliers μ the inputs: redundant actuators share as in the plan, u = u_wish + split μ."""
+    def share(self, split, wish, weights):
+        """Redundant actuators share as in the plan: the multipliers μ are the inputs, u = u_wish + split μ.
+
+        Where some inputs get integrators in any case, the others share at the end.
+        """
+        if self.rank() < len(self.names) and self._choice()[-1]:
+            self.wish, self.weights = wish, weights
+            return
         v = ca.SX.sym("v", split.shape[1])
         self._substitute(self.v, wish + split @ v)
         self.v = v
 
-    def extend(self):
-        """Make derivatives of ρ residuals inputs, with an integrator before those that other residuals depend on."""
+    def _choice(self):
+        """D, rows and columns of a regular block, which of these rows need integrators, and whether they turn."""
         D = self.decoupling
         rows, columns = self._pivots(D)
+        integrated = self._needed(D, rows, columns, [i for i in range(D.shape[0]) if i not in rows])
+        return D, rows, columns, integrated, bool(all(integrated)) and self._turns(D[rows, columns])
+
+    def extend(self):
+        """Make derivatives of ρ residuals inputs, with an integrator before those that other residuals depend on."""
+        D, rows, columns, integrated, turns = self._choice()
         others = [i for i in range(D.shape[0]) if i not in rows]
         rest = [j for j in range(D.shape[1]) if j not in columns]
+        if turns:
+            self._integrate_inputs(D, columns, rest)
+            return
         block = D[rows, columns]
         drift = ca.vertcat(*(self.levels[i][-1] for i in rows))
         drift = ca.substitute(drift, self.v[columns], ca.SX.zeros(len(columns)))
-        integrated = self._needed(D, rows, columns, others)
         new = [ca.SX.sym(f"{self.names[i]}_{len(self.levels[i]) - 1}") for i in rows]
         solved, _ = eliminate(block, ca.vertcat(*new) - drift, clean(*self.values(block, beside=False)))
         self._substitute(self.v[columns], solved)
@@ -196,14 +239,41 @@ class _Extension:
         for i, symbol, needed in zip(rows, new, integrated, strict=True):
             self.levels[i][-1] = symbol
             if needed:
-                rate = ca.SX.sym(f"d{symbol.name()}")
-                self.state_names.append(symbol.name())
-                self.xi, self.xi_rate = ca.vertcat(self.xi, symbol), ca.vertcat(self.xi_rate, rate)
-                self.levels[i].append(rate)
-            inputs.append(rate if needed else symbol)
+                self.levels[i].append(self._integrated(symbol))
+            inputs.append(self.xi_rate[-1] if needed else symbol)
         self.v = ca.vertcat(*inputs, self.v[rest])
         for i in others:
             self._differentiate(self.levels[i])
+
+    def _integrated(self, symbol):
+        """The rate of a new controller state."""
+        rate = ca.SX.sym(f"d{symbol.name()}")
+        self.state_names.append(symbol.name())
+        self.xi, self.xi_rate = ca.vertcat(self.xi, symbol), ca.vertcat(self.xi_rate, rate)
+        return rate
+
+    def _turns(self, block):
+        """Whether a regular block of the decoupling matrix loses its rank somewhere along the plan."""
+        times, states = self.along
+        values = self._at(block, times, states, self.controller_states(times, states))[0].astype(float)
+        sizes = np.abs(np.linalg.det(np.moveaxis(_without_units(values), 2, 0)))
+        return sizes.min() < WEAK * sizes.max()
+
+    def _integrate_inputs(self, D, columns, rest):
+        """Put integrators before the inputs of independent columns of D, w = v_c + K v_r with D_r = D_c K.
+
+        The rows that see these inputs may change along the plan: no row is chosen.
+        """
+        self.turns = True
+        new = [ca.SX.sym(f"extended_{self.xi.numel() + i}") for i in range(len(columns))]
+        w, square = ca.vertcat(*new), D[:, columns].T @ D[:, columns]
+        if rest:
+            right = D[:, columns].T @ (D[:, rest] @ self.v[rest])
+            w -= eliminate(square, right, clean(*self.values(square)))[0]
+        self._substitute(self.v[columns], w)
+        self.v = ca.vertcat(*(self._integrated(symbol) for symbol in new), self.v[rest])
+        for level in self.levels:
+            self._differentiate(level)
 
     def _needed(self, D, rows, columns, others):
         """Whether other rows depend on the derivative of a pivot row, (ρ,) bool."""
@@ -243,15 +313,30 @@ class _Extension:
         tops = [ca.substitute(level[-1], self.v, ca.SX.zeros(self.v.shape)) for level in self.levels]
         errors = (ca.dot(ci, ca.vertcat(*level[:-1])) for ci, level in zip(c, self.levels, strict=True))
         target = -ca.vertcat(*(top + error for top, error in zip(tops, errors, strict=True)))
-        square = D if D.shape[0] == D.shape[1] else D @ D.T
-        solved = eliminate(square, target, clean(*self.values(square, beside=False)))[0]
-        self._substitute(self.v, solved if square is D else D.T @ solved)
+        self._substitute(self.v, self._solved(D, target))
         period, ahead = ca.SX.sym("Ts"), ca.SX.sym("ahead", self.u.numel())
         column = ca.vertcat(self.numbers, period, ahead, *c)
         outputs = [self.u + ahead, self._advanced(period)]
         step = law_step("computed", self.t, ca.vertcat(self.x, self.xi), column, outputs)
         orders = dict(zip(self.names, counts, strict=True))
-        return Linearisation(orders, self.relative_degree, tuple(self.state_names), step)
+        start = self.controller_states(*(values[:1] for values in self.along))[0]
+        return Linearisation(orders, self.relative_degree, tuple(self.state_names), start, step)
+
+    def _solved(self, D, target):
+        """v with D v = target: the only one, or the one of least norm, of the inputs if they still have to share."""
+        if self.weights is None:
+            # D Dᵀ needs no choice of pivots
+            square = D if D.shape[0] == D.shape[1] and not self.turns else D @ D.T
+            solved = eliminate(square, target, clean(*self.values(square, beside=False)))[0]
+            return solved if square is D else D.T @ solved
+        # least (u - u_wish)ᵀ W (u - u_wish) with u = u_0 + S v; its matrix is regular with DᵀD, as D v is given
+        S, W = ca.jacobian(self.u, self.v), ca.diag(self.weights)
+        normal = S.T @ W @ S + D.T @ D
+        gradient = S.T @ W @ (self.wish - ca.substitute(self.u, self.v, ca.SX.zeros(self.v.shape)))
+        both = eliminate(normal, ca.horzcat(gradient, D.T), clean(*self.values(normal)))[0]
+        nearest, free = both[:, 0], both[:, 1:]
+        square = D @ free
+        return nearest + free @ eliminate(square, target - D @ nearest, clean(*self.values(square)))[0]
 
     def _advanced(self, period):
         """ξ a period later with x held: its Taylor series, which is finite for chains of integrators."""
@@ -319,7 +404,7 @@ def computed(
     return Law(
         name="computed", measures=plant.state_names, inputs=plant.inputs, rate=rate, t0=float(plan.t[0]),
         step=linear.step, schedule=np.column_stack([np.concatenate(column) for column in columns]),
-        state=np.zeros(len(linear.state_names)), state_names=linear.state_names,
+        state=linear.start, state_names=linear.state_names,
         initial_input=np.array([plan[name][0] for name in plant.inputs]), plan=plan, info=info,
     )  # fmt: skip
 

@@ -8,22 +8,34 @@ from typing import Any
 import numpy as np
 
 from servoctl.checks import as_span, finite, interval, mapping, require_kind
-from servoctl.errors import InconsistentStart, IntegrationStopped, LimitExceeded, SingularProgram, SpecificationError
+from servoctl.control.time_optimal import Curve, Inverse, Problem, smooth
+from servoctl.errors import (
+    InconsistentStart,
+    IntegrationStopped,
+    LimitExceeded,
+    SingularProgram,
+    SpecificationError,
+    UnstableInternalDynamics,
+)
+from servoctl.internal_dynamics import internal_dynamics
 from servoctl.model.model import derived
 from servoctl.progress import progress_bar
 from servoctl.run import Run
 from servoctl.simulation import judged, simulated
 from servoctl.spec.mechanism import Mechanism
+from servoctl.spec.paths import rest_to_rest
 from servoctl.spec.program import Program
 
 REACH = 12  # doublings of the time, after which a motion is nearly static, or halvings
 BELOW = 1e-6  # of a limit: distance that the fastest time law keeps from it
+TIGHTENED, TIGHTER = 5, 1.2  # how often a time-optimal law is solved; limits at nodes give way by this many excesses
+SHORT = 1e-6  # of the span: intervals of samples that are too short for a difference quotient
 REACHED = 1e-4  # of a limit: largest distance at which it counts as reached
 
 
 @dataclass(frozen=True, eq=False)
 class TimeLaw:
-    """A program whose time is scaled until a signal reaches its limit; made by `fastest`.
+    """A program whose time is stretched evenly, or runs by an optimal law, up to a limit; made by `fastest`.
 
     Attributes
     ----------
@@ -54,27 +66,34 @@ class TimeLaw:
 def fastest(
     mechanism: Mechanism, program: Program, limits: Mapping[str, Any], t_span: tuple[float, float],
     start: Mapping[str, float] | None = None, guess: Mapping[str, float] | None = None,
-    parameters: Mapping[str, float] | None = None, progress: bool | None = None,
+    parameters: Mapping[str, float] | None = None, shape: bool = False,
 ) -> TimeLaw:  # fmt: skip
-    """The fastest time law q(t0 + (t - t0)/σ) under which signals keep their limits.
+    """The fastest time law along the path of a program under which signals keep their limits.
 
-    The geometry of the motion stays; speeds scale with 1/σ, accelerations with 1/σ²; static loads stay. If several σ
-    reach a limit, the result is the one next to σ = 1.
+    By default the time is stretched evenly, q(t0 + (t - t0)/σ): the geometry of the motion stays; speeds scale with
+    1/σ, accelerations with 1/σ²; static loads stay. If several σ reach a limit, the result is the one next to σ = 1.
+
+    With `shape=True` the law s(t) along the path is free, from rest to rest: a local minimum of the duration by the
+    exact inverse, for programs that are flat or minimum phase. Its derivative that the actuation contains is
+    continuous and linear on 80 intervals, so that actuators change within one of them from limit to limit.
 
     Parameters
     ----------
     mechanism : Mechanism
     program : Program
+        With `shape=True` its residuals are h(q) - p(t), or conditions that hold at any speed; they may follow the curve
+        p at any pace, such as `paths.line(q.t, ...)`.
     limits : dict of str to (float, float) or float
-        Lower and upper limit of actuators and outputs by name; a number c is (-c, c), None leaves a side open.
+        Lower and upper limit of actuators, their rates ("dtrolley") and outputs by name; a number c is (-c, c), None
+        leaves a side open.
     t_span : (t0, t1)
         Span of the original program [s].
     start, guess : dict of str to float, optional
         As for `Model.start`, for the original program; derivatives in `start` are scaled with the motion.
     parameters : dict of str to float, optional
         Parameters of the mechanism that differ from their defaults.
-    progress : bool, optional
-        Show the number of simulated motions; default: on a terminal, for work of more than a second.
+    shape : bool, optional
+        Whether the law along the path is free; default: only its duration is.
 
     Returns
     -------
@@ -85,12 +104,15 @@ def fastest(
     LimitExceeded
         If even a nearly static motion exceeds a limit, or motions cease to exist before one is reached.
     SpecificationError
-        For limits that are no interval, and a span that does not go forward.
+        For limits that are no interval, and a span that does not go forward; with `shape=True` for a program that is
+        no curve, or turns sharply.
+    UnstableInternalDynamics
+        With `shape=True`, if what the program leaves free is unstable.
+    IntegrationStopped
+        If the optimisation with `shape=True` finds no minimum.
     NameUnknown
         For a limit of an unknown signal.
     """
-    from scipy.optimize import brentq
-
     scene = _Scene(
         mechanism,
         program,
@@ -100,6 +122,13 @@ def fastest(
         guess,
         mapping(parameters, "The parameters"),
     )
+    with progress_bar("fastest", None, unit=" motions") as bar:
+        return _optimal(scene, bar) if require_kind(bool, "shape", shape, "shape=True") else _even(scene, bar)
+
+
+def _even(scene, bar):
+    """The time law that is stretched evenly."""
+    from scipy.optimize import brentq
 
     @functools.cache
     def attempt(factor):
@@ -108,9 +137,8 @@ def fastest(
         finally:
             bar.update()
 
-    with progress_bar("fastest", progress, unit=" motions") as bar:
-        quick, slow = _bracket(attempt)
-        factor = brentq(lambda sigma: min(attempt(sigma)[0], 1.0) + BELOW, quick, slow, rtol=BELOW / 10)
+    quick, slow = _bracket(attempt)
+    factor = brentq(lambda sigma: min(attempt(sigma)[0], 1.0) + BELOW, quick, slow, rtol=BELOW / 10)
     excess, binding, slower, plan = attempt(factor)
     if not abs(excess) < REACHED:
         raise LimitExceeded(
@@ -122,6 +150,43 @@ def fastest(
             slow=slow,
         )
     return TimeLaw(factor, slower, plan if plan.model.flat else judged(plan), binding)
+
+
+def _optimal(scene, bar):
+    """The time law that is free along the curve: solved within the limits at nodes, and these tightened in between."""
+    curve = Curve(scene.mechanism, scene.program, scene.t_span, scene.parameters)
+    inverse = Inverse(curve, tuple(scene.limits), scene.parameters, scene.guess)
+    (t0, t1), t = scene.t_span, scene.mechanism.q.t
+
+    @functools.cache
+    def attempt(factor):
+        step = rest_to_rest(t - t0, 0.0, 1.0, (t1 - t0) * factor, inverse.order)
+        found = scene.along(curve, step, (t1 - t0) * factor)
+        bar.update()
+        _require_stable(found[-1])
+        return found
+
+    _, slow = _bracket(attempt)
+    law, plan = smooth((t1 - t0) * slow, inverse.order), attempt(slow)[-1]
+    sides = np.array([*scene.limits.values()]).T
+    for _ in range(TIGHTENED):
+        law = Problem(inverse, sides, law, plan).solved()
+        excess, binding, program, plan = scene.along(curve, law.expression(t, t0), law.duration)
+        bar.update()
+        if excess <= 0:
+            return TimeLaw(law.duration / (t1 - t0), program, plan if plan.model.flat else judged(plan), binding)
+        if plan is None:
+            break
+        beyond = [[max(0.0, e) for e in _excesses(plan, name, *scene.limits[name])] for name in scene.limits]
+        sides += TIGHTER * np.array(beyond).T * [[1.0], [-1.0]]
+        if np.any(sides[0] >= sides[1]):
+            break
+    raise LimitExceeded(
+        f"Between the nodes {binding[0] or 'a signal'} exceeds its limit by {excess:.2g} of it.",
+        "A time-optimal law keeps its limits at all instants.",
+        do="Add a limit of rates, as {'dtrolley': ...}, or choose shape=False.",
+        name=binding[0], excess=float(excess),
+    )  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -146,8 +211,15 @@ class _Scene:
 
     def slowed(self, factor):
         """(largest excess, binding, program, plan) of a time law; the excess is infinite if there is no motion."""
+        return self._tried(self.program.slowed(self.mechanism.q, factor, at=self.t_span[0]), factor)
+
+    def along(self, curve, law, duration):
+        """The same of a law along the curve, an SX scalar."""
         t0, t1 = self.t_span
-        slower = self.program.slowed(self.mechanism.q, factor, at=t0)
+        return self._tried(curve.program_along(law), duration / (t1 - t0))
+
+    def _tried(self, slower, factor):
+        t0, t1 = self.t_span
         try:
             model = derived(self.mechanism, slower, self.guess)
             model = model.with_parameters(**self.parameters) if self.parameters else model
@@ -174,10 +246,39 @@ def _worst(plan, limits):
     """Largest excess over the limits, relative to their size, and its (signal, side, instant)."""
     excesses = []
     for name, (low, high) in limits.items():
-        (t_low, least), (t_high, most) = plan.extrema(name)
+        (t_low, least), (t_high, most) = _extrema_of(plan, name)
         size = max(abs(v) for v in (low, high) if np.isfinite(v)) or max(abs(least), abs(most)) or 1.0
-        excesses += [((low - least) / size, (name, "lower", t_low)), ((most - high) / size, (name, "upper", t_high))]
+        below, above = _excesses(plan, name, low, high)
+        excesses += [(below / size, (name, "lower", t_low)), (above / size, (name, "upper", t_high))]
     return max(excesses)
+
+
+def _excesses(plan, name, low, high):
+    """By how much a signal exceeds its lower and its upper limit."""
+    (_, least), (_, most) = _extrema_of(plan, name)
+    return low - least, most - high
+
+
+def _extrema_of(plan, name):
+    """((t, least), (t, most)) of a signal or a rate."""
+    if not _differenced(plan, name):
+        return plan.extrema(name)
+    t, rates = _values(plan, name)
+    return tuple((float(t[i]), float(rates[i])) for i in (np.argmin(rates), np.argmax(rates)))
+
+
+def _differenced(plan, name):
+    """Whether a name is that of a rate that is taken from the samples at both ends of intervals."""
+    return name not in plan.names and name[:1] == "d" and name[1:] in plan.names
+
+
+def _values(plan, name):
+    """Times and values of a signal or a rate."""
+    if not _differenced(plan, name):
+        return plan.t, plan[name]
+    whole = np.append(True, np.diff(plan.t) > SHORT * np.ptp(plan.t))
+    t, values = plan.t[whole], plan[name[1:]][whole]
+    return t[:-1], np.diff(values) / np.diff(t)
 
 
 def _level(model, name):
@@ -193,6 +294,20 @@ def _unreached(factor):
         do="Pass limits of the actuators that the motion uses.",
         factor=factor,
     )
+
+
+def _require_stable(plan):
+    """Refuse a plan, if there is one, along which errors of the internal dynamics grow."""
+    if plan is None or plan.model.flat:
+        return
+    internal = internal_dynamics(plan.model, plan)
+    if internal.verdict == "unstable":
+        raise UnstableInternalDynamics(
+            f"Along the curve {internal.sentence()}.",
+            "A time-optimal law by the exact inverse is for programs that are flat or minimum phase.",
+            do="Use sv.relaxed(plant, program, t_span, limits=...) for a given duration, or choose another output.",
+            growth=float(internal.growth),
+        )
 
 
 def _exceeded(last, factor):

@@ -5,7 +5,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 from servoctl.checks import as_span, interval, mapping, numbers_by_name, positive_number, require_kind
-from servoctl.errors import ServoError, SpecificationError, unknown
+from servoctl.errors import ServoError, SingularProgram, SpecificationError, unknown
 from servoctl.inversion.relaxed import relaxed
 from servoctl.inversion.report import extremes
 from servoctl.inversion.verdict import (
@@ -58,7 +58,8 @@ def inverse(
         Limits of actuators and of their rates, {"trolley": 100.0, "dtrolley": 500.0}. An exact plan beyond them is
         replaced by the relaxed one.
     bounds : dict of str to float or (low, high), optional
-        Bounds of other signals, such as {"tension": (0, None)}, likewise.
+        Bounds of other signals, such as {"tension": (0, None)}, likewise. With limits or bounds, an exact plan that
+        reaches a singular state is replaced, too.
     weight : float or dict of str to float, optional
         Of the relaxed inverse; default: 1e-6 of that for which standing still costs as much as the program.
 
@@ -114,8 +115,14 @@ class Task:
         """The run by the method that the verdict chooses; the relaxed one where that is beyond limits or grows."""
         if chosen == RELAXED:
             return self.relaxed(found)
-        run = self.exact(model, begin, found, chosen)
-        excess = _excess(run, {**self.ranges[0], **self.ranges[1]})
+        ranges = {**self.ranges[0], **self.ranges[1]}
+        try:
+            run = self.exact(model, begin, found, chosen)
+        except SingularProgram as error:  # as at a rope without tension, which a bound excludes
+            if model.ideal or not ranges:
+                raise
+            return self.relaxed(f"the exact plan ends: {str(error).split('; ')[0]}")
+        excess = _excess(run, ranges)
         if excess:
             return self.relaxed(excess)
         if found.dynamics == OPEN or run.internal.get("verdict") == "unstable":

@@ -15,7 +15,18 @@ from functools import cached_property
 import casadi as ca
 import numpy as np
 
-from servoctl.checks import as_list, as_span, finite, interval, mapping, positive_number, positives, require_kind
+from servoctl.checks import (
+    array_of,
+    as_list,
+    as_span,
+    finite,
+    interval,
+    mapping,
+    numbers_by_name,
+    positive_number,
+    positives,
+    require_kind,
+)
 from servoctl.errors import (
     InconsistentStart,
     IntegrationStopped,
@@ -25,7 +36,7 @@ from servoctl.errors import (
     unknown,
 )
 from servoctl.inversion.equilibrium import RANK, Equilibria
-from servoctl.inversion.transcription import Mesh, Node, Transcription
+from servoctl.inversion.transcription import LONGEST, Mesh, Node, Transcription
 from servoctl.methods.motion import breakpoints
 from servoctl.model.model import derive
 from servoctl.model.start import State
@@ -43,7 +54,7 @@ INTERVALS = 24  # of the first mesh at least
 FIRST = 1e-3  # first weight, relative to that for which standing still costs as much as the program
 DEFAULT = 1e-6  # default weight, relative to the same
 FACTOR = 100.0  # between the weights of two successive solutions
-EXCEEDED = 1e-6  # of a bound: excess between the instants of bounds that a run tells
+EXCEEDED = 1e-6  # of a bound: excess between its instants that a run tells, and at the ends that is refused
 COARSE = 1e-6  # defect with which no plan is returned
 DEFECT, AIM = 1e-7, 0.1  # of the states between nodes, relative to their sizes; and what refinement aims at of it
 PLACES = (0.12, 0.4, 0.75)  # places within an interval where the defect is measured
@@ -54,6 +65,7 @@ STANDING = 1e-6  # rate of a program that stands still, relative to its largest
 STATUS = {
     "Infeasible_Problem_Detected": "finds no motion",
     "Maximum_Iterations_Exceeded": "does not converge in 200 iterations",
+    "Maximum_WallTime_Exceeded": f"does not converge in {LONGEST:g} s",
     "Restoration_Failed": "finds no way back to the equations of motion",
 }
 SOLVED = ("Solve_Succeeded", "Solved_To_Acceptable_Level")
@@ -119,7 +131,8 @@ def relaxed(
     several = None if isinstance(weight, Mapping) else as_list(weight)
     if several is None:
         return task.run(_weights(weight, program))
-    return task.front(positives("weight", several, "Write weight=[1e-6, 1e-8].").tolist())
+    weights = positives("weight", several, "Write weight=[1e-6, 1e-8].")
+    return task.front(array_of("weight", weights, None).tolist())
 
 
 def _weights(weight, program):
@@ -185,6 +198,7 @@ class Task:
         self.equilibria = Equilibria(plant, program, self.node)
         self.begin, self.held = self._begin(start)
         self.target = self._target()
+        self._require_bounds_at_ends()
         self.states, self.inputs, self.sizes = self._guess()
 
     def _bounded(self):
@@ -193,11 +207,22 @@ class Task:
         jets = {name: s for k in range(3) for name, s in zip(q.jet_names(k), ca.vertsplit(q.jet(k)), strict=True)}
         known = jets | self.program.residuals | mechanism.outputs
         for name in self.bounds:
+            if name in (*self.plant.inputs, *(f"d{u}" for u in self.plant.inputs)):
+                raise SpecificationError(
+                    f"bounds has {name!r}, an actuator or the rate of one.",
+                    "Bounds are of states, outputs and residuals; those of actuators are limits.",
+                    do=f"Write limits={{{name!r}: ...}}.",
+                    name=name,
+                )
             if name not in known:
                 raise unknown(name, known, "state, output or residual")
         return {name: known[name] for name in self.bounds}
 
     # the ends
+
+    @property
+    def _to_rest(self):
+        return isinstance(self.end, str) and self.end == "rest"
 
     def _begin(self, start):
         """The state at t0, and the inputs that hold it at rest; None if it may move."""
@@ -208,15 +233,16 @@ class Task:
             names, guess = list(self.plant.mechanism.q.names), zero[:nq].copy()
             if self._exact is not None:
                 guess = self._exact.jets[:nq, 0].copy()
-            fixed = [names.index(name) for name in start or ()]
-            guess[fixed] = [start[name] for name in start or ()]
+            given = numbers_by_name(start, names, "coordinate", "start")
+            fixed = [names.index(name) for name in given]
+            guess[fixed] = list(given.values())
             rest, worst = self.equilibria.at(t0, guess, zero[nq:], fixed)
             if rest is None:
                 raise _no_rest("start", t0, worst)
             return np.concatenate([rest[0], np.zeros(self.n - nq)]), self._held(rest, "start")
-        values = getattr(start, "values", start) if not isinstance(start, dict) else start
-        x = self.plant.state(values if isinstance(values, dict) else np.ravel(values)[: self.n])
-        if self.end != "rest":
+        values = start.values[: self.n] if isinstance(start, State) else start
+        x = self.plant.state(values)
+        if not self._to_rest:
             return x, None
         self._require_standing(t0, "start")
         rest, worst = self.equilibria.at(t0, x[:nq], zero[nq:], range(nq), self.equilibria.program)
@@ -274,7 +300,7 @@ class Task:
     def _target(self):
         """What is fixed at the end: (state with NaN where open, inputs or None, function that vanishes or None)."""
         open_ = np.full(self.n, np.nan)
-        if self.end == "free":
+        if isinstance(self.end, str) and self.end == "free":
             return open_, None, None
         if isinstance(self.end, Mapping):
             for name, value in self.end.items():
@@ -282,7 +308,7 @@ class Task:
                     raise unknown(name, self.plant.state_names, "state")
                 open_[self.plant.state_names.index(name)] = finite(name, value, "value at the end")
             return open_, None, None
-        if self.end != "rest":
+        if not self._to_rest:
             raise SpecificationError(
                 f"end={self.end!r}.", "It is 'rest', 'free', or values of states by name.", end=self.end
             )
@@ -302,6 +328,23 @@ class Task:
             return np.concatenate([rest[0], np.zeros(self.n - self.nq)]), held, None
         open_[self.nq :] = 0.0
         return open_, held, self._independent(rest)
+
+    def _require_bounds_at_ends(self):
+        """Refuse bounds that a fixed state at an end exceeds, whatever the inputs."""
+        node, t = self.node, self.span
+        f = node.function("bounded", node.bounded)
+        for k, (where, x) in enumerate((("start", self.begin), ("end", self.target[0]))):
+            values = np.array(f(t[k], x, np.zeros(node.v.numel()))).ravel()
+            for name, value, each in zip(node.bounds, values, node.bounded.elements(), strict=True):
+                low, high = self.bounds[name]
+                excess = max(low - value, value - high)
+                if excess > EXCEEDED * max(1.0, abs(value)) and not ca.depends_on(each, node.v):
+                    raise LimitExceeded(
+                        f"At the {where}, t = {t[k]:g} s, {name} = {value:.6g}; its bound is ({low:g}, {high:g}).",
+                        "The states at both ends lie within the bounds.",
+                        do=f"Widen the bound, or choose another {where}.",
+                        name=name, t=float(t[k]), value=float(value), limit=(low, high),
+                    )  # fmt: skip
 
     def _independent(self, rest):
         """A function of (t, x, v) whose values vanish at rests near this one, without dependent rows."""
@@ -329,7 +372,7 @@ class Task:
             return None
 
     def _guess(self):
-        """States (n_x, G) and inputs (m, G) at equal instants, and sizes of states, inputs and effort."""
+        """States (n_x, G) and inputs (m, G) at equal instants, and the sizes that `Transcription` takes."""
         times = np.linspace(*self.span, GUESS)
         if self._exact is not None:
             x = np.array([np.interp(times, self._exact.t, self._exact[name]) for name in self.plant.state_names])
@@ -341,7 +384,17 @@ class Task:
         u_size = np.abs(u).max(axis=1)
         u_size = np.where(u_size > 1e-6 * u_size.max(), u_size, u_size.max() or 1.0)
         v = np.concatenate([u_size, np.zeros(self.m * self.node.depth)])
-        return x, u, (x_size, u_size, float(effort(self.span[0], self.begin, v)) or 1.0)
+        sizes = x_size, u_size, self._bounded_sizes(times, x, u), float(effort(self.span[0], self.begin, v)) or 1.0
+        return x, u, sizes
+
+    def _bounded_sizes(self, times, x, u):
+        """Size of each bounded quantity (b,): its largest value along states and inputs, at least that of its sides."""
+        v = np.vstack([u, np.zeros((self.m * self.node.depth, len(times)))])
+        values = np.array(self.node.function("bounded", self.node.bounded).map(len(times))(times[None], x, v))
+        sides = np.array([*self.bounds.values()]).reshape(-1, 2)
+        both = np.abs(np.hstack([values.reshape(len(sides), len(times)), sides]))
+        largest = np.max(both, axis=1, where=np.isfinite(both), initial=0.0)
+        return np.where(largest > 0, largest, 1.0)
 
     def _quasi_static(self, times):
         """Rests at frozen instants, with the speeds and the inertia of moving through them slowly."""
@@ -381,7 +434,7 @@ class Task:
         """The run of weights (k,), by default a small part of the usual ones."""
         if beta is None:
             usual = self._usual_weights()
-            beta = DEFAULT * np.where(np.isfinite(usual), usual, 1.0 / self.sizes[2])
+            beta = DEFAULT * np.where(np.isfinite(usual), usual, 1.0 / self.sizes[3])
         return self._as_run(self._plan(beta))
 
     def front(self, weights):
@@ -442,7 +495,8 @@ class Task:
         if near is not None:
             first = near.beta / beta
         else:
-            first = FIRST * usual / beta if self._exact is None else np.ones(1)
+            near_rest = FIRST * (FACTOR if self.bounds else 1.0)  # bounds are met sooner by plans of little motion
+            first = near_rest * usual / beta if self._exact is None else np.ones(1)
         factor = max(1.0, float(np.min(first[np.isfinite(first)], initial=np.inf)))
         steps = int(np.ceil(np.log(factor) / np.log(FACTOR))) if np.isfinite(factor) else 0
         weights = [beta * factor ** (1 - k / max(steps, 1)) for k in range(near is not None and steps > 0, steps + 1)]
@@ -454,7 +508,7 @@ class Task:
         v = np.concatenate([self.begin_inputs, np.zeros(self.m * self.node.depth)])
         still = np.hstack([np.array(f(t, self.begin, v)) for t in np.linspace(*self.span, GUESS)])
         moved = np.abs(still).max(axis=1)
-        return np.where(moved > 0, moved**2 / self.sizes[2], np.inf)
+        return np.where(moved > 0, moved**2 / self.sizes[3], np.inf)
 
     @property
     def begin_inputs(self):
@@ -466,7 +520,7 @@ class Task:
         nlp = Transcription(self.node, plan.mesh, plan.pieces, self.sizes, self.target[2])
         bounds, w, multipliers, iterations = self._sides(nlp), nlp.joined(plan.x, plan.points), None, list(iterations)
         for beta in weights:
-            w, multipliers, stats = nlp.solve(w, beta, bounds, multipliers)
+            w, multipliers, stats = nlp.solve(w, beta, bounds, None if self.bounds else multipliers)
             iterations.append(stats["iter_count"])
             if stats["return_status"] not in SOLVED:
                 raise self._failed(nlp, (w, beta, bounds), stats["return_status"], plan)
@@ -490,7 +544,8 @@ class Task:
                 jump[:, i] = [[-np.inf], [np.inf]]
                 u[:, i, 0] = self.begin_inputs[i] if self.held is not None else u[:, i, 0]
                 u[:, i, -1] = self.target[1][i] if self.target[1] is not None and not self.target[2] else u[:, i, -1]
-        bounded = np.array([*self.bounds.values()]).reshape(-1, 2).T[:, :, None].repeat(len(nlp.watched), axis=2)
+        bounded = np.array([*self.bounds.values()]).reshape(-1, 2).T[:, :, None] / self.sizes[2][:, None]
+        bounded = bounded.repeat(len(nlp.watched), axis=2)
         rest = np.zeros((2, 0 if self.target[2] is None else self.target[2].numel_out(0), 1))
         motion = np.zeros((2, self.n, K - 1))
         limits = {"motion": motion, "begin": jump, "slope": slopes, "bound": bounded, "rest": rest}
@@ -521,7 +576,7 @@ class Task:
             return IntegrationStopped(
                 f"IPOPT {said}; the largest violation is that of {row} at t = {t:.4g} s, {abs(value - side):.3g}.",
                 "A plan satisfies the equations of motion and the conditions at both ends.",
-                do="Choose a longer span, another end or start nearer to the program.",
+                do="Choose a greater weight, a longer span, or a start and an end nearer to the program.",
                 row=row, t=t, violation=float(abs(value - side)), **facts,
             )  # fmt: skip
         row, t, value, side = self._violation(nlp, without[0], bounds)
@@ -530,7 +585,7 @@ class Task:
             f"IPOPT {said} within the limits and bounds; without them {row} is {value:.5g} at t = {t:.4g} s, "
             f"beyond {side:.5g}.",
             "A plan keeps all limits from end to end.",
-            do="Widen this limit, or give the transition more time.",
+            do="Widen this limit, choose a greater weight, or give the transition more time.",
             row=row, t=t, value=value, limit=side, **facts,
         )  # fmt: skip
 
@@ -558,7 +613,7 @@ class Task:
             "motion": ([f"the motion of {name}" for name in states], mesh.nodes, x_size),
             "begin": (inputs, mesh.edges[:1], u_size),
             "slope": ([f"d{name}" for name in inputs], pieces.nodes, u_size),
-            "bound": (self.node.bounds, nlp.watched, np.ones(len(self.bounds))),
+            "bound": (self.node.bounds, nlp.watched, self.sizes[2]),
         }
         values, limits = nlp.constraints(w), bounds[2]
         count = len(values["rest"])
@@ -596,7 +651,10 @@ class Task:
         parts = max(1, -(-SAMPLES // len(mesh.h)))
         t = _cut(mesh.edges, np.full(len(mesh.h), parts))
         x = mesh.states(plan.x, t)
-        jets = np.vstack([x, model.function("ode").grid(t, x, model.parameters)[self.nq : self.n]])
+        v = np.vstack([plan.pieces.inputs(plan.points, t, rate) for rate in range(self.node.depth + 1)])
+        jets = np.vstack([x, np.array(self.node.function("motion", self.node.acceleration).map(len(t))(t[None], x, v))])
+        if not np.isfinite(model.function("ode").grid(t, x, model.parameters)).all():
+            model = model.near(t[0], jets[:, 0])  # material constraints whose pivot vanishes at the rest
         counters = {"iterations": sum(plan.iterations), "intervals": len(mesh.h), "solves": len(plan.iterations)}
         run = Run(
             t, jets, tuple(model.jet_names), model, "relaxed", counters=counters,

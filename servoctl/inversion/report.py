@@ -13,6 +13,7 @@ from servoctl.inversion.verdict import UNREALISABLE, Verdict, endpoints, verdict
 from servoctl.model.model import SAMPLED, Model, derive
 from servoctl.model.report import WIDTH
 from servoctl.model.start import State
+from servoctl.reduction.self_motion import SelfMotion, self_motion
 from servoctl.reduction.structure import Directions, Local, directions, margins
 from servoctl.run import Run, require_model
 from servoctl.spec.mechanism import Mechanism
@@ -77,6 +78,8 @@ class Report:
         How each hidden constraint was derived.
     free : int
         Dimension of the internal dynamics, Σ o_a.
+    self_motion : SelfMotion or None
+        What more actuators than residuals can move while the program holds, and whether it is damped; None without any.
     ranks : dict of str to Local
         Relative degrees, zeros at infinity and index: at seeded points, at the start, in the middle of a run, and
         where the leading matrix loses rank along it.
@@ -94,6 +97,7 @@ class Report:
     directions: Directions | None = None
     hidden: tuple = ()
     free: int = 0
+    self_motion: SelfMotion | None = None
     ranks: dict[str, Local] = field(default_factory=dict)
     margin: tuple[float, float] | None = None
     efforts: dict[str, Effort] = field(default_factory=dict)
@@ -124,6 +128,7 @@ class Report:
             "directions": None if self.directions is None else _plain(self.directions),
             "hidden": list(self.hidden),
             "free": self.free,
+            "self_motion": None if self.self_motion is None else _plain(self.self_motion),
             "ranks": {place: _plain(local) for place, local in self.ranks.items()},
             "margin": None if self.margin is None else list(self.margin),
             "efforts": {name: _plain(effort) for name, effort in self.efforts.items()},
@@ -149,6 +154,8 @@ class Report:
             lines.append(f"  index {index}; {self.realisation} realisation{_of_directions(self.directions)}")
             hidden = f"hidden: {'; '.join(self.hidden)}" if self.hidden else "no hidden constraint"
             lines.append(f"  {hidden}; {self.free} free initial value{'s' * (self.free != 1)}")
+            if self.self_motion is not None:
+                lines[-1] += f"; {self.self_motion}"
         if self.margin is not None:
             lines.append(f"  smallest pivot along the run {self.margin[0]:.2g} (t = {self.margin[1]:.4g} s)")
         lines += [f"  {place}: {local.named(self.residuals)}" for place, local in self._differing()]
@@ -239,6 +246,7 @@ def report(
         _directions(model, ends),
         tuple(row.story for row in model.reduction.hidden),
         model.free,
+        None if model.ideal else self_motion(model.reduction),
         ranks,
         margin,
         {} if along is None else {name: _effort(along, name, limits.get(name)) for name in efforts(along)},

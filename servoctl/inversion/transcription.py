@@ -16,6 +16,8 @@ from servoctl.methods.bounded import basis_rates
 from servoctl.methods.radau import basis, radau
 
 WATCHED = 12  # instants of bounds in an interval of the inputs
+PIVOTS = 0.1  # threshold of MUMPS: with smaller ones rounding hides the inertia of stiff machines
+LONGEST = 120.0  # of a solution [s]
 IPOPT = {
     "print_level": 0,
     "sb": "yes",
@@ -27,6 +29,8 @@ IPOPT = {
     "bound_relax_factor": 0.0,
     "nlp_scaling_method": "none",
     "mu_strategy": "adaptive",
+    "mumps_pivtol": PIVOTS,
+    "max_wall_time": LONGEST,
 }
 WARM = {
     "warm_start_init_point": "yes",
@@ -84,7 +88,8 @@ class Node:
 
     def function(self, name, *outputs):
         """A function of (t, x, v)."""
-        return ca.Function(name, [self.q.t, self.state, self.v], [ca.densify(ca.cse(o)) for o in outputs])
+        outputs = [ca.densify(ca.cse(o)) for o in outputs]
+        return ca.Function(name, [self.q.t, self.state, self.v], outputs, {"der_options": {"cse": True}})
 
 
 @dataclass(frozen=True)
@@ -187,7 +192,7 @@ class Transcription:
         Of the states, N intervals.
     pieces : Mesh
         Of the inputs, P intervals, each of one or several of the states'.
-    sizes : (x, u, effort) of (n_x,), (m,) arrays and float
+    sizes : (x, u, bounded, effort) of (n_x,), (m,), (b,) arrays and float
     rest : Function, optional
         Of (t, x, v): what vanishes at the end.
     """
@@ -218,7 +223,7 @@ class Transcription:
         increments = (x[:, 1:] - x[:, begins]) @ _matrix(block_diag([radau(mesh.order)[1].T] * len(mesh.h)))
         h = ca.repmat(ca.DM(np.repeat(mesh.h, s)).T, self.n, 1)
         cost = ca.sum1(residuals**2 / ca.repmat(beta, 1, K)) + effort
-        scale = self.sizes[2] * np.sum(mesh.h)
+        scale = self.sizes[3] * np.sum(mesh.h)
         highest = ca.DM([(-1.0) ** (s - j) * comb(s, j) for j in range(s + 1)])
         constraints = {
             "motion": (increments - h * rates) / ca.repmat(ca.DM(self.sizes[0]), 1, K),
@@ -236,7 +241,7 @@ class Transcription:
             return ca.MX(0, len(t))
         f = node.function("bounded", node.bounded).map(len(t))
         v = ca.vertcat(*(points @ _matrix(_at(self.pieces, t, k)) for k in range(node.depth + 1)))
-        return f(ca.DM(t).T, x @ _matrix(_states_at(self.mesh, t)), v)
+        return f(ca.DM(t).T, x @ _matrix(_states_at(self.mesh, t)), v) / ca.repmat(ca.DM(self.sizes[2]), 1, len(t))
 
     def _split(self, w):
         """States and control points, in SI, of the variables."""
@@ -297,7 +302,8 @@ class Transcription:
         if warm not in self._solvers:
             w, beta, objective, constraints = self._problem
             g = ca.vertcat(*(ca.vec(value) for value in constraints.values()))
-            options = {"print_time": False, "ipopt": IPOPT | (WARM if warm else {})}
+            quiet = {"print_time": False, "show_eval_warnings": False, "calc_lam_p": False}
+            options = quiet | {"ipopt": IPOPT | (WARM if warm else {})}
             self._solvers[warm] = ca.nlpsol("relaxed", "ipopt", {"x": w, "p": beta, "f": objective, "g": g}, options)
         return self._solvers[warm]
 

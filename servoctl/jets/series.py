@@ -15,9 +15,10 @@ from math import factorial, prod
 import casadi as ca
 import numpy as np
 
-from servoctl.jets.tape import REAL, Scalars, add, apply, divide, multiply, select, subtract
+from servoctl.jets.tape import REAL, Scalars, add, apply, divide, finite, multiply, select, subtract
 
 _NUMBERS = (float, int)
+OVERFLOWING = 1e100  # a divisor beyond it, of which a coefficient has overflown, is infinite
 
 
 def is_zero(c):
@@ -110,6 +111,7 @@ class Series:
             if kind == "sub":
                 return _minus(a[k], b[k])
             rest = _minus(a[k], _dot((c[i][j], b[k - j]) for j in _inner_first(k) if j < k))
+            rest = self._bounded(rest, a[k], args[1], k)
             return 0.0 if is_zero(rest) else divide(rest, b[0])
         if kind == "input":
             return self.inputs[data][k]
@@ -133,6 +135,17 @@ class Series:
         if kind == "power":
             return self._constant_power(a, c[i], data, k)
         return self._branch(node, k)
+
+    def _bounded(self, rest, dividend, divisor, k):
+        """The rest of a division by a series that may overflow, as 1 + exp(a) does.
+
+        Its quotient vanishes there, to far below the smallest number that matters, and so do all its coefficients.
+        """
+        if k == 0 or is_zero(rest) or not self.tape.growing[divisor]:
+            return rest
+        size = apply("fabs", self.c[divisor][0])
+        counts = apply("logic_or", apply("lt", size, OVERFLOWING), finite(rest))
+        return select(counts, rest, dividend)
 
     def _deciding(self, node):
         """The value of a node by which branches are taken."""

@@ -74,6 +74,11 @@ def select(condition, yes, no):
     return np.where(condition, yes, no)
 
 
+def finite(a):
+    """Whether an SX expression, as 1 or 0, or the entries of an array are finite."""
+    return ca.fabs(a) < ca.inf if isinstance(a, ca.SX) else np.isfinite(a)
+
+
 class Node(NamedTuple):
     """One primitive operation: `kind`, the nodes it takes, and a constant or a function's name."""
 
@@ -99,6 +104,7 @@ _REFUSED = {
     ca.OP_FLOOR: "floor", ca.OP_CEIL: "ceil", ca.OP_FMOD: "fmod", ca.OP_REMAINDER: "remainder",
     ca.OP_COPYSIGN: "copysign", ca.OP_ERFINV: "erfinv",
 }  # fmt: skip
+_GROWING = {"exp", "expm1", "sinh", "cosh"}  # functions that leave the range of doubles
 _OPTIONS = {"allow_free": True, "live_variables": False}  # no place is reused: operations fill them in order
 
 
@@ -154,6 +160,14 @@ class Tape:
                 last = max(self.nodes[i].data[1])
                 count, i = (1 + last, 1 + last) if last >= count else (count, i)
         return count
+
+    @cached_property
+    def growing(self):
+        """Whether each node has a function that may overflow among its arguments (list of bool)."""
+        result = []
+        for kind, args, data in self.nodes:
+            result.append((kind == "quad" and data[0] in _GROWING) or any(result[i] for i in args))
+        return result
 
     def _add(self, kind, *args, data=None):
         self.nodes.append(Node(kind, args, data))

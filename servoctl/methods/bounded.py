@@ -23,7 +23,7 @@ from servoctl.model.switching import switching
 from servoctl.tolerances import CUTOFF, NOISE
 
 ORDER = 13  # of the collocation: seven nodes
-LONGEST = 1.0  # interval of the first mesh, in time constants of the fastest mode
+LONGEST = 4.0  # interval of the first mesh, in time constants of the fastest mode
 MOST_INTERVALS = 4000
 NEWTON_STEPS, NEWTON_ENDS, STALLED = 40, 1e-12, 1e-9  # of Newton's method; relative size of its last step
 REFINEMENTS, MOST_PIECES = 10, 4  # of the mesh; and into how many an interval is cut at most
@@ -367,8 +367,9 @@ class Problem(FreeEntries):
     def _first_mesh(self, window, corners):
         fastest = max(np.abs(end.eigenvalues).max(initial=0.0) for end in (self.first, self.last))
         corners = np.array(breakpoints(window, sorted(set(corners))))
-        counts = np.maximum(1, np.ceil(np.diff(corners) * fastest / LONGEST)).astype(int)
-        return _cut(corners, np.minimum(counts, MOST_INTERVALS // len(counts)))
+        counts = np.maximum(1, np.ceil(np.diff(corners) * fastest / LONGEST))
+        share = min(1.0, MOST_INTERVALS / counts.sum())
+        return _cut(corners, np.ceil(counts * share).astype(int))
 
     def _nodes(self, mesh):
         return np.append(mesh[0], (mesh[:-1, None] + np.diff(mesh)[:, None] * self.c).ravel())

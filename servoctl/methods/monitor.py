@@ -17,9 +17,10 @@ from servoctl.tolerances import ENTRY
 DEGRADED = 0.02  # of its reference: a pivot below this is replaced, if the matrix itself is better than that
 HELPS = 5.0  # factor by which the matrix must be better
 NEGLIGIBLE = 1e-7  # of its reference: a pivot below this is zero
+SINGULAR = 1e-3  # at a zero of a pivot that dense output has located: a rank measure below this counts as lost
 HOPELESS = 1e-9  # an equilibrated singular value below this leaves no digits
 VANISHING = 0.03  # of its reference: a gradient or rank measure below this counts as lost
-LOST = 0.1  # of its best: below this, rank and not the integrator is why no step succeeds
+LOST = 0.1  # of its best, or beside a zero: below this, rank is why no step succeeds or a pivot is zero
 HIDES = 10.0  # times the root of a residual: a smaller pivot may be zero, as it touches zero quadratically
 SHARE = 0.1  # of the largest entry of a null vector: smaller entries are not named in the error
 LINGERS = 5.0  # times the extrapolated way to its zero, after which a pivot hidden by the residual is zero
@@ -94,6 +95,7 @@ class Stretch:
     pivots: np.ndarray
     top: object
     crosses: bool = False
+    lost = DEGRADED  # rank measure at a zero as roughly located as here, below which the program is singular
 
     def first(self, count):
         """The first steps alone."""
@@ -153,6 +155,7 @@ class DenseStretch(Stretch):
     pivots_at: object = None
     slope: object = None
     resumes: bool = False
+    lost = SINGULAR
 
     def instants(self, k):
         """The ends of step k and quarters between them."""
@@ -357,11 +360,16 @@ class Monitor:
         ends = np.abs(stretch.pivots[:, :, -1])
         largest = np.maximum(self.reference, self.model.pivot_sizes)[:, None]
         before = np.maximum.accumulate(np.column_stack([largest, ends]), axis=1)[:, :-1]
-        grown = np.flatnonzero(np.any(NEGLIGIBLE * ends > before, axis=0))
-        if not len(grown):
-            return None
-        k = int(grown[0])
-        return Singular(k, stretch.t[k + 1], stretch.x[:, k + 1], "a pivot grows without bound")
+        for k in np.flatnonzero(np.any(NEGLIGIBLE * ends > before, axis=0)):
+            t, x = stretch.t[k + 1], stretch.x[:, k + 1]
+            if self._unbounded(self._matrices(t, x)):  # else an earlier pivot vanishes, by which this one is divided
+                return Singular(int(k), t, x, "a pivot grows without bound")
+        return None
+
+    def _unbounded(self, matrices):
+        """Whether rows are far larger than ever, or not finite."""
+        sizes = [np.linalg.norm(m / c, axis=1) for m, c in zip(matrices, self.columns, strict=True)]
+        return any(np.any(~(NEGLIGIBLE * a <= np.where(b > 0, b, 1.0))) for a, b in zip(sizes, self.rows, strict=True))
 
     def _step(self, stretch, k, before, scale):
         """The outcome of one step, None if it is fine; `before` are the relative pivots at and before its start."""
@@ -398,7 +406,8 @@ class Monitor:
 
     def _vanishing(self, stretch, k, t, why):
         """The outcome of a pivot that vanishes at t in step k: another choice of pivots, or a singular program."""
-        if min(self.rank_measure(s, stretch.state(k, s)) for s in stretch.ranks_at(k, t)) > DEGRADED:
+        measure = min(self.rank_measure(s, stretch.state(k, s)) for s in stretch.ranks_at(k, t))
+        if measure > stretch.lost or self._as_beside(stretch, k, t):
             if stretch.crosses:
                 return _other_pivots(k + 1, stretch.t[k + 1], stretch.x[:, k + 1])
             before = stretch.last_before(k, t)
@@ -406,8 +415,27 @@ class Monitor:
         x, before = stretch.state(k, t), stretch.last_before(k, t)
         singular, start = Singular(k, t, x, why), stretch.state(k, before)
         variant = self.repivoted(before, start, stretch.top(before, start))
-        helps = variant is not None and variant[1].rank_measure(t, x) > DEGRADED
+        helps = variant is not None and variant[1].rank_measure(t, x) > stretch.lost
         return Repivot(k, before, start, variant, singular) if helps else singular
+
+    def _as_beside(self, stretch, k, t):
+        """Whether rows at the zero of a pivot are as large and independent as beside it; if so they are references.
+
+        Gradients may fall along the whole motion, as 1/r where a row is an angle or its rate.
+        """
+        x = stretch.state(k, t)
+        if self.hidden_zero(1.0, t, x):
+            return False
+        beside = [self._matrices(s, stretch.state(k, s)) for s in stretch.t[k : k + 2]]
+        before, self.rows = self.rows, [
+            np.max([np.linalg.norm(m[i] / c, axis=1) for m in beside], axis=0) for i, c in enumerate(self.columns)
+        ]
+        now, ends = self._smallest(self._matrices(t, x)), [self._smallest(m) for m in beside]
+        if np.any(now <= LOST * np.min(ends, axis=0)):
+            self.rows = before
+            return False
+        self.best = now
+        return True
 
     def _lingers(self, k, instants, sizes, x):
         """Singular if a pivot sank below what the residual hides, should have crossed zero by now, and stays there."""

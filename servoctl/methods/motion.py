@@ -63,8 +63,10 @@ class Motion:
         starts = np.cumsum([0, *(len(piece[1]) for piece in self.pieces[:-1])])
         counts = np.add.reduceat(keep, starts, dtype=int)
         z = np.empty((sum(map(len, self.pieces[0][2:])), counts.sum()))  # filled by piece: one large copy takes seconds
-        for (_, of_piece, *parts), start, end, count in zip(self.pieces, starts, counts.cumsum(), counts, strict=True):
-            z[:, end - count : end] = np.vstack(parts)[:, keep[start : start + len(of_piece)]]
+        for (_, of_piece, x, top), start, end, count in zip(self.pieces, starts, counts.cumsum(), counts, strict=True):
+            new = keep[start : start + len(of_piece)]
+            new = slice(int(not new[0]), None) if new[1:].all() else new  # without a copy, eleven times as fast
+            z[: len(x), end - count : end], z[len(x) :, end - count : end] = x[:, new], top[:, new]
         variants, end = [], 0
         for (model, *_), count in zip(self.pieces, counts.tolist(), strict=True):
             first, end = end, end + count

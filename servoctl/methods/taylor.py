@@ -286,9 +286,9 @@ class TaylorSteps(Stepping):
     def _instants(self, t, states, y):
         """Steps and instants within them at which series are compared with the equations."""
         h = np.diff(t)
-        each, further, ends = net(t, self.watch.span / RESOLUTION, 1)
-        k = np.concatenate([np.repeat(np.arange(len(h)), len(INSIDE)), each[~ends]])
-        at = np.concatenate([(t[:-1, None] + INSIDE * h[:, None]).ravel(), further[~ends]])
+        each, further, _ = net(t, self.watch.span / RESOLUTION, 1)
+        k = np.concatenate([np.repeat(np.arange(len(h)), len(INSIDE)), each])
+        at = np.concatenate([(t[:-1, None] + INSIDE * h[:, None]).ravel(), further])
         steep = arguments(self.model)
         if steep is not None:
             order = np.lexsort((at * np.sign(h[0]), k))
@@ -300,7 +300,7 @@ class TaylorSteps(Stepping):
 
             more = centres(steep, self.model.parameters, parts[0], dense(parts[0]), dense)
             k, at = np.append(k, steps_of(t, more)), np.append(at, more)
-        within = at != t[k]  # where paths have other branches
+        within = (at != t[k]) & ~np.isin(at, list(self.knots))  # where paths have other branches
         return k[within], at[within]
 
     def _stretch(self, t, states, y):

@@ -16,7 +16,7 @@ import numpy as np
 from servoctl.errors import NotRealisable, SingularProgram, SpecificationError, unknown
 from servoctl.reduction.appell import Realisation, plant_accelerations
 from servoctl.reduction.hidden import complete
-from servoctl.reduction.ranks import clean, decide_all, decide_each
+from servoctl.reduction.ranks import THRESHOLD, clean, decide_all, decide_each
 from servoctl.reduction.rows import balances, settle_alone
 
 
@@ -89,11 +89,30 @@ def _realised(mechanism, constraints, directions, actuation, points, among=None,
             rank=rank.rank,
             directions=B.shape[1],
         )
-    dependent = tuple(sorted(candidates[i] for i in rank.columns))
     cleaned = clean(numbers, sizes)
+    inertia = clean(*points.matrix(ca.diag(mechanism.mass)))[candidates, 0, best]
+    columns = _sizeable_columns(cleaned[:, candidates, best], inertia, list(rank.columns))
+    dependent = tuple(sorted(candidates[i] for i in columns))
     regular = [p for p, rank in enumerate(decide_each(cleaned[:, list(dependent)])) if rank.rank == len(cleaned)]
     independent = tuple(i for i in range(n) if i not in dependent)
     return Realisation(B, actuation, dependent, independent, cleaned[:, :, regular or [best]], **settled)
+
+
+def _sizeable_columns(matrix, inertia, columns):
+    """Independent columns of a matrix (b, n) at a point: the given ones, or others in the metric of the inertia (n,).
+
+    Equilibration makes a column that is about to vanish as large as any other; with the inertia of its coordinate it is
+    small.
+    """
+    from scipy.linalg import qr
+
+    if not len(columns) or not (inertia > 0).all():
+        return columns
+    scaled = (matrix / np.sqrt(inertia)).astype(float)
+    scaled /= np.linalg.norm(scaled, axis=1, keepdims=True)
+    others = qr(scaled, mode="r", pivoting=True)[1][: len(columns)]
+    given, best = (np.linalg.svd(scaled[:, some], compute_uv=False)[-1] for some in (columns, others))
+    return columns if given >= THRESHOLD * best else others.tolist()
 
 
 def _shared(mechanism, program, constraints, independent, points, context):

@@ -43,6 +43,18 @@ class Parameters:
         """The symbols, in the order of `names`."""
         return tuple(self._symbols.values())
 
+    def extended(self, **values):
+        """These parameters, with the same symbols, and further ones.
+
+        Parameters
+        ----------
+        **values : float
+            Defaults of the further ones.
+        """
+        wider = Parameters(self.defaults | values)
+        wider._symbols.update(self._symbols)
+        return wider
+
     def values(self, changes=None):
         """The numbers in the order of `names`, some of them changed.
 

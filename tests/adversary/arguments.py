@@ -25,7 +25,7 @@ from servoctl.errors import ServoError
 from servoctl.shell.main import main
 
 WORDS = ("accepted", "refused")
-SECONDS = 10  # of a call before it counts as hanging
+SECONDS, WAITING = 10, 60  # of processor time, and of all time, of a call before it counts as hanging
 
 ODD = {
     "None": None, "text": "abc", "no text": "", "a number in text": "1.0", "NUL": "a\0b", "a surrogate": "\ud800",
@@ -133,7 +133,7 @@ def calls():
         "close_many case": (lambda m: sv.close_many(closed, [{"m": m}]), dict(m=2.1)),
         "limit_report": (sv.limit_report, dict(run=sv.close(bounded, sv.limited(law, bounded), x0, span), scene=None)),
         "fastest": (sv.fastest, dict(mechanism=s["mechanism"], program=s["program"], limits={"pull": 50.0}, t_span=(0.0, 1.0),
-                                     start=None, guess=None, parameters=None, progress=False)),
+                                     start=None, guess=None, parameters=None, shape=False)),
         "slowed": (s["program"].slowed, dict(q=q, factor=2.0, at=0.0)),
         "grid": (lambda a: sv.grid(a=a), dict(a=[1.0, 2.0])),
         "monte_carlo": (lambda n, seed, a: sv.monte_carlo(n, seed=seed, a=a), dict(n=3, seed=1, a=stats.uniform(1.0, 2.0))),
@@ -184,6 +184,77 @@ def calls():
         "plots.sweep": (sv.plots.sweep, dict(study=study, names=["a"], against=None, units=None)),
         "plots.save_figures": (sv.plots.save_figures, dict(run=plan, folder=os.path.join(folder, "figures"), units=None,
                                                            title="")),
+    }  # fmt: skip
+
+
+@functools.cache
+def swaying():
+    """A cart that carries a pendulum, with its load moved from rest to rest: what the inverse calls need, as a dict."""
+    p, q = sv.parameters(M=2.0, m=1.0, g=9.81), sv.coordinates("x a")
+    x, a = q
+    load = ca.vertcat(x + ca.sin(a), -ca.cos(a))
+    mechanism = sv.Mechanism(
+        q, gibbs=sv.particle(q, p.M, x) + sv.particle(q, p.m, load), potential=p.m * p.g * load[1], parameters=p,
+        actuators={"cart": x}, outputs={"load": load[0]},
+    )  # fmt: skip
+    program = sv.Program({"X": x - sv.paths.rest_to_rest(q.t, 0.0, 0.2, duration=0.5)})
+    model = sv.derive(mechanism, program)
+    run = sv.simulate(model, model.start(), (0.0, 0.5), "RK4", t_eval=np.linspace(0.0, 0.5, 51))
+    return {"mechanism": mechanism, "program": program, "model": model, "run": run, "plant": sv.plant(mechanism)}
+
+
+def sliding():
+    """The plant of a mass on a line under a force, and a program that moves it from rest to rest in half a second."""
+    q = sv.coordinates("x")
+    (x,) = q
+    mechanism = sv.Mechanism(q, gibbs=sv.particle(q, 1.0, x), actuators={"pull": x})
+    return sv.plant(mechanism), sv.Program({"X": x - sv.paths.rest_to_rest(q.t, 0.0, 0.2, duration=0.5)})
+
+
+def inverses():
+    """Calls that report on programs, invert and relax them, with events, sensitivities and identification."""
+    s, sway, span = scene(), swaying(), (0.0, 0.5)
+    x, _ = s["q"]
+    mechanism, program, plant, closed, free = (s[k] for k in ("mechanism", "program", "plant", "closed", "free"))
+    near, slide = s["ideal"].start(y=0.1, dy=0.0), sliding()
+    noise = dict.fromkeys(("x", "y", "dx", "dy"), 1e-3)
+    log = {"t": closed.t[:8], **{k: v[:8] for k, v in closed.input.items()}, **{k: v[:8] for k, v in closed.measured.items()}}
+    event = sv.Event("y", 0.05)
+    return {
+        "report": (sv.report, dict(model=sway["model"], run=sway["run"], limits={"cart": 50.0})),
+        "report limit": (lambda limit: sv.report(s["model"], s["plan"], limits={"pull": limit}), dict(limit=50.0)),
+        "report mechanism": (sv.report, dict(model=mechanism, run=program)),
+        "inverse": (sv.inverse, dict(mechanism=mechanism, program=program, t_span=span, start=None, method=None,
+                                     limits={"pull": 50.0}, bounds={"x": (-1.0, 2.0)}, weight=None)),
+        "inverse start": (lambda value: sv.inverse(mechanism, program, span, start={"x": value}), dict(value=0.0)),
+        "inverse limit": (lambda limit: sv.inverse(mechanism, program, span, limits={"pull": limit}), dict(limit=50.0)),
+        "inverse bound": (lambda bound: sv.inverse(mechanism, program, span, bounds={"far": bound}), dict(bound=50.0)),
+        "relaxed": (sv.relaxed, dict(plant=slide[0], program=slide[1], t_span=span, weight=1e-4, limits={"pull": 50.0},
+                                     bounds={"x": (-1.0, 2.0)}, start=None, end="rest")),
+        "relaxed weight": (lambda weight: sv.relaxed(*slide, span, weight={"X": weight}), dict(weight=1e-4)),
+        "relaxed limit": (lambda limit: sv.relaxed(*slide, span, limits={"pull": limit}), dict(limit=50.0)),
+        "relaxed bound": (lambda bound: sv.relaxed(*slide, span, bounds={"x": bound}), dict(bound=(-1.0, 2.0))),
+        "relaxed start": (lambda value: sv.relaxed(*slide, span, start={"x": value}), dict(value=0.0)),
+        "relaxed end": (lambda value: sv.relaxed(*slide, span, end={"x": value}), dict(value=1.0)),
+        "simulate events": (sv.simulate, dict(model=s["ideal"], start=near, t_span=span, method="RK4",
+                                              events={"down": event})),
+        "simulate event": (lambda event: sv.simulate(s["ideal"], near, span, "RK4", events=[event]), dict(event=event)),
+        "simulate event value": (lambda value: sv.simulate(s["ideal"], near, span, "RK4", events=lambda t, x: value),
+                                 dict(value=1.0)),
+        "Event": (sv.Event, dict(signal="y", value=0.05, terminal=2, direction=-1.0)),
+        "sensitivity": (sv.sensitivity, dict(model=s["ideal"], run=free, of="y", to=["m", "y"])),
+        "sensitivity flat": (sv.sensitivity, dict(model=s["model"], run=s["plan"], of=["pull"], to="m")),
+        "Sensitivity": (sv.sensitivity(s["ideal"], free, "y", "m").extrema, dict(of="y")),
+        "Sensitivity[]": (sv.sensitivity(s["ideal"], free, "y", "m").__getitem__, dict(pair=("y", "m"))),
+        "identify": (sv.identify, dict(plant=plant, measured=closed, parameters=["m"], noise=noise, start=None)),
+        "identify log": (lambda t, pull, x: sv.identify(plant, log | {"t": t, "pull": pull, "x": x}, ["m"], noise=noise),
+                         {k: log[k] for k in ("t", "pull", "x")}),
+        "identify guess": (lambda m: sv.identify(plant, closed, {"m": m}, noise=noise), dict(m=1.5)),
+        "identify noise": (lambda sigma: sv.identify(plant, closed, ["m"], noise=noise | {"x": sigma}), dict(sigma=1e-3)),
+        "identify start": (lambda x: sv.identify(plant, closed, ["m"], noise=noise, start={"x": x}), dict(x=0.0)),
+        "Program by wishes": (sv.Program, dict(residuals={"X": x}, weights={"pull": 2.0}, toward={"pull": 1.0})),
+        "Program of wishes": (lambda wish: sv.derive(mechanism, sv.Program({"X": x}, toward={"pull": wish})),
+                              dict(wish=2.0)),
     }  # fmt: skip
 
 
@@ -329,8 +400,10 @@ def outcome(call, arguments):
     def late(*_):
         raise Hanging
 
+    signal.signal(signal.SIGPROF, late)
     signal.signal(signal.SIGALRM, late)
-    signal.alarm(SECONDS)
+    signal.setitimer(signal.ITIMER_PROF, SECONDS)
+    signal.alarm(WAITING)
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
@@ -343,6 +416,7 @@ def outcome(call, arguments):
         where = f" ({type(error).__name__})"
         return f"{str(error).splitlines()[0][:90] if str(error) else 'no text'}{where}"
     finally:
+        signal.setitimer(signal.ITIMER_PROF, 0)
         signal.alarm(0)
         plt.close("all")
     return "accepted"
@@ -351,7 +425,7 @@ def outcome(call, arguments):
 def fuzz(only=()):
     """Outcomes by (call, argument, odd value)."""
     outcomes = {}
-    for name, (call, arguments) in (calls() | specifications() | further()).items():
+    for name, (call, arguments) in (calls() | inverses() | specifications() | further()).items():
         if only and not any(word in name for word in only):
             continue
         good = outcome(call, arguments)

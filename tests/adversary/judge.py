@@ -18,7 +18,8 @@ DOUBTFUL = 1e-5  # relative singular values below this confirm a refusal on rank
 SHARP = 1e5  # sensitivities of accelerations above this confirm a refusal as singular
 STEEPER = 30.0  # the growth of that sensitivity from start to stop that confirms a stop
 POLE, FURTHER = 0.9, 1.2  # or with this power, as a pole does, where the start is this factor farther from the stop
-BESIDE = 0.03  # distance of the farther of two states beside one at which the reference has no verdict
+BESIDE = (3.0, 1.0, 0.3, 0.1, 0.03, 0.01)  # distances [s, too] from a state at which the reference has no verdict
+NEARLY = 0.99  # of the way to a stop before the first sample, which is followed again
 POWER = 0.3  # or it grows at least with this power of one over the time that is left
 LARGE = 1e4  # a motion that has grown so far may end
 PATIENCE = 40  # s of processor time for a case; a few tenths are usual
@@ -190,6 +191,16 @@ def _sentence(error):
     return re.sub(r"[\d.e+-]+|'[^']*'", "…", str(error))[:60]
 
 
+def _towards(model, start, stop, run):
+    """The motion to a stop that came before the first sample, sampled; the run itself where there is none."""
+    times = stop * np.linspace(0.0, NEARLY, 21)
+    try:
+        method = None if model.flat else sv.Adaptive("DOP853", rtol=1e-12, atol=1e-13)
+        return sv.simulate(model, start, (0.0, times[-1]), method, t_eval=times)
+    except sv.ServoError:
+        return run
+
+
 def _state(start, n):
     """q and the Taylor coefficients of w at a start."""
     jets = start.values[n:].reshape(-1, n).T
@@ -197,23 +208,32 @@ def _state(start, n):
 
 
 def _beside(reference, start, model):
-    """Whether accelerations and actuation grow without bound towards a start, in words."""
-    rng, gains = np.random.default_rng(1), []
+    """Whether accelerations and actuation grow without bound towards a start, in words.
+
+    Towards it lead later starts, and states of the same instant.
+    """
+    rng = np.random.default_rng(1)
     directions = dict(zip(start.names, rng.uniform(-1, 1, len(start.names)), strict=True))
-    for distance in (BESIDE, BESIDE / 3):
-        near = model.start(guess={name: start[name] + distance * d for name, d in directions.items()})
-        solution = reference.determined(0.0, *_state(near, reference.n), near=True)
-        if solution is None or not solution.clear or solution.residual > 1e-9:
-            return ""
-        gains.append(solution.gain)
-    grows = gains[1] > max(STEEPER, 2 * gains[0])
-    return f"next to the start the sensitivity is {gains[0]:.1e}, nearer {gains[1]:.1e}" if grows else ""
+    for later in (True, False):
+        last = np.inf
+        for distance in BESIDE[-2:] if later else BESIDE:
+            moved = {name: start[name] + (0.0 if later else distance * d) for name, d in directions.items()}
+            near = model.start(start.t + distance * later, guess=moved)
+            solution = reference.determined(near.t, *_state(near, reference.n), near=True)
+            if solution is None or not solution.clear or solution.residual > 1e-9:
+                continue
+            if solution.gain > max(STEEPER, 2 * last):
+                return f"next to the start the sensitivity is {last:.1e}, nearer {solution.gain:.1e}"
+            last = solution.gain
+    return ""
 
 
 def _cause(reference, case, start, error, model):
     """What of the reference confirms a refusal; empty where nothing does."""
     t, q, w, near = 0.0, np.array(case.guess), np.array(case.speeds)[:, None], False
     run = error.run
+    if run is not None and len(run.t) == 1 and model is not None and error.details.get("t", 0.0) > 0.0:
+        run = _towards(model, start, error.details["t"], run)
     if start is not None:
         (q, w), near = _state(start, case.n), True
     if run is not None and len(run.t) and np.all(np.isfinite(run.jets[:, -1])):

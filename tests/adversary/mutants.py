@@ -55,7 +55,7 @@ MUTANTS = {  # name: (file, old text, new text, tests)
     ),
     "wishes with another sign": (
         "reduction/reduce.py", "self.mechanism.balance - self.mechanism.E @ wished(",
-        "self.mechanism.balance + self.mechanism.E @ wished(", ("test_redundant_actuation.py",),
+        "self.mechanism.balance + self.mechanism.E @ wished(", ("test_open_actuation.py",),
     ),
     "squares lose their middle term": (
         "jets/series.py", "inner = 0.0 if k % 2 else", "inner = 0.0 if k % 4 else",

@@ -34,6 +34,9 @@ MENDED = {  # seeds of cases that once ended wrongly, and how they end
     "factors of a balance in either order": ("right", (20148, 20360)),
     "an actuator without a lever at the start": ("refused rightly", (1529,)),
     "a residual of higher order than the motion's jets": ("refused rightly", (1000230,)),
+    "a dependent coordinate whose only entry vanishes": ("right", (1000000,)),
+    "a pivot vanishes where the rank is low": ("right", (320699,)),
+    "singular at the start, and the array, too": ("refused rightly", (1002520,)),
     "a pole of the actuation": ("refused rightly", (320344,)),
 }
 

@@ -1,0 +1,417 @@
+"""The time-optimal law s(t) along the curve of a program: a nonlinear program with the exact inverse at its nodes.
+
+A program follows a curve, φ(q, s) = 0 for s from 0 to 1. Its rows, hidden ones included, are algebraic equations
+between the jets of the motion and s, s', ..., s^(k). On N intervals s^(k) is continuous and linear; the unknowns are
+the duration T, the jets of s at the ends of the intervals, and those of the motion at the nodes in them:
+
+    minimise T   subject to   the rows and low <= signals <= high at the nodes,   s' >= 0,   rest at both ends.
+
+Entries of the state that the rows leave free, the internal dynamics, are collocated at the same nodes.
+"""
+
+from copy import copy
+from dataclasses import dataclass
+from functools import cached_property
+from math import comb, factorial
+
+import casadi as ca
+import numpy as np
+from numpy.polynomial import chebyshev
+
+from servoctl.errors import IntegrationStopped, SpecificationError, unknown
+from servoctl.methods.radau import radau
+from servoctl.model.model import derived
+from servoctl.spec.paths import piecewise
+from servoctl.spec.program import Program
+
+JETS = 14  # s, s', ..., among which are those that the rows contain
+INTERVALS = 80
+COLLOCATION = 5  # of the collocation: three nodes
+REGULAR = 1e-3  # least speed along a curve, of the largest, with which time itself is its parameter
+DEGREES = (1, 2, 4, 8, 12, 16, 20)  # of the polynomial of the arc length that a curve is, or else
+SPLINE = (9, 80)  # the degree and the intervals of its spline
+MISSED = (1e-12, 1e-8)  # of its extent: by which the polynomial, and the spline, may miss it
+PANELS, GAUSS = 2000, np.polynomial.legendre.leggauss(8)  # of the quadrature of the arc length
+NEWTON_STEPS = 4  # to the instant of an arc length, from its secant
+IPOPT = {
+    "print_level": 0,
+    "sb": "yes",
+    "tol": 1e-8,
+    "acceptable_tol": 1e-6,
+    "max_iter": 500,
+    "bound_relax_factor": 0.0,
+    "nlp_scaling_method": "none",
+    "mu_strategy": "adaptive",
+}
+LEAST = 1e-4  # duration, relative to that of the first motion
+
+
+class Curve:
+    """The curve of a program: its residuals as functions of a parameter s from 0 to 1.
+
+    Parameters
+    ----------
+    mechanism : Mechanism
+    program : Program
+        Residuals h(q) - p(t), and others that hold along the curve at any speed.
+    t_span : (t0, t1)
+        [s]
+    values : dict of str to float
+        Parameters that differ from their defaults.
+    """
+
+    def __init__(self, mechanism, program, t_span, values):
+        self.mechanism, self.program, self.span = mechanism, program, t_span
+        self.moving = self._moving()
+        q, p = mechanism.q, mechanism.parameters
+        offsets = [e - ca.substitute(e, q.t, t_span[0]) for e in self.moving.values()]
+        anywhere = ca.vertcat(*q, *p.symbols), ca.DM([0.5] * q.nq + [*p.values(values)])
+        offsets = ca.substitute(ca.vertcat(*offsets), *anywhere)
+        self._offsets = ca.Function("curve", [q.t], [ca.densify(offsets), ca.densify(ca.jacobian(offsets, q.t))])
+        t = np.linspace(*t_span, PANELS + 1)
+        self.extent = np.ptp(self._along(t)[0], axis=1)
+        if not np.all(self.extent > 0):
+            raise self._refused(list(self.moving)[int(np.argmin(self.extent))], "returns to no other value in the span")
+        speed = self._speed(t)
+        self._pieces = None if speed.min() > REGULAR * speed.max() else self._by_arc_length()
+
+    def _moving(self):
+        """The residuals that contain the time, by name; refuses what is no curve."""
+        mechanism, q = self.mechanism, self.mechanism.q
+        fixed = [mechanism.balance, mechanism.E, q.V, q.h, *mechanism.constraints.values(), *mechanism.outputs.values()]
+        chosen = [ca.SX(e) for e in (*self.program.weights.values(), *self.program.toward.values())]
+        if any(ca.depends_on(e, q.t) for e in (*fixed, *chosen)):
+            raise self._refused("the mechanism", "depends on time")
+        moving = {}
+        for name, e in self.program.with_turns.items():
+            w, timed = q.jet(1), ca.depends_on(e, q.t)
+            if q.order(e) > 0 and (timed or q.order(e) > 1 or not mechanism.is_zero([ca.jtimes(e, w, w) - e])):
+                raise self._refused(name, "prescribes rates")
+            if timed and ca.depends_on(ca.jacobian(e, q.t), ca.vertcat(*q)):
+                raise self._refused(name, "contains products of the time and the coordinates")
+            if timed:
+                moving[name] = e
+        if not moving:
+            raise self._refused(next(iter(self.program.residuals)), "does not contain the time")
+        return moving
+
+    def _refused(self, name, what):
+        return SpecificationError(
+            f"{name!r} {what}." if name in self.program.residuals else f"{name.capitalize()} {what}.",
+            "A time-optimal law runs along a curve, h(q) = p(s); only its time law is open.",
+            do="Write residuals h(q) - p(t), with via points by spline(..., ends='natural'), or choose shape=False.",
+            name=name,
+        )
+
+    def _along(self, t):
+        """Places p(t) - p(t0) of the curve (k, N) and their rates."""
+        return tuple(np.array(part) for part in self._offsets.map(len(t))(np.asarray(t, dtype=float)[None]))
+
+    def _by_arc_length(self):
+        """Ends of pieces (n + 1,) in s and coefficients (degree + 1, n, k), as for `paths.piecewise`."""
+        from scipy.interpolate import make_interp_spline
+
+        places = self._by_length
+        check = np.linspace(0.0, 1.0, 403)[1:-1]
+        known = places(check)
+        for degree in DEGREES:
+            y = -np.cos(np.pi * (2 * np.arange(degree + 1) + 1) / (2 * degree + 2))
+            fit = chebyshev.chebfit(y, places((1 + y) / 2), degree)
+            if (np.abs(chebyshev.chebval(2 * check - 1, fit).T - known) / self.extent).max() < MISSED[0]:
+                powers = np.array([np.pad(p := chebyshev.cheb2poly(c), (0, degree + 1 - len(p))) for c in fit.T])
+                return np.array([0.0, 1.0]), powers.T[:, None, :]
+        degree, count = SPLINE
+        s = np.linspace(0.0, 1.0, count + 1)
+        curve = make_interp_spline(s, places(s), k=degree)
+        miss = np.abs(curve(check) - known) / self.extent
+        if not miss.max() < MISSED[1]:
+            k, i = np.unravel_index(np.argmax(miss), miss.shape)
+            raise self._refused(list(self.moving)[i], f"turns sharply at {check[k]:.3g} of the length of its curve")
+        half = 0.5 / count
+        coefficients = [curve(s[:-1] + half, nu=j) / factorial(j) * half**j for j in range(degree + 1)]
+        return s, np.array(coefficients)
+
+    def _speed(self, t):
+        return np.linalg.norm(self._along(t)[1] / self.extent[:, None], axis=0)
+
+    @cached_property
+    def _lengths(self):
+        """The length of the curve at the ends of panels of time, each (PANELS + 1,)."""
+        panels = np.linspace(*self.span, PANELS + 1)
+        t = panels[:-1, None] + np.diff(panels)[:, None] * (1 + GAUSS[0]) / 2
+        pieces = self._speed(t.ravel()).reshape(t.shape) @ GAUSS[1] * np.diff(panels) / 2
+        return panels, np.append(0.0, np.cumsum(pieces))
+
+    def _by_length(self, s):
+        """Places (M, k) of the curve at parts s (M,) of its length, by Newton's method in the panel of each."""
+        panels, length = self._lengths
+        target = np.asarray(s) * length[-1]
+        k = np.clip(np.searchsorted(length, target, side="right") - 1, 0, PANELS - 1)
+        t = np.interp(target, length, panels)
+        for _ in range(NEWTON_STEPS):
+            half = (t - panels[k]) / 2
+            inside = self._speed((panels[k, None] + half[:, None] * (1 + GAUSS[0])).ravel()).reshape(len(t), -1)
+            miss, speed = length[k] + half * (inside @ GAUSS[1]) - target, self._speed(t)
+            t = np.clip(t - np.divide(miss, speed, out=np.zeros_like(t), where=speed > 0), panels[k], panels[k + 1])
+        return self._along(t)[0].T
+
+    def program_along(self, law):
+        """The program whose curve is followed by a law s, an SX scalar from 0 to 1."""
+        q, (t0, t1) = self.mechanism.q, self.span
+        residuals = dict(self.program.with_turns)
+        if self._pieces is None:
+            timed = {name: ca.substitute(e, q.t, t0 + (t1 - t0) * law) for name, e in self.moving.items()}
+        else:
+            offsets = piecewise(law, *self._pieces).elements()
+            begins = (ca.substitute(e, q.t, t0) for e in self.moving.values())
+            timed = dict(zip(self.moving, map(sum, zip(begins, offsets, strict=True)), strict=True))
+        weights, toward = self.program.weights, self.program.toward
+        return Program(residuals | timed, self.program.by, weights or None, toward or None)
+
+
+class Inverse:
+    """The exact inverse at one instant: equations between jets Z of the motion and c = (s, s', ...), and signals.
+
+    Parameters
+    ----------
+    curve : Curve
+    signals : sequence of str
+    values : dict of str to float
+        Parameters that differ from their defaults.
+    guess : dict of str to float, optional
+    """
+
+    def __init__(self, curve, signals, values, guess):
+        mechanism = copy(curve.mechanism)
+        mechanism.parameters = mechanism.parameters.extended(**{f"s_{j}": 0.4 * (-0.5) ** j for j in range(JETS)})
+        c, t = mechanism.parameters.symbols[-JETS:], mechanism.q.t
+        law = sum(s * t**j / factorial(j) for j, s in enumerate(c))
+        model = derived(mechanism, curve.program_along(law), guess)
+        self.model = model = model.with_parameters(**values) if values else model
+        e, q, top = model.equations, mechanism.q, model.reduction.top
+        found = [self._signal(name) for name in signals]
+        size = max([e.jets.numel(), *(f.size1_in(1) for _, f in found)])
+        self.extra = (size - e.jets.numel()) // q.n
+        self.jets = ca.vertcat(e.jets, *(s for k in range(top + 1, top + 1 + self.extra) for s in q.gamma(k)))
+        counts = [count + self.extra for count in e.raised]
+        levels = [
+            [level[0] for level in q.derivatives([row.expression], count)]
+            for row, count in zip(model.reduction.rows, counts, strict=True)
+        ]
+        rows = ca.vertcat(*q.invariants.values(), *(row for level in levels for row in level))
+        values = ca.vertcat(*(f(t, self.jets[: f.size1_in(1)], e.parameters)[i] for i, f in found))
+        parts = [ca.vertcat(*(level[-1 - self.extra] for level in levels)), rows, values, e.rates(q.jet(top))]
+        numbers = ca.DM([0.0, *model.parameters[:-JETS]])
+        tops, *parts = ca.substitute(parts, [ca.vertcat(t, *e.parameters.elements()[:-JETS])], [ca.SX(numbers)])
+        self.order, highest = (max(j for j in range(JETS) if ca.depends_on(x, c[j])) for x in (tops, parts[0]))
+        self.c, self.state, self.free = ca.vertcat(*c[: highest + 1]), e.state.numel(), model.free
+        self.function = ca.Function("inverse", [self.jets, self.c], [ca.densify(ca.cse(part)) for part in parts])
+
+    def _signal(self, name):
+        """The place of a signal among the outputs of a function of (t, Z, p), and this function."""
+        model = self.model
+        e = model.equations
+        if name in model.jet_names:
+            i = model.jet_names.index(name)
+            return 0, ca.Function("jet", [e.q.t, e.jets, e.parameters], [e.jets[i]])
+        for rate, prefix in enumerate(("", "d")):
+            base = name[len(prefix) :]
+            if name.startswith(prefix) and base in model.signal_groups:
+                names, f = e.signals(model.signal_groups[base], rate)
+                return names.index(name), f
+        raise unknown(name, [*model.jet_names, *model.signal_groups], "signal")
+
+
+@dataclass(frozen=True)
+class Law:
+    """A law s(t): s^(k) at the ends of N equal intervals of a duration, between which it is linear.
+
+    Attributes
+    ----------
+    duration : float
+        [s]
+    jets : (k + 1, N + 1) array
+        s, s' T, ..., s^(k) T^k.
+    """
+
+    duration: float
+    jets: np.ndarray
+
+    def expression(self, t, t0):
+        """s as an SX of a time that begins at t0 [s]; before and after it rests."""
+        k, count = len(self.jets) - 1, self.jets.shape[1] - 1
+        begins = np.vstack([self.jets[:, :-1], np.diff(self.jets[-1:]) * count])
+        powers = np.array([begins[j] / (count**j * factorial(j)) for j in range(k + 2)])
+        about_middle = np.array([[comb(j, i) / 2**j if i <= j else 0.0 for j in range(k + 2)] for i in range(k + 2)])
+        times = t0 + self.duration * np.linspace(0.0, 1.0, count + 1)
+        return piecewise(ca.fmin(ca.fmax(t, times[0]), times[-1]), times, (about_middle @ powers)[:, :, None])
+
+
+def taylor(rows, k, step):
+    """The matrix (rows, k + 2) from (s, ..., s^(k+1)) at the begin of an interval to s, s', ... a step later."""
+    powers = [step**j / factorial(j) for j in range(k + 2)]
+    return np.array([[powers[j - i] if j >= i else 0.0 for j in range(k + 2)] for i in range(rows)])
+
+
+def resting(top, k):
+    """Values (N + 1,) of s^(k) nearest to these whose integrals go from rest at s = 0 to rest at s = 1."""
+    count = len(top) - 1
+
+    def integrals(values):
+        state = np.zeros((k + 1, values.shape[1]))
+        state[k] = values[0]
+        for slopes in np.diff(values, axis=0) * count:
+            state = taylor(k + 1, k, 1.0 / count) @ np.vstack([state, slopes])
+        return state
+
+    fixed = np.array(top, dtype=float)
+    fixed[[0, -1]] = 0.0
+    ends = integrals(np.eye(count + 1))[:k, 1:-1]
+    size = np.abs(ends).sum(axis=1, keepdims=True)
+    for _ in range(2):
+        miss = np.eye(k)[:, 0] - integrals(fixed[:, None])[:k, 0]
+        fixed[1:-1] += np.linalg.lstsq(ends / size, miss / size[:, 0], rcond=None)[0]
+    jets = np.zeros((k + 1, count + 1))
+    for i, slope in enumerate(np.diff(fixed) * count):
+        jets[k, i] = fixed[i]
+        jets[:, i + 1] = taylor(k + 1, k, 1.0 / count) @ np.append(jets[:, i], slope)
+    return jets
+
+
+def _each(sizes, count):
+    return ca.repmat(ca.DM(sizes), 1, count)
+
+
+def smooth(duration, k):
+    """The law of a given duration [s] and class that is a polynomial, `paths.rest_to_rest`."""
+    step = np.polynomial.Polynomial([0.0, 1.0])
+    bump = (step * (1 - step)) ** k
+    jets = [(whole := bump.integ()) / whole(1.0)]
+    jets += [jets[0].deriv(j) for j in range(1, k + 1)]
+    return Law(duration, np.array([jet(np.linspace(0.0, 1.0, INTERVALS + 1)) for jet in jets]))
+
+
+class Problem:
+    """The nonlinear program of a curve.
+
+    Unknowns: the duration, the jets of s at the ends of the intervals (k + 1, N + 1), the jets of the motion at all
+    nodes (n_z, N S), each in units of its size.
+
+    Parameters
+    ----------
+    inverse : Inverse
+    limits : (low, high) of (m,) arrays
+        Of the signals of the inverse.
+    law : Law
+        Of a motion within the limits.
+    plan : Run
+        This motion.
+    """
+
+    def __init__(self, inverse, limits, law, plan):
+        self.inverse, self.limits, self.law, self.k = inverse, np.array(limits), law, inverse.order
+        self.c, self.rate, *_ = radau(COLLOCATION)
+        self.count = law.jets.shape[1] - 1
+        begins = np.arange(self.count)[:, None]
+        nodes = plan.t[0] + law.duration * (begins + self.c).ravel() / self.count
+        size = inverse.jets.numel()
+        times = np.append(plan.t[0], nodes)
+        jets = np.array([np.interp(times, plan.t, row) for row in plan.jets])
+        jets = jets[:size] if len(jets) >= size else plan.model.extended(times, jets, size)
+        self.begin, self.z = jets[:, 0], jets[:, 1:]
+        self._measure()
+
+    def _measure(self):
+        """Sizes of the unknowns, of the rows and of the signals; and the free entries of the state."""
+        from scipy.linalg import qr
+
+        inverse, z = self.inverse, self.z
+        self.sizes = np.maximum(np.abs(self.law.jets).max(axis=1), 1e-300)
+        largest = np.abs(z).max(axis=1)
+        self.z_size = np.where(largest > 1e-6 * largest.max(), largest, 1.0)
+        at = self._places(self.law)
+        f, of = inverse.function, (inverse.jets, inverse.c)
+        J = ca.Function("slopes", [*of], [ca.densify(ca.jacobian(f(*of)[0], inverse.jets))])
+        slopes = np.array([np.array(J(z[:, i], at[:, i])) * self.z_size for i in range(z.shape[1])])
+        self.row_size = np.abs(slopes).max(axis=(0, 2))
+        values = np.array(f.map(z.shape[1])(z, at)[1])
+        self.value_size = np.maximum(np.abs(values).max(axis=1), 1e-300)
+        count = inverse.free
+        tangents = np.linalg.svd(slopes / self.row_size[:, None])[2][:, z.shape[0] - count :, : inverse.state]
+        self.free = np.sort(qr(np.concatenate(tangents), pivoting=True)[2][:count]) if count else np.arange(0)
+
+    def _stages(self, jets):
+        """s, s' T, ... (rows, N) at each stage."""
+        k, rows = self.k, self.inverse.c.numel()
+        stack = ca.vertcat(jets[:, :-1], (jets[k, 1:] - jets[k, :-1]) * self.count)
+        return [ca.DM(taylor(rows, k, theta / self.count)) @ stack for theta in self.c]
+
+    def _places(self, law):
+        """c (rows, N S) at the nodes."""
+        stages = np.array([np.array(stage) for stage in self._stages(ca.DM(law.jets))])
+        scaled = stages / law.duration ** np.arange(stages.shape[1])[:, None]
+        return scaled.transpose(1, 2, 0).reshape(stages.shape[1], -1)
+
+    def solved(self):
+        """The time-optimal law."""
+        N, k = self.count, self.k
+        T, s, z = ca.MX.sym("T"), ca.MX.sym("s", k + 1, N + 1), ca.MX.sym("z", *self.z.shape)
+        jets = ca.diag(ca.DM(self.sizes)) @ s
+        equal, values = self._constraints(T * self.law.duration, jets, ca.diag(ca.DM(self.z_size)) @ z)
+        problem = {"x": ca.veccat(T, s, z), "f": T, "g": ca.vertcat(equal, values)}
+        solver = ca.nlpsol("time_optimal", "ipopt", problem, {"print_time": False, "ipopt": IPOPT})
+        zeros, free = np.zeros(equal.numel()), np.full(z.numel(), np.inf)
+        sides = [np.tile(side / self.value_size, values.numel() // max(len(side), 1)) for side in self.limits]
+        first = [(self.law.jets / self.sizes[:, None]).ravel("F"), (self.z / self.z_size[:, None]).ravel("F")]
+        result = solver(
+            x0=np.concatenate([[1.0], *first]),
+            lbx=np.concatenate([[LEAST], self._sides(0), -free]),
+            ubx=np.concatenate([[np.inf], self._sides(1), free]),
+            lbg=np.concatenate([zeros, sides[0]]),
+            ubg=np.concatenate([zeros, sides[1]]),
+        )
+        w, stats = np.array(result["x"]).ravel(), solver.stats()
+        if not stats["success"]:
+            raise _failed(stats)
+        top = w[1 : 1 + s.numel()].reshape(s.shape, order="F")[k] * self.sizes[k]
+        return Law(w[0] * self.law.duration, resting(top, k))
+
+    def _constraints(self, duration, jets, motion):
+        """What vanishes, and the signals in their sizes, all as columns."""
+        N, S, k = self.count, len(self.c), self.k
+        slopes = (jets[k, 1:] - jets[k, :-1]) * N
+        moved = ca.DM(taylor(k, k, 1.0 / N)) @ ca.vertcat(jets[:, :-1], slopes)
+        equal, values, rates = [(jets[:k, 1:] - moved) / _each(self.sizes[:k], N)], [], []
+        powers = ca.vertcat(*(duration**i for i in range(self.inverse.c.numel())))
+        f = self.inverse.function.map(N)
+        for j, place in enumerate(self._stages(jets)):
+            rows, value, rate = f(motion[:, j::S], place / ca.repmat(powers, 1, N))
+            equal.append(rows / _each(self.row_size, N))
+            values.append(value / _each(self.value_size, N))
+            rates.append(rate)
+        for i in self.free.tolist():
+            x = ca.vertcat(*(motion[i, j::S] for j in range(S)))
+            begin = ca.horzcat(ca.MX(self.begin[i]), x[-1, :-1])
+            rate = ca.vertcat(*(rate[i, :] for rate in rates))
+            equal.append((ca.DM(self.rate) @ (x - ca.repmat(begin, S, 1)) - duration / N * rate) / self.z_size[i])
+        return ca.veccat(*equal), ca.veccat(*values)
+
+    def _sides(self, upper):
+        """Lower or upper bounds of the jets of s."""
+        bound = np.full((self.k + 1, self.count + 1), np.inf if upper else -np.inf)
+        bound[0] = float(upper)
+        if not upper:
+            bound[1] = 0.0
+        bound[:, 0] = 0.0
+        bound[:, -1] = np.eye(self.k + 1)[0]
+        return (bound / self.sizes[:, None]).ravel("F")
+
+
+def _failed(stats):
+    status = stats["return_status"]
+    return IntegrationStopped(
+        f"IPOPT ends with {status} after {stats['iter_count']} iterations.",
+        "A time-optimal law is a minimum of the duration.",
+        do="Choose wider limits, a simpler curve, or shape=False.",
+        status=status, iterations=stats["iter_count"],
+    )  # fmt: skip
