@@ -97,7 +97,8 @@ def simulate(
         Of a plant, by actuator, default 0: numbers, expressions of `q.t` such as paths, or functions that give these
         of `q.t`. They act at once, within the plant's limits of magnitude.
     t_eval : (N,) array, optional
-        Times of the samples [s], within t_span. Default: 1001 instants and the knots; all steps of `RungeKutta`.
+        Times of the samples [s], within t_span, or within the window of `Bounded`. Default: 1001 instants and the
+        knots; all steps of `RungeKutta`.
     events : Event, dict of str to Event, or a sequence, optional
         Signals whose crossings are located, such as `{"slack": sv.Event("tension", terminal=True, direction=-1)}`. A
         terminal event ends the motion: it is the last sample, `status` is 1 and `message` names it. Names of signals
@@ -124,7 +125,7 @@ def simulate(
     """
     model, start = _model_and_start(model, start, inputs)
     span = as_span(t_span)
-    times = None if t_eval is None else _sample_times(*span, t_eval, ())
+    times = None if t_eval is None else _sample_times(*span, t_eval, (), method)
     events = as_events(events)
 
     def motion(times):
@@ -192,7 +193,7 @@ def simulated(model, start, t_span, method=None, *, drift=None, t_eval=None, eve
     leads_back = isinstance(method, (Algebraic, Bounded)) or isinstance(drift, (Poles, Project))
     x0 = (as_state if leads_back else consistent_state)(model, start, t0)
     knots = model.require_smooth((min(span), max(span)))
-    times = None if isinstance(method, Bounded) and t_eval is None else _sample_times(t0, t1, t_eval, knots)
+    times = None if isinstance(method, Bounded) and t_eval is None else _sample_times(t0, t1, t_eval, knots, method)
     bar = Progress(span, progress)
     try:
         default = getattr(method, "atol", 0.0) is None
@@ -452,7 +453,7 @@ def consistent_state(model, start, t):
     return x
 
 
-def _sample_times(t0, t1, t_eval, knots):
+def _sample_times(t0, t1, t_eval, knots, method=None):
     if t_eval is None:
         times = np.union1d(np.linspace(t0, t1, DEFAULT_SAMPLES), [k for k in knots if min(t0, t1) < k < max(t0, t1)])
     else:
@@ -461,7 +462,9 @@ def _sample_times(t0, t1, t_eval, knots):
             raise SpecificationError(
                 f"t_eval={repr(t_eval)[:150]} was given.", "It is a sequence of finite times [s].", t_eval=t_eval
             )
-        if not times.size or times[0] < min(t0, t1) - SAME_TIME or times[-1] > max(t0, t1) + SAME_TIME:
+        window = method is not None and isinstance(as_method(method), Bounded)  # which is known with the motion
+        low, high = (-np.inf, np.inf) if window else (min(t0, t1), max(t0, t1))
+        if not times.size or times[0] < low - SAME_TIME or times[-1] > high + SAME_TIME:
             covered = f"covers {times[0]:g} to {times[-1]:g} s" if times.size else "is empty"
             raise SpecificationError(
                 f"t_eval {covered}.",

@@ -1,14 +1,16 @@
 """Bounded motions of programs with unstable internal dynamics: known answers, a second opinion, refusals."""
 
+from itertools import pairwise
 from math import pi
 
 import casadi as ca
 import numpy as np
 import pytest
 from refusals import refused
+from scipy.integrate import quad
 
 import servoctl as sv
-from servoctl.errors import IntegrationStopped, SpecificationError, UnstableInternalDynamics
+from servoctl.errors import IntegrationStopped, LimitExceeded, SpecificationError, UnstableInternalDynamics
 from servoctl.gallery import gallery
 from servoctl.methods.bounded import LONGEST, Problem
 
@@ -231,6 +233,91 @@ def test_bounded_plans_in_a_sweep():
     assert peaks[1] == pytest.approx(48.88454, abs=1e-4) and np.ptp(peaks) > 0.1
 
 
+def masses(forces, residual):
+    """Masses of 1 kg at x, y and z under forces(x, v), of which an actuator moves the first by residual(t, x, v, a)."""
+    q = sv.coordinates("x y z")
+    x, v, a = tuple(q), tuple(q.d(1)), tuple(q.d(2))
+    S = sv.particle(q, 1.0, x[0]) + sv.particle(q, 1.0, x[1]) + sv.particle(q, 1.0, x[2])
+    mechanism = sv.Mechanism(q, S, actuators={"F": x[0]}, forces=ca.vertcat(0, *forces(x, v)))
+    return sv.derive(mechanism, sv.Program({"x": residual(q.t, x, v, a)}))
+
+
+def follows(t, x, v, a):
+    """x follows the path of `step()`."""
+    return x[0] - step()(t)
+
+
+def convolved(path, rate, t):
+    """The bounded solution of y'' = rate² y + x(t): the integral of x along both exponentials."""
+    ends = sorted({-10.0, 0.0, 1.0, t, 12.0})
+    value = sum(quad(lambda s: np.exp(-rate * abs(t - s)) * path(s), a, b, epsabs=1e-14)[0] for a, b in pairwise(ends))
+    return -value / (2 * rate)
+
+
+def s9(t):
+    """The path of `step()` at an instant, as a number."""
+    s = np.clip(t, 0.0, 1.0)
+    return s**5 * (126 - 420 * s + 540 * s**2 - 315 * s**3 + 70 * s**4)
+
+
+def stiff_forces(damping, stiffness):
+    return lambda x, v: (25 * x[1] + x[0], -damping * v[2] - stiffness * x[2] + x[0])
+
+
+@pytest.mark.parametrize("damping, stiffness", [(8e3, 8e4), (1e3, 1e9), (-2e3, -1e4)], ids=["stiff", "vibrates", "grows"])
+def test_stiff_modes_beside_an_unstable_one(damping, stiffness):
+    """They need no more intervals than their layers beside corners, and the others have their closed form."""
+    model = masses(stiff_forces(damping, stiffness), follows)
+    run = sv.simulate(model, model.start(), (0.0, 1.0), sv.Bounded())
+    assert run.counters["intervals"] < 2500
+    for t in (-0.3, 0.0, 0.4, 1.0, 1.5):
+        assert run.state(t)[1] == pytest.approx(convolved(s9, 5.0, t), abs=1e-12)
+
+
+def test_unstable_modes_that_no_mesh_resolves_are_refused():
+    model = masses(stiff_forces(-8e4, -8e5), follows)
+    with refused(LimitExceeded, "4000", most=4000):
+        sv.simulate(model, model.start(), (0.0, 1.0), sv.Bounded())
+
+
+def test_a_program_of_accelerations_has_no_invariants():
+    """x'' + 3 x' + 2 x = 2 path leaves the whole state free, one eigenvalue of which is unstable."""
+    model = masses(
+        lambda x, v: (4 * x[1] + x[0], -x[2] - v[2]),
+        lambda t, x, v, a: a[0] + 3 * v[0] + 2 * x[0] - 2 * step()(t),
+    )
+    run = sv.simulate(model, model.start(), (0.0, 1.0), sv.Bounded())
+    assert not model.invariant_names() and sv.verify(model, run).passed
+    assert run.state(run.t[0])[1] == pytest.approx(0.0, abs=1e-4) and run.state(run.t[-1])[1] == pytest.approx(-0.25, abs=1e-4)
+    assert run.state(1.0)[1] == pytest.approx(convolved(lambda s: run.state(np.clip(s, *run.t[[0, -1]]))[0], 2.0, 1.0), abs=1e-6)
+    assert "hyperbolic" in sv.report(model, run).verdict
+
+
+def test_accelerations_that_leave_an_oscillation_are_marginal():
+    model = masses(lambda x, v: (-x[1], -x[2]), lambda t, x, v, a: a[0] - ca.sin(t))
+    assert sv.report(model).verdict == "marginal"
+    with refused(IntegrationStopped, "equilibrium"):
+        sv.simulate(model, model.start(), (0.0, 1.0), sv.Bounded())
+
+
+def test_samples_within_the_window():
+    """The actuation ahead of the program, at any rate; its message says what samples leave out."""
+    model = arm(0.5)
+    whole = sv.simulate(model, model.start(), (0.0, 2.0), sv.Bounded())
+    times = np.linspace(whole.t[0], whole.t[-1], 2001)
+    run = sv.simulate(model, model.start(), (0.0, 2.0), "bounded", t_eval=times)
+    assert np.array_equal(run.t, times) and "leave out" not in run.message and sv.verify(model, run).passed
+    assert np.abs(run["torque"] - np.interp(times, whole.t, whole["torque"])).max() < 0.05
+    part = sv.simulate(model, model.start(), (0.0, 2.0), sv.Bounded(), t_eval=[0.0, 1.0, 2.5])
+    assert "leave out the motion before t = 0 s;" in part.message and "after" not in part.message
+    assert part.jets[:4, 1] == pytest.approx(whole.state(1.0), abs=1e-9)
+    with refused(SpecificationError, "window", window=(float(whole.t[0]), float(whole.t[-1]))):
+        sv.simulate(model, model.start(), (0.0, 2.0), sv.Bounded(), t_eval=[-50.0, 1.0])
+    for times in ([], [0.0, np.nan]):
+        with refused(SpecificationError, "t_eval"):
+            sv.simulate(model, model.start(), (0.0, 2.0), sv.Bounded(), t_eval=times)
+
+
 # refusals -------------------------------------------------------------------------------------------------------------
 
 
@@ -249,6 +336,22 @@ def test_internal_dynamics_on_the_imaginary_axis_are_refused():
     model, start = cart_pole(step(), start=pi)
     with refused(UnstableInternalDynamics, "imaginary axis", t=0.0):
         sv.simulate(model, start, (0.0, 1.0), sv.Bounded())
+
+
+def test_the_eigenvalue_on_the_axis_is_named():
+    """Rolling as a constraint of velocities has a constant, whose eigenvalue 0 lies between a pair of real ones."""
+    q = sv.coordinates("x phi a")
+    x, phi, a = q
+    S = sv.particle(q, 2.0, (x, 0)) + sv.particle(q, 1.0, (x + 0.7 * ca.sin(a), 0.7 * ca.cos(a)))
+    S += sv.rigid_body(q, 1e-4, (0, 0, 0.05), position=ca.vertcat(x, 0), rates=(0, 0, q.d(1)[1]))
+    constraints = {"roll": q.d(1)[0] - 0.2 * q.d(1)[1]}
+    U = 9.81 * 0.7 * ca.cos(a)
+    mechanism = sv.Mechanism(q, gibbs=S, potential=U, constraints=constraints, actuators={"T": phi})
+    model = sv.derive(mechanism, sv.Program({"x": x - step()(q.t)}))
+    with refused(UnstableInternalDynamics, "eigenvalue 0 1/s") as caught:
+        sv.simulate(model, model.start(a=0.0, da=0.0), (0.0, 1.0), sv.Bounded())
+    values = np.real(caught.value.details["eigenvalues"])
+    assert values == pytest.approx([(9.81 / 0.7) ** 0.5, 0.0, -((9.81 / 0.7) ** 0.5)], abs=1e-9)
 
 
 def test_ends_that_differ_in_their_unstable_modes_are_refused():

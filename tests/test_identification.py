@@ -1,5 +1,8 @@
 """Parameters from measured runs: statistics over seeds, logs, what cannot be seen, and what is refused."""
 
+from dataclasses import replace
+
+import casadi as ca
 import numpy as np
 import pytest
 from refusals import refused
@@ -132,6 +135,77 @@ def test_wrong_noise_levels_are_said():
     assert found.misfit == pytest.approx(5.0, rel=0.1) and "noise levels are wrong" in found.message
 
 
+def test_masses_stay_positive():
+    """A mass that begins negative is refused; one that begins far too large or small does not turn negative."""
+    plant = masses()
+    data = shaken(plant)
+    for first in ({"m1": -10.0}, {"m1": -3.0}, {"m1": 1.0, "m2": -1.5}):  # of the sum, the inertia
+        with refused(SpecificationError, "mass matrix"):
+            sv.identify(plant, data, first, noise={"x": 1e-4})
+    for first in (-2.9, 0.05, 300.0):  # m1 alone may be negative where the sum is not
+        found = sv.identify(plant, data, {"m1": first, "c": 3.0}, noise={"x": 1e-4})
+        assert abs(found["m1"] - 2.0) < 4 * found.deviation("m1") < 0.1, first
+    against = data | {"F": -data["F"]}  # which no positive mass fits
+    found = sv.identify(plant, against, {"m1": 1.0}, noise={"x": 1e-4})
+    assert found["m1"] > -3.0 and "noise levels are wrong" in found.message
+
+
+def test_lags_stay_positive():
+    q = sv.coordinates("x")
+    (x,) = q
+    plant = sv.plant(sv.Mechanism(q, gibbs=sv.particle(q, 2.0, x), actuators={"F": x}), lag={"F": 0.1})
+    t = np.arange(0.0, 4.0, 0.01)
+    data = {"t": t, "F": np.sin(3 * t), "x": (t / 3 - np.sin(3 * t) / 9) / 2}  # without any lag
+    with refused(SpecificationError, name="lag_F", value=-0.1):
+        sv.identify(plant, data, {"lag_F": -0.1}, noise={"x": 1e-4})
+    found = sv.identify(plant, data, {"lag_F": 0.02}, noise={"x": 1e-4})
+    assert found["lag_F"] > 0 and found["lag_F"] < 0.02
+
+
+def pendulum(**numbers):
+    p = sv.parameters(m=1.0, l=0.5, g=9.81, c=0.05)
+    (a,) = q = sv.coordinates("a")
+    inertia, torque = p.m * p.l**2, -p.m * p.g * p.l * ca.sin(a) - p.c * q.d(1)[0]
+    mechanism = sv.Mechanism(q, sv.particle(q, inertia, a), actuators={"M": a}, forces={"a": torque}, parameters=p)
+    return sv.plant(mechanism, **numbers)
+
+
+def test_times_in_milliseconds_are_refused():
+    plant = pendulum()
+    for period in (10.0, 2.0, 1.13):  # 4.43 1/s
+        t = period * np.arange(300)
+        with refused(SpecificationError, period=pytest.approx(period), eigenvalue=pytest.approx(4.43, abs=0.01)):
+            sv.identify(plant, {"t": t, "M": np.ones(300), "a": 0.1 * np.sin(t)}, ["m"], noise={"a": 1e-3})
+    lagging = pendulum(lag={"M": 0.005})  # four time constants per sample
+    law = lambda t, y: {"M": 2.0 * np.sin(3 * t)}  # noqa: E731
+    loop = sv.close(lagging, law, [0.0] * 3, (0.0, 4.0), timing=sv.Timing(rate=50.0))
+    data = {"t": loop.t, "M": loop.input["M"], "a": loop.measured["a"]}
+    found = sv.identify(lagging, data, {"m": 1.3}, noise={"a": 1e-4})
+    assert found["m"] == pytest.approx(1.0, rel=1e-6)
+
+
+def test_a_result_in_pieces_says_so():
+    """A pendulum of another law in chaotic motion: neither the whole run nor the noise is explained."""
+    plant = pendulum()
+    law = lambda t, y: {"M": 6.0 * np.sin(3.1 * t)}  # noqa: E731
+    loop = sv.close(pendulum(m=1.1), law, [0.5, 0.0], (0.0, 60.0), timing=sv.Timing(rate=50.0))
+    a = loop.measured["a"] + 0.05 * np.sin(0.7 * loop.t)
+    runs = [{"t": loop.t, "M": loop.input["M"], "a": a}, {"t": loop.t[:400], "M": loop.input["M"][:400], "a": a[:400]}]
+    found = sv.identify(plant, runs, ["m", "c"], noise={"a": 1e-4})
+    assert found.misfit > 1.25 and "pieces" in found.message and "noise levels are wrong" in found.message
+    assert len(found.starts) == 2 and all(x.shape == (2,) for x in found.starts)
+    assert [len(run["a"]) for run in found.residuals] == [len(loop.t), 400]
+
+
+def test_what_an_identification_prints(crane):
+    run, guess = crane
+    found = sv.identify(guess, run(7), ["m_load"])
+    assert "1 parameter from" in repr(found)
+    longest = replace(found, message="converged " + "and ".join(["nothing is left out "] * 12))
+    assert longest.message.split() == repr(longest).split()[6 : 6 + len(longest.message.split())]
+    assert max(map(len, repr(longest).splitlines())) <= 118
+
+
 def test_a_lag_is_found():
     q = sv.coordinates("x")
     (x,) = q
@@ -190,8 +264,10 @@ def test_other_arguments_that_are_refused(crane):
         sv.identify(guess, run(0), ["damping_theta"])
     with refused(SpecificationError):
         sv.identify(guess, run(0), [])
-    with refused(SpecificationError):
+    with refused(SpecificationError, 'noise={"x": 1e-3}'):
         sv.identify(guess, run(0, None), ["m_load"])  # without noise levels
+    with refused(SpecificationError, 'noise={"a": 1e-3}'):
+        sv.identify(pendulum(), {"t": np.arange(9.0), "M": np.ones(9), "a": np.ones(9)}, ["m"])
     with refused(NameUnknown, "phi"):
         sv.identify(guess, run(0), ["m_load"], noise={"phi": 1e-3})
     with refused(SpecificationError):

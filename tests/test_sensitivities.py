@@ -1,5 +1,6 @@
 """Derivatives of motions by parameters and initial values, against closed forms and differences."""
 
+from dataclasses import replace
 from functools import partial
 
 import casadi as ca
@@ -136,6 +137,78 @@ def test_a_force_that_ends_at_a_parameter():
         assert np.abs(s["dx", "T"][~after][:-1]).max() < 1e-9
 
 
+SAMPLES = {"late": [1.0, 2.0, 3.0], "between": [0.7, 1.31, 2.0], "one": [2.5], "the first alone": [0.0], "the end": [3.0]}
+
+
+@pytest.mark.parametrize("times", SAMPLES.values(), ids=SAMPLES)
+@pytest.mark.parametrize("method", ["DOP853", "Taylor", "RadauIIA", "RK8", "CVODES"])
+def test_samples_that_begin_after_the_start(method, times):
+    """A damped mass, x = x0 + v0 m/c (1 - e^(-c t/m)), forwards and backwards: derivatives are those from its start."""
+    p = sv.parameters(m=2.0, c=0.5)
+    q = sv.coordinates("x")
+    (x,) = q
+    plant = sv.plant(sv.Mechanism(q, gibbs=sv.particle(q, p.m, x), forces={"x": -p.c * q.d(1)[0]}, parameters=p))
+    for sign in (1.0, -1.0):
+        run = sv.simulate(plant, {"x": 1.0, "dx": 3.0}, (0.0, sign * 3.0), method, t_eval=sign * np.array(times))
+        s = sv.sensitivity(run.model, run, ["x", "dx"], ["m", "c", "x", "dx"])
+        t, decay = run.t, np.exp(-run.t / 4)
+        assert s["x", "x"] == pytest.approx(np.ones(len(t)), abs=1e-9) and s.number("dx") == 3.0
+        assert s["x", "dx"] == pytest.approx(4 * (1 - decay), abs=1e-8)
+        assert s["x", "m"] == pytest.approx(6 * (1 - decay) - 1.5 * t * decay, abs=1e-8)
+        assert s["dx", "c"] == pytest.approx(-1.5 * t * decay, abs=1e-8)
+
+
+@pytest.mark.parametrize("times", [[2.0, 3.0], [1.31], [0.5, 2.0]])
+def test_a_knot_before_the_first_sample(times):
+    """x'' = F until T, as above; a knot may lie between the start and the first sample, or between two samples."""
+    p = sv.parameters(T=1.3, F=2.0)
+    q = sv.coordinates("x")
+    (x,) = q
+    force = {"x": ca.if_else(q.t < p.T, p.F, 0.0)}
+    plant = sv.plant(sv.Mechanism(q, gibbs=sv.particle(q, 1.0, x), forces=force, parameters=p))
+    run = sv.simulate(plant, {"x": 0.0, "dx": 0.0}, (0.0, 3.0), "DOP853", t_eval=times)
+    s, after = sv.sensitivity(run.model, run, ["x", "dx"]), run.t > 1.3
+    assert s["dx", "T"] == pytest.approx(np.where(after, 2.0, 0.0), abs=1e-8)
+    assert s["x", "T"] == pytest.approx(np.where(after, 2.0 * (run.t - 1.3), 0.0), abs=1e-8)
+    assert s["dx", "F"] == pytest.approx(np.minimum(run.t, 1.3), abs=1e-8)
+
+
+def two_masses(path=lambda t: 0.5 * ca.sin(t)):
+    """A driven mass with a second one, which the program leaves free, on a spring and a damper."""
+    p = sv.parameters(k=5.0, d=0.4)
+    x, y = q = sv.coordinates("x y")
+    force = p.k * (x - y) + p.d * (q.d(1)[0] - q.d(1)[1])
+    S = sv.particle(q, 1.0, x) + sv.particle(q, 2.0, y)
+    mechanism = sv.Mechanism(q, S, actuators={"F": x}, forces=ca.vertcat(-force, force), parameters=p)
+    return sv.derive(mechanism, sv.Program({"X": x - path(q.t)}))
+
+
+@pytest.mark.parametrize("drift", [None, "project", "minimal", 0.1])
+def test_internal_motion_sampled_after_the_start(drift):
+    """2 y'' = k (x - y) + d (x' - y') with x = sin(t)/2, against the same motion for complex k, d and y0."""
+    model = two_masses()
+    run = sv.simulate(model, model.start(y=0.1, dy=0.0), (0.0, 3.0), drift=drift, t_eval=[1.0, 2.0, 3.0])
+    s = sv.sensitivity(model, run, ["y", "dy"], ["k", "d", "y", "dy"])
+
+    def motion(k=5.0, d=0.4, y=0.1, dy=0.0):
+        i = (k + 1j * d) / (k - 2 + 1j * d)  # of a forcing (k + d D)/2 e^(it): y = Im(i e^(it))/2, for complex numbers
+        j = (k - 1j * d) / (k - 2 - 1j * d)
+        part = [(i * (1j) ** n * np.exp(1j * run.t) - j * (-1j) ** n * np.exp(-1j * run.t)) / 4j for n in (0, 1)]
+        at_0 = [(i - j) / 4j, (i + j) / 4]
+        root = np.sqrt(0j + (d / 4) ** 2 - k / 2)
+        r1, r2 = -d / 4 + root, -d / 4 - root
+        c2 = (dy - at_0[1] - r1 * (y - at_0[0])) / (r2 - r1)
+        c1 = y - at_0[0] - c2
+        return [part[n] + c1 * r1**n * np.exp(r1 * run.t) + c2 * r2**n * np.exp(r2 * run.t) for n in (0, 1)]
+
+    assert [run["y"], run["dy"]] == pytest.approx(np.real(motion()), abs=1e-7)
+    for name, value in {"k": 5.0, "d": 0.4, "y": 0.1, "dy": 0.0}.items():
+        h = 1e-4
+        a, b, c, e = (np.real(motion(**{name: value + n * h})) for n in (-2, -1, 1, 2))
+        exact = (a - 8 * b + 8 * c - e) / (12 * h)
+        assert np.abs(exact - [s["y", name], s["dy", name]]).max() < 1e-9, name
+
+
 def test_initial_values_that_follow_from_others(gallery_model):
     model = gallery_model("passive-arm")
     run = sv.simulate(model, model.start(q2=0.0, dq2=0.0), (0.0, 0.5))
@@ -158,6 +231,19 @@ def test_what_is_refused(crane, gallery_model):
         sv.sensitivity(gallery_model("passive-arm"), run)
     with refused(NameUnknown):
         sv.sensitivity(model, run)["trolley", "m"]
+
+
+def test_a_plan_of_the_plant_is_no_motion_of_the_program():
+    """A relaxed plan is a motion under inputs; the derivatives of its own model hold these."""
+    model = two_masses(lambda t: sv.paths.rest_to_rest(t, 0.0, 1.0, 2.0))
+    r = model.reduction
+    plan = sv.relaxed(sv.plant(r.mechanism), r.program, (0.0, 2.0))
+    with refused(SpecificationError, model=("X",), run=()):
+        sv.sensitivity(model, plan, "y", "k")
+    s = sv.sensitivity(plan.model, plan, "y", "k")
+    ends = [plan.model.with_parameters(k=5.0 + h) for h in (-1e-3, 1e-3)]
+    below, above = (sv.simulate(m, plan.start.values, (0.0, 2.0), t_eval=plan.t)["y"] for m in ends)
+    assert np.abs((above - below) / 2e-3 - s["y", "k"]).max() < 1e-6 * np.abs(s["y", "k"]).max() + 1e-9
 
 
 def test_what_it_prints_and_draws(crane):
@@ -200,3 +286,54 @@ def test_a_bounded_motion_has_no_free_initial_values():
     run = sv.simulate(model, model.start(), (0.0, 2.0), sv.Bounded())
     with refused(SpecificationError, name="q2"):
         sv.sensitivity(model, run, to="q2")
+
+
+BOUNDED_SAMPLES = {"between": [0.5, 1.0, 1.5], "one": [1.0], "late": [1.7, 2.0], "ends": [0.0, 2.0], "start": [0.0, 0.3]}
+
+
+@pytest.mark.parametrize("times", BOUNDED_SAMPLES.values(), ids=BOUNDED_SAMPLES)
+def test_samples_do_not_change_the_derivatives_of_a_bounded_motion(times):
+    """Against the samples of the whole window, whose derivatives are compared with differences above."""
+    from test_bounded import arm
+
+    model = arm(0.5)
+    full = sv.simulate(model, model.start(), (0.0, 2.0), sv.Bounded(), t_eval=np.linspace(0.0, 2.0, 1001))
+    whole = sv.simulate(model, model.start(), (0.0, 2.0), sv.Bounded())
+    run = sv.simulate(model, model.start(), (0.0, 2.0), sv.Bounded(), t_eval=times)
+    exact, s = (sv.sensitivity(model, one, ["q2", "torque"]) for one in (full, run))
+    beyond = sv.sensitivity(model, whole, ["q2", "torque"])
+    for pair in s.names:
+        size = np.abs(exact[pair]).max() + 1e-9
+        assert np.abs(np.interp(run.t, full.t, exact[pair]) - s[pair]).max() < 1e-5 * size
+        at = [int(np.argmin(np.abs(whole.t - t))) for t in full.t]
+        same = np.abs(whole.t[at] - full.t) < 1e-12
+        assert same.sum() > 10 and np.abs(exact[pair] - beyond[pair][at])[same].max() < 1e-8 * size
+
+
+def test_bounded_motions_whose_window_the_samples_do_not_tell():
+    """y'' = k (y - x) has the bounded motion y = ∫ √k/2 e^(-√k |t - s|) x(s) ds; x has no knots."""
+    p = sv.parameters(k=9.0)
+    x, y = q = sv.coordinates("x y")
+    S = sv.particle(q, 1.0, x) + sv.particle(q, 1.0, y)
+    mechanism = sv.Mechanism(q, S, actuators={"F": x}, forces={"y": p.k * (y - x)}, parameters=p)
+    model = sv.derive(mechanism, sv.Program({"X": x - (1 + ca.tanh(4 * (q.t - 3))) / 2}))
+    span = (-3.0, 9.0)
+
+    def run(**settings):
+        return sv.simulate(model, model.start(t=span[0]), span, "bounded", **settings)
+
+    u = np.linspace(-12.0, 12.0, 48001)
+    both = [np.sqrt(k) / 2 * np.exp(-np.sqrt(k) * np.abs(u)) for k in (9.001, 8.999)]
+    weights = (both[0] - both[1]) / 0.002
+    for times in (None, [2.5, 8.0], [-2.0, 3.0, 9.0]):
+        s = sv.sensitivity(model, run(t_eval=times), "y")
+        near = np.abs(s.t - 3.0) < 6.0
+        exact = [np.trapezoid(weights * (1 + np.tanh(4 * (t - u - 3))) / 2, u) for t in s.t[near]]
+        assert s["y", "k"][near] == pytest.approx(exact, abs=1e-7)
+    for times in ([2.5, 3.1], [3.0]):  # after which the program moves on, without a knot
+        with refused(SpecificationError, samples=(times[0], times[-1])):
+            sv.sensitivity(model, run(t_eval=times), "y")
+    whole = run()
+    assert len(sv.sensitivity(model, replace(whole, jets=1.0001 * whole.jets), "y")) == 1
+    with refused(SpecificationError, samples=(whole.t[0], whole.t[-1])):
+        sv.sensitivity(model, replace(whole, jets=1.004 * whole.jets), "y")

@@ -10,20 +10,29 @@ Newton iteration with exact Jacobians; a mesh is refined until the defect betwee
 
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import pairwise
 
 import casadi as ca
 import numpy as np
 
 from servoctl.codegen.function import compiled
-from servoctl.errors import IntegrationStopped, SingularProgram, SpecificationError, UnstableInternalDynamics
+from servoctl.errors import (
+    IntegrationStopped,
+    LimitExceeded,
+    SingularProgram,
+    SpecificationError,
+    UnstableInternalDynamics,
+)
 from servoctl.methods.accuracy import state_levels
-from servoctl.methods.motion import DEFAULT_SAMPLES, Motion, breakpoints
+from servoctl.methods.motion import DEFAULT_SAMPLES, Motion, breakpoints, margin_at
 from servoctl.methods.radau import basis, radau
 from servoctl.model.switching import switching
 from servoctl.tolerances import CUTOFF, NOISE
 
 ORDER = 13  # of the collocation: seven nodes
-LONGEST = 4.0  # interval of the first mesh, in time constants of the fastest mode
+LONGEST = 4.0  # interval of the first mesh beside corners, in time constants of the fastest mode
+FIRST_INTERVALS = 1000  # of a first mesh that need not resolve its fastest modes everywhere
+COARSEST = 10.0  # interval in time constants of the fastest unstable mode, up to which the collocation lets it grow
 MOST_INTERVALS = 4000
 NEWTON_STEPS, NEWTON_ENDS, STALLED = 40, 1e-12, 1e-9  # of Newton's method; relative size of its last step
 REFINEMENTS, MOST_PIECES = 10, 4  # of the mesh; and into how many an interval is cut at most
@@ -82,6 +91,8 @@ def bounded(model, span, guess, method, instants, progress, events=None):
         )
     problem = Problem(model, span, guess)
     window = problem.window(method.window)
+    _require_within(window, times)
+    left_out = _left_out(span, window, times)
     mesh, x = problem.solve(window, knots, method.rtol)
     progress(window[0])
     reference = problem.solve(problem.window(2 * method.window), knots, np.inf, (mesh, x))
@@ -94,14 +105,35 @@ def bounded(model, span, guess, method, instants, progress, events=None):
     if events is not None:
         times, motion.ended = _to_event(problem, events, (mesh, x), times)
     samples = problem.at(times, mesh, x)
-    inside = times[(times >= window[0]) & (times <= window[1])]
-    truncation = problem.distance(problem.at(inside, mesh, x), problem.at(inside, *reference))
+    truncation = problem.distance(samples, problem.at(times, *reference))
     outputs = model.function("ode").grid(times, samples, model.parameters)
     problem.require_pivots(times, outputs[problem.n_x :])
     motion.add(model, times, samples, outputs[problem.n_x - model.n : problem.n_x])
-    motion.note = f"bounded from t = {window[0]:.4g} to {window[1]:.4g} s; a window of twice the length changes the "
-    motion.note += f"motion by {truncation:.1e}"
+    motion.note = f"bounded from t = {window[0]:.4g} to {window[1]:.4g} s{left_out}; "
+    motion.note += f"a window of twice the length changes the motion by {truncation:.1e}"
     return motion
+
+
+def _require_within(window, times):
+    """Refuse samples (N,) or None outside the window, but for rounding."""
+    low, high = window
+    if times is not None and (times[0] < low - margin_at(low) or times[-1] > high + margin_at(high)):
+        raise SpecificationError(
+            f"t_eval covers {times[0]:g} to {times[-1]:g} s.",
+            f"Samples of the bounded motion lie within its window, {low:.9g} to {high:.9g} s.",
+            do="Sample this window, or widen it by sv.Bounded(window=...).",
+            t_eval=times.tolist(),
+            window=window,
+        )
+
+
+def _left_out(span, window, times):
+    """What samples (N,) or None leave out of the motion before and after the span, in words; "" if nothing."""
+    if times is None:
+        return ""
+    sides = [f"before t = {times[0]:.4g} s"] if window[0] < span[0] <= times[0] else []
+    sides += [f"after t = {times[-1]:.4g} s"] if window[1] > span[1] >= times[-1] else []
+    return "; the samples leave out the motion " + " and ".join(sides) if sides else ""
 
 
 def _to_event(problem, events, solution, times):
@@ -137,6 +169,7 @@ class End:
         """The eigenvalues on the imaginary axis: A is as near to a matrix with one there as rounding is.
 
         Real parts alone do not tell: those of multiple eigenvalues are far larger than the rounding that splits them.
+        Halfway between such an eigenvalue and the axis A is as near to singular; between different ones it is not.
         """
         from scipy.linalg import matrix_balance
 
@@ -144,13 +177,19 @@ class End:
         scaled = np.where(np.abs(scaled) > NOISE * np.abs(scaled).max(initial=0.0), scaled, 0.0)
         balanced, one = matrix_balance(scaled, permute=False)[0], np.eye(len(scaled))
         size = np.linalg.norm(balanced)
-        near = [np.linalg.svd(balanced - 1j * b * one, compute_uv=False)[-1] for b in self.eigenvalues.imag]
-        return self.eigenvalues[np.array(near) <= HYPERBOLIC * size]
+        path = np.stack([1j * self.eigenvalues.imag, self.eigenvalues - self.eigenvalues.real / 2], axis=1)
+        distances = np.linalg.svd(balanced - path[:, :, None, None] * one, compute_uv=False)[:, :, -1]
+        return self.eigenvalues[distances.max(axis=1) <= HYPERBOLIC * size]
 
     @property
     def unstable(self):
         """The number of unstable eigenvalues."""
         return int((self.eigenvalues.real > 0).sum())
+
+    @property
+    def fastest(self):
+        """The magnitude of the fastest unstable eigenvalue [1/s], 0 without one."""
+        return float(np.abs(self.eigenvalues[self.eigenvalues.real > 0]).max(initial=0.0))
 
     def left_space(self, unstable):
         """An orthonormal basis (k, f) of the left eigenspace of the unstable, or of the stable eigenvalues."""
@@ -199,7 +238,7 @@ class FreeEntries:
         n, m = self.n_x, self.m
         y = self._equations.grid(t, x, self.p).T
         f, J, g, G = np.split(y, np.cumsum([n, n * n, m]), axis=1)
-        return f, J.reshape(-1, n, n).swapaxes(1, 2), g, G.reshape(-1, n, m).swapaxes(1, 2)
+        return f, J.reshape(len(t), n, n).swapaxes(1, 2), g, G.reshape(len(t), n, m).swapaxes(1, 2)
 
     def _choose(self, t, x, count):
         """Choose the free entries: those that span the tangent space at all these states best."""
@@ -289,6 +328,7 @@ class Problem(FreeEntries):
         """Refuse eigenvalues on the imaginary axis, and ends with different numbers of unstable ones."""
         for end, where in ((self.first, "begin"), (self.last, "end")):
             for value in end.on_axis[:1]:
+                value = value if value.imag else value.real
                 raise UnstableInternalDynamics(
                     f"The internal dynamics have the eigenvalue {value:.4g} 1/s at the {where} of the program.",
                     "The bounded motion is unique only where no eigenvalue lies on the imaginary axis.",
@@ -340,7 +380,7 @@ class Problem(FreeEntries):
 
         The mesh begins with that of a solution for a shorter window, or is as fine as the fastest mode requires.
         """
-        mesh = self._first_mesh(window, near[0] if near else [*self.span, *knots])
+        mesh = self._wider_mesh(window, near[0]) if near else self._first_mesh(window, knots)
         x = self.at(self._nodes(mesh), *near) if near else self._guess(mesh)
         for _ in range(REFINEMENTS):
             x = self._newton(mesh, x)
@@ -364,12 +404,47 @@ class Problem(FreeEntries):
         x = self._quasi_static(nodes, straight)
         return np.where(np.isfinite(x).all(axis=0), x, straight)
 
-    def _first_mesh(self, window, corners):
+    def _first_mesh(self, window, knots):
+        """A mesh of the window that is graded between the ends of the span and the knots."""
+        shortest, longest = self._lengths(window)
+        self._require_resolved(window, longest)
+        corners = breakpoints(window, sorted({*self.span, *knots}))
+        while True:
+            mesh = np.unique([t for a, b in pairwise(corners) for t in _graded(a, b, shortest, longest)])
+            if len(mesh) <= MOST_INTERVALS or shortest == longest:
+                return mesh
+            shortest = min(2 * shortest, longest)  # beside many knots, layers are left to refinement
+
+    def _require_resolved(self, window, longest):
+        """Refuse a window in which the unstable modes need intervals too short for a mesh."""
+        count = int(np.ceil((window[1] - window[0]) / longest))
+        if count > MOST_INTERVALS:
+            unstable = max(self.first.fastest, self.last.fastest)
+            raise LimitExceeded(
+                f"The bounded motion from t = {window[0]:.4g} to {window[1]:.4g} s has an unstable mode of "
+                f"{unstable:.4g} 1/s.",
+                f"It needs {count} intervals, and a mesh has at most {MOST_INTERVALS}.",
+                do="Leave this mode out of the mechanism, or take a shorter window, such as sv.Bounded(5).",
+                intervals=count,
+                most=MOST_INTERVALS,
+            )
+
+    def _wider_mesh(self, window, mesh):
+        """A mesh continued to a wider window."""
+        lengths = self._lengths(window)
+        before, after = _graded(window[0], mesh[0], *lengths), _graded(mesh[-1], window[1], *lengths)
+        return np.unique(np.concatenate([before, mesh, after]))
+
+    def _lengths(self, window):
+        """Lengths [s] of first intervals, beside corners and between them.
+
+        Stable modes have layers beside corners; unstable ones must grow in every interval, as they do in truth.
+        """
         fastest = max(np.abs(end.eigenvalues).max(initial=0.0) for end in (self.first, self.last))
-        corners = np.array(breakpoints(window, sorted(set(corners))))
-        counts = np.maximum(1, np.ceil(np.diff(corners) * fastest / LONGEST))
-        share = min(1.0, MOST_INTERVALS / counts.sum())
-        return _cut(corners, np.ceil(counts * share).astype(int))
+        unstable = max(self.first.fastest, self.last.fastest)
+        shortest = LONGEST / fastest
+        between = min((window[1] - window[0]) / FIRST_INTERVALS, COARSEST / unstable if unstable else np.inf)
+        return shortest, max(shortest, between)
 
     def _nodes(self, mesh):
         return np.append(mesh[0], (mesh[:-1, None] + np.diff(mesh)[:, None] * self.c).ravel())
@@ -505,6 +580,15 @@ def _two_digits(length):
     """A length rounded up to two digits, so that windows hold whole samples."""
     digit = 10.0 ** (np.floor(np.log10(length)) - 1) if length > 0 else 1.0
     return float(np.round(np.ceil(length / digit * (1 - 1e-12)) * digit, 12))
+
+
+def _graded(a, b, shortest, longest):
+    """A mesh from a to b: intervals grow by a factor of two from `shortest` beside both ends to `longest`."""
+    doubled = shortest * (2.0 ** np.arange(np.ceil(np.log2(longest / shortest))) * 2 - 1)
+    beside = np.append(0.0, doubled[3 * doubled < b - a])
+    low, high = a + beside[-1], b - beside[-1]
+    between = np.linspace(low, high, max(1, int(np.ceil((high - low) / longest))) + 1)
+    return np.concatenate([a + beside[:-1], between, (b - beside[:-1])[::-1]])
 
 
 def _cut(mesh, counts):

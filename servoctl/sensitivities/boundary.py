@@ -9,10 +9,13 @@ import casadi as ca
 import numpy as np
 
 from servoctl.codegen.function import compiled
+from servoctl.errors import SpecificationError, UnstableInternalDynamics
 from servoctl.methods.bounded import Problem
 from servoctl.methods.choice import Bounded
 from servoctl.methods.radau import basis
-from servoctl.sensitivities.tangent import invariants_by, parameter_symbols
+from servoctl.sensitivities.tangent import invariants_by, parameter_symbols, start_of
+
+SAME_MOTION = 1e-3  # of its size: a run that differs by more is not the bounded motion of its program
 
 
 def bounded_tangent(model, run, names):
@@ -24,10 +27,13 @@ def bounded_tangent(model, run, names):
     run : Run
     names : tuple of str
         Of the parameters.
+
+    Raises
+    ------
+    SpecificationError
+        If the samples do not tell the window of the motion.
     """
-    window = float(run.t[0]), float(run.t[-1])
-    problem = Problem(model, window, run.jets[: len(model.state_names), 0])
-    mesh, x = problem.solve(window, run.knots, Bounded().rtol)
+    problem, mesh, x = _recomputed(model, run)
     at_nodes = _Linear(problem, names, problem._nodes(mesh), x)
     dz = _collocated(problem, at_nodes, np.diff(mesh))
     k = np.clip(np.searchsorted(mesh, run.t, side="right") - 1, 0, len(mesh) - 2)
@@ -37,6 +43,32 @@ def bounded_tangent(model, run, names):
     stages = dz[1:].reshape(len(mesh) - 1, len(problem.c), *dz.shape[1:])[k]
     dz = begin + np.einsum("nsfk,sn->nfk", stages - begin[:, None], weights)
     return at_samples.lifted(dz).transpose(1, 2, 0)
+
+
+def _recomputed(model, run):
+    """The boundary value problem of a bounded run with its mesh and states; samples need not cover its window."""
+    t, guess = start_of(run)
+    try:
+        problem = Problem(model, (t, float(max(run.t[-1], *run.knots, t))), guess)
+        begin, end = problem.window(Bounded().window)
+    except (SpecificationError, UnstableInternalDynamics) as error:
+        raise _unknown_window(run, "is not at rest before its start or after its last sample") from error
+    window = min(begin, float(run.t[0])), end
+    mesh, x = problem.solve(window, run.knots, Bounded().rtol)
+    off = problem.distance(problem.at(run.t, mesh, x), run.jets[: problem.n_x])
+    if not off <= SAME_MOTION:
+        raise _unknown_window(run, f"differs by {off:.1e} of its size from the bounded one from rest to rest", off=off)
+    return problem, mesh, x
+
+
+def _unknown_window(run, what, **facts):
+    return SpecificationError(
+        f"The run has samples from t = {run.t[0]:.4g} to {run.t[-1]:.4g} s, and its motion {what}.",
+        "The derivatives of a bounded motion depend on the whole of it, from rest to rest.",
+        do="Leave t_eval out in simulate, or sample the whole window of the motion; its message says which that is.",
+        samples=(float(run.t[0]), float(run.t[-1])),
+        **facts,
+    )
 
 
 class _Linear:

@@ -5,6 +5,7 @@ the state x its tangents S = ∂x/∂(θ, x_0) are advanced by the same steps, s
 (measured less computed, over its standard deviation) is that of the computation itself. First states are unknowns, too.
 """
 
+import textwrap
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -87,15 +88,17 @@ class Identification(ByName, Value):
         return float(self.deviations[self.names.index(named(name, self.names, "parameter"))])
 
     def __repr__(self):
-        count = sum(len(values) for run in self.residuals for values in run.values())
-        lines = [f"Identification: {len(self.names)} parameters from {count} measurements; {self.message}"]
+        count, k = sum(len(values) for run in self.residuals for values in run.values()), len(self.names)
+        lines = [f"Identification: {k} parameter{'s' * (k != 1)} from {count} measurements; {self.message}"]
         for name in self.names[:6]:
             lines.append(f"  {name} = {self[name]:.6g}, standard deviation {self.deviation(name):.2g}")
+        if k > 6:
+            lines.append(f"  and {k - 6} more: {', '.join(self.names[6:])}")
         for direction in self.unseen[:3]:
             parts = " and ".join(f"{name} ({part:+.2f})" for name, part in direction.items())
             lines.append(f"  not seen in the data: {parts}, in relative changes")
         lines.append(f"  residuals are {self.misfit:.3g} times the noise")
-        return "\n".join(line[:118] for line in lines)
+        return "\n".join(textwrap.fill(line, 118, subsequent_indent="    ") for line in lines)
 
 
 def identify(
@@ -133,18 +136,20 @@ def identify(
     NameUnknown
         For names that the plant does not have.
     SpecificationError
-        For measurements that lack inputs or values, or are not sampled at equal intervals, and for plants with material
-        constraints.
+        For measurements that lack inputs or values, or are not sampled at equal intervals or far too seldom, for plants
+        with material constraints, and for first values by which the mass matrix is not positive definite.
     IntegrationStopped
         If the plant's motion is not finite at the values from which the search starts.
 
     Notes
     -----
-    The covariance is that of the linearised problem, (JᵀJ)⁻¹, first states included as unknowns.
+    The covariance is that of the linearised problem, (JᵀJ)⁻¹, first states included as unknowns. The mass matrix stays
+    positive definite during the search, and lags stay positive.
     """
     require_kind(Plant, "plant", plant, "sv.plant(mechanism)")
     _require_free(plant)
     names, theta = _first_values(plant, parameters)
+    _require_inertia(plant, names, theta)
     records, noise = as_records(plant, measured, noise, start)
     sizes, best = np.abs(theta), None
     for count in (SHORTER * PIECES[0], *PIECES):
@@ -191,11 +196,40 @@ def _first_values(plant, parameters):
             raise unknown(name, list(places), "parameter")
     if not names or len(set(names)) < len(names):
         raise SpecificationError(
-            f"The parameters are {names}.", "At least one is named, each once.", parameters=names
-        )  # fmt: skip
+            f"The parameters are {', '.join(names)}." if names else "No parameter is named.",
+            "A search is for at least one parameter, and names each of them once.",
+            do=f"Choose among {', '.join(places)}." if places else "Give the mechanism parameters=sv.parameters(...).",
+            parameters=names,
+        )
     own = plant.parameters[[places[name] for name in names]]
     own = [1 / value if name.startswith("lag_") else value for name, value in zip(names, own, strict=True)]
     return names, np.array([given.get(name, value) for name, value in zip(names, own, strict=True)])
+
+
+def _numbers(plant, names, theta):
+    """All numbers of the plant with these parameters (k,)."""
+    p, places = plant.parameters.copy(), _places(plant)
+    for name, value in zip(names, theta, strict=True):
+        p[places[name]] = 1 / value if name.startswith("lag_") else value
+    return p
+
+
+def _require_inertia(plant, names, theta):
+    """Refuse lags that are not positive, and parameters by which the mass matrix is not positive definite."""
+    for name, value in zip(names, theta, strict=True):
+        if name.startswith("lag_") and not value > 0:
+            raise SpecificationError(
+                f"The first value of {name!r} is {value:g} s.", "A lag must be positive.", name=name, value=float(value)
+            )
+    plant.equations.require_inertia(_numbers(plant, names, theta)[: len(plant.mechanism.parameters.names)])
+
+
+def _has_inertia(plant, names, theta):
+    try:
+        _require_inertia(plant, names, theta)
+    except SpecificationError:
+        return False
+    return True
 
 
 class _Problem:
@@ -240,19 +274,20 @@ class _Problem:
             states[i][:, a : a + len(piece.t)] = self._moved(piece, unknowns[: self.k], x)[: self.n_x]
         return [replace(record, states=x) for record, x in zip(self.records, states, strict=True)]
 
-    def numbers(self, unknowns):
-        """All numbers of the plant with the parameters among the unknowns."""
-        p = self.plant.parameters.copy()
-        for name, value in zip(self.names, unknowns[: self.k], strict=True):
-            p[_places(self.plant)[name]] = 1 / value if name.startswith("lag_") else value
-        return p
-
     def starts(self, unknowns):
         """First states of the pieces."""
         return tuple(unknowns[self.k :].reshape(-1, self.n_x))
 
+    def first_states(self, unknowns):
+        """First states of the records."""
+        return tuple(x for (_, a, _), x in zip(self.pieces, self.starts(unknowns), strict=True) if a == 0)
+
     def _evaluated(self, unknowns):
+        """Residuals and their derivatives; infinite where the plant is none, so that no search goes there."""
         if self._latest[0] is None or not np.array_equal(self._latest[0], unknowns):
+            if not _has_inertia(self.plant, self.names, unknowns[: self.k]):
+                count = len(self.noise) * sum(len(piece.t) for _, _, piece in self.pieces)
+                return np.full(count, np.inf), np.full((count, len(unknowns)), np.inf)
             values, slopes = [], []
             for i, ((_, _, piece), x) in enumerate(zip(self.pieces, self.starts(unknowns), strict=True)):
                 value, slope = self._computed(piece, unknowns[: self.k], x)
@@ -396,7 +431,8 @@ def _identified(plant, fit, sizes):
     covariance, deviations, unseen = _told(problem.names, J[:, : problem.k] * sizes, J[:, problem.k :])
     return Identification(
         problem.names, theta, deviations * sizes, covariance * np.outer(sizes, sizes), unseen, fit.misfit,
-        problem.starts(x), problem.by_name(x), _with_numbers(plant, problem.numbers(x)), fit.status > 0,
+        problem.first_states(x), problem.by_name(x),
+        _with_numbers(plant, _numbers(plant, problem.names, x[: problem.k])), fit.status > 0,
         _message(fit, unseen),
     )  # fmt: skip
 
@@ -404,10 +440,12 @@ def _identified(plant, fit, sizes):
 def _message(fit, unseen):
     if fit.status <= 0:
         return "the search has not converged"
+    parts = ["converged"]
+    if fit.problem.count > 1:
+        parts.append(f"in {len(fit.problem.pieces)} pieces, as longer motions diverge")
     if fit.misfit > MISFIT:
-        return "converged, but residuals exceed the noise: the plant or the noise levels are wrong"
-    pieces = "" if fit.problem.count == 1 else f", in {len(fit.problem.pieces)} pieces: longer motions diverge"
-    return f"converged{pieces}{'; not all are seen' if unseen else ''}"
+        parts.append("but residuals exceed the noise: the plant or the noise levels are wrong")
+    return ", ".join(parts) + ("; not all are seen" if unseen else "")
 
 
 def _told(names, by_parameters, by_starts):

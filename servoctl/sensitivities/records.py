@@ -12,6 +12,7 @@ from servoctl.errors import SpecificationError, unknown
 
 UNEVEN = 1e-3  # of the median interval: samples farther from equal intervals are uneven
 AROUND = 5  # samples to each side, through which a line guesses a velocity that is not measured
+SELDOM = 5.0  # time constants of the plant's fastest eigenvalue, beyond which samples do not show it
 GAP = 1.5  # median intervals, beyond which samples are missing
 
 
@@ -95,10 +96,12 @@ def _levels(plant, listed, noise):
         noise = {name: float(np.hypot(sensors.noise.get(name, 0.0), q / np.sqrt(12))) for name, q in quanta.items()}
         noise = {name: level for name, level in noise.items() if level > 0}
     if not noise:
+        one = listed[0].law.measures if isinstance(listed[0], Closed) else listed[0]
+        example = next((name for name in names if name in one), names[0])
         raise SpecificationError(
             "No noise level is known.",
             "Measurements are weighed by their standard deviations.",
-            do='Write noise={"theta": 1e-3}; only what has a level is used.',
+            do=f'Write noise={{"{example}": 1e-3}} with its standard deviation; only what has a level is used.',
             names=names,
         )
     return noise
@@ -118,11 +121,37 @@ def _record(plant, one, noise, start):
         substeps, late, before = one.loop.substeps, one.loop.transport, one.loop.initial_input
     else:
         before, period = inputs[:, 0], float(t[-1] - t[0]) / (len(t) - 1)
+        _require_often(plant, t, period, states[:, 0], before)
         substeps, late = steps(plant, period, None, float(t[0]), states[:, 0], before)
     late = np.zeros(len(before), dtype=int) if late is None else late
     step = float(t[-1] - t[0]) / ((len(t) - 1) * substeps)
     measured = {name: data[name] for name in noise}
     return Record(t, inputs, _held(inputs, late, before, substeps), measured, substeps, step, states)
+
+
+def _require_often(plant, t, period, x, u):
+    """Refuse samples that are too far apart for the fastest eigenvalue of the plant at its start."""
+    A, _ = plant.linearised(float(t[0]), x[:, None], u[:, None])
+    fastest = float(np.abs(np.linalg.eigvals(A[0])).max(initial=0.0)) if np.isfinite(A).all() else np.inf
+    if fastest * period <= SELDOM:
+        return
+    if not np.isfinite(fastest):
+        raise SpecificationError(
+            "The plant's linearisation at the first sample is not finite.",
+            "The search starts from a state in which the plant can move.",
+            do="Pass another first state, start={...}, or other numbers of the plant.",
+            start=x.tolist(),
+        )
+    raise SpecificationError(
+        f"Samples are {period:g} s apart, and the plant's fastest eigenvalue at the first one is {fastest:.4g} 1/s.",
+        f"Samples are at most {SELDOM:g} time constants of the plant's fastest eigenvalue apart.",
+        nearest=f"Intervals of {SELDOM / fastest:.3g} s.",
+        do=f"Write t in seconds: {period:g} ms are {period / 1000:g} s. Otherwise sample faster, or leave out a "
+        "lag or a stiffness that the samples do not show.",
+        period=period,
+        eigenvalue=fastest,
+        most=SELDOM / fastest,
+    )
 
 
 def _require_states(plant, loop):

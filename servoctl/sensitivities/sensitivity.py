@@ -1,5 +1,6 @@
 """Derivatives of a run's signals by parameters and initial values."""
 
+import textwrap
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
@@ -14,7 +15,7 @@ from servoctl.model.model import Model
 from servoctl.model.switching import switching
 from servoctl.run import STENCIL, ByName, Run, require_model
 from servoctl.sensitivities.boundary import bounded_tangent
-from servoctl.sensitivities.tangent import along_state, determined, invariants_by, variational
+from servoctl.sensitivities.tangent import along_state, determined, invariants_by, start_of, variational
 from servoctl.values import Value
 
 RTOL = 1e-11  # of a step of the variational equation
@@ -71,7 +72,7 @@ class Sensitivity(ByName, Value):
             One of `to`.
         """
         numbers, name = self.run.model.numbers, named(name, self.to, "parameter or initial value")
-        return numbers[name] if name in numbers else float(self.run[name][0])
+        return numbers[name] if name in numbers else float(start_of(self.run)[1][self.run.jet_names.index(name)])
 
     def change(self, name: str) -> float:
         """One percent of a number, 0.01 of its unit where that is zero: the change to which figures refer.
@@ -122,7 +123,8 @@ class Sensitivity(ByName, Value):
 
     def __repr__(self):
         t = self.t
-        lines = [f"Sensitivity: {len(self.of)} signals by {len(self.to)} numbers, t = {t[0]:g} .. {t[-1]:g} s"]
+        what = f"{_counted(self.of, 'signal')} by {_counted(self.to, 'number')}"
+        lines = [f"Sensitivity: {what}, t = {t[0]:g} .. {t[-1]:g} s"]
         for of in self.of[:8]:
             sizes = {to: np.nanmax(np.abs(self[of, to])) * self.change(to) for to in self.to}
             largest = sorted(sizes, key=sizes.get, reverse=True)[:3]
@@ -130,7 +132,11 @@ class Sensitivity(ByName, Value):
             lines.append(f"  {of} changes at most with {shown}")
         if self.independent:
             lines.append(f"  constant else at the start: {', '.join(self.independent)}")
-        return "\n".join(line[:118] for line in lines)
+        return "\n".join(textwrap.fill(line, 118, subsequent_indent="    ") for line in lines)
+
+
+def _counted(names, what):
+    return f"{len(names)} {what}{'s' * (len(names) != 1)}"
 
 
 def _growth_in_words(number):
@@ -182,7 +188,13 @@ def sensitivity(
     to = tuple(dict.fromkeys(list(model.numbers) if to is None else texts(to, "The names of parameters")))
     known = (*model.jet_names, *model.signal_groups)
     if not of or not to:
-        raise SpecificationError("Nothing was named.", "A derivative is of a signal by a number.", of=of, to=to)
+        raise SpecificationError(
+            f"The derivatives are of {len(of)} signals by {len(to)} numbers.",
+            "They are of at least one signal by at least one parameter or initial value.",
+            do=f"Name {'initial values' if of else 'signals'}, such as {(model.state_names if of else known)[0]!r}.",
+            of=of,
+            to=to,
+        )
     for name in of:
         if name not in known:
             raise unknown(name, known, "signal")
@@ -204,8 +216,18 @@ def sensitivity(
 
 
 def _require_run(model, run):
-    """Refuse a run with other numbers, and one with switches of the state."""
+    """Refuse a run with other numbers or of another program, and one with switches of the state."""
     switches = switching(model) is not None
+    programs = [tuple(one.reduction.program.residuals) for one in (model, run.model)]
+    if not switches and programs[0] != programs[1]:
+        names, other = (", ".join(names) or "no program" for names in programs)
+        raise SpecificationError(
+            f"The model is of {names}, the run of {other}.",
+            "Derivatives are those of the motion that the model determines.",
+            do="Pass run.model: a relaxed plan is a motion of the plant under inputs, which are then held.",
+            model=programs[0],
+            run=programs[1],
+        )
     if switches or run.model.numbers != model.numbers:
         smooth = "Smooth the switch, such as tanh(v/v0) for sign(v)."
         raise SpecificationError(
@@ -268,7 +290,7 @@ def _along(model, run, to, kinds):
 def _tangent_at_start(run, names, initial):
     """The tangent (n_x, K) of the first state, and the names of the initial values that do not depend on others."""
     model = run.variant(0)
-    t, x = run.t[0], run.jets[: len(model.state_names), 0]
+    t, x = start_of(run)
     m, n_x = len(model.invariant_names()), len(x)
     y = invariants_by(model, names)(t, x, model.parameters)
     G = y[m:].reshape(n_x + len(names), m).T
@@ -320,15 +342,15 @@ def _require_free(model, initial, independent):
 
 
 def _integrated(model, run, names, S):
-    """The tangent (n_x, K, N) of the state at the samples of a run."""
+    """The tangent (n_x, K, N) of the state at the samples of a run, from its start S (n_x, K) on."""
     from scipy.integrate import solve_ivp
 
-    n_x, K = S.shape
+    (n_x, K), (t, x) = S.shape, start_of(run)
     method = "Radau" if run.method in STIFF else "DOP853"
-    y, result = np.concatenate([run.jets[:n_x, 0], S.T.ravel()]), np.empty((n_x, K, len(run.t)))
+    y, result = np.concatenate([x, S.T.ravel()]), np.repeat(S[:, :, None], len(run.t), axis=2)
     atol = _absolute(model, run, names, S)
-    cuts = breakpoints((run.t[0], run.t[-1]), run.knots)
-    forward = np.sign(run.t[-1] - run.t[0]) or 1.0
+    cuts = breakpoints((t, float(run.t[-1])), run.knots) if run.t[-1] != t else []
+    forward = np.sign(run.t[-1] - t)
     for k, (a, b) in enumerate(zip(cuts[:-1], cuts[1:], strict=True)):
         if k:
             y[n_x:] += _shifted(model, run, names, a, y[:n_x], K).T.ravel()
@@ -341,7 +363,8 @@ def _integrated(model, run, names, S):
         )  # fmt: skip
         if solved.status:
             raise _ended(float(solved.t[-1]), solved.message)
-        result[:, :, inside] = solved.sol(run.t[inside])[n_x:].reshape(K, n_x, -1).swapaxes(0, 1)
+        if len(inside):
+            result[:, :, inside] = solved.sol(run.t[inside])[n_x:].reshape(K, n_x, -1).swapaxes(0, 1)
         y = solved.y[:, -1].copy()
     return result
 
@@ -353,7 +376,8 @@ def _variant_at(run, a, b):
 
 def _absolute(model, run, names, S):
     """Absolute tolerances of the state and of its tangent, from the sizes of the motion and of the numbers."""
-    sizes = motion_sizes(model, run.t, run.jets[: len(S)])
+    t, x = start_of(run)
+    sizes = motion_sizes(model, np.append(t, run.t), np.column_stack([x, run.jets[: len(S)]]))
     sizes = np.where(sizes > 0, sizes, 1.0)
     numbers = [abs(model.numbers[name]) or 1.0 for name in names]
     initial = [sizes[np.argmax(column != 0)] for column in S.T[len(names) :]]
@@ -371,9 +395,10 @@ def _ended(t, why):
 
 def _shifted(model, run, names, t, x, columns):
     """The jump (n_x, K) of the tangent at a knot t that moves with parameters, where the rates jump."""
-    length, f = abs(run.t[-1] - run.t[0]), model.function("ode")
+    first = start_of(run)[0]
+    length, f = abs(run.t[-1] - first), model.function("ode")
     sides = [f(t + side * BESIDE_KNOT * length, x, model.parameters)[: len(x)] for side in (-1.0, 1.0)]
-    before, after = sides if run.t[-1] > run.t[0] else sides[::-1]
+    before, after = sides if run.t[-1] > first else sides[::-1]
     jump = np.zeros((len(x), columns))
     if np.abs(after - before).max() > JUMPS * np.abs(sides).max():
         for j, name in enumerate(names):
@@ -383,7 +408,8 @@ def _shifted(model, run, names, t, x, columns):
 
 def _knot_rate(model, run, name, t):
     """Derivative of the instant of a knot by a parameter."""
-    value, span = model.numbers[name], (float(run.t.min()), float(run.t.max()))
+    value, ends = model.numbers[name], (start_of(run)[0], float(run.t[-1]))
+    span = min(ends), max(ends)
     shift = SHIFT * (abs(value) or 1.0)
     knots = [np.array(model.with_parameters(**{name: value + h}).require_smooth(span)) for h in (-shift, shift)]
     nearest = [k[np.argmin(np.abs(k - t))] if len(k) else np.nan for k in knots]

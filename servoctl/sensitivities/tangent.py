@@ -24,6 +24,13 @@ def parameter_symbols(equations, names):
     return ca.vertcat(ca.SX(0, 1), *(parameters.symbols[parameters.names.index(name)] for name in names))
 
 
+def start_of(run):
+    """The instant [s] and the state (n_x,) from which a run was computed, which need not be its first sample."""
+    if run.start is None:
+        return float(run.t[0]), run.jets[: len(run.model.state_names), 0]
+    return float(run.start.t), np.asarray(run.start.values, dtype=float)
+
+
 class Tangent:
     """The tangent of the jets Z = (q, γ', ..., γ^(s̄)) of a model in the direction of its parameters.
 
