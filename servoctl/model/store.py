@@ -144,7 +144,8 @@ def fingerprint(mechanism, program, guess=None, near=None, values=None):
             np.asarray(mechanism.parameters.values() if values is None else values, dtype=float).tolist(),
         ]
         chosen = (*program.weights.values(), *program.toward.values())
-        expressions = [*program.residuals.values(), *(e for e in chosen if isinstance(e, ca.SX))]
+        residuals = [*program.residuals.values(), *program.with_turns.values()]
+        expressions = [*residuals, *(e for e in chosen if isinstance(e, ca.SX))]
         function = mechanism.q.as_function(expressions, mechanism.parameters.symbols)
         text = "\n".join([json.dumps(facts, allow_nan=False), mechanism.as_text(), function.serialize()])
     except Exception:  # CasADi raises bare ones; the derivation says what is wrong
