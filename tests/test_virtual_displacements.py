@@ -13,7 +13,7 @@ def virtual_displacements(realisation):
     """Tᵀ, (n - b, n) SX, from the rows of (3.18) of a symbolic balance."""
     r = ca.SX.sym("r", realisation.B.shape[0])
     rows, _ = realisation.dynamics(r)
-    return ca.jacobian(ca.vertcat(*rows), r)
+    return ca.jacobian(ca.vertcat(*rows.values()), r)
 
 
 @pytest.fixture(scope="module")

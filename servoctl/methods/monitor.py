@@ -367,9 +367,13 @@ class Monitor:
         return None
 
     def _unbounded(self, matrices):
-        """Whether rows are far larger than ever, or not finite."""
-        sizes = [np.linalg.norm(m / c, axis=1) for m, c in zip(matrices, self.columns, strict=True)]
-        return any(np.any(~(NEGLIGIBLE * a <= np.where(b > 0, b, 1.0))) for a, b in zip(sizes, self.rows, strict=True))
+        """Whether gradients of constraints, or actuators, are far larger than ever, or not finite."""
+        given = [self.model.reduction.original.get(name) is not None for name in self.l_names]
+        for m, c, largest, some in zip(matrices, self.columns, self.rows, (given, slice(None)), strict=True):
+            sizes = np.linalg.norm(m / c, axis=1)[some]
+            if np.any(~(NEGLIGIBLE * sizes <= np.where(largest > 0, largest, 1.0)[some])):
+                return True
+        return False
 
     def _step(self, stretch, k, before, scale):
         """The outcome of one step, None if it is fine; `before` are the relative pivots at and before its start."""
