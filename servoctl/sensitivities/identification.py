@@ -414,9 +414,12 @@ def _fitted(problem, theta, first):
         return least_squares(residuals, x, partial(jacobian, open_=open_), **options)
 
     with np.errstate(all="ignore"):
-        if problem.count > 1:  # the guesses of first states are far worse than those of the parameters
-            unknowns = search(unknowns, np.arange(len(unknowns)) >= k).x
-        found = search(unknowns, True)
+        try:
+            if problem.count > 1:  # the guesses of first states are far worse than those of the parameters
+                unknowns = search(unknowns, np.arange(len(unknowns)) >= k).x
+            found = search(unknowns, True)
+        except np.linalg.LinAlgError:  # of derivatives that are not finite
+            return None
     values = problem.residuals(found.x)
     misfit = np.sqrt(values @ values / max(len(values) - len(unknowns), 1))
     return _Fit(problem, found.x, float(misfit), found.status)
