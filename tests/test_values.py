@@ -1,5 +1,6 @@
 """Values: models, plants, runs and laws are equal by what they say, travel to other processes, and never change."""
 
+import copy
 import multiprocessing
 import pickle
 import subprocess
@@ -12,7 +13,7 @@ import pytest
 from refusals import refused
 
 import servoctl as sv
-from servoctl.gallery import gallery
+from servoctl.gallery import gallery, overhead_crane
 
 SCENES = ("overhead-crane", "appell-hamel", "crane-3d", "constant-speed", "three-cars", "wheeled-robot")
 
@@ -191,3 +192,11 @@ def test_parts_of_a_model_say_how_they_pickle(gallery_model):
         with refused(sv.SpecificationError, "sv.derive(mechanism, program)", type=type(part).__name__):
             pickle.dumps(part)
     assert pickle.loads(pickle.dumps(model)) == model
+
+
+def test_a_copy_of_a_mechanism_has_its_symbols():
+    """Also where an equal mechanism of other symbols came from another process before."""
+    other, _ = overhead_crane()
+    again(other)
+    mechanism, _ = overhead_crane()
+    assert [a.element_hash() for a in copy.copy(mechanism).q] == [a.element_hash() for a in mechanism.q]

@@ -128,6 +128,12 @@ class Mechanism:
     def __hash__(self):
         return hash((self.q.names, self.actuators, self.parameters.names))
 
+    def __copy__(self):
+        """With the same symbols, unlike one that is read back."""
+        twin = object.__new__(type(self))
+        vars(twin).update(vars(self))
+        return twin
+
     def __reduce__(self):
         content = packed(vars(self), self.q, self.parameters, {"parameters": self.parameters})
         return _restored, (self.q, self.parameters, content)
