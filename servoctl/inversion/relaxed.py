@@ -37,6 +37,7 @@ from servoctl.errors import (
 )
 from servoctl.inversion.equilibrium import RANK, Equilibria
 from servoctl.inversion.transcription import LONGEST, Mesh, Node, Transcription
+from servoctl.methods.bounded import subdivided
 from servoctl.methods.motion import breakpoints
 from servoctl.model.model import derive
 from servoctl.model.start import State
@@ -485,7 +486,7 @@ class Task:
         knots = switches.times(self.plant.parameters, self.span)
         corners = np.array(breakpoints(self.span, sorted(knots)))
         counts = np.maximum(1, np.ceil(np.diff(corners) * INTERVALS / np.ptp(corners) * (1 - 1e-9))).astype(int)
-        return Mesh(_cut(corners, counts), ORDER)
+        return Mesh(subdivided(corners, counts), ORDER)
 
     def _continued(self, beta, near):
         """The plan of weights from one of greater weights, or from the guess, over weights between."""
@@ -638,7 +639,7 @@ class Task:
         pieces = np.where(defect > DEFECT, np.clip(pieces, 2, MOST_PIECES), 1)
         if pieces.max() == 1 or pieces.sum() > MOST_INTERVALS:
             return None
-        finer = Mesh(_cut(mesh.edges, pieces), mesh.order)
+        finer = Mesh(subdivided(mesh.edges, pieces), mesh.order)
         nodes = np.append(mesh.edges[0], finer.nodes)
         return replace(plan, mesh=finer, x=mesh.states(plan.x, nodes))
 
@@ -649,7 +650,7 @@ class Task:
         inputs = dict(zip(self.plant.inputs, ca.vertsplit(u), strict=True))
         model = driven(self.plant, inputs, self.program.residuals)
         parts = max(1, -(-SAMPLES // len(mesh.h)))
-        t = _cut(mesh.edges, np.full(len(mesh.h), parts))
+        t = subdivided(mesh.edges, np.full(len(mesh.h), parts))
         x = mesh.states(plan.x, t)
         v = np.vstack([plan.pieces.inputs(plan.points, t, rate) for rate in range(self.node.depth + 1)])
         jets = np.vstack([x, np.array(self.node.function("motion", self.node.acceleration).map(len(t))(t[None], x, v))])
@@ -681,12 +682,6 @@ def _state_sizes(x, nq, span):
     for level, floor in ((slice(nq), 1.0), (slice(nq, None), 1.0 / (span[1] - span[0]))):
         ranges[level] = np.maximum(ranges[level], 1e-2 * (ranges[level].max(initial=0.0) or floor))
     return ranges
-
-
-def _cut(edges, counts):
-    """Edges with each interval cut into so many, (N,) int."""
-    pieces = [np.linspace(a, b, n + 1)[:-1] for a, b, n in zip(edges[:-1], edges[1:], counts, strict=True)]
-    return np.append(np.concatenate(pieces), edges[-1])
 
 
 def _no_rest(where, t, worst):

@@ -388,7 +388,7 @@ class Problem(FreeEntries):
             if defect.max() <= rtol:
                 return mesh, x
             pieces = np.ceil((defect / (AIM * rtol)) ** (1 / len(self.c))).astype(int)
-            finer = _cut(mesh, np.where(defect > AIM * rtol, np.clip(pieces, 2, MOST_PIECES), 1))
+            finer = subdivided(mesh, np.where(defect > AIM * rtol, np.clip(pieces, 2, MOST_PIECES), 1))
             if len(finer) > MOST_INTERVALS:
                 break
             x = self.at(self._nodes(finer), mesh, x)
@@ -591,7 +591,7 @@ def _graded(a, b, shortest, longest):
     return np.concatenate([a + beside[:-1], between, (b - beside[:-1])[::-1]])
 
 
-def _cut(mesh, counts):
+def subdivided(mesh, counts):
     """The mesh with each interval cut into so many, (N,) int."""
     pieces = [np.linspace(a, b, n + 1)[:-1] for a, b, n in zip(mesh[:-1], mesh[1:], counts, strict=True)]
     return np.append(np.concatenate(pieces), mesh[-1])
