@@ -72,6 +72,11 @@ def wished(mechanism, program):
     return ca.vertcat(*(ca.SX(program.toward.get(name, 0.0)) for name in mechanism.actuators))
 
 
+def wished_balance(mechanism, program):
+    """The balance under the wished actuation, r - E u_wish, (n,) SX: what the reaction B μ holds."""
+    return mechanism.balance - mechanism.E @ wished(mechanism, program)
+
+
 def _realised(mechanism, constraints, directions, actuation, points, among=None, **settled):
     """The realisation by a program's directions beside material rows; `among` are candidates for dependence."""
     n = mechanism.q.n

@@ -15,7 +15,7 @@ from servoctl.reduction.knots import Knots, Switches, require_smooth
 from servoctl.reduction.manifold import Context, Points, sample
 from servoctl.reduction.orders import Orders
 from servoctl.reduction.ranks import Rank, clean, decide, decide_all
-from servoctl.reduction.realisation import realisation, wished
+from servoctl.reduction.realisation import realisation, wished, wished_balance
 from servoctl.reduction.rows import Balance, as_rows, balances, merge_uses, settle_alone
 from servoctl.reduction.scales import ORDINARY, usual
 from servoctl.spec.mechanism import Mechanism, require_known
@@ -123,8 +123,8 @@ class Reduction(Packed):
 
     @cached_property
     def balance(self):
-        """The balance under the wished actuation, r - E u_wish, (n,) SX: what the reaction B μ holds."""
-        return self.mechanism.balance - self.mechanism.E @ wished(self.mechanism, self.program)
+        """The balance under the wished actuation, (n,) SX."""
+        return wished_balance(self.mechanism, self.program)
 
     @cached_property
     def flow(self):
@@ -189,7 +189,7 @@ def reduce(mechanism, program, guess=None, near=None, values=None):
     _require_parts(mechanism, program, guess)
     q = mechanism.q
     names = q.names if q.plain else q.velocity_names
-    balance = mechanism.balance - mechanism.E @ wished(mechanism, program)
+    balance = wished_balance(mechanism, program)
     forces = dict(zip(map(Balance, names), balance.elements(), strict=True))
     switches = Switches(q, {**program.residuals, **mechanism.constraints, **forces}, mechanism.parameters.symbols)
     values = mechanism.parameters.values() if values is None else np.asarray(values, dtype=float)

@@ -54,8 +54,8 @@ MUTANTS = {  # name: (file, old text, new text, tests)
         ("test_redundant_actuation.py",),
     ),
     "wishes with another sign": (
-        "reduction/reduce.py", "self.mechanism.balance - self.mechanism.E @ wished(",
-        "self.mechanism.balance + self.mechanism.E @ wished(", ("test_open_actuation.py",),
+        "reduction/realisation.py", "mechanism.balance - mechanism.E @ wished(",
+        "mechanism.balance + mechanism.E @ wished(", ("test_open_actuation.py",),
     ),
     "squares lose their middle term": (
         "jets/series.py", "inner = 0.0 if k % 2 else", "inner = 0.0 if k % 4 else",
