@@ -459,60 +459,78 @@ class Problem(FreeEntries):
             if not np.isfinite(size):
                 break
             x = x + step
-            if size <= NEWTON_ENDS or 0.1 * last < size <= STALLED:
+            following = size**2 if last == np.inf else size * (size / last) ** 2  # of quadratic convergence
+            if following <= NEWTON_ENDS or 0.1 * last < size <= STALLED:
                 return x
             last = size
         raise self._failure("Newton's method for the bounded motion does not converge.", self.span[0])
 
     def _newton_step(self, nodes, h, x):
-        """The Newton step (n_x, 1 + N s): stages are eliminated interval by interval, then the ends are solved for."""
+        """The Newton step (n_x, 1 + N s)."""
         rate, A, step, tangent = self.local(nodes, x)
         count, s, f = len(h), len(self.c), len(self.free)
         z = x[self.free].T
         stages, begin = z[1:].reshape(count, s, f), z[:-1:s]
         # D (ζ - z) - h z' = 0 with the increments ζ of the stages over the begin of their interval
-        length = h[:, None, None]
-        values = self.derivative @ (stages - begin[:, None]) - length * rate[1:].reshape(count, s, f)
+        missing = h[:, None, None] * rate[1:].reshape(count, s, f) - self.derivative @ (stages - begin[:, None])
+        at_ends = [(end.x[self.free] - z[i])[:, None] for i, end in ((0, self.first), (-1, self.last))]
+        dz = self.linear(h, A, missing.reshape(count * s, f, 1), at_ends)
+        return (step + (tangent @ dz)[:, :, 0]).T
+
+    def linear(self, h, A, right, at_ends):
+        """Solve the collocated ζ' = A ζ + b for k right sides: ζ (1 + N s, f, k) at the begin and at all nodes.
+
+        Stages are eliminated interval by interval, then the ends of the intervals are solved for.
+
+        Parameters
+        ----------
+        h : (N,) array
+            Lengths of the intervals [s].
+        A : (1 + N s, f, f) array
+        right : (N s, f, k) array
+            h b at the nodes.
+        at_ends : two (f, k) arrays
+            What the stable components at the begin, and the unstable ones at the end, are those of.
+        """
+        count, s, f, k = len(h), len(self.c), len(self.free), right.shape[2]
         K = np.tile(np.kron(self.derivative, np.eye(f)), (count, 1, 1)).reshape(count, s, f, s, f)
-        inside = A[1:].reshape(count, s, f, f)
+        inside, length = A[1:].reshape(count, s, f, f), h[:, None, None]
         for j in range(s):
             K[:, j, :, j] -= length * inside[:, j]
         onto_begin = np.tile(np.kron(self.derivative.sum(axis=1)[:, None], np.eye(f)), (count, 1, 1))
-        right = np.concatenate([-values.reshape(count, s * f, 1), onto_begin], axis=2)
-        eliminated = np.linalg.solve(K.reshape(count, s * f, s * f), right)
-        ends = self._solve_ends(eliminated[:, -f:, 0], eliminated[:, -f:, 1:], z)
-        inner = eliminated[:, :, 0] + (eliminated[:, :, 1:] @ ends[:-1, :, None])[:, :, 0]
-        dz = np.concatenate([ends[:1], inner.reshape(count * s, f)])
-        return (step + (tangent @ dz[:, :, None])[:, :, 0]).T
+        sides = np.concatenate([right.reshape(count, s * f, k), onto_begin], axis=2)
+        eliminated = np.linalg.solve(K.reshape(count, s * f, s * f), sides)
+        ends = self._solve_ends(eliminated[:, -f:, :k], eliminated[:, -f:, k:], at_ends)
+        inner = eliminated[:, :, :k] + eliminated[:, :, k:] @ ends[:-1]
+        return np.concatenate([ends[:1], inner.reshape(count * s, f, k)])
 
     @cached_property
     def _boundary_rows(self):
         """Left eigenvectors of the stable modes at the begin (k, f), and of the unstable ones at the end (f - k, f)."""
         return self.first.left_space(unstable=False), self.last.left_space(unstable=True)
 
-    def _solve_ends(self, constants, factors, z):
-        """Steps (N + 1, f) at the mesh points: dz_(i+1) = constants_i + factors_i dz_i between the boundary rows."""
+    def _solve_ends(self, constants, factors, at_ends):
+        """ζ (N + 1, f, k) at the mesh points: ζ_(i+1) = constants_i + factors_i ζ_i between the boundary rows."""
         from scipy.linalg import solve_banded
 
-        before, after = self._boundary_rows
-        count, f, k = len(constants), z.shape[1], len(before)
-        matrix, right = np.zeros((4 * f + 1, (count + 1) * f)), np.zeros((count + 1) * f)
+        rows = self._boundary_rows
+        (count, f, k), first = constants.shape, len(rows[0])
+        matrix, right = np.zeros((4 * f + 1, (count + 1) * f)), np.empty(((count + 1) * f, k))
 
         def put(rows, columns, values):
             matrix[2 * f + rows - columns, columns] = values
 
-        i, j = np.indices((k, f))
-        put(i, j, before)
-        right[:k] = -before @ (z[0] - self.first.x[self.free])
+        i, j = np.indices((first, f))
+        put(i, j, rows[0])
         n, i, j = np.indices((count, f, f))
-        put(k + n * f + i, n * f + j, -factors)
+        put(first + n * f + i, n * f + j, -factors)
         n, i = np.indices((count, f))
-        put(k + n * f + i, (n + 1) * f + i, 1.0)
-        right[k : k + count * f] = constants.ravel()
-        i, j = np.indices((f - k, f))
-        put(k + count * f + i, count * f + j, after)
-        right[k + count * f :] = -after @ (z[-1] - self.last.x[self.free])
-        return solve_banded((2 * f, 2 * f), matrix, right).reshape(count + 1, f)
+        put(first + n * f + i, (n + 1) * f + i, 1.0)
+        i, j = np.indices((f - first, f))
+        put(first + count * f + i, count * f + j, rows[1])
+        right[:first], right[first + count * f :] = (each @ part for each, part in zip(rows, at_ends, strict=True))
+        right[first : first + count * f] = constants.reshape(count * f, k)
+        return solve_banded((2 * f, 2 * f), matrix, right).reshape(count + 1, f, k)
 
     # between the nodes
 
