@@ -37,7 +37,7 @@ from servoctl.errors import (
 )
 from servoctl.inversion.equilibrium import RANK, Equilibria
 from servoctl.inversion.transcription import LONGEST, Mesh, Node, Transcription
-from servoctl.methods.bounded import subdivided
+from servoctl.methods.bounded import End, FreeEntries, subdivided
 from servoctl.methods.motion import breakpoints
 from servoctl.model.model import derive
 from servoctl.model.start import State
@@ -103,8 +103,9 @@ def relaxed(
         some 300 instants; `run.message` has what exceeds them between these.
     start : State, array or dict of str to float, optional
         Default: the rest at which the program is met. A dict may name some coordinates of a rest, or a whole state.
-    end : "rest", "free", or dict of str to float
-        "rest": a rest at which the program is met; the start is at rest then, too. Or values of states at the end.
+    end : "rest", "bounded", "free", or dict of str to float
+        "rest": a rest at which the program is met; the start is at rest then, too. "bounded": open, but for unstable
+        modes of the internal dynamics, which would grow until the end. "free": open. Or values of states at the end.
 
     Returns
     -------
@@ -128,12 +129,13 @@ def relaxed(
     """
     require_kind(Plant, "plant", plant, "sv.plant(mechanism)")
     require_kind(Program, "program", program, "sv.Program({...})")
-    task = Task(at_once(plant), program, as_span(t_span, forward=True), _all_limits(plant, limits), bounds, start, end)
+    limits = _all_limits(plant, limits)
+    relaxation = Relaxation(at_once(plant), program, as_span(t_span, forward=True), limits, bounds, start, end)
     several = None if isinstance(weight, Mapping) else as_list(weight)
     if several is None:
-        return task.run(_weights(weight, program))
+        return relaxation.run(_weights(weight, program))
     weights = positives("weight", several, "Write weight=[1e-6, 1e-8].")
-    return task.front(array_of("weight", weights, None).tolist())
+    return relaxation.front(array_of("weight", weights, None).tolist())
 
 
 def _weights(weight, program):
@@ -187,7 +189,7 @@ class Plan:
     beta: np.ndarray | None = None
 
 
-class Task:
+class Relaxation:
     """A plant, a program, and what limits the plan; `run` solves for weights."""
 
     def __init__(self, plant, program, span, limits, bounds, start, end):
@@ -198,9 +200,9 @@ class Task:
         self.node = Node(plant, program, self._bounded())
         self.equilibria = Equilibria(plant, program, self.node)
         self.begin, self.held = self._begin(start)
+        self.states, self.inputs, self.sizes = self._guess()
         self.target = self._target()
         self._require_bounds_at_ends()
-        self.states, self.inputs, self.sizes = self._guess()
 
     def _bounded(self):
         """Bounded quantities as expressions."""
@@ -309,9 +311,11 @@ class Task:
                     raise unknown(name, self.plant.state_names, "state")
                 open_[self.plant.state_names.index(name)] = finite(name, value, "value at the end")
             return open_, None, None
+        if isinstance(self.end, str) and self.end == "bounded":
+            return open_, None, self._without_growth()
         if not self._to_rest:
             raise SpecificationError(
-                f"end={self.end!r}.", "It is 'rest', 'free', or values of states by name.", end=self.end
+                f"end={self.end!r}.", "It is 'rest', 'bounded', 'free', or values of states by name.", end=self.end
             )
         t1 = self.span[1]
         self._require_standing(t1, "end")
@@ -329,6 +333,28 @@ class Task:
             return np.concatenate([rest[0], np.zeros(self.n - self.nq)]), held, None
         open_[self.nq :] = 0.0
         return open_, held, self._independent(rest)
+
+    def _without_growth(self):
+        """A function of (t, x, v): unstable modes of the internal dynamics, which are those of the guess at the end.
+
+        The exact plan from a start beside its bounded motion has modes that grow until the end. Their values there are
+        open to tiny changes of the program; fixed, they leave a layer of a few time constants at the end.
+        """
+        try:
+            model, x = self._exact_model, self.states[:, -1]
+            near = dict(zip(self.plant.state_names, x, strict=True))
+            near = {name: near.get(name, 0.0) for name in model.state_names}
+            state = np.asarray(model.start(self.span[1], guess=near).values)
+            entries = FreeEntries(model, self.span[1], state)
+        except ServoError:
+            return None
+        _, A, _, tangent = entries.local(np.array([self.span[1]]), state[:, None])
+        modes = End(self.span[1], state, A[0], entries.size[entries.free]).left_space(unstable=True)
+        places = [model.state_names.index(name) for name in self.plant.state_names]
+        rows = modes @ np.linalg.pinv(tangent[0][places])
+        if not len(rows):
+            return None
+        return self.node.function("unstable", ca.DM(rows) @ (self.node.state - ca.DM(x)))
 
     def _require_bounds_at_ends(self):
         """Refuse bounds that a fixed state at an end exceeds, whatever the inputs."""
@@ -360,15 +386,18 @@ class Task:
     # where the iteration begins
 
     @cached_property
+    def _exact_model(self):
+        """The model of the program with the plant's numbers, or the error of its derivation."""
+        model = derive(self.plant.mechanism, self.program)
+        names = self.plant.mechanism.parameters.names
+        return model.with_parameters(**dict(zip(names, self.plant.parameters, strict=False)))
+
+    @cached_property
     def _exact(self):
         """The exact plan of a program that determines the motion completely; None if there is none."""
         try:
-            model = derive(self.plant.mechanism, self.program)
-            names = self.plant.mechanism.parameters.names
-            model = model.with_parameters(**dict(zip(names, self.plant.parameters, strict=False)))
-            if not model.flat:
-                return None
-            return simulated(model, model.start(self.span[0]), self.span, progress=False)
+            model = self._exact_model
+            return simulated(model, model.start(self.span[0]), self.span, progress=False) if model.flat else None
         except ServoError:
             return None
 
@@ -618,7 +647,7 @@ class Task:
         }
         values, limits = nlp.constraints(w), bounds[2]
         count = len(values["rest"])
-        rows["rest"] = (["the rest at the end"] * count, mesh.edges[-1:], np.ones(count))
+        rows["rest"] = (["the condition at the end"] * count, mesh.edges[-1:], np.ones(count))
         for kind, (names, at, size) in rows.items():
             yield names, at, size, values[kind], *limits[kind]
 

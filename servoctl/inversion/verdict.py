@@ -62,6 +62,11 @@ class Verdict:
         object.__setattr__(self, "dynamics", self.dynamics or self.word)
 
     @property
+    def swings(self):
+        """Whether a rest has eigenvalues on the imaginary axis."""
+        return any(len(end.on_axis) for end in self.rest.values())
+
+    @property
     def growth(self):
         """How errors grow along the run, in words; "" without one."""
         said = "" if self.internal is None else self.internal.sentence().split("; ")[0]
@@ -256,7 +261,8 @@ def _judged(rest, internal, why, constants=()):
         if constants:
             reason += f"; 0 is the constant of {', '.join(constants)}"
             do = f"{' and '.join(constants)} determine velocities: if they have integrals, write these on coordinates"
-        return Verdict(MARGINAL, reason, do, **facts)
+        grows = grows or any(end.unstable_beyond_axis for end in rest.values())
+        return Verdict(GROWS if grows else MARGINAL, reason, do, **facts)
     counts = {end.unstable for end in rest.values()}
     if counts == {0}:
         return Verdict(GROWS if grows else MINIMUM, reason, **facts)

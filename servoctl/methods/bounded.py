@@ -187,6 +187,11 @@ class End:
         return int((self.eigenvalues.real > 0).sum())
 
     @property
+    def unstable_beyond_axis(self):
+        """The number of unstable eigenvalues that are not on the imaginary axis."""
+        return int((np.setdiff1d(self.eigenvalues, self.on_axis).real > 0).sum())
+
+    @property
     def fastest(self):
         """The magnitude of the fastest unstable eigenvalue [1/s], 0 without one."""
         return float(np.abs(self.eigenvalues[self.eigenvalues.real > 0]).max(initial=0.0))
@@ -195,7 +200,8 @@ class End:
         """An orthonormal basis (k, f) of the left eigenspace of the unstable, or of the stable eigenvalues."""
         from scipy.linalg import schur
 
-        _, vectors, count = schur(self.A.T, output="real", sort="rhp" if unstable else "lhp")
+        split, sign = np.abs(self.on_axis.real).max(initial=0.0), 1 if unstable else -1  # as rounding splits them
+        _, vectors, count = schur(self.A.T, output="real", sort=lambda re, im: sign * re > split)
         return vectors[:, :count].T
 
 
