@@ -236,6 +236,12 @@ STIFF = np.array([[0.0, 1.0], [-1e9, -1.0]])
         (np.array([[0.0, 1e7], [-1e-7, -1e-7]]), np.array([1e7, 1.0]), 0),
         (np.diag([1.0, -1e-8]), 1.0, 0),
         (STIFF, 1.0, 0),
+        (np.diag([-1e6, -1e-5]), 1.0, 0),
+        (np.array([[0.0, 1.0], [-10.0, -1e6]]), 1.0, 0),
+        (np.array([[0.0, 1.0], [1.0, -1e6]]), 1.0, 0),
+        (np.array([[0.0, 1.0], [0.0, -1e9]]), 1.0, 1),
+        (np.diag([-1e6, -1e-9]), 1.0, 1),  # 1e-15 of the fastest: the rounding of zero
+        (np.diag([-0.01, -0.01]) + np.eye(2, k=1), 1.0, 0),
     ],
 )
 def test_eigenvalues_on_the_axis(A, size, count):
@@ -406,6 +412,24 @@ SMOOTH_THERE = {
     "drag": (lambda x, y, v: -y - ca.fabs(v) * v, [1j, -1j]),
     "of the driven mass": (lambda x, y, v: -y - 0.2 * v + ca.fabs(x), [-0.1 + 0.99499j, -0.1 - 0.99499j]),
 }
+
+
+@pytest.mark.parametrize("name", KINKS)
+def test_a_run_that_stays_on_a_kink_is_inconclusive(name):
+    """At rest on a kink CasADi's slope is that of one side."""
+    model = sv.derive(*beside(KINKS[name], ca.SX(0)))
+    run = sv.simulate(model, model.start(), (0.0, 3.0))
+    assert run.internal["verdict"] == "inconclusive" and "stays on a switch" in run.internal["text"]
+    mechanism, program = beside(KINKS[name], ca.SX(0))
+    with refused(sv.UnstableInternalDynamics, "switch", verdict="inconclusive"):
+        sv.computed(run, sv.plant(mechanism), rate=100.0)
+
+
+@pytest.mark.parametrize("name", SMOOTH_THERE)
+def test_a_run_that_stays_beside_kinks_is_judged(name):
+    model = sv.derive(*beside(SMOOTH_THERE[name][0], ca.SX(0)))
+    run = sv.simulate(model, model.start(), (0.0, 20.0))
+    assert run.internal["verdict"] == ("neutral" if name == "drag" else "stable")
 
 
 @pytest.mark.parametrize("name", KINKS)

@@ -424,9 +424,9 @@ def _require_stable(plan):
     facts = {"verdict": internal.verdict, "growth": internal.growth, "eigenvalue": worst, "states": internal.names}
     if internal.verdict == "inconclusive":
         raise UnstableInternalDynamics(
-            f"The samples of the plan do not resolve whether the internal dynamics of {names} are stable.",
+            f"The internal dynamics of {names} are inconclusive: {internal.cause}.",
             "Exact linearisation makes them unobservable and does not stabilise them.",
-            do="Simulate the plan with more samples (t_eval), or use sv.lqr.",
+            do="Remove this cause, or use sv.lqr.",
             **facts,
         )
     raise UnstableInternalDynamics(

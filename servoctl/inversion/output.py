@@ -18,8 +18,8 @@ from servoctl.errors import (
     SpecificationError,
     UnstableInternalDynamics,
 )
-from servoctl.inversion.kinks import SMOOTHER, kink
 from servoctl.inversion.zeros import AT_REST, NEWTON, NO_COEFFICIENT, ZeroPolynomial
+from servoctl.methods.kinks import SMOOTHER, kink
 from servoctl.model.model import Model
 from servoctl.model.start import State
 from servoctl.simulation import simulate

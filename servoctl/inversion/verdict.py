@@ -11,8 +11,8 @@ import numpy as np
 
 from servoctl.errors import IntegrationStopped, ServoError, SingularProgram
 from servoctl.internal_dynamics import InternalDynamics, internal_dynamics
-from servoctl.inversion.kinks import SMOOTHER, kink
 from servoctl.methods.bounded import End, FreeEntries
+from servoctl.methods.kinks import SMOOTHER, kink, stays_on_kink
 from servoctl.model.model import Model
 from servoctl.model.start import State
 from servoctl.reduction.structure import margins
@@ -273,10 +273,7 @@ def _on_switch(model, motion, why):
     """The verdict where the program rests on a kink: by the growth along a run that leaves it."""
     if not isinstance(motion, Run):
         return Verdict(OPEN, why, f"pass a run that leaves it, along which errors are measured, or {SMOOTHER}")
-    x = motion.jets[: len(model.state_names)]
-    known = np.flatnonzero(np.isfinite(x).all(axis=0))
-    some = known[np.linspace(0, len(known) - 1, LOOKS).round().astype(int)]
-    if all(kink(model, motion.t[k], x[:, k]) for k in some):
+    if stays_on_kink(model, motion):
         return Verdict(OPEN, f"{why}; the run stays there", f"{SMOOTHER}, or begin beside it")
     internal = internal_dynamics(model, motion)
     return _along(internal, why, {"internal": internal})

@@ -27,7 +27,7 @@ from servoctl.methods.accuracy import state_levels
 from servoctl.methods.motion import DEFAULT_SAMPLES, Motion, breakpoints, margin_at
 from servoctl.methods.radau import basis, radau
 from servoctl.model.switching import switching
-from servoctl.tolerances import CUTOFF, NOISE
+from servoctl.tolerances import CUTOFF, NOISE, TINY
 
 ORDER = 13  # of the collocation: seven nodes
 LONGEST = 4.0  # interval of the first mesh beside corners, in time constants of the fastest mode
@@ -170,16 +170,29 @@ class End:
 
         Real parts alone do not tell: those of multiple eigenvalues are far larger than the rounding that splits them.
         Halfway between such an eigenvalue and the axis A is as near to singular; between different ones it is not.
+        Nor does the size of A: a slow mode beside a fast one moves by what each entry's rounding moves it by.
         """
         from scipy.linalg import matrix_balance
 
         scaled = self.A * self.size / self.size[:, None]
-        scaled = np.where(np.abs(scaled) > NOISE * np.abs(scaled).max(initial=0.0), scaled, 0.0)
-        balanced, one = matrix_balance(scaled, permute=False)[0], np.eye(len(scaled))
+        cut = np.where(np.abs(scaled) > NOISE * np.abs(scaled).max(initial=0.0), scaled, 0.0)
+        balanced, (scale, _) = matrix_balance(cut, permute=False, separate=True)
         size = np.linalg.norm(balanced)
         path = np.stack([1j * self.eigenvalues.imag, self.eigenvalues - self.eigenvalues.real / 2], axis=1)
-        distances = np.linalg.svd(balanced - path[:, :, None, None] * one, compute_uv=False)[:, :, -1]
-        return self.eigenvalues[distances.max(axis=1) <= HYPERBOLIC * size]
+        shifted = balanced - path[:, :, None, None] * np.eye(len(scaled))
+        distances = np.linalg.svd(shifted, compute_uv=False)[:, :, -1].max(axis=1)
+        moved = self._moved(scaled * scale / scale[:, None], HYPERBOLIC * np.abs(balanced) + NOISE * size)
+        return self.eigenvalues[(distances <= HYPERBOLIC * size) & (np.abs(self.eigenvalues.real) <= moved)]
+
+    @staticmethod
+    def _moved(A, change):
+        """The most by which a change of its entries (f, f) moves each eigenvalue of A, |y|ᵀ change |x| / |yᴴx|, (f,)."""
+        from scipy.linalg import eig
+
+        values, left, right = eig(A, left=True)
+        moved = np.einsum("ik,ij,jk->k", np.abs(left), change, np.abs(right))
+        moved = moved / np.maximum(np.abs(np.einsum("ik,ik->k", left.conj(), right)), TINY)
+        return moved[np.lexsort((-values.imag, -values.real))]
 
     @property
     def unstable(self):
