@@ -104,6 +104,21 @@ def test_a_program_that_is_singular_at_rest_gets_a_relaxed_plan():
     assert np.degrees(np.abs(run["theta"]).max()) < 7.665
 
 
+def test_a_start_near_a_rest_serves_relaxed_plans_too():
+    """A load on an elastic rope, whose rest is stretched by m g/k = 9.81 mm."""
+    q = sv.coordinates("x l theta")
+    x, l, theta = q
+    load = (x + l * ca.sin(theta), -l * ca.cos(theta))
+    S = sv.particle(q, 10.0, (x, 0)) + sv.particle(q, 100.0, load)
+    V = 981.0 * load[1] + 1e5 * (l - 4.0) ** 2 / 2
+    mechanism = sv.Mechanism(q, gibbs=S, potential=V, forces={"l": -200.0 * q.d(1)[1]}, actuators={"F": x})
+    program = sv.Program({"X": load[0] - sv.paths.rest_to_rest(q.t, 0.0, 3.0, 6.0)})
+    run = sv.inverse(mechanism, program, (0.0, 6.0), start={"l": 4.0})
+    assert said(run).startswith("relaxed, as the program is singular at rest")
+    assert run["l"][[0, -1]] == pytest.approx(4.0 + 981.0 / 1e5, abs=1e-9)
+    assert np.abs(run.residual["X"]).max() < 3e-3 and sv.verify(run.model, run).passed
+
+
 def test_a_marginal_program_is_integrated_forward_and_says_that_it_swings_on():
     """The pole of 0.7 m on a cart that moves by a metre in 2 s: 0.7 a'' = -(g sin a + x'' cos a), by SciPy."""
     with warned("marginal", "goes on", "da = -1.3", "method='relaxed'"):

@@ -8,8 +8,15 @@ import casadi as ca
 import numpy as np
 
 from servoctl.checks import as_span, interval, mapping, numbers_by_name, positive_number, require_kind
-from servoctl.errors import IntegrationStopped, ServoError, SingularProgram, SpecificationError, unknown
-from servoctl.inversion.relaxed import relaxed
+from servoctl.errors import (
+    InconsistentStart,
+    IntegrationStopped,
+    ServoError,
+    SingularProgram,
+    SpecificationError,
+    unknown,
+)
+from servoctl.inversion.relaxed import relaxed, rest_near
 from servoctl.inversion.report import extremes
 from servoctl.inversion.verdict import (
     FLAT,
@@ -164,7 +171,7 @@ class Request:
         if not isinstance(self.start, State) and (begin is None or method is None and "start" in found.rest):
             rest = found.rest["start"].x.tolist() if "start" in found.rest else ()
             guess = dict(zip(model.state_names, rest, strict=False)) or _of_states(model, self.start or {})
-            begin = model.start(self.span[0], guess=guess)  # or the error that tells why there is no start
+            begin = model.start(self.span[0], guess=guess)  # or the error that says why there is no start
         with warnings.catch_warnings():  # growth is part of the verdict
             warnings.filterwarnings("ignore", "Internal dynamics unstable")
             return simulate(model, begin, self.span, method)
@@ -178,13 +185,9 @@ class Request:
         tries = [({}, ""), ({"end": "bounded"}, END_MOVES)] if not swings else [({"end": "bounded"}, END_SWINGS)]
         tries = [] if moving else [({"start": self.start} | ends, note) for ends, note in tries]
         tries += [({"start": begin, "end": "bounded"}, END_MOVES)] if begin is not None else []
-        limits, bounds = self.ranges
         for k, (ends, note) in enumerate(tries):
             try:
-                run = relaxed(
-                    plant(self.mechanism), self.program, self.span, weight=self.weight, limits=limits, bounds=bounds,
-                    **ends,
-                )  # fmt: skip
+                run = self._planned(**ends)
             except SpecificationError as error:
                 if "rate" not in error.details or k + 1 == len(tries):
                     raise
@@ -194,6 +197,20 @@ class Request:
                 raise _no_plan(why, error) from error
             else:
                 return _with_reason(run, why, note)
+
+    def _planned(self, start, **end):
+        """The relaxed plan; from the rest near values of coordinates, where there is none with exactly these."""
+        limits, bounds = self.ranges
+        full = plant(self.mechanism)
+        options = {"weight": self.weight, "limits": limits, "bounds": bounds, **end}
+        try:
+            return relaxed(full, self.program, self.span, start=start, **options)
+        except InconsistentStart:
+            values = isinstance(start, Mapping) and {*start} <= {*self.mechanism.q.names}
+            near = rest_near(full, self.program, self.span[0], start) if values else None
+            if near is None:
+                raise
+            return relaxed(full, self.program, self.span, start=near, **options)
 
 
 def _no_plan(why, error):

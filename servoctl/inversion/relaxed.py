@@ -55,7 +55,7 @@ INTERVALS = 24  # of the first mesh at least
 FIRST = 1e-3  # first weight, relative to that for which standing still costs as much as the program
 DEFAULT = 1e-6  # default weight, relative to the same
 FACTOR = 100.0  # between the weights of two successive solutions
-EXCEEDED = 1e-6  # of a bound: excess between its instants that a run tells, and at the ends that is refused
+EXCEEDED = 1e-6  # of a bound: excess between its instants that a run reports, and at the ends that is refused
 COARSE = 1e-6  # defect with which no plan is returned
 DEFECT, AIM = 1e-7, 0.1  # of the states between nodes, relative to their sizes; and what refinement aims at of it
 PLACES = (0.12, 0.4, 0.75)  # places within an interval where the defect is measured
@@ -136,6 +136,28 @@ def relaxed(
         return relaxation.run(_weights(weight, program))
     weights = positives("weight", several, "Write weight=[1e-6, 1e-8].")
     return relaxation.front(array_of("weight", weights, None).tolist())
+
+
+def rest_near(plant, program, t, start):
+    """The coordinates of a rest at which a program is met, near values of some of them; None if there is none.
+
+    Parameters
+    ----------
+    plant : Plant
+    program : Program
+    t : float
+        [s]
+    start : dict of str to float
+
+    Returns
+    -------
+    dict of str to float or None
+    """
+    names = plant.mechanism.q.names
+    node = Node(at_once(plant), program, {})
+    near = np.array([start.get(name, 0.0) for name in names])
+    rest, _ = Equilibria(at_once(plant), program, node).at(t, near, np.zeros(len(plant.inputs)))
+    return None if rest is None else dict(zip(names, rest[0].tolist(), strict=True))
 
 
 def _weights(weight, program):
@@ -337,7 +359,7 @@ class Relaxation:
     def _without_growth(self):
         """A function of (t, x, v): unstable modes of the internal dynamics, which are those of the guess at the end.
 
-        The exact plan from a start beside its bounded motion has modes that grow until the end. Their values there are
+        The exact plan from a start near its bounded motion has modes that grow until the end. Their values there are
         open to tiny changes of the program; fixed, they leave a layer of a few time constants at the end.
         """
         try:

@@ -21,8 +21,8 @@ from servoctl.run import Run
 FLAT, MINIMUM, MARGINAL, SINGULAR = "flat", "minimum phase", "marginal", "singular at rest"
 HYPERBOLIC_ZEROS, GROWS = "non-minimum phase (hyperbolic)", "non-minimum phase"
 UNDETERMINED, UNREALISABLE, OPEN = "undetermined", "not realisable", "inconclusive"
-LOOKS = 5  # instants beside a path at which the program must stand still for its end to be a rest
-ASIDE = 0.25  # of the path's length: how far beside it they lie
+LOOKS = 5  # instants before and after a path at which the program must stand still for its end to be a rest
+ASIDE = 0.25  # of the path's length: how far from it they lie
 AT_ZERO = 1e-6  # of the fastest eigenvalue: a smaller one is zero, which rounding splits where it is double
 NEAR = 0.1  # of the sizes of the free entries: distance within which a run begins or ends in an unstable rest
 
@@ -204,13 +204,13 @@ def _rests(model, states, along):
         entries = FreeEntries(model, t0, first)
     except ServoError as error:
         return rest, _first_sentence(error)
-    for name, t, x, beside in places[: 2 if t1 != t0 else 1]:
+    for name, t, x, around in places[: 2 if t1 != t0 else 1]:
         try:
             end = entries.equilibrium(t, rest["start"].x if rest else x)
         except IntegrationStopped as error:
             why = why or f"at t = {t:.4g} s: {_first_sentence(error)}"
             continue
-        moved = entries.moved(end, t + _reach(end, t1 - t0) * beside)
+        moved = entries.moved(end, t + _reach(end, t1 - t0) * around)
         far = along and end.unstable and np.abs((end.x - x) / entries.size)[entries.free].max() > NEAR
         if moved is None and not far and not _lost_rank(model, t, end.x):
             rest[name] = end
@@ -220,7 +220,7 @@ def _rests(model, states, along):
 
 
 def _reach(end, length):
-    """How far beside a rest the program must stand still [s]: a part of the path, or the time constant of a mode."""
+    """How long the program must stand still around a rest [s]: a part of the path, or the time constant of a mode."""
     fastest = np.abs(end.eigenvalues).max(initial=0.0)
     return ASIDE * abs(length) or (1 / fastest if fastest else 1.0)
 
@@ -274,7 +274,7 @@ def _on_switch(model, motion, why):
     if not isinstance(motion, Run):
         return Verdict(OPEN, why, f"pass a run that leaves it, along which errors are measured, or {SMOOTHER}")
     if stays_on_kink(model, motion):
-        return Verdict(OPEN, f"{why}; the run stays there", f"{SMOOTHER}, or begin beside it")
+        return Verdict(OPEN, f"{why}; the run stays there", f"{SMOOTHER}, or begin off it")
     internal = internal_dynamics(model, motion)
     return _along(internal, why, {"internal": internal})
 

@@ -3,7 +3,7 @@
 Σ o_a entries z of the state are free, the invariants determine the others, and z' = f(t, z). Before and after its span
 the program stands still, so that f is autonomous there, with equilibria. The bounded motion leaves the first one along
 its unstable manifold and arrives at the other along its stable one: the components of z along the stable eigenspace
-are zero at the begin of a window that exceeds the span, those along the unstable one at its end (Devasia, Chen and
+are zero at the start of a window that exceeds the span, those along the unstable one at its end (Devasia, Chen and
 Paden 1996; Chen 1993). Collocation at the nodes of Radau IIA of order 13 turns this into equations for one banded
 Newton iteration with exact Jacobians; a mesh is refined until the defect between the nodes is below the tolerance.
 """
@@ -30,7 +30,7 @@ from servoctl.model.switching import switching
 from servoctl.tolerances import CUTOFF, NOISE, TINY
 
 ORDER = 13  # of the collocation: seven nodes
-LONGEST = 4.0  # interval of the first mesh beside corners, in time constants of the fastest mode
+LONGEST = 4.0  # interval of the first mesh at corners, in time constants of the fastest mode
 FIRST_INTERVALS = 1000  # of a first mesh that need not resolve its fastest modes everywhere
 COARSEST = 10.0  # interval in time constants of the fastest unstable mode, up to which the collocation lets it grow
 MOST_INTERVALS = 4000
@@ -168,9 +168,9 @@ class End:
     def on_axis(self):
         """The eigenvalues on the imaginary axis: A is as near to a matrix with one there as rounding is.
 
-        Real parts alone do not tell: those of multiple eigenvalues are far larger than the rounding that splits them.
+        Real parts alone do not decide: those of multiple eigenvalues are far larger than the rounding that splits them.
         Halfway between such an eigenvalue and the axis A is as near to singular; between different ones it is not.
-        Nor does the size of A: a slow mode beside a fast one moves by what each entry's rounding moves it by.
+        Nor does the size of A: rounding of each entry moves a slow mode by less than that of a fast one.
         """
         from scipy.linalg import matrix_balance
 
@@ -186,7 +186,7 @@ class End:
 
     @staticmethod
     def _moved(A, change):
-        """The most by which a change of its entries (f, f) moves each eigenvalue of A, |y|ᵀ change |x| / |yᴴx|, (f,)."""
+        """The most by which a change of entries (f, f) moves each eigenvalue of A, |y|ᵀ change |x| / |yᴴx|, (f,)."""
         from scipy.linalg import eig
 
         values, left, right = eig(A, left=True)
@@ -358,7 +358,7 @@ class Problem(FreeEntries):
         unstable = [end.unstable for end in (self.first, self.last)]
         if unstable[0] != unstable[1]:
             raise UnstableInternalDynamics(
-                f"The internal dynamics have {unstable[0]} unstable modes at the begin, {unstable[1]} at the end.",
+                f"The internal dynamics have {unstable[0]} unstable modes at the start, {unstable[1]} at the end.",
                 "An isolated bounded motion has as many at both ends.",
                 do="Begin and end in equilibria of the same kind.",
                 unstable=unstable,
@@ -432,7 +432,7 @@ class Problem(FreeEntries):
             mesh = np.unique([t for a, b in pairwise(corners) for t in _graded(a, b, shortest, longest)])
             if len(mesh) <= MOST_INTERVALS or shortest == longest:
                 return mesh
-            shortest = min(2 * shortest, longest)  # beside many knots, layers are left to refinement
+            shortest = min(2 * shortest, longest)  # with many knots, layers are left to refinement
 
     def _require_resolved(self, window, longest):
         """Refuse a window in which the unstable modes need intervals too short for a mesh."""
@@ -455,9 +455,9 @@ class Problem(FreeEntries):
         return np.unique(np.concatenate([before, mesh, after]))
 
     def _lengths(self, window):
-        """Lengths [s] of first intervals, beside corners and between them.
+        """Lengths [s] of first intervals, at corners and between them.
 
-        Stable modes have layers beside corners; unstable ones must grow in every interval, as they do in truth.
+        Stable modes have layers at corners; unstable ones must grow in every interval, as they do in truth.
         """
         fastest = max(np.abs(end.eigenvalues).max(initial=0.0) for end in (self.first, self.last))
         unstable = max(self.first.fastest, self.last.fastest)
@@ -497,7 +497,7 @@ class Problem(FreeEntries):
         return (step + (tangent @ dz)[:, :, 0]).T
 
     def linear(self, h, A, right, at_ends):
-        """Solve the collocated ζ' = A ζ + b for k right sides: ζ (1 + N s, f, k) at the begin and at all nodes.
+        """Solve the collocated ζ' = A ζ + b for k right sides: ζ (1 + N s, f, k) at the start and at all nodes.
 
         Stages are eliminated interval by interval, then the ends of the intervals are solved for.
 
@@ -509,7 +509,7 @@ class Problem(FreeEntries):
         right : (N s, f, k) array
             h b at the nodes.
         at_ends : two (f, k) arrays
-            What the stable components at the begin, and the unstable ones at the end, are those of.
+            What the stable components at the start, and the unstable ones at the end, are those of.
         """
         count, s, f, k = len(h), len(self.c), len(self.free), right.shape[2]
         K = np.tile(np.kron(self.derivative, np.eye(f)), (count, 1, 1)).reshape(count, s, f, s, f)
@@ -525,7 +525,7 @@ class Problem(FreeEntries):
 
     @cached_property
     def _boundary_rows(self):
-        """Left eigenvectors of the stable modes at the begin (k, f), and of the unstable ones at the end (f - k, f)."""
+        """Left eigenvectors of the stable modes at the start (k, f), and of the unstable ones at the end (f - k, f)."""
         return self.first.left_space(unstable=False), self.last.left_space(unstable=True)
 
     def _solve_ends(self, constants, factors, at_ends):
@@ -620,12 +620,12 @@ def _two_digits(length):
 
 
 def _graded(a, b, shortest, longest):
-    """A mesh from a to b: intervals grow by a factor of two from `shortest` beside both ends to `longest`."""
+    """A mesh from a to b: intervals grow by a factor of two from `shortest` at both ends to `longest`."""
     doubled = shortest * (2.0 ** np.arange(np.ceil(np.log2(longest / shortest))) * 2 - 1)
-    beside = np.append(0.0, doubled[3 * doubled < b - a])
-    low, high = a + beside[-1], b - beside[-1]
+    layer = np.append(0.0, doubled[3 * doubled < b - a])
+    low, high = a + layer[-1], b - layer[-1]
     between = np.linspace(low, high, max(1, int(np.ceil((high - low) / longest))) + 1)
-    return np.concatenate([a + beside[:-1], between, (b - beside[:-1])[::-1]])
+    return np.concatenate([a + layer[:-1], between, (b - layer[:-1])[::-1]])
 
 
 def subdivided(mesh, counts):

@@ -1,7 +1,7 @@
 """The tangent of a bounded motion: the linear boundary value problem of its variational equation.
 
 The free entries z of the state obey z' = f(t, z, p), so that their tangent obeys δz' = A δz + b with A = ∂f/∂z and
-b = ∂f/∂p. It is bounded if its stable components at the begin of the window, and its unstable ones at the end, are
+b = ∂f/∂p. It is bounded if its stable components at the start of the window, and its unstable ones at the end, are
 those of the equilibria, δz = -A⁻¹ b. It is collocated at the nodes of the motion itself.
 """
 
@@ -31,7 +31,7 @@ def bounded_tangent(model, run, names):
     Raises
     ------
     SpecificationError
-        If the samples do not tell the window of the motion.
+        If the samples do not determine the window of the motion.
     """
     problem, mesh, x = _recomputed(model, run)
     at_nodes = _Linear(problem, names, problem._nodes(mesh), x)
