@@ -16,8 +16,9 @@ from servoctl.errors import (
     SpecificationError,
     unknown,
 )
-from servoctl.inversion.relaxed import relaxed, rest_near
+from servoctl.inversion.relaxed import relaxed
 from servoctl.inversion.report import extremes
+from servoctl.inversion.transfer import rest_near
 from servoctl.inversion.verdict import (
     FLAT,
     GROWS,
