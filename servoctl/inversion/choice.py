@@ -316,11 +316,8 @@ def _swinging(run):
     if name is None or parts[name] <= SWINGS_ON:
         return ""
     what = f"the internal motion goes on after it, with {name} = {speeds[name][-1]:.3g} at t = {run.t[-1]:.4g} s"
-    warnings.warn(
-        f"The program is marginal, and {what}. method='relaxed' rests at both ends, as near to the program as that is.",
-        RuntimeWarning,
-        stacklevel=5,
-    )
+    do = "" if run.model.ideal else " method='relaxed' rests at both ends, as near to the program as that is."
+    warnings.warn(f"The program is marginal, and {what}.{do}", RuntimeWarning, stacklevel=5)
     return f"; {what}"
 
 

@@ -175,9 +175,7 @@ class Transfer:
             )
         t1 = self.span[1]
         self._require_standing(t1, "end")
-        rests = self.equilibria.along(np.linspace(*self.span, 101)[1:], self.begin[: self.nq], self.held)
-        known = rests[:, np.isfinite(rests).all(axis=0)]
-        last = known[:, -1] if known.size else np.concatenate([self.begin[: self.nq], self.held])
+        last = np.concatenate([self.states[: self.nq, -1], self.inputs[:, -1]])
         rest, worst = self.equilibria.at(t1, last[: self.nq], last[self.nq :])
         if rest is None:
             raise _no_rest("end", t1, worst)
@@ -294,24 +292,25 @@ class Transfer:
         mechanism = self.plant.mechanism
         forces = self.node.known(mechanism.mass), self.node.known(mechanism.E)
         motion = self.node.function("motion", self.node.acceleration, *forces)
-        rate, zero = np.gradient(q, times, axis=1), np.zeros(self.m * self.node.depth)
-        w = np.zeros((self.n - self.nq, len(times)))
-        for k, t in enumerate(times):
-            x, v = np.concatenate([q[:, k], w[:, k]]), np.append(u[:, k], zero)
-            V, h = (np.array(part) for part in kinematics(t, x, v))
-            w[:, k] = np.linalg.lstsq(V, rate[:, k] - h.ravel(), rcond=None)[0]
-        accelerations = np.gradient(w, times, axis=1)
-        for k, t in enumerate(times):
-            x, v = np.concatenate([q[:, k], w[:, k]]), np.append(u[:, k], zero)
-            present, M, E = (np.array(part) for part in motion(t, x, v))
-            inertial = M @ (accelerations[:, k] - present.ravel())
-            u[:, k] += np.linalg.lstsq(E, inertial, rcond=None)[0]
+        rate = np.gradient(q, times, axis=1)
+        v = np.vstack([u, np.zeros((self.m * self.node.depth, len(times)))])
+        V, h = _at_each(kinematics, times, np.vstack([q, np.zeros((self.n - self.nq, len(times)))]), v)
+        w = (np.linalg.pinv(V) @ (rate.T[:, :, None] - h))[:, :, 0].T
+        present, M, E = _at_each(motion, times, np.vstack([q, w]), v)
+        inertial = M @ (np.gradient(w, times, axis=1).T[:, :, None] - present)
+        u = u + (np.linalg.pinv(E) @ inertial)[:, :, 0].T
         return np.vstack([q, w]), u
 
     @property
     def begin_inputs(self):
         """Inputs that hold the start at rest (m,), or zeros."""
         return np.zeros(self.m) if self.held is None else self.held
+
+
+def _at_each(f, t, x, v):
+    """Values of a function of (t, x, v) at instants (N,): an (N, rows, columns) array for each output."""
+    values = f.map(len(t))(t[None], x, v)
+    return [np.array(part).reshape(part.size1(), len(t), -1).swapaxes(0, 1) for part in values]
 
 
 def rest_near(plant, program, t, start):
