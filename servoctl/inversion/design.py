@@ -166,9 +166,12 @@ def design(
     motions = Motions(model, tuple(ranges), _span(model, t_span, ranges), (mapping(start, "The start"), guess))
     with progress_bar("design", None, unit=" motions") as bar:
         motions.count = bar.update
-        found = Search(motions, np.array(list(ranges.values())), minimise, sizes, limits).found()
+        try:
+            found = Search(motions, np.array(list(ranges.values())), minimise, sizes, limits).found()
+        except NoMotion as failure:
+            raise failure.error from None
     if found.gain > STATIONARY:
-        warnings.warn(f"{found.message[0].upper()}{found.message[1:]}.", RuntimeWarning, stacklevel=2)
+        warnings.warn(f"The design is {found.message}.", RuntimeWarning, stacklevel=2)
     return found
 
 
@@ -268,7 +271,7 @@ class Motions:
             elif found.dynamics == GROWS:
                 raise _unstable(found)
             self.guess = dict(zip(model.state_names, np.asarray(begin.values).tolist(), strict=False))
-        first = self.run(self.numbers)
+        first = self.run(model)
         self.guess = dict(zip(model.state_names, np.asarray(first.start.values).tolist(), strict=False))
         if not model.flat and self.method is None:
             free = sensitivity(first.model, first, model.state_names[0], names).independent
@@ -287,11 +290,14 @@ class Motions:
         t1, slopes = self.end(list(numbers.values()))
         return float(t1), np.array(slopes).ravel()
 
-    def run(self, p, times=None):
-        """The motion with parameters p (k,) at times (N,)."""
+    def with_parameters(self, p):
+        """The model with parameters p (k,)."""
+        return self.model.with_parameters(**dict(zip(self.names, p.tolist(), strict=True)))
+
+    def run(self, model, times=None):
+        """The motion of a model with other parameters at times (N,)."""
         self.count()
-        model = self.model.with_parameters(**dict(zip(self.names, p.tolist(), strict=True)))
-        t1, _ = self.ends(p)
+        t1, _ = self.ends([model.numbers[name] for name in self.names])
         if not t1 > self.t0:
             raise SpecificationError(
                 f"The motion ends at t = {t1:.6g} s and begins at {self.t0:g} s.",
@@ -399,20 +405,19 @@ class Search:
         return self._known(np.ascontiguousarray(v, dtype=float).tobytes())
 
     def _local(self, v):
-        p = self.parameters(v)
         self.evaluated += 1
         try:
-            return self._signals_of(p)
+            return self._signals_of(self.parameters(v))
         except ServoError as error:
             raise NoMotion(v, error) from error
 
     def _signals_of(self, p):
-        t1, end_slopes = self.motions.ends(p)
+        model, (t1, end_slopes) = self.motions.with_parameters(p), self.motions.ends(p)
         fixed = self.nodes.at(self.motions.t0, t1)
-        edges = [k for k in self.motions.model.with_parameters(**self._by_name(p)).knots if fixed[0] < k < fixed[-1]]
+        edges = [k for k in model.knots if fixed[0] < k < fixed[-1]]
         t, weights = _quadrature([fixed[0], *edges, fixed[-1]], self.panels)
         times, where = np.unique(np.concatenate([fixed, t]), return_inverse=True)
-        run = self.motions.run(p, times)
+        run = self.motions.run(model, times)
         tangents = sensitivity(run.model, run, self.signals, self.motions.names)
         y = np.array([run[name] for name in self.signals])
         dy = np.array([[tangents[name, to] for to in self.motions.names] for name in self.signals]).swapaxes(1, 2)
@@ -467,10 +472,10 @@ class Search:
         """The design; solved with more nodes and panels until nothing is exceeded between them."""
         motions = self.motions
         v = (motions.numbers - self.low) / self.width
-        before = self.measured(v, motions.run(motions.numbers))
+        before = self.measured(v, motions.run(motions.model))
         for _ in range(ROUNDS):
             v = self.feasible(self.solved(v, self.minimise))
-            plan = motions.run(self.parameters(v))
+            plan = motions.run(motions.with_parameters(self.parameters(v)))
             times = self.exceeding(v, plan)
             doubled = self.minimise == "rms" and self.refined(v)
             if not times and not doubled:
@@ -529,7 +534,7 @@ class Search:
             return v
         least = self.solved(v, "excess")
         if self.within(least)[0].min() < -INSIDE:
-            raise self.beyond(self.motions.run(self.parameters(least)))
+            raise self.beyond(self.motions.run(self.motions.with_parameters(self.parameters(least))))
         again = self.solved(least, self.minimise)
         return again if self.within(again)[0].min() >= -INSIDE else least
 
@@ -555,8 +560,8 @@ class Search:
                     raise failure.error from None
                 continue
             v = np.clip(x, low, high)
-            inside = ((v > low) | (low == 0.0)) & ((v < high) | (high == 1.0))
-            if inside.all():
+            edge = SMALLEST * (high - low)
+            if np.all(((v > low + edge) | (low == 0.0)) & ((v < high - edge) | (high == 1.0))):
                 break
             region *= 2
         return v
