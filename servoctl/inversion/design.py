@@ -30,15 +30,16 @@ from servoctl.sensitivities.sensitivity import sensitivity
 from servoctl.simulation import judged, simulated
 from servoctl.verification import Verification, verify
 
-COSTS = ("rms", "peak", "time")
-NODES = 100  # instants of the motion at which inequalities hold, before extrema between them are added
-PANELS, GAUSS = 32, np.polynomial.legendre.leggauss(8)  # of the quadrature, in which knots are ends of panels
+MINIMISED = ("rms", "peak", "time")
+FIRST_NODES = 100  # instants of the motion at which inequalities hold, before extrema between them are added
+SQUARE_PANELS, EIGHT_NODES = 32, np.polynomial.legendre.leggauss(8)  # of the quadrature; knots end panels
 QUADRATURE = 1e-8  # of a mean square: error of its quadrature, beyond which it gets twice as many panels
-INSIDE = 1e-6  # of a limit: by which inequalities at nodes are stricter, and by which a peak may exceed that at nodes
-ROUNDS = 12  # of the search, each with more nodes or panels than the one before
-ATTEMPTS = 30  # of one search, each in a smaller or larger region around the best motion
-SMALLEST = 1e-6  # of the ranges: region without a motion next to one with a motion
-CONVERGED = 1e-12  # change of the cost, relative to that before, with which sequential quadratic programming ends
+SAFELY_INSIDE = 1e-6  # of a limit: by which it is stricter at nodes, and by which a peak may exceed that at nodes
+SEARCHES = 12  # of the search, each with more nodes or panels than the one before
+REGIONS = 30  # of one search, each in a smaller or larger region around the best motion
+SMALLEST_REGION = 1e-6  # of the ranges: region without a motion next to one with a motion
+QUADRATIC_PROGRAMS = 200  # of sequential quadratic programming in one region
+UNCHANGED = 1e-12  # change of the cost, relative to that before, with which sequential quadratic programming ends
 ACTIVE = 1e-5  # distance from an inequality, relative to the limit, within which it counts as met
 STATIONARY = 1e-4  # of the cost: largest first-order gain across the ranges at a local minimum
 
@@ -153,9 +154,9 @@ def design(
         If the search ends where the cost still has a gradient.
     """
     require_kind(Model, "model", model, "sv.derive(mechanism, program)")
-    named(minimise, COSTS, "cost")
-    ranges = _ranges(model, vary)
-    sizes, limits = _sizes(model, of), _limits(model, limits)
+    named(minimise, MINIMISED, "cost")
+    ranges = _varied(model, vary)
+    sizes, limits = _sized(model, of), _limited(model, limits)
     if minimise == "time" and not limits:
         raise SpecificationError(
             "The time is minimised without limits.",
@@ -175,7 +176,7 @@ def design(
     return found
 
 
-def _ranges(model, vary):
+def _varied(model, vary):
     """The ranges of parameters by name, (low, high)."""
     if not mapping(vary, "The parameters that are varied"):
         raise SpecificationError(
@@ -198,7 +199,7 @@ def _ranges(model, vary):
     return ranges
 
 
-def _sizes(model, of):
+def _sized(model, of):
     """The signals whose actuation counts, with their sizes."""
     if of is None:
         kinds = model.signal_groups
@@ -209,7 +210,7 @@ def _sizes(model, of):
     return {named(name, known, "signal"): 1.0 for name in texts(of, "The signals")}
 
 
-def _limits(model, limits):
+def _limited(model, limits):
     """(low, high) by signal."""
     known = (*model.jet_names, *model.signal_groups)
     for name in mapping(limits, "The limits"):
@@ -269,7 +270,7 @@ class Motions:
                 begin = replace(begin, values=np.array(getattr(rest, "x", begin.values)))
                 self.method, self.held = Bounded(), {}
             elif found.dynamics == GROWS:
-                raise _unstable(found)
+                raise _growing(found)
             self.guess = dict(zip(model.state_names, np.asarray(begin.values).tolist(), strict=False))
         first = self.run(model)
         self.guess = dict(zip(model.state_names, np.asarray(first.start.values).tolist(), strict=False))
@@ -312,7 +313,7 @@ class Motions:
         return simulated(model, begin, (self.t0, t1), self.method, t_eval=times, progress=False)
 
 
-def _unstable(found):
+def _growing(found):
     return UnstableInternalDynamics(
         f"The program is {found}.",
         "A design is one of exact inverses: flat, integrated forward, or bounded.",
@@ -321,22 +322,36 @@ def _unstable(found):
     )
 
 
-def _rates(run, name, picked):
-    """The time derivative of a signal at some samples, (N,)."""
+def _derivatives_at(run, signals, picked):
+    """The time derivatives (s, N) of signals at some samples (N,), which are in order."""
     parts = []
     for first, end, model in run.variants or ((0, len(run.t), run.model),):
         inside = picked[(picked >= first) & (picked < end)]
-        t, jets = run.t[inside], run.jets[: len(model.jet_names), inside]
-        if name in model.jet_names and (model.reduction.mechanism.q.plain or name not in model.coordinate_names):
-            jets = model.extended(t, jets, len(model.jet_names) + model.n)
-            parts.append(jets[model.jet_names.index(name) + model.n])
-            continue
-        base, rate = (f"d{name}", 0) if name in model.coordinate_names else (name, 1)
-        kind = model.signal_groups[base]
-        f = model.signals(kind, rate)[1]
-        jets = model.extended(t, jets, f.n_x) if f.n_x > len(jets) else jets[: f.n_x]
-        parts.append(f.grid(t, jets, model.parameters)[model.signals(kind)[0].index(base)])
-    return np.concatenate(parts)
+        groups = {_rate_group(model, name) for name in signals if not _is_state_jet(model, name)}
+        functions = {group: model.signals(*group)[1] for group in groups}
+        size = max([len(model.jet_names) + model.n, *(f.n_x for f in functions.values())])
+        jets = model.extended(run.t[inside], run.jets[: len(model.jet_names), inside], size)
+        grids = {g: f.grid(run.t[inside], jets[: f.n_x], model.parameters) for g, f in functions.items()}
+        parts.append([_rate_row(model, name, jets, grids) for name in signals])
+    return np.concatenate(parts, axis=1)
+
+
+def _is_state_jet(model, name):
+    """Whether the derivative of a signal is another jet."""
+    return name in model.jet_names and (model.reduction.mechanism.q.plain or name not in model.coordinate_names)
+
+
+def _rate_group(model, name):
+    """The group of a signal's derivative, and its order there."""
+    return ("coordinate_rates", 0) if name in model.coordinate_names else (model.signal_groups[name], 1)
+
+
+def _rate_row(model, name, jets, grids):
+    """The derivative of a signal (N,) out of jets and groups of signals."""
+    if _is_state_jet(model, name):
+        return jets[model.jet_names.index(name) + model.n]
+    kind, order = _rate_group(model, name)
+    return grids[kind, order][model.signals(kind)[0].index(name if order else f"d{name}")]
 
 
 @dataclass(frozen=True)
@@ -360,7 +375,7 @@ class Nodes:
 
 
 @dataclass(frozen=True)
-class Local:
+class Evaluated:
     """Signals at nodes (s, N), their derivatives (s, N, k) there, mean squares (s,), and their derivatives (s, k)."""
 
     values: np.ndarray
@@ -385,8 +400,8 @@ class Search:
         self.motions, self.minimise, self.sizes, self.limits = motions, minimise, sizes, limits
         self.low, self.width = ranges[:, 0], ranges[:, 1] - ranges[:, 0]
         self.signals = tuple(dict.fromkeys([*sizes, *limits]))
-        self.panels, self.evaluated = PANELS, 0
-        count = NODES + 1 if limits or minimise == "peak" else 2
+        self.panels, self.evaluated = SQUARE_PANELS, 0
+        count = FIRST_NODES + 1 if limits or minimise == "peak" else 2
         t = np.linspace(motions.t0 - motions.ahead, motions.t1 + motions.after, count)
         none = Nodes(np.zeros(0), np.zeros(0))
         self.nodes = none.joined(motions.t0, motions.t1, t)
@@ -424,13 +439,12 @@ class Search:
         at, inside = where[: len(fixed)], where[len(fixed) :]
         slopes = dy[:, at]
         if end_slopes.any():
-            rates = np.array([_rates(run, name, at) for name in self.signals])
-            slopes = slopes + rates[:, :, None] * self.nodes.part[:, None] * end_slopes
+            slopes = slopes + _derivatives_at(run, self.signals, at)[:, :, None] * self.nodes.part[:, None] * end_slopes
         length = fixed[-1] - fixed[0]
         squares = y[:, inside] ** 2 @ weights / length
         end = (y[:, at[-1], None] ** 2 - squares[:, None]) * end_slopes
         square_slopes = (np.einsum("sn,n,snk->sk", 2 * y[:, inside], weights, dy[:, inside]) + end) / length
-        return Local(y[:, at], slopes * self.width, squares, square_slopes * self.width)
+        return Evaluated(y[:, at], slopes * self.width, squares, square_slopes * self.width)
 
     def _by_name(self, p):
         return dict(zip(self.motions.names, p.tolist(), strict=True))
@@ -459,10 +473,10 @@ class Search:
         """How far signals at nodes are inside their limits, relative to these, (c,), and derivatives (c, k)."""
         local, values, slopes = self.local(v), [np.zeros(0)], [np.zeros((0, len(v)))]
         for name, (low, high) in self.limits.items():
-            i, size = self.signals.index(name), _largest(low, high)
+            i, size = self.signals.index(name), _size_of_limit(low, high)
             for sign, side in ((1.0, low), (-1.0, high)):
                 if np.isfinite(side):
-                    values.append(sign * (local.values[i] - side) / size - INSIDE)
+                    values.append(sign * (local.values[i] - side) / size - SAFELY_INSIDE)
                     slopes.append(sign * local.slopes[i] / size)
         return np.concatenate(values), np.concatenate(slopes)
 
@@ -473,7 +487,7 @@ class Search:
         motions = self.motions
         v = (motions.numbers - self.low) / self.width
         before = self.measured(v, motions.run(motions.model))
-        for _ in range(ROUNDS):
+        for _ in range(SEARCHES):
             v = self.feasible(self.solved(v, self.minimise))
             plan = motions.run(motions.with_parameters(self.parameters(v)))
             times = self.exceeding(v, plan)
@@ -492,7 +506,7 @@ class Search:
         limits = [
             (name, side) for name, ends in self.limits.items()
             for (value, _), limit, side in zip(extremes(plan, name), ends, ("lower", "upper"), strict=True)
-            if np.isfinite(limit) and abs(value - limit) <= REACHED * _largest(*ends)
+            if np.isfinite(limit) and abs(value - limit) <= REACHED * _size_of_limit(*ends)
         ]  # fmt: skip
         at_ends = [(name, "lower" if x < 0.5 else "upper") for name, x in zip(values, v, strict=True)
                    if min(x, 1.0 - x) <= ACTIVE]  # fmt: skip
@@ -511,11 +525,11 @@ class Search:
         """Instants of extrema of the plan that exceed a limit, or the peak at nodes."""
         limits = [(name, *ends) for name, ends in self.limits.items()]
         if self.minimise == "peak":
-            peak = self.cost(v) * (1.0 + INSIDE)
+            peak = self.cost(v) * (1.0 + SAFELY_INSIDE)
             limits += [(name, -peak * size, peak * size) for name, size in self.sizes.items()]
         times = [t for name, low, high in limits for t in _extrema_beyond(plan, name, low, high)]
         known = self.nodes.at(self.motions.t0, self.motions.ends(self.parameters(v))[0])
-        close = SMALLEST * np.ptp(known)
+        close = SMALLEST_REGION * np.ptp(known)
         return [t for t in times if np.abs(known - t).min() > close]
 
     def refined(self, v):
@@ -530,37 +544,26 @@ class Search:
 
     def feasible(self, v):
         """Unknowns within the limits: these, or those of the minimum that is found from the ones of least excess."""
-        if not self.limits or self.within(v)[0].min() >= -INSIDE:
+        if not self.limits or self.within(v)[0].min() >= -SAFELY_INSIDE:
             return v
         least = self.solved(v, "excess")
-        if self.within(least)[0].min() < -INSIDE:
+        if self.within(least)[0].min() < -SAFELY_INSIDE:
             raise self.beyond(self.motions.run(self.motions.with_parameters(self.parameters(least))))
         again = self.solved(least, self.minimise)
-        return again if self.within(again)[0].min() >= -INSIDE else least
+        return again if self.within(again)[0].min() >= -SAFELY_INSIDE else least
 
     def solved(self, v, what):
         """Unknowns (k,) of a minimum from v, in a region that shrinks where there is no motion."""
-        from scipy.optimize import minimize
-
-        problem = Problem(self, what, v)
-        region = np.inf
-        for _ in range(ATTEMPTS):
+        problem, region = NonlinearProgram(self, what, v), np.inf
+        for _ in range(REGIONS):
             low, high = np.maximum(v - region, 0.0), np.minimum(v + region, 1.0)
-            passed = [v]
-            try:
-                x = minimize(
-                    problem.cost, problem.start(v), jac=True, method="SLSQP", bounds=problem.bounds(low, high),
-                    constraints=problem.constraints, callback=lambda x: passed.append(x[: len(low)].copy()),
-                    options={"maxiter": 200, "ftol": CONVERGED},
-                ).x[: len(v)]  # fmt: skip
-            except NoMotion as failure:
-                v = passed[-1]
+            v, failure = problem.minimum(v, low, high)
+            if failure is not None:
                 region = np.abs(failure.at - v).max() / 2
-                if region < SMALLEST:
-                    raise failure.error from None
+                if region < SMALLEST_REGION:
+                    raise failure
                 continue
-            v = np.clip(x, low, high)
-            edge = SMALLEST * (high - low)
+            edge = SMALLEST_REGION * (high - low)
             if np.all(((v > low + edge) | (low == 0.0)) & ((v < high - edge) | (high == 1.0))):
                 break
             region *= 2
@@ -570,7 +573,7 @@ class Search:
         """The norm of what the gradient of the cost is not balanced by active inequalities, relative to the cost."""
         from scipy.optimize import nnls
 
-        problem = Problem(self, self.minimise, v)
+        problem = NonlinearProgram(self, self.minimise, v)
         x = problem.start(v)
         gradient, k = problem.cost(x)[1], len(v)
         sides = [np.eye(k)[v <= ACTIVE], -np.eye(k)[v >= 1.0 - ACTIVE]]
@@ -583,7 +586,7 @@ class Search:
 
     def beyond(self, plan):
         """The error of a motion that exceeds a limit."""
-        excess, name, t = max(_excesses(plan, self.limits))
+        excess, name, t = max(_beyond_limits(plan, self.limits))
         (least, _), (most, _) = extremes(plan, name)
         return LimitExceeded(
             f"With the least excess that was found {name} exceeds its limit by {100 * excess:.3g} % at t = {t:.4g} s.",
@@ -597,7 +600,7 @@ class Search:
         )
 
 
-class Problem:
+class NonlinearProgram:
     """The cost and the inequalities of x = v, or of x = (v, z) with a bound z of all magnitudes or excesses.
 
     Parameters
@@ -626,6 +629,21 @@ class Problem:
         """Lower and upper bounds of x."""
         z = [(-ACTIVE, None)] * (self.what == "excess") + [(0.0, None)] * (self.what == "peak")
         return [*zip(low, high, strict=True), *z]
+
+    def minimum(self, v, low, high):
+        """The unknowns (k,) of a minimum between bounds, None; or the last ones on the way, and why it ended there."""
+        from scipy.optimize import minimize
+
+        passed = [v]
+        try:
+            x = minimize(
+                self.cost, self.start(v), jac=True, method="SLSQP", bounds=self.bounds(low, high),
+                constraints=self.constraints, callback=lambda x: passed.append(np.array(x[: self.k])),
+                options={"maxiter": QUADRATIC_PROGRAMS, "ftol": UNCHANGED},
+            ).x  # fmt: skip
+        except NoMotion as failure:
+            return passed[-1], failure
+        return np.clip(x[: self.k], low, high), None
 
     def cost(self, x):
         """The cost, relative to that at the start, and its derivatives."""
@@ -662,35 +680,38 @@ class Problem:
 
 def _quadrature(edges, panels):
     """Instants (N,) [s] and weights (N,) of a quadrature over pieces, with about a number of panels in all."""
-    edges = np.asarray(edges)
     counts = np.ceil(panels * np.diff(edges) / np.ptp(edges)).astype(int)
-    ends = np.concatenate([np.linspace(a, b, n + 1)[:-1] for a, b, n in zip(edges, edges[1:], counts)] + [edges[-1:]])
-    half = np.diff(ends) / 2
-    return ((ends[:-1] + half)[:, None] + half[:, None] * GAUSS[0]).ravel(), (half[:, None] * GAUSS[1]).ravel()
+    pieces = zip(edges[:-1], edges[1:], counts, strict=True)
+    ends = np.concatenate([*(np.linspace(a, b, n + 1)[:-1] for a, b, n in pieces), edges[-1:]])
+    (x, weights), half = EIGHT_NODES, np.diff(ends)[:, None] / 2
+    return (ends[:-1, None] + half * (1 + x)).ravel(), (half * weights).ravel()
 
 
-def _largest(low, high):
+def _size_of_limit(low, high):
     """The size of a limit: its larger finite side."""
     return max(abs(side) for side in (low, high) if np.isfinite(side)) or 1.0
 
 
-def _excesses(plan, limits):
+def _beyond_limits(plan, limits):
     """(excess relative to the limit, name, instant) of each signal at each side."""
     for name, (low, high) in limits.items():
         (least, t_least), (most, t_most) = extremes(plan, name)
-        size = _largest(low, high)
+        size = _size_of_limit(low, high)
         yield float((low - least) / size), name, float(t_least)
         yield float((most - high) / size), name, float(t_most)
 
 
 def _extrema_beyond(plan, name, low, high):
-    """Instants of the extrema of a signal beyond its limits, from parabolas through samples."""
+    """Instants of the extrema of a signal beyond its limits."""
     t, y = plan.t, plan[name]
-    for sign, limit in ((1.0, high), (-1.0, -low)):
-        excess = sign * y - limit
-        ends = [k for k in (0, -1) if excess[k] > 0]
-        yield from (float(t[k]) for k in ends)
-        inner = np.flatnonzero((excess[1:-1] > 0) & (excess[1:-1] >= excess[:-2]) & (excess[1:-1] > excess[2:])) + 1
-        for k in inner:
-            c = np.polynomial.Polynomial.fit(t[k - 1 : k + 2] - t[k], excess[k - 1 : k + 2], 2).convert().coef
-            yield float(np.clip(t[k] - c[1] / (2 * c[2]), t[k - 1], t[k + 1])) if len(c) == 3 and c[2] < 0 else float(t[k])
+    for excess in (y - high, low - y):
+        yield from (float(t[k]) for k in (0, -1) if excess[k] > 0)
+        inner = (excess[1:-1] > 0) & (excess[1:-1] >= excess[:-2]) & (excess[1:-1] > excess[2:])
+        for k in np.flatnonzero(inner):
+            yield _vertex(t[k : k + 3], excess[k : k + 3])
+
+
+def _vertex(t, y):
+    """Where the parabola through three samples (3,), the middle one the largest, has its maximum."""
+    (a, b), (left, right) = np.diff(t), np.diff(y)
+    return float(t[1] + (left * b**2 + right * a**2) / (2 * (left * b - right * a)))

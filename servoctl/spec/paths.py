@@ -334,7 +334,7 @@ def _spline_pieces(times, points, degree, vanishing):
 
 
 @functools.cache
-def _hermite(m):
+def _from_ends(m):
     """Polynomials of degree 2m + 1 on (-1, 1) by their Taylor coefficients 0 .. m at -1, then at 1.
 
     Returns the powers 0 .. 2m + 1 (rows) of each, and the integrals of products of their derivatives m + 1; both are
@@ -369,7 +369,7 @@ def _symbolic_pieces(times, points, m, ends):
     It has the least integral of the square of derivative m + 1 over its Taylor coefficients 1 .. m at the points; those
     at the ends are zero for "rest". The unit of time is the mean of half an interval.
     """
-    n, (powers, energy) = points.shape[0], _hermite(m)
+    n, (powers, energy) = points.shape[0], _from_ends(m)
     half = (times[1:] - times[:-1]) / (times[-1] - times[0]) * (n - 1)
     scales = [ca.diag(ca.vertcat(*([h**j for j in range(m + 1)] * 2))) for h in half.elements()]
     total = ca.SX(n * (m + 1), n * (m + 1))
