@@ -46,16 +46,17 @@ def save_figure(designs, path):
 
 
 def main(fast=False, save=None):
-    """Durations [s] on a straight way and through the best via point, and this point [m]."""
+    """Durations [s] on a straight way and through the best via point, and this point [m]; `fast`: the latter."""
     model, p = arm()
     vary = {"via_x": (0.2, 0.7), "via_y": (0.4, 0.9), "duration": (0.3, 3.0)}
+    ways = {"designed": vary} if fast else {"straight": {"duration": vary["duration"]}, "designed": vary}
     designs = {
         label: sv.design(model, chosen, (0.0, p.duration), "time", limits=LIMITS, guess=GUESS)
-        for label, chosen in (("straight", {"duration": vary["duration"]}), ("designed", vary))
+        for label, chosen in ways.items()
     }
     for design in designs.values():
         print(design)
-    if save and not fast:
+    if save:
         save_figure(designs, save)
     found = designs["designed"]
     return {f"{label} [s]": design.cost for label, design in designs.items()} | {

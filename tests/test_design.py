@@ -304,9 +304,10 @@ def test_a_search_goes_round_parameters_without_a_motion(monkeypatch):
     assert missed and found.proof.passed and found.values["via"] == pytest.approx(0.51, abs=1e-5)
 
 
-def test_parameters_without_a_motion_at_the_start_are_refused(arm):
+def test_parameters_without_a_motion_at_the_start_are_refused():
+    model, _ = mass(lambda t, p: ca.sqrt(p.via - 0.5) * sv.paths.rest_to_rest(t, 0, 1, 2.0), via=2.0)
     with refused(sv.InconsistentStart):
-        sv.design(arm.with_parameters(l1=0.01), {"vx": (0.2, 0.9)}, (0.0, 1.0), guess={"q1": 0.2, "q2": 1.0})
+        sv.design(model.with_parameters(via=0.4), {"via": (-5.0, 5.0)}, (0.0, 2.0))
 
 
 # bounded and forward motions, ideal programs --------------------------------------------------------------------------
@@ -349,6 +350,40 @@ def test_ideal_programs_are_designed_by_their_reaction():
     model = sv.derive(mechanism, sv.Program({"X": x - path}, by="ideal"))
     found = sv.design(model, {"via": (0.0, 1.0)}, (0.0, 2.0))
     assert found.values["via"] == pytest.approx(0.5, abs=1e-9) and found.proof.passed
+
+
+def cart(upright):
+    """A cart with a pendulum without damping, which moves steadily from t = 0 on."""
+    p = sv.parameters(M=2.0, m=1.0, l=0.5, g=9.81, v=0.3)
+    q = sv.coordinates("x theta")
+    x, theta = q
+    bob = ca.vertcat(x + p.l * ca.sin(theta), -p.l * ca.cos(theta))
+    S = sv.particle(q, p.M, x) + sv.particle(q, p.m, bob)
+    mechanism = sv.Mechanism(q, S, potential=p.m * p.g * bob[1], actuators={"pull": x}, parameters=p)
+    return sv.derive(mechanism, sv.Program({"X": x - p.v * ca.sin(3 * q.t)})), {"theta": np.pi if upright else 0.0}
+
+
+def test_unstable_motions_without_a_rest_are_refused_and_marginal_ones_designed():
+    model, guess = cart(upright=True)
+    with refused(sv.UnstableInternalDynamics, "dwell"):
+        sv.design(model, {"v": (0.1, 0.5)}, (0.0, 3.0), guess=guess)
+    model, guess = cart(upright=False)
+    found = sv.design(model, {"v": (0.1, 0.5)}, (0.0, 3.0), guess=guess)
+    assert found.values["v"] == pytest.approx(0.1) and found.binding == (("v", "lower"),) and found.proof.passed
+
+
+def test_units_and_the_begin_of_the_span_do_not_matter():
+    """Millimetres and milliseconds; from 1 to 1 + T, with dwells before and after it; by symmetry through 0.5."""
+    u, s = 1e3, 1e-3
+    model, p = mass(
+        lambda t, p: sv.paths.spline((t - s) / p.T, [0.0, 0.5, 1.0], [0.0, p.via, u], smoothness=3), T=3.0 * s, via=0.6 * u
+    )
+    ranges, span = {"T": (s, 20.0 * s), "via": (0.0, u)}, (0.5 * s, 1.5 * s + p.T)
+    found = sv.design(model, ranges, span, "time", limits={"push": 4.0 * u / s**2})
+    peak = np.abs(curve((0.0, 0.5, 1.0), (0.0, 0.5, 1.0), 3)(np.linspace(0.0, 1.0, 200_001), nu=2)).max()
+    assert found.values["T"] / s == pytest.approx(np.sqrt(2.0 * peak / 4.0), rel=1e-6)
+    assert found.values["via"] / u == pytest.approx(0.5, abs=1e-6)
+    assert found.plan.t[-1] == pytest.approx(1.5 * s + found.values["T"], rel=1e-12)
 
 
 # the result ----------------------------------------------------------------------------------------------------------

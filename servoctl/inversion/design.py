@@ -20,8 +20,9 @@ import numpy as np
 from servoctl.checks import as_list, finite, interval, mapping, named, numbers_by_name, require_kind, texts
 from servoctl.control.time_law import REACHED
 from servoctl.errors import LimitExceeded, ServoError, SpecificationError, UnstableInternalDynamics, unknown
+from servoctl.internal_dynamics import internal_dynamics
 from servoctl.inversion.report import extremes
-from servoctl.inversion.verdict import GROWS, HYPERBOLIC_ZEROS, verdict
+from servoctl.inversion.verdict import HYPERBOLIC_ZEROS, verdict
 from servoctl.methods.choice import Bounded
 from servoctl.model.model import Model
 from servoctl.progress import progress_bar
@@ -269,12 +270,11 @@ class Motions:
                 rest = found.rest["start"] if "start" in found.rest else begin
                 begin = replace(begin, values=np.array(getattr(rest, "x", begin.values)))
                 self.method, self.held = Bounded(), {}
-            elif found.dynamics == GROWS:
-                raise _growing(found)
             self.guess = dict(zip(model.state_names, np.asarray(begin.values).tolist(), strict=False))
         first = self.run(model)
         self.guess = dict(zip(model.state_names, np.asarray(first.start.values).tolist(), strict=False))
         if not model.flat and self.method is None:
+            _require_no_growth(model, first)
             free = sensitivity(first.model, first, model.state_names[0], names).independent
             self.held = {name: self.guess[name] for name in free}
         self.t1 = float(self.ends(self.numbers)[0])
@@ -313,13 +313,16 @@ class Motions:
         return simulated(model, begin, (self.t0, t1), self.method, t_eval=times, progress=False)
 
 
-def _growing(found):
-    return UnstableInternalDynamics(
-        f"The program is {found}.",
-        "A design is one of exact inverses: flat, integrated forward, or bounded.",
-        do="Begin and end the program with a dwell, or choose another output.",
-        verdict=found.dynamics,
-    )
+def _require_no_growth(model, run):
+    """Refuse a motion that is integrated forward, along which errors grow."""
+    internal = internal_dynamics(model, run)
+    if internal.verdict == "unstable":
+        raise UnstableInternalDynamics(
+            f"Along the motion {internal.sentence()}.",
+            "A design is one of exact inverses: flat, bounded, or integrated forward where errors do not grow.",
+            do="Begin and end the program with a dwell, or choose another output.",
+            growth=float(internal.growth),
+        )
 
 
 def _derivatives_at(run, signals, picked):
@@ -502,7 +505,9 @@ class Search:
     def designed(self, v, before, plan):
         """The result for the unknowns of a minimum, with its plan."""
         values = self._by_name(self.parameters(v))
-        plan = plan if plan.model.flat or self.motions.method is not None else judged(plan)
+        if not plan.model.flat and self.motions.method is None:
+            _require_no_growth(plan.model, plan)
+            plan = judged(plan)
         limits = [
             (name, side) for name, ends in self.limits.items()
             for (value, _), limit, side in zip(extremes(plan, name), ends, ("lower", "upper"), strict=True)
