@@ -288,10 +288,11 @@ def test_the_via_point_of_least_peak_torque_is_that_of_a_grid(arm):
     def peak(via):
         return (np.abs(arm_torques(via)).max(axis=1) / [100.0, 40.0]).max()
 
-    anywhere = min((peak((x, y)), x, y) for x in np.linspace(0.2, 0.9, 29) for y in np.linspace(0.4, 0.9, 21))
-    near = min((peak((anywhere[1] + x, anywhere[2] + y)), x, y) for x in np.linspace(-0.03, 0.03, 41)
-               for y in np.linspace(-0.03, 0.03, 41))  # fmt: skip
-    assert near[0] * (1 - 1e-4) <= found.cost <= near[0] * (1 + 1e-4)
+    best = min((peak((x, y)), x, y) for x in np.linspace(0.2, 0.9, 15) for y in np.linspace(0.4, 0.9, 11))
+    for width in 0.05 * 0.5 ** np.arange(8):  # each grid finer, about the best point of the one before
+        offsets = width * np.linspace(-1.0, 1.0, 7)
+        best = min((peak((best[1] + a, best[2] + b)), best[1] + a, best[2] + b) for a in offsets for b in offsets)
+    assert best[0] * (1 - 1e-4) <= found.cost <= best[0] * (1 + 1e-4)
     assert found.cost == pytest.approx(peak(tuple(found.values.values())), rel=1e-4)
 
 
@@ -315,8 +316,10 @@ def test_parameters_without_a_motion_at_the_start_are_refused():
 
 def test_bounded_motions_are_designed():
     """The plan begins ahead of the program; its limits hold over the whole window."""
-    model, p = aircraft()
+    model, _ = aircraft()
     found = sv.design(model, {"via": (0.0, 2.0)}, (0.0, 4.0), "peak")
+    limited = sv.design(found.model, {"via": (0.0, 2.0)}, (0.0, 4.0), "peak", limits={"theta": (None, 0.322)})
+    assert found.plan["theta"].max() > 0.322 >= limited.plan["theta"].max() and limited.cost > found.cost
     assert found.plan.method == "bounded" and found.plan.t[0] < 0.0 and found.proof.passed
     peaks = []
     for via in found.values["via"] + np.array([-0.02, 0.02]):
@@ -324,9 +327,6 @@ def test_bounded_motions_are_designed():
         run = sv.simulate(other, found.plan.start, (0.0, 4.0), "bounded")
         peaks.append(max(np.abs(run[u]).max() for u in ("u1", "u2")))
     assert found.cost < min(peaks) and found.cost < found.before
-    quick = sv.design(model, {"via": (0.0, 2.0), "T": (2.0, 6.0)}, (0.0, p.T), "time", limits={"u1": (0, 300), "u2": (0, 300)})
-    assert quick.cost < 4.0 and ("u1", "upper") in quick.binding
-    assert max(quick.plan[u].max() for u in ("u1", "u2")) <= 300.0
 
 
 def test_forward_motions_are_designed():
