@@ -408,6 +408,22 @@ def test_a_kink_at_the_minimum_is_not_called_one():
     assert "inconclusive" in found.message and found.cost <= found.before
 
 
+def test_a_force_that_jumps_between_knots_is_integrated():
+    """A narrow blend of a load, 5 N from 1 s on, where no knot is: u = x'' + 5, orthogonal to no path."""
+    p = sv.parameters(via=0.9)
+    q = sv.coordinates("x")
+    (x,) = q
+    load = {"x": -2.5 * (1 + ca.tanh((q.t - 1.0) / 1e-6))}
+    mechanism = sv.Mechanism(q, sv.particle(q, 1.0, x), forces=load, actuators={"push": x}, parameters=p)
+    path = sv.paths.spline(q.t, (0.0, 0.8, 2.0), [0.0, p.via, 1.0])
+    found = sv.design(sv.derive(mechanism, sv.Program({"X": x - path})), {"via": (-2.0, 2.0)}, (0.0, 2.0))
+    t = (np.arange(200_000) + 0.5) * 1e-5
+    a, b = (curve((0.0, 0.8, 2.0), points, 2)(t, nu=2) for points in ((0, 0, 1), (0, 1, 0)))
+    via = -((a + 5.0 * (t > 1.0)) @ b) / (b @ b)
+    assert found.values["via"] == pytest.approx(via, abs=1e-3)
+    assert found.cost == pytest.approx(np.sqrt(np.mean((a + via * b + 5.0 * (t > 1.0)) ** 2)), rel=1e-3)
+
+
 def test_limits_that_no_parameters_keep_are_refused_with_the_least_excess():
     model, _ = through()
     least = sv.design(model, {"via": (-1.0, 2.0)}, (0.0, 2.0), "peak").cost

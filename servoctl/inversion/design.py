@@ -34,6 +34,7 @@ from servoctl.verification import Verification, verify
 MINIMISED = ("rms", "peak", "time")
 FIRST_NODES = 100  # instants of the motion at which inequalities hold, before extrema between them are added
 SQUARE_PANELS, EIGHT_NODES = 32, np.polynomial.legendre.leggauss(8)  # of the quadrature; knots end panels
+MOST_PANELS = 1024  # with which jumps of the actuation between knots are integrated to a thousandth
 QUADRATURE = 1e-8  # of a mean square: error of its quadrature, beyond which it gets twice as many panels
 SAFELY_INSIDE = 1e-6  # of a limit: by which it is stricter at nodes, and by which a peak may exceed that at nodes
 SEARCHES = 12  # of the search, each with more nodes or panels than the one before
@@ -500,7 +501,9 @@ class Search:
             if times:
                 self.nodes = self.nodes.joined(motions.t0, motions.ends(self.parameters(v))[0], times)
             self.clear()
-        raise self.beyond(plan)
+        if any(excess > 0 for excess, *_ in _beyond_limits(plan, self.limits)):
+            raise self.beyond(plan)
+        return self.designed(v, before, plan)
 
     def designed(self, v, before, plan):
         """The result for the unknowns of a minimum, with its plan."""
@@ -539,6 +542,8 @@ class Search:
 
     def refined(self, v):
         """Whether mean squares change with twice as many panels, which are then taken."""
+        if self.panels >= MOST_PANELS:
+            return False
         coarse = self.rms(self.local(v))[0]
         self.panels *= 2
         self.clear()
