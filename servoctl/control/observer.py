@@ -1,12 +1,14 @@
 """Output feedback: a Kalman filter along the plan estimates the state from some measured entries."""
 
 from collections.abc import Mapping
+from functools import partial
 
 import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
 
 from servoctl.checks import numbers_by_name
+from servoctl.codegen.matrices import riccati
 from servoctl.control.feedback import integral_names, integration, law_step
 from servoctl.control.law import Law
 from servoctl.control.lqr import tangents, weights
@@ -15,7 +17,9 @@ from servoctl.control.residuals import Residuals
 from servoctl.control.sampling import discretised, spectral_radii
 from servoctl.errors import ServoError, SpecificationError
 from servoctl.plants.plant import Plant
+from servoctl.values import Deferred
 
+FILTER_RADIUS = "spectral radius of the filter"
 POSITION_NOISE, VELOCITY_NOISE = 1e-3, 1.0  # per √s, of coordinates and velocities
 
 
@@ -93,8 +97,6 @@ def output_feedback(
     where = [plant.state_names.index(name) for name in measured]
     C = np.eye(n_x)[where]
     L = _filter(A, C, W, np.diag(deviations**2), basis)
-    errors = A @ (np.eye(n_x) - L @ C)
-    errors = errors if basis is None else basis.swapaxes(1, 2) @ errors @ basis
     residuals = Residuals(law.plan.model, plant, gains.residuals) if n_z else None
     schedule = [reference.inputs(), reference.x]
     schedule += [part.reshape(len(A), -1).T for part in (gains.K, gains.K_i, L, A, B)]  # row by row
@@ -105,9 +107,15 @@ def output_feedback(
         step=estimating_law(plant.state_names, where, len(plant.inputs), residuals), schedule=np.vstack(schedule),
         state=np.zeros(n_x + n_z), initial_input=law.initial_input, plan=law.plan,
         state_names=(*(f"estimated error of {name}" for name in plant.state_names), *integral_names(gains.residuals)),
-        info=law.info | {"spectral radius of the filter": float(spectral_radii(errors).max())},
+        info=Deferred({}, (*law.info.keys(), FILTER_RADIUS), partial(_info, law.info, A @ (np.eye(n_x) - L @ C), basis)),
         integrators=tuple(range(n_x, n_x + n_z)), feedback=gains, input_matrix=input_matrix,
     )  # fmt: skip
+
+
+def _info(of_law, errors, basis):
+    """The results of the law's design, and the largest spectral radius of the filter's errors."""
+    errors = errors if basis is None else basis.swapaxes(1, 2) @ errors @ basis
+    return of_law | {FILTER_RADIUS: float(spectral_radii(errors).max())}
 
 
 def _process_noise(plant):
@@ -178,12 +186,5 @@ def _filter(A, C, W, V, basis):
             do="Measure more states; velocities alone do not determine the position.",
             measured=len(C),
         ) from error
-    L = np.empty((count, n_x, len(C)))
-    for k in range(count):
-        S = seen[k] @ P @ seen[k].T + V
-        gain = np.linalg.solve(S, seen[k] @ P).T
-        L[k] = T[k] @ gain
-        corrected = P - gain @ seen[k] @ P
-        P = moved[k] @ corrected @ moved[k].T + gathered[k]
-        P = (P + P.T) / 2
-    return L
+    gains, _, _ = riccati(moved.swapaxes(1, 2), seen.swapaxes(1, 2), gathered, V, P, of_state=False)
+    return T @ gains.swapaxes(1, 2)

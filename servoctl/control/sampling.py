@@ -2,6 +2,8 @@
 
 import numpy as np
 
+from servoctl.codegen import matrices as compiled
+
 SCALED, TERMS = 0.5, 16  # norm of a matrix whose exponential is summed; 0.5^17/17! is 2e-20
 ONE_NORM = 16  # times SCALED: a norm of which the powers are not worth computing
 IN_DOUBLE = 8  # squarings that leave 2^8 roundings of a double, 3e-14
@@ -26,18 +28,20 @@ def exponentials(matrices):
     from scipy.linalg import matrix_balance
 
     units = matrix_balance(np.abs(matrices).max(axis=0, initial=0.0), permute=False, separate=True)[1][0]
-    balanced = matrices * (units / units[:, None])
+    scales = units[:, None] / units
+    balanced = matrices / scales
     norm = _norms(balanced)
     if norm.max(initial=0.0) > ONE_NORM * SCALED:
         fourth = np.linalg.matrix_power(balanced, 4)
         norm = np.maximum(_norms(fourth) ** (1 / 4), _norms(fourth @ balanced) ** (1 / 5))
     squarings = np.maximum(0, np.ceil(np.log2(np.maximum(norm, SCALED) / SCALED))).astype(int)
-    result = np.empty(matrices.shape)
-    for long in (False, True):
-        some = (squarings > IN_DOUBLE) == long
-        precision = np.longdouble if long else float
-        result[some] = _squared(balanced[some].astype(precision), squarings[some])
-    return result * (units[:, None] / units)
+    result = compiled.exponentials(balanced, scales, squarings, TERMS)
+    if result is None:
+        result = _squared(balanced, squarings) * scales
+    long = squarings > IN_DOUBLE
+    if long.any():
+        result[long] = _squared(balanced[long].astype(np.longdouble), squarings[long]) * scales
+    return result
 
 
 def _squared(matrices, squarings):

@@ -1,0 +1,117 @@
+"""Exponentials and the Riccati equation of many small matrices, compiled for their size once on a machine."""
+
+import contextlib
+import ctypes
+
+import numpy as np
+
+from servoctl.codegen import compiler
+from servoctl.codegen.native import pointer
+
+FEW = 100  # matrices up to which NumPy takes a millisecond
+PRODUCTS = 3e7  # multiplications of one call, some hundredths of a second: then Python looks for Ctrl-C
+
+
+def exponentials(matrices, scales, squarings, terms):
+    """s exp(x 2^-k)^(2^k) by the Taylor series of some terms, in C; None without a compiler or for few matrices.
+
+    Parameters
+    ----------
+    matrices : (N, n, n) array
+        x
+    scales : (n, n) array
+        s, of each entry.
+    squarings : (N,) array of int
+        k
+    terms : int
+
+    Returns
+    -------
+    (N, n, n) array or None
+    """
+    count, n, _ = matrices.shape
+    call = _function("exponentials", count, N=n, TERMS=terms)
+    if call is None:
+        return None
+    x, scales = (np.ascontiguousarray(part, dtype=float) for part in (matrices, scales))
+    squarings, y = np.ascontiguousarray(squarings, dtype=np.int64), np.empty((count, n, n))
+    for part in _parts(count, terms * n**3):
+        call(_length(part), pointer(x[part]), pointer(scales), pointer(squarings[part]), pointer(y[part]))
+    return y
+
+
+def riccati(A, B, Q, R, P, of_state=True):
+    """H = R + BᵀPB and K = H⁻¹BᵀPA, then P = Q + AᵀP(A - BK), at one sample after another.
+
+    Parameters
+    ----------
+    A, B, Q : (N, n, n), (N, n, m), (N, n, n) arrays
+    R, P : (m, m), (n, n) arrays
+    of_state : bool
+        False: H⁻¹BᵀP in place of K.
+
+    Returns
+    -------
+    gains : (N, m, n) array
+    H : (N, m, m) array
+    P : (n, n) array
+        After the last sample.
+    """
+    count, n, m = B.shape
+    call = _function("riccati", count, N=n, NU=m) if m else None
+    if call is None:
+        return _by_numpy(A, B, Q, R, P, of_state)
+    A, B, Q = (_with_rows(part) for part in (A, B, Q))
+    R, P = np.ascontiguousarray(R, dtype=float), np.array(P, dtype=float)
+    gains, H = np.empty((count, m, n)), np.empty((count, m, m))
+    for part in _parts(count, 3 * n**3):
+        given = [entry for stack in (A, B, Q) for entry in (pointer(stack[part]), *_distances(stack))]
+        outputs = (pointer(P), pointer(gains[part]), pointer(H[part]))
+        call(_length(part), *given, pointer(R), ctypes.c_int64(of_state), *outputs)
+    return gains, H, P
+
+
+def _by_numpy(A, B, Q, R, P, of_state):
+    count, n, m = B.shape
+    gains, H = np.full((count, m, n), np.nan), np.full((count, m, m), np.nan)
+    with np.errstate(all="ignore"), contextlib.suppress(np.linalg.LinAlgError):  # of weights beyond the range of floats
+        for k in range(count):
+            PB = P @ B[k]
+            H[k] = R + B[k].T @ PB
+            G = np.linalg.solve(H[k], PB.T)
+            K = G @ A[k]
+            gains[k] = K if of_state else G
+            P = Q[k] + A[k].T @ P @ (A[k] - B[k] @ K)
+            P = (P + P.T) / 2
+    return gains, H, P
+
+
+def _function(name, count, **sizes):
+    """The C function of this name for matrices of these sizes; None where NumPy is as good, and without a compiler."""
+    if count <= FEW:
+        return None
+    defined = {"NAME": "servoctl", **sizes, "NX": 1, "NP": 1, "NY": 1}
+    text = "".join(f"#define {key} {value}\n" for key, value in defined.items()) + f'#include "{name}.c"\n'
+    library = compiler.library(text, "-O3")
+    return None if library is None else library[f"servoctl_{name}"]
+
+
+def _parts(count, products):
+    """Slices of so many matrices that each takes some hundredths of a second."""
+    size = max(1, int(PRODUCTS / products))
+    return [slice(a, min(a + size, count)) for a in range(0, count, size)]
+
+
+def _length(part):
+    return ctypes.c_int64(part.stop - part.start)
+
+
+def _with_rows(stack):
+    """A stack of matrices of doubles whose rows have no gaps, in place where it is one."""
+    whole = stack.dtype == float and stack.strides[-1] == stack.itemsize and not any(s % 8 for s in stack.strides)
+    return stack if whole else np.ascontiguousarray(stack, dtype=float)
+
+
+def _distances(stack):
+    """Distances from a matrix and from a row to the next, in numbers."""
+    return (ctypes.c_int64(step // stack.itemsize) for step in stack.strides[:2])
