@@ -75,5 +75,5 @@ def _computed(name):
     return method
 
 
-for _name in ("__getitem__", "__iter__", "__eq__", "__or__", "__ror__", "__repr__", "get", "items", "values", "copy", "pop"):
+for _name in "__getitem__ __iter__ __eq__ __or__ __ror__ __repr__ get items values copy pop".split():
     setattr(Deferred, _name, _computed(_name))

@@ -12,8 +12,8 @@ FEW = 100  # matrices up to which NumPy takes a millisecond
 PRODUCTS = 3e7  # multiplications of one call, some hundredths of a second: then Python looks for Ctrl-C
 
 
-def exponentials(matrices, scales, squarings, terms):
-    """s exp(x 2^-k)^(2^k) by the Taylor series of some terms, in C; None without a compiler or for few matrices.
+def norms(matrices, scales):
+    """Largest sums of a row's magnitudes, of x/s.
 
     Parameters
     ----------
@@ -21,23 +21,59 @@ def exponentials(matrices, scales, squarings, terms):
         x
     scales : (n, n) array
         s, of each entry.
+
+    Returns
+    -------
+    (N,) array
+    """
+    count, n, _ = matrices.shape
+    call = _function("exponentials", "norms", count, N=n)
+    if call is None:
+        return np.abs(matrices / scales).sum(axis=2).max(axis=1, initial=0.0)
+    x, scales, result = _whole(matrices), _whole(scales), np.empty(count)
+    call(ctypes.c_int64(count), pointer(x), pointer(scales), pointer(result))
+    return result
+
+
+def exponentials(matrices, scales, squarings, terms):
+    """s exp(x/s 2^-k)^(2^k) by the Taylor series of some terms.
+
+    Parameters
+    ----------
+    matrices : (N, n, n) array
+        x
+    scales : (n, n) array
+        s, of each entry: powers of two.
     squarings : (N,) array of int
         k
     terms : int
 
     Returns
     -------
-    (N, n, n) array or None
+    (N, n, n) array
     """
     count, n, _ = matrices.shape
-    call = _function("exponentials", count, N=n, TERMS=terms)
+    call = _function("exponentials", "exponentials", count, N=n)
     if call is None:
-        return None
-    x, scales = (np.ascontiguousarray(part, dtype=float) for part in (matrices, scales))
-    squarings, y = np.ascontiguousarray(squarings, dtype=np.int64), np.empty((count, n, n))
+        return squared(matrices / scales, squarings, terms) * scales
+    x, scales, y = _whole(matrices), _whole(scales), np.empty((count, n, n))
+    squarings = np.ascontiguousarray(squarings, dtype=np.int64)
     for part in _parts(count, terms * n**3):
-        call(_length(part), pointer(x[part]), pointer(scales), pointer(squarings[part]), pointer(y[part]))
+        given = (pointer(x[part]), pointer(scales), pointer(squarings[part]), ctypes.c_int64(terms))
+        call(_length(part), *given, pointer(y[part]))
     return y
+
+
+def squared(matrices, squarings, terms):
+    """exp(A/2^k)^(2^k) of each matrix, (N, n, n), in their own precision, with k in `squarings`, (N,)."""
+    scaled, eye = matrices / np.exp2(squarings)[:, None, None].astype(matrices.dtype), np.eye(matrices.shape[1])
+    power = np.broadcast_to(eye, scaled.shape).astype(matrices.dtype)
+    for k in range(terms, 0, -1):
+        power = eye + scaled @ power / k
+    for k in range(squarings.max(initial=0)):
+        more = squarings > k
+        power[more] = power[more] @ power[more]
+    return power
 
 
 def riccati(A, B, Q, R, P, of_state=True):
@@ -58,11 +94,11 @@ def riccati(A, B, Q, R, P, of_state=True):
         After the last sample.
     """
     count, n, m = B.shape
-    call = _function("riccati", count, N=n, NU=m) if m else None
+    call = _function("riccati", "riccati", count, N=n, NU=m) if m else None
     if call is None:
         return _by_numpy(A, B, Q, R, P, of_state)
     A, B, Q = (_with_rows(part) for part in (A, B, Q))
-    R, P = np.ascontiguousarray(R, dtype=float), np.array(P, dtype=float)
+    R, P = _whole(R), np.array(P, dtype=float, order="C")
     gains, H = np.empty((count, m, n)), np.empty((count, m, m))
     for part in _parts(count, 3 * n**3):
         given = [entry for stack in (A, B, Q) for entry in (pointer(stack[part]), *_distances(stack))]
@@ -86,12 +122,12 @@ def _by_numpy(A, B, Q, R, P, of_state):
     return gains, H, P
 
 
-def _function(name, count, **sizes):
-    """The C function of this name for matrices of these sizes; None where NumPy is as good, and without a compiler."""
+def _function(file, name, count, **sizes):
+    """A C function of a file for matrices of these sizes; None where NumPy is as good, and without a compiler."""
     if count <= FEW:
         return None
     defined = {"NAME": "servoctl", **sizes, "NX": 1, "NP": 1, "NY": 1}
-    text = "".join(f"#define {key} {value}\n" for key, value in defined.items()) + f'#include "{name}.c"\n'
+    text = "".join(f"#define {key} {value}\n" for key, value in defined.items()) + f'#include "{file}.c"\n'
     library = compiler.library(text, "-O3")
     return None if library is None else library[f"servoctl_{name}"]
 
@@ -100,6 +136,10 @@ def _parts(count, products):
     """Slices of so many matrices that each takes some hundredths of a second."""
     size = max(1, int(PRODUCTS / products))
     return [slice(a, min(a + size, count)) for a in range(0, count, size)]
+
+
+def _whole(array):
+    return np.ascontiguousarray(array, dtype=float)
 
 
 def _length(part):

@@ -107,15 +107,15 @@ def output_feedback(
         step=estimating_law(plant.state_names, where, len(plant.inputs), residuals), schedule=np.vstack(schedule),
         state=np.zeros(n_x + n_z), initial_input=law.initial_input, plan=law.plan,
         state_names=(*(f"estimated error of {name}" for name in plant.state_names), *integral_names(gains.residuals)),
-        info=Deferred({}, (*law.info.keys(), FILTER_RADIUS), partial(_info, law.info, A @ (np.eye(n_x) - L @ C), basis)),
+        info=Deferred({}, (*law.info.keys(), FILTER_RADIUS), partial(_info, law, A @ (np.eye(n_x) - L @ C), basis)),
         integrators=tuple(range(n_x, n_x + n_z)), feedback=gains, input_matrix=input_matrix,
     )  # fmt: skip
 
 
-def _info(of_law, errors, basis):
-    """The results of the law's design, and the largest spectral radius of the filter's errors."""
+def _info(law, errors, basis):
+    """The results of a law's design, and the largest spectral radius of the filter's errors (N, n_x, n_x)."""
     errors = errors if basis is None else basis.swapaxes(1, 2) @ errors @ basis
-    return of_law | {FILTER_RADIUS: float(spectral_radii(errors).max())}
+    return law.info | {FILTER_RADIUS: float(spectral_radii(errors).max())}
 
 
 def _process_noise(plant):

@@ -25,9 +25,6 @@
 #define LAST 4
 #define PLAIN 1
 
-/* exponentials.c */
-#define TERMS 16
-
 /* batch.c */
 #define NU 2
 #define NC 2

@@ -1,23 +1,23 @@
 /* The Riccati equation from sample to sample. */
-#include "unit.h"
+#include "rows.h"
 
 /* S Y = Y by Gauss's elimination with partial pivoting; S is (NU, NU) and Y (NU, N), both are overwritten. */
-INLINE void solve(double S[NU][NU], double Y[NU][N])
+INLINE void solve(double S[NU][NU], V Y[NU][BLOCKS])
 {
     for (int i = 0; i < NU; i++) {
         int best = i;
         for (int k = i + 1; k < NU; k++) if (fabs(S[k][i]) > fabs(S[best][i])) best = k;
         for (int j = 0; j < NU; j++) { const double s = S[i][j]; S[i][j] = S[best][j]; S[best][j] = s; }
-        for (int j = 0; j < N; j++) { const double y = Y[i][j]; Y[i][j] = Y[best][j]; Y[best][j] = y; }
+        EACH_BLOCK(j) { const V y = Y[i][j]; Y[i][j] = Y[best][j]; Y[best][j] = y; }
         for (int k = i + 1; k < NU; k++) {
             const double factor = S[k][i] / S[i][i];
             for (int j = i; j < NU; j++) S[k][j] -= factor * S[i][j];
-            for (int j = 0; j < N; j++) Y[k][j] -= factor * Y[i][j];
+            EACH_BLOCK(j) Y[k][j] -= factor * Y[i][j];
         }
     }
     for (int i = NU - 1; i >= 0; i--) {
-        for (int k = i + 1; k < NU; k++) for (int j = 0; j < N; j++) Y[i][j] -= S[i][k] * Y[k][j];
-        for (int j = 0; j < N; j++) Y[i][j] /= S[i][i];
+        for (int k = i + 1; k < NU; k++) EACH_BLOCK(j) Y[i][j] -= S[i][k] * Y[k][j];
+        EACH_BLOCK(j) Y[i][j] /= S[i][i];
     }
 }
 
@@ -28,32 +28,26 @@ void FN(riccati)(int64_t count, const double *A, int64_t A_next, int64_t A_row, 
                  int64_t B_row, const double *Q, int64_t Q_next, int64_t Q_row, const double *R, int64_t of_state,
                  double *P, double *gains, double *weights)
 {
-    double p[N][N];
-    for (int i = 0; i < N * N; i++) p[i / N][i % N] = P[i];
+    V a[N][BLOCKS], p[N][BLOCKS], G[NU][BLOCKS], K[NU][BLOCKS], closed[N][BLOCKS], moved[N][BLOCKS], next[N][BLOCKS];
+    double S[NU][NU];
+    for (int i = 0; i < N; i++) loaded(p[i], P + i * N);
     for (int64_t sample = 0; sample < count; sample++, A += A_next, B += B_next, Q += Q_next) {
-        double G[NU][N] = {0}, S[NU][NU], K[NU][N] = {0}, closed[N][N], moved[N][N] = {0}, next[N][N];
-        for (int k = 0; k < N; k++) for (int i = 0; i < NU; i++) for (int j = 0; j < N; j++)
-            G[i][j] += B[k * B_row + i] * p[k][j];
+        for (int i = 0; i < N; i++) loaded(a[i], A + i * A_row);
+        for (int i = 0; i < NU; i++) COMBINE(G[i], 1, N, B[k * B_row + i], p)
         for (int i = 0; i < NU; i++) for (int j = 0; j < NU; j++) {
             S[i][j] = R[i * NU + j];
-            for (int k = 0; k < N; k++) S[i][j] += G[i][k] * B[k * B_row + j];
+            for (int k = 0; k < N; k++) S[i][j] += ENTRY(G[i], k) * B[k * B_row + j];
+            *weights++ = S[i][j];
         }
-        for (int i = 0; i < NU * NU; i++) *weights++ = S[i / NU][i % NU];
         solve(S, G);
-        for (int i = 0; i < NU; i++) for (int k = 0; k < N; k++) for (int j = 0; j < N; j++)
-            K[i][j] += G[i][k] * A[k * A_row + j];
-        for (int i = 0; i < N; i++) {
-            for (int j = 0; j < N; j++) closed[i][j] = A[i * A_row + j];
-            for (int k = 0; k < NU; k++) for (int j = 0; j < N; j++) closed[i][j] -= B[i * B_row + k] * K[k][j];
-        }
-        for (int i = 0; i < N; i++) for (int k = 0; k < N; k++) for (int j = 0; j < N; j++)
-            moved[i][j] += p[i][k] * closed[k][j];
-        for (int i = 0; i < N; i++) {
-            for (int j = 0; j < N; j++) next[i][j] = Q[i * Q_row + j];
-            for (int k = 0; k < N; k++) for (int j = 0; j < N; j++) next[i][j] += A[k * A_row + i] * moved[k][j];
-        }
-        for (int i = 0; i < N; i++) for (int j = 0; j < N; j++) p[i][j] = (next[i][j] + next[j][i]) / 2;
-        for (int i = 0; i < NU * N; i++) *gains++ = of_state ? K[i / N][i % N] : G[i / N][i % N];
+        for (int i = 0; i < NU; i++) COMBINE(K[i], 1, N, ENTRY(G[i], k), a)
+        for (int i = 0; i < N; i++) COMBINE(closed[i], -1, NU, B[i * B_row + k], K)
+        for (int i = 0; i < N; i++) EACH_BLOCK(j) closed[i][j] += a[i][j];
+        for (int i = 0; i < N; i++) COMBINE(moved[i], 1, N, ENTRY(p[i], k), closed)
+        for (int i = 0; i < N; i++) COMBINE(next[i], 1, N, ENTRY(a[k], i), moved)
+        for (int i = 0; i < N; i++) for (int j = 0; j < N; j++) ENTRY(next[i], j) += Q[i * Q_row + j];
+        for (int i = 0; i < N; i++) for (int j = 0; j < N; j++) ENTRY(p[i], j) = (ENTRY(next[i], j) + ENTRY(next[j], i)) / 2;
+        for (int i = 0; i < NU; i++) for (int k = 0; k < N; k++) *gains++ = of_state ? ENTRY(K[i], k) : ENTRY(G[i], k);
     }
-    for (int i = 0; i < N * N; i++) P[i] = p[i / N][i % N];
+    for (int i = 0; i < N; i++) for (int k = 0; k < N; k++) P[i * N + k] = ENTRY(p[i], k);
 }
