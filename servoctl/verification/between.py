@@ -118,14 +118,14 @@ class Interval:
     inside: list = field(default_factory=list)
 
 
-def between(flows, t, x, settings):
+def between(attempts, t, x, settings):
     """Integrate from each edge to the next.
 
     Parameters
     ----------
-    flows : callable
-        Of the index of an edge: a sequence of `Flow`, each of which is tried if those before it did not lead to the
-        next edge, as pivots may vanish between edges.
+    attempts : sequence of callable
+        Of the indices (K,) of edges: pairs of a `Flow` and of the indices of those that it leads on. Each is tried
+        where those before it did not lead to the next edge, as pivots may vanish between edges.
     t : (K + 1,) array
         Edges, in the order of the motion [s].
     x : (n_x, K + 1) array
@@ -141,18 +141,16 @@ def between(flows, t, x, settings):
     sampled = np.all(np.isfinite(x), axis=0)
     targets, ready = x[:, 1:].copy(), np.flatnonzero(sampled[:-1])
     while ready.size:
-        tried = {k: iter(flows(k)) for k in ready}
-        while tried:
-            groups = {}
-            for k, rest in tried.items():
-                flow = next(rest, None)
-                if flow is not None:
-                    groups.setdefault((flow, settings.steps[k]), []).append(k)
-            for (flow, _), ks in groups.items():
-                problem = t[ks], np.diff(t)[ks], x[:, ks], targets[:, ks]
-                _integrate(flow, problem, np.array(ks), settings, found, budget)
-            left = [k for ks in groups.values() for k in ks if not found.resolved[k]]
-            tried = {k: tried[k] for k in left}
+        left = ready
+        for attempt in attempts:
+            for flow, ks in attempt(left):
+                for steps in np.unique(settings.steps[ks]):
+                    here = np.asarray(ks)[settings.steps[ks] == steps]
+                    problem = t[here], np.diff(t)[here], x[:, here], targets[:, here]
+                    _integrate(flow, problem, here, settings, found, budget)
+            left = left[~found.resolved[left]]
+            if not left.size:
+                break
         on = ready[~sampled[ready + 1] & found.resolved[ready]]
         x[:, on + 1] = found.ends[:, on]
         ready = on + 1
