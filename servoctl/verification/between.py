@@ -68,7 +68,9 @@ class Flow:
         if not self.balanced:
             return np.zeros(len(t))
         power = self.model.signals("power")[1]
-        return power.grid(t, z[: power.n_x], self.model.parameters)[1]
+        values = np.empty((power.n_y, len(t)))
+        power.interpreted.grid(t, z[: power.n_x], self.model.parameters, values)  # once: compiling it takes longer
+        return values[1]
 
 
 @dataclass(frozen=True)
