@@ -3,7 +3,10 @@
 import functools
 from dataclasses import dataclass, field
 
+import casadi as ca
 import numpy as np
+
+from servoctl.codegen.function import compiled
 
 STAGES = 4  # Gauss points of a step: order 8
 FIXED_POINT_STEPS = 25  # of a step, at most: an explicit iteration that takes more needs shorter steps
@@ -67,10 +70,17 @@ class Flow:
         """Power of the forces without a potential at times (N,) and jets (n_z, N)."""
         if not self.balanced:
             return np.zeros(len(t))
-        power = self.model.signals("power")[1]
-        values = np.empty((power.n_y, len(t)))
-        power.interpreted.grid(t, z[: power.n_x], self.model.parameters, values)  # once: compiling it takes longer
-        return values[1]
+        work = self.model.once("power of forces", lambda: _power_of_forces(self.model))
+        values = np.empty((1, len(t)))
+        work.interpreted.grid(t, z[: work.n_x], self.model.parameters, values)  # once: compiling it takes longer
+        return values[0]
+
+
+def _power_of_forces(model):
+    """The second of the signals "power" alone, without those that take most of its operations."""
+    f = model.signals("power")[1].expression
+    t, z, p = f.sx_in()
+    return compiled(ca.Function("work", [t, z, p], [ca.densify(f(t, z, p)[1])]), "work")
 
 
 @dataclass(frozen=True)
@@ -199,7 +209,7 @@ def _stepped(flow, t, length, x, targets, steps, sizes):
         inside += [(t + k * h, jets)] * (k > 0)
         goal = flow.values(t + h, np.where(np.isfinite(targets), targets, x))[0] if steps == 1 else start
         times, rates, jets, converged, count = _stages(flow, t + k * h, h, x, (start, goal), sizes)
-        x = x + h * np.einsum("j,njk->nk", b, rates)
+        x = x + h * np.tensordot(b, rates, (0, 1))
         back = flow.newton(t + (k + 1) * h, x)
         led_back = np.fmax(led_back, (np.abs(back) / sizes[:, None]).max(axis=0))
         led_back[~(converged & np.all(np.isfinite(x), axis=0))] = np.inf
@@ -219,19 +229,22 @@ def _stages(flow, t, h, x, guess, sizes):
     c, _, A = gauss(STAGES)
     times, (start, end) = t + c[:, None] * h, guess
     rates = start[:, None] + c[:, None] * (end - start)[:, None]
-    jets, left, evaluations = None, np.arange(len(t)), 0
+    jets, left, evaluations = None, slice(None), 0
     settled = np.zeros(len(t), dtype=bool)
     for _ in range(FIXED_POINT_STEPS):
+        before = rates[..., left]
         with np.errstate(all="ignore"):
-            states = x[:, None, left] + h[left] * np.einsum("ij,njk->nik", A, rates[..., left])
+            states = x[:, None, left] + h[left] * (A @ before)
             pair = flow.values(times[:, left].ravel(), states.reshape(len(x), -1))
             new, z = (values.reshape(len(values), STAGES, -1) for values in pair)
-            change = (np.abs(h[left] * (new - rates[..., left])) / sizes[:, None, None]).max(axis=(0, 1))
+            change = (np.abs(h[left] * (new - before)) / sizes[:, None, None]).max(axis=(0, 1))
         jets = np.zeros((len(z), STAGES, len(t))) if jets is None else jets
         rates[..., left], jets[..., left] = new, z
-        evaluations += times[:, left].size
+        evaluations += new[0].size
+        left = np.arange(len(t))[left]
         settled[left[change <= SETTLED]] = True
         left = left[change > SETTLED]  # without those that are no longer finite
         if not left.size:
             break
+        left = slice(None) if left.size == len(t) else left
     return times, rates, jets, settled, evaluations
