@@ -8,7 +8,7 @@ import numpy as np
 from servoctl.codegen import compiler
 from servoctl.codegen.native import pointer
 
-FEW = 100  # matrices up to which NumPy takes a millisecond
+FEWEST_COMPILED = 100  # matrices up to which NumPy takes at most two milliseconds
 PRODUCTS = 3e7  # multiplications of one call, some hundredths of a second: then Python looks for Ctrl-C
 
 
@@ -124,7 +124,7 @@ def _by_numpy(A, B, Q, R, P, of_state):
 
 def _function(file, name, count, **sizes):
     """A C function of a file for matrices of these sizes; None where NumPy is as good, and without a compiler."""
-    if count <= FEW:
+    if count <= FEWEST_COMPILED:
         return None
     defined = {"NAME": "servoctl", **sizes, "NX": 1, "NP": 1, "NY": 1}
     text = "".join(f"#define {key} {value}\n" for key, value in defined.items()) + f'#include "{file}.c"\n'
