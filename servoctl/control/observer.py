@@ -107,13 +107,14 @@ def output_feedback(
         step=estimating_law(plant.state_names, where, len(plant.inputs), residuals), schedule=np.vstack(schedule),
         state=np.zeros(n_x + n_z), initial_input=law.initial_input, plan=law.plan,
         state_names=(*(f"estimated error of {name}" for name in plant.state_names), *integral_names(gains.residuals)),
-        info=Deferred({}, (*law.info.keys(), FILTER_RADIUS), partial(_info, law, A @ (np.eye(n_x) - L @ C), basis)),
+        info=Deferred({}, (*law.info.keys(), FILTER_RADIUS), partial(_info, law, A, L @ C, basis)),
         integrators=tuple(range(n_x, n_x + n_z)), feedback=gains, input_matrix=input_matrix,
     )  # fmt: skip
 
 
-def _info(law, errors, basis):
-    """The results of a law's design, and the largest spectral radius of the filter's errors (N, n_x, n_x)."""
+def _info(law, A, LC, basis):
+    """The results of a law's design, and the largest spectral radius of the filter's errors."""
+    errors = A @ (np.eye(A.shape[1]) - LC)
     errors = errors if basis is None else basis.swapaxes(1, 2) @ errors @ basis
     return law.info | {FILTER_RADIUS: float(spectral_radii(errors).max())}
 
@@ -173,12 +174,16 @@ def _filter(A, C, W, V, basis):
     """Gains L (N, n_x, n_y) of the filter along the plan; covariances are in the basis of each sample."""
     from scipy.linalg import solve_discrete_are
 
-    count, n_x = len(A), A.shape[1]
-    T = np.broadcast_to(np.eye(n_x), (count, n_x, n_x)) if basis is None else basis
-    after = T[np.minimum(np.arange(count) + 1, count - 1)]
-    moved, seen, gathered = after.swapaxes(1, 2) @ A @ T, C @ T, after.swapaxes(1, 2) @ W @ after
+    count = len(A)
+    if basis is None:
+        moved, seen, gathered = A, np.broadcast_to(C, (count, *C.shape)), np.broadcast_to(W, A.shape)
+        A_0, W_0 = A[0], W
+    else:
+        after = basis[np.minimum(np.arange(count) + 1, count - 1)].swapaxes(1, 2)
+        moved, seen, gathered = after @ A @ basis, C @ basis, after @ W @ after.swapaxes(1, 2)
+        A_0, W_0 = (basis[0].T @ part @ basis[0] for part in (A[0], W))
     try:
-        P = solve_discrete_are((T[0].T @ A[0] @ T[0]).T, seen[0].T, T[0].T @ W @ T[0], V)
+        P = solve_discrete_are(A_0.T, seen[0].T, W_0, V)
     except (np.linalg.LinAlgError, ValueError) as error:
         raise ServoError(
             f"The filter's Riccati equation has no stabilising solution ({error}).",
@@ -187,4 +192,4 @@ def _filter(A, C, W, V, basis):
             measured=len(C),
         ) from error
     gains, _, _ = riccati(moved.swapaxes(1, 2), seen.swapaxes(1, 2), gathered, V, P, of_state=False)
-    return T @ gains.swapaxes(1, 2)
+    return gains.swapaxes(1, 2) if basis is None else basis @ gains.swapaxes(1, 2)
