@@ -87,6 +87,8 @@ class Interpreter:
         """Fill y (n_y, N) with the outputs at t (N,) and the columns of x, and of p if that is a matrix."""
         left = t.size % BLOCK
         blocks = t.size - left * (2 * left < BLOCK)  # a block that is half full is faster than its points
+        if t.size < BLOCK and "_blocks" not in vars(self):  # which takes longer to make than to do without; same bits
+            blocks = 0
         if blocks:
             parts, run = self._blocks.parts
             parts[2][:] = 0.0 if p.ndim == 2 else p
