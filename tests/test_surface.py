@@ -20,7 +20,7 @@ ENTRIES = ("__init__.py", "__main__.py")  # of the package itself: they gather t
 
 LAYERS = (
     "version", "errors", "values", "tolerances", "checks", "archive", "progress", "jets", "spec", "reduction", "codegen",
-    "model", "plants", "run", "methods", "internal_dynamics", "simulation", "figures", "control", "verification",
+    "model", "plants", "run", "methods", "growth", "simulation", "figures", "control", "verification",
     "sensitivities", "study", "inversion", "interop", "export", "gallery", "shell",
 )  # fmt: skip
 WITHOUT_CASADI = ("study", "figures", "interop", "shell")

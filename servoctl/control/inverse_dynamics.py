@@ -20,7 +20,7 @@ from servoctl.control.reference import Reference, refuse_transport, require_plan
 from servoctl.control.residuals import in_symbols_of
 from servoctl.control.sampling import sampled_radii
 from servoctl.errors import NotRealisable, SpecificationError, UnstableInternalDynamics, unknown
-from servoctl.internal_dynamics import internal_dynamics
+from servoctl.growth import internal_dynamics
 from servoctl.jets.tape import Tape, evaluate
 from servoctl.methods.stability import sampled_bound
 from servoctl.plants.plant import Plant

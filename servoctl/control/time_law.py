@@ -17,7 +17,7 @@ from servoctl.errors import (
     SpecificationError,
     UnstableInternalDynamics,
 )
-from servoctl.internal_dynamics import internal_dynamics
+from servoctl.growth import internal_dynamics
 from servoctl.model.model import derived
 from servoctl.progress import progress_bar
 from servoctl.run import Run
