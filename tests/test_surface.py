@@ -2,6 +2,7 @@
 
 import ast
 import inspect
+import os
 import re
 import subprocess
 import sys
@@ -231,10 +232,11 @@ def test_optional_and_heavy_packages_are_imported_where_they_are_used(path):
     assert not {name.split(".")[0] for name in names} & set(LATE)
 
 
-def loaded(script, names):
+def loaded(script, names, **environment):
     """Those of some modules that a new process has imported after a script."""
     program = f"{script}\nimport sys\nprint([name for name in {names!r} if name in sys.modules], file=sys.stderr)"
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, cwd=PACKAGE.parent)
+    command, environment = [sys.executable, "-c", program], {**os.environ, **environment}
+    done = subprocess.run(command, capture_output=True, text=True, cwd=PACKAGE.parent, env=environment)
     assert done.returncode == 0, done.stderr
     return ast.literal_eval(done.stderr.splitlines()[-1])
 
@@ -258,7 +260,7 @@ def test_public_names_load_no_heavy_package():
     assert loaded("import servoctl\nfor name in servoctl.__all__: getattr(servoctl, name)", LATE) == []
 
 
-def test_a_plan_loads_what_it_needs():
+def test_a_plan_loads_what_it_needs(tmp_path):
     """A determined motion is continued by Newton's iteration: neither SciPy nor what laws and sweeps need."""
     script = """
 import servoctl as sv
@@ -270,8 +272,9 @@ run["trolley"]
 print(model)
 """
     laws = [module_name(path) for path in FILES if layer(path) in ("control", "study", "inversion", "figures", "interop")]
-    loaded(script, ())  # what is decided once is kept on disk
-    assert loaded(script, (*LATE, *SWEEPS, *laws)) == []
+    kept = {"SERVOCTL_MEMO": "", "SERVOCTL_CACHE": str(tmp_path)}
+    loaded(script, (), **kept)  # derives
+    assert loaded(script, (*LATE, *SWEEPS, *laws), **kept) == []
 
 
 # sizes ---------------------------------------------------------------------------------------------------------------
