@@ -39,3 +39,16 @@ def read_only(array):
     view = array.view()
     view.flags.writeable = False
     return view
+
+
+class Identity:
+    """A value that equals only itself: what is kept for a mechanism holds its symbols, not those of an equal one."""
+
+    def __init__(self, value):
+        self.value = value
+
+    def __eq__(self, other):
+        return self.value is other.value
+
+    def __hash__(self):
+        return id(self.value)
