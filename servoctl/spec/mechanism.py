@@ -78,6 +78,7 @@ class Mechanism:
         constraints=None,
         outputs=None,
     ):
+        self.left_out = {}
         self.q = require_kind(Coordinates, "q", q, 'sv.coordinates("x y")')
         parameters = Parameters({}) if parameters is None else parameters
         self.parameters = require_kind(Parameters, "parameters", parameters, "sv.parameters(m=1.0, ...)")
@@ -90,7 +91,7 @@ class Mechanism:
         self.E = self._directions(actuators or {})
         self.constraints = self._named(constraints, "constraint")
         self.outputs = self._named(outputs, "output")
-        self.inputs, self.reported, self.left_out = (), {}, {}
+        self.inputs, self.reported = (), {}
         self._refuse_orders()
         self._refuse_names()
         self._check_balance()
