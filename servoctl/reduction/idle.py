@@ -1,16 +1,22 @@
-"""Coordinates that play no part in a program: nothing couples them to what it prescribes or reports."""
+"""Coordinates that play no part in a program: nothing couples them to what it prescribes, drives or reports."""
 
 from collections.abc import Mapping
 
+import casadi as ca
+import numpy as np
+
 from servoctl.checks import texts
 from servoctl.errors import unknown
+from servoctl.spec.mechanism import IDENTITY_SEED, RANDOM
+from servoctl.tolerances import ENTRY
 
 
 def needed(mechanism, program, keep=(), named=()):
     """The mechanism without the coordinates that play no part in a program; itself if all do.
 
-    A coordinate plays a part if residuals, weights, wishes, outputs, `keep` or `named` contain it, or if terms of the
-    mechanism couple it to one that does.
+    A coordinate plays a part if residuals, actuators, weights, wishes or outputs contain it, if it is named, or if
+    terms of the mechanism couple it to one that does. Coordinates without inertia, or with constraints that depend on
+    each other, are left to the derivation, which refuses them.
 
     Parameters
     ----------
@@ -19,8 +25,7 @@ def needed(mechanism, program, keep=(), named=()):
     keep : sequence of str
         Names of coordinates.
     named : iterable of str
-        Signals that a caller starts from, limits or bounds: coordinates and actuators with their derivatives among
-        them.
+        Names of signals that a caller guesses, holds or bounds, coordinates and their derivatives among them.
 
     Returns
     -------
@@ -37,13 +42,18 @@ def needed(mechanism, program, keep=(), named=()):
             raise unknown(name, q.names, "coordinate")
     if not program.residuals or mechanism.left_out:
         return mechanism
-    choices = program.weights | program.toward
-    asked = [*program.residuals.values(), *choices.values(), *mechanism.outputs.values(), *mechanism.reported.values()]
-    roots = mechanism.places(*asked).union(*(mechanism.driven(name) for name in choices if name in mechanism.actuators))
+    chosen = [*program.weights.values(), *program.toward.values()]
+    roots = mechanism.places(*program.residuals.values(), *chosen, *mechanism.outputs.values())
+    roots = roots.union(*map(mechanism.driven, mechanism.actuators), mechanism.places(*mechanism.reported.values()))
     roots |= {place for name, place in _jets(q).items() if name in keep or name in named}
-    roots = roots.union(*(mechanism.driven(name) for name in mechanism.actuators if {name, f"d{name}"} & {*named}))
     reached = _reached(roots, mechanism.couplings())
-    return mechanism.part(reached) if 0 < len(reached) < q.nq + q.n else mechanism
+    all_play = not reached or len(reached) == q.nq + q.n
+    return mechanism.part(reached) if not all_play and _moves(mechanism, reached) else mechanism
+
+
+def names_of(values):
+    """Names of a start, or of values by name; none of anything else."""
+    return tuple(values) if isinstance(values, Mapping) else tuple(getattr(values, "names", ()))
 
 
 def _jets(q):
@@ -65,6 +75,27 @@ def _reached(roots, couplings):
     return reached
 
 
-def names_of(values):
-    """Names of a start, or of values by name; none of anything else."""
-    return tuple(values) if isinstance(values, Mapping) else tuple(getattr(values, "names", ()))
+def _moves(mechanism, reached):
+    """Whether [M Gᵀ; G 0] of the others, with their constraints G, determines accelerations, and M >= 0, at a point."""
+    q = mechanism.q
+    rows = [i for i in range(q.n) if ("w", i) not in reached]
+    constraints = [e for e in mechanism.constraints.values() if not mechanism.places(e) <= reached]
+    gradients = [_leading(q, e)[rows] for e in constraints]
+    parts = [mechanism.mass[rows, rows], ca.horzcat(ca.SX(len(rows), 0), *gradients)]
+    f = q.as_function(parts, mechanism.parameters.symbols)
+    rng = np.random.default_rng(IDENTITY_SEED)
+    jets = [rng.uniform(*RANDOM, f.size1_in(k)) for k in range(f.n_in() - 1)]
+    M, G = (np.array(part).reshape(len(rows), -1) for part in f(*jets, mechanism.parameters.values()))
+    K = np.block([[M, G], [G.T, np.zeros((G.shape[1], G.shape[1]))]])
+    size = np.sqrt(np.abs(K).max(axis=1))
+    if not np.isfinite(K).all() or not size.all():
+        return False
+    least = np.linalg.eigvalsh(M / np.outer(size, size)[: len(M), : len(M)]).min()
+    return bool(least > -ENTRY and np.linalg.matrix_rank(K / np.outer(size, size)) == len(K))
+
+
+def _leading(q, constraint):
+    """∂φ/∂γ^(s) as a column, by the velocities."""
+    order = q.order(constraint)
+    slopes = ca.jacobian(constraint, q.jet(order))
+    return (slopes if order or q.plain else slopes @ q.V).T
