@@ -7,6 +7,7 @@ from pathlib import Path
 
 import servoctl as sv
 from servoctl.errors import ServoError, SpecificationError, unknown
+from servoctl.figures.style import write_png
 from servoctl.shell.folder import folder_of
 from servoctl.shell.options import MANY, METHODS_HELP, by_name, count, draw, drawn, draws, shard, used, variation, whole
 from servoctl.shell.printing import Report, complain
@@ -209,7 +210,7 @@ def _leave(study, folder, stem, units):
     except SpecificationError as error:
         complain(f"There is no figure: {error}")
     else:
-        folder.write(lambda path: figure.savefig(path / f"{stem}.png"))
+        folder.write(lambda path: write_png(figure, path / f"{stem}.png"))
         written.append(f"{stem}.png")
     print(f"{', '.join(written)} in {folder.path}")
     whole = study.meta["shard"] is not None or len(study) == study.meta["count"]

@@ -1,6 +1,7 @@
 """`servoctl tradeoff`: measure errors and costs of methods and treatments of drift on a scene, and recommend one."""
 
 import servoctl as sv
+from servoctl.figures.style import write_png
 from servoctl.shell.folder import folder_of
 from servoctl.shell.motion import described
 from servoctl.shell.options import add_motion, drift, positive
@@ -39,7 +40,7 @@ def _measured(args, name, scene, folder):
     folder.write(lambda path: study.save(path / "tradeoff.npz"))
     folder.write(lambda path: study.csv(path / "tradeoff.csv"))
     figure = study.plot(title=name).figure
-    folder.write(lambda path: figure.savefig(path / "tradeoff.png", dpi=100))
+    folder.write(lambda path: write_png(figure, path / "tradeoff.png"))
     try:
         best = _recommended(study, args, report)
     finally:  # also where no setting is good enough
