@@ -33,6 +33,8 @@ from servoctl.export.c import export_c as export_c
 from servoctl.growth import InternalDynamics as InternalDynamics
 from servoctl.growth import internal_dynamics as internal_dynamics
 from servoctl.inversion.choice import inverse as inverse
+from servoctl.inversion.design import Design as Design
+from servoctl.inversion.design import design as design
 from servoctl.inversion.output import MinimumPhase as MinimumPhase
 from servoctl.inversion.output import minimum_phase as minimum_phase
 from servoctl.inversion.relaxed import relaxed as relaxed
