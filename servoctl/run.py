@@ -142,10 +142,15 @@ class Run(ByName, Value):
             groups = self._groups
             rate, base = (0, name) if name in groups else _split(name)
             if base not in groups:
-                raise unknown(name, self.names, "signal")
+                raise self._no_signal(name)
             names, values = self.signals(groups[base], rate)
             self.stored.update(zip(names, values, strict=True))
         return self.stored[name]
+
+    def _no_signal(self, name):
+        if self.model is None:
+            return unknown(name, self.names, "signal")
+        return self.model.reduction.mechanism.no("signal", name, self.names)
 
     def signals(self, kind, rate=0):
         """Names and (n, N) values of one of the model's groups of signals, or of their time derivatives.

@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 
 from servoctl.checks import as_numbers, as_span
 from servoctl.errors import InconsistentStart, ServoError, SpecificationError
-from servoctl.internal_dynamics import FEWEST, STEP_ERROR, UNSTABLE, growth_bound, internal_dynamics
+from servoctl.growth import FEWEST, STEP_ERROR, UNSTABLE, growth_bound, internal_dynamics
 from servoctl.methods.accuracy import ATOL, absolute_tolerances, accurate, large_tolerances
 from servoctl.methods.algebraic import algebraic
 from servoctl.methods.bounded import bounded

@@ -42,6 +42,19 @@ def read_only(array):
     return view
 
 
+class Identity:
+    """A value that equals only itself: what is kept for a mechanism holds its symbols, not those of an equal one."""
+
+    def __init__(self, value):
+        self.value = value
+
+    def __eq__(self, other):
+        return self.value is other.value
+
+    def __hash__(self):
+        return id(self.value)
+
+
 class Deferred(dict):
     """A dict of which some values are computed together when one of its values is first read.
 

@@ -17,7 +17,7 @@ from servoctl.control.close import require_names
 from servoctl.control.conditions import ranges
 from servoctl.control.law import Law
 from servoctl.control.lqr import Q_POSITION, R_INPUT, steady, tangents
-from servoctl.control.reference import Reference, require_plant
+from servoctl.control.reference import Reference, of_plan, require_plant
 from servoctl.control.residuals import Residuals, in_symbols_of, program_residuals
 from servoctl.control.result import Closed
 from servoctl.control.sampling import discretised
@@ -148,6 +148,7 @@ def limited(
     LimitExceeded
         During the loop, if no inputs satisfy limits and bounds together.
     """
+    plant = of_plan(getattr(law, "plan", None), plant)
     _require_law(law, plant)
     effects, bounds = _bounds(plant, bounds)
     reference = Reference(law.plan, plant, law.rate)

@@ -12,7 +12,7 @@ from servoctl.checks import as_numbers, numbers_by_name
 from servoctl.codegen.matrices import riccati
 from servoctl.control.feedback import StateFeedback, affine
 from servoctl.control.law import Law
-from servoctl.control.reference import Reference, refuse_transport
+from servoctl.control.reference import Reference, of_plan, refuse_transport
 from servoctl.control.residuals import Residuals, program_residuals
 from servoctl.control.sampling import discretised, spectral_radii
 from servoctl.errors import ServoError, SpecificationError
@@ -83,6 +83,7 @@ def lqr(
         raise SpecificationError(
             f"varying={varying!r} was given.", "It is True (along the plan) or False (frozen time).", value=varying
         )
+    plant = of_plan(plan, plant)
     reference = Reference(plan, plant, rate)
     refuse_transport(plant, "The design is")
     Q = weights(Q, _state_weights(plant), plant.state_names, "state", "Q")

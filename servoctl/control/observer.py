@@ -12,7 +12,7 @@ from servoctl.codegen.matrices import riccati
 from servoctl.control.feedback import integral_names, integration, law_step
 from servoctl.control.law import Law
 from servoctl.control.lqr import tangents, weights
-from servoctl.control.reference import Reference, refuse_transport, require_plant
+from servoctl.control.reference import Reference, of_plan, refuse_transport, require_plant
 from servoctl.control.residuals import Residuals
 from servoctl.control.sampling import discretised, spectral_radii
 from servoctl.errors import ServoError, SpecificationError
@@ -87,6 +87,7 @@ def output_feedback(
     ServoError
         If a mode that the measured states do not see does not decay.
     """
+    plant = of_plan(getattr(law, "plan", None), plant)
     _require_lqr(law, plant)
     measured, deviations = _deviations(noise, plant)
     reference, gains = Reference(law.plan, plant, law.rate), law.feedback

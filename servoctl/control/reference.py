@@ -7,7 +7,7 @@ import numpy as np
 
 from servoctl.checks import ON_SAMPLE, positive, require_memory
 from servoctl.errors import NotRealisable, ServoError, SpecificationError, unknown
-from servoctl.plants.plant import Plant
+from servoctl.plants.plant import Plant, part_of
 
 
 class Reference:
@@ -106,6 +106,12 @@ def require_plant(plant):
             do="Make the plant of the mechanism: sv.plant(mechanism).",
             kind=type(plant).__name__,
         )
+
+
+def of_plan(plan, plant):
+    """The plant without the coordinates that play no part in the program of a plan; as it is without a plan."""
+    model = getattr(plan, "model", None)
+    return part_of(plant, model.reduction.mechanism) if isinstance(plant, Plant) and model is not None else plant
 
 
 def refuse_transport(plant, what):

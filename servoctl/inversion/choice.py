@@ -34,6 +34,7 @@ from servoctl.methods.choice import Algebraic, Bounded, Method, as_method
 from servoctl.model.model import derive
 from servoctl.model.start import State
 from servoctl.plants.plant import plant
+from servoctl.reduction.idle import names_of, needed
 from servoctl.run import Run
 from servoctl.simulation import as_state, simulate
 from servoctl.spec.mechanism import Mechanism
@@ -106,6 +107,7 @@ def inverse(
     require_kind(Mechanism, "mechanism", mechanism, "sv.Mechanism(q, gibbs, ...)")
     require_kind(Program, "program", program, "sv.Program({...})")
     span, ranges = as_span(t_span, forward=True), _ranges(mechanism, limits, bounds)
+    mechanism = needed(mechanism, program, named=[*names_of(start), *ranges[0], *ranges[1]])
     request = Request(mechanism, program, span, start, ranges, _checked(weight, program))
     known = None if isinstance(start, State) else mapping(start, "The start")
     by_hand = method if method is None or isinstance(method, str) and method == RELAXED else as_method(method)

@@ -20,7 +20,7 @@ import numpy as np
 from servoctl.checks import as_list, finite, interval, mapping, named, numbers_by_name, require_kind, texts
 from servoctl.control.time_law import REACHED
 from servoctl.errors import LimitExceeded, ServoError, SpecificationError, UnstableInternalDynamics, unknown
-from servoctl.internal_dynamics import internal_dynamics
+from servoctl.growth import internal_dynamics
 from servoctl.inversion.report import extremes
 from servoctl.inversion.verdict import HYPERBOLIC_ZEROS, verdict
 from servoctl.methods.choice import Bounded

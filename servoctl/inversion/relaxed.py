@@ -36,7 +36,8 @@ from servoctl.methods.bounded import subdivided
 from servoctl.methods.motion import breakpoints
 from servoctl.model.start import State
 from servoctl.plants.driven import at_once, driven
-from servoctl.plants.plant import Plant
+from servoctl.plants.plant import Plant, part_of
+from servoctl.reduction.idle import names_of, needed
 from servoctl.reduction.knots import Switches
 from servoctl.run import Run
 from servoctl.spec.paths import piecewise
@@ -119,6 +120,8 @@ def relaxed(
     """
     require_kind(Plant, "plant", plant, "sv.plant(mechanism)")
     require_kind(Program, "program", program, "sv.Program({...})")
+    named = [name for given in (start, end, limits, plant.limits, bounds) for name in names_of(given)]
+    plant = part_of(plant, needed(plant.mechanism, program, named=named))
     limits = _all_limits(plant, limits)
     relaxation = Relaxation(at_once(plant), program, as_span(t_span, forward=True), limits, bounds, start, end)
     several = None if isinstance(weight, Mapping) else as_list(weight)

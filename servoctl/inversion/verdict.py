@@ -10,7 +10,7 @@ import casadi as ca
 import numpy as np
 
 from servoctl.errors import IntegrationStopped, ServoError, SingularProgram
-from servoctl.internal_dynamics import InternalDynamics, internal_dynamics
+from servoctl.growth import InternalDynamics, internal_dynamics
 from servoctl.methods.bounded import End, FreeEntries
 from servoctl.methods.kinks import SMOOTHER, kink, stays_on_kink
 from servoctl.model.model import Model
