@@ -37,6 +37,15 @@ class Motion:
         if len(t):
             self.pieces.append((model, np.asarray(t), np.asarray(x), np.asarray(top)))
 
+    def end_before(self, t, error):
+        """Drop the samples from an instant t [s] on, and stop there for an error."""
+        for i, (model, times, x, top) in enumerate(self.pieces):
+            if t in times:
+                k = int(np.flatnonzero(times == t)[0])
+                self.pieces[i:] = [(model, times[:k], x[:, :k], top[:, :k])] if k else []
+                break
+        self.stop = error
+
     def changes_pivots(self, t):
         """Note a change of pivots at t; False if one was made at this instant already and did not help."""
         again = t in self.changed

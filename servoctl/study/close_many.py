@@ -110,7 +110,8 @@ def close_many(
     seeds = _seeds(run.conditions.sensors, len(columns[next(iter(columns))]))
     threads = threads if threads is None else whole("threads", threads, least=1)
     gathered = None
-    if not run.plant.equations.orders:  # else each loop is judged by itself
+    equations = run.plant.equations
+    if not equations.orders and equations.left_out is None:  # else each loop is judged by itself
         gathered = run_batch(derived, loop, numbers, _noise(run, seeds), traced, every, threads)
     if gathered is None:
         gathered = _one_by_one(run, derived, loop, numbers, seeds, traced, every)
