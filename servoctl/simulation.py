@@ -34,7 +34,7 @@ from servoctl.methods.choice import (
 )
 from servoctl.methods.events import Event, Events, as_events, occurrences
 from servoctl.methods.left_out import DERIVATIONS, alive_along, came_alive
-from servoctl.methods.motion import DEFAULT_SAMPLES
+from servoctl.methods.motion import DEFAULT_SAMPLES, without_interruption
 from servoctl.methods.orders import end_at_other_orders
 from servoctl.methods.radau import RadauSteps
 from servoctl.methods.runge_kutta import ORDERS, RungeKuttaSteps
@@ -201,11 +201,14 @@ def simulated(model, start, t_span, method=None, *, drift=None, t_eval=None, eve
         model, motion = _derived_along(model, method, drift, (t0, x0, t1, times, knots, events), bar)
     finally:
         bar.close()
-    end_at_other_orders(motion)
-    run = _run(model, motion, method, drift, knots, (t0, x0, t1))
-    run = replace(run, start=_as_started(model, start, t0, x0 if motion.start is None else motion.start))
-    if t_eval is not None and isinstance(method, RungeKutta):
-        run = _resample(run, times)
+    with without_interruption() as pressed:  # a motion that is computed is kept
+        end_at_other_orders(motion)
+        run = _run(model, motion, method, drift, knots, (t0, x0, t1))
+        run = replace(run, start=_as_started(model, start, t0, x0 if motion.start is None else motion.start))
+        if t_eval is not None and isinstance(method, RungeKutta):
+            run = _resample(run, times)
+    if pressed and run.status == 0:
+        run = replace(run, success=False, status=1, message=f"{run.message}; interrupted at its end")
     if motion.stop is not None:
         motion.stop.run = run
         raise motion.stop
@@ -484,7 +487,8 @@ def _sample_times(t0, t1, t_eval, knots, method=None):
     if t_eval is None:
         times = np.union1d(np.linspace(t0, t1, DEFAULT_SAMPLES), [k for k in knots if min(t0, t1) < k < max(t0, t1)])
     else:
-        times = np.unique(as_numbers(t_eval))
+        times = as_numbers(t_eval)
+        times = times if times.ndim == 1 and np.all(times[1:] > times[:-1]) else np.unique(times)
         if not np.all(np.isfinite(times)):
             raise SpecificationError(
                 f"t_eval={repr(t_eval)[:150]} was given.", "It is a sequence of finite times [s].", t_eval=t_eval

@@ -1,6 +1,8 @@
 """What all integrations share: the pieces of a motion, and the change of pivots that the rank monitor requires."""
 
 import contextlib
+import signal
+import threading
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -93,6 +95,20 @@ def interruptible(motion):
         yield
     except KeyboardInterrupt:
         motion.interrupted = True
+
+
+@contextlib.contextmanager
+def without_interruption():
+    """Ctrl-C waits until the end; the list is not empty if it came."""
+    pressed, before = [], signal.getsignal(signal.SIGINT)
+    if threading.current_thread() is not threading.main_thread() or not callable(before):
+        yield pressed
+        return
+    signal.signal(signal.SIGINT, lambda number, frame: pressed.append(number))
+    try:
+        yield pressed
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 def margin_at(t):
