@@ -3,9 +3,8 @@
 import numpy as np
 
 from servoctl.errors import IntegrationStopped
-from servoctl.reduction.ranks import alive
+from servoctl.reduction.ranks import SUSPECT, alive
 
-SUSPECT = 1e-8  # of the size of its terms: an entry above this is evaluated in extended precision
 DERIVATIONS = 4  # of the equations of one motion, each near a state at which an entry came alive
 
 

@@ -15,7 +15,7 @@ from servoctl.reduction.appell import plant_accelerations, require_inertia
 from servoctl.reduction.hidden import complete
 from servoctl.reduction.manifold import Context, sample
 from servoctl.reduction.orders import Orders
-from servoctl.reduction.ranks import alive, noting_left_out
+from servoctl.reduction.ranks import SUSPECT, alive, noting_left_out
 from servoctl.reduction.reduce import NEAR_SPREAD, NEARBY, WINDOW, strong
 from servoctl.reduction.rows import as_rows
 
@@ -159,10 +159,21 @@ class PlantEquations:
             return True
         if self.orders and not all(self.orders.hold(self._points(case)) for case in values.T):
             return False
-        entries, points = self.entries_left_out, self._material[1]
-        if entries and any(alive(entries, replace(points, values=case)).any() for case in values.T):
+        if self.left_out is not None and self._alive(values):
             return False
         return bool(strong(self._pivot_sizes(values), self._usual_pivots).all())
+
+    def _alive(self, values):
+        """Whether an entry that was left out is not zero at a point with parameters (n_p, N)."""
+        shares = np.split(np.abs(self._left_out_at_points(values).full()), 2)
+        suspects = (shares[0] > SUSPECT * shares[1]).any(axis=0).reshape(values.shape[1], -1).any(axis=1)
+        entries, points = self.entries_left_out, self._material[1]
+        return any(alive(entries, replace(points, values=case)).any() for case in values.T[suspects])
+
+    @cached_property
+    def _left_out_at_points(self):
+        entries = self.entries_left_out
+        return self._at_points(ca.vertcat(*entries, *map(size_of_terms, entries)))
 
     @cached_property
     def _usual_pivots(self):

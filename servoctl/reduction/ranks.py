@@ -22,6 +22,7 @@ from servoctl.jets.tape import divide, multiply, subtract
 from servoctl.tolerances import CUTOFF, ENTRY, NOISE, REFINEMENTS, RESOLVED, TINY
 
 THRESHOLD = 0.1  # least size of a pivot, relative to the largest entry of its equilibrated row
+SUSPECT = 1e-8  # of the size of its terms: an entry above this is evaluated in extended precision
 _left_out = ContextVar("left_out", default=None)  # where eliminations note what they leave out
 SWEEPS = 6  # of equilibration; each takes the square root of the remaining factors: 1e±30 comes within a factor of 3
 
