@@ -60,7 +60,7 @@ def component_sizes(values, levels, least=SMALLEST_SIZE):
     for level in np.unique(levels):
         same = levels == level
         size[same] = np.maximum(size[same], least * size[same].max())
-    size[size == 0] = 1.0
+    size[~(size > 0)] = 1.0  # NaN among them
     return size
 
 
