@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import servoctl as sv
+from servoctl.methods.bulk import BulkSteps
 from servoctl.methods.monitor import DEGRADED, NO_CHOICE, DenseStretch, Fine, Monitor, Repivot, Singular, Stretch
 
 
@@ -130,13 +131,35 @@ def test_a_gradient_that_falls_along_the_motion_is_no_lost_rank(row, method):
     assert np.hypot(run["x"], run["y"])[-1] == pytest.approx(radius, rel=1e-7)
 
 
+def a_gradient_that_vanishes():
+    """(x - 20) y' = cos t."""
+    q = sv.coordinates("x y")
+    mechanism = sv.Mechanism(q, gibbs=ca.sumsqr(ca.vertcat(*q.d(2))) / 2)
+    return sv.derive(mechanism, sv.Program({"p": (q.jet(0)[0] - 20.0) * q.jet(1)[1] - ca.cos(q.t)}, by="ideal"))
+
+
 @pytest.mark.parametrize("method", ["DOP853", "Taylor", "RK8", "RadauIIA"])
 def test_a_rank_that_is_lost_after_a_long_way_is_lost(method):
     """(x - 20) y' = cos t at x = 1 + 8 t: a gradient that falls to zero linearly, at 19/8 s."""
-    q = sv.coordinates("x y")
-    mechanism = sv.Mechanism(q, gibbs=ca.sumsqr(ca.vertcat(*q.d(2))) / 2)
-    program = sv.Program({"p": (q.jet(0)[0] - 20.0) * q.jet(1)[1] - ca.cos(q.t)}, by="ideal")
-    model = sv.derive(mechanism, program)
+    model = a_gradient_that_vanishes()
     with pytest.raises(sv.SingularProgram) as error:
         sv.simulate(model, model.start(x=1.0, y=0.0, dx=8.0), (0.0, 4.0), method)
     assert error.value.details["t"] == pytest.approx(19 / 8, abs=1e-3)
+
+
+def test_steps_that_miss_the_equations_where_the_rank_is_lost_end_the_motion(monkeypatch):
+    """Rounding of accelerations grows towards a singular state, where steps of any length then miss the equations."""
+    model = a_gradient_that_vanishes()
+    ordinary, tries = BulkSteps._doubted, []
+
+    def doubted(self, stretch):
+        if stretch.t[-1] < 19 / 8 - 1e-4:
+            return ordinary(self, stretch)
+        tries.append(stretch.t[1] - stretch.t[0])
+        assert len(tries) < 40
+        return 0, stretch.t[0] + tries[-1] / 10
+
+    monkeypatch.setattr(BulkSteps, "_doubted", doubted)
+    with pytest.raises(sv.SingularProgram) as error:
+        sv.simulate(model, model.start(x=1.0, y=0.0, dx=8.0), (0.0, 4.0), "DOP853")
+    assert error.value.details["t"] == pytest.approx(19 / 8, abs=1e-3) and tries
