@@ -4,6 +4,7 @@ import casadi as ca
 import closed_forms as cf
 import numpy as np
 import pytest
+from scipy.integrate import solve_ivp
 
 import servoctl as sv
 from servoctl.methods.bulk import BulkSteps
@@ -145,6 +146,29 @@ def test_a_rank_that_is_lost_after_a_long_way_is_lost(method):
     with pytest.raises(sv.SingularProgram) as error:
         sv.simulate(model, model.start(x=1.0, y=0.0, dx=8.0), (0.0, 4.0), method)
     assert error.value.details["t"] == pytest.approx(19 / 8, abs=1e-3)
+
+
+@pytest.mark.parametrize("method, distance", [("DOP853", 1e-3), ("Taylor", 0.1), ("RadauIIA", 1e-2)])
+@pytest.mark.filterwarnings("ignore:Internal dynamics unstable")
+def test_a_zero_of_a_pivot_next_to_a_singular_state_is_passed(method, distance):
+    """s y' + ε z' = cos t with s = 8 t - 19: the entry of y' vanishes at 19/8 s, where the gradient is ε."""
+    q = sv.coordinates("x y z")
+    x, _, _ = q
+    mechanism = sv.Mechanism(q, gibbs=ca.sumsqr(ca.vertcat(*q.d(2))) / 2)
+    _, dy, dz = q.d(1)
+    program = sv.Program({"p": (x - 20.0) * dy + distance * dz - ca.cos(q.t)}, by="ideal")
+    model = sv.derive(mechanism, program)
+    start = model.start(x=1.0, y=0.0, z=0.0, dx=8.0, dz=0.3)
+    run = sv.simulate(model, start, (0.0, 3.0), method, t_eval=[0.0, 3.0])
+
+    def rates(t, v):
+        gradient = np.array([8.0 * t - 19.0, distance])
+        return -gradient * (np.sin(t) + 8.0 * v[0]) / (gradient @ gradient)
+
+    ends = [run["dy"][0], run["dz"][0]]
+    assert ends == pytest.approx([(0.3 * distance - 1.0) / 19.0, 0.3])
+    true = solve_ivp(rates, (0.0, 3.0), ends, "Radau", rtol=1e-10, atol=1e-12).y[:, -1]
+    assert [run["dy"][1], run["dz"][1]] == pytest.approx(true, rel=1e-5)
 
 
 def test_steps_that_miss_the_equations_where_the_rank_is_lost_end_the_motion(monkeypatch):
