@@ -32,6 +32,7 @@ from servoctl.errors import (
 from servoctl.export.c import export_c
 from servoctl.internal_dynamics import InternalDynamics, internal_dynamics
 from servoctl.inversion.choice import inverse
+from servoctl.inversion.design import Design, design
 from servoctl.inversion.output import MinimumPhase, minimum_phase
 from servoctl.inversion.relaxed import relaxed
 from servoctl.inversion.report import Report, report
@@ -85,6 +86,7 @@ __all__ = [
     "Closed",
     "Controller",
     "Coordinates",
+    "Design",
     "Event",
     "Identification",
     "InconsistentStart",
@@ -128,6 +130,7 @@ __all__ = [
     "computed",
     "coordinates",
     "derive",
+    "design",
     "disturbances",
     "export_c",
     "fastest",

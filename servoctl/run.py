@@ -185,7 +185,7 @@ class Run(ByName, Value):
                     jets=needed,
                 )
             parts.append(f.grid(self.t[first:end], jets, model.parameters))
-        return names, np.concatenate(parts, axis=1)
+        return names, parts[0] if len(parts) == 1 else np.concatenate(parts, axis=1)
 
     def variant(self, i: int):
         """The variant of the model that holds at sample i."""
