@@ -6,6 +6,7 @@ the sizes of the terms that made them.
 
 import math
 import operator
+import sys
 from functools import cached_property
 from math import factorial
 from typing import NamedTuple
@@ -77,7 +78,7 @@ def select(condition, yes, no):
 
 def finite(a):
     """Whether an SX expression, as 1 or 0, or the entries of an array are finite."""
-    return ca.fabs(a) < ca.inf if isinstance(a, ca.SX) else np.isfinite(a)
+    return ca.fabs(a) <= sys.float_info.max if isinstance(a, ca.SX) else np.isfinite(a)
 
 
 class Node(NamedTuple):

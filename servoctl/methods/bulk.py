@@ -19,6 +19,7 @@ from servoctl.methods.watch import FINER, RESOLUTION, End, net, steps_of
 OFF = 1e3  # times the tolerance, which the equations may add to a step
 REPEATS = 8  # of a step at one instant, after which it is believed
 SHORTER = 1e-2  # to which part a first step is shortened that errs by far
+FUTILE = 1e-8  # of the span: a shorter step that misses the equations where the rank is lost ends the motion
 SHORTEST = 1e-12  # of the span: shorter steps are not repeated, so that a jump of the equations is passed
 SPACING = 1e-3  # of a step, between the points by which its dense output is differentiated
 
@@ -78,7 +79,8 @@ class BulkSteps(Stepping):
             if before < last:
                 self._record(steps, before, last)
             self.progress(t)
-            if isinstance(outcome, Fine) and steps.failed and last == len(steps.t) - 1:
+            futile = doubt is not None and abs(doubt - t) < FUTILE * self.watch.span and self.monitor.lost(t, x)
+            if isinstance(outcome, Fine) and (futile or steps.failed and last == len(steps.t) - 1):
                 self._fail(t, x, self.failure)
                 goes_on = False
             if not goes_on:
