@@ -40,6 +40,9 @@ class Knots:
     classes: dict
 
 
+_ANY_SPAN = object()  # in place of the span where no switch is scanned for
+
+
 class Switches:
     """The switches in residuals that depend on t and parameters alone.
 
@@ -47,21 +50,56 @@ class Switches:
     ----------
     q : Coordinates
     residuals : dict of str to SX
+        Those without such switches are left out.
     parameters : tuple of SX
     timed : list of (int, int or None), optional
         Sides of the switches, as nodes of the tape; they are searched by default.
     """
 
     def __init__(self, q, residuals, parameters, timed=None):
-        self.q, self.residuals, self._arguments = q, residuals, (q, residuals, parameters)
-        self.symbols = ca.symvar(ca.vertcat(*residuals.values()))
+        self.q, self._symbols, self._last = q, parameters, None
         self.parameters = [p.element_hash() for p in parameters]
+        self._read(residuals)
         self.timed = timed
         if timed is None:
             self.timed = self._timed() if any(s.element_hash() == q.t.element_hash() for s in self.symbols) else []
+            self._read({name: residuals[name] for name in self._switching()})
+            self.timed = self._timed() if self.timed else []
 
     def __reduce__(self):
-        return Switches, (*self._arguments, self.timed)
+        return Switches, (self.q, self.residuals, self._symbols, self.timed)
+
+    def _read(self, residuals):
+        self.residuals, self.symbols = residuals, ca.symvar(ca.vertcat(ca.SX(0, 1), *residuals.values()))
+        self.__dict__.pop("tape", None)
+
+    def _switching(self):
+        """Names of the residuals that contain a switch in t."""
+        if not self.timed:
+            return []
+        sides, reached = set(self.timed), []
+        for _, args, _ in self.tape.nodes:
+            switch = args and (args[0], args[1] if len(args) > 1 else None) in sides
+            reached.append(bool(switch) or any(reached[a] for a in args))
+        return [name for name, node in zip(self.residuals, self.tape.outputs, strict=True) if reached[node]]
+
+    @cached_property
+    def _numbers(self):
+        """Indices of the parameters on which the residuals depend."""
+        return [self.parameters.index(h) for h in (s.element_hash() for s in self.symbols) if h in self.parameters]
+
+    def knots(self, values, needs, span=None):
+        """The switching instants and the classes there; see `times` and `classes`.
+
+        The last ones are known as long as the numbers in the residuals are the same.
+        """
+        key = values[self._numbers].tolist(), needs
+        if self._last is None or self._last[0] != key or self._last[1] not in (_ANY_SPAN, span):
+            instants, others = self._affine(values)
+            times = self._times(values, instants, others, span)
+            knots = Knots(tuple(times), self.classes(values, needs, times))
+            self._last = key, span if others else _ANY_SPAN, knots
+        return self._last[2]
 
     @cached_property
     def tape(self):
@@ -92,10 +130,12 @@ class Switches:
         span : (t0, t1), optional
             A span that is scanned for switches that are not affine in t.
         """
-        if not self.timed:
-            return []
+        return self._times(values, *self._affine(values), span)
+
+    def _affine(self, values):
+        """Instants of switches whose sides are affine in t (a set), and the sides of the others (a list)."""
         pieces = []
-        for node in self.tape.nodes:
+        for node in self.tape.nodes if self.timed else ():
             pieces.append(self._pieces(node, pieces, values))
         instants, others = set(), []
         for a, b in self.timed:
@@ -104,6 +144,10 @@ class Switches:
                 others.append((a, b))
                 continue
             instants |= {(d0 - c0) / (c1 - d1) for c0, c1 in first for d0, d1 in second if c1 != d1}
+        return instants, others
+
+    def _times(self, values, instants, others, span):
+        """Instants of all switches, ascending: affine ones, and others within these and a span."""
         window = [*instants, *(span or ())]
         if others and window and max(window) > min(window):
             instants |= self._scan(values, min(window), max(window), others)
@@ -311,9 +355,8 @@ def require_smooth(switches, values, needs, span=None):
     SpecificationError
         If a path has a lower class at an instant, such as C^2 instead of C^4 at t = 3 s.
     """
-    times = switches.times(values, span)
-    classes = switches.classes(values, needs, times)
-    for name, instants in classes.items():
+    knots = switches.knots(values, needs, span)
+    for name, instants in knots.classes.items():
         when, k = min(instants, key=lambda pair: pair[1])
         if k < needs.get(name, 0):
             what = f"The path in {name!r}" if isinstance(name, str) else str(name).capitalize()
@@ -326,4 +369,4 @@ def require_smooth(switches, values, needs, span=None):
                 has=k,
                 t=when,
             )
-    return Knots(tuple(times), classes)
+    return knots
