@@ -1,5 +1,7 @@
 """Where paths switch, and programs that need more derivatives than their paths have."""
 
+import math
+
 import casadi as ca
 import pytest
 from refusals import refused
@@ -213,3 +215,21 @@ def test_a_residual_may_be_named_like_a_force():
         derive(mechanism, sv.Program({"the force on x1": x1 - path}))
     assert caught.value.details["name"] == "the force on x1"
     assert (caught.value.details["needs"], caught.value.details["has"]) == (4, 2)
+
+
+def test_remembered_knots_are_those_of_their_numbers_and_span():
+    """Switches of max(0, sin t - h) lie at arcsin h and π - arcsin h of every turn within the span."""
+    q, p = sv.coordinates("x"), sv.parameters(h=0.5, m=1.0)
+    (x,) = q
+    mechanism = sv.Mechanism(q, gibbs=sv.particle(q, p.m, (x,)), actuators={"F": x}, parameters=p)
+    model = derive(mechanism, sv.Program({"X": x - ca.fmax(0, ca.sin(q.t) - p.h) ** 4}))
+
+    def crossings(h, end):
+        turns = [2 * math.pi * k + a for k in range(3) for a in (math.asin(h), math.pi - math.asin(h))]
+        return [t for t in turns if t < end]
+
+    for _ in range(2):  # the second time they are remembered
+        for h in (0.5, 0.6):
+            for end in (2.0, 9.0, 5.0):
+                other = model.with_parameters(h=h, m=1.0 + h)
+                assert other.require_smooth((0.0, end)) == pytest.approx(crossings(h, end), abs=4e-15)

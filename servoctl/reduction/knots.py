@@ -13,7 +13,8 @@ from servoctl.jets.tape import Tape
 
 MOST_BRANCHES = 24  # affine pieces that are followed through one operation
 SCAN = 801  # instants of a scan for switches that are not affine in t
-BISECTIONS = 60  # halvings of an interval of the scan: all digits of a double
+PARTS, DIVISIONS = 1024, 6  # of an interval of the scan, whose signs are evaluated at once: all digits of a double
+KNOWN = 8  # sets of numbers whose knots are remembered
 SAME_INSTANT = 1e-9  # switches closer than this fraction of the time from first to last are one
 NEAR_ZERO = 0.5  # of the values beside it: a parabola's least value below this is looked at closely
 WIDE, NARROW = 1e-4, 1e-7  # distances of far and close series from an instant, relative to its neighbourhood
@@ -40,9 +41,6 @@ class Knots:
     classes: dict
 
 
-_ANY_SPAN = object()  # in place of the span where no switch is scanned for
-
-
 class Switches:
     """The switches in residuals that depend on t and parameters alone.
 
@@ -57,7 +55,7 @@ class Switches:
     """
 
     def __init__(self, q, residuals, parameters, timed=None):
-        self.q, self._symbols, self._last = q, parameters, None
+        self.q, self._symbols, self._known = q, parameters, {}
         self.parameters = [p.element_hash() for p in parameters]
         self._read(residuals)
         self.timed = timed
@@ -91,15 +89,19 @@ class Switches:
     def knots(self, values, needs, span=None):
         """The switching instants and the classes there; see `times` and `classes`.
 
-        The last ones are known as long as the numbers in the residuals are the same.
+        Those of the last few numbers in the residuals are known.
         """
-        key = values[self._numbers].tolist(), needs
-        if self._last is None or self._last[0] != key or self._last[1] not in (_ANY_SPAN, span):
-            instants, others = self._affine(values)
-            times = self._times(values, instants, others, span)
-            knots = Knots(tuple(times), self.classes(values, needs, times))
-            self._last = key, span if others else _ANY_SPAN, knots
-        return self._last[2]
+        key = *values[self._numbers].tolist(), frozenset(needs.items())
+        for known in ((*key, "any span"), (*key, span)):
+            if known in self._known:
+                return self._known[known]
+        instants, others = self._affine(values)
+        times = self._times(values, instants, others, span)
+        knots = Knots(tuple(times), self.classes(values, needs, times))
+        self._known[*key, span if others else "any span"] = knots
+        if len(self._known) > KNOWN:
+            self._known.pop(next(iter(self._known)), None)
+        return knots
 
     @cached_property
     def tape(self):
@@ -184,7 +186,7 @@ class Switches:
         return result if 0 < len(result) <= MOST_BRANCHES else None
 
     def _scan(self, values, t0, t1, switches):
-        """Instants between t0 and t1 at which switches, the sides of each, change sides, by bisection.
+        """Instants between t0 and t1 at which switches, the sides of each, change sides.
 
         Between three instants a side may change twice: the parabola through them shows where, if it comes near zero.
         """
@@ -197,7 +199,7 @@ class Switches:
         for s, g in enumerate(sides(grid)):
 
             def side(t, s=s):
-                return float(sides(np.array([t]))[s][0])
+                return sides(np.atleast_1d(t))[s]
 
             decided = np.flatnonzero(g != 0)
             instants |= {float(end) for end, value in zip(grid[[0, -1]], g[[0, -1]], strict=True) if value == 0}
@@ -205,8 +207,8 @@ class Switches:
             pairs = [(t[i], t[i + 1], g[i]) for i in np.flatnonzero(g[:-1] * g[1:] < 0)]
             for i in np.flatnonzero(_grazes(t, g)):
                 sign = np.sign(g[i])
-                least = _least(lambda t, f=side, sign=sign: sign * f(t), t[i - 1], t[i + 1])
-                if sign * side(least) < 0:
+                least = _least(lambda t, f=side, sign=sign: float(sign * f(t)[0]), t[i - 1], t[i + 1])
+                if sign * side(least)[0] < 0:
                     pairs += [(t[i - 1], least, g[i - 1]), (least, t[i + 1], -g[i - 1])]
             instants |= {_changes(side, *pair) for pair in pairs}
         return instants
@@ -285,9 +287,10 @@ def _least(function, a, b):
 
 def _changes(side, low, high, first):
     """The instant between low and high at which a side changes its sign, which is that of `first` at low."""
-    for _ in range(BISECTIONS):
-        middle = (low + high) / 2
-        low, high = (middle, high) if side(middle) * first > 0 else (low, middle)
+    for _ in range(DIVISIONS):
+        t = np.linspace(low, high, PARTS + 1)
+        k = 1 + int(np.argmax(np.append(~(side(t[1:-1]) * first > 0), True)))
+        low, high = t[k - 1], t[k]
     return float((low + high) / 2)
 
 
