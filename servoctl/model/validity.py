@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import casadi as ca
 import numpy as np
 
-from servoctl.jets.branches import size_of_terms
+from servoctl.jets.branches import sizes_of_terms
 from servoctl.reduction.appell import NEGATIVE
 from servoctl.reduction.manifold import ON_MANIFOLD, gradient_scales, least_steps
 from servoctl.reduction.ranks import clean
@@ -30,7 +30,7 @@ class Quantities:
         Values and sizes of the terms of all groups; None if these contain jets above s̄.
     counts : dict of str to int
         Scalars in each group: "slopes" that vanish and their "jets" and "terms", "pivots", "conditions" and "dropped"
-        entries, which vanish, and the inertia matrix, "mass".
+        entries, which vanish, and the inertia matrix, "mass", without sizes.
     pivots : (n_pivots,) array
         Least sizes of the pivots at the points where they were chosen.
     """
@@ -53,7 +53,9 @@ def quantities(equations):
     places = filter(None, map(r.mechanism.q.where, ca.symvar(ca.vertcat(*scalars))))
     if any(level > r.top for of, level, _ in places if of not in ("t", "q")):
         return Quantities(None, counts, np.zeros(0))
-    f = equations.function("quantities", equations.jets, [*scalars, *map(size_of_terms, scalars)])
+    sized = len(scalars) - counts["mass"]
+    sizes = [*sizes_of_terms(scalars[:sized]), ca.SX(counts["mass"], 1)]
+    f = equations.function("quantities", equations.jets, [*scalars, *sizes])
     jets = np.vstack([r.points.jet(k) for k in range(r.top + 1)]).astype(float)
     values, _ = Quantities(f, counts, None).at(r.points.t.astype(float), jets, r.points.values)["pivots"]
     return Quantities(f, counts, np.abs(values).min(axis=1, initial=np.inf))
