@@ -390,12 +390,9 @@ class Compiled:
 
         Returns
         -------
-        t : (S + 1,) array
-            Starts of the steps and end of the last one [s]; the end is before t1 if the step length vanishes.
-        x : (n_x, S + 1) array
-            States at these times, SI.
-        y : (n_y, S) array
-            Outputs at the starts.
+        (S + 1, 1 + n_x + n_y) array
+            t, x and outputs at the starts of the S steps, and t and x at the end of the last one, which lies before t1
+            if the step length vanishes.
 
         Raises
         ------
@@ -405,8 +402,30 @@ class Compiled:
         self._require_loop("taylor")
         self._place(self._library, t0, x0, p)
         every = project_every if self._project is not None else 0
-        log = self._library.taylor(t1, rtol, atol, every, max_steps)
-        return log[:, 0], log[:, 1 : 1 + self.n_x].T, log[:-1, 1 + self.n_x :].T
+        return self._library.taylor(t1, rtol, atol, every, max_steps)
+
+    def jets(self, log, k, t, levels):
+        """The jets q, γ', ..., γ^(levels) at instants within the steps of `taylor`.
+
+        Parameters
+        ----------
+        log : (S + 1, 1 + n_x + n_y) array
+            From `taylor`.
+        k : (N,) array of int
+            Steps, 0 .. S - 1.
+        t : (N,) array
+            Times [s].
+        levels : int
+            Below ``sizes["last"]``.
+
+        Returns
+        -------
+        (nq + levels n, N) array
+        """
+        k, t = np.ascontiguousarray(k, dtype=np.int64), np.ascontiguousarray(t, dtype=float)
+        z = np.empty((self._sizes["nq"] + levels * self._sizes["n"], t.size))
+        self._library.jets(np.ascontiguousarray(log), k, t, levels, z)
+        return z
 
     def restore(self, t, x, p):
         """The state (n_x,) with its invariants restored by `project`, by CasADi; x if there is no `project`."""

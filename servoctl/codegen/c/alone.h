@@ -14,6 +14,8 @@
 #define FOLLOWED 0.01
 #define STEADY 0.25
 #define SHORTEST 0x1p-32
+#define TERMS 4
+#define BEND 0.344
 
 /* newton.c */
 #define PIVOTS 1
