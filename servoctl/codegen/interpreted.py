@@ -14,6 +14,7 @@ from servoctl.codegen.loops import (
     CORRECTED,
     CORRECTIONS,
     FOLLOWED,
+    LAST_TERM,
     QUADRATIC,
     ROUNDING,
     SHORTEST,
@@ -266,7 +267,7 @@ def longest(levels, c, first, rtol, atol):
         falling = np.prod([k - m + 0.0 for m in range(j)], axis=0) if j else np.ones(len(k))
         scale = rough_log2(atol / rtol + np.abs(level).max(initial=0.0))
         terms = rough_log2(np.abs(c[k - 1]).max(axis=1, initial=0.0)) + rough_log2(falling)
-        shortest = np.min(np.log2(rtol) / (last - j) + (scale - terms) / (k - j), initial=shortest)
+        shortest = np.min(np.log2(LAST_TERM * rtol) / (last - j) + (scale - terms) / (k - j), initial=shortest)
     return shortest
 
 

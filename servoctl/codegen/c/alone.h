@@ -15,6 +15,7 @@
 #define STEADY 0.25
 #define SHORTEST 0x1p-32
 #define TERMS 4
+#define LAST_TERM 0.1
 #define BEND 0.344
 
 /* newton.c */

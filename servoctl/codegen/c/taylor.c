@@ -1,6 +1,7 @@
 /* Steps of the Taylor method. NQ, N, TOP and LAST are the numbers of coordinates and quasi-velocities, the order s and
    the highest index of coefficients; PLAIN says whether q' = gamma'. Loops over them are unrolled. */
 #include "unit.h"
+#include "lanes.h"
 #include "restore.h"
 
 static inline double falling(int64_t k, int64_t j)
@@ -29,8 +30,8 @@ static inline double largest_size(const double *v, int64_t n)
     return s_value(largest);
 }
 
-/* log2 of the step at which the last term meets the tolerance at levels first .. levels - 1 of the state, the terms
-   taken to grow as the fastest of the last ones do: single coefficients may vanish. x holds the first of the levels. */
+/* log2 of the step at which the last term is 2^log_rtol of levels first .. levels - 1 of the state, the terms taken to
+   grow as the fastest of the last ones do: single coefficients may vanish. x holds the first of the levels. */
 static inline double length(const double *x, const double *c, int64_t n, int64_t first, int64_t levels,
                             double log_rtol, double least)
 {
@@ -78,7 +79,7 @@ typedef struct {
    Returns the number of steps; fewer than max_steps without reaching t1 where a step vanishes or is not finite. */
 int64_t FN(taylor)(const Steps *s)
 {
-    const double *p = s->start + 1 + NX, log_rtol = log2(s->rtol), least = s->atol / s->rtol, t1 = s->t1;
+    const double *p = s->start + 1 + NX, log_rtol = log2(LAST_TERM * s->rtol), least = s->atol / s->rtol, t1 = s->t1;
     const int64_t max_steps = (int64_t)s->max_steps, project_every = (int64_t)s->project_every;
     double t = s->start[0], *log = s->log;
     for (int64_t i = 0; i < NX; i++) log[1 + i] = s->start[1 + i];
@@ -102,28 +103,26 @@ int64_t FN(taylor)(const Steps *s)
     }
 }
 
-#define TOGETHER 16 /* instants of one step whose series are summed at once */
-
 /* The jets q, gamma', ..., gamma^(levels) at n instants t in the steps k of a log, row by row, one column per instant.
-   Consecutive instants of one step are summed together. */
+   The lanes of a vector are consecutive instants of one step. */
 void FN(taylor_jets)(const double *log, int64_t n, const int64_t *k, const double *t, int64_t levels, double *jets)
 {
-    double factor[LAST + 1], h[TOGETHER], total[TOGETHER];
+    double factor[LAST + 1];
     for (int64_t j = 0; j <= levels; j++) {
         const int64_t size = j ? N : NQ;
         double *rows = jets + (j ? NQ + (j - 1) * N : 0) * n;
         for (int64_t m = 1; m <= LAST; m++) factor[m] = falling(m, j);
         for (int64_t at = 0, count; at < n; at += count) {
             const double *row = log + k[at] * (1 + NX + NY), *x = row + 1, *c = x + NX + (j && !PLAIN ? NQ * LAST : 0);
-            for (count = 1; count < TOGETHER && at + count < n && k[at + count] == k[at]; count++) {}
-            for (int64_t b = 0; b < TOGETHER; b++) h[b] = b < count ? t[at + b] - row[0] : 0;
+            W h = ALL(0.0);
+            for (count = 0; count < W_LANES && at + count < n && k[at + count] == k[at]; count++) {
+                h[count] = t[at + count] - row[0];
+            }
             for (int64_t i = 0; i < size; i++) {
-                for (int64_t b = 0; b < TOGETHER; b++) total[b] = 0;
-                for (int64_t m = LAST; m >= (j ? j : 1); m--) {
-                    const double value = factor[m] * c[(m - 1) * size + i];
-                    for (int64_t b = 0; b < TOGETHER; b++) total[b] = total[b] * h[b] + value;
-                }
-                for (int64_t b = 0; b < count; b++) rows[i * n + at + b] = j ? total[b] : x[i] + total[b] * h[b];
+                W total = ALL(0.0);
+                for (int64_t m = LAST; m >= (j ? j : 1); m--) total = total * h + factor[m] * c[(m - 1) * size + i];
+                if (!j) total = x[i] + total * h;
+                for (int64_t b = 0; b < count; b++) rows[i * n + at + b] = total[b];
             }
         }
     }
