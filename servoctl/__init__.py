@@ -70,6 +70,7 @@ from servoctl.spec import (
 from servoctl.study.cases import grid, monte_carlo
 from servoctl.study.close_many import Batch, close_many
 from servoctl.study.load import load_study
+from servoctl.study.many import Motions, simulate_many
 from servoctl.study.stability_map import StabilityMap, stability
 from servoctl.study.sweep import merge, sweep
 from servoctl.study.table import Study
@@ -97,6 +98,7 @@ __all__ = [
     "MinimalCoordinates",
     "MinimumPhase",
     "Model",
+    "Motions",
     "NameUnknown",
     "NotRealisable",
     "Parameters",
@@ -159,6 +161,7 @@ __all__ = [
     "sampled_bound",
     "sensitivity",
     "simulate",
+    "simulate_many",
     "spec",
     "stability",
     "sweep",

@@ -129,21 +129,23 @@ class Compiled:
         Numbers of states, parameters and outputs.
     loops : tuple of str
         Loops that it can run.
+    sizes : dict of str to int
+        Constants of the loops.
     expression : casadi.Function
         The SX function (t, x, p) -> y.
     """
 
     def __init__(self, f, name, loops, project=None, others=None, sizes=None):
         self.name, self.loops, self._project = name, loops, project
-        self._others, self._sizes = others or {}, sizes or {}
+        self._others, self.sizes = others or {}, sizes or {}
         self.n_x, self.n_p, self.n_y = f.numel_in(1), f.numel_in(2), f.numel_out(0)
         self.expression, self._symbol = f, f"servoctl_{name}"
         self._x_shape, self._p_shape = (self.n_x,), (self.n_p,)
-        self._interpreter = Interpreter(f, project, self._sizes)
+        self._interpreter = Interpreter(f, project, self.sizes)
         self._text = None
 
     def __reduce__(self):
-        parts = (self.expression, self.name, self.loops, self._project, self._others, self._sizes)
+        parts = (self.expression, self.name, self.loops, self._project, self._others, self.sizes)
         # Emitting takes longer than reading: the C text travels until the library is loaded, where it can be compiled.
         travels = self.loops and "_library" not in self.__dict__ and compiler.compiler() is not None
         return Compiled, parts, {"_text": self.source() if travels else None}
@@ -423,7 +425,7 @@ class Compiled:
         (nq + levels n, N) array
         """
         k, t = np.ascontiguousarray(k, dtype=np.int64), np.ascontiguousarray(t, dtype=float)
-        z = np.empty((self._sizes["nq"] + levels * self._sizes["n"], t.size))
+        z = np.empty((self.sizes["nq"] + levels * self.sizes["n"], t.size))
         self._library.jets(np.ascontiguousarray(log), k, t, levels, z)
         return z
 
@@ -492,7 +494,7 @@ class Compiled:
     def source(self):
         """C text of the library."""
         if self._text is None:
-            parts = {"project": self._project, "others": self._others, "sizes": self._sizes}
+            parts = {"project": self._project, "others": self._others, "sizes": self.sizes}
             self._text = emit.emit(self.expression, self._symbol, self.loops, **parts, wide="newton" in self.loops)
         return self._text
 
