@@ -353,8 +353,8 @@ def test_changed_signals_of_a_closed_loop_fail(what, plan):
 
 
 def test_what_cannot_be_followed_is_inconclusive(c_compiler):
-    model, start, span = chain(1e13, by="ideal")
-    run = sv.simulate(model, start, span, as_method("RadauIIA"), t_eval=[0.0, 1.0, 2.0])
+    model, start, _ = chain(1e13, by="ideal")
+    run = sv.simulate(model, start, (0.0, 0.02), as_method("RadauIIA"), t_eval=[0.0, 0.01, 0.02])
     proof = sv.verify(model, run)
     assert (proof.verdict, proof.passed, proof.failures) == ("inconclusive", False, ())
     assert "t_eval" in proof.doubts[0] and "Verification: inconclusive" in repr(proof)
