@@ -16,7 +16,7 @@ from servoctl.methods.narrow import steep
 from servoctl.methods.taylor import FAR_OFF, series_loop
 from servoctl.model.switching import switching
 
-MOST_STEPS = 10**6  # of a case
+MOST_IN_LANES = 10**6  # of a case
 PER_THREAD = 8  # tasks, so that threads end at about the same time
 
 _NUMBERS = {"t0": ctypes.c_double, "t1": ctypes.c_double, "rtol": ctypes.c_double}
@@ -72,7 +72,7 @@ def integrate(model, last, span, cases, rtol, times, threads=None):
     arrays = {"x0": x0, "p": p, "atol": atol, "pivots": model.pivot_sizes, "times": times}
     arrays = {name: np.ascontiguousarray(array, dtype=float) for name, array in arrays.items()}
     arrays |= {"ends": np.zeros((n, 3 + 2 * n_x)), "samples": np.full((n, len(times), n_x), np.nan)}
-    many = _Many(arrays, t0=span[0], t1=span[1], rtol=rtol, max_steps=MOST_STEPS, n_times=len(times))
+    many = _Many(arrays, t0=span[0], t1=span[1], rtol=rtol, max_steps=MOST_IN_LANES, n_times=len(times))
 
     def run(first, end):
         library(ctypes.byref(many), ctypes.c_int64(first), ctypes.c_int64(end))
@@ -93,14 +93,14 @@ def _library(f, n_x):
     """The C function of a model's series in lanes; None without a compiler."""
     if os.environ.get("SERVOCTL_COMPILER") == "none" or compiler.compiler() is None:
         return None
-    library = compiler.library(f"#define W_LANES {compiler.lanes()}\n{_text(f, n_x)}", "-O3")
+    library = compiler.library(f"#define W_LANES {compiler.lanes()}\n{_source(f, n_x)}", "-O3")
     if library is not None:
         library.servoctl_many.restype = None
     return library and library.servoctl_many
 
 
 @lru_cache(32)
-def _text(f, n_x):
+def _source(f, n_x):
     """The C text for any number of lanes."""
     sizes = {key.upper(): int(value) for key, value in f.sizes.items()}
     sizes |= {"NAME": "servoctl", "NX": n_x, "NP": f.n_p, "NY": f.n_y}

@@ -100,15 +100,15 @@ def simulate_many(
     require_kind(Model, "model", model, "sv.derive(...)")
     span, threads = as_span(t_span), threads if threads is None else whole("threads", threads, least=1)
     method = as_method(method) if method is not None else as_method("algebraic") if model.flat else Taylor()
-    times = _times(span, t_eval)
-    motions = _Many(model, *_cases(model, starts, parameters), len(times))
+    times = _trace_times(span, t_eval)
+    motions = _Many(model, *_case_table(model, starts, parameters), len(times))
     if isinstance(method, Taylor) and fits(model):
         motions.in_lanes(span, method, times, threads)
     interrupted = motions.one_by_one(span, method, times)
     return motions.result(times, {"t_span": list(span), "method": str(method), "interrupted": interrupted})
 
 
-def _cases(model, starts, parameters):
+def _case_table(model, starts, parameters):
     """Parameters of each case (list of dict); a start of all cases, columns (N,) by name, or states (N, n_x)."""
     cases, lengths = [{}], set()
     if parameters is not None:
@@ -133,7 +133,7 @@ def _cases(model, starts, parameters):
     return cases * max(lengths, default=1) if len(cases) == 1 else cases, starts
 
 
-def _times(span, t_eval):
+def _trace_times(span, t_eval):
     times = np.unique(as_numbers([] if t_eval is None else t_eval))
     if times.size and not (np.isfinite(times).all() and min(span) <= times[0] and times[-1] <= max(span)):
         raise SpecificationError(

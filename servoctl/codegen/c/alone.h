@@ -28,6 +28,11 @@
 #define LAST 4
 #define PLAIN 1
 
+/* many.c */
+#define DEGRADED 0.02
+#define NEGLIGIBLE 1e-7
+#define FAR_OFF 30.0
+
 /* batch.c */
 #define NU 2
 #define NC 2
@@ -52,6 +57,7 @@ DECLARED(example_project, double)
 DECLARED(example_jacobian, double)
 DECLARED(example_wide, W)
 DECLARED(example_wide_step, W)
+DECLARED(series, W)
 DECLARED(numbers, W)
 DECLARED(change, W)
 void law(W t, const W *restrict x, const double *restrict p, W *restrict y);

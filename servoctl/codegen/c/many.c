@@ -4,7 +4,7 @@
 #include "lanes.h"
 #include "series.h"
 
-#define NC ((PLAIN ? 0 : NQ * LAST) + N * LAST) /* outputs before the pivots */
+#define COEFFICIENTS ((PLAIN ? 0 : NQ * LAST) + N * LAST) /* outputs before the pivots */
 
 /* Inputs are a row for each case: x0, p, absolute tolerance; and for all of them the pivots' sizes, and the instants of
    samples. Results are a row for each case: the outcome, the number of steps, the last instant and state, the largest
@@ -19,7 +19,7 @@ typedef struct {
 enum { FINISHED = 1, PIVOT_FALLS = -1, STUCK = -2, SERIES_OFF = -3 };
 
 typedef struct {
-    W t, x[NX + 1], p[NP + 1], y[NY + 1], atol, h, largest[NX + 1], pivots[NY - NC + 1], signs[NY - NC + 1];
+    W t, x[NX + 1], p[NP + 1], y[NY + 1], atol, h, largest[NX + 1], pivots[NY - COEFFICIENTS + 1], signs[NY - COEFFICIENTS + 1];
     W ahead[N + 1]; /* gamma^(s) at the end of the step, by its series */
     I steps;
     int64_t of[W_LANES], sampled[W_LANES];
@@ -80,8 +80,8 @@ static void load(const Many *m, int64_t lane, int64_t at, int64_t last, Motions 
     for (int64_t i = 0; i < NX; i++) s->x[i][lane] = m->x0[from * NX + i];
     for (int64_t i = 0; i < NX; i++) s->largest[i][lane] = fabs(m->x0[from * NX + i]);
     for (int64_t i = 0; i < NP; i++) s->p[i][lane] = m->p[from * NP + i];
-    for (int64_t i = 0; i < NY - NC; i++) s->pivots[i][lane] = m->pivots[i];
-    for (int64_t i = 0; i < NY - NC; i++) s->signs[i][lane] = 0;
+    for (int64_t i = 0; i < NY - COEFFICIENTS; i++) s->pivots[i][lane] = m->pivots[i];
+    for (int64_t i = 0; i < NY - COEFFICIENTS; i++) s->signs[i][lane] = 0;
 }
 
 static void end(const Many *m, int64_t lane, int64_t outcome, const Motions *s)
@@ -118,8 +118,8 @@ static void sample(const Many *m, int64_t lane, double h, int ends, Motions *s)
 INLINE I falling_pivots(Motions *s)
 {
     I bad = w_bits(ALL(0.0));
-    for (int64_t i = 0; i < NY - NC; i++) {
-        const W value = s->y[NC + i], size = w_fabs(value);
+    for (int64_t i = 0; i < NY - COEFFICIENTS; i++) {
+        const W value = s->y[COEFFICIENTS + i], size = w_fabs(value);
         bad |= ~(size >= DEGRADED * s->pivots[i]) | (value * s->signs[i] < 0) | (size * NEGLIGIBLE > s->pivots[i]);
         s->signs[i] = value;
         s->pivots[i] = w_fmax(s->pivots[i], size);
