@@ -19,7 +19,6 @@ from servoctl.codegen.loops import (
     ROUNDING,
     SHORTEST,
     STEADY,
-    TERMS,
 )
 
 BLOCK = 128  # instants of a path that are solved together
@@ -257,13 +256,14 @@ def rough_log2(a):
 
 
 def longest(levels, c, first, rtol, atol):
-    """log2 of the step at which the last term meets the tolerance, if terms grow as the fastest of the last ones.
+    """log2 of the step at which the last term meets the tolerance, if terms grow as the fastest of four of them.
 
     `levels` are consecutive levels of the state from `first` on, c (last, n) their Taylor coefficients.
     """
     last, shortest = len(c), np.inf
     for j, level in enumerate(levels, first):
-        k = np.arange(max(last - TERMS, j) + 1, last + 1)
+        k = np.array([last, last - 1, last // 2 + 1, last // 2])
+        k = k[k > j]
         falling = np.prod([k - m + 0.0 for m in range(j)], axis=0) if j else np.ones(len(k))
         scale = rough_log2(atol / rtol + np.abs(level).max(initial=0.0))
         terms = rough_log2(np.abs(c[k - 1]).max(axis=1, initial=0.0)) + rough_log2(falling)

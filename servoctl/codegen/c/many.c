@@ -46,13 +46,14 @@ INLINE W w_length(const W *x, const W *c, int64_t n, int64_t first, int64_t leve
 {
     W size[TERMS], shortest = ALL(INFINITY);
     for (int64_t m = 0; m < TERMS; m++) {
-        const int64_t k = LAST - m;
+        const int64_t k = term(m);
         size[m] = k > 0 ? w_rough_log2(w_largest(c + (k - 1) * n, n)) : ALL(0.0);
     }
     for (int64_t j = first; j < levels; j++) {
         const W scale = w_rough_log2(least + w_largest(x + (j - first) * n, n));
-        for (int64_t m = 0; m < TERMS && LAST - m > j; m++) {
-            const int64_t k = LAST - m;
+        for (int64_t m = 0; m < TERMS; m++) {
+            const int64_t k = term(m);
+            if (k <= j) continue;
             const W growth = (scale - size[m] - rough_log2(falling(k, j))) * (1.0 / (double)(k - j));
             const W h = log_rtol * (1.0 / (double)(LAST - j)) + growth;
             shortest = w_select(h < shortest, h, shortest);

@@ -11,6 +11,10 @@ static inline double falling(int64_t k, int64_t j)
     return product;
 }
 
+/* Index of the m-th coefficient whose growth gives the step: the last two, and two of the middle, which keep the steps of
+   functions without singularities, such as sin, below their period. */
+static inline int64_t term(int64_t m) { return m < 2 ? LAST - m : LAST / 2 + 3 - m; }
+
 /* log2 of a number >= 0 from its bits, within 0.01; that of zero is -1023. */
 static inline double rough_log2(double a)
 {

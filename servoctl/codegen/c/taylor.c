@@ -17,19 +17,20 @@ static inline double largest_size(const double *v, int64_t n)
 }
 
 /* log2 of the step at which the last term is 2^log_rtol of levels first .. levels - 1 of the state, the terms taken to
-   grow as the fastest of the last ones do: single coefficients may vanish. x holds the first of the levels. */
+   grow as the fastest of some do: single coefficients may vanish. x holds the first of the levels. */
 static inline double length(const double *x, const double *c, int64_t n, int64_t first, int64_t levels,
                             double log_rtol, double least)
 {
     double size[TERMS], shortest = INFINITY;
     for (int64_t m = 0; m < TERMS; m++) {
-        const int64_t k = LAST - m;
+        const int64_t k = term(m);
         size[m] = k > 0 ? rough_log2(largest_size(c + (k - 1) * n, n)) : 0;
     }
     for (int64_t j = first; j < levels; j++) {
         const double scale = rough_log2(least + largest_size(x + (j - first) * n, n));
-        for (int64_t m = 0; m < TERMS && LAST - m > j; m++) {
-            const int64_t k = LAST - m;
+        for (int64_t m = 0; m < TERMS; m++) {
+            const int64_t k = term(m);
+            if (k <= j) continue;
             const double growth = (scale - size[m] - rough_log2(falling(k, j))) * (1.0 / (double)(k - j));
             const double h = log_rtol * (1.0 / (double)(LAST - j)) + growth;
             shortest = h < shortest ? h : shortest;
