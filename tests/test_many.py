@@ -11,7 +11,7 @@ from servoctl.gallery import gallery
 from servoctl.methods import lanes
 from servoctl.simulation import simulated
 
-RNG = np.random.default_rng(4)
+SEED = 4
 
 
 def pendulum(force=lambda a, t, p: 0.0):
@@ -53,7 +53,7 @@ def in_lanes(monkeypatch):
 def test_parameters_in_lanes_equal_simulate(span, gallery_model, monkeypatch, c_compiler):
     scene, model = gallery["appell-hamel"], gallery_model("appell-hamel")
     start = model.start(t=span[0], **scene.start, guess=scene.guess)
-    values = model.numbers["M"] * RNG.uniform(0.8, 1.2, 11)
+    values = model.numbers["M"] * np.random.default_rng(SEED).uniform(0.8, 1.2, 11)
     assert lanes.fits(model)
     with monkeypatch.context() as patch:
         in_lanes(patch)
@@ -61,10 +61,10 @@ def test_parameters_in_lanes_equal_simulate(span, gallery_model, monkeypatch, c_
     each_equals_simulate(model, many, start, span, sv.Taylor())
 
 
-@pytest.mark.parametrize("method", [sv.Taylor(), sv.Taylor(8, rtol=1e-5, atol=1e-7), sv.Taylor(jets=9, rtol=1e-11, atol=1e-13)])
+@pytest.mark.parametrize("method", [sv.Taylor(), sv.Taylor(8, rtol=1e-5, atol=1e-7), sv.Taylor(jets=9, rtol=1e-10, atol=1e-12)])
 def test_starts_by_name_and_by_state_equal_simulate(method, monkeypatch, c_compiler):
     model = pendulum()
-    angles = np.append(RNG.uniform(-3, 3, 9), [0.0, np.pi])
+    angles = np.append(np.random.default_rng(SEED).uniform(-3, 3, 9), [0.0, np.pi])
     with monkeypatch.context() as patch:
         in_lanes(patch)
         many = sv.simulate_many(model, {"a": angles, "da": 0.1}, None, (0.0, 3.0), method)
@@ -76,7 +76,7 @@ def test_starts_by_name_and_by_state_equal_simulate(method, monkeypatch, c_compi
 
 def test_a_case_depends_neither_on_others_nor_on_threads(c_compiler):
     model = pendulum()
-    angles = RNG.uniform(-3, 3, 300)
+    angles = np.random.default_rng(SEED).uniform(-3, 3, 300)
     all_ = sv.simulate_many(model, {"a": angles, "da": 0.0}, None, (0.0, 1.0), threads=2)
     some = sv.simulate_many(model, {"a": angles[100:103], "da": 0.0}, None, (0.0, 1.0), threads=1)
     assert np.array_equal(all_["final a"][100:103], some["final a"])

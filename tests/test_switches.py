@@ -35,7 +35,7 @@ def beside(force=lambda t, y, dy: 0.0, potential=lambda y: 0.0, **start):
         actuators={"F": q.jet(0)[0]},
         forces={"y": force(q.t, y, dy)},
     )
-    model = sv.derive(mechanism, sv.Program({"x": q.jet(0)[0] - ca.sin(q.t)}))
+    model = sv.derive(mechanism, sv.Program({"x": q.jet(0)[0] - ca.sin(q.t)}), keep=q.names)
     return model, model.start(**start)
 
 
@@ -44,7 +44,9 @@ def ideal(residual, **start):
     q = sv.coordinates("x y")
     ddx, ddy = q.d(2)
     model = sv.derive(
-        sv.Mechanism(q, gibbs=(ddx**2 + ddy**2) / 2), sv.Program({"p": residual(q.t, *q, *q.d(1))}, by="ideal")
+        sv.Mechanism(q, gibbs=(ddx**2 + ddy**2) / 2),
+        sv.Program({"p": residual(q.t, *q, *q.d(1))}, by="ideal"),
+        keep=q.names,
     )
     return model, model.start(**start)
 
@@ -409,7 +411,7 @@ def test_a_grazing_contact_is_found(method):
     x, y = q
     S = (q.d(2)[0] ** 2 + q.d(2)[1] ** 2) / 2
     mechanism = sv.Mechanism(q, gibbs=S, potential=y, forces={"y": -1e4 * ca.fmax(y - 0.4999, 0)}, actuators={"F": x})
-    model = sv.derive(mechanism, sv.Program({"x": x - q.t}))
+    model = sv.derive(mechanism, sv.Program({"x": x - q.t}), keep=q.names)
     run = sv.simulate(model, model.start(y=0.0, dy=1.0), (0.0, 2.0), method, t_eval=[0.0, 1.0, 2.0])
     from scipy.integrate import solve_ivp
 
@@ -447,7 +449,7 @@ def pushed(force, y, dy):
     x, y_ = q
     gibbs = ca.sumsqr(ca.vertcat(*q.d(2))) / 2
     mechanism = sv.Mechanism(q, gibbs=gibbs, forces={"y": force(q.t, x, y_)}, actuators={"F": x})
-    model = sv.derive(mechanism, sv.Program({"x": x - q.t}))
+    model = sv.derive(mechanism, sv.Program({"x": x - q.t}), keep=q.names)
     return model, model.start(y=y, dy=dy)
 
 
@@ -525,6 +527,18 @@ def test_quotients_that_overflow_keep_their_derivatives_and_others_none():
     with np.errstate(all="ignore"):
         near.advance(), near.advance()
     assert not np.isfinite(near.outputs[4][1])  # an infinite slope is no overflow
+
+
+@pytest.mark.parametrize("divisor", [lambda x: 1 + ca.exp(0.3 * x), ca.cosh, lambda x: (2 + ca.exp(x)) ** 2])
+def test_derivatives_of_quotients_that_may_overflow_are_differentiated_again(divisor):
+    q = sv.coordinates("x y")
+    x, y = q
+    quotient = y / divisor(x)
+    at_once, twice = q.derivatives([quotient], 4)[-1], q.derivatives(q.derivatives([quotient], 2)[-1], 2)[-1]
+    jets = ca.vertcat(*(q.jet(k) for k in range(5)))
+    at = np.random.default_rng(4).uniform(-1, 1, jets.numel())
+    first, second = (float(ca.Function("f", [jets], [e[0]])(at)) for e in (at_once, twice))
+    assert first == pytest.approx(second, rel=1e-13)
 
 
 PULSES = {  # of time alone, or of the place x = t: their impulse is 1, about t = 1

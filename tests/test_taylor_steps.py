@@ -33,7 +33,7 @@ def oscillator():
     q = sv.coordinates("x y")
     x, y = q
     mechanism = sv.Mechanism(q, gibbs=sv.particle(q, 1.0, (x, y)), potential=x**2 / 2)
-    return sv.derive(mechanism, sv.Program({"held": y}, by="ideal"))
+    return sv.derive(mechanism, sv.Program({"held": y}, by="ideal"), keep=["x"])
 
 
 @pytest.mark.parametrize("name", ["appell-hamel", "wheeled-robot"])

@@ -11,9 +11,10 @@ from servoctl.checks import as_span, require_memory, whole_multiple
 from servoctl.control.conditions import Conditions, Sensors, Timing, index, limits, require_few_steps, steps
 from servoctl.control.law import Law, UserStep
 from servoctl.control.loop import FINISHED, INTERRUPTED, LAW_LOST, STATE_LOST, Loop, run_loop
-from servoctl.control.reference import Reference, require_plan, require_plant, resampled
+from servoctl.control.reference import Reference, of_plan, require_plan, require_plant, resampled
 from servoctl.control.result import Closed
 from servoctl.errors import InconsistentStart, IntegrationStopped, ServoError, SpecificationError
+from servoctl.methods.dropped import DERIVATIONS, came_alive, first_alive
 from servoctl.plants.plant import Plant
 from servoctl.reduction.orders import other_order
 from servoctl.run import Run
@@ -72,13 +73,44 @@ def close(
         If the state becomes infinite; `run` is the motion so far.
     """
     require_plant(plant)
+    plant = _of_start(plant, getattr(law, "plan", None) if plan is None else plan, x0)
     t_span, conditions = as_span(t_span, forward=True), Conditions(sensors, timing, disturbance)
     law = _as_law(law, plant, conditions.timing.rate, t_span[0], plan)
     require_names(law, plant)
     if plan is not None:
         require_plan(plan, plant)
-    loop = _loop(plant, law, x0, t_span, conditions)
-    return _finish(plant, law, law.plan if plan is None else plan, loop, conditions)
+    plan = law.plan if plan is None else plan
+    for _ in range(DERIVATIONS):
+        run = _finish(plant, law, plan, _loop(plant, law, x0, t_span, conditions), conditions)
+        t, equations = _derived_along(run)
+        if equations is None:
+            return run
+        plant = replace(plant, equations=equations)
+    raise _stopped_at(run, came_alive(t))
+
+
+def _derived_along(run):
+    """The instant at which an entry that eliminations left out comes alive, and equations derived near it; or None."""
+    plant, equations, t, x = run.plant, run.plant.equations, run.t, run.states
+    values = plant.parameters[: len(equations.values)]
+
+    def entries(some):
+        return equations.entries_dropped, equations.points_at(t[some], x[:, some], values)
+
+    found = first_alive(equations.dropped, entries, t, x, plant.p())
+    if found is None:
+        return None, None
+    first, clearest = found
+    return float(t[first]), equations.near(float(t[clearest]), x[:, clearest], values)
+
+
+def _of_start(plant, plan, x0):
+    """The plant without coordinates that play no part in the plan's program, unless the start has them."""
+    part = of_plan(plan, plant)
+    if isinstance(x0, Mapping):
+        return part if set(x0) <= set(part.state_names) else plant
+    size = np.size(getattr(x0, "values", x0))
+    return part if size in (part.n_x - len(part.lag), part.n_x) else plant
 
 
 def _loop(plant, law, x0, t_span, conditions):
@@ -87,6 +119,9 @@ def _loop(plant, law, x0, t_span, conditions):
     samples = whole_multiple((t1 - t0) * law.rate, f"t_span of {t1 - t0:g} s at {law.rate:g} Hz", "samples")
     stored = plant.n_x + len(law.measures) + len(law.state) + law.n_out + len(plant.inputs) + len(sensors.noise)
     require_memory(samples, stored, f"The loop runs for {t1 - t0:g} s at {law.rate:g} Hz")
+    for name in forces:
+        if name not in plant.disturbable:
+            raise plant.mechanism.no("generalised force", name, plant.disturbable)
     first = whole_multiple((t0 - law.t0) * law.rate, f"A start at {t0:g} s of a law from {law.t0:g} s on", "samples")
     low, high, change = limits(plant, law.period)
     initial = _initial_input(law, t0)
@@ -177,9 +212,13 @@ def _of_same_orders(run):
     k, row = equations.orders.first_change(run.t, states, values)
     if k is None:
         return run
-    error = other_order(row, float(run.t[k]))
+    raise _stopped_at(run, other_order(row, float(run.t[k])))
+
+
+def _stopped_at(run, error):
+    """The error that stops a loop, with the run."""
     error.run = replace(run, success=False, status=-1, message=f"stopped: {str(error).split('. ')[0]}")
-    raise error
+    return error
 
 
 def _stopped(law, loop, status, end):

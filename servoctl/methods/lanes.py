@@ -105,5 +105,5 @@ def _source(f, n_x):
     sizes = {key.upper(): int(value) for key, value in f.sizes.items()}
     sizes |= {"NAME": "servoctl", "NX": n_x, "NP": f.n_p, "NY": f.n_y}
     sizes |= {"DEGRADED": DEGRADED, "NEGLIGIBLE": NEGLIGIBLE, "FAR_OFF": FAR_OFF}
-    parts = [emit.unit(sizes), emit.include("lanes.h"), emit.function(f.expression, "series", emit.LANES)]
+    parts = [emit.unit(sizes), emit.include("lanes.h"), emit.function(f.expression, "expansion", emit.LANES)]
     return "".join((*parts, emit.include("many.c")))

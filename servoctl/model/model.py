@@ -1,6 +1,6 @@
 """The model: a reduction as functions on numbers, built at their first use."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
 from math import factorial
@@ -19,9 +19,11 @@ from servoctl.model.rest import started
 from servoctl.model.start import State
 from servoctl.model.store import Store, pack, unpack
 from servoctl.reduction.appell import require_positive
+from servoctl.reduction.idle import needed
 from servoctl.reduction.knots import require_smooth
 from servoctl.reduction.manifold import ON_MANIFOLD, solve
-from servoctl.reduction.reduce import holds, reduce, strong
+from servoctl.reduction.ranks import alive
+from servoctl.reduction.reduce import holds, reduce, require_parts, strong
 from servoctl.reduction.structure import structure
 from servoctl.spec.mechanism import Mechanism
 from servoctl.spec.program import Program
@@ -30,7 +32,9 @@ from servoctl.values import read_only
 SAMPLED = 50  # samples of a run at which its structure is decided; each takes tens of milliseconds
 
 
-def derive(mechanism: Mechanism, program: Program, guess: Mapping[str, float] | None = None) -> "Model":
+def derive(
+    mechanism: Mechanism, program: Program, guess: Mapping[str, float] | None = None, keep: Sequence[str] = (),
+) -> "Model":  # fmt: skip
     """Derive the reduced dynamics and the required actuation of a mechanism under its program (3.18).
 
     Parameters
@@ -40,6 +44,10 @@ def derive(mechanism: Mechanism, program: Program, guess: Mapping[str, float] | 
     guess : dict of str to float, optional
         Values of coordinates or derivatives near the motion. Ranks are decided at points of the constraint manifold
         near these values. Seldom needed.
+    keep : sequence of str, optional
+        Names of coordinates that are included although they play no part in the program. By default those are left
+        out, with their actuators and material constraints, that nothing couples to the coordinates in residuals,
+        weights, wishes, outputs and `guess`; the printed model counts them.
 
     Returns
     -------
@@ -62,13 +70,14 @@ def derive(mechanism: Mechanism, program: Program, guess: Mapping[str, float] | 
     RuntimeWarning
         For a residual that is a product and vanishes about the guess by more than one of its factors.
     """
-    model = derived(mechanism, program, guess)
+    require_parts(mechanism, program, guess)
+    model = derived(needed(mechanism, program, keep, guess or {}), program, guess)
     warn_of_products(model.reduction)
     return model
 
 
 def derived(mechanism, program, guess=None):
-    """The model of `derive`, without its warnings."""
+    """The model of all coordinates, without warnings."""
     return _derived(mechanism, program, guess)
 
 
@@ -156,7 +165,7 @@ class Model:
                 raise unknown(name, list(current), "parameter")
         values = r.mechanism.parameters.values({**current, **changes})
         require_positive(r.mechanism, replace(r.points, values=values))
-        if not (holds(r, values) and self._constant_pivots_hold(values)):
+        if not (holds(r, values) and self._constant_pivots_hold(values) and self._dropped_hold(values)):
             self._store.require_unchanged()
             return _derived(r.mechanism, r.program, r.context.guess, None, values)
         return Model(r, self._store, values, require_smooth(r.switches, values, r.smoothness), self._functions)
@@ -164,6 +173,12 @@ class Model:
     def _constant_pivots_hold(self, values):
         f = self.once("constant pivots", lambda: self.equations.constant_pivots())
         return bool(strong(*(f(p).full() for p in (values, self.reduction.context.values))).all())
+
+    def _dropped_hold(self, values):
+        """Whether what eliminations left out vanishes with other parameters, too."""
+        if self.dropped is None:
+            return True
+        return not alive(self.equations.entries_dropped, replace(self.reduction.points, values=values)).any()
 
     def near(self, t, jets, sizes=()):
         """The model of the same specification, derived with pivots chosen at an instant of the motion.
@@ -238,6 +253,11 @@ class Model:
     def coordinate_names(self):
         """Names of the coordinates."""
         return self.reduction.mechanism.q.names
+
+    @property
+    def left_out(self):
+        """Names of the mechanism's coordinates that play no part in the program."""
+        return self.reduction.mechanism.left_out.get("coordinate", ())
 
     @property
     def actuators(self):
@@ -323,6 +343,16 @@ class Model:
             return compiled(f, name, *options)
 
         return self.once(name, build)
+
+    @property
+    def dropped(self):
+        """What eliminations left out as zero, and the sizes of its terms, compiled, of (t, Z, p); None if nothing."""
+
+        def build():
+            f = self.equations.dropped()
+            return None if f is None else compiled(f, f.name())
+
+        return self.once("left out", build)
 
     def signals(self, kind, rate=0):
         """Names of a group of signals, and the compiled function (t, Z, p) of their `rate`-th time derivatives.

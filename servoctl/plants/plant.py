@@ -18,6 +18,7 @@ from servoctl.checks import (
 )
 from servoctl.codegen.function import compiled
 from servoctl.errors import SpecificationError, unknown
+from servoctl.jets.overflow import settled
 from servoctl.plants.equations import PlantEquations, equations_at, plant_equations
 from servoctl.spec.mechanism import Mechanism, require_known
 from servoctl.values import Value
@@ -83,6 +84,40 @@ def plant(
     return Plant(
         mechanism, numbers, state_names, actuators, tuple(names),
         _limits(limits, actuators), rate_limits, lag, {n: d for n, d in delay.items() if d}, damping, equations,
+    )  # fmt: skip
+
+
+def part_of(whole, mechanism):
+    """The plant of a mechanism that `derive` left coordinates out of, with the numbers of the whole one.
+
+    The whole plant, if it has no more coordinates, or if its forces couple them to those left out.
+
+    Parameters
+    ----------
+    whole : Plant
+    mechanism : Mechanism
+
+    Returns
+    -------
+    Plant
+    """
+    source, q = whole.mechanism, mechanism.q
+    if not mechanism.left_out or source.q.names == q.names:
+        return whole
+    kinds = (("q", source.q.names, q.names), ("w", source.q.velocity_names, q.velocity_names))
+    places = {(kind, i) for kind, names, kept in kinds for i, name in enumerate(names) if name in kept}
+    forces = dict(zip(whole.disturbable, whole.equations.forces.elements(), strict=True))
+    rows = [{("w", i), *source.places(force)} for i, force in enumerate(forces.values())]
+    if any(row & places and not row <= places for row in (*source.couplings(), *rows)):
+        return whole
+    part = source.part(places)
+    names = part.q.names if part.q.plain else part.q.velocity_names
+    by_actuator = ("limits", "rate_limits", "lag", "delay")
+    numbers = {what: {n: v for n, v in getattr(whole, what).items() if n in part.actuators} for what in by_actuator}
+    return plant(
+        part, forces={name: forces[name] for name in names if not forces[name].is_zero()},
+        damping={name: c for name, c in whole.damping.items() if name in names}, **numbers,
+        **dict(zip(part.parameters.names, whole.parameters.tolist(), strict=False)),
     )  # fmt: skip
 
 
@@ -314,7 +349,7 @@ def _forces(mechanism, forces, names):
     for name, value in mapping(forces, "The forces").items():
         if name not in names:
             raise unknown(name, names, "coordinate" if q.plain else "quasi-velocity")
-        expression = column(value, f"the force on {name!r}", 1)[0]
+        (expression,) = settled(column(value, f"the force on {name!r}", 1))
         require_known(expression, mechanism, f"the force on {name!r}")
         if q.order(expression) > 1:
             raise SpecificationError(

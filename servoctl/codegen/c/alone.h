@@ -57,7 +57,7 @@ DECLARED(example_project, double)
 DECLARED(example_jacobian, double)
 DECLARED(example_wide, W)
 DECLARED(example_wide_step, W)
-DECLARED(series, W)
+DECLARED(expansion, W)
 DECLARED(numbers, W)
 DECLARED(change, W)
 void law(W t, const W *restrict x, const double *restrict p, W *restrict y);

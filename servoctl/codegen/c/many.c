@@ -1,5 +1,5 @@
 /* Motions of many cases by the Taylor method: the lanes of W are motions with steps of their own, and a lane whose motion
-   ends takes the next case. Before it comes `series`, the function of taylor.c in lanes, with its sizes. */
+   ends takes the next case. Before it comes `expansion`, the function of taylor.c in lanes, with its sizes. */
 #include "unit.h"
 #include "lanes.h"
 #include "series.h"
@@ -148,7 +148,7 @@ void FN(many)(Many *m, int64_t first, int64_t last)
     for (int64_t lane = 0; lane < W_LANES; lane++, next++) load(m, lane, next, last, &s), open += next < last;
     while (open) {
         if (*(const volatile int64_t *)&m->stop) return;
-        series(s.t, s.x, s.p, s.y);
+        expansion(s.t, s.x, s.p, s.y);
         const W *c = s.y + (PLAIN ? 0 : NQ * LAST), least = s.atol / m->rtol;
         const W of_q = w_length(s.x, s.y, NQ, 0, 1, log_rtol, least);
         const W of_rates = w_length(s.x + NQ, c, N, 1, TOP, log_rtol, least);
