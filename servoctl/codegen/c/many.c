@@ -19,7 +19,8 @@ typedef struct {
 enum { FINISHED = 1, PIVOT_FALLS = -1, STUCK = -2, SERIES_OFF = -3 };
 
 typedef struct {
-    W t, x[NX + 1], p[NP + 1], y[NY + 1], atol, h, largest[NX + 1], pivots[NY - COEFFICIENTS + 1], signs[NY - COEFFICIENTS + 1];
+    W t, x[NX + 1], p[NP + 1], y[NY + 1], atol, h, largest[NX + 1];
+    W pivots[NY - COEFFICIENTS + 1], signs[NY - COEFFICIENTS + 1];
     W ahead[N + 1]; /* gamma^(s) at the end of the step, by its series */
     I steps;
     int64_t of[W_LANES], sampled[W_LANES];
