@@ -23,10 +23,13 @@ class Invariants:
         s̄.
     points : Points
         Points of the manifold of the rows, at which pivots are chosen.
+    cascade : Cascade, optional
+        The rows by blocks.
     """
 
-    def __init__(self, mechanism, rows, top, points):
+    def __init__(self, mechanism, rows, top, points, cascade=None):
         self.mechanism, self.rows, self.top, self.points = mechanism, rows, top, points
+        self.cascade, self._motions = cascade, {}
         q = self.q = mechanism.q
         self.state = ca.vertcat(*q, *(s for k in range(1, top) for s in q.gamma(k)))
         self.parameters = ca.vertcat(*mechanism.parameters.symbols)
@@ -35,10 +38,23 @@ class Invariants:
     @cached_property
     def levels(self):
         """For each row its total time derivatives of orders 0 .. s̄ - o_a."""
-        return [
-            [level[0] for level in self.q.derivatives([row.expression], count)]
-            for row, count in zip(self.rows, self.raised, strict=True)
-        ]
+        if self.cascade is not None:
+            return [
+                [self._along(row.order + j).levels[a] for j in range(count + 1)]
+                for a, (row, count) in enumerate(zip(self.rows, self.raised, strict=True))
+            ]
+        return [self._levels(row) for row in self.rows]
+
+    def _levels(self, row):
+        """Total time derivatives of a row of orders 0 .. s̄ - o_a, by its expression."""
+        return [level[0] for level in self.q.derivatives([row.expression], max(0, self.top - row.order))]
+
+    def _along(self, given, correct=False):
+        """The motion of the cascade by its jets up to a given level."""
+        if (given, correct) not in self._motions:
+            level = self.top if correct or given < self.top else given
+            self._motions[given, correct] = self.cascade.along(self.points, given, level, correct)
+        return self._motions[given, correct]
 
     def function(self, name, x, outputs, extra=None):
         """An SX function of (t, x, p) with one dense column."""
@@ -95,7 +111,7 @@ class Equations(Invariants):
     """
 
     def __init__(self, reduction):
-        super().__init__(reduction.mechanism, reduction.rows, reduction.top, reduction.points)
+        super().__init__(reduction.mechanism, reduction.rows, reduction.top, reduction.points, reduction.cascade)
         self.r = reduction
         self.jets = ca.vertcat(self.state, *self.q.gamma(self.top))
         self.coefficients = [
@@ -131,11 +147,16 @@ class Equations(Invariants):
 
     def dense(self, poles=False):
         """γ^(s̄) from the rows, L γ^(s̄) = -rest."""
+        if self.cascade is not None and not poles:
+            return self._along(self.top - 1).jet(self.top)
         return self._solve(-ca.vertcat(*self.rest(range(len(self.levels)), poles)))[0]
 
     @cached_property
     def _all_pivots(self):
-        leading = self.saddle[2] if self.sparse else self._solve(ca.SX(self.q.n, 0))[1]
+        if self.cascade is not None:
+            leading = self._along(0 if not self.r.free else self.top - 1).pivots
+        else:
+            leading = self.saddle[2] if self.sparse else self._solve(ca.SX(self.q.n, 0))[1]
         return [*self.r.pivots, *((f"leading matrix {i + 1}", p) for i, p in enumerate(leading))]
 
     @cached_property
@@ -203,6 +224,8 @@ class Equations(Invariants):
         With quasi-velocities (δq, q', q'', γ', γ'', pivots).
         """
         q, n = self.q, self.q.n
+        if self.cascade is not None:
+            return self._path_by_blocks()
         zero = ca.SX.zeros(n)
         w, dw = q.jet(1), q.jet(2)
         first = ca.vertcat(*(level[1] for level in self.levels))
@@ -216,6 +239,16 @@ class Equations(Invariants):
             ca.substitute(e, ca.vertcat(w, dw), ca.vertcat(velocity, acceleration)) for e in moving
         )
         return self.function("path", q.jet(0), [self._newton(), rate, second, *jets, *pivots])
+
+    def _path_by_blocks(self):
+        """`path` by the cascade, whose rates are those after the Newton step."""
+        q, motion = self.q, self._along(0, correct=True)
+        steady = [any(q.where(s) is not None for s in ca.symvar(p)) for p in self._along(0).pivots]
+        of_rows = [p for name, p in self.pivots if not name.startswith("leading matrix")]
+        pivots = [*of_rows, *(p for p, moves in zip(motion.pivots, steady, strict=True) if moves)]
+        jets = [] if q.plain else [motion.jet(1), motion.jet(2)]
+        outputs = [ca.vertcat(*motion.newton), motion.rates(1), motion.rates(2), *jets, *pivots]
+        return self.function("path", q.jet(0), outputs)
 
     def _newton(self):
         q = self.q
@@ -346,10 +379,11 @@ class Equations(Invariants):
     def _residuals(self):
         """Given residuals, material constraints and hidden rows, at every level up to order s̄."""
         names, expressions = [], []
+        deep = {} if self.cascade is None else dict(zip(map(id, self.rows), self.levels, strict=True))
         for name, row in residual_rows(self.r).items():
-            levels = self.q.derivatives([row.expression], max(0, self.top - row.order))
+            levels = deep[id(row)] if id(row) in deep else self._levels(row)
             names += [(name, j) for j in range(len(levels))]
-            expressions += [level[0] for level in levels]
+            expressions += levels
         reported, invariants = self.r.mechanism.reported, self.q.invariants
         names += [(name, 0) for name in reported]
         expressions += reported.values()

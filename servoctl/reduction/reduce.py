@@ -10,6 +10,7 @@ from servoctl.checks import finite, mapping
 from servoctl.errors import NotRealisable, ServoError, SpecificationError, unknown
 from servoctl.jets.series import Flow
 from servoctl.reduction.appell import Realisation, require_inertia
+from servoctl.reduction.cascade import Cascade, completed
 from servoctl.reduction.hidden import complete
 from servoctl.reduction.knots import Knots, Switches, require_smooth
 from servoctl.reduction.manifold import Context, Points, sample
@@ -54,6 +55,8 @@ class Reduction(Packed):
     context : Context
     original : dict of str to Row
         Rows of the designer's residuals and material constraints, by name.
+    cascade : Cascade, optional
+        The rows by blocks, where they are deep.
     """
 
     mechanism: Mechanism
@@ -67,6 +70,7 @@ class Reduction(Packed):
     switches: Switches
     context: Context
     original: dict
+    cascade: Cascade | None = None
 
     def __repr__(self):
         rows = ", ".join(f"{row.name} {row.order}" for row in self.rows)
@@ -222,12 +226,16 @@ def _reduced(mechanism, program, switches, balance, context):
             realised = split
             break
     _require_motion(dynamics, program)
-    rows, rank, points, of_rows = complete(q, [*(realised.settled or constraints), *dynamics], context, points)
+    rows = [*(realised.settled or constraints), *dynamics]
+    solve = complete if realised.settled else completed
+    rows, rank, points, of_rows, *cascade = solve(q, rows, context, points)
     knots = require_smooth(switches, context.values, smoothness(switches, rows))
     of_split = [(f"choice of dependent coordinates {i}", pivot) for i, pivot in enumerate(of_split, 1)]
     pivots = (*of_constraints, *of_sharing, *of_split, *of_rows)
     by_name = {row.name: row for row in original}
-    return Reduction(mechanism, program, tuple(rows), realised, rank, points, pivots, knots, switches, context, by_name)
+    return Reduction(
+        mechanism, program, tuple(rows), realised, rank, points, pivots, knots, switches, context, by_name, *cascade
+    )
 
 
 def holds(reduction, values):

@@ -65,6 +65,8 @@ class Row:
     vanishing : tuple of (SX, SX, SX)
         What the row's order rests on: slopes that vanish at the points of its derivation, but not identically; the jets
         in which they are slopes, or products of two; and the expression ψ that they are slopes of.
+    slopes : (1, n) SX, optional
+        A leading gradient that differs from ∂ψ/∂γ^(order) by multiples of other rows' only.
     """
 
     expression: ca.SX
@@ -76,11 +78,14 @@ class Row:
     uses: dict = field(default_factory=dict)
     parts: tuple = field(default=(), repr=False, compare=False)
     vanishing: tuple = field(default=(), repr=False)
+    slopes: object = field(default=None, repr=False)
     _gradients: dict = field(default_factory=dict, repr=False, compare=False)
 
     def gradient(self, q, level=None):
         """∂ψ/∂γ^(level), (1, n) SX; for level 0 ∂ψ/∂q · V. Default level: the order, for the leading gradient."""
         level = self.order if level is None else level
+        if self.slopes is not None and level == self.order:
+            return self.slopes
         key = self.expression.element_hash(), level
         if key not in self._gradients:
             slopes = ca.jacobian(self.expression, q.jet(level))
