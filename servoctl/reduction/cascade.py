@@ -3,8 +3,8 @@
 The path of the last of N cars determines its motion; its balance then holds only the next car's place, that car's
 balance the place of the one after it, and so on. Each block of rows determines as many coordinates from jets of those
 before it. Taylor coefficients of a motion follow block by block, those of the first blocks up to the levels that later
-ones contain: what one expression of all rows would repeat at every level is computed once, and the work is polynomial in
-the number of blocks (block triangular forms: Pothen and Fan, ACM TOMS 16 (1990) 303-324; coefficients: see
+ones contain. What expressions of the rows would repeat at every level is computed once, so that the work is polynomial
+in the number of blocks (block triangular forms: Pothen and Fan, ACM TOMS 16 (1990) 303-324; coefficients: see
 `servoctl.methods.taylor`).
 """
 
@@ -15,19 +15,14 @@ from math import factorial
 import casadi as ca
 import numpy as np
 
-from servoctl.jets.identity import spread
 from servoctl.jets.series import Motion, Series, is_zero, shifted
 from servoctl.jets.tape import REAL, Tape, add, divide, multiply
-from servoctl.reduction.hidden import _derivative_name, complete
-from servoctl.reduction.ranks import clean, decide_each, eliminate, generic, solve_clean
-from servoctl.reduction.rows import dependence, leading, merge_uses
+from servoctl.reduction.ranks import clean, eliminate, solve_clean
 
-DEEP = 4  # derivatives of a residual in a row: from these on a cascade takes fewer operations than one expression
-SHALLOW = 2  # derivatives that blocks take of each other, below which no row can be as deep
-NEWTON_STEPS = 100  # to the coordinates of a block
-NEWTON_SOLVED = 1e-17  # relative step at which they are solved
-SETTLED = 1e-15  # relative last step of points that count as solved
-REPEATED = 2  # solutions of a level, in which rows are affine: the second takes away rounding
+COORDINATES = 100  # Newton steps to the coordinates of a block, each of at most their size
+PLACED = 1e-17  # relative step at which they are solved
+NEARLY_PLACED = 1e-15  # relative last step of points that count
+TWICE = 2  # solutions of a level, in which rows are affine: the second takes away rounding
 
 
 @dataclass(frozen=True)
@@ -69,6 +64,11 @@ class Cascade:
 
     q: object
     blocks: tuple
+
+    @property
+    def rows(self):
+        """The rows of all blocks."""
+        return [row for block in self.blocks for row in block.rows]
 
     def __repr__(self):
         return f"Cascade(blocks of {', '.join(str(len(block.rows)) for block in self.blocks)} rows)"
@@ -240,7 +240,7 @@ class Expressions(_Follow):
     """
 
     def __init__(self, cascade, points, given, correct):
-        q, level = cascade.q, max(cascade.depths(given))
+        q = cascade.q
         gamma = {k: [divide(s, float(factorial(k))) for s in q.gamma(k)] for k in range(1, given + 1)}
         place = {0: list(q), **({k: list(gamma[k]) for k in gamma} if q.plain else {})}
         super().__init__(cascade, gamma, place)
@@ -308,8 +308,8 @@ class _Numbers(_Follow):
     def __init__(self, cascade, points, z):
         q = cascade.q
         gamma = {k: list(z[q.nq + (k - 1) * q.n :][: q.n]) for k in range(1, 1 + (len(z) - q.nq) // q.n)}
-        place = {k: list(z[: q.nq] if k == 0 else np.zeros((q.nq, z.shape[1]), dtype=REAL)) for k in range(len(gamma) + 1)}
-        super().__init__(cascade, gamma, place)
+        place = {k: list(np.zeros((q.nq, z.shape[1]), dtype=REAL)) for k in gamma}
+        super().__init__(cascade, gamma, {0: list(z[: q.nq]), **place})
         self.points, self.sizes = points, points.sizes(0)
         self.known = dict(zip((s.element_hash() for s in points.parameters), points.values, strict=True))
         self.converged = np.ones(len(points.t), dtype=bool)
@@ -327,16 +327,16 @@ class _Numbers(_Follow):
     def steps(self, block, level, active):
         """Changes of γ_[level] of a block until its rows hold; coordinates move by Newton's method."""
         if level:
-            yield from (self._step(block, level, active) for _ in range(REPEATED if active else 0))
+            yield from (self._step(block, level, active) for _ in range(TWICE if active else 0))
             return
         longest = np.zeros(len(self.points.t))
-        for _ in range(NEWTON_STEPS if active else 0):
+        for _ in range(COORDINATES if active else 0):
             longest = self._moved(block, self._step(block, level, active))
             for series, _ in active:
                 series.repeat()
-            if np.all(longest <= NEWTON_SOLVED):
+            if np.all(longest <= PLACED):
                 break
-        self.converged &= longest < SETTLED
+        self.converged &= longest < NEARLY_PLACED
 
     def _moved(self, block, step):
         """Move the coordinates of a block by a step (b, N), shortened; its largest relative size (N,)."""
@@ -369,213 +369,3 @@ def _least(matrix, right):
     if matrix.shape[0] == matrix.shape[1]:
         return solve_clean(matrix, right[:, None])[:, 0]
     return np.linalg.lstsq(matrix.astype(float), right.astype(float), rcond=None)[0].astype(REAL)
-
-
-def completed(q, rows, context, starts):
-    """Rows with their hidden constraints, by blocks where the expression of a row would hold high derivatives.
-
-    Parameters
-    ----------
-    q : Coordinates
-    rows : list of Row
-        n rows, as for `hidden.complete`, whose results come first.
-    context : Context
-    starts : Points
-
-    Returns
-    -------
-    rows : list of Row
-    rank : Rank
-    points : Points
-    pivots : list of (str, SX)
-    cascade : Cascade or None
-        None where rows have no such form, or no high derivatives.
-    """
-    blocks = triangular(q, rows)
-    last = max((k for k, block in enumerate(blocks) if not _determines(q, block)), default=0)
-    head, tail = blocks[: last + 1], blocks[last + 1 :]
-    if tail and _ahead(q, blocks, last) >= SHALLOW:
-        places = sorted(a for block in head for a in block.places)
-        some, _, points, pivots = complete(q, [rows[a] for a in places], context, starts)
-        columns, coordinates = (sum((getattr(b, part) for b in head), ()) for part in ("columns", "coordinates"))
-        found = _by_blocks(q, rows, Cascade(q, (Block(tuple(some), tuple(places), columns, coordinates), *tail)), points)
-        if found is not None:
-            return *found[:3], pivots, found[3]
-    return *complete(q, rows, context, starts), None
-
-
-def _by_blocks(q, rows, cascade, points):
-    """Rows, their rank, points and the cascade; None if it is shallow, or does not determine the motion."""
-    head, *tail = cascade.blocks
-    rows, explicit = list(rows), {}
-    for row, a in zip(head.rows, head.places, strict=True):
-        rows[a] = row
-    orders = [[row.order for row in block.rows] for block in cascade.blocks]
-    if not all(row.affine for row in head.rows) or any(
-        min(some) < max(map(max, orders[:k])) - 1 for k, some in enumerate(orders) if k
-    ):
-        return None
-    points = cascade.solved(points, max(2, *map(max, orders)))
-    regular = np.ones(len(points.t), dtype=bool)
-    for block in tail:
-        ranks = decide_each(clean(*points.matrix(block.leading(q)))) if len(points.t) else []
-        regular &= np.array([rank.rank == len(block.rows) and rank.clear for rank in ranks], dtype=bool)
-    points = points.take(np.flatnonzero(regular))
-    if not len(points.t):
-        return None
-    cascade = replace(cascade, blocks=(head, *_told(q, cascade, rows, points)))
-    if max(count for block in cascade.blocks[1:] for row in block.rows for count in row.uses.values()) < DEEP:
-        return None
-    for order in {row.order for block in cascade.blocks[1:] for row in block.rows}:
-        motion = cascade.along(points, order, order)
-        for block in cascade.blocks[1:]:
-            for row, a in zip(block.rows, block.places, strict=True):
-                if row.order == order:
-                    explicit[a] = _explicit(q, row, motion, a)
-    rows = [explicit.get(a, row) for a, row in enumerate(rows)]
-    rank, _ = generic(decide_each(leading(q, rows, points)[0]))
-    return (rows, rank, points, cascade) if rank.rank == len(rows) and rank.clear else None
-
-
-def _explicit(q, row, motion, place):
-    """A row as a function of t, q, ..., γ^(order): higher jets by those of earlier blocks."""
-    gradient = row.gradient(q)
-    slopes = ca.SX(gradient.sparsity(), ca.vertcat(ca.SX(0, 1), *motion.values(gradient.nonzeros())))
-    return replace(row, expression=ca.cse(motion.levels[place]), slopes=ca.densify(slopes), parts=())
-
-
-def _told(q, cascade, rows, points):
-    """The blocks beyond the first, whose rows tell of which rows they are combinations, and what they use."""
-    blocks, known = [], list(cascade.blocks[0].rows)
-    for k, block in enumerate(cascade.blocks[1:], 1):
-        told = []
-        for a, row in enumerate(block.rows):
-            jets = {m: order for (b, m), order in cascade.jets[k].items() if b == a}
-            uses = [(other.uses, max(order - other.order, 0)) for m, order in jets.items() for other in [*cascade.blocks[:1], *blocks][m].rows]
-            top = max([row.order, *jets.values()])
-            story = _story(q, row, known, top, points) if top > row.order else ""
-            told.append(replace(row, uses=merge_uses((row.uses, 0), *uses), story=story))
-        blocks.append(replace(block, rows=tuple(told)))
-        known += told
-    return blocks
-
-
-def _story(q, row, known, top, points):
-    """The combination of known rows by which the highest jets of a row cancel."""
-    values = [points.matrix(other.gradient(q)) for other in known] + [points.matrix(row.gradient(q, top))]
-    support, _ = dependence(np.concatenate([clean(*pair) for pair in values]), first=len(known))
-    names = [_derivative_name(known[a], top - known[a].order) for a in support[:-1]]
-    return f"{row.name} with {', '.join(names)}" if names else row.name
-
-
-def _determines(q, block):
-    """Whether the leading gradients of a block's rows are independent and do not change with what they determine."""
-    gradient = block.leading(q)
-    own = {("w", row.order, c) for row in block.rows for c in block.columns if row.order}
-    if any(q.where(s) in own for s in ca.symvar(gradient)):
-        return False
-    values = spread(gradient.nonzeros())
-    numbers = np.zeros((*gradient.shape, values.shape[1]))
-    numbers[tuple(gradient.sparsity().get_triplet())] = values
-    numbers = numbers[:, :, np.isfinite(values).all(axis=0)]
-    return numbers.shape[2] > 0 and generic(decide_each(numbers))[0].rank == len(numbers)
-
-
-def _ahead(q, blocks, last):
-    """How far rows differentiate those of earlier blocks, beyond what happens up to block `last`."""
-    jets, ahead = Cascade(q, tuple(blocks)).jets, [0] * len(blocks)
-    for k in range(last + 1, len(blocks)):
-        for (_, m), order in jets[k].items():
-            lowest = min(row.order for row in blocks[m].rows) if m > last else 0
-            ahead[k] = max(ahead[k], ahead[m] + order - lowest)
-    return max(ahead)
-
-
-def triangular(q, rows):
-    """Rows and the quasi-velocities in them as blocks, each square, in which later ones do not occur in earlier rows.
-
-    Parameters
-    ----------
-    q : Coordinates
-    rows : list of Row
-
-    Returns
-    -------
-    list of Block
-        Empty where rows cannot be matched with quasi-velocities.
-    """
-    of_place = _rates(q)
-    contents = []
-    for row in rows:
-        places = [q.where(s) for s in ca.symvar(row.expression)]
-        contents.append({c for kind, _, i in filter(None, places) if kind != "t" for c in (of_place[i] if kind == "q" else [i])})
-    matched = _matching(contents, q.n)
-    if len(rows) != q.n or None in matched:
-        return []
-    components = _components([[matched[c] for c in sorted(some)] for some in contents])
-    blocks, known, moved = [], set(), set()
-    for component in components:
-        columns = {c for c in range(q.n) if matched[c] in component}
-        known |= columns
-        here = [i for i in range(q.nq) if i not in moved and of_place[i] <= known]
-        moved |= set(here)
-        own = tuple(replace(rows[a], order=_own_order(q, rows[a], columns), parts=()) for a in sorted(component))
-        blocks.append(Block(own, tuple(sorted(component)), tuple(sorted(columns)), tuple(here)))
-    return blocks
-
-
-def _own_order(q, row, columns):
-    """The highest order of the jets of some quasi-velocities in a row, 0 for none."""
-    places = filter(None, map(q.where, ca.symvar(row.expression)))
-    return max((order for kind, order, i in places if kind == "w" and i in columns), default=0)
-
-
-def _rates(q):
-    """For each coordinate the quasi-velocities that move it, also by way of other coordinates."""
-    moved = [{j for j in range(q.n) if q.V.sparsity().has_nz(i, j)} for i in range(q.nq)]
-    seen = [{q.where(s)[2] for s in ca.symvar(ca.vertcat(ca.vec(q.V[i, :]), q.h[i])) if (q.where(s) or ("",))[0] == "q"} for i in range(q.nq)]
-    for _ in range(q.nq):
-        moved = [some.union(*(moved[m] for m in seen[i])) for i, some in enumerate(moved)]
-    return moved
-
-
-def _matching(contents, count):
-    """For each of `count` columns the row that is matched with it, None for none; `contents` are columns by row."""
-    matched = [None] * count
-
-    def place(a, tried):
-        for c in sorted(contents[a] - tried):
-            tried.add(c)
-            if matched[c] is None or place(matched[c], tried):
-                matched[c] = a
-                return True
-        return False
-
-    for a in range(len(contents)):
-        place(a, set())
-    return matched
-
-
-def _components(successors):
-    """Strongly connected components of a graph, each after those to which it leads (Tarjan)."""
-    index, low, stack, result = {}, {}, [], []
-
-    def visit(a):
-        index[a] = low[a] = len(index)
-        stack.append(a)
-        for b in successors[a]:
-            if b not in index:
-                visit(b)
-                low[a] = min(low[a], low[b])
-            elif b in stack:
-                low[a] = min(low[a], index[b])
-        if low[a] == index[a]:
-            component = set()
-            while a not in component:
-                component.add(stack.pop())
-            result.append(component)
-
-    for a in range(len(successors)):
-        if a not in index:
-            visit(a)
-    return result

@@ -10,7 +10,7 @@ from servoctl.checks import finite, mapping
 from servoctl.errors import NotRealisable, ServoError, SpecificationError, unknown
 from servoctl.jets.series import Flow
 from servoctl.reduction.appell import Realisation, require_inertia
-from servoctl.reduction.cascade import Cascade, completed
+from servoctl.reduction.cascade import Cascade
 from servoctl.reduction.hidden import complete
 from servoctl.reduction.knots import Knots, Switches, require_smooth
 from servoctl.reduction.manifold import Context, Points, sample
@@ -19,6 +19,7 @@ from servoctl.reduction.ranks import Rank, clean, decide, decide_all
 from servoctl.reduction.realisation import realisation, wished, wished_balance
 from servoctl.reduction.rows import Balance, as_rows, balances, merge_uses, settle_alone
 from servoctl.reduction.scales import ORDINARY, usual
+from servoctl.reduction.triangular import completed
 from servoctl.spec.mechanism import Mechanism, require_known
 from servoctl.spec.packing import Packed
 from servoctl.spec.program import Program
