@@ -83,7 +83,7 @@ class Invariants:
             values = ca.vertcat(*(self.levels[a][level - self.rows[a].order] for a in rows))
             change = ca.SX.zeros(q.n)
             if rows:
-                J = ca.vertcat(*(self.rows[a].gradient(q) for a in rows))
+                J = self.slopes(rows, values, level)
                 saddle = ca.vertcat(ca.horzcat(mass, J.T), ca.horzcat(J, ca.SX.zeros(len(rows), len(rows))))
                 numbers = clean(*self.points.matrix(saddle))
                 change = eliminate(saddle, ca.vertcat(ca.SX.zeros(q.n), -values), numbers)[0][: q.n]
@@ -91,6 +91,13 @@ class Invariants:
                 change = q.V @ change + self._restore_kinematics()
             changes.append(change)
         return self.function("project", self.state, changes)
+
+    def slopes(self, rows, values, level):
+        """∂/∂γ^(level), or ∂/∂q V, of the values of rows at their derivatives of this level."""
+        if self.cascade is None:
+            return ca.vertcat(*(self.rows[a].gradient(self.q) for a in rows))
+        slopes = ca.jacobian(values, self.q.jet(level))
+        return slopes if level else slopes @ self.q.V
 
     def _restore_kinematics(self):
         """The least change of q that restores the invariants of the kinematics."""
@@ -147,9 +154,15 @@ class Equations(Invariants):
 
     def dense(self, poles=False):
         """γ^(s̄) from the rows, L γ^(s̄) = -rest."""
-        if self.cascade is not None and not poles:
-            return self._along(self.top - 1).jet(self.top)
+        if self.cascade is not None:
+            return self._along(self.top - 1).jet(self.top) if not poles else self._by_blocks_with_poles()
         return self._solve(-ca.vertcat(*self.rest(range(len(self.levels)), poles)))[0]
+
+    def _by_blocks_with_poles(self):
+        """γ^(s̄) by the cascade, with error dynamics."""
+        pairs = zip(self.coefficients, self.levels, strict=True)
+        errors = {a: sum(c * e for c, e in zip(some, lower[:-1], strict=True)) for a, (some, lower) in enumerate(pairs)}
+        return self.cascade.along(self.points, self.top - 1, self.top, errors=errors).jet(self.top)
 
     @cached_property
     def _all_pivots(self):
@@ -397,6 +410,10 @@ class Equations(Invariants):
         """
         places = filter(None, map(self.q.where, ca.symvar(expression)))
         highest = max((level for of, level, _ in places if of not in ("t", "q")), default=0)
+        if self.cascade is not None and highest > self.top:
+            motion, above = self.cascade.along(self.points, self.top, highest), range(self.top + 1, highest + 1)
+            jets = [ca.vertcat(*(e for k in above for e in part(k).elements())) for part in (self.q.jet, motion.jet)]
+            return ca.substitute(expression, *jets)
         for k in range(highest, self.top, -1):
             jet = self.q.jet(k)
             pairs = zip(self.r.rows, self.raised, strict=True)

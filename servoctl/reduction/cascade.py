@@ -101,19 +101,39 @@ class Cascade:
                 depths[m] = max(depths[m], order + depths[k] - self.blocks[k].rows[a].order)
         return depths
 
-    def solved(self, points, level):
-        """Points whose jets up to a level satisfy the rows, with those of earlier blocks that this takes."""
+    def continued(self, points, level, given=-1):
+        """Jets near points that satisfy the rows up to a level; those of earlier blocks reach as far as this takes.
+
+        Parameters
+        ----------
+        points : Points
+        level : int
+        given : int, optional
+            Jets up to this level stay as they are; default: none.
+
+        Returns
+        -------
+        z : (nz, N) array
+            q and normalised Taylor coefficients, as in `Points`.
+        solved : (N,) array of bool
+        """
         depths, q = self.depths(level), self.q
         z = np.zeros((q.nq + max(depths) * q.n, len(points.t)), dtype=REAL)
-        z[: min(len(z), len(points.z))] = points.z[: len(z)]
+        shared = min(len(z), len(points.z))
+        z[:shared] = points.z[:shared]
         with np.errstate(all="ignore"):
-            motion = _Numbers(self, points, z)
-            for k, block in enumerate(self.blocks):
-                motion.follow(block, depths[k])
+            motion = _Numbers(self, points, z, given)
+            for block, depth in zip(self.blocks, depths, strict=True):
+                motion.follow(block, depth)
         z = motion.z()
-        return replace(points, z=z).take(np.flatnonzero(np.isfinite(z).all(axis=0) & motion.converged))
+        return z, np.isfinite(z).all(axis=0) & motion.converged
 
-    def along(self, points, given, level, correct=False):
+    def solved(self, points, level):
+        """The points that satisfy the rows up to a level, from others near them."""
+        z, solved = self.continued(points, level)
+        return replace(points, z=z).take(np.flatnonzero(solved))
+
+    def along(self, points, given, level, correct=False, running=None, errors=None):
         """The motion by jets up to a given level, and Newton steps to its coordinates where it is `correct`ed first.
 
         Parameters
@@ -126,24 +146,33 @@ class Cascade:
             To which jets are computed.
         correct : bool, optional
             Whether coordinates become those after a Newton step. Rows have order 0 then.
+        running : callable, optional
+            What makes a `Running` of (motion, order, expressions); default: that class.
+        errors : dict of int to SX, optional
+            By place of a row: what is added to ψ^(given + 1 - order), as by error dynamics; default: nothing.
 
         Returns
         -------
         Expressions
         """
         motion = Expressions(self, points, given, correct)
+        motion.running, motion.errors = running or Running, errors or {}
         for block, depth in zip(self.blocks, self.depths(level), strict=True):
             motion.follow(block, depth)
         return motion
 
 
-class _Series:
+class Running:
     """Expressions along a motion, one coefficient after the other; that of index j belongs to the level j + order."""
 
     def __init__(self, motion, order, expressions):
         self.motion, self.order = motion, order
         self.symbols = ca.symvar(ca.vertcat(ca.SX(0, 1), *expressions))
-        self.series = Series(Tape(self.symbols, expressions), [[] for _ in self.symbols])
+        self.series = self.run(Tape(self.symbols, expressions))
+
+    def run(self, tape):
+        """The series of a tape."""
+        return Series(tape, [[] for _ in self.symbols])
 
     def advance(self):
         """The next coefficients."""
@@ -173,6 +202,8 @@ class _Follow(Motion):
         Coefficients k of γ (n,) and of q (nq,).
     """
 
+    running = Running
+
     def __init__(self, cascade, gamma, place):
         super().__init__(cascade.q)
         self.gamma, self.place = gamma, place
@@ -186,11 +217,11 @@ class _Follow(Motion):
     def follow(self, block, depth):
         """The coefficients of a block up to a level."""
         moving = self.q.V @ self.q.jet(1) + self.q.h
-        rates = None if self.q.plain else _Series(self, 1, [moving[i] for i in block.coordinates])
+        rates = None if self.q.plain else self.running(self, 1, [moving[i] for i in block.coordinates])
         groups = []
         for order in sorted({row.order for row in block.rows}):
             members = [a for a, row in enumerate(block.rows) if row.order == order]
-            groups.append((_Series(self, order, [block.rows[a].expression for a in members]), members))
+            groups.append((self.running(self, order, [block.rows[a].expression for a in members]), members))
         for level in range(depth + 1):
             active = [(series, members) for series, members in groups if series.order <= level]
             self._move(block, level, rates and rates.advance)
@@ -223,7 +254,7 @@ class _Follow(Motion):
 
     def values(self, entries):
         """Values of SX scalars by the coefficients 0 of all jets."""
-        return _Series(self, 0, entries).advance()
+        return self.running(self, 0, entries).advance()
 
 
 class Expressions(_Follow):
@@ -244,7 +275,7 @@ class Expressions(_Follow):
         gamma = {k: [divide(s, float(factorial(k))) for s in q.gamma(k)] for k in range(1, given + 1)}
         place = {0: list(q), **({k: list(gamma[k]) for k in gamma} if q.plain else {})}
         super().__init__(cascade, gamma, place)
-        self.points, self.given, self.correct, self.matrix = points, given, correct, None
+        self.points, self.given, self.correct, self.matrix, self.errors = points, given, correct, None, {}
         self.levels, self.newton, self.pivots = {}, [ca.SX(0)] * q.nq, []
 
     def jet(self, k):
@@ -283,7 +314,10 @@ class Expressions(_Follow):
         if first:
             leading = block.leading(self.q)
             self.matrix = ca.SX(leading.sparsity(), ca.vertcat(ca.SX(0, 1), *self.values(leading.nonzeros())))
-        right = ca.vertcat(*(ca.SX(c) for c in self.right(level, active).values()))
+        right = {a: ca.SX(c) for a, c in self.right(level, active).items()}
+        for a in right if level == self.given + 1 else ():
+            right[a] -= self.errors.get(block.places[a], 0.0) / factorial(level)
+        right = ca.vertcat(*right.values())
         numbers = clean(*self.points.matrix(block.leading(self.q)))
         solution, pivots = eliminate(self.matrix, right, numbers)
         if first and level:
@@ -305,12 +339,12 @@ class Expressions(_Follow):
 class _Numbers(_Follow):
     """Motions near points, in numbers: jets (nz, N) that change as little as the rows demand."""
 
-    def __init__(self, cascade, points, z):
+    def __init__(self, cascade, points, z, given):
         q = cascade.q
         gamma = {k: list(z[q.nq + (k - 1) * q.n :][: q.n]) for k in range(1, 1 + (len(z) - q.nq) // q.n)}
         place = {k: list(np.zeros((q.nq, z.shape[1]), dtype=REAL)) for k in gamma}
         super().__init__(cascade, gamma, {0: list(z[: q.nq]), **place})
-        self.points, self.sizes = points, points.sizes(0)
+        self.points, self.sizes, self.given = points, points.sizes(0), given
         self.known = dict(zip((s.element_hash() for s in points.parameters), points.values, strict=True))
         self.converged = np.ones(len(points.t), dtype=bool)
 
@@ -326,11 +360,12 @@ class _Numbers(_Follow):
 
     def steps(self, block, level, active):
         """Changes of γ_[level] of a block until its rows hold; coordinates move by Newton's method."""
-        if level:
-            yield from (self._step(block, level, active) for _ in range(TWICE if active else 0))
+        if level <= self.given or not active:
             return
-        longest = np.zeros(len(self.points.t))
-        for _ in range(COORDINATES if active else 0):
+        if level:
+            yield from (self._step(block, level, active) for _ in range(TWICE))
+            return
+        for _ in range(COORDINATES):
             longest = self._moved(block, self._step(block, level, active))
             for series, _ in active:
                 series.repeat()

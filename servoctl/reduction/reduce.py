@@ -256,7 +256,10 @@ def holds(reduction, values):
     """
     q, r = reduction.mechanism.q, reduction
     context = replace(r.context, values=values)
-    points = sample(q, r.rows, r.top, context, starts=r.points, flow=r.flow)
+    if r.cascade is None:
+        points = sample(q, r.rows, r.top, context, starts=r.points, flow=r.flow)
+    else:
+        points = r.cascade.solved(replace(r.points, values=values), r.top)
     if not len(points.t) or not r.orders.hold(points):
         return False
     for matrix in (r.leading, r.realisation.B.T):
