@@ -254,7 +254,7 @@ class Equations(Invariants):
         return self.function("path", q.jet(0), [self._newton(), rate, second, *jets, *pivots])
 
     def _path_by_blocks(self):
-        """`path` by the cascade, whose rates are those after the Newton step."""
+        """`path` by the cascade."""
         q, motion = self.q, self._along(0, correct=True)
         steady = [any(q.where(s) is not None for s in ca.symvar(p)) for p in self._along(0).pivots]
         of_rows = [p for name, p in self.pivots if not name.startswith("leading matrix")]

@@ -19,7 +19,7 @@ from servoctl.jets.series import Motion, Series, is_zero, shifted
 from servoctl.jets.tape import REAL, Tape, add, divide, multiply
 from servoctl.reduction.ranks import clean, eliminate, solve_clean
 
-COORDINATES = 100  # Newton steps to the coordinates of a block, each of at most their size
+PLACING = 100  # Newton steps to the coordinates of a block, each of at most their size
 PLACED = 1e-17  # relative step at which they are solved
 NEARLY_PLACED = 1e-15  # relative last step of points that count
 TWICE = 2  # solutions of a level, in which rows are affine: the second takes away rounding
@@ -145,7 +145,7 @@ class Cascade:
         level : int
             To which jets are computed.
         correct : bool, optional
-            Whether coordinates become those after a Newton step. Rows have order 0 then.
+            Whether there are Newton steps. Rows have order 0 then.
         running : callable, optional
             What makes a `Running` of (motion, order, expressions); default: that class.
         errors : dict of int to SX, optional
@@ -277,6 +277,7 @@ class Expressions(_Follow):
         super().__init__(cascade, gamma, place)
         self.points, self.given, self.correct, self.matrix, self.errors = points, given, correct, None, {}
         self.levels, self.newton, self.pivots = {}, [ca.SX(0)] * q.nq, []
+        self.passed_on = {cascade.blocks[m].places for jets in cascade.jets for _, m in jets}
 
     def jet(self, k):
         """γ^(k), or q, of this motion, SX."""
@@ -305,7 +306,7 @@ class Expressions(_Follow):
                     self.levels[block.places[a]] = ca.SX(c) * float(factorial(level - series.order))
         if level == 0 and self.correct:
             self._correct(block, active)
-        if active and level > self.given:
+        if level > self.given and sum(len(members) for _, members in active) == len(block.rows):
             yield self._solved(block, level, active)
 
     def _solved(self, block, level, active):
@@ -325,12 +326,14 @@ class Expressions(_Follow):
         return [0.0 if x.is_zero() else x for x in solution.elements()]
 
     def _correct(self, block, active):
-        """The Newton step to the coordinates of a block."""
+        """The Newton step to the coordinates of a block; jets that later blocks need are those after it."""
         V = self.q.V[list(block.coordinates), list(block.columns)]
         V = ca.SX(V.sparsity(), ca.vertcat(ca.SX(0, 1), *self.values(V.nonzeros())))
         step = V @ ca.vertcat(*map(ca.SX, self._solved(block, 0, active)))
         for i, x in zip(block.coordinates, step.elements(), strict=True):
-            self.newton[i], self.place[0][i] = x, add(self.place[0][i], x)
+            self.newton[i] = x
+            if block.places in self.passed_on:
+                self.place[0][i] = add(self.place[0][i], x)
         self.matrix = None  # which may depend on them
         for series, _ in active:
             series.repeat()
@@ -365,7 +368,7 @@ class _Numbers(_Follow):
         if level:
             yield from (self._step(block, level, active) for _ in range(TWICE))
             return
-        for _ in range(COORDINATES):
+        for _ in range(PLACING):
             longest = self._moved(block, self._step(block, level, active))
             for series, _ in active:
                 series.repeat()
@@ -394,10 +397,10 @@ class _Numbers(_Follow):
         for i, j, value in zip(*leading.sparsity().get_triplet(), self.values(leading.nonzeros()), strict=True):
             matrix[i, j] = value
         right = np.array([c + np.zeros(len(self.points.t), dtype=REAL) for c in right.values()])
-        return np.array([_least(matrix[:, :, p], right[:, p]) for p in range(right.shape[1])]).T
+        return np.array([_nearest_solution(matrix[:, :, p], right[:, p]) for p in range(right.shape[1])]).T
 
 
-def _least(matrix, right):
+def _nearest_solution(matrix, right):
     """The least solution of a regular or underdetermined system of numbers."""
     if not (np.isfinite(matrix).all() and np.isfinite(right).all()):
         return np.full(matrix.shape[1], np.nan)

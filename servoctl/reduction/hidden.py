@@ -85,9 +85,7 @@ def complete(q, rows, context, starts=None, most=None):
         dropped = max(dropped, rank.dropped)
         if rank.rank == len(rows):
             return rows, replace(rank, dropped=dropped), points.take(same), pivots
-        if most is not None and _differentiations(rows, numbers[:, :, same]) > most:
-            raise Deep
-        combination = _lowest(q, rows, numbers[:, :, same], context, points)
+        combination = _lowest(q, rows, numbers[:, :, same], context, points, most)
         if combination.row.order < 0:
             raise _dependent(q, rows, combination, context)
         rows[combination.replaces] = replace(combination.row, parts=())
@@ -106,34 +104,23 @@ class _Combination:
     whole: Row  # the combination itself, before its order was settled
 
 
-def _dependent_rows(rows, numbers):
-    """Indices of dependent rows, and the smallest sizes of their coefficients; see `dependence`.
-
-    Rows of (3.18) come last, and are replaced first among those of highest order: where it can be, the designer's
-    constraints stay as they are written.
-    """
-    order = sorted(range(len(rows)), key=lambda a: (rows[a].kind == "dynamics", rows[a].order, a))
-    support, weights = dependence(numbers[order])
-    return [order[i] for i in support], weights
-
-
-def _differentiations(rows, numbers):
-    """The highest derivative of a residual, or of a balance, in the combination of dependent rows."""
-    support, _ = _dependent_rows(rows, numbers)
-    return max(combined_uses([rows[a] for a in support]).values(), default=0)
-
-
 def combined_uses(rows):
     """The highest derivative of each residual, and of the balance, in a combination of rows at their highest order."""
     top = max((row.order for row in rows), default=0)
     return merge_uses(*((row.uses, top - row.order) for row in rows))
 
 
-def _lowest(q, rows, numbers, context, starts=None):
+def _lowest(q, rows, numbers, context, starts=None, most=None):
     """The combination of dependent rows that replaces one of them by a row of lower order."""
-    support, weights = _dependent_rows(rows, numbers)
+    # Rows of (3.18) come last, and are replaced first among those of highest order: where it can be, the designer's
+    # constraints stay as they are written.
+    order = sorted(range(len(rows)), key=lambda a: (rows[a].kind == "dynamics", rows[a].order, a))
+    support, weights = dependence(numbers[order])
     if not support:  # the ranks at single points and the dependence at all of them disagree
         raise _ill_conditioned(rows, generic(decide_each(numbers))[0])
+    support = [order[i] for i in support]
+    if most is not None and max(combined_uses([rows[a] for a in support]).values(), default=0) > most:
+        raise Deep
     top = max(rows[a].order for a in support)
     highest = ((a, w) for a, w in zip(support, weights, strict=True) if rows[a].order == top)
     b = max((rows[a].kind == "dynamics", w, a) for a, w in highest)[2]

@@ -75,7 +75,7 @@ def _alone(block, earlier):
 
 def _follows(q, block, earlier):
     """Whether jets of a block follow, from the orders of its rows on, wherever those of earlier blocks are known."""
-    highest = max([0, *(row.order for other in earlier for row in other.rows)])
+    highest = max(row.order for other in (*earlier, block) for row in other.rows)
     return all(
         row.affine and row.order >= highest - 1 and _own_order(q, row, block.columns) <= row.order for row in block.rows
     )
@@ -92,23 +92,23 @@ def _regular(q, cascade, points):
 
 def _explicit(q, rows, cascade, points, pivots):
     """The rows as functions of t, q, ..., γ^(order), higher jets by those of earlier blocks; see `completed`."""
-    rows, cascade = list(rows), _told(q, rows, cascade, points)
+    rows, cascade = list(rows), _with_uses(q, rows, cascade, points)
     motions = {order: cascade.along(points, order, order) for order in {row.order for row in cascade.rows}}
     for k, block in enumerate(cascade.blocks):
         for row, a in zip(block.rows, block.places, strict=True):
-            rows[a] = _closed(q, row, motions[row.order], a) if k else row
+            rows[a] = _in_own_jets(q, row, motions[row.order], a) if k else row
     rank, _ = generic(decide_each(leading(q, rows, points)[0]))
     return (rows, rank, points, pivots, cascade) if rank.rank == len(rows) and rank.clear else None
 
 
-def _closed(q, row, motion, place):
+def _in_own_jets(q, row, motion, place):
     """A row as a function of t, q, ..., γ^(order)."""
     gradient = row.gradient(q)
     slopes = ca.SX(gradient.sparsity(), ca.vertcat(ca.SX(0, 1), *motion.values(gradient.nonzeros())))
     return replace(row, expression=ca.cse(motion.levels[place]), slopes=ca.densify(slopes), parts=())
 
 
-def _told(q, rows, cascade, points):
+def _with_uses(q, rows, cascade, points):
     """The cascade, whose rows say of which rows they are combinations, and what they use."""
     blocks, known = [], []
     for k, block in enumerate(cascade.blocks):
@@ -161,12 +161,12 @@ def triangular(q, rows):
     Returns
     -------
     list of Block
-        Empty where rows cannot be matched with quasi-velocities.
+        Empty where rows cannot be matched with quasi-velocities, and these with coordinates.
     """
     moved_by = _moved_by(q)
     contents = [_contents(q, row, moved_by) for row in rows]
     matched = _matching(contents, q.n)
-    if len(rows) != q.n or None in matched:
+    if not q.n == q.nq == len(rows) or None in matched:
         return []
     blocks, known, moved = [], set(), set()
     for component in _components([[matched[c] for c in sorted(some)] for some in contents]):
