@@ -4,164 +4,110 @@ A specification flows one way: Mechanism and Program, by `derive`, become a Mode
 `verify` proves the run against the full mechanism.
 """
 
-from servoctl import figures, interop, spec
-from servoctl import figures as plots
-from servoctl.control import disturbances
-from servoctl.control.close import close
-from servoctl.control.conditions import Sensors, Timing
-from servoctl.control.feedforward import feedforward
-from servoctl.control.inverse_dynamics import computed
-from servoctl.control.law import Controller, Law
-from servoctl.control.limits import LimitReport, limit_report, limited
-from servoctl.control.lqr import lqr
-from servoctl.control.observer import output_feedback
-from servoctl.control.pd import pd
-from servoctl.control.result import Closed
-from servoctl.control.time_law import TimeLaw, fastest
-from servoctl.errors import (
-    InconsistentStart,
-    IntegrationStopped,
-    LimitExceeded,
-    NameUnknown,
-    NotRealisable,
-    ServoError,
-    SingularProgram,
-    SpecificationError,
-    UnstableInternalDynamics,
-)
-from servoctl.export.c import export_c
-from servoctl.internal_dynamics import InternalDynamics, internal_dynamics
-from servoctl.inversion.choice import inverse
-from servoctl.inversion.output import MinimumPhase, minimum_phase
-from servoctl.inversion.relaxed import relaxed
-from servoctl.inversion.report import Report, report
-from servoctl.methods.choice import (
-    Adaptive,
-    Algebraic,
-    Bounded,
-    MinimalCoordinates,
-    Poles,
-    Project,
-    RadauIIA,
-    RungeKutta,
-    Sundials,
-    Taylor,
-)
-from servoctl.methods.events import Event
-from servoctl.methods.stability import sampled_bound
-from servoctl.model.model import Model, derive
-from servoctl.plants.plant import Plant, plant
-from servoctl.run import Run, load
-from servoctl.sensitivities.identification import Identification, identify
-from servoctl.sensitivities.sensitivity import Sensitivity, sensitivity
-from servoctl.simulation import simulate
-from servoctl.spec import (
-    Coordinates,
-    Mechanism,
-    Parameters,
-    Program,
-    body_rates,
-    coordinates,
-    parameters,
-    particle,
-    paths,
-    rigid_body,
-)
-from servoctl.study.cases import grid, monte_carlo
-from servoctl.study.close_many import Batch, close_many
-from servoctl.study.load import load_study
-from servoctl.study.stability_map import StabilityMap, stability
-from servoctl.study.sweep import merge, sweep
-from servoctl.study.table import Study
-from servoctl.study.tradeoff import TradeOff, tradeoff
-from servoctl.verification import Verification, verify
+from importlib import import_module
+
 from servoctl.version import __version__ as __version__
 
-__all__ = [
-    "Adaptive",
-    "Algebraic",
-    "Batch",
-    "Bounded",
-    "Closed",
-    "Controller",
-    "Coordinates",
-    "Event",
-    "Identification",
-    "InconsistentStart",
-    "IntegrationStopped",
-    "InternalDynamics",
-    "Law",
-    "LimitExceeded",
-    "LimitReport",
-    "Mechanism",
-    "MinimalCoordinates",
-    "MinimumPhase",
-    "Model",
-    "NameUnknown",
-    "NotRealisable",
-    "Parameters",
-    "Plant",
-    "Poles",
-    "Program",
-    "Project",
-    "RadauIIA",
-    "Report",
-    "Run",
-    "RungeKutta",
-    "Sensitivity",
-    "Sensors",
-    "ServoError",
-    "SingularProgram",
-    "SpecificationError",
-    "StabilityMap",
-    "Study",
-    "Sundials",
-    "Taylor",
-    "TimeLaw",
-    "Timing",
-    "TradeOff",
-    "UnstableInternalDynamics",
-    "Verification",
-    "body_rates",
-    "close",
-    "close_many",
-    "computed",
-    "coordinates",
-    "derive",
-    "disturbances",
-    "export_c",
-    "fastest",
-    "feedforward",
-    "figures",
-    "grid",
-    "identify",
-    "internal_dynamics",
-    "interop",
-    "inverse",
-    "limit_report",
-    "limited",
-    "load",
-    "load_study",
-    "lqr",
-    "merge",
-    "minimum_phase",
-    "monte_carlo",
-    "output_feedback",
-    "parameters",
-    "particle",
-    "paths",
-    "pd",
-    "plant",
-    "plots",
-    "relaxed",
-    "report",
-    "rigid_body",
-    "sampled_bound",
-    "sensitivity",
-    "simulate",
-    "spec",
-    "stability",
-    "sweep",
-    "tradeoff",
-    "verify",
-]
+HOMES = {  # of each public name: the module that defines it, or that it is; imported when the name is used
+    "Adaptive": "methods.choice",
+    "Algebraic": "methods.choice",
+    "Batch": "study.close_many",
+    "Bounded": "methods.choice",
+    "Closed": "control.result",
+    "Controller": "control.law",
+    "Coordinates": "spec.coordinates",
+    "Design": "inversion.design",
+    "Event": "methods.events",
+    "Identification": "sensitivities.identification",
+    "InconsistentStart": "errors",
+    "IntegrationStopped": "errors",
+    "InternalDynamics": "growth",
+    "Law": "control.law",
+    "LimitExceeded": "errors",
+    "LimitReport": "control.limits",
+    "Mechanism": "spec.mechanism",
+    "MinimalCoordinates": "methods.choice",
+    "MinimumPhase": "inversion.output",
+    "Model": "model.model",
+    "NameUnknown": "errors",
+    "NotRealisable": "errors",
+    "Parameters": "spec.parameters",
+    "Plant": "plants.plant",
+    "Poles": "methods.choice",
+    "Program": "spec.program",
+    "Project": "methods.choice",
+    "RadauIIA": "methods.choice",
+    "Report": "inversion.report",
+    "Run": "run",
+    "RungeKutta": "methods.choice",
+    "Sensitivity": "sensitivities.sensitivity",
+    "Sensors": "control.conditions",
+    "ServoError": "errors",
+    "SingularProgram": "errors",
+    "SpecificationError": "errors",
+    "StabilityMap": "study.stability_map",
+    "Study": "study.table",
+    "Sundials": "methods.choice",
+    "Taylor": "methods.choice",
+    "TimeLaw": "control.time_law",
+    "Timing": "control.conditions",
+    "TradeOff": "study.tradeoff",
+    "UnstableInternalDynamics": "errors",
+    "Verification": "verification",
+    "body_rates": "spec.bodies",
+    "close": "control.close",
+    "close_many": "study.close_many",
+    "computed": "control.inverse_dynamics",
+    "coordinates": "spec.coordinates",
+    "derive": "model.model",
+    "design": "inversion.design",
+    "disturbances": "control.disturbances",
+    "export_c": "export.c",
+    "fastest": "control.time_law",
+    "feedforward": "control.feedforward",
+    "figures": "figures",
+    "grid": "study.cases",
+    "identify": "sensitivities.identification",
+    "internal_dynamics": "growth",
+    "interop": "interop",
+    "inverse": "inversion.choice",
+    "limit_report": "control.limits",
+    "limited": "control.limits",
+    "load": "run",
+    "load_study": "study.load",
+    "lqr": "control.lqr",
+    "merge": "study.sweep",
+    "minimum_phase": "inversion.output",
+    "monte_carlo": "study.cases",
+    "output_feedback": "control.observer",
+    "parameters": "spec.parameters",
+    "particle": "spec.bodies",
+    "paths": "spec.paths",
+    "pd": "control.pd",
+    "plant": "plants.plant",
+    "plots": "figures",
+    "relaxed": "inversion.relaxed",
+    "report": "inversion.report",
+    "rigid_body": "spec.bodies",
+    "sampled_bound": "methods.stability",
+    "sensitivity": "sensitivities.sensitivity",
+    "simulate": "simulation",
+    "spec": "spec",
+    "stability": "study.stability_map",
+    "sweep": "study.sweep",
+    "tradeoff": "study.tradeoff",
+    "verify": "verification",
+}
+__all__ = sorted(HOMES)
+
+
+def __getattr__(name):
+    if name not in HOMES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    module = import_module(f"{__name__}.{HOMES[name]}")
+    globals()[name] = value = getattr(module, name, module)
+    return value
+
+
+def __dir__():
+    return sorted({*globals(), *HOMES})

@@ -142,10 +142,15 @@ class Run(ByName, Value):
             groups = self._groups
             rate, base = (0, name) if name in groups else _split(name)
             if base not in groups:
-                raise unknown(name, self.names, "signal")
+                raise self._no_signal(name)
             names, values = self.signals(groups[base], rate)
             self.stored.update(zip(names, values, strict=True))
         return self.stored[name]
+
+    def _no_signal(self, name):
+        if self.model is None:
+            return unknown(name, self.names, "signal")
+        return self.model.reduction.mechanism.no("signal", name, self.names)
 
     def signals(self, kind, rate=0):
         """Names and (n, N) values of one of the model's groups of signals, or of their time derivatives.
@@ -185,7 +190,7 @@ class Run(ByName, Value):
                     jets=needed,
                 )
             parts.append(f.grid(self.t[first:end], jets, model.parameters))
-        return names, np.concatenate(parts, axis=1)
+        return names, parts[0] if len(parts) == 1 else np.concatenate(parts, axis=1)
 
     def variant(self, i: int):
         """The variant of the model that holds at sample i."""

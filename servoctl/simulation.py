@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 
 from servoctl.checks import as_numbers, as_span
 from servoctl.errors import InconsistentStart, ServoError, SpecificationError
-from servoctl.internal_dynamics import FEWEST, STEP_ERROR, UNSTABLE, growth_bound, internal_dynamics
+from servoctl.growth import FEWEST, STEP_ERROR, UNSTABLE, growth_bound, internal_dynamics
 from servoctl.methods.accuracy import ATOL, absolute_tolerances, accurate, large_tolerances
 from servoctl.methods.algebraic import algebraic
 from servoctl.methods.bounded import bounded
@@ -457,7 +457,9 @@ def _sample_times(t0, t1, t_eval, knots, method=None):
     if t_eval is None:
         times = np.union1d(np.linspace(t0, t1, DEFAULT_SAMPLES), [k for k in knots if min(t0, t1) < k < max(t0, t1)])
     else:
-        times = np.unique(as_numbers(t_eval))
+        times = as_numbers(t_eval)
+        if times.ndim != 1 or not np.all(times[1:] > times[:-1]):
+            times = np.unique(times)
         if not np.all(np.isfinite(times)):
             raise SpecificationError(
                 f"t_eval={repr(t_eval)[:150]} was given.", "It is a sequence of finite times [s].", t_eval=t_eval

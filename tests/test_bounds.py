@@ -214,7 +214,7 @@ def test_steps_over_a_singularity_end_there():
         actuators={"pull": x},
         constraints={"circle": x**2 + y**2 - 1.0},
     )
-    model = sv.derive(mechanism, sv.Program({"path": x - q.t}), guess={"y": -1.0})
+    model = sv.derive(mechanism, sv.Program({"path": x - q.t}), guess={"y": -1.0}, keep=["s"])
     start = model.start(s=0.0, ds=1.0, guess={"y": -1.0})
     for drift in (None, 0.5, "project"):
         with refused(sv.SingularProgram, rows=["path", "circle"]) as caught:

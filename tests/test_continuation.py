@@ -12,6 +12,7 @@ import servoctl as sv
 from servoctl.codegen import loops
 from servoctl.codegen.function import compiled
 from servoctl.gallery import gallery
+from servoctl.jets.branches import Branches
 
 TIP = {  # paths of the tip of an arm with two links of length 1
     "spiral": lambda t: (1.5 * ca.cos(np.pi * t), 1.5 * (1 + 0.1 * t) * ca.sin(np.pi * t)),
@@ -187,3 +188,24 @@ def test_a_short_path_in_a_long_span_is_followed(gallery_model):
     expected = sv.simulate(model, model.start(guess=scene.guess), (0.0, 7.0), t_eval=times)
     run = sv.simulate(model, model.start(guess=scene.guess), (0.0, 1e9), t_eval=[*times, 1e9])
     assert run.jets[:, :-1] == pytest.approx(expected.jets, abs=1e-10) and run["x"][-1] == pytest.approx(5.0, abs=1e-12)
+
+
+def test_a_second_plan_does_not_look_for_switches_again(monkeypatch):
+    model = sv.derive(*gallery["overhead-crane"].build())
+    looked, smooth = [], Branches.smooth
+    monkeypatch.setattr(Branches, "smooth", lambda *given, **rest: looked.append(1) or smooth(*given, **rest))
+    monkeypatch.setattr(model._store, "recall", lambda name, build: build())
+    for changed in (model, model, model.with_parameters(m_load=120.0)):
+        sv.simulate(changed, changed.start(guess={"l": 4.0}), (0.0, 1.0), t_eval=[0.0, 1.0], progress=False)
+    assert len(looked) == 1
+
+
+def test_the_forces_of_many_instants_are_compiled_with_the_same_bits(c_compiler):
+    model = sv.derive(*gallery["overhead-crane"].build())
+    start, t = model.start(guess={"l": 4.0}), np.linspace(0.0, 8.0, 3001)
+    few = sv.simulate(model, start, (0.0, 8.0), t_eval=t[::10], progress=False)["trolley"]
+    assert model.signals("actuation")[1].backend == "casadi"
+    first, again = (sv.simulate(model, start, (0.0, 8.0), t_eval=t, progress=False)["trolley"] for _ in range(2))
+    assert model.signals("actuation")[1].backend == "c"
+    np.testing.assert_array_equal(again, first)
+    np.testing.assert_allclose(first[::10], few, rtol=0, atol=1e-12 * np.abs(few).max())

@@ -103,6 +103,15 @@ def test_quaternion(numbers):
     assert result["unit error"] < 1e-14
 
 
+def test_designed_arm(numbers):
+    """Both torques are at a limit."""
+    result = numbers("designed_arm")
+    assert result["designed [s]"] == pytest.approx(0.718014, abs=1e-5)
+    assert (result["via x [m]"], result["via y [m]"]) == pytest.approx((0.44518, 0.62279), abs=1e-4)
+    assert 45.0 * (1 - 1e-5) < result["shoulder [N m]"] <= 45.0 and 5.0 * (1 - 1e-5) < result["elbow [N m]"] <= 5.0
+    assert result["gain"] < 1e-4
+
+
 # closed loops ----------------------------------------------------------------------------------------------------------
 
 LOST = 15.0 * 9.81  # N: the weight that the crane's laws do not know of

@@ -16,7 +16,7 @@ from scipy.integrate import solve_ivp
 import servoctl as sv
 from servoctl import simulation
 from servoctl.gallery import cars, gallery, mass_on_car, passive_arm, spiral, vtol
-from servoctl.internal_dynamics import growth_bound
+from servoctl.growth import growth_bound
 
 
 def internal(pair, span, start, **guess):

@@ -211,7 +211,7 @@ def two_masses(stiffness):
         parameters=p,
     )
     program = sv.Program({"X": x - sv.paths.rest_to_rest(q.t, 0.0, 1.0, duration=1.0, smoothness=3)})
-    model = sv.derive(mechanism, program)
+    model = sv.derive(mechanism, program, keep=["y"])
     return sv.simulate(model, model.start(y=0.0, dy=0.0), (0.0, 1.0)), sv.plant(mechanism)
 
 

@@ -14,7 +14,7 @@ from servoctl.errors import NameUnknown, SpecificationError
 from servoctl.spec import paths
 from servoctl.spec.coordinates import coordinates
 
-T = ca.SX.sym("t")
+T, P = ca.SX.sym("t"), ca.SX.sym("p")
 S9 = {5: 126, 6: -420, 7: 540, 8: -315, 9: 70}
 S13 = {7: 1716, 8: -9009, 9: 20020, 10: -24024, 11: 16380, 12: -6006, 13: 924}
 
@@ -189,6 +189,22 @@ def test_spline_takes_a_derivative_by_taylor_arithmetic_as_by_jacobians():
         assert abs(float(by_series(t)) - by_jacobians(t)[3, 0, 0]) < 1e-10
 
 
+@pytest.mark.parametrize("ends", ["rest", "natural"])
+@pytest.mark.parametrize("smoothness, most", [(0, 1e-13), (2, 1e-12), (4, 1e-9), (6, 1e-6)])
+def test_a_spline_through_parameters_is_that_through_their_numbers(ends, smoothness, most):
+    """Via points, times, or both as symbols: the same values and derivatives up to the class."""
+    grid = np.linspace(0.2, 7.3, 43)
+    expected = derivatives(paths.spline(T, TIMES, POINTS, smoothness, ends), smoothness)(grid)
+    times, points = ca.SX.sym("times", len(TIMES)), ca.SX.sym("points", *POINTS.shape)
+    symbols, numbers = ca.veccat(times, points), np.concatenate([TIMES, np.ravel(POINTS, order="F")])
+    rows = [points[i, :].T for i in range(len(TIMES))]
+    nested = [points[i, :].elements() for i in range(len(TIMES))]
+    for a, b in ((TIMES, points), (TIMES, rows), (times, POINTS), (times.elements(), nested)):
+        path = ca.substitute(paths.spline(T, a, b, smoothness, ends), symbols, ca.DM(numbers))
+        miss = np.abs(derivatives(path, smoothness)(grid) - expected).max(axis=(1, 2))
+        assert np.all(miss <= most * np.abs(expected).max(axis=(1, 2)))
+
+
 @pytest.mark.parametrize(
     ("make", "facts"),
     [
@@ -217,8 +233,15 @@ def test_spline_takes_a_derivative_by_taylor_arithmetic_as_by_jacobians():
         (lambda: paths.spline(T, [0, 1, 2], [0, 1]), ["(3,)", "(2,)", "one point for each"]),
         (lambda: paths.spline(T, [0], [1]), ["(1,)", "at least two"]),
         (lambda: paths.spline(T, [0, 1], [0, np.nan]), ["finite numbers"]),
-        (lambda: paths.spline(T, [0, 1], [0, T]), ["finite numbers", "For expressions"]),
+        (lambda: paths.spline(T, [0, 1], [0, T]), ["points contain t", "rest_to_rest"]),
         (lambda: paths.spline(T, [0, 1], [[0, 1], [2]]), ["finite numbers"]),
+        (lambda: paths.spline(T, [0, T], [0, 1]), ["times contain t"]),
+        (lambda: paths.spline(T, [0, P, 1], [[0, 1], [P, 2], [3]]), ["points[2] has 1"]),
+        (lambda: paths.spline(T, [0, P], [0, P, 1]), ["(2,)", "(3,)", "one point for each"]),
+        (lambda: paths.spline(T, [0, P, P, 2], [0, 1, 2, 3]), ["times 1 and 2", "increase strictly"]),
+        (lambda: paths.spline(T, [0, P], [0, 1], 7), ["smoothness=7", "at most 6", "smoothness=6"]),
+        (lambda: paths.spline(T, [0, 1], [0, ca.MX.sym("p")]), ["finite numbers"]),
+        (lambda: paths.spline(T, [0, 1], [P, P / 0]), ["NaN or infinity"]),
         (lambda: paths.spline(T, [0, 1, 2], [0, 1, 0], 6, "natural"), ["3 points", "4 points", "smoothness=4"]),
         (lambda: paths.spline(T, [0, 1e-5, 1], [0, 1, 0], 4), ["degree 9 misses", "1e+05 times its shortest"]),
         (lambda: paths.spline(T, [0, 1e-300, 1], [0, 1, 0], 4), ["degree 9 misses"]),

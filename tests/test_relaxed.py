@@ -14,7 +14,7 @@ import servoctl as sv
 from servoctl.control.reference import resampled
 from servoctl.errors import InconsistentStart, IntegrationStopped, LimitExceeded, NameUnknown, SpecificationError
 from servoctl.gallery import overhead_crane
-from servoctl.inversion.relaxed import DEFECT, FACTOR, FIRST, Task
+from servoctl.inversion.relaxed import DEFECT, FACTOR, FIRST, Relaxation
 from servoctl.inversion.transcription import IPOPT, LONGEST, WATCHED, Mesh, Transcription, bernstein
 from servoctl.run import load
 
@@ -345,8 +345,8 @@ def test_the_plant_follows_the_plan(scene):
 def test_stiff_machines_are_solved_in_a_few_iterations():
     """Eight segments, the first solution, with modes of 650 rad/s in intervals of 0.09 s."""
     mechanism, program = flexible_link(8)
-    task = Task(sv.plant(mechanism), program, (0.0, 2.2), ({}, {}), None, None, "rest")
-    plan = task._solved(task._first(task._mesh()), [FIRST * task._usual_weights()])
+    relaxation = Relaxation(sv.plant(mechanism), program, (0.0, 2.2), ({}, {}), None, None, "rest")
+    plan = relaxation._solved(relaxation._first(relaxation._mesh()), [FIRST * relaxation._usual_weights()])
     assert plan.iterations[0] <= 5
 
 

@@ -236,6 +236,12 @@ STIFF = np.array([[0.0, 1.0], [-1e9, -1.0]])
         (np.array([[0.0, 1e7], [-1e-7, -1e-7]]), np.array([1e7, 1.0]), 0),
         (np.diag([1.0, -1e-8]), 1.0, 0),
         (STIFF, 1.0, 0),
+        (np.diag([-1e6, -1e-5]), 1.0, 0),
+        (np.array([[0.0, 1.0], [-10.0, -1e6]]), 1.0, 0),
+        (np.array([[0.0, 1.0], [1.0, -1e6]]), 1.0, 0),
+        (np.array([[0.0, 1.0], [0.0, -1e9]]), 1.0, 1),
+        (np.diag([-1e6, -1e-9]), 1.0, 1),  # 1e-15 of the fastest: the rounding of zero
+        (np.diag([-0.01, -0.01]) + np.eye(2, k=1), 1.0, 0),
     ],
 )
 def test_eigenvalues_on_the_axis(A, size, count):
@@ -409,6 +415,24 @@ SMOOTH_THERE = {
 
 
 @pytest.mark.parametrize("name", KINKS)
+def test_a_run_that_stays_on_a_kink_is_inconclusive(name):
+    """At rest on a kink CasADi's slope is that of one side."""
+    model = sv.derive(*beside(KINKS[name], ca.SX(0)))
+    run = sv.simulate(model, model.start(), (0.0, 3.0))
+    assert run.internal["verdict"] == "inconclusive" and "stays on a switch" in run.internal["text"]
+    mechanism, program = beside(KINKS[name], ca.SX(0))
+    with refused(sv.UnstableInternalDynamics, "switch", verdict="inconclusive"):
+        sv.computed(run, sv.plant(mechanism), rate=100.0)
+
+
+@pytest.mark.parametrize("name", SMOOTH_THERE)
+def test_a_run_that_stays_beside_kinks_is_judged(name):
+    model = sv.derive(*beside(SMOOTH_THERE[name][0], ca.SX(0)))
+    run = sv.simulate(model, model.start(), (0.0, 20.0))
+    assert run.internal["verdict"] == ("neutral" if name == "drag" else "stable")
+
+
+@pytest.mark.parametrize("name", KINKS)
 def test_a_rest_on_a_kink_has_no_eigenvalues(name):
     found = verdict(sv.derive(*beside(KINKS[name])))
     assert found.word == "inconclusive" and not found.rest
@@ -479,7 +503,8 @@ def on_coordinates(q):
 @pytest.mark.parametrize("gravity", [9.81, -9.81])
 def test_the_constant_of_a_rolling_constraint_is_named(gravity):
     written, integrated = verdict(ballbot(on_velocities, gravity)), verdict(ballbot(on_coordinates, gravity))
-    assert written.word == "marginal" and "0 is the constant of roll" in written.reason and "coordinates" in written.do
+    assert written.word == ("marginal" if gravity < 0 else "non-minimum phase")
+    assert "0 is the constant of roll" in written.reason and "coordinates" in written.do
     assert integrated.word == ("marginal" if gravity < 0 else "non-minimum phase (hyperbolic)")
     assert "constant" not in integrated.reason
     others = [z for z in written.rest["start"].eigenvalues if abs(z) > 1e-6]

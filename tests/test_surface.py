@@ -2,9 +2,11 @@
 
 import ast
 import inspect
+import os
 import re
 import subprocess
 import sys
+from importlib import import_module
 from pathlib import Path
 from types import ModuleType
 
@@ -20,10 +22,11 @@ ENTRIES = ("__init__.py", "__main__.py")  # of the package itself: they gather t
 
 LAYERS = (
     "version", "errors", "values", "tolerances", "checks", "archive", "progress", "jets", "spec", "reduction", "codegen",
-    "model", "plants", "run", "methods", "internal_dynamics", "simulation", "figures", "control", "verification",
+    "model", "plants", "run", "methods", "growth", "simulation", "figures", "control", "verification",
     "sensitivities", "study", "inversion", "interop", "export", "gallery", "shell",
 )  # fmt: skip
 WITHOUT_CASADI = ("study", "figures", "interop", "shell")
+SWEEPS = ("concurrent.futures", "multiprocessing", "importlib.metadata")
 LATE = ("scipy", "matplotlib", "control", "tqdm", "xarray", "dask")
 MOST_IN_A_FUNCTION, MOST_PARAMETERS, MOST_MODULES_OF_A_NAME, MOST_IN_A_REPR = 40, 8, 2, 12
 SHEETS = ("Mechanism.__init__", "simulate")  # filled in by keyword
@@ -60,6 +63,26 @@ layered = pytest.mark.parametrize("path", [f for f in FILES if relative(f) not i
 def test_public_names_exist_once_and_in_order():
     assert sv.__all__ == sorted(set(sv.__all__))
     assert all(hasattr(sv, name) for name in sv.__all__)
+    assert set(sv.__all__) <= set(dir(sv))
+    with pytest.raises(AttributeError, match="'servoctl' has no attribute 'dervie'"):
+        sv.dervie  # noqa: B018
+
+
+def test_type_checkers_see_the_public_names():
+    """The stub, executed, binds the objects that the package gives on use, and no others."""
+    seen = {}
+    exec(PACKAGE.joinpath("__init__.pyi").read_text(), seen)
+    public = {name: thing for name, thing in seen.items() if name not in ("__builtins__", "__doc__")}
+    assert set(public) == {*sv.__all__, "__version__"}
+    assert [name for name, thing in public.items() if getattr(sv, name) is not thing] == []
+
+
+def test_importing_a_module_hides_no_public_name():
+    """Importing servoctl.x sets the attribute x of the package, in place of a function of that name."""
+    for package in (sv, import_module("servoctl.gallery")):
+        modules = {path.stem for path in Path(package.__file__).parent.iterdir()}
+        named = {name for name in package.__all__ if not isinstance(getattr(package, name), ModuleType)}
+        assert modules & named == set()
 
 
 def public():
@@ -209,10 +232,49 @@ def test_optional_and_heavy_packages_are_imported_where_they_are_used(path):
     assert not {name.split(".")[0] for name in names} & set(LATE)
 
 
-def test_importing_servoctl_loads_no_heavy_package():
-    program = f"import sys, servoctl; print([name for name in {LATE!r} if name in sys.modules])"
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, cwd=PACKAGE.parent)
-    assert (done.stdout.strip(), done.returncode) == ("[]", 0)
+def loaded(script, names, **environment):
+    """Those of some modules that a new process has imported after a script."""
+    program = f"{script}\nimport sys\nprint([name for name in {names!r} if name in sys.modules], file=sys.stderr)"
+    command, environment = [sys.executable, "-c", program], {**os.environ, **environment}
+    done = subprocess.run(command, capture_output=True, text=True, cwd=PACKAGE.parent, env=environment)
+    assert done.returncode == 0, done.stderr
+    return ast.literal_eval(done.stderr.splitlines()[-1])
+
+
+LIGHT = """
+from servoctl.shell.main import main
+try:
+    main([%r])
+except SystemExit:
+    pass
+"""
+
+
+@pytest.mark.parametrize("script", ["import servoctl", LIGHT % "list", LIGHT % "--version", LIGHT % "--help"])
+def test_what_needs_no_equations_imports_no_numpy(script):
+    own = [module_name(path) for path in FILES if layer(path) in LAYERS and layer(path) not in ("gallery", "shell")]
+    assert set(loaded(script, ("numpy", "casadi", *LATE, *SWEEPS, *own))) <= {"servoctl.errors", "servoctl.version"}
+
+
+def test_public_names_load_no_heavy_package():
+    assert loaded("import servoctl\nfor name in servoctl.__all__: getattr(servoctl, name)", LATE) == []
+
+
+def test_a_plan_loads_what_it_needs(tmp_path):
+    """A determined motion is continued by Newton's iteration: neither SciPy nor what laws and sweeps need."""
+    script = """
+import servoctl as sv
+from servoctl.gallery import gallery
+scene = gallery["overhead-crane"]
+model = sv.derive(*scene.build())
+run = sv.simulate(model, model.start(guess=scene.guess), scene.t_span)
+run["trolley"]
+print(model)
+"""
+    laws = [module_name(path) for path in FILES if layer(path) in ("control", "study", "inversion", "figures", "interop")]
+    kept = {"SERVOCTL_MEMO": "", "SERVOCTL_CACHE": str(tmp_path)}
+    loaded(script, (), **kept)  # derives
+    assert loaded(script, (*LATE, *SWEEPS, *laws), **kept) == []
 
 
 # sizes ---------------------------------------------------------------------------------------------------------------

@@ -35,7 +35,7 @@ def beside(force=lambda t, y, dy: 0.0, potential=lambda y: 0.0, **start):
         actuators={"F": q.jet(0)[0]},
         forces={"y": force(q.t, y, dy)},
     )
-    model = sv.derive(mechanism, sv.Program({"x": q.jet(0)[0] - ca.sin(q.t)}))
+    model = sv.derive(mechanism, sv.Program({"x": q.jet(0)[0] - ca.sin(q.t)}), keep=q.names)
     return model, model.start(**start)
 
 
@@ -44,7 +44,9 @@ def ideal(residual, **start):
     q = sv.coordinates("x y")
     ddx, ddy = q.d(2)
     model = sv.derive(
-        sv.Mechanism(q, gibbs=(ddx**2 + ddy**2) / 2), sv.Program({"p": residual(q.t, *q, *q.d(1))}, by="ideal")
+        sv.Mechanism(q, gibbs=(ddx**2 + ddy**2) / 2),
+        sv.Program({"p": residual(q.t, *q, *q.d(1))}, by="ideal"),
+        keep=q.names,
     )
     return model, model.start(**start)
 
@@ -409,7 +411,7 @@ def test_a_grazing_contact_is_found(method):
     x, y = q
     S = (q.d(2)[0] ** 2 + q.d(2)[1] ** 2) / 2
     mechanism = sv.Mechanism(q, gibbs=S, potential=y, forces={"y": -1e4 * ca.fmax(y - 0.4999, 0)}, actuators={"F": x})
-    model = sv.derive(mechanism, sv.Program({"x": x - q.t}))
+    model = sv.derive(mechanism, sv.Program({"x": x - q.t}), keep=q.names)
     run = sv.simulate(model, model.start(y=0.0, dy=1.0), (0.0, 2.0), method, t_eval=[0.0, 1.0, 2.0])
     from scipy.integrate import solve_ivp
 
@@ -447,7 +449,7 @@ def pushed(force, y, dy):
     x, y_ = q
     gibbs = ca.sumsqr(ca.vertcat(*q.d(2))) / 2
     mechanism = sv.Mechanism(q, gibbs=gibbs, forces={"y": force(q.t, x, y_)}, actuators={"F": x})
-    model = sv.derive(mechanism, sv.Program({"x": x - q.t}))
+    model = sv.derive(mechanism, sv.Program({"x": x - q.t}), keep=q.names)
     return model, model.start(y=y, dy=dy)
 
 

@@ -1,5 +1,6 @@
 """Verdicts: what is right passes, what is wrong fails or is refused, what cannot be followed is inconclusive."""
 
+import importlib
 import pickle
 from dataclasses import replace
 
@@ -9,9 +10,12 @@ import pytest
 from refusals import refused
 
 import servoctl as sv
+from servoctl.codegen.function import Compiled
 from servoctl.gallery import gallery
 from servoctl.methods.choice import as_method
+from servoctl.verification import between as intervals
 
+checks = importlib.import_module("servoctl.verification.verify")
 CHANGE = 1.001
 
 
@@ -353,8 +357,8 @@ def test_changed_signals_of_a_closed_loop_fail(what, plan):
 
 
 def test_what_cannot_be_followed_is_inconclusive(c_compiler):
-    model, start, span = chain(1e13, by="ideal")
-    run = sv.simulate(model, start, span, as_method("RadauIIA"), t_eval=[0.0, 1.0, 2.0])
+    model, start, _ = chain(1e13, by="ideal")
+    run = sv.simulate(model, start, (0.0, 0.02), as_method("RadauIIA"), t_eval=[0.0, 0.01, 0.02])
     proof = sv.verify(model, run)
     assert (proof.verdict, proof.passed, proof.failures) == ("inconclusive", False, ())
     assert "t_eval" in proof.doubts[0] and "Verification: inconclusive" in repr(proof)
@@ -419,3 +423,45 @@ def test_wrong_forces_at_narrow_peaks_fail(samples):
     jets = run.jets.copy()
     jets[0, samples // 2 :] += 1e-4
     assert sv.verify(model, replace(run, jets=jets)).verdict == "failed"
+
+
+@pytest.mark.parametrize("name", ["overhead-crane", "appell-hamel", "spiral"])
+@pytest.mark.parametrize("change", [0.0, 1e-13, 1e-10, 1e-7, 3e-6])
+def test_sizes_at_some_instants_give_the_same_verdict(name, change, gallery_model, monkeypatch):
+    model, scene = gallery_model(name), gallery[name]
+    run = sv.simulate(model, model.start(**scene.start, guess=scene.guess), scene.t_span, "Taylor" if name == "spiral" else None)
+    jets = run.jets.copy()
+    jets[0, 507] += change * np.abs(jets[0]).max()  # between the instants whose sizes are known
+    run = edited(run, jets=jets)
+    some = sv.verify(model, run)
+    monkeypatch.setattr(checks, "FEW_SIZES", 10**6)
+    every = sv.verify(model, run)
+    assert (some.verdict, some.failures) == (every.verdict, every.failures)
+    assert every.failures or change < 1e-6
+    for key, number in every.numbers.items():
+        assert number / 30 <= some.numbers[key] <= 30 * number + 1e-30, key
+
+
+def test_what_is_clear_is_evaluated_once_or_twice_at_a_sample(gallery_model, monkeypatch):
+    model, scene = gallery_model("overhead-crane"), gallery["overhead-crane"]
+    run = sv.simulate(model, model.start(guess=scene.guess), scene.t_span)
+    sv.verify(model, run)
+    points, grid = {}, Compiled.grid
+
+    def counted(f, t, x, p):
+        points[f.name] = points.get(f.name, 0) + np.shape(x)[-1]
+        return grid(f, t, x, p)
+
+    monkeypatch.setattr(Compiled, "grid", counted)
+    assert sv.verify(model, run).passed
+    for name in ("residuals", "plant", "multiplier_form", "all_multipliers", "power", "energy"):
+        assert points[name] <= 2 * len(run.t), points
+
+
+def test_many_variants_of_one_model_are_followed_together(gallery_model, monkeypatch):
+    model, scene = gallery_model("overhead-crane"), gallery["overhead-crane"]
+    run = sv.simulate(model, model.start(guess=scene.guess), scene.t_span)
+    cut = edited(run, variants=tuple((k, k + 13, model) for k in range(0, 1001, 13)))
+    seen, integrate = [], intervals._integrate
+    monkeypatch.setattr(intervals, "_integrate", lambda flow, *rest: seen.append(flow) or integrate(flow, *rest))
+    assert sv.verify(model, cut).passed and len(seen) <= 4

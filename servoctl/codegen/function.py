@@ -17,7 +17,7 @@ from servoctl.codegen.loops import LOOPS
 from servoctl.codegen.native import Library
 from servoctl.errors import SpecificationError, unknown
 
-GRID_POINTS = 20_000  # CasADi takes some 0.3 us per point: a longer grid takes as long as compiling it
+GRID_POINTS = 2_500  # three longer grids take CasADi as long as writing and loading a library, 50 as compiling it
 FULLY_OPTIMISED = 6_000  # operations: up to here -O3 takes at most 1.5 s; with -O1 15,000 take no longer
 TAYLOR_COMPILED = 15_000  # operations: beyond, compiling takes as long as 50,000 steps that CasADi evaluates
 

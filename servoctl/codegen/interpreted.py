@@ -43,6 +43,15 @@ class Workspace(threading.local):
         return self._log
 
 
+class Blocks(threading.local):
+    """Memory of one thread for the t, x, p and y of a block, and the call without arguments that fills y."""
+
+    def __init__(self, block, sizes):
+        parts = [np.zeros((BLOCK, size)) for size in sizes]
+        run, self._alive = connected(block, parts)
+        self.parts = parts, run
+
+
 def connected(f, parts):
     """The call of a CasADi function on arrays t, x, p, y, and the buffer that must live as long as the call."""
     with _guard:
@@ -76,20 +85,26 @@ class Interpreter:
 
     def grid(self, t, x, p, y):
         """Fill y (n_y, N) with the outputs at t (N,) and the columns of x, and of p if that is a matrix."""
-        whole = t.size - t.size % BLOCK
-        parts = [np.empty((BLOCK, size)) for size in (1, self._n_x, self._f.numel_in(2), len(y))]
-        if whole:
+        left = t.size % BLOCK
+        blocks = t.size - left * (2 * left < BLOCK)  # a block that is half full is faster than its points
+        if t.size < BLOCK and "_blocks" not in vars(self):  # which takes longer to make than to do without; same bits
+            blocks = 0
+        if blocks:
+            parts, run = self._blocks.parts
             parts[2][:] = 0.0 if p.ndim == 2 else p
-            run, alive = connected(self._block, parts)  # the buffer lives as long as its name
-        for k in range(0, whole, BLOCK):
-            here = slice(k, k + BLOCK)
-            parts[0][:, 0], parts[1][:] = t[here], x[:, here].T
+        for k in range(0, blocks, BLOCK):
+            here, size = slice(k, k + BLOCK), min(BLOCK, t.size - k)
+            parts[0][:size, 0], parts[1][:size] = t[here], x[:, here].T
             if p.ndim == 2:
-                parts[2][:] = p[:, here].T
+                parts[2][:size] = p[:, here].T
             run()
-            y[:, here] = parts[3].T
-        for k in range(whole, t.size):
+            y[:, here] = parts[3][:size].T
+        for k in range(blocks, t.size):
             y[:, k] = self._value(t[k], x[:, k], p[:, k] if p.ndim == 2 else p)
+
+    @functools.cached_property
+    def _blocks(self):
+        return Blocks(self._block, (1, self._n_x, self._f.numel_in(2), self._f.numel_out(0)))
 
     @functools.cached_property
     def _block(self):

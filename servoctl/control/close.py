@@ -11,7 +11,7 @@ from servoctl.checks import as_span, require_memory, whole_multiple
 from servoctl.control.conditions import Conditions, Sensors, Timing, index, limits, require_few_steps, steps
 from servoctl.control.law import Law, UserStep
 from servoctl.control.loop import FINISHED, INTERRUPTED, LAW_LOST, STATE_LOST, Loop, run_loop
-from servoctl.control.reference import Reference, require_plan, require_plant, resampled
+from servoctl.control.reference import Reference, of_plan, require_plan, require_plant, resampled
 from servoctl.control.result import Closed
 from servoctl.errors import InconsistentStart, IntegrationStopped, ServoError, SpecificationError
 from servoctl.plants.plant import Plant
@@ -72,6 +72,7 @@ def close(
         If the state becomes infinite; `run` is the motion so far.
     """
     require_plant(plant)
+    plant = _of_start(plant, getattr(law, "plan", None) if plan is None else plan, x0)
     t_span, conditions = as_span(t_span, forward=True), Conditions(sensors, timing, disturbance)
     law = _as_law(law, plant, conditions.timing.rate, t_span[0], plan)
     require_names(law, plant)
@@ -81,12 +82,24 @@ def close(
     return _finish(plant, law, law.plan if plan is None else plan, loop, conditions)
 
 
+def _of_start(plant, plan, x0):
+    """The plant without coordinates that play no part in the plan's program, unless the start has them."""
+    part = of_plan(plan, plant)
+    if isinstance(x0, Mapping):
+        return part if set(x0) <= set(part.state_names) else plant
+    size = np.size(getattr(x0, "values", x0))
+    return part if size in (part.n_x - len(part.lag), part.n_x) else plant
+
+
 def _loop(plant, law, x0, t_span, conditions):
     """All numbers of the loop, in tables made beforehand."""
     (t0, t1), sensors, timing, forces = t_span, conditions.sensors, conditions.timing, conditions.disturbance
     samples = whole_multiple((t1 - t0) * law.rate, f"t_span of {t1 - t0:g} s at {law.rate:g} Hz", "samples")
     stored = plant.n_x + len(law.measures) + len(law.state) + law.n_out + len(plant.inputs) + len(sensors.noise)
     require_memory(samples, stored, f"The loop runs for {t1 - t0:g} s at {law.rate:g} Hz")
+    for name in forces:
+        if name not in plant.disturbable:
+            raise plant.mechanism.no("generalised force", name, plant.disturbable)
     first = whole_multiple((t0 - law.t0) * law.rate, f"A start at {t0:g} s of a law from {law.t0:g} s on", "samples")
     low, high, change = limits(plant, law.period)
     initial = _initial_input(law, t0)

@@ -4,7 +4,7 @@ import casadi as ca
 
 from servoctl.control.feedback import law_step
 from servoctl.control.law import Law
-from servoctl.control.reference import Reference
+from servoctl.control.reference import Reference, of_plan
 from servoctl.plants.plant import Plant
 from servoctl.run import Run
 
@@ -28,6 +28,7 @@ def feedforward(plan: Run, plant: Plant, rate: float = 100.0) -> Law:
     -------
     Law
     """
+    plant = of_plan(plan, plant)
     reference = Reference(plan, plant, rate)
     u_ff = ca.SX.sym("u_ff", len(plant.inputs))
     return Law(

@@ -16,11 +16,11 @@ import numpy as np
 from servoctl.checks import as_complex, is_number, positive, whole
 from servoctl.control.feedback import law_step
 from servoctl.control.law import Law
-from servoctl.control.reference import Reference, refuse_transport, require_plan
+from servoctl.control.reference import Reference, of_plan, refuse_transport, require_plan
 from servoctl.control.residuals import in_symbols_of
 from servoctl.control.sampling import sampled_radii
 from servoctl.errors import NotRealisable, SpecificationError, UnstableInternalDynamics, unknown
-from servoctl.internal_dynamics import internal_dynamics
+from servoctl.growth import internal_dynamics
 from servoctl.jets.tape import Tape, evaluate
 from servoctl.methods.stability import sampled_bound
 from servoctl.plants.plant import Plant
@@ -387,6 +387,7 @@ def computed(
         If a residual depends on no input.
     """
     rate = positive("rate", rate)
+    plant = of_plan(plan, plant)
     require_plan(plan, plant)
     refuse_transport(plant, "The linearisation is")
     delay = whole("delay", delay, most=MOST_DELAY)
@@ -424,9 +425,9 @@ def _require_stable(plan):
     facts = {"verdict": internal.verdict, "growth": internal.growth, "eigenvalue": worst, "states": internal.names}
     if internal.verdict == "inconclusive":
         raise UnstableInternalDynamics(
-            f"The samples of the plan do not resolve whether the internal dynamics of {names} are stable.",
+            f"The internal dynamics of {names} are inconclusive: {internal.cause}.",
             "Exact linearisation makes them unobservable and does not stabilise them.",
-            do="Simulate the plan with more samples (t_eval), or use sv.lqr.",
+            do="Remove this cause, or use sv.lqr.",
             **facts,
         )
     raise UnstableInternalDynamics(

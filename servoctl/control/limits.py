@@ -12,11 +12,12 @@ import numpy as np
 
 from servoctl.checks import ON_SAMPLE, as_list, interval, mapping, named, numbers_by_name, positive
 from servoctl.codegen.function import compiled
+from servoctl.codegen.matrices import riccati
 from servoctl.control.close import require_names
 from servoctl.control.conditions import ranges
 from servoctl.control.law import Law
 from servoctl.control.lqr import Q_POSITION, R_INPUT, steady, tangents
-from servoctl.control.reference import Reference, require_plant
+from servoctl.control.reference import Reference, of_plan, require_plant
 from servoctl.control.residuals import Residuals, in_symbols_of, program_residuals
 from servoctl.control.result import Closed
 from servoctl.control.sampling import discretised
@@ -147,6 +148,7 @@ def limited(
     LimitExceeded
         During the loop, if no inputs satisfy limits and bounds together.
     """
+    plant = of_plan(getattr(law, "plan", None), plant)
     _require_law(law, plant)
     effects, bounds = _bounds(plant, bounds)
     reference = Reference(law.plan, plant, law.rate)
@@ -265,12 +267,7 @@ def _metric(reference, names, weights, at_once):
     Q = np.einsum("nki,k,nkj->nij", C, w, C) + UNSEEN * Q_POSITION * np.eye(plant.n_x)
     R, basis = R_INPUT * np.eye(len(plant.inputs)), tangents(reference)
     _, P = steady(A[-1:], B[-1:], Q[-1], R, None if basis is None else basis[-1:])
-    H = np.empty((len(A), *R.shape))
-    for k in reversed(range(len(A))):
-        PB = P @ B[k]
-        H[k] = R + B[k].T @ PB
-        P = Q[k] + A[k].T @ P @ (A[k] - B[k] @ np.linalg.solve(H[k], PB.T @ A[k]))
-        P = (P + P.T) / 2
+    H = riccati(A[::-1], B[::-1], Q[::-1], R, P)[1][::-1]
     for name, O in at_once.items():
         H += Q_POSITION * weights[names.index(name)] * np.einsum("ni,nj->nij", O, O)
     return H

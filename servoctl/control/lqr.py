@@ -3,25 +3,29 @@
 import contextlib
 from collections.abc import Mapping
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from servoctl.checks import as_numbers, numbers_by_name
+from servoctl.codegen.matrices import riccati
 from servoctl.control.feedback import StateFeedback, affine
 from servoctl.control.law import Law
-from servoctl.control.reference import Reference, refuse_transport
+from servoctl.control.reference import Reference, of_plan, refuse_transport
 from servoctl.control.residuals import Residuals, program_residuals
 from servoctl.control.sampling import discretised, spectral_radii
 from servoctl.errors import ServoError, SpecificationError
 from servoctl.plants.plant import Plant
 from servoctl.run import Run
+from servoctl.values import Deferred
 
 MARGINAL = 1 + 1e-6  # spectral radius up to which a mode that no input reaches neither decays nor grows
 UNREACHED = 1e-7  # product of a mode with the inputs' directions, each of size 1, below which no input reaches it
 NAMED = 0.05  # share of a state in a mode, of the largest, above which an error names it
 COMPARED = 8  # samples along the plan at which a combination of states must be conserved
 DOUBLINGS, CONVERGED = 60, 1e-12  # of the horizon of the Riccati equation; relative change at convergence
+LARGEST_RADIUS, LAST_RADIUS = "largest spectral radius along the plan", "spectral radius at its end"
 Q_POSITION, Q_VELOCITY, R_INPUT, Q_INTEGRAL = 1e3, 1e2, 1e-3, 1e4
 
 
@@ -79,6 +83,7 @@ def lqr(
         raise SpecificationError(
             f"varying={varying!r} was given.", "It is True (along the plan) or False (frozen time).", value=varying
         )
+    plant = of_plan(plan, plant)
     reference = Reference(plan, plant, rate)
     refuse_transport(plant, "The design is")
     Q = weights(Q, _state_weights(plant), plant.state_names, "state", "Q")
@@ -92,17 +97,20 @@ def lqr(
         K = _varying(*augmented, R, basis) if varying else steady(*augmented, R, basis)[0]
     except ServoError as error:
         raise _explained(error, augmented, basis, names, plant, varying) from None
-    radii = spectral_radii(_reduced(augmented[0] - augmented[1] @ K, basis))
     K_x, K_i = np.split(K, [plant.n_x], axis=2)
     integrated = residuals.names if residuals else ()
     how = f"lqr, {'time-varying' if varying else 'frozen-time'}" + (", with integrals" if residuals else "")
-    info = {
-        "largest spectral radius along the plan": float(radii.max()),
-        "spectral radius at its end": float(radii[-1]),
-        "gains": K, "Q": augmented[2], "R": R, "integrated": integrated, "states": plant.state_names,
-    }  # fmt: skip
+    known = {"gains": K, "Q": augmented[2], "R": R, "integrated": integrated, "states": plant.state_names}
+    info = Deferred(known, (LARGEST_RADIUS, LAST_RADIUS), partial(_radii, augmented[:2], K, basis))
     law = affine(how, reference, K_x, K_i, residuals, info)
     return replace(law, feedback=StateFeedback(plant.state_names, integrated, K_x, K_i))
+
+
+def _radii(plant, K, basis):
+    """The largest and the last spectral radius of the sampled error dynamics; an eigenvalue problem at each sample."""
+    A, B = plant
+    radii = spectral_radii(_reduced(A - B @ K, basis))
+    return {LARGEST_RADIUS: float(radii.max()), LAST_RADIUS: float(radii[-1])}
 
 
 def _state_weights(plant):
@@ -261,28 +269,18 @@ def _varying(A, B, Q, R, basis):
 
     If there is none, as for a spin that no input reaches, from a horizon after the end that is as long as the plan.
     """
-    count = len(A)
-    K = np.empty((count, B.shape[2], A.shape[1]))
+    Q = np.broadcast_to(Q, A.shape)
     try:
-        K[-1:], P = steady(A[-1:], B[-1:], Q, R, None if basis is None else basis[-1:])
+        K, P = steady(A[-1:], B[-1:], Q[-1], R, None if basis is None else basis[-1:])
     except ServoError:
-        P = Q
-        for _ in range(count):
-            K[-1], P = _riccati(A[-1], B[-1], Q, R, P)
-        last = _reduced(A[-1:] - B[-1:] @ K[-1:], None if basis is None else basis[-1:])
+        gains, _, P = riccati(np.broadcast_to(A[-1], A.shape), np.broadcast_to(B[-1], B.shape), Q, R, Q[-1])
+        K = gains[-1:]
+        last = _reduced(A[-1:] - B[-1:] @ K, None if basis is None else basis[-1:])
         if not spectral_radii(last)[0] < MARGINAL:
             raise
-    for k in range(count - 2, -1, -1):
-        K[k], P = _riccati(A[k], B[k], Q, R, P)
-    return K
-
-
-def _riccati(A, B, Q, R, P):
-    """The gain of one sample, and P one sample earlier."""
-    PB = P @ B
-    K = np.linalg.solve(R + B.T @ PB, PB.T @ A)
-    P = Q + A.T @ P @ (A - B @ K)
-    return K, (P + P.T) / 2
+    backwards = slice(-2, None, -1)
+    before, _, _ = riccati(A[backwards], B[backwards], Q[backwards], R, P)
+    return np.concatenate([before[::-1], K])
 
 
 def weights(values, default, names, what, symbol, positive=False):

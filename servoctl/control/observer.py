@@ -1,21 +1,25 @@
 """Output feedback: a Kalman filter along the plan estimates the state from some measured entries."""
 
 from collections.abc import Mapping
+from functools import partial
 
 import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
 
 from servoctl.checks import numbers_by_name
+from servoctl.codegen.matrices import riccati
 from servoctl.control.feedback import integral_names, integration, law_step
 from servoctl.control.law import Law
 from servoctl.control.lqr import tangents, weights
-from servoctl.control.reference import Reference, refuse_transport, require_plant
+from servoctl.control.reference import Reference, of_plan, refuse_transport, require_plant
 from servoctl.control.residuals import Residuals
 from servoctl.control.sampling import discretised, spectral_radii
 from servoctl.errors import ServoError, SpecificationError
 from servoctl.plants.plant import Plant
+from servoctl.values import Deferred
 
+FILTER_RADIUS = "spectral radius of the filter"
 POSITION_NOISE, VELOCITY_NOISE = 1e-3, 1.0  # per √s, of coordinates and velocities
 
 
@@ -83,6 +87,7 @@ def output_feedback(
     ServoError
         If a mode that the measured states do not see does not decay.
     """
+    plant = of_plan(getattr(law, "plan", None), plant)
     _require_lqr(law, plant)
     measured, deviations = _deviations(noise, plant)
     reference, gains = Reference(law.plan, plant, law.rate), law.feedback
@@ -93,8 +98,6 @@ def output_feedback(
     where = [plant.state_names.index(name) for name in measured]
     C = np.eye(n_x)[where]
     L = _filter(A, C, W, np.diag(deviations**2), basis)
-    errors = A @ (np.eye(n_x) - L @ C)
-    errors = errors if basis is None else basis.swapaxes(1, 2) @ errors @ basis
     residuals = Residuals(law.plan.model, plant, gains.residuals) if n_z else None
     schedule = [reference.inputs(), reference.x]
     schedule += [part.reshape(len(A), -1).T for part in (gains.K, gains.K_i, L, A, B)]  # row by row
@@ -105,9 +108,16 @@ def output_feedback(
         step=estimating_law(plant.state_names, where, len(plant.inputs), residuals), schedule=np.vstack(schedule),
         state=np.zeros(n_x + n_z), initial_input=law.initial_input, plan=law.plan,
         state_names=(*(f"estimated error of {name}" for name in plant.state_names), *integral_names(gains.residuals)),
-        info=law.info | {"spectral radius of the filter": float(spectral_radii(errors).max())},
+        info=Deferred({}, (*law.info.keys(), FILTER_RADIUS), partial(_info, law, A, L @ C, basis)),
         integrators=tuple(range(n_x, n_x + n_z)), feedback=gains, input_matrix=input_matrix,
     )  # fmt: skip
+
+
+def _info(law, A, LC, basis):
+    """The results of a law's design, and the largest spectral radius of the filter's errors."""
+    errors = A @ (np.eye(A.shape[1]) - LC)
+    errors = errors if basis is None else basis.swapaxes(1, 2) @ errors @ basis
+    return law.info | {FILTER_RADIUS: float(spectral_radii(errors).max())}
 
 
 def _process_noise(plant):
@@ -165,12 +175,16 @@ def _filter(A, C, W, V, basis):
     """Gains L (N, n_x, n_y) of the filter along the plan; covariances are in the basis of each sample."""
     from scipy.linalg import solve_discrete_are
 
-    count, n_x = len(A), A.shape[1]
-    T = np.broadcast_to(np.eye(n_x), (count, n_x, n_x)) if basis is None else basis
-    after = T[np.minimum(np.arange(count) + 1, count - 1)]
-    moved, seen, gathered = after.swapaxes(1, 2) @ A @ T, C @ T, after.swapaxes(1, 2) @ W @ after
+    count = len(A)
+    if basis is None:
+        moved, seen, gathered = A, np.broadcast_to(C, (count, *C.shape)), np.broadcast_to(W, A.shape)
+        A_0, W_0 = A[0], W
+    else:
+        after = basis[np.minimum(np.arange(count) + 1, count - 1)].swapaxes(1, 2)
+        moved, seen, gathered = after @ A @ basis, C @ basis, after @ W @ after.swapaxes(1, 2)
+        A_0, W_0 = (basis[0].T @ part @ basis[0] for part in (A[0], W))
     try:
-        P = solve_discrete_are((T[0].T @ A[0] @ T[0]).T, seen[0].T, T[0].T @ W @ T[0], V)
+        P = solve_discrete_are(A_0.T, seen[0].T, W_0, V)
     except (np.linalg.LinAlgError, ValueError) as error:
         raise ServoError(
             f"The filter's Riccati equation has no stabilising solution ({error}).",
@@ -178,12 +192,5 @@ def _filter(A, C, W, V, basis):
             do="Measure more states; velocities alone do not determine the position.",
             measured=len(C),
         ) from error
-    L = np.empty((count, n_x, len(C)))
-    for k in range(count):
-        S = seen[k] @ P @ seen[k].T + V
-        gain = np.linalg.solve(S, seen[k] @ P).T
-        L[k] = T[k] @ gain
-        corrected = P - gain @ seen[k] @ P
-        P = moved[k] @ corrected @ moved[k].T + gathered[k]
-        P = (P + P.T) / 2
-    return L
+    gains, _, _ = riccati(moved.swapaxes(1, 2), seen.swapaxes(1, 2), gathered, V, P, of_state=False)
+    return gains.swapaxes(1, 2) if basis is None else basis @ gains.swapaxes(1, 2)

@@ -7,7 +7,7 @@ import numpy as np
 from servoctl.checks import numbers_by_name
 from servoctl.control.feedback import affine
 from servoctl.control.law import Law
-from servoctl.control.reference import Reference
+from servoctl.control.reference import Reference, of_plan
 from servoctl.control.sampling import sampled_radii
 from servoctl.errors import ServoError
 from servoctl.plants.plant import Plant
@@ -47,6 +47,7 @@ def pd(
         If the rate is too low for the gains: the error dynamics at the plan's end are unstable, and would not be at a
         higher rate.
     """
+    plant = of_plan(plan, plant)
     reference = Reference(plan, plant, rate)
     kp, kd = _gains(kp, plant, "kp"), _gains(kd, plant, "kd")
     K = _feedback(reference, kp, kd)

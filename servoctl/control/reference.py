@@ -7,7 +7,7 @@ import numpy as np
 
 from servoctl.checks import ON_SAMPLE, positive, require_memory
 from servoctl.errors import NotRealisable, ServoError, SpecificationError, unknown
-from servoctl.plants.plant import Plant
+from servoctl.plants.plant import Plant, part_of
 
 
 class Reference:
@@ -35,19 +35,27 @@ class Reference:
         matrices = 2 * (plant.n_x + len(plant.inputs)) ** 2  # linearisations in continuous and in discrete time
         require_memory(count, matrices, f"The plan of {plan.t[-1] - plan.t[0]:g} s is sampled at {self.rate:g} Hz")
         self.t = plan.t[0] + np.arange(int(count) + 1) * period
-        self.period, self.end = period, plan.t[-1]
+        self.period, self.end, self._runs = period, plan.t[-1], {}
         self.x = self._states(self.t)
         self.middle = np.minimum(self.t + period / 2, self.end)
         self.middle_x, self.middle_input = self._states(self.middle), self._actuation(self.middle)
         self.initial_input = self._actuation(self.t[:1])[:, 0]
 
+    def _run(self, t):
+        """The plan at instants (N,), at its end beyond it [s]."""
+        t = np.minimum(t, self.end)
+        key = t.tobytes()
+        if key not in self._runs:
+            self._runs[key] = resampled(self.plan, t)
+        return self._runs[key]
+
     def _actuation(self, t):
-        run = resampled(self.plan, np.minimum(t, self.end))
+        run = self._run(t)
         return np.array([run[name] for name in self.plant.inputs]).reshape(len(self.plant.inputs), len(t))
 
     def _states(self, t):
-        run, plant = resampled(self.plan, np.minimum(t, self.end)), self.plant
-        return np.array([run[name] for name in plant.state_names])  # a lagged input follows the plan's
+        run = self._run(t)
+        return np.array([run[name] for name in self.plant.state_names])  # a lagged input follows the plan's
 
     def inputs(self):
         """The command of each sample, (m, N): the actuation in its middle, with lag and transport delay inverted."""
@@ -98,6 +106,12 @@ def require_plant(plant):
             do="Make the plant of the mechanism: sv.plant(mechanism).",
             kind=type(plant).__name__,
         )
+
+
+def of_plan(plan, plant):
+    """The plant without the coordinates that play no part in the program of a plan; as it is without a plan."""
+    model = getattr(plan, "model", None)
+    return part_of(plant, model.reduction.mechanism) if isinstance(plant, Plant) and model is not None else plant
 
 
 def refuse_transport(plant, what):
@@ -173,10 +187,18 @@ def _hermite(t, derivatives, i, h, times):
     its length. Returns as many (n, M) arrays.
     """
     r, s = len(derivatives), (times - t[i]) / h
-    low = [d[:, i] * h**k / factorial(k) for k, d in enumerate(derivatives)]
+    low = [d[:, i] * (h**k / factorial(k)) for k, d in enumerate(derivatives)]
     matrix = np.array([[perm(j, k) for j in range(r, 2 * r)] for k in range(r)], dtype=float)
     ends = [d[:, i + 1] * h**k for k, d in enumerate(derivatives)]
     missing = [end - sum(perm(j, k) * low[j] for j in range(k, r)) for k, end in enumerate(ends)]
-    high = np.einsum("jk,knm->jnm", np.linalg.inv(matrix), np.array(missing))
-    c = [*low, *high]
-    return [sum(perm(j, k) * c[j] * s ** (j - k) for j in range(k, 2 * r)) / h**k for k in range(r)]
+    c = [*low, *np.tensordot(np.linalg.inv(matrix), missing, 1)]
+    return [_derivative(c, k, s) / h**k for k in range(r)]
+
+
+def _derivative(c, k, s):
+    """The k-th derivative of Σ c_j s^j, by Horner's rule."""
+    value = np.zeros(c[0].shape)
+    for j in reversed(range(k, len(c))):
+        value *= s
+        value += perm(j, k) * c[j]
+    return value

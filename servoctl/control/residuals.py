@@ -1,5 +1,7 @@
 """Residuals of a program as functions of a plant's state, matched by name."""
 
+from functools import lru_cache
+
 import casadi as ca
 import numpy as np
 
@@ -114,6 +116,12 @@ class Residuals:
             if name in self._plant.state_names:
                 jacobian[:, :, self._plant.state_names.index(name)] = values[:, :, i]
         return jacobian
+
+
+@lru_cache(32)
+def known_residuals(model, plant):
+    """All residuals up to order 2, whose functions are derived once for a model and a plant."""
+    return Residuals(model, plant, order=2)
 
 
 def program_residuals(model):

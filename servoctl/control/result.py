@@ -12,7 +12,7 @@ from servoctl.control.conditions import Conditions
 from servoctl.control.law import Law, UserStep
 from servoctl.control.loop import Loop
 from servoctl.control.reference import resampled
-from servoctl.control.residuals import Residuals
+from servoctl.control.residuals import known_residuals
 from servoctl.errors import SpecificationError, unknown
 from servoctl.plants.plant import Plant
 from servoctl.run import ByName, Run
@@ -175,7 +175,7 @@ class Closed(ByName, Value):
         residuals = {}
         if self.plan is not None:
             jets = np.vstack([self.states, self._evaluated("accelerations")])
-            residuals |= Residuals(self.plan.model, self.plant, order=2).levels(self.t, jets)
+            residuals |= known_residuals(self.plan.model, self.plant).levels(self.t, jets)
         if self.plant.constrained:
             values = self.plant.function("constraints").grid(self.t, self.states, self.plant.p())
             residuals |= {name: value[None] for name, value in zip(self.plant.constraint_names(), values, strict=True)}

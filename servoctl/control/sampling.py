@@ -2,6 +2,8 @@
 
 import numpy as np
 
+from servoctl.codegen import matrices as many
+
 SCALED, TERMS = 0.5, 16  # norm of a matrix whose exponential is summed; 0.5^17/17! is 2e-20
 ONE_NORM = 16  # times SCALED: a norm of which the powers are not worth computing
 IN_DOUBLE = 8  # squarings that leave 2^8 roundings of a double, 3e-14
@@ -11,7 +13,8 @@ def discretised(A, B, period):
     """Exact discretisation of A (N, n, n), B (N, n, m) under a zero-order hold of a period [s]: exp([A B; 0 0] Ts)."""
     n, m = B.shape[1:]
     both = np.zeros((len(A), n + m, n + m))
-    both[:, :n, :n], both[:, :n, n:] = A * period, B * period
+    np.multiply(A, period, out=both[:, :n, :n])
+    np.multiply(B, period, out=both[:, :n, n:])
     exact = exponentials(both)
     return exact[:, :n, :n], exact[:, :n, n:]
 
@@ -25,35 +28,20 @@ def exponentials(matrices):
     """
     from scipy.linalg import matrix_balance
 
-    units = matrix_balance(np.abs(matrices).max(axis=0, initial=0.0), permute=False, separate=True)[1][0]
-    balanced = matrices * (units / units[:, None])
-    norm = _norms(balanced)
+    sizes = np.maximum(matrices.max(axis=0, initial=0.0), -matrices.min(axis=0, initial=0.0))
+    units = matrix_balance(sizes, permute=False, separate=True)[1][0]
+    scales = units[:, None] / units
+    norm = many.norms(matrices, scales)
     if norm.max(initial=0.0) > ONE_NORM * SCALED:
+        balanced, ones = matrices / scales, np.ones(scales.shape)
         fourth = np.linalg.matrix_power(balanced, 4)
-        norm = np.maximum(_norms(fourth) ** (1 / 4), _norms(fourth @ balanced) ** (1 / 5))
+        norm = np.maximum(many.norms(fourth, ones) ** (1 / 4), many.norms(fourth @ balanced, ones) ** (1 / 5))
     squarings = np.maximum(0, np.ceil(np.log2(np.maximum(norm, SCALED) / SCALED))).astype(int)
-    result = np.empty(matrices.shape)
-    for long in (False, True):
-        some = (squarings > IN_DOUBLE) == long
-        precision = np.longdouble if long else float
-        result[some] = _squared(balanced[some].astype(precision), squarings[some])
-    return result * (units[:, None] / units)
-
-
-def _squared(matrices, squarings):
-    """exp(A) = exp(A/2^s)^(2^s) of each matrix, (N, n, n), with s in `squarings`, (N,)."""
-    scaled, eye = matrices / np.exp2(squarings)[:, None, None].astype(matrices.dtype), np.eye(matrices.shape[1])
-    power = np.broadcast_to(eye, scaled.shape).astype(matrices.dtype)
-    for k in range(TERMS, 0, -1):
-        power = eye + scaled @ power / k
-    for k in range(squarings.max(initial=0)):
-        more = squarings > k
-        power[more] = power[more] @ power[more]
-    return power
-
-
-def _norms(matrices):
-    return np.abs(matrices).sum(axis=2).max(axis=1)
+    result = many.exponentials(matrices, scales, squarings, TERMS)
+    long = squarings > IN_DOUBLE
+    if long.any():
+        result[long] = many.squared((matrices[long] / scales).astype(np.longdouble), squarings[long], TERMS) * scales
+    return result
 
 
 def spectral_radii(matrices):

@@ -17,9 +17,10 @@ from servoctl.errors import (
     SpecificationError,
     UnstableInternalDynamics,
 )
-from servoctl.internal_dynamics import internal_dynamics
+from servoctl.growth import internal_dynamics
 from servoctl.model.model import derived
 from servoctl.progress import progress_bar
+from servoctl.reduction.idle import names_of, needed
 from servoctl.run import Run
 from servoctl.simulation import judged, simulated
 from servoctl.spec.mechanism import Mechanism
@@ -113,8 +114,10 @@ def fastest(
     NameUnknown
         For a limit of an unknown signal.
     """
+    require_kind(Mechanism, "mechanism", mechanism, "sv.Mechanism(q, gibbs, ...)")
+    require_kind(Program, "program", program, "sv.Program({...})")
     scene = _Scene(
-        mechanism,
+        needed(mechanism, program, named=[name for given in (limits, start, guess) for name in names_of(given)]),
         program,
         {name: interval(name, value, "limit") for name, value in mapping(limits, "The limits").items()},
         as_span(t_span, forward=True),
@@ -206,8 +209,6 @@ class _Scene:
             raise SpecificationError(
                 "There are no limits.", "The fastest time law reaches a limit.", do='Pass some, as {"trolley": 100.0}.'
             )
-        require_kind(Mechanism, "mechanism", self.mechanism, "sv.Mechanism(q, gibbs, ...)")
-        require_kind(Program, "program", self.program, "sv.Program({...})")
 
     def slowed(self, factor):
         """(largest excess, binding, program, plan) of a time law; the excess is infinite if there is no motion."""

@@ -11,7 +11,17 @@ from servoctl.archive import writing
 from servoctl.checks import as_units, require_kind, text, texts
 from servoctl.errors import SpecificationError
 from servoctl.figures.names import along_one_axis, coordinates, efforts, label_of, planes, unit_of
-from servoctl.figures.style import BESIDE, COLOURS, STYLES, as_axes, as_single_axes, look, panels
+from servoctl.figures.style import (
+    BESIDE,
+    COLOURS,
+    STYLES,
+    as_axes,
+    as_single_axes,
+    logarithmic,
+    look,
+    panels,
+    write_png,
+)
 from servoctl.run import Run
 
 SOURCE = "sv.simulate(...) or sv.load(path)"
@@ -164,7 +174,7 @@ def residuals(run, ax=None):
             worst = np.array([row[rows].max() for rows in bins])
             top = max(top, worst[np.isfinite(worst)].max(initial=LEAST))
             ax.plot(t, worst, STYLES[j % len(STYLES)], color=COLOURS[i % len(COLOURS)], linewidth=1.0 if j else 1.8)
-    ax.set_yscale("log")
+    logarithmic(ax)
     ax.set(xlabel="t [s]", ylabel="|residual|, SI (1e-18: zero)", ylim=(LEAST / 2, max(10 * top, 1e-12)))
     ax.grid(alpha=0.3)
     _instants(run, [ax])
@@ -208,7 +218,7 @@ def save_figures(run, folder, units=None, title=""):
             figure = np.ravel(axes)[0].figure
             figure.suptitle(f"{title}: {name}" if title else name)
             files.append(folder / f"{name}.png")
-            figure.savefig(files[-1], dpi=100)
+            write_png(figure, files[-1])
     return files
 
 

@@ -41,6 +41,22 @@ def as_single_axes(ax, height, **options):
     return panels(1, height, **options)[0] if ax is None else require_kind(Axes, "ax", ax, SOURCE)
 
 
+def write_png(drawn, path):
+    """Write a figure to a file, laid out and drawn once; `savefig` does both twice."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+
+    FigureCanvasAgg(drawn).print_png(path)
+
+
+def logarithmic(ax):
+    """Powers of ten as 1e-12, without minor ticks: typesetting them takes longer than the rest of a figure."""
+    from matplotlib.ticker import FuncFormatter, NullLocator
+
+    ax.set_yscale("log")
+    ax.yaxis.set_minor_locator(NullLocator())
+    ax.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:.0e}"))
+
+
 def look(i):
     """Colour and line style of the i-th curve."""
     return {"color": COLOURS[i % len(COLOURS)], "linestyle": STYLES[i // len(COLOURS) % len(STYLES)]}

@@ -8,9 +8,17 @@ import casadi as ca
 import numpy as np
 
 from servoctl.checks import as_span, interval, mapping, numbers_by_name, positive_number, require_kind
-from servoctl.errors import IntegrationStopped, ServoError, SingularProgram, SpecificationError, unknown
+from servoctl.errors import (
+    InconsistentStart,
+    IntegrationStopped,
+    ServoError,
+    SingularProgram,
+    SpecificationError,
+    unknown,
+)
 from servoctl.inversion.relaxed import relaxed
 from servoctl.inversion.report import extremes
+from servoctl.inversion.transfer import rest_near
 from servoctl.inversion.verdict import (
     FLAT,
     GROWS,
@@ -26,20 +34,23 @@ from servoctl.methods.choice import Algebraic, Bounded, Method, as_method
 from servoctl.model.model import derive
 from servoctl.model.start import State
 from servoctl.plants.plant import plant
+from servoctl.reduction.idle import names_of, needed
 from servoctl.run import Run
 from servoctl.simulation import as_state, simulate
 from servoctl.spec.mechanism import Mechanism
 from servoctl.spec.program import Program
 
 RELAXED = "relaxed"  # the word for the inverse that is no method of `simulate`
-END_MOVES = "; its end is free, as the program moves there"
+END_MOVES = "; its end is open, as the program moves there"
+END_SWINGS = "; its end is open, as modes on the imaginary axis swing on"
 DWELL = "Add a dwell before and after the path (a longer t_span)"
 REMEDIES = {
-    MARGINAL: f"{DWELL}, or take the exact forward plan by method='DOP853', whose internal motion goes on after it.",
+    MARGINAL: f"{DWELL}, or take the exact forward plan, which swings on after it, by leaving method and weight out.",
     GROWS: f"{DWELL}.",
     OPEN: "Begin and end the program with a dwell, or pass a start=... nearer to its bounded motion.",
 }  # of a relaxed plan that misses its program, by verdict
 MISS = 1e-3  # of the stroke of a residual, by which a plan misses it with a warning
+SWINGS_ON = 1e-3  # speed at the end relative to the largest one, with which a forward plan warns that it goes on
 
 
 def inverse(
@@ -50,10 +61,10 @@ def inverse(
 ) -> Run:  # fmt: skip
     """The motion and the actuation of a program by the inverse that its verdict allows.
 
-    Flat programs are solved instant by instant, minimum-phase ones are integrated forward, hyperbolic ones get the
-    bounded motion (`Bounded`), and marginal ones, those singular at rest, rough paths and limits that the exact plan
-    exceeds the relaxed one (`relaxed`), which rests at both ends unless the program moves there. The message of the run
-    says which, and why.
+    Flat programs are solved instant by instant, minimum-phase and marginal ones are integrated forward, hyperbolic ones
+    get the bounded motion (`Bounded`), and those singular at rest, rough paths and limits that the exact plan exceeds
+    the relaxed one (`relaxed`), which rests at both ends unless the program moves there. The message of the run says
+    which, and why.
 
     Parameters
     ----------
@@ -73,7 +84,8 @@ def inverse(
         Bounds of other signals, such as {"tension": (0, None)}, likewise. With limits or bounds, an exact plan that
         reaches a singular state is replaced, too.
     weight : float or dict of str to float, optional
-        Of the relaxed inverse; default: 1e-6 of that for which standing still costs as much as the program.
+        Of the relaxed inverse, which a marginal program then gets; default: 1e-6 of that for which standing still costs
+        as much as the program.
 
     Returns
     -------
@@ -89,13 +101,14 @@ def inverse(
     Warns
     -----
     RuntimeWarning
-        If a method is given that is not the one of the verdict, or a relaxed plan misses the program by more than a
-        thousandth of what its residual moves.
+        If a method is given that is not the one of the verdict, a relaxed plan misses the program by more than a
+        thousandth of what its residual moves, or the internal motion of a marginal program goes on after the path.
     """
     require_kind(Mechanism, "mechanism", mechanism, "sv.Mechanism(q, gibbs, ...)")
     require_kind(Program, "program", program, "sv.Program({...})")
     span, ranges = as_span(t_span, forward=True), _ranges(mechanism, limits, bounds)
-    task = Task(mechanism, program, span, start, ranges, _checked(weight, program))
+    mechanism = needed(mechanism, program, named=[*names_of(start), *ranges[0], *ranges[1]])
+    request = Request(mechanism, program, span, start, ranges, _checked(weight, program))
     known = None if isinstance(start, State) else mapping(start, "The start")
     by_hand = method if method is None or isinstance(method, str) and method == RELAXED else as_method(method)
     try:
@@ -105,17 +118,17 @@ def inverse(
         if by_hand not in (None, RELAXED) or not {"needs", "has"} <= facts.keys():
             raise
         rough = f"{facts['name']} has class C^{facts['has']}, and the exact inverse needs {facts['needs']}"
-        return _measured(task.relaxed(rough), program, "")
+        return _measured(request.relaxed(rough), program, "")
     begin = _begin(model, start, span[0])
     found = verdict(model, begin)
-    chosen = _chosen(model, found)
+    chosen = _chosen(model, found, weight is not None)
     if by_hand is not None:
-        return _measured(_by_hand(task, model, begin, found, chosen, by_hand), program, found.dynamics)
-    return _measured(task.run(model, begin, found, chosen), program, found.dynamics)
+        return _measured(_by_hand(request, model, begin, found, chosen, by_hand), program, found.dynamics)
+    return _measured(request.run(model, begin, found, chosen), program, found.dynamics)
 
 
 @dataclass(frozen=True)
-class Task:
+class Request:
     """What `inverse` received; `ranges` are limits and bounds, {signal: (low, high)} each."""
 
     mechanism: Mechanism
@@ -146,39 +159,38 @@ class Task:
         excess = _excess(run, ranges)
         if excess:
             return self.relaxed(excess, begin)
+        moving = found.dynamics != MARGINAL
         if found.dynamics == OPEN or run.internal.get("verdict") == "unstable":
             found = verdict(model, run)
         if found.dynamics != GROWS:
-            return _told(run, found)
+            return _with_reason(run, found)
         if not model.ideal:
-            return self.relaxed(found, begin, moving=True)
+            return self.relaxed(found, begin, moving)
         warnings.warn(f"An ideal program has no other inverse, and this is {found}.", RuntimeWarning, stacklevel=3)
-        return _told(run, found)
+        return _with_reason(run, found)
 
     def exact(self, model, begin, found, method):
         """The run of an exact inverse; integrated forward from the rest where the program begins, if there is one."""
         if not isinstance(self.start, State) and (begin is None or method is None and "start" in found.rest):
             rest = found.rest["start"].x.tolist() if "start" in found.rest else ()
             guess = dict(zip(model.state_names, rest, strict=False)) or _of_states(model, self.start or {})
-            begin = model.start(self.span[0], guess=guess)  # or the error that tells why there is no start
+            begin = model.start(self.span[0], guess=guess)  # or the error that says why there is no start
         with warnings.catch_warnings():  # growth is part of the verdict
             warnings.filterwarnings("ignore", "Internal dynamics unstable")
             return simulate(model, begin, self.span, method)
 
     def relaxed(self, why, begin=None, moving=False):
-        """The run of the relaxed inverse: from rest to rest, and free where the program moves.
+        """The run of the relaxed inverse: from rest to rest, and with open ends where the program moves.
 
         `moving` says that it begins in motion, with the state `begin`.
         """
-        tries = [] if moving else [({"start": self.start}, ""), ({"start": self.start, "end": "free"}, END_MOVES)]
-        tries += [({"start": begin, "end": "free"}, END_MOVES)] if begin is not None else []
-        limits, bounds = self.ranges
+        swings = isinstance(why, Verdict) and why.dynamics == GROWS and why.swings
+        tries = [({}, ""), ({"end": "bounded"}, END_MOVES)] if not swings else [({"end": "bounded"}, END_SWINGS)]
+        tries = [] if moving else [({"start": self.start} | ends, note) for ends, note in tries]
+        tries += [({"start": begin, "end": "bounded"}, END_MOVES)] if begin is not None else []
         for k, (ends, note) in enumerate(tries):
             try:
-                run = relaxed(
-                    plant(self.mechanism), self.program, self.span, weight=self.weight, limits=limits, bounds=bounds,
-                    **ends,
-                )  # fmt: skip
+                run = self._planned(**ends)
             except SpecificationError as error:
                 if "rate" not in error.details or k + 1 == len(tries):
                     raise
@@ -187,7 +199,21 @@ class Task:
                     raise
                 raise _no_plan(why, error) from error
             else:
-                return _told(run, why, note)
+                return _with_reason(run, why, note)
+
+    def _planned(self, start, **end):
+        """The relaxed plan; from the rest near values of coordinates, where there is none with exactly these."""
+        limits, bounds = self.ranges
+        full = plant(self.mechanism)
+        options = {"weight": self.weight, "limits": limits, "bounds": bounds, **end}
+        try:
+            return relaxed(full, self.program, self.span, start=start, **options)
+        except InconsistentStart:
+            values = isinstance(start, Mapping) and {*start} <= {*self.mechanism.q.names}
+            near = rest_near(full, self.program, self.span[0], start) if values else None
+            if near is None:
+                raise
+            return relaxed(full, self.program, self.span, start=near, **options)
 
 
 def _no_plan(why, error):
@@ -234,17 +260,17 @@ def _of_states(model, known):
     return {name: value for name, value in known.items() if name in model.state_names}
 
 
-def _chosen(model, found):
+def _chosen(model, found, weighted):
     """The method of the exact inverse, None for the default of `simulate`, or `RELAXED`."""
     if found.dynamics == HYPERBOLIC_ZEROS:
         return Bounded()
-    relaxes = found.dynamics in (MARGINAL, SINGULAR, GROWS) and not model.ideal
-    return RELAXED if relaxes else None
+    relaxes = found.dynamics in (SINGULAR, GROWS) or weighted and found.dynamics == MARGINAL
+    return RELAXED if relaxes and not model.ideal else None
 
 
-def _by_hand(task, model, begin, found, chosen, method):
+def _by_hand(request, model, begin, found, chosen, method):
     """The run of a method that was given, with a warning if the verdict speaks against it."""
-    expected = {FLAT: Algebraic, MINIMUM: Method}.get(found.dynamics, Bounded if isinstance(chosen, Bounded) else ())
+    expected = {FLAT: Algebraic, MINIMUM: Method, MARGINAL: Method, HYPERBOLIC_ZEROS: Bounded}.get(found.dynamics, ())
     fits = method == RELAXED or isinstance(method, expected)
     if not fits:
         warnings.warn(
@@ -254,12 +280,12 @@ def _by_hand(task, model, begin, found, chosen, method):
             stacklevel=3,
         )
     if method == RELAXED:
-        return task.relaxed(found)
-    run = task.exact(model, begin, found, method)
-    excess = _excess(run, {**task.ranges[0], **task.ranges[1]})
+        return request.relaxed(found)
+    run = request.exact(model, begin, found, method)
+    excess = _excess(run, {**request.ranges[0], **request.ranges[1]})
     if excess:
         warnings.warn(f"method={str(method)!r} was chosen, and {excess}.", RuntimeWarning, stacklevel=3)
-    return _told(run, found)
+    return _with_reason(run, found)
 
 
 def _excess(run, ranges):
@@ -272,11 +298,29 @@ def _excess(run, ranges):
     return ""
 
 
-def _told(run, why, note=""):
+def _with_reason(run, why, note=""):
     """The run, whose message says which inverse it is and why."""
     kind = {"algebraic": "instant by instant", "bounded": "bounded", RELAXED: "relaxed"}.get(run.method, "forward")
     reason = f"the program is {why.word} ({why.reason})" if isinstance(why, Verdict) else why
+    if kind == "forward" and isinstance(why, Verdict) and why.dynamics == MARGINAL and "end" in why.rest:
+        note += _swinging(run)
     return replace(run, message=f"{run.message}; inverse: {kind}, as {reason}{note}")
+
+
+def _swinging(run):
+    """What of the motion goes on where the program rests, for the message and with a warning; "" if nothing does."""
+    q = run.model.reduction.mechanism.q
+    speeds = {name: run[name] for name in q.jet_names(1)}
+    largest = {name: np.abs(values).max() for name, values in speeds.items()}
+    least = SWINGS_ON * max(largest.values())  # those below are rounding
+    parts = {name: abs(speeds[name][-1]) / size for name, size in largest.items() if size > least}
+    name = max(parts, key=parts.get, default=None)
+    if name is None or parts[name] <= SWINGS_ON:
+        return ""
+    what = f"the internal motion goes on after it, with {name} = {speeds[name][-1]:.3g} at t = {run.t[-1]:.4g} s"
+    do = "" if run.model.ideal else " method='relaxed' rests at both ends, as near to the program as that is."
+    warnings.warn(f"The program is marginal, and {what}.{do}", RuntimeWarning, stacklevel=5)
+    return f"; {what}"
 
 
 def _measured(run, program, dynamics):

@@ -18,8 +18,8 @@ from servoctl.errors import (
     SpecificationError,
     UnstableInternalDynamics,
 )
-from servoctl.inversion.kinks import SMOOTHER, kink
 from servoctl.inversion.zeros import AT_REST, NEWTON, NO_COEFFICIENT, ZeroPolynomial
+from servoctl.methods.kinks import SMOOTHER, kink
 from servoctl.model.model import Model
 from servoctl.model.start import State
 from servoctl.simulation import simulate
@@ -277,7 +277,7 @@ def minimum_phase(model: Model, parameter: str, values, at: State | None = None)
 
     Notes
     -----
-    Ranges are sought between 257 values, and at and beside the smallest distances of roots from the axis between these;
+    Ranges are sought between 257 values, and at and around the smallest distances of roots from the axis between these;
     narrower ones may be missed. Boundaries are accurate to rounding.
     """
     require_kind(Model, "model", model, "sv.derive(mechanism, program)")
@@ -386,8 +386,8 @@ def _refined(polynomial, grid):
     ]
     # where roots cross there and back between two values, one of these lies between the crossings
     offsets = step * np.concatenate([s * 0.5 ** np.arange(1, NARROWEST) for s in (1.0, -1.0)])
-    beside = [v for c in closest for v in c + offsets if grid[0] < v < grid[-1] and not polynomial.kind(v)[1]]
-    return np.unique([*grid, *closest, *beside]).tolist()
+    around = [v for c in closest for v in c + offsets if grid[0] < v < grid[-1] and not polynomial.kind(v)[1]]
+    return np.unique([*grid, *closest, *around]).tolist()
 
 
 def _edge(polynomial, a, b, first, last):

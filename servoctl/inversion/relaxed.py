@@ -10,7 +10,6 @@ from the solution before, on a mesh that is refined until its motion is that of 
 from collections.abc import Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass, replace
-from functools import cached_property
 
 import casadi as ca
 import numpy as np
@@ -19,33 +18,28 @@ from servoctl.checks import (
     array_of,
     as_list,
     as_span,
-    finite,
     interval,
     mapping,
-    numbers_by_name,
     positive_number,
     positives,
     require_kind,
 )
 from servoctl.errors import (
-    InconsistentStart,
     IntegrationStopped,
     LimitExceeded,
-    ServoError,
     SpecificationError,
     unknown,
 )
-from servoctl.inversion.equilibrium import RANK, Equilibria
-from servoctl.inversion.transcription import LONGEST, Mesh, Node, Transcription
+from servoctl.inversion.transcription import LONGEST, Mesh, Transcription
+from servoctl.inversion.transfer import EXCEEDED, GUESS, Transfer, state_sizes
 from servoctl.methods.bounded import subdivided
 from servoctl.methods.motion import breakpoints
-from servoctl.model.model import derive
 from servoctl.model.start import State
 from servoctl.plants.driven import at_once, driven
-from servoctl.plants.plant import Plant
+from servoctl.plants.plant import Plant, part_of
+from servoctl.reduction.idle import names_of, needed
 from servoctl.reduction.knots import Switches
 from servoctl.run import Run
-from servoctl.simulation import simulated
 from servoctl.spec.paths import piecewise
 from servoctl.spec.program import Program
 from servoctl.study.table import Study, machine
@@ -55,14 +49,11 @@ INTERVALS = 24  # of the first mesh at least
 FIRST = 1e-3  # first weight, relative to that for which standing still costs as much as the program
 DEFAULT = 1e-6  # default weight, relative to the same
 FACTOR = 100.0  # between the weights of two successive solutions
-EXCEEDED = 1e-6  # of a bound: excess between its instants that a run tells, and at the ends that is refused
 COARSE = 1e-6  # defect with which no plan is returned
 DEFECT, AIM = 1e-7, 0.1  # of the states between nodes, relative to their sizes; and what refinement aims at of it
 PLACES = (0.12, 0.4, 0.75)  # places within an interval where the defect is measured
 ROUNDS, MOST_PIECES, MOST_INTERVALS = 6, 8, 400  # of the mesh; pieces of an interval; intervals
 SAMPLES = 1000  # of the run, at least
-GUESS = 241  # instants of the guess
-STANDING = 1e-6  # rate of a program that stands still, relative to its largest
 STATUS = {
     "Infeasible_Problem_Detected": "finds no motion",
     "Maximum_Iterations_Exceeded": "does not converge in 200 iterations",
@@ -103,8 +94,9 @@ def relaxed(
         some 300 instants; `run.message` has what exceeds them between these.
     start : State, array or dict of str to float, optional
         Default: the rest at which the program is met. A dict may name some coordinates of a rest, or a whole state.
-    end : "rest", "free", or dict of str to float
-        "rest": a rest at which the program is met; the start is at rest then, too. Or values of states at the end.
+    end : "rest", "bounded", "free", or dict of str to float
+        "rest": a rest at which the program is met; the start is at rest then, too. "bounded": open, but for unstable
+        modes of the internal dynamics, which would grow until the end. "free": open. Or values of states at the end.
 
     Returns
     -------
@@ -128,12 +120,15 @@ def relaxed(
     """
     require_kind(Plant, "plant", plant, "sv.plant(mechanism)")
     require_kind(Program, "program", program, "sv.Program({...})")
-    task = Task(at_once(plant), program, as_span(t_span, forward=True), _all_limits(plant, limits), bounds, start, end)
+    named = [name for given in (start, end, limits, plant.limits, bounds) for name in names_of(given)]
+    plant = part_of(plant, needed(plant.mechanism, program, named=named))
+    limits = _all_limits(plant, limits)
+    relaxation = Relaxation(at_once(plant), program, as_span(t_span, forward=True), limits, bounds, start, end)
     several = None if isinstance(weight, Mapping) else as_list(weight)
     if several is None:
-        return task.run(_weights(weight, program))
+        return relaxation.run(_weights(weight, program))
     weights = positives("weight", several, "Write weight=[1e-6, 1e-8].")
-    return task.front(array_of("weight", weights, None).tolist())
+    return relaxation.front(array_of("weight", weights, None).tolist())
 
 
 def _weights(weight, program):
@@ -187,241 +182,8 @@ class Plan:
     beta: np.ndarray | None = None
 
 
-class Task:
-    """A plant, a program, and what limits the plan; `run` solves for weights."""
-
-    def __init__(self, plant, program, span, limits, bounds, start, end):
-        self.plant, self.program, self.span, self.end = plant, program, span, end
-        self.limits, self.rates = limits
-        self.n, self.m, self.nq = plant.n_x, len(plant.inputs), plant.mechanism.q.nq
-        self.bounds = {name: interval(name, value, "bound") for name, value in mapping(bounds, "The bounds").items()}
-        self.node = Node(plant, program, self._bounded())
-        self.equilibria = Equilibria(plant, program, self.node)
-        self.begin, self.held = self._begin(start)
-        self.target = self._target()
-        self._require_bounds_at_ends()
-        self.states, self.inputs, self.sizes = self._guess()
-
-    def _bounded(self):
-        """Bounded quantities as expressions."""
-        mechanism, q = self.plant.mechanism, self.plant.mechanism.q
-        jets = {name: s for k in range(3) for name, s in zip(q.jet_names(k), ca.vertsplit(q.jet(k)), strict=True)}
-        known = jets | self.program.residuals | mechanism.outputs
-        for name in self.bounds:
-            if name in (*self.plant.inputs, *(f"d{u}" for u in self.plant.inputs)):
-                raise SpecificationError(
-                    f"bounds has {name!r}, an actuator or the rate of one.",
-                    "Bounds are of states, outputs and residuals; those of actuators are limits.",
-                    do=f"Write limits={{{name!r}: ...}}.",
-                    name=name,
-                )
-            if name not in known:
-                raise unknown(name, known, "state, output or residual")
-        return {name: known[name] for name in self.bounds}
-
-    # the ends
-
-    @property
-    def _to_rest(self):
-        return isinstance(self.end, str) and self.end == "rest"
-
-    def _begin(self, start):
-        """The state at t0, and the inputs that hold it at rest; None if it may move."""
-        nq, t0 = self.nq, self.span[0]
-        zero = np.zeros(nq + self.m)
-        if start is None or isinstance(start, dict) and set(start) <= set(self.plant.mechanism.q.names):
-            self._require_standing(t0, "start")
-            names, guess = list(self.plant.mechanism.q.names), zero[:nq].copy()
-            if self._exact is not None:
-                guess = self._exact.jets[:nq, 0].copy()
-            given = numbers_by_name(start, names, "coordinate", "start")
-            fixed = [names.index(name) for name in given]
-            guess[fixed] = list(given.values())
-            rest, worst = self.equilibria.at(t0, guess, zero[nq:], fixed)
-            if rest is None:
-                raise _no_rest("start", t0, worst)
-            return np.concatenate([rest[0], np.zeros(self.n - nq)]), self._held(rest, "start")
-        values = start.values[: self.n] if isinstance(start, State) else start
-        x = self.plant.state(values)
-        if not self._to_rest:
-            return x, None
-        self._require_standing(t0, "start")
-        rest, worst = self.equilibria.at(t0, x[:nq], zero[nq:], range(nq), self.equilibria.program)
-        speeds = dict(zip(self.plant.state_names[nq:], x[nq:].tolist(), strict=True))
-        if rest is None or np.any(x[nq:]):
-            raise _no_equilibrium(t0, worst, speeds)
-        return x, self._held(rest, "start")
-
-    def _held(self, rest, where):
-        """Inputs that hold a rest within the limits of magnitude."""
-        (q, u), t = rest, self.span[where == "end"]
-        low, high = np.array([self.limits.get(name, (-np.inf, np.inf)) for name in self.plant.inputs]).reshape(-1, 2).T
-        if np.all((u >= low) & (u <= high)):
-            return u
-        from scipy.optimize import lsq_linear
-
-        B = self.equilibria.slopes(t, q, u)[:, self.nq :]
-        found = lsq_linear(B, B @ u, (low, high), tol=1e-12)
-        if np.abs(B @ (found.x - u)).max() <= 1e-6 * np.abs(B @ u).max():
-            return np.clip(found.x, low, high)
-        worst = int(np.argmax(np.maximum(low - u, u - high)))
-        name = self.plant.inputs[worst]
-        raise LimitExceeded(
-            f"At rest at the {where}, t = {t:g} s, {name} = {u[worst]:.6g}; its limits are {low[worst]:g} and "
-            f"{high[worst]:g}.",
-            "The inputs that hold the machine at rest lie within the limits.",
-            nearest=f"A limit of at least {abs(u[worst]):.6g}.",
-            name=name, t=t, value=float(u[worst]), limit=(float(low[worst]), float(high[worst])),
-        )  # fmt: skip
-
-    def _require_standing(self, t, where):
-        """Refuse a program that moves at an instant at which the plant rests."""
-        q = self.node.q
-        moving = ca.vertcat(*q.gamma(1), *(s for k in range(2, 3 + self.node.depth) for s in q.gamma(k)))
-        orders = {name: q.order(e) for name, e in self.program.residuals.items()}
-        rates = [ca.jacobian(e, q.t) if orders[name] <= 0 else e for name, e in self.program.residuals.items()]
-        values = ca.substitute(self.node.known(ca.vertcat(*rates)), moving, ca.SX.zeros(moving.numel()))
-        f = ca.Function("rates", [q.t, ca.vertcat(*q)], [values])
-        some = np.full(self.nq, 0.3)  # a place where expressions of the coordinates have values
-        times = np.linspace(*self.span, 101)
-        along = np.hstack([np.array(f(s, some)) for s in times])
-        at = np.array(f(t, some)).ravel()
-        moved = np.abs(at) > STANDING * np.abs(along).max(axis=1)
-        if moved.any():
-            name = list(orders)[int(np.argmax(moved))]
-            raise SpecificationError(
-                f"The program's residual {name!r} moves at the {where}, t = {t:g} s: at rest it "
-                f"{'changes by' if orders[name] <= 0 else 'is'} {at[np.argmax(moved)]:.4g}"
-                f"{' 1/s' if orders[name] <= 0 else ''}.",
-                "Where the plant rests, the program does, too.",
-                do="Choose a span between rests of the program, or end='free' and a start with its velocities.",
-                name=name, t=float(t), rate=float(at[np.argmax(moved)]),
-            )  # fmt: skip
-
-    def _target(self):
-        """What is fixed at the end: (state with NaN where open, inputs or None, function that vanishes or None)."""
-        open_ = np.full(self.n, np.nan)
-        if isinstance(self.end, str) and self.end == "free":
-            return open_, None, None
-        if isinstance(self.end, Mapping):
-            for name, value in self.end.items():
-                if name not in self.plant.state_names:
-                    raise unknown(name, self.plant.state_names, "state")
-                open_[self.plant.state_names.index(name)] = finite(name, value, "value at the end")
-            return open_, None, None
-        if not self._to_rest:
-            raise SpecificationError(
-                f"end={self.end!r}.", "It is 'rest', 'free', or values of states by name.", end=self.end
-            )
-        t1 = self.span[1]
-        self._require_standing(t1, "end")
-        rests = self.equilibria.along(np.linspace(*self.span, 101)[1:], self.begin[: self.nq], self.held)
-        known = rests[:, np.isfinite(rests).all(axis=0)]
-        last = known[:, -1] if known.size else np.concatenate([self.begin[: self.nq], self.held])
-        rest, worst = self.equilibria.at(t1, last[: self.nq], last[self.nq :])
-        if rest is None:
-            raise _no_rest("end", t1, worst)
-        held = self._held(rest, "end")
-        slopes = self.equilibria.slopes(t1, *rest)
-        slopes = slopes / np.maximum(np.abs(slopes).max(axis=1, keepdims=True), 1e-300)
-        open_directions = np.linalg.svd(slopes)[2][np.linalg.matrix_rank(slopes, RANK) :, : self.nq]
-        if np.abs(open_directions).max(initial=0.0) < RANK:  # the rest is isolated
-            return np.concatenate([rest[0], np.zeros(self.n - self.nq)]), held, None
-        open_[self.nq :] = 0.0
-        return open_, held, self._independent(rest)
-
-    def _require_bounds_at_ends(self):
-        """Refuse bounds that a fixed state at an end exceeds, whatever the inputs."""
-        node, t = self.node, self.span
-        f = node.function("bounded", node.bounded)
-        for k, (where, x) in enumerate((("start", self.begin), ("end", self.target[0]))):
-            values = np.array(f(t[k], x, np.zeros(node.v.numel()))).ravel()
-            for name, value, each in zip(node.bounds, values, node.bounded.elements(), strict=True):
-                low, high = self.bounds[name]
-                excess = max(low - value, value - high)
-                if excess > EXCEEDED * max(1.0, abs(value)) and not ca.depends_on(each, node.v):
-                    raise LimitExceeded(
-                        f"At the {where}, t = {t[k]:g} s, {name} = {value:.6g}; its bound is ({low:g}, {high:g}).",
-                        "The states at both ends lie within the bounds.",
-                        do=f"Widen the bound, or choose another {where}.",
-                        name=name, t=float(t[k]), value=float(value), limit=(low, high),
-                    )  # fmt: skip
-
-    def _independent(self, rest):
-        """A function of (t, x, v) whose values vanish at rests near this one, without dependent rows."""
-        from scipy.linalg import qr
-
-        slopes = self.equilibria.slopes(self.span[1], *rest)
-        scaled = slopes / np.maximum(np.abs(slopes).max(axis=1, keepdims=True), 1e-300)
-        order = qr(scaled.T, pivoting=True)[2][: np.linalg.matrix_rank(scaled, RANK)]
-        rows = self.equilibria.rows(self.node.q.t, self.node.state[: self.nq], self.node.v[: self.m])
-        return self.node.function("rest", rows[np.sort(order).tolist()])
-
-    # where the iteration begins
-
-    @cached_property
-    def _exact(self):
-        """The exact plan of a program that determines the motion completely; None if there is none."""
-        try:
-            model = derive(self.plant.mechanism, self.program)
-            names = self.plant.mechanism.parameters.names
-            model = model.with_parameters(**dict(zip(names, self.plant.parameters, strict=False)))
-            if not model.flat:
-                return None
-            return simulated(model, model.start(self.span[0]), self.span, progress=False)
-        except ServoError:
-            return None
-
-    def _guess(self):
-        """States (n_x, G) and inputs (m, G) at equal instants, and the sizes that `Transcription` takes."""
-        times = np.linspace(*self.span, GUESS)
-        if self._exact is not None:
-            x = np.array([np.interp(times, self._exact.t, self._exact[name]) for name in self.plant.state_names])
-            u = np.array([np.interp(times, self._exact.t, self._exact[name]) for name in self.plant.inputs])
-        else:
-            x, u = self._quasi_static(times)
-        x_size = _state_sizes(x, self.nq, self.span)
-        effort = self.node.function("effort", self.node.effort)
-        u_size = np.abs(u).max(axis=1)
-        u_size = np.where(u_size > 1e-6 * u_size.max(), u_size, u_size.max() or 1.0)
-        v = np.concatenate([u_size, np.zeros(self.m * self.node.depth)])
-        sizes = x_size, u_size, self._bounded_sizes(times, x, u), float(effort(self.span[0], self.begin, v)) or 1.0
-        return x, u, sizes
-
-    def _bounded_sizes(self, times, x, u):
-        """Size of each bounded quantity (b,): its largest value along states and inputs, at least that of its sides."""
-        v = np.vstack([u, np.zeros((self.m * self.node.depth, len(times)))])
-        values = np.array(self.node.function("bounded", self.node.bounded).map(len(times))(times[None], x, v))
-        sides = np.array([*self.bounds.values()]).reshape(-1, 2)
-        both = np.abs(np.hstack([values.reshape(len(sides), len(times)), sides]))
-        largest = np.max(both, axis=1, where=np.isfinite(both), initial=0.0)
-        return np.where(largest > 0, largest, 1.0)
-
-    def _quasi_static(self, times):
-        """Rests at frozen instants, with the speeds and the inertia of moving through them slowly."""
-        held = np.zeros(self.m) if self.held is None else self.held
-        rests = self.equilibria.along(times, self.begin[: self.nq], held)
-        rests[:, 0] = np.concatenate([self.begin[: self.nq], held])
-        known = np.isfinite(rests).all(axis=0)
-        rests = np.array([np.interp(times, times[known], row[known]) for row in rests])
-        q, u = rests[: self.nq], rests[self.nq :]
-        kinematics = self.node.function("kinematics", self.node.q.V, self.node.q.h)
-        mechanism = self.plant.mechanism
-        forces = self.node.known(mechanism.mass), self.node.known(mechanism.E)
-        motion = self.node.function("motion", self.node.acceleration, *forces)
-        rate, zero = np.gradient(q, times, axis=1), np.zeros(self.m * self.node.depth)
-        w = np.zeros((self.n - self.nq, len(times)))
-        for k, t in enumerate(times):
-            x, v = np.concatenate([q[:, k], w[:, k]]), np.append(u[:, k], zero)
-            V, h = (np.array(part) for part in kinematics(t, x, v))
-            w[:, k] = np.linalg.lstsq(V, rate[:, k] - h.ravel(), rcond=None)[0]
-        accelerations = np.gradient(w, times, axis=1)
-        for k, t in enumerate(times):
-            x, v = np.concatenate([q[:, k], w[:, k]]), np.append(u[:, k], zero)
-            present, M, E = (np.array(part) for part in motion(t, x, v))
-            inertial = M @ (accelerations[:, k] - present.ravel())
-            u[:, k] += np.linalg.lstsq(E, inertial, rcond=None)[0]
-        return np.vstack([q, w]), u
+class Relaxation(Transfer):
+    """The relaxed inverse of a transfer; `run` solves for weights."""
 
     def _first(self, mesh):
         """The guess on a mesh."""
@@ -510,11 +272,6 @@ class Task:
         still = np.hstack([np.array(f(t, self.begin, v)) for t in np.linspace(*self.span, GUESS)])
         moved = np.abs(still).max(axis=1)
         return np.where(moved > 0, moved**2 / self.sizes[3], np.inf)
-
-    @property
-    def begin_inputs(self):
-        """Inputs that hold the start at rest (m,), or zeros."""
-        return np.zeros(self.m) if self.held is None else self.held
 
     def _solved(self, plan, weights, iterations=()):
         """The plan of the last of falling weights, each solved from the one before."""
@@ -618,7 +375,7 @@ class Task:
         }
         values, limits = nlp.constraints(w), bounds[2]
         count = len(values["rest"])
-        rows["rest"] = (["the rest at the end"] * count, mesh.edges[-1:], np.ones(count))
+        rows["rest"] = (["the condition at the end"] * count, mesh.edges[-1:], np.ones(count))
         for kind, (names, at, size) in rows.items():
             yield names, at, size, values[kind], *limits[kind]
 
@@ -629,7 +386,7 @@ class Task:
         f = self.node.function("rates", self.node.rates).map(len(t))
         v = np.vstack([plan.pieces.inputs(u, t, rate) for rate in range(self.node.depth + 1)])
         defect = mesh.states(x, t, 1) - np.array(f(t[None], mesh.states(x, t), v))
-        defect *= np.repeat(mesh.h, len(theta)) / _state_sizes(x, self.nq, self.span)[:, None]
+        defect *= np.repeat(mesh.h, len(theta)) / state_sizes(x, self.nq, self.span)[:, None]
         return np.abs(defect).max(axis=0).reshape(len(mesh.h), -1).max(axis=1)
 
     def _finer(self, plan):
@@ -674,33 +431,3 @@ class Task:
             if excess > EXCEEDED * max(abs(side) for side in (low, high) if np.isfinite(side)):
                 text += f"; between its instants {name} exceeds its bound by {excess:.2g}"
         return text
-
-
-def _state_sizes(x, nq, span):
-    """Size of each state (n_x,): its range, at least a part of that of others at its level."""
-    ranges = np.ptp(x, axis=1)
-    for level, floor in ((slice(nq), 1.0), (slice(nq, None), 1.0 / (span[1] - span[0]))):
-        ranges[level] = np.maximum(ranges[level], 1e-2 * (ranges[level].max(initial=0.0) or floor))
-    return ranges
-
-
-def _no_rest(where, t, worst):
-    row, value = worst
-    return InconsistentStart(
-        f"There is no rest at the {where}, t = {t:g} s, at which the program is met: {row} remains {value:.3g}.",
-        "The plan begins and ends at rest where start or end do not say otherwise.",
-        do="Give coordinates near the rest in start={...}, or end='free'.",
-        where=where, t=float(t), row=row, value=value,
-    )  # fmt: skip
-
-
-def _no_equilibrium(t, worst, speeds):
-    row, value = worst
-    moving = {name: speed for name, speed in speeds.items() if speed}
-    what = ", ".join(f"{name} = {speed:g}" for name, speed in moving.items()) or f"{row} = {value:.4g}"
-    return InconsistentStart(
-        f"The start at t = {t:g} s is no equilibrium: {what}.",
-        "With end='rest' the plan leaves a rest, at which inputs hold the machine.",
-        do="Leave start= out, or write end='free' or the values of states at the end.",
-        t=float(t), row=row, value=value, speeds=moving,
-    )  # fmt: skip

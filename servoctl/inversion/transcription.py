@@ -135,7 +135,7 @@ class Mesh:
         return k, (t - self.edges[k]) / self.h[k]
 
     def states(self, x, t, rate=0):
-        """States (n_x, M) at instants from those at the begin and the nodes (n_x, 1 + N s), or their rates."""
+        """States (n_x, M) at instants from those at the start and the nodes (n_x, 1 + N s), or their rates."""
         k, theta = self.place(t)
         s = len(self.c)
         weights = (basis_rates if rate else basis)(self.c, theta) / self.h[k] ** rate
@@ -151,7 +151,7 @@ class Mesh:
         return np.einsum("uns,ns->un", values, bernstein(s, theta, rate) / self.h[k, None] ** rate)
 
     def control_points(self, values, begin):
-        """Control points (m, 1 + N s) of inputs with these values (m, N s) at the nodes and (m,) at the begin."""
+        """Control points (m, 1 + N s) of inputs with these values (m, N s) at the nodes and (m,) at the start."""
         s, matrix = len(self.c), np.linalg.inv(bernstein(len(self.c), np.append(0.0, self.c)))
         points = [np.asarray(begin, dtype=float)[:, None]]
         for i in range(len(self.h)):
@@ -180,7 +180,7 @@ def bernstein(s, theta, rate=0):
 class Transcription:
     """The nonlinear program of one mesh; weights, bounds and the ends are data of each solution.
 
-    Unknowns are states at the begin and all nodes (n_x, 1 + N s) and control points of the inputs (m, 1 + P s), each in
+    Unknowns are states at the start and all nodes (n_x, 1 + N s) and control points of the inputs (m, 1 + P s), each in
     units of its size. Constraints by kind: "motion" (n_x, N s), collocation; "begin" (m, 1), the highest coefficient of
     the inputs on the first interval, whose begin is no node; "slope" (m, P s), control points of u'; "bound" (b, P w);
     "rest" (r, 1).
@@ -320,7 +320,7 @@ def _at(pieces, t, rate):
 
 
 def _states_at(mesh, t):
-    """The matrix (1 + N s, M) from states at the begin and all nodes to those at instants (M,)."""
+    """The matrix (1 + N s, M) from states at the start and all nodes to those at instants (M,)."""
     from scipy.sparse import csc_matrix
 
     k, theta = mesh.place(t)

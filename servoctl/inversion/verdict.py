@@ -10,9 +10,9 @@ import casadi as ca
 import numpy as np
 
 from servoctl.errors import IntegrationStopped, ServoError, SingularProgram
-from servoctl.internal_dynamics import InternalDynamics, internal_dynamics
-from servoctl.inversion.kinks import SMOOTHER, kink
+from servoctl.growth import InternalDynamics, internal_dynamics
 from servoctl.methods.bounded import End, FreeEntries
+from servoctl.methods.kinks import SMOOTHER, kink, stays_on_kink
 from servoctl.model.model import Model
 from servoctl.model.start import State
 from servoctl.reduction.structure import margins
@@ -21,8 +21,8 @@ from servoctl.run import Run
 FLAT, MINIMUM, MARGINAL, SINGULAR = "flat", "minimum phase", "marginal", "singular at rest"
 HYPERBOLIC_ZEROS, GROWS = "non-minimum phase (hyperbolic)", "non-minimum phase"
 UNDETERMINED, UNREALISABLE, OPEN = "undetermined", "not realisable", "inconclusive"
-LOOKS = 5  # instants beside a path at which the program must stand still for its end to be a rest
-ASIDE = 0.25  # of the path's length: how far beside it they lie
+LOOKS = 5  # instants before and after a path at which the program must stand still for its end to be a rest
+ASIDE = 0.25  # of the path's length: how far from it they lie
 AT_ZERO = 1e-6  # of the fastest eigenvalue: a smaller one is zero, which rounding splits where it is double
 NEAR = 0.1  # of the sizes of the free entries: distance within which a run begins or ends in an unstable rest
 
@@ -60,6 +60,11 @@ class Verdict:
 
     def __post_init__(self):
         object.__setattr__(self, "dynamics", self.dynamics or self.word)
+
+    @property
+    def swings(self):
+        """Whether a rest has eigenvalues on the imaginary axis."""
+        return any(len(end.on_axis) for end in self.rest.values())
 
     @property
     def growth(self):
@@ -199,13 +204,13 @@ def _rests(model, states, along):
         entries = FreeEntries(model, t0, first)
     except ServoError as error:
         return rest, _first_sentence(error)
-    for name, t, x, beside in places[: 2 if t1 != t0 else 1]:
+    for name, t, x, around in places[: 2 if t1 != t0 else 1]:
         try:
             end = entries.equilibrium(t, rest["start"].x if rest else x)
         except IntegrationStopped as error:
             why = why or f"at t = {t:.4g} s: {_first_sentence(error)}"
             continue
-        moved = entries.moved(end, t + _reach(end, t1 - t0) * beside)
+        moved = entries.moved(end, t + _reach(end, t1 - t0) * around)
         far = along and end.unstable and np.abs((end.x - x) / entries.size)[entries.free].max() > NEAR
         if moved is None and not far and not _lost_rank(model, t, end.x):
             rest[name] = end
@@ -215,7 +220,7 @@ def _rests(model, states, along):
 
 
 def _reach(end, length):
-    """How far beside a rest the program must stand still [s]: a part of the path, or the time constant of a mode."""
+    """How long the program must stand still around a rest [s]: a part of the path, or the time constant of a mode."""
     fastest = np.abs(end.eigenvalues).max(initial=0.0)
     return ASIDE * abs(length) or (1 / fastest if fastest else 1.0)
 
@@ -256,7 +261,8 @@ def _judged(rest, internal, why, constants=()):
         if constants:
             reason += f"; 0 is the constant of {', '.join(constants)}"
             do = f"{' and '.join(constants)} determine velocities: if they have integrals, write these on coordinates"
-        return Verdict(MARGINAL, reason, do, **facts)
+        grows = grows or any(end.unstable_beyond_axis for end in rest.values())
+        return Verdict(GROWS if grows else MARGINAL, reason, do, **facts)
     counts = {end.unstable for end in rest.values()}
     if counts == {0}:
         return Verdict(GROWS if grows else MINIMUM, reason, **facts)
@@ -267,11 +273,8 @@ def _on_switch(model, motion, why):
     """The verdict where the program rests on a kink: by the growth along a run that leaves it."""
     if not isinstance(motion, Run):
         return Verdict(OPEN, why, f"pass a run that leaves it, along which errors are measured, or {SMOOTHER}")
-    x = motion.jets[: len(model.state_names)]
-    known = np.flatnonzero(np.isfinite(x).all(axis=0))
-    some = known[np.linspace(0, len(known) - 1, LOOKS).round().astype(int)]
-    if all(kink(model, motion.t[k], x[:, k]) for k in some):
-        return Verdict(OPEN, f"{why}; the run stays there", f"{SMOOTHER}, or begin beside it")
+    if stays_on_kink(model, motion):
+        return Verdict(OPEN, f"{why}; the run stays there", f"{SMOOTHER}, or begin off it")
     internal = internal_dynamics(model, motion)
     return _along(internal, why, {"internal": internal})
 

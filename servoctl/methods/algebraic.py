@@ -85,10 +85,8 @@ class _Algebraic(Stepping):
 
         Those of forces alone change the actuation, not the motion.
         """
-        r = self.model.reduction
-        of_motion = Branches(lambda s: (r.mechanism.q.where(s) or ("t",))[0] != "t")
-        of_motion.smooth([row.expression for row in r.rows], angles=True)
-        self.family = switching(self.model) if of_motion.switches else None
+        switched = self.model.once("switches of the motion", lambda: _switched(self.model.reduction))
+        self.family = switching(self.model) if switched else None
         if self.family is not None:
             branches = self.family.branches(t, x)
             self._use(self.family.at(branches))
@@ -193,3 +191,10 @@ class _Algebraic(Stepping):
                 return self._fail(block[solved], x, "Newton's method finds no solution of the program there")
             if solved:
                 self.progress(block[-1])
+
+
+def _switched(reduction):
+    """Whether a row of the motion has a kink or a switch that the motion may cross."""
+    branches = Branches(lambda s: (reduction.mechanism.q.where(s) or ("t",))[0] != "t")
+    branches.smooth([row.expression for row in reduction.rows], angles=True)
+    return bool(branches.switches)

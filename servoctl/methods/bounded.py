@@ -3,7 +3,7 @@
 Σ o_a entries z of the state are free, the invariants determine the others, and z' = f(t, z). Before and after its span
 the program stands still, so that f is autonomous there, with equilibria. The bounded motion leaves the first one along
 its unstable manifold and arrives at the other along its stable one: the components of z along the stable eigenspace
-are zero at the begin of a window that exceeds the span, those along the unstable one at its end (Devasia, Chen and
+are zero at the start of a window that exceeds the span, those along the unstable one at its end (Devasia, Chen and
 Paden 1996; Chen 1993). Collocation at the nodes of Radau IIA of order 13 turns this into equations for one banded
 Newton iteration with exact Jacobians; a mesh is refined until the defect between the nodes is below the tolerance.
 """
@@ -27,10 +27,10 @@ from servoctl.methods.accuracy import state_levels
 from servoctl.methods.motion import DEFAULT_SAMPLES, Motion, breakpoints, margin_at
 from servoctl.methods.radau import basis, radau
 from servoctl.model.switching import switching
-from servoctl.tolerances import CUTOFF, NOISE
+from servoctl.tolerances import CUTOFF, NOISE, TINY
 
 ORDER = 13  # of the collocation: seven nodes
-LONGEST = 4.0  # interval of the first mesh beside corners, in time constants of the fastest mode
+LONGEST = 4.0  # interval of the first mesh at corners, in time constants of the fastest mode
 FIRST_INTERVALS = 1000  # of a first mesh that need not resolve its fastest modes everywhere
 COARSEST = 10.0  # interval in time constants of the fastest unstable mode, up to which the collocation lets it grow
 MOST_INTERVALS = 4000
@@ -168,23 +168,41 @@ class End:
     def on_axis(self):
         """The eigenvalues on the imaginary axis: A is as near to a matrix with one there as rounding is.
 
-        Real parts alone do not tell: those of multiple eigenvalues are far larger than the rounding that splits them.
+        Real parts alone do not decide: those of multiple eigenvalues are far larger than the rounding that splits them.
         Halfway between such an eigenvalue and the axis A is as near to singular; between different ones it is not.
+        Nor does the size of A: rounding of each entry moves a slow mode by less than that of a fast one.
         """
         from scipy.linalg import matrix_balance
 
         scaled = self.A * self.size / self.size[:, None]
-        scaled = np.where(np.abs(scaled) > NOISE * np.abs(scaled).max(initial=0.0), scaled, 0.0)
-        balanced, one = matrix_balance(scaled, permute=False)[0], np.eye(len(scaled))
+        cut = np.where(np.abs(scaled) > NOISE * np.abs(scaled).max(initial=0.0), scaled, 0.0)
+        balanced, (scale, _) = matrix_balance(cut, permute=False, separate=True)
         size = np.linalg.norm(balanced)
         path = np.stack([1j * self.eigenvalues.imag, self.eigenvalues - self.eigenvalues.real / 2], axis=1)
-        distances = np.linalg.svd(balanced - path[:, :, None, None] * one, compute_uv=False)[:, :, -1]
-        return self.eigenvalues[distances.max(axis=1) <= HYPERBOLIC * size]
+        shifted = balanced - path[:, :, None, None] * np.eye(len(scaled))
+        distances = np.linalg.svd(shifted, compute_uv=False)[:, :, -1].max(axis=1)
+        moved = self._moved(scaled * scale / scale[:, None], HYPERBOLIC * np.abs(balanced) + NOISE * size)
+        return self.eigenvalues[(distances <= HYPERBOLIC * size) & (np.abs(self.eigenvalues.real) <= moved)]
+
+    @staticmethod
+    def _moved(A, change):
+        """The most by which a change of entries (f, f) moves each eigenvalue of A, |y|ᵀ change |x| / |yᴴx|, (f,)."""
+        from scipy.linalg import eig
+
+        values, left, right = eig(A, left=True)
+        moved = np.einsum("ik,ij,jk->k", np.abs(left), change, np.abs(right))
+        moved = moved / np.maximum(np.abs(np.einsum("ik,ik->k", left.conj(), right)), TINY)
+        return moved[np.lexsort((-values.imag, -values.real))]
 
     @property
     def unstable(self):
         """The number of unstable eigenvalues."""
         return int((self.eigenvalues.real > 0).sum())
+
+    @property
+    def unstable_beyond_axis(self):
+        """The number of unstable eigenvalues that are not on the imaginary axis."""
+        return int((np.setdiff1d(self.eigenvalues, self.on_axis).real > 0).sum())
 
     @property
     def fastest(self):
@@ -195,7 +213,8 @@ class End:
         """An orthonormal basis (k, f) of the left eigenspace of the unstable, or of the stable eigenvalues."""
         from scipy.linalg import schur
 
-        _, vectors, count = schur(self.A.T, output="real", sort="rhp" if unstable else "lhp")
+        split, sign = np.abs(self.on_axis.real).max(initial=0.0), 1 if unstable else -1  # as rounding splits them
+        _, vectors, count = schur(self.A.T, output="real", sort=lambda re, im: sign * re > split)
         return vectors[:, :count].T
 
 
@@ -339,7 +358,7 @@ class Problem(FreeEntries):
         unstable = [end.unstable for end in (self.first, self.last)]
         if unstable[0] != unstable[1]:
             raise UnstableInternalDynamics(
-                f"The internal dynamics have {unstable[0]} unstable modes at the begin, {unstable[1]} at the end.",
+                f"The internal dynamics have {unstable[0]} unstable modes at the start, {unstable[1]} at the end.",
                 "An isolated bounded motion has as many at both ends.",
                 do="Begin and end in equilibria of the same kind.",
                 unstable=unstable,
@@ -413,7 +432,7 @@ class Problem(FreeEntries):
             mesh = np.unique([t for a, b in pairwise(corners) for t in _graded(a, b, shortest, longest)])
             if len(mesh) <= MOST_INTERVALS or shortest == longest:
                 return mesh
-            shortest = min(2 * shortest, longest)  # beside many knots, layers are left to refinement
+            shortest = min(2 * shortest, longest)  # with many knots, layers are left to refinement
 
     def _require_resolved(self, window, longest):
         """Refuse a window in which the unstable modes need intervals too short for a mesh."""
@@ -436,9 +455,9 @@ class Problem(FreeEntries):
         return np.unique(np.concatenate([before, mesh, after]))
 
     def _lengths(self, window):
-        """Lengths [s] of first intervals, beside corners and between them.
+        """Lengths [s] of first intervals, at corners and between them.
 
-        Stable modes have layers beside corners; unstable ones must grow in every interval, as they do in truth.
+        Stable modes have layers at corners; unstable ones must grow in every interval, as they do in truth.
         """
         fastest = max(np.abs(end.eigenvalues).max(initial=0.0) for end in (self.first, self.last))
         unstable = max(self.first.fastest, self.last.fastest)
@@ -459,60 +478,78 @@ class Problem(FreeEntries):
             if not np.isfinite(size):
                 break
             x = x + step
-            if size <= NEWTON_ENDS or 0.1 * last < size <= STALLED:
+            following = size**2 if last == np.inf else size * (size / last) ** 2  # of quadratic convergence
+            if following <= NEWTON_ENDS or 0.1 * last < size <= STALLED:
                 return x
             last = size
         raise self._failure("Newton's method for the bounded motion does not converge.", self.span[0])
 
     def _newton_step(self, nodes, h, x):
-        """The Newton step (n_x, 1 + N s): stages are eliminated interval by interval, then the ends are solved for."""
+        """The Newton step (n_x, 1 + N s)."""
         rate, A, step, tangent = self.local(nodes, x)
         count, s, f = len(h), len(self.c), len(self.free)
         z = x[self.free].T
         stages, begin = z[1:].reshape(count, s, f), z[:-1:s]
         # D (ζ - z) - h z' = 0 with the increments ζ of the stages over the begin of their interval
-        length = h[:, None, None]
-        values = self.derivative @ (stages - begin[:, None]) - length * rate[1:].reshape(count, s, f)
+        missing = h[:, None, None] * rate[1:].reshape(count, s, f) - self.derivative @ (stages - begin[:, None])
+        at_ends = [(end.x[self.free] - z[i])[:, None] for i, end in ((0, self.first), (-1, self.last))]
+        dz = self.linear(h, A, missing.reshape(count * s, f, 1), at_ends)
+        return (step + (tangent @ dz)[:, :, 0]).T
+
+    def linear(self, h, A, right, at_ends):
+        """Solve the collocated ζ' = A ζ + b for k right sides: ζ (1 + N s, f, k) at the start and at all nodes.
+
+        Stages are eliminated interval by interval, then the ends of the intervals are solved for.
+
+        Parameters
+        ----------
+        h : (N,) array
+            Lengths of the intervals [s].
+        A : (1 + N s, f, f) array
+        right : (N s, f, k) array
+            h b at the nodes.
+        at_ends : two (f, k) arrays
+            What the stable components at the start, and the unstable ones at the end, are those of.
+        """
+        count, s, f, k = len(h), len(self.c), len(self.free), right.shape[2]
         K = np.tile(np.kron(self.derivative, np.eye(f)), (count, 1, 1)).reshape(count, s, f, s, f)
-        inside = A[1:].reshape(count, s, f, f)
+        inside, length = A[1:].reshape(count, s, f, f), h[:, None, None]
         for j in range(s):
             K[:, j, :, j] -= length * inside[:, j]
         onto_begin = np.tile(np.kron(self.derivative.sum(axis=1)[:, None], np.eye(f)), (count, 1, 1))
-        right = np.concatenate([-values.reshape(count, s * f, 1), onto_begin], axis=2)
-        eliminated = np.linalg.solve(K.reshape(count, s * f, s * f), right)
-        ends = self._solve_ends(eliminated[:, -f:, 0], eliminated[:, -f:, 1:], z)
-        inner = eliminated[:, :, 0] + (eliminated[:, :, 1:] @ ends[:-1, :, None])[:, :, 0]
-        dz = np.concatenate([ends[:1], inner.reshape(count * s, f)])
-        return (step + (tangent @ dz[:, :, None])[:, :, 0]).T
+        sides = np.concatenate([right.reshape(count, s * f, k), onto_begin], axis=2)
+        eliminated = np.linalg.solve(K.reshape(count, s * f, s * f), sides)
+        ends = self._solve_ends(eliminated[:, -f:, :k], eliminated[:, -f:, k:], at_ends)
+        inner = eliminated[:, :, :k] + eliminated[:, :, k:] @ ends[:-1]
+        return np.concatenate([ends[:1], inner.reshape(count * s, f, k)])
 
     @cached_property
     def _boundary_rows(self):
-        """Left eigenvectors of the stable modes at the begin (k, f), and of the unstable ones at the end (f - k, f)."""
+        """Left eigenvectors of the stable modes at the start (k, f), and of the unstable ones at the end (f - k, f)."""
         return self.first.left_space(unstable=False), self.last.left_space(unstable=True)
 
-    def _solve_ends(self, constants, factors, z):
-        """Steps (N + 1, f) at the mesh points: dz_(i+1) = constants_i + factors_i dz_i between the boundary rows."""
+    def _solve_ends(self, constants, factors, at_ends):
+        """ζ (N + 1, f, k) at the mesh points: ζ_(i+1) = constants_i + factors_i ζ_i between the boundary rows."""
         from scipy.linalg import solve_banded
 
-        before, after = self._boundary_rows
-        count, f, k = len(constants), z.shape[1], len(before)
-        matrix, right = np.zeros((4 * f + 1, (count + 1) * f)), np.zeros((count + 1) * f)
+        rows = self._boundary_rows
+        (count, f, k), first = constants.shape, len(rows[0])
+        matrix, right = np.zeros((4 * f + 1, (count + 1) * f)), np.empty(((count + 1) * f, k))
 
         def put(rows, columns, values):
             matrix[2 * f + rows - columns, columns] = values
 
-        i, j = np.indices((k, f))
-        put(i, j, before)
-        right[:k] = -before @ (z[0] - self.first.x[self.free])
+        i, j = np.indices((first, f))
+        put(i, j, rows[0])
         n, i, j = np.indices((count, f, f))
-        put(k + n * f + i, n * f + j, -factors)
+        put(first + n * f + i, n * f + j, -factors)
         n, i = np.indices((count, f))
-        put(k + n * f + i, (n + 1) * f + i, 1.0)
-        right[k : k + count * f] = constants.ravel()
-        i, j = np.indices((f - k, f))
-        put(k + count * f + i, count * f + j, after)
-        right[k + count * f :] = -after @ (z[-1] - self.last.x[self.free])
-        return solve_banded((2 * f, 2 * f), matrix, right).reshape(count + 1, f)
+        put(first + n * f + i, (n + 1) * f + i, 1.0)
+        i, j = np.indices((f - first, f))
+        put(first + count * f + i, count * f + j, rows[1])
+        right[:first], right[first + count * f :] = (each @ part for each, part in zip(rows, at_ends, strict=True))
+        right[first : first + count * f] = constants.reshape(count * f, k)
+        return solve_banded((2 * f, 2 * f), matrix, right).reshape(count + 1, f, k)
 
     # between the nodes
 
@@ -583,12 +620,12 @@ def _two_digits(length):
 
 
 def _graded(a, b, shortest, longest):
-    """A mesh from a to b: intervals grow by a factor of two from `shortest` beside both ends to `longest`."""
+    """A mesh from a to b: intervals grow by a factor of two from `shortest` at both ends to `longest`."""
     doubled = shortest * (2.0 ** np.arange(np.ceil(np.log2(longest / shortest))) * 2 - 1)
-    beside = np.append(0.0, doubled[3 * doubled < b - a])
-    low, high = a + beside[-1], b - beside[-1]
+    layer = np.append(0.0, doubled[3 * doubled < b - a])
+    low, high = a + layer[-1], b - layer[-1]
     between = np.linspace(low, high, max(1, int(np.ceil((high - low) / longest))) + 1)
-    return np.concatenate([a + beside[:-1], between, (b - beside[:-1])[::-1]])
+    return np.concatenate([a + layer[:-1], between, (b - layer[:-1])[::-1]])
 
 
 def subdivided(mesh, counts):

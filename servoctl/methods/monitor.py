@@ -6,6 +6,7 @@ as soon as the matrices are far better than it.
 """
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -244,11 +245,16 @@ class Monitor:
         self.best, self.lift = self._smallest(matrices), 1.0
         if before is not None:
             self._inherit(before, matrices)
-        self.m = len(model.invariant_names())
-        jacobian = self.invariants(t, x, model.parameters)[self.m :].reshape(len(x), self.m).T
-        sizes = motion_sizes(model, np.array([t, t + 1.0]), np.column_stack([x, x]))
+        self.m, self.start = len(model.invariant_names()), (t, np.array(x))
+
+    @cached_property
+    def gradients(self):
+        """Sizes of the invariants' gradients at the start, (m,)."""
+        t, x = self.start
+        jacobian = self.invariants(t, x, self.model.parameters)[self.m :].reshape(len(x), self.m).T
+        sizes = motion_sizes(self.model, np.array([t, t + 1.0]), np.column_stack([x, x]))
         sizes = np.where(sizes > 0, sizes, 1.0) + np.abs(x)
-        self.gradients = np.maximum(np.sqrt((jacobian**2 * sizes**2).sum(axis=1)), 1e-300)
+        return np.maximum(np.sqrt((jacobian**2 * sizes**2).sum(axis=1)), 1e-300)
 
     def _columns(self, t, x, matrices):
         """√M_ii, with which the entries of a row have one unit; for columns without inertia the size of their entries.
@@ -259,6 +265,8 @@ class Monitor:
         inertia = self.f(t, x, self.model.parameters)[-self.model.n :]
         metric = np.sqrt(np.where(inertia > 0, inertia, 0.0))
         moves, result = metric > 0, []
+        if moves.all():
+            return [metric, metric]
         for m, usual in zip(matrices, self.model.column_sizes, strict=True):
             scaled = np.abs(m) / np.where(moves, metric, 1.0)
             rows = scaled[:, moves].max(axis=1, initial=0.0)

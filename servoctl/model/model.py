@@ -1,6 +1,6 @@
 """The model: a reduction as functions on numbers, built at their first use."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
 from math import factorial
@@ -19,9 +19,10 @@ from servoctl.model.rest import started
 from servoctl.model.start import State
 from servoctl.model.store import Store, pack, unpack
 from servoctl.reduction.appell import require_positive
+from servoctl.reduction.idle import needed
 from servoctl.reduction.knots import require_smooth
 from servoctl.reduction.manifold import ON_MANIFOLD, solve
-from servoctl.reduction.reduce import holds, reduce, strong
+from servoctl.reduction.reduce import holds, reduce, require_parts, strong
 from servoctl.reduction.structure import structure
 from servoctl.spec.mechanism import Mechanism
 from servoctl.spec.program import Program
@@ -30,7 +31,9 @@ from servoctl.values import read_only
 SAMPLED = 50  # samples of a run at which its structure is decided; each takes tens of milliseconds
 
 
-def derive(mechanism: Mechanism, program: Program, guess: Mapping[str, float] | None = None) -> "Model":
+def derive(
+    mechanism: Mechanism, program: Program, guess: Mapping[str, float] | None = None, keep: Sequence[str] = (),
+) -> "Model":  # fmt: skip
     """Derive the reduced dynamics and the required actuation of a mechanism under its program (3.18).
 
     Parameters
@@ -40,6 +43,10 @@ def derive(mechanism: Mechanism, program: Program, guess: Mapping[str, float] | 
     guess : dict of str to float, optional
         Values of coordinates or derivatives near the motion. Ranks are decided at points of the constraint manifold
         near these values. Seldom needed.
+    keep : sequence of str, optional
+        Names of coordinates that are included although they play no part in the program. By default those are left
+        out, with their actuators and material constraints, that nothing couples to the coordinates in residuals,
+        weights, wishes, outputs and `guess`; the printed model counts them.
 
     Returns
     -------
@@ -62,13 +69,14 @@ def derive(mechanism: Mechanism, program: Program, guess: Mapping[str, float] | 
     RuntimeWarning
         For a residual that is a product and vanishes about the guess by more than one of its factors.
     """
-    model = derived(mechanism, program, guess)
+    require_parts(mechanism, program, guess)
+    model = derived(needed(mechanism, program, keep, guess or {}), program, guess)
     warn_of_products(model.reduction)
     return model
 
 
 def derived(mechanism, program, guess=None):
-    """The model of `derive`, without its warnings."""
+    """The model of all coordinates, without warnings."""
     return _derived(mechanism, program, guess)
 
 
@@ -238,6 +246,11 @@ class Model:
     def coordinate_names(self):
         """Names of the coordinates."""
         return self.reduction.mechanism.q.names
+
+    @property
+    def left_out(self):
+        """Names of the mechanism's coordinates that play no part in the program."""
+        return self.reduction.mechanism.left_out.get("coordinate", ())
 
     @property
     def actuators(self):

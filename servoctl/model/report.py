@@ -19,6 +19,7 @@ def describe(model):
     raised = _raised(r)
     lines = [
         f"Model: {' '.join(r.mechanism.q.names)}; {program}",
+        *_left_out(model),
         *([f"  {raised}"] if raised else []),
         *_hidden_and_free(model),
         f"  {_rule(r)}",
@@ -31,6 +32,13 @@ def describe(model):
     if model.knots:
         lines.append(f"  paths switch at t = {', '.join(f'{k:g}' for k in model.knots[:8])} s")
     return "\n".join(line if len(line) <= WIDTH else line[: WIDTH - 3] + "..." for line in lines)
+
+
+def _left_out(model):
+    """How many coordinates play no part in the program."""
+    names = model.left_out
+    count = f"{len(names)} coordinates play" if len(names) > 1 else f"The coordinate {''.join(names)} plays"
+    return [f"  {count} no part in this program: left out; keep= includes them"] if names else []
 
 
 def _by(r):

@@ -170,7 +170,7 @@ def consistent(model, t, held, guess, hold):
     """See `Model.start`."""
     values, conditions = _split_held(model, held, hold)
     n_x, states = len(model.state_names), model.state_names
-    guess = {name: _known(name, value, states) for name, value in mapping(guess, "The guesses").items()}
+    guess = {name: _known(model, name, value, states) for name, value in mapping(guess, "The guesses").items()}
     chosen = guess | values
     names = JetEquations(model, t, conditions).names
     aim = Aim.of(names, guess, values)
@@ -189,7 +189,7 @@ def _split_held(model, held, hold):
     """Held states by name, and conditions by name: outputs less their held values, and expressions that are zero."""
     mechanism, names = model.reduction.mechanism, model.state_names
     known, what = (*names, *mechanism.outputs), "state or output" if mechanism.outputs else "state"
-    values = {name: _known(name, value, known, what) for name, value in held.items()}
+    values = {name: _known(model, name, value, known, what) for name, value in held.items()}
     conditions = {name: mechanism.outputs[name] - value for name, value in values.items() if name not in names}
     for name, expression in mapping(hold, "The conditions").items():
         conditions[name] = _condition(name, expression, mechanism, known)
@@ -211,9 +211,9 @@ def _condition(name, expression, mechanism, known):
     return scalar
 
 
-def _known(name, value, names, what="state"):
+def _known(model, name, value, names, what="state"):
     if name not in names:
-        raise unknown(name, names, what)
+        raise model.reduction.mechanism.no(what, name, names)
     return finite(name, value)
 
 

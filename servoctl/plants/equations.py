@@ -15,6 +15,7 @@ from servoctl.reduction.manifold import Context, sample
 from servoctl.reduction.orders import Orders
 from servoctl.reduction.reduce import WINDOW, strong
 from servoctl.reduction.rows import as_rows
+from servoctl.values import Identity
 
 LATEST = 32  # plants whose equations stay in memory
 CLEAR = 1e-6  # a mass matrix with unit diagonal and a larger least eigenvalue is clearly positive definite
@@ -269,7 +270,7 @@ def _cases(values):
 
 def plant_equations(mechanism, *choices):
     """The `PlantEquations` of a mechanism, derived once for all plants that differ only in numbers."""
-    return _latest(_Identity(mechanism), choices)
+    return _latest(Identity(mechanism), choices)
 
 
 def equations_at(equations, values):
@@ -299,16 +300,3 @@ def equations_at(equations, values):
 @lru_cache(LATEST)
 def _latest(identity, choices):
     return PlantEquations(identity.value, *choices)
-
-
-class _Identity:
-    """A value that equals only itself: equations hold the symbols of one mechanism, not those of an equal one."""
-
-    def __init__(self, value):
-        self.value = value
-
-    def __eq__(self, other):
-        return self.value is other.value
-
-    def __hash__(self):
-        return id(self.value)

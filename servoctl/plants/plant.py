@@ -86,6 +86,40 @@ def plant(
     )  # fmt: skip
 
 
+def part_of(whole, mechanism):
+    """The plant of a mechanism that `derive` left coordinates out of, with the numbers of the whole one.
+
+    The whole plant, if it has no more coordinates, or if its forces couple them to those left out.
+
+    Parameters
+    ----------
+    whole : Plant
+    mechanism : Mechanism
+
+    Returns
+    -------
+    Plant
+    """
+    source, q = whole.mechanism, mechanism.q
+    if not mechanism.left_out or source.q.names == q.names:
+        return whole
+    kinds = (("q", source.q.names, q.names), ("w", source.q.velocity_names, q.velocity_names))
+    places = {(kind, i) for kind, names, kept in kinds for i, name in enumerate(names) if name in kept}
+    forces = dict(zip(whole.disturbable, whole.equations.forces.elements(), strict=True))
+    rows = [{("w", i), *source.places(force)} for i, force in enumerate(forces.values())]
+    if any(row & places and not row <= places for row in (*source.couplings(), *rows)):
+        return whole
+    part = source.part(places)
+    names = part.q.names if part.q.plain else part.q.velocity_names
+    by_actuator = ("limits", "rate_limits", "lag", "delay")
+    numbers = {what: {n: v for n, v in getattr(whole, what).items() if n in part.actuators} for what in by_actuator}
+    return plant(
+        part, forces={name: forces[name] for name in names if not forces[name].is_zero()},
+        damping={name: c for name, c in whole.damping.items() if name in names}, **numbers,
+        **dict(zip(part.parameters.names, whole.parameters.tolist(), strict=False)),
+    )  # fmt: skip
+
+
 @dataclass(frozen=True, eq=False)
 class Plant(Value):
     """The full mechanism under actuator inputs and disturbances, material constraints held; made by `plant`.

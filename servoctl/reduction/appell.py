@@ -117,7 +117,8 @@ def require_inertia(mechanism, material, points):
         raise SpecificationError(
             f"The mass matrix is singular: a direction of {', '.join(names)} has no inertia.",
             "M = ∂²S/∂γ''² is positive definite on the displacements that material constraints allow.",
-            do="Check the masses, the inertias and the values of their parameters, or remove a coordinate.",
+            do="Check the masses, the inertias and the values of their parameters, or remove a coordinate. The "
+            "parameter of a path as a coordinate has unit inertia and an actuator.",
             names=names,
         )
 

@@ -191,7 +191,7 @@ def reduce(mechanism, program, guess=None, near=None, values=None):
     SpecificationError, NotRealisable, SingularProgram, InconsistentStart
         See `hidden.complete` and `appell.realisation`.
     """
-    _require_parts(mechanism, program, guess)
+    require_parts(mechanism, program, guess)
     q = mechanism.q
     names = q.names if q.plain else q.velocity_names
     balance = wished_balance(mechanism, program)
@@ -278,7 +278,8 @@ def strong(pivots, before):
     return np.abs(pivots) >= WEAKER * np.abs(before)
 
 
-def _require_parts(mechanism, program, guess):
+def require_parts(mechanism, program, guess):
+    """Refuse what is no mechanism or no program, unknown symbols, names that differ not, and unknown guesses."""
     for value, kind in ((mechanism, Mechanism), (program, Program)):
         if not isinstance(value, kind):
             raise SpecificationError(

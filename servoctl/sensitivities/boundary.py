@@ -1,7 +1,7 @@
 """The tangent of a bounded motion: the linear boundary value problem of its variational equation.
 
 The free entries z of the state obey z' = f(t, z, p), so that their tangent obeys δz' = A δz + b with A = ∂f/∂z and
-b = ∂f/∂p. It is bounded if its stable components at the begin of the window, and its unstable ones at the end, are
+b = ∂f/∂p. It is bounded if its stable components at the start of the window, and its unstable ones at the end, are
 those of the equilibria, δz = -A⁻¹ b. It is collocated at the nodes of the motion itself.
 """
 
@@ -31,16 +31,18 @@ def bounded_tangent(model, run, names):
     Raises
     ------
     SpecificationError
-        If the samples do not tell the window of the motion.
+        If the samples do not determine the window of the motion.
     """
     problem, mesh, x = _recomputed(model, run)
     at_nodes = _Linear(problem, names, problem._nodes(mesh), x)
-    dz = _collocated(problem, at_nodes, np.diff(mesh))
+    h, s = np.diff(mesh), len(problem.c)
+    rest = [-np.linalg.solve(at_nodes.A[i], at_nodes.b[i]) for i in (0, -1)]
+    dz = problem.linear(h, at_nodes.A, np.repeat(h, s)[:, None, None] * at_nodes.b[1:], rest)
     k = np.clip(np.searchsorted(mesh, run.t, side="right") - 1, 0, len(mesh) - 2)
     weights = basis(problem.c, (run.t - mesh[k]) / (mesh[k + 1] - mesh[k]))
     at_samples = _Linear(problem, names, run.t, run.jets[: problem.n_x])
-    begin = dz[k * len(problem.c)]
-    stages = dz[1:].reshape(len(mesh) - 1, len(problem.c), *dz.shape[1:])[k]
+    begin = dz[k * s]
+    stages = dz[1:].reshape(len(h), s, *dz.shape[1:])[k]
     dz = begin + np.einsum("nsfk,sn->nfk", stages - begin[:, None], weights)
     return at_samples.lifted(dz).transpose(1, 2, 0)
 
@@ -99,24 +101,3 @@ def _rates_by(model, names):
         return compiled(f, "rates_by", ("rk",))  # which is evaluated at many points, and therefore compiled
 
     return model.once(f"rates by {' '.join(names)}", build)
-
-
-def _collocated(problem, linear, h):
-    """The tangent of the free entries (1 + N s, f, k) at the begin and at all nodes of the mesh."""
-    count, s, f, k = len(h), len(problem.c), len(problem.free), linear.b.shape[2]
-    inside, length = linear.A[1:].reshape(count, s, f, f), h[:, None, None]
-    K = np.tile(np.kron(problem.derivative, np.eye(f)), (count, 1, 1)).reshape(count, s, f, s, f)
-    for j in range(s):
-        K[:, j, :, j] -= length * inside[:, j]
-    onto_begin = np.tile(np.kron(problem.derivative.sum(axis=1)[:, None], np.eye(f)), (count, 1, 1))
-    right = np.concatenate([length * linear.b[1:].reshape(count, s * f, k), onto_begin], axis=2)
-    eliminated = np.linalg.solve(K.reshape(count, s * f, s * f), right)
-    rest = [-np.linalg.solve(linear.A[i], linear.b[i]) for i in (0, -1)]
-    ends = np.empty((count + 1, f, k))
-    for j in range(k):
-        beside = np.zeros((count + 1, f))  # at whose ends the equilibria lie by these amounts
-        beside[0] = problem.first.x[problem.free] - rest[0][:, j]
-        beside[-1] = problem.last.x[problem.free] - rest[1][:, j]
-        ends[:, :, j] = problem._solve_ends(eliminated[:, -f:, j], eliminated[:, -f:, k:], beside)
-    inner = eliminated[:, :, :k] + eliminated[:, :, k:] @ ends[:-1]
-    return np.concatenate([ends[:1], inner.reshape(count * s, f, k)])

@@ -24,8 +24,8 @@ from servoctl.tolerances import TINY
 from servoctl.values import Value
 
 CONVERGES = 1e-10  # of least squares: relative changes of the sum, the unknowns and the gradient
-PRIOR = 1e-3  # weight of relative changes of the parameters, beside residuals near 1: it decides what is not seen
-UNSEEN = 1.0  # relative standard deviation above which the data do not tell the size of a combination of parameters
+PRIOR = 1e-3  # weight of relative changes of the parameters, against residuals near 1: it decides what is not seen
+UNSEEN = 1.0  # relative standard deviation above which the data do not determine a combination of parameters
 TAKES_PART = 0.1  # of a direction's length: parameters that take part in a combination
 PIECES = (16, 4, 1)  # into which a run is cut, one after the other: over long times a first guess leads far away
 SHORTER = 4  # times as many pieces, where the motion is not finite in these
@@ -45,11 +45,11 @@ class Identification(ByName, Value):
     names : tuple of str
         Of the parameters.
     values, deviations : (k,) arrays
-        The parameters, and their standard deviations; infinite where the data do not tell them.
+        The parameters, and their standard deviations; infinite where the data do not determine them.
     covariance : (k, k) array
         With unseen combinations left out.
     unseen : tuple of dict of str to float
-        Combinations of relative changes of the parameters that the data do not tell.
+        Combinations of relative changes of the parameters that the data do not determine.
     misfit : float
         Root mean square of the residuals relative to the noise: near 1 if plant and noise levels are right.
     starts : tuple of (n_x,) arrays
@@ -314,7 +314,7 @@ class _Problem:
         measured = np.array([piece.measured[name] for name in self.noise]) / self.weights[:, None]
         return (measured - y[:, 0]).ravel(), -y[:, 1:].swapaxes(1, 2).reshape(-1, self.k + self.n_x)
 
-    # functions of the plant, kept beside its equations
+    # functions of the plant, cached with its equations
 
     def _kept(self, what, build):
         functions = self.plant.equations.functions
@@ -431,7 +431,7 @@ def _identified(plant, fit, sizes):
     theta, J = x[: problem.k], problem.jacobian(x)
     sizes = np.maximum(np.abs(theta), sizes)
     sizes = np.where(sizes > 0, sizes, 1.0)
-    covariance, deviations, unseen = _told(problem.names, J[:, : problem.k] * sizes, J[:, problem.k :])
+    covariance, deviations, unseen = _determined(problem.names, J[:, : problem.k] * sizes, J[:, problem.k :])
     return Identification(
         problem.names, theta, deviations * sizes, covariance * np.outer(sizes, sizes), unseen, fit.misfit,
         problem.first_states(x), problem.by_name(x),
@@ -451,8 +451,8 @@ def _message(fit, unseen):
     return ", ".join(parts) + ("; not all are seen" if unseen else "")
 
 
-def _told(names, by_parameters, by_starts):
-    """Relative covariance (k, k) and deviations (k,), and the combinations that the data do not tell.
+def _determined(names, by_parameters, by_starts):
+    """Relative covariance (k, k) and deviations (k,), and the combinations that the data do not determine.
 
     What first states explain is taken out of the derivatives by the parameters.
     """

@@ -3,9 +3,8 @@
 from servoctl.codegen.cache import clear, entries, folders
 
 
-def add_cache(commands):
-    """Add the command to the subparsers of the command line."""
-    cache = commands.add_parser("cache", help="where compiled code and derivations are kept on disk, and how much")
+def add_cache(cache):
+    """Add the arguments of the command."""
     cache.add_argument("--clear", action="store_true", help="delete all of it; it is made again where it is needed")
     cache.set_defaults(command=_cache)
 

@@ -7,9 +7,8 @@ from servoctl.shell.options import MANY, SCENE_HELP, assignment, by_name
 from servoctl.shell.scenes import find_scene
 
 
-def add_export(commands):
-    """Add the command to the subparsers of the command line."""
-    export = commands.add_parser("export-c", help="the feedforward and residuals of a scene as one C file and header")
+def add_export(export):
+    """Add the arguments of the command."""
     export.add_argument("scene", metavar="NAME_OR_FILE", help=SCENE_HELP)
     export.add_argument("--out", metavar="DIR", required=True, help="folder for the two files")
     export.add_argument("--name", help="prefix of the files and of all functions; default: the scene's name")

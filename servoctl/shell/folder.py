@@ -1,50 +1,20 @@
-"""What a run leaves: its printed report, the folder with its files, and its summary."""
+"""What a run leaves: the folder with its files, and its summary."""
 
 import contextlib
 import json
 import math
 import os
-import sys
 import tempfile
-import textwrap
 from pathlib import Path
 
 import servoctl as sv
 from servoctl.checks import as_path
 from servoctl.errors import ServoError
+from servoctl.shell.printing import complain
 from servoctl.study.table import machine
 
-COLUMNS = 120  # width of printed lines
 FILES = ("run.npz", "summary.json", "report.txt", "path.png", "coordinates.png", "actuation.png", "residuals.png")
 LOOP_FILES = ("closed_loop.npz", "closed_loop.png")
-
-
-class Report:
-    """Prints values, and keeps what it printed in `text`."""
-
-    def __init__(self):
-        self.text = ""
-
-    def say(self, value):
-        """Print a value, with long lines wrapped."""
-        text = "\n".join(_wrapped(line, "    ") for line in str(value).splitlines()) + "\n"
-        self.text = f"{self.text}\n{text}" if self.text else text
-        try:
-            print(text, flush=True)
-        except BrokenPipeError:  # a reader that stops reading, such as head, does not stop the computation
-            sys.stdout = open(os.devnull, "w")
-
-
-def complain(*texts):
-    """Print texts to stderr, with long lines wrapped."""
-    for text in texts:
-        print(_wrapped(text, "  "), file=sys.stderr)
-
-
-def _wrapped(line, indent):
-    if len(line) <= COLUMNS:
-        return line
-    return textwrap.fill(line, COLUMNS, subsequent_indent=indent, break_on_hyphens=False)
 
 
 class Folder:

@@ -4,6 +4,7 @@ import math
 
 import servoctl as sv
 from servoctl.errors import ServoError, SpecificationError, unknown
+from servoctl.figures.style import write_png
 from servoctl.shell.options import MANY, assignment, by_name, deviation, limits, positive, used, whole
 
 LAWS = ("lqr", "computed", "feedforward")
@@ -133,4 +134,4 @@ def save_figure(closed, folder, units, title):
     """Write closed_loop.png."""
     figure = sv.figures.closed(closed, units=units)[0].figure
     figure.suptitle(f"{title}: closed loop, {closed.law.name}, {closed.law.rate:g} Hz")
-    figure.savefig(folder / "closed_loop.png", dpi=100)
+    write_png(figure, folder / "closed_loop.png")

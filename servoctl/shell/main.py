@@ -1,15 +1,22 @@
-"""The command line: its parser, and the commands without a motion, `servoctl list` and `servoctl report`."""
+"""The command line: its parser. The module of a command is imported when it is the one that is given."""
 
 import argparse
-import os
 import sys
-from pathlib import Path
+from importlib import import_module
 
-import servoctl as sv
-from servoctl.errors import NotRealisable, ServoError
-from servoctl.shell import cache, export, run, sweep, tradeoff
-from servoctl.shell.folder import Report, complain
-from servoctl.shell.scenes import find_scene
+from servoctl.errors import ServoError
+from servoctl.shell.printing import complain
+from servoctl.version import __version__
+
+COMMANDS = {  # name: module, its function that adds the arguments, help
+    "list": ("listing", "add_list", "the gallery's scenes"),
+    "report": ("report", "add_report", "the derivation of a model, its structure, its verdict; no simulation"),
+    "run": ("run", "add_run", "derive, simulate, verify; write figures and numbers to a folder"),
+    "tradeoff": ("tradeoff", "add_tradeoff", "measure errors and costs of methods and treatments of drift"),
+    "sweep": ("sweep", "add_sweep", "many cases of a scene, on several processes or machines, in one table"),
+    "export-c": ("export", "add_export", "the feedforward and residuals of a scene as one C file and header"),
+    "cache": ("cache", "add_cache", "where compiled code and derivations are kept on disk, and how much"),
+}
 
 
 def main(argv=None):
@@ -26,8 +33,9 @@ def main(argv=None):
         0 done; 1 the motion stopped early, its verification failed, or files were written to another folder; 2 an
         error, explained on stderr; 3 the verification is inconclusive; 130 interrupted.
     """
-    args = _parser().parse_args(argv)
-    args.command_line = list(sys.argv[1:] if argv is None else argv)
+    argv = list(sys.argv[1:] if argv is None else argv)
+    args = _parser(argv).parse_args(argv)
+    args.command_line = argv
     for stream in (sys.stdout, sys.stderr):
         if hasattr(stream, "reconfigure"):
             stream.reconfigure(errors="replace")  # a run must not fail because a terminal has no Greek letters
@@ -41,7 +49,7 @@ def main(argv=None):
         return 130
 
 
-def _parser():
+def _parser(argv):
     parser = argparse.ArgumentParser(
         prog="servoctl",
         description="Inverse dynamics and motions of mechanisms under program constraints of any order.",
@@ -49,64 +57,12 @@ def _parser():
         "servoctl report my_scene.py, a file that defines scene() -> (Mechanism, Program).",
     )
     parser.add_argument(
-        "--version", action="version", version=f"servoctl {sv.__version__}", help="print the version and exit"
+        "--version", action="version", version=f"servoctl {__version__}", help="print the version and exit"
     )
     commands = parser.add_subparsers(required=True, metavar="command")
-    listing = commands.add_parser("list", help="the gallery's scenes")
-    listing.set_defaults(command=_list)
-    report = commands.add_parser("report", help="the derivation of a model, its structure, its verdict; no simulation")
-    report.add_argument("scene", metavar="NAME_OR_FILE", help="a gallery name, a .py file, or the folder of a run")
-    report.set_defaults(command=_report)
-    for add in (run.add_run, tradeoff.add_tradeoff, sweep.add_sweep, export.add_export, cache.add_cache):
-        add(commands)
+    given = next((text for text in argv if not text.startswith("-")), None)
+    for name, (module, add, about) in COMMANDS.items():
+        command = commands.add_parser(name, help=about)
+        if name == given:
+            getattr(import_module(f"servoctl.shell.{module}"), add)(command)
     return parser
-
-
-def _list(args):
-    from servoctl.gallery import gallery
-
-    width = max(map(len, gallery))
-    for name, scene in gallery.items():
-        print(f"{name:{width}}  {scene.description}")
-    return 0
-
-
-def _report(args):
-    from servoctl.gallery import gallery
-
-    if args.scene not in gallery and os.path.isdir(args.scene):
-        print(_earlier_report(Path(args.scene)), end="")
-        return 0
-    report = Report()
-    _, scene = find_scene(args.scene)
-    mechanism, program = scene.build()
-    report.say(mechanism)
-    try:
-        model = sv.derive(mechanism, program)
-    except NotRealisable:
-        report.say(sv.report(mechanism, program))
-        return 0
-    report.say(model)
-    report.say(model.structure())
-    report.say(sv.report(model, _start_of(model, scene)))
-    return 0
-
-
-def _start_of(model, scene):
-    """The scene's start; None if there is none, which the report then says."""
-    try:
-        return model.start(t=scene.t_span[0], guess=scene.guess, **scene.start)
-    except ServoError:
-        return None
-
-
-def _earlier_report(folder):
-    try:
-        return (folder / "report.txt").read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        raise ServoError(
-            f"{folder} has no report.txt that can be read: {getattr(error, 'strerror', None) or error}.",
-            "Each folder that servoctl run writes, by default servoctl-runs/NAME, has one.",
-            do="Give such a folder, a gallery name, or a .py file that defines scene().",
-            folder=str(folder),
-        ) from error

@@ -9,18 +9,18 @@ from servoctl.inversion.verdict import HYPERBOLIC_ZEROS, verdict
 from servoctl.methods.choice import as_drift, as_method, default_method
 from servoctl.methods.runge_kutta import ORDERS
 from servoctl.shell import loop
-from servoctl.shell.folder import FILES, LOOP_FILES, Report, complain, folder_of, summary
+from servoctl.shell.folder import FILES, LOOP_FILES, folder_of, summary
 from servoctl.shell.motion import described
 from servoctl.shell.options import METHODS_HELP, add_motion, drift, samples, used
+from servoctl.shell.printing import Report, complain
 from servoctl.shell.scenes import find_scene
 
 SETTINGS = ("method", "drift", "accuracy", "step", "rtol", "atol")  # options that decide how a motion is computed
 INCONCLUSIVE = 3  # exit code where nothing failed and something could not be verified
 
 
-def add_run(commands):
-    """Add the command to the subparsers of the command line."""
-    run = commands.add_parser("run", help="derive, simulate, verify; write figures and numbers to a folder")
+def add_run(run):
+    """Add the arguments of the command."""
     add_motion(run)
     run.add_argument("--out", metavar="DIR", help="folder; files of an earlier run are replaced")
     run.add_argument("--accuracy", type=float, metavar="E", help="largest error of the motion; sets method and steps")

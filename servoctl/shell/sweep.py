@@ -2,15 +2,15 @@
 
 import functools
 import inspect
-import multiprocessing
 import os
-from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 
 import servoctl as sv
 from servoctl.errors import ServoError, SpecificationError, unknown
-from servoctl.shell.folder import Report, complain, folder_of
+from servoctl.figures.style import write_png
+from servoctl.shell.folder import folder_of
 from servoctl.shell.options import MANY, METHODS_HELP, by_name, count, draw, drawn, draws, shard, used, variation, whole
+from servoctl.shell.printing import Report, complain
 from servoctl.shell.scenes import find_scene, own_case, stamp
 from servoctl.study.sweep import require_fitting
 
@@ -18,9 +18,8 @@ from servoctl.study.sweep import require_fitting
 COMPUTING = ("vary", "monte_carlo", "draw", "seed", "t_span", "method", "workers", "shard", "resume")
 
 
-def add_sweep(commands):
-    """Add the command to the subparsers of the command line."""
-    sweep = commands.add_parser("sweep", help="many cases of a scene, on several processes or machines, in one table")
+def add_sweep(sweep):
+    """Add the arguments of the command."""
     scene = "a gallery name, or a .py file with scene() or case(**parameters)"
     sweep.add_argument("scene", metavar="NAME_OR_FILE", nargs="?", help=scene)
     vary = {"type": variation, "metavar": "NAME=LOW:HIGH:N", **MANY}
@@ -91,7 +90,10 @@ def _computed(args, folder):
     if args.workers in (None, 1):
         study = sv.sweep(case, cases, **options)
     else:
-        with ProcessPoolExecutor(args.workers, mp_context=multiprocessing.get_context("spawn")) as pool:
+        from concurrent.futures import ProcessPoolExecutor
+        from multiprocessing import get_context
+
+        with ProcessPoolExecutor(args.workers, mp_context=get_context("spawn")) as pool:
             study = sv.sweep(case, cases, executor=pool, **options)
     if not study.meta["interrupted"] and not study.meta["lost"]:
         checkpoint.unlink()
@@ -208,7 +210,7 @@ def _leave(study, folder, stem, units):
     except SpecificationError as error:
         complain(f"There is no figure: {error}")
     else:
-        folder.write(lambda path: figure.savefig(path / f"{stem}.png"))
+        folder.write(lambda path: write_png(figure, path / f"{stem}.png"))
         written.append(f"{stem}.png")
     print(f"{', '.join(written)} in {folder.path}")
     whole = study.meta["shard"] is not None or len(study) == study.meta["count"]

@@ -1,17 +1,18 @@
 """`servoctl tradeoff`: measure errors and costs of methods and treatments of drift on a scene, and recommend one."""
 
 import servoctl as sv
-from servoctl.shell.folder import Report, folder_of
+from servoctl.figures.style import write_png
+from servoctl.shell.folder import folder_of
 from servoctl.shell.motion import described
 from servoctl.shell.options import add_motion, drift, positive
+from servoctl.shell.printing import Report
 from servoctl.shell.scenes import find_scene
 
 FILES = ("tradeoff.npz", "tradeoff.csv", "tradeoff.png", "report.txt", "summary.json")
 
 
-def add_tradeoff(commands):
-    """Add the command to the subparsers of the command line."""
-    trade = commands.add_parser("tradeoff", help="measure errors and costs of methods and treatments of drift")
+def add_tradeoff(trade):
+    """Add the arguments of the command."""
     add_motion(trade)
     trade.add_argument("--out", metavar="DIR", help="folder; default servoctl-runs/NAME-tradeoff")
     trade.add_argument("--method", nargs="+", metavar="M", help="methods to measure; default: all but RK1, RK2, RK23")
@@ -39,7 +40,7 @@ def _measured(args, name, scene, folder):
     folder.write(lambda path: study.save(path / "tradeoff.npz"))
     folder.write(lambda path: study.csv(path / "tradeoff.csv"))
     figure = study.plot(title=name).figure
-    folder.write(lambda path: figure.savefig(path / "tradeoff.png", dpi=100))
+    folder.write(lambda path: write_png(figure, path / "tradeoff.png"))
     try:
         best = _recommended(study, args, report)
     finally:  # also where no setting is good enough

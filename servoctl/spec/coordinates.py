@@ -40,6 +40,7 @@ class Coordinates:
         self.velocity_names = tuple(f"d{name}" for name in names)
         self.V, self.h, self.invariants = ca.SX.eye(self.nq), ca.SX.zeros(self.nq), {}
         self.plain = True
+        self._whole = None  # of a part: the coordinates whose symbols it has, and the places of its velocities there
 
     def __iter__(self):
         return iter(self._q)
@@ -107,6 +108,32 @@ class Coordinates:
                     )
         return other
 
+    def part(self, places, velocities):
+        """Some of the coordinates and velocities, with the same symbols.
+
+        Parameters
+        ----------
+        places, velocities : sequence of int
+            Of the coordinates q and of γ', of which q' = V w + h couples none to the others.
+
+        Returns
+        -------
+        Coordinates
+        """
+        other = Coordinates(tuple(self.names[i] for i in places))
+        other.t, other._q = self.t, tuple(self._q[i] for i in places)
+        other._index = {self.t.element_hash(): ("t", 0, 0)}
+        other._index |= {s.element_hash(): ("q", 0, i) for i, s in enumerate(other._q)}
+        other.velocity_names = tuple(self.velocity_names[i] for i in velocities)
+        other.V, other.h, other.plain = self.V[places, velocities], self.h[places], self.plain
+        known = {s.element_hash() for s in other._q}
+        other.invariants = {
+            name: value for name, value in self.invariants.items()
+            if {s.element_hash() for s in ca.symvar(value)} & known
+        }  # fmt: skip
+        other._whole = self, tuple(velocities)
+        return other
+
     def w(self, k=0):
         """Symbols of the k-th derivative of the quasi-velocities, γ^(k+1): a tuple of n SX scalars."""
         return self.gamma(_order(k) + 1)
@@ -115,9 +142,10 @@ class Coordinates:
         """Symbols of γ^(k), k >= 1: a tuple of n SX scalars. γ' are the quasi-velocities."""
         k = _order(k, least=1)
         if k not in self._w:
+            shared = None if self._whole is None else tuple(self._whole[0].gamma(k)[i] for i in self._whole[1])
             with _lock:  # threads that derive from one mechanism share its symbols
                 if k not in self._w:
-                    symbols = tuple(map(ca.SX.sym, self.jet_names(k)))
+                    symbols = shared or tuple(map(ca.SX.sym, self.jet_names(k)))
                     self._index |= {s.element_hash(): ("w", k, i) for i, s in enumerate(symbols)}
                     self._w[k] = symbols
         return self._w[k]
@@ -164,7 +192,12 @@ class Coordinates:
 
     def where(self, symbol):
         """What a symbol is: ("t", 0, 0), ("q", 0, i), ("w", k, i) for γ_i^(k), or None."""
-        return self._index.get(require_kind(ca.SX, "symbol", symbol, "q.d(1)").element_hash())
+        key = require_kind(ca.SX, "symbol", symbol, "q.d(1)").element_hash()
+        if key not in self._index and self._whole is not None:
+            kind, k, i = self._whole[0].where(symbol) or ("", 0, 0)
+            if kind == "w" and i in self._whole[1]:
+                self.gamma(k)
+        return self._index.get(key)
 
     def order(self, expression):
         """The highest k for which γ^(k) is in an expression; 0 for q alone, -1 for neither."""

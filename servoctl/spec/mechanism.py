@@ -8,13 +8,15 @@ import casadi as ca
 import numpy as np
 
 from servoctl.checks import column, mapping, require_kind
-from servoctl.errors import SpecificationError, unknown
+from servoctl.errors import NameUnknown, SpecificationError, unknown
 from servoctl.jets.identity import spread, vanish
 from servoctl.jets.tape import Tape, evaluate
-from servoctl.spec.coordinates import Coordinates
+from servoctl.spec.coordinates import Coordinates, jet_name
 from servoctl.spec.packing import packed, unpacked
 from servoctl.spec.parameters import Parameters
+from servoctl.spec.sums import summands, without
 from servoctl.tolerances import ENTRY
+from servoctl.values import Identity
 
 IDENTITY_SEED = 20021  # of the random points at which identities are tested
 RANDOM = (0.3, 1.3)  # range of these, with parameters in units of their defaults: of order one, and away from zero
@@ -76,6 +78,7 @@ class Mechanism:
         constraints=None,
         outputs=None,
     ):
+        self.left_out = {}
         self.q = require_kind(Coordinates, "q", q, 'sv.coordinates("x y")')
         parameters = Parameters({}) if parameters is None else parameters
         self.parameters = require_kind(Parameters, "parameters", parameters, "sv.parameters(m=1.0, ...)")
@@ -118,7 +121,8 @@ class Mechanism:
             *self.constraints.values(), *self.outputs.values(),
         ]  # fmt: skip
         function = q.as_function([*expressions, *self.reported.values()], p.symbols).serialize()
-        return json.dumps([names, list(self.outputs), self.inputs, list(self.reported), p.defaults]) + "\n" + function
+        facts = [names, list(self.outputs), self.inputs, list(self.reported), p.defaults, self.left_out]
+        return json.dumps(facts) + "\n" + function
 
     def __eq__(self, other):
         if type(other) is not type(self):
@@ -137,6 +141,73 @@ class Mechanism:
     def __reduce__(self):
         content = packed(vars(self), self.q, self.parameters, {"parameters": self.parameters})
         return _restored, (self.q, self.parameters, content)
+
+    def places(self, *expressions):
+        """Coordinates and velocities in expressions: a set of ("q", i) and ("w", i)."""
+        found = (self.q.where(s) for e in expressions for s in ca.symvar(ca.SX(e)))
+        return {(place[0], place[2]) for place in found if place is not None and place[0] != "t"}
+
+    def couplings(self):
+        """What is coupled: a list of sets of places, one for each term.
+
+        Terms are those of inertia and potential, the rows of forces and of q' = V w + h, the invariants, the material
+        constraints, and the directions of actuators.
+        """
+        q = self.q
+        energies = [e for e in (self._gibbs, self._kinetic, self.potential) if e is not None]
+        terms = [self.places(term) for energy in energies for term in summands(energy, self.places)]
+        rows = [self._applied] if self._inverse_dynamics is None else [self._applied, self._inverse_dynamics]
+        terms += [{("w", i), *self.places(row[i])} for row in rows for i in range(q.n)]
+        terms += [{("q", i), *self._along(q.V[i, :].T), *self.places(q.h[i])} for i in range(q.nq)]
+        terms += [self.places(e) for e in (*q.invariants.values(), *self.constraints.values())]
+        return terms + [self.driven(name) for name in self.actuators]
+
+    def driven(self, actuator):
+        """Places that an actuator couples."""
+        return self._along(self.E[:, self.actuators.index(actuator)])
+
+    def _along(self, direction):
+        """Places of the velocities along a direction (n,), and in its entries."""
+        entries = {i: direction[i] for i in range(self.q.n) if not direction[i].is_zero()}
+        return {*(("w", i) for i in entries), *self.places(*entries.values())}
+
+    def part(self, places):
+        """The mechanism of some of its coordinates and velocities, to which nothing couples the others.
+
+        Parameters
+        ----------
+        places : set of ("q", i) and ("w", i)
+            Whole unions of `couplings`.
+
+        Returns
+        -------
+        Mechanism
+            With the same symbols and all parameters; `left_out` has the names of the others by kind.
+        """
+        return _part(Identity(self), frozenset(places))
+
+    def no(self, what, name, valid):
+        """The `NameUnknown` of a name that is not valid; of one that plays no part, how to include it.
+
+        Parameters
+        ----------
+        what : str
+            Kind of the valid names.
+        name : str
+        valid : sequence of str
+        """
+        for kind, names in self.left_out.items():
+            for other in names:
+                coordinates = [other] if kind == "coordinate" else list(self.left_out["coordinate"])
+                if name in (f"multiplier_{other}", *(jet_name(other, k, kind == "coordinate") for k in range(8))):
+                    return NameUnknown(
+                        f"{name!r} belongs to the {kind} {other}, which plays no part in the program.",
+                        "A model leaves out what nothing couples to its program.",
+                        do=f"Include it: sv.derive(mechanism, program, keep={coordinates}).",
+                        name=name,
+                        left_out=other,
+                    )
+        return unknown(name, valid, what)
 
     def under(self, inputs, forces, reported=None):
         """The mechanism without actuators, whose inputs are forces and outputs instead.
@@ -404,6 +475,37 @@ class Mechanism:
                 seen[name] = what
 
 
+@lru_cache(32)
+def _part(identity, places):
+    whole = identity.value
+    q, part = whole.q, object.__new__(Mechanism)
+    coordinates, velocities = ([i for i in range(n) if (kind, i) in places] for kind, n in (("q", q.nq), ("w", q.n)))
+    columns = [j for j, name in enumerate(whole.actuators) if whole.driven(name) <= places]
+
+    def rows(vector):
+        return None if vector is None else vector[velocities]
+
+    def terms(energy):
+        return None if energy is None else without(energy, whole.places, lambda e: not whole.places(e) <= places)
+
+    part.q, part.parameters = q.part(coordinates, velocities), whole.parameters
+    part._gibbs, part._kinetic, part.potential = map(terms, (whole._gibbs, whole._kinetic, whole.potential))
+    part._inverse_dynamics, part._applied, part.forces = map(
+        rows, (whole._inverse_dynamics, whole._applied, whole.forces)
+    )
+    part.actuators, part.E = tuple(whole.actuators[j] for j in columns), whole.E[velocities, columns]
+    part.constraints = {name: e for name, e in whole.constraints.items() if whole.places(e) <= places}
+    part.outputs, part.inputs, part.reported = whole.outputs, whole.inputs, whole.reported
+    groups = {
+        "coordinate": (q.names, part.q.names),
+        "quasi-velocity": ((), ()) if q.plain else (q.velocity_names, part.q.velocity_names),
+        "actuator": (whole.actuators, part.actuators),
+        "material constraint": (whole.constraints, part.constraints),
+    }
+    part.left_out = {what: tuple(n for n in names if n not in kept) for what, (names, kept) in groups.items()}
+    return part
+
+
 def _restored(q, parameters, content):
     mechanism = object.__new__(Mechanism)
     vars(mechanism).update(unpacked(content, q, parameters, {"parameters": parameters}))
@@ -426,6 +528,8 @@ def require_known(expression, mechanism, what):
     q, known = mechanism.q, {s.element_hash() for s in mechanism.parameters.symbols}
     for s in ca.symvar(expression):
         if q.where(s) is None and s.element_hash() not in known:
+            if (error := mechanism.no("symbol", s.name(), ())).details.get("left_out"):
+                raise error
             names = ["t", *q.names, *q.jet_names(1), *q.jet_names(2), *mechanism.parameters.names]
             hint = unknown(s.name(), names, "symbol")
             same = s.name() in names

@@ -11,7 +11,10 @@ either side of a knot. A path of class C^k has k continuous derivatives; the doc
 arguments. A path along a time law has the lower of both classes.
 """
 
+import functools
+import itertools
 import math
+from fractions import Fraction
 
 import casadi as ca
 import numpy as np
@@ -19,6 +22,7 @@ import numpy as np
 from servoctl.checks import as_numbers, column, is_number, is_whole, named
 from servoctl.errors import SpecificationError
 
+TIMED_BY_SYMBOLS = 6  # class of a spline whose times are expressions, beyond which they lose 1e-6 to rounding
 SMOOTHEST = 100  # class of a path, beyond which the terms of its polynomials leave the range of a double
 MISSED = 1e-9  # largest distance of a spline from its points, relative to the largest point
 ORTHONORMAL = 1e-9  # largest difference of products of a circle's axes from those of orthonormal vectors
@@ -192,16 +196,16 @@ def spline(t, times, points, smoothness=2, ends="rest"):
     along a time law, or a plan that starts in motion.
 
     A high smoothness over very uneven times overshoots between the points: choose times in proportion to
-    the distances between them.
+    the distances between them. Times that are expressions of parameters allow a smoothness up to 6.
 
     Parameters
     ----------
     t : SX or float
         Time [s], or a time law.
-    times : (n,) array
-        Strictly increasing times [s] (values of the time law), n >= 2.
-    points : (n,) or (n, dim) array
-        The via points, SI.
+    times : (n,) array, SX or sequence of SX
+        Strictly increasing times [s] (values of the time law), n >= 2; expressions of parameters where these increase.
+    points : (n,) or (n, dim) array, SX or nested sequences of SX
+        The via points, SI; numbers or expressions of parameters.
     smoothness : int, optional
         Class k >= 0 of the path.
     ends : {"rest", "natural"}, optional
@@ -223,18 +227,35 @@ def spline(t, times, points, smoothness=2, ends="rest"):
     named(ends, ("rest", "natural"), "spline end")
     t, k = _scalar(t, "t"), _smoothness(smoothness)
     times, points = _via_points(times, points)
+    for what, entries in (("times", times), ("points", points)):
+        if t.is_symbolic() and isinstance(entries, ca.SX) and ca.depends_on(entries, t):
+            raise SpecificationError(
+                f"The spline's {what} contain {t}.",
+                "A spline is a polynomial of its first argument between constant times.",
+                do="Use parameters (sv.parameters), or line and rest_to_rest for ends that move.",
+                what=what,
+            )
+    if isinstance(times, ca.SX):
+        k = _smoothness(k, most=TIMED_BY_SYMBOLS)
     m = k if ends == "rest" else (k + 1) // 2
     vanishing = range(1, m + 1) if ends == "rest" else range(m + 1, 2 * m + 1)
-    if ends == "natural" and len(times) <= m:
+    count = points.shape[0]
+    if ends == "natural" and count <= m:
         raise SpecificationError(
-            f"A natural spline of smoothness {k} has {len(times)} points.",
+            f"A natural spline of smoothness {k} has {count} points.",
             f"Its degree is {2 * m + 1}, which needs at least {m + 1} points.",
-            f"smoothness={2 * (len(times) - 1)}.",
+            f"smoothness={2 * (count - 1)}.",
             "Use more points, a lower smoothness, or ends='rest'.",
-            points=len(times),
+            points=count,
             smoothness=k,
         )
-    pieces = _spline_pieces(times, points, 2 * m + 1, vanishing)
+    if isinstance(times, ca.SX):
+        pieces, times = _symbolic_pieces(times, points, m, ends), times.elements()
+    elif isinstance(points, ca.SX):
+        each = _spline_pieces(times, np.eye(count), 2 * m + 1, vanishing)  # of a point alone: the spline is linear
+        pieces = [ca.DM(power) @ points for power in each]
+    else:
+        pieces = _spline_pieces(times, points, 2 * m + 1, vanishing)
     if ends == "rest":
         t = ca.fmin(ca.fmax(t, times[0]), times[-1])
     return piecewise(t, times, pieces)
@@ -247,9 +268,9 @@ def piecewise(t, times, coefficients):
     ----------
     t : SX or float
         Time [s], or a time law.
-    times : (n,) array
+    times : (n,) array or list of SX
         Strictly increasing ends of the pieces [s].
-    coefficients : (degree + 1, n - 1, dim) array
+    coefficients : (degree + 1, n - 1, dim) array, or sequence of (n - 1, dim) SX
         Of the powers 0, 1, ... of a time that goes from -1 to 1 on each piece, SI.
 
     Returns
@@ -259,11 +280,12 @@ def piecewise(t, times, coefficients):
     """
     begun = ca.vertcat(1, *(t >= knot for knot in times[1:-1]), 0)
     inside = begun[:-1] - begun[1:]
+    times = times if isinstance(times, np.ndarray) else ca.vertcat(*times)
     middle, half = (times[:-1] + times[1:]) / 2, (times[1:] - times[:-1]) / 2
     tau = (t - ca.dot(inside, middle)) * ca.dot(inside, 1 / half)
-    value = ca.SX(coefficients.shape[2], 1)
+    value = ca.SX(coefficients[0].shape[1], 1)
     for power in coefficients[::-1]:
-        value = value * tau + ca.mtimes(ca.DM(power.T), inside)
+        value = value * tau + ca.mtimes(power.T if isinstance(power, ca.SX) else ca.DM(power.T), inside)
     return value
 
 
@@ -311,35 +333,116 @@ def _spline_pieces(times, points, degree, vanishing):
     return pieces
 
 
+@functools.cache
+def _from_ends(m):
+    """Polynomials of degree 2m + 1 on (-1, 1) by their Taylor coefficients 0 .. m at -1, then at 1.
+
+    Returns the powers 0 .. 2m + 1 (rows) of each, and the integrals of products of their derivatives m + 1; both are
+    computed in fractions.
+    """
+    size = 2 * m + 2
+    rows = [
+        [Fraction(math.comb(p, j) * side ** (p - j)) if p >= j else Fraction(0) for p in range(size)]
+        for side in (-1, 1)
+        for j in range(m + 1)
+    ]
+    rows = [row + [Fraction(int(i == j)) for j in range(size)] for i, row in enumerate(rows)]
+    for k in range(size):
+        pivot = next(i for i in range(k, size) if rows[i][k])
+        rows[k], rows[pivot] = rows[pivot], rows[k]
+        rows[k] = [e / rows[k][k] for e in rows[k]]
+        for i in set(range(size)) - {k}:
+            rows[i] = [e - rows[i][k] * f for e, f in zip(rows[i], rows[k], strict=True)]
+    powers = np.array([row[size:] for row in rows])
+    falling = [math.perm(p, m + 1) for p in range(size)]
+    products = np.full((size, size), Fraction(0))
+    for p, r in itertools.product(range(m + 1, size), repeat=2):
+        if (p + r) % 2 == 0:
+            products[p, r] = Fraction(2 * falling[p] * falling[r], p + r - 2 * m - 1)
+    energy = powers.T @ products @ powers
+    return powers.astype(float), (energy / energy[0, 0]).astype(float)
+
+
+def _symbolic_pieces(times, points, m, ends):
+    """Coefficients as of `_spline_pieces`, a list of (n - 1, dim) SX, of a spline whose times are expressions.
+
+    It has the least integral of the square of derivative m + 1 over its Taylor coefficients 1 .. m at the points; those
+    at the ends are zero for "rest". The unit of time is the mean of half an interval.
+    """
+    n, (powers, energy) = points.shape[0], _from_ends(m)
+    half = (times[1:] - times[:-1]) / (times[-1] - times[0]) * (n - 1)
+    scales = [ca.diag(ca.vertcat(*([h**j for j in range(m + 1)] * 2))) for h in half.elements()]
+    total = ca.SX(n * (m + 1), n * (m + 1))
+    for i, scale in enumerate(scales):
+        part = slice(i * (m + 1), (i + 2) * (m + 1))
+        total[part, part] += scale @ ca.DM(energy) @ scale / half[i] ** (2 * m + 1)
+    fixed = [k * (m + 1) for k in range(n)]
+    inner = range(1, n - 1) if ends == "rest" else range(n)
+    free = [k * (m + 1) + j for k in inner for j in range(1, m + 1)]
+    values = ca.SX(n * (m + 1), points.shape[1])
+    values[fixed, :] = points
+    if free:
+        values[free, :] = ca.ldl_solve(-total[free, fixed] @ points, *ca.ldl(ca.sparsify(total[free, free])))
+    parts = [values[i * (m + 1) : (i + 2) * (m + 1), :] for i in range(n - 1)]
+    pieces = [ca.DM(powers) @ scale @ part for scale, part in zip(scales, parts, strict=True)]
+    return [ca.vertcat(*(piece[power, :] for piece in pieces)) for power in range(2 * m + 2)]
+
+
 def _via_points(times, points):
-    """The times (n,) and points (n, dim) of a spline as arrays of numbers."""
-    times, points = as_numbers(times), as_numbers(points)
-    if not (np.isfinite(times).all() and np.isfinite(points).all()):
+    """The times (n,) and points (n, dim) of a spline: arrays of numbers, or SX where they contain symbols."""
+    times, points = _entries(times, "times"), _entries(points, "points")
+    if not all(isinstance(e, ca.SX) or np.isfinite(e).all() for e in (times, points)):
         raise SpecificationError(
             "The spline's times or points are not all finite numbers.",
-            "Times and points are arrays of numbers of shapes (n,) and (n,) or (n, dim).",
-            do="For expressions use line or rest_to_rest.",
+            "Times and points are numbers or expressions, of shapes (n,) and (n,) or (n, dim).",
+            do="Put points in rows, and their entries in columns.",
             times=times,
             points=points,
         )
-    if times.ndim != 1 or len(times) < 2 or points.ndim not in (1, 2) or len(points) != len(times) or not points.size:
+    shapes = [e.shape[:1] if isinstance(e, ca.SX) and e.shape[1] == 1 else e.shape for e in (times, points)]
+    fit = len(shapes[0]) == 1 and len(shapes[1]) in (1, 2) and shapes[0][0] == shapes[1][0] >= 2
+    if not fit or 0 in shapes[1]:
         raise SpecificationError(
-            f"The spline's times have the shape {times.shape}, its points {points.shape}.",
+            f"The spline's times have the shape {shapes[0]}, its points {shapes[1]}.",
             "There are at least two times, and one point for each.",
             do="Put points in rows, and their entries in columns.",
-            times=times.shape,
-            points=points.shape,
+            times=shapes[0],
+            points=shapes[1],
         )
-    falls = np.flatnonzero(np.diff(times) <= 0)
-    if falls.size:
-        i = int(falls[0])
-        raise SpecificationError(
-            f"The spline's times {i} and {i + 1} are {times[i]:g} and {times[i + 1]:g}.",
-            "Times increase strictly.",
-            do="Sort the points by time and remove repeated times.",
-            index=i + 1,
-        )
+    _require_rising(times)
+    if isinstance(points, ca.SX) or isinstance(times, ca.SX):
+        points = ca.reshape(ca.SX(points), shapes[0][0], -1) if isinstance(points, ca.SX) else ca.SX(ca.DM(points))
+        return times, points
     return times, points.reshape(len(times), -1)
+
+
+def _entries(value, what):
+    """An array of numbers, or an SX matrix of a value that contains symbols, a row for each of its entries."""
+    rows = [value[i, :] for i in range(value.shape[0])] if isinstance(value, ca.SX) else value
+    if isinstance(rows, (list, tuple)) and any(ca.symvar(e) for row in rows for e in _parts(row)):
+        columns = [ca.horzcat(*column(row, f"entry {i} of the {what}")) for i, row in enumerate(rows)]
+        _same_size(**{f"{what}[{i}]": c for i, c in enumerate(columns)})
+        return ca.vertcat(*columns)
+    return as_numbers(np.array(ca.DM(value)) if isinstance(value, ca.SX) else value)
+
+
+def _parts(row):
+    """The SX among the entries of a row."""
+    return [e for e in (row if isinstance(row, (list, tuple)) else [row]) if isinstance(e, ca.SX)]
+
+
+def _require_rising(times):
+    """Refuse times that do not increase strictly, where they are numbers."""
+    steps = ca.SX(ca.DM(np.diff(times))) if isinstance(times, np.ndarray) else times[1:] - times[:-1]
+    for i, step in enumerate(steps.elements()):
+        if step.is_constant() and float(step) <= 0:
+            t = [str(times[j]) if isinstance(times, ca.SX) else f"{times[j]:g}" for j in (i, i + 1)]
+            raise SpecificationError(
+                f"The spline's times {i} and {i + 1} are {t[0]} and {t[1]}.",
+                "Times increase strictly.",
+                do="Sort the points by time and remove repeated times.",
+                index=i + 1,
+            )
 
 
 def _column(value, what):
@@ -381,13 +484,13 @@ def _positive(value, what):
     return value
 
 
-def _smoothness(k, least=0):
+def _smoothness(k, least=0, most=SMOOTHEST):
     """The k of a class C^k as an int."""
-    if not is_whole(k) or not least <= k <= SMOOTHEST:
+    if not is_whole(k) or not least <= k <= most:
         raise SpecificationError(
             f"smoothness={k!r}."[:200],
-            f"The smoothness k of a path of class C^k is a whole number, at least {least} and at most {SMOOTHEST}.",
-            f"smoothness={min(max(least, math.ceil(k)), SMOOTHEST)}." if is_number(k) else "",
+            f"The smoothness k of a path of class C^k is a whole number, at least {least} and at most {most}.",
+            f"smoothness={min(max(least, math.ceil(k)), most)}." if is_number(k) else "",
             "The error for a path of too low a class names the class that a program needs.",
             smoothness=k,
         )

@@ -13,7 +13,7 @@ import numpy as np
 
 from servoctl.checks import named, positives, require_kind
 from servoctl.errors import SpecificationError
-from servoctl.internal_dynamics import linearised
+from servoctl.growth import linearised
 from servoctl.methods.choice import Poles, as_drift
 from servoctl.methods.runge_kutta import ORDERS
 from servoctl.methods.stability import STEP_MAPS, amplification, stability_function

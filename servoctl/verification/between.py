@@ -3,7 +3,10 @@
 import functools
 from dataclasses import dataclass, field
 
+import casadi as ca
 import numpy as np
+
+from servoctl.codegen.function import compiled
 
 STAGES = 4  # Gauss points of a step: order 8
 FIXED_POINT_STEPS = 25  # of a step, at most: an explicit iteration that takes more needs shorter steps
@@ -67,8 +70,17 @@ class Flow:
         """Power of the forces without a potential at times (N,) and jets (n_z, N)."""
         if not self.balanced:
             return np.zeros(len(t))
-        power = self.model.signals("power")[1]
-        return power.grid(t, z[: power.n_x], self.model.parameters)[1]
+        work = self.model.once("power of forces", lambda: _power_of_forces(self.model))
+        values = np.empty((1, len(t)))
+        work.interpreted.grid(t, z[: work.n_x], self.model.parameters, values)  # once: compiling it takes longer
+        return values[0]
+
+
+def _power_of_forces(model):
+    """The second of the signals "power" alone, without those that take most of its operations."""
+    f = model.signals("power")[1].expression
+    t, z, p = f.sx_in()
+    return compiled(ca.Function("work", [t, z, p], [ca.densify(f(t, z, p)[1])]), "work")
 
 
 @dataclass(frozen=True)
@@ -118,14 +130,14 @@ class Interval:
     inside: list = field(default_factory=list)
 
 
-def between(flows, t, x, settings):
+def between(attempts, t, x, settings):
     """Integrate from each edge to the next.
 
     Parameters
     ----------
-    flows : callable
-        Of the index of an edge: a sequence of `Flow`, each of which is tried if those before it did not lead to the
-        next edge, as pivots may vanish between edges.
+    attempts : sequence of callable
+        Of the indices (K,) of edges: pairs of a `Flow` and of the indices of those that it leads on. Each is tried
+        where those before it did not lead to the next edge, as pivots may vanish between edges.
     t : (K + 1,) array
         Edges, in the order of the motion [s].
     x : (n_x, K + 1) array
@@ -141,18 +153,16 @@ def between(flows, t, x, settings):
     sampled = np.all(np.isfinite(x), axis=0)
     targets, ready = x[:, 1:].copy(), np.flatnonzero(sampled[:-1])
     while ready.size:
-        tried = {k: iter(flows(k)) for k in ready}
-        while tried:
-            groups = {}
-            for k, rest in tried.items():
-                flow = next(rest, None)
-                if flow is not None:
-                    groups.setdefault((flow, settings.steps[k]), []).append(k)
-            for (flow, _), ks in groups.items():
-                problem = t[ks], np.diff(t)[ks], x[:, ks], targets[:, ks]
-                _integrate(flow, problem, np.array(ks), settings, found, budget)
-            left = [k for ks in groups.values() for k in ks if not found.resolved[k]]
-            tried = {k: tried[k] for k in left}
+        left = ready
+        for attempt in attempts:
+            for flow, ks in attempt(left):
+                for steps in np.unique(settings.steps[ks]):
+                    here = np.asarray(ks)[settings.steps[ks] == steps]
+                    problem = t[here], np.diff(t)[here], x[:, here], targets[:, here]
+                    _integrate(flow, problem, here, settings, found, budget)
+            left = left[~found.resolved[left]]
+            if not left.size:
+                break
         on = ready[~sampled[ready + 1] & found.resolved[ready]]
         x[:, on + 1] = found.ends[:, on]
         ready = on + 1
@@ -199,7 +209,7 @@ def _stepped(flow, t, length, x, targets, steps, sizes):
         inside += [(t + k * h, jets)] * (k > 0)
         goal = flow.values(t + h, np.where(np.isfinite(targets), targets, x))[0] if steps == 1 else start
         times, rates, jets, converged, count = _stages(flow, t + k * h, h, x, (start, goal), sizes)
-        x = x + h * np.einsum("j,njk->nk", b, rates)
+        x = x + h * np.tensordot(b, rates, (0, 1))
         back = flow.newton(t + (k + 1) * h, x)
         led_back = np.fmax(led_back, (np.abs(back) / sizes[:, None]).max(axis=0))
         led_back[~(converged & np.all(np.isfinite(x), axis=0))] = np.inf
@@ -219,19 +229,22 @@ def _stages(flow, t, h, x, guess, sizes):
     c, _, A = gauss(STAGES)
     times, (start, end) = t + c[:, None] * h, guess
     rates = start[:, None] + c[:, None] * (end - start)[:, None]
-    jets, left, evaluations = None, np.arange(len(t)), 0
+    jets, left, evaluations = None, slice(None), 0
     settled = np.zeros(len(t), dtype=bool)
     for _ in range(FIXED_POINT_STEPS):
+        before = rates[..., left]
         with np.errstate(all="ignore"):
-            states = x[:, None, left] + h[left] * np.einsum("ij,njk->nik", A, rates[..., left])
+            states = x[:, None, left] + h[left] * (A @ before)
             pair = flow.values(times[:, left].ravel(), states.reshape(len(x), -1))
             new, z = (values.reshape(len(values), STAGES, -1) for values in pair)
-            change = (np.abs(h[left] * (new - rates[..., left])) / sizes[:, None, None]).max(axis=(0, 1))
+            change = (np.abs(h[left] * (new - before)) / sizes[:, None, None]).max(axis=(0, 1))
         jets = np.zeros((len(z), STAGES, len(t))) if jets is None else jets
         rates[..., left], jets[..., left] = new, z
-        evaluations += times[:, left].size
+        evaluations += new[0].size
+        left = np.arange(len(t))[left]
         settled[left[change <= SETTLED]] = True
         left = left[change > SETTLED]  # without those that are no longer finite
         if not left.size:
             break
+        left = slice(None) if left.size == len(t) else left
     return times, rates, jets, settled, evaluations

@@ -40,6 +40,7 @@ BLUNT = 1e-3  # effect of rounding, relative to the accelerations, above which t
 OWN_INSTANTS, MOST_OWN = 200, 8  # instants between samples at which everything is checked, in all and of an interval
 BALANCED = 1e-9  # part of dE/dt, relative to its terms, that does not follow from the forces: more is no rounding
 BY_INPUTS = 1e-6  # part of the accelerations that rounding of the inputs may excuse
+FEW_SIZES = 20  # instants that give the sizes of residuals that are far below their limit
 MOST_SEGMENTS = 10_000  # steps along the run that are accepted: seconds
 MOST_OWN_PIVOTS = 3  # choices of pivots of its own, where those of the run vanish between samples
 MOST_ENTRIES = 2e6  # of matrices that are held at once
@@ -154,8 +155,12 @@ def _variants(model, run, count):
 
 def _same(model, other):
     """Whether two models have the same specification and numbers, up to the choice of pivots."""
-    marks = {fingerprint(m.reduction.mechanism, m.reduction.program, values=()) for m in (model, other)}
-    return model is other or (len(marks) == 1 and np.array_equal(model.parameters, other.parameters))
+    if model is other:
+        return True
+    specifications = [(m.reduction.mechanism, m.reduction.program) for m in (model, other)]
+    one = all(a is b for a, b in zip(*specifications, strict=True))
+    alike = one or len({fingerprint(*parts, values=()) for parts in specifications}) == 1
+    return alike and np.array_equal(model.parameters, other.parameters)
 
 
 def _same_or_smooth(model, variant):
@@ -279,6 +284,10 @@ class _Checks:
             changes = [np.nan_to_num(f(t, x + PROBE * d * steps) - y) / PROBE for d in directions]
         return np.sqrt(np.mean(np.square(changes), axis=0))
 
+    def _rounding(self, f, t, x, y):
+        """Effect of rounding of x on f(t, x) = y."""
+        return ROUNDING * self._response(f, t, x, y, np.abs(x))
+
     # between samples
 
     def _integrate(self, segments):
@@ -305,32 +314,41 @@ class _Checks:
         return found, sampled, self._own(found), again
 
     def _between(self, flat, sample, edges, x, settings, **changes):
-        return between(self._flows(flat, sample), edges, x, replace(settings, **changes))
+        return between(self._attempts(flat, sample), edges, x, replace(settings, **changes))
 
-    def _flows(self, flat, sample):
-        """The flows to try from an edge on: of the variants next to its sample, and of one with its own pivots.
+    def _attempts(self, flat, sample):
+        """The flows to try from edges on: of the variants next to their samples, and of one with its own pivots.
 
-        Edges lie on all switches, so that the model itself is smooth between them.
+        Each attempt is a function of the indices (K,) of edges and returns pairs of a flow and of those that it leads
+        on. Edges lie on all switches, so that the model itself is smooth between them.
         """
         variants = [self.model if self.family else v for *_, v in self.run.variants]
-        firsts = [a for a, *_ in self.run.variants]
+        first = np.array([next(i for i, v in enumerate(variants) if v is variant) for variant in variants])  # the same
+        of = np.searchsorted([a for a, *_ in self.run.variants], sample, side="right") - 1
         allowance = [MOST_OWN_PIVOTS]
 
-        def flows(k):
-            if flat and self.family:  # whose residuals count, in which angles may have turned round
-                yield Flow(self._side_after(self.edges[k : k + 2].mean(), sample[k]), flat, self.balanced, ENOUGH_STEPS)
-            i = int(np.searchsorted(firsts, sample[k], side="right")) - 1
-            near = range(i, min(i + 2, len(variants)))
-            for j in near:
-                yield Flow(variants[j], flat, self.balanced, FEW_STEPS)
-            if allowance[0]:
+        def flow(model, most=FEW_STEPS):
+            return Flow(model, flat, self.balanced, most)
+
+        def next_to(ks, shift=0, most=FEW_STEPS):
+            ks = ks[of[ks] + shift < len(variants)]
+            model = first[of[ks] + shift]
+            return [(flow(variants[j], most), ks[model == j]) for j in np.unique(model)]
+
+        def own_sides(ks):  # whose residuals count, in which angles may have turned round
+            return [(flow(self._side_after(self.edges[k : k + 2].mean(), sample[k]), ENOUGH_STEPS), [k]) for k in ks]
+
+        def own_pivots(ks):
+            found = []
+            for k in ks[: allowance[0]]:
                 allowance[0] -= 1
                 with contextlib.suppress(ServoError):
                     at = self.run.jets[: len(self.model.jet_names), sample[k]]
-                    yield Flow(self.model.near(self.run.t[sample[k]], at), flat, self.balanced, FEW_STEPS)
-            yield Flow(variants[i], flat, self.balanced, ENOUGH_STEPS)
+                    found.append((flow(self.model.near(self.run.t[sample[k]], at)), [k]))
+            return found
 
-        return flows
+        sides = [own_sides] if flat and self.family else []
+        return [*sides, next_to, partial(next_to, shift=1), own_pivots, partial(next_to, most=ENOUGH_STEPS)]
 
     def _side_after(self, t, sample):
         """The variant of a run with switches at t [s], after a sample."""
@@ -402,11 +420,13 @@ class _Checks:
 
             x = np.vstack([at.z[: nq + n], at.inputs])
             accelerations = f(at.t, x)
-            rounding = ROUNDING * self._response(f, at.t, x, accelerations, np.abs(x))
-            of_inputs = ROUNDING * self._response(given, at.t, at.z, given(at.t, at.z), np.abs(at.z))
-            excused = rounding + np.minimum(of_inputs, BY_INPUTS * size)
-            errors = np.abs(accelerations - at.z[nq + n : nq + 2 * n]) / (size + excused / limit)
-            worst, blunt = max(worst, largest(errors)), max(blunt, largest(rounding / size))
+            errors = _ratio(accelerations - at.z[nq + n : nq + 2 * n], size)
+            if largest(errors) > LIMITS["acceleration"]:  # errors of rounding are larger where it decides
+                rounding = self._rounding(f, at.t, x, accelerations)
+                of_inputs = self._rounding(given, at.t, at.z, given(at.t, at.z))
+                errors = errors / (1 + (rounding + np.minimum(of_inputs, BY_INPUTS * size)) / (limit * size))
+                blunt = max(blunt, largest(rounding / size))
+            worst = max(worst, largest(errors))
         if blunt > BLUNT:
             self.doubts.append(
                 f"rounding changes the mechanism's accelerations by {blunt:.1e} of their size: scale the units, or "
@@ -416,41 +436,46 @@ class _Checks:
 
     def multiplier_form(self):
         """Largest residual of [M -B; C 0] [γ''; μ] = ..., relative to the largest terms of each row."""
-        parts = [self._rows(at) for at in self.instants]
+        parts, limit = [self._rows(at) for at in self.instants], self.limit("multiplier form")
         terms = np.max([terms for _, terms, _ in parts], axis=0)[:, None]
-        sizes = (terms + rounding / self.limit("multiplier form") for *_, rounding in parts)
-        return max(largest(_ratio(rows, size)) for (rows, *_), size in zip(parts, sizes, strict=True))
+        return max(_excused(rows, terms, limit, rounding) for rows, _, rounding in parts)
 
     def _rows(self, at):
-        """Residuals (rows, N), largest terms (rows,) and rounding (rows, N) of the equations with multipliers."""
+        """Residuals (rows, N) and largest terms (rows,) of the equations with multipliers, and their rounding."""
         n, nq, n_z = self.model.n, self.model.nq, len(self.model.jet_names)
         z, f = at.z[:n_z], at.model.signals("all_multipliers")[1]
+        mu = f.grid(at.t, z, at.model.parameters)
+        most = np.concatenate([self.sizes[nq + n : nq + 2 * n], np.abs(mu).max(axis=1, initial=0.0)])
+        unknowns = np.concatenate([z[nq + n : nq + 2 * n], mu])
+        few = max(1, int(MOST_ENTRIES / len(unknowns) ** 2))
+        parts = [slice(a, a + few) for a in range(0, len(at.t), few)]
+        rows, terms = [], []
+        for part in parts:
+            matrix, right = at.model.multiplier_form(at.t[part], z[:, part])
+            rows.append(_product(matrix, unknowns[:, part]) - right)
+            terms.append((_product(np.abs(matrix), most[:, None]) + np.abs(right)).max(axis=1))
+
+        def rounding():
+            return np.concatenate([self._rounding_of_rows(at, z, unknowns, part) for part in parts], axis=1)
+
+        return np.concatenate(rows, axis=1), np.max(terms, axis=0), rounding
+
+    def _rounding_of_rows(self, at, z, unknowns, part):
+        """Effect of rounding on the residuals of the equations with multipliers at some instants."""
+        t, z, unknowns, f = at.t[part], z[:, part], unknowns[:, part], at.model.signals("all_multipliers")[1]
+        n = self.model.n
 
         def multipliers(t, z):
             return f.grid(t, z, at.model.parameters)
 
-        mu = multipliers(at.t, z)
-        d_mu = self._response(multipliers, at.t, z, mu, np.abs(z))
-        most = np.concatenate([self.sizes[nq + n : nq + 2 * n], np.abs(mu).max(axis=1, initial=0.0)])
-        unknowns = np.concatenate([z[nq + n : nq + 2 * n], mu])
-        columns = len(unknowns)
-        few = max(1, int(MOST_ENTRIES / columns**2))
-        rows, terms, rounding = [], [], []
-        for a in range(0, len(at.t), few):
-            part = slice(a, a + few)
+        def residual(t, z):
+            matrix, right = at.model.multiplier_form(t, z)
+            return _product(matrix, unknowns) - right
 
-            def residual(t, z, y=unknowns[:, part]):
-                matrix, right = at.model.multiplier_form(t, z)
-                return np.einsum("ijk,jk->ik", matrix, y) - right
-
-            matrix, right = at.model.multiplier_form(at.t[part], z[:, part])
-            matrix_size = np.abs(matrix)
-            rows.append(np.einsum("ijk,jk->ik", matrix, unknowns[:, part]) - right)
-            terms.append((np.einsum("ijk,j->ik", matrix_size, most) + np.abs(right)).max(axis=1))
-            response = self._response(residual, at.t[part], z[:, part], rows[-1], np.abs(z[:, part]))
-            response += np.einsum("ijk,jk->ik", matrix_size[:, n:], d_mu[:, part])
-            rounding.append(ROUNDING * response)
-        return np.concatenate(rows, axis=1), np.max(terms, axis=0), np.concatenate(rounding, axis=1)
+        response = self._response(residual, t, z, residual(t, z), np.abs(z))
+        d_mu = self._response(multipliers, t, z, multipliers(t, z), np.abs(z))
+        matrix, _ = at.model.multiplier_form(t, z)
+        return ROUNDING * (response + _product(np.abs(matrix[:, n:]), d_mu))
 
     def residuals(self):
         """Largest residual of each row at any level, by the relative change of the jets that would remove it."""
@@ -464,16 +489,31 @@ class _Checks:
                 return f.grid(t, z, model.parameters)
 
             levels = values(at.t, z)
-            response = self._response(values, at.t, z, levels, self.sizes[: f.n_x, None])
-            response = np.maximum(response, FLOOR * np.median(response, axis=1, keepdims=True))
-            if at.first is not None:
-                levels = self._as_stored(np.abs(levels), names, at.first)
-            for (name, _), level, size in zip(names, levels, response, strict=True):
+            known = levels if at.first is None else self._as_stored(np.abs(levels), names, at.first)
+            response = self._residual_sizes(values, at.t, z, levels, known)
+            for (name, _), level, size in zip(names, known, response, strict=True):
                 worst[f"residual {name}"] = max(worst[f"residual {name}"], largest(_ratio(level, size)))
         for name in self.model.reduction.mechanism.reported:  # of a program that inputs realise approximately
             del worst[f"residual {name}"]
             self.notes.append(f"the program's residual {name} is at most {largest(self.fresh.residual[name]):.2g}")
         return worst
+
+    def _residual_sizes(self, values, t, z, levels, known):
+        """Changes (rows, N) of residuals if each jet changes by its size; at least FLOOR of their medians.
+
+        Where residuals `known` are small beside the least of them, those at FEW_SIZES instants, in which the others
+        lie, decide.
+        """
+        few = np.unique(np.linspace(0, len(t) - 1, FEW_SIZES).round().astype(int))
+        steps, least = self.sizes[: len(z), None], None
+        if 2 * len(few) < len(t):
+            some = self._response(values, t[few], z[:, few], levels[:, few], steps)
+            least = FLOOR * np.median(some, axis=1, keepdims=True)
+        if least is None or not np.all(np.abs(known) <= AGREES * self.limit("residual") * least):
+            some, few = self._response(values, t, z, levels, steps), np.arange(len(t))
+            least = FLOOR * np.median(some, axis=1, keepdims=True)
+        nearest = np.searchsorted((few[1:] + few[:-1]) / 2, np.arange(len(t)))
+        return np.maximum(some[:, nearest], least)
 
     def _as_stored(self, levels, names, first):
         """Levels, or those that the run has stored if these are larger."""
@@ -499,7 +539,8 @@ class _Checks:
 
     def _balanced(self):
         """Whether dE/dt is the power of the forces; a note if not."""
-        rate, _, size, by_time = np.concatenate([at.signals("power") for at in self.samples], axis=1)
+        self.powers = [at.signals("power") for at in self.samples]
+        rate, _, size, by_time = np.concatenate(self.powers, axis=1)
         first, second = self.model.nq, self.model.nq + self.model.n
         inertial = self.mass * self.sizes[first:second] * self.sizes[second : second + self.model.n]
         largest_term = max(np.abs(size).max(), np.abs(rate).max(), inertial.max())
@@ -517,7 +558,8 @@ class _Checks:
         speeds, accelerations = self.sizes[nq : nq + n], self.sizes[nq + n : nq + 2 * n]
         scale = FLOOR * (self.mass * speeds * accelerations).max()
         errors, roundings = [], []
-        for at in self.instants:
+        known = dict(enumerate(self.powers))  # of the samples, which are the first instants
+        for i, at in enumerate(self.instants):
             f = at.model.signals("power")[1]
 
             def defect(t, z, f=f, model=at.model):
@@ -525,32 +567,30 @@ class _Checks:
                 return (rate - work)[None]
 
             z = at.z[: f.n_x]
-            rate, work, size, _ = f.grid(at.t, z, at.model.parameters)
+            rate, work, size, _ = known[i] if i in known else at.signals("power")
             errors.append((rate - work)[None])
-            roundings.append(ROUNDING * self._response(defect, at.t, z, errors[-1], np.abs(z)))
+            roundings.append(lambda z=z, at=at, defect=defect, e=errors[-1]: self._rounding(defect, at.t, z, e))
             inertial = np.abs(at.z[nq : nq + n] * at.z[nq + n : nq + 2 * n]).T @ self.mass
             scale = max(scale, (np.abs(size) + np.abs(rate) + inertial).max())
-        sizes = (scale + rounding / self.limit("power") for rounding in roundings)
-        power = max(largest(_ratio(error, size)) for error, size in zip(errors, sizes, strict=True))
+        limit = self.limit("power")
+        power = max(_excused(e, scale, limit, rounding) for e, rounding in zip(errors, roundings, strict=True))
         return {"power": power} | self._energy(scale)
 
     def _energy(self, power):
         """Largest difference of the energy gained from the work, relative to the kinetic energy and the work done."""
         if self.between is None or not self.between.resolved.all():
             return {}
-        energies = []
-        for at in self.samples:
-            f = at.model.signals("energy")[1]
-
-            def energy(t, z, f=f, model=at.model):
-                return f.grid(t, z, model.parameters)
-
-            z = at.z[: f.n_x]
-            values = energy(at.t, z)
-            energies.append(np.vstack([values, ROUNDING * self._response(energy, at.t, z, values, np.abs(z))]))
-        energy, rounding = np.concatenate(energies, axis=1)
+        parts = [(at, at.model.signals("energy")[1]) for at in self.samples]
+        energies = [f.grid(at.t, at.z[: f.n_x], at.model.parameters) for at, f in parts]
+        energy = np.concatenate(energies, axis=1)[0]
         kinetic = (self.mass * self.sizes[self.model.nq : self.model.nq + self.model.n] ** 2).max() / 2
-        scale = max(kinetic, np.ptp(energy), *np.abs(np.cumsum(self.between.work))) + rounding.max() / LIMITS["energy"]
+        scale = max(kinetic, np.ptp(energy), *np.abs(np.cumsum(self.between.work)))
+        if not self._off(np.diff(energy)) <= AGREES * LIMITS["energy"] * scale:
+            rounding = [
+                self._rounding(lambda t, z, f=f, at=at: f.grid(t, z, at.model.parameters), at.t, at.z[: f.n_x], values)
+                for (at, f), values in zip(parts, energies, strict=True)
+            ]
+            scale += max(map(np.max, rounding)) / LIMITS["energy"]
         work = self._work(np.diff(energy), AGREES * LIMITS["energy"] * scale)
         if not np.isfinite(work).all():
             first = self.run.t[int(np.argmin(np.isfinite(work)))]
@@ -564,13 +604,25 @@ class _Checks:
 
         `allowed` is an error of the sum.
         """
-        whose = np.cumsum(self.sampled)[:-1] - 1  # the sample before an edge
-        work = np.bincount(whose, self.between.work, len(gained))
+        work = self._known_work(self.between.work)
         doubtful = np.abs(work - gained) > allowed / len(gained)
-        if np.abs(np.cumsum(work - gained)).max() <= allowed or not doubtful.any():
+        if self._off(gained) <= allowed or not doubtful.any():
             return work
+        whose = self._sample_before()
         found = self.integrated(work=np.where(doubtful, allowed / doubtful.sum(), np.inf)[whose])
-        return np.bincount(whose, np.where(found.resolved, found.work, np.nan), len(gained))
+        return self._known_work(np.where(found.resolved, found.work, np.nan))
+
+    def _sample_before(self):
+        """The index of the sample at or before each edge but the last."""
+        return np.cumsum(self.sampled)[:-1] - 1
+
+    def _known_work(self, work):
+        """Work between samples (N - 1,) from that between edges."""
+        return np.bincount(self._sample_before(), work, len(self.run.t) - 1)
+
+    def _off(self, gained):
+        """Largest difference of the work since the start from the energy gained."""
+        return np.abs(np.cumsum(self._known_work(self.between.work) - gained)).max()
 
     # further signals
 
@@ -614,11 +666,25 @@ class _Checks:
         for at in self.samples:
             values = at.signals("reach")
             size = max(size, np.abs(values[:n]).max())
-            for column in values.T:
-                reaction, E = column[:n], column[n:].reshape(-1, n).T
-                left = reaction - E @ np.linalg.lstsq(E, reaction, rcond=None)[0]
-                worst = max(worst, float(np.abs(left).max()))
+            reaction, E = values[:n].T[:, :, None], values[n:].reshape(-1, n, len(at.t)).transpose(2, 1, 0)
+            E = E[:1] if np.all(E == E[:1]) else E
+            inverse = np.linalg.pinv(E, rcond=max(E.shape[1:]) * np.finfo(float).eps)
+            worst = max(worst, largest(reaction - E @ (inverse @ reaction)))
         return {"outside": worst / size}
+
+
+def _product(matrix, vectors):
+    """Matrices (rows, columns, N) times vectors (columns, N), or one vector (columns, 1)."""
+    return (matrix * vectors).sum(axis=1)
+
+
+def _excused(errors, size, limit, rounding):
+    """The largest of errors (n, N) relative to sizes; where it exceeds its limit, relative to what rounding explains.
+
+    `rounding` returns the effect of rounding on the errors, which divided by the limit adds to the sizes.
+    """
+    plain = largest(_ratio(errors, size))
+    return plain if plain <= limit else largest(_ratio(errors, size + rounding() / limit))
 
 
 def _ratio(errors, sizes):

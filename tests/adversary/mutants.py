@@ -81,7 +81,7 @@ MUTANTS = {  # name: (file, old text, new text, tests)
         "methods/runge_kutta.py", '"RK4": [1 / 6, 1 / 3, 1 / 3, 1 / 6]', '"RK4": [1 / 6, 1 / 3, 1 / 6, 1 / 3]', MOTION,
     ),
     "the hold is half a period": (
-        "control/sampling.py", "A * period, B * period", "A * period, B * period / 2", ("test_lqr.py", "test_sampling.py"),
+        "control/sampling.py", "(B, period, out", "(B, period / 2, out", ("test_lqr.py", "test_sampling.py"),
     ),
     "exponentials lose their last terms": (
         "control/sampling.py", "SCALED, TERMS = 0.5, 16", "SCALED, TERMS = 0.5, 6", ("test_lqr.py", "test_sampling.py"),

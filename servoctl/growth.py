@@ -17,6 +17,7 @@ import numpy as np
 
 from servoctl.checks import positive
 from servoctl.errors import SpecificationError
+from servoctl.methods.kinks import SMOOTHER, stays_on_kink
 from servoctl.methods.stability import stability_function
 from servoctl.model.model import Model
 from servoctl.run import SAME_TIME, Run, require_model
@@ -71,6 +72,8 @@ class InternalDynamics:
         [s]; 0 if there was none.
     multipliers : (f,) complex array
         Floquet's, the eigenvalues of the propagator over a period; none without a period.
+    cause : str
+        Of an inconclusive verdict, with the remedy.
     """
 
     tangents: "Tangents" = field(repr=False)
@@ -80,6 +83,7 @@ class InternalDynamics:
     until: np.ndarray = field(default_factory=lambda: np.ones((2, 0)))
     period: float = 0.0
     multipliers: np.ndarray = field(default_factory=lambda: np.zeros(0, complex))
+    cause: str = "the samples do not resolve it; simulate with more of them (t_eval)"
 
     @property
     def t(self):
@@ -141,7 +145,7 @@ class InternalDynamics:
         if self.verdict == "none":
             return "internal dynamics: none (the program determines the motion)"
         if self.verdict == "inconclusive":
-            return "internal dynamics inconclusive: the samples do not resolve it; simulate with more of them (t_eval)"
+            return f"internal dynamics inconclusive: {self.cause}"
         facts = {
             "unstable": f"errors grow by {self.growth:.2g}",
             "neutral": f"errors grow by at most {self.growth:.2g}",
@@ -215,6 +219,9 @@ def internal_dynamics(model: Model, run: Run, period: float | None = None) -> In
     require_model(model, run, "internal_dynamics")
     if model.flat:
         return InternalDynamics(Tangents((), run.t[:0], np.ones(0), *np.zeros((2, 0, 0, 0))), "none", 1.0)
+    if switch := stays_on_kink(model, run):
+        cause = f"the run stays on a switch, {switch}, and has no linearisation; {SMOOTHER}"
+        return replace(_inconclusive(model, run), cause=cause)
     resolved = _resolved(model, run)
     if resolved is None:
         return _inconclusive(model, run)

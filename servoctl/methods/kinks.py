@@ -8,6 +8,7 @@ from servoctl.model.switching import switching
 
 ON_SWITCH = 1e-6  # value of a switching function, of what the state's size changes it by, below which it is zero
 SAME_SIDES = 1e-6  # relative difference of two linearisations that is rounding
+STAYS_AT = 5  # instants of a run that stays on a switch
 SMOOTHER = "smooth the switch, such as tanh(v/v0) for sign(v)"  # the remedy
 
 
@@ -37,6 +38,27 @@ def kink(model, t, x):
             if not _same(family, branches, beyond, t, x):
                 return switch.text
     return ""
+
+
+def stays_on_kink(model, run):
+    """The switch on which a run lies from its begin to its end, without a linearisation; "" if there is none.
+
+    Parameters
+    ----------
+    model : Model
+    run : Run
+
+    Returns
+    -------
+    str
+    """
+    if switching(model) is None:
+        return ""
+    x = run.jets[: len(model.state_names)]
+    known = np.flatnonzero(np.isfinite(x).all(axis=0))
+    some = known[np.linspace(0, len(known) - 1, STAYS_AT).round().astype(int)]
+    found = [kink(model, run.t[k], x[:, k]) for k in some]
+    return found[0] if all(found) else ""
 
 
 def _same(family, branches, beyond, t, x):
