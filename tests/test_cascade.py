@@ -11,8 +11,7 @@ import numpy as np
 import pytest
 
 import servoctl as sv
-from servoctl.gallery import gallery
-from servoctl.gallery.cars import cars
+from servoctl.gallery import cars, gallery
 from servoctl.reduction import triangular
 
 SPAN = (0.0, 2.0)

@@ -143,7 +143,7 @@ def taylor_coefficients(equations, last):
     r, q = equations.r, equations.q
     if r.cascade is not None:
         motion = r.cascade.along(r.points, equations.top - 1, last, running=_InBlock)
-        return _function(equations, motion.place, motion.gamma, last, _InBlock.instant)
+        return _coefficients(equations, motion.place, motion.gamma, last, _InBlock.instant)
     motion = _Motion(equations)
     groups = []
     for order in sorted({row.order for row in r.rows}):
@@ -163,10 +163,10 @@ def taylor_coefficients(equations, last):
         motion.settle(k, [0.0 if x.is_zero() else x for x in solution.elements()])
         for group in groups:
             group.correct(k)
-    return _function(equations, motion.coordinates, motion.gamma, last, motion.branch)
+    return _coefficients(equations, motion.coordinates, motion.gamma, last, motion.branch)
 
 
-def _function(equations, coordinates, gamma, last, instant):
+def _coefficients(equations, coordinates, gamma, last, instant):
     """What `taylor_coefficients` returns, from coefficients by index."""
     coefficients = [] if equations.q.plain else [ca.SX(c) for k in range(1, last + 1) for c in coordinates[k]]
     coefficients += [ca.SX(c) for k in range(1, last + 1) for c in gamma[k]]
