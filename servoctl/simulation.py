@@ -1,6 +1,7 @@
 """From a model and a start to a run."""
 
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 
@@ -31,8 +32,9 @@ from servoctl.methods.choice import (
     default_method,
     require_combination,
 )
+from servoctl.methods.dropped import DERIVATIONS, alive_along, came_alive
 from servoctl.methods.events import Event, Events, as_events, occurrences
-from servoctl.methods.motion import DEFAULT_SAMPLES
+from servoctl.methods.motion import DEFAULT_SAMPLES, without_interruption
 from servoctl.methods.orders import end_at_other_orders
 from servoctl.methods.radau import RadauSteps
 from servoctl.methods.runge_kutta import ORDERS, RungeKuttaSteps
@@ -196,20 +198,17 @@ def simulated(model, start, t_span, method=None, *, drift=None, t_eval=None, eve
     times = None if isinstance(method, Bounded) and t_eval is None else _sample_times(t0, t1, t_eval, knots, method)
     bar = Progress(span, progress)
     try:
-        default = getattr(method, "atol", 0.0) is None
-        first = large_tolerances(model, span, x0) if default else None
-        motion = _motion(model, method, drift, (t0, x0, t1, times, knots, events), bar, first)
-        tolerances = _smaller_tolerances(model, method, motion)
-        if tolerances is not None:
-            again = _motion(model, method, drift, (t0, x0, t1, times, knots, events), bar, tolerances)
-            motion = again if again.stop is None or motion.stop is not None else motion
+        model, motion = _derived_along(model, method, drift, (t0, x0, t1, times, knots, events), bar)
     finally:
         bar.close()
-    end_at_other_orders(motion)
-    run = _run(model, motion, method, drift, knots, (t0, x0, t1))
-    run = replace(run, start=_as_started(model, start, t0, x0 if motion.start is None else motion.start))
-    if t_eval is not None and isinstance(method, RungeKutta):
-        run = _resample(run, times)
+    with without_interruption() as pressed:  # a motion that is computed is kept
+        end_at_other_orders(motion)
+        run = _run(model, motion, method, drift, knots, (t0, x0, t1))
+        run = replace(run, start=_as_started(model, start, t0, x0 if motion.start is None else motion.start))
+        if t_eval is not None and isinstance(method, RungeKutta):
+            run = _resample(run, times)
+    if pressed and run.status == 0:
+        run = replace(run, success=False, status=1, message=f"{run.message}; interrupted at its end")
     if motion.stop is not None:
         motion.stop.run = run
         raise motion.stop
@@ -281,6 +280,37 @@ def _model_and_start(model, start, inputs):
     return model, start
 
 
+def _derived_along(model, method, drift, problem, bar):
+    """A model and its motion: derived again where an entry comes alive that eliminations left out."""
+    names = model.state_names
+    for _ in range(DERIVATIONS):
+        motion = _tolerant(model, method, drift, problem, bar)
+        t, place = alive_along(motion) or (None, None)
+        if place is None:
+            return model, motion
+        with suppress(ServoError):
+            again = model.near(*place)
+            if again.state_names == names:
+                model = again
+                continue
+        break
+    motion.end_before(t, came_alive(t))
+    return model, motion
+
+
+def _tolerant(model, method, drift, problem, bar):
+    """Integrate with absolute tolerances that fit the motion: where the default is no small part of it, once more."""
+    if getattr(method, "atol", 0.0) is not None:
+        return _motion(model, method, drift, problem, bar)
+    t0, x0, t1, *_ = problem
+    motion = _motion(model, method, drift, problem, bar, large_tolerances(model, (t0, t1), x0))
+    smaller = _smaller_tolerances(model, method, motion)
+    if smaller is None:
+        return motion
+    again = _motion(model, method, drift, problem, bar, smaller)
+    return again if again.stop is None or motion.stop is not None else motion
+
+
 def _motion(model, method, drift, problem, bar, atol=None):
     """Integrate (t0, x0, t1, times, knots, events) by a method; samples are taken at the times (N,), or at all steps.
 
@@ -329,7 +359,7 @@ def _stepping(model, method, drift, span, bar, atol):
 
 def _smaller_tolerances(model, method, motion):
     """Absolute tolerances with which a motion is computed again, as the default is no small part of it; else None."""
-    if getattr(method, "atol", 0.0) is not None or motion.interrupted or not motion.pieces:
+    if motion.interrupted or not motion.pieces:
         return None
     if isinstance(method, RadauIIA) and method.step is not None:
         return None

@@ -12,4 +12,5 @@ RESOLVED = 1e-10  # division by an equilibrated pivot above this leaves six digi
 DEPENDENT = 1e-11  # largest residual of an equilibrated row that is a combination of other rows
 CUTOFF = 1e-11  # singular values below this fraction of the largest do not count in least squares
 REFINEMENTS = 3  # steps in double precision with residuals in extended precision; each gains at least ten digits
+LAST_EXPONENT = 138.15510557964274  # ln 1e60, beyond which bounded functions of exponentials have their limits
 TINY = 1e-300  # keeps denominators from zero, and decides nothing

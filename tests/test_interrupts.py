@@ -11,6 +11,7 @@ import pytest
 from scenes import CRANE
 
 import servoctl as sv
+from servoctl import simulation
 from servoctl.codegen import compiler
 from servoctl.control import batch
 from servoctl.control import loop as loops
@@ -57,6 +58,20 @@ def test_an_integration_of_minutes_is_interrupted_and_kept(wheel_model, method, 
     run = sv.simulate(model, start, (0.0, end), method, progress=False)
     assert (run.status, run.success) == (1, False) and "interrupted" in run.message
     assert len(run.t) and run.t[-1] < end and np.all(np.isfinite(run.jets[: len(start.values)]))
+
+
+@pytest.mark.parametrize("method", [None, "algebraic"])
+def test_a_computed_motion_is_kept_when_interrupted_at_its_end(wheel_model, method, ctrl_c, monkeypatch):
+    model, start = wheel_model
+    if method is not None:
+        model = sv.derive(*gallery["overhead-crane"].build())
+        start = model.start()
+    started = simulation._as_started
+    monkeypatch.setattr(simulation, "_as_started", lambda *given: signal.raise_signal(signal.SIGINT) or started(*given))
+    ctrl_c(60.0)
+    run = sv.simulate(model, start, (0.0, 1.0), method)
+    assert (run.status, run.success) == (1, False) and "interrupted" in run.message and run.t[-1] == 1.0
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
 
 @pytest.mark.parametrize(

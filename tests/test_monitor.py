@@ -4,8 +4,10 @@ import casadi as ca
 import closed_forms as cf
 import numpy as np
 import pytest
+from scipy.integrate import solve_ivp
 
 import servoctl as sv
+from servoctl.methods.bulk import BulkSteps
 from servoctl.methods.monitor import DEGRADED, NO_CHOICE, DenseStretch, Fine, Monitor, Repivot, Singular, Stretch
 
 
@@ -130,13 +132,58 @@ def test_a_gradient_that_falls_along_the_motion_is_no_lost_rank(row, method):
     assert np.hypot(run["x"], run["y"])[-1] == pytest.approx(radius, rel=1e-7)
 
 
+def a_gradient_that_vanishes():
+    """(x - 20) y' = cos t."""
+    q = sv.coordinates("x y")
+    mechanism = sv.Mechanism(q, gibbs=ca.sumsqr(ca.vertcat(*q.d(2))) / 2)
+    return sv.derive(mechanism, sv.Program({"p": (q.jet(0)[0] - 20.0) * q.jet(1)[1] - ca.cos(q.t)}, by="ideal"))
+
+
 @pytest.mark.parametrize("method", ["DOP853", "Taylor", "RK8", "RadauIIA"])
 def test_a_rank_that_is_lost_after_a_long_way_is_lost(method):
     """(x - 20) y' = cos t at x = 1 + 8 t: a gradient that falls to zero linearly, at 19/8 s."""
-    q = sv.coordinates("x y")
-    mechanism = sv.Mechanism(q, gibbs=ca.sumsqr(ca.vertcat(*q.d(2))) / 2)
-    program = sv.Program({"p": (q.jet(0)[0] - 20.0) * q.jet(1)[1] - ca.cos(q.t)}, by="ideal")
-    model = sv.derive(mechanism, program)
+    model = a_gradient_that_vanishes()
     with pytest.raises(sv.SingularProgram) as error:
         sv.simulate(model, model.start(x=1.0, y=0.0, dx=8.0), (0.0, 4.0), method)
     assert error.value.details["t"] == pytest.approx(19 / 8, abs=1e-3)
+
+
+@pytest.mark.parametrize("method, distance", [("DOP853", 1e-3), ("Taylor", 0.1), ("RadauIIA", 1e-2)])
+@pytest.mark.filterwarnings("ignore:Internal dynamics unstable")
+def test_a_zero_of_a_pivot_next_to_a_singular_state_is_passed(method, distance):
+    """s y' + ε z' = cos t with s = 8 t - 19: the entry of y' vanishes at 19/8 s, where the gradient is ε."""
+    q = sv.coordinates("x y z")
+    x, _, _ = q
+    mechanism = sv.Mechanism(q, gibbs=ca.sumsqr(ca.vertcat(*q.d(2))) / 2)
+    _, dy, dz = q.d(1)
+    program = sv.Program({"p": (x - 20.0) * dy + distance * dz - ca.cos(q.t)}, by="ideal")
+    model = sv.derive(mechanism, program)
+    start = model.start(x=1.0, y=0.0, z=0.0, dx=8.0, dz=0.3)
+    run = sv.simulate(model, start, (0.0, 3.0), method, t_eval=[0.0, 3.0])
+
+    def rates(t, v):
+        gradient = np.array([8.0 * t - 19.0, distance])
+        return -gradient * (np.sin(t) + 8.0 * v[0]) / (gradient @ gradient)
+
+    ends = [run["dy"][0], run["dz"][0]]
+    assert ends == pytest.approx([(0.3 * distance - 1.0) / 19.0, 0.3])
+    true = solve_ivp(rates, (0.0, 3.0), ends, "Radau", rtol=1e-10, atol=1e-12).y[:, -1]
+    assert [run["dy"][1], run["dz"][1]] == pytest.approx(true, rel=1e-5)
+
+
+def test_steps_that_miss_the_equations_where_the_rank_is_lost_end_the_motion(monkeypatch):
+    """Rounding of accelerations grows towards a singular state, where steps of any length then miss the equations."""
+    model = a_gradient_that_vanishes()
+    ordinary, tries = BulkSteps._doubted, []
+
+    def doubted(self, stretch):
+        if stretch.t[-1] < 19 / 8 - 1e-4:
+            return ordinary(self, stretch)
+        tries.append(stretch.t[1] - stretch.t[0])
+        assert len(tries) < 40
+        return 0, stretch.t[0] + tries[-1] / 10
+
+    monkeypatch.setattr(BulkSteps, "_doubted", doubted)
+    with pytest.raises(sv.SingularProgram) as error:
+        sv.simulate(model, model.start(x=1.0, y=0.0, dx=8.0), (0.0, 4.0), "DOP853")
+    assert error.value.details["t"] == pytest.approx(19 / 8, abs=1e-3) and tries

@@ -529,6 +529,18 @@ def test_quotients_that_overflow_keep_their_derivatives_and_others_none():
     assert not np.isfinite(near.outputs[4][1])  # an infinite slope is no overflow
 
 
+@pytest.mark.parametrize("divisor", [lambda x: 1 + ca.exp(0.3 * x), ca.cosh, lambda x: (2 + ca.exp(x)) ** 2])
+def test_derivatives_of_quotients_that_may_overflow_are_differentiated_again(divisor):
+    q = sv.coordinates("x y")
+    x, y = q
+    quotient = y / divisor(x)
+    at_once, twice = q.derivatives([quotient], 4)[-1], q.derivatives(q.derivatives([quotient], 2)[-1], 2)[-1]
+    jets = ca.vertcat(*(q.jet(k) for k in range(5)))
+    at = np.random.default_rng(4).uniform(-1, 1, jets.numel())
+    first, second = (float(ca.Function("f", [jets], [e[0]])(at)) for e in (at_once, twice))
+    assert first == pytest.approx(second, rel=1e-13)
+
+
 PULSES = {  # of time alone, or of the place x = t: their impulse is 1, about t = 1
     "by fabs": lambda t: ca.if_else(ca.fabs(t - 1) < 0.002, 250.0, 0.0),
     "by a square": lambda t: ca.if_else((t - 1.00037) ** 2 < 4e-6, 250.0, 0.0),

@@ -8,9 +8,11 @@ import numpy as np
 import pytest
 from refusals import refused
 
+import servoctl as sv
 from servoctl.errors import SpecificationError
 from servoctl.jets.series import Series
 from servoctl.jets.tape import Tape, evaluate
+from servoctl.methods.taylor import taylor_coefficients
 from servoctl.spec import coordinates
 
 RNG = np.random.default_rng(31)
@@ -284,6 +286,28 @@ def growth(expression, q, orders):
 def test_cost_grows_quadratically(build):
     q = coordinates("x y")
     assert growth(build(q), q, np.arange(4, 17, 2)) < 2.3
+
+
+SINE, COSINE = (np.array([phase[k % 4] / factorial(k) for k in range(10)]) for phase in ((0, 1, 0, -1), (1, 0, -1, 0)))
+COEFFICIENTS = {  # a residual in x, y, y' and t, a start, and the series of y
+    "order 0": (lambda x, y, dy, t: y - ca.sin(t), {}, SINE),
+    "order 1": (lambda x, y, dy, t: dy - x, {"y": 0.5}, SINE + (2 * (np.arange(10) == 0) - COSINE) / 2),
+}
+
+
+@pytest.mark.parametrize("row", COEFFICIENTS)
+def test_coefficients_of_a_series_are_those_of_the_motion(row):
+    """A mass on a spring, x'' = -x, whose y is moved by an actuator of its own."""
+    residual, start, series = COEFFICIENTS[row]
+    q = coordinates("x y")
+    x, y = q
+    mechanism = sv.Mechanism(q, gibbs=ca.sumsqr(ca.vertcat(*q.d(2))) / 2, potential=x**2 / 2, actuators={"u": y})
+    model = sv.derive(mechanism, sv.Program({"p": residual(x, y, q.d(1)[1], q.t)}))
+    state = model.start(x=1.0, dx=0.5, **start).values
+    f = taylor_coefficients(model.equations, 9)
+    computed = np.array(f(0.0, state, 0.0)).ravel()[:18].reshape(9, 2)
+    assert computed[:, 0] == pytest.approx((COSINE + SINE / 2)[1:], abs=1e-15)
+    assert computed[:, 1] == pytest.approx(series[1:], abs=1e-15)
 
 
 def test_cost_with_quasi_velocities_grows_quadratically():

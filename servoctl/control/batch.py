@@ -31,7 +31,8 @@ class Unit:
     """The C text of a batch for any number of lanes, and the function of its table; made by `unit`.
 
     `table` maps t_k and row k of the schedule to values that are common to all cases at a sample. `states`, `inputs`
-    and `residuals` (Residuals or None) are gathered; `n_y` is the number of measurements.
+    and `residuals` (Residuals or None) are gathered; `n_y` is the number of measurements. Behind these comes, if
+    `watched` is 1, the largest share of its terms that an entry left out by eliminations has.
     """
 
     text: str
@@ -40,6 +41,7 @@ class Unit:
     inputs: tuple
     residuals: object
     n_y: int
+    watched: int
 
     @property
     def names(self):
@@ -81,6 +83,10 @@ def _derived(plant, law, disturbed, residuals):
         # a single parameter indexed by [] is a row in CasADi, not a column
         numbers = ca.vertcat(ca.SX(0, 1), *(constants[i] for i in places))
         phi = residuals.expression(t_k, x, plant.state_names, numbers)
+    entries = plant.equations.dropped
+    if entries is not None:
+        values, sizes = ca.vertsplit(ca.fabs(entries.expression(t_k, x, p)), entries.n_y // 2)
+        phi = ca.vertcat(phi, ca.mmax(ca.if_else(sizes > 0, values / sizes, 0)))
     phi, s, s_values = _apart(phi, t_k)
     phi, v, v_values = _apart(phi, constants)
     sizes = {
@@ -101,7 +107,9 @@ def _derived(plant, law, disturbed, residuals):
         emit.include("batch.c"),
     ]
     table = _function("table", t_k, ca.SX(0, 1), row, ca.vertcat(common_values, s_values))
-    return Unit("".join(parts), compiled(table, "table"), plant.state_names, plant.inputs, residuals, len(law.measures))
+    text, watched = "".join(parts), int(entries is not None)
+    table = compiled(table, "table")
+    return Unit(text, table, plant.state_names, plant.inputs, residuals, len(law.measures), watched)
 
 
 def _rates(plant, disturbed):
@@ -167,7 +175,7 @@ def run_batch(unit, loop, cases, noise=None, traced=(), every=1, threads=None):
     if native is None:
         return None
     native.restype = None
-    count, width, size = cases[1].shape[1], 2 * n, len(unit.names)
+    count, width, size = cases[1].shape[1], 2 * n, len(unit.names) + unit.watched
     blocks = -(-count // width)
     columns = np.minimum(np.arange(blocks * width), count - 1)
     gathered = np.full((2 + 3 * size, blocks * width), np.nan)

@@ -14,6 +14,7 @@ from servoctl.control.loop import FINISHED, INTERRUPTED, LAW_LOST, STATE_LOST, L
 from servoctl.control.reference import Reference, of_plan, require_plan, require_plant, resampled
 from servoctl.control.result import Closed
 from servoctl.errors import InconsistentStart, IntegrationStopped, ServoError, SpecificationError
+from servoctl.methods.dropped import DERIVATIONS, came_alive, first_alive
 from servoctl.plants.plant import Plant
 from servoctl.reduction.orders import other_order
 from servoctl.run import Run
@@ -78,8 +79,29 @@ def close(
     require_names(law, plant)
     if plan is not None:
         require_plan(plan, plant)
-    loop = _loop(plant, law, x0, t_span, conditions)
-    return _finish(plant, law, law.plan if plan is None else plan, loop, conditions)
+    plan = law.plan if plan is None else plan
+    for _ in range(DERIVATIONS):
+        run = _finish(plant, law, plan, _loop(plant, law, x0, t_span, conditions), conditions)
+        t, equations = _derived_along(run)
+        if equations is None:
+            return run
+        plant = replace(plant, equations=equations)
+    raise _stopped_at(run, came_alive(t))
+
+
+def _derived_along(run):
+    """The instant at which an entry that eliminations left out comes alive, and equations derived near it; or None."""
+    plant, equations, t, x = run.plant, run.plant.equations, run.t, run.states
+    values = plant.parameters[: len(equations.values)]
+
+    def entries(some):
+        return equations.entries_dropped, equations.points_at(t[some], x[:, some], values)
+
+    found = first_alive(equations.dropped, entries, t, x, plant.p())
+    if found is None:
+        return None, None
+    first, clearest = found
+    return float(t[first]), equations.near(float(t[clearest]), x[:, clearest], values)
 
 
 def _of_start(plant, plan, x0):
@@ -190,9 +212,13 @@ def _of_same_orders(run):
     k, row = equations.orders.first_change(run.t, states, values)
     if k is None:
         return run
-    error = other_order(row, float(run.t[k]))
+    raise _stopped_at(run, other_order(row, float(run.t[k])))
+
+
+def _stopped_at(run, error):
+    """The error that stops a loop, with the run."""
     error.run = replace(run, success=False, status=-1, message=f"stopped: {str(error).split('. ')[0]}")
-    raise error
+    return error
 
 
 def _stopped(law, loop, status, end):

@@ -12,6 +12,8 @@ from typing import NamedTuple
 import casadi as ca
 import numpy as np
 
+from servoctl.tolerances import LAST_EXPONENT
+
 _SIDES = {
     ca.OP_FABS: lambda b, x, y: (2 * b - 1) * x,
     ca.OP_SIGN: lambda b, x, y: 2 * b - 1,
@@ -59,8 +61,18 @@ def has_switches(expressions):
     ----------
     expressions : SX column
     """
-    f = ca.Function("branches", [], [expressions], {"allow_free": True})
-    return any(f.instruction_id(k) in _SWITCHING for k in range(f.n_instructions()))
+    f, last = ca.Function("branches", [], [expressions], {"allow_free": True, "live_variables": False}), set()
+    places = 0
+    for k in range(f.n_instructions()):
+        op, operands = f.instruction_id(k), f.instruction_input(k)
+        if op == ca.OP_OUTPUT:
+            continue
+        if op in _SWITCHING and not last.intersection(operands):
+            return True
+        if op == ca.OP_CONST and abs(f.instruction_constant(k)) == LAST_EXPONENT:
+            last.add(places)
+        places += 1
+    return False
 
 
 class Branches:
@@ -97,11 +109,12 @@ class Branches:
         work, original, moves = [], [], []  # smooth values, the same with their decisions, whether these may change
 
         def value(op, operands):
-            original.append(_apply(op, *(original[i] for i in operands)))
+            original.append(apply_code(op, *(original[i] for i in operands)))
             moves.append(any(moves[i] for i in operands))
             decides = op in _SIDES or (angles and op == ca.OP_ATAN2)
+            decides &= not any(_ends_an_exponent(original[i]) for i in operands)
             if not (moves[-1] and decides):
-                return _apply(op, *(work[i] for i in operands))
+                return apply_code(op, *(work[i] for i in operands))
             pairs = [(work[i], original[i]) for i in operands]
             return self._angle(*pairs) if op == ca.OP_ATAN2 else self._side(op, *pairs)
 
@@ -110,7 +123,7 @@ class Branches:
             moves.append(symbol and self.moves(expression))
             return expression
 
-        return _replayed(merged.elements(), work, leaf, value)
+        return replayed(merged.elements(), work, leaf, value)
 
     def _side(self, op, x, y=None):
         """|x|, sign x, or an operation that compares x with y; pairs of smooth and original expressions."""
@@ -154,6 +167,11 @@ class Branches:
         return b
 
 
+def _ends_an_exponent(value):
+    """Whether a value is the constant at which exponents stay (see `overflow`), which is no switch."""
+    return value.is_constant() and abs(float(value)) == LAST_EXPONENT
+
+
 def without_turns(expression):
     """An expression that is a sum with angles atan2(y, x), zero also where it differs from zero by whole turns.
 
@@ -174,11 +192,11 @@ def without_turns(expression):
     def value(op, operands):
         arguments = [work[i] for i in operands]
         if op != ca.OP_ATAN2 or not any(map(ca.symvar, arguments)):
-            return _apply(op, *arguments)
+            return apply_code(op, *arguments)
         angles.append((ca.SX.sym(f"angle_{len(angles)}"), *arguments))
         return angles[-1][0]
 
-    (whole,) = _replayed([ca.cse(expression)], work, lambda leaf, symbol: leaf, value)
+    (whole,) = replayed([ca.cse(expression)], work, lambda leaf, symbol: leaf, value)
     slopes = [ca.simplify(ca.jacobian(whole, angle)) for angle, *_ in angles]
     if not all(c.is_constant() for c in slopes) or all(c.is_zero() for c in slopes):
         return expression
@@ -235,9 +253,9 @@ def domain_edges(expressions):
         if op == ca.OP_ATAN2:
             angle = f"the angle atan2({', '.join(map(_words, arguments))}) passes pi"
             result.append((angle, ca.fmax(ca.fabs(arguments[0]), arguments[1]), 0.0))
-        return _apply(op, *arguments)
+        return apply_code(op, *arguments)
 
-    _replayed(expressions, work, lambda expression, symbol: expression, value)
+    replayed(expressions, work, lambda expression, symbol: expression, value)
     return result
 
 
@@ -268,9 +286,9 @@ def steep_arguments(expressions):
         if op in _STEEP:
             steep = arguments[1:] if op == ca.OP_DIV else arguments
             result.update((a.element_hash(), a) for a in steep if not a.is_constant())
-        return _apply(op, *arguments)
+        return apply_code(op, *arguments)
 
-    _replayed(expressions, work, lambda expression, symbol: expression, value)
+    replayed(expressions, work, lambda expression, symbol: expression, value)
     return list(result.values())
 
 
@@ -298,7 +316,7 @@ def size_of_terms(expression):
     values, sizes = [], []
 
     def size(op, operands):
-        values.append(_apply(op, *(values[i] for i in operands)))
+        values.append(apply_code(op, *(values[i] for i in operands)))
         if op == ca.OP_DIV:
             return sizes[operands[0]] / ca.fabs(values[operands[1]])
         return _SIZES[op](*(sizes[i] for i in operands)) if op in _SIZES else ca.fabs(values[-1])
@@ -307,10 +325,10 @@ def size_of_terms(expression):
         values.append(expression)
         return ca.fabs(expression)
 
-    return _replayed([expression], sizes, leaf, size)[0]
+    return replayed([expression], sizes, leaf, size)[0]
 
 
-def _replayed(expressions, work, leaf, value):
+def replayed(expressions, work, leaf, value):
     """The outputs of expressions whose operations are taken one by one; `work` receives all values in their order.
 
     `leaf` gives the value of a symbol (True) or a constant (False), `value` that of an operation on places of `work`.
@@ -330,7 +348,8 @@ def _replayed(expressions, work, leaf, value):
     return outputs
 
 
-def _apply(op, *operands):
+def apply_code(op, *operands):
+    """The operation of CasADi with a code on SX scalars."""
     return ca.SX.unary(op, *operands) if len(operands) == 1 else ca.SX.binary(op, *operands)
 
 
@@ -362,6 +381,6 @@ def _without_paths(expression):
     def value(op, operands):
         moves = any(timed[i] is False for i in operands)
         timed.append(False if moves else True if any(timed[i] for i in operands) else None)
-        return _apply(op, *(path if moves and timed[i] and work[i].n_dep() else work[i] for i in operands))
+        return apply_code(op, *(path if moves and timed[i] and work[i].n_dep() else work[i] for i in operands))
 
-    return _replayed([expression], work, leaf, value)[0]
+    return replayed([expression], work, leaf, value)[0]

@@ -6,6 +6,7 @@ the sizes of the terms that made them.
 
 import math
 import operator
+import sys
 from functools import cached_property
 from math import factorial
 from typing import NamedTuple
@@ -14,6 +15,7 @@ import casadi as ca
 import numpy as np
 
 from servoctl.errors import SpecificationError
+from servoctl.tolerances import LAST_EXPONENT
 
 REAL = np.longdouble
 MOST_SQUARED = 64  # the largest whole exponent that is written as squares and products
@@ -76,7 +78,7 @@ def select(condition, yes, no):
 
 def finite(a):
     """Whether an SX expression, as 1 or 0, or the entries of an array are finite."""
-    return ca.fabs(a) < ca.inf if isinstance(a, ca.SX) else np.isfinite(a)
+    return ca.fabs(a) <= sys.float_info.max if isinstance(a, ca.SX) else np.isfinite(a)
 
 
 class Node(NamedTuple):
@@ -195,7 +197,7 @@ class Tape:
     def _operation(self, op, a):
         if op in _BINARY:
             if op in (ca.OP_FMIN, ca.OP_FMAX):
-                self.switches.append((a[0], a[1]))
+                self._switch(a[0], a[1])
             return self._add(_BINARY[op], a[0], a[1])
         if op in _UNARY:
             if op == ca.OP_FABS:
@@ -203,7 +205,7 @@ class Tape:
             return self._add(_UNARY[op], a[0])
         if op in _CONSTANT:
             if op in (ca.OP_LT, ca.OP_LE, ca.OP_SIGN):
-                self.switches.append((a[0], a[1] if op != ca.OP_SIGN else None))
+                self._switch(a[0], a[1] if op != ca.OP_SIGN else None)
             return self._add("constant", *a[: 1 if op in (ca.OP_NOT, ca.OP_SIGN) else 2], data=_CONSTANT[op])
         if op == ca.OP_TWICE:
             return self._add("scale", a[0], data=2.0)
@@ -226,6 +228,12 @@ class Tape:
             do="Use if_else, fmin, fmax or fabs: each of their branches is differentiated.",
             operation=name,
         )
+
+    def _switch(self, a, b):
+        """Note that the sign of a difference of nodes decides a branch."""
+        ends = (self.nodes[i].data for i in (a, b) if i is not None and self.nodes[i].kind == "const")
+        if not any(abs(end) == LAST_EXPONENT for end in ends):
+            self.switches.append((a, b))
 
     def _power(self, base, exponent):
         node = self.nodes[exponent]

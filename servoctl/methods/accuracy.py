@@ -54,13 +54,13 @@ def relative_error(values, reference, levels=None):
     return float((np.abs(values - reference) / component_sizes(reference, levels)[:, None]).max())
 
 
-def component_sizes(values, levels):
-    """The size of each component (n,) of values (n, N), as `relative_error` takes it."""
+def component_sizes(values, levels, least=SMALLEST_SIZE):
+    """The size of each component (n,) of values (n, N), as `relative_error` takes it, from a share of its level on."""
     size = np.abs(values).max(axis=1)
     for level in np.unique(levels):
         same = levels == level
-        size[same] = np.maximum(size[same], SMALLEST_SIZE * size[same].max())
-    size[size == 0] = 1.0
+        size[same] = np.maximum(size[same], least * size[same].max())
+    size[~(size > 0)] = 1.0  # NaN among them
     return size
 
 

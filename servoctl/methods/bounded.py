@@ -23,7 +23,7 @@ from servoctl.errors import (
     SpecificationError,
     UnstableInternalDynamics,
 )
-from servoctl.methods.accuracy import state_levels
+from servoctl.methods.accuracy import component_sizes, state_levels
 from servoctl.methods.motion import DEFAULT_SAMPLES, Motion, breakpoints, margin_at
 from servoctl.methods.radau import basis, radau
 from servoctl.model.switching import switching
@@ -338,7 +338,7 @@ class Problem(FreeEntries):
         last = self.equilibrium(span[1], first.x)
         times = np.linspace(*span, 41)
         along = self._quasi_static(times, first.x[:, None] + np.linspace(0, 1, 41) * (last.x - first.x)[:, None])
-        self.size = _level_sizes(along, state_levels(model))
+        self.size = component_sizes(along, state_levels(model), 1.0)
         self._choose(times, along, self.n_x - self.m)
         self.first, self.last = (self.equilibrium(end.t, end.x) for end in (first, last))
         self._require_splitting()
@@ -632,12 +632,6 @@ def subdivided(mesh, counts):
     """The mesh with each interval cut into so many, (N,) int."""
     pieces = [np.linspace(a, b, n + 1)[:-1] for a, b, n in zip(mesh[:-1], mesh[1:], counts, strict=True)]
     return np.append(np.concatenate(pieces), mesh[-1])
-
-
-def _level_sizes(values, levels):
-    """Size of each entry (n_x,): the largest value at its level, of values (n_x, N); 1 where a level is zero."""
-    largest = np.array([np.abs(values[levels == level]).max() for level in levels])
-    return np.where(largest > 0, largest, 1.0)
 
 
 def basis_rates(c, theta):

@@ -6,7 +6,7 @@ function in the equations may be narrow. Steps up to the first one that does not
 that instant, so that its stages see what it stepped over.
 """
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -19,16 +19,36 @@ from servoctl.methods.watch import FINER, RESOLUTION, End, net, steps_of
 OFF = 1e3  # times the tolerance, which the equations may add to a step
 REPEATS = 8  # of a step at one instant, after which it is believed
 SHORTER = 1e-2  # to which part a first step is shortened that errs by far
+FUTILE = 1e-8  # of the span: a shorter step that misses the equations where the rank is lost ends the motion
 SHORTEST = 1e-12  # of the span: shorter steps are not repeated, so that a jump of the equations is passed
 SPACING = 1e-3  # of a step, between the points by which its dense output is differentiated
+
+
+@dataclass(frozen=True)
+class Steps:
+    """Steps with dense output: states `at(k, times)` (n_x, N) within steps k (N,) at times (N,).
+
+    `slope(k, times)` gives their derivatives, NaN for entries that are not integrated.
+
+    Attributes
+    ----------
+    t : (S + 1,) array
+        Starts, and the end of the last one [s].
+    x : (n_x, S + 1) array
+        States there.
+    failed : bool
+        Whether no further step succeeds.
+    """
+
+    t: np.ndarray
+    x: np.ndarray
+    failed: bool
 
 
 class BulkSteps(Stepping):
     """An integration that takes many steps at once, by `_steps`; `failure` is the reason if no further one succeeds.
 
-    `_steps` returns an object with the ends t (S + 1,) [s], states x (n_x, S + 1) there, states `at(k, times)` in
-    between, from steps k (N,) and times (N,), their derivatives `slope(k, times)`, NaN for entries that are not
-    integrated, and `failed`: whether no step succeeds after them.
+    `_steps` returns an object with the attributes and methods of `Steps`.
     """
 
     off = OFF
@@ -59,7 +79,8 @@ class BulkSteps(Stepping):
             if before < last:
                 self._record(steps, before, last)
             self.progress(t)
-            if isinstance(outcome, Fine) and steps.failed and last == len(steps.t) - 1:
+            futile = doubt is not None and abs(doubt - t) < FUTILE * self.watch.span and self.monitor.lost(t, x)
+            if isinstance(outcome, Fine) and (futile or steps.failed and last == len(steps.t) - 1):
                 self._fail(t, x, self.failure)
                 goes_on = False
             if not goes_on:

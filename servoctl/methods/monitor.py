@@ -18,7 +18,8 @@ from servoctl.tolerances import ENTRY
 DEGRADED = 0.02  # of its reference: a pivot below this is replaced, if the matrix itself is better than that
 HELPS = 5.0  # factor by which the matrix must be better
 NEGLIGIBLE = 1e-7  # of its reference: a pivot below this is zero
-SINGULAR = 1e-3  # at a zero of a pivot that dense output has located: a rank measure below this counts as lost
+SINGULAR = 1e-3  # of the rank measure beside a zero of a pivot that dense output has located: below this it is lost
+NEXT = 1e-6  # of a step: distance from the zero of a pivot at which the rank measure is taken
 HOPELESS = 1e-9  # an equilibrated singular value below this leaves no digits
 VANISHING = 0.03  # of its reference: a gradient or rank measure below this counts as lost
 LOST = 0.1  # of its best, or beside a zero: below this, rank is why no step succeeds or a pivot is zero
@@ -96,7 +97,7 @@ class Stretch:
     pivots: np.ndarray
     top: object
     crosses: bool = False
-    lost = DEGRADED  # rank measure at a zero as roughly located as here, below which the program is singular
+    lost = LOST  # rank measure at a zero as roughly located as here, below which the program is singular
 
     def first(self, count):
         """The first steps alone."""
@@ -126,10 +127,6 @@ class Stretch:
         """Where pivot i is least in step k, and its size there relative to a scale, from such sizes at instants."""
         j = int(np.argmin(sizes))
         return instants[j], sizes[j]
-
-    def ranks_at(self, k, t):
-        """Instants at which the matrices must have full rank if a zero at t is one of the pivots only."""
-        return self.t[k], t, self.t[k + 1]  # linear interpolation locates the zero only roughly
 
     def last_before(self, k, t):
         """The last instant before t from which the motion may go on."""
@@ -204,10 +201,6 @@ class DenseStretch(Stretch):
         best = min([*instants, float(least.x)], key=size)
         return best, size(best) / scale
 
-    def ranks_at(self, k, t):
-        """The zero alone: dense output locates it to rounding."""
-        return (t,)
-
     def last_before(self, k, t):
         """The last inspected instant before t, or the start of step k if the motion resumes from steps only."""
         if not self.resumes:
@@ -240,6 +233,7 @@ class Monitor:
         self.rows = [np.linalg.norm(m / c, axis=1) for m, c in zip(matrices, self.columns, strict=True)]
         for row, i in model.balances().items():  # TᵀM grows at the zeros of a pivot; √M_ii is its size with others
             self.rows[0][row] = self.columns[0][i]
+        self.balances = list(model.balances())
         self.stories = [model.row_stories(), {}]
         self.largest = np.abs(np.asarray(x, dtype=float))
         self.best, self.lift = self._smallest(matrices), 1.0
@@ -293,11 +287,17 @@ class Monitor:
         rows = len(self.l_names)
         return y[: rows * n].reshape(n, rows).T, y[rows * n : -n].reshape(n, len(self.b_names)).T
 
-    def _smallest(self, matrices):
+    def _smallest(self, matrices, rows=None):
+        """The smallest singular values of L and B, their rows scaled by `rows`; default: by the references.
+
+        Rows TᵀM of (3.18) hold quotients of pivots; an orthonormal basis of their span does not.
+        """
         result = []
-        for m, c, r in zip(matrices, self.columns, self.rows, strict=True):
+        for m, c, r, some in zip(matrices, self.columns, rows or self.rows, (self.balances, []), strict=True):
             scaled = (m / c) / np.where(r > 0, r, 1.0)[:, None] if np.all(np.isfinite(m)) else m
             finite = scaled.size and np.all(np.isfinite(m))
+            if finite and some:
+                scaled[some] = np.linalg.qr(scaled[some].T)[0].T
             result.append(np.linalg.svd(scaled, compute_uv=False)[-1] if finite else (0.0 if scaled.size else 1.0))
         return np.array(result)
 
@@ -418,8 +418,7 @@ class Monitor:
 
     def _vanishing(self, stretch, k, t, why):
         """The outcome of a pivot that vanishes at t in step k: another choice of pivots, or a singular program."""
-        measure = min(self.rank_measure(s, stretch.state(k, s)) for s in stretch.ranks_at(k, t))
-        if measure > stretch.lost or self._as_beside(stretch, k, t):
+        if self.at_zero(stretch, k, t) > stretch.lost:
             if stretch.crosses:
                 return _other_pivots(k + 1, stretch.t[k + 1], stretch.x[:, k + 1])
             before = stretch.last_before(k, t)
@@ -427,27 +426,28 @@ class Monitor:
         x, before = stretch.state(k, t), stretch.last_before(k, t)
         singular, start = Singular(k, t, x, why), stretch.state(k, before)
         variant = self.repivoted(before, start, stretch.top(before, start))
-        helps = variant is not None and variant[1].rank_measure(t, x) > stretch.lost
+        helps = variant is not None and variant[1].at_zero(stretch, k, t) > stretch.lost
         return Repivot(k, before, start, variant, singular) if helps else singular
 
-    def _as_beside(self, stretch, k, t):
-        """Whether rows at the zero of a pivot are as large and independent as beside it; if so they are references.
+    def at_zero(self, stretch, k, t):
+        """The rank measure at a zero of a pivot in step k, relative to the larger one at the step's ends.
 
-        Gradients may fall along the whole motion, as 1/r where a row is an angle or its rate.
+        Rows are measured by their sizes at these ends: gradients may fall along the whole motion, as 1/r where a row
+        is an angle or its rate. Where the motion so far was far better, these sizes become the references. It is zero
+        where the residual may hide a zero.
         """
+        t += NEXT * max(stretch.t[k : k + 2] - t, key=abs)  # at the zero itself, quotients of pivots have no value
         x = stretch.state(k, t)
-        if self.hidden_zero(1.0, t, x):
-            return False
-        beside = [self._matrices(s, stretch.state(k, s)) for s in stretch.t[k : k + 2]]
-        before, self.rows = self.rows, [
-            np.max([np.linalg.norm(m[i] / c, axis=1) for m in beside], axis=0) for i, c in enumerate(self.columns)
-        ]
-        now, ends = self._smallest(self._matrices(t, x)), [self._smallest(m) for m in beside]
-        if np.any(now <= LOST * np.min(ends, axis=0)):
-            self.rows = before
-            return False
-        self.best = now
-        return True
+        if self.rank_measure(t, x) < self._hides(stretch.t[k + 1], stretch.x[:, k + 1]):
+            return 0.0
+        ends = [self._matrices(s, stretch.state(k, s)) for s in stretch.t[k : k + 2]]
+        rows = [np.max([np.linalg.norm(m[i] / c, axis=1) for m in ends], axis=0) for i, c in enumerate(self.columns)]
+        here, *beside = (self._smallest(m, rows) for m in (self._matrices(t, x), *ends))
+        larger = np.maximum(*beside)
+        result = float(np.min(here / np.where(larger > 0, larger, np.inf)))
+        if result > stretch.lost and self.rank_measure(t, x) < LOST:
+            self.rows, self.best = rows, here
+        return result
 
     def _lingers(self, k, instants, sizes, x):
         """Singular if a pivot sank below what the residual hides, should have crossed zero by now, and stays there."""
@@ -470,9 +470,13 @@ class Monitor:
 
     def hidden_zero(self, relative, t, x):
         """Whether a relative pivot, or the rank measure, is so small that the residual may hide a zero."""
+        return min(relative, self.rank_measure(t, x)) < self._hides(t, x)
+
+    def _hides(self, t, x):
+        """Below which the residual at a state may hide a zero."""
         values = self.invariants(t, x, self.model.parameters)[: self.m]
         residual = np.abs(values / self.gradients).max(initial=0.0)  # relative to the gradients at the start
-        return min(relative, self.rank_measure(t, x)) < max(NEGLIGIBLE, HIDES * np.sqrt(residual))
+        return max(NEGLIGIBLE, HIDES * np.sqrt(residual))
 
     def pivots_only(self, relative, t, x):
         """Whether a degraded pivot is only badly chosen: the matrices themselves are far better."""

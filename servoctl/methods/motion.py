@@ -1,6 +1,8 @@
 """What all integrations share: the pieces of a motion, and the change of pivots that the rank monitor requires."""
 
 import contextlib
+import signal
+import threading
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -36,6 +38,15 @@ class Motion:
         """Append samples t (N,), X (n_x, N) and γ^(s̄) (n, N) computed with one variant of the model."""
         if len(t):
             self.pieces.append((model, np.asarray(t), np.asarray(x), np.asarray(top)))
+
+    def end_before(self, t, error):
+        """Drop the samples from an instant t [s] on, and stop there for an error."""
+        for i, (model, times, x, top) in enumerate(self.pieces):
+            if t in times:
+                k = int(np.flatnonzero(times == t)[0])
+                self.pieces[i:] = [(model, times[:k], x[:, :k], top[:, :k])] if k else []
+                break
+        self.stop = error
 
     def changes_pivots(self, t):
         """Note a change of pivots at t; False if one was made at this instant already and did not help."""
@@ -84,6 +95,20 @@ def interruptible(motion):
         yield
     except KeyboardInterrupt:
         motion.interrupted = True
+
+
+@contextlib.contextmanager
+def without_interruption():
+    """Ctrl-C waits until the end; the list is not empty if it came."""
+    pressed, before = [], signal.getsignal(signal.SIGINT)
+    if threading.current_thread() is not threading.main_thread() or not callable(before):
+        yield pressed
+        return
+    signal.signal(signal.SIGINT, lambda number, frame: pressed.append(number))
+    try:
+        yield pressed
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 def margin_at(t):

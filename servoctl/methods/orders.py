@@ -14,12 +14,11 @@ def end_at_other_orders(motion):
     motion : Motion
         Its samples are cut in place.
     """
-    for i, (model, t, x, top) in enumerate(motion.pieces):
+    for model, t, x, top in motion.pieces:
         jets = np.vstack([x, top])
         k, name = model.reduction.orders.first_change(t, jets, model.parameters)
         if k is not None:
-            motion.stop = _other_order(model, name, float(t[k]), jets[:, k])
-            motion.pieces[i:] = [(model, t[:k], x[:, :k], top[:, :k])] if k else []
+            motion.end_before(t[k], _other_order(model, name, float(t[k]), jets[:, k]))
             return
 
 

@@ -10,7 +10,7 @@ from servoctl.codegen.function import compiled
 from servoctl.codegen.loops import ROUNDING
 from servoctl.codegen.native import pointer
 from servoctl.errors import SpecificationError
-from servoctl.methods.bulk import BulkSteps
+from servoctl.methods.bulk import BulkSteps, Steps
 from servoctl.methods.choice import RADAU_ORDERS, Project
 from servoctl.methods.motion import equal_steps
 
@@ -218,25 +218,16 @@ def _size(v):
 
 
 @dataclass(frozen=True)
-class Steps:
+class Collocated(Steps):
     """Steps of a Radau IIA method.
 
     Attributes
     ----------
-    t : (S + 1,) array
-        Starts, and the end of the last one [s].
-    x : (n_x, S + 1) array
-        States there.
-    failed : bool
-        Whether no further step succeeds.
     order : int
     z : (S, s, n_x) array
         Increments of the stages.
     """
 
-    t: np.ndarray
-    x: np.ndarray
-    failed: bool
     order: int
     z: np.ndarray
 
@@ -334,7 +325,7 @@ class RadauSteps(BulkSteps):
             self.motion.count(projections=len(z) // self.every)
             if t[-1] == b:
                 x = np.column_stack([x[:, :-1], self._settled(t[-1:], x[:, -1:])])
-        return Steps(t, x, len(z) < self.most and t[-1] != b, self.settings.order, z)
+        return Collocated(t, x, len(z) < self.most and t[-1] != b, self.settings.order, z)
 
     def _settled(self, times, states):
         return settle(self.f, times, states, self.p) if self.every else states

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from servoctl.methods.bulk import BulkSteps, differentiated
+from servoctl.methods.bulk import BulkSteps, Steps, differentiated
 from servoctl.methods.choice import MinimalCoordinates, Project
 from servoctl.methods.minimal import Chart, MinimalSolver, Sizes
 from servoctl.methods.watch import edge
@@ -15,24 +15,15 @@ MANY, CREEPS = 200, 1e-5  # steps in which a motion near the edge of a domain pa
 
 
 @dataclass(frozen=True)
-class Steps:
+class Solved(Steps):
     """Steps of a solver.
 
     Attributes
     ----------
-    t : (S + 1,) array
-        Starts, and the end of the last one [s].
-    x : (n_x, S + 1) array
-        States there.
-    failed : bool
-        Whether no further step succeeds.
     dense : list of callable
         States (n_x, N) at times (N,) within each step.
     """
 
-    t: np.ndarray
-    x: np.ndarray
-    failed: bool
     dense: list
 
     def at(self, k, times):
@@ -133,7 +124,7 @@ class ScipySteps(BulkSteps):
         self._count(len(dense))
         if not self.failure and self._creeps(len(dense)):
             self.failure = "its steps shrink"
-        return Steps(np.array(t), np.array(x).T, bool(self.failure), dense)
+        return Solved(np.array(t), np.array(x).T, bool(self.failure), dense)
 
     def _creeps(self, steps):
         """Whether the motion has stopped because it creeps towards the edge of a residual's domain."""

@@ -569,7 +569,7 @@ class Watch:
         """The error of a residual, or derivative of one, that jumps at a switch to another model; None if none does."""
         t, x = np.array([end.t]), end.x[:, None]
         sides = [Residuals(m, self.switches.tolerance) for m in (self.model, model)]
-        if sides[0].names != sides[1].names:
+        if not sides[0].names or sides[0].names != sides[1].names:
             return None
         (before, allowed), (after, other) = (side.values(t, x) for side in sides)
         heights = np.abs(after - before)[:, 0]

@@ -6,9 +6,10 @@ import casadi as ca
 import numpy as np
 
 from servoctl.errors import SpecificationError
+from servoctl.jets.branches import size_of_terms
 from servoctl.model import saddle
 from servoctl.reduction.appell import plant_accelerations
-from servoctl.reduction.ranks import clean, column_sizes, eliminate
+from servoctl.reduction.ranks import clean, column_sizes, eliminate, noting_dropped
 from servoctl.spec.coordinates import jet_name
 
 
@@ -52,8 +53,10 @@ class Invariants:
     def _along(self, given, correct=False):
         """The motion of the cascade by its jets up to a given level."""
         if (given, correct) not in self._motions:
-            level = self.top if correct or given < self.top else given
-            self._motions[given, correct] = self.cascade.along(self.points, given, level, correct)
+            with noting_dropped() as entries:
+                motion = self.cascade.along(self.points, given, max(given, self.top), correct)
+            motion.dropped = entries
+            self._motions[given, correct] = motion
         return self._motions[given, correct]
 
     def function(self, name, x, outputs, extra=None):
@@ -135,10 +138,24 @@ class Equations(Invariants):
         """Whether the sparse elimination of [M -B; G 0] gives γ^(s̄), instead of the rows of (3.18)."""
         return self.q.n > saddle.FEW and saddle.applies(self.r)
 
-    @cached_property
+    @property
     def saddle(self):
         """γ'', μ and the pivots of [M -B; G 0]."""
-        return saddle.solve(self)
+        return self._saddle[:3]
+
+    @cached_property
+    def _saddle(self):
+        with noting_dropped() as entries:
+            return *saddle.solve(self), entries
+
+    @cached_property
+    def _leading(self):
+        """The pivots of L, and what its elimination leaves out."""
+        if self.cascade is not None:
+            motion = self._along(self.top - 1 if self.r.free else 0)
+            return motion.pivots, motion.dropped
+        with noting_dropped() as entries:
+            return self._solve(ca.SX(self.q.n, 0))[1], entries
 
     def rest(self, rows, poles=False):
         """Some rows raised to order s̄, at γ^(s̄) = 0; with their error dynamics if `poles`."""
@@ -166,16 +183,31 @@ class Equations(Invariants):
 
     @cached_property
     def _all_pivots(self):
-        if self.cascade is not None:
-            leading = self._along(0 if not self.r.free else self.top - 1).pivots
-        else:
-            leading = self.saddle[2] if self.sparse else self._solve(ca.SX(self.q.n, 0))[1]
+        leading = (self._saddle[2:] if self.sparse else self._leading)[0]
         return [*self.r.pivots, *((f"leading matrix {i + 1}", p) for i, p in enumerate(leading))]
 
     @cached_property
     def pivots(self):
         """Pivots that depend on the motion, which must not vanish: a list of (name, SX)."""
         return [(name, p) for name, p in self._all_pivots if any(self.q.where(s) is not None for s in ca.symvar(p))]
+
+    @property
+    def entries_dropped(self):
+        """What eliminations left out as zero: a list of SX."""
+        return [*self.r.dropped, *(self._saddle[2:] if self.sparse else self._leading)[1]]
+
+    def dropped(self):
+        """Of what eliminations left out the values, then the sizes of their terms, of (t, Z, p); None without any.
+
+        The jets Z extend beyond s̄ as far as these depend on them.
+        """
+        entries = self.entries_dropped
+        if not entries:
+            return None
+        places = filter(None, map(self.q.where, ca.symvar(ca.vertcat(*entries))))
+        highest = max((level for of, level, _ in places if of not in ("t", "q")), default=0)
+        above = (s for k in range(self.top + 1, highest + 1) for s in self.q.gamma(k))
+        return self.function("dropped", ca.vertcat(self.jets, *above), [*entries, *map(size_of_terms, entries)])
 
     def constant_pivots(self):
         """A function of the parameters: the pivots that depend on these alone."""

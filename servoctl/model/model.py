@@ -22,6 +22,7 @@ from servoctl.reduction.appell import require_positive
 from servoctl.reduction.idle import needed
 from servoctl.reduction.knots import require_smooth
 from servoctl.reduction.manifold import ON_MANIFOLD, solve
+from servoctl.reduction.ranks import alive
 from servoctl.reduction.reduce import holds, reduce, require_parts, strong
 from servoctl.reduction.structure import structure
 from servoctl.spec.mechanism import Mechanism
@@ -164,7 +165,7 @@ class Model:
                 raise unknown(name, list(current), "parameter")
         values = r.mechanism.parameters.values({**current, **changes})
         require_positive(r.mechanism, replace(r.points, values=values))
-        if not (holds(r, values) and self._constant_pivots_hold(values)):
+        if not (holds(r, values) and self._constant_pivots_hold(values) and self._dropped_hold(values)):
             self._store.require_unchanged()
             return _derived(r.mechanism, r.program, r.context.guess, None, values)
         return Model(r, self._store, values, require_smooth(r.switches, values, r.smoothness), self._functions)
@@ -172,6 +173,12 @@ class Model:
     def _constant_pivots_hold(self, values):
         f = self.once("constant pivots", lambda: self.equations.constant_pivots())
         return bool(strong(*(f(p).full() for p in (values, self.reduction.context.values))).all())
+
+    def _dropped_hold(self, values):
+        """Whether what eliminations left out vanishes with other parameters, too."""
+        if self.dropped is None:
+            return True
+        return not alive(self.equations.entries_dropped, replace(self.reduction.points, values=values)).any()
 
     def near(self, t, jets, sizes=()):
         """The model of the same specification, derived with pivots chosen at an instant of the motion.
@@ -336,6 +343,16 @@ class Model:
             return compiled(f, name, *options)
 
         return self.once(name, build)
+
+    @property
+    def dropped(self):
+        """What eliminations left out as zero, and the sizes of its terms, compiled, of (t, Z, p); None if nothing."""
+
+        def build():
+            f = self.equations.dropped()
+            return None if f is None else compiled(f, f.name())
+
+        return self.once("left out", build)
 
     def signals(self, kind, rate=0):
         """Names of a group of signals, and the compiled function (t, Z, p) of their `rate`-th time derivatives.

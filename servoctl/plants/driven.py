@@ -6,6 +6,7 @@ import casadi as ca
 
 from servoctl.checks import column, mapping
 from servoctl.errors import SpecificationError, unknown
+from servoctl.jets.overflow import settled
 from servoctl.model.model import derive
 from servoctl.plants.equations import plant_equations
 from servoctl.spec.program import no_program
@@ -70,7 +71,7 @@ def _expression(name, value, t):
             do="Lay sv.paths.spline(q.t, times, points) through samples, or use CasADi's functions.",
             name=name,
         ) from error
-    return column(value, f"the input {name!r}", 1)[0]
+    return settled(column(value, f"the input {name!r}", 1))[0]
 
 
 def at_once(plant):

@@ -18,6 +18,7 @@ from servoctl.checks import (
 )
 from servoctl.codegen.function import compiled
 from servoctl.errors import SpecificationError, unknown
+from servoctl.jets.overflow import settled
 from servoctl.plants.equations import PlantEquations, equations_at, plant_equations
 from servoctl.spec.mechanism import Mechanism, require_known
 from servoctl.values import Value
@@ -348,7 +349,7 @@ def _forces(mechanism, forces, names):
     for name, value in mapping(forces, "The forces").items():
         if name not in names:
             raise unknown(name, names, "coordinate" if q.plain else "quasi-velocity")
-        expression = column(value, f"the force on {name!r}", 1)[0]
+        (expression,) = settled(column(value, f"the force on {name!r}", 1))
         require_known(expression, mechanism, f"the force on {name!r}")
         if q.order(expression) > 1:
             raise SpecificationError(

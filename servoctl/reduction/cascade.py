@@ -268,7 +268,11 @@ class Expressions(_Follow):
         The Newton step to the coordinates.
     pivots : list of SX
         Of each block's elimination.
+    dropped : list of SX
+        What eliminations left out as zero.
     """
+
+    dropped = ()
 
     def __init__(self, cascade, points, given, correct):
         q = cascade.q

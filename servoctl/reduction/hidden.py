@@ -279,7 +279,7 @@ def _require_affine(q, rows, support, top, context):
 
 def _refuse_factor(q, rows, indices, context):
     """Refuse a row with a factor that vanishes on the solutions of the others: it follows from them."""
-    for b in indices:
+    for b in (b for b in indices if not rows[b].story):  # a combination is no residual that could be divided
         found, others = (*_factor(q, rows, b, context), None, None)[:2]
         if others:
             factor = shown(found)

@@ -48,7 +48,7 @@ def needed(mechanism, program, keep=(), named=()):
     roots |= {place for name, place in _jets(q).items() if name in keep or name in named}
     reached = _reached(roots, mechanism.couplings())
     all_play = not reached or len(reached) == q.nq + q.n
-    return mechanism.part(reached) if not all_play and _determined(mechanism, reached) else mechanism
+    return mechanism.part(reached) if not all_play and _others_are_regular(mechanism, reached) else mechanism
 
 
 def names_of(values):
@@ -75,7 +75,7 @@ def _reached(roots, couplings):
     return reached
 
 
-def _determined(mechanism, reached):
+def _others_are_regular(mechanism, reached):
     """Whether [M Gᵀ; G 0] of the others, with their constraints G, determines accelerations, and M >= 0, at a point."""
     q = mechanism.q
     rows = [i for i in range(q.n) if ("w", i) not in reached]

@@ -109,6 +109,13 @@ class Points:
         residual = np.append(self.residual, other.residual)
         return replace(self, t=np.append(self.t, other.t), z=np.hstack([self.z, other.z]), residual=residual)
 
+    def at(self, t, jets, values):
+        """Other points: at times t (N,), jets (nq + K n, N) and parameters (n_p,)."""
+        level = (len(jets) - self.q.nq) // self.q.n
+        factorials = np.repeat([1.0, *(factorial(k) for k in range(1, level + 1))], [self.q.nq, *level * [self.q.n]])
+        z = jets / factorials[:, None].astype(REAL)
+        return replace(self, t=np.asarray(t), z=z, values=values, residual=np.zeros(len(t)))
+
     def take(self, keep):
         """Some of the points."""
         some = replace(self, t=self.t[keep], z=self.z[:, keep], residual=self.residual[keep])

@@ -7,7 +7,6 @@ terms of the row, times the size of the jet in which it is the slope, both the l
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from math import factorial
 
 import numpy as np
 
@@ -103,11 +102,8 @@ class Orders:
 
     def _sampled(self, t, jets, values):
         """Points at samples of a motion; jets that it does not have follow from the rows."""
-        q = self.points.q
-        level = (len(jets) - q.nq) // q.n
-        factorials = np.concatenate([np.ones(q.nq), *(np.full(q.n, factorial(k)) for k in range(1, level + 1))])
-        points = replace(self.points, t=t, z=jets / factorials[:, None], values=values, residual=np.zeros(len(t)))
-        return points if level >= self._level else self._on_manifold(points)
+        points = self.points.at(t, jets, values)
+        return points if points.level >= self._level else self._on_manifold(points)
 
     def _sizes(self, points):
         """Sizes of each slope's jet, and of the terms of its row, at points: two arrays (slopes, N)."""

@@ -9,6 +9,8 @@ among those of sufficient size at the points, and leaves out entries that vanish
 whose size along a motion shows when the choice has become bad.
 """
 
+from contextlib import contextmanager
+from contextvars import ContextVar
 from dataclasses import dataclass
 
 import casadi as ca
@@ -20,6 +22,8 @@ from servoctl.jets.tape import divide, multiply, subtract
 from servoctl.tolerances import CUTOFF, ENTRY, NOISE, REFINEMENTS, RESOLVED, TINY
 
 THRESHOLD = 0.1  # least size of a pivot, relative to the largest entry of its equilibrated row
+SUSPECT = 1e-8  # of the size of its terms: an entry above this is evaluated in extended precision
+_dropped = ContextVar("dropped", default=None)  # where eliminations note what they leave out
 SWEEPS = 6  # of equilibration; each takes the square root of the remaining factors: 1e±30 comes within a factor of 3
 
 
@@ -218,6 +222,25 @@ def _difference(a, b):
     return np.where(np.abs(result) <= ENTRY * (np.abs(a) + np.abs(b)), 0.0, result)
 
 
+@contextmanager
+def noting_dropped():
+    """The list of the entries (SX scalars) that eliminations inside leave out, since they vanish identically."""
+    entries = []
+    token = _dropped.set(entries)
+    try:
+        yield entries
+    finally:
+        _dropped.reset(token)
+
+
+def alive(entries, points):
+    """How many times its rounding an entry that was left out is at each of some points, at least 1, (N,); or 0."""
+    values, sizes = points.evaluate(entries)
+    with np.errstate(all="ignore"):
+        share = np.nan_to_num(np.abs(values) / (ENTRY * sizes), posinf=0.0).max(axis=0, initial=0.0)
+    return np.where(share > 1.0, share, 0.0)
+
+
 def eliminate(matrix, right, numbers):
     """Solve A X = B symbolically.
 
@@ -271,6 +294,8 @@ class _System:
         for i, j, entry, values in zip(*matrix.sparsity().get_triplet(), entries, anywhere, strict=True):
             if scaled[i, j].any() or not vanish(values):
                 self.rows[i][j] = entry, np.append(scaled[i, j], values)
+            else:
+                _leave_out(entry)
         self.rhs = (
             [right[i, :].elements() for i in range(n)] if right.shape[1] != 1 else [[b] for b in right.elements()]
         )
@@ -330,6 +355,7 @@ class _System:
             change = factor_number * a_number
             new = _difference(old_number, change)
             if not new[: self.points].any() and vanish(new[self.points :]):
+                _leave_out(subtract(old, multiply(factor, a)))
                 if row.pop(c, None) is not None:
                     del self.members[c][r]
             else:
@@ -341,6 +367,12 @@ class _System:
 
 
 _ZERO = ca.SX(0)
+
+
+def _leave_out(entry):
+    noted = _dropped.get()
+    if noted is not None and not entry.is_zero():
+        noted.append(entry)
 
 
 def _back(value, terms, pivot):

@@ -15,7 +15,7 @@ from servoctl.reduction.hidden import complete
 from servoctl.reduction.knots import Knots, Switches, require_smooth
 from servoctl.reduction.manifold import Context, Points, sample
 from servoctl.reduction.orders import Orders
-from servoctl.reduction.ranks import Rank, clean, decide, decide_all
+from servoctl.reduction.ranks import Rank, clean, decide, decide_all, noting_dropped
 from servoctl.reduction.realisation import realisation, wished, wished_balance
 from servoctl.reduction.rows import Balance, as_rows, balances, merge_uses, settle_alone
 from servoctl.reduction.scales import ORDINARY, usual
@@ -58,6 +58,8 @@ class Reduction(Packed):
         Rows of the designer's residuals and material constraints, by name.
     cascade : Cascade, optional
         The rows by blocks, where they are deep.
+    entries_dropped : tuple of SX
+        What the eliminations of the derivation left out, as it vanishes identically.
     """
 
     mechanism: Mechanism
@@ -72,6 +74,7 @@ class Reduction(Packed):
     context: Context
     original: dict
     cascade: Cascade | None = None
+    entries_dropped: tuple = ()
 
     def __repr__(self):
         rows = ", ".join(f"{row.name} {row.order}" for row in self.rows)
@@ -136,10 +139,20 @@ class Reduction(Packed):
         """The rows along a motion."""
         return Flow(self.mechanism.q, self.rows, self.top, self.points)
 
-    @cached_property
+    @property
     def multipliers(self):
         """Multipliers of the reaction, those of the program first, (b,) SX of t, q, γ', γ''."""
-        return self.realisation.multipliers(self.balance)
+        return self._multipliers[0]
+
+    @cached_property
+    def _multipliers(self):
+        with noting_dropped() as entries:
+            return self.realisation.multipliers(self.balance), entries
+
+    @property
+    def dropped(self):
+        """What eliminations left out, as it vanishes identically: a list of SX of t, jets and parameters."""
+        return [*self.entries_dropped, *self._multipliers[1]]
 
     @cached_property
     def actuation(self):
@@ -211,7 +224,13 @@ def reduce(mechanism, program, guess=None, near=None, values=None):
     return _reduced(mechanism, program, switches, balance, _context(mechanism, times, guess, near, values, scales))
 
 
-def _reduced(mechanism, program, switches, balance, context):
+def _reduced(*specification):
+    """The reduction by points of a context, with what its eliminations leave out."""
+    with noting_dropped() as entries:
+        return replace(_by_points(*specification), entries_dropped=tuple(entries))
+
+
+def _by_points(mechanism, program, switches, balance, context):
     """The reduction by points of a context."""
     q = mechanism.q
     original = [

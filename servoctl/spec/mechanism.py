@@ -10,6 +10,7 @@ import numpy as np
 from servoctl.checks import column, mapping, require_kind
 from servoctl.errors import NameUnknown, SpecificationError, unknown
 from servoctl.jets.identity import spread, vanish
+from servoctl.jets.overflow import settled
 from servoctl.jets.tape import Tape, evaluate
 from servoctl.spec.coordinates import Coordinates, jet_name
 from servoctl.spec.packing import packed, unpacked
@@ -376,7 +377,7 @@ class Mechanism:
 
     def _known(self, value, what, size=1):
         """An SX scalar or column in symbols of the mechanism."""
-        expression = ca.vertcat(*column(value, what, size))
+        expression = ca.vertcat(*settled(column(value, what, size)))
         require_known(expression, self, what)
         return expression
 

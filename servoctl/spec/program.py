@@ -8,6 +8,7 @@ import numpy as np
 from servoctl.checks import column, mapping, require_kind
 from servoctl.errors import SpecificationError
 from servoctl.jets.branches import without_turns
+from servoctl.jets.overflow import settled
 from servoctl.spec.coordinates import Coordinates
 from servoctl.spec.packing import Packed
 
@@ -151,6 +152,7 @@ def _residual(name, value):
             name=name,
             entries=len(items),
         )
+    items = settled(items)
     if not ca.symvar(items[0]):
         raise SpecificationError(
             f"The residual {name!r} is the number {items[0]}.",

@@ -22,7 +22,7 @@ BESIDE = (3.0, 1.0, 0.3, 0.1, 0.03, 0.01)  # distances [s, too] from a state at 
 NEARLY = 0.99  # of the way to a stop before the first sample, which is followed again
 POWER = 0.3  # or it grows at least with this power of one over the time that is left
 LARGE = 1e4  # a motion that has grown so far may end
-PATIENCE = 40  # s of processor time for a case; a few tenths are usual
+PATIENCE = 60  # s of processor time for a case; a few tenths are usual
 
 
 @dataclass(frozen=True)

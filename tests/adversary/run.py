@@ -1,12 +1,15 @@
 """Run many random mechanisms through the package and the reference: `python tests/adversary/run.py --cases 10000`.
 
 Findings are saved as text, one file for each, named by seed; `--case FILE` or `--seed N --cases 1` runs one again.
+`--log FILE` keeps one line for each case as soon as it ends: the same command goes on after an interruption, and with
+`--cases 0` it prints the counts so far. A case has at most `judge.PATIENCE` seconds of processor time.
 """
 
 import argparse
 import json
 import os
 import sys
+import time
 from collections import Counter
 from pathlib import Path
 
@@ -20,8 +23,8 @@ from machines import from_text, seeded  # noqa: E402
 
 
 def _one(seed):
-    case = seeded(seed)
-    return seed, case, judge(case)
+    start, case = time.process_time(), seeded(seed)
+    return seed, case, judge(case), time.process_time() - start
 
 
 def main():
@@ -30,23 +33,33 @@ def main():
     parser.add_argument("--seed", type=int, default=0, help="of the first case; the others follow")
     parser.add_argument("--jobs", type=int, default=1)
     parser.add_argument("--out", type=Path, default=Path("findings"), help="folder of findings")
+    parser.add_argument("--log", type=Path, help="a line for each case; cases that it holds are not run again")
     parser.add_argument("--case", type=Path, help="one saved case")
     options = parser.parse_args()
     if options.case:
         saved = json.loads(options.case.read_text())
         print(judge(from_text(json.dumps(saved["case"]))))
         return 0
-    seeds, counts, words = range(options.seed, options.seed + options.cases), Counter(), {}
-    for seed, case, verdict in _verdicts(seeds, options.jobs):
-        counts[verdict.outcome] += 1
-        for word in set(case.kinds):
-            words.setdefault(word, Counter())[verdict.outcome.split(":")[0]] += 1
+    done = _logged(options.log)
+    seeds = [seed for seed in range(options.seed, options.seed + options.cases) if seed not in done]
+    for seed, case, verdict, seconds in _verdicts(seeds, options.jobs):
+        line = {"seed": seed, "outcome": verdict.outcome, "kinds": sorted(set(case.kinds)), "seconds": round(seconds, 2)}
+        done[seed] = line
+        if options.log:
+            with options.log.open("a") as file:
+                file.write(json.dumps(line) + "\n")
         if verdict.wrong:
             options.out.mkdir(parents=True, exist_ok=True)
             content = {"seed": seed, "outcome": verdict.outcome, "detail": verdict.detail, "case": json.loads(case.as_text())}
             (options.out / f"{seed}.json").write_text(json.dumps(content, indent=1))
-    table(counts, words)
+    counts = table(done.values())
     return 1 if any(outcome.startswith("wrong") for outcome in counts) else 0
+
+
+def _logged(log):
+    """The lines of a log by their seeds."""
+    lines = log.read_text().splitlines() if log and log.exists() else ()
+    return {line["seed"]: line for line in map(json.loads, lines)}
 
 
 def _verdicts(seeds, jobs):
@@ -61,13 +74,19 @@ def _verdicts(seeds, jobs):
         yield from tqdm(pool.map(_one, seeds, chunksize=4), total=len(seeds), unit="case")
 
 
-def table(counts, words):
-    """Print how cases ended, in all and by what they contain."""
+def table(lines):
+    """Print how cases ended, in all and by what they contain; return the counts of outcomes."""
+    counts, words = Counter(), {}
+    for line in lines:
+        counts[line["outcome"]] += 1
+        for word in line["kinds"]:
+            words.setdefault(word, Counter())[line["outcome"].split(":")[0]] += 1
     for outcome, count in sorted(counts.items(), key=lambda item: (item[0].startswith("wrong"), -item[1])):
         print(f"{count:7d}  {outcome}")
     print(f"\n{'':22s}{'right':>8s}{'refused rightly':>17s}{'wrong':>8s}")
     for word, ends in sorted(words.items()):
         print(f"{word:22s}{ends['right']:8d}{ends['refused rightly']:17d}{ends['wrong']:8d}")
+    return counts
 
 
 if __name__ == "__main__":
