@@ -157,6 +157,7 @@ DEEP = {
     "cars": (lambda N: chain(N, linear), lambda N: chain_by_series(N), 8, 3000),
     "cubic springs": (lambda N: chain(N, cubic), lambda N: chain_by_series(N, hard=True), 8, 9000),
     "discs": (lambda N: chain(N, linear, weight), lambda N: chain_by_series(N, heavy=True), 8, 5500),
+    "velocities between cars": (lambda N: chain(N, linear, frame=differences), lambda N: chain_by_series(N), 8, 3000),
     "crane and cars": (crane, crane_by_series, 5, 20000),
 }
 
@@ -181,6 +182,8 @@ ALIKE = {
     "discs": lambda: chain(3, linear, weight),
     "scaled velocities": lambda: chain(3, cubic, frame=scaled),
     "velocities by place": lambda: chain(3, linear, frame=by_place),
+    "distances": lambda: chain(4, linear, relative=True),
+    "velocities between cars": lambda: chain(3, cubic, frame=differences),
     "first damper": lambda: chain(4, linear, damper=0),
     "last damper": lambda: chain(4, linear, damper=2),
     "crane before a car": lambda: crane(1),
@@ -297,15 +300,6 @@ def test_residuals_of_hidden_rows_are_those_of_the_motion(pairs):
 @pytest.mark.parametrize("name", gallery)
 def test_shallow_rows_are_one_expression_each(name, gallery_model):
     assert (gallery_model(name).reduction.cascade is None) == (name != "three-cars")
-
-
-@pytest.mark.parametrize("form", ["distances", "differences of velocities"])
-def test_coordinates_that_mix_several_cars_are_right_too(form):
-    """Each balance then holds the accelerations of several cars."""
-    relative = form == "distances"
-    model = sv.derive(*chain(3, cubic, frame=None if relative else differences, relative=relative))
-    run = sv.simulate(model, model.start(), SPAN, t_eval=TIMES)
-    assert run["force"] == pytest.approx(chain_by_series(3, hard=True)["force"].astype(float), rel=1e-11)
 
 
 def test_cars_far_beyond_ordinary_numbers():

@@ -11,13 +11,15 @@ import casadi as ca
 import numpy as np
 
 from servoctl.errors import ServoError
-from servoctl.jets.identity import spread
+from servoctl.jets.identity import spread, vanish
 from servoctl.reduction.cascade import Block, Cascade
 from servoctl.reduction.hidden import Deep, complete, told
 from servoctl.reduction.ranks import clean, decide_each, generic
 from servoctl.reduction.rows import dependence, leading, merge_uses
+from servoctl.tolerances import DEPENDENT, ENTRY
 
 SHALLOW = 3  # derivatives of a residual or a balance in rows that are one expression each
+DIGITS = 10  # decimal digits of the weights of rows
 
 
 def completed(q, rows, context, starts):
@@ -50,7 +52,10 @@ def completed(q, rows, context, starts):
 def _by_blocks(q, rows, context, starts):
     """What `completed` returns, with a cascade; None where the rows have no such form."""
     blocks, pivots, points = [], [], starts
-    for block in triangular(q, rows):
+    found = triangular(q, rows)
+    if not all(_determines(q, block) for block in found[1:]):
+        found = max(found, triangular(q, recombined(q, rows)), key=len)
+    for block in found:
         if not _determines(q, block):
             try:
                 some, _, points, of_block = complete(q, _alone(block, blocks), context, points)
@@ -110,31 +115,35 @@ def _in_own_jets(q, row, motion, place):
 
 def _with_uses(q, rows, cascade, points):
     """The cascade, whose rows say of which rows they are combinations, and what they use."""
-    blocks, known = [], []
+    blocks, known = [], {}
     for k, block in enumerate(cascade.blocks):
         of_block = []
         for a, row in enumerate(block.rows):
             jets = {m: order for (b, m), order in cascade.jets[k].items() if b == a}
             uses = [(other.uses, max(order - other.order, 0)) for m, order in jets.items() for other in blocks[m].rows]
             of_block.append(replace(row, uses=merge_uses((row.uses, 0), *uses)))
-        pairs = list(zip(block.places, of_block, strict=True))
-        known += [pair for pair in pairs if not pair[1].story]
-        if k:
-            of_block = [_with_story(q, row, rows[a], known, points) for a, row in pairs]
-        known += [(a, row) for a, row in zip(block.places, of_block, strict=True) if row.story]
-        blocks.append(replace(block, rows=tuple(of_block)))
+        pairs = dict(zip(block.places, of_block, strict=True))
+        known |= {a: row for a, row in pairs.items() if not row.story}
+        open_ = [a for a in block.places if k or a not in known]
+        while open_:
+            stories = {a: _story(q, pairs[a], rows[a], known, points) for a in open_}
+            told_now = {a for a in open_ if stories[a]} or set(open_)
+            pairs |= {a: replace(pairs[a], story=stories[a] or pairs[a].story) for a in told_now if k}
+            known |= {a: pairs[a] for a in told_now}
+            open_ = [a for a in open_ if a not in told_now]
+        blocks.append(replace(block, rows=tuple(pairs.values())))
     return replace(cascade, blocks=tuple(blocks))
 
 
-def _with_story(q, row, whole, known, points):
-    """A row with the combination of its `whole` and known rows, each with its place, by which its order is lower."""
-    if row.order == whole.order:
-        return row
-    others = sorted(known, key=lambda pair: (pair[1].kind == "dynamics", pair[1].order, pair[0]))
+def _story(q, row, whole, known, points):
+    """The combination of the `whole` row and known rows, by place, by which a row's order is lower; "" for none."""
+    others = sorted(known.items(), key=lambda pair: (pair[1].kind == "dynamics", pair[1].order, pair[0]))
     others = [other for _, other in others if other.name != row.name]
+    if row.order == whole.order:
+        return row.story
     values = [clean(*points.matrix(other.gradient(q))) for other in [*others, whole]]
     support, _ = dependence(np.concatenate(values), first=len(others))
-    return replace(row, story=told(row, [others[a] for a in support[:-1]], whole.order))
+    return told(row, [others[a] for a in support[:-1]], whole.order) if support else ""
 
 
 def _determines(q, block):
@@ -177,6 +186,75 @@ def triangular(q, rows):
         own = tuple(_own(q, rows[a], columns) for a in sorted(component))
         blocks.append(Block(own, tuple(sorted(component)), tuple(sorted(columns)), tuple(here)))
     return blocks
+
+
+def recombined(q, rows):
+    """Rows of which constant combinations replace some, where these hold rates of coordinates known before alone.
+
+    Balances of joint coordinates, or of velocities between bodies, are sums of those of single bodies.
+
+    Parameters
+    ----------
+    q : Coordinates
+    rows : list of Row
+
+    Returns
+    -------
+    list of Row
+    """
+    slopes, rows, known, left = _slopes_anywhere(q, rows), list(rows), set(), list(range(len(rows)))
+    while left:
+        unknown, here = [c for c in range(q.n) if c not in known], slopes[left, 0]
+        weights, pivots = _combinations(slopes[left][:, 1:, unknown].reshape(len(left), -1))
+        values, sizes = (np.einsum("wa,acp->wcp", *pair) for pair in ((weights, here), (abs(weights), abs(here))))
+        new = {c for c in unknown if np.any(np.abs(values[:, c]) > ENTRY * sizes[:, c])}
+        if len(new) != len(weights) or not new:
+            break
+        known |= new
+        some = [_combined(q, [rows[a] for a in left], w, i, known) for w, i in zip(weights, pivots, strict=True)]
+        if None in some:
+            break
+        for i, row in zip(pivots, some, strict=True):
+            rows[left[i]] = row
+        left = [a for i, a in enumerate(left) if i not in pivots]
+    return rows
+
+
+def _slopes_anywhere(q, rows):
+    """∂ψ/∂γ^(k) at random points, (rows, levels, n, N); of the level 0 ∂ψ/∂q V."""
+    levels = 1 + max(row.order for row in rows)
+    gradients = ca.vertcat(*(row.gradient(q, k) for row in rows for k in range(levels)))
+    values = spread(gradients.nonzeros())
+    numbers = np.zeros((*gradients.shape, values.shape[1]))
+    numbers[tuple(gradients.sparsity().get_triplet())] = values
+    return numbers.reshape(len(rows), levels, q.n, -1)[..., np.isfinite(values).all(axis=0)]
+
+
+def _combinations(matrix):
+    """Combinations of rows that vanish, in reduced echelon form, (r, rows), and the place of the 1 in each."""
+    sizes = np.abs(matrix).max(axis=1, initial=0.0)
+    scaled = matrix / np.where(sizes > 0, sizes, 1.0)[:, None]
+    U, s, _ = np.linalg.svd(scaled)
+    null, pivots = U[:, int((s > DEPENDENT * s.max(initial=0.0)).sum()) :].T / np.where(sizes > 0, sizes, 1.0), []
+    for k in range(len(null)):
+        pivots.append(int(np.argmax(np.abs(null[k]))))
+        null[k] /= null[k, pivots[k]]
+        others = [i for i in range(len(null)) if i != k]
+        null[others] -= null[others][:, [pivots[k]]] * null[k]
+    return np.round(null, DIGITS), pivots
+
+
+def _combined(q, rows, weights, pivot, known):
+    """Row `pivot` with others added, in which other jets than those of known quasi-velocities cancel; or None."""
+    moved_by, whole = _moved_by(q), sum(float(w) * row.expression for w, row in zip(weights, rows, strict=True) if w)
+    needs = {"t": lambda i: set(), "q": lambda i: moved_by[i], "w": lambda i: {i}}
+    places = [(s, q.where(s)) for s in ca.symvar(whole)]
+    others = [s for s, place in places if place and not needs[place[0]](place[2]) <= known]
+    expression = ca.substitute(whole, ca.vertcat(*others), ca.SX.zeros(len(others))) if others else whole
+    if not vanish(spread([expression - whole])).all():
+        return None
+    uses = merge_uses(*((row.uses, 0) for w, row in zip(weights, rows, strict=True) if w))
+    return replace(rows[pivot], expression=expression, uses=uses, parts=())
 
 
 def _contents(q, row, moved_by):
