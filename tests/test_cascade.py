@@ -9,6 +9,7 @@ from math import factorial
 import casadi as ca
 import numpy as np
 import pytest
+from refusals import refused
 
 import servoctl as sv
 from servoctl.gallery import cars, gallery
@@ -292,6 +293,14 @@ def test_residuals_of_hidden_rows_are_those_of_the_motion(pairs):
     wrong[3] += 1e-3  # the car's place, which its hidden row determines
     values = [np.abs(function.grid(run.t, jets, by_blocks.parameters)).max() for jets in (run.jets, wrong)]
     assert values[0] < 1e-8 < 1e-4 < values[1]
+
+
+def test_a_spring_that_yields_ends_the_motion():
+    """Its tangent stiffness vanishes at 0.13 m, where the balance no longer determines the next car."""
+    model = sv.derive(*chain(3, lambda e, k, c: k * (e**2 / 2 - 5 * e**4)))
+    assert model.reduction.cascade is not None
+    with refused(sv.SingularProgram, "balance of x1"):
+        sv.simulate(model, model.start(), SPAN)
 
 
 # where there is no cascade -------------------------------------------------------------------------------------------
