@@ -22,7 +22,7 @@ from servoctl.reduction.ranks import clean, eliminate, solve_clean
 PLACING = 100  # Newton steps to the coordinates of a block, each of at most their size
 PLACED = 1e-17  # relative step at which they are solved
 NEARLY_PLACED = 1e-15  # relative last step of points that count
-TWICE = 2  # solutions of a level, in which rows are affine: the second takes away rounding
+TWICE = 2  # least-squares solutions of a level, in which rows are affine: the second takes away rounding
 
 
 @dataclass(frozen=True)
@@ -370,7 +370,8 @@ class _Numbers(_Follow):
         if level <= self.given or not active:
             return
         if level:
-            yield from (self._step(block, level, active) for _ in range(TWICE))
+            square = sum(len(members) for _, members in active) == len(block.columns)
+            yield from (self._step(block, level, active) for _ in range(1 if square else TWICE))
             return
         for _ in range(PLACING):
             longest = self._moved(block, self._step(block, level, active))
@@ -401,6 +402,8 @@ class _Numbers(_Follow):
         for i, j, value in zip(*leading.sparsity().get_triplet(), self.values(leading.nonzeros()), strict=True):
             matrix[i, j] = value
         right = np.array([c + np.zeros(len(self.points.t), dtype=REAL) for c in right.values()])
+        if matrix.shape[:2] == (1, 1):
+            return right / matrix[0]
         return np.array([_nearest_solution(matrix[:, :, p], right[:, p]) for p in range(right.shape[1])]).T
 
 
