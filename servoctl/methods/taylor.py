@@ -19,6 +19,7 @@ from servoctl.methods.monitor import DenseStretch, Fine, Repivot
 from servoctl.methods.motion import Stepping
 from servoctl.methods.narrow import arguments, centres
 from servoctl.methods.watch import RESOLUTION, End, net, steps_of
+from servoctl.reduction.cascade import Running
 from servoctl.reduction.ranks import clean, eliminate
 
 LOWEST, HIGHEST = 4, 24  # orders: below, steps are too short; above, compiling grows faster than steps
@@ -39,6 +40,18 @@ class _Branches(Series):
         return ca.copysign(c, c) if isinstance(c, ca.SX) and not c.is_constant() else c
 
 
+def _decided(q, symbols, tape, instant):
+    """Values of the nodes of a tape that depend on time alone, at the instant that selects branches."""
+    places = [q.where(s) for s in symbols]
+    timed = [place is None or place[0] == "t" for place in places]
+    at = [[instant if place and place[0] == "t" else s] for s, place in zip(symbols, places, strict=True)]
+    values, alone = Series(tape, at), []
+    values.advance()
+    for node in tape.nodes:
+        alone.append(timed[node.data] if node.kind == "input" else all(alone[a] for a in node.args))
+    return {i: values.c[i][0] for i, of_time in enumerate(alone) if of_time}
+
+
 class _Group:
     """Rows of one order with their running series."""
 
@@ -47,18 +60,7 @@ class _Group:
         self.symbols = ca.symvar(ca.vertcat(*expressions))
         self.inputs = [[] for _ in self.symbols]
         tape = Tape(self.symbols, expressions)
-        self.series = _Branches(tape, self.inputs, self._decided(tape))
-
-    def _decided(self, tape):
-        """Values of the nodes that depend on time alone, at the instant that selects branches."""
-        place = self.motion.q.where
-        timed = [place(s) is None or place(s)[0] == "t" for s in self.symbols]
-        at = [[self.motion.branch if (place(s) or ("",))[0] == "t" else s] for s in self.symbols]
-        values, alone = Series(tape, at), []
-        values.advance()
-        for node in tape.nodes:
-            alone.append(timed[node.data] if node.kind == "input" else all(alone[a] for a in node.args))
-        return {i: values.c[i][0] for i, of_time in enumerate(alone) if of_time}
+        self.series = _Branches(tape, self.inputs, _decided(motion.q, self.symbols, tape, motion.branch))
 
     def advance(self, k):
         """Coefficient k - order of the rows, from the motion's coefficients up to k."""
@@ -71,6 +73,16 @@ class _Group:
         """Repeat the last coefficient with the solution γ_[k]."""
         j = k - self.order
         self.series.replace_last({i: self.motion.coefficient(s, j) for i, s in enumerate(self.symbols)})
+
+
+class _InBlock(Running):
+    """Rows of a block with their series, whose branches stay where an instant selects them."""
+
+    instant = ca.SX.sym("t_branch")
+
+    def run(self, tape):
+        decided = _decided(self.motion.q, self.symbols, tape, self.instant)
+        return _Branches(tape, [[] for _ in self.symbols], decided)
 
 
 class _Motion(Motion):
@@ -131,6 +143,9 @@ def taylor_coefficients(equations, last):
         q_[last] (left out if q' = γ'), γ_[1], ..., γ_[last], pivots.
     """
     r, q = equations.r, equations.q
+    if r.cascade is not None:
+        motion = r.cascade.along(r.points, equations.top - 1, last, running=_InBlock)
+        return _coefficients(equations, motion.place, motion.gamma, last, _InBlock.instant)
     motion = _Motion(equations)
     groups = []
     for order in sorted({row.order for row in r.rows}):
@@ -150,10 +165,15 @@ def taylor_coefficients(equations, last):
         motion.settle(k, [0.0 if x.is_zero() else x for x in solution.elements()])
         for group in groups:
             group.correct(k)
-    coefficients = [] if q.plain else [ca.SX(c) for k in range(1, last + 1) for c in motion.coordinates[k]]
-    coefficients += [ca.SX(c) for k in range(1, last + 1) for c in motion.gamma[k]]
+    return _coefficients(equations, motion.coordinates, motion.gamma, last, motion.branch)
+
+
+def _coefficients(equations, coordinates, gamma, last, instant):
+    """What `taylor_coefficients` returns, from coefficients by index."""
+    coefficients = [] if equations.q.plain else [ca.SX(c) for k in range(1, last + 1) for c in coordinates[k]]
+    coefficients += [ca.SX(c) for k in range(1, last + 1) for c in gamma[k]]
     outputs = [*coefficients, *(g for _, g in equations.pivots)]
-    return equations.function("taylor", equations.state, outputs, motion.branch)
+    return equations.function("taylor", equations.state, outputs, instant)
 
 
 def series_loop(model, last):

@@ -433,8 +433,13 @@ class Model:
         z = np.zeros((size, len(t)), dtype=REAL)
         z[: len(jets)] = jets / scale[: len(jets)]
         points = replace(r.points, t=np.asarray(t), z=z, values=self.parameters, residual=np.zeros(len(t)))
-        solved, residual = solve(Flow(q, r.rows, level, points), t, z)
-        result = np.where(residual < ON_MANIFOLD, (solved * scale).astype(float), np.nan)
+        if r.cascade is not None:
+            deeper, good = r.cascade.continued(points, level, r.top - 1)
+            solved = deeper[:size]
+        else:
+            solved, residual = solve(Flow(q, r.rows, level, points), t, z)
+            good = residual < ON_MANIFOLD
+        result = np.where(good, (solved * scale).astype(float), np.nan)
         result[: len(jets)] = jets
         return result
 
