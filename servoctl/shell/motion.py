@@ -24,7 +24,8 @@ def described(args, scene, report, require=lambda model: None):
     """
     span = as_span(tuple(args.t_span or scene.t_span))
     changes, held, guess = (by_name(getattr(args, name), f"--{name}") for name in ("set", "hold", "guess"))
-    model = with_parameters(sv.derive(*scene.build()), changes)
+    model = sv.derive(*scene.build()).including([*scene.start, *scene.guess, *held, *guess])
+    model = with_parameters(model, changes)
     require(model)
     report.say(model)
     start = _start(model, scene, span[0], held, guess)
