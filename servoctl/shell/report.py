@@ -25,7 +25,7 @@ def _report(args):
     mechanism, program = scene.build()
     report.say(mechanism)
     try:
-        model = sv.derive(mechanism, program)
+        model = sv.derive(mechanism, program).including([*scene.start, *scene.guess])
     except NotRealisable:
         report.say(sv.report(mechanism, program))
         return 0
