@@ -18,7 +18,7 @@ from servoctl.errors import (
 )
 from servoctl.inversion.relaxed import relaxed
 from servoctl.inversion.report import extremes
-from servoctl.inversion.transfer import rest_near
+from servoctl.inversion.transfer import Near, rest_near
 from servoctl.inversion.verdict import (
     FLAT,
     GROWS,
@@ -182,12 +182,13 @@ class Request:
     def relaxed(self, why, begin=None, moving=False):
         """The run of the relaxed inverse: from rest to rest, and with open ends where the program moves.
 
-        `moving` says that it begins in motion, with the state `begin`.
+        `moving` says that it begins in motion, with the state `begin`, or near it where values by name were given.
         """
         swings = isinstance(why, Verdict) and why.dynamics == GROWS and why.swings
         tries = [({}, ""), ({"end": "bounded"}, END_MOVES)] if not swings else [({"end": "bounded"}, END_SWINGS)]
         tries = [] if moving else [({"start": self.start} | ends, note) for ends, note in tries]
-        tries += [({"start": begin, "end": "bounded"}, END_MOVES)] if begin is not None else []
+        near = begin if isinstance(self.start, State) else Near(begin)
+        tries += [({"start": near, "end": "bounded"}, END_MOVES)] if begin is not None else []
         for k, (ends, note) in enumerate(tries):
             try:
                 run = self._planned(**ends)
@@ -280,7 +281,7 @@ def _by_hand(request, model, begin, found, chosen, method):
             stacklevel=3,
         )
     if method == RELAXED:
-        return request.relaxed(found)
+        return request.relaxed(found, begin)
     run = request.exact(model, begin, found, method)
     excess = _excess(run, {**request.ranges[0], **request.ranges[1]})
     if excess:
