@@ -152,7 +152,8 @@ def mathieu():
     forces = {"x": -0.1 * q.d(1)[1] - (1 + 0.6 * ca.cos(2 * q.t)) * x}
     S = sv.particle(q, 1.0, (y, 0)) + sv.particle(q, 1.0, (x, 0))
     path = sv.paths.rest_to_rest(q.t, 0.0, 1.0, duration=1.0, smoothness=4)
-    return sv.derive(sv.Mechanism(q, gibbs=S, forces=forces, actuators={"F": y}), sv.Program({"y": y - path}))
+    mechanism = sv.Mechanism(q, gibbs=S, forces=forces, actuators={"F": y}, outputs={"free": x})
+    return sv.derive(mechanism, sv.Program({"y": y - path}))
 
 
 def test_frozen_eigenvalues_are_no_verdict():
@@ -393,7 +394,8 @@ def beside(force, path=None):
     q = sv.coordinates("x y")
     (x, y), (_, dy) = q, q.d(1)
     S = sv.particle(q, 1.0, x) + sv.particle(q, 1.0, y)
-    mechanism = sv.Mechanism(q, gibbs=S, actuators={"F": x}, forces=ca.vertcat(0, force(x, y, dy)))
+    free = {"free": y}  # an output, so that no free mass is left out
+    mechanism = sv.Mechanism(q, gibbs=S, actuators={"F": x}, forces=ca.vertcat(0, force(x, y, dy)), outputs=free)
     path = path if path is not None else sv.paths.rest_to_rest(q.t, 0.0, 1.0, duration=2.0, smoothness=4)
     return mechanism, sv.Program({"X": x - path})
 

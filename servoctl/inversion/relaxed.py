@@ -39,6 +39,7 @@ from servoctl.plants.driven import at_once, driven
 from servoctl.plants.plant import Plant, part_of
 from servoctl.reduction.idle import names_of, needed
 from servoctl.reduction.knots import Switches
+from servoctl.reduction.reduce import require_parts
 from servoctl.run import Run
 from servoctl.spec.paths import piecewise
 from servoctl.spec.program import Program
@@ -120,6 +121,7 @@ def relaxed(
     """
     require_kind(Plant, "plant", plant, "sv.plant(mechanism)")
     require_kind(Program, "program", program, "sv.Program({...})")
+    require_parts(plant.mechanism, program, {})
     named = [name for given in (start, end, limits, plant.limits, bounds) for name in names_of(given)]
     plant = part_of(plant, needed(plant.mechanism, program, named=named))
     limits = _all_limits(plant, limits)

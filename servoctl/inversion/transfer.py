@@ -219,19 +219,19 @@ class Transfer:
         """
         try:
             model = self._exact_model
-            entries = FreeEntries(model, start.t, start.values)
+            entries, values = FreeEntries(model, start.t, start.values), np.asarray(start.values, dtype=float)
         except ServoError:
             return None
-        A = entries.local(np.array([start.t]), np.asarray(start.values)[:, None])[1][0]
+        A, _ = _linearised(entries, start.t, values)
         if tuple(model.state_names) != tuple(self.plant.state_names) or not np.isfinite(A).all():
             return None
-        left_of_transpose = End(start.t, start.values, A.T, entries.size[entries.free]).left_space(unstable=True)
-        closed = np.linalg.svd(left_of_transpose)[2][len(left_of_transpose) :]
-        if len(closed) == len(A):
+        opened = End(start.t, values, A.T, entries.size[entries.free]).left_space(unstable=True)  # right space of A
+        if not len(opened):
             return None
+        closed = np.linalg.svd(opened)[2][len(opened) :]
         t, x, free = self.node.q.t, self.node.state, entries.free.tolist()
         on_program = model.function("invariants").expression(t, x, model.parameters)[: entries.m]
-        rows = ca.vertcat(on_program, ca.DM(closed) @ (x[free] - ca.DM(np.asarray(start.values)[free])))
+        rows = ca.vertcat(on_program, ca.DM(closed) @ (x[free] - ca.DM(values[free])))
         return ca.Function("start", [t, x], [ca.densify(ca.cse(rows))], {"der_options": {"cse": True}})
 
     def _without_growth(self):
@@ -248,12 +248,12 @@ class Transfer:
             entries = FreeEntries(model, self.span[1], state)
         except ServoError:
             return None
-        _, A, _, tangent = entries.local(np.array([self.span[1]]), state[:, None])
+        A, tangent = _linearised(entries, self.span[1], state)
         if not np.isfinite(A).all():
             return None
-        modes = End(self.span[1], state, A[0], entries.size[entries.free]).left_space(unstable=True)
+        modes = End(self.span[1], state, A, entries.size[entries.free]).left_space(unstable=True)
         places = [model.state_names.index(name) for name in self.plant.state_names]
-        rows = modes @ np.linalg.pinv(tangent[0][places])
+        rows = modes @ np.linalg.pinv(tangent[places])
         if not len(rows):
             return None
         return self.node.function("unstable", ca.DM(rows) @ (self.node.state - ca.DM(x)))
@@ -354,6 +354,13 @@ class Transfer:
     def begin_inputs(self):
         """Inputs that hold the start at rest (m,), or zeros."""
         return np.zeros(self.m) if self.held is None else self.held
+
+
+def _linearised(entries, t, x):
+    """The linearisation (f, f) of the internal dynamics at a state and the tangent (n_x, f); not finite where singular."""
+    with np.errstate(all="ignore"):
+        _, A, _, tangent = entries.local(np.array([t]), x[:, None])
+    return A[0], tangent[0]
 
 
 def _at_each(f, t, x, v):
