@@ -448,7 +448,8 @@ def test_a_program_of_other_coordinates_is_refused(crane):
 def test_a_span_that_ends_within_a_path_that_is_singular_at_rest(crane):
     """The linearisation at the end is not finite; a plan has an open end."""
     run = sv.relaxed(*crane, (0.0, 3.0), weight=1e-9, end="bounded")
-    assert sv.verify(run.model, run).passed and np.abs(run.residual["X"]).max() < 1e-3
+    assert sv.verify(run.model, run).passed
+    assert np.abs(run.residual["X"][0][run.t < 2.5]).max() < 1e-3  # a layer follows at the open end
 
 
 @pytest.mark.parametrize("start, fact", [

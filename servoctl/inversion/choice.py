@@ -27,6 +27,7 @@ from servoctl.inversion.verdict import (
     MINIMUM,
     OPEN,
     SINGULAR,
+    UNDETERMINED,
     Verdict,
     verdict,
 )
@@ -303,7 +304,10 @@ def _excess(run, ranges):
 def _with_reason(run, why, note=""):
     """The run, whose message says which inverse it is and why."""
     kind = {"algebraic": "instant by instant", "bounded": "bounded", RELAXED: "relaxed"}.get(run.method, "forward")
-    reason = f"the program is {why.word} ({why.reason})" if isinstance(why, Verdict) else why
+    reason = why
+    if isinstance(why, Verdict):
+        grown = "" if why.rest or why.word == UNDETERMINED or not why.growth else f"; {why.growth}"
+        reason = f"the program is {why.word} ({why.reason}{grown})"
     if kind == "forward" and isinstance(why, Verdict) and why.dynamics == MARGINAL and "end" in why.rest:
         note += _swinging(run)
     return replace(run, message=f"{run.message}; inverse: {kind}, as {reason}{note}")

@@ -357,7 +357,7 @@ class Transfer:
 
 
 def _linearised(entries, t, x):
-    """The linearisation (f, f) of the internal dynamics at a state and the tangent (n_x, f); not finite where singular."""
+    """The internal dynamics at a state: linearisation (f, f), not finite where singular, and tangent (n_x, f)."""
     with np.errstate(all="ignore"):
         _, A, _, tangent = entries.local(np.array([t]), x[:, None])
     return A[0], tangent[0]
