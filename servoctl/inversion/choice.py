@@ -207,12 +207,14 @@ class Request:
     def _planned(self, start, **end):
         """The relaxed plan; from the rest near values of coordinates, where there is none with exactly these."""
         limits, bounds = self.ranges
-        full = plant(self.mechanism)
+        full, q = plant(self.mechanism), self.mechanism.q
+        if isinstance(start, Mapping) and not {*full.state_names} <= {*start}:
+            start = {name: value for name, value in start.items() if name in q.names}  # a rest is near these
         options = {"weight": self.weight, "limits": limits, "bounds": bounds, **end}
         try:
             return relaxed(full, self.program, self.span, start=start, **options)
         except InconsistentStart:
-            values = isinstance(start, Mapping) and {*start} <= {*self.mechanism.q.names}
+            values = isinstance(start, Mapping) and {*start} <= {*q.names}
             near = rest_near(full, self.program, self.span[0], start) if values else None
             if near is None:
                 raise
