@@ -432,7 +432,7 @@ class _Checks:
         return max(worst, self._where_blunt(blunt, size)) if blunt > BLUNT else worst
 
     def _where_blunt(self, blunt, size):
-        """Largest error of γ'' against the equations with multipliers, where rounding of inputs decides the mechanism's.
+        """Largest error of γ'' against the equations with multipliers, where rounding decides the mechanism's.
 
         That the program determines γ'' is a note; if rounding decides these equations too, it is a doubt.
         """
@@ -448,7 +448,7 @@ class _Checks:
         return max(_excused(errors, size, limit, lambda r=rounding: r) for errors, rounding in found)
 
     def _by_multipliers(self, at):
-        """Errors of γ'' against the solution of the equations with multipliers, and the effect of rounding on it, (n, N).
+        """Errors (n, N) of γ'' against the equations with multipliers, and the effect of rounding on these.
 
         The effect is infinite where these equations do not determine γ''.
         """
