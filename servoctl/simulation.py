@@ -384,10 +384,26 @@ def _run(model, motion, method, drift, knots, span):
         status, message = 0, f"finished; {motion.note}" if motion.note else "finished"
     facts = {"method": str(method), "drift": str(drift or ""), "counters": motion.counters}
     facts["knots"] = tuple(sorted({*knots, *motion.switches}))
+    if isinstance(method, Taylor):
+        _set_at_knots(t, jets, variants, knots)
     facts["events"] = occurrences(motion.occurrences, model.names_to)
     facts |= {"success": status == 0 or bool(motion.ended), "status": status, "message": message}
     facts["variants"] = tuple(variants)
     return Run(t, jets, model.names_to(len(jets)), model, **facts)
+
+
+def _set_at_knots(t, jets, variants, knots):
+    """Derivatives at knots by the equations at that instant: those of a series are of the side that it comes from."""
+    knots = np.asarray(knots, dtype=float)
+    for first, end, model in variants:
+        near = np.abs(t[first:end, None] - knots) <= SAME_TIME * np.maximum(1.0, np.abs(knots))
+        at = first + np.flatnonzero(near.any(axis=1))
+        if len(at):
+            n_x, top = len(model.state_names), len(model.jet_names)
+            rates = model.function("ode").grid(t[at], jets[:n_x, at], model.parameters)
+            jets[n_x:top, at] = rates[n_x - model.n : n_x]
+            if len(jets) > top:
+                jets[:, at] = model.extended(t[at], jets[:top, at], len(jets))
 
 
 def _resample(run, times):
