@@ -208,13 +208,18 @@ def simulated(model, start, t_span, method=None, *, drift=None, t_eval=None, eve
         if t_eval is not None and isinstance(method, RungeKutta):
             run = _resample(run, times)
     if pressed and run.status == 0:
-        run = replace(run, success=False, status=1, message=f"{run.message}; interrupted at its end")
+        run = _interrupted_at_its_end(run)
     if motion.stop is not None:
         motion.stop.run = run
         raise motion.stop
     if run.success and not model.flat:
         _warn_drifted(run)
     return run
+
+
+def _interrupted_at_its_end(run):
+    """A run that is complete, though Ctrl-C came while it was put together or judged."""
+    return replace(run, success=False, status=1, message=f"{run.message}; interrupted at its end")
 
 
 def _warn_drifted(run):
@@ -249,11 +254,16 @@ def judged(run, tolerance=STEP_ERROR, again=None):
     -------
     Run
     """
-    interrupted = not run.success
-    if interrupted or growth_bound(run.model, run) <= UNSTABLE:
-        return replace(run, verdict=partial(_verdict, tolerance=tolerance))
-    run = run if again is None else again()
-    internal = internal_dynamics(run.model, run)
+    known = replace(run, verdict=partial(_verdict, tolerance=tolerance))
+    try:
+        if not run.success or growth_bound(run.model, run) <= UNSTABLE:
+            return known
+        run = run if again is None else again()
+        internal = internal_dynamics(run.model, run) if run.success else None
+    except KeyboardInterrupt:
+        return _interrupted_at_its_end(known)
+    if internal is None:  # interrupted while it was computed with more samples
+        return _interrupted_at_its_end(known)
     if internal.verdict == "unstable":
         warn_unstable(internal.sentence(tolerance))
     return replace(run, verdict=internal.facts(tolerance))
