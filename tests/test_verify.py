@@ -105,6 +105,18 @@ def nearly(q):
     return {"a": row, "b": 0.7 * row + 1e-3 * (y - 0.3 * ca.cos(q.t))}
 
 
+def leaning(lean, by="actuators", order=0):
+    """A point on a weightless rod: the mass matrix is singular where the rod is upright, the program leaves no doubt."""
+    q = sv.coordinates("y lean")
+    y, b = q
+    gibbs = sv.particle(q, 80.0, (y + ca.sin(b), ca.cos(b)))
+    mechanism = sv.Mechanism(q, gibbs=gibbs, potential=785.0 * ca.cos(b), actuators={"side": y})
+    program = sv.Program({"y": q.dt(y - 0.1 * ca.sin(2 * q.t), order)}, by=by)
+    model = sv.derive(mechanism, program)
+    free = {"y": 0.0, "dy": 0.2, "d2y": 0.0} if order else {}
+    return model, model.start(lean=lean, dlean=0.02, **free), (0.0, 0.2)
+
+
 RIGHT = {
     "rod": (rod, None),
     "rod, Taylor": (rod, "Taylor"),
@@ -116,6 +128,8 @@ RIGHT = {
     "ropes": (lambda: ropes(4e6), None),
     "stiffer ropes": (lambda: ropes(4e8), None),
     "stiff spring": (lambda: chain(1e10), None),
+    "upright rod": (lambda: leaning(0.0), None),
+    "almost upright rod, ideal": (lambda: leaning(1e-8, "ideal"), None),
     "nearly dependent": (lambda: chain(by="ideal", program=nearly), None),
 }
 
@@ -218,6 +232,22 @@ def test_samples_that_are_no_numbers_fail(which, plan):
     assert proof.failures == ("samples",) and proof.numbers["samples"] >= 1
 
 
+def test_what_neither_inputs_nor_multipliers_determine_is_inconclusive():
+    model, start, span = leaning(0.0, order=3)
+    proof = sv.verify(model, sv.simulate(model, start, span))
+    assert proof.verdict == "inconclusive" and len(proof.doubts) == 1
+
+
+@pytest.mark.filterwarnings("ignore:Internal dynamics unstable")
+@pytest.mark.parametrize("jet", ["lean", "d2y", "d2lean"])
+@pytest.mark.parametrize("lean", [0.0, 1e-8])
+def test_wrong_motions_of_a_singular_mechanism_fail(lean, jet):
+    model, start, span = leaning(lean)
+    run = sv.simulate(model, start, span)
+    wrong = scaled(run.jets, model.jet_names.index(jet))
+    assert "acceleration" in sv.verify(model, edited(run, jets=wrong)).failures
+
+
 @pytest.mark.parametrize("name", ["trolley", "hoist", "energy"])
 @pytest.mark.parametrize("which", [slice(None), 100])
 def test_changed_forces_fail(name, which, plan):
@@ -276,7 +306,7 @@ def rubbed(friction=2.0):
     (x, y), (_, dy), (ddx, ddy) = q, q.d(1), q.d(2)
     forces = {"y": -9 * y - friction * ca.sign(dy)}
     mechanism = sv.Mechanism(q, gibbs=(ddx**2 + ddy**2) / 2, actuators={"F": x}, forces=forces)
-    model = sv.derive(mechanism, sv.Program({"x": x - ca.sin(q.t)}))
+    model = sv.derive(mechanism, sv.Program({"x": x - ca.sin(q.t)}), keep=["y"])
     return model, model.start(y=2.0, dy=0.0), (0.0, 2.8)
 
 

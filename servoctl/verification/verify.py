@@ -421,18 +421,49 @@ class _Checks:
             x = np.vstack([at.z[: nq + n], at.inputs])
             accelerations = f(at.t, x)
             errors = _ratio(accelerations - at.z[nq + n : nq + 2 * n], size)
-            if largest(errors) > LIMITS["acceleration"]:  # errors of rounding are larger where it decides
+            if not largest(errors) <= LIMITS["acceleration"]:  # errors of rounding are larger where it decides
+                determined = np.isfinite(accelerations)
                 rounding = self._rounding(f, at.t, x, accelerations)
                 of_inputs = self._rounding(given, at.t, at.z, given(at.t, at.z))
                 errors = errors / (1 + (rounding + np.minimum(of_inputs, BY_INPUTS * size)) / (limit * size))
-                blunt = max(blunt, largest(rounding / size))
+                errors = np.where(determined, errors, 0.0)
+                blunt = max(blunt, largest(np.where(determined, rounding / size, np.inf)))
             worst = max(worst, largest(errors))
-        if blunt > BLUNT:
-            self.doubts.append(
-                f"rounding changes the mechanism's accelerations by {blunt:.1e} of their size: scale the units, or "
-                "replace stiff springs and small masses by constraints"
-            )
-        return worst
+        return max(worst, self._where_blunt(blunt, size)) if blunt > BLUNT else worst
+
+    def _where_blunt(self, blunt, size):
+        """Largest error of γ'' against the equations with multipliers, where rounding decides the mechanism's.
+
+        That the program determines γ'' is a note; if rounding decides these equations too, it is a doubt.
+        """
+        what = "the inputs do not determine the mechanism's accelerations"
+        if np.isfinite(blunt):
+            what = f"rounding changes the mechanism's accelerations by {blunt:.1e} of their size"
+        found = [self._by_multipliers(at) for at in self.instants]
+        if max(largest(rounding / size) for _, rounding in found) > BLUNT:
+            self.doubts.append(f"{what}: scale the units, or replace stiff springs and small masses by constraints")
+            return 0.0
+        self.notes.append(f"{what}: those under the program's constraints are compared instead")
+        limit = self.limit("acceleration")
+        return max(_excused(errors, size, limit, lambda r=rounding: r) for errors, rounding in found)
+
+    def _by_multipliers(self, at):
+        """Errors (n, N) of γ'' against the equations with multipliers, and the effect of rounding on these.
+
+        The effect is infinite where these equations do not determine γ''.
+        """
+        n, nq, z = self.model.n, self.model.nq, at.z[: len(self.model.jet_names)]
+
+        def accelerations(t, z):
+            matrix, right = at.model.multiplier_form(t, z)
+            return np.linalg.solve(matrix.transpose(2, 0, 1), right.T[:, :, None])[:, :n, 0].T
+
+        try:
+            again = accelerations(at.t, z)
+            return z[nq + n : nq + 2 * n] - again, self._rounding(accelerations, at.t, z, again)
+        except (np.linalg.LinAlgError, ValueError):  # singular, or of hidden constraints and higher orders
+            unknown = np.full((n, len(at.t)), np.inf)
+            return unknown, unknown
 
     def multiplier_form(self):
         """Largest residual of [M -B; C 0] [γ''; μ] = ..., relative to the largest terms of each row."""
