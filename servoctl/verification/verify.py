@@ -39,7 +39,7 @@ FLOOR = 1e-3  # least size of a component, relative to what moves as much mass, 
 BLUNT = 1e-3  # effect of rounding, relative to the accelerations, above which these decide nothing
 OWN_INSTANTS, MOST_OWN = 200, 8  # instants between samples at which everything is checked, in all and of an interval
 BALANCED = 1e-9  # part of dE/dt, relative to its terms, that does not follow from the forces: more is no rounding
-BY_INPUTS = 1e-6  # part of the accelerations that rounding of the inputs may excuse
+BY_INPUTS = 1e-6  # part of the accelerations, or of the power, that rounding of the inputs may excuse
 FEW_SIZES = 20  # instants that give the sizes of residuals that are far below their limit
 MOST_SEGMENTS = 10_000  # steps along the run that are accepted: seconds
 MOST_OWN_PIVOTS = 3  # choices of pivots of its own, where those of the run vanish between samples
@@ -424,6 +424,8 @@ class _Checks:
             if largest(errors) > LIMITS["acceleration"]:  # errors of rounding are larger where it decides
                 rounding = self._rounding(f, at.t, x, accelerations)
                 of_inputs = self._rounding(given, at.t, at.z, given(at.t, at.z))
+                terms = np.vstack([np.zeros_like(at.z[: nq + n]), at.signals("input_terms")])
+                of_inputs += ROUNDING * self._response(f, at.t, x, accelerations, terms)
                 errors = errors / (1 + (rounding + np.minimum(of_inputs, BY_INPUTS * size)) / (limit * size))
                 blunt = max(blunt, largest(rounding / size))
             worst = max(worst, largest(errors))
@@ -560,21 +562,25 @@ class _Checks:
         errors, roundings = [], []
         known = dict(enumerate(self.powers))  # of the samples, which are the first instants
         for i, at in enumerate(self.instants):
-            f = at.model.signals("power")[1]
-
-            def defect(t, z, f=f, model=at.model):
-                rate, work, *_ = f.grid(t, z, model.parameters)
-                return (rate - work)[None]
-
-            z = at.z[: f.n_x]
             rate, work, size, _ = known[i] if i in known else at.signals("power")
             errors.append((rate - work)[None])
-            roundings.append(lambda z=z, at=at, defect=defect, e=errors[-1]: self._rounding(defect, at.t, z, e))
+            roundings.append(partial(self._rounding_of_power, at, errors[-1]))
             inertial = np.abs(at.z[nq : nq + n] * at.z[nq + n : nq + 2 * n]).T @ self.mass
             scale = max(scale, (np.abs(size) + np.abs(rate) + inertial).max())
         limit = self.limit("power")
-        power = max(_excused(e, scale, limit, rounding) for e, rounding in zip(errors, roundings, strict=True))
+        power = max(_excused(e, scale, limit, lambda r=r: r(scale)) for e, r in zip(errors, roundings, strict=True))
         return {"power": power} | self._energy(scale)
+
+    def _rounding_of_power(self, at, error, scale):
+        """Effect of rounding on the error (1, N) of the power, that of inputs at most a part of its scale."""
+        f = at.model.signals("power")[1]
+
+        def defect(t, z):
+            rate, work, *_ = f.grid(t, z, at.model.parameters)
+            return (rate - work)[None]
+
+        of_inputs = np.minimum(ROUNDING * at.signals("power_terms"), BY_INPUTS * scale)
+        return self._rounding(defect, at.t, at.z[: f.n_x], error) + of_inputs
 
     def _energy(self, power):
         """Largest difference of the energy gained from the work, relative to the kinetic energy and the work done."""
