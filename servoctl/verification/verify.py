@@ -38,6 +38,7 @@ PROBE, PROBES = 1e-7, 3  # relative change by which a response is measured, and 
 FLOOR = 1e-3  # least size of a component, relative to what moves as much mass, and to what moves there in the span
 BLUNT = 1e-3  # effect of rounding, relative to the accelerations, above which these decide nothing
 OWN_INSTANTS, MOST_OWN = 200, 8  # instants between samples at which everything is checked, in all and of an interval
+AT_ZERO = 1e-6  # of the least singular value of B: below it B_D is at the zero of a pivot, where inputs have no digits
 BALANCED = 1e-9  # part of dE/dt, relative to its terms, that does not follow from the forces: more is no rounding
 BY_INPUTS = 1e-6  # part of the accelerations, or of the power, that rounding of the inputs may excuse
 FEW_SIZES = 20  # instants that give the sizes of residuals that are far below their limit
@@ -371,6 +372,8 @@ class _Checks:
             t, z = (np.concatenate(values, axis=-1) for values in zip(*parts, strict=True))
             few = np.unique(np.linspace(0, len(t) - 1, OWN_INSTANTS).astype(int))
             t, z = t[few], flow.corrected(t[few], z[:, few])
+            regular = _regular(flow.model, t, z)
+            t, z = (t[regular], z[:, regular]) if regular.any() else (t, z)
             for model, which in self._sides(flow.model, t, z):
                 instants = _Instants(model, t[which], z[:, which], None)
                 own.append(replace(instants, inputs=instants.signals("inputs")))
@@ -677,6 +680,17 @@ class _Checks:
             inverse = np.linalg.pinv(E, rcond=max(E.shape[1:]) * np.finfo(float).eps)
             worst = max(worst, largest(reaction - E @ (inverse @ reaction)))
         return {"outside": worst / size}
+
+
+def _regular(model, t, z):
+    """Whether the inputs are determined with the model's pivots at instants, (N,): B_D is as regular as B."""
+    f, dependent, n = model.function("matrices"), list(model.reduction.realisation.dependent), model.n
+    values = f.grid(t, z[: f.n_x], model.parameters)
+    B = values[len(values) - n * (len(dependent) + 1) : -n].reshape(n, len(dependent), len(t)).T
+    if not dependent or not np.all(np.isfinite(B)):
+        return np.ones(len(t), dtype=bool)
+    least, of_all = (np.linalg.svd(b, compute_uv=False)[:, -1] for b in (B[:, :, dependent], B))
+    return least > AT_ZERO * of_all
 
 
 def _product(matrix, vectors):
