@@ -38,8 +38,9 @@ PROBE, PROBES = 1e-7, 3  # relative change by which a response is measured, and 
 FLOOR = 1e-3  # least size of a component, relative to what moves as much mass, and to what moves there in the span
 BLUNT = 1e-3  # effect of rounding, relative to the accelerations, above which these decide nothing
 OWN_INSTANTS, MOST_OWN = 200, 8  # instants between samples at which everything is checked, in all and of an interval
+AT_ZERO = 1e-6  # of the least singular value of B: below it B_D is at the zero of a pivot, where inputs have no digits
 BALANCED = 1e-9  # part of dE/dt, relative to its terms, that does not follow from the forces: more is no rounding
-BY_INPUTS = 1e-6  # part of the accelerations that rounding of the inputs may excuse
+BY_INPUTS = 1e-6  # part of the accelerations, or of the power, that rounding of the inputs may excuse
 FEW_SIZES = 20  # instants that give the sizes of residuals that are far below their limit
 MOST_SEGMENTS = 10_000  # steps along the run that are accepted: seconds
 MOST_OWN_PIVOTS = 3  # choices of pivots of its own, where those of the run vanish between samples
@@ -371,6 +372,8 @@ class _Checks:
             t, z = (np.concatenate(values, axis=-1) for values in zip(*parts, strict=True))
             few = np.unique(np.linspace(0, len(t) - 1, OWN_INSTANTS).astype(int))
             t, z = t[few], flow.corrected(t[few], z[:, few])
+            regular = _regular(flow.model, t, z)
+            t, z = (t[regular], z[:, regular]) if regular.any() else (t, z)
             for model, which in self._sides(flow.model, t, z):
                 instants = _Instants(model, t[which], z[:, which], None)
                 own.append(replace(instants, inputs=instants.signals("inputs")))
@@ -425,6 +428,8 @@ class _Checks:
                 determined = np.isfinite(accelerations)
                 rounding = self._rounding(f, at.t, x, accelerations)
                 of_inputs = self._rounding(given, at.t, at.z, given(at.t, at.z))
+                terms = np.vstack([np.zeros_like(at.z[: nq + n]), at.signals("input_terms")])
+                of_inputs += ROUNDING * self._response(f, at.t, x, accelerations, terms)
                 errors = errors / (1 + (rounding + np.minimum(of_inputs, BY_INPUTS * size)) / (limit * size))
                 errors = np.where(determined, errors, 0.0)
                 blunt = max(blunt, largest(np.where(determined, rounding / size, np.inf)))
@@ -591,21 +596,25 @@ class _Checks:
         errors, roundings = [], []
         known = dict(enumerate(self.powers))  # of the samples, which are the first instants
         for i, at in enumerate(self.instants):
-            f = at.model.signals("power")[1]
-
-            def defect(t, z, f=f, model=at.model):
-                rate, work, *_ = f.grid(t, z, model.parameters)
-                return (rate - work)[None]
-
-            z = at.z[: f.n_x]
             rate, work, size, _ = known[i] if i in known else at.signals("power")
             errors.append((rate - work)[None])
-            roundings.append(lambda z=z, at=at, defect=defect, e=errors[-1]: self._rounding(defect, at.t, z, e))
+            roundings.append(partial(self._rounding_of_power, at, errors[-1]))
             inertial = np.abs(at.z[nq : nq + n] * at.z[nq + n : nq + 2 * n]).T @ self.mass
             scale = max(scale, (np.abs(size) + np.abs(rate) + inertial).max())
         limit = self.limit("power")
-        power = max(_excused(e, scale, limit, rounding) for e, rounding in zip(errors, roundings, strict=True))
+        power = max(_excused(e, scale, limit, lambda r=r: r(scale)) for e, r in zip(errors, roundings, strict=True))
         return {"power": power} | self._energy(scale)
+
+    def _rounding_of_power(self, at, error, scale):
+        """Effect of rounding on the error (1, N) of the power, that of inputs at most a part of its scale."""
+        f = at.model.signals("power")[1]
+
+        def defect(t, z):
+            rate, work, *_ = f.grid(t, z, at.model.parameters)
+            return (rate - work)[None]
+
+        of_inputs = np.minimum(ROUNDING * at.signals("power_terms"), BY_INPUTS * scale)
+        return self._rounding(defect, at.t, at.z[: f.n_x], error) + of_inputs
 
     def _energy(self, power):
         """Largest difference of the energy gained from the work, relative to the kinetic energy and the work done."""
@@ -702,6 +711,17 @@ class _Checks:
             inverse = np.linalg.pinv(E, rcond=max(E.shape[1:]) * np.finfo(float).eps)
             worst = max(worst, largest(reaction - E @ (inverse @ reaction)))
         return {"outside": worst / size}
+
+
+def _regular(model, t, z):
+    """Whether the inputs are determined with the model's pivots at instants, (N,): B_D is as regular as B."""
+    f, dependent, n = model.function("matrices"), list(model.reduction.realisation.dependent), model.n
+    values = f.grid(t, z[: f.n_x], model.parameters)
+    B = values[len(values) - n * (len(dependent) + 1) : -n].reshape(n, len(dependent), len(t)).T
+    if not dependent or not np.all(np.isfinite(B)):
+        return np.ones(len(t), dtype=bool)
+    least, of_all = (np.linalg.svd(b, compute_uv=False)[:, -1] for b in (B[:, :, dependent], B))
+    return least > AT_ZERO * of_all
 
 
 def _product(matrix, vectors):
