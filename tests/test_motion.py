@@ -51,7 +51,7 @@ def test_samples_are_not_copied_when_a_motion_ends(method, wheel, gallery_model,
 
 @pytest.mark.parametrize("end", [1.4, 3.9])
 def test_fixed_steps_end_at_the_end_of_the_span_and_at_knots(end):
-    """390 steps of (3.9 s)/390 are not 3.9 s."""
+    """140 steps of (1.4 s)/140 are 1.4000000000000001 s."""
     q = sv.coordinates("x y")
     x, y = q
     mechanism = sv.Mechanism(q, gibbs=sv.particle(q, 1.0, (x, y)))
