@@ -16,7 +16,7 @@ from servoctl.reduction.orders import other_order
 DEFAULT_SAMPLES = 1001  # without t_eval: smooth curves, and extrema refined to rounding
 SAME_INSTANT = 1e-12  # of the time: instants closer than this are one
 BESIDE_KNOTS = 0.1  # of that: how far before and after a knot a piece ends and begins, with all stages on its own side
-MOST_RESERVED = 2**21  # samples: for more of them arrays grow, by doubling
+MOST_RESERVED = 2_000_000  # samples: for more of them arrays grow, by doubling
 ADVICE = "Use a smaller rtol, another method or drift='project', or check whether the program ends or jumps there."
 
 
