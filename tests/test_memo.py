@@ -198,7 +198,8 @@ def test_the_key_holds_all_that_a_derivation_reads():
                 owner = getattr(node.value, "id", getattr(node.value, "attr", ""))
                 if owner in read:
                     read[owner].add(node.attr)
-    read["mechanism"] -= {"couplings", "driven", "part", "places"}  # which decide of which part of a mechanism the key is made
+    # which decide of which part of a mechanism the key is made, and name what is left out
+    read["mechanism"] -= {"couplings", "driven", "part", "places", "whole", "left_out", "no"}
     read["mechanism"] -= {"as_text"}  # where they are told, and `mass` is the Jacobian of `balance`
     assert read == told
 
