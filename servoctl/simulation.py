@@ -346,7 +346,7 @@ def _motion(model, method, drift, problem, bar, atol=None):
 def _with_events(motion, events):
     """The motion with the occurrences of its events up to its end."""
     if events is not None and motion.pieces:
-        motion.occurrences = events.until(motion.pieces[-1][1][-1])
+        motion.occurrences = events.until(motion.t[-1])
     return motion
 
 
@@ -374,16 +374,17 @@ def _smaller_tolerances(model, method, motion):
         return None
     if isinstance(method, RadauIIA) and method.step is not None:
         return None
-    t, jets, _ = motion.samples()
-    x = jets[: len(model.state_names), np.all(np.isfinite(jets), axis=0)]
-    return absolute_tolerances(model, t, x, method.rtol) if x.shape[1] > 1 else None
+    finite = np.all(np.isfinite(motion.jets), axis=0)
+    x = motion.jets[: len(model.state_names)]
+    x = x if finite.all() else x[:, finite]
+    return absolute_tolerances(model, motion.t, x, method.rtol) if x.shape[1] > 1 else None
 
 
 def _run(model, motion, method, drift, knots, span):
     """The run of a motion, to its end or its stop."""
     if not motion.pieces:  # interrupted or stopped before the first sample
         motion.add(model, [span[0]], span[1][:, None], np.full((model.n, 1), np.nan))
-    t, jets, variants = motion.samples()
+    t, jets = motion.t, motion.jets
     last = f"t = {t[-1]:.7g} s"
     if motion.stop is not None:
         status, message = -1, f"stopped: {str(motion.stop).split('. ')[0]}"
@@ -395,11 +396,11 @@ def _run(model, motion, method, drift, knots, span):
         status, message = 0, f"finished; {motion.note}" if motion.note else "finished"
     facts = {"method": str(method), "drift": str(drift or ""), "counters": motion.counters}
     facts["knots"] = tuple(sorted({*knots, *motion.switches}))
+    facts["variants"] = tuple(motion.variants())
     if isinstance(method, Taylor):
-        _set_at_knots(t, jets, variants, knots)
+        _set_at_knots(t, jets, facts["variants"], knots)
     facts["events"] = occurrences(motion.occurrences, model.names_to)
     facts |= {"success": status == 0 or bool(motion.ended), "status": status, "message": message}
-    facts["variants"] = tuple(variants)
     return Run(t, jets, model.names_to(len(jets)), model, **facts)
 
 
