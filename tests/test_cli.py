@@ -10,6 +10,7 @@ import warnings
 from pathlib import Path
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 from conftest import words
 
@@ -116,6 +117,18 @@ def test_unstable_internal_dynamics_get_the_bounded_plan(here, capsys):
     thrusts = [facts["extrema"][name][side]["value"] for name in ("u1", "u2") for side in ("min", "max")]
     assert 200.0 < min(thrusts) and max(thrusts) < 300.0  # its weight is 490.5 N
     assert max(r["worst"] for r in facts["closed_loop"]["residuals"].values()) < 1e-5 * 5.0
+
+
+def test_samples_of_the_bounded_plan_include_what_comes_before_and_after_the_program(here, capsys):
+    spans = []
+    for options in ([], ["--samples", "201"]):
+        assert main(["run", "vtol-centre", "--no-figures", "--no-loop", "--no-verify", *options]) == 0
+        with np.load(here / "servoctl-runs" / "vtol-centre" / "run.npz") as file:
+            spans.append((file["t"][0], file["t"][-1]))
+    assert len(np.unique(spans[0])) == 2 and spans[0][0] < 0.0 and spans[0][1] > 4.0
+    assert spans[1] == spans[0]
+    facts = summary(here / "servoctl-runs" / "vtol-centre")
+    assert facts["samples"] == 201 and "leave out" not in facts["message"]
 
 
 def test_where_there_is_no_bounded_plan_the_forward_one_says_so(here, capsys):

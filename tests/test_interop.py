@@ -363,3 +363,19 @@ def test_a_model_whose_pivots_vanish_says_so(gallery_model):
     model = gallery_model("overhead-crane")
     with refused(ServoError, t=1.0):
         interop.nlsys(model).dynamics(1.0, np.zeros(6), [])
+
+
+def test_a_plant_is_linearised_along_a_plan_that_has_fewer_coordinates():
+    """A pendulum beside a cart is left out of the plan, and of what is linearised along it."""
+    q = sv.coordinates("x phi")
+    x, phi = q
+    gibbs = sv.particle(q, 3.0, (x,)) + sv.particle(q, 2.0, (phi,))
+    mechanism = sv.Mechanism(q, gibbs=gibbs, potential=4.0 * phi**2, actuators={"F": x})
+    model = sv.derive(mechanism, sv.Program({"X": x - sv.paths.rest_to_rest(q.t, 0.0, 1.0, duration=2.0)}))
+    plan, plant = sv.simulate(model, model.start(), (0.0, 2.0)), sv.plant(mechanism)
+    systems = list(interop.along(plant, plan, [0.5, 1.5]))
+    for system in systems:
+        assert system.state_labels == ["x", "dx"] and system.input_labels == ["F"]
+        assert system.A == pytest.approx(np.array([[0, 1], [0, 0]])) and system.B[1, 0] == pytest.approx(1 / 3)
+    law = list(interop.along(sv.lqr(plan, plant, 50.0), plan, [0.5]))[0]
+    assert list(law.input_labels) == list(systems[0].state_labels)

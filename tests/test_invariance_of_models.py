@@ -1,5 +1,7 @@
 """The same report and the same accelerations in other words: names, order, units, equivalent constraints; numbers."""
 
+from dataclasses import replace
+
 import casadi as ca
 import numpy as np
 import pytest
@@ -9,6 +11,10 @@ from servoctl import spec as sv
 from servoctl.errors import ServoError
 from servoctl.gallery import gallery, mass_on_car, overhead_crane, winch_crane
 from servoctl.model.model import derive
+from servoctl.model.validity import affirmed
+from servoctl.reduction.appell import require_positive
+from servoctl.reduction.knots import Switches
+from servoctl.reduction.reduce import holds
 
 TIMES = (0.7, 2.0, 4.4)
 STARTS = {  # off the places where the gallery's starts have a pivot that vanishes
@@ -296,3 +302,61 @@ def test_a_start_where_a_pivot_vanishes_gets_pivots_of_its_own(name, gallery_mod
     assert np.all(np.isfinite(rates))
     reaction = signal(near, "reaction", 0.0, np.append(state.values, rates[-model.n :]))
     assert np.all(np.isfinite(list(reaction.values())))
+
+
+AFFIRMED = ("overhead-crane", "winch-crane", "appell-hamel", "mass-on-car", "vtol", "two-link-arm", "wheeled-robot")
+
+
+@pytest.mark.parametrize("name", AFFIRMED)
+def test_new_numbers_are_affirmed_by_a_few_evaluations(name, gallery_model, monkeypatch):
+    """Neither points in extended precision nor series of paths without these numbers are computed again."""
+    model = gallery_model(name)
+    changed = {name: 1.1 * value if value else 0.1 for name, value in model.numbers.items()}
+    evaluated = []
+    monkeypatch.setattr("servoctl.model.model.holds", lambda *_: pytest.fail("decided in extended precision"))
+    monkeypatch.setattr(Switches, "classes", lambda *_: evaluated.append(1) or {})
+    for name, value in changed.items():
+        other = model.with_parameters(**{name: value})
+        assert other._functions is model._functions and other.numbers[name] == value
+    switches = model.reduction.switches
+    assert len(evaluated) <= 1 + 2 * len(switches._numbers)
+
+
+EXTREMES = (0.0, 1e-13, 1e-9, 1e-6, 0.1, 3.0, 100.0, -1.0)
+CHANGED = {
+    "friction": lambda: cars_with_friction(0.2),
+    "no friction": lambda: cars_with_friction(0.0),
+    "coupled": lambda: coupled(0.3),
+    "uncoupled": lambda: coupled(0.0),
+    "horizontal": lambda: derive(*mass_on_car(alpha=0.0, damping=1.0)),
+    "inclined": lambda: derive(*mass_on_car(alpha=0.3)),
+}
+
+
+@pytest.mark.parametrize("name", CHANGED)
+def test_what_is_affirmed_in_doubles_is_so_in_extended_precision(name):
+    """Numbers that change ranks, orders or the sign of a mass are left to extended precision, ordinary ones are not."""
+    model, both = CHANGED[name](), 0
+    r = model.reduction
+    for parameter, value in model.numbers.items():
+        for factor in EXTREMES:
+            values = r.mechanism.parameters.values({**model.numbers, parameter: (value or 1.0) * factor})
+            if affirmed(model, values):
+                require_positive(r.mechanism, replace(r.points, values=values))
+                assert holds(r, values) and model._constant_pivots_hold(values) and model._dropped_hold(values)
+                both += 1
+    assert both >= 5
+
+
+@pytest.mark.parametrize(("name", "change"), [("no friction", {"c": 0.7}), ("horizontal", {"alpha": 0.3})])
+def test_what_was_special_at_derivation_is_not_affirmed(name, change):
+    model = CHANGED[name]()
+    values = model.reduction.mechanism.parameters.values({**model.numbers, **change})
+    assert not affirmed(model, values) and not holds(model.reduction, values)
+
+
+def test_a_run_after_new_numbers_takes_the_knots_that_are_known(monkeypatch):
+    model = derive(*overhead_crane())
+    other = model.with_parameters(m_load=1.1 * model.numbers["m_load"])
+    monkeypatch.setattr(Switches, "classes", lambda *_: pytest.fail("classes are known"))
+    assert other.knots == model.knots and tuple(other.require_smooth((0.0, 9.0))) == model.knots

@@ -1,5 +1,7 @@
 """Where paths switch, and programs that need more derivatives than their paths have."""
 
+import math
+
 import casadi as ca
 import pytest
 from refusals import refused
@@ -231,3 +233,21 @@ def test_a_sample_on_a_jump_of_a_force_has_the_acceleration_of_that_instant(opti
     late = run.t >= 1.3 if included else run.t > 1.3
     assert 1.3 in run.t and run["d2y"] == pytest.approx(5.0 * late - run["y"], abs=1e-9)
     assert servoctl.verify(model, run).passed
+
+
+def test_remembered_knots_are_those_of_their_numbers_and_span():
+    """Switches of max(0, sin t - h) lie at arcsin h and π - arcsin h of every turn within the span."""
+    q, p = sv.coordinates("x"), sv.parameters(h=0.5, m=1.0)
+    (x,) = q
+    mechanism = sv.Mechanism(q, gibbs=sv.particle(q, p.m, (x,)), actuators={"F": x}, parameters=p)
+    model = derive(mechanism, sv.Program({"X": x - ca.fmax(0, ca.sin(q.t) - p.h) ** 4}))
+
+    def crossings(h, end):
+        turns = [2 * math.pi * k + a for k in range(3) for a in (math.asin(h), math.pi - math.asin(h))]
+        return [t for t in turns if t < end]
+
+    for _ in range(2):  # the second time they are remembered
+        for h in (0.5, 0.6):
+            for end in (2.0, 9.0, 5.0):
+                other = model.with_parameters(h=h, m=1.0 + h)
+                assert other.require_smooth((0.0, end)) == pytest.approx(crossings(h, end), abs=4e-15)

@@ -191,6 +191,7 @@ def test_the_key_holds_all_that_a_derivation_reads():
         "program": {"residuals", "with_turns", "names", "by", "weights", "toward"},
     }  # fmt: skip
     files = [*(PACKAGE / "reduction").glob("*.py"), *(PACKAGE / "model").glob("*.py")]
+    files.remove(PACKAGE / "reduction" / "idle.py")  # it makes the mechanism of the key
     read = {"mechanism": set(), "program": set()}
     for path in files:
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):

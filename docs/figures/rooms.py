@@ -10,6 +10,8 @@ import numpy as np
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt  # noqa: E402
 
+from servoctl import HOMES  # noqa: E402
+
 PACKAGE = Path(__file__).parents[2] / "servoctl"
 WIDTH, HEIGHT = 1.62, 0.5  # of a box; floors are 1 apart
 STEP, TRIES = 2.0, 6000  # distance of columns; moves of the search
@@ -31,6 +33,9 @@ def rooms():
         modules = [n.module for n in nodes if isinstance(n, ast.ImportFrom) and n.module]
         modules += [f"servoctl.{a.name}" for n in nodes if isinstance(n, ast.ImportFrom) and n.module == "servoctl"
                     for a in n.names]  # fmt: skip
+        if any(a.name == "servoctl" for n in nodes if isinstance(n, ast.Import) for a in n.names):  # as sv
+            names = {n.attr for n in nodes if isinstance(n, ast.Attribute) and getattr(n.value, "id", "") == "sv"}
+            modules += [f"servoctl.{HOMES.get(name, name)}" for name in names]
         imported = {m.split(".")[1] for m in modules if m.startswith("servoctl.")}
         imports.setdefault(name, set()).update(imported - {name})
     return lines, {name: imported & set(lines) for name, imported in imports.items()}

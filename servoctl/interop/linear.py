@@ -11,7 +11,7 @@ from servoctl.control.sampling import discretised
 from servoctl.errors import SpecificationError
 from servoctl.interop.names import connected, force_names, output_names, signal_names, stranger, system_name
 from servoctl.model.model import Model
-from servoctl.plants.plant import Plant
+from servoctl.plants.plant import Plant, part_of
 from servoctl.reduction.reduce import require_outputs
 from servoctl.run import Run
 
@@ -88,6 +88,7 @@ def along(thing, run, times=None, **options):
     Parameters
     ----------
     thing : Plant, Model or Law
+        Of a plant the part that the model of the run has, if `derive` left coordinates out.
     run : Run or Closed
         States, inputs or measurements by name.
     times : (N,) array, optional
@@ -116,6 +117,8 @@ def along(thing, run, times=None, **options):
     else:
         _require_within(run, times)
         values = resampled(run, times)
+        if isinstance(thing, Plant) and run.model is not None:
+            thing = part_of(thing, run.model.reduction.mechanism)
     for k, t in enumerate(times):
         if isinstance(thing, Plant):
             inputs = [f"input {name}" if isinstance(run, Closed) else name for name in thing.inputs]

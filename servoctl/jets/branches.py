@@ -322,6 +322,11 @@ def size_of_terms(expression):
     -------
     SX scalar
     """
+    return sizes_of_terms([expression])[0]
+
+
+def sizes_of_terms(expressions):
+    """The sums of the magnitudes of several expressions' terms, which share their operations: a list of SX scalars."""
     values, sizes = [], []
 
     def size(op, operands):
@@ -334,7 +339,7 @@ def size_of_terms(expression):
         values.append(expression)
         return ca.fabs(expression)
 
-    return replayed([expression], sizes, leaf, size)[0]
+    return replayed(expressions, sizes, leaf, size)
 
 
 def replayed(expressions, work, leaf, value):

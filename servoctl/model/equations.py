@@ -182,14 +182,15 @@ class Equations(Invariants):
         return self.cascade.along(self.points, self.top - 1, self.top, errors=errors).jet(self.top)
 
     @cached_property
-    def _all_pivots(self):
+    def all_pivots(self):
+        """Pivots by which the equations divide: a list of (name, SX)."""
         leading = (self._saddle[2:] if self.sparse else self._leading)[0]
         return [*self.r.pivots, *((f"leading matrix {i + 1}", p) for i, p in enumerate(leading))]
 
     @cached_property
     def pivots(self):
         """Pivots that depend on the motion, which must not vanish: a list of (name, SX)."""
-        return [(name, p) for name, p in self._all_pivots if any(self.q.where(s) is not None for s in ca.symvar(p))]
+        return [(name, p) for name, p in self.all_pivots if any(self.q.where(s) is not None for s in ca.symvar(p))]
 
     @property
     def entries_dropped(self):
@@ -211,7 +212,7 @@ class Equations(Invariants):
 
     def constant_pivots(self):
         """A function of the parameters: the pivots that depend on these alone."""
-        constant = [p for _, p in self._all_pivots if all(self.q.where(s) is None for s in ca.symvar(p))]
+        constant = [p for _, p in self.all_pivots if all(self.q.where(s) is None for s in ca.symvar(p))]
         return ca.Function("constant_pivots", [self.parameters], [ca.vertcat(*constant)])
 
     @property

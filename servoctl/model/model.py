@@ -18,6 +18,7 @@ from servoctl.model.report import describe, warn_of_products
 from servoctl.model.rest import started
 from servoctl.model.start import State
 from servoctl.model.store import Store, pack, unpack
+from servoctl.model.validity import affirmed
 from servoctl.reduction.appell import require_positive
 from servoctl.reduction.idle import names_of, needed
 from servoctl.reduction.knots import require_smooth
@@ -186,10 +187,11 @@ class Model:
             if name not in current:
                 raise unknown(name, list(current), "parameter")
         values = r.mechanism.parameters.values({**current, **changes})
-        require_positive(r.mechanism, replace(r.points, values=values))
-        if not (holds(r, values) and self._constant_pivots_hold(values) and self._dropped_hold(values)):
-            self._store.require_unchanged()
-            return _derived(r.mechanism, r.program, r.context.guess, None, values)
+        if not affirmed(self, values):
+            require_positive(r.mechanism, replace(r.points, values=values))
+            if not (holds(r, values) and self._constant_pivots_hold(values) and self._dropped_hold(values)):
+                self._store.require_unchanged()
+                return _derived(r.mechanism, r.program, r.context.guess, None, values)
         return Model(r, self._store, values, require_smooth(r.switches, values, r.smoothness), self._functions)
 
     def _constant_pivots_hold(self, values):

@@ -13,7 +13,8 @@ from servoctl.jets.tape import Tape
 
 MOST_BRANCHES = 24  # affine pieces that are followed through one operation
 SCAN = 801  # instants of a scan for switches that are not affine in t
-BISECTIONS = 60  # halvings of an interval of the scan: all digits of a double
+PARTS, DIVISIONS = 1024, 6  # of an interval of the scan, whose signs are evaluated at once: all digits of a double
+KNOWN = 8  # sets of numbers whose knots are remembered
 SAME_INSTANT = 1e-9  # switches closer than this fraction of the time from first to last are one
 NEAR_ZERO = 0.5  # of the values beside it: a parabola's least value below this is looked at closely
 WIDE, NARROW = 1e-4, 1e-7  # distances of far and close series from an instant, relative to its neighbourhood
@@ -47,21 +48,60 @@ class Switches:
     ----------
     q : Coordinates
     residuals : dict of str to SX
+        Those without such switches are left out.
     parameters : tuple of SX
     timed : list of (int, int or None), optional
         Sides of the switches, as nodes of the tape; they are searched by default.
     """
 
     def __init__(self, q, residuals, parameters, timed=None):
-        self.q, self.residuals, self._arguments = q, residuals, (q, residuals, parameters)
-        self.symbols = ca.symvar(ca.vertcat(*residuals.values()))
+        self.q, self._symbols, self._known = q, parameters, {}
         self.parameters = [p.element_hash() for p in parameters]
+        self._read(residuals)
         self.timed = timed
         if timed is None:
             self.timed = self._timed() if any(s.element_hash() == q.t.element_hash() for s in self.symbols) else []
+            self._read({name: residuals[name] for name in self._switching()})
+            self.timed = self._timed() if self.timed else []
 
     def __reduce__(self):
-        return Switches, (*self._arguments, self.timed)
+        return Switches, (self.q, self.residuals, self._symbols, self.timed)
+
+    def _read(self, residuals):
+        self.residuals, self.symbols = residuals, ca.symvar(ca.vertcat(ca.SX(0, 1), *residuals.values()))
+        self.__dict__.pop("tape", None)
+
+    def _switching(self):
+        """Names of the residuals that contain a switch in t."""
+        if not self.timed:
+            return []
+        sides, reached = set(self.timed), []
+        for _, args, _ in self.tape.nodes:
+            switch = args and (args[0], args[1] if len(args) > 1 else None) in sides
+            reached.append(bool(switch) or any(reached[a] for a in args))
+        return [name for name, node in zip(self.residuals, self.tape.outputs, strict=True) if reached[node]]
+
+    @cached_property
+    def _numbers(self):
+        """Indices of the parameters on which the residuals depend."""
+        return [self.parameters.index(h) for h in (s.element_hash() for s in self.symbols) if h in self.parameters]
+
+    def knots(self, values, needs, span=None):
+        """The switching instants and the classes there; see `times` and `classes`.
+
+        Those of the last few numbers in the residuals are known.
+        """
+        key = *values[self._numbers].tolist(), frozenset(needs.items())
+        for known in ((*key, "any span"), (*key, span)):
+            if known in self._known:
+                return self._known[known]
+        instants, others = self._affine(values)
+        times = self._times(values, instants, others, span)
+        knots = Knots(tuple(times), self.classes(values, needs, times))
+        self._known[*key, span if others else "any span"] = knots
+        if len(self._known) > KNOWN:
+            self._known.pop(next(iter(self._known)), None)
+        return knots
 
     @cached_property
     def tape(self):
@@ -92,10 +132,12 @@ class Switches:
         span : (t0, t1), optional
             A span that is scanned for switches that are not affine in t.
         """
-        if not self.timed:
-            return []
+        return self._times(values, *self._affine(values), span)
+
+    def _affine(self, values):
+        """Instants of switches whose sides are affine in t (a set), and the sides of the others (a list)."""
         pieces = []
-        for node in self.tape.nodes:
+        for node in self.tape.nodes if self.timed else ():
             pieces.append(self._pieces(node, pieces, values))
         instants, others = set(), []
         for a, b in self.timed:
@@ -104,6 +146,10 @@ class Switches:
                 others.append((a, b))
                 continue
             instants |= {(d0 - c0) / (c1 - d1) for c0, c1 in first for d0, d1 in second if c1 != d1}
+        return instants, others
+
+    def _times(self, values, instants, others, span):
+        """Instants of all switches, ascending: affine ones, and others within these and a span."""
         window = [*instants, *(span or ())]
         if others and window and max(window) > min(window):
             instants |= self._scan(values, min(window), max(window), others)
@@ -140,7 +186,7 @@ class Switches:
         return result if 0 < len(result) <= MOST_BRANCHES else None
 
     def _scan(self, values, t0, t1, switches):
-        """Instants between t0 and t1 at which switches, the sides of each, change sides, by bisection.
+        """Instants between t0 and t1 at which switches, the sides of each, change sides.
 
         Between three instants a side may change twice: the parabola through them shows where, if it comes near zero.
         """
@@ -153,7 +199,7 @@ class Switches:
         for s, g in enumerate(sides(grid)):
 
             def side(t, s=s):
-                return float(sides(np.array([t]))[s][0])
+                return sides(np.atleast_1d(t))[s]
 
             decided = np.flatnonzero(g != 0)
             instants |= {float(end) for end, value in zip(grid[[0, -1]], g[[0, -1]], strict=True) if value == 0}
@@ -161,8 +207,8 @@ class Switches:
             pairs = [(t[i], t[i + 1], g[i]) for i in np.flatnonzero(g[:-1] * g[1:] < 0)]
             for i in np.flatnonzero(_grazes(t, g)):
                 sign = np.sign(g[i])
-                least = _least(lambda t, f=side, sign=sign: sign * f(t), t[i - 1], t[i + 1])
-                if sign * side(least) < 0:
+                least = _least(lambda t, f=side, sign=sign: float(sign * f(t)[0]), t[i - 1], t[i + 1])
+                if sign * side(least)[0] < 0:
                     pairs += [(t[i - 1], least, g[i - 1]), (least, t[i + 1], -g[i - 1])]
             instants |= {_changes(side, *pair) for pair in pairs}
         return instants
@@ -241,9 +287,10 @@ def _least(function, a, b):
 
 def _changes(side, low, high, first):
     """The instant between low and high at which a side changes its sign, which is that of `first` at low."""
-    for _ in range(BISECTIONS):
-        middle = (low + high) / 2
-        low, high = (middle, high) if side(middle) * first > 0 else (low, middle)
+    for _ in range(DIVISIONS):
+        t = np.linspace(low, high, PARTS + 1)
+        k = 1 + int(np.argmax(np.append(~(side(t[1:-1]) * first > 0), True)))
+        low, high = t[k - 1], t[k]
     return float((low + high) / 2)
 
 
@@ -311,9 +358,8 @@ def require_smooth(switches, values, needs, span=None):
     SpecificationError
         If a path has a lower class at an instant, such as C^2 instead of C^4 at t = 3 s.
     """
-    times = switches.times(values, span)
-    classes = switches.classes(values, needs, times)
-    for name, instants in classes.items():
+    knots = switches.knots(values, needs, span)
+    for name, instants in knots.classes.items():
         when, k = min(instants, key=lambda pair: pair[1])
         if k < needs.get(name, 0):
             what = f"The path in {name!r}" if isinstance(name, str) else str(name).capitalize()
@@ -326,4 +372,4 @@ def require_smooth(switches, values, needs, span=None):
                 has=k,
                 t=when,
             )
-    return Knots(tuple(times), classes)
+    return knots

@@ -109,11 +109,14 @@ class Points:
         residual = np.append(self.residual, other.residual)
         return replace(self, t=np.append(self.t, other.t), z=np.hstack([self.z, other.z]), residual=residual)
 
+    def factorials(self, level):
+        """The derivatives of jets up to a level relative to their normalised Taylor coefficients, (nq + level n,)."""
+        return np.repeat([1.0, *(factorial(k) for k in range(1, level + 1))], [self.q.nq, *level * [self.q.n]])
+
     def at(self, t, jets, values):
         """Other points: at times t (N,), jets (nq + K n, N) and parameters (n_p,)."""
         level = (len(jets) - self.q.nq) // self.q.n
-        factorials = np.repeat([1.0, *(factorial(k) for k in range(1, level + 1))], [self.q.nq, *level * [self.q.n]])
-        z = jets / factorials[:, None].astype(REAL)
+        z = jets / self.factorials(level)[:, None].astype(REAL)
         return replace(self, t=np.asarray(t), z=z, values=values, residual=np.zeros(len(t)))
 
     def take(self, keep):
@@ -158,14 +161,14 @@ def solve(flow, t, z, iterations=GAUSS_NEWTON_STEPS, natural=False):
             break
         start = z[:, active]
         residual, jacobian = flow(t[active], start)
-        scale = _scales(jacobian, start, sizes)
+        scale = gradient_scales(jacobian, start, sizes)
         norm[active] = _norms(residual, scale)
         rough = norm[active] > ROUNDED
         active, start, residual, scale = active[rough], start[:, rough], residual[:, rough], scale[:, rough]
         if not len(active):
             break
         jacobian = jacobian[:, :, rough]
-        step = _least_steps(jacobian, residual, sizes)
+        step = least_steps(jacobian, residual, sizes)
         search = _natural_search if natural else _search
         trial, better = search(flow, t[active], start, step, jacobian if natural else scale, residual)
         active = active[better]
@@ -201,7 +204,7 @@ def _natural_search(flow, t, z, step, jacobian, _):
     damping, trial, open_ = 1.0 / np.maximum(1.0, longest), z.copy(), np.arange(len(t))
     for _ in range(SHORTENINGS):
         trial[:, open_] = z[:, open_] + damping[open_] * step[:, open_]
-        left = _least_steps(jacobian[:, :, open_], flow.residual(t[open_], trial[:, open_]), sizes)
+        left = least_steps(jacobian[:, :, open_], flow.residual(t[open_], trial[:, open_]), sizes)
         open_ = open_[~(np.max(np.abs(left) / (sizes + np.abs(z[:, open_])), axis=0) < longest[open_])]
         if not len(open_):
             break
@@ -221,15 +224,15 @@ def _solve_level(flow, t, z, level, scales, sizes):
     for _ in range((COORDINATE_STEPS if level == 0 else JET_STEPS) if len(rows) else 0):
         residual, slopes = flow.at_level(t, z, level)
         residual, slopes = residual[rows], slopes[rows]
-        step = _least_steps(slopes, residual, sizes)
+        step = least_steps(slopes, residual, sizes)
         longest = np.max(np.abs(step) / (sizes + np.abs(z[columns])), axis=0)
         z[columns] += step / np.maximum(1.0, longest) if level == 0 else step
-        scales[rows] = _scales(slopes, z[columns], sizes)
+        scales[rows] = gradient_scales(slopes, z[columns], sizes)
         if np.all(np.abs(step) <= LEVEL_SOLVED * (sizes + np.abs(z[columns]))):
             break
 
 
-def _scales(jacobian, z, sizes):
+def gradient_scales(jacobian, z, sizes):
     """Size of each residual's gradient times that of the jets, (equations, N)."""
     scale = np.sqrt((jacobian**2 * (sizes + np.abs(z.astype(float))) ** 2).sum(axis=1))
     return np.where(scale > 0, scale, 1.0)
@@ -240,7 +243,7 @@ def _norms(residual, scales):
     return np.where(np.isfinite(norm), norm, np.inf)
 
 
-def _least_steps(jacobian, residual, sizes):
+def least_steps(jacobian, residual, sizes):
     """Steps, least relative to `sizes`, to zeros of the linearised residual, (nz, N); zero where not finite."""
     a = np.moveaxis(jacobian * sizes, 2, 0)
     scale = np.sqrt((a**2).sum(axis=2))

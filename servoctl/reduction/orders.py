@@ -52,6 +52,11 @@ class Orders:
         names, *zeros = zip(*each.values(), strict=True)
         return names, zeros
 
+    @property
+    def vanishing(self):
+        """Slopes, jets, and the expressions that they are slopes of: three sequences of SX."""
+        return self._vanishing[1] if self else ((), (), ())
+
     @cached_property
     def _level(self):
         order = self.points.q.order

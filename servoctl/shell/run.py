@@ -6,7 +6,8 @@ from dataclasses import replace
 import servoctl as sv
 from servoctl.errors import ServoError
 from servoctl.inversion.verdict import HYPERBOLIC_ZEROS, verdict
-from servoctl.methods.choice import as_drift, as_method, default_method
+from servoctl.methods.bounded import Problem
+from servoctl.methods.choice import Bounded, as_drift, as_method, default_method
 from servoctl.methods.runge_kutta import ORDERS
 from servoctl.shell import loop
 from servoctl.shell.folder import FILES, LOOP_FILES, folder_of, summary
@@ -81,28 +82,29 @@ def _compute(args, name, scene, folder):
 
 def _planned(args, motion, report):
     """The motion and its run: the bounded one of unstable internal dynamics, unless a method or settings are given."""
-    options = _options(args, motion)
+    options = _options(args, motion.model, motion.span)
     if used(args, SETTINGS) or verdict(motion.model, motion.start).dynamics != HYPERBOLIC_ZEROS:
         return motion, _simulate(motion, options, report)
     t0, t1 = motion.span
     span = motion.span if args.t_span else (min(t0, *motion.model.knots, t1), max(t0, *motion.model.knots, t1))
     whole = replace(motion, span=span)
     try:
-        return whole, _simulate(whole, _options(args, whole) | {"method": "bounded"}, report)
+        window = Problem(whole.model, span, whole.start.values).window(Bounded().window) if args.samples else span
+        return whole, _simulate(whole, _options(args, whole.model, window) | {"method": "bounded"}, report)
     except ServoError as error:
         report.say(f"There is no bounded motion: {error}")
         return motion, _simulate(motion, options, report)
 
 
-def _options(args, motion):
-    """Arguments of `simulate` from the command line."""
+def _options(args, model, span):
+    """Arguments of `simulate` from the command line, with samples of the span."""
     options = {} if args.accuracy is None else {"accuracy": args.accuracy}
     options |= {} if args.drift in (None, "none") else {"drift": args.drift}
     settings = {name: getattr(args, name) for name in ("step", "rtol", "atol") if getattr(args, name) is not None}
     if args.method or settings:
-        options["method"] = as_method(args.method or default_method(motion.model), **settings)
+        options["method"] = as_method(args.method or default_method(model), **settings)
     if args.samples:
-        (t0, t1), intervals = motion.span, args.samples - 1
+        (t0, t1), intervals = span, args.samples - 1
         options["t_eval"] = [t0 + (t1 - t0) * i / intervals for i in range(intervals)] + [t1]
     return options
 
