@@ -209,13 +209,18 @@ def simulated(model, start, t_span, method=None, *, drift=None, t_eval=None, eve
         if t_eval is not None and isinstance(method, RungeKutta):
             run = _resample(run, times)
     if pressed and run.status == 0:
-        run = replace(run, success=False, status=1, message=f"{run.message}; interrupted at its end")
+        run = _interrupted_at_its_end(run)
     if motion.stop is not None:
         motion.stop.run = run
         raise motion.stop
     if run.success and not model.flat:
         _warn_drifted(run)
     return run
+
+
+def _interrupted_at_its_end(run):
+    """A run that is complete, though Ctrl-C came while it was put together or judged."""
+    return replace(run, success=False, status=1, message=f"{run.message}; interrupted at its end")
 
 
 def _warn_drifted(run):
@@ -250,11 +255,16 @@ def judged(run, tolerance=STEP_ERROR, again=None):
     -------
     Run
     """
-    interrupted = not run.success
-    if interrupted or growth_bound(run.model, run) <= UNSTABLE:
-        return replace(run, verdict=partial(_verdict, tolerance=tolerance))
-    run = run if again is None else again()
-    internal = internal_dynamics(run.model, run)
+    known = replace(run, verdict=partial(_verdict, tolerance=tolerance))
+    try:
+        if not run.success or growth_bound(run.model, run) <= UNSTABLE:
+            return known
+        run = run if again is None else again()
+        internal = internal_dynamics(run.model, run) if run.success else None
+    except KeyboardInterrupt:
+        return _interrupted_at_its_end(known)
+    if internal is None:  # interrupted while it was computed with more samples
+        return _interrupted_at_its_end(known)
     if internal.verdict == "unstable":
         warn_unstable(internal.sentence(tolerance))
     return replace(run, verdict=internal.facts(tolerance))
@@ -336,7 +346,7 @@ def _motion(model, method, drift, problem, bar, atol=None):
 def _with_events(motion, events):
     """The motion with the occurrences of its events up to its end."""
     if events is not None and motion.pieces:
-        motion.occurrences = events.until(motion.pieces[-1][1][-1])
+        motion.occurrences = events.until(motion.t[-1])
     return motion
 
 
@@ -364,16 +374,17 @@ def _smaller_tolerances(model, method, motion):
         return None
     if isinstance(method, RadauIIA) and method.step is not None:
         return None
-    t, jets, _ = motion.samples()
-    x = jets[: len(model.state_names), np.all(np.isfinite(jets), axis=0)]
-    return absolute_tolerances(model, t, x, method.rtol) if x.shape[1] > 1 else None
+    finite = np.all(np.isfinite(motion.jets), axis=0)
+    x = motion.jets[: len(model.state_names)]
+    x = x if finite.all() else x[:, finite]
+    return absolute_tolerances(model, motion.t, x, method.rtol) if x.shape[1] > 1 else None
 
 
 def _run(model, motion, method, drift, knots, span):
     """The run of a motion, to its end or its stop."""
     if not motion.pieces:  # interrupted or stopped before the first sample
         motion.add(model, [span[0]], span[1][:, None], np.full((model.n, 1), np.nan))
-    t, jets, variants = motion.samples()
+    t, jets = motion.t, motion.jets
     last = f"t = {t[-1]:.7g} s"
     if motion.stop is not None:
         status, message = -1, f"stopped: {str(motion.stop).split('. ')[0]}"
@@ -385,10 +396,26 @@ def _run(model, motion, method, drift, knots, span):
         status, message = 0, f"finished; {motion.note}" if motion.note else "finished"
     facts = {"method": str(method), "drift": str(drift or ""), "counters": motion.counters}
     facts["knots"] = tuple(sorted({*knots, *motion.switches}))
+    facts["variants"] = tuple(motion.variants())
+    if isinstance(method, Taylor):
+        _set_at_knots(t, jets, facts["variants"], knots)
     facts["events"] = occurrences(motion.occurrences, model.names_to)
     facts |= {"success": status == 0 or bool(motion.ended), "status": status, "message": message}
-    facts["variants"] = tuple(variants)
     return Run(t, jets, model.names_to(len(jets)), model, **facts)
+
+
+def _set_at_knots(t, jets, variants, knots):
+    """Derivatives at knots by the equations at that instant: those of a series are of the side that it comes from."""
+    knots = np.asarray(knots, dtype=float)
+    for first, end, model in variants:
+        near = np.abs(t[first:end, None] - knots) <= SAME_TIME * np.maximum(1.0, np.abs(knots))
+        at = first + np.flatnonzero(near.any(axis=1))
+        if len(at):
+            n_x, top = len(model.state_names), len(model.jet_names)
+            rates = model.function("ode").grid(t[at], jets[:n_x, at], model.parameters)
+            jets[n_x:top, at] = rates[n_x - model.n : n_x]
+            if len(jets) > top:
+                jets[:, at] = model.extended(t[at], jets[:top, at], len(jets))
 
 
 def _resample(run, times):

@@ -74,6 +74,31 @@ def test_a_computed_motion_is_kept_when_interrupted_at_its_end(wheel_model, meth
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
 
+@pytest.mark.parametrize("while_", ["growth_bound", "internal_dynamics", "_interrupted motion"])
+def test_a_motion_is_kept_when_its_growth_is_judged(wheel_model, while_, ctrl_c, monkeypatch):
+    model, start = wheel_model
+    compute, calls = simulation._motion, []
+
+    def interrupt(*_):
+        signal.raise_signal(signal.SIGINT)
+
+    def interrupted(*given):  # the second, with more samples
+        motion = compute(*given)
+        calls.append(motion)
+        motion.interrupted = len(calls) == 2
+        return motion
+
+    if while_ == "_interrupted motion":
+        monkeypatch.setattr(simulation, "_motion", interrupted)
+    else:
+        monkeypatch.setattr(simulation, while_, interrupt)
+    monkeypatch.setattr(simulation, "UNSTABLE", 0.0)
+    ctrl_c(60.0)
+    run = sv.simulate(model, start, (0.0, 1.0), t_eval=[0.0, 0.5, 1.0])
+    assert (run.status, run.success) == (1, False) and "interrupted at its end" in run.message
+    assert run.t.tolist() == [0.0, 0.5, 1.0] and sv.internal_dynamics(model, run) is not None
+
+
 @pytest.mark.parametrize(
     "substeps, span", [(1000, (0.0, 100.0)), (10**8, (0.0, 0.02))], ids=["many samples", "long samples"]
 )

@@ -249,6 +249,60 @@ def test_an_unstable_program_that_never_rests_gets_a_plan_that_does_not_grow(k, 
     assert np.abs(run.residual["X"]).max() < 1e-3 and sv.verify(run.model, run).passed
 
 
+@pytest.mark.parametrize("k", [4.0, 2500.0])
+@pytest.mark.parametrize("start", [{}, {"y": 0.3}])
+def test_a_plan_that_begins_in_motion_begins_on_its_bounded_motion(k, start, recwarn):
+    """y'' = k y + x from values off it: y = -sin t/(k + 1) + c e^(-√k t), where √k y + y' leaves only c."""
+    mechanism, _ = beside(lambda x, y, v: k * y + x)
+    program = sv.Program({"X": [*mechanism.q][0] - ca.sin(mechanism.q.t)})
+    run = sv.inverse(mechanism, program, (0.0, 6.0), start=start)
+    assert "begins on its bounded motion" in run.message and not recwarn.list
+    assert np.sqrt(k) * run["y"][0] + run["dy"][0] == pytest.approx(-1 / (k + 1), abs=1e-5 / k)
+    c = (np.sqrt(k) * start.get("y", 0.0) - 1 / (k + 1)) / (2 * np.sqrt(k))  # √k y - dy is that of the start
+    early = run.t < 6.0 - 8 / np.sqrt(k)
+    exact = -np.sin(run.t) / (k + 1) + c * np.exp(-np.sqrt(k) * run.t)
+    assert run["y"][early] == pytest.approx(exact[early], abs=1e-3 / k)
+    assert np.abs(run.residual["X"]).max() < 1e-3 and sv.verify(run.model, run).passed
+
+
+def sway():
+    """An upright pole of 0.2 kg and 0.5 m on a cart of 1 kg that sways by 0.3 m."""
+    q = sv.coordinates("x a")
+    x, a = q
+    S = sv.particle(q, 1.0, (x, 0)) + sv.particle(q, 0.2, (x + 0.5 * ca.sin(a), 0.5 * ca.cos(a)))
+    mechanism = sv.Mechanism(q, gibbs=S, potential=0.2 * 9.81 * 0.5 * ca.cos(a), actuators={"F": x})
+    return mechanism, sv.Program({"x": x - 0.3 * ca.sin(2 * q.t)})
+
+
+def test_an_upright_pole_leans_from_the_first_instant_of_a_sway(recwarn):
+    """0.5 a'' = g sin a + 1.2 sin 2t cos a: a = -A sin 2t + O(A³) with A = 1.2/(g + 2)."""
+    mechanism, program = sway()
+    run = sv.inverse(mechanism, program, (0.0, 6.0))
+    late = (run.t > 2.0) & (run.t < 4.0)
+    assert run["a"][late] == pytest.approx(-1.2 / 11.81 * np.sin(2 * run.t[late]), abs=2e-3)
+    assert np.abs(run.residual["x"]).max() < 1e-3 * 0.6 and np.abs(run["F"]).max() < 1.5
+    assert not recwarn.list and sv.verify(run.model, run).passed
+
+
+def test_an_upright_pole_that_falls_along_a_forward_plan_has_a_relaxed_one(recwarn):
+    """At a speed of 1 + 0.2 sin 3t m/s: 0.5 a'' = g sin a - 0.6 cos 3t cos a, |a| about 0.6/(g + 4.5)."""
+    mechanism, _ = sway()
+    program = sv.Program({"v": mechanism.q.d(1)[0] - 1 - 0.2 * ca.sin(3 * mechanism.q.t)})
+    forward = sv.inverse(mechanism, program, (0.0, 6.0), start={"dx": 1.0})
+    assert "errors grow by at most" in forward.message
+    run = sv.inverse(mechanism, program, (0.0, 6.0), start={"dx": 1.0}, method="relaxed")
+    assert np.abs(run["a"][run.t > 2.0]).max() == pytest.approx(0.6 / 14.31, rel=0.02) and "begins on" in run.message
+    assert np.abs(run.residual["v"]).max() < 1e-3 * 0.4 and not recwarn.list
+
+
+def test_a_state_from_which_a_plan_begins_is_kept():
+    mechanism, program = sway()
+    start = sv.derive(mechanism, program).start(a=0.0, da=0.0)
+    with warned("misses x by", "bounded motion"):
+        run = sv.inverse(mechanism, program, (0.0, 6.0), start=start)
+    assert [run["a"][0], run["da"][0]] == [0.0, 0.0] and "begins on" not in run.message
+
+
 def test_an_unstable_program_without_a_plan_names_its_verdict(monkeypatch):
     monkeypatch.setitem(IPOPT, "max_wall_time", 1e-3)
     mechanism, _ = beside(lambda x, y, v: 25 * y + x)

@@ -151,6 +151,31 @@ def test_a_chart_has_the_exact_jacobian():
     assert chart.jacobian(0.0, x) == pytest.approx(np.array(columns).T, abs=1e-7)
 
 
+@pytest.mark.filterwarnings("error::RuntimeWarning")
+@pytest.mark.parametrize("bad", ["none", "beyond", "nan", "singular"])
+def test_states_are_solved_together_as_one_by_one(bad):
+    """x² + y² = 1 has no state with x beyond 1; where x = y = 0 the matrix to be solved is singular."""
+    model = pendulum()
+    start = model.start(x=0.6, y=-0.8, guess={"dx": 2.0}).values
+    chart = Chart(model, Sizes(model), 0.0, start)
+    y, near = np.outer(start[chart.free], np.linspace(-1.2, 1.2, 9)), np.repeat(start[:, None], 9, axis=1)
+    y[0, 4], near[:, 4] = {
+        "none": (0.3, start), "beyond": (1.5, start), "nan": (0.3, np.nan), "singular": (0.3, 0.0)
+    }[bad]  # fmt: skip
+    together = chart.lift_all(np.zeros(9), y, near)
+    each = np.column_stack([chart.lift(0.0, y[:, i], near[:, i]) for i in range(9)])
+    assert np.isnan(together).any(axis=0).tolist() == [i == 4 and bad != "none" for i in range(9)]
+    assert together == pytest.approx(each, abs=1e-14, nan_ok=True)
+
+
+def test_samples_and_inspected_instants_cost_no_solve_each(wheel, monkeypatch):
+    model, start = wheel
+    lift, calls = Chart.lift, []
+    monkeypatch.setattr(Chart, "lift", lambda self, *given: calls.append(given[0]) or lift(self, *given))
+    run = sv.simulate(model, start, (0.0, 2.0), "DOP853", drift="minimal")
+    assert len(run.t) > 1000 and len(calls) <= run.counters["nfev"] + 3 * run.counters["steps"]
+
+
 def test_time_runs_backwards(wheel):
     model, start = wheel
     there = sv.simulate(model, start, (0.0, 2.0), sv.Adaptive(**PRECISE), drift="minimal")

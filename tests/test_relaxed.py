@@ -440,6 +440,18 @@ def test_refusals(crane):
         sv.relaxed(plant.mechanism, program, span, weight=1e-8)
 
 
+def test_a_program_of_other_coordinates_is_refused(crane):
+    with refused(SpecificationError, name="x"):
+        sv.relaxed(crane[0], fixed_rope_crane()[1], (0.0, 6.0))
+
+
+def test_a_span_that_ends_within_a_path_that_is_singular_at_rest(crane):
+    """The linearisation at the end is not finite; a plan has an open end."""
+    run = sv.relaxed(*crane, (0.0, 3.0), weight=1e-9, end="bounded")
+    assert sv.verify(run.model, run).passed
+    assert np.abs(run.residual["X"][0][run.t < 2.5]).max() < 1e-3  # a layer follows at the open end
+
+
 @pytest.mark.parametrize("start, fact", [
     ({"x": 0.0, "theta": 0.1, "dx": 0.0, "dtheta": 0.0}, "d2theta"),
     ({"x": 0.0, "theta": 0.0, "dx": 0.3, "dtheta": 0.0}, "dx = 0.3"),

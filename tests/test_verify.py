@@ -105,6 +105,34 @@ def nearly(q):
     return {"a": row, "b": 0.7 * row + 1e-3 * (y - 0.3 * ca.cos(q.t))}
 
 
+def leaning(lean, by="actuators", order=0):
+    """A point on a weightless rod: the mass matrix is singular where the rod is upright, the program leaves no doubt."""
+    q = sv.coordinates("y lean")
+    y, b = q
+    gibbs = sv.particle(q, 80.0, (y + ca.sin(b), ca.cos(b)))
+    mechanism = sv.Mechanism(q, gibbs=gibbs, potential=785.0 * ca.cos(b), actuators={"side": y})
+    program = sv.Program({"y": q.dt(y - 0.1 * ca.sin(2 * q.t), order)}, by=by)
+    model = sv.derive(mechanism, program)
+    free = {"y": 0.0, "dy": 0.2, "d2y": 0.0} if order else {}
+    return model, model.start(lean=lean, dlean=0.02, **free), (0.0, 0.2)
+
+
+def dependent(share, by):
+    """Rows that differ by a share of their size; ideal reactions and redundant inputs are then sums of large terms."""
+    q = sv.coordinates("x y z")
+    x, y, z = q
+    wave = ca.sin(x) if by == "ideal" else 0.0
+    path = x - 0.3 * ca.sin(q.t) - 0.2 * wave * z, y - 0.2 * ca.cos(z) - 0.1 * q.t, z - 0.3 * ca.sin(x) + 0.4 * ca.sin(q.t)
+    gibbs = ca.sumsqr(ca.vertcat(*q.d(2))) / 2 + sv.particle(q, 0.7, (0.4 * x + ca.sin(y) - 0.3 * z,))
+    motors = {} if by == "ideal" else {"actuators": {"u": x, "v": y, "w": y + 0.3 * ca.sin(z)}}
+    mechanism = sv.Mechanism(q, gibbs=gibbs, potential=0.8 * x * y + 0.5 * z**2, **motors)
+    rows = {"a": path[0], "b": 0.7 * path[0] + share * path[1]}
+    rows |= {"c": -0.2 * path[1] + share * path[2]} if by == "ideal" else {}
+    model = sv.derive(mechanism, sv.Program(rows, by=by))
+    free = {} if by == "ideal" else {"z": 0.2, "dz": 0.3}
+    return model, model.start(guess=free), (0.0, 1.0)
+
+
 RIGHT = {
     "rod": (rod, None),
     "rod, Taylor": (rod, "Taylor"),
@@ -116,7 +144,11 @@ RIGHT = {
     "ropes": (lambda: ropes(4e6), None),
     "stiffer ropes": (lambda: ropes(4e8), None),
     "stiff spring": (lambda: chain(1e10), None),
+    "upright rod": (lambda: leaning(0.0), None),
+    "almost upright rod, ideal": (lambda: leaning(1e-8, "ideal"), None),
     "nearly dependent": (lambda: chain(by="ideal", program=nearly), None),
+    "nearly dependent, twice": (lambda: dependent(1e-5, "ideal"), None),
+    "nearly dependent, redundant": (lambda: dependent(1e-9, "actuators"), None),
 }
 
 
@@ -126,6 +158,28 @@ def test_what_is_right_passes(name):
     model, start, span = build()
     proof = sv.verify(model, sv.simulate(model, start, span, method))
     assert proof.verdict == "passed" and proof.passed, proof
+
+
+@pytest.mark.parametrize("share, by", [(1e-5, "ideal"), (1e-9, "actuators")])
+def test_rounding_of_nearly_dependent_rows_excuses_no_other_force(share, by):
+    model, start, span = dependent(share, by)
+    run = sv.simulate(model, start, span)
+    names, forces = run.signals("reaction" if model.ideal else "actuation")
+    for name, force in zip(names, forces, strict=True):
+        stored = {name: force + 5e-6 * np.abs(forces).max()}
+        assert "acceleration" in sv.verify(model, replace(run, stored=stored)).failures
+
+
+@pytest.mark.parametrize("eps", [0.1, 1e-3])
+def test_a_pivot_may_vanish_at_an_instant_of_the_checks(eps):
+    """The row's leading entry x − 20 vanishes at 2.375 s, where the other one, eps, keeps the rank."""
+    q = sv.coordinates("x y z")
+    (x, *_), (_, dy, dz) = q, q.d(1)
+    mechanism = sv.Mechanism(q, gibbs=ca.sumsqr(ca.vertcat(*q.d(2))) / 2)
+    model = sv.derive(mechanism, sv.Program({"p": (x - 20.0) * dy + eps * dz - ca.cos(q.t)}, by="ideal"))
+    start = model.start(x=1.0, y=0.0, z=0.0, dx=8.0, dz=0.3)
+    run = sv.simulate(model, start, (0.0, 3.0), "DOP853", t_eval=[0.0, 2.3, 2.37, 2.38, 3.0])
+    assert sv.verify(model, run).passed
 
 
 @pytest.mark.parametrize("samples", [2, 3, 11, 2001])
@@ -218,6 +272,22 @@ def test_samples_that_are_no_numbers_fail(which, plan):
     assert proof.failures == ("samples",) and proof.numbers["samples"] >= 1
 
 
+def test_what_neither_inputs_nor_multipliers_determine_is_inconclusive():
+    model, start, span = leaning(0.0, order=3)
+    proof = sv.verify(model, sv.simulate(model, start, span))
+    assert proof.verdict == "inconclusive" and len(proof.doubts) == 1
+
+
+@pytest.mark.filterwarnings("ignore:Internal dynamics unstable")
+@pytest.mark.parametrize("jet", ["lean", "d2y", "d2lean"])
+@pytest.mark.parametrize("lean", [0.0, 1e-8])
+def test_wrong_motions_of_a_singular_mechanism_fail(lean, jet):
+    model, start, span = leaning(lean)
+    run = sv.simulate(model, start, span)
+    wrong = scaled(run.jets, model.jet_names.index(jet))
+    assert "acceleration" in sv.verify(model, edited(run, jets=wrong)).failures
+
+
 @pytest.mark.parametrize("name", ["trolley", "hoist", "energy"])
 @pytest.mark.parametrize("which", [slice(None), 100])
 def test_changed_forces_fail(name, which, plan):
@@ -276,7 +346,7 @@ def rubbed(friction=2.0):
     (x, y), (_, dy), (ddx, ddy) = q, q.d(1), q.d(2)
     forces = {"y": -9 * y - friction * ca.sign(dy)}
     mechanism = sv.Mechanism(q, gibbs=(ddx**2 + ddy**2) / 2, actuators={"F": x}, forces=forces)
-    model = sv.derive(mechanism, sv.Program({"x": x - ca.sin(q.t)}))
+    model = sv.derive(mechanism, sv.Program({"x": x - ca.sin(q.t)}), keep=["y"])
     return model, model.start(y=2.0, dy=0.0), (0.0, 2.8)
 
 

@@ -18,7 +18,7 @@ from servoctl.errors import (
 )
 from servoctl.inversion.relaxed import relaxed
 from servoctl.inversion.report import extremes
-from servoctl.inversion.transfer import rest_near
+from servoctl.inversion.transfer import Near, rest_near
 from servoctl.inversion.verdict import (
     FLAT,
     GROWS,
@@ -27,6 +27,7 @@ from servoctl.inversion.verdict import (
     MINIMUM,
     OPEN,
     SINGULAR,
+    UNDETERMINED,
     Verdict,
     verdict,
 )
@@ -73,7 +74,8 @@ def inverse(
     t_span : (t0, t1)
         [s]; the bounded motion begins before and ends after it.
     start : State or dict of str to float, optional
-        A state of the model, or values near the start by name. Default: near zero. Motions that may begin at rest do.
+        A state of the model, or values near the start by name. Default: near zero. Motions that may begin at rest do;
+        relaxed plans that begin in motion begin on their bounded motion, near values by name.
     method : Method or str, optional
         A method of `simulate`, or "relaxed", instead of the one that the verdict chooses; where it is another one, a
         warning says what speaks against it.
@@ -182,12 +184,13 @@ class Request:
     def relaxed(self, why, begin=None, moving=False):
         """The run of the relaxed inverse: from rest to rest, and with open ends where the program moves.
 
-        `moving` says that it begins in motion, with the state `begin`.
+        `moving` says that it begins in motion, with the state `begin`, or near it where values by name were given.
         """
         swings = isinstance(why, Verdict) and why.dynamics == GROWS and why.swings
         tries = [({}, ""), ({"end": "bounded"}, END_MOVES)] if not swings else [({"end": "bounded"}, END_SWINGS)]
         tries = [] if moving else [({"start": self.start} | ends, note) for ends, note in tries]
-        tries += [({"start": begin, "end": "bounded"}, END_MOVES)] if begin is not None else []
+        near = begin if isinstance(self.start, State) else Near(begin)
+        tries += [({"start": near, "end": "bounded"}, END_MOVES)] if begin is not None else []
         for k, (ends, note) in enumerate(tries):
             try:
                 run = self._planned(**ends)
@@ -204,12 +207,14 @@ class Request:
     def _planned(self, start, **end):
         """The relaxed plan; from the rest near values of coordinates, where there is none with exactly these."""
         limits, bounds = self.ranges
-        full = plant(self.mechanism)
+        full, q = plant(self.mechanism), self.mechanism.q
+        if isinstance(start, Mapping) and not {*full.state_names} <= {*start}:
+            start = {name: value for name, value in start.items() if name in q.names}  # a rest is near these
         options = {"weight": self.weight, "limits": limits, "bounds": bounds, **end}
         try:
             return relaxed(full, self.program, self.span, start=start, **options)
         except InconsistentStart:
-            values = isinstance(start, Mapping) and {*start} <= {*self.mechanism.q.names}
+            values = isinstance(start, Mapping) and {*start} <= {*q.names}
             near = rest_near(full, self.program, self.span[0], start) if values else None
             if near is None:
                 raise
@@ -280,7 +285,7 @@ def _by_hand(request, model, begin, found, chosen, method):
             stacklevel=3,
         )
     if method == RELAXED:
-        return request.relaxed(found)
+        return request.relaxed(found, begin)
     run = request.exact(model, begin, found, method)
     excess = _excess(run, {**request.ranges[0], **request.ranges[1]})
     if excess:
@@ -301,7 +306,10 @@ def _excess(run, ranges):
 def _with_reason(run, why, note=""):
     """The run, whose message says which inverse it is and why."""
     kind = {"algebraic": "instant by instant", "bounded": "bounded", RELAXED: "relaxed"}.get(run.method, "forward")
-    reason = f"the program is {why.word} ({why.reason})" if isinstance(why, Verdict) else why
+    reason = why
+    if isinstance(why, Verdict):
+        grown = "" if why.rest or why.word == UNDETERMINED or not why.growth else f"; {why.growth}"
+        reason = f"the program is {why.word} ({why.reason}{grown})"
     if kind == "forward" and isinstance(why, Verdict) and why.dynamics == MARGINAL and "end" in why.rest:
         note += _swinging(run)
     return replace(run, message=f"{run.message}; inverse: {kind}, as {reason}{note}")

@@ -274,6 +274,8 @@ def minimum_phase(model: Model, parameter: str, values, at: State | None = None)
         equilibrium.
     NotRealisable
         If the residuals determine no motion at the equilibrium, for any value.
+    SpecificationError
+        For a parameter of nothing but coordinates that the model leaves out.
 
     Notes
     -----
@@ -284,6 +286,7 @@ def minimum_phase(model: Model, parameter: str, values, at: State | None = None)
     named(parameter, list(model.numbers), "parameter")
     ends = [finite(parameter, end, "range") for end in interval(parameter, values, "range")]
     _require_program(model)
+    _require_part(model, parameter)
     at = model.start() if at is None else require_kind(State, "at", at, "model.start(...)")
     polynomial, grid = ZeroPolynomial(model, parameter, at), np.linspace(*ends, VALUES)
     _require_linearisation(model, at)
@@ -304,6 +307,21 @@ def _require_program(model):
             "Outputs are redefined where actuators realise a program.",
             do='Write sv.Program(..., by="actuators").',
             by=model.reduction.program.by,
+        )
+
+
+def _require_part(model, parameter):
+    """Refuse a parameter of nothing but coordinates that were left out."""
+    mechanism, names = model.reduction.mechanism, ", ".join(model.left_out)
+    symbol = dict(zip(mechanism.parameters.names, mechanism.parameters.symbols, strict=True))[parameter]
+    rows = (*model.reduction.program.residuals.values(), *mechanism.constraints.values())
+    if names and not ca.depends_on(ca.vertcat(mechanism.balance, ca.vec(mechanism.E), *rows), symbol):
+        raise SpecificationError(
+            f"The model was derived without {names}, and nothing that is left depends on {parameter}.",
+            "Coordinates that nothing couples to the program are left out, and their stability is not judged.",
+            do=f"Write sv.derive(mechanism, program, keep={list(model.left_out)}).",
+            parameter=parameter,
+            left_out=model.left_out,
         )
 
 

@@ -39,6 +39,7 @@ from servoctl.plants.driven import at_once, driven
 from servoctl.plants.plant import Plant, part_of
 from servoctl.reduction.idle import names_of, needed
 from servoctl.reduction.knots import Switches
+from servoctl.reduction.reduce import require_parts
 from servoctl.run import Run
 from servoctl.spec.paths import piecewise
 from servoctl.spec.program import Program
@@ -120,6 +121,7 @@ def relaxed(
     """
     require_kind(Plant, "plant", plant, "sv.plant(mechanism)")
     require_kind(Program, "program", program, "sv.Program({...})")
+    require_parts(plant.mechanism, program, {})
     named = [name for given in (start, end, limits, plant.limits, bounds) for name in names_of(given)]
     plant = part_of(plant, needed(plant.mechanism, program, named=named))
     limits = _all_limits(plant, limits)
@@ -275,7 +277,7 @@ class Relaxation(Transfer):
 
     def _solved(self, plan, weights, iterations=()):
         """The plan of the last of falling weights, each solved from the one before."""
-        nlp = Transcription(self.node, plan.mesh, plan.pieces, self.sizes, self.target[2])
+        nlp = Transcription(self.node, plan.mesh, plan.pieces, self.sizes, self.opening, self.target[2])
         bounds, w, multipliers, iterations = self._sides(nlp), nlp.joined(plan.x, plan.points), None, list(iterations)
         for beta in weights:
             w, multipliers, stats = nlp.solve(w, beta, bounds, None if self.bounds else multipliers)
@@ -288,7 +290,8 @@ class Relaxation(Transfer):
         """Bounds of the variables and of the constraints by kind."""
         K, P = 1 + nlp.count, 1 + len(nlp.pieces.nodes)
         x = np.repeat([[-np.inf], [np.inf]], self.n * K, axis=1).reshape(2, self.n, K)
-        x[:, :, 0] = self.begin
+        if self.opening is None:
+            x[:, :, 0] = self.begin
         fixed = np.isfinite(self.target[0])
         x[:, fixed, -1] = self.target[0][fixed]
         u = np.repeat([[-np.inf], [np.inf]], self.m * P, axis=1).reshape(2, self.m, P)
@@ -304,9 +307,9 @@ class Relaxation(Transfer):
                 u[:, i, -1] = self.target[1][i] if self.target[1] is not None and not self.target[2] else u[:, i, -1]
         bounded = np.array([*self.bounds.values()]).reshape(-1, 2).T[:, :, None] / self.sizes[2][:, None]
         bounded = bounded.repeat(len(nlp.watched), axis=2)
-        rest = np.zeros((2, 0 if self.target[2] is None else self.target[2].numel_out(0), 1))
+        start, rest = (np.zeros((2, f.numel_out(0) if f else 0, 1)) for f in (self.opening, self.target[2]))
         motion = np.zeros((2, self.n, K - 1))
-        limits = {"motion": motion, "begin": jump, "slope": slopes, "bound": bounded, "rest": rest}
+        limits = {"motion": motion, "begin": jump, "slope": slopes, "bound": bounded, "start": start, "rest": rest}
         return nlp.joined(x[0], u[0]), nlp.joined(x[1], u[1]), limits
 
     def _useless(self, beta, usual):
@@ -374,8 +377,9 @@ class Relaxation(Transfer):
             "bound": (self.node.bounds, nlp.watched, self.sizes[2]),
         }
         values, limits = nlp.constraints(w), bounds[2]
-        count = len(values["rest"])
-        rows["rest"] = (["the condition at the end"] * count, mesh.edges[-1:], np.ones(count))
+        for kind, where, at in (("start", "start", mesh.edges[:1]), ("rest", "end", mesh.edges[-1:])):
+            count = len(values[kind])
+            rows[kind] = ([f"the condition at the {where}"] * count, at, np.ones(count))
         for kind, (names, at, size) in rows.items():
             yield names, at, size, values[kind], *limits[kind]
 
@@ -420,7 +424,8 @@ class Relaxation(Transfer):
             start=State(float(t[0]), x[:, 0].copy(), tuple(model.state_names), (), (), 0.0),
         )  # fmt: skip
         missed = ", ".join(f"{name} {np.abs(run.residual[name]).max():.2g}" for name in self.program.names)
-        return replace(run, message=f"finished; the program is missed by at most {missed}{self._exceeded(run)}")
+        begins = "" if self.opening is None else "begins on its bounded motion; "
+        return replace(run, message=f"finished; {begins}the program is missed by at most {missed}{self._exceeded(run)}")
 
     def _exceeded(self, run):
         """How far samples between the instants of bounds exceed these, for the message; "" if they do not."""

@@ -183,7 +183,7 @@ class Transcription:
     Unknowns are states at the start and all nodes (n_x, 1 + N s) and control points of the inputs (m, 1 + P s), each in
     units of its size. Constraints by kind: "motion" (n_x, N s), collocation; "begin" (m, 1), the highest coefficient of
     the inputs on the first interval, whose begin is no node; "slope" (m, P s), control points of u'; "bound" (b, P w);
-    "rest" (r, 1).
+    "start" and "rest" (r, 1).
 
     Parameters
     ----------
@@ -193,12 +193,12 @@ class Transcription:
     pieces : Mesh
         Of the inputs, P intervals, each of one or several of the states'.
     sizes : (x, u, bounded, effort) of (n_x,), (m,), (b,) arrays and float
-    rest : Function, optional
-        Of (t, x, v): what vanishes at the end.
+    start, rest : Function, optional
+        What vanishes at the start, of (t, x), and at the end, of (t, x, v).
     """
 
-    def __init__(self, node, mesh, pieces, sizes, rest=None):
-        self.node, self.mesh, self.pieces, self.sizes, self.rest = node, mesh, pieces, sizes, rest
+    def __init__(self, node, mesh, pieces, sizes, start=None, rest=None):
+        self.node, self.mesh, self.pieces, self.sizes, self.start, self.rest = node, mesh, pieces, sizes, start, rest
         self.n, self.m, self.count = len(sizes[0]), len(sizes[1]), len(mesh.nodes)
 
     @cached_property
@@ -230,6 +230,7 @@ class Transcription:
             "begin": points[:, : s + 1] @ highest / ca.DM(self.sizes[1]),
             "slope": points @ _matrix(_slopes(self.pieces)) / ca.DM(self.sizes[1]),
             "bound": self._bounded(x, points),
+            "start": self.start(mesh.edges[0], x[:, 0]) if self.start else ca.MX(0, 1),
             "rest": self.rest(mesh.edges[-1], x[:, -1], v[:, -1]) if self.rest else ca.MX(0, 1),
         }
         return w, beta, ca.dot(cost, ca.DM(mesh.weights).T) / scale, constraints

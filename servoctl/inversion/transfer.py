@@ -1,6 +1,7 @@
 """What a relaxed plan joins: states and inputs at both ends, and a motion between them, where the iteration begins."""
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from functools import cached_property
 
 import casadi as ca
@@ -21,6 +22,24 @@ GUESS = 241  # instants of the guess
 STANDING = 1e-6  # rate of a program that stands still, relative to its largest
 
 
+@dataclass(frozen=True)
+class Near:
+    """A start in motion whose unstable modes are open, so that the plan begins on its bounded motion.
+
+    Attributes
+    ----------
+    state : State
+        Of the model of the program, near which the plan begins.
+    """
+
+    state: State
+
+    @property
+    def names(self):
+        """Names of the state's entries."""
+        return self.state.names
+
+
 class Transfer:
     """A plant, a program, the limits and bounds of a plan, and its ends.
 
@@ -39,7 +58,9 @@ class Transfer:
     Attributes
     ----------
     begin : (n_x,) array
-        The state at t0.
+        The state at t0, or one near it.
+    opening : Function or None
+        Of (t, x), which vanishes at a start that is open.
     held : (m,) array or None
         The inputs that hold it at rest.
     target : (state (n_x,), inputs (m,) or None, Function or None)
@@ -57,6 +78,7 @@ class Transfer:
         self.equilibria = Equilibria(plant, program, self.node)
         self.begin, self.held = self._begin(start)
         self.states, self.inputs, self.sizes = self._guess()
+        self.opening = self._opening(start.state) if isinstance(start, Near) else None
         self.target = self._target()
         self._require_bounds_at_ends()
 
@@ -99,6 +121,7 @@ class Transfer:
             if rest is None:
                 raise _no_rest("start", t0, worst)
             return np.concatenate([rest[0], np.zeros(self.n - nq)]), self._held(rest, "start")
+        start = start.state if isinstance(start, Near) else start
         values = start.values[: self.n] if isinstance(start, State) else start
         x = self.plant.state(values)
         if not self._to_rest:
@@ -188,6 +211,29 @@ class Transfer:
         open_[self.nq :] = 0.0
         return open_, held, self._independent(rest)
 
+    def _opening(self, start):
+        """A function of (t, x) that vanishes on the program for all values of the unstable modes; None if none are.
+
+        Of the entries of the state that the program leaves free, the directions of unstable modes at the start are
+        open, and what complements them is that of the start.
+        """
+        try:
+            model = self._exact_model
+            entries, values = FreeEntries(model, start.t, start.values), np.asarray(start.values, dtype=float)
+        except ServoError:
+            return None
+        A, _ = _linearised(entries, start.t, values)
+        if tuple(model.state_names) != tuple(self.plant.state_names) or not np.isfinite(A).all():
+            return None
+        opened = End(start.t, values, A.T, entries.size[entries.free]).left_space(unstable=True)  # right space of A
+        if not len(opened):
+            return None
+        closed = np.linalg.svd(opened)[2][len(opened) :]
+        t, x, free = self.node.q.t, self.node.state, entries.free.tolist()
+        on_program = model.function("invariants").expression(t, x, model.parameters)[: entries.m]
+        rows = ca.vertcat(on_program, ca.DM(closed) @ (x[free] - ca.DM(values[free])))
+        return ca.Function("start", [t, x], [ca.densify(ca.cse(rows))], {"der_options": {"cse": True}})
+
     def _without_growth(self):
         """A function of (t, x, v): unstable modes of the internal dynamics, which are those of the guess at the end.
 
@@ -202,10 +248,12 @@ class Transfer:
             entries = FreeEntries(model, self.span[1], state)
         except ServoError:
             return None
-        _, A, _, tangent = entries.local(np.array([self.span[1]]), state[:, None])
-        modes = End(self.span[1], state, A[0], entries.size[entries.free]).left_space(unstable=True)
+        A, tangent = _linearised(entries, self.span[1], state)
+        if not np.isfinite(A).all():
+            return None
+        modes = End(self.span[1], state, A, entries.size[entries.free]).left_space(unstable=True)
         places = [model.state_names.index(name) for name in self.plant.state_names]
-        rows = modes @ np.linalg.pinv(tangent[0][places])
+        rows = modes @ np.linalg.pinv(tangent[places])
         if not len(rows):
             return None
         return self.node.function("unstable", ca.DM(rows) @ (self.node.state - ca.DM(x)))
@@ -214,7 +262,8 @@ class Transfer:
         """Refuse bounds that a fixed state at an end exceeds, whatever the inputs."""
         node, t = self.node, self.span
         f = node.function("bounded", node.bounded)
-        for k, (where, x) in enumerate((("start", self.begin), ("end", self.target[0]))):
+        begin = self.begin if self.opening is None else np.full(self.n, np.nan)
+        for k, (where, x) in enumerate((("start", begin), ("end", self.target[0]))):
             values = np.array(f(t[k], x, np.zeros(node.v.numel()))).ravel()
             for name, value, each in zip(node.bounds, values, node.bounded.elements(), strict=True):
                 low, high = self.bounds[name]
@@ -305,6 +354,13 @@ class Transfer:
     def begin_inputs(self):
         """Inputs that hold the start at rest (m,), or zeros."""
         return np.zeros(self.m) if self.held is None else self.held
+
+
+def _linearised(entries, t, x):
+    """The internal dynamics at a state: linearisation (f, f), not finite where singular, and tangent (n_x, f)."""
+    with np.errstate(all="ignore"):
+        _, A, _, tangent = entries.local(np.array([t]), x[:, None])
+    return A[0], tangent[0]
 
 
 def _at_each(f, t, x, v):

@@ -291,6 +291,7 @@ def _along(internal, why, facts):
 
 def eigenvalues(end):
     """The eigenvalues of a rest in words, at most four of them."""
-    values = [f"{v.real:.6g}" + (f" ± {v.imag:.6g}i" if v.imag > 0 else "") for v in end.eigenvalues if v.imag >= 0]
+    upper = [(0.0 if v in end.on_axis else v.real, v.imag) for v in end.eigenvalues if v.imag >= 0]
+    values = [f"{real:.6g}" + (f" ± {imag:.6g}i" if imag > 0 else "") for real, imag in upper]
     more = f" and {len(values) - 4} more" if len(values) > 4 else ""
     return f"eigenvalues {', '.join(values[:4])}{more} 1/s"

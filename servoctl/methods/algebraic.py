@@ -74,7 +74,7 @@ class _Algebraic(Stepping):
             self._start(t0, x0, t1)
             cuts = np.array(breakpoints((t0, t1), knots))
             self.longest, self.direction = abs(t1 - t0) / STEPS, np.sign(t1 - t0)
-            self.pending, self.resumed = times, None
+            self.pending, self.resumed, self.motion.room = times, None, len(times)
             t, x = t0, x0
             while t != t1 and self.motion.stop is None and not self.motion.ended:
                 t, x = self._advance(np.append(t, cuts[(cuts - t) * self.direction > 0]), x)

@@ -55,11 +55,10 @@ def alive_along(motion):
     None
         If all are zero.
     """
-    for model, t, x, top in motion.pieces:
+    for model, t, jets in motion.by_piece():
         f = model.dropped
         if f is None:
             continue
-        jets = np.vstack([x, top])
         full = jets if len(jets) == f.n_x else jets[: f.n_x] if len(jets) > f.n_x else model.extended(t, jets, f.n_x)
 
         def entries(some, model=model, t=t, full=full):

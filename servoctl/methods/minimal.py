@@ -167,6 +167,28 @@ class Chart:
             last = size
         return np.full(self.n_x, np.nan)
 
+    @np.errstate(all="ignore")
+    def lift_all(self, t, y, near):
+        """The same at times t (N,) for values y (f, N) and states near by (n_x, N): states (n_x, N)."""
+        x, size = np.array(near, dtype=float), np.full(len(t), np.inf)
+        x[self.free] = y
+        for _ in range(ITERATIONS):
+            slopes = self._invariants.grid(t, x, self.p).T
+            values, matrices = slopes[:, : self.m], slopes[:, self.m :].reshape(len(t), self.n_x, self.m).swapaxes(1, 2)
+            matrices = (matrices * self.columns)[:, :, self.solved]
+            try:
+                steps = np.linalg.solve(matrices, -values[:, :, None])[:, :, 0].T
+            except np.linalg.LinAlgError:
+                break
+            x[self.solved] += self.columns[self.solved, None] * steps
+            sizes = np.maximum(np.abs(x[self.solved]), self.usual[self.solved, None])
+            size = np.abs(self.columns[self.solved, None] * steps / sizes).max(axis=0, initial=0.0)
+            if not np.any(size > CONVERGED):
+                break
+        for i in np.flatnonzero(~(size <= CONVERGED) | (np.linalg.slogdet(matrices)[0] != self.sign)):
+            x[:, i] = self.lift(t[i], y[:, i], near[:, i])
+        return x
+
     def rates(self, t, x):
         """y' at a state."""
         return self.ode(t, x, self.p)[self.free]
@@ -318,22 +340,22 @@ class Dense:
 
     def __call__(self, times):
         """States (n_x, N)."""
-        return np.array([self._state(t) for t in times]).reshape(len(times), -1).T
+        (t0, x0, t1, x1), times = self.ends, np.asarray(times)
+        near = x0[:, None] + (times - t0) * ((x1 - x0) / (t1 - t0))[:, None]
+        states = self.chart.lift_all(times, self.inner(times), near)
+        failed = np.flatnonzero(~np.all(np.isfinite(states), axis=0))
+        if not len(failed):
+            return states
+        t = float(times[failed[0]])
+        raise IntegrationStopped(
+            f"Newton's method finds no solution of the constraints at t = {t:.7g} s, within a step.",
+            "The values that are not integrated are solved from the constraints.",
+            do="Use a smaller rtol, or drift='project', which solves nothing within a step.",
+            t=t,
+        )
 
     def integrated(self, times):
         """The integrated values at their places (n_x, N), NaN at others."""
         states = np.full((len(self.ends[1]), len(times)), np.nan)
         states[self.chart.free] = self.inner(times)
         return states
-
-    def _state(self, t):
-        t0, x0, t1, x1 = self.ends
-        x = self.chart.lift(t, self.inner(t), x0 + (t - t0) * (x1 - x0) / (t1 - t0))
-        if np.all(np.isfinite(x)):
-            return x
-        raise IntegrationStopped(
-            f"Newton's method finds no solution of the constraints at t = {t:.7g} s, within a step.",
-            "The values that are not integrated are solved from the constraints.",
-            do="Use a smaller rtol, or drift='project', which solves nothing within a step.",
-            t=float(t),
-        )

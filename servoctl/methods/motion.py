@@ -16,12 +16,20 @@ from servoctl.reduction.orders import other_order
 DEFAULT_SAMPLES = 1001  # without t_eval: smooth curves, and extrema refined to rounding
 SAME_INSTANT = 1e-12  # of the time: instants closer than this are one
 BESIDE_KNOTS = 0.1  # of that: how far before and after a knot a piece ends and begins, with all stages on its own side
+MOST_RESERVED = 2_000_000  # samples: for more of them arrays grow, by doubling
 ADVICE = "Use a smaller rtol, another method or drift='project', or check whether the program ends or jumps there."
 
 
 @dataclass
 class Motion:
-    """A motion while it is being computed: samples of the state, and the model variant that holds in each piece."""
+    """A motion while it is being computed: samples of the state, and the model variant that holds in each piece.
+
+    Attributes
+    ----------
+    pieces : list of (model, first, start, end)
+        The samples from `start` to `end` belong to a variant of the model; its steps begin at the sample `first`, which
+        is `start` or the one before, as an instant that two pieces share is one sample.
+    """
 
     counters: dict = field(default_factory=dict)
     pieces: list = field(default_factory=list)
@@ -33,19 +41,53 @@ class Motion:
     changed: set = field(default_factory=set)
     switches: list = field(default_factory=list)
     start: object = None  # X at t0, if it is not the given one
+    room: int = 0  # samples of the whole motion
+    _t: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    _jets: np.ndarray = field(default_factory=lambda: np.zeros((0, 0)))
+
+    @property
+    def t(self):
+        """Instants of all samples [s], (N,) array."""
+        return self._t[: self._end]
+
+    @property
+    def jets(self):
+        """Jets at all samples, (n_z, N) array."""
+        return self._jets[:, : self._end]
+
+    @property
+    def _end(self):
+        return self.pieces[-1][-1] if self.pieces else 0
 
     def add(self, model, t, x, top):
         """Append samples t (N,), X (n_x, N) and γ^(s̄) (n, N) computed with one variant of the model."""
-        if len(t):
-            self.pieces.append((model, np.asarray(t), np.asarray(x), np.asarray(top)))
+        start = self._end
+        new = np.diff(t, prepend=self._t[start - 1] if start else np.nan) != 0
+        if not new.any():
+            return
+        shared, end = int(not new[0]), start + int(new.sum())
+        if end > len(self._t):
+            self._reserve(max(end, 2 * start, min(self.room, MOST_RESERVED)), len(x) + len(top))
+        new = slice(shared, None) if new[1:].all() else new  # without a copy, eleven times as fast
+        self._t[start:end] = np.asarray(t)[new]
+        self._jets[: len(x), start:end], self._jets[len(x) :, start:end] = x[:, new], top[:, new]
+        self.pieces.append((model, start - shared, start, end))
+
+    def _reserve(self, room, rows):
+        """Make room for samples; the system gives memory as they fill it."""
+        t, jets = np.empty(room), np.empty((rows, room))
+        if self.pieces:
+            t[: self._end], jets[:, : self._end] = self.t, self.jets
+        self._t, self._jets = t, jets
+
+    def by_piece(self):
+        """The (model, t, jets) of each piece."""
+        return [(model, self._t[a:b], self._jets[:, a:b]) for model, _, a, b in self.pieces]
 
     def end_before(self, t, error):
         """Drop the samples from an instant t [s] on, and stop there for an error."""
-        for i, (model, times, x, top) in enumerate(self.pieces):
-            if t in times:
-                k = int(np.flatnonzero(times == t)[0])
-                self.pieces[i:] = [(model, times[:k], x[:, :k], top[:, :k])] if k else []
-                break
+        k = int(np.flatnonzero(self.t == t)[0])
+        self.pieces = [(model, first, a, min(b, k)) for model, first, a, b in self.pieces if a < k]
         self.stop = error
 
     def changes_pivots(self, t):
@@ -59,33 +101,14 @@ class Motion:
         for name, number in numbers.items():
             self.counters[name] = self.counters.get(name, 0) + int(number)
 
-    def samples(self):
-        """All samples; an instant that two pieces share appears once.
-
-        Returns
-        -------
-        t : (N,) array
-        z : (n_z, N) array
-        variants : list of (first, last + 1, model)
-            The variant of the model that holds for each range of samples.
-        """
-        t = np.concatenate([piece[1] for piece in self.pieces])
-        keep = np.append(True, np.diff(t) != 0)
-        starts = np.cumsum([0, *(len(piece[1]) for piece in self.pieces[:-1])])
-        counts = np.add.reduceat(keep, starts, dtype=int)
-        z = np.empty((sum(map(len, self.pieces[0][2:])), counts.sum()))  # filled by piece: one large copy takes seconds
-        for (_, of_piece, x, top), start, end, count in zip(self.pieces, starts, counts.cumsum(), counts, strict=True):
-            new = keep[start : start + len(of_piece)]
-            new = slice(int(not new[0]), None) if new[1:].all() else new  # without a copy, eleven times as fast
-            z[: len(x), end - count : end], z[len(x) :, end - count : end] = x[:, new], top[:, new]
-        variants, end = [], 0
-        for (model, *_), count in zip(self.pieces, counts.tolist(), strict=True):
-            first, end = end, end + count
-            if count and variants and variants[-1][2] is model:
-                variants[-1] = (variants[-1][0], end, model)
-            elif count:
-                variants.append((first, end, model))
-        return t[keep], z, variants
+    def variants(self):
+        """The variant of the model that holds for each range of samples: a list of (first, last + 1, model)."""
+        result = []
+        for model, _, start, end in self.pieces:
+            if result and result[-1][2] is model:
+                start = result.pop()[0]
+            result.append((start, end, model))
+        return result
 
 
 @contextlib.contextmanager
@@ -215,11 +238,16 @@ class Stepping:
             t, x, cuts = t0, x0, breakpoints((t0, t1), knots)
             self.knots = {c for c in cuts if any(abs(c - k) <= margin_at(c) for k in knots)}
             self._start(t, x, cuts[1])
+            self.motion.room = self._samples(cuts, t_eval)
             for b in cuts[1:]:
                 while t != b and self.motion.stop is None and not self.motion.ended:
                     due = (t_eval >= min(t, b)) & (t_eval <= max(t, b)) & ((t_eval != t) | (t == t0))
                     t, x = self._piece(t, x, b, t_eval[due])
         return self.motion
+
+    def _samples(self, cuts, t_eval):
+        """The number of samples of a whole motion through instants (K,) at which pieces end."""
+        return len(t_eval)
 
     def _beside(self, a, b):
         """The ends of a piece, moved inwards where they are knots: on a knot a jump has the value beyond, or before."""
@@ -299,7 +327,7 @@ class Stepping:
         """Stop at the end of a smooth piece, or go on beyond its switch towards b."""
         if end.event:
             self.motion.ended = end.event
-            if not self.motion.pieces or self.motion.pieces[-1][1][-1] != end.t:
+            if end.t not in self.motion.t[-1:]:
                 self.motion.add(self.model, [end.t], end.x[:, None], self._top(end.t, end.x)[:, None])
             return
         if end.error is not None:

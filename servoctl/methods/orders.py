@@ -1,7 +1,5 @@
 """A motion ends where a row takes another order than the one that it was derived with."""
 
-import numpy as np
-
 from servoctl.errors import ServoError
 from servoctl.reduction.orders import other_order
 
@@ -14,8 +12,7 @@ def end_at_other_orders(motion):
     motion : Motion
         Its samples are cut in place.
     """
-    for model, t, x, top in motion.pieces:
-        jets = np.vstack([x, top])
+    for model, t, jets in motion.by_piece():
         k, name = model.reduction.orders.first_change(t, jets, model.parameters)
         if k is not None:
             motion.end_before(t[k], _other_order(model, name, float(t[k]), jets[:, k]))

@@ -67,10 +67,14 @@ def radau(order):
 
 def basis(c, theta):
     """Lagrange polynomials of the nodes c, and 0, at theta (N,): an (s, N) array."""
-    nodes = np.append(0.0, c)
-    rows = [[k for k in range(len(nodes)) if k != j] for j in range(1, len(nodes))]
-    factors = ([(theta - nodes[k]) / (nodes[j + 1] - nodes[k]) for k in row] for j, row in enumerate(rows))
-    return np.array([np.prod(row, axis=0) for row in factors])
+    return lagrange(np.append(0.0, c), theta)[1:]
+
+
+def lagrange(nodes, theta):
+    """Lagrange polynomials of nodes (s,) at theta (N,): an (s, N) array."""
+    own = np.eye(len(nodes), dtype=bool)
+    gaps = nodes[:, None] - nodes + own
+    return np.where(own[:, :, None], 1.0, (theta - nodes[:, None]) / gaps[:, :, None]).prod(axis=1)
 
 
 def radau_order(rtol):
@@ -188,17 +192,6 @@ def settle(f, t, x, p):
     return rows.T
 
 
-def basis_slopes(c, theta):
-    """Derivatives of these polynomials."""
-    nodes = np.append(0.0, c)
-    result = []
-    for j in range(1, len(nodes)):
-        others = np.delete(nodes, j)
-        products = (np.prod(theta - np.delete(others, i)[:, None], axis=0) for i in range(len(others)))
-        result.append(sum(products) / np.prod(nodes[j] - others))
-    return np.array(result)
-
-
 def first_step(f, t, x, p, span, settings):
     """Length of a first step (Hairer, Nørsett and Wanner 1993, II.4); f is a Compiled with the outputs X', pivots."""
     n, power = len(x), 1.0 / (STAGES[settings.order] + 1)
@@ -233,15 +226,20 @@ class Collocated(Steps):
 
     def at(self, k, times):
         """States (n_x, N) at times (N,) within steps k (N,), by the collocation polynomials."""
-        return self.x[:, k] + self._sum(basis, k, times)
+        theta, _ = self._parts(k, times)
+        weights = basis(radau(self.order)[0], theta)
+        return self.x[:, k] + np.einsum("jm,mjl->lm", weights, self.z[k])
 
     def slope(self, k, times):
-        """Their derivatives."""
-        return self._sum(basis_slopes, k, times) / np.diff(self.t)[k]
+        """Their derivatives: polynomials through the rates of the stages."""
+        theta, h = self._parts(k, times)
+        c, rate = radau(self.order)[:2]
+        return np.einsum("jm,mjl->lm", rate.T @ lagrange(c, theta), self.z[k]) / h
 
-    def _sum(self, weights, k, times):
-        theta = (times - self.t[k]) / np.diff(self.t)[k]
-        return np.einsum("jm,mjl->lm", weights(radau(self.order)[0], theta), self.z[k])
+    def _parts(self, k, times):
+        """Parts of steps at which times lie in them, and their lengths [s]."""
+        h = np.diff(self.t)[k]
+        return (times - self.t[k]) / h, h
 
 
 class RadauSteps(BulkSteps):

@@ -1,5 +1,7 @@
 """Compiled explicit Runge-Kutta methods of fixed step: their tableaus and their integration."""
 
+from itertools import pairwise
+
 import numpy as np
 
 from servoctl.errors import unknown
@@ -78,8 +80,12 @@ class RungeKuttaSteps(Stepping):
 
     @property
     def taken(self):
-        """The steps as (model, t, states, ...)."""
-        return self.motion.pieces
+        """The steps as (model, t, states)."""
+        m = self.motion
+        return [(model, m.t[first:end], m.jets[: self.n_x, first:end]) for model, first, _, end in m.pieces]
+
+    def _samples(self, cuts, t_eval):
+        return 1 + sum(equal_steps(a, b, self.step)[1] for a, b in pairwise(cuts))
 
     def _piece(self, a, x, b, times):
         h, count = equal_steps(a, b, self.step)
@@ -94,6 +100,7 @@ class RungeKuttaSteps(Stepping):
             steps = min(most, count - done)
             states, pivots = self._steps(first + done * inner, x, inner, steps)
             t = a + (done + np.arange(states.shape[1])) * h
+            t[-1] = b if done + len(t) > count else t[-1]
             outcome = self._inspect(t, states, pivots)
             good = outcome.steps
             if isinstance(outcome, End):

@@ -265,7 +265,7 @@ def unresolved(pieces, halved):
 
     Parameters
     ----------
-    pieces : list of (model, t, states, ...)
+    pieces : list of (model, t, states)
         Steps from t[k] to t[k + 1] [s] with states (n_x, N) by one variant of the model.
     halved : callable
         (model, t, x, h) -> states (n_x, 3) at t, t + h and t + 2 h; fewer if a step fails.
@@ -276,7 +276,7 @@ def unresolved(pieces, halved):
         Start and end of the step [s], the state (n_x,) at its start, the difference of both ends relative to the sizes
         of the state's entries (n_x,), and these sizes.
     """
-    pieces = [(model, t, states) for model, t, states, *_ in pieces if len(t) > 1]
+    pieces = [piece for piece in pieces if len(piece[1]) > 1]
     if not pieces:
         return None
     largest = np.column_stack([np.abs(states).max(axis=1) for _, _, states in pieces])

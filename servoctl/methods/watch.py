@@ -6,7 +6,6 @@ adds to that is its error. Where the program ends (an angle whose sine passes 1)
 """
 
 from dataclasses import dataclass
-from functools import cached_property
 from math import factorial
 
 import casadi as ca
@@ -304,18 +303,23 @@ class Residuals:
         return y[: self.m], allowed
 
     def small(self, t, x):
-        """Whether residuals at the ends of steps are what they may be at the start, which needs no slopes."""
-        if self.first is None:
-            self.values(t[:1], x[:, :1])
-        residuals = self.f.grid(t[1:], x[:, 1:], self.model.parameters)[: self.m]
+        """Whether residuals at times t (N,) and states x (n_x, N) are what they may be at the start of the motion.
+
+        This needs no slopes.
+        """
+        residuals = self.f.grid(t, x, self.model.parameters)[: self.m]
         return bool(np.all(np.abs(residuals) <= self.first[:, None]))
 
-    @cached_property
+    @property
     def _terms(self):
         """The sum of the magnitudes of each residual's terms."""
-        e = self.model.equations
-        sizes = [size_of_terms(ca.densify(expression)) for _, _, expression in e.invariant_rows]
-        return compiled(e.function("terms", e.state, sizes), "terms")
+
+        def build():
+            e = self.model.equations
+            sizes = [size_of_terms(ca.densify(expression)) for _, _, expression in e.invariant_rows]
+            return compiled(e.function("terms", e.state, sizes), "terms")
+
+        return self.model.once("terms", build)
 
     def accept(self):
         """Take in the states of the last evaluation as part of the motion."""
@@ -466,10 +470,12 @@ class Watch:
             np.arange(count + 1)
         )
         t, x = stretch.t[picked], stretch.x[:, picked]
-        if not projected and self.residuals.small(t, x):
+        ends = stretch.dense(np.arange(count), stretch.t[1:]) if projected else stretch.x[:, 1:]
+        if self.residuals.first is None:
+            self.residuals.values(t[:1], x[:, :1])
+        if self.residuals.small(t[1:], ends[:, picked[1:] - 1]):
             self.tolerance.accept(x)
             return None
-        ends = stretch.dense(np.arange(count), stretch.t[1:]) if projected else stretch.x[:, 1:]
         over = self.residuals.off(np.array([t[:-1], t[1:]]), x[:, :-1], ends[:, picked[1:] - 1])
         for p in np.flatnonzero((over > 0).any(axis=0)):
             for k in range(picked[p], picked[p + 1]):

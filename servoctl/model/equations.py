@@ -395,6 +395,10 @@ class Equations(Invariants):
         """Inputs of the plant: the actuation, or the reaction of an ideal program."""
         return ["inputs"], [self.r.actuation]
 
+    def _input_terms(self):
+        """The sizes of the terms of these inputs."""
+        return ["input_terms"], [size_of_terms(e) for e in self.r.actuation.elements()]
+
     def _all_multipliers(self):
         """All multipliers μ of the reaction B μ."""
         return ["all_multipliers"], [self.r.multipliers]
@@ -402,11 +406,19 @@ class Equations(Invariants):
     def _power(self):
         """dE/dt, the power of forces without a potential, the size of its terms, the part of dE/dt by explicit time."""
         r, q = self.r, self.q
-        w = q.jet(1)
+        w, force = q.jet(1), self._force()
         rate = q.dt(r.mechanism.energy)
-        force = r.mechanism.forces + r.mechanism.balance - r.balance + r.realisation.B @ r.multipliers
         law = rate - ca.dot(w, r.mechanism.balance + r.mechanism.forces)
         return ["rate", "work", "size", "law"], [rate, ca.dot(w, force), ca.dot(ca.fabs(w), ca.fabs(force)), law]
+
+    def _power_terms(self):
+        """The size of the terms of the power of forces without a potential."""
+        return ["power_terms"], [size_of_terms(ca.dot(self.q.jet(1), self._force()))]
+
+    def _force(self):
+        """Forces without a potential, inputs and reactions, (n,) SX."""
+        r = self.r
+        return r.mechanism.forces + r.mechanism.balance - r.balance + r.realisation.B @ r.multipliers
 
     def _reach(self):
         """The reaction of an ideal program, and the directions of actuators and material constraints."""
@@ -482,8 +494,10 @@ SIGNALS = {  # names and expressions of each group
     "coordinate_rates": Equations._coordinate_rates,
     "residuals": Equations._residuals,
     "inputs": Equations._inputs,
+    "input_terms": Equations._input_terms,
     "all_multipliers": Equations._all_multipliers,
     "power": Equations._power,
+    "power_terms": Equations._power_terms,
     "reach": Equations._reach,
 }
 

@@ -31,6 +31,7 @@ from servoctl.spec.program import Program
 from servoctl.values import read_only
 
 SAMPLED = 50  # samples of a run at which its structure is decided; each takes tens of milliseconds
+MOST_VARIANTS = 8  # of a model that it holds: motions from one start meet the same ones again
 
 
 def derive(
@@ -106,7 +107,7 @@ class Model:
         Names of the jets Z = (X, γ^(s̄)).
     """
 
-    def __init__(self, reduction, store, values=None, knots=None, functions=None):
+    def __init__(self, reduction, store, values=None, knots=None, functions=None, variants=None):
         q = reduction.mechanism.q
         self.reduction, self._store = reduction, store
         self.parameters = read_only(reduction.context.values.copy() if values is None else values)
@@ -116,6 +117,7 @@ class Model:
         # Models that differ only in numbers share their functions.
         self._functions = {} if functions is None else functions
         self._knots_within = {}  # by time span
+        self._variants = {} if variants is None else variants  # with other pivots, by place: one set for all of them
 
     def __eq__(self, other):
         if not isinstance(other, Model):
@@ -221,6 +223,9 @@ class Model:
         default = self.once("jet sizes", lambda: self.equations.jet_sizes)
         self._store.require_unchanged()
         r, place = self.reduction, (float(t), guess, default | dict(sizes))
+        key = repr(place)
+        if key in self._variants:
+            return self._variants[key]
         guess = None if r.context.scales is None else self._store.specification[2] or {}
         near = _derived(r.mechanism, r.program, guess, place, self.parameters)
         if near.free != self.free:
@@ -232,7 +237,10 @@ class Model:
                 free=near.free,
                 expected=self.free,
             )
-        return Model(near.reduction, near._store, self.parameters, self._knots)
+        if len(self._variants) == MOST_VARIANTS:
+            del self._variants[next(iter(self._variants))]
+        self._variants[key] = Model(near.reduction, near._store, self.parameters, self._knots, variants=self._variants)
+        return self._variants[key]
 
     @property
     def place(self):

@@ -4,7 +4,7 @@ import servoctl as sv
 from servoctl.export.files import identifier
 from servoctl.shell.motion import with_parameters
 from servoctl.shell.options import MANY, SCENE_HELP, assignment, by_name
-from servoctl.shell.scenes import find_scene
+from servoctl.shell.scenes import find_scene, model_of
 
 
 def add_export(export):
@@ -18,7 +18,7 @@ def add_export(export):
 
 def _export(args):
     name, scene = find_scene(args.scene)
-    model = with_parameters(sv.derive(*scene.build()), by_name(args.set, "--set"))
+    model = with_parameters(model_of(scene), by_name(args.set, "--set"))
     start = model.start(t=scene.t_span[0], guess=scene.guess, **scene.start)
     files = sv.export_c(model, args.out, name=args.name or identifier(name), start=start)
     print(f"{', '.join(file.name for file in files)} in {args.out}")

@@ -2,10 +2,10 @@
 
 from dataclasses import dataclass
 
-import servoctl as sv
 from servoctl.checks import as_span
 from servoctl.errors import SpecificationError, unknown
 from servoctl.shell.options import by_name
+from servoctl.shell.scenes import model_of
 
 
 @dataclass(frozen=True)
@@ -24,8 +24,7 @@ def described(args, scene, report, require=lambda model: None):
     """
     span = as_span(tuple(args.t_span or scene.t_span))
     changes, held, guess = (by_name(getattr(args, name), f"--{name}") for name in ("set", "hold", "guess"))
-    model = sv.derive(*scene.build()).including([*scene.start, *scene.guess, *held, *guess])
-    model = with_parameters(model, changes)
+    model = with_parameters(model_of(scene, [*held, *guess]), changes)
     require(model)
     report.say(model)
     start = _start(model, scene, span[0], held, guess)

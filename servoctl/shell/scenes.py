@@ -8,6 +8,7 @@ import sys
 import traceback
 from pathlib import Path
 
+import servoctl as sv
 from servoctl.errors import ServoError, SpecificationError, unknown
 
 _MODULE = "servoctl_scene"  # name of the module made from a user's file, so that it shadows no other module
@@ -35,6 +36,11 @@ def find_scene(given):
     elif os.path.exists(given):
         error.add_note(f"{given} exists, but a scene's file ends in .py.")
     raise error
+
+
+def model_of(scene, named=()):
+    """The model of a scene, with the coordinates that its start and these names of signals name."""
+    return sv.derive(*scene.build()).including([*scene.start, *scene.guess, *named])
 
 
 def _module(path):

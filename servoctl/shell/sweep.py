@@ -11,7 +11,7 @@ from servoctl.figures.style import write_png
 from servoctl.shell.folder import folder_of
 from servoctl.shell.options import MANY, METHODS_HELP, by_name, count, draw, drawn, draws, shard, used, variation, whole
 from servoctl.shell.printing import Report, complain
-from servoctl.shell.scenes import find_scene, own_case, stamp
+from servoctl.shell.scenes import find_scene, model_of, own_case, stamp
 from servoctl.study.sweep import require_fitting
 
 # options without effect beside --merge
@@ -161,7 +161,7 @@ def _model(given):
 
 @functools.cache
 def _model_of(given, _):
-    return sv.derive(*find_scene(given)[1].build())
+    return model_of(find_scene(given)[1])
 
 
 def scene_case(given, options, /, **values):

@@ -38,8 +38,9 @@ PROBE, PROBES = 1e-7, 3  # relative change by which a response is measured, and 
 FLOOR = 1e-3  # least size of a component, relative to what moves as much mass, and to what moves there in the span
 BLUNT = 1e-3  # effect of rounding, relative to the accelerations, above which these decide nothing
 OWN_INSTANTS, MOST_OWN = 200, 8  # instants between samples at which everything is checked, in all and of an interval
+AT_ZERO = 1e-6  # of the least singular value of B: below it B_D is at the zero of a pivot, where inputs have no digits
 BALANCED = 1e-9  # part of dE/dt, relative to its terms, that does not follow from the forces: more is no rounding
-BY_INPUTS = 1e-6  # part of the accelerations that rounding of the inputs may excuse
+BY_INPUTS = 1e-6  # part of the accelerations, or of the power, that rounding of the inputs may excuse
 FEW_SIZES = 20  # instants that give the sizes of residuals that are far below their limit
 MOST_SEGMENTS = 10_000  # steps along the run that are accepted: seconds
 MOST_OWN_PIVOTS = 3  # choices of pivots of its own, where those of the run vanish between samples
@@ -371,6 +372,8 @@ class _Checks:
             t, z = (np.concatenate(values, axis=-1) for values in zip(*parts, strict=True))
             few = np.unique(np.linspace(0, len(t) - 1, OWN_INSTANTS).astype(int))
             t, z = t[few], flow.corrected(t[few], z[:, few])
+            regular = _regular(flow.model, t, z)
+            t, z = (t[regular], z[:, regular]) if regular.any() else (t, z)
             for model, which in self._sides(flow.model, t, z):
                 instants = _Instants(model, t[which], z[:, which], None)
                 own.append(replace(instants, inputs=instants.signals("inputs")))
@@ -421,18 +424,51 @@ class _Checks:
             x = np.vstack([at.z[: nq + n], at.inputs])
             accelerations = f(at.t, x)
             errors = _ratio(accelerations - at.z[nq + n : nq + 2 * n], size)
-            if largest(errors) > LIMITS["acceleration"]:  # errors of rounding are larger where it decides
+            if not largest(errors) <= LIMITS["acceleration"]:  # errors of rounding are larger where it decides
+                determined = np.isfinite(accelerations)
                 rounding = self._rounding(f, at.t, x, accelerations)
                 of_inputs = self._rounding(given, at.t, at.z, given(at.t, at.z))
+                terms = np.vstack([np.zeros_like(at.z[: nq + n]), at.signals("input_terms")])
+                of_inputs += ROUNDING * self._response(f, at.t, x, accelerations, terms)
                 errors = errors / (1 + (rounding + np.minimum(of_inputs, BY_INPUTS * size)) / (limit * size))
-                blunt = max(blunt, largest(rounding / size))
+                errors = np.where(determined, errors, 0.0)
+                blunt = max(blunt, largest(np.where(determined, rounding / size, np.inf)))
             worst = max(worst, largest(errors))
-        if blunt > BLUNT:
-            self.doubts.append(
-                f"rounding changes the mechanism's accelerations by {blunt:.1e} of their size: scale the units, or "
-                "replace stiff springs and small masses by constraints"
-            )
-        return worst
+        return max(worst, self._where_blunt(blunt, size)) if blunt > BLUNT else worst
+
+    def _where_blunt(self, blunt, size):
+        """Largest error of γ'' against the equations with multipliers, where rounding decides the mechanism's.
+
+        That the program determines γ'' is a note; if rounding decides these equations too, it is a doubt.
+        """
+        what = "the inputs do not determine the mechanism's accelerations"
+        if np.isfinite(blunt):
+            what = f"rounding changes the mechanism's accelerations by {blunt:.1e} of their size"
+        found = [self._by_multipliers(at) for at in self.instants]
+        if max(largest(rounding / size) for _, rounding in found) > BLUNT:
+            self.doubts.append(f"{what}: scale the units, or replace stiff springs and small masses by constraints")
+            return 0.0
+        self.notes.append(f"{what}: those under the program's constraints are compared instead")
+        limit = self.limit("acceleration")
+        return max(_excused(errors, size, limit, lambda r=rounding: r) for errors, rounding in found)
+
+    def _by_multipliers(self, at):
+        """Errors (n, N) of γ'' against the equations with multipliers, and the effect of rounding on these.
+
+        The effect is infinite where these equations do not determine γ''.
+        """
+        n, nq, z = self.model.n, self.model.nq, at.z[: len(self.model.jet_names)]
+
+        def accelerations(t, z):
+            matrix, right = at.model.multiplier_form(t, z)
+            return np.linalg.solve(matrix.transpose(2, 0, 1), right.T[:, :, None])[:, :n, 0].T
+
+        try:
+            again = accelerations(at.t, z)
+            return z[nq + n : nq + 2 * n] - again, self._rounding(accelerations, at.t, z, again)
+        except (np.linalg.LinAlgError, ValueError):  # singular, or of hidden constraints and higher orders
+            unknown = np.full((n, len(at.t)), np.inf)
+            return unknown, unknown
 
     def multiplier_form(self):
         """Largest residual of [M -B; C 0] [γ''; μ] = ..., relative to the largest terms of each row."""
@@ -560,21 +596,25 @@ class _Checks:
         errors, roundings = [], []
         known = dict(enumerate(self.powers))  # of the samples, which are the first instants
         for i, at in enumerate(self.instants):
-            f = at.model.signals("power")[1]
-
-            def defect(t, z, f=f, model=at.model):
-                rate, work, *_ = f.grid(t, z, model.parameters)
-                return (rate - work)[None]
-
-            z = at.z[: f.n_x]
             rate, work, size, _ = known[i] if i in known else at.signals("power")
             errors.append((rate - work)[None])
-            roundings.append(lambda z=z, at=at, defect=defect, e=errors[-1]: self._rounding(defect, at.t, z, e))
+            roundings.append(partial(self._rounding_of_power, at, errors[-1]))
             inertial = np.abs(at.z[nq : nq + n] * at.z[nq + n : nq + 2 * n]).T @ self.mass
             scale = max(scale, (np.abs(size) + np.abs(rate) + inertial).max())
         limit = self.limit("power")
-        power = max(_excused(e, scale, limit, rounding) for e, rounding in zip(errors, roundings, strict=True))
+        power = max(_excused(e, scale, limit, lambda r=r: r(scale)) for e, r in zip(errors, roundings, strict=True))
         return {"power": power} | self._energy(scale)
+
+    def _rounding_of_power(self, at, error, scale):
+        """Effect of rounding on the error (1, N) of the power, that of inputs at most a part of its scale."""
+        f = at.model.signals("power")[1]
+
+        def defect(t, z):
+            rate, work, *_ = f.grid(t, z, at.model.parameters)
+            return (rate - work)[None]
+
+        of_inputs = np.minimum(ROUNDING * at.signals("power_terms"), BY_INPUTS * scale)
+        return self._rounding(defect, at.t, at.z[: f.n_x], error) + of_inputs
 
     def _energy(self, power):
         """Largest difference of the energy gained from the work, relative to the kinetic energy and the work done."""
@@ -671,6 +711,17 @@ class _Checks:
             inverse = np.linalg.pinv(E, rcond=max(E.shape[1:]) * np.finfo(float).eps)
             worst = max(worst, largest(reaction - E @ (inverse @ reaction)))
         return {"outside": worst / size}
+
+
+def _regular(model, t, z):
+    """Whether the inputs are determined with the model's pivots at instants, (N,): B_D is as regular as B."""
+    f, dependent, n = model.function("matrices"), list(model.reduction.realisation.dependent), model.n
+    values = f.grid(t, z[: f.n_x], model.parameters)
+    B = values[len(values) - n * (len(dependent) + 1) : -n].reshape(n, len(dependent), len(t)).T
+    if not dependent or not np.all(np.isfinite(B)):
+        return np.ones(len(t), dtype=bool)
+    least, of_all = (np.linalg.svd(b, compute_uv=False)[:, -1] for b in (B[:, :, dependent], B))
+    return least > AT_ZERO * of_all
 
 
 def _product(matrix, vectors):

@@ -215,7 +215,7 @@ class Reference:
         return residual, J
 
     def solve(self, t, q0, w0, more=0, near=False, unit=1.0):
-        """The array at an instant from a state: q0 (n,), w0 (n, coefficients).
+        """The array at an instant from a state of the motion: q0 (n,), w0 (n, coefficients), without accelerations.
 
         Its columns are scaled to a unit of time [s].
 
@@ -228,7 +228,7 @@ class Reference:
         q[:, 0], w[:, :known] = q0, w0[:, :known]
         state = np.zeros(len(x), dtype=bool)
         q_state, w_state, _ = self._parts(state, N)
-        q_state[:, 0], w_state[:, : self.top - 1] = True, True
+        q_state[:, 0], w_state[:, : min(known, self.top - 1)] = True, True
         sizes, everything = np.ones(len(x)), np.ones(len(x), dtype=bool)
         for part in self._parts(sizes, N):
             part[:] = unit ** -np.arange(part.shape[1])

@@ -122,11 +122,15 @@ def _judge(case):
     return _compared(reference, case, model, run, proof)
 
 
-def _jets(run, k, n):
-    """q and the Taylor coefficients of w at a sample."""
-    jets = run.jets[n:, k].reshape(-1, n).T
-    factorials = np.cumprod([1.0, *range(1, jets.shape[1])])
-    return run.jets[:n, k], jets / factorials
+def _coefficients(jets, n):
+    """q and the Taylor coefficients of w, from q, w, w', ..."""
+    w = jets[n:].reshape(-1, n).T
+    return jets[:n], w / np.cumprod([1.0, *range(1, w.shape[1])])
+
+
+def _at(reference, run, k):
+    """What the reference determines at a sample, from the state there."""
+    return reference.determined(run.t[k], *_coefficients(run.jets[: -reference.n, k], reference.n), near=True)
 
 
 def _compared(reference, case, model, run, proof):
@@ -135,8 +139,8 @@ def _compared(reference, case, model, run, proof):
     worst = {"acceleration": 0.0, "actuation": 0.0, "state": 0.0}
     unclear, gains = "", []
     for k in INSTANTS:
-        q, w = _jets(run, k, n)
-        solution = reference.determined(run.t[k], q, w[:, : min(w.shape[1], top)], near=True)
+        q, w = _coefficients(run.jets[:, k], n)
+        solution = _at(reference, run, k)
         if solution is None or not solution.clear or solution.residual > AGREE:
             numbers = "none" if solution is None else f"loose {solution.loose:.1e}, residual {solution.residual:.1e}"
             unclear = f"at t = {run.t[k]:.2f}: {numbers}"
@@ -180,7 +184,7 @@ def _growth(reference, run, t, last, end):
     if not end.clear or end.gain > SHARP or left[0] < FURTHER * left[last]:
         return f"the sensitivity is {end.gain:.1e} at the stop" if not end.clear or end.gain > SHARP else ""
     for k, least, power in (*((k, 1.5, POWER) for k in earlier[-1:]), (0, STEEPER, 0.0), (0, FURTHER, POLE)):
-        before = reference.determined(run.t[k], *_jets(run, k, reference.n), near=True)
+        before = _at(reference, run, k)
         if before is not None and end.gain > before.gain * max(least, (left[k] / left[last]) ** power):
             return f"the sensitivity grows from {before.gain:.1e} at {run.t[k]:.3g} s to {end.gain:.1e} at {run.t[last]:.3g} s"
     return ""
@@ -201,12 +205,6 @@ def _towards(model, start, stop, run):
         return run
 
 
-def _state(start, n):
-    """q and the Taylor coefficients of w at a start."""
-    jets = start.values[n:].reshape(-1, n).T
-    return start.values[:n], jets / np.cumprod([1.0, *range(1, jets.shape[1])])
-
-
 def _beside(reference, start, model):
     """Whether accelerations and actuation grow without bound towards a start, in words.
 
@@ -219,7 +217,7 @@ def _beside(reference, start, model):
         for distance in BESIDE[-2:] if later else BESIDE:
             moved = {name: start[name] + (0.0 if later else distance * d) for name, d in directions.items()}
             near = model.start(start.t + distance * later, guess=moved)
-            solution = reference.determined(near.t, *_state(near, reference.n), near=True)
+            solution = reference.determined(near.t, *_coefficients(near.values, reference.n), near=True)
             if solution is None or not solution.clear or solution.residual > 1e-9:
                 continue
             if solution.gain > max(STEEPER, 2 * last):
@@ -235,9 +233,9 @@ def _cause(reference, case, start, error, model):
     if run is not None and len(run.t) == 1 and model is not None and error.details.get("t", 0.0) > 0.0:
         run = _towards(model, start, error.details["t"], run)
     if start is not None:
-        (q, w), near = _state(start, case.n), True
+        (q, w), near = _coefficients(start.values, case.n), True
     if run is not None and len(run.t) and np.all(np.isfinite(run.jets[:, -1])):
-        t, (q, w) = run.t[-1], _jets(run, -1, case.n)
+        t, (q, w) = run.t[-1], _coefficients(run.jets[: -case.n, -1], case.n)
         if np.abs(run.jets[:, -1]).max() > LARGE:
             return f"the motion has grown to {np.abs(run.jets[:, -1]).max():.1e}"
     points = [reference.determined(t, q, w[:, : reference.top - 1], near)]
@@ -249,7 +247,7 @@ def _cause(reference, case, start, error, model):
     last = -1
     while run is not None and not solved and 4 - last <= len(run.t):  # next to a stop the array may be singular
         last -= 1
-        before = reference.determined(run.t[last], *_jets(run, last, case.n), near=True)
+        before = _at(reference, run, last)
         solved = [before] if before is not None and before.residual < 1e-9 else []
         if last < -5:
             break
