@@ -7,6 +7,7 @@ from refusals import refused
 from scenes import CRANE
 
 import servoctl as sv
+from servoctl.control import lqr as lqr_module
 from servoctl.control.lqr import weights
 from servoctl.control.reference import Reference
 from servoctl.control.sampling import discretised, exponentials
@@ -321,3 +322,23 @@ def test_a_mode_that_no_weight_sees_is_named(plan):
     with refused(sv.ServoError, "weight") as caught:
         sv.lqr(plan, sv.plant(CRANE), Q=0.0, varying=False)
     assert "x" in caught.value.details["mode"]
+
+
+def test_last_bits_of_a_neutral_mode_do_not_change_the_gains(monkeypatch):
+    """The place along a straight line and the integral of the speed make a mode that no input reaches at the end."""
+    scene = gallery["wheeled-robot"]
+    mechanism, program = scene.build()
+    model = sv.derive(mechanism, program)
+    plan = sv.simulate(model, model.start(**scene.start, guess=scene.guess), scene.t_span)
+
+    def gains(seed=None):
+        def perturbed(*given):
+            A, B = discretised(*given)
+            return A * (1 + 1e-16 * np.random.default_rng(seed).choice([-2, 0, 2], A.shape)), B
+
+        monkeypatch.setattr(lqr_module, "discretised", discretised if seed is None else perturbed)
+        return sv.lqr(plan, sv.plant(mechanism), R=1.0, integral={"speed": 1e4}).schedule
+
+    exact = gains()
+    for seed in range(6):
+        assert np.abs(gains(seed) - exact).max() < 1e-6 * np.abs(exact).max()
