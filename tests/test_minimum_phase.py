@@ -196,7 +196,7 @@ def test_several_ranges():
     mechanism = sv.Mechanism(
         q, gibbs=S, potential=ca.sin(p.w) * y**2 / 2, forces=(0, -0.5 * dy), actuators={"a": x}, parameters=p
     )
-    model = sv.derive(mechanism, sv.Program({"X": x - sv.paths.rest_to_rest(q.t, 0.0, 1.0, 1.0, smoothness=4)}))
+    model = sv.derive(mechanism, sv.Program({"X": x - sv.paths.rest_to_rest(q.t, 0.0, 1.0, 1.0, smoothness=4)}), keep=["y"])
     result = sv.minimum_phase(model, "w", (1.0, 11.0))
     assert np.array(result.stable) == pytest.approx(np.array([(1.0, np.pi), (2 * np.pi, 3 * np.pi)]), abs=1e-8)
     assert len(repr(result).splitlines()) <= 12

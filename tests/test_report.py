@@ -157,7 +157,7 @@ def mathieu():
     forces = {"x": -0.1 * q.d(1)[1] - (1 + 0.6 * ca.cos(2 * q.t)) * x}
     S = sv.particle(q, 1.0, (y, 0)) + sv.particle(q, 1.0, (x, 0))
     path = sv.paths.rest_to_rest(q.t, 0.0, 1.0, duration=1.0, smoothness=4)
-    return sv.derive(sv.Mechanism(q, gibbs=S, forces=forces, actuators={"F": y}), sv.Program({"y": y - path}))
+    return sv.derive(sv.Mechanism(q, gibbs=S, forces=forces, actuators={"F": y}), sv.Program({"y": y - path}), keep=["x"])
 
 
 def test_frozen_eigenvalues_are_no_verdict():
@@ -422,7 +422,7 @@ SMOOTH_THERE = {
 @pytest.mark.parametrize("name", KINKS)
 def test_a_run_that_stays_on_a_kink_is_inconclusive(name):
     """At rest on a kink CasADi's slope is that of one side."""
-    model = sv.derive(*beside(KINKS[name], ca.SX(0)))
+    model = sv.derive(*beside(KINKS[name], ca.SX(0)), keep=["y"])
     run = sv.simulate(model, model.start(), (0.0, 3.0))
     assert run.internal["verdict"] == "inconclusive" and "stays on a switch" in run.internal["text"]
     mechanism, program = beside(KINKS[name], ca.SX(0))
@@ -432,14 +432,14 @@ def test_a_run_that_stays_on_a_kink_is_inconclusive(name):
 
 @pytest.mark.parametrize("name", SMOOTH_THERE)
 def test_a_run_that_stays_beside_kinks_is_judged(name):
-    model = sv.derive(*beside(SMOOTH_THERE[name][0], ca.SX(0)))
+    model = sv.derive(*beside(SMOOTH_THERE[name][0], ca.SX(0)), keep=["y"])
     run = sv.simulate(model, model.start(), (0.0, 20.0))
     assert run.internal["verdict"] == ("neutral" if name == "drag" else "stable")
 
 
 @pytest.mark.parametrize("name", KINKS)
 def test_a_rest_on_a_kink_has_no_eigenvalues(name):
-    found = verdict(sv.derive(*beside(KINKS[name])))
+    found = verdict(sv.derive(*beside(KINKS[name]), keep=["y"]))
     assert found.word == "inconclusive" and not found.rest
     assert "on a switch" in found.reason and "tanh" in found.do and "run" in found.do
 
@@ -447,13 +447,13 @@ def test_a_rest_on_a_kink_has_no_eigenvalues(name):
 @pytest.mark.parametrize("name", SMOOTH_THERE)
 def test_a_rest_on_a_switch_without_a_kink_has_eigenvalues(name):
     force, expected = SMOOTH_THERE[name]
-    found = verdict(sv.derive(*beside(force)))
+    found = verdict(sv.derive(*beside(force), keep=["y"]))
     assert found.word == ("marginal" if name == "drag" else "minimum phase")
     assert found.rest["start"].eigenvalues == pytest.approx(expected, abs=1e-5)
 
 
 def test_a_smoothed_kink_has_a_verdict():
-    found = verdict(sv.derive(*beside(lambda x, y, v: -y - 0.1 * ca.tanh(v / 0.1))))
+    found = verdict(sv.derive(*beside(lambda x, y, v: -y - 0.1 * ca.tanh(v / 0.1)), keep=["y"]))
     assert found.word == "minimum phase"
     assert found.rest["start"].eigenvalues == pytest.approx(np.roots([1, 1, 1]), abs=1e-9)
 
@@ -467,7 +467,7 @@ def test_output_redefinition_refuses_an_equilibrium_on_a_kink():
         q, gibbs=S, actuators={"F": x}, forces=ca.vertcat(0, -p.a * ca.fmax(y, 0) - dy), parameters=p
     )
     with refused(sv.InconsistentStart, switch="y = 0"):
-        sv.minimum_phase(sv.derive(mechanism, sv.Program({"X": x})), "a", (0.1, 1.0))
+        sv.minimum_phase(sv.derive(mechanism, sv.Program({"X": x}), keep=["y"]), "a", (0.1, 1.0))
 
 
 def test_output_redefinition_takes_an_equilibrium_beside_a_kink():
@@ -477,7 +477,7 @@ def test_output_redefinition_takes_an_equilibrium_beside_a_kink():
     S = sv.particle(q, 1.0, x) + sv.particle(q, 1.0, y)
     forces = ca.vertcat(0, -p.a * y - ca.fmax(y - 0.5, 0) - dy)
     mechanism = sv.Mechanism(q, gibbs=S, actuators={"F": x}, forces=forces, parameters=p)
-    result = sv.minimum_phase(sv.derive(mechanism, sv.Program({"X": x})), "a", (0.1, 1.0))
+    result = sv.minimum_phase(sv.derive(mechanism, sv.Program({"X": x}), keep=["y"]), "a", (0.1, 1.0))
     assert [r.verdict for r in result.ranges] == ["stable"]
 
 
@@ -517,7 +517,7 @@ def test_the_constant_of_a_rolling_constraint_is_named(gravity):
 
 
 def test_a_drift_that_no_constraint_explains_has_no_constant():
-    found = verdict(sv.derive(*beside(lambda x, y, v: -0.2 * v - x)))
+    found = verdict(sv.derive(*beside(lambda x, y, v: -0.2 * v - x), keep=["y"]))
     assert found.word == "marginal" and "constant" not in found.reason
     mechanism, _ = beside(lambda x, y, v: -0.2 * v)
     found = verdict(sv.derive(mechanism, sv.Program({"V": mechanism.q.d(1)[0]})))
