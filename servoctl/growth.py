@@ -216,7 +216,7 @@ def internal_dynamics(model: Model, run: Run, period: float | None = None) -> In
     Instants are taken from the samples, more and more until growth by steps twice as long agrees; where the samples
     are too few, the motion is integrated between them.
     """
-    require_model(model, run, "internal_dynamics")
+    model = require_model(model, run, "internal_dynamics")
     if model.flat:
         return InternalDynamics(Tangents((), run.t[:0], np.ones(0), *np.zeros((2, 0, 0, 0))), "none", 1.0)
     if switch := stays_on_kink(model, run):

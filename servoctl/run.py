@@ -561,14 +561,19 @@ def on_side(model, branches):
 
 
 def require_model(model, run, what):
-    """Refuse a run of another model, or none; `what` is the function that needs both."""
+    """The model, with the coordinates that the run has and it leaves out; a run of another model, or none, is refused.
+
+    `what` is the function that needs both.
+    """
+    if getattr(run, "model", None) is not None and hasattr(model, "including"):
+        model = model.including(run.jet_names)
     states = getattr(model, "state_names", ())
     if getattr(run, "model", None) is None or not hasattr(model, "reduction"):
         which = " without its model" if hasattr(run, "jets") else ""
     elif run.jet_names[: len(states)] != tuple(states):
         which = " of another model"
     else:
-        return
+        return model
     raise SpecificationError(
         f"sv.{what} received a {type(model).__name__} and a {type(run).__name__}{which}.",
         "It needs a model and a run of this model; a run that was loaded from a file has none.",

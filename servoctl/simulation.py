@@ -48,6 +48,7 @@ from servoctl.model.switching import switching
 from servoctl.plants.driven import driven
 from servoctl.plants.plant import Plant
 from servoctl.progress import Progress
+from servoctl.reduction.idle import names_of
 from servoctl.run import SAME_TIME, Run
 
 STEPS_IN_SPAN = 2000  # steps of fixed length in a span if the method has no step
@@ -277,7 +278,7 @@ def _model_and_start(model, start, inputs):
             "sv.simulate(sv.plant(mechanism), x0, t_span, inputs={...}).",
             type=type(model).__name__,
         )
-    return model, start
+    return model.including(names_of(start)), start
 
 
 def _derived_along(model, method, drift, problem, bar):

@@ -5,7 +5,7 @@ import pickle
 import casadi as ca
 import numpy as np
 import pytest
-from refusals import refused
+from refusals import refused, warned
 
 import servoctl as sv
 from servoctl.gallery import gallery
@@ -142,8 +142,7 @@ def test_one_of_two_is_restored_by_name():
 ABSENT = {
     "signal": lambda m, run: run["phi0"],
     "derivative": lambda m, run: run["d2phi0"],
-    "start": lambda m, run: run.model.start(phi0=0.1),
-    "guess": lambda m, run: run.model.start(guess={"dphi0": 0.1}),
+    "start of a copy": lambda m, run: pickle.loads(pickle.dumps(run.model)).start(phi0=0.1),
     "condition": lambda m, run: run.model.start(hold={"c": m.q.d(0)[3] - 0.1}),
     "disturbance": lambda m, run: sv.close(
         sv.plant(m), sv.lqr(run, sv.plant(m)), run.state(0.0), SPAN, disturbance={"phi0": 1.0}
@@ -156,6 +155,22 @@ def test_an_absent_name_says_how_to_include_it(beside, what):
     mechanism, _, run = beside
     with refused(sv.NameUnknown, "keep=['phi0']", left_out="phi0"):
         ABSENT[what](mechanism, run)
+
+
+@pytest.mark.parametrize("named", [{"phi0": 0.1}, {"guess": {"l": 4.0, "dphi0": 0.1}}])
+def test_a_start_that_names_a_coordinate_includes_it(beside, named):
+    """The pendulum swings beside the same plan of the crane, and all that takes the model takes the motion."""
+    _, model, run = beside
+    start = model.start(**{"guess": {"l": 4.0}} | named)
+    with warned("unstable"):
+        swung = sv.simulate(model, start, (0.0, 2.0))
+    assert swung.model.left_out == () and swung["phi0"][-1] > 0.5
+    assert swung["hoist"] == pytest.approx(np.interp(swung.t, run.t, run["hoist"]), abs=1e-2)
+    assert sv.internal_dynamics(model, swung).verdict == "unstable" and sv.verify(model, swung).passed
+    assert sv.report(model, swung).verdict.startswith("non-minimum phase")
+    assert model.structure(swung).index == model.structure(run).index
+    assert sv.sensitivity(model, swung, to=["phi0"], of=["d2phi0"]).values.any()
+    assert model.including(["phi0"]).including(["phi0"]).left_out == () and model.left_out == ("phi0",)
 
 
 def test_keep_names_coordinates():

@@ -194,11 +194,11 @@ def test_exponential_growth_is_unstable_above_ten(growth, verdict):
 def test_the_plan_of_a_parametric_resonance_is_refused_by_inverse_dynamics():
     model = passive(mathieu(0.6))
     run, found = moved(model, 120.0)
-    plant = sv.plant(model.reduction.mechanism)
+    plant = sv.plant(run.model.reduction.mechanism)
     with refused(sv.UnstableInternalDynamics, "lqr", verdict="unstable", growth=found.growth, states=("x", "dx")):
         sv.computed(run, plant)
-    model = passive(mathieu(0.15))
-    assert sv.computed(moved(model, 120.0)[0], sv.plant(model.reduction.mechanism)).name == "computed"
+    run, _ = moved(passive(mathieu(0.15)), 120.0)
+    assert sv.computed(run, sv.plant(run.model.reduction.mechanism)).name == "computed"
 
 
 def test_stiff_and_backward_motions_are_judged(c_compiler):
@@ -411,7 +411,7 @@ def test_the_bound_is_one_of_the_propagator(seed):
         for span in ((0.0, 2.0), (2.0, 0.0)):
             start = model.start(t=span[0], x=1.0, y=0.5, dx=0.0, dy=0.0)
             run = sv.simulate(model, start, span, t_eval=np.linspace(*span, 41))
-            assert run.internal["growth"] <= 1.05 * growth_bound(model, run)
+            assert run.internal["growth"] <= 1.05 * growth_bound(run.model, run)
 
 
 def test_the_verdict_is_computed_when_it_is_read(tmp_path, gallery_model):

@@ -117,6 +117,12 @@ def features():
     return frozenset(_processor().split())
 
 
+def lanes():
+    """Number of doubles in one vector of the processor: 8 with AVX-512, 4 with AVX2, else 1."""
+    words = features()
+    return 8 if "avx512f" in words else 4 if "avx2" in words else 1
+
+
 def _optional_flags():
     # A compiler may refuse them. Code for this very processor only where the library's key names the processor.
     return ("-fno-semantic-interposition", *(("-march=native",) if _processor() else ()))

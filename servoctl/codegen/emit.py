@@ -14,11 +14,12 @@ from itertools import chain, count
 
 import casadi as ca
 
-from servoctl.codegen.loops import INLINE_SINES, LOOPS, NEWTON
+from servoctl.codegen.loops import CONSTANTS, INLINE_SINES, LOOPS
 
 CHUNK = 350  # statements per C function: compile time is least, and flat, between 250 and 500
 WIDE = 3000  # operations: up to here a function is emitted for eight points at once as well
 SHARED = 2  # divisions by the same value: from here on they become products with its reciprocal
+SCALAR_FASTER = '#pragma GCC optimize("no-tree-slp-vectorize")\n'  # pairs of terms of a series cost more to gather
 
 _ARITHMETIC = {
     ca.OP_ASSIGN: "{0}",
@@ -177,12 +178,12 @@ def emit(f, name, loops=(), *, project=None, others=None, sizes=None, wide=True,
     constants |= {"PIVOTS": 0} if "newton" in loops else {}
     constants |= {key.upper(): int(value) for key, value in (sizes or {}).items()}
     files = ["grid.c", *(f"{loop}.c" for loop in LOOPS if loop in loops)]
-    return "".join((unit(constants), *parts, *map(include, files)))
+    return "".join((SCALAR_FASTER if "taylor" in loops else "", unit(constants), *parts, *map(include, files)))
 
 
 def unit(constants):
     """Head of a translation unit: #define lines of constants by name, and `unit.h`."""
-    lines = (f"#define {key} {value}\n" for key, value in (NEWTON | constants).items())
+    lines = (f"#define {key} {value}\n" for key, value in (CONSTANTS | constants).items())
     return "".join(("#include <math.h>\n#include <stdint.h>\n", *lines, include("unit.h")))
 
 

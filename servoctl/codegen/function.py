@@ -129,21 +129,23 @@ class Compiled:
         Numbers of states, parameters and outputs.
     loops : tuple of str
         Loops that it can run.
+    sizes : dict of str to int
+        Constants of the loops.
     expression : casadi.Function
         The SX function (t, x, p) -> y.
     """
 
     def __init__(self, f, name, loops, project=None, others=None, sizes=None):
         self.name, self.loops, self._project = name, loops, project
-        self._others, self._sizes = others or {}, sizes or {}
+        self._others, self.sizes = others or {}, sizes or {}
         self.n_x, self.n_p, self.n_y = f.numel_in(1), f.numel_in(2), f.numel_out(0)
         self.expression, self._symbol = f, f"servoctl_{name}"
         self._x_shape, self._p_shape = (self.n_x,), (self.n_p,)
-        self._interpreter = Interpreter(f, project, self._sizes)
+        self._interpreter = Interpreter(f, project, self.sizes)
         self._text = None
 
     def __reduce__(self):
-        parts = (self.expression, self.name, self.loops, self._project, self._others, self._sizes)
+        parts = (self.expression, self.name, self.loops, self._project, self._others, self.sizes)
         # Emitting takes longer than reading: the C text travels until the library is loaded, where it can be compiled.
         travels = self.loops and "_library" not in self.__dict__ and compiler.compiler() is not None
         return Compiled, parts, {"_text": self.source() if travels else None}
@@ -390,12 +392,9 @@ class Compiled:
 
         Returns
         -------
-        t : (S + 1,) array
-            Starts of the steps and end of the last one [s]; the end is before t1 if the step length vanishes.
-        x : (n_x, S + 1) array
-            States at these times, SI.
-        y : (n_y, S) array
-            Outputs at the starts.
+        (S + 1, 1 + n_x + n_y) array
+            t, x and outputs at the starts of the S steps, and t and x at the end of the last one, which lies before t1
+            if the step length vanishes.
 
         Raises
         ------
@@ -405,8 +404,30 @@ class Compiled:
         self._require_loop("taylor")
         self._place(self._library, t0, x0, p)
         every = project_every if self._project is not None else 0
-        log = self._library.taylor(t1, rtol, atol, every, max_steps)
-        return log[:, 0], log[:, 1 : 1 + self.n_x].T, log[:-1, 1 + self.n_x :].T
+        return self._library.taylor(t1, rtol, atol, every, max_steps)
+
+    def jets(self, log, k, t, levels):
+        """The jets q, γ', ..., γ^(levels) at instants within the steps of `taylor`.
+
+        Parameters
+        ----------
+        log : (S + 1, 1 + n_x + n_y) array
+            From `taylor`.
+        k : (N,) array of int
+            Steps, 0 .. S - 1.
+        t : (N,) array
+            Times [s].
+        levels : int
+            Below ``sizes["last"]``.
+
+        Returns
+        -------
+        (nq + levels n, N) array
+        """
+        k, t = np.ascontiguousarray(k, dtype=np.int64), np.ascontiguousarray(t, dtype=float)
+        z = np.empty((self.sizes["nq"] + levels * self.sizes["n"], t.size))
+        self._library.jets(np.ascontiguousarray(log), k, t, levels, z)
+        return z
 
     def restore(self, t, x, p):
         """The state (n_x,) with its invariants restored by `project`, by CasADi; x if there is no `project`."""
@@ -473,7 +494,7 @@ class Compiled:
     def source(self):
         """C text of the library."""
         if self._text is None:
-            parts = {"project": self._project, "others": self._others, "sizes": self._sizes}
+            parts = {"project": self._project, "others": self._others, "sizes": self.sizes}
             self._text = emit.emit(self.expression, self._symbol, self.loops, **parts, wide="newton" in self.loops)
         return self._text
 

@@ -1,16 +1,20 @@
 """Evaluations and loops of a function by CasADi and NumPy: for short motions, and where there is no compiler."""
 
+import ctypes
 import functools
 import threading
 from itertools import pairwise
+from math import perm
 
 import numpy as np
 
 from servoctl.codegen.loops import (
+    BEND,
     CONTRACTION,
     CORRECTED,
     CORRECTIONS,
     FOLLOWED,
+    LAST_TERM,
     QUADRATIC,
     ROUNDING,
     SHORTEST,
@@ -32,14 +36,16 @@ class Workspace(threading.local):
         parts = np.split(row, np.cumsum([1, n_x, n_p]))
         run, self._alive = connect(row, parts)
         self.row, self.buffer = (*map(memoryview, parts[:3]), parts[3], run), (*parts, run)
-        self.start, self.address = row[: 1 + n_x + n_p], row.ctypes.data
-        self._log = np.empty((0, 0)), 0
+        self.start, self._log = row[: 1 + n_x + n_p], np.empty((0, 0))
+        self._task = np.zeros(7)  # the Steps of taylor.c: five numbers, and the addresses of the start and the log
+        self._task.view(np.int64)[5] = row.ctypes.data
+        self.task, self.pointer = memoryview(self._task), ctypes.c_void_p(self._task.ctypes.data)
 
     def log(self, rows, columns):
-        """Memory for a log and its address; the next log overwrites it."""
-        if len(self._log[0]) < rows:
-            log = np.empty((rows, columns))
-            self._log = log, log.ctypes.data
+        """Memory for a log; the next log overwrites it."""
+        if len(self._log) < rows:
+            self._log = np.empty((rows, columns))
+            self._task.view(np.int64)[6] = self._log.ctypes.data
         return self._log
 
 
@@ -146,8 +152,8 @@ class Interpreter:
             y = self._value(t, x, p)
             of_q = y[: nq * last].reshape(last, nq)
             c = of_q if plain else y[nq * last : (nq + n) * last].reshape(last, n)
-            h = step_length(x, c, (nq, n, top), rtol, atol)
-            h = h if plain else min(h, step_length(x, of_q, (nq, nq, 1), rtol, atol))
+            of_rates = x[nq:].reshape(top - 1, n)
+            h = 2.0 ** min(longest(x[None, :nq], of_q, 0, rtol, atol), longest(of_rates, c, 1, rtol, atol))
             if not h > 1e-13 * (1 + abs(t)):
                 break
             ends = h >= abs(t1 - t) * (1 - 1e-12)
@@ -160,6 +166,17 @@ class Interpreter:
             if every and len(rows) % every == 0:
                 x = self._restore(t, x, p)
         return np.array([*rows, end])
+
+    def jets(self, log, k, t, levels, z):
+        """Fill z with the jets at times t in the steps k of a log; see `Compiled.jets`."""
+        nq, n, last, plain = (self._sizes[key] for key in ("nq", "n", "last", "plain"))
+        x, y = log[k, 1 : 1 + nq], log[k, 1 + self._n_x :]
+        of_q = y[:, : nq * last].reshape(-1, last, nq)
+        c = of_q if plain else y[:, nq * last : (nq + n) * last].reshape(-1, last, n)
+        h = (t - log[k, 0])[:, None]
+        z[:nq] = (x + jet(of_q, 0, h)).T
+        for j in range(1, levels + 1):
+            z[nq + (j - 1) * n : nq + j * n] = jet(c, j, h).T
 
     def _restore(self, t, x, p):
         return restored(self._project, t, x, p)
@@ -239,29 +256,34 @@ def restored_grid(project, t, x, p):
 
 
 def jet(c, j, h):
-    """Change (n,) of the j-th derivative in a time h, from Taylor coefficients c (last, n) of index 1 .. last."""
-    k = np.arange(1, len(c) + 1)
-    falling = np.prod([k - m for m in range(j)], axis=0) if j else np.ones(len(c))
-    total = np.zeros(c.shape[1])
-    for i in reversed(range(max(j, 1) - 1, len(c))):
-        total = total * h + falling[i] * c[i]
+    """Change (..., n) of the j-th derivative in times h (..., 1), from coefficients c (..., last, n) of index 1 on."""
+    total, last = np.zeros(c.shape[:-2] + c.shape[-1:]), c.shape[-2]
+    for k in range(last, max(j, 1) - 1, -1):
+        total = total * h + float(perm(k, j)) * c[..., k - 1, :]
     return total if j else total * h
 
 
-def step_length(x, c, shape, rtol, atol):
-    """The step at which the last term meets the tolerance, if terms grow as the fastest of the upper half."""
-    nq, n, top = shape
-    h, last = np.inf, len(c)
-    for j in range(top):
-        level = x[:nq] if j == 0 else x[nq + (j - 1) * n : nq + j * n]
-        scale = atol + rtol * np.max(np.abs(level), initial=0.0)
-        for k in range(last // 2 if last // 2 > j else j + 1, last + 1):
-            term = np.prod([k - m for m in range(j)]) * np.max(np.abs(c[k - 1]), initial=0.0)
-            if not np.isfinite(term):
-                return 0.0
-            if term > 0:
-                h = min(h, rtol ** (1.0 / (last - j)) * (scale / rtol / term) ** (1.0 / (k - j)))
-    return h
+def rough_log2(a):
+    """log2 of numbers >= 0 from their bits, as in taylor.c."""
+    bits = np.asarray(a, dtype=float).view(np.int64)
+    f = ((bits & 0x000FFFFFFFFFFFFF) | 0x3FF0000000000000).view(float) - 1.0
+    return (bits >> 52) - 1023.0 + f * (1.0 + BEND - BEND * f)
+
+
+def longest(levels, c, first, rtol, atol):
+    """log2 of the step at which the last term meets the tolerance, if terms grow as the fastest of four of them.
+
+    `levels` are consecutive levels of the state from `first` on, c (last, n) their Taylor coefficients.
+    """
+    last, shortest = len(c), np.inf
+    for j, level in enumerate(levels, first):
+        k = np.array([last, last - 1, last // 2 + 1, last // 2])
+        k = k[k > j]
+        falling = np.prod([k - m + 0.0 for m in range(j)], axis=0) if j else np.ones(len(k))
+        scale = rough_log2(atol / rtol + np.abs(level).max(initial=0.0))
+        terms = rough_log2(np.abs(c[k - 1]).max(axis=1, initial=0.0)) + rough_log2(falling)
+        shortest = np.min(np.log2(LAST_TERM * rtol) / (last - j) + (scale - terms) / (k - j), initial=shortest)
+    return shortest
 
 
 def _distance(x, other):

@@ -12,8 +12,11 @@ CONTRACTION = 0.25  # largest ratio of two Newton corrections at one instant: an
 FOLLOWED = 0.02  # largest error of a step's prediction, relative to the way of the step
 STEADY = 0.25  # smallest ratio of a pivot to itself in a step: none is jumped over, none loses its digits in one step
 SHORTEST = 2.0**-32  # of the longest step in a piece: the path ends where a shorter one would be needed
+TERMS = 4  # coefficients of a Taylor series whose growth gives the step: two even ones and two odd ones
+LAST_TERM = 0.1  # of the tolerance, at the end of a step: the terms that are left out and earlier errors add to it
+BEND = 0.344  # of the parabola in place of log2 between powers of two
 
-NEWTON = {  # constants that C needs by name
+CONSTANTS = {  # that C needs by name
     "CORRECTIONS": CORRECTIONS,
     "CORRECTED": CORRECTED,
     "ROUNDING": ROUNDING,
@@ -22,6 +25,9 @@ NEWTON = {  # constants that C needs by name
     "FOLLOWED": FOLLOWED,
     "STEADY": STEADY,
     "SHORTEST": SHORTEST,
+    "TERMS": TERMS,
+    "LAST_TERM": LAST_TERM,
+    "BEND": BEND,
 }
 
 LOOPS = ("rk", "newton", "taylor", "radau", "closed", "law")  # files of these names; rk.c defines NAME_rk

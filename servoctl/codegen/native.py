@@ -52,16 +52,20 @@ class Library:
     def taylor(self, t1, rtol, atol, every, max_steps):
         """Rows (t, x, y) of the steps from the start in the workspace; see `Compiled.taylor`."""
         workspace = self.workspace
-        log, address = workspace.log(max_steps + 1, self._columns)
-        steps = self._taylor(workspace.address, t1, rtol, atol, every, max_steps, address)
-        return log[: steps + 1].copy()
+        log, task = workspace.log(max_steps + 1, self._columns), workspace.task
+        task[0], task[1], task[2], task[3], task[4] = t1, rtol, atol, every, max_steps
+        return log[: self._taylor(workspace.pointer) + 1].copy()
 
     @functools.cached_property
     def _taylor(self):
         run = self.native("taylor")
         run.restype = ctypes.c_int64
-        run.argtypes = (ctypes.c_void_p, *3 * [ctypes.c_double], *2 * [ctypes.c_int64], ctypes.c_void_p)
         return run
+
+    def jets(self, log, k, t, levels, z):
+        """Fill z with the jets at times t in the steps k of a log; see `Compiled.jets`."""
+        size, levels = ctypes.c_int64(t.size), ctypes.c_int64(levels)
+        self.native("taylor_jets")(pointer(log), size, pointer(k), pointer(t), levels, pointer(z))
 
     def continuation(self, cuts, x0, p, longest, nodes):
         """Fill rows of nodes; return their number and that of evaluations. See `Compiled.continuation`."""

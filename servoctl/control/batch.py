@@ -10,6 +10,7 @@ import casadi as ca
 import numpy as np
 
 from servoctl.codegen import compiler, emit
+from servoctl.codegen.compiler import lanes
 from servoctl.codegen.function import Compiled, compiled
 from servoctl.codegen.native import pointer
 from servoctl.control.loop import Arguments
@@ -18,12 +19,6 @@ INLINED = 300  # operations of the plant's rates, up to which they are inlined i
 PER_THREAD = 16  # tasks, so that threads end at about the same time
 
 _UNITS = weakref.WeakKeyDictionary()  # step of a law -> its units
-
-
-def lanes():
-    """Number of cases in one vector: 8 with AVX-512, 4 with AVX2, else 1."""
-    features = compiler.features()
-    return 8 if "avx512f" in features else 4 if "avx2" in features else 1
 
 
 @dataclass(frozen=True, eq=False)

@@ -21,7 +21,7 @@ from servoctl.run import Run
 from servoctl.values import Deferred
 
 MARGINAL = 1 + 1e-6  # spectral radius up to which a mode that no input reaches neither decays nor grows
-DECAYS = 1e-9  # how far below 1 the spectral radius under a steady gain is at least: nearer it is a neutral mode's rounding
+DECAYS = 1e-9  # how far below 1 the spectral radius under a steady gain is: nearer it is a neutral mode's rounding
 UNREACHED = 1e-7  # product of a mode with the inputs' directions, each of size 1, below which no input reaches it
 NAMED = 0.05  # share of a state in a mode, of the largest, above which an error names it
 COMPARED = 8  # samples along the plan at which a combination of states must be conserved

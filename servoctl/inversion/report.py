@@ -233,7 +233,7 @@ def report(
             model, run = derive(model, run), None
         except NotRealisable as error:
             return _not_realisable(model, run, error)
-    _require_motion(model, run)
+    model = _require_motion(model, run)
     limits = {name: interval(name, value, "limit") for name, value in mapping(limits, "The limits").items()}
     along = run if isinstance(run, Run) else None
     _require_limits(model, along, limits)
@@ -266,7 +266,7 @@ def _not_realisable(mechanism, program, error):
 
 
 def _require_motion(model, run):
-    """Refuse what is no model, and a motion of another one."""
+    """The model of a motion; refuse what is no model, and a motion of another one."""
     if not isinstance(model, Model) or not (run is None or isinstance(run, (Run, State))):
         raise SpecificationError(
             f"sv.report received a {type(model).__name__} and a {type(run).__name__}.",
@@ -275,10 +275,8 @@ def _require_motion(model, run):
             model=type(model).__name__,
             run=type(run).__name__,
         )
-    if isinstance(run, Run):
-        require_model(model, run, "report")
-    elif run is not None and tuple(run.names) != model.state_names:
-        require_model(model, SimpleNamespace(model=model, jets=(), jet_names=run.names), "report")
+    motion = run if isinstance(run, Run) else SimpleNamespace(model=model, jets=(), jet_names=getattr(run, "names", ()))
+    return model if run is None else require_model(model, motion, "report")
 
 
 def _require_limits(model, run, limits):

@@ -265,7 +265,7 @@ _STEEP = {
 }  # not sin and cos, which are as steep everywhere
 
 
-def steep_arguments(expressions):
+def steep_arguments(expressions, squares=True):
     """The arguments near whose zeros, or least magnitudes, functions in expressions may change much in a short time.
 
     A bump exp(-(k z)²), a blend tanh(k z) or a pole 1/(z² + a²) is narrow about z = 0.
@@ -273,6 +273,8 @@ def steep_arguments(expressions):
     Parameters
     ----------
     expressions : sequence of SX scalars
+    squares : bool
+        Whether squares and whole powers count, which are narrow inside other functions alone.
 
     Returns
     -------
@@ -283,13 +285,20 @@ def steep_arguments(expressions):
 
     def value(op, operands):
         arguments = [work[i] for i in operands]
-        if op in _STEEP:
+        if op in _STEEP and (squares or not _whole_power(op, arguments)):
             steep = arguments[1:] if op == ca.OP_DIV else arguments
             result.update((a.element_hash(), a) for a in steep if not a.is_constant())
         return apply_code(op, *arguments)
 
     replayed(expressions, work, lambda expression, symbol: expression, value)
     return list(result.values())
+
+
+def _whole_power(op, arguments):
+    if op in (ca.OP_POW, ca.OP_CONSTPOW) and arguments[1].is_constant():
+        exponent = float(arguments[1])
+        return exponent >= 0 and exponent == round(exponent)
+    return op == ca.OP_SQ
 
 
 _SIZES = {

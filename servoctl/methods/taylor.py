@@ -5,19 +5,21 @@ coefficient κ - o_a, computed with γ_[κ] = 0, and L γ_[κ] = -((κ - o_a)!/�
 motion by one solve with the same L.
 """
 
+from dataclasses import dataclass, replace
 from math import factorial
 
 import casadi as ca
 import numpy as np
 
-from servoctl.codegen.function import compiled
-from servoctl.jets.series import Motion, Series, is_zero, shifted
+from servoctl.codegen.function import Compiled, compiled
+from servoctl.jets.series import Motion, Series, is_zero, over, shifted
 from servoctl.jets.tape import Tape
 from servoctl.methods.choice import Project
 from servoctl.methods.monitor import DenseStretch, Fine, Repivot
 from servoctl.methods.motion import Stepping
 from servoctl.methods.narrow import arguments, centres
 from servoctl.methods.watch import RESOLUTION, End, net, steps_of
+from servoctl.reduction.cascade import Running
 from servoctl.reduction.ranks import clean, eliminate
 
 LOWEST, HIGHEST = 4, 24  # orders: below, steps are too short; above, compiling grows faster than steps
@@ -38,6 +40,18 @@ class _Branches(Series):
         return ca.copysign(c, c) if isinstance(c, ca.SX) and not c.is_constant() else c
 
 
+def _decided(q, symbols, tape, instant):
+    """Values of the nodes of a tape that depend on time alone, at the instant that selects branches."""
+    places = [q.where(s) for s in symbols]
+    timed = [place is None or place[0] == "t" for place in places]
+    at = [[instant if place and place[0] == "t" else s] for s, place in zip(symbols, places, strict=True)]
+    values, alone = Series(tape, at), []
+    values.advance()
+    for node in tape.nodes:
+        alone.append(timed[node.data] if node.kind == "input" else all(alone[a] for a in node.args))
+    return {i: values.c[i][0] for i, of_time in enumerate(alone) if of_time}
+
+
 class _Group:
     """Rows of one order with their running series."""
 
@@ -46,18 +60,7 @@ class _Group:
         self.symbols = ca.symvar(ca.vertcat(*expressions))
         self.inputs = [[] for _ in self.symbols]
         tape = Tape(self.symbols, expressions)
-        self.series = _Branches(tape, self.inputs, self._decided(tape))
-
-    def _decided(self, tape):
-        """Values of the nodes that depend on time alone, at the instant that selects branches."""
-        place = self.motion.q.where
-        timed = [place(s) is None or place(s)[0] == "t" for s in self.symbols]
-        at = [[self.motion.branch if (place(s) or ("",))[0] == "t" else s] for s in self.symbols]
-        values, alone = Series(tape, at), []
-        values.advance()
-        for node in tape.nodes:
-            alone.append(timed[node.data] if node.kind == "input" else all(alone[a] for a in node.args))
-        return {i: values.c[i][0] for i, of_time in enumerate(alone) if of_time}
+        self.series = _Branches(tape, self.inputs, _decided(motion.q, self.symbols, tape, motion.branch))
 
     def advance(self, k):
         """Coefficient k - order of the rows, from the motion's coefficients up to k."""
@@ -70,6 +73,16 @@ class _Group:
         """Repeat the last coefficient with the solution γ_[k]."""
         j = k - self.order
         self.series.replace_last({i: self.motion.coefficient(s, j) for i, s in enumerate(self.symbols)})
+
+
+class _InBlock(Running):
+    """Rows of a block with their series, whose branches stay where an instant selects them."""
+
+    instant = ca.SX.sym("t_branch")
+
+    def run(self, tape):
+        decided = _decided(self.motion.q, self.symbols, tape, self.instant)
+        return _Branches(tape, [[] for _ in self.symbols], decided)
 
 
 class _Motion(Motion):
@@ -90,7 +103,7 @@ class _Motion(Motion):
         if self.q.plain:
             self.coordinates[k] = self.gamma[k]
         else:
-            self.coordinates[k] = [c if is_zero(c) else c / k for c in self.kinematics.advance(k)]
+            self.coordinates[k] = [c if is_zero(c) else over(c, k) for c in self.kinematics.advance(k)]
 
     def guess(self, k):
         """Set γ_[k] = 0, and q_[k] with it."""
@@ -104,7 +117,8 @@ class _Motion(Motion):
             self.coordinates[k] = gamma
         else:
             self.kinematics.correct(k)
-            self.coordinates[k] = [c[-1] if is_zero(c[-1]) else c[-1] / k for c in self.kinematics.series.outputs]
+            latest = (c[-1] for c in self.kinematics.series.outputs)
+            self.coordinates[k] = [c if is_zero(c) else over(c, k) for c in latest]
 
     def coordinate(self, i, j):
         return self.coordinates[j][i]
@@ -129,6 +143,9 @@ def taylor_coefficients(equations, last):
         q_[last] (left out if q' = γ'), γ_[1], ..., γ_[last], pivots.
     """
     r, q = equations.r, equations.q
+    if r.cascade is not None:
+        motion = r.cascade.along(r.points, equations.top - 1, last, running=_InBlock)
+        return _coefficients(equations, motion.place, motion.gamma, last, _InBlock.instant)
     motion = _Motion(equations)
     groups = []
     for order in sorted({row.order for row in r.rows}):
@@ -148,10 +165,15 @@ def taylor_coefficients(equations, last):
         motion.settle(k, [0.0 if x.is_zero() else x for x in solution.elements()])
         for group in groups:
             group.correct(k)
-    coefficients = [] if q.plain else [ca.SX(c) for k in range(1, last + 1) for c in motion.coordinates[k]]
-    coefficients += [ca.SX(c) for k in range(1, last + 1) for c in motion.gamma[k]]
+    return _coefficients(equations, motion.coordinates, motion.gamma, last, motion.branch)
+
+
+def _coefficients(equations, coordinates, gamma, last, instant):
+    """What `taylor_coefficients` returns, from coefficients by index."""
+    coefficients = [] if equations.q.plain else [ca.SX(c) for k in range(1, last + 1) for c in coordinates[k]]
+    coefficients += [ca.SX(c) for k in range(1, last + 1) for c in gamma[k]]
     outputs = [*coefficients, *(g for _, g in equations.pivots)]
-    return equations.function("taylor", equations.state, outputs, motion.branch)
+    return equations.function("taylor", equations.state, outputs, instant)
 
 
 def series_loop(model, last):
@@ -217,9 +239,9 @@ class TaylorSteps(Stepping):
         self.model, self.n_x = model, len(model.state_names)
         last = max(self.order + model.reduction.top - 1, self.jets + 1)
         self.f, self.rates = series_loop(model, last), model.function("ode")
-        self.nq, self.n, self.top, self.last = model.nq, model.n, model.reduction.top, last
-        self.plain = model.reduction.mechanism.q.plain
-        self.n_c = (0 if self.plain else self.nq * last) + self.n * last
+        self.nq, self.n, self.top = model.nq, model.n, model.reduction.top
+        plain = model.reduction.mechanism.q.plain
+        self.n_c = (0 if plain else self.nq * last) + self.n * last
 
     def _start(self, t, x, b):
         self.p = np.append(self.model.parameters, (t + b) / 2)
@@ -238,20 +260,22 @@ class TaylorSteps(Stepping):
         self.watch.begin(a)
         until = b
         while a != b and self.motion.stop is None:
-            t, states, y = self.f.taylor(a, x, until, self.p, *self.tolerances, self.most, self.every)
-            taken, good = y.shape[1], self._believed(t, states, y, abs(b - a))
+            rows = self.f.taylor(a, x, until, self.p, *self.tolerances, self.most, self.every)
+            log = _Log(self.f, self.n_x, rows)
+            taken, good = len(rows) - 1, self._believed(log, abs(b - a))
             if good < taken:
-                until = (t[good] + t[good + 1]) / 2  # the next step ends there
-                t, states, y = t[: good + 1], states[:, : good + 1], y[:, :good]
+                until = (log.t[good] + log.t[good + 1]) / 2  # the next step ends there
+                log = log.first(good)
+            t, states = log.t, log.states
             failed, until = good == taken < self.most and t[-1] != until, until if good < taken else b
             if not (good or failed):
                 continue
-            outcome = self._inspected(self._stretch(t, states, y))
+            outcome = self._inspected(self._stretch(log))
             fine, steps = isinstance(outcome, Fine), outcome.steps
             self.motion.count(steps=steps, nfev=steps)
             if isinstance(outcome, End) and outcome.event:  # which is the last sample
                 times = np.union1d(times, outcome.t)[:: 1 if t[-1] >= t[0] else -1]
-            times = self._sample(t, states, y, times, t[steps] if fine else outcome.t)
+            times = self._sample(log, times, t[steps] if fine else outcome.t)
             if isinstance(outcome, End):
                 self._turn(outcome, b)
                 return outcome.t, outcome.x
@@ -263,29 +287,30 @@ class TaylorSteps(Stepping):
             elif failed:
                 self._fail(a, x, "its steps vanish or are not finite")
         if len(times) and self.motion.stop is None:
-            self._sample(np.array([a, a]), np.column_stack([x, x]), self._outputs(a, x)[:, None], times, a)
+            row = np.concatenate([[a], x, self._outputs(a, x)])
+            self._sample(_Log(self.f, self.n_x, np.array([row, row])), times, a)
         return a, x
 
-    def _believed(self, t, states, y, span):
+    def _believed(self, log, span):
         """The number of steps whose series meet the equations, at instants within them.
 
         A series at one state knows nothing of what is flat there, such as exp(-(100 (t - 3))²) at t = 0.
         """
-        h, n = np.diff(t), self.n
+        t, h, n = log.t, np.diff(log.t), self.n
         if not len(h):
             return 0
-        k, at = self._instants(t, states, y)
-        jets = self._jets(states[:, k], y[:, k], at - t[k], self.top)
+        k, at = self._instants(log)
+        jets = log.jets(k, at, self.top)
         rates = self.rates.grid(at, jets[: self.n_x], self.model.parameters)[self.n_x - n : self.n_x]
         rtol, atol = self.tolerances
-        sizes = np.maximum(np.abs(states[-n:]).max(), np.abs(h[k] * jets[-n:]).max(axis=0))
+        sizes = np.maximum(np.abs(log.states[-n:]).max(), np.abs(h[k] * jets[-n:]).max(axis=0))
         error = np.abs(h[k] * (rates - jets[-n:])).max(axis=0)
         wrong = (error > FAR_OFF * (atol + rtol * sizes)) & (np.abs(h[k]) > SMALLEST * span)
-        return int(k[wrong].min(initial=len(h)))
+        return int(k[wrong].min(initial=len(t) - 1))
 
-    def _instants(self, t, states, y):
+    def _instants(self, log):
         """Steps and instants within them at which series are compared with the equations."""
-        h = np.diff(t)
+        t, h = log.t, np.diff(log.t)
         each, further, _ = net(t, self.watch.span / RESOLUTION, 1)
         k = np.concatenate([np.repeat(np.arange(len(h)), len(INSIDE)), each])
         at = np.concatenate([(t[:-1, None] + INSIDE * h[:, None]).ravel(), further])
@@ -295,56 +320,68 @@ class TaylorSteps(Stepping):
             parts = np.append(t[:1], at[order]), np.append(0, k[order])
 
             def dense(s):
-                i = steps_of(t, s)
-                return self._jets(states[:, i], y[:, i], s - t[i], self.top - 1)
+                return log.jets(steps_of(t, s), s, self.top - 1)
 
             more = centres(steep, self.model.parameters, parts[0], dense(parts[0]), dense)
             k, at = np.append(k, steps_of(t, more)), np.append(at, more)
         within = (at != t[k]) & ~np.isin(at, list(self.knots))  # where paths have other branches
         return k[within], at[within]
 
-    def _stretch(self, t, states, y):
+    def _stretch(self, log):
         """The steps for the monitor; pivots inside them cost a series each, so only suspicious steps evaluate them."""
-        ends = np.column_stack([y[self.n_c :, 1:], self._pivots(t[-1], states[:, -1])]) if len(t) > 1 else y[self.n_c :]
+        t, states, pivots = log.t, log.states, log.outputs[self.n_c :]
+        ends = np.column_stack([pivots[:, 1:], self._pivots(t[-1], states[:, -1])]) if len(t) > 1 else pivots
         return DenseStretch(
             t,
             states,
             ends[:, :, None],
             self._top,
-            dense=lambda k, s: self._jets(states[:, k], y[:, k], s - t[k], self.top - 1),
+            dense=lambda k, s: log.jets(k, s, self.top - 1),
             pivots_at=self._pivots,
             resumes=True,
         )
 
-    def _coefficients(self, y):
-        """Coefficients of q and of γ with index 1 .. last."""
-        of_q = y[: self.nq * self.last].reshape(self.last, self.nq, -1)
-        return of_q, of_q if self.plain else y[self.nq * self.last : self.n_c].reshape(self.last, self.n, -1)
-
-    def _jets(self, x, y, h, top):
-        """Jets q, γ', ..., γ^(top) at times h (N,) after the starts of steps, (nq + top n, N)."""
-        of_q, of_gamma = self._coefficients(y)
-        q = x[: self.nq] + _level(of_q, 0, h)
-        return np.concatenate([q, *(_level(of_gamma, j, h) for j in range(1, top + 1))])
-
-    def _sample(self, t, states, y, pending, end):
+    def _sample(self, log, pending, end):
         """Record the pending samples up to `end` and return those that remain."""
-        if not y.shape[1]:
+        t = log.t
+        if len(t) < 2:
             return pending
         direction = 1.0 if t[-1] >= t[0] else -1.0
         due = direction * pending <= direction * end
         times = pending[due]
         if len(times):
-            k = np.clip(np.searchsorted(direction * t, direction * times, "right") - 1, 0, y.shape[1] - 1)
-            parts = self._jets(states[:, k], y[:, k], times - t[k], self.jets)
-            n_x = len(states)
-            self.motion.add(self.model, times, parts[:n_x], parts[n_x:])
+            parts = log.jets(steps_of(t, times), times, self.jets)
+            self.motion.add(self.model, times, parts[: self.n_x], parts[self.n_x :])
         return pending[~due]
 
 
-def _level(c, j, h):
-    """The j-th derivative at times h (N,) of series with coefficients c (last, n, N), less the constant for j = 0."""
-    total = np.zeros(c.shape[1:])
-    for k in range(len(c), max(j, 1) - 1, -1):
-        total = total * h + float(factorial(k) // factorial(k - j)) * c[k - 1]
-    return total * h if j == 0 else total
+@dataclass(frozen=True)
+class _Log:
+    """Steps of the method with the series at their starts, as `Compiled.taylor` returns them."""
+
+    f: Compiled
+    n_x: int
+    rows: np.ndarray
+
+    @property
+    def t(self):
+        """Ends of the steps (S + 1,) [s]."""
+        return self.rows[:, 0]
+
+    @property
+    def states(self):
+        """X (n_x, S + 1) there."""
+        return self.rows[:, 1 : 1 + self.n_x].T
+
+    @property
+    def outputs(self):
+        """Coefficients and pivots (n_y, S) at the starts."""
+        return self.rows[:-1, 1 + self.n_x :].T
+
+    def first(self, count):
+        """The first steps alone."""
+        return replace(self, rows=self.rows[: count + 1])
+
+    def jets(self, k, t, top):
+        """Jets q, γ', ..., γ^(top) at times t (N,) in the steps k (N,), (nq + top n, N)."""
+        return self.f.jets(self.rows, k, t, top)

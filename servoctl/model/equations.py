@@ -24,10 +24,13 @@ class Invariants:
         s̄.
     points : Points
         Points of the manifold of the rows, at which pivots are chosen.
+    cascade : Cascade, optional
+        The rows by blocks.
     """
 
-    def __init__(self, mechanism, rows, top, points):
+    def __init__(self, mechanism, rows, top, points, cascade=None):
         self.mechanism, self.rows, self.top, self.points = mechanism, rows, top, points
+        self.cascade, self._motions = cascade, {}
         q = self.q = mechanism.q
         self.state = ca.vertcat(*q, *(s for k in range(1, top) for s in q.gamma(k)))
         self.parameters = ca.vertcat(*mechanism.parameters.symbols)
@@ -36,10 +39,25 @@ class Invariants:
     @cached_property
     def levels(self):
         """For each row its total time derivatives of orders 0 .. s̄ - o_a."""
-        return [
-            [level[0] for level in self.q.derivatives([row.expression], count)]
-            for row, count in zip(self.rows, self.raised, strict=True)
-        ]
+        if self.cascade is not None:
+            return [
+                [self._along(row.order + j).levels[a] for j in range(count + 1)]
+                for a, (row, count) in enumerate(zip(self.rows, self.raised, strict=True))
+            ]
+        return [self._levels(row) for row in self.rows]
+
+    def _levels(self, row):
+        """Total time derivatives of a row of orders 0 .. s̄ - o_a, by its expression."""
+        return [level[0] for level in self.q.derivatives([row.expression], max(0, self.top - row.order))]
+
+    def _along(self, given, correct=False):
+        """The motion of the cascade by its jets up to a given level."""
+        if (given, correct) not in self._motions:
+            with noting_dropped() as entries:
+                motion = self.cascade.along(self.points, given, max(given, self.top), correct)
+            motion.dropped = entries
+            self._motions[given, correct] = motion
+        return self._motions[given, correct]
 
     def function(self, name, x, outputs, extra=None):
         """An SX function of (t, x, p) with one dense column."""
@@ -68,7 +86,7 @@ class Invariants:
             values = ca.vertcat(*(self.levels[a][level - self.rows[a].order] for a in rows))
             change = ca.SX.zeros(q.n)
             if rows:
-                J = ca.vertcat(*(self.rows[a].gradient(q) for a in rows))
+                J = self.slopes(rows, values, level)
                 saddle = ca.vertcat(ca.horzcat(mass, J.T), ca.horzcat(J, ca.SX.zeros(len(rows), len(rows))))
                 numbers = clean(*self.points.matrix(saddle))
                 change = eliminate(saddle, ca.vertcat(ca.SX.zeros(q.n), -values), numbers)[0][: q.n]
@@ -76,6 +94,13 @@ class Invariants:
                 change = q.V @ change + self._restore_kinematics()
             changes.append(change)
         return self.function("project", self.state, changes)
+
+    def slopes(self, rows, values, level):
+        """∂/∂γ^(level), or ∂/∂q V, of the values of rows at their derivatives of this level."""
+        if self.cascade is None:
+            return ca.vertcat(*(self.rows[a].gradient(self.q) for a in rows))
+        slopes = ca.jacobian(values, self.q.jet(level))
+        return slopes if level else slopes @ self.q.V
 
     def _restore_kinematics(self):
         """The least change of q that restores the invariants of the kinematics."""
@@ -96,7 +121,7 @@ class Equations(Invariants):
     """
 
     def __init__(self, reduction):
-        super().__init__(reduction.mechanism, reduction.rows, reduction.top, reduction.points)
+        super().__init__(reduction.mechanism, reduction.rows, reduction.top, reduction.points, reduction.cascade)
         self.r = reduction
         self.jets = ca.vertcat(self.state, *self.q.gamma(self.top))
         self.coefficients = [
@@ -126,6 +151,9 @@ class Equations(Invariants):
     @cached_property
     def _leading(self):
         """The pivots of L, and what its elimination leaves out."""
+        if self.cascade is not None:
+            motion = self._along(self.top - 1 if self.r.free else 0)
+            return motion.pivots, motion.dropped
         with noting_dropped() as entries:
             return self._solve(ca.SX(self.q.n, 0))[1], entries
 
@@ -143,7 +171,15 @@ class Equations(Invariants):
 
     def dense(self, poles=False):
         """γ^(s̄) from the rows, L γ^(s̄) = -rest."""
+        if self.cascade is not None:
+            return self._along(self.top - 1).jet(self.top) if not poles else self._by_blocks_with_poles()
         return self._solve(-ca.vertcat(*self.rest(range(len(self.levels)), poles)))[0]
+
+    def _by_blocks_with_poles(self):
+        """γ^(s̄) by the cascade, with error dynamics."""
+        pairs = zip(self.coefficients, self.levels, strict=True)
+        errors = {a: sum(c * e for c, e in zip(some, lower[:-1], strict=True)) for a, (some, lower) in enumerate(pairs)}
+        return self.cascade.along(self.points, self.top - 1, self.top, errors=errors).jet(self.top)
 
     @cached_property
     def _all_pivots(self):
@@ -233,6 +269,8 @@ class Equations(Invariants):
         With quasi-velocities (δq, q', q'', γ', γ'', pivots).
         """
         q, n = self.q, self.q.n
+        if self.cascade is not None:
+            return self._path_by_blocks()
         zero = ca.SX.zeros(n)
         w, dw = q.jet(1), q.jet(2)
         first = ca.vertcat(*(level[1] for level in self.levels))
@@ -246,6 +284,16 @@ class Equations(Invariants):
             ca.substitute(e, ca.vertcat(w, dw), ca.vertcat(velocity, acceleration)) for e in moving
         )
         return self.function("path", q.jet(0), [self._newton(), rate, second, *jets, *pivots])
+
+    def _path_by_blocks(self):
+        """`path` by the cascade."""
+        q, motion = self.q, self._along(0, correct=True)
+        steady = [any(q.where(s) is not None for s in ca.symvar(p)) for p in self._along(0).pivots]
+        of_rows = [p for name, p in self.pivots if not name.startswith("leading matrix")]
+        pivots = [*of_rows, *(p for p, moves in zip(motion.pivots, steady, strict=True) if moves)]
+        jets = [] if q.plain else [motion.jet(1), motion.jet(2)]
+        outputs = [ca.vertcat(*motion.newton), motion.rates(1), motion.rates(2), *jets, *pivots]
+        return self.function("path", q.jet(0), outputs)
 
     def _newton(self):
         q = self.q
@@ -376,10 +424,11 @@ class Equations(Invariants):
     def _residuals(self):
         """Given residuals, material constraints and hidden rows, at every level up to order s̄."""
         names, expressions = [], []
+        deep = {} if self.cascade is None else dict(zip(map(id, self.rows), self.levels, strict=True))
         for name, row in residual_rows(self.r).items():
-            levels = self.q.derivatives([row.expression], max(0, self.top - row.order))
+            levels = deep[id(row)] if id(row) in deep else self._levels(row)
             names += [(name, j) for j in range(len(levels))]
-            expressions += [level[0] for level in levels]
+            expressions += levels
         reported, invariants = self.r.mechanism.reported, self.q.invariants
         names += [(name, 0) for name in reported]
         expressions += reported.values()
@@ -393,6 +442,10 @@ class Equations(Invariants):
         """
         places = filter(None, map(self.q.where, ca.symvar(expression)))
         highest = max((level for of, level, _ in places if of not in ("t", "q")), default=0)
+        if self.cascade is not None and highest > self.top:
+            motion, above = self.cascade.along(self.points, self.top, highest), range(self.top + 1, highest + 1)
+            jets = [ca.vertcat(*(e for k in above for e in part(k).elements())) for part in (self.q.jet, motion.jet)]
+            return ca.substitute(expression, *jets)
         for k in range(highest, self.top, -1):
             jet = self.q.jet(k)
             pairs = zip(self.r.rows, self.raised, strict=True)

@@ -1,6 +1,6 @@
 """The model: a reduction as functions on numbers, built at their first use."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
 from math import factorial
@@ -19,7 +19,7 @@ from servoctl.model.rest import started
 from servoctl.model.start import State
 from servoctl.model.store import Store, pack, unpack
 from servoctl.reduction.appell import require_positive
-from servoctl.reduction.idle import needed
+from servoctl.reduction.idle import names_of, needed
 from servoctl.reduction.knots import require_smooth
 from servoctl.reduction.manifold import ON_MANIFOLD, solve
 from servoctl.reduction.ranks import alive
@@ -136,6 +136,26 @@ class Model:
             k += 1
             names += q.jet_names(k)
         return tuple(names[:size])
+
+    def including(self, names: Iterable[str]) -> "Model":
+        """The model with those coordinates among names of signals that play no part in the program; itself without any.
+
+        Parameters
+        ----------
+        names : iterable of str
+            Coordinates and their derivatives; other names are ignored.
+
+        Returns
+        -------
+        Model
+        """
+        r = self.reduction
+        if r.mechanism.whole is None:
+            return self
+        wider = needed(r.mechanism.whole, r.program, self.coordinate_names, names)
+        if wider.q.names == self.coordinate_names:
+            return self
+        return derived(wider, r.program, self._store.specification[2]).with_parameters(**self.numbers)
 
     def with_parameters(self, **changes: float) -> "Model":
         """The same model with other parameters.
@@ -413,8 +433,13 @@ class Model:
         z = np.zeros((size, len(t)), dtype=REAL)
         z[: len(jets)] = jets / scale[: len(jets)]
         points = replace(r.points, t=np.asarray(t), z=z, values=self.parameters, residual=np.zeros(len(t)))
-        solved, residual = solve(Flow(q, r.rows, level, points), t, z)
-        result = np.where(residual < ON_MANIFOLD, (solved * scale).astype(float), np.nan)
+        if r.cascade is not None:
+            deeper, good = r.cascade.continued(points, level, r.top - 1)
+            solved = deeper[:size]
+        else:
+            solved, residual = solve(Flow(q, r.rows, level, points), t, z)
+            good = residual < ON_MANIFOLD
+        result = np.where(good, (solved * scale).astype(float), np.nan)
         result[: len(jets)] = jets
         return result
 
@@ -490,7 +515,8 @@ class Model:
             Time of the start [s].
         guess : dict of str to float, optional
             Approximate values: free ones start there if that is consistent. Values without a guess are as near to zero
-            as the invariants allow.
+            as the invariants allow. A coordinate that the model leaves out, and that is named here or held, is a part
+            of the state, and of the motions that begin there.
         hold : dict of str to SX, optional
             Further conditions by name: expressions of t, the coordinates and their derivatives of any order that are
             zero at the start, such as `{"heading": ca.atan2(dy, dx) - 0.5}`.
@@ -512,7 +538,8 @@ class Model:
         SingularProgram
             If the machine stands still, its constraints leave a coordinate open there, and the motion has no limit.
         """
-        return started(self, finite("t", t, "time"), held, guess, hold)
+        model = self.including([*names_of(held), *names_of(guess)])
+        return started(model, finite("t", t, "time"), held, guess, hold)
 
     def structure(self, motion=None, jets=None):
         """Index, relative degrees, zeros at infinity and essential orders (see `reduction.structure`).
@@ -531,8 +558,9 @@ class Model:
         """
         if motion is None:
             return self.once("structure", lambda: structure(self.reduction, start=self._default_start()))
-        t, jets = _samples(self, motion, jets)
-        return structure(self.reduction, t, jets, self.parameters)
+        model = self.including(names_of(motion))
+        t, jets = _samples(model, motion, jets)
+        return structure(model.reduction, t, jets, model.parameters)
 
     def _default_start(self):
         """The time and the values of the start without held or guessed values; None if there is none."""

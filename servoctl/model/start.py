@@ -2,6 +2,7 @@
 
 from copy import copy
 from dataclasses import dataclass, field, replace
+from math import factorial
 
 import casadi as ca
 import numpy as np
@@ -221,6 +222,8 @@ def _solve(model, t, aim, conditions):
     equations, n_x = JetEquations(model, t, conditions), len(model.state_names)
     finite_there = np.all(np.isfinite(equations(aim.reference)[0][: equations.invariants]))
     x, residual = _best(equations, aim) if finite_there else (aim.reference, np.inf)
+    if not residual < TOLERANCE and model.reduction.cascade is not None:
+        x, residual = _by_blocks(model, t, equations, aim)
     for at in (aim.reference, None):
         if residual < TOLERANCE:
             break
@@ -235,6 +238,18 @@ def _solve(model, t, aim, conditions):
         if residual_there < residual or not np.isfinite(residual):
             equations, x, residual = other, y, residual_there
     return equations, x, residual
+
+
+def _by_blocks(model, t, equations, aim):
+    """The start that Newton's method reaches from the reference block by block, then on all rows together."""
+    r, q, n_x = model.reduction, model.reduction.mechanism.q, len(model.state_names)
+    sizes = np.repeat([1.0, *(factorial(k) for k in range(1, r.top))], [q.nq, *[q.n] * (r.top - 1)])
+    z = (aim.reference[:n_x] / sizes)[:, None]
+    z, _ = r.cascade.continued(replace(r.points, t=np.array([t]), z=z, values=model.parameters), r.top)
+    x = aim.reference.copy()
+    x[:n_x] = np.where(aim.movable[:n_x], z[:n_x, 0].astype(float) * sizes, x[:n_x])
+    x = gauss_newton(equations, np.where(np.isfinite(x), x, aim.reference), aim)
+    return x, _largest(equations, x)
 
 
 def _at_guess(equations, x, residual, aim, guessed):

@@ -29,7 +29,11 @@ from servoctl.tolerances import NOISE, RESOLVED
 DIVIDES = 1e-3  # of its usual size: a combination is not divided by a jet that is smaller at a point
 
 
-def complete(q, rows, context, starts=None):
+class Deep(Exception):
+    """A row would differentiate a residual or a balance more often than allowed."""
+
+
+def complete(q, rows, context, starts=None, most=None):
     """Replace rows by hidden constraints until their leading matrix has full row rank.
 
     Parameters
@@ -40,6 +44,8 @@ def complete(q, rows, context, starts=None):
     context : Context
     starts : Points, optional
         Starts for points of the manifold.
+    most : int, optional
+        Derivatives of a residual or a balance in a row, at most.
 
     Returns
     -------
@@ -61,6 +67,8 @@ def complete(q, rows, context, starts=None):
         If a row's gradient vanishes on its own solutions, or a rank is undecided in double precision.
     InconsistentStart
         If no state satisfies the rows.
+    Deep
+        If there are more derivatives than `most`.
     """
     rows, pivots, points, dropped = list(rows), [], starts, 0.0
     while True:
@@ -77,7 +85,7 @@ def complete(q, rows, context, starts=None):
         dropped = max(dropped, rank.dropped)
         if rank.rank == len(rows):
             return rows, replace(rank, dropped=dropped), points.take(same), pivots
-        combination = _lowest(q, rows, numbers[:, :, same], context, points)
+        combination = _lowest(q, rows, numbers[:, :, same], context, points, most)
         if combination.row.order < 0:
             raise _dependent(q, rows, combination, context)
         rows[combination.replaces] = replace(combination.row, parts=())
@@ -96,7 +104,13 @@ class _Combination:
     whole: Row  # the combination itself, before its order was settled
 
 
-def _lowest(q, rows, numbers, context, starts=None):
+def combined_uses(rows):
+    """The highest derivative of each residual, and of the balance, in a combination of rows at their highest order."""
+    top = max((row.order for row in rows), default=0)
+    return merge_uses(*((row.uses, top - row.order) for row in rows))
+
+
+def _lowest(q, rows, numbers, context, starts=None, most=None):
     """The combination of dependent rows that replaces one of them by a row of lower order."""
     # Rows of (3.18) come last, and are replaced first among those of highest order: where it can be, the designer's
     # constraints stay as they are written.
@@ -105,6 +119,8 @@ def _lowest(q, rows, numbers, context, starts=None):
     if not support:  # the ranks at single points and the dependence at all of them disagree
         raise _ill_conditioned(rows, generic(decide_each(numbers))[0])
     support = [order[i] for i in support]
+    if most is not None and max(combined_uses([rows[a] for a in support]).values(), default=0) > most:
+        raise Deep
     top = max(rows[a].order for a in support)
     highest = ((a, w) for a, w in zip(support, weights, strict=True) if rows[a].order == top)
     b = max((rows[a].kind == "dynamics", w, a) for a, w in highest)[2]
@@ -125,9 +141,8 @@ def _combination(q, rows, b, support, numbers, context, starts=None):
     _require_affine(q, rows, support, top, context)
     others = [a for a in support if a != b]
     parts, pivots = _combine(q, rows, b, others, top, numbers)
-    names = [_derivative_name(rows[a], top - rows[a].order) for a in others]
-    story = f"{rows[b].name} with {', '.join(names)}" if names else rows[b].name
-    uses = merge_uses(*((rows[a].uses, top - rows[a].order) for a in support))
+    story = told(rows[b], [rows[a] for a in others], top)
+    uses = combined_uses([rows[a] for a in support])
     vanishing = sum((rows[a].vanishing for a in support), ())
     expression = ca.cse(sum(parts))
     chi = replace(rows[b], expression=expression, order=top, uses=uses, parts=tuple(parts), vanishing=vanishing)
@@ -236,6 +251,12 @@ def _combine(q, rows, b, others, top, numbers):
     raised = (q.derivatives([rows[a].expression], top - rows[a].order)[-1][0] for a in others)
     parts = [rows[b].expression, *(weight * e for weight, e in zip(w.elements(), raised, strict=True))]
     return parts, [p for p in pivots if ca.symvar(p)]
+
+
+def told(row, others, top):
+    """The combination of a row with derivatives of others to an order, in words."""
+    names = [_derivative_name(other, top - other.order) for other in others]
+    return f"{row.name} with {', '.join(names)}" if names else row.name
 
 
 def _derivative_name(row, k):

@@ -1,6 +1,5 @@
 """Coordinates that play no part in a program: nothing couples them to what it prescribes, drives or reports."""
 
-from collections.abc import Mapping
 
 import casadi as ca
 import numpy as np
@@ -52,8 +51,11 @@ def needed(mechanism, program, keep=(), named=()):
 
 
 def names_of(values):
-    """Names of a start, or of values by name; none of anything else."""
-    return tuple(values) if isinstance(values, Mapping) else tuple(getattr(values, "names", ()))
+    """Names of a start, of the jets of a run, or of values by name; none of anything else."""
+    if isinstance(values, dict):
+        return tuple(values)
+    names = getattr(values, "jet_names", getattr(values, "names", ()))
+    return names if isinstance(names, tuple) else ()
 
 
 def _jets(q):

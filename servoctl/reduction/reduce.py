@@ -10,6 +10,7 @@ from servoctl.checks import finite, mapping
 from servoctl.errors import NotRealisable, ServoError, SpecificationError, unknown
 from servoctl.jets.series import Flow
 from servoctl.reduction.appell import Realisation, require_inertia
+from servoctl.reduction.cascade import Cascade
 from servoctl.reduction.hidden import complete
 from servoctl.reduction.knots import Knots, Switches, require_smooth
 from servoctl.reduction.manifold import Context, Points, sample
@@ -18,6 +19,7 @@ from servoctl.reduction.ranks import Rank, clean, decide, decide_all, noting_dro
 from servoctl.reduction.realisation import realisation, wished, wished_balance
 from servoctl.reduction.rows import Balance, as_rows, balances, merge_uses, settle_alone
 from servoctl.reduction.scales import ORDINARY, usual
+from servoctl.reduction.triangular import completed
 from servoctl.spec.mechanism import Mechanism, require_known
 from servoctl.spec.packing import Packed
 from servoctl.spec.program import Program
@@ -54,6 +56,8 @@ class Reduction(Packed):
     context : Context
     original : dict of str to Row
         Rows of the designer's residuals and material constraints, by name.
+    cascade : Cascade, optional
+        The rows by blocks, where they are deep.
     entries_dropped : tuple of SX
         What the eliminations of the derivation left out, as it vanishes identically.
     """
@@ -69,6 +73,7 @@ class Reduction(Packed):
     switches: Switches
     context: Context
     original: dict
+    cascade: Cascade | None = None
     entries_dropped: tuple = ()
 
     def __repr__(self):
@@ -241,12 +246,16 @@ def _by_points(mechanism, program, switches, balance, context):
             realised = split
             break
     _require_motion(dynamics, program)
-    rows, rank, points, of_rows = complete(q, [*(realised.settled or constraints), *dynamics], context, points)
+    rows = [*(realised.settled or constraints), *dynamics]
+    solve = complete if realised.settled else completed
+    rows, rank, points, of_rows, *cascade = solve(q, rows, context, points)
     knots = require_smooth(switches, context.values, smoothness(switches, rows))
     of_split = [(f"choice of dependent coordinates {i}", pivot) for i, pivot in enumerate(of_split, 1)]
     pivots = (*of_constraints, *of_sharing, *of_split, *of_rows)
     by_name = {row.name: row for row in original}
-    return Reduction(mechanism, program, tuple(rows), realised, rank, points, pivots, knots, switches, context, by_name)
+    return Reduction(
+        mechanism, program, tuple(rows), realised, rank, points, pivots, knots, switches, context, by_name, *cascade
+    )
 
 
 def holds(reduction, values):
@@ -266,7 +275,10 @@ def holds(reduction, values):
     """
     q, r = reduction.mechanism.q, reduction
     context = replace(r.context, values=values)
-    points = sample(q, r.rows, r.top, context, starts=r.points, flow=r.flow)
+    if r.cascade is None:
+        points = sample(q, r.rows, r.top, context, starts=r.points, flow=r.flow)
+    else:
+        points = r.cascade.solved(replace(r.points, values=values), r.top)
     if not len(points.t) or not r.orders.hold(points):
         return False
     for matrix in (r.leading, r.realisation.B.T):

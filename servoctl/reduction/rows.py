@@ -65,6 +65,10 @@ class Row:
     vanishing : tuple of (SX, SX, SX)
         What the row's order rests on: slopes that vanish at the points of its derivation, but not identically; the jets
         in which they are slopes, or products of two; and the expression ψ that they are slopes of.
+    slopes : (1, n) SX, optional
+        A leading gradient that differs from ∂ψ/∂γ^(order) by multiples of other rows' only.
+    columns : tuple of int, optional
+        The quasi-velocities whose jets count; those of others are functions of time. Default: all.
     """
 
     expression: ca.SX
@@ -76,16 +80,29 @@ class Row:
     uses: dict = field(default_factory=dict)
     parts: tuple = field(default=(), repr=False, compare=False)
     vanishing: tuple = field(default=(), repr=False)
+    slopes: object = field(default=None, repr=False)
+    columns: tuple | None = field(default=None, repr=False)
     _gradients: dict = field(default_factory=dict, repr=False, compare=False)
 
     def gradient(self, q, level=None):
         """∂ψ/∂γ^(level), (1, n) SX; for level 0 ∂ψ/∂q · V. Default level: the order, for the leading gradient."""
         level = self.order if level is None else level
-        key = self.expression.element_hash(), level
+        if self.slopes is not None and level == self.order:
+            return self.slopes
+        key = self.expression.element_hash(), level, self.columns
         if key not in self._gradients:
             slopes = ca.jacobian(self.expression, q.jet(level))
-            self._gradients[key] = self.expression, slopes if level or q.plain else slopes @ q.V
+            slopes = slopes if level or q.plain else slopes @ q.V
+            if self.columns is not None:
+                some, slopes = slopes[:, list(self.columns)], ca.SX(1, q.n)
+                slopes[:, list(self.columns)] = some
+            self._gradients[key] = self.expression, slopes
         return self._gradients[key][1]
+
+    def own(self, q, level):
+        """Symbols of the jets γ^(level) that count."""
+        jets = q.gamma(level)
+        return jets if self.columns is None else tuple(jets[i] for i in self.columns)
 
     def resting_on(self, slopes, jets):
         """The row, with slopes in jets among `vanishing` that are zero at points, unless they vanish identically."""
@@ -339,7 +356,9 @@ def settle(q, row, others, context, starts=None):
                 return _of_order(q, row, j, points), points
             row = eliminated
         if j > 0:
-            row = _without(q, row.resting_on(row.gradient(q, j).T, q.jet(j)), q.gamma(j), points)
+            row = _without(q, row.resting_on(row.gradient(q, j).T, q.jet(j)), row.own(q, j), points)
+    if row.columns is not None:
+        return replace(row, order=-1), points
     if q.order(row.expression) == 0 and not np.any(slopes(q, row, 0, points)):
         return replace(row, order=-1), points
     return replace(row, order=max(q.order(row.expression), -1)), points

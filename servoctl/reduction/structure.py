@@ -375,7 +375,11 @@ def _jets(reduction, points, level, states):
     z = np.zeros((q.nq + level * q.n, len(points.t)), dtype=np.longdouble)
     shared, state = min(len(z), len(points.z)), q.nq + q.n
     z[:shared] = points.z[:shared]
-    solved, residual = solve(Flow(q, reduction.rows, level, points), points.t, z)
+    if reduction.cascade is None:
+        solved, residual = solve(Flow(q, reduction.rows, level, points), points.t, z)
+    else:
+        deeper, good = reduction.cascade.continued(replace(points, z=z), level)
+        solved, residual = deeper[: len(z)], np.where(good, 0.0, np.inf)
     change = np.abs(solved[:state] - z[:state]) / (1.0 + np.abs(z[:state]))
     for p in np.flatnonzero(~(np.maximum(change.max(axis=0), residual) < LEAVES)) if states else ():
         solved[:, p] = _plant_jets(reduction, points.take([p]), z[:, [p]], level)[:, 0]

@@ -181,7 +181,7 @@ def sensitivity(
     Initial values that the constraints determine change with the others. Those that `model.start` held are constant
     where they are not differentiated by.
     """
-    require_model(model, run, "sensitivity")
+    model = require_model(model, run, "sensitivity")
     _require_run(model, run)
     default = [name for name, kind in model.signal_groups.items() if kind in ("actuation", "reaction")]
     of = tuple(dict.fromkeys(default if of is None else texts(of, "The names of signals")))

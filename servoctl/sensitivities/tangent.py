@@ -65,11 +65,12 @@ class Tangent:
         """∂γ^(j), or ∂q, from the tangents of the jets below."""
         e = self.e
         rows = ca.vertcat(*(level[j - e.top + ρ] for level, ρ in zip(e.levels, e.raised, strict=True)))
-        if j:
+        if j and e.cascade is None:
             return e._solve(-self.along(rows, [e.q.jet(i) for i in range(j)], known))[0]
-        rows = ca.vertcat(rows, *e.q.invariants.values())
-        matrix = ca.jacobian(rows, e.q.jet(0))
-        return eliminate(matrix, -self.along(rows, [], []), clean(*e.r.points.matrix(matrix)))[0]
+        rows = rows if j else ca.vertcat(rows, *e.q.invariants.values())
+        matrix = ca.jacobian(rows, e.q.jet(j))
+        right = -self.along(rows, [e.q.jet(i) for i in range(j)], known[:j])
+        return eliminate(matrix, right, clean(*e.r.points.matrix(matrix)))[0]
 
     def along(self, expressions, jets, tangents):
         """The derivatives (m, K) of expressions (m,) along tangents of jets, and by the parameters."""

@@ -79,7 +79,7 @@ class Mechanism:
         constraints=None,
         outputs=None,
     ):
-        self.left_out = {}
+        self.left_out, self.whole = {}, None
         self.q = require_kind(Coordinates, "q", q, 'sv.coordinates("x y")')
         parameters = Parameters({}) if parameters is None else parameters
         self.parameters = require_kind(Parameters, "parameters", parameters, "sv.parameters(m=1.0, ...)")
@@ -140,7 +140,7 @@ class Mechanism:
         return twin
 
     def __reduce__(self):
-        content = packed(vars(self), self.q, self.parameters, {"parameters": self.parameters})
+        content = packed(vars(self) | {"whole": None}, self.q, self.parameters, {"parameters": self.parameters})
         return _restored, (self.q, self.parameters, content)
 
     def places(self, *expressions):
@@ -183,7 +183,8 @@ class Mechanism:
         Returns
         -------
         Mechanism
-            With the same symbols and all parameters; `left_out` has the names of the others by kind.
+            With the same symbols and all parameters; `left_out` has the names of the others by kind, `whole` is this
+            mechanism until it is pickled.
         """
         return _part(Identity(self), frozenset(places))
 
@@ -503,6 +504,7 @@ def _part(identity, places):
         "actuator": (whole.actuators, part.actuators),
         "material constraint": (whole.constraints, part.constraints),
     }
+    part.whole = whole
     part.left_out = {what: tuple(n for n in names if n not in kept) for what, (names, kept) in groups.items()}
     return part
 

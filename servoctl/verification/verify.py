@@ -81,7 +81,7 @@ def verify(model: Model | Closed, run: Run | None = None, segments: int = 20) ->
     segments = whole("segments", segments, least=1, most=MOST_SEGMENTS)
     if run is None and isinstance(model, Closed):
         return verify_loop(model)
-    run, faulty = _required(model, run)
+    model, run, faulty = _required(model, run)
     if faulty or not len(run.t):
         return judged({"samples": float(faulty or 1)}, {"samples": LIMITS["samples"]})
     checks = _Checks(model, run, segments)
@@ -104,13 +104,13 @@ def verify(model: Model | Closed, run: Run | None = None, segments: int = 20) ->
 
 
 def _required(model, run):
-    """The run by this model, as far as its samples are finite, and the number of faulty samples.
+    """The model, its run as far as samples are finite, and the number of faulty samples.
 
     A motion that stopped may end in samples without accelerations.
     """
     whose = getattr(run, "model", None)
     whole_run = isinstance(run, Run) and isinstance(whose, Model) and isinstance(run.jet_names, tuple)
-    require_model(model if isinstance(model, Model) else None, run if whole_run else None, "verify")
+    model = require_model(model if isinstance(model, Model) else None, run if whole_run else None, "verify")
     _require_same(model, run.model)
     t, jets, knots = numbers(run.t, 1), numbers(run.jets, 2), numbers(run.knots, 1)
     least, mappings = len(model.jet_names), (run.stored, run.stored_residual)
@@ -127,7 +127,7 @@ def _required(model, run):
     faulty = int(np.sum(~good[:count]) + np.sum((steps >= 0) if backwards else (steps <= 0)))
     parts = {"variants": _variants(model, run, count), "knots": tuple(knots)}
     parts["stored"] = {name: np.asarray(values)[:count] for name, values in run.stored.items() if np.ndim(values)}
-    return replace(run, t=t[:count], jets=jets[:, :count], jet_names=model.names_to(len(jets)), **parts), faulty
+    return model, replace(run, t=t[:count], jets=jets[:, :count], jet_names=model.names_to(len(jets)), **parts), faulty
 
 
 def _malformed(least, n, **shapes):

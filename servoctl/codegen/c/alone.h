@@ -14,6 +14,9 @@
 #define FOLLOWED 0.01
 #define STEADY 0.25
 #define SHORTEST 0x1p-32
+#define TERMS 4
+#define LAST_TERM 0.1
+#define BEND 0.344
 
 /* newton.c */
 #define PIVOTS 1
@@ -24,6 +27,11 @@
 #define TOP 2
 #define LAST 4
 #define PLAIN 1
+
+/* many.c */
+#define DEGRADED 0.02
+#define NEGLIGIBLE 1e-7
+#define FAR_OFF 30.0
 
 /* batch.c */
 #define NU 2
@@ -49,6 +57,7 @@ DECLARED(example_project, double)
 DECLARED(example_jacobian, double)
 DECLARED(example_wide, W)
 DECLARED(example_wide_step, W)
+DECLARED(expansion, W)
 DECLARED(numbers, W)
 DECLARED(change, W)
 void law(W t, const W *restrict x, const double *restrict p, W *restrict y);

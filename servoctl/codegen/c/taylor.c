@@ -1,38 +1,39 @@
 /* Steps of the Taylor method. NQ, N, TOP and LAST are the numbers of coordinates and quasi-velocities, the order s and
    the highest index of coefficients; PLAIN says whether q' = gamma'. Loops over them are unrolled. */
 #include "unit.h"
+#include "lanes.h"
 #include "restore.h"
+#include "series.h"
 
-static inline double falling(int64_t k, int64_t j)
-{
-    double product = 1;
-    for (int64_t m = 0; m < j; m++) product *= (double)(k - m);
-    return product;
-}
-
+/* The bits of non-negative numbers have the order of the numbers, and those of NaN are largest. */
 static inline double largest_size(const double *v, int64_t n)
 {
-    double largest = 0;
-    for (int64_t i = 0; i < n; i++) if (!(fabs(v[i]) <= largest)) largest = fabs(v[i]);
-    return largest;
+    int64_t largest = 0;
+    for (int64_t i = 0; i < n; i++) {
+        const int64_t bits = s_bits(fabs(v[i]));
+        largest = bits > largest ? bits : largest;
+    }
+    return s_value(largest);
 }
 
-/* log2 of the step at which the last term meets the tolerance at the first `levels` levels of the state, the
-   terms taken to grow as the fastest of the upper half do: single coefficients may vanish. */
-static inline double length(const double *x, const double *c, int64_t n, int64_t levels, double log_rtol, double least)
+/* log2 of the step at which the last term is 2^log_rtol of levels first .. levels - 1 of the state, the terms taken to
+   grow as the fastest of some do: single coefficients may vanish. x holds the first of the levels. */
+static inline double length(const double *x, const double *c, int64_t n, int64_t first, int64_t levels,
+                            double log_rtol, double least)
 {
-    const int64_t last = LAST;
-    double size[LAST + 1], shortest = INFINITY;
-    for (int64_t k = last / 2 > 1 ? last / 2 : 1; k <= last; k++) {
-        const double largest = largest_size(c + (k - 1) * n, n);
-        if (!isfinite(largest)) return -INFINITY;
-        size[k] = log2(largest);
+    double size[TERMS], shortest = INFINITY;
+    for (int64_t m = 0; m < TERMS; m++) {
+        const int64_t k = term(m);
+        size[m] = k > 0 ? rough_log2(largest_size(c + (k - 1) * n, n)) : 0;
     }
-    for (int64_t j = 0; j < levels; j++) {
-        const double scale = log2(least + (j ? largest_size(x + NQ + (j - 1) * n, n) : largest_size(x, NQ)));
-        for (int64_t k = last / 2 > j ? last / 2 : j + 1; k <= last; k++) {
-            const double growth = (scale - size[k] - log2(falling(k, j))) / (double)(k - j);
-            shortest = fmin(shortest, log_rtol / (double)(last - j) + growth);
+    for (int64_t j = first; j < levels; j++) {
+        const double scale = rough_log2(least + largest_size(x + (j - first) * n, n));
+        for (int64_t m = 0; m < TERMS; m++) {
+            const int64_t k = term(m);
+            if (k <= j) continue;
+            const double growth = (scale - size[m] - rough_log2(falling(k, j))) * (1.0 / (double)(k - j));
+            const double h = log_rtol * (1.0 / (double)(LAST - j)) + growth;
+            shortest = h < shortest ? h : shortest;
         }
     }
     return shortest;
@@ -53,24 +54,31 @@ static inline void move(const double *x, const double *y, const double *c, doubl
     for (int64_t i = NQ; i < NX; i++) x_next[i] = jet[i];
 }
 
-/* Steps of the Taylor method from the start (t, x, p) towards t1. The function gives the coefficients of q (unless
-   plain), those of gamma, and pivots. The log has a row (t, x, y) for each step, and one more for the end. Returns the
-   number of steps, at most max_steps; fewer without reaching t1 where a step vanishes or is not finite. */
-int64_t FN(taylor)(const double *start, double t1, double rtol, double atol, int64_t project_every, int64_t max_steps,
-           double *log)
+/* Steps from the start (t, x, p) towards t1: at most max_steps, which may be projected. The log has a row (t, x, y) for
+   each step, and one more for the end. One pointer, since ctypes spends most of a call on converting arguments. */
+typedef struct {
+    double t1, rtol, atol, project_every, max_steps;
+    const double *start;
+    double *log;
+} Steps;
+
+/* Steps of the Taylor method. The function gives the coefficients of q (unless plain), those of gamma, and pivots.
+   Returns the number of steps; fewer than max_steps without reaching t1 where a step vanishes or is not finite. */
+int64_t FN(taylor)(const Steps *s)
 {
-    const double *p = start + 1 + NX, log_rtol = log2(rtol), least = atol / rtol;
-    double t = start[0];
-    for (int64_t i = 0; i < NX; i++) log[1 + i] = start[1 + i];
+    const double *p = s->start + 1 + NX, log_rtol = log2(LAST_TERM * s->rtol), least = s->atol / s->rtol, t1 = s->t1;
+    const int64_t max_steps = (int64_t)s->max_steps, project_every = (int64_t)s->project_every;
+    double t = s->start[0], *log = s->log;
+    for (int64_t i = 0; i < NX; i++) log[1 + i] = s->start[1 + i];
     for (int64_t step = 0; ; step++) {
         double *x = log + 1, *y = x + NX, *row = y + NY, *x_next = row + 1;
         log[0] = t;
         if (step == max_steps || t == t1) return step;
         NAME(t, x, p, y);
         const double *c = y + (PLAIN ? 0 : NQ * LAST);
-        double h = length(x, c, N, TOP, log_rtol, least);
-        if (!PLAIN) h = fmin(h, length(x, y, NQ, 1, log_rtol, least));
-        h = exp2(h);
+        const double of_q = length(x, y, NQ, 0, 1, log_rtol, least);
+        const double of_rates = length(x + NQ, c, N, 1, TOP, log_rtol, least);
+        const double h = exp2(of_rates < of_q ? of_rates : of_q);
         if (!(h > 1e-13 * (1 + fabs(t)))) return step;
         const int ends = h >= fabs(t1 - t) * (1 - 1e-12);
         const double signed_h = ends ? t1 - t : t1 > t ? h : -h;
@@ -79,5 +87,30 @@ int64_t FN(taylor)(const double *start, double t1, double rtol, double atol, int
         for (int64_t i = 0; i < NX; i++) if (!isfinite(x_next[i])) return step;
         if (project_every && (step + 1) % project_every == 0) restore(t, x_next, p);
         log = row;
+    }
+}
+
+/* The jets q, gamma', ..., gamma^(levels) at n instants t in the steps k of a log, row by row, one column per instant.
+   The lanes of a vector are consecutive instants of one step. */
+void FN(taylor_jets)(const double *log, int64_t n, const int64_t *k, const double *t, int64_t levels, double *jets)
+{
+    double factor[LAST + 1];
+    for (int64_t j = 0; j <= levels; j++) {
+        const int64_t size = j ? N : NQ;
+        double *rows = jets + (j ? NQ + (j - 1) * N : 0) * n;
+        for (int64_t m = 1; m <= LAST; m++) factor[m] = falling(m, j);
+        for (int64_t at = 0, count; at < n; at += count) {
+            const double *row = log + k[at] * (1 + NX + NY), *x = row + 1, *c = x + NX + (j && !PLAIN ? NQ * LAST : 0);
+            W h = ALL(0.0);
+            for (count = 0; count < W_LANES && at + count < n && k[at + count] == k[at]; count++) {
+                h[count] = t[at + count] - row[0];
+            }
+            for (int64_t i = 0; i < size; i++) {
+                W total = ALL(0.0);
+                for (int64_t m = LAST; m >= (j ? j : 1); m--) total = total * h + factor[m] * c[(m - 1) * size + i];
+                if (!j) total = x[i] + total * h;
+                for (int64_t b = 0; b < count; b++) rows[i * n + at + b] = total[b];
+            }
+        }
     }
 }

@@ -1,0 +1,192 @@
+/* Motions of many cases by the Taylor method: the lanes of W are motions with steps of their own, and a lane whose motion
+   ends takes the next case. Before it comes `expansion`, the function of taylor.c in lanes, with its sizes. */
+#include "unit.h"
+#include "lanes.h"
+#include "series.h"
+
+#define COEFFICIENTS ((PLAIN ? 0 : NQ * LAST) + N * LAST) /* outputs before the pivots */
+
+/* Inputs are a row for each case: x0, p, absolute tolerance; and for all of them the pivots' sizes, and the instants of
+   samples. Results are a row for each case: the outcome, the number of steps, the last instant and state, the largest
+   sizes of the state; and its samples. */
+typedef struct {
+    double t0, t1, rtol;
+    int64_t max_steps, n_times, stop;
+    const double *x0, *p, *atol, *pivots, *times;
+    double *ends, *samples;
+} Many;
+
+enum { FINISHED = 1, PIVOT_FALLS = -1, STUCK = -2, SERIES_OFF = -3 };
+
+typedef struct {
+    W t, x[NX + 1], p[NP + 1], y[NY + 1], atol, h, largest[NX + 1];
+    W pivots[NY - COEFFICIENTS + 1], signs[NY - COEFFICIENTS + 1];
+    W ahead[N + 1]; /* gamma^(s) at the end of the step, by its series */
+    I steps;
+    int64_t of[W_LANES], sampled[W_LANES];
+} Motions;
+
+INLINE W w_rough_log2(W a)
+{
+    const W f = w_value((w_bits(a) & 0x000fffffffffffffLL) | 0x3ff0000000000000LL) - 1.0;
+    return __builtin_convertvector((w_bits(a) >> 52) - 1023, W) + f * (1.0 + BEND - BEND * f);
+}
+
+INLINE W w_largest(const W *v, int64_t n)
+{
+    I largest = w_bits(ALL(0.0));
+    for (int64_t i = 0; i < n; i++) {
+        const I bits = w_bits(w_fabs(v[i])), more = bits > largest;
+        largest = (more & bits) | (~more & largest);
+    }
+    return w_value(largest);
+}
+
+/* `length` of taylor.c in lanes. */
+INLINE W w_length(const W *x, const W *c, int64_t n, int64_t first, int64_t levels, double log_rtol, W least)
+{
+    W size[TERMS], shortest = ALL(INFINITY);
+    for (int64_t m = 0; m < TERMS; m++) {
+        const int64_t k = term(m);
+        size[m] = k > 0 ? w_rough_log2(w_largest(c + (k - 1) * n, n)) : ALL(0.0);
+    }
+    for (int64_t j = first; j < levels; j++) {
+        const W scale = w_rough_log2(least + w_largest(x + (j - first) * n, n));
+        for (int64_t m = 0; m < TERMS; m++) {
+            const int64_t k = term(m);
+            if (k <= j) continue;
+            const W growth = (scale - size[m] - rough_log2(falling(k, j))) * (1.0 / (double)(k - j));
+            const W h = log_rtol * (1.0 / (double)(LAST - j)) + growth;
+            shortest = w_select(h < shortest, h, shortest);
+        }
+    }
+    return shortest;
+}
+
+/* gamma^(j) or, for j = 0, the change of q, a time h after the expansion. */
+INLINE W w_series(const W *c, int64_t n, int64_t i, int64_t j, W h)
+{
+    W total = ALL(0.0);
+    for (int64_t k = LAST; k >= (j ? j : 1); k--) total = total * h + falling(k, j) * c[(k - 1) * n + i];
+    return j ? total : total * h;
+}
+
+/* Put a case, or none, into a lane; the lane of none rests at the end of the first case. */
+static void load(const Many *m, int64_t lane, int64_t at, int64_t last, Motions *s)
+{
+    const int64_t from = at < last ? at : 0;
+    s->of[lane] = at < last ? at : -1;
+    s->t[lane] = m->t0;
+    s->h[lane] = s->steps[lane] = s->sampled[lane] = 0;
+    s->atol[lane] = m->atol[from];
+    for (int64_t i = 0; i < NX; i++) s->x[i][lane] = m->x0[from * NX + i];
+    for (int64_t i = 0; i < NX; i++) s->largest[i][lane] = fabs(m->x0[from * NX + i]);
+    for (int64_t i = 0; i < NP; i++) s->p[i][lane] = m->p[from * NP + i];
+    for (int64_t i = 0; i < NY - COEFFICIENTS; i++) s->pivots[i][lane] = m->pivots[i];
+    for (int64_t i = 0; i < NY - COEFFICIENTS; i++) s->signs[i][lane] = 0;
+}
+
+static void end(const Many *m, int64_t lane, int64_t outcome, const Motions *s)
+{
+    double *row = m->ends + s->of[lane] * (3 + 2 * NX);
+    row[0] = (double)outcome;
+    row[1] = (double)s->steps[lane];
+    row[2] = s->t[lane];
+    for (int64_t i = 0; i < NX; i++) row[3 + i] = s->x[i][lane];
+    for (int64_t i = 0; i < NX; i++) row[3 + NX + i] = s->largest[i][lane];
+}
+
+/* The samples of a lane in its next step. */
+static void sample(const Many *m, int64_t lane, double h, int ends, Motions *s)
+{
+    const double forward = m->t1 > m->t0 ? 1 : -1, t = s->t[lane];
+    const int64_t c = PLAIN ? 0 : NQ * LAST;
+    for (int64_t k; (k = s->sampled[lane]) < m->n_times; s->sampled[lane]++) {
+        const double after = m->times[k] - t;
+        if (!ends && forward * after > forward * h) return;
+        double *row = m->samples + (s->of[lane] * m->n_times + k) * NX;
+        for (int64_t i = 0; i < NX; i++) {
+            const int64_t j = i < NQ ? 0 : 1 + (i - NQ) / N, n = i < NQ ? NQ : N, place = i < NQ ? i : (i - NQ) % N;
+            double total = 0;
+            for (int64_t a = LAST; a >= (j ? j : 1); a--) {
+                total = total * after + falling(a, j) * s->y[(j ? c : 0) + (a - 1) * n + place][lane];
+            }
+            row[i] = j ? total : s->x[i][lane] + total * after;
+        }
+    }
+}
+
+/* Whether a pivot has another sign than at the start, or is far below or above its largest size so far. */
+INLINE I falling_pivots(Motions *s)
+{
+    I bad = w_bits(ALL(0.0));
+    for (int64_t i = 0; i < NY - COEFFICIENTS; i++) {
+        const W value = s->y[COEFFICIENTS + i], size = w_fabs(value);
+        bad |= ~(size >= DEGRADED * s->pivots[i]) | (value * s->signs[i] < 0) | (size * NEGLIGIBLE > s->pivots[i]);
+        s->signs[i] = value;
+        s->pivots[i] = w_fmax(s->pivots[i], size);
+    }
+    return bad;
+}
+
+/* Whether the series before does not meet the equations at the end of its step. */
+INLINE I off(const Motions *s, const W *c, double rtol)
+{
+    W error = ALL(0.0), size = w_largest(s->x + NX - N, N);
+    for (int64_t i = 0; i < N; i++) {
+        const W now = falling(TOP, TOP) * c[(TOP - 1) * N + i];
+        error = w_fmax(error, w_fabs(s->h * (now - s->ahead[i])));
+        size = w_fmax(size, w_fabs(s->h * now));
+    }
+    return (s->h != 0) & ~(error <= FAR_OFF * (s->atol + rtol * size));
+}
+
+void FN(many)(Many *m, int64_t first, int64_t last)
+{
+    const double log_rtol = log2(LAST_TERM * m->rtol), forward = m->t1 > m->t0 ? 1 : -1;
+    Motions s = {0};
+    int64_t next = first, open = 0;
+    for (int64_t lane = 0; lane < W_LANES; lane++, next++) load(m, lane, next, last, &s), open += next < last;
+    while (open) {
+        if (*(const volatile int64_t *)&m->stop) return;
+        expansion(s.t, s.x, s.p, s.y);
+        const W *c = s.y + (PLAIN ? 0 : NQ * LAST), least = s.atol / m->rtol;
+        const W of_q = w_length(s.x, s.y, NQ, 0, 1, log_rtol, least);
+        const W of_rates = w_length(s.x + NQ, c, N, 1, TOP, log_rtol, least);
+        const W log_h = w_select(of_rates < of_q, of_rates, of_q), left = forward * (m->t1 - s.t);
+        const I fallen = falling_pivots(&s), wrong = off(&s, c, m->rtol);
+        W h_long, x[NX + 1];
+        for (int64_t lane = 0; lane < W_LANES; lane++) h_long[lane] = exp2(log_h[lane]);
+        const I ends = h_long >= left * (1 - 1e-12);
+        W h = forward * w_select(ends, left, h_long);
+        for (int64_t i = 0; i < NX; i++) {
+            const int64_t j = i < NQ ? 0 : 1 + (i - NQ) / N;
+            const W part = j ? w_series(c, N, (i - NQ) % N, j, h) : w_series(s.y, NQ, i, 0, h);
+            x[i] = j ? part : s.x[i] + part;
+        }
+        for (int64_t i = 0; i < N; i++) s.ahead[i] = w_series(c, N, i, TOP, h);
+        W sum = ALL(0.0);
+        for (int64_t i = 0; i < NX; i++) sum += x[i] * 0.0;
+        const I stuck = ~(h_long > 1e-13 * (1.0 + w_fabs(s.t))) | (sum != 0) | (s.steps >= m->max_steps);
+        const I arrived = s.t == m->t1, over = fallen | wrong | arrived | stuck;
+        for (int64_t lane = 0; lane < W_LANES && (m->n_times || w_any(over)); lane++) {
+            if (s.of[lane] < 0) continue;
+            if (!over[lane]) {
+                sample(m, lane, h[lane], (int)ends[lane], &s);
+                continue;
+            }
+            end(m, lane, fallen[lane] ? PIVOT_FALLS : wrong[lane] ? SERIES_OFF : arrived[lane] ? FINISHED : STUCK, &s);
+            load(m, lane, next, last, &s);
+            open -= next++ >= last;
+            for (int64_t i = 0; i < NX; i++) x[i][lane] = s.x[i][lane];
+            h[lane] = s.steps[lane] = 0;
+        }
+        s.steps += (h != 0) & 1;
+        s.h = h;
+        for (int64_t i = 0; i < NX; i++) {
+            s.x[i] = x[i];
+            s.largest[i] = w_fmax(s.largest[i], w_fabs(x[i]));
+        }
+        s.t = w_select(ends & (h != 0), ALL(m->t1), s.t + h);
+    }
+}

@@ -1,0 +1,26 @@
+/* What loops over Taylor series share. */
+#include "unit.h"
+
+#ifndef SERIES_H
+#define SERIES_H
+
+static inline double falling(int64_t k, int64_t j)
+{
+    double product = 1;
+    for (int64_t m = 0; m < j; m++) product *= (double)(k - m);
+    return product;
+}
+
+/* Index of the m-th coefficient whose growth gives the step: the last two, and two of the middle, which keep the steps of
+   functions without singularities, such as sin, below their period. */
+static inline int64_t term(int64_t m) { return m < 2 ? LAST - m : LAST / 2 + 3 - m; }
+
+/* log2 of a number >= 0 from its bits, within 0.01; that of zero is -1023. */
+static inline double rough_log2(double a)
+{
+    const int64_t bits = s_bits(a);
+    const double f = s_value((bits & 0x000fffffffffffffLL) | 0x3ff0000000000000LL) - 1;
+    return (double)((bits >> 52) - 1023) + f * (1 + BEND - BEND * f);
+}
+
+#endif

@@ -1,0 +1,109 @@
+"""Motions of many cases by the Taylor method at once, in vector lanes with steps of their own."""
+
+import ctypes
+import os
+from concurrent.futures import ThreadPoolExecutor
+from functools import lru_cache
+
+import casadi as ca
+import numpy as np
+
+from servoctl.codegen import compiler, emit
+from servoctl.codegen.function import TAYLOR_COMPILED
+from servoctl.codegen.native import pointer
+from servoctl.methods.monitor import DEGRADED, NEGLIGIBLE
+from servoctl.methods.narrow import steep
+from servoctl.methods.taylor import FAR_OFF, series_loop
+from servoctl.model.switching import switching
+
+MOST_IN_LANES = 10**6  # of a case
+PER_THREAD = 8  # tasks, so that threads end at about the same time
+
+_NUMBERS = {"t0": ctypes.c_double, "t1": ctypes.c_double, "rtol": ctypes.c_double}
+_COUNTS = ("max_steps", "n_times", "stop")
+_ARRAYS = ("x0", "p", "atol", "pivots", "times", "ends", "samples")
+
+
+class _Many(ctypes.Structure):
+    """The C structure ``Many`` of many.c, from its fields by name; it holds a reference to its arrays."""
+
+    _fields_ = [*_NUMBERS.items(), *((n, ctypes.c_int64) for n in _COUNTS), *((n, ctypes.c_void_p) for n in _ARRAYS)]
+
+    def __init__(self, arrays, **numbers):
+        super().__init__(**numbers, **{name: pointer(array) for name, array in arrays.items()})
+        self.arrays = arrays
+
+
+def fits(model):
+    """Whether the motions of a model can be integrated in lanes, where they are watched at the ends of steps alone.
+
+    Nothing may happen within a step that its series does not show: equations are polynomials of the state and of sines
+    and cosines, do not depend on time, and have no kinks.
+    """
+
+    def smooth():
+        f = model.function("ode").expression
+        inputs = f.sx_in()
+        alone = not model.reduction.orders and switching(model) is None and not steep(model, squares=False)
+        return alone and not ca.depends_on(f(*inputs), inputs[0])
+
+    return not model.flat and not model.knots and model.once("fits lanes", smooth)
+
+
+def integrate(model, last, span, cases, rtol, times, threads=None):
+    """Integrate from starts x0 (N, n_x) with parameters p (N, n_p) and absolute tolerances (N,) over a span.
+
+    Returns
+    -------
+    ends : (N, 3 + 2 n_x) array
+        Outcome (1: finished, else to be computed by itself), number of steps, last instant, state there, and largest
+        sizes of the state.
+    samples : (N, K, n_x) array
+        States at the times (K,), in the order of the motion.
+    Both are None without a compiler.
+    """
+    f = series_loop(model, last)
+    library = None if f.operations > TAYLOR_COMPILED else _library(f, len(model.state_names))
+    if library is None:
+        return None, None
+    x0, p, atol = cases
+    n, n_x = x0.shape
+    p = np.column_stack([p, np.full(n, sum(span) / 2)])  # the instant that selects branches of paths
+    arrays = {"x0": x0, "p": p, "atol": atol, "pivots": model.pivot_sizes, "times": times}
+    arrays = {name: np.ascontiguousarray(array, dtype=float) for name, array in arrays.items()}
+    arrays |= {"ends": np.zeros((n, 3 + 2 * n_x)), "samples": np.full((n, len(times), n_x), np.nan)}
+    many = _Many(arrays, t0=span[0], t1=span[1], rtol=rtol, max_steps=MOST_IN_LANES, n_times=len(times))
+
+    def run(first, end):
+        library(ctypes.byref(many), ctypes.c_int64(first), ctypes.c_int64(end))
+
+    threads = threads or os.cpu_count() or 1
+    width = compiler.lanes()
+    length = max(-(-n // (threads * PER_THREAD)), 8 * width)  # lanes that wait at the end of a task cost their time
+    starts = range(0, n, length)
+    with ThreadPoolExecutor(threads) as pool:
+        try:
+            list(pool.map(run, starts, (min(first + length, n) for first in starts)))
+        except KeyboardInterrupt:
+            many.stop = 1  # which the threads read at each step
+    return arrays["ends"], arrays["samples"]
+
+
+def _library(f, n_x):
+    """The C function of a model's series in lanes; None without a compiler."""
+    if os.environ.get("SERVOCTL_COMPILER") == "none" or compiler.compiler() is None:
+        return None
+    library = compiler.library(f"#define W_LANES {compiler.lanes()}\n{_source(f, n_x)}", "-O3")
+    if library is not None:
+        library.servoctl_many.restype = None
+    return library and library.servoctl_many
+
+
+@lru_cache(32)
+def _source(f, n_x):
+    """The C text for any number of lanes."""
+    sizes = {key.upper(): int(value) for key, value in f.sizes.items()}
+    sizes |= {"NAME": "servoctl", "NX": n_x, "NP": f.n_p, "NY": f.n_y}
+    sizes |= {"DEGRADED": DEGRADED, "NEGLIGIBLE": NEGLIGIBLE, "FAR_OFF": FAR_OFF}
+    parts = [emit.unit(sizes), emit.include("lanes.h"), emit.function(f.expression, "expansion", emit.LANES)]
+    return "".join((*parts, emit.include("many.c")))

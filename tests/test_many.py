@@ -1,0 +1,202 @@
+"""Many motions at once: equal to `simulate` case by case, failures as rows, and what does not fit the lanes."""
+
+import casadi as ca
+import numpy as np
+import pytest
+from refusals import refused
+
+import servoctl as sv
+from servoctl.errors import SpecificationError
+from servoctl.gallery import gallery
+from servoctl.methods import lanes
+from servoctl.simulation import simulated
+
+SEED = 4
+
+
+def pendulum(force=lambda a, t, p: 0.0):
+    """A pendulum of length 1 under a force, on a cart that its program holds."""
+    q = sv.coordinates("x a")
+    x, a = q
+    p = sv.parameters(m=1.0, g=9.81, k=0.5)
+    S = sv.particle(q, p.m, (x + ca.sin(a), -ca.cos(a)))
+    forces = {"a": force(a, q.t, p)}
+    potential = -p.m * p.g * ca.cos(a)
+    mechanism = sv.Mechanism(q, gibbs=S, potential=potential, forces=forces, actuators={"F": x}, parameters=p)
+    return sv.derive(mechanism, sv.Program({"rest": x}))
+
+
+def each_equals_simulate(model, many, start, span, method, rtol=1e-12):
+    """Every case, its traces and its number of steps are those of `simulate`."""
+    names = [name for name in model.numbers if name in many.study.columns]
+    for i, row in enumerate(many.study.rows()):
+        one = model.with_parameters(**{name: row[name] for name in names})
+        x0 = start(i, one) if callable(start) else start
+        run = simulated(one, x0, span, method, t_eval=np.union1d(many.t, span[1])[:: 1 if span[1] > span[0] else -1])
+        assert row["error"] == "" and row["steps"] == run.counters["steps"]
+        for name in model.state_names:
+            size = np.abs(run[name]).max() + 1e-300
+            assert row[f"final {name}"] == pytest.approx(run[name][-1], abs=rtol * size)
+            if len(many.t):
+                np.testing.assert_allclose(many.trace[name][:, i], run[name][np.isin(run.t, many.t)], atol=rtol * size)
+
+
+def in_lanes(monkeypatch):
+    """Forbid the ordinary method."""
+    def refuse(*_, **__):
+        raise AssertionError("a case left the lanes")
+
+    monkeypatch.setattr("servoctl.study.many.simulated", refuse)
+
+
+@pytest.mark.parametrize("span", [(0.0, 2.0), (1.0, -0.5)])
+def test_parameters_in_lanes_equal_simulate(span, gallery_model, monkeypatch, c_compiler):
+    scene, model = gallery["appell-hamel"], gallery_model("appell-hamel")
+    start = model.start(t=span[0], **scene.start, guess=scene.guess)
+    values = model.numbers["M"] * np.random.default_rng(SEED).uniform(0.8, 1.2, 11)
+    assert lanes.fits(model)
+    with monkeypatch.context() as patch:
+        in_lanes(patch)
+        many = sv.simulate_many(model, start, {"M": values}, span, t_eval=np.linspace(*span, 7), threads=2)
+    each_equals_simulate(model, many, start, span, sv.Taylor())
+
+
+@pytest.mark.parametrize("method", [sv.Taylor(), sv.Taylor(8, rtol=1e-5, atol=1e-7), sv.Taylor(jets=9, rtol=1e-10, atol=1e-12)])
+def test_starts_by_name_and_by_state_equal_simulate(method, monkeypatch, c_compiler):
+    model = pendulum()
+    angles = np.append(np.random.default_rng(SEED).uniform(-3, 3, 9), [0.0, np.pi])
+    with monkeypatch.context() as patch:
+        in_lanes(patch)
+        many = sv.simulate_many(model, {"a": angles, "da": 0.1}, None, (0.0, 3.0), method)
+        states = np.array([model.start(a=a, da=0.1).values for a in angles]).T
+        again = sv.simulate_many(model, states, None, (0.0, 3.0), method, threads=1)
+    assert np.array_equal(many["final a"], again["final a"])
+    each_equals_simulate(model, many, lambda i, one: one.start(a=angles[i], da=0.1), (0.0, 3.0), method)
+
+
+def test_a_case_depends_neither_on_others_nor_on_threads(c_compiler):
+    model = pendulum()
+    angles = np.random.default_rng(SEED).uniform(-3, 3, 300)
+    all_ = sv.simulate_many(model, {"a": angles, "da": 0.0}, None, (0.0, 1.0), threads=2)
+    some = sv.simulate_many(model, {"a": angles[100:103], "da": 0.0}, None, (0.0, 1.0), threads=1)
+    assert np.array_equal(all_["final a"][100:103], some["final a"])
+
+
+@pytest.mark.parametrize(
+    "force",
+    [
+        lambda a, t, p: ca.exp(-((100 * (a - 1.0)) ** 2)),  # a bump that no series sees from afar
+        lambda a, t, p: p.k * ca.tanh(50 * a),
+        lambda a, t, p: p.k * 1e-4 / (a**2 + 1e-4),
+        lambda a, t, p: p.k * ca.sqrt(a**2 + 1e-6),
+        lambda a, t, p: -p.k * ca.fabs(a),
+        lambda a, t, p: p.k * ca.sin(t),
+    ],
+)
+def test_what_a_step_may_hide_stays_out_of_the_lanes(force):
+    model = pendulum(force)
+    assert not lanes.fits(model)
+    many = sv.simulate_many(model, {"a": [0.4, 1.3], "da": 0.0}, {"k": [0.5, 0.7]}, (0.0, 1.0), t_eval=[0.5])
+    angles = [0.4, 1.3]
+    each_equals_simulate(model, many, lambda i, one: one.start(a=angles[i], da=0.0), (0.0, 1.0), sv.Taylor())
+
+
+@pytest.mark.parametrize("force", [lambda a, t, p: -p.k * a**3, lambda a, t, p: p.k * ca.sin(3 * a) * a + ca.exp(p.k)])
+def test_polynomials_and_functions_of_parameters_fit(force):
+    assert lanes.fits(pendulum(force))
+
+
+def test_singular_programs_are_rows_among_others():
+    """A squared constraint of the gallery: its gradient vanishes on the way, and `simulate` says so."""
+    scene = gallery["constant-speed-horizontal"]
+    model = sv.derive(*scene.build())
+    start = model.start(**scene.start, guess=scene.guess)
+    with pytest.raises(sv.SingularProgram) as caught:
+        simulated(model, start, (0.0, 10.0), sv.Taylor())
+    many = sv.simulate_many(model, start, {"m": [model.numbers["m"]] * 3}, (0.0, 10.0))
+    assert list(many["error"]) == ["SingularProgram"] * 3 and np.isnan(many["steps"]).all()
+    assert many["message"][0] == str(caught.value)
+
+
+def test_starts_that_violate_the_program_are_rows(gallery_model):
+    scene, model = gallery["appell-hamel"], gallery_model("appell-hamel")
+    good = model.start(**scene.start, guess=scene.guess).values
+    bad = good.copy()
+    bad[model.state_names.index("dx")] += 0.5
+    many = sv.simulate_many(model, np.array([good, bad, good]).T, None, (0.0, 0.5))
+    assert list(many["error"]) == ["", "InconsistentStart", ""]
+    assert many["final x"][0] == many["final x"][2] and np.isnan(many["final x"][1])
+
+
+def test_other_ranks_leave_the_lanes():
+    """With k = 0 the force of a spring vanishes, and nothing else; a mass that is negative is a row."""
+    model = pendulum(lambda a, t, p: -p.k * a)
+    many = sv.simulate_many(model, {"a": 0.3, "da": 0.0}, {"k": [0.5, 0.0], "m": [1.0, -1.0]}, (0.0, 0.5))
+    assert many["error"][0] == "" and many["error"][1] == "SpecificationError"
+
+
+def test_small_and_large_motions_take_the_tolerances_of_simulate(c_compiler):
+    model = pendulum(lambda a, t, p: -p.k * a)
+    angles = np.array([1e-9, 1e-3, 1.0, 0.0])
+    many = sv.simulate_many(model, {"a": angles, "da": 0.0}, None, (0.0, 2.0))
+    each_equals_simulate(model, many, lambda i, one: one.start(a=angles[i], da=0.0), (0.0, 2.0), sv.Taylor())
+
+
+@pytest.mark.parametrize("method", [None, "RK4"])
+def test_plans_and_other_methods_run_one_by_one(method, gallery_model):
+    name, parameter = ("overhead-crane", "m") if method is None else ("appell-hamel", "M")
+    scene, model = gallery[name], gallery_model(name)
+    parameter = parameter if parameter in model.numbers else next(iter(model.numbers))
+    start = model.start(**scene.start, guess=scene.guess)
+    values = model.numbers[parameter] * np.array([0.9, 1.1])
+    many = sv.simulate_many(model, start, {parameter: values}, (0.0, 0.5), method, t_eval=[0.0, 0.5])
+    for i, value in enumerate(values):
+        run = sv.simulate(model.with_parameters(**{parameter: value}), start, (0.0, 0.5), method, t_eval=[0.0, 0.5])
+        assert many.trace[model.state_names[0]][:, i] == pytest.approx(run[model.state_names[0]], abs=1e-12)
+
+
+def test_an_interrupt_leaves_the_finished_cases(monkeypatch):
+    model = pendulum(lambda a, t, p: p.k * ca.sin(t))
+    calls = []
+
+    def stops(*arguments, **options):
+        calls.append(1)
+        if len(calls) == 3:
+            raise KeyboardInterrupt
+        return simulated(*arguments, **options)
+
+    monkeypatch.setattr("servoctl.study.many.simulated", stops)
+    many = sv.simulate_many(model, {"a": [0.1, 0.2, 0.3, 0.4], "da": 0.0}, None, (0.0, 0.1))
+    assert list(many["case"]) == [0, 1] and many.study.meta["interrupted"]
+
+
+def test_without_a_compiler_the_results_are_the_same(monkeypatch, c_compiler):
+    model, starts = pendulum(), {"a": [0.3, 2.0], "da": 0.0}
+    many = sv.simulate_many(model, starts, None, (0.0, 1.0))
+    monkeypatch.setenv("SERVOCTL_COMPILER", "none")
+    again = sv.simulate_many(pendulum(), starts, None, (0.0, 1.0))
+    assert again["final a"] == pytest.approx(many["final a"], rel=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("changed", "kind", "facts"),
+    [
+        ({"starts": {"a": [0.1, 0.2], "da": [0.0]}}, SpecificationError, {"lengths": [1, 2]}),
+        ({"starts": np.zeros((3, 2))}, SpecificationError, {}),
+        ({"starts": {"a": [np.nan], "da": 0.0}}, SpecificationError, {}),
+        ({"starts": {"a": [0.1] * 3, "da": 0.0}, "parameters": {"k": [1.0, 2.0]}}, SpecificationError,
+         {"lengths": [2, 3]}),
+        ({"t_eval": [2.0]}, SpecificationError, {"t_eval": [2.0]}),
+        ({"threads": 0}, SpecificationError, {}),
+    ],
+)
+def test_bad_input(changed, kind, facts):
+    model = pendulum()
+    given = {"starts": {"a": 0.1, "da": 0.0}, "parameters": None, "t_span": (0.0, 1.0)} | changed
+    with refused(kind, facts):
+        sv.simulate_many(model, **given)
+
+
+def test_names_that_are_no_parameters_are_rows():
+    many = sv.simulate_many(pendulum(), {"a": 0.1, "da": 0.0}, {"mass": [1.0, 2.0]}, (0.0, 0.1))
+    assert list(many["error"]) == ["NameUnknown"] * 2
