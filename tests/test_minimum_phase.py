@@ -154,13 +154,17 @@ def test_a_root_that_touches_the_axis_divides_a_range():
     assert result.eigenvalues(0.3) == pytest.approx([0.0, -0.3], abs=1e-9)
 
 
+@pytest.fixture(scope="module")
+def narrow():
+    """φ = x - c y with 4 (1 - c) = (w - w0)² - h²: unstable between w0 - h and w0 + h alone."""
+    specification = oscillator(lambda p: ((p.w - p.middle) ** 2 - p.half**2) / 4 - 1.0, middle=0.3, half=0.1)
+    return sv.derive(*specification)
+
+
 @pytest.mark.parametrize("middle", [0.3, 0.5117, 0.5123])
 @pytest.mark.parametrize("half", [1e-2, 1e-3, 1e-4, 1e-5])
-def test_a_narrow_unstable_range_is_found(middle, half):
-    """φ = x - c y with 4 (1 - c) = (w - w0)² - h²: unstable between w0 - h and w0 + h alone."""
-    result = sv.minimum_phase(
-        sv.derive(*oscillator(lambda p: ((p.w - middle) ** 2 - half**2) / 4 - 1.0)), "w", (0.0, 1.0)
-    )
+def test_a_narrow_unstable_range_is_found(middle, half, narrow):
+    result = sv.minimum_phase(narrow.with_parameters(middle=middle, half=half), "w", (0.0, 1.0))
     assert [r.verdict for r in result.ranges] == ["stable", "unstable", "stable"]
     assert [result.ranges[1].low, result.ranges[1].high] == pytest.approx([middle - half, middle + half], abs=half / 4)
 

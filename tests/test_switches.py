@@ -461,9 +461,9 @@ def narrow_reference(name):
     f = ca.Function("f", [t, y], [force(t, t, y)])
     where = {"a bump late in a long rest": 33.3, "backwards": -3.0}.get(name, 3.0 if b == 5.0 else 1.0)
     state, wide = np.array(start), 1e-3 if "us" in name else 0.1
-    for low, high in ((a, where - np.sign(b) * wide), (where - np.sign(b) * wide, where + np.sign(b) * wide),
-                      (where + np.sign(b) * wide, b)):  # fmt: skip
-        settings = {"method": "DOP853", "rtol": 1e-12, "atol": 1e-14, "max_step": abs(high - low) / 2000}
+    edges = (a, where - np.sign(b) * wide, where + np.sign(b) * wide, b)
+    for low, high, steps in zip(edges[:-1], edges[1:], (50, 1000, 50), strict=True):
+        settings = {"method": "DOP853", "rtol": 1e-12, "atol": 1e-14, "max_step": abs(high - low) / steps}
         state = solve_ivp(lambda s, z: [z[1], float(f(s, z[0]))], (low, high), state, **settings).y[:, -1]
     return state
 

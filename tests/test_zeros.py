@@ -1,5 +1,7 @@
 """What vanishes where a model is derived and comes alive at other numbers, later, or elsewhere."""
 
+import functools
+
 import casadi as ca
 import numpy as np
 import pytest
@@ -252,30 +254,46 @@ FLAT = {  # where a motion starts: even their rates are zero to all digits there
 }
 
 
-@pytest.mark.parametrize("name", [*BLENDS, *FLAT])
-@pytest.mark.parametrize("method", [None, "Taylor", {"accuracy": 1e-7}], ids=["default", "Taylor", "accuracy"])
-def test_what_comes_alive_later_or_elsewhere_acts(name, method):
+def moved(f, span, start):
+    """The end of the motion by SciPy, in steps shorter than what comes alive."""
+    found = solve_ivp(
+        lambda t, s: f(t, s).full().ravel(), span, start, "DOP853", rtol=1e-10, atol=1e-13, max_step=0.005
+    )
+    return found.y[:, -1]
+
+
+@functools.cache
+def scene(name):
+    """A model, its span, the start and the end of its motion."""
     model, f = blended({**BLENDS, **FLAT}[name])
     start = (1.0, 0.0) if "place" not in name and "dwell" not in name else (1.0, 6.0 if "bump" in name else 3.5)
     span = (0.0, 42.0 if "far" in name else 5.0)
+    return model, span, start, moved(f, span, start)
+
+
+@pytest.mark.parametrize("name", [*BLENDS, *FLAT])
+@pytest.mark.parametrize("method", [None, "Taylor", {"accuracy": 1e-7}], ids=["default", "Taylor", "accuracy"])
+def test_what_comes_alive_later_or_elsewhere_acts(name, method):
+    model, span, start, end = scene(name)
     settings = method if isinstance(method, dict) else {"method": method}
     run = sv.simulate(model, model.start(x=start[0], dx=start[1]), span, **settings)
-    reference = solve_ivp(
-        lambda t, s: f(t, s).full().ravel(), span, start, "DOP853", rtol=1e-10, atol=1e-12, max_step=0.005
-    )
-    assert [run["x"][-1], run["dx"][-1]] == pytest.approx(reference.y[:, -1], abs=2e-6)
+    assert [run["x"][-1], run["dx"][-1]] == pytest.approx(end, abs=2e-6)
     assert np.abs(run.residual["Y"][0]).max() < (5e-7 if method == "Taylor" else 1e-7)
+
+
+@functools.cache
+def resting():
+    """A motion that rests until a bump, and where it ends."""
+    model, f = blended(lambda t, x: 0.3 * ca.exp(-((100 * (t - 33.3)) ** 2)) * x)
+    return model, moved(f, (33.0, 40.0), (0.0, 0.0))
 
 
 @pytest.mark.parametrize("method", ["DOP853", "RK45", "Radau", "BDF", "LSODA", "Taylor"])
 def test_a_bump_while_the_motion_rests_is_not_stepped_over(method):
     """The steps of a motion at rest are the longest; the bump, 0.03 s of 40 s, is narrower than any of them."""
-    model, f = blended(lambda t, x: 0.3 * ca.exp(-((100 * (t - 33.3)) ** 2)) * x)
+    model, end = resting()
     run = sv.simulate(model, model.start(x=0.0, dx=0.0), (0.0, 40.0), method)
-    reference = solve_ivp(
-        lambda t, s: f(t, s).full().ravel(), (33.0, 40.0), (0.0, 0.0), "DOP853", rtol=1e-10, atol=1e-13, max_step=0.005
-    )
-    assert abs(reference.y[0, -1]) > 1e-3 and abs(run["x"][-1] - reference.y[0, -1]) < 1e-8
+    assert abs(end[0]) > 1e-3 and abs(run["x"][-1] - end[0]) < 1e-8
 
 
 @pytest.mark.parametrize("blend", [lambda t: ca.fmax(0, t - 3) ** 5, lambda t: (1 + ca.tanh(40 * (t - 3))) / 2])

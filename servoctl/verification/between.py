@@ -11,7 +11,7 @@ from servoctl.codegen.function import compiled
 STAGES = 4  # Gauss points of a step: order 8
 FIXED_POINT_STEPS = 25  # of a step, at most: an explicit iteration that takes more needs shorter steps
 SETTLED = 1e-9  # change of the state, relative to its size, at which the iteration has converged
-CORRECTIONS = 3  # Newton steps from a state that was integrated, which is accurate to AGREES or better
+CORRECTIONS = 3  # Newton steps of a state, at most; one that was integrated is accurate to AGREES or better
 AGREES = 0.1  # of the limit: a difference from the next sample, or between two lengths of step, that decides
 FEW_STEPS, ENOUGH_STEPS = 32, 1024  # between two samples, where other pivots may help, and else
 MOST_OPERATIONS, OVERHEAD = 5e9, 200  # of all steps together: seconds; what an evaluation takes besides its own
@@ -56,6 +56,15 @@ class Flow:
     def newton(self, t, x):
         """The Newton step (n_x, N) that leads states back to the constraints; none where the states are integrated."""
         return self.f.grid(t, x, self.model.parameters)[: self.n_x] if self.flat else np.zeros_like(x)
+
+    def settled(self, t, x, sizes, limit):
+        """States led back to the constraints by Newton's method, up to a limit relative to the sizes."""
+        for _ in range(CORRECTIONS if self.flat else 0):
+            step = self.newton(t, x)
+            x = x + step
+            if np.nanmax(np.abs(step) / sizes[:, None], initial=0.0) <= limit:
+                break
+        return x
 
     def corrected(self, t, z):
         """Jets at instants, those of a flat program solved for q by Newton's method."""
@@ -171,8 +180,13 @@ def between(attempts, t, x, settings):
 
 
 def _integrate(flow, problem, numbers, settings, found, budget):
-    """Integrate the intervals of these numbers with more and more steps, until the states at their ends are known."""
+    """Integrate the intervals of these numbers with more and more steps, until the states at their ends are known.
+
+    A sample beside its constraints shows in the interval before it and in the residuals; no length of step mends it.
+    """
     left, steps = np.arange(len(numbers)), settings.steps[numbers[0]]
+    t, length, x, targets = problem
+    problem = t, length, flow.settled(t, x, settings.sizes, AGREES * settings.limit), targets
     least, cost = steps, flow.f.operations + OVERHEAD
     while left.size and steps <= max(flow.most, least):
         if steps > least and left.size * steps * STAGES * cost > budget[0]:
