@@ -38,7 +38,7 @@ PROBE, PROBES = 1e-7, 3  # relative change by which a response is measured, and 
 FLOOR = 1e-3  # least size of a component, relative to what moves as much mass, and to what moves there in the span
 BLUNT = 1e-3  # effect of rounding, relative to the accelerations, above which these decide nothing
 OWN_INSTANTS, MOST_OWN = 200, 8  # instants between samples at which everything is checked, in all and of an interval
-AT_ZERO = 1e-6  # of the least singular value of B: below it B_D is at the zero of a pivot, where inputs have no digits
+AT_PIVOT_ZERO = 1e-6  # of the least singular value of B: below it B_D is singular, and inputs have no digits
 BALANCED = 1e-9  # part of dE/dt, relative to its terms, that does not follow from the forces: more is no rounding
 BY_INPUTS = 1e-6  # part of the accelerations, or of the power, that rounding of the inputs may excuse
 FEW_SIZES = 20  # instants that give the sizes of residuals that are far below their limit
@@ -721,7 +721,7 @@ def _regular(model, t, z):
     if not dependent or not np.all(np.isfinite(B)):
         return np.ones(len(t), dtype=bool)
     least, of_all = (np.linalg.svd(b, compute_uv=False)[:, -1] for b in (B[:, :, dependent], B))
-    return least > AT_ZERO * of_all
+    return least > AT_PIVOT_ZERO * of_all
 
 
 def _product(matrix, vectors):
