@@ -101,7 +101,8 @@ def pendulum(unit=1.0, guess=True):
         constraints={"rod": x**2 + y**2 - p.length**2},
         parameters=p,
     )
-    return sv.derive(mechanism, sv.Program({"cart": s - 0.1 * unit * ca.sin(q.t)}), guess={"y": -unit} if guess else {})
+    program = sv.Program({"cart": s - 0.1 * unit * ca.sin(q.t)})
+    return sv.derive(mechanism, program, guess={"y": -unit} if guess else {}, keep=["x", "y"])
 
 
 def words(text):

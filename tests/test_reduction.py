@@ -741,3 +741,20 @@ def test_a_ball_rolls_from_the_identity():
     run = simulate(model, start, (0.0, 5.0), Adaptive(rtol=1e-10, atol=1e-12))
     velocity = run["vx"] + 1j * run["vy"]
     assert velocity == pytest.approx(0.3j * np.exp(0.2j * run.t), abs=1e-7)
+
+
+def test_a_rolling_machine_of_few_velocities_is_programmed_by_rates():
+    """Both wheels of a robot drive it along its heading: x and y are independent, but move along v alone."""
+    xy = sv.coordinates("x y psi")
+    psi = list(xy)[2]
+    q = xy.with_quasi_velocities("v w", [[ca.cos(psi), 0], [ca.sin(psi), 0], [0, 1]])
+    x, y, _ = q
+    gibbs = sv.rigid_body(q, 20.0, (0, 0, 1.5), position=(x, y), rates=(0, 0, q.w()[1]))
+    mechanism = sv.Mechanism(q, gibbs=gibbs, actuators={"left": (1, -0.2), "right": (1, 0.2)})
+    path = {"x": x - q.t, "y": y - 0.1 * q.t**2}
+    with refused(SpecificationError, "q.dt(residual, 1)", rows=["x", "y"], velocities=("v", "w")):
+        derive(mechanism, sv.Program(path))
+    model = derive(mechanism, sv.Program({name: q.dt(residual, 1) for name, residual in path.items()}))
+    run = simulate(model, model.start(x=0.0, y=0.0, guess={"v": 1.0}), (0.0, 2.0))
+    assert run["x"] == pytest.approx(run.t, abs=1e-9) and run["y"] == pytest.approx(0.1 * run.t**2, abs=1e-9)
+    assert run["v"] == pytest.approx(np.hypot(1, 0.2 * run.t), abs=1e-9) and verify(model, run).passed

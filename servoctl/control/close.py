@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from servoctl.checks import as_span, require_memory, whole_multiple
+from servoctl.checks import as_numbers, as_span, require_memory, whole_multiple
 from servoctl.control.conditions import Conditions, Sensors, Timing, index, limits, require_few_steps, steps
 from servoctl.control.law import Law, UserStep
 from servoctl.control.loop import FINISHED, INTERRUPTED, LAW_LOST, STATE_LOST, Loop, run_loop
@@ -109,7 +109,7 @@ def _of_start(plant, plan, x0):
     part = of_plan(plan, plant)
     if isinstance(x0, Mapping):
         return part if set(x0) <= set(part.state_names) else plant
-    size = np.size(getattr(x0, "values", x0))
+    size = as_numbers(getattr(x0, "values", x0)).size
     return part if size in (part.n_x - len(part.lag), part.n_x) else plant
 
 

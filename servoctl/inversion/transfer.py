@@ -249,7 +249,7 @@ class Transfer:
         except ServoError:
             return None
         A, tangent = _linearised(entries, self.span[1], state)
-        if not np.isfinite(A).all():
+        if not A.size or not np.isfinite(A).all():
             return None
         modes = End(self.span[1], state, A, entries.size[entries.free]).left_space(unstable=True)
         places = [model.state_names.index(name) for name in self.plant.state_names]

@@ -310,6 +310,8 @@ def _dependent(q, rows, combination, context):
         )
     if zero:
         _refuse_factor(q, rows, combination.support, context)
+        if _independent_in_q(q, [rows[a] for a in combination.support], combination.points):
+            return _beyond_velocities(q, names)
         return SpecificationError(
             f"The constraints {listed} are dependent: the combination {story} vanishes identically.",
             "Constraints must be independent of each other.",
@@ -323,6 +325,28 @@ def _dependent(q, rows, combination, context):
         do=f"Correct one of {listed}.",
         rows=names,
         combination=story,
+    )
+
+
+def _independent_in_q(q, rows, points):
+    """Whether residuals of order 0 restrict more directions of q than the velocities have, as rolling machines do."""
+    if q.nq <= q.n or any(row.order for row in rows):
+        return False
+    expressions = [*(row.expression for row in rows), *q.invariants.values()]
+    numbers = clean(*points.matrix(ca.jacobian(ca.vertcat(*expressions), q.jet(0))))
+    return generic(decide_each(numbers))[0].rank == len(expressions)
+
+
+def _beyond_velocities(q, names):
+    listed, velocities = ", ".join(names), ", ".join(q.velocity_names)
+    return SpecificationError(
+        f"The residuals {listed} are independent, but the velocities {velocities} move them in dependent directions.",
+        "Hidden constraints of quasi-velocities are derived from rates where residuals outnumber the directions in "
+        "which the velocities move them.",
+        do=f"Program the rates q.dt(residual, 1) of {listed}, and start where the residuals are zero; or write the "
+        "machine in its coordinates, with constraints={...} in place of fewer velocities.",
+        rows=names,
+        velocities=q.velocity_names,
     )
 
 
