@@ -438,7 +438,7 @@ class Monitor:
         """
         t += NEXT * max(stretch.t[k : k + 2] - t, key=abs)  # at the zero itself, quotients of pivots have no value
         x = stretch.state(k, t)
-        if self.rank_measure(t, x) < self._hides(stretch.t[k + 1], stretch.x[:, k + 1]):
+        if self.rank_measure(t, x) < min(LOST, self._hides(stretch.t[k + 1], stretch.x[:, k + 1])):
             return 0.0
         ends = [self._matrices(s, stretch.state(k, s)) for s in stretch.t[k : k + 2]]
         rows = [np.max([np.linalg.norm(m[i] / c, axis=1) for m in ends], axis=0) for i, c in enumerate(self.columns)]
