@@ -170,6 +170,8 @@ def test_a_start_that_names_a_coordinate_includes_it(beside, named):
     assert sv.report(model, swung).verdict.startswith("non-minimum phase")
     assert model.structure(swung).index == model.structure(run).index
     assert np.any([*sv.sensitivity(model, swung, to=["phi0"], of=["d2phi0"]).values.values()])
+    many = sv.simulate_many(model, {"l": 4.0, "phi0": [0.1, 0.2]}, None, (0.0, 0.5)) if "phi0" in named else None
+    assert many is None or many["final phi0"].min() > 0.1
     assert model.including(["phi0"]).including(["phi0"]).left_out == () and model.left_out == ("phi0",)
 
 

@@ -15,6 +15,7 @@ from servoctl.methods.lanes import fits, integrate
 from servoctl.methods.taylor import order_for
 from servoctl.model.model import Model
 from servoctl.model.start import State
+from servoctl.reduction.idle import names_of
 from servoctl.simulation import OFF, as_state, simulated
 from servoctl.study.cases import FAILURE, as_cases
 from servoctl.study.table import Study, machine, table
@@ -97,7 +98,7 @@ def simulate_many(
     SpecificationError
         If the cases form no table, or method or times are invalid.
     """
-    require_kind(Model, "model", model, "sv.derive(...)")
+    model = require_kind(Model, "model", model, "sv.derive(...)").including(names_of(starts))
     span, threads = as_span(t_span), threads if threads is None else whole("threads", threads, least=1)
     method = as_method(method) if method is not None else as_method("algebraic") if model.flat else Taylor()
     times = _trace_times(span, t_eval)
