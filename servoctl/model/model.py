@@ -382,7 +382,7 @@ class Model:
             f = self.equations.dropped()
             return None if f is None else compiled(f, f.name())
 
-        return self.once("left out", build)
+        return self.once("dropped", build)
 
     def signals(self, kind, rate=0):
         """Names of a group of signals, and the compiled function (t, Z, p) of their `rate`-th time derivatives.

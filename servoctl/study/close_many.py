@@ -17,13 +17,13 @@ from servoctl.errors import IntegrationStopped, ServoError, SpecificationError, 
 from servoctl.plants.equations import equations_at
 from servoctl.reduction.ranks import SUSPECT
 from servoctl.study.cases import CASES, as_cases, generator
-from servoctl.study.table import Study, machine, table
+from servoctl.study.table import Study, Traced, machine, table
 
 SEEDS = 2**31  # seeds of cases are below this
 
 
 @dataclass(frozen=True, eq=False)
-class Batch:
+class Batch(Traced):
     """The results of many closed loops; made by `close_many`.
 
     `batch["max |theta|"]` is a column of the table, (N,), `batch.trace["theta"]` is (K, N).
@@ -39,16 +39,6 @@ class Batch:
     trace : dict of str to (K, N) array
         Traces of the signals in `record`.
     """
-
-    study: Study
-    t: np.ndarray
-    trace: dict[str, np.ndarray]
-
-    def __len__(self) -> int:
-        return len(self.study)
-
-    def __getitem__(self, name: str) -> np.ndarray:
-        return self.study[name]
 
     def __repr__(self):
         failed = int(np.sum(self.study["error"] != ""))

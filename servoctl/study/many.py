@@ -18,11 +18,11 @@ from servoctl.model.start import State
 from servoctl.reduction.idle import names_of
 from servoctl.simulation import OFF, as_state, simulated
 from servoctl.study.cases import FAILURE, as_cases
-from servoctl.study.table import Study, machine, table
+from servoctl.study.table import Study, Traced, machine, table
 
 
 @dataclass(frozen=True, eq=False)
-class Motions:
+class Motions(Traced):
     """The motions of many cases; made by `simulate_many`.
 
     `motions["final theta"]` is a column of the table, (N,), `motions.trace["theta"]` is (K, N).
@@ -37,16 +37,6 @@ class Motions:
     trace : dict of str to (K, N) array
         The states at these.
     """
-
-    study: Study
-    t: np.ndarray
-    trace: dict[str, np.ndarray]
-
-    def __len__(self) -> int:
-        return len(self.study)
-
-    def __getitem__(self, name: str) -> np.ndarray:
-        return self.study[name]
 
     def __repr__(self):
         failed = int(np.sum(self.study["error"] != ""))

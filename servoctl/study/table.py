@@ -188,6 +188,29 @@ def machine():
     }
 
 
+@dataclass(frozen=True, eq=False)
+class Traced:
+    """A table with a row per case, and traces of signals at common instants.
+
+    Attributes
+    ----------
+    study : Study
+    t : (K,) array
+        [s]
+    trace : dict of str to (K, N) array
+    """
+
+    study: Study
+    t: np.ndarray
+    trace: dict[str, np.ndarray]
+
+    def __len__(self) -> int:
+        return len(self.study)
+
+    def __getitem__(self, name: str) -> np.ndarray:
+        return self.study[name]
+
+
 @functools.cache
 def _version(package):
     return metadata.version(package)
