@@ -56,6 +56,11 @@ from servoctl.model.model import Model as Model
 from servoctl.model.model import derive as derive
 from servoctl.plants.plant import Plant as Plant
 from servoctl.plants.plant import plant as plant
+from servoctl.robots.contact import held as held
+from servoctl.robots.contact import loop as loop
+from servoctl.robots.robot import Frame as Frame
+from servoctl.robots.robot import Robot as Robot
+from servoctl.robots.robot import urdf as urdf
 from servoctl.run import Run as Run
 from servoctl.run import load as load
 from servoctl.sensitivities.identification import Identification as Identification

@@ -1,0 +1,441 @@
+"""A robot from its file: coordinates named by joints, frames, limits, and the mechanism of its tree of bodies."""
+
+import keyword
+import math
+import re
+from dataclasses import dataclass
+from functools import cached_property
+
+import casadi as ca
+import numpy as np
+
+from servoctl.checks import as_list, column, finite, mapping, named, texts
+from servoctl.errors import SpecificationError, unknown
+from servoctl.robots.description import Inertial, described
+from servoctl.robots.dynamics import (
+    Axis,
+    Kinematics,
+    inverse_dynamics,
+    kinetic_energy,
+    mass_matrix,
+    potential_energy,
+    quaternion_rotation,
+)
+from servoctl.robots.tree import TRIANGLE, tree, with_followers
+from servoctl.spec.coordinates import coordinates
+from servoctl.spec.mechanism import Mechanism
+from servoctl.spec.parameters import Parameters
+
+POSE = ("x", "y", "z", "qx", "qy", "qz", "qw")  # position and quaternion of a free body
+TWIST = ("vx", "vy", "vz", "wx", "wy", "wz")  # its velocities in its own axes
+CARRIED = ("t", "guess", "hold")  # names that no coordinate has
+NEGATIVE = 1e-9  # part of the largest principal moment below zero that is rounding
+
+
+@dataclass(frozen=True)
+class Frame:
+    """A frame of a robot, made by `Robot.frame`.
+
+    Attributes
+    ----------
+    name : str
+        The link's.
+    position : (3,) SX
+        Of its origin in the world [m].
+    rotation : (3, 3) SX
+        From its axes to the world's.
+    jacobian : (6, n) SX
+        Velocity of the origin [m/s] and angular velocity [rad/s], both in the world's axes, over the velocities.
+    q : Coordinates
+    """
+
+    name: str
+    position: ca.SX
+    rotation: ca.SX
+    jacobian: ca.SX
+    q: object
+
+    def __repr__(self):
+        return f"Frame {self.name!r} of {' '.join(self.q.names)}"[:118]
+
+
+class Robot:
+    """A robot as a tree of bodies, made by `urdf`.
+
+    Attributes
+    ----------
+    q : Coordinates
+        Named by the joints, as identifiers. A free base has base_x ... base_z, the quaternion base_qx ... base_qw
+        (scalar last) with its invariant, and the velocities base_vx ... base_wz in its own axes; a joint's velocity is
+        then named hip_rate.
+    parameters : Parameters
+        Mass, centre and inertia of the symbolic links.
+    joints : dict of str to str
+        Names of the joints in the file, by coordinate.
+    links : tuple of str
+        Names of the frames.
+    effort, velocity, position : dict
+        Limits of the file: largest force or torque by actuator [N or N m], largest speed [m/s or rad/s] and (low, high)
+        [m or rad] by coordinate. Joints without a limit are left out.
+    damping, friction : dict of str to float
+        Viscous coefficients [N s/m or N m s] and dry friction [N or N m] by coordinate.
+    """
+
+    def __init__(self, description, tree, gravity, parameters):
+        self._description, self._tree, self._gravity = description, tree, gravity
+        self.name, self.parameters, self.links = description.name, parameters, tuple(tree.places)
+        self.q, self._axes, self.joints = _axes(description, tree)
+        moving = {name: description.joints[joint] for name, joint in self.joints.items() if joint in description.joints}
+        moving = {name: joint for name, joint in moving.items() if joint.kind in ("revolute", "continuous", "prismatic")}
+        self._moving = moving
+        self.effort = {actuator(name, j): j.effort for name, j in moving.items() if math.isfinite(j.effort)}
+        self.velocity = {name: j.velocity for name, j in moving.items() if math.isfinite(j.velocity)}
+        self.position = {
+            name: (j.lower, j.upper) for name, j in moving.items() if math.isfinite(j.lower) or math.isfinite(j.upper)
+        }
+        self.damping, self.friction = self._resistances("damping"), self._resistances("friction")
+
+    def __repr__(self):
+        return f"Robot {self.name!r}: {self.q.n} degrees of freedom\n  coordinates {' '.join(self.q.names)}"
+
+    def frame(self, name) -> Frame:
+        """The frame of a link.
+
+        Parameters
+        ----------
+        name : str
+            The link's name in the file.
+
+        Raises
+        ------
+        NameUnknown
+            If no link has this name.
+        """
+        if name not in self._tree.places:
+            raise unknown(name, self.links, "link")
+        body, placement = self._tree.places[name]
+        position, rotation = ca.SX(ca.DM(placement.offset)), ca.SX(ca.DM(placement.rotation))
+        if body is not None:
+            outer = self._kinematics.rotations[body]
+            position, rotation = self._kinematics.offsets[body] + outer @ position, outer @ rotation
+        return Frame(name, position, rotation, self._jacobian(body, position), self.q)
+
+    def mechanism(
+        self, constraints=None, actuators=None, *, outputs=None, forces=None, friction=None, parameters=None
+    ) -> Mechanism:
+        """The mechanism of the robot: its balance by the recursive Newton-Euler scheme, gravity and damping.
+
+        Parameters
+        ----------
+        constraints : dict of str to SX, optional
+            Material constraints, such as those of `held` and `loop`.
+        actuators : sequence of str or dict, optional
+            Coordinates whose joints are driven; all joints by default. They are named torque_hip, and force_lift where
+            the joint slides. A dict has displacements or directions, as in `Mechanism`.
+        outputs : dict of str to SX, optional
+        forces : dict of str to SX, optional
+            Further generalised forces, as in `Mechanism`.
+        friction : float, optional
+            Speed [rad/s or m/s] below which the file's dry friction c becomes viscous, c tanh(v / friction); 0 leaves
+            it out. Needed where the file has friction.
+        parameters : Parameters, optional
+            `robot.parameters.extended(...)`, where constraints and forces have further ones.
+
+        Raises
+        ------
+        SpecificationError
+            If the file has dry friction and `friction` is not given.
+        NameUnknown
+            If an actuator names no joint.
+        """
+        names = self.q.names if self.q.plain else self.q.velocity_names
+        total = {name: ca.SX(0) for name in names}
+        for name, value in mapping(forces, "The forces").items():
+            if name not in total:
+                raise unknown(name, names, "coordinate" if self.q.plain else "quasi-velocity")
+            total[name] += column(value, f"the force on {name!r}", 1)[0]
+        for name, value in zip(names, self._resistance(friction).elements(), strict=True):
+            total[name] += value
+        return Mechanism(
+            self.q,
+            potential=potential_energy(self._kinematics, self._gravity),
+            actuators=self._driven(actuators),
+            parameters=self.parameters if parameters is None else parameters,
+            kinetic=kinetic_energy(self._kinematics),
+            balance=inverse_dynamics(self._kinematics, self.q.n),
+            mass=mass_matrix(self._kinematics, self.q.n),
+            forces={name: value for name, value in total.items() if not value.is_zero()} or None,
+            constraints=constraints,
+            outputs=outputs,
+        )
+
+    @cached_property
+    def _kinematics(self):
+        return Kinematics(self._tree, self._axes)
+
+    def _jacobian(self, body, position):
+        """Jacobian of the velocities of a point and of the body it is on, (6, n) SX."""
+        result = ca.SX.zeros(6, self.q.n)
+        while body is not None:
+            rotation, arm = self._kinematics.rotations[body], position - self._kinematics.offsets[body]
+            axis = self._axes[body]
+            directions = ca.horzsplit(rotation) * 2 if axis.motion == "free" else [rotation[:, 2]]
+            for k, ((row, factor), e) in enumerate(zip(axis.rows, directions, strict=True)):
+                slides = axis.motion == "slide" or axis.motion == "free" and k < 3
+                column = ca.vertcat(e, ca.SX.zeros(3)) if slides else ca.vertcat(ca.cross(e, arm), e)
+                result[:, row] += factor * column
+            body = self._tree.bodies[body].parent
+        return result
+
+    def _resistances(self, key):
+        """Coefficients of a kind by coordinate."""
+        return {name: getattr(j, key) for name, j in self._moving.items() if getattr(j, key)}
+
+    def _resistance(self, friction):
+        """Generalised forces of damping and friction, (n,) SX."""
+        if friction is None and self.friction:
+            named = ", ".join(self.friction)
+            raise SpecificationError(
+                f"The joints {named} have dry friction."[:500],
+                "Dry friction jumps where a joint stops; servoctl takes it smoothed, as c tanh(v / friction).",
+                do="Pass friction=0.01, a speed in rad/s or m/s, or friction=0 to leave it out.",
+                joints=list(self.friction),
+            )
+        speed = finite("friction", 0.0 if friction is None else friction)
+        if speed < 0.0:
+            raise SpecificationError(f"friction={speed:g} is given.", "It is a speed, at least zero.", "0.")
+        rows = ca.SX.zeros(self.q.n)
+        for axis, joint in zip(self._axes, (self._description.joints.get(b.joint) for b in self._tree.bodies), strict=True):
+            if joint is None or joint.kind not in ("revolute", "continuous", "prismatic"):
+                continue
+            (row, factor), rate = axis.rows[0], axis.rate[0]
+            load = joint.damping * rate
+            if speed and joint.friction:
+                load = load + joint.friction * ca.tanh(rate / speed)
+            rows[row] -= factor * load
+        return rows
+
+    def _driven(self, actuators):
+        """Displacements of the actuators by name."""
+        if isinstance(actuators, dict):
+            return actuators
+        chosen = list(self._moving) if actuators is None else texts(actuators, "The actuators")
+        places = dict(zip(self.q.names, self.q, strict=True))
+        for name in chosen:
+            if name not in self._moving:
+                raise unknown(name, list(self._moving), "joint that can be driven")
+        return {actuator(name, self._moving[name]): places[name] for name in chosen}
+
+
+def urdf(source, base="fixed", lock=None, symbolic=(), gravity=9.81) -> Robot:
+    """Read a robot from a URDF file.
+
+    Fixed and locked joints make one body of their links; meshes, visuals, collisions and transmissions play no part.
+    Joints that mimic others move with them.
+
+    Parameters
+    ----------
+    source : str or Path
+        Path of the file, or its text.
+    base : "fixed" or "free"
+        Whether the root link rests in the world, or moves with six degrees of freedom.
+    lock : dict of str to float, optional
+        Positions of joints that do not move [rad or m], by their names in the file.
+    symbolic : sequence of str
+        Links whose mass, centre and inertia become parameters tool0_mass [kg], tool0_cx ... [m], tool0_ixx ... [kg m^2]:
+        about the centre of mass, in the axes of the link. Their defaults are the numbers of the file.
+    gravity : float or (3,) sequence
+        Along -z of the world, or a vector [m/s^2].
+
+    Returns
+    -------
+    Robot
+
+    Raises
+    ------
+    SpecificationError
+        If the file is no URDF or written for xacro, is too large, declares a document type, has an impossible inertia,
+        two roots or a loop, or a joint that moves no mass.
+    NameUnknown
+        If a joint or a link does not exist.
+    """
+    description = described(source)
+    named(base, ("fixed", "free"), "base")
+    lock = {name: finite(name, value, "position") for name, value in mapping(lock, "The locked joints").items()}
+    parameters, inertials = _symbolic(description, texts(symbolic, "The symbolic links"))
+    description, lock = with_followers(description, lock)
+    bodies = tree(description, base, lock, inertials)
+    _refuse_impossible(bodies, parameters)
+    return Robot(description, bodies, _field(gravity), parameters)
+
+
+def actuator(name, joint):
+    """The name of the actuator of a joint, by its coordinate."""
+    return f"{'force' if joint.kind == 'prismatic' else 'torque'}_{name}"
+
+
+def _axes(description, tree):
+    """Coordinates of a tree, the axis of each body, and the joints' names in the file by coordinate."""
+    free = any(body.motion == "free" for body in tree.bodies)
+    taken, places, joints = [], {}, {}
+    for body in tree.bodies:
+        if body.mimic is None:
+            base = identifier(body.joint, taken)
+            places[body.joint] = [f"{base}_{part}" for part in POSE] if body.motion == "free" else [base]
+            taken += places[body.joint]
+            joints |= dict.fromkeys(places[body.joint], body.joint)
+    if not taken:
+        raise SpecificationError(
+            f"The robot {description.name!r} has no joint that moves.",
+            "A mechanism has at least one degree of freedom.",
+            do='Release a joint, or pass base="free".',
+        )
+    q = coordinates(" ".join(taken))
+    if free:
+        q = _with_twists(q, tree, places)
+    rates, accelerations = q.gamma(1), q.gamma(2)
+    symbols, axes, row, rows = dict(zip(q.names, q, strict=True)), {}, 0, []
+    for body in tree.bodies:
+        if body.mimic is None:
+            rows = range(row, row + (6 if body.motion == "free" else 1))
+            row = rows.stop
+            position = ca.vertcat(*(symbols[name] for name in places[body.joint]))
+            rate, acceleration = (ca.vertcat(*(jet[i] for i in rows)) for jet in (rates, accelerations))
+            axes[body.joint] = Axis(body.motion, position, rate, acceleration, tuple((i, 1.0) for i in rows))
+    for body in tree.bodies:
+        if body.mimic is not None:
+            source, factor, offset = body.mimic
+            axis, motion = axes[source], body.motion
+            rows = tuple((i, factor * f) for i, f in axis.rows)
+            position, rate, acceleration = factor * axis.value + offset, factor * axis.rate, factor * axis.acceleration
+            axes[body.joint] = Axis(motion, position, rate, acceleration, rows)
+    return q, [axes[body.joint] for body in tree.bodies], joints
+
+
+def _with_twists(q, tree, places):
+    """Coordinates of which free bodies have the velocities of their own axes, and joints their rates."""
+    symbols, names, columns, invariants = dict(zip(q.names, q, strict=True)), [], [], {}
+    for body in tree.bodies:
+        if body.mimic is not None:
+            continue
+        own = places[body.joint]
+        if body.motion != "free":
+            names.append(f"{own[0]}_rate")
+            columns.append({own[0]: 1.0})
+            continue
+        base = own[0].removesuffix("_x")
+        x, y, z, w = (symbols[name] for name in own[3:])
+        names += [f"{base}_{part}" for part in TWIST]
+        turned = quaternion_rotation(x, y, z, w)
+        columns += [dict(zip(own, e.elements(), strict=False)) for e in ca.horzsplit(turned)]
+        rates = ((w, z, -y, -x), (-z, w, x, -y), (y, -x, w, -z))
+        columns += [{name: value / 2 for name, value in zip(own[3:], rate, strict=True)} for rate in rates]
+        invariants[f"{base}_unit"] = x * x + y * y + z * z + w * w - 1
+    V = ca.SX.zeros(q.nq, len(names))
+    for j, entries in enumerate(columns):
+        for name, value in entries.items():
+            V[q.names.index(name), j] = value
+    return q.with_quasi_velocities(" ".join(names), V, invariants=invariants)
+
+
+def identifier(name, taken=()):
+    """A name as a Python identifier that neither a coordinate nor a derivative of one has.
+
+    Parameters
+    ----------
+    name : str
+    taken : sequence of str
+    """
+    plain = re.sub(r"\W", "_", name)
+    plain = f"j_{plain}" if not plain.isidentifier() or keyword.iskeyword(plain) or plain in CARRIED else plain
+    while plain in taken or any(_derives(a, b) for other in taken for a, b in ((plain, other), (other, plain))):
+        plain += "_"
+    return plain
+
+
+def _derives(name, base):
+    """Whether a name is that of a derivative of another."""
+    return bool(re.fullmatch(rf"d[2-9]?{re.escape(base)}", name))
+
+
+def _field(gravity):
+    """The vector of gravity."""
+    entries = as_list(gravity) or [gravity]
+    if len(entries) not in (1, 3):
+        raise SpecificationError(
+            f"gravity has {len(entries)} entries.", "It is a number along -z, or a vector of three."
+        )
+    numbers = [finite("gravity", value) for value in entries]
+    return np.array(numbers if len(numbers) == 3 else [0.0, 0.0, -numbers[0]])
+
+
+def _symbolic(description, links):
+    """Parameters of symbolic links, and the inertia of all links."""
+    inertials, defaults = dict(description.links), {}
+    for link in links:
+        if link not in inertials:
+            raise unknown(link, inertials, "link")
+        defaults |= _numbers_of(link, inertials[link])
+    parameters = Parameters(defaults)
+    for link in links:
+        own = [getattr(parameters, name) for name in _numbers_of(link, inertials[link])]
+        mass, centre, (ixx, ixy, ixz, iyy, iyz, izz) = own[0], ca.vertcat(*own[1:4]), own[4:]
+        inertia = ca.vertcat(ca.horzcat(ixx, ixy, ixz), ca.horzcat(ixy, iyy, iyz), ca.horzcat(ixz, iyz, izz))
+        inertials[link] = Inertial(mass, ca.SX.zeros(3), inertia).moved(np.eye(3), centre)
+    return parameters, inertials
+
+
+def _numbers_of(link, inertial):
+    """Mass, centre of mass and inertia about it of a link, by the names of their parameters."""
+    base, mass = identifier(link), float(inertial.mass)
+    centre = np.zeros(3) if not mass else np.array(inertial.moment).ravel() / mass
+    inertia = np.array(inertial.inertia) - mass * (centre @ centre * np.eye(3) - np.outer(centre, centre))
+    moments = {f"i{'xyz'[i]}{'xyz'[j]}": float(inertia[i, j]) for i in range(3) for j in range(i, 3)}
+    numbers = {"mass": mass, **dict(zip(("cx", "cy", "cz"), map(float, centre), strict=True)), **moments}
+    return {f"{base}_{key}": value for key, value in numbers.items()}
+
+
+def _refuse_impossible(tree, parameters):
+    """Refuse bodies that no distribution of mass has, and joints that move no mass."""
+    numbers = ca.DM(list(parameters.defaults.values()))
+    carried = [False] * len(tree.bodies)
+    for i in reversed(range(len(tree.bodies))):
+        body = tree.bodies[i]
+        parts = [ca.SX(part) for part in (body.inertial.mass, body.inertial.moment, body.inertial.inertia)]
+        mass, moment, inertia = (
+            np.array(value)
+            for value in ca.Function("f", [ca.vertcat(ca.SX(0, 1), *parameters.symbols)], parts).call([numbers])
+        )
+        _refuse_inertia(body, mass.item(), moment.ravel(), inertia)
+        carried[i] = carried[i] or bool(mass.item() or inertia.any())
+        if body.parent is not None:
+            carried[body.parent] = carried[body.parent] or carried[i]
+        if not carried[i]:
+            raise SpecificationError(
+                f"The joint {body.joint!r} moves no mass: neither link {body.name!r} nor what hangs on it has inertia.",
+                "Each degree of freedom has inertia.",
+                do=f"Lock it, lock={{{body.joint!r}: 0.0}}, or give a link an <inertial>.",
+                joint=body.joint,
+            )
+
+
+def _refuse_inertia(body, mass, moment, inertia):
+    centre = moment / mass if mass else np.zeros(3)
+    about = inertia - mass * (centre @ centre * np.eye(3) - np.outer(centre, centre))
+    principal, axes = np.linalg.eigh((about + about.T) / 2)
+    excess = principal[2] - principal[0] - principal[1]
+    if principal[0] >= -NEGATIVE * abs(principal[2]) and excess <= TRIANGLE * abs(principal[2]):
+        return
+    spread = np.maximum(principal.sum() / 2 - principal, 0.0)  # of mass along the principal axes
+    possible = axes @ np.diag(spread.sum() - spread) @ axes.T
+    values = ", ".join(f"i{'xyz'[i]}{'xyz'[j]}={possible[i, j]:.4g}" for i in range(3) for j in range(i, 3))
+    raise SpecificationError(
+        f"The body of link {body.name!r} has the principal moments of inertia {principal[0]:.4g}, {principal[1]:.4g}, "
+        f"{principal[2]:.4g} kg m^2 about its centre of mass.",
+        "None is negative, and each is at most the sum of the two others; links that fixed joints connect count as one.",
+        f"{values}.",
+        do="Correct the <inertia> of its links.",
+        link=body.name,
+        principal=principal.tolist(),
+        possible=possible.tolist(),
+    )
