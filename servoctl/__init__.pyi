@@ -2,6 +2,7 @@
 
 from servoctl import figures as figures
 from servoctl import interop as interop
+from servoctl import programs as programs
 from servoctl import spec as spec
 from servoctl.control import disturbances as disturbances
 from servoctl.control.close import close as close
@@ -69,6 +70,7 @@ from servoctl.sensitivities.sensitivity import Sensitivity as Sensitivity
 from servoctl.sensitivities.sensitivity import sensitivity as sensitivity
 from servoctl.simulation import simulate as simulate
 from servoctl.spec import paths as paths
+from servoctl.spec import rotations as rotations
 from servoctl.spec.bodies import body_rates as body_rates
 from servoctl.spec.bodies import particle as particle
 from servoctl.spec.bodies import rigid_body as rigid_body

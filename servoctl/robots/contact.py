@@ -5,12 +5,14 @@ import numpy as np
 
 from servoctl.checks import mapping, named, require_kind, texts
 from servoctl.errors import SpecificationError, unknown
-from servoctl.robots.robot import Frame, Robot, identifier
+from servoctl.robots.joints import identifier
+from servoctl.robots.robot import Frame, Robot
+from servoctl.spec import rotations
 
-KINDS = ("position", "pose")
-SEED = 20033  # of the postures at which rows are compared
+HOLDS = ("position", "pose")
+POSTURE_SEED = 20033  # of the postures at which rows are compared
 POSTURES = 3
-DEPENDENT = 1e-9  # part of the largest singular value below which rows of Jacobians depend on others
+FOLLOWS = 1e-9  # part of the largest singular value below which rows of Jacobians depend on others
 
 
 def held(robot: Robot, frames, at) -> dict:
@@ -20,7 +22,8 @@ def held(robot: Robot, frames, at) -> dict:
     ----------
     robot : Robot
     frames : sequence of str, or dict of str to str
-        Links. A dict says of each what is held: its "position" (three rows) or its "pose" (six); a sequence holds poses.
+        Links. A dict says of each what is held, its "position" (three rows) or its "pose" (six); a sequence holds
+        poses.
     at : dict of str to float
         The posture in which the frames are where they are held: coordinates by name, the others zero, the quaternion of
         a free base one.
@@ -42,11 +45,11 @@ def held(robot: Robot, frames, at) -> dict:
     rows = {}
     numbers = posture(robot, at)
     for link, kind in frames.items():
-        named(kind, KINDS, "kind of constraint")
+        named(kind, HOLDS, "kind of constraint")
         frame = robot.frame(link)
         there = [ca.substitute(part, ca.vertcat(*robot.q), numbers) for part in (frame.position, frame.rotation)]
-        rows |= _rows(identifier(link), frame.position - there[0], there[1].T @ frame.rotation, kind)
-    return _independent(rows, robot.q, robot.parameters, numbers)
+        rows |= _coinciding(identifier(link), frame.position - there[0], there[1].T @ frame.rotation, kind)
+    return _without_followers(rows, robot.q, robot.parameters, numbers)
 
 
 def loop(a: Frame, b: Frame, kind="pose", name="loop") -> dict:
@@ -75,7 +78,7 @@ def loop(a: Frame, b: Frame, kind="pose", name="loop") -> dict:
     """
     for key, frame in (("a", a), ("b", b)):
         require_kind(Frame, key, frame, "robot.frame(link)")
-    named(kind, KINDS, "kind of constraint")
+    named(kind, HOLDS, "kind of constraint")
     if a.q is not b.q:
         raise SpecificationError(
             f"The frames {a.name!r} and {b.name!r} are of different robots.",
@@ -83,8 +86,8 @@ def loop(a: Frame, b: Frame, kind="pose", name="loop") -> dict:
             do="Put both into one URDF file.",
             frames=[a.name, b.name],
         )
-    rows = _rows(identifier(name), a.rotation.T @ (b.position - a.position), a.rotation.T @ b.rotation, kind)
-    return _independent(rows, a.q, None, None)
+    rows = _coinciding(identifier(name), a.rotation.T @ (b.position - a.position), a.rotation.T @ b.rotation, kind)
+    return _without_followers(rows, a.q, None, None)
 
 
 def posture(robot, at):
@@ -97,20 +100,15 @@ def posture(robot, at):
     return ca.DM(list(numbers.values()))
 
 
-def rotation_vector(rotation):
-    """The vector 2 tan(angle/2) along the axis of a rotation, (3,) SX: Rodrigues' parameters, twice."""
-    skew = rotation - rotation.T
-    return 2 * ca.vertcat(skew[2, 1], skew[0, 2], skew[1, 0]) / (1 + ca.trace(rotation))
-
-
-def _rows(name, offset, rotation, kind):
+def _coinciding(name, offset, rotation, kind):
     rows = {f"{name}_{axis}": offset[i] for i, axis in enumerate("xyz")}
     if kind == "pose":
-        rows |= {f"{name}_r{axis}": rotation_vector(rotation)[i] for i, axis in enumerate("xyz")}
+        turned = rotations.vector(rotation)
+        rows |= {f"{name}_r{axis}": turned[i] for i, axis in enumerate("xyz")}
     return rows
 
 
-def _independent(rows, q, parameters, known):
+def _without_followers(rows, q, parameters, known):
     """The rows without those that depend on rows before them in every posture.
 
     Parameters
@@ -126,9 +124,9 @@ def _independent(rows, q, parameters, known):
     gradient = ca.jacobian(values, ca.vertcat(*q)) @ q.V
     evaluate = ca.Function("rows", [symbols], [values, ca.densify(gradient), ca.densify(q.V)])
     numbers = np.array(list(parameters.defaults.values()) if parameters else [], float)
-    random = np.random.default_rng(SEED)
+    random = np.random.default_rng(POSTURE_SEED)
     places = [np.concatenate([_some_posture(q, random), numbers]) for _ in range(POSTURES)]
-    kept = _leading([np.array(evaluate(place)[1]) for place in places])
+    kept = _adding([np.array(evaluate(place)[1]) for place in places])
     if len(kept) < len(rows) and known is None:
         _refuse_contradiction(list(rows), kept, evaluate, places, q.nq)
     return {name: row for i, (name, row) in enumerate(rows.items()) if i in kept}
@@ -143,7 +141,7 @@ def _some_posture(q, random):
     return posture
 
 
-def _leading(jacobians):
+def _adding(jacobians):
     """Rows, first ones first, that add to the rank of the rows before them in one of the postures."""
     kept = []
     for i in range(jacobians[0].shape[0]):
@@ -155,19 +153,19 @@ def _leading(jacobians):
 
 def _full_rank(matrix):
     singular = np.linalg.svd(matrix, compute_uv=False)
-    return len(singular) == len(matrix) and singular[-1] > DEPENDENT * max(1.0, singular[0])
+    return len(singular) == len(matrix) and singular[-1] > FOLLOWS * max(1.0, singular[0])
 
 
 def _refuse_contradiction(names, kept, evaluate, places, nq):
     """Refuse rows left out that do not vanish where the others do."""
     dropped = [i for i in range(len(names)) if i not in kept]
     for place in places:
-        closed = _closed(evaluate, kept, place.copy(), nq)
+        closed = _newton(evaluate, kept, place.copy(), nq)
         if closed is None:
             continue
         values = np.array(evaluate(closed)[0]).ravel()
         worst = max(dropped, key=lambda i: abs(values[i]))
-        if abs(values[worst]) > DEPENDENT:
+        if abs(values[worst]) > FOLLOWS:
             raise SpecificationError(
                 f"The chain cannot be closed: {names[worst]!r} is {values[worst]:.3g} where the other rows vanish.",
                 "The frames coincide in some posture.",
@@ -178,11 +176,11 @@ def _refuse_contradiction(names, kept, evaluate, places, nq):
         return
 
 
-def _closed(evaluate, kept, place, nq):
-    """A posture in which the rows kept vanish, by Newton's iteration from a posture; None where it does not lead there."""
+def _newton(evaluate, kept, place, nq):
+    """A posture in which the rows kept vanish, by Newton's iteration from a posture; None where it finds none."""
     for _ in range(50):
         values, jacobian, frame = (np.array(part) for part in evaluate(place))
-        if np.abs(values[kept]).max(initial=0.0) < 1e-2 * DEPENDENT:
+        if np.abs(values[kept]).max(initial=0.0) < 1e-2 * FOLLOWS:
             return place
         step = np.linalg.lstsq(jacobian[kept], -values[kept].ravel(), rcond=None)[0]
         place[:nq] += frame @ (step * min(1.0, 0.5 / max(np.abs(step).max(), 1e-300)))

@@ -13,13 +13,13 @@ from servoctl.errors import SpecificationError, unknown
 
 LARGEST_FILE = 20_000_000  # bytes: a hundred times the largest description of a humanoid
 NEGLIGIBLE = 1e-12  # entry of a rotation that is rounding: zero, or one if it is that near to one
-KINDS = ("revolute", "continuous", "prismatic", "fixed", "floating", "planar")
+JOINTS = ("revolute", "continuous", "prismatic", "fixed", "floating", "planar")
 MOMENTS = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
 
 
 @dataclass(frozen=True)
 class Inertial:
-    """Mass [kg], its first moment [kg m] and its inertia [kg m^2] about the origin of a frame, in its axes: DM or SX."""
+    """Mass [kg], first moment [kg m] and inertia [kg m^2] about the origin of a frame, in its axes: DM or SX."""
 
     mass: object = 0.0
     moment: object = field(default_factory=lambda: ca.DM.zeros(3))
@@ -79,13 +79,13 @@ def described(source):
     SpecificationError
         If the file is no URDF, is too large, has a document type, entities or xacro, or numbers that are none.
     """
-    root = _root(*_content(source))
+    root = _root_element(*_bytes(source))
     if root.tag != "robot":
         raise SpecificationError(
             f"The root of the document is <{root.tag}>.", "That of a URDF file is <robot>.", tag=root.tag
         )
-    links = {name: _inertial(node, name) for name, node in _named(root, "link").items()}
-    joints = {name: _joint(node, name) for name, node in _named(root, "joint").items()}
+    links = {name: _inertial(node, name) for name, node in _by_name(root, "link").items()}
+    joints = {name: _joint(node, name) for name, node in _by_name(root, "joint").items()}
     if not links:
         raise SpecificationError("The robot has no link.", "A URDF file has at least one <link name=...>.")
     for joint in joints.values():
@@ -115,7 +115,7 @@ def _parallel(a, b):
     return ca.dot(a, b) * ca.DM.eye(3) - b @ a.T
 
 
-def _content(source):
+def _bytes(source):
     """Bytes of a document and the encoding that overrides its declaration, or None."""
     if isinstance(source, str) and "<" in source:
         return source.encode(), "utf-8"
@@ -155,11 +155,11 @@ def _require_size(size):
         )
 
 
-def _root(content, encoding):
+def _root_element(content, encoding):
     """The root element; document types are refused, so that no entity is expanded or fetched."""
     _require_size(len(content))
     builder, parser = TreeBuilder(), expat.ParserCreate(encoding)
-    parser.StartElementHandler = lambda tag, attributes: builder.start(tag, _literal(tag, attributes))
+    parser.StartElementHandler = lambda tag, attributes: builder.start(tag, _without_macros(tag, attributes))
     parser.EndElementHandler = builder.end
     parser.StartDoctypeDeclHandler = _refuse_document_type
     try:
@@ -182,7 +182,7 @@ def _refuse_document_type(name, *_):
     )
 
 
-def _literal(tag, attributes):
+def _without_macros(tag, attributes):
     """The attributes of an element that needs no macro processor."""
     macro = next((f"{k}={v!r}" for k, v in attributes.items() if "${" in v or "$(" in v), None)
     if tag.startswith("xacro:") or macro:
@@ -195,7 +195,7 @@ def _literal(tag, attributes):
     return attributes
 
 
-def _named(root, tag):
+def _by_name(root, tag):
     """Elements of a kind by name."""
     found = {}
     for node in root.findall(tag):
@@ -218,8 +218,8 @@ def _inertial(link, name):
         return Inertial()
     rotation, offset = _origin(node, f"the inertial of link {name!r}")
     what = f"link {name!r}"
-    mass = _number(node.find("mass"), "value", what)
-    ixx, ixy, ixz, iyy, iyz, izz = (_number(node.find("inertia"), key, what, 0.0) for key in MOMENTS)
+    mass = _one_number(node.find("mass"), "value", what)
+    ixx, ixy, ixz, iyy, iyz, izz = (_one_number(node.find("inertia"), key, what, 0.0) for key in MOMENTS)
     inertia = ca.DM([[ixx, ixy, ixz], [ixy, iyy, iyz], [ixz, iyz, izz]])
     if mass < 0.0:
         raise SpecificationError(
@@ -230,11 +230,11 @@ def _inertial(link, name):
 
 def _joint(node, name):
     kind, what = node.get("type"), f"joint {name!r}"
-    if kind not in KINDS:
+    if kind not in JOINTS:
         raise SpecificationError(
             f"The type of {what} is {kind!r}.",
-            f"Types of joints are {', '.join(KINDS)}.",
-            unknown(kind, KINDS, "type").details["match"] or "",
+            f"Types of joints are {', '.join(JOINTS)}.",
+            unknown(kind, JOINTS, "type").details["match"] or "",
             do="Build it from joints of these types, with links without mass between them.",
             joint=name,
             type=kind,
@@ -243,17 +243,17 @@ def _joint(node, name):
     limit, dynamics = node.find("limit"), node.find("dynamics")
     turns = kind in ("continuous", "floating", "planar")
     return Joint(
-        name, kind, _link(node, "parent", what), _link(node, "child", what), rotation, offset,
+        name, kind, _link_of(node, "parent", what), _link_of(node, "child", what), rotation, offset,
         np.zeros(3) if kind in ("fixed", "floating") else _axis(node, what),
-        lower=-math.inf if turns else _number(limit, "lower", what, 0.0 if limit is not None else -math.inf),
-        upper=math.inf if turns else _number(limit, "upper", what, 0.0 if limit is not None else math.inf),
-        effort=_number(limit, "effort", what, math.inf), velocity=_number(limit, "velocity", what, math.inf),
+        lower=-math.inf if turns else _one_number(limit, "lower", what, 0.0 if limit is not None else -math.inf),
+        upper=math.inf if turns else _one_number(limit, "upper", what, 0.0 if limit is not None else math.inf),
+        effort=_one_number(limit, "effort", what, math.inf), velocity=_one_number(limit, "velocity", what, math.inf),
         damping=_resistance(dynamics, "damping", what), friction=_resistance(dynamics, "friction", what),
         mimic=_mimic(node.find("mimic"), what),
     )  # fmt: skip
 
 
-def _link(node, tag, what):
+def _link_of(node, tag, what):
     found = node.find(tag)
     if found is None or not found.get("link"):
         raise SpecificationError(f"{what} has no <{tag} link=...>.", "A joint has a parent and a child.", joint=what)
@@ -263,7 +263,7 @@ def _link(node, tag, what):
 def _mimic(node, what):
     if node is None:
         return None
-    return node.get("joint"), _number(node, "multiplier", what, 1.0), _number(node, "offset", what, 0.0)
+    return node.get("joint"), _one_number(node, "multiplier", what, 1.0), _one_number(node, "offset", what, 0.0)
 
 
 def _origin(node, what):
@@ -271,11 +271,12 @@ def _origin(node, what):
     origin = node.find("origin")
     if origin is None:
         return np.eye(3), np.zeros(3)
-    return rotation_of(*_numbers(origin, "rpy", what, "0 0 0")), np.array(_numbers(origin, "xyz", what, "0 0 0"))
+    angles, offset = (_finite_numbers(origin, key, what, "0 0 0") for key in ("rpy", "xyz"))
+    return rotation_of(*angles), np.array(offset)
 
 
 def _axis(node, what):
-    axis = np.array(_numbers(node.find("axis"), "xyz", what, "1 0 0"))
+    axis = np.array(_finite_numbers(node.find("axis"), "xyz", what, "1 0 0"))
     length = np.linalg.norm(axis)
     if not length:
         raise SpecificationError(f"The axis of {what} is 0 0 0.", "An axis has a direction.", joint=what)
@@ -283,7 +284,7 @@ def _axis(node, what):
 
 
 def _resistance(node, key, what):
-    value = _number(node, key, what, 0.0)
+    value = _one_number(node, key, what, 0.0)
     if value < 0.0:
         raise SpecificationError(
             f"The {key} of {what} is {value:g}.", "It takes energy away: it is at least zero.", "0.", joint=what
@@ -291,15 +292,15 @@ def _resistance(node, key, what):
     return value
 
 
-def _number(node, key, what, default=None):
+def _one_number(node, key, what, default=None):
     if node is None or node.get(key) is None:
         if default is not None:
             return default
         raise SpecificationError(f"{what} has no {key!r}.", f"It needs one number {key!r}.", what=what, attribute=key)
-    return _numbers(node, key, what, count=1)[0]
+    return _finite_numbers(node, key, what, count=1)[0]
 
 
-def _numbers(node, key, what, default="", count=3):
+def _finite_numbers(node, key, what, default="", count=3):
     """The finite numbers of an attribute."""
     text = default if node is None else node.get(key, default)
     try:

@@ -36,7 +36,8 @@ class Kinematics:
     def __init__(self, tree, axes):
         self.tree, self.axes = tree, axes
         self.rotations, self.offsets, self.omega, self.speed = [], [], [], []
-        self.locals, self.along = [_local(axis) for axis in axes], [_along(axis) for axis in axes]
+        self.locals = [_local(axis, body.parent is None) for body, axis in zip(tree.bodies, axes, strict=True)]
+        self.along = [_carried(axis) for axis in axes]
         for body, axis in zip(tree.bodies, axes, strict=True):
             self._place(body, axis)
             self._move(body, axis)
@@ -138,26 +139,30 @@ def potential_energy(kinematics, gravity):
     return total
 
 
-def quaternion_rotation(x, y, z, w):
-    """The rotation matrix of a unit quaternion with the scalar w."""
+def quaternion_rotation(x, y, z, w, twice=2):
+    """The rotation matrix of a quaternion with the scalar w; a unit one, or any with `twice` 2/(x² + y² + z² + w²)."""
     return ca.vertcat(
-        ca.horzcat(1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)),
-        ca.horzcat(2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)),
-        ca.horzcat(2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)),
+        ca.horzcat(1 - twice * (y * y + z * z), twice * (x * y - z * w), twice * (x * z + y * w)),
+        ca.horzcat(twice * (x * y + z * w), 1 - twice * (x * x + z * z), twice * (y * z - x * w)),
+        ca.horzcat(twice * (x * z - y * w), twice * (y * z + x * w), 1 - twice * (x * x + y * y)),
     )
 
 
-def _local(axis):
-    """Rotation of a body in the frame of its placement."""
+def _local(axis, first):
+    """Rotation of a body in the frame of its placement, orthonormal for any quaternion but that of a `first` body.
+
+    Of a first body nothing but frames and gravity depends on it, and they are read where the quaternion is a unit one.
+    """
     if axis.motion == "slide":
         return ca.SX.eye(3)
     if axis.motion == "free":
-        return quaternion_rotation(*axis.value[3:].elements())
+        quaternion = axis.value[3:]
+        return quaternion_rotation(*quaternion.elements(), 2 if first else 2 / ca.dot(quaternion, quaternion))
     c, s = ca.cos(axis.value), ca.sin(axis.value)
     return ca.vertcat(ca.horzcat(c, -s, 0), ca.horzcat(s, c, 0), ca.horzcat(0, 0, 1))
 
 
-def _along(axis):
+def _carried(axis):
     """Offset of a body in the frame of its placement."""
     return {"turn": ca.SX.zeros(3), "slide": along_z(axis.value[0]), "free": axis.value[:3]}[axis.motion]
 
@@ -200,14 +205,14 @@ def mass_matrix(kinematics, n):
     composites = [body.inertial for body in bodies]
     M = ca.SX.zeros(n, n)
     for i in reversed(range(len(bodies))):
-        directions = _directions(bodies[i])
+        directions = _units_of_motion(bodies[i])
         loads = [_inertial_load(composites[i], ca.SX.zeros(3), alpha, a) for alpha, a in directions]
         for k, ((row, factor), load) in enumerate(zip(axes[i].rows, loads, strict=True)):
             j, columns = i, range(k + 1)
             while j is not None:
                 for c in columns:
                     other, scale = axes[j].rows[c]
-                    alpha, a = _directions(bodies[j])[c]
+                    alpha, a = _units_of_motion(bodies[j])[c]
                     entry = factor * scale * (ca.dot(a, load[0]) + ca.dot(alpha, load[1]))
                     M[row, other] += entry
                     if (j, c) != (i, k):
@@ -223,7 +228,7 @@ def mass_matrix(kinematics, n):
     return M
 
 
-def _directions(body):
+def _units_of_motion(body):
     """Angular and linear acceleration of a body for a unit of each of its velocities."""
     zero, e = ca.SX.zeros(3), ca.horzsplit(ca.SX.eye(3))
     if body.motion == "free":

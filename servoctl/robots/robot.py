@@ -1,8 +1,6 @@
 """A robot from its file: coordinates named by joints, frames, limits, and the mechanism of its tree of bodies."""
 
-import keyword
 import math
-import re
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -11,25 +9,12 @@ import numpy as np
 
 from servoctl.checks import as_list, column, finite, mapping, named, texts
 from servoctl.errors import SpecificationError, unknown
-from servoctl.robots.description import Inertial, described
-from servoctl.robots.dynamics import (
-    Axis,
-    Kinematics,
-    inverse_dynamics,
-    kinetic_energy,
-    mass_matrix,
-    potential_energy,
-    quaternion_rotation,
-)
-from servoctl.robots.tree import TRIANGLE, tree, with_followers
-from servoctl.spec.coordinates import coordinates
+from servoctl.robots.description import described
+from servoctl.robots.dynamics import Kinematics, inverse_dynamics, kinetic_energy, mass_matrix, potential_energy
+from servoctl.robots.inertia import require_possible, with_symbols
+from servoctl.robots.joints import ONE_AXIS, axes_of
+from servoctl.robots.tree import tree, with_followers
 from servoctl.spec.mechanism import Mechanism
-from servoctl.spec.parameters import Parameters
-
-POSE = ("x", "y", "z", "qx", "qy", "qz", "qw")  # position and quaternion of a free body
-TWIST = ("vx", "vy", "vz", "wx", "wy", "wz")  # its velocities in its own axes
-CARRIED = ("t", "guess", "hold")  # names that no coordinate has
-NEGATIVE = 1e-9  # part of the largest principal moment below zero that is rounding
 
 
 @dataclass(frozen=True)
@@ -84,10 +69,9 @@ class Robot:
     def __init__(self, description, tree, gravity, parameters):
         self._description, self._tree, self._gravity = description, tree, gravity
         self.name, self.parameters, self.links = description.name, parameters, tuple(tree.places)
-        self.q, self._axes, self.joints = _axes(description, tree)
-        moving = {name: description.joints[joint] for name, joint in self.joints.items() if joint in description.joints}
-        moving = {name: joint for name, joint in moving.items() if joint.kind in ("revolute", "continuous", "prismatic")}
-        self._moving = moving
+        self.q, self._axes, self.joints = axes_of(description, tree)
+        moving = {name: description.joints.get(joint) for name, joint in self.joints.items()}
+        self._moving = moving = {name: j for name, j in moving.items() if j is not None and j.kind in ONE_AXIS}
         self.effort = {actuator(name, j): j.effort for name, j in moving.items() if math.isfinite(j.effort)}
         self.velocity = {name: j.velocity for name, j in moving.items() if math.isfinite(j.velocity)}
         self.position = {
@@ -205,8 +189,9 @@ class Robot:
         if speed < 0.0:
             raise SpecificationError(f"friction={speed:g} is given.", "It is a speed, at least zero.", "0.")
         rows = ca.SX.zeros(self.q.n)
-        for axis, joint in zip(self._axes, (self._description.joints.get(b.joint) for b in self._tree.bodies), strict=True):
-            if joint is None or joint.kind not in ("revolute", "continuous", "prismatic"):
+        for axis, body in zip(self._axes, self._tree.bodies, strict=True):
+            joint = self._description.joints.get(body.joint)
+            if joint is None or joint.kind not in ONE_AXIS:
                 continue
             (row, factor), rate = axis.rows[0], axis.rate[0]
             load = joint.damping * rate
@@ -242,8 +227,8 @@ def urdf(source, base="fixed", lock=None, symbolic=(), gravity=9.81) -> Robot:
     lock : dict of str to float, optional
         Positions of joints that do not move [rad or m], by their names in the file.
     symbolic : sequence of str
-        Links whose mass, centre and inertia become parameters tool0_mass [kg], tool0_cx ... [m], tool0_ixx ... [kg m^2]:
-        about the centre of mass, in the axes of the link. Their defaults are the numbers of the file.
+        Links whose mass, centre and inertia become parameters tool0_mass [kg], tool0_cx ... [m] and tool0_ixx ...
+        [kg m^2], about the centre of mass in the axes of the link. Their defaults are the numbers of the file.
     gravity : float or (3,) sequence
         Along -z of the world, or a vector [m/s^2].
 
@@ -262,100 +247,16 @@ def urdf(source, base="fixed", lock=None, symbolic=(), gravity=9.81) -> Robot:
     description = described(source)
     named(base, ("fixed", "free"), "base")
     lock = {name: finite(name, value, "position") for name, value in mapping(lock, "The locked joints").items()}
-    parameters, inertials = _symbolic(description, texts(symbolic, "The symbolic links"))
+    parameters, inertials = with_symbols(description, texts(symbolic, "The symbolic links"))
     description, lock = with_followers(description, lock)
     bodies = tree(description, base, lock, inertials)
-    _refuse_impossible(bodies, parameters)
+    require_possible(bodies, parameters)
     return Robot(description, bodies, _field(gravity), parameters)
 
 
 def actuator(name, joint):
     """The name of the actuator of a joint, by its coordinate."""
     return f"{'force' if joint.kind == 'prismatic' else 'torque'}_{name}"
-
-
-def _axes(description, tree):
-    """Coordinates of a tree, the axis of each body, and the joints' names in the file by coordinate."""
-    free = any(body.motion == "free" for body in tree.bodies)
-    taken, places, joints = [], {}, {}
-    for body in tree.bodies:
-        if body.mimic is None:
-            base = identifier(body.joint, taken)
-            places[body.joint] = [f"{base}_{part}" for part in POSE] if body.motion == "free" else [base]
-            taken += places[body.joint]
-            joints |= dict.fromkeys(places[body.joint], body.joint)
-    if not taken:
-        raise SpecificationError(
-            f"The robot {description.name!r} has no joint that moves.",
-            "A mechanism has at least one degree of freedom.",
-            do='Release a joint, or pass base="free".',
-        )
-    q = coordinates(" ".join(taken))
-    if free:
-        q = _with_twists(q, tree, places)
-    rates, accelerations = q.gamma(1), q.gamma(2)
-    symbols, axes, row, rows = dict(zip(q.names, q, strict=True)), {}, 0, []
-    for body in tree.bodies:
-        if body.mimic is None:
-            rows = range(row, row + (6 if body.motion == "free" else 1))
-            row = rows.stop
-            position = ca.vertcat(*(symbols[name] for name in places[body.joint]))
-            rate, acceleration = (ca.vertcat(*(jet[i] for i in rows)) for jet in (rates, accelerations))
-            axes[body.joint] = Axis(body.motion, position, rate, acceleration, tuple((i, 1.0) for i in rows))
-    for body in tree.bodies:
-        if body.mimic is not None:
-            source, factor, offset = body.mimic
-            axis, motion = axes[source], body.motion
-            rows = tuple((i, factor * f) for i, f in axis.rows)
-            position, rate, acceleration = factor * axis.value + offset, factor * axis.rate, factor * axis.acceleration
-            axes[body.joint] = Axis(motion, position, rate, acceleration, rows)
-    return q, [axes[body.joint] for body in tree.bodies], joints
-
-
-def _with_twists(q, tree, places):
-    """Coordinates of which free bodies have the velocities of their own axes, and joints their rates."""
-    symbols, names, columns, invariants = dict(zip(q.names, q, strict=True)), [], [], {}
-    for body in tree.bodies:
-        if body.mimic is not None:
-            continue
-        own = places[body.joint]
-        if body.motion != "free":
-            names.append(f"{own[0]}_rate")
-            columns.append({own[0]: 1.0})
-            continue
-        base = own[0].removesuffix("_x")
-        x, y, z, w = (symbols[name] for name in own[3:])
-        names += [f"{base}_{part}" for part in TWIST]
-        turned = quaternion_rotation(x, y, z, w)
-        columns += [dict(zip(own, e.elements(), strict=False)) for e in ca.horzsplit(turned)]
-        rates = ((w, z, -y, -x), (-z, w, x, -y), (y, -x, w, -z))
-        columns += [{name: value / 2 for name, value in zip(own[3:], rate, strict=True)} for rate in rates]
-        invariants[f"{base}_unit"] = x * x + y * y + z * z + w * w - 1
-    V = ca.SX.zeros(q.nq, len(names))
-    for j, entries in enumerate(columns):
-        for name, value in entries.items():
-            V[q.names.index(name), j] = value
-    return q.with_quasi_velocities(" ".join(names), V, invariants=invariants)
-
-
-def identifier(name, taken=()):
-    """A name as a Python identifier that neither a coordinate nor a derivative of one has.
-
-    Parameters
-    ----------
-    name : str
-    taken : sequence of str
-    """
-    plain = re.sub(r"\W", "_", name)
-    plain = f"j_{plain}" if not plain.isidentifier() or keyword.iskeyword(plain) or plain in CARRIED else plain
-    while plain in taken or any(_derives(a, b) for other in taken for a, b in ((plain, other), (other, plain))):
-        plain += "_"
-    return plain
-
-
-def _derives(name, base):
-    """Whether a name is that of a derivative of another."""
-    return bool(re.fullmatch(rf"d[2-9]?{re.escape(base)}", name))
 
 
 def _field(gravity):
@@ -367,75 +268,3 @@ def _field(gravity):
         )
     numbers = [finite("gravity", value) for value in entries]
     return np.array(numbers if len(numbers) == 3 else [0.0, 0.0, -numbers[0]])
-
-
-def _symbolic(description, links):
-    """Parameters of symbolic links, and the inertia of all links."""
-    inertials, defaults = dict(description.links), {}
-    for link in links:
-        if link not in inertials:
-            raise unknown(link, inertials, "link")
-        defaults |= _numbers_of(link, inertials[link])
-    parameters = Parameters(defaults)
-    for link in links:
-        own = [getattr(parameters, name) for name in _numbers_of(link, inertials[link])]
-        mass, centre, (ixx, ixy, ixz, iyy, iyz, izz) = own[0], ca.vertcat(*own[1:4]), own[4:]
-        inertia = ca.vertcat(ca.horzcat(ixx, ixy, ixz), ca.horzcat(ixy, iyy, iyz), ca.horzcat(ixz, iyz, izz))
-        inertials[link] = Inertial(mass, ca.SX.zeros(3), inertia).moved(np.eye(3), centre)
-    return parameters, inertials
-
-
-def _numbers_of(link, inertial):
-    """Mass, centre of mass and inertia about it of a link, by the names of their parameters."""
-    base, mass = identifier(link), float(inertial.mass)
-    centre = np.zeros(3) if not mass else np.array(inertial.moment).ravel() / mass
-    inertia = np.array(inertial.inertia) - mass * (centre @ centre * np.eye(3) - np.outer(centre, centre))
-    moments = {f"i{'xyz'[i]}{'xyz'[j]}": float(inertia[i, j]) for i in range(3) for j in range(i, 3)}
-    numbers = {"mass": mass, **dict(zip(("cx", "cy", "cz"), map(float, centre), strict=True)), **moments}
-    return {f"{base}_{key}": value for key, value in numbers.items()}
-
-
-def _refuse_impossible(tree, parameters):
-    """Refuse bodies that no distribution of mass has, and joints that move no mass."""
-    numbers = ca.DM(list(parameters.defaults.values()))
-    carried = [False] * len(tree.bodies)
-    for i in reversed(range(len(tree.bodies))):
-        body = tree.bodies[i]
-        parts = [ca.SX(part) for part in (body.inertial.mass, body.inertial.moment, body.inertial.inertia)]
-        mass, moment, inertia = (
-            np.array(value)
-            for value in ca.Function("f", [ca.vertcat(ca.SX(0, 1), *parameters.symbols)], parts).call([numbers])
-        )
-        _refuse_inertia(body, mass.item(), moment.ravel(), inertia)
-        carried[i] = carried[i] or bool(mass.item() or inertia.any())
-        if body.parent is not None:
-            carried[body.parent] = carried[body.parent] or carried[i]
-        if not carried[i]:
-            raise SpecificationError(
-                f"The joint {body.joint!r} moves no mass: neither link {body.name!r} nor what hangs on it has inertia.",
-                "Each degree of freedom has inertia.",
-                do=f"Lock it, lock={{{body.joint!r}: 0.0}}, or give a link an <inertial>.",
-                joint=body.joint,
-            )
-
-
-def _refuse_inertia(body, mass, moment, inertia):
-    centre = moment / mass if mass else np.zeros(3)
-    about = inertia - mass * (centre @ centre * np.eye(3) - np.outer(centre, centre))
-    principal, axes = np.linalg.eigh((about + about.T) / 2)
-    excess = principal[2] - principal[0] - principal[1]
-    if principal[0] >= -NEGATIVE * abs(principal[2]) and excess <= TRIANGLE * abs(principal[2]):
-        return
-    spread = np.maximum(principal.sum() / 2 - principal, 0.0)  # of mass along the principal axes
-    possible = axes @ np.diag(spread.sum() - spread) @ axes.T
-    values = ", ".join(f"i{'xyz'[i]}{'xyz'[j]}={possible[i, j]:.4g}" for i in range(3) for j in range(i, 3))
-    raise SpecificationError(
-        f"The body of link {body.name!r} has the principal moments of inertia {principal[0]:.4g}, {principal[1]:.4g}, "
-        f"{principal[2]:.4g} kg m^2 about its centre of mass.",
-        "None is negative, and each is at most the sum of the two others; links that fixed joints connect count as one.",
-        f"{values}.",
-        do="Correct the <inertia> of its links.",
-        link=body.name,
-        principal=principal.tolist(),
-        possible=possible.tolist(),
-    )

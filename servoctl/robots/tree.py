@@ -7,8 +7,6 @@ import numpy as np
 from servoctl.errors import SpecificationError, unknown
 from servoctl.robots.description import Inertial, without_rounding
 
-TRIANGLE = 1e-6  # part of the largest principal moment by which it may exceed the sum of the others: rounded files
-
 
 @dataclass(frozen=True)
 class Placement:
@@ -71,21 +69,22 @@ def tree(description, base, lock, inertials):
         if name not in description.joints:
             raise unknown(name, description.joints, "joint")
     bodies, places = [], {}
-    root = _root(description)
+    root = _root_link(description)
     if base == "free":
         bodies.append(Body(root, "base", "free", None, Placement(), Inertial()))
     children = {}
     for joint in description.joints.values():
         children.setdefault(joint.parent, []).append(joint)
-    waiting = [(root, 0 if base == "free" else None, Placement())]
+    waiting = [(root, None, 0 if base == "free" else None, Placement())]
     while waiting:
-        link, body, placement = waiting.pop()
+        link, joint, body, placement = waiting.pop()
+        if joint is not None:
+            body, placement = _beyond(joint, body, placement, lock, bodies)
         places[link] = body, placement
         if body is not None:
             moved = inertials[link].moved(placement.rotation, placement.offset)
             bodies[body] = replace(bodies[body], inertial=bodies[body].inertial + moved)
-        for joint in reversed(children.get(link, [])):
-            waiting.append((joint.child, *_beyond(joint, body, placement, lock, bodies)))
+        waiting += [(joint.child, joint, body, placement) for joint in reversed(children.get(link, []))]
     return Tree(tuple(bodies), places)
 
 
@@ -120,7 +119,7 @@ def with_followers(description, lock):
     return replace(description, joints=joints), locked
 
 
-def _root(description):
+def _root_link(description):
     """The one link that is no joint's child."""
     parents = {}
     for joint in description.joints.values():
@@ -167,7 +166,7 @@ def _beyond(joint, body, placement, lock, bodies):
     """Body and placement of the link beyond a joint; bodies of the joint are appended to `bodies`."""
     placement = placement @ Placement(joint.rotation, joint.offset)
     if joint.kind == "fixed" or joint.name in lock:
-        return body, placement @ _locked(joint, lock.get(joint.name, 0.0))
+        return body, placement @ _fixed_at(joint, lock.get(joint.name, 0.0))
     if joint.kind == "floating":
         bodies.append(Body(joint.child, joint.name, "free", body, placement, Inertial()))
         return len(bodies) - 1, Placement()
@@ -189,7 +188,7 @@ def _beyond(joint, body, placement, lock, bodies):
 CYCLE = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])  # its axes z, x, y are the x, y, z of the parent
 
 
-def _locked(joint, position):
+def _fixed_at(joint, position):
     """The placement of a joint's child at a position."""
     if joint.kind == "fixed":
         return Placement()

@@ -62,7 +62,8 @@ class Mechanism:
     ------
     SpecificationError
         If an expression names a symbol that is no coordinate, parameter or t; if S is not quadratic in γ''; if S
-        and T disagree; if there is nothing to take the balance from; if the mass matrix of `balance` is not symmetric, or is not `mass`.
+        and T disagree; if there is nothing to take the balance from; if the mass matrix of `balance` is not symmetric,
+        or not `mass`.
     NameUnknown
         If a force names no coordinate.
     """
@@ -330,7 +331,7 @@ class Mechanism:
         pairs = [*pairs, *((i, i) for i in range(n))]
         for i, j in self._different([(self.mass[i, j] * factor, slope[i, j] * factor) for i, j in pairs], pairs):
             raise SpecificationError(
-                f"The entry of the mass matrix in row {i} and column {j} is not the factor of {names[j]} in the balance.",
+                f"The mass matrix has another entry ({i}, {j}) than the factor of {names[j]} in the balance.",
                 "`mass` is ∂r/∂γ'' of `balance`.",
                 do="Correct one of them, or leave out `mass`.",
                 components=[names[i], names[j]],
