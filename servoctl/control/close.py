@@ -81,12 +81,22 @@ def close(
         require_plan(plan, plant)
     plan = law.plan if plan is None else plan
     for _ in range(DERIVATIONS):
+        plant = regular_at_start(plant, t_span[0], x0)
         run = finished(plant, law, plan, loop_of(plant, law, x0, t_span, conditions), conditions)
         t, equations = _derived_along(run)
         if equations is None:
             return run
         plant = replace(plant, equations=equations)
     raise _stopped_at(run, came_alive(t))
+
+
+def regular_at_start(plant, t0, x0):
+    """The plant, with pivots decided near the start of a loop if those decided elsewhere vanish there."""
+    rest = np.zeros(len(plant.inputs))
+    if not plant.constrained:
+        return plant
+    x = _initial_state(plant, t0, x0, rest)
+    return plant if np.isfinite(plant.rates(t0, x, rest)).all() else plant.near(t0, x)
 
 
 def _derived_along(run):
@@ -181,7 +191,7 @@ def require_consistent(plant, t0, starts, p):
 
 
 def finished(plant, law, plan, loop, conditions, advance=None):
-    """Run a loop; return its `Closed`, or raise the error that ended it, with the motion so far; `advance` of `run_loop`."""
+    """Run a loop and return its `Closed`, or raise the error that ended it; `advance` is that of `run_loop`."""
     status, x, law_x, law_y, inputs = run_loop(plant.function("ode"), law.begin(), loop, advance)
     if status == INTERRUPTED and not len(x):
         raise KeyboardInterrupt

@@ -4,11 +4,10 @@ import math
 from dataclasses import replace
 from pathlib import Path
 
-import casadi as ca
 import numpy as np
 
 from servoctl.checks import ON_SAMPLE, as_span, require_kind
-from servoctl.control.close import as_law, finished, loop_of, require_names
+from servoctl.control.close import as_law, finished, loop_of, regular_at_start, require_names
 from servoctl.control.conditions import Conditions
 from servoctl.control.reference import require_plant
 from servoctl.control.result import Closed
@@ -63,12 +62,13 @@ def mujoco(model, law, x0, t_span, *, plant=None, sensors=None, timing=None, dis
             "The names of states and inputs are those of a plant.",
             do="Pass plant=sv.plant(mechanism).",
         )
-    plant = plant_of(plan.model.mechanism) if plant is None else plant
+    plant = plant_of(plan.model.reduction.mechanism) if plant is None else plant
     require_plant(plant)
     conditions, t_span = Conditions(sensors, timing, disturbance), as_span(t_span, forward=True)
     law = as_law(law, plant, conditions.timing.rate, t_span[0], plan)
     require_names(law, plant)
     machine = _Machine(library, model, plant)
+    plant = regular_at_start(plant, t_span[0], x0)
     timing = replace(conditions.timing, substeps=machine.steps(law.period))
     conditions = replace(conditions, timing=timing)
     try:
@@ -76,12 +76,12 @@ def mujoco(model, law, x0, t_span, *, plant=None, sensors=None, timing=None, dis
         run = finished(plant, law, plan, loop, conditions, machine.hold)
     except ServoError as error:
         if error.run is not None:
-            error.run = _named(error.run, library)
+            error.run = _of_mujoco(error.run, library)
         raise
-    return _named(run, library)
+    return _of_mujoco(run, library)
 
 
-def _named(run, library):
+def _of_mujoco(run, library):
     """The run, whose message says that it is MuJoCo's."""
     return replace(run, message=f"{run.message}, in MuJoCo {library.__version__}")
 
@@ -123,12 +123,10 @@ class _Machine:
                 lag=list(plant.lag),
             )
         self.library, self.model, self.data, self.plant = library, model, library.MjData(model), plant
-        q, p = plant.mechanism.q, plant.mechanism.parameters
+        q = plant.mechanism.q
         self.free, self.places, self.speeds = [], np.zeros(q.nq, int), np.zeros(q.n, int)
         self._find(q)
-        symbols = ca.vertcat(ca.SX(0, 1), *p.symbols)
-        self._directions = ca.Function("E", [q.t, ca.vertcat(*q), symbols], [ca.densify(plant.mechanism.E)])
-        self._numbers, self._inputs = plant.parameters[: len(p.symbols)], slice(len(plant.parameters), None)
+        self._directions, self._inputs = plant.function("directions"), slice(len(plant.parameters), None)
 
     def _find(self, q):
         """Addresses of the coordinates and velocities in MuJoCo's state."""
@@ -140,7 +138,8 @@ class _Machine:
             joints.append(name)
             base = name if f"{name}_qw" in q.names else "base"
             if kind == FREE and f"{base}_qw" in q.names:
-                self.places[[q.names.index(f"{base}_{part}") for part in PLACE]] = at_q + np.array([0, 1, 2, 4, 5, 6, 3])
+                scalar_last = np.array([0, 1, 2, 4, 5, 6, 3])
+                self.places[[q.names.index(f"{base}_{part}") for part in PLACE]] = at_q + scalar_last
                 rows = [velocities.index(f"{base}_{part}") for part in TWIST]
                 self.speeds[rows] = at_v + np.arange(6)
                 self.free.append((at_q, at_v))
@@ -176,7 +175,8 @@ class _Machine:
         for start, _middle, _end in steps:
             forces = start[self._inputs]
             u, d = forces[: len(self.plant.inputs)], forces[len(self.plant.inputs) :]
-            E = np.array(self._directions(data.time, data.qpos[self.places], self._numbers))
+            state = np.concatenate([data.qpos[self.places], x[nq:]])
+            E = self._directions(data.time, state, start)[: len(self.speeds) * len(u)].reshape(len(u), -1).T
             data.qfrc_applied[self.speeds] = E @ u + self._disturbing(d)
             for at_q, at_v in self.free:
                 data.qfrc_applied[at_v : at_v + 3] = self._turn(at_q) @ data.qfrc_applied[at_v : at_v + 3]

@@ -3,8 +3,8 @@
 import casadi as ca
 import numpy as np
 
-from servoctl.checks import mapping, named, require_kind, texts
-from servoctl.errors import SpecificationError, unknown
+from servoctl.checks import named, require_kind, texts
+from servoctl.errors import SpecificationError
 from servoctl.robots.joints import identifier
 from servoctl.robots.robot import Frame, Robot
 from servoctl.spec import rotations
@@ -43,13 +43,12 @@ def held(robot: Robot, frames, at) -> dict:
     require_kind(Robot, "robot", robot, "sv.urdf(file)")
     frames = frames if isinstance(frames, dict) else dict.fromkeys(texts(frames, "The frames"), "pose")
     rows = {}
-    numbers = posture(robot, at)
     for link, kind in frames.items():
         named(kind, HOLDS, "kind of constraint")
-        frame = robot.frame(link)
-        there = [ca.substitute(part, ca.vertcat(*robot.q), numbers) for part in (frame.position, frame.rotation)]
-        rows |= _coinciding(identifier(link), frame.position - there[0], there[1].T @ frame.rotation, kind)
-    return _without_followers(rows, robot.q, robot.parameters, numbers)
+        frame, (position, rotation) = robot.frame(link), robot.at(at, link)
+        turned = ca.DM(rotation.T) @ frame.rotation
+        rows |= _coinciding(identifier(link), frame.position - ca.DM(position), turned, kind)
+    return _without_followers(rows, robot.q, robot.parameters, True)
 
 
 def loop(a: Frame, b: Frame, kind="pose", name="loop") -> dict:
@@ -87,17 +86,7 @@ def loop(a: Frame, b: Frame, kind="pose", name="loop") -> dict:
             frames=[a.name, b.name],
         )
     rows = _coinciding(identifier(name), a.rotation.T @ (b.position - a.position), a.rotation.T @ b.rotation, kind)
-    return _without_followers(rows, a.q, None, None)
-
-
-def posture(robot, at):
-    """Numbers of the coordinates in a posture, (nq,) DM."""
-    numbers = {name: 1.0 if name.endswith("_qw") and name in robot.q.names else 0.0 for name in robot.q.names}
-    for name, value in mapping(at, "The posture").items():
-        if name not in numbers:
-            raise unknown(name, robot.q.names, "coordinate")
-        numbers[name] = float(value)
-    return ca.DM(list(numbers.values()))
+    return _without_followers(rows, a.q, None, False)
 
 
 def _coinciding(name, offset, rotation, kind):
@@ -108,7 +97,7 @@ def _coinciding(name, offset, rotation, kind):
     return rows
 
 
-def _without_followers(rows, q, parameters, known):
+def _without_followers(rows, q, parameters, consistent):
     """The rows without those that depend on rows before them in every posture.
 
     Parameters
@@ -116,8 +105,8 @@ def _without_followers(rows, q, parameters, known):
     rows : dict of str to SX
     q : Coordinates
     parameters : Parameters or None
-    known : (nq,) DM or None
-        A posture in which all rows vanish, where one is known.
+    consistent : bool
+        Whether all rows are known to vanish in some posture.
     """
     values = ca.vertcat(*rows.values())
     symbols = ca.vertcat(*q, *((parameters.symbols) if parameters else ()))
@@ -127,7 +116,7 @@ def _without_followers(rows, q, parameters, known):
     random = np.random.default_rng(POSTURE_SEED)
     places = [np.concatenate([_some_posture(q, random), numbers]) for _ in range(POSTURES)]
     kept = _adding([np.array(evaluate(place)[1]) for place in places])
-    if len(kept) < len(rows) and known is None:
+    if len(kept) < len(rows) and not consistent:
         _refuse_contradiction(list(rows), kept, evaluate, places, q.nq)
     return {name: row for i, (name, row) in enumerate(rows.items()) if i in kept}
 

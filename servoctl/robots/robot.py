@@ -104,6 +104,47 @@ class Robot:
             position, rotation = self._kinematics.offsets[body] + outer @ position, outer @ rotation
         return Frame(name, position, rotation, self._jacobian(body, position), self.q)
 
+    def posture(self, at) -> np.ndarray:
+        """All coordinates of a posture, (nq,): those not named are zero, and the quaternion of a free body is one.
+
+        Parameters
+        ----------
+        at : dict of str to float
+            Coordinates by name [rad or m].
+
+        Raises
+        ------
+        NameUnknown
+            If one is no coordinate.
+        """
+        upright = () if self.q.plain else tuple(name for name in self.q.names if name.endswith("_qw"))
+        numbers = {name: 1.0 if name in upright else 0.0 for name in self.q.names}
+        for name, value in mapping(at, "The posture").items():
+            numbers[named(name, self.q.names, "coordinate")] = finite(name, value, "coordinate")
+        return np.array(list(numbers.values()))
+
+    def at(self, posture, link):
+        """Position (3,) [m] and rotation (3, 3) of a link in a posture, with the parameters' defaults.
+
+        Parameters
+        ----------
+        posture : dict of str to float
+        link : str
+
+        Returns
+        -------
+        position, rotation : arrays
+
+        Raises
+        ------
+        NameUnknown
+            If the link or a coordinate does not exist.
+        """
+        frame = self.frame(link)
+        f = ca.Function("f", [ca.vertcat(*self.q)], [ca.densify(frame.position), ca.densify(frame.rotation)])
+        position, rotation = f.call([ca.DM(self.posture(posture))])
+        return np.array(position).ravel(), np.array(rotation)
+
     def mechanism(
         self, constraints=None, actuators=None, *, outputs=None, forces=None, friction=None, parameters=None
     ) -> Mechanism:
