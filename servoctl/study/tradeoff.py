@@ -53,6 +53,33 @@ class Recommendation(dict):
         self.row = row
 
 
+def unbeaten(cost, error):
+    """Indices of the entries that no other one beats in both cost (N,) and error (N,), from cheap to accurate."""
+    front, best = [], np.inf
+    for i in np.lexsort((error, cost)):
+        if error[i] < best:
+            front.append(i)
+            best = error[i]
+    return np.array(front, dtype=int)
+
+
+def bound(error, seconds):
+    """What bounds a recommendation, "error" or "seconds", and its value; exactly one of the two is a number."""
+    if (error is None) == (seconds is None):
+        raise SpecificationError(
+            f"error={error!r} and seconds={seconds!r} were given.",
+            "Exactly one of the two bounds a recommendation.",
+            do="Give recommend(error=1e-6) or recommend(seconds=1e-3).",
+            error=error,
+            seconds=seconds,
+        )
+    wanted, limit = ("error", error) if seconds is None else ("seconds", seconds)
+    if not (is_number(limit) and limit > 0):
+        given, rule = f"{wanted}={limit!r} was given.", "It must be a positive number."
+        raise SpecificationError(given, rule, **{wanted: limit})
+    return wanted, limit
+
+
 class TradeOff(Study):
     """Errors and costs of methods, settings and treatments of drift on one motion; made by `tradeoff`.
 
@@ -91,13 +118,8 @@ class TradeOff(Study):
         -------
         TradeOff
         """
-        good, error = self._good(), self._errors()
-        front, best = [], np.inf
-        for i in good[np.lexsort((error[good], self.column(_cost(cost))[good]))]:
-            if error[i] < best:
-                front.append(i)
-                best = error[i]
-        return self.take(front)
+        good = self._good()
+        return self.take(good[unbeaten(self.column(as_cost(cost))[good], self._errors()[good])])
 
     def recommend(self, *, error: float | None = None, seconds: float | None = None) -> Recommendation:
         """Arguments of `simulate`: the fastest within an error, or the most accurate within a time.
@@ -121,25 +143,14 @@ class TradeOff(Study):
         LimitExceeded
             If no row reaches it; the message has the nearest one.
         """
-        if (error is None) == (seconds is None):
-            raise SpecificationError(
-                f"error={error!r} and seconds={seconds!r} were given.",
-                "Exactly one of the two bounds a recommendation.",
-                do="Give recommend(error=1e-6) or recommend(seconds=1e-3).",
-                error=error,
-                seconds=seconds,
-            )
-        wanted, limit = ("error", error) if seconds is None else ("seconds", seconds)
-        if not (is_number(limit) and limit > 0):
-            given, rule = f"{wanted}={limit!r} was given.", "It must be a positive number."
-            raise SpecificationError(given, rule, **{wanted: limit})
+        wanted, limit = bound(error, seconds)
         front = self.pareto()
         reached = front._errors() if wanted == "error" else front["seconds"]
         within = np.flatnonzero(reached <= limit)
         if not len(within):
             raise self._out_of_reach(wanted, limit, front)
         row = front.rows()[within[0] if wanted == "error" else within[-1]]
-        return Recommendation(_arguments(row), row)
+        return Recommendation(arguments_of(row), row)
 
     def _out_of_reach(self, wanted, limit, front):
         nearest = ""
@@ -173,7 +184,7 @@ class TradeOff(Study):
         """
         from servoctl.figures.work_precision import draw_tradeoff
 
-        return draw_tradeoff(self, ax, _cost(cost), text("title", title))
+        return draw_tradeoff(self, ax, as_cost(cost), text("title", title))
 
     def _good(self):
         return np.flatnonzero(np.isfinite(self["error"]) & np.isfinite(self["seconds"]))
@@ -286,7 +297,8 @@ def tradeoff(
 class Reference:
     """The motion with which others are compared, at any instants.
 
-    `agreement` has its method, the method that verified it within ten times `seconds`, and their difference.
+    `agreement` has its method, the method that verified it within ten times `seconds`, and their difference; `check`
+    is the run of the latter at `times`.
     """
 
     def __init__(self, model, x0, t_span, seconds):
@@ -310,10 +322,11 @@ class Reference:
         for method in checks:
             options = {"drift": Project(), "t_eval": self.times, "progress": Deadline(10 * seconds)}
             try:
-                run = _whole(simulated(self.model, self.start, self.span, method, **options))
+                run = whole_run(simulated(self.model, self.start, self.span, method, **options))
             except ServoError as error:
                 failure = error
                 continue
+            self.check = run
             return {
                 "method": _text(self.method),
                 "verified by": _text(method),
@@ -328,7 +341,7 @@ class Reference:
         key = times.tobytes()
         if key not in self._runs:
             run = simulated(self.model, self.start, self.span, self.method, drift=self.drift, t_eval=times)
-            self._runs[key] = _whole(run)
+            self._runs[key] = whole_run(run)
         return self._runs[key]
 
 
@@ -347,7 +360,7 @@ class Deadline:
             raise LimitExceeded(late, seconds=self.seconds, steps=self.steps, t=t)
 
 
-def _whole(run):
+def whole_run(run):
     """The run, if it reached its end; one that Ctrl-C stopped ends the study."""
     if not run.success:
         raise KeyboardInterrupt
@@ -395,7 +408,7 @@ def _errors_and_cost(reference, name, treatment, value, seconds):
 
     def at(times):
         options = {"drift": treatment, "t_eval": times, "progress": Deadline(seconds)}
-        return _whole(simulated(model, reference.start, reference.span, method, **options))
+        return whole_run(simulated(model, reference.start, reference.span, method, **options))
 
     run, timed = at(times), []
     for _ in range(TIMED):
@@ -489,7 +502,7 @@ def _kind(method):
 
 
 def _drift_word(treatment):
-    """A treatment as a word, which `_arguments` reads."""
+    """A treatment as a word, which `arguments_of` reads."""
     if isinstance(treatment, Poles):
         return repr(treatment.values)
     if isinstance(treatment, Project):
@@ -514,7 +527,7 @@ def method_at(name, value):
     return as_method(method, **settings)
 
 
-def _arguments(row):
+def arguments_of(row):
     """The arguments of `simulate` with which a row was measured."""
     options, drift = {"method": method_at(row["method"], row["value"])}, row["drift"]
     if drift != "none":
@@ -523,5 +536,6 @@ def _arguments(row):
     return options
 
 
-def _cost(name):
+def as_cost(name):
+    """One of the columns that count as cost, or the error of another name."""
     return named(name, COSTS, "cost")
