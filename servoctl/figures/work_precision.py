@@ -11,6 +11,7 @@ LOOKS = {  # line, marker and label of each treatment of drift
     "minimal": (":", "^", "minimal coordinates"),
 }
 MARKS = ("o", "s", "^", "D", "v", "P", "X")
+AROUND = 1.5  # from the cheapest and the dearest row to the ends of the axis: small differences look small
 OF = {
     "error": "error of the motion",
     "modelling": "error of modelling",
@@ -53,21 +54,22 @@ def draw_levels(study, ax, cost, of, title):
     ax = style.as_single_axes(ax, 5.0, width=8.0)
     floor = max(study._floor(of), 1e-17)
     good = np.isfinite(study[of]) & np.isfinite(study[cost])
-    front = study.take(np.flatnonzero(good)).pareto(cost, of)
+    front = study.pareto(cost, of)
     for i, level in enumerate(dict.fromkeys(study["level"][good].tolist())):
-        look = {"marker": MARKS[i % len(MARKS)], "linestyle": "", "markersize": 7, "label": level}
-        colour = COLOURS[i % len(COLOURS)] if level in front["level"] else GREY
         rows, best = study.take(np.flatnonzero(good & (study["level"] == level))), front.where(level=level)
-        ax.plot(rows[cost], np.maximum(rows[of], floor), **look | {"label": None}, color=FRONT, markerfacecolor="none")
-        ax.plot(best[cost], np.maximum(best[of], floor), **look, color=colour)
+        look = {"marker": MARKS[i % len(MARKS)], "linestyle": "", "markersize": 7}
+        names = (None, level) if len(best) else (level, None)
+        ax.plot(rows[cost], np.maximum(rows[of], floor), **look, color=FRONT, markerfacecolor="none", label=names[0])
+        ax.plot(best[cost], np.maximum(best[of], floor), **look, color=COLOURS[i % len(COLOURS)], label=names[1])
     ax.step(front[cost], np.maximum(front[of], floor), where="post", color=FRONT, linewidth=1.2, zorder=0)
     ax.axhspan(floor / 10, floor, color=UNRESOLVED, zorder=-1, label="not resolved")
     ax.set(xscale="log", yscale="log", xlabel=style.label(cost, "s" if cost == "seconds" else ""), title=title)
     ax.set(ylabel=f"{OF[of]}, relative", ylim=(floor / 10, max(3.0 * study[of][good].max(initial=floor), 100 * floor)))
+    ax.set_xlim(study[cost][good].min(initial=1.0) / AROUND, study[cost][good].max(initial=1e-4) * AROUND)
     if not good.any():
         ax.text(0.5, 0.5, "no level has numbers", transform=ax.transAxes, ha="center")
     ax.grid(True, which="major", color="#DDDDDD", linewidth=0.6)
-    ax.legend(loc="center left", bbox_to_anchor=(1.01, 0.5), frameon=False, fontsize=8, title="on the front: filled")
+    ax.legend(loc="center left", bbox_to_anchor=(1.01, 0.5), frameon=False, fontsize=8, title="filled: on the front")
     return ax
 
 

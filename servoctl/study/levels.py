@@ -10,7 +10,7 @@ from servoctl.checks import as_span, mapping, named, numbers_by_name, text
 from servoctl.errors import LimitExceeded, SpecificationError, unknown
 from servoctl.progress import progress_bar
 from servoctl.study.cases import as_cases
-from servoctl.study.modelling import Levelled
+from servoctl.study.modelling import Levelled, add_likeness
 from servoctl.study.power_law import Prediction, power_law
 from servoctl.study.table import SHOWN, Study, machine, table
 from servoctl.study.tradeoff import Recommendation, arguments_of, as_cost, bound, unbeaten
@@ -90,6 +90,7 @@ def levels(
                 uncertain = np.maximum(uncertain, unsure)
         except KeyboardInterrupt:
             interrupted = True
+    add_likeness(rows)
     names = ("case", *cases[0], *Levels.COLUMNS)
     agreement = dict(zip(("error", "actuation"), uncertain.tolist(), strict=True))
     meta = {"t_span": list(span), "levels": list(builds), "parameters": list(cases[0]), "law": _name(law)}
@@ -106,7 +107,9 @@ class Levels(Study):
     and its value, as in `TradeOff`; error: the largest deviation of the common signals from the converged motion of the
     reference, relative to their sizes, over at least 402 instants; modelling: that of the level's own converged motion;
     integration: the deviation from this; actuation: the deviation of the forces and moments of the same names; in_loop:
-    the deviation of the reference's plant under the level's law (NaN without one); operations of one evaluation of the
+    the deviation of the reference's plant under the level's law (NaN without one); modelling_like, actuation_like,
+    in_loop_like: the cosine of the error's course in time with that in the first case (1: the same up to a factor);
+    operations of one evaluation of the
     rates, or of Newton's step; evaluations and steps; seconds: processor time of the shortest of five calls, in turn
     with those of all other rows, with samples at the same instants; resolved: whether the error exceeds the
     uncertainty; failure: why numbers are missing.
@@ -114,6 +117,7 @@ class Levels(Study):
 
     COLUMNS = (
         *("level", "method", "drift", "setting", "value", "error", "modelling", "integration", "actuation", "in_loop"),
+        *("modelling_like", "actuation_like", "in_loop_like"),
         *("operations", "evaluations", "steps", "seconds", "resolved", "failure"),
     )
 
@@ -209,7 +213,8 @@ class Levels(Study):
         cases = np.unique(rows["case"])
         of_case = [np.flatnonzero((rows["case"] == case) & np.isfinite(rows[of])) for case in cases]
         finest = [some[np.argmin(rows["integration"][some])] for some in of_case if len(some)]
-        return self._law(rows.take(finest), at, rows[of][finest], self._floor(of))
+        rows = rows.take(finest)
+        return self._law(rows, at, of, rows[of], self._floor(of))
 
     def plot(self, ax=None, cost: str = "seconds", of: str = "error", title: str = ""):
         """Draw error over cost, the front of all levels in colour.
@@ -253,9 +258,10 @@ class Levels(Study):
     def _errors(self, of):
         return np.maximum(self[of], self._floor(of))
 
-    def _law(self, rows, at, errors, floor=0.0):
-        cases = np.column_stack([rows[name] for name in at]).reshape(len(rows), len(at))
-        return power_law(cases.astype(float), errors, at, floor)
+    def _law(self, rows, at, of, errors, floor=0.0):
+        cases = np.column_stack([rows[name] for name in at]).reshape(len(rows), len(at)).astype(float)
+        likeness = rows["modelling_like" if of == "error" else f"{of}_like"]
+        return power_law(cases, errors, at, floor, likeness=likeness.min(initial=1.0))
 
     def _candidates(self, of, parameters):
         """One row for each level and setting: the largest numbers of all cases, or those for these parameters."""
@@ -270,7 +276,7 @@ class Levels(Study):
                 largest = float(errors[same].max())
             else:
                 known = np.flatnonzero(np.isfinite(errors))
-                largest = self._law(rows.take(known), at, errors[known]).high
+                largest = self._law(rows.take(known), at, of, errors[known]).high
             yield rows.rows()[0] | {of: largest, "seconds": float(rows["seconds"].max())} | (at or {})
 
     def _out_of_reach(self, wanted, limit, row, of):

@@ -23,6 +23,7 @@ from servoctl.study.tradeoff import Deadline, Reference, method_at, whole_run
 ACCURACIES = (1e-3, 1e-5, 1e-7, 1e-9)  # relative tolerances with which levels are integrated
 ROUNDS = 5  # timed calls of each row, one after the other in each round
 LONGEST = 3.0  # s that one motion may take
+INSTANTS = 201  # at which the courses of errors in time are compared from case to case
 NEGLIGIBLE = 1e-9  # an output below this part of the largest signal is zero, and its error absolute
 
 
@@ -199,29 +200,38 @@ class Comparison:
         off = [float(np.abs(run[name] - other[name]).max()) / self.sizes[name] for name in names]
         return max(off, default=np.nan)
 
+    def course(self, names, run, other):
+        """Deviations of all signals at evenly spaced instants (n INSTANTS,): how an error goes with time."""
+        t = np.linspace(*self.exact.span, INSTANTS)
+        forward = np.argsort(run.t)
+        off = [(run[name] - other[name])[forward] / self.sizes[name] for name in names]
+        return np.concatenate([np.interp(t, run.t[forward], values) for values in off] or [np.zeros(0)])
+
     def disagreement(self, motion):
         """Deviations of motion and actuation between the two methods that computed a converged motion."""
         exact, check = motion.converged.at(motion.converged.times), motion.converged.check
         return [self.off(names, check, exact) if names else 0.0 for names in (self.names, self.actuators)]
 
     def in_loop(self, motion, run):
-        """Deviation of the reference's plant under the law of a level's plan."""
+        """Deviation of the reference's plant under the law of a level's plan, and its course."""
         span = self.exact.span
         loop = close(self.exact.plant, self.law(run, motion.plant), self.run.state(span[0]), span)
-        names = [name for name in self.names if name in loop.names]
-        return self.off(names, loop, self.exact.converged.at(loop.t))
+        names, exact = [name for name in self.names if name in loop.names], self.exact.converged.at(loop.t)
+        return self.off(names, loop, exact), self.course(names, loop, exact)
 
     def ladder(self, motion):
         """The rows of a level: one for each setting."""
         converged = motion.converged.at(self.times)
-        modelling = self.off(self.names, converged, self.run)
+        modelling, course = (of(self.names, converged, self.run) for of in (self.off, self.course))
         for method, drift, setting, value in motion.settings():
             row = {"method": method, "drift": drift, "setting": setting, "value": value, "modelling": modelling}
+            row["courses"] = {"modelling": course}
             chosen, treatment = method_at(method, value), Project() if drift == "project" else None
             try:
                 run = motion.run(chosen, treatment, self.times)
                 row |= self._errors(motion, run, converged) | {"call": (motion.run, chosen, treatment, self.times)}
-                row |= {"failure": ""} if self.law is None else self._looped(motion, run)
+                row["courses"]["actuation"] = self.course(self.actuators, run, self.run)
+                row["failure"] = "" if self.law is None else self._looped(motion, run, row)
             except ServoError as error:
                 row["failure"] = _said(error)
             yield row
@@ -236,11 +246,26 @@ class Comparison:
             "steps": run.counters.get("steps", len(run.t)),
         }
 
-    def _looped(self, motion, run):
+    def _looped(self, motion, run, row):
+        """Add the error in the loop to a row; returns why there is none, or an empty text."""
         try:
-            return {"in_loop": self.in_loop(motion, run), "failure": ""}
+            row["in_loop"], row["courses"]["in_loop"] = self.in_loop(motion, run)
         except ServoError as error:
-            return {"failure": f"in the loop: {_said(error)}"}
+            return f"in the loop: {_said(error)}"
+        return ""
+
+
+def add_likeness(rows):
+    """Replace the courses of errors in rows by their cosines with those of the first row of the same level and setting.
+
+    They are 1 where the course in time is the same up to a factor, and -1 up to a negative one.
+    """
+    first = {}
+    for row in rows:
+        for of, course in row.pop("courses", {}).items():
+            other = first.setdefault((of, row["level"], row["method"], str(row["value"])), course)
+            sizes = np.linalg.norm(course) * np.linalg.norm(other) if course.shape == other.shape else 0.0
+            row[f"{of}_like"] = float(course @ other / sizes) if sizes > 0 else 1.0
 
 
 def _time(rows):

@@ -7,6 +7,7 @@ import numpy as np
 
 WITHIN = 2.0  # factor up to which a prediction counts as conclusive
 FURTHEST = 2.0  # distance outside the measured values, in half-widths of their range of logarithms
+ALIKE = 0.9  # cosine between courses in time of errors that differ by a factor alone
 SAFETY = 2.0  # times the largest difference between a case and what the others predict for it
 LARGEST = 700.0  # of a spread whose exponential is a double
 MOST_LEVERAGE = 1.0 - 1e-9  # of a case without which the others determine no law
@@ -44,12 +45,12 @@ class Prediction:
         return "\n".join(lines + ([f"  error ~ {law}"] if law else []) + [f"  {self.message}"])
 
 
-def power_law(cases, errors, at, floor):
+def power_law(cases, errors, at, floor, likeness=1.0):
     """The error at parameters from errors at others: error = c Π pᵢ^eᵢ by least squares in logarithms.
 
     Each case in turn is predicted from all others. Twice the largest of these differences, in ln(error), is the
-    uncertainty between the measured cases. Outside of them it grows like the square of the distance from their middle, as the
-    curvature of a law that is no power law does.
+    uncertainty between the measured cases. Outside of them it grows like the square of the distance from their middle,
+    as the curvature of a law that is no power law does.
 
     Parameters
     ----------
@@ -60,6 +61,8 @@ def power_law(cases, errors, at, floor):
         The k parameters by name, in the order of the columns.
     floor : float
         Uncertainty of the measured errors.
+    likeness : float
+        Smallest cosine between courses of the errors in time: those that follow one law differ by a factor alone.
 
     Returns
     -------
@@ -67,7 +70,7 @@ def power_law(cases, errors, at, floor):
     """
     if len(errors) and np.all(errors <= floor):
         return _vanishing(cases, np.array(list(at.values())), floor)
-    problem = _problem(cases, errors, at, floor)
+    problem = _problem(cases, errors, at, floor, likeness)
     if problem:
         return Prediction(np.nan, 0.0, np.inf, conclusive=False, message=problem)
     x, place, half = _centred(np.log(cases), np.log(list(at.values())))
@@ -93,12 +96,14 @@ def _centred(x, place):
     return (x - (low + high) / 2) / half, (place - (low + high) / 2) / half, half
 
 
-def _problem(cases, errors, at, floor):
+def _problem(cases, errors, at, floor, likeness):
     """Why the cases determine no law that could be checked; empty if they do."""
     if np.any(cases <= 0) or min(at.values()) <= 0:
         return "A power law needs positive parameters: measure cases of one sign, or the case itself."
     if np.any(errors <= floor):
         return "Some of the errors vanish, and others do not: measure cases on one side, or the case itself."
+    if likeness < ALIKE:
+        return "The errors of the cases have different courses in time, as vibrations do: measure the case itself."
     needed = len(at) + 2
     if len(cases) < needed or np.any(np.ptp(cases, axis=0) == 0):
         return f"A law in {', '.join(at)} is checked by at least {needed} cases in which each varies: measure more."
