@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from servoctl.checks import mapping, numbers_by_name, texts
+from servoctl.checks import mapping, named, numbers_by_name, texts
 from servoctl.control.close import close
 from servoctl.errors import NameUnknown, ServoError, SpecificationError, unknown
 from servoctl.methods.accuracy import component_sizes, is_stiff, method_for
@@ -18,10 +18,10 @@ from servoctl.plants.plant import Plant, plant
 from servoctl.simulation import simulated
 from servoctl.spec.mechanism import Mechanism
 from servoctl.spec.program import Program
-from servoctl.study.tradeoff import Deadline, Reference, method_at, whole_run
+from servoctl.study.tradeoff import CHECKS, Deadline, Reference, method_at, whole_run
 
-ACCURACIES = (1e-3, 1e-5, 1e-7, 1e-9)  # relative tolerances with which levels are integrated
-ROUNDS = 5  # timed calls of each row, one after the other in each round
+ACCURACIES = (1e-3, 1e-6, 1e-9)  # relative tolerances with which levels are integrated
+ROUNDS = 3  # timed calls of each row, one after the other in each round
 LONGEST = 3.0  # s that one motion may take
 INSTANTS = 201  # at which the courses of errors in time are compared from case to case
 NEGLIGIBLE = 1e-9  # an output below this part of the largest signal is zero, and its error absolute
@@ -107,6 +107,7 @@ class Levelled:
                 rows.append({"level": name, "failure": _said(error)})
             bar.update()
         self._settle_names(motions)
+        self._require_held(motions.values())
         comparison = Comparison(self, exact, motions.values())
         for name, motion in motions.items():
             rows += [{"level": name, **row} for row in comparison.ladder(motion)]
@@ -122,11 +123,16 @@ class Levelled:
         return LevelMotion(level, start, self.span)
 
     def _start(self, model, near):
-        known = {*model.names_to(len(model.jet_names)), *model.outputs}
-        held = {name: value for name, value in self.held.items() if name in known}
+        held = {name: value for name, value in self.held.items() if name in (*model.state_names, *model.outputs)}
         near = {} if near is None else dict(zip(near.names, near.values.tolist(), strict=True))
         guess = {name: value for name, value in near.items() if name in model.state_names and name not in held}
         return model.start(t=self.span[0], guess=guess or None, **held)
+
+    def _require_held(self, motions):
+        """Refuse values at the start that no level has."""
+        known = {name: None for motion in motions for name in (*motion.model.state_names, *motion.model.outputs)}
+        for name in self.held or ():
+            named(name, known, "value at the start")
 
     def _settle_names(self, motions):
         """Which signals are compared: decided in the first case, and the same in all."""
@@ -155,7 +161,7 @@ class LevelMotion:
 
     def __init__(self, level, start, span):
         self.model, self.plant, self.start, self.span = level.model.including(start.names), level.plant, start, span
-        self.converged = Reference(self.model, start, span, LONGEST)
+        self.converged = Reference(self.model, start, span, LONGEST, CHECKS[::-1])
 
     def run(self, method, drift, times, span=None):
         """The run by a method, sampled at times (N,) [s]."""

@@ -1,5 +1,6 @@
 """The trade-off: measured errors and costs of methods, settings and treatments of drift on one motion."""
 
+import functools
 import itertools
 import time
 import warnings
@@ -39,6 +40,7 @@ TIMED, ENOUGH = 3, 0.3  # calls timed after a warm-up, fewer where they take thi
 FEW = 20  # steps: a run that takes too long for fewer has diverged, and says nothing about finer settings
 TIME_CONSTANT = 50  # default time constants of the poles in the span
 DRIFTS = ("none", "project", "minimal")  # words of the column drift; others are time constants of poles
+CHECKS = (Adaptive("DOP853", 3e-14, 1e-15), Taylor(12, rtol=1e-14, atol=1e-14))  # of the reference, in this order
 COSTS = ("seconds", "evaluations", "steps")
 
 
@@ -297,11 +299,11 @@ def tradeoff(
 class Reference:
     """The motion with which others are compared, at any instants.
 
-    `agreement` has its method, the method that verified it within ten times `seconds`, and their difference; `check`
-    is the run of the latter at `times`.
+    `check` is the run at `times` of the method that verified it, the first that ends within ten times `seconds`.
+    `agreement` has both methods and their differences.
     """
 
-    def __init__(self, model, x0, t_span, seconds):
+    def __init__(self, model, x0, t_span, seconds, checks=CHECKS):
         consistent_state(model, x0, t_span[0])
         self.model, self.start, self.span, self._runs = model, x0, t_span, {}
         self.knots = [k for k in model.require_smooth((min(t_span), max(t_span))) if min(t_span) < k < max(t_span)]
@@ -309,32 +311,34 @@ class Reference:
         self.few = np.union1d(np.linspace(t0, t1, INSTANTS), self.knots)
         between = t0 + (t1 - t0) * (np.arange(COMPARED) + BETWEEN) / COMPARED
         self.times = np.unique([t0, *between, t1, *self.knots])
-        checks = [Adaptive("DOP853", 3e-14, 1e-15), Taylor(12, rtol=1e-14, atol=1e-14)]
         self.method, self.drift = Taylor(16, rtol=1e-15, atol=1e-15), Project()
         if model.flat:
-            self.method, self.drift, checks = Algebraic(), None, checks[::-1]
-        self.agreement = self._verified(checks, seconds)
+            self.method, self.drift, checks = Algebraic(), None, CHECKS[::-1]
+        self.at(self.times)
+        self.checked_by, self.check = self._verified(checks, seconds)
 
     def _verified(self, checks, seconds):
-        """The difference from the first of the other methods that ends in time."""
-        exact = self.at(self.times)
-        dense = np.union1d(np.linspace(*self.span, DENSE), self.knots)
+        """The first of the other methods that ends in time, and its run."""
         for method in checks:
             options = {"drift": Project(), "t_eval": self.times, "progress": Deadline(10 * seconds)}
             try:
-                run = whole_run(simulated(self.model, self.start, self.span, method, **options))
+                return method, whole_run(simulated(self.model, self.start, self.span, method, **options))
             except ServoError as error:
                 failure = error
-                continue
-            self.check = run
-            return {
-                "method": _text(self.method),
-                "verified by": _text(method),
-                "error": motion_error(self.model, run.jets, exact.jets),
-                "actuation": relative_error(actuation(run), actuation(exact)),
-                "energy": _energy_balance(self.at(dense), self.knots),
-            }
         raise failure
+
+    @functools.cached_property
+    def agreement(self):
+        """The two methods in words, and how far their motions, actuations and energies differ."""
+        exact = self.at(self.times)
+        dense = np.union1d(np.linspace(*self.span, DENSE), self.knots)
+        return {
+            "method": _text(self.method),
+            "verified by": _text(self.checked_by),
+            "error": motion_error(self.model, self.check.jets, exact.jets),
+            "actuation": relative_error(actuation(self.check), actuation(exact)),
+            "energy": _energy_balance(self.at(dense), self.knots),
+        }
 
     def at(self, times):
         """The run with samples at these times (N,) [s]."""
