@@ -11,7 +11,7 @@ LOOKS = {  # line, marker and label of each treatment of drift
     "minimal": (":", "^", "minimal coordinates"),
 }
 MARKS = ("o", "s", "^", "D", "v", "P", "X")
-AROUND = 1.5  # from the cheapest and the dearest row to the ends of the axis: small differences look small
+AXIS_MARGIN = 1.5  # from the cheapest and the dearest row to the ends of the axis: small differences look small
 OF = {
     "error": "error of the motion",
     "modelling": "error of modelling",
@@ -65,7 +65,7 @@ def draw_levels(study, ax, cost, of, title):
     ax.axhspan(floor / 10, floor, color=UNRESOLVED, zorder=-1, label="not resolved")
     ax.set(xscale="log", yscale="log", xlabel=style.label(cost, "s" if cost == "seconds" else ""), title=title)
     ax.set(ylabel=f"{OF[of]}, relative", ylim=(floor / 10, max(3.0 * study[of][good].max(initial=floor), 100 * floor)))
-    ax.set_xlim(study[cost][good].min(initial=1.0) / AROUND, study[cost][good].max(initial=1e-4) * AROUND)
+    ax.set_xlim(study[cost][good].min(initial=1.0) / AXIS_MARGIN, study[cost][good].max(initial=1e-4) * AXIS_MARGIN)
     if not good.any():
         ax.text(0.5, 0.5, "no level has numbers", transform=ax.transAxes, ha="center")
     ax.grid(True, which="major", color="#DDDDDD", linewidth=0.6)

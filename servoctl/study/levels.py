@@ -79,7 +79,7 @@ def levels(
     named(reference, mapping(builds, "The levels"), "level")
     span = as_span(t_span)
     scene = Levelled(builds, reference, span, start, outputs, _as_law(law))
-    cases = _cases(cases, scene)
+    cases = _checked_cases(cases, scene)
     rows, interrupted, uncertain = [], False, np.zeros(2)
     with progress_bar("levels", progress, len(cases) * len(builds), unit="level") as bar, warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)  # of growth and steps: the errors are measured
@@ -320,7 +320,7 @@ def _as_law(law):
     return law
 
 
-def _cases(cases, scene):
+def _checked_cases(cases, scene):
     """Cases whose parameters are some level's, and no columns of the table."""
     cases = [{}] if cases is None else as_cases(cases)
     known = scene.parameters(cases[0]) if cases[0] else ()

@@ -21,10 +21,10 @@ from servoctl.spec.program import Program
 from servoctl.study.tradeoff import CHECKS, Deadline, Reference, method_at, whole_run
 
 ACCURACIES = (1e-3, 1e-6, 1e-9)  # relative tolerances with which levels are integrated
-ROUNDS = 3  # timed calls of each row, one after the other in each round
-LONGEST = 3.0  # s that one motion may take
-INSTANTS = 201  # at which the courses of errors in time are compared from case to case
-NEGLIGIBLE = 1e-9  # an output below this part of the largest signal is zero, and its error absolute
+TIMED_ROUNDS = 3  # timed calls of each row, one after the other in each round
+LONGEST_CALL = 3.0  # s that one motion may take
+COURSE = 201  # at which the courses of errors in time are compared from case to case
+ZERO_SIGNAL = 1e-9  # an output below this part of the largest signal is zero, and its error absolute
 
 
 @dataclass(frozen=True)
@@ -104,7 +104,7 @@ class Levelled:
             try:
                 motions[name] = exact if name == self.reference else self._motion(name, case, exact.start)
             except ServoError as error:
-                rows.append({"level": name, "failure": _said(error)})
+                rows.append({"level": name, "failure": _failure(error)})
             bar.update()
         self._settle_names(motions)
         self._require_held(motions.values())
@@ -161,11 +161,11 @@ class LevelMotion:
 
     def __init__(self, level, start, span):
         self.model, self.plant, self.start, self.span = level.model.including(start.names), level.plant, start, span
-        self.converged = Reference(self.model, start, span, LONGEST, CHECKS[::-1])
+        self.converged = Reference(self.model, start, span, LONGEST_CALL, CHECKS[::-1])
 
     def run(self, method, drift, times, span=None):
         """The run by a method, sampled at times (N,) [s]."""
-        options = {"drift": drift, "t_eval": times, "progress": Deadline(LONGEST)}
+        options = {"drift": drift, "t_eval": times, "progress": Deadline(LONGEST_CALL)}
         return whole_run(simulated(self.model, self.start, span or self.span, method, **options))
 
     def require(self, signals, level):
@@ -198,8 +198,8 @@ class Comparison:
         self.times = np.unique(np.concatenate([motion.converged.times for motion in motions]))
         self.run = exact.converged.at(self.times)
         together = [name for name in self.names if name in exact.model.coordinate_names]
-        forces = _sizes(self.run, self.actuators, self.actuators)
-        self.sizes = _sizes(self.run, self.names, together) | forces | scene.sizes
+        forces = _signal_sizes(self.run, self.actuators, self.actuators)
+        self.sizes = _signal_sizes(self.run, self.names, together) | forces | scene.sizes
 
     def off(self, names, run, other):
         """Largest deviation of signals between two motions at the same instants, relative to their sizes."""
@@ -207,8 +207,8 @@ class Comparison:
         return max(off, default=np.nan)
 
     def course(self, names, run, other):
-        """Deviations of all signals at evenly spaced instants (n INSTANTS,): how an error goes with time."""
-        t = np.linspace(*self.exact.span, INSTANTS)
+        """Deviations of all signals at evenly spaced instants (n COURSE,): how an error goes with time."""
+        t = np.linspace(*self.exact.span, COURSE)
         forward = np.argsort(run.t)
         off = [(run[name] - other[name])[forward] / self.sizes[name] for name in names]
         return np.concatenate([np.interp(t, run.t[forward], values) for values in off] or [np.zeros(0)])
@@ -239,7 +239,7 @@ class Comparison:
                 row["courses"]["actuation"] = self.course(self.actuators, run, self.run)
                 row["failure"] = "" if self.law is None else self._looped(motion, run, row)
             except ServoError as error:
-                row["failure"] = _said(error)
+                row["failure"] = _failure(error)
             yield row
 
     def _errors(self, motion, run, converged):
@@ -257,7 +257,7 @@ class Comparison:
         try:
             row["in_loop"], row["courses"]["in_loop"] = self.in_loop(motion, run)
         except ServoError as error:
-            return f"in the loop: {_said(error)}"
+            return f"in the loop: {_failure(error)}"
         return ""
 
 
@@ -277,20 +277,20 @@ def add_likeness(rows):
 def _time(rows):
     """Processor time of each row's call: the shortest of some rounds over all rows."""
     calls = [(row, *row.pop("call")) for row in rows if "call" in row]
-    for _ in range(ROUNDS):
+    for _ in range(TIMED_ROUNDS):
         for row, call, *arguments in calls:
             since = time.process_time()
             call(*arguments)
             row["seconds"] = min(row.get("seconds", np.inf), time.process_time() - since)
 
 
-def _sizes(run, names, together):
+def _signal_sizes(run, names, together):
     """Size of each signal: its largest magnitude, at least 1e-3 of the largest of those taken together."""
     if not names:
         return {}
     values = np.array([run[name] for name in names])
     groups = np.array([0 if name in together else i + 1 for i, name in enumerate(names)])
-    zero = (np.abs(values).max(axis=1) <= NEGLIGIBLE * np.abs(values).max()) & (groups > 0)
+    zero = (np.abs(values).max(axis=1) <= ZERO_SIGNAL * np.abs(values).max()) & (groups > 0)
     return dict(zip(names, np.where(zero, 1.0, component_sizes(values, groups)).tolist(), strict=True))
 
 
@@ -299,7 +299,7 @@ def _forces(model):
     return [name for name, group in model.signal_groups.items() if group in ("actuation", "reaction")]
 
 
-def _said(error):
+def _failure(error):
     return f"{type(error).__name__}: {error}"
 
 

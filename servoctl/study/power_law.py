@@ -5,11 +5,11 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-WITHIN = 2.0  # factor up to which a prediction counts as conclusive
-FURTHEST = 2.0  # distance outside the measured values, in half-widths of their range of logarithms
-ALIKE = 0.9  # cosine between courses in time of errors that differ by a factor alone
-SAFETY = 2.0  # times the largest difference between a case and what the others predict for it
-LARGEST = 700.0  # of a spread whose exponential is a double
+CONCLUSIVE = 2.0  # factor up to which a prediction counts as conclusive
+FURTHEST = 1.0  # distance outside the measured values, in half-widths of their range of logarithms
+ALIKE = 0.98  # cosine between courses in time of errors that differ by a factor alone
+SPREAD_FACTOR = 4.0  # times the largest difference between a case and what the others predict for it
+LARGEST_SPREAD = 700.0  # of a spread whose exponential is a double
 MOST_LEVERAGE = 1.0 - 1e-9  # of a case without which the others determine no law
 
 
@@ -48,7 +48,7 @@ class Prediction:
 def power_law(cases, errors, at, floor, likeness=1.0):
     """The error at parameters from errors at others: error = c Π pᵢ^eᵢ by least squares in logarithms.
 
-    Each case in turn is predicted from all others. Twice the largest of these differences, in ln(error), is the
+    Each case in turn is predicted from all others. Four times the largest of these differences, in ln(error), is the
     uncertainty between the measured cases. Outside of them it grows like the square of the distance from their middle,
     as the curvature of a law that is no power law does.
 
@@ -70,7 +70,7 @@ def power_law(cases, errors, at, floor, likeness=1.0):
     """
     if len(errors) and np.all(errors <= floor):
         return _vanishing(cases, np.array(list(at.values())), floor)
-    problem = _problem(cases, errors, at, floor, likeness)
+    problem = _why_no_law(cases, errors, at, floor, likeness)
     if problem:
         return Prediction(np.nan, 0.0, np.inf, conclusive=False, message=problem)
     x, place, half = _centred(np.log(cases), np.log(list(at.values())))
@@ -79,14 +79,12 @@ def power_law(cases, errors, at, floor, likeness=1.0):
     law, leverage = inverse @ np.log(errors), np.diag(basis @ inverse)
     left_out = (np.log(errors) - basis @ law) / (1.0 - leverage)
     outside = max(np.abs(place).max() - 1.0, 0.0)
-    spread = (SAFETY * np.abs(left_out).max() + floor / errors.min()) * (1.0 + outside) ** 2
-    factor = float(np.exp(min(spread, LARGEST))) if outside <= FURTHEST else np.inf
-    value = float(np.exp(law @ [1.0, *place]))
-    return Prediction(
-        value, value / factor, value * factor, conclusive=bool(factor <= WITHIN),
-        exponents=dict(zip(at, (law[1:] / half).tolist(), strict=True)),
-        message=_said(len(errors), np.exp(np.abs(left_out).max()), outside),
-    )  # fmt: skip
+    spread = (SPREAD_FACTOR * np.abs(left_out).max() + floor / errors.min()) * (1.0 + outside) ** 2
+    factor = float(np.exp(min(spread, LARGEST_SPREAD))) if outside <= FURTHEST else np.inf
+    value, conclusive = float(np.exp(law @ [1.0, *place])), factor <= CONCLUSIVE
+    message = _basis_of(len(errors), np.exp(np.abs(left_out).max()), outside, conclusive)
+    exponents = dict(zip(at, (law[1:] / half).tolist(), strict=True))
+    return Prediction(value, value / factor, value * factor, conclusive, exponents, message)
 
 
 def _centred(x, place):
@@ -96,7 +94,7 @@ def _centred(x, place):
     return (x - (low + high) / 2) / half, (place - (low + high) / 2) / half, half
 
 
-def _problem(cases, errors, at, floor, likeness):
+def _why_no_law(cases, errors, at, floor, likeness):
     """Why the cases determine no law that could be checked; empty if they do."""
     if np.any(cases <= 0) or min(at.values()) <= 0:
         return "A power law needs positive parameters: measure cases of one sign, or the case itself."
@@ -122,9 +120,9 @@ def _vanishing(cases, at, floor):
     return Prediction(0.0, 0.0, floor if inside else np.inf, conclusive=inside, message=message)
 
 
-def _said(count, factor, outside):
+def _basis_of(count, factor, outside, conclusive):
+    """What a prediction rests on, and what to do where that is too little."""
     message = f"Each of {count} cases follows from the others within a factor {factor:.3g}"
     if outside > 0:
-        message += f"; the parameters lie {outside:.2g} half-widths outside the cases"
-        message += " (measure a case nearer to them)" if outside > FURTHEST else ""
-    return f"{message}."
+        message += f"; the parameters lie {outside:.2g} half-widths outside of them"
+    return message + ("." if conclusive else ": measure cases nearer to the parameters.")
