@@ -74,7 +74,7 @@ def levels(
     SpecificationError
         For levels that are no models or share no signal.
     ServoError
-        If the reference itself cannot be computed.
+        If the reference itself cannot be computed in the first case.
     """
     named(reference, mapping(builds, "The levels"), "level")
     span = as_span(t_span)
@@ -259,6 +259,10 @@ class Levels(Study):
         return np.maximum(self[of], self._floor(of))
 
     def _law(self, rows, at, of, errors, floor=0.0):
+        texts = [name for name in at if rows[name].dtype.kind == "U"]
+        if texts:
+            rule, do = "A law is one of numbers.", f"Take the rows by study.where({texts[0]}=...)."
+            raise SpecificationError(f"The parameter {texts[0]!r} of the cases is a text.", rule, do=do, name=texts[0])
         cases = np.column_stack([rows[name] for name in at]).reshape(len(rows), len(at)).astype(float)
         likeness = rows["modelling_like" if of == "error" else f"{of}_like"]
         return power_law(cases, errors, at, floor, likeness=likeness.min(initial=1.0))

@@ -97,8 +97,14 @@ class Levelled:
 
         The latter are two numbers, of the motion and of the actuation.
         """
-        exact, rows = self._motion(self.reference, case), []
-        motions = {}
+        try:
+            exact = self._motion(self.reference, case)
+        except ServoError as error:
+            if self.actuators is None:  # in the first case
+                raise
+            said = f"the reference: {_failure(error)}"
+            return [{"level": name, "failure": said} for name in self.builds], np.zeros(2)
+        motions, rows = {}, []
         for name in self.builds:
             self.built(name, case)
             try:
