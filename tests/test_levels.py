@@ -13,6 +13,7 @@ from servoctl.errors import LimitExceeded, NameUnknown, SingularProgram, Specifi
 from servoctl.figures.work_precision import COLOURS
 from servoctl.gallery import gallery
 from servoctl.study.levels import ERRORS
+from servoctl.study.modelling import _signal_sizes
 from servoctl.study.power_law import power_law
 
 # --- scenes, each with a parameter that its reference has more than its simple level
@@ -464,6 +465,24 @@ def test_conclusive_predictions_of_smooth_laws_are_within_a_factor_of_two(law):
         assert found.low <= law(at, s) * (1 + 1e-9) and law(at, s) <= found.high * (1 + 1e-9)
         assert not found.conclusive or 0.5 < found.value / law(at, s) < 2.0
     assert conclusive > 10
+
+
+@pytest.mark.parametrize("curvature, at, likeness, conclusive", [
+    (0.08, 1.0, 1.0, True), (0.095, 1.0, 1.0, False),  # each case differs by 2 c from what the others predict
+    (0.0, 3.9, 1.0, True), (0.0, 4.1, 1.0, False), (0.0, 0.26, 1.0, True), (0.0, 0.24, 1.0, False),
+    (0.0, 1.0, 0.985, True), (0.0, 1.0, 0.975, False),
+])  # fmt: skip
+def test_a_prediction_is_conclusive_within_bounds(curvature, at, likeness, conclusive):
+    values = np.array([0.5, 1.0, 2.0])
+    errors = np.exp(curvature * np.array([1.0, 0.0, 1.0]))
+    found = power_law(values[:, None], errors, {"k": at}, 1e-15, likeness)
+    assert found.conclusive == conclusive
+
+
+def test_the_size_of_a_signal_that_is_rounding_is_one():
+    run = {"x": np.array([0.0, 2.0]), "side": np.array([1e-12, -1e-13]), "small": np.array([1e-8, 0.0]), "y": np.zeros(2)}
+    sizes = _signal_sizes(run, ("x", "side", "small", "y"), ["x", "y"])
+    assert sizes == {"x": 2.0, "side": 1.0, "small": 1e-8, "y": 2e-3}
 
 
 def test_a_prediction_needs_all_parameters_of_the_cases(ropes, pendula):

@@ -109,10 +109,9 @@ class Levels(Study):
     integration: the deviation from this; actuation: the deviation of the forces and moments of the same names; in_loop:
     the deviation of the reference's plant under the level's law (NaN without one); modelling_like, actuation_like,
     in_loop_like: the cosine of the error's course in time with that in the first case (1: the same up to a factor);
-    operations of one evaluation of the
-    rates, or of Newton's step; evaluations and steps; seconds: processor time of the shortest of three calls, in turn
-    with those of all other rows, with samples at the same instants; resolved: whether the error exceeds the
-    uncertainty; failure: why numbers are missing.
+    operations of one evaluation of the rates, or of Newton's step; evaluations and steps; seconds: processor time of
+    the shortest of three or more calls, in turn with those of all other rows, with samples at the same instants;
+    resolved: whether the error exceeds the uncertainty; failure: why numbers are missing.
     """
 
     COLUMNS = (

@@ -21,7 +21,7 @@ from servoctl.spec.program import Program
 from servoctl.study.tradeoff import CHECKS, Deadline, Reference, method_at, whole_run
 
 ACCURACIES = (1e-3, 1e-6, 1e-9)  # relative tolerances with which levels are integrated
-TIMED_ROUNDS = 3  # timed calls of each row, one after the other in each round
+FEWEST_ROUNDS, ROUNDS_FOR = 3, 0.1  # rounds of timed calls, one of each row, and s that they take together in a case
 LONGEST_CALL = 3.0  # s that one motion may take
 COURSE = 201  # at which the courses of errors in time are compared from case to case
 ZERO_SIGNAL = 1e-9  # an output below this part of the largest signal is zero, and its error absolute
@@ -281,13 +281,16 @@ def add_likeness(rows):
 
 
 def _time(rows):
-    """Processor time of each row's call: the shortest of some rounds over all rows."""
+    """Processor time of each row's call: the shortest of several rounds over all rows."""
     calls = [(row, *row.pop("call")) for row in rows if "call" in row]
-    for _ in range(TIMED_ROUNDS):
+    rounds, spent = 0, 0.0
+    while calls and (rounds < FEWEST_ROUNDS or spent < ROUNDS_FOR):
         for row, call, *arguments in calls:
             since = time.process_time()
             call(*arguments)
-            row["seconds"] = min(row.get("seconds", np.inf), time.process_time() - since)
+            seconds = time.process_time() - since
+            row["seconds"], spent = min(row.get("seconds", np.inf), seconds), spent + seconds
+        rounds += 1
 
 
 def _signal_sizes(run, names, together):
