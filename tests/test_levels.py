@@ -156,6 +156,14 @@ SCENES = {  # levels, the simple one, reference, span, parameter, measured value
 }  # fmt: skip
 
 
+@pytest.fixture(scope="module", autouse=True)
+def timed_briefly():
+    """No test asserts a time: the fewest rounds will do."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("servoctl.study.modelling.ROUNDS_FOR", 0.0)
+        yield
+
+
 @pytest.fixture(scope="module")
 def pendula():
     return sv.levels(PENDULA, (0.0, 4.0), reference="friction", law=partial(sv.feedforward, rate=500.0))
@@ -241,6 +249,29 @@ def test_operations_do_not_depend_on_the_machine_and_order_the_levels(pendula, r
         counts = [set(study.where(level=level)["operations"]) for level in order]
         assert all(len(count) == 1 for count in counts) and counts == sorted(counts, key=min)
     assert np.all(np.isfinite(pendula["seconds"])) and np.all(pendula["evaluations"] > 0)
+
+
+def test_a_stiff_level_is_measured_by_an_implicit_method_too():
+    """A damped spring with a time constant of 0.5 ms: 2,000 of them in the span."""
+    def coupled(stiff=True):
+        q = sv.coordinates("x y")
+        x, y = q
+        pull = 2e3 * (q.d(1)[1] - q.d(1)[0]) + 1e5 * (y - x)
+        mechanism = sv.Mechanism(
+            q, sv.particle(q, 2.0, x) + sv.particle(q, 1.0, y), actuators={"u": x},
+            forces={"x": pull if stiff else y - x, "y": -pull if stiff else x - y},
+        )  # fmt: skip
+        path = sv.paths.rest_to_rest(q.t, 0.0, 1.0, 1.0, smoothness=4)
+        return mechanism, sv.Program({"x": x - path}, by="actuators")
+
+    study = sv.levels({"stiff": coupled, "soft": partial(coupled, False)}, (0.0, 1.0), reference="stiff")
+    stiff = study.where(level="stiff")
+    assert list(dict.fromkeys(stiff["method"])) == ["Taylor", "RadauIIA"] and set(study["failure"]) == {""}
+    assert set(study.where(level="soft")["method"]) == {"Taylor"}
+    implicit = stiff.where(method="RadauIIA")
+    assert implicit["steps"].max() < stiff.where(method="Taylor")["steps"].min() / 10
+    assert np.all(implicit["integration"] < [1e-2, 1e-5, 1e-8])
+    assert str(study.recommend(error=1e-3).get("method")).startswith("RadauIIA")
 
 
 def test_sizes_make_errors_absolute():

@@ -10,7 +10,7 @@ import numpy as np
 from servoctl.checks import mapping, named, numbers_by_name, texts
 from servoctl.control.close import close
 from servoctl.errors import NameUnknown, ServoError, SpecificationError, unknown
-from servoctl.methods.accuracy import component_sizes, is_stiff, method_for
+from servoctl.methods.accuracy import component_sizes
 from servoctl.methods.choice import Project
 from servoctl.model.model import Model, derive
 from servoctl.plants.equations import equations_at
@@ -23,6 +23,8 @@ from servoctl.study.tradeoff import CHECKS, Deadline, Reference, method_at, whol
 ACCURACIES = (1e-3, 1e-6, 1e-9)  # relative tolerances with which levels are integrated
 FEWEST_ROUNDS, ROUNDS_FOR = 3, 0.1  # rounds of timed calls, one of each row, and s that they take together in a case
 LONGEST_CALL = 3.0  # s that one motion may take
+SETTINGS = {True: ("none", ""), False: ("project", "rtol")}  # drift and setting of flat programs, and of others
+MANY_STEPS = 150  # which a finer tolerance does not multiply: stability limits them
 COURSE = 201  # at which the courses of errors in time are compared from case to case
 ZERO_SIGNAL = 1e-9  # an output below this part of the largest signal is zero, and its error absolute
 
@@ -169,10 +171,10 @@ class LevelMotion:
         self.model, self.plant, self.start, self.span = level.model.including(start.names), level.plant, start, span
         self.converged = Reference(self.model, start, span, LONGEST_CALL, CHECKS[::-1])
 
-    def run(self, method, drift, times, span=None):
+    def run(self, method, drift, times):
         """The run by a method, sampled at times (N,) [s]."""
         options = {"drift": drift, "t_eval": times, "progress": Deadline(LONGEST_CALL)}
-        return whole_run(simulated(self.model, self.start, span or self.span, method, **options))
+        return whole_run(simulated(self.model, self.start, self.span, method, **options))
 
     def require(self, signals, level):
         """Refuse signals that the motion does not have."""
@@ -182,18 +184,6 @@ class LevelMotion:
                 run[name]
             except NameUnknown as error:
                 raise unknown(name, run.names, f"signal of the level {level!r}") from error
-
-    def settings(self):
-        """Method, drift, setting and its value, of each row."""
-        if self.model.flat:
-            return [("algebraic", "none", "", np.nan)]
-
-        def first(method, drift, span, times):
-            return self.run(method, drift, times, span)
-
-        series, (t0, t1) = method_for(self.model, ACCURACIES[0]), self.span
-        stiff = is_stiff(first, self.model, series, t0, self.start.values, t1)
-        return [("RadauIIA" if stiff else "Taylor", "project", "rtol", value) for value in ACCURACIES]
 
 
 class Comparison:
@@ -232,21 +222,29 @@ class Comparison:
         return self.off(names, loop, exact), self.course(names, loop, exact)
 
     def ladder(self, motion):
-        """The rows of a level: one for each setting."""
-        converged = motion.converged.at(self.times)
-        modelling, course = (of(self.names, converged, self.run) for of in (self.off, self.course))
-        for method, drift, setting, value in motion.settings():
-            row = {"method": method, "drift": drift, "setting": setting, "value": value, "modelling": modelling}
-            row["courses"] = {"modelling": course}
-            chosen, treatment = method_at(method, value), Project() if drift == "project" else None
-            try:
-                run = motion.run(chosen, treatment, self.times)
-                row |= self._errors(motion, run, converged) | {"call": (motion.run, chosen, treatment, self.times)}
-                row["courses"]["actuation"] = self.course(self.actuators, run, self.run)
-                row["failure"] = "" if self.law is None else self._looped(motion, run, row)
-            except ServoError as error:
-                row["failure"] = _failure(error)
-            yield row
+        """The rows of a level: one for each setting; by an implicit method, too, where stability limits the steps."""
+        if motion.model.flat:
+            return [self._row(motion, "algebraic", np.nan)]
+        rows = [self._row(motion, "Taylor", value) for value in ACCURACIES]
+        steps = [row.get("steps", MANY_STEPS) for row in rows]  # of those that take too long, too
+        if steps[0] >= max(MANY_STEPS, steps[-1]):
+            rows += [self._row(motion, "RadauIIA", value) for value in ACCURACIES]
+        return rows
+
+    def _row(self, motion, name, value):
+        flat, converged = motion.model.flat, motion.converged.at(self.times)
+        method, drift = method_at(name, value), None if flat else Project()
+        row = {"method": name, "value": value} | dict(zip(("drift", "setting"), SETTINGS[flat], strict=True))
+        row["modelling"] = self.off(self.names, converged, self.run)
+        row["courses"] = {"modelling": self.course(self.names, converged, self.run)}
+        try:
+            run = motion.run(method, drift, self.times)
+            row |= self._errors(motion, run, converged) | {"call": (motion.run, method, drift, self.times)}
+            row["courses"]["actuation"] = self.course(self.actuators, run, self.run)
+            row["failure"] = "" if self.law is None else self._looped(motion, run, row)
+        except ServoError as error:
+            row["failure"] = _failure(error)
+        return row
 
     def _errors(self, motion, run, converged):
         return {
