@@ -531,10 +531,26 @@ def test_a_prediction_needs_all_parameters_of_the_cases(ropes, pendula):
 # --- the table
 
 
+@pytest.mark.parametrize("calls, rows", [(1, 0), (4, 2)])
+def test_an_interrupted_study_has_the_cases_that_were_finished(calls, rows):
+    seen = []
+
+    def start(model):
+        seen.append(model)
+        if len(seen) == calls:
+            raise KeyboardInterrupt
+        return model.start()
+
+    study = sv.levels(ROPES, (0.0, 3.0), reference="elastic", cases={"k": [1e5, 2e5]}, start=start)
+    assert study.meta["message"] == "interrupted" and len(study) == rows
+    assert "interrupted" in repr(study) and len(repr(study).splitlines()) <= 12
+
+
 def test_a_study_of_levels_is_saved_printed_and_drawn(pendula, ropes, tmp_path):
     for study in (pendula, ropes):
         again = sv.load_study(study.save(tmp_path / "levels"))
         assert type(again) is sv.Levels and repr(again) == repr(study)
+        assert "0x" not in study.meta["law"]
         lines = repr(study).splitlines()
         assert len(lines) <= 12 and max(map(len, lines)) <= 120
     axes = pendula.plot(title="pendula")

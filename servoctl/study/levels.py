@@ -12,6 +12,7 @@ from servoctl.progress import progress_bar
 from servoctl.study.cases import as_cases
 from servoctl.study.modelling import Levelled, add_likeness
 from servoctl.study.power_law import Prediction, power_law
+from servoctl.study.sweep import name_of
 from servoctl.study.table import SHOWN, Study, machine, table
 from servoctl.study.tradeoff import Recommendation, arguments_of, as_cost, bound, unbeaten
 
@@ -93,9 +94,9 @@ def levels(
     add_likeness(rows)
     names = ("case", *cases[0], *Levels.COLUMNS)
     agreement = dict(zip(("error", "actuation"), uncertain.tolist(), strict=True))
-    meta = {"t_span": list(span), "levels": list(builds), "parameters": list(cases[0]), "law": _name(law)}
-    meta |= {"outputs": list(scene.names or ()), "actuators": list(scene.actuators or ()), "machine": machine()}
-    meta |= {"reference": {"level": reference, **agreement}}
+    meta = {"t_span": list(span), "levels": list(builds), "parameters": list(cases[0])}
+    meta |= {"law": "" if law is None else name_of(law), "outputs": list(scene.names or ()), "actuators": list(scene.actuators or ())}
+    meta |= {"reference": {"level": reference, **agreement}, "machine": machine()}
     meta |= {"message": "interrupted" if interrupted else "", "measured": time.strftime("%Y-%m-%d")}
     return Levels("levels", {name: [row.get(name) for row in rows] for name in names}, meta)
 
@@ -334,10 +335,6 @@ def _checked_cases(cases, scene):
         if name not in known:
             raise unknown(name, known, "parameter of a level")
     return cases
-
-
-def _name(law):
-    return "" if law is None else getattr(law, "__name__", repr(law))
 
 
 def _setting(row):

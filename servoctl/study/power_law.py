@@ -13,7 +13,7 @@ LARGEST_SPREAD = 700.0  # of a spread whose exponential is a double
 MOST_LEVERAGE = 1.0 - 1e-9  # of a case without which the others determine no law
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Prediction:
     """An error at parameters that were not measured; made by `Levels.predict`.
 
@@ -38,7 +38,7 @@ class Prediction:
     exponents: Mapping[str, float] = field(default_factory=dict)
     message: str = ""
 
-    def __str__(self):
+    def __repr__(self):
         law = " · ".join(f"{name}^{e:.2f}" for name, e in self.exponents.items())
         verdict = "conclusive" if self.conclusive else "inconclusive"
         lines = [f"Prediction, {verdict}: {self.value:.3g}, from {self.low:.3g} to {self.high:.3g}"]
