@@ -95,9 +95,10 @@ def levels(
     names = ("case", *cases[0], *Levels.COLUMNS)
     agreement = dict(zip(("error", "actuation"), uncertain.tolist(), strict=True))
     meta = {"t_span": list(span), "levels": list(builds), "parameters": list(cases[0])}
-    meta |= {"law": "" if law is None else name_of(law), "outputs": list(scene.names or ()), "actuators": list(scene.actuators or ())}
-    meta |= {"reference": {"level": reference, **agreement}, "machine": machine()}
+    meta |= {"outputs": list(scene.names or ()), "actuators": list(scene.actuators or ())}
+    meta |= {"law": "" if law is None else name_of(law), "reference": {"level": reference, **agreement}}
     meta |= {"message": "interrupted" if interrupted else "", "measured": time.strftime("%Y-%m-%d")}
+    meta |= {"machine": machine()}
     return Levels("levels", {name: [row.get(name) for row in rows] for name in names}, meta)
 
 

@@ -23,7 +23,7 @@ from servoctl.study.tradeoff import CHECKS, Deadline, Reference, method_at, whol
 ACCURACIES = (1e-3, 1e-6, 1e-9)  # relative tolerances with which levels are integrated
 FEWEST_ROUNDS, ROUNDS_FOR = 3, 0.1  # rounds of timed calls, one of each row, and s that they take together in a case
 LONGEST_CALL = 3.0  # s that one motion may take
-SETTINGS = {True: ("none", ""), False: ("project", "rtol")}  # drift and setting of flat programs, and of others
+ROW_SETTINGS = {True: ("none", ""), False: ("project", "rtol")}  # drift and setting of flat programs, and of others
 MANY_STEPS = 150  # which a finer tolerance does not multiply: stability limits them
 COURSE = 201  # at which the courses of errors in time are compared from case to case
 ZERO_SIGNAL = 1e-9  # an output below this part of the largest signal is zero, and its error absolute
@@ -234,7 +234,7 @@ class Comparison:
     def _row(self, motion, name, value):
         flat, converged = motion.model.flat, motion.converged.at(self.times)
         method, drift = method_at(name, value), None if flat else Project()
-        row = {"method": name, "value": value} | dict(zip(("drift", "setting"), SETTINGS[flat], strict=True))
+        row = {"method": name, "value": value} | dict(zip(("drift", "setting"), ROW_SETTINGS[flat], strict=True))
         row["modelling"] = self.off(self.names, converged, self.run)
         row["courses"] = {"modelling": self.course(self.names, converged, self.run)}
         try:
