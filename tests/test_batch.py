@@ -150,6 +150,40 @@ def test_a_long_plant_is_called_not_written_into_the_steps(plan, cases, monkeypa
     assert long[0] == pytest.approx(short[0], rel=1e-13)
 
 
+def test_any_number_of_vectors_gives_the_same(plan, cases, monkeypatch):
+    plant = sv.plant(CRANE, damping={"x": 5.0}, delay={"trolley": 0.02})
+    law = sv.lqr(plan, replace(plant, delay={}), rate=100.0)
+    one = sv.close(plant, law, plan.state(0.0), (0.0, 1.0), timing=sv.Timing(delay=1))
+    found = []
+    for vectors in (1, 2, 3):
+        monkeypatch.setattr(batch, "VECTORS", vectors)
+        monkeypatch.setattr(batch, "_UNITS", {})
+        found += [sv.close_many(one, {"m_load": cases["m_load"]}, record=["theta"], every=7)]
+    for other in found[:2]:
+        assert other["rms theta"] == pytest.approx(found[2]["rms theta"], rel=1e-13)
+        assert other.trace["theta"] == pytest.approx(found[2].trace["theta"], rel=1e-10, abs=1e-15)
+
+
+def test_lost_states_and_commands_are_dated_at_their_samples(plan):
+    """Not only where lanes look whether all is finite; a lost command may leave the state finite, within a limit."""
+    plant = sv.plant(CRANE, damping={"x": 1.0}, limits={"trolley": 1e4, "hoist": 1e4})
+    law = sv.lqr(plan, plant, rate=100.0)
+    schedule = law.schedule.copy()
+    schedule[8:, 70] = 1e308  # far from the plan the command is infinite at this sample
+    law = replace(law, schedule=schedule)
+    span, timing = (0.0, 1.5), sv.Timing(substeps=1)
+    starts, damping = np.where(np.arange(20) % 7 == 2, 100.0, 0.0), np.where(np.arange(20) % 7 == 3, 1e5, 1.0)
+    one = sv.close(plant, law, plan.state(0.0), span, timing=timing)
+    many = sv.close_many(one, {"x": starts, "damping x": damping}, record=["x"])
+    assert [many["error"][i] for i in (0, 2, 3, 4)] == ["", "ServoError", "IntegrationStopped", ""]
+    for i in (2, 3):
+        x0 = dict(zip(CRANE.q.names + CRANE.q.jet_names(1), plan.state(0.0), strict=True)) | {"x": starts[i]}
+        with pytest.raises(sv.ServoError) as caught:
+            sv.close(sv.plant(CRANE, damping={"x": damping[i]}, limits=plant.limits), law, x0, span, timing=timing)
+        assert f"t = {caught.value.details['t']:.6g} s" in many["message"][i]
+    assert relative(many.trace["x"][:, 0], one["x"]) < 1e-10 and np.array_equal(many.trace["x"][:, 0], many.trace["x"][:, 4])
+
+
 def test_cases_keep_their_seeds_when_there_are_more(plan):
     plant = sv.plant(CRANE)
     pd = sv.pd(plan, plant, rate=50.0, kp={"trolley": 100.0, "hoist": 100.0}, kd={"trolley": 50.0, "hoist": 50.0})

@@ -15,7 +15,9 @@ from servoctl.codegen.function import Compiled, compiled
 from servoctl.codegen.native import pointer
 from servoctl.control.loop import Arguments
 
-INLINED = 300  # operations of the plant's rates, up to which they are inlined into each stage, for two vectors in turn
+INLINED = 300  # operations of the plant's rates, up to which they are inlined into each stage, for all vectors in turn
+VECTORS = 2  # in a block: as many chains of dependent operations as registers hold
+LOOKED = 64  # samples between two looks whether all is finite
 PER_THREAD = 16  # tasks, so that threads end at about the same time
 
 _UNITS = weakref.WeakKeyDictionary()  # step of a law -> its units
@@ -87,7 +89,7 @@ def _derived(plant, law, disturbed, residuals):
     sizes = {
         "NX": x.numel(), "NU": n_u, "NP": p.numel(), "NC": n_c, "NW": w.numel(), "NV": v.numel(),
         "ND": len(disturbed), "NM": len(law.measures), "NZ": len(law.state), "NO": law.n_out, "NL": common.numel(),
-        "NS": s.numel(), "NR": phi.numel(), "NT": x.numel() + n_u + phi.numel(),
+        "VECTORS": VECTORS, "LOOKED": LOOKED, "NS": s.numel(), "NR": phi.numel(), "NT": x.numel() + n_u + phi.numel(),
     }  # fmt: skip
     where = ", ".join(str(plant.state_names.index(name)) for name in law.measures) or "0"
     constants_of_c = {"NAME": "batch", "MEASURED": f"{{{where}}}"} | ({} if project is None else {"PROJECTED": ""})
@@ -95,7 +97,7 @@ def _derived(plant, law, disturbed, residuals):
         emit.unit(sizes | constants_of_c),
         emit.include("lanes.h"),
         _lanes("numbers", t, constants, ca.SX(0, 1), ca.vertcat(w_values, v_values)),
-        _rates_of_two(_function("rates", t, x, ca.vertcat(w, applied), rates)),
+        _rates_of_block(_function("rates", t, x, ca.vertcat(w, applied), rates)),
         _lanes("law", t_k, y, common, command, emit.LANES_COMMON),
         _lanes("signals", t_k, ca.vertcat(x, v), s, phi, emit.LANES_COMMON),
         "" if project is None else _lanes("change", *project.sx_in(), project(*project.sx_in())),
@@ -131,12 +133,16 @@ def _lanes(name, t, x, p, value, dialect=emit.LANES):
     return emit.function(_function(name, t, x, p, value), name, dialect)
 
 
-def _rates_of_two(f):
-    """C text of the rates of two vectors of cases, inlined if they are short."""
-    if emit.operations(f) <= INLINED:
-        return emit.function_of_two(f, "rates_of_two", emit.LANES_INLINE)
-    calls = "    rates(t, x, p, y);\n    rates(t, x2, p2, y2);\n}\n"
-    return emit.function(f, "rates", emit.LANES) + emit.LANES_INLINE.head("rates_of_two", ("", "2")) + calls
+def _rates_of_block(f):
+    """C text of the rates of the vectors of a block, inlined if they are short."""
+    head = "INLINE void rates_of_block(const W t, const W *const x[], const W *const p[], W (*y)[NX + 1])\n{\n"
+    if emit.operations(f) > INLINED:
+        each = (f"    rates(t, x[{g}], p[{g}], y[{g}]);\n" for g in range(VECTORS))
+        return emit.function(f, "rates", emit.LANES) + head + "".join(each) + "}\n"
+    suffixes = ("", *map(str, range(1, VECTORS)))
+    arguments = ", ".join(f"x[{g}], p[{g}], y[{g}]" for g in range(VECTORS))
+    text = emit.function_of_several(f, "rates_of_several", emit.LANES_INLINE, suffixes)
+    return text + head + f"    rates_of_several(t, {arguments});\n}}\n"
 
 
 @dataclass(frozen=True)
@@ -170,7 +176,7 @@ def run_batch(unit, loop, cases, noise=None, traced=(), every=1, threads=None):
     if native is None:
         return None
     native.restype = None
-    count, width, size = cases[1].shape[1], 2 * n, len(unit.names) + unit.watched
+    count, width, size = cases[1].shape[1], VECTORS * n, len(unit.names) + unit.watched
     blocks = -(-count // width)
     columns = np.minimum(np.arange(blocks * width), count - 1)
     gathered = np.full((2 + 3 * size, blocks * width), np.nan)

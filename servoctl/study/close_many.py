@@ -137,7 +137,7 @@ def _at_all(run, constants):
     """The loop of a plant whose equations hold for the constants (n_c, N) of all cases."""
     equations = run.plant.equations
     parameters = constants[: len(equations.values)]
-    equations.require_inertia(np.unique(parameters, axis=1))
+    equations.require_inertia(parameters)
     again = equations_at(equations, parameters)
     return run if again is equations else replace(run, plant=replace(run.plant, equations=again))
 

@@ -30,6 +30,7 @@ __attribute__((flatten, optimize("no-tree-vectorize")))
 static void advance(const Loop *c, double t, double h, const double *d, double *x, double *p)
 {
     double k1[NX + 1], k2[NX + 1], k3[NX + 1], k4[NX + 1], z[NX + 1], *pd = p + c->at_u + c->n_u;
+    RATES(0, t, x, k1);
 #include "rk4.h"
 }
 
