@@ -95,7 +95,7 @@ def _derived(plant, law, disturbed, residuals):
     constants_of_c = {"NAME": "batch", "MEASURED": f"{{{where}}}"} | ({} if project is None else {"PROJECTED": ""})
     parts = [
         emit.unit(sizes | constants_of_c),
-        emit.include("lanes.h"),
+        emit.include("normal.h"),
         _lanes("numbers", t, constants, ca.SX(0, 1), ca.vertcat(w_values, v_values)),
         _rates_of_block(_function("rates", t, x, ca.vertcat(w, applied), rates)),
         _lanes("law", t_k, y, common, command, emit.LANES_COMMON),
@@ -167,7 +167,8 @@ def run_batch(unit, loop, cases, noise=None, traced=(), every=1, threads=None):
     """Run the closed loops of N cases: `Gathered`, or None without a compiler.
 
     `loop` holds for all cases, without its p, x0 and noise. `cases` are parameters of the plant (n_c, N), initial
-    states (n_x, N) and factors of the disturbances (n_d, N); `noise` maps a case's index to its (samples + 1, n_y).
+    states (n_x, N) and factors of the disturbances (n_d, N); `noise` are standard deviations of the measurements (n_y,)
+    and keys of the cases (N, 2).
     `traced` are indices of quantities that are traced at every n-th sample. By default there is one thread per core;
     the numbers do not depend on it.
     """
@@ -184,20 +185,20 @@ def run_batch(unit, loop, cases, noise=None, traced=(), every=1, threads=None):
     late = 0 if loop.transport is None else int(np.max(loop.transport)) // loop.substeps + 1
     depth = 1 + max(loop.delay, late)
     constants, x0, scale = (part[:, columns] for part in cases)
+    deviations, keys = noise or (None, None)
     arguments = Arguments(**vars(loop) | {
-        "constants": constants, "x0": x0, "scale": scale, "table": _common(unit, loop), "noise": None, "p": None,
+        "constants": constants, "x0": x0, "scale": scale, "table": _common(unit, loop), "p": None,
+        "deviations": deviations, "keys": None if keys is None else keys[columns],
         "depth": depth, "every": every, "columns": blocks * width, "n_traced": len(traced), "traced": traced,
         "gathered": gathered, "trace": trace,
     })  # fmt: skip
 
     def run(first, last):
-        noisy = None if noise is None else _noise(noise, columns[first * width : last * width], unit.n_y, width)
         scratch = np.empty(2 * depth * loop.n_u * width + 1)
-        rows = (None if noisy is None else pointer(noisy), pointer(scratch))
-        native(ctypes.byref(arguments), ctypes.c_int64(first), ctypes.c_int64(last), *rows)
+        native(ctypes.byref(arguments), ctypes.c_int64(first), ctypes.c_int64(last), pointer(scratch))
 
     threads = threads or os.cpu_count() or 1
-    length = 1 if noise is not None else -(-blocks // (threads * PER_THREAD))
+    length = -(-blocks // (threads * PER_THREAD))
     starts = range(0, blocks, length)
     with ThreadPoolExecutor(threads) as pool:
         try:
@@ -206,12 +207,6 @@ def run_batch(unit, loop, cases, noise=None, traced=(), every=1, threads=None):
             arguments.stop = 1  # which the threads read at each integration step
     lost, largest, squares, last = np.split(gathered[:, :count], [2, 2 + size, 2 + 2 * size])
     return Gathered(*lost, largest, np.sqrt(squares / (loop.samples + 1)), last, trace[:, :, :count])
-
-
-def _noise(noise, cases, n_y, width):
-    """Noise of some cases in the order of batch.c, (blocks, samples + 1, n_y, width)."""
-    columns = np.stack([noise(case) for case in cases], axis=-1)
-    return np.ascontiguousarray(np.moveaxis(columns.reshape(*columns.shape[:1], n_y, -1, width), 2, 0))
 
 
 def _common(unit, loop):

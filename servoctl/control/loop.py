@@ -50,10 +50,10 @@ _FIELDS = {
     ctypes.c_int64: "samples substeps delay n_y n_z n_u n_out n_row rows first n_d at_u depth every n_traced columns "
     "stop status sample step steps",
     ctypes.c_double: "t0 period",
-    ctypes.c_void_p: "p x0 z0 table noise quantum low high change initial_input disturbance constants scale measured "
-    "transport disturbed traced state x law_x law_y input gathered trace",
+    ctypes.c_void_p: "p x0 z0 table noise quantum low high change initial_input disturbance constants scale "
+    "deviations measured transport disturbed traced keys state x law_x law_y input gathered trace",
 }
-_WHOLE = {"measured", "transport", "disturbed", "traced"}  # arrays of whole numbers
+_KINDS = dict.fromkeys(("measured", "transport", "disturbed", "traced"), np.int64) | {"keys": np.uint64}
 
 
 class Arguments(ctypes.Structure):
@@ -73,7 +73,7 @@ class Arguments(ctypes.Structure):
             if value is None:
                 continue
             if kind is ctypes.c_void_p:
-                self.arrays.append(np.ascontiguousarray(value, dtype=np.int64 if name in _WHOLE else np.float64))
+                self.arrays.append(np.ascontiguousarray(value, dtype=_KINDS.get(name, np.float64)))
                 value = pointer(self.arrays[-1])
             setattr(self, name, value)
 

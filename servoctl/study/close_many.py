@@ -11,12 +11,13 @@ from servoctl.codegen.function import Compiled
 from servoctl.control.batch import Gathered, run_batch, unit
 from servoctl.control.close import close, require_consistent
 from servoctl.control.conditions import Timing, index, steps
+from servoctl.control.noise import first_words, key
 from servoctl.control.residuals import Residuals
 from servoctl.control.result import Closed
 from servoctl.errors import IntegrationStopped, ServoError, SpecificationError, unknown
 from servoctl.plants.equations import equations_at
 from servoctl.reduction.ranks import SUSPECT
-from servoctl.study.cases import CASES, as_cases, generator
+from servoctl.study.cases import CASES, as_cases
 from servoctl.study.table import Study, Traced, machine, table
 
 SEEDS = 2**31  # seeds of cases are below this
@@ -167,15 +168,15 @@ def _seeds(sensors, n):
     """The seed of each case's noise; None without noise."""
     if not sensors.noise:
         return None
-    return [int(generator(sensors.seed or 0, CASES, i).integers(SEEDS)) for i in range(n)]
+    words = first_words(sensors.seed or 0, CASES, n)
+    return (words % 2**32 * SEEDS // 2**32).tolist()  # as numpy's Generator.integers(SEEDS) of the same words
 
 
 def _noise(run, seeds):
-    """A function that maps the index of a case to its noise, (samples + 1, n_y); None without noise."""
+    """Standard deviations (n_y,) of the measurements, and keys (N, 2) of the cases' noise; None without noise."""
     if seeds is None:
         return None
-    sensors, measures, count = run.conditions.sensors, run.law.measures, run.loop.samples + 1
-    return lambda case: replace(sensors, seed=seeds[case]).noisy(measures, count)
+    return run.conditions.sensors.deviations(run.law.measures), np.array([key(seed) for seed in seeds])
 
 
 def _columns(cases):

@@ -10,7 +10,7 @@
 
    and MEASURED, the measured states. What all cases share is a table for law and signals, a row for each sample. */
 #include "unit.h"
-#include "lanes.h"
+#include "normal.h"
 
 #define EACH_VECTOR(g) _Pragma("GCC unroll 8") for (int g = 0; g < VECTORS; g++)
 #define V W
@@ -57,7 +57,7 @@ static void project(W t, W *x, const W *p)
 /* The cases in the lanes of one vector; `lost` is NaN in each lane in which the law's output was once not finite. */
 typedef struct {
     W constants[NP + 1], p[NW + NU + ND + 1], y[NM + NZ + 1], out[NO + 1], u[NU + 1], r[NR + 1];
-    W scale[ND + 1], largest[NT + 1], squares[NT + 1], lost, state_lost, law_lost;
+    W noise[NM + 1][4], scale[ND + 1], largest[NT + 1], squares[NT + 1], lost, state_lost, law_lost;
     double *commands, *inputs;
 } Cases;
 
@@ -86,15 +86,25 @@ static __attribute__((noinline, cold)) void date(double t, W bad_state, W bad_la
     s->law_lost = w_fmin(s->law_lost, w_select(bad_law != 0, ALL(t), ALL(INFINITY)));
 }
 
+/* Noise of four samples, from k on. */
+static __attribute__((noinline)) void draw(const Loop *c, int64_t k, int64_t at, W (*noise)[4])
+{
+    for (int i = 0; i < NM; i++) if (c->deviations[i] > 0) {
+        w_normal(c->keys + 2 * at, 2, (uint64_t)(k / 4 + 1), 0, (uint64_t)i, noise[i]);
+    }
+}
+
 /* Sample k: measure, law, delay, limits; gathered quantities. */
-INLINE void sample(const Loop *c, int64_t k, int64_t at, const double *noise, int dated, Cases *s, const W *x)
+INLINE void sample(const Loop *c, int64_t k, int64_t at, int dated, Cases *s, const W *x)
 {
     const double t = c->t0 + (double)k * c->period, *row = c->table + k * (NL + NS);
     const int64_t here = k % c->depth;
     W *u = s->u, *y = s->y;
+    if (c->deviations && k % 4 == 0) draw(c, k, at, s->noise);
     for (int i = 0; i < NM; i++) {
-        const W value = x[measured[i]];
-        y[i] = quantised(c, i, noise ? value + w_load(noise + (k * NM + i) * VECTORS * W_LANES) : value);
+        W value = x[measured[i]];
+        if (c->deviations && c->deviations[i] > 0) value += c->deviations[i] * s->noise[i][k % 4];
+        y[i] = quantised(c, i, value);
     }
     law(ALL(t), y, row, s->out);
     const W bad_law = lost(NU + NZ, s->out);
@@ -183,13 +193,13 @@ INLINE void end(const Loop *c, int64_t at, const Cases *s, const W *x)
 /* The loops of one block; nothing is gathered if they are stopped. The last commands and inputs, as many as the delays
    need, are in scratch. A state that is not finite stays so, and the law's outputs are summed: unless they are dated at
    each sample, it is enough to look now and then. Returns whether some were found, which are then to be dated. */
-static int block(const Loop *c, int64_t at, const double *noise, double *scratch, int dated)
+static int block(const Loop *c, int64_t at, double *scratch, int dated)
 {
     Cases s[VECTORS];
     W x[VECTORS][NX + NV + 1], k1[VECTORS][NX + 1];
     EACH_VECTOR(g) begin(c, at + g * W_LANES, scratch + g * 2 * c->depth * NU * W_LANES, s + g, x[g]);
     for (int64_t k = 0; ; k++) {
-        EACH_VECTOR(g) sample(c, k, at + g * W_LANES, noise ? noise + g * W_LANES : 0, dated, s + g, x[g]);
+        EACH_VECTOR(g) sample(c, k, at + g * W_LANES, dated, s + g, x[g]);
         if (!dated && (k % LOOKED == 0 || k == c->samples)) {
             EACH_VECTOR(g) if (w_any((s[g].lost + lost(NX, x[g])) != 0)) return 1;
         }
@@ -206,11 +216,10 @@ static int block(const Loop *c, int64_t at, const double *noise, double *scratch
     return 0;
 }
 
-void batch(const Loop *c, int64_t first, int64_t last, const double *noise, double *scratch)
+void batch(const Loop *c, int64_t first, int64_t last, double *scratch)
 {
     const int64_t width = VECTORS * W_LANES;
     for (int64_t b = first; b < last && !*(const volatile int64_t *)&c->stop; b++) {
-        const double *of_block = noise ? noise + (b - first) * (c->samples + 1) * NM * width : 0;
-        if (block(c, b * width, of_block, scratch, 0)) block(c, b * width, of_block, scratch, 1);
+        if (block(c, b * width, scratch, 0)) block(c, b * width, scratch, 1);
     }
 }

@@ -8,8 +8,9 @@ typedef struct {
     int64_t status, sample, step, steps; /* of one: how it ended, where it goes on, integration steps until it pauses */
     double t0, period;
     const double *p, *x0, *z0, *table, *noise, *quantum, *low, *high, *change, *initial_input, *disturbance;
-    const double *constants, *scale;
+    const double *constants, *scale, *deviations;
     const int64_t *measured, *transport, *disturbed, *traced;
+    const uint64_t *keys;
     double *state, *x, *law_x, *law_y, *input; /* the state and logs of one loop */
     double *gathered, *trace;          /* and of many */
 } Loop;
