@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from servoctl.codegen.native import pointer
+from servoctl.errors import ServoError
 from servoctl.values import Value
 
 FINISHED, STATE_LOST, LAW_LOST, INTERRUPTED, PAUSED = enum.IntEnum(
@@ -124,7 +125,16 @@ def _native(native, law, loop, logs):
             arguments.steps = max(1, int(arguments.steps * faster))
     except KeyboardInterrupt:
         return done, INTERRUPTED
-    return done, failures[0] if failures else arguments.status
+    status = failures[0] if failures else arguments.status
+    return done, _raised(law, loop, done, logs["law_x"]) or status if status == LAW_LOST else status
+
+
+def _raised(law, loop, k, law_x):
+    """The error that a law in C raises in Python at sample k; None if it does not raise."""
+    try:
+        law(loop.t0 + k * loop.period, law_x[k].copy(), loop.table[min(loop.first + k, len(loop.table) - 1)])
+    except ServoError as error:
+        return error
 
 
 def _called_back(law, loop, n_in, failures):
