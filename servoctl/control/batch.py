@@ -72,8 +72,7 @@ def _derived(plant, law, disturbed, residuals):
     t, x, p, rates = _rates(plant, disturbed)
     constants, applied = p[:n_c], ca.vertcat(p[n_c : n_c + n_u], p[n_c + n_u :][list(disturbed)])
     rates, w, w_values = _apart(rates, constants)
-    t_k, y, row = law.step.expression.sx_in()
-    command, common, common_values = _apart(law.step.expression(t_k, y, row), ca.vertcat(t_k, row))
+    t_k, row, written, common_values = _law(law)
     phi = ca.SX(0, 1)
     if residuals:
         places = [plant.mechanism.parameters.names.index(s.name()) for s in residuals.symbols]
@@ -88,17 +87,19 @@ def _derived(plant, law, disturbed, residuals):
     phi, v, v_values = _apart(phi, constants)
     sizes = {
         "NX": x.numel(), "NU": n_u, "NP": p.numel(), "NC": n_c, "NW": w.numel(), "NV": v.numel(),
-        "ND": len(disturbed), "NM": len(law.measures), "NZ": len(law.state), "NO": law.n_out, "NL": common.numel(),
-        "VECTORS": VECTORS, "LOOKED": LOOKED, "NS": s.numel(), "NR": phi.numel(), "NT": x.numel() + n_u + phi.numel(),
+        "ND": len(disturbed), "NM": len(law.measures), "NZ": len(law.state), "NO": law.n_out,
+        "NL": common_values.numel(), "VECTORS": VECTORS, "LOOKED": LOOKED, "NS": s.numel(), "NR": phi.numel(),
+        "NT": x.numel() + n_u + phi.numel(),
     }  # fmt: skip
     where = ", ".join(str(plant.state_names.index(name)) for name in law.measures) or "0"
-    constants_of_c = {"NAME": "batch", "MEASURED": f"{{{where}}}"} | ({} if project is None else {"PROJECTED": ""})
+    given = {"PROJECTED": project is not None, "CALLED": not written}
+    texts = {"NAME": "batch", "MEASURED": f"{{{where}}}"} | {name: "" for name, is_so in given.items() if is_so}
     parts = [
-        emit.unit(sizes | constants_of_c),
+        emit.unit(sizes | texts),
         emit.include("normal.h"),
         _lanes("numbers", t, constants, ca.SX(0, 1), ca.vertcat(w_values, v_values)),
         _rates_of_block(_function("rates", t, x, ca.vertcat(w, applied), rates)),
-        _lanes("law", t_k, y, common, command, emit.LANES_COMMON),
+        written,
         _lanes("signals", t_k, ca.vertcat(x, v), s, phi, emit.LANES_COMMON),
         "" if project is None else _lanes("change", *project.sx_in(), project(*project.sx_in())),
         emit.include("batch.c"),
@@ -107,6 +108,16 @@ def _derived(plant, law, disturbed, residuals):
     text, watched = "".join(parts), int(entries is not None)
     table = compiled(table, "table")
     return Unit(text, table, plant.state_names, plant.inputs, residuals, len(law.measures), watched)
+
+
+def _law(law):
+    """Symbols t_k and row; C text of the law, "" for one that is called; what all cases share at a sample."""
+    if law.allocation is not None:
+        t_k, row = ca.SX.sym("t"), ca.SX.sym("row", law.schedule.shape[0])
+        return t_k, row, "", row
+    t_k, y, row = law.step.expression.sx_in()
+    command, common, values = _apart(law.step.expression(t_k, y, row), ca.vertcat(t_k, row))
+    return t_k, row, _lanes("law", t_k, y, common, command, emit.LANES_COMMON), values
 
 
 def _rates(plant, disturbed):
@@ -163,12 +174,12 @@ class Gathered:
     trace: np.ndarray
 
 
-def run_batch(unit, loop, cases, noise=None, traced=(), every=1, threads=None):
+def run_batch(unit, loop, cases, noise=None, traced=(), every=1, threads=None, step=None):
     """Run the closed loops of N cases: `Gathered`, or None without a compiler.
 
     `loop` holds for all cases, without its p, x0 and noise. `cases` are parameters of the plant (n_c, N), initial
     states (n_x, N) and factors of the disturbances (n_d, N); `noise` are standard deviations of the measurements (n_y,)
-    and keys of the cases (N, 2).
+    and keys of the cases (N, 2). `step` is the C function of a law that is called.
     `traced` are indices of quantities that are traced at every n-th sample. By default there is one thread per core;
     the numbers do not depend on it.
     """
@@ -188,6 +199,7 @@ def run_batch(unit, loop, cases, noise=None, traced=(), every=1, threads=None):
     deviations, keys = noise or (None, None)
     arguments = Arguments(**vars(loop) | {
         "constants": constants, "x0": x0, "scale": scale, "table": _common(unit, loop), "p": None,
+        "law": step and ctypes.cast(step, ctypes.c_void_p),
         "deviations": deviations, "keys": None if keys is None else keys[columns],
         "depth": depth, "every": every, "columns": blocks * width, "n_traced": len(traced), "traced": traced,
         "gathered": gathered, "trace": trace,

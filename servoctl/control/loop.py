@@ -52,7 +52,7 @@ _FIELDS = {
     "stop status sample step steps",
     ctypes.c_double: "t0 period",
     ctypes.c_void_p: "p x0 z0 table noise quantum low high change initial_input disturbance constants scale "
-    "deviations measured transport disturbed traced keys state x law_x law_y input gathered trace",
+    "deviations measured transport disturbed traced keys state x law_x law_y input gathered trace law",
 }
 _KINDS = dict.fromkeys(("measured", "transport", "disturbed", "traced"), np.int64) | {"keys": np.uint64}
 
@@ -73,7 +73,7 @@ class Arguments(ctypes.Structure):
             value = values.get(name)
             if value is None:
                 continue
-            if kind is ctypes.c_void_p:
+            if kind is ctypes.c_void_p and not isinstance(value, ctypes.c_void_p):
                 self.arrays.append(np.ascontiguousarray(value, dtype=_KINDS.get(name, np.float64)))
                 value = pointer(self.arrays[-1])
             setattr(self, name, value)

@@ -1,6 +1,6 @@
 /* Closed loops of several cases at once: the lanes of W are cases, and blocks of vectors follow each other.
 
-   The functions numbers, rates_of_block, law, signals and, if PROJECTED, change come before it, with the sizes
+   The functions numbers, rates_of_block, law unless CALLED, signals and, if PROJECTED, change come before it, with the sizes
 
    VECTORS, LOOKED       vectors of a block; samples between two looks whether all is finite
    NX, NU, ND, NM, NZ    states, inputs, disturbances, measurements, states of the law
@@ -52,6 +52,22 @@ static void project(W t, W *x, const W *p)
         moving &= largest > ROUNDING;
     }
 }
+#endif
+
+#ifdef CALLED
+/* The law of each case by itself. */
+static __attribute__((noinline)) void called(const Loop *c, double t, const W *x, const double *row, W *y)
+{
+    EACH_LANE {
+        double own[NM + NZ + 1], out[NO + 1];
+        for (int j = 0; j < NM + NZ; j++) own[j] = x[j][i];
+        c->law(t, own, row, out);
+        for (int j = 0; j < NU + NZ; j++) y[j][i] = out[j];
+    }
+}
+#define LAW(t, x, row, y) called(c, t, x, row, y)
+#else
+#define LAW(t, x, row, y) law(ALL(t), x, row, y)
 #endif
 
 /* The cases in the lanes of one vector; `lost` is NaN in each lane in which the law's output was once not finite. */
@@ -106,7 +122,7 @@ INLINE void sample(const Loop *c, int64_t k, int64_t at, int dated, Cases *s, co
         if (c->deviations && c->deviations[i] > 0) value += c->deviations[i] * s->noise[i][k % 4];
         y[i] = quantised(c, i, value);
     }
-    law(ALL(t), y, row, s->out);
+    LAW(t, y, row, s->out);
     const W bad_law = lost(NU + NZ, s->out);
     s->lost += bad_law;
     if (dated) date(t, lost(NX, x), bad_law, s);
