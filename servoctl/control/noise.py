@@ -24,7 +24,7 @@ def key(seed):
 def normal(seed, count, channels):
     """Standard normal numbers of some channels, (count, len(channels))."""
     y = np.empty((count, len(channels)))
-    library = _library(compiler.lanes())
+    library = _library(compiler.lanes(), compiler.compiler())
     for column, channel in enumerate(channels):
         if library is None:
             y[:, column] = _by_numpy(seed, channel, count)
@@ -37,7 +37,7 @@ def normal(seed, count, channels):
 
 def first_words(seed, kind, count):
     """The first word of channels 0 .. count - 1 of a kind, (count,) uint64; noise is kind 0."""
-    y, library = np.empty(count, dtype=np.uint64), _library(compiler.lanes())
+    y, library = np.empty(count, dtype=np.uint64), _library(compiler.lanes(), compiler.compiler())
     if library is None:
         words = (np.random.Philox(key=key(seed), counter=[0, channel, kind, 0]) for channel in range(count))
         return np.array([word.random_raw() for word in words], dtype=np.uint64)
@@ -53,7 +53,7 @@ def _by_numpy(seed, channel, count):
 
 
 @cache
-def _library(lanes):
-    """The compiled functions for a number of lanes; None without a compiler."""
+def _library(lanes, _compiler):
+    """The compiled functions for a number of lanes and a compiler; None without one."""
     text = f"#define W_LANES {lanes}\n{emit.unit({'NAME': 'normal'})}{emit.include('normal.c')}"
     return compiler.library(text, level="-O3")

@@ -11,7 +11,7 @@ from servoctl.codegen.function import Compiled
 from servoctl.control.batch import Gathered, run_batch, unit
 from servoctl.control.close import close, require_consistent
 from servoctl.control.conditions import Timing, index, steps
-from servoctl.control.noise import first_words, key
+from servoctl.control.noise import first_words
 from servoctl.control.residuals import Residuals
 from servoctl.control.result import Closed
 from servoctl.errors import IntegrationStopped, ServoError, SpecificationError, unknown
@@ -178,7 +178,9 @@ def _noise(run, seeds):
     """Standard deviations (n_y,) of the measurements, and keys (N, 2) of the cases' noise; None without noise."""
     if seeds is None:
         return None
-    return run.conditions.sensors.deviations(run.law.measures), np.array([key(seed) for seed in seeds])
+    keys = np.zeros((len(seeds), 2), dtype=np.uint64)
+    keys[:, 0] = seeds  # below 2^64: see `noise.key`
+    return run.conditions.sensors.deviations(run.law.measures), keys
 
 
 def _columns(cases):
