@@ -1,6 +1,7 @@
 """The quadratic program of an allocation in C: optimal by its conditions of optimality, and equal to DAQP's solution."""
 
 import ctypes
+import pickle
 
 import mpmath
 import numpy as np
@@ -122,3 +123,13 @@ def test_an_allocation_that_is_impossible_says_so_from_c(plan):
     with refused(sv.LimitExceeded, "tension") as caught:
         sv.close(machine, law, plan.state(0.0), (0.0, 4.0))
     assert caught.value.run is not None and len(caught.value.details["low"]) == 2
+
+
+def test_laws_and_loops_that_ran_in_c_are_pickled(plan):
+    machine = sv.plant(CRANE, limits={"trolley": 50.0})
+    law = sv.limited(sv.lqr(plan, machine, rate=100.0), machine)
+    run = sv.close(machine, law, plan.state(0.0), (0.0, 0.5))
+    again = pickle.loads(pickle.dumps(run))
+    assert again.law == law
+    assert np.array_equal(sv.close(machine, again.law, plan.state(0.0), (0.0, 0.5)).states, run.states)
+    assert sv.close_many(again, {"m_load": [100.0]})["final x"] == pytest.approx(run["x"][-1], rel=1e-12)

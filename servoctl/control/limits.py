@@ -1,7 +1,7 @@
 """Laws under limits: a small quadratic program per sample decides the inputs, and which residual gives way."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from math import prod
 from types import SimpleNamespace
@@ -301,6 +301,9 @@ class Allocation(Value):
     residuals: tuple
     sizes: np.ndarray
     slack_sizes: np.ndarray
+
+    def __getstate__(self):
+        return {f.name: getattr(self, f.name) for f in fields(self)}  # loaded libraries stay in the process
 
     @property
     def limits(self):
