@@ -72,7 +72,7 @@ def _derived(plant, law, disturbed, residuals):
     t, x, p, rates = _rates(plant, disturbed)
     constants, applied = p[:n_c], ca.vertcat(p[n_c : n_c + n_u], p[n_c + n_u :][list(disturbed)])
     rates, w, w_values = _apart(rates, constants)
-    t_k, row, written, common_values = _law(law)
+    t_k, row, written, common_values = _law_in_c(law)
     phi = ca.SX(0, 1)
     if residuals:
         places = [plant.mechanism.parameters.names.index(s.name()) for s in residuals.symbols]
@@ -110,7 +110,7 @@ def _derived(plant, law, disturbed, residuals):
     return Unit(text, table, plant.state_names, plant.inputs, residuals, len(law.measures), watched)
 
 
-def _law(law):
+def _law_in_c(law):
     """Symbols t_k and row; C text of the law, "" for one that is called; what all cases share at a sample."""
     if law.allocation is not None:
         t_k, row = ca.SX.sym("t"), ca.SX.sym("row", law.schedule.shape[0])
