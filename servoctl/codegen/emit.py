@@ -206,11 +206,15 @@ def function(f, name, dialect=SCALAR, chunk=CHUNK):
     return dialect.head(name) + "".join(_line(statement, dialect) for statement in statements) + "}\n"
 
 
-def function_of_two(f, name, dialect):
-    """C text of y = f(t, x, p) and y2 = f(t, x2, p2), with alternating statements: the processor overlaps the two."""
-    one, two = (_with_reciprocals(_statements(f, dialect, suffix)) for suffix in ("", "2"))
-    lines = ((_line(a, dialect), _line(b, dialect, "b")) for a, b in zip(one, two, strict=True))
-    return dialect.head(name, ("", "2")) + "".join(chain.from_iterable(lines)) + "}\n"
+def function_of_several(f, name, dialect, suffixes):
+    """C text of y = f(t, x, p) for each suffix of x, p, y, with alternating statements: the processor overlaps them."""
+    copies = [_with_reciprocals(_statements(f, dialect, suffix)) for suffix in suffixes]
+    lines = (
+        _line(statement, dialect, f"a{suffix}_")
+        for statements in zip(*copies, strict=True)
+        for suffix, statement in zip(suffixes, statements, strict=True)
+    )
+    return dialect.head(name, suffixes) + "".join(lines) + "}\n"
 
 
 def literal(value):
