@@ -14,7 +14,7 @@ FILES = [(folder, file.name) for folder in (LOOPS, EXPORTED) for file in folder.
 
 
 def test_every_loop_has_a_file():
-    others = {"grid.c", "batch.c", "exponentials.c", "many.c", "riccati.c"}
+    others = {"grid.c", "builtin.c", "batch.c", "exponentials.c", "many.c", "riccati.c"}
     assert {f"{loop}.c" for loop in loops.LOOPS} | others == {n for folder, n in FILES if folder is LOOPS}
     assert all(loops.source(f"{loop}.c").startswith(("/*", "#include")) for loop in loops.LOOPS)
     assert {name for folder, name in FILES if folder is EXPORTED} == {"newton.c", "integrated.c", "law.c"}
