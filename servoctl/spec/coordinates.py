@@ -222,7 +222,8 @@ class Coordinates:
         if _order(k) == 0:
             return [expressions]
         outputs = self._series(expressions, k).outputs[: len(expressions)]
-        return [[ca.SX(multiply(c[j], float(factorial(j)))) for c in outputs] for j in range(k + 1)]
+        derivatives = ([multiply(c[j], float(factorial(j))) for c in outputs] for j in range(k + 1))
+        return [[e if e.__class__ is ca.SX else ca.SX(e) for e in level] for level in derivatives]
 
     def as_function(self, expressions, parameters=()):
         """Expressions of t, q, jets and parameters as one CasADi function, which serialises and pickles.

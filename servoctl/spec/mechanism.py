@@ -145,7 +145,7 @@ class Mechanism:
 
     def places(self, *expressions):
         """Coordinates and velocities in expressions: a set of ("q", i) and ("w", i)."""
-        found = (self.q.where(s) for e in expressions for s in ca.symvar(ca.SX(e)))
+        found = (self.q.where(s) for e in expressions for s in ca.symvar(e if e.__class__ is ca.SX else ca.SX(e)))
         return {(place[0], place[2]) for place in found if place is not None and place[0] != "t"}
 
     def couplings(self):
