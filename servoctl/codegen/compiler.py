@@ -18,8 +18,6 @@ import os
 import platform
 import shlex
 import shutil
-import subprocess
-import tempfile
 import threading
 import warnings
 from pathlib import Path
@@ -134,6 +132,8 @@ def _optional_flags():
 
 @functools.cache
 def _scratch():
+    import tempfile
+
     # Windows does not delete loaded libraries.
     directory = tempfile.TemporaryDirectory(prefix="servoctl-", ignore_cleanup_errors=True)
     atexit.register(directory.cleanup)
@@ -142,6 +142,8 @@ def _scratch():
 
 def _build(text, flags, file_name, command):
     """Compile into the cache, or into a temporary directory if that fails, as where the cache's disk is full."""
+    import subprocess
+
     for directory in (cache_directory, _scratch):
         try:
             return _compile(text, flags, directory() / file_name, command)
@@ -154,6 +156,8 @@ def _build(text, flags, file_name, command):
 
 
 def _compile(text, flags, target, command):
+    import subprocess
+
     with replacing(target) as temporary:
         for optional in (_optional_flags(), ()):
             done = subprocess.run(
