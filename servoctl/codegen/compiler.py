@@ -28,7 +28,7 @@ from servoctl.codegen.loops import SOURCES, digest
 PATIENCE_WITH_COMPILER = 600.0  # s: one that takes longer waits for something, such as a licence
 USUAL = ("cc", "gcc", "clang")  # compilers that are looked for
 FLAGS = ("-fPIC", "-shared", "-w", "-fno-math-errno")
-EXACT = ("-ffp-contract=off", "-fno-builtin-pow")  # every operation rounds by itself; pow is that of the C library
+ROUNDED = ("-ffp-contract=off", "-fno-builtin-pow")  # every operation rounds by itself; pow is that of the C library
 
 _loaded = {}  # key -> ctypes.CDLL, or None where it could not be built
 _locks = {}  # key -> lock: no two threads compile the same text
@@ -60,7 +60,7 @@ def library(text, level="-O1", exact=False):
     command, identity = _compiler()
     if command is None:
         return None if os.environ.get("SERVOCTL_COMPILER") == "none" else _without("No C compiler was found")
-    flags = (level, *FLAGS, *(EXACT if exact else ()))
+    flags = (level, *FLAGS, *(ROUNDED if exact else ()))
     parts = (text, digest(), *flags, *_optional_flags(), identity, platform.machine(), _processor())
     key = hashlib.sha256("\0".join(parts).encode()).hexdigest()
     with _guard:
