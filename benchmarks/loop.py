@@ -213,7 +213,6 @@ def numba_loop():
 
 def drake_loop():
     """A multibody plant, a hold, and its law from blocks of Drake, by its third-order Runge-Kutta method."""
-    from pydrake.math import RigidTransform
     from pydrake.multibody.plant import MultibodyPlant
     from pydrake.multibody.tree import PrismaticJoint, RevoluteJoint, SpatialInertia, UnitInertia
     from pydrake.systems.analysis import ResetIntegratorFromFlags, Simulator
