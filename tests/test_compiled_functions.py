@@ -193,7 +193,7 @@ def test_points_of_a_function_called_often_are_compiled_with_the_bits_of_casadi(
         model, n = compiled(f, "points"), x.shape[1]
         reference = np.asarray(f.map(n)(np.full((1, n), 2.5), x, np.full((1, n), 1.5)))
         often(monkeypatch, model)
-        assert type(model._point) is type(len)
+        assert model._builtin
         y = np.array([model(2.5, column, np.array([1.5])) for column in x.T.copy()]).T
         np.testing.assert_array_equal(y, reference)
         np.testing.assert_array_equal(np.signbit(y[y == 0]), np.signbit(reference[y == 0]))
@@ -206,7 +206,7 @@ def test_compiled_points_take_what_others_take(monkeypatch, c_compiler):
              (2.0, np.array([0.3, 1.2]), np.frombuffer(b"-" + np.float64(1.5).tobytes(), offset=1))]  # not aligned
     before = [model(*form) for form in forms]
     often(monkeypatch, model)
-    assert type(model._point) is type(len)
+    assert model._builtin
     for form, y in zip(forms, before, strict=True):
         np.testing.assert_array_equal(model(*form), y)
     whole = np.array([1, 2])  # not numbers of double precision, of the same size
@@ -224,7 +224,7 @@ def test_points_stay_with_casadi_without_a_compiler_or_a_function_of_c(monkeypat
     other = often(monkeypatch, compiled(function(ca.SX.unary(ca.OP_ERFINV, X2[0]), X2[1]), "other"))
     monkeypatch.setenv("SERVOCTL_COMPILER", "none")
     for model in (other, often(monkeypatch, pendulum())):
-        assert type(model._point) is not type(len)
+        assert not model._builtin
         assert np.isfinite(model(0.0, [0.5, 0.1], [1.0])).all()
 
 

@@ -144,7 +144,7 @@ class Compiled:
         self.expression, self._symbol = f, f"servoctl_{name}"
         self._x_shape, self._p_shape = (self.n_x,), (self.n_p,)
         self._interpreter = Interpreter(f, project, self.sizes)
-        self._text, self._calls = None, 0
+        self._text, self._builtin, self._calls = None, None, 0
 
     def __reduce__(self):
         parts = (self.expression, self.name, self.loops, self._project, self._others, self.sizes)
@@ -200,19 +200,18 @@ class Compiled:
         SpecificationError
             If x or p has another shape.
         """
-        y = self._point(t, x, p)
-        if y is None:  # not a number and arrays of floats of the right shapes
-            y = self._point(float(t), self._array("x", x, self._x_shape), self._array("p", p, self._p_shape))
-        return y
+        call = self._builtin
+        y = None if call is None else call(t, x, p)
+        return self._point(t, x, p) if y is None else y
 
     def _point(self, t, x, p):
-        """By CasADi; the function gets an attribute of this name that takes the same calls, when it is called often."""
+        """Evaluate by CasADi; once compiled, what is not a number and arrays of floats of the right shapes."""
+        if self._builtin is not None:
+            return self._builtin(float(t), self._array("x", x, self._x_shape), self._array("p", p, self._p_shape))
         self._calls += 1
         if self._calls == CALLS and compiler.compiler() and not emit.contains(self.expression, ca.OP_ERFINV):
             library = compiler.library(emit.emit_builtin(self.expression, self._symbol), exact=True)
-            call = library and builtin(library, self._symbol, self.n_y)
-            if call:
-                self._point = call
+            self._builtin = library and builtin(library, self._symbol, self.n_y)
         row_y, run = self._place(self._interpreter, t, x, p)
         run()
         return row_y.copy()
