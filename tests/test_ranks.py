@@ -213,7 +213,7 @@ def test_identities_are_decided_where_values_cannot_tell(monkeypatch):
                       ca.horzcat(c, a, d)))
     assert tests == [1, 1]  # nothing is left of it
     solved(ca.vertcat(ca.horzcat(a, a * b, c), ca.horzcat(c, b * c + late, d), ca.horzcat(d, b, a)))
-    assert tests[2:] and set(tests[2:]) == {1}  # a difference that arises in the elimination, and is alive at t = 9
+    assert tests[2] == 1 and len(tests) <= 4  # a difference that arises on the way; then those that follow, at once
 
 
 def test_columns_of_a_plan_are_those_of_a_pivoted_qr():

@@ -281,7 +281,8 @@ class _System:
     """A system under elimination.
 
     `rows` has for each row its entries by column: an SX scalar, and its equilibrated numbers at the points where pivots
-    are chosen. What is zero at all of them is left out if it vanishes identically.
+    are chosen. What is zero at all of them is left out if it vanishes identically. Where an elimination asks
+    that, the entries that follow have behind their numbers the values at random points that tell.
     `candidates` are the columns whose entries may be pivots; `open` lists the rows that were no pivot rows yet,
     `members` those of a column.
     """
@@ -289,6 +290,7 @@ class _System:
     def __init__(self, matrix, right, numbers):
         n = matrix.shape[0]
         scaled = np.moveaxis(equilibrate(np.moveaxis(numbers, 2, 0))[0], 0, 2).astype(float)
+        self.points, self.asked, self.followed = scaled.shape[2], False, False
         entries = list(zip(*matrix.sparsity().get_triplet(), matrix.nonzeros(), strict=True))
         doubtful = [(i, j, entry) for i, j, entry in entries if not scaled[i, j].any()]
         vanishing = _vanish([entry for _, _, entry in doubtful])
@@ -313,12 +315,14 @@ class _System:
         """The candidates of a row: a size is the smallest over the points."""
         if not row:
             return []
-        sizes = np.abs([number for _, number in row.values()]).min(axis=1).tolist()
+        sizes = np.abs([number[: self.points] for _, number in row.values()]).min(axis=1).tolist()
         least = THRESHOLD * max(sizes)
         return [(j, size) for j, size in zip(row, sizes, strict=True) if size >= least and size > 0.0]
 
     def step(self):
         """Eliminate by the pivot with the least fill-in, and return its row and column."""
+        if self.asked and not self.followed:
+            self._follow()
         i, j = self._pivot()
         row = self.rows[i]
         del self.open[i]
@@ -356,7 +360,7 @@ class _System:
                 continue
             old, old_number = row.get(c, (_ZERO, 0.0))
             left, numbers = subtract(old, multiply(factor, a)), _difference(old_number, factor_number * a_number)
-            if not numbers.any() and _vanish([left])[0]:
+            if not numbers[: self.points].any() and self._vanishes(left, numbers[self.points :]):
                 _leave_out(left)
                 if row.pop(c, None) is not None:
                     del self.members[c][r]
@@ -366,6 +370,18 @@ class _System:
         for k, b in enumerate(pivot_right):
             if not b.is_zero():
                 right[k] = subtract(right[k], multiply(factor, b))
+
+    def _vanishes(self, entry, values):
+        """Whether an entry vanishes identically, from its values at random points if they are followed."""
+        self.asked = True
+        return bool(vanish(values)) if self.followed else _vanish([entry])[0]
+
+    def _follow(self):
+        """Append the values at random points to the numbers of all entries that are still eliminated."""
+        places = [(self.rows[i], j) for i in self.open for j in self.rows[i]]
+        for (row, j), values in zip(places, spread([row[j][0] for row, j in places]), strict=True):
+            row[j] = row[j][0], np.append(row[j][1], values)
+        self.followed = True
 
 
 _ZERO = ca.SX(0)
