@@ -109,15 +109,24 @@ def _sizeable_columns(matrix, inertia, columns):
     Equilibration makes a column that is about to vanish as large as any other; with the inertia of its coordinate it is
     small.
     """
-    from scipy.linalg import qr
-
     if not len(columns) or not (inertia > 0).all():
         return columns
     scaled = (matrix / np.sqrt(inertia)).astype(float)
     scaled /= np.linalg.norm(scaled, axis=1, keepdims=True)
-    others = qr(scaled, mode="r", pivoting=True)[1][: len(columns)]
+    others = _independent_columns(scaled, len(columns))
     given, best = (np.linalg.svd(scaled[:, some], compute_uv=False)[-1] for some in (columns, others))
-    return columns if given >= THRESHOLD * best else others.tolist()
+    return columns if given >= THRESHOLD * best else others
+
+
+def _independent_columns(matrix, count):
+    """So many columns of a matrix (m, n): each the longest beside those before it (QR with column pivoting)."""
+    rest, chosen = matrix.copy(), []
+    for _ in range(count):
+        lengths = np.linalg.norm(rest, axis=0)
+        chosen.append(int(np.argmax(lengths)))
+        direction = rest[:, chosen[-1]] / lengths[chosen[-1]]
+        rest -= np.outer(direction, direction @ rest)
+    return chosen
 
 
 def _shared(mechanism, program, constraints, independent, points, context):

@@ -1,12 +1,11 @@
 """Program (servo) constraints of any order."""
 
-import difflib
 
 import casadi as ca
 import numpy as np
 
 from servoctl.checks import column, mapping, require_kind
-from servoctl.errors import SpecificationError
+from servoctl.errors import SpecificationError, unknown
 from servoctl.jets.branches import without_turns
 from servoctl.jets.overflow import settled
 from servoctl.spec.coordinates import Coordinates
@@ -57,10 +56,11 @@ class Program(Packed):
                 residuals=residuals,
             )
         if not isinstance(by, str) or by not in REALISATIONS:
+            match = unknown(by, REALISATIONS, "realisation").details["match"]
             raise SpecificationError(
                 f"by={by!r}.",
                 "A program is realised by 'ideal' reactions or by the mechanism's 'actuators'.",
-                nearest="".join(map(repr, difflib.get_close_matches(str(by), REALISATIONS, 1))),
+                nearest=repr(match) if match else "",
                 by=by,
             )
         mapping(residuals, "The residuals")
