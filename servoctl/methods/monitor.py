@@ -403,7 +403,7 @@ class Monitor:
         if lingering is not None:
             return lingering
         t, x = stretch.t[k + 1], stretch.x[:, k + 1]
-        degraded = weakest[-1] < DEGRADED and self.pivots_only(weakest[-1], t, x)
+        degraded = weakest[-1] < DEGRADED and (self.model.diagonal or self.pivots_only(weakest[-1], t, x))
         return _other_pivots(k + 1, t, x) if degraded else None
 
     def _touched(self, stretch, k, sizes, scale):
@@ -504,6 +504,9 @@ class Monitor:
 
     def repivoted(self, t, x, top):
         """The model with pivots chosen at x and γ^(s̄) = top, and its monitor; None if no choice succeeds."""
+        diagonal = self.model.without_choice
+        if diagonal is not None and self.rank_measure(t, x) > LOST:
+            return diagonal, Monitor(diagonal, t, x, self)
         sizes = {name: size for name, size in zip(self.model.state_names, self.largest, strict=True) if size > 0}
         try:
             model = self.model.near(t, np.append(x, np.nan_to_num(top)), sizes)

@@ -13,13 +13,23 @@ from servoctl.codegen.function import compiled
 from servoctl.errors import ServoError, SpecificationError, unknown
 from servoctl.jets.series import Flow
 from servoctl.jets.tape import REAL
-from servoctl.model.equations import EQUATIONS, SIGNALS, Equations, gradient_jets, leading_names, residual_rows
+from servoctl.model import saddle
+from servoctl.model.equations import (
+    EQUATIONS,
+    SIGNALS,
+    Equations,
+    gradient_jets,
+    leading_names,
+    monitored_rows,
+    residual_rows,
+)
 from servoctl.model.report import describe, warn_of_products
 from servoctl.model.rest import started
 from servoctl.model.start import State
 from servoctl.model.store import Store, pack, unpack
 from servoctl.model.validity import affirmed
 from servoctl.reduction.appell import require_positive
+from servoctl.reduction.definite import Definite, definite
 from servoctl.reduction.idle import names_of, needed
 from servoctl.reduction.knots import require_smooth
 from servoctl.reduction.manifold import ON_MANIFOLD, solve
@@ -31,6 +41,7 @@ from servoctl.spec.program import Program
 from servoctl.values import read_only
 
 SAMPLED = 50  # samples of a run at which its structure is decided; each takes tens of milliseconds
+DIAGONAL = "diagonal"  # place of the variant whose pivots are diagonal entries
 MOST_VARIANTS = 8  # of a model that it holds: motions from one start meet the same ones again
 
 
@@ -123,7 +134,8 @@ class Model:
         if not isinstance(other, Model):
             return NotImplemented
         known = self._store.fingerprint is not None and self._store.fingerprint == other._store.fingerprint
-        return self is other or (known and np.array_equal(self.parameters, other.parameters))
+        same = known and self.diagonal == other.diagonal
+        return self is other or (same and np.array_equal(self.parameters, other.parameters))
 
     def __hash__(self):
         return hash(self._store.fingerprint)
@@ -237,20 +249,38 @@ class Model:
                 free=near.free,
                 expected=self.free,
             )
-        if len(self._variants) == MOST_VARIANTS:
-            del self._variants[next(iter(self._variants))]
+        chosen = [known for known in self._variants if known != DIAGONAL]
+        if len(chosen) == MOST_VARIANTS:
+            del self._variants[chosen[0]]
         self._variants[key] = Model(near.reduction, near._store, self.parameters, self._knots, variants=self._variants)
         return self._variants[key]
 
+    @cached_property
+    def without_choice(self):
+        """The model whose pivots are diagonal entries of definite matrices (`reduction.definite`); None without such."""
+        r, place = self.reduction, DIAGONAL
+        if self.diagonal or self.flat or not saddle.applies(r):
+            return None
+        if place not in self._variants:
+            found, functions = definite(r), self._functions.setdefault(place, {})
+            store, numbers = self._store.part(place), (self.parameters, self._knots)
+            self._variants[place] = found and Model(found, store, *numbers, functions, self._variants)
+        return self._variants[place]
+
+    @property
+    def diagonal(self):
+        """Whether pivots are diagonal entries of definite matrices."""
+        return isinstance(self.reduction.realisation, Definite)
+
     @property
     def place(self):
-        """(t, jets, sizes) near which pivots were chosen by `near`; None if they were by `derive`."""
-        return self._store.specification[3]
+        """(t, jets, sizes) near which pivots were chosen by `near`; `DIAGONAL`, or None if they were by `derive`."""
+        return DIAGONAL if self.diagonal else self._store.specification[3]
 
     def at(self, place):
         """The variant of a `place`; this model if that is None."""
-        if place is None:
-            return self
+        if place is None or place == DIAGONAL:
+            return self.without_choice if place else self
         t, jets, sizes = place
         return self.near(t, [jets[name] for name in self.jet_names], sizes)
 
@@ -472,7 +502,7 @@ class Model:
         right : (rows, N) array
         """
         y = self.function("multiplier_form").grid(t, jets, self.parameters)
-        columns = self.n + len(self.reduction.realisation.dependent)
+        columns = self.n + self.reduction.realisation.B.shape[1]
         rows = len(y) // (columns + 1)
         return y[rows:].reshape(columns, rows, -1).swapaxes(0, 1), y[:rows]
 
@@ -494,7 +524,7 @@ class Model:
         """The coordinate or quasi-velocity, by index, of each row of L that is a row TᵀM of (3.18), by index."""
         q = self.reduction.mechanism.q
         names = [f"balance of {name}" for name in (q.names if q.plain else q.velocity_names)]
-        rows = enumerate(self.reduction.rows)
+        rows = enumerate(monitored_rows(self.reduction))
         return {a: names.index(row.name) for a, row in rows if row.name in names and row.order == 2 and not row.story}
 
     def leading_names(self):
@@ -608,4 +638,6 @@ def _samples(model, motion, jets):
 
 def _unpickled(mechanism, content, choices, parameters, knots):
     reduction = unpack(content, mechanism)
-    return Model(reduction, Store(mechanism, reduction.program, *choices), parameters, knots)
+    store = Store(mechanism, reduction.program, *choices)
+    model = Model(reduction, store, parameters, knots)
+    return Model(reduction, store.part(DIAGONAL), parameters, knots) if model.diagonal else model

@@ -241,7 +241,7 @@ def alive(entries, points):
     return np.where(share > 1.0, share, 0.0)
 
 
-def eliminate(matrix, right, numbers):
+def eliminate(matrix, right, numbers, diagonal=False):
     """Solve A X = B symbolically.
 
     Parameters
@@ -250,6 +250,8 @@ def eliminate(matrix, right, numbers):
     right : (n, m) SX
     numbers : (n, n, N) array
         A at N points, cleaned of rounding, where pivots are chosen.
+    diagonal : bool, optional
+        Whether pivots are diagonal entries, as is stable for definite matrices.
 
     Returns
     -------
@@ -263,7 +265,7 @@ def eliminate(matrix, right, numbers):
         If A is singular at a point.
     """
     n, m = right.shape
-    system = _System(matrix, right, numbers)
+    system = _System(matrix, right, numbers, diagonal)
     with np.errstate(all="ignore"):  # at some random points a pivot has no value
         order = [system.step() for _ in range(n)]
     solution, rows, rhs = [None] * n, system.rows, system.rhs
@@ -285,8 +287,8 @@ class _System:
     `members` those of a column.
     """
 
-    def __init__(self, matrix, right, numbers):
-        n = matrix.shape[0]
+    def __init__(self, matrix, right, numbers, diagonal):
+        n, self.diagonal = matrix.shape[0], diagonal
         scaled = np.moveaxis(equilibrate(np.moveaxis(numbers, 2, 0))[0], 0, 2).astype(float)
         self.points = scaled.shape[2]
         entries, anywhere = matrix.nonzeros(), spread(matrix.nonzeros())
@@ -304,10 +306,13 @@ class _System:
         for i, row in enumerate(self.rows):
             for j in row:
                 self.members[j][i] = None
-        self.candidates = [self._large(row) for row in self.rows]
+        self.candidates = [self._large(i) for i in range(n)]
 
-    def _large(self, row):
-        """The candidates of a row: a size is the smallest over the points."""
+    def _large(self, i):
+        """The candidates of row i: a size is the smallest over the points."""
+        row = self.rows[i]
+        if self.diagonal:
+            row = {i: row[i]} if i in row else {}
         if not row:
             return []
         sizes = np.abs([number[: self.points] for _, number in row.values()]).min(axis=1).tolist()
@@ -323,7 +328,7 @@ class _System:
             del self.members[c][i]
         for r in self.members[j]:
             self._subtract(r, row, self.rhs[i], j)
-            self.candidates[r] = self._large(self.rows[r])
+            self.candidates[r] = self._large(r)
         self.members[j] = {}
         return i, j
 
