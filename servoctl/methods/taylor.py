@@ -21,7 +21,6 @@ from servoctl.methods.narrow import arguments, centres
 from servoctl.methods.watch import RESOLUTION, End, net, steps_of
 from servoctl.model.equations import monitored_rows
 from servoctl.reduction.cascade import Running
-from servoctl.reduction.ranks import clean, eliminate
 
 LOWEST, HIGHEST = 4, 24  # orders: below, steps are too short; above, compiling grows faster than steps
 INSIDE = np.array([0.07, 0.19, 0.34, 0.53, 0.71, 0.86, 0.98])  # parts of a step at which its series is checked
@@ -167,10 +166,10 @@ def taylor_coefficients(equations, last):
 def _by_rows(equations, last):
     """The motion by L γ_[k] = ..."""
     r, motion = equations.r, _Motion(equations)
-    groups, numbers = _groups(motion, r.rows), clean(*r.points.matrix(r.leading))
+    groups = _groups(motion, r.rows)
     for k in range(equations.top, last + 1):
         motion.guess(k)
-        solution, _ = eliminate(r.leading, _right(groups, k), numbers)
+        solution, _ = r.solve(_right(groups, k))
         motion.settle(k, [0.0 if x.is_zero() else x for x in solution.elements()])
         for group in groups:
             group.correct(k)

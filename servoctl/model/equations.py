@@ -131,8 +131,7 @@ class Equations(Invariants):
 
     def _solve(self, right):
         """L⁻¹ right and the pivots of L."""
-        values, sizes = self.r.points.matrix(self.r.leading)
-        return eliminate(self.r.leading, right, clean(values, sizes))
+        return self.r.solve(right)
 
     @property
     def sparse(self):

@@ -41,7 +41,7 @@ from servoctl.spec.program import Program
 from servoctl.values import read_only
 
 SAMPLED = 50  # samples of a run at which its structure is decided; each takes tens of milliseconds
-DIAGONAL = "diagonal"  # place of the variant whose pivots are diagonal entries
+DIAGONAL = "diagonal"  # pivots of definite matrices, beside places of other pivots
 MOST_VARIANTS = 8  # of a model that it holds: motions from one start meet the same ones again
 
 
@@ -134,7 +134,7 @@ class Model:
         if not isinstance(other, Model):
             return NotImplemented
         known = self._store.fingerprint is not None and self._store.fingerprint == other._store.fingerprint
-        same = known and self.diagonal == other.diagonal
+        same = known and self.place == other.place
         return self is other or (same and np.array_equal(self.parameters, other.parameters))
 
     def __hash__(self):
@@ -249,23 +249,53 @@ class Model:
                 free=near.free,
                 expected=self.free,
             )
-        chosen = [known for known in self._variants if known != DIAGONAL]
-        if len(chosen) == MOST_VARIANTS:
-            del self._variants[chosen[0]]
-        self._variants[key] = Model(near.reduction, near._store, self.parameters, self._knots, variants=self._variants)
+        self._keep(key, Model(near.reduction, near._store, self.parameters, self._knots, variants=self._variants))
         return self._variants[key]
 
-    @cached_property
+    @property
     def without_choice(self):
         """The model whose pivots are diagonal entries of definite matrices (`reduction.definite`); None without such."""
-        r, place = self.reduction, DIAGONAL
-        if self.diagonal or self.flat or not saddle.applies(r):
+        if self.diagonal or self.flat or not saddle.applies(self.reduction):
             return None
-        if place not in self._variants:
-            found, functions = definite(r), self._functions.setdefault(place, {})
-            store, numbers = self._store.part(place), (self.parameters, self._knots)
-            self._variants[place] = found and Model(found, store, *numbers, functions, self._variants)
-        return self._variants[place]
+        return self._variants[DIAGONAL] if DIAGONAL in self._variants else self._formed(DIAGONAL)
+
+    def reordered(self, t, jets):
+        """The model with the same rows, and pivots of their leading matrix chosen at an instant.
+
+        Parameters
+        ----------
+        t : float
+            [s]
+        jets : (n_z,) array
+
+        Returns
+        -------
+        Model or None
+            None if the pivots stay, or are not those of the leading matrix.
+        """
+        r = self.reduction
+        if self.diagonal or r.cascade is not None or self.equations.sparse or (self.flat and self.nq != self.n):
+            return None
+        order = r.order_at(float(t), np.asarray(jets, dtype=float), self.parameters)
+        return None if order == r.order else self._formed(order)
+
+    def _formed(self, form):
+        """The model with the same rows, and pivots by their places, or from the diagonal; None without the latter."""
+        near, r = self._store.specification[3] or (), self.reduction
+        key = repr((*near, form)) if near or form != DIAGONAL else DIAGONAL
+        if key not in self._variants:
+            reduction = definite(r) if form == DIAGONAL else replace(r, order=form)
+            store, functions = self._store.part(form), self._functions.setdefault(str(form), {})
+            made = reduction and Model(reduction, store, self.parameters, self._knots, functions, self._variants)
+            self._keep(key, made)
+        return self._variants[key]
+
+    def _keep(self, key, variant):
+        """Hold a variant, in place of the oldest one where there are too many."""
+        chosen = [known for known in self._variants if known != DIAGONAL]
+        if len(chosen) >= MOST_VARIANTS:
+            del self._variants[chosen[0]]
+        self._variants[key] = variant
 
     @property
     def diagonal(self):
@@ -274,15 +304,22 @@ class Model:
 
     @property
     def place(self):
-        """(t, jets, sizes) near which pivots were chosen by `near`; `DIAGONAL`, or None if they were by `derive`."""
-        return DIAGONAL if self.diagonal else self._store.specification[3]
+        """How pivots were chosen: (t, jets, sizes) of `near`, then their places or `DIAGONAL`; None as by `derive`."""
+        form = DIAGONAL if self.diagonal else self.reduction.order
+        near = self._store.specification[3] or ()
+        return (*near, form) if form else near or None
 
     def at(self, place):
         """The variant of a `place`; this model if that is None."""
-        if place is None or place == DIAGONAL:
-            return self.without_choice if place else self
-        t, jets, sizes = place
-        return self.near(t, [jets[name] for name in self.jet_names], sizes)
+        place = place or ()
+        near, form = place[:3] if len(place) > 1 else (), place[-1] if len(place) % 3 == 1 else None
+        model = self
+        if near:
+            t, jets, sizes = near
+            model = self.near(t, [jets[name] for name in self.jet_names], sizes)
+        if form is None:
+            return model
+        return model._formed(form if form == DIAGONAL else tuple((i, j) for i, j in form))
 
     @property
     def numbers(self):
@@ -507,6 +544,17 @@ class Model:
         return y[rows:].reshape(columns, rows, -1).swapaxes(0, 1), y[:rows]
 
     @cached_property
+    def row_pivots(self):
+        """Names of the pivots by which the rows divide, and which depend on the motion; those of L come after them."""
+        rows = {name for name, _ in self.reduction.pivots}
+        return self.once("row pivots", lambda: [name for name, _ in self.equations.pivots if name in rows])
+
+    def pivots_at(self, t, jets):
+        """Pivots (n_g,) at the jets (n_z,) of an instant t [s]."""
+        here = self.reduction.points.at(np.array([t]), jets[:, None], self.parameters)
+        return here.evaluate([pivot for _, pivot in self.equations.pivots])[0][:, 0].astype(float)
+
+    @cached_property
     def pivot_sizes(self):
         """Largest size of each pivot at the points where the pivots were chosen, (n_g,) array."""
         return self.once("pivot sizes", lambda: self.equations.pivot_sizes)
@@ -640,4 +688,5 @@ def _unpickled(mechanism, content, choices, parameters, knots):
     reduction = unpack(content, mechanism)
     store = Store(mechanism, reduction.program, *choices)
     model = Model(reduction, store, parameters, knots)
-    return Model(reduction, store.part(DIAGONAL), parameters, knots) if model.diagonal else model
+    form = DIAGONAL if model.diagonal else reduction.order
+    return Model(reduction, store.part(form), parameters, knots) if form else model

@@ -99,7 +99,10 @@ def _positive_by_blocks(matrices, m):
 
 def _positive(matrices):
     """Whether matrices (N, m, m) are symmetric and positive definite."""
-    sizes = np.sqrt(np.einsum("pii->pi", matrices))
+    diagonal = np.einsum("pii->pi", matrices)
+    if not (diagonal > 0).all():
+        return False
+    sizes = np.sqrt(diagonal)
     scaled = matrices / sizes[:, :, None] / sizes[:, None, :]
     if not np.isfinite(scaled).all() or np.abs(scaled - scaled.swapaxes(1, 2)).max(initial=0.0) > NEGATIVE:
         return False

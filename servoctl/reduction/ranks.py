@@ -241,7 +241,15 @@ def alive(entries, points):
     return np.where(share > 1.0, share, 0.0)
 
 
-def eliminate(matrix, right, numbers, diagonal=False):
+def pivot_order(matrix, numbers):
+    """Pivots ((row, column), ...) of a matrix (n, n) SX in their order, chosen by its numbers (n, n, N) at points."""
+    n = matrix.shape[0]
+    system = _System(matrix, ca.SX(n, 0), numbers, False)
+    with np.errstate(all="ignore"):
+        return tuple(system.step() for _ in range(n))
+
+
+def eliminate(matrix, right, numbers, diagonal=False, order=()):
     """Solve A X = B symbolically.
 
     Parameters
@@ -252,6 +260,8 @@ def eliminate(matrix, right, numbers, diagonal=False):
         A at N points, cleaned of rounding, where pivots are chosen.
     diagonal : bool, optional
         Whether pivots are diagonal entries, as is stable for definite matrices.
+    order : sequence of (int, int), optional
+        Row and column of each pivot; default: chosen by the numbers.
 
     Returns
     -------
@@ -267,7 +277,7 @@ def eliminate(matrix, right, numbers, diagonal=False):
     n, m = right.shape
     system = _System(matrix, right, numbers, diagonal)
     with np.errstate(all="ignore"):  # at some random points a pivot has no value
-        order = [system.step() for _ in range(n)]
+        order = [system.step(*pivot) for pivot in order or [()] * n]
     solution, rows, rhs = [None] * n, system.rows, system.rhs
     for i, j in reversed(order):
         others = [(a, solution[c]) for c, (a, _) in rows[i].items() if c != j]
@@ -319,9 +329,9 @@ class _System:
         least = THRESHOLD * max(sizes)
         return [(j, size) for j, size in zip(row, sizes, strict=True) if size >= least and size > 0.0]
 
-    def step(self):
-        """Eliminate by the pivot with the least fill-in, and return its row and column."""
-        i, j = self._pivot()
+    def step(self, *pivot):
+        """Eliminate by a pivot, by default that with the least fill-in, and return its row and column."""
+        i, j = pivot or self._pivot()
         row = self.rows[i]
         del self.open[i]
         for c in row:
