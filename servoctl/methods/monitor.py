@@ -523,8 +523,9 @@ class Monitor:
         """The model with other pivots of the leading matrix, unless the rows divide by a pivot that is weak."""
         count = len(self.model.row_pivots)
         pivots = np.abs(self.model.pivots_at(t, jets)[:count])
-        strong = pivots > HELPS * DEGRADED * (self.model.pivot_sizes if self.reference is None else self.reference)[:count]
-        return self.model.reordered(t, jets) if strong.all() else None
+        sizes = self.model.pivot_sizes if self.reference is None else self.reference
+        strong = np.all(pivots > HELPS * DEGRADED * sizes[:count])
+        return self.model.reordered(t, jets) if strong else None
 
     def failed(self, t, x, why, what, do):
         """The error of a state from which no step succeeds: singular for the reason `why`, or the method's own.

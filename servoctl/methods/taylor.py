@@ -155,7 +155,7 @@ def taylor_coefficients(equations, last):
         Arguments t, X, p, where p ends with the instant that selects the branches of paths. Outputs q_[1], ...,
         q_[last] (left out if q' = γ'), γ_[1], ..., γ_[last], pivots.
     """
-    r, q = equations.r, equations.q
+    r = equations.r
     if r.cascade is not None:
         motion = r.cascade.along(r.points, equations.top - 1, last, running=_InBlock)
         return _coefficients(equations, motion.place, motion.gamma, last, _InBlock.instant)

@@ -128,7 +128,7 @@ class Model:
         # Models that differ only in numbers share their functions.
         self._functions = {} if functions is None else functions
         self._knots_within = {}  # by time span
-        self._variants = {} if variants is None else variants  # with other pivots, by place: one set for all of them
+        self._variants = {None: self} if variants is None else variants  # with other pivots: one set for all of them
 
     def __eq__(self, other):
         if not isinstance(other, Model):
@@ -254,10 +254,10 @@ class Model:
 
     @property
     def without_choice(self):
-        """The model whose pivots are diagonal entries of definite matrices (`reduction.definite`); None without such."""
-        if self.diagonal or self.flat or not saddle.applies(self.reduction):
-            return None
-        return self._variants[DIAGONAL] if DIAGONAL in self._variants else self._formed(DIAGONAL)
+        """The model with diagonal entries of definite matrices as pivots (`reduction.definite`); None without such."""
+        first = self._variants[None]
+        applies = not (self.diagonal or first.flat) and saddle.applies(first.reduction)
+        return first._formed(DIAGONAL) if applies else None
 
     def reordered(self, t, jets):
         """The model with the same rows, and pivots of their leading matrix chosen at an instant.
@@ -281,8 +281,7 @@ class Model:
 
     def _formed(self, form):
         """The model with the same rows, and pivots by their places, or from the diagonal; None without the latter."""
-        near, r = self._store.specification[3] or (), self.reduction
-        key = repr((*near, form)) if near or form != DIAGONAL else DIAGONAL
+        key, r = repr((*(self._store.specification[3] or ()), form)), self.reduction
         if key not in self._variants:
             reduction = definite(r) if form == DIAGONAL else replace(r, order=form)
             store, functions = self._store.part(form), self._functions.setdefault(str(form), {})
@@ -292,9 +291,8 @@ class Model:
 
     def _keep(self, key, variant):
         """Hold a variant, in place of the oldest one where there are too many."""
-        chosen = [known for known in self._variants if known != DIAGONAL]
-        if len(chosen) >= MOST_VARIANTS:
-            del self._variants[chosen[0]]
+        if len(self._variants) > MOST_VARIANTS:
+            del self._variants[next(known for known in self._variants if known is not None)]
         self._variants[key] = variant
 
     @property
@@ -550,7 +548,14 @@ class Model:
         return self.once("row pivots", lambda: [name for name, _ in self.equations.pivots if name in rows])
 
     def pivots_at(self, t, jets):
-        """Pivots (n_g,) at the jets (n_z,) of an instant t [s]."""
+        """Pivots at an instant, (n_g,) array.
+
+        Parameters
+        ----------
+        t : float
+            [s]
+        jets : (n_z,) array
+        """
         here = self.reduction.points.at(np.array([t]), jets[:, None], self.parameters)
         return here.evaluate([pivot for _, pivot in self.equations.pivots])[0][:, 0].astype(float)
 

@@ -75,10 +75,10 @@ def definite(reduction):
     order = (*range(k, len(constraints)), *range(k))
     G, mass = ca.vertcat(*(row.gradient(q) for row in constraints)), r.mechanism.mass
     M, left, right = (np.moveaxis(clean(*r.points.matrix(m)), 2, 0).astype(float) for m in (mass, G, B))
-    if not _positive(M):
+    if not _definite(M):
         return None
     felt = left @ np.linalg.solve(M, right)
-    if not _positive_by_blocks(felt[:, order][:, :, order], len(order) - k):
+    if not _definite_by_blocks(felt[:, order][:, :, order], len(order) - k):
         return None
     sizes = tuple(np.moveaxis(m, 0, 2) for m in (M, felt))
     kinds = {"B": B, "actuation": r.realisation.actuation, "dependent": (), "independent": tuple(range(q.n))}
@@ -87,17 +87,17 @@ def definite(reduction):
     return replace(r, realisation=realised, pivots=pivots)
 
 
-def _positive_by_blocks(matrices, m):
+def _definite_by_blocks(matrices, m):
     """Whether the first m rows and columns of matrices (N, b, b), and what elimination by them leaves, are definite."""
     first, rest = matrices[:, :m, :m], matrices[:, m:, m:]
     if m:
-        if not _positive(first):
+        if not _definite(first):
             return False
         rest = rest - matrices[:, m:, :m] @ np.linalg.solve(first, matrices[:, :m, m:])
-    return _positive(rest)
+    return _definite(rest)
 
 
-def _positive(matrices):
+def _definite(matrices):
     """Whether matrices (N, m, m) are symmetric and positive definite."""
     diagonal = np.einsum("pii->pi", matrices)
     if not (diagonal > 0).all():
