@@ -10,8 +10,8 @@ from numpy.typing import ArrayLike
 
 from servoctl.checks import as_numbers, as_span
 from servoctl.errors import InconsistentStart, ServoError, SpecificationError
-from servoctl.growth import FEWEST, STEP_ERROR, UNSTABLE, growth_bound, internal_dynamics
-from servoctl.methods.accuracy import ATOL, absolute_tolerances, accurate, large_tolerances
+from servoctl.growth import FEWEST, STEP_ERROR, UNSTABLE, growth_bound, internal_dynamics, quiet_by_series
+from servoctl.methods.accuracy import ATOL, absolute_tolerances, accurate, large_tolerances, method_for
 from servoctl.methods.algebraic import algebraic
 from servoctl.methods.bounded import bounded
 from servoctl.methods.choice import (
@@ -41,7 +41,7 @@ from servoctl.methods.runge_kutta import ORDERS, RungeKuttaSteps
 from servoctl.methods.scipy_methods import ScipySteps
 from servoctl.methods.stability import run_checked, warn_drifted, warn_many_steps, warn_unstable
 from servoctl.methods.sundials import SundialsSteps
-from servoctl.methods.taylor import TaylorSteps
+from servoctl.methods.taylor import TaylorSteps, last_index
 from servoctl.model.model import Model
 from servoctl.model.start import State
 from servoctl.model.switching import switching
@@ -150,7 +150,16 @@ def simulate(
             error.run = _sampled(replace(error.run, verdict=partial(_verdict, tolerance=tolerance)), times)
         raise
     dense = own(DEFAULT_SAMPLES)
-    return _sampled(judged(run, tolerance, None if dense is None else partial(motion, dense)), times)
+    again = None if dense is None else partial(motion, dense)
+    by_series = _series_of(run, method if accuracy is None else method_for(model, accuracy, getattr(method, "jets", None)))
+    return _sampled(judged(run, tolerance, again, by_series), times)
+
+
+def _series_of(run, method):
+    """Highest index of the coefficients with which a run was computed; None if it is none of the Taylor method."""
+    if run.method != str(Taylor()):
+        return None
+    return last_index(run.model, as_method(method or default_method(run.model)))
 
 
 def _integrates(method):
@@ -237,7 +246,7 @@ def _has_internal_dynamics(model):
     return bool(model.reduction.program.residuals) and not model.flat
 
 
-def judged(run, tolerance=STEP_ERROR, again=None):
+def judged(run, tolerance=STEP_ERROR, again=None, by_series=None):
     """A run that gives the verdict on its internal dynamics when it is read; warns at once if they are unstable.
 
     Most motions need no propagators to know that there is nothing to warn of. Who interrupts a motion does not wait.
@@ -250,6 +259,8 @@ def judged(run, tolerance=STEP_ERROR, again=None):
         Relative error of a step of its method.
     again : callable, optional
         Returns the same motion with more samples, where the run has few of them.
+    by_series : int, optional
+        Highest index of the coefficients of a motion by the Taylor method.
 
     Returns
     -------
@@ -258,6 +269,8 @@ def judged(run, tolerance=STEP_ERROR, again=None):
     known = replace(run, verdict=partial(_verdict, tolerance=tolerance))
     try:
         if not run.success or growth_bound(run.model, run) <= UNSTABLE:
+            return known
+        if by_series is not None and quiet_by_series(run.model, run, by_series):
             return known
         run = run if again is None else again()
         internal = internal_dynamics(run.model, run) if run.success else None
@@ -354,8 +367,8 @@ def _stepping(model, method, drift, span, bar, atol):
     """The integration by a method other than `Algebraic`."""
     (t0, t1), least = span, ATOL if atol is None else atol.min()
     match method:
-        case Taylor(order, jets, rtol, given):
-            return TaylorSteps(model, drift, rtol, given or least, order, jets or 0, bar)
+        case Taylor():
+            return TaylorSteps(model, drift, method, method.atol or least, bar)
         case RadauIIA(order, step, rtol, given):
             step = None if step is None else _step_length(step, t0, t1)
             return RadauSteps(model, drift, rtol, given or least, order, step, bar)

@@ -208,6 +208,13 @@ def order_for(rtol):
     return int(np.clip(np.ceil(5.0 - 0.5 * np.log(rtol)), LOWEST, HIGHEST))
 
 
+def last_index(model, method):
+    """The highest index of the coefficients that a Taylor method needs for its order and for the jets in the samples."""
+    top = model.reduction.top
+    order = order_for(method.rtol) if method.order is None else method.order
+    return max(order + top - 1, max(method.jets or 0, top) + 1)
+
+
 class TaylorSteps(Stepping):
     """One integration by the Taylor method.
 
@@ -215,11 +222,9 @@ class TaylorSteps(Stepping):
     ----------
     model : Model
     drift : None or Project
-    rtol, atol : float
-    order : int or None
-        None chooses it by `order_for`.
-    jets : int
-        Highest level of the jets in the samples.
+    method : Taylor
+    atol : float
+        Its absolute tolerance.
     progress : callable
     """
 
@@ -227,17 +232,16 @@ class TaylorSteps(Stepping):
     rank_lost = "the radius of convergence shrinks to nothing"
     advice = "Check whether the motion escapes or meets a point where it is not smooth."
 
-    def __init__(self, model, drift, rtol, atol, order, jets, progress):
-        self.tolerances = rtol, atol
-        self.order = order_for(rtol) if order is None else order
+    def __init__(self, model, drift, method, atol, progress):
+        self.tolerances = method.rtol, atol
         self.every = drift.every if isinstance(drift, Project) else 0
         self.projects = self.every > 0
-        self.jets = max(jets, model.reduction.top)
+        self.jets, self.settings = max(method.jets or 0, model.reduction.top), method
         super().__init__(model, "Taylor", drift, progress)
 
     def _use(self, model):
         self.model, self.n_x = model, len(model.state_names)
-        last = max(self.order + model.reduction.top - 1, self.jets + 1)
+        last = last_index(model, self.settings)
         self.f, self.rates = series_loop(model, last), model.function("ode")
         self.nq, self.n, self.top = model.nq, model.n, model.reduction.top
         plain = model.reduction.mechanism.q.plain
