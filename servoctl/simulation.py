@@ -41,7 +41,7 @@ from servoctl.methods.runge_kutta import ORDERS, RungeKuttaSteps
 from servoctl.methods.scipy_methods import ScipySteps
 from servoctl.methods.stability import run_checked, warn_drifted, warn_many_steps, warn_unstable
 from servoctl.methods.sundials import SundialsSteps
-from servoctl.methods.taylor import TaylorSteps, last_index
+from servoctl.methods.taylor import TaylorSteps, Unsuited, last_index
 from servoctl.model.model import Model
 from servoctl.model.start import State
 from servoctl.model.switching import switching
@@ -85,7 +85,8 @@ def simulate(
         A method with its settings, such as `sv.Taylor(jets=3)` or `sv.RungeKutta(4, step=1e-3)`, or the short form of
         a method with its defaults: "algebraic", "Taylor", "RadauIIA", "RK1" to "RK8", scipy's names, "CVODES" or
         "IDAS". Default: "algebraic" (a Newton solve at each instant) if the program determines the motion completely,
-        Σ o_a = 0, else "DOP853". "Taylor" is the most accurate; "RadauIIA" is for stiff motions.
+        Σ o_a = 0, else "Taylor", or "RadauIIA" where stability limits its steps; "DOP853" with the treatments of drift
+        that series exclude, and for equations so large that making a series takes seconds.
     drift : None, "project", "minimal", float, `Project(...)`, `Poles(...)` or `MinimalCoordinates()`, optional
         Treatment of constraint drift. A number is the time constant of the error dynamics [s]. "minimal" integrates
         as many values as the program leaves free and solves for the others: exact, in Python, at many times the cost.
@@ -132,13 +133,10 @@ def simulate(
     events = as_events(events)
 
     def motion(times):
-        def attempt(method, drift, t_span=span, times=times):
-            of_span = events if t_span is span else {}
-            return simulated(model, start, t_span, method, drift=drift, t_eval=times, events=of_span, progress=progress)
+        def attempt(method, drift):
+            return simulated(model, start, span, method, drift=drift, t_eval=times, events=events, progress=progress)
 
-        if accuracy is None:
-            return attempt(method, drift)
-        return accurate(attempt, model, accuracy, (span[0], as_state(model, start, span[0]), span[1]), method, drift)
+        return attempt(method, drift) if accuracy is None else accurate(attempt, model, accuracy, method, drift)
 
     if not _has_internal_dynamics(model) or not _integrates(method):
         return motion(times)
@@ -159,7 +157,7 @@ def _series_of(run, method):
     """Highest index of the coefficients with which a run was computed; None if it is none of the Taylor method."""
     if run.method != str(Taylor()):
         return None
-    return last_index(run.model, as_method(method or default_method(run.model)))
+    return last_index(run.model, Taylor() if method is None else as_method(method))
 
 
 def _integrates(method):
@@ -195,8 +193,8 @@ def _sampled(run, times):
 def simulated(model, start, t_span, method=None, *, drift=None, t_eval=None, events=None, progress=None):
     """The run of `simulate`, without a verdict on its internal dynamics."""
     span = t0, t1 = as_span(t_span)
-    method = default_method(model) if method is None else as_method(method)
     drift = as_drift(drift)
+    method = default_method(model, drift) if method is None else as_method(method)
     require_combination(model, method, drift)
     if isinstance(drift, Poles):
         _require_decay(model, drift, t0, t1)
@@ -206,9 +204,13 @@ def simulated(model, start, t_span, method=None, *, drift=None, t_eval=None, eve
     x0 = (as_state if leads_back else consistent_state)(model, start, t0)
     knots = model.require_smooth((min(span), max(span)))
     times = None if isinstance(method, Bounded) and t_eval is None else _sample_times(t0, t1, t_eval, knots, method)
-    bar = Progress(span, progress)
+    bar, problem = Progress(span, progress), (t0, x0, t1, times, knots, events)
     try:
-        model, motion = _derived_along(model, method, drift, (t0, x0, t1, times, knots, events), bar)
+        model, motion = _derived_along(model, method, drift, problem, bar)
+    except Unsuited as unsuited:
+        method = unsuited.method
+        model, motion = _derived_along(model, method, drift, problem, bar)
+        motion.note = f"by {method}, since {unsuited}"
     finally:
         bar.close()
     with without_interruption() as pressed:  # a motion that is computed is kept

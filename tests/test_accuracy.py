@@ -138,7 +138,7 @@ def test_where_rounding_hides_the_motion_the_accuracy_is_refused(gallery_model):
         return replace(run, jets=run.jets * (1.0 + 1e-6 * random.standard_normal(run.jets.shape)))
 
     with refused(LimitExceeded, accuracy=1e-9) as error:
-        rule.accurate(spoilt, model, 1e-9, (0.0, start.values, 0.5))
+        rule.accurate(spoilt, model, 1e-9)
     assert asked == sorted(asked, reverse=True) and asked[-1] == rule.FINEST and len(set(asked)) == len(asked)
     assert 1e-8 < error.value.details["reached"] < 1e-5 and error.value.run is not None
 

@@ -25,6 +25,8 @@ from servoctl.reduction.ranks import clean, eliminate
 LOWEST, HIGHEST = 4, 24  # orders: below, steps are too short; above, compiling grows faster than steps
 INSIDE = np.array([0.07, 0.19, 0.34, 0.53, 0.71, 0.86, 0.98])  # parts of a step at which its series is checked
 FAR_OFF = 30.0  # times the tolerance, which the equations may add to a series over its step
+STIFF_STEPS = 400  # of this length in the span, from which compiling an implicit method pays
+LIMITED = 1.2  # times the longest stable steps: more of them are taken where accuracy limits them, not stability
 SMALLEST = 1e-12  # of a piece: shorter steps are not halved, so that a jump of the equations is passed
 
 
@@ -215,6 +217,30 @@ def last_index(model, method):
     return max(order + top - 1, max(method.jets or 0, top) + 1)
 
 
+class Unsuited(Exception):
+    """Series do not suit a motion, for which their settings name another method."""
+
+    def __init__(self, why, method):
+        super().__init__(why)
+        self.method = method
+
+
+def limited_by_stability(model, order, t, x, span):
+    """Whether stability limits the steps of a series with the ends t (S + 1,) [s], the last one at the state x (n_x,).
+
+    A series of order p damps a mode of rate λ on the negative real axis for steps up to about p/(e |λ|).
+    """
+    step = (t[-1] - t[0]) / (len(t) - 1)
+    if abs(span) < STIFF_STEPS * abs(step):
+        return False
+    jacobian = model.function("ode_jacobian")(t[-1], x, model.parameters).reshape(len(x), len(x))
+    if not np.isfinite(jacobian).all():
+        return False
+    decay = np.linalg.eigvals(jacobian * np.sign(step))
+    fastest = -decay.real[np.abs(decay.imag) < -decay.real].min(initial=0.0)
+    return bool(LIMITED * abs(step) * fastest * np.e > order)
+
+
 class TaylorSteps(Stepping):
     """One integration by the Taylor method.
 
@@ -241,7 +267,7 @@ class TaylorSteps(Stepping):
 
     def _use(self, model):
         self.model, self.n_x = model, len(model.state_names)
-        last = last_index(model, self.settings)
+        self.last = last = last_index(model, self.settings)
         self.f, self.rates = series_loop(model, last), model.function("ode")
         self.nq, self.n, self.top = model.nq, model.n, model.reduction.top
         plain = model.reduction.mechanism.q.plain
@@ -286,6 +312,8 @@ class TaylorSteps(Stepping):
             go_on = isinstance(outcome, Repivot)
             a, x = (outcome.t, outcome.x) if go_on else (t[steps], states[:, steps].copy())
             self.progress(a)
+            if steps == self.most:
+                self._leave_if_stiff(t, x)
             if not fine:
                 self._follow(outcome)
             elif failed:
@@ -294,6 +322,19 @@ class TaylorSteps(Stepping):
             row = np.concatenate([[a], x, self._outputs(a, x)])
             self._sample(_Log(self.f, self.n_x, np.array([row, row])), times, a)
         return a, x
+
+    def _leave_if_stiff(self, t, x):
+        """Leave the motion to an implicit method if stability limits steps with the ends t (S + 1,) [s]."""
+        method, order = getattr(self.settings, "for_stiff", None), self.last - self.top + 1
+        if method is not None and limited_by_stability(self.model, order, t, x, self.watch.span):
+            why = f"stability, not accuracy, limits the steps of {self.method} to {abs(t[-1] - t[-2]):.2g} s"
+            raise Unsuited(why, method)
+
+    def _go_on(self, variant, t, x):
+        method = getattr(self.settings, "for_pivots", None)
+        if method is not None:
+            raise Unsuited(f"pivots change at t = {t:.4g} s, and {self.method} would need other series", method)
+        super()._go_on(variant, t, x)
 
     def _believed(self, log, span):
         """The number of steps whose series meet the equations, at instants within them.
