@@ -274,7 +274,7 @@ def growth_bound(model, run):
 def quiet_by_series(model, run, last):
     """Whether propagators by the series of a motion say that its internal dynamics are not unstable.
 
-    They are those of `internal_dynamics` without a Jacobian, and without smaller and smaller steps: in a part of its time.
+    They are those of `internal_dynamics`, without a Jacobian and without smaller and smaller steps.
 
     Parameters
     ----------
@@ -654,7 +654,8 @@ def _growth(corners, propagators, scale=None):
     logs, most = np.full((2, len(ends), len(ends)), -np.inf)
     columns, rows = (scaled**2).sum(axis=1), (scaled**2).sum(axis=2)
     least = np.maximum(columns.max(axis=1), rows.max(axis=1))
-    logs[later], most[later] = (log + np.log(np.maximum(square, TINY**2)) / 2 for square in (least, columns.sum(axis=1)))
+    for bound, square in ((logs, least), (most, columns.sum(axis=1))):
+        bound[later] = log + np.log(np.maximum(square, TINY**2)) / 2
     matter = _may_be_largest(corners.t[ends], logs, most)[later]
     norms = np.linalg.eigvalsh(scaled[matter].swapaxes(1, 2) @ scaled[matter])[:, -1]
     logs[s[matter], t[matter]] = log[matter] + np.log(np.maximum(norms, TINY**2)) / 2

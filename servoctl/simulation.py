@@ -149,8 +149,8 @@ def simulate(
         raise
     dense = own(DEFAULT_SAMPLES)
     again = None if dense is None else partial(motion, dense)
-    by_series = _series_of(run, method if accuracy is None else method_for(model, accuracy, getattr(method, "jets", None)))
-    return _sampled(judged(run, tolerance, again, by_series), times)
+    first = method if accuracy is None else method_for(model, accuracy, getattr(method, "jets", None))
+    return _sampled(judged(run, tolerance, again, _series_of(run, first)), times)
 
 
 def _series_of(run, method):

@@ -8,6 +8,7 @@ import pytest
 
 import servoctl as sv
 from servoctl.gallery import gallery
+from servoctl.methods import choice
 from servoctl.methods.choice import METHODS, as_method
 
 TREATMENTS = (None, sv.Project(), sv.Poles(0.1), sv.MinimalCoordinates())
@@ -113,3 +114,14 @@ def test_jets_beside_an_accuracy_where_nothing_is_integrated(gallery_model):
     plain = sv.simulate(model, model.start(), (0.0, 0.5), t_eval=[0.5])
     assert run.method == "Taylor" and np.isfinite(run["d4theta"]).all()
     assert run.jets[: len(plain.jets)] == pytest.approx(plain.jets, rel=1e-9, abs=1e-9)
+
+
+def test_the_default_is_a_series_where_nothing_speaks_against_it(scene, gallery_model, monkeypatch):
+    model, start, span = scene
+    assert sv.simulate(*scene).method == sv.simulate(*scene, drift="project").method == "Taylor"
+    for drift in (0.1, "minimal"):
+        assert sv.simulate(*scene, drift=drift).method == "DOP853"
+    flat = gallery_model("overhead-crane")
+    assert sv.simulate(flat, flat.start(), (0.0, 0.1)).method == "algebraic"
+    monkeypatch.setattr(choice, "LARGE_FOR_SERIES", model.function("ode").operations - 1)
+    assert sv.simulate(*scene).method == "DOP853"

@@ -1,7 +1,7 @@
 """How deviations from a motion move, by the series of the Taylor method at states beside it.
 
-A series is exact for every state, not for one motion alone: the propagator over a step is the derivative of its series by
-the state at its start, here by central differences of all columns at once. No Jacobian is formed.
+A series is exact for every state, not for one motion alone: the propagator over a step is the derivative of its series
+by the state at its start, here by central differences of all columns at once. No Jacobian is formed.
 """
 
 from dataclasses import dataclass
@@ -16,11 +16,11 @@ from servoctl.methods.taylor import series_loop
 RTOL = 1e-6  # of the steps along which deviations are moved, and of the least size of a level of the state
 BESIDE = 1e-6  # of the size of a state: distance of the states from which deviations are taken
 LEFT_OUT = 1e-3  # of a propagator over a step: its last terms, which bound those that are left out
-MOST_STEPS = 2_000  # of a motion: more of them take longer than propagators by the linearisation
+MOST_ALONG = 2_000  # of a motion: more of them take longer than propagators by the linearisation
 
 
 @dataclass(frozen=True)
-class Flow:
+class Propagation:
     """Instants t (K + 1,) of a motion, states (n_x, K + 1) there, and the series that lead from each to the next.
 
     `parameters` (n_p, K) are those of the series, with the instants that select the branches of paths.
@@ -58,15 +58,18 @@ class Flow:
             return ((both[:, :, 0] - both[:, :, 1]) / (2 * BESIDE)).transpose(1, 0, 2)
 
         result = difference(ends) / size[:, None]
-        last = np.abs(difference(self._last_terms(y, h)) / size[:, None]).max(axis=(1, 2))
-        return result if np.all(last <= LEFT_OUT * np.abs(result).max(axis=(1, 2))) else None
+        largest = LEFT_OUT * np.abs(result).max(axis=(1, 2))
+        for k in (sizes["last"], sizes["last"] - 1):  # one of them vanishes where a motion is even or odd
+            if np.any(np.abs(difference(self._term(k, y, h)) / size[:, None]).max(axis=(1, 2)) > largest):
+                return None
+        return result
 
-    def _last_terms(self, y, h):
-        """The last term of each entry of the states (n_x, M), from coefficients (n_y, M) and times h (M,)."""
+    def _term(self, k, y, h):
+        """The terms of index k of the states (n_x, M), from coefficients (n_y, M) and times h (M,)."""
         nq, n, top, last, plain = (self.f.sizes[name] for name in ("nq", "n", "top", "last", "plain"))
-        rates = y[(0 if plain else nq * last) :][n * (last - 1) : n * last]
-        of_q = rates if plain else y[nq * (last - 1) : nq * last]
-        return np.concatenate([of_q * h**last, *(perm(last, j) * rates * h ** (last - j) for j in range(1, top))])
+        rates = y[(0 if plain else nq * last) :][n * (k - 1) : n * k]
+        of_q = rates if plain else y[nq * (k - 1) : nq * k]
+        return np.concatenate([of_q * h**k, *(perm(k, j) * rates * h ** (k - j) for j in range(1, top))])
 
 
 def flow(model, last, t, x, knots, size):
@@ -89,14 +92,14 @@ def flow(model, last, t, x, knots, size):
 
     Returns
     -------
-    Flow or None
+    Propagation or None
         None where the series do not reach the end.
     """
     f, n_x, parts = series_loop(model, last), len(x), []
     forward = np.sign(t[-1] - t[0])
     for a, b in pairwise(breakpoints((t[0], t[-1]), knots)):
         p = np.append(model.parameters, (a + b) / 2)
-        log = f.taylor(a, x, b, p, RTOL, RTOL * size.min(), MOST_STEPS)
+        log = f.taylor(a, x, b, p, RTOL, RTOL * size.min(), MOST_ALONG)
         if log[-1, 0] != b:
             return None
         ends, x = log[:, 0], log[-1, 1 : 1 + n_x]
@@ -104,7 +107,7 @@ def flow(model, last, t, x, knots, size):
         at *= forward
         k = np.searchsorted(forward * ends, forward * at, "right") - 1
         parts.append((at, f.jets(log, k, at, f.sizes["top"] - 1), np.tile(p[:, None], len(at))))
-        if sum(len(part[0]) for part in parts) > MOST_STEPS:
+        if sum(len(part[0]) for part in parts) > MOST_ALONG:
             return None
     instants, states, parameters = (np.concatenate(part, axis=-1) for part in zip(*parts, strict=True))
-    return Flow(f, np.append(instants, t[-1]), np.column_stack([states, x]), parameters)
+    return Propagation(f, np.append(instants, t[-1]), np.column_stack([states, x]), parameters)

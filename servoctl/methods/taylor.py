@@ -211,7 +211,7 @@ def order_for(rtol):
 
 
 def last_index(model, method):
-    """The highest index of the coefficients that a Taylor method needs for its order and for the jets in the samples."""
+    """The highest index of the coefficients that a Taylor method needs for its order and for its jets."""
     top = model.reduction.top
     order = order_for(method.rtol) if method.order is None else method.order
     return max(order + top - 1, max(method.jets or 0, top) + 1)
@@ -262,7 +262,7 @@ class TaylorSteps(Stepping):
         self.tolerances = method.rtol, atol
         self.every = drift.every if isinstance(drift, Project) else 0
         self.projects = self.every > 0
-        self.jets, self.settings = max(method.jets or 0, model.reduction.top), method
+        self.settings = method
         super().__init__(model, "Taylor", drift, progress)
 
     def _use(self, model):
@@ -395,8 +395,11 @@ class TaylorSteps(Stepping):
         due = direction * pending <= direction * end
         times = pending[due]
         if len(times):
-            parts = log.jets(steps_of(t, times), times, self.jets)
-            self.motion.add(self.model, times, parts[: self.n_x], parts[self.n_x :])
+            parts = log.jets(steps_of(t, times), times, max(self.settings.jets or 0, self.top - 1))
+            x, top = parts[: self.n_x], parts[self.n_x :]
+            if not len(top):  # more accurate than as a derivative of the series
+                top = self.rates.grid(times, x, self.model.parameters)[self.n_x - self.n : self.n_x]
+            self.motion.add(self.model, times, x, top)
         return pending[~due]
 
 
