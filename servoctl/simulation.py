@@ -142,7 +142,8 @@ def simulate(
         return motion(times)
     tolerance, own = getattr(method, "rtol", STEP_ERROR), partial(_with_own, method, span, times)
     try:
-        run = motion(own(FEWEST + 1))
+        enough = own(FEWEST + 1)
+        run = motion(times if enough is None else enough)
     except ServoError as error:
         if error.run is not None:
             error.run = _sampled(replace(error.run, verdict=partial(_verdict, tolerance=tolerance)), times)
@@ -150,7 +151,7 @@ def simulate(
     dense = own(DEFAULT_SAMPLES)
     again = None if dense is None else partial(motion, dense)
     first = method if accuracy is None else method_for(model, accuracy, getattr(method, "jets", None))
-    return _sampled(judged(run, tolerance, again, _series_of(run, first)), times)
+    return _sampled(judged(run, tolerance, again, _series_of(run, first)), None if dense is None else times)
 
 
 def _series_of(run, method):
@@ -166,9 +167,12 @@ def _integrates(method):
 
 
 def _with_own(method, span, times, count):
-    """Times of samples and `count` more along the span; None where the samples are all steps or the default."""
+    """Times of samples and `count` more along the span; None where the samples are all steps, the default or as dense."""
     fixed_steps = method is not None and isinstance(as_method(method), RungeKutta)
     if times is None or fixed_steps:
+        return None
+    gaps = np.abs(np.diff(times, prepend=span[0], append=span[1]))
+    if gaps[0] == gaps[-1] == 0.0 and (count - 1) * gaps.max() <= abs(span[1] - span[0]) * (1 + SAME_TIME):
         return None
     return np.union1d(times, np.linspace(*span, count))[:: 1 if span[1] > span[0] else -1]
 

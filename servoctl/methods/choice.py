@@ -458,7 +458,7 @@ def as_method(value, **settings):
                 do=f"Leave {name} out, or choose a method that takes it: {users}." if users else f"Leave {name} out.",
                 **{name: setting},
             )
-    return replace(method, **settings)
+    return replace(method, **settings) if settings else method
 
 
 def default_method(model, drift=None):
