@@ -167,7 +167,7 @@ def _integrates(method):
 
 
 def _with_own(method, span, times, count):
-    """Times of samples and `count` more along the span; None where the samples are all steps, the default or as dense."""
+    """Times of samples and `count` more along the span; None for all steps, the default, or samples as dense."""
     fixed_steps = method is not None and isinstance(as_method(method), RungeKutta)
     if times is None or fixed_steps:
         return None

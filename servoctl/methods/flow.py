@@ -14,7 +14,7 @@ from servoctl.methods.motion import breakpoints
 from servoctl.methods.taylor import series_loop
 
 RTOL = 1e-6  # of the steps along which deviations are moved, and of the least size of a level of the state
-BESIDE = 1e-6  # of the size of a state: distance of the states from which deviations are taken
+NEARBY = 1e-6  # of the size of a state: distance of the states from which deviations are taken
 LEFT_OUT = 1e-3  # of a propagator over a step: its last terms, which bound those that are left out
 MOST_ALONG = 2_000  # of a motion: more of them take longer than propagators by the linearisation
 
@@ -46,7 +46,7 @@ class Propagation:
             None where the series are too short.
         """
         (K, n_x, count), sizes = columns.shape, self.f.sizes
-        beside = BESIDE * (columns * size[:, None]).transpose(1, 0, 2)
+        beside = NEARBY * (columns * size[:, None]).transpose(1, 0, 2)
         x = (self.x[:, :-1, None, None] + np.stack([beside, -beside], axis=2)).reshape(n_x, -1)
         t, h, p = (np.repeat(part, 2 * count, axis=-1) for part in (self.t[:-1], np.diff(self.t), self.parameters))
         y = self.f.grid(t, x, p)
@@ -55,7 +55,7 @@ class Propagation:
 
         def difference(values):
             both = values.reshape(len(values), K, 2, count)
-            return ((both[:, :, 0] - both[:, :, 1]) / (2 * BESIDE)).transpose(1, 0, 2)
+            return ((both[:, :, 0] - both[:, :, 1]) / (2 * NEARBY)).transpose(1, 0, 2)
 
         result = difference(ends) / size[:, None]
         largest = LEFT_OUT * np.abs(result).max(axis=(1, 2))
