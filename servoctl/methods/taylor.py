@@ -25,6 +25,8 @@ from servoctl.reduction.cascade import Running
 LOWEST, HIGHEST = 4, 24  # orders: below, steps are too short; above, compiling grows faster than steps
 INSIDE = np.array([0.07, 0.19, 0.34, 0.53, 0.71, 0.86, 0.98])  # parts of a step at which its series is checked
 FAR_OFF = 30.0  # times the tolerance, which the equations may add to a series over its step
+STIFF_STEPS = 400  # of this length in the span, from which compiling an implicit method pays
+LIMITED = 1.2  # times the longest stable steps: more of them are taken where accuracy limits them, not stability
 SMALLEST = 1e-12  # of a piece: shorter steps are not halved, so that a jump of the equations is passed
 
 
@@ -252,6 +254,37 @@ def order_for(rtol):
     return int(np.clip(np.ceil(5.0 - 0.5 * np.log(rtol)), LOWEST, HIGHEST))
 
 
+def last_index(model, method):
+    """The highest index of the coefficients that a Taylor method needs for its order and for its jets."""
+    top = model.reduction.top
+    order = order_for(method.rtol) if method.order is None else method.order
+    return max(order + top - 1, max(method.jets or 0, top) + 1)
+
+
+class Unsuited(Exception):
+    """Series do not suit a motion, for which their settings name another method."""
+
+    def __init__(self, why, method):
+        super().__init__(why)
+        self.method = method
+
+
+def limited_by_stability(model, order, t, x, span):
+    """Whether stability limits the steps of a series with the ends t (S + 1,) [s], the last one at the state x (n_x,).
+
+    A series of order p damps a mode of rate λ on the negative real axis for steps up to about p/(e |λ|).
+    """
+    step = (t[-1] - t[0]) / (len(t) - 1)
+    if abs(span) < STIFF_STEPS * abs(step):
+        return False
+    jacobian = model.function("ode_jacobian")(t[-1], x, model.parameters).reshape(len(x), len(x))
+    if not np.isfinite(jacobian).all():
+        return False
+    decay = np.linalg.eigvals(jacobian * np.sign(step))
+    fastest = -decay.real[np.abs(decay.imag) < -decay.real].min(initial=0.0)
+    return bool(LIMITED * abs(step) * fastest * np.e > order)
+
+
 class TaylorSteps(Stepping):
     """One integration by the Taylor method.
 
@@ -259,11 +292,9 @@ class TaylorSteps(Stepping):
     ----------
     model : Model
     drift : None or Project
-    rtol, atol : float
-    order : int or None
-        None chooses it by `order_for`.
-    jets : int
-        Highest level of the jets in the samples.
+    method : Taylor
+    atol : float
+        Its absolute tolerance.
     progress : callable
     """
 
@@ -271,17 +302,16 @@ class TaylorSteps(Stepping):
     rank_lost = "the radius of convergence shrinks to nothing"
     advice = "Check whether the motion escapes or meets a point where it is not smooth."
 
-    def __init__(self, model, drift, rtol, atol, order, jets, progress):
-        self.tolerances = rtol, atol
-        self.order = order_for(rtol) if order is None else order
+    def __init__(self, model, drift, method, atol, progress):
+        self.tolerances = method.rtol, atol
         self.every = drift.every if isinstance(drift, Project) else 0
         self.projects = self.every > 0
-        self.jets = max(jets, model.reduction.top)
+        self.settings = method
         super().__init__(model, "Taylor", drift, progress)
 
     def _use(self, model):
         self.model, self.n_x = model, len(model.state_names)
-        last = max(self.order + model.reduction.top - 1, self.jets + 1)
+        self.last = last = last_index(model, self.settings)
         self.f, self.rates = series_loop(model, last), model.function("ode")
         self.nq, self.n, self.top = model.nq, model.n, model.reduction.top
         plain = model.reduction.mechanism.q.plain
@@ -326,6 +356,8 @@ class TaylorSteps(Stepping):
             go_on = isinstance(outcome, Repivot)
             a, x = (outcome.t, outcome.x) if go_on else (t[steps], states[:, steps].copy())
             self.progress(a)
+            if steps == self.most:
+                self._leave_if_stiff(t, x)
             if not fine:
                 self._follow(outcome)
             elif failed:
@@ -334,6 +366,19 @@ class TaylorSteps(Stepping):
             row = np.concatenate([[a], x, self._outputs(a, x)])
             self._sample(_Log(self.f, self.n_x, np.array([row, row])), times, a)
         return a, x
+
+    def _leave_if_stiff(self, t, x):
+        """Leave the motion to an implicit method if stability limits steps with the ends t (S + 1,) [s]."""
+        method, order = getattr(self.settings, "for_stiff", None), self.last - self.top + 1
+        if method is not None and limited_by_stability(self.model, order, t, x, self.watch.span):
+            why = f"stability, not accuracy, limits the steps of {self.method} to {abs(t[-1] - t[-2]):.2g} s"
+            raise Unsuited(why, method)
+
+    def _go_on(self, variant, t, x):
+        method = getattr(self.settings, "for_pivots", None)
+        if method is not None:
+            raise Unsuited(f"pivots change at t = {t:.4g} s, and {self.method} would need other series", method)
+        super()._go_on(variant, t, x)
 
     def _believed(self, log, span):
         """The number of steps whose series meet the equations, at instants within them.
@@ -394,8 +439,11 @@ class TaylorSteps(Stepping):
         due = direction * pending <= direction * end
         times = pending[due]
         if len(times):
-            parts = log.jets(steps_of(t, times), times, self.jets)
-            self.motion.add(self.model, times, parts[: self.n_x], parts[self.n_x :])
+            parts = log.jets(steps_of(t, times), times, max(self.settings.jets or 0, self.top - 1))
+            x, top = parts[: self.n_x], parts[self.n_x :]
+            if not len(top):  # more accurate than as a derivative of the series
+                top = self.rates.grid(times, x, self.model.parameters)[self.n_x - self.n : self.n_x]
+            self.motion.add(self.model, times, x, top)
         return pending[~due]
 
 
