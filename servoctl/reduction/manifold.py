@@ -22,6 +22,7 @@ LEVEL_SOLVED = 1e-17  # relative step below which a level is solved
 ON_MANIFOLD = 1e-13  # largest scaled residual of a point: far below ENTRY, so that zeros show
 GAUSS_NEWTON_STEPS = 60  # on all levels together
 COORDINATE_STEPS, JET_STEPS = 8, 2  # Newton steps for q, and for a level of jets, where rows are mostly affine
+LEVEL_SWEEPS = 2  # a second one, without gradients in all jets, where the first leaves the rounding of its steps
 SHORTENINGS = 12  # quarterings of a step before the search from a start ends
 SPREAD = 0.1  # relative width of starts about a guess, whose size is its value plus its usual size
 POINTS = 5  # at which ranks are decided; with as many further starts where one of the first fails
@@ -151,10 +152,12 @@ def solve(flow, t, z, iterations=GAUSS_NEWTON_STEPS, natural=False):
     if not len(flow.equations):
         return z, np.zeros(len(t), dtype=REAL)
     scales, sizes = np.ones((len(flow.equations), len(t))), flow.points.sizes(flow.level)[:, None]
-    for level in range(flow.level + 1):
-        _solve_level(flow, t, z, level, scales, sizes)
-    residual = flow.residual(t, z)
-    norm = _norms(residual, scales)
+    for _ in range(LEVEL_SWEEPS):
+        for level in range(flow.level + 1):
+            _solve_level(flow, t, z, level, scales, sizes)
+        norm = _norms(flow.residual(t, z), scales)
+        if not np.any((norm > ROUNDED) & (norm < ON_MANIFOLD)):
+            break
     active = np.flatnonzero(norm > ROUNDED)
     for _ in range(iterations):
         if not len(active):

@@ -24,6 +24,7 @@ from servoctl.tolerances import CUTOFF, ENTRY, NOISE, REFINEMENTS, RESOLVED, TIN
 THRESHOLD = 0.1  # least size of a pivot, relative to the largest entry of its equilibrated row
 SUSPECT = 1e-8  # of the size of its terms: an entry above this is evaluated in extended precision
 _dropped = ContextVar("dropped", default=None)  # where eliminations note what they leave out
+LARGE, THIN = 40, 1 / 4  # rows and columns of a matrix, and its share of nonzero entries, for sparse elimination
 SWEEPS = 6  # of equilibration; each takes the square root of the remaining factors: 1e±30 comes within a factor of 3
 
 
@@ -73,12 +74,18 @@ def equilibrate(matrix):
     """
     a = np.array(matrix, dtype=np.longdouble)
     rows, columns = np.ones(a.shape[:-1], dtype=a.dtype), np.ones(a.shape[:-2] + a.shape[-1:], dtype=a.dtype)
-    for _ in range(SWEEPS if a.size else 0):
-        for axis, factors in ((-1, rows), (-2, columns)):
-            largest = np.abs(a).max(axis=axis)
+    if not a.any():
+        return a, rows, columns
+    *each, i, j = places = np.nonzero(a)
+    entries = a[places]
+    for _ in range(SWEEPS):
+        for factors, place in ((rows, (*each, i)), (columns, (*each, j))):
+            largest = np.zeros_like(factors)
+            np.maximum.at(largest, place, np.abs(entries))
             scale = 1.0 / np.sqrt(np.where(largest > 0, largest, 1.0))
             factors *= scale
-            a *= np.expand_dims(scale, axis)
+            entries *= scale[place]
+    a[places] = entries
     return a, rows, columns
 
 
@@ -108,6 +115,20 @@ def decide_each(matrices, resolved=RESOLVED):
     list of Rank
     """
     a, _, _ = equilibrate(np.moveaxis(matrices, 2, 0))
+    thin = min(a.shape[1:]) >= LARGE and np.count_nonzero(a) <= THIN * a.size
+    pivots, rows, columns = map(np.array, zip(*map(_sparse_pivots, a), strict=True)) if thin else _dense_pivots(a)
+    ranks = (pivots > resolved).astype(int).cumprod(axis=1).sum(axis=1).tolist()
+    return [
+        Rank(r, min(p[:r], default=np.inf), max(p[r:], default=0.0), tuple(i[:r]), tuple(j[:r]))
+        for r, p, i, j in zip(ranks, pivots.tolist(), rows.tolist(), columns.tolist(), strict=True)
+    ]
+
+
+def _dense_pivots(a):
+    """Sizes of the pivots (N, min(m, n)) of complete pivoting, rows (N, m) and columns (N, n) in their order.
+
+    Eliminates the matrices a (N, m, n) in place, all at a time.
+    """
     count, m, n = a.shape
     each, least = np.arange(count), min(m, n)
     rows, columns = np.tile(np.arange(m), (count, 1)), np.tile(np.arange(n), (count, 1))
@@ -124,11 +145,26 @@ def decide_each(matrices, resolved=RESOLVED):
         pivot = np.where(open_, a[:, k, k], 1.0)
         pivots[:, k] = np.where(open_, np.abs(pivot), 0.0)
         a[:, k + 1 :, k + 1 :] -= (a[:, k + 1 :, k] / pivot[:, None])[:, :, None] * a[:, None, k, k + 1 :]
-    ranks = (pivots > resolved).astype(int).cumprod(axis=1).sum(axis=1).tolist()
-    return [
-        Rank(r, min(p[:r], default=np.inf), max(p[r:], default=0.0), tuple(i[:r]), tuple(j[:r]))
-        for r, p, i, j in zip(ranks, pivots.tolist(), rows.tolist(), columns.tolist(), strict=True)
-    ]
+    return pivots, rows, columns
+
+
+def _sparse_pivots(a):
+    """The same pivots, rows and columns of one matrix (m, n); changes the entries that are not zero alone."""
+    m, n = a.shape
+    rows, columns, pivots = np.arange(m), np.arange(n), np.zeros(min(m, n))
+    largest = np.abs(a).max(axis=1, initial=0.0)  # of each row that is left
+    for k in range(min(m, n)):
+        i = k + largest[k:].argmax()
+        if not largest[i] > 0:
+            break
+        j = k + np.abs(a[i, k:]).argmax()
+        for array, other in ((a, i), (rows, i), (largest, i), (a.T, j), (columns, j)):
+            array[[k, other]] = array[[other, k]]
+        pivots[k] = np.abs(a[k, k])
+        below, right = (k + 1 + np.flatnonzero(entries) for entries in (a[k + 1 :, k], a[k, k + 1 :]))
+        a[np.ix_(below, right)] -= (a[below, k] / a[k, k])[:, None] * a[k, right]
+        largest[below] = np.abs(a[below, k + 1 :]).max(axis=1, initial=0.0)
+    return pivots, rows, columns
 
 
 def decide_all(values, sizes):
