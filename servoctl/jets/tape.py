@@ -107,7 +107,7 @@ _REFUSED = {
     ca.OP_COPYSIGN: "copysign", ca.OP_ERFINV: "erfinv",
 }  # fmt: skip
 _GROWING = {"exp", "expm1", "sinh", "cosh"}  # functions that leave the range of doubles
-_OPTIONS = {"allow_free": True, "live_variables": False}  # no place is reused: operations fill them in order
+_OPTIONS = {"allow_free": True, "live_variables": False, "max_io": 10**9}  # operations fill new places in order
 
 
 class Tape:

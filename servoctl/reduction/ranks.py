@@ -24,7 +24,7 @@ from servoctl.tolerances import CUTOFF, ENTRY, NOISE, REFINEMENTS, RESOLVED, TIN
 THRESHOLD = 0.1  # least size of a pivot, relative to the largest entry of its equilibrated row
 SUSPECT = 1e-8  # of the size of its terms: an entry above this is evaluated in extended precision
 _dropped = ContextVar("dropped", default=None)  # where eliminations note what they leave out
-LARGE, THIN = 40, 1 / 4  # rows and columns of a matrix, and its share of nonzero entries, for sparse elimination
+LARGE, THIN = 40, 0.25  # rows and columns of a matrix, and its share of nonzero entries, for sparse elimination
 SWEEPS = 6  # of equilibration; each takes the square root of the remaining factors: 1e±30 comes within a factor of 3
 
 
@@ -277,7 +277,7 @@ def alive(entries, points):
     return np.where(share > 1.0, share, 0.0)
 
 
-def eliminate(matrix, right, numbers):
+def eliminate(matrix, right, numbers, in_order=False):
     """Solve A X = B symbolically.
 
     Parameters
@@ -286,6 +286,9 @@ def eliminate(matrix, right, numbers):
     right : (n, m) SX
     numbers : (n, n, N) array
         A at N points, cleaned of rounding, where pivots are chosen.
+    in_order : bool, optional
+        Among pivots of the same fill-in the one of the first row is taken instead of the largest: chains of bodies are
+        eliminated from end to end, with less fill-in later.
 
     Returns
     -------
@@ -301,7 +304,7 @@ def eliminate(matrix, right, numbers):
     n, m = right.shape
     system = _System(matrix, right, numbers)
     with np.errstate(all="ignore"):  # at some random points a pivot has no value
-        order = [system.step() for _ in range(n)]
+        order = [system.step(in_order) for _ in range(n)]
     solution, rows, rhs = [None] * n, system.rows, system.rhs
     for i, j in reversed(order):
         others = [(a, solution[c]) for c, (a, _) in rows[i].items() if c != j]
@@ -350,9 +353,9 @@ class _System:
         least = THRESHOLD * max(sizes)
         return [(j, size) for j, size in zip(row, sizes, strict=True) if size >= least and size > 0.0]
 
-    def step(self):
+    def step(self, in_order):
         """Eliminate by the pivot with the least fill-in, and return its row and column."""
-        i, j = self._pivot()
+        i, j = self._pivot(in_order)
         row = self.rows[i]
         del self.open[i]
         for c in row:
@@ -363,12 +366,12 @@ class _System:
         self.members[j] = {}
         return i, j
 
-    def _pivot(self):
+    def _pivot(self, in_order):
         least, place = None, None
         for i in self.open:
             fill = len(self.rows[i]) - 1
             for j, size in self.candidates[i]:
-                key = (fill * (len(self.members[j]) - 1), -size)
+                key = (fill * (len(self.members[j]) - 1), 0 if in_order else -size)
                 if least is None or key < least:
                     least, place = key, (i, j)
         if place is None:
