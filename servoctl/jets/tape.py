@@ -391,10 +391,10 @@ class Plan:
         for kind, data, here, operands in self.groups:
             parts = size.take(operands, axis=0)
             if kind in ("add", "sub"):
-                np.add(*parts, out=size[here])
+                np.hypot(*parts, out=size[here])
             elif kind == "mul":
                 a, b = magnitude.take(operands, axis=0)
-                np.add(a * parts[1], parts[0] * b, out=size[here])
+                np.hypot(a * parts[1], parts[0] * b, out=size[here])
             elif kind == "quad":
                 for slope, part in zip(self.slopes[here.start], parts, strict=True):
                     size[here] += np.nan_to_num(magnitude.take(slope, axis=0)) * part
@@ -421,7 +421,7 @@ VALUE = {
     "quad": apply,
 }
 _SIZE = {  # from the magnitude of y, and values and sizes of the operands
-    "div": lambda _, y, a, b, size_a, size_b: (size_a + y * size_b) / np.abs(b),
+    "div": lambda _, y, a, b, size_a, size_b: np.hypot(size_a, y * size_b) / np.abs(b),
     "neg": lambda _, y, a, size: size,
     "copy": lambda _, y, a, size: size,
     "fabs": lambda _, y, a, size: size,
@@ -437,9 +437,10 @@ _SIZE = {  # from the magnitude of y, and values and sizes of the operands
 def evaluate(tape, inputs, operations=None):
     """Values of a tape's outputs and the sizes of their terms.
 
-    The size of a + b is size(a) + size(b), that of a b is |a| size(b) + size(a) |b|, and that of y = f(a) is
-    |y| + |f'(a)| size(a). Rounding errors are about the machine's epsilon times the size, so an output far below its
-    size is zero. The precision is that of `inputs`.
+    The size of a + b is the root of the sum of squares of size(a) and size(b), as for independent errors, that of a b is
+    the same of |a| size(b) and size(a) |b|, and that of y = f(a) is |y| + |f'(a)| size(a). Rounding errors are about the
+    machine's epsilon times the size, so an output far below its size is zero. Sums instead of roots would grow
+    exponentially along a chain of rotations, whose errors do not. The precision is that of `inputs`.
 
     Parameters
     ----------

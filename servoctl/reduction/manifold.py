@@ -131,6 +131,8 @@ class Points:
 def solve(flow, t, z, iterations=GAUSS_NEWTON_STEPS, natural=False):
     """Solve a flow's rows for jets: level by level, then by damped Gauss-Newton steps on all levels.
 
+    Where the levels lead nowhere, damped steps for the rows of q alone come first; a point without these has no jets.
+
     Parameters
     ----------
     flow : Flow
@@ -152,13 +154,14 @@ def solve(flow, t, z, iterations=GAUSS_NEWTON_STEPS, natural=False):
     if not len(flow.equations):
         return z, np.zeros(len(t), dtype=REAL)
     scales, sizes = np.ones((len(flow.equations), len(t))), flow.points.sizes(flow.level)[:, None]
-    for _ in range(LEVEL_SWEEPS):
-        for level in range(flow.level + 1):
-            _solve_level(flow, t, z, level, scales, sizes)
-        norm = _norms(flow.residual(t, z), scales)
-        if not np.any((norm > ROUNDED) & (norm < ON_MANIFOLD)):
-            break
+    norm = _solve_levels(flow, t, z, scales, sizes)
     active = np.flatnonzero(norm > ROUNDED)
+    far = np.flatnonzero(~(norm < ON_MANIFOLD))
+    if len(far) and flow.level and 0 in flow.members and not natural:
+        z[: flow.q.nq, far], lowest = solve(flow.lowest, t[far], z[: flow.q.nq, far], iterations)
+        norm = _solve_levels(flow, t, z, scales, sizes)
+        lost = far[~(lowest < ON_MANIFOLD)]
+        active = np.setdiff1d(np.flatnonzero(norm > ROUNDED), lost)
     for _ in range(iterations):
         if not len(active):
             break
@@ -177,6 +180,20 @@ def solve(flow, t, z, iterations=GAUSS_NEWTON_STEPS, natural=False):
         active = active[better]
         z[:, active] = trial[:, better]
     return z, norm
+
+
+def _solve_levels(flow, t, z, scales, sizes):
+    """Solve level after level, twice where the rounding of the first steps is left; changes z and scales in place.
+
+    Returns the largest scaled residual of each point, (N,).
+    """
+    for _ in range(LEVEL_SWEEPS):
+        for level in range(flow.level + 1):
+            _solve_level(flow, t, z, level, scales, sizes)
+        norm = _norms(flow.residual(t, z), scales)
+        if not np.any((norm > ROUNDED) & (norm < ON_MANIFOLD)):
+            break
+    return norm
 
 
 def _search(flow, t, z, step, scale, residual):
