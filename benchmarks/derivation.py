@@ -102,16 +102,19 @@ def sixteen_links(rounds):
     return samples
 
 
-def growth(rounds):
-    return [count(32) / count(16)]
+def growth(rounds, coordinates="bodies"):
+    return [count(32, coordinates) / count(16, coordinates)]
 
 
-def per_link(rounds):
-    return [count(32) / 32]
+def per_link(rounds, coordinates="bodies"):
+    return [count(32, coordinates) / 32]
 
 
-def count(n):
-    return arms.arm(n, False, "bodies")[0].operations
+def count(n, coordinates):
+    return arms.arm(n, False, coordinates)[0].operations
+
+
+joints_growth, joints_per_link = (partial(f, coordinates="joints") for f in (growth, per_link))
 
 
 cold = partial(compiled, LINKS, "joints") if COMPILER else Missing("gcc is not installed")
@@ -123,4 +126,10 @@ ROWS = {
     ),
     "growth": partial(Limit, "Operations of the planar arm: 32 links / 16 links", growth, 2.15),
     "per-link": partial(Limit, "Operations per link of the planar arm of 32 links", per_link, 300),
+    "growth-joints": partial(
+        Limit, "Operations of the planar arm in joint angles: 32 links / 16 links", joints_growth, 2.15
+    ),
+    "per-link-joints": partial(
+        Limit, "Operations per link of the planar arm of 32 links in joint angles", joints_per_link, 300
+    ),
 }
