@@ -391,7 +391,7 @@ class Plan:
         for kind, data, here, operands in self.groups:
             parts = size.take(operands, axis=0)
             if kind in ("add", "sub"):
-                np.hypot(*parts, out=size[here])
+                np.maximum(np.hypot(*parts), magnitude[here], out=size[here])
             elif kind == "mul":
                 a, b = magnitude.take(operands, axis=0)
                 np.hypot(a * parts[1], parts[0] * b, out=size[here])
@@ -437,10 +437,10 @@ _SIZE = {  # from the magnitude of y, and values and sizes of the operands
 def evaluate(tape, inputs, operations=None):
     """Values of a tape's outputs and the sizes of their terms.
 
-    The size of a + b is the root of the sum of squares of size(a) and size(b), as for independent errors, that of a b
-    is the same of |a| size(b) and size(a) |b|, and that of y = f(a) is |y| + |f'(a)| size(a). Rounding errors are about
-    the machine's epsilon times the size, so an output far below its size is zero. Sums instead of roots would grow
-    exponentially along a chain of rotations, whose errors do not. The precision is that of `inputs`.
+    The size of a + b is the root of the sum of squares of size(a) and size(b), as for independent errors, and at least
+    |a + b|; that of a b is the same root for |a| size(b) and size(a) |b|, that of y = f(a) is |y| + |f'(a)| size(a).
+    Rounding errors are about the machine's epsilon times the size, so an output far below its size is zero. Sums instead
+    of roots would grow exponentially along a chain of rotations, whose errors do not. The precision is that of `inputs`.
 
     Parameters
     ----------
