@@ -1,107 +1,80 @@
-"""Robots with a free base and revolute joints, by recursive Newton-Euler equations as a library would give them."""
+"""Robots for tests: the project's own files, those of example-robot-data where it is installed, and pinocchio's view."""
+
+from importlib.util import find_spec
+from pathlib import Path
 
 import casadi as ca
 import numpy as np
 
-import servoctl as sv
-
-GRAVITY = 9.81
-
-
-def turn(axis, angle):
-    """The rotation by an angle about a coordinate axis, 0 to 2."""
-    s, c, R = ca.sin(angle), ca.cos(angle), ca.SX.eye(3)
-    i, j = (axis + 1) % 3, (axis + 2) % 3
-    R[i, i], R[i, j], R[j, i], R[j, j] = c, -s, s, c
-    return R
+OWN = Path(__file__).parents[1] / "examples" / "robots"
+PUBLIC = {
+    "ur5": "ur_description/urdf/ur5_robot.urdf",
+    "panda": "panda_description/urdf/panda.urdf",
+    "solo12": "solo_description/robots/solo12.urdf",
+    "talos": "talos_data/robots/talos_reduced.urdf",
+}
 
 
-def attitude(e):
-    """The rotation matrix of a quaternion, and Q of e' = Q w by body rates w."""
-    a, b, c, d = e
-    Q = [[-b, -c, -d], [a, -d, c], [d, a, -b], [-c, b, a]]
-    R = [
-        [1 - 2 * (c**2 + d**2), 2 * (b * c - a * d), 2 * (b * d + a * c)],
-        [2 * (b * c + a * d), 1 - 2 * (b**2 + d**2), 2 * (c * d - a * b)],
-        [2 * (b * d - a * c), 2 * (c * d + a * b), 1 - 2 * (b**2 + c**2)],
-    ]
-    return tuple(ca.vertcat(*(ca.horzcat(*row) for row in rows)) for rows in (R, np.array(Q) / 2))
+def file_of(name):
+    """The path of a robot's file, or None where example-robot-data is not installed."""
+    if name not in PUBLIC:
+        return str(OWN / f"{name}.urdf")
+    found = find_spec("cmeel")
+    if found is None:
+        return None
+    root = Path(found.origin).parents[1] / "cmeel.prefix/share/example-robot-data/robots"
+    return str(root / PUBLIC[name]) if (root / PUBLIC[name]).exists() else None
 
 
-class Robot:
-    """Base 0 and links 1, 2, ...: `parents` of the links, seeded axes, offsets, masses, centres and inertias.
-
-    Coordinates are the place of the base, its quaternion and the joint angles; velocities those of the base along its
-    own axes, its body rates and the joint rates.
-    """
-
-    def __init__(self, parents, seed=1):
-        rng, n = np.random.default_rng(seed), len(parents)
-        joints = [f"j{i}" for i in range(1, n + 1)]
-        plain = sv.coordinates(" ".join(["x y z e0 e1 e2 e3", *joints]))
-        R, Q = attitude(list(plain)[3:7])
-        names = " ".join(["u v w p q r", *(f"rate_{name}" for name in joints)])
-        unit = {"unit": ca.sumsqr(ca.vertcat(*list(plain)[3:7])) - 1}
-        self.q = q = plain.with_quasi_velocities(names, ca.diagcat(R, Q, ca.SX.eye(n)), invariants=unit)
-        angles, rates, changes = list(q)[7:], ca.vertcat(*q.gamma(1)), ca.vertcat(*q.gamma(2))
-        masses, centres = rng.uniform(0.5, 2.0, n + 1), rng.uniform(-0.1, 0.1, (n + 1, 3)).round(3)
-        inertias, offsets = rng.uniform(0.01, 0.02, (n + 1, 3)).round(4), rng.uniform(-0.3, 0.3, (n + 1, 3)).round(2)
-        axes = [i % 3 for i in range(n + 1)]
-        self.turns, self.places = [R], [ca.vertcat(*list(q)[:3])]
-        spin, speed = [rates[3:6]], [changes[3:6]]
-        moved, relative = [changes[:3] + ca.cross(rates[3:6], rates[:3])], [None]
-        for i, parent in enumerate(parents, 1):
-            unit, offset, R = ca.SX.eye(3)[:, axes[i]], ca.SX(offsets[i]), turn(axes[i], angles[i - 1])
-            carried = R.T @ spin[parent]
-            relative.append(R)
-            spin.append(carried + unit * rates[5 + i])
-            speed.append(R.T @ speed[parent] + unit * changes[5 + i] + ca.cross(carried, unit) * rates[5 + i])
-            moved.append(R.T @ (moved[parent] + _about(spin[parent], speed[parent], offset)))
-            self.places.append(self.places[parent] + self.turns[parent] @ offset)
-            self.turns.append(self.turns[parent] @ R)
-        forces, moments, self.potential = [], [], 0
-        for i in range(n + 1):
-            force = masses[i] * (moved[i] + _about(spin[i], speed[i], ca.SX(centres[i])))
-            inertia = ca.SX(inertias[i])
-            forces.append(force)
-            moments.append(
-                inertia * speed[i] + ca.cross(spin[i], inertia * spin[i]) + ca.cross(ca.SX(centres[i]), force)
-            )
-            self.potential += GRAVITY * masses[i] * (self.places[i] + self.turns[i] @ ca.SX(centres[i]))[2]
-        torques = [None] * n
-        for i in range(n, 0, -1):
-            parent, force = parents[i - 1], relative[i] @ forces[i]
-            torques[i - 1] = moments[i][axes[i]]
-            forces[parent] += force
-            moments[parent] += relative[i] @ moments[i] + ca.cross(ca.SX(offsets[i]), force)
-        self.balance = ca.vertcat(forces[0], moments[0], *torques)
-
-    def posture(self, seed=2):
-        """Coordinates of the robot upright with seeded joint angles, by name."""
-        angles = np.random.default_rng(seed).uniform(-0.6, 0.6, self.q.nq - 7).round(2)
-        return dict(zip(self.q.names, [0, 0, 1, 1, 0, 0, 0, *angles], strict=True))
-
-    def scene(self, programmed, feet=(), base=False):
-        """Links held to the ground by material constraints; joints, and perhaps the base, on paths by motors."""
-        q, posture = self.q, self.posture()
-        symbols, constraints = dict(zip(q.names, q, strict=True)), {}
-        for foot in feet:
-            here = ca.Function("here", [q.jet(0)], [self.places[foot], self.turns[foot]])
-            place, turned = (ca.SX(m) for m in here(list(posture.values())))
-            difference = turned.T @ self.turns[foot]
-            rows = [*(self.places[foot] - place).elements(), difference[2, 1], difference[0, 2], difference[1, 0]]
-            constraints |= {f"foot {foot} {name}": row for name, row in zip("xyzabc", rows, strict=True)}
-        motors = {f"motor {name}": symbols[name] for name in q.names[7:]}
-        targets = {name: 0.2 * ca.sin(2 * q.t + i) - 0.2 * np.sin(i) for i, name in enumerate(programmed)}
-        targets |= {name: 0.02 * (1 - ca.cos(q.t)) for name in "xyz" if base}
-        targets |= {name: 0 for name in ("e1", "e2", "e3") if base}
-        mechanism = sv.Mechanism(
-            q, balance=self.balance, potential=self.potential, actuators=motors, constraints=constraints
-        )
-        residuals = {f"on {name}": symbols[name] - posture[name] - target for name, target in targets.items()}
-        return mechanism, sv.Program(residuals)
+TWIST, PLACE = ("vx", "vy", "vz", "wx", "wy", "wz"), ("x", "y", "z", "qx", "qy", "qz", "qw")
 
 
-def _about(spin, turned, arm):
-    """The acceleration of a point of a body relative to that of its origin."""
-    return ca.cross(turned, arm) + ca.cross(spin, ca.cross(spin, arm))
+class Pinocchio:
+    """A robot in pinocchio, with states given in the names of servoctl."""
+
+    def __init__(self, robot, path, base):
+        import pinocchio
+
+        self.pin, self.robot = pinocchio, robot
+        free = (pinocchio.JointModelFreeFlyer(),) if base == "free" else ()
+        self.model = pinocchio.buildModelFromUrdf(path, *free, mimic=True)
+        self.data = self.model.createData()
+        q, by_joint = robot.q, {joint: name for name, joint in robot.joints.items()}
+        velocities = list(q.names if q.plain else q.velocity_names)
+        self.rows = np.zeros(self.model.nv, int)  # of our velocities, in pinocchio's order
+        for joint, name in zip(list(self.model.joints)[1:], list(self.model.names)[1:], strict=True):
+            if joint.nv == 6:
+                self.rows[joint.idx_v : joint.idx_v + 6] = [velocities.index(f"base_{e}") for e in TWIST]
+            elif joint.nv:
+                own = by_joint[name]
+                self.rows[joint.idx_v] = velocities.index(own if q.plain else f"{own}_rate")
+        self.by_joint = by_joint
+
+    def configuration(self, values):
+        """pinocchio's configuration of ours, (nq,) array."""
+        numbers, result = dict(zip(self.robot.q.names, values, strict=True)), self.pin.neutral(self.model)
+        for joint, name in zip(list(self.model.joints)[1:], list(self.model.names)[1:], strict=True):
+            if joint.nv == 6:
+                result[joint.idx_q : joint.idx_q + 7] = [numbers[f"base_{e}"] for e in PLACE]
+            elif joint.nv:
+                angle = numbers[self.by_joint[name]]
+                turns = joint.nq == 2
+                result[joint.idx_q : joint.idx_q + joint.nq] = [np.cos(angle), np.sin(angle)] if turns else [angle]
+        return result
+
+
+def random_state(robot, random):
+    """Coordinates, velocities and accelerations; the quaternion of a free base is a unit one."""
+    q = robot.q
+    values = random.uniform(-2.0, 2.0, q.nq)
+    if not q.plain:
+        place = q.names.index("base_qx")
+        values[place : place + 4] /= np.linalg.norm(values[place : place + 4])
+    return values, random.normal(size=q.n), random.normal(size=q.n)
+
+
+def function_of(robot, *expressions):
+    """Expressions as a function of coordinates, velocities and accelerations that returns arrays."""
+    q = robot.q
+    f = ca.Function("f", [ca.vertcat(*q), q.jet(1), q.jet(2)], [ca.densify(ca.SX(e)) for e in expressions])
+    return lambda *state: [np.array(value).squeeze() for value in f.call([ca.DM(part) for part in state])]

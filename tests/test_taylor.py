@@ -271,7 +271,7 @@ def test_an_exact_cancellation_is_zero_in_the_size_of_its_terms():
 
 
 def test_sizes_do_not_grow_along_a_chain_of_rotations():
-    """Errors of components turn with them: an exact cancellation behind a hundred rotations is zero, a small entry is not."""
+    """Errors of components turn with them: a cancellation behind a hundred rotations is zero, a small entry is not."""
     q = coordinates(" ".join(f"a{i}" for i in range(100)))
     x, y = ca.SX(1), ca.SX(0)
     for angle in q:

@@ -439,8 +439,9 @@ def evaluate(tape, inputs, operations=None):
 
     The size of a + b is the root of the sum of squares of size(a) and size(b), as for independent errors, and at least
     |a + b|; that of a b is the same root for |a| size(b) and size(a) |b|, that of y = f(a) is |y| + |f'(a)| size(a).
-    Rounding errors are about the machine's epsilon times the size, so an output far below its size is zero. Sums instead
-    of roots would grow exponentially along a chain of rotations, whose errors do not. The precision is that of `inputs`.
+    Rounding errors are about the machine's epsilon times the size, so an output far below its size is zero. Sums
+    instead of roots would grow exponentially along a chain of rotations, whose errors do not. The precision is that of
+    `inputs`.
 
     Parameters
     ----------

@@ -4,7 +4,7 @@ from functools import cache
 
 import numpy as np
 import pytest
-from robots import Robot
+from walkers import Robot
 
 import servoctl as sv
 from servoctl.jets.series import Flow
