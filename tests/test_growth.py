@@ -139,11 +139,13 @@ def _by_motors(mechanism, program):
 
 
 @pytest.mark.parametrize("poles", [False, True])
-@pytest.mark.parametrize("driven", [False, True])
-def test_the_sparse_elimination_gives_what_3_18_gives(poles, driven):
-    arm = planar_arm(4, "bodies")
+@pytest.mark.parametrize(("coordinates", "driven"), [("bodies", False), ("bodies", True), ("joints", False)])
+def test_the_sparse_elimination_gives_what_3_18_gives(poles, coordinates, driven):
+    arm = planar_arm(4, coordinates)
     equations = derive(*(_by_motors(*arm) if driven else arm)).equations
-    assert equations.sparse
+    assert saddle.applies(equations.r) and equations.sparse == (coordinates == "bodies")
+    shared = saddle.matrix(equations).shape[0] - 4 * {"bodies": 3, "joints": 1}[coordinates] - 2
+    assert shared == {"bodies": 8, "joints": 18}[coordinates], "material constraints, or sums of the joint angles"
     sparse, multipliers, _ = saddle.solve(equations, poles)
     dense = equations.dense(poles)
     expected = ca.substitute(equations.r.multipliers, ca.vertcat(*equations.q.gamma(2)), dense)
