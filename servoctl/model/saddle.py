@@ -16,6 +16,7 @@ from servoctl.reduction.lifting import lifted
 from servoctl.reduction.ranks import clean, eliminate
 
 FEW = 8  # quasi-velocities: up to this number (3.18) takes about as few operations
+SHARED = 0.95  # of the work of [M -B; G 0] below which the system with shared sums is taken
 CLOSE = 1.1  # ratio of operations up to which the forms are compared after common terms are merged
 
 
@@ -34,7 +35,7 @@ def solve(equations, poles=False):
     right = -ca.vertcat(rest, *equations.rest(constraints, poles))
     sums = system.shape[0] - right.shape[0]
     right, numbers = ca.vertcat(right, ca.SX(sums, 1)), clean(*r.points.matrix(system))
-    solution, pivots = eliminate(system, right, numbers, in_order=True)
+    solution, pivots = eliminate(system, right, numbers, in_order=sums > 0)
     reactions = slice(q.n, q.n + r.realisation.B.shape[1])
     return solution[: q.n], solution[reactions], pivots
 
@@ -48,7 +49,7 @@ def matrix(equations):
     direct = ca.vertcat(r.mechanism.mass, G)
     raised = ca.vertcat(*(equations.levels[a][-1] for a in constraints))
     shared = lifted(ca.vertcat(r.balance, raised), q.jet(2))
-    if shared is None or _work(direct) <= _work(shared):
+    if shared is None or _work(shared) >= SHARED * _work(direct):
         return ca.horzcat(direct, reactions)
     reactions = ca.vertcat(reactions, ca.SX(shared.shape[0] - direct.shape[0], reactions.shape[1]))
     return ca.horzcat(shared[:, : q.n], reactions, shared[:, q.n :])
