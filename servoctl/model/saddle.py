@@ -16,7 +16,7 @@ from servoctl.reduction.lifting import lifted
 from servoctl.reduction.ranks import clean, eliminate
 
 FEW = 8  # quasi-velocities: up to this number (3.18) takes about as few operations
-SHARED = 0.95  # of the work of [M -B; G 0] below which the system with shared sums is taken
+SPARED = 0.95  # of the work of [M -B; G 0] below which the system with shared sums is taken
 CLOSE = 1.1  # ratio of operations up to which the forms are compared after common terms are merged
 
 
@@ -49,7 +49,7 @@ def matrix(equations):
     direct = ca.vertcat(r.mechanism.mass, G)
     raised = ca.vertcat(*(equations.levels[a][-1] for a in constraints))
     shared = lifted(ca.vertcat(r.balance, raised), q.jet(2))
-    if shared is None or _work(shared) >= SHARED * _work(direct):
+    if shared is None or _work(shared) >= SPARED * _work(direct):
         return ca.horzcat(direct, reactions)
     reactions = ca.vertcat(reactions, ca.SX(shared.shape[0] - direct.shape[0], reactions.shape[1]))
     return ca.horzcat(shared[:, : q.n], reactions, shared[:, q.n :])
