@@ -268,6 +268,13 @@ class Flow:
         flow.points = points
         return flow
 
+    @property
+    def lowest(self):
+        """The rows of order 0 as equations of q."""
+        if "lowest" not in self._cache:
+            self._cache["lowest"] = Flow(self.q, self.rows, 0, self.points, self.signals, self.real)
+        return self._cache["lowest"].at(self.points)
+
     def _scalars(self, expressions):
         return Scalars(self.q, self.points.parameters, expressions, self.signals)
 
