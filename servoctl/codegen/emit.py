@@ -9,16 +9,17 @@ eight products. This rounds twice instead of once.
 
 import math
 from collections import Counter
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import chain, count
 
 import casadi as ca
 
-from servoctl.codegen.loops import CONSTANTS, INLINE_SINES, LOOPS
+from servoctl.codegen.loops import CONSTANTS, INLINE_SINES, LOOPS, PHASED
 
 CHUNK = 350  # statements per C function: compile time is least, and flat, between 250 and 500
 WIDE = 3000  # operations: up to here a function is emitted for eight points at once as well
 SHARED = 2  # divisions by the same value: from here on they become products with its reciprocal
+PHASES = ("instant", "correction", "rest")  # of t and p alone; for a Newton correction; for the other outputs
 SCALAR_FASTER = '#pragma GCC optimize("no-tree-slp-vectorize")\n'  # pairs of terms of a series cost more to gather
 
 _ARITHMETIC = {
@@ -139,6 +140,7 @@ def emit(f, name, loops=(), *, project=None, others=None, sizes=None, wide=True,
 
     The unit defines ``void name(double t, const double *x, const double *p, double *y)`` (``y`` overlaps no input),
     ``name_point``, ``name_grid``, ``name_casadi`` in the form that CasADi calls, and the functions of each loop's file.
+    For loops in `PHASED` also ``name_instant``, ``name_correction`` and ``name_rest``; see `phases`.
 
     Parameters
     ----------
@@ -167,11 +169,16 @@ def emit(f, name, loops=(), *, project=None, others=None, sizes=None, wide=True,
     dialect = SCALAR_INLINE if INLINE_SINES.intersection(loops) else SCALAR
     scalar = {name: f} | ({} if project is None else {f"{name}_project": project})
     scalar |= {f"{name}_{key}": other for key, other in (others or {}).items()}
-    parts = [function(other, key, dialect, chunk) for key, other in scalar.items()]
+    step = f.numel_in(1) if "newton" in loops else 0
+
+    def emitted(f, name, dialect):
+        return phases(f, name, step, dialect, chunk) if f is phased else function(f, name, dialect, chunk)
+
+    phased = f if PHASED.intersection(loops) else None
+    parts = [emitted(other, key, dialect) for key, other in scalar.items()]
     wide = wide and operations(f) <= WIDE
     if wide:
-        copies = {f"{name}_wide": f} | ({f"{name}_wide_step": _first(f, f.numel_in(1))} if "newton" in loops else {})
-        parts += [include("lanes.h"), *(function(copy, key, WIDE_LANES, chunk) for key, copy in copies.items())]
+        parts += [include("lanes.h"), emitted(f, f"{name}_wide", WIDE_LANES)]
     constants = {"NAME": name, "NX": f.numel_in(1), "NP": f.numel_in(2), "NY": f.numel_out(0)}
     constants |= {"PROJECTED": ""} if project is not None else {}
     constants |= {"WIDE": ""} if wide else {}
@@ -192,18 +199,32 @@ def include(name):
     return f'#include "{name}"\n'
 
 
-def _first(f, n):
-    inputs = f.sx_in()
-    return ca.Function(f.name(), inputs, [f(*inputs)[:n]])
-
-
 def function(f, name, dialect=SCALAR, chunk=CHUNK):
     """C text of one function y = f(t, x, p), cut into chunks of at most `chunk` statements."""
-    statements = _with_reciprocals(_statements(f, dialect))
-    chunks = [statements[k : k + chunk] for k in range(0, len(statements), chunk)]
-    if len(chunks) > 1:
-        return _chunked(name, chunks, dialect)
-    return dialect.head(name) + "".join(_line(statement, dialect) for statement in statements) + "}\n"
+    chunks = _cut(_with_reciprocals(_statements(f, dialect)), chunk)
+    if len(chunks) == 1:
+        return dialect.head(name) + "".join(_line(statement, dialect) for statement in chunks[0]) + "}\n"
+    names = [f"{name}_{here}" for here in range(len(chunks))]
+    text, size = _sharing(names, chunks, [0] * len(chunks), dialect)
+    return text + dialect.head(name) + f"    {dialect.number} w[{size}];\n" + _calls(names) + "}\n"
+
+
+def phases(f, name, step, dialect=SCALAR, chunk=CHUNK):
+    """C text of one function y = f(t, x, p) in phases, which share a vector w of ``WORK`` numbers.
+
+    ``name_instant`` computes what depends on t and p alone, ``name_correction`` the first `step` outputs, ``name_rest``
+    the others. At one instant, corrections of several x may precede the rest, which completes the last one.
+    """
+    parts = [_cut(part, chunk) for part in _by_phase(_with_reciprocals(_statements(f, dialect)), step)]
+    wholes = [f"{name}_{phase}" for phase in PHASES]
+    names = [[f"{w}_{k}" for k in range(len(c))] if len(c) > 1 else [w] for w, c in zip(wholes, parts, strict=True)]
+    of = [k for k, chunks in enumerate(parts) for _ in chunks]
+    text, size = _sharing(list(chain(*names)), list(chain(*parts)), of, dialect)
+    static = replace(dialect, linkage="static ")
+    for whole, some in zip(wholes, names, strict=True):
+        text += static.head(whole, work=True) + _calls(some) + "}\n" if len(some) > 1 else ""
+    all_three = dialect.head(name) + f"    {dialect.number} w[WORK];\n" + _calls(wholes) + "}\n"
+    return f"\n#define WORK {size}\n{text}{all_three}"
 
 
 def function_of_two(f, name, dialect):
@@ -266,17 +287,41 @@ def _line(statement, dialect, value="a"):
     return f"    {place} = {text};\n"
 
 
-def _chunked(name, chunks, dialect):
-    """C text of a function that calls its chunks, which share a work vector w."""
+def _by_phase(statements, step):
+    """The statements of each of the `PHASES`, in order; outputs are written by the step or the rest."""
+    moving, needed = set(), {f"y[{k}]" for k in range(step)}
+    for target, _, operands in statements:
+        if isinstance(target, str) or any(v in moving or str(v).startswith("x") for v in operands):
+            moving.add(target)
+    for target, _, operands in reversed(statements):
+        if target in needed:
+            needed.update(operands)
+    phase = [0 if s[0] not in moving else 1 if s[0] in needed else 2 for s in statements]
+    return [[s for s, k in zip(statements, phase, strict=True) if k == here] for here in range(len(PHASES))]
+
+
+def _cut(statements, chunk):
+    """The statements in chunks, at least one."""
+    return [statements[k : k + chunk] for k in range(0, max(len(statements), 1), chunk)]
+
+
+def _calls(names):
+    return "".join(f"    {name}(t, x, p, y, w);\n" for name in names)
+
+
+def _sharing(names, chunks, of, dialect):
+    """C text of functions, one for each chunk, that share a work vector w, and its length.
+
+    `of` are the phases of the chunks: a function that is the only one of its phase may be inlined.
+    """
     home = {target: here for here, chunk in enumerate(chunks) for target, _, _ in chunk if isinstance(target, int)}
-    slots, n_slots = _slots(chunks, home)
-    functions = (
-        f"{dialect.head(f'{name}_{here}', work=True)}{_chunk(chunk, slots, home, here, dialect)}}}\n"
-        for here, chunk in enumerate(chunks)
+    slots, n_slots = _slots(chunks, home, of)
+    text = "".join(
+        f"{(replace(dialect, linkage='static ') if of.count(k) == 1 else dialect).head(name, work=True)}"
+        f"{_chunk(chunk, slots, home, here, dialect)}}}\n"
+        for here, (name, chunk, k) in enumerate(zip(names, chunks, of, strict=True))
     )
-    calls = (f"    {name}_{here}(t, x, p, y, w);\n" for here in range(len(chunks)))
-    work = f"    {dialect.number} w[{n_slots + 1}];\n"
-    return "".join(chain(functions, [dialect.head(name), work], calls, ["}\n"]))
+    return text, n_slots + 1
 
 
 def _chunk(statements, slots, home, here, dialect):
@@ -294,12 +339,18 @@ def _chunk(statements, slots, home, here, dialect):
     return "".join(lines)
 
 
-def _slots(chunks, home):
-    """Index in w of each value that outlives its chunk; it is free again after the last chunk that reads the value."""
-    last = {
-        v: here for here, chunk in enumerate(chunks) for _, _, operands in chunk for v in operands if isinstance(v, int)
-    }
-    expiring, free, slots, n_slots = [[] for _ in chunks], [], {}, 0
+def _slots(chunks, home, of):
+    """Index in w of each value that outlives its chunk, and the number of indices.
+
+    An index is free again after the last chunk that reads the value, unless that is of another phase, which may be
+    repeated.
+    """
+    last = {}
+    for here, chunk in enumerate(chunks):
+        for v in chain.from_iterable(operands for _, _, operands in chunk):
+            if isinstance(v, int):
+                last[v] = here if of[here] == of[home[v]] else len(chunks)
+    expiring, free, slots, n_slots = [[] for _ in range(len(chunks) + 1)], [], {}, 0
     for here, chunk in enumerate(chunks):
         free += expiring[here - 1] if here else []
         for target, _, _ in chunk:
