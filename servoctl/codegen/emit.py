@@ -7,7 +7,6 @@ values have the same divisor, such as a pivot, they are multiplied with its reci
 eight products. This rounds twice instead of once.
 """
 
-import math
 from collections import Counter
 from dataclasses import dataclass, field, replace
 from itertools import chain, count
@@ -15,6 +14,7 @@ from itertools import chain, count
 import casadi as ca
 
 from servoctl.codegen.loops import CONSTANTS, INLINE_SINES, LOOPS, PHASED
+from servoctl.codegen.tables import Constant, Entry, Row, literal, tabulated
 
 CHUNK = 350  # statements per C function: compile time is least, and flat, between 250 and 500
 WIDE = 3000  # operations: up to here a function is emitted for eight points at once as well
@@ -96,6 +96,8 @@ class Dialect:
 
     def expression(self, operation, operands):
         """C text of an operation on operands."""
+        if isinstance(operation, (Row, Entry)):
+            return operation.text(self.prefix, *operands)
         if operation in _ARITHMETIC:
             return _ARITHMETIC[operation].format(*operands, one=self.constant(1.0), two=self.constant(2.0))
         name, n = _ELEMENTARY[operation]
@@ -125,9 +127,8 @@ LANES_COMMON = Dialect("W", "ALL({})", "w_", common=True, linkage="static ")
 
 
 def operations(f):
-    """Number of arithmetic instructions of an SX function: all but constants, inputs, outputs and copies."""
-    instructions = ((f.instruction_id(k), f.instruction_input(k)) for k in range(f.n_instructions()))
-    return sum(code not in _NOT_ARITHMETIC and not _copies(code, source) for code, source in instructions)
+    """Number of arithmetic operations of an SX function in C: all but constants, inputs, outputs and copies."""
+    return sum(isinstance(target, int) for target, _, _ in tabulated(_statements(f, SCALAR))[0])
 
 
 def _copies(operation, source):
@@ -201,12 +202,13 @@ def include(name):
 
 def function(f, name, dialect=SCALAR, chunk=CHUNK):
     """C text of one function y = f(t, x, p), cut into chunks of at most `chunk` statements."""
-    chunks = _cut(_with_reciprocals(_statements(f, dialect)), chunk)
+    statements, tables = _prepared(f, dialect)
+    chunks = _cut(statements, chunk)
     if len(chunks) == 1:
-        return dialect.head(name) + "".join(_line(statement, dialect) for statement in chunks[0]) + "}\n"
+        return "".join((*tables, dialect.head(name), *(_line(s, dialect) for s in statements), "}\n"))
     names = [f"{name}_{here}" for here in range(len(chunks))]
     text, size = _sharing(names, chunks, [0] * len(chunks), dialect)
-    return text + dialect.head(name) + f"    {dialect.number} w[{size}];\n" + _calls(names) + "}\n"
+    return "".join(tables) + text + dialect.head(name) + f"    {dialect.number} w[{size}];\n" + _calls(names) + "}\n"
 
 
 def phases(f, name, step, dialect=SCALAR, chunk=CHUNK):
@@ -215,7 +217,8 @@ def phases(f, name, step, dialect=SCALAR, chunk=CHUNK):
     ``name_instant`` computes what depends on t and p alone, ``name_correction`` the first `step` outputs, ``name_rest``
     the others. At one instant, corrections of several x may precede the rest, which completes the last one.
     """
-    parts = [_cut(part, chunk) for part in _by_phase(_with_reciprocals(_statements(f, dialect)), step)]
+    statements, tables = _prepared(f, dialect)
+    parts = [_cut(part, chunk) for part in _by_phase(statements, step)]
     wholes = [f"{name}_{phase}" for phase in PHASES]
     names = [[f"{w}_{k}" for k in range(len(c))] if len(c) > 1 else [w] for w, c in zip(wholes, parts, strict=True)]
     of = [k for k, chunks in enumerate(parts) for _ in chunks]
@@ -224,33 +227,35 @@ def phases(f, name, step, dialect=SCALAR, chunk=CHUNK):
     for whole, some in zip(wholes, names, strict=True):
         text += static.head(whole, work=True) + _calls(some) + "}\n" if len(some) > 1 else ""
     all_three = dialect.head(name) + f"    {dialect.number} w[WORK];\n" + _calls(wholes) + "}\n"
-    return f"\n#define WORK {size}\n{text}{all_three}"
+    return f"{''.join(tables)}\n#define WORK {size}\n{text}{all_three}"
 
 
 def function_of_two(f, name, dialect):
     """C text of y = f(t, x, p) and y2 = f(t, x2, p2), with alternating statements: the processor overlaps the two."""
-    one, two = (_with_reciprocals(_statements(f, dialect, suffix)) for suffix in ("", "2"))
+    (one, tables), (two, _) = (_prepared(f, dialect, suffix) for suffix in ("", "2"))
     lines = ((_line(a, dialect), _line(b, dialect, "b")) for a, b in zip(one, two, strict=True))
-    return dialect.head(name, ("", "2")) + "".join(chain.from_iterable(lines)) + "}\n"
+    return "".join((*tables, dialect.head(name, ("", "2")), *chain.from_iterable(lines), "}\n"))
 
 
-def literal(value):
-    """A number as C text, exactly."""
-    if math.isnan(value):
-        return "NAN"
-    text = "INFINITY" if math.isinf(value) else repr(abs(value))
-    return f"(-{text})" if math.copysign(1.0, value) < 0 else text
+def _prepared(f, dialect, suffix=""):
+    """The statements of a function, with lookups and reciprocals, and C texts of what the lookups need."""
+    statements, tables = tabulated(_statements(f, dialect, suffix))
+    header = [include("table_lanes.h" if dialect.prefix else "table.h")] if tables else []
+    return _with_reciprocals(statements), [*header, *tables]
 
 
 def _statements(f, dialect, suffix=""):
-    """Single assignments (target, operation, operands); values are numbered, inputs and outputs are C text."""
+    """Single assignments (target, operation, operands).
+
+    Values are numbered; inputs and outputs are C text.
+    """
     register, statements, values = {}, [], 0
     for k in range(f.n_instructions()):
         operation, source, target = f.instruction_id(k), f.instruction_input(k), f.instruction_output(k)
         if operation == ca.OP_INPUT:
             register[target[0]] = dialect.operand("txp"[source[0]], source[1], suffix)
         elif operation == ca.OP_CONST:
-            register[target[0]] = dialect.constant(f.instruction_constant(k))
+            register[target[0]] = Constant(f.instruction_constant(k))
         elif operation == ca.OP_OUTPUT:
             statements.append((f"y{suffix}[{target[1]}]", ca.OP_ASSIGN, (register[source[0]],)))
         elif _copies(operation, source):
@@ -265,7 +270,7 @@ def _statements(f, dialect, suffix=""):
 def _with_reciprocals(statements):
     """The statements, with products by a reciprocal where `SHARED` or more divisions have the same divisor."""
     divisors = Counter(operands[1] for _, operation, operands in statements if operation == ca.OP_DIV)
-    new = count(len(statements))
+    new = count(1 + max((target for target, _, _ in statements if isinstance(target, int)), default=0))
     reciprocal = {v: next(new) for v, n in divisors.items() if n >= SHARED and isinstance(v, int)}
     result, computed = [], set()
     for target, operation, operands in statements:
@@ -282,7 +287,7 @@ def _with_reciprocals(statements):
 def _line(statement, dialect, value="a"):
     """C line of a statement; a value's name is a letter and its number."""
     target, operation, operands = statement
-    text = dialect.expression(operation, [v if isinstance(v, str) else f"{value}{v}" for v in operands])
+    text = dialect.expression(operation, [_operand_text(v, dialect, value) for v in operands])
     place = target if isinstance(target, str) else f"const {dialect.number} {value}{target}"
     return f"    {place} = {text};\n"
 
@@ -307,6 +312,13 @@ def _cut(statements, chunk):
 
 def _calls(names):
     return "".join(f"    {name}(t, x, p, y, w);\n" for name in names)
+
+
+def _operand_text(operand, dialect, value):
+    """C text of an operand."""
+    if isinstance(operand, Constant):
+        return dialect.constant(operand.value)
+    return operand if isinstance(operand, str) else f"{value}{operand}"
 
 
 def _sharing(names, chunks, of, dialect):
