@@ -1,6 +1,7 @@
 """Tables in C for splines: the numbers of the sums, at the cost of one piece."""
 
 import re
+from copy import copy
 
 import casadi as ca
 import numpy as np
@@ -11,6 +12,9 @@ import servoctl as sv
 from servoctl.codegen import compiler, emit
 from servoctl.codegen import function as functions
 from servoctl.codegen.function import compiled
+from servoctl.jets.pieces import by_pieces
+from servoctl.jets.series import Series
+from servoctl.jets.tape import Tape
 
 T, X, P = ca.SX.sym("t"), ca.SX.sym("x", 2), ca.SX.sym("p", 1)
 RNG = np.random.default_rng(7)
@@ -29,8 +33,6 @@ def linear(s, times):
 
 
 PATHS = {
-    "even": (lambda: sv.paths.spline(T, EVEN, points(EVEN)), EVEN),
-    "natural": (lambda: sv.paths.spline(T, UNEVEN, points(UNEVEN), ends="natural"), UNEVEN),
     "jumping, knots of very different distances": (lambda: linear(T, GROWING), GROWING),
     "far from zero": (lambda: linear(T, EVENTS), EVENTS),
     "along a time law": (
@@ -39,7 +41,7 @@ PATHS = {
         lambda: linear(sv.paths.spline(T, EVEN, 3.0 + points(EVEN, 1), 2), np.linspace(0.0, 6.0, 9)), EVEN),
     "along a state": (lambda: sv.paths.spline(X[0], EVEN, points(EVEN)) * X[1], EVEN),
     "two splines": (
-        lambda: sv.paths.spline(T, EVEN, points(EVEN)) + 3.0 * sv.paths.spline(T, UNEVEN, points(UNEVEN)), EVEN),
+        lambda: sv.paths.spline(T, EVEN, points(EVEN)) + 3.0 * sv.paths.spline(T, UNEVEN, points(UNEVEN), ends="natural"), EVEN),
     "points of parameters": (
         lambda: sv.paths.spline(T, EVEN[:6], [P[0] * c for c in range(6)]) * ca.SX.ones(2), EVEN[:6]),
     "constants that are equal to numbers of values": (
@@ -69,15 +71,12 @@ def test_lookups_equal_the_sums_to_the_last_bit_one_by_one_and_in_lanes(uncontra
     build, knots = PATHS[name]
     path = build()
     f = ca.Function("f", [T, X, P], [ca.densify(ca.vertcat(path, ca.vec(ca.jacobian(path, ca.vertcat(T, X)))))])
-    model, t = compiled(f, "f", ("rk",)), instants(knots)
+    model, t = compiled(f, "f"), instants(knots)
     x = np.array([t[::-1], RNG.normal(size=t.size)])
     expected = np.array([np.asarray(f(*row)).ravel() for row in zip(t, x.T, np.full(t.size, 1.5), strict=True)]).T
-    at, state, parameters, y, call = model.buffer()
-    for k, column in enumerate(expected.T):
-        at[0], state[:], parameters[:] = t[k], x[:, k], 1.5
-        call()
-        np.testing.assert_array_equal(y, column)
-    np.testing.assert_array_equal(compiled(f, "f").grid(t, x, [1.5]), expected)
+    alone = np.hstack([model.grid(t[k : k + 7], x[:, k : k + 7], [1.5]) for k in range(0, t.size, 7)])  # not in lanes
+    np.testing.assert_array_equal(alone, expected)
+    np.testing.assert_array_equal(model.grid(t, x, [1.5]), expected)
     assert ("table_" in model.source()) == (name not in ("points of parameters", "a switch"))
 
 
@@ -117,3 +116,21 @@ def test_a_plan_along_100_points_has_the_forces_of_the_spline():
     expected = 2.0 * curve(run.t, nu=2)
     np.testing.assert_allclose(np.array([run["Fx"], run["Fy"]]).T, expected, atol=1e-8)
     assert compiler.compiler() is None or "table_" in model.function("path").source()
+
+
+def test_series_by_pieces_are_those_of_the_sums():
+    inside = sv.paths.spline(T, UNEVEN, points(UNEVEN), ends="natural")
+    path = ca.vertcat(inside, ca.sin(inside[0]) * (T >= UNEVEN[3]), sum(float(k) * (T >= k) for k in range(9)), ca.exp(-T))
+    tape = Tape([T], path.elements())
+    short = copy(tape)
+    short.nodes = by_pieces(tape, (a for a, _ in tape.switches))
+    t = instants(UNEVEN)[:-3].astype(np.longdouble)
+    results = []
+    for some in (tape, short):
+        series = Series(some, [[t, 1.0, *[0.0] * 5]])
+        for _ in range(6):
+            series.advance()
+        results.append(np.array([[np.broadcast_to(c, t.shape) for c in output] for output in series.outputs]))
+    size = np.abs(results[0]).max(axis=2, keepdims=True)
+    np.testing.assert_allclose(results[1] / (size + 1.0), results[0] / (size + 1.0), atol=1e-13)
+    assert sum(node.kind != "const" for node in short.nodes) < len(tape.nodes) / 4

@@ -14,7 +14,8 @@ from itertools import chain, count
 import casadi as ca
 
 from servoctl.codegen.loops import CONSTANTS, INLINE_SINES, LOOPS, PHASED
-from servoctl.codegen.tables import Constant, Entry, Row, literal, tabulated
+from servoctl.codegen.tables import Entry, Row, literal, tabulated
+from servoctl.jets.pieces import Constant
 
 CHUNK = 350  # statements per C function: compile time is least, and flat, between 250 and 500
 WIDE = 3000  # operations: up to here a function is emitted for eight points at once as well

@@ -11,23 +11,11 @@ from collections import Counter, defaultdict
 from itertools import chain
 from typing import NamedTuple
 
-import casadi as ca
 import numpy as np
 
-FEWEST = 2  # knots from which on a search takes no longer than sums
+from servoctl.jets.pieces import of_all_pieces, operand_values, piecewise_constant
+
 MARGIN = 1e-6  # of a cell of a table: how far rounding may lead beyond its ends
-
-_STEPWISE = {
-    ca.OP_ADD: np.add, ca.OP_SUB: np.subtract, ca.OP_MUL: np.multiply, ca.OP_DIV: np.divide, ca.OP_NEG: np.negative,
-    ca.OP_SQ: np.square, ca.OP_TWICE: lambda a: 2.0 * a, ca.OP_INV: lambda a: 1.0 / a,
-}  # fmt: skip
-
-
-class Constant(NamedTuple):
-    """An operand that is a number."""
-
-    value: float
-
 
 class Row(NamedTuple):
     """The operation that finds the row of a value s in a table, the number of knots that it has reached."""
@@ -65,14 +53,14 @@ def tabulated(statements):
         The same values, of which fewer are computed.
     texts : list of str
     """
-    pieces = _piecewise_constant(statements)
+    pieces = piecewise_constant(statements)
     others = (operands for target, _, operands in statements if target not in pieces)
-    read = {v for operands in others for v in _operands_of(operands) if v in pieces}
+    read = {v for operands in others for v in operand_values(operands) if v in pieces}
     pieces = _shorter(pieces, read)
     if not pieces:
         return statements, []
     columns = defaultdict(dict)
-    for v, column in _of_all_rows(statements, pieces, read.intersection(pieces)):
+    for v, column in of_all_pieces(statements, pieces, read.intersection(pieces)):
         columns[pieces[v][0]][v] = column
     new, texts, lookups = 1 + max(target for target, _, _ in statements if isinstance(target, int)), [], {}
     for row, (s, entries) in enumerate(columns.items(), new):
@@ -93,54 +81,12 @@ def literal(value):
     return f"(-{text})" if math.copysign(1.0, value) < 0 else text
 
 
-def _operands_of(operands):
-    return [v for v in operands if isinstance(v, int)]
-
-
-def _piecewise_constant(statements):
-    """The s and the knots, an array, of each value that is made of constants and of comparisons knot <= s."""
-    source, knots = {}, defaultdict(set)
-    for target, operation, operands in statements:
-        if operation == ca.OP_LE and isinstance(operands[0], Constant) and not isinstance(operands[1], Constant):
-            if operands[1] not in source:
-                source[target] = operands[1]
-                knots[operands[1]].add(operands[0].value)
-        elif operation in _STEPWISE:
-            of = {source.get(v) for v in operands if not isinstance(v, Constant)}
-            if len(of) == 1 and None not in of:
-                source[target] = of.pop()
-    sorted_ = {s: np.array(sorted(some)) for s, some in knots.items() if len(some) >= FEWEST}
-    usable = {s: k for s, k in sorted_.items() if np.isfinite(len(k) / (k[-1] - k[0])) and np.isfinite(k).all()}
-    return {v: (s, usable[s]) for v, s in source.items() if s in usable}
-
-
 def _shorter(pieces, read):
     """Those of each s whose table has no more entries than operations that it replaces."""
     replaced, entries = Counter(s for s, _ in pieces.values()), Counter()
     for s, knots in (pieces[v] for v in read):
         entries[s] += len(knots) + 1
     return {v: (s, knots) for v, (s, knots) in pieces.items() if entries[s] <= replaced[s]}
-
-
-def _of_all_rows(statements, pieces, read):
-    """(value, its numbers on all pieces) of each value that is read; numbers live as long as others need them."""
-    last = {v: k for k, (_, _, operands) in enumerate(statements) for v in _operands_of(operands)}
-    numbers = {}
-    for k, (target, operation, operands) in enumerate(statements):
-        if target not in pieces:
-            continue
-        if operation == ca.OP_LE:
-            knots = pieces[target][1]
-            numbers[target] = 1.0 * (np.arange(len(knots) + 1) > np.searchsorted(knots, operands[0].value))
-        else:
-            arguments = (v.value if isinstance(v, Constant) else numbers[v] for v in operands)
-            with np.errstate(all="ignore"):
-                numbers[target] = _STEPWISE[operation](*arguments)
-        if target in read:
-            yield target, np.broadcast_to(numbers[target], len(pieces[target][1]) + 1)
-        for v in {*_operands_of(operands), target}:
-            if last.get(v, k) <= k:
-                numbers.pop(v, None)
 
 
 def _table(knots, rows):
