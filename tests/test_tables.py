@@ -1,6 +1,9 @@
 """Tables in C for splines: the numbers of the sums, at the cost of one piece."""
 
+import ctypes
 import re
+import shlex
+import subprocess
 from copy import copy
 
 import casadi as ca
@@ -134,3 +137,26 @@ def test_series_by_pieces_are_those_of_the_sums():
     size = np.abs(results[0]).max(axis=2, keepdims=True)
     np.testing.assert_allclose(results[1] / (size + 1.0), results[0] / (size + 1.0), atol=1e-13)
     assert sum(node.kind != "const" for node in short.nodes) < len(tape.nodes) / 4
+
+
+@pytest.mark.parametrize("real", ["double", "float"])
+def test_an_exported_plan_has_the_tables(real, tmp_path, c_compiler):
+    q = sv.coordinates("a")
+    (a,) = q
+    p = sv.parameters(m=2.0)
+    path = sv.paths.spline(q.t, EVEN, points(EVEN, 1)[:, 0])
+    mechanism = sv.Mechanism(q, gibbs=sv.particle(q, p.m, a), actuators={"F": a}, parameters=p)
+    model = sv.derive(mechanism, sv.Program({"X": a - path}, by="actuators"))
+    source, _ = sv.export_c(model, tmp_path, start=model.start(), real=real)
+    strict = "-std=c99 -O1 -Wall -Wextra -Wconversion -Wdouble-promotion -pedantic -Werror -fPIC -shared"
+    library = tmp_path / "model.so"
+    subprocess.run([*shlex.split(compiler.compiler()), *strict.split(), source, "-o", library, "-lm"], check=True)
+    number = ctypes.c_double if real == "double" else ctypes.c_float
+    x, parameters, z, u = (np.zeros(k, number) for k in (2, 1, 3, 1))
+    parameters[:] = 2.0
+    run = sv.simulate(model, model.start(), t_span=(0.0, 6.0), t_eval=np.linspace(0.0, 6.0, 97))
+    step = ctypes.CDLL(str(library)).model_feedforward
+    for t, force in zip(run.t, run["F"], strict=True):
+        assert step(number(t), *(a.ctypes.data_as(ctypes.c_void_p) for a in (x, parameters, z, u))) >= 0
+        assert abs(u[0] - force) < (1e-10 if real == "double" else 1e-3) * np.abs(run["F"]).max()
+    assert source.read_text().count("static double row(") + source.read_text().count("static float row(") == 1

@@ -14,14 +14,14 @@ typedef struct {
 static double row(const Knots *knots, double s)
 {
     const double place = (s - knots->start) * knots->cells_per_second;
-    const int cell = place > 0 ? (place < knots->n ? (int)place : knots->n - 1) : 0;
+    const int cell = place > 0 ? (place < (double)knots->n ? (int)place : knots->n - 1) : 0;
     int low = knots->cells[2 * cell], high = knots->cells[2 * cell + 1];
     while (low < high) {
         const int middle = (low + high) / 2;
         if (knots->at[middle] <= s) low = middle + 1;
         else high = middle;
     }
-    return low;
+    return (double)low;
 }
 
 static double entry(const double *column, int columns, double row) { return column[(int)row * columns]; }
