@@ -77,6 +77,8 @@ class Dialect:
         Whether all lanes share p, an array of ``double``.
     linkage : str
         Linkage of the function and of its chunks; without one, the chunks are static and not inlined.
+    exact : bool
+        Whether the operations are those of CasADi, one by one, without shared reciprocals.
     """
 
     number: str = "double"
@@ -85,6 +87,7 @@ class Dialect:
     forms: dict = field(default_factory=dict)
     common: bool = False
     linkage: str = ""
+    exact: bool = False
 
     def constant(self, value):
         """A number as C text, exactly."""
@@ -119,6 +122,7 @@ class Dialect:
 
 
 SCALAR = Dialect(forms=_FORMS_OF_ONE)
+EXACT = Dialect(forms=_FORMS_OF_ONE, exact=True)
 SCALAR_INLINE = Dialect(forms=_FORMS_OF_ONE | {"sin": "s_sin({0})", "cos": "s_cos({0})"})
 PORTABLE = Dialect(forms=_FORMS_OF_ONE, linkage="static ")
 WIDE_LANES = Dialect("W", "ALL({})", "w_")
@@ -190,6 +194,12 @@ def emit(f, name, loops=(), *, project=None, others=None, sizes=None, wide=True,
     return "".join((SCALAR_FASTER if "taylor" in loops else "", unit(constants), *parts, *map(include, files)))
 
 
+def emit_builtin(f, name):
+    """C translation unit of the builtin function of Python ``name``, with the operations of CasADi, one by one."""
+    constants = {"NAME": name, "NX": f.numel_in(1), "NP": f.numel_in(2), "NY": f.numel_out(0)}
+    return "".join((unit(constants), function(f, name, EXACT), include("builtin.c")))
+
+
 def unit(constants):
     """Head of a translation unit: #define lines of constants by name, and `unit.h`."""
     lines = (f"#define {key} {value}\n" for key, value in (CONSTANTS | constants).items())
@@ -231,18 +241,22 @@ def phases(f, name, step, dialect=SCALAR, chunk=CHUNK):
     return f"{''.join(tables)}\n#define WORK {size}\n{text}{all_three}"
 
 
-def function_of_two(f, name, dialect):
-    """C text of y = f(t, x, p) and y2 = f(t, x2, p2), with alternating statements: the processor overlaps the two."""
-    (one, tables), (two, _) = (_prepared(f, dialect, suffix) for suffix in ("", "2"))
-    lines = ((_line(a, dialect), _line(b, dialect, "b")) for a, b in zip(one, two, strict=True))
-    return "".join((*tables, dialect.head(name, ("", "2")), *chain.from_iterable(lines), "}\n"))
+def function_of_several(f, name, dialect, suffixes):
+    """C text of y = f(t, x, p) for each suffix of x, p, y, with alternating statements: the processor overlaps them."""
+    copies, tables = zip(*(_prepared(f, dialect, suffix) for suffix in suffixes), strict=True)
+    lines = (
+        _line(statement, dialect, f"a{suffix}_")
+        for statements in zip(*copies, strict=True)
+        for suffix, statement in zip(suffixes, statements, strict=True)
+    )
+    return "".join((*tables[0], dialect.head(name, suffixes), *lines, "}\n"))
 
 
 def _prepared(f, dialect, suffix=""):
     """The statements of a function, with lookups and reciprocals, and C texts of what the lookups need."""
     statements, tables = tabulated(_statements(f, dialect, suffix))
     header = [include("table_lanes.h" if dialect.prefix else "table.h")] if tables else []
-    return _with_reciprocals(statements), [*header, *tables]
+    return statements if dialect.exact else _with_reciprocals(statements), [*header, *tables]
 
 
 def _statements(f, dialect, suffix=""):
