@@ -21,7 +21,7 @@ SAME_INSTANT = 1e-9  # switches closer than this fraction of the time from first
 NEAR_ZERO = 0.5  # of the values beside it: a parabola's least value below this is looked at closely
 WIDE, NARROW = 1e-4, 1e-7  # distances of far and close series from an instant, relative to its neighbourhood
 JUMP = 1e-6  # jumps below this fraction of the largest value of a derivative nearby are rounding errors
-ROUNDED = 1e-12  # of the values: what differs by no more within a neighbourhood is rounding, as in a spline's equations
+BY_ROUNDING = 1e-12  # of the values: what differs by no more within a neighbourhood is rounding, as of splines
 STAYS = 0.5  # a jump keeps more than this fraction of its size from far to close series; other differences shrink
 AROUND = np.delete(np.linspace(-1.0, 1.0, 41), 20)  # places in the neighbourhood for the size of a derivative
 EXTRA = 4  # additional coefficients for shifting series to the instant itself
@@ -269,7 +269,7 @@ class Switches:
                 wide = jump(c[:, 0, i], c[:, 1, i], far[i])
                 narrow = jump(c[:, 2, i], c[:, 3, i], close[i])
                 least = np.maximum(JUMP * np.abs(c[:, :, i]).max(axis=1), np.nan_to_num(STAYS * np.abs(wide)))
-                least = np.maximum(least, ROUNDED * np.abs(c[0, :, i]).max() / near[i] ** np.arange(len(c)))
+                least = np.maximum(least, BY_ROUNDING * np.abs(c[0, :, i]).max() / near[i] ** np.arange(len(c)))
                 rough = np.flatnonzero(np.abs(narrow) > least)
                 if rough.size and rough[0] <= needs.get(name, -1):
                     result.setdefault(name, []).append((when, int(rough[0]) - 1))
