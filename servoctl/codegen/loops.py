@@ -32,6 +32,7 @@ CONSTANTS = {  # that C needs by name
 
 LOOPS = ("rk", "newton", "taylor", "radau", "closed", "law")  # files of these names; rk.c defines NAME_rk
 INLINE_SINES = {"radau", "closed", "law"}  # loops with inlined sin and cos, within 2 units in the last place
+PHASED = frozenset({"rk", "newton", "radau"})  # loops that evaluate at one instant again and again
 
 SOURCES = Path(__file__).with_name("c")
 

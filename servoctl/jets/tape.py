@@ -47,7 +47,9 @@ _NUMPY["erf"] = _erf
 
 
 def apply(name, *args):
-    """The function `name` of SX expressions, or of numbers and arrays."""
+    """The function `name` of SX expressions, or of numbers and arrays; `name` may be a function of arrays itself."""
+    if callable(name):
+        return name(*args)
     functions = _CASADI if any(isinstance(a, ca.SX) for a in args) else _NUMPY
     return functions[name](*args)
 

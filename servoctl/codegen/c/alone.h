@@ -5,6 +5,7 @@
 #define NY 13
 #define PROJECTED
 #define WIDE
+#define WORK 8
 
 #define CORRECTIONS 30
 #define CORRECTED 1e-13
@@ -72,10 +73,17 @@ DECLARED(example, double)
 DECLARED(example_project, double)
 DECLARED(example_jacobian, double)
 DECLARED(example_wide, W)
-DECLARED(example_wide_step, W)
 DECLARED(expansion, W)
 DECLARED(numbers, W)
 DECLARED(change, W)
+#define PHASE(name, number) \
+    void name(number t, const number *restrict x, const number *restrict p, number *restrict y, number *restrict w);
+PHASE(example_instant, double)
+PHASE(example_correction, double)
+PHASE(example_rest, double)
+PHASE(example_wide_instant, W)
+PHASE(example_wide_correction, W)
+PHASE(example_wide_rest, W)
 void law(W t, const W *restrict x, const double *restrict p, W *restrict y);
 void signals(W t, const W *restrict x, const double *restrict p, W *restrict y);
 void rates_of_block(W t, const W *const x[], const W *const p[], W (*y)[NX + 1]);
