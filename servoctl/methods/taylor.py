@@ -12,6 +12,8 @@ import casadi as ca
 import numpy as np
 
 from servoctl.codegen.function import Compiled, compiled
+from servoctl.errors import SingularProgram
+from servoctl.jets.identity import spread, vanish
 from servoctl.jets.series import Motion, Series, is_zero, over, shifted
 from servoctl.jets.tape import Tape
 from servoctl.methods.choice import Project
@@ -20,7 +22,7 @@ from servoctl.methods.motion import Stepping
 from servoctl.methods.narrow import arguments, centres
 from servoctl.methods.watch import RESOLUTION, End, net, steps_of
 from servoctl.reduction.cascade import Running
-from servoctl.reduction.ranks import clean, eliminate
+from servoctl.reduction.ranks import clean, eliminate, noting_dropped, pivot_columns
 
 LOWEST, HIGHEST = 4, 24  # orders: below, steps are too short; above, compiling grows faster than steps
 INSIDE = np.array([0.07, 0.19, 0.34, 0.53, 0.71, 0.86, 0.98])  # parts of a step at which its series is checked
@@ -91,12 +93,10 @@ class _Motion(Motion):
     def __init__(self, equations):
         super().__init__(equations.q)
         self.top, self.branch = equations.top, ca.SX.sym("t_branch")
-        self.gamma = {k: [s / factorial(k) for s in self.q.gamma(k)] for k in range(1, self.top)}
+        self.gamma = {}
         self.coordinates = {0: list(self.q)}
         moving = (self.q.V @ ca.vertcat(*self.q.gamma(1)) + self.q.h).elements()
         self.kinematics = None if self.q.plain else _Group(self, 1, range(self.q.nq), moving)
-        for k in range(1, self.top):
-            self._move(k)
 
     def _move(self, k):
         """q_[k] from q' = V w + h."""
@@ -105,9 +105,10 @@ class _Motion(Motion):
         else:
             self.coordinates[k] = [c if is_zero(c) else over(c, k) for c in self.kinematics.advance(k)]
 
-    def guess(self, k):
-        """Set γ_[k] = 0, and q_[k] with it."""
-        self.gamma[k] = [0.0] * self.q.n
+    def guess(self, k, solved):
+        """Set γ_[k] to that of the state, and to zero where it is solved for, and q_[k] with it."""
+        state = (s / factorial(k) for s in self.q.gamma(k)) if k < self.top else [0.0] * self.q.n
+        self.gamma[k] = [0.0 if i in solved else s for i, s in enumerate(state)]
         self._move(k)
 
     def settle(self, k, gamma):
@@ -125,6 +126,66 @@ class _Motion(Motion):
 
     def velocity(self, i, level, j):
         return shifted(self.gamma[level + j][i], level, j)
+
+
+def solved_for(equations):
+    """Velocities that rows determine: for each level below s̄ indices of rows, and of the entries of γ^(k) they give.
+
+    A row of order k or less is linear in γ^(k). Those entries are not integrated: what is integrated satisfies the row
+    with the tolerance, what is solved for to rounding. They are chosen so that all pivots are constant or watched.
+    """
+    r, solved = equations.r, {}
+    for k in range(1, equations.top if r.cascade is None else 1):
+        rows = [a for a, row in enumerate(r.rows) if row.order + (not row.affine) <= k]
+        matrix = r.leading[rows, :]
+        numbers = clean(*r.points.matrix(matrix))
+        try:
+            columns = pivot_columns(matrix, numbers)
+            with noting_dropped() as entries:
+                _, pivots = eliminate(matrix[:, columns], ca.SX(len(rows), 0), numbers[:, columns])
+        except SingularProgram:
+            continue
+        if rows and not entries and all(_watched(pivot, equations) for pivot in pivots):
+            solved[k] = rows, columns
+    return solved
+
+
+def _watched(pivot, equations):
+    """Whether a pivot is constant, or equals one that is watched up to its sign."""
+    others = [other for _, other in equations.all_pivots]
+    return not ca.symvar(pivot) or any(vanish(v) for o in others for v in spread([pivot - o, pivot + o]))
+
+
+class _Rows:
+    """The rows of a reduction along a motion, whose coefficients they give index by index."""
+
+    def __init__(self, equations):
+        self.r, self.top, self.motion = equations.r, equations.top, _Motion(equations)
+        self.solved, self.groups = solved_for(equations), []
+        for order in sorted({row.order for row in self.r.rows}):
+            members = [a for a, row in enumerate(self.r.rows) if row.order == order]
+            self.groups.append(_Group(self.motion, order, members, [self.r.rows[a].expression for a in members]))
+
+    def advance(self, k):
+        """γ_[k]: below s̄ from the state and the rows that determine a part of it, from s̄ on from all rows."""
+        every = range(len(self.r.rows))
+        rows, columns = self.solved.get(k, ([], [])) if k < self.top else (every, every)
+        groups, right = [group for group in self.groups if group.order <= k], {}
+        if k:
+            self.motion.guess(k, columns)
+        for group in groups:
+            scale = -factorial(k - group.order) / factorial(k)
+            right |= {a: ca.SX(c) * scale for a, c in zip(group.members, group.advance(k), strict=True)}
+        if len(rows):
+            matrix = self.r.leading[list(rows), list(columns)]
+            numbers = clean(*self.r.points.matrix(matrix))
+            solution, _ = eliminate(matrix, ca.vertcat(*(right[a] for a in rows)), numbers)
+            gamma = list(self.motion.gamma[k])
+            for i, x in zip(columns, solution.elements(), strict=True):
+                gamma[i] = 0.0 if x.is_zero() else x
+            self.motion.settle(k, gamma)
+            for group in groups:
+                group.correct(k)
 
 
 def taylor_coefficients(equations, last):
@@ -146,26 +207,10 @@ def taylor_coefficients(equations, last):
     if r.cascade is not None:
         motion = r.cascade.along(r.points, equations.top - 1, last, running=_InBlock)
         return _coefficients(equations, motion.place, motion.gamma, last, _InBlock.instant)
-    motion = _Motion(equations)
-    groups = []
-    for order in sorted({row.order for row in r.rows}):
-        members = [a for a, row in enumerate(r.rows) if row.order == order]
-        groups.append(_Group(motion, order, members, [r.rows[a].expression for a in members]))
-        for k in range(order, equations.top):
-            groups[-1].advance(k)
-    numbers = clean(*r.points.matrix(r.leading))
-    for k in range(equations.top, last + 1):
-        motion.guess(k)
-        right = [None] * q.n
-        for group in groups:
-            scale = -factorial(k - group.order) / factorial(k)
-            for a, c in zip(group.members, group.advance(k), strict=True):
-                right[a] = ca.SX(c) * scale
-        solution, _ = eliminate(r.leading, ca.vertcat(*right), numbers)
-        motion.settle(k, [0.0 if x.is_zero() else x for x in solution.elements()])
-        for group in groups:
-            group.correct(k)
-    return _coefficients(equations, motion.coordinates, motion.gamma, last, motion.branch)
+    rows = _Rows(equations)
+    for k in range(last + 1):
+        rows.advance(k)
+    return _coefficients(equations, rows.motion.coordinates, rows.motion.gamma, last, rows.motion.branch)
 
 
 def _coefficients(equations, coordinates, gamma, last, instant):
@@ -174,6 +219,24 @@ def _coefficients(equations, coordinates, gamma, last, instant):
     coefficients += [ca.SX(c) for k in range(1, last + 1) for c in gamma[k]]
     outputs = [*coefficients, *(g for _, g in equations.pivots)]
     return equations.function("taylor", equations.state, outputs, instant)
+
+
+def settled(equations):
+    """The state with the velocities that rows determine, as a function of (t, X, p) as in `taylor_coefficients`.
+
+    Parameters
+    ----------
+    equations : Equations
+
+    Returns
+    -------
+    casadi.Function
+    """
+    rows = _Rows(equations)
+    for k in range(equations.top):
+        rows.advance(k)
+    velocities = [ca.SX(c) * float(factorial(k)) for k in range(1, equations.top) for c in rows.motion.gamma[k]]
+    return equations.function("settled", equations.state, [*equations.q, *velocities], rows.motion.branch)
 
 
 def series_loop(model, last):
@@ -192,9 +255,13 @@ def series_loop(model, last):
 
     def build():
         e, q = model.equations, model.reduction.mechanism.q
-        sizes = {"nq": q.nq, "n": q.n, "top": e.top, "last": last, "plain": int(q.plain)}
+        solved = solved_for(e)
+        sizes, others = {"nq": q.nq, "n": q.n, "top": e.top, "last": last, "plain": int(q.plain)}, {}
+        if solved:
+            free = (int(i not in solved.get(k, ((), ()))[1]) for k in range(1, e.top) for i in range(q.n))
+            sizes, others = sizes | {"free": tuple(free)}, {"settled": settled(e)}
         f = taylor_coefficients(e, last)
-        return compiled(f, f"taylor_{last}", ("taylor",), project=e.project(), sizes=sizes)
+        return compiled(f, f"taylor_{last}", ("taylor",), project=e.project(), others=others, sizes=sizes)
 
     return model.once(f"taylor {last}", build)
 
@@ -261,7 +328,7 @@ class TaylorSteps(Stepping):
         until = b
         while a != b and self.motion.stop is None:
             rows = self.f.taylor(a, x, until, self.p, *self.tolerances, self.most, self.every)
-            log = _Log(self.f, self.n_x, rows)
+            log = _Log(self.f, self.n_x, self.p, rows)
             taken, good = len(rows) - 1, self._believed(log, abs(b - a))
             if good < taken:
                 until = (log.t[good] + log.t[good + 1]) / 2  # the next step ends there
@@ -288,7 +355,7 @@ class TaylorSteps(Stepping):
                 self._fail(a, x, "its steps vanish or are not finite")
         if len(times) and self.motion.stop is None:
             row = np.concatenate([[a], x, self._outputs(a, x)])
-            self._sample(_Log(self.f, self.n_x, np.array([row, row])), times, a)
+            self._sample(_Log(self.f, self.n_x, self.p, np.array([row, row])), times, a)
         return a, x
 
     def _believed(self, log, span):
@@ -361,6 +428,7 @@ class _Log:
 
     f: Compiled
     n_x: int
+    p: np.ndarray
     rows: np.ndarray
 
     @property
@@ -384,4 +452,4 @@ class _Log:
 
     def jets(self, k, t, top):
         """Jets q, γ', ..., γ^(top) at times t (N,) in the steps k (N,), (nq + top n, N)."""
-        return self.f.jets(self.rows, k, t, top)
+        return self.f.jets(self.rows, k, t, self.p, top)

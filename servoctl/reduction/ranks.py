@@ -276,6 +276,25 @@ def eliminate(matrix, right, numbers):
     return ca.vertcat(*(row[0] for row in solution)), pivots
 
 
+def pivot_columns(matrix, numbers):
+    """Columns of a matrix with more columns than rows that can be solved for, sparse ones first, (m,) list of int.
+
+    Parameters
+    ----------
+    matrix : (m, n) SX
+    numbers : (m, n, N) array
+        It at N points, cleaned of rounding.
+
+    Raises
+    ------
+    SingularProgram
+        If no columns are regular at all points.
+    """
+    system = _System(matrix, ca.SX(matrix.shape[0], 0), numbers)
+    with np.errstate(all="ignore"):
+        return sorted(system.step()[1] for _ in range(matrix.shape[0]))
+
+
 class _System:
     """A system under elimination.
 
@@ -300,7 +319,7 @@ class _System:
             [right[i, :].elements() for i in range(n)] if right.shape[1] != 1 else [[b] for b in right.elements()]
         )
         self.open = dict.fromkeys(range(n))
-        self.members = [{} for _ in range(n)]
+        self.members = [{} for _ in range(matrix.shape[1])]
         for i, row in enumerate(self.rows):
             for j in row:
                 self.members[j][i] = None

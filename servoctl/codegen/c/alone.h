@@ -27,6 +27,8 @@
 #define TOP 2
 #define LAST 4
 #define PLAIN 1
+#define FREE {1, 1}
+#define SETTLED
 
 /* many.c */
 #define DEGRADED 0.02
@@ -54,6 +56,7 @@
     void name(number t, const number *restrict x, const number *restrict p, number *restrict y);
 DECLARED(example, double)
 DECLARED(example_project, double)
+DECLARED(example_settled, double)
 DECLARED(example_jacobian, double)
 DECLARED(example_wide, W)
 DECLARED(example_wide_step, W)
