@@ -51,7 +51,7 @@ def test_compiled_and_interpreted_steps_are_the_same(name, span, gallery_model, 
     t = np.linspace(*span, 41)
     k = np.clip(np.searchsorted(abs(log[:, 0] - span[0]), abs(t - span[0]), "right") - 1, 0, len(log) - 2)
     z, other = f.jets(log, k, t, p, top + 2), np.empty((model.nq + (top + 2) * model.n, 41))
-    f._interpreter.jets(log, k, t, p, top + 2, other)
+    f._interpreter.jets(log, k, t, p, (top + 2, n_x), other)
     np.testing.assert_allclose(z, other, rtol=1e-12, atol=1e-12 * np.abs(other).max())
     ends = f.jets(log, np.arange(len(log) - 1), log[1:, 0], p, top - 1)
     np.testing.assert_allclose(ends, log[1:, 1 : 1 + n_x].T, rtol=1e-12, atol=1e-12)

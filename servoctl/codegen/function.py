@@ -42,8 +42,8 @@ def compiled(f, name, loops=(), project=None, others=None, sizes=None):
     sizes : dict of str to int or tuple of int, optional
         Constants of the loops. That of "newton": the number of "pivots" (default: 0). Those of "taylor": the numbers
         of coordinates "nq" and of quasi-velocities "n", the order s̄ "top", the highest index of coefficients "last",
-        "plain" (1 if q' = γ', else 0), and, beside a function "settled" of `others`, (t, x, p) -> x, "free":
-        a tuple of 0 for each entry of γ', ..., γ^(s̄-1) that this function gives, of 1 for those that are integrated.
+        "plain" (1 if q' = γ', else 0), and, beside a function "settled" of `others`, (t, x, p) -> (x, γ^(s̄)),
+        "free": a tuple of 0 for each entry of γ', ..., γ^(s̄-1) that this function gives, of 1 for those integrated.
 
     Returns
     -------
@@ -409,7 +409,7 @@ class Compiled:
         every = project_every if self._project is not None else 0
         return self._library.taylor(t1, rtol, atol, every, max_steps)
 
-    def jets(self, log, k, t, p, levels):
+    def jets(self, log, k, t, p, levels, by_rows=False):
         """The jets q, γ', ..., γ^(levels) at instants within the steps of `taylor`.
 
         Parameters
@@ -424,6 +424,8 @@ class Compiled:
             Parameters, SI.
         levels : int
             At least s̄ - 1, and below ``sizes["last"]``.
+        by_rows : bool
+            Whether "settled" gives γ^(s̄), too, if the series has it; levels must then include it.
 
         Returns
         -------
@@ -431,7 +433,9 @@ class Compiled:
         """
         k, t = np.ascontiguousarray(k, dtype=np.int64), np.ascontiguousarray(t, dtype=float)
         z = np.empty((self.sizes["nq"] + levels * self.sizes["n"], t.size))
-        self._library.jets(np.ascontiguousarray(log), k, t, self._array("p", p, self._p_shape), levels, z)
+        p = self._array("p", p, self._p_shape)
+        settled = self.n_x + by_rows * self.sizes["n"]
+        self._library.jets(np.ascontiguousarray(log), k, t, p, (levels, settled), z)
         return z
 
     def restore(self, t, x, p):

@@ -170,9 +170,10 @@ class Interpreter:
                 x = self._restore(t, self._settle(t, x, p), p)
         return np.array([*rows, np.concatenate([[t], x, np.zeros(len(self.workspace.row[3]))])])
 
-    def jets(self, log, k, t, p, levels, z):
+    def jets(self, log, k, t, p, counts, z):
         """Fill z with the jets at times t in the steps k of a log; see `Compiled.jets`."""
         nq, n, last, plain = (self._sizes[key] for key in ("nq", "n", "last", "plain"))
+        levels, settled = counts
         x, y = log[k, 1 : 1 + nq], log[k, 1 + self._n_x :]
         of_q = y[:, : nq * last].reshape(-1, last, nq)
         c = of_q if plain else y[:, nq * last : (nq + n) * last].reshape(-1, last, n)
@@ -181,7 +182,9 @@ class Interpreter:
         for j in range(1, levels + 1):
             z[nq + (j - 1) * n : nq + j * n] = jet(c, j, h).T
         if self._settled is not None:
-            self._settling.grid(t, z[: self._n_x].copy(), p, z[: self._n_x])
+            rows = np.empty((self._settled.numel_out(0), t.size))
+            self._settling.grid(t, z[: self._n_x], p, rows)
+            z[:settled] = rows[:settled]
 
     @functools.cached_property
     def _settling(self):
@@ -189,7 +192,7 @@ class Interpreter:
 
     def _settle(self, t, x, p):
         """The state with the rates that rows determine."""
-        return x if self._settled is None else self._settling._value(t, x, p)
+        return x if self._settled is None else self._settling._value(t, x, p)[: self._n_x]
 
     def _restore(self, t, x, p):
         return restored(self._project, t, x, p)

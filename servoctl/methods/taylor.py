@@ -222,7 +222,9 @@ def _coefficients(equations, coordinates, gamma, last, instant):
 
 
 def settled(equations):
-    """The state with the velocities that rows determine, as a function of (t, X, p) as in `taylor_coefficients`.
+    """The state with the velocities that rows determine, and γ^(s̄), as a function of (t, X, p).
+
+    Near the end of a step the series of these velocities errs more than what is integrated, its derivatives even more.
 
     Parameters
     ----------
@@ -233,10 +235,10 @@ def settled(equations):
     casadi.Function
     """
     rows = _Rows(equations)
-    for k in range(equations.top):
+    for k in range(equations.top + 1):
         rows.advance(k)
-    velocities = [ca.SX(c) * float(factorial(k)) for k in range(1, equations.top) for c in rows.motion.gamma[k]]
-    return equations.function("settled", equations.state, [*equations.q, *velocities], rows.motion.branch)
+    gamma = [ca.SX(c) * float(factorial(k)) for k in range(1, equations.top + 1) for c in rows.motion.gamma[k]]
+    return equations.function("settled", equations.state, [*equations.q, *gamma], rows.motion.branch)
 
 
 def series_loop(model, last):
@@ -417,7 +419,7 @@ class TaylorSteps(Stepping):
         due = direction * pending <= direction * end
         times = pending[due]
         if len(times):
-            parts = log.jets(steps_of(t, times), times, self.jets)
+            parts = log.jets(steps_of(t, times), times, self.jets, by_rows=True)
             self.motion.add(self.model, times, parts[: self.n_x], parts[self.n_x :])
         return pending[~due]
 
@@ -450,6 +452,6 @@ class _Log:
         """The first steps alone."""
         return replace(self, rows=self.rows[: count + 1])
 
-    def jets(self, k, t, top):
-        """Jets q, γ', ..., γ^(top) at times t (N,) in the steps k (N,), (nq + top n, N)."""
-        return self.f.jets(self.rows, k, t, self.p, top)
+    def jets(self, k, t, top, by_rows=False):
+        """Jets q, γ', ..., γ^(top) at times t (N,) in the steps k (N,), (nq + top n, N); see `Compiled.jets`."""
+        return self.f.jets(self.rows, k, t, self.p, top, by_rows)

@@ -35,7 +35,7 @@ static inline double rough_log2(double a)
 /* Put the rates that rows determine into a state. */
 static inline void settle(double t, double *x, const double *p)
 {
-    double all[NX + 1];
+    double all[NX + N];
     FN(settled)(t, x, p, all);
     for (int64_t i = NQ; i < NX; i++) if (!IS_FREE(i - NQ)) x[i] = all[i];
 }

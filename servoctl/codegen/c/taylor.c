@@ -98,9 +98,10 @@ int64_t FN(taylor)(const Steps *s)
 }
 
 /* The jets q, gamma', ..., gamma^(levels) at n instants t in the steps k of a log, row by row, one column per instant.
-   The lanes of a vector are consecutive instants of one step. */
+   The lanes of a vector are consecutive instants of one step. Of the first `settled` jets those that rows determine are
+   theirs. */
 void FN(taylor_jets)(const double *log, int64_t n, const int64_t *k, const double *t, const double *p, int64_t levels,
-                     double *jets)
+                     int64_t settled, double *jets)
 {
     double factor[LAST + 1];
     for (int64_t j = 0; j <= levels; j++) {
@@ -123,12 +124,12 @@ void FN(taylor_jets)(const double *log, int64_t n, const int64_t *k, const doubl
     }
 #ifdef SETTLED
     for (int64_t at = 0; at < n; at++) {
-        double x[NX];
+        double x[NX + 1], all[NX + N];
         for (int64_t i = 0; i < NX; i++) x[i] = jets[i * n + at];
-        settle(t[at], x, p);
-        for (int64_t i = NQ; i < NX; i++) jets[i * n + at] = x[i];
+        FN(settled)(t[at], x, p, all);
+        for (int64_t i = NQ; i < settled; i++) jets[i * n + at] = all[i];
     }
 #else
-    (void)p;
+    (void)p, (void)settled;
 #endif
 }
