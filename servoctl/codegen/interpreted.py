@@ -157,6 +157,7 @@ class Interpreter:
             of_rates = (longest(level[i], c[:, i], j, rtol, atol) for j, (level, i) in enumerate(levels, 1))
             h = 2.0 ** min(longest(x[:nq], of_q, 0, rtol, atol), *of_rates)
             if not h > 1e-13 * (1 + abs(t)):
+                x = self._settle(t, x, p)
                 break
             x[nq:][~free.ravel()] = np.concatenate([jet(c, j, 0.0) for j in range(1, top)])[~free.ravel()]
             ends = h >= abs(t1 - t) * (1 - 1e-12)

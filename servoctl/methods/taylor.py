@@ -13,6 +13,7 @@ import numpy as np
 
 from servoctl.codegen.function import Compiled, compiled
 from servoctl.errors import SingularProgram
+from servoctl.jets.factors import constants_outside
 from servoctl.jets.identity import spread, vanish
 from servoctl.jets.series import Motion, Series, is_zero, over, shifted
 from servoctl.jets.tape import Tape
@@ -61,7 +62,8 @@ class _Group:
         self.motion, self.order, self.members = motion, order, members
         self.symbols = ca.symvar(ca.vertcat(*expressions))
         self.inputs = [[] for _ in self.symbols]
-        tape = Tape(self.symbols, expressions)
+        constants = {i for i, symbol in enumerate(self.symbols) if motion.q.where(symbol) is None}
+        tape = constants_outside(Tape(self.symbols, expressions), constants)
         self.series = _Branches(tape, self.inputs, _decided(motion.q, self.symbols, tape, motion.branch))
 
     def advance(self, k):
@@ -97,13 +99,19 @@ class _Motion(Motion):
         self.coordinates = {0: list(self.q)}
         moving = (self.q.V @ ca.vertcat(*self.q.gamma(1)) + self.q.h).elements()
         self.kinematics = None if self.q.plain else _Group(self, 1, range(self.q.nq), moving)
+        places = [self.q.where(e) if e.is_symbolic() else None for e in moving]
+        self.velocities = {i: place[2] for i, place in enumerate(places) if place and place[0] == "w"}  # q_i' = γ_j'
 
     def _move(self, k):
         """q_[k] from q' = V w + h."""
-        if self.q.plain:
-            self.coordinates[k] = self.gamma[k]
-        else:
-            self.coordinates[k] = [c if is_zero(c) else over(c, k) for c in self.kinematics.advance(k)]
+        self._place(k, self.gamma[k] if self.q.plain else self.kinematics.advance(k))
+
+    def _place(self, k, rates):
+        """Set q_[k] from coefficient k - 1 of q', or γ_[k] itself."""
+        coordinates = [c if is_zero(c) or self.q.plain else over(c, k) for c in rates]
+        for i, j in self.velocities.items():
+            coordinates[i] = self.gamma[k][j]
+        self.coordinates[k] = coordinates
 
     def guess(self, k, solved):
         """Set γ_[k] to that of the state, and to zero where it is solved for, and q_[k] with it."""
@@ -113,13 +121,11 @@ class _Motion(Motion):
 
     def settle(self, k, gamma):
         """Set γ_[k] to the solution, and q_[k] with it."""
-        self.gamma[k] = gamma
-        if self.q.plain:
-            self.coordinates[k] = gamma
-        else:
+        self.gamma[k], rates = gamma, gamma
+        if not self.q.plain:
             self.kinematics.correct(k)
-            latest = (c[-1] for c in self.kinematics.series.outputs)
-            self.coordinates[k] = [c if is_zero(c) else over(c, k) for c in latest]
+            rates = [c[-1] for c in self.kinematics.series.outputs]
+        self._place(k, rates)
 
     def coordinate(self, i, j):
         return self.coordinates[j][i]

@@ -334,7 +334,10 @@ class _System:
         return [(j, size) for j, size in zip(row, sizes, strict=True) if size >= least and size > 0.0]
 
     def step(self):
-        """Eliminate by the pivot with the least fill-in, and return its row and column."""
+        """Eliminate by the pivot with the least fill-in, and return its row and column.
+
+        Among these a number is taken, if there is one: it cannot vanish, and less depends on it.
+        """
         i, j = self._pivot()
         row = self.rows[i]
         del self.open[i]
@@ -351,9 +354,11 @@ class _System:
         for i in self.open:
             fill = len(self.rows[i]) - 1
             for j, size in self.candidates[i]:
-                key = (fill * (len(self.members[j]) - 1), -size)
-                if least is None or key < least:
-                    least, place = key, (i, j)
+                new = fill * (len(self.members[j]) - 1)
+                if least is None or new <= least[0]:
+                    key = (new, not self.rows[i][j][0].is_constant(), -size)
+                    if least is None or key < least:
+                        least, place = key, (i, j)
         if place is None:
             raise SingularProgram(
                 "A system of equations is singular at the points where its pivots are chosen.",

@@ -166,6 +166,8 @@ void FN(many)(Many *m, int64_t first, int64_t last)
         W h = forward * w_select(ends, left, h_long);
         for (int64_t i = 0; i < NX; i++) {
             const int64_t j = i < NQ ? 0 : 1 + (i - NQ) / N;
+            x[i] = s.x[i];
+            if (j && !IS_FREE(i - NQ)) continue; /* rows determine it in the next expansion */
             const W part = j ? w_series(c, N, (i - NQ) % N, j, h) : w_series(s.y, NQ, i, 0, h);
             x[i] = j ? part : s.x[i] + part;
         }

@@ -34,7 +34,8 @@ static inline double length(const double *x, const double *c, int64_t n, int64_t
     return shortest;
 }
 
-/* The state a time h after the expansion: x_j = sum over k of k!/(k - j)! c_[k] h^(k - j); y holds the coefficients. */
+/* The state a time h after the expansion: x_j = sum over k of k!/(k - j)! c_[k] h^(k - j); y holds the coefficients.
+   Rates that rows determine are left to these. */
 static inline void move(const double *x, const double *y, const double *c, double h, double *x_next)
 {
     double jet[NX + 1] = {0};
@@ -42,11 +43,13 @@ static inline void move(const double *x, const double *y, const double *c, doubl
         for (int64_t i = 0; i < NQ; i++) jet[i] = jet[i] * h + y[(k - 1) * NQ + i];
         for (int64_t j = 1; j < TOP && j <= k; j++) {
             double *level = jet + NQ + (j - 1) * N;
-            for (int64_t i = 0; i < N; i++) level[i] = level[i] * h + falling(k, j) * c[(k - 1) * N + i];
+            for (int64_t i = 0; i < N; i++) {
+                if (IS_FREE((j - 1) * N + i)) level[i] = level[i] * h + falling(k, j) * c[(k - 1) * N + i];
+            }
         }
     }
     for (int64_t i = 0; i < NQ; i++) x_next[i] = x[i] + jet[i] * h;
-    for (int64_t i = NQ; i < NX; i++) x_next[i] = jet[i];
+    for (int64_t i = NQ; i < NX; i++) x_next[i] = IS_FREE(i - NQ) ? jet[i] : x[i];
 }
 
 /* Steps from the start (t, x, p) towards t1: at most max_steps, which may be projected. The log has a row (t, x, y) for
@@ -80,7 +83,10 @@ int64_t FN(taylor)(const Steps *s)
             log_h = of_level < log_h ? of_level : log_h;
         }
         const double h = exp2(log_h);
-        if (!(h > 1e-13 * (1 + fabs(t)))) return step;
+        if (!(h > 1e-13 * (1 + fabs(t)))) {
+            settle(t, x, p);
+            return step;
+        }
         for (int64_t i = 0; i < N * (TOP - 1); i++) {
             if (!IS_FREE(i)) x[NQ + i] = falling(1 + i / N, 1 + i / N) * c[i];
         }
