@@ -288,7 +288,7 @@ def rough_log2(a):
 
 
 def longest(level, c, j, rtol, atol):
-    """log2 of the step at which the last term of level j of the state, whose coefficients are c (last, n), is in tolerance.
+    """log2 of the step at which the last term of a level j of the state is in tolerance; c (last, n) are coefficients.
 
     Terms are taken to grow as the fastest of four of them.
     """

@@ -6,7 +6,7 @@ motion by one solve with the same L.
 """
 
 from dataclasses import dataclass, replace
-from math import factorial
+from math import factorial, perm
 
 import casadi as ca
 import numpy as np
@@ -209,7 +209,7 @@ def taylor_coefficients(equations, last):
         Arguments t, X, p, where p ends with the instant that selects the branches of paths. Outputs q_[1], ...,
         q_[last] (left out if q' = γ'), γ_[1], ..., γ_[last], pivots.
     """
-    r, q = equations.r, equations.q
+    r = equations.r
     if r.cascade is not None:
         motion = r.cascade.along(r.points, equations.top - 1, last, running=_InBlock)
         return _coefficients(equations, motion.place, motion.gamma, last, _InBlock.instant)
@@ -378,10 +378,21 @@ class TaylorSteps(Stepping):
         jets = log.jets(k, at, self.top)
         rates = self.rates.grid(at, jets[: self.n_x], self.model.parameters)[self.n_x - n : self.n_x]
         rtol, atol = self.tolerances
-        sizes = np.maximum(np.abs(log.states[-n:]).max(), np.abs(h[k] * jets[-n:]).max(axis=0))
-        error = np.abs(h[k] * (rates - jets[-n:])).max(axis=0)
-        wrong = (error > FAR_OFF * (atol + rtol * sizes)) & (np.abs(h[k]) > SMALLEST * span)
+        wrong, last = np.zeros(len(k), bool), self.f.sizes["last"]
+        for level, entries in self._integrated_levels().items():
+            raised = self.top - level
+            part = np.abs(h[k]) ** raised * (perm(last, level) / perm(last, self.top - 1))
+            state = log.states[: self.nq] if level == 0 else log.states[self.nq + (level - 1) * n :][:n]
+            sizes = np.maximum(np.abs(state).max(), np.abs(part * jets[-n:][entries]).max(axis=0))
+            error = (part * np.abs(rates - jets[-n:])[entries]).max(axis=0)
+            wrong |= (error > FAR_OFF * (atol + rtol * sizes)) & (np.abs(h[k]) > SMALLEST * span)
         return int(k[wrong].min(initial=len(t) - 1))
+
+    def _integrated_levels(self):
+        """Entries of γ by the highest level at which they are integrated, 0 where only q is."""
+        free = np.array(self.f.sizes.get("free", [1] * (self.n_x - self.nq))).reshape(self.top - 1, self.n)
+        highest = (free * np.arange(1, self.top)[:, None]).max(axis=0)
+        return {int(level): np.flatnonzero(highest == level) for level in np.unique(highest)}
 
     def _instants(self, log):
         """Steps and instants within them at which series are compared with the equations."""

@@ -128,16 +128,24 @@ INLINE I falling_pivots(Motions *s)
     return bad;
 }
 
-/* Whether the series before does not meet the equations at the end of its step. */
+/* Whether the series before does not meet the equations at the end of its step: an error of gamma^(s) is judged by what it
+   is at the highest level that is integrated. */
 INLINE I off(const Motions *s, const W *c, double rtol)
 {
-    W error = ALL(0.0), size = w_largest(s->x + NX - N, N, 0);
-    for (int64_t i = 0; i < N; i++) {
-        const W now = falling(TOP, TOP) * c[(TOP - 1) * N + i];
-        error = w_fmax(error, w_fabs(s->h * (now - s->ahead[i])));
-        size = w_fmax(size, w_fabs(s->h * now));
+    I wrong = w_bits(ALL(0.0));
+    for (int64_t j = 0; j < TOP; j++) {
+        W error = ALL(0.0), size = j ? w_largest(s->x + NQ + (j - 1) * N, N, 0) : w_largest(s->x, NQ, 0);
+        W part = ALL(falling(LAST, j) / falling(LAST, TOP - 1));
+        for (int64_t m = j; m < TOP; m++) part *= s->h;
+        for (int64_t i = 0; i < N; i++) {
+            if (highest_level(i) != j) continue;
+            const W now = falling(TOP, TOP) * c[(TOP - 1) * N + i];
+            error = w_fmax(error, w_fabs(part * (now - s->ahead[i])));
+            size = w_fmax(size, w_fabs(part * now));
+        }
+        wrong |= ~(error <= FAR_OFF * (s->atol + rtol * size));
     }
-    return (s->h != 0) & ~(error <= FAR_OFF * (s->atol + rtol * size));
+    return (s->h != 0) & wrong;
 }
 
 void FN(many)(Many *m, int64_t first, int64_t last)

@@ -23,6 +23,14 @@ static const int8_t free_rates[] = FREE;
 #define IS_FREE(i) 1
 #endif
 
+/* The highest level at which the i-th quasi-coordinate is integrated. */
+static inline int64_t highest_level(int64_t i)
+{
+    int64_t j = TOP - 1;
+    while (j > 0 && !IS_FREE((j - 1) * N + i)) j--;
+    return j;
+}
+
 /* log2 of a number >= 0 from its bits, within 0.01; that of zero is -1023. */
 static inline double rough_log2(double a)
 {
