@@ -4,7 +4,7 @@ import ctypes
 import functools
 import threading
 from itertools import pairwise
-from math import perm
+from math import ldexp, perm
 
 import numpy as np
 
@@ -15,6 +15,7 @@ from servoctl.codegen.loops import (
     CORRECTIONS,
     FOLLOWED,
     LAST_TERM,
+    LONGEST,
     QUADRATIC,
     ROUNDING,
     SHORTEST,
@@ -155,7 +156,7 @@ class Interpreter:
             c = of_q if plain else y[nq * last : (nq + n) * last].reshape(last, n)
             levels = zip(x[nq:].reshape(top - 1, n), free, strict=True)
             of_rates = (longest(level[i], c[:, i], j, rtol, atol) for j, (level, i) in enumerate(levels, 1))
-            h = 2.0 ** min(longest(x[:nq], of_q, 0, rtol, atol), *of_rates)
+            h = rough_exp2(min(longest(x[:nq], of_q, 0, rtol, atol), *of_rates))
             if not h > 1e-13 * (1 + abs(t)):
                 x = self._settle(t, x, p)
                 break
@@ -285,6 +286,12 @@ def rough_log2(a):
     bits = np.asarray(a, dtype=float).view(np.int64)
     f = ((bits & 0x000FFFFFFFFFFFFF) | 0x3FF0000000000000).view(float) - 1.0
     return (bits >> 52) - 1023.0 + f * (1.0 + BEND - BEND * f)
+
+
+def rough_exp2(a):
+    """Its inverse, as in taylor.c."""
+    whole, f = divmod(min(max(a, -1022.0), LONGEST), 1.0)
+    return ldexp(1.0 + f * (1.0 - BEND + BEND * f), int(whole))
 
 
 def longest(level, c, j, rtol, atol):

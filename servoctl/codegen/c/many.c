@@ -32,6 +32,14 @@ INLINE W w_rough_log2(W a)
     return __builtin_convertvector((w_bits(a) >> 52) - 1023, W) + f * (1.0 + BEND - BEND * f);
 }
 
+INLINE W w_rough_exp2(W a)
+{
+    const W within = w_fmax(w_fmin(a, ALL((double)LONGEST)), ALL(-1022.0));
+    const I above = __builtin_convertvector(within, I), whole = above + (__builtin_convertvector(above, W) > within);
+    const W f = within - __builtin_convertvector(whole, W);
+    return w_value((whole + 1023) << 52) * (1.0 + f * (1.0 - BEND + BEND * f));
+}
+
 INLINE W w_largest(const W *v, int64_t n, int64_t level)
 {
     I largest = w_bits(ALL(0.0));
@@ -168,8 +176,8 @@ void FN(many)(Many *m, int64_t first, int64_t last)
         }
         const W left = forward * (m->t1 - s.t);
         const I fallen = falling_pivots(&s), wrong = off(&s, c, m->rtol);
-        W h_long, x[NX + 1];
-        for (int64_t lane = 0; lane < W_LANES; lane++) h_long[lane] = exp2(log_h[lane]);
+        const W h_long = w_rough_exp2(log_h);
+        W x[NX + 1];
         const I ends = h_long >= left * (1 - 1e-12);
         W h = forward * w_select(ends, left, h_long);
         for (int64_t i = 0; i < NX; i++) {

@@ -82,7 +82,7 @@ int64_t FN(taylor)(const Steps *s)
             const double of_level = length(x + NQ + (j - 1) * N, c, N, j, log_rtol, least);
             log_h = of_level < log_h ? of_level : log_h;
         }
-        const double h = exp2(log_h);
+        const double h = rough_exp2(log_h);
         if (!(h > 1e-13 * (1 + fabs(t)))) {
             settle(t, x, p);
             return step;
