@@ -423,9 +423,10 @@ class Compiled:
         p : (n_p,) array
             Parameters, SI.
         levels : int
-            At least s̄ - 1, and below ``sizes["last"]``.
+            Below ``sizes["last"]``.
         by_rows : bool
-            Whether "settled" gives γ^(s̄), too, if the series has it; levels must then include it.
+            Whether "settled" gives the rates up to γ^(s̄), if there is one; levels must then include them. Not where a
+            pivot may vanish.
 
         Returns
         -------
@@ -434,7 +435,7 @@ class Compiled:
         k, t = np.ascontiguousarray(k, dtype=np.int64), np.ascontiguousarray(t, dtype=float)
         z = np.empty((self.sizes["nq"] + levels * self.sizes["n"], t.size))
         p = self._array("p", p, self._p_shape)
-        settled = self.n_x + by_rows * self.sizes["n"]
+        settled = (self.n_x + self.sizes["n"]) * by_rows
         self._library.jets(np.ascontiguousarray(log), k, t, p, (levels, settled), z)
         return z
 

@@ -15,7 +15,7 @@ from servoctl.codegen.loops import (
     CORRECTIONS,
     FOLLOWED,
     LAST_TERM,
-    LONGEST,
+    REST,
     QUADRATIC,
     ROUNDING,
     SHORTEST,
@@ -183,7 +183,7 @@ class Interpreter:
         z[:nq] = (x + jet(of_q, 0, h)).T
         for j in range(1, levels + 1):
             z[nq + (j - 1) * n : nq + j * n] = jet(c, j, h).T
-        if self._settled is not None:
+        if settled and self._settled is not None:
             rows = np.empty((self._settled.numel_out(0), t.size))
             self._settling.grid(t, z[: self._n_x], p, rows)
             z[:settled] = rows[:settled]
@@ -290,7 +290,7 @@ def rough_log2(a):
 
 def rough_exp2(a):
     """Its inverse, as in taylor.c."""
-    whole, f = divmod(min(max(a, -1022.0), LONGEST), 1.0)
+    whole, f = divmod(min(max(a, -1022.0), REST), 1.0)
     return ldexp(1.0 + f * (1.0 - BEND + BEND * f), int(whole))
 
 

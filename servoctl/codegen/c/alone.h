@@ -17,7 +17,7 @@
 #define TERMS 4
 #define LAST_TERM 0.1
 #define BEND 0.344
-#define LONGEST 1000
+#define REST 1000
 
 /* newton.c */
 #define PIVOTS 1

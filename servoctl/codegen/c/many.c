@@ -34,7 +34,7 @@ INLINE W w_rough_log2(W a)
 
 INLINE W w_rough_exp2(W a)
 {
-    const W within = w_fmax(w_fmin(a, ALL((double)LONGEST)), ALL(-1022.0));
+    const W within = w_fmax(w_fmin(a, ALL((double)REST)), ALL(-1022.0));
     const I above = __builtin_convertvector(within, I), whole = above + (__builtin_convertvector(above, W) > within);
     const W f = within - __builtin_convertvector(whole, W);
     return w_value((whole + 1023) << 52) * (1.0 + f * (1.0 - BEND + BEND * f));

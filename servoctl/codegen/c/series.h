@@ -39,10 +39,10 @@ static inline double rough_log2(double a)
     return (double)((bits >> 52) - 1023) + f * (1 + BEND - BEND * f);
 }
 
-/* Its inverse, within 0.5 %, the smallest normal number for what is far below, and 2^LONGEST for what is far above. */
+/* Its inverse, within 0.5 %, the smallest normal number for what is far below, and 2^REST for what is far above. */
 static inline double rough_exp2(double a)
 {
-    const double within = a > -1022 ? (a < LONGEST ? a : LONGEST) : -1022, whole = floor(within), f = within - whole;
+    const double within = a > -1022 ? (a < REST ? a : REST) : -1022, whole = floor(within), f = within - whole;
     return s_value(((int64_t)whole + 1023) << 52) * (1 + f * (1 - BEND + BEND * f));
 }
 

@@ -129,7 +129,7 @@ void FN(taylor_jets)(const double *log, int64_t n, const int64_t *k, const doubl
         }
     }
 #ifdef SETTLED
-    for (int64_t at = 0; at < n; at++) {
+    for (int64_t at = 0; at < n && settled; at++) {
         double x[NX + 1], all[NX + N];
         for (int64_t i = 0; i < NX; i++) x[i] = jets[i * n + at];
         FN(settled)(t[at], x, p, all);
