@@ -2,6 +2,7 @@
 
 from servoctl import figures as figures
 from servoctl import interop as interop
+from servoctl import programs as programs
 from servoctl import spec as spec
 from servoctl.control import disturbances as disturbances
 from servoctl.control.close import close as close
@@ -56,6 +57,11 @@ from servoctl.model.model import Model as Model
 from servoctl.model.model import derive as derive
 from servoctl.plants.plant import Plant as Plant
 from servoctl.plants.plant import plant as plant
+from servoctl.robots.contact import held as held
+from servoctl.robots.contact import loop as loop
+from servoctl.robots.robot import Frame as Frame
+from servoctl.robots.robot import Robot as Robot
+from servoctl.robots.robot import urdf as urdf
 from servoctl.run import Run as Run
 from servoctl.run import load as load
 from servoctl.sensitivities.identification import Identification as Identification
@@ -64,6 +70,7 @@ from servoctl.sensitivities.sensitivity import Sensitivity as Sensitivity
 from servoctl.sensitivities.sensitivity import sensitivity as sensitivity
 from servoctl.simulation import simulate as simulate
 from servoctl.spec import paths as paths
+from servoctl.spec import rotations as rotations
 from servoctl.spec.bodies import body_rates as body_rates
 from servoctl.spec.bodies import particle as particle
 from servoctl.spec.bodies import rigid_body as rigid_body

@@ -23,7 +23,7 @@ from servoctl.gallery import gallery
 
 pytestmark = pytest.mark.usefixtures("c_compiler")
 
-STRICT = ("-std=c99", "-O1", "-Wall", "-Wextra", "-pedantic", "-Werror")
+STRICT = ("-std=c99", "-O1", "-Wall", "-Wextra", "-Wconversion", "-Wdouble-promotion", "-pedantic", "-Werror")
 TOLERANCE = 1e-12
 
 
@@ -40,7 +40,8 @@ class Exported:
 
     def __call__(self, function, *arguments):
         call = [
-            a.ctypes.data_as(ctypes.c_void_p) if isinstance(a, np.ndarray) else ctypes.c_double(a) for a in arguments
+            a.ctypes.data_as(ctypes.c_void_p) if isinstance(a, np.ndarray)
+            else a if isinstance(a, ctypes.c_float) else ctypes.c_double(a) for a in arguments
         ]
         return self.library[f"{self.name}_{function}"](*call)
 
@@ -50,6 +51,33 @@ class Exported:
     def indices(self, key):
         found = re.findall(rf"^    {self.name.upper()}_{key.upper()}_(\w+) = (\d+)", self.header, re.M)
         return {name: int(index) for name, index in found}
+
+
+@pytest.mark.parametrize("name", ["overhead-crane", "crane-3d-redundant", "three-cars"])
+def test_feedforward_in_floats_is_that_of_doubles_to_six_digits(name, gallery_model, tmp_path):
+    scene, model = gallery[name], gallery_model(name)
+    start = model.start(**scene.start, guess=scene.guess)
+    times = np.linspace(*scene.t_span, 41)
+    run = sv.simulate(model, start, scene.t_span, t_eval=times)
+    plan, number = exported(model, tmp_path, start=start, real="float"), np.float32
+    x, p = start.values.astype(number), model.parameters.astype(number)
+    z, u = np.empty(len(model.jet_names), number), np.empty(len(model.actuators), number)
+    wanted = np.array([run[actuator] for actuator in model.actuators])
+    for k, t in enumerate(times):
+        assert plan("feedforward", ctypes.c_float(t), x, p, z, u) >= 0
+        assert np.abs(u - wanted[:, k]).max() < 2e-5 * np.abs(wanted).max()
+    assert "double" not in re.sub(r"/\*.*?\*/", "", (tmp_path / "plan.c").read_text(), flags=re.DOTALL)
+
+
+@pytest.mark.parametrize("name", ["overhead-crane", "passive-arm"])
+def test_a_time_that_is_no_number_is_refused(name, gallery_model, tmp_path):
+    scene, model = gallery[name], gallery_model(name)
+    start = model.start(**scene.start, guess=scene.guess)
+    plan, x = exported(model, tmp_path, start=start), start.values.copy()
+    z, u = np.full(len(model.jet_names), 7.0), np.full(len(model.actuators), 7.0)
+    for t in (np.nan, np.inf):
+        assert plan("feedforward", t, x, model.parameters.copy(), z, u) == -1
+        assert np.array_equal(x, start.values) and set(z) == {7.0} and set(u) == {7.0}
 
 
 def exported(model, folder, **options):

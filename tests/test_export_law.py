@@ -4,19 +4,22 @@ import ctypes
 import re
 import shlex
 import subprocess
+from shutil import which
 
 import numpy as np
 import pytest
 from refusals import refused
 from scenes import CRANE
+from scipy.interpolate import CubicHermiteSpline
 
 import servoctl as sv
 from servoctl.codegen.compiler import compiler
 from servoctl.errors import SpecificationError
+from servoctl.export.c import thin
 
 pytestmark = pytest.mark.usefixtures("c_compiler")
 
-STRICT = ("-std=c99", "-O1", "-Wall", "-Wextra", "-pedantic", "-Werror")
+STRICT = ("-std=c99", "-O1", "-Wall", "-Wextra", "-Wconversion", "-Wdouble-promotion", "-pedantic", "-Werror")
 SENSORS = {"x": 1e-3, "l": 1e-3, "theta": 1e-3}
 
 LAWS = {
@@ -124,6 +127,90 @@ def test_the_table_is_a_constant_and_indices_have_names(plan, tmp_path):
     size = int(re.search(r"static const double \w*table\[(\d+)\]", source)[1])
     assert set(re.findall(r"#include (\S+)", source)) == {'"loop.h"', "<math.h>"}
     assert size == law.schedule.size and "malloc" not in source
+
+
+def test_a_thinned_schedule_is_within_its_bound(plan):
+    law = sv.lqr(plan, sv.plant(CRANE), rate=500.0, integral=True)
+    rows = np.asarray(law.schedule).T
+    sizes = {}
+    for bound in (1e-3, 1e-5, 1e-7):
+        knots, slopes = thin(rows, bound)
+        sizes[bound] = len(knots)
+        assert knots[0] == 0
+        assert knots[-1] == len(rows) - 1
+        cubic = CubicHermiteSpline(knots, rows[knots], slopes[knots])(np.arange(len(rows)))
+        assert (np.abs(cubic - rows) <= 1.0001 * bound * np.abs(rows).max(axis=0) + 1e-15).all()
+    assert sizes[1e-3] < sizes[1e-5] < sizes[1e-7] < len(rows)
+    assert sizes[1e-5] < len(rows) / 10
+
+
+def test_a_thinned_law_in_floats_follows_like_the_law(plan, tmp_path):
+    law = sv.lqr(plan, sv.plant(CRANE), rate=500.0)
+    whole, thinned = (sv.export_c(law, tmp_path / name, name="loop", **options)[0] for name, options in (
+        ("whole", {}), ("thinned", {"thinned": 1e-5, "real": "float"})))  # fmt: skip
+    assert thinned.stat().st_size < whole.stat().st_size / 10
+    command = [*shlex.split(compiler()), *STRICT, "-fPIC", "-shared", str(thinned), "-o", str(tmp_path / "l.so"), "-lm"]
+    assert subprocess.run(command, capture_output=True, text=True).stderr == ""
+    c = ctypes.CDLL(str(tmp_path / "l.so"))
+    u, z = np.empty(len(law.inputs), np.float32), np.zeros(1, np.float32)
+
+    def step(t, measurement):
+        y = np.array([measurement[name] for name in law.measures], np.float32)
+        assert c.loop_step(ctypes.c_float(t), *(a.ctypes.data_as(ctypes.c_void_p) for a in (y, z, u))) == 0
+        return u.astype(float)
+
+    machine, given = sv.plant(CRANE, m_load=110.0), (plan.state(0.0), (0.0, 4.0))
+    ours = sv.close(machine, step, *given, timing=sv.Timing(rate=500.0), plan=plan)
+    exact = sv.close(machine, law, *given)
+    stroke = np.ptp(exact["x"])
+    assert np.abs(ours["x"] - exact["x"]).max() < 1e-4 * stroke
+    before = u.copy()
+    assert c.loop_step(ctypes.c_float(np.nan), *(a.ctypes.data_as(ctypes.c_void_p) for a in (u, z, u))) == -1
+    assert np.array_equal(u, before)
+
+
+def test_the_header_is_read_by_a_compiler_of_cplusplus(plan, tmp_path):
+    if which("g++") is None:
+        pytest.skip("there is no g++")
+    source, header = sv.export_c(sv.lqr(plan, sv.plant(CRANE)), tmp_path, name="loop", thinned=1e-4)
+    (tmp_path / "main.cpp").write_text(
+        '#include "loop.h"\nint main() { double y[LOOP_NY] = {}, z[1], u[LOOP_NU]; loop_start(z); return loop_step(0, y, z, u); }\n'
+    )
+    for command in (["gcc", "-std=c99", "-c", str(source), "-o", str(tmp_path / "loop.o")],
+                    ["g++", "-Wall", "-Wextra", str(tmp_path / "main.cpp"), str(tmp_path / "loop.o"), "-o", str(tmp_path / "run")],
+                    [str(tmp_path / "run")]):  # fmt: skip
+        done = subprocess.run(command, capture_output=True, text=True)
+        assert (done.returncode, done.stderr) == (0, "")
+    assert header.exists()
+
+
+@pytest.mark.parametrize("tool", ["sanitizers", "valgrind"])
+def test_a_law_in_c_runs_without_a_complaint_of(tool, plan, tmp_path):
+    if tool == "valgrind" and which("valgrind") is None:
+        pytest.skip("there is no valgrind")
+    source, _ = sv.export_c(sv.lqr(plan, sv.plant(CRANE), integral=True), tmp_path, name="loop", thinned=1e-4)
+    (tmp_path / "main.c").write_text(
+        '#include "loop.h"\nint main(void) { double y[LOOP_NY] = {0}, z[LOOP_NZ], u[LOOP_NU]; int bad = 0; loop_start(z);\n'
+        "for (int k = -3; k < 2000; k++) bad += loop_step(0.004 * k, y, z, u); return bad; }\n"
+    )
+    flags = ["-fsanitize=address,undefined", "-fno-sanitize-recover=all"] if tool == "sanitizers" else ["-g"]
+    run = tmp_path / "run"
+    built = subprocess.run(["gcc", "-std=c99", *flags, str(tmp_path / "main.c"), str(source), "-o", str(run), "-lm"],
+                           capture_output=True, text=True)  # fmt: skip
+    if built.returncode and tool == "sanitizers":
+        pytest.skip(f"the compiler has no sanitizers: {built.stderr[:100]}")
+    before = ["valgrind", "-q", "--error-exitcode=9"] if tool == "valgrind" else []
+    assert subprocess.run([*before, str(run)], capture_output=True, text=True).returncode == 0
+
+
+def test_options_of_the_export_are_refused_in_words(plan, tmp_path):
+    law = sv.lqr(plan, sv.plant(CRANE))
+    with refused(sv.NameUnknown, "flaot", match="float"):
+        sv.export_c(law, tmp_path, real="flaot")
+    with refused(SpecificationError, "0"):
+        sv.export_c(law, tmp_path, thinned=0.0)
+    with refused(SpecificationError, "thinned"):
+        sv.export_c(plan.model, tmp_path, thinned=1e-3)
 
 
 def test_a_law_that_allocates_in_python_is_refused(plan, tmp_path):

@@ -21,7 +21,7 @@ FILES = sorted(PACKAGE.rglob("*.py"))
 ENTRIES = ("__init__.py", "__main__.py")  # of the package itself: they gather the rest
 
 LAYERS = (
-    "version", "errors", "values", "tolerances", "checks", "archive", "progress", "jets", "spec", "reduction", "codegen",
+    "version", "errors", "values", "tolerances", "checks", "archive", "progress", "jets", "spec", "robots", "programs", "reduction", "codegen",
     "model", "plants", "run", "methods", "growth", "simulation", "figures", "control", "verification",
     "sensitivities", "study", "inversion", "interop", "export", "gallery", "shell",
 )  # fmt: skip

@@ -75,18 +75,28 @@ def close(
     require_plant(plant)
     plant = _of_start(plant, getattr(law, "plan", None) if plan is None else plan, x0)
     t_span, conditions = as_span(t_span, forward=True), Conditions(sensors, timing, disturbance)
-    law = _as_law(law, plant, conditions.timing.rate, t_span[0], plan)
+    law = as_law(law, plant, conditions.timing.rate, t_span[0], plan)
     require_names(law, plant)
     if plan is not None:
         require_plan(plan, plant)
     plan = law.plan if plan is None else plan
     for _ in range(DERIVATIONS):
-        run = _finish(plant, law, plan, _loop(plant, law, x0, t_span, conditions), conditions)
+        plant = regular_at_start(plant, t_span[0], x0)
+        run = finished(plant, law, plan, loop_of(plant, law, x0, t_span, conditions), conditions)
         t, equations = _derived_along(run)
         if equations is None:
             return run
         plant = replace(plant, equations=equations)
     raise _stopped_at(run, came_alive(t))
+
+
+def regular_at_start(plant, t0, x0):
+    """The plant, with pivots decided near the start of a loop if those decided elsewhere vanish there."""
+    rest = np.zeros(len(plant.inputs))
+    if not plant.constrained:
+        return plant
+    x = _initial_state(plant, t0, x0, rest)
+    return plant if np.isfinite(plant.rates(t0, x, rest)).all() else plant.near(t0, x)
 
 
 def _derived_along(run):
@@ -113,7 +123,7 @@ def _of_start(plant, plan, x0):
     return part if size in (part.n_x - len(part.lag), part.n_x) else plant
 
 
-def _loop(plant, law, x0, t_span, conditions):
+def loop_of(plant, law, x0, t_span, conditions):
     """All numbers of the loop, in tables made beforehand."""
     (t0, t1), sensors, timing, forces = t_span, conditions.sensors, conditions.timing, conditions.disturbance
     samples = whole_multiple((t1 - t0) * law.rate, f"t_span of {t1 - t0:g} s at {law.rate:g} Hz", "samples")
@@ -180,9 +190,9 @@ def require_consistent(plant, t0, starts, p):
         )
 
 
-def _finish(plant, law, plan, loop, conditions):
-    """Run a loop; return its `Closed`, or raise the error that ended it, with the motion so far."""
-    status, x, law_x, law_y, inputs = run_loop(plant.function("ode"), law.begin(), loop)
+def finished(plant, law, plan, loop, conditions, advance=None):
+    """Run a loop and return its `Closed`, or raise the error that ended it; `advance` is that of `run_loop`."""
+    status, x, law_x, law_y, inputs = run_loop(plant.function("ode"), law.begin(), loop, advance)
     if status == INTERRUPTED and not len(x):
         raise KeyboardInterrupt
     t = loop.t0 + np.arange(len(x)) * loop.period
@@ -242,7 +252,7 @@ def _stopped(law, loop, status, end):
     )
 
 
-def _as_law(law, plant, rate, t0, plan):
+def as_law(law, plant, rate, t0, plan):
     """A Law as it is; a function as a law that measures all states."""
     if isinstance(law, Law):
         # both rates may come from the same division by two ways of rounding

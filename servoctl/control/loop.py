@@ -81,8 +81,10 @@ class Arguments(ctypes.Structure):
 _STEP = ctypes.CFUNCTYPE(None, ctypes.c_double, ctypes.c_void_p, ctypes.c_void_p, ctypes.c_void_p)
 
 
-def run_loop(ode, law, loop):
+def run_loop(ode, law, loop, advance=None):
     """Run a closed loop: in C, which calls a law in Python back, or in Python without a compiler.
+
+    `advance`, of the arguments of `hold`, advances the state by a sample in place of the plant's equations.
 
     `ode` are the plant's rates, compiled with the loop "closed"; `law` maps (t, [y; z], row of the schedule) to
     [u; z+; signals]. Returns the status (FINISHED; STATE_LOST or LAW_LOST if the state or the law's output is not
@@ -95,9 +97,9 @@ def run_loop(ode, law, loop):
         "x": np.empty((n, ode.n_x)), "law_x": np.empty((n + 1, n_y + n_z)),
         "law_y": np.empty((n, loop.n_out)), "input": np.empty((n, loop.n_u)),
     }  # fmt: skip
-    native = ode.native("closed")
+    native = ode.native("closed") if advance is None else None
     if native is None:
-        done, status = _interpreted(ode, law, loop, *logs.values())
+        done, status = _interpreted(ode, law, loop, advance or hold, logs)
     else:
         done, status = _native(native, law, loop, logs)
     return status, *(log[:done] for log in logs.values())
@@ -194,8 +196,9 @@ def _steps(c, k, inputs):
 
 
 @np.errstate(all="ignore")
-def _interpreted(ode, law, c, x_log, law_x, law_y, inputs):
+def _interpreted(ode, law, c, advance, logs):
     """The loop of closed.c in Python; returns the number of completed samples and the status."""
+    x_log, law_x, law_y, inputs = logs.values()
     n_y, n_z, n_u, x = len(c.measured), len(c.z0), c.n_u, c.x0
     law_x[0, n_y:] = c.z0
     for k in range(c.samples + 1):
@@ -216,7 +219,7 @@ def _interpreted(ode, law, c, x_log, law_x, law_y, inputs):
             break
         law_x[k + 1, n_y:] = law_y[k, n_u : n_u + n_z]
         try:
-            x = hold(ode, t, c.period / c.substeps, x, _steps(c, k, inputs))
+            x = advance(ode, t, c.period / c.substeps, x, _steps(c, k, inputs))
         except KeyboardInterrupt:
             return k + 1, INTERRUPTED
     return c.samples + 1, FINISHED

@@ -86,7 +86,12 @@ class Reference:
     def linearised(self):
         """A (N, n_x, n_x) and B (N, n_x, m) of the plant in the middle of each sample."""
         A, B = self.plant.linearised(self.middle, self.middle_x, self.middle_input)
-        lost = ~(np.isfinite(A).all(axis=(1, 2)) & np.isfinite(B).all(axis=(1, 2)))
+        lost = _lost(A, B)
+        if lost.any() and self.plant.constrained:
+            k, at = int(np.argmax(lost)), (self.middle, self.middle_x, self.middle_input)
+            other = self.plant.near(float(self.middle[k]), self.middle_x[:, k])
+            A[lost], B[lost] = other.linearised(at[0][lost], at[1][:, lost], at[2][:, lost])
+            lost = _lost(A, B)
         if lost.any():
             raise ServoError(
                 f"The plant's linearisation is not finite at t = {self.middle[lost][0]:.6g} s of the plan.",
@@ -95,6 +100,11 @@ class Reference:
                 t=float(self.middle[lost][0]),
             )
         return A, B
+
+
+def _lost(A, B):
+    """Samples at which a linearisation is not finite, (N,)."""
+    return ~(np.isfinite(A).all(axis=(1, 2)) & np.isfinite(B).all(axis=(1, 2)))
 
 
 def require_plant(plant):

@@ -11,6 +11,7 @@ from pathlib import Path
 import casadi as ca
 import numpy as np
 
+from servoctl.checks import named, positive
 from servoctl.codegen.function import Compiled
 from servoctl.control.law import Law
 from servoctl.errors import SpecificationError
@@ -21,15 +22,18 @@ from servoctl.model.start import State
 from servoctl.reduction.reduce import require_outputs
 
 ITERATIONS, TOLERANCE = 30, 1e-13  # of Newton's method, as in `Compiled.newton`
+IN_FLOATS = {"TOLERANCE": 1e-6, "STALLED": 1e-3}  # corrections that end it: at once, and where they no longer fall
 TIME = Scalar("t")
+FINITE = "Returns 0, or -1 if a time is no finite number: nothing is then changed."
 RESERVED = "auto break case char const continue default do double else enum extern float for goto if inline int long "
 RESERVED += "register restrict return short signed sizeof static struct switch typedef union unsigned void volatile "
 RESERVED += "while class new delete this template typename operator private public protected friend namespace using"
 
 
 def export_c(
-    source: Model | Law, folder: str | os.PathLike, *, name: str | None = None, start: State | None = None
-) -> tuple[Path, Path]:
+    source: Model | Law, folder: str | os.PathLike, *, name: str | None = None, start: State | None = None,
+    real: str = "double", thinned: float | None = None,
+) -> tuple[Path, Path]:  # fmt: skip
     """Write a model's feedforward and residuals, or a law's step, as NAME.c and NAME.h: self-contained C99.
 
     Main arguments
@@ -50,6 +54,12 @@ def export_c(
         Name of the files and prefix of all C names; default "model" or "law".
     start : State, optional
         Consistent start of the model, written as `NAME_x0` with its time `NAME_t0`.
+    real : {"double", "float"}
+        Type of all numbers. In floats Newton's method ends where rounding does: at about 1e-6 of the coordinates.
+    thinned : float, optional
+        Largest error of an entry of a law's schedule, relative to the largest magnitude of that entry along the
+        schedule. Rows between those that are needed for it are left out, and computed by cubic polynomials. Default:
+        all rows are written.
 
     Returns
     -------
@@ -59,7 +69,9 @@ def export_c(
     Raises
     ------
     SpecificationError
-        If the name is no C identifier, the source has no expressions, or a law has a start.
+        If the name is no C identifier, the source has no expressions, a law has a start, or a model is thinned.
+    NameUnknown
+        If `real` is another type.
     ServoError
         If the files cannot be written.
 
@@ -72,6 +84,8 @@ def export_c(
     if not law and not hasattr(source, "reduction"):
         raise _without_expressions(source)
     _require_start(law, start)
+    named(real, ("double", "float"), "type of numbers")
+    thinned = None if thinned is None else _thinning(law, thinned)
     name = ("law" if law else "model") if name is None else name
     _require_name(name)
     if not isinstance(folder, (str, os.PathLike)):
@@ -89,7 +103,10 @@ def export_c(
             RuntimeWarning,
             stacklevel=2,
         )
-    return write(folder, name, _of_law(source) if law else _of_model(source, start))
+    contents = _of_law(source, thinned) if law else _of_model(source, start)
+    if real == "float" and "TOLERANCE" in contents.sizes:
+        contents.sizes.update(IN_FLOATS)
+    return write(folder, name, contents, real)
 
 
 def _require_start(law, start):
@@ -191,7 +208,7 @@ def _algebraic(model, x, z, p, u):
     arguments = (TIME, x.output(), p.input(), z.output(), u.output())
     first = model.nq if model.reduction.mechanism.q.plain else 3 * model.nq  # of γ' in the outputs of `path`
     sizes = {"N": model.n, "NQ": model.nq, "NY": f.numel_out(0), "FIRST": first}
-    sizes |= {"ITERATIONS": ITERATIONS, "TOLERANCE": TOLERANCE}
+    sizes |= {"ITERATIONS": ITERATIONS, "TOLERANCE": TOLERANCE, "STALLED": 0.0}
     return {"path": f}, [Routine("feedforward", about, arguments, "int")], ("newton.c",), sizes
 
 
@@ -202,33 +219,96 @@ def _integrated(model, x, z, p, u):
     rates = ca.Function("rates", arguments, [f(*arguments)[:size]])
     about = {
         "rates": "dx/dt at time t [s] and state x of the plan; not finite where its equations lose rank.",
-        "feedforward": "Feedforward: jets z and u at time t [s] and state x of the plan.",
-        "advance": "Takes the plan's state x from time t to t + h [s]: a Runge-Kutta step of order 4.",
+        "feedforward": f"Feedforward: jets z and u at time t [s] and state x of the plan. {FINITE}",
+        "advance": f"Takes the plan's state x from time t to t + h [s]: a Runge-Kutta step of order 4. {FINITE}",
     }
     at = (TIME, x.input(), p.input())
     routines = [
         Routine("rates", about["rates"], (*at, x.output("dx"))),
-        Routine("feedforward", about["feedforward"], (*at, z.output(), u.output())),
-        Routine("advance", about["advance"], (TIME, Scalar("h"), x.output(), p.input())),
+        Routine("feedforward", about["feedforward"], (*at, z.output(), u.output()), "int"),
+        Routine("advance", about["advance"], (TIME, Scalar("h"), x.output(), p.input()), "int"),
     ]
     return {"rates": rates}, routines, ("integrated.c",), {"N": model.n, "NX": size}
 
 
-def _of_law(law):
+def _thinning(law, thinned):
+    """The bound of `thinned`, checked."""
+    if not law:
+        raise SpecificationError(
+            "thinned= is set in the export of a model.",
+            "Rows are left out of the schedule of a law.",
+            do="Leave thinned= out.",
+        )
+    return positive("thinned", thinned)
+
+
+def _of_law(law, thinned):
     f, table = law.step.expression, np.atleast_2d(np.asarray(law.schedule, dtype=float))
     y = Array("y", "Measurement y, SI", law.measures)
     u = Array("u", "Command u, SI", law.inputs)
     z = Array("z", "Controller state z", law.state_names)
     about = (
         "One sample of the law: command u of the measurement y and the controller state z, which becomes the next one. "
-        f"Call it every {1 / law.rate:.9g} s from t = {law.t0:g} s; after the schedule its last row applies."
+        f"Call it every {1 / law.rate:.9g} s from t = {law.t0:g} s; after the schedule its last row applies. {FINITE}"
     )
     routines = (
         Routine("start", "Sets the controller state z to its value at the start.", (z.output(),)),
-        Routine("step", about, (TIME, y.input(), z.output(), u.output())),
+        Routine("step", about, (TIME, y.input(), z.output(), u.output()), "int"),
     )
     state = np.asarray(law.state, dtype=float)
-    constants = (Constant("z0", state if len(state) else np.zeros(1)), Constant("table", table.T.ravel()))
-    sizes = {f"N{a.key.upper()}": len(a.names) for a in (y, u, z)} | {"NO": f.numel_out(0), "WIDTH": len(table)}
+    stored, sizes = _schedule(table.T, thinned)
+    constants = (Constant("z0", state if len(state) else np.zeros(1)), *stored)
+    sizes |= {f"N{a.key.upper()}": len(a.names) for a in (y, u, z)} | {"NO": f.numel_out(0), "WIDTH": len(table)}
     sizes |= {"ROWS": table.shape[1], "T0": float(law.t0), "RATE": float(law.rate)}
-    return Contents((y, u, z), constants, {"law": f}, routines, ("law.c",), sizes)
+    return Contents((y, u, z), constants, {"law": f}, routines, (_OF_TABLE[thinned is not None], "law.c"), sizes)
+
+
+_OF_TABLE = ("table.c", "thinned.c")
+
+
+def _schedule(rows, thinned):
+    """Constants of the schedule (N, width), and sizes."""
+    if thinned is None or len(rows) < 3:
+        return (Constant("table", rows.ravel()),), {}
+    knots, slopes = thin(rows, thinned)
+    table = np.hstack([rows[knots], slopes[knots]])
+    return (Constant("knot", knots), Constant("table", table.ravel())), {"KNOTS": len(knots)}
+
+
+def thin(rows, bound):
+    """Rows between which cubic polynomials give all others.
+
+    Parameters
+    ----------
+    rows : (N, width) array
+    bound : float
+        Largest error of an entry, relative to its largest magnitude over all rows.
+
+    Returns
+    -------
+    knots : (K,) int array
+        The rows, with the first and the last.
+    slopes : (N, width) array
+        Changes from row to row.
+    """
+    slopes, allowed = np.gradient(rows, axis=0), bound * np.abs(rows).max(axis=0)
+    knots = [0]
+    while knots[-1] < len(rows) - 1:
+        first, reach = knots[-1], 1
+        while first + 2 * reach < len(rows) and _fits(rows, slopes, first, first + 2 * reach, allowed):
+            reach *= 2
+        low, high = reach, min(2 * reach, len(rows) - 1 - first)
+        while low < high:
+            middle = (low + high + 1) // 2
+            low, high = (middle, high) if _fits(rows, slopes, first, first + middle, allowed) else (low, middle - 1)
+        knots.append(first + low)
+    return np.array(knots), slopes
+
+
+def _fits(rows, slopes, a, b, allowed):
+    """Whether the cubic polynomial between rows a and b is within the bound at the rows between."""
+    h, s = b - a, (np.arange(a + 1, b)[:, None] - a) / (b - a)
+    r = 1 - s
+    cubic = r * r * (1 + 2 * s) * rows[a] + s * s * (1 + 2 * r) * rows[b]
+    cubic += h * s * r * (r * slopes[a] - s * slopes[b])
+    return bool((np.abs(cubic - rows[a + 1 : b]) <= allowed).all())

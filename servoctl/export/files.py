@@ -14,6 +14,11 @@ from servoctl.codegen import emit
 from servoctl.codegen.loops import source
 
 WIDTH = 110  # longest line of a file
+FUNCTIONS = (  # of math.h, which has each for floats with the suffix f
+    "acos|acosh|asin|asinh|atan|atan2|atanh|ceil|copysign|cos|cosh|erf|exp|expm1|fabs|floor|fma|fmax|fmin|fmod|hypot|"
+    "log|log1p|pow|sin|sinh|sqrt|tan|tanh"
+)
+LARGEST_FLOAT = float(np.finfo(np.float32).max)
 
 
 @dataclass(frozen=True)
@@ -89,15 +94,21 @@ class Constant:
     values: object
     about: str = ""
 
+    @property
+    def kind(self):
+        """C type: whole numbers are int."""
+        return "int" if np.asarray(self.values).dtype.kind == "i" else "double"
+
     def declaration(self, prefix):
         """C declaration without a value."""
-        name = f"const double {prefix}_{self.name}" if self.about else f"static const double {self.name}"
+        name = f"const double {prefix}_{self.name}" if self.about else f"static const {self.kind} {self.name}"
         return f"{name}[{len(self.values)}]" if np.ndim(self.values) else name
 
     @property
     def text(self):
         """C text of the values."""
-        literals = [emit.literal(float(value)).strip("()") for value in np.ravel(self.values)]
+        values = np.ravel(self.values).tolist()
+        literals = [str(v) if self.kind == "int" else emit.literal(float(v)).strip("()") for v in values]
         lines = "".join(f"    {', '.join(literals[k : k + 4])},\n" for k in range(0, len(literals), 4))
         return f"{{\n{lines}}}" if np.ndim(self.values) else literals[0]
 
@@ -157,8 +168,10 @@ class Contents:
     sizes: dict = field(default_factory=dict)
 
 
-def write(folder, name, contents):
+def write(folder, name, contents, real="double"):
     """Write NAME.c and NAME.h; their two paths. `name`, a C identifier, is the prefix of all public names.
+
+    `real` is the type of all numbers, "double" or "float".
 
     Raises
     ------
@@ -166,6 +179,8 @@ def write(folder, name, contents):
         If the files cannot be written.
     """
     texts = {f"{name}.c": _source(name, contents), f"{name}.h": _header(name, contents)}
+    convert = _doubles if real == "double" else _floats
+    texts = {file: _outside_comments(convert, text) for file, text in texts.items()}
     with archive.writing(folder, "C export", folder=True) as place:
         for file, text in texts.items():
             (place / file).write_text(_wrapped(text), encoding="utf-8")
@@ -210,6 +225,32 @@ def _source(name, contents):
         *(routine.definition(name) for routine in contents.routines),
     ]
     return "".join(parts)
+
+
+def _outside_comments(convert, text):
+    """C text of which what is no comment is converted."""
+    parts = re.split(r"(/\*.*?\*/)", text, flags=re.DOTALL)
+    return "".join(part if part.startswith("/*") else convert(part) for part in parts)
+
+
+def _doubles(code):
+    """Infinity and NaN as doubles: those of math.h are floats."""
+    return re.sub(r"\bNAN\b", "(double)NAN", re.sub(r"\bINFINITY\b", "HUGE_VAL", code))
+
+
+def _floats(code):
+    """Types, literals and functions of floats in place of those of doubles."""
+    code = re.sub(r"\bdouble\b", "float", code)
+    code = re.sub(rf"\b({FUNCTIONS})(?=\()", r"\1f", code)
+    code = re.sub(r"\bHUGE_VAL\b", "HUGE_VALF", code)
+    return re.sub(r"(?<![\w.])(\d+\.\d*(?:[eE][+-]?\d+)?|\.?\d+[eE][+-]?\d+)(?![\w.])", _float_literal, code)
+
+
+def _float_literal(found):
+    """A literal within the range of floats, with their digits."""
+    value = np.float32(min(float(found[0]), LARGEST_FLOAT))
+    text = f"{value:.9g}"
+    return f"{text if '.' in text or 'e' in text else text + '.'}f"
 
 
 def _comment(text):

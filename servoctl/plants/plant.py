@@ -1,6 +1,6 @@
 """The plant: the full mechanism with its parameters, friction, actuators and their limits."""
 
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 
 import casadi as ca
 import numpy as np
@@ -260,6 +260,17 @@ class Plant(Value):
         y = self.function("jacobian").grid(t, x, self.p(u))
         both = y.reshape(-1, self.n_x, len(t)).transpose(2, 1, 0)
         return both[:, :, : self.n_x], both[:, :, self.n_x :]
+
+    def near(self, t: float, x) -> "Plant":
+        """The plant whose pivots are decided near a state, where those decided elsewhere vanish.
+
+        Parameters
+        ----------
+        t : float
+            [s]
+        x : (n_x,) array
+        """
+        return replace(self, equations=self.equations.near(t, x, self.parameters[: len(self.equations.values)]))
 
     def state(self, values) -> np.ndarray:
         """A full state: an array of (q, γ') or of all states, or values by name.

@@ -1,6 +1,6 @@
 """What the designer says: coordinates, bodies, mechanisms, programs, paths."""
 
-from servoctl.spec import paths
+from servoctl.spec import paths, rotations
 from servoctl.spec.bodies import body_rates, particle, rigid_body
 from servoctl.spec.coordinates import Coordinates, coordinates
 from servoctl.spec.mechanism import Mechanism
@@ -18,4 +18,5 @@ __all__ = [
     "particle",
     "paths",
     "rigid_body",
+    "rotations",
 ]

@@ -7,7 +7,7 @@ from math import factorial
 import casadi as ca
 
 from servoctl.checks import as_list, column, is_whole, mapping, matrix, require_kind
-from servoctl.errors import SpecificationError
+from servoctl.errors import SpecificationError, unknown
 from servoctl.jets.series import Motion, Series, is_zero
 from servoctl.jets.tape import Tape, divide, multiply
 
@@ -47,6 +47,12 @@ class Coordinates:
 
     def __len__(self) -> int:
         return self.nq
+
+    def __getitem__(self, name):
+        """The symbol of a coordinate by its name."""
+        if name not in self.names:
+            raise unknown(name, self.names, "coordinate")
+        return self._q[self.names.index(name)]
 
     @property
     def n(self):

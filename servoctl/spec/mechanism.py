@@ -49,6 +49,8 @@ class Mechanism:
         The balance itself, r(t, q, γ', γ''), without `forces` and `potential`: inverse dynamics from elsewhere. Its
         mass matrix is symmetric. What is left of it at rest, r(t, q, 0, 0), such as gravity, counts as forces -r;
         energy includes gravity only as `potential`.
+    mass : (n, n) SX, optional
+        The mass matrix ∂r/∂γ'' of `balance` in a form that takes fewer operations than its derivative does.
     forces : dict of str to SX, or (n,) SX, optional
         Generalised forces by coordinate (or quasi-velocity) name.
     constraints : dict of str to SX, optional
@@ -60,7 +62,8 @@ class Mechanism:
     ------
     SpecificationError
         If an expression names a symbol that is no coordinate, parameter or t; if S is not quadratic in γ''; if S
-        and T disagree; if there is nothing to take the balance from; if the mass matrix of `balance` is not symmetric.
+        and T disagree; if there is nothing to take the balance from; if the mass matrix of `balance` is not symmetric,
+        or not `mass`.
     NameUnknown
         If a force names no coordinate.
     """
@@ -75,6 +78,7 @@ class Mechanism:
         *,
         kinetic=None,
         balance=None,
+        mass=None,
         forces=None,
         constraints=None,
         outputs=None,
@@ -85,7 +89,8 @@ class Mechanism:
         self.parameters = require_kind(Parameters, "parameters", parameters, "sv.parameters(m=1.0, ...)")
         self._gibbs = None if gibbs is None else self._known(gibbs, "the Gibbs function")
         self._kinetic = None if kinetic is None else self._known(kinetic, "the kinetic energy")
-        self._inverse_dynamics = None if balance is None else self._known(balance, "the balance", q.n)
+        n, self._inverse_dynamics = q.n, None if balance is None else self._known(balance, "the balance", q.n)
+        self._mass = None if mass is None else ca.reshape(self._known(ca.vec(mass), "the mass matrix", n * n), n, n)
         self.potential = ca.SX(0) if potential is None else self._known(potential, "the potential")
         self._applied = self.forces = self._forces(forces)
         self.actuators = tuple(mapping(actuators, "The actuators"))
@@ -226,8 +231,8 @@ class Mechanism:
         driving = self.E @ ca.vertcat(*(inputs[name] for name in self.actuators)) if self.actuators else 0
         driven = Mechanism(
             self.q, self._gibbs, self.potential, None, self.parameters, kinetic=self._kinetic,
-            balance=self._inverse_dynamics, forces=self.forces + forces + driving, constraints=self.constraints,
-            outputs={**self.outputs, **inputs},
+            balance=self._inverse_dynamics, mass=self._mass, forces=self.forces + forces + driving,
+            constraints=self.constraints, outputs={**self.outputs, **inputs},
         )  # fmt: skip
         driven.inputs, driven.reported = tuple(inputs), driven._named(reported, "residual")
         return driven
@@ -246,7 +251,7 @@ class Mechanism:
     @cached_property
     def mass(self):
         """The inertia matrix M = ∂r/∂γ'', (n, n) SX."""
-        return ca.jacobian(self.balance, ca.vertcat(*self.q.gamma(2)))
+        return ca.jacobian(self.balance, ca.vertcat(*self.q.gamma(2))) if self._mass is None else self._mass
 
     @cached_property
     def energy(self):
@@ -279,7 +284,8 @@ class Mechanism:
                 do="Pass gibbs=sv.particle(...) + ..., kinetic=T or balance=r.",
                 coordinates=list(self.q.names),
             )
-        if self._kinetic is not None and self._gibbs is None and not self.q.plain and self.q.n < self.q.nq:
+        given = self._gibbs is not None or self._inverse_dynamics is not None
+        if self._kinetic is not None and not given and not self.q.plain and self.q.n < self.q.nq:
             self._refuse_nonholonomic_frame()
         acceleration = ca.vertcat(*self.q.gamma(2))
         curvature = ca.jacobian(ca.vec(self.mass), acceleration)
@@ -308,17 +314,34 @@ class Mechanism:
         """Refuse a given balance whose mass matrix is not symmetric."""
         if self._inverse_dynamics is None:
             return
-        names = self.q.jet_names(2)
+        names, n = self.q.jet_names(2), self.q.n
         factor = self.q.gamma(2)[0]  # the difference of two constants would be folded, and its rounding has no size
-        for i, j in itertools.combinations(range(self.q.n), 2):
-            if not self.is_zero([self.mass[i, j] * factor - self.mass[j, i] * factor]):
-                raise SpecificationError(
-                    f"The balance has {names[j]} in row {i} and {names[i]} in row {j} with different factors.",
-                    "The mass matrix ∂r/∂γ'' is symmetric where the rows are generalised forces of the coordinates; "
-                    "kinetic energy and ideal reactions need it.",
-                    do="Undo combinations of rows, such as a partial linearisation, or pass gibbs= or kinetic=.",
-                    components=[names[i], names[j]],
-                )
+        pairs = list(itertools.combinations(range(n), 2))
+        for i, j in self._different([(self.mass[i, j] * factor, self.mass[j, i] * factor) for i, j in pairs], pairs):
+            raise SpecificationError(
+                f"The balance has {names[j]} in row {i} and {names[i]} in row {j} with different factors.",
+                "The mass matrix ∂r/∂γ'' is symmetric where the rows are generalised forces of the coordinates; "
+                "kinetic energy and ideal reactions need it.",
+                do="Undo combinations of rows, such as a partial linearisation, or pass gibbs= or kinetic=.",
+                components=[names[i], names[j]],
+            )
+        if self._mass is None:
+            return
+        slope = ca.jacobian(self._inverse_dynamics, ca.vertcat(*self.q.gamma(2)))
+        pairs = [*pairs, *((i, i) for i in range(n))]
+        for i, j in self._different([(self.mass[i, j] * factor, slope[i, j] * factor) for i, j in pairs], pairs):
+            raise SpecificationError(
+                f"The mass matrix has another entry ({i}, {j}) than the factor of {names[j]} in the balance.",
+                "`mass` is ∂r/∂γ'' of `balance`.",
+                do="Correct one of them, or leave out `mass`.",
+                components=[names[i], names[j]],
+            )
+
+    def _different(self, couples, labels):
+        """Labels of the couples of SX scalars that differ at seeded random points by more than rounding."""
+        values, sizes = self.at_random([a - b for a, b in couples]) if couples else (np.zeros((0, 4)), 0.0)
+        differs = np.any(np.abs(values) > ENTRY * sizes, axis=1)
+        return [label for label, other in zip(labels, differs, strict=True) if other]
 
     def _static_forces(self):
         """What a given balance is at rest, such as gravity, (n,) SX; the rest is inertia and has a kinetic energy."""
@@ -495,6 +518,7 @@ def _part(identity, places):
     part._inverse_dynamics, part._applied, part.forces = map(
         rows, (whole._inverse_dynamics, whole._applied, whole.forces)
     )
+    part._mass = None if whole._mass is None else whole._mass[velocities, velocities]
     part.actuators, part.E = tuple(whole.actuators[j] for j in columns), whole.E[velocities, columns]
     part.constraints = {name: e for name, e in whole.constraints.items() if whole.places(e) <= places}
     part.outputs, part.inputs, part.reported = whole.outputs, whole.inputs, whole.reported

@@ -1,18 +1,21 @@
 
 /* Jets z = (x, highest derivative) and actuation u at state x of the plan. */
-static void feedforward(double t, const double *x, const double *p, double *z, double *u)
+static int feedforward(double t, const double *x, const double *p, double *z, double *u)
 {
     double dx[NX];
+    if (!(t - t == 0)) return -1;
     rates(t, x, p, dx);
     for (int i = 0; i < NX; i++) z[i] = x[i];
     for (int i = 0; i < N; i++) z[NX + i] = dx[NX - N + i];
     actuation(t, z, p, u);
+    return 0;
 }
 
 /* A Runge-Kutta step of order 4 of the state x from t to t + h. */
-static void advance(double t, double h, double *x, const double *p)
+static int advance(double t, double h, double *x, const double *p)
 {
     double k[4][NX], y[NX];
+    if (!(t - t == 0 && h - h == 0)) return -1;
     rates(t, x, p, k[0]);
     for (int i = 0; i < NX; i++) y[i] = x[i] + 0.5 * h * k[0][i];
     rates(t + 0.5 * h, y, p, k[1]);
@@ -21,4 +24,5 @@ static void advance(double t, double h, double *x, const double *p)
     for (int i = 0; i < NX; i++) y[i] = x[i] + h * k[2][i];
     rates(t + h, y, p, k[3]);
     for (int i = 0; i < NX; i++) x[i] += h / 6 * (k[0][i] + 2 * k[1][i] + 2 * k[2][i] + k[3][i]);
+    return 0;
 }

@@ -1,0 +1,426 @@
+"""Programs as people say them: residuals by name, in dicts that join with |, for `Program` and constraints.
+
+Each function takes the name that its residuals begin with. What is wished may be a number or an expression of time, of
+parameters, or of the coordinates::
+
+    tool = robot.frame("tool")
+    program = sv.Program(pose("tool", tool, path, turn) | {"elbow": robot.q["joint_3"] - 0.2})
+
+A norm is compared by the half difference of squares over the wished value, (|v|^2 - c^2)/(2 c), which is |v| - c to
+first order and has derivatives of every order.
+"""
+
+import casadi as ca
+
+from servoctl.checks import column, finite, is_number, mapping, matrix, named, require_kind, text
+from servoctl.errors import SpecificationError
+from servoctl.robots.robot import Frame
+from servoctl.spec import rotations
+from servoctl.spec.coordinates import Coordinates
+from servoctl.spec.mechanism import Mechanism
+
+
+def follow_point(name, position, target):
+    """A point goes where it is told: position - target, of order 0.
+
+    Parameters
+    ----------
+    name : str
+    position : SX scalar, column or sequence, one to three entries
+        The point [m], a function of the coordinates.
+    target : float, SX or sequence of as many
+        Where it is [m]: an expression of time, as those of `servoctl.paths`, or of other points.
+
+    Returns
+    -------
+    dict of str to SX
+        name_x, name_y, name_z [m].
+
+    Raises
+    ------
+    SpecificationError
+        If the sizes differ.
+    """
+    position, target = _vector(position, f"the position of {name!r}"), _vector(target, f"the target of {name!r}")
+    _require_equal(name, position, target)
+    return _entries(name, position - target)
+
+
+def follow_path(name, position, path, along):
+    """A point stays on a path: at a given time law, or freely, with the path's parameter as a further coordinate.
+
+    Parameters
+    ----------
+    name : str
+    position : SX column or sequence
+        The point [m].
+    path : callable
+        The path [m] as a function of its parameter: `lambda s: sv.paths.circle(s, (0, 1), 0.5)`.
+    along : SX
+        The parameter: a time law, or the symbol of a coordinate that only says how far the point is; the point is then
+        free along the path.
+
+    Returns
+    -------
+    dict of str to SX
+        name_x, name_y, name_z [m].
+    """
+    if not callable(path):
+        raise SpecificationError(
+            f"The path of {name!r} is a {type(path).__name__}.",
+            "It is a function of the path's parameter.",
+            do="Write lambda s: sv.paths.line(s, start, end); for an expression of time, use follow_point.",
+            name=name,
+        )
+    (along,) = column(along, f"the parameter of {name!r}", 1)
+    return follow_point(name, position, path(along))
+
+
+def pose(name, frame, position, rotation):
+    """A frame is where a position and a rotation are: three residuals each, of order 0.
+
+    Parameters
+    ----------
+    name : str
+    frame : Frame, or pair of a position (3,) and a rotation (3, 3)
+        The frame that moves.
+    position : (3,) SX or sequence
+        Its wished origin [m].
+    rotation : (3, 3) SX or array
+        Its wished rotation from its axes to the world's, as from `paths.turn` or `paths.slerp`.
+
+    Returns
+    -------
+    dict of str to SX
+        name_x, name_y, name_z [m] and name_rx, name_ry, name_rz [rad], as those of `orientation`.
+    """
+    place, turn = _frame(frame)
+    return follow_point(name, place, position) | orientation(name, turn, rotation)
+
+
+def orientation(name, frame, rotation):
+    """A frame has an orientation: the vector 2 tan(angle/2) along the axis of the rotation between them, of order 0.
+
+    It goes to infinity at half a turn, where half the difference of the matrices would vanish as at none.
+
+    Parameters
+    ----------
+    name : str
+    frame : Frame, or (3, 3) SX
+        The frame that moves, or its rotation.
+    rotation : (3, 3) SX or array
+        The wished rotation.
+
+    Returns
+    -------
+    dict of str to SX
+        name_rx, name_ry, name_rz [rad], in the wished axes.
+    """
+    turn = frame.rotation if isinstance(frame, Frame) else frame
+    difference = rotations.vector(_rotation(rotation, name).T @ _rotation(turn, name))
+    return {f"{name}_r{axis}": difference[i] for i, axis in enumerate("xyz")}
+
+
+def distance(name, a, b, value):
+    """Two points are a distance apart, of order 0; zero distance is `follow_point`.
+
+    Parameters
+    ----------
+    name : str
+    a, b : SX column or sequence, one to three entries
+        The points [m].
+    value : float or SX
+        The distance [m], positive.
+
+    Returns
+    -------
+    dict of str to SX
+        One residual [m].
+    """
+    a, b = _vector(a, f"the first point of {name!r}"), _vector(b, f"the second point of {name!r}")
+    _require_equal(name, a, b)
+    return {name: _norm(name, a - b, value, "a distance")}
+
+
+def constant_speed(name, q, position, value):
+    """A point has a speed, of order 1.
+
+    Parameters
+    ----------
+    name : str
+    q : Coordinates
+    position : SX column or sequence
+        The point [m].
+    value : float or SX
+        The speed [m/s], positive.
+
+    Returns
+    -------
+    dict of str to SX
+        One residual [m/s].
+    """
+    return {name: _norm(name, _rate_of(name, q, position, 1), value, "a speed")}
+
+
+def acceleration_norm(name, q, position, value):
+    """The acceleration of a point has a magnitude, of order 2.
+
+    Parameters
+    ----------
+    name : str
+    q : Coordinates
+    position : SX column or sequence
+        The point [m].
+    value : float or SX
+        The magnitude [m/s^2], positive.
+
+    Returns
+    -------
+    dict of str to SX
+        One residual [m/s^2].
+    """
+    return {name: _norm(name, _rate_of(name, q, position, 2), value, "the magnitude of an acceleration")}
+
+
+def jerk_norm(name, q, position, value):
+    """The jerk of a point, the rate of its acceleration, has a magnitude, of order 3.
+
+    Parameters
+    ----------
+    name : str
+    q : Coordinates
+    position : SX column or sequence
+        The point [m].
+    value : float or SX
+        The magnitude [m/s^3], positive.
+
+    Returns
+    -------
+    dict of str to SX
+        One residual [m/s^3].
+    """
+    return {name: _norm(name, _rate_of(name, q, position, 3), value, "the magnitude of a jerk")}
+
+
+def curvature(name, q, position, value):
+    """The path of a point in the plane has a curvature, of order 2; positive turns from x to y.
+
+    Parameters
+    ----------
+    name : str
+    q : Coordinates
+    position : (2,) SX or sequence
+        The point [m].
+    value : float or SX
+        The curvature [1/m].
+
+    Returns
+    -------
+    dict of str to SX
+        One residual [m^2/s^3]: x' y'' - y' x'' - curvature |v|^3.
+    """
+    v, a = (_rate_of(name, q, position, k) for k in (1, 2))
+    _require_plane(name, v)
+    (value,) = column(value, f"the curvature of {name!r}", 1)
+    return {name: v[0] * a[1] - v[1] * a[0] - value * ca.dot(v, v) ** 1.5}
+
+
+def curvature_rate(name, q, position, value):
+    """The curvature of a point's path in the plane changes at a rate, of order 3.
+
+    Parameters
+    ----------
+    name : str
+    q : Coordinates
+    position : (2,) SX or sequence
+        The point [m].
+    value : float or SX
+        Time derivative of the curvature [1/(m s)].
+
+    Returns
+    -------
+    dict of str to SX
+        One residual [1/(m s)].
+    """
+    v, a = (_rate_of(name, q, position, k) for k in (1, 2))
+    _require_plane(name, v)
+    (value,) = column(value, f"the rate of {name!r}", 1)
+    return {name: q.dt((v[0] * a[1] - v[1] * a[0]) / ca.dot(v, v) ** 1.5) - value}
+
+
+def perpendicular_velocities(name, q, a, b):
+    """The velocities of two points are perpendicular, of order 1.
+
+    Parameters
+    ----------
+    name : str
+    q : Coordinates
+    a, b : SX column or sequence
+        The points [m].
+
+    Returns
+    -------
+    dict of str to SX
+        One residual [m^2/s^2].
+    """
+    first, second = _rate_of(name, q, a, 1), _rate_of(name, q, b, 1)
+    _require_equal(name, first, second)
+    return {name: ca.dot(first, second)}
+
+
+def energy(name, mechanism, value):
+    """The energy of a mechanism, kinetic and potential, has a value, of order 1.
+
+    Parameters
+    ----------
+    name : str
+    mechanism : Mechanism
+    value : float or SX
+        [J]
+
+    Returns
+    -------
+    dict of str to SX
+        One residual [J].
+    """
+    require_kind(Mechanism, "mechanism", mechanism, "sv.Mechanism(q, gibbs, ...)")
+    (value,) = column(value, f"the energy of {name!r}", 1)
+    return {name: mechanism.energy - value}
+
+
+def momentum(name, mechanism, coordinate, value):
+    """The generalised momentum of a coordinate, (M w)_i, has a value: a virtual nonholonomic constraint, of order 1.
+
+    Parameters
+    ----------
+    name : str
+    mechanism : Mechanism
+    coordinate : str
+        The coordinate, or the quasi-velocity.
+    value : float or SX
+        [kg m/s or kg m^2/s]; an expression of the coordinates makes the constraint virtual and nonholonomic.
+
+    Returns
+    -------
+    dict of str to SX
+        One residual [kg m/s or kg m^2/s].
+    """
+    require_kind(Mechanism, "mechanism", mechanism, "sv.Mechanism(q, gibbs, ...)")
+    q = mechanism.q
+    names = q.names if q.plain else q.velocity_names
+    named(coordinate, names, "coordinate" if q.plain else "quasi-velocity")
+    (value,) = column(value, f"the momentum of {name!r}", 1)
+    return {name: (mechanism.mass @ ca.vertcat(*q.gamma(1)))[names.index(coordinate)] - value}
+
+
+def formation(name, leader, followers, offsets):
+    """Points keep their places relative to a leader, of order 0.
+
+    Parameters
+    ----------
+    name : str
+    leader : SX column or sequence
+        The leading point [m].
+    followers : dict of str to SX column or sequence
+        The other points [m].
+    offsets : dict of str to sequence
+        The place of each, relative to the leader [m]: numbers, or expressions that turn with it.
+
+    Returns
+    -------
+    dict of str to SX
+        name_follower_x, ... [m].
+
+    Raises
+    ------
+    NameUnknown
+        If an offset names no follower.
+    """
+    leader, followers = _vector(leader, f"the leader of {name!r}"), mapping(followers, "The followers")
+    for follower in mapping(offsets, "The offsets"):
+        named(follower, list(followers), "follower")
+    if missing := [follower for follower in followers if follower not in offsets]:
+        raise SpecificationError(
+            f"The followers {', '.join(missing)} of {name!r} have no offset.",
+            "Each follower has a place relative to the leader.",
+            do="Give offsets={...} for all.",
+            missing=missing,
+        )
+    rows = {}
+    for follower, point in followers.items():
+        rows |= follow_point(f"{name}_{follower}", point, leader + _vector(offsets[follower], f"offset {follower!r}"))
+    return rows
+
+
+def _frame(frame):
+    """Position and rotation of a frame, or of a pair."""
+    if isinstance(frame, Frame):
+        return frame.position, frame.rotation
+    if not isinstance(frame, tuple) or len(frame) != 2:
+        raise SpecificationError(
+            f"The frame is a {type(frame).__name__}.",
+            "It is a Frame, or a pair of a position and a rotation.",
+            do="Write robot.frame(link), or (position, rotation).",
+            type=type(frame).__name__,
+        )
+    return frame
+
+
+def _rotation(rotation, name):
+    rotation = matrix(rotation, f"the rotation of {name!r}")
+    if rotation.shape != (3, 3):
+        raise SpecificationError(
+            f"A rotation of {name!r} has the shape {rotation.shape}.", "It is (3, 3).", name=name, shape=rotation.shape
+        )
+    return rotation
+
+
+def _vector(value, what):
+    entries = column(value, what)
+    if not 1 <= len(entries) <= 3:
+        raise SpecificationError(f"{what} has {len(entries)} entries.", "A point has one to three.", what=what)
+    return ca.vertcat(*entries)
+
+
+def _rate_of(name, q, position, k):
+    """The k-th derivative of a point."""
+    require_kind(Coordinates, "q", q, 'sv.coordinates("x y")')
+    return q.dt(_vector(position, f"the position of {name!r}"), k)
+
+
+def _norm(name, vector, value, what):
+    """(|v|^2 - c^2)/(2 c)."""
+    if is_number(value) and finite(name, value) <= 0.0:
+        raise SpecificationError(
+            f"{name!r} programs {what} of {float(value):g}.",
+            "It is positive: at zero the gradient of a norm has no direction.",
+            do="Program the components instead.",
+            name=name,
+            value=float(value),
+        )
+    (value,) = column(value, f"the value of {name!r}", 1)
+    return (ca.dot(vector, vector) - value**2) / (2 * value)
+
+
+def _require_plane(name, vector):
+    if vector.numel() != 2:
+        raise SpecificationError(
+            f"The point of {name!r} has {vector.numel()} coordinates.",
+            "The curvature of a path has a sign in the plane alone.",
+            do="Give its two coordinates in the plane.",
+            name=name,
+        )
+
+
+def _require_equal(name, a, b):
+    if a.numel() != b.numel():
+        raise SpecificationError(
+            f"{name!r} compares {a.numel()} entries with {b.numel()}.", "Both have as many.", name=name
+        )
+
+
+def _entries(name, vector):
+    """Entries of a vector by name: the name itself for one, with _x, _y, _z for more."""
+    if vector.numel() == 1:
+        return {text("name", name): vector[0]}
+    return {f"{text('name', name)}_{axis}": vector[i] for i, axis in zip(range(vector.numel()), "xyz", strict=False)}

@@ -1,0 +1,1 @@
+"""Robots from their files: a tree of bodies becomes coordinates, a balance and frames."""

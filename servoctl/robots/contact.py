@@ -1,0 +1,176 @@
+"""Material constraints of robots: frames that are held, and chains that are closed."""
+
+import casadi as ca
+import numpy as np
+
+from servoctl.checks import named, require_kind, texts
+from servoctl.errors import SpecificationError
+from servoctl.robots.joints import identifier
+from servoctl.robots.robot import Frame, Robot
+from servoctl.spec import rotations
+
+HOLDS = ("position", "pose")
+POSTURE_SEED = 20033  # of the postures at which rows are compared
+POSTURES = 3
+FOLLOWS = 1e-9  # part of the largest singular value below which rows of Jacobians depend on others
+
+
+def held(robot: Robot, frames, at) -> dict:
+    """Material constraints that hold frames of a robot in the world.
+
+    Parameters
+    ----------
+    robot : Robot
+    frames : sequence of str, or dict of str to str
+        Links. A dict says of each what is held, its "position" (three rows) or its "pose" (six); a sequence holds
+        poses.
+    at : dict of str to float
+        The posture in which the frames are where they are held: coordinates by name, the others zero, the quaternion of
+        a free base one.
+
+    Returns
+    -------
+    dict of str to SX
+        Rows foot_x, foot_y, foot_z [m] and foot_rx, foot_ry, foot_rz: the vector 2 tan(angle/2) along the axis of the
+        rotation from the held orientation [rad], which goes to infinity, not back to zero, at half a turn. Rows that
+        follow from the others in every posture are left out.
+
+    Raises
+    ------
+    NameUnknown
+        If a link, a coordinate or a kind does not exist.
+    """
+    require_kind(Robot, "robot", robot, "sv.urdf(file)")
+    frames = frames if isinstance(frames, dict) else dict.fromkeys(texts(frames, "The frames"), "pose")
+    rows = {}
+    for link, kind in frames.items():
+        named(kind, HOLDS, "kind of constraint")
+        frame, (position, rotation) = robot.frame(link), robot.at(at, link)
+        turned = ca.DM(rotation.T) @ frame.rotation
+        rows |= _coinciding(identifier(link), frame.position - ca.DM(position), turned, kind)
+    return _without_followers(rows, robot.q, robot.parameters, True)
+
+
+def loop(a: Frame, b: Frame, kind="pose", name="loop") -> dict:
+    """Material constraints that close a chain: two frames of one robot coincide.
+
+    Parameters
+    ----------
+    a, b : Frame
+    kind : "position" or "pose"
+        Whether their origins coincide (three rows), or their axes as well (six).
+    name : str
+        What the rows' names begin with.
+
+    Returns
+    -------
+    dict of str to SX
+        Rows as those of `held`, in the axes of `a`. Rows that follow from the others in every posture, as those
+        across the plane of a planar linkage, are left out.
+
+    Raises
+    ------
+    SpecificationError
+        If the frames are of different robots.
+    NameUnknown
+        If the kind does not exist.
+    """
+    for key, frame in (("a", a), ("b", b)):
+        require_kind(Frame, key, frame, "robot.frame(link)")
+    named(kind, HOLDS, "kind of constraint")
+    if a.q is not b.q:
+        raise SpecificationError(
+            f"The frames {a.name!r} and {b.name!r} are of different robots.",
+            "A chain is closed in one robot; two robots are one where one file has both.",
+            do="Put both into one URDF file.",
+            frames=[a.name, b.name],
+        )
+    rows = _coinciding(identifier(name), a.rotation.T @ (b.position - a.position), a.rotation.T @ b.rotation, kind)
+    return _without_followers(rows, a.q, None, False)
+
+
+def _coinciding(name, offset, rotation, kind):
+    rows = {f"{name}_{axis}": offset[i] for i, axis in enumerate("xyz")}
+    if kind == "pose":
+        turned = rotations.vector(rotation)
+        rows |= {f"{name}_r{axis}": turned[i] for i, axis in enumerate("xyz")}
+    return rows
+
+
+def _without_followers(rows, q, parameters, consistent):
+    """The rows without those that depend on rows before them in every posture.
+
+    Parameters
+    ----------
+    rows : dict of str to SX
+    q : Coordinates
+    parameters : Parameters or None
+    consistent : bool
+        Whether all rows are known to vanish in some posture.
+    """
+    values = ca.vertcat(*rows.values())
+    symbols = ca.vertcat(*q, *((parameters.symbols) if parameters else ()))
+    gradient = ca.jacobian(values, ca.vertcat(*q)) @ q.V
+    evaluate = ca.Function("rows", [symbols], [values, ca.densify(gradient), ca.densify(q.V)])
+    numbers = np.array(list(parameters.defaults.values()) if parameters else [], float)
+    random = np.random.default_rng(POSTURE_SEED)
+    places = [np.concatenate([_some_posture(q, random), numbers]) for _ in range(POSTURES)]
+    kept = _adding([np.array(evaluate(place)[1]) for place in places])
+    if len(kept) < len(rows) and not consistent:
+        _refuse_contradiction(list(rows), kept, evaluate, places, q.nq)
+    return {name: row for i, (name, row) in enumerate(rows.items()) if i in kept}
+
+
+def _some_posture(q, random):
+    """A random posture; quaternions of free bodies are unit ones."""
+    posture = random.uniform(-1.0, 1.0, q.nq)
+    for i, name in enumerate(q.names):
+        if name.endswith("_qw") and not q.plain:
+            posture[i - 3 : i + 1] /= np.linalg.norm(posture[i - 3 : i + 1])
+    return posture
+
+
+def _adding(jacobians):
+    """Rows, first ones first, that add to the rank of the rows before them in one of the postures."""
+    kept = []
+    for i in range(jacobians[0].shape[0]):
+        trial = [*kept, i]
+        if any(_full_rank(jacobian[trial]) for jacobian in jacobians):
+            kept = trial
+    return kept
+
+
+def _full_rank(matrix):
+    singular = np.linalg.svd(matrix, compute_uv=False)
+    return len(singular) == len(matrix) and singular[-1] > FOLLOWS * max(1.0, singular[0])
+
+
+def _refuse_contradiction(names, kept, evaluate, places, nq):
+    """Refuse rows left out that do not vanish where the others do."""
+    dropped = [i for i in range(len(names)) if i not in kept]
+    for place in places:
+        closed = _newton(evaluate, kept, place.copy(), nq)
+        if closed is None:
+            continue
+        values = np.array(evaluate(closed)[0]).ravel()
+        worst = max(dropped, key=lambda i: abs(values[i]))
+        if abs(values[worst]) > FOLLOWS:
+            raise SpecificationError(
+                f"The chain cannot be closed: {names[worst]!r} is {values[worst]:.3g} where the other rows vanish.",
+                "The frames coincide in some posture.",
+                do='Correct the frames, or close their position alone, kind="position".',
+                row=names[worst],
+                value=float(values[worst]),
+            )
+        return
+
+
+def _newton(evaluate, kept, place, nq):
+    """A posture in which the rows kept vanish, by Newton's iteration from a posture; None where it finds none."""
+    for _ in range(50):
+        values, jacobian, frame = (np.array(part) for part in evaluate(place))
+        if np.abs(values[kept]).max(initial=0.0) < 1e-2 * FOLLOWS:
+            return place
+        step = np.linalg.lstsq(jacobian[kept], -values[kept].ravel(), rcond=None)[0]
+        place[:nq] += frame @ (step * min(1.0, 0.5 / max(np.abs(step).max(), 1e-300)))
+    return None

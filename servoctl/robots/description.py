@@ -1,0 +1,328 @@
+"""A URDF file, read by expat: links, joints and their numbers; document types, and so entities, are refused."""
+
+import math
+from dataclasses import dataclass, field
+from pathlib import Path
+from xml.etree.ElementTree import TreeBuilder
+from xml.parsers import expat
+
+import casadi as ca
+import numpy as np
+
+from servoctl.errors import SpecificationError, unknown
+
+LARGEST_FILE = 20_000_000  # bytes: a hundred times the largest description of a humanoid
+NEGLIGIBLE = 1e-12  # entry of a rotation that is rounding: zero, or one if it is that near to one
+JOINTS = ("revolute", "continuous", "prismatic", "fixed", "floating", "planar")
+MOMENTS = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
+
+
+@dataclass(frozen=True)
+class Inertial:
+    """Mass [kg], first moment [kg m] and inertia [kg m^2] about the origin of a frame, in its axes: DM or SX."""
+
+    mass: object = 0.0
+    moment: object = field(default_factory=lambda: ca.DM.zeros(3))
+    inertia: object = field(default_factory=lambda: ca.DM.zeros(3, 3))
+
+    def __add__(self, other):
+        return Inertial(self.mass + other.mass, self.moment + other.moment, self.inertia + other.inertia)
+
+    def moved(self, rotation, offset):
+        """The same body seen from a frame in which its own frame has this rotation and offset."""
+        if isinstance(rotation, np.ndarray):
+            rotation, offset = ca.DM(rotation), ca.DM(offset)
+        turned = rotation @ self.moment
+        shift = _parallel(offset, turned) + _parallel(turned, offset) + self.mass * _parallel(offset, offset)
+        inertia = rotation @ self.inertia @ rotation.T + shift
+        return Inertial(self.mass, turned + self.mass * offset, ca.triu2symm(ca.triu(inertia)))
+
+
+@dataclass(frozen=True)
+class Joint:
+    """A joint: child link on parent link, its placement, axis and the numbers of its tags."""
+
+    name: str
+    kind: str
+    parent: str
+    child: str
+    rotation: np.ndarray
+    offset: np.ndarray
+    axis: np.ndarray
+    lower: float = -math.inf
+    upper: float = math.inf
+    effort: float = math.inf
+    velocity: float = math.inf
+    damping: float = 0.0
+    friction: float = 0.0
+    mimic: tuple[str, float, float] | None = None  # joint, multiplier, offset
+
+
+@dataclass(frozen=True)
+class Description:
+    """Links by name with their inertia, and joints by name in the order of the file."""
+
+    name: str
+    links: dict[str, Inertial]
+    joints: dict[str, Joint]
+
+
+def described(source):
+    """The description of a robot from the path of a URDF file, or from its text.
+
+    Parameters
+    ----------
+    source : str, bytes or Path
+
+    Raises
+    ------
+    SpecificationError
+        If the file is no URDF, is too large, has a document type, entities or xacro, or numbers that are none.
+    """
+    root = _root_element(*_bytes(source))
+    if root.tag != "robot":
+        raise SpecificationError(
+            f"The root of the document is <{root.tag}>.", "That of a URDF file is <robot>.", tag=root.tag
+        )
+    links = {name: _inertial(node, name) for name, node in _by_name(root, "link").items()}
+    joints = {name: _joint(node, name) for name, node in _by_name(root, "joint").items()}
+    if not links:
+        raise SpecificationError("The robot has no link.", "A URDF file has at least one <link name=...>.")
+    for joint in joints.values():
+        _require_known(joint, links, joints)
+    return Description(root.get("name") or "robot", links, joints)
+
+
+def rotation_of(roll, pitch, yaw):
+    """The rotation matrix of roll, pitch and yaw [rad] about fixed axes, without entries that are rounding."""
+    cr, sr, cp, sp, cy, sy = (f(angle) for angle in (roll, pitch, yaw) for f in (math.cos, math.sin))
+    rotation = np.array([
+        [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr],
+        [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr],
+        [-sp, cp * sr, cp * cr],
+    ])  # fmt: skip
+    return without_rounding(rotation)
+
+
+def without_rounding(rotation):
+    """A rotation matrix whose entries within 1e-12 of -1, 0 or 1 are these."""
+    whole = np.round(rotation)
+    return np.where(np.abs(rotation - whole) < NEGLIGIBLE, whole, rotation)
+
+
+def _parallel(a, b):
+    """(a·b) E - b aᵀ, of which Steiner's rule is made."""
+    return ca.dot(a, b) * ca.DM.eye(3) - b @ a.T
+
+
+def _bytes(source):
+    """Bytes of a document and the encoding that overrides its declaration, or None."""
+    if isinstance(source, str) and "<" in source:
+        return source.encode(), "utf-8"
+    if isinstance(source, bytes):
+        return source, None
+    if not isinstance(source, (str, Path)):
+        raise SpecificationError(
+            f"The source of the robot is a {type(source).__name__}.",
+            "It is the path of a URDF file, or its text.",
+            do='Write sv.urdf("robot.urdf").',
+            type=type(source).__name__,
+        )
+    path = Path(source)
+    try:
+        size, content = path.stat().st_size, b""
+        if size <= LARGEST_FILE:
+            content = path.read_bytes()
+    except (OSError, ValueError) as error:
+        raise SpecificationError(
+            f"The file {str(source)[:200]!r} cannot be read: {getattr(error, 'strerror', None) or error}.",
+            "A robot comes from the path of a URDF file, or from its text.",
+            do="Check the path.",
+            path=str(source),
+        ) from None
+    _require_size(size)
+    return content, None
+
+
+def _require_size(size):
+    if size > LARGEST_FILE:
+        raise SpecificationError(
+            f"The document has {size} bytes.",
+            f"A robot's description has at most {LARGEST_FILE}.",
+            do="Meshes belong in files of their own.",
+            size=size,
+            limit=LARGEST_FILE,
+        )
+
+
+def _root_element(content, encoding):
+    """The root element; document types are refused, so that no entity is expanded or fetched."""
+    _require_size(len(content))
+    builder, parser = TreeBuilder(), expat.ParserCreate(encoding)
+    parser.StartElementHandler = lambda tag, attributes: builder.start(tag, _without_macros(tag, attributes))
+    parser.EndElementHandler = builder.end
+    parser.StartDoctypeDeclHandler = _refuse_document_type
+    try:
+        parser.Parse(content, True)
+    except (expat.ExpatError, LookupError) as error:
+        raise SpecificationError(
+            f"The document is no XML: {error}.",
+            "A robot's description is a URDF file: XML with a root <robot>.",
+            do="Check the place that the message names.",
+        ) from None
+    return builder.close()
+
+
+def _refuse_document_type(name, *_):
+    raise SpecificationError(
+        f"The document declares a document type {name!r}.",
+        "A URDF file needs none, and entities in it can fetch files or grow without bound.",
+        do="Remove <!DOCTYPE ...>.",
+        doctype=name,
+    )
+
+
+def _without_macros(tag, attributes):
+    """The attributes of an element that needs no macro processor."""
+    macro = next((f"{k}={v!r}" for k, v in attributes.items() if "${" in v or "$(" in v), None)
+    if tag.startswith("xacro:") or macro:
+        raise SpecificationError(
+            f"The document has {f'the attribute {macro}' if macro else f'the element <{tag}>'}.",
+            "It is written for xacro; sv.urdf reads the URDF that xacro makes of it.",
+            do="Run xacro robot.urdf.xacro > robot.urdf first.",
+            tag=tag,
+        )
+    return attributes
+
+
+def _by_name(root, tag):
+    """Elements of a kind by name."""
+    found = {}
+    for node in root.findall(tag):
+        name = node.get("name")
+        if not name or name in found:
+            raise SpecificationError(
+                f"Two of <{tag}> are named {name!r}." if name else f"A <{tag}> has no name.",
+                f"Each <{tag}> has a name that no other has.",
+                do="Rename one of them." if name else f"Write <{tag} name=...>.",
+                name=name,
+            )
+        found[name] = node
+    return found
+
+
+def _inertial(link, name):
+    """Inertia of a link about its origin; none where it has no <inertial>."""
+    node = link.find("inertial")
+    if node is None:
+        return Inertial()
+    rotation, offset = _origin(node, f"the inertial of link {name!r}")
+    what = f"link {name!r}"
+    mass = _one_number(node.find("mass"), "value", what)
+    ixx, ixy, ixz, iyy, iyz, izz = (_one_number(node.find("inertia"), key, what, 0.0) for key in MOMENTS)
+    inertia = ca.DM([[ixx, ixy, ixz], [ixy, iyy, iyz], [ixz, iyz, izz]])
+    if mass < 0.0:
+        raise SpecificationError(
+            f"The mass of link {name!r} is {mass:g} kg.", "A mass is at least zero.", "0.", link=name, mass=mass
+        )
+    return Inertial(mass, ca.DM.zeros(3), inertia).moved(rotation, offset)
+
+
+def _joint(node, name):
+    kind, what = node.get("type"), f"joint {name!r}"
+    if kind not in JOINTS:
+        raise SpecificationError(
+            f"The type of {what} is {kind!r}.",
+            f"Types of joints are {', '.join(JOINTS)}.",
+            unknown(kind, JOINTS, "type").details["match"] or "",
+            do="Build it from joints of these types, with links without mass between them.",
+            joint=name,
+            type=kind,
+        )
+    rotation, offset = _origin(node, what)
+    limit, dynamics = node.find("limit"), node.find("dynamics")
+    turns = kind in ("continuous", "floating", "planar")
+    return Joint(
+        name, kind, _link_of(node, "parent", what), _link_of(node, "child", what), rotation, offset,
+        np.zeros(3) if kind in ("fixed", "floating") else _axis(node, what),
+        lower=-math.inf if turns else _one_number(limit, "lower", what, 0.0 if limit is not None else -math.inf),
+        upper=math.inf if turns else _one_number(limit, "upper", what, 0.0 if limit is not None else math.inf),
+        effort=_one_number(limit, "effort", what, math.inf), velocity=_one_number(limit, "velocity", what, math.inf),
+        damping=_resistance(dynamics, "damping", what), friction=_resistance(dynamics, "friction", what),
+        mimic=_mimic(node.find("mimic"), what),
+    )  # fmt: skip
+
+
+def _link_of(node, tag, what):
+    found = node.find(tag)
+    if found is None or not found.get("link"):
+        raise SpecificationError(f"{what} has no <{tag} link=...>.", "A joint has a parent and a child.", joint=what)
+    return found.get("link")
+
+
+def _mimic(node, what):
+    if node is None:
+        return None
+    return node.get("joint"), _one_number(node, "multiplier", what, 1.0), _one_number(node, "offset", what, 0.0)
+
+
+def _origin(node, what):
+    """Rotation and offset of an element's <origin>; the identity where it has none."""
+    origin = node.find("origin")
+    if origin is None:
+        return np.eye(3), np.zeros(3)
+    angles, offset = (_finite_numbers(origin, key, what, "0 0 0") for key in ("rpy", "xyz"))
+    return rotation_of(*angles), np.array(offset)
+
+
+def _axis(node, what):
+    axis = np.array(_finite_numbers(node.find("axis"), "xyz", what, "1 0 0"))
+    length = np.linalg.norm(axis)
+    if not length:
+        raise SpecificationError(f"The axis of {what} is 0 0 0.", "An axis has a direction.", joint=what)
+    return without_rounding(axis / length)
+
+
+def _resistance(node, key, what):
+    value = _one_number(node, key, what, 0.0)
+    if value < 0.0:
+        raise SpecificationError(
+            f"The {key} of {what} is {value:g}.", "It takes energy away: it is at least zero.", "0.", joint=what
+        )
+    return value
+
+
+def _one_number(node, key, what, default=None):
+    if node is None or node.get(key) is None:
+        if default is not None:
+            return default
+        raise SpecificationError(f"{what} has no {key!r}.", f"It needs one number {key!r}.", what=what, attribute=key)
+    return _finite_numbers(node, key, what, count=1)[0]
+
+
+def _finite_numbers(node, key, what, default="", count=3):
+    """The finite numbers of an attribute."""
+    text = default if node is None else node.get(key, default)
+    try:
+        values = [float(word) for word in text.split()]
+    except ValueError:
+        values = []
+    infinite = count == 1 and key in ("lower", "upper", "effort", "velocity")
+    if len(values) != count or not all(math.isfinite(v) or infinite and not math.isnan(v) for v in values):
+        raise SpecificationError(
+            f"The attribute {key}={text!r} of {what} is given.",
+            f"It is {'a finite number' if count == 1 else f'{count} finite numbers, separated by blanks'}.",
+            what=what,
+            attribute=key,
+            value=text,
+        )
+    return values
+
+
+def _require_known(joint, links, joints):
+    """Refuse a joint between links, or like a joint, that are not there."""
+    for name in (joint.parent, joint.child):
+        if name not in links:
+            raise unknown(name, links, f"link (as joint {joint.name!r} needs it)")
+    if joint.mimic and joint.mimic[0] not in joints:
+        raise unknown(joint.mimic[0], joints, f"joint (as joint {joint.name!r} mimics it)")

@@ -1,0 +1,236 @@
+"""Kinematics and inertia of a tree of bodies, by recursion over them: linear in their number."""
+
+from dataclasses import dataclass
+
+import casadi as ca
+
+
+@dataclass(frozen=True)
+class Axis:
+    """The motion of a joint: coordinates, their rates and accelerations (SX), and what its force works on.
+
+    `rows` pairs places of the velocities with factors: that of the joint a joint mimics, times the multiplier. A free
+    body has a position (3,), a quaternion (4,) with the scalar last, and six velocities in its own axes.
+    """
+
+    motion: str
+    value: ca.SX
+    rate: ca.SX
+    acceleration: ca.SX
+    rows: tuple[tuple[int, float], ...]
+
+
+class Kinematics:
+    """Rotation and offset of each body in its parent, and its rates; all vectors in the body's own axes.
+
+    Attributes
+    ----------
+    rotations, offsets : list of (3, 3) and (3,) SX
+        Of the bodies in the world.
+    omega : list of (3,) SX
+        Angular velocities [rad/s].
+    speed : list of (3,) SX
+        Velocities of the origins [m/s].
+    """
+
+    def __init__(self, tree, axes):
+        self.tree, self.axes = tree, axes
+        self.rotations, self.offsets, self.omega, self.speed = [], [], [], []
+        self.locals = [_local(axis, body.parent is None) for body, axis in zip(tree.bodies, axes, strict=True)]
+        self.along = [_carried(axis) for axis in axes]
+        for body, axis in zip(tree.bodies, axes, strict=True):
+            self._place(body, axis)
+            self._move(body, axis)
+
+    def into(self, i, vector):
+        """A vector in the parent's axes, in those of body i."""
+        return self.locals[i].T @ (ca.DM(self.tree.bodies[i].placement.rotation.T) @ vector)
+
+    def out_of(self, i, vector):
+        """A vector in the axes of body i, in those of its parent."""
+        return ca.DM(self.tree.bodies[i].placement.rotation) @ (self.locals[i] @ vector)
+
+    def arm(self, i):
+        """The offset of body i's origin in its parent's axes."""
+        placement = self.tree.bodies[i].placement
+        return ca.DM(placement.offset) + ca.DM(placement.rotation) @ self.along[i]
+
+    def parent(self, vectors, i):
+        """The vector of body i's parent, zero for the ground."""
+        parent = self.tree.bodies[i].parent
+        return ca.SX.zeros(3) if parent is None else vectors[parent]
+
+    def _place(self, body, axis):
+        i = len(self.rotations)
+        inner = ca.horzcat(*(self.out_of(i, e) for e in ca.horzsplit(ca.SX.eye(3))))
+        if body.parent is None:
+            self.rotations.append(inner)
+            self.offsets.append(self.arm(i))
+        else:
+            outer = self.rotations[body.parent]
+            self.rotations.append(outer @ inner)
+            self.offsets.append(self.offsets[body.parent] + outer @ self.arm(i))
+
+    def _move(self, body, axis):
+        i = len(self.omega)
+        outer, speed = self.parent(self.omega, i), self.parent(self.speed, i)
+        carried = self.into(i, speed + ca.cross(outer, self.arm(i)))
+        spin, slide = {
+            "turn": (along_z(axis.rate[0]), 0),
+            "slide": (0, along_z(axis.rate[0])),
+            "free": (axis.rate[3:], axis.rate[:3]),
+        }[body.motion]
+        self.omega.append(self.into(i, outer) + spin)
+        self.speed.append(carried + slide)
+
+
+def inverse_dynamics(kinematics, n):
+    """Generalised forces of inertia M γ'' + h without gravity, by the recursive Newton-Euler scheme: (n,) SX.
+
+    Source: Featherstone, Rigid Body Dynamics Algorithms (2008), section 5.3, written with vectors of three.
+    """
+    bodies, axes, into = kinematics.tree.bodies, kinematics.axes, kinematics.into
+    alphas, accelerations, forces, couples = [], [], [], []
+    for i, (body, axis) in enumerate(zip(bodies, axes, strict=True)):
+        outer, arm = kinematics.parent(kinematics.omega, i), kinematics.arm(i)
+        alpha, acceleration = kinematics.parent(alphas, i), kinematics.parent(accelerations, i)
+        acceleration = into(i, acceleration + ca.cross(alpha, arm) + ca.cross(outer, ca.cross(outer, arm)))
+        alpha, outer = into(i, alpha), into(i, outer)
+        if body.motion == "turn":
+            spin = along_z(axis.rate[0])
+            alpha = alpha + ca.cross(outer, spin) + along_z(axis.acceleration[0])
+        elif body.motion == "slide":
+            slide = along_z(axis.rate[0])
+            acceleration = acceleration + 2 * ca.cross(outer, slide) + along_z(axis.acceleration[0])
+        else:
+            slide, spin = axis.rate[:3], axis.rate[3:]
+            alpha = alpha + ca.cross(outer, spin) + axis.acceleration[3:]
+            acceleration = acceleration + ca.cross(2 * outer + spin, slide) + axis.acceleration[:3]
+        alphas.append(alpha)
+        accelerations.append(acceleration)
+        force, couple = _inertial_load(body.inertial, kinematics.omega[i], alpha, acceleration)
+        forces.append(force)
+        couples.append(couple)
+    return _projected(kinematics, forces, couples, n)
+
+
+def kinetic_energy(kinematics):
+    """Kinetic energy [J] of the bodies: a function of q and the velocities."""
+    total = 0
+    for body, omega, speed in zip(kinematics.tree.bodies, kinematics.omega, kinematics.speed, strict=True):
+        inertial = body.inertial
+        total += inertial.mass * ca.dot(speed, speed) / 2 + ca.dot(ca.cross(omega, inertial.moment), speed)
+        total += ca.dot(omega, inertial.inertia @ omega) / 2
+    return total
+
+
+def potential_energy(kinematics, gravity):
+    """Potential energy [J] in a field of gravity, a vector (3,) [m/s^2] in the world's axes."""
+    moments, masses = zip(*((body.inertial.moment, body.inertial.mass) for body in kinematics.tree.bodies), strict=True)
+    moments, masses, total = list(map(ca.SX, moments)), list(masses), 0
+    for i in reversed(range(len(moments))):
+        parent, moment = kinematics.tree.bodies[i].parent, kinematics.out_of(i, moments[i])
+        moment = moment + masses[i] * kinematics.arm(i)
+        if parent is None:
+            total -= ca.dot(ca.DM(gravity), moment)
+        else:
+            moments[parent] = moments[parent] + moment
+            masses[parent] = masses[parent] + masses[i]
+    return total
+
+
+def quaternion_rotation(x, y, z, w, twice=2):
+    """The rotation matrix of a quaternion with the scalar w; a unit one, or any with `twice` 2/(x² + y² + z² + w²)."""
+    return ca.vertcat(
+        ca.horzcat(1 - twice * (y * y + z * z), twice * (x * y - z * w), twice * (x * z + y * w)),
+        ca.horzcat(twice * (x * y + z * w), 1 - twice * (x * x + z * z), twice * (y * z - x * w)),
+        ca.horzcat(twice * (x * z - y * w), twice * (y * z + x * w), 1 - twice * (x * x + y * y)),
+    )
+
+
+def _local(axis, first):
+    """Rotation of a body in the frame of its placement, orthonormal for any quaternion but that of a `first` body.
+
+    Of a first body nothing but frames and gravity depends on it, and they are read where the quaternion is a unit one.
+    """
+    if axis.motion == "slide":
+        return ca.SX.eye(3)
+    if axis.motion == "free":
+        quaternion = axis.value[3:]
+        return quaternion_rotation(*quaternion.elements(), 2 if first else 2 / ca.dot(quaternion, quaternion))
+    c, s = ca.cos(axis.value), ca.sin(axis.value)
+    return ca.vertcat(ca.horzcat(c, -s, 0), ca.horzcat(s, c, 0), ca.horzcat(0, 0, 1))
+
+
+def _carried(axis):
+    """Offset of a body in the frame of its placement."""
+    return {"turn": ca.SX.zeros(3), "slide": along_z(axis.value[0]), "free": axis.value[:3]}[axis.motion]
+
+
+def along_z(value):
+    """The vector (0, 0, value)."""
+    return ca.vertcat(0, 0, value)
+
+
+def _inertial_load(inertial, omega, alpha, acceleration):
+    """Force and couple about the body's origin that its motion takes."""
+    moment = inertial.moment
+    force = inertial.mass * acceleration + ca.cross(alpha, moment) + ca.cross(omega, ca.cross(omega, moment))
+    couple = inertial.inertia @ alpha + ca.cross(omega, inertial.inertia @ omega) + ca.cross(moment, acceleration)
+    return force, couple
+
+
+def _projected(kinematics, forces, couples, n):
+    """Generalised forces of forces and couples on the bodies, each with all that its joint carries."""
+    rows = [0] * n
+    for i in reversed(range(len(forces))):
+        body, axis = kinematics.tree.bodies[i], kinematics.axes[i]
+        load = {"turn": [couples[i][2]], "slide": [forces[i][2]]}.get(body.motion)
+        load = [*forces[i].elements(), *couples[i].elements()] if load is None else load
+        for (row, factor), value in zip(axis.rows, load, strict=True):
+            rows[row] += factor * value
+        if body.parent is not None:
+            force, couple = kinematics.out_of(i, forces[i]), kinematics.out_of(i, couples[i])
+            forces[body.parent] = forces[body.parent] + force
+            couples[body.parent] = couples[body.parent] + couple + ca.cross(kinematics.arm(i), force)
+    return ca.vertcat(*rows)
+
+
+def mass_matrix(kinematics, n):
+    """The mass matrix of the bodies by composite rigid bodies: (n, n) SX.
+
+    Source: Featherstone, Rigid Body Dynamics Algorithms (2008), section 6.2, written with vectors of three.
+    """
+    bodies, axes = kinematics.tree.bodies, kinematics.axes
+    composites = [body.inertial for body in bodies]
+    M = ca.SX.zeros(n, n)
+    for i in reversed(range(len(bodies))):
+        directions = _units_of_motion(bodies[i])
+        loads = [_inertial_load(composites[i], ca.SX.zeros(3), alpha, a) for alpha, a in directions]
+        for k, ((row, factor), load) in enumerate(zip(axes[i].rows, loads, strict=True)):
+            j, columns = i, range(k + 1)
+            while j is not None:
+                for c in columns:
+                    other, scale = axes[j].rows[c]
+                    alpha, a = _units_of_motion(bodies[j])[c]
+                    entry = factor * scale * (ca.dot(a, load[0]) + ca.dot(alpha, load[1]))
+                    M[row, other] += entry
+                    if (j, c) != (i, k):
+                        M[other, row] += entry
+                force, couple = kinematics.out_of(j, load[0]), kinematics.out_of(j, load[1])
+                load = force, couple + ca.cross(kinematics.arm(j), force)
+                j = bodies[j].parent
+                columns = range(6 if j is not None and bodies[j].motion == "free" else 1)
+        if (parent := bodies[i].parent) is not None:
+            inner = composites[i].moved(kinematics.locals[i], kinematics.along[i])
+            placement = bodies[i].placement
+            composites[parent] = composites[parent] + inner.moved(placement.rotation, placement.offset)
+    return M
+
+
+def _units_of_motion(body):
+    """Angular and linear acceleration of a body for a unit of each of its velocities."""
+    zero, e = ca.SX.zeros(3), ca.horzsplit(ca.SX.eye(3))
+    if body.motion == "free":
+        return [*((zero, axis) for axis in e), *((axis, zero) for axis in e)]
+    return [(e[2], zero) if body.motion == "turn" else (zero, e[2])]

@@ -1,0 +1,311 @@
+"""A robot from its file: coordinates named by joints, frames, limits, and the mechanism of its tree of bodies."""
+
+import math
+from dataclasses import dataclass
+from functools import cached_property
+
+import casadi as ca
+import numpy as np
+
+from servoctl.checks import as_list, column, finite, mapping, named, texts
+from servoctl.errors import SpecificationError, unknown
+from servoctl.robots.description import described
+from servoctl.robots.dynamics import Kinematics, inverse_dynamics, kinetic_energy, mass_matrix, potential_energy
+from servoctl.robots.inertia import require_possible, with_symbols
+from servoctl.robots.joints import ONE_AXIS, axes_of
+from servoctl.robots.tree import tree, with_followers
+from servoctl.spec.mechanism import Mechanism
+
+
+@dataclass(frozen=True)
+class Frame:
+    """A frame of a robot, made by `Robot.frame`.
+
+    Attributes
+    ----------
+    name : str
+        The link's.
+    position : (3,) SX
+        Of its origin in the world [m].
+    rotation : (3, 3) SX
+        From its axes to the world's.
+    jacobian : (6, n) SX
+        Velocity of the origin [m/s] and angular velocity [rad/s], both in the world's axes, over the velocities.
+    q : Coordinates
+    """
+
+    name: str
+    position: ca.SX
+    rotation: ca.SX
+    jacobian: ca.SX
+    q: object
+
+    def __repr__(self):
+        return f"Frame {self.name!r} of {' '.join(self.q.names)}"[:118]
+
+
+class Robot:
+    """A robot as a tree of bodies, made by `urdf`.
+
+    Attributes
+    ----------
+    q : Coordinates
+        Named by the joints, as identifiers. A free base has base_x ... base_z, the quaternion base_qx ... base_qw
+        (scalar last) with its invariant, and the velocities base_vx ... base_wz in its own axes; a joint's velocity is
+        then named hip_rate.
+    parameters : Parameters
+        Mass, centre and inertia of the symbolic links.
+    joints : dict of str to str
+        Names of the joints in the file, by coordinate.
+    links : tuple of str
+        Names of the frames.
+    effort, velocity, position : dict
+        Limits of the file: largest force or torque by actuator [N or N m], largest speed [m/s or rad/s] and (low, high)
+        [m or rad] by coordinate. Joints without a limit are left out.
+    damping, friction : dict of str to float
+        Viscous coefficients [N s/m or N m s] and dry friction [N or N m] by coordinate.
+    """
+
+    def __init__(self, description, tree, gravity, parameters):
+        self._description, self._tree, self._gravity = description, tree, gravity
+        self.name, self.parameters, self.links = description.name, parameters, tuple(tree.places)
+        self.q, self._axes, self.joints = axes_of(description, tree)
+        moving = {name: description.joints.get(joint) for name, joint in self.joints.items()}
+        self._moving = moving = {name: j for name, j in moving.items() if j is not None and j.kind in ONE_AXIS}
+        self.effort = {actuator(name, j): j.effort for name, j in moving.items() if math.isfinite(j.effort)}
+        self.velocity = {name: j.velocity for name, j in moving.items() if math.isfinite(j.velocity)}
+        self.position = {
+            name: (j.lower, j.upper) for name, j in moving.items() if math.isfinite(j.lower) or math.isfinite(j.upper)
+        }
+        self.damping, self.friction = self._resistances("damping"), self._resistances("friction")
+
+    def __repr__(self):
+        return f"Robot {self.name!r}: {self.q.n} degrees of freedom\n  coordinates {' '.join(self.q.names)}"
+
+    def frame(self, name) -> Frame:
+        """The frame of a link.
+
+        Parameters
+        ----------
+        name : str
+            The link's name in the file.
+
+        Raises
+        ------
+        NameUnknown
+            If no link has this name.
+        """
+        if name not in self._tree.places:
+            raise unknown(name, self.links, "link")
+        body, placement = self._tree.places[name]
+        position, rotation = ca.SX(ca.DM(placement.offset)), ca.SX(ca.DM(placement.rotation))
+        if body is not None:
+            outer = self._kinematics.rotations[body]
+            position, rotation = self._kinematics.offsets[body] + outer @ position, outer @ rotation
+        return Frame(name, position, rotation, self._jacobian(body, position), self.q)
+
+    def posture(self, at) -> np.ndarray:
+        """All coordinates of a posture, (nq,): those not named are zero, and the quaternion of a free body is one.
+
+        Parameters
+        ----------
+        at : dict of str to float
+            Coordinates by name [rad or m].
+
+        Raises
+        ------
+        NameUnknown
+            If one is no coordinate.
+        """
+        upright = () if self.q.plain else tuple(name for name in self.q.names if name.endswith("_qw"))
+        numbers = {name: 1.0 if name in upright else 0.0 for name in self.q.names}
+        for name, value in mapping(at, "The posture").items():
+            numbers[named(name, self.q.names, "coordinate")] = finite(name, value, "coordinate")
+        return np.array(list(numbers.values()))
+
+    def at(self, posture, link):
+        """Position (3,) [m] and rotation (3, 3) of a link in a posture, with the parameters' defaults.
+
+        Parameters
+        ----------
+        posture : dict of str to float
+        link : str
+
+        Returns
+        -------
+        position, rotation : arrays
+
+        Raises
+        ------
+        NameUnknown
+            If the link or a coordinate does not exist.
+        """
+        frame = self.frame(link)
+        f = ca.Function("f", [ca.vertcat(*self.q)], [ca.densify(frame.position), ca.densify(frame.rotation)])
+        position, rotation = f.call([ca.DM(self.posture(posture))])
+        return np.array(position).ravel(), np.array(rotation)
+
+    def mechanism(
+        self, constraints=None, actuators=None, *, outputs=None, forces=None, friction=None, parameters=None
+    ) -> Mechanism:
+        """The mechanism of the robot: its balance by the recursive Newton-Euler scheme, gravity and damping.
+
+        Parameters
+        ----------
+        constraints : dict of str to SX, optional
+            Material constraints, such as those of `held` and `loop`.
+        actuators : sequence of str or dict, optional
+            Coordinates whose joints are driven; all joints by default. They are named torque_hip, and force_lift where
+            the joint slides. A dict has displacements or directions, as in `Mechanism`.
+        outputs : dict of str to SX, optional
+        forces : dict of str to SX, optional
+            Further generalised forces, as in `Mechanism`.
+        friction : float, optional
+            Speed [rad/s or m/s] below which the file's dry friction c becomes viscous, c tanh(v / friction); 0 leaves
+            it out. Needed where the file has friction.
+        parameters : Parameters, optional
+            `robot.parameters.extended(...)`, where constraints and forces have further ones.
+
+        Raises
+        ------
+        SpecificationError
+            If the file has dry friction and `friction` is not given.
+        NameUnknown
+            If an actuator names no joint.
+        """
+        names = self.q.names if self.q.plain else self.q.velocity_names
+        total = {name: ca.SX(0) for name in names}
+        for name, value in mapping(forces, "The forces").items():
+            if name not in total:
+                raise unknown(name, names, "coordinate" if self.q.plain else "quasi-velocity")
+            total[name] += column(value, f"the force on {name!r}", 1)[0]
+        for name, value in zip(names, self._resistance(friction).elements(), strict=True):
+            total[name] += value
+        return Mechanism(
+            self.q,
+            potential=potential_energy(self._kinematics, self._gravity),
+            actuators=self._driven(actuators),
+            parameters=self.parameters if parameters is None else parameters,
+            kinetic=kinetic_energy(self._kinematics),
+            balance=inverse_dynamics(self._kinematics, self.q.n),
+            mass=mass_matrix(self._kinematics, self.q.n),
+            forces={name: value for name, value in total.items() if not value.is_zero()} or None,
+            constraints=constraints,
+            outputs=outputs,
+        )
+
+    @cached_property
+    def _kinematics(self):
+        return Kinematics(self._tree, self._axes)
+
+    def _jacobian(self, body, position):
+        """Jacobian of the velocities of a point and of the body it is on, (6, n) SX."""
+        result = ca.SX.zeros(6, self.q.n)
+        while body is not None:
+            rotation, arm = self._kinematics.rotations[body], position - self._kinematics.offsets[body]
+            axis = self._axes[body]
+            directions = ca.horzsplit(rotation) * 2 if axis.motion == "free" else [rotation[:, 2]]
+            for k, ((row, factor), e) in enumerate(zip(axis.rows, directions, strict=True)):
+                slides = axis.motion == "slide" or axis.motion == "free" and k < 3
+                column = ca.vertcat(e, ca.SX.zeros(3)) if slides else ca.vertcat(ca.cross(e, arm), e)
+                result[:, row] += factor * column
+            body = self._tree.bodies[body].parent
+        return result
+
+    def _resistances(self, key):
+        """Coefficients of a kind by coordinate."""
+        return {name: getattr(j, key) for name, j in self._moving.items() if getattr(j, key)}
+
+    def _resistance(self, friction):
+        """Generalised forces of damping and friction, (n,) SX."""
+        if friction is None and self.friction:
+            named = ", ".join(self.friction)
+            raise SpecificationError(
+                f"The joints {named} have dry friction."[:500],
+                "Dry friction jumps where a joint stops; servoctl takes it smoothed, as c tanh(v / friction).",
+                do="Pass friction=0.01, a speed in rad/s or m/s, or friction=0 to leave it out.",
+                joints=list(self.friction),
+            )
+        speed = finite("friction", 0.0 if friction is None else friction)
+        if speed < 0.0:
+            raise SpecificationError(f"friction={speed:g} is given.", "It is a speed, at least zero.", "0.")
+        rows = ca.SX.zeros(self.q.n)
+        for axis, body in zip(self._axes, self._tree.bodies, strict=True):
+            joint = self._description.joints.get(body.joint)
+            if joint is None or joint.kind not in ONE_AXIS:
+                continue
+            (row, factor), rate = axis.rows[0], axis.rate[0]
+            load = joint.damping * rate
+            if speed and joint.friction:
+                load = load + joint.friction * ca.tanh(rate / speed)
+            rows[row] -= factor * load
+        return rows
+
+    def _driven(self, actuators):
+        """Displacements of the actuators by name."""
+        if isinstance(actuators, dict):
+            return actuators
+        chosen = list(self._moving) if actuators is None else texts(actuators, "The actuators")
+        places = dict(zip(self.q.names, self.q, strict=True))
+        for name in chosen:
+            if name not in self._moving:
+                raise unknown(name, list(self._moving), "joint that can be driven")
+        return {actuator(name, self._moving[name]): places[name] for name in chosen}
+
+
+def urdf(source, base="fixed", lock=None, symbolic=(), gravity=9.81) -> Robot:
+    """Read a robot from a URDF file.
+
+    Fixed and locked joints make one body of their links; meshes, visuals, collisions and transmissions play no part.
+    Joints that mimic others move with them.
+
+    Parameters
+    ----------
+    source : str or Path
+        Path of the file, or its text.
+    base : "fixed" or "free"
+        Whether the root link rests in the world, or moves with six degrees of freedom.
+    lock : dict of str to float, optional
+        Positions of joints that do not move [rad or m], by their names in the file.
+    symbolic : sequence of str
+        Links whose mass, centre and inertia become parameters tool0_mass [kg], tool0_cx ... [m] and tool0_ixx ...
+        [kg m^2], about the centre of mass in the axes of the link. Their defaults are the numbers of the file.
+    gravity : float or (3,) sequence
+        Along -z of the world, or a vector [m/s^2].
+
+    Returns
+    -------
+    Robot
+
+    Raises
+    ------
+    SpecificationError
+        If the file is no URDF or written for xacro, is too large, declares a document type, has an impossible inertia,
+        two roots or a loop, or a joint that moves no mass.
+    NameUnknown
+        If a joint or a link does not exist.
+    """
+    description = described(source)
+    named(base, ("fixed", "free"), "base")
+    lock = {name: finite(name, value, "position") for name, value in mapping(lock, "The locked joints").items()}
+    parameters, inertials = with_symbols(description, texts(symbolic, "The symbolic links"))
+    description, lock = with_followers(description, lock)
+    bodies = tree(description, base, lock, inertials)
+    require_possible(bodies, parameters)
+    return Robot(description, bodies, _field(gravity), parameters)
+
+
+def actuator(name, joint):
+    """The name of the actuator of a joint, by its coordinate."""
+    return f"{'force' if joint.kind == 'prismatic' else 'torque'}_{name}"
+
+
+def _field(gravity):
+    """The vector of gravity."""
+    entries = as_list(gravity) or [gravity]
+    if len(entries) not in (1, 3):
+        raise SpecificationError(
+            f"gravity has {len(entries)} entries.", "It is a number along -z, or a vector of three."
+        )
+    numbers = [finite("gravity", value) for value in entries]
+    return np.array(numbers if len(numbers) == 3 else [0.0, 0.0, -numbers[0]])

@@ -1,0 +1,180 @@
+"""Paths of rotations: matrices R(s) from a body's axes to the world's, of the class of their argument.
+
+With a time law from `servoctl.paths` as the argument they are orientations to be programmed::
+
+    s = sv.paths.rest_to_rest(q.t, 0.0, 1.0, duration=2.0)
+    rotation = sv.rotations.slerp(s, start, end)
+"""
+
+import casadi as ca
+import numpy as np
+
+from servoctl.checks import as_numbers, column, matrix
+from servoctl.errors import SpecificationError
+from servoctl.spec import paths
+
+ORTHONORMAL = 1e-9  # largest difference of RᵀR from the identity
+HALF_TURN = 1e-6  # [rad] nearness to half a turn, where the shorter way is not determined
+
+
+def turn(angle, axis, start=None):
+    """Turn about an axis that is fixed in the world: R = exp(angle [axis]) start.
+
+    Parameters
+    ----------
+    angle : SX or float
+        [rad], of the class of the path.
+    axis : (3,) sequence of float
+        The axis; its length plays no part.
+    start : (3, 3) array or SX, optional
+        The rotation at angle zero; the identity by default.
+
+    Returns
+    -------
+    (3, 3) SX
+
+    Raises
+    ------
+    SpecificationError
+        If the axis is zero or the start is no rotation.
+    """
+    (angle,) = column(angle, "the angle", 1)
+    axis = np.asarray(as_numbers(axis), float) if as_numbers(axis) is not None else np.zeros(0)
+    if axis.shape != (3,) or not np.isfinite(axis).all() or not axis.any():
+        raise SpecificationError(
+            f"The axis of the turn is {axis.tolist()}.", "It has three numbers, not all zero.", axis=axis.tolist()
+        )
+    return _about(axis / np.linalg.norm(axis), angle) @ (ca.SX.eye(3) if start is None else _rotation(start, "start"))
+
+
+def slerp(s, start, end):
+    """Turn evenly from one rotation to another, by the shorter way: R = start exp(s log(startᵀ end)).
+
+    Parameters
+    ----------
+    s : SX or float
+        Time law, 0 at the start and 1 at the end; the turn goes on outside.
+    start, end : (3, 3) arrays
+        The rotations.
+
+    Returns
+    -------
+    (3, 3) SX
+
+    Raises
+    ------
+    SpecificationError
+        If one is no rotation, or they are half a turn apart, where both ways are as long.
+    """
+    (s,) = column(s, "s", 1)
+    start, end = _matrix_of_numbers(start, "start"), _matrix_of_numbers(end, "end")
+    axis, angle = _axis_and_angle(start.T @ end)
+    return ca.SX(ca.DM(start)) @ _about(axis, s * angle)
+
+
+def spline(t, times, rotations, smoothness=2, ends="rest"):
+    """Pass through measured rotations at given times.
+
+    The vectors 2 tan(angle/2) along the axes, relative to the middle rotation, are a spline of `paths.spline`.
+
+    Parameters
+    ----------
+    t : SX or float
+        Time [s], or a time law.
+    times : (n,) array
+        Strictly increasing [s].
+    rotations : (n, 3, 3) array
+    smoothness : int, optional
+        Class k >= 0 of the path.
+    ends : {"rest", "natural"}, optional
+        As those of `paths.spline`.
+
+    Returns
+    -------
+    (3, 3) SX
+
+    Raises
+    ------
+    SpecificationError
+        If one is no rotation, or is half a turn or more from the middle one.
+    """
+    rotations = [_matrix_of_numbers(rotation, f"rotations[{i}]") for i, rotation in enumerate(rotations)]
+    middle = rotations[len(rotations) // 2]
+    vectors = []
+    for i, rotation in enumerate(rotations):
+        axis, angle = _axis_and_angle(middle.T @ rotation, f"rotations[{i}] and the middle one")
+        vectors.append(2.0 * np.tan(angle / 2.0) * axis)
+    return ca.SX(ca.DM(middle)) @ from_vector(paths.spline(t, times, np.array(vectors), smoothness, ends))
+
+
+def from_vector(vector):
+    """The rotation of a vector 2 tan(angle/2) along its axis: Rodrigues' parameters, twice.
+
+    Parameters
+    ----------
+    vector : (3,) SX or sequence
+
+    Returns
+    -------
+    (3, 3) SX
+    """
+    vector = ca.vertcat(*column(vector, "the vector", 3))
+    cross = ca.skew(vector)
+    return ca.SX.eye(3) + (cross + cross @ cross / 2) * (4 / (4 + ca.dot(vector, vector)))
+
+
+def vector(rotation):
+    """The vector 2 tan(angle/2) along the axis of a rotation, which goes to infinity at half a turn.
+
+    Parameters
+    ----------
+    rotation : (3, 3) SX or array
+
+    Returns
+    -------
+    (3,) SX
+    """
+    rotation = _rotation(rotation, "the rotation")
+    skew = rotation - rotation.T
+    return 2 * ca.vertcat(skew[2, 1], skew[0, 2], skew[1, 0]) / (1 + ca.trace(rotation))
+
+
+def _about(axis, angle):
+    """exp(angle [axis]) of a unit vector of numbers."""
+    axis, cross = ca.DM(axis), ca.skew(ca.DM(axis))
+    return ca.SX.eye(3) + ca.sin(angle) * cross + (1 - ca.cos(angle)) * (cross @ cross)
+
+
+def _axis_and_angle(rotation, what="start and end"):
+    """Axis (3,) and angle [rad] in [0, π) of a rotation of numbers."""
+    skew = np.array([rotation[2, 1] - rotation[1, 2], rotation[0, 2] - rotation[2, 0], rotation[1, 0] - rotation[0, 1]])
+    angle = float(np.arctan2(np.linalg.norm(skew) / 2.0, (np.trace(rotation) - 1.0) / 2.0))
+    if np.pi - angle < HALF_TURN:
+        raise SpecificationError(
+            f"{what} are half a turn apart.",
+            "Both ways are as long, and the axis depends on rounding.",
+            do="Add a rotation between them, or use rotations.turn with the axis that you mean.",
+            angle=angle,
+        )
+    return (skew / np.linalg.norm(skew) if skew.any() else np.array([0.0, 0.0, 1.0])), angle
+
+
+def _rotation(value, what):
+    value = matrix(value, what)
+    if value.shape != (3, 3):
+        raise SpecificationError(f"{what} has the shape {value.shape}.", "A rotation is (3, 3).", shape=value.shape)
+    return value
+
+
+def _matrix_of_numbers(value, what):
+    """A rotation of numbers, (3, 3) array."""
+    array = np.asarray(as_numbers(value), float) if as_numbers(value) is not None else np.zeros(0)
+    proper = array.shape == (3, 3) and np.isfinite(array).all() and np.linalg.det(array) > 0.0
+    if not proper or np.abs(array.T @ array - np.eye(3)).max() > ORTHONORMAL:
+        raise SpecificationError(
+            f"{what} is no rotation: {array.tolist()}."[:300],
+            "A rotation matrix has orthonormal columns and determinant 1.",
+            do="Take the nearest one, U Vᵀ of its singular value decomposition, or use rotations.turn.",
+            what=what,
+        )
+    return array

@@ -1,0 +1,80 @@
+"""Robots for tests: the project's own files, those of example-robot-data where it is installed, and pinocchio's view."""
+
+from importlib.util import find_spec
+from pathlib import Path
+
+import casadi as ca
+import numpy as np
+
+OWN = Path(__file__).parents[1] / "examples" / "robots"
+PUBLIC = {
+    "ur5": "ur_description/urdf/ur5_robot.urdf",
+    "panda": "panda_description/urdf/panda.urdf",
+    "solo12": "solo_description/robots/solo12.urdf",
+    "talos": "talos_data/robots/talos_reduced.urdf",
+}
+
+
+def file_of(name):
+    """The path of a robot's file, or None where example-robot-data is not installed."""
+    if name not in PUBLIC:
+        return str(OWN / f"{name}.urdf")
+    found = find_spec("cmeel")
+    if found is None:
+        return None
+    root = Path(found.origin).parents[1] / "cmeel.prefix/share/example-robot-data/robots"
+    return str(root / PUBLIC[name]) if (root / PUBLIC[name]).exists() else None
+
+
+TWIST, PLACE = ("vx", "vy", "vz", "wx", "wy", "wz"), ("x", "y", "z", "qx", "qy", "qz", "qw")
+
+
+class Pinocchio:
+    """A robot in pinocchio, with states given in the names of servoctl."""
+
+    def __init__(self, robot, path, base):
+        import pinocchio
+
+        self.pin, self.robot = pinocchio, robot
+        free = (pinocchio.JointModelFreeFlyer(),) if base == "free" else ()
+        self.model = pinocchio.buildModelFromUrdf(path, *free, mimic=True)
+        self.data = self.model.createData()
+        q, by_joint = robot.q, {joint: name for name, joint in robot.joints.items()}
+        velocities = list(q.names if q.plain else q.velocity_names)
+        self.rows = np.zeros(self.model.nv, int)  # of our velocities, in pinocchio's order
+        for joint, name in zip(list(self.model.joints)[1:], list(self.model.names)[1:], strict=True):
+            if joint.nv == 6:
+                self.rows[joint.idx_v : joint.idx_v + 6] = [velocities.index(f"base_{e}") for e in TWIST]
+            elif joint.nv:
+                own = by_joint[name]
+                self.rows[joint.idx_v] = velocities.index(own if q.plain else f"{own}_rate")
+        self.by_joint = by_joint
+
+    def configuration(self, values):
+        """pinocchio's configuration of ours, (nq,) array."""
+        numbers, result = dict(zip(self.robot.q.names, values, strict=True)), self.pin.neutral(self.model)
+        for joint, name in zip(list(self.model.joints)[1:], list(self.model.names)[1:], strict=True):
+            if joint.nv == 6:
+                result[joint.idx_q : joint.idx_q + 7] = [numbers[f"base_{e}"] for e in PLACE]
+            elif joint.nv:
+                angle = numbers[self.by_joint[name]]
+                turns = joint.nq == 2
+                result[joint.idx_q : joint.idx_q + joint.nq] = [np.cos(angle), np.sin(angle)] if turns else [angle]
+        return result
+
+
+def random_state(robot, random):
+    """Coordinates, velocities and accelerations; the quaternion of a free base is a unit one."""
+    q = robot.q
+    values = random.uniform(-2.0, 2.0, q.nq)
+    if not q.plain:
+        place = q.names.index("base_qx")
+        values[place : place + 4] /= np.linalg.norm(values[place : place + 4])
+    return values, random.normal(size=q.n), random.normal(size=q.n)
+
+
+def function_of(robot, *expressions):
+    """Expressions as a function of coordinates, velocities and accelerations that returns arrays."""
+    q = robot.q
+    f = ca.Function("f", [ca.vertcat(*q), q.jet(1), q.jet(2)], [ca.densify(ca.SX(e)) for e in expressions])
+    return lambda *state: [np.array(value).squeeze() for value in f.call([ca.DM(part) for part in state])]
