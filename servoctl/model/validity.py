@@ -161,7 +161,7 @@ def _moved(model, values):
     for _ in range(MOVES):
         here = (left[:, None] * n_points + np.arange(n_points)).ravel()
         y = _evaluated(invariants, m * (1 + n_x), t[here], x[:, here], p[:, here])
-        residual, jacobian = y[:m], y[m:].reshape(n_x, m, -1).swapaxes(0, 1)
+        residual, jacobian = y[:m], y[m:].reshape(n_x, m, len(here)).swapaxes(0, 1)
         finite = np.isfinite(y).all(axis=0)
         near = (np.abs(residual) <= ON_MANIFOLD * gradient_scales(jacobian, x[:, here], sizes)).all(axis=0) & finite
         finite, near = (each.reshape(-1, n_points).all(axis=1) for each in (finite, near))
