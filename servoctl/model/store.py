@@ -134,6 +134,7 @@ def fingerprint(mechanism, program, guess=None, near=None, values=None):
         facts = [
             list(program.residuals),
             program.by,
+            program.metric,
             *(
                 [(name, None if isinstance(e, ca.SX) else float(e)) for name, e in chosen.items()]
                 for chosen in (program.weights, program.toward)

@@ -76,9 +76,10 @@ def equilibrate(matrix):
     for _ in range(SWEEPS if a.size else 0):
         for axis, factors in ((-1, rows), (-2, columns)):
             largest = np.abs(a).max(axis=axis)
-            scale = 1.0 / np.sqrt(np.where(largest > 0, largest, 1.0))
+            largest[~(largest > 0)] = 1.0
+            scale = 1.0 / np.sqrt(largest)
             factors *= scale
-            a *= np.expand_dims(scale, axis)
+            a *= scale[..., None] if axis == -1 else scale[..., None, :]
     return a, rows, columns
 
 
@@ -298,8 +299,9 @@ def pivot_columns(matrix, numbers):
 class _System:
     """A system under elimination.
 
-    `rows` has for each row its entries by column: an SX scalar, its equilibrated numbers at the points where pivots are
-    chosen, and behind these its values at random points, where it is zero only if it vanishes identically.
+    `rows` has for each row its entries by column: an SX scalar, and its equilibrated numbers at the points where pivots
+    are chosen. What is zero at all of them is left out if it vanishes identically. Where an elimination asks
+    that, the entries that follow have behind their numbers the values at random points that tell.
     `candidates` are the columns whose entries may be pivots; `open` lists the rows that were no pivot rows yet,
     `members` those of a column.
     """
@@ -307,14 +309,17 @@ class _System:
     def __init__(self, matrix, right, numbers):
         n = matrix.shape[0]
         scaled = np.moveaxis(equilibrate(np.moveaxis(numbers, 2, 0))[0], 0, 2).astype(float)
-        self.points = scaled.shape[2]
-        entries, anywhere = matrix.nonzeros(), spread(matrix.nonzeros())
+        self.points, self.asked, self.followed = scaled.shape[2], False, False
+        entries = list(zip(*matrix.sparsity().get_triplet(), matrix.nonzeros(), strict=True))
+        doubtful = [(i, j, entry) for i, j, entry in entries if not scaled[i, j].any()]
+        vanishing = _vanish([entry for _, _, entry in doubtful])
+        zeros = {(i, j) for (i, j, _), zero in zip(doubtful, vanishing, strict=True) if zero}
         self.rows = [{} for _ in range(n)]
-        for i, j, entry, values in zip(*matrix.sparsity().get_triplet(), entries, anywhere, strict=True):
-            if scaled[i, j].any() or not vanish(values):
-                self.rows[i][j] = entry, np.append(scaled[i, j], values)
-            else:
+        for i, j, entry in entries:
+            if (i, j) in zeros:
                 _leave_out(entry)
+            else:
+                self.rows[i][j] = entry, scaled[i, j]
         self.rhs = (
             [right[i, :].elements() for i in range(n)] if right.shape[1] != 1 else [[b] for b in right.elements()]
         )
@@ -338,6 +343,8 @@ class _System:
 
         Among these a number is taken, if there is one: it cannot vanish, and less depends on it.
         """
+        if self.asked and not self.followed:
+            self._follow()
         i, j = self._pivot()
         row = self.rows[i]
         del self.open[i]
@@ -376,21 +383,37 @@ class _System:
             if c == j:
                 continue
             old, old_number = row.get(c, (_ZERO, 0.0))
-            change = factor_number * a_number
-            new = _difference(old_number, change)
-            if not new[: self.points].any() and vanish(new[self.points :]):
-                _leave_out(subtract(old, multiply(factor, a)))
+            left, numbers = subtract(old, multiply(factor, a)), _difference(old_number, factor_number * a_number)
+            if not numbers[: self.points].any() and self._vanishes(left, numbers[self.points :]):
+                _leave_out(left)
                 if row.pop(c, None) is not None:
                     del self.members[c][r]
             else:
-                row[c] = (subtract(old, multiply(factor, a)), new)
+                row[c] = left, numbers
                 self.members[c][r] = None
         for k, b in enumerate(pivot_right):
             if not b.is_zero():
                 right[k] = subtract(right[k], multiply(factor, b))
 
+    def _vanishes(self, entry, values):
+        """Whether an entry vanishes identically, from its values at random points if they are followed."""
+        self.asked = True
+        return bool(vanish(values)) if self.followed else _vanish([entry])[0]
+
+    def _follow(self):
+        """Append the values at random points to the numbers of all entries that are still eliminated."""
+        places = [(self.rows[i], j) for i in self.open for j in self.rows[i]]
+        for (row, j), values in zip(places, spread([row[j][0] for row, j in places]), strict=True):
+            row[j] = row[j][0], np.append(row[j][1], values)
+        self.followed = True
+
 
 _ZERO = ca.SX(0)
+
+
+def _vanish(entries):
+    """Whether each of some SX scalars vanishes identically."""
+    return [vanish(values) for values in spread(entries)] if entries else []
 
 
 def _leave_out(entry):
