@@ -10,7 +10,7 @@ from scipy.linalg import qr
 from servoctl.errors import SingularProgram
 from servoctl.jets.identity import spread
 from servoctl.reduction import ranks
-from servoctl.reduction.ranks import clean, combination, decide, decide_all, eliminate, equilibrate, pivot_columns
+from servoctl.reduction.ranks import clean, combination, decide, decide_all, eliminate, equilibrate, pivot_order
 from servoctl.reduction.realisation import _independent_columns
 from servoctl.tolerances import EXTENDED, NOISE
 
@@ -248,7 +248,7 @@ def test_columns_to_be_solved_for_are_regular_at_all_points():
     a = ca.SX.sym("a")
     matrix = ca.horzcat(ca.vertcat(1.0, 0.0), ca.vertcat(a, 1.0), ca.vertcat(2.0, 1.0))
     numbers = np.array([[[1.0, 1.0], [0.0, 2.0], [2.0, 2.0]], [[0.0, 0.0], [1.0, 1.0], [1.0, 1.0]]])
-    columns = pivot_columns(matrix, numbers)
+    columns = [j for _, j in pivot_order(matrix, numbers)]
     assert len(columns) == 2 and all(abs(np.linalg.det(numbers[:, columns, i])) > 0.1 for i in range(2))
     with pytest.raises(SingularProgram):
-        pivot_columns(ca.SX([[1.0, 1.0], [1.0, 1.0]]), np.ones((2, 2, 1)))
+        pivot_order(ca.SX([[1.0, 1.0], [1.0, 1.0]]), np.ones((2, 2, 1)))

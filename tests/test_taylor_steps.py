@@ -160,7 +160,8 @@ def test_rates_that_rows_determine_satisfy_them_to_rounding(scene, rtol=1e-7):
     for name, row in model.reduction.original.items():
         first = 1 if row.order == 0 else 0  # positions are integrated, and their rates follow from the row with them
         left = np.abs(run.residual[name][first:]).max()
-        assert left < (1e-13 if first == 0 else 10 * rtol) * max(1.0, np.abs(run.jets).max()), name
+        by_rows = first == 0 and not run.counters.get("pivot_changes")  # pivots of definite matrices determine no rates
+        assert left < (1e-13 if by_rows else 10 * rtol) * max(1.0, np.abs(run.jets).max()), name
 
 
 def test_a_mechanism_as_given_takes_the_steps_of_one_reduced_by_hand():

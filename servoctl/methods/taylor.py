@@ -22,8 +22,9 @@ from servoctl.methods.monitor import DenseStretch, Fine, Repivot
 from servoctl.methods.motion import Stepping
 from servoctl.methods.narrow import arguments, centres
 from servoctl.methods.watch import RESOLUTION, End, net, steps_of
+from servoctl.model.equations import monitored_rows
 from servoctl.reduction.cascade import Running
-from servoctl.reduction.ranks import clean, eliminate, noting_dropped, pivot_columns
+from servoctl.reduction.ranks import clean, eliminate, noting_dropped, pivot_order
 
 LOWEST, HIGHEST = 4, 24  # orders: below, steps are too short; above, compiling grows faster than steps
 INSIDE = np.array([0.07, 0.19, 0.34, 0.53, 0.71, 0.86, 0.98])  # parts of a step at which its series is checked
@@ -135,24 +136,26 @@ class _Motion(Motion):
 
 
 def solved_for(equations):
-    """Velocities that rows determine: for each level below s̄ indices of rows, and of the entries of γ^(k) they give.
+    """Velocities that rows determine: for each level below s̄ rows, the entries of γ^(k) they give, and pivots.
 
     A row of order k or less is linear in γ^(k). Those entries are not integrated: what is integrated satisfies the row
     with the tolerance, what is solved for to rounding. They are chosen so that all pivots are constant or watched.
     """
     r, solved = equations.r, {}
-    for k in range(1, equations.top if r.cascade is None else 1):
+    for k in range(1, equations.top if r.cascade is None and not equations.definite else 1):
         rows = [a for a, row in enumerate(r.rows) if row.order + (not row.affine) <= k]
         matrix = r.leading[rows, :]
         numbers = clean(*r.points.matrix(matrix))
         try:
-            columns = pivot_columns(matrix, numbers)
+            order = [(rows.index(i), j) for i, j in r.order if i in rows] or pivot_order(matrix, numbers)
+            columns = sorted(j for _, j in order)
+            order = tuple((i, columns.index(j)) for i, j in order)
             with noting_dropped() as entries:
-                _, pivots = eliminate(matrix[:, columns], ca.SX(len(rows), 0), numbers[:, columns])
+                _, pivots = eliminate(matrix[:, columns], ca.SX(len(rows), 0), numbers[:, columns], order=order)
         except SingularProgram:
             continue
         if rows and not entries and all(_watched(pivot, equations) for pivot in pivots):
-            solved[k] = rows, columns
+            solved[k] = rows, columns, order
     return solved
 
 
@@ -175,7 +178,7 @@ class _Rows:
     def advance(self, k):
         """γ_[k]: below s̄ from the state and the rows that determine a part of it, from s̄ on from all rows."""
         every = range(len(self.r.rows))
-        rows, columns = self.solved.get(k, ([], [])) if k < self.top else (every, every)
+        rows, columns, order = self.solved.get(k, ([], [], ())) if k < self.top else (every, every, ())
         groups, right = [group for group in self.groups if group.order <= k], {}
         if k:
             self.motion.guess(k, columns)
@@ -183,15 +186,32 @@ class _Rows:
             scale = -factorial(k - group.order) / factorial(k)
             right |= {a: ca.SX(c) * scale for a, c in zip(group.members, group.advance(k), strict=True)}
         if len(rows):
-            matrix = self.r.leading[list(rows), list(columns)]
-            numbers = clean(*self.r.points.matrix(matrix))
-            solution, _ = eliminate(matrix, ca.vertcat(*(right[a] for a in rows)), numbers)
+            solution = self._solution((list(rows), list(columns)), order, ca.vertcat(*(right[a] for a in rows)))
             gamma = list(self.motion.gamma[k])
             for i, x in zip(columns, solution.elements(), strict=True):
                 gamma[i] = 0.0 if x.is_zero() else x
             self.motion.settle(k, gamma)
             for group in groups:
                 group.correct(k)
+
+    def _solution(self, place, order, right):
+        if not order:
+            return self.r.solve(right)[0]
+        matrix = self.r.leading[place[0], place[1]]
+        return eliminate(matrix, right, clean(*self.r.points.matrix(matrix)), order=order)[0]
+
+
+class _Reacting(_Motion):
+    """A motion with coefficients of the multipliers μ."""
+
+    def __init__(self, equations):
+        super().__init__(equations)
+        self.multipliers, self.mu = ca.SX.sym("mu", equations.r.realisation.B.shape[1]), []
+        self.indices = {s.element_hash(): i for i, s in enumerate(self.multipliers.elements())}
+
+    def coefficient(self, symbol, j):
+        i = self.indices.get(symbol.element_hash())
+        return super().coefficient(symbol, j) if i is None else self.mu[j][i]
 
 
 def taylor_coefficients(equations, last):
@@ -213,10 +233,54 @@ def taylor_coefficients(equations, last):
     if r.cascade is not None:
         motion = r.cascade.along(r.points, equations.top - 1, last, running=_InBlock)
         return _coefficients(equations, motion.place, motion.gamma, last, _InBlock.instant)
+    motion = _with_multipliers(equations, last) if equations.definite else _by_rows(equations, last)
+    return _coefficients(equations, motion.coordinates, motion.gamma, last, motion.branch)
+
+
+def _by_rows(equations, last):
+    """The motion by L γ_[k] = ..."""
     rows = _Rows(equations)
     for k in range(last + 1):
         rows.advance(k)
-    return _coefficients(equations, rows.motion.coordinates, rows.motion.gamma, last, rows.motion.branch)
+    return rows.motion
+
+
+def _with_multipliers(equations, last):
+    """The motion by M γ_[k] - B μ_[k-2] (k - 2)!/k! = ..., G γ_[k] = ..."""
+    r, motion = equations.r, _Reacting(equations)
+    for k in range(1, equations.top):
+        motion.guess(k, ())
+    groups, forces = _groups(motion, monitored_rows(r)), (r.balance - r.realisation.B @ motion.multipliers).elements()
+    balance = _Group(motion, 2, range(len(forces)), forces)
+    for k in range(2, last + 1):
+        motion.guess(k, ())
+        motion.mu.append([0.0] * len(motion.indices))
+        gamma, mu, _ = r.realisation.solve(_right([balance], k), _right(groups, k))
+        motion.mu[-1] = (mu * float(k * (k - 1))).elements()
+        motion.settle(k, [0.0 if x.is_zero() else x for x in gamma.elements()])
+        for group in (*groups, balance):
+            group.correct(k)
+    return motion
+
+
+def _groups(motion, rows):
+    """Rows by order, with their coefficients up to the motion's known ones."""
+    groups = []
+    for order in sorted({row.order for row in rows}):
+        members = [a for a, row in enumerate(rows) if row.order == order]
+        groups.append(_Group(motion, order, members, [rows[a].expression for a in members]))
+        for k in range(order, motion.top):
+            groups[-1].advance(k)
+    return groups
+
+
+def _right(groups, k):
+    """-((k - o)!/k!) ψ_[k-o] of the rows of groups, with γ_[k] = 0."""
+    right = {}
+    for group in groups:
+        scale = -factorial(k - group.order) / factorial(k)
+        right |= {a: ca.SX(c) * scale for a, c in zip(group.members, group.advance(k), strict=True)}
+    return ca.vertcat(*(right[a] for a in sorted(right)))
 
 
 def _coefficients(equations, coordinates, gamma, last, instant):
@@ -266,7 +330,7 @@ def series_loop(model, last):
         solved = solved_for(e)
         sizes, others = {"nq": q.nq, "n": q.n, "top": e.top, "last": last, "plain": int(q.plain)}, {}
         if solved:
-            free = (int(i not in solved.get(k, ((), ()))[1]) for k in range(1, e.top) for i in range(q.n))
+            free = (int(i not in solved.get(k, ((), (), ()))[1]) for k in range(1, e.top) for i in range(q.n))
             sizes, others = sizes | {"free": tuple(free)}, {"settled": settled(e)}
         f = taylor_coefficients(e, last)
         return compiled(f, f"taylor_{last}", ("taylor",), project=e.project(), others=others, sizes=sizes)

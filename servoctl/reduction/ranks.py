@@ -242,7 +242,15 @@ def alive(entries, points):
     return np.where(share > 1.0, share, 0.0)
 
 
-def eliminate(matrix, right, numbers):
+def pivot_order(matrix, numbers):
+    """Pivots ((row, column), ...) of a matrix (m, n) SX in their order, chosen by its numbers (m, n, N) at points."""
+    n = matrix.shape[0]
+    system = _System(matrix, ca.SX(n, 0), numbers, False)
+    with np.errstate(all="ignore"):
+        return tuple(system.step() for _ in range(n))
+
+
+def eliminate(matrix, right, numbers, diagonal=False, order=()):
     """Solve A X = B symbolically.
 
     Parameters
@@ -251,6 +259,10 @@ def eliminate(matrix, right, numbers):
     right : (n, m) SX
     numbers : (n, n, N) array
         A at N points, cleaned of rounding, where pivots are chosen.
+    diagonal : bool, optional
+        Whether pivots are diagonal entries, as is stable for definite matrices.
+    order : sequence of (int, int), optional
+        Row and column of each pivot; default: chosen by the numbers.
 
     Returns
     -------
@@ -264,9 +276,9 @@ def eliminate(matrix, right, numbers):
         If A is singular at a point.
     """
     n, m = right.shape
-    system = _System(matrix, right, numbers)
+    system = _System(matrix, right, numbers, diagonal)
     with np.errstate(all="ignore"):  # at some random points a pivot has no value
-        order = [system.step() for _ in range(n)]
+        order = [system.step(*pivot) for pivot in order or [()] * n]
     solution, rows, rhs = [None] * n, system.rows, system.rhs
     for i, j in reversed(order):
         others = [(a, solution[c]) for c, (a, _) in rows[i].items() if c != j]
@@ -275,25 +287,6 @@ def eliminate(matrix, right, numbers):
     if m != 1:
         return ca.vertcat(*(ca.horzcat(*row) for row in solution)) if m else ca.SX(n, 0), pivots
     return ca.vertcat(*(row[0] for row in solution)), pivots
-
-
-def pivot_columns(matrix, numbers):
-    """Columns of a matrix with more columns than rows that can be solved for, sparse ones first, (m,) list of int.
-
-    Parameters
-    ----------
-    matrix : (m, n) SX
-    numbers : (m, n, N) array
-        It at N points, cleaned of rounding.
-
-    Raises
-    ------
-    SingularProgram
-        If no columns are regular at all points.
-    """
-    system = _System(matrix, ca.SX(matrix.shape[0], 0), numbers)
-    with np.errstate(all="ignore"):
-        return sorted(system.step()[1] for _ in range(matrix.shape[0]))
 
 
 class _System:
@@ -306,8 +299,8 @@ class _System:
     `members` those of a column.
     """
 
-    def __init__(self, matrix, right, numbers):
-        n = matrix.shape[0]
+    def __init__(self, matrix, right, numbers, diagonal):
+        n, self.diagonal = matrix.shape[0], diagonal
         scaled = np.moveaxis(equilibrate(np.moveaxis(numbers, 2, 0))[0], 0, 2).astype(float)
         self.points, self.asked, self.followed = scaled.shape[2], False, False
         entries = list(zip(*matrix.sparsity().get_triplet(), matrix.nonzeros(), strict=True))
@@ -328,31 +321,34 @@ class _System:
         for i, row in enumerate(self.rows):
             for j in row:
                 self.members[j][i] = None
-        self.candidates = [self._large(row) for row in self.rows]
+        self.candidates = [self._large(i) for i in range(n)]
 
-    def _large(self, row):
-        """The candidates of a row: a size is the smallest over the points."""
+    def _large(self, i):
+        """The candidates of row i: a size is the smallest over the points."""
+        row = self.rows[i]
+        if self.diagonal:
+            row = {i: row[i]} if i in row else {}
         if not row:
             return []
         sizes = np.abs([number[: self.points] for _, number in row.values()]).min(axis=1).tolist()
         least = THRESHOLD * max(sizes)
         return [(j, size) for j, size in zip(row, sizes, strict=True) if size >= least and size > 0.0]
 
-    def step(self):
-        """Eliminate by the pivot with the least fill-in, and return its row and column.
+    def step(self, *pivot):
+        """Eliminate by a pivot, by default that with the least fill-in, and return its row and column.
 
         Among these a number is taken, if there is one: it cannot vanish, and less depends on it.
         """
         if self.asked and not self.followed:
             self._follow()
-        i, j = self._pivot()
+        i, j = pivot or self._pivot()
         row = self.rows[i]
         del self.open[i]
         for c in row:
             del self.members[c][i]
         for r in self.members[j]:
             self._subtract(r, row, self.rhs[i], j)
-            self.candidates[r] = self._large(self.rows[r])
+            self.candidates[r] = self._large(r)
         self.members[j] = {}
         return i, j
 
