@@ -189,7 +189,8 @@ def emit(f, name, loops=(), *, project=None, others=None, sizes=None, wide=True,
     constants |= {"PROJECTED": ""} if project is not None else {}
     constants |= {"WIDE": ""} if wide else {}
     constants |= {"PIVOTS": 0} if "newton" in loops else {}
-    constants |= {key.upper(): int(value) for key, value in (sizes or {}).items()}
+    constants |= {"SETTLED": ""} if "settled" in (others or {}) else {}
+    constants |= definitions(sizes or {})
     files = ["grid.c", *(f"{loop}.c" for loop in LOOPS if loop in loops)]
     return "".join((SCALAR_FASTER if "taylor" in loops else "", unit(constants), *parts, *map(include, files)))
 
@@ -204,6 +205,14 @@ def unit(constants):
     """Head of a translation unit: #define lines of constants by name, and `unit.h`."""
     lines = (f"#define {key} {value}\n" for key, value in (CONSTANTS | constants).items())
     return "".join(("#include <math.h>\n#include <stdint.h>\n", *lines, include("unit.h")))
+
+
+def definitions(sizes):
+    """Constants of loops by their names in C: numbers, and tuples of numbers as initialisers."""
+    return {
+        key.upper(): "{" + ", ".join(map(str, value)) + "}" if isinstance(value, tuple) else int(value)
+        for key, value in sizes.items()
+    }
 
 
 def include(name):

@@ -278,7 +278,7 @@ def alive(entries, points):
 
 
 def pivot_order(matrix, numbers):
-    """Pivots ((row, column), ...) of a matrix (n, n) SX in their order, chosen by its numbers (n, n, N) at points."""
+    """Pivots ((row, column), ...) of a matrix (m, n) SX in their order, chosen by its numbers (m, n, N) at points."""
     n = matrix.shape[0]
     system = _System(matrix, ca.SX(n, 0), numbers)
     with np.errstate(all="ignore"):
@@ -355,7 +355,7 @@ class _System:
             [right[i, :].elements() for i in range(n)] if right.shape[1] != 1 else [[b] for b in right.elements()]
         )
         self.open = dict.fromkeys(range(n))
-        self.members = [{} for _ in range(n)]
+        self.members = [{} for _ in range(matrix.shape[1])]
         for i, row in enumerate(self.rows):
             for j in row:
                 self.members[j][i] = None
@@ -373,7 +373,10 @@ class _System:
         return [(j, size) for j, size in zip(row, sizes, strict=True) if size >= least and size > 0.0]
 
     def step(self, *pivot):
-        """Eliminate by a pivot, by default that with the least fill-in, and return its row and column."""
+        """Eliminate by a pivot, by default that with the least fill-in, and return its row and column.
+
+        Among these a number is taken, if there is one: it cannot vanish, and less depends on it.
+        """
         if self.asked and not self.followed:
             self._follow()
         i, j = pivot or self._pivot()
@@ -392,9 +395,12 @@ class _System:
         for i in self.open:
             fill = len(self.rows[i]) - 1
             for j, size in self.candidates[i]:
-                key = (fill * (len(self.members[j]) - 1), 0 if self.in_order else -size)
-                if least is None or key < least:
-                    least, place = key, (i, j)
+                new = fill * (len(self.members[j]) - 1)
+                if least is None or new <= least[0]:
+                    variable = not self.rows[i][j][0].is_constant()
+                    key = (new, 0, 0) if self.in_order else (new, variable, -size)
+                    if least is None or key < least:
+                        least, place = key, (i, j)
         if place is None:
             raise SingularProgram(
                 "A system of equations is singular at the points where its pivots are chosen.",

@@ -18,6 +18,7 @@
 #define TERMS 4
 #define LAST_TERM 0.1
 #define BEND 0.344
+#define REST 1000
 
 /* newton.c */
 #define PIVOTS 1
@@ -28,6 +29,8 @@
 #define TOP 2
 #define LAST 4
 #define PLAIN 1
+#define FREE {1, 1}
+#define SETTLED
 
 /* many.c */
 #define DEGRADED 0.02
@@ -71,6 +74,7 @@
     void name(number t, const number *restrict x, const number *restrict p, number *restrict y);
 DECLARED(example, double)
 DECLARED(example_project, double)
+DECLARED(example_settled, double)
 DECLARED(example_jacobian, double)
 DECLARED(example_wide, W)
 DECLARED(expansion, W)
