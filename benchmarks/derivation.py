@@ -102,16 +102,16 @@ def sixteen_links(rounds):
     return samples
 
 
-def growth(rounds):
-    return [count(32) / count(16)]
+def growth(coordinates, rounds):
+    return [count(32, coordinates) / count(16, coordinates)]
 
 
-def per_link(rounds):
-    return [count(32) / 32]
+def per_link(coordinates, rounds):
+    return [count(32, coordinates) / 32]
 
 
-def count(n):
-    return arms.arm(n, False, "bodies")[0].operations
+def count(n, coordinates):
+    return arms.arm(n, False, coordinates)[0].operations
 
 
 cold = partial(compiled, LINKS, "joints") if COMPILER else Missing("gcc is not installed")
@@ -121,6 +121,12 @@ ROWS = {
     "derive-16-cold": partial(
         Limit, "Planar arm of 16 links, derived and compiled, empty cache", sixteen_links, 2.0, "s"
     ),
-    "growth": partial(Limit, "Operations of the planar arm: 32 links / 16 links", growth, 2.15),
-    "per-link": partial(Limit, "Operations per link of the planar arm of 32 links", per_link, 300),
 }
+for form, name in (("bodies", "coordinates of each body"), ("joints", "joint angles")):
+    suffix = "" if form == "bodies" else "-joints"
+    ROWS[f"growth{suffix}"] = partial(
+        Limit, f"Operations of the planar arm in {name}: 32 links / 16 links", partial(growth, form), 2.15
+    )
+    ROWS[f"per-link{suffix}"] = partial(
+        Limit, f"Operations per link of the planar arm of 32 links in {name}", partial(per_link, form), 300
+    )

@@ -175,7 +175,8 @@ def _quartiles(samples):
 
 def machine():
     """What the numbers were measured on: that of a study, with gcc's version and those of the peers."""
-    peers = {name: name for name in ("heyoka", "sympy", "control", "mujoco", "numba")} | {"pin": "pinocchio"}
+    peers = {name: name for name in ("heyoka", "sympy", "control", "mujoco", "numba")}
+    peers |= {"pin": "pinocchio", "drake": "pydrake"}
     about = study.machine()
     about["versions"] |= {name: metadata.version(name) for name, module in peers.items() if installed(module)}
     return about | {"compiler": _first_line("gcc", "--version")}

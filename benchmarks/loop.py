@@ -1,14 +1,18 @@
 """The closed loop of the overhead crane, with 15 % more load and friction than its LQR knows: 10 s at 1 kHz.
 
 All integrate by RK4 with one step per sample and log states and inputs, but for python-control, whose controller is
-continuous, and solve_ivp, which chooses its steps in each sample.
+continuous, and solve_ivp, which chooses its steps in each sample. MuJoCo is called from Python with the law in NumPy,
+and from C with the law in C; numba compiles the same loop with the equations by hand. Drake's law consists of its own
+blocks; it has no RK4, so that it takes its method of third order.
 """
 
-from functools import cache
+import ctypes
+from functools import cache, partial
+from pathlib import Path
 
 import numpy as np
 from harness import Missing, Row, installed
-from native import COMPILER
+from native import COMPILER, build, function
 
 import servoctl as sv
 from servoctl.gallery import overhead_crane
@@ -17,7 +21,9 @@ RATE, END = 1000.0, 10.0
 M_TROLLEY, M_HOIST, M_LOAD, G = 10.0, 5.0, 115.0, 9.81  # of the plant; the law believes in 100 kg
 DAMPING = {"x": 5.0, "l": 5.0}
 WITHIN = 1e-10  # of the largest value of each state
-LOOSER = {"mujoco": 1e-8, "python-control": 5e-3, "solve_ivp": 1e-5}
+LOOSER = {
+    "mujoco, law in NumPy": 1e-8, "mujoco, law in C": 1e-8, "drake": 1e-7, "python-control": 5e-3, "solve_ivp": 1e-5
+}  # fmt: skip
 
 
 @cache
@@ -97,25 +103,166 @@ CRANE = f"""
 """
 
 
-def mujoco_loop():
+MUJOCO_LOOP = """
+#include <mujoco/mujoco.h>
+void sampled(const mjModel *m, mjData *d, void (*step)(const mjModel *, mjData *), long count, const double *u_ff,
+             const double *reference, const double *K, double *states, double *inputs)
+{
+    static const int order[3] = {0, 2, 1};
+    for (long k = 0; k < count; k++, u_ff += 2, reference += 6, states += 6, inputs += 2) {
+        for (int i = 0; i < 3; i++) states[i] = d->qpos[order[i]], states[3 + i] = d->qvel[order[i]];
+        for (int i = 0; i < 2; i++) {
+            inputs[i] = u_ff[i];
+            for (int j = 0; j < 6; j++) inputs[i] -= K[6 * i + j] * (states[j] - reference[j]);
+            d->ctrl[i] = inputs[i];
+        }
+        step(m, d);
+    }
+}
+"""
+
+
+def mujoco_loop(compiled):
+    """MuJoCo's steps, with the law between them in C or in NumPy."""
     import mujoco
 
     _, _, x0, u_ff, reference, K = loop()
     model = mujoco.MjModel.from_xml_string(CRANE)
     data = mujoco.MjData(model)
     order = np.array([0, 2, 1])  # theta before l, which slides along the rope
-    u_ff, reference = np.ascontiguousarray(u_ff.T), np.ascontiguousarray(reference.T)
+    u_ff, reference, K = (np.ascontiguousarray(values) for values in (u_ff.T, reference.T, K))
 
-    def call():
-        mujoco.mj_resetData(model, data)
-        data.qpos[:], data.qvel[:] = x0[:3][order], x0[3:][order]
-        states, inputs, x = np.empty((len(u_ff), 6)), np.empty((len(u_ff), 2)), np.empty(6)
+    def in_numpy(states, inputs):
+        x = np.empty(6)
         for k in range(len(u_ff)):
             x[:3], x[3:] = data.qpos[order], data.qvel[order]
             states[k] = x
             inputs[k] = data.ctrl[:] = u_ff[k] - K @ (x - reference[k])
             mujoco.mj_step(model, data)
+
+    def in_c(states, inputs):
+        arrays = (array.ctypes.data for array in (u_ff, reference, K, states, inputs))
+        sampled(model._address, data._address, step, len(u_ff), *arrays)
+
+    if compiled:
+        home = Path(mujoco.__file__).parent
+        step = ctypes.cast(ctypes.CDLL(str(next(home.glob("libmujoco*")))).mj_step, ctypes.c_void_p)
+        library = build(MUJOCO_LOOP, "-O3", f"-I{home / 'include'}")
+        sampled = function(library, "sampled", *3 * [ctypes.c_void_p], ctypes.c_long, *5 * [ctypes.c_void_p])
+
+    def call():
+        mujoco.mj_resetData(model, data)
+        data.qpos[:], data.qvel[:] = x0[:3][order], x0[3:][order]
+        states, inputs = np.empty((len(u_ff), 6)), np.empty((len(u_ff), 2))
+        (in_c if compiled else in_numpy)(states, inputs)
         return states.T
+
+    return call
+
+
+def numba_loop():
+    """The equations by hand and the loop, compiled."""
+    import numba
+
+    _, _, x0, u_ff, reference, K = loop()
+    c_x, c_l = DAMPING["x"], DAMPING["l"]
+    x0, u_ff, reference, K = (np.ascontiguousarray(values) for values in (x0, u_ff.T, reference.T, K))
+
+    @numba.njit(fastmath=True, inline="always")
+    def rate(x, u, dx):
+        s, c = np.sin(x[2]), np.cos(x[2])
+        w = M_LOAD * (x[1] * x[5] * x[5] + G * c)
+        along, up, ms = u[0] - c_x * x[3] + s * w, u[1] - c_l * x[4] + w, M_LOAD * s
+        scale = 1 / (M_TROLLEY * (M_HOIST + M_LOAD) + ms * s * M_HOIST)
+        dx[:3] = x[3:]
+        dx[3] = (along * (M_HOIST + M_LOAD) - ms * up) * scale
+        dx[4] = ((M_TROLLEY + ms * s) * up - ms * along) * scale
+        dx[5] = -(dx[3] * c + 2 * x[4] * x[5] + G * s) / x[1]
+
+    @numba.njit(fastmath=True)
+    def run(x0, u_ff, reference, K, states, inputs):
+        h, x = 1 / RATE, x0.copy()
+        y, a, b, c, d = np.empty(6), np.empty(6), np.empty(6), np.empty(6), np.empty(6)
+        for k in range(len(u_ff)):
+            u = inputs[k]
+            for i in range(2):
+                u[i] = u_ff[k, i]
+                for j in range(6):
+                    u[i] -= K[i, j] * (x[j] - reference[k, j])
+            states[k] = x
+            rate(x, u, a)
+            for j in range(6):
+                y[j] = x[j] + h / 2 * a[j]
+            rate(y, u, b)
+            for j in range(6):
+                y[j] = x[j] + h / 2 * b[j]
+            rate(y, u, c)
+            for j in range(6):
+                y[j] = x[j] + h * c[j]
+            rate(y, u, d)
+            for j in range(6):
+                x[j] += h / 6 * (a[j] + 2 * (b[j] + c[j]) + d[j])
+
+    def call():
+        states, inputs = np.empty((len(u_ff), 6)), np.empty((len(u_ff), 2))
+        run(x0, u_ff, reference, K, states, inputs)
+        return states.T
+
+    return call
+
+
+def drake_loop():
+    """A multibody plant, a hold, and its law from blocks of Drake, by its third-order Runge-Kutta method."""
+    from pydrake.multibody.plant import MultibodyPlant
+    from pydrake.multibody.tree import PrismaticJoint, RevoluteJoint, SpatialInertia, UnitInertia
+    from pydrake.systems.analysis import ResetIntegratorFromFlags, Simulator
+    from pydrake.systems.framework import DiagramBuilder
+    from pydrake.systems.primitives import Adder, LogVectorOutput, MatrixGain, TrajectorySource, ZeroOrderHold
+    from pydrake.trajectories import PiecewisePolynomial
+
+    _, _, x0, u_ff, reference, K = loop()
+    order, h = [0, 2, 1, 3, 5, 4], 1 / RATE  # theta before l
+    builder = DiagramBuilder()
+    plant = builder.AddSystem(MultibodyPlant(time_step=0.0))
+    point = np.zeros(3), UnitInertia(0, 0, 0)
+    trolley, rope, load = (
+        plant.AddRigidBody(name, SpatialInertia(mass, *point))
+        for name, mass in (("trolley", M_TROLLEY), ("rope", 0.0), ("load", M_LOAD))
+    )
+    frames = plant.world_frame(), trolley.body_frame(), rope.body_frame(), load.body_frame()
+    x = plant.AddJoint(PrismaticJoint("x", *frames[:2], [1, 0, 0], damping=DAMPING["x"]))
+    plant.AddJoint(RevoluteJoint("theta", *frames[1:3], [0, -1, 0]))
+    l = plant.AddJoint(PrismaticJoint("l", *frames[2:], [0, 0, -1], damping=DAMPING["l"]))
+    plant.AddJointActuator("trolley", x)
+    hoist = plant.AddJointActuator("hoist", l)
+    hoist.set_default_rotor_inertia(M_HOIST)
+    hoist.set_default_gear_ratio(1.0)
+    plant.mutable_gravity_field().set_gravity_vector([0, 0, -G])
+    plant.Finalize()
+    times = (np.arange(u_ff.shape[1] + 1) - 0.5) * h  # jumps between samples, which then are exact
+    open_loop = u_ff + K @ reference
+    table = PiecewisePolynomial.ZeroOrderHold(times, np.hstack([open_loop, open_loop[:, -1:]]))
+    source, adder = builder.AddSystem(TrajectorySource(table)), builder.AddSystem(Adder(2, 2))
+    gain, hold = builder.AddSystem(MatrixGain(-K[:, order])), builder.AddSystem(ZeroOrderHold(h, 2))
+    state = plant.get_state_output_port()
+    builder.Connect(state, gain.get_input_port())
+    builder.Connect(source.get_output_port(), adder.get_input_port(0))
+    builder.Connect(gain.get_output_port(), adder.get_input_port(1))
+    builder.Connect(adder.get_output_port(), hold.get_input_port())
+    builder.Connect(hold.get_output_port(), plant.get_actuation_input_port())
+    log = LogVectorOutput(state, builder, publish_period=h)
+    simulator = Simulator(builder.Build())
+    context = simulator.get_mutable_context()
+    ResetIntegratorFromFlags(simulator, "runge_kutta3", h).set_fixed_step_mode(True)
+
+    def call():
+        context.SetTime(0.0)
+        simulator.get_system().SetDefaultContext(context)
+        plant.SetPositionsAndVelocities(plant.GetMyMutableContextFromRoot(context), x0[order])
+        log.FindMutableLog(context).Clear()
+        simulator.Initialize()
+        simulator.AdvanceTo(END)
+        return log.FindLog(context).data()[order]
 
     return call
 
@@ -139,12 +286,20 @@ def solve_ivp_loop():
 # rows ----------------------------------------------------------------------------------------------------------------
 
 
+def peer(module, make, compiler=True):
+    missing = [name for name, there in ((module, installed(module)), ("gcc", compiler)) if not there]
+    return Missing(f"{missing[0]} is not installed") if missing else make()
+
+
 def closed_loop():
     exact = ours(4)()
     size = np.abs(exact).max(axis=1, keepdims=True)
     peers = {
-        "python-control": python_control() if installed("control") else Missing("control is not installed"),
-        "mujoco": mujoco_loop() if installed("mujoco") else Missing("mujoco is not installed"),
+        "python-control": peer("control", python_control),
+        "mujoco, law in NumPy": peer("mujoco", partial(mujoco_loop, False)),
+        "mujoco, law in C": peer("mujoco", partial(mujoco_loop, True), COMPILER),
+        "drake": peer("pydrake", drake_loop),
+        "numba": peer("numba", numba_loop),
         "solve_ivp": solve_ivp_loop(),
     }
     return Row(
@@ -153,7 +308,7 @@ def closed_loop():
         peers,
         lambda states: np.abs((states - exact) / size).max(),
         WITHIN,
-        {"python-control": 250, "mujoco": 50, "solve_ivp": 500},
+        {"python-control": 250, "mujoco, law in NumPy": 50, "solve_ivp": 500},
         LOOSER,
     )
 

@@ -1,4 +1,7 @@
-"""Times of a new process: the import, and the first plan with and without a cache."""
+"""Times of a new process: the import, and the first plan with and without a cache.
+
+Modules are there as bytecode, as after an installation.
+"""
 
 import json
 import os
@@ -15,6 +18,7 @@ import servoctl as sv
 
 ROOT = Path(sv.__file__).parents[1]
 IMPORTS = 7  # least number of processes for a median
+_bytecode = tempfile.TemporaryDirectory(prefix="servoctl-bytecode-")
 
 FIRST_PLAN = """
 import json, time
@@ -28,12 +32,15 @@ run = sv.simulate(model, model.start(**scene.start, guess=scene.guess), scene.t_
 forces = [run["trolley"].tolist(), run["hoist"].tolist()]
 print(json.dumps([time.perf_counter() - start, forces]))
 """
-IMPORT = "import json, time; a = time.perf_counter(); import servoctl; print(json.dumps([time.perf_counter() - a, 0]))"
+IMPORT = "import json, time; a = time.perf_counter(); import {}; print(json.dumps([time.perf_counter() - a, 0]))"
 
 
 def fresh(code, cache):
     """Run code in a new process with this cache directory: the seconds that it measures, and its answer."""
-    environment = os.environ | {"SERVOCTL_CACHE": cache, "SERVOCTL_MEMO": "", "PYTHONPATH": str(ROOT)}
+    environment = os.environ | {
+        "SERVOCTL_CACHE": cache, "SERVOCTL_MEMO": "", "PYTHONPATH": str(ROOT), "PYTHONDONTWRITEBYTECODE": "",
+        "PYTHONPYCACHEPREFIX": _bytecode.name,
+    }  # fmt: skip
     done = subprocess.run(
         [sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True, cwd=cache
     )
@@ -48,8 +55,8 @@ def cold():
 
 def import_time(rounds):
     with tempfile.TemporaryDirectory() as cache:
-        fresh(IMPORT, cache)
-        return [fresh(IMPORT, cache).seconds for _ in range(max(rounds, IMPORTS))]
+        fresh(IMPORT.format("servoctl"), cache)
+        return [fresh(IMPORT.format("servoctl"), cache).seconds for _ in range(max(rounds, IMPORTS))]
 
 
 def cold_time(rounds):
@@ -64,9 +71,13 @@ def second_process():
     def warm():
         return fresh(FIRST_PLAN, directory.name)
 
+    def imports():
+        return Timed(fresh(IMPORT.format("numpy, casadi"), directory.name).seconds, exact)
+
     warm.directory = directory  # deleted with the row
     return Row(
-        "Crane from specification to first plan: a second process", warm, {"the first process, empty cache": cold},
+        "Crane from specification to first plan: a second process", warm,
+        {"the first process, empty cache": cold, "importing numpy and casadi": imports},
         lambda forces: np.abs(forces - exact).max() / np.abs(exact).max(), 1e-9,
         {"the first process, empty cache": 5},
     )  # fmt: skip

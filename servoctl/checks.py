@@ -42,7 +42,7 @@ def column(value, what, size=None):
     if size is not None and len(items) != size:
         given = f"{what} has {len(items)} entries."
         raise SpecificationError(given, f"It needs {size}.", what=what, entries=len(items), size=size)
-    if any(_holds_no_number(item) for item in items):
+    if _holds_no_number(flat):
         raise SpecificationError(
             f"{what} holds NaN or infinity.",
             "Functions of math and most of numpy turn symbols into NaN without a warning.",
@@ -73,7 +73,7 @@ def matrix(value, what):
 
 
 def _holds_no_number(expression):
-    """Whether a constant in an SX scalar is NaN or infinite."""
+    """Whether a constant in an SX column is NaN or infinite."""
     f = ca.Function("f", [], [expression], {"allow_free": True})
     constants = (f.instruction_constant(k) for k in range(f.n_instructions()) if f.instruction_id(k) == ca.OP_CONST)
     return any(not math.isfinite(c) for c in constants)

@@ -4,7 +4,6 @@ Each message has up to four sentences: what was given, the rule, the nearest val
 also in `details`.
 """
 
-import difflib
 import re
 
 DERIVATIVE = re.compile(r"d([2-9]?)([A-Za-z_]\w*)")  # dx, d2x: names that may be those of derivatives
@@ -79,6 +78,8 @@ def unknown(name, valid, what):
 
     Its details are `name`, `valid` (tuple) and `match` (the closest valid name, or None).
     """
+    import difflib
+
     valid = tuple(str(candidate) for candidate in valid)
     by_lower_case = {candidate.lower(): candidate for candidate in reversed(valid)}
     matches = difflib.get_close_matches(str(name).lower(), by_lower_case, n=1)

@@ -11,8 +11,9 @@ first order and has derivatives of every order.
 """
 
 import casadi as ca
+import numpy as np
 
-from servoctl.checks import column, finite, is_number, mapping, matrix, named, require_kind, text
+from servoctl.checks import column, finite, is_number, mapping, matrix, named, positive, require_kind, text
 from servoctl.errors import SpecificationError
 from servoctl.robots.robot import Frame
 from servoctl.spec import rotations
@@ -350,6 +351,90 @@ def formation(name, leader, followers, offsets):
     for follower, point in followers.items():
         rows |= follow_point(f"{name}_{follower}", point, leader + _vector(offsets[follower], f"offset {follower!r}"))
     return rows
+
+
+def wish(mechanism, accelerations=None):
+    """Inputs under which the mechanism alone would have given accelerations: `toward` of a redundant `Program`.
+
+    With `weights="inertia"` the accelerations of the motion are those nearest to them, in the metric of the inertia,
+    with which the program holds: zero ones give the least accelerations, others a self-motion.
+
+    Parameters
+    ----------
+    mechanism : Mechanism
+        Each velocity has an actuator, along a constant direction.
+    accelerations : dict of str to float or SX, optional
+        By coordinate, or quasi-velocity; expressions of t, the coordinates and velocities. Default 0 each.
+
+    Returns
+    -------
+    dict of str to SX
+        By actuator [N or N m].
+
+    Raises
+    ------
+    SpecificationError
+        If a velocity has no actuator.
+    NameUnknown
+        If an acceleration names no coordinate.
+    """
+    require_kind(Mechanism, "mechanism", mechanism, "robot.mechanism()")
+    q, E = mechanism.q, mechanism.E
+    names = q.names if q.plain else q.velocity_names
+    if E.shape[0] != E.shape[1] or not E.is_constant():
+        raise SpecificationError(
+            f"The mechanism has {E.shape[1]} actuators for {E.shape[0]} velocities.",
+            "Inputs for given accelerations exist where each velocity has an actuator, along a constant direction.",
+            do="Write the wish by actuator yourself.",
+            actuators=list(mechanism.actuators),
+        )
+    wanted = dict.fromkeys(names, ca.SX(0))
+    for name, value in mapping(accelerations, "The accelerations").items():
+        named(name, names, "coordinate" if q.plain else "quasi-velocity")
+        (wanted[name],) = column(value, f"the acceleration of {name!r}", 1)
+    balance = ca.substitute(mechanism.balance, q.jet(2), ca.vertcat(*wanted.values()))
+    forces = ca.solve(ca.DM(ca.evalf(E)), balance) if not _is_identity(E) else balance
+    return dict(zip(mechanism.actuators, ca.cse(forces).elements(), strict=True))
+
+
+def posture(mechanism, at, rate):
+    """A wish that draws a redundant machine to a posture and damps its self-motion, critically.
+
+    Parameters
+    ----------
+    mechanism : Mechanism
+    at : dict of str to float or SX
+        Wished coordinates [rad or m]; those not named are damped alone.
+    rate : float
+        Decay rate [1/s], positive: accelerations -rate^2 (q - at) - 2 rate q'.
+
+    Returns
+    -------
+    dict of str to SX
+        By actuator, for `Program(..., weights="inertia", toward=...)`.
+
+    Raises
+    ------
+    NameUnknown
+        If the posture names no coordinate.
+    """
+    require_kind(Mechanism, "mechanism", mechanism, "robot.mechanism()")
+    q, rate = mechanism.q, positive("rate", rate)
+    if not q.plain:
+        raise SpecificationError(
+            "The mechanism has quasi-velocities.",
+            "A posture is a wish for coordinates whose rates are the velocities.",
+            do="Give accelerations to sv.programs.wish.",
+        )
+    drawn = {name: -2.0 * rate * w for name, w in zip(q.names, q.gamma(1), strict=True)}
+    for name, value in mapping(at, "The posture").items():
+        named(name, q.names, "coordinate")
+        drawn[name] -= rate**2 * (q[name] - column(value, f"the wish of {name!r}", 1)[0])
+    return wish(mechanism, drawn)
+
+
+def _is_identity(E):
+    return bool(np.array_equal(np.array(ca.evalf(E)), np.eye(E.shape[0])))
 
 
 def _frame(frame):

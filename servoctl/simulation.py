@@ -532,7 +532,8 @@ def consistent_state(model, start, t):
 
 def _sample_times(t0, t1, t_eval, knots, method=None):
     if t_eval is None:
-        times = np.union1d(np.linspace(t0, t1, DEFAULT_SAMPLES), [k for k in knots if min(t0, t1) < k < max(t0, t1)])
+        within = (float(k) for k in knots if min(t0, t1) < k < max(t0, t1))
+        times = np.array(sorted({*np.linspace(t0, t1, DEFAULT_SAMPLES).tolist(), *within}))  # np.union1d imports np.ma
     else:
         times = as_numbers(t_eval)
         if times.ndim != 1 or not np.all(times[1:] > times[:-1]):

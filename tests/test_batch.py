@@ -140,6 +140,47 @@ def test_laws_of_the_toolkit(plan, name):
             assert many[f"final {state}"][i] == pytest.approx(row[-1], rel=1e-10, abs=1e-12)
 
 
+@pytest.mark.parametrize("what", ["weights", "bounds and noise", "estimator and lag"])
+def test_limited_laws_in_lanes_are_those_alone(plan, what, monkeypatch):
+    lag = {"hoist": 0.02} if what == "estimator and lag" else {}
+    machine = {"limits": {"trolley": 100.0}, "rate_limits": {"hoist": 2e3}, "lag": lag}
+    plant, free = sv.plant(CRANE, **machine), sv.plant(CRANE)
+    law, given = sv.lqr(plan, free, rate=100.0, integral=True), {}
+    if what == "estimator and lag":
+        law = sv.output_feedback(sv.lqr(plan, free, 100.0), free, {"x": 1e-3, "l": 1e-3, "theta": 1e-3})
+    bounds = {"tension": (0.0, 1100.0)} if what == "bounds and noise" else None
+    if bounds:
+        given = {"sensors": sv.Sensors(noise={"theta": 1e-3}, seed=3)}
+    law = sv.limited(law, sv.plant(CRANE, limits=plant.limits, rate_limits=plant.rate_limits), bounds=bounds)
+    loads, span = np.linspace(90.0, 112.0, 11), (0.0, 3.0)
+    timing = sv.Timing(substeps=2, delay=1)
+    many = sv.close_many(
+        sv.close(plant, law, plan.state(0.0), span, timing=timing, **given), {"m_load": loads}, record=["trolley"]
+    )
+    assert not np.any(many["error"] != "")
+    active = 0
+    for i in (0, 5, 10):
+        seeded = {"sensors": replace(given["sensors"], seed=int(many["seed"][i]))} if given else {}
+        own = sv.plant(CRANE, m_load=loads[i], **machine)
+        run = sv.close(own, law, plan.state(0.0), span, timing=timing, **seeded)
+        active += np.count_nonzero(run.signal["limit trolley"])
+        assert relative(many.trace["trolley"][:, i], run.input["trolley"]) < 1e-8
+        assert many["rms theta"][i] == pytest.approx(np.sqrt(np.mean(run["theta"] ** 2)), rel=1e-9)
+    assert active > 50
+
+
+def test_limits_that_no_inputs_keep_are_rows(plan):
+    plant = sv.plant(CRANE, limits={"hoist": (-1150.0, -850.0)})
+    law = sv.limited(sv.lqr(plan, plant, rate=100.0), plant, bounds={"tension": (850.0, 1100.0)})
+    given, starts = (law, plan.state(0.0), (0.0, 0.5)), np.array([0.0, 0.0, 6.0, 0.0])
+    many = sv.close_many(sv.close(plant, *given), {"dtheta": starts})
+    x0 = dict(zip(plant.state_names, plan.state(0.0), strict=True)) | {"dtheta": 6.0}
+    with pytest.raises(sv.LimitExceeded) as caught:
+        sv.close(plant, law, x0, (0.0, 0.5))
+    assert many["error"].tolist() == ["", "", "LimitExceeded", ""]
+    assert many["message"][2] == str(caught.value) and np.isnan(many["final x"][2])
+
+
 def test_a_long_plant_is_called_not_written_into_the_steps(plan, cases, monkeypatch):
     plant = sv.plant(CRANE, damping={"x": 5.0})
     short, long = [], []
@@ -148,6 +189,40 @@ def test_a_long_plant_is_called_not_written_into_the_steps(plan, cases, monkeypa
         one = sv.close(plant, sv.lqr(plan, plant, rate=100.0), plan.state(0.0), (0.0, 1.0))
         kept += [sv.close_many(one, {"m_load": cases["m_load"]})["max |theta|"]]
     assert long[0] == pytest.approx(short[0], rel=1e-13)
+
+
+def test_any_number_of_vectors_gives_the_same(plan, cases, monkeypatch):
+    plant = sv.plant(CRANE, damping={"x": 5.0}, delay={"trolley": 0.02})
+    law = sv.lqr(plan, replace(plant, delay={}), rate=100.0)
+    one = sv.close(plant, law, plan.state(0.0), (0.0, 1.0), timing=sv.Timing(delay=1))
+    found = []
+    for vectors in (1, 2, 3):
+        monkeypatch.setattr(batch, "VECTORS", vectors)
+        monkeypatch.setattr(batch, "_UNITS", {})
+        found += [sv.close_many(one, {"m_load": cases["m_load"]}, record=["theta"], every=7)]
+    for other in found[:2]:
+        assert other["rms theta"] == pytest.approx(found[2]["rms theta"], rel=1e-13)
+        assert other.trace["theta"] == pytest.approx(found[2].trace["theta"], rel=1e-10, abs=1e-15)
+
+
+def test_lost_states_and_commands_are_dated_at_their_samples(plan):
+    """Not only where lanes look whether all is finite; a lost command may leave the state finite, within a limit."""
+    plant = sv.plant(CRANE, damping={"x": 1.0}, limits={"trolley": 1e4, "hoist": 1e4})
+    law = sv.lqr(plan, plant, rate=100.0)
+    schedule = law.schedule.copy()
+    schedule[8:, 70] = 1e308  # far from the plan the command is infinite at this sample
+    law = replace(law, schedule=schedule)
+    span, timing = (0.0, 1.5), sv.Timing(substeps=1)
+    starts, damping = np.where(np.arange(20) % 7 == 2, 100.0, 0.0), np.where(np.arange(20) % 7 == 3, 1e5, 1.0)
+    one = sv.close(plant, law, plan.state(0.0), span, timing=timing)
+    many = sv.close_many(one, {"x": starts, "damping x": damping}, record=["x"])
+    assert [many["error"][i] for i in (0, 2, 3, 4)] == ["", "ServoError", "IntegrationStopped", ""]
+    for i in (2, 3):
+        x0 = dict(zip(CRANE.q.names + CRANE.q.jet_names(1), plan.state(0.0), strict=True)) | {"x": starts[i]}
+        with pytest.raises(sv.ServoError) as caught:
+            sv.close(sv.plant(CRANE, damping={"x": damping[i]}, limits=plant.limits), law, x0, span, timing=timing)
+        assert f"t = {caught.value.details['t']:.6g} s" in many["message"][i]
+    assert relative(many.trace["x"][:, 0], one["x"]) < 1e-10 and np.array_equal(many.trace["x"][:, 0], many.trace["x"][:, 4])
 
 
 def test_cases_keep_their_seeds_when_there_are_more(plan):
@@ -233,12 +308,10 @@ def test_sine_and_cosine_of_the_lanes_are_within_two_units(n):
 
 
 def test_laws_in_python_are_sent_to_sweep(plan):
-    plant = sv.plant(CRANE, limits={"trolley": 100.0})
-    limited = sv.limited(sv.lqr(plan, plant, rate=50.0), plant)
-    for law, rate in ((lambda t, y: [0.0, -981.0], 50.0), (limited, None)):
-        one = sv.close(plant, law, plan.state(0.0), (0.0, 0.1), timing=sv.Timing(rate=rate))
-        with refused(sv.SpecificationError, "sv.sweep"):
-            sv.close_many(one, {"m_load": [100.0]})
+    plant = sv.plant(CRANE)
+    one = sv.close(plant, lambda t, y: [0.0, -981.0], plan.state(0.0), (0.0, 0.1), timing=sv.Timing(rate=50.0))
+    with refused(sv.SpecificationError, "sv.sweep"):
+        sv.close_many(one, {"m_load": [100.0]})
     with refused(sv.SpecificationError, "Closed"):
         sv.close_many(plan, {"m_load": [100.0]})
 

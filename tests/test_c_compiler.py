@@ -47,6 +47,17 @@ def test_points_and_short_grids_are_not_compiled_however_many(fresh):
     assert not fresh and model.backend == "casadi"
 
 
+def test_points_called_ten_thousand_times_are_compiled(fresh):
+    model, x, p = pendulum(), np.array([0.1, 0.2]), np.ones(1)
+    first, compilations = model(0.0, x, p), []
+    for calls in (2_000, 8_000):
+        for _ in range(calls):
+            y = model(0.0, x, p)
+        compilations.append(len(fresh))
+        np.testing.assert_array_equal(y, first)
+    assert compilations == [0, 1]
+
+
 def test_a_long_grid_is_compiled(fresh):
     model = pendulum()
     model.grid(0.0, np.zeros((2, GRID_POINTS + 1)), [1.0])

@@ -70,19 +70,25 @@ def in_buffer(model, t, x, p):
     return y.copy()
 
 
-def test_every_operation_equals_casadi(monkeypatch, c_compiler):
-    monkeypatch.setattr(functions, "GRID_POINTS", 0)
+def every_operation():
+    """A function of all operations, their expressions, and states (2, n) at and between their edges."""
     a, b = X2[0], X2[1]
     expressions = [*(ca.SX.unary(getattr(ca, f"OP_{name.upper()}"), a) for name in UNARY),
                    *(ca.SX.binary(getattr(ca, f"OP_{name.upper()}"), a, b) for name in BINARY),
                    *(ca.SX.binary(ca.OP_CONSTPOW, a, c) for c in (2.5, -1.5, 0.5, 3, -2, 1 / 3)),
                    *(a + c for c in CONSTANTS), *CONSTANTS, T, a, P1]
-    f = function(*expressions)
-    emitted = {f.instruction_id(k) for k in range(f.n_instructions())}
-    assert {getattr(ca, f"OP_{name.upper()}") for name in (*UNARY, *BINARY, "constpow")} <= emitted
     rng = np.random.default_rng(0)
     x = np.hstack([np.array(list(itertools.product(EDGES, EDGES))).T, rng.normal(size=(2, 1000)),
                    1e3 * rng.normal(size=(2, 500)), rng.uniform(-1, 1, (2, 500))])
+    return expressions, x
+
+
+def test_every_operation_equals_casadi(monkeypatch, c_compiler):
+    monkeypatch.setattr(functions, "GRID_POINTS", 0)
+    expressions, x = every_operation()
+    f = function(*expressions)
+    emitted = {f.instruction_id(k) for k in range(f.n_instructions())}
+    assert {getattr(ca, f"OP_{name.upper()}") for name in (*UNARY, *BINARY, "constpow")} <= emitted
     n = x.shape[1]
     reference = np.asarray(f.map(n)(np.full((1, n), 2.5), x, np.full((1, n), 1.5)))
     model = compiled(f, "operations")
@@ -168,6 +174,58 @@ def test_each_call_returns_its_own_array(backend):
     kept = first.copy()
     model(1.0, np.array([3.0, 4.0]), np.array([1.0]))
     np.testing.assert_array_equal(first, kept)
+
+
+def often(monkeypatch, model, t=0.0):
+    """The model after so many calls that its points are compiled."""
+    monkeypatch.setattr(functions, "CALLS", model._calls + 1)
+    model(t, np.zeros(model.n_x), np.zeros(model.n_p))
+    return model
+
+
+def test_points_of_a_function_called_often_are_compiled_with_the_bits_of_casadi(monkeypatch, c_compiler):
+    expressions, x = every_operation()
+    a, b = X2[0], X2[1]
+    sums = a * b + P1, T * b - a * a, a / (b + 3) + T / (b + 3), ca.sin(a * b) ** 2 + ca.cos(a * b) ** 2, a**2.0 * b
+    other = ca.SX.unary(ca.OP_ERFINV, a)
+    expressions = [e for e in (*expressions, *sums) if not ca.is_equal(ca.SX(e), other, 2)]
+    for f in (function(*expressions), random_function(1500)):
+        model, n = compiled(f, "points"), x.shape[1]
+        reference = np.asarray(f.map(n)(np.full((1, n), 2.5), x, np.full((1, n), 1.5)))
+        often(monkeypatch, model)
+        assert model._builtin
+        y = np.array([model(2.5, column, np.array([1.5])) for column in x.T.copy()]).T
+        np.testing.assert_array_equal(y, reference)
+        np.testing.assert_array_equal(np.signbit(y[y == 0]), np.signbit(reference[y == 0]))
+
+
+def test_compiled_points_take_what_others_take(monkeypatch, c_compiler):
+    model, many = pendulum(), np.array([[0.3, 9.0, 1.2], [8.0, 7.0, 6.0]])
+    forms = [(2.0, many[0, ::2], [1.5]), (2, [0.3, 1.2], (1.5,)), (np.float64(2), np.float64([0.3, 1.2]), np.ones(1) * 1.5),
+             (np.array(2.0), many[:1, ::2].ravel(), np.array(["1.5"])), (True + 1, (0.3, 1.2), np.array([1.5], ">f8")),
+             (2.0, np.array([0.3, 1.2]), np.frombuffer(b"-" + np.float64(1.5).tobytes(), offset=1))]  # not aligned
+    before = [model(*form) for form in forms]
+    often(monkeypatch, model)
+    assert model._builtin
+    for form, y in zip(forms, before, strict=True):
+        np.testing.assert_array_equal(model(*form), y)
+    whole = np.array([1, 2])  # not numbers of double precision, of the same size
+    np.testing.assert_array_equal(model(0.0, whole, [1.0]), compiled(model.expression, "other")(0.0, whole, [1.0]))
+    first, second = model(0.0, [0.1, 0.2], [1.0]), model(0.0, [0.3, 0.4], [1.0])
+    assert first.flags.owndata and not np.shares_memory(first, second)
+    for x, p in (([0.1], [1.0]), (np.zeros((2, 1)), [1.0]), (np.zeros(2), np.zeros(2))):
+        with refused(SpecificationError):
+            model(0.0, x, p)
+    copied = pickle.loads(pickle.dumps(model))
+    np.testing.assert_array_equal(copied(*forms[0]), before[0])
+
+
+def test_points_stay_with_casadi_without_a_compiler_or_a_function_of_c(monkeypatch, c_compiler):
+    other = often(monkeypatch, compiled(function(ca.SX.unary(ca.OP_ERFINV, X2[0]), X2[1]), "other"))
+    monkeypatch.setenv("SERVOCTL_COMPILER", "none")
+    for model in (other, often(monkeypatch, pendulum())):
+        assert not model._builtin
+        assert np.isfinite(model(0.0, [0.5, 0.1], [1.0])).all()
 
 
 def test_a_buffer_is_written_called_and_read(backend):

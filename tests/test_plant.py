@@ -234,3 +234,40 @@ def test_gathered_powers_of_two_change_no_bit(name):
 
 def test_the_crane_takes_few_operations():
     assert sv.plant(RELATIVE).function("ode").operations <= 75
+
+
+def machine_of(kinetic, **parameters):
+    """Two coordinates with a kinetic energy that is a function of velocities and parameters."""
+    q, p = sv.coordinates("x y"), sv.parameters(**parameters)
+    x, y = q
+    return sv.Mechanism(q, kinetic=kinetic(*q.d(1), p), parameters=p, actuators={"F": x, "G": y})
+
+
+CASES = np.linspace(0.0, 2.0, 41)
+INERTIAS = {
+    # affine: decided at the corners
+    "between": (lambda u, v, p: (u**2 + (1 + p.a) * v**2) / 2 + 0.5 * u * v, dict(a=1.0, b=1.0), True),
+    "negative inside and at a corner": (lambda u, v, p: (u**2 + (p.a - 0.1) * v**2) / 2, dict(a=1.0, b=1.0), False),
+    # the corner a = 0, b = 2 is no case
+    "a corner that is no case": (lambda u, v, p: (u**2 + (1 + p.a - p.b) * v**2) / 2, dict(a=1.0, b=1.0), True),
+    # not affine: sound at the corners, singular between them
+    "a square": (lambda u, v, p: (u**2 + (p.a - 1) ** 2 * v**2) / 2, dict(a=3.0, b=1.0), False),
+    "a product": (lambda u, v, p: (u**2 + (1 + p.a * p.b) * v**2) / 2, dict(a=1.0, b=1.0), True),
+}
+
+
+@pytest.mark.parametrize("name", INERTIAS)
+def test_inertia_of_many_cases_is_that_of_each(name):
+    kinetic, parameters, sound = INERTIAS[name]
+    equations = sv.plant(machine_of(kinetic, **parameters)).equations
+    cases = np.vstack([CASES, CASES])
+    if sound:
+        equations.require_inertia(cases)
+    else:
+        with refused(sv.SpecificationError):
+            equations.require_inertia(cases)
+    for case in cases.T:
+        try:
+            equations.require_inertia(case)
+        except sv.SpecificationError:
+            assert not sound

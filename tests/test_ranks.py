@@ -5,9 +5,13 @@ import numpy as np
 import pytest
 from conftest import numbers
 from refusals import refused
+from scipy.linalg import qr
 
 from servoctl.errors import SingularProgram
+from servoctl.jets.identity import spread
+from servoctl.reduction import ranks
 from servoctl.reduction.ranks import clean, combination, decide, decide_all, eliminate, equilibrate
+from servoctl.reduction.realisation import _independent_columns
 from servoctl.tolerances import EXTENDED, NOISE
 
 LONG = np.longdouble
@@ -183,6 +187,41 @@ def test_entries_that_cancel_are_not_eliminated_again():
     solution, _ = eliminate(A, ca.SX([1, 2, 3]), dense[:, :, None])
     found = numbers([solution], dict(zip("abcdef", values, strict=True)))
     assert found == pytest.approx(np.linalg.solve(dense, [1.0, 2.0, 3.0]), rel=1e-13)
+
+
+def test_identities_are_decided_where_values_cannot_tell(monkeypatch):
+    """What is zero at the points of the pivots is left out if it vanishes identically, and stays otherwise."""
+    tests = []
+    monkeypatch.setattr(ranks, "spread", lambda entries: tests.append(len(entries)) or spread(entries))
+    a, b, c, d, t = symbols = [ca.SX.sym(name) for name in "abcdt"]
+    late = ca.fmax(0, t - 4)
+    values = np.array([1.0, 0.9, 0.5, 0.7, 1.0])
+
+    def solved(A, t=9.0):
+        f = ca.Function("A", symbols, [A])
+        solution, _ = eliminate(A, ca.SX([1, 2, 3]), np.array(f(*values)).round(12)[:, :, None])
+        at = np.append(values[:4], t)
+        assert numbers([solution], dict(zip("abcdt", at, strict=True))) == pytest.approx(
+            np.linalg.solve(np.array(f(*at)), [1.0, 2.0, 3.0]), rel=1e-12
+        )
+
+    solved(ca.vertcat(ca.horzcat(a, b, c), ca.horzcat(b, d, a), ca.horzcat(c, a, d)))
+    assert tests == []  # no entry is zero at the points
+    solved(ca.vertcat(ca.horzcat(a, late, c), ca.horzcat(b, d, a), ca.horzcat(c, a, d)))
+    assert tests == [1]  # the entry is asked about, and stays: it is alive at t = 9
+    solved(ca.vertcat(ca.horzcat(a, (a + b) ** 2 - a * a - 2 * a * b - b * b, c), ca.horzcat(b, d, a),
+                      ca.horzcat(c, a, d)))
+    assert tests == [1, 1]  # nothing is left of it
+    solved(ca.vertcat(ca.horzcat(a, a * b, c), ca.horzcat(c, b * c + late, d), ca.horzcat(d, b, a)))
+    assert tests[2] == 1 and len(tests) <= 4  # a difference that arises on the way; then those that follow, at once
+
+
+def test_columns_of_a_plan_are_those_of_a_pivoted_qr():
+    rng = np.random.default_rng(7)
+    for _ in range(300):
+        m = int(rng.integers(1, 7))
+        matrix = rng.normal(size=(m, m + int(rng.integers(0, 6)))) * 10.0 ** rng.integers(-5, 6)
+        assert _independent_columns(matrix, m) == qr(matrix, mode="r", pivoting=True)[1][:m].tolist()
 
 
 def test_a_small_pivot_is_not_taken_for_its_fill_in():

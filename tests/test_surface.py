@@ -261,7 +261,10 @@ def test_public_names_load_no_heavy_package():
 
 
 def test_a_plan_loads_what_it_needs(tmp_path):
-    """A determined motion is continued by Newton's iteration: neither SciPy nor what laws and sweeps need."""
+    """A determined motion is continued by Newton's iteration: neither SciPy nor what laws and sweeps need.
+
+    A second process neither compiles nor writes files, and refuses nothing.
+    """
     script = """
 import servoctl as sv
 from servoctl.gallery import gallery
@@ -273,8 +276,9 @@ print(model)
 """
     laws = [module_name(path) for path in FILES if layer(path) in ("control", "study", "inversion", "figures", "interop")]
     kept = {"SERVOCTL_MEMO": "", "SERVOCTL_CACHE": str(tmp_path)}
-    loaded(script, (), **kept)  # derives
-    assert loaded(script, (*LATE, *SWEEPS, *laws), **kept) == []
+    assert loaded(script, (*LATE, *SWEEPS, *laws), **kept) == []  # derives
+    unused = "numpy.ma", "subprocess", "tempfile", "difflib", "fractions", "zipfile", "importlib.resources"
+    assert loaded(script, (*LATE, *SWEEPS, *laws, *unused), **kept) == []
 
 
 # sizes ---------------------------------------------------------------------------------------------------------------

@@ -11,7 +11,6 @@ import os
 import re
 import stat
 import sys
-import tempfile
 import time
 from pathlib import Path
 
@@ -37,6 +36,8 @@ def cache_directory():
     try:
         return _chosen_directory()
     except RuntimeError:  # no home directory, or none of the user that ~name means
+        import tempfile
+
         return Path(tempfile.gettempdir()) / f"servoctl-{os.getuid() if hasattr(os, 'getuid') else 'cache'}"
 
 
@@ -109,6 +110,8 @@ def replacing(path):
     OSError
         If the file cannot be written.
     """
+    import tempfile
+
     _make_private(path.parent)
     _require_private(path.parent)
     handle, temporary = tempfile.mkstemp(dir=path.parent, suffix=".tmp")

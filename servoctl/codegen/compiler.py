@@ -18,8 +18,6 @@ import os
 import platform
 import shlex
 import shutil
-import subprocess
-import tempfile
 import threading
 import warnings
 from pathlib import Path
@@ -30,6 +28,7 @@ from servoctl.codegen.loops import SOURCES, digest
 PATIENCE_WITH_COMPILER = 600.0  # s: one that takes longer waits for something, such as a licence
 USUAL = ("cc", "gcc", "clang")  # compilers that are looked for
 FLAGS = ("-fPIC", "-shared", "-w", "-fno-math-errno")
+ROUNDED = ("-ffp-contract=off", "-fno-builtin-pow")  # every operation rounds by itself; pow is that of the C library
 
 _loaded = {}  # key -> ctypes.CDLL, or None where it could not be built
 _locks = {}  # key -> lock: no two threads compile the same text
@@ -41,7 +40,7 @@ class _CompilerFailed(Exception):
     """The compiler refused the text."""
 
 
-def library(text, level="-O1"):
+def library(text, level="-O1", exact=False):
     """Load the library of a C translation unit; compile it where it is neither loaded nor on disk.
 
     Parameters
@@ -50,6 +49,8 @@ def library(text, level="-O1"):
         C text.
     level : str
         Optimisation level. "-O1" compiles fastest, and its straight-line code is at most a quarter slower than "-O3".
+    exact : bool
+        Whether the results are those of the operations one by one, without contraction.
 
     Returns
     -------
@@ -59,13 +60,14 @@ def library(text, level="-O1"):
     command, identity = _compiler()
     if command is None:
         return None if os.environ.get("SERVOCTL_COMPILER") == "none" else _without("No C compiler was found")
-    parts = (text, digest(), level, *FLAGS, *_optional_flags(), identity, platform.machine(), _processor())
+    flags = (level, *FLAGS, *(ROUNDED if exact else ()))
+    parts = (text, digest(), *flags, *_optional_flags(), identity, platform.machine(), _processor())
     key = hashlib.sha256("\0".join(parts).encode()).hexdigest()
     with _guard:
         lock = _locks.setdefault(key, threading.Lock())
     with lock:
         if key not in _loaded:
-            _loaded[key] = _open(cache_directory() / f"{key}.so") or _build(text, level, f"{key}.so", command)
+            _loaded[key] = _open(cache_directory() / f"{key}.so") or _build(text, flags, f"{key}.so", command)
         return _loaded[key]
 
 
@@ -130,17 +132,21 @@ def _optional_flags():
 
 @functools.cache
 def _scratch():
+    import tempfile
+
     # Windows does not delete loaded libraries.
     directory = tempfile.TemporaryDirectory(prefix="servoctl-", ignore_cleanup_errors=True)
     atexit.register(directory.cleanup)
     return Path(directory.name)
 
 
-def _build(text, level, file_name, command):
+def _build(text, flags, file_name, command):
     """Compile into the cache, or into a temporary directory if that fails, as where the cache's disk is full."""
+    import subprocess
+
     for directory in (cache_directory, _scratch):
         try:
-            return _compile(text, level, directory() / file_name, command)
+            return _compile(text, flags, directory() / file_name, command)
         except (OSError, _CompilerFailed) as error:
             failed = error
         except subprocess.TimeoutExpired:
@@ -149,11 +155,13 @@ def _build(text, level, file_name, command):
     return _without(f"{' '.join(command)} failed: {failed}")
 
 
-def _compile(text, level, target, command):
+def _compile(text, flags, target, command):
+    import subprocess
+
     with replacing(target) as temporary:
-        for flags in ((*FLAGS, *_optional_flags()), FLAGS):
+        for optional in (_optional_flags(), ()):
             done = subprocess.run(
-                [*command, level, *flags, f"-I{SOURCES}", "-x", "c", "-", "-o", temporary, "-lm"],
+                [*command, *flags, *optional, f"-I{SOURCES}", "-x", "c", "-", "-o", temporary, "-lm"],
                 input=text, encoding="utf-8", errors="replace", capture_output=True, cwd=target.parent,
                 check=False, timeout=PATIENCE_WITH_COMPILER,
             )  # fmt: skip

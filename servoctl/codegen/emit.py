@@ -75,6 +75,8 @@ class Dialect:
         Whether all lanes share p, an array of ``double``.
     linkage : str
         Linkage of the function and of its chunks; without one, the chunks are static and not inlined.
+    exact : bool
+        Whether the operations are those of CasADi, one by one, without shared reciprocals.
     """
 
     number: str = "double"
@@ -83,6 +85,7 @@ class Dialect:
     forms: dict = field(default_factory=dict)
     common: bool = False
     linkage: str = ""
+    exact: bool = False
 
     def constant(self, value):
         """A number as C text, exactly."""
@@ -115,6 +118,7 @@ class Dialect:
 
 
 SCALAR = Dialect(forms=_FORMS_OF_ONE)
+EXACT = Dialect(forms=_FORMS_OF_ONE, exact=True)
 SCALAR_INLINE = Dialect(forms=_FORMS_OF_ONE | {"sin": "s_sin({0})", "cos": "s_cos({0})"})
 PORTABLE = Dialect(forms=_FORMS_OF_ONE, linkage="static ")
 WIDE_LANES = Dialect("W", "ALL({})", "w_")
@@ -181,6 +185,12 @@ def emit(f, name, loops=(), *, project=None, others=None, sizes=None, wide=True,
     return "".join((SCALAR_FASTER if "taylor" in loops else "", unit(constants), *parts, *map(include, files)))
 
 
+def emit_builtin(f, name):
+    """C translation unit of the builtin function of Python ``name``, with the operations of CasADi, one by one."""
+    constants = {"NAME": name, "NX": f.numel_in(1), "NP": f.numel_in(2), "NY": f.numel_out(0)}
+    return "".join((unit(constants), function(f, name, EXACT), include("builtin.c")))
+
+
 def unit(constants):
     """Head of a translation unit: #define lines of constants by name, and `unit.h`."""
     lines = (f"#define {key} {value}\n" for key, value in (CONSTANTS | constants).items())
@@ -199,18 +209,22 @@ def _first(f, n):
 
 def function(f, name, dialect=SCALAR, chunk=CHUNK):
     """C text of one function y = f(t, x, p), cut into chunks of at most `chunk` statements."""
-    statements = _with_reciprocals(_statements(f, dialect))
+    statements = _statements(f, dialect) if dialect.exact else _with_reciprocals(_statements(f, dialect))
     chunks = [statements[k : k + chunk] for k in range(0, len(statements), chunk)]
     if len(chunks) > 1:
         return _chunked(name, chunks, dialect)
     return dialect.head(name) + "".join(_line(statement, dialect) for statement in statements) + "}\n"
 
 
-def function_of_two(f, name, dialect):
-    """C text of y = f(t, x, p) and y2 = f(t, x2, p2), with alternating statements: the processor overlaps the two."""
-    one, two = (_with_reciprocals(_statements(f, dialect, suffix)) for suffix in ("", "2"))
-    lines = ((_line(a, dialect), _line(b, dialect, "b")) for a, b in zip(one, two, strict=True))
-    return dialect.head(name, ("", "2")) + "".join(chain.from_iterable(lines)) + "}\n"
+def function_of_several(f, name, dialect, suffixes):
+    """C text of y = f(t, x, p) for each suffix of x, p, y, with alternating statements: the processor overlaps them."""
+    copies = [_with_reciprocals(_statements(f, dialect, suffix)) for suffix in suffixes]
+    lines = (
+        _line(statement, dialect, f"a{suffix}_")
+        for statements in zip(*copies, strict=True)
+        for suffix, statement in zip(suffixes, statements, strict=True)
+    )
+    return dialect.head(name, suffixes) + "".join(lines) + "}\n"
 
 
 def literal(value):

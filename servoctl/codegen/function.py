@@ -2,7 +2,8 @@
 
 Compiled code and CasADi agree to rounding only. Which of the two evaluates depends on the call alone, never on earlier
 calls or on the cache, so that a repeated call has the same bits: loops, buffers and long grids are compiled at their
-first use, single points and short grids are left to CasADi, as is everything where there is no compiler.
+first use, single points and short grids are left to CasADi, as is everything where there is no compiler. Single points
+of a function that is called often are compiled too, with CasADi's operations one by one, so that their bits stay.
 """
 
 import functools
@@ -14,10 +15,11 @@ import numpy as np
 from servoctl.codegen import compiler, emit
 from servoctl.codegen.interpreted import Interpreter, restored, restored_grid
 from servoctl.codegen.loops import LOOPS
-from servoctl.codegen.native import Library
+from servoctl.codegen.native import Library, builtin
 from servoctl.errors import SpecificationError, unknown
 
 GRID_POINTS = 2_500  # three longer grids take CasADi as long as writing and loading a library, 50 as compiling it
+CALLS = 10_000  # of one point: CasADi has taken as long as compiling takes then, where the function is long
 FULLY_OPTIMISED = 6_000  # operations: up to here -O3 takes at most 1.5 s; with -O1 15,000 take no longer
 TAYLOR_COMPILED = 15_000  # operations: beyond, compiling takes as long as 50,000 steps that CasADi evaluates
 
@@ -142,7 +144,7 @@ class Compiled:
         self.expression, self._symbol = f, f"servoctl_{name}"
         self._x_shape, self._p_shape = (self.n_x,), (self.n_p,)
         self._interpreter = Interpreter(f, project, self.sizes)
-        self._text = None
+        self._text, self._builtin, self._calls = None, None, 0
 
     def __reduce__(self):
         parts = (self.expression, self.name, self.loops, self._project, self._others, self.sizes)
@@ -198,6 +200,18 @@ class Compiled:
         SpecificationError
             If x or p has another shape.
         """
+        call = self._builtin
+        y = None if call is None else call(t, x, p)
+        return self._point(t, x, p) if y is None else y
+
+    def _point(self, t, x, p):
+        """Evaluate by CasADi; once compiled, what is not a number and arrays of floats of the right shapes."""
+        if self._builtin is not None:
+            return self._builtin(float(t), self._array("x", x, self._x_shape), self._array("p", p, self._p_shape))
+        self._calls += 1
+        if self._calls == CALLS and compiler.compiler() and not emit.contains(self.expression, ca.OP_ERFINV):
+            library = compiler.library(emit.emit_builtin(self.expression, self._symbol), exact=True)
+            self._builtin = library and builtin(library, self._symbol, self.n_y)
         row_y, run = self._place(self._interpreter, t, x, p)
         run()
         return row_y.copy()
@@ -509,7 +523,7 @@ class Compiled:
         return row_y, run
 
     def _array(self, what, value, shape):
-        array = np.ascontiguousarray(value, dtype=float)
+        array = np.require(np.ascontiguousarray(value, dtype=float), requirements="A")
         if array.shape != shape:
             raise SpecificationError(
                 f"{what} of {self.name!r} has the shape {array.shape}.",

@@ -2,7 +2,7 @@
 
 import functools
 import hashlib
-from importlib import resources
+from pathlib import Path
 
 CORRECTIONS = 30  # of one point by Newton's method, at most
 CORRECTED = 1e-13  # a Newton correction this small relative to 1 + |x| ends the iteration
@@ -33,7 +33,7 @@ CONSTANTS = {  # that C needs by name
 LOOPS = ("rk", "newton", "taylor", "radau", "closed", "law")  # files of these names; rk.c defines NAME_rk
 INLINE_SINES = {"radau", "closed", "law"}  # loops with inlined sin and cos, within 2 units in the last place
 
-SOURCES = resources.files("servoctl.codegen") / "c"
+SOURCES = Path(__file__).with_name("c")
 
 
 def source(name):

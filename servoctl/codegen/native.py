@@ -4,8 +4,14 @@ import ctypes
 import functools
 
 import casadi as ca
+import numpy as np
 
 from servoctl.codegen.interpreted import Workspace, connected
+
+_OF_PYTHON = (  # in the order of builtin.c
+    "PyObject_GetBuffer PyBuffer_Release PyFloat_AsDouble PyErr_Occurred PyErr_Clear PyTuple_GetItem "
+    "PyObject_Vectorcall Py_IncRef PyCFunction_NewEx"
+).split()
 
 
 class Library:
@@ -82,6 +88,16 @@ class Library:
         sizes = ctypes.c_int64(t.size), ctypes.c_int64(len(nodes))
         n = run(sizes[0], pointer(t), sizes[1], *map(pointer, (nodes, p, x, y)), ctypes.byref(count))
         return n, count.value
+
+
+def builtin(library, symbol, n_y):
+    """A function (t, x, p) -> new array of a library by builtin.c; None where Python has no such interface."""
+    try:
+        functions = [ctypes.cast(getattr(ctypes.pythonapi, name), ctypes.c_void_p) for name in _OF_PYTHON]
+    except AttributeError:
+        return None
+    make = ctypes.PYFUNCTYPE(ctypes.py_object, ctypes.c_void_p, ctypes.py_object)((f"{symbol}_builtin", library))
+    return make((ctypes.c_void_p * len(functions))(*functions), (np.empty, n_y, None))
 
 
 def pointer(array):

@@ -15,7 +15,9 @@ from servoctl.codegen.function import Compiled, compiled
 from servoctl.codegen.native import pointer
 from servoctl.control.loop import Arguments
 
-INLINED = 300  # operations of the plant's rates, up to which they are inlined into each stage, for two vectors in turn
+INLINED = 300  # operations of the plant's rates, up to which they are inlined into each stage, for all vectors in turn
+VECTORS = 2  # in a block: as many chains of dependent operations as registers hold
+LOOKED = 64  # samples between two looks whether all is finite
 PER_THREAD = 16  # tasks, so that threads end at about the same time
 
 _UNITS = weakref.WeakKeyDictionary()  # step of a law -> its units
@@ -70,8 +72,7 @@ def _derived(plant, law, disturbed, residuals):
     t, x, p, rates = _rates(plant, disturbed)
     constants, applied = p[:n_c], ca.vertcat(p[n_c : n_c + n_u], p[n_c + n_u :][list(disturbed)])
     rates, w, w_values = _apart(rates, constants)
-    t_k, y, row = law.step.expression.sx_in()
-    command, common, common_values = _apart(law.step.expression(t_k, y, row), ca.vertcat(t_k, row))
+    t_k, row, written, common_values = _law_in_c(law)
     phi = ca.SX(0, 1)
     if residuals:
         places = [plant.mechanism.parameters.names.index(s.name()) for s in residuals.symbols]
@@ -86,17 +87,19 @@ def _derived(plant, law, disturbed, residuals):
     phi, v, v_values = _apart(phi, constants)
     sizes = {
         "NX": x.numel(), "NU": n_u, "NP": p.numel(), "NC": n_c, "NW": w.numel(), "NV": v.numel(),
-        "ND": len(disturbed), "NM": len(law.measures), "NZ": len(law.state), "NO": law.n_out, "NL": common.numel(),
-        "NS": s.numel(), "NR": phi.numel(), "NT": x.numel() + n_u + phi.numel(),
+        "ND": len(disturbed), "NM": len(law.measures), "NZ": len(law.state), "NO": law.n_out,
+        "NL": common_values.numel(), "VECTORS": VECTORS, "LOOKED": LOOKED, "NS": s.numel(), "NR": phi.numel(),
+        "NT": x.numel() + n_u + phi.numel(),
     }  # fmt: skip
     where = ", ".join(str(plant.state_names.index(name)) for name in law.measures) or "0"
-    constants_of_c = {"NAME": "batch", "MEASURED": f"{{{where}}}"} | ({} if project is None else {"PROJECTED": ""})
+    given = {"PROJECTED": project is not None, "CALLED": not written}
+    texts = {"NAME": "batch", "MEASURED": f"{{{where}}}"} | {name: "" for name, is_so in given.items() if is_so}
     parts = [
-        emit.unit(sizes | constants_of_c),
-        emit.include("lanes.h"),
+        emit.unit(sizes | texts),
+        emit.include("normal.h"),
         _lanes("numbers", t, constants, ca.SX(0, 1), ca.vertcat(w_values, v_values)),
-        _rates_of_two(_function("rates", t, x, ca.vertcat(w, applied), rates)),
-        _lanes("law", t_k, y, common, command, emit.LANES_COMMON),
+        _rates_of_block(_function("rates", t, x, ca.vertcat(w, applied), rates)),
+        written,
         _lanes("signals", t_k, ca.vertcat(x, v), s, phi, emit.LANES_COMMON),
         "" if project is None else _lanes("change", *project.sx_in(), project(*project.sx_in())),
         emit.include("batch.c"),
@@ -105,6 +108,16 @@ def _derived(plant, law, disturbed, residuals):
     text, watched = "".join(parts), int(entries is not None)
     table = compiled(table, "table")
     return Unit(text, table, plant.state_names, plant.inputs, residuals, len(law.measures), watched)
+
+
+def _law_in_c(law):
+    """Symbols t_k and row; C text of the law, "" for one that is called; what all cases share at a sample."""
+    if law.allocation is not None:
+        t_k, row = ca.SX.sym("t"), ca.SX.sym("row", law.schedule.shape[0])
+        return t_k, row, "", row
+    t_k, y, row = law.step.expression.sx_in()
+    command, common, values = _apart(law.step.expression(t_k, y, row), ca.vertcat(t_k, row))
+    return t_k, row, _lanes("law", t_k, y, common, command, emit.LANES_COMMON), values
 
 
 def _rates(plant, disturbed):
@@ -131,12 +144,16 @@ def _lanes(name, t, x, p, value, dialect=emit.LANES):
     return emit.function(_function(name, t, x, p, value), name, dialect)
 
 
-def _rates_of_two(f):
-    """C text of the rates of two vectors of cases, inlined if they are short."""
-    if emit.operations(f) <= INLINED:
-        return emit.function_of_two(f, "rates_of_two", emit.LANES_INLINE)
-    calls = "    rates(t, x, p, y);\n    rates(t, x2, p2, y2);\n}\n"
-    return emit.function(f, "rates", emit.LANES) + emit.LANES_INLINE.head("rates_of_two", ("", "2")) + calls
+def _rates_of_block(f):
+    """C text of the rates of the vectors of a block, inlined if they are short."""
+    head = "INLINE void rates_of_block(const W t, const W *const x[], const W *const p[], W (*y)[NX + 1])\n{\n"
+    if emit.operations(f) > INLINED:
+        each = (f"    rates(t, x[{g}], p[{g}], y[{g}]);\n" for g in range(VECTORS))
+        return emit.function(f, "rates", emit.LANES) + head + "".join(each) + "}\n"
+    suffixes = ("", *map(str, range(1, VECTORS)))
+    arguments = ", ".join(f"x[{g}], p[{g}], y[{g}]" for g in range(VECTORS))
+    text = emit.function_of_several(f, "rates_of_several", emit.LANES_INLINE, suffixes)
+    return text + head + f"    rates_of_several(t, {arguments});\n}}\n"
 
 
 @dataclass(frozen=True)
@@ -157,11 +174,12 @@ class Gathered:
     trace: np.ndarray
 
 
-def run_batch(unit, loop, cases, noise=None, traced=(), every=1, threads=None):
+def run_batch(unit, loop, cases, noise=None, traced=(), every=1, threads=None, step=None):
     """Run the closed loops of N cases: `Gathered`, or None without a compiler.
 
     `loop` holds for all cases, without its p, x0 and noise. `cases` are parameters of the plant (n_c, N), initial
-    states (n_x, N) and factors of the disturbances (n_d, N); `noise` maps a case's index to its (samples + 1, n_y).
+    states (n_x, N) and factors of the disturbances (n_d, N); `noise` are standard deviations of the measurements (n_y,)
+    and keys of the cases (N, 2). `step` is the C function of a law that is called.
     `traced` are indices of quantities that are traced at every n-th sample. By default there is one thread per core;
     the numbers do not depend on it.
     """
@@ -170,7 +188,7 @@ def run_batch(unit, loop, cases, noise=None, traced=(), every=1, threads=None):
     if native is None:
         return None
     native.restype = None
-    count, width, size = cases[1].shape[1], 2 * n, len(unit.names) + unit.watched
+    count, width, size = cases[1].shape[1], VECTORS * n, len(unit.names) + unit.watched
     blocks = -(-count // width)
     columns = np.minimum(np.arange(blocks * width), count - 1)
     gathered = np.full((2 + 3 * size, blocks * width), np.nan)
@@ -178,20 +196,21 @@ def run_batch(unit, loop, cases, noise=None, traced=(), every=1, threads=None):
     late = 0 if loop.transport is None else int(np.max(loop.transport)) // loop.substeps + 1
     depth = 1 + max(loop.delay, late)
     constants, x0, scale = (part[:, columns] for part in cases)
+    deviations, keys = noise or (None, None)
     arguments = Arguments(**vars(loop) | {
-        "constants": constants, "x0": x0, "scale": scale, "table": _common(unit, loop), "noise": None, "p": None,
+        "constants": constants, "x0": x0, "scale": scale, "table": _common(unit, loop), "p": None,
+        "law": step and ctypes.cast(step, ctypes.c_void_p),
+        "deviations": deviations, "keys": None if keys is None else keys[columns],
         "depth": depth, "every": every, "columns": blocks * width, "n_traced": len(traced), "traced": traced,
         "gathered": gathered, "trace": trace,
     })  # fmt: skip
 
     def run(first, last):
-        noisy = None if noise is None else _noise(noise, columns[first * width : last * width], unit.n_y, width)
         scratch = np.empty(2 * depth * loop.n_u * width + 1)
-        rows = (None if noisy is None else pointer(noisy), pointer(scratch))
-        native(ctypes.byref(arguments), ctypes.c_int64(first), ctypes.c_int64(last), *rows)
+        native(ctypes.byref(arguments), ctypes.c_int64(first), ctypes.c_int64(last), pointer(scratch))
 
     threads = threads or os.cpu_count() or 1
-    length = 1 if noise is not None else -(-blocks // (threads * PER_THREAD))
+    length = -(-blocks // (threads * PER_THREAD))
     starts = range(0, blocks, length)
     with ThreadPoolExecutor(threads) as pool:
         try:
@@ -200,12 +219,6 @@ def run_batch(unit, loop, cases, noise=None, traced=(), every=1, threads=None):
             arguments.stop = 1  # which the threads read at each integration step
     lost, largest, squares, last = np.split(gathered[:, :count], [2, 2 + size, 2 + 2 * size])
     return Gathered(*lost, largest, np.sqrt(squares / (loop.samples + 1)), last, trace[:, :, :count])
-
-
-def _noise(noise, cases, n_y, width):
-    """Noise of some cases in the order of batch.c, (blocks, samples + 1, n_y, width)."""
-    columns = np.stack([noise(case) for case in cases], axis=-1)
-    return np.ascontiguousarray(np.moveaxis(columns.reshape(*columns.shape[:1], n_y, -1, width), 2, 0))
 
 
 def _common(unit, loop):

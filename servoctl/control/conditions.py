@@ -17,6 +17,7 @@ from servoctl.checks import (
     whole,
 )
 from servoctl.control.disturbances import sampled
+from servoctl.control.noise import normal
 from servoctl.errors import SpecificationError
 
 RESOLVED = 0.05  # largest |λ| h: the error of one Runge-Kutta step of order 4 is then 3e-9
@@ -70,6 +71,8 @@ class Sensors:
     def noisy(self, measures, count):
         """Normally distributed noise of the measurement at each sample.
 
+        It follows from the seed, the place of the state in `measures` and the sample alone (Philox 4x64-10).
+
         Parameters
         ----------
         measures : tuple of str
@@ -82,10 +85,18 @@ class Sensors:
         (count, n_y) array or None
             None without noise.
         """
-        std = _by_measure(self.noise, texts(measures, "The measured states"))
+        std = self.deviations(texts(measures, "The measured states"))
         count = whole("count", count, most=MOST_COUNT)
         require_memory(count, len(self.noise), f"Noise of {count} samples")
-        return None if std is None else np.random.default_rng(self.seed or 0).standard_normal((count, len(std))) * std
+        if std is None:
+            return None
+        noisy, values = np.flatnonzero(std), np.zeros((count, len(std)))
+        values[:, noisy] = normal(self.seed or 0, count, noisy.tolist()) * std[noisy]
+        return values
+
+    def deviations(self, measures):
+        """Standard deviations in the order of `measures`, (n_y,), 0 for a state without noise; None without noise."""
+        return _by_measure(self.noise, measures)
 
     def quantum(self, measures):
         """The quantisation in the order of `measures`, (n_y,), 0 for a state without; None if no state has any."""

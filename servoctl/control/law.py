@@ -166,7 +166,8 @@ class Law(Value):
         Compiled or callable
             (t_k, [y; z], column k) -> [u; z+; signals].
         """
-        if isinstance(self.step, Compiled):
+        native = getattr(self.step, "native", None)
+        if isinstance(self.step, Compiled) or (native is not None and native("step") is not None):
             return self.step
         return (replace(self, step=self.step.started()) if isinstance(self.step, UserStep) else self).answer
 

@@ -1,7 +1,7 @@
 """Laws under limits: a small quadratic program per sample decides the inputs, and which residual gives way."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from math import prod
 from types import SimpleNamespace
@@ -11,7 +11,8 @@ import casadi as ca
 import numpy as np
 
 from servoctl.checks import ON_SAMPLE, as_list, interval, mapping, named, numbers_by_name, positive
-from servoctl.codegen.function import compiled
+from servoctl.codegen import compiler, emit
+from servoctl.codegen.function import Compiled, compiled
 from servoctl.codegen.matrices import riccati
 from servoctl.control.close import require_names
 from servoctl.control.conditions import ranges
@@ -32,6 +33,9 @@ UNSEEN = 1e-6  # weight of each state relative to residuals: keeps states at res
 IDLE = 1e-3  # least cost of an input that the plan does not use, as the root of its share in the largest cost
 MET = 1e-7  # of an input's size: distance from a limit at which it is met
 GIVEN_WAY = 1e-6  # of a residual's largest effect: least slack that counts
+STEPS = 100  # of the active-set method, which needs about as many as constraints become active
+WITHIN = 1e-10  # of an input's size: an admissible violation of a limit
+DEPENDENT = 1e-9  # sine of the angle between a constraint and others, below which it depends on them
 SCENE = frozenset(("t_span", "start", "guess", "parameters"))  # arguments of `fastest` for a scene
 
 
@@ -70,7 +74,8 @@ class Effects:
         still = ca.substitute(values, e.u, ca.SX.zeros(e.u.numel()))
         numbers = e.p[: e.p.numel() - e.u.numel() - e.q.n]
         parts = ca.densify(ca.cse(ca.vertcat(still, ca.vec(ca.densify(slopes)))))
-        self._function = compiled(ca.Function("effects", [e.q.t, e.state, numbers], [parts]), "effects")
+        self.expression = ca.Function("effects", [e.q.t, e.state, numbers], [parts])
+        self._function = compiled(self.expression, "effects")
 
     def __call__(self, t, x):
         """c (j,) and O (j, m) at a state x (n_x,)."""
@@ -156,12 +161,13 @@ def limited(
     H = _metric(reference, residuals, _weights(residuals, weights, priority), at_once)
     sizes = _sizes(law.plan, plant, H)
     allocation = Allocation(law, plant, effects, bounds, residuals, sizes, np.abs(D).max(axis=0) @ sizes)
-    low, high, _ = ranges(plant, law.period)
+    low, high, change = ranges(plant, law.period)
+    numbers = np.concatenate([low, high, change, sizes, *bounds.T, plant.parameters])
     return replace(
         law,
         name=f"{law.name}, limited " + (f"by priority {' > '.join(priority)}" if priority else "by weight"),
         step=allocation,
-        schedule=_schedule(law, reference, D, H),
+        schedule=_schedule(law, reference, D, H, _finite(numbers)),
         state=np.concatenate([law.state, np.clip(law.initial_input, low, high)]),
         state_names=(*law.state_names, *(f"last {name}" for name in plant.inputs)),
         signals=(*law.signals, *allocation.signals),
@@ -196,13 +202,19 @@ def _bounds(plant, bounds):
     return effects, np.array(list(bounds.values())).reshape(-1, 2)
 
 
-def _schedule(law, reference, D, H):
-    """The law's schedule followed by x_ref, D and H at each sample; the last columns hold."""
+def _schedule(law, reference, D, H, numbers):
+    """The law's schedule followed by numbers, an input matrix, x_ref, D and H at each sample; the last columns hold."""
     count = len(D)
     along = np.vstack([reference.x, D.reshape(count, -1).T, H.reshape(count, -1).T])
+    matrix = [] if law.input_matrix is None else [law.input_matrix.reshape(len(law.input_matrix), -1).T]
+    parts = (law.schedule, numbers[:, None], *matrix, along)
     samples = np.arange(max(count, law.schedule.shape[1]))
-    parts = (law.schedule, along)
     return np.vstack([part[:, np.minimum(samples, part.shape[1] - 1)] for part in parts])
+
+
+def _finite(numbers):
+    """Numbers with the largest double for infinity: a schedule is finite."""
+    return np.clip(numbers, -np.finfo(float).max, np.finfo(float).max)
 
 
 def _require_law(law, plant):
@@ -275,7 +287,7 @@ def _metric(reference, names, weights, at_once):
 
 @dataclass(frozen=True, eq=False)
 class Allocation(Value):
-    """The step of a limited law: (t, [y; z; last u], [column; x_ref; D; H]) -> [u; z+; u; signals].
+    """The step of a limited law: (t, [y; z; last u], [column; numbers; x_ref; D; H]) -> [u; z+; u; signals].
 
     `law` is the law without limits, `plant` the plant with them; `effects` are those of the inputs on the bounded
     outputs, `bounds` (j, 2). `residuals` may have slack; `sizes` (m,) are typical sizes of the inputs, `slack_sizes`
@@ -289,6 +301,9 @@ class Allocation(Value):
     residuals: tuple
     sizes: np.ndarray
     slack_sizes: np.ndarray
+
+    def __getstate__(self):
+        return {f.name: getattr(self, f.name) for f in fields(self)}  # loaded libraries stay in the process
 
     @property
     def limits(self):
@@ -304,9 +319,10 @@ class Allocation(Value):
     def _layouts(self):
         """Layouts of the arguments x and column, and of the law's output."""
         law, m, k, n_z = self.law, len(self.sizes), len(self.residuals), len(self.law.state)
+        for_c = 4 * m + self.bounds.size + len(self.plant.parameters) + (n_z * m if law.input_matrix is not None else 0)
         return (
             Layout(y=len(law.measures), z=n_z, last=m),
-            Layout(column=law.schedule.shape[0], x_ref=self.plant.n_x, D=(k, m), H=(m, m)),
+            Layout(column=law.schedule.shape[0], for_c=for_c, x_ref=self.plant.n_x, D=(k, m), H=(m, m)),
             Layout(u=m, z=n_z, signals=len(law.signals)),
         )
 
@@ -322,6 +338,27 @@ class Allocation(Value):
     @cached_property
     def _qp(self):
         return SmallQP(len(self.sizes), len(self.bounds))
+
+    def native(self, suffix):
+        """The same in C, `NAME_suffix`; None without a compiler, or for a law in Python."""
+        return self._library and self._library[f"allocation_{suffix}"]
+
+    @cached_property
+    def _library(self):
+        if not isinstance(self.law.step, Compiled):
+            return None
+        f, e, j = self.law.step.expression, self.effects.expression, len(self.bounds)
+        integrators = ", ".join(map(str, self.law.integrators)) or "0"
+        sizes = {
+            "NM": len(self.law.measures), "NZ": len(self.law.state), "NU": len(self.sizes), "NX": self.plant.n_x,
+            "NSIG": len(self.law.signals), "NROW": self.law.schedule.shape[0], "NK": len(self.residuals), "NJ": j,
+            "NC": len(self.plant.parameters),
+            "NI": len(self.law.integrators), "INTEGRATORS": f"{{{integrators}}}", "NAME": "allocation",
+            "MEASURED": f"{{{', '.join(map(str, self._measured)) or '0'}}}", "QP_STEPS": STEPS, "QP_MET": WITHIN,
+            "QP_DEPENDENT": DEPENDENT, "MET": MET, "GIVEN_WAY": GIVEN_WAY,
+        } | ({} if self.law.input_matrix is None else {"CORRECTED_BY": ""})  # fmt: skip
+        functions = emit.function(f, "unlimited", emit.PORTABLE), emit.function(e, "effects", emit.PORTABLE)
+        return compiler.library("".join([emit.unit(sizes), *functions, emit.include("allocation.c")]))
 
     def __call__(self, t, x, column):
         """The inputs, the next controller state and the signals, in one array."""

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from servoctl.codegen.native import pointer
+from servoctl.errors import ServoError
 from servoctl.values import Value
 
 FINISHED, STATE_LOST, LAW_LOST, INTERRUPTED, PAUSED = enum.IntEnum(
@@ -50,10 +51,10 @@ _FIELDS = {
     ctypes.c_int64: "samples substeps delay n_y n_z n_u n_out n_row rows first n_d at_u depth every n_traced columns "
     "stop status sample step steps",
     ctypes.c_double: "t0 period",
-    ctypes.c_void_p: "p x0 z0 table noise quantum low high change initial_input disturbance constants scale measured "
-    "transport disturbed traced state x law_x law_y input gathered trace",
+    ctypes.c_void_p: "p x0 z0 table noise quantum low high change initial_input disturbance constants scale "
+    "deviations measured transport disturbed traced keys state x law_x law_y input gathered trace law",
 }
-_WHOLE = {"measured", "transport", "disturbed", "traced"}  # arrays of whole numbers
+_KINDS = dict.fromkeys(("measured", "transport", "disturbed", "traced"), np.int64) | {"keys": np.uint64}
 
 
 class Arguments(ctypes.Structure):
@@ -72,8 +73,8 @@ class Arguments(ctypes.Structure):
             value = values.get(name)
             if value is None:
                 continue
-            if kind is ctypes.c_void_p:
-                self.arrays.append(np.ascontiguousarray(value, dtype=np.int64 if name in _WHOLE else np.float64))
+            if kind is ctypes.c_void_p and not isinstance(value, ctypes.c_void_p):
+                self.arrays.append(np.ascontiguousarray(value, dtype=_KINDS.get(name, np.float64)))
                 value = pointer(self.arrays[-1])
             setattr(self, name, value)
 
@@ -126,7 +127,16 @@ def _native(native, law, loop, logs):
             arguments.steps = max(1, int(arguments.steps * faster))
     except KeyboardInterrupt:
         return done, INTERRUPTED
-    return done, failures[0] if failures else arguments.status
+    status = failures[0] if failures else arguments.status
+    return done, _raised(law, loop, done, logs["law_x"]) or status if status == LAW_LOST else status
+
+
+def _raised(law, loop, k, law_x):
+    """The error that a law in C raises in Python at sample k; None if it does not raise."""
+    try:
+        law(loop.t0 + k * loop.period, law_x[k].copy(), loop.table[min(loop.first + k, len(loop.table) - 1)])
+    except ServoError as error:
+        return error
 
 
 def _called_back(law, loop, n_in, failures):

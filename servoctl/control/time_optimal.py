@@ -22,7 +22,6 @@ from servoctl.errors import IntegrationStopped, SpecificationError, unknown
 from servoctl.methods.radau import radau
 from servoctl.model.model import derived
 from servoctl.spec.paths import piecewise
-from servoctl.spec.program import Program
 
 JETS = 14  # s, s', ..., among which are those that the rows contain
 INTERVALS = 80
@@ -166,7 +165,7 @@ class Curve:
             begins = (ca.substitute(e, q.t, t0) for e in self.moving.values())
             timed = dict(zip(self.moving, map(sum, zip(begins, offsets, strict=True)), strict=True))
         weights, toward = self.program.weights, self.program.toward
-        return Program(residuals | timed, self.program.by, weights or None, toward or None)
+        return self.program.again(residuals | timed, weights, toward)
 
 
 class Inverse:

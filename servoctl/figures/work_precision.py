@@ -1,4 +1,4 @@
-"""The work-precision diagram of a trade-off."""
+"""Work-precision diagrams: of a trade-off, and of levels of modelling."""
 
 import numpy as np
 
@@ -9,6 +9,14 @@ LOOKS = {  # line, marker and label of each treatment of drift
     "none": ("-", "o", "as it drifts"),
     "project": ("--", "s", "projected"),
     "minimal": (":", "^", "minimal coordinates"),
+}
+MARKS = ("o", "s", "^", "D", "v", "P", "X")
+AXIS_MARGIN = 1.5  # from the cheapest and the dearest row to the ends of the axis: small differences look small
+OF = {
+    "error": "error of the motion",
+    "modelling": "error of modelling",
+    "actuation": "error of the actuation",
+    "in_loop": "error in the loop",
 }
 FRONT, UNRESOLVED, GREY = "#BBBBBB", "#EEEEEE", "#555555"
 
@@ -38,6 +46,30 @@ def draw_tradeoff(study, ax, cost, title):
     ax.set_ylim(low / 10, min(3.0, max(10 * error[good].max(initial=low), 100 * low)))
     ax.grid(True, which="major", color="#DDDDDD", linewidth=0.6)
     ax.legend(handles=_keys(colours, drifts), loc="center left", bbox_to_anchor=(1.01, 0.5), frameon=False, fontsize=8)
+    return ax
+
+
+def draw_levels(study, ax, cost, of, title):
+    """Draw errors of levels of modelling over a cost: the front of all levels in colour, other rows in grey."""
+    ax = style.as_single_axes(ax, 5.0, width=8.0)
+    floor = max(study._floor(of), 1e-17)
+    good = np.isfinite(study[of]) & np.isfinite(study[cost])
+    front = study.pareto(cost, of)
+    for i, level in enumerate(dict.fromkeys(study["level"][good].tolist())):
+        rows, best = study.take(np.flatnonzero(good & (study["level"] == level))), front.where(level=level)
+        look = {"marker": MARKS[i % len(MARKS)], "linestyle": "", "markersize": 7}
+        names = (None, level) if len(best) else (level, None)
+        ax.plot(rows[cost], np.maximum(rows[of], floor), **look, color=FRONT, markerfacecolor="none", label=names[0])
+        ax.plot(best[cost], np.maximum(best[of], floor), **look, color=COLOURS[i % len(COLOURS)], label=names[1])
+    ax.step(front[cost], np.maximum(front[of], floor), where="post", color=FRONT, linewidth=1.2, zorder=0)
+    ax.axhspan(floor / 10, floor, color=UNRESOLVED, zorder=-1, label="not resolved")
+    ax.set(xscale="log", yscale="log", xlabel=style.label(cost, "s" if cost == "seconds" else ""), title=title)
+    ax.set(ylabel=f"{OF[of]}, relative", ylim=(floor / 10, max(3.0 * study[of][good].max(initial=floor), 100 * floor)))
+    ax.set_xlim(study[cost][good].min(initial=1.0) / AXIS_MARGIN, study[cost][good].max(initial=1e-4) * AXIS_MARGIN)
+    if not good.any():
+        ax.text(0.5, 0.5, "no level has numbers", transform=ax.transAxes, ha="center")
+    ax.grid(True, which="major", color="#DDDDDD", linewidth=0.6)
+    ax.legend(loc="center left", bbox_to_anchor=(1.01, 0.5), frameon=False, fontsize=8, title="filled: on the front")
     return ax
 
 

@@ -388,6 +388,7 @@ class Plan:
         """Sizes of the terms of all nodes, (n_nodes, N), from the values; see `evaluate`."""
         magnitude = np.abs(v)
         size = magnitude.copy()
+        slopes = np.nan_to_num(magnitude) if self.slopes else magnitude
         for kind, data, here, operands in self.groups:
             parts = size.take(operands, axis=0)
             if kind in ("add", "sub"):
@@ -397,7 +398,7 @@ class Plan:
                 np.add(a * parts[1], parts[0] * b, out=size[here])
             elif kind == "quad":
                 for slope, part in zip(self.slopes[here.start], parts, strict=True):
-                    size[here] += np.nan_to_num(magnitude.take(slope, axis=0)) * part
+                    size[here] += slopes.take(slope, axis=0) * part
             elif kind != "constant":
                 size[here] = _SIZE[kind](data, magnitude[here], *v.take(operands, axis=0), *parts)
         return size

@@ -19,8 +19,8 @@ from servoctl.methods.monitor import DenseStretch, Fine, Repivot
 from servoctl.methods.motion import Stepping
 from servoctl.methods.narrow import arguments, centres
 from servoctl.methods.watch import RESOLUTION, End, net, steps_of
+from servoctl.model.equations import monitored_rows
 from servoctl.reduction.cascade import Running
-from servoctl.reduction.ranks import clean, eliminate
 
 LOWEST, HIGHEST = 4, 24  # orders: below, steps are too short; above, compiling grows faster than steps
 INSIDE = np.array([0.07, 0.19, 0.34, 0.53, 0.71, 0.86, 0.98])  # parts of a step at which its series is checked
@@ -130,6 +130,19 @@ class _Motion(Motion):
         return shifted(self.gamma[level + j][i], level, j)
 
 
+class _Reacting(_Motion):
+    """A motion with coefficients of the multipliers μ."""
+
+    def __init__(self, equations):
+        super().__init__(equations)
+        self.multipliers, self.mu = ca.SX.sym("mu", equations.r.realisation.B.shape[1]), []
+        self.indices = {s.element_hash(): i for i, s in enumerate(self.multipliers.elements())}
+
+    def coefficient(self, symbol, j):
+        i = self.indices.get(symbol.element_hash())
+        return super().coefficient(symbol, j) if i is None else self.mu[j][i]
+
+
 def taylor_coefficients(equations, last):
     """Normalised Taylor coefficients of q and γ with index 1 .. last at a state.
 
@@ -145,30 +158,61 @@ def taylor_coefficients(equations, last):
         Arguments t, X, p, where p ends with the instant that selects the branches of paths. Outputs q_[1], ...,
         q_[last] (left out if q' = γ'), γ_[1], ..., γ_[last], pivots.
     """
-    r, q = equations.r, equations.q
+    r = equations.r
     if r.cascade is not None:
         motion = r.cascade.along(r.points, equations.top - 1, last, running=_InBlock)
         return _coefficients(equations, motion.place, motion.gamma, last, _InBlock.instant)
-    motion = _Motion(equations)
-    groups = []
-    for order in sorted({row.order for row in r.rows}):
-        members = [a for a, row in enumerate(r.rows) if row.order == order]
-        groups.append(_Group(motion, order, members, [r.rows[a].expression for a in members]))
-        for k in range(order, equations.top):
-            groups[-1].advance(k)
-    numbers = clean(*r.points.matrix(r.leading))
+    motion = _with_multipliers(equations, last) if equations.definite else _by_rows(equations, last)
+    return _coefficients(equations, motion.coordinates, motion.gamma, last, motion.branch)
+
+
+def _by_rows(equations, last):
+    """The motion by L γ_[k] = ..."""
+    r, motion = equations.r, _Motion(equations)
+    groups = _groups(motion, r.rows)
     for k in range(equations.top, last + 1):
         motion.guess(k)
-        right = [None] * q.n
-        for group in groups:
-            scale = -factorial(k - group.order) / factorial(k)
-            for a, c in zip(group.members, group.advance(k), strict=True):
-                right[a] = ca.SX(c) * scale
-        solution, _ = eliminate(r.leading, ca.vertcat(*right), numbers)
+        solution, _ = r.solve(_right(groups, k))
         motion.settle(k, [0.0 if x.is_zero() else x for x in solution.elements()])
         for group in groups:
             group.correct(k)
-    return _coefficients(equations, motion.coordinates, motion.gamma, last, motion.branch)
+    return motion
+
+
+def _with_multipliers(equations, last):
+    """The motion by M γ_[k] - B μ_[k-2] (k - 2)!/k! = ..., G γ_[k] = ..."""
+    r, motion = equations.r, _Reacting(equations)
+    groups, forces = _groups(motion, monitored_rows(r)), (r.balance - r.realisation.B @ motion.multipliers).elements()
+    balance = _Group(motion, 2, range(len(forces)), forces)
+    for k in range(2, last + 1):
+        motion.guess(k)
+        motion.mu.append([0.0] * len(motion.indices))
+        gamma, mu, _ = r.realisation.solve(_right([balance], k), _right(groups, k))
+        motion.mu[-1] = (mu * float(k * (k - 1))).elements()
+        motion.settle(k, [0.0 if x.is_zero() else x for x in gamma.elements()])
+        for group in (*groups, balance):
+            group.correct(k)
+    return motion
+
+
+def _groups(motion, rows):
+    """Rows by order, with their coefficients up to the motion's known ones."""
+    groups = []
+    for order in sorted({row.order for row in rows}):
+        members = [a for a, row in enumerate(rows) if row.order == order]
+        groups.append(_Group(motion, order, members, [rows[a].expression for a in members]))
+        for k in range(order, motion.top):
+            groups[-1].advance(k)
+    return groups
+
+
+def _right(groups, k):
+    """-((k - o)!/k!) ψ_[k-o] of the rows of groups, with γ_[k] = 0."""
+    right = {}
+    for group in groups:
+        scale = -factorial(k - group.order) / factorial(k)
+        right |= {a: ca.SX(c) * scale for a, c in zip(group.members, group.advance(k), strict=True)}
+    return ca.vertcat(*(right[a] for a in sorted(right)))
 
 
 def _coefficients(equations, coordinates, gamma, last, instant):

@@ -9,6 +9,7 @@ import casadi as ca
 
 from servoctl.codegen.emit import operations
 from servoctl.errors import SpecificationError
+from servoctl.reduction.definite import Definite
 from servoctl.reduction.ranks import clean, eliminate
 
 FEW = 8  # quasi-velocities: up to this number (3.18) takes about as few operations
@@ -30,7 +31,11 @@ def solve(equations, poles=False):
     matrix = ca.vertcat(ca.horzcat(r.mechanism.mass, -B), ca.horzcat(G, ca.SX(size, B.shape[1])))
     acceleration = q.jet(2)
     rest = ca.substitute(r.balance, acceleration, ca.SX.zeros(q.n))
-    right = -ca.vertcat(rest, *equations.rest(constraints, poles))
+    second = ca.vertcat(ca.SX(0, 1), *equations.rest(constraints, poles))
+    if isinstance(r.realisation, Definite):
+        acceleration, mu, pivots = r.realisation.solve(-rest, -second)
+        return acceleration, mu, [ca.sign(p) * ca.sqrt(ca.fabs(p)) for p in pivots]  # of the size of singular values
+    right = -ca.vertcat(rest, second)
     solution, pivots = eliminate(matrix, right, clean(*r.points.matrix(matrix)))
     return solution[: q.n], solution[q.n :], pivots
 

@@ -11,7 +11,6 @@ from servoctl.jets.branches import Branches, has_switches
 from servoctl.model.model import Model, derived
 from servoctl.spec.mechanism import Mechanism
 from servoctl.spec.parameters import Parameters
-from servoctl.spec.program import Program
 
 LARGEST_CHAIN = 16  # branches that may follow from each other at one state
 
@@ -203,7 +202,7 @@ def _smooth(mechanism, program, residuals, branches):
     }
     parameters = _extended(mechanism.parameters, [s.branch for s in branches.switches])
     smooth = _with(mechanism, **columns, constraints=constraints, energy=mechanism.energy, parameters=parameters)
-    return smooth, Program(residuals, program.by, weights, toward) if residuals else program
+    return smooth, program.again(residuals, weights, toward) if residuals else program
 
 
 def _with(mechanism, **parts):

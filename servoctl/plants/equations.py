@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from functools import cached_property, lru_cache
+from itertools import product
 
 import casadi as ca
 import numpy as np
@@ -9,6 +10,7 @@ import numpy as np
 from servoctl.codegen.folding import folded
 from servoctl.codegen.function import compiled
 from servoctl.errors import SpecificationError
+from servoctl.jets.algebra import cancels
 from servoctl.jets.branches import size_of_terms
 from servoctl.model.equations import Invariants
 from servoctl.reduction.appell import plant_accelerations, require_inertia
@@ -104,10 +106,10 @@ class PlantEquations:
         """Points at times t (N,) and states x (n_x, N)."""
         return self._material[1].at(t, x[: self.q.nq + self.q.n], np.asarray(values))
 
-    @property
+    @cached_property
     def entries_dropped(self):
-        """What eliminations left out as zero: a list of SX."""
-        return [*self._rows[2], *self._solved[2]]
+        """What eliminations left out as zero, unless all terms cancel by algebra: a list of SX."""
+        return [entry for entry in (*self._rows[2], *self._solved[2]) if not cancels(entry)]
 
     @cached_property
     def dropped(self):
@@ -121,8 +123,31 @@ class PlantEquations:
         """Raise SpecificationError if the mass matrix is not positive with parameters (n_p,) or (n_p, N)."""
         rows, points = self._material
         cases = _cases(values)
+        if self._clearly_positive(self._corners(cases)).all():
+            return
+        cases = np.unique(cases, axis=1)
         for case in cases.T[~self._clearly_positive(cases)]:
             require_inertia(self.mechanism, rows, replace(points, values=case))
+
+    def _corners(self, cases):
+        """Corners of the box around the cases (n_p, N), or the cases.
+
+        Where the mass matrix M is affine in each parameter that varies, it is in each case a convex combination of
+        those at the corners. So is M minus a share of its diagonal: where it is positive at the corners, it is in all.
+        """
+        low, high = cases.min(axis=1), cases.max(axis=1)
+        varied = np.flatnonzero(low != high)
+        if 2.0 ** len(varied) >= cases.shape[1] or not self._affine[varied].all():
+            return cases
+        corners = np.repeat(low[:, None], 2 ** len(varied), axis=1)
+        corners[varied] = np.array(list(product(*zip(low[varied], high[varied], strict=True)))).T
+        return corners
+
+    @cached_property
+    def _affine(self):
+        """Whether the mass matrix is affine in each parameter, (n_p,)."""
+        mass, parameters = ca.vec(self.mechanism.mass), self.mechanism.parameters.symbols
+        return np.array([not ca.depends_on(ca.jacobian(mass, s), s) for s in parameters], dtype=bool)
 
     def _clearly_positive(self, cases):
         """Whether the mass matrix of each case (n_p, N) is far from singular at all points."""

@@ -20,7 +20,7 @@ NEAR_ZERO = 0.5  # of the values beside it: a parabola's least value below this 
 WIDE, NARROW = 1e-4, 1e-7  # distances of far and close series from an instant, relative to its neighbourhood
 JUMP = 1e-6  # jumps below this fraction of the largest value of a derivative nearby are rounding errors
 STAYS = 0.5  # a jump keeps more than this fraction of its size from far to close series; other differences shrink
-AROUND = np.setdiff1d(np.linspace(-1.0, 1.0, 41), [0.0])  # places in the neighbourhood for the size of a derivative
+AROUND = np.delete(np.linspace(-1.0, 1.0, 41), 20)  # places in the neighbourhood for the size of a derivative
 EXTRA = 4  # additional coefficients for shifting series to the instant itself
 ALONE = 0.5  # s, the neighbourhood of a single switch
 

@@ -87,8 +87,8 @@ class Orders:
         str
             Name of the row; empty if there is no such sample.
         """
-        known = np.flatnonzero(np.isfinite(jets).all(axis=0))
-        if not self or not len(known):
+        known = np.flatnonzero(np.isfinite(jets).all(axis=0)) if self else ()
+        if not len(known):
             return None, ""
         points = self._sampled(t[known], jets[:, known], values)
         jets, terms = (

@@ -76,9 +76,10 @@ def equilibrate(matrix):
     for _ in range(SWEEPS if a.size else 0):
         for axis, factors in ((-1, rows), (-2, columns)):
             largest = np.abs(a).max(axis=axis)
-            scale = 1.0 / np.sqrt(np.where(largest > 0, largest, 1.0))
+            largest[~(largest > 0)] = 1.0
+            scale = 1.0 / np.sqrt(largest)
             factors *= scale
-            a *= np.expand_dims(scale, axis)
+            a *= scale[..., None] if axis == -1 else scale[..., None, :]
     return a, rows, columns
 
 
@@ -241,7 +242,15 @@ def alive(entries, points):
     return np.where(share > 1.0, share, 0.0)
 
 
-def eliminate(matrix, right, numbers):
+def pivot_order(matrix, numbers):
+    """Pivots ((row, column), ...) of a matrix (n, n) SX in their order, chosen by its numbers (n, n, N) at points."""
+    n = matrix.shape[0]
+    system = _System(matrix, ca.SX(n, 0), numbers, False)
+    with np.errstate(all="ignore"):
+        return tuple(system.step() for _ in range(n))
+
+
+def eliminate(matrix, right, numbers, diagonal=False, order=()):
     """Solve A X = B symbolically.
 
     Parameters
@@ -250,6 +259,10 @@ def eliminate(matrix, right, numbers):
     right : (n, m) SX
     numbers : (n, n, N) array
         A at N points, cleaned of rounding, where pivots are chosen.
+    diagonal : bool, optional
+        Whether pivots are diagonal entries, as is stable for definite matrices.
+    order : sequence of (int, int), optional
+        Row and column of each pivot; default: chosen by the numbers.
 
     Returns
     -------
@@ -263,9 +276,9 @@ def eliminate(matrix, right, numbers):
         If A is singular at a point.
     """
     n, m = right.shape
-    system = _System(matrix, right, numbers)
+    system = _System(matrix, right, numbers, diagonal)
     with np.errstate(all="ignore"):  # at some random points a pivot has no value
-        order = [system.step() for _ in range(n)]
+        order = [system.step(*pivot) for pivot in order or [()] * n]
     solution, rows, rhs = [None] * n, system.rows, system.rhs
     for i, j in reversed(order):
         others = [(a, solution[c]) for c, (a, _) in rows[i].items() if c != j]
@@ -279,23 +292,27 @@ def eliminate(matrix, right, numbers):
 class _System:
     """A system under elimination.
 
-    `rows` has for each row its entries by column: an SX scalar, its equilibrated numbers at the points where pivots are
-    chosen, and behind these its values at random points, where it is zero only if it vanishes identically.
+    `rows` has for each row its entries by column: an SX scalar, and its equilibrated numbers at the points where pivots
+    are chosen. What is zero at all of them is left out if it vanishes identically. Where an elimination asks
+    that, the entries that follow have behind their numbers the values at random points that tell.
     `candidates` are the columns whose entries may be pivots; `open` lists the rows that were no pivot rows yet,
     `members` those of a column.
     """
 
-    def __init__(self, matrix, right, numbers):
-        n = matrix.shape[0]
+    def __init__(self, matrix, right, numbers, diagonal):
+        n, self.diagonal = matrix.shape[0], diagonal
         scaled = np.moveaxis(equilibrate(np.moveaxis(numbers, 2, 0))[0], 0, 2).astype(float)
-        self.points = scaled.shape[2]
-        entries, anywhere = matrix.nonzeros(), spread(matrix.nonzeros())
+        self.points, self.asked, self.followed = scaled.shape[2], False, False
+        entries = list(zip(*matrix.sparsity().get_triplet(), matrix.nonzeros(), strict=True))
+        doubtful = [(i, j, entry) for i, j, entry in entries if not scaled[i, j].any()]
+        vanishing = _vanish([entry for _, _, entry in doubtful])
+        zeros = {(i, j) for (i, j, _), zero in zip(doubtful, vanishing, strict=True) if zero}
         self.rows = [{} for _ in range(n)]
-        for i, j, entry, values in zip(*matrix.sparsity().get_triplet(), entries, anywhere, strict=True):
-            if scaled[i, j].any() or not vanish(values):
-                self.rows[i][j] = entry, np.append(scaled[i, j], values)
-            else:
+        for i, j, entry in entries:
+            if (i, j) in zeros:
                 _leave_out(entry)
+            else:
+                self.rows[i][j] = entry, scaled[i, j]
         self.rhs = (
             [right[i, :].elements() for i in range(n)] if right.shape[1] != 1 else [[b] for b in right.elements()]
         )
@@ -304,26 +321,31 @@ class _System:
         for i, row in enumerate(self.rows):
             for j in row:
                 self.members[j][i] = None
-        self.candidates = [self._large(row) for row in self.rows]
+        self.candidates = [self._large(i) for i in range(n)]
 
-    def _large(self, row):
-        """The candidates of a row: a size is the smallest over the points."""
+    def _large(self, i):
+        """The candidates of row i: a size is the smallest over the points."""
+        row = self.rows[i]
+        if self.diagonal:
+            row = {i: row[i]} if i in row else {}
         if not row:
             return []
         sizes = np.abs([number[: self.points] for _, number in row.values()]).min(axis=1).tolist()
         least = THRESHOLD * max(sizes)
         return [(j, size) for j, size in zip(row, sizes, strict=True) if size >= least and size > 0.0]
 
-    def step(self):
-        """Eliminate by the pivot with the least fill-in, and return its row and column."""
-        i, j = self._pivot()
+    def step(self, *pivot):
+        """Eliminate by a pivot, by default that with the least fill-in, and return its row and column."""
+        if self.asked and not self.followed:
+            self._follow()
+        i, j = pivot or self._pivot()
         row = self.rows[i]
         del self.open[i]
         for c in row:
             del self.members[c][i]
         for r in self.members[j]:
             self._subtract(r, row, self.rhs[i], j)
-            self.candidates[r] = self._large(self.rows[r])
+            self.candidates[r] = self._large(r)
         self.members[j] = {}
         return i, j
 
@@ -352,21 +374,37 @@ class _System:
             if c == j:
                 continue
             old, old_number = row.get(c, (_ZERO, 0.0))
-            change = factor_number * a_number
-            new = _difference(old_number, change)
-            if not new[: self.points].any() and vanish(new[self.points :]):
-                _leave_out(subtract(old, multiply(factor, a)))
+            left, numbers = subtract(old, multiply(factor, a)), _difference(old_number, factor_number * a_number)
+            if not numbers[: self.points].any() and self._vanishes(left, numbers[self.points :]):
+                _leave_out(left)
                 if row.pop(c, None) is not None:
                     del self.members[c][r]
             else:
-                row[c] = (subtract(old, multiply(factor, a)), new)
+                row[c] = left, numbers
                 self.members[c][r] = None
         for k, b in enumerate(pivot_right):
             if not b.is_zero():
                 right[k] = subtract(right[k], multiply(factor, b))
 
+    def _vanishes(self, entry, values):
+        """Whether an entry vanishes identically, from its values at random points if they are followed."""
+        self.asked = True
+        return bool(vanish(values)) if self.followed else _vanish([entry])[0]
+
+    def _follow(self):
+        """Append the values at random points to the numbers of all entries that are still eliminated."""
+        places = [(self.rows[i], j) for i in self.open for j in self.rows[i]]
+        for (row, j), values in zip(places, spread([row[j][0] for row, j in places]), strict=True):
+            row[j] = row[j][0], np.append(row[j][1], values)
+        self.followed = True
+
 
 _ZERO = ca.SX(0)
+
+
+def _vanish(entries):
+    """Whether each of some SX scalars vanishes identically."""
+    return [vanish(values) for values in spread(entries)] if entries else []
 
 
 def _leave_out(entry):

@@ -109,15 +109,24 @@ def _sizeable_columns(matrix, inertia, columns):
     Equilibration makes a column that is about to vanish as large as any other; with the inertia of its coordinate it is
     small.
     """
-    from scipy.linalg import qr
-
     if not len(columns) or not (inertia > 0).all():
         return columns
     scaled = (matrix / np.sqrt(inertia)).astype(float)
     scaled /= np.linalg.norm(scaled, axis=1, keepdims=True)
-    others = qr(scaled, mode="r", pivoting=True)[1][: len(columns)]
+    others = _independent_columns(scaled, len(columns))
     given, best = (np.linalg.svd(scaled[:, some], compute_uv=False)[-1] for some in (columns, others))
-    return columns if given >= THRESHOLD * best else others.tolist()
+    return columns if given >= THRESHOLD * best else others
+
+
+def _independent_columns(matrix, count):
+    """So many columns of a matrix (m, n): each the longest beside those before it (QR with column pivoting)."""
+    rest, chosen = matrix.copy(), []
+    for _ in range(count):
+        lengths = np.linalg.norm(rest, axis=0)
+        chosen.append(int(np.argmax(lengths)))
+        direction = rest[:, chosen[-1]] / lengths[chosen[-1]]
+        rest -= np.outer(direction, direction @ rest)
+    return chosen
 
 
 def _shared(mechanism, program, constraints, independent, points, context):
@@ -129,8 +138,8 @@ def _shared(mechanism, program, constraints, independent, points, context):
     rows = [*constraints, *(row for row, _ in settle_alone(q, balances(q, unreached), context))]
     rows, _, points, pivots = complete(q, rows, context, points)
     pivots = [*((f"choice of unreached balances {i}", p) for i, p in enumerate(of_split, 1)), *pivots]
-    P = _determined_rows(mechanism, rows, material, points, k)
-    A = _inverse_weights(mechanism, program) @ P.T
+    P, L = _determined_rows(mechanism, rows, material, points, k)
+    A = _inverse_weights(mechanism, program) @ P.T if program.metric == "actuators" else _inertial(mechanism, L)
     realised = _realised(
         mechanism, constraints, mechanism.E @ A, A, points, reached.dependent,
         settled=tuple(rows), unreached=reached.independent,
@@ -139,7 +148,7 @@ def _shared(mechanism, program, constraints, independent, points, context):
 
 
 def _determined_rows(mechanism, rows, material, points, k):
-    """P: k independent rows of L N, (k, m) SX."""
+    """P, k independent rows of L N, (k, m) SX, and these rows of L."""
     q = mechanism.q
     L = ca.vertcat(*(row.gradient(q) for row in rows))
     P = L @ _responses(mechanism, material, points)
@@ -158,7 +167,7 @@ def _determined_rows(mechanism, rows, material, points, k):
             rank=rank,
             determined=k,
         )
-    return ca.cse(P[chosen, :])
+    return ca.cse(P[chosen, :]), L[chosen, :]
 
 
 def _responses(mechanism, material, points):
@@ -202,6 +211,26 @@ def _inverse_weights(mechanism, program):
     return ca.diag(ca.vertcat(*(1 / ca.SX(program.weights.get(name, 1.0)) for name in mechanism.actuators)))
 
 
+def _inertial(mechanism, L):
+    """W⁻¹Pᵀ = E⁻¹Lᵀ for the weights EᵀM⁻¹E and P = L M⁻¹E, (m, k) SX."""
+    return ca.DM(np.linalg.inv(np.array(ca.evalf(mechanism.E)))) @ L.T
+
+
+def _require_inertial(mechanism, program):
+    """Refuse weights of the inertia where some velocity has no actuator of its own."""
+    E = mechanism.E
+    square = E.shape[0] == E.shape[1] and E.is_constant() and not mechanism.constraints
+    if not square or np.linalg.matrix_rank(np.array(ca.evalf(E))) < len(E.elements()) ** 0.5:
+        raise SpecificationError(
+            f"weights='inertia' is set for {E.shape[1]} actuators and {E.shape[0]} velocities"
+            f"{' with material constraints' if mechanism.constraints else ''}.",
+            "The accelerations are chosen freely where each velocity has an actuator, along a constant direction.",
+            do="Give weights by actuator, or program the further accelerations.",
+            actuators=list(mechanism.actuators),
+            velocities=list(mechanism.q.velocity_names),
+        )
+
+
 def _require_enough(mechanism, program, independent):
     """Refuse more residuals than independent actuators."""
     k = len(program.residuals)
@@ -220,6 +249,8 @@ def _require_enough(mechanism, program, independent):
 
 def _require_choices(mechanism, program):
     """Refuse unknown actuators, wishes of accelerations, and wishes where no actuation is open."""
+    if program.metric == "inertia":
+        _require_inertial(mechanism, program)
     for name in (*program.weights, *program.toward):
         if name not in mechanism.actuators:
             raise unknown(name, mechanism.actuators, "actuator")

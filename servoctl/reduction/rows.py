@@ -280,15 +280,26 @@ def alternatives(q, row, context):
     """Factors of a row that have zeros about the guess, in words, where there are several: it holds by any of them."""
     found = [f for f in factors(row.expression) if q.order(f) >= 0]
     found = [f for i, f in enumerate(found) if not any(ca.is_equal(f, g, SAME_DEPTH) for g in found[:i])]
-    words = [shown(f) for f in found]
+    rest = []
     if len(found) == 1:  # perhaps a sum whose terms have a jet in common
-        jets = [s for s in ca.symvar(found[0]) if q.order(s) >= 0 and ca.substitute(found[0], s, 0).is_zero()]
-        found, words = [*jets, reduce(ca.SX.__truediv__, jets, found[0])], [*map(shown, jets), "the rest"]
+        jets = [s for s in _perhaps_factors(q, found[0]) if ca.substitute(found[0], s, 0).is_zero()]
+        found, rest = [*jets, reduce(ca.SX.__truediv__, jets, found[0])], ["the rest"]
     if len(found) < 2:
         return []
+    words = [*map(shown, found[: len(found) - len(rest)]), *rest]
     values = anywhere(q, max(map(q.order, found)), context).evaluate(found)[0]
     crossed = [word for word, v in zip(words, values, strict=True) if v.min() < 0 < v.max()]
     return crossed if len(crossed) > 1 else []
+
+
+def _perhaps_factors(q, expression):
+    """The jets at whose zeros an SX scalar is zero, or has no value, for some values of its other symbols."""
+    symbols = ca.symvar(expression)
+    jets = [i for i, s in enumerate(symbols) if (q.where(s) or "t")[0] != "t"]
+    z = np.tile(0.8 + 0.5 * np.sin(1.0 + np.arange(len(symbols)))[:, None], len(jets))  # numbers without relations
+    z[jets, range(len(jets))] = 0.0
+    values = ca.Function("e", [ca.vertcat(*symbols)], [expression])(z).full().ravel() if jets else []
+    return [symbols[i] for i, value in zip(jets, values, strict=True) if not abs(value) > 0]
 
 
 def leading(q, rows, points):

@@ -209,7 +209,7 @@ class Coordinates:
         """The highest k for which γ^(k) is in an expression; 0 for q alone, -1 for neither."""
         if not isinstance(expression, ca.SX):
             expression = ca.SX(ca.vertcat(*column(expression, "the expression")))
-        places = [self.where(s) for s in ca.symvar(expression)]
+        places = map(self.where, symbols_in(expression))
         return max([-1, *(place[1] for place in places if place is not None and place[0] in "qw")])
 
     def derivatives(self, expressions, k):
@@ -228,7 +228,8 @@ class Coordinates:
         if _order(k) == 0:
             return [expressions]
         outputs = self._series(expressions, k).outputs[: len(expressions)]
-        return [[ca.SX(multiply(c[j], float(factorial(j)))) for c in outputs] for j in range(k + 1)]
+        derivatives = ([multiply(c[j], float(factorial(j))) for c in outputs] for j in range(k + 1))
+        return [[e if e.__class__ is ca.SX else ca.SX(e) for e in level] for level in derivatives]
 
     def as_function(self, expressions, parameters=()):
         """Expressions of t, q, jets and parameters as one CasADi function, which serialises and pickles.
@@ -308,6 +309,13 @@ class _SymbolicMotion(Motion):
 
     def velocity(self, i, level, j):
         return divide(self.q.gamma(level + j)[i], float(factorial(j)))
+
+
+def symbols_in(expression):
+    """The symbols in an SX expression; CasADi's search is left out where there is nothing to search."""
+    if expression.is_constant():
+        return []
+    return [expression] if expression.is_scalar() and expression.is_symbolic() else ca.symvar(expression)
 
 
 def _moved(names, velocity_names, frame, invariants):

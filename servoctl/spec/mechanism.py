@@ -12,7 +12,7 @@ from servoctl.errors import NameUnknown, SpecificationError, unknown
 from servoctl.jets.identity import spread, vanish
 from servoctl.jets.overflow import settled
 from servoctl.jets.tape import Tape, evaluate
-from servoctl.spec.coordinates import Coordinates, jet_name
+from servoctl.spec.coordinates import Coordinates, jet_name, symbols_in
 from servoctl.spec.packing import packed, unpacked
 from servoctl.spec.parameters import Parameters
 from servoctl.spec.sums import summands, without
@@ -150,7 +150,8 @@ class Mechanism:
 
     def places(self, *expressions):
         """Coordinates and velocities in expressions: a set of ("q", i) and ("w", i)."""
-        found = (self.q.where(s) for e in expressions for s in ca.symvar(ca.SX(e)))
+        expressions = (e if e.__class__ is ca.SX else ca.SX(e) for e in expressions)
+        found = (self.q.where(s) for e in expressions for s in symbols_in(e))
         return {(place[0], place[2]) for place in found if place is not None and place[0] != "t"}
 
     def couplings(self):

@@ -14,7 +14,6 @@ arguments. A path along a time law has the lower of both classes.
 import functools
 import itertools
 import math
-from fractions import Fraction
 
 import casadi as ca
 import numpy as np
@@ -340,6 +339,8 @@ def _from_ends(m):
     Returns the powers 0 .. 2m + 1 (rows) of each, and the integrals of products of their derivatives m + 1; both are
     computed in fractions.
     """
+    from fractions import Fraction
+
     size = 2 * m + 2
     rows = [
         [Fraction(math.comb(p, j) * side ** (p - j)) if p >= j else Fraction(0) for p in range(size)]

@@ -1,12 +1,11 @@
 """Program (servo) constraints of any order."""
 
-import difflib
 
 import casadi as ca
 import numpy as np
 
 from servoctl.checks import column, mapping, require_kind
-from servoctl.errors import SpecificationError
+from servoctl.errors import SpecificationError, unknown
 from servoctl.jets.branches import without_turns
 from servoctl.jets.overflow import settled
 from servoctl.spec.coordinates import Coordinates
@@ -26,9 +25,11 @@ class Program(Packed):
         "ideal": an ideal reaction, which does no work on the virtual displacements that the program's leading
         matrix allows (eq. (3.18) as printed; for residuals nonlinear in velocities or of order >= 2 this
         generalised Chetaev rule is a postulate). "actuators": the actuators of the mechanism.
-    weights : dict of str to float or SX, optional
+    weights : dict of str to float or SX, or "inertia", optional
         Weights W of the actuators, for programs with fewer residuals than actuators: the actuation has least
-        (u - u_wish)ᵀW(u - u_wish). Default 1 each, in units of the actuators.
+        (u - u_wish)ᵀW(u - u_wish). Default 1 each, in units of the actuators. "inertia", where each velocity has an
+        actuator: W = EᵀM⁻¹E, so that the accelerations are nearest, in the metric of the inertia, to those that the
+        wish would give (Gauss's principle).
     toward : dict of str to float or SX, optional
         The wish u_wish by actuator: expressions of t, q and γ', such as a spring that draws a redundant arm towards a
         posture, or a brake that damps its self-motion. Default 0 each.
@@ -37,6 +38,8 @@ class Program(Packed):
     ----------
     with_turns : dict of str to SX scalar
         The residuals as they were written: their angles jump by 2π.
+    metric : {"actuators", "inertia"}
+        What the weights measure.
 
     Raises
     ------
@@ -53,10 +56,11 @@ class Program(Packed):
                 residuals=residuals,
             )
         if not isinstance(by, str) or by not in REALISATIONS:
+            match = unknown(by, REALISATIONS, "realisation").details["match"]
             raise SpecificationError(
                 f"by={by!r}.",
                 "A program is realised by 'ideal' reactions or by the mechanism's 'actuators'.",
-                nearest="".join(map(repr, difflib.get_close_matches(str(by), REALISATIONS, 1))),
+                nearest=repr(match) if match else "",
                 by=by,
             )
         mapping(residuals, "The residuals")
@@ -71,6 +75,8 @@ class Program(Packed):
         self.with_turns = {name: _residual(name, value) for name, value in residuals.items()}
         self.residuals = {name: without_turns(value) for name, value in self.with_turns.items()}
         self.by = by
+        self.metric = "inertia" if isinstance(weights, str) and weights == "inertia" else "actuators"
+        weights = None if self.metric == "inertia" else weights
         self.weights = {name: _weight(name, value) for name, value in mapping(weights, "The weights").items()}
         self.toward = {name: _wish(name, value) for name, value in mapping(toward, "The wishes").items()}
 
@@ -127,7 +133,17 @@ class Program(Packed):
         residuals = {name: next(slower) for name in self.residuals}
         weights = {name: next(slower) for name in weights}
         toward = {name: ca.substitute(ca.SX(wish), q.t, values[0]) for name, wish in self.toward.items()}
-        return Program(residuals, self.by, weights or None, toward or None)
+        return self.again(residuals, weights, toward)
+
+    def again(self, residuals, weights, toward):
+        """A program with other expressions, realised alike.
+
+        Parameters
+        ----------
+        residuals : dict of str to SX scalar
+        weights, toward : dict of str to float or SX
+        """
+        return Program(residuals, self.by, "inertia" if self.metric == "inertia" else weights or None, toward or None)
 
     def __repr__(self):
         return f"Program({', '.join(self.residuals)}; by {self.by})"

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from servoctl.checks import MOST_CASES, as_list, plain, whole
 from servoctl.errors import SpecificationError
 
-DRAWS, CASES = 0, 1  # first spawn key: draws of the parameters, and draws inside a case
+CASES = 1  # third word of the counters from which cases draw; noise of measurements has 0
 FAILURE = ("error", "message", "facts")  # columns of cases that failed
 RESERVED = ("case", *FAILURE, "rng")
 
@@ -62,7 +62,7 @@ def monte_carlo(n: int, /, *, seed: int, **distributions) -> list[dict]:
     draws = {name: _draw(name, distribution) for name, distribution in distributions.items()}
 
     def case(i):
-        return {name: _value(name, draw, generator(seed, DRAWS, i, name)) for name, draw in draws.items()}
+        return {name: _value(name, draw, _stream(seed, i, name)) for name, draw in draws.items()}
 
     return [case(i) for i in range(n)]
 
@@ -78,14 +78,21 @@ def _require_few(n):
         )
 
 
-def generator(seed, kind, index, name=""):
-    """A numpy Generator for each seed, kind (`DRAWS` or `CASES`), index of the case and name of the parameter.
+def _stream(seed, index, name):
+    """A numpy Generator for each seed, index of the case and name of the parameter."""
+    import numpy as np
+
+    return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(0, index, *name.encode())))
+
+
+def generator(seed, index):
+    """The numpy Generator of a case, for each seed and index, by counter: Philox 4x64-10.
 
     It does not depend on other cases, their order, or where they run.
     """
     import numpy as np
 
-    return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(kind, index, *name.encode())))
+    return np.random.Generator(np.random.Philox(key=seed % 2**128, counter=[0, index, CASES, 0]))
 
 
 def as_cases(cases):

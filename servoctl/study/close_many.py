@@ -11,12 +11,13 @@ from servoctl.codegen.function import Compiled
 from servoctl.control.batch import Gathered, run_batch, unit
 from servoctl.control.close import close, require_consistent
 from servoctl.control.conditions import Timing, index, steps
+from servoctl.control.noise import first_words
 from servoctl.control.residuals import Residuals
 from servoctl.control.result import Closed
 from servoctl.errors import IntegrationStopped, ServoError, SpecificationError, unknown
 from servoctl.plants.equations import equations_at
 from servoctl.reduction.ranks import SUSPECT
-from servoctl.study.cases import CASES, as_cases, generator
+from servoctl.study.cases import CASES, as_cases
 from servoctl.study.table import Study, Traced, machine, table
 
 SEEDS = 2**31  # seeds of cases are below this
@@ -62,7 +63,7 @@ def close_many(
     ----------
     run : Closed
         A loop run by `close`. Its plant, law, start, span, sensors, timing, disturbances and plan hold for all cases,
-        except for the numbers in `cases`. Its law must be compiled: functions and limited laws go by `sweep`.
+        except for the numbers in `cases`. Its law must be compiled, alone or under `limited`: functions go by `sweep`.
     cases : dict of str to (N,) array, or sequence of dict
         Numbers by name: parameters of the plant ("m_load", "damping x" if it has that damping), initial states
         ("theta"), and columns for `scale`. `monte_carlo` and `grid` make them. With noise each case has a seed that
@@ -102,7 +103,8 @@ def close_many(
     threads = threads if threads is None else whole("threads", threads, least=1)
     gathered = None
     if not run.plant.equations.orders:  # else each loop is judged by itself
-        gathered = run_batch(derived, loop, numbers, _noise(run, seeds), traced, every, threads)
+        step = run.law.step.native("step") if run.law.allocation else None
+        gathered = run_batch(derived, loop, numbers, _noise(run, seeds), traced, every, threads, step)
         if gathered is not None and derived.watched and np.nan_to_num(gathered.largest[-1]).max() > SUSPECT:
             gathered = None  # so that `close` judges
     if gathered is None:
@@ -111,7 +113,8 @@ def close_many(
         "t_span": [loop.t0, loop.t0 + loop.samples * loop.period], "law": run.law.name, "rate": run.law.rate,
         "substeps": loop.substeps, "delay": loop.delay, "machine": machine(),
     }  # fmt: skip
-    study, gathered = _study(columns, seeds, derived.names, gathered, meta)
+    reasons = _reasons(run, loop, numbers, seeds, gathered) if run.law.allocation else {}
+    study, gathered = _study(columns, seeds, derived.names, gathered, meta, reasons)
     t = loop.t0 + np.arange(len(gathered.trace)) * every * loop.period
     return Batch(study, t, dict(zip(record, np.moveaxis(gathered.trace, 1, 0), strict=True)))
 
@@ -124,11 +127,11 @@ def _require(run):
             do="Pass the Closed of sv.close.",
             kind=type(run).__name__,
         )
-    if not isinstance(run.law.step, Compiled):
+    if not isinstance((run.law.allocation or run).law.step, Compiled):
         raise SpecificationError(
             f"The law {run.law.name!r} is computed in Python.",
             "Many loops run in compiled code, with their law.",
-            do="Use a compiled law, as of sv.lqr without sv.limited, or sv.sweep, whose cases may close any loop.",
+            do="Use a compiled law, as of sv.lqr, or sv.sweep, whose cases may close any loop.",
             name=run.law.name,
         )
 
@@ -137,7 +140,7 @@ def _at_all(run, constants):
     """The loop of a plant whose equations hold for the constants (n_c, N) of all cases."""
     equations = run.plant.equations
     parameters = constants[: len(equations.values)]
-    equations.require_inertia(np.unique(parameters, axis=1))
+    equations.require_inertia(parameters)
     again = equations_at(equations, parameters)
     return run if again is equations else replace(run, plant=replace(run.plant, equations=again))
 
@@ -167,15 +170,17 @@ def _seeds(sensors, n):
     """The seed of each case's noise; None without noise."""
     if not sensors.noise:
         return None
-    return [int(generator(sensors.seed or 0, CASES, i).integers(SEEDS)) for i in range(n)]
+    words = first_words(sensors.seed or 0, CASES, n)
+    return (words % 2**32 * SEEDS // 2**32).tolist()  # as numpy's Generator.integers(SEEDS) of the same words
 
 
 def _noise(run, seeds):
-    """A function that maps the index of a case to its noise, (samples + 1, n_y); None without noise."""
+    """Standard deviations (n_y,) of the measurements, and keys (N, 2) of the cases' noise; None without noise."""
     if seeds is None:
         return None
-    sensors, measures, count = run.conditions.sensors, run.law.measures, run.loop.samples + 1
-    return lambda case: replace(sensors, seed=seeds[case]).noisy(measures, count)
+    keys = np.zeros((len(seeds), 2), dtype=np.uint64)
+    keys[:, 0] = seeds  # below 2^64: see `noise.key`
+    return run.conditions.sensors.deviations(run.law.measures), keys
 
 
 def _columns(cases):
@@ -287,7 +292,18 @@ def _scaled(f, factor):
     return (lambda t: factor * f(t)) if callable(f) else factor * f
 
 
-def _study(columns, seeds, names, gathered, meta):
+def _reasons(run, loop, numbers, seeds, gathered):
+    """The errors of cases whose law found no inputs, by index."""
+    errors = {}
+    for i in np.flatnonzero(gathered.law_lost < gathered.state_lost):
+        try:
+            _one(run, loop, *(part[:, i] for part in numbers), seeds[i] if seeds else None)
+        except ServoError as error:
+            errors[int(i)] = error
+    return errors
+
+
+def _study(columns, seeds, names, gathered, meta, reasons):
     """The table, of the finished cases; results of a loop that ended early are NaN."""
     finished = ~np.isnan(gathered.state_lost)
     meta["interrupted"] = not finished.all()
@@ -307,4 +323,9 @@ def _study(columns, seeds, names, gathered, meta):
     errors = np.where(ended, np.where(of_law, "ServoError", "IntegrationStopped"), "")
     what = np.where(of_law, "the law's answer", "the state")
     messages = [f"{w} is not finite at t = {t:.6g} s" if e else "" for w, t, e in zip(what, early, ended, strict=True)]
+    errors = errors.astype(object)
+    for i, error in reasons.items():
+        place = int(np.sum(finished[:i]))
+        errors[place], messages[place] = type(error).__name__, str(error)
+    errors = errors.astype(str)
     return Study("batch", numbers | results | {"error": errors, "message": np.array(messages)}, meta), gathered

@@ -20,7 +20,7 @@ from servoctl.control.result import Closed
 from servoctl.errors import ServoError, SpecificationError
 from servoctl.progress import progress_bar
 from servoctl.run import Run
-from servoctl.study.cases import CASES, FAILURE, RESERVED, as_cases, generator
+from servoctl.study.cases import FAILURE, RESERVED, as_cases, generator
 from servoctl.study.checkpoint import Checkpoint, by_case, identity
 from servoctl.study.table import Study, machine
 
@@ -153,7 +153,7 @@ def evaluate(case, index, parameters, seed):
     """One row: case (the index), with the numbers of the case or its error, message and facts (JSON)."""
     if multiprocessing.parent_process() is not None and threading.current_thread() is threading.main_thread():
         signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent handles Ctrl-C: workers finish the case they are at
-    random = {} if seed is None else {"rng": generator(seed, CASES, index)}
+    random = {} if seed is None else {"rng": generator(seed, index)}
     try:
         numbers = _results(case(**parameters, **random), parameters)
     except KeyboardInterrupt:

@@ -22,14 +22,14 @@ SHOWN, MOST_COLUMNS = 7, 12  # rows of a table in a repr, and columns
 
 @dataclass(frozen=True, eq=False)
 class Study:
-    """A table of results; made by `tradeoff`, `stability`, `sweep` or `load_study`.
+    """A table of results; made by `tradeoff`, `levels`, `stability`, `sweep` or `load_study`.
 
     `study["seconds"]` is a column, `study.rows()` a list of dicts, `len(study)` the number of rows.
 
     Attributes
     ----------
     kind : str
-        "tradeoff" or "sweep".
+        "tradeoff", "levels" or "sweep".
     columns : dict of str to (N,) array
         Numbers or texts by name. A missing number is NaN, a missing text is empty.
     meta : dict

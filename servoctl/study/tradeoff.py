@@ -1,5 +1,6 @@
 """The trade-off: measured errors and costs of methods, settings and treatments of drift on one motion."""
 
+import functools
 import itertools
 import time
 import warnings
@@ -39,6 +40,7 @@ TIMED, ENOUGH = 3, 0.3  # calls timed after a warm-up, fewer where they take thi
 FEW = 20  # steps: a run that takes too long for fewer has diverged, and says nothing about finer settings
 TIME_CONSTANT = 50  # default time constants of the poles in the span
 DRIFTS = ("none", "project", "minimal")  # words of the column drift; others are time constants of poles
+CHECKS = (Adaptive("DOP853", 3e-14, 1e-15), Taylor(12, rtol=1e-14, atol=1e-14))  # of the reference, in this order
 COSTS = ("seconds", "evaluations", "steps")
 
 
@@ -51,6 +53,33 @@ class Recommendation(dict):
     def __init__(self, options, row):
         super().__init__(options)
         self.row = row
+
+
+def unbeaten(cost, error):
+    """Indices of the entries that no other one beats in both cost (N,) and error (N,), from cheap to accurate."""
+    front, best = [], np.inf
+    for i in np.lexsort((error, cost)):
+        if error[i] < best:
+            front.append(i)
+            best = error[i]
+    return np.array(front, dtype=int)
+
+
+def bound(error, seconds):
+    """What bounds a recommendation, "error" or "seconds", and its value; exactly one of the two is a number."""
+    if (error is None) == (seconds is None):
+        raise SpecificationError(
+            f"error={error!r} and seconds={seconds!r} were given.",
+            "Exactly one of the two bounds a recommendation.",
+            do="Give recommend(error=1e-6) or recommend(seconds=1e-3).",
+            error=error,
+            seconds=seconds,
+        )
+    wanted, limit = ("error", error) if seconds is None else ("seconds", seconds)
+    if not (is_number(limit) and limit > 0):
+        given, rule = f"{wanted}={limit!r} was given.", "It must be a positive number."
+        raise SpecificationError(given, rule, **{wanted: limit})
+    return wanted, limit
 
 
 class TradeOff(Study):
@@ -91,13 +120,8 @@ class TradeOff(Study):
         -------
         TradeOff
         """
-        good, error = self._good(), self._errors()
-        front, best = [], np.inf
-        for i in good[np.lexsort((error[good], self.column(_cost(cost))[good]))]:
-            if error[i] < best:
-                front.append(i)
-                best = error[i]
-        return self.take(front)
+        good = self._good()
+        return self.take(good[unbeaten(self.column(as_cost(cost))[good], self._errors()[good])])
 
     def recommend(self, *, error: float | None = None, seconds: float | None = None) -> Recommendation:
         """Arguments of `simulate`: the fastest within an error, or the most accurate within a time.
@@ -121,25 +145,14 @@ class TradeOff(Study):
         LimitExceeded
             If no row reaches it; the message has the nearest one.
         """
-        if (error is None) == (seconds is None):
-            raise SpecificationError(
-                f"error={error!r} and seconds={seconds!r} were given.",
-                "Exactly one of the two bounds a recommendation.",
-                do="Give recommend(error=1e-6) or recommend(seconds=1e-3).",
-                error=error,
-                seconds=seconds,
-            )
-        wanted, limit = ("error", error) if seconds is None else ("seconds", seconds)
-        if not (is_number(limit) and limit > 0):
-            given, rule = f"{wanted}={limit!r} was given.", "It must be a positive number."
-            raise SpecificationError(given, rule, **{wanted: limit})
+        wanted, limit = bound(error, seconds)
         front = self.pareto()
         reached = front._errors() if wanted == "error" else front["seconds"]
         within = np.flatnonzero(reached <= limit)
         if not len(within):
             raise self._out_of_reach(wanted, limit, front)
         row = front.rows()[within[0] if wanted == "error" else within[-1]]
-        return Recommendation(_arguments(row), row)
+        return Recommendation(arguments_of(row), row)
 
     def _out_of_reach(self, wanted, limit, front):
         nearest = ""
@@ -173,7 +186,7 @@ class TradeOff(Study):
         """
         from servoctl.figures.work_precision import draw_tradeoff
 
-        return draw_tradeoff(self, ax, _cost(cost), text("title", title))
+        return draw_tradeoff(self, ax, as_cost(cost), text("title", title))
 
     def _good(self):
         return np.flatnonzero(np.isfinite(self["error"]) & np.isfinite(self["seconds"]))
@@ -286,10 +299,11 @@ def tradeoff(
 class Reference:
     """The motion with which others are compared, at any instants.
 
-    `agreement` has its method, the method that verified it within ten times `seconds`, and their difference.
+    `check` is the run at `times` of the method that verified it, the first that ends within ten times `seconds`.
+    `agreement` has both methods and their differences.
     """
 
-    def __init__(self, model, x0, t_span, seconds):
+    def __init__(self, model, x0, t_span, seconds, checks=CHECKS):
         consistent_state(model, x0, t_span[0])
         self.model, self.start, self.span, self._runs = model, x0, t_span, {}
         self.knots = [k for k in model.require_smooth((min(t_span), max(t_span))) if min(t_span) < k < max(t_span)]
@@ -297,38 +311,41 @@ class Reference:
         self.few = np.union1d(np.linspace(t0, t1, INSTANTS), self.knots)
         between = t0 + (t1 - t0) * (np.arange(COMPARED) + BETWEEN) / COMPARED
         self.times = np.unique([t0, *between, t1, *self.knots])
-        checks = [Adaptive("DOP853", 3e-14, 1e-15), Taylor(12, rtol=1e-14, atol=1e-14)]
         self.method, self.drift = Taylor(16, rtol=1e-15, atol=1e-15), Project()
         if model.flat:
-            self.method, self.drift, checks = Algebraic(), None, checks[::-1]
-        self.agreement = self._verified(checks, seconds)
+            self.method, self.drift, checks = Algebraic(), None, CHECKS[::-1]
+        self.at(self.times)
+        self.checked_by, self.check = self._verified(checks, seconds)
 
     def _verified(self, checks, seconds):
-        """The difference from the first of the other methods that ends in time."""
-        exact = self.at(self.times)
-        dense = np.union1d(np.linspace(*self.span, DENSE), self.knots)
+        """The first of the other methods that ends in time, and its run."""
         for method in checks:
             options = {"drift": Project(), "t_eval": self.times, "progress": Deadline(10 * seconds)}
             try:
-                run = _whole(simulated(self.model, self.start, self.span, method, **options))
+                return method, whole_run(simulated(self.model, self.start, self.span, method, **options))
             except ServoError as error:
                 failure = error
-                continue
-            return {
-                "method": _text(self.method),
-                "verified by": _text(method),
-                "error": motion_error(self.model, run.jets, exact.jets),
-                "actuation": relative_error(actuation(run), actuation(exact)),
-                "energy": _energy_balance(self.at(dense), self.knots),
-            }
         raise failure
+
+    @functools.cached_property
+    def agreement(self):
+        """The two methods in words, and how far their motions, actuations and energies differ."""
+        exact = self.at(self.times)
+        dense = np.union1d(np.linspace(*self.span, DENSE), self.knots)
+        return {
+            "method": _text(self.method),
+            "verified by": _text(self.checked_by),
+            "error": motion_error(self.model, self.check.jets, exact.jets),
+            "actuation": relative_error(actuation(self.check), actuation(exact)),
+            "energy": _energy_balance(self.at(dense), self.knots),
+        }
 
     def at(self, times):
         """The run with samples at these times (N,) [s]."""
         key = times.tobytes()
         if key not in self._runs:
             run = simulated(self.model, self.start, self.span, self.method, drift=self.drift, t_eval=times)
-            self._runs[key] = _whole(run)
+            self._runs[key] = whole_run(run)
         return self._runs[key]
 
 
@@ -347,7 +364,7 @@ class Deadline:
             raise LimitExceeded(late, seconds=self.seconds, steps=self.steps, t=t)
 
 
-def _whole(run):
+def whole_run(run):
     """The run, if it reached its end; one that Ctrl-C stopped ends the study."""
     if not run.success:
         raise KeyboardInterrupt
@@ -395,7 +412,7 @@ def _errors_and_cost(reference, name, treatment, value, seconds):
 
     def at(times):
         options = {"drift": treatment, "t_eval": times, "progress": Deadline(seconds)}
-        return _whole(simulated(model, reference.start, reference.span, method, **options))
+        return whole_run(simulated(model, reference.start, reference.span, method, **options))
 
     run, timed = at(times), []
     for _ in range(TIMED):
@@ -489,7 +506,7 @@ def _kind(method):
 
 
 def _drift_word(treatment):
-    """A treatment as a word, which `_arguments` reads."""
+    """A treatment as a word, which `arguments_of` reads."""
     if isinstance(treatment, Poles):
         return repr(treatment.values)
     if isinstance(treatment, Project):
@@ -514,7 +531,7 @@ def method_at(name, value):
     return as_method(method, **settings)
 
 
-def _arguments(row):
+def arguments_of(row):
     """The arguments of `simulate` with which a row was measured."""
     options, drift = {"method": method_at(row["method"], row["value"])}, row["drift"]
     if drift != "none":
@@ -523,5 +540,6 @@ def _arguments(row):
     return options
 
 
-def _cost(name):
+def as_cost(name):
+    """One of the columns that count as cost, or the error of another name."""
     return named(name, COSTS, "cost")

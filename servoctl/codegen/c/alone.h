@@ -34,6 +34,8 @@
 #define FAR_OFF 30.0
 
 /* batch.c */
+#define VECTORS 2
+#define LOOKED 64
 #define NU 2
 #define NC 2
 #define NW 2
@@ -47,6 +49,20 @@
 #define NR 2
 #define NT 8
 #define MEASURED {0, 1, 2, 3}
+
+/* allocation.c */
+#define NROW 5
+#define NSIG 1
+#define NK 2
+#define NJ 1
+#define NI 1
+#define INTEGRATORS {0}
+#define CORRECTED_BY
+#define QP_STEPS 100
+#define QP_MET 1e-10
+#define QP_DEPENDENT 1e-9
+#define MET 1e-7
+#define GIVEN_WAY 1e-6
 
 #include "lanes.h"
 
@@ -62,5 +78,6 @@ DECLARED(numbers, W)
 DECLARED(change, W)
 void law(W t, const W *restrict x, const double *restrict p, W *restrict y);
 void signals(W t, const W *restrict x, const double *restrict p, W *restrict y);
-void rates_of_two(W t, const W *restrict x, const W *restrict p, W *restrict y,
-                  const W *restrict x2, const W *restrict p2, W *restrict y2);
+void rates_of_block(W t, const W *const x[], const W *const p[], W (*y)[NX + 1]);
+DECLARED(unlimited, double)
+DECLARED(effects, double)

@@ -3,7 +3,7 @@
 
 #define FAR 1e5 /* beyond it sin and cos are those of the C library */
 
-/* sin(a + turns pi/2), where a is finite and not large. */
+/* sin(a), or cos(a) if turns is 1, where a is finite and not large. */
 INLINE REAL OF(turned)(REAL a, int64_t turns)
 {
     const REAL n_shifted = a * 0.63661977236758134308 + 6755399441055744.0, n = n_shifted - 6755399441055744.0;
@@ -16,9 +16,9 @@ INLINE REAL OF(turned)(REAL a, int64_t turns)
     const REAL c = w + (((1.0 - w) - half) + z * z * (4.16666666666666019037e-02 + z * (-1.38888888888741095749e-03
         + z * (2.48015872894767294178e-05 + z * (-2.75573143513906633035e-07 + z * (2.08757232129817482790e-09
         + z * -1.13596475577881948265e-11))))));
-    const WHOLE quadrant = OF(bits)(n_shifted) + turns;
-    const REAL value = OF(select)((quadrant & 1) != 0, c, s);
-    return OF(value)(OF(bits)(value) ^ ((quadrant & 2) << 62));
+    const WHOLE quadrant = OF(bits)(n_shifted), odd = (quadrant & 1) != 0;
+    const REAL value = turns ? OF(select)(odd, s, c) : OF(select)(odd, c, s);
+    return OF(value)(OF(bits)(value) ^ ((quadrant + turns) << 62 & INT64_MIN));
 }
 
 #undef OF

@@ -7,8 +7,6 @@
 #define V_CALL(name) name
 #include "sampled.h"
 
-typedef void Law(double t, const double *x, const double *p, double *y);
-
 /* y = C x + noise, quantised. */
 static void measure(const Loop *c, int64_t k, const double *x, double *y)
 {
@@ -30,13 +28,14 @@ __attribute__((flatten, optimize("no-tree-vectorize")))
 static void advance(const Loop *c, double t, double h, const double *d, double *x, double *p)
 {
     double k1[NX + 1], k2[NX + 1], k3[NX + 1], k4[NX + 1], z[NX + 1], *pd = p + c->at_u + c->n_u;
+    RATES(0, t, x, k1);
 #include "rk4.h"
 }
 
 /* The loop; sample k at t0 + k period: measure, call the law, delay, limit, hold. It goes on at a step of a sample, and
    pauses after some steps, as an interruption waits for it. Returns the samples completed. */
 __attribute__((optimize("no-tree-vectorize")))
-int64_t FN(closed)(Law *law, Loop *c)
+int64_t FN(closed)(Step *law, Loop *c)
 {
     double x[NX + 1], p[NP + 1];
     const double h = c->period / (double)c->substeps;

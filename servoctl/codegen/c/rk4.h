@@ -1,8 +1,7 @@
-/* One Runge-Kutta step of order 4 of x from t to t + h, inside a function that has these arrays, and k1, ..., k4 and z.
-   Before it, EACH runs over the states, AT(x) is the one it is at, and RATES(stage, t, x, k) computes k = x' under the
-   disturbances at the start (0), the middle (1) or the end (2) of the step. */
+/* One Runge-Kutta step of order 4 of x from t to t + h, inside a function that has these arrays, k1 = x' at t, k2, k3,
+   k4 and z. Before it, EACH runs over the states, AT(x) is the one it is at, and RATES(stage, t, x, k) computes k = x'
+   under the disturbances at the start (0), the middle (1) or the end (2) of the step. */
 const double half = h / 2, sixth = h / 6;
-RATES(0, t, x, k1);
 EACH AT(z) = AT(x) + half * AT(k1);
 RATES(1, t + half, z, k2);
 EACH AT(z) = AT(x) + half * AT(k2);

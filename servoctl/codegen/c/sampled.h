@@ -1,6 +1,8 @@
 /* The rule of a sampled loop that one loop and the lanes of many have in common. Before it, V is the type of numbers,
    V_OF(number) a V of one number, and V_CALL(name) a function of V. */
 
+typedef void Step(double t, const double *x, const double *row, double *y); /* of a law */
+
 /* Mirrored by servoctl/control/loop.py; arrays that are not used are null. */
 typedef struct {
     int64_t samples, substeps, delay, n_y, n_z, n_u, n_out, n_row, rows, first, n_d, at_u; /* of any loop */
@@ -8,10 +10,12 @@ typedef struct {
     int64_t status, sample, step, steps; /* of one: how it ended, where it goes on, integration steps until it pauses */
     double t0, period;
     const double *p, *x0, *z0, *table, *noise, *quantum, *low, *high, *change, *initial_input, *disturbance;
-    const double *constants, *scale;
+    const double *constants, *scale, *deviations;
     const int64_t *measured, *transport, *disturbed, *traced;
+    const uint64_t *keys;
     double *state, *x, *law_x, *law_y, *input; /* the state and logs of one loop */
     double *gathered, *trace;          /* and of many */
+    Step *law;                         /* which is called, where the law is not written into the loop */
 } Loop;
 
 INLINE V quantised(const Loop *c, int64_t i, V value)

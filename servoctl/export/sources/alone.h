@@ -11,13 +11,16 @@
 #define NO 3
 #define ITERATIONS 30
 #define TOLERANCE 1e-13
+#define STALLED 0.0
 #define T0 0.0
 #define RATE 100.0
 #define ROWS 2
 #define WIDTH 3
+#define KNOTS 2
 
 void path(double t, const double *x, const double *p, double *y);
 void rates(double t, const double *x, const double *p, double *y);
 void actuation(double t, const double *x, const double *p, double *y);
 void law(double t, const double *x, const double *p, double *y);
-static const double z0[NZ] = {0}, table[ROWS * WIDTH] = {0};
+static const int knot[KNOTS] = {0, 1};
+static const double z0[NZ] = {0}, table[2 * ROWS * WIDTH] = {0};
