@@ -412,8 +412,8 @@ class Automatic(Taylor):
         return RadauIIA(rtol=self.rtol, atol=self.atol) if self.jets is None else None
 
     @property
-    def for_pivots(self):
-        """What goes on where pivots change, which takes another series; None for an order that an accuracy requires."""
+    def without_series(self):
+        """What goes on where pivots change or the equations are no series; None for an order that is required."""
         return Adaptive(rtol=self.rtol, atol=self.atol) if self.jets is None and self.order is None else None
 
 

@@ -31,6 +31,7 @@ INSIDE = np.array([0.07, 0.19, 0.34, 0.53, 0.71, 0.86, 0.98])  # parts of a step
 FAR_OFF = 30.0  # times the tolerance, which the equations may add to a series over its step
 STIFF_STEPS = 400  # of this length in the span, from which compiling an implicit method pays
 LIMITED = 1.2  # times the longest stable steps: more of them are taken where accuracy limits them, not stability
+MOST_DOUBTED = 50  # times that series did not meet the equations, after which they do not suit a motion
 SMALLEST = 1e-12  # of a piece: shorter steps are not halved, so that a jump of the equations is passed
 
 
@@ -401,7 +402,7 @@ class TaylorSteps(Stepping):
         self.tolerances = method.rtol, atol
         self.every = drift.every if isinstance(drift, Project) else 0
         self.projects = self.every > 0
-        self.settings = method
+        self.settings, self.doubted = method, 0
         super().__init__(model, "Taylor", drift, progress)
 
     def _use(self, model):
@@ -433,6 +434,7 @@ class TaylorSteps(Stepping):
             log = _Log(self.f, self.n_x, self.p, rows)
             taken, good = len(rows) - 1, self._believed(log, abs(b - a))
             if good < taken:
+                self._doubt(log.t[good])
                 until = (log.t[good] + log.t[good + 1]) / 2  # the next step ends there
                 log = log.first(good)
             t, states = log.t, log.states
@@ -469,8 +471,15 @@ class TaylorSteps(Stepping):
             why = f"stability, not accuracy, limits the steps of {self.method} to {abs(t[-1] - t[-2]):.2g} s"
             raise Unsuited(why, method)
 
+    def _doubt(self, t):
+        """Leave the motion to an adaptive method if its series have often missed the equations."""
+        self.doubted += 1
+        method = getattr(self.settings, "without_series", None)
+        if method is not None and self.doubted > MOST_DOUBTED:
+            raise Unsuited(f"near t = {t:.4g} s the equations are no series over the steps of {self.method}", method)
+
     def _go_on(self, variant, t, x):
-        method = getattr(self.settings, "for_pivots", None)
+        method = getattr(self.settings, "without_series", None)
         if method is not None:
             raise Unsuited(f"pivots change at t = {t:.4g} s, and {self.method} would need other series", method)
         super()._go_on(variant, t, x)
