@@ -236,6 +236,12 @@ def test_a_free_path_is_kept_at_the_speed_that_forces_give():
     [
         (lambda q: sv.programs.distance("p", (q["x"],), (0,), 0.0), "0"),
         (lambda q: sv.programs.constant_speed("p", q, (q["x"],), -1.0), "-1"),
+        (lambda q: sv.programs.constant_speed("p", q, (q["x"],), ca.DM(0.0)), "0"),
+        (lambda q: sv.programs.jerk_norm("p", q, (q["x"],), ca.SX(2.0) - 3.0), "-1"),
+        (lambda q: sv.programs.orientation("p", sv.rotations.turn(q["x"], (0, 0, 1)), 2.0 * np.eye(3)), "no rotation"),
+        (lambda q: sv.programs.orientation("p", sv.rotations.turn(q["x"], (0, 0, 1)), np.diag([1, 1, -1])), "no rotation"),
+        (lambda q: sv.rotations.turn(q["x"], (0, 0, 1), np.zeros((3, 3))), "no rotation"),
+        (lambda q: sv.rotations.spline(q.t, [], []), "rotation"),
         (lambda q: sv.programs.follow_point("p", (q["x"], q["y"]), (1,)), "2 entries with 1"),
         (lambda q: sv.programs.curvature("p", q, (q["x"], q["y"], 0), 1.0), "3 coordinates"),
         (lambda q: sv.programs.follow_path("p", (q["x"],), q["y"], q.t), "follow_point"),

@@ -5,7 +5,7 @@ import numpy as np
 
 from servoctl.checks import named, require_kind, texts
 from servoctl.errors import SpecificationError
-from servoctl.robots.joints import identifier
+from servoctl.robots.joints import identifier, some_posture
 from servoctl.robots.robot import Frame, Robot
 from servoctl.spec import rotations
 
@@ -37,17 +37,20 @@ def held(robot: Robot, frames, at) -> dict:
 
     Raises
     ------
+    SpecificationError
+        If the frames cannot move, or a quaternion has not the length one.
     NameUnknown
         If a link, a coordinate or a kind does not exist.
     """
     require_kind(Robot, "robot", robot, "sv.urdf(file)")
     frames = frames if isinstance(frames, dict) else dict.fromkeys(texts(frames, "The frames"), "pose")
-    rows = {}
+    rows, names = {}, set()
     for link, kind in frames.items():
         named(kind, HOLDS, "kind of constraint")
+        names.add(name := identifier(link, names))
         frame, (position, rotation) = robot.frame(link), robot.at(at, link)
         turned = ca.DM(rotation.T) @ frame.rotation
-        rows |= _coinciding(identifier(link), frame.position - ca.DM(position), turned, kind)
+        rows |= _coinciding(name, frame.position - ca.DM(position), turned, kind)
     return _without_followers(rows, robot.q, robot.parameters, True)
 
 
@@ -71,7 +74,7 @@ def loop(a: Frame, b: Frame, kind="pose", name="loop") -> dict:
     Raises
     ------
     SpecificationError
-        If the frames are of different robots.
+        If the frames are of different robots, cannot meet, or cannot move against each other.
     NameUnknown
         If the kind does not exist.
     """
@@ -114,20 +117,18 @@ def _without_followers(rows, q, parameters, consistent):
     evaluate = ca.Function("rows", [symbols], [values, ca.densify(gradient), ca.densify(q.V)])
     numbers = np.array(list(parameters.defaults.values()) if parameters else [], float)
     random = np.random.default_rng(POSTURE_SEED)
-    places = [np.concatenate([_some_posture(q, random), numbers]) for _ in range(POSTURES)]
+    places = [np.concatenate([some_posture(q, random), numbers]) for _ in range(POSTURES)]
     kept = _adding([np.array(evaluate(place)[1]) for place in places])
     if len(kept) < len(rows) and not consistent:
         _refuse_contradiction(list(rows), kept, evaluate, places, q.nq)
+    if rows and not kept:
+        raise SpecificationError(
+            f"The rows {', '.join(rows)} have the same values in every posture."[:300],
+            "Frames that are held or closed move with the coordinates.",
+            do="Name links beyond a joint that moves.",
+            rows=list(rows),
+        )
     return {name: row for i, (name, row) in enumerate(rows.items()) if i in kept}
-
-
-def _some_posture(q, random):
-    """A random posture; quaternions of free bodies are unit ones."""
-    posture = random.uniform(-1.0, 1.0, q.nq)
-    for i, name in enumerate(q.names):
-        if name.endswith("_qw") and not q.plain:
-            posture[i - 3 : i + 1] /= np.linalg.norm(posture[i - 3 : i + 1])
-    return posture
 
 
 def _adding(jacobians):
