@@ -146,7 +146,9 @@ def test_frames_that_cannot_meet_are_refused():
 
 def test_held_frames_have_independent_rows():
     arm = sv.urdf(robots.file_of("four_bar"))
-    assert list(sv.held(arm, ["coupler_end"], {"crank_joint": 0.4})) == ["coupler_end_x", "coupler_end_z"]
+    bent, straight = {"crank_joint": 0.4, "coupler_joint": 0.5}, {"crank_joint": 0.4}
+    assert list(sv.held(arm, ["coupler_end"], bent)) == ["coupler_end_x", "coupler_end_z"]
+    assert list(sv.held(arm, ["coupler_end"], straight)) == ["coupler_end_x", "coupler_end_ry"], "x and z are dependent"
     robot = sv.urdf(robots.file_of("quadruped"), base="free")
     assert len(sv.held(robot, ["front_left_foot"], STANDING)) == 6
     with refused(sv.NameUnknown, "fron_left_foot", match="front_left_foot"):
@@ -295,3 +297,20 @@ def test_rotations_refuse_half_turns_and_what_is_none():
         sv.rotations.slerp(0.5, np.diag([1.0, 1.0, -1.0]), np.eye(3))
     with refused(sv.SpecificationError, "axis", axis=[0, 0, 0]):
         sv.rotations.turn(0.5, (0, 0, 0))
+
+
+TWO_LEGS = {f"{leg}_{joint}": angle for leg in ("front", "hind") for joint, angle in (("hip", 0.7), ("knee", -1.4), ("ankle", 0.7))}
+
+
+def test_rows_of_two_soles_are_those_of_their_plane():
+    """With one sole held, the other moves in the plane of the legs alone, though in no posture at random."""
+    robot = sv.urdf(robots.two_legs(), base="free")
+    rows = sv.held(robot, ["front_foot", "hind_foot"], TWO_LEGS | {"base_z": 0.3})
+    assert list(rows)[6:] == ["hind_foot_x", "hind_foot_z", "hind_foot_ry"]
+    turned = {"base_qz": np.sin(np.pi / 4), "base_qw": np.cos(np.pi / 4)}
+    rows = sv.held(robot, ["hind_foot", "front_foot"], TWO_LEGS | turned)  # rotations in the axes of the foot
+    assert list(rows)[6:] == ["front_foot_y", "front_foot_z", "front_foot_ry"]
+    frames = robot.frame("front_foot"), robot.frame("hind_foot")
+    assert list(sv.loop(*frames)) == ["loop_x", "loop_z", "loop_ry"]
+    arm = sv.urdf(robots.file_of("six_axis_arm"))
+    assert len(sv.held(arm, ["tool"], {})) == 6, "a stretched arm that cannot move has all rows"

@@ -83,7 +83,11 @@ def scalars(q):
 
 def some_posture(q, random):
     """A random posture, (nq,); quaternions of free bodies are unit ones."""
-    posture = random.uniform(-1.0, 1.0, q.nq)
+    return unit_quaternions(q, random.uniform(-1.0, 1.0, q.nq))
+
+
+def unit_quaternions(q, posture):
+    """A posture (nq,) whose quaternions of free bodies have length one."""
     for name in scalars(q):
         end = q.names.index(name) + 1
         posture[end - 4 : end] /= np.linalg.norm(posture[end - 4 : end])
