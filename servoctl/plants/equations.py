@@ -46,13 +46,15 @@ class PlantEquations:
         Forces, damped velocities, lagging actuators and parameters.
     functions : dict of str to Compiled
         Compiled functions by name.
+    others : list of PlantEquations
+        The same equations with pivots that were decided near states where these vanish.
     """
 
     def __init__(self, mechanism, forces, damped, lagged, values=None):
         q = self.q = mechanism.q
         self.mechanism, self.choices, self.lagged = mechanism, (forces, damped, lagged, values), lagged
         self.values = mechanism.parameters.values() if values is None else np.array(values)
-        self.functions = {}
+        self.functions, self.others = {}, []
         self.forces = _expression(forces, mechanism)
         self.velocity = ca.vertcat(*q.gamma(1))
         self.lagging = ca.SX.sym("lagging", len(lagged))

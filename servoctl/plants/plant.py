@@ -264,13 +264,21 @@ class Plant(Value):
     def near(self, t: float, x) -> "Plant":
         """The plant whose pivots are decided near a state, where those decided elsewhere vanish.
 
+        Pivots that were decided near another state are taken where they do not vanish at this one.
+
         Parameters
         ----------
         t : float
             [s]
         x : (n_x,) array
         """
-        return replace(self, equations=self.equations.near(t, x, self.parameters[: len(self.equations.values)]))
+        rest, others = np.zeros(len(self.inputs)), self.equations.others
+        for equations in others:
+            plant = replace(self, equations=equations)
+            if np.isfinite(plant.rates(t, x, rest)).all():
+                return plant
+        others.append(self.equations.near(t, x, self.parameters[: len(self.equations.values)]))
+        return replace(self, equations=others[-1])
 
     def state(self, values) -> np.ndarray:
         """A full state: an array of (q, γ') or of all states, or values by name.
