@@ -135,8 +135,11 @@ class Equations(Invariants):
 
     @property
     def sparse(self):
-        """Whether the sparse elimination of [M -B; G 0] gives γ^(s̄), instead of the rows of (3.18)."""
-        return self.definite or (self.q.n > saddle.FEW and saddle.applies(self.r))
+        """Whether the sparse elimination of [M -B; G 0] gives γ^(s̄), instead of the rows of (3.18).
+
+        The rows of a flat program are constraints alone: they give γ^(s̄) without the inertia.
+        """
+        return self.definite or (self.r.free > 0 and self.q.n > saddle.FEW and saddle.applies(self.r))
 
     @property
     def definite(self):
