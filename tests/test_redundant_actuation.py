@@ -42,6 +42,7 @@ def constrained_minimum(mechanism, program, z, t, weights):
     """γ'' and the least uᵀWu with φ'' = 0 and material constraints: the KKT system in (γ'', u, λ; μ), by numpy."""
     q, n, m = mechanism.q, mechanism.q.n, len(mechanism.actuators)
     values = dict(zip([name for k in range(3) for name in q.jet_names(k)], z, strict=True)) | {"t": t}
+    values |= dict(zip(mechanism.parameters.names, mechanism.parameters.values(), strict=True))
     at_zero = values | dict.fromkeys(q.jet_names(2), 0.0)
     acceleration = ca.vertcat(*q.gamma(2))
 
@@ -247,6 +248,69 @@ def test_two_motors_beside_a_guide_leave_its_multiplier_true():
     assert u["askew"] * 2 / u["along"] == pytest.approx(1 / 2)
     guide = signal(model, "multipliers", t, jets)["multiplier_guide"]
     assert abs(2 * acceleration - u["along"] - u["askew"]) == pytest.approx(abs(guide))
+
+
+def test_least_forces_on_a_ring_are_tangential_all_the_way_round():
+    """u = (F·τ)τ; each entry of the ring's gradient (2x, 2y), by which displacements are divided, vanishes twice."""
+    q = sv.coordinates("x y")
+    x, y = q
+    mechanism = sv.Mechanism(
+        q, gibbs=sv.particle(q, 2.0, ca.vertcat(x, y)), potential=3.0 * y, constraints={"ring": x**2 + y**2 - 1},
+        actuators={"right": (1, 0), "up": (0, 1)},
+    )  # fmt: skip
+    angle = 0.4 + q.t + 0.3 * ca.sin(q.t)
+    model = derive(mechanism, sv.Program({"ray": y * ca.cos(angle) - x * ca.sin(angle)}))
+    run = simulate(model, model.start(guess={"x": 1.0, "y": 0.4}), (0.0, 2 * np.pi))
+    at = 0.4 + run.t + 0.3 * np.sin(run.t)
+    along = np.array([-np.sin(at), np.cos(at)])
+    force = 2.0 * -0.3 * np.sin(run.t) + 3.0 * np.cos(at)
+    assert np.array([run["right"], run["up"]]) == pytest.approx(force * along, abs=1e-9)
+    assert run.counters["pivot_changes"] > 1 and verify(model, run).passed
+
+
+def standing(legs, weights=None):
+    """A planar body on legs of two links, whose feet are held; its place and its pitch follow sines."""
+    q = sv.coordinates(" ".join(["x z pitch", *(f"hip{i} knee{i}" for i in range(legs))]))
+    x, z, pitch = list(q)[:3]
+    p = sv.parameters(**{f"m{i}": 0.6 for i in range(legs)})
+    S, U, feet, guess = sv.rigid_body(q, 5.0, (0, 0.3, 0), position=(x, 0, z), rates=(0, q.d(1)[2], 0)), 5.0 * z, {}, {}
+    for i in range(legs):
+        hip, knee = list(q)[3 + 2 * i :][:2]
+        at, place = 0.4 * i - 0.2 * (legs - 1), ca.vertcat(x, z)
+        place += at * ca.vertcat(ca.cos(pitch), -ca.sin(pitch))
+        for angle, mass in ((pitch + hip, p.symbols[i]), (pitch + hip + knee, 0.3)):
+            place -= 0.5 * ca.vertcat(ca.sin(angle), ca.cos(angle))
+            S, U = S + sv.particle(q, mass, place), U + mass * place[1]
+        feet |= {f"foot{i}_x": place[0] - at, f"foot{i}_z": place[1]}
+        guess |= {f"hip{i}": 0.6, f"knee{i}": -1.2}
+    wishes = {"X": x - 0.05 * ca.sin(q.t), "Z": z - 0.8 - 0.03 * ca.sin(2 * q.t), "pitch": pitch - 0.1 * ca.sin(q.t)}
+    motors = {f"motor_{name}": e for name, e in list(zip(q.names, q, strict=True))[3:]}
+    mechanism = sv.Mechanism(q, gibbs=S, potential=9.81 * U, constraints=feet, actuators=motors, parameters=p)
+    return mechanism, sv.Program(wishes, weights=weights), guess | {"z": 0.8}
+
+
+@pytest.mark.parametrize("weights", [None, {"motor_hip0": 4.0, "motor_knee1": 0.3}])
+def test_least_torques_of_a_body_on_three_legs(weights):
+    mechanism, program, guess = standing(3, weights)
+    model = derive(mechanism, program)
+    jets = motion(model, 0.8, guess)
+    found = signal(model, "actuation", 0.8, jets)
+    w = [(weights or {}).get(name, 1.0) for name in found]
+    acceleration, u = constrained_minimum(mechanism, program, jets, 0.8, w)
+    assert list(found.values()) == pytest.approx(u, rel=1e-11, abs=1e-11 * np.abs(u).max())
+    assert jets[-model.n :] == pytest.approx(acceleration, rel=1e-10, abs=1e-11)
+
+
+def test_the_motion_of_a_body_on_legs_and_its_pivots_are_free_of_masses():
+    """Neither displacements that feet allow nor the rows of a flat program contain the inertia."""
+    counts = []
+    for legs in (2, 4, 8):
+        mechanism, program, _ = standing(legs)
+        path = derive(mechanism, program).function("path")
+        assert path.n_p == legs and not path.expression.sparsity_jac(2, 0).nnz()
+        counts.append(path.operations)
+    few, some, many = counts
+    assert many - some < 2.3 * (some - few)
 
 
 def test_fewer_independent_actuators_than_residuals_are_refused():

@@ -4,11 +4,13 @@ from functools import cache
 
 import numpy as np
 import pytest
+from conftest import at_random, numbers
 from walkers import Robot
 
 import servoctl as sv
 from servoctl.jets.series import Flow
 from servoctl.reduction.lifting import lifted
+from servoctl.reduction.rows import row_levels
 
 LEG = [0, 1, 2, 3, 4, 5]  # parents of the links of a leg with six joints
 
@@ -69,3 +71,17 @@ def test_the_operations_of_a_robot_are_linear_in_its_joints():
     assert counts[10] <= 2.4 * counts[5]
     entries = [lifted(r.mechanism.balance, r.mechanism.q.jet(2)).nnz() for r in (models[n].reduction for n in (5, 10))]
     assert entries[1] <= 2.1 * entries[0]
+
+
+def test_rows_of_a_robot_are_differentiated_together(monkeypatch):
+    """Rows that are differentiated equally often share the kinematics of the robot."""
+    reduction = accelerated(5).reduction
+    q, rows = reduction.mechanism.q, [row for row in reduction.rows if row.kind == "program"]
+    one_by_one = [row_levels(q, [row], 2)[0] for row in rows]
+    calls, series = [], type(q)._series
+    monkeypatch.setattr(type(q), "_series", lambda *given: calls.append(given) or series(*given))
+    together = row_levels(q, rows, 2)
+    assert len(calls) == 1 and len(rows) == 5
+    known = at_random(q)
+    values = [numbers(sum(levels, []), known) for levels in (together, one_by_one)]
+    assert len(values[0]) == 15 and (values[0] == values[1]).all()

@@ -11,6 +11,7 @@ from servoctl.model import saddle
 from servoctl.reduction.appell import plant_accelerations
 from servoctl.reduction.definite import Definite
 from servoctl.reduction.ranks import clean, column_sizes, eliminate, noting_dropped
+from servoctl.reduction.rows import row_levels
 from servoctl.spec.coordinates import jet_name
 
 
@@ -45,11 +46,7 @@ class Invariants:
                 [self._along(row.order + j).levels[a] for j in range(count + 1)]
                 for a, (row, count) in enumerate(zip(self.rows, self.raised, strict=True))
             ]
-        return [self._levels(row) for row in self.rows]
-
-    def _levels(self, row):
-        """Total time derivatives of a row of orders 0 .. s̄ - o_a, by its expression."""
-        return [level[0] for level in self.q.derivatives([row.expression], max(0, self.top - row.order))]
+        return row_levels(self.q, self.rows, self.top)
 
     def _along(self, given, correct=False):
         """The motion of the cascade by its jets up to a given level."""
@@ -135,8 +132,11 @@ class Equations(Invariants):
 
     @property
     def sparse(self):
-        """Whether the sparse elimination of [M -B; G 0] gives γ^(s̄), instead of the rows of (3.18)."""
-        return self.definite or (self.q.n > saddle.FEW and saddle.applies(self.r))
+        """Whether the sparse elimination of [M -B; G 0] gives γ^(s̄), instead of the rows of (3.18).
+
+        The rows of a flat program are constraints alone: they give γ^(s̄) without the inertia.
+        """
+        return self.definite or (self.r.free > 0 and self.q.n > saddle.FEW and saddle.applies(self.r))
 
     @property
     def definite(self):
@@ -164,15 +164,12 @@ class Equations(Invariants):
 
     def rest(self, rows, poles=False):
         """Some rows raised to order s̄, at γ^(s̄) = 0; with their error dynamics if `poles`."""
-        top, zero = self.q.jet(self.top), ca.SX.zeros(self.q.n)
-        rests = []
-        for a in rows:
-            *lower, highest = self.levels[a]
-            row = ca.substitute(highest, top, zero)
-            if poles:
-                row += sum(c * e for c, e in zip(self.coefficients[a], lower, strict=True))
-            rests.append(row)
-        return rests
+        raised = ca.vertcat(ca.SX(0, 1), *(self.levels[a][-1] for a in rows))
+        rests = ca.substitute(raised, self.q.jet(self.top), ca.SX.zeros(self.q.n)).elements()
+        if not poles:
+            return rests
+        errors = (zip(self.coefficients[a], self.levels[a][:-1], strict=True) for a in rows)
+        return [row + sum(c * e for c, e in pairs) for row, pairs in zip(rests, errors, strict=True)]
 
     def dense(self, poles=False):
         """γ^(s̄) from the rows, L γ^(s̄) = -rest."""
@@ -338,7 +335,7 @@ class Equations(Invariants):
         inputs = ca.SX.sym("input", r.actuation.shape[0])
         driven = mechanism.E @ inputs if r.program.by == "actuators" else inputs
         material = [row for row in r.original.values() if row.kind == "material"]
-        second = [q.derivatives([row.expression], 2 - row.order)[-1][0] for row in material]
+        second = [level[-1] for level in row_levels(q, material, 2)]
         second = ca.substitute(ca.vertcat(*second), acceleration, zero) if material else ca.SX(0, 1)
         force = driven - ca.substitute(mechanism.balance, acceleration, zero)
         solution, _ = plant_accelerations(mechanism, material, force, -second, r.points)
@@ -350,7 +347,7 @@ class Equations(Invariants):
         r, q = self.r, self.q
         acceleration, zero = q.jet(2), ca.SX.zeros(q.n)
         rows = [row for row in r.original.values() if row.order <= 1 or (row.order == 2 and row.affine)]
-        second = ca.vertcat(*(q.derivatives([row.expression], 2 - row.order)[-1][0] for row in rows))
+        second = ca.vertcat(*(level[-1] for level in row_levels(q, rows, 2)))
         B = r.realisation.B
         C = ca.jacobian(second, acceleration) if rows else ca.SX(0, q.n)
         matrix = ca.vertcat(ca.horzcat(r.mechanism.mass, -B), ca.horzcat(C, ca.SX.zeros(len(rows), B.shape[1])))
@@ -445,12 +442,13 @@ class Equations(Invariants):
 
     def _residuals(self):
         """Given residuals, material constraints and hidden rows, at every level up to order s̄."""
-        names, expressions = [], []
+        names, expressions, rows = [], [], residual_rows(self.r)
         deep = {} if self.cascade is None else dict(zip(map(id, self.rows), self.levels, strict=True))
-        for name, row in residual_rows(self.r).items():
-            levels = deep[id(row)] if id(row) in deep else self._levels(row)
-            names += [(name, j) for j in range(len(levels))]
-            expressions += levels
+        others = [row for row in rows.values() if id(row) not in deep]
+        deep |= zip(map(id, others), row_levels(self.q, others, self.top), strict=True)
+        for name, row in rows.items():
+            names += [(name, j) for j in range(len(deep[id(row)]))]
+            expressions += deep[id(row)]
         reported, invariants = self.r.mechanism.reported, self.q.invariants
         names += [(name, 0) for name in reported]
         expressions += reported.values()

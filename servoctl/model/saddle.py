@@ -86,7 +86,7 @@ def accelerations(equations):
             hidden=[row.name for row in r.hidden],
         )
     sparse = ca.vertcat(*equations.saddle[:2])
-    if equations.sparse:
+    if equations.definite or q.n > FEW:
         return equations.function("accelerations", equations.state, [sparse])
     solution, acceleration = equations.dense(), q.jet(2)
     dense = ca.vertcat(solution, ca.substitute(r.multipliers, acceleration, solution))

@@ -51,17 +51,17 @@ class Realisation:
 
     def dynamics(self, balance):
         """Tᵀ r by independent coordinate, without unreached ones, and the pivots divided by, as in the multipliers."""
-        if not self.dependent:
-            return {i: balance[i] for i in self.independent}, []
-        transposed = self.B.T
-        a, pivots = eliminate(
-            transposed[:, list(self.dependent)],
-            -transposed[:, list(self.independent)],
-            self.numbers[:, list(self.dependent)],
-        )
-        virtual = zip(self.independent, (a.T @ balance[list(self.dependent)]).elements(), strict=True)
-        rows = {i: balance[i] + reaction for i, reaction in virtual if i not in self.unreached}
-        return rows, [p for p in pivots if ca.symvar(p)]
+        virtual, pivots = self.virtual(balance)
+        rows = zip(self.independent, virtual.elements(), strict=True)
+        return {i: row for i, row in rows if i not in self.unreached}, pivots
+
+    def virtual(self, forces):
+        """Tᵀ f for columns f (n, columns) SX, (n - b, columns) SX, and the pivots divided by."""
+        dependent, independent, transposed = list(self.dependent), list(self.independent), self.B.T
+        if not dependent:
+            return forces, []
+        a, pivots = eliminate(transposed[:, dependent], -transposed[:, independent], self.numbers[:, dependent])
+        return forces[independent, :] + a.T @ forces[dependent, :], [p for p in pivots if ca.symvar(p)]
 
     def splits(self):
         """Splits into dependent and independent coordinates: the chosen one, and others regular at some points."""

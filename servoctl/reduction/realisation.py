@@ -59,11 +59,12 @@ def realisation(mechanism, program, constraints, points, context):
     if k == m:
         return _realised(mechanism, constraints, mechanism.E, ca.SX.eye(m), points), points, []
     if k == len(independent):
-        # The program determines E u. P has the row space of E, beside material rows that of what u does to the motion.
-        rows = _responses(mechanism, material, points) if material else mechanism.E
+        # The program determines E u up to forces of material rows. P has the row space of T_mᵀE.
+        rows, pivots = _realised(mechanism, material, ca.SX(mechanism.q.n, 0), None, points).virtual(mechanism.E)
         chosen = _independent_rows(clean(*points.matrix(rows)), k)
         A = _inverse_weights(mechanism, program) @ rows[chosen, :].T
-        return _realised(mechanism, constraints, mechanism.E @ A, A, points), points, []
+        pivots = [(f"choice of virtual displacements {i}", p) for i, p in enumerate(pivots, 1)]
+        return _realised(mechanism, constraints, mechanism.E @ A, A, points), points, pivots
     return _shared(mechanism, program, constraints, independent, points, context)
 
 

@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
+from itertools import chain
 
 import casadi as ca
 import numpy as np
@@ -17,7 +18,7 @@ from servoctl.reduction.manifold import Context, Points, sample
 from servoctl.reduction.orders import Orders
 from servoctl.reduction.ranks import Rank, clean, decide, decide_all, eliminate, noting_dropped, pivot_order
 from servoctl.reduction.realisation import realisation, wished, wished_balance
-from servoctl.reduction.rows import Balance, as_rows, balances, merge_uses, settle_alone
+from servoctl.reduction.rows import Balance, as_rows, balances, merge_uses, row_levels, settle_alone
 from servoctl.reduction.scales import ORDINARY, usual
 from servoctl.reduction.triangular import completed
 from servoctl.spec.mechanism import Mechanism, require_known
@@ -137,8 +138,7 @@ class Reduction(Packed):
     def conditions(self):
         """What must vanish on the manifold: the residuals with their derivatives, and the balance with the reaction."""
         q, B = self.mechanism.q, self.realisation.B
-        orders = (q.derivatives([row.expression], max(0, self.top - row.order)) for row in self.original.values())
-        residuals = [level[0] for levels in orders for level in levels]
+        residuals = chain.from_iterable(row_levels(q, self.original.values(), self.top))
         return [*residuals, *(self.balance - B @ self.multipliers).elements()]
 
     @cached_property

@@ -133,6 +133,17 @@ def merge_uses(*parts):
     return total
 
 
+def row_levels(q, rows, top):
+    """Total time derivatives of each row of orders 0 .. top - o_a, but at least the row, by its expression."""
+    rows, by_count, found = list(rows), {}, {}  # rows that are differentiated equally often share their terms
+    for a, row in enumerate(rows):
+        by_count.setdefault(max(0, top - row.order), []).append(a)
+    for count, some in by_count.items():
+        derivatives = q.derivatives([rows[a].expression for a in some], count)
+        found |= zip(some, map(list, zip(*derivatives, strict=True)), strict=True)
+    return [found[a] for a in range(len(rows))]
+
+
 def as_rows(q, named, kind, context):
     """Rows of residuals by name, of kind "program" or "material", with their true orders.
 
