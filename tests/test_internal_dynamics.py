@@ -467,5 +467,4 @@ def test_neutral_growth_above_ten_takes_no_linearisation(span, t_eval, gallery_m
     monkeypatch.setattr(simulation, "internal_dynamics", lambda *a: calls.append(a) or real(*a))
     run = sv.simulate(model, start, span, t_eval=t_eval)
     assert growth_bound(model, run) > 10 or t_eval
-    verdict = sv.internal_dynamics(model, run).verdict
-    assert (not calls and verdict == "neutral") or verdict == "unstable"
+    assert not calls and 30 < sv.internal_dynamics(model, run).growth < 52
