@@ -51,7 +51,7 @@ class Propagation:
         t, h, p = (np.repeat(part, 2 * count, axis=-1) for part in (self.t[:-1], np.diff(self.t), self.parameters))
         y = self.f.grid(t, x, p)
         log = np.concatenate([t[None], x, y]).T
-        ends = self.f.jets(log, np.arange(len(t)), t + h, p[:, 0], sizes["top"] - 1)
+        ends = self.f.jets(log, np.arange(len(t)), t + h, self.parameters[:, 0], sizes["top"] - 1)
 
         def difference(values):
             both = values.reshape(len(values), K, 2, count)
