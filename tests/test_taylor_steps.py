@@ -3,6 +3,7 @@
 import casadi as ca
 import numpy as np
 import pytest
+from scipy.integrate import solve_ivp
 
 import servoctl as sv
 from servoctl.codegen.interpreted import rough_log2
@@ -207,3 +208,31 @@ def test_interpreted_samples_satisfy_the_rows(scene, c_compiler):
     z, other = f.jets(log, k, t, p, top + 1, by_rows=True), np.empty((model.nq + (top + 1) * model.n, 5))
     f._interpreter.jets(log, k, t, p, (top + 1, n_x + model.n), other)
     np.testing.assert_allclose(z, other, rtol=1e-12, atol=1e-12)
+
+
+@pytest.mark.parametrize("span", [(0.0, 6.0), (6.0, 0.0)], ids=str)
+def test_matrices_have_the_velocities_that_rows_determine(span):
+    """A skate of given speed: dy = a(t, z) dx. The gradient 2 (dx, dy) of the row of the speed has this dy.
+
+    Then s = ∫ dx = ∫ v / sqrt(1 + a²) in quadrature, and series do not depend on the dy of the state.
+    """
+    q = sv.coordinates("x y z")
+    z, (dx, dy, _) = q["z"], q.d(1)
+    mechanism = sv.Mechanism(
+        q, gibbs=sum(a**2 for a in q.d(2)) / 2, potential=z**2 / 2, constraints={"skate": dy - ca.sin(z + q.t) * dx}
+    )
+    model = sv.derive(mechanism, sv.Program({"speed": dx**2 + dy**2 - 4.0}, by="ideal"), guess={"dx": 1.5, "dy": 1.0})
+    start = model.start(t=span[0], x=0.0, y=0.0, z=0.4, dz=0.0, guess={"dx": 1.5})
+    run = sv.simulate(model, start, span, t_eval=np.linspace(*span, 50))
+    assert run.method == "Taylor"
+    assert run["dx"] ** 2 * (1 + np.sin(run["z"] + run.t) ** 2) == pytest.approx(4.0, abs=1e-8)
+    assert run["z"] == pytest.approx(0.4 * np.cos(run.t - span[0]), abs=1e-8)
+    speed = lambda t, _: [2 / np.sqrt(1 + np.sin(0.4 * np.cos(t - span[0]) + t) ** 2)]  # noqa: E731
+    exact = solve_ivp(speed, span, [0.0], rtol=1e-11, atol=1e-12)
+    assert run["x"][-1] == pytest.approx(exact.y[0, -1], abs=1e-8)
+    f, p, state = series_loop(model, 8), np.append(model.parameters, 3.0), start.values
+    assert f.others, "no velocity is determined by rows"
+    moved = state.copy()
+    moved[f.sizes["nq"] :] += 0.1 * (1 - np.array(f.sizes["free"]))
+    assert f(span[0], moved, p) == pytest.approx(f(span[0], state, p), rel=1e-13, abs=1e-13)
+    assert f.others["settled"](span[0], moved, p) == pytest.approx(f.others["settled"](span[0], state, p))

@@ -13,7 +13,7 @@ import numpy as np
 from servoctl.methods.motion import breakpoints
 from servoctl.methods.taylor import series_loop
 
-RTOL = 1e-6  # of the steps along which deviations are moved, and of the least size of a level of the state
+RTOL = 1e-7  # of the steps along which deviations are moved, and of the least size of a level of the state
 NEARBY = 1e-6  # of the size of a state: distance of the states from which deviations are taken
 LEFT_OUT = 1e-3  # of a propagator over a step: its last terms, which bound those that are left out
 MOST_ALONG = 2_000  # of a motion: more of them take longer than propagators by the linearisation

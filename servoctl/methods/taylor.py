@@ -203,6 +203,19 @@ class _Rows:
         matrix = self.r.leading[place[0], place[1]]
         return eliminate(matrix, right, clean(*self.r.points.matrix(matrix)), order=order)[0]
 
+    def by_rows(self, outputs):
+        """Outputs with the velocities that rows determine in place of those of the state, which need not meet the rows.
+
+        Leading matrices and pivots depend on them, and the solutions of a level on those of lower levels.
+        """
+        outputs = ca.vertcat(*outputs)
+        for k, (_, columns, _) in sorted(self.solved.items(), reverse=True):
+            given = ca.vertcat(*(self.motion.q.gamma(k)[i] for i in columns))
+            if ca.depends_on(outputs, given):
+                solution = ca.vertcat(*(ca.SX(self.motion.gamma[k][i]) * float(factorial(k)) for i in columns))
+                outputs = ca.substitute(outputs, given, solution)
+        return outputs.elements()
+
 
 class _Reacting(_Motion):
     """A motion with coefficients of the multipliers μ."""
@@ -236,16 +249,19 @@ def taylor_coefficients(equations, last):
     if r.cascade is not None:
         motion = r.cascade.along(r.points, equations.top - 1, last, running=_InBlock)
         return _coefficients(equations, motion.place, motion.gamma, last, _InBlock.instant)
-    motion = _with_multipliers(equations, last) if equations.definite else _by_rows(equations, last)
-    return _coefficients(equations, motion.coordinates, motion.gamma, last, motion.branch)
+    if equations.definite:
+        motion = _with_multipliers(equations, last)
+        return _coefficients(equations, motion.coordinates, motion.gamma, last, motion.branch)
+    rows = _by_rows(equations, last)
+    return _coefficients(equations, rows.motion.coordinates, rows.motion.gamma, last, rows.motion.branch, rows.by_rows)
 
 
 def _by_rows(equations, last):
-    """The motion by L γ_[k] = ..."""
+    """The rows with their motion by L γ_[k] = ..."""
     rows = _Rows(equations)
     for k in range(last + 1):
         rows.advance(k)
-    return rows.motion
+    return rows
 
 
 def _with_multipliers(equations, last):
@@ -286,11 +302,11 @@ def _right(groups, k):
     return ca.vertcat(*(right[a] for a in sorted(right)))
 
 
-def _coefficients(equations, coordinates, gamma, last, instant):
+def _coefficients(equations, coordinates, gamma, last, instant, finished=list):
     """What `taylor_coefficients` returns, from coefficients by index."""
     coefficients = [] if equations.q.plain else [ca.SX(c) for k in range(1, last + 1) for c in coordinates[k]]
     coefficients += [ca.SX(c) for k in range(1, last + 1) for c in gamma[k]]
-    outputs = [*coefficients, *(g for _, g in equations.pivots)]
+    outputs = finished([*coefficients, *(g for _, g in equations.pivots)])
     return equations.function("taylor", equations.state, outputs, instant)
 
 
@@ -307,11 +323,9 @@ def settled(equations):
     -------
     casadi.Function
     """
-    rows = _Rows(equations)
-    for k in range(equations.top + 1):
-        rows.advance(k)
+    rows = _by_rows(equations, equations.top)
     gamma = [ca.SX(c) * float(factorial(k)) for k in range(1, equations.top + 1) for c in rows.motion.gamma[k]]
-    return equations.function("settled", equations.state, [*equations.q, *gamma], rows.motion.branch)
+    return equations.function("settled", equations.state, rows.by_rows([*equations.q, *gamma]), rows.motion.branch)
 
 
 def series_loop(model, last):

@@ -194,10 +194,13 @@ class Equations(Invariants):
         """Pivots that depend on the motion, which must not vanish: a list of (name, SX)."""
         return [(name, p) for name, p in self.all_pivots if any(self.q.where(s) is not None for s in ca.symvar(p))]
 
-    @property
+    @cached_property
     def entries_dropped(self):
-        """What eliminations left out as zero: a list of SX."""
-        return [*self.r.dropped, *(self._saddle[2:] if self.sparse else self._leading)[1]]
+        """What eliminations left out as zero, unless all terms cancel by algebra: a list of SX."""
+        from servoctl.jets.algebra import cancels
+
+        entries = *self.r.dropped, *(self._saddle[2:] if self.sparse else self._leading)[1]
+        return [entry for entry in entries if not cancels(entry)]
 
     def dropped(self):
         """Of what eliminations left out the values, then the sizes of their terms, of (t, Z, p); None without any.
