@@ -49,6 +49,10 @@ class Reference:
             self._runs[key] = resampled(self.plan, t)
         return self._runs[key]
 
+    def planned(self, name):
+        """A signal of the plan at the samples, (N,)."""
+        return self._run(self.t)[name]
+
     def _actuation(self, t):
         run = self._run(t)
         return np.array([run[name] for name in self.plant.inputs]).reshape(len(self.plant.inputs), len(t))
