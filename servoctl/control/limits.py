@@ -10,7 +10,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from servoctl.checks import ON_SAMPLE, as_list, interval, mapping, named, numbers_by_name, positive
+from servoctl.checks import ON_SAMPLE, as_list, finite, interval, mapping, named, numbers_by_name, positive
 from servoctl.codegen import compiler, emit
 from servoctl.codegen.function import Compiled, compiled
 from servoctl.codegen.matrices import riccati
@@ -132,7 +132,9 @@ def limited(
         The controller's model of the machine, with its limits.
     bounds : dict of str to (float, float) or float, optional
         Outputs of the mechanism, affine in the inputs, that stay within (low, high), None for an open side, or within
-        (-c, c): a rope that cannot push is {"tension": (0.0, None)}.
+        (-c, c): a rope that cannot push is {"tension": (0.0, None)}. So do the reactions of material constraints,
+        "multiplier_NAME" as in the plan. A combination goes before low and high, under a name of its own: one side of a
+        cone of friction is {"slip": ({"multiplier_sole_x": 1.0, "multiplier_sole_z": -0.6}, None, 0.0)}.
     weights : dict of str to float, optional
         w_i by residual; default 1 each.
     priority : sequence of str, optional
@@ -179,7 +181,9 @@ def limited(
 
 def _bounds(plant, bounds):
     """The effects of inputs on the bounded outputs, and the bounds, (j, 2)."""
-    bounds = {name: interval(name, value, "bound") for name, value in mapping(bounds, "The bounds").items()}
+    bounds = mapping(bounds, "The bounds")
+    parts = {name: _combination(name, value) for name, value in bounds.items()}
+    bounds = {name: interval(name, sides, "bound") for name, (_, sides) in parts.items()}
     if not (plant.limits or plant.rate_limits or bounds):
         raise SpecificationError(
             "There are no limits of the plant and no bounds.",
@@ -187,10 +191,12 @@ def _bounds(plant, bounds):
             do='Pass bounds, or limits of the plant: sv.plant(mechanism, limits={"trolley": 150.0}).',
             names=plant.inputs,
         )
-    for name in bounds:
-        if name not in plant.mechanism.outputs:
-            raise unknown(name, plant.mechanism.outputs, "output of the mechanism")
-    effects = Effects(plant, {name: plant.mechanism.outputs[name] for name in bounds})
+    known = plant.mechanism.outputs | (plant.equations.multipliers if bounds else {})
+    for one in (one for combination, _ in parts.values() for one in combination):
+        if one not in known:
+            raise unknown(one, known, "output or multiplier")
+    rows = {name: sum(c * known[one] for one, c in combination.items()) for name, (combination, _) in parts.items()}
+    effects = Effects(plant, rows)
     for name in bounds:
         if name not in effects.immediate:
             raise SpecificationError(
@@ -202,6 +208,15 @@ def _bounds(plant, bounds):
                 lagged=plant.lagged,
             )
     return effects, np.array(list(bounds.values())).reshape(-1, 2)
+
+
+def _combination(name, value):
+    """Coefficients by signal of what is bounded, and its sides."""
+    if not isinstance(value, (tuple, list)) or len(value) != 3:
+        return {name: 1.0}, value
+    combination, *sides = value
+    combination = mapping(combination, f"The signals of the bound {name!r}")
+    return {one: finite(one, c, "coefficient") for one, c in combination.items()}, tuple(sides)
 
 
 def _schedule(law, reference, D, H, numbers):
