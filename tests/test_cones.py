@@ -14,7 +14,7 @@ CONE = {
 }
 
 
-def standing(duration=1.0):
+def standing(duration=1.0, **options):
     """A body that actuators push away from its foot, on a program that moves it to the side and up."""
     p, q = sv.parameters(foot=FOOT, body=BODY, g=G), sv.coordinates("x z s h")
     x, z, s, h = q
@@ -26,7 +26,7 @@ def standing(duration=1.0):
     path = sv.paths.rest_to_rest(q.t, start=(0.0, 0.5), end=(0.6, 0.7), duration=duration, smoothness=4)
     program = sv.Program({"S": s - path[0], "H": h - path[1]}, by="actuators")
     model = sv.derive(mechanism, program)
-    return sv.simulate(model, model.start(0.0, guess={"h": 0.5}), (0.0, duration)), sv.plant(mechanism)
+    return sv.simulate(model, model.start(0.0, guess={"h": 0.5}), (0.0, duration), **options), sv.plant(mechanism)
 
 
 @pytest.fixture(scope="module")
@@ -80,3 +80,13 @@ def test_bounds_of_reactions_are_refused_by_name(stand):
         sv.limited(law, plant, bounds={"slip": ([1.0], None, 0.0)})
     with refused(sv.SpecificationError, "immediately"):
         sv.limited(law, sv.plant(plant.mechanism, lag={"side": 0.1, "lift": 0.1}), bounds=CONE)
+
+
+@pytest.mark.parametrize("t_eval", [None, np.unique([*np.linspace(0.0, 0.9, 91), 0.3, 0.1 + 0.2, 0.9 - 2e-16])])
+def test_plans_whose_samples_nearly_coincide_give_their_own_feedforward(t_eval):
+    plan, plant = standing(0.9, t_eval=t_eval)  # a path that ends at 0.8999999999999999
+    law = sv.lqr(plan, plant)
+    assert law.schedule[:2, -1] == pytest.approx([0.0, BODY * G], abs=1e-6)
+    if t_eval is None:
+        assert len(plan.t) == 1001
+        assert np.diff(plan.t).min() > 8e-4
