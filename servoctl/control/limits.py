@@ -212,7 +212,7 @@ def _bounds(plant, bounds):
 
 def _combination(name, value):
     """Coefficients by signal of what is bounded, and its sides."""
-    if not isinstance(value, (tuple, list)) or len(value) != 3:
+    if not (isinstance(value, (tuple, list)) and len(value) == 3 and isinstance(value[0], Mapping)):
         return {name: 1.0}, value
     combination, *sides = value
     combination = mapping(combination, f"The signals of the bound {name!r}")
