@@ -34,7 +34,7 @@ from servoctl.methods.choice import (
 )
 from servoctl.methods.dropped import DERIVATIONS, alive_along, came_alive
 from servoctl.methods.events import Event, Events, as_events, occurrences
-from servoctl.methods.motion import DEFAULT_SAMPLES, without_interruption
+from servoctl.methods.motion import DEFAULT_SAMPLES, breakpoints, margin_at, without_interruption
 from servoctl.methods.orders import end_at_other_orders
 from servoctl.methods.radau import RadauSteps
 from servoctl.methods.runge_kutta import ORDERS, RungeKuttaSteps
@@ -530,10 +530,19 @@ def consistent_state(model, start, t):
     return x
 
 
+def _default_times(t0, t1, knots):
+    """Equally spaced instants, with the knots; an instant that differs from a knot by rounding alone is the knot."""
+    times, (_, *inside, _) = np.linspace(t0, t1, DEFAULT_SAMPLES), breakpoints((t0, t1), knots)
+    for k in inside:
+        nearest = round((k - t0) / (t1 - t0) * (DEFAULT_SAMPLES - 1))
+        if abs(times[nearest] - k) <= margin_at(k):
+            times[nearest] = k
+    return np.array(sorted({*times.tolist(), *map(float, inside)}))  # np.union1d imports np.ma
+
+
 def _sample_times(t0, t1, t_eval, knots, method=None):
     if t_eval is None:
-        within = (float(k) for k in knots if min(t0, t1) < k < max(t0, t1))
-        times = np.array(sorted({*np.linspace(t0, t1, DEFAULT_SAMPLES).tolist(), *within}))  # np.union1d imports np.ma
+        times = _default_times(t0, t1, knots)
     else:
         times = as_numbers(t_eval)
         if times.ndim != 1 or not np.all(times[1:] > times[:-1]):

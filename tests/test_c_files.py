@@ -17,7 +17,7 @@ def test_every_loop_has_a_file():
     others = {"allocation.c", "batch.c", "builtin.c", "exponentials.c", "grid.c", "many.c", "normal.c", "riccati.c"}
     assert {f"{loop}.c" for loop in loops.LOOPS} | others == {n for folder, n in FILES if folder is LOOPS}
     assert all(loops.source(f"{loop}.c").startswith(("/*", "#include")) for loop in loops.LOOPS)
-    exported = {"newton.c", "integrated.c", "law.c", "table.c", "thinned.c"}
+    exported = {"newton.c", "integrated.c", "law.c", "limited.c", "table.c", "thinned.c"}
     assert {name for folder, name in FILES if folder is EXPORTED} == exported
 
 

@@ -35,18 +35,23 @@ LAWS = {
     "output feedback with integral": lambda plan, plant: sv.output_feedback(
         sv.lqr(plan, plant, integral={"X": 1e4}), plant, SENSORS
     ),
+    "lqr that holds the trolley": lambda plan, plant: sv.lqr(plan, plant, integral={"x": 1e4, "Z": 1e4}),
+    "limited": lambda plan, _: narrow(plan),
+    "limited by priority": lambda plan, _: narrow(plan, priority=["Z", "X"]),
+    "limited output feedback": lambda plan, plant: sv.limited(
+        sv.output_feedback(sv.lqr(plan, plant, integral=True), plant, SENSORS),
+        sv.plant(CRANE, limits={"trolley": 120.0}),
+    ),
     "lqr of a lagged plant": lambda plan, _: sv.lqr(plan, sv.plant(CRANE, lag={"trolley": 0.05})),
 }
 MEMORY = {
-    "lqr with integral": 2, "computed": 2, "output feedback": 6, "output feedback with integral": 7
+    "lqr with integral": 2, "lqr that holds the trolley": 2, "computed": 2, "output feedback": 6, "output feedback with integral": 7,
+    "limited": 4, "limited by priority": 4, "limited output feedback": 10,
 }  # fmt: skip
 
 
 def test_laws_without_expressions_name_themselves_and_what_can_be_exported(plan, tmp_path):
-    plant = sv.plant(CRANE, limits={"trolley": 150.0})
-    inside = sv.lqr(plan, plant)
-    with refused(SpecificationError, "limited by weight", limited="lqr, time-varying"):
-        sv.export_c(sv.limited(inside, plant), tmp_path)
+    inside = sv.lqr(plan, sv.plant(CRANE))
     own = sv.Law("held", (), ("trolley", "hoist"), 100.0, 0.0, lambda t, x, row: row, np.zeros((2, 1)))
     with refused(SpecificationError, "Python", law="held"):
         sv.export_c(own, tmp_path)
@@ -213,7 +218,61 @@ def test_options_of_the_export_are_refused_in_words(plan, tmp_path):
         sv.export_c(plan.model, tmp_path, thinned=1e-3)
 
 
-def test_a_law_that_allocates_in_python_is_refused(plan, tmp_path):
-    machine = sv.plant(CRANE, limits={"trolley": 120.0})
-    with refused(SpecificationError, "limited by weight"):
-        sv.export_c(sv.limited(sv.lqr(plan, sv.plant(CRANE)), machine), tmp_path)
+def test_a_limited_law_of_a_python_function_is_refused(plan, tmp_path):
+    own = sv.Law("held", (), ("trolley", "hoist"), 100.0, 0.0, lambda t, x, row: row, np.zeros((2, 1)), plan=plan)
+    with refused(SpecificationError, "Python", law="held, limited by weight"):
+        sv.export_c(sv.limited(own, sv.plant(CRANE, limits={"trolley": 120.0})), tmp_path)
+
+
+def narrow(plan, **more):
+    """The crane's LQR with integral, within limits that it meets, and a bound of the rope's tension."""
+    limits = {"limits": {"trolley": 120.0}, "rate_limits": {"hoist": 500.0}}
+    law = sv.lqr(plan, sv.plant(CRANE), integral=True)
+    return sv.limited(law, sv.plant(CRANE, **limits), bounds={"tension": (900.0, 1060.0)}, **more)
+
+
+def test_a_limited_law_in_floats_keeps_its_limits_and_its_loop(plan, tmp_path):
+    law, machine = narrow(plan), sv.plant(CRANE, m_load=104.0)
+    source, _ = sv.export_c(law, tmp_path, name="loop", real="float", thinned=1e-5)
+    command = [*shlex.split(compiler()), *STRICT, "-fPIC", "-shared", str(source), "-o", str(tmp_path / "l.so"), "-lm"]
+    done = subprocess.run(command, capture_output=True, text=True)
+    assert (done.returncode, done.stderr) == (0, "")
+    c, u, z = ctypes.CDLL(str(tmp_path / "l.so")), np.empty(2, np.float32), np.zeros(len(law.state), np.float32)
+    c.loop_start(z.ctypes.data_as(ctypes.c_void_p))
+
+    def answered(t, y):
+        y = np.array(y, np.float32)
+        return c.loop_step(ctypes.c_float(t), *(a.ctypes.data_as(ctypes.c_void_p) for a in (y, z, u)))
+
+    def step(t, measurement):
+        assert answered(t, [measurement[name] for name in law.measures]) == 0
+        return u.astype(float)
+
+    given = (plan.state(0.0), (0.0, 6.0))
+    exact = sv.close(machine, law, *given)
+    ours = sv.close(machine, step, *given, timing=sv.Timing(rate=100.0), plan=plan)
+    met = np.mean([np.any(exact.signal[f"{kind} {name}"] != 0) for kind, name in law.allocation.limits])
+    assert met == 1.0  # each limit, and the bound
+    assert np.abs(ours["x"] - exact["x"]).max() < 1e-3 * np.ptp(exact["x"])
+    assert np.abs(ours.commands[0]).max() <= 120.0
+    before = u.copy(), z.copy()
+    assert answered(1.0, [np.nan] * len(law.measures)) == -1
+    assert answered(np.inf, plan.state(0.0)) == -1
+    assert np.array_equal(before[0], u) and np.array_equal(before[1], z)
+    heavy = narrow(plan, weights={"Z": 1e12})
+    with refused(SpecificationError, "double", "4.1e+06", law=law.name):
+        sv.export_c(heavy, tmp_path, real="float")
+    sv.export_c(heavy, tmp_path)
+
+
+def test_no_command_is_answered_where_limits_exclude_each_other(plan, tmp_path):
+    machine = sv.plant(CRANE, limits={"trolley": 120.0, "hoist": (-1500.0, 0.0)})
+    law = sv.limited(sv.lqr(plan, sv.plant(CRANE)), machine, bounds={"tension": (2000.0, None)})
+    with refused(sv.LimitExceeded, "tension"):
+        sv.close(sv.plant(CRANE), law, plan.state(0.0), (0.0, 1.0))
+    c, _ = library(law, tmp_path)
+    u, z, y = np.full(2, 7.0), np.zeros(len(law.state)), plan.state(0.0)
+    c.loop_start(z.ctypes.data_as(ctypes.c_void_p))
+    before = z.copy()
+    assert c.loop_step(ctypes.c_double(0.0), *(a.ctypes.data_as(ctypes.c_void_p) for a in (y, z, u))) == -1
+    assert np.array_equal(u, [7.0, 7.0]) and np.array_equal(z, before)

@@ -50,6 +50,49 @@ def test_the_integral_of_the_program_takes_it_back(plan, varying):
     assert law.state_names == ("integral of X", "integral of Z")
 
 
+HELD = {"x": 1e4, "Z": 1e4}
+
+
+def test_the_trolley_is_held_under_steady_wind_that_moves_the_load(plan):
+    plant, wind = sv.plant(CRANE), -80.0
+    law = sv.lqr(plan, plant, integral=HELD)
+    assert law.state_names == ("integral of Z", "integral of x")
+    noisy = sv.output_feedback(law, plant, {"x": 1e-3, "l": 1e-3, "theta": 1e-3}, process=dict.fromkeys("xl", 1e-2))
+    bounded = sv.limited(law, sv.plant(CRANE, limits={"trolley": 400.0, "hoist": (-3000.0, 0.0)}))
+    leaning = np.arcsin(wind / (100.0 * 9.81 * 2.0))
+    for held, within in ((law, 1e-4), (bounded, 1e-4), (noisy, 1e-3)):
+        run = sv.close(plant, held, plan.state(0.0), (0.0, 20.0), disturbance={"theta": wind})
+        assert abs(run.error["x"][-1]) < within and abs(run.residual["Z"][0, -1]) < within
+        assert run["theta"][-1] == pytest.approx(leaning, rel=2e-2)
+        assert abs(run.residual["X"][0, -1] - 2.0 * np.sin(leaning)) < 3e-3
+    both = sv.close(plant, law, plan.state(0.0), (0.0, 3.0), disturbance={"theta": wind})
+    many = sv.close_many(both, {"m_load": [100.0, 115.0]})
+    assert many["final x"][0] == pytest.approx(both["x"][-1], abs=1e-12)
+
+
+def test_the_integral_of_an_output_is_that_of_the_residual_about_the_same_path():
+    p, q = sv.parameters(m=2.0, arm=0.5), sv.coordinates("x phi")
+    x, phi = q
+    load = x + p.arm * ca.sin(phi)
+    mechanism = sv.Mechanism(
+        q, gibbs=sv.particle(q, p.m, x) + sv.particle(q, 1.0, phi), actuators={"force": x, "torque": phi},
+        parameters=p, outputs={"load": load, "speed": q.dt(load), "pull": q.d(2)[0]},
+    )  # fmt: skip
+    path = sv.paths.rest_to_rest(q.t, start=(0.0, 0.0), end=(1.0, 0.8), duration=2.0, smoothness=4)
+    model = sv.derive(mechanism, sv.Program({"place": load - path[0], "turn": phi - path[1]}, by="actuators"))
+    plan, plant = sv.simulate(model, model.start(0.0), (0.0, 2.0)), sv.plant(mechanism, arm=0.6)
+    laws = [sv.lqr(plan, plant, integral={name: 1e4}) for name in ("place", "load")]
+    assert np.array_equal(*(law.info["gains"] for law in laws))
+    runs = [sv.close(plant, law, plan.state(0.0), (0.0, 4.0), disturbance={"x": 3.0}) for law in laws]
+    assert np.abs(runs[0].states - runs[1].states).max() < 1e-8 < 1e-3 < np.abs(runs[0].error["x"]).max()
+    law = sv.lqr(plan, plant, integral={"speed": 10.0, "dphi": 10.0})
+    assert law.state_names == ("integral of dphi", "integral of speed")
+    with refused(sv.SpecificationError, "order 2", "'load'", name="pull"):
+        sv.lqr(plan, plant, integral={"pull": 1.0})
+    with refused(sv.NameUnknown, match="load"):
+        sv.lqr(plan, plant, integral={"lode": 1.0})
+
+
 def test_defaults_are_the_weights_of_the_design(plan):
     plain = sv.lqr(plan, sv.plant(CRANE), integral=True)
     said = sv.lqr(plan, sv.plant(CRANE), integral={"X": 1e4, "Z": 1e4}, **WEIGHTS)
@@ -236,7 +279,7 @@ BAD = {
     "R of zero": (lambda p, m: sv.lqr(p, m, R=0.0), sv.SpecificationError, "definite"),
     "R of three": (lambda p, m: sv.lqr(p, m, R=np.eye(3)), sv.SpecificationError, {"shape": (3, 3)}),
     "R of NaN": (lambda p, m: sv.lqr(p, m, R=np.nan), sv.SpecificationError, "definite"),
-    "integral of nothing": (lambda p, m: sv.lqr(p, m, integral={"Y": 1.0}), sv.NameUnknown, {"valid": ("X", "Z")}),
+    "integral of nothing": (lambda p, m: sv.lqr(p, m, integral={"Y": 1.0}), sv.NameUnknown, {"name": "Y"}),
     "integral of three": (lambda p, m: sv.lqr(p, m, integral=[1.0] * 3), sv.SpecificationError, {"shape": (3,)}),
     "rate of zero": (lambda p, m: sv.lqr(p, m, rate=0.0), sv.SpecificationError, "rate"),
     "plant of a delay": (lambda p, m: sv.lqr(p, sv.plant(CRANE, delay=0.02)), sv.SpecificationError, "0.02 s"),

@@ -56,7 +56,7 @@ class Unit:
 def unit(plant, law, disturbed, residuals=None):
     """The unit of a plant and a compiled law; one serves all numbers of both.
 
-    `disturbed` are the indices of disturbed generalised forces; `residuals` are gathered beside states and inputs.
+    `disturbed` are indices in p of what is disturbed; `residuals` are gathered beside states and inputs.
     """
     units = _UNITS.setdefault(law.step, {})
     phi = tuple(e.element_hash() for e in residuals.expressions.elements()) if residuals else ()
@@ -70,8 +70,8 @@ def _derived(plant, law, disturbed, residuals):
     """Rates, law and residuals in C; parts that depend on the case alone, or on the sample alone, are split off."""
     n_c, n_u, project = len(plant.parameters), len(plant.inputs), plant.equations.project()
     t, x, p, rates = _rates(plant, disturbed)
-    constants, applied = p[:n_c], ca.vertcat(p[n_c : n_c + n_u], p[n_c + n_u :][list(disturbed)])
-    rates, w, w_values = _apart(rates, constants)
+    constants, applied = p[:n_c], ca.vertcat(p[n_c : n_c + n_u], *(p[i] for i in disturbed))
+    rates, w, w_values = _apart(rates, ca.vertcat(ca.SX(0, 1), *(p[i] for i in range(n_c) if i not in disturbed)))
     t_k, row, written, common_values = _law_in_c(law)
     phi = ca.SX(0, 1)
     if residuals:
@@ -121,12 +121,12 @@ def _law_in_c(law):
 
 
 def _rates(plant, disturbed):
-    """Symbols t, x and p of a plant, and x' with disturbances of some generalised forces only."""
+    """Symbols t, x and p of a plant, and x' with no generalised force but those that are disturbed."""
     f = plant.function("ode").expression
     t, x, p = f.sx_in()
-    forces = p[len(plant.parameters) + len(plant.inputs) :]
-    calm = [i for i in range(forces.numel()) if i not in disturbed]
-    return t, x, p, ca.substitute(f(t, x, p), forces[calm], ca.SX.zeros(len(calm)))
+    first = len(plant.parameters) + len(plant.inputs)
+    calm = [i for i in range(first, p.numel()) if i not in disturbed]
+    return t, x, p, ca.substitute(f(t, x, p), p[calm], ca.SX.zeros(len(calm)))
 
 
 def _apart(expression, symbols):

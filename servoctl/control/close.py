@@ -50,7 +50,8 @@ def close(
         Rate [Hz] of a function, delay in samples, integration steps per sample.
     disturbance : dict of str to callable or float, optional
         Generalised forces by coordinate (or quasi-velocity), functions of time such as those of `sv.disturbances`.
-        They should jump at the ends of integration steps only.
+        They should jump at the ends of integration steps only. A parameter of the mechanism that enters forces only,
+        such as the speed of the wind, is also named: its value is then this function, which the law does not know.
     plan : Run, optional
         The reference trajectory for residuals and errors; default: that of the law.
 
@@ -64,7 +65,8 @@ def close(
     NameUnknown
         For a name that plant or law do not have.
     SpecificationError
-        For times that are not whole samples or steps, and for invalid values.
+        For times that are not whole samples or steps, for invalid values, and for a disturbed parameter on which
+        inertia, kinematics or constraints depend.
     ServoError
         If the law returns NaN or infinity. An error of the law itself is passed on; its `run` is the motion so far.
     InconsistentStart
@@ -129,9 +131,7 @@ def loop_of(plant, law, x0, t_span, conditions):
     samples = whole_multiple((t1 - t0) * law.rate, f"t_span of {t1 - t0:g} s at {law.rate:g} Hz", "samples")
     stored = plant.n_x + len(law.measures) + len(law.state) + law.n_out + len(plant.inputs) + len(sensors.noise)
     require_memory(samples, stored, f"The loop runs for {t1 - t0:g} s at {law.rate:g} Hz")
-    for name in forces:
-        if name not in plant.disturbable:
-            raise plant.mechanism.no("generalised force", name, plant.disturbable)
+    disturbed = np.array([plant.disturbed(name) for name in forces], dtype=np.int64)
     first = whole_multiple((t0 - law.t0) * law.rate, f"A start at {t0:g} s of a law from {law.t0:g} s on", "samples")
     low, high, change = limits(plant, law.period)
     initial = _initial_input(law, t0)
@@ -143,8 +143,8 @@ def loop_of(plant, law, x0, t_span, conditions):
         samples=samples, substeps=substeps, delay=timing.delay, n_u=len(plant.inputs), n_out=law.n_out, first=first,
         at_u=len(plant.parameters), t0=t0, period=law.period, p=plant.p(), x0=x0, z0=law.state, table=law.schedule.T,
         measured=np.array([plant.state_names.index(name) for name in law.measures], dtype=np.int64),
-        disturbed=np.array([index(name, plant.disturbable, "generalised force") for name in forces], dtype=np.int64),
-        initial_input=initial, disturbance=conditions.forces(t0, law.period / substeps, samples * substeps),
+        disturbed=disturbed, initial_input=initial,
+        disturbance=conditions.forces(t0, law.period / substeps, samples * substeps),
         noise=sensors.noisy(law.measures, samples + 1), quantum=sensors.quantum(law.measures),
         low=low, high=high, change=change, transport=transport,
     )  # fmt: skip

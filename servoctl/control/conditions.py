@@ -138,7 +138,7 @@ class Timing:
 
 @dataclass(frozen=True)
 class Conditions:
-    """Sensors, timing and disturbances of a loop: generalised forces by coordinate (or quasi-velocity), of t [s]."""
+    """Sensors, timing and disturbances of a loop: generalised forces or parameters by name, as functions of t [s]."""
 
     sensors: Sensors = field(default_factory=Sensors)
     timing: Timing = field(default_factory=Timing)

@@ -72,8 +72,11 @@ def affine(name, reference, K, K_i=None, residuals=None, info=None):
 
 
 def integration(reference, residuals):
-    """The schedule of z+ = z + Ts φ: Ts and the parameters of φ at each sample, (1 + n_p, N)."""
-    return np.tile(np.append(reference.period, residuals.parameters)[:, None], len(reference.t))
+    """The schedule of z+ = z + Ts φ: Ts, the parameters of φ and values along the plan at each sample, (1 + n_p, N)."""
+    numbers = np.tile(np.append(reference.period, residuals.parameters)[:, None], len(reference.t))
+    for row, name in enumerate(residuals.planned, start=len(numbers) - len(residuals.planned)):
+        numbers[row] = reference.planned(name)
+    return numbers
 
 
 def integral_names(residuals):

@@ -10,7 +10,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from servoctl.checks import ON_SAMPLE, as_list, interval, mapping, named, numbers_by_name, positive
+from servoctl.checks import ON_SAMPLE, as_list, finite, interval, mapping, named, numbers_by_name, positive
 from servoctl.codegen import compiler, emit
 from servoctl.codegen.function import Compiled, compiled
 from servoctl.codegen.matrices import riccati
@@ -25,6 +25,7 @@ from servoctl.control.sampling import discretised
 from servoctl.control.time_law import fastest
 from servoctl.errors import LimitExceeded, ServoError, SpecificationError, unknown
 from servoctl.plants.plant import Plant
+from servoctl.tolerances import TINY
 from servoctl.values import Value
 
 HORIZON = 0.5  # s
@@ -35,6 +36,7 @@ MET = 1e-7  # of an input's size: distance from a limit at which it is met
 GIVEN_WAY = 1e-6  # of a residual's largest effect: least slack that counts
 STEPS = 100  # of the active-set method, which needs about as many as constraints become active
 WITHIN = 1e-10  # of an input's size: an admissible violation of a limit
+OPEN = 1e300  # stands for infinity in a schedule, which is finite
 DEPENDENT = 1e-9  # sine of the angle between a constraint and others, below which it depends on them
 SCENE = frozenset(("t_span", "start", "guess", "parameters"))  # arguments of `fastest` for a scene
 
@@ -130,7 +132,9 @@ def limited(
         The controller's model of the machine, with its limits.
     bounds : dict of str to (float, float) or float, optional
         Outputs of the mechanism, affine in the inputs, that stay within (low, high), None for an open side, or within
-        (-c, c): a rope that cannot push is {"tension": (0.0, None)}.
+        (-c, c): a rope that cannot push is {"tension": (0.0, None)}. So do the reactions of material constraints,
+        "multiplier_NAME" as in the plan. A combination goes before low and high, under a name of its own: one side of a
+        cone of friction is {"slip": ({"multiplier_sole_x": 1.0, "multiplier_sole_z": -0.6}, None, 0.0)}.
     weights : dict of str to float, optional
         w_i by residual; default 1 each.
     priority : sequence of str, optional
@@ -177,7 +181,9 @@ def limited(
 
 def _bounds(plant, bounds):
     """The effects of inputs on the bounded outputs, and the bounds, (j, 2)."""
-    bounds = {name: interval(name, value, "bound") for name, value in mapping(bounds, "The bounds").items()}
+    bounds = mapping(bounds, "The bounds")
+    parts = {name: _combination(name, value) for name, value in bounds.items()}
+    bounds = {name: interval(name, sides, "bound") for name, (_, sides) in parts.items()}
     if not (plant.limits or plant.rate_limits or bounds):
         raise SpecificationError(
             "There are no limits of the plant and no bounds.",
@@ -185,10 +191,12 @@ def _bounds(plant, bounds):
             do='Pass bounds, or limits of the plant: sv.plant(mechanism, limits={"trolley": 150.0}).',
             names=plant.inputs,
         )
-    for name in bounds:
-        if name not in plant.mechanism.outputs:
-            raise unknown(name, plant.mechanism.outputs, "output of the mechanism")
-    effects = Effects(plant, {name: plant.mechanism.outputs[name] for name in bounds})
+    known = plant.mechanism.outputs | (plant.equations.multipliers if bounds else {})
+    for one in (one for combination, _ in parts.values() for one in combination):
+        if one not in known:
+            raise unknown(one, known, "output or multiplier")
+    rows = {name: sum(c * known[one] for one, c in combination.items()) for name, (combination, _) in parts.items()}
+    effects = Effects(plant, rows)
     for name in bounds:
         if name not in effects.immediate:
             raise SpecificationError(
@@ -202,6 +210,15 @@ def _bounds(plant, bounds):
     return effects, np.array(list(bounds.values())).reshape(-1, 2)
 
 
+def _combination(name, value):
+    """Coefficients by signal of what is bounded, and its sides."""
+    if not (isinstance(value, (tuple, list)) and len(value) == 3 and isinstance(value[0], Mapping)):
+        return {name: 1.0}, value
+    combination, *sides = value
+    combination = mapping(combination, f"The signals of the bound {name!r}")
+    return {one: finite(one, c, "coefficient") for one, c in combination.items()}, tuple(sides)
+
+
 def _schedule(law, reference, D, H, numbers):
     """The law's schedule followed by numbers, an input matrix, x_ref, D and H at each sample; the last columns hold."""
     count = len(D)
@@ -213,8 +230,8 @@ def _schedule(law, reference, D, H, numbers):
 
 
 def _finite(numbers):
-    """Numbers with the largest double for infinity: a schedule is finite."""
-    return np.clip(numbers, -np.finfo(float).max, np.finfo(float).max)
+    """Numbers within the range of a schedule."""
+    return np.clip(numbers, -OPEN, OPEN)
 
 
 def _require_law(law, plant):
@@ -327,7 +344,8 @@ class Allocation(Value):
         )
 
     @cached_property
-    def _measured(self):
+    def measured(self):
+        """Indices of the measured states."""
         return [self.plant.state_names.index(name) for name in self.law.measures]
 
     @cached_property
@@ -347,18 +365,27 @@ class Allocation(Value):
     def _library(self):
         if not isinstance(self.law.step, Compiled):
             return None
-        f, e, j = self.law.step.expression, self.effects.expression, len(self.bounds)
-        integrators = ", ".join(map(str, self.law.integrators)) or "0"
-        sizes = {
-            "NM": len(self.law.measures), "NZ": len(self.law.state), "NU": len(self.sizes), "NX": self.plant.n_x,
-            "NSIG": len(self.law.signals), "NROW": self.law.schedule.shape[0], "NK": len(self.residuals), "NJ": j,
-            "NC": len(self.plant.parameters),
-            "NI": len(self.law.integrators), "INTEGRATORS": f"{{{integrators}}}", "NAME": "allocation",
-            "MEASURED": f"{{{', '.join(map(str, self._measured)) or '0'}}}", "QP_STEPS": STEPS, "QP_MET": WITHIN,
-            "QP_DEPENDENT": DEPENDENT, "MET": MET, "GIVEN_WAY": GIVEN_WAY,
-        } | ({} if self.law.input_matrix is None else {"CORRECTED_BY": ""})  # fmt: skip
-        functions = emit.function(f, "unlimited", emit.PORTABLE), emit.function(e, "effects", emit.PORTABLE)
-        return compiler.library("".join([emit.unit(sizes), *functions, emit.include("allocation.c")]))
+        indices = {"MEASURED": self.measured, "INTEGRATORS": self.law.integrators}
+        lists = {name: f"{{{', '.join(map(str, places)) or '0'}}}" for name, places in indices.items()}
+        functions = (emit.function(f, name, emit.PORTABLE) for name, f in self.functions.items())
+        head = emit.unit(self.sizes_in_c | lists | {"NAME": "allocation"})
+        return compiler.library("".join([head, *functions, emit.include("allocation.c")]))
+
+    @property
+    def functions(self):
+        """Functions that allocation.h calls, by name."""
+        return {"unlimited": self.law.step.expression, "effects": self.effects.expression}
+
+    @property
+    def sizes_in_c(self):
+        """Sizes and tolerances of allocation.h."""
+        law = self.law
+        return {
+            "NM": len(law.measures), "NZ_LAW": len(law.state), "NU": len(self.sizes), "NX": self.plant.n_x,
+            "NSIG": len(law.signals), "NROW": law.schedule.shape[0], "NK": len(self.residuals), "NJ": len(self.bounds),
+            "NC": len(self.plant.parameters), "NI": len(law.integrators), "QP_STEPS": STEPS, "QP_MET": WITHIN,
+            "QP_DEPENDENT": DEPENDENT, "QP_TINY": TINY, "MET": MET, "GIVEN_WAY": GIVEN_WAY,
+        } | ({} if law.input_matrix is None else {"CORRECTED_BY": 1})  # fmt: skip
 
     def __call__(self, t, x, column):
         """The inputs, the next controller state and the signals, in one array."""
@@ -366,7 +393,7 @@ class Allocation(Value):
         now, along = of_x.split(x), of_column.split(column)
         desired = of_output.split(self.law.answer(t, np.concatenate([now.y, now.z]), along.column))
         state = along.x_ref.copy()
-        state[self._measured] = now.y
+        state[self.measured] = now.y
         low, high, change = self._limits
         low, high = np.maximum(low, now.last - change), np.minimum(high, now.last + change)
         c, O = self.effects(t, state)
@@ -397,7 +424,7 @@ class Allocation(Value):
             return desired
         S, A = np.diag(self.sizes), O * self.sizes
         # rows are scaled to entries of order one, for the tolerance of the solver
-        scale = np.maximum(np.abs(A).max(axis=1, initial=0.0), 1e-300)
+        scale = np.maximum(np.abs(A).max(axis=1, initial=0.0), TINY)
         H = S @ H @ S
         ends = (low - desired) / self.sizes, (high - desired) / self.sizes
         v = self._qp(H / np.abs(H).max(), *ends, A / scale[:, None], least / scale, most / scale)

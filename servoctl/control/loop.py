@@ -28,7 +28,7 @@ class Loop(Value):
     n_u: int
     n_out: int  # outputs of the law: command, controller state, further signals
     first: int  # row of the table at the first sample
-    at_u: int  # index of the first input in p; disturbances follow the inputs
+    at_u: int  # index of the first input in p
     t0: float  # [s]
     period: float  # [s]
     p: np.ndarray
@@ -36,7 +36,7 @@ class Loop(Value):
     z0: np.ndarray  # initial controller state
     table: np.ndarray  # gain schedule, a row per sample; the last row holds after the end
     measured: np.ndarray  # (n_y,) indices of states
-    disturbed: np.ndarray  # (n_d,) indices of generalised forces
+    disturbed: np.ndarray  # (n_d,) indices in p of generalised forces and parameters
     initial_input: np.ndarray  # (n_u,) until the first command arrives
     disturbance: np.ndarray = None  # (samples * substeps, 3, n_d) at the start, the middle and the end of each step
     noise: np.ndarray = None  # (samples + 1, n_y)
@@ -195,13 +195,13 @@ def hold(ode, t, h, x, steps):
 
 def _steps(c, k, inputs):
     """Parameters at the start, the middle and the end of each step of sample k."""
-    d_at, late = c.at_u + c.n_u + c.disturbed, 0 if c.transport is None else c.transport
+    late = 0 if c.transport is None else c.transport
     for s in range(c.substeps):
         stages = np.tile(c.p, (3, 1))
         applied = k - samples_ago(s, late, c.substeps) + np.zeros(c.n_u, dtype=int)
         stages[:, c.at_u : c.at_u + c.n_u] = np.where(applied < 0, c.initial_input, inputs[applied, range(c.n_u)])
-        if len(d_at):
-            stages[:, d_at] = c.disturbance[k * c.substeps + s]
+        if len(c.disturbed):
+            stages[:, c.disturbed] = c.disturbance[k * c.substeps + s]
         yield stages
 
 

@@ -61,7 +61,8 @@ def lqr(
     integral : bool, float, dict of str to float, or (k,) array, optional
         Weights of the integrals of the program's residuals, by residual; they remove the error that a constant mismatch
         or disturbance leaves. True: 1e4 each, so that an error of 3 mm that lasts for 1 s costs as much as 1 cm of
-        error. Default: none.
+        error. An output of the mechanism, or a state, is also named: the deviation from its value along the plan is
+        integrated. Default: none.
     varying : bool
         False: frozen-time gains.
 
@@ -74,7 +75,7 @@ def lqr(
     Raises
     ------
     NameUnknown
-        For a weight of an unknown state, input or residual, and if plan and plant have different names.
+        For a weight of an unknown state, input, residual or output, and if plan and plant have different names.
     SpecificationError
         For weights of a wrong shape, or not (semi)definite.
     ServoError
@@ -322,7 +323,7 @@ def weights(values, default, names, what, symbol, positive=False):
 
 
 def _integrals(integral, plan, plant):
-    """The integrated residuals and their weights; (None, None) without integrals."""
+    """The integrated residuals and deviations, and their weights; (None, None) without integrals."""
     integral = bool(integral) if isinstance(integral, np.bool_) else integral
     if integral is None or integral is False or (isinstance(integral, dict) and not integral):
         return None, None
@@ -331,7 +332,7 @@ def _integrals(integral, plan, plant):
         raise SpecificationError(
             "The program has no residual of order 0 or 1.",
             "A residual that is fed back is a function of the state (q, γ').",
-            do="Leave out integral.",
+            do=f'Integrate deviations from the plan: integral={{"{plant.state_names[0]}": {Q_INTEGRAL:g}}}.',
             names=tuple(program_residuals(plan.model)),
         )
     weighted = None if integral is True else integral

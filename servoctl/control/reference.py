@@ -9,6 +9,8 @@ from servoctl.checks import ON_SAMPLE, positive, require_memory
 from servoctl.errors import NotRealisable, ServoError, SpecificationError, unknown
 from servoctl.plants.plant import Plant, part_of
 
+DISTINCT = 1e-6  # of the mean distance of samples: between nearer ones polynomials are rounding
+
 
 class Reference:
     """States, inputs and linearisations at the sampling instants of a plan; plan and plant must have the same names.
@@ -48,6 +50,10 @@ class Reference:
         if key not in self._runs:
             self._runs[key] = resampled(self.plan, t)
         return self._runs[key]
+
+    def planned(self, name):
+        """A signal of the plan at the samples, (N,)."""
+        return self._run(self.t)[name]
 
     def _actuation(self, t):
         run = self._run(t)
@@ -174,18 +180,20 @@ def require_plan(plan, plant):
 
 def resampled(plan, times):
     """The plan at other instants within it, (N,) [s], increasing, by Hermite interpolation of all derivatives."""
-    model, t = plan.model, plan.t
+    apart = DISTINCT * (plan.t[-1] - plan.t[0]) / len(plan.t)
+    model, distinct = plan.model, np.append(np.diff(plan.t) > apart, True)
+    t, z = plan.t[distinct], plan.jets[:, distinct]
     nq, n = model.nq, model.n
-    top = (len(plan.jets) - nq) // n
+    top = (len(z) - nq) // n
     i = np.clip(np.searchsorted(t, times, side="right") - 1, 0, len(t) - 2)
     place = (i, t[i + 1] - t[i], times)
-    levels = [plan.jets[nq + k * n : nq + (k + 1) * n] for k in range(top)]
+    levels = [z[nq + k * n : nq + (k + 1) * n] for k in range(top)]
     if model.reduction.mechanism.q.plain:
-        jets = _hermite(t, [plan.jets[:nq], *levels], *place)
+        jets = _hermite(t, [z[:nq], *levels], *place)
     else:
-        rates = plan.signals("coordinate_rates")[1]
-        jets = [*_hermite(t, [plan.jets[:nq], rates[:nq], rates[nq:]], *place)[:1], *_hermite(t, levels, *place)]
-    edges = [0, *(np.searchsorted(times, t[first]) for first, _, _ in plan.variants[1:]), len(times)]
+        rates = plan.signals("coordinate_rates")[1][:, distinct]
+        jets = [*_hermite(t, [z[:nq], rates[:nq], rates[nq:]], *place)[:1], *_hermite(t, levels, *place)]
+    edges = [0, *(np.searchsorted(times, plan.t[first]) for first, _, _ in plan.variants[1:]), len(times)]
     variants = tuple((a, b, v[2]) for a, b, v in zip(edges[:-1], edges[1:], plan.variants, strict=False) if b > a)
     return replace(plan, t=times, jets=np.vstack(jets), variants=variants, stored={}, stored_residual={})
 

@@ -12,16 +12,19 @@ from servoctl.errors import SpecificationError, unknown
 class Residuals:
     """Residuals of a model's program at the states and parameters of a plant.
 
-    `names` selects some; `order` is the highest: 1 for functions of the state (q, γ'), 2 with accelerations.
+    `names` selects some, and may name outputs of the mechanism and states: their residual is the deviation from the
+    plan. `order` is the highest: 1 for functions of the state (q, γ'), 2 with accelerations.
 
     Attributes
     ----------
     names, orders : tuple
         Names and orders of the residuals.
     expressions, symbols : SX, list of SX
-        The residuals, and the parameters on which they depend.
+        The residuals, and the parameters on which they depend; values along the plan are the last of them.
     parameters : (n_p,) array
-        The plant's numbers of these parameters.
+        The plant's numbers of these parameters, 0 for values along the plan.
+    planned : tuple of str
+        Names of the residuals that are deviations from the plan.
     measures : tuple of str
         The states on which the residuals depend.
     """
@@ -29,15 +32,19 @@ class Residuals:
     def __init__(self, model, plant, names=None, order=1):
         mechanism, residuals = model.reduction.mechanism, program_residuals(model)
         self._q = mechanism.q
+        values = {name: e for name, e in _planned(mechanism).items() if name in (names or ()) and name not in residuals}
+        along = {name: ca.SX.sym(f"plan {name}") for name in values}
+        residuals = residuals | {name: value - along[name] for name, value in values.items()}
         orders = {name: self._q.order(e) for name, e in residuals.items()}
+        valid = {name: self._q.order(e) for name, e in (residuals | _planned(mechanism)).items()} if names else {}
         for name in names or ():
             if name not in orders:
-                raise unknown(name, orders, "residual")
+                raise unknown(name, valid, "residual, output or state")
             if orders[name] > order:
                 raise SpecificationError(
                     f"The residual {name!r} has order {orders[name]}.",
-                    "A residual that is fed back is a function of the state (q, γ').",
-                    nearest=", ".join(repr(n) for n, order in orders.items() if order <= 1),
+                    "What is fed back is a function of the state (q, γ').",
+                    nearest=", ".join(repr(n) for n, order in valid.items() if order <= 1),
                     do="Leave it out.",
                     name=name,
                     order=orders[name],
@@ -45,12 +52,14 @@ class Residuals:
         self.names = tuple(name for name in orders if orders[name] <= order and (names is None or name in names))
         self.orders = tuple(max(orders[name], 0) for name in self.names)
         self.expressions = ca.vertcat(*(residuals[name] for name in self.names))
-        valid = plant.mechanism.parameters.names
+        numbers = dict(zip(plant.mechanism.parameters.names, plant.parameters.tolist(), strict=False))
         self.symbols = [s for s in mechanism.parameters.symbols if _depends(self.expressions, s)]
         for s in self.symbols:
-            if s.name() not in valid:
-                raise unknown(s.name(), valid, "parameter of the plant")
-        self.parameters = np.array([plant.parameters[valid.index(s.name())] for s in self.symbols])
+            if s.name() not in numbers:
+                raise unknown(s.name(), numbers, "parameter of the plant")
+        self.planned = tuple(along)
+        self.parameters = np.array([numbers[s.name()] for s in self.symbols] + [0.0] * len(along))
+        self.symbols = [*self.symbols, *along.values()]
         self.measures = tuple(s.name() for s in self._states(self.expressions))
         for name in self.measures:
             if name not in plant.state_names:
@@ -116,6 +125,12 @@ class Residuals:
             if name in self._plant.state_names:
                 jacobian[:, :, self._plant.state_names.index(name)] = values[:, :, i]
         return jacobian
+
+
+def _planned(mechanism):
+    """What may be compared with its value along a plan, by name: states and outputs."""
+    states = {s.name(): s for s in (*mechanism.q, *mechanism.q.gamma(1))}
+    return states | mechanism.outputs
 
 
 @lru_cache(32)

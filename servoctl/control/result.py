@@ -109,17 +109,19 @@ class Closed(ByName, Value):
             for a, late in enumerate(loop.transport):
                 sent = (np.arange(len(self.t)) * loop.substeps - late) // loop.substeps
                 inputs[a] = np.where(sent < 0, loop.initial_input[a], self.inputs[a, np.maximum(sent, 0)])
-        return self.plant.p(inputs, self._disturbances)
+        p = self.plant.p(inputs)
+        p[loop.disturbed] = self._disturbances
+        return p
 
     @cached_property
     def _disturbances(self):
-        """Disturbances right after each sample, (n, N)."""
-        forces, loop = np.zeros((len(self.plant.disturbable), len(self.t))), self.loop
-        if loop.disturbance is not None:
-            steps = np.minimum(np.arange(len(self.t)) * loop.substeps, len(loop.disturbance) - 1)
-            ends = np.where(np.arange(len(self.t)) < loop.samples, 0, 2)
-            forces[loop.disturbed] = loop.disturbance[steps, ends].T
-        return forces
+        """Disturbances right after each sample, (n_d, N)."""
+        loop = self.loop
+        if loop.disturbance is None:
+            return np.zeros((0, len(self.t)))
+        steps = np.minimum(np.arange(len(self.t)) * loop.substeps, len(loop.disturbance) - 1)
+        ends = np.where(np.arange(len(self.t)) < loop.samples, 0, 2)
+        return loop.disturbance[steps, ends].T
 
     @property
     def measured(self) -> dict[str, np.ndarray]:
@@ -138,8 +140,9 @@ class Closed(ByName, Value):
 
     @property
     def disturbance(self) -> dict[str, np.ndarray]:
-        """Disturbances right after each sample, (N,) by generalised force."""
-        return dict(zip(self.plant.disturbable, self._disturbances, strict=True))
+        """Disturbances right after each sample, (N,) by generalised force, and by parameter where that is disturbed."""
+        calm = {name: np.zeros(len(self.t)) for name in self.plant.disturbable}
+        return calm | dict(zip(self.conditions.disturbance, self._disturbances, strict=True))
 
     @property
     def signal(self) -> dict[str, np.ndarray]:

@@ -22,9 +22,15 @@ from servoctl.model.start import State
 from servoctl.reduction.reduce import require_outputs
 
 ITERATIONS, TOLERANCE = 30, 1e-13  # of Newton's method, as in `Compiled.newton`
-IN_FLOATS = {"TOLERANCE": 1e-6, "STALLED": 1e-3}  # corrections that end it: at once, and where they no longer fall
+IN_FLOATS = {  # corrections that end it, at once and where they no longer fall; tolerances of an allocation
+    "TOLERANCE": 1e-6, "STALLED": 1e-3, "QP_MET": 1e-5, "QP_DEPENDENT": 1e-3, "QP_TINY": 1e-30, "MET": 1e-4,
+    "GIVEN_WAY": 1e-4,
+}  # fmt: skip
+LARGEST_CONDITION = 1e5  # of the metric of an allocation in floats, which have seven digits
 TIME = Scalar("t")
 FINITE = "Returns 0, or -1 if a time is no finite number: nothing is then changed."
+ANSWERED = "Returns 0, or -1 if the time or a command is no finite number: nothing is then changed."
+EXCLUDED = " There is no command where limits and bounds exclude each other."
 RESERVED = "auto break case char const continue default do double else enum extern float for goto if inline int long "
 RESERVED += "register restrict return short signed sizeof static struct switch typedef union unsigned void volatile "
 RESERVED += "while class new delete this template typename operator private public protected friend namespace using"
@@ -80,7 +86,8 @@ def export_c(
     RuntimeWarning
         If `NAME_advance` would integrate unstable internal dynamics.
     """
-    law = hasattr(source, "schedule") and isinstance(source.step, Compiled)
+    step = getattr(source, "step", None)
+    law = hasattr(source, "schedule") and isinstance(getattr(getattr(step, "law", None), "step", step), Compiled)
     if not law and not hasattr(source, "reduction"):
         raise _without_expressions(source)
     _require_start(law, start)
@@ -104,8 +111,9 @@ def export_c(
             stacklevel=2,
         )
     contents = _of_law(source, thinned) if law else _of_model(source, start)
-    if real == "float" and "TOLERANCE" in contents.sizes:
-        contents.sizes.update(IN_FLOATS)
+    if real == "float":
+        _require_condition(source)
+        contents.sizes.update({key: value for key, value in IN_FLOATS.items() if key in contents.sizes})
     return write(folder, name, contents, real)
 
 
@@ -147,22 +155,30 @@ def _without_expressions(source):
             do="Pass derive(mechanism, program), or a law such as sv.lqr(...).",
             type=kind,
         )
-    limited, rule = getattr(source.step, "law", None), "C code is written from the expressions of a law's step."
-    if limited is None:
-        return SpecificationError(
-            f"The step of the law {source.name!r} is a Python function.",
-            rule,
-            do="Export a law with expressions, such as sv.lqr(...).",
-            law=source.name,
-        )
     return SpecificationError(
-        f"The step of the law {source.name!r} is a quadratic program.",
-        rule,
-        nearest=f"The law {limited.name!r}, which it limits.",
-        do="Export that law, and limit the inputs on the machine.",
+        f"The step of the law {source.name!r} is a Python function.",
+        "C code is written from the expressions of a law's step.",
+        do="Export a law with expressions, such as sv.lqr(...).",
         law=source.name,
-        limited=limited.name,
     )
+
+
+def _require_condition(source):
+    """Refuse an allocation whose weights are further apart than the digits of a float."""
+    allocation = getattr(source, "allocation", None)
+    if allocation is None:
+        return
+    m = len(allocation.sizes)
+    H = np.asarray(source.schedule)[-m * m :].T.reshape(-1, m, m) * np.outer(allocation.sizes, allocation.sizes)
+    condition = float(np.linalg.cond(H).max())
+    if not condition <= LARGEST_CONDITION:
+        raise SpecificationError(
+            f"In the allocation of {source.name!r} the costs of inputs differ by a factor of {condition:.2g}.",
+            f"In floats, with seven digits, they differ by {LARGEST_CONDITION:g} at most.",
+            do='Export it with real="double", or pass weights nearer to each other in place of a priority.',
+            law=source.name,
+            condition=condition,
+        )
 
 
 def _of_model(model, start):
@@ -243,13 +259,14 @@ def _thinning(law, thinned):
 
 
 def _of_law(law, thinned):
-    f, table = law.step.expression, np.atleast_2d(np.asarray(law.schedule, dtype=float))
+    allocation, table = getattr(law, "allocation", None), np.atleast_2d(np.asarray(law.schedule, dtype=float))
     y = Array("y", "Measurement y, SI", law.measures)
     u = Array("u", "Command u, SI", law.inputs)
     z = Array("z", "Controller state z", law.state_names)
     about = (
         "One sample of the law: command u of the measurement y and the controller state z, which becomes the next one. "
-        f"Call it every {1 / law.rate:.9g} s from t = {law.t0:g} s; after the schedule its last row applies. {FINITE}"
+        f"Call it every {1 / law.rate:.9g} s from t = {law.t0:g} s; after the schedule its last row applies. "
+        f"{ANSWERED}{'' if allocation is None else EXCLUDED}"
     )
     routines = (
         Routine("start", "Sets the controller state z to its value at the start.", (z.output(),)),
@@ -258,9 +275,18 @@ def _of_law(law, thinned):
     state = np.asarray(law.state, dtype=float)
     stored, sizes = _schedule(table.T, thinned)
     constants = (Constant("z0", state if len(state) else np.zeros(1)), *stored)
-    sizes |= {f"N{a.key.upper()}": len(a.names) for a in (y, u, z)} | {"NO": f.numel_out(0), "WIDTH": len(table)}
+    sizes |= {f"N{a.key.upper()}": len(a.names) for a in (y, u, z)} | {"WIDTH": len(table)}
     sizes |= {"ROWS": table.shape[1], "T0": float(law.t0), "RATE": float(law.rate)}
-    return Contents((y, u, z), constants, {"law": f}, routines, (_OF_TABLE[thinned is not None], "law.c"), sizes)
+    if allocation is None:
+        functions, sources = {"law": law.step.expression}, ()
+        sizes["NO"] = law.step.expression.numel_out(0)
+    else:
+        indices = {"measured": allocation.measured, "integrators": allocation.law.integrators}
+        constants += tuple(Constant(name, np.array([*(places or [0])])) for name, places in indices.items())
+        functions, sources = allocation.functions, ("allocation.h", "limited.c")
+        sizes |= allocation.sizes_in_c | {"NO": law.n_out}
+    sources = (_OF_TABLE[thinned is not None], *sources, "law.c")
+    return Contents((y, u, z), constants, functions, routines, sources, sizes)
 
 
 _OF_TABLE = ("table.c", "thinned.c")
@@ -309,6 +335,6 @@ def _fits(rows, slopes, a, b, allowed):
     """Whether the cubic polynomial between rows a and b is within the bound at the rows between."""
     h, s = b - a, (np.arange(a + 1, b)[:, None] - a) / (b - a)
     r = 1 - s
-    cubic = r * r * (1 + 2 * s) * rows[a] + s * s * (1 + 2 * r) * rows[b]
+    cubic = rows[a] + s * s * (1 + 2 * r) * (rows[b] - rows[a])
     cubic += h * s * r * (r * slopes[a] - s * slopes[b])
     return bool((np.abs(cubic - rows[a + 1 : b]) <= allowed).all())

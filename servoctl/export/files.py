@@ -155,7 +155,8 @@ class Contents:
         Static functions by name, SX functions of (t, x, p) with one dense column.
     routines : sequence of Routine
     sources : sequence of str
-        Files of the folder `sources` with further static functions, which may call `functions`.
+        Files of the folder `sources`, and headers of `codegen/c`, with further static functions, which may call
+        `functions`.
     sizes : dict of str to float
         Macros of these files.
     """
@@ -215,7 +216,6 @@ def _source(name, contents):
     functions = "".join(emit.function(f, key, emit.PORTABLE) for key, f in contents.functions.items())
     table = emit.include("table.h")
     inverse = any(emit.contains(f, ca.OP_ERFINV) for f in contents.functions.values())
-    sources = resources.files("servoctl.export") / "sources"
     parts = [
         f'/* {name}.c: written by servoctl {_version()}. C99; link with -lm. */\n#include "{name}.h"\n',
         "#include <math.h>\n",
@@ -223,10 +223,17 @@ def _source(name, contents):
         *(f"\n{c.declaration(name)} = {c.text};\n" for c in contents.constants),
         f"\n{source('inverse_erf.h')}" if inverse else "",
         functions.replace(table, source("table.h"), 1).replace(table, ""),
-        *((sources / file).read_text(encoding="utf-8") for file in contents.sources),
+        *map(_text_of, contents.sources),
         *(routine.definition(name) for routine in contents.routines),
     ]
     return "".join(parts)
+
+
+def _text_of(file):
+    """The text of a source, with the headers that it includes."""
+    sources = resources.files("servoctl.export") / "sources"
+    text = source(file) if file.endswith(".h") else (sources / file).read_text(encoding="utf-8")
+    return re.sub(r'#include "(.*)"\n', lambda found: "" if found[1] == "unit.h" else _text_of(found[1]), text)
 
 
 def _outside_comments(convert, text):

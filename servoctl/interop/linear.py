@@ -1,5 +1,7 @@
 """Exact linearisations as linear systems of python-control, by name."""
 
+from dataclasses import replace
+
 import numpy as np
 
 from servoctl.checks import array_of, as_list, as_numbers, finite, named, positive
@@ -9,7 +11,15 @@ from servoctl.control.reference import resampled
 from servoctl.control.result import Closed
 from servoctl.control.sampling import discretised
 from servoctl.errors import SpecificationError
-from servoctl.interop.names import connected, force_names, output_names, signal_names, stranger, system_name
+from servoctl.interop.names import (
+    connected,
+    disturbable_of,
+    disturbed_names,
+    output_names,
+    signal_names,
+    stranger,
+    system_name,
+)
 from servoctl.model.model import Model
 from servoctl.plants.plant import Plant, part_of
 from servoctl.reduction.reduce import require_outputs
@@ -36,7 +46,7 @@ def linearise(thing, t, x=None, u=None, *, controller_state=None, rate=None, dis
     rate : float, optional
         A plant is discretised exactly under a zero-order hold of 1/rate [s].
     disturbed : sequence of str
-        Generalised forces of a plant that are further inputs.
+        Generalised forces, and parameters that enter forces only, of a plant that are further inputs.
     name : str, optional
 
     Returns
@@ -49,7 +59,7 @@ def linearise(thing, t, x=None, u=None, *, controller_state=None, rate=None, dis
     SpecificationError
         For a law written in Python, a plant with transport delay, and options that do not apply.
     NameUnknown
-        For a disturbance of an unknown generalised force.
+        For a disturbance of what is no generalised force or parameter.
     """
     _require_applicable(
         thing, x=x is not None, u=u is not None, controller_state=controller_state is not None, rate=rate is not None,
@@ -210,12 +220,12 @@ def _linear_plant(plant, t, x, u, rate, disturbed, name):
             do="Linearise the plant without delay, and put control.pade in series or a delay of samples into sv.close.",
             delay=dict(plant.delay),
         )
-    (disturbed, forces), m, n_x = force_names(plant, disturbed), len(plant.inputs), plant.n_x
+    (disturbed, places), m, n_x = disturbed_names(plant, disturbed), len(plant.inputs), plant.n_x
     u = np.zeros(m) if u is None else ordered(u, plant.inputs, "input")
     at_rest = [0.0] * (n_x - len(plant.lag)) + [u[plant.inputs.index(name)] for name in plant.lagged]
     x = np.where(np.isnan(x), at_rest, x)
     p, at_u = plant.p(u), len(plant.parameters)
-    columns = [*range(at_u, at_u + m), *(at_u + m + i for i in forces)]
+    columns = [*range(at_u, at_u + m), *places]
     A, B = jacobian(plant.function("ode"), "x", t, x, p), jacobian(plant.function("ode"), "p", t, x, p)[:, columns]
     C, D = np.eye(n_x), np.zeros((n_x, len(columns)))
     if plant.mechanism.outputs:
@@ -277,8 +287,9 @@ def _linear_closed(closed, t, name):
             quantisation=closed.conditions.sensors.quantisation,
         )
     u, y = closed.inputs[:, k], closed.measurements[:, k]
-    system = _late(_linear_plant(plant, t, x, u, law.rate, plant.disturbable, "plant"), plant, loop.delay)
-    return connected(system, _linear_law(law, t, y, closed.controller_states[:, k], "law"), plant, law, name)
+    now = replace(plant, parameters=closed.p[: len(plant.parameters), k])  # of which some are disturbed
+    system = _late(_linear_plant(now, t, x, u, law.rate, disturbable_of(closed), "plant"), plant, loop.delay)
+    return connected(system, _linear_law(law, t, y, closed.controller_states[:, k], "law"), closed, name)
 
 
 def _late(system, plant, delay):

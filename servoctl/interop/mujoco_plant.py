@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from servoctl.checks import ON_SAMPLE, as_span, require_kind
+from servoctl.checks import ON_SAMPLE, as_span, named, require_kind
 from servoctl.control.close import as_law, finished, loop_of, regular_at_start, require_names
 from servoctl.control.conditions import Conditions
 from servoctl.control.reference import require_plant
@@ -67,6 +67,8 @@ def mujoco(model, law, x0, t_span, *, plant=None, sensors=None, timing=None, dis
     conditions, t_span = Conditions(sensors, timing, disturbance), as_span(t_span, forward=True)
     law = as_law(law, plant, conditions.timing.rate, t_span[0], plan)
     require_names(law, plant)
+    for name in conditions.disturbance:
+        named(name, plant.disturbable, "generalised force")  # MuJoCo does not have the plant's parameters
     machine = _Machine(library, model, plant)
     plant = regular_at_start(plant, t_span[0], x0)
     timing = replace(conditions.timing, substeps=machine.steps(law.period))

@@ -1,6 +1,6 @@
 """Names of signals in python-control, and the loop of a plant and a law by them."""
 
-from servoctl.checks import named, text, texts
+from servoctl.checks import text, texts
 from servoctl.errors import SpecificationError
 
 RULE = "A system of python-control is made of a Model, a Plant, a Law or the Closed of sv.close."
@@ -16,12 +16,10 @@ def signal_names(names, inputs):
     return [f"lagged {name}" if name in inputs else name for name in names]
 
 
-def force_names(plant, disturbed):
-    """Names of disturbed generalised forces, from one name or several, and their indices."""
-    names = texts(disturbed, "The disturbed forces")
-    for name in names:
-        named(name, plant.disturbable, "generalised force")
-    return names, [plant.disturbable.index(name) for name in names]
+def disturbed_names(plant, disturbed):
+    """Names of disturbed generalised forces and parameters, from one name or several, and their indices in p."""
+    names = texts(disturbed, "The names of what is disturbed")
+    return names, [plant.disturbed(name) for name in names]
 
 
 def system_name(name, default):
@@ -33,13 +31,19 @@ def system_name(name, default):
     return name
 
 
-def connected(system, law_system, plant, law, name):
+def disturbable_of(closed):
+    """Names of generalised forces, and of parameters that are disturbed in a loop."""
+    return tuple(dict.fromkeys((*closed.plant.disturbable, *closed.conditions.disturbance)))
+
+
+def connected(system, law_system, closed, name):
     """The loop of a plant's system and a law's, nonlinear or linear."""
     import control
 
+    plant, law = closed.plant, closed.law
     measured = signal_names(law.measures, law.inputs)
     wires = [[f"plant.{a}", f"law.{a}"] for a in law.inputs] + [[f"law.{y}", f"plant.{y}"] for y in measured]
-    disturbances, outputs = [f"disturbance {force}" for force in plant.disturbable], output_names(plant)
+    disturbances, outputs = [f"disturbance {name}" for name in disturbable_of(closed)], output_names(plant)
     return control.interconnect(
         [system, law_system], wires, name=name,
         inplist=[*(f"plant.{d}" for d in disturbances), *(f"law.{y}" for y in measured)],

@@ -10,7 +10,15 @@ from servoctl.control.law import Law
 from servoctl.control.loop import hold, limited, quantised, samples_ago
 from servoctl.control.result import Closed
 from servoctl.errors import ServoError, SpecificationError
-from servoctl.interop.names import connected, force_names, output_names, signal_names, stranger, system_name
+from servoctl.interop.names import (
+    connected,
+    disturbable_of,
+    disturbed_names,
+    output_names,
+    signal_names,
+    stranger,
+    system_name,
+)
 from servoctl.model.model import Model
 from servoctl.plants.plant import Plant
 from servoctl.reduction.reduce import require_outputs
@@ -37,7 +45,7 @@ def nlsys(thing, *, rate=None, substeps=None, disturbed=(), name=None):
     substeps : int, optional
         Runge-Kutta steps of order 4 per sample of a plant; default 10.
     disturbed : sequence of str
-        Generalised forces of a plant that have an input "disturbance NAME".
+        Generalised forces, and parameters that enter forces only, of a plant that have an input "disturbance NAME".
     name : str, optional
         Name of the system; default "model", "plant", "law" or "loop".
 
@@ -51,7 +59,7 @@ def nlsys(thing, *, rate=None, substeps=None, disturbed=(), name=None):
     SpecificationError
         For other objects, options that do not apply, and limits of rate or delays in continuous time.
     NameUnknown
-        For a disturbance of an unknown generalised force.
+        For a disturbance of what is no generalised force or parameter.
     """
     given = as_list(disturbed) != []
     if not isinstance(thing, Plant) and (rate is not None or substeps is not None or given):
@@ -133,7 +141,7 @@ def _parameter_values(p, symbols, params):
 def _plant(plant, name, disturbed, rate, substeps, delay=0):
     import control
 
-    disturbed, forces = force_names(plant, disturbed)
+    disturbed, places = disturbed_names(plant, disturbed)
     period = None if rate is None else 1.0 / positive("rate", rate)
     substeps = None if substeps is None else whole("substeps", substeps, least=1, most=MOST_COUNT)
     if period is None:
@@ -143,10 +151,10 @@ def _plant(plant, name, disturbed, rate, substeps, delay=0):
     ode, low_high = plant.function("ode"), limits(plant, 1.0)[:2]
 
     def numbers(u, params):
-        d = np.zeros(len(plant.disturbable))
-        d[forces] = u[m:]
-        applied = limited(u[:m], None, *low_high, None)
-        return np.concatenate([_parameter_values(plant.parameters, symbols, params), applied, d])
+        applied, calm = limited(u[:m], None, *low_high, None), np.zeros(len(plant.disturbable))
+        p = np.concatenate([_parameter_values(plant.parameters, symbols, params), applied, calm])
+        p[places] = u[m:]
+        return p
 
     def rates(t, x, u, params):
         return ode(t, x, numbers(u, params))
@@ -237,5 +245,5 @@ def _law(law, name, quantum=None):
 
 def _closed(closed, name):
     plant, loop = closed.plant, closed.loop
-    system = _plant(plant, "plant", plant.disturbable, 1.0 / loop.period, loop.substeps, loop.delay)
-    return connected(system, _law(closed.law, "law", loop.quantum), plant, closed.law, name)
+    system = _plant(plant, "plant", disturbable_of(closed), 1.0 / loop.period, loop.substeps, loop.delay)
+    return connected(system, _law(closed.law, "law", loop.quantum), closed, name)

@@ -12,7 +12,7 @@ from servoctl.codegen.function import compiled
 from servoctl.errors import SpecificationError
 from servoctl.jets.branches import size_of_terms
 from servoctl.model.equations import Invariants
-from servoctl.reduction.appell import plant_accelerations, require_inertia
+from servoctl.reduction.appell import plant_solution, require_inertia
 from servoctl.reduction.hidden import complete
 from servoctl.reduction.manifold import Context, sample
 from servoctl.reduction.orders import Orders
@@ -231,11 +231,19 @@ class PlantEquations:
     @property
     def acceleration(self):
         """γ'' with ideal material constraints."""
-        return self._solved[0]
+        return self._solved[0][: self.q.n]
+
+    @property
+    def multipliers(self):
+        """Reactions λ of the material constraints, G_mᵀλ, as "multiplier_NAME"; none where rows were combined."""
+        rows, given = self._material[0], self.mechanism.constraints
+        if len(rows) != len(given) or any(not ca.is_equal(row.expression, given.get(row.name, 0), 1) for row in rows):
+            return {}
+        return {f"multiplier_{row.name}": -self._solved[0][self.q.n + i] for i, row in enumerate(rows)}
 
     @cached_property
     def _solved(self):
-        """γ'' from [M G_mᵀ; G_m 0] [γ''; -λ] = [forces; ...], the pivots, and what elimination left out."""
+        """[γ''; -λ] from [M G_mᵀ; G_m 0] [γ''; -λ] = [forces; ...], the pivots, and what elimination left out."""
         q, (rows, points) = self.q, self._material
         acceleration, zero = ca.vertcat(*q.gamma(2)), ca.SX.zeros(q.n)
         second = [q.derivatives([row.expression], 2 - row.order)[-1][0] for row in rows]
@@ -243,7 +251,7 @@ class PlantEquations:
         driven = self.mechanism.E @ self.force + self.d + self.forces + self.resisting
         force = driven - ca.substitute(self.mechanism.balance, acceleration, zero)
         with noting_dropped() as entries:
-            solution, pivots = plant_accelerations(self.mechanism, rows, force, -second, points)
+            solution, pivots = plant_solution(self.mechanism, rows, force, -second, points)
         return ca.cse(solution), pivots, entries
 
     @cached_property

@@ -198,6 +198,47 @@ class Plant(Value):
         d = np.repeat(d[:, None], u.shape[1], axis=1) if d.ndim == 1 else _sized("d", d, len(d), u.shape[1])
         return np.concatenate([fixed, u, d])
 
+    def disturbed(self, name):
+        """The index in p of what a disturbance acts on.
+
+        Parameters
+        ----------
+        name : str
+            A generalised force, or a parameter that enters forces only, such as the speed of the wind: a disturbance
+            is then its value.
+
+        Returns
+        -------
+        int
+
+        Raises
+        ------
+        NameUnknown
+            If the plant has neither.
+        SpecificationError
+            For a parameter of inertia, kinematics or constraints, whose rate of change would act as well.
+        """
+        parameters = self.mechanism.parameters
+        if name in self.disturbable:
+            return len(self.parameters) + len(self.inputs) + self.disturbable.index(name)
+        if name not in parameters.names:
+            raise self.mechanism.no("generalised force or parameter", name, (*self.disturbable, *parameters.names))
+        m, place = self.mechanism, parameters.names.index(name)
+        kinds = {
+            "the inertia": ca.vec(m.mass), "the kinematics": ca.vertcat(ca.vec(m.q.V), m.q.h, *m.q.invariants.values()),
+            "the material constraints": ca.vertcat(ca.SX(0, 1), *m.constraints.values()),
+        }  # fmt: skip
+        for what, expression in kinds.items():
+            if ca.depends_on(expression, parameters.symbols[place]):
+                raise SpecificationError(
+                    f"The parameter {name!r} is disturbed, and {what} depend{'s' * (what[-1] == 'a')} on it.",
+                    "A parameter that is a function of time enters forces only; elsewhere its rate of change acts too.",
+                    do="Describe it as a coordinate that is driven, or as a function of t in the mechanism.",
+                    name=name,
+                    where=what,
+                )
+        return place
+
     def function(self, name):
         """One of the plant's compiled functions of (t, x, p), built at first use.
 

@@ -91,11 +91,16 @@ def _saddle(mechanism, material):
 
 
 def plant_accelerations(mechanism, material, forces, second, points):
-    """γ'' of the plant, the upper part of [M G_mᵀ; G_m 0] [γ''; -λ] = [forces; second], (n, columns) SX; the pivots."""
+    """γ'' of the plant, the upper part of `plant_solution`, (n, columns) SX; the pivots."""
+    solution, pivots = plant_solution(mechanism, material, forces, second, points)
+    return solution[: mechanism.q.n, :], pivots
+
+
+def plant_solution(mechanism, material, forces, second, points):
+    """[γ''; -λ] of [M G_mᵀ; G_m 0] [γ''; -λ] = [forces; second], (n + k, columns) SX; the pivots."""
     matrix = _saddle(mechanism, material)
     numbers = clean(*points.matrix(matrix))
-    solution, pivots = eliminate(matrix, ca.vertcat(forces, second), numbers)
-    return solution[: mechanism.q.n, :], pivots
+    return eliminate(matrix, ca.vertcat(forces, second), numbers)
 
 
 def require_inertia(mechanism, material, points):

@@ -214,6 +214,13 @@ def _case_numbers(run, columns, scale):
     constants = np.repeat(plant.parameters[:, None], n, axis=1)
     starts = np.repeat(run.loop.x0[:, None], n, axis=1)
     for name, values in columns.items():
+        if name in parameters and name in disturbance:
+            raise SpecificationError(
+                f"The cases have the number {name!r}, which is disturbed in the loop.",
+                "A disturbed parameter is a function of time.",
+                do=f'Multiply the function in each case: scale={{"{name}": column}}.',
+                name=name,
+            )
         if name in parameters:
             constants[parameters.index(name)] = values
         elif name in plant.state_names:

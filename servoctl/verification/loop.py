@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 import numpy as np
+from casadi import depends_on
 
 from servoctl.control.loop import FINISHED, run_loop
 from servoctl.errors import SpecificationError
@@ -31,8 +32,9 @@ def verify_loop(closed):
     plant, found, limits, notes = closed.plant, {}, dict(LOOP_LIMITS), []
     _require_signals(closed)
     found["loop repeated"] = _repeated(closed)
-    if plant.equations.unbalanced:
-        notes.append(f"power balance: not applicable, {plant.equations.unbalanced}")
+    unbalanced = plant.equations.unbalanced or _driven(closed)
+    if unbalanced:
+        notes.append(f"power balance: not applicable, {unbalanced}")
     elif found["loop repeated"] <= limits["loop repeated"]:
         defect = found["loop power"] = _defect(closed, 1)
         found["loop power halved"] = _defect(closed, 2)
@@ -43,6 +45,14 @@ def verify_loop(closed):
     if plant.limits or plant.rate_limits:
         found["loop limits"] = _excess(closed)
     return judged(found, {name: limits[name] for name in found}, notes)
+
+
+def _driven(closed):
+    """Why dE/dt is not the power of the forces, where the energy depends on a disturbed parameter; "" elsewhere."""
+    mechanism = closed.plant.mechanism
+    names = [s.name() for s in mechanism.parameters.symbols if depends_on(mechanism.energy, s)]
+    disturbed = ", ".join(name for name in names if name in closed.conditions.disturbance)
+    return f"the energy depends on {disturbed}, which is disturbed" if disturbed else ""
 
 
 def _require_signals(closed):

@@ -57,6 +57,7 @@
 /* allocation.c */
 #define NROW 5
 #define NSIG 1
+#define NZ_LAW 1
 #define NK 2
 #define NJ 1
 #define NI 1
@@ -65,6 +66,7 @@
 #define QP_STEPS 100
 #define QP_MET 1e-10
 #define QP_DEPENDENT 1e-9
+#define QP_TINY 1e-300
 #define MET 1e-7
 #define GIVEN_WAY 1e-6
 

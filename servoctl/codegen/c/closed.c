@@ -19,7 +19,7 @@ static void measure(const Loop *c, int64_t k, const double *x, double *y)
 #define EACH _Pragma("GCC unroll 32") for (int i = 0; i < NX; i++)
 #define AT(v) v[i]
 #define RATES(stage, instant, state, k) \
-    for (int64_t i = 0; i < c->n_d; i++) pd[c->disturbed[i]] = d[stage * c->n_d + i]; \
+    for (int64_t i = 0; i < c->n_d; i++) p[c->disturbed[i]] = d[stage * c->n_d + i]; \
     NAME(instant, state, p, k)
 
 /* A step with the rates written into it; d holds the disturbances at its start, middle and end. Vectors of states would
@@ -27,7 +27,7 @@ static void measure(const Loop *c, int64_t k, const double *x, double *y)
 __attribute__((flatten, optimize("no-tree-vectorize")))
 static void advance(const Loop *c, double t, double h, const double *d, double *x, double *p)
 {
-    double k1[NX + 1], k2[NX + 1], k3[NX + 1], k4[NX + 1], z[NX + 1], *pd = p + c->at_u + c->n_u;
+    double k1[NX + 1], k2[NX + 1], k3[NX + 1], k4[NX + 1], z[NX + 1];
     RATES(0, t, x, k1);
 #include "rk4.h"
 }

@@ -11,7 +11,7 @@ static void schedule(int k, double *row)
     const double *a = table + 2 * WIDTH * low, *b = table + 2 * WIDTH * high;
     const double h = (double)(knot[high] - knot[low]), s = h > 0 ? (double)(k - knot[low]) / h : 0, r = 1 - s;
     for (int i = 0; i < WIDTH; i++) {
-        row[i] = r * r * (1 + 2 * s) * a[i] + s * s * (1 + 2 * r) * b[i];
+        row[i] = a[i] + s * s * (1 + 2 * r) * (b[i] - a[i]); /* constants to the last digit */
         row[i] += h * s * r * (r * a[WIDTH + i] - s * b[WIDTH + i]);
     }
 }
