@@ -13,11 +13,12 @@ import crane
 import derivation
 import harness
 import loop
+import many
 import monte_carlo
 import process
 import relaxed
 
-GROUPS = (appell_hamel, crane, bounded, relaxed, arms, loop, monte_carlo, derivation, compiling, process)
+GROUPS = (appell_hamel, crane, bounded, relaxed, arms, loop, many, monte_carlo, derivation, compiling, process)
 ROWS = {name: row for group in GROUPS for name, row in group.ROWS.items()}
 HERE = Path(__file__).parent
 RESULTS, README = HERE / "results.json", HERE / "README.md"

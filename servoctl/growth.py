@@ -17,9 +17,11 @@ import numpy as np
 
 from servoctl.checks import positive
 from servoctl.errors import SpecificationError
+from servoctl.methods.flow import flow
 from servoctl.methods.kinks import SMOOTHER, stays_on_kink
 from servoctl.methods.stability import stability_function
 from servoctl.model.model import Model
+from servoctl.model.switching import switching
 from servoctl.run import SAME_TIME, Run, require_model
 from servoctl.tolerances import TINY
 
@@ -268,6 +270,45 @@ def growth_bound(model, run):
     return float(np.exp(fine + abs(fine - coarse)))
 
 
+@np.errstate(all="ignore")
+def quiet_by_series(model, run, last):
+    """Whether propagators by the series of a motion say that its internal dynamics are not unstable.
+
+    They are those of `internal_dynamics`, without a Jacobian and without smaller and smaller steps.
+
+    Parameters
+    ----------
+    model : Model
+    run : Run
+        A motion of it by the Taylor method, with internal dynamics.
+    last : int
+        Highest index of its coefficients.
+
+    Returns
+    -------
+    bool
+        False where the series do not follow the motion, which then is judged by its linearisation.
+    """
+    x, size = _states(model, run), _sizes(model, run)
+    if len(run.variants) > 1 or switching(model) is not None or not np.isfinite(x[:, [0, -1]]).all():
+        return False
+    between = np.linspace(run.t[0], run.t[-1], BLOCKS + 1)
+    along = flow(model, last, between, x[:, 0], run.knots, size)
+    if along is None or not _small(model, run, np.abs(along.x[:, -1:] - x[:, -1:])):
+        return False
+    N, lost = _kernel(model, along.t, along.x, size)
+    moved = None if lost.any() else along.moved(N[:-1], size)
+    if moved is None:
+        return False
+    steps = N[1:].swapaxes(1, 2) @ moved
+    if not (_frobenius(moved - N[1:] @ steps) <= DEFECT * _frobenius(moved)).all():
+        return False
+    forward = np.sign(between[-1] - between[0])
+    ends = np.searchsorted(forward * along.t, forward * between)
+    corners = Tangents(model.state_names, along.t, size, N, N)
+    return not _unstable(corners, steps, *_growth(corners, _propagators(steps, ends)))
+
+
 def _spread(t, x):
     """BOUNDED_AT + 1 samples at equal parts of the time and of the way of the states x (n_x, N), first and last too."""
     way, time = np.abs(np.diff(x)).sum(axis=0), np.abs(np.diff(t))
@@ -390,14 +431,21 @@ def _tangents(model, run, samples, t, x):
 @np.errstate(all="ignore")
 def _bases(model, t, x, size):
     """N, the kernel of the invariants' Jacobian, and J N: (K, n_x, f) each, in scaled states; NaN where not finite."""
-    n_x, m = len(size), len(model.invariant_names())
+    n_x = len(size)
     J = _slopes(model, "ode_jacobian", t, x, n_x) * size / size[:, None]
+    N, lost = _kernel(model, t, x, size)
+    return N, np.where(lost[:, None, None], np.nan, J @ N)
+
+
+@np.errstate(all="ignore")
+def _kernel(model, t, x, size):
+    """N, the kernel of the invariants' Jacobian in scaled states (K, n_x, f), and where it is not finite (K,)."""
+    m = len(model.invariant_names())
     C = _slopes(model, "invariants", t, x, m) * size
     rows = np.sqrt((C**2).sum(axis=2, keepdims=True))
     C = C / np.where(rows > 0, rows, 1.0)
-    lost = ~np.isfinite(C).all(axis=(1, 2))[:, None, None]
-    N = np.linalg.qr(np.where(lost, 0.0, C).swapaxes(1, 2), mode="complete")[0][:, :, m:]
-    return N, np.where(lost, np.nan, J @ N)
+    lost = ~np.isfinite(C).all(axis=(1, 2))
+    return np.linalg.qr(np.where(lost[:, None, None], 0.0, C).swapaxes(1, 2), mode="complete")[0][:, :, m:], lost
 
 
 def _slopes(model, name, t, x, rows):
@@ -563,9 +611,10 @@ def _exponential(omega):
 
 
 @np.errstate(all="ignore")
-def _propagators(steps):
+def _propagators(steps, ends=None):
     """Ends of blocks of steps (n,), then propagators e^log Y between all of them, Y[s, t] (f, f) and log[s, t]."""
-    ends = np.linspace(0, len(steps), min(BLOCKS, len(steps)) + 1).round().astype(int)
+    if ends is None:
+        ends = np.linspace(0, len(steps), min(BLOCKS, len(steps)) + 1).round().astype(int)
     n, f, longest = len(ends), steps.shape[1], np.diff(ends).max()
     block, of_block = np.tile(np.eye(f), (n - 1, 1, 1)), np.zeros(n - 1)
     for k in range(longest):
@@ -574,9 +623,12 @@ def _propagators(steps):
         of_block[inside] += size
     Y, log = np.zeros((n, n, f, f)), np.full((n, n), -np.inf)
     Y[range(n), range(n)], log[range(n), range(n)] = np.eye(f), 0.0
-    for j in range(1, n):
-        Y[:j, j], size = _normalised(block[j - 1] @ Y[:j, j - 1])
-        log[:j, j] = log[:j, j - 1] + of_block[j - 1] + size
+    Y[range(n - 1), range(1, n)], log[range(n - 1), range(1, n)] = block, of_block
+    i, j = np.indices((n, n))
+    for length in 2 ** np.arange(int(np.ceil(np.log2(n)))):  # longer ones from two of at most this length
+        s, t = np.nonzero((j - i > length) & (j - i <= 2 * length))
+        Y[s, t], size = _normalised(Y[s + length, t] @ Y[s, s + length])
+        log[s, t] = log[s + length, t] + log[s, s + length] + size
     return ends, Y, log
 
 
@@ -586,31 +638,56 @@ def _normalised(matrices):
     return matrices / size[:, None, None], np.log(size)
 
 
-def _growth(tangents, propagators, scale=None):
-    """Ends of blocks of steps (n,), ln ‖Φ(t, s)‖ between them (n, n), and the scale of the states (n_x,)."""
+def _growth(corners, propagators, scale=None):
+    """Ends of blocks of steps (n,), ln ‖Φ(t, s)‖ between them (n, n), and the scale of the states (n_x,).
+
+    Where it can be no largest one, the logarithm is a lower bound.
+    """
     ends, Y, log = propagators
     s, t = later = np.triu_indices(len(ends))
-    N, Y, log = tangents.N[2 * ends], Y[later], log[later]
+    N, Y, log = corners.N[ends], Y[later], log[later]
     if scale is None:
         shares = np.exp(2 * (log - log.max()))[:, None, None]
         scale = _balance((shares * (N[t] @ Y @ N[s].swapaxes(1, 2)) ** 2).sum(axis=0))
     R = np.linalg.qr(N / scale[:, None])[1]
     scaled = R[t] @ Y @ np.linalg.inv(R)[s]
-    norms = np.sqrt(np.linalg.eigvalsh(scaled.swapaxes(1, 2) @ scaled)[:, -1])
-    logs = np.full((len(ends), len(ends)), -np.inf)
-    logs[later] = log + np.log(np.maximum(norms, TINY))
+    logs, most = np.full((2, len(ends), len(ends)), -np.inf)
+    columns, rows = (scaled**2).sum(axis=1), (scaled**2).sum(axis=2)
+    least = np.maximum(columns.max(axis=1), rows.max(axis=1))
+    for bound, square in ((logs, least), (most, columns.sum(axis=1))):
+        bound[later] = log + np.log(np.maximum(square, TINY**2)) / 2
+    matter = _may_be_largest(corners.t[ends], logs, most)[later]
+    norms = np.linalg.eigvalsh(scaled[matter].swapaxes(1, 2) @ scaled[matter])[:, -1]
+    logs[s[matter], t[matter]] = log[matter] + np.log(np.maximum(norms, TINY**2)) / 2
     return ends, logs, scale
 
 
-def _unstable(tangents, steps, ends, logs, scale):
+def _may_be_largest(t, least, most):
+    """Of which pairs of instants (n, n) the growth may be the largest over a time, or up to an instant.
+
+    Its logarithm lies between `least`, of the largest row or column of a propagator, and `most`, of all its entries.
+    """
+    matter = most >= np.maximum.accumulate(least.max(axis=0))
+    for inside in _windows(t):
+        matter |= inside & (most >= least[inside].max())
+    matter[0, -1] = True
+    return matter
+
+
+def _windows(t):
+    """Which pairs of instants t (n,) lie at most the whole time apart, at most half of it, and so on; neighbours."""
+    ago = np.abs(t - t[:, None])
+    halves = ago.max() * (1 + SAME_TIME) / 2.0 ** np.arange(int(np.log2(len(t))))
+    return [*(ago <= halves[:, None, None]), np.eye(len(t), k=1, dtype=bool)]
+
+
+def _unstable(corners, steps, ends, logs, scale):
     """Whether errors grow more than tenfold and exponentially, not as a power of time like phases that drift apart.
 
     Growth over a time is compared with that over half of it, and where a block has most of it, in that block.
     """
-    t, limit = tangents.t[2 * ends], np.log(UNSTABLE)
-    ago = np.abs(t - t[:, None])
-    within = [logs[ago <= ago.max() / 2**k].max() for k in range(int(np.log2(len(t))))]
-    within = np.array([*within, np.diag(logs, 1).max()])
+    limit = np.log(UNSTABLE)
+    within = np.array([logs[inside].max() for inside in _windows(corners.t[ends])])
     whole, half = within[:-1], within[1:]
     exponential = (whole > limit) & (whole - half > np.log(FASTER)) & (whole > EXPONENTIAL * half)
     exponential &= within.max() < EXPONENTIAL * whole  # most of the growth is that over this time
@@ -620,7 +697,7 @@ def _unstable(tangents, steps, ends, logs, scale):
     first, end = ends[j], ends[j + 1]
     if logs[j, j + 1] <= limit or end == first + 1:
         return False
-    block = tangents[2 * first : 2 * end + 1]
+    block = corners[first : end + 1]
     return _unstable(block, steps[first:end], *_growth(block, _propagators(steps[first:end]), scale))
 
 
@@ -642,10 +719,11 @@ def _balance(W, sweeps=SWEEPS):
 @np.errstate(over="ignore")
 def _judged(tangents, steps, propagators):
     """The verdict on a motion from its propagators."""
-    ends, logs, scale = _growth(tangents, propagators)
+    corners = tangents[::2]  # ends of the steps
+    ends, logs, scale = _growth(corners, propagators)
     growth, left = (float(f"{np.exp(log):.3g}") for log in (logs.max(), logs[0, -1]))  # as many digits as are right
-    until = np.stack([tangents.t[2 * ends], np.exp(np.maximum.accumulate(logs.max(axis=0)))])
-    unstable = _unstable(tangents, steps, ends, logs, scale)
+    until = np.stack([corners.t[ends], np.exp(np.maximum.accumulate(logs.max(axis=0)))])
+    unstable = _unstable(corners, steps, ends, logs, scale)
     verdict = "unstable" if unstable else "stable" if left < SHRUNK else "neutral"
     return InternalDynamics(tangents, verdict, growth, left, until)
 

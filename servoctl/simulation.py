@@ -10,8 +10,8 @@ from numpy.typing import ArrayLike
 
 from servoctl.checks import as_numbers, as_span
 from servoctl.errors import InconsistentStart, ServoError, SpecificationError
-from servoctl.growth import FEWEST, STEP_ERROR, UNSTABLE, growth_bound, internal_dynamics
-from servoctl.methods.accuracy import ATOL, absolute_tolerances, accurate, large_tolerances
+from servoctl.growth import FEWEST, STEP_ERROR, UNSTABLE, growth_bound, internal_dynamics, quiet_by_series
+from servoctl.methods.accuracy import ATOL, absolute_tolerances, accurate, large_tolerances, method_for
 from servoctl.methods.algebraic import algebraic
 from servoctl.methods.bounded import bounded
 from servoctl.methods.choice import (
@@ -41,7 +41,7 @@ from servoctl.methods.runge_kutta import ORDERS, RungeKuttaSteps
 from servoctl.methods.scipy_methods import ScipySteps
 from servoctl.methods.stability import run_checked, warn_drifted, warn_many_steps, warn_unstable
 from servoctl.methods.sundials import SundialsSteps
-from servoctl.methods.taylor import TaylorSteps
+from servoctl.methods.taylor import TaylorSteps, Unsuited, last_index
 from servoctl.model.model import Model
 from servoctl.model.start import State
 from servoctl.model.switching import switching
@@ -85,7 +85,8 @@ def simulate(
         A method with its settings, such as `sv.Taylor(jets=3)` or `sv.RungeKutta(4, step=1e-3)`, or the short form of
         a method with its defaults: "algebraic", "Taylor", "RadauIIA", "RK1" to "RK8", scipy's names, "CVODES" or
         "IDAS". Default: "algebraic" (a Newton solve at each instant) if the program determines the motion completely,
-        Σ o_a = 0, else "DOP853". "Taylor" is the most accurate; "RadauIIA" is for stiff motions.
+        Σ o_a = 0, else "Taylor", or "RadauIIA" where stability limits its steps; "DOP853" with the treatments of drift
+        that series exclude, and for equations so large that making a series takes seconds.
     drift : None, "project", "minimal", float, `Project(...)`, `Poles(...)` or `MinimalCoordinates()`, optional
         Treatment of constraint drift. A number is the time constant of the error dynamics [s]. "minimal" integrates
         as many values as the program leaves free and solves for the others: exact, in Python, at many times the cost.
@@ -132,25 +133,32 @@ def simulate(
     events = as_events(events)
 
     def motion(times):
-        def attempt(method, drift, t_span=span, times=times):
-            of_span = events if t_span is span else {}
-            return simulated(model, start, t_span, method, drift=drift, t_eval=times, events=of_span, progress=progress)
+        def attempt(method, drift):
+            return simulated(model, start, span, method, drift=drift, t_eval=times, events=events, progress=progress)
 
-        if accuracy is None:
-            return attempt(method, drift)
-        return accurate(attempt, model, accuracy, (span[0], as_state(model, start, span[0]), span[1]), method, drift)
+        return attempt(method, drift) if accuracy is None else accurate(attempt, model, accuracy, method, drift)
 
     if not _has_internal_dynamics(model) or not _integrates(method):
         return motion(times)
     tolerance, own = getattr(method, "rtol", STEP_ERROR), partial(_with_own, method, span, times)
     try:
-        run = motion(own(FEWEST + 1))
+        enough = own(FEWEST + 1)
+        run = motion(times if enough is None else enough)
     except ServoError as error:
         if error.run is not None:
             error.run = _sampled(replace(error.run, verdict=partial(_verdict, tolerance=tolerance)), times)
         raise
     dense = own(DEFAULT_SAMPLES)
-    return _sampled(judged(run, tolerance, None if dense is None else partial(motion, dense)), times)
+    again = None if dense is None else partial(motion, dense)
+    first = method if accuracy is None else method_for(model, accuracy, getattr(method, "jets", None))
+    return _sampled(judged(run, tolerance, again, _series_of(run, first)), None if dense is None else times)
+
+
+def _series_of(run, method):
+    """Highest index of the coefficients with which a run was computed; None if it is none of the Taylor method."""
+    if run.method != str(Taylor()):
+        return None
+    return last_index(run.model, Taylor() if method is None else as_method(method))
 
 
 def _integrates(method):
@@ -159,9 +167,12 @@ def _integrates(method):
 
 
 def _with_own(method, span, times, count):
-    """Times of samples and `count` more along the span; None where the samples are all steps or the default."""
+    """Times of samples and `count` more along the span; None for all steps, the default, or samples as dense."""
     fixed_steps = method is not None and isinstance(as_method(method), RungeKutta)
     if times is None or fixed_steps:
+        return None
+    gaps = np.abs(np.diff(times, prepend=span[0], append=span[1]))
+    if gaps[0] == gaps[-1] == 0.0 and (count - 1) * gaps.max() <= abs(span[1] - span[0]) * (1 + SAME_TIME):
         return None
     return np.union1d(times, np.linspace(*span, count))[:: 1 if span[1] > span[0] else -1]
 
@@ -186,8 +197,8 @@ def _sampled(run, times):
 def simulated(model, start, t_span, method=None, *, drift=None, t_eval=None, events=None, progress=None):
     """The run of `simulate`, without a verdict on its internal dynamics."""
     span = t0, t1 = as_span(t_span)
-    method = default_method(model) if method is None else as_method(method)
     drift = as_drift(drift)
+    method = default_method(model, drift) if method is None else as_method(method)
     require_combination(model, method, drift)
     if isinstance(drift, Poles):
         _require_decay(model, drift, t0, t1)
@@ -197,9 +208,13 @@ def simulated(model, start, t_span, method=None, *, drift=None, t_eval=None, eve
     x0 = (as_state if leads_back else consistent_state)(model, start, t0)
     knots = model.require_smooth((min(span), max(span)))
     times = None if isinstance(method, Bounded) and t_eval is None else _sample_times(t0, t1, t_eval, knots, method)
-    bar = Progress(span, progress)
+    bar, problem = Progress(span, progress), (t0, x0, t1, times, knots, events)
     try:
-        model, motion = _derived_along(model, method, drift, (t0, x0, t1, times, knots, events), bar)
+        model, motion = _derived_along(model, method, drift, problem, bar)
+    except Unsuited as unsuited:
+        method = unsuited.method
+        model, motion = _derived_along(model, method, drift, problem, bar)
+        motion.note = f"by {method}, since {unsuited}"
     finally:
         bar.close()
     with without_interruption() as pressed:  # a motion that is computed is kept
@@ -237,7 +252,7 @@ def _has_internal_dynamics(model):
     return bool(model.reduction.program.residuals) and not model.flat
 
 
-def judged(run, tolerance=STEP_ERROR, again=None):
+def judged(run, tolerance=STEP_ERROR, again=None, by_series=None):
     """A run that gives the verdict on its internal dynamics when it is read; warns at once if they are unstable.
 
     Most motions need no propagators to know that there is nothing to warn of. Who interrupts a motion does not wait.
@@ -250,6 +265,8 @@ def judged(run, tolerance=STEP_ERROR, again=None):
         Relative error of a step of its method.
     again : callable, optional
         Returns the same motion with more samples, where the run has few of them.
+    by_series : int, optional
+        Highest index of the coefficients of a motion by the Taylor method.
 
     Returns
     -------
@@ -258,6 +275,8 @@ def judged(run, tolerance=STEP_ERROR, again=None):
     known = replace(run, verdict=partial(_verdict, tolerance=tolerance))
     try:
         if not run.success or growth_bound(run.model, run) <= UNSTABLE:
+            return known
+        if by_series is not None and quiet_by_series(run.model, run, by_series):
             return known
         run = run if again is None else again()
         internal = internal_dynamics(run.model, run) if run.success else None
@@ -354,8 +373,8 @@ def _stepping(model, method, drift, span, bar, atol):
     """The integration by a method other than `Algebraic`."""
     (t0, t1), least = span, ATOL if atol is None else atol.min()
     match method:
-        case Taylor(order, jets, rtol, given):
-            return TaylorSteps(model, drift, rtol, given or least, order, jets or 0, bar)
+        case Taylor():
+            return TaylorSteps(model, drift, method, method.atol or least, bar)
         case RadauIIA(order, step, rtol, given):
             step = None if step is None else _step_length(step, t0, t1)
             return RadauSteps(model, drift, rtol, given or least, order, step, bar)

@@ -8,6 +8,7 @@ import pytest
 
 import servoctl as sv
 from servoctl.gallery import gallery
+from servoctl.methods import choice
 from servoctl.methods.choice import METHODS, as_method
 
 TREATMENTS = (None, sv.Project(), sv.Poles(0.1), sv.MinimalCoordinates())
@@ -25,7 +26,7 @@ def scene(gallery_model):
 )
 def test_values_are_equal_after_pickling_and_are_frozen(value):
     assert pickle.loads(pickle.dumps(value)) == value
-    assert eval(repr(value), vars(sv)) == value
+    assert eval(repr(value), {name: getattr(sv, name) for name in sv.__all__}) == value
     with pytest.raises(AttributeError):
         value.rtol = 1e-3
 
@@ -56,7 +57,7 @@ def test_a_short_form_and_its_value_give_the_same_run(scene):
         ("Taylor", sv.Taylor()),
         ("RK8", sv.RungeKutta()),
         ("DOP853", sv.Adaptive()),
-        (None, sv.Adaptive()),
+        (None, sv.Taylor()),
     ):
         one, other = (sv.simulate(*scene, method, drift="project") for method in (short, value))
         assert np.array_equal(one.jets, other.jets)
@@ -113,3 +114,14 @@ def test_jets_beside_an_accuracy_where_nothing_is_integrated(gallery_model):
     plain = sv.simulate(model, model.start(), (0.0, 0.5), t_eval=[0.5])
     assert run.method == "Taylor" and np.isfinite(run["d4theta"]).all()
     assert run.jets[: len(plain.jets)] == pytest.approx(plain.jets, rel=1e-9, abs=1e-9)
+
+
+def test_the_default_is_a_series_where_nothing_speaks_against_it(scene, gallery_model, monkeypatch):
+    model, start, span = scene
+    assert sv.simulate(*scene).method == sv.simulate(*scene, drift="project").method == "Taylor"
+    for drift in (0.1, "minimal"):
+        assert sv.simulate(*scene, drift=drift).method == "DOP853"
+    flat = gallery_model("overhead-crane")
+    assert sv.simulate(flat, flat.start(), (0.0, 0.1)).method == "algebraic"
+    monkeypatch.setattr(choice, "LARGE_FOR_SERIES", model.function("ode").operations - 1)
+    assert sv.simulate(*scene).method == "DOP853"

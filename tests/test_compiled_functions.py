@@ -4,6 +4,7 @@ import copy
 import ctypes
 import itertools
 import pickle
+import re
 import threading
 
 import casadi as ca
@@ -123,6 +124,36 @@ def test_chunks_equal_one_function_and_casadi_to_the_last_bit(monkeypatch, c_com
     expected = np.asarray(f(0.3, [0.5, -0.7], 1.1)).ravel()
     for result in results:
         np.testing.assert_array_equal(result, expected)
+
+
+@pytest.mark.parametrize("chunk", [100, 10**9])
+def test_phases_equal_one_function_to_the_last_bit_after_other_corrections(monkeypatch, c_compiler, chunk):
+    monkeypatch.setenv("CC", "cc -ffp-contract=off")
+    f = random_function(2600)
+    text = emit.emit(f, "f", ("newton",), chunk=chunk) + """
+void f_again(double t, const double *x, const double *other, const double *p, double *y)
+{
+    double w[WORK];
+    f_instant(t, x, p, y, w);
+    f_correction(t, other, p, y, w);
+    f_correction(t, x, p, y, w);
+    f_rest(t, x, p, y, w);
+}
+"""
+    library, x, other, p, y = compiler.library(text), *map(np.array, ([0.5, -0.7], [3.0, 1e200], [1.1])), np.zeros(f.numel_out())
+    library.f_again(ctypes.c_double(0.3), *(ctypes.c_void_p(a.ctypes.data) for a in (x, other, p, y)))
+    np.testing.assert_array_equal(y, np.asarray(f(0.3, x, p)).ravel())
+    np.testing.assert_array_equal(in_buffer(compiled(f, "f", ("rk",)), 0.3, x, p), y)
+
+
+@pytest.mark.parametrize(("name", "share"), [("overhead-crane", 0.3), ("crane-3d", 0.3), ("three-cars", 0.15)])
+def test_a_newton_correction_takes_few_of_the_operations_of_a_point(gallery_model, name, share):
+    f = gallery_model(name).function("path")
+    text = emit.phases(f.expression, "f", f.n_x, chunk=10**9)
+    body = dict(zip(emit.PHASES, re.split(r"void f_\w+\(", text)[1:], strict=True))
+    lines = {phase: body[phase].count("const double a") for phase in emit.PHASES}
+    assert lines["instant"] > 0.25 * f.operations and lines["correction"] < share * f.operations
+    assert not re.search(r"\bt [-+*/]|\(t\b", body["correction"].split("\n", 1)[1]), "nothing of t alone is repeated"
 
 
 def test_the_work_vector_uses_its_places_again():

@@ -17,6 +17,7 @@ import servoctl as sv
 from servoctl import simulation
 from servoctl.gallery import cars, gallery, mass_on_car, passive_arm, spiral, vtol
 from servoctl.growth import growth_bound
+from servoctl.methods.flow import MOST_ALONG, flow
 
 
 def internal(pair, span, start, **guess):
@@ -425,3 +426,46 @@ def test_the_verdict_is_computed_when_it_is_read(tmp_path, gallery_model):
     with pytest.raises(TypeError):
         run.internal["verdict"] = "unstable"
     assert sv.simulate(model, model.start(**start), (0.0, 1.0)).internal["verdict"] == "stable"
+
+
+@pytest.mark.parametrize("span", [(0.0, 12.0), (12.0, 0.0), (0.0, 0.05)], ids=str)
+def test_deviations_moved_by_series_are_those_of_mathieus_equation(span):
+    model, depth = passive(mathieu(0.6)), 0.6
+    run = sv.simulate(model, model.start(t=span[0], x=1e-3, dx=0.0), span)
+    along = flow(model, 17, np.linspace(*span, 9), run.jets[:4, 0], run.knots, np.ones(4))
+    assert np.isin(np.linspace(*span, 9), along.t).all() and np.all(np.diff(along.t) * (span[1] - span[0]) > 0)
+    free = np.eye(4)[:, [model.state_names.index(name) for name in ("x", "dx")]]
+    product = np.eye(2)
+    for step in free.T @ along.moved(np.tile(free, (len(along.t) - 1, 1, 1)), np.ones(4)):
+        product = step @ product
+
+    def rates(t, Y):
+        return np.concatenate([Y[2:], -0.1 * Y[2:] - (1 + depth * np.cos(2 * t)) * Y[:2]])
+
+    exact = solve_ivp(rates, span, np.eye(2).ravel(), rtol=1e-11, atol=1e-13).y[:, -1].reshape(2, 2)
+    assert product == pytest.approx(exact, rel=1e-4, abs=1e-4 * np.abs(exact).max())
+
+
+def test_series_that_are_too_short_move_no_deviations():
+    model = passive(lambda x, v, t: -x)
+    x = model.start(x=1.0, dx=0.0).values
+    short = flow(model, 17, np.linspace(0.0, 8.0, 33), x, (), np.ones(4))
+    columns = np.eye(4)[None, :, :2]
+    assert short.moved(np.repeat(columns, len(short.t) - 1, axis=0), np.ones(4)) is not None
+    longer = replace(short, t=short.t[[0, -1]], x=short.x[:, [0, -1]], parameters=short.parameters[:, :1])
+    assert longer.moved(columns, np.ones(4)) is None
+    assert flow(model, 17, np.linspace(0.0, 2e4, 33), x, (), np.ones(4)) is None
+    assert flow(model, 17, np.linspace(0.0, 8.0, MOST_ALONG + 2), x, (), np.ones(4)) is None
+
+
+@pytest.mark.parametrize("span, t_eval", [((0.0, 10.0), None), ((10.0, 0.0), None), ((0.0, 10.0), [5.0, 10.0])], ids=str)
+def test_neutral_growth_above_ten_takes_no_linearisation(span, t_eval, gallery_model, monkeypatch):
+    """The wheel of Appell and Hamel turns back; its errors grow thirtyfold, but not exponentially."""
+    model = gallery_model("appell-hamel").with_parameters(I_x=0.1125, I_y=0.225)
+    start = model.start(t=span[0], x=0.0, y=0.0, phi=0.0, theta=0.0, dphi=1.0, dtheta=0.5)
+    calls, real = [], simulation.internal_dynamics
+    monkeypatch.setattr(simulation, "internal_dynamics", lambda *a: calls.append(a) or real(*a))
+    run = sv.simulate(model, start, span, t_eval=t_eval)
+    assert growth_bound(model, run) > 10 or t_eval
+    verdict = sv.internal_dynamics(model, run).verdict
+    assert (not calls and verdict == "neutral") or verdict == "unstable"

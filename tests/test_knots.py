@@ -42,6 +42,7 @@ def S9(s):
     return 126 * s**5 - 420 * s**6 + 540 * s**7 - 315 * s**8 + 70 * s**9
 
 
+HUNDRED = [6 * k / 99 for k in range(100)]
 VIA = ([0.5, 1.5, 2.0, 4.0], [0.0, 1.0, 0.5, 2.0])
 SMOOTH = {
     "rest_to_rest": (lambda t, p: move(t), [0, 2]),
@@ -51,6 +52,9 @@ SMOOTH = {
     "trapezoid": (lambda t, p: sv.paths.trapezoid(t, 2.0, 6.0, 1.5, smoothness=4, t_start=1.0), [1, 2.5, 5.5, 7]),
     "spline, rest": (lambda t, p: sv.paths.spline(t, *VIA, smoothness=4), VIA[0]),
     "spline, natural": (lambda t, p: sv.paths.spline(t, *VIA, smoothness=4, ends="natural"), [1.5, 2.0]),
+    "spline through 100 points of a slow departure": (
+        lambda t, p: sv.paths.spline(t, HUNDRED, [4 - 2 * S9(k / 99) for k in range(100)], smoothness=4), HUNDRED
+    ),
     "if_else": (lambda t, p: ca.if_else(t < 3, 0, (t - 3) ** 5), [3]),
     "a window": (lambda t, p: ca.if_else(ca.logic_and(t > 1, t < 2), (t - 1) ** 5 * (2 - t) ** 5, 0), [1, 2]),
     "fabs": (lambda t, p: ca.fabs(t - 1) ** 5, [1]),

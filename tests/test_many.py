@@ -9,6 +9,8 @@ import servoctl as sv
 from servoctl.errors import SpecificationError
 from servoctl.gallery import gallery
 from servoctl.methods import lanes
+from servoctl.model.validity import affirmed, affirmed_each
+from servoctl.reduction.reduce import holds
 from servoctl.simulation import simulated
 
 SEED = 4
@@ -200,3 +202,26 @@ def test_bad_input(changed, kind, facts):
 def test_names_that_are_no_parameters_are_rows():
     many = sv.simulate_many(pendulum(), {"a": 0.1, "da": 0.0}, {"mass": [1.0, 2.0]}, (0.0, 0.1))
     assert list(many["error"]) == ["NameUnknown"] * 2
+
+
+def test_motions_of_a_mechanism_as_given_stay_in_the_lanes(gallery_model, monkeypatch, c_compiler):
+    """Rates that rows determine are judged by what they add to the coordinates, at every tolerance."""
+    scene, model = gallery["appell-hamel"], gallery_model("appell-hamel")
+    start = model.start(**scene.start, guess=scene.guess)
+    in_lanes(monkeypatch)
+    for method in (sv.Taylor(8, rtol=1e-4), sv.Taylor(20, rtol=1e-13, atol=1e-13)):
+        many = sv.simulate_many(model, start, {"M": [4.0, 5.0, 6.0]}, (0.0, 2.0), method)
+        assert list(many["error"]) == [""] * 3
+
+
+def test_derivations_are_affirmed_for_each_set_of_parameters_by_itself(gallery_model):
+    model = gallery_model("appell-hamel")
+    names = list(model.numbers)
+    values = np.tile(model.parameters[:, None], 7)
+    values[names.index("M")] = [5.0, 4.0, -50.0, np.nan, 6.0, 1e-3, 5.5]
+    values[names.index("b"), 4] = 0.0
+    found = affirmed_each(model, values)
+    assert found.tolist() == [True, True, False, False, found[4], found[5], True]
+    assert found.tolist() == [affirmed(model, column) for column in values.T]
+    for column in values[:, found].T:
+        assert holds(model.reduction, column)

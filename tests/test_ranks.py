@@ -10,7 +10,7 @@ from scipy.linalg import qr
 from servoctl.errors import SingularProgram
 from servoctl.jets.identity import spread
 from servoctl.reduction import ranks
-from servoctl.reduction.ranks import clean, combination, decide, decide_all, eliminate, equilibrate
+from servoctl.reduction.ranks import clean, combination, decide, decide_all, eliminate, equilibrate, pivot_order
 from servoctl.reduction.realisation import _independent_columns
 from servoctl.tolerances import EXTENDED, NOISE
 
@@ -231,3 +231,24 @@ def test_a_small_pivot_is_not_taken_for_its_fill_in():
     _, pivots = eliminate(A, ca.SX([1, 2, 3, 4]), chosen[:, :, None])
     values = {f"a{i}_{j}": chosen[i, j] for i in range(4) for j in range(4)}
     assert min(abs(numbers(pivots, values))) > 0.05
+
+
+def test_a_number_is_taken_before_an_expression_that_may_vanish():
+    """Among pivots of the same fill-in, though the other is larger at the points."""
+    a, b, c = (ca.SX.sym(name) for name in "abc")
+    matrix = ca.vertcat(ca.horzcat(a, 1.0), ca.horzcat(b, c))
+    numbers = np.array([[[1.5], [1.0]], [[0.3], [2.0]]])
+    solution, pivots = eliminate(matrix, ca.SX([1.0, 2.0]), numbers)
+    assert pivots[0].is_constant()
+    found = np.array(ca.Function("f", [a, b, c], [solution])(1.5, 0.3, 2.0)).ravel()
+    np.testing.assert_allclose(found, np.linalg.solve(numbers[:, :, 0], [1.0, 2.0]), rtol=1e-14)
+
+
+def test_columns_to_be_solved_for_are_regular_at_all_points():
+    a = ca.SX.sym("a")
+    matrix = ca.horzcat(ca.vertcat(1.0, 0.0), ca.vertcat(a, 1.0), ca.vertcat(2.0, 1.0))
+    numbers = np.array([[[1.0, 1.0], [0.0, 2.0], [2.0, 2.0]], [[0.0, 0.0], [1.0, 1.0], [1.0, 1.0]]])
+    columns = [j for _, j in pivot_order(matrix, numbers)]
+    assert len(columns) == 2 and all(abs(np.linalg.det(numbers[:, columns, i])) > 0.1 for i in range(2))
+    with pytest.raises(SingularProgram):
+        pivot_order(ca.SX([[1.0, 1.0], [1.0, 1.0]]), np.ones((2, 2, 1)))

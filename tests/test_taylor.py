@@ -270,6 +270,20 @@ def test_an_exact_cancellation_is_zero_in_the_size_of_its_terms():
     assert np.all(np.abs(values[1]) > 0.1 * sizes[1])
 
 
+def test_sizes_do_not_grow_along_a_chain_of_rotations():
+    """Errors of components turn with them: a cancellation behind a hundred rotations is zero, a small entry is not."""
+    q = coordinates(" ".join(f"a{i}" for i in range(100)))
+    x, y = ca.SX(1), ca.SX(0)
+    for angle in q:
+        x, y = ca.cos(angle) * x - ca.sin(angle) * y, ca.sin(angle) * x + ca.cos(angle) * y
+    whole = ca.sum1(ca.vertcat(*q))
+    expressions = [x - ca.cos(whole), x, 1e-6 * y]
+    points = np.random.default_rng(9).uniform(-3.0, 3.0, (100, 20)).astype(np.longdouble)
+    values, sizes = evaluate(Tape(list(q), expressions), points)
+    assert np.all(np.abs(values[0]) < 1e-15 * sizes[0]) and np.all(sizes[:2] < 300)
+    assert np.all(np.abs(values[1:]) > 1e-12 * sizes[1:])
+
+
 def growth(expression, q, orders):
     return np.polyfit(np.log(orders), [np.log(operations(q.dt(expression, k))) for k in orders], 1)[0]
 

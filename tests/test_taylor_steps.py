@@ -1,5 +1,6 @@
 """Steps of the Taylor method: their length, compiled and interpreted alike, and jets within them."""
 
+import casadi as ca
 import numpy as np
 import pytest
 
@@ -50,10 +51,10 @@ def test_compiled_and_interpreted_steps_are_the_same(name, span, gallery_model, 
     np.testing.assert_allclose(again[:, : 1 + n_x], log[:, : 1 + n_x], rtol=1e-11, atol=1e-11)
     t = np.linspace(*span, 41)
     k = np.clip(np.searchsorted(abs(log[:, 0] - span[0]), abs(t - span[0]), "right") - 1, 0, len(log) - 2)
-    z, other = f.jets(log, k, t, top + 2), np.empty((model.nq + (top + 2) * model.n, 41))
-    f._interpreter.jets(log, k, t, top + 2, other)
+    z, other = f.jets(log, k, t, p, top + 2), np.empty((model.nq + (top + 2) * model.n, 41))
+    f._interpreter.jets(log, k, t, p, (top + 2, 0), other)
     np.testing.assert_allclose(z, other, rtol=1e-12, atol=1e-12 * np.abs(other).max())
-    ends = f.jets(log, np.arange(len(log) - 1), log[1:, 0], top - 1)
+    ends = f.jets(log, np.arange(len(log) - 1), log[1:, 0], p, top, by_rows=True)[:n_x]
     np.testing.assert_allclose(ends, log[1:, 1 : 1 + n_x].T, rtol=1e-12, atol=1e-12)
 
 
@@ -71,3 +72,138 @@ def test_the_accuracy_of_steps_follows_the_tolerance(gallery_model):
         for rtol in (1e-4, 1e-6, 1e-8):
             error = np.abs(end(rtol) - exact).max() / max(1.0, np.abs(exact).max())
             assert 1e-6 * rtol < error < rtol
+
+
+# rates that rows determine --------------------------------------------------------------------------------------------
+
+
+def trailer():
+    """A car with a trailer, its speed and its turning as programs: rows of order 1 determine all velocities."""
+    q = sv.coordinates("x y theta alpha")
+    (x, y, theta, alpha), (dx, dy, dtheta, _) = q, q.d(1)
+    p = sv.parameters(m=10.0, M=5.0, I=1.0, J=0.7, L=1.2)
+    behind = x - p.L * ca.cos(alpha), y - p.L * ca.sin(alpha)
+    S = sv.particle(q, p.m, (x, y)) + sv.particle(q, p.M, behind) + p.I * q.d(2)[2] ** 2 / 2 + p.J * q.d(2)[3] ** 2 / 2
+    wheels = {
+        "car": dy * ca.cos(theta) - dx * ca.sin(theta),
+        "trailer": q.dt(behind[1]) * ca.cos(alpha) - q.dt(behind[0]) * ca.sin(alpha),
+    }
+    program = {"speed": dx * ca.cos(theta) + dy * ca.sin(theta) - 1.0, "turn": dtheta - 0.5 * ca.sin(q.t)}
+    model = sv.derive(sv.Mechanism(q, gibbs=S, parameters=p, constraints=wheels), sv.Program(program, by="ideal"))
+    return model, model.start(x=0.0, y=0.0, theta=0.1, alpha=0.3)
+
+
+def sled():
+    """A blade that turns through all directions: the entries of its row vanish in turn."""
+    q = sv.coordinates("x y theta")
+    (x, y, theta), (dx, dy, dtheta) = q, q.d(1)
+    p = sv.parameters(m=2.0, I=0.3)
+    S = sv.particle(q, p.m, (x, y)) + p.I * q.d(2)[2] ** 2 / 2
+    blade = {"blade": dy * ca.cos(theta) - dx * ca.sin(theta)}
+    mechanism = sv.Mechanism(q, gibbs=S, potential=2 * p.m * x, parameters=p, constraints=blade)
+    model = sv.derive(mechanism, sv.Program({"turn": dtheta - 1.0}, by="ideal"))
+    return model, model.start(x=0.0, y=0.0, theta=0.1, dx=1.0)
+
+
+def driven():
+    """A row that depends on time, of particles on springs."""
+    q = sv.coordinates("x y")
+    (x, y), (dx, dy) = q, q.d(1)
+    p = sv.parameters(m=1.0, k=4.0, c=0.7)
+    row = {"drive": dx - p.c * ca.sin(3 * q.t) * dy - ca.cos(q.t)}
+    mechanism = sv.Mechanism(q, gibbs=sv.particle(q, p.m, (x, y)), potential=p.k * (x**2 + y**2) / 2, parameters=p)
+    model = sv.derive(mechanism, sv.Program(row, by="ideal"))
+    return model, model.start(x=0.1, y=0.2, dy=1.0)
+
+
+def bead():
+    """A bead on a circle, given by its position, that moves a driven mass: a row of order 0, and a change of pivots."""
+    q = sv.coordinates("x y s")
+    (x, y, s), p = q, sv.parameters(m=1.0, l=1.0)
+    S = sv.particle(q, p.m, (x, y)) + q.d(2)[2] ** 2 / 2
+    rod = {"rod": x**2 + y**2 - p.l**2}
+    potential = 9.81 * p.m * y + 2 * s**2 + x * s
+    mechanism = sv.Mechanism(q, gibbs=S, potential=potential, parameters=p, constraints=rod)
+    model = sv.derive(mechanism, sv.Program({"drive": q.d(1)[2] - 0.3 * ca.cos(q.t)}, by="ideal"))
+    return model, model.start(x=0.6, s=0.1, dx=0.5, guess={"y": -0.8})
+
+
+def disc(by_hand):
+    """A disc that rolls down a slope; by hand its rolling is a choice of quasi-velocities."""
+    q, p = sv.coordinates("x y psi phi"), sv.parameters(m=1.0, R=0.5, I=0.2, J=0.125)
+    x, y, psi, _ = q
+    if by_hand:
+        V = [[0, p.R * ca.cos(psi)], [0, p.R * ca.sin(psi)], [1, 0], [0, 1]]
+        q = q.with_quasi_velocities("w_psi w_phi", V)
+        turn, (dw_psi, dw_phi) = q.w(0)[0], q.w(1)
+        S, rolling = (p.I * dw_psi**2 + (p.J + p.m * p.R**2) * dw_phi**2) / 2, {}
+        velocities = {"w_phi": 1.5}
+    else:
+        dx, dy, turn, dphi = q.d(1)
+        S = sv.particle(q, p.m, (x, y)) + p.I * q.d(2)[2] ** 2 / 2 + p.J * q.d(2)[3] ** 2 / 2
+        rolling = {"along": dx - p.R * dphi * ca.cos(psi), "across": dy - p.R * dphi * ca.sin(psi)}
+        velocities = {"dphi": 1.5}
+    mechanism = sv.Mechanism(q, gibbs=S, potential=-p.m * x, parameters=p, constraints=rolling)
+    model = sv.derive(mechanism, sv.Program({"turn": turn - 0.8}, by="ideal"))
+    return model, model.start(x=0.0, y=0.0, psi=0.2, phi=0.0, **velocities)
+
+
+@pytest.mark.parametrize("scene", [trailer, sled, driven, bead])
+def test_rates_that_rows_determine_satisfy_them_to_rounding(scene, rtol=1e-7):
+    model, start = scene()
+    t = np.linspace(0.0, 2.5, 23)
+    run = simulated(model, start, (0.0, 2.5), sv.Taylor(rtol=rtol, atol=rtol), t_eval=t)
+    exact = simulated(model, start, (0.0, 2.5), sv.Adaptive("DOP853", rtol=1e-12, atol=1e-13), t_eval=t)
+    n_x = len(start.values)
+    size = np.abs(exact.jets[:n_x]).max()
+    np.testing.assert_allclose(run.jets[:n_x], exact.jets[:n_x], rtol=0.0, atol=10 * rtol * size)
+    for name, row in model.reduction.original.items():
+        first = 1 if row.order == 0 else 0  # positions are integrated, and their rates follow from the row with them
+        left = np.abs(run.residual[name][first:]).max()
+        by_rows = first == 0 and not run.counters.get("pivot_changes")  # pivots of definite matrices determine no rates
+        assert left < (1e-13 if by_rows else 10 * rtol) * max(1.0, np.abs(run.jets).max()), name
+
+
+def test_a_mechanism_as_given_takes_the_steps_of_one_reduced_by_hand():
+    """Rates that rows determine neither drift nor set the length of steps."""
+    steps, ends = [], []
+    for by_hand in (False, True):
+        model, start = disc(by_hand)
+        run = simulated(model, start, (0.0, 8.0), sv.Taylor(12, rtol=1e-8, atol=1e-8), t_eval=[8.0])
+        steps.append(run.counters["steps"])
+        ends.append([run[name][-1] for name in ("x", "y", "psi", "phi")])
+    assert steps[0] <= steps[1]
+    np.testing.assert_allclose(*ends, rtol=0.0, atol=1e-7)
+
+
+def test_a_motion_without_change_takes_one_step():
+    """All coefficients vanish but that of the speed, for 1e9 s."""
+    q = sv.coordinates("x y")
+    x, y = q
+    program = sv.Program({"rest": y}, by="ideal")
+    model = sv.derive(sv.Mechanism(q, gibbs=sv.particle(q, 1.0, (x, y))), program, keep=["x"])
+    run = simulated(model, model.start(x=0.0, dx=2.0), (0.0, 1e9), sv.Taylor(8, rtol=1e-6), t_eval=[1e9])
+    assert run.counters["steps"] == 1 and run["x"][-1] == 2e9
+
+
+def test_what_rates_do_between_states_is_seen():
+    """A pulse in a rate that the program prescribes, 0.05 s wide, at an instant far from the start."""
+    q = sv.coordinates("x y")
+    x, y = q
+    mechanism = sv.Mechanism(q, gibbs=sv.particle(q, 1.0, (x, y)), potential=0.5 * y**2)
+    speed = 1.0 + ca.exp(-((20 * (q.t - 3.0)) ** 2))
+    model = sv.derive(mechanism, sv.Program({"speed": q.d(1)[0] - speed}, by="ideal"), keep=["y"])
+    method = sv.Taylor(rtol=1e-9, atol=1e-9)
+    run = simulated(model, model.start(x=0.0, y=1.0, dy=0.0), (0.0, 6.0), method, t_eval=[6.0])
+    assert run["x"][-1] == pytest.approx(6.0 + np.sqrt(np.pi) / 20, abs=1e-7)
+
+
+@pytest.mark.parametrize("scene", [trailer, sled])
+def test_interpreted_samples_satisfy_the_rows(scene, c_compiler):
+    model, start = scene()
+    f, top, p = series_loop(model, 12), model.reduction.top, np.append(model.parameters, 0.5)
+    log = f.taylor(0.0, start.values, 1.0, p, 1e-6, 1e-6, 100)
+    k, t, n_x = np.zeros(5, dtype=int), np.linspace(0.0, log[1, 0], 5), len(start.values)
+    z, other = f.jets(log, k, t, p, top + 1, by_rows=True), np.empty((model.nq + (top + 1) * model.n, 5))
+    f._interpreter.jets(log, k, t, p, (top + 1, n_x + model.n), other)
+    np.testing.assert_allclose(z, other, rtol=1e-12, atol=1e-12)

@@ -7,18 +7,20 @@ values have the same divisor, such as a pivot, they are multiplied with its reci
 eight products. This rounds twice instead of once.
 """
 
-import math
 from collections import Counter
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import chain, count
 
 import casadi as ca
 
-from servoctl.codegen.loops import CONSTANTS, INLINE_SINES, LOOPS
+from servoctl.codegen.loops import CONSTANTS, INLINE_SINES, LOOPS, PHASED
+from servoctl.codegen.tables import Entry, Row, literal, tabulated
+from servoctl.jets.pieces import Constant
 
 CHUNK = 350  # statements per C function: compile time is least, and flat, between 250 and 500
 WIDE = 3000  # operations: up to here a function is emitted for eight points at once as well
 SHARED = 2  # divisions by the same value: from here on they become products with its reciprocal
+PHASES = ("instant", "correction", "rest")  # of t and p alone; for a Newton correction; for the other outputs
 SCALAR_FASTER = '#pragma GCC optimize("no-tree-slp-vectorize")\n'  # pairs of terms of a series cost more to gather
 
 _ARITHMETIC = {
@@ -98,6 +100,8 @@ class Dialect:
 
     def expression(self, operation, operands):
         """C text of an operation on operands."""
+        if isinstance(operation, (Row, Entry)):
+            return operation.text(self.prefix, *operands)
         if operation in _ARITHMETIC:
             return _ARITHMETIC[operation].format(*operands, one=self.constant(1.0), two=self.constant(2.0))
         name, n = _ELEMENTARY[operation]
@@ -128,9 +132,8 @@ LANES_COMMON = Dialect("W", "ALL({})", "w_", common=True, linkage="static ")
 
 
 def operations(f):
-    """Number of arithmetic instructions of an SX function: all but constants, inputs, outputs and copies."""
-    instructions = ((f.instruction_id(k), f.instruction_input(k)) for k in range(f.n_instructions()))
-    return sum(code not in _NOT_ARITHMETIC and not _copies(code, source) for code, source in instructions)
+    """Number of arithmetic operations of an SX function in C: all but constants, inputs, outputs and copies."""
+    return sum(isinstance(target, int) for target, _, _ in tabulated(_statements(f, SCALAR))[0])
 
 
 def _copies(operation, source):
@@ -143,6 +146,7 @@ def emit(f, name, loops=(), *, project=None, others=None, sizes=None, wide=True,
 
     The unit defines ``void name(double t, const double *x, const double *p, double *y)`` (``y`` overlaps no input),
     ``name_point``, ``name_grid``, ``name_casadi`` in the form that CasADi calls, and the functions of each loop's file.
+    For loops in `PHASED` also ``name_instant``, ``name_correction`` and ``name_rest``; see `phases`.
 
     Parameters
     ----------
@@ -171,16 +175,22 @@ def emit(f, name, loops=(), *, project=None, others=None, sizes=None, wide=True,
     dialect = SCALAR_INLINE if INLINE_SINES.intersection(loops) else SCALAR
     scalar = {name: f} | ({} if project is None else {f"{name}_project": project})
     scalar |= {f"{name}_{key}": other for key, other in (others or {}).items()}
-    parts = [function(other, key, dialect, chunk) for key, other in scalar.items()]
+    step = f.numel_in(1) if "newton" in loops else 0
+
+    def emitted(f, name, dialect):
+        return phases(f, name, step, dialect, chunk) if f is phased else function(f, name, dialect, chunk)
+
+    phased = f if PHASED.intersection(loops) else None
+    parts = [emitted(other, key, dialect) for key, other in scalar.items()]
     wide = wide and operations(f) <= WIDE
     if wide:
-        copies = {f"{name}_wide": f} | ({f"{name}_wide_step": _first(f, f.numel_in(1))} if "newton" in loops else {})
-        parts += [include("lanes.h"), *(function(copy, key, WIDE_LANES, chunk) for key, copy in copies.items())]
+        parts += [include("lanes.h"), emitted(f, f"{name}_wide", WIDE_LANES)]
     constants = {"NAME": name, "NX": f.numel_in(1), "NP": f.numel_in(2), "NY": f.numel_out(0)}
     constants |= {"PROJECTED": ""} if project is not None else {}
     constants |= {"WIDE": ""} if wide else {}
     constants |= {"PIVOTS": 0} if "newton" in loops else {}
-    constants |= {key.upper(): int(value) for key, value in (sizes or {}).items()}
+    constants |= {"SETTLED": ""} if "settled" in (others or {}) else {}
+    constants |= definitions(sizes or {})
     files = ["grid.c", *(f"{loop}.c" for loop in LOOPS if loop in loops)]
     return "".join((SCALAR_FASTER if "taylor" in loops else "", unit(constants), *parts, *map(include, files)))
 
@@ -197,53 +207,79 @@ def unit(constants):
     return "".join(("#include <math.h>\n#include <stdint.h>\n", *lines, include("unit.h")))
 
 
+def definitions(sizes):
+    """Constants of loops by their names in C: numbers, and tuples of numbers as initialisers."""
+    return {
+        key.upper(): "{" + ", ".join(map(str, value)) + "}" if isinstance(value, tuple) else int(value)
+        for key, value in sizes.items()
+    }
+
+
 def include(name):
     """C line that includes a file."""
     return f'#include "{name}"\n'
 
 
-def _first(f, n):
-    inputs = f.sx_in()
-    return ca.Function(f.name(), inputs, [f(*inputs)[:n]])
-
-
 def function(f, name, dialect=SCALAR, chunk=CHUNK):
     """C text of one function y = f(t, x, p), cut into chunks of at most `chunk` statements."""
-    statements = _statements(f, dialect) if dialect.exact else _with_reciprocals(_statements(f, dialect))
-    chunks = [statements[k : k + chunk] for k in range(0, len(statements), chunk)]
-    if len(chunks) > 1:
-        return _chunked(name, chunks, dialect)
-    return dialect.head(name) + "".join(_line(statement, dialect) for statement in statements) + "}\n"
+    statements, tables = _prepared(f, dialect)
+    chunks = _cut(statements, chunk)
+    if len(chunks) == 1:
+        return "".join((*tables, dialect.head(name), *(_line(s, dialect) for s in statements), "}\n"))
+    names = [f"{name}_{here}" for here in range(len(chunks))]
+    text, size = _sharing(names, chunks, [0] * len(chunks), dialect)
+    return "".join(tables) + text + dialect.head(name) + f"    {dialect.number} w[{size}];\n" + _calls(names) + "}\n"
+
+
+def phases(f, name, step, dialect=SCALAR, chunk=CHUNK):
+    """C text of one function y = f(t, x, p) in phases, which share a vector w of ``WORK`` numbers.
+
+    ``name_instant`` computes what depends on t and p alone, ``name_correction`` the first `step` outputs, ``name_rest``
+    the others. At one instant, corrections of several x may precede the rest, which completes the last one.
+    """
+    statements, tables = _prepared(f, dialect)
+    parts = [_cut(part, chunk) for part in _by_phase(statements, step)]
+    wholes = [f"{name}_{phase}" for phase in PHASES]
+    names = [[f"{w}_{k}" for k in range(len(c))] if len(c) > 1 else [w] for w, c in zip(wholes, parts, strict=True)]
+    of = [k for k, chunks in enumerate(parts) for _ in chunks]
+    text, size = _sharing(list(chain(*names)), list(chain(*parts)), of, dialect)
+    static = replace(dialect, linkage="static ")
+    for whole, some in zip(wholes, names, strict=True):
+        text += static.head(whole, work=True) + _calls(some) + "}\n" if len(some) > 1 else ""
+    all_three = dialect.head(name) + f"    {dialect.number} w[WORK];\n" + _calls(wholes) + "}\n"
+    return f"{''.join(tables)}\n#define WORK {size}\n{text}{all_three}"
 
 
 def function_of_several(f, name, dialect, suffixes):
     """C text of y = f(t, x, p) for each suffix of x, p, y, with alternating statements: the processor overlaps them."""
-    copies = [_with_reciprocals(_statements(f, dialect, suffix)) for suffix in suffixes]
+    copies, tables = zip(*(_prepared(f, dialect, suffix) for suffix in suffixes), strict=True)
     lines = (
         _line(statement, dialect, f"a{suffix}_")
         for statements in zip(*copies, strict=True)
         for suffix, statement in zip(suffixes, statements, strict=True)
     )
-    return dialect.head(name, suffixes) + "".join(lines) + "}\n"
+    return "".join((*tables[0], dialect.head(name, suffixes), *lines, "}\n"))
 
 
-def literal(value):
-    """A number as C text, exactly."""
-    if math.isnan(value):
-        return "NAN"
-    text = "INFINITY" if math.isinf(value) else repr(abs(value))
-    return f"(-{text})" if math.copysign(1.0, value) < 0 else text
+def _prepared(f, dialect, suffix=""):
+    """The statements of a function, with lookups and reciprocals, and C texts of what the lookups need."""
+    statements, tables = tabulated(_statements(f, dialect, suffix))
+    header = [include("table_lanes.h" if dialect.prefix else "table.h")] if tables else []
+    return statements if dialect.exact else _with_reciprocals(statements), [*header, *tables]
 
 
 def _statements(f, dialect, suffix=""):
-    """Single assignments (target, operation, operands); values are numbered, inputs and outputs are C text."""
+    """Single assignments (target, operation, operands).
+
+    Values are numbered; inputs and outputs are C text.
+    """
     register, statements, values = {}, [], 0
     for k in range(f.n_instructions()):
         operation, source, target = f.instruction_id(k), f.instruction_input(k), f.instruction_output(k)
         if operation == ca.OP_INPUT:
             register[target[0]] = dialect.operand("txp"[source[0]], source[1], suffix)
         elif operation == ca.OP_CONST:
-            register[target[0]] = dialect.constant(f.instruction_constant(k))
+            register[target[0]] = Constant(f.instruction_constant(k))
         elif operation == ca.OP_OUTPUT:
             statements.append((f"y{suffix}[{target[1]}]", ca.OP_ASSIGN, (register[source[0]],)))
         elif _copies(operation, source):
@@ -258,7 +294,7 @@ def _statements(f, dialect, suffix=""):
 def _with_reciprocals(statements):
     """The statements, with products by a reciprocal where `SHARED` or more divisions have the same divisor."""
     divisors = Counter(operands[1] for _, operation, operands in statements if operation == ca.OP_DIV)
-    new = count(len(statements))
+    new = count(1 + max((target for target, _, _ in statements if isinstance(target, int)), default=0))
     reciprocal = {v: next(new) for v, n in divisors.items() if n >= SHARED and isinstance(v, int)}
     result, computed = [], set()
     for target, operation, operands in statements:
@@ -275,22 +311,53 @@ def _with_reciprocals(statements):
 def _line(statement, dialect, value="a"):
     """C line of a statement; a value's name is a letter and its number."""
     target, operation, operands = statement
-    text = dialect.expression(operation, [v if isinstance(v, str) else f"{value}{v}" for v in operands])
+    text = dialect.expression(operation, [_operand_text(v, dialect, value) for v in operands])
     place = target if isinstance(target, str) else f"const {dialect.number} {value}{target}"
     return f"    {place} = {text};\n"
 
 
-def _chunked(name, chunks, dialect):
-    """C text of a function that calls its chunks, which share a work vector w."""
+def _by_phase(statements, step):
+    """The statements of each of the `PHASES`, in order; outputs are written by the step or the rest."""
+    moving, needed = set(), {f"y[{k}]" for k in range(step)}
+    for target, _, operands in statements:
+        if isinstance(target, str) or any(v in moving or str(v).startswith("x") for v in operands):
+            moving.add(target)
+    for target, _, operands in reversed(statements):
+        if target in needed:
+            needed.update(operands)
+    phase = [0 if s[0] not in moving else 1 if s[0] in needed else 2 for s in statements]
+    return [[s for s, k in zip(statements, phase, strict=True) if k == here] for here in range(len(PHASES))]
+
+
+def _cut(statements, chunk):
+    """The statements in chunks, at least one."""
+    return [statements[k : k + chunk] for k in range(0, max(len(statements), 1), chunk)]
+
+
+def _calls(names):
+    return "".join(f"    {name}(t, x, p, y, w);\n" for name in names)
+
+
+def _operand_text(operand, dialect, value):
+    """C text of an operand."""
+    if isinstance(operand, Constant):
+        return dialect.constant(operand.value)
+    return operand if isinstance(operand, str) else f"{value}{operand}"
+
+
+def _sharing(names, chunks, of, dialect):
+    """C text of functions, one for each chunk, that share a work vector w, and its length.
+
+    `of` are the phases of the chunks: a function that is the only one of its phase may be inlined.
+    """
     home = {target: here for here, chunk in enumerate(chunks) for target, _, _ in chunk if isinstance(target, int)}
-    slots, n_slots = _slots(chunks, home)
-    functions = (
-        f"{dialect.head(f'{name}_{here}', work=True)}{_chunk(chunk, slots, home, here, dialect)}}}\n"
-        for here, chunk in enumerate(chunks)
+    slots, n_slots = _slots(chunks, home, of)
+    text = "".join(
+        f"{(replace(dialect, linkage='static ') if of.count(k) == 1 else dialect).head(name, work=True)}"
+        f"{_chunk(chunk, slots, home, here, dialect)}}}\n"
+        for here, (name, chunk, k) in enumerate(zip(names, chunks, of, strict=True))
     )
-    calls = (f"    {name}_{here}(t, x, p, y, w);\n" for here in range(len(chunks)))
-    work = f"    {dialect.number} w[{n_slots + 1}];\n"
-    return "".join(chain(functions, [dialect.head(name), work], calls, ["}\n"]))
+    return text, n_slots + 1
 
 
 def _chunk(statements, slots, home, here, dialect):
@@ -308,12 +375,18 @@ def _chunk(statements, slots, home, here, dialect):
     return "".join(lines)
 
 
-def _slots(chunks, home):
-    """Index in w of each value that outlives its chunk; it is free again after the last chunk that reads the value."""
-    last = {
-        v: here for here, chunk in enumerate(chunks) for _, _, operands in chunk for v in operands if isinstance(v, int)
-    }
-    expiring, free, slots, n_slots = [[] for _ in chunks], [], {}, 0
+def _slots(chunks, home, of):
+    """Index in w of each value that outlives its chunk, and the number of indices.
+
+    An index is free again after the last chunk that reads the value, unless that is of another phase, which may be
+    repeated.
+    """
+    last = {}
+    for here, chunk in enumerate(chunks):
+        for v in chain.from_iterable(operands for _, _, operands in chunk):
+            if isinstance(v, int):
+                last[v] = here if of[here] == of[home[v]] else len(chunks)
+    expiring, free, slots, n_slots = [[] for _ in range(len(chunks) + 1)], [], {}, 0
     for here, chunk in enumerate(chunks):
         free += expiring[here - 1] if here else []
         for target, _, _ in chunk:

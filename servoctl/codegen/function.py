@@ -41,10 +41,11 @@ def compiled(f, name, loops=(), project=None, others=None, sizes=None):
         SX function (t, x, p) -> change of x that restores invariants; loops may call it after their steps.
     others : dict of str to casadi.Function, optional
         Further functions of the same form in the same library, called by `Compiled.native`.
-    sizes : dict of str to int, optional
+    sizes : dict of str to int or tuple of int, optional
         Constants of the loops. That of "newton": the number of "pivots" (default: 0). Those of "taylor": the numbers
         of coordinates "nq" and of quasi-velocities "n", the order s̄ "top", the highest index of coefficients "last",
-        and "plain" (1 if q' = γ', else 0).
+        "plain" (1 if q' = γ', else 0), and, beside a function "settled" of `others`, (t, x, p) -> (x, γ^(s̄)),
+        "free": a tuple of 0 for each entry of γ', ..., γ^(s̄-1) that this function gives, of 1 for those integrated.
 
     Returns
     -------
@@ -131,6 +132,8 @@ class Compiled:
         Numbers of states, parameters and outputs.
     loops : tuple of str
         Loops that it can run.
+    others : dict of str to casadi.Function
+        Further functions in the same library.
     sizes : dict of str to int
         Constants of the loops.
     expression : casadi.Function
@@ -139,15 +142,15 @@ class Compiled:
 
     def __init__(self, f, name, loops, project=None, others=None, sizes=None):
         self.name, self.loops, self._project = name, loops, project
-        self._others, self.sizes = others or {}, sizes or {}
+        self.others, self.sizes = others or {}, sizes or {}
         self.n_x, self.n_p, self.n_y = f.numel_in(1), f.numel_in(2), f.numel_out(0)
         self.expression, self._symbol = f, f"servoctl_{name}"
         self._x_shape, self._p_shape = (self.n_x,), (self.n_p,)
-        self._interpreter = Interpreter(f, project, self.sizes)
+        self._interpreter = Interpreter(f, project, self.sizes, self.others.get("settled"))
         self._text, self._builtin, self._calls = None, None, 0
 
     def __reduce__(self):
-        parts = (self.expression, self.name, self.loops, self._project, self._others, self.sizes)
+        parts = (self.expression, self.name, self.loops, self._project, self.others, self.sizes)
         # Emitting takes longer than reading: the C text travels until the library is loaded, where it can be compiled.
         travels = self.loops and "_library" not in self.__dict__ and compiler.compiler() is not None
         return Compiled, parts, {"_text": self.source() if travels else None}
@@ -420,7 +423,7 @@ class Compiled:
         every = project_every if self._project is not None else 0
         return self._library.taylor(t1, rtol, atol, every, max_steps)
 
-    def jets(self, log, k, t, levels):
+    def jets(self, log, k, t, p, levels, by_rows=False):
         """The jets q, γ', ..., γ^(levels) at instants within the steps of `taylor`.
 
         Parameters
@@ -431,8 +434,13 @@ class Compiled:
             Steps, 0 .. S - 1.
         t : (N,) array
             Times [s].
+        p : (n_p,) array
+            Parameters, SI.
         levels : int
             Below ``sizes["last"]``.
+        by_rows : bool
+            Whether "settled" gives the rates up to γ^(s̄), if there is one; levels must then include them. Not where a
+            pivot may vanish.
 
         Returns
         -------
@@ -440,7 +448,9 @@ class Compiled:
         """
         k, t = np.ascontiguousarray(k, dtype=np.int64), np.ascontiguousarray(t, dtype=float)
         z = np.empty((self.sizes["nq"] + levels * self.sizes["n"], t.size))
-        self._library.jets(np.ascontiguousarray(log), k, t, levels, z)
+        p = self._array("p", p, self._p_shape)
+        settled = (self.n_x + self.sizes["n"]) * by_rows
+        self._library.jets(np.ascontiguousarray(log), k, t, p, (levels, settled), z)
         return z
 
     def restore(self, t, x, p):
@@ -508,7 +518,7 @@ class Compiled:
     def source(self):
         """C text of the library."""
         if self._text is None:
-            parts = {"project": self._project, "others": self._others, "sizes": self.sizes}
+            parts = {"project": self._project, "others": self.others, "sizes": self.sizes}
             self._text = emit.emit(self.expression, self._symbol, self.loops, **parts, wide="newton" in self.loops)
         return self._text
 

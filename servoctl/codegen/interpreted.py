@@ -4,7 +4,7 @@ import ctypes
 import functools
 import threading
 from itertools import pairwise
-from math import perm
+from math import ldexp, perm
 
 import numpy as np
 
@@ -16,6 +16,7 @@ from servoctl.codegen.loops import (
     FOLLOWED,
     LAST_TERM,
     QUADRATIC,
+    REST,
     ROUNDING,
     SHORTEST,
     STEADY,
@@ -73,8 +74,8 @@ class Interpreter:
 
     backend = "casadi"
 
-    def __init__(self, f, project=None, sizes=None):
-        self._f, self._n_x, self._project, self._sizes = f, f.numel_in(1), project, sizes
+    def __init__(self, f, project=None, sizes=None, settled=None):
+        self._f, self._n_x, self._project, self._sizes, self._settled = f, f.numel_in(1), project, sizes, settled
         self.workspace = Workspace(self._n_x, f.numel_in(2), f.numel_out(0), self._connect)
 
     def _connect(self, row, parts):
@@ -145,17 +146,21 @@ class Interpreter:
         nq, n, top, last, plain = (self._sizes[key] for key in ("nq", "n", "top", "last", "plain"))
         start, n_x = self.workspace.start.copy(), self._n_x
         t, x, p, rows = start[0], start[1 : 1 + n_x], start[1 + n_x :], []
+        free = np.array(self._sizes.get("free", [1] * (n_x - nq)), dtype=bool).reshape(top - 1, n)
         while True:
-            end = np.concatenate([[t], x, np.zeros(len(self.workspace.row[3]))])
             if len(rows) == max_steps or t == t1:
+                x = self._settle(t, x, p)
                 break
             y = self._value(t, x, p)
             of_q = y[: nq * last].reshape(last, nq)
             c = of_q if plain else y[nq * last : (nq + n) * last].reshape(last, n)
-            of_rates = x[nq:].reshape(top - 1, n)
-            h = 2.0 ** min(longest(x[None, :nq], of_q, 0, rtol, atol), longest(of_rates, c, 1, rtol, atol))
+            levels = zip(x[nq:].reshape(top - 1, n), free, strict=True)
+            of_rates = (longest(level[i], c[:, i], j, rtol, atol) for j, (level, i) in enumerate(levels, 1))
+            h = rough_exp2(min(longest(x[:nq], of_q, 0, rtol, atol), *of_rates))
             if not h > 1e-13 * (1 + abs(t)):
+                x = self._settle(t, x, p)
                 break
+            x[nq:][~free.ravel()] = np.concatenate([jet(c, j, 0.0) for j in range(1, top)])[~free.ravel()]
             ends = h >= abs(t1 - t) * (1 - 1e-12)
             h = t1 - t if ends else np.copysign(h, t1 - t)
             following = np.concatenate([x[:nq] + jet(of_q, 0, h), *(jet(c, j, h) for j in range(1, top))])
@@ -164,12 +169,13 @@ class Interpreter:
             rows.append(np.concatenate([[t], x, y]))
             t, x = t1 if ends else t + h, following
             if every and len(rows) % every == 0:
-                x = self._restore(t, x, p)
-        return np.array([*rows, end])
+                x = self._restore(t, self._settle(t, x, p), p)
+        return np.array([*rows, np.concatenate([[t], x, np.zeros(len(self.workspace.row[3]))])])
 
-    def jets(self, log, k, t, levels, z):
+    def jets(self, log, k, t, p, counts, z):
         """Fill z with the jets at times t in the steps k of a log; see `Compiled.jets`."""
         nq, n, last, plain = (self._sizes[key] for key in ("nq", "n", "last", "plain"))
+        levels, settled = counts
         x, y = log[k, 1 : 1 + nq], log[k, 1 + self._n_x :]
         of_q = y[:, : nq * last].reshape(-1, last, nq)
         c = of_q if plain else y[:, nq * last : (nq + n) * last].reshape(-1, last, n)
@@ -177,6 +183,18 @@ class Interpreter:
         z[:nq] = (x + jet(of_q, 0, h)).T
         for j in range(1, levels + 1):
             z[nq + (j - 1) * n : nq + j * n] = jet(c, j, h).T
+        if settled and self._settled is not None:
+            rows = np.empty((self._settled.numel_out(0), t.size))
+            self._settling.grid(t, z[: self._n_x], p, rows)
+            z[:settled] = rows[:settled]
+
+    @functools.cached_property
+    def _settling(self):
+        return Interpreter(self._settled)
+
+    def _settle(self, t, x, p):
+        """The state with the rates that rows determine."""
+        return x if self._settled is None else self._settling._value(t, x, p)[: self._n_x]
 
     def _restore(self, t, x, p):
         return restored(self._project, t, x, p)
@@ -270,20 +288,24 @@ def rough_log2(a):
     return (bits >> 52) - 1023.0 + f * (1.0 + BEND - BEND * f)
 
 
-def longest(levels, c, first, rtol, atol):
-    """log2 of the step at which the last term meets the tolerance, if terms grow as the fastest of four of them.
+def rough_exp2(a):
+    """Its inverse, as in taylor.c."""
+    whole, f = divmod(min(max(a, -1022.0), REST), 1.0)
+    return ldexp(1.0 + f * (1.0 - BEND + BEND * f), int(whole))
 
-    `levels` are consecutive levels of the state from `first` on, c (last, n) their Taylor coefficients.
+
+def longest(level, c, j, rtol, atol):
+    """log2 of the step at which the last term of a level j of the state is in tolerance; c (last, n) are coefficients.
+
+    Terms are taken to grow as the fastest of four of them.
     """
-    last, shortest = len(c), np.inf
-    for j, level in enumerate(levels, first):
-        k = np.array([last, last - 1, last // 2 + 1, last // 2])
-        k = k[k > j]
-        falling = np.prod([k - m + 0.0 for m in range(j)], axis=0) if j else np.ones(len(k))
-        scale = rough_log2(atol / rtol + np.abs(level).max(initial=0.0))
-        terms = rough_log2(np.abs(c[k - 1]).max(axis=1, initial=0.0)) + rough_log2(falling)
-        shortest = np.min(np.log2(LAST_TERM * rtol) / (last - j) + (scale - terms) / (k - j), initial=shortest)
-    return shortest
+    last = len(c)
+    k = np.array([last, last - 1, last // 2 + 1, last // 2])
+    k = k[k > j]
+    falling = np.prod([k - m + 0.0 for m in range(j)], axis=0) if j else np.ones(len(k))
+    scale = rough_log2(atol / rtol + np.abs(level).max(initial=0.0))
+    terms = rough_log2(np.abs(c[k - 1]).max(axis=1, initial=0.0)) + rough_log2(falling)
+    return np.min(np.log2(LAST_TERM * rtol) / (last - j) + (scale - terms) / (k - j), initial=np.inf)
 
 
 def _distance(x, other):

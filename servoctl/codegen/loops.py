@@ -14,6 +14,7 @@ STEADY = 0.25  # smallest ratio of a pivot to itself in a step: none is jumped o
 SHORTEST = 2.0**-32  # of the longest step in a piece: the path ends where a shorter one would be needed
 TERMS = 4  # coefficients of a Taylor series whose growth gives the step: two even ones and two odd ones
 LAST_TERM = 0.1  # of the tolerance, at the end of a step: the terms that are left out and earlier errors add to it
+REST = 1000  # log2 of the longest step of a Taylor series [s]
 BEND = 0.344  # of the parabola in place of log2 between powers of two
 
 CONSTANTS = {  # that C needs by name
@@ -28,10 +29,12 @@ CONSTANTS = {  # that C needs by name
     "TERMS": TERMS,
     "LAST_TERM": LAST_TERM,
     "BEND": BEND,
+    "REST": REST,
 }
 
 LOOPS = ("rk", "newton", "taylor", "radau", "closed", "law")  # files of these names; rk.c defines NAME_rk
 INLINE_SINES = {"radau", "closed", "law"}  # loops with inlined sin and cos, within 2 units in the last place
+PHASED = frozenset({"rk", "newton", "radau"})  # loops that evaluate at one instant again and again
 
 SOURCES = Path(__file__).with_name("c")
 

@@ -68,10 +68,10 @@ class Library:
         run.restype = ctypes.c_int64
         return run
 
-    def jets(self, log, k, t, levels, z):
+    def jets(self, log, k, t, p, counts, z):
         """Fill z with the jets at times t in the steps k of a log; see `Compiled.jets`."""
-        size, levels = ctypes.c_int64(t.size), ctypes.c_int64(levels)
-        self.native("taylor_jets")(pointer(log), size, pointer(k), pointer(t), levels, pointer(z))
+        size, (levels, settled) = ctypes.c_int64(t.size), map(ctypes.c_int64, counts)
+        self.native("taylor_jets")(pointer(log), size, pointer(k), pointer(t), pointer(p), levels, settled, pointer(z))
 
     def continuation(self, cuts, x0, p, longest, nodes):
         """Fill rows of nodes; return their number and that of evaluations. See `Compiled.continuation`."""

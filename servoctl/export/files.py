@@ -212,6 +212,8 @@ def _enum(name, array):
 
 
 def _source(name, contents):
+    functions = "".join(emit.function(f, key, emit.PORTABLE) for key, f in contents.functions.items())
+    table = emit.include("table.h")
     inverse = any(emit.contains(f, ca.OP_ERFINV) for f in contents.functions.values())
     sources = resources.files("servoctl.export") / "sources"
     parts = [
@@ -220,7 +222,7 @@ def _source(name, contents):
         *(f"#define {key} {emit.literal(value)}\n" for key, value in contents.sizes.items()),
         *(f"\n{c.declaration(name)} = {c.text};\n" for c in contents.constants),
         f"\n{source('inverse_erf.h')}" if inverse else "",
-        *(emit.function(f, key, emit.PORTABLE) for key, f in contents.functions.items()),
+        functions.replace(table, source("table.h"), 1).replace(table, ""),
         *((sources / file).read_text(encoding="utf-8") for file in contents.sources),
         *(routine.definition(name) for routine in contents.routines),
     ]

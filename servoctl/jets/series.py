@@ -50,9 +50,9 @@ def _minus(a, b):
     return a if is_zero(b) else multiply(-1.0, b) if is_zero(a) else subtract(a, b)
 
 
-def _inner_first(k, first=0):
-    """Indices first..k of a product's terms; terms with the highest coefficients, which come latest, are last."""
-    return sorted(range(first, k + 1), key=lambda j: max(j, k - j))
+def _inner_first(k):
+    """Indices 0..k of a product's terms; terms with the highest coefficients, which come latest, are last."""
+    return sorted(range(k + 1), key=lambda j: max(j, k - j))
 
 
 class Series:
@@ -163,6 +163,9 @@ class Series:
             return select(self._deciding(node.args[0]) >= 0, a[k], -a[k])
         if node.kind == "gate":
             return 0.0 if is_zero(b[k]) else select(a[0] != 0, b[k], 0.0)
+        symbolic = any(isinstance(x[0], ca.SX) for x in (a, b))
+        if k == 0 and symbolic and not self.decided.keys() & node.args:
+            return (ca.fmin if node.kind == "fmin" else ca.fmax)(a[0], b[0])  # as in the expression itself
         first_is_least = self._deciding(node.args[0]) <= self._deciding(node.args[1])
         return select(first_is_least, *((a[k], b[k]) if node.kind == "fmin" else (b[k], a[k])))
 
@@ -195,8 +198,11 @@ class Series:
             return apply(name, *(self.c[j][0] for j in node.args))
         total = 0.0
         for argument, slope in zip(node.args, slopes, strict=True):
-            a, g = self.c[argument], self.c[slope]
-            total = _plus(total, _dot((multiply(j, a[j]), g[k - j]) for j in _inner_first(k, 1) if not is_zero(a[j])))
+            of, add_to = (slope, _plus) if self.nodes[slope].kind != "neg" else (self.nodes[slope].args[0], _minus)
+            a, g = self.c[argument], self.c[of]
+            # Coefficient k - 1 of the product a' g, term by term as `mul` has it, so that the same product is shared.
+            terms = ((_times(a[j + 1], float(j + 1)), g[k - 1 - j]) for j in _inner_first(k - 1))
+            total = add_to(total, _dot(terms))
         return total if k == 1 or is_zero(total) else over(total, k)
 
 
@@ -267,6 +273,13 @@ class Flow:
         flow = copy(self)
         flow.points = points
         return flow
+
+    @property
+    def lowest(self):
+        """The rows of order 0 as equations of q."""
+        if "lowest" not in self._cache:
+            self._cache["lowest"] = Flow(self.q, self.rows, 0, self.points, self.signals, self.real)
+        return self._cache["lowest"].at(self.points)
 
     def _scalars(self, expressions):
         return Scalars(self.q, self.points.parameters, expressions, self.signals)

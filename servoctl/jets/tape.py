@@ -47,7 +47,9 @@ _NUMPY["erf"] = _erf
 
 
 def apply(name, *args):
-    """The function `name` of SX expressions, or of numbers and arrays."""
+    """The function `name` of SX expressions, or of numbers and arrays; `name` may be a function of arrays itself."""
+    if callable(name):
+        return name(*args)
     functions = _CASADI if any(isinstance(a, ca.SX) for a in args) else _NUMPY
     return functions[name](*args)
 
@@ -107,7 +109,7 @@ _REFUSED = {
     ca.OP_COPYSIGN: "copysign", ca.OP_ERFINV: "erfinv",
 }  # fmt: skip
 _GROWING = {"exp", "expm1", "sinh", "cosh"}  # functions that leave the range of doubles
-_OPTIONS = {"allow_free": True, "live_variables": False}  # no place is reused: operations fill them in order
+_OPTIONS = {"allow_free": True, "live_variables": False, "max_io": 10**9}  # operations fill new places in order
 
 
 class Tape:
@@ -392,10 +394,10 @@ class Plan:
         for kind, data, here, operands in self.groups:
             parts = size.take(operands, axis=0)
             if kind in ("add", "sub"):
-                np.add(*parts, out=size[here])
+                np.maximum(np.hypot(*parts), magnitude[here], out=size[here])
             elif kind == "mul":
                 a, b = magnitude.take(operands, axis=0)
-                np.add(a * parts[1], parts[0] * b, out=size[here])
+                np.hypot(a * parts[1], parts[0] * b, out=size[here])
             elif kind == "quad":
                 for slope, part in zip(self.slopes[here.start], parts, strict=True):
                     size[here] += slopes.take(slope, axis=0) * part
@@ -422,7 +424,7 @@ VALUE = {
     "quad": apply,
 }
 _SIZE = {  # from the magnitude of y, and values and sizes of the operands
-    "div": lambda _, y, a, b, size_a, size_b: (size_a + y * size_b) / np.abs(b),
+    "div": lambda _, y, a, b, size_a, size_b: np.hypot(size_a, y * size_b) / np.abs(b),
     "neg": lambda _, y, a, size: size,
     "copy": lambda _, y, a, size: size,
     "fabs": lambda _, y, a, size: size,
@@ -438,9 +440,11 @@ _SIZE = {  # from the magnitude of y, and values and sizes of the operands
 def evaluate(tape, inputs, operations=None):
     """Values of a tape's outputs and the sizes of their terms.
 
-    The size of a + b is size(a) + size(b), that of a b is |a| size(b) + size(a) |b|, and that of y = f(a) is
-    |y| + |f'(a)| size(a). Rounding errors are about the machine's epsilon times the size, so an output far below its
-    size is zero. The precision is that of `inputs`.
+    The size of a + b is the root of the sum of squares of size(a) and size(b), as for independent errors, and at least
+    |a + b|; that of a b is the same root for |a| size(b) and size(a) |b|, that of y = f(a) is |y| + |f'(a)| size(a).
+    Rounding errors are about the machine's epsilon times the size, so an output far below its size is zero. Sums
+    instead of roots would grow exponentially along a chain of rotations, whose errors do not. The precision is that of
+    `inputs`.
 
     Parameters
     ----------

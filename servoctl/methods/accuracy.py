@@ -14,7 +14,7 @@ import numpy as np
 
 from servoctl.checks import is_number
 from servoctl.errors import LimitExceeded, SpecificationError
-from servoctl.methods.choice import Algebraic, Project, RadauIIA, Taylor
+from servoctl.methods.choice import Algebraic, Automatic, Project, RadauIIA, Taylor
 from servoctl.methods.sizes import motion_sizes, state_levels
 from servoctl.methods.taylor import order_for
 
@@ -25,9 +25,6 @@ COARSE = 10.0  # times rtol: an absolute tolerance above this part of a size dec
 LARGE = 1e3  # size above which the default absolute tolerance comes near rounding and grows with the size
 FINEST = 1e-15  # tolerance below which steps shorten and rounding grows
 SAME = 1.0 + 1e-9  # tolerances within this factor are one and the same, up to the rounding of their decades
-FIRST_STEPS = 40  # longest stable steps of the part of a motion on which it is decided whether the motion is stiff
-STIFF_STEPS = 150  # longest stable steps in the span that make an implicit method worth compiling
-LIMITED = 1.2  # times the longest stable steps: more of them are taken where accuracy limits them, not stability
 COARSEST_ACCURACY, FINEST_ACCURACY = 1e-1, 1e-13  # accuracies that make sense in double precision
 
 
@@ -119,37 +116,10 @@ def method_for(model, accuracy, jets=None):
     if model.flat and jets is None:
         return Algebraic()
     rtol = max(MARGIN * accuracy, FINEST)
-    return Taylor(order_for(rtol), jets, rtol, rtol)
+    return Automatic(order_for(rtol), jets, rtol, rtol)
 
 
-def is_stiff(simulated, model, method, t0, x0, t1):
-    """Whether stability, not accuracy, limits the steps of a series, decided on the first steps of a motion.
-
-    The series of order p damps a mode of rate λ on the negative real axis for steps up to about p/(e |λ|).
-
-    Parameters
-    ----------
-    simulated : callable
-        Run from a method, a treatment of drift, a span and the times of the samples.
-    model : Model
-    method : Taylor
-    t0, x0, t1 : float, (n_x,) array, float
-        Span [s] and start.
-    """
-    n_x, length = len(x0), t1 - t0
-    jacobian = model.function("ode_jacobian")(t0, x0, model.parameters).reshape(n_x, n_x)
-    if not np.isfinite(jacobian).all():
-        return False
-    decay = np.linalg.eigvals(jacobian * np.sign(length))
-    fastest = -decay.real[np.abs(decay.imag) < -decay.real].min(initial=0.0)
-    if fastest * abs(length) * np.e < STIFF_STEPS * method.order:
-        return False
-    end = t0 + np.sign(length) * FIRST_STEPS * method.order / (np.e * fastest)
-    first = simulated(method, Project(), (t0, end), [end])
-    return first.success and first.counters["steps"] < LIMITED * FIRST_STEPS
-
-
-def accurate(simulated, model, accuracy, start, method=None, drift=None):
+def accurate(simulated, model, accuracy, method=None, drift=None):
     """The motion with an error of at most `accuracy`.
 
     A flat program is solved to rounding at each instant. Otherwise the tolerance is lowered until two successive
@@ -158,12 +128,10 @@ def accurate(simulated, model, accuracy, start, method=None, drift=None):
     Parameters
     ----------
     simulated : callable
-        Run from a method and a treatment of drift, and optionally another span and times of samples.
+        Run from a method and a treatment of drift.
     model : Model
     accuracy : float
         See `motion_error`.
-    start : (t0, x0, t1)
-        Span [s] and state (n_x,) at t0.
     method : None or Taylor
         `Taylor(jets=...)` sets the jets; order and tolerances follow from the accuracy.
     drift : None
@@ -185,9 +153,9 @@ def accurate(simulated, model, accuracy, start, method=None, drift=None):
     method = method_for(model, accuracy, jets)
     if isinstance(method, Algebraic):
         return simulated(method, None)
-    if jets is None and is_stiff(simulated, model, method, *start):
-        method = RadauIIA(rtol=method.rtol, atol=method.atol)
     run = simulated(method, Project())
+    if run.method == str(RadauIIA()):
+        method = method.for_stiff
     if not run.success:
         return run
     best, growth = np.inf, 0.0

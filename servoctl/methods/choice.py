@@ -25,6 +25,7 @@ SCIPY = ("RK23", "RK45", "DOP853", "Radau", "BDF", "LSODA")
 EXPLICIT, MULTISTEP = ("RK23", "RK45", "DOP853"), ("BDF", "LSODA")
 SUNDIALS = ("CVODES", "IDAS")
 SMALLEST_RTOL = 100 * np.finfo(float).eps  # that scipy's methods except LSODA accept: they replace a smaller one
+LARGE_FOR_SERIES = 300  # operations of the rates, above which a series takes a second to make, and more to compile
 REAL = 1e-9  # imaginary part of a pole polynomial, relative to its largest coefficient, that is rounding
 
 PAST_STATES = "A multistep method carries past states, which projection would contradict."
@@ -398,6 +399,24 @@ class Sundials(Method):
         return self.name
 
 
+@dataclass(frozen=True, repr=False)
+class Automatic(Taylor):
+    """The series as a default, in whose place another method takes what does not suit them."""
+
+    def __str__(self):
+        return "Taylor"
+
+    @property
+    def for_stiff(self):
+        """What goes on where stability limits the steps; None where jets are required, which only series give."""
+        return RadauIIA(rtol=self.rtol, atol=self.atol) if self.jets is None else None
+
+    @property
+    def without_series(self):
+        """What goes on where pivots change or the equations are no series; None for an order that is required."""
+        return Adaptive(rtol=self.rtol, atol=self.atol) if self.jets is None and self.order is None else None
+
+
 _FAMILIES = ((RungeKutta, ORDERS.values()), (Adaptive, SCIPY), (Sundials, SUNDIALS))
 _NAMED = (family(name) for family, names in _FAMILIES for name in names)
 _DEFAULTS = (Algebraic(), Taylor(), RadauIIA(), Bounded(), *_NAMED)
@@ -439,12 +458,18 @@ def as_method(value, **settings):
                 do=f"Leave {name} out, or choose a method that takes it: {users}." if users else f"Leave {name} out.",
                 **{name: setting},
             )
-    return replace(method, **settings)
+    return replace(method, **settings) if settings else method
 
 
-def default_method(model):
-    """The method for a model if the user names none."""
-    return Algebraic() if model.flat else Adaptive()
+def default_method(model, drift=None):
+    """The method for a model and a treatment of drift if the user names none.
+
+    Series, unless the treatment excludes them, or the equations are so large that making a series takes seconds.
+    """
+    if model.flat:
+        return Algebraic()
+    series = type(drift) not in Taylor.refused and model.function("ode").operations <= LARGE_FOR_SERIES
+    return Automatic() if series else Adaptive()
 
 
 def require_combination(model, method, drift):

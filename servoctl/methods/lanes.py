@@ -102,8 +102,11 @@ def _library(f, n_x):
 @lru_cache(32)
 def _source(f, n_x):
     """The C text for any number of lanes."""
-    sizes = {key.upper(): int(value) for key, value in f.sizes.items()}
+    sizes = emit.definitions(f.sizes)
     sizes |= {"NAME": "servoctl", "NX": n_x, "NP": f.n_p, "NY": f.n_y}
     sizes |= {"DEGRADED": DEGRADED, "NEGLIGIBLE": NEGLIGIBLE, "FAR_OFF": FAR_OFF}
+    settled = f.others.get("settled")
+    sizes |= {} if settled is None else {"SETTLED": ""}
     parts = [emit.unit(sizes), emit.include("lanes.h"), emit.function(f.expression, "expansion", emit.LANES)]
+    parts += [] if settled is None else [emit.function(settled, "servoctl_settled", emit.PORTABLE)]
     return "".join((*parts, emit.include("many.c")))

@@ -403,7 +403,7 @@ class Monitor:
         if lingering is not None:
             return lingering
         t, x = stretch.t[k + 1], stretch.x[:, k + 1]
-        degraded = weakest[-1] < DEGRADED and self.pivots_only(weakest[-1], t, x)
+        degraded = weakest[-1] < DEGRADED and (self.model.diagonal or self.pivots_only(weakest[-1], t, x))
         return _other_pivots(k + 1, t, x) if degraded else None
 
     def _touched(self, stretch, k, sizes, scale):
@@ -502,14 +502,30 @@ class Monitor:
         reference = self.model.pivot_sizes
         return float((np.abs(pivots) / np.where(reference > 0, reference, 1.0)).min(initial=1.0))
 
-    def repivoted(self, t, x, top):
-        """The model with pivots chosen at x and γ^(s̄) = top, and its monitor; None if no choice succeeds."""
+    def repivoted(self, t, x, top, same_rows=True):
+        """The model with pivots chosen at x and γ^(s̄) = top, and its monitor; None if no choice succeeds.
+
+        With the same rows, which other pivots solve, or derived again.
+        """
+        jets = np.append(x, np.nan_to_num(top))
+        if same_rows and self.rank_measure(t, x) > LOST:
+            other = self.model.without_choice or self._reordered(t, jets)
+            if other is not None:
+                return other, Monitor(other, t, x, self)
         sizes = {name: size for name, size in zip(self.model.state_names, self.largest, strict=True) if size > 0}
         try:
-            model = self.model.near(t, np.append(x, np.nan_to_num(top)), sizes)
+            model = self.model.near(t, jets, sizes)
             return model, Monitor(model, t, x, self)
         except ServoError:
             return None
+
+    def _reordered(self, t, jets):
+        """The model with other pivots of the leading matrix, unless the rows divide by a pivot that is weak."""
+        count = len(self.model.row_pivots)
+        pivots = np.abs(self.model.pivots_at(t, jets)[:count])
+        sizes = self.model.pivot_sizes if self.reference is None else self.reference
+        strong = np.all(pivots > HELPS * DEGRADED * sizes[:count])
+        return self.model.reordered(t, jets) if strong else None
 
     def failed(self, t, x, why, what, do):
         """The error of a state from which no step succeeds: singular for the reason `why`, or the method's own.

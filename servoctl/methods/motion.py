@@ -13,6 +13,7 @@ from servoctl.methods.monitor import VANISHING, Fine, Monitor, Repivot, Singular
 from servoctl.methods.watch import End, Watch, edge, no_model, sticks
 from servoctl.reduction.orders import other_order
 
+MOST_CHANGES = 2  # of pivots at one instant: those of the same rows, then of rows derived again
 DEFAULT_SAMPLES = 1001  # without t_eval: smooth curves, and extrema refined to rounding
 SAME_INSTANT = 1e-12  # of the time: instants closer than this are one
 BESIDE_KNOTS = 0.1  # of that: how far before and after a knot a piece ends and begins, with all stages on its own side
@@ -38,7 +39,7 @@ class Motion:
     ended: str = ""  # by this terminal event
     occurrences: dict = field(default_factory=dict)  # of events, by name
     note: str = ""
-    changed: set = field(default_factory=set)
+    changed: dict = field(default_factory=dict)
     switches: list = field(default_factory=list)
     start: object = None  # X at t0, if it is not the given one
     room: int = 0  # samples of the whole motion
@@ -91,10 +92,9 @@ class Motion:
         self.stop = error
 
     def changes_pivots(self, t):
-        """Note a change of pivots at t; False if one was made at this instant already and did not help."""
-        again = t in self.changed
-        self.changed.add(t)
-        return not again
+        """Note a change of pivots at t; how many were made at this instant already and did not help."""
+        self.changed[t] = self.changed.get(t, -1) + 1
+        return self.changed[t]
 
     def count(self, **numbers):
         """Add to counters."""
@@ -386,9 +386,9 @@ class Stepping:
         """Go on with other pivots if the outcome requires them; False if the program is singular."""
         if isinstance(outcome, Repivot):
             t, x = outcome.t, outcome.x
-            variant = None
-            if self.motion.changes_pivots(t):
-                variant = outcome.variant or self.monitor.repivoted(t, x, self._top(t, x))
+            variant, tried = None, self.motion.changes_pivots(t)
+            if tried < MOST_CHANGES:
+                variant = outcome.variant or self.monitor.repivoted(t, x, self._top(t, x), same_rows=not tried)
             if variant is not None:
                 self._go_on(variant, t, x)
                 return True

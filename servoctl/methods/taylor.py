@@ -6,12 +6,15 @@ motion by one solve with the same L.
 """
 
 from dataclasses import dataclass, replace
-from math import factorial
+from math import factorial, perm
 
 import casadi as ca
 import numpy as np
 
 from servoctl.codegen.function import Compiled, compiled
+from servoctl.errors import SingularProgram
+from servoctl.jets.factors import constants_outside
+from servoctl.jets.identity import spread, vanish
 from servoctl.jets.series import Motion, Series, is_zero, over, shifted
 from servoctl.jets.tape import Tape
 from servoctl.methods.choice import Project
@@ -19,12 +22,16 @@ from servoctl.methods.monitor import DenseStretch, Fine, Repivot
 from servoctl.methods.motion import Stepping
 from servoctl.methods.narrow import arguments, centres
 from servoctl.methods.watch import RESOLUTION, End, net, steps_of
+from servoctl.model.equations import monitored_rows
 from servoctl.reduction.cascade import Running
-from servoctl.reduction.ranks import clean, eliminate
+from servoctl.reduction.ranks import clean, eliminate, noting_dropped, pivot_order
 
 LOWEST, HIGHEST = 4, 24  # orders: below, steps are too short; above, compiling grows faster than steps
 INSIDE = np.array([0.07, 0.19, 0.34, 0.53, 0.71, 0.86, 0.98])  # parts of a step at which its series is checked
 FAR_OFF = 30.0  # times the tolerance, which the equations may add to a series over its step
+STIFF_STEPS = 400  # of this length in the span, from which compiling an implicit method pays
+LIMITED = 1.2  # times the longest stable steps: more of them are taken where accuracy limits them, not stability
+MOST_DOUBTED = 50  # times that series did not meet the equations, after which they do not suit a motion
 SMALLEST = 1e-12  # of a piece: shorter steps are not halved, so that a jump of the equations is passed
 
 
@@ -59,7 +66,8 @@ class _Group:
         self.motion, self.order, self.members = motion, order, members
         self.symbols = ca.symvar(ca.vertcat(*expressions))
         self.inputs = [[] for _ in self.symbols]
-        tape = Tape(self.symbols, expressions)
+        constants = {i for i, symbol in enumerate(self.symbols) if motion.q.where(symbol) is None}
+        tape = constants_outside(Tape(self.symbols, expressions), constants)
         self.series = _Branches(tape, self.inputs, _decided(motion.q, self.symbols, tape, motion.branch))
 
     def advance(self, k):
@@ -91,40 +99,122 @@ class _Motion(Motion):
     def __init__(self, equations):
         super().__init__(equations.q)
         self.top, self.branch = equations.top, ca.SX.sym("t_branch")
-        self.gamma = {k: [s / factorial(k) for s in self.q.gamma(k)] for k in range(1, self.top)}
+        self.gamma = {}
         self.coordinates = {0: list(self.q)}
         moving = (self.q.V @ ca.vertcat(*self.q.gamma(1)) + self.q.h).elements()
         self.kinematics = None if self.q.plain else _Group(self, 1, range(self.q.nq), moving)
-        for k in range(1, self.top):
-            self._move(k)
+        places = [self.q.where(e) if e.is_symbolic() else None for e in moving]
+        self.velocities = {i: place[2] for i, place in enumerate(places) if place and place[0] == "w"}  # q_i' = γ_j'
 
     def _move(self, k):
         """q_[k] from q' = V w + h."""
-        if self.q.plain:
-            self.coordinates[k] = self.gamma[k]
-        else:
-            self.coordinates[k] = [c if is_zero(c) else over(c, k) for c in self.kinematics.advance(k)]
+        self._place(k, self.gamma[k] if self.q.plain else self.kinematics.advance(k))
 
-    def guess(self, k):
-        """Set γ_[k] = 0, and q_[k] with it."""
-        self.gamma[k] = [0.0] * self.q.n
+    def _place(self, k, rates):
+        """Set q_[k] from coefficient k - 1 of q', or γ_[k] itself."""
+        coordinates = [c if is_zero(c) or self.q.plain else over(c, k) for c in rates]
+        for i, j in self.velocities.items():
+            coordinates[i] = self.gamma[k][j]
+        self.coordinates[k] = coordinates
+
+    def guess(self, k, solved):
+        """Set γ_[k] to that of the state, and to zero where it is solved for, and q_[k] with it."""
+        state = (s / factorial(k) for s in self.q.gamma(k)) if k < self.top else [0.0] * self.q.n
+        self.gamma[k] = [0.0 if i in solved else s for i, s in enumerate(state)]
         self._move(k)
 
     def settle(self, k, gamma):
         """Set γ_[k] to the solution, and q_[k] with it."""
-        self.gamma[k] = gamma
-        if self.q.plain:
-            self.coordinates[k] = gamma
-        else:
+        self.gamma[k], rates = gamma, gamma
+        if not self.q.plain:
             self.kinematics.correct(k)
-            latest = (c[-1] for c in self.kinematics.series.outputs)
-            self.coordinates[k] = [c if is_zero(c) else over(c, k) for c in latest]
+            rates = [c[-1] for c in self.kinematics.series.outputs]
+        self._place(k, rates)
 
     def coordinate(self, i, j):
         return self.coordinates[j][i]
 
     def velocity(self, i, level, j):
         return shifted(self.gamma[level + j][i], level, j)
+
+
+def solved_for(equations):
+    """Velocities that rows determine: for each level below s̄ rows, the entries of γ^(k) they give, and pivots.
+
+    A row of order k or less is linear in γ^(k). Those entries are not integrated: what is integrated satisfies the row
+    with the tolerance, what is solved for to rounding. They are chosen so that all pivots are constant or watched.
+    """
+    r, solved = equations.r, {}
+    for k in range(1, equations.top if r.cascade is None and not equations.definite else 1):
+        rows = [a for a, row in enumerate(r.rows) if row.order + (not row.affine) <= k]
+        matrix = r.leading[rows, :]
+        numbers = clean(*r.points.matrix(matrix))
+        try:
+            order = [(rows.index(i), j) for i, j in r.order if i in rows] or pivot_order(matrix, numbers)
+            columns = sorted(j for _, j in order)
+            order = tuple((i, columns.index(j)) for i, j in order)
+            with noting_dropped() as entries:
+                _, pivots = eliminate(matrix[:, columns], ca.SX(len(rows), 0), numbers[:, columns], order=order)
+        except SingularProgram:
+            continue
+        if rows and not entries and all(_watched(pivot, equations) for pivot in pivots):
+            solved[k] = rows, columns, order
+    return solved
+
+
+def _watched(pivot, equations):
+    """Whether a pivot is constant, or equals one that is watched up to its sign."""
+    others = [other for _, other in equations.all_pivots]
+    return not ca.symvar(pivot) or any(vanish(v) for o in others for v in spread([pivot - o, pivot + o]))
+
+
+class _Rows:
+    """The rows of a reduction along a motion, whose coefficients they give index by index."""
+
+    def __init__(self, equations):
+        self.r, self.top, self.motion = equations.r, equations.top, _Motion(equations)
+        self.solved, self.groups = solved_for(equations), []
+        for order in sorted({row.order for row in self.r.rows}):
+            members = [a for a, row in enumerate(self.r.rows) if row.order == order]
+            self.groups.append(_Group(self.motion, order, members, [self.r.rows[a].expression for a in members]))
+
+    def advance(self, k):
+        """γ_[k]: below s̄ from the state and the rows that determine a part of it, from s̄ on from all rows."""
+        every = range(len(self.r.rows))
+        rows, columns, order = self.solved.get(k, ([], [], ())) if k < self.top else (every, every, ())
+        groups, right = [group for group in self.groups if group.order <= k], {}
+        if k:
+            self.motion.guess(k, columns)
+        for group in groups:
+            scale = -factorial(k - group.order) / factorial(k)
+            right |= {a: ca.SX(c) * scale for a, c in zip(group.members, group.advance(k), strict=True)}
+        if len(rows):
+            solution = self._solution((list(rows), list(columns)), order, ca.vertcat(*(right[a] for a in rows)))
+            gamma = list(self.motion.gamma[k])
+            for i, x in zip(columns, solution.elements(), strict=True):
+                gamma[i] = 0.0 if x.is_zero() else x
+            self.motion.settle(k, gamma)
+            for group in groups:
+                group.correct(k)
+
+    def _solution(self, place, order, right):
+        if not order:
+            return self.r.solve(right)[0]
+        matrix = self.r.leading[place[0], place[1]]
+        return eliminate(matrix, right, clean(*self.r.points.matrix(matrix)), order=order)[0]
+
+
+class _Reacting(_Motion):
+    """A motion with coefficients of the multipliers μ."""
+
+    def __init__(self, equations):
+        super().__init__(equations)
+        self.multipliers, self.mu = ca.SX.sym("mu", equations.r.realisation.B.shape[1]), []
+        self.indices = {s.element_hash(): i for i, s in enumerate(self.multipliers.elements())}
+
+    def coefficient(self, symbol, j):
+        i = self.indices.get(symbol.element_hash())
+        return super().coefficient(symbol, j) if i is None else self.mu[j][i]
 
 
 def taylor_coefficients(equations, last):
@@ -142,30 +232,58 @@ def taylor_coefficients(equations, last):
         Arguments t, X, p, where p ends with the instant that selects the branches of paths. Outputs q_[1], ...,
         q_[last] (left out if q' = γ'), γ_[1], ..., γ_[last], pivots.
     """
-    r, q = equations.r, equations.q
+    r = equations.r
     if r.cascade is not None:
         motion = r.cascade.along(r.points, equations.top - 1, last, running=_InBlock)
         return _coefficients(equations, motion.place, motion.gamma, last, _InBlock.instant)
-    motion = _Motion(equations)
-    groups = []
-    for order in sorted({row.order for row in r.rows}):
-        members = [a for a, row in enumerate(r.rows) if row.order == order]
-        groups.append(_Group(motion, order, members, [r.rows[a].expression for a in members]))
-        for k in range(order, equations.top):
-            groups[-1].advance(k)
-    numbers = clean(*r.points.matrix(r.leading))
-    for k in range(equations.top, last + 1):
-        motion.guess(k)
-        right = [None] * q.n
-        for group in groups:
-            scale = -factorial(k - group.order) / factorial(k)
-            for a, c in zip(group.members, group.advance(k), strict=True):
-                right[a] = ca.SX(c) * scale
-        solution, _ = eliminate(r.leading, ca.vertcat(*right), numbers)
-        motion.settle(k, [0.0 if x.is_zero() else x for x in solution.elements()])
-        for group in groups:
-            group.correct(k)
+    motion = _with_multipliers(equations, last) if equations.definite else _by_rows(equations, last)
     return _coefficients(equations, motion.coordinates, motion.gamma, last, motion.branch)
+
+
+def _by_rows(equations, last):
+    """The motion by L γ_[k] = ..."""
+    rows = _Rows(equations)
+    for k in range(last + 1):
+        rows.advance(k)
+    return rows.motion
+
+
+def _with_multipliers(equations, last):
+    """The motion by M γ_[k] - B μ_[k-2] (k - 2)!/k! = ..., G γ_[k] = ..."""
+    r, motion = equations.r, _Reacting(equations)
+    for k in range(1, equations.top):
+        motion.guess(k, ())
+    groups, forces = _groups(motion, monitored_rows(r)), (r.balance - r.realisation.B @ motion.multipliers).elements()
+    balance = _Group(motion, 2, range(len(forces)), forces)
+    for k in range(2, last + 1):
+        motion.guess(k, ())
+        motion.mu.append([0.0] * len(motion.indices))
+        gamma, mu, _ = r.realisation.solve(_right([balance], k), _right(groups, k))
+        motion.mu[-1] = (mu * float(k * (k - 1))).elements()
+        motion.settle(k, [0.0 if x.is_zero() else x for x in gamma.elements()])
+        for group in (*groups, balance):
+            group.correct(k)
+    return motion
+
+
+def _groups(motion, rows):
+    """Rows by order, with their coefficients up to the motion's known ones."""
+    groups = []
+    for order in sorted({row.order for row in rows}):
+        members = [a for a, row in enumerate(rows) if row.order == order]
+        groups.append(_Group(motion, order, members, [rows[a].expression for a in members]))
+        for k in range(order, motion.top):
+            groups[-1].advance(k)
+    return groups
+
+
+def _right(groups, k):
+    """-((k - o)!/k!) ψ_[k-o] of the rows of groups, with γ_[k] = 0."""
+    right = {}
+    for group in groups:
+        scale = -factorial(k - group.order) / factorial(k)
+        right |= {a: ca.SX(c) * scale for a, c in zip(group.members, group.advance(k), strict=True)}
+    return ca.vertcat(*(right[a] for a in sorted(right)))
 
 
 def _coefficients(equations, coordinates, gamma, last, instant):
@@ -174,6 +292,26 @@ def _coefficients(equations, coordinates, gamma, last, instant):
     coefficients += [ca.SX(c) for k in range(1, last + 1) for c in gamma[k]]
     outputs = [*coefficients, *(g for _, g in equations.pivots)]
     return equations.function("taylor", equations.state, outputs, instant)
+
+
+def settled(equations):
+    """The state with the velocities that rows determine, and γ^(s̄), as a function of (t, X, p).
+
+    Near the end of a step the series of these velocities errs more than what is integrated, its derivatives even more.
+
+    Parameters
+    ----------
+    equations : Equations
+
+    Returns
+    -------
+    casadi.Function
+    """
+    rows = _Rows(equations)
+    for k in range(equations.top + 1):
+        rows.advance(k)
+    gamma = [ca.SX(c) * float(factorial(k)) for k in range(1, equations.top + 1) for c in rows.motion.gamma[k]]
+    return equations.function("settled", equations.state, [*equations.q, *gamma], rows.motion.branch)
 
 
 def series_loop(model, last):
@@ -192,9 +330,13 @@ def series_loop(model, last):
 
     def build():
         e, q = model.equations, model.reduction.mechanism.q
-        sizes = {"nq": q.nq, "n": q.n, "top": e.top, "last": last, "plain": int(q.plain)}
+        solved = solved_for(e)
+        sizes, others = {"nq": q.nq, "n": q.n, "top": e.top, "last": last, "plain": int(q.plain)}, {}
+        if solved:
+            free = (int(i not in solved.get(k, ((), (), ()))[1]) for k in range(1, e.top) for i in range(q.n))
+            sizes, others = sizes | {"free": tuple(free)}, {"settled": settled(e)}
         f = taylor_coefficients(e, last)
-        return compiled(f, f"taylor_{last}", ("taylor",), project=e.project(), sizes=sizes)
+        return compiled(f, f"taylor_{last}", ("taylor",), project=e.project(), others=others, sizes=sizes)
 
     return model.once(f"taylor {last}", build)
 
@@ -208,6 +350,37 @@ def order_for(rtol):
     return int(np.clip(np.ceil(5.0 - 0.5 * np.log(rtol)), LOWEST, HIGHEST))
 
 
+def last_index(model, method):
+    """The highest index of the coefficients that a Taylor method needs for its order and for its jets."""
+    top = model.reduction.top
+    order = order_for(method.rtol) if method.order is None else method.order
+    return max(order + top - 1, max(method.jets or 0, top) + 1)
+
+
+class Unsuited(Exception):
+    """Series do not suit a motion, for which their settings name another method."""
+
+    def __init__(self, why, method):
+        super().__init__(why)
+        self.method = method
+
+
+def limited_by_stability(model, order, t, x, span):
+    """Whether stability limits the steps of a series with the ends t (S + 1,) [s], the last one at the state x (n_x,).
+
+    A series of order p damps a mode of rate λ on the negative real axis for steps up to about p/(e |λ|).
+    """
+    step = (t[-1] - t[0]) / (len(t) - 1)
+    if abs(span) < STIFF_STEPS * abs(step):
+        return False
+    jacobian = model.function("ode_jacobian")(t[-1], x, model.parameters).reshape(len(x), len(x))
+    if not np.isfinite(jacobian).all():
+        return False
+    decay = np.linalg.eigvals(jacobian * np.sign(step))
+    fastest = -decay.real[np.abs(decay.imag) < -decay.real].min(initial=0.0)
+    return bool(LIMITED * abs(step) * fastest * np.e > order)
+
+
 class TaylorSteps(Stepping):
     """One integration by the Taylor method.
 
@@ -215,11 +388,9 @@ class TaylorSteps(Stepping):
     ----------
     model : Model
     drift : None or Project
-    rtol, atol : float
-    order : int or None
-        None chooses it by `order_for`.
-    jets : int
-        Highest level of the jets in the samples.
+    method : Taylor
+    atol : float
+        Its absolute tolerance.
     progress : callable
     """
 
@@ -227,17 +398,16 @@ class TaylorSteps(Stepping):
     rank_lost = "the radius of convergence shrinks to nothing"
     advice = "Check whether the motion escapes or meets a point where it is not smooth."
 
-    def __init__(self, model, drift, rtol, atol, order, jets, progress):
-        self.tolerances = rtol, atol
-        self.order = order_for(rtol) if order is None else order
+    def __init__(self, model, drift, method, atol, progress):
+        self.tolerances = method.rtol, atol
         self.every = drift.every if isinstance(drift, Project) else 0
         self.projects = self.every > 0
-        self.jets = max(jets, model.reduction.top)
+        self.settings, self.doubted = method, 0
         super().__init__(model, "Taylor", drift, progress)
 
     def _use(self, model):
         self.model, self.n_x = model, len(model.state_names)
-        last = max(self.order + model.reduction.top - 1, self.jets + 1)
+        self.last = last = last_index(model, self.settings)
         self.f, self.rates = series_loop(model, last), model.function("ode")
         self.nq, self.n, self.top = model.nq, model.n, model.reduction.top
         plain = model.reduction.mechanism.q.plain
@@ -261,9 +431,10 @@ class TaylorSteps(Stepping):
         until = b
         while a != b and self.motion.stop is None:
             rows = self.f.taylor(a, x, until, self.p, *self.tolerances, self.most, self.every)
-            log = _Log(self.f, self.n_x, rows)
+            log = _Log(self.f, self.n_x, self.p, rows)
             taken, good = len(rows) - 1, self._believed(log, abs(b - a))
             if good < taken:
+                self._doubt(log.t[good])
                 until = (log.t[good] + log.t[good + 1]) / 2  # the next step ends there
                 log = log.first(good)
             t, states = log.t, log.states
@@ -282,14 +453,36 @@ class TaylorSteps(Stepping):
             go_on = isinstance(outcome, Repivot)
             a, x = (outcome.t, outcome.x) if go_on else (t[steps], states[:, steps].copy())
             self.progress(a)
+            if steps == self.most:
+                self._leave_if_stiff(t, x)
             if not fine:
                 self._follow(outcome)
             elif failed:
                 self._fail(a, x, "its steps vanish or are not finite")
         if len(times) and self.motion.stop is None:
             row = np.concatenate([[a], x, self._outputs(a, x)])
-            self._sample(_Log(self.f, self.n_x, np.array([row, row])), times, a)
+            self._sample(_Log(self.f, self.n_x, self.p, np.array([row, row])), times, a)
         return a, x
+
+    def _leave_if_stiff(self, t, x):
+        """Leave the motion to an implicit method if stability limits steps with the ends t (S + 1,) [s]."""
+        method, order = getattr(self.settings, "for_stiff", None), self.last - self.top + 1
+        if method is not None and limited_by_stability(self.model, order, t, x, self.watch.span):
+            why = f"stability, not accuracy, limits the steps of {self.method} to {abs(t[-1] - t[-2]):.2g} s"
+            raise Unsuited(why, method)
+
+    def _doubt(self, t):
+        """Leave the motion to an adaptive method if its series have often missed the equations."""
+        self.doubted += 1
+        method = getattr(self.settings, "without_series", None)
+        if method is not None and self.doubted > MOST_DOUBTED:
+            raise Unsuited(f"near t = {t:.4g} s the equations are no series over the steps of {self.method}", method)
+
+    def _go_on(self, variant, t, x):
+        method = getattr(self.settings, "without_series", None)
+        if method is not None:
+            raise Unsuited(f"pivots change at t = {t:.4g} s, and {self.method} would need other series", method)
+        super()._go_on(variant, t, x)
 
     def _believed(self, log, span):
         """The number of steps whose series meet the equations, at instants within them.
@@ -303,10 +496,21 @@ class TaylorSteps(Stepping):
         jets = log.jets(k, at, self.top)
         rates = self.rates.grid(at, jets[: self.n_x], self.model.parameters)[self.n_x - n : self.n_x]
         rtol, atol = self.tolerances
-        sizes = np.maximum(np.abs(log.states[-n:]).max(), np.abs(h[k] * jets[-n:]).max(axis=0))
-        error = np.abs(h[k] * (rates - jets[-n:])).max(axis=0)
-        wrong = (error > FAR_OFF * (atol + rtol * sizes)) & (np.abs(h[k]) > SMALLEST * span)
+        wrong, last = np.zeros(len(k), bool), self.f.sizes["last"]
+        for level, entries in self._integrated_levels().items():
+            raised = self.top - level
+            part = np.abs(h[k]) ** raised * (perm(last, level) / perm(last, self.top - 1))
+            state = log.states[: self.nq] if level == 0 else log.states[self.nq + (level - 1) * n :][:n]
+            sizes = np.maximum(np.abs(state).max(), np.abs(part * jets[-n:][entries]).max(axis=0))
+            error = (part * np.abs(rates - jets[-n:])[entries]).max(axis=0)
+            wrong |= (error > FAR_OFF * (atol + rtol * sizes)) & (np.abs(h[k]) > SMALLEST * span)
         return int(k[wrong].min(initial=len(t) - 1))
+
+    def _integrated_levels(self):
+        """Entries of γ by the highest level at which they are integrated, 0 where only q is."""
+        free = np.array(self.f.sizes.get("free", [1] * (self.n_x - self.nq))).reshape(self.top - 1, self.n)
+        highest = (free * np.arange(1, self.top)[:, None]).max(axis=0)
+        return {int(level): np.flatnonzero(highest == level) for level in np.unique(highest)}
 
     def _instants(self, log):
         """Steps and instants within them at which series are compared with the equations."""
@@ -350,8 +554,12 @@ class TaylorSteps(Stepping):
         due = direction * pending <= direction * end
         times = pending[due]
         if len(times):
-            parts = log.jets(steps_of(t, times), times, self.jets)
-            self.motion.add(self.model, times, parts[: self.n_x], parts[self.n_x :])
+            by_rows, jets = "settled" in self.f.others, self.settings.jets or 0
+            parts = log.jets(steps_of(t, times), times, max(jets, self.top - (not by_rows)), by_rows)
+            x, top = parts[: self.n_x], parts[self.n_x :]
+            if not len(top):  # more accurate than as a derivative of the series
+                top = self.rates.grid(times, x, self.model.parameters)[self.n_x - self.n : self.n_x]
+            self.motion.add(self.model, times, x, top)
         return pending[~due]
 
 
@@ -361,6 +569,7 @@ class _Log:
 
     f: Compiled
     n_x: int
+    p: np.ndarray
     rows: np.ndarray
 
     @property
@@ -382,6 +591,6 @@ class _Log:
         """The first steps alone."""
         return replace(self, rows=self.rows[: count + 1])
 
-    def jets(self, k, t, top):
-        """Jets q, γ', ..., γ^(top) at times t (N,) in the steps k (N,), (nq + top n, N)."""
-        return self.f.jets(self.rows, k, t, top)
+    def jets(self, k, t, top, by_rows=False):
+        """Jets q, γ', ..., γ^(top) at times t (N,) in the steps k (N,), (nq + top n, N); see `Compiled.jets`."""
+        return self.f.jets(self.rows, k, t, self.p, top, by_rows)

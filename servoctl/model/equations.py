@@ -9,6 +9,7 @@ from servoctl.errors import SpecificationError
 from servoctl.jets.branches import size_of_terms
 from servoctl.model import saddle
 from servoctl.reduction.appell import plant_accelerations
+from servoctl.reduction.definite import Definite
 from servoctl.reduction.ranks import clean, column_sizes, eliminate, noting_dropped
 from servoctl.spec.coordinates import jet_name
 
@@ -130,13 +131,17 @@ class Equations(Invariants):
 
     def _solve(self, right):
         """L⁻¹ right and the pivots of L."""
-        values, sizes = self.r.points.matrix(self.r.leading)
-        return eliminate(self.r.leading, right, clean(values, sizes))
+        return self.r.solve(right)
 
     @property
     def sparse(self):
         """Whether the sparse elimination of [M -B; G 0] gives γ^(s̄), instead of the rows of (3.18)."""
-        return self.q.n > saddle.FEW and saddle.applies(self.r)
+        return self.definite or (self.q.n > saddle.FEW and saddle.applies(self.r))
+
+    @property
+    def definite(self):
+        """Whether pivots are diagonal entries of definite matrices."""
+        return isinstance(self.r.realisation, Definite)
 
     @property
     def saddle(self):
@@ -224,7 +229,7 @@ class Equations(Invariants):
     @property
     def column_sizes(self):
         """Column sizes (n,) (see `ranks.column_sizes`) of L and of Bᵀ at the points where ranks were decided."""
-        matrices = (self.r.points.matrix(m)[0] for m in (self.r.leading, self.r.realisation.B.T))
+        matrices = (self.r.points.matrix(m)[0] for m in self._monitored())
         return [column_sizes(m).max(axis=1, initial=0.0).astype(float) for m in matrices]
 
     @property
@@ -318,8 +323,12 @@ class Equations(Invariants):
 
     def matrices(self):
         """L and Bᵀ, column by column, whose ranks must not change, and the diagonal of M, which scales columns."""
-        matrices = [ca.vec(ca.densify(m)) for m in (self.r.leading, self.r.realisation.B.T)]
+        matrices = [ca.vec(ca.densify(m)) for m in self._monitored()]
         return self.function("matrices", self.state, [*matrices, ca.densify(ca.diag(self.r.mechanism.mass))])
+
+    def _monitored(self):
+        """L and Bᵀ."""
+        return ca.vertcat(*(row.gradient(self.q) for row in monitored_rows(self.r))), self.r.realisation.B.T
 
     def plant(self):
         """(q', γ'') of the full mechanism as a function of (t, [q; γ'; inputs of the program])."""
@@ -512,13 +521,19 @@ def residual_rows(reduction):
     return {**reduction.original, **hidden}
 
 
+def monitored_rows(reduction):
+    """Rows of L; with pivots of definite matrices the constraints alone, whose rank is that of all."""
+    rows = reduction.rows
+    return [row for row in rows if row.kind != "dynamics"] if isinstance(reduction.realisation, Definite) else rows
+
+
 def leading_names(reduction):
     """Names of the rows of L, then of Bᵀ."""
     constraints = [row for row in reduction.rows if row.kind != "dynamics"]
     program = [row.name for row in constraints if row.kind == "program"]
     material = [row.name for row in constraints if row.kind == "material"]
     directions = program if reduction.program.by == "ideal" else list(reduction.mechanism.actuators)[: len(program)]
-    return [row.name for row in reduction.rows], [*directions, *material]
+    return [row.name for row in monitored_rows(reduction)], [*directions, *material]
 
 
 def gradient_jets(reduction, name):

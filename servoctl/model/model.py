@@ -13,13 +13,23 @@ from servoctl.codegen.function import compiled
 from servoctl.errors import ServoError, SpecificationError, unknown
 from servoctl.jets.series import Flow
 from servoctl.jets.tape import REAL
-from servoctl.model.equations import EQUATIONS, SIGNALS, Equations, gradient_jets, leading_names, residual_rows
+from servoctl.model import saddle
+from servoctl.model.equations import (
+    EQUATIONS,
+    SIGNALS,
+    Equations,
+    gradient_jets,
+    leading_names,
+    monitored_rows,
+    residual_rows,
+)
 from servoctl.model.report import describe, warn_of_products
 from servoctl.model.rest import started
 from servoctl.model.start import State
 from servoctl.model.store import Store, pack, unpack
 from servoctl.model.validity import affirmed
 from servoctl.reduction.appell import require_positive
+from servoctl.reduction.definite import Definite, definite
 from servoctl.reduction.idle import names_of, needed
 from servoctl.reduction.knots import require_smooth
 from servoctl.reduction.manifold import ON_MANIFOLD, solve
@@ -31,6 +41,7 @@ from servoctl.spec.program import Program
 from servoctl.values import read_only
 
 SAMPLED = 50  # samples of a run at which its structure is decided; each takes tens of milliseconds
+DIAGONAL = "diagonal"  # pivots of definite matrices, beside places of other pivots
 MOST_VARIANTS = 8  # of a model that it holds: motions from one start meet the same ones again
 
 
@@ -117,13 +128,14 @@ class Model:
         # Models that differ only in numbers share their functions.
         self._functions = {} if functions is None else functions
         self._knots_within = {}  # by time span
-        self._variants = {} if variants is None else variants  # with other pivots, by place: one set for all of them
+        self._variants = {None: self} if variants is None else variants  # with other pivots: one set for all of them
 
     def __eq__(self, other):
         if not isinstance(other, Model):
             return NotImplemented
         known = self._store.fingerprint is not None and self._store.fingerprint == other._store.fingerprint
-        return self is other or (known and np.array_equal(self.parameters, other.parameters))
+        same = known and self.place == other.place
+        return self is other or (same and np.array_equal(self.parameters, other.parameters))
 
     def __hash__(self):
         return hash(self._store.fingerprint)
@@ -237,22 +249,75 @@ class Model:
                 free=near.free,
                 expected=self.free,
             )
-        if len(self._variants) == MOST_VARIANTS:
-            del self._variants[next(iter(self._variants))]
-        self._variants[key] = Model(near.reduction, near._store, self.parameters, self._knots, variants=self._variants)
+        self._keep(key, Model(near.reduction, near._store, self.parameters, self._knots, variants=self._variants))
         return self._variants[key]
 
     @property
+    def without_choice(self):
+        """The model with diagonal entries of definite matrices as pivots (`reduction.definite`); None without such."""
+        first = self._variants[None]
+        applies = not (self.diagonal or first.flat) and saddle.applies(first.reduction)
+        return first._formed(DIAGONAL) if applies else None
+
+    def reordered(self, t, jets):
+        """The model with the same rows, and pivots of their leading matrix chosen at an instant.
+
+        Parameters
+        ----------
+        t : float
+            [s]
+        jets : (n_z,) array
+
+        Returns
+        -------
+        Model or None
+            None if the pivots stay, or are not those of the leading matrix.
+        """
+        r = self.reduction
+        if self.diagonal or r.cascade is not None or self.equations.sparse or (self.flat and self.nq != self.n):
+            return None
+        order = r.order_at(float(t), np.asarray(jets, dtype=float), self.parameters)
+        return None if order == r.order else self._formed(order)
+
+    def _formed(self, form):
+        """The model with the same rows, and pivots by their places, or from the diagonal; None without the latter."""
+        key, r = repr((*(self._store.specification[3] or ()), form)), self.reduction
+        if key not in self._variants:
+            reduction = definite(r) if form == DIAGONAL else replace(r, order=form)
+            store, functions = self._store.part(form), self._functions.setdefault(str(form), {})
+            made = reduction and Model(reduction, store, self.parameters, self._knots, functions, self._variants)
+            self._keep(key, made)
+        return self._variants[key]
+
+    def _keep(self, key, variant):
+        """Hold a variant, in place of the oldest one where there are too many."""
+        if len(self._variants) > MOST_VARIANTS:
+            del self._variants[next(known for known in self._variants if known is not None)]
+        self._variants[key] = variant
+
+    @property
+    def diagonal(self):
+        """Whether pivots are diagonal entries of definite matrices."""
+        return isinstance(self.reduction.realisation, Definite)
+
+    @property
     def place(self):
-        """(t, jets, sizes) near which pivots were chosen by `near`; None if they were by `derive`."""
-        return self._store.specification[3]
+        """How pivots were chosen: (t, jets, sizes) of `near`, then their places or `DIAGONAL`; None as by `derive`."""
+        form = DIAGONAL if self.diagonal else self.reduction.order
+        near = self._store.specification[3] or ()
+        return (*near, form) if form else near or None
 
     def at(self, place):
         """The variant of a `place`; this model if that is None."""
-        if place is None:
-            return self
-        t, jets, sizes = place
-        return self.near(t, [jets[name] for name in self.jet_names], sizes)
+        place = place or ()
+        near, form = place[:3] if len(place) > 1 else (), place[-1] if len(place) % 3 == 1 else None
+        model = self
+        if near:
+            t, jets, sizes = near
+            model = self.near(t, [jets[name] for name in self.jet_names], sizes)
+        if form is None:
+            return model
+        return model._formed(form if form == DIAGONAL else tuple((i, j) for i, j in form))
 
     @property
     def numbers(self):
@@ -472,9 +537,27 @@ class Model:
         right : (rows, N) array
         """
         y = self.function("multiplier_form").grid(t, jets, self.parameters)
-        columns = self.n + len(self.reduction.realisation.dependent)
+        columns = self.n + self.reduction.realisation.B.shape[1]
         rows = len(y) // (columns + 1)
         return y[rows:].reshape(columns, rows, -1).swapaxes(0, 1), y[:rows]
+
+    @cached_property
+    def row_pivots(self):
+        """Names of the pivots by which the rows divide, and which depend on the motion; those of L come after them."""
+        rows = {name for name, _ in self.reduction.pivots}
+        return self.once("row pivots", lambda: [name for name, _ in self.equations.pivots if name in rows])
+
+    def pivots_at(self, t, jets):
+        """Pivots at an instant, (n_g,) array.
+
+        Parameters
+        ----------
+        t : float
+            [s]
+        jets : (n_z,) array
+        """
+        here = self.reduction.points.at(np.array([t]), jets[:, None], self.parameters)
+        return here.evaluate([pivot for _, pivot in self.equations.pivots])[0][:, 0].astype(float)
 
     @cached_property
     def pivot_sizes(self):
@@ -494,7 +577,7 @@ class Model:
         """The coordinate or quasi-velocity, by index, of each row of L that is a row TᵀM of (3.18), by index."""
         q = self.reduction.mechanism.q
         names = [f"balance of {name}" for name in (q.names if q.plain else q.velocity_names)]
-        rows = enumerate(self.reduction.rows)
+        rows = enumerate(monitored_rows(self.reduction))
         return {a: names.index(row.name) for a, row in rows if row.name in names and row.order == 2 and not row.story}
 
     def leading_names(self):
@@ -608,4 +691,7 @@ def _samples(model, motion, jets):
 
 def _unpickled(mechanism, content, choices, parameters, knots):
     reduction = unpack(content, mechanism)
-    return Model(reduction, Store(mechanism, reduction.program, *choices), parameters, knots)
+    store = Store(mechanism, reduction.program, *choices)
+    model = Model(reduction, store, parameters, knots)
+    form = DIAGONAL if model.diagonal else reduction.order
+    return Model(reduction, store.part(form), parameters, knots) if form else model

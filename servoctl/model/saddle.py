@@ -2,16 +2,22 @@
 
 The balance M γ'' + c = B μ and the constraints G γ'' + d = 0 have the matrix [M -B; G 0]. Elimination by T first gives
 (3.18); pivots chosen by Markowitz counts over the whole matrix preserve the sparsity of many bodies, and the number of
-operations grows with the number of bodies. Either way γ'' is an expression of the state, without numerical multipliers.
+operations grows with the number of bodies. In joint angles M is full, and sums of accelerations and forces that several
+rows share become unknowns (`lifted`), so that it grows with their number, too. Either way γ'' is an expression of the
+state, without numerical multipliers.
 """
 
 import casadi as ca
+import numpy as np
 
 from servoctl.codegen.emit import operations
 from servoctl.errors import SpecificationError
+from servoctl.reduction.definite import Definite
+from servoctl.reduction.lifting import lifted
 from servoctl.reduction.ranks import clean, eliminate
 
 FEW = 8  # quasi-velocities: up to this number (3.18) takes about as few operations
+SPARED = 0.95  # of the work of [M -B; G 0] below which the system with shared sums is taken
 CLOSE = 1.1  # ratio of operations up to which the forms are compared after common terms are merged
 
 
@@ -25,14 +31,40 @@ def solve(equations, poles=False):
     """γ'' (n,), the multipliers μ (b,) and the list of pivots; `poles` adds the constraints' error dynamics."""
     r, q = equations.r, equations.q
     constraints = [a for a, row in enumerate(r.rows) if row.kind != "dynamics"]
-    B, size = r.realisation.B, len(constraints)
-    G = ca.vertcat(*(r.rows[a].gradient(q) for a in constraints))
-    matrix = ca.vertcat(ca.horzcat(r.mechanism.mass, -B), ca.horzcat(G, ca.SX(size, B.shape[1])))
-    acceleration = q.jet(2)
-    rest = ca.substitute(r.balance, acceleration, ca.SX.zeros(q.n))
+    if isinstance(r.realisation, Definite):
+        rest = ca.substitute(r.balance, q.jet(2), ca.SX.zeros(q.n))
+        second = ca.vertcat(ca.SX(0, 1), *equations.rest(constraints, poles))
+        acceleration, mu, pivots = r.realisation.solve(-rest, -second)
+        return acceleration, mu, [ca.sign(p) * ca.sqrt(ca.fabs(p)) for p in pivots]  # of the size of singular values
+    system = matrix(equations)
+    rest = ca.substitute(r.balance, q.jet(2), ca.SX.zeros(q.n))
     right = -ca.vertcat(rest, *equations.rest(constraints, poles))
-    solution, pivots = eliminate(matrix, right, clean(*r.points.matrix(matrix)))
-    return solution[: q.n], solution[q.n :], pivots
+    sums = system.shape[0] - right.shape[0]
+    right, numbers = ca.vertcat(right, ca.SX(sums, 1)), clean(*r.points.matrix(system))
+    solution, pivots = eliminate(system, right, numbers, in_order=sums > 0)
+    reactions = slice(q.n, q.n + r.realisation.B.shape[1])
+    return solution[: q.n], solution[reactions], pivots
+
+
+def matrix(equations):
+    """[M -B; G 0], or the same with shared sums as unknowns where that takes fewer operations, (n + b + k)² SX."""
+    r, q = equations.r, equations.q
+    constraints = [a for a, row in enumerate(r.rows) if row.kind != "dynamics"]
+    reactions = ca.vertcat(-r.realisation.B, ca.SX(len(constraints), r.realisation.B.shape[1]))
+    G = ca.vertcat(*(r.rows[a].gradient(q) for a in constraints))
+    direct = ca.vertcat(r.mechanism.mass, G)
+    raised = ca.vertcat(*(equations.levels[a][-1] for a in constraints))
+    shared = lifted(ca.vertcat(r.balance, raised), q.jet(2))
+    if shared is None or _work(shared) >= SPARED * _work(direct):
+        return ca.horzcat(direct, reactions)
+    reactions = ca.vertcat(reactions, ca.SX(shared.shape[0] - direct.shape[0], reactions.shape[1]))
+    return ca.horzcat(shared[:, : q.n], reactions, shared[:, q.n :])
+
+
+def _work(rows):
+    """Operations that the entries of a matrix and its elimination without fill-in take, about."""
+    entries = _instructions(ca.vertcat(ca.SX(0, 1), *rows.nonzeros()))
+    return entries + int((np.bincount(rows.row()) ** 2).sum())
 
 
 def accelerations(equations):

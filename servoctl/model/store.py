@@ -14,6 +14,7 @@ import pickle
 import platform
 import sys
 import time
+from copy import copy
 from dataclasses import replace
 from pathlib import Path
 
@@ -51,7 +52,13 @@ class Store:
 
     def __init__(self, mechanism, program, guess=None, near=None, values=None):
         self.specification = mechanism, program, dict(guess) if isinstance(guess, dict) else guess, near, values
-        self.fingerprint = fingerprint(*self.specification)
+        self.fingerprint, self._part = fingerprint(*self.specification), ""
+
+    def part(self, name):
+        """The entries of another form of the equations, beside those of this store."""
+        other = copy(self)
+        other._part = f"{name} "
+        return other
 
     def recall(self, name, build):
         """The entry of this name; if there is none, the value of `build()`, which is written.
@@ -96,7 +103,7 @@ class Store:
         stamp = None if os.environ.get("SERVOCTL_MEMO") == "none" else _stamp()
         if stamp is None or self.fingerprint is None:
             return None
-        entry = hashlib.sha256(f"{stamp} {self.fingerprint} {name}".encode()).hexdigest()
+        entry = hashlib.sha256(f"{stamp} {self.fingerprint} {self._part}{name}".encode()).hexdigest()
         return cache_directory() / "derived" / entry
 
 

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import casadi as ca
 import numpy as np
 
+from servoctl.codegen.interpreted import Interpreter
 from servoctl.jets.branches import sizes_of_terms
 from servoctl.reduction.appell import NEGATIVE
 from servoctl.reduction.manifold import ON_MANIFOLD, gradient_scales, least_steps
@@ -17,6 +18,7 @@ from servoctl.reduction.ranks import clean
 from servoctl.reduction.reduce import HELD, strong
 from servoctl.tolerances import ENTRY, TINY
 
+TOGETHER = 1000  # sets of parameters, which bounds the memory
 MOVES = 8  # Newton steps of a point to the manifold of other parameters
 
 
@@ -40,8 +42,9 @@ class Quantities:
     pivots: np.ndarray
 
     def at(self, t, jets, values):
-        """Values and sizes (2, n, N) of each group, by name."""
-        result = self.function(t[None], jets, values).full().reshape(2, -1, len(t))
+        """Values and sizes (2, n, N) of each group, by name; the parameters (n_p,) or (n_p, N)."""
+        result = _evaluated(Interpreter(self.function), self.function.numel_out(0), t, jets, values)
+        result = result.reshape(2, -1, len(t))
         return dict(zip(self.counts, np.split(result, np.cumsum([*self.counts.values()])[:-1], axis=1), strict=True))
 
 
@@ -88,52 +91,93 @@ def affirmed(model, values):
     bool
         If it is false, extended precision must decide.
     """
+    return bool(affirmed_each(model, np.reshape(values, (-1, 1)))[0])
+
+
+def affirmed_each(model, values):
+    """The same for each column of parameters (n_p, C), (C,) array of bool."""
     known = model.once("quantities", lambda: quantities(model.equations))
-    if known.function is None or not len(model.reduction.points.t):
-        return False
+    result, points = np.zeros(values.shape[1], bool), len(model.reduction.points.t)
+    if known.function is None or not points:
+        return result
     with np.errstate(all="ignore"):
-        t, jets = _moved(model, values)
-        return jets is not None and _valid(known, known.at(t, jets, values), model.n)
+        for first in range(0, len(result), TOGETHER):
+            here = first + np.arange(len(result[first : first + TOGETHER]))
+            moved, t, jets = _moved(model, values[:, here])
+            here = here[moved]
+            if len(here):
+                p = np.repeat(values[:, here], points, axis=1)
+                result[here] = _valid(known, known.at(t, jets, p), model.n, len(here))
+    return result
 
 
-def _valid(known, found, n):
+def _valid(known, found, n, cases):
     """Whether the values and sizes of all groups are those of a valid derivation with a positive inertia matrix."""
+    found = {name: group.reshape(*group.shape[:2], cases, group.shape[2] // cases) for name, group in found.items()}
     (slopes, of_slopes), (jets, _), (_, terms) = found["slopes"], found["jets"], found["terms"]
-    jets, terms = (np.max(np.abs(each), axis=1, keepdims=True, initial=0.0) for each in (jets, terms))
+    jets, terms = (np.max(np.abs(each), axis=2, keepdims=True, initial=0.0) for each in (jets, terms))
     slopes = np.abs(slopes)
-    alive = ~((slopes <= ENTRY * of_slopes) | (slopes * np.maximum(jets, 1.0) <= ENTRY * terms))
+    dead = (slopes <= ENTRY * of_slopes) | (slopes * np.maximum(jets, 1.0) <= ENTRY * terms)
     left, of_left = found["conditions"]
     dropped, of_dropped = found["dropped"]
-    return bool(
-        not alive.any()
-        and strong(clean(*found["pivots"]), known.pivots[:, None]).all()
-        and (np.abs(left) <= HELD * np.maximum(of_left, TINY)).all()
-        and (np.abs(dropped) <= ENTRY * of_dropped).all()
-        and _positive(found["mass"][0].reshape(n, n, -1))
+    checks = (
+        dead,
+        strong(clean(*found["pivots"]), known.pivots[:, None, None]),
+        np.abs(left) <= HELD * np.maximum(of_left, TINY),
+        np.abs(dropped) <= ENTRY * of_dropped,
     )
+    positive = _positive(found["mass"][0].reshape(n, n, -1)).reshape(cases, -1).all(axis=1)
+    return np.all([check.all(axis=(0, 2)) for check in checks], axis=0) & positive
 
 
 def _positive(mass):
-    """Whether inertia matrices (n, n, N) are certainly positive definite."""
+    """Whether each inertia matrix (n, n, N) is certainly positive definite, (N,)."""
     size = np.sqrt(np.einsum("iip->ip", mass))
     scaled = np.moveaxis(mass / size / size[:, None], 2, 0)
-    return bool(np.isfinite(scaled).all() and np.linalg.eigvalsh(scaled).min() > NEGATIVE)
+    finite = np.isfinite(scaled).all(axis=(1, 2))
+    scaled[~finite] = 0.0
+    return finite & (np.linalg.eigvalsh(scaled).min(axis=1) > NEGATIVE)
 
 
 def _moved(model, values):
-    """Times (N,), and jets (n_z, N) of the model's points moved to the manifold of other parameters, or None."""
+    """The model's points moved to the manifolds of other parameters (n_p, C).
+
+    Returns
+    -------
+    cases : (K,) array of int
+        Those whose points all reach it.
+    t : (K points,) array
+    jets : (n_z, K points) array
+        Case by case.
+    """
     points, top, n_x = model.reduction.points, model.reduction.top, len(model.state_names)
-    t, x = points.t.astype(float), np.vstack([points.jet(k) for k in range(top)]).astype(float)
+    n_points, cases = len(points.t), values.shape[1]
     sizes = (points.sizes(top - 1) * points.factorials(top - 1))[:, None]
-    invariants, rates = model.function("invariants"), model.function("ode")
+    invariants, rates = model.function("invariants").interpreted, model.function("ode").interpreted
+    t = np.tile(points.t.astype(float), cases)
+    x = np.tile(np.vstack([points.jet(k) for k in range(top)]).astype(float), cases)
+    p, m = np.repeat(values, n_points, axis=1), len(model.invariant_names())
+    left, moved = np.arange(cases), np.zeros(cases, bool)
     for _ in range(MOVES):
-        y = np.array([invariants(*place, values) for place in zip(t, x.T, strict=True)]).T
-        m = len(y) // (1 + n_x)
-        residual, jacobian = y[:m], y[m:].reshape(n_x, m, len(t)).swapaxes(0, 1)
-        if not np.isfinite(y).all():
+        here = (left[:, None] * n_points + np.arange(n_points)).ravel()
+        y = _evaluated(invariants, m * (1 + n_x), t[here], x[:, here], p[:, here])
+        residual, jacobian = y[:m], y[m:].reshape(n_x, m, len(here)).swapaxes(0, 1)
+        finite = np.isfinite(y).all(axis=0)
+        near = (np.abs(residual) <= ON_MANIFOLD * gradient_scales(jacobian, x[:, here], sizes)).all(axis=0) & finite
+        finite, near = (each.reshape(-1, n_points).all(axis=1) for each in (finite, near))
+        moved[left[near]] = True
+        on = np.repeat(finite & ~near, n_points)
+        left = left[finite & ~near]
+        if not len(left):
             break
-        if (np.abs(residual) <= ON_MANIFOLD * gradient_scales(jacobian, x, sizes)).all():
-            highest = np.array([rates(*place, values)[n_x - model.n : n_x] for place in zip(t, x.T, strict=True)]).T
-            return t, np.vstack([x, highest])
-        x = x + least_steps(jacobian, residual, sizes).astype(float)
-    return t, None
+        x[:, here[on]] += least_steps(jacobian[:, :, on], residual[:, on], sizes).astype(float)
+    here = np.flatnonzero(np.repeat(moved, n_points))
+    t, x, n_y = t[here], x[:, here], model.function("ode").n_y
+    highest = _evaluated(rates, n_y, t, x, p[:, here])[n_x - model.n : n_x]
+    return np.flatnonzero(moved), t, np.vstack([x, highest])
+
+
+def _evaluated(f, n_y, t, x, p):
+    y = np.empty((n_y, len(t)))
+    f.grid(t, x, p, y)
+    return y

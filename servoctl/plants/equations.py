@@ -10,7 +10,6 @@ import numpy as np
 from servoctl.codegen.folding import folded
 from servoctl.codegen.function import compiled
 from servoctl.errors import SpecificationError
-from servoctl.jets.algebra import cancels
 from servoctl.jets.branches import size_of_terms
 from servoctl.model.equations import Invariants
 from servoctl.reduction.appell import plant_accelerations, require_inertia
@@ -109,6 +108,8 @@ class PlantEquations:
     @cached_property
     def entries_dropped(self):
         """What eliminations left out as zero, unless all terms cancel by algebra: a list of SX."""
+        from servoctl.jets.algebra import cancels
+
         return [entry for entry in (*self._rows[2], *self._solved[2]) if not cancels(entry)]
 
     @cached_property

@@ -1,5 +1,6 @@
 """Instants at which paths switch, and the smoothness of residuals there, from the expressions themselves."""
 
+from copy import copy
 from dataclasses import dataclass
 from functools import cached_property
 from math import factorial
@@ -8,6 +9,7 @@ import casadi as ca
 import numpy as np
 
 from servoctl.errors import SpecificationError
+from servoctl.jets.pieces import by_pieces
 from servoctl.jets.series import Series
 from servoctl.jets.tape import Tape
 
@@ -19,6 +21,7 @@ SAME_INSTANT = 1e-9  # switches closer than this fraction of the time from first
 NEAR_ZERO = 0.5  # of the values beside it: a parabola's least value below this is looked at closely
 WIDE, NARROW = 1e-4, 1e-7  # distances of far and close series from an instant, relative to its neighbourhood
 JUMP = 1e-6  # jumps below this fraction of the largest value of a derivative nearby are rounding errors
+BY_ROUNDING = 1e-12  # of the values: what differs by no more within a neighbourhood is rounding, as of splines
 STAYS = 0.5  # a jump keeps more than this fraction of its size from far to close series; other differences shrink
 AROUND = np.delete(np.linspace(-1.0, 1.0, 41), 20)  # places in the neighbourhood for the size of a derivative
 EXTRA = 4  # additional coefficients for shifting series to the instant itself
@@ -107,6 +110,13 @@ class Switches:
     def tape(self):
         """The tape of the residuals."""
         return Tape(self.symbols, list(self.residuals.values()))
+
+    @cached_property
+    def _numeric_tape(self):
+        """The tape, for numbers, without the sums over the pieces of splines."""
+        tape = copy(self.tape)
+        tape.nodes = by_pieces(tape, (i for sides in self.timed for i in sides if i is not None))
+        return tape
 
     def _timed(self):
         """The sides of switches that depend on t and not on jets."""
@@ -227,7 +237,7 @@ class Switches:
                 # No switch depends on jets; these values keep divisions by them from zero.
                 first = np.longdouble(0.3 + 0.1 * ((7 * i) % 10))
             inputs.append([first, *(float(k == 1 and place is not None and place[0] == "t") for k in range(1, depth))])
-        series = Series(self.tape, inputs)
+        series = Series(self._numeric_tape, inputs)
         with np.errstate(all="ignore"):
             for _ in range(depth):
                 series.advance()
@@ -259,6 +269,7 @@ class Switches:
                 wide = jump(c[:, 0, i], c[:, 1, i], far[i])
                 narrow = jump(c[:, 2, i], c[:, 3, i], close[i])
                 least = np.maximum(JUMP * np.abs(c[:, :, i]).max(axis=1), np.nan_to_num(STAYS * np.abs(wide)))
+                least = np.maximum(least, BY_ROUNDING * np.abs(c[0, :, i]).max() / near[i] ** np.arange(len(c)))
                 rough = np.flatnonzero(np.abs(narrow) > least)
                 if rough.size and rough[0] <= needs.get(name, -1):
                     result.setdefault(name, []).append((when, int(rough[0]) - 1))

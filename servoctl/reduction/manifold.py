@@ -22,6 +22,7 @@ LEVEL_SOLVED = 1e-17  # relative step below which a level is solved
 ON_MANIFOLD = 1e-13  # largest scaled residual of a point: far below ENTRY, so that zeros show
 GAUSS_NEWTON_STEPS = 60  # on all levels together
 COORDINATE_STEPS, JET_STEPS = 8, 2  # Newton steps for q, and for a level of jets, where rows are mostly affine
+LEVEL_SWEEPS = 2  # a second one, without gradients in all jets, where the first leaves the rounding of its steps
 SHORTENINGS = 12  # quarterings of a step before the search from a start ends
 SPREAD = 0.1  # relative width of starts about a guess, whose size is its value plus its usual size
 POINTS = 5  # at which ranks are decided; with as many further starts where one of the first fails
@@ -130,6 +131,8 @@ class Points:
 def solve(flow, t, z, iterations=GAUSS_NEWTON_STEPS, natural=False):
     """Solve a flow's rows for jets: level by level, then by damped Gauss-Newton steps on all levels.
 
+    Where the levels lead nowhere, damped steps for the rows of q alone come first; a point without these has no jets.
+
     Parameters
     ----------
     flow : Flow
@@ -151,11 +154,14 @@ def solve(flow, t, z, iterations=GAUSS_NEWTON_STEPS, natural=False):
     if not len(flow.equations):
         return z, np.zeros(len(t), dtype=REAL)
     scales, sizes = np.ones((len(flow.equations), len(t))), flow.points.sizes(flow.level)[:, None]
-    for level in range(flow.level + 1):
-        _solve_level(flow, t, z, level, scales, sizes)
-    residual = flow.residual(t, z)
-    norm = _norms(residual, scales)
+    norm = _solve_levels(flow, t, z, scales, sizes)
     active = np.flatnonzero(norm > ROUNDED)
+    far = np.flatnonzero(~(norm < ON_MANIFOLD))
+    if len(far) and flow.level and 0 in flow.members and not natural:
+        z[: flow.q.nq, far], lowest = solve(flow.lowest, t[far], z[: flow.q.nq, far], iterations)
+        norm = _solve_levels(flow, t, z, scales, sizes)
+        lost = far[~(lowest < ON_MANIFOLD)]
+        active = np.setdiff1d(np.flatnonzero(norm > ROUNDED), lost)
     for _ in range(iterations):
         if not len(active):
             break
@@ -174,6 +180,20 @@ def solve(flow, t, z, iterations=GAUSS_NEWTON_STEPS, natural=False):
         active = active[better]
         z[:, active] = trial[:, better]
     return z, norm
+
+
+def _solve_levels(flow, t, z, scales, sizes):
+    """Solve level after level, twice where the rounding of the first steps is left; changes z and scales in place.
+
+    Returns the largest scaled residual of each point, (N,).
+    """
+    for _ in range(LEVEL_SWEEPS):
+        for level in range(flow.level + 1):
+            _solve_level(flow, t, z, level, scales, sizes)
+        norm = _norms(flow.residual(t, z), scales)
+        if not np.any((norm > ROUNDED) & (norm < ON_MANIFOLD)):
+            break
+    return norm
 
 
 def _search(flow, t, z, step, scale, residual):

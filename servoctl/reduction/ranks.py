@@ -24,6 +24,7 @@ from servoctl.tolerances import CUTOFF, ENTRY, NOISE, REFINEMENTS, RESOLVED, TIN
 THRESHOLD = 0.1  # least size of a pivot, relative to the largest entry of its equilibrated row
 SUSPECT = 1e-8  # of the size of its terms: an entry above this is evaluated in extended precision
 _dropped = ContextVar("dropped", default=None)  # where eliminations note what they leave out
+LARGE, THIN = 40, 0.25  # rows and columns of a matrix, and its share of nonzero entries, for sparse elimination
 SWEEPS = 6  # of equilibration; each takes the square root of the remaining factors: 1e±30 comes within a factor of 3
 
 
@@ -73,13 +74,18 @@ def equilibrate(matrix):
     """
     a = np.array(matrix, dtype=np.longdouble)
     rows, columns = np.ones(a.shape[:-1], dtype=a.dtype), np.ones(a.shape[:-2] + a.shape[-1:], dtype=a.dtype)
-    for _ in range(SWEEPS if a.size else 0):
-        for axis, factors in ((-1, rows), (-2, columns)):
-            largest = np.abs(a).max(axis=axis)
-            largest[~(largest > 0)] = 1.0
-            scale = 1.0 / np.sqrt(largest)
+    if not a.any():
+        return a, rows, columns
+    *each, i, j = places = np.nonzero(a)
+    entries = a[places]
+    for _ in range(SWEEPS):
+        for factors, place in ((rows, (*each, i)), (columns, (*each, j))):
+            largest = np.zeros_like(factors)
+            np.maximum.at(largest, place, np.abs(entries))
+            scale = 1.0 / np.sqrt(np.where(largest > 0, largest, 1.0))
             factors *= scale
-            a *= scale[..., None] if axis == -1 else scale[..., None, :]
+            entries *= scale[place]
+    a[places] = entries
     return a, rows, columns
 
 
@@ -109,6 +115,20 @@ def decide_each(matrices, resolved=RESOLVED):
     list of Rank
     """
     a, _, _ = equilibrate(np.moveaxis(matrices, 2, 0))
+    thin = min(a.shape[1:]) >= LARGE and np.count_nonzero(a) <= THIN * a.size
+    pivots, rows, columns = map(np.array, zip(*map(_sparse_pivots, a), strict=True)) if thin else _dense_pivots(a)
+    ranks = (pivots > resolved).astype(int).cumprod(axis=1).sum(axis=1).tolist()
+    return [
+        Rank(r, min(p[:r], default=np.inf), max(p[r:], default=0.0), tuple(i[:r]), tuple(j[:r]))
+        for r, p, i, j in zip(ranks, pivots.tolist(), rows.tolist(), columns.tolist(), strict=True)
+    ]
+
+
+def _dense_pivots(a):
+    """Sizes of the pivots (N, min(m, n)) of complete pivoting, rows (N, m) and columns (N, n) in their order.
+
+    Eliminates the matrices a (N, m, n) in place, all at a time.
+    """
     count, m, n = a.shape
     each, least = np.arange(count), min(m, n)
     rows, columns = np.tile(np.arange(m), (count, 1)), np.tile(np.arange(n), (count, 1))
@@ -125,11 +145,26 @@ def decide_each(matrices, resolved=RESOLVED):
         pivot = np.where(open_, a[:, k, k], 1.0)
         pivots[:, k] = np.where(open_, np.abs(pivot), 0.0)
         a[:, k + 1 :, k + 1 :] -= (a[:, k + 1 :, k] / pivot[:, None])[:, :, None] * a[:, None, k, k + 1 :]
-    ranks = (pivots > resolved).astype(int).cumprod(axis=1).sum(axis=1).tolist()
-    return [
-        Rank(r, min(p[:r], default=np.inf), max(p[r:], default=0.0), tuple(i[:r]), tuple(j[:r]))
-        for r, p, i, j in zip(ranks, pivots.tolist(), rows.tolist(), columns.tolist(), strict=True)
-    ]
+    return pivots, rows, columns
+
+
+def _sparse_pivots(a):
+    """The same pivots, rows and columns of one matrix (m, n); changes the entries that are not zero alone."""
+    m, n = a.shape
+    rows, columns, pivots = np.arange(m), np.arange(n), np.zeros(min(m, n))
+    largest = np.abs(a).max(axis=1, initial=0.0)  # of each row that is left
+    for k in range(min(m, n)):
+        i = k + largest[k:].argmax()
+        if not largest[i] > 0:
+            break
+        j = k + np.abs(a[i, k:]).argmax()
+        for array, other in ((a, i), (rows, i), (largest, i), (a.T, j), (columns, j)):
+            array[[k, other]] = array[[other, k]]
+        pivots[k] = np.abs(a[k, k])
+        below, right = (k + 1 + np.flatnonzero(entries) for entries in (a[k + 1 :, k], a[k, k + 1 :]))
+        a[np.ix_(below, right)] -= (a[below, k] / a[k, k])[:, None] * a[k, right]
+        largest[below] = np.abs(a[below, k + 1 :]).max(axis=1, initial=0.0)
+    return pivots, rows, columns
 
 
 def decide_all(values, sizes):
@@ -242,7 +277,15 @@ def alive(entries, points):
     return np.where(share > 1.0, share, 0.0)
 
 
-def eliminate(matrix, right, numbers):
+def pivot_order(matrix, numbers):
+    """Pivots ((row, column), ...) of a matrix (m, n) SX in their order, chosen by its numbers (m, n, N) at points."""
+    n = matrix.shape[0]
+    system = _System(matrix, ca.SX(n, 0), numbers)
+    with np.errstate(all="ignore"):
+        return tuple(system.step() for _ in range(n))
+
+
+def eliminate(matrix, right, numbers, diagonal=False, order=(), in_order=False):
     """Solve A X = B symbolically.
 
     Parameters
@@ -251,6 +294,13 @@ def eliminate(matrix, right, numbers):
     right : (n, m) SX
     numbers : (n, n, N) array
         A at N points, cleaned of rounding, where pivots are chosen.
+    diagonal : bool, optional
+        Whether pivots are diagonal entries, as is stable for definite matrices.
+    order : sequence of (int, int), optional
+        Row and column of each pivot; default: chosen by the numbers.
+    in_order : bool, optional
+        Among pivots of the same fill-in the one of the first row is taken instead of the largest: chains of bodies are
+        eliminated from end to end, with less fill-in later.
 
     Returns
     -------
@@ -264,9 +314,9 @@ def eliminate(matrix, right, numbers):
         If A is singular at a point.
     """
     n, m = right.shape
-    system = _System(matrix, right, numbers)
+    system = _System(matrix, right, numbers, diagonal, in_order)
     with np.errstate(all="ignore"):  # at some random points a pivot has no value
-        order = [system.step() for _ in range(n)]
+        order = [system.step(*pivot) for pivot in order or [()] * n]
     solution, rows, rhs = [None] * n, system.rows, system.rhs
     for i, j in reversed(order):
         others = [(a, solution[c]) for c, (a, _) in rows[i].items() if c != j]
@@ -287,8 +337,8 @@ class _System:
     `members` those of a column.
     """
 
-    def __init__(self, matrix, right, numbers):
-        n = matrix.shape[0]
+    def __init__(self, matrix, right, numbers, diagonal=False, in_order=False):
+        n, self.diagonal, self.in_order = matrix.shape[0], diagonal, in_order
         scaled = np.moveaxis(equilibrate(np.moveaxis(numbers, 2, 0))[0], 0, 2).astype(float)
         self.points, self.asked, self.followed = scaled.shape[2], False, False
         entries = list(zip(*matrix.sparsity().get_triplet(), matrix.nonzeros(), strict=True))
@@ -305,32 +355,38 @@ class _System:
             [right[i, :].elements() for i in range(n)] if right.shape[1] != 1 else [[b] for b in right.elements()]
         )
         self.open = dict.fromkeys(range(n))
-        self.members = [{} for _ in range(n)]
+        self.members = [{} for _ in range(matrix.shape[1])]
         for i, row in enumerate(self.rows):
             for j in row:
                 self.members[j][i] = None
-        self.candidates = [self._large(row) for row in self.rows]
+        self.candidates = [self._large(i) for i in range(n)]
 
-    def _large(self, row):
-        """The candidates of a row: a size is the smallest over the points."""
+    def _large(self, i):
+        """The candidates of row i: a size is the smallest over the points."""
+        row = self.rows[i]
+        if self.diagonal:
+            row = {i: row[i]} if i in row else {}
         if not row:
             return []
         sizes = np.abs([number[: self.points] for _, number in row.values()]).min(axis=1).tolist()
         least = THRESHOLD * max(sizes)
         return [(j, size) for j, size in zip(row, sizes, strict=True) if size >= least and size > 0.0]
 
-    def step(self):
-        """Eliminate by the pivot with the least fill-in, and return its row and column."""
+    def step(self, *pivot):
+        """Eliminate by a pivot, by default that with the least fill-in, and return its row and column.
+
+        Among these a number is taken, if there is one: it cannot vanish, and less depends on it.
+        """
         if self.asked and not self.followed:
             self._follow()
-        i, j = self._pivot()
+        i, j = pivot or self._pivot()
         row = self.rows[i]
         del self.open[i]
         for c in row:
             del self.members[c][i]
         for r in self.members[j]:
             self._subtract(r, row, self.rhs[i], j)
-            self.candidates[r] = self._large(self.rows[r])
+            self.candidates[r] = self._large(r)
         self.members[j] = {}
         return i, j
 
@@ -339,9 +395,12 @@ class _System:
         for i in self.open:
             fill = len(self.rows[i]) - 1
             for j, size in self.candidates[i]:
-                key = (fill * (len(self.members[j]) - 1), -size)
-                if least is None or key < least:
-                    least, place = key, (i, j)
+                new = fill * (len(self.members[j]) - 1)
+                if least is None or new <= least[0]:
+                    variable = not self.rows[i][j][0].is_constant()
+                    key = (new, 0, 0) if self.in_order else (new, variable, -size)
+                    if least is None or key < least:
+                        least, place = key, (i, j)
         if place is None:
             raise SingularProgram(
                 "A system of equations is singular at the points where its pivots are chosen.",

@@ -15,7 +15,7 @@ from servoctl.reduction.hidden import complete
 from servoctl.reduction.knots import Knots, Switches, require_smooth
 from servoctl.reduction.manifold import Context, Points, sample
 from servoctl.reduction.orders import Orders
-from servoctl.reduction.ranks import Rank, clean, decide, decide_all, noting_dropped
+from servoctl.reduction.ranks import Rank, clean, decide, decide_all, eliminate, noting_dropped, pivot_order
 from servoctl.reduction.realisation import realisation, wished, wished_balance
 from servoctl.reduction.rows import Balance, as_rows, balances, merge_uses, settle_alone
 from servoctl.reduction.scales import ORDINARY, usual
@@ -60,6 +60,8 @@ class Reduction(Packed):
         The rows by blocks, where they are deep.
     entries_dropped : tuple of SX
         What the eliminations of the derivation left out, as it vanishes identically.
+    order : tuple of (int, int)
+        Row and column of each pivot of the leading matrix; empty if they are chosen at the points.
     """
 
     mechanism: Mechanism
@@ -75,6 +77,7 @@ class Reduction(Packed):
     original: dict
     cascade: Cascade | None = None
     entries_dropped: tuple = ()
+    order: tuple = ()
 
     def __repr__(self):
         rows = ", ".join(f"{row.name} {row.order}" for row in self.rows)
@@ -120,6 +123,15 @@ class Reduction(Packed):
     def leading(self):
         """The leading matrix L, (n, n) SX."""
         return ca.vertcat(*(row.gradient(self.mechanism.q) for row in self.rows))
+
+    def solve(self, right):
+        """L⁻¹ right, and the pivots of L."""
+        return eliminate(self.leading, right, clean(*self.points.matrix(self.leading)), order=self.order)
+
+    def order_at(self, t, jets, values):
+        """Pivots of L chosen at jets (nz,) of an instant t [s], with these parameters."""
+        here = self.points.at(np.array([t]), jets[:, None], values)
+        return pivot_order(self.leading, clean(*here.matrix(self.leading)))
 
     @cached_property
     def conditions(self):

@@ -181,7 +181,8 @@ class Mechanism:
 
     def _along(self, direction):
         """Places of the velocities along a direction (n,), and in its entries."""
-        entries = {i: direction[i] for i in range(self.q.n) if not direction[i].is_zero()}
+        nonzero = zip(direction.row(), direction.nonzeros(), strict=True)
+        entries = {i: entry for i, entry in nonzero if not entry.is_zero()}
         return {*(("w", i) for i in entries), *self.places(*entries.values())}
 
     def part(self, places):

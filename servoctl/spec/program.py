@@ -153,6 +153,7 @@ def no_program():
     """The program without residuals: forces alone determine the motion."""
     program = object.__new__(Program)
     program.by, program.residuals, program.with_turns, program.weights, program.toward = "actuators", {}, {}, {}, {}
+    program.metric = "actuators"
     return program
 
 

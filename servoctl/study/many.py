@@ -1,5 +1,6 @@
 """Many motions of one model, with different starts and parameters, in one compiled call."""
 
+import contextlib
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -15,6 +16,7 @@ from servoctl.methods.lanes import fits, integrate
 from servoctl.methods.taylor import order_for
 from servoctl.model.model import Model
 from servoctl.model.start import State
+from servoctl.model.validity import affirmed_each
 from servoctl.reduction.idle import names_of
 from servoctl.simulation import OFF, as_state, simulated
 from servoctl.study.cases import FAILURE, as_cases
@@ -160,18 +162,9 @@ class _Many:
 
     def in_lanes(self, span, method, times, threads):
         """Compute the cases that need nothing but steps."""
-        which, states = [], []
-        for i in range(len(self.cases)):
-            try:
-                model = self.model_of(i)
-                if model.reduction is self.model.reduction and not model.knots:
-                    states.append(as_state(model, self.start(i, model, span[0]), span[0]))
-                    which.append(i)
-            except ServoError:
-                continue  # it fails again, and becomes a row, where the case is computed by itself
-        if not which:
+        which, x0, p = self._prepared(span[0])
+        if not len(which):
             return
-        x0, p = np.array(states), np.array([self.model_of(i).parameters for i in which])
         order, top = order_for(method.rtol) if method.order is None else method.order, self.model.reduction.top
         last = max(order + top - 1, (method.jets or top) + 1)
         atol = np.full(len(which), ATOL if method.atol is None else method.atol)
@@ -182,9 +175,35 @@ class _Many:
         good = (ends[:, 0] > 0) & self._consistent(span[0], x0, p) & self._consistent(span[1], x, p)
         if method.atol is None:
             good &= self._default_fits(span, x0, largest, method.rtol)
-        here = np.array(which)[good]
+        here = which[good]
         self.done[here], self.final[here], self.steps[here] = True, x[good], ends[good, 1]
         self.samples[here] = samples[good]
+
+    def _prepared(self, t):
+        """Cases (K,) for which the derivation holds, their states (K, n_x) and parameters (K, n_p)."""
+        affirmed, which, states, values = self._affirmed(), [], [], []
+        for i in range(len(self.cases)):
+            try:
+                model = self.model if i in affirmed else self.model_of(i)
+                if model.reduction is self.model.reduction and not model.knots:
+                    states.append(as_state(model, self.start(i, model, t), t))
+                    values.append(affirmed.get(i, model.parameters))
+                    which.append(i)
+            except ServoError:
+                continue  # it fails again, and becomes a row, where the case is computed by itself
+        return np.array(which, dtype=int), np.array(states), np.array(values)
+
+    def _affirmed(self):
+        """Parameters of cases for which the derivation holds, as far as double precision affirms it at once."""
+        by_name = isinstance(self.starts, dict)  # whose states depend on them
+        if by_name or self.model.reduction.timed or not self.cases[0]:
+            return {}
+        symbols, numbers, values = self.model.reduction.mechanism.parameters, self.model.numbers, {}
+        for i, case in enumerate(self.cases):
+            with contextlib.suppress(ServoError):
+                values[i] = symbols.values({**numbers, **case})
+        valid = affirmed_each(self.model, np.array([*values.values()]).T) if values else []
+        return {i: each for (i, each), holds in zip(values.items(), valid, strict=True) if holds}
 
     def _consistent(self, t, x, p):
         """Whether states (N, n_x) satisfy the invariants."""

@@ -211,7 +211,8 @@ class _Checks:
     def __init__(self, model, run, segments):
         self.model, self.run, self.notes, self.doubts = model, run, [], []
         hidden = bool(model.reduction.hidden) and run.method != "algebraic"
-        self.drifts = run.method == "Taylor" or model.reduction.top > 2 or hidden
+        of_series = run.method == "Taylor" and len(run.jets) > len(model.jet_names)
+        self.drifts = of_series or model.reduction.top > 2 or hidden
         self.stored, self.fresh = run.stored, replace(run, stored={}, stored_residual={})
         self.span = abs(run.t[-1] - run.t[0]) or 1.0
         self.samples = [

@@ -5,6 +5,7 @@
 #define NY 13
 #define PROJECTED
 #define WIDE
+#define WORK 8
 
 #define CORRECTIONS 30
 #define CORRECTED 1e-13
@@ -17,6 +18,7 @@
 #define TERMS 4
 #define LAST_TERM 0.1
 #define BEND 0.344
+#define REST 1000
 
 /* newton.c */
 #define PIVOTS 1
@@ -27,6 +29,8 @@
 #define TOP 2
 #define LAST 4
 #define PLAIN 1
+#define FREE {1, 1}
+#define SETTLED
 
 /* many.c */
 #define DEGRADED 0.02
@@ -70,12 +74,20 @@
     void name(number t, const number *restrict x, const number *restrict p, number *restrict y);
 DECLARED(example, double)
 DECLARED(example_project, double)
+DECLARED(example_settled, double)
 DECLARED(example_jacobian, double)
 DECLARED(example_wide, W)
-DECLARED(example_wide_step, W)
 DECLARED(expansion, W)
 DECLARED(numbers, W)
 DECLARED(change, W)
+#define PHASE(name, number) \
+    void name(number t, const number *restrict x, const number *restrict p, number *restrict y, number *restrict w);
+PHASE(example_instant, double)
+PHASE(example_correction, double)
+PHASE(example_rest, double)
+PHASE(example_wide_instant, W)
+PHASE(example_wide_correction, W)
+PHASE(example_wide_rest, W)
 void law(W t, const W *restrict x, const double *restrict p, W *restrict y);
 void signals(W t, const W *restrict x, const double *restrict p, W *restrict y);
 void rates_of_block(W t, const W *const x[], const W *const p[], W (*y)[NX + 1]);

@@ -32,10 +32,19 @@ INLINE W w_rough_log2(W a)
     return __builtin_convertvector((w_bits(a) >> 52) - 1023, W) + f * (1.0 + BEND - BEND * f);
 }
 
-INLINE W w_largest(const W *v, int64_t n)
+INLINE W w_rough_exp2(W a)
+{
+    const W within = w_fmax(w_fmin(a, ALL((double)REST)), ALL(-1022.0));
+    const I above = __builtin_convertvector(within, I), whole = above + (__builtin_convertvector(above, W) > within);
+    const W f = within - __builtin_convertvector(whole, W);
+    return w_value((whole + 1023) << 52) * (1.0 + f * (1.0 - BEND + BEND * f));
+}
+
+INLINE W w_largest(const W *v, int64_t n, int64_t level)
 {
     I largest = w_bits(ALL(0.0));
     for (int64_t i = 0; i < n; i++) {
+        if (level && !IS_FREE((level - 1) * N + i)) continue;
         const I bits = w_bits(w_fabs(v[i])), more = bits > largest;
         largest = (more & bits) | (~more & largest);
     }
@@ -43,22 +52,17 @@ INLINE W w_largest(const W *v, int64_t n)
 }
 
 /* `length` of taylor.c in lanes. */
-INLINE W w_length(const W *x, const W *c, int64_t n, int64_t first, int64_t levels, double log_rtol, W least)
+INLINE W w_length(const W *x, const W *c, int64_t n, int64_t level, double log_rtol, W least)
 {
-    W size[TERMS], shortest = ALL(INFINITY);
+    const W scale = w_rough_log2(least + w_largest(x, n, level));
+    W shortest = ALL(INFINITY);
     for (int64_t m = 0; m < TERMS; m++) {
         const int64_t k = term(m);
-        size[m] = k > 0 ? w_rough_log2(w_largest(c + (k - 1) * n, n)) : ALL(0.0);
-    }
-    for (int64_t j = first; j < levels; j++) {
-        const W scale = w_rough_log2(least + w_largest(x + (j - first) * n, n));
-        for (int64_t m = 0; m < TERMS; m++) {
-            const int64_t k = term(m);
-            if (k <= j) continue;
-            const W growth = (scale - size[m] - rough_log2(falling(k, j))) * (1.0 / (double)(k - j));
-            const W h = log_rtol * (1.0 / (double)(LAST - j)) + growth;
-            shortest = w_select(h < shortest, h, shortest);
-        }
+        if (k <= level || k == 0) continue;
+        const W size = w_rough_log2(w_largest(c + (k - 1) * n, n, level));
+        const W growth = (scale - size - rough_log2(falling(k, level))) * (1.0 / (double)(k - level));
+        const W h = log_rtol * (1.0 / (double)(LAST - level)) + growth;
+        shortest = w_select(h < shortest, h, shortest);
     }
     return shortest;
 }
@@ -101,6 +105,7 @@ static void sample(const Many *m, int64_t lane, double h, int ends, Motions *s)
 {
     const double forward = m->t1 > m->t0 ? 1 : -1, t = s->t[lane];
     const int64_t c = PLAIN ? 0 : NQ * LAST;
+    double p[NP + 1];
     for (int64_t k; (k = s->sampled[lane]) < m->n_times; s->sampled[lane]++) {
         const double after = m->times[k] - t;
         if (!ends && forward * after > forward * h) return;
@@ -113,6 +118,8 @@ static void sample(const Many *m, int64_t lane, double h, int ends, Motions *s)
             }
             row[i] = j ? total : s->x[i][lane] + total * after;
         }
+        for (int64_t i = 0; i < NP; i++) p[i] = s->p[i][lane];
+        settle(m->times[k], row, p);
     }
 }
 
@@ -129,16 +136,24 @@ INLINE I falling_pivots(Motions *s)
     return bad;
 }
 
-/* Whether the series before does not meet the equations at the end of its step. */
+/* Whether the series before does not meet the equations at the end of its step: an error of gamma^(s) is judged by what it
+   is at the highest level that is integrated. */
 INLINE I off(const Motions *s, const W *c, double rtol)
 {
-    W error = ALL(0.0), size = w_largest(s->x + NX - N, N);
-    for (int64_t i = 0; i < N; i++) {
-        const W now = falling(TOP, TOP) * c[(TOP - 1) * N + i];
-        error = w_fmax(error, w_fabs(s->h * (now - s->ahead[i])));
-        size = w_fmax(size, w_fabs(s->h * now));
+    I wrong = w_bits(ALL(0.0));
+    for (int64_t j = 0; j < TOP; j++) {
+        W error = ALL(0.0), size = j ? w_largest(s->x + NQ + (j - 1) * N, N, 0) : w_largest(s->x, NQ, 0);
+        W part = ALL(falling(LAST, j) / falling(LAST, TOP - 1));
+        for (int64_t m = j; m < TOP; m++) part *= s->h;
+        for (int64_t i = 0; i < N; i++) {
+            if (highest_level(i) != j) continue;
+            const W now = falling(TOP, TOP) * c[(TOP - 1) * N + i];
+            error = w_fmax(error, w_fabs(part * (now - s->ahead[i])));
+            size = w_fmax(size, w_fabs(part * now));
+        }
+        wrong |= ~(error <= FAR_OFF * (s->atol + rtol * size));
     }
-    return (s->h != 0) & ~(error <= FAR_OFF * (s->atol + rtol * size));
+    return (s->h != 0) & wrong;
 }
 
 void FN(many)(Many *m, int64_t first, int64_t last)
@@ -151,16 +166,24 @@ void FN(many)(Many *m, int64_t first, int64_t last)
         if (*(const volatile int64_t *)&m->stop) return;
         expansion(s.t, s.x, s.p, s.y);
         const W *c = s.y + (PLAIN ? 0 : NQ * LAST), least = s.atol / m->rtol;
-        const W of_q = w_length(s.x, s.y, NQ, 0, 1, log_rtol, least);
-        const W of_rates = w_length(s.x + NQ, c, N, 1, TOP, log_rtol, least);
-        const W log_h = w_select(of_rates < of_q, of_rates, of_q), left = forward * (m->t1 - s.t);
+        W log_h = w_length(s.x, s.y, NQ, 0, log_rtol, least);
+        for (int64_t j = 1; j < TOP; j++) {
+            const W of_level = w_length(s.x + NQ + (j - 1) * N, c, N, j, log_rtol, least);
+            log_h = w_select(of_level < log_h, of_level, log_h);
+        }
+        for (int64_t i = 0; i < N * (TOP - 1); i++) {
+            if (!IS_FREE(i)) s.x[NQ + i] = falling(1 + i / N, 1 + i / N) * c[i];
+        }
+        const W left = forward * (m->t1 - s.t);
         const I fallen = falling_pivots(&s), wrong = off(&s, c, m->rtol);
-        W h_long, x[NX + 1];
-        for (int64_t lane = 0; lane < W_LANES; lane++) h_long[lane] = exp2(log_h[lane]);
+        const W h_long = w_rough_exp2(log_h);
+        W x[NX + 1];
         const I ends = h_long >= left * (1 - 1e-12);
         W h = forward * w_select(ends, left, h_long);
         for (int64_t i = 0; i < NX; i++) {
             const int64_t j = i < NQ ? 0 : 1 + (i - NQ) / N;
+            x[i] = s.x[i];
+            if (j && !IS_FREE(i - NQ)) continue; /* rows determine it in the next expansion */
             const W part = j ? w_series(c, N, (i - NQ) % N, j, h) : w_series(s.y, NQ, i, 0, h);
             x[i] = j ? part : s.x[i] + part;
         }

@@ -1,5 +1,8 @@
 /* A path by continuation, and its points between. The outputs are the Newton correction delta of x, the rates x' and x''
-   along the path, others, and at last the pivots of the elimination. A node is a row of t, x and these outputs. */
+   along the path, others, and at last the pivots of the elimination. A node is a row of t, x and these outputs. Newton's
+   iteration computes delta alone; what depends on t and p alone once, and the other outputs at its end. */
+#include <string.h>
+
 #include "unit.h"
 #ifdef WIDE
 #include "lanes.h"
@@ -23,9 +26,10 @@ static double relative(const double *x, const double *change)
    `first` the size of the first correction. */
 static int correct(double t, double *x, const double *p, double factor, double *y, double *first, int64_t *count)
 {
-    double x_next[NX + 1], y_next[NY + 1], defect, before = INFINITY;
+    double x_next[NX + 1], y_next[NX + 1], w[WORK], w_next[WORK], defect, before = INFINITY;
+    FN(instant)(t, x, p, y, w);
     for (int64_t iteration = 0; ; iteration++, before = defect) {
-        NAME(t, x, p, y);
+        FN(correction)(t, x, p, y, w);
         ++*count;
         defect = relative(x, y);
         if (!iteration) *first = defect;
@@ -34,14 +38,18 @@ static int correct(double t, double *x, const double *p, double factor, double *
         if (defect > factor * before || iteration == CORRECTIONS) return 0;
         for (int64_t i = 0; i < NX; i++) x[i] += y[i];
     }
-    if (defect <= ROUNDING) return 1;
-    for (int64_t i = 0; i < NX; i++) x_next[i] = x[i] + y[i];
-    NAME(t, x_next, p, y_next);
-    ++*count;
-    if (relative(x_next, y_next) < defect) {
-        for (int64_t i = 0; i < NX; i++) x[i] = x_next[i];
-        for (int64_t i = 0; i < NY; i++) y[i] = y_next[i];
+    if (defect > ROUNDING) {
+        for (int64_t i = 0; i < NX; i++) x_next[i] = x[i] + y[i];
+        memcpy(w_next, w, sizeof w);
+        FN(correction)(t, x_next, p, y_next, w_next);
+        ++*count;
+        if (relative(x_next, y_next) < defect) {
+            for (int64_t i = 0; i < NX; i++) x[i] = x_next[i];
+            for (int64_t i = 0; i < NX; i++) y[i] = y_next[i];
+            memcpy(w, w_next, sizeof w);
+        }
     }
+    FN(rest)(t, x, p, y, w);
     return 1;
 }
 
@@ -189,7 +197,7 @@ static inline double wide_relative(const W *x, const W *y)
 static int block(int64_t n, int64_t k, const double *t, const double *const *a, const double *const *b, double allowed,
                  const W *p, double *x_log, double *y_log, int64_t *count)
 {
-    W x[NX + 1], y[NY + 1];
+    W x[NX + 1], y[NY + 1], w[WORK];
     const W now = w_load(t + k), start = gather(a, 0), h = gather(b, 0) - start;
     const W s = (now - start) / h, r = 1.0 - s, s3 = s * s * s, r3 = r * r * r;
     const W at_a = r3 * (1.0 + s * (3.0 + 6.0 * s)), rate_a = r3 * s * (1.0 + 3.0 * s) * h;
@@ -198,16 +206,18 @@ static int block(int64_t n, int64_t k, const double *t, const double *const *a, 
     for (int64_t i = 0; i < NX; i++)
         x[i] = at_a * gather(a, 1 + i) + rate_a * gather(a, 1 + 2 * NX + i) + second_a * gather(a, 1 + 3 * NX + i)
              + at_b * gather(b, 1 + i) - rate_b * gather(b, 1 + 2 * NX + i) + second_b * gather(b, 1 + 3 * NX + i);
+    FN(wide_instant)(now, x, p, y, w);
     for (double defect = INFINITY, before = allowed; !(defect <= QUADRATIC); before = CONTRACTION * defect) {
-        FN(wide_step)(now, x, p, y);
+        FN(wide_correction)(now, x, p, y, w);
         *count += 8;
         defect = wide_relative(x, y);
         if (!(defect <= before)) return 0;
         for (int64_t i = 0; i < NX; i++) x[i] += y[i];
     }
-    FN(wide)(now, x, p, y);
+    FN(wide_correction)(now, x, p, y, w);
     *count += 8;
     if (!(wide_relative(x, y) <= CORRECTED)) return 0;
+    FN(wide_rest)(now, x, p, y, w);
     for (int64_t i = NY - PIVOTS; i < NY; i++) {
         const W other = gather(a, 1 + NX + i), product = y[i] * other;
         if (w_any(~((product >= STEADY * y[i] * y[i]) & (product >= STEADY * other * other)))) return 0;

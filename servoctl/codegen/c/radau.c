@@ -1,5 +1,6 @@
 /* Adaptive steps of the Radau IIA methods (Hairer and Wanner 1996, IV.8). */
 #include "unit.h"
+#include "phased.h"
 #include "restore.h"
 
 /* LU decomposition with partial pivoting of a complex matrix, real and imaginary parts side by side; the diagonal keeps
@@ -95,12 +96,13 @@ static int prepare(Method *m, double h)
 static int64_t iterate(Method *m, double t, const double *x, double h, double *z, double *rate)
 {
     const int64_t n = NX, s = m->s;
-    double point[NX + 1], y[NY + 1], last = 0;
+    double point[NX + 1], y[NY + 1], w[s][WORK], now[s], last = 0;
+    for (int64_t i = 0; i < s; i++) now[i] = NAN;
     *rate = 0;
     for (int64_t k = 0; k < m->limit; k++) {
         for (int64_t i = 0; i < s; i++) {
             for (int64_t l = 0; l < n; l++) point[l] = x[l] + z[i * n + l];
-            NAME(t + m->c[i] * h, point, m->p, y);
+            evaluate(t + m->c[i] * h, point, m->p, y, w[i], now + i);
             for (int64_t l = 0; l < n; l++) {
                 double slope = 0;
                 for (int64_t j = 0; j < s; j++) slope += m->rate[i * s + j] * z[j * n + l];

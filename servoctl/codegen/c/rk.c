@@ -1,4 +1,5 @@
 #include "unit.h"
+#include "phased.h"
 #include "restore.h"
 
 /* Explicit Runge-Kutta steps on the first n_x outputs by a tableau of s stages; the other outputs are logged beside the
@@ -8,12 +9,12 @@ int64_t FN(rk)(double t0, const double *x0, double h, int64_t n_steps, int64_t e
            const double *p, int64_t s, const double *a, const double *b, const double *c, int64_t n_log, double *x_log,
            double *guard_log)
 {
-    double x[NX + 1], z[NX + 1], k[s][NY + 1];
+    double x[NX + 1], z[NX + 1], k[s][NY + 1], w[WORK], now = NAN;
     int64_t column = 0, due = 1;
     for (int64_t i = 0; i < NX; i++) x[i] = x0[i];
     for (int64_t step = 0; ; step++) {
         for (int64_t i = 0; i < NX; i++) if (!isfinite(x[i])) return column - 1;
-        NAME(t0 + (double)step * h, x, p, k[0]);
+        evaluate(t0 + (double)step * h, x, p, k[0], w, &now);
         if (--due == 0 || step == n_steps) {
             for (int64_t i = 0; i < NX; i++) x_log[i * n_log + column] = x[i];
             for (int64_t i = NX; i < NY; i++) guard_log[(i - NX) * n_log + column] = k[0][i];
@@ -28,7 +29,7 @@ int64_t FN(rk)(double t0, const double *x0, double h, int64_t n_steps, int64_t e
                 if (weight != 0) for (int64_t i = 0; i < NX; i++) z[i] += weight * k[m][i];
             }
             for (int64_t i = 0; i < NX; i++) z[i] = x[i] + h * z[i];
-            NAME(t0 + ((double)step + c[j]) * h, z, p, k[j]);
+            evaluate(t0 + ((double)step + c[j]) * h, z, p, k[j], w, &now);
         }
         for (int64_t i = 0; i < NX; i++) z[i] = 0;
         for (int64_t m = 0; m < s; m++) {

@@ -5,41 +5,37 @@
 #include "restore.h"
 #include "series.h"
 
-/* The bits of non-negative numbers have the order of the numbers, and those of NaN are largest. */
-static inline double largest_size(const double *v, int64_t n)
+/* The bits of non-negative numbers have the order of the numbers, and those of NaN are largest. Of a level of rates only
+   those count that are integrated. */
+static inline double largest_size(const double *v, int64_t n, int64_t level)
 {
     int64_t largest = 0;
     for (int64_t i = 0; i < n; i++) {
         const int64_t bits = s_bits(fabs(v[i]));
-        largest = bits > largest ? bits : largest;
+        largest = bits > largest && (!level || IS_FREE((level - 1) * N + i)) ? bits : largest;
     }
     return s_value(largest);
 }
 
-/* log2 of the step at which the last term is 2^log_rtol of levels first .. levels - 1 of the state, the terms taken to
-   grow as the fastest of some do: single coefficients may vanish. x holds the first of the levels. */
-static inline double length(const double *x, const double *c, int64_t n, int64_t first, int64_t levels,
-                            double log_rtol, double least)
+/* log2 of the step at which the last term is 2^log_rtol of a level x of the state, the terms taken to grow as the
+   fastest of some do: single coefficients may vanish. */
+static inline double length(const double *x, const double *c, int64_t n, int64_t level, double log_rtol, double least)
 {
-    double size[TERMS], shortest = INFINITY;
+    const double scale = rough_log2(least + largest_size(x, n, level));
+    double shortest = INFINITY;
     for (int64_t m = 0; m < TERMS; m++) {
         const int64_t k = term(m);
-        size[m] = k > 0 ? rough_log2(largest_size(c + (k - 1) * n, n)) : 0;
-    }
-    for (int64_t j = first; j < levels; j++) {
-        const double scale = rough_log2(least + largest_size(x + (j - first) * n, n));
-        for (int64_t m = 0; m < TERMS; m++) {
-            const int64_t k = term(m);
-            if (k <= j) continue;
-            const double growth = (scale - size[m] - rough_log2(falling(k, j))) * (1.0 / (double)(k - j));
-            const double h = log_rtol * (1.0 / (double)(LAST - j)) + growth;
-            shortest = h < shortest ? h : shortest;
-        }
+        if (k <= level || k == 0) continue;
+        const double size = rough_log2(largest_size(c + (k - 1) * n, n, level));
+        const double growth = (scale - size - rough_log2(falling(k, level))) * (1.0 / (double)(k - level));
+        const double h = log_rtol * (1.0 / (double)(LAST - level)) + growth;
+        shortest = h < shortest ? h : shortest;
     }
     return shortest;
 }
 
-/* The state a time h after the expansion: x_j = sum over k of k!/(k - j)! c_[k] h^(k - j); y holds the coefficients. */
+/* The state a time h after the expansion: x_j = sum over k of k!/(k - j)! c_[k] h^(k - j); y holds the coefficients.
+   Rates that rows determine are left to these. */
 static inline void move(const double *x, const double *y, const double *c, double h, double *x_next)
 {
     double jet[NX + 1] = {0};
@@ -47,11 +43,13 @@ static inline void move(const double *x, const double *y, const double *c, doubl
         for (int64_t i = 0; i < NQ; i++) jet[i] = jet[i] * h + y[(k - 1) * NQ + i];
         for (int64_t j = 1; j < TOP && j <= k; j++) {
             double *level = jet + NQ + (j - 1) * N;
-            for (int64_t i = 0; i < N; i++) level[i] = level[i] * h + falling(k, j) * c[(k - 1) * N + i];
+            for (int64_t i = 0; i < N; i++) {
+                if (IS_FREE((j - 1) * N + i)) level[i] = level[i] * h + falling(k, j) * c[(k - 1) * N + i];
+            }
         }
     }
     for (int64_t i = 0; i < NQ; i++) x_next[i] = x[i] + jet[i] * h;
-    for (int64_t i = NQ; i < NX; i++) x_next[i] = jet[i];
+    for (int64_t i = NQ; i < NX; i++) x_next[i] = IS_FREE(i - NQ) ? jet[i] : x[i];
 }
 
 /* Steps from the start (t, x, p) towards t1: at most max_steps, which may be projected. The log has a row (t, x, y) for
@@ -73,26 +71,43 @@ int64_t FN(taylor)(const Steps *s)
     for (int64_t step = 0; ; step++) {
         double *x = log + 1, *y = x + NX, *row = y + NY, *x_next = row + 1;
         log[0] = t;
-        if (step == max_steps || t == t1) return step;
+        if (step == max_steps || t == t1) {
+            settle(t, x, p);
+            return step;
+        }
         NAME(t, x, p, y);
         const double *c = y + (PLAIN ? 0 : NQ * LAST);
-        const double of_q = length(x, y, NQ, 0, 1, log_rtol, least);
-        const double of_rates = length(x + NQ, c, N, 1, TOP, log_rtol, least);
-        const double h = exp2(of_rates < of_q ? of_rates : of_q);
-        if (!(h > 1e-13 * (1 + fabs(t)))) return step;
+        double log_h = length(x, y, NQ, 0, log_rtol, least);
+        for (int64_t j = 1; j < TOP; j++) {
+            const double of_level = length(x + NQ + (j - 1) * N, c, N, j, log_rtol, least);
+            log_h = of_level < log_h ? of_level : log_h;
+        }
+        const double h = rough_exp2(log_h);
+        if (!(h > 1e-13 * (1 + fabs(t)))) {
+            settle(t, x, p);
+            return step;
+        }
+        for (int64_t i = 0; i < N * (TOP - 1); i++) {
+            if (!IS_FREE(i)) x[NQ + i] = falling(1 + i / N, 1 + i / N) * c[i];
+        }
         const int ends = h >= fabs(t1 - t) * (1 - 1e-12);
         const double signed_h = ends ? t1 - t : t1 > t ? h : -h;
         move(x, y, c, signed_h, x_next);
         t = ends ? t1 : t + signed_h;
         for (int64_t i = 0; i < NX; i++) if (!isfinite(x_next[i])) return step;
-        if (project_every && (step + 1) % project_every == 0) restore(t, x_next, p);
+        if (project_every && (step + 1) % project_every == 0) {
+            settle(t, x_next, p);
+            restore(t, x_next, p);
+        }
         log = row;
     }
 }
 
 /* The jets q, gamma', ..., gamma^(levels) at n instants t in the steps k of a log, row by row, one column per instant.
-   The lanes of a vector are consecutive instants of one step. */
-void FN(taylor_jets)(const double *log, int64_t n, const int64_t *k, const double *t, int64_t levels, double *jets)
+   The lanes of a vector are consecutive instants of one step. Of the first `settled` jets those that rows determine are
+   theirs. */
+void FN(taylor_jets)(const double *log, int64_t n, const int64_t *k, const double *t, const double *p, int64_t levels,
+                     int64_t settled, double *jets)
 {
     double factor[LAST + 1];
     for (int64_t j = 0; j <= levels; j++) {
@@ -113,4 +128,14 @@ void FN(taylor_jets)(const double *log, int64_t n, const int64_t *k, const doubl
             }
         }
     }
+#ifdef SETTLED
+    for (int64_t at = 0; at < n && settled; at++) {
+        double x[NX + 1], all[NX + N];
+        for (int64_t i = 0; i < NX; i++) x[i] = jets[i * n + at];
+        FN(settled)(t[at], x, p, all);
+        for (int64_t i = NQ; i < settled; i++) jets[i * n + at] = all[i];
+    }
+#else
+    (void)p, (void)settled;
+#endif
 }

@@ -3,7 +3,9 @@
    NAME            the function: void NAME(double t, const double *x, const double *p, double *y), x -> y
    NX, NP, NY      the lengths of x, p and y
    PROJECTED       where there is NAME_project, the change of x that restores invariants
-   WIDE            where there are NAME_wide and NAME_wide_step, the same for eight points at once
+   WIDE            where there is NAME_wide, the same for eight points at once
+   WORK            for some loops the length of the vector w that NAME_instant, NAME_correction and NAME_rest share: what
+                   depends on t and p alone, the Newton correction, and the other outputs; of NAME_wide as well
    CORRECTIONS, ...    the tolerances of Newton's method and of continuation in loops.py
 
    and what the file itself names. A file that is read alone takes them from alone.h. */

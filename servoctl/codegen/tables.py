@@ -1,0 +1,117 @@
+"""Tables in C for piecewise constant values: the coefficients of splines, of which one piece counts at an instant.
+
+CasADi writes a spline as sums over all its pieces. In C a value that is made of constants and of comparisons knot <= s
+of one s is looked up: the number of knots that s has reached is its row in a table. The numbers are those of the sums,
+to the last bit.
+"""
+
+import hashlib
+import math
+from collections import Counter, defaultdict
+from itertools import chain
+from typing import NamedTuple
+
+import numpy as np
+
+from servoctl.jets.pieces import of_all_pieces, operand_values, piecewise_constant
+
+MARGIN = 1e-6  # of a cell of a table: how far rounding may lead beyond its ends
+
+class Row(NamedTuple):
+    """The operation that finds the row of a value s in a table, the number of knots that it has reached."""
+
+    table: str
+
+    def text(self, prefix, s):
+        """C text."""
+        return f"{prefix}row(&{self.table}_knots, {s})"
+
+
+class Entry(NamedTuple):
+    """The operation that takes the entry of a table in a row."""
+
+    table: str
+    columns: int
+    column: int
+
+    def text(self, prefix, row):
+        """C text."""
+        return f"{prefix}entry({self.table} + {self.column}, {self.columns}, {row})"
+
+
+def tabulated(statements):
+    """Statements with lookups in tables in place of sums over pieces, where that is shorter, and C texts of the tables.
+
+    Parameters
+    ----------
+    statements : list of (target, operation, operands)
+        In single assignment: operands are values, which are numbered, constants, or C text of inputs.
+
+    Returns
+    -------
+    statements : list of (target, operation, operands)
+        The same values, of which fewer are computed.
+    texts : list of str
+    """
+    pieces = piecewise_constant(statements)
+    others = (operands for target, _, operands in statements if target not in pieces)
+    read = {v for operands in others for v in operand_values(operands) if v in pieces}
+    pieces = _shorter(pieces, read)
+    if not pieces:
+        return statements, []
+    columns = defaultdict(dict)
+    for v, column in of_all_pieces(statements, pieces, read.intersection(pieces)):
+        columns[pieces[v][0]][v] = column
+    new, texts, lookups = 1 + max(target for target, _, _ in statements if isinstance(target, int)), [], {}
+    for row, (s, entries) in enumerate(columns.items(), new):
+        table, text = _table(pieces[next(iter(entries))][1], np.array([*entries.values()]).T)
+        texts.append(text)
+        for j, v in enumerate(entries):
+            found = [(row, Row(table), (s,))] if j == 0 else []
+            lookups[v] = [*found, (v, Entry(table, len(entries), j), (row,))]
+    kept = (lookups.get(s[0], []) if s[0] in pieces else [s] for s in statements)
+    return list(chain.from_iterable(kept)), texts
+
+
+def literal(value):
+    """A number as C text, exactly."""
+    if math.isnan(value):
+        return "NAN"
+    text = "INFINITY" if math.isinf(value) else repr(abs(value))
+    return f"(-{text})" if math.copysign(1.0, value) < 0 else text
+
+
+def _shorter(pieces, read):
+    """Those of each s whose table has no more entries than operations that it replaces."""
+    replaced, entries = Counter(s for s, _ in pieces.values()), Counter()
+    for s, knots in (pieces[v] for v in read):
+        entries[s] += len(knots) + 1
+    return {v: (s, knots) for v, (s, knots) in pieces.items() if entries[s] <= replaced[s]}
+
+
+def _table(knots, rows):
+    """Name and C text of a table: its knots with the rows that each cell of equal length may hold, and its rows.
+
+    The name is that of the content, so that functions of one unit share a table.
+    """
+    name = f"table_{hashlib.sha256(knots.tobytes() + b'|' + rows.tobytes()).hexdigest()[:16]}"
+    n, offsets = len(knots), knots - knots[0]
+    cell = offsets[-1] / n
+    edges = cell * np.arange(n + 1)
+    low = np.searchsorted(offsets, edges[:-1] - MARGIN * cell, "right")
+    high = np.searchsorted(offsets, edges[1:] + MARGIN * cell, "right")
+    low[0], high[-1] = 0, n
+    cells = np.array([low, high]).T
+    numbers = f"{n}, {literal(float(knots[0]))}, {literal(float(1 / cell))}"
+    return name, (
+        f"\n#ifndef HAS_{name}\n#define HAS_{name}\n"
+        f"static const double {name}_at[{n}] = {_array(knots)};\n"
+        f"static const int {name}_cells[{2 * n}] = {_array(cells)};\n"
+        f"static const Knots {name}_knots = {{{numbers}, {name}_at, {name}_cells}};\n"
+        f"static const double {name}[{rows.size}] = {_array(rows)};\n#endif\n"
+    )
+
+
+def _array(numbers):
+    texts = [literal(x) for x in numbers.ravel().tolist()]
+    return "{" + ",\n".join(", ".join(texts[k : k + 6]) for k in range(0, len(texts), 6)) + "}"

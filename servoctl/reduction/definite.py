@@ -1,0 +1,109 @@
+"""Elimination without a choice of pivots: the inertia first, then what the constraints feel of it.
+
+The balance M γ'' = f + B μ and the constraints G γ'' = d give
+
+    γ'' = M⁻¹f + M⁻¹B μ,    (G M⁻¹B) μ = d - G M⁻¹f.
+
+With an ideal reaction, B = Gᵀ, and with the least actuation, B = E W⁻¹(G M⁻¹E)ᵀ, the matrix G M⁻¹B is symmetric and
+positive definite like M, wherever the rows are independent. Elimination by the diagonal is then stable in any order,
+and a pivot vanishes only where the rank is lost: no coordinates are chosen as dependent, and no motion leaves the
+choice behind (range-space method: Benzi, Golub and Liesen, Acta Numerica 14 (2005), section 5).
+"""
+
+from dataclasses import dataclass, field, replace
+
+import casadi as ca
+import numpy as np
+
+from servoctl.reduction.appell import NEGATIVE, Realisation
+from servoctl.reduction.ranks import clean, eliminate
+
+
+@dataclass(frozen=True)
+class Definite(Realisation):
+    """A reaction whose multipliers follow from the definite matrix G M⁻¹B; no coordinate is dependent.
+
+    Attributes
+    ----------
+    G : (b, n) SX
+        Leading gradients of the constraints, in the order of the columns of B.
+    mass : (n, n) SX
+    order : tuple of int
+        Of the constraints in the elimination: material ones first.
+    sizes : tuple of two arrays
+        M (n, n, N) and G M⁻¹B (b, b, N) at points.
+    """
+
+    G: ca.SX = None
+    mass: ca.SX = None
+    order: tuple = ()
+    sizes: tuple = field(default=(), repr=False)
+
+    def solve(self, force, second):
+        """γ'' (n, 1) and μ (b, 1) of M γ'' = force + B μ, G γ'' = second, and the pivots."""
+        b, order = self.B.shape[1], list(self.order)
+        moved, pivots = eliminate(self.mass, ca.horzcat(self.B, force), self.sizes[0], diagonal=True)
+        felt = self.G @ moved
+        matrix, right = felt[order, order], (second - felt[:, b])[order]
+        mu, others = eliminate(matrix, right, self.sizes[1][np.ix_(order, order)], diagonal=True)
+        mu = mu[np.argsort(order).tolist()]
+        return moved[:, b] + moved[:, :b] @ mu, mu, [*pivots, *others]
+
+    def multipliers(self, balance):
+        """μ with B μ = r, (b,) SX, as M γ'' = B μ - r has the solution γ'' = 0."""
+        return self.solve(-balance, ca.SX.zeros(self.B.shape[1]))[1] if len(self.order) else ca.SX(0, 1)
+
+
+def definite(reduction):
+    """A reduction of second order whose elimination takes its pivots from the diagonal.
+
+    Parameters
+    ----------
+    reduction : Reduction
+        Whose balance and constraints determine γ''.
+
+    Returns
+    -------
+    Reduction or None
+        None where M, or G M⁻¹B, is not symmetric and positive definite at the points of the reduction.
+    """
+    r, q = reduction, reduction.mechanism.q
+    constraints = [row for row in r.rows if row.kind != "dynamics"]
+    if not constraints or r.cascade is not None or not len(r.points.t):
+        return None
+    k, B = sum(row.kind == "program" for row in constraints), r.realisation.B
+    order = (*range(k, len(constraints)), *range(k))
+    G, mass = ca.vertcat(*(row.gradient(q) for row in constraints)), r.mechanism.mass
+    M, left, right = (np.moveaxis(clean(*r.points.matrix(m)), 2, 0).astype(float) for m in (mass, G, B))
+    if not _definite(M):
+        return None
+    felt = left @ np.linalg.solve(M, right)
+    if not _definite_by_blocks(felt[:, order][:, :, order], len(order) - k):
+        return None
+    sizes = tuple(np.moveaxis(m, 0, 2) for m in (M, felt))
+    kinds = {"B": B, "actuation": r.realisation.actuation, "dependent": (), "independent": tuple(range(q.n))}
+    realised = Definite(**kinds, numbers=r.realisation.numbers, G=G, mass=mass, order=order, sizes=sizes)
+    pivots = tuple((name, pivot) for name, pivot in r.pivots if not name.startswith("choice of dependent"))
+    return replace(r, realisation=realised, pivots=pivots)
+
+
+def _definite_by_blocks(matrices, m):
+    """Whether the first m rows and columns of matrices (N, b, b), and what elimination by them leaves, are definite."""
+    first, rest = matrices[:, :m, :m], matrices[:, m:, m:]
+    if m:
+        if not _definite(first):
+            return False
+        rest = rest - matrices[:, m:, :m] @ np.linalg.solve(first, matrices[:, :m, m:])
+    return _definite(rest)
+
+
+def _definite(matrices):
+    """Whether matrices (N, m, m) are symmetric and positive definite."""
+    diagonal = np.einsum("pii->pi", matrices)
+    if not (diagonal > 0).all():
+        return False
+    sizes = np.sqrt(diagonal)
+    scaled = matrices / sizes[:, :, None] / sizes[:, None, :]
+    if not np.isfinite(scaled).all() or np.abs(scaled - scaled.swapaxes(1, 2)).max(initial=0.0) > NEGATIVE:
+        return False
+    return bool(np.linalg.eigvalsh(scaled).min(initial=1.0) > NEGATIVE)

@@ -1,0 +1,187 @@
+"""Other pivots along a motion: of the same rows where that is possible, once for each set, kept in the process and on disk."""
+
+import pickle
+
+import casadi as ca
+import numpy as np
+import pytest
+from conftest import relative
+
+import servoctl as sv
+from servoctl.codegen import compiler
+from servoctl.methods.taylor import series_loop
+from servoctl.model import model as models
+from servoctl.model import store
+
+
+def arm(program, by="actuators", unit=1.0, weights=None, order=0, constraint=None):
+    """A planar arm of four links, lengths in units of 1/unit m, with some of its end point's motions programmed."""
+    q = sv.coordinates("a b c d")
+    angles = [sum(list(q)[: i + 1]) for i in range(4)]
+    gibbs, point = 0, ca.SX.zeros(2)
+    for angle in angles:
+        link = 0.5 * unit * ca.vertcat(ca.cos(angle), ca.sin(angle))
+        gibbs += sv.particle(q, 1.0 / unit**2, point + link) + 0.02 * q.dt(angle, 2) ** 2
+        point = point + 2 * link
+    s = ca.sin(1.5 * q.t)
+    targets = {
+        "X": point[0] / unit - 1.2 - 0.5 * s, "Y": point[1] / unit - 0.8 + 0.6 * s, "turn": angles[-1] - 1.5 * s,
+    }  # fmt: skip
+    residuals = {name: q.dt(targets[name], order) if order else targets[name] for name in program}
+    actuators = {f"u{i}": np.eye(4)[i] for i in range(4)} if by == "actuators" else None
+    constraints = {"bar": constraint(*q)} if constraint else None
+    mechanism = sv.Mechanism(q, gibbs, 3.0 * sum(map(ca.sin, angles)), actuators, constraints=constraints)
+    return mechanism, sv.Program(residuals, by=by, weights=weights)
+
+
+START = {"a": 0.9, "b": -1.1, "c": 1.3, "d": -0.7}
+ARMS = {
+    "ideal": {"program": ["X", "Y", "turn"], "by": "ideal"},
+    "ideal point": {"program": ["X", "Y"], "by": "ideal"},
+    "ideal rates": {"program": ["X", "Y"], "by": "ideal", "order": 1},
+    "ideal accelerations": {"program": ["X", "turn"], "by": "ideal", "order": 2},
+    "least torque": {"program": ["X", "Y"], "weights": {"u0": 3.0}},
+    "least torque beside a bar": {"program": ["X", "turn"], "constraint": lambda a, b, c, d: b + c - 0.2},
+    "millimetres": {"program": ["X", "Y"], "by": "ideal", "unit": 1e3},
+}
+
+
+def begun(which):
+    model = sv.derive(*arm(**ARMS[which]))
+    return model, model.start(guess=START)
+
+
+@pytest.fixture
+def counted(monkeypatch, tmp_path):
+    """Derivations and compilations from now on; both are kept under `tmp_path`."""
+    counts, reduce, compile_ = {"derived": 0, "compiled": 0}, models.reduce, compiler._compile
+
+    def count(name, f):
+        def counting(*given):
+            counts[name] += 1
+            return f(*given)
+
+        return counting
+
+    monkeypatch.setenv("SERVOCTL_CACHE", str(tmp_path))
+    monkeypatch.delenv("SERVOCTL_MEMO", raising=False)
+    monkeypatch.setattr(store, "_stamp", lambda: "these sources")
+    monkeypatch.setattr(models, "reduce", count("derived", reduce))
+    monkeypatch.setattr(compiler, "_compile", count("compiled", compile_))
+    return counts
+
+
+@pytest.mark.parametrize("which", ARMS)
+def test_pivots_of_definite_matrices_give_the_same_motion(which):
+    model, start = begun(which)
+    other, p, x = model.without_choice, model.parameters, start.values
+    one, two = (m.function("ode")(start.t, x, p)[: len(x)] for m in (model, other))
+    assert relative(one, two) < 1e-10
+    one, two = (series_loop(m, 6)(start.t, x, np.append(p, start.t))[: 6 * model.n] for m in (model, other))
+    assert relative(one, two) < 1e-8
+    jets = np.append(x, model.function("ode")(start.t, x, p)[len(x) - model.n : len(x)])
+    for kind in ("inputs", "all_multipliers"):
+        one, two = (m.signals(kind)[1](start.t, jets, p) for m in (model, other))
+        assert relative(one, two) < 1e-10
+
+
+@pytest.mark.parametrize("which", ["ideal", "least torque beside a bar"])
+def test_error_dynamics_are_the_same_with_them(which):
+    model, start = begun(which)
+    x = start.values + 1e-3 * np.cos(np.arange(len(start.values)))
+    p = np.append(model.parameters, np.full(sum(model.raised.values()), 3.0))
+    one, two = (m.function("ode_poles")(start.t, x, p)[: len(x)] for m in (model, model.without_choice))
+    assert relative(one, two) < 1e-10
+
+
+@pytest.mark.filterwarnings("ignore:Internal dynamics unstable")
+@pytest.mark.parametrize(("which", "method"), [("ideal", "DOP853"), ("ideal", "Taylor"), ("least torque", "DOP853")])
+def test_a_redundant_arm_changes_its_pivots_once(which, method, counted):
+    model, start = begun(which)
+    counted["derived"] = 0
+    runs = [sv.simulate(model, start, (0.0, 2.0), method) for _ in range(2)]
+    assert counted["derived"] == 0 and np.array_equal(*(run.jets for run in runs))
+    assert runs[0].counters["pivot_changes"] == 1
+    assert sv.verify(model, runs[0]).passed
+
+
+def two_links(order=0):
+    """Two links whose end point goes round its base."""
+    q = sv.coordinates("a b")
+    a, b = q
+    elbow = ca.vertcat(ca.cos(a), ca.sin(a))
+    end = elbow + ca.vertcat(ca.cos(a + b), ca.sin(a + b))
+    gibbs = sv.particle(q, 2.0, elbow) + sv.particle(q, 1.0, end)
+    mechanism = sv.Mechanism(q, gibbs, actuators={"u": a, "v": b})
+    residuals = {"X": end[0] - ca.cos(q.t) - 0.1, "Y": end[1] - ca.sin(q.t)}
+    return mechanism, sv.Program({name: q.dt(e, order) if order else e for name, e in residuals.items()})
+
+
+ROUND = [(0, "algebraic"), (1, "Taylor"), (2, "RK4")]
+
+
+def on_the_circle(order):
+    model, path = sv.derive(*two_links(order)), sv.derive(*two_links())
+    start = path.start(guess={"a": -1.0, "b": 2.0})
+    held = dict(zip(start.names, start.values, strict=True))
+    return model, model.start(**{name: held[name] for name in model.state_names}) if order else start
+
+
+@pytest.mark.parametrize(("order", "method"), ROUND)
+def test_pivots_change_without_a_derivation(order, method, counted):
+    model, start = on_the_circle(order)
+    counted["derived"] = 0
+    run = sv.simulate(model, start, (0.0, 12.0), sv.RungeKutta(4, step=4e-3) if method == "RK4" else method)
+    variants = {id(variant) for *_, variant in run.variants}
+    assert counted["derived"] == 0 and run.counters["pivot_changes"] >= 5 and len(variants) <= 4
+    assert max(np.abs(run.residual[name]).max() for name in ("X", "Y")) < 1e-6
+
+
+@pytest.mark.filterwarnings("ignore:Internal dynamics unstable")
+@pytest.mark.parametrize("which", ["ideal", "least torque", "round"])
+def test_another_process_derives_and_compiles_nothing(which, counted):
+    def simulated():
+        model, start = on_the_circle(1) if which == "round" else begun(which)
+        return sv.simulate(model, start, (0.0, 2.0), "DOP853")
+
+    first = simulated()
+    for name in counted:
+        counted[name] = 0
+    again = simulated()
+    assert counted == {"derived": 0, "compiled": 0} and np.array_equal(first.jets, again.jets)
+    assert first.counters == again.counters and len(first.variants) > 1
+
+
+@pytest.mark.filterwarnings("ignore:Internal dynamics unstable")
+@pytest.mark.parametrize("which", ["ideal", "round"])
+def test_runs_with_other_pivots_are_saved_and_pickled(which, tmp_path):
+    model, start = on_the_circle(1) if which == "round" else begun(which)
+    run = sv.simulate(model, start, (0.0, 2.0), "DOP853")
+    assert len(run.variants) > 1
+    loaded = sv.load(run.save(tmp_path / "run"), model)
+    assert loaded == run and [v.place for *_, v in loaded.variants] == [v.place for *_, v in run.variants]
+    variant = run.variants[-1][2]
+    copy = pickle.loads(pickle.dumps(variant))
+    x, p = start.values, model.parameters
+    assert copy == variant != model and copy.place == variant.place
+    assert np.array_equal(copy.function("ode")(0.0, x, p), variant.function("ode")(0.0, x, p))
+
+
+def test_parameters_change_with_other_pivots():
+    q, p = sv.coordinates("x y z"), sv.parameters(m=1.0, l=1.0)
+    mechanism = sv.Mechanism(q, sv.particle(q, p.m, ca.vertcat(*q)), 9.81 * p.m * q.jet(0)[2], parameters=p)
+    program = sv.Program({"rod": ca.sumsqr(ca.vertcat(*q)) - p.l**2}, by="ideal")
+    model = sv.derive(mechanism, program)
+    other = model.without_choice.with_parameters(l=2.0)
+    start = model.with_parameters(l=2.0).start(x=2.0, dz=1.0, dy=0.5)
+    rates = other.function("ode")(0.0, start.values, other.parameters)
+    assert other.diagonal and rates[3:6] == pytest.approx([-1.25 / 2, 0.0, -9.81], abs=1e-12)
+
+
+def test_matrices_that_are_not_definite_have_no_such_pivots():
+    """A crane's residuals lie across its actuators; an arm's torques as many as residuals; a plan integrates nothing."""
+    from servoctl.gallery import gallery
+
+    for name in ("overhead-crane", "vtol-centre", "spiral"):
+        assert sv.derive(*gallery[name].build()).without_choice is None
+    assert sv.derive(*two_links(1)).without_choice is None

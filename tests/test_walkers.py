@@ -1,0 +1,71 @@
+"""Robots with a free base and many joints: points, starts and operations in reasonable numbers."""
+
+from functools import cache
+
+import numpy as np
+import pytest
+from walkers import Robot
+
+import servoctl as sv
+from servoctl.jets.series import Flow
+from servoctl.reduction.lifting import lifted
+
+LEG = [0, 1, 2, 3, 4, 5]  # parents of the links of a leg with six joints
+
+
+def branches(n):
+    """Parents of n links in two branches."""
+    return [max(0, i - 2) for i in range(1, n + 1)]
+
+
+@pytest.fixture(scope="module")
+def standing():
+    """A robot of 14 velocities that stands on its foot, with one of two arm joints programmed."""
+    robot = Robot([*LEG, 0, 7])
+    return robot, *robot.scene(["j7"], feet=[6], base=True)
+
+
+def test_a_robot_is_derived_without_gradients_in_all_jets(standing, monkeypatch):
+    """They take most of the time, and a start from which q cannot be solved is given up before."""
+    robot, mechanism, program = standing
+    called, levels = Flow.__call__, []
+
+    def noted(flow, t, z):
+        levels.append(flow.level)
+        return called(flow, t, z)
+
+    monkeypatch.setattr(Flow, "__call__", noted)
+    model = sv.derive(mechanism, program, guess=robot.posture())
+    assert not any(levels)
+    start = model.start(guess=robot.posture())
+    assert start.residual < 1e-15 and len(start.free) == 2
+    assert all(abs(start[name] - value) < 1e-12 for name, value in robot.posture().items())
+
+
+@cache
+def accelerated(n):
+    """A robot in the air, all joints programmed, of 6 + n velocities."""
+    robot = Robot(branches(n))
+    mechanism, program = robot.scene([f"j{i}" for i in range(1, n + 1)])
+    return sv.derive(mechanism, program, guess=robot.posture())
+
+
+def test_the_accelerations_of_a_robot_are_those_of_its_full_mass_matrix():
+    model = accelerated(5)
+    equations, n = model.equations, model.n
+    assert equations.sparse
+    for seed in range(3):
+        state = np.random.default_rng(seed).uniform(-1.0, 1.0, len(model.state_names))
+        form = model.function("multiplier_form")(0.3, np.append(state, np.zeros(n)), model.parameters)
+        size = int(round((np.sqrt(1 + 4 * len(form)) - 1) / 2))
+        expected = np.linalg.solve(form[size:].reshape(size, size).T, form[:size])
+        y = model.function("accelerations")(0.3, state, model.parameters)
+        assert y == pytest.approx(expected, rel=1e-9, abs=1e-9 * np.abs(expected).max())
+
+
+def test_the_operations_of_a_robot_are_linear_in_its_joints():
+    models = {n: accelerated(n) for n in (5, 10)}
+    counts = {n: model.function("accelerations").operations for n, model in models.items()}
+    assert counts[10] <= 2.4 * counts[5]
+    entries = [lifted(r.mechanism.balance, r.mechanism.q.jet(2)).nnz() for r in (models[n].reduction for n in (5, 10))]
+    assert entries[1] <= 2.1 * entries[0]
