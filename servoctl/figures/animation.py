@@ -260,6 +260,21 @@ def _unrolled(picture):
     return replace(picture, shapes=shapes, trails={n: v + fall for n, v in picture.trails.items()}, programmed={})
 
 
+def shows_mechanism(run) -> bool:
+    """Whether `animate` and `stroboscope` can draw a run: it has samples, and its mechanism shapes or positions."""
+    model = run.plant if hasattr(run, "commands") else run.model
+    if model is None or not len(run.t):
+        return False
+    mechanism = model.mechanism if hasattr(run, "commands") else model.reduction.mechanism
+    return bool(mechanism.shapes or _positions(mechanism))
+
+
+def _positions(mechanism):
+    """Names of the outputs and coordinates that are positions, by point."""
+    outputs = [name for name, e in mechanism.outputs.items() if mechanism.q.order(e) <= 0]
+    return [sorted(names, key=str.lower) for names in planes_of([*outputs, *mechanism.q.names])]
+
+
 def _require_motion(run):
     """Refuse what is no motion with a mechanism and finite samples."""
     if not hasattr(run, "commands"):
@@ -286,7 +301,11 @@ def _postures(run, t):
         q = np.array([np.interp(t, run.t, run[name]) for name in mechanism.q.names])
     else:
         mechanism, p = run.model.reduction.mechanism, run.model.parameters
-        q = np.array([run.at(instant)[: run.model.nq] for instant in t]).T
+        names = run.jet_names[: run.model.nq]
+        if len(run.t) >= PATH_POINTS:  # straight between samples: the difference cannot be seen
+            q = np.array([np.interp(t, *_ascending(run, name)) for name in names])
+        else:
+            q = np.array([run.at(instant)[: len(names)] for instant in t]).T
     return mechanism, np.asarray(p)[: len(mechanism.parameters.names)], q
 
 
@@ -311,10 +330,8 @@ def _shapes(run, t):
     mechanism, p, q = _postures(run, t)
     if mechanism.shapes:
         return moved(mechanism, t, q, p)
-    outputs = [name for name, e in mechanism.outputs.items() if mechanism.q.order(e) <= 0]
     shapes = {}
-    for names in planes_of([*outputs, *mechanism.q.names]):
-        names = sorted(names, key=str.lower)
+    for names in _positions(mechanism):
         signs = [-1.0 if sign < 0 else 1.0 for sign in heights(mechanism, names, t, q, p)]
         rows = [sign * np.interp(t, *_ascending(run, name)) for name, sign in zip(names, signs, strict=True)]
         shapes.setdefault(", ".join(names), np.array(rows)[:, np.newaxis, :])

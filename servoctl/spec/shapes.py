@@ -185,6 +185,7 @@ def heights(mechanism, names, t, q, p):
     rates = ca.vertcat(*system.gamma(1), *system.gamma(2))
     symbols = [system.t, ca.vertcat(*system), rates, ca.vertcat(ca.SX(0, 1), *mechanism.parameters.symbols)]
     slopes = ca.jacobian(ca.vertcat(*(own[name] for name in names)), symbols[1]) @ system.V
+    p = np.asarray(p)[: len(mechanism.parameters.names)]
     rest = ca.Function("rest", symbols, [ca.densify(mechanism.balance), ca.densify(slopes.T)])
     shares = []
     for i in chosen:
