@@ -7,6 +7,7 @@ import stat
 import casadi as ca
 import numpy as np
 import pytest
+import robots
 from PIL import Image
 from refusals import refused
 
@@ -35,7 +36,8 @@ def at_random(mechanism, count=3, **values):
     q = np.random.default_rng(7).uniform(0.2, 1.2, (mechanism.q.nq, count))
     for name, value in values.items():
         q[mechanism.q.names.index(name)] = value
-    return moved(mechanism, np.zeros(count), q, mechanism.parameters.values({})), dict(zip(mechanism.q.names, q))
+    named = dict(zip(mechanism.q.names, q, strict=True))
+    return moved(mechanism, np.zeros(count), q, mechanism.parameters.values({})), named
 
 
 # --- where shapes are
@@ -285,3 +287,16 @@ def test_what_cannot_be_animated_is_refused(crane, loop, tmp_path):
     assert not shows_mechanism(run)
     with refused(SpecificationError, "shapes=", coordinates=["a", "b"], outputs=[]):
         sv.plots.animate(run)
+
+
+@pytest.mark.parametrize(("name", "base"), [("six_axis_arm", "fixed"), ("quadruped", "free"), ("scara", "fixed")])
+def test_a_robot_is_drawn_by_its_frames(name, base):
+    robot = sv.urdf(robots.file_of(name), base=base)
+    mechanism, posture = robot.mechanism(friction=0.0), {q: 0.1 * i for i, q in enumerate(robot.joints) if q in robot.q.names}
+    shapes = moved(mechanism, [0.0], robot.posture(posture)[:, None], robot.parameters.values({}))
+    assert set(shapes) < set(robot.links)  # all but the root
+    for link, points in shapes.items():
+        assert points[:, -1, 0] == pytest.approx(robot.at(posture, link)[0], abs=1e-12)
+    starts = {tuple(np.round(points[:, 0, 0], 9)) for points in shapes.values()}
+    ends = {tuple(np.round(points[:, -1, 0], 9)) for points in shapes.values()}
+    assert len(starts - ends) <= 1  # a tree: each link begins where another ends, or at the root

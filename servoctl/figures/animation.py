@@ -21,8 +21,8 @@ from servoctl.values import Value
 MOST_FRAMES = 500  # of an animation: longer motions are shown faster
 PATH_POINTS = 400  # of a drawn path
 STILL = 1e-9  # change of a shape over the motion below which it is the ground, relative to the picture
-MARGIN = 0.06  # around the motion, of the picture's larger side
-WIDE, TALL = 6.4, 5.6  # inches, of the picture's plane
+BORDER = 0.06  # around the motion, of the picture's larger side
+ACROSS, UP = 6.4, 5.6  # inches, of the picture's plane
 SLIM = 0.12  # ratio of the sides below which poses would hide each other
 SLIMMEST = 0.3  # least ratio of its sides
 VIEW = np.array([[0.866, -0.5, 0.0], [0.25, 0.433, 0.866]])  # parallel projection of space, from 30° above
@@ -66,7 +66,8 @@ class Animation(Value):
         return f"Animation: {lasts}{faster}\n  shapes {', '.join(self.shapes)}"
 
     def _repr_html_(self):
-        return f'<img alt="the mechanism in motion" src="data:image/gif;base64,{base64.b64encode(self.gif()).decode()}">'
+        content = base64.b64encode(self.gif()).decode()
+        return f'<img alt="the mechanism in motion" src="data:image/gif;base64,{content}">'
 
     def gif(self) -> bytes:
         """The animation as the content of a GIF file, which repeats itself."""
@@ -125,9 +126,10 @@ class Animation(Value):
             )
         frames = [pixels[: len(pixels) // 2 * 2, : pixels.shape[1] // 2 * 2] for pixels in self._frames()]
         size = f"{frames[0].shape[1]}x{frames[0].shape[0]}"
-        command = f"{program} -y -loglevel error -f rawvideo -pix_fmt rgb24 -s {size} -r {self.fps:g} -i - -pix_fmt yuv420p"
+        read = f"-y -loglevel error -f rawvideo -pix_fmt rgb24 -s {size} -r {self.fps:g} -i -"
+        command = [program, *read.split(), "-pix_fmt", "yuv420p", str(path)]
         content = b"".join(np.ascontiguousarray(pixels).tobytes() for pixels in frames)
-        done = subprocess.run([*command.split(), str(path)], input=content, capture_output=True)
+        done = subprocess.run(command, input=content, capture_output=True)
         if done.returncode:
             said = done.stderr.decode(errors="replace").strip()[-300:]
             raise ServoError(f"ffmpeg failed: {said}", do="Write a GIF instead.", path=str(path))
@@ -161,8 +163,8 @@ class Animation(Value):
 def animate(run, fps=25, trail=None):
     """Show the mechanism of a run in motion, with the programmed path beneath and the path of the motion.
 
-    The mechanism is drawn by its `shapes`; one without by dots at those outputs and coordinates that are positions, such
-    as X and Z. Scales are equal and up is up. Of a closed loop the path of its plan is drawn beneath.
+    The mechanism is drawn by its `shapes`; one without by dots at those outputs and coordinates that are positions,
+    such as X and Z. Scales are equal and up is up. Of a closed loop the path of its plan is drawn beneath.
 
     Parameters
     ----------
@@ -195,10 +197,10 @@ def animate(run, fps=25, trail=None):
             nearest=f"fps = {min(max(fps, 1), 50)}.",
             fps=fps,
         )
-    _require_motion(run)
+    _require_drawable(run)
     span = abs(run.t[-1] - run.t[0])
     pace = max(1.0, span * fps / (MOST_FRAMES - 1))
-    return _pictured(run, _instants(run, math.floor(span * fps / pace + 1e-9) + 1), trail, float(fps), pace)
+    return _pictured(run, _spread(run, math.floor(span * fps / pace + 1e-9) + 1), trail, float(fps), pace)
 
 
 def stroboscope(run, poses=9, trail=None, ax=None, title=""):
@@ -227,10 +229,10 @@ def stroboscope(run, poses=9, trail=None, ax=None, title=""):
     NameUnknown
         If there is no such shape.
     """
-    _require_motion(run)
+    _require_drawable(run)
     poses = whole("poses", poses, 1)
     each = max(1, -(-PATH_POINTS // max(1, poses - 1)))
-    picture = _pictured(run, _instants(run, (poses - 1) * each + 1), trail, 25.0, 1.0)
+    picture = _pictured(run, _spread(run, (poses - 1) * each + 1), trail, 25.0, 1.0)
     rows = _along_a_line(picture) and poses > 1
     picture = _unrolled(picture) if rows else picture
     ax = _axes(picture, ax, text("title", title))
@@ -275,7 +277,7 @@ def _positions(mechanism):
     return [sorted(names, key=str.lower) for names in planes_of([*outputs, *mechanism.q.names])]
 
 
-def _require_motion(run):
+def _require_drawable(run):
     """Refuse what is no motion with a mechanism and finite samples."""
     if not hasattr(run, "commands"):
         require_kind(Run, "run", run, "sv.simulate(...) or sv.close(...)")
@@ -290,7 +292,7 @@ def _require_motion(run):
         raise SpecificationError("The motion has no samples.", do="See run.message.", samples=0)
 
 
-def _instants(run, count):
+def _spread(run, count):
     return np.linspace(run.t[0], run.t[-1], count)
 
 
@@ -318,7 +320,7 @@ def _pictured(run, t, trail, fps, pace):
             raise unknown(name, tuple(shapes), "shape")
     plan, closed = getattr(run, "plan", None), hasattr(run, "commands")
     whole_plan = plan if closed and getattr(plan, "model", None) is not None else None if closed else run
-    below = {} if whole_plan is None else _shapes(whole_plan, _instants(whole_plan, PATH_POINTS))
+    below = {} if whole_plan is None else _shapes(whole_plan, _spread(whole_plan, PATH_POINTS))
     programmed = {name: _flat(_tip(below[name])) for name in trail if name in below}
     space = any(points.shape[0] == 3 for points in shapes.values())
     trails = {name: _flat(_tip(shapes[name])) for name in trail}
@@ -354,10 +356,10 @@ def _ascending(run, name):
 
 def _tip(points):
     """The last point of a line, the middle of a body: (d, 1, N)."""
-    return points[:, :-1].mean(axis=1, keepdims=True) if _closed(points) else points[:, -1:]
+    return points[:, :-1].mean(axis=1, keepdims=True) if _is_body(points) else points[:, -1:]
 
 
-def _closed(points):
+def _is_body(points):
     size = np.nan_to_num(np.abs(points), posinf=0.0).max(initial=0.0)
     return points.shape[1] > 3 and bool(np.nanmax(np.abs(points[:, 0] - points[:, -1])) <= STILL * size)
 
@@ -385,9 +387,10 @@ def _axes(picture, ax, title=""):
     """Axes with equal scales, the ground and the programmed paths."""
     low, high = _extent(picture)
     side = max(float((high - low).max()), 1e-9)
-    low, high = low - MARGIN * side, high + MARGIN * side
-    low, high = np.minimum(low, (low + high - SLIMMEST * side) / 2), np.maximum(high, (low + high + SLIMMEST * side) / 2)
-    across, up = (high - low) * min(WIDE / (high - low)[0], TALL / (high - low)[1])
+    low, high = low - BORDER * side, high + BORDER * side
+    middle = (low + high) / 2
+    low, high = np.minimum(low, middle - SLIMMEST * side / 2), np.maximum(high, middle + SLIMMEST * side / 2)
+    across, up = (high - low) * min(ACROSS / (high - low)[0], UP / (high - low)[1])
     if ax is None:
         _, ((ax,),) = style.figure(up + 0.6 + 0.35 * bool(title), width=across + 0.7)
     ax = style.as_single_axes(ax, up)
@@ -423,9 +426,9 @@ class _Moving:
 
     def __init__(self, ax, points, alpha=1.0):
         self.points = points if points.ndim == 3 else points[:, np.newaxis]
-        self.closed = _closed(self.points)
+        self.closed = _is_body(self.points)
         if self.closed:
-            (self.artist,) = ax.fill([], [], facecolor=BODY, edgecolor=LINE, linewidth=1.2, alpha=0.55 * alpha, zorder=4)
+            (self.artist,) = ax.fill([], [], facecolor=BODY, edgecolor=LINE, alpha=0.55 * alpha, zorder=4)
         elif self.points.shape[1] == 1:
             (self.artist,) = ax.plot([], [], "o", color=POINT, markersize=8, alpha=alpha, zorder=6)
         else:

@@ -42,8 +42,8 @@ def path(run, x=None, y=None, ax=None, units=None):
     x, y : str, optional
         Names of signals. Default: two of x, y, z (or X, Y, Z, preferred) with the same prefix and suffix, such as
         "x" and "z" or "tip_x" and "tip_y", among outputs and coordinates; else the first two coordinates. A single
-        coordinate, or coordinates along one axis, such as "x1" and "x2", are drawn over time. Of three axes the vertical
-        one is drawn, where the balance at rest shows which that is; an axis that measures depth points down.
+        coordinate, or coordinates along one axis, such as "x1" and "x2", are drawn over time. Of three axes the
+        vertical one is drawn, where the balance at rest shows which that is; an axis that measures depth points down.
     ax : Axes, optional
     units : dict of str to str, optional
         Signals of the same unit have equal scales if both remain visible.

@@ -98,10 +98,9 @@ class Robot:
         if name not in self._tree.places:
             raise unknown(name, self.links, "link")
         body, placement = self._tree.places[name]
-        position, rotation = ca.SX(ca.DM(placement.offset)), ca.SX(ca.DM(placement.rotation))
+        position, rotation = self._position(body, placement), ca.SX(ca.DM(placement.rotation))
         if body is not None:
-            outer = self._kinematics.rotations[body]
-            position, rotation = self._kinematics.offsets[body] + outer @ position, outer @ rotation
+            rotation = self._kinematics.rotations[body] @ rotation
         return Frame(name, position, rotation, self._jacobian(body, position), self.q)
 
     def posture(self, at) -> np.ndarray:
@@ -150,6 +149,8 @@ class Robot:
     ) -> Mechanism:
         """The mechanism of the robot: its balance by the recursive Newton-Euler scheme, gravity and damping.
 
+        Figures show each link as a line from the frame of the link that carries it to its own.
+
         Parameters
         ----------
         constraints : dict of str to SX, optional
@@ -192,7 +193,20 @@ class Robot:
             forces={name: value for name, value in total.items() if not value.is_zero()} or None,
             constraints=constraints,
             outputs=outputs,
+            shapes=self._lines(),
         )
+
+    def _lines(self):
+        """Each link as a line from the frame of the link that carries it to its own."""
+        ends = {name: self._position(*place) for name, place in self._tree.places.items()}
+        joints = [joint for joint in self._description.joints.values() if {joint.parent, joint.child} <= set(ends)]
+        return {joint.child: [ends[joint.parent], ends[joint.child]] for joint in joints}
+
+    def _position(self, body, placement):
+        """Position of a link on a body, (3,) SX [m]."""
+        offset = ca.SX(ca.DM(placement.offset))
+        moving = body is not None
+        return self._kinematics.offsets[body] + self._kinematics.rotations[body] @ offset if moving else offset
 
     @cached_property
     def _kinematics(self):

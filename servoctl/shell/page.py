@@ -4,7 +4,11 @@ import base64
 import shlex
 from html import escape
 
+from servoctl.verification.result import WORDS
+
 NAME = "index.html"
+VERSIONS = ("", "version")
+EXTREMA = ("signal", "least", "at t [s]", "greatest", "at t [s]", "unit")
 PICTURES = {  # file: what it shows
     "motion.gif": "The mechanism in motion, over the programmed path.",
     "motion.png": "The mechanism at instants from the start (light) to the end (dark), over the programmed path.",
@@ -40,16 +44,17 @@ def write_page(folder, facts, units, verification, report):
         f"<p>{escape(scene['description'])}</p>",
         f'<p class="verdict">{escape(_outcome(facts, verification))}</p>',
         *_pictures(folder, command),
-        _section("What was computed", _table(("", "value"), _asked(facts))),
-        _section("Extrema", _table(("signal", "least", "at t [s]", "greatest", "at t [s]", "unit"), _extrema(facts, units))),
-        *_closed(facts, units),
+        _chapter("What was computed", _rows_of(("", "value"), _asked(facts))),
+        _chapter("Extrema", _rows_of(EXTREMA, _ends(facts, units))),
+        *_of_loop(facts, units),
         *_checks(verification),
-        _section("Report", f"<pre>{escape(report)}</pre>"),
-        _section("To repeat it", f"<pre>{escape(command)}</pre>" + _table(("", "version"), facts["versions"].items())),
+        _chapter("Report", f"<pre>{escape(report)}</pre>"),
+        _chapter("To repeat it", f"<pre>{escape(command)}</pre>" + _rows_of(VERSIONS, facts["versions"].items())),
     ]
     body, title = "\n".join(parts), escape(scene["name"])
     head = f'<meta charset="utf-8"><meta name="viewport" content="width=device-width"><title>{title}</title>'
-    text = f'<!DOCTYPE html>\n<html lang="en"><head>{head}<style>{STYLE}</style></head>\n<body>\n{body}\n</body></html>\n'
+    head = f'<!DOCTYPE html>\n<html lang="en"><head>{head}<style>{STYLE}</style></head>'
+    text = f"{head}\n<body>\n{body}\n</body></html>\n"
     (folder / NAME).write_text(text, encoding="utf-8")
 
 
@@ -70,55 +75,58 @@ def _pictures(folder, command):
 
 
 def _asked(facts):
-    start = ", ".join(f"{name} = {_number(value)}" for name, value in facts["start"]["values"].items())
-    yield "time span [s]", " to ".join(map(_number, facts["t_span"]))
-    yield "parameters, SI", ", ".join(f"{name} = {_number(value)}" for name, value in facts["parameters"].items())
+    start = ", ".join(f"{name} = {_digits(value)}" for name, value in facts["start"]["values"].items())
+    yield "time span [s]", " to ".join(map(_digits, facts["t_span"]))
+    yield "parameters, SI", ", ".join(f"{name} = {_digits(value)}" for name, value in facts["parameters"].items())
     yield "start, SI", start
     yield "method", facts["method"] + (f", drift: {facts['drift']}" if facts["drift"] else "")
     yield "samples", str(facts["samples"])
     yield "index", str(facts["structure"]["index"])
 
 
-def _extrema(facts, units):
+def _ends(facts, units):
     for name, ends in facts["extrema"].items():
         low, high = ends["min"], ends["max"]
-        yield name, *map(_number, (low["value"], low["t"], high["value"], high["t"])), units.get(name, "SI")
+        yield name, *map(_digits, (low["value"], low["t"], high["value"], high["t"])), units.get(name, "SI")
 
 
-def _closed(facts, units):
+def _of_loop(facts, units):
     loop = facts["closed_loop"]
     if loop is None:
         return
-    other = [f"{n} = {_number(v)}" for n, v in loop["machine"].items() if facts["parameters"].get(n) != v]
-    noise = [f"{n} {_number(v)}" for n, v in (loop["noise"] or {}).items()]
-    said = [f"{loop['law']} at {_number(loop['rate'])} Hz", loop["message"]]
+    other = [f"{n} = {_digits(v)}" for n, v in loop["machine"].items() if facts["parameters"].get(n) != v]
+    noise = [f"{n} {_digits(v)}" for n, v in (loop["noise"] or {}).items()]
+    said = [f"{loop['law']} at {_digits(loop['rate'])} Hz", loop["message"]]
     said += [f"on a machine with {', '.join(other)}"] * bool(other) + [f"noise {', '.join(noise)}"] * bool(noise)
-    errors = ((name, _number(e["worst"]), _number(e["end"])) for name, e in loop["residuals"].items())
-    inputs = ((n, _number(v["min"]), _number(v["max"]), units.get(n, "SI")) for n, v in loop["inputs"].items())
-    content = f"<p>{escape('; '.join(said))}.</p>" + _table(("residual, SI", "worst", "at the end"), errors)
-    yield _section("Closed loop", content + _table(("input", "least", "greatest", "unit"), inputs))
+    errors = ((name, _digits(e["worst"]), _digits(e["end"])) for name, e in loop["residuals"].items())
+    inputs = ((n, _digits(v["min"]), _digits(v["max"]), units.get(n, "SI")) for n, v in loop["inputs"].items())
+    content = f"<p>{escape('; '.join(said))}.</p>" + _rows_of(("residual, SI", "worst", "at the end"), errors)
+    yield _chapter("Closed loop", content + _rows_of(("input", "least", "greatest", "unit"), inputs))
 
 
 def _checks(verification):
-    """Each number of the verification beside its limit; the worst first."""
+    """Each number of the verification with its limit, and what was not checked."""
     if verification is None:
         return
-    limits = verification.limits
-    rows = [(name, _number(n), _number(limits.get(name)), _judged(n, limits.get(name))) for name, n in verification.numbers.items()]
-    notes = "".join(f"<p>{escape(str(note))}</p>" for note in verification.notes)
-    content = _table(("check, relative", "value", "limit", ""), rows) + notes
-    yield _section(f"Verification: {verification.verdict}", content)
+    limits = {name: verification.limits.get(name) for name in verification.numbers}
+    rows = [
+        (name, _digits(value), _digits(limits[name]), _within(value, limits[name]), WORDS.get(name, ""))
+        for name, value in verification.numbers.items()
+    ]
+    notes = "".join(f"<p>{escape(note)}</p>" for note in (*verification.doubts, *verification.notes))
+    content = _rows_of(("check, relative", "value", "limit", "", ""), rows) + notes
+    yield _chapter(f"Verification: {verification.verdict}", content)
 
 
-def _judged(number, limit):
+def _within(number, limit):
     return "" if limit is None else "within" if number <= limit else "beyond"
 
 
-def _section(title, content):
+def _chapter(title, content):
     return f"<h2>{escape(title)}</h2>\n{content}"
 
 
-def _table(head, rows):
+def _rows_of(head, rows):
     rows = [tuple(map(str, row)) for row in rows]
     if not rows:
         return "<p>none</p>"
@@ -139,5 +147,5 @@ def _is_number(text):
     return True
 
 
-def _number(value):
+def _digits(value):
     return "–" if value is None else f"{value:.6g}"

@@ -37,7 +37,7 @@ def add_run(run):
     run.add_argument("--samples", type=samples, metavar="N", help="equally spaced samples of the run")
     run.add_argument("--no-verify", action="store_true", help="leave out the check against the full mechanism")
     run.add_argument("--no-figures", action="store_true", help="leave out the figures")
-    run.add_argument("--animate", action="store_true", help=f"show the mechanism in motion, in {ANIMATION} and the page")
+    run.add_argument("--animate", action="store_true", help=f"write the mechanism in motion: {ANIMATION}")
     loop.add_loop(run)
     run.set_defaults(command=_run)
 
@@ -69,7 +69,7 @@ def _compute(args, name, scene, folder):
     facts["closed_loop"] = loop.facts(closed)
     folder.write_json("summary.json", facts)
     folder.write_text("report.txt", report.text)
-    _draw(args, folder, scene, name, run, closed)
+    _pictures_of(args, folder, scene, name, run, closed)
     folder.write(lambda path: write_page(path, jsonable(facts), scene.units, verification, report.text))
     print(f"{', '.join(f for f in (*FILES, *LOOP_FILES, ANIMATION) if (folder.path / f).exists())} in {folder.path}")
     if not run.success:
@@ -83,7 +83,7 @@ def _compute(args, name, scene, folder):
     return INCONCLUSIVE if verified == "inconclusive" else 0
 
 
-def _draw(args, folder, scene, name, run, closed):
+def _pictures_of(args, folder, scene, name, run, closed):
     """Write the figures, and the animation if it is wanted; the mechanism moves as in the loop, else as planned."""
     moving = run if closed is None else closed
     shown, left_out = shows_mechanism(moving), ("path",) if run.model.reduction.mechanism.shapes else ()

@@ -133,7 +133,8 @@ class Mechanism:
             *self.constraints.values(), *self.outputs.values(), *self.shapes.values(),
         ]  # fmt: skip
         function = q.as_function([*expressions, *self.reported.values()], p.symbols).serialize()
-        facts = [names, list(self.outputs), list(self.shapes), self.inputs, list(self.reported), p.defaults, self.left_out]
+        facts = [names, list(self.outputs), list(self.shapes), self.inputs, list(self.reported)]
+        facts += [p.defaults, self.left_out]
         return json.dumps(facts) + "\n" + function
 
     def __eq__(self, other):

@@ -1,8 +1,8 @@
 """Shapes by which figures show a mechanism: lines between points that move with it.
 
 A shape is a sequence of points, each a column or sequence (x, y) or (x, y, z) [m] of expressions of t, q and the
-parameters. x points to the right, the last axis up. One point is drawn as a dot, several as a line, and a line that ends
-where it began as a body. `box`, `disc` and `spring` make such sequences.
+parameters. x points to the right, the last axis up. One point is drawn as a dot, several as a line, and a line that
+ends where it began as a body. `box`, `disc` and `spring` make such sequences.
 
     shapes={"rail": [(-1, 0), (6, 0)], "trolley": sv.shapes.box((x, 0), 0.6, 0.2), "rope": [(x, 0), (X, -Z)]}
 """
@@ -42,7 +42,7 @@ def box(centre, width, height, angle=0.0):
     """
     across = ca.vertcat(ca.cos(angle), ca.sin(angle)) * width / 2
     up = ca.vertcat(-ca.sin(angle), ca.cos(angle)) * height / 2
-    return [_column(centre) + a * across + b * up for a, b in ((-1, -1), (1, -1), (1, 1), (-1, 1), (-1, -1))]
+    return [_point(centre) + a * across + b * up for a, b in ((-1, -1), (1, -1), (1, 1), (-1, 1), (-1, -1))]
 
 
 def disc(centre, radius, angle=None, plane=None):
@@ -64,7 +64,7 @@ def disc(centre, radius, angle=None, plane=None):
     list of (2,) or (3,) SX
     """
     first, second = ((1, 0), (0, 1)) if plane is None else plane
-    first, second, centre = _column(first), _column(second), _column(centre)
+    first, second, centre = _point(first), _point(second), _point(centre)
     turned = 0.0 if angle is None else angle
     angles = [turned + 2 * ca.pi * i / CORNERS for i in range(CORNERS)]
     rim = [centre + radius * (ca.cos(a) * first + ca.sin(a) * second) for a in angles]
@@ -86,7 +86,7 @@ def spring(start, end, width, coils=6):
     -------
     list of (2,) SX
     """
-    start, end = _column(start), _column(end)
+    start, end = _point(start), _point(end)
     along = end - start
     aside = width / 2 * ca.vertcat(-along[1], along[0]) / ca.sqrt(ca.sumsqr(along) + width**2 / 1e6)
     parts = np.linspace(EARLY, LATE, 2 * coils + 1)
@@ -94,7 +94,7 @@ def spring(start, end, width, coils=6):
     return [start, *middle, end]
 
 
-def _column(point):
+def _point(point):
     return ca.vertcat(*column(point, "A point"))
 
 
@@ -144,7 +144,7 @@ def moved(mechanism, t, q, p):
     dict of str to (d, n, N) array
         [m]
     """
-    values = np.array(_function(Identity(mechanism))(np.reshape(t, (1, -1)), q, p))
+    values = np.array(_points_of(Identity(mechanism))(np.reshape(t, (1, -1)), q, p))
     ends = np.cumsum([points.numel() for points in mechanism.shapes.values()])
     rows = np.split(values, ends[:-1])
     return {
@@ -154,7 +154,7 @@ def moved(mechanism, t, q, p):
 
 
 @lru_cache(32)
-def _function(identity):
+def _points_of(identity):
     mechanism = identity.value
     q, p = mechanism.q, ca.vertcat(ca.SX(0, 1), *mechanism.parameters.symbols)
     points = ca.vertcat(*(ca.vec(points) for points in mechanism.shapes.values()))
@@ -195,5 +195,7 @@ def heights(mechanism, names, t, q, p):
         shares.append(np.linalg.lstsq(directions, weight[:, 0], rcond=None)[0] * np.linalg.norm(directions, axis=0))
     shares, sizes = np.array(shares), np.abs(shares).max(axis=0)
     others = [np.delete(sizes, i).max(initial=0.0) for i in range(len(names))]
-    certain = [np.all(np.sign(s) == np.sign(s[0])) and o < SIDEWAYS * abs(s).min() for s, o in zip(shares.T, others)]
-    return [int(np.sign(s[0])) if sure else 0 for s, sure in zip(shares.T, certain, strict=True)]
+    return [
+        int(np.sign(s[0])) if np.all(s * s[0] > 0) and other < SIDEWAYS * np.abs(s).min() else 0
+        for s, other in zip(shares.T, others, strict=True)
+    ]
