@@ -163,9 +163,6 @@ class Series:
             return select(self._deciding(node.args[0]) >= 0, a[k], -a[k])
         if node.kind == "gate":
             return 0.0 if is_zero(b[k]) else select(a[0] != 0, b[k], 0.0)
-        symbolic = any(isinstance(x[0], ca.SX) for x in (a, b))
-        if k == 0 and symbolic and not self.decided.keys() & node.args:
-            return (ca.fmin if node.kind == "fmin" else ca.fmax)(a[0], b[0])  # as in the expression itself
         first_is_least = self._deciding(node.args[0]) <= self._deciding(node.args[1])
         return select(first_is_least, *((a[k], b[k]) if node.kind == "fmin" else (b[k], a[k])))
 

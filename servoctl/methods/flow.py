@@ -51,7 +51,7 @@ class Propagation:
         t, h, p = (np.repeat(part, 2 * count, axis=-1) for part in (self.t[:-1], np.diff(self.t), self.parameters))
         y = self.f.grid(t, x, p)
         log = np.concatenate([t[None], x, y]).T
-        ends = self.f.jets(log, np.arange(len(t)), t + h, sizes["top"] - 1)
+        ends = self.f.jets(log, np.arange(len(t)), t + h, self.parameters[:, 0], sizes["top"] - 1)
 
         def difference(values):
             both = values.reshape(len(values), K, 2, count)
@@ -106,7 +106,7 @@ def flow(model, last, t, x, knots, size):
         at = np.unique(forward * np.append(ends[:-1], t[(forward * t > forward * a) & (forward * t < forward * b)]))
         at *= forward
         k = np.searchsorted(forward * ends, forward * at, "right") - 1
-        parts.append((at, f.jets(log, k, at, f.sizes["top"] - 1), np.tile(p[:, None], len(at))))
+        parts.append((at, f.jets(log, k, at, p, f.sizes["top"] - 1), np.tile(p[:, None], len(at))))
         if sum(len(part[0]) for part in parts) > MOST_ALONG:
             return None
     instants, states, parameters = (np.concatenate(part, axis=-1) for part in zip(*parts, strict=True))
