@@ -107,6 +107,11 @@ def two_masses(shapes=None, **rest):
     return mechanism, sv.Program({"X": x - q.t**2, "Y": y - q.t}, by="actuators")
 
 
+def test_arrays_hold_a_point_in_each_row():
+    mechanism, _ = two_masses(lambda q, p: {"ground": np.array([[0.0, 1.0], [2.0, 3.0], [4.0, 5.0]])})
+    assert at_random(mechanism, 1)[0]["ground"][:, :, 0] == pytest.approx(np.array([[0.0, 2.0, 4.0], [1.0, 3.0, 5.0]]))
+
+
 def test_shapes_of_what_plays_no_part_are_left_out():
     model = sv.derive(*two_masses())
     assert list(model.reduction.mechanism.shapes) == ["near"]
@@ -132,6 +137,8 @@ def test_shapes_count_for_equality_and_survive_a_pickle(crane):
         (lambda q, p: {"rope": [(ca.SX.sym("y"), 0)]}, {"name": "y"}),
         (lambda q, p: {"rope": [(np.nan, 0)]}, {}),
         (lambda q, p: [(0, 0)], {}),
+        (lambda q, p: {"rope": "xy"}, {"name": "rope", "type": "str"}),
+        (lambda q, p: {"rope": ca.SX.zeros(2, 3)}, {"name": "rope", "type": "SX"}),  # columns or rows?
     ],
 )
 def test_what_is_no_shape_is_refused(shapes, facts):
@@ -300,3 +307,24 @@ def test_a_robot_is_drawn_by_its_frames(name, base):
     starts = {tuple(np.round(points[:, 0, 0], 9)) for points in shapes.values()}
     ends = {tuple(np.round(points[:, -1, 0], 9)) for points in shapes.values()}
     assert len(starts - ends) <= 1  # a tree: each link begins where another ends, or at the root
+
+
+def test_motions_of_every_kind_are_drawn(crane, loop, tmp_path):
+    mechanism, start = crane.model.reduction.mechanism, crane.start
+    runs = {
+        "one sample": sv.simulate(crane.model, start, (0.0, 1.0), t_eval=[0.5]),
+        "two samples": sv.simulate(crane.model, start, (0.0, 1.0), t_eval=[0.0, 1.0]),
+        "loaded": sv.load(crane.save(tmp_path / "crane"), crane.model),
+        "under its own weight": sv.simulate(sv.plant(mechanism), crane.state(0.0), (0.0, 1.0)),
+        "without feedback": sv.close(loop.plant, sv.feedforward(crane, loop.plant, 50.0), crane.state(0.0), (0.0, 1.0)),
+    }
+    for name, run in runs.items():
+        shown = sv.plots.animate(run, fps=2)
+        assert np.isfinite(shown.shapes["load"]).all(), name
+    assert sv.plots.animate(runs["two samples"], fps=40).trails["load"] == pytest.approx(
+        sv.plots.animate(crane, fps=40).trails["load"], abs=1e-3
+    )  # by the polynomial between samples
+    still = sv.plots.animate(runs["one sample"], fps=2)
+    assert len(still.t) == 1 and Image.open(io.BytesIO(still.gif())).n_frames == 1
+    copy = pickle.loads(pickle.dumps(still))
+    assert copy == still

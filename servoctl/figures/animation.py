@@ -63,7 +63,7 @@ class Animation(Value):
     def __repr__(self):
         lasts = f"{len(self.t)} frames, {len(self.t) / self.fps:.3g} s"
         faster = f" ({self.pace:.3g} times as fast as the motion)" if self.pace > 1 else ""
-        return f"Animation: {lasts}{faster}\n  shapes {', '.join(self.shapes)}"
+        return f"Animation: {lasts}{faster}\n  shapes {'; '.join(self.shapes)}"
 
     def _repr_html_(self):
         content = base64.b64encode(self.gif()).decode()

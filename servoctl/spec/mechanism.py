@@ -241,7 +241,8 @@ class Mechanism:
         driven = Mechanism(
             self.q, self._gibbs, self.potential, None, self.parameters, kinetic=self._kinetic,
             balance=self._inverse_dynamics, mass=self._mass, forces=self.forces + forces + driving,
-            constraints=self.constraints, outputs={**self.outputs, **inputs}, shapes=self.shapes,
+            constraints=self.constraints, outputs={**self.outputs, **inputs},
+            shapes={name: ca.horzsplit(points) for name, points in self.shapes.items()},
         )  # fmt: skip
         driven.inputs, driven.reported = tuple(inputs), driven._named(reported, "residual")
         return driven

@@ -18,6 +18,8 @@ from servoctl.values import Identity
 
 __all__ = ["box", "disc", "spring"]
 
+SEQUENCE = "A shape is a sequence of points, all (x, y) or all (x, y, z)."
+EXAMPLE = 'Write "rope": [(x, 0), (X, -Z)].'
 CORNERS = 24  # of a disc
 EARLY, LATE = 0.15, 0.85  # parts of a spring between which it has coils
 INSTANTS = 9  # of a motion, at which the direction of gravity is examined
@@ -103,14 +105,17 @@ def as_shapes(shapes, known):
     placed = {}
     for name, points in mapping(shapes, "The shapes").items():
         what = f"The shape {name!r}"
-        several = list(points) if isinstance(points, (list, tuple)) else ca.horzsplit(ca.SX(points))
-        columns = [column(point, f"{what}, point {i},") for i, point in enumerate(several, 1)]
+        if not isinstance(points, (list, tuple, np.ndarray)):
+            raise SpecificationError(
+                f"{what} is a {type(points).__name__}.", SEQUENCE, do=EXAMPLE, name=name, type=type(points).__name__
+            )
+        columns = [column(point, f"{what}, point {i},") for i, point in enumerate(points, 1)]
         sizes = sorted({len(point) for point in columns})
         if len(sizes) != 1 or sizes[0] not in (2, 3):
             raise SpecificationError(
                 f"{what} has points of {' and '.join(map(str, sizes))} numbers." if sizes else f"{what} is empty.",
-                "A shape is a sequence of points, all (x, y) or all (x, y, z).",
-                do='Write "rope": [(x, 0), (X, -Z)].',
+                SEQUENCE,
+                do=EXAMPLE,
                 name=name,
                 sizes=sizes,
             )
