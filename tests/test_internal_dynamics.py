@@ -443,7 +443,7 @@ def test_deviations_moved_by_series_are_those_of_mathieus_equation(span):
         return np.concatenate([Y[2:], -0.1 * Y[2:] - (1 + depth * np.cos(2 * t)) * Y[:2]])
 
     exact = solve_ivp(rates, span, np.eye(2).ravel(), rtol=1e-11, atol=1e-13).y[:, -1].reshape(2, 2)
-    assert product == pytest.approx(exact, rel=1e-4, abs=1e-4 * np.abs(exact).max())
+    assert product == pytest.approx(exact, abs=LEFT_OUT * np.abs(exact).max())  # the part that a series may lack
 
 
 def test_series_that_are_too_short_move_no_deviations():
