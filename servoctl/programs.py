@@ -13,7 +13,7 @@ first order and has derivatives of every order.
 import casadi as ca
 import numpy as np
 
-from servoctl.checks import column, finite, is_number, mapping, matrix, named, positive, require_kind, text
+from servoctl.checks import column, mapping, named, positive, require_kind, text
 from servoctl.errors import SpecificationError
 from servoctl.robots.robot import Frame
 from servoctl.spec import rotations
@@ -118,7 +118,8 @@ def orientation(name, frame, rotation):
         name_rx, name_ry, name_rz [rad], in the wished axes.
     """
     turn = frame.rotation if isinstance(frame, Frame) else frame
-    difference = rotations.vector(_rotation(rotation, name).T @ _rotation(turn, name))
+    wished, turn = (rotations.as_rotation(value, f"a rotation of {name!r}") for value in (rotation, turn))
+    difference = rotations.vector(wished.T @ turn)
     return {f"{name}_r{axis}": difference[i] for i, axis in enumerate("xyz")}
 
 
@@ -451,15 +452,6 @@ def _frame(frame):
     return frame
 
 
-def _rotation(rotation, name):
-    rotation = matrix(rotation, f"the rotation of {name!r}")
-    if rotation.shape != (3, 3):
-        raise SpecificationError(
-            f"A rotation of {name!r} has the shape {rotation.shape}.", "It is (3, 3).", name=name, shape=rotation.shape
-        )
-    return rotation
-
-
 def _vector(value, what):
     entries = column(value, what)
     if not 1 <= len(entries) <= 3:
@@ -475,7 +467,8 @@ def _rate_of(name, q, position, k):
 
 def _norm(name, vector, value, what):
     """(|v|^2 - c^2)/(2 c)."""
-    if is_number(value) and finite(name, value) <= 0.0:
+    (value,) = column(value, f"the value of {name!r}", 1)
+    if value.is_constant() and float(value) <= 0.0:
         raise SpecificationError(
             f"{name!r} programs {what} of {float(value):g}.",
             "It is positive: at zero the gradient of a norm has no direction.",
@@ -483,7 +476,6 @@ def _norm(name, vector, value, what):
             name=name,
             value=float(value),
         )
-    (value,) = column(value, f"the value of {name!r}", 1)
     return (ca.dot(vector, vector) - value**2) / (2 * value)
 
 

@@ -78,3 +78,25 @@ def function_of(robot, *expressions):
     q = robot.q
     f = ca.Function("f", [ca.vertcat(*q), q.jet(1), q.jet(2)], [ca.densify(ca.SX(e)) for e in expressions])
     return lambda *state: [np.array(value).squeeze() for value in f.call([ca.DM(part) for part in state])]
+
+
+def two_legs():
+    """The text of a trunk on two legs of hip, knee and ankle, whose axes are parallel; soles are welded to feet."""
+    body = (
+        '<link name="{0}"><inertial><origin xyz="0 0 {1}"/><mass value="{2}"/>'
+        '<inertia ixx="{3}" ixy="0" ixz="0" iyy="{3}" iyz="0" izz="{3}"/></inertial></link>'
+    )
+    joint = (
+        '<joint name="{}" type="revolute"><origin xyz="{}"/><parent link="{}"/><child link="{}"/><axis xyz="0 1 0"/>'
+        '<limit lower="-3" upper="3" effort="40" velocity="20"/><dynamics damping="0.05"/></joint>'
+    )
+    parts = [body.format("trunk", 0.05, 5, 0.06)]
+    for leg, x in (("front", 0.15), ("hind", -0.15)):
+        above = "trunk"
+        for name, link, origin, mass in (
+            ("hip", "thigh", f"{x} 0 0", 0.9), ("knee", "shank", "0 0 -0.2", 0.4), ("ankle", "foot", "0 0 -0.2", 0.2),
+        ):  # fmt: skip
+            parts.append(body.format(f"{leg}_{link}", -0.05, mass, 2e-3))
+            parts.append(joint.format(f"{leg}_{name}", origin, above, f"{leg}_{link}"))
+            above = f"{leg}_{link}"
+    return f'<robot name="two_legs">{"".join(parts)}</robot>'

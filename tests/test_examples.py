@@ -112,6 +112,14 @@ def test_designed_arm(numbers):
     assert result["gain"] < 1e-4
 
 
+def test_robot_arm(numbers):
+    """Without an integral the unknown 2 kg deflect the arm as its gains are stiff; with it they are carried."""
+    result = numbers("robot_arm")
+    assert result["free"] == 0
+    assert result["LQR: at the end [mm]"] > 20 * result["LQR with integral: at the end [mm]"]
+    assert result["LQR with integral: at the end [mm]"] < 1.0 and result["LQR with integral: at the end [mrad]"] < 1.0
+
+
 # closed loops ----------------------------------------------------------------------------------------------------------
 
 LOST = 15.0 * 9.81  # N: the weight that the crane's laws do not know of

@@ -17,7 +17,7 @@ import servoctl as sv
 from servoctl import simulation
 from servoctl.gallery import cars, gallery, mass_on_car, passive_arm, spiral, vtol
 from servoctl.growth import growth_bound
-from servoctl.methods.flow import MOST_ALONG, flow
+from servoctl.methods.flow import LEFT_OUT, MOST_ALONG, flow
 
 
 def internal(pair, span, start, **guess):

@@ -97,7 +97,7 @@ def test_a_quadruped_moves_its_body_on_feet_that_give_way():
     loop = sv.interop.mujoco(standing_model(), law, start, (0.0, 1.2), plant=plant)
     for axis in "xyz":
         assert np.abs(loop.residual[f"trunk_{axis}"][0]).max() < 1e-3
-    rigid = sv.close(plant, law, start, (0.0, 1.2))
+    rigid = sv.close(plant, law, start, (0.0, 0.3), timing=sv.Timing(substeps=2))  # given, or a Jacobian decides them
     assert np.abs(rigid.residual["trunk_x"][0]).max() < 1e-6
 
 
@@ -117,3 +117,27 @@ def test_what_mujoco_cannot_run_is_refused():
         sv.interop.mujoco(file, law, start, (0.0, 1.0), plant=lagging)
     with refused(sv.SpecificationError, "plant"):
         sv.interop.mujoco(file, lambda t, y: {}, start, (0.0, 1.0), timing=sv.Timing(rate=100.0))
+
+
+def two_links(first, second):
+    inertia = '<inertia ixx="1" ixy="0" ixz="0" iyy="2" iyz="0" izz="2.5"/>'
+    link = f'<link name="{{}}"><inertial><origin xyz="0.1 0 0.2"/><mass value="{{}}"/>{inertia}</inertial></link>'
+    joint = '<joint name="{}" type="continuous"><parent link="{}"/><child link="{}"/><axis xyz="0 1 0"/></joint>'
+    parts = (link.format("a", 1), link.format("b", 2), joint.format(first, "root", "a"), joint.format(second, "a", "b"))
+    return f'<robot name="two"><link name="root"/>{"".join(parts)}</robot>'
+
+
+def test_joints_whose_names_were_taken_are_found():
+    """The joint dx has the coordinate dx_, for dx is the rate of x; MuJoCo's state of it is its own."""
+    text = two_links("x", "dx")
+    plant = sv.plant(sv.urdf(text).mechanism())
+    start, timing = {"x": 0.4, "dx_": -0.7, "dx": 0.3, "ddx_": 1.0}, sv.Timing(rate=100.0, substeps=5)
+    model = mujoco.MjModel.from_xml_string(text)
+    model.opt.timestep, model.opt.integrator = 2e-3, mujoco.mjtIntegrator.mjINT_RK4
+    idle = lambda t, y: dict.fromkeys(plant.inputs, 0.0)  # noqa: E731
+    theirs = sv.interop.mujoco(model, idle, start, (0.0, 0.2), plant=plant, timing=timing)
+    ours = sv.close(plant, idle, start, (0.0, 0.2), timing=timing)
+    assert np.abs(theirs.states - ours.states).max() < 1e-12
+    with refused(sv.SpecificationError, "a.b", coordinates=["a_b", "a_b_"]):
+        other = sv.plant(sv.urdf(two_links("a.b", "a_b")).mechanism())
+        sv.interop.mujoco(two_links("a.b", "a_b"), idle, [0.0] * 4, (0.0, 0.2), plant=other, timing=timing)

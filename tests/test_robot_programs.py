@@ -88,7 +88,7 @@ def test_torques_of_the_arm_equal_pinocchio():
 def test_least_torques_of_a_standing_quadruped_equal_pinocchio():
     robot, mechanism, model, run = quadruped_plan()
     assert len(mechanism.constraints) == 12
-    assert sv.verify(model, run).verdict == "passed"
+    assert sv.verify(model, run, segments=4).verdict == "passed"
     other = robots.Pinocchio(robot, robots.file_of("quadruped"), "free")
     rows = ca.vertcat(*(robot.frame(f"{leg}_foot").jacobian[:3, :] for leg in LEGS))
     jacobian = ca.Function("J", [ca.vertcat(*robot.q)], [ca.densify(rows)])
@@ -146,7 +146,9 @@ def test_frames_that_cannot_meet_are_refused():
 
 def test_held_frames_have_independent_rows():
     arm = sv.urdf(robots.file_of("four_bar"))
-    assert list(sv.held(arm, ["coupler_end"], {"crank_joint": 0.4})) == ["coupler_end_x", "coupler_end_z"]
+    bent, straight = {"crank_joint": 0.4, "coupler_joint": 0.5}, {"crank_joint": 0.4}
+    assert list(sv.held(arm, ["coupler_end"], bent)) == ["coupler_end_x", "coupler_end_z"]
+    assert list(sv.held(arm, ["coupler_end"], straight)) == ["coupler_end_x", "coupler_end_ry"], "x and z are dependent"
     robot = sv.urdf(robots.file_of("quadruped"), base="free")
     assert len(sv.held(robot, ["front_left_foot"], STANDING)) == 6
     with refused(sv.NameUnknown, "fron_left_foot", match="front_left_foot"):
@@ -236,6 +238,12 @@ def test_a_free_path_is_kept_at_the_speed_that_forces_give():
     [
         (lambda q: sv.programs.distance("p", (q["x"],), (0,), 0.0), "0"),
         (lambda q: sv.programs.constant_speed("p", q, (q["x"],), -1.0), "-1"),
+        (lambda q: sv.programs.constant_speed("p", q, (q["x"],), ca.DM(0.0)), "0"),
+        (lambda q: sv.programs.jerk_norm("p", q, (q["x"],), ca.SX(2.0) - 3.0), "-1"),
+        (lambda q: sv.programs.orientation("p", sv.rotations.turn(q["x"], (0, 0, 1)), 2.0 * np.eye(3)), "no rotation"),
+        (lambda q: sv.programs.orientation("p", sv.rotations.turn(q["x"], (0, 0, 1)), np.diag([1, 1, -1])), "no rotation"),
+        (lambda q: sv.rotations.turn(q["x"], (0, 0, 1), np.zeros((3, 3))), "no rotation"),
+        (lambda q: sv.rotations.spline(q.t, [], []), "rotation"),
         (lambda q: sv.programs.follow_point("p", (q["x"], q["y"]), (1,)), "2 entries with 1"),
         (lambda q: sv.programs.curvature("p", q, (q["x"], q["y"], 0), 1.0), "3 coordinates"),
         (lambda q: sv.programs.follow_path("p", (q["x"],), q["y"], q.t), "follow_point"),
@@ -289,3 +297,20 @@ def test_rotations_refuse_half_turns_and_what_is_none():
         sv.rotations.slerp(0.5, np.diag([1.0, 1.0, -1.0]), np.eye(3))
     with refused(sv.SpecificationError, "axis", axis=[0, 0, 0]):
         sv.rotations.turn(0.5, (0, 0, 0))
+
+
+TWO_LEGS = {f"{leg}_{joint}": angle for leg in ("front", "hind") for joint, angle in (("hip", 0.7), ("knee", -1.4), ("ankle", 0.7))}
+
+
+def test_rows_of_two_soles_are_those_of_their_plane():
+    """With one sole held, the other moves in the plane of the legs alone, though in no posture at random."""
+    robot = sv.urdf(robots.two_legs(), base="free")
+    rows = sv.held(robot, ["front_foot", "hind_foot"], TWO_LEGS | {"base_z": 0.3})
+    assert list(rows)[6:] == ["hind_foot_x", "hind_foot_z", "hind_foot_ry"]
+    turned = {"base_qz": np.sin(np.pi / 4), "base_qw": np.cos(np.pi / 4)}
+    rows = sv.held(robot, ["hind_foot", "front_foot"], TWO_LEGS | turned)  # rotations in the axes of the foot
+    assert list(rows)[6:] == ["front_foot_y", "front_foot_z", "front_foot_ry"]
+    frames = robot.frame("front_foot"), robot.frame("hind_foot")
+    assert list(sv.loop(*frames)) == ["loop_x", "loop_z", "loop_ry"]
+    arm = sv.urdf(robots.file_of("six_axis_arm"))
+    assert len(sv.held(arm, ["tool"], {})) == 6, "a stretched arm that cannot move has all rows"

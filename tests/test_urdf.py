@@ -260,6 +260,16 @@ REFUSED = {
     "a joint without inertia": (bar("<!-- -->"), "lock={'hinge': 0.0}", {"joint": "hinge"}),
     "a mimic of itself": (bar(inside='<mimic joint="hinge"/>'), "itself", {"joint": "hinge"}),
     "negative damping": (bar(inside='<dynamics damping="-1"/>'), "-1", {}),
+    "an encoding of several bytes": (b'<?xml version="1.0" encoding="shift_jis"?>' + bar().encode(), "multi-byte", {}),
+    "half a character": (bar().replace('"bar"', '"\udc80"'), "no XML", {}),
+    "a mass beyond numbers": (bar(INERTIAL.replace('"2"/>', '"1e308"/>').replace("<mass", '<origin xyz="9 0 0"/><mass')),
+                              "range", {"link": "bar"}),
+    "moments beyond numbers": (bar(INERTIAL.replace('"1"', '"1e308"').replace('"2.5"', '"1e308"').replace(
+        'iyy="2"', 'iyy="1e308"')), "range", {"link": "bar"}),
+    "reversed limits": (bar(inside='<limit lower="2" upper="1"/>'), "lower=1, upper=2", {"limits": [2.0, 1.0]}),
+    "a mimic of nothing": (bar(inside='<mimic multiplier="2"/>'), "None", {}),
+    "a floating joint that mimics": (bar(kind="floating", inside='<mimic joint="j"/>'), "floating", {}),
+    "a planar joint that mimics": (bar(kind="planar", inside='<mimic joint="j"/>'), "planar", {}),
 }  # fmt: skip
 
 
@@ -309,3 +319,107 @@ def test_a_mass_matrix_that_is_not_that_of_the_balance_is_refused():
     assert sv.Mechanism(q, balance=balance, mass=right).mass is not None
     with refused(sv.SpecificationError, "d2y", components=["d2y", "d2y"]):
         sv.Mechanism(q, balance=balance, mass=ca.SX(ca.DM([[2, 1], [1, 4]])))
+
+
+# names that meet, and documents as they come ---------------------------------------------------------------------------
+
+
+def link(name, inertial=INERTIAL):
+    return f'<link name="{name}">{inertial}</link>'
+
+
+def joint(name, parent, child, kind="revolute", inside='<axis xyz="0 1 0"/>'):
+    return f'<joint name="{name}" type="{kind}"><parent link="{parent}"/><child link="{child}"/>{inside}</joint>'
+
+
+def assembled(*parts, **options):
+    return sv.urdf(f'<robot name="r">{"".join(parts)}</robot>', **options)
+
+
+DAMPED = '<axis xyz="0 1 0"/><dynamics damping="3"/>'
+ROOT = link("root", "")
+MEETING = {  # robots whose names meet, and the same ones whose names do not
+    "a joint named as the free base": (
+        lambda name: assembled(link("root"), link("b"), joint(name, "root", "b", inside=DAMPED), base="free"), "base"),
+    "a joint named as a part of a planar one": (
+        lambda name: assembled(ROOT, link("a"), link("b"), joint("p", "root", "a", "planar"),
+                               joint(name, "a", "b", inside=DAMPED)), "p_x"),
+    "a joint named as a rate": (
+        lambda name: assembled(link("root"), link("a"), link("b"), joint("h", "root", "a"),
+                               joint(name, "a", "b", inside=DAMPED), base="free"), "h_rate"),
+    "a joint named as an actuator": (
+        lambda name: assembled(ROOT, link("a"), link("b"), joint("h", "root", "a"), joint(name, "a", "b", inside=DAMPED)),
+        "torque_h"),
+    "a joint named as a parameter": (
+        lambda name: assembled(ROOT, link("a"), link("b"), joint("h", "root", "a"), joint(name, "a", "b", inside=DAMPED),
+                               symbolic=("a",)), "a_mass"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", MEETING)
+def test_names_that_meet_change_no_equation(case):
+    make, name = MEETING[case]
+    ours, plain = make(name), make("other")
+    assert name in ours.joints.values()
+    assert len(set(ours.joints.values())) == len(set(plain.joints.values()))
+    assert list(ours.damping.values()) == list(plain.damping.values()) == [3.0]
+    assert len(ours.mechanism().actuators) == len(plain.mechanism().actuators)
+    state = robots.random_state(plain, np.random.default_rng(8))
+    numbers = list(plain.parameters.defaults.values())
+    values = []
+    for arm in (ours, plain):
+        symbols = [ca.vertcat(*arm.q), arm.q.jet(1), arm.q.jet(2), ca.vertcat(*arm.parameters.symbols)]
+        values.append(np.array(ca.Function("b", symbols, [arm.mechanism().balance])(*state, numbers)))
+    assert np.abs(values[0] - values[1]).max() < 1e-14
+
+
+def test_links_whose_names_are_one_identifier_keep_apart():
+    parts = (ROOT, link("a.b"), link("a_b"), joint("j", "root", "a.b"), joint("k", "a.b", "a_b", "prismatic"))
+    arm = assembled(*parts, symbolic=("a.b", "a_b", "a.b"))
+    assert len(arm.parameters.names) == 20
+    rows = sv.held(arm, ["a.b", "a_b"], {})
+    assert set(rows) == {"a_b_ry", "a_b__y"}
+
+
+def test_a_quaternion_is_that_of_the_base_and_a_unit_one():
+    arm = assembled(link("root"), link("b"), joint("arm_qw", "root", "b"), base="free")
+    assert dict(zip(arm.q.names, arm.posture({}), strict=True))["arm_qw"] == 0.0
+    with refused(sv.SpecificationError, "base_qz=0.3", "Nearest", length=pytest.approx(np.hypot(1.0, 0.3))) as caught:
+        sv.held(arm, ["b"], {"base_qz": 0.3})
+    assert caught.value.details["unit"] == pytest.approx(np.array([0, 0, 0.3, 1.0]) / np.hypot(1.0, 0.3))
+    assert len(sv.held(arm, ["b"], {"base_qz": 0.6, "base_qw": 0.8})) == 6
+
+
+def test_a_joint_and_what_mimics_it_move_mass_together():
+    follower = '<axis xyz="0 1 0"/><mimic joint="j" multiplier="-2"/>'
+    driven = assembled(ROOT, link("a", ""), link("b"), joint("j", "root", "a"), joint("f", "root", "b", inside=follower))
+    assert robots.function_of(driven, driven.mechanism().mass)(0.0, 0.0, 0.0)[0] == pytest.approx(4 * 2.0)
+    assembled(ROOT, link("a"), link("b", ""), joint("j", "root", "a"), joint("f", "root", "b", inside=follower))
+    with refused(sv.SpecificationError, "j", joint="j"):
+        assembled(ROOT, link("a", ""), link("b", ""), joint("j", "root", "a"), joint("f", "root", "b", inside=follower))
+    with refused(sv.SpecificationError, "free base", joint=None):
+        assembled(link("root", ""), base="free")
+
+
+@pytest.mark.parametrize("change", [
+    lambda text: "\ufeff" + text, lambda text: text.replace("\n", "\r\n"), lambda text: f'\n  <?xml version="1.0"?>{text}',
+    lambda text: text.replace("<robot ", '<robot xmlns="http://a.org" xmlns:xacro="http://b.org" '),
+    lambda text: text.replace("<link", "<!-- <xacro:m/> ${x} --><link"), lambda text: text.encode("utf-16"),
+    lambda text: text.replace('"0 1 0"', '"0 1e308 0"'), lambda text: text.replace('"0 1 0"', '"0 1e-300 0"'),
+], ids=["BOM", "CRLF", "blanks first", "namespaces", "comments", "utf-16", "long axis", "short axis"])  # fmt: skip
+def test_documents_are_read_as_they_come(change):
+    arm = sv.urdf(change(bar()))
+    assert arm.q.names == ("hinge",)
+    turned = robots.function_of(arm, arm.frame("bar").rotation)(0.3, 0.0, 0.0)[0]
+    assert turned[0] == pytest.approx([np.cos(0.3), 0.0, np.sin(0.3)])
+
+
+@pytest.mark.parametrize("kind", ["fixed", "planar", "floating"])
+def test_joints_without_one_position_are_not_locked(kind):
+    with refused(sv.SpecificationError, kind, "hinge", joint="hinge"):
+        sv.urdf(bar(kind=kind), lock={"hinge": 0.3})
+
+
+def test_a_file_without_end_is_refused():
+    with refused(sv.SpecificationError, "bytes"):
+        sv.urdf("/dev/zero")

@@ -111,6 +111,21 @@ def _mujoco(model):
         ) from error
 
 
+def _coordinate(joint, q):
+    """The name of a joint's coordinate, which ends in underscores where the joint's name was taken."""
+    plain = identifier(joint or "joint")
+    alike = [name for name in q.names if name.rstrip("_") == plain.rstrip("_")]
+    if len(alike) > 1 and joint not in alike:
+        raise SpecificationError(
+            f"The joint {joint!r} of MuJoCo's model may have the coordinates {', '.join(alike)}.",
+            "A coordinate has the name of one joint.",
+            do="Rename the joints, so that they differ in letters or digits.",
+            joint=joint,
+            coordinates=alike,
+        )
+    return joint if joint in alike else alike[0] if alike else plain
+
+
 class _Machine:
     """MuJoCo's model and data under the names of a plant."""
 
@@ -134,8 +149,8 @@ class _Machine:
         placed, joints = set(), []
         for i in range(self.model.njnt):
             joint = self.model.joint(i)
-            name, kind, at_q, at_v = identifier(joint.name or "joint"), joint.type[0], joint.qposadr[0], joint.dofadr[0]
-            joints.append(name)
+            name, kind, at_q, at_v = _coordinate(joint.name, q), joint.type[0], joint.qposadr[0], joint.dofadr[0]
+            joints.append(joint.name)
             base = name if f"{name}_qw" in q.names else "base"
             if kind == FREE and f"{base}_qw" in q.names:
                 scalar_last = np.array([0, 1, 2, 4, 5, 6, 3])

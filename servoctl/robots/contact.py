@@ -5,13 +5,14 @@ import numpy as np
 
 from servoctl.checks import named, require_kind, texts
 from servoctl.errors import SpecificationError
-from servoctl.robots.joints import identifier
+from servoctl.robots.joints import identifier, some_posture, unit_quaternions
 from servoctl.robots.robot import Frame, Robot
 from servoctl.spec import rotations
 
 HOLDS = ("position", "pose")
 POSTURE_SEED = 20033  # of the postures at which rows are compared
 POSTURES = 3
+ALONE = 1e-6  # [rad, m] largest difference of postures that are one: nothing moves
 FOLLOWS = 1e-9  # part of the largest singular value below which rows of Jacobians depend on others
 
 
@@ -33,22 +34,25 @@ def held(robot: Robot, frames, at) -> dict:
     dict of str to SX
         Rows foot_x, foot_y, foot_z [m] and foot_rx, foot_ry, foot_rz: the vector 2 tan(angle/2) along the axis of the
         rotation from the held orientation [rad], which goes to infinity, not back to zero, at half a turn. Rows that
-        follow from the others in every posture are left out.
+        follow from the others wherever all hold are left out.
 
     Raises
     ------
+    SpecificationError
+        If the frames cannot move, or a quaternion has not the length one.
     NameUnknown
         If a link, a coordinate or a kind does not exist.
     """
     require_kind(Robot, "robot", robot, "sv.urdf(file)")
     frames = frames if isinstance(frames, dict) else dict.fromkeys(texts(frames, "The frames"), "pose")
-    rows = {}
+    rows, names = {}, set()
     for link, kind in frames.items():
         named(kind, HOLDS, "kind of constraint")
+        names.add(name := identifier(link, names))
         frame, (position, rotation) = robot.frame(link), robot.at(at, link)
         turned = ca.DM(rotation.T) @ frame.rotation
-        rows |= _coinciding(identifier(link), frame.position - ca.DM(position), turned, kind)
-    return _without_followers(rows, robot.q, robot.parameters, True)
+        rows |= _coinciding(name, frame.position - ca.DM(position), turned, kind)
+    return _without_followers(rows, robot.q, robot.parameters, robot.posture(at))
 
 
 def loop(a: Frame, b: Frame, kind="pose", name="loop") -> dict:
@@ -65,13 +69,13 @@ def loop(a: Frame, b: Frame, kind="pose", name="loop") -> dict:
     Returns
     -------
     dict of str to SX
-        Rows as those of `held`, in the axes of `a`. Rows that follow from the others in every posture, as those
+        Rows as those of `held`, in the axes of `a`. Rows that follow from the others wherever all hold, as those
         across the plane of a planar linkage, are left out.
 
     Raises
     ------
     SpecificationError
-        If the frames are of different robots.
+        If the frames are of different robots, cannot meet, or cannot move against each other.
     NameUnknown
         If the kind does not exist.
     """
@@ -86,7 +90,7 @@ def loop(a: Frame, b: Frame, kind="pose", name="loop") -> dict:
             frames=[a.name, b.name],
         )
     rows = _coinciding(identifier(name), a.rotation.T @ (b.position - a.position), a.rotation.T @ b.rotation, kind)
-    return _without_followers(rows, a.q, None, False)
+    return _without_followers(rows, a.q, None, None)
 
 
 def _coinciding(name, offset, rotation, kind):
@@ -97,47 +101,54 @@ def _coinciding(name, offset, rotation, kind):
     return rows
 
 
-def _without_followers(rows, q, parameters, consistent):
-    """The rows without those that depend on rows before them in every posture.
+def _without_followers(rows, q, parameters, at):
+    """The rows without those that depend on rows before them wherever all of them vanish.
 
     Parameters
     ----------
     rows : dict of str to SX
     q : Coordinates
     parameters : Parameters or None
-    consistent : bool
-        Whether all rows are known to vanish in some posture.
+    at : (nq,) array or None
+        A posture in which all rows vanish, where one is known.
     """
-    values = ca.vertcat(*rows.values())
     symbols = ca.vertcat(*q, *((parameters.symbols) if parameters else ()))
+    values = ca.vertcat(*rows.values())
     gradient = ca.jacobian(values, ca.vertcat(*q)) @ q.V
     evaluate = ca.Function("rows", [symbols], [values, ca.densify(gradient), ca.densify(q.V)])
     numbers = np.array(list(parameters.defaults.values()) if parameters else [], float)
     random = np.random.default_rng(POSTURE_SEED)
-    places = [np.concatenate([_some_posture(q, random), numbers]) for _ in range(POSTURES)]
-    kept = _adding([np.array(evaluate(place)[1]) for place in places])
-    if len(kept) < len(rows) and not consistent:
-        _refuse_contradiction(list(rows), kept, evaluate, places, q.nq)
+    places = [np.concatenate([some_posture(q, random), numbers]) for _ in range(POSTURES)]
+    starts = places if at is None else [np.concatenate([_near(q, at, place), numbers]) for place in places]
+    closed = [place for start in starts if (place := _newton(evaluate, range(len(rows)), start.copy(), q)) is not None]
+    kept = _adding([np.array(evaluate(place)[1]) for place in closed])
+    if not closed or max(np.abs(place - closed[0]).max() for place in closed) < ALONE:
+        kept = _adding([np.array(evaluate(place)[1]) for place in places], kept)
+    if len(kept) < len(rows) and not closed and at is None:
+        _refuse_contradiction(list(rows), kept, evaluate, places, q)
+    if rows and not kept:
+        raise SpecificationError(
+            f"The rows {', '.join(rows)} have the same values in every posture."[:300],
+            "Frames that are held or closed move with the coordinates.",
+            do="Name links beyond a joint that moves.",
+            rows=list(rows),
+        )
     return {name: row for i, (name, row) in enumerate(rows.items()) if i in kept}
 
 
-def _some_posture(q, random):
-    """A random posture; quaternions of free bodies are unit ones."""
-    posture = random.uniform(-1.0, 1.0, q.nq)
-    for i, name in enumerate(q.names):
-        if name.endswith("_qw") and not q.plain:
-            posture[i - 3 : i + 1] /= np.linalg.norm(posture[i - 3 : i + 1])
-    return posture
+def _near(q, at, place):
+    """A posture a third of the way to another one; quaternions are unit ones."""
+    return unit_quaternions(q, at + (place[: q.nq] - at) / 3)
 
 
-def _adding(jacobians):
+def _adding(jacobians, kept=()):
     """Rows, first ones first, that add to the rank of the rows before them in one of the postures."""
-    kept = []
-    for i in range(jacobians[0].shape[0]):
+    kept = list(kept)
+    for i in range(jacobians[0].shape[0] if jacobians else 0):
         trial = [*kept, i]
-        if any(_full_rank(jacobian[trial]) for jacobian in jacobians):
+        if i not in kept and any(_full_rank(jacobian[trial]) for jacobian in jacobians):
             kept = trial
-    return kept
+    return sorted(kept)
 
 
 def _full_rank(matrix):
@@ -145,11 +156,11 @@ def _full_rank(matrix):
     return len(singular) == len(matrix) and singular[-1] > FOLLOWS * max(1.0, singular[0])
 
 
-def _refuse_contradiction(names, kept, evaluate, places, nq):
+def _refuse_contradiction(names, kept, evaluate, places, q):
     """Refuse rows left out that do not vanish where the others do."""
     dropped = [i for i in range(len(names)) if i not in kept]
     for place in places:
-        closed = _newton(evaluate, kept, place.copy(), nq)
+        closed = _newton(evaluate, kept, place.copy(), q)
         if closed is None:
             continue
         values = np.array(evaluate(closed)[0]).ravel()
@@ -165,12 +176,15 @@ def _refuse_contradiction(names, kept, evaluate, places, nq):
         return
 
 
-def _newton(evaluate, kept, place, nq):
+def _newton(evaluate, kept, place, q):
     """A posture in which the rows kept vanish, by Newton's iteration from a posture; None where it finds none."""
     for _ in range(50):
         values, jacobian, frame = (np.array(part) for part in evaluate(place))
+        if not np.isfinite(jacobian).all():
+            return None
         if np.abs(values[kept]).max(initial=0.0) < 1e-2 * FOLLOWS:
             return place
         step = np.linalg.lstsq(jacobian[kept], -values[kept].ravel(), rcond=None)[0]
-        place[:nq] += frame @ (step * min(1.0, 0.5 / max(np.abs(step).max(), 1e-300)))
+        place[: q.nq] += frame @ (step * min(1.0, 0.5 / max(np.abs(step).max(), 1e-300)))
+        place[: q.nq] = unit_quaternions(q, place[: q.nq])
     return None

@@ -118,7 +118,7 @@ def _parallel(a, b):
 def _bytes(source):
     """Bytes of a document and the encoding that overrides its declaration, or None."""
     if isinstance(source, str) and "<" in source:
-        return source.encode(), "utf-8"
+        return source.encode(errors="surrogatepass"), "utf-8"
     if isinstance(source, bytes):
         return source, None
     if not isinstance(source, (str, Path)):
@@ -130,9 +130,9 @@ def _bytes(source):
         )
     path = Path(source)
     try:
-        size, content = path.stat().st_size, b""
-        if size <= LARGEST_FILE:
-            content = path.read_bytes()
+        with path.open("rb") as file:
+            content = file.read(LARGEST_FILE + 1)
+        size = max(path.stat().st_size, len(content))
     except (OSError, ValueError) as error:
         raise SpecificationError(
             f"The file {str(source)[:200]!r} cannot be read: {getattr(error, 'strerror', None) or error}.",
@@ -163,8 +163,10 @@ def _root_element(content, encoding):
     parser.EndElementHandler = builder.end
     parser.StartDoctypeDeclHandler = _refuse_document_type
     try:
-        parser.Parse(content, True)
-    except (expat.ExpatError, LookupError) as error:
+        parser.Parse(content.lstrip(), True)
+    except SpecificationError:
+        raise
+    except (expat.ExpatError, LookupError, ValueError) as error:
         raise SpecificationError(
             f"The document is no XML: {error}.",
             "A robot's description is a URDF file: XML with a root <robot>.",
@@ -242,15 +244,24 @@ def _joint(node, name):
     rotation, offset = _origin(node, what)
     limit, dynamics = node.find("limit"), node.find("dynamics")
     turns = kind in ("continuous", "floating", "planar")
-    return Joint(
+    joint = Joint(
         name, kind, _link_of(node, "parent", what), _link_of(node, "child", what), rotation, offset,
         np.zeros(3) if kind in ("fixed", "floating") else _axis(node, what),
         lower=-math.inf if turns else _one_number(limit, "lower", what, 0.0 if limit is not None else -math.inf),
         upper=math.inf if turns else _one_number(limit, "upper", what, 0.0 if limit is not None else math.inf),
         effort=_one_number(limit, "effort", what, math.inf), velocity=_one_number(limit, "velocity", what, math.inf),
         damping=_resistance(dynamics, "damping", what), friction=_resistance(dynamics, "friction", what),
-        mimic=_mimic(node.find("mimic"), what),
+        mimic=_mimic(node.find("mimic"), kind, what),
     )  # fmt: skip
+    if joint.lower > joint.upper:
+        raise SpecificationError(
+            f"The limits of {what} are lower={joint.lower:g}, upper={joint.upper:g}.",
+            "The lower one is at most the upper one.",
+            f"lower={joint.upper:g}, upper={joint.lower:g}.",
+            joint=name,
+            limits=[joint.lower, joint.upper],
+        )
+    return joint
 
 
 def _link_of(node, tag, what):
@@ -260,9 +271,16 @@ def _link_of(node, tag, what):
     return found.get("link")
 
 
-def _mimic(node, what):
-    if node is None:
+def _mimic(node, kind, what):
+    if node is None or kind == "fixed":
         return None
+    if kind in ("floating", "planar") or not node.get("joint"):
+        raise SpecificationError(
+            f"The {kind} {what} mimics {node.get('joint')!r}.",
+            "A joint with one position mimics another one, by its name.",
+            do="Remove the <mimic>, or write <mimic joint=...>.",
+            joint=what,
+        )
     return node.get("joint"), _one_number(node, "multiplier", what, 1.0), _one_number(node, "offset", what, 0.0)
 
 
@@ -277,10 +295,10 @@ def _origin(node, what):
 
 def _axis(node, what):
     axis = np.array(_finite_numbers(node.find("axis"), "xyz", what, "1 0 0"))
-    length = np.linalg.norm(axis)
-    if not length:
+    if not axis.any():
         raise SpecificationError(f"The axis of {what} is 0 0 0.", "An axis has a direction.", joint=what)
-    return without_rounding(axis / length)
+    axis = axis / np.abs(axis).max()  # whose square is in the range of numbers
+    return without_rounding(axis / np.linalg.norm(axis))
 
 
 def _resistance(node, key, what):

@@ -14,28 +14,29 @@ NEGATIVE = 1e-9  # part of the largest principal moment below zero that is round
 
 def with_symbols(description, links):
     """Parameters of symbolic links, and the inertia of all links."""
-    inertials, defaults = dict(description.links), {}
+    inertials, numbers, names = dict(description.links), {}, set()
     for link in links:
         if link not in inertials:
             raise unknown(link, inertials, "link")
-        defaults |= _numbers_of(link, inertials[link])
-    parameters = Parameters(defaults)
-    for link in links:
-        own = [getattr(parameters, name) for name in _numbers_of(link, inertials[link])]
+        if link not in numbers:
+            names.add(name := identifier(link, names))
+            numbers[link] = {f"{name}_{key}": value for key, value in _numbers_of(inertials[link]).items()}
+    parameters = Parameters({name: value for own in numbers.values() for name, value in own.items()})
+    for link, values in numbers.items():
+        own = [getattr(parameters, name) for name in values]
         mass, centre, (ixx, ixy, ixz, iyy, iyz, izz) = own[0], ca.vertcat(*own[1:4]), own[4:]
         inertia = ca.vertcat(ca.horzcat(ixx, ixy, ixz), ca.horzcat(ixy, iyy, iyz), ca.horzcat(ixz, iyz, izz))
         inertials[link] = Inertial(mass, ca.SX.zeros(3), inertia).moved(ca.DM.eye(3), centre)
     return parameters, inertials
 
 
-def _numbers_of(link, inertial):
-    """Mass, centre of mass and inertia about it of a link, by the names of their parameters."""
-    base, mass = identifier(link), float(inertial.mass)
+def _numbers_of(inertial):
+    """Mass, centre of mass and inertia about it."""
+    mass = float(inertial.mass)
     centre = np.zeros(3) if not mass else np.array(inertial.moment).ravel() / mass
     inertia = np.array(inertial.inertia) - mass * (centre @ centre * np.eye(3) - np.outer(centre, centre))
     moments = {f"i{'xyz'[i]}{'xyz'[j]}": float(inertia[i, j]) for i in range(3) for j in range(i, 3)}
-    numbers = {"mass": mass, **dict(zip(("cx", "cy", "cz"), map(float, centre), strict=True)), **moments}
-    return {f"{base}_{key}": value for key, value in numbers.items()}
+    return {"mass": mass, **dict(zip(("cx", "cy", "cz"), map(float, centre), strict=True)), **moments}
 
 
 def require_possible(tree, parameters):
@@ -53,16 +54,28 @@ def require_possible(tree, parameters):
         carried[i] = carried[i] or bool(mass.item() or inertia.any())
         if body.parent is not None:
             carried[body.parent] = carried[body.parent] or carried[i]
-        if not carried[i]:
-            raise SpecificationError(
-                f"The joint {body.joint!r} moves no mass: neither link {body.name!r} nor what hangs on it has inertia.",
-                "Each degree of freedom has inertia.",
-                do=f"Lock it, lock={{{body.joint!r}: 0.0}}, or give a link an <inertial>.",
-                joint=body.joint,
-            )
+    followed = {body.mimic[0] for body, moves in zip(tree.bodies, carried, strict=True) if body.mimic and moves}
+    for body, moves in zip(tree.bodies, carried, strict=True):
+        if moves or body.mimic or body.joint and body.joint.name in followed:
+            continue
+        name = body.joint.name if body.joint else None
+        raise SpecificationError(
+            f"The {f'joint {name!r}' if name else 'free base'} moves no mass: neither link {body.name!r} nor what "
+            "hangs on it has inertia.",
+            "Each degree of freedom has inertia.",
+            do="Give a link an <inertial>" + (f", or lock the joint, lock={{{name!r}: 0.0}}." if name else "."),
+            joint=name,
+        )
 
 
 def _refuse_inertia(body, mass, moment, inertia):
+    if not (np.isfinite(mass) and np.isfinite(moment).all() and np.isfinite(inertia).all()):
+        raise SpecificationError(
+            f"The inertia of the body of link {body.name!r} is beyond the range of numbers.",
+            "Mass, first moment and inertia about the joint are finite in double precision.",
+            do="Correct the numbers of its links, in kg and m.",
+            link=body.name,
+        )
     centre = moment / mass if mass else np.zeros(3)
     about = inertia - mass * (centre @ centre * np.eye(3) - np.outer(centre, centre))
     principal, axes = np.linalg.eigh((about + about.T) / 2)

@@ -2,64 +2,103 @@
 
 import keyword
 import re
+import unicodedata
 
 import casadi as ca
+import numpy as np
 
 from servoctl.errors import SpecificationError
 from servoctl.robots.dynamics import Axis, quaternion_rotation
 from servoctl.spec.coordinates import coordinates
 
-ONE_AXIS = ("revolute", "continuous", "prismatic")  # kinds of joints with one position
 PLACE = ("x", "y", "z", "qx", "qy", "qz", "qw")  # position and quaternion of a free body
 TWIST = ("vx", "vy", "vz", "wx", "wy", "wz")  # its velocities in its own axes
 ARGUMENTS = ("t", "guess", "hold")  # names that no coordinate has
 
 
-def axes_of(description, tree):
-    """Coordinates of a tree, the axis of each body, and the joints' names in the file by coordinate."""
-    free = any(body.motion == "free" for body in tree.bodies)
-    taken, places, joints = [], {}, {}
-    for body in tree.bodies:
+def axes_of(description, tree, taken):
+    """Coordinates of a tree, the axis of each body, and the joints of the file by coordinate.
+
+    Parameters
+    ----------
+    description : Description
+    tree : Tree
+    taken : sequence of str
+        Names that no coordinate has.
+    """
+    free, taken = any(body.motion == "free" for body in tree.bodies), set(taken)
+    places, joints, sources = {}, {}, {}
+    for i, body in enumerate(tree.bodies):
         if body.mimic is None:
-            base = identifier(body.joint, taken)
-            places[body.joint] = [f"{base}_{part}" for part in PLACE] if body.motion == "free" else [base]
-            taken += places[body.joint]
-            joints |= dict.fromkeys(places[body.joint], body.joint)
-    if not taken:
+            base = identifier(body.label, taken, lambda name, body=body: _names_of(name, body, free))
+            taken |= set(_names_of(base, body, free))
+            places[i] = [f"{base}_{part}" for part in PLACE] if body.motion == "free" else [base]
+            if body.joint is not None:
+                joints |= dict.fromkeys(places[i], body.joint)
+                sources[body.joint.name] = i
+    if not places:
         raise SpecificationError(
             f"The robot {description.name!r} has no joint that moves.",
             "A mechanism has at least one degree of freedom.",
             do='Release a joint, or pass base="free".',
         )
-    q = coordinates(" ".join(taken))
+    q = coordinates(" ".join(name for names in places.values() for name in names))
     if free:
         q = _with_twists(q, tree, places)
     rates, accelerations = q.gamma(1), q.gamma(2)
-    symbols, axes, row, rows = dict(zip(q.names, q, strict=True)), {}, 0, []
-    for body in tree.bodies:
+    symbols, axes, row = dict(zip(q.names, q, strict=True)), {}, 0
+    for i, body in enumerate(tree.bodies):
         if body.mimic is None:
             rows = range(row, row + (6 if body.motion == "free" else 1))
             row = rows.stop
-            position = ca.vertcat(*(symbols[name] for name in places[body.joint]))
-            rate, acceleration = (ca.vertcat(*(jet[i] for i in rows)) for jet in (rates, accelerations))
-            axes[body.joint] = Axis(body.motion, position, rate, acceleration, tuple((i, 1.0) for i in rows))
-    for body in tree.bodies:
+            position = ca.vertcat(*(symbols[name] for name in places[i]))
+            rate, acceleration = (ca.vertcat(*(jet[k] for k in rows)) for jet in (rates, accelerations))
+            axes[i] = Axis(body.motion, position, rate, acceleration, tuple((k, 1.0) for k in rows))
+    for i, body in enumerate(tree.bodies):
         if body.mimic is not None:
             source, factor, offset = body.mimic
-            axis, motion = axes[source], body.motion
-            rows = tuple((i, factor * f) for i, f in axis.rows)
+            axis, motion = axes[sources[source]], body.motion
+            rows = tuple((k, factor * f) for k, f in axis.rows)
             position, rate, acceleration = factor * axis.value + offset, factor * axis.rate, factor * axis.acceleration
-            axes[body.joint] = Axis(motion, position, rate, acceleration, rows)
-    return q, [axes[body.joint] for body in tree.bodies], joints
+            axes[i] = Axis(motion, position, rate, acceleration, rows)
+    return q, [axes[i] for i in range(len(axes))], joints
+
+
+def _names_of(base, body, free):
+    """Names of the coordinates, velocities and actuator of a body."""
+    if body.motion == "free":
+        return [f"{base}_{part}" for part in (*PLACE, *TWIST, "unit")]
+    return [base, actuator(base, body.joint), *((f"{base}_rate",) if free else ())]
+
+
+def actuator(name, joint):
+    """The name of the actuator of a joint, by its coordinate."""
+    return f"{'force' if joint.kind == 'prismatic' else 'torque'}_{name}"
+
+
+def scalars(q):
+    """Names of the scalars of the quaternions of free bodies."""
+    return tuple(f"{name.removesuffix('_unit')}_qw" for name in q.invariants)
+
+
+def some_posture(q, random):
+    """A random posture, (nq,); quaternions of free bodies are unit ones."""
+    return unit_quaternions(q, random.uniform(-1.0, 1.0, q.nq))
+
+
+def unit_quaternions(q, posture):
+    """A posture (nq,) whose quaternions of free bodies have length one."""
+    for name in scalars(q):
+        end = q.names.index(name) + 1
+        posture[end - 4 : end] /= np.linalg.norm(posture[end - 4 : end])
+    return posture
 
 
 def _with_twists(q, tree, places):
     """Coordinates of which free bodies have the velocities of their own axes, and joints their rates."""
     symbols, names, columns, invariants = dict(zip(q.names, q, strict=True)), [], [], {}
-    for body in tree.bodies:
-        if body.mimic is not None:
-            continue
-        own = places[body.joint]
+    for i, own in places.items():
+        body = tree.bodies[i]
         if body.motion != "free":
             names.append(f"{own[0]}_rate")
             columns.append({own[0]: 1.0})
@@ -79,21 +118,26 @@ def _with_twists(q, tree, places):
     return q.with_quasi_velocities(" ".join(names), V, invariants=invariants)
 
 
-def identifier(name, taken=()):
+def identifier(name, taken=(), names_of=lambda name: (name,)):
     """A name as a Python identifier that neither a coordinate nor a derivative of one has.
 
     Parameters
     ----------
     name : str
-    taken : sequence of str
+    taken : set of str
+    names_of : callable
+        Names that come with a name.
     """
-    plain = re.sub(r"\W", "_", name)
+    plain = re.sub(r"\W", "_", unicodedata.normalize("NFKC", name))
     plain = f"j_{plain}" if not plain.isidentifier() or keyword.iskeyword(plain) or plain in ARGUMENTS else plain
-    while plain in taken or any(_derives(a, b) for other in taken for a, b in ((plain, other), (other, plain))):
+    while any(_clashes(own, taken) for own in names_of(plain)):
         plain += "_"
     return plain
 
 
-def _derives(name, base):
-    """Whether a name is that of a derivative of another."""
-    return bool(re.fullmatch(rf"d[2-9]?{re.escape(base)}", name))
+def _clashes(name, taken):
+    """Whether a name is taken, or that of a derivative of a taken one, or one of its derivatives is."""
+    bases = re.fullmatch(r"d([2-9]?)(.+)", name)
+    related = {name, *(f"d{k}{name}" for k in ("", *range(2, 10)))}
+    related |= {bases[2], bases[1] + bases[2]} if bases else set()
+    return not related.isdisjoint(taken)

@@ -12,9 +12,11 @@ from servoctl.errors import SpecificationError, unknown
 from servoctl.robots.description import described
 from servoctl.robots.dynamics import Kinematics, inverse_dynamics, kinetic_energy, mass_matrix, potential_energy
 from servoctl.robots.inertia import require_possible, with_symbols
-from servoctl.robots.joints import ONE_AXIS, axes_of
-from servoctl.robots.tree import tree, with_followers
+from servoctl.robots.joints import actuator, axes_of, scalars
+from servoctl.robots.tree import ONE_AXIS, tree, with_followers
 from servoctl.spec.mechanism import Mechanism
+
+UNIT = 1e-6  # largest difference of a quaternion's length from one: numbers of a file or a table with seven digits
 
 
 @dataclass(frozen=True)
@@ -67,11 +69,11 @@ class Robot:
     """
 
     def __init__(self, description, tree, gravity, parameters):
-        self._description, self._tree, self._gravity = description, tree, gravity
+        self._tree, self._gravity = tree, gravity
         self.name, self.parameters, self.links = description.name, parameters, tuple(tree.places)
-        self.q, self._axes, self.joints = axes_of(description, tree)
-        moving = {name: description.joints.get(joint) for name, joint in self.joints.items()}
-        self._moving = moving = {name: j for name, j in moving.items() if j is not None and j.kind in ONE_AXIS}
+        self.q, self._axes, joints = axes_of(description, tree, parameters.names)
+        self.joints = {name: joint.name for name, joint in joints.items()}
+        self._moving = moving = {name: joint for name, joint in joints.items() if joint.kind in ONE_AXIS}
         self.effort = {actuator(name, j): j.effort for name, j in moving.items() if math.isfinite(j.effort)}
         self.velocity = {name: j.velocity for name, j in moving.items() if math.isfinite(j.velocity)}
         self.position = {
@@ -113,14 +115,19 @@ class Robot:
 
         Raises
         ------
+        SpecificationError
+            If a quaternion has not the length one.
         NameUnknown
             If one is no coordinate.
         """
-        upright = () if self.q.plain else tuple(name for name in self.q.names if name.endswith("_qw"))
-        numbers = {name: 1.0 if name in upright else 0.0 for name in self.q.names}
+        numbers = {name: 1.0 if name in scalars(self.q) else 0.0 for name in self.q.names}
         for name, value in mapping(at, "The posture").items():
             numbers[named(name, self.q.names, "coordinate")] = finite(name, value, "coordinate")
-        return np.array(list(numbers.values()))
+        posture = np.array(list(numbers.values()))
+        for name in scalars(self.q):
+            end = self.q.names.index(name) + 1
+            posture[end - 4 : end] = _unit(self.q.names[end - 4 : end], posture[end - 4 : end])
+        return posture
 
     def at(self, posture, link):
         """Position (3,) [m] and rotation (3, 3) of a link in a posture, with the parameters' defaults.
@@ -245,7 +252,7 @@ class Robot:
             raise SpecificationError(f"friction={speed:g} is given.", "It is a speed, at least zero.", "0.")
         rows = ca.SX.zeros(self.q.n)
         for axis, body in zip(self._axes, self._tree.bodies, strict=True):
-            joint = self._description.joints.get(body.joint)
+            joint = body.joint
             if joint is None or joint.kind not in ONE_AXIS:
                 continue
             (row, factor), rate = axis.rows[0], axis.rate[0]
@@ -309,9 +316,21 @@ def urdf(source, base="fixed", lock=None, symbolic=(), gravity=9.81) -> Robot:
     return Robot(description, bodies, _field(gravity), parameters)
 
 
-def actuator(name, joint):
-    """The name of the actuator of a joint, by its coordinate."""
-    return f"{'force' if joint.kind == 'prismatic' else 'torque'}_{name}"
+def _unit(names, quaternion):
+    """A quaternion without its rounding; one that is no rotation is refused."""
+    length = float(np.linalg.norm(quaternion))
+    if abs(length - 1.0) > UNIT:
+        unit = quaternion / length if length else np.array([0.0, 0.0, 0.0, 1.0])
+        raise SpecificationError(
+            f"The quaternion {', '.join(f'{n}={v:g}' for n, v in zip(names, quaternion, strict=True))} has the length "
+            f"{length:g}.",
+            "Its length is one; the scalar is one where it is not given.",
+            f"{', '.join(f'{n}={v:.9g}' for n, v in zip(names, unit, strict=True))}.",
+            do="Give all four entries.",
+            length=length,
+            unit=unit.tolist(),
+        )
+    return quaternion / length
 
 
 def _field(gravity):

@@ -5,7 +5,9 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from servoctl.errors import SpecificationError, unknown
-from servoctl.robots.description import Inertial, without_rounding
+from servoctl.robots.description import Inertial, Joint, without_rounding
+
+ONE_AXIS = ("revolute", "continuous", "prismatic")  # kinds of joints with one position
 
 
 @dataclass(frozen=True)
@@ -26,16 +28,22 @@ class Placement:
 class Body:
     """A moving body: its parent (a position in the tree, or None for the ground), its joint, and its inertia.
 
-    Its frame has the joint's axis as z, in which it turns ("turn") or slides ("slide"), or is free ("free").
+    Its frame has the joint's axis as z, in which it turns ("turn") or slides ("slide"), or is free ("free"). A planar
+    joint has three bodies, a free base no joint. Coordinates are named by `label`.
     """
 
     name: str
-    joint: str
+    label: str
+    joint: Joint | None
     motion: str
     parent: int | None
     placement: Placement
-    inertial: Inertial
-    mimic: tuple[str, float, float] | None = None
+    inertial: Inertial = field(default_factory=Inertial)
+
+    @property
+    def mimic(self):
+        """The joint that moves it, multiplier and offset; None where it moves by itself."""
+        return self.joint.mimic if self.joint else None
 
 
 @dataclass(frozen=True)
@@ -62,16 +70,11 @@ def tree(description, base, lock, inertials):
     ------
     SpecificationError
         If links have no root, several, or form a loop.
-    NameUnknown
-        If a locked joint does not exist.
     """
-    for name in lock:
-        if name not in description.joints:
-            raise unknown(name, description.joints, "joint")
     bodies, places = [], {}
     root = _root_link(description)
     if base == "free":
-        bodies.append(Body(root, "base", "free", None, Placement(), Inertial()))
+        bodies.append(Body(root, "base", None, "free", None, Placement()))
     children = {}
     for joint in description.joints.values():
         children.setdefault(joint.parent, []).append(joint)
@@ -94,8 +97,20 @@ def with_followers(description, lock):
     Raises
     ------
     SpecificationError
-        If joints mimic each other, or one that has several positions.
+        If a joint is locked that is fixed, or joints mimic each other, or one that has several positions.
+    NameUnknown
+        If a locked joint does not exist.
     """
+    for name in lock:
+        if name not in description.joints:
+            raise unknown(name, description.joints, "joint")
+        if description.joints[name].kind not in ONE_AXIS:
+            raise SpecificationError(
+                f"The {description.joints[name].kind} joint {name!r} is locked at {lock[name]:g}.",
+                f"Joints with one position can be locked: {', '.join(ONE_AXIS)}.",
+                do='Leave it out of lock, or place its link by type="fixed" and <origin> in the file.',
+                joint=name,
+            )
     joints, locked = dict(description.joints), dict(lock)
     for name, joint in description.joints.items():
         if joint.mimic is None or name in lock:
@@ -168,19 +183,17 @@ def _beyond(joint, body, placement, lock, bodies):
     if joint.kind == "fixed" or joint.name in lock:
         return body, placement @ _fixed_at(joint, lock.get(joint.name, 0.0))
     if joint.kind == "floating":
-        bodies.append(Body(joint.child, joint.name, "free", body, placement, Inertial()))
+        bodies.append(Body(joint.child, joint.name, joint, "free", body, placement))
         return len(bodies) - 1, Placement()
     frame = _with_axis_z(joint.axis)
     if joint.kind != "planar":
         motion = "slide" if joint.kind == "prismatic" else "turn"
-        bodies.append(
-            Body(joint.child, joint.name, motion, body, placement @ Placement(frame), Inertial(), joint.mimic)
-        )
+        bodies.append(Body(joint.child, joint.name, joint, motion, body, placement @ Placement(frame)))
         return len(bodies) - 1, Placement(frame.T)
     placement = placement @ Placement(frame)
     for name, motion in (("x", "slide"), ("y", "slide"), ("angle", "turn")):
         placement = placement @ Placement(CYCLE)
-        bodies.append(Body(joint.child, f"{joint.name}_{name}", motion, body, placement, Inertial()))
+        bodies.append(Body(joint.child, f"{joint.name}_{name}", joint, motion, body, placement))
         body, placement = len(bodies) - 1, Placement()
     return body, Placement(frame.T)
 
@@ -192,13 +205,6 @@ def _fixed_at(joint, position):
     """The placement of a joint's child at a position."""
     if joint.kind == "fixed":
         return Placement()
-    if joint.kind in ("floating", "planar"):
-        raise SpecificationError(
-            f"The {joint.kind} joint {joint.name!r} is locked at {position!r}.",
-            "Joints with one position can be locked.",
-            do='Write type="fixed" in the file.',
-            joint=joint.name,
-        )
     if joint.kind == "prismatic":
         return Placement(offset=position * joint.axis)
     frame = _with_axis_z(joint.axis)

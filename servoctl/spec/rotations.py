@@ -44,7 +44,7 @@ def turn(angle, axis, start=None):
         raise SpecificationError(
             f"The axis of the turn is {axis.tolist()}.", "It has three numbers, not all zero.", axis=axis.tolist()
         )
-    return _about(axis / np.linalg.norm(axis), angle) @ (ca.SX.eye(3) if start is None else _rotation(start, "start"))
+    return _about(axis / np.linalg.norm(axis), angle) @ (ca.SX.eye(3) if start is None else as_rotation(start, "start"))
 
 
 def slerp(s, start, end):
@@ -99,6 +99,8 @@ def spline(t, times, rotations, smoothness=2, ends="rest"):
         If one is no rotation, or is half a turn or more from the middle one.
     """
     rotations = [_matrix_of_numbers(rotation, f"rotations[{i}]") for i, rotation in enumerate(rotations)]
+    if not rotations:
+        raise SpecificationError("No rotation is given.", "A spline passes through two at least.")
     middle = rotations[len(rotations) // 2]
     vectors = []
     for i, rotation in enumerate(rotations):
@@ -134,9 +136,35 @@ def vector(rotation):
     -------
     (3,) SX
     """
-    rotation = _rotation(rotation, "the rotation")
+    rotation = as_rotation(rotation, "the rotation")
     skew = rotation - rotation.T
     return 2 * ca.vertcat(skew[2, 1], skew[0, 2], skew[1, 0]) / (1 + ca.trace(rotation))
+
+
+def as_rotation(value, what):
+    """A rotation matrix, of which one of numbers is verified.
+
+    Parameters
+    ----------
+    value : (3, 3) SX or array
+    what : str
+        What it is, for errors.
+
+    Returns
+    -------
+    (3, 3) SX
+
+    Raises
+    ------
+    SpecificationError
+        If it has another shape, or numbers that are no rotation.
+    """
+    value = matrix(value, what)
+    if value.shape != (3, 3):
+        raise SpecificationError(f"{what} has the shape {value.shape}.", "A rotation is (3, 3).", shape=value.shape)
+    if value.is_constant():
+        _matrix_of_numbers(np.array(ca.evalf(value)), what)
+    return value
 
 
 def _about(axis, angle):
@@ -157,13 +185,6 @@ def _axis_and_angle(rotation, what="start and end"):
             angle=angle,
         )
     return (skew / np.linalg.norm(skew) if skew.any() else np.array([0.0, 0.0, 1.0])), angle
-
-
-def _rotation(value, what):
-    value = matrix(value, what)
-    if value.shape != (3, 3):
-        raise SpecificationError(f"{what} has the shape {value.shape}.", "A rotation is (3, 3).", shape=value.shape)
-    return value
 
 
 def _matrix_of_numbers(value, what):
