@@ -72,6 +72,7 @@ class Robot:
         self._tree, self._gravity = tree, gravity
         self.name, self.parameters, self.links = description.name, parameters, tuple(tree.places)
         self.q, self._axes, joints = axes_of(description, tree, parameters.names)
+        self._all_joints = tuple(description.joints.values())
         self.joints = {name: joint.name for name, joint in joints.items()}
         self._moving = moving = {name: joint for name, joint in joints.items() if joint.kind in ONE_AXIS}
         self.effort = {actuator(name, j): j.effort for name, j in moving.items() if math.isfinite(j.effort)}
@@ -206,7 +207,7 @@ class Robot:
     def _lines(self):
         """Each link as a line from the frame of the link that carries it to its own."""
         ends = {name: self._position(*place) for name, place in self._tree.places.items()}
-        joints = [joint for joint in self._description.joints.values() if {joint.parent, joint.child} <= set(ends)]
+        joints = [joint for joint in self._all_joints if {joint.parent, joint.child} <= set(ends)]
         return {joint.child: [ends[joint.parent], ends[joint.child]] for joint in joints}
 
     def _position(self, body, placement):
