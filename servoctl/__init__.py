@@ -101,6 +101,7 @@ HOMES = {  # of each public name: the module that defines it, or that it is; imp
     "rotations": "spec.rotations",
     "sampled_bound": "methods.stability",
     "sensitivity": "sensitivities.sensitivity",
+    "shapes": "spec.shapes",
     "simulate": "simulation",
     "simulate_many": "study.many",
     "spec": "spec",

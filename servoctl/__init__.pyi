@@ -71,6 +71,7 @@ from servoctl.sensitivities.sensitivity import sensitivity as sensitivity
 from servoctl.simulation import simulate as simulate
 from servoctl.spec import paths as paths
 from servoctl.spec import rotations as rotations
+from servoctl.spec import shapes as shapes
 from servoctl.spec.bodies import body_rates as body_rates
 from servoctl.spec.bodies import particle as particle
 from servoctl.spec.bodies import rigid_body as rigid_body

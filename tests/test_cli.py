@@ -3,12 +3,12 @@
 import json
 import os
 import platform
+import re
 import shutil
 import subprocess
 import sys
 import warnings
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -40,6 +40,7 @@ def scene():
 '''
 
 
+LARGEST_PAGE = 2_000_000  # bytes
 pytestmark = pytest.mark.usefixtures("here")
 
 
@@ -66,7 +67,7 @@ def summary(folder):
 def test_run_leaves_numbers_figures_and_the_report(here, capsys):
     assert main(["run", "overhead-crane"]) == 0
     folder = here / "servoctl-runs" / "overhead-crane"
-    assert {f.name for f in folder.iterdir()} == {*FILES, *LOOP_FILES}
+    assert {f.name for f in folder.iterdir()} == {*FILES, *LOOP_FILES} - {"path.png"}
     printed = capsys.readouterr().out
     report = (folder / "report.txt").read_text(encoding="utf-8")
     assert printed.startswith(report)
@@ -92,6 +93,22 @@ def test_run_leaves_numbers_figures_and_the_report(here, capsys):
     assert facts["versions"]["servoctl"] == servoctl.__version__
     assert facts["versions"]["python"] == platform.python_version()
     assert set(facts["versions"]) == {"servoctl", "casadi", "numpy", "scipy", "python"}
+
+    page = (folder / "index.html").read_text(encoding="utf-8")
+    pictures = ["motion.png", "coordinates.png", "actuation.png", "closed_loop.png", "residuals.png"]
+    assert re.findall('alt="([^"]+)" src="data:image/png;base64,', page) == pictures  # all inside, nothing elsewhere
+    assert page.count("src=") == len(pictures) and not re.search("href|https?://|url\\(", page)
+    assert len(page) < LARGEST_PAGE
+    for value in ("-137.992", "1041.23", "servoctl run overhead-crane --animate", "Verification: passed", "within", "lqr"):
+        assert value in page
+    assert re.search(r"<td>hoist</td>(<td class=n>[^<]+</td>){4}<td>N</td>", page)
+    assert "<td>index</td><td>5</td>" in page
+    assert "beyond" not in page
+    model = servoctl.derive(*gallery["overhead-crane"].build())
+    verification = servoctl.verify(model, servoctl.load(folder / "run.npz", model))
+    for name in verification.numbers:
+        limit = verification.limits[name]
+        assert re.search(rf"<td>{name}</td><td class=n>[^<]+</td><td class=n>{limit:.6g}</td>", page)
 
 
 def test_a_plan_with_unstable_internal_dynamics_is_kept_and_fails(here, capsys):
@@ -164,11 +181,31 @@ def test_a_motion_that_stops_is_kept_drawn_and_explained(here, capsys):
     assert "SingularProgram: The program is singular at t = 0.698" in words(out) and "'speed'" in out
     assert "Verification: left out" in out
     assert "ended early, at t = 0.698" in err
-    assert {f.name for f in (here / "squared").iterdir()} == set(FILES)
+    assert {f.name for f in (here / "squared").iterdir()} == set(FILES) - {"path.png"}
     run = servoctl.load(here / "squared" / "run.npz")
     assert not run.success and 0.69 < run.t[-1] < 0.7
     assert summary(here / "squared")["status"] == -1
     assert "SingularProgram" in (here / "squared" / "report.txt").read_text(encoding="utf-8")
+
+
+def test_the_page_holds_the_animation(here, fall):
+    assert main(["run", fall, "--t-span", "0", "0.2", "--animate", "--no-verify", "--machine", "m=2.5"]) == 0
+    folder = here / "servoctl-runs" / "fall"
+    page = (folder / "index.html").read_text(encoding="utf-8")
+    assert (folder / "motion.gif").read_bytes()[:6] == b"GIF89a"
+    assert re.findall('alt="([^"]+)" src="data:image/(gif|png)', page)[0] == ("motion.gif", "gif")
+    assert "not verified" in page and "on a machine with m = 2.5" in page and len(page) < LARGEST_PAGE
+    assert main(["run", fall, "--t-span", "0", "0.2", "--no-verify", "--no-figures"]) == 0
+    assert not (folder / "motion.gif").exists() and "<img" not in (folder / "index.html").read_text(encoding="utf-8")
+
+
+def test_a_mechanism_that_cannot_be_drawn_has_a_page_without_it(here, capsys):
+    text = FALL.replace("x y", "a b").replace('"y"', '"b"')
+    (here / "turn.py").write_text(text.replace('"dy"', '"db"').replace('"x": "m", "b": "m"', '"a": "rad"'))
+    assert main(["run", "turn.py", "--animate", "--no-verify", "--no-loop"]) == 0
+    assert "There is no animation" in capsys.readouterr().err
+    names = {f.name for f in (here / "servoctl-runs" / "turn").iterdir()}
+    assert names.isdisjoint({"motion.gif", "motion.png", "path.png"}) and "index.html" in names
 
 
 # --- a user's file
@@ -177,7 +214,7 @@ def test_a_motion_that_stops_is_kept_drawn_and_explained(here, capsys):
 def test_run_of_a_users_file(here, fall, capsys):
     assert main(["run", fall, "--set", "m=3", "--hold", "dy=1.5", "--no-figures"]) == 0
     folder = here / "servoctl-runs" / "fall"
-    assert {f.name for f in folder.iterdir()} == {"run.npz", "closed_loop.npz", "summary.json", "report.txt"}
+    assert {f.name for f in folder.iterdir()} == {"index.html", "run.npz", "closed_loop.npz", "summary.json", "report.txt"}
     facts = summary(folder)
     assert facts["scene"]["description"] == "A mass in a plane follows a path in x, and falls."
     assert facts["parameters"] == {"m": 3.0, "g": 9.81}
@@ -306,7 +343,7 @@ def test_a_folder_that_is_lost_while_computing_loses_nothing(here, fall, capsys,
     monkeypatch.setattr(servoctl, when, losing)
     assert main(["run", fall, "--out", "lost", "--no-figures"]) == 1
     (kept,) = (here / "temporary").iterdir()
-    assert {f.name for f in kept.iterdir()} == {"run.npz", "closed_loop.npz", "summary.json", "report.txt"}
+    assert {f.name for f in kept.iterdir()} == {"index.html", "run.npz", "closed_loop.npz", "summary.json", "report.txt"}
     assert f"it is written to {kept} instead" in words(capsys.readouterr().err)
     assert servoctl.load(kept / "run.npz").success
 
@@ -327,7 +364,7 @@ def test_files_of_an_earlier_run_are_replaced_and_others_kept(here, fall):
     (here / "kept" / "notes.md").write_text("mine")
     assert main(["run", fall, "--out", "kept", "--no-verify", "--no-figures"]) == 0
     assert {f.name for f in (here / "kept").iterdir()} == {
-        "run.npz", "closed_loop.npz", "summary.json", "report.txt", "notes.md"
+        "index.html", "run.npz", "closed_loop.npz", "summary.json", "report.txt", "notes.md"
     }  # fmt: skip
 
 
@@ -409,7 +446,7 @@ def test_an_interrupted_verification_keeps_the_run(here, fall, capsys, monkeypat
 
 
 def test_a_failed_verification_is_seen_in_the_exit_code(here, fall, monkeypatch):
-    failed = SimpleNamespace(verdict="failed", passed=False, numbers={"acceleration": float("nan")})
+    failed = servoctl.Verification({"acceleration": float("nan")}, ("acceleration",), limits={"acceleration": 1e-6})
     monkeypatch.setattr(servoctl, "verify", lambda *_: failed)
     assert main(["run", fall, "--no-figures"]) == 1
     verification = summary(here / "servoctl-runs" / "fall")["verification"]
@@ -417,10 +454,11 @@ def test_a_failed_verification_is_seen_in_the_exit_code(here, fall, monkeypatch)
 
 
 def test_an_inconclusive_verification_has_an_exit_code_of_its_own(here, fall, monkeypatch):
-    doubtful = SimpleNamespace(verdict="inconclusive", passed=False, numbers={})
+    doubtful = servoctl.Verification({}, doubts=("No sample was checked.",))
     monkeypatch.setattr(servoctl, "verify", lambda *_: doubtful)
     assert main(["run", fall, "--no-figures"]) == 3
     assert summary(here / "servoctl-runs" / "fall")["verification"]["verdict"] == "inconclusive"
+    assert "No sample was checked." in (here / "servoctl-runs" / "fall" / "index.html").read_text(encoding="utf-8")
 
 
 # --- the other commands
@@ -474,6 +512,7 @@ def test_a_terminal_without_greek_letters(here, fall, monkeypatch):
 def test_a_reader_that_leaves_does_not_end_the_computation(here, fall):
     process("sh", "-c", f"{sys.executable} -m servoctl run {fall} --no-verify --no-figures | true")
     assert {f.name for f in (here / "servoctl-runs" / "fall").iterdir()} == {
+        "index.html",
         "run.npz",
         "closed_loop.npz",
         "summary.json",

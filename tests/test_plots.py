@@ -285,7 +285,7 @@ def test_figures_without_actuation_and_residuals(tmp_path):
 def test_a_run_of_one_sample_is_drawn(tmp_path):
     signals, rows = {"f": np.ones(1)}, {"X": np.zeros((2, 1))}
     run = Run(np.zeros(1), np.ones((2, 1)), ("x", "dx"), success=False, status=-1, stored=signals, stored_residual=rows)
-    assert len(plots.save_figures(run, tmp_path)) == 4
+    assert len(plots.save_figures(run, tmp_path)) == 3  # x alone is no path
 
 
 def test_a_folder_that_cannot_be_written(run, tmp_path):

@@ -37,8 +37,13 @@ def _antiderivative(name, names):
 def planes(run):
     """Groups of names of axes such as (X, Z) or (tip_x, tip_y): capitals first, outputs before coordinates."""
     outputs = list(run.model.outputs) if run.model is not None else []
+    return planes_of([*outputs, *coordinates(run)])
+
+
+def planes_of(names):
+    """Those of some names that are axes of a plane or of space, by point."""
     groups = {}
-    for name in [*outputs, *coordinates(run)]:
+    for name in names:
         match = re.fullmatch(r"(.*_)?([xyzXYZ])(_.*|\d*)", name)
         if match:
             groups.setdefault((match[2].islower(), match[1], match[3]), []).append(name)

@@ -23,6 +23,7 @@ from servoctl.figures.style import (
     write_png,
 )
 from servoctl.run import Run
+from servoctl.spec.shapes import heights
 
 SOURCE = "sv.simulate(...) or sv.load(path)"
 LEAST = 1e-18  # residual drawn for exact zeros on the logarithmic scale
@@ -41,7 +42,8 @@ def path(run, x=None, y=None, ax=None, units=None):
     x, y : str, optional
         Names of signals. Default: two of x, y, z (or X, Y, Z, preferred) with the same prefix and suffix, such as
         "x" and "z" or "tip_x" and "tip_y", among outputs and coordinates; else the first two coordinates. A single
-        coordinate, or coordinates along one axis, such as "x1" and "x2", are drawn over time.
+        coordinate, or coordinates along one axis, such as "x1" and "x2", are drawn over time. Of three axes the
+        vertical one is drawn, where the balance at rest shows which that is; an axis that measures depth points down.
     ax : Axes, optional
     units : dict of str to str, optional
         Signals of the same unit have equal scales if both remain visible.
@@ -60,6 +62,8 @@ def path(run, x=None, y=None, ax=None, units=None):
     if x is None and y is None and not groups and along_one_axis(names):
         return signals(run, names, ax=as_single_axes(ax, 4.2), units=units)
     first, second, *_ = groups[0] if groups else dict.fromkeys([*names, *run.names])
+    if x is None and y is None and groups:
+        first, second = _upright(run, groups[0])
     across, up = (None if name is None else run[name] for name in (x, y))
     x = (first if y != first else second) if x is None else x
     y = (second if x != second else first) if y is None else y
@@ -73,9 +77,29 @@ def path(run, x=None, y=None, ax=None, units=None):
     spans = sorted(float(np.ptp(v[np.isfinite(v)])) if np.isfinite(v).any() else 0.0 for v in (across, up))
     if unit_of(x, units) and unit_of(x, units) == unit_of(y, units) and spans[1] <= 5 * spans[0]:
         ax.set_aspect("equal", adjustable="datalim")
+    if _height(run, [x, y])[1] < 0:
+        ax.invert_yaxis()
     ax.grid(alpha=0.3)
     ax.legend()
     return ax
+
+
+def _height(run, names):
+    """For each signal 1 if it measures height, -1 if depth, 0 if neither is certain or it is no position."""
+    own = () if run.model is None else (*run.model.reduction.mechanism.q.names, *run.model.outputs)
+    if not len(run.t) or not set(names) <= set(own):
+        return [0] * len(names)
+    model = run.model
+    return heights(model.reduction.mechanism, names, run.t, run.jets[: model.nq], model.parameters)
+
+
+def _upright(run, names):
+    """Two of the names of a point's axes: the vertical one last, if there is one."""
+    vertical = [name for name, sign in zip(names, _height(run, names), strict=True) if sign]
+    if len(names) < 3 or not vertical:
+        return names[:2]
+    level = [name for name in names if name not in vertical]
+    return max(level, key=lambda name: np.ptp(run[name])), vertical[0]
 
 
 def signals(run, *names, ax=None, units=None):
@@ -198,7 +222,8 @@ def save_figures(run, folder, units=None, title=""):
     Returns
     -------
     list of Path
-        The files; without actuation.png or residuals.png if the run has no actuation or no residuals.
+        The files; without path.png, actuation.png or residuals.png if the run has no positions in a plane, no
+        actuation, or no residuals.
 
     Raises
     ------
@@ -207,11 +232,18 @@ def save_figures(run, folder, units=None, title=""):
     """
     require_kind(Run, "run", run, SOURCE)
     text("title", title)
-    drawn = {"path": path(run, units=units), "coordinates": signals(run, units=units)}
+    return write_figures(run, folder, units, title)
+
+
+def write_figures(run, folder, units, title, left_out=()):
+    """As `save_figures`, but for the figures of some names."""
+    drawn = {"path": path} if planes(run) else {}
+    drawn |= {"coordinates": signals}
     if efforts(run):
-        drawn["actuation"] = actuation(run, units=units)
+        drawn["actuation"] = actuation
     if len(run.residual):
-        drawn["residuals"] = residuals(run)
+        drawn["residuals"] = lambda run, units: residuals(run)
+    drawn = {name: draw(run, units=units) for name, draw in drawn.items() if name not in left_out}
     files = []
     with writing(folder, "figures", folder=True) as folder:
         for name, axes in drawn.items():

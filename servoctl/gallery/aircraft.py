@@ -54,6 +54,18 @@ def vtol(point="flat"):
             "u1": ca.vertcat(along + ca.sin(p.tilt) * across, arm),
             "u2": ca.vertcat(along - ca.sin(p.tilt) * across, -arm),
         },
+        shapes={
+            "wings": [ca.vertcat(x, z) + side * p.l * across + p.h * along for side in (-1, 0, 1)],
+            "left thruster": _thruster(ca.vertcat(x, z) - p.l * across + p.h * along, along, across, p.tilt),
+            "right thruster": _thruster(ca.vertcat(x, z) + p.l * across + p.h * along, along, -across, p.tilt),
+            "fuselage": sv.shapes.box((x, z), 0.5, 0.3, theta),
+            "followed": [followed],
+        },
         parameters=p,
     )
     return mechanism, sv.Program({"X": followed[0] - path[0], "Z": followed[1] - path[1]}, by="actuators")
+
+
+def _thruster(tip, along, across, tilt):
+    """A line from a wing tip along its thrust."""
+    return [tip, tip - 0.3 * (ca.cos(tilt) * along + ca.sin(tilt) * across)]

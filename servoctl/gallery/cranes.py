@@ -46,7 +46,8 @@ def overhead_crane(duration=6.0, coordinates="relative"):
         hung = _roped(ca.vertcat(x, 0), l, ca.vertcat(X, Z))
     machine = sv.particle(q, p.m_trolley, x) + sv.particle(q, p.m_hoist, l)
     path = sv.paths.rest_to_rest(q.t, start=(0.0, 4.0), end=(5.0, 2.0), duration=duration, smoothness=4)
-    return _following(q, p, machine, hung, {"trolley": x, "hoist": l}, path)
+    shapes = _plane_shapes(x, hung[0], (-0.5, 5.5))
+    return _following(q, p, machine, hung, {"trolley": x, "hoist": l}, path, shapes)
 
 
 def winch_crane(coordinates="relative"):
@@ -79,7 +80,8 @@ def winch_crane(coordinates="relative"):
         hung = _roped(ca.vertcat(x, 0), p.r * beta, ca.vertcat(X, Z))
     machine = sv.particle(q, p.m_trolley, x) + sv.particle(q, p.J, beta)
     path = sv.paths.rest_to_rest(q.t, start=(0.0, 4.0), end=(1.0, 5.0), duration=6.0, smoothness=6)
-    return _following(q, p, machine, hung, {"trolley": x, "winch": beta}, path)
+    shapes = {"drum": sv.shapes.disc((x, 0), 2 * p.r, beta)} | _plane_shapes(x, hung[0], (-1.5, 2.5))
+    return _following(q, p, machine, hung, {"trolley": x, "winch": beta}, path, shapes)
 
 
 def crane_3d(coordinates="relative"):
@@ -116,7 +118,16 @@ def crane_3d(coordinates="relative"):
     s = sv.paths.rest_to_rest(q.t, 0.0, 1.0, duration=6.0, smoothness=6)
     turn = sv.paths.circle(pi / 2 * (s - 1), centre=(0.0, 3.0), radius=3.0)
     path = ca.vertcat(turn, sv.paths.line(s, 5.0, 3.0))
-    return _following(q, p, machine, hung, {"bridge": x, "trolley": y, "hoist": l}, path)
+    (X, Y, Z), low, high = ca.vertsplit(hung[0]), -0.5, 3.5
+    shapes = {
+        "left rail": [(low, low, 0), (high, low, 0)],
+        "right rail": [(low, high, 0), (high, high, 0)],
+        "bridge": [(x, low, 0), (x, high, 0)],
+        "trolley": [(x, y, 0)],
+        "rope": [(x, y, 0), (X, Y, -Z)],
+        "load": [(X, Y, -Z)],
+    }
+    return _following(q, p, machine, hung, {"bridge": x, "trolley": y, "hoist": l}, path, shapes)
 
 
 def _relative(coordinates):
@@ -136,7 +147,18 @@ def _roped(trolley, length, load):
     return load, offset / length, {"rope": ca.dot(offset, offset) - length**2}
 
 
-def _following(q, p, machine, hung, actuators, path):
+def _plane_shapes(x, load, rail):
+    """Rail, trolley, rope and load of a crane in a plane; its load's second coordinate points down."""
+    load = ca.vertcat(load[0], -load[1])
+    return {
+        "rail": [(end, 0) for end in rail],
+        "trolley": sv.shapes.box((x, 0), 0.6, 0.2),
+        "rope": [(x, 0), load],
+        "load": [load],
+    }
+
+
+def _following(q, p, machine, hung, actuators, path, shapes):
     """The crane whose load, as `_hanging` or `_roped` give it, follows a path; the last axis points down."""
     load, rope, constraints = hung
     weight = p.m_load * p.g
@@ -150,6 +172,7 @@ def _following(q, p, machine, hung, actuators, path):
         actuators=actuators,
         constraints=constraints,
         outputs={"tension": tension} | positions,
+        shapes=shapes,
         parameters=p,
     )
     return mechanism, sv.Program({name: load[i] - path[i] for i, name in enumerate(axes)}, by="actuators")

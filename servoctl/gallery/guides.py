@@ -55,6 +55,13 @@ def mass_on_car(alpha=pi / 4, damping=1.0, coordinates="relative"):
         forces=-p.d * q.dt(s) * ca.gradient(s, ca.vertcat(*q)),
         actuators={"force": x},
         constraints=constraints,
+        shapes={
+            "rail": [(-1.0, 0.0), (4.0, 0.0)],
+            "car": sv.shapes.box((x, 0), 0.5, 0.2),
+            "guide": [(x - 0.9 * cosine, -0.9 * sine), (x + 0.9 * cosine, 0.9 * sine)],
+            "spring": sv.shapes.spring((x, 0), mass, 0.1),
+            "mass": [mass],
+        },
         parameters=p,
     )
     return mechanism, sv.Program({"z": mass[0] - path}, by="actuators")

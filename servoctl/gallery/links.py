@@ -69,6 +69,11 @@ def planar_arm(n=3, coordinates="joints", acceleration=(0.0, 0.0)):
         potential=p.m * p.g * height,
         constraints=constraints,
         outputs={"X": joint[0], "Y": joint[1]},
+        shapes={
+            "base": [(0, 0)],
+            "links": [centres[0] - halves[0], *(c + half for c, half in zip(centres, halves, strict=True))],
+            "end": [joint],
+        },
         parameters=p,
     )
     residuals = {name: a - target for name, a, target in zip("XY", end, acceleration, strict=True)}
@@ -128,8 +133,18 @@ def spatial_arm(n=3, coordinates="joints"):
         centre, end = (joint + _about_joint(spin, turned, part * rod) for part in (0.5, 1.0))
         S += p.m * ca.sumsqr(centre) / 2 + ca.dot(turned, inertia * turned / 2 + ca.cross(spin, inertia * spin))
     forces = ca.jtimes(ca.vertcat(*twists), ca.vertcat(*rates), ca.vertcat(*wrenches), True)
-    mechanism = sv.Mechanism(q, gibbs=S, forces=forces, constraints=constraints, parameters=p)
+    shapes = _placed(angles, rod)
+    mechanism = sv.Mechanism(q, gibbs=S, forces=forces, constraints=constraints, shapes=shapes, parameters=p)
     return mechanism, sv.Program(dict(zip("XYZ", end.elements(), strict=True)), by="ideal")
+
+
+def _placed(angles, rod):
+    """The links of the spatial arm by their joints."""
+    axes, joints = ca.SX.eye(3), [ca.SX.zeros(3)]
+    for i, angle in enumerate(angles):
+        axes = axes @ _turn(angle, i % 2).T
+        joints.append(joints[-1] + axes @ rod)
+    return {"base": [(0, 0, 0)], "links": joints, "end": joints[-1:]}
 
 
 def _check(n, coordinates, least):

@@ -50,6 +50,20 @@ def appell_hamel(form="linear"):
         raise unknown(form, ("linear", "squared"), "form of the program")
 
     mechanism = sv.Mechanism(
-        q, gibbs=S, potential=-p.m * p.g * z, outputs={"tension": p.m * (p.g - ddz)}, parameters=p
+        q, gibbs=S, potential=-p.m * p.g * z, outputs={"tension": p.m * (p.g - ddz)}, parameters=p,
+        shapes=_shapes(q, p),
     )  # fmt: skip
     return mechanism, sv.Program(rolling | {"string": z + p.b * phi}, by="ideal")  # (4.5)
+
+
+def _shapes(q, p):
+    """The wheel, whose axle is at height 0, the frame that trails it with a pulley, the string and its particle."""
+    x, y, z, phi, theta = q
+    ahead, pulley = ca.vertcat(ca.cos(theta), ca.sin(theta), 0), (x, y, 1.0)
+    centre = ca.vertcat(x, y, 0) - p.rho * ahead
+    return {
+        "wheel": sv.shapes.disc(centre, p.a, -phi, ((ca.cos(theta), ca.sin(theta), 0), (0, 0, 1))),
+        "frame": [centre, (x, y, 0), pulley],
+        "string": [pulley, (x, y, -z)],
+        "particle": [(x, y, -z)],
+    }

@@ -37,6 +37,7 @@ def constant_speed(realisation="ideal"):
         gibbs=sv.particle(q, p.m, ca.vertcat(x, y)),
         potential=p.m * p.g * y,
         actuators={"thrust": x},
+        shapes={"particle": [(x, y)]},
         parameters=p,
     )
     by = "ideal" if realisation == "ideal" else "actuators"

@@ -41,5 +41,6 @@ def spiral(order=3, c=None):
     dx, dy = q.d(1)
     ddx, ddy = q.d(2)
     curvature = (dx * ddy - dy * ddx) / (dx**2 + dy**2) ** 1.5  # 1/m
-    mechanism = sv.Mechanism(q, gibbs=sv.particle(q, p.m, ca.vertcat(x, y)), parameters=p)
+    S = sv.particle(q, p.m, ca.vertcat(x, y))
+    mechanism = sv.Mechanism(q, gibbs=S, shapes={"particle": [(x, y)]}, parameters=p)
     return mechanism, sv.Program({"curvature": q.dt(curvature, n) - p.c}, by="ideal")

@@ -51,6 +51,8 @@ def cars(N=2, masses=None, stiffnesses=None, gaps=None, by="actuators"):
         gibbs=sum(sv.particle(q, m[i], x[i]) for i in range(N)),
         potential=ca.dot(ca.vertcat(*k), stretch**2) / 2,
         actuators={"force": x[-1]},
+        shapes={f"spring {i}": sv.shapes.spring((x[i], 0), (x[i - 1], 0), 0.15) for i in range(1, N)}
+        | {f"car {i}": sv.shapes.box((x[i - 1], 0), 0.2, 0.15) for i in range(N, 0, -1)},
         parameters=p,
     )
     return mechanism, sv.Program({"car 1": x[0] - path}, by=by)

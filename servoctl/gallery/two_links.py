@@ -17,7 +17,7 @@ def two_link_arm():
     """
     p = sv.parameters(m1=4.0, m2=3.0, l1=0.6, l2=0.5, I1=0.12, I2=0.07, g=9.81)  # kg, kg, m, m, kg m^2, kg m^2, m/s^2
     q = sv.coordinates("q1 q2")  # rad from the horizontal, rad (relative)
-    end, S, height = _links(q, (p.m1, p.m2), (p.l1, p.l2), (p.I1, p.I2))
+    end, S, height, shapes = _links(q, (p.m1, p.m2), (p.l1, p.l2), (p.I1, p.I2))
     path = sv.paths.rest_to_rest(q.t, start=(0.6, 0.4), end=(0.2, 0.9), duration=2.0, smoothness=2)
     mechanism = sv.Mechanism(
         q,
@@ -25,6 +25,7 @@ def two_link_arm():
         potential=p.g * height,
         actuators=dict(zip(("shoulder", "elbow"), q, strict=True)),
         outputs={"X_end": end[0], "Y_end": end[1]},
+        shapes=shapes,
         parameters=p,
     )
     return mechanism, sv.Program({"X": end[0] - path[0], "Y": end[1] - path[1]}, by="actuators")
@@ -53,7 +54,7 @@ def pendubot(start=-90.0, end=0.0, duration=3.0, damping=0.05):
     p = sv.parameters(m1=4.0, m2=3.0, l1=0.6, l2=0.5, I1=0.12, I2=0.07, g=9.81, d=damping)
     q = sv.coordinates("q1 q2")  # rad from the horizontal, rad (relative)
     q1, _ = q
-    end_point, S, height = _links(q, (p.m1, p.m2), (p.l1, p.l2), (p.I1, p.I2))
+    end_point, S, height, shapes = _links(q, (p.m1, p.m2), (p.l1, p.l2), (p.I1, p.I2))
     degree = ca.pi / 180
     path = sv.paths.rest_to_rest(q.t, start * degree, end * degree, duration=duration, smoothness=2)
     mechanism = sv.Mechanism(
@@ -63,6 +64,7 @@ def pendubot(start=-90.0, end=0.0, duration=3.0, damping=0.05):
         forces={"q2": -p.d * q.d(1)[1]},
         actuators={"shoulder": q1},
         outputs={"X_end": end_point[0], "Y_end": end_point[1]},
+        shapes=shapes,
         parameters=p,
     )
     return mechanism, sv.Program({"angle": q1 - path}, by="actuators")
@@ -87,7 +89,7 @@ def passive_arm(Gamma=0.3):
     p = sv.parameters(m=1.0, l=1.0, I=1 / 12, c=10.0, d=1.0, Gamma=Gamma)  # kg, m, kg m^2, N m/rad, N m s/rad, 1
     q = sv.coordinates("q1 q2")  # rad, rad (relative)
     q1, q2 = q
-    _, S, _ = _links(q, (p.m, p.m), (p.l, p.l), (p.I, p.I))
+    _, S, _, shapes = _links(q, (p.m, p.m), (p.l, p.l), (p.I, p.I))
     path = sv.paths.rest_to_rest(q.t, 0.0, pi / 2, duration=2.0, smoothness=4)
     mechanism = sv.Mechanism(
         q,
@@ -95,13 +97,14 @@ def passive_arm(Gamma=0.3):
         potential=p.c * q2**2 / 2,
         forces={"q2": -p.d * q.d(1)[1]},
         actuators={"torque": q1},
+        shapes=shapes,
         parameters=p,
     )
     return mechanism, sv.Program({"angle": q1 + p.Gamma * q2 - path}, by="actuators")
 
 
 def _links(q, masses, lengths, inertias):
-    """Position of the end [m], the Gibbs function, and the sum of masses times heights [kg m]."""
+    """Position of the end [m], the Gibbs function, the sum of masses times heights [kg m], and shapes."""
     q1, q2 = q
     dq1, dq2 = q.d(1)
     (m1, m2), (l1, l2), (I1, I2) = masses, lengths, inertias
@@ -111,4 +114,5 @@ def _links(q, masses, lengths, inertias):
     middle = elbow + l2 / 2 * along[1]
     S = sv.rigid_body(q, m1, (0, 0, I1), position=elbow / 2, rates=(0, 0, dq1))
     S += sv.rigid_body(q, m2, (0, 0, I2), position=middle, rates=(0, 0, dq1 + dq2))
-    return end, S, m1 * elbow[1] / 2 + m2 * middle[1]
+    shapes = {"base": [(0, 0)], "first link": [(0, 0), elbow], "second link": [elbow, end], "end": [end]}
+    return end, S, m1 * elbow[1] / 2 + m2 * middle[1], shapes

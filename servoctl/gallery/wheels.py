@@ -30,6 +30,7 @@ def wheeled_robot(turn=90.0, speed=1.0, duration=4.0):
     psi = list(xy)[2]
     q = xy.with_quasi_velocities("v r", [[ca.cos(psi), 0], [ca.sin(psi), 0], [0, 1]])  # m/s, rad/s
     x, y, _ = q
+    centre, ahead, side = ca.vertcat(x, y), ca.vertcat(ca.cos(psi), ca.sin(psi)), ca.vertcat(-ca.sin(psi), ca.cos(psi))
     v, r = q.w()
 
     c = turn * ca.pi / 180 * 2 * ca.pi / (speed * duration**2)  # 1/(m s): heading change = c v T^2/(2π)
@@ -39,6 +40,12 @@ def wheeled_robot(turn=90.0, speed=1.0, duration=4.0):
         gibbs=sv.rigid_body(q, p.m, (0, 0, p.J), position=(x, y), rates=(0, 0, r)),
         actuators={"drive": (1, 0), "steer": (0, 1)},
         outputs={"curvature": r / v},
+        shapes={
+            "axle": [centre - 0.25 * side, centre + 0.25 * side],
+            "body": sv.shapes.box(centre + 0.2 * ahead, 0.6, 0.35, psi),
+            "heading": [centre, centre + 0.5 * ahead],
+            "centre": [centre],
+        },
         parameters=p,
     )
     return mechanism, sv.Program({"speed": v - p.speed, "clothoid": q.dt(r / v) - rate}, by="actuators")

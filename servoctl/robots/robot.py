@@ -72,6 +72,7 @@ class Robot:
         self._tree, self._gravity = tree, gravity
         self.name, self.parameters, self.links = description.name, parameters, tuple(tree.places)
         self.q, self._axes, joints = axes_of(description, tree, parameters.names)
+        self._all_joints = tuple(description.joints.values())
         self.joints = {name: joint.name for name, joint in joints.items()}
         self._moving = moving = {name: joint for name, joint in joints.items() if joint.kind in ONE_AXIS}
         self.effort = {actuator(name, j): j.effort for name, j in moving.items() if math.isfinite(j.effort)}
@@ -100,10 +101,9 @@ class Robot:
         if name not in self._tree.places:
             raise unknown(name, self.links, "link")
         body, placement = self._tree.places[name]
-        position, rotation = ca.SX(ca.DM(placement.offset)), ca.SX(ca.DM(placement.rotation))
+        position, rotation = self._position(body, placement), ca.SX(ca.DM(placement.rotation))
         if body is not None:
-            outer = self._kinematics.rotations[body]
-            position, rotation = self._kinematics.offsets[body] + outer @ position, outer @ rotation
+            rotation = self._kinematics.rotations[body] @ rotation
         return Frame(name, position, rotation, self._jacobian(body, position), self.q)
 
     def posture(self, at) -> np.ndarray:
@@ -157,6 +157,8 @@ class Robot:
     ) -> Mechanism:
         """The mechanism of the robot: its balance by the recursive Newton-Euler scheme, gravity and damping.
 
+        Figures show each link as a line from the frame of the link that carries it to its own.
+
         Parameters
         ----------
         constraints : dict of str to SX, optional
@@ -199,7 +201,20 @@ class Robot:
             forces={name: value for name, value in total.items() if not value.is_zero()} or None,
             constraints=constraints,
             outputs=outputs,
+            shapes=self._lines(),
         )
+
+    def _lines(self):
+        """Each link as a line from the frame of the link that carries it to its own."""
+        ends = {name: self._position(*place) for name, place in self._tree.places.items()}
+        joints = [joint for joint in self._all_joints if {joint.parent, joint.child} <= set(ends)]
+        return {joint.child: [ends[joint.parent], ends[joint.child]] for joint in joints}
+
+    def _position(self, body, placement):
+        """Position of a link on a body, (3,) SX [m]."""
+        offset = ca.SX(ca.DM(placement.offset))
+        moving = body is not None
+        return self._kinematics.offsets[body] + self._kinematics.rotations[body] @ offset if moving else offset
 
     @cached_property
     def _kinematics(self):

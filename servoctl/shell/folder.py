@@ -13,8 +13,12 @@ from servoctl.errors import ServoError
 from servoctl.shell.printing import complain
 from servoctl.study.table import machine
 
-FILES = ("run.npz", "summary.json", "report.txt", "path.png", "coordinates.png", "actuation.png", "residuals.png")
+FILES = (
+    "index.html", "run.npz", "summary.json", "report.txt", "motion.png", "path.png", "coordinates.png", "actuation.png",
+    "residuals.png",
+)  # fmt: skip
 LOOP_FILES = ("closed_loop.npz", "closed_loop.png")
+ANIMATION = "motion.gif"
 
 
 class Folder:
@@ -63,7 +67,7 @@ class Folder:
         """
         try:
             if not self._actions:
-                for name in (*FILES, *LOOP_FILES):
+                for name in (*FILES, *LOOP_FILES, ANIMATION):
                     (self.path / name).unlink(missing_ok=True)
             action(self.path)
         except (OSError, ServoError) as error:

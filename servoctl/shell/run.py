@@ -5,14 +5,18 @@ from dataclasses import replace
 
 import servoctl as sv
 from servoctl.errors import ServoError
+from servoctl.figures.animation import shows_mechanism
+from servoctl.figures.run import write_figures
+from servoctl.figures.style import write_png
 from servoctl.inversion.verdict import HYPERBOLIC_ZEROS, verdict
 from servoctl.methods.bounded import Problem
 from servoctl.methods.choice import Bounded, as_drift, as_method, default_method
 from servoctl.methods.runge_kutta import ORDERS
 from servoctl.shell import loop
-from servoctl.shell.folder import FILES, LOOP_FILES, folder_of, summary
+from servoctl.shell.folder import ANIMATION, FILES, LOOP_FILES, folder_of, jsonable, summary
 from servoctl.shell.motion import described
 from servoctl.shell.options import METHODS_HELP, add_motion, drift, samples, used
+from servoctl.shell.page import write_page
 from servoctl.shell.printing import Report, complain
 from servoctl.shell.scenes import find_scene
 
@@ -33,6 +37,7 @@ def add_run(run):
     run.add_argument("--samples", type=samples, metavar="N", help="equally spaced samples of the run")
     run.add_argument("--no-verify", action="store_true", help="leave out the check against the full mechanism")
     run.add_argument("--no-figures", action="store_true", help="leave out the figures")
+    run.add_argument("--animate", action="store_true", help=f"write the mechanism in motion: {ANIMATION}")
     loop.add_loop(run)
     run.set_defaults(command=_run)
 
@@ -64,11 +69,9 @@ def _compute(args, name, scene, folder):
     facts["closed_loop"] = loop.facts(closed)
     folder.write_json("summary.json", facts)
     folder.write_text("report.txt", report.text)
-    if not args.no_figures:
-        folder.write(lambda path: sv.figures.save_figures(run, path, units=scene.units, title=name))
-        if closed is not None:
-            folder.write(lambda path: loop.save_figure(closed, path, scene.units, name))
-    print(f"{', '.join(f for f in (*FILES, *LOOP_FILES) if (folder.path / f).exists())} in {folder.path}")
+    _pictures_of(args, folder, scene, name, run, closed)
+    folder.write(lambda path: write_page(path, jsonable(facts), scene.units, verification, report.text))
+    print(f"{', '.join(f for f in (*FILES, *LOOP_FILES, ANIMATION) if (folder.path / f).exists())} in {folder.path}")
     if not run.success:
         complain(f"The motion ended early, at t = {run.t[-1]:.6g} s; what was computed is kept.")
     unstable = run.internal.get("verdict") == "unstable"
@@ -78,6 +81,27 @@ def _compute(args, name, scene, folder):
     if unstable or not (run.success and verified != "failed" and done and not folder.moved):
         return 1
     return INCONCLUSIVE if verified == "inconclusive" else 0
+
+
+def _pictures_of(args, folder, scene, name, run, closed):
+    """Write the figures, and the animation if it is wanted; the mechanism moves as in the loop, else as planned."""
+    moving = run if closed is None else closed
+    shown, left_out = shows_mechanism(moving), ("path",) if run.model.reduction.mechanism.shapes else ()
+    if not args.no_figures:
+        folder.write(lambda path: write_figures(run, path, scene.units, name, left_out))
+        if closed is not None:
+            folder.write(lambda path: loop.save_figure(closed, path, scene.units, name))
+    if not shown:
+        if args.animate:
+            complain("There is no animation: the mechanism has no shapes=, and no outputs or coordinates like X and Z.")
+        return
+    if not args.no_figures:
+        what = f"{name}: motion" + (", in the closed loop" if closed is not None else "")
+        axes = sv.figures.stroboscope(moving, title=what)
+        folder.write(lambda path: write_png(axes.figure, path / "motion.png"))
+    if args.animate:
+        animation = sv.figures.animate(moving)
+        folder.write(lambda path: animation.save(path / ANIMATION))
 
 
 def _planned(args, motion, report):

@@ -1,6 +1,6 @@
 """What the designer says: coordinates, bodies, mechanisms, programs, paths."""
 
-from servoctl.spec import paths, rotations
+from servoctl.spec import paths, rotations, shapes
 from servoctl.spec.bodies import body_rates, particle, rigid_body
 from servoctl.spec.coordinates import Coordinates, coordinates
 from servoctl.spec.mechanism import Mechanism
@@ -19,4 +19,5 @@ __all__ = [
     "paths",
     "rigid_body",
     "rotations",
+    "shapes",
 ]

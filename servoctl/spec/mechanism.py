@@ -15,6 +15,7 @@ from servoctl.jets.tape import Tape, evaluate
 from servoctl.spec.coordinates import Coordinates, jet_name, symbols_in
 from servoctl.spec.packing import packed, unpacked
 from servoctl.spec.parameters import Parameters
+from servoctl.spec.shapes import as_shapes
 from servoctl.spec.sums import summands, without
 from servoctl.tolerances import ENTRY
 from servoctl.values import Identity
@@ -57,6 +58,9 @@ class Mechanism:
         Material constraints of order 0, 1 or 2, realised by ideal reactions.
     outputs : dict of str to SX, optional
         Named outputs, expressions of t, q and jets.
+    shapes : dict of str to sequence of points, optional
+        Lines and bodies by which figures show the mechanism (`servoctl.spec.shapes`): points (x, y) or (x, y, z) [m],
+        the last axis up, expressions of t, q and the parameters.
 
     Raises
     ------
@@ -82,6 +86,7 @@ class Mechanism:
         forces=None,
         constraints=None,
         outputs=None,
+        shapes=None,
     ):
         self.left_out, self.whole = {}, None
         self.q = require_kind(Coordinates, "q", q, 'sv.coordinates("x y")')
@@ -97,6 +102,7 @@ class Mechanism:
         self.E = self._directions(actuators or {})
         self.constraints = self._named(constraints, "constraint")
         self.outputs = self._named(outputs, "output")
+        self.shapes = as_shapes(shapes, self._known)
         self.inputs, self.reported = (), {}
         self._refuse_orders()
         self._refuse_names()
@@ -124,10 +130,11 @@ class Mechanism:
         names = [q.names, q.velocity_names, q.plain, list(q.invariants), self.actuators, list(self.constraints)]
         expressions = [
             q.V, q.h, *q.invariants.values(), self.balance, self.energy, self.forces, self.E,
-            *self.constraints.values(), *self.outputs.values(),
+            *self.constraints.values(), *self.outputs.values(), *self.shapes.values(),
         ]  # fmt: skip
         function = q.as_function([*expressions, *self.reported.values()], p.symbols).serialize()
-        facts = [names, list(self.outputs), self.inputs, list(self.reported), p.defaults, self.left_out]
+        facts = [names, list(self.outputs), list(self.shapes), self.inputs, list(self.reported)]
+        facts += [p.defaults, self.left_out]
         return json.dumps(facts) + "\n" + function
 
     def __eq__(self, other):
@@ -235,6 +242,7 @@ class Mechanism:
             self.q, self._gibbs, self.potential, None, self.parameters, kinetic=self._kinetic,
             balance=self._inverse_dynamics, mass=self._mass, forces=self.forces + forces + driving,
             constraints=self.constraints, outputs={**self.outputs, **inputs},
+            shapes={name: ca.horzsplit(points) for name, points in self.shapes.items()},
         )  # fmt: skip
         driven.inputs, driven.reported = tuple(inputs), driven._named(reported, "residual")
         return driven
@@ -471,6 +479,7 @@ class Mechanism:
             ("The balance", {"": self._inverse_dynamics}, 2),
             ("The forces", {"": self.forces}, 2),
             ("The material constraint", self.constraints, 2),
+            ("The shape", self.shapes, 0),
         ):
             for name, expression in items.items():
                 if expression is not None and self.q.order(expression) > limit:
@@ -524,6 +533,7 @@ def _part(identity, places):
     part.actuators, part.E = tuple(whole.actuators[j] for j in columns), whole.E[velocities, columns]
     part.constraints = {name: e for name, e in whole.constraints.items() if whole.places(e) <= places}
     part.outputs, part.inputs, part.reported = whole.outputs, whole.inputs, whole.reported
+    part.shapes = {name: e for name, e in whole.shapes.items() if whole.places(e) <= places}
     groups = {
         "coordinate": (q.names, part.q.names),
         "quasi-velocity": ((), ()) if q.plain else (q.velocity_names, part.q.velocity_names),

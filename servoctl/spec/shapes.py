@@ -1,0 +1,206 @@
+"""Shapes by which figures show a mechanism: lines between points that move with it.
+
+A shape is a sequence of points, each a column or sequence (x, y) or (x, y, z) [m] of expressions of t, q and the
+parameters. x points to the right, the last axis up. One point is drawn as a dot, several as a line, and a line that
+ends where it began as a body. `box`, `disc` and `spring` make such sequences.
+
+    shapes={"rail": [(-1, 0), (6, 0)], "trolley": sv.shapes.box((x, 0), 0.6, 0.2), "rope": [(x, 0), (X, -Z)]}
+"""
+
+from functools import lru_cache
+
+import casadi as ca
+import numpy as np
+
+from servoctl.checks import column, mapping
+from servoctl.errors import SpecificationError
+from servoctl.values import Identity
+
+__all__ = ["box", "disc", "spring"]
+
+SEQUENCE = "A shape is a sequence of points, all (x, y) or all (x, y, z)."
+EXAMPLE = 'Write "rope": [(x, 0), (X, -Z)].'
+CORNERS = 24  # of a disc
+EARLY, LATE = 0.15, 0.85  # parts of a spring between which it has coils
+INSTANTS = 9  # of a motion, at which the direction of gravity is examined
+SIDEWAYS = 1e-6  # part of gravity along other axes below which an axis is vertical
+
+
+def box(centre, width, height, angle=0.0):
+    """A rectangle.
+
+    Parameters
+    ----------
+    centre : (2,) SX or sequence
+        [m]
+    width, height : SX or float
+        [m]
+    angle : SX or float
+        From the horizontal to its width [rad], counterclockwise.
+
+    Returns
+    -------
+    list of (2,) SX
+    """
+    across = ca.vertcat(ca.cos(angle), ca.sin(angle)) * width / 2
+    up = ca.vertcat(-ca.sin(angle), ca.cos(angle)) * height / 2
+    return [_point(centre) + a * across + b * up for a, b in ((-1, -1), (1, -1), (1, 1), (-1, 1), (-1, -1))]
+
+
+def disc(centre, radius, angle=None, plane=None):
+    """A disc, with a spoke that shows its rotation if an angle is given.
+
+    Parameters
+    ----------
+    centre : (2,) or (3,) SX or sequence
+        [m]
+    radius : SX or float
+        [m]
+    angle : SX or float, optional
+        Of the spoke, from the first towards the second direction of the plane [rad].
+    plane : pair of columns, optional
+        Orthogonal unit vectors; default: those of the plane, to the right and up.
+
+    Returns
+    -------
+    list of (2,) or (3,) SX
+    """
+    first, second = ((1, 0), (0, 1)) if plane is None else plane
+    first, second, centre = _point(first), _point(second), _point(centre)
+    turned = 0.0 if angle is None else angle
+    angles = [turned + 2 * ca.pi * i / CORNERS for i in range(CORNERS)]
+    rim = [centre + radius * (ca.cos(a) * first + ca.sin(a) * second) for a in angles]
+    return [*rim, rim[0]] if angle is None else [centre, *rim, rim[0], centre]
+
+
+def spring(start, end, width, coils=6):
+    """A zigzag between two points of the plane.
+
+    Parameters
+    ----------
+    start, end : (2,) SX or sequence
+        [m]
+    width : float
+        [m]
+    coils : int
+
+    Returns
+    -------
+    list of (2,) SX
+    """
+    start, end = _point(start), _point(end)
+    along = end - start
+    aside = width / 2 * ca.vertcat(-along[1], along[0]) / ca.sqrt(ca.sumsqr(along) + width**2 / 1e6)
+    parts = np.linspace(EARLY, LATE, 2 * coils + 1)
+    middle = [start + s * along + (0, 1, 0, -1)[i % 4] * aside for i, s in enumerate(parts)]
+    return [start, *middle, end]
+
+
+def _point(point):
+    return ca.vertcat(*column(point, "A point"))
+
+
+def as_shapes(shapes, known):
+    """Shapes by name as (d, n) SX of n points; `known(expression, what, size)` checks the symbols of an expression."""
+    placed = {}
+    for name, points in mapping(shapes, "The shapes").items():
+        what = f"The shape {name!r}"
+        if not isinstance(points, (list, tuple, np.ndarray)):
+            raise SpecificationError(
+                f"{what} is a {type(points).__name__}.", SEQUENCE, do=EXAMPLE, name=name, type=type(points).__name__
+            )
+        columns = [column(point, f"{what}, point {i},") for i, point in enumerate(points, 1)]
+        sizes = sorted({len(point) for point in columns})
+        if len(sizes) != 1 or sizes[0] not in (2, 3):
+            raise SpecificationError(
+                f"{what} has points of {' and '.join(map(str, sizes))} numbers." if sizes else f"{what} is empty.",
+                SEQUENCE,
+                do=EXAMPLE,
+                name=name,
+                sizes=sizes,
+            )
+        entries = [e for point in columns for e in point]
+        placed[name] = ca.reshape(known(entries, what, len(entries)), sizes[0], len(columns))
+    sizes = {name: points.shape[0] for name, points in placed.items()}
+    if len(set(sizes.values())) > 1:
+        raise SpecificationError(
+            f"The shapes {', '.join(sizes)} have points of {', '.join(map(str, sizes.values()))} numbers.",
+            "All shapes of a mechanism lie in one plane, or in space.",
+            do="Give every point a third number, its height.",
+            sizes=sizes,
+        )
+    return placed
+
+
+def moved(mechanism, t, q, p):
+    """Where the shapes are.
+
+    Parameters
+    ----------
+    mechanism : Mechanism
+    t : (N,) array
+        [s]
+    q : (nq, N) array
+    p : (n_p,) array
+        Parameters of the mechanism.
+
+    Returns
+    -------
+    dict of str to (d, n, N) array
+        [m]
+    """
+    values = np.array(_points_of(Identity(mechanism))(np.reshape(t, (1, -1)), q, p))
+    ends = np.cumsum([points.numel() for points in mechanism.shapes.values()])
+    rows = np.split(values, ends[:-1])
+    return {
+        name: part.reshape(points.shape[1], points.shape[0], -1).swapaxes(0, 1)
+        for (name, points), part in zip(mechanism.shapes.items(), rows, strict=True)
+    }
+
+
+@lru_cache(32)
+def _points_of(identity):
+    mechanism = identity.value
+    q, p = mechanism.q, ca.vertcat(ca.SX(0, 1), *mechanism.parameters.symbols)
+    points = ca.vertcat(*(ca.vec(points) for points in mechanism.shapes.values()))
+    return ca.Function("shapes", [q.t, ca.vertcat(*q), p], [ca.densify(points)])
+
+
+def heights(mechanism, names, t, q, p):
+    """For each of some coordinates or outputs: 1 if it measures height, -1 if depth, 0 if neither is certain.
+
+    At rest, the balance of a mechanism under gravity is that of a force along one of them.
+
+    Parameters
+    ----------
+    mechanism : Mechanism
+    names : sequence of str
+        Of coordinates, or outputs without derivatives.
+    t, q, p : (N,), (nq, N), (n_p,) arrays
+
+    Returns
+    -------
+    list of int
+    """
+    own = dict(zip(mechanism.q.names, mechanism.q, strict=True)) | mechanism.outputs
+    if any(mechanism.q.order(own[name]) > 0 for name in names):
+        return [0] * len(names)
+    chosen = np.unique(np.linspace(0, len(t) - 1, INSTANTS).astype(int))
+    system = mechanism.q
+    rates = ca.vertcat(*system.gamma(1), *system.gamma(2))
+    symbols = [system.t, ca.vertcat(*system), rates, ca.vertcat(ca.SX(0, 1), *mechanism.parameters.symbols)]
+    slopes = ca.jacobian(ca.vertcat(*(own[name] for name in names)), symbols[1]) @ system.V
+    p = np.asarray(p)[: len(mechanism.parameters.names)]
+    rest = ca.Function("rest", symbols, [ca.densify(mechanism.balance), ca.densify(slopes.T)])
+    shares = []
+    for i in chosen:
+        weight, directions = (np.array(value) for value in rest(t[i], q[:, i], 0.0, p))
+        if not (np.isfinite(weight).all() and np.isfinite(directions).all()):
+            return [0] * len(names)
+        shares.append(np.linalg.lstsq(directions, weight[:, 0], rcond=None)[0] * np.linalg.norm(directions, axis=0))
+    shares, sizes = np.array(shares), np.abs(shares).max(axis=0)
+    others = [np.delete(sizes, i).max(initial=0.0) for i in range(len(names))]
+    return [
+        int(np.sign(s[0])) if np.all(s * s[0] > 0) and other < SIDEWAYS * np.abs(s).min() else 0
+        for s, other in zip(shares.T, others, strict=True)
+    ]

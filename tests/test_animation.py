@@ -1,0 +1,330 @@
+"""Pictures of mechanisms: where their shapes are, that up is up, and what the files hold."""
+
+import io
+import pickle
+import stat
+
+import casadi as ca
+import numpy as np
+import pytest
+import robots
+from PIL import Image
+from refusals import refused
+
+import servoctl as sv
+from servoctl.errors import NameUnknown, ServoError, SpecificationError
+from servoctl.figures.animation import MOST_FRAMES, shows_mechanism
+from servoctl.gallery import gallery
+from servoctl.spec.shapes import heights, moved
+
+
+@pytest.fixture(scope="module")
+def crane(gallery_model):
+    model, scene = gallery_model("overhead-crane"), gallery["overhead-crane"]
+    return sv.simulate(model, model.start(guess=scene.guess), (0.0, 1.0), t_eval=np.linspace(0.0, 1.0, 41))
+
+
+@pytest.fixture(scope="module")
+def loop(crane):
+    plant = sv.plant(crane.model.reduction.mechanism, m_load=130.0)
+    law = sv.lqr(crane, sv.plant(crane.model.reduction.mechanism), 50.0)
+    return sv.close(plant, law, crane.state(0.0), (0.0, 1.0))
+
+
+def at_random(mechanism, count=3, **values):
+    """The shapes at random coordinates, or at given ones."""
+    q = np.random.default_rng(7).uniform(0.2, 1.2, (mechanism.q.nq, count))
+    for name, value in values.items():
+        q[mechanism.q.names.index(name)] = value
+    named = dict(zip(mechanism.q.names, q, strict=True))
+    return moved(mechanism, np.zeros(count), q, mechanism.parameters.values({})), named
+
+
+# --- where shapes are
+
+
+@pytest.mark.parametrize("name", gallery)
+def test_every_scene_has_shapes_in_one_space(name):
+    mechanism, _ = gallery[name].build()
+    shapes, _ = at_random(mechanism)
+    assert {points.shape[0] for points in shapes.values()} in ({2}, {3})
+    assert all(np.isfinite(points).all() for points in shapes.values())
+    assert any(np.ptp(points, axis=-1).max() > 1e-3 for points in shapes.values())
+
+
+def test_links_keep_their_lengths_and_ropes_theirs():
+    shapes, q = at_random(gallery["pendubot"].build()[0])
+    for link, length in (("first link", 0.6), ("second link", 0.5)):
+        assert np.linalg.norm(shapes[link][:, 1] - shapes[link][:, 0], axis=0) == pytest.approx(length)
+    end = 0.6 * np.sin(q["q1"]) + 0.5 * np.sin(q["q1"] + q["q2"])
+    assert shapes["end"][1, 0] == pytest.approx(end)
+    shapes, q = at_random(gallery["crane-3d"].build()[0])
+    assert np.linalg.norm(np.diff(shapes["rope"], axis=1)[:, 0], axis=0) == pytest.approx(q["l"])
+    assert (shapes["load"][2, 0] < 0).all()  # below the trolley, whose height is zero
+
+
+def test_the_spatial_arm_is_a_chain_of_equal_rods():
+    from servoctl.gallery import spatial_arm
+
+    shapes, q = at_random(spatial_arm(3)[0])
+    rods = np.diff(shapes["links"], axis=1)
+    assert np.linalg.norm(rods, axis=0) == pytest.approx(0.5)
+    one, two = q["theta1"], q["theta2"]
+    along = [np.cos(one) * np.cos(two), np.sin(one) * np.cos(two), -np.sin(two)]  # about z, then about y
+    assert rods[:, 1] == pytest.approx(0.5 * np.array(along))
+    bodies, _ = at_random(spatial_arm(3, "bodies")[0], **{name: values for name, values in q.items()})
+    assert bodies["links"] == pytest.approx(shapes["links"])
+
+
+def test_the_wheel_touches_the_ground_and_its_spoke_rolls():
+    shapes, q = at_random(gallery["appell-hamel"].build()[0])
+    wheel = shapes["wheel"]
+    centre, rim = wheel[:, 0], wheel[:, 1:-1]
+    assert np.linalg.norm(rim - centre[:, None], axis=0) == pytest.approx(0.5)
+    ahead = np.array([np.cos(q["theta"]), np.sin(q["theta"]), 0 * q["theta"]])
+    spoke = rim[:, 0] - centre
+    assert (spoke * ahead).sum(axis=0) == pytest.approx(0.5 * np.cos(q["phi"]))
+    assert spoke[2] == pytest.approx(-0.5 * np.sin(q["phi"]))  # the top of the wheel goes ahead
+
+
+def test_boxes_and_springs():
+    corners = np.array(ca.evalf(ca.horzcat(*sv.shapes.box((1.0, 2.0), 0.6, 0.2, np.pi / 2))))
+    assert corners[:, :-1].mean(axis=1) == pytest.approx([1.0, 2.0])
+    assert np.ptp(corners, axis=1) == pytest.approx([0.2, 0.6]) and np.array_equal(corners[:, 0], corners[:, -1])
+    zigzag = np.array(ca.evalf(ca.horzcat(*sv.shapes.spring((0.0, 0.0), (3.0, 4.0), 0.2, coils=2))))
+    aside = np.array([-0.8, 0.6]) @ zigzag
+    assert np.ptp(aside) == pytest.approx(0.2, rel=1e-6) and zigzag[:, -1] == pytest.approx([3.0, 4.0])
+    assert np.isfinite(np.array(ca.evalf(ca.horzcat(*sv.shapes.spring((1.0, 1.0), (1.0, 1.0), 0.2))))).all()
+
+
+def two_masses(shapes=None, **rest):
+    p = sv.parameters(m=1.0, g=9.81)
+    q = sv.coordinates("x y far")
+    x, y, far = q
+    S = sv.particle(q, p.m, ca.vertcat(x, y)) + sv.particle(q, p.m, far)
+    shapes = {"near": [(x, y)], "far": [(x, y), (far, 0)]} if shapes is None else shapes(q, p)
+    mechanism = sv.Mechanism(q, gibbs=S, actuators={"u": x, "v": y}, parameters=p, shapes=shapes, **rest)
+    return mechanism, sv.Program({"X": x - q.t**2, "Y": y - q.t}, by="actuators")
+
+
+def test_arrays_hold_a_point_in_each_row():
+    mechanism, _ = two_masses(lambda q, p: {"ground": np.array([[0.0, 1.0], [2.0, 3.0], [4.0, 5.0]])})
+    assert at_random(mechanism, 1)[0]["ground"][:, :, 0] == pytest.approx(np.array([[0.0, 2.0, 4.0], [1.0, 3.0, 5.0]]))
+
+
+def test_shapes_of_what_plays_no_part_are_left_out():
+    model = sv.derive(*two_masses())
+    assert list(model.reduction.mechanism.shapes) == ["near"]
+    assert list(sv.derive(*two_masses(), keep=["far"]).reduction.mechanism.shapes) == ["near", "far"]
+
+
+def test_shapes_count_for_equality_and_survive_a_pickle(crane):
+    assert two_masses()[0] != two_masses(lambda q, p: {"near": [(q["x"], 0)]})[0] and two_masses()[0] == two_masses()[0]
+    copy = pickle.loads(pickle.dumps(crane.model)).reduction.mechanism
+    mechanism = crane.model.reduction.mechanism
+    one, other = at_random(mechanism)[0], at_random(copy)[0]
+    assert list(one) == list(other) and all(np.array_equal(one[name], other[name]) for name in one)
+
+
+@pytest.mark.parametrize(
+    ("shapes", "facts"),
+    [
+        (lambda q, p: {"rope": []}, {"name": "rope", "sizes": []}),
+        (lambda q, p: {"rope": [(q["x"], 0), (0, 0, 0)]}, {"sizes": [2, 3]}),
+        (lambda q, p: {"rope": [q["x"]]}, {"sizes": [1]}),
+        (lambda q, p: {"rope": [(q["x"], 0)], "far": [(0, 0, 0)]}, {"sizes": {"rope": 2, "far": 3}}),
+        (lambda q, p: {"rope": [(q.d(1)[0], 0)]}, {"name": "rope", "order": 1, "limit": 0}),
+        (lambda q, p: {"rope": [(ca.SX.sym("y"), 0)]}, {"name": "y"}),
+        (lambda q, p: {"rope": [(np.nan, 0)]}, {}),
+        (lambda q, p: [(0, 0)], {}),
+        (lambda q, p: {"rope": "xy"}, {"name": "rope", "type": "str"}),
+        (lambda q, p: {"rope": ca.SX.zeros(2, 3)}, {"name": "rope", "type": "SX"}),  # columns or rows?
+    ],
+)
+def test_what_is_no_shape_is_refused(shapes, facts):
+    with refused(SpecificationError, **facts):
+        two_masses(shapes)
+
+
+# --- up is up
+
+
+def test_depth_is_drawn_downwards(gallery_model):
+    for name, axes in (("overhead-crane", ("X", "Z")), ("crane-3d", ("X", "Z"))):
+        model, scene = gallery_model(name), gallery[name]
+        run = sv.simulate(model, model.start(guess=scene.guess), (0.0, 3.0), t_eval=[0.0, 1.5, 3.0])
+        ax = sv.plots.path(run)
+        assert (ax.get_xlabel(), ax.get_ylabel()) == axes and ax.yaxis_inverted()
+
+
+@pytest.mark.parametrize(
+    ("rest", "signs"),
+    [
+        (lambda y, p: {"potential": p.m * p.g * y}, [0, 1]),
+        (lambda y, p: {"potential": -p.m * p.g * y}, [0, -1]),
+        (lambda y, p: {"forces": {"y": p.m * p.g}}, [0, -1]),
+        (lambda y, p: {}, [0, 0]),
+        (lambda y, p: {"potential": 50 * (y - 0.5) ** 2}, [0, 0]),  # a spring pulls to both sides
+        (lambda y, p: {"forces": {"y": p.m * p.g, "x": 1.0}}, [0, 0]),  # an oblique force is no weight
+    ],
+)
+def test_height_is_what_weight_acts_along(rest, signs):
+    p, q = sv.parameters(m=2.0, g=9.81), sv.coordinates("x y")
+    mechanism = sv.Mechanism(q, gibbs=sv.particle(q, p.m, ca.vertcat(*q)), parameters=p, **rest(q["y"], p))
+    places = np.array([[0.0, 0.3, 1.0], [0.0, 0.4, 1.0]])
+    assert heights(mechanism, ["x", "y"], np.zeros(3), places, [2.0, 9.81]) == signs
+
+
+# --- animations
+
+
+def test_an_animation_shows_the_motion(crane):
+    shown = sv.plots.animate(crane, fps=40)
+    assert (len(shown.t), shown.pace, shown.space) == (41, 1.0, False)
+    assert shown.shapes["load"] == pytest.approx(np.array([crane["X"], -crane["Z"]]), abs=1e-9)
+    assert shown.shapes["rope"][:, 0] == pytest.approx(np.array([crane["x"], 0 * crane["x"]]), abs=1e-9)
+    assert shown.trails["load"] is not shown.shapes["load"] and list(shown.trails) == ["load"]
+    X, height = shown.programmed["load"]
+    assert height == pytest.approx(-4 + 2 * X / 5, abs=1e-9)
+    assert list(sv.plots.animate(crane, trail=["trolley", "load"]).trails) == ["trolley", "load"]
+    assert sv.plots.animate(crane, trail=()).programmed == {}
+    middle = sv.plots.animate(crane, fps=40, trail="trolley").trails["trolley"]
+    assert middle == pytest.approx(np.array([crane["x"], 0 * crane["x"]]), abs=1e-9)  # of a body
+
+
+def test_the_path_of_a_loop_lies_over_that_of_its_plan(crane, loop):
+    shown = sv.plots.animate(loop, fps=50)
+    assert shown.trails["load"] == pytest.approx(np.array([loop["X"], -loop["Z"]]), abs=1e-9)
+    X, height = shown.programmed["load"]
+    assert height == pytest.approx(-4 + 2 * X / 5, abs=1e-6)
+    assert np.abs(shown.trails["load"][1] - (-4 + 2 * shown.trails["load"][0] / 5)).max() > 1e-3  # a heavier load
+
+
+def test_a_file_has_the_frames_and_the_load_rises(crane, tmp_path):
+    path = sv.plots.animate(crane, fps=10).save(tmp_path / "crane")
+    assert path.name == "crane.gif"
+    picture = Image.open(path)
+    assert (picture.n_frames, picture.info["loop"], picture.info["duration"]) == (11, 0, 100)
+    lines = []
+    for frame in (0, 10):
+        picture.seek(frame)
+        red, _, blue = np.moveaxis(np.asarray(picture.convert("RGB")).astype(int), -1, 0)
+        lines.append(np.nonzero(red - blue > 120)[0].min())
+    assert lines[1] < lines[0]  # rows of pixels count downwards
+    html = sv.plots.animate(crane, fps=1)._repr_html_()
+    assert html.startswith("<img ") and "data:image/gif;base64," in html
+
+
+def test_a_long_motion_is_shown_faster(crane):
+    fps, run = 50, sv.simulate(crane.model, crane.start, (0.0, 40.0), t_eval=np.linspace(0.0, 40.0, 401))
+    shown = sv.plots.animate(run, fps=fps)
+    assert len(shown.t) == MOST_FRAMES and shown.pace == pytest.approx(40 * fps / (MOST_FRAMES - 1))
+    assert "times as fast" in repr(shown)
+
+
+def test_films_are_written_by_ffmpeg(crane, tmp_path, monkeypatch):
+    shown = sv.plots.animate(crane, fps=2)
+    monkeypatch.setenv("PATH", str(tmp_path))
+    with refused(ServoError, "ffmpeg"):
+        shown.save(tmp_path / "crane.mp4")
+    program = tmp_path / "ffmpeg"
+    program.write_text('#!/bin/sh\nfor last; do :; done\n/bin/cat > "$last"\necho "$@" > "$last.txt"\n')
+    program.chmod(program.stat().st_mode | stat.S_IEXEC)
+    raw = shown.save(tmp_path / "crane.mp4").read_bytes()
+    words = (tmp_path / "crane.mp4.txt").read_text().split()
+    width, height = map(int, words[words.index("-s") + 1].split("x"))
+    assert width % 2 == height % 2 == 0 and len(raw) == 3 * width * height * 3 and words[words.index("-r") + 1] == "2"
+    program.write_text("#!/bin/sh\necho broken codec >&2\nexit 1\n")
+    with refused(ServoError, "broken codec"):
+        shown.save(tmp_path / "crane.mp4")
+
+
+def test_a_spatial_mechanism_is_projected_with_up_up(gallery_model):
+    model, scene = gallery_model("crane-3d"), gallery["crane-3d"]
+    run = sv.simulate(model, model.start(guess=scene.guess), scene.t_span, t_eval=np.linspace(*scene.t_span, 25))
+    shown = sv.plots.animate(run, fps=4)
+    assert shown.space and shown.shapes["load"][1, -1] > shown.shapes["load"][1, 0]  # it is lifted
+    assert len(Image.open(io.BytesIO(shown.gif())).getbbox()) == 4
+
+
+def test_a_mechanism_without_shapes_is_shown_by_its_positions():
+    p, q = sv.parameters(m=2.0, g=9.81), sv.coordinates("x z")  # z down
+    x, z = q
+    mechanism = sv.Mechanism(
+        q, gibbs=sv.particle(q, p.m, ca.vertcat(x, z)), potential=-p.m * p.g * z, actuators={"a": x, "b": z}, parameters=p
+    )
+    model = sv.derive(mechanism, sv.Program({"X": x - q.t, "Z": z - q.t**2}, by="actuators"))
+    shown = sv.plots.animate(sv.simulate(model, model.start(), (0.0, 1.0)), fps=10)
+    assert shown.shapes["x, z"] == pytest.approx(np.array([shown.t, -(shown.t**2)]), abs=1e-6)
+
+
+def test_poses_are_drawn_at_instants(crane, gallery_model):
+    ax = sv.plots.stroboscope(crane, poses=4, title="crane")
+    assert ax.get_title() == "crane" and ax.get_aspect() == 1.0
+    dots = [line for line in ax.get_lines() if line.get_marker() == "o"]
+    places = np.array([line.get_xydata()[0] for line in dots])
+    expected = [[crane["X"][k], -crane["Z"][k]] for k in (0, -1)]
+    assert len(dots) == 4 and places[[0, -1]] == pytest.approx(np.array(expected), abs=1e-9)
+    assert sv.plots.stroboscope(crane, poses=1) is not None
+    model = gallery_model("two-cars")
+    run = sv.simulate(model, model.start(), (0.0, 2.0), t_eval=np.linspace(0.0, 2.0, 21))
+    ax = sv.plots.stroboscope(run, poses=5)  # on one line: one below the other
+    assert [label.get_text() for label in ax.get_yticklabels()] == ["0", "0.5", "1", "1.5", "2"]
+    assert (np.diff(ax.get_yticks()) < 0).all() and ax.get_ylabel() == "t [s]"
+
+
+def test_what_cannot_be_animated_is_refused(crane, loop, tmp_path):
+    for fps in (0.5, 1000, np.nan, "fast"):
+        with refused(SpecificationError):
+            sv.plots.animate(crane, fps=fps)
+    with refused(NameUnknown, match="load"):
+        sv.plots.animate(crane, trail="lod")
+    with refused(SpecificationError, type="int"):
+        sv.plots.animate(3)
+    loaded = sv.load(crane.save(tmp_path / "crane"))
+    assert not shows_mechanism(loaded) and shows_mechanism(crane) and shows_mechanism(loop)
+    with refused(SpecificationError, "sv.load(path, model)"):
+        sv.plots.animate(loaded)
+    with refused(SpecificationError, suffix=".webm"):
+        sv.plots.animate(crane, fps=1).save(tmp_path / "crane.webm")
+    q = sv.coordinates("a b")
+    model = sv.derive(sv.Mechanism(q, gibbs=sv.particle(q, 1.0, ca.vertcat(*q)), actuators={"u": q["a"], "v": q["b"]}),
+                      sv.Program({"A": q["a"] - q.t, "B": q["b"]}, by="actuators"))  # fmt: skip
+    run = sv.simulate(model, model.start(), (0.0, 0.1))
+    assert not shows_mechanism(run)
+    with refused(SpecificationError, "shapes=", coordinates=["a", "b"], outputs=[]):
+        sv.plots.animate(run)
+
+
+@pytest.mark.parametrize(("name", "base"), [("six_axis_arm", "fixed"), ("quadruped", "free"), ("scara", "fixed")])
+def test_a_robot_is_drawn_by_its_frames(name, base):
+    robot = sv.urdf(robots.file_of(name), base=base)
+    mechanism, posture = robot.mechanism(friction=0.0), {q: 0.1 * i for i, q in enumerate(robot.joints) if q in robot.q.names}
+    shapes = moved(mechanism, [0.0], robot.posture(posture)[:, None], robot.parameters.values({}))
+    assert set(shapes) < set(robot.links)  # all but the root
+    for link, points in shapes.items():
+        assert points[:, -1, 0] == pytest.approx(robot.at(posture, link)[0], abs=1e-12)
+    starts = {tuple(np.round(points[:, 0, 0], 9)) for points in shapes.values()}
+    ends = {tuple(np.round(points[:, -1, 0], 9)) for points in shapes.values()}
+    assert len(starts - ends) <= 1  # a tree: each link begins where another ends, or at the root
+
+
+def test_motions_of_every_kind_are_drawn(crane, loop, tmp_path):
+    mechanism, start = crane.model.reduction.mechanism, crane.start
+    runs = {
+        "one sample": sv.simulate(crane.model, start, (0.0, 1.0), t_eval=[0.5]),
+        "two samples": sv.simulate(crane.model, start, (0.0, 1.0), t_eval=[0.0, 1.0]),
+        "loaded": sv.load(crane.save(tmp_path / "crane"), crane.model),
+        "under its own weight": sv.simulate(sv.plant(mechanism), crane.state(0.0), (0.0, 1.0)),
+        "without feedback": sv.close(loop.plant, sv.feedforward(crane, loop.plant, 50.0), crane.state(0.0), (0.0, 1.0)),
+    }
+    for name, run in runs.items():
+        shown = sv.plots.animate(run, fps=2)
+        assert np.isfinite(shown.shapes["load"]).all(), name
+    assert sv.plots.animate(runs["two samples"], fps=40).trails["load"] == pytest.approx(
+        sv.plots.animate(crane, fps=40).trails["load"], abs=1e-3
+    )  # by the polynomial between samples
+    still = sv.plots.animate(runs["one sample"], fps=2)
+    assert len(still.t) == 1 and Image.open(io.BytesIO(still.gif())).n_frames == 1
+    copy = pickle.loads(pickle.dumps(still))
+    assert copy == still
