@@ -403,7 +403,7 @@ class Plan:
                     size[here] += slopes.take(slope, axis=0) * part
             elif kind != "constant":
                 size[here] = _SIZE[kind](data, magnitude[here], *v.take(operands, axis=0), *parts)
-        return size
+        return np.where(np.isfinite(size), size, np.nan)  # what has no size is comparable to nothing
 
 
 def _power_size(exponent, y, a, size):
