@@ -13,8 +13,8 @@ from numbers import Real
 import numpy as np
 
 from servoctl.checks import is_number
-from servoctl.errors import LimitExceeded, SpecificationError
-from servoctl.methods.choice import Algebraic, Automatic, Project, RadauIIA, Taylor
+from servoctl.errors import IntegrationStopped, LimitExceeded, SpecificationError
+from servoctl.methods.choice import Adaptive, Algebraic, Automatic, Project, RadauIIA, Taylor
 from servoctl.methods.sizes import motion_sizes, state_levels
 from servoctl.methods.taylor import order_for
 
@@ -119,6 +119,17 @@ def method_for(model, accuracy, jets=None):
     return Automatic(order_for(rtol), jets, rtol, rtol)
 
 
+def _moved(simulated, method):
+    """The method and its motion; where series stop, those of DOP853, which needs none."""
+    try:
+        return method, simulated(method, Project())
+    except IntegrationStopped:
+        if not isinstance(method, Automatic) or method.jets is not None:
+            raise
+        other = Adaptive(rtol=method.rtol, atol=method.atol)
+        return other, simulated(other, Project())
+
+
 def accurate(simulated, model, accuracy, method=None, drift=None):
     """The motion with an error of at most `accuracy`.
 
@@ -153,7 +164,7 @@ def accurate(simulated, model, accuracy, method=None, drift=None):
     method = method_for(model, accuracy, jets)
     if isinstance(method, Algebraic):
         return simulated(method, None)
-    run = simulated(method, Project())
+    method, run = _moved(simulated, method)
     if run.method == str(RadauIIA()):
         method = method.for_stiff
     if not run.success:
@@ -162,7 +173,7 @@ def accurate(simulated, model, accuracy, method=None, drift=None):
     while method.rtol > SAME * FINEST:
         coarser, rtol = method, max(FINER * method.rtol, FINEST)
         method = replace(method, rtol=rtol, atol=rtol)
-        finer = simulated(method, Project())
+        method, finer = _moved(simulated, method)
         if not finer.success:
             return finer
         difference = _disagreement(model, run, finer)

@@ -9,6 +9,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from servoctl.checks import as_span, is_number, mapping, named, positive, positives, require_kind, text
+from servoctl.control.reference import resampled
 from servoctl.errors import LimitExceeded, ServoError, SpecificationError, unknown
 from servoctl.methods.accuracy import motion_error, relative_error
 from servoctl.methods.choice import (
@@ -23,6 +24,7 @@ from servoctl.methods.choice import (
     as_drift,
     as_method,
 )
+from servoctl.methods.motion import DEFAULT_SAMPLES
 from servoctl.model.model import Model
 from servoctl.model.start import State
 from servoctl.progress import progress_bar
@@ -421,7 +423,11 @@ def _errors_and_cost(reference, name, treatment, value, seconds):
         timed.append(time.perf_counter() - since)
         if sum(timed) > ENOUGH * seconds:
             break
-    return _errors(reference, at(reference.times)) | {
+    errors = _errors(reference, at(reference.times))
+    if isinstance(method, Taylor) and t1 > t0:
+        between = resampled(at(np.union1d(np.linspace(t0, t1, DEFAULT_SAMPLES), reference.knots)), reference.times)
+        errors["error"] = max(errors["error"], motion_error(model, between.jets, reference.at(reference.times).jets))
+    return errors | {
         "evaluations": run.counters.get("nfev", run.counters.get("iterations", 0)),
         "steps": run.counters.get("steps", len(run.t)),
         "seconds": min(timed),
