@@ -11,6 +11,7 @@ import pytest
 from refusals import refused
 from scenes import CRANE
 from scipy.interpolate import CubicHermiteSpline
+from test_robot_programs import HOME, arm_plan
 
 import servoctl as sv
 from servoctl.codegen.compiler import compiler
@@ -172,6 +173,28 @@ def test_a_thinned_law_in_floats_follows_like_the_law(plan, tmp_path):
     before = u.copy()
     assert c.loop_step(ctypes.c_float(np.nan), *(a.ctypes.data_as(ctypes.c_void_p) for a in (u, z, u))) == -1
     assert np.array_equal(u, before)
+
+
+def test_an_arm_follows_its_path_under_a_controller_in_floats(tmp_path):
+    """A six-axis arm at 1 kHz: its exported law with thinned gains, in a plain loop around the plant in Python."""
+    arm, mechanism, model, run = arm_plan()
+    plant = sv.plant(mechanism, limits=arm.effort)
+    source, _ = sv.export_c(sv.lqr(run, plant, rate=1000.0), tmp_path, name="loop", real="float", thinned=1e-5)
+    command = [*shlex.split(compiler()), *STRICT, "-fPIC", "-shared", str(source), "-o", str(tmp_path / "l.so"), "-lm"]
+    assert subprocess.run(command, capture_output=True, text=True).stderr == ""
+    c, u, z = ctypes.CDLL(str(tmp_path / "l.so")), np.empty(6, np.float32), np.zeros(1, np.float32)
+    rates, x, h = plant.function("ode"), np.array(model.start(guess=HOME).values), 1e-3
+    worst, tool = 0.0, np.array([run[name] for name in arm.q.names])
+    for k in range(2001):
+        y = x.astype(np.float32)
+        assert c.loop_step(ctypes.c_float(k * h), *(a.ctypes.data_as(ctypes.c_void_p) for a in (y, z, u))) == 0
+        worst = max(worst, np.abs(x[:6] - tool[:, k // 2]).max() if k % 2 == 0 else 0.0)
+        p = plant.p(u.astype(float))
+        k1 = rates(k * h, x, p)
+        k2 = rates(k * h, x + h / 2 * k1, p)
+        k3 = rates(k * h, x + h / 2 * k2, p)
+        x = x + h / 6 * (k1 + 2 * k2 + 2 * k3 + rates(k * h, x + h * k3, p))
+    assert worst < 1e-3 * np.ptp(tool, axis=1).max()
 
 
 def test_the_header_is_read_by_a_compiler_of_cplusplus(plan, tmp_path):

@@ -132,6 +132,46 @@ def test_a_four_bar_is_closed_in_its_plane():
         assert run["torque_crank_joint"][k] == pytest.approx(wanted, rel=1e-9, abs=1e-9)
 
 
+FIVE_BAR = """<robot name="five_bar"><link name="ground"/>{sides}</robot>"""
+SIDE = """<link name="{s}_crank">{rod}</link><link name="{s}_coupler">{rod}</link><link name="{s}_end"/>
+<joint name="{s}_motor" type="continuous"><origin xyz="{x} 0 0"/><parent link="ground"/><child link="{s}_crank"/>
+<axis xyz="0 1 0"/></joint>
+<joint name="{s}_elbow" type="continuous"><origin xyz="0.3 0 0"/><parent link="{s}_crank"/><child link="{s}_coupler"/>
+<axis xyz="0 1 0"/></joint>
+<joint name="{s}_tip" type="fixed"><origin xyz="0.4 0 0"/><parent link="{s}_coupler"/><child link="{s}_end"/></joint>"""
+ROD = (
+    '<inertial><origin xyz="0.17 0 0"/><mass value="0.8"/>'
+    '<inertia ixx="0.001" ixy="0" ixz="0" iyy="0.008" iyz="0" izz="0.008"/></inertial>'
+)
+
+
+def test_a_parallel_robot_takes_the_torques_of_pinocchio(tmp_path):
+    """Two cranks move the point where two chains meet: along a line, by the motors at the ground alone."""
+    path = tmp_path / "five_bar.urdf"
+    path.write_text(FIVE_BAR.format(sides="".join(SIDE.format(s=s, x=x, rod=ROD) for s, x in (("left", -0.1), ("right", 0.1)))))
+    robot = sv.urdf(path)
+    ends = robot.frame("left_end"), robot.frame("right_end")
+    mechanism = robot.mechanism(sv.loop(*ends, "position"), actuators=("left_motor", "right_motor"))
+    home = {"left_motor": -2.2, "left_elbow": 1.2, "right_motor": -0.9, "right_elbow": -1.2}
+    s = sv.paths.rest_to_rest(robot.q.t, 0.0, 1.0, 1.5)
+    line = sv.paths.line(s, (0.0, 0.56), (0.08, 0.5))
+    point = ends[0].position[[0, 2]]
+    model = sv.derive(mechanism, sv.Program({"X": point[0] - line[0], "Z": point[1] - line[1]}))
+    run = sv.simulate(model, model.start(guess=home), (0.0, 1.5))
+    assert model.flat
+    assert sv.verify(model, run).verdict == "passed"
+    if find_spec("pinocchio") is None:
+        return
+    other = robots.Pinocchio(robot, str(path), "fixed")
+    rows = (ends[0].jacobian - ends[1].jacobian)[[0, 2], :]
+    jacobian = ca.Function("J", [ca.vertcat(*robot.q)], [ca.densify(rows)])
+    driven = [robot.q.names.index(name) for name in ("left_motor", "right_motor")]
+    for k in range(0, len(run.t), 100):
+        wanted = constrained_torques(robot, other, run, k, jacobian, driven)
+        ours = [run["torque_left_motor"][k], run["torque_right_motor"][k]]
+        assert ours == pytest.approx(wanted, rel=1e-9, abs=1e-9)
+
+
 def test_frames_that_cannot_meet_are_refused():
     text = open(robots.file_of("four_bar")).read().replace('xyz="0.5 0 0"', 'xyz="0.5 0.1 0"')
     arm = sv.urdf(text)

@@ -218,6 +218,12 @@ def test_limits_and_damping_reach_the_plant():
     assert plant.limits["force_lift"] == (-80.0, 80.0)
 
 
+def test_limits_of_zero_are_none():
+    """Files of some exporters have effort="0" where nothing was stated."""
+    arm = sv.urdf(bar(inside='<axis xyz="0 1 0"/><limit lower="-1" upper="1" effort="0" velocity="0"/>'))
+    assert (arm.effort, arm.velocity, arm.position) == ({}, {}, {"hinge": (-1.0, 1.0)})
+
+
 def test_dry_friction_is_smooth_or_refused():
     text = bar(inside='<axis xyz="0 1 0"/><dynamics friction="0.5"/>')
     with refused(sv.SpecificationError, "hinge", "friction=0.01", joints=["hinge"]):

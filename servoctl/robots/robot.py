@@ -63,7 +63,8 @@ class Robot:
         Names of the frames.
     effort, velocity, position : dict
         Limits of the file: largest force or torque by actuator [N or N m], largest speed [m/s or rad/s] and (low, high)
-        [m or rad] by coordinate. Joints without a limit are left out.
+        [m or rad] by coordinate. Joints without a limit, or with the 0 of files that state none,
+        are left out.
     damping, friction : dict of str to float
         Viscous coefficients [N s/m or N m s] and dry friction [N or N m] by coordinate.
     """
@@ -75,8 +76,8 @@ class Robot:
         self._all_joints = tuple(description.joints.values())
         self.joints = {name: joint.name for name, joint in joints.items()}
         self._moving = moving = {name: joint for name, joint in joints.items() if joint.kind in ONE_AXIS}
-        self.effort = {actuator(name, j): j.effort for name, j in moving.items() if math.isfinite(j.effort)}
-        self.velocity = {name: j.velocity for name, j in moving.items() if math.isfinite(j.velocity)}
+        self.effort = {actuator(name, j): j.effort for name, j in moving.items() if 0.0 < j.effort < math.inf}
+        self.velocity = {name: j.velocity for name, j in moving.items() if 0.0 < j.velocity < math.inf}
         self.position = {
             name: (j.lower, j.upper) for name, j in moving.items() if math.isfinite(j.lower) or math.isfinite(j.upper)
         }
