@@ -119,7 +119,7 @@ def method_for(model, accuracy, jets=None):
     return Automatic(order_for(rtol), jets, rtol, rtol)
 
 
-def _moved(simulated, method):
+def _with_fallback(simulated, method):
     """The method and its motion; where series stop, those of DOP853, which needs none."""
     try:
         return method, simulated(method, Project())
@@ -164,7 +164,7 @@ def accurate(simulated, model, accuracy, method=None, drift=None):
     method = method_for(model, accuracy, jets)
     if isinstance(method, Algebraic):
         return simulated(method, None)
-    method, run = _moved(simulated, method)
+    method, run = _with_fallback(simulated, method)
     if run.method == str(RadauIIA()):
         method = method.for_stiff
     if not run.success:
@@ -173,7 +173,7 @@ def accurate(simulated, model, accuracy, method=None, drift=None):
     while method.rtol > SAME * FINEST:
         coarser, rtol = method, max(FINER * method.rtol, FINEST)
         method = replace(method, rtol=rtol, atol=rtol)
-        method, finer = _moved(simulated, method)
+        method, finer = _with_fallback(simulated, method)
         if not finer.success:
             return finer
         difference = _disagreement(model, run, finer)
