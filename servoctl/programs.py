@@ -11,14 +11,13 @@ first order and has derivatives of every order.
 """
 
 import casadi as ca
-import numpy as np
 
 from servoctl.checks import column, mapping, named, positive, require_kind, text
 from servoctl.errors import SpecificationError
 from servoctl.robots.robot import Frame
 from servoctl.spec import rotations
 from servoctl.spec.coordinates import Coordinates
-from servoctl.spec.mechanism import Mechanism
+from servoctl.spec.mechanism import Mechanism, inverse_directions
 
 
 def follow_point(name, position, target):
@@ -309,7 +308,7 @@ def momentum(name, mechanism, coordinate, value):
     """
     require_kind(Mechanism, "mechanism", mechanism, "sv.Mechanism(q, gibbs, ...)")
     q = mechanism.q
-    names = q.names if q.plain else q.velocity_names
+    names = q.force_names
     named(coordinate, names, "coordinate" if q.plain else "quasi-velocity")
     (value,) = column(value, f"the momentum of {name!r}", 1)
     return {name: (mechanism.mass @ ca.vertcat(*q.gamma(1)))[names.index(coordinate)] - value}
@@ -380,11 +379,12 @@ def wish(mechanism, accelerations=None):
         If an acceleration names no coordinate.
     """
     require_kind(Mechanism, "mechanism", mechanism, "robot.mechanism()")
-    q, E = mechanism.q, mechanism.E
-    names = q.names if q.plain else q.velocity_names
-    if E.shape[0] != E.shape[1] or not E.is_constant():
+    q = mechanism.q
+    names = q.force_names
+    inverse = inverse_directions(mechanism.E)
+    if inverse is None:
         raise SpecificationError(
-            f"The mechanism has {E.shape[1]} actuators for {E.shape[0]} velocities.",
+            f"The mechanism has {len(mechanism.actuators)} actuators for {q.n} velocities.",
             "Inputs for given accelerations exist where each velocity has an actuator, along a constant direction.",
             do="Write the wish by actuator yourself.",
             actuators=list(mechanism.actuators),
@@ -394,8 +394,8 @@ def wish(mechanism, accelerations=None):
         named(name, names, "coordinate" if q.plain else "quasi-velocity")
         (wanted[name],) = column(value, f"the acceleration of {name!r}", 1)
     balance = ca.substitute(mechanism.balance, q.jet(2), ca.vertcat(*wanted.values()))
-    forces = ca.solve(ca.DM(ca.evalf(E)), balance) if not _is_identity(E) else balance
-    return dict(zip(mechanism.actuators, ca.cse(forces).elements(), strict=True))
+    forces = ca.cse(inverse @ balance)
+    return dict(zip(mechanism.actuators, forces.elements(), strict=True))
 
 
 def posture(mechanism, at, rate):
@@ -432,10 +432,6 @@ def posture(mechanism, at, rate):
         named(name, q.names, "coordinate")
         drawn[name] -= rate**2 * (q[name] - column(value, f"the wish of {name!r}", 1)[0])
     return wish(mechanism, drawn)
-
-
-def _is_identity(E):
-    return bool(np.array_equal(np.array(ca.evalf(E)), np.eye(E.shape[0])))
 
 
 def _frame(frame):

@@ -147,7 +147,7 @@ class _Machine:
 
     def _find(self, q):
         """Addresses of the coordinates and velocities in MuJoCo's state."""
-        velocities = list(q.names if q.plain else q.velocity_names)
+        velocities = q.force_names
         placed, joints = set(), []
         for i in range(self.model.njnt):
             joint = self.model.joint(i)
@@ -194,7 +194,7 @@ class _Machine:
             u, d = forces[: len(self.plant.inputs)], forces[len(self.plant.inputs) :]
             state = np.concatenate([data.qpos[self.places], x[nq:]])
             E = self._directions(data.time, state, start)[: len(self.speeds) * len(u)].reshape(len(u), -1).T
-            data.qfrc_applied[self.speeds] = E @ u + self._disturbing(d)
+            data.qfrc_applied[self.speeds] = E @ u + d
             for at_q, at_v in self.free:
                 data.qfrc_applied[at_v : at_v + 3] = self._turn(at_q) @ data.qfrc_applied[at_v : at_v + 3]
             self.library.mj_step(self.model, data)
@@ -202,15 +202,6 @@ class _Machine:
         for at_q, at_v in self.free:
             speeds[at_v : at_v + 3] = self._turn(at_q).T @ speeds[at_v : at_v + 3]
         return np.concatenate([data.qpos[self.places], speeds[self.speeds]])
-
-    def _disturbing(self, forces):
-        """Generalised forces of the disturbances, in the order of the velocities."""
-        q = self.plant.mechanism.q
-        names = list(q.names if q.plain else q.velocity_names)
-        rows = np.zeros(q.n)
-        for name, force in zip(self.plant.disturbable, forces, strict=True):
-            rows[names.index(name)] += force
-        return rows
 
     def _turn(self, at_q):
         """The rotation of a free body (3, 3)."""

@@ -377,7 +377,7 @@ class Equations(Invariants):
         return list(self.r.mechanism.actuators), [self.r.actuation]
 
     def _reaction(self):
-        names = self.q.names if self.q.plain else self.q.velocity_names
+        names = self.q.force_names
         return [f"reaction_{name}" for name in names], [self.r.actuation]
 
     def _multipliers(self):
@@ -436,7 +436,7 @@ class Equations(Invariants):
         return ["reach"], [self.r.actuation, ca.vec(ca.densify(directions))]
 
     def _balance(self):
-        names = self.q.names if self.q.plain else self.q.velocity_names
+        names = self.q.force_names
         return [f"balance_{name}" for name in names], [self.r.mechanism.balance]
 
     def _coordinate_rates(self):

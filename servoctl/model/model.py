@@ -471,7 +471,7 @@ class Model:
     def signal_groups(self):
         """The group of each signal that is no jet, {signal name: key of `SIGNALS`}."""
         mechanism, program = self.reduction.mechanism, self.reduction.program
-        names = mechanism.q.names if mechanism.q.plain else mechanism.q.velocity_names
+        names = mechanism.q.force_names
         groups = dict.fromkeys(mechanism.outputs, "outputs") | dict.fromkeys(mechanism.inputs, "given_inputs")
         groups |= {"energy": "energy"}
         if program.by == "actuators":
@@ -576,7 +576,7 @@ class Model:
     def balances(self):
         """The coordinate or quasi-velocity, by index, of each row of L that is a row TᵀM of (3.18), by index."""
         q = self.reduction.mechanism.q
-        names = [f"balance of {name}" for name in (q.names if q.plain else q.velocity_names)]
+        names = [f"balance of {name}" for name in q.force_names]
         rows = enumerate(monitored_rows(self.reduction))
         return {a: names.index(row.name) for a, row in rows if row.name in names and row.order == 2 and not row.story}
 

@@ -71,7 +71,7 @@ def _hidden_and_free(model):
 
 
 def _rule(r):
-    names = r.mechanism.q.names if r.mechanism.q.plain else r.mechanism.q.velocity_names
+    names = r.mechanism.q.force_names
     dependent = ", ".join(names[i] for i in r.realisation.dependent) or "none"
     if r.program.by == "actuators":
         return f"(3.18) with T from ker Eᵀ; dependent: {dependent}; no rule for the reaction is assumed"

@@ -65,7 +65,7 @@ def plant(
     """
     require_kind(Mechanism, "mechanism", mechanism, "sv.Mechanism(q, gibbs, ...)")
     actuators = mechanism.actuators
-    names = mechanism.q.names if mechanism.q.plain else mechanism.q.velocity_names
+    names = mechanism.q.force_names
     values = mechanism.parameters.values(parameters)
     damping = numbers_by_name(damping, names, "coordinate", "damping", low=0.0)
     lag = numbers_by_name(lag, actuators, "actuator", "lag", positive=True)
@@ -111,7 +111,7 @@ def part_of(whole, mechanism):
     if any(row & places and not row <= places for row in (*source.couplings(), *rows)):
         return whole
     part = source.part(places)
-    names = part.q.names if part.q.plain else part.q.velocity_names
+    names = part.q.force_names
     by_actuator = ("limits", "rate_limits", "lag", "delay")
     numbers = {what: {n: v for n, v in getattr(whole, what).items() if n in part.actuators} for what in by_actuator}
     return plant(

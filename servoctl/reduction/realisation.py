@@ -18,6 +18,7 @@ from servoctl.reduction.appell import Realisation, plant_accelerations
 from servoctl.reduction.hidden import complete
 from servoctl.reduction.ranks import THRESHOLD, clean, decide_all, decide_each
 from servoctl.reduction.rows import balances, settle_alone
+from servoctl.spec.mechanism import inverse_directions
 
 
 def realisation(mechanism, program, constraints, points, context):
@@ -214,16 +215,14 @@ def _inverse_weights(mechanism, program):
 
 def _inertial(mechanism, L):
     """W⁻¹Pᵀ = E⁻¹Lᵀ for the weights EᵀM⁻¹E and P = L M⁻¹E, (m, k) SX."""
-    return ca.DM(np.linalg.inv(np.array(ca.evalf(mechanism.E)))) @ L.T
+    return inverse_directions(mechanism.E) @ L.T
 
 
 def _require_inertial(mechanism, program):
     """Refuse weights of the inertia where some velocity has no actuator of its own."""
-    E = mechanism.E
-    square = E.shape[0] == E.shape[1] and E.is_constant() and not mechanism.constraints
-    if not square or np.linalg.matrix_rank(np.array(ca.evalf(E))) < len(E.elements()) ** 0.5:
+    if inverse_directions(mechanism.E) is None or mechanism.constraints:
         raise SpecificationError(
-            f"weights='inertia' is set for {E.shape[1]} actuators and {E.shape[0]} velocities"
+            f"weights='inertia' is set for {len(mechanism.actuators)} actuators and {mechanism.q.n} velocities"
             f"{' with material constraints' if mechanism.constraints else ''}.",
             "The accelerations are chosen freely where each velocity has an actuator, along a constant direction.",
             do="Give weights by actuator, or program the further accelerations.",

@@ -218,7 +218,7 @@ def reduce(mechanism, program, guess=None, near=None, values=None):
     """
     require_parts(mechanism, program, guess)
     q = mechanism.q
-    names = q.names if q.plain else q.velocity_names
+    names = q.force_names
     balance = wished_balance(mechanism, program)
     forces = dict(zip(map(Balance, names), balance.elements(), strict=True))
     switches = Switches(q, {**program.residuals, **mechanism.constraints, **forces}, mechanism.parameters.symbols)

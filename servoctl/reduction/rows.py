@@ -117,7 +117,7 @@ class Row:
 
 def balances(q, expressions):
     """Rows of (3.18) from their expressions by index of the independent quasi-coordinate."""
-    names = q.names if q.plain else q.velocity_names
+    names = q.force_names
     return [
         Row(e, max(q.order(e), 0), f"balance of {names[i]}", "dynamics", uses={Balance(): 0})
         for i, e in expressions.items()

@@ -183,7 +183,7 @@ class Robot:
         NameUnknown
             If an actuator names no joint.
         """
-        names = self.q.names if self.q.plain else self.q.velocity_names
+        names = self.q.force_names
         total = {name: ca.SX(0) for name in names}
         for name, value in mapping(forces, "The forces").items():
             if name not in total:

@@ -59,6 +59,11 @@ class Coordinates:
         """The number of quasi-velocities."""
         return len(self.velocity_names)
 
+    @property
+    def force_names(self):
+        """Names of the generalised forces: those of the coordinates, or of quasi-velocities where these differ."""
+        return self.names if self.plain else self.velocity_names
+
     def __repr__(self):
         frame = "" if self.plain else f", quasi-velocities {' '.join(self.velocity_names)}"
         return f"Coordinates({' '.join(self.names)}{frame})"
@@ -164,8 +169,7 @@ class Coordinates:
         """Names of γ^(k), k >= 1, or of q for k = 0."""
         if _order(k) == 0:
             return self.names
-        base = self.names if self.plain else self.velocity_names
-        return tuple(jet_name(name, k, self.plain) for name in base)
+        return tuple(jet_name(name, k, self.plain) for name in self.force_names)
 
     def d(self, k=1):
         """The k-th time derivatives of the coordinates: a tuple of nq SX scalars.

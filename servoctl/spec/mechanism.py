@@ -424,7 +424,7 @@ class Mechanism:
             return ca.SX.zeros(self.q.n)
         if not isinstance(forces, dict):
             return self._known(forces, "the forces", self.q.n)
-        names = list(self.q.names if self.q.plain else self.q.velocity_names)
+        names = self.q.force_names
         total = ca.SX.zeros(self.q.n)
         for name, value in forces.items():
             if name not in names:
@@ -555,6 +555,20 @@ def _restored(q, parameters, content):
 def _latest(mechanism):
     """The first of equal mechanisms from other processes, so that models derived from it are shared."""
     return mechanism
+
+
+def inverse_directions(E):
+    """E⁻¹, (n, n) DM, where each velocity has an actuator along a constant direction; else None.
+
+    Parameters
+    ----------
+    E : (n, m) SX
+        Directions of the actuators.
+    """
+    if E.shape[0] != E.shape[1] or not E.is_constant():
+        return None
+    numbers = np.array(ca.evalf(E))
+    return ca.DM(np.linalg.inv(numbers)) if np.linalg.matrix_rank(numbers) == len(numbers) else None
 
 
 def require_known(expression, mechanism, what):

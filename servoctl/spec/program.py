@@ -1,6 +1,5 @@
 """Program (servo) constraints of any order."""
 
-
 import casadi as ca
 import numpy as np
 

@@ -39,7 +39,7 @@ def turn(angle, axis, start=None):
         If the axis is zero or the start is no rotation.
     """
     (angle,) = column(angle, "the angle", 1)
-    axis = np.asarray(as_numbers(axis), float) if as_numbers(axis) is not None else np.zeros(0)
+    axis = as_numbers(axis)
     if axis.shape != (3,) or not np.isfinite(axis).all() or not axis.any():
         raise SpecificationError(
             f"The axis of the turn is {axis.tolist()}.", "It has three numbers, not all zero.", axis=axis.tolist()
@@ -189,7 +189,7 @@ def _axis_and_angle(rotation, what="start and end"):
 
 def _matrix_of_numbers(value, what):
     """A rotation of numbers, (3, 3) array."""
-    array = np.asarray(as_numbers(value), float) if as_numbers(value) is not None else np.zeros(0)
+    array = as_numbers(value)
     proper = array.shape == (3, 3) and np.isfinite(array).all() and np.linalg.det(array) > 0.0
     if not proper or np.abs(array.T @ array - np.eye(3)).max() > ORTHONORMAL:
         raise SpecificationError(
