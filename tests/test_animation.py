@@ -1,8 +1,13 @@
 """Pictures of mechanisms: where their shapes are, that up is up, and what the files hold."""
 
 import io
+import json
 import pickle
+import re
+import shutil
 import stat
+import subprocess
+import xml.etree.ElementTree as ET
 
 import casadi as ca
 import numpy as np
@@ -13,6 +18,7 @@ from refusals import refused
 
 import servoctl as sv
 from servoctl.errors import NameUnknown, ServoError, SpecificationError
+from servoctl.figures import page_motion, style
 from servoctl.figures.animation import MOST_FRAMES, shows_mechanism
 from servoctl.gallery import gallery
 from servoctl.spec.shapes import heights, moved
@@ -220,6 +226,72 @@ def test_a_long_motion_is_shown_faster(crane):
     shown = sv.plots.animate(run, fps=fps)
     assert len(shown.t) == MOST_FRAMES and shown.pace == pytest.approx(40 * fps / (MOST_FRAMES - 1))
     assert "times as fast" in repr(shown)
+
+
+def drawn_by_its_script(page, frame):
+    """What the script of a page writes into the clock, and into each moving line, at a frame."""
+    if shutil.which("node") is None:
+        pytest.skip("needs node")
+    data = re.search('<script type="application/json">(.*?)</script>', page)[1]
+    script = re.search("<script>(.*?)</script>", page, re.S)[1]
+    elements = "Array.from({length: %d}, () => ({setAttribute(name, value) { this[name] = value; }}))"
+    moving, trails = (elements % len(json.loads(data)[name]) for name in ("shapes", "trails"))
+    program = f"""
+        const moving = {moving}, trails = {trails}, button = {{}}, input = {{value: 0}}, output = {{}}, queue = [];
+        const found = {{"script[type='application/json']": {{textContent: {json.dumps(data)}}}, button, input, output}};
+        const figure = {{querySelector: (s) => found[s], querySelectorAll: (s) => (s === ".moving" ? moving : trails)}};
+        globalThis.document = {{currentScript: {{parentElement: figure}}}};
+        globalThis.requestAnimationFrame = (call) => queue.push(call);
+        {script}
+        queue.shift()(500);
+        queue.shift()(500 + {frame} * 1000 / JSON.parse({json.dumps(data)}).fps + 1);
+        button.onclick();
+        queue.shift()(1e9);
+        console.log(JSON.stringify([output.textContent, button.textContent, input.value, moving, trails]));
+    """
+    done = subprocess.run(["node", "-e", program], capture_output=True, text=True, check=True)
+    return json.loads(done.stdout)
+
+
+def points_of(text):
+    return np.array([point.split(",") for point in text.split()], dtype=float)
+
+
+def test_a_page_moves_the_lines_by_its_script(crane, tmp_path):
+    shown = sv.plots.animate(crane, fps=20)
+    page = shown.save(tmp_path / "crane.html").read_text(encoding="utf-8")
+    assert not re.search("href|https?://|src=", page)
+    drawing = ET.fromstring(re.search("<svg.*?</svg>", page, re.S)[0])
+    bar = points_of(drawing.findall("polyline")[-1].get("points"))
+    scale = (bar[1] - bar[0])[0] / float(drawing.find("text").text.split()[0])  # units of the drawing in a metre
+    clock, button, frame, moving, (trail,) = drawn_by_its_script(page, 15)
+    assert (clock, button, frame) == ("t = 0.75 s", "Play", 15)
+    load, start = points_of(moving[-1]["points"]), points_of(drawing.findall("polyline")[-2].get("points"))
+    assert np.array_equal(load[0], load[1])  # a dot, drawn last
+    moved_by = [crane["X"][30] - crane["X"][0], crane["Z"][30] - crane["Z"][0]]  # Z points down, as the drawing's y
+    assert load[0] - start[0] == pytest.approx(scale * np.array(moved_by), abs=1.0) and crane.t[30] == 0.75
+    assert np.array_equal(points_of(trail["points"])[-1], load[0]) and len(trail["points"].split()) == 16
+
+
+def test_a_page_of_many_points_leaves_frames_out(crane, monkeypatch):
+    shown = sv.plots.animate(crane, fps=40)
+    whole, t = shown.html(), shown.t
+    monkeypatch.setattr(page_motion, "MOST_POINTS", 40 * 10)
+    data = json.loads(re.search('<script type="application/json">(.*?)</script>', shown.html())[1])
+    every = round(shown.fps / data["fps"])
+    assert every > 1 and data["t"] == pytest.approx(t[::every]) and len(shown.html()) < len(whole)
+    assert {len(frames) for frames in (*data["shapes"], *data["trails"])} == {len(data["t"])}
+
+
+@pytest.mark.parametrize("name", ["crane-3d", "appell-hamel", "wheeled-robot", "two-cars", "vtol"])
+def test_bodies_lie_below_lines_and_lines_below_dots_in_a_page(name, gallery_model):
+    model, scene = gallery_model(name), gallery[name]
+    run = sv.simulate(model, model.start(**scene.start, guess=scene.guess), (0.0, 0.2), t_eval=np.linspace(0.0, 0.2, 5))
+    drawing = ET.fromstring(re.search("<svg.*?</svg>", sv.plots.animate(run).html(), re.S)[0])
+    looks = ["body" if line.get("fill") != "none" else "dot" if line.get("stroke") == style.COLOURS[1] else "line"
+             for line in drawing.findall("polyline") if line.get("class") == "moving"]  # fmt: skip
+    assert looks == sorted(looks, key=["body", "line", "dot"].index) and looks
+    assert (drawing.find("text") is None) == (name in ("crane-3d", "appell-hamel"))  # a projection has no scale
 
 
 def test_films_are_written_by_ffmpeg(crane, tmp_path, monkeypatch):

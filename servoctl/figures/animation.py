@@ -14,6 +14,7 @@ from servoctl.checks import as_path, finite, require_kind, text, texts, whole
 from servoctl.errors import ServoError, SpecificationError, unknown
 from servoctl.figures import style
 from servoctl.figures.names import planes_of
+from servoctl.figures.page_motion import moving_drawing
 from servoctl.run import Run
 from servoctl.spec.shapes import heights, moved
 from servoctl.values import Value
@@ -27,7 +28,7 @@ SLIM = 0.12  # ratio of the sides below which poses would hide each other
 SLIMMEST = 0.3  # least ratio of its sides
 VIEW = np.array([[0.866, -0.5, 0.0], [0.25, 0.433, 0.866]])  # parallel projection of space, from 30° above
 GREY, LINE, BODY, POINT = "#9A9A9A", "#404040", style.COLOURS[0], style.COLOURS[1]
-SUFFIXES = (".gif", ".mp4")
+SUFFIXES = (".gif", ".html", ".mp4")
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,13 +81,20 @@ class Animation(Value):
         frames[0].save(file, "GIF", save_all=True, append_images=frames[1:], duration=milliseconds, loop=0)
         return file.getvalue()
 
+    def html(self) -> str:
+        """The animation as a part of an HTML page: lines that a script moves, with a slider for the time."""
+        low, high = _corners(self)
+        kinds = {name: "ground" if _still(points, self) else _kind(points) for name, points in self.shapes.items()}
+        return moving_drawing(self, low, high, kinds)
+
     def save(self, path):
         """Write the animation to a file.
 
         Parameters
         ----------
         path : str or Path
-            It ends in .gif, which is added if there is no suffix, or .mp4, which needs ffmpeg.
+            It ends in .gif, which is added if there is no suffix, in .html, a page with a slider for the time, or in
+            .mp4, which needs ffmpeg.
 
         Returns
         -------
@@ -111,6 +119,8 @@ class Animation(Value):
         with writing(path, "animation"):
             if path.suffix.lower() == ".gif":
                 path.write_bytes(self.gif())
+            elif path.suffix.lower() == ".html":
+                path.write_text(f'<!DOCTYPE html>\n<meta charset="utf-8">\n{self.html()}', encoding="utf-8")
             else:
                 self._film(path)
         return path
@@ -383,13 +393,23 @@ def _extent(picture):
     return (points.min(axis=1), points.max(axis=1)) if points.size else (np.zeros(2), np.ones(2))
 
 
-def _axes(picture, ax, title=""):
-    """Axes with equal scales, the ground and the programmed paths."""
+def _corners(picture):
+    """Corners (2,) of the picture with its border, at least a third as high as wide and the other way round."""
     low, high = _extent(picture)
     side = max(float((high - low).max()), 1e-9)
     low, high = low - BORDER * side, high + BORDER * side
     middle = (low + high) / 2
-    low, high = np.minimum(low, middle - SLIMMEST * side / 2), np.maximum(high, middle + SLIMMEST * side / 2)
+    return np.minimum(low, middle - SLIMMEST * side / 2), np.maximum(high, middle + SLIMMEST * side / 2)
+
+
+def _kind(points):
+    """How a shape (2, n, N), or a point (2, N), is drawn."""
+    return "dot" if points.ndim == 2 else "body" if _is_body(points) else "line"
+
+
+def _axes(picture, ax, title=""):
+    """Axes with equal scales, the ground and the programmed paths."""
+    low, high = _corners(picture)
     across, up = (high - low) * min(ACROSS / (high - low)[0], UP / (high - low)[1])
     if ax is None:
         _, ((ax,),) = style.figure(up + 0.6 + 0.35 * bool(title), width=across + 0.7)
@@ -425,11 +445,11 @@ class _Moving:
     """The artist of a shape: a dot, a line or a body; `show(i)` moves it to the i-th instant."""
 
     def __init__(self, ax, points, alpha=1.0):
-        self.points = points if points.ndim == 3 else points[:, np.newaxis]
-        self.closed = _is_body(self.points)
+        kind, self.points = _kind(points), points if points.ndim == 3 else points[:, np.newaxis]
+        self.closed = kind == "body"
         if self.closed:
             (self.artist,) = ax.fill([], [], facecolor=BODY, edgecolor=LINE, alpha=0.55 * alpha, zorder=4)
-        elif self.points.shape[1] == 1:
+        elif kind == "dot":
             (self.artist,) = ax.plot([], [], "o", color=POINT, markersize=8, alpha=alpha, zorder=6)
         else:
             (self.artist,) = ax.plot([], [], color=LINE, linewidth=2.2, alpha=alpha, zorder=5, solid_joinstyle="round")

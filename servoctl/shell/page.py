@@ -10,7 +10,6 @@ NAME = "index.html"
 VERSIONS = ("", "version")
 EXTREMA = ("signal", "least", "at t [s]", "greatest", "at t [s]", "unit")
 PICTURES = {  # file: what it shows
-    "motion.gif": "The mechanism in motion, over the programmed path.",
     "motion.png": "The mechanism at instants from the start (light) to the end (dark), over the programmed path.",
     "path.png": "The path.",
     "coordinates.png": "Coordinates.",
@@ -27,7 +26,7 @@ pre { background: #f5f5f5; padding: .8rem; overflow-x: auto; font-size: 13px; } 
 """
 
 
-def write_page(folder, facts, units, verification, report):
+def write_page(folder, facts, units, verification, report, motion):
     """Write index.html from the facts of summary.json, the report and the pictures in the folder.
 
     Parameters
@@ -37,13 +36,16 @@ def write_page(folder, facts, units, verification, report):
     units : dict of str to str
     verification : Verification or None
     report : str
+    motion : str
+        HTML of the mechanism in motion, or "".
     """
     scene, command = facts["scene"], shlex.join(["servoctl", *facts["command"]])
     parts = [
         f"<h1>{escape(scene['name'])}</h1>",
         f"<p>{escape(scene['description'])}</p>",
         f'<p class="verdict">{escape(_outcome(facts, verification))}</p>',
-        *_pictures(folder, command),
+        motion,
+        *_pictures(folder),
         _chapter("What was computed", _rows_of(("", "value"), _asked(facts))),
         _chapter("Extrema", _rows_of(EXTREMA, _ends(facts, units))),
         *_of_loop(facts, units),
@@ -63,15 +65,13 @@ def _outcome(facts, verification):
     return f"{facts['verdict'][:1].upper()}{facts['verdict'][1:]}; {facts['message']}; {verified}."
 
 
-def _pictures(folder, command):
-    """Figures with their pictures inside; where there is no animation, how to make one."""
+def _pictures(folder):
+    """Figures with their pictures inside."""
     present = {name: words for name, words in PICTURES.items() if (folder / name).exists()}
     for name, words in present.items():
         content = base64.b64encode((folder / name).read_bytes()).decode()
         source = f"data:image/{name.rpartition('.')[2]};base64,{content}"
         yield f'<figure><img alt="{name}" src="{source}"><figcaption>{escape(words)}</figcaption></figure>'
-    if "motion.png" in present and "motion.gif" not in present:
-        yield f"<p>The animation: <code>{escape(command)} --animate</code></p>"
 
 
 def _asked(facts):

@@ -38,7 +38,7 @@ def add_run(run):
     run.add_argument("--samples", type=samples, metavar="N", help="equally spaced samples of the run")
     run.add_argument("--no-verify", action="store_true", help="leave out the check against the full mechanism")
     run.add_argument("--no-figures", action="store_true", help="leave out the figures")
-    run.add_argument("--animate", action="store_true", help=f"write the mechanism in motion: {ANIMATION}")
+    run.add_argument("--animate", action="store_true", help=f"write the motion to a file, too: {ANIMATION}")
     loop.add_loop(run)
     run.set_defaults(command=_run)
 
@@ -70,8 +70,8 @@ def _compute(args, name, scene, folder):
     facts["closed_loop"] = loop.facts(closed)
     folder.write_json("summary.json", facts)
     folder.write_text("report.txt", report.text)
-    _pictures_of(args, folder, scene, name, run, closed)
-    folder.write(lambda path: write_page(path, jsonable(facts), scene.units, verification, report.text))
+    motion = _pictures_of(args, folder, scene, name, run, closed)
+    folder.write(lambda path: write_page(path, jsonable(facts), scene.units, verification, report.text, motion))
     print(f"{', '.join(f for f in (*FILES, *LOOP_FILES, ANIMATION) if (folder.path / f).exists())} in {folder.path}")
     if not run.success:
         complain(f"The motion ended early, at t = {run.t[-1]:.6g} s; what was computed is kept.")
@@ -86,7 +86,7 @@ def _compute(args, name, scene, folder):
 
 @stage("drawing")
 def _pictures_of(args, folder, scene, name, run, closed):
-    """Write the figures, and the animation if it is wanted; the mechanism moves as in the loop, else as planned."""
+    """Write the figures, and the GIF if it is wanted; returns the motion as HTML: in the loop if there is one."""
     moving = run if closed is None else closed
     shown, left_out = shows_mechanism(moving), ("path",) if run.model.reduction.mechanism.shapes else ()
     if not args.no_figures:
@@ -96,14 +96,14 @@ def _pictures_of(args, folder, scene, name, run, closed):
     if not shown:
         if args.animate:
             complain("There is no animation: the mechanism has no shapes=, and no outputs or coordinates like X and Z.")
-        return
+        return ""
     if not args.no_figures:
         what = f"{name}: motion" + (", in the closed loop" if closed is not None else "")
         axes = sv.figures.stroboscope(moving, title=what)
         folder.write(lambda path: write_png(axes.figure, path / "motion.png"))
     if args.animate:
-        animation = sv.figures.animate(moving)
-        folder.write(lambda path: animation.save(path / ANIMATION))
+        folder.write(lambda path: sv.figures.animate(moving).save(path / ANIMATION))
+    return "" if args.no_figures else sv.figures.animate(moving).html()
 
 
 def _planned(args, motion, report):
