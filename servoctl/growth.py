@@ -17,7 +17,7 @@ import numpy as np
 
 from servoctl.checks import positive
 from servoctl.errors import SpecificationError
-from servoctl.methods.flow import flow
+from servoctl.methods.flow import deviations
 from servoctl.methods.kinks import SMOOTHER, stays_on_kink
 from servoctl.methods.stability import stability_function
 from servoctl.model.model import Model
@@ -39,8 +39,11 @@ TURNED = 0.75  # squared sines of the angles between tangent spaces at an end of
 DENSE = 3  # samples for each instant, with which instants are samples
 DEFECT = 1e-3  # of the sizes of the states: largest error, over an interval of samples, of states between them
 BLOCKS = 32  # instants between which growth is measured, as all pairs of them
+MODERATE = 1e8  # ‖P‖ ‖P⁻¹‖ of propagators P from the start, below which those between all instants follow from them
+SQUARINGS = 6  # of a matrix, from which its largest eigenvalue follows within a part of 2^-SQUARINGS of its logarithm
 SWEEPS, BALANCED = 30, 0.01  # of balancing, at most; until sums of rows and of columns agree to one percent
 BOUNDED_AT, BOUNDED_IN = 16, 4  # intervals between the instants of a bound of the growth; sweeps of its balancing
+_SETTINGS = MODERATE, SWEEPS, BALANCED, TINY, SQUARINGS  # of the growth in C
 SHARED = 0.5  # of the largest part that is independent of states chosen before: with it a state is fit as the next one
 MATTERS = 1e-3  # of the states' scales: an error as large as this matters
 STEP_ERROR = 1e-9  # of the steps of a motion, unless its method has another
@@ -292,21 +295,20 @@ def quiet_by_series(model, run, last):
     x, size = _states(model, run), _sizes(model, run)
     if len(run.variants) > 1 or switching(model) is not None or not np.isfinite(x[:, [0, -1]]).all():
         return False
+    N, lost = _kernel(model, run.t[[0, -1]], x[:, [0, -1]], size)
     between = np.linspace(run.t[0], run.t[-1], BLOCKS + 1)
-    along = flow(model, last, between, x[:, 0], run.knots, size)
-    if along is None or not _small(model, run, np.abs(along.x[:, -1:] - x[:, -1:])):
+    moved = None if lost.any() else deviations(model, last, between, x[:, 0], run.knots, size, N[0])
+    if moved is None or not _small(model, run, np.abs(moved.x - x[:, -1])[:, None]):
         return False
-    N, lost = _kernel(model, along.t, along.x, size)
-    moved = None if lost.any() else along.moved(N[:-1], size)
-    if moved is None:
-        return False
-    steps = N[1:].swapaxes(1, 2) @ moved
-    if not (_frobenius(moved - N[1:] @ steps) <= DEFECT * _frobenius(moved)).all():
+    end = moved.Q[-1]
+    if not _frobenius(end - N[1] @ (N[1].T @ end)) <= DEFECT:
         return False
     forward = np.sign(between[-1] - between[0])
-    ends = np.searchsorted(forward * along.t, forward * between)
-    corners = Tangents(model.state_names, along.t, size, N, N)
-    return not _unstable(corners, steps, *_growth(corners, _propagators(steps, ends)))
+    ends = np.searchsorted(forward * moved.t, forward * between)
+    corners = Tangents(model.state_names, moved.t, size, moved.Q, moved.Q)
+    logs, scale = moved.growth(*_SETTINGS)
+    growth = (ends, logs, scale) if scale is not None else _growth(corners, _propagators(moved.R, ends))
+    return not _unstable(corners, moved.R, *growth)
 
 
 def _spread(t, x):
