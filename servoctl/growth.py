@@ -298,14 +298,14 @@ def quiet_by_series(model, run, last):
     N, lost = _kernel(model, run.t[[0, -1]], x[:, [0, -1]], size)
     between = np.linspace(run.t[0], run.t[-1], BLOCKS + 1)
     moved = None if lost.any() else deviations(model, last, between, x[:, 0], run.knots, size, N[0])
-    if moved is None or not _small(model, run, np.abs(moved.x - x[:, -1])[:, None]):
+    if moved is None or not _small(np.abs(moved.x - x[:, -1]), size):
         return False
-    end = moved.Q[-1]
-    if not _frobenius(end - N[1] @ (N[1].T @ end)) <= DEFECT:
+    Q = moved.Q
+    if not _frobenius(Q[-1] - N[1] @ (N[1].T @ Q[-1])) <= DEFECT:
         return False
     forward = np.sign(between[-1] - between[0])
     ends = np.searchsorted(forward * moved.t, forward * between)
-    corners = Tangents(model.state_names, moved.t, size, moved.Q, moved.Q)
+    corners = Tangents(model.state_names, moved.t, size, Q, Q)
     logs, scale = moved.growth(*_SETTINGS)
     growth = (ends, logs, scale) if scale is not None else _growth(corners, _propagators(moved.R, ends))
     return not _unstable(corners, moved.R, *growth)
@@ -506,12 +506,12 @@ def _instants(model, run, finite, count):
     t, z = run.t[starts] + s * h, x[:, starts] + s * chord + s * (1 - s) * ((1 - s) * a - s * b)
     slope = chord + (1 - s) * (1 - 3 * s) * a + s * (3 * s - 2) * b
     gap = np.abs(slope - h * _rates(model, run, starts, t, z))
-    return (starts, t, z) if _small(model, run, gap) else None
+    return (starts, t, z) if _small(gap, _sizes(model, run)[:, None]) else None
 
 
-def _small(model, run, errors):
-    """Whether errors of the states (n_x, N) are small against their sizes, or those that integration leaves anyway."""
-    return bool(np.all(errors <= DEFECT * _sizes(model, run)[:, None] + STEP_ERROR))
+def _small(errors, sizes):
+    """Whether errors of the states are small against their sizes, or those that integration leaves anyway."""
+    return bool(np.all(errors <= DEFECT * sizes + STEP_ERROR))
 
 
 def _irregular(count):
@@ -529,7 +529,7 @@ def _stepped(model, run, finite, steps):
     states = [x[:, starts]]
     for a, h in zip(t[:-1], np.diff(t, axis=0), strict=True):
         states.append(_advanced(model, run, starts, a, states[-1], h))
-    if not _small(model, run, np.abs(states[-1] - x[:, ends])):
+    if not _small(np.abs(states[-1] - x[:, ends]), _sizes(model, run)[:, None]):
         return None
     between = np.array(states[:-1]).transpose(1, 2, 0).reshape(len(x), -1)
     samples, instants = np.append(np.repeat(starts, steps), ends[-1]), np.append(t[:-1].T, run.t[ends[-1]])

@@ -172,8 +172,9 @@ def _with_own(method, span, times, count):
     fixed_steps = method is not None and isinstance(as_method(method), RungeKutta)
     if times is None or fixed_steps:
         return None
-    gaps = np.abs(np.diff(times, prepend=span[0], append=span[1]))
-    if gaps[0] == gaps[-1] == 0.0 and (count - 1) * gaps.max() <= abs(span[1] - span[0]) * (1 + SAME_TIME):
+    gap = np.abs(times[1:] - times[:-1]).max(initial=0.0)
+    whole = times[0] == span[0] and times[-1] == span[1]
+    if whole and (count - 1) * gap <= abs(span[1] - span[0]) * (1 + SAME_TIME):
         return None
     return np.union1d(times, np.linspace(*span, count))[:: 1 if span[1] > span[0] else -1]
 
