@@ -13,7 +13,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from servoctl.codegen.function import Compiled
+from servoctl.codegen.matrices import of_any_size
 from servoctl.codegen.native import pointer
 from servoctl.methods.motion import breakpoints
 from servoctl.methods.taylor import series_loop
@@ -40,7 +40,6 @@ class Deviations:
         State at the last one.
     """
 
-    f: Compiled
     cuts: np.ndarray
     start: np.ndarray
     log: np.ndarray
@@ -63,12 +62,12 @@ class Deviations:
         return self.log[:, 1 + self.start.size :].reshape(-1, len(self.start), len(self.start))
 
     def growth(self, *settings):
-        """ln of the growth between all cuts and the scale of the states, as `growth._growth`; see growth.h.
+        """ln of the growth between all cuts and the scale of the states, as `growth._growth`; see growth.c.
 
         Parameters
         ----------
         *settings : float
-            Those of growth.h.
+            Those of growth.c.
 
         Returns
         -------
@@ -77,13 +76,13 @@ class Deviations:
             Both are None where propagators are not moderate.
         """
         n, (free, n_x) = len(self.cuts), self.start.shape
-        work = np.empty(3 * (n + 1) * free**2 + n_x * free * (free + n) + n * free + 2 * n * (n + 1))
+        sizes = 3 * (n + 1) * free**2, n_x * (free * (free + n + 2) + n_x + 2), n * (free + 2 * n + 2)
+        settings, work = np.array(settings), np.empty(sum(sizes))
         logs, scale = np.full((n, n), -np.inf), np.empty(n_x)
-        arrays = map(pointer, (np.array(settings), work, scale, logs))
-        run, counts = self.f.native("growth"), [ctypes.c_int64(count) for count in (len(self.log), n, free)]
-        run.restype = ctypes.c_int64
-        given = counts[0], pointer(self.log), counts[1], pointer(self.cuts), pointer(self.start), counts[2]
-        return (logs, scale) if run(*given, *arrays) else (None, None)
+        steps, n_x, n, free = map(ctypes.c_int64, (len(self.log), n_x, n, free))
+        given = steps, n_x, pointer(self.log), n, pointer(self.cuts), pointer(self.start), free
+        found = of_any_size("growth", "growth")(*given, *map(pointer, (settings, work, scale, logs)))
+        return (logs, scale) if found else (None, None)
 
 
 def deviations(model, last, t, x, knots, size, Q):
@@ -127,4 +126,4 @@ def deviations(model, last, t, x, knots, size, Q):
         if steps < 0:
             return None
         taken += steps
-    return Deviations(f, np.ascontiguousarray(t), start, log[:taken], x)
+    return Deviations(np.ascontiguousarray(t), start, log[:taken], x)

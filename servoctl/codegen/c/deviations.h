@@ -2,8 +2,12 @@
 #ifndef DEVIATIONS_H
 #define DEVIATIONS_H
 
+#include "orthonormal.h"
+
+#define COLD static __attribute__((cold)) /* called once for a motion: compiled for size, in a fifth of the time */
+
 /* The state a time h after the expansion by the series of all its entries; y holds the coefficients, c those of gamma. */
-static inline void reached(const double *x, const double *y, const double *c, double h, double *result)
+COLD void reached(const double *x, const double *y, const double *c, double h, double *result)
 {
     double jet[NX + 1] = {0};
     for (int64_t k = LAST; k >= 1; k--) {
@@ -18,7 +22,7 @@ static inline void reached(const double *x, const double *y, const double *c, do
 }
 
 /* Of all entries, their terms of index k in these series; power is h^(k - TOP + 1). */
-static inline void terms(const double *y, const double *c, double h, int64_t k, double power, double *result)
+COLD void terms(const double *y, const double *c, double h, int64_t k, double power, double *result)
 {
     for (int64_t j = TOP - 1; j >= 1; j--, power *= h) {
         for (int64_t i = 0; i < N; i++) result[NQ + (j - 1) * N + i] = falling(k, j) * power * c[(k - 1) * N + i];
@@ -26,32 +30,9 @@ static inline void terms(const double *y, const double *c, double h, int64_t k, 
     for (int64_t i = 0; i < NQ; i++) result[i] = y[(k - 1) * NQ + i] * power;
 }
 
-/* Columns Q (F, NX) become Q R^-1 with Q'Q = 1, by Gram and Schmidt's process, twice; 0 where they are dependent. */
-static int orthonormal(int64_t F, double *Q, double *R)
-{
-    for (int64_t i = 0; i < F * F; i++) R[i] = 0;
-    for (int64_t j = 0; j < F; j++) {
-        double *v = Q + j * NX, square = 0;
-        for (int twice = 0; twice < 2; twice++) {
-            for (int64_t i = 0; i < j; i++) {
-                double along = 0;
-                for (int64_t m = 0; m < NX; m++) along += Q[i * NX + m] * v[m];
-                for (int64_t m = 0; m < NX; m++) v[m] -= along * Q[i * NX + m];
-                R[i * F + j] += along;
-            }
-        }
-        for (int64_t m = 0; m < NX; m++) square += v[m] * v[m];
-        const double size = sqrt(square);
-        if (!(size > 0 && isfinite(size))) return 0;
-        for (int64_t m = 0; m < NX; m++) v[m] /= size;
-        R[j * F + j] = size;
-    }
-    return 1;
-}
-
 /* Where F deviations of unit size, the rows of Q (F, NX), are a time h later: half the difference of the states from x
    with these times `nearby` added and subtracted. The last terms of the series are `left_out` of this at most, else 0. */
-static int moved(double t, const double *x, const double *p, double h, int64_t F, const double *sizes, double nearby,
+COLD int moved(double t, const double *x, const double *p, double h, int64_t F, const double *sizes, double nearby,
                  double left_out, double *Q)
 {
     const double powers[2] = {pow(h, LAST - TOP + 1), pow(h, LAST - TOP)};
@@ -81,8 +62,8 @@ static int moved(double t, const double *x, const double *p, double h, int64_t F
    as the tolerance allows. `settings` are rtol, atol, nearby and left_out. x and Q are those of the end on return, and each
    row of the log has the instant of a step's end, Q (F, NX) and R (F, F) there. Returns the number of steps, at most
    `most`; -1 where series are too short for the deviations, vanish, or are not finite. */
-int64_t FN(deviations)(int64_t count, const double *cuts, double *x, const double *p, const double *settings, int64_t F,
-                       const double *sizes, double *Q, int64_t most, double *log)
+__attribute__((cold)) int64_t FN(deviations)(int64_t count, const double *cuts, double *x, const double *p,
+                                             const double *settings, int64_t F, const double *sizes, double *Q, int64_t most, double *log)
 {
     const double log_rtol = log2(LAST_TERM * settings[0]), least = settings[1] / settings[0];
     double y[NY + 1], x_next[NX + 1];
@@ -99,7 +80,7 @@ int64_t FN(deviations)(int64_t count, const double *cuts, double *x, const doubl
             reached(x, y, c, signed_h, x_next);
             for (int64_t i = 0; i < NX; i++) if (!isfinite(x_next[i])) return -1;
             if (!moved(t, x, p, signed_h, F, sizes, settings[2], settings[3], Q)) return -1;
-            if (!orthonormal(F, Q, log + 1 + F * NX)) return -1;
+            if (!orthonormal(F, NX, Q, log + 1 + F * NX)) return -1;
             t = ends ? cuts[cut] : t + signed_h;
             for (int64_t i = 0; i < NX; i++) x[i] = x_next[i];
             settle(t, x, p);

@@ -147,4 +147,3 @@ void FN(taylor_jets)(const double *log, int64_t n, const int64_t *k, const doubl
 }
 
 #include "deviations.h"
-#include "growth.h"

@@ -1,6 +1,6 @@
-/* The growth of deviations between all pairs of instants of a motion. */
-#ifndef GROWTH_H
-#define GROWTH_H
+/* The growth of deviations between all pairs of instants of a motion with n_x states. */
+#include "unit.h"
+#include "orthonormal.h"
 
 typedef struct {
     double moderate, sweeps, balanced, tiny, squarings;
@@ -32,17 +32,17 @@ static inline void inverse(int64_t F, const double *A, double *B)
 }
 
 /* d that makes the sum of W_ij d_j^2/d_i^2 smallest, as `_balance` of growth.py. */
-static void balance(const double *W, const Settings *settings, double *scale)
+static void balance(int64_t n_x, const double *W, const Settings *settings, double *scale, double *work)
 {
-    double square[NX + 1];
-    for (int64_t i = 0; i < NX; i++) square[i] = 1;
+    double *square = work, *ratios = work + n_x;
+    for (int64_t i = 0; i < n_x; i++) square[i] = 1;
     for (int64_t sweep = 0; sweep < settings->sweeps; sweep++) {
-        double ratios[NX + 1], most = 1;
-        for (int64_t i = 0; i < NX; i++) {
+        double most = 1;
+        for (int64_t i = 0; i < n_x; i++) {
             double row = 0, column = 0;
-            for (int64_t j = 0; j < NX; j++) {
-                row += W[i * NX + j] * square[j];
-                column += W[j * NX + i] / square[j];
+            for (int64_t j = 0; j < n_x; j++) {
+                row += W[i * n_x + j] * square[j];
+                column += W[j * n_x + i] / square[j];
             }
             row /= square[i];
             column *= square[i];
@@ -50,9 +50,9 @@ static void balance(const double *W, const Settings *settings, double *scale)
             most = fmax(most, fmax(ratios[i], 1 / ratios[i]));
         }
         if (log(most) < settings->balanced) break;
-        for (int64_t i = 0; i < NX; i++) square[i] *= sqrt(sqrt(ratios[i]));
+        for (int64_t i = 0; i < n_x; i++) square[i] *= sqrt(sqrt(ratios[i]));
     }
-    for (int64_t i = 0; i < NX; i++) scale[i] = sqrt(square[i]);
+    for (int64_t i = 0; i < n_x; i++) scale[i] = sqrt(square[i]);
 }
 
 /* ln of the norm of Y (F, F), from the trace of (Y'Y)^(2^squarings), which exceeds that of the largest eigenvalue F times
@@ -79,43 +79,43 @@ static double log_norm(int64_t F, const double *Y, double squarings, double leas
     }
 }
 
-/* The sum of the squares of N(t) Phi(t, s) N(s)' over all pairs of instants t >= s; before is (F, F, NX). */
-static void sum_of_squares(int64_t n, int64_t F, const double *Q, const double *P, const double *inverses, double *before,
-                           double *W)
+/* The sum of the squares of N(t) Phi(t, s) N(s)' over all pairs of instants t >= s; before is (F, F, n_x), after and
+   earlier are (F, n_x), W is (n_x, n_x). */
+static void sum_of_squares(int64_t n, int64_t n_x, int64_t F, const double *Q, const double *P, const double *inverses,
+                           double *before, double *after, double *earlier, double *W)
 {
-    double after[NX][NX + 1], earlier[NX][NX + 1];
-    for (int64_t i = 0; i < NX * NX; i++) W[i] = 0;
-    for (int64_t i = 0; i < NX * F * F; i++) before[i] = 0;
-    for (int64_t t = 0; t < n; t++, Q += F * NX) {
-        for (int64_t j = 0; j < F; j++) for (int64_t i = 0; i < NX; i++) after[j][i] = earlier[j][i] = 0;
-        for (int64_t j = 0; j < F; j++) for (int64_t k = 0; k <= j; k++) for (int64_t i = 0; i < NX; i++) {
-            after[j][i] += Q[k * NX + i] * AT(P, t, k, j);
-            earlier[k][i] += Q[j * NX + i] * AT(inverses, t, k, j);
+    for (int64_t i = 0; i < n_x * n_x; i++) W[i] = 0;
+    for (int64_t i = 0; i < n_x * F * F; i++) before[i] = 0;
+    for (int64_t t = 0; t < n; t++, Q += F * n_x) {
+        for (int64_t i = 0; i < F * n_x; i++) after[i] = earlier[i] = 0;
+        for (int64_t j = 0; j < F; j++) for (int64_t k = 0; k <= j; k++) for (int64_t i = 0; i < n_x; i++) {
+            after[j * n_x + i] += Q[k * n_x + i] * AT(P, t, k, j);
+            earlier[k * n_x + i] += Q[j * n_x + i] * AT(inverses, t, k, j);
         }
         for (int64_t a = 0; a < F; a++) for (int64_t b = a; b < F; b++) {
-            double *sums = before + (a * F + b) * NX;
-            for (int64_t j = 0; j < NX; j++) sums[j] += earlier[a][j] * earlier[b][j];
-            for (int64_t i = 0; i < NX; i++) {
-                const double both = (a == b ? 1 : 2) * after[a][i] * after[b][i];
-                for (int64_t j = 0; j < NX; j++) W[i * NX + j] += both * sums[j];
+            double *sums = before + (a * F + b) * n_x;
+            for (int64_t j = 0; j < n_x; j++) sums[j] += earlier[a * n_x + j] * earlier[b * n_x + j];
+            for (int64_t i = 0; i < n_x; i++) {
+                const double both = (a == b ? 1 : 2) * after[a * n_x + i] * after[b * n_x + i];
+                for (int64_t j = 0; j < n_x; j++) W[i * n_x + j] += both * sums[j];
             }
         }
     }
 }
 
 /* Propagators P from the first instant to each of the n cuts, and the deviations there, from the log of `deviations`. */
-static void from_the_start(int64_t steps, const double *row, int64_t n, const double *cuts, const double *Q, int64_t F,
-                           double *P, double *corners, double *work)
+static void from_the_start(int64_t steps, int64_t n_x, const double *row, int64_t n, const double *cuts,
+                           const double *Q, int64_t F, double *P, double *corners, double *work)
 {
     for (int64_t i = 0; i < F * F; i++) P[i] = i % (F + 1) == 0;
-    for (int64_t i = 0; i < F * NX; i++) corners[i] = Q[i];
+    for (int64_t i = 0; i < F * n_x; i++) corners[i] = Q[i];
     for (int64_t i = 0; i < F * F; i++) work[i] = P[i];
-    for (int64_t step = 0, k = 1; step < steps && k < n; step++, row += 1 + F * (NX + F)) {
+    for (int64_t step = 0, k = 1; step < steps && k < n; step++, row += 1 + F * (n_x + F)) {
         double *next = P + k * F * F;
-        product(F, row + 1 + F * NX, work, next);
+        product(F, row + 1 + F * n_x, work, next);
         for (int64_t i = 0; i < F * F; i++) work[i] = next[i];
         if (row[0] != cuts[k]) continue;
-        for (int64_t i = 0; i < F * NX; i++) corners[k * F * NX + i] = row[1 + i];
+        for (int64_t i = 0; i < F * n_x; i++) corners[k * F * n_x + i] = row[1 + i];
         k++;
     }
 }
@@ -166,22 +166,23 @@ static void bounds(int64_t n, int64_t F, const double *A, const double *B, doubl
 /* ln of the growth between the n cuts of `deviations`, (n, n), from its log, and the scale of the states: as `_growth` of
    growth.py. Q are the deviations at the first cut. A pair of which the growth is less than between two that are no
    farther apart has a lower bound. Returns 0 beyond moderate propagators, of which products with inverses lose digits.
-   work has 3 n F^2 + 3 F^2 + NX F (F + n) + n F + 2 n (n + 1) numbers. */
-int64_t FN(growth)(int64_t steps, const double *log_of_steps, int64_t n, const double *cuts, const double *Q, int64_t F,
-                   const Settings *settings, double *work, double *scale, double *logs)
+   work has 3 n F^2 + 3 F^2 + n_x F (F + n) + n F + 2 n (n + 1) + n_x (2 F + 2 + n_x) numbers. */
+int64_t FN(growth)(int64_t steps, int64_t n_x, const double *log_of_steps, int64_t n, const double *cuts,
+                   const double *Q, int64_t F, const Settings *settings, double *work, double *scale, double *logs)
 {
     double *P = work, *inverses = P + n * F * F, *pair = inverses + n * F * F, *before = pair + 3 * F * F;
-    double *corners = before + NX * F * F, *least = corners + n * F * NX, *most = least + n * n, W[NX * NX + 1], best = 0;
+    double *corners = before + n_x * F * F, *least = corners + n * F * n_x, *most = least + n * n, best = 0;
+    double *after = most + n * n + n * F * F + n * F + 2 * n, *earlier = after + n_x * (F + 2), *W = earlier + n_x * F;
     const double least_part = exp2(-settings->squarings) * log((double)F);
-    from_the_start(steps, log_of_steps, n, cuts, Q, F, P, corners, pair);
+    from_the_start(steps, n_x, log_of_steps, n, cuts, Q, F, P, corners, pair);
     for (int64_t k = 0; k < n; k++) inverse(F, P + k * F * F, inverses + k * F * F);
     if (!moderate(n, F, P, inverses, settings->moderate)) return 0;
-    sum_of_squares(n, F, corners, P, inverses, before, W);
-    balance(W, settings, scale);
+    sum_of_squares(n, n_x, F, corners, P, inverses, before, after, earlier, W);
+    balance(n_x, W, settings, scale, after);
     for (int64_t k = 0; k < n; k++) {
-        double *columns = corners + k * F * NX;
-        for (int64_t i = 0; i < F * NX; i++) columns[i] /= scale[i % NX];
-        if (!orthonormal(F, columns, pair)) return 0;
+        double *columns = corners + k * F * n_x;
+        for (int64_t i = 0; i < F * n_x; i++) columns[i] /= scale[i % n_x];
+        if (!orthonormal(F, n_x, columns, pair)) return 0;
         product(F, pair, P + k * F * F, pair + F * F);
         for (int64_t i = 0; i < F * F; i++) P[k * F * F + i] = pair[F * F + i];
         inverse(F, P + k * F * F, inverses + k * F * F);
@@ -200,5 +201,3 @@ int64_t FN(growth)(int64_t steps, const double *log_of_steps, int64_t n, const d
     }
     return 1;
 }
-
-#endif
