@@ -54,7 +54,6 @@ from servoctl.run import SAME_TIME, Run
 STEPS_IN_SPAN = 2000  # steps of fixed length in a span if the method has no step
 MOST_STEPS = 10**8  # of fixed length: more would fill the memory with samples
 DRIFTED = 1e-2  # the same at the end of a motion that deserves a warning
-SHORT = 100  # steps of a motion along which propagators by its series take less time than a bound of the growth
 OFF = 1e-5  # residual relative to its gradient times the state, above which a start is inconsistent
 
 
@@ -276,7 +275,9 @@ def judged(run, tolerance=STEP_ERROR, again=None, by_series=None):
     """
     known = replace(run, verdict=partial(_verdict, tolerance=tolerance))
     try:
-        if not run.success or _quiet(run, by_series):
+        if not run.success or growth_bound(run.model, run) <= UNSTABLE:
+            return known
+        if by_series is not None and quiet_by_series(run.model, run, by_series):
             return known
         run = run if again is None else again()
         internal = internal_dynamics(run.model, run) if run.success else None
@@ -287,18 +288,6 @@ def judged(run, tolerance=STEP_ERROR, again=None, by_series=None):
     if internal.verdict == "unstable":
         warn_unstable(internal.sentence(tolerance))
     return replace(run, verdict=internal.facts(tolerance))
-
-
-def _quiet(run, by_series):
-    """Whether a bound of the growth or propagators by series, whichever takes less time first, settle a motion."""
-
-    def bounded():
-        return growth_bound(run.model, run) <= UNSTABLE
-
-    def moved():
-        return by_series is not None and quiet_by_series(run.model, run, by_series)
-
-    return moved() or bounded() if run.counters.get("steps", 0) <= SHORT else bounded() or moved()
 
 
 def _verdict(run, _=None, *, tolerance):

@@ -515,16 +515,6 @@ def test_neutral_growth_above_ten_takes_no_linearisation(span, t_eval, gallery_m
     assert not calls and 30 < sv.internal_dynamics(model, run).growth < 52
 
 
-@pytest.mark.parametrize("short, count", [(simulation.SHORT, 0), (1, 1)])
-def test_a_short_motion_is_judged_by_its_series_before_a_bound(short, count, gallery_model, monkeypatch):
-    model, scene = gallery_model("pendubot"), gallery["pendubot"]
-    calls, real = [], simulation.growth_bound
-    monkeypatch.setattr(simulation, "growth_bound", lambda *a: calls.append(a) or real(*a))
-    monkeypatch.setattr(simulation, "SHORT", short)
-    sv.simulate(model, model.start(**scene.start, guess=scene.guess), scene.t_span)
-    assert len(calls) == count
-
-
 @pytest.mark.parametrize("length", [9.0, 20.0])
 @pytest.mark.parametrize("samples", [41, 201, 1001, 4001])
 def test_blocks_of_unequal_times_do_not_make_growth_exponential(length, samples, gallery_model):
