@@ -17,7 +17,7 @@ import numpy as np
 
 from servoctl.checks import positive
 from servoctl.errors import SpecificationError
-from servoctl.methods.flow import flow
+from servoctl.methods.flow import deviations
 from servoctl.methods.kinks import SMOOTHER, stays_on_kink
 from servoctl.methods.stability import stability_function
 from servoctl.model.model import Model
@@ -39,8 +39,11 @@ TURNED = 0.75  # squared sines of the angles between tangent spaces at an end of
 DENSE = 3  # samples for each instant, with which instants are samples
 DEFECT = 1e-3  # of the sizes of the states: largest error, over an interval of samples, of states between them
 BLOCKS = 32  # instants between which growth is measured, as all pairs of them
+MODERATE = 1e8  # ‖P‖ ‖P⁻¹‖ of propagators P from the start, below which those between all instants follow from them
+SQUARINGS = 6  # of a matrix, from which its largest eigenvalue follows within a part of 2^-SQUARINGS of its logarithm
 SWEEPS, BALANCED = 30, 0.01  # of balancing, at most; until sums of rows and of columns agree to one percent
 BOUNDED_AT, BOUNDED_IN = 16, 4  # intervals between the instants of a bound of the growth; sweeps of its balancing
+_SETTINGS = MODERATE, SWEEPS, BALANCED, TINY, SQUARINGS  # of the growth in C
 SHARED = 0.5  # of the largest part that is independent of states chosen before: with it a state is fit as the next one
 MATTERS = 1e-3  # of the states' scales: an error as large as this matters
 STEP_ERROR = 1e-9  # of the steps of a motion, unless its method has another
@@ -292,21 +295,20 @@ def quiet_by_series(model, run, last):
     x, size = _states(model, run), _sizes(model, run)
     if len(run.variants) > 1 or switching(model) is not None or not np.isfinite(x[:, [0, -1]]).all():
         return False
+    N, lost = _kernel(model, run.t[[0, -1]], x[:, [0, -1]], size)
     between = np.linspace(run.t[0], run.t[-1], BLOCKS + 1)
-    along = flow(model, last, between, x[:, 0], run.knots, size)
-    if along is None or not _small(model, run, np.abs(along.x[:, -1:] - x[:, -1:])):
+    moved = None if lost.any() else deviations(model, last, between, x[:, 0], run.knots, size, N[0])
+    if moved is None or not _small(np.abs(moved.x - x[:, -1]), size):
         return False
-    N, lost = _kernel(model, along.t, along.x, size)
-    moved = None if lost.any() else along.moved(N[:-1], size)
-    if moved is None:
-        return False
-    steps = N[1:].swapaxes(1, 2) @ moved
-    if not (_frobenius(moved - N[1:] @ steps) <= DEFECT * _frobenius(moved)).all():
+    Q = moved.Q
+    if not _frobenius(Q[-1] - N[1] @ (N[1].T @ Q[-1])) <= DEFECT:
         return False
     forward = np.sign(between[-1] - between[0])
-    ends = np.searchsorted(forward * along.t, forward * between)
-    corners = Tangents(model.state_names, along.t, size, N, N)
-    return not _unstable(corners, steps, *_growth(corners, _propagators(steps, ends)))
+    ends = np.searchsorted(forward * moved.t, forward * between)
+    corners = Tangents(model.state_names, moved.t, size, Q, Q)
+    logs, scale = moved.growth(*_SETTINGS)
+    growth = (ends, logs, scale) if scale is not None else _growth(corners, _propagators(moved.R, ends))
+    return not _unstable(corners, moved.R, *growth)
 
 
 def _spread(t, x):
@@ -475,8 +477,10 @@ def _resolved(model, run):
             except np.linalg.LinAlgError:  # of rates near a singular state, which steps as long as these do not resolve
                 steps = longer = None
             if steps is not None and longer is not None:
-                propagators = _propagators(steps)
-                if _mismatch(steps, longer) < LOCAL and _agree(propagators, _propagators(longer)):
+                ends = _block_ends(tangents.t[::2])
+                propagators = _propagators(steps, ends)
+                coarse = _propagators(longer, ends[ends % 2 == 0] // 2)
+                if _mismatch(steps, longer) < LOCAL and _agree(propagators, coarse):
                     return tangents, steps, propagators
         count *= 2
     return None
@@ -502,12 +506,12 @@ def _instants(model, run, finite, count):
     t, z = run.t[starts] + s * h, x[:, starts] + s * chord + s * (1 - s) * ((1 - s) * a - s * b)
     slope = chord + (1 - s) * (1 - 3 * s) * a + s * (3 * s - 2) * b
     gap = np.abs(slope - h * _rates(model, run, starts, t, z))
-    return (starts, t, z) if _small(model, run, gap) else None
+    return (starts, t, z) if _small(gap, _sizes(model, run)[:, None]) else None
 
 
-def _small(model, run, errors):
-    """Whether errors of the states (n_x, N) are small against their sizes, or those that integration leaves anyway."""
-    return bool(np.all(errors <= DEFECT * _sizes(model, run)[:, None] + STEP_ERROR))
+def _small(errors, sizes):
+    """Whether errors of the states are small against their sizes, or those that integration leaves anyway."""
+    return bool(np.all(errors <= DEFECT * sizes + STEP_ERROR))
 
 
 def _irregular(count):
@@ -525,7 +529,7 @@ def _stepped(model, run, finite, steps):
     states = [x[:, starts]]
     for a, h in zip(t[:-1], np.diff(t, axis=0), strict=True):
         states.append(_advanced(model, run, starts, a, states[-1], h))
-    if not _small(model, run, np.abs(states[-1] - x[:, ends])):
+    if not _small(np.abs(states[-1] - x[:, ends]), _sizes(model, run)[:, None]):
         return None
     between = np.array(states[:-1]).transpose(1, 2, 0).reshape(len(x), -1)
     samples, instants = np.append(np.repeat(starts, steps), ends[-1]), np.append(t[:-1].T, run.t[ends[-1]])
@@ -560,10 +564,10 @@ def _mismatch(steps, longer):
 
 def _agree(propagators, longer):
     """Whether the logarithms of the growth, and of what is left at the end, are the same by steps twice as long."""
-    (ends, _, log), (half, _, other) = propagators, longer
-    fine, coarse = np.isin(ends, 2 * half), np.isin(2 * half, ends)  # between the same instants
-    a, b = log[np.ix_(fine, fine)], other[np.ix_(coarse, coarse)]
-    return all(abs(x - y) <= AGREE * (1 + abs(x)) for x, y in ((a.max(), b.max()), (a[0, -1], b[0, -1])))
+    (ends, _, log), (_, _, other) = propagators, longer
+    common = ends % 2 == 0
+    log = log[np.ix_(common, common)]
+    return all(abs(x - y) <= AGREE * (1 + abs(x)) for x, y in ((log.max(), other.max()), (log[0, -1], other[0, -1])))
 
 
 def _frobenius(matrices):
@@ -610,11 +614,17 @@ def _exponential(omega):
     return fraction @ fraction
 
 
+def _block_ends(t):
+    """Which ends t (S + 1,) of steps are nearest to those of BLOCKS blocks of equal times: even ones, or all if few."""
+    every = 2 if len(t) > 2 * BLOCKS else 1
+    ago = np.abs(t[::every] - t[0])
+    equal = np.linspace(0.0, ago[-1], min(BLOCKS, len(ago) - 1) + 1)
+    return every * np.unique(np.searchsorted((ago[1:] + ago[:-1]) / 2, equal))
+
+
 @np.errstate(all="ignore")
-def _propagators(steps, ends=None):
+def _propagators(steps, ends):
     """Ends of blocks of steps (n,), then propagators e^log Y between all of them, Y[s, t] (f, f) and log[s, t]."""
-    if ends is None:
-        ends = np.linspace(0, len(steps), min(BLOCKS, len(steps)) + 1).round().astype(int)
     n, f, longest = len(ends), steps.shape[1], np.diff(ends).max()
     block, of_block = np.tile(np.eye(f), (n - 1, 1, 1)), np.zeros(n - 1)
     for k in range(longest):
@@ -675,9 +685,12 @@ def _may_be_largest(t, least, most):
 
 
 def _windows(t):
-    """Which pairs of instants t (n,) lie at most the whole time apart, at most half of it, and so on; neighbours."""
+    """Which pairs of instants t (n,) lie at most the whole time apart, at most half of it, and so on; neighbours.
+
+    Times that differ by half of the least distance between instants, which are those of steps, are the same.
+    """
     ago = np.abs(t - t[:, None])
-    halves = ago.max() * (1 + SAME_TIME) / 2.0 ** np.arange(int(np.log2(len(t))))
+    halves = ago.max() / 2.0 ** np.arange(int(np.log2(len(t)))) + np.abs(np.diff(t)).min() / 2
     return [*(ago <= halves[:, None, None]), np.eye(len(t), k=1, dtype=bool)]
 
 
@@ -697,8 +710,8 @@ def _unstable(corners, steps, ends, logs, scale):
     first, end = ends[j], ends[j + 1]
     if logs[j, j + 1] <= limit or end == first + 1:
         return False
-    block = corners[first : end + 1]
-    return _unstable(block, steps[first:end], *_growth(block, _propagators(steps[first:end]), scale))
+    block, steps = corners[first : end + 1], steps[first:end]
+    return _unstable(block, steps, *_growth(block, _propagators(steps, _block_ends(block.t)), scale))
 
 
 def _balance(W, sweeps=SWEEPS):

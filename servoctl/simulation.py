@@ -171,8 +171,9 @@ def _with_own(method, span, times, count):
     fixed_steps = method is not None and isinstance(as_method(method), RungeKutta)
     if times is None or fixed_steps:
         return None
-    gaps = np.abs(np.diff(times, prepend=span[0], append=span[1]))
-    if gaps[0] == gaps[-1] == 0.0 and (count - 1) * gaps.max() <= abs(span[1] - span[0]) * (1 + SAME_TIME):
+    gap = np.abs(times[1:] - times[:-1]).max(initial=0.0)
+    whole = times[0] == span[0] and times[-1] == span[1]
+    if whole and (count - 1) * gap <= abs(span[1] - span[0]) * (1 + SAME_TIME):
         return None
     return np.union1d(times, np.linspace(*span, count))[:: 1 if span[1] > span[0] else -1]
 
@@ -219,8 +220,8 @@ def simulated(model, start, t_span, method=None, *, drift=None, t_eval=None, eve
         bar.close()
     with without_interruption() as pressed:  # a motion that is computed is kept
         end_at_other_orders(motion)
-        run = _run(model, motion, method, drift, knots, (t0, x0, t1))
-        run = replace(run, start=_as_started(model, start, t0, x0 if motion.start is None else motion.start))
+        started = _as_started(model, start, t0, x0 if motion.start is None else motion.start)
+        run = _run(model, motion, (method, drift, knots), started, t1)
         if t_eval is not None and isinstance(method, RungeKutta):
             run = _resample(run, times)
     if pressed and run.status == 0:
@@ -399,16 +400,17 @@ def _smaller_tolerances(model, method, motion):
     return absolute_tolerances(model, motion.t, x, method.rtol) if x.shape[1] > 1 else None
 
 
-def _run(model, motion, method, drift, knots, span):
-    """The run of a motion, to its end or its stop."""
+def _run(model, motion, settings, start, t1):
+    """The run of a motion towards t1 by (method, drift, knots), to its end or its stop."""
+    method, drift, knots = settings
     if not motion.pieces:  # interrupted or stopped before the first sample
-        motion.add(model, [span[0]], span[1][:, None], np.full((model.n, 1), np.nan))
+        motion.add(model, [start.t], start.values[:, None], np.full((model.n, 1), np.nan))
     t, jets = motion.t, motion.jets
     last = f"t = {t[-1]:.7g} s"
     if motion.stop is not None:
         status, message = -1, f"stopped: {str(motion.stop).split('. ')[0]}"
     elif motion.interrupted:
-        status, message = 1, f"interrupted at {last} of {span[2]:g} s; what was computed is kept"
+        status, message = 1, f"interrupted at {last} of {t1:g} s; what was computed is kept"
     elif motion.ended:
         status, message = 1, f"ended by the event {motion.ended!r} at t = {t[-1]:.9g} s"
     else:
@@ -420,7 +422,7 @@ def _run(model, motion, method, drift, knots, span):
         _set_at_knots(t, jets, facts["variants"], knots)
     facts["events"] = occurrences(motion.occurrences, model.names_to)
     facts |= {"success": status == 0 or bool(motion.ended), "status": status, "message": message}
-    return Run(t, jets, model.names_to(len(jets)), model, **facts)
+    return Run(t, jets, model.names_to(len(jets)), model, start=start, **facts)
 
 
 def _set_at_knots(t, jets, variants, knots):

@@ -4,6 +4,7 @@ import pickle
 import runpy
 import warnings
 from dataclasses import replace
+from functools import reduce
 from math import pi
 from pathlib import Path
 
@@ -14,10 +15,10 @@ from refusals import refused, warned
 from scipy.integrate import solve_ivp
 
 import servoctl as sv
-from servoctl import simulation
+from servoctl import growth, simulation
 from servoctl.gallery import cars, gallery, mass_on_car, passive_arm, spiral, vtol
 from servoctl.growth import growth_bound
-from servoctl.methods.flow import MOST_ALONG, flow
+from servoctl.methods.flow import MOST_ALONG, deviations
 
 
 def internal(pair, span, start, **guess):
@@ -428,34 +429,78 @@ def test_the_verdict_is_computed_when_it_is_read(tmp_path, gallery_model):
     assert sv.simulate(model, model.start(**start), (0.0, 1.0)).internal["verdict"] == "stable"
 
 
+def free_deviations(model, *names):
+    """Unit deviations (n_x, f) of states."""
+    return np.eye(len(model.state_names))[:, [model.state_names.index(name) for name in names]]
+
+
 @pytest.mark.parametrize("span", [(0.0, 12.0), (12.0, 0.0), (0.0, 0.05)], ids=str)
-def test_deviations_moved_by_series_are_those_of_mathieus_equation(span):
-    model, depth = passive(mathieu(0.6)), 0.6
-    run = sv.simulate(model, model.start(t=span[0], x=1e-3, dx=0.0), span)
-    along = flow(model, 17, np.linspace(*span, 9), run.jets[:4, 0], run.knots, np.ones(4))
-    assert np.isin(np.linspace(*span, 9), along.t).all() and np.all(np.diff(along.t) * (span[1] - span[0]) > 0)
-    free = np.eye(4)[:, [model.state_names.index(name) for name in ("x", "dx")]]
-    product = np.eye(2)
-    for step in free.T @ along.moved(np.tile(free, (len(along.t) - 1, 1, 1)), np.ones(4)):
-        product = step @ product
+@pytest.mark.parametrize("scale", [1.0, 1e6], ids=str)
+def test_deviations_moved_by_series_are_those_of_mathieus_equation(span, scale):
+    model, depth, instants = passive(mathieu(0.6), scale), 0.6, np.linspace(*span, 9)
+    x = model.start(t=span[0], x=1e-3 * scale, dx=0.0).values
+    size = np.where(np.char.find(model.state_names, "x") >= 0, scale, 1.0)
+    along = deviations(model, 17, instants, x, (), size, free_deviations(model, "x", "dx"))
+    assert np.isin(instants, along.t).all() and np.all(np.diff(along.t) * (span[1] - span[0]) > 0)
+    for Q in along.Q:
+        assert Q.T @ Q == pytest.approx(np.eye(2), abs=1e-12)
+    product = along.Q[-1] @ reduce(lambda P, R: R @ P, along.R)
 
     def rates(t, Y):
         return np.concatenate([Y[2:], -0.1 * Y[2:] - (1 + depth * np.cos(2 * t)) * Y[:2]])
 
     exact = solve_ivp(rates, span, np.eye(2).ravel(), rtol=1e-11, atol=1e-13).y[:, -1].reshape(2, 2)
-    assert product == pytest.approx(exact, rel=1e-4, abs=1e-4 * np.abs(exact).max())
+    moved = free_deviations(model, "x", "dx").T @ product
+    assert moved == pytest.approx(exact, rel=1e-4, abs=1e-4 * np.abs(exact).max())
 
 
 def test_series_that_are_too_short_move_no_deviations():
     model = passive(lambda x, v, t: -x)
-    x = model.start(x=1.0, dx=0.0).values
-    short = flow(model, 17, np.linspace(0.0, 8.0, 33), x, (), np.ones(4))
-    columns = np.eye(4)[None, :, :2]
-    assert short.moved(np.repeat(columns, len(short.t) - 1, axis=0), np.ones(4)) is not None
-    longer = replace(short, t=short.t[[0, -1]], x=short.x[:, [0, -1]], parameters=short.parameters[:, :1])
-    assert longer.moved(columns, np.ones(4)) is None
-    assert flow(model, 17, np.linspace(0.0, 2e4, 33), x, (), np.ones(4)) is None
-    assert flow(model, 17, np.linspace(0.0, 8.0, MOST_ALONG + 2), x, (), np.ones(4)) is None
+    x, Q = model.start(x=1.0, dx=0.0).values, free_deviations(model, "x", "dx")
+    assert deviations(model, 17, np.linspace(0.0, 8.0, 33), x, (), np.ones(4), Q) is not None
+    fast = passive(lambda x, v, t: -900 * x)  # at rest, so that its steps are those of the slow motion of y
+    assert deviations(fast, 17, np.linspace(0.0, 8.0, 3), fast.start(x=0.0, dx=0.0).values, (), np.ones(4), Q) is None
+    assert deviations(model, 17, np.linspace(0.0, 2e4, 33), x, (), np.ones(4), Q) is None
+    assert deviations(model, 17, np.linspace(0.0, 8.0, MOST_ALONG + 2), x, (), np.ones(4), Q) is None
+
+
+COMPARED = {
+    "appell-hamel": ((0.0, 10.0), 24),
+    "backwards": ((10.0, 0.0), 24),
+    "one second": ((0.0, 1.0), 24),
+    "low order": ((0.0, 10.0), 10),
+    "long": ((0.0, 60.0), 18),
+}
+
+
+@pytest.mark.parametrize("name", COMPARED)
+def test_the_growth_between_all_instants_is_that_of_products_of_propagators(name, gallery_model):
+    (t0, t1), last = COMPARED[name]
+    model = gallery_model("appell-hamel").with_parameters(I_x=0.1125, I_y=0.225)
+    x = model.start(t=t0, x=0.0, y=0.0, phi=0.0, theta=0.0, dphi=1.0, dtheta=0.5).values
+    size, cuts = 1 + np.arange(10.0), np.linspace(t0, t1, 33)
+    N = growth._kernel(model, np.array([t0]), x[:, None], size)[0][0]
+    along = deviations(model, last, cuts, x, (), size, N)
+    corners = growth.Tangents(model.state_names, along.t, size, along.Q, along.Q)
+    ends = np.flatnonzero(np.isin(along.t, cuts))
+    _, exact, scale = growth._growth(corners, growth._propagators(along.R, ends))
+    logs, other = along.growth(*growth._SETTINGS)
+    assert other == pytest.approx(scale, rel=1e-6)
+    for inside in growth._windows(cuts):
+        assert logs[inside].max() == pytest.approx(exact[inside].max(), abs=0.03)
+    assert along.growth(1.0, *growth._SETTINGS[1:]) == (None, None)  # no propagator is as moderate as this
+
+
+def test_propagators_that_shrink_beyond_rounding_are_multiplied_one_by_one():
+    model = passive(lambda x, v, t: -40 * v - 400 * x)
+    along = deviations(
+        model, 17, np.linspace(0, 4, 33), model.start(x=1.0, dx=0.0).values, (), np.ones(4),
+        free_deviations(model, "x", "dx"),
+    )  # fmt: skip
+    assert np.linalg.norm(reduce(lambda P, R: R @ P, along.R)) < 1e-20
+    assert along.growth(*growth._SETTINGS) == (None, None)
+    run = sv.simulate(model, model.start(x=1.0, dx=0.0), (0.0, 4.0), "Taylor")
+    assert growth.quiet_by_series(model, run, 17)
 
 
 @pytest.mark.parametrize("span, t_eval", [((0.0, 10.0), None), ((10.0, 0.0), None), ((0.0, 10.0), [5.0, 10.0])], ids=str)
@@ -468,3 +513,19 @@ def test_neutral_growth_above_ten_takes_no_linearisation(span, t_eval, gallery_m
     run = sv.simulate(model, start, span, t_eval=t_eval)
     assert growth_bound(model, run) > 10 or t_eval
     assert not calls and 30 < sv.internal_dynamics(model, run).growth < 52
+
+
+@pytest.mark.parametrize("length", [9.0, 20.0])
+@pytest.mark.parametrize("samples", [41, 201, 1001, 4001])
+def test_blocks_of_unequal_times_do_not_make_growth_exponential(length, samples, gallery_model):
+    """Over 9 s the wheel's errors grow by 2.97 in twice the time at most: three times would be exponential."""
+    model = gallery_model("appell-hamel").with_parameters(m=1.0, M=5.0, I_x=0.1125, I_y=0.225, a=0.3, b=0.1, rho=0.2)
+    start = model.start(x=0.0, y=0.0, phi=0.0, theta=0.0, dphi=1.0, dtheta=0.5)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        run = sv.simulate(model, start, (0.0, length), t_eval=np.linspace(0.0, length, samples))
+    found = sv.internal_dynamics(model, run)
+    assert run.internal["verdict"] == "neutral"
+    assert found.growth == pytest.approx({9.0: 33.5, 20.0: 80.0}[length], rel=0.05)
+    if samples > 41 or length > 9.0:  # 41 samples give 3.01, within the two percent of growth by longer steps
+        assert found.verdict == "neutral"

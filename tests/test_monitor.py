@@ -7,6 +7,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 import servoctl as sv
+from servoctl.gallery import gallery
 from servoctl.methods.bulk import BulkSteps
 from servoctl.methods.monitor import DEGRADED, NO_CHOICE, DenseStretch, Fine, Monitor, Repivot, Singular, Stretch
 
@@ -61,6 +62,17 @@ def test_quiet_steps_are_fine(circle):
     assert begun(circle, 0.0, round_the_circle(0.0)).inspect(sampled(circle, t, round_the_circle(t))) == Fine(14)
     none = Stretch(t[:1], round_the_circle(t[:1]), np.zeros((1, 0, 1)), functions(circle)[1])
     assert begun(circle, 0.0, round_the_circle(0.0)).inspect(none) == Fine(0)
+
+
+@pytest.mark.parametrize("scene", ["overhead-crane", "appell-hamel"])
+def test_a_motion_with_strong_pivots_decomposes_no_matrix(scene, gallery_model, monkeypatch):
+    model, (start, guess) = gallery_model(scene), (gallery[scene].start, gallery[scene].guess)
+    calls, real = [], Monitor._smallest
+    monkeypatch.setattr(Monitor, "_smallest", lambda *a: calls.append(a) or real(*a))
+    run = sv.simulate(model, model.start(**start, guess=guess), gallery[scene].t_span)
+    assert run.success and not calls
+    late = Monitor(model, run.t[0], run.jets[: len(model.state_names), 0])
+    assert late.rank_measure(run.t[0], run.jets[: len(model.state_names), 0]) == pytest.approx(1.0) and calls
 
 
 def test_what_was_inspected_in_two_parts_is_what_was_inspected_at_once(circle):

@@ -58,8 +58,8 @@ class _Algebraic(Stepping):
         """State (q, γ'), γ'' and pivots from q and the outputs of `Equations.path`."""
         nq, n = self.model.nq, self.model.n
         first = nq if self.model.reduction.mechanism.q.plain else 3 * nq
-        velocity, top, pivots = np.split(y[first:], [n, 2 * n])
-        return np.concatenate([q, velocity]), top, pivots
+        end = first + n
+        return np.concatenate([q, y[first:end]]), y[end : end + n], y[end + n :]
 
     def _pivots(self, t, x):
         return self._split(x[: self.model.nq], self._outputs(t, x))[2]
@@ -180,8 +180,9 @@ class _Algebraic(Stepping):
     def _sample(self, nodes, x, t, t1):
         """Solve at the pending instants up to t, where the state is x; at all of them if the motion ends there."""
         count = len(self.pending) if t == t1 else int(np.sum((self.pending - t) * self.direction <= 0))
-        now, self.pending = np.split(self.pending, [count])
-        for block in np.split(now, range(BLOCK, count, BLOCK)):
+        now, self.pending = self.pending[:count], self.pending[count:]
+        for first in range(0, count, BLOCK):
+            block = now[first : first + BLOCK]
             q, y, iterations = self.f.newton(block, nodes, self.p)
             self.motion.count(iterations=iterations)
             state, top, _ = self._split(q, y)

@@ -1,15 +1,20 @@
 """How deviations from a motion move, by the series of the Taylor method at states beside it.
 
 A series is exact for every state, not for one motion alone: the propagator over a step is the derivative of its series
-by the state at its start, here by central differences of all columns at once. No Jacobian is formed.
+by the state at its start, here by central differences, without a Jacobian. With orthonormal deviations Q_k at the end
+of step k, those that the step takes from Q_(k-1) are Q_k R_k, so that propagators between ends of steps are products
+of the triangular R (Dieci, Russell and Van Vleck 1997). Deviations within the tangent space of the constraints stay
+there.
 """
 
+import ctypes
 from dataclasses import dataclass
 from itertools import pairwise
-from math import perm
 
 import numpy as np
 
+from servoctl.codegen.matrices import of_any_size
+from servoctl.codegen.native import pointer
 from servoctl.methods.motion import breakpoints
 from servoctl.methods.taylor import series_loop
 
@@ -20,60 +25,68 @@ MOST_ALONG = 2_000  # of a motion: more of them take longer than propagators by 
 
 
 @dataclass(frozen=True)
-class Propagation:
-    """Instants t (K + 1,) of a motion, states (n_x, K + 1) there, and the series that lead from each to the next.
+class Deviations:
+    """How deviations move along a motion, in the sizes of its states.
 
-    `parameters` (n_p, K) are those of the series, with the instants that select the branches of paths.
+    Attributes
+    ----------
+    cuts : (N,) array
+        Instants at which steps end, among others [s].
+    start : (f, n_x) array
+        Orthonormal deviations at the first one.
+    log : (K, 1 + f (n_x + f)) array
+        The end of each step [s], the deviations Qᵀ there and R.
+    x : (n_x,) array
+        State at the last one.
     """
 
-    f: object
-    t: np.ndarray
+    cuts: np.ndarray
+    start: np.ndarray
+    log: np.ndarray
     x: np.ndarray
-    parameters: np.ndarray
 
-    def moved(self, columns, size):
-        """Where small deviations at the starts of the steps are at their ends.
+    @property
+    def t(self):
+        """The first instant and the ends of the steps (K + 1,) [s]."""
+        return np.append(self.cuts[0], self.log[:, 0])
+
+    @property
+    def Q(self):
+        """The deviations at these instants, (K + 1, n_x, f)."""
+        end = 1 + self.start.size
+        return np.concatenate([self.start[None], self.log[:, 1:end].reshape(-1, *self.start.shape)]).swapaxes(1, 2)
+
+    @property
+    def R(self):
+        """The propagators of the steps between them, (K, f, f)."""
+        return self.log[:, 1 + self.start.size :].reshape(-1, len(self.start), len(self.start))
+
+    def growth(self, *settings):
+        """ln of the growth between all cuts and the scale of the states, as `growth._growth`; see growth.c.
 
         Parameters
         ----------
-        columns : (K, n_x, f) array
-            In the sizes of the states.
-        size : (n_x,) array
+        *settings : float
+            Those of growth.c.
 
         Returns
         -------
-        (K, n_x, f) array or None
-            None where the series are too short.
+        logs : (N, N) array
+        scale : (n_x,) array
+            Both are None where propagators are not moderate.
         """
-        (K, n_x, count), sizes = columns.shape, self.f.sizes
-        beside = NEARBY * (columns * size[:, None]).transpose(1, 0, 2)
-        x = (self.x[:, :-1, None, None] + np.stack([beside, -beside], axis=2)).reshape(n_x, -1)
-        t, h, p = (np.repeat(part, 2 * count, axis=-1) for part in (self.t[:-1], np.diff(self.t), self.parameters))
-        y = self.f.grid(t, x, p)
-        log = np.concatenate([t[None], x, y]).T
-        ends = self.f.jets(log, np.arange(len(t)), t + h, self.parameters[:, 0], sizes["top"] - 1)
-
-        def difference(values):
-            both = values.reshape(len(values), K, 2, count)
-            return ((both[:, :, 0] - both[:, :, 1]) / (2 * NEARBY)).transpose(1, 0, 2)
-
-        result = difference(ends) / size[:, None]
-        largest = LEFT_OUT * np.abs(result).max(axis=(1, 2))
-        for k in (sizes["last"], sizes["last"] - 1):  # one of them vanishes where a motion is even or odd
-            if np.any(np.abs(difference(self._term(k, y, h)) / size[:, None]).max(axis=(1, 2)) > largest):
-                return None
-        return result
-
-    def _term(self, k, y, h):
-        """The terms of index k of the states (n_x, M), from coefficients (n_y, M) and times h (M,)."""
-        nq, n, top, last, plain = (self.f.sizes[name] for name in ("nq", "n", "top", "last", "plain"))
-        rates = y[(0 if plain else nq * last) :][n * (k - 1) : n * k]
-        of_q = rates if plain else y[nq * (k - 1) : nq * k]
-        return np.concatenate([of_q * h**k, *(perm(k, j) * rates * h ** (k - j) for j in range(1, top))])
+        n, (free, n_x) = len(self.cuts), self.start.shape
+        sizes = 3 * (n + 1) * free**2, n_x * (free * (free + n + 2) + n_x + 2), n * (free + 2 * n + 2)
+        settings, work = np.array(settings), np.empty(sum(sizes))
+        logs, scale = np.full((n, n), -np.inf), np.empty(n_x)
+        steps, n_x, n, free = map(ctypes.c_int64, (len(self.log), n_x, n, free))
+        given = steps, n_x, pointer(self.log), n, pointer(self.cuts), pointer(self.start), free
+        found = of_any_size("growth", "growth")(*given, *map(pointer, (settings, work, scale, logs)))
+        return (logs, scale) if found else (None, None)
 
 
-def flow(model, last, t, x, knots, size):
-    """The series along a motion at given instants and wherever they end between them.
+def deviations(model, last, t, x, knots, size, Q):
+    """How deviations move along a motion.
 
     Parameters
     ----------
@@ -82,32 +95,35 @@ def flow(model, last, t, x, knots, size):
     last : int
         Highest index of the coefficients, for which they are compiled.
     t : (N,) array
-        Instants, the first and the last one that of the motion [s].
+        Instants at which steps end, the first and the last one that of the motion [s].
     x : (n_x,) array
         State at the first one.
     knots : sequence of float
         Instants at which paths take other branches [s].
     size : (n_x,) array
         Sizes of the states.
+    Q : (n_x, f) array
+        Orthonormal deviations at the first instant.
 
     Returns
     -------
-    Propagation or None
-        None where the series do not reach the end.
+    Deviations or None
+        None where nothing is compiled, or the series do not reach the end or are too short for the deviations.
     """
-    f, n_x, parts = series_loop(model, last), len(x), []
-    forward = np.sign(t[-1] - t[0])
+    f, forward, (n_x, free) = series_loop(model, last), np.sign(t[-1] - t[0]), Q.shape
+    run, x, start = f.native("deviations"), np.array(x), np.array(Q.T, order="C")
+    if run is None:
+        return None
+    run.restype, moved = ctypes.c_int64, start.copy()
+    settings, size = np.array([RTOL, RTOL * size.min(), NEARBY, LEFT_OUT]), np.ascontiguousarray(size)
+    log, taken = np.empty((MOST_ALONG, 1 + free * (n_x + free))), 0
     for a, b in pairwise(breakpoints((t[0], t[-1]), knots)):
         p = np.append(model.parameters, (a + b) / 2)
-        log = f.taylor(a, x, b, p, RTOL, RTOL * size.min(), MOST_ALONG)
-        if log[-1, 0] != b:
+        inside = np.concatenate([[a], t[(forward * t > forward * a) & (forward * t < forward * b)], [b]])
+        counts = ctypes.c_int64(len(inside)), ctypes.c_int64(free), ctypes.c_int64(MOST_ALONG - taken)
+        given = (counts[0], *map(pointer, (inside, x, p, settings)), counts[1], *map(pointer, (size, moved)))
+        steps = run(*given, counts[2], pointer(log[taken:]))
+        if steps < 0:
             return None
-        ends, x = log[:, 0], log[-1, 1 : 1 + n_x]
-        at = np.unique(forward * np.append(ends[:-1], t[(forward * t > forward * a) & (forward * t < forward * b)]))
-        at *= forward
-        k = np.searchsorted(forward * ends, forward * at, "right") - 1
-        parts.append((at, f.jets(log, k, at, p, f.sizes["top"] - 1), np.tile(p[:, None], len(at))))
-        if sum(len(part[0]) for part in parts) > MOST_ALONG:
-            return None
-    instants, states, parameters = (np.concatenate(part, axis=-1) for part in zip(*parts, strict=True))
-    return Propagation(f, np.append(instants, t[-1]), np.column_stack([states, x]), parameters)
+        taken += steps
+    return Deviations(np.ascontiguousarray(t), start, log[:taken], x)

@@ -227,19 +227,39 @@ class Monitor:
         self.model = model
         self.f, self.invariants = model.function("matrices"), model.function("invariants")
         self.l_names, self.b_names = model.leading_names()
-        self.reference = None
-        matrices = [np.nan_to_num(m, nan=0.0, posinf=0.0, neginf=0.0) for m in self._matrices(t, x)]
-        self.columns = self._columns(t, x, matrices) if before is None else before.columns
-        self.rows = [np.linalg.norm(m / c, axis=1) for m, c in zip(matrices, self.columns, strict=True)]
-        for row, i in model.balances().items():  # TᵀM grows at the zeros of a pivot; √M_ii is its size with others
-            self.rows[0][row] = self.columns[0][i]
+        self.reference, self.lift = None, 1.0
         self.balances = list(model.balances())
         self.stories = [model.row_stories(), {}]
         self.largest = np.abs(np.asarray(x, dtype=float))
-        self.best, self.lift = self._smallest(matrices), 1.0
-        if before is not None:
-            self._inherit(before, matrices)
         self.m, self.start = len(model.invariant_names()), (t, np.array(x))
+        if before is not None:
+            self.columns = before.columns
+            self._inherit(before)
+
+    # What follows belongs to the start, and most motions never read it.
+
+    @cached_property
+    def matrices(self):
+        """L and Bᵀ at the start, with zeros where they are not finite."""
+        return [np.nan_to_num(m, nan=0.0, posinf=0.0, neginf=0.0) for m in self._matrices(*self.start)]
+
+    @cached_property
+    def columns(self):
+        """Sizes of the columns of L and Bᵀ."""
+        return self._columns(*self.start, self.matrices)
+
+    @cached_property
+    def rows(self):
+        """Sizes of the rows of L and Bᵀ, to which later ones are compared."""
+        rows = [np.linalg.norm(m / c, axis=1) for m, c in zip(self.matrices, self.columns, strict=True)]
+        for row, i in self.model.balances().items():  # TᵀM grows at the zeros of a pivot; √M_ii is its size with others
+            rows[0][row] = self.columns[0][i]
+        return rows
+
+    @cached_property
+    def best(self):
+        """The best smallest singular values of L and B so far."""
+        return self._smallest(self.matrices)
 
     @cached_property
     def gradients(self):
@@ -270,14 +290,14 @@ class Monitor:
             result.append(np.where(moves, metric, massless))
         return result
 
-    def _inherit(self, before, matrices):
+    def _inherit(self, before):
         for i, names in enumerate((self.l_names, self.b_names)):
             old = dict(zip((before.l_names, before.b_names)[i], before.rows[i], strict=True))
             for j, name in enumerate(names):
                 if name in old and self.stories[i].get(name) == before.stories[i].get(name):
                     self.rows[i][j] = old[name]
         self.largest = np.maximum(self.largest, before.largest)
-        now = self._smallest(matrices)
+        now = self._smallest(self.matrices)
         self.best = np.maximum(now, before.best)
         self.lift = 1.0 / max(float(np.min(now / np.where(self.best > 0, self.best, 1.0))), DEGRADED)
 

@@ -62,15 +62,17 @@ class Motion:
 
     def add(self, model, t, x, top):
         """Append samples t (N,), X (n_x, N) and γ^(s̄) (n, N) computed with one variant of the model."""
-        start = self._end
-        new = np.diff(t, prepend=self._t[start - 1] if start else np.nan) != 0
-        if not new.any():
+        start, t = self._end, np.asarray(t)
+        shared = int(start > 0 and len(t) > 0 and t[0] == self._t[start - 1])
+        further = t[1:] != t[:-1]
+        every = bool(further.all())
+        new = slice(shared, None) if every else np.append(not shared, further)  # a slice is eleven times as fast
+        end = start + (len(t) - shared if every else int(new.sum()))
+        if end == start:
             return
-        shared, end = int(not new[0]), start + int(new.sum())
         if end > len(self._t):
             self._reserve(max(end, 2 * start, min(self.room, MOST_RESERVED)), len(x) + len(top))
-        new = slice(shared, None) if new[1:].all() else new  # without a copy, eleven times as fast
-        self._t[start:end] = np.asarray(t)[new]
+        self._t[start:end] = t[new]
         self._jets[: len(x), start:end], self._jets[len(x) :, start:end] = x[:, new], top[:, new]
         self.pieces.append((model, start - shared, start, end))
 

@@ -542,7 +542,9 @@ class TaylorSteps(Stepping):
 
             more = centres(steep, self.model.parameters, parts[0], dense(parts[0]), dense)
             k, at = np.append(k, steps_of(t, more)), np.append(at, more)
-        within = (at != t[k]) & ~np.isin(at, list(self.knots))  # where paths have other branches
+        within = at != t[k]
+        if self.knots:  # where paths have other branches
+            within &= ~np.isin(at, list(self.knots))
         return k[within], at[within]
 
     def _stretch(self, log):

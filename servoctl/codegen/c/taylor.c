@@ -34,6 +34,18 @@ static inline double length(const double *x, const double *c, int64_t n, int64_t
     return shortest;
 }
 
+/* The step h at which the last terms of all levels meet the tolerance. */
+static inline double step_length(const double *x, const double *y, double log_rtol, double least)
+{
+    const double *c = y + (PLAIN ? 0 : NQ * LAST);
+    double log_h = length(x, y, NQ, 0, log_rtol, least);
+    for (int64_t j = 1; j < TOP; j++) {
+        const double of_level = length(x + NQ + (j - 1) * N, c, N, j, log_rtol, least);
+        log_h = of_level < log_h ? of_level : log_h;
+    }
+    return rough_exp2(log_h);
+}
+
 /* The state a time h after the expansion: x_j = sum over k of k!/(k - j)! c_[k] h^(k - j); y holds the coefficients.
    Rates that rows determine are left to these. */
 static inline void move(const double *x, const double *y, const double *c, double h, double *x_next)
@@ -76,13 +88,7 @@ int64_t FN(taylor)(const Steps *s)
             return step;
         }
         NAME(t, x, p, y);
-        const double *c = y + (PLAIN ? 0 : NQ * LAST);
-        double log_h = length(x, y, NQ, 0, log_rtol, least);
-        for (int64_t j = 1; j < TOP; j++) {
-            const double of_level = length(x + NQ + (j - 1) * N, c, N, j, log_rtol, least);
-            log_h = of_level < log_h ? of_level : log_h;
-        }
-        const double h = rough_exp2(log_h);
+        const double *c = y + (PLAIN ? 0 : NQ * LAST), h = step_length(x, y, log_rtol, least);
         if (!(h > 1e-13 * (1 + fabs(t)))) {
             settle(t, x, p);
             return step;
@@ -139,3 +145,5 @@ void FN(taylor_jets)(const double *log, int64_t n, const int64_t *k, const doubl
     (void)p, (void)settled;
 #endif
 }
+
+#include "deviations.h"
