@@ -1,5 +1,7 @@
 """The gallery: mechanisms with programs, ready to derive and simulate.
 
+::
+
     from servoctl.gallery import gallery
     scene = gallery["overhead-crane"]
     model = sv.derive(*scene.build())

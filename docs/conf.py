@@ -1,0 +1,37 @@
+"""Settings of Sphinx: `python -m sphinx -W -b html docs site` builds the documentation, without a network."""
+
+import re
+
+import servoctl
+
+project, author, version = "servoctl", "servoctl contributors", servoctl.__version__
+extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx.ext.mathjax"]
+html_theme, html_title, html_copy_source = "furo", "servoctl", False
+myst_enable_extensions = ["dollarmath"]
+myst_heading_anchors = 3
+autodoc_default_options = {"members": True, "member-order": "bysource"}
+napoleon_google_docstring = napoleon_use_rtype = False
+default_role = "py:obj"
+suppress_warnings = ["ref.python"]  # a shape such as (n,) is taken for a name, and several classes have an n
+CODE = r"(::\n\n(?:    .*\n|\n)+)"
+
+
+def sections(app, what, name, thing, options, lines):
+    """Long tables of parameters in the sections of numpydoc; a bar is a norm, and no substitution."""
+    text = re.sub(r"^Main arguments\n\n", "", "\n".join(lines), flags=re.M)
+    text = re.sub(r"^Other arguments$", "\nOther Parameters\n----------------", text, flags=re.M)
+    parts = re.split(CODE, text)
+    parts[::2] = [part.replace("|", r"\|") for part in parts[::2]]
+    lines[:] = "".join(parts).split("\n")
+
+
+def outside(app, docname, source):
+    """Pages of the repository that are no pages of the site are files to download."""
+    if "/" not in docname:
+        source[0] = re.sub(r"\]\((\.\./[^)]*\.md)\)", r"](path:\1)", source[0])
+
+
+def setup(app):
+    """Connect both to Sphinx, before napoleon reads the docstrings."""
+    app.connect("autodoc-process-docstring", sections, priority=1)
+    app.connect("source-read", outside)

@@ -1,0 +1,62 @@
+"""The documentation site: every page has its place, every public name is in the reference once, commands are valid."""
+
+import re
+import shlex
+from pathlib import Path
+
+import pytest
+
+import servoctl as sv
+import servoctl.shell.main as shell
+from servoctl import gallery
+
+ROOT = Path(__file__).parents[1]
+DOCS = ROOT / "docs"
+REFERENCE = sorted((DOCS / "reference").glob("*.md"))
+COMMANDS = [
+    (page.name, line.strip())
+    for page in [ROOT / "README.md", *sorted(DOCS.rglob("*.md"))]
+    for line in re.findall(r"^    (servoctl .*)$", page.read_text(), re.M)
+]
+SAME_MODULE, CONTENTS = {"plots": "figures"}, {"spec"}  # another name of a module; a module whose names are all in `sv`
+
+
+def contents(page):
+    """Pages in the tables of contents of a page."""
+    tables = re.findall(r"```\{toctree\}\n(.*?)```", page.read_text(), re.S)
+    return sorted(line for table in tables for line in table.splitlines() if line and not line.startswith(":"))
+
+
+def directive(thing):
+    """The directive of Sphinx that documents an object."""
+    if isinstance(thing, type):
+        return "exception" if issubclass(thing, Exception) else "class"
+    return type(thing).__name__
+
+
+def test_every_page_is_in_a_table_of_contents_once():
+    pages = [page.stem for page in DOCS.glob("*.md") if page.stem != "index"]
+    assert contents(DOCS / "index.md") == sorted([*pages, "reference/index"])
+    assert contents(DOCS / "reference" / "index.md") == [page.stem for page in REFERENCE if page.stem != "index"]
+
+
+def test_the_reference_has_every_public_name_once():
+    text = "".join(page.read_text() for page in REFERENCE)
+    listed = re.findall(r"^\.\. auto(\w+):: servoctl\.(\w+)$", text, re.M)
+    names = [name for _, name in listed]
+    assert sorted(names) == sorted((set(sv.__all__) | {"gallery"}) - CONTENTS - set(SAME_MODULE))
+    assert all(getattr(sv, alias) is getattr(sv, name) for alias, name in SAME_MODULE.items())
+    things = {**{name: getattr(sv, name) for name in sv.__all__}, "gallery": gallery}
+    assert [name for kind, name in listed if kind != directive(things[name])] == []
+
+
+@pytest.mark.parametrize("page", REFERENCE, ids=lambda page: page.stem)
+def test_links_of_the_reference_lead_somewhere(page):
+    targets = re.findall(r"\]\(([^)#]+)\)", page.read_text())
+    assert all((page.parent / target).exists() for target in targets)
+
+
+@pytest.mark.parametrize("page, command", COMMANDS, ids=lambda text: text)
+def test_the_shell_commands_of_the_pages_are_valid(page, command):
+    name, *arguments = shlex.split(command)
+    shell._parser(arguments).parse_args(arguments)
