@@ -17,12 +17,15 @@ CODE = r"(::\n\n(?:    .*\n|\n)+)"
 
 
 def sections(app, what, name, thing, options, lines):
-    """Long tables of parameters in the sections of numpydoc; a bar is a norm, and no substitution."""
+    """Long tables of parameters in the sections of numpydoc; a bar is a norm, and no substitution.
+
+    The empty line in front of a property's text keeps napoleon from taking what precedes a colon for a type.
+    """
     text = re.sub(r"^Main arguments\n\n", "", "\n".join(lines), flags=re.M)
     text = re.sub(r"^Other arguments$", "\nOther Parameters\n----------------", text, flags=re.M)
     parts = re.split(CODE, text)
     parts[::2] = [part.replace("|", r"\|") for part in parts[::2]]
-    lines[:] = "".join(parts).split("\n")
+    lines[:] = [""] * (what == "property") + "".join(parts).split("\n")
 
 
 def outside(app, docname, source):

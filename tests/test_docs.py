@@ -1,7 +1,9 @@
 """The documentation site: every page has its place, every public name is in the reference once, commands are valid."""
 
+import contextlib
 import re
 import shlex
+from importlib import import_module
 from pathlib import Path
 
 import pytest
@@ -60,3 +62,51 @@ def test_links_of_the_reference_lead_somewhere(page):
 def test_the_shell_commands_of_the_pages_are_valid(page, command):
     name, *arguments = shlex.split(command)
     shell._parser(arguments).parse_args(arguments)
+
+
+TOOLS = {
+    "servoctl": "servoctl",
+    "SymPy": "sympy.physics.mechanics",
+    "Pinocchio": "pinocchio",
+    "Drake": "pydrake.all",
+    "MuJoCo": "mujoco",
+    "python-control": "control",
+}
+TEN_LINES = (DOCS / "ten_lines.md").read_text()
+
+
+def column(tool):
+    """Names in code in the cells of a tool, in all tables that have it as a heading."""
+    for block in re.findall(r"(?:^\|.*\n)+", (DOCS / "names_elsewhere.md").read_text(), re.M):
+        rows = [[cell.strip() for cell in line.strip("|\n ").split("|")] for line in block.splitlines()]
+        if tool in rows[0]:
+            yield from (name for row in rows[2:] for name in re.findall("`([^`]+)`", row[rows[0].index(tool)]))
+
+
+def exists(module, name):
+    """Whether a module leads to a dotted name; modules within it are imported."""
+    for part in name.split("."):
+        if not hasattr(module, part):
+            with contextlib.suppress(ImportError):
+                import_module(f"{module.__name__}.{part}")
+        if not hasattr(module, part):
+            return False
+        module = getattr(module, part)
+    return True
+
+
+@pytest.mark.parametrize("tool", TOOLS)
+def test_the_names_of_each_tool_exist(tool):
+    module = pytest.importorskip(TOOLS[tool], reason=f"{tool} is not installed")
+    names = list(column(tool))
+    assert len(names) > 9
+    assert [name for name in names if not exists(module, name)] == []
+
+
+@pytest.mark.parametrize("tool", ["SymPy", "Pinocchio", "MuJoCo", "Drake"])
+def test_each_tool_prints_the_same_line(tool, capsys):
+    pytest.importorskip(TOOLS[tool], reason=f"{tool} is not installed")
+    by_hand = re.findall(r"```python\n(.*?)```", TEN_LINES, re.S)[1]
+    block = re.search(rf"^## {tool}\n\n```py\n(.*?)```", TEN_LINES, re.M | re.S)[1]
+    exec(by_hand + block, {})
+    assert capsys.readouterr().out == re.search(r"```text\n(.*?)```", TEN_LINES, re.S)[1]
