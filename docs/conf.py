@@ -1,6 +1,10 @@
 """Settings of Sphinx: `python -m sphinx -W -b html docs site` builds the documentation, without a network."""
 
+import json
 import re
+from base64 import b64decode
+from pathlib import Path
+from shutil import rmtree
 
 import servoctl
 
@@ -13,6 +17,7 @@ autodoc_default_options = {"members": True, "member-order": "bysource"}
 napoleon_google_docstring = napoleon_use_rtype = False
 default_role = "py:obj"
 suppress_warnings = ["ref.python"]  # a shape such as (n,) is taken for a name, and several classes have an n
+HERE = Path(__file__).parent
 CODE = r"(::\n\n(?:    .*\n|\n)+)"
 
 
@@ -34,7 +39,34 @@ def outside(app, docname, source):
         source[0] = re.sub(r"\]\((\.\./[^)]*\.md)\)", r"](path:\1)", source[0])
 
 
+def as_page(notebook, folder):
+    """The cells of a notebook with their stored outputs as a page; pictures are written to a folder."""
+    parts = []
+    for cell in json.loads(notebook.read_text())["cells"]:
+        text = "".join(cell["source"])
+        parts.append(text if cell["cell_type"] == "markdown" else f"```python\n{text}\n```")
+        for output in cell.get("outputs", ()):
+            data = output.get("data", {"text/plain": output.get("text", ())})
+            if "image/png" in data:
+                picture = folder / f"{notebook.stem}_{len(parts)}.png"
+                picture.write_bytes(b64decode("".join(data["image/png"])))
+                parts.append(f"![Output of the cell above]({picture.name})")
+            elif printed := "".join(data.get("text/plain", ())):
+                parts.append(f"```text\n{printed.rstrip()}\n```")
+    return "\n\n".join(parts) + "\n"
+
+
+def notebooks(app):
+    """Write the notebooks as pages, in a folder that is no part of the repository."""
+    folder = HERE / "notebooks"
+    rmtree(folder, ignore_errors=True)
+    folder.mkdir()
+    for notebook in sorted((HERE.parent / "notebooks").glob("*.ipynb")):
+        (folder / f"{notebook.stem}.md").write_text(as_page(notebook, folder))
+
+
 def setup(app):
-    """Connect both to Sphinx, before napoleon reads the docstrings."""
+    """Connect these functions to Sphinx, that of docstrings before napoleon's."""
+    app.connect("builder-inited", notebooks)
     app.connect("autodoc-process-docstring", sections, priority=1)
     app.connect("source-read", outside)

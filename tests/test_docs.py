@@ -1,7 +1,9 @@
 """The documentation site: every page has its place, every public name is in the reference once, commands are valid."""
 
 import contextlib
+import json
 import re
+import runpy
 import shlex
 from importlib import import_module
 from pathlib import Path
@@ -29,6 +31,25 @@ def contents(page):
     return sorted(line for table in tables for line in table.splitlines() if line and not line.startswith(":"))
 
 
+def test_every_block_is_executed_or_printed_by_a_test():
+    """Python by test_readme, C by test_export_c, other processes by test_sweep, other tools below, commands by .ci/run."""
+    elsewhere = {"c_export.md": {"c"}, "sweeps.md": {"py"}, "ten_lines.md": {"py", "modelica"}, "README.md": {"sh"}}
+    for page in [ROOT / "README.md", *DOCS.glob("*.md")]:
+        kinds = set(re.findall(r"^```(\w+)", page.read_text(), re.M))
+        assert kinds - elsewhere.get(page.name, set()) <= {"python", "text"}, page.name
+
+
+def test_a_notebook_is_a_page_with_its_outputs(tmp_path):
+    picture, code = {"image/png": "AAEC\n", "text/plain": ["<Figure>"]}, {"cell_type": "code", "source": ["a = 1\n", "a"]}
+    printed = [{"output_type": "stream", "text": ["one\n", "two\n"]}, {"data": picture}, {"data": picture}, {"text": []}]
+    cells = [{"cell_type": "markdown", "source": ["# Title"]}, {**code, "outputs": printed}]
+    (tmp_path / "name.ipynb").write_text(json.dumps({"cells": cells}))
+    page = runpy.run_path(str(DOCS / "conf.py"))["as_page"](tmp_path / "name.ipynb", tmp_path)
+    shown = re.findall(r"!\[[^]]*\]\((.*?)\)", page)
+    assert len(set(shown)) == 2 and all((tmp_path / name).read_bytes() == b"\0\1\2" for name in shown)
+    assert page.startswith("# Title\n\n```python\na = 1\na\n```\n\n```text\none\ntwo\n```\n\n![")
+
+
 def directive(thing):
     """The directive of Sphinx that documents an object."""
     if isinstance(thing, type):
@@ -38,7 +59,7 @@ def directive(thing):
 
 def test_every_page_is_in_a_table_of_contents_once():
     pages = [page.stem for page in DOCS.glob("*.md") if page.stem != "index"]
-    assert contents(DOCS / "index.md") == sorted([*pages, "reference/index"])
+    assert contents(DOCS / "index.md") == sorted([*pages, "notebooks/*", "reference/index"])
     assert contents(DOCS / "reference" / "index.md") == [page.stem for page in REFERENCE if page.stem != "index"]
 
 
