@@ -14,6 +14,7 @@ html_theme, html_title, html_copy_source = "furo", "servoctl", False
 myst_enable_extensions = ["dollarmath"]
 myst_heading_anchors = 3
 autodoc_default_options = {"members": True, "member-order": "bysource"}
+autodoc_typehints = "none"  # docstrings have them, with shapes and units
 napoleon_google_docstring = napoleon_use_rtype = False
 default_role = "py:obj"
 suppress_warnings = ["ref.python"]  # a shape such as (n,) is taken for a name, and several classes have an n
@@ -24,13 +25,15 @@ CODE = r"(::\n\n(?:    .*\n|\n)+)"
 def sections(app, what, name, thing, options, lines):
     """Long tables of parameters in the sections of numpydoc; a bar is a norm, and no substitution.
 
-    The empty line in front of a property's text keeps napoleon from taking what precedes a colon for a type.
+    What precedes a colon in the first line of a property is no type.
     """
+    if what in ("attribute", "property"):
+        lines[0] = lines[0].replace(": ", " - ")
     text = re.sub(r"^Main arguments\n\n", "", "\n".join(lines), flags=re.M)
     text = re.sub(r"^Other arguments$", "\nOther Parameters\n----------------", text, flags=re.M)
     parts = re.split(CODE, text)
     parts[::2] = [part.replace("|", r"\|") for part in parts[::2]]
-    lines[:] = [""] * (what == "property") + "".join(parts).split("\n")
+    lines[:] = "".join(parts).split("\n")
 
 
 def outside(app, docname, source):
