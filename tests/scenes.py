@@ -6,6 +6,13 @@ from servoctl.gallery import gallery
 CRANE, CRANE_PROGRAM = gallery["overhead-crane"].build()
 ROPE = gallery["overhead-crane-redundant"].build()[0]
 
+CERTIFIED = (  # scenes that every method and treatment of drift is tested on; the others are verified once, by default
+    "overhead-crane", "winch-crane", "crane-3d", "two-cars", "three-cars", "vtol", "overhead-crane-redundant",
+    "winch-crane-redundant", "crane-3d-redundant", "mass-on-car-absolute", "mass-on-car", "passive-arm", "pendubot",
+    "vtol-centre", "two-link-arm", "appell-hamel", "two-cars-ideal", "constant-speed", "spiral", "wheeled-robot",
+    "appell-hamel-squared", "constant-speed-horizontal",
+)  # fmt: skip
+
 
 def point_mass(smoothness=3):
     """A driven mass of 2 kg that moves by 1 m in 1 s."""

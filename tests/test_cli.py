@@ -19,6 +19,7 @@ from servoctl.errors import IntegrationStopped
 from servoctl.gallery import gallery
 from servoctl.methods.choice import METHODS as ALL_METHODS
 from servoctl.shell.folder import FILES, LOOP_FILES
+from servoctl.shell.listing import COLUMNS_PRINTED, subjects
 from servoctl.shell.main import main
 
 FALL = '''"""A mass in a plane follows a path in x, and falls."""
@@ -469,6 +470,22 @@ def test_list_names_every_scene(capsys):
     lines = capsys.readouterr().out.splitlines()
     assert [line.split("  ")[0].strip() for line in lines] == list(gallery)
     assert all(line.endswith(scene.description) for line, scene in zip(lines, gallery.values(), strict=True))
+
+
+def test_the_long_list_groups_scenes_by_what_they_teach(capsys):
+    assert main(["list", "--long"]) == 0
+    printed = capsys.readouterr().out
+    groups = {}
+    for line in filter(str.strip, printed.splitlines()):
+        if line[0] != " ":
+            members = groups.setdefault(line.lower(), [])
+        elif line[2] != " ":
+            members.append(line.strip())
+    assert groups == {group: list(members) for group, members in subjects()}
+    assert [name for members in groups.values() for name in members] == list(gallery)
+    text = " ".join(printed.split())
+    assert all(part in text for scene in gallery.values() for part in (scene.teaches, scene.number, scene.source))
+    assert max(map(len, printed.splitlines())) <= COLUMNS_PRINTED
 
 
 def test_report_of_a_specification_simulates_nothing(here, fall, capsys, monkeypatch):

@@ -215,3 +215,12 @@ def test_the_table_of_other_machines_is_what_the_example_says(numbers):
         for cell, what in zip(cells, ("worst", "last", "feedforward worst"), strict=True):
             digits = len(cell.partition(".")[2])
             assert cell == f"{result[f'{name}: {what}']:.{digits}f}"
+
+
+def test_the_page_of_examples_has_all_of_them_and_their_numbers(numbers):
+    rows = re.findall(r"^\| \[(\w+)\]\(.*?\) \| [^|]+ \| (.*) \|$", (EXAMPLES.parent / "docs" / "examples.md").read_text(), re.M)
+    assert sorted(name for name, _ in rows) == sorted(path.stem for path in EXAMPLES.glob("*.py"))
+    shown = [(name, *number) for name, cell in rows for number in re.findall(r"`([^`]+)` (-?[\d.]*\d)", cell)]
+    assert len(shown) > 20
+    for name, what, number in shown:
+        assert number == f"{numbers(name)[what]:.{len(number.partition('.')[2])}f}"

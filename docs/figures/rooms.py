@@ -2,6 +2,7 @@
 
 import ast
 import sys
+from graphlib import TopologicalSorter
 from pathlib import Path
 
 import matplotlib
@@ -42,23 +43,20 @@ def rooms():
 
 
 def heights(imports):
-    """Longest path down to a room that imports nothing."""
-
-    def height(name, above=()):
-        assert name not in above, f"a circle: {' -> '.join([*above, name])}"
-        return max((1 + height(below, (*above, name)) for below in imports[name]), default=0)
-
-    return {name: height(name) for name in imports}
+    """Longest path down to a room that imports nothing; a circle of imports is an error."""
+    height = {}
+    for name in TopologicalSorter(imports).static_order():  # what a room imports comes before it
+        height[name] = max((1 + height[below] for below in imports[name]), default=0)
+    return height
 
 
 def direct(imports):
     """Imports that are not implied by a longer path."""
-
-    def reach(name):
-        return set().union(*({below} | reach(below) for below in imports[name])) if imports[name] else set()
-
+    reach = {}
+    for name in TopologicalSorter(imports).static_order():
+        reach[name] = imports[name].union(*(reach[below] for below in imports[name]))
     return {
-        name: {b for b in imported if not any(b in reach(other) for other in imported - {b})}
+        name: {b for b in imported if not any(b in reach[other] for other in imported - {b})}
         for name, imported in imports.items()
     }
 

@@ -2,7 +2,7 @@
 
 A shape is a sequence of points, each a column or sequence (x, y) or (x, y, z) [m] of expressions of t, q and the
 parameters. x points to the right, the last axis up. One point is drawn as a dot, several as a line, and a line that
-ends where it began as a body. `box`, `disc` and `spring` make such sequences.
+ends where it began as a body. `box`, `disc` and `spring` make such sequences::
 
     shapes={"rail": [(-1, 0), (6, 0)], "trolley": sv.shapes.box((x, 0), 0.6, 0.2), "rope": [(x, 0), (X, -Z)]}
 """

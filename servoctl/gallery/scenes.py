@@ -1,0 +1,349 @@
+"""The table of scenes: what each is, what it teaches, where it comes from, and a number that it must give."""
+
+import re
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from functools import partial
+from importlib import import_module
+
+BUILDERS = {  # name of a function: its module in this package, imported when it is used
+    "appell_hamel": "rolling",
+    "cars": "springs",
+    "constant_speed": "speed",
+    "crane_3d": "cranes",
+    "mass_on_car": "guides",
+    "overhead_crane": "cranes",
+    "passive_arm": "two_links",
+    "pendubot": "two_links",
+    "planar_arm": "links",
+    "spatial_arm": "links",
+    "spiral": "spirals",
+    "two_link_arm": "two_links",
+    "vtol": "aircraft",
+    "wheeled_robot": "wheels",
+    "winch_crane": "cranes",
+}
+
+
+def builder(name):
+    """The function of a name, from its module."""
+    return getattr(import_module(f"servoctl.gallery.{BUILDERS[name]}"), name)
+
+
+def _built(name, *arguments, **options):
+    return builder(name)(*arguments, **options)
+
+
+@dataclass(frozen=True)
+class Scene:
+    """A mechanism with a program, initial values and a time span.
+
+    Parameters
+    ----------
+    build : callable
+        Returns (Mechanism, Program).
+    description : str
+        One sentence.
+    group : str
+        The subject that it belongs to, in two or three words.
+    teaches : str
+        What it teaches, one sentence.
+    source : str
+        The publication, or the closed form, that it comes from.
+    number : str
+        One sentence with a number that the source or a closed form gives.
+    start : dict of str to float
+        Free initial values by name, SI.
+    guess : dict of str to float
+        Guesses of the other initial values by name, SI.
+    t_span : (2,) tuple of float
+        [s]
+    units : dict of str to str
+        Unit of each coordinate, actuator and output, by name.
+    """
+
+    build: Callable
+    description: str
+    group: str = ""
+    teaches: str = ""
+    source: str = ""
+    number: str = ""
+    start: dict = field(default_factory=dict)
+    guess: dict = field(default_factory=dict)
+    t_span: tuple = (0.0, 1.0)
+    units: dict = field(default_factory=dict)
+
+
+def _units(text):
+    """Units by name, from names followed by their unit in brackets."""
+    return {name: unit for names, unit in re.findall(r"([^\[]+)\[([^]]+)\]", text) for name in names.split()}
+
+
+FLAT_MACHINES = "flat machines"
+MATERIAL_CONSTRAINTS = "material constraints"
+INTERNAL_DYNAMICS = "internal dynamics"
+ARMS_AND_ROBOTS = "arms and robots"
+IDEAL_REACTIONS = "ideal reactions"
+HIGHER_ORDERS = "higher orders"
+ROLLING_MACHINES = "rolling machines"
+SINGULAR_PROGRAMS = "singular programs"
+
+BLAJER = "Blajer and Kołodziejczyk, Nonlinear Dynamics 50 (2007) 781-791"
+EMAMI = "Emami, Zohoor and Sohrabpour (docs/paper.md)"
+SEIFRIED = "Seifried and Blajer, Mechanical Sciences 4 (2013) 113-129"
+FLIESS = "Fliess, Lévine, Martin and Rouchon, International Journal of Control 61 (1995) 1327-1361"
+
+_APPELL_HAMEL = {
+    "source": EMAMI,
+    "start": {"x": 0.0, "y": 0.0, "phi": 0.0, "theta": 0.0, "dphi": 1.0, "dtheta": 2.0},
+    "guess": {"dx": 0.5, "dy": 0.6},
+    "t_span": (0.0, 2.0),
+    "units": _units("x y z [m] phi theta [rad] tension [N]"),
+}
+
+gallery = {
+    # --- flat machines
+    "overhead-crane": Scene(
+        partial(_built, "overhead_crane"),
+        "A trolley and a hoist carry a load along a straight path.",
+        group=FLAT_MACHINES,
+        teaches="A path of the load alone determines trolley, rope and both forces, without integration.",
+        source=FLIESS,
+        number="The hoist holds at most 1044 N.",
+        guess={"l": 4.0},
+        t_span=(0.0, 8.0),
+        units=_units("x l X Z [m] theta [rad] trolley hoist tension [N]"),
+    ),
+    "winch-crane": Scene(
+        partial(_built, "winch_crane"),
+        "Blajer's crane: a trolley and a winch carry a load.",
+        group=FLAT_MACHINES,
+        teaches="A rotating drum instead of a hoist changes the actuation, not the motion of the load.",
+        source=BLAJER,
+        number="The winch holds at most 102.2 N m.",
+        guess={"beta": 40.0},
+        t_span=(0.0, 6.0),
+        units=_units("x X Z [m] beta theta [rad] trolley [N] winch [N m] tension [N]"),
+    ),
+    "crane-3d": Scene(
+        partial(_built, "crane_3d"),
+        "A bridge, a trolley and a hoist lift a load along a quarter turn.",
+        group=FLAT_MACHINES,
+        teaches="Three residuals for five coordinates: two hidden constraints, the balances of both angles.",
+        source=BLAJER,
+        number="The rope's tension is at most 1070 N.",
+        guess={"l": 5.0},
+        t_span=(0.0, 6.0),
+        units=_units("x y l X Y Z [m] theta phi [rad] bridge trolley hoist tension [N]"),
+    ),
+    "two-cars": Scene(
+        partial(_built, "cars"),
+        "Two cars joined by a spring: the first follows a path, the second is driven.",
+        group=FLAT_MACHINES,
+        teaches="A force that acts through a spring needs the path's fourth derivative.",
+        source=SEIFRIED,
+        number="The force is at most 316.2 N.",
+        t_span=(0.0, 2.0),
+        units=_units("x1 x2 [m] force [N]"),
+    ),
+    "three-cars": Scene(
+        partial(_built, "cars", 3),
+        "Three cars joined by springs: the first follows a path, the last is driven; index 7.",
+        group=FLAT_MACHINES,
+        teaches="Each further spring raises the index by two, and the forces by orders of magnitude.",
+        source=f"{SEIFRIED}, by one car more",
+        number="The force is at most 11770 N.",
+        t_span=(0.0, 2.0),
+        units=_units("x1 x2 x3 [m] force [N]"),
+    ),
+    "vtol": Scene(
+        partial(_built, "vtol"),
+        "The flat point of an aircraft with tilted thrusters follows a path.",
+        group=FLAT_MACHINES,
+        teaches="The choice of the point decides: this one determines the whole motion.",
+        source="Martin, Devasia and Paden, Automatica 32 (1996) 101-107",
+        number="The left thruster gives at most 295.5 N.",
+        t_span=(0.0, 4.0),
+        units=_units("x z [m] theta [rad] u1 u2 [N]"),
+    ),
+    # --- material constraints
+    "overhead-crane-redundant": Scene(
+        partial(_built, "overhead_crane", coordinates="redundant"),
+        "The same crane in redundant coordinates, its rope a material constraint.",
+        group=MATERIAL_CONSTRAINTS,
+        teaches="Coordinates may be redundant: motion and forces are those of the smallest set.",
+        source=FLIESS,
+        number="The trolley's force is at most 138 N.",
+        guess={"l": 4.0, "Z": 4.0},
+        t_span=(0.0, 8.0),
+        units=_units("x l X Z [m] trolley hoist tension [N]"),
+    ),
+    "winch-crane-redundant": Scene(
+        partial(_built, "winch_crane", "redundant"),
+        "The winch crane in redundant coordinates, its rope a material constraint.",
+        group=MATERIAL_CONSTRAINTS,
+        teaches="The balance is polynomial in redundant coordinates, as in the literature on index reduction.",
+        source=BLAJER,
+        number="The rope's tension is at most 1018 N.",
+        guess={"beta": 40.0, "Z": 4.0},
+        t_span=(0.0, 6.0),
+        units=_units("x [m] beta [rad] X Z [m] trolley [N] winch [N m] tension [N]"),
+    ),
+    "crane-3d-redundant": Scene(
+        partial(_built, "crane_3d", "redundant"),
+        "The three-dimensional crane in redundant coordinates, its rope a material constraint.",
+        group=MATERIAL_CONSTRAINTS,
+        teaches="Without angles there is no chart to leave: the load may swing in all directions.",
+        source=BLAJER,
+        number="The hoist holds at most 1074 N.",
+        guess={"l": 5.0, "Z": 5.0},
+        t_span=(0.0, 6.0),
+        units=_units("x y l X Y Z [m] bridge trolley hoist tension [N]"),
+    ),
+    "mass-on-car-absolute": Scene(
+        partial(_built, "mass_on_car", coordinates="absolute"),
+        "The same mass and car in absolute coordinates, the guide a material constraint.",
+        group=MATERIAL_CONSTRAINTS,
+        teaches="A material constraint changes neither the internal dynamics nor the force.",
+        source=SEIFRIED,
+        number="The force is at most 12.31 N.",
+        start={"x": 0.5, "dx": 0.0},
+        t_span=(0.0, 6.0),
+        units=_units("x x_m y_m [m] force [N]"),
+    ),
+    # --- internal dynamics
+    "mass-on-car": Scene(
+        partial(_built, "mass_on_car"),
+        "A mass on an inclined guide of a driven car follows a path; two internal states.",
+        group=INTERNAL_DYNAMICS,
+        teaches="The guide's inclination decides the relative degree: 4 or 3 when level, 2 when inclined.",
+        source=SEIFRIED,
+        number="The internal dynamics decay with 0.5 1/s.",
+        start={"s": 0.0, "ds": 0.0},
+        t_span=(0.0, 6.0),
+        units=_units("x s [m] force [N]"),
+    ),
+    "passive-arm": Scene(
+        partial(_built, "passive_arm"),
+        "An arm with an elastic passive joint turns by 90 degrees; two stable internal states.",
+        group=INTERNAL_DYNAMICS,
+        teaches="A point nearer to the base than the tip makes the internal dynamics stable.",
+        source="Seifried, Dynamics of Underactuated Multibody Systems (Springer, 2014)",
+        number="The internal dynamics decay with 6 1/s where the arm is straight.",
+        start={"q2": 0.0, "dq2": 0.0},
+        t_span=(0.0, 3.0),
+        units=_units("q1 q2 [rad] torque [N m]"),
+    ),
+    "pendubot": Scene(
+        partial(_built, "pendubot"),
+        "The shoulder of a two-link arm swings it up by 90 degrees; the elbow is passive.",
+        group=INTERNAL_DYNAMICS,
+        teaches="What the shoulder leaves free is a pendulum, here about its hanging pose.",
+        source="Spong and Block, Proceedings of the IEEE Conference on Decision and Control (1995) 555-557",
+        number="A small swing of the second link has the frequency 5.345 rad/s.",
+        start={"q2": 0.0, "dq2": 0.0},
+        t_span=(0.0, 3.0),
+        units=_units("q1 q2 [rad] shoulder [N m] X_end Y_end [m]"),
+    ),
+    "vtol-centre": Scene(
+        partial(_built, "vtol", "centre"),
+        "Its centre of mass instead: the internal dynamics are unstable.",
+        group=INTERNAL_DYNAMICS,
+        teaches="A plan by forward integration diverges; the bounded inverse looks ahead.",
+        source="Hauser, Sastry and Meyer, Automatica 28 (1992) 665-679",
+        number="Errors grow with 15.04 1/s in hover.",
+        start={"theta": 0.0, "dtheta": 0.0},
+        t_span=(0.0, 1.0),
+        units=_units("x z [m] theta [rad] u1 u2 [N]"),
+    ),
+    # --- arms and robots
+    "two-link-arm": Scene(
+        partial(_built, "two_link_arm"),
+        "The end point of an arm with two driven joints moves along a line, in gravity.",
+        group=ARMS_AND_ROBOTS,
+        teaches="As many motors as coordinates: inverse kinematics and inverse dynamics in one.",
+        source="The closed form by the cosine rule",
+        number="The elbow is bent by 1.721 rad at the start.",
+        guess={"q1": -0.4, "q2": 1.5},
+        t_span=(0.0, 2.0),
+        units=_units("q1 q2 [rad] shoulder elbow [N m] X_end Y_end [m]"),
+    ),
+    # --- ideal reactions
+    "appell-hamel": Scene(
+        partial(_built, "appell_hamel"),
+        "The Appell-Hamel mechanism, linear rolling constraints, ideal (Emami et al.).",
+        group=IDEAL_REACTIONS,
+        teaches="Constraints on velocities enter (3.18) without multipliers; the reaction follows afterwards.",
+        number="The string's tension is at most 9.699 N.",
+        **_APPELL_HAMEL,
+    ),
+    "two-cars-ideal": Scene(
+        partial(_built, "cars", by="ideal"),
+        "The same program by an ideal reaction, which acts on the first car: another motion.",
+        group=IDEAL_REACTIONS,
+        teaches="Who realises a program decides the motion: 6.85 N here, 316 N by the motor.",
+        source="The closed form, a driven oscillator",
+        number="The reaction is at most 6.852 N.",
+        start={"x2": 0.0, "dx2": 0.0},
+        t_span=(0.0, 2.0),
+        units=_units("x1 x2 [m] force [N]"),
+    ),
+    "constant-speed": Scene(
+        partial(_built, "constant_speed"),
+        "A particle kept at constant speed in gravity by an ideal reaction.",
+        group=IDEAL_REACTIONS,
+        teaches="A constraint that is quadratic in velocities: its reaction is along the velocity.",
+        source="The closed form, heading -arcsin tanh(g t/v)",
+        number="After 1 s the particle has fallen by 3.283 m.",
+        start={"x": 0.0, "y": 0.0, "dy": 0.0},
+        guess={"dx": 5.0},
+        t_span=(0.0, 1.0),
+        units=_units("x y [m] thrust [N]"),
+    ),
+    # --- higher orders
+    "spiral": Scene(
+        partial(_built, "spiral"),
+        "A particle whose curvature grows steadily: Cornu's spiral, a program of order 3.",
+        group=HIGHER_ORDERS,
+        teaches="Residuals may contain any derivative; those above the second are states.",
+        source="The closed form, Fresnel integrals",
+        number="After 2 s the particle is at y = 0.6205 m.",
+        start={"x": 0.0, "y": 0.0, "dx": 1.0, "dy": 0.0, "d2y": 0.0},
+        t_span=(0.0, 2.0),
+        units=_units("x y [m]"),
+    ),
+    # --- rolling machines
+    "wheeled-robot": Scene(
+        partial(_built, "wheeled_robot"),
+        "A wheeled robot turns by 90 degrees at constant speed; the rate of its path's curvature is programmed.",
+        group=ROLLING_MACHINES,
+        teaches="Quasi-velocities satisfy the rolling constraints; orders of residuals may differ.",
+        source="The closed form, a curvature that grows and falls like 1 - cos",
+        number="The curvature is at most 0.7854 1/m.",
+        start={"x": 0.0, "y": 0.0, "psi": 0.0, "r": 0.0},
+        guess={"v": 1.0},
+        t_span=(0.0, 5.0),
+        units=_units("x y [m] psi [rad] drive [N] steer [N m] curvature [1/m]"),
+    ),
+    # --- singular programs
+    "appell-hamel-squared": Scene(
+        partial(_built, "appell_hamel", "squared"),
+        "The paper's squared form (4.4): singular when the wheel stops, at 0.698 s.",
+        group=SINGULAR_PROGRAMS,
+        teaches="A squared residual loses its gradient where the velocity vanishes, and the motion ends in words.",
+        number="The motion ends at 0.698 s.",
+        **_APPELL_HAMEL,
+    ),
+    "constant-speed-horizontal": Scene(
+        partial(_built, "constant_speed", "horizontal"),
+        "The same program by a horizontal force: it ends at v/g = 0.510 s.",
+        group=SINGULAR_PROGRAMS,
+        teaches="An actuator that does not act along the velocity needs more and more force, up to a singularity.",
+        source="The closed form, a force of -m g² t/sqrt(v² - g² t²)",
+        number="The motion ends at 0.5097 s.",
+        start={"x": 0.0, "y": 0.0, "dy": 0.0},
+        guess={"dx": 5.0},
+        t_span=(0.0, 1.0),
+        units=_units("x y [m] thrust [N]"),
+    ),
+}
