@@ -46,7 +46,7 @@ def trailers(radius=2.0, duration=4.0, speed=1.0):
         q,
         gibbs=S,
         actuators={"drive": (1 / (ca.cos(bend) * ca.cos(last_bend)), 0), "steer": (0, 1)},
-        shapes=_shapes(axles, angles),
+        shapes=_boxes_on_axles(axles, angles),
         parameters=p,
     )
     curvature = sv.paths.rest_to_rest(q.t, 0.0, 1 / radius, duration=duration, smoothness=4)
@@ -54,7 +54,7 @@ def trailers(radius=2.0, duration=4.0, speed=1.0):
     return mechanism, sv.Program(residuals, by="actuators")
 
 
-def _shapes(axles, angles):
+def _boxes_on_axles(axles, angles):
     """The bars, a box on each axle, and the last axle's middle."""
     boxes = {
         f"body {i}": sv.shapes.box(axle, length, 0.3, angle)
