@@ -115,15 +115,20 @@ def cable_robot(run):
     largest = 0.0
     for (*place, yaw), (*acceleration, turned) in zip(*(values.T for values in y), strict=True):
         wrench = np.array([*(20.0 * (np.array(acceleration) + [0, 0, GRAVITY])), 0.0, 0.0, 1.0 * turned])
-        rotation = np.array([[cos(yaw), -sin(yaw), 0], [sin(yaw), cos(yaw), 0], [0, 0, 1]])
-        ropes = []
-        for up, side, front in product((1, -1), repeat=3):
-            arm = rotation @ [0.4 * front * up, 0.3 * side, -0.15 * up]
-            along = np.array([2.0 * front, 1.5 * side, 1.5 * up]) - place - arm
-            ropes.append([*along, *np.cross(arm, along)] / np.linalg.norm(along))
-        W, wish = np.array(ropes).T, np.full(8, 500.0)
+        W, wish = wrenches(place, yaw), np.full(8, 500.0)
         largest = max(largest, (wish + np.linalg.pinv(W) @ (wrench - W @ wish)).max())
     return max(run[f"rope{i}"].max() for i in range(1, 9)), largest
+
+
+def wrenches(place, yaw):
+    """Forces and moments about the centre of the platform by unit tensions of its ropes, (6, 8)."""
+    rotation = np.array([[cos(yaw), -sin(yaw), 0], [sin(yaw), cos(yaw), 0], [0, 0, 1]])
+    ropes = []
+    for up, side, front in product((1, -1), repeat=3):
+        arm = rotation @ [0.4 * front * up, 0.3 * side, -0.15 * up]
+        along = np.array([2.0 * front, 1.5 * side, 1.5 * up]) - place - arm
+        ropes.append([*along, *np.cross(arm, along)] / np.linalg.norm(along))
+    return np.array(ropes).T
 
 
 def reaction_wheels(run):

@@ -5,7 +5,6 @@ import casadi as ca
 import servoctl as sv
 
 AXIS = (1.0, 2.0, 2.0)  # of the satellite's turn
-LOOP = ((-1, -1), (1, -1), (1, 1), (-1, 1), (-1, -1))  # corners of a face
 
 
 def reaction_wheels(turn=120.0, duration=20.0):
@@ -37,17 +36,18 @@ def reaction_wheels(turn=120.0, duration=20.0):
     S = ca.dot(dw, ca.vertcat(p.J1, p.J2, p.J3) * dw) / 2 + p.J_w * ca.dot(ds, ds / 2 + dw)
     S += ca.dot(dw, ca.cross(w, momentum))  # (3.11) of the satellite and its wheels
     turned = sv.paths.rest_to_rest(q.t, 0.0, turn * ca.pi / 180, duration=duration, smoothness=2)
-    axes, wheels = attitude(e), ca.horzsplit(attitude(e))
+    axes = attitude(e)
+    axles = ca.horzsplit(axes)
     mechanism = sv.Mechanism(
         q,
         gibbs=S,
         actuators={f"motor{i + 1}": ca.SX.eye(6)[:, 3 + i] for i in range(3)},
-        shapes={
-            f"face {end}": [0.5 * axes @ ca.DM([x, y, end]) for x, y in LOOP] for end in (-1, 1)
-        } | {
-            f"wheel {i + 1}": sv.shapes.disc(0.6 * wheels[i], 0.3, angle, (wheels[i - 2], wheels[i - 1]))
-            for i, angle in enumerate(list(plain)[4:])
-        },
+        shapes={f"axle {i + 1}": [(0, 0, 0), 0.6 * axle] for i, axle in enumerate(axles)}
+        | {
+            f"wheel {i + 1}": sv.shapes.disc(0.6 * axle, 0.15, angle, (axles[i - 2], axles[i - 1]))[:-1]
+            for i, (axle, angle) in enumerate(zip(axles, list(plain)[4:], strict=True))
+        }
+        | {"pointer": [1.2 * axles[2]]},
         parameters=p,
     )
     residuals = sv.programs.orientation("turn", axes, sv.rotations.turn(turned, AXIS))

@@ -41,7 +41,8 @@ def four_bar():
         shapes={
             "base": [(0, 0), (p.d, 0)],
             "crank": [(0, 0), pin],
-            "coupler": [pin, joint, traced, pin],
+            "coupler": [pin, joint],
+            "arm": [(pin + joint) / 2, traced],
             "rocker": [(p.d, 0), end],
             "traced": [traced],
         },

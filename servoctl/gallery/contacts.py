@@ -74,7 +74,7 @@ def ball_on_turntable(rate=3.0):
         actuators={"motor": table},
         constraints={"rolling_x": dx - p.a * dbeta + dtable * y, "rolling_y": dy + p.a * dalpha - dtable * x},
         shapes={
-            "table": sv.shapes.disc((0, 0, 0), 1.0, table, ((1, 0, 0), (0, 1, 0))),
+            "table": sv.shapes.disc((0, 0, 0), 0.8, table, ((1, 0, 0), (0, 1, 0)))[:-1],  # open: its rim alone
             "ball": sv.shapes.disc(centre, p.a, None, ((1, 0, 0), (0, 1, 0))),
             "centre": [centre],
         },

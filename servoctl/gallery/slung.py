@@ -45,8 +45,8 @@ def slung_load_3d():
         (sin α, -cos α sin β, -cos α cos β). Outputs "X", "Y", "Z" of the load [m], Z up.
     """
     p = sv.parameters(m=1.0, J=0.02, J_z=0.04, m_load=0.5, L=1.2, g=9.81)  # kg, kg m^2, kg m^2, kg, m, m/s^2
-    q = sv.coordinates("z x y alpha beta psi theta phi")  # m, m, m (up), rad each
-    z, x, y, alpha, beta, *angles = q
+    q = sv.coordinates("x y z alpha beta psi theta phi")  # m, m, m (up), rad each
+    x, y, z, alpha, beta, *angles = q
     body = ca.vertcat(x, y, z)
     rope = ca.vertcat(ca.sin(alpha), -ca.cos(alpha) * ca.sin(beta), -ca.cos(alpha) * ca.cos(beta))
     load = body + p.L * rope
@@ -63,7 +63,7 @@ def slung_load_3d():
         q,
         gibbs=S,
         potential=p.g * (p.m * z + p.m_load * load[2]),
-        actuators={"thrust": ca.vertcat(axes[2, 2], axes[:2, 2], ca.SX(5, 1))}
+        actuators={"thrust": ca.vertcat(axes[:, 2], ca.SX(5, 1))}
         | dict(zip(("roll", "pitch", "yaw"), ca.horzsplit(turning), strict=True)),
         outputs=dict(zip("XYZ", load.elements(), strict=True)),
         shapes={f"arm {i + 1}": [body - 0.4 * axes[:, i], body + 0.4 * axes[:, i]] for i in (0, 1)}
