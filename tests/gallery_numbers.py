@@ -82,14 +82,17 @@ def flexible_joint(run):
 
 
 def elastic_link(run):
-    """Four rods with springs and dampers between them: small angles, in numbers."""
+    return _slowest(run), np.abs(link_poles().imag).min()
+
+
+def link_poles():
+    """Eight poles of four rods with springs and dampers between them, for small angles [1/s]."""
     n, m, l, tau = 4, 2.0 / 4, 1.0 / 4, 0.002
     angles = np.tril(np.ones((n, n)))  # of the rods, by those of the springs
     middles = [l * (angles[:i].sum(0) + angles[i] / 2) for i in range(n)]
     mass = sum(m * (np.outer(y, y) + l**2 / 12 * np.outer(a, a)) for y, a in zip(middles, angles, strict=True))
     spring = np.linalg.solve(mass, np.diag([160.0, 80.0, 80.0, 80.0]))
-    poles = np.linalg.eigvals(np.block([[np.zeros((n, n)), np.eye(n)], [-spring, -tau * spring]]))
-    return _slowest(run), np.abs(poles.imag).min()
+    return np.linalg.eigvals(np.block([[np.zeros((n, n)), np.eye(n)], [-spring, -tau * spring]]))
 
 
 def double_pendulum(run):
