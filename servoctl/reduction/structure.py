@@ -134,7 +134,7 @@ class Structure:
             lines.append(f"  it differs at {count}, first t = {t:.4g} s: {first.named(self.residuals)}")
         if self.start is not None and self.start[1].decided != typical:
             t, local = self.start
-            lost = local.zeros_at_infinity != self.zeros_at_infinity
+            lost = local.zeros_at_infinity and local.zeros_at_infinity != self.zeros_at_infinity
             lines.append(f"  at the start nearest zero, t = {t:.4g} s: {local.named(self.residuals)}")
             lines += ["    the motion's relative degrees are lost there: the program is singular"] if lost else []
         return lines
