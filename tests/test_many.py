@@ -172,6 +172,30 @@ def test_an_interrupt_leaves_the_finished_cases(monkeypatch):
     assert list(many["case"]) == [0, 1] and many.study.meta["interrupted"]
 
 
+def test_an_interrupt_ends_the_lanes_at_once(monkeypatch, c_compiler):
+    """The cases that were finished are kept, and no case is computed by itself afterwards."""
+    def stop(bar, count):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("servoctl.methods.lanes.SHOWN_EVERY", 1e-4)
+    monkeypatch.setattr("tqdm.std.tqdm.update", stop)
+    in_lanes(monkeypatch)
+    angles = np.random.default_rng(SEED).uniform(-1, 1, 20_000)
+    model = pendulum()
+    start = model.start(a=0.1, da=0.0)
+    many = sv.simulate_many(model, start, {"k": 0.5 + 0.01 * angles}, (0.0, 30.0), threads=1)
+    assert many.study.meta["interrupted"] and 0 < len(many) < len(angles)
+    assert np.isfinite(many["final a"]).all()
+
+
+def test_progress_counts_the_cases(monkeypatch, c_compiler):
+    counts = []
+    monkeypatch.setattr("tqdm.std.tqdm.update", lambda bar, count: counts.append(count))
+    model = pendulum(lambda a, t, p: p.k * ca.sin(t))
+    sv.simulate_many(model, {"a": [0.1, 0.2, 0.3], "da": 0.0}, None, (0.0, 0.1), progress=False)
+    assert np.cumsum(counts)[-1] >= 3
+
+
 def test_without_a_compiler_the_results_are_the_same(monkeypatch, c_compiler):
     model, starts = pendulum(), {"a": [0.3, 2.0], "da": 0.0}
     many = sv.simulate_many(model, starts, None, (0.0, 1.0))

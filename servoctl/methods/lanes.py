@@ -2,8 +2,8 @@
 
 import ctypes
 import os
-from concurrent.futures import ThreadPoolExecutor
 from functools import lru_cache
+from threading import Thread
 
 import casadi as ca
 import numpy as np
@@ -17,10 +17,10 @@ from servoctl.methods.taylor import FAR_OFF, series_loop
 from servoctl.model.switching import switching
 
 MOST_IN_LANES = 10**6  # of a case
-PER_THREAD = 8  # tasks, so that threads end at about the same time
+SHOWN_EVERY = 0.1  # s between two looks at how far the threads are
 
 _NUMBERS = {"t0": ctypes.c_double, "t1": ctypes.c_double, "rtol": ctypes.c_double}
-_COUNTS = ("max_steps", "n_times", "stop")
+_COUNTS = ("max_steps", "n_times", "n_cases", "next", "stop")
 _ARRAYS = ("x0", "p", "atol", "pivots", "times", "ends", "samples")
 
 
@@ -50,43 +50,49 @@ def fits(model):
     return not model.flat and not model.knots and model.once("fits lanes", smooth)
 
 
-def integrate(model, last, span, cases, rtol, times, threads=None):
+def integrate(model, last, span, cases, rtol, times, threads=None, progress=None):
     """Integrate from starts x0 (N, n_x) with parameters p (N, n_p) and absolute tolerances (N,) over a span.
+
+    Ctrl-C ends it; `progress` is called with the number of cases begun.
 
     Returns
     -------
     ends : (N, 3 + 2 n_x) array
-        Outcome (1: finished, else to be computed by itself), number of steps, last instant, state there, and largest
-        sizes of the state.
+        Outcome (1: finished, 0: not reached before Ctrl-C, else to be computed by itself), number of steps, last
+        instant, state there, and largest sizes of the state.
     samples : (N, K, n_x) array
         States at the times (K,), in the order of the motion.
-    Both are None without a compiler.
+    interrupted : bool
+    The arrays are None without a compiler.
     """
     f = series_loop(model, last)
     library = None if f.operations > TAYLOR_COMPILED else _library(f, len(model.state_names))
     if library is None:
-        return None, None
+        return None, None, False
     x0, p, atol = cases
     n, n_x = x0.shape
     p = np.column_stack([p, np.full(n, sum(span) / 2)])  # the instant that selects branches of paths
     arrays = {"x0": x0, "p": p, "atol": atol, "pivots": model.pivot_sizes, "times": times}
     arrays = {name: np.ascontiguousarray(array, dtype=float) for name, array in arrays.items()}
     arrays |= {"ends": np.zeros((n, 3 + 2 * n_x)), "samples": np.full((n, len(times), n_x), np.nan)}
-    many = _Many(arrays, t0=span[0], t1=span[1], rtol=rtol, max_steps=MOST_IN_LANES, n_times=len(times))
-
-    def run(first, end):
-        library(ctypes.byref(many), ctypes.c_int64(first), ctypes.c_int64(end))
-
-    threads = threads or os.cpu_count() or 1
-    width = compiler.lanes()
-    length = max(-(-n // (threads * PER_THREAD)), 8 * width)  # lanes that wait at the end of a task cost their time
-    starts = range(0, n, length)
-    with ThreadPoolExecutor(threads) as pool:
-        try:
-            list(pool.map(run, starts, (min(first + length, n) for first in starts)))
-        except KeyboardInterrupt:
-            many.stop = 1  # which the threads read at each step
-    return arrays["ends"], arrays["samples"]
+    counts = {"max_steps": MOST_IN_LANES, "n_times": len(times), "n_cases": n}
+    many = _Many(arrays, t0=span[0], t1=span[1], rtol=rtol, **counts)
+    threads = min(threads or os.cpu_count() or 1, -(-n // compiler.lanes()))
+    workers = [Thread(target=library, args=(ctypes.byref(many),)) for _ in range(threads)]
+    try:
+        for worker in workers:
+            worker.start()
+        while progress and any(worker.is_alive() for worker in workers):
+            workers[0].join(SHOWN_EVERY)
+            progress(min(many.next, n))
+        for worker in workers:
+            worker.join()
+    except KeyboardInterrupt:
+        many.stop = 1  # which the threads read at each step
+        for worker in workers:
+            if worker.ident:
+                worker.join()
+    return arrays["ends"], arrays["samples"], bool(many.stop)
 
 
 def _library(f, n_x):
@@ -102,11 +108,12 @@ def _library(f, n_x):
 @lru_cache(32)
 def _source(f, n_x):
     """The C text for any number of lanes."""
-    sizes = emit.definitions(f.sizes)
+    sizes, chunk = emit.definitions(f.sizes), emit.WIDE if f.operations <= emit.WIDE else emit.CHUNK
     sizes |= {"NAME": "servoctl", "NX": n_x, "NP": f.n_p, "NY": f.n_y}
     sizes |= {"DEGRADED": DEGRADED, "NEGLIGIBLE": NEGLIGIBLE, "FAR_OFF": FAR_OFF}
     settled = f.others.get("settled")
     sizes |= {} if settled is None else {"SETTLED": ""}
-    parts = [emit.unit(sizes), emit.include("lanes.h"), emit.function(f.expression, "expansion", emit.LANES)]
+    expansion = emit.function(f.expression, "expansion", emit.LANES, chunk)  # in one piece values stay in registers
+    parts = [emit.unit(sizes), emit.include("lanes.h"), expansion]
     parts += [] if settled is None else [emit.function(settled, "servoctl_settled", emit.PORTABLE)]
     return "".join((*parts, emit.include("many.c")))

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from servoctl.checks import as_numbers, as_span, mapping, require_kind, whole
+from servoctl.checks import as_numbers, as_span, mapping, plain, require_kind, whole
 from servoctl.errors import ServoError, SpecificationError
 from servoctl.methods.accuracy import ATOL, LARGE, absolute_tolerances
 from servoctl.methods.choice import Method, Taylor, as_method
@@ -17,9 +17,10 @@ from servoctl.methods.taylor import order_for
 from servoctl.model.model import Model
 from servoctl.model.start import State
 from servoctl.model.validity import affirmed_each
+from servoctl.progress import progress_bar
 from servoctl.reduction.idle import names_of
 from servoctl.simulation import OFF, as_state, simulated
-from servoctl.study.cases import FAILURE, as_cases
+from servoctl.study.cases import FAILURE, as_columns
 from servoctl.study.table import Study, Traced, machine, table
 
 
@@ -51,7 +52,7 @@ class Motions(Traced):
 def simulate_many(
     model: Model, starts: State | ArrayLike | Mapping[str, ArrayLike], parameters: Mapping[str, ArrayLike] | None,
     t_span: Sequence[float], method: Method | str | None = None, *, t_eval: ArrayLike | None = None,
-    threads: int | None = None,
+    threads: int | None = None, progress: bool | None = None,
 ) -> Motions:  # fmt: skip
     """Simulate the motion of a program for many starts and sets of parameters.
 
@@ -76,6 +77,8 @@ def simulate_many(
         Times of the traces [s]; default: no traces.
     threads : int, optional
         Default: one per core.
+    progress : bool, optional
+        Show a progress bar; default: on a terminal, for work of more than a second.
 
     Returns
     -------
@@ -95,18 +98,22 @@ def simulate_many(
     method = as_method(method) if method is not None else as_method("algebraic") if model.flat else Taylor()
     times = _trace_times(span, t_eval)
     motions = _Many(model, *_case_table(model, starts, parameters), len(times))
-    if isinstance(method, Taylor) and fits(model):
-        motions.in_lanes(span, method, times, threads)
-    interrupted = motions.one_by_one(span, method, times)
-    return motions.result(times, {"t_span": list(span), "method": str(method), "interrupted": interrupted})
+    with progress_bar("simulate_many", progress, motions.n, unit="case") as bar:
+        def show(count):
+            bar.update(count - bar.n)
+
+        if isinstance(method, Taylor) and fits(model):
+            motions.in_lanes(span, method, times, threads, show)
+        if not motions.interrupted:
+            motions.one_by_one(span, method, times, show)
+    meta = {"t_span": list(span), "method": str(method), "interrupted": motions.interrupted}
+    return motions.result(times, meta)
 
 
 def _case_table(model, starts, parameters):
-    """Parameters of each case (list of dict); a start of all cases, columns (N,) by name, or states (N, n_x)."""
-    cases, lengths = [{}], set()
-    if parameters is not None:
-        cases = as_cases(parameters)
-        lengths.add(len(cases))
+    """Number of cases; their parameters by name; one start, starts by name, or states (N, n_x)."""
+    columns = {} if parameters is None else as_columns(parameters)
+    lengths = {len(column) for column in columns.values()}
     if isinstance(starts, Mapping):
         starts = {name: as_numbers(values) for name, values in mapping(starts, "The starts").items()}
         valid = all(values.ndim < 2 and np.isfinite(values).all() for values in starts.values())
@@ -115,6 +122,7 @@ def _case_table(model, starts, parameters):
         starts = as_numbers(starts).T
         valid = starts.ndim in (1, 2) and starts.shape[-1] == len(model.state_names) and np.isfinite(starts).all()
         lengths |= {len(starts)} if starts.ndim == 2 else set()
+    n = max(lengths, default=1)
     if not isinstance(starts, State) and not valid or len(lengths) > 1 or 0 in lengths:
         raise SpecificationError(
             f"The starts and parameters have the lengths {', '.join(map(str, sorted(lengths))) or '(none)'}.",
@@ -123,7 +131,7 @@ def _case_table(model, starts, parameters):
             lengths=sorted(lengths),
             names=model.state_names,
         )
-    return cases * max(lengths, default=1) if len(cases) == 1 else cases, starts
+    return n, columns, starts
 
 
 def _trace_times(span, t_eval):
@@ -141,17 +149,18 @@ def _trace_times(span, t_eval):
 class _Many:
     """The cases, and what is known of their motions so far."""
 
-    def __init__(self, model, cases, starts, n_times):
-        self.model, self.cases, self.starts, self.models = model, cases, starts, {}
-        n, n_x = len(cases), len(model.state_names)
+    def __init__(self, model, n, columns, starts, n_times):
+        self.model, self.n, self.columns, self.starts, self.models = model, n, columns, starts, {}
+        self.interrupted, n_x = False, len(model.state_names)
         self.done, self.steps, self.errors = np.zeros(n, bool), np.full(n, np.nan), {}
         self.final, self.samples = np.full((n, n_x), np.nan), np.full((n, n_times, n_x), np.nan)
 
     def model_of(self, i):
         """The model with the parameters of a case; each set of parameters is checked once."""
-        key = tuple(self.cases[i].items())
+        case = {name: plain(column[i]) for name, column in self.columns.items()}
+        key = tuple(case.values())
         if key not in self.models:
-            self.models[key] = self.model.with_parameters(**self.cases[i]) if key else self.model
+            self.models[key] = self.model.with_parameters(**case) if case else self.model
         return self.models[key]
 
     def start(self, i, model, t):
@@ -160,7 +169,7 @@ class _Many:
             return model.start(t=t, **{name: float(v[i] if v.ndim else v) for name, v in self.starts.items()})
         return self.starts[i] if np.ndim(self.starts) == 2 else self.starts
 
-    def in_lanes(self, span, method, times, threads):
+    def in_lanes(self, span, method, times, threads, progress):
         """Compute the cases that need nothing but steps."""
         which, x0, p = self._prepared(span[0])
         if not len(which):
@@ -168,7 +177,8 @@ class _Many:
         order, top = order_for(method.rtol) if method.order is None else method.order, self.model.reduction.top
         last = max(order + top - 1, (method.jets or top) + 1)
         atol = np.full(len(which), ATOL if method.atol is None else method.atol)
-        ends, samples = integrate(self.model, last, span, (x0, p, atol), method.rtol, times, threads)
+        cases, rtol = (x0, p, atol), method.rtol
+        ends, samples, self.interrupted = integrate(self.model, last, span, cases, rtol, times, threads, progress)
         if ends is None:
             return
         x, largest = np.split(ends[:, 3:], 2, axis=1)
@@ -181,29 +191,31 @@ class _Many:
 
     def _prepared(self, t):
         """Cases (K,) for which the derivation holds, their states (K, n_x) and parameters (K, n_p)."""
-        affirmed, which, states, values = self._affirmed(), [], [], []
-        for i in range(len(self.cases)):
-            try:
-                model = self.model if i in affirmed else self.model_of(i)
-                if model.reduction is self.model.reduction and not model.knots:
-                    states.append(as_state(model, self.start(i, model, t), t))
-                    values.append(affirmed.get(i, model.parameters))
-                    which.append(i)
-            except ServoError:
-                continue  # it fails again, and becomes a row, where the case is computed by itself
-        return np.array(which, dtype=int), np.array(states), np.array(values)
-
-    def _affirmed(self):
-        """Parameters of cases for which the derivation holds, as far as double precision affirms it at once."""
-        by_name = isinstance(self.starts, dict)  # whose states depend on them
-        if by_name or self.model.reduction.timed or not self.cases[0]:
-            return {}
-        symbols, numbers, values = self.model.reduction.mechanism.parameters, self.model.numbers, {}
-        for i, case in enumerate(self.cases):
+        p, x = np.tile(self.model.parameters, (self.n, 1)), np.empty(self.final.shape)
+        ready, by_name = self._affirmed(p), isinstance(self.starts, dict)
+        if not by_name:
+            with contextlib.suppress(ServoError):  # it is raised again, and becomes a row, for each case by itself
+                x[:] = as_state(self.model, self.starts, t) if isinstance(self.starts, State) else self.starts
+        for i in np.flatnonzero(~ready).tolist():
             with contextlib.suppress(ServoError):
-                values[i] = symbols.values({**numbers, **case})
-        valid = affirmed_each(self.model, np.array([*values.values()]).T) if values else []
-        return {i: each for (i, each), holds in zip(values.items(), valid, strict=True) if holds}
+                model = self.model_of(i)
+                if model.reduction is self.model.reduction and not model.knots:
+                    x[i], p[i] = as_state(model, self.start(i, model, t), t), model.parameters
+                    ready[i] = True
+        which = np.flatnonzero(ready)
+        return which, x[which], p[which]
+
+    def _affirmed(self, p):
+        """Cases (N,) whose start is known and for which double precision affirms the derivation; p (N, n_p) is set."""
+        names = list(self.model.numbers)
+        if isinstance(self.starts, dict) or self.model.reduction.timed or not self.columns.keys() <= set(names):
+            return np.zeros(self.n, bool)  # states by name depend on the parameters
+        if not self.columns:
+            return np.ones(self.n, bool)
+        for name, column in self.columns.items():
+            p[:, names.index(name)] = as_numbers(column)
+        sets, places = np.unique(p, axis=0, return_inverse=True)
+        return affirmed_each(self.model, sets.T)[places.ravel()]
 
     def _consistent(self, t, x, p):
         """Whether states (N, n_x) satisfy the invariants."""
@@ -222,14 +234,14 @@ class _Many:
             fits[i] = largest[i].max() <= LARGE and absolute_tolerances(self.model, np.array(span), both, rtol) is None
         return fits
 
-    def one_by_one(self, span, method, times):
-        """Compute the others as `simulate` does; whether Ctrl-C came."""
+    def one_by_one(self, span, method, times, progress):
+        """Compute the others as `simulate` does."""
         try:
             for i in np.flatnonzero(~self.done).tolist():
                 self._one(i, span, method, times)
+                progress(int(self.done.sum()))
         except KeyboardInterrupt:
-            return True
-        return False
+            self.interrupted = True
 
     def _one(self, i, span, method, times):
         t_eval = np.union1d(times, [span[1]])[:: 1 if span[1] > span[0] else -1]
@@ -252,10 +264,12 @@ class _Many:
         which, names = np.flatnonzero(self.done), self.model.state_names
         if not len(which):
             raise KeyboardInterrupt
-        columns = {"case": which} | {name: [self.cases[i][name] for i in which] for name in self.cases[0]}
+        columns = {"case": which}
+        columns |= {name: np.asarray(column)[which] for name, column in self.columns.items()}
         columns |= {"steps": self.steps[which]}
         columns |= {f"final {name}": self.final[which, j] for j, name in enumerate(names)}
         for name in FAILURE:
-            columns[name] = np.array([self.errors.get(i, {}).get(name, "") for i in which.tolist()], dtype=str)
+            texts = [self.errors.get(i, {}).get(name, "") for i in which.tolist()] if self.errors else [""] * len(which)
+            columns[name] = np.array(texts, dtype=str)
         trace = dict(zip(names, self.samples[which].transpose(2, 1, 0), strict=True)) if len(times) else {}
         return Motions(Study("many", columns, meta | {"machine": machine()}), times, trace)
