@@ -144,17 +144,73 @@ def test_small_and_large_motions_take_the_tolerances_of_simulate(c_compiler):
     each_equals_simulate(model, many, lambda i, one: one.start(a=angles[i], da=0.0), (0.0, 2.0), sv.Taylor())
 
 
-@pytest.mark.parametrize("method", [None, "RK4"])
-def test_plans_and_other_methods_run_one_by_one(method, gallery_model):
-    name, parameter = ("overhead-crane", "m") if method is None else ("appell-hamel", "M")
-    scene, model = gallery[name], gallery_model(name)
-    parameter = parameter if parameter in model.numbers else next(iter(model.numbers))
+def test_other_methods_run_one_by_one(gallery_model):
+    scene, model = gallery["appell-hamel"], gallery_model("appell-hamel")
     start = model.start(**scene.start, guess=scene.guess)
-    values = model.numbers[parameter] * np.array([0.9, 1.1])
-    many = sv.simulate_many(model, start, {parameter: values}, (0.0, 0.5), method, t_eval=[0.0, 0.5])
+    values = model.numbers["M"] * np.array([0.9, 1.1])
+    many = sv.simulate_many(model, start, {"M": values}, (0.0, 0.5), "RK4", t_eval=[0.0, 0.5])
     for i, value in enumerate(values):
-        run = sv.simulate(model.with_parameters(**{parameter: value}), start, (0.0, 0.5), method, t_eval=[0.0, 0.5])
-        assert many.trace[model.state_names[0]][:, i] == pytest.approx(run[model.state_names[0]], abs=1e-12)
+        run = sv.simulate(model.with_parameters(M=value), start, (0.0, 0.5), "RK4", t_eval=[0.0, 0.5])
+        assert many.trace["x"][:, i] == pytest.approx(run["x"], abs=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("name", "span"),
+    [("overhead-crane", (0.0, 6.0)), ("overhead-crane", (4.0, 1.0)), ("crane-3d", (0.0, 2.0)), ("two-cars", (0.0, 2.0)),
+     ("winch-crane-redundant", (0.5, 2.0))],
+)
+def test_plans_over_parameters_equal_simulate(name, span, gallery_model, monkeypatch, c_compiler):
+    scene, model = gallery[name], gallery_model(name)
+    start = model.start(t=span[0], **scene.start, guess=scene.guess)
+    parameters = {p: model.numbers[p] * np.array([0.9, 1.0, 1.2]) for p in [*model.numbers][:2]}
+    assert lanes.plans_fit(model)
+    with monkeypatch.context() as patch:
+        in_lanes(patch)
+        many = sv.simulate_many(model, start, parameters, span, t_eval=np.linspace(*span, 11), threads=2)
+        final = sv.simulate_many(model, start, parameters, span)
+    each_equals_simulate(model, many, start, span, None)
+    name = f"final {model.state_names[0]}"
+    np.testing.assert_allclose(many[name], final[name], rtol=1e-12)
+
+
+def held_pendulum(path):
+    """A pendulum of length r on a trolley whose place is programmed, and its angle as well."""
+    q = sv.coordinates("x a")
+    x, a = q
+    p = sv.parameters(m=1.0, r=1.0, g=9.81, T=2.0, f=1.0)
+    S = sv.particle(q, 1.0, (x,)) + sv.particle(q, p.m, (x + p.r * ca.sin(a), -p.r * ca.cos(a)))
+    potential = -p.m * p.g * p.r * ca.cos(a)
+    mechanism = sv.Mechanism(q, gibbs=S, potential=potential, actuators={"F": x, "M": a}, parameters=p)
+    height = p.r * ca.cos(a) - 0.5 - 0.1 * ca.cos(q.t)
+    return sv.derive(mechanism, sv.Program({"place": x + p.r * ca.sin(a) - path(q.t, p), "height": height}))
+
+
+def test_plans_whose_motion_depends_on_parameters(monkeypatch, c_compiler):
+    """r cos a = 0.5 + 0.1 cos t, x = sin(f t) - r sin a."""
+    model = held_pendulum(lambda t, p: ca.sin(p.f * t))
+    start = model.start(guess={"a": 0.9})
+    r, f = np.linspace(0.7, 2.0, 9), np.linspace(0.5, 3.0, 9)
+    with monkeypatch.context() as patch:
+        in_lanes(patch)
+        many = sv.simulate_many(model, start, {"r": r, "f": f}, (0.0, 2.0), t_eval=[0.3, 1.7])
+    t = np.array([[0.3], [1.7]])
+    a = np.arccos((0.5 + 0.1 * np.cos(t)) / r)
+    np.testing.assert_allclose(many.trace["a"], a, atol=1e-12)
+    np.testing.assert_allclose(many.trace["x"], np.sin(f * t) - r * np.sin(a), atol=1e-12)
+    a = np.arccos((0.5 + 0.1 * np.cos(2.0)) / r)
+    np.testing.assert_allclose(many["final da"], 0.1 * np.sin(2.0) / (r * np.sin(a)), atol=1e-11)
+
+
+def test_plans_with_other_knots_and_without_solutions():
+    """Paths of other durations leave the compiled plans, and where the rod is too short there is no plan."""
+    model = held_pendulum(lambda t, p: sv.paths.rest_to_rest(t, 0.0, 1.0, duration=p.T))
+    start = model.start(guess={"a": 0.9})
+    many = sv.simulate_many(model, start, {"T": [2.0, 1.0, 2.0], "r": [1.0, 1.0, 0.5]}, (0.0, 1.5), t_eval=[0.8])
+    assert list(many["error"] != "") == [False, False, True]
+    for i, T in enumerate((2.0, 1.0)):
+        run = simulated(model.with_parameters(T=T), start, (0.0, 1.5), t_eval=[0.8, 1.5])
+        assert many.trace["x"][0, i] == pytest.approx(run["x"][0], abs=1e-12)
+        assert many["final x"][i] == pytest.approx(run["x"][1], abs=1e-12)
 
 
 def test_an_interrupt_leaves_the_finished_cases(monkeypatch):

@@ -11,8 +11,8 @@ from numpy.typing import ArrayLike
 from servoctl.checks import as_numbers, as_span, mapping, plain, require_kind, whole
 from servoctl.errors import ServoError, SpecificationError
 from servoctl.methods.accuracy import ATOL, LARGE, absolute_tolerances
-from servoctl.methods.choice import Method, Taylor, as_method
-from servoctl.methods.lanes import fits, integrate
+from servoctl.methods.choice import Algebraic, Method, Taylor, as_method
+from servoctl.methods.lanes import fits, integrate, plan_many, plans_fit
 from servoctl.methods.taylor import order_for
 from servoctl.model.model import Model
 from servoctl.model.start import State
@@ -57,9 +57,11 @@ def simulate_many(
     """Simulate the motion of a program for many starts and sets of parameters.
 
     By the Taylor method the motions run in compiled code, in the lanes of vectors with steps of their own, and on
-    threads, where the equations are polynomials of the state and of sines and cosines that do not depend on time. All
-    other motions, and those whose pivots fall, run one after the other, as `simulate` computes them. The result of a
-    case equals that of `simulate` to rounding, and depends neither on other cases nor on threads.
+    threads, where the equations are polynomials of the state and of sines and cosines that do not depend on time. Plans
+    of programs that determine the motion completely run in compiled code and on threads as well, unless kinks or
+    switches may lie on their way. All other motions, and those whose pivots fall, run one after the other, as `simulate`
+    computes them. The result of a case equals that of `simulate` to rounding, and depends neither on other cases nor on
+    threads.
 
     Parameters
     ----------
@@ -104,6 +106,8 @@ def simulate_many(
 
         if isinstance(method, Taylor) and fits(model):
             motions.in_lanes(span, method, times, threads, show)
+        elif isinstance(method, Algebraic) and plans_fit(model):
+            motions.plans(span, times, threads, show)
         if not motions.interrupted:
             motions.one_by_one(span, method, times, show)
     meta = {"t_span": list(span), "method": str(method), "interrupted": motions.interrupted}
@@ -146,6 +150,11 @@ def _trace_times(span, t_eval):
     return times if span[1] > span[0] else times[::-1]
 
 
+def _with_end(times, span):
+    """Times (K,) in the order of the motion, with its end."""
+    return times if len(times) and times[-1] == span[1] else np.append(times, span[1])
+
+
 class _Many:
     """The cases, and what is known of their motions so far."""
 
@@ -171,7 +180,7 @@ class _Many:
 
     def in_lanes(self, span, method, times, threads, progress):
         """Compute the cases that need nothing but steps."""
-        which, x0, p = self._prepared(span[0])
+        which, x0, p = self._prepared(span)
         if not len(which):
             return
         order, top = order_for(method.rtol) if method.order is None else method.order, self.model.reduction.top
@@ -185,12 +194,25 @@ class _Many:
         good = (ends[:, 0] > 0) & self._consistent(span[0], x0, p) & self._consistent(span[1], x, p)
         if method.atol is None:
             good &= self._default_fits(span, x0, largest, method.rtol)
-        here = which[good]
-        self.done[here], self.final[here], self.steps[here] = True, x[good], ends[good, 1]
-        self.samples[here] = samples[good]
+        self._take(which, ends, samples, good)
 
-    def _prepared(self, t):
-        """Cases (K,) for which the derivation holds, their states (K, n_x) and parameters (K, n_p)."""
+    def plans(self, span, times, threads, progress):
+        """Compute the plans whose pivots do not fall."""
+        which, *cases = self._prepared(span)
+        ends, samples, self.interrupted = plan_many(self.model, span, cases, _with_end(times, span), threads, progress)
+        if ends is not None:
+            self._take(which, ends, samples[:, : len(times)], ends[:, 0] > 0)
+
+    def _take(self, which, ends, samples, good):
+        """Take what was computed for some cases, as far as it is good."""
+        here, n_x = which[good], self.final.shape[1]
+        self.done[here], self.steps[here] = True, ends[good, 1]
+        self.final[here], self.samples[here] = ends[good, 3 : 3 + n_x], samples[good]
+
+    def _prepared(self, span):
+        """Cases (K,) for which the derivation and its knots hold, their states (K, n_x) and parameters (K, n_p)."""
+        t, span = span[0], (min(span), max(span))
+        knots = self.model.require_smooth(span)
         p, x = np.tile(self.model.parameters, (self.n, 1)), np.empty(self.final.shape)
         ready, by_name = self._affirmed(p), isinstance(self.starts, dict)
         if not by_name:
@@ -199,7 +221,7 @@ class _Many:
         for i in np.flatnonzero(~ready).tolist():
             with contextlib.suppress(ServoError):
                 model = self.model_of(i)
-                if model.reduction is self.model.reduction and not model.knots:
+                if model.reduction is self.model.reduction and model.require_smooth(span) == knots:
                     x[i], p[i] = as_state(model, self.start(i, model, t), t), model.parameters
                     ready[i] = True
         which = np.flatnonzero(ready)
@@ -207,15 +229,16 @@ class _Many:
 
     def _affirmed(self, p):
         """Cases (N,) whose start is known and for which double precision affirms the derivation; p (N, n_p) is set."""
-        names = list(self.model.numbers)
-        if isinstance(self.starts, dict) or self.model.reduction.timed or not self.columns.keys() <= set(names):
+        names, of_knots = list(self.model.numbers), self.model.reduction.switches.numbers
+        if isinstance(self.starts, dict) or not self.columns.keys() <= set(names):
             return np.zeros(self.n, bool)  # states by name depend on the parameters
         if not self.columns:
             return np.ones(self.n, bool)
         for name, column in self.columns.items():
             p[:, names.index(name)] = as_numbers(column)
         sets, places = np.unique(p, axis=0, return_inverse=True)
-        return affirmed_each(self.model, sets.T)[places.ravel()]
+        same_knots = (sets[:, of_knots] == self.model.parameters[of_knots]).all(axis=1)
+        return (affirmed_each(self.model, sets.T) & same_knots)[places.ravel()]
 
     def _consistent(self, t, x, p):
         """Whether states (N, n_x) satisfy the invariants."""
@@ -244,7 +267,7 @@ class _Many:
             self.interrupted = True
 
     def _one(self, i, span, method, times):
-        t_eval = np.union1d(times, [span[1]])[:: 1 if span[1] > span[0] else -1]
+        t_eval = _with_end(times, span)
         try:
             model = self.model_of(i)
             run = simulated(model, self.start(i, model, span[0]), span, method, t_eval=t_eval, progress=False)

@@ -3,20 +3,9 @@
 #include "unit.h"
 #include "lanes.h"
 #include "series.h"
+#include "cases.h"
 
 #define COEFFICIENTS ((PLAIN ? 0 : NQ * LAST) + N * LAST) /* outputs before the pivots */
-
-/* Inputs are a row for each case: x0, p, absolute tolerance; and for all of them the pivots' sizes, and the instants of
-   samples. Results are a row for each case: the outcome, the number of steps, the last instant and state, the largest
-   sizes of the state; and its samples. */
-typedef struct {
-    double t0, t1, rtol;
-    int64_t max_steps, n_times, n_cases, next, stop;
-    const double *x0, *p, *atol, *pivots, *times;
-    double *ends, *samples;
-} Many;
-
-enum { FINISHED = 1, PIVOT_FALLS = -1, STUCK = -2, SERIES_OFF = -3 };
 
 typedef struct {
     W t, x[NX + 1], p[NP + 1], y[NY + 1], atol, h, largest[NX + 1];
@@ -76,8 +65,8 @@ INLINE W w_series(const W *c, int64_t n, int64_t i, int64_t j, W h)
 /* Put the next case, or none, into a lane, which then rests at the start of the first case; whether there was one. */
 static int load(Many *m, int64_t lane, Motions *s)
 {
-    const int64_t next = __atomic_fetch_add(&m->next, 1, __ATOMIC_RELAXED), from = next < m->n_cases ? next : 0;
-    s->of[lane] = next < m->n_cases ? next : -1;
+    const int64_t next = next_case(m), from = next < 0 ? 0 : next;
+    s->of[lane] = next;
     s->t[lane] = m->t0;
     s->h[lane] = s->steps[lane] = s->sampled[lane] = 0;
     s->atol[lane] = m->atol[from];
@@ -86,7 +75,7 @@ static int load(Many *m, int64_t lane, Motions *s)
     for (int64_t i = 0; i < NP; i++) s->p[i][lane] = m->p[from * NP + i];
     for (int64_t i = 0; i < NY - COEFFICIENTS; i++) s->pivots[i][lane] = m->pivots[i];
     for (int64_t i = 0; i < NY - COEFFICIENTS; i++) s->signs[i][lane] = 0;
-    return s->of[lane] >= 0;
+    return next >= 0;
 }
 
 static void end(const Many *m, int64_t lane, int64_t outcome, const Motions *s)
@@ -163,7 +152,7 @@ void FN(many)(Many *m)
     int64_t open = 0;
     for (int64_t lane = 0; lane < W_LANES; lane++) open += load(m, lane, &s);
     while (open) {
-        if (*(const volatile int64_t *)&m->stop) return;
+        if (stopped(m)) return;
         expansion(s.t, s.x, s.p, s.y);
         const W *c = s.y + (PLAIN ? 0 : NQ * LAST), least = s.atol / m->rtol;
         W log_h = w_length(s.x, s.y, NQ, 0, log_rtol, least);
