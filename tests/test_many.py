@@ -76,6 +76,34 @@ def test_starts_by_name_and_by_state_equal_simulate(method, monkeypatch, c_compi
     each_equals_simulate(model, many, lambda i, one: one.start(a=angles[i], da=0.1), (0.0, 3.0), method)
 
 
+def test_starts_by_name_follow_for_all_cases_at_once(gallery_model, monkeypatch, c_compiler):
+    """They are those of `Model.start`, without a call of it where the held values leave a linear problem."""
+    scene, wheel = gallery["appell-hamel"], gallery_model("appell-hamel")
+    crane, n = gallery_model("overhead-crane"), 5
+    held = {name: value + 0.1 * np.arange(n) for name, value in scene.start.items()}
+    parameters = {"b": wheel.numbers["b"] * np.linspace(0.5, 2.0, n)}
+    expected = [
+        wheel.with_parameters(b=b).start(**{name: v[i] for name, v in held.items()}).values
+        for i, b in enumerate(parameters["b"])
+    ]
+    nearest = crane.start().values
+    monkeypatch.setattr("servoctl.model.model.Model.start", lambda *_, **__: pytest.fail("a start by itself"))
+    many = sv.simulate_many(wheel, held, parameters, (0.0, 0.1), t_eval=[0.0])
+    found = np.array([many.trace[name][0] for name in wheel.state_names]).T
+    np.testing.assert_allclose(found, expected, atol=1e-13)
+    monkeypatch.undo()
+    many = sv.simulate_many(crane, {}, {"m_load": [90.0, 110.0]}, (0.0, 0.1), t_eval=[0.0])
+    np.testing.assert_allclose([many.trace[name][0, 1] for name in crane.state_names], nearest, atol=1e-13)
+
+
+def test_starts_with_several_solutions_are_those_of_start(monkeypatch):
+    """The angle of a rod whose height is given has two: each case takes the one that `Model.start` names."""
+    model = held_pendulum(lambda t, p: ca.sin(p.f * t))
+    many = sv.simulate_many(model, {}, {"r": [1.0, 1.5]}, (0.0, 0.2), t_eval=[0.0])
+    for i, r in enumerate((1.0, 1.5)):
+        assert many.trace["a"][0, i] == pytest.approx(model.with_parameters(r=r).start()["a"], abs=1e-12)
+
+
 def test_a_case_depends_neither_on_others_nor_on_threads(c_compiler):
     model = pendulum()
     angles = np.random.default_rng(SEED).uniform(-3, 3, 300)

@@ -42,11 +42,11 @@ class _Many(ctypes.Structure):
         try:
             for worker in workers:
                 worker.start()
-            while progress and any(worker.is_alive() for worker in workers):
-                workers[0].join(SHOWN_EVERY)
-                progress(min(self.next, self.n_cases))
             for worker in workers:
-                worker.join()
+                while worker.is_alive():
+                    worker.join(SHOWN_EVERY)
+                    if progress:
+                        progress(min(self.next, self.n_cases))
         except KeyboardInterrupt:
             self.stop = 1  # which the threads read at each step
             for worker in workers:

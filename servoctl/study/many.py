@@ -10,12 +10,14 @@ from numpy.typing import ArrayLike
 
 from servoctl.checks import as_numbers, as_span, mapping, plain, require_kind, whole
 from servoctl.errors import ServoError, SpecificationError
-from servoctl.methods.accuracy import ATOL, LARGE, absolute_tolerances
+from servoctl.methods.accuracy import ATOL, LARGE, coarse
 from servoctl.methods.choice import Algebraic, Method, Taylor, as_method
 from servoctl.methods.lanes import fits, integrate, plan_many, plans_fit
+from servoctl.methods.sizes import sizes_of
 from servoctl.methods.taylor import order_for
 from servoctl.model.model import Model
 from servoctl.model.start import State
+from servoctl.model.starts import linear_starts, same_start
 from servoctl.model.validity import affirmed_each
 from servoctl.progress import progress_bar
 from servoctl.reduction.idle import names_of
@@ -59,9 +61,9 @@ def simulate_many(
     By the Taylor method the motions run in compiled code, in the lanes of vectors with steps of their own, and on
     threads, where the equations are polynomials of the state and of sines and cosines that do not depend on time. Plans
     of programs that determine the motion completely run in compiled code and on threads as well, unless kinks or
-    switches may lie on their way. All other motions, and those whose pivots fall, run one after the other, as `simulate`
-    computes them. The result of a case equals that of `simulate` to rounding, and depends neither on other cases nor on
-    threads.
+    switches may lie on their way. All other motions, and those whose pivots fall, run one after the other, as
+    `simulate` computes them. The result of a case equals that of `simulate` to rounding, and depends neither on other
+    cases nor on threads.
 
     Parameters
     ----------
@@ -193,7 +195,7 @@ class _Many:
         x, largest = np.split(ends[:, 3:], 2, axis=1)
         good = (ends[:, 0] > 0) & self._consistent(span[0], x0, p) & self._consistent(span[1], x, p)
         if method.atol is None:
-            good &= self._default_fits(span, x0, largest, method.rtol)
+            good &= self._default_fits(span, (x0, p), largest, rtol)
         self._take(which, ends, samples, good)
 
     def plans(self, span, times, threads, progress):
@@ -214,10 +216,11 @@ class _Many:
         t, span = span[0], (min(span), max(span))
         knots = self.model.require_smooth(span)
         p, x = np.tile(self.model.parameters, (self.n, 1)), np.empty(self.final.shape)
-        ready, by_name = self._affirmed(p), isinstance(self.starts, dict)
-        if not by_name:
-            with contextlib.suppress(ServoError):  # it is raised again, and becomes a row, for each case by itself
-                x[:] = as_state(self.model, self.starts, t) if isinstance(self.starts, State) else self.starts
+        ready = self._affirmed(p)
+        try:
+            ready &= self._started(t, x, p)
+        except ServoError:  # which is raised again, and becomes a row, for each case by itself
+            ready[:] = False
         for i in np.flatnonzero(~ready).tolist():
             with contextlib.suppress(ServoError):
                 model = self.model_of(i)
@@ -227,11 +230,23 @@ class _Many:
         which = np.flatnonzero(ready)
         return which, x[which], p[which]
 
+    def _started(self, t, x, p):
+        """Cases (N,) whose states x (N, n_x) follow for all cases at once; these are set."""
+        if not isinstance(self.starts, dict):
+            x[:] = as_state(self.model, self.starts, t) if isinstance(self.starts, State) else self.starts
+        elif all(v.ndim == 0 for v in self.starts.values()) and same_start(self.model, self.starts, self.columns):
+            x[:] = self.start(0, self.model, t).values
+        else:
+            held = {name: np.broadcast_to(values, self.n) for name, values in self.starts.items()}
+            x[:], solved = linear_starts(self.model, t, held, p)
+            return solved
+        return np.ones(self.n, bool)
+
     def _affirmed(self, p):
-        """Cases (N,) whose start is known and for which double precision affirms the derivation; p (N, n_p) is set."""
+        """Cases (N,) for which double precision affirms the derivation; their parameters p (N, n_p) are set."""
         names, of_knots = list(self.model.numbers), self.model.reduction.switches.numbers
-        if isinstance(self.starts, dict) or not self.columns.keys() <= set(names):
-            return np.zeros(self.n, bool)  # states by name depend on the parameters
+        if not self.columns.keys() <= set(names):
+            return np.zeros(self.n, bool)
         if not self.columns:
             return np.ones(self.n, bool)
         for name, column in self.columns.items():
@@ -249,13 +264,15 @@ class _Many:
             sizes = np.sqrt((slopes**2 * (1.0 + np.abs(x.T))[:, None] ** 2).sum(axis=0))
             return ~(np.abs(y[:m]) > OFF * np.where(sizes > 0, sizes, 1.0)).any(axis=0)
 
-    def _default_fits(self, span, x0, largest, rtol):
+    def _default_fits(self, span, cases, largest, rtol):
         """Whether the default absolute tolerance is a small part of the sizes (N, n_x) of a motion, and no rounding."""
-        fits = np.ones(len(x0), bool)
-        for i in np.flatnonzero((largest.max(axis=1) > LARGE) | (largest < ATOL / rtol).any(axis=1)):
-            both = np.column_stack([x0[i], largest[i]])
-            fits[i] = largest[i].max() <= LARGE and absolute_tolerances(self.model, np.array(span), both, rtol) is None
-        return fits
+        small = largest.max(axis=1) <= LARGE
+        some = np.flatnonzero((largest < ATOL / rtol).any(axis=1))
+        if len(some):
+            x0, p = (part[some].T for part in cases)
+            inertia = self.model.function("matrices").grid(span[0], x0, p)[-self.model.n :]
+            small[some] &= ~coarse(sizes_of(self.model, inertia, largest[some].T, span[1] - span[0]), rtol).any(axis=0)
+        return small
 
     def one_by_one(self, span, method, times, progress):
         """Compute the others as `simulate` does."""
