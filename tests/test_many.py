@@ -201,11 +201,13 @@ def test_plans_over_parameters_equal_simulate(name, span, gallery_model, monkeyp
     np.testing.assert_allclose(many[name], final[name], rtol=1e-12)
 
 
-def held_pendulum(path):
-    """A pendulum of length r on a trolley whose place is programmed, and its angle as well."""
+def held_pendulum(path, quasi=False):
+    """A pendulum of length r on a trolley; its place and height are programmed."""
     q = sv.coordinates("x a")
     x, a = q
     p = sv.parameters(m=1.0, r=1.0, g=9.81, T=2.0, f=1.0)
+    if quasi:
+        q = q.with_quasi_velocities("u w", [[1, ca.cos(a)], [0, 1]])
     S = sv.particle(q, 1.0, (x,)) + sv.particle(q, p.m, (x + p.r * ca.sin(a), -p.r * ca.cos(a)))
     potential = -p.m * p.g * p.r * ca.cos(a)
     mechanism = sv.Mechanism(q, gibbs=S, potential=potential, actuators={"F": x, "M": a}, parameters=p)
@@ -213,9 +215,10 @@ def held_pendulum(path):
     return sv.derive(mechanism, sv.Program({"place": x + p.r * ca.sin(a) - path(q.t, p), "height": height}))
 
 
-def test_plans_whose_motion_depends_on_parameters(monkeypatch, c_compiler):
+@pytest.mark.parametrize("quasi", [False, True])
+def test_plans_whose_motion_depends_on_parameters(quasi, monkeypatch, c_compiler):
     """r cos a = 0.5 + 0.1 cos t, x = sin(f t) - r sin a."""
-    model = held_pendulum(lambda t, p: ca.sin(p.f * t))
+    model = held_pendulum(lambda t, p: ca.sin(p.f * t), quasi)
     start = model.start(guess={"a": 0.9})
     r, f = np.linspace(0.7, 2.0, 9), np.linspace(0.5, 3.0, 9)
     with monkeypatch.context() as patch:
@@ -226,7 +229,10 @@ def test_plans_whose_motion_depends_on_parameters(monkeypatch, c_compiler):
     np.testing.assert_allclose(many.trace["a"], a, atol=1e-12)
     np.testing.assert_allclose(many.trace["x"], np.sin(f * t) - r * np.sin(a), atol=1e-12)
     a = np.arccos((0.5 + 0.1 * np.cos(2.0)) / r)
-    np.testing.assert_allclose(many["final da"], 0.1 * np.sin(2.0) / (r * np.sin(a)), atol=1e-11)
+    da = 0.1 * np.sin(2.0) / (r * np.sin(a))
+    np.testing.assert_allclose(many["final w" if quasi else "final da"], da, atol=1e-11)
+    dx = f * np.cos(2 * f) - r * np.cos(a) * da
+    np.testing.assert_allclose(many["final u"] + np.cos(a) * da if quasi else many["final dx"], dx, atol=1e-11)
 
 
 def test_plans_with_other_knots_and_without_solutions():

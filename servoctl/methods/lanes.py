@@ -143,7 +143,13 @@ def _library(f, n_x):
     """The C function of a model's series in lanes; None without a compiler."""
     if os.environ.get("SERVOCTL_COMPILER") == "none" or compiler.compiler() is None:
         return None
-    library = compiler.library(f"#define W_LANES {compiler.lanes()}\n{_source(f, n_x)}", "-O3")
+    return _loaded(f, n_x, compiler.lanes(), compiler.compiler())
+
+
+@lru_cache(32)
+def _loaded(f, n_x, width, _):
+    """The same for a number of lanes and a compiler."""
+    library = compiler.library(f"#define W_LANES {width}\n{_source(f, n_x)}", "-O3")
     if library is not None:
         library.servoctl_many.restype = None
     return library and library.servoctl_many
@@ -166,7 +172,6 @@ def _plan_library(f, model):
     return library and library.servoctl_plans
 
 
-@lru_cache(32)
 def _source(f, n_x):
     """The C text for any number of lanes."""
     sizes, chunk = emit.definitions(f.sizes), emit.WIDE if f.operations <= emit.WIDE else emit.CHUNK
