@@ -13,7 +13,7 @@ import numpy as np
 from servoctl.codegen.function import GRID_POINTS, compiled
 from servoctl.jets.branches import sizes_of_terms
 from servoctl.reduction.appell import NEGATIVE
-from servoctl.reduction.manifold import ON_MANIFOLD, gradient_scales, least_steps
+from servoctl.reduction.manifold import ON_MANIFOLD, at_usual_size, gradient_scales, least_steps
 from servoctl.reduction.ranks import clean
 from servoctl.reduction.reduce import HELD, strong
 from servoctl.tolerances import ENTRY, TINY
@@ -110,19 +110,28 @@ def affirmed_each(model, values):
             moved, t, jets = _moved(model, at, values[:, here])
             here = here[moved]
             if len(here):
-                p = np.repeat(values[:, here], points, axis=1)
-                result[here] = _valid(known, known.at(t, jets, p), model.n, len(here))
+                result[here] = _valid(model, known, t, jets, values[:, here])
     return result
 
 
-def _valid(known, found, n, cases):
-    """Whether the values and sizes of all groups are those of a valid derivation with a positive inertia matrix."""
-    found = {name: group.reshape(*group.shape[:2], cases, group.shape[2] // cases) for name, group in found.items()}
+def _valid(model, known, t, z, values):
+    """Whether a derivation is valid and the inertia positive in each case, by jets z at times t, case by case."""
+    n, cases, r = model.n, values.shape[1], model.reduction
+    p = np.repeat(values, len(t) // cases, axis=1)
+
+    def at(z):
+        found = known.at(t, z, p)
+        return {name: group.reshape(*group.shape[:2], cases, group.shape[2] // cases) for name, group in found.items()}
+
+    found = at(z)
     (slopes, of_slopes), (jets, _), (_, terms) = found["slopes"], found["jets"], found["terms"]
     jets, terms = (np.max(np.abs(each), axis=2, keepdims=True, initial=0.0) for each in (jets, terms))
     slopes = np.abs(slopes)
     dead = (slopes <= ENTRY * of_slopes) | (slopes * np.maximum(jets, 1.0) <= ENTRY * terms)
     left, of_left = found["conditions"]
+    if not (np.abs(left) <= HELD * np.maximum(of_left, TINY)).all():  # a velocity that is kept at zero is rounding
+        sizes = r.points.sizes(r.top) * r.points.factorials(r.top)
+        of_left = np.maximum(of_left, at(at_usual_size(z, sizes, model.nq))["conditions"][1])
     dropped, of_dropped = found["dropped"]
     checks = (
         dead,
