@@ -72,7 +72,7 @@ def lanes(scene, last, rtol):
     columns = [*range(len(NAMES)), *velocities]
 
     def call():
-        x, _ = integrate(model, last, (0.0, DURATION), cases, rtol, np.zeros(0), threads=1)
+        x, *_ = integrate(model, last, (0.0, DURATION), cases, rtol, np.zeros(0), threads=1)
         return np.where(x[:, 0] == 1, x[:, 3 : 3 + start.values.size].T, np.nan)[columns]
 
     return call

@@ -319,7 +319,7 @@ def test_new_numbers_are_affirmed_by_a_few_evaluations(name, gallery_model, monk
         other = model.with_parameters(**{name: value})
         assert other._functions is model._functions and other.numbers[name] == value
     switches = model.reduction.switches
-    assert len(evaluated) <= 1 + 2 * len(switches._numbers)
+    assert len(evaluated) <= 1 + 2 * len(switches.numbers)
 
 
 EXTREMES = (0.0, 1e-13, 1e-9, 1e-6, 0.1, 3.0, 100.0, -1.0)

@@ -76,6 +76,34 @@ def test_starts_by_name_and_by_state_equal_simulate(method, monkeypatch, c_compi
     each_equals_simulate(model, many, lambda i, one: one.start(a=angles[i], da=0.1), (0.0, 3.0), method)
 
 
+def test_starts_by_name_follow_for_all_cases_at_once(gallery_model, monkeypatch, c_compiler):
+    """They are those of `Model.start`, without a call of it where the held values leave a linear problem."""
+    scene, wheel = gallery["appell-hamel"], gallery_model("appell-hamel")
+    crane, n = gallery_model("overhead-crane"), 5
+    held = {name: value + 0.1 * np.arange(n) for name, value in scene.start.items()}
+    parameters = {"b": wheel.numbers["b"] * np.linspace(0.5, 2.0, n)}
+    expected = [
+        wheel.with_parameters(b=b).start(**{name: v[i] for name, v in held.items()}).values
+        for i, b in enumerate(parameters["b"])
+    ]
+    nearest = crane.start().values
+    monkeypatch.setattr("servoctl.model.model.Model.start", lambda *_, **__: pytest.fail("a start by itself"))
+    many = sv.simulate_many(wheel, held, parameters, (0.0, 0.1), t_eval=[0.0])
+    found = np.array([many.trace[name][0] for name in wheel.state_names]).T
+    np.testing.assert_allclose(found, expected, atol=1e-13)
+    monkeypatch.undo()
+    many = sv.simulate_many(crane, {}, {"m_load": [90.0, 110.0]}, (0.0, 0.1), t_eval=[0.0])
+    np.testing.assert_allclose([many.trace[name][0, 1] for name in crane.state_names], nearest, atol=1e-13)
+
+
+def test_starts_with_several_solutions_are_those_of_start(monkeypatch):
+    """The angle of a rod whose height is given has two: each case takes the one that `Model.start` names."""
+    model = held_pendulum(lambda t, p: ca.sin(p.f * t))
+    many = sv.simulate_many(model, {}, {"r": [1.0, 1.5]}, (0.0, 0.2), t_eval=[0.0])
+    for i, r in enumerate((1.0, 1.5)):
+        assert many.trace["a"][0, i] == pytest.approx(model.with_parameters(r=r).start()["a"], abs=1e-12)
+
+
 def test_a_case_depends_neither_on_others_nor_on_threads(c_compiler):
     model = pendulum()
     angles = np.random.default_rng(SEED).uniform(-3, 3, 300)
@@ -144,17 +172,92 @@ def test_small_and_large_motions_take_the_tolerances_of_simulate(c_compiler):
     each_equals_simulate(model, many, lambda i, one: one.start(a=angles[i], da=0.0), (0.0, 2.0), sv.Taylor())
 
 
-@pytest.mark.parametrize("method", [None, "RK4"])
-def test_plans_and_other_methods_run_one_by_one(method, gallery_model):
-    name, parameter = ("overhead-crane", "m") if method is None else ("appell-hamel", "M")
-    scene, model = gallery[name], gallery_model(name)
-    parameter = parameter if parameter in model.numbers else next(iter(model.numbers))
+def test_other_methods_run_one_by_one(gallery_model):
+    scene, model = gallery["appell-hamel"], gallery_model("appell-hamel")
     start = model.start(**scene.start, guess=scene.guess)
-    values = model.numbers[parameter] * np.array([0.9, 1.1])
-    many = sv.simulate_many(model, start, {parameter: values}, (0.0, 0.5), method, t_eval=[0.0, 0.5])
+    values = model.numbers["M"] * np.array([0.9, 1.1])
+    many = sv.simulate_many(model, start, {"M": values}, (0.0, 0.5), "RK4", t_eval=[0.0, 0.5])
     for i, value in enumerate(values):
-        run = sv.simulate(model.with_parameters(**{parameter: value}), start, (0.0, 0.5), method, t_eval=[0.0, 0.5])
-        assert many.trace[model.state_names[0]][:, i] == pytest.approx(run[model.state_names[0]], abs=1e-12)
+        run = sv.simulate(model.with_parameters(M=value), start, (0.0, 0.5), "RK4", t_eval=[0.0, 0.5])
+        assert many.trace["x"][:, i] == pytest.approx(run["x"], abs=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("name", "span"),
+    [("overhead-crane", (0.0, 6.0)), ("overhead-crane", (4.0, 1.0)), ("crane-3d", (0.0, 2.0)), ("two-cars", (0.0, 2.0)),
+     ("winch-crane-redundant", (0.5, 2.0))],
+)
+def test_plans_over_parameters_equal_simulate(name, span, gallery_model, monkeypatch, c_compiler):
+    scene, model = gallery[name], gallery_model(name)
+    start = model.start(t=span[0], **scene.start, guess=scene.guess)
+    parameters = {p: model.numbers[p] * np.array([0.9, 1.0, 1.2]) for p in [*model.numbers][:2]}
+    assert lanes.plans_fit(model)
+    with monkeypatch.context() as patch:
+        in_lanes(patch)
+        many = sv.simulate_many(model, start, parameters, span, t_eval=np.linspace(*span, 11), threads=2)
+        final = sv.simulate_many(model, start, parameters, span)
+    each_equals_simulate(model, many, start, span, None)
+    name = f"final {model.state_names[0]}"
+    np.testing.assert_allclose(many[name], final[name], rtol=1e-12)
+
+
+def held_pendulum(path, quasi=False, height=lambda t: 0.5 + 0.1 * ca.cos(t)):
+    """A pendulum of length r on a trolley; its place and height are programmed."""
+    q = sv.coordinates("x a")
+    x, a = q
+    p = sv.parameters(m=1.0, r=1.0, g=9.81, T=2.0, f=1.0)
+    if quasi:
+        q = q.with_quasi_velocities("u w", [[1, ca.cos(a)], [0, 1]])
+    S = sv.particle(q, 1.0, (x,)) + sv.particle(q, p.m, (x + p.r * ca.sin(a), -p.r * ca.cos(a)))
+    potential = -p.m * p.g * p.r * ca.cos(a)
+    mechanism = sv.Mechanism(q, gibbs=S, potential=potential, actuators={"F": x, "M": a}, parameters=p)
+    height = p.r * ca.cos(a) - height(q.t)
+    return sv.derive(mechanism, sv.Program({"place": x + p.r * ca.sin(a) - path(q.t, p), "height": height}))
+
+
+@pytest.mark.parametrize("quasi", [False, True])
+def test_plans_whose_motion_depends_on_parameters(quasi, monkeypatch, c_compiler):
+    """r cos a = 0.5 + 0.1 cos t, x = sin(f t) - r sin a."""
+    model = held_pendulum(lambda t, p: ca.sin(p.f * t), quasi)
+    start = model.start(guess={"a": 0.9})
+    r, f = np.linspace(0.7, 2.0, 9), np.linspace(0.5, 3.0, 9)
+    with monkeypatch.context() as patch:
+        in_lanes(patch)
+        many = sv.simulate_many(model, start, {"r": r, "f": f}, (0.0, 2.0), t_eval=[0.3, 1.7])
+    t = np.array([[0.3], [1.7]])
+    a = np.arccos((0.5 + 0.1 * np.cos(t)) / r)
+    np.testing.assert_allclose(many.trace["a"], a, atol=1e-12)
+    np.testing.assert_allclose(many.trace["x"], np.sin(f * t) - r * np.sin(a), atol=1e-12)
+    a = np.arccos((0.5 + 0.1 * np.cos(2.0)) / r)
+    da = 0.1 * np.sin(2.0) / (r * np.sin(a))
+    np.testing.assert_allclose(many["final w" if quasi else "final da"], da, atol=1e-11)
+    dx = f * np.cos(2 * f) - r * np.cos(a) * da
+    np.testing.assert_allclose(many["final u"] + np.cos(a) * da if quasi else many["final dx"], dx, atol=1e-11)
+
+
+@pytest.mark.parametrize("height", [lambda t: 0.6, lambda t: 0.6 + 1e-12 * ca.sin(t), lambda t: 0.6 + 0.1 * ca.sin(t)])
+@pytest.mark.parametrize("quasi", [False, True])
+def test_what_stays_constant_keeps_the_derivation(height, quasi):
+    """Velocities that a program keeps at zero are rounding at all points, and no reason to derive again."""
+    model = held_pendulum(lambda t, p: ca.sin(p.f * t), quasi, height)
+    values = model.parameters.copy()
+    values[[*model.numbers].index("r")] = 1.3
+    assert affirmed(model, values) and holds(model.reduction, values)
+    assert model.with_parameters(r=1.3).reduction is model.reduction
+    with refused(SpecificationError):
+        model.with_parameters(m=-1.0)
+
+
+def test_plans_with_other_knots_and_without_solutions():
+    """Paths of other durations leave the compiled plans, and where the rod is too short there is no plan."""
+    model = held_pendulum(lambda t, p: sv.paths.rest_to_rest(t, 0.0, 1.0, duration=p.T))
+    start = model.start(guess={"a": 0.9})
+    many = sv.simulate_many(model, start, {"T": [2.0, 1.0, 2.0], "r": [1.0, 1.0, 0.5]}, (0.0, 1.5), t_eval=[0.8])
+    assert list(many["error"] != "") == [False, False, True]
+    for i, T in enumerate((2.0, 1.0)):
+        run = simulated(model.with_parameters(T=T), start, (0.0, 1.5), t_eval=[0.8, 1.5])
+        assert many.trace["x"][0, i] == pytest.approx(run["x"][0], abs=1e-12)
+        assert many["final x"][i] == pytest.approx(run["x"][1], abs=1e-12)
 
 
 def test_an_interrupt_leaves_the_finished_cases(monkeypatch):
@@ -170,6 +273,30 @@ def test_an_interrupt_leaves_the_finished_cases(monkeypatch):
     monkeypatch.setattr("servoctl.study.many.simulated", stops)
     many = sv.simulate_many(model, {"a": [0.1, 0.2, 0.3, 0.4], "da": 0.0}, None, (0.0, 0.1))
     assert list(many["case"]) == [0, 1] and many.study.meta["interrupted"]
+
+
+def test_an_interrupt_ends_the_lanes_at_once(monkeypatch, c_compiler):
+    """The cases that were finished are kept, and no case is computed by itself afterwards."""
+    def stop(bar, count):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("servoctl.methods.lanes.SHOWN_EVERY", 1e-4)
+    monkeypatch.setattr("tqdm.std.tqdm.update", stop)
+    in_lanes(monkeypatch)
+    angles = np.random.default_rng(SEED).uniform(-1, 1, 20_000)
+    model = pendulum()
+    start = model.start(a=0.1, da=0.0)
+    many = sv.simulate_many(model, start, {"k": 0.5 + 0.01 * angles}, (0.0, 30.0), threads=1)
+    assert many.study.meta["interrupted"] and 0 < len(many) < len(angles)
+    assert np.isfinite(many["final a"]).all()
+
+
+def test_progress_counts_the_cases(monkeypatch, c_compiler):
+    counts = []
+    monkeypatch.setattr("tqdm.std.tqdm.update", lambda bar, count: counts.append(count))
+    model = pendulum(lambda a, t, p: p.k * ca.sin(t))
+    sv.simulate_many(model, {"a": [0.1, 0.2, 0.3], "da": 0.0}, None, (0.0, 0.1), progress=False)
+    assert np.cumsum(counts)[-1] >= 3
 
 
 def test_without_a_compiler_the_results_are_the_same(monkeypatch, c_compiler):

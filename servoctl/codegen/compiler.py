@@ -115,6 +115,7 @@ def _processor():
         return ""
 
 
+@functools.cache
 def features():
     """Features of the processor, as words; empty where the system does not publish them."""
     return frozenset(_processor().split())

@@ -76,6 +76,11 @@ def large_tolerances(model, t, x):
     return ATOL * np.where(sizes > LARGE, sizes, 1.0) if sizes.max() > LARGE else None
 
 
+def coarse(sizes, rtol):
+    """Whether the default absolute tolerance is no small part of sizes, an array of numbers >= 0."""
+    return (sizes > 0) & (ATOL > COARSE * rtol * sizes)
+
+
 def absolute_tolerances(model, t, x, rtol):
     """Absolute tolerances (n_x,) for a motion of which the default is no small part; None where it is.
 
@@ -89,7 +94,7 @@ def absolute_tolerances(model, t, x, rtol):
     """
     sizes = motion_sizes(model, t, x)
     moves = sizes > 0
-    if not np.any(ATOL > COARSE * rtol * sizes[moves]):
+    if not coarse(sizes, rtol).any():
         return None
     return np.where(moves, np.minimum(ATOL, FINER * rtol * sizes), ATOL)
 

@@ -85,8 +85,8 @@ class _Algebraic(Stepping):
 
         Those of forces alone change the actuation, not the motion.
         """
-        switched = self.model.once("switches of the motion", lambda: _switched(self.model.reduction))
-        self.family = switching(self.model) if switched else None
+        moves = self.model.once("switches of the motion", lambda: switched(self.model.reduction))
+        self.family = switching(self.model) if moves else None
         if self.family is not None:
             branches = self.family.branches(t, x)
             self._use(self.family.at(branches))
@@ -194,7 +194,7 @@ class _Algebraic(Stepping):
                 self.progress(block[-1])
 
 
-def _switched(reduction):
+def switched(reduction):
     """Whether a row of the motion has a kink or a switch that the motion may cross."""
     branches = Branches(lambda s: (reduction.mechanism.q.where(s) or ("t",))[0] != "t")
     branches.smooth([row.expression for row in reduction.rows], angles=True)

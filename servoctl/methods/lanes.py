@@ -2,8 +2,8 @@
 
 import ctypes
 import os
-from concurrent.futures import ThreadPoolExecutor
 from functools import lru_cache
+from threading import Thread
 
 import casadi as ca
 import numpy as np
@@ -11,27 +11,48 @@ import numpy as np
 from servoctl.codegen import compiler, emit
 from servoctl.codegen.function import TAYLOR_COMPILED
 from servoctl.codegen.native import pointer
+from servoctl.methods.algebraic import NODES, STEPS, switched
 from servoctl.methods.monitor import DEGRADED, NEGLIGIBLE
+from servoctl.methods.motion import breakpoints
 from servoctl.methods.narrow import steep
 from servoctl.methods.taylor import FAR_OFF, series_loop
 from servoctl.model.switching import switching
 
 MOST_IN_LANES = 10**6  # of a case
-PER_THREAD = 8  # tasks, so that threads end at about the same time
+SHOWN_EVERY = 0.1  # s between two looks at how far the threads are
 
-_NUMBERS = {"t0": ctypes.c_double, "t1": ctypes.c_double, "rtol": ctypes.c_double}
-_COUNTS = ("max_steps", "n_times", "stop")
-_ARRAYS = ("x0", "p", "atol", "pivots", "times", "ends", "samples")
+_NUMBERS = ("t0", "t1", "rtol", "longest")
+_COUNTS = ("max_steps", "n_times", "n_cuts", "n_cases", "next", "stop")
+_ARRAYS = ("x0", "p", "atol", "pivots", "times", "cuts", "ends", "samples")
+_KINDS = {ctypes.c_double: _NUMBERS, ctypes.c_int64: _COUNTS, ctypes.c_void_p: _ARRAYS}
 
 
 class _Many(ctypes.Structure):
-    """The C structure ``Many`` of many.c, from its fields by name; it holds a reference to its arrays."""
+    """The C structure ``Many`` of cases.h, from its fields by name; it holds a reference to its arrays."""
 
-    _fields_ = [*_NUMBERS.items(), *((n, ctypes.c_int64) for n in _COUNTS), *((n, ctypes.c_void_p) for n in _ARRAYS)]
+    _fields_ = [(name, kind) for kind, names in _KINDS.items() for name in names]
 
     def __init__(self, arrays, **numbers):
         super().__init__(**numbers, **{name: pointer(array) for name, array in arrays.items()})
         self.arrays = arrays
+
+    def run(self, library, threads, progress):
+        """Call a C function on threads; whether Ctrl-C ended it."""
+        workers = [Thread(target=library, args=(ctypes.byref(self),)) for _ in range(threads)]
+        try:
+            for worker in workers:
+                worker.start()
+            for worker in workers:
+                while worker.is_alive():
+                    worker.join(SHOWN_EVERY)
+                    if progress:
+                        progress(min(self.next, self.n_cases))
+        except KeyboardInterrupt:
+            self.stop = 1  # which the threads read at each step
+            for worker in workers:
+                if worker.ident:
+                    worker.join()
+        return bool(self.stop)
 
 
 def fits(model):
@@ -44,69 +65,121 @@ def fits(model):
     def smooth():
         f = model.function("ode").expression
         inputs = f.sx_in()
-        alone = not model.reduction.orders and switching(model) is None and not steep(model, squares=False)
+        quiet = not model.reduction.orders and model.dropped is None
+        alone = quiet and switching(model) is None and not steep(model, squares=False)
         return alone and not ca.depends_on(f(*inputs), inputs[0])
 
     return not model.flat and not model.knots and model.once("fits lanes", smooth)
 
 
-def integrate(model, last, span, cases, rtol, times, threads=None):
+def integrate(model, last, span, cases, rtol, times, threads=None, progress=None):
     """Integrate from starts x0 (N, n_x) with parameters p (N, n_p) and absolute tolerances (N,) over a span.
+
+    Ctrl-C ends it; `progress` is called with the number of cases begun.
 
     Returns
     -------
     ends : (N, 3 + 2 n_x) array
-        Outcome (1: finished, else to be computed by itself), number of steps, last instant, state there, and largest
-        sizes of the state.
+        Outcome (1: finished, 0: not reached before Ctrl-C, else to be computed by itself), number of steps, last
+        instant, state there, and largest sizes of the state.
     samples : (N, K, n_x) array
         States at the times (K,), in the order of the motion.
-    Both are None without a compiler.
+    interrupted : bool
+    The arrays are None without a compiler.
     """
     f = series_loop(model, last)
     library = None if f.operations > TAYLOR_COMPILED else _library(f, len(model.state_names))
     if library is None:
-        return None, None
+        return None, None, False
     x0, p, atol = cases
     n, n_x = x0.shape
     p = np.column_stack([p, np.full(n, sum(span) / 2)])  # the instant that selects branches of paths
     arrays = {"x0": x0, "p": p, "atol": atol, "pivots": model.pivot_sizes, "times": times}
     arrays = {name: np.ascontiguousarray(array, dtype=float) for name, array in arrays.items()}
     arrays |= {"ends": np.zeros((n, 3 + 2 * n_x)), "samples": np.full((n, len(times), n_x), np.nan)}
-    many = _Many(arrays, t0=span[0], t1=span[1], rtol=rtol, max_steps=MOST_IN_LANES, n_times=len(times))
+    many = _Many(arrays, t0=span[0], t1=span[1], rtol=rtol, max_steps=MOST_IN_LANES, n_times=len(times), n_cases=n)
+    threads = min(threads or os.cpu_count() or 1, -(-n // compiler.lanes()))
+    interrupted = many.run(library, threads, progress)
+    return arrays["ends"], arrays["samples"], interrupted
 
-    def run(first, end):
-        library(ctypes.byref(many), ctypes.c_int64(first), ctypes.c_int64(end))
 
-    threads = threads or os.cpu_count() or 1
-    width = compiler.lanes()
-    length = max(-(-n // (threads * PER_THREAD)), 8 * width)  # lanes that wait at the end of a task cost their time
-    starts = range(0, n, length)
-    with ThreadPoolExecutor(threads) as pool:
-        try:
-            list(pool.map(run, starts, (min(first + length, n) for first in starts)))
-        except KeyboardInterrupt:
-            many.stop = 1  # which the threads read at each step
-    return arrays["ends"], arrays["samples"]
+def plans_fit(model):
+    """Whether plans of a model can be computed in compiled code alone, where pivots are watched at the ends of steps.
+
+    Nothing may happen on the way but that they fall: no switches, no other orders, nothing that eliminations left out.
+    """
+
+    def quiet():
+        r = model.reduction
+        return r.cascade is None and not (r.orders or switched(r)) and model.dropped is None
+
+    return model.flat and model.once("plans fit", quiet)
+
+
+def plan_many(model, span, cases, times, threads=None, progress=None):
+    """Plans from states x0 (N, n_x) with parameters p (N, n_p) over a span; the results are those of `integrate`.
+
+    The last of the times is the end of the span; the largest sizes are zero.
+    """
+    f = model.function("path")
+    library = _plan_library(f, model)
+    if library is None:
+        return None, None, False
+    x0, p = cases
+    n, n_x = x0.shape
+    cuts = breakpoints(span, model.require_smooth((min(span), max(span))))
+    arrays = {"x0": x0, "p": p, "pivots": model.pivot_sizes, "times": times, "cuts": cuts}
+    arrays = {name: np.ascontiguousarray(array, dtype=float) for name, array in arrays.items()}
+    arrays |= {"ends": np.zeros((n, 3 + 2 * n_x)), "samples": np.full((n, len(times), n_x), np.nan)}
+    counts = {"max_steps": NODES, "n_times": len(times), "n_cuts": len(cuts), "n_cases": n}
+    many = _Many(arrays, t0=span[0], t1=span[1], longest=abs(span[1] - span[0]) / STEPS, **counts)
+    interrupted = many.run(library, min(threads or os.cpu_count() or 1, n), progress)
+    ends, samples = arrays["ends"], arrays["samples"]
+    ends[:, 3 : 3 + n_x] = samples[:, -1]
+    return ends, samples, interrupted
 
 
 def _library(f, n_x):
     """The C function of a model's series in lanes; None without a compiler."""
     if os.environ.get("SERVOCTL_COMPILER") == "none" or compiler.compiler() is None:
         return None
-    library = compiler.library(f"#define W_LANES {compiler.lanes()}\n{_source(f, n_x)}", "-O3")
+    return _loaded(f, n_x, compiler.lanes(), compiler.compiler())
+
+
+@lru_cache(32)
+def _loaded(f, n_x, width, _):
+    """The same for a number of lanes and a compiler."""
+    library = compiler.library(f"#define W_LANES {width}\n{_source(f, n_x)}", "-O3")
     if library is not None:
         library.servoctl_many.restype = None
     return library and library.servoctl_many
 
 
-@lru_cache(32)
+def _plan_library(f, model):
+    """The C function of the plans of a model; None without a compiler."""
+    if os.environ.get("SERVOCTL_COMPILER") == "none" or compiler.compiler() is None:
+        return None
+
+    def text():
+        q, sizes = model.reduction.mechanism.q, f.sizes | {"n": model.n}
+        given = {"DEGRADED": DEGRADED, "NEGLIGIBLE": NEGLIGIBLE, "PLAIN": int(q.plain)}
+        head = "".join(f"#define {name} {value}\n" for name, value in given.items())
+        return head + emit.emit(f.expression, "servoctl", ("newton",), sizes=sizes) + emit.include("plans.c")
+
+    library = compiler.library(model.once("C text of plans", text), "-O3")
+    if library is not None:
+        library.servoctl_plans.restype = None
+    return library and library.servoctl_plans
+
+
 def _source(f, n_x):
     """The C text for any number of lanes."""
-    sizes = emit.definitions(f.sizes)
+    sizes, chunk = emit.definitions(f.sizes), emit.WIDE if f.operations <= emit.WIDE else emit.CHUNK
     sizes |= {"NAME": "servoctl", "NX": n_x, "NP": f.n_p, "NY": f.n_y}
     sizes |= {"DEGRADED": DEGRADED, "NEGLIGIBLE": NEGLIGIBLE, "FAR_OFF": FAR_OFF}
     settled = f.others.get("settled")
     sizes |= {} if settled is None else {"SETTLED": ""}
-    parts = [emit.unit(sizes), emit.include("lanes.h"), emit.function(f.expression, "expansion", emit.LANES)]
+    expansion = emit.function(f.expression, "expansion", emit.LANES, chunk)  # in one piece values stay in registers
+    parts = [emit.unit(sizes), emit.include("lanes.h"), expansion]
     parts += [] if settled is None else [emit.function(settled, "servoctl_settled", emit.PORTABLE)]
     return "".join((*parts, emit.include("many.c")))

@@ -24,13 +24,17 @@ def motion_sizes(model, t, x):
     x : (n_x, N) array
     """
     inertia = model.function("matrices")(t[0], x[:, 0], model.parameters)[-model.n :]
+    return sizes_of(model, inertia, np.abs(x).max(axis=1), t[-1] - t[0])
+
+
+def sizes_of(model, inertia, largest, duration):
+    """The same from the inertia (n, ...), the largest magnitudes (n_x, ...) of the state and a duration [s]."""
     metric, levels = np.sqrt(np.maximum(inertia, 0.0)), state_levels(model)
-    largest, duration = np.abs(x).max(axis=1), max(abs(t[-1] - t[0]), 1e-300)
-    sizes, below = largest.copy(), 0.0
+    sizes, below, duration = largest.copy(), 0.0, max(abs(duration), 1e-300)
     for level in range(levels.max() + 1):
         here = levels == level
         if level == 0 and not model.reduction.mechanism.q.plain:
             continue
-        below = max(float((metric * largest[here]).max()), below / duration)
+        below = np.maximum((metric * largest[here]).max(axis=0), below / duration)
         sizes[here] = np.where(metric > 0, below / np.where(metric > 0, metric, 1.0), largest[here])
     return sizes

@@ -10,10 +10,10 @@ from dataclasses import dataclass
 import casadi as ca
 import numpy as np
 
-from servoctl.codegen.interpreted import Interpreter
+from servoctl.codegen.function import GRID_POINTS, compiled
 from servoctl.jets.branches import sizes_of_terms
 from servoctl.reduction.appell import NEGATIVE
-from servoctl.reduction.manifold import ON_MANIFOLD, gradient_scales, least_steps
+from servoctl.reduction.manifold import ON_MANIFOLD, at_usual_size, gradient_scales, least_steps
 from servoctl.reduction.ranks import clean
 from servoctl.reduction.reduce import HELD, strong
 from servoctl.tolerances import ENTRY, TINY
@@ -28,7 +28,7 @@ class Quantities:
 
     Attributes
     ----------
-    function : casadi.Function or None
+    function : Compiled or None
         Values and sizes of the terms of all groups; None if these contain jets above s̄.
     counts : dict of str to int
         Scalars in each group: "slopes" that vanish and their "jets" and "terms", "pivots", "conditions" and "dropped"
@@ -43,7 +43,7 @@ class Quantities:
 
     def at(self, t, jets, values):
         """Values and sizes (2, n, N) of each group, by name; the parameters (n_p,) or (n_p, N)."""
-        result = _evaluated(Interpreter(self.function), self.function.numel_out(0), t, jets, values)
+        result = _evaluated(self.function, t, jets, values)
         result = result.reshape(2, -1, len(t))
         return dict(zip(self.counts, np.split(result, np.cumsum([*self.counts.values()])[:-1], axis=1), strict=True))
 
@@ -58,7 +58,7 @@ def quantities(equations):
         return Quantities(None, counts, np.zeros(0))
     sized = len(scalars) - counts["mass"]
     sizes = [*sizes_of_terms(scalars[:sized]), ca.SX(counts["mass"], 1)]
-    f = equations.function("quantities", equations.jets, [*scalars, *sizes])
+    f = compiled(equations.function("quantities", equations.jets, [*scalars, *sizes]), "quantities")
     jets = np.vstack([r.points.jet(k) for k in range(r.top + 1)]).astype(float)
     values, _ = Quantities(f, counts, None).at(r.points.t.astype(float), jets, r.points.values)["pivots"]
     return Quantities(f, counts, np.abs(values).min(axis=1, initial=np.inf))
@@ -101,24 +101,37 @@ def affirmed_each(model, values):
     if known.function is None or not points:
         return result
     with np.errstate(all="ignore"):
+        at = _points_of(model)
+        if len(result) > 1:  # from the manifold of the model's own parameters others are fewer steps away
+            moved, _, jets = _moved(model, at, model.parameters[:, None])
+            at = jets[: len(at)] if len(moved) else at
         for first in range(0, len(result), TOGETHER):
             here = first + np.arange(len(result[first : first + TOGETHER]))
-            moved, t, jets = _moved(model, values[:, here])
+            moved, t, jets = _moved(model, at, values[:, here])
             here = here[moved]
             if len(here):
-                p = np.repeat(values[:, here], points, axis=1)
-                result[here] = _valid(known, known.at(t, jets, p), model.n, len(here))
+                result[here] = _valid(model, known, t, jets, values[:, here])
     return result
 
 
-def _valid(known, found, n, cases):
-    """Whether the values and sizes of all groups are those of a valid derivation with a positive inertia matrix."""
-    found = {name: group.reshape(*group.shape[:2], cases, group.shape[2] // cases) for name, group in found.items()}
+def _valid(model, known, t, z, values):
+    """Whether a derivation is valid and the inertia positive in each case, by jets z at times t, case by case."""
+    n, cases, r = model.n, values.shape[1], model.reduction
+    p = np.repeat(values, len(t) // cases, axis=1)
+
+    def at(z):
+        found = known.at(t, z, p)
+        return {name: group.reshape(*group.shape[:2], cases, group.shape[2] // cases) for name, group in found.items()}
+
+    found = at(z)
     (slopes, of_slopes), (jets, _), (_, terms) = found["slopes"], found["jets"], found["terms"]
     jets, terms = (np.max(np.abs(each), axis=2, keepdims=True, initial=0.0) for each in (jets, terms))
     slopes = np.abs(slopes)
     dead = (slopes <= ENTRY * of_slopes) | (slopes * np.maximum(jets, 1.0) <= ENTRY * terms)
     left, of_left = found["conditions"]
+    if not (np.abs(left) <= HELD * np.maximum(of_left, TINY)).all():  # a velocity that is kept at zero is rounding
+        sizes = r.points.sizes(r.top) * r.points.factorials(r.top)
+        of_left = np.maximum(of_left, at(at_usual_size(z, sizes, model.nq))["conditions"][1])
     dropped, of_dropped = found["dropped"]
     checks = (
         dead,
@@ -139,8 +152,14 @@ def _positive(mass):
     return finite & (np.linalg.eigvalsh(scaled).min(axis=1) > NEGATIVE)
 
 
-def _moved(model, values):
-    """The model's points moved to the manifolds of other parameters (n_p, C).
+def _points_of(model):
+    """States (n_x, points) at which the ranks of a model were decided."""
+    points = model.reduction.points
+    return np.vstack([points.jet(k) for k in range(model.reduction.top)]).astype(float)
+
+
+def _moved(model, at, values):
+    """States (n_x, points) moved to the manifolds of other parameters (n_p, C).
 
     Returns
     -------
@@ -153,14 +172,14 @@ def _moved(model, values):
     points, top, n_x = model.reduction.points, model.reduction.top, len(model.state_names)
     n_points, cases = len(points.t), values.shape[1]
     sizes = (points.sizes(top - 1) * points.factorials(top - 1))[:, None]
-    invariants, rates = model.function("invariants").interpreted, model.function("ode").interpreted
+    invariants, rates = model.function("invariants"), model.function("ode")
     t = np.tile(points.t.astype(float), cases)
-    x = np.tile(np.vstack([points.jet(k) for k in range(top)]).astype(float), cases)
+    x = np.tile(at, cases)
     p, m = np.repeat(values, n_points, axis=1), len(model.invariant_names())
     left, moved = np.arange(cases), np.zeros(cases, bool)
     for _ in range(MOVES):
         here = (left[:, None] * n_points + np.arange(n_points)).ravel()
-        y = _evaluated(invariants, m * (1 + n_x), t[here], x[:, here], p[:, here])
+        y = _evaluated(invariants, t[here], x[:, here], p[:, here])
         residual, jacobian = y[:m], y[m:].reshape(n_x, m, len(here)).swapaxes(0, 1)
         finite = np.isfinite(y).all(axis=0)
         near = (np.abs(residual) <= ON_MANIFOLD * gradient_scales(jacobian, x[:, here], sizes)).all(axis=0) & finite
@@ -172,12 +191,15 @@ def _moved(model, values):
             break
         x[:, here[on]] += least_steps(jacobian[:, :, on], residual[:, on], sizes).astype(float)
     here = np.flatnonzero(np.repeat(moved, n_points))
-    t, x, n_y = t[here], x[:, here], model.function("ode").n_y
-    highest = _evaluated(rates, n_y, t, x, p[:, here])[n_x - model.n : n_x]
+    t, x = t[here], x[:, here]
+    highest = _evaluated(rates, t, x, p[:, here])[n_x - model.n : n_x]
     return np.flatnonzero(moved), t, np.vstack([x, highest])
 
 
-def _evaluated(f, n_y, t, x, p):
-    y = np.empty((n_y, len(t)))
-    f.grid(t, x, p, y)
+def _evaluated(f, t, x, p):
+    """The outputs (n_y, N) of a Compiled, which few points do not load."""
+    if len(t) > GRID_POINTS:
+        return f.grid(t, x, p)
+    y = np.empty((f.n_y, len(t)))
+    f.interpreted.grid(t, x, p, y)
     return y

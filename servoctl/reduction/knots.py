@@ -85,7 +85,7 @@ class Switches:
         return [name for name, node in zip(self.residuals, self.tape.outputs, strict=True) if reached[node]]
 
     @cached_property
-    def _numbers(self):
+    def numbers(self):
         """Indices of the parameters on which the residuals depend."""
         return [self.parameters.index(h) for h in (s.element_hash() for s in self.symbols) if h in self.parameters]
 
@@ -94,7 +94,7 @@ class Switches:
 
         Those of the last few numbers in the residuals are known.
         """
-        key = *values[self._numbers].tolist(), frozenset(needs.items())
+        key = *values[self.numbers].tolist(), frozenset(needs.items())
         for known in ((*key, "any span"), (*key, span)):
             if known in self._known:
                 return self._known[known]

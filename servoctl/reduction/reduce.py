@@ -14,7 +14,7 @@ from servoctl.reduction.appell import Realisation, require_inertia
 from servoctl.reduction.cascade import Cascade
 from servoctl.reduction.hidden import complete
 from servoctl.reduction.knots import Knots, Switches, require_smooth
-from servoctl.reduction.manifold import Context, Points, sample
+from servoctl.reduction.manifold import Context, Points, at_usual_size, sample
 from servoctl.reduction.orders import Orders
 from servoctl.reduction.ranks import Rank, clean, decide, decide_all, eliminate, noting_dropped, pivot_order
 from servoctl.reduction.realisation import realisation, wished, wished_balance
@@ -301,6 +301,8 @@ def holds(reduction, values):
     if not strong(now.min(axis=1), before.min(axis=1)).all():
         return False
     left, sizes = points.evaluate(r.conditions)
+    usual = replace(points, z=at_usual_size(points.z, points.sizes(points.level), q.nq))
+    sizes = np.maximum(sizes, usual.evaluate(r.conditions)[1])  # a velocity that the program keeps at zero is rounding
     return bool(np.all(np.abs(left) <= HELD * np.maximum(sizes, TINY)))
 
 

@@ -131,6 +131,24 @@ def as_cases(cases):
     return cases
 
 
+def as_columns(cases):
+    """Columns by name, (N,) arrays or lists, from what `as_cases` takes; arrays of finite numbers as they are."""
+    columns = cases if isinstance(cases, Mapping) else {}
+    if columns and all(map(_are_numbers, columns.values())) and len(set(map(len, columns.values()))) == 1:
+        _case(0, {name: column[0] for name, column in columns.items()})  # which checks the names
+        return dict(columns)
+    rows = as_cases(cases)
+    return {name: [row[name] for row in rows] for name in rows[0]}
+
+
+def _are_numbers(column):
+    """Whether a column is an array (N,) of finite numbers."""
+    import numpy as np
+
+    numeric = isinstance(column, np.ndarray) and column.ndim == 1 and column.dtype.kind in "iuf"
+    return numeric and len(column) > 0 and bool(np.isfinite(column).all())
+
+
 def _case(i, case):
     if not isinstance(case, Mapping):
         rule, example = "A case must be a dict of parameters.", 'Give a dict such as {"m_load": 100.0}.'

@@ -8,18 +8,21 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from servoctl.checks import as_numbers, as_span, mapping, require_kind, whole
+from servoctl.checks import as_numbers, as_span, mapping, plain, require_kind, whole
 from servoctl.errors import ServoError, SpecificationError
-from servoctl.methods.accuracy import ATOL, LARGE, absolute_tolerances
-from servoctl.methods.choice import Method, Taylor, as_method
-from servoctl.methods.lanes import fits, integrate
+from servoctl.methods.accuracy import ATOL, LARGE, coarse
+from servoctl.methods.choice import Algebraic, Method, Taylor, as_method
+from servoctl.methods.lanes import fits, integrate, plan_many, plans_fit
+from servoctl.methods.sizes import sizes_of
 from servoctl.methods.taylor import order_for
 from servoctl.model.model import Model
 from servoctl.model.start import State
+from servoctl.model.starts import linear_starts, same_start
 from servoctl.model.validity import affirmed_each
+from servoctl.progress import progress_bar
 from servoctl.reduction.idle import names_of
 from servoctl.simulation import OFF, as_state, simulated
-from servoctl.study.cases import FAILURE, as_cases
+from servoctl.study.cases import FAILURE, as_columns
 from servoctl.study.table import Study, Traced, machine, table
 
 
@@ -51,14 +54,16 @@ class Motions(Traced):
 def simulate_many(
     model: Model, starts: State | ArrayLike | Mapping[str, ArrayLike], parameters: Mapping[str, ArrayLike] | None,
     t_span: Sequence[float], method: Method | str | None = None, *, t_eval: ArrayLike | None = None,
-    threads: int | None = None,
+    threads: int | None = None, progress: bool | None = None,
 ) -> Motions:  # fmt: skip
     """Simulate the motion of a program for many starts and sets of parameters.
 
     By the Taylor method the motions run in compiled code, in the lanes of vectors with steps of their own, and on
-    threads, where the equations are polynomials of the state and of sines and cosines that do not depend on time. All
-    other motions, and those whose pivots fall, run one after the other, as `simulate` computes them. The result of a
-    case equals that of `simulate` to rounding, and depends neither on other cases nor on threads.
+    threads, where the equations are polynomials of the state and of sines and cosines that do not depend on time. Plans
+    of programs that determine the motion completely run in compiled code and on threads as well, unless kinks or
+    switches may lie on their way. All other motions, and those whose pivots fall, run one after the other, as
+    `simulate` computes them. The result of a case equals that of `simulate` to rounding, and depends neither on other
+    cases nor on threads.
 
     Parameters
     ----------
@@ -76,6 +81,8 @@ def simulate_many(
         Times of the traces [s]; default: no traces.
     threads : int, optional
         Default: one per core.
+    progress : bool, optional
+        Show a progress bar; default: on a terminal, for work of more than a second.
 
     Returns
     -------
@@ -95,18 +102,24 @@ def simulate_many(
     method = as_method(method) if method is not None else as_method("algebraic") if model.flat else Taylor()
     times = _trace_times(span, t_eval)
     motions = _Many(model, *_case_table(model, starts, parameters), len(times))
-    if isinstance(method, Taylor) and fits(model):
-        motions.in_lanes(span, method, times, threads)
-    interrupted = motions.one_by_one(span, method, times)
-    return motions.result(times, {"t_span": list(span), "method": str(method), "interrupted": interrupted})
+    with progress_bar("simulate_many", progress, motions.n, unit="case") as bar:
+        def show(count):
+            bar.update(count - bar.n)
+
+        if isinstance(method, Taylor) and fits(model):
+            motions.in_lanes(span, method, times, threads, show)
+        elif isinstance(method, Algebraic) and plans_fit(model):
+            motions.plans(span, times, threads, show)
+        if not motions.interrupted:
+            motions.one_by_one(span, method, times, show)
+    meta = {"t_span": list(span), "method": str(method), "interrupted": motions.interrupted}
+    return motions.result(times, meta)
 
 
 def _case_table(model, starts, parameters):
-    """Parameters of each case (list of dict); a start of all cases, columns (N,) by name, or states (N, n_x)."""
-    cases, lengths = [{}], set()
-    if parameters is not None:
-        cases = as_cases(parameters)
-        lengths.add(len(cases))
+    """Number of cases; their parameters by name; one start, starts by name, or states (N, n_x)."""
+    columns = {} if parameters is None else as_columns(parameters)
+    lengths = {len(column) for column in columns.values()}
     if isinstance(starts, Mapping):
         starts = {name: as_numbers(values) for name, values in mapping(starts, "The starts").items()}
         valid = all(values.ndim < 2 and np.isfinite(values).all() for values in starts.values())
@@ -115,6 +128,7 @@ def _case_table(model, starts, parameters):
         starts = as_numbers(starts).T
         valid = starts.ndim in (1, 2) and starts.shape[-1] == len(model.state_names) and np.isfinite(starts).all()
         lengths |= {len(starts)} if starts.ndim == 2 else set()
+    n = max(lengths, default=1)
     if not isinstance(starts, State) and not valid or len(lengths) > 1 or 0 in lengths:
         raise SpecificationError(
             f"The starts and parameters have the lengths {', '.join(map(str, sorted(lengths))) or '(none)'}.",
@@ -123,7 +137,7 @@ def _case_table(model, starts, parameters):
             lengths=sorted(lengths),
             names=model.state_names,
         )
-    return cases * max(lengths, default=1) if len(cases) == 1 else cases, starts
+    return n, columns, starts
 
 
 def _trace_times(span, t_eval):
@@ -138,20 +152,26 @@ def _trace_times(span, t_eval):
     return times if span[1] > span[0] else times[::-1]
 
 
+def _with_end(times, span):
+    """Times (K,) in the order of the motion, with its end."""
+    return times if len(times) and times[-1] == span[1] else np.append(times, span[1])
+
+
 class _Many:
     """The cases, and what is known of their motions so far."""
 
-    def __init__(self, model, cases, starts, n_times):
-        self.model, self.cases, self.starts, self.models = model, cases, starts, {}
-        n, n_x = len(cases), len(model.state_names)
+    def __init__(self, model, n, columns, starts, n_times):
+        self.model, self.n, self.columns, self.starts, self.models = model, n, columns, starts, {}
+        self.interrupted, n_x = False, len(model.state_names)
         self.done, self.steps, self.errors = np.zeros(n, bool), np.full(n, np.nan), {}
         self.final, self.samples = np.full((n, n_x), np.nan), np.full((n, n_times, n_x), np.nan)
 
     def model_of(self, i):
         """The model with the parameters of a case; each set of parameters is checked once."""
-        key = tuple(self.cases[i].items())
+        case = {name: plain(column[i]) for name, column in self.columns.items()}
+        key = tuple(case.values())
         if key not in self.models:
-            self.models[key] = self.model.with_parameters(**self.cases[i]) if key else self.model
+            self.models[key] = self.model.with_parameters(**case) if case else self.model
         return self.models[key]
 
     def start(self, i, model, t):
@@ -160,50 +180,80 @@ class _Many:
             return model.start(t=t, **{name: float(v[i] if v.ndim else v) for name, v in self.starts.items()})
         return self.starts[i] if np.ndim(self.starts) == 2 else self.starts
 
-    def in_lanes(self, span, method, times, threads):
+    def in_lanes(self, span, method, times, threads, progress):
         """Compute the cases that need nothing but steps."""
-        which, x0, p = self._prepared(span[0])
+        which, x0, p = self._prepared(span)
         if not len(which):
             return
         order, top = order_for(method.rtol) if method.order is None else method.order, self.model.reduction.top
         last = max(order + top - 1, (method.jets or top) + 1)
         atol = np.full(len(which), ATOL if method.atol is None else method.atol)
-        ends, samples = integrate(self.model, last, span, (x0, p, atol), method.rtol, times, threads)
+        cases, rtol = (x0, p, atol), method.rtol
+        ends, samples, self.interrupted = integrate(self.model, last, span, cases, rtol, times, threads, progress)
         if ends is None:
             return
         x, largest = np.split(ends[:, 3:], 2, axis=1)
         good = (ends[:, 0] > 0) & self._consistent(span[0], x0, p) & self._consistent(span[1], x, p)
         if method.atol is None:
-            good &= self._default_fits(span, x0, largest, method.rtol)
-        here = which[good]
-        self.done[here], self.final[here], self.steps[here] = True, x[good], ends[good, 1]
-        self.samples[here] = samples[good]
+            good &= self._default_fits(span, (x0, p), largest, rtol)
+        self._take(which, ends, samples, good)
 
-    def _prepared(self, t):
-        """Cases (K,) for which the derivation holds, their states (K, n_x) and parameters (K, n_p)."""
-        affirmed, which, states, values = self._affirmed(), [], [], []
-        for i in range(len(self.cases)):
-            try:
-                model = self.model if i in affirmed else self.model_of(i)
-                if model.reduction is self.model.reduction and not model.knots:
-                    states.append(as_state(model, self.start(i, model, t), t))
-                    values.append(affirmed.get(i, model.parameters))
-                    which.append(i)
-            except ServoError:
-                continue  # it fails again, and becomes a row, where the case is computed by itself
-        return np.array(which, dtype=int), np.array(states), np.array(values)
+    def plans(self, span, times, threads, progress):
+        """Compute the plans whose pivots do not fall."""
+        which, *cases = self._prepared(span)
+        ends, samples, self.interrupted = plan_many(self.model, span, cases, _with_end(times, span), threads, progress)
+        if ends is not None:
+            self._take(which, ends, samples[:, : len(times)], ends[:, 0] > 0)
 
-    def _affirmed(self):
-        """Parameters of cases for which the derivation holds, as far as double precision affirms it at once."""
-        by_name = isinstance(self.starts, dict)  # whose states depend on them
-        if by_name or self.model.reduction.timed or not self.cases[0]:
-            return {}
-        symbols, numbers, values = self.model.reduction.mechanism.parameters, self.model.numbers, {}
-        for i, case in enumerate(self.cases):
+    def _take(self, which, ends, samples, good):
+        """Take what was computed for some cases, as far as it is good."""
+        here, n_x = which[good], self.final.shape[1]
+        self.done[here], self.steps[here] = True, ends[good, 1]
+        self.final[here], self.samples[here] = ends[good, 3 : 3 + n_x], samples[good]
+
+    def _prepared(self, span):
+        """Cases (K,) for which the derivation and its knots hold, their states (K, n_x) and parameters (K, n_p)."""
+        t, span = span[0], (min(span), max(span))
+        knots = self.model.require_smooth(span)
+        p, x = np.tile(self.model.parameters, (self.n, 1)), np.empty(self.final.shape)
+        ready = self._affirmed(p)
+        try:
+            ready &= self._started(t, x, p)
+        except ServoError:  # which is raised again, and becomes a row, for each case by itself
+            ready[:] = False
+        for i in np.flatnonzero(~ready).tolist():
             with contextlib.suppress(ServoError):
-                values[i] = symbols.values({**numbers, **case})
-        valid = affirmed_each(self.model, np.array([*values.values()]).T) if values else []
-        return {i: each for (i, each), holds in zip(values.items(), valid, strict=True) if holds}
+                model = self.model_of(i)
+                if model.reduction is self.model.reduction and model.require_smooth(span) == knots:
+                    x[i], p[i] = as_state(model, self.start(i, model, t), t), model.parameters
+                    ready[i] = True
+        which = np.flatnonzero(ready)
+        return which, x[which], p[which]
+
+    def _started(self, t, x, p):
+        """Cases (N,) whose states x (N, n_x) follow for all cases at once; these are set."""
+        if not isinstance(self.starts, dict):
+            x[:] = as_state(self.model, self.starts, t) if isinstance(self.starts, State) else self.starts
+        elif all(v.ndim == 0 for v in self.starts.values()) and same_start(self.model, self.starts, self.columns):
+            x[:] = self.start(0, self.model, t).values
+        else:
+            held = {name: np.broadcast_to(values, self.n) for name, values in self.starts.items()}
+            x[:], solved = linear_starts(self.model, t, held, p)
+            return solved
+        return np.ones(self.n, bool)
+
+    def _affirmed(self, p):
+        """Cases (N,) for which double precision affirms the derivation; their parameters p (N, n_p) are set."""
+        names, of_knots = list(self.model.numbers), self.model.reduction.switches.numbers
+        if not self.columns.keys() <= set(names):
+            return np.zeros(self.n, bool)
+        if not self.columns:
+            return np.ones(self.n, bool)
+        for name, column in self.columns.items():
+            p[:, names.index(name)] = as_numbers(column)
+        sets, places = np.unique(p, axis=0, return_inverse=True)
+        same_knots = (sets[:, of_knots] == self.model.parameters[of_knots]).all(axis=1)
+        return (affirmed_each(self.model, sets.T) & same_knots)[places.ravel()]
 
     def _consistent(self, t, x, p):
         """Whether states (N, n_x) satisfy the invariants."""
@@ -214,25 +264,27 @@ class _Many:
             sizes = np.sqrt((slopes**2 * (1.0 + np.abs(x.T))[:, None] ** 2).sum(axis=0))
             return ~(np.abs(y[:m]) > OFF * np.where(sizes > 0, sizes, 1.0)).any(axis=0)
 
-    def _default_fits(self, span, x0, largest, rtol):
+    def _default_fits(self, span, cases, largest, rtol):
         """Whether the default absolute tolerance is a small part of the sizes (N, n_x) of a motion, and no rounding."""
-        fits = np.ones(len(x0), bool)
-        for i in np.flatnonzero((largest.max(axis=1) > LARGE) | (largest < ATOL / rtol).any(axis=1)):
-            both = np.column_stack([x0[i], largest[i]])
-            fits[i] = largest[i].max() <= LARGE and absolute_tolerances(self.model, np.array(span), both, rtol) is None
-        return fits
+        small = largest.max(axis=1) <= LARGE
+        some = np.flatnonzero((largest < ATOL / rtol).any(axis=1))
+        if len(some):
+            x0, p = (part[some].T for part in cases)
+            inertia = self.model.function("matrices").grid(span[0], x0, p)[-self.model.n :]
+            small[some] &= ~coarse(sizes_of(self.model, inertia, largest[some].T, span[1] - span[0]), rtol).any(axis=0)
+        return small
 
-    def one_by_one(self, span, method, times):
-        """Compute the others as `simulate` does; whether Ctrl-C came."""
+    def one_by_one(self, span, method, times, progress):
+        """Compute the others as `simulate` does."""
         try:
             for i in np.flatnonzero(~self.done).tolist():
                 self._one(i, span, method, times)
+                progress(int(self.done.sum()))
         except KeyboardInterrupt:
-            return True
-        return False
+            self.interrupted = True
 
     def _one(self, i, span, method, times):
-        t_eval = np.union1d(times, [span[1]])[:: 1 if span[1] > span[0] else -1]
+        t_eval = _with_end(times, span)
         try:
             model = self.model_of(i)
             run = simulated(model, self.start(i, model, span[0]), span, method, t_eval=t_eval, progress=False)
@@ -252,10 +304,12 @@ class _Many:
         which, names = np.flatnonzero(self.done), self.model.state_names
         if not len(which):
             raise KeyboardInterrupt
-        columns = {"case": which} | {name: [self.cases[i][name] for i in which] for name in self.cases[0]}
+        columns = {"case": which}
+        columns |= {name: np.asarray(column)[which] for name, column in self.columns.items()}
         columns |= {"steps": self.steps[which]}
         columns |= {f"final {name}": self.final[which, j] for j, name in enumerate(names)}
         for name in FAILURE:
-            columns[name] = np.array([self.errors.get(i, {}).get(name, "") for i in which.tolist()], dtype=str)
+            texts = [self.errors.get(i, {}).get(name, "") for i in which.tolist()] if self.errors else [""] * len(which)
+            columns[name] = np.array(texts, dtype=str)
         trace = dict(zip(names, self.samples[which].transpose(2, 1, 0), strict=True)) if len(times) else {}
         return Motions(Study("many", columns, meta | {"machine": machine()}), times, trace)

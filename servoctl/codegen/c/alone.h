@@ -32,7 +32,7 @@
 #define FREE {1, 1}
 #define SETTLED
 
-/* many.c */
+/* many.c, plans.c */
 #define DEGRADED 0.02
 #define NEGLIGIBLE 1e-7
 #define FAR_OFF 30.0

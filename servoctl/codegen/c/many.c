@@ -1,22 +1,11 @@
 /* Motions of many cases by the Taylor method: the lanes of W are motions with steps of their own, and a lane whose motion
-   ends takes the next case. Before it comes `expansion`, the function of taylor.c in lanes, with its sizes. */
+   ends takes the next case that no thread has taken. Before it comes `expansion`, the function of taylor.c in lanes, with its sizes. */
 #include "unit.h"
 #include "lanes.h"
 #include "series.h"
+#include "cases.h"
 
 #define COEFFICIENTS ((PLAIN ? 0 : NQ * LAST) + N * LAST) /* outputs before the pivots */
-
-/* Inputs are a row for each case: x0, p, absolute tolerance; and for all of them the pivots' sizes, and the instants of
-   samples. Results are a row for each case: the outcome, the number of steps, the last instant and state, the largest
-   sizes of the state; and its samples. */
-typedef struct {
-    double t0, t1, rtol;
-    int64_t max_steps, n_times, stop;
-    const double *x0, *p, *atol, *pivots, *times;
-    double *ends, *samples;
-} Many;
-
-enum { FINISHED = 1, PIVOT_FALLS = -1, STUCK = -2, SERIES_OFF = -3 };
 
 typedef struct {
     W t, x[NX + 1], p[NP + 1], y[NY + 1], atol, h, largest[NX + 1];
@@ -42,13 +31,11 @@ INLINE W w_rough_exp2(W a)
 
 INLINE W w_largest(const W *v, int64_t n, int64_t level)
 {
-    I largest = w_bits(ALL(0.0));
+    W largest = ALL(0.0);
     for (int64_t i = 0; i < n; i++) {
-        if (level && !IS_FREE((level - 1) * N + i)) continue;
-        const I bits = w_bits(w_fabs(v[i])), more = bits > largest;
-        largest = (more & bits) | (~more & largest);
+        if (!level || IS_FREE((level - 1) * N + i)) largest = w_larger_size(w_fabs(v[i]), largest);
     }
-    return w_value(largest);
+    return largest;
 }
 
 /* `length` of taylor.c in lanes. */
@@ -62,7 +49,7 @@ INLINE W w_length(const W *x, const W *c, int64_t n, int64_t level, double log_r
         const W size = w_rough_log2(w_largest(c + (k - 1) * n, n, level));
         const W growth = (scale - size - rough_log2(falling(k, level))) * (1.0 / (double)(k - level));
         const W h = log_rtol * (1.0 / (double)(LAST - level)) + growth;
-        shortest = w_select(h < shortest, h, shortest);
+        shortest = w_lesser(h, shortest);
     }
     return shortest;
 }
@@ -75,11 +62,11 @@ INLINE W w_series(const W *c, int64_t n, int64_t i, int64_t j, W h)
     return j ? total : total * h;
 }
 
-/* Put a case, or none, into a lane; the lane of none rests at the end of the first case. */
-static void load(const Many *m, int64_t lane, int64_t at, int64_t last, Motions *s)
+/* Put the next case, or none, into a lane, which then rests at the start of the first case; whether there was one. */
+static int load(Many *m, int64_t lane, Motions *s)
 {
-    const int64_t from = at < last ? at : 0;
-    s->of[lane] = at < last ? at : -1;
+    const int64_t next = next_case(m), from = next < 0 ? 0 : next;
+    s->of[lane] = next;
     s->t[lane] = m->t0;
     s->h[lane] = s->steps[lane] = s->sampled[lane] = 0;
     s->atol[lane] = m->atol[from];
@@ -88,6 +75,7 @@ static void load(const Many *m, int64_t lane, int64_t at, int64_t last, Motions 
     for (int64_t i = 0; i < NP; i++) s->p[i][lane] = m->p[from * NP + i];
     for (int64_t i = 0; i < NY - COEFFICIENTS; i++) s->pivots[i][lane] = m->pivots[i];
     for (int64_t i = 0; i < NY - COEFFICIENTS; i++) s->signs[i][lane] = 0;
+    return next >= 0;
 }
 
 static void end(const Many *m, int64_t lane, int64_t outcome, const Motions *s)
@@ -131,7 +119,7 @@ INLINE I falling_pivots(Motions *s)
         const W value = s->y[COEFFICIENTS + i], size = w_fabs(value);
         bad |= ~(size >= DEGRADED * s->pivots[i]) | (value * s->signs[i] < 0) | (size * NEGLIGIBLE > s->pivots[i]);
         s->signs[i] = value;
-        s->pivots[i] = w_fmax(s->pivots[i], size);
+        s->pivots[i] = w_larger_size(s->pivots[i], size);
     }
     return bad;
 }
@@ -148,28 +136,29 @@ INLINE I off(const Motions *s, const W *c, double rtol)
         for (int64_t i = 0; i < N; i++) {
             if (highest_level(i) != j) continue;
             const W now = falling(TOP, TOP) * c[(TOP - 1) * N + i];
-            error = w_fmax(error, w_fabs(part * (now - s->ahead[i])));
-            size = w_fmax(size, w_fabs(part * now));
+            error = w_larger_size(error, w_fabs(part * (now - s->ahead[i])));
+            size = w_larger_size(size, w_fabs(part * now));
         }
         wrong |= ~(error <= FAR_OFF * (s->atol + rtol * size));
     }
     return (s->h != 0) & wrong;
 }
 
-void FN(many)(Many *m, int64_t first, int64_t last)
+/* Called by each thread. */
+void FN(many)(Many *m)
 {
     const double log_rtol = log2(LAST_TERM * m->rtol), forward = m->t1 > m->t0 ? 1 : -1;
     Motions s = {0};
-    int64_t next = first, open = 0;
-    for (int64_t lane = 0; lane < W_LANES; lane++, next++) load(m, lane, next, last, &s), open += next < last;
+    int64_t open = 0;
+    for (int64_t lane = 0; lane < W_LANES; lane++) open += load(m, lane, &s);
     while (open) {
-        if (*(const volatile int64_t *)&m->stop) return;
+        if (stopped(m)) return;
         expansion(s.t, s.x, s.p, s.y);
         const W *c = s.y + (PLAIN ? 0 : NQ * LAST), least = s.atol / m->rtol;
         W log_h = w_length(s.x, s.y, NQ, 0, log_rtol, least);
         for (int64_t j = 1; j < TOP; j++) {
             const W of_level = w_length(s.x + NQ + (j - 1) * N, c, N, j, log_rtol, least);
-            log_h = w_select(of_level < log_h, of_level, log_h);
+            log_h = w_lesser(of_level, log_h);
         }
         for (int64_t i = 0; i < N * (TOP - 1); i++) {
             if (!IS_FREE(i)) s.x[NQ + i] = falling(1 + i / N, 1 + i / N) * c[i];
@@ -199,8 +188,7 @@ void FN(many)(Many *m, int64_t first, int64_t last)
                 continue;
             }
             end(m, lane, fallen[lane] ? PIVOT_FALLS : wrong[lane] ? SERIES_OFF : arrived[lane] ? FINISHED : STUCK, &s);
-            load(m, lane, next, last, &s);
-            open -= next++ >= last;
+            open -= !load(m, lane, &s);
             for (int64_t i = 0; i < NX; i++) x[i][lane] = s.x[i][lane];
             h[lane] = s.steps[lane] = 0;
         }
@@ -208,7 +196,7 @@ void FN(many)(Many *m, int64_t first, int64_t last)
         s.h = h;
         for (int64_t i = 0; i < NX; i++) {
             s.x[i] = x[i];
-            s.largest[i] = w_fmax(s.largest[i], w_fabs(x[i]));
+            s.largest[i] = w_larger_size(s.largest[i], w_fabs(x[i]));
         }
         s.t = w_select(ends & (h != 0), ALL(m->t1), s.t + h);
     }

@@ -1,0 +1,59 @@
+/* Paths of many cases, each by newton.c. N is the number of quasi-velocities, which follow x in a state, and PLAIN says
+   whether they are its rates. */
+#include <stdlib.h>
+
+#include "unit.h"
+#include "cases.h"
+#ifndef NODE
+#include "newton.c"
+#endif
+
+#define STATE (NX + N)
+#define FIRST (PLAIN ? NX : 3 * NX) /* of the velocities among the outputs */
+
+/* Whether a pivot of some nodes is far below or above its largest size so far. */
+static int pivots_fall(const Many *m, int64_t n, const double *nodes)
+{
+    for (int64_t i = 0; i < PIVOTS; i++) {
+        double largest = m->pivots[i];
+        for (int64_t k = 0; k < n; k++) {
+            const double size = fabs(nodes[k * NODE + 1 + NX + NY - PIVOTS + i]);
+            if (!(size >= DEGRADED * largest) || size * NEGLIGIBLE > largest) return 1;
+            largest = fmax(largest, size);
+        }
+    }
+    return 0;
+}
+
+/* A case; the nodes, x and y are memory for its path and samples. */
+static void plan(const Many *m, int64_t at, double *nodes, double *x, double *y)
+{
+    const double *p = m->p + at * NP;
+    double *row = m->ends + at * (3 + 2 * STATE), *samples = m->samples + at * m->n_times * STATE;
+    int64_t count;
+    const int64_t n = FN(continuation)(m->n_cuts, m->cuts, m->x0 + at * STATE, p, m->longest, m->max_steps, nodes, &count);
+    row[0] = STUCK;
+    if (!n || nodes[(n - 1) * NODE] != m->t1) return;
+    row[0] = PIVOT_FALLS;
+    if (pivots_fall(m, n, nodes)) return;
+    row[0] = STUCK;
+    if (FN(newton)(m->n_times, m->times, n, nodes, p, x, y, &count) != m->n_times) return;
+    row[0] = FINISHED;
+    row[1] = (double)(n - 1);
+    row[2] = m->t1;
+    for (int64_t k = 0; k < m->n_times; k++, samples += STATE) {
+        for (int64_t i = 0; i < NX; i++) samples[i] = x[i * m->n_times + k];
+        for (int64_t i = 0; i < N; i++) samples[NX + i] = y[(FIRST + i) * m->n_times + k];
+    }
+}
+
+/* Called by each thread; without memory the cases are left as they are. */
+void FN(plans)(Many *m)
+{
+    double *nodes = malloc(sizeof(double) * (size_t)(m->max_steps * NODE));
+    double *x = malloc(sizeof(double) * (size_t)(m->n_times * NX)), *y = malloc(sizeof(double) * (size_t)(m->n_times * NY));
+    for (int64_t at; nodes && x && y && !stopped(m) && (at = next_case(m)) >= 0;) plan(m, at, nodes, x, y);
+    free(nodes);
+    free(x);
+    free(y);
+}

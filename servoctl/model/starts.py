@@ -1,0 +1,83 @@
+"""Consistent starts of many cases at once, where they are the same or a linear problem with one solution.
+
+Of a linear problem: level by level, coordinates first and then velocities, as many invariants as unknown entries must
+remain, which are affine in them. Then one state has the held values, and it is the one that `Model.start` finds.
+"""
+
+import casadi as ca
+import numpy as np
+
+from servoctl.reduction.manifold import WELL_CONDITIONED
+
+PASSES = 2  # Newton steps of each level: one solves it, another one takes what rounding left
+
+
+def linear_levels(model, held):
+    """Rows of the invariants and unknown entries of the state of each level; None if they are no linear problem.
+
+    Parameters
+    ----------
+    model : Model
+    held : sequence of str
+        Names of the held values.
+
+    Returns
+    -------
+    list of (list of int, list of int)
+    """
+    names = model.state_names
+    if not set(held) <= set(names) or len(set(held)) != model.free or model.reduction.cascade is not None:
+        return None
+    f, m = model.function("invariants").expression, len(model.invariant_names())
+    t, x, p = f.sx_in()
+    values, entries = f(t, x, p)[:m], x.elements()
+    of = [0 if i < model.nq else 1 + (i - model.nq) // model.n for i in range(len(names))]
+    rows = [[i for i, e in enumerate(entries) if ca.depends_on(value, e)] for value in values.elements()]
+    levels = []
+    for level in range(max(of) + 1):
+        some = [a for a, places in enumerate(rows) if max((of[i] for i in places), default=0) == level]
+        unknown = [i for i, name in enumerate(names) if of[i] == level and name not in held]
+        block = x[unknown]
+        if len(some) != len(unknown) or some and ca.depends_on(ca.jacobian(values[some], block), block):
+            return None
+        levels += [(some, unknown)] if some else []
+    return levels
+
+
+def same_start(model, held, parameters):
+    """Whether starts with one set of held values are the same for all values of some parameters, by their names."""
+    f, m = model.function("invariants").expression, len(model.invariant_names())
+    t, x, p = f.sx_in()
+    places = [i for i, name in enumerate(model.numbers) if name in parameters]
+    return set(held) <= set(model.state_names) and not (places and ca.depends_on(f(t, x, p)[:m], p[places]))
+
+
+def linear_starts(model, t, held, p):
+    """States (N, n_x) at time t with held values, a dict of str to (N,) array, for parameters p (N, n_p).
+
+    Returns
+    -------
+    states : (N, n_x) array
+    solved : (N,) array of bool
+        Where they are the only ones with these values.
+    """
+    states, solved = np.zeros((len(p), len(model.state_names))), np.zeros(len(p), bool)
+    levels = model.once(f"linear levels {sorted(held)}", lambda: linear_levels(model, tuple(held)))
+    if levels is None:
+        return states, solved
+    for name, values in held.items():
+        states[:, model.state_names.index(name)] = values
+    f, m = model.function("invariants"), len(model.invariant_names())
+    solved[:] = True
+    with np.errstate(all="ignore"):
+        for rows, unknown in (level for level in levels for _ in range(PASSES)):
+            y = f.grid(t, states.T, p.T)
+            jacobian = y[m:].reshape(states.shape[1], m, -1)[np.ix_(unknown, rows)].transpose(2, 1, 0)
+            sizes = np.linalg.norm(jacobian, axis=2)
+            scaled, off = jacobian / sizes[:, :, None], y[rows].T / sizes
+            solved &= np.isfinite(scaled).all(axis=(1, 2)) & np.isfinite(off).all(axis=1)
+            scaled[~solved] = np.eye(len(rows))
+            regular = np.linalg.svd(scaled, compute_uv=False)[:, -1] > WELL_CONDITIONED
+            scaled[~regular], solved = np.eye(len(rows)), solved & regular
+            states[:, unknown] -= np.linalg.solve(scaled, np.where(solved[:, None], off, 0.0)[:, :, None])[:, :, 0]
+    return states, solved
