@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from servoctl.errors import IntegrationStopped
+from servoctl.methods import brent
 from servoctl.reduction.ranks import equilibrate
 
 REACH = 2.0  # speed of the solved values relative to the integrated ones, above which the choice is reconsidered
@@ -213,22 +214,20 @@ class Chart:
         pivot : int
             Its place among those that "ode" logs.
         """
-        from scipy.optimize import minimize_scalar
-
         def state(part):
             return self._step(t, x, part * span, *tableau)
 
         def size(part):
             return np.nan_to_num(abs(self.ode(t + part * span, state(part), self.p)[self.n_x + pivot]))
 
-        least = minimize_scalar(size, bounds=(0.0, 1.0), method="bounded", options={"xatol": 1e-12})
-        part = least.x
+        lowest, smallest = brent.least(size, 0.0, 1.0, 1e-12)
+        part = lowest
         if not np.all(np.isfinite(state(part))):
-            part, beyond = 0.0, least.x
+            part, beyond = 0.0, lowest
             while beyond - part > 1e-12:
                 middle = (part + beyond) / 2
                 part, beyond = (middle, beyond) if np.all(np.isfinite(state(middle))) else (part, middle)
-        return t + part * span, state(part), least.fun
+        return t + part * span, state(part), smallest
 
     def steps(self, t0, x, h, count, tableau):
         """Explicit Runge-Kutta steps, fewer than `count` where no state is found.
