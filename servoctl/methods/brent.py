@@ -5,26 +5,26 @@ Source: R. P. Brent, Algorithms for Minimization Without Derivatives, 1973, chap
 
 from math import copysign, sqrt
 
-RTOL = 8.9e-16  # of a root: least relative tolerance that rounding allows
-MOST = 500  # evaluations
+LAST_PLACES = 8.9e-16  # of a root: least relative tolerance that rounding allows
+MOST_TRIED = 500  # evaluations
 GOLDEN, SQRT_EPS = 0.5 * (3.0 - sqrt(5.0)), sqrt(2.2e-16)
 
 
 def root(f, a, b, xtol):
-    """The root of f between a and b, where its values have opposite signs, to xtol + RTOL |root|."""
+    """The root of f between a and b, where its values have opposite signs, to xtol + LAST_PLACES |root|."""
     before, f_before, x, fx = a, f(a), b, f(b)
     other, f_other, last = before, f_before, x - before
     step = last
     if f_before == 0 or fx == 0:
         return before if f_before == 0 else x
-    for _ in range(MOST):
+    for _ in range(MOST_TRIED):
         if f_before != 0 and fx != 0 and (f_before > 0) != (fx > 0):
             other, f_other, last = before, f_before, x - before
             step = last
         if abs(f_other) < abs(fx):
             before, x, other = x, other, x
             f_before, fx, f_other = fx, f_other, fx
-        least, half = (xtol + RTOL * abs(x)) / 2, (other - x) / 2
+        least, half = (xtol + LAST_PLACES * abs(x)) / 2, (other - x) / 2
         if fx == 0 or abs(half) < least:
             break
         trial = _interpolated((before, f_before), (x, fx), (other, f_other)) if abs(fx) < abs(f_before) else None
@@ -54,7 +54,7 @@ def least(f, a, b, xtol):
     x = second = third = a + GOLDEN * (b - a)
     fx = f_second = f_third = f(x)
     last = step = 0.0
-    for _ in range(MOST):
+    for _ in range(MOST_TRIED):
         middle, near = (a + b) / 2, SQRT_EPS * abs(x) + xtol / 3
         if not abs(x - middle) > 2 * near - (b - a) / 2:
             break

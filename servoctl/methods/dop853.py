@@ -6,7 +6,7 @@ Differential Equations I, II.5, II.6 and II.10, and the coefficients of their pr
 
 import numpy as np
 
-STAGES, ORDER = 12, 8
+N_STAGES, METHOD_ORDER = 12, 8
 SAFETY, MIN_FACTOR, MAX_FACTOR = 0.9, 0.2, 10.0  # of the next step, relative to the optimal one and to the last one
 TOO_SMALL = "Required step size is less than spacing between numbers."
 
@@ -68,7 +68,7 @@ _DENSE = (
 # fmt: on
 
 A = np.array([[*row, *[0.0] * (16 - len(row))] for row in ((), *_ROWS)])
-B, C, E3, E5, D = A[STAGES, :STAGES], *map(np.array, (_NODES, _E3, _E5, _DENSE))
+B, C, E3, E5, D = A[N_STAGES, :N_STAGES], *map(np.array, (_NODES, _E3, _E5, _DENSE))
 
 
 class DormandPrince8:
@@ -115,7 +115,7 @@ class DormandPrince8:
         h = probe * self.direction
         bend = _norm((self.fun(self.t + h, self.y + h * self.f) - self.f) / scale) / probe
         straight = speed <= 1e-15 and bend <= 1e-15
-        length = max(1e-6, probe * 1e-3) if straight else (0.01 / max(speed, bend)) ** (1 / ORDER)
+        length = max(1e-6, probe * 1e-3) if straight else (0.01 / max(speed, bend)) ** (1 / METHOD_ORDER)
         return min(100 * probe, length, span)
 
     def step(self):
@@ -131,7 +131,7 @@ class DormandPrince8:
             h = end - self.t
             y, f = self._tried(h)
             error = self._error(y, h)
-            factor = MAX_FACTOR if error == 0 else SAFETY * error ** (-1 / ORDER)
+            factor = MAX_FACTOR if error == 0 else SAFETY * error ** (-1 / METHOD_ORDER)
             if error < 1:
                 self._length = abs(h) * min(1.0 if rejected else MAX_FACTOR, factor)
                 self.t_old, self.y_old, self.t, self.y, self.f = self.t, self.y, end, y, f
@@ -145,17 +145,17 @@ class DormandPrince8:
         """The state after a step, and its rates."""
         k = self._stages
         k[0] = self.f
-        for s in range(1, STAGES):
+        for s in range(1, N_STAGES):
             k[s] = self.fun(self.t + C[s] * h, self.y + np.dot(k[:s].T, A[s, :s]) * h)
-        y = self.y + h * np.dot(k[:STAGES].T, B)
-        k[STAGES] = f = self.fun(self.t + h, y)
+        y = self.y + h * np.dot(k[:N_STAGES].T, B)
+        k[N_STAGES] = f = self.fun(self.t + h, y)
         return y, f
 
     def _error(self, y, h):
         """The error estimate relative to the tolerances, from those of orders 5 and 3."""
         rtol, atol = self.tolerances
         scale = atol + np.maximum(np.abs(self.y), np.abs(y)) * rtol
-        fifth, third = (np.linalg.norm(np.dot(self._stages[: STAGES + 1].T, e) / scale) ** 2 for e in (E5, E3))
+        fifth, third = (np.linalg.norm(np.dot(self._stages[: N_STAGES + 1].T, e) / scale) ** 2 for e in (E5, E3))
         return 0.0 if fifth == third == 0.0 else abs(h) * fifth / np.sqrt((fifth + 0.01 * third) * len(scale))
 
     def dense_output(self):
@@ -163,7 +163,7 @@ class DormandPrince8:
         if self.t == self.t_old or not self.y.size:
             return lambda t, y=self.y: y if np.ndim(t) == 0 else np.repeat(y[:, None], len(t), axis=1)
         k, start, h = self._stages, self.y_old, self.t - self.t_old
-        for s in range(STAGES + 1, len(A)):
+        for s in range(N_STAGES + 1, len(A)):
             k[s] = self.fun(self.t_old + C[s] * h, start + np.dot(k[:s].T, A[s, :s]) * h)
         change = self.y - start
         terms = [change, h * k[0] - change, 2 * change - h * (self.f + k[0]), *(h * np.dot(D, k))]
