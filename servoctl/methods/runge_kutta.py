@@ -43,7 +43,8 @@ def tableau(name):
     if name not in ORDERS:
         raise unknown(name, ORDERS, "method")
     if name == "RK8":
-        return dop853.A[: dop853.N_STAGES, : dop853.N_STAGES].copy(), dop853.B.copy(), dop853.C[: dop853.N_STAGES].copy()
+        s = dop853.N_STAGES
+        return dop853.A[:s, :s].copy(), dop853.B.copy(), dop853.C[:s].copy()
     if name == "RK5":
         a = np.array([[*row, *[0.0] * (6 - len(row))] for row in DORMAND_PRINCE_5[:6]])
         return a, np.array(DORMAND_PRINCE_5[6]), np.array([0.0, 1 / 5, 3 / 10, 4 / 5, 8 / 9, 1.0])
