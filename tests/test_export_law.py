@@ -212,15 +212,53 @@ def test_the_header_is_read_by_a_compiler_of_cplusplus(plan, tmp_path):
     assert header.exists()
 
 
+DRIVER = """
+#include <math.h>
+#include "loop.h"
+int main(void) {
+    loop_real y[LOOP_NY], z[LOOP_NZ + 1], u[LOOP_NU];
+    unsigned long seed = 1;
+    int answered = 0, wrong = 0;
+    loop_start(z);
+    for (int k = -3; k < 2000; k++) {
+        for (int i = 0; i < LOOP_NY; i++) {
+            seed = (seed * 1103515245UL + 12345UL) % 2147483648UL;
+            y[i] = (loop_real)(SIZE * ((double)seed / 1073741824.0 - 1.0));
+        }
+        if (k % 50 == 0) y[0] = k % 100 ? NAN : INFINITY;
+        int status = loop_step((loop_real)(0.004 * k), y, z, u);
+        answered += status == 0;
+        wrong += (k % 50 == 0) != (status != 0);
+        for (int i = 0; status == 0 && i < LOOP_NU; i++)
+            wrong += !isfinite(u[i]);
+    }
+    return BOUNDED ? answered < 100 : wrong != 0;
+}
+"""
+LIMITS = {"limits": {"trolley": 120.0}, "rate_limits": {"hoist": 500.0}}
+WITHIN_LIMITS = {  # and the size of its random measurements; bounds may exclude limits there, and there is no answer
+    "LQR": (lambda law: law, 1.0),
+    "limited": (lambda law: sv.limited(law, sv.plant(CRANE, **LIMITS)), 1e3),
+    "limited by priority": (lambda law: sv.limited(law, sv.plant(CRANE, **LIMITS), priority=["X", "Z"]), 1.0),
+    "bounded": (lambda law: sv.limited(law, sv.plant(CRANE, **LIMITS), bounds={"tension": (900.0, 1060.0)}), 0.1),
+}
+
+
 @pytest.mark.parametrize("tool", ["sanitizers", "valgrind"])
-def test_a_law_in_c_runs_without_a_complaint_of(tool, plan, tmp_path):
+@pytest.mark.parametrize("real", ["double", "float"])
+@pytest.mark.parametrize("kind", WITHIN_LIMITS)
+def test_a_law_in_c_runs_without_a_complaint_of(kind, real, tool, plan, tmp_path):
+    """Random measurements, every 50th of them infinite or no number, before the plan, along it and after its end."""
     if tool == "valgrind" and which("valgrind") is None:
         pytest.skip("there is no valgrind")
-    source, _ = sv.export_c(sv.lqr(plan, sv.plant(CRANE), integral=True), tmp_path, name="loop", thinned=1e-4)
-    (tmp_path / "main.c").write_text(
-        '#include "loop.h"\nint main(void) { double y[LOOP_NY] = {0}, z[LOOP_NZ], u[LOOP_NU]; int bad = 0; loop_start(z);\n'
-        "for (int k = -3; k < 2000; k++) bad += loop_step(0.004 * k, y, z, u); return bad; }\n"
-    )
+    limited, size = WITHIN_LIMITS[kind]
+    law = limited(sv.lqr(plan, sv.plant(CRANE), integral=True))
+    source, _ = sv.export_c(law, tmp_path, name="loop", real=real, thinned=1e-4)
+    facts = {"loop_real": real, "SIZE": repr(size), "BOUNDED": str(int(kind == "bounded"))}
+    text = DRIVER
+    for word, fact in facts.items():
+        text = text.replace(word, fact)
+    (tmp_path / "main.c").write_text(text)
     flags = ["-fsanitize=address,undefined", "-fno-sanitize-recover=all"] if tool == "sanitizers" else ["-g"]
     run = tmp_path / "run"
     built = subprocess.run(["gcc", "-std=c99", *flags, str(tmp_path / "main.c"), str(source), "-o", str(run), "-lm"],
@@ -228,7 +266,8 @@ def test_a_law_in_c_runs_without_a_complaint_of(tool, plan, tmp_path):
     if built.returncode and tool == "sanitizers":
         pytest.skip(f"the compiler has no sanitizers: {built.stderr[:100]}")
     before = ["valgrind", "-q", "--error-exitcode=9"] if tool == "valgrind" else []
-    assert subprocess.run([*before, str(run)], capture_output=True, text=True).returncode == 0
+    done = subprocess.run([*before, str(run)], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
 
 
 def test_options_of_the_export_are_refused_in_words(plan, tmp_path):
