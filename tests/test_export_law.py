@@ -4,6 +4,7 @@ import ctypes
 import re
 import shlex
 import subprocess
+from pathlib import Path
 from shutil import which
 
 import numpy as np
@@ -210,6 +211,60 @@ def test_the_header_is_read_by_a_compiler_of_cplusplus(plan, tmp_path):
         done = subprocess.run(command, capture_output=True, text=True)
         assert (done.returncode, done.stderr) == (0, "")
     assert header.exists()
+
+
+ROS = """
+#include <memory>
+#include <vector>
+#include "loop.h"
+namespace rclcpp {
+struct Duration { double s; double seconds() const { return s; } };
+struct Time { double s = 0; Duration operator-(const Time &other) const { return {s - other.s}; } };
+}
+namespace rclcpp_lifecycle { struct State {}; struct Node { rclcpp::Time now() const { return {2.0}; } }; }
+struct Interface { double value; double get_value() const { return value; } void set_value(double v) { value = v; } };
+namespace controller_interface {
+enum class return_type { OK, ERROR };
+struct ControllerInterface {
+    enum class CallbackReturn { SUCCESS };
+    std::vector<Interface> state_interfaces_, command_interfaces_;
+    std::shared_ptr<rclcpp_lifecycle::Node> get_node() const { return std::make_shared<rclcpp_lifecycle::Node>(); }
+    virtual CallbackReturn on_activate(const rclcpp_lifecycle::State &) = 0;
+    virtual return_type update(const rclcpp::Time &, const rclcpp::Duration &) = 0;
+    virtual ~ControllerInterface() = default;
+};
+}
+%s
+int main()
+{
+    LoopController own;
+    controller_interface::ControllerInterface &c = own;
+    double z[LOOP_NZ + 1], u[LOOP_NU], y[LOOP_NY];
+    loop_start(z);
+    c.command_interfaces_.resize(LOOP_NU);
+    for (int i = 0; i < LOOP_NY; ++i) c.state_interfaces_.push_back({y[i] = 0.1 * i});
+    c.on_activate({});
+    bool same = c.update({2.5}, {0.01}) == controller_interface::return_type::OK && loop_step(0.5, y, z, u) == 0;
+    for (int i = 0; i < LOOP_NU; ++i) same = same && c.command_interfaces_[i].get_value() == u[i];
+    c.state_interfaces_[0].set_value(__builtin_nan(""));
+    return same && c.update({2.51}, {0.01}) == controller_interface::return_type::ERROR ? 0 : 1;
+}
+"""
+
+
+def test_the_controller_of_the_documents_gives_the_commands_of_the_law(plan, tmp_path):
+    if which("g++") is None:
+        pytest.skip("there is no g++")
+    page = (Path(__file__).parents[1] / "docs" / "c_export.md").read_text()
+    (shown,) = re.findall(r"```cpp\n(.*?)```", page, re.S)
+    source, _ = sv.export_c(sv.lqr(plan, sv.plant(CRANE), integral=True), tmp_path, name="loop", thinned=1e-4)
+    (tmp_path / "main.cpp").write_text(ROS % shown)
+    for command in (["gcc", "-std=c99", "-c", str(source), "-o", str(tmp_path / "loop.o")],
+                    ["g++", "-std=c++17", "-Wall", "-Wextra", str(tmp_path / "main.cpp"), str(tmp_path / "loop.o"), "-lm",
+                     "-o", str(tmp_path / "run")],
+                    [str(tmp_path / "run")]):  # fmt: skip
+        done = subprocess.run(command, capture_output=True, text=True)
+        assert (done.returncode, done.stderr) == (0, "")
 
 
 DRIVER = """
