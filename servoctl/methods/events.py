@@ -8,7 +8,6 @@ import numpy as np
 
 from servoctl.checks import as_list, finite, mapping, whole
 from servoctl.errors import SpecificationError
-from servoctl.methods import brent
 from servoctl.methods.watch import BESIDE_ENDS
 from servoctl.run import Run
 
@@ -253,16 +252,20 @@ def _turns(t, g):
 
 def _least(value, a, b):
     """Where a positive signal is below zero between a and b; None where it is not."""
-    t, smallest = brent.least(value, a, b, 1e-9 * abs(b - a))
-    return float(t) if smallest < 0 else None
+    from scipy.optimize import minimize_scalar
+
+    found = minimize_scalar(value, bounds=sorted((a, b)), method="bounded", options={"xatol": 1e-9 * abs(b - a)})
+    return float(found.x) if found.fun < 0 else None
 
 
 def _root(value, a, b):
     """The root between a and b, to rounding; the nearer end where the values there have one sign, as after a jump."""
+    from scipy.optimize import brentq
+
     low, high = value(a), value(b)
     if not low * high < 0:
         return a if abs(low) < abs(high) else b
-    return float(brent.root(value, a, b, 1e-15))
+    return float(brentq(value, a, b, xtol=1e-15, rtol=8.9e-16))
 
 
 def _require_signal(event, model):

@@ -11,7 +11,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from servoctl.errors import IntegrationStopped
-from servoctl.methods import brent
 from servoctl.reduction.ranks import equilibrate
 
 REACH = 2.0  # speed of the solved values relative to the integrated ones, above which the choice is reconsidered
@@ -214,20 +213,22 @@ class Chart:
         pivot : int
             Its place among those that "ode" logs.
         """
+        from scipy.optimize import minimize_scalar
+
         def state(part):
             return self._step(t, x, part * span, *tableau)
 
         def size(part):
             return np.nan_to_num(abs(self.ode(t + part * span, state(part), self.p)[self.n_x + pivot]))
 
-        lowest, smallest = brent.least(size, 0.0, 1.0, 1e-12)
-        part = lowest
+        least = minimize_scalar(size, bounds=(0.0, 1.0), method="bounded", options={"xatol": 1e-12})
+        part = least.x
         if not np.all(np.isfinite(state(part))):
-            part, beyond = 0.0, lowest
+            part, beyond = 0.0, least.x
             while beyond - part > 1e-12:
                 middle = (part + beyond) / 2
                 part, beyond = (middle, beyond) if np.all(np.isfinite(state(middle))) else (part, middle)
-        return t + part * span, state(part), smallest
+        return t + part * span, state(part), least.fun
 
     def steps(self, t0, x, h, count, tableau):
         """Explicit Runge-Kutta steps, fewer than `count` where no state is found.

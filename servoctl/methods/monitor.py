@@ -11,7 +11,6 @@ from functools import cached_property
 import numpy as np
 
 from servoctl.errors import IntegrationStopped, ServoError, SingularProgram
-from servoctl.methods import brent
 from servoctl.methods.sizes import motion_sizes
 from servoctl.model.report import explain
 from servoctl.tolerances import ENTRY
@@ -181,20 +180,25 @@ class DenseStretch(Stretch):
 
     def zero(self, k, i, ends, sizes):
         """The root of pivot i between two instants."""
+        from scipy.optimize import brentq
+
         a, b = (self._pivot(k, i, t) for t in ends)
         if np.sign(a) == np.sign(b):  # where states were projected the dense output differs from what was inspected
             return ends[0] if abs(a) < abs(b) else ends[1]
-        return brent.root(lambda s: self._pivot(k, i, s), *ends, 1e-14)
+        return brentq(lambda s: self._pivot(k, i, s), *ends, xtol=1e-14)
 
     def least(self, k, i, instants, sizes, scale):
         """The instant in step k at which pivot i is least, and its size there relative to a scale."""
+        from scipy.optimize import minimize_scalar
+
         low, high = sorted(self.t[k : k + 2])
 
         def size(t):
             return abs(self._pivot(k, i, t))
 
-        least, _ = brent.least(size, low, high, 1e-10 * max(high - low, 1e-12))
-        best = min([*instants, float(least)], key=size)
+        options = {"xatol": 1e-10 * max(high - low, 1e-12)}
+        least = minimize_scalar(size, bounds=(low, high), method="bounded", options=options)
+        best = min([*instants, float(least.x)], key=size)
         return best, size(best) / scale
 
     def last_before(self, k, t):

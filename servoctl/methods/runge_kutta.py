@@ -5,25 +5,17 @@ from itertools import pairwise
 import numpy as np
 
 from servoctl.errors import unknown
-from servoctl.methods import dop853
 from servoctl.methods.choice import ORDERS, MinimalCoordinates, Project
 from servoctl.methods.minimal import Chart, Sizes
 from servoctl.methods.monitor import DEGRADED, Fine, Singular, Stretch
 from servoctl.methods.motion import Cubics, Stepping, equal_steps
 from servoctl.methods.watch import FINER, End
 
-# Rows of A, then b: Hairer, Nørsett and Wanner, Solving Ordinary Differential Equations I, II.5, table 5.2.
-DORMAND_PRINCE_5 = (
-    (), (1 / 5,), (3 / 40, 9 / 40), (44 / 45, -56 / 15, 32 / 9),
-    (19372 / 6561, -25360 / 2187, 64448 / 6561, -212 / 729),
-    (9017 / 3168, -355 / 33, 46732 / 5247, 49 / 176, -5103 / 18656),
-    (35 / 384, 0.0, 500 / 1113, 125 / 192, -2187 / 6784, 11 / 84),
-)  # fmt: skip
 NEARLY_ZERO = 0.3  # of its reference: below this a pivot's least size is searched for within steps
 
 
 def tableau(name):
-    """The tableau (a, b, c) of a method.
+    """The tableau (a, b, c) of a method; the coefficients of RK5 and RK8 are scipy's.
 
     Parameters
     ----------
@@ -42,12 +34,14 @@ def tableau(name):
     """
     if name not in ORDERS:
         raise unknown(name, ORDERS, "method")
-    if name == "RK8":
-        s = dop853.N_STAGES
-        return dop853.A[:s, :s].copy(), dop853.B.copy(), dop853.C[:s].copy()
-    if name == "RK5":
-        a = np.array([[*row, *[0.0] * (6 - len(row))] for row in DORMAND_PRINCE_5[:6]])
-        return a, np.array(DORMAND_PRINCE_5[6]), np.array([0.0, 1 / 5, 3 / 10, 4 / 5, 8 / 9, 1.0])
+    if name in ("RK5", "RK8"):
+        import scipy.integrate
+
+        method = scipy.integrate.RK45 if name == "RK5" else scipy.integrate.DOP853
+        s = method.n_stages
+        a = np.zeros((s, s))
+        a[:, : method.A.shape[1]] = method.A[:s, :s]
+        return a, np.array(method.B[:s]), np.array(method.C[:s])
     b = {"RK1": [1.0], "RK2": [0.0, 1.0], "RK4": [1 / 6, 1 / 3, 1 / 3, 1 / 6]}[name]
     c = {"RK1": [0.0], "RK2": [0.0, 0.5], "RK4": [0.0, 0.5, 0.5, 1.0]}[name]
     a = np.zeros((len(b), len(b)))

@@ -6,7 +6,6 @@ import numpy as np
 
 from servoctl.methods.bulk import BulkSteps, Steps, differentiated
 from servoctl.methods.choice import MinimalCoordinates, Project
-from servoctl.methods.dop853 import DormandPrince8
 from servoctl.methods.minimal import Chart, MinimalSolver, Sizes
 from servoctl.methods.watch import edge
 
@@ -89,12 +88,13 @@ class ScipySteps(BulkSteps):
         self.most = 1
 
     def _solver(self, a, x, b):
+        import scipy.integrate
+
         rtol, atol = self.tolerances
-        family = _family(self.method)
 
         def solver(rates, t, y, jacobian, **options):
             exact = {"jac": jacobian} if self.slopes is not None else {}
-            return family(rates, t, y, b, rtol=rtol, atol=atol, **options, **exact)
+            return getattr(scipy.integrate, self.method)(rates, t, y, b, rtol=rtol, atol=atol, **options, **exact)
 
         if self.sizes is not None:
             return MinimalSolver(solver, Chart(self.model, self.sizes, a, x), a, x)
@@ -157,15 +157,6 @@ class ScipySteps(BulkSteps):
         if self.sizes is not None:
             self.motion.counters["integrated"] = len(self.solver.chart.free)
             self.motion.count(coordinate_changes=changes)
-
-
-def _family(name):
-    """The solver of a name, without scipy's import for the one that `simulate` falls back to."""
-    if name == "DOP853":
-        return DormandPrince8
-    import scipy.integrate
-
-    return getattr(scipy.integrate, name)
 
 
 def _step(solver):

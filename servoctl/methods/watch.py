@@ -14,7 +14,6 @@ import numpy as np
 from servoctl.codegen.function import compiled
 from servoctl.errors import IntegrationStopped
 from servoctl.jets.branches import domain_edges, size_of_terms
-from servoctl.methods import brent
 from servoctl.methods.sizes import state_levels
 from servoctl.tolerances import TINY
 
@@ -204,10 +203,13 @@ class Switches:
         return None
 
     def _least(self, i, a, b, state):
+        from scipy.optimize import minimize_scalar
+
         def function(s):
             return self.family.values(self.branches, np.array([s]), state(s)[:, None])[0][i, 0]
 
-        return brent.least(function, a, b, 1e-9 * abs(b - a))
+        found = minimize_scalar(function, bounds=sorted((a, b)), method="bounded", options={"xatol": 1e-9 * abs(b - a)})
+        return found.x, found.fun
 
     def _instants(self, stretch, states):
         """Instants (N,) and states (n_x, N) at which the functions are evaluated: ends of steps, and parts of them."""
@@ -222,13 +224,15 @@ class Switches:
         return np.append(stretch.t[:1], at), np.column_stack([stretch.x[:, :1], x])
 
     def _root(self, i, a, b, state):
+        from scipy.optimize import brentq
+
         def function(s):
             return self.family.values(self.branches, np.array([s]), state(s)[:, None])[0][i, 0]
 
         low, high = function(a), function(b)
         if not low > 0 > high:
             return a
-        return brent.root(function, a, b, 1e-15)
+        return brentq(function, a, b, xtol=1e-15, rtol=8.9e-16)
 
     def _beyond(self, changed, t, x):
         """All branches beyond a switch, with those that follow from it."""
