@@ -484,3 +484,11 @@ def test_pickles_and_copies(backend):
         np.testing.assert_array_equal(other.rk(0.0, [0.1, 0.0], 0.1, 5, [1.0], RK4)[1], x)
         assert other.backend == backend
         assert repr(other) == repr(model)
+
+
+def test_a_copy_knows_its_operations_without_counting(monkeypatch):
+    """Which method suits a model is decided by them, in each process."""
+    model = pendulum(("rk",))
+    content = pickle.dumps(model)
+    monkeypatch.setattr(emit, "operations", None)
+    assert pickle.loads(content).operations == model.operations > 0

@@ -4,6 +4,7 @@ import ctypes
 import re
 import shlex
 import subprocess
+from pathlib import Path
 from shutil import which
 
 import numpy as np
@@ -212,15 +213,107 @@ def test_the_header_is_read_by_a_compiler_of_cplusplus(plan, tmp_path):
     assert header.exists()
 
 
+ROS = """
+#include <memory>
+#include <vector>
+#include "loop.h"
+namespace rclcpp {
+struct Duration { double s; double seconds() const { return s; } };
+struct Time { double s = 0; Duration operator-(const Time &other) const { return {s - other.s}; } };
+}
+namespace rclcpp_lifecycle { struct State {}; struct Node { rclcpp::Time now() const { return {2.0}; } }; }
+struct Interface { double value; double get_value() const { return value; } void set_value(double v) { value = v; } };
+namespace controller_interface {
+enum class return_type { OK, ERROR };
+struct ControllerInterface {
+    enum class CallbackReturn { SUCCESS };
+    std::vector<Interface> state_interfaces_, command_interfaces_;
+    std::shared_ptr<rclcpp_lifecycle::Node> get_node() const { return std::make_shared<rclcpp_lifecycle::Node>(); }
+    virtual CallbackReturn on_activate(const rclcpp_lifecycle::State &) = 0;
+    virtual return_type update(const rclcpp::Time &, const rclcpp::Duration &) = 0;
+    virtual ~ControllerInterface() = default;
+};
+}
+%s
+int main()
+{
+    LoopController own;
+    controller_interface::ControllerInterface &c = own;
+    double z[LOOP_NZ + 1], u[LOOP_NU], y[LOOP_NY];
+    loop_start(z);
+    c.command_interfaces_.resize(LOOP_NU);
+    for (int i = 0; i < LOOP_NY; ++i) c.state_interfaces_.push_back({y[i] = 0.1 * i});
+    c.on_activate({});
+    bool same = c.update({2.5}, {0.01}) == controller_interface::return_type::OK && loop_step(0.5, y, z, u) == 0;
+    for (int i = 0; i < LOOP_NU; ++i) same = same && c.command_interfaces_[i].get_value() == u[i];
+    c.state_interfaces_[0].set_value(__builtin_nan(""));
+    return same && c.update({2.51}, {0.01}) == controller_interface::return_type::ERROR ? 0 : 1;
+}
+"""
+
+
+def test_the_controller_of_the_documents_gives_the_commands_of_the_law(plan, tmp_path):
+    if which("g++") is None:
+        pytest.skip("there is no g++")
+    page = (Path(__file__).parents[1] / "docs" / "c_export.md").read_text()
+    (shown,) = re.findall(r"```cpp\n(.*?)```", page, re.S)
+    source, _ = sv.export_c(sv.lqr(plan, sv.plant(CRANE), integral=True), tmp_path, name="loop", thinned=1e-4)
+    (tmp_path / "main.cpp").write_text(ROS % shown)
+    for command in (["gcc", "-std=c99", "-c", str(source), "-o", str(tmp_path / "loop.o")],
+                    ["g++", "-std=c++17", "-Wall", "-Wextra", str(tmp_path / "main.cpp"), str(tmp_path / "loop.o"), "-lm",
+                     "-o", str(tmp_path / "run")],
+                    [str(tmp_path / "run")]):  # fmt: skip
+        done = subprocess.run(command, capture_output=True, text=True)
+        assert (done.returncode, done.stderr) == (0, "")
+
+
+DRIVER = """
+#include <math.h>
+#include "loop.h"
+int main(void) {
+    loop_real y[LOOP_NY], z[LOOP_NZ + 1], u[LOOP_NU];
+    unsigned long seed = 1;
+    int answered = 0, wrong = 0;
+    loop_start(z);
+    for (int k = -3; k < 2000; k++) {
+        for (int i = 0; i < LOOP_NY; i++) {
+            seed = (seed * 1103515245UL + 12345UL) % 2147483648UL;
+            y[i] = (loop_real)(SIZE * ((double)seed / 1073741824.0 - 1.0));
+        }
+        if (k % 50 == 0) y[0] = k % 100 ? NAN : INFINITY;
+        int status = loop_step((loop_real)(0.004 * k), y, z, u);
+        answered += status == 0;
+        wrong += (k % 50 == 0) != (status != 0);
+        for (int i = 0; status == 0 && i < LOOP_NU; i++)
+            wrong += !isfinite(u[i]);
+    }
+    return BOUNDED ? answered < 100 : wrong != 0;
+}
+"""
+LIMITS = {"limits": {"trolley": 120.0}, "rate_limits": {"hoist": 500.0}}
+WITHIN_LIMITS = {  # and the size of its random measurements; bounds may exclude limits there, and there is no answer
+    "LQR": (lambda law: law, 1.0),
+    "limited": (lambda law: sv.limited(law, sv.plant(CRANE, **LIMITS)), 1e3),
+    "limited by priority": (lambda law: sv.limited(law, sv.plant(CRANE, **LIMITS), priority=["X", "Z"]), 1.0),
+    "bounded": (lambda law: sv.limited(law, sv.plant(CRANE, **LIMITS), bounds={"tension": (900.0, 1060.0)}), 0.1),
+}
+
+
 @pytest.mark.parametrize("tool", ["sanitizers", "valgrind"])
-def test_a_law_in_c_runs_without_a_complaint_of(tool, plan, tmp_path):
+@pytest.mark.parametrize("real", ["double", "float"])
+@pytest.mark.parametrize("kind", WITHIN_LIMITS)
+def test_a_law_in_c_runs_without_a_complaint_of(kind, real, tool, plan, tmp_path):
+    """Random measurements, every 50th of them infinite or no number, before the plan, along it and after its end."""
     if tool == "valgrind" and which("valgrind") is None:
         pytest.skip("there is no valgrind")
-    source, _ = sv.export_c(sv.lqr(plan, sv.plant(CRANE), integral=True), tmp_path, name="loop", thinned=1e-4)
-    (tmp_path / "main.c").write_text(
-        '#include "loop.h"\nint main(void) { double y[LOOP_NY] = {0}, z[LOOP_NZ], u[LOOP_NU]; int bad = 0; loop_start(z);\n'
-        "for (int k = -3; k < 2000; k++) bad += loop_step(0.004 * k, y, z, u); return bad; }\n"
-    )
+    limited, size = WITHIN_LIMITS[kind]
+    law = limited(sv.lqr(plan, sv.plant(CRANE), integral=True))
+    source, _ = sv.export_c(law, tmp_path, name="loop", real=real, thinned=1e-4)
+    facts = {"loop_real": real, "SIZE": repr(size), "BOUNDED": str(int(kind == "bounded"))}
+    text = DRIVER
+    for word, fact in facts.items():
+        text = text.replace(word, fact)
+    (tmp_path / "main.c").write_text(text)
     flags = ["-fsanitize=address,undefined", "-fno-sanitize-recover=all"] if tool == "sanitizers" else ["-g"]
     run = tmp_path / "run"
     built = subprocess.run(["gcc", "-std=c99", *flags, str(tmp_path / "main.c"), str(source), "-o", str(run), "-lm"],
@@ -228,7 +321,8 @@ def test_a_law_in_c_runs_without_a_complaint_of(tool, plan, tmp_path):
     if built.returncode and tool == "sanitizers":
         pytest.skip(f"the compiler has no sanitizers: {built.stderr[:100]}")
     before = ["valgrind", "-q", "--error-exitcode=9"] if tool == "valgrind" else []
-    assert subprocess.run([*before, str(run)], capture_output=True, text=True).returncode == 0
+    done = subprocess.run([*before, str(run)], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
 
 
 def test_options_of_the_export_are_refused_in_words(plan, tmp_path):

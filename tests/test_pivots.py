@@ -9,6 +9,7 @@ from conftest import relative
 
 import servoctl as sv
 from servoctl.codegen import compiler
+from servoctl.methods.monitor import Monitor
 from servoctl.methods.taylor import series_loop
 from servoctl.model import model as models
 from servoctl.model import store
@@ -165,6 +166,25 @@ def test_runs_with_other_pivots_are_saved_and_pickled(which, tmp_path):
     x, p = start.values, model.parameters
     assert copy == variant != model and copy.place == variant.place
     assert np.array_equal(copy.function("ode")(0.0, x, p), variant.function("ode")(0.0, x, p))
+
+
+@pytest.mark.filterwarnings("ignore:Internal dynamics unstable")
+def test_a_start_at_which_the_same_rows_have_no_pivots_is_derived_again(monkeypatch):
+    """A symmetric stance: rows that divide by a choice of actuators have no value there, whatever solves them."""
+    model, start = begun("ideal point")
+    usual, chosen, repivoted = sv.simulate(model, start, (0.0, 0.5), "DOP853"), [], Monitor.repivoted
+
+    def noted(monitor, t, x, top, same_rows=True):
+        chosen.append(same_rows)
+        return repivoted(monitor, t, x, top, same_rows)
+
+    without = iter([True, False])
+    monkeypatch.setattr(Monitor, "repivoted", noted)
+    monkeypatch.setattr(Monitor, "bad_choice", lambda *_: True)
+    monkeypatch.setattr(Monitor, "without_value", lambda *_: next(without, False))
+    run = sv.simulate(model, start, (0.0, 0.5), "DOP853")
+    assert chosen[:2] == [True, False] and run.success
+    assert np.abs(run.jets - usual.jets).max() < 1e-6 * np.abs(usual.jets).max()
 
 
 def test_parameters_change_with_other_pivots():

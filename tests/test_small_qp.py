@@ -89,6 +89,22 @@ def test_constraints_that_coincide_touch_or_exclude_each_other():
     assert solve(np.nan * np.eye(2), one, 2 * one, A, *none) is None
 
 
+@pytest.mark.parametrize("far", [1.0, 1e3, 1e6, 1e9, 1e12])
+def test_limits_far_from_what_is_wanted_are_met_to_rounding(far):
+    """A wild measurement: what the law wants is so far from the limits that rounding exceeds any fixed tolerance."""
+    rng, solve = np.random.default_rng(1983), in_c(3, 8)
+    for _ in range(20):
+        root = rng.normal(size=(3, 3))
+        low = far * rng.normal(size=3)
+        high, A = low + far * rng.random(3), rng.normal(size=(1, 3))
+        least = A @ (low + (high - low) * rng.random(3))
+        v = solve(root.T @ root + np.eye(3), low, high, A, least, least + 0.1 * far)
+        assert v is not None
+        assert np.all(v >= low - 1e-9 * far) and np.all(v <= high + 1e-9 * far) and A @ v >= least - 1e-8 * far
+    outside = A @ np.where(A[0] > 0, low, high) - 0.1 * far
+    assert solve(np.eye(3), low, high, A, outside - far, outside) is None
+
+
 def laws(plan, machine):
     free = sv.plant(CRANE)
     yield "integral", sv.lqr(plan, free, rate=200.0, integral=True), {}

@@ -26,7 +26,8 @@ class Closed(ByName, Value):
     """The motion of a plant under a law; made by `close`.
 
     `run["theta"]`, `run["dtheta"]`, `run["d2theta"]`, `run["trolley"]` are (N,) arrays at the samples, SI. The
-    signal of an actuator is its force or torque; with a lag that is a state. `run.residual["X"]` is (levels, N).
+    signal of an actuator is its force or torque; with a lag that is a state. Outputs and the reactions λ of material
+    constraints, `run["multiplier_rope"]`, are those right after a sample. `run.residual["X"]` is (levels, N).
 
     Attributes
     ----------
@@ -74,7 +75,10 @@ class Closed(ByName, Value):
     def _kinds(self):
         """Names of the evaluated signals, by the function of the plant that evaluates them."""
         mechanism = self.plant.mechanism
-        return {"accelerations": mechanism.q.jet_names(2), "outputs": tuple(mechanism.outputs), "power": ("energy",)}
+        return {
+            "accelerations": mechanism.q.jet_names(2), "outputs": tuple(mechanism.outputs), "power": ("energy",),
+            "multipliers": self.plant.equations.multiplier_names,
+        }  # fmt: skip
 
     @property
     def names(self) -> tuple[str, ...]:

@@ -106,6 +106,8 @@ class Branches:
         if not expressions:
             return []
         merged = ca.densify(ca.cse(ca.vertcat(*expressions)))
+        if not has_switches(merged):
+            return merged.elements()
         work, original, moves = [], [], []  # smooth values, the same with their decisions, whether these may change
 
         def value(op, operands):

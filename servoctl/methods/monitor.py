@@ -510,6 +510,10 @@ class Monitor:
         why = f"a pivot is {weakest:.1e} of its size nearby"
         return self.singular(t, x, why) if weakest < ENTRY else None
 
+    def without_value(self, outputs, pivots):
+        """Whether accelerations at the start are not finite, or divided by a pivot that is zero."""
+        return not np.all(np.isfinite(outputs)) or self._weakest(pivots) < ENTRY
+
     def bad_choice(self, outputs, pivots):
         """Whether outputs at the start are not finite, or pivots are zero or far worse than the matrices."""
         if not np.all(np.isfinite(outputs)):

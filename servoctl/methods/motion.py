@@ -361,9 +361,12 @@ class Stepping:
         """Choose other pivots at the start of the first piece, up to b, if the model's are a bad choice there."""
         self.monitor = Monitor(self.model, t, x)
         if self.monitor.bad_choice(self._outputs(t, x), self._pivots(t, x)):
-            variant = self.monitor.repivoted(t, x, self._top(t, x))
-            if variant is not None:
-                self._go_on(variant, t, x)
+            for same_rows in (True, False):  # whose rows may divide by a pivot that is zero there
+                variant = self.monitor.repivoted(t, x, self._top(t, x), same_rows)
+                if variant is not None:
+                    self._go_on(variant, t, x)
+                if not self.monitor.without_value(self._outputs(t, x), self._pivots(t, x)):
+                    break
             self.motion.stop = self.monitor.refuse_start(t, x, self._outputs(t, x), self._pivots(t, x))
 
     def _outputs(self, t, x):

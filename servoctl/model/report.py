@@ -9,6 +9,7 @@ from servoctl.model.rest import first_motion, standstill
 from servoctl.reduction.rows import alternatives
 from servoctl.reduction.self_motion import self_motion
 
+LARGEST_EXPLAINED = 20_000  # operations of the accelerations, beyond which relative degrees take minutes
 WIDTH = 118
 
 
@@ -114,7 +115,8 @@ def explain(model, t, x, lost, **facts):
     if still is not None:
         return still.error(t, first_motion(model, t, chosen, still), chosen, **facts)
     prescribed = any(name in model.reduction.original for name in lost)
-    return None if prescribed else _lost_degrees(model, t, np.asarray(x, dtype=float), **facts)
+    large = model.function("ode").operations > LARGEST_EXPLAINED
+    return None if prescribed or large else _lost_degrees(model, t, np.asarray(x, dtype=float), **facts)
 
 
 def _lost_degrees(model, t, x, **facts):

@@ -233,13 +233,23 @@ class PlantEquations:
         """γ'' with ideal material constraints."""
         return self._solved[0][: self.q.n]
 
+    @cached_property
+    def multiplier_names(self):
+        """Names of `multipliers`."""
+        given = self.mechanism.constraints
+        rows = self._material[0] if given else []
+        if len(rows) != len(given) or any(not ca.is_equal(row.expression, given.get(row.name, 0), 1) for row in rows):
+            return ()
+        return tuple(f"multiplier_{row.name}" for row in rows)
+
     @property
     def multipliers(self):
         """Reactions λ of the material constraints, G_mᵀλ, as "multiplier_NAME"; none where rows were combined."""
-        rows, given = self._material[0], self.mechanism.constraints
-        if len(rows) != len(given) or any(not ca.is_equal(row.expression, given.get(row.name, 0), 1) for row in rows):
-            return {}
-        return {f"multiplier_{row.name}": -self._solved[0][self.q.n + i] for i, row in enumerate(rows)}
+        return {name: -self._solved[0][self.q.n + i] for i, name in enumerate(self.multiplier_names)}
+
+    def reactions(self):
+        """The values of `multipliers`."""
+        return self.function("multipliers", list(self.multipliers.values()))
 
     @cached_property
     def _solved(self):

@@ -245,8 +245,8 @@ class Plant(Value):
         Parameters
         ----------
         name : str
-            "ode", "ode_power", "jacobian", "directions", "power", "accelerations", "outputs", "constraints" or
-            "constraints_jacobian".
+            "ode", "ode_power", "jacobian", "directions", "power", "accelerations", "outputs", "multipliers",
+            "constraints" or "constraints_jacobian".
 
         Returns
         -------
@@ -434,6 +434,7 @@ FUNCTIONS = {  # arguments of `compiled`: the function, its loops, its projectio
     "power": lambda e: (e.power(),),
     "accelerations": lambda e: (e.accelerations(),),
     "outputs": lambda e: (e.outputs(),),
+    "multipliers": lambda e: (e.reactions(),),
     "constraints": lambda e: (e.constraints()[1],),
     "constraints_jacobian": lambda e: (e.constraints_jacobian(),),
 }

@@ -1,7 +1,8 @@
 /* min v'Hv/2 subject to rows v >= b for n unknowns, n small: the dual active-set method of Goldfarb and Idnani (1983). It
    starts at v = 0 and adds the constraint that is violated most, until none is. In the metric of H = LL' the constraints
-   are the columns of inv(L) rows', which are orthogonalised anew in each step. Before it, N_QP and M_QP are the numbers of
-   unknowns and of constraints. */
+   are the columns of inv(L) rows', which are orthogonalised anew in each step. A constraint is met up to QP_MET of 1 and
+   of its terms, which may be large where v = 0 is far from it. Before it, N_QP and M_QP are the numbers of unknowns and
+   of constraints. */
 #include "unit.h"
 
 #ifndef SMALL_QP_H
@@ -85,12 +86,15 @@ static int small_qp(const double (*H)[N_QP], const double (*rows)[N_QP], const d
     }
     for (int i = 0; i < N_QP; i++) v[i] = 0;
     for (int iteration = 0; iteration < QP_STEPS; iteration++) {
-        double worst = -QP_MET, own = 0;
+        double worst = 0, own = 0;
         int new = -1;
         for (int m = 0; m < M_QP; m++) {
-            double s = -b[m];
-            for (int i = 0; i < N_QP; i++) s += rows[m][i] * v[i];
-            if (!(s >= worst)) {
+            double s = -b[m], terms = 1 + fabs(b[m]);
+            for (int i = 0; i < N_QP; i++) {
+                s += rows[m][i] * v[i];
+                terms += fabs(rows[m][i] * v[i]);
+            }
+            if (!(s >= worst || (isfinite(s) && s >= -QP_MET * terms))) {
                 worst = s;
                 new = m;
             }
