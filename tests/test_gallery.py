@@ -6,6 +6,7 @@ from math import pi
 import closed_forms
 import numpy as np
 import pytest
+from gallery_numbers import MORE
 from scenes import CERTIFIED
 
 import servoctl as sv
@@ -82,6 +83,7 @@ NUMBERS = {
     "wheeled-robot": lambda run: (run["curvature"].max(), pi / 4),
     "appell-hamel-squared": lambda stop: (stop.details["t"], closed_forms.WHEEL_STOPS),
     "constant-speed-horizontal": lambda stop: (stop.details["t"], 5.0 / closed_forms.GRAVITY),
+    **MORE,
 }
 
 
