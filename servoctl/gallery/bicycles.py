@@ -6,7 +6,7 @@ import servoctl as sv
 
 
 def bicycle(width=8.0, lap=16.0):
-    """The rear axle of a bicycle without lean follows a figure eight.
+    """The rear axle of a bicycle without lean follows a figure eight, by its speed and its curvature.
 
     The wheels do not slip sideways: the quasi-velocities are the speed v of the rear axle and the steering rate s.
 
@@ -47,5 +47,7 @@ def bicycle(width=8.0, lap=16.0):
         },
         parameters=p,
     )
-    rates = q.dt(rear - path)
-    return mechanism, sv.Program({"X": rates[0], "Y": rates[1]}, by="actuators")
+    velocity, acceleration = q.dt(path, 1), q.dt(path, 2)
+    speed = ca.norm_2(velocity)
+    curvature = (velocity[0] * acceleration[1] - velocity[1] * acceleration[0]) / speed**3
+    return mechanism, sv.Program({"speed": v - speed, "curvature": turn - curvature}, by="actuators")

@@ -52,7 +52,7 @@ def beam_crane():
     Returns
     -------
     Mechanism, Program
-        Realised by the actuators "trolley1", "trolley2", "hoist1", "hoist2" [N], with the ropes as material constraints.
+        Realised by the actuators "trolley1", "trolley2", "hoist1", "hoist2" [N]; the ropes are material constraints.
     """
     p = sv.parameters(m_trolley=10.0, m_hoist=5.0, m_beam=200.0, b=1.0, g=9.81)  # kg, kg, kg, half of the length [m]
     q = sv.coordinates("x1 x2 l1 l2 X Z phi")  # m, six times; rad

@@ -27,16 +27,18 @@ def clothoid_arm(speed=0.25, growth=4.0):
     elbow, end = p.l * first, p.l * (first + second)
     S = sv.rigid_body(q, p.m, (0, 0, p.I), position=elbow / 2, rates=(0, 0, q.d(1)[0]))
     S += sv.rigid_body(q, p.m, (0, 0, p.I), position=elbow + p.l / 2 * second, rates=(0, 0, sum(q.d(1))))
+    velocity, acceleration = q.dt(end, 1), q.dt(end, 2)
+    curvature = (velocity[0] * acceleration[1] - velocity[1] * acceleration[0]) / ca.dot(velocity, velocity) ** 1.5
     mechanism = sv.Mechanism(
         q,
         gibbs=S,
         actuators={"shoulder": q1, "elbow": q2},
-        outputs={"X": end[0], "Y": end[1]},
+        outputs={"X": end[0], "Y": end[1], "curvature": curvature},
         shapes={"base": [(0, 0)], "first link": [(0, 0), elbow], "second link": [elbow, end], "end": [end]},
         parameters=p,
     )
     program = sv.programs.constant_speed("speed", q, end, p.speed)
-    program |= sv.programs.curvature_rate("clothoid", q, end, p.growth)
+    program |= {"clothoid": q.dt(curvature) - p.growth}
     return mechanism, sv.Program(program, by="actuators")
 
 

@@ -93,7 +93,10 @@ def ball_and_beam(tilt=0.05):
         gibbs=ball + sv.rigid_body(q, 0.0, (0, 0, p.J_beam), rates=(0, 0, q.d(1)[1])),
         potential=p.m * p.g * centre[1],
         actuators={"torque": theta},
-        shapes={"beam": [-half - normal, half - normal], "ball": sv.shapes.disc(centre, p.radius, theta - r / p.radius)},
+        shapes={
+            "beam": [-half - normal, half - normal],
+            "ball": sv.shapes.disc(centre, p.radius, theta - r / p.radius),
+        },
         parameters=p,
     )
     return mechanism, sv.Program({"tilt": theta - sv.paths.rest_to_rest(q.t, 0.0, -tilt, duration=0.5)}, by="actuators")
