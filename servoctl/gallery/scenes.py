@@ -558,8 +558,8 @@ gallery = {
         teaches="Programs of orders 1 and 3 for one machine, realised by its motors.",
         source="Jarzębowska, Model-Based Tracking Control of Nonlinear Systems (CRC Press, 2012); Fresnel integrals",
         number="After 2 s the end is 0.4167 m from its start.",
-        start={"q1": -0.6, "q2": 1.5, "curvature": 0.0},
-        guess={"dq1": -0.2, "dq2": 0.5},
+        start={"q1": -0.6, "q2": 1.5, "dq1": -0.2, "d2q1": 0.22677037187619453},  # curvature 0
+        guess={"dq2": 0.673, "d2q2": -0.283},
         t_span=(0.0, 2.0),
         units=_units("q1 q2 [rad] shoulder elbow [N m] X Y [m] curvature [1/m]"),
     ),
