@@ -15,7 +15,7 @@ def hopper():
     Mechanism, Program
         Realised by the actuators "hip", "left_shoulder", "right_shoulder" [N m]; z points up.
     """
-    p = sv.parameters(m=20.0, J=0.6, m_leg=5.0, l_leg=0.4, m_arm=1.5, l_arm=0.35, g=9.81)  # kg, kg m^2, kg, m, ...
+    p = sv.parameters(m=20.0, J=0.6, m_leg=5.0, l_leg=0.4, m_arm=1.5, l_arm=0.35, g=9.81)  # kg, m, m/s^2
     q = sv.coordinates("x z phi leg left right")  # m, m, rad, rad, rad, rad (relative)
     x, z, phi, *limbs = q
     centre = ca.vertcat(x, z)
