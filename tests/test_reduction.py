@@ -86,6 +86,17 @@ GALLERY = {
     "constant-jerk": ([3, 3], {"jerk": 0}),
     "trailers": ([0, 1], {"curvature": 2, "speed": 2}),
     "ball-on-turntable": ([0, 1, 1, 2, 2], {"rate": 2}),
+    "rotary-crane": ([0] * 5, {"X": 4, "Y": 4, "Z": 4}),
+    "beam-crane": ([0] * 7, {"X": 4, "Z": 4, "level": 2, "apart": 2}),
+    "cart-pole": ([0, 2], {"X": 2}),
+    "fixed-rope-crane": ([0, 2], {"tool": 2}),
+    "furuta-pendulum": ([0, 2], {"angle": 2}),
+    "ball-and-beam": ([0, 2], {"tilt": 2}),
+    "acrobot": ([1, 1], {"momentum": 2}),
+    "hopper": ([0, 0, 0, 2, 2, 2], {"leg": 2, "left": 2, "right": 2}),
+    "clothoid-arm": ([1, 3], {"speed": 1, "clothoid": 0}),
+    "steady-satellite": ([3, 2], {"steady": 0}),
+    "bicycle": ([1, 0], {"speed": 1, "curvature": 2}),
 }
 
 
