@@ -92,7 +92,8 @@ def test_what_a_point_costs_does_not_depend_on_the_number_of_via_points():
             motion.append(ca.jtimes(motion[-1], T, 1.0))
         return emit.operations(ca.Function("f", [T, X, P], [ca.vertcat(*motion)]))
 
-    assert operations(400) == operations(40) == operations(5)
+    assert operations(40) == operations(5)
+    assert operations(30_000) == operations(400) < 1.05 * operations(5)  # the entries of large tables are scaled
 
 
 def test_functions_of_one_unit_share_a_table_and_the_text_depends_on_content_alone():

@@ -4,6 +4,9 @@ import math
 
 import casadi as ca
 
+from servoctl.jets.lookup import lookups
+from servoctl.jets.merging import apply_code
+
 _OF_ONE = {ca.OP_ASSIGN: 1.0, ca.OP_NEG: -1.0, ca.OP_TWICE: 2.0}
 
 
@@ -23,9 +26,9 @@ def folded(f):
         The output in terms of the symbols `f.sx_in()`.
     """
     inputs = [column.elements() for column in f.sx_in()]
-    work, outputs = {}, [ca.SX(0)] * f.numel_out(0)
+    work, outputs, called = {}, [ca.SX(0)] * f.numel_out(0), lookups(f)
     for k in range(f.n_instructions()):
-        operation, source, target = f.instruction_id(k), f.instruction_input(k), f.instruction_output(k)
+        operation, source, target = called.get(k, f.instruction_id(k)), f.instruction_input(k), f.instruction_output(k)
         if operation == ca.OP_INPUT:
             work[target[0]] = (1.0, inputs[source[0]][source[1]])
         elif operation == ca.OP_CONST:
@@ -67,4 +70,4 @@ def _operation(operation, terms):
         ratio = d / c
         return c, a + b if ratio == 1 else a - b if ratio == -1 else a + ratio * b
     operands = [_product(term) for term in terms]
-    return 1.0, (ca.SX.unary if len(operands) == 1 else ca.SX.binary)(operation, *operands)
+    return 1.0, apply_code(operation, *operands)

@@ -10,6 +10,8 @@ from fractions import Fraction
 
 import casadi as ca
 
+from servoctl.jets.lookup import lookups
+
 MOST_OPERATIONS = 300  # of an expression that is expanded
 MOST_PRODUCTS = 20_000  # of terms of all polynomials in one expansion: some hundredths of a second
 
@@ -44,9 +46,9 @@ class _Expansion:
 
     def of(self, f):
         """The polynomial of a function without inputs and with one output."""
-        work, free, operations = [], iter(range(f.n_instructions())), _OPERATIONS
+        work, free, operations, called = [], iter(range(f.n_instructions())), _OPERATIONS, lookups(f)
         for k in range(f.n_instructions()):
-            op, operands = f.instruction_id(k), f.instruction_input(k)
+            op, operands = called.get(k, f.instruction_id(k)), f.instruction_input(k)
             if op == ca.OP_OUTPUT:
                 return work[operands[0]]
             if op == ca.OP_PARAMETER:

@@ -12,6 +12,7 @@ from typing import NamedTuple
 import casadi as ca
 import numpy as np
 
+from servoctl.jets.merging import apply_code, cse, replayed
 from servoctl.tolerances import LAST_EXPONENT
 
 _SIDES = {
@@ -105,7 +106,7 @@ class Branches:
         """
         if not expressions:
             return []
-        merged = ca.densify(ca.cse(ca.vertcat(*expressions)))
+        merged = ca.densify(cse(ca.vertcat(*expressions)))
         work, original, moves = [], [], []  # smooth values, the same with their decisions, whether these may change
 
         def value(op, operands):
@@ -196,7 +197,7 @@ def without_turns(expression):
         angles.append((ca.SX.sym(f"angle_{len(angles)}"), *arguments))
         return angles[-1][0]
 
-    (whole,) = replayed([ca.cse(expression)], work, lambda leaf, symbol: leaf, value)
+    (whole,) = replayed([cse(expression)], work, lambda leaf, symbol: leaf, value)
     slopes = [ca.simplify(ca.jacobian(whole, angle)) for angle, *_ in angles]
     if not all(c.is_constant() for c in slopes) or all(c.is_zero() for c in slopes):
         return expression
@@ -340,31 +341,6 @@ def sizes_of_terms(expressions):
         return ca.fabs(expression)
 
     return replayed(expressions, sizes, leaf, size)
-
-
-def replayed(expressions, work, leaf, value):
-    """The outputs of expressions whose operations are taken one by one; `work` receives all values in their order.
-
-    `leaf` gives the value of a symbol (True) or a constant (False), `value` that of an operation on places of `work`.
-    """
-    f = ca.Function("operations", [], list(expressions), {"allow_free": True, "live_variables": False})
-    free, outputs = iter(f.free_sx()), [ca.SX(0)] * len(expressions)
-    for k in range(f.n_instructions()):
-        op, operands = f.instruction_id(k), f.instruction_input(k)
-        if op == ca.OP_OUTPUT:
-            outputs[f.instruction_output(k)[0]] = work[operands[0]]
-        elif op == ca.OP_PARAMETER:
-            work.append(leaf(next(free), True))
-        elif op == ca.OP_CONST:
-            work.append(leaf(ca.SX(f.instruction_constant(k)), False))
-        else:
-            work.append(value(op, operands))
-    return outputs
-
-
-def apply_code(op, *operands):
-    """The operation of CasADi with a code on SX scalars."""
-    return ca.SX.unary(op, *operands) if len(operands) == 1 else ca.SX.binary(op, *operands)
 
 
 def _words(expression):

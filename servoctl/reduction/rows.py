@@ -9,6 +9,7 @@ import numpy as np
 from servoctl.errors import SingularProgram, SpecificationError
 from servoctl.jets.branches import shown
 from servoctl.jets.identity import spread, vanish
+from servoctl.jets.merging import cse
 from servoctl.jets.series import Flow
 from servoctl.reduction.manifold import POINTS_SEED, ROUNDED, anywhere, sample, solve
 from servoctl.reduction.ranks import clean, combination, decide, eliminate, equilibrate, refined
@@ -464,7 +465,7 @@ def _eliminated(q, row, j, values, lower, points):
     solution, _ = eliminate(matrix, -rest, numbers[:, columns])
     uses = merge_uses((row.uses, 0), *((other.uses, j - other.order) for other in rows))
     expression, *parts = _substituted(row, ca.vertsplit(jets), solution)
-    return replace(row, expression=ca.cse(expression), uses=uses, parts=tuple(parts))
+    return replace(row, expression=cse(expression), uses=uses, parts=tuple(parts))
 
 
 def dependence(numbers, first=0):

@@ -20,8 +20,10 @@ import numpy as np
 
 from servoctl.checks import as_numbers, column, is_number, is_whole, named
 from servoctl.errors import SpecificationError
+from servoctl.jets.lookup import columns_at
 
 TIMED_BY_SYMBOLS = 6  # class of a spline whose times are expressions, beyond which they lose 1e-6 to rounding
+MOST_SUMMED = 200  # times of a spline, beyond which its coefficients are a table: each in sums takes 10 ms to derive
 SMOOTHEST = 100  # class of a path, beyond which the terms of its polynomials leave the range of a double
 MISSED = 1e-9  # largest distance of a spline from its points, relative to the largest point
 ORTHONORMAL = 1e-9  # largest difference of products of a circle's axes from those of orthonormal vectors
@@ -277,6 +279,8 @@ def piecewise(t, times, coefficients):
     SX
         Scalar, or (dim, 1) column.
     """
+    if isinstance(times, np.ndarray) and isinstance(coefficients, np.ndarray) and len(times) > MOST_SUMMED:
+        return _looked_up(t, times, coefficients)
     begun = ca.vertcat(1, *(t >= knot for knot in times[1:-1]), 0)
     inside = begun[:-1] - begun[1:]
     times = times if isinstance(times, np.ndarray) else ca.vertcat(*times)
@@ -285,6 +289,17 @@ def piecewise(t, times, coefficients):
     value = ca.SX(coefficients[0].shape[1], 1)
     for power in coefficients[::-1]:
         value = value * tau + ca.mtimes(power.T if isinstance(power, ca.SX) else ca.DM(power.T), inside)
+    return value
+
+
+def _looked_up(t, times, coefficients):
+    """The value of `piecewise`, whose coefficients are taken from a table."""
+    middle, half, dim = (times[:-1] + times[1:]) / 2, (times[1:] - times[:-1]) / 2, coefficients.shape[2]
+    rows = np.column_stack([middle, 1 / half, *coefficients])
+    centre, per_half, *entries = columns_at(t, times[1:-1], rows)
+    tau, value = (t - centre) * per_half, ca.SX(dim, 1)
+    for k in range(len(entries) - dim, -1, -dim):
+        value = value * tau + ca.vertcat(*entries[k : k + dim])
     return value
 
 
