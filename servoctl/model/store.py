@@ -31,7 +31,7 @@ from servoctl.spec.packing import packed, unpacked
 from servoctl.spec.parameters import Parameters
 from servoctl.spec.program import Program
 
-MOST_STORED = 100_000  # numbers in tables of a specification, whose functions are otherwise as fast to derive as to read
+MOST_STORED = 100_000  # numbers in tables of a specification: with more, deriving again is faster than reading
 SETTLED = 1.0  # s: sources that are newer than this before they were loaded may have been loaded in another version
 
 _LOADED = time.time()
