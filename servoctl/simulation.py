@@ -208,7 +208,7 @@ def simulated(model, start, t_span, method=None, *, drift=None, t_eval=None, eve
     x0 = (as_state if leads_back else consistent_state)(model, start, t0)
     knots = model.require_smooth((min(span), max(span)))
     if not isinstance(method, Algebraic):
-        knots = tuple(np.union1d(knots, model.ends_of_pieces((min(span), max(span)))).tolist())
+        knots = tuple(sorted({*knots, *model.ends_of_pieces((min(span), max(span))).tolist()}))
     times = None if isinstance(method, Bounded) and t_eval is None else _sample_times(t0, t1, t_eval, knots, method)
     bar, problem = Progress(span, progress), (t0, x0, t1, times, knots, events)
     try:

@@ -128,7 +128,11 @@ def lookups(f):
 
 
 def _opaque(name, argument, values):
-    return ca.Function(name, [argument], values, {"never_inline": True})
+    """A function that stays one operation, and that CasADi need not differentiate."""
+    outputs = [ca.MX.sym(f"y{i}") for i, _ in enumerate(values)]
+    slopes = ca.Function(f"jac_{name}", [argument, *outputs], [ca.MX(1, 1) for _ in values])
+    undifferentiated = {"enable_forward": False, "enable_reverse": False, "custom_jacobian": slopes}
+    return ca.Function(name, [argument], values, {"never_inline": True, **undifferentiated})
 
 
 def _name(kind, numbers):

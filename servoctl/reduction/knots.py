@@ -18,7 +18,7 @@ MOST_BRANCHES = 24  # affine pieces that are followed through one operation
 SCAN = 801  # instants of a scan for switches that are not affine in t
 PARTS, DIVISIONS = 1024, 6  # of an interval of the scan, whose signs are evaluated at once: all digits of a double
 INSPECTED = 9  # knots of a table, with their neighbours, whose class is inspected: a spline has the same at each
-HALVINGS = 60  # of an interval of the scan, for all knots of a table at once: more than a double has digits
+BISECTIONS = 60  # of an interval of the scan, for all knots of a table at once: more than a double has digits
 KNOWN = 8  # sets of numbers whose knots are remembered
 SAME_INSTANT = 1e-9  # switches closer than this fraction of the time from first to last are one
 NEAR_ZERO = 0.5  # of the values beside it: a parabola's least value below this is looked at closely
@@ -171,14 +171,13 @@ class Switches:
 
     def ends_of_pieces(self, values, span):
         """Ascending instants within a span at which the coefficients from tables change, an array."""
+        tables = [(a, b) for a, b in self.timed if self._is_table(b)]
         pieces, instants = [], [np.empty(0)]
-        for node in self.tape.nodes:
+        for node in self.tape.nodes if tables else ():
             pieces.append(self._pieces(node, pieces, values))
-        for a, b in self.timed:
-            if self._is_table(b):
-                knots = self.tape.nodes[b].data.numbers
-                affine = pieces[a] is not None
-                instants.append(_of_affine(pieces[a], knots) if affine else self._reached(values, a, knots, span))
+        for a, b in tables:
+            knots, affine = self.tape.nodes[b].data.numbers, pieces[a] is not None
+            instants.append(_of_affine(pieces[a], knots) if affine else self._reached(values, a, knots, span))
         instants = np.unique(np.concatenate(instants))
         return instants[(instants >= span[0]) & (instants <= span[1])]
 
@@ -197,7 +196,7 @@ class Switches:
         crossed = np.concatenate([np.arange(i, j) for i, j in zip(first, last, strict=True)]).astype(int)
         within = np.repeat(np.arange(SCAN - 1), last - first)
         low, high, rising = grid[within], grid[within + 1], (ends[1] > ends[0])[within]
-        for _ in range(HALVINGS if crossed.size else 0):
+        for _ in range(BISECTIONS if crossed.size else 0):
             middle = (low + high) / 2
             before = (at(middle) < knots[crossed]) == rising
             low, high = np.where(before, middle, low), np.where(before, high, middle)

@@ -449,16 +449,19 @@ def _parts(row):
 
 def _require_rising(times):
     """Refuse times that do not increase strictly, where they are numbers."""
-    steps = ca.SX(ca.DM(np.diff(times))) if isinstance(times, np.ndarray) else times[1:] - times[:-1]
-    for i, step in enumerate(steps.elements()):
-        if step.is_constant() and float(step) <= 0:
-            t = [str(times[j]) if isinstance(times, ca.SX) else f"{times[j]:g}" for j in (i, i + 1)]
-            raise SpecificationError(
-                f"The spline's times {i} and {i + 1} are {t[0]} and {t[1]}.",
-                "Times increase strictly.",
-                do="Sort the points by time and remove repeated times.",
-                index=i + 1,
-            )
+    if isinstance(times, np.ndarray):
+        falling = np.flatnonzero(np.diff(times) <= 0)[:1].tolist()
+    else:
+        steps = (times[1:] - times[:-1]).elements()
+        falling = [i for i, step in enumerate(steps) if step.is_constant() and float(step) <= 0]
+    for i in falling:
+        t = [str(times[j]) if isinstance(times, ca.SX) else f"{times[j]:g}" for j in (i, i + 1)]
+        raise SpecificationError(
+            f"The spline's times {i} and {i + 1} are {t[0]} and {t[1]}.",
+            "Times increase strictly.",
+            do="Sort the points by time and remove repeated times.",
+            index=i + 1,
+        )
 
 
 def _column(value, what):
