@@ -14,7 +14,7 @@ import casadi as ca
 
 from servoctl.checks import column, mapping, named, positive, require_kind, text
 from servoctl.errors import SpecificationError
-from servoctl.jets.merging import cse
+from servoctl.jets.branches import cse
 from servoctl.robots.robot import Frame
 from servoctl.spec import rotations
 from servoctl.spec.coordinates import Coordinates

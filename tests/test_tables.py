@@ -268,7 +268,7 @@ def test_tables_travel_to_processes_that_have_not_made_them(monkeypatch):
     f = model.function("ode")
     here = f.grid(EVEN, np.ones((4, EVEN.size)), model.parameters)
     content = pickle.dumps(model)
-    monkeypatch.setattr(lookup, "_known", {})
+    monkeypatch.setattr(lookup, "made", {})
     monkeypatch.setattr(lookup, "_contents", {})
     there = pickle.loads(content).function("ode")
     np.testing.assert_array_equal(there.grid(EVEN, np.ones((4, EVEN.size)), model.parameters), here)

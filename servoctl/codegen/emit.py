@@ -15,7 +15,7 @@ import casadi as ca
 
 from servoctl.codegen.loops import CONSTANTS, INLINE_SINES, LOOPS, PHASED
 from servoctl.codegen.tables import Entry, Row, literal, lookup_operation, lookup_text, tabulated
-from servoctl.jets.lookup import lookups
+from servoctl.jets.lookup import lookup_at, lookups
 from servoctl.jets.pieces import Constant
 
 CHUNK = 350  # statements per C function: compile time is least, and flat, between 250 and 500
@@ -269,7 +269,7 @@ def function_of_several(f, name, dialect, suffixes):
 def _prepared(f, dialect, suffix=""):
     """The statements of a function, with lookups and reciprocals, and C texts of what the lookups need."""
     statements, tables = tabulated(_statements(f, dialect, suffix))
-    tables += [lookup_text(lookup, dialect.whole) for lookup in dict.fromkeys(lookups(f).values())]
+    tables += [lookup_text(lookup, dialect.whole) for lookup in lookups(f)]
     header = [include("table_lanes.h" if dialect.prefix else "table.h")] if tables else []
     return statements if dialect.exact else _with_reciprocals(statements), [*header, *tables]
 
@@ -279,7 +279,7 @@ def _statements(f, dialect, suffix=""):
 
     Values are numbered; inputs and outputs are C text.
     """
-    register, statements, values, called, looked_up = {}, [], 0, lookups(f), set()
+    register, statements, values, looked_up = {}, [], 0, set()
     for k in range(f.n_instructions()):
         operation, source, target = f.instruction_id(k), f.instruction_input(k), f.instruction_output(k)
         if operation == ca.OP_INPUT:
@@ -292,7 +292,7 @@ def _statements(f, dialect, suffix=""):
             register[target[0]] = register[source[0]]
         else:
             if operation == ca.OP_CALL:
-                operation = lookup_operation(called[k])
+                operation = lookup_operation(lookup_at(f, k))
                 looked_up.add(values)
             statements.append((values, operation, tuple(register[i] for i in source)))
             register[target[0]] = values

@@ -4,8 +4,8 @@ import math
 
 import casadi as ca
 
-from servoctl.jets.lookup import lookups
-from servoctl.jets.merging import apply_code
+from servoctl.jets.branches import apply_code
+from servoctl.jets.lookup import lookup_at
 
 _OF_ONE = {ca.OP_ASSIGN: 1.0, ca.OP_NEG: -1.0, ca.OP_TWICE: 2.0}
 
@@ -26,9 +26,9 @@ def folded(f):
         The output in terms of the symbols `f.sx_in()`.
     """
     inputs = [column.elements() for column in f.sx_in()]
-    work, outputs, called = {}, [ca.SX(0)] * f.numel_out(0), lookups(f)
+    work, outputs = {}, [ca.SX(0)] * f.numel_out(0)
     for k in range(f.n_instructions()):
-        operation, source, target = called.get(k, f.instruction_id(k)), f.instruction_input(k), f.instruction_output(k)
+        operation, source, target = f.instruction_id(k), f.instruction_input(k), f.instruction_output(k)
         if operation == ca.OP_INPUT:
             work[target[0]] = (1.0, inputs[source[0]][source[1]])
         elif operation == ca.OP_CONST:
@@ -36,6 +36,7 @@ def folded(f):
         elif operation == ca.OP_OUTPUT:
             outputs[target[1]] = _product(work[source[0]])
         else:
+            operation = lookup_at(f, k) if operation == ca.OP_CALL else operation
             work[target[0]] = _operation(operation, [work[i] for i in source])
     return ca.vertcat(*outputs)
 

@@ -7,7 +7,7 @@ import numpy as np
 
 from servoctl.codegen.function import compiled
 from servoctl.control.law import Law
-from servoctl.jets.merging import cse
+from servoctl.jets.branches import cse
 
 
 def law_step(name, t, x, column, outputs):

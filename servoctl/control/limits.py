@@ -24,7 +24,7 @@ from servoctl.control.result import Closed
 from servoctl.control.sampling import discretised
 from servoctl.control.time_law import fastest
 from servoctl.errors import LimitExceeded, ServoError, SpecificationError, unknown
-from servoctl.jets.merging import cse
+from servoctl.jets.branches import cse
 from servoctl.plants.plant import Plant
 from servoctl.tolerances import TINY
 from servoctl.values import Value

@@ -7,7 +7,7 @@ import numpy as np
 
 from servoctl.codegen.function import compiled
 from servoctl.errors import SpecificationError, unknown
-from servoctl.jets.merging import cse
+from servoctl.jets.branches import cse
 
 
 class Residuals:

@@ -10,7 +10,7 @@ from fractions import Fraction
 
 import casadi as ca
 
-from servoctl.jets.lookup import lookups
+from servoctl.jets.lookup import lookup_at
 
 MOST_OPERATIONS = 300  # of an expression that is expanded
 MOST_PRODUCTS = 20_000  # of terms of all polynomials in one expansion: some hundredths of a second
@@ -46,9 +46,9 @@ class _Expansion:
 
     def of(self, f):
         """The polynomial of a function without inputs and with one output."""
-        work, free, operations, called = [], iter(range(f.n_instructions())), _OPERATIONS, lookups(f)
+        work, free, operations = [], iter(range(f.n_instructions())), _OPERATIONS
         for k in range(f.n_instructions()):
-            op, operands = called.get(k, f.instruction_id(k)), f.instruction_input(k)
+            op, operands = f.instruction_id(k), f.instruction_input(k)
             if op == ca.OP_OUTPUT:
                 return work[operands[0]]
             if op == ca.OP_PARAMETER:
@@ -58,6 +58,7 @@ class _Expansion:
             elif op in operations:
                 work.append(operations[op](self, *(work[i] for i in operands)))
             else:
+                op = lookup_at(f, k) if op == ca.OP_CALL else op
                 work.append(self._factor(op, *(frozenset(work[i].items()) for i in operands)))
         return {}
 

@@ -5,17 +5,18 @@ expression calls a function instead, which stays one operation: `Lookup`. Its va
 whose derivative is zero, so that CasADi differentiates expressions of them as those of any piecewise constant function.
 """
 
+import functools
 import hashlib
 import re
-from functools import cached_property
 
 import casadi as ca
 import numpy as np
 
 BITS = 80  # of the largest number of a column: smaller parts of the others are left out
+NAMED = re.compile(r"(?:knots|entries)_(\d+)_[0-9a-f]{16}")  # the name of a table, with how many numbers it has
 BEYOND = 1e300  # before and after all knots
 
-_known = {}  # functions by name, which is that of the content: CasADi shares calls of the same function only
+made = {}  # functions of this process by name, that of the content: CasADi shares calls of the same function only
 _contents = {}  # by the same name
 
 
@@ -30,28 +31,28 @@ class Lookup:
 
     def __init__(self, function):
         self.name = function.name()
-        self.function = _known.setdefault(self.name, function)
+        self.function = made.setdefault(self.name, function)
 
     @classmethod
     def of_knots(cls, knots):
         """The lookup of the number of ascending knots (n,) that s has reached."""
         knots, n = np.asarray(knots, dtype=float), len(knots)
         name = _name("knots", knots)
-        if name not in _known:
+        if name not in made:
             s = ca.MX.sym("s")
             rows = _line([-BEYOND, *np.repeat(knots, 2), BEYOND], np.repeat(np.arange(n + 1.0), 2).tolist())
-            _known[name], _contents[name] = _opaque(name, s, [ca.floor(rows(s) + 0.5), _list(knots)(s)]), knots
-        return cls(_known[name])
+            made[name], _contents[name] = _opaque(name, s, [ca.floor(rows(s) + 0.5), _list(knots)(s)]), knots
+        return cls(made[name])
 
     @classmethod
     def of_entries(cls, entries):
         """The lookup of a list (n,) of whole numbers, as floats, by place."""
         entries = np.asarray(entries, dtype=float)
         name = _name("entries", entries)
-        if name not in _known:
+        if name not in made:
             place = ca.MX.sym("place")
-            _known[name], _contents[name] = _opaque(name, place, [_list(entries)(place)]), entries
-        return cls(_known[name])
+            made[name], _contents[name] = _opaque(name, place, [_list(entries)(place)]), entries
+        return cls(made[name])
 
     def __eq__(self, other):
         return isinstance(other, Lookup) and self.name == other.name
@@ -67,7 +68,7 @@ class Lookup:
         """Whether it counts knots."""
         return self.name.startswith("knots")
 
-    @cached_property
+    @functools.cached_property
     def numbers(self):
         """The knots, or the entries."""
         if self.name not in _contents:
@@ -87,16 +88,6 @@ class Lookup:
     def called(self, s):
         """The value at an SX scalar, without the `floor` that has no derivative."""
         return self.function.call([s])[0]
-
-
-def size_in(text):
-    """How many numbers the tables have whose names are in a text."""
-    return sum(int(n) for n in {*re.findall(r"(?:knots|entries)_(\d+)_[0-9a-f]{16}", text)})
-
-
-def used():
-    """Whether this process has tables."""
-    return bool(_known)
 
 
 def columns_at(s, knots, values):
@@ -120,11 +111,20 @@ def columns_at(s, knots, values):
     return [entries(place + j) * 2.0 ** (int(e) - BITS) for j, e in enumerate(exponents)]
 
 
+def lookup_at(f, k):
+    """The lookup that instruction k of an SX function calls."""
+    return Lookup(_instructions(f)[k].which_function())
+
+
+@functools.lru_cache(maxsize=2)
+def _instructions(f):
+    return f.instructions_sx()
+
+
 def lookups(f):
-    """The lookup of each instruction of an SX function that calls one: a dict by number of instruction."""
-    calls = [k for k in range(f.n_instructions()) if f.instruction_id(k) == ca.OP_CALL]
-    instructions = f.instructions_sx() if calls else ()
-    return {k: Lookup(instructions[k].which_function()) for k in calls}
+    """The lookups that an SX function calls, each once, in their order."""
+    calls = (k for k in range(f.n_instructions()) if f.instruction_id(k) == ca.OP_CALL)
+    return list(dict.fromkeys(lookup_at(f, k) for k in calls))
 
 
 def _opaque(name, argument, values):

@@ -7,7 +7,7 @@ holds where the expression is bounded in e^s, as its degree in e^s shows; log(1 
 
 import casadi as ca
 
-from servoctl.jets.merging import apply_code, cse, replayed
+from servoctl.jets.branches import apply_code, cse, replayed
 from servoctl.tolerances import LAST_EXPONENT
 
 _GROWING = {ca.OP_EXP, ca.OP_EXPM1, ca.OP_SINH, ca.OP_COSH}

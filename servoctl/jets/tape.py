@@ -15,7 +15,7 @@ import casadi as ca
 import numpy as np
 
 from servoctl.errors import SpecificationError
-from servoctl.jets.lookup import Lookup, lookups
+from servoctl.jets.lookup import Lookup, lookup_at
 from servoctl.tolerances import LAST_EXPONENT
 
 REAL = np.longdouble
@@ -181,7 +181,7 @@ class Tape:
     def _read(self, function, symbols):
         """Append the instructions of a function, whose free symbols have the nodes `symbols`."""
         work, nodes, symbols = [], self.nodes, iter(symbols)
-        code, operands, called = function.instruction_id, function.instruction_input, lookups(function)
+        code, operands = function.instruction_id, function.instruction_input
         for k in range(function.n_instructions()):
             op = code(k)
             if op in _ARITHMETIC_NODES:
@@ -195,7 +195,7 @@ class Tape:
             elif op == ca.OP_CONST:
                 work.append(self._add("const", data=function.instruction_constant(k)))
             elif op == ca.OP_CALL:
-                work.append(self._add("constant", *(work[i] for i in operands(k)), data=called[k]))
+                work.append(self._add("constant", *(work[i] for i in operands(k)), data=lookup_at(function, k)))
             elif op == ca.OP_FLOOR and isinstance(nodes[work[operands(k)[0]]].data, Lookup):
                 work.append(work[operands(k)[0]])
             else:

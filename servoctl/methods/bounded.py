@@ -23,7 +23,7 @@ from servoctl.errors import (
     SpecificationError,
     UnstableInternalDynamics,
 )
-from servoctl.jets.merging import cse
+from servoctl.jets.branches import cse
 from servoctl.methods.accuracy import component_sizes, state_levels
 from servoctl.methods.motion import DEFAULT_SAMPLES, Motion, breakpoints, margin_at
 from servoctl.methods.radau import basis, radau

@@ -6,8 +6,7 @@ import casadi as ca
 import numpy as np
 
 from servoctl.errors import SpecificationError
-from servoctl.jets.branches import size_of_terms
-from servoctl.jets.merging import cse
+from servoctl.jets.branches import cse, size_of_terms
 from servoctl.model import saddle
 from servoctl.reduction.appell import plant_accelerations
 from servoctl.reduction.definite import Definite

@@ -7,8 +7,7 @@ import numpy as np
 
 from servoctl.codegen.function import compiled
 from servoctl.errors import SpecificationError
-from servoctl.jets.branches import Branches, has_switches
-from servoctl.jets.merging import cse
+from servoctl.jets.branches import Branches, cse, has_switches
 from servoctl.model.model import Model, derived
 from servoctl.spec.mechanism import Mechanism
 from servoctl.spec.parameters import Parameters

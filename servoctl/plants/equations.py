@@ -10,8 +10,7 @@ import numpy as np
 from servoctl.codegen.folding import folded
 from servoctl.codegen.function import compiled
 from servoctl.errors import SpecificationError
-from servoctl.jets.branches import size_of_terms
-from servoctl.jets.merging import cse
+from servoctl.jets.branches import cse, size_of_terms
 from servoctl.model.equations import Invariants
 from servoctl.reduction.appell import plant_solution, require_inertia
 from servoctl.reduction.hidden import complete

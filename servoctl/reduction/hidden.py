@@ -10,8 +10,7 @@ import casadi as ca
 import numpy as np
 
 from servoctl.errors import InconsistentStart, NotRealisable, SingularProgram, SpecificationError
-from servoctl.jets.branches import shown
-from servoctl.jets.merging import cse
+from servoctl.jets.branches import cse, shown
 from servoctl.reduction.manifold import POINTS_SEED, SPREAD, sample
 from servoctl.reduction.ranks import clean, decide, decide_each, eliminate, generic
 from servoctl.reduction.rows import (

@@ -7,7 +7,7 @@ each with the row that defines it, the system has about n entries, and eliminati
 
 import casadi as ca
 
-from servoctl.jets.merging import cse
+from servoctl.jets.branches import cse
 from servoctl.jets.series import Series
 from servoctl.jets.tape import Tape, add, divide, multiply
 

@@ -14,7 +14,7 @@ import casadi as ca
 import numpy as np
 
 from servoctl.errors import NotRealisable, SingularProgram, SpecificationError, unknown
-from servoctl.jets.merging import cse
+from servoctl.jets.branches import cse
 from servoctl.reduction.appell import Realisation, plant_accelerations
 from servoctl.reduction.hidden import complete
 from servoctl.reduction.ranks import THRESHOLD, clean, decide_all, decide_each

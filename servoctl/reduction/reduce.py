@@ -9,7 +9,7 @@ import numpy as np
 
 from servoctl.checks import finite, mapping
 from servoctl.errors import NotRealisable, ServoError, SpecificationError, unknown
-from servoctl.jets.merging import cse
+from servoctl.jets.branches import cse
 from servoctl.jets.series import Flow
 from servoctl.reduction.appell import Realisation, require_inertia
 from servoctl.reduction.cascade import Cascade

@@ -7,9 +7,8 @@ import casadi as ca
 import numpy as np
 
 from servoctl.errors import SingularProgram, SpecificationError
-from servoctl.jets.branches import shown
+from servoctl.jets.branches import cse, shown
 from servoctl.jets.identity import spread, vanish
-from servoctl.jets.merging import cse
 from servoctl.jets.series import Flow
 from servoctl.reduction.manifold import POINTS_SEED, ROUNDED, anywhere, sample, solve
 from servoctl.reduction.ranks import clean, combination, decide, eliminate, equilibrate, refined

@@ -11,8 +11,8 @@ import casadi as ca
 import numpy as np
 
 from servoctl.errors import ServoError
+from servoctl.jets.branches import cse
 from servoctl.jets.identity import spread, vanish
-from servoctl.jets.merging import cse
 from servoctl.reduction.cascade import Block, Cascade
 from servoctl.reduction.hidden import Deep, complete, told
 from servoctl.reduction.ranks import clean, decide_each, generic

@@ -9,8 +9,8 @@ import numpy as np
 
 from servoctl.checks import column, mapping, require_kind
 from servoctl.errors import NameUnknown, SpecificationError, unknown
+from servoctl.jets.branches import as_text, cse
 from servoctl.jets.identity import spread, vanish
-from servoctl.jets.merging import as_text, cse
 from servoctl.jets.overflow import settled
 from servoctl.jets.tape import Tape, evaluate
 from servoctl.spec.coordinates import Coordinates, jet_name, symbols_in
