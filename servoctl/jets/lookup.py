@@ -13,7 +13,7 @@ import casadi as ca
 import numpy as np
 
 BITS = 80  # of the largest number of a column: smaller parts of the others are left out
-NAMED = re.compile(r"(?:knots|entries)_(\d+)_[0-9a-f]{16}")  # the name of a table, with how many numbers it has
+TABLE_NAME = re.compile(r"(?:knots|entries)_(\d+)_[0-9a-f]{16}")  # the name of a table, with how many numbers it has
 BEYOND = 1e300  # before and after all knots
 
 made = {}  # functions of this process by name, that of the content: CasADi shares calls of the same function only

@@ -24,7 +24,7 @@ import numpy as np
 from servoctl.codegen.cache import cache_directory, read_cached, replacing
 from servoctl.errors import SpecificationError
 from servoctl.jets.branches import as_text
-from servoctl.jets.lookup import NAMED
+from servoctl.jets.lookup import TABLE_NAME
 from servoctl.spec.coordinates import Coordinates
 from servoctl.spec.mechanism import Mechanism
 from servoctl.spec.packing import packed, unpacked
@@ -161,7 +161,7 @@ def fingerprint(mechanism, program, guess=None, near=None, values=None):
         text = "\n".join([json.dumps(facts, allow_nan=False), mechanism.as_text(), as_text(function)])
     except Exception:  # CasADi raises bare ones; the derivation says what is wrong
         return None
-    return None if sum(map(int, {*NAMED.findall(text)})) > MOST_STORED else hashlib.sha256(text.encode()).hexdigest()
+    return None if sum(map(int, {*TABLE_NAME.findall(text)})) > MOST_STORED else hashlib.sha256(text.encode()).hexdigest()
 
 
 @functools.cache

@@ -199,6 +199,10 @@ def spline(t, times, points, smoothness=2, ends="rest"):
     A high smoothness over very uneven times overshoots between the points: choose times in proportion to
     the distances between them. Times that are expressions of parameters allow a smoothness up to 6.
 
+    Through more than 200 points, with numbers as times and points, the coefficients are a table, so that samples of a
+    measurement may be as many as memory holds. Derivatives of samples amplify their rounding: derivative k of samples
+    at a distance h has errors of about 1e-16 (pi/h)^k of their size.
+
     Parameters
     ----------
     t : SX or float
