@@ -161,7 +161,8 @@ def fingerprint(mechanism, program, guess=None, near=None, values=None):
         text = "\n".join([json.dumps(facts, allow_nan=False), mechanism.as_text(), as_text(function)])
     except Exception:  # CasADi raises bare ones; the derivation says what is wrong
         return None
-    return None if sum(map(int, {*TABLE_NAME.findall(text)})) > MOST_STORED else hashlib.sha256(text.encode()).hexdigest()
+    stored = sum(map(int, {*TABLE_NAME.findall(text)})) <= MOST_STORED
+    return hashlib.sha256(text.encode()).hexdigest() if stored else None
 
 
 @functools.cache
