@@ -14,6 +14,7 @@ import casadi as ca
 
 from servoctl.checks import column, mapping, named, positive, require_kind, text
 from servoctl.errors import SpecificationError
+from servoctl.jets.branches import cse
 from servoctl.robots.robot import Frame
 from servoctl.spec import rotations
 from servoctl.spec.coordinates import Coordinates
@@ -394,7 +395,7 @@ def wish(mechanism, accelerations=None):
         named(name, names, "coordinate" if q.plain else "quasi-velocity")
         (wanted[name],) = column(value, f"the acceleration of {name!r}", 1)
     balance = ca.substitute(mechanism.balance, q.jet(2), ca.vertcat(*wanted.values()))
-    forces = ca.cse(inverse @ balance)
+    forces = cse(inverse @ balance)
     return dict(zip(mechanism.actuators, forces.elements(), strict=True))
 
 

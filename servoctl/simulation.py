@@ -208,6 +208,8 @@ def simulated(model, start, t_span, method=None, *, drift=None, t_eval=None, eve
     leads_back = isinstance(method, (Algebraic, Bounded)) or isinstance(drift, (Poles, Project))
     x0 = (as_state if leads_back else consistent_state)(model, start, t0)
     knots = model.require_smooth((min(span), max(span)))
+    if not isinstance(method, Algebraic):
+        knots = tuple(sorted({*knots, *model.ends_of_pieces((min(span), max(span))).tolist()}))
     times = None if isinstance(method, Bounded) and t_eval is None else _sample_times(t0, t1, t_eval, knots, method)
     bar, problem = Progress(span, progress), (t0, x0, t1, times, knots, events)
     try:

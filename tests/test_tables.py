@@ -1,6 +1,7 @@
 """Tables in C for splines: the numbers of the sums, at the cost of one piece."""
 
 import ctypes
+import pickle
 import re
 import shlex
 import subprocess
@@ -15,9 +16,11 @@ import servoctl as sv
 from servoctl.codegen import compiler, emit
 from servoctl.codegen import function as functions
 from servoctl.codegen.function import compiled
+from servoctl.jets import lookup
 from servoctl.jets.pieces import by_pieces
 from servoctl.jets.series import Series
 from servoctl.jets.tape import Tape
+from servoctl.spec import paths
 
 T, X, P = ca.SX.sym("t"), ca.SX.sym("x", 2), ca.SX.sym("p", 1)
 RNG = np.random.default_rng(7)
@@ -92,7 +95,8 @@ def test_what_a_point_costs_does_not_depend_on_the_number_of_via_points():
             motion.append(ca.jtimes(motion[-1], T, 1.0))
         return emit.operations(ca.Function("f", [T, X, P], [ca.vertcat(*motion)]))
 
-    assert operations(400) == operations(40) == operations(5)
+    assert operations(40) == operations(5)
+    assert operations(30_000) == operations(400) < 1.05 * operations(5)  # the entries of large tables are scaled
 
 
 def test_functions_of_one_unit_share_a_table_and_the_text_depends_on_content_alone():
@@ -160,3 +164,146 @@ def test_an_exported_plan_has_the_tables(real, tmp_path, c_compiler):
         assert step(number(t), *(a.ctypes.data_as(ctypes.c_void_p) for a in (x, parameters, z, u))) >= 0
         assert abs(u[0] - force) < (1e-10 if real == "double" else 1e-3) * np.abs(run["F"]).max()
     assert source.read_text().count("static double row(") + source.read_text().count("static float row(") == 1
+
+
+# tables of data --------------------------------------------------------------------------------------------------------
+
+
+def in_both_forms(monkeypatch, build):
+    """The values of a builder with coefficients in sums, and with coefficients as data."""
+    results = []
+    for most in (10**6, 8):
+        monkeypatch.setattr(paths, "MOST_SUMMED", most)
+        results.append(build())
+    return results
+
+
+def pendulum_cart(path):
+    """A cart that follows a path under a pendulum, whose motion is free."""
+    q = sv.coordinates("x theta")
+    x, theta = q
+    p = sv.parameters(M=2.0, m=0.5, L=1.0, g=9.81)
+    bob = ca.vertcat(x + p.L * ca.sin(theta), -p.L * ca.cos(theta))
+    gibbs = sv.particle(q, p.M, x) + sv.particle(q, p.m, bob)
+    machine = sv.Mechanism(q, gibbs=gibbs, potential=p.m * p.g * bob[1], actuators={"F": x}, parameters=p)
+    return sv.derive(machine, sv.Program({"X": x - path(q.t)}, by="actuators"))
+
+
+def along_a_law(s):
+    times = np.linspace(0.0, 1.0, 12)
+    return sv.paths.spline(s, times, np.sin(3.0 * times), 3, "natural")
+
+
+def in_time(t):
+    times = np.linspace(0.0, 6.0, 12)
+    return sv.paths.spline(t, times, 0.2 * np.sin(times), 3)
+
+
+def turning(t):
+    return along_a_law(0.5 + 0.4 * ca.sin(t))
+
+
+MOVING = {
+    None: in_time,
+    "DOP853": lambda t: along_a_law(sv.paths.rest_to_rest(t, 0.0, 1.0, 6.0, 6)),
+    "RadauIIA": turning,
+}
+
+
+@pytest.mark.parametrize("name", PATHS)
+def test_tables_of_data_equal_the_sums_at_and_between_knots(uncontracted, monkeypatch, name):
+    build, knots = PATHS[name]
+    t = instants(knots)[:-3]
+    x, values = np.array([t[::-1], np.cos(np.arange(t.size))]), []
+    for path in in_both_forms(monkeypatch, build):
+        slopes = ca.vec(ca.jacobian(path, ca.vertcat(T, X)))
+        f = ca.Function("f", [T, X, P], [ca.densify(ca.vertcat(path, slopes, ca.jtimes(ca.jtimes(path, T, 1.0), T, 1.0)))])
+        model = compiled(f, "f")
+        alone = np.hstack([model.grid(t[k : k + 7], x[:, k : k + 7], [1.5]) for k in range(0, t.size, 7)])
+        by_casadi = np.array([np.asarray(f(*row)).ravel() for row in zip(t, x.T, np.full(t.size, 1.5), strict=True)]).T
+        values.append((model.grid(t, x, [1.5]), alone, by_casadi))
+    size = np.nanmax(np.where(np.isfinite(values[0][0]), np.abs(values[0][0]), 0.0), axis=1, keepdims=True) + 1e-300
+    for one in (*values[0], *values[1]):
+        np.testing.assert_allclose(one / size, values[0][0] / size, atol=1e-15)
+
+
+@pytest.mark.parametrize("method", MOVING)
+def test_motions_on_tables_of_data_are_those_on_sums(monkeypatch, method):
+    def motion():
+        model = pendulum_cart(MOVING[method])
+        return sv.simulate(model, model.start(theta=0.1, dtheta=0.0), method=method, t_span=(0.0, EVEN[19]), t_eval=EVEN[:20])
+
+    sums, data = in_both_forms(monkeypatch, motion)
+    assert data.method == sums.method
+    np.testing.assert_allclose(data["theta"], sums["theta"], atol=1e-12)
+    np.testing.assert_allclose(data["F"], sums["F"], atol=1e-9)
+    assert sv.verify(data.model, data).passed
+
+
+def test_series_end_where_a_time_law_reaches_the_knots_of_a_table(monkeypatch):
+    monkeypatch.setattr(paths, "MOST_SUMMED", 8)
+    model = pendulum_cart(turning)
+    knots = np.linspace(0.0, 1.0, 12)[1:-1]
+    first = np.arcsin((knots[np.abs(knots - 0.5) < 0.4] - 0.5) / 0.4)
+    expected = np.sort([*(first % (2 * np.pi)), *(np.pi - first)])
+    np.testing.assert_allclose(model.ends_of_pieces((0.0, 2 * np.pi)), expected[expected <= 2 * np.pi], atol=1e-13)
+
+
+@pytest.mark.parametrize("law", [lambda t: t, lambda t: sv.paths.rest_to_rest(t, 0.0, 6.0, 6.0, 6)])
+def test_a_table_of_too_low_a_class_is_refused_as_sums_are(monkeypatch, law):
+    def refusal():
+        with pytest.raises(sv.SpecificationError) as caught:
+            model = pendulum_cart(lambda t: sv.paths.spline(law(t), EVEN[::4], np.sin(EVEN[::4]), 0, "natural"))
+            sv.simulate(model, model.start(theta=0.1, dtheta=0.0), t_span=(0.0, 6.0))
+        return caught.value.details
+
+    sums, data = in_both_forms(monkeypatch, refusal)
+    assert data["has"] == sums["has"] == 0
+    assert data["needs"] == sums["needs"] == 2
+
+
+def test_tables_travel_to_processes_that_have_not_made_them(monkeypatch):
+    monkeypatch.setattr(paths, "MOST_SUMMED", 8)
+    model = pendulum_cart(in_time)
+    f = model.function("ode")
+    here = f.grid(EVEN, np.ones((4, EVEN.size)), model.parameters)
+    content = pickle.dumps(model)
+    monkeypatch.setattr(lookup, "made", {})
+    monkeypatch.setattr(lookup, "_contents", {})
+    there = pickle.loads(content).function("ode")
+    np.testing.assert_array_equal(there.grid(EVEN, np.ones((4, EVEN.size)), model.parameters), here)
+    assert there.source() == f.source()
+
+
+def test_a_loop_on_a_plan_with_tables_of_data_is_that_with_sums(monkeypatch):
+    def closed():
+        q = sv.coordinates("a")
+        (a,) = q
+        p = sv.parameters(m=2.0)
+        machine = sv.Mechanism(q, gibbs=sv.particle(q, p.m, a), actuators={"F": a}, parameters=p)
+        model = sv.derive(machine, sv.Program({"X": a - in_time(q.t)}, by="actuators"))
+        plan = sv.simulate(model, model.start(), t_span=(0.0, 6.0), t_eval=np.linspace(0.0, 6.0, 301))
+        plant = sv.plant(machine)
+        return sv.close(plant, sv.lqr(plan, plant, rate=50.0), plan.state(0.0), (0.0, 6.0))
+
+    sums, data = in_both_forms(monkeypatch, closed)
+    np.testing.assert_allclose(data["a"], sums["a"], atol=1e-11)
+
+
+def test_what_a_derivation_holds_does_not_depend_on_the_number_of_samples():
+    def sizes(n):
+        times = np.linspace(0.0, 6.0, n)
+        model = pendulum_cart(lambda t: sv.paths.spline(t, times, np.sin(times), 3))
+        run = sv.simulate(model, model.start(t=1.0, theta=0.1, dtheta=0.0), t_span=(1.0, 1.01))
+        return len(model.reduction.switches.tape.nodes), model.function("ode").operations, run["F"][0]
+
+    few, many = sizes(300), sizes(20_000)
+    assert few[:2] == many[:2]
+    np.testing.assert_allclose(few[2], many[2], rtol=1e-6)
+
+
+def test_an_exported_plan_holds_its_tables_of_data(monkeypatch, tmp_path, c_compiler):
+    monkeypatch.setattr(paths, "MOST_SUMMED", 8)
+    for real in ("double", "float"):
+        (tmp_path / real).mkdir()
+        test_an_exported_plan_has_the_tables(real, tmp_path / real, c_compiler)

@@ -24,6 +24,7 @@ from pathlib import Path
 
 from servoctl.codegen.cache import cache_directory, read_cached, replacing
 from servoctl.codegen.loops import SOURCES, digest
+from servoctl.codegen.tables import bind
 from servoctl.progress import stage
 
 PATIENCE_WITH_COMPILER = 600.0  # s: one that takes longer waits for something, such as a licence
@@ -69,6 +70,8 @@ def library(text, level="-O1", exact=False):
     with lock:
         if key not in _loaded:
             _loaded[key] = _open(cache_directory() / f"{key}.so") or _build(text, flags, f"{key}.so", command)
+            if _loaded[key] is not None:
+                bind(_loaded[key], text)
         return _loaded[key]
 
 

@@ -14,7 +14,8 @@ from itertools import chain, count
 import casadi as ca
 
 from servoctl.codegen.loops import CONSTANTS, INLINE_SINES, LOOPS, PHASED
-from servoctl.codegen.tables import Entry, Row, literal, tabulated
+from servoctl.codegen.tables import Entry, Row, literal, lookup_operation, lookup_text, tabulated
+from servoctl.jets.lookup import lookup_at, lookups
 from servoctl.jets.pieces import Constant
 
 CHUNK = 350  # statements per C function: compile time is least, and flat, between 250 and 500
@@ -43,7 +44,7 @@ _ELEMENTARY = {getattr(ca, f"OP_{name.upper()}"): (name, 1) for name in _UNARY}
 _ELEMENTARY |= {getattr(ca, f"OP_{name.upper()}"): (name, 2) for name in _BINARY} | {ca.OP_CONSTPOW: ("pow", 2)}
 _COPIES = {ca.OP_ASSIGN, ca.OP_LIFT}  # the first operand, unchanged
 _NOT_ARITHMETIC = {ca.OP_CONST, ca.OP_INPUT, ca.OP_OUTPUT, *_COPIES}
-EMITTED = frozenset({*_ARITHMETIC, *_ELEMENTARY, *_NOT_ARITHMETIC})  # instructions that have a C counterpart
+EMITTED = frozenset({*_ARITHMETIC, *_ELEMENTARY, *_NOT_ARITHMETIC, ca.OP_CALL})  # what has a C counterpart
 
 _FORMS_OF_ONE = {
     "sign": "({0} < 0 ? -1 : {0} > 0 ? 1 : {0})",
@@ -79,6 +80,8 @@ class Dialect:
         Linkage of the function and of its chunks; without one, the chunks are static and not inlined.
     exact : bool
         Whether the operations are those of CasADi, one by one, without shared reciprocals.
+    whole : bool
+        Whether the text holds the numbers of large tables; otherwise they are set when its library is loaded.
     """
 
     number: str = "double"
@@ -88,6 +91,7 @@ class Dialect:
     common: bool = False
     linkage: str = ""
     exact: bool = False
+    whole: bool = False
 
     def constant(self, value):
         """A number as C text, exactly."""
@@ -125,6 +129,7 @@ SCALAR = Dialect(forms=_FORMS_OF_ONE)
 EXACT = Dialect(forms=_FORMS_OF_ONE, exact=True)
 SCALAR_INLINE = Dialect(forms=_FORMS_OF_ONE | {"sin": "s_sin({0})", "cos": "s_cos({0})"})
 PORTABLE = Dialect(forms=_FORMS_OF_ONE, linkage="static ")
+EXPORTED = replace(PORTABLE, whole=True)
 WIDE_LANES = Dialect("W", "ALL({})", "w_")
 LANES = Dialect("W", "ALL({})", "w_", linkage="static ")
 LANES_INLINE = Dialect("W", "ALL({})", "w_", linkage="INLINE ")
@@ -264,6 +269,7 @@ def function_of_several(f, name, dialect, suffixes):
 def _prepared(f, dialect, suffix=""):
     """The statements of a function, with lookups and reciprocals, and C texts of what the lookups need."""
     statements, tables = tabulated(_statements(f, dialect, suffix))
+    tables += [lookup_text(lookup, dialect.whole) for lookup in lookups(f)]
     header = [include("table_lanes.h" if dialect.prefix else "table.h")] if tables else []
     return statements if dialect.exact else _with_reciprocals(statements), [*header, *tables]
 
@@ -273,7 +279,7 @@ def _statements(f, dialect, suffix=""):
 
     Values are numbered; inputs and outputs are C text.
     """
-    register, statements, values = {}, [], 0
+    register, statements, values, looked_up = {}, [], 0, set()
     for k in range(f.n_instructions()):
         operation, source, target = f.instruction_id(k), f.instruction_input(k), f.instruction_output(k)
         if operation == ca.OP_INPUT:
@@ -282,9 +288,12 @@ def _statements(f, dialect, suffix=""):
             register[target[0]] = Constant(f.instruction_constant(k))
         elif operation == ca.OP_OUTPUT:
             statements.append((f"y{suffix}[{target[1]}]", ca.OP_ASSIGN, (register[source[0]],)))
-        elif _copies(operation, source):
+        elif _copies(operation, source) or (operation == ca.OP_FLOOR and register[source[0]] in looked_up):
             register[target[0]] = register[source[0]]
         else:
+            if operation == ca.OP_CALL:
+                operation = lookup_operation(lookup_at(f, k))
+                looked_up.add(values)
             statements.append((values, operation, tuple(register[i] for i in source)))
             register[target[0]] = values
             values += 1

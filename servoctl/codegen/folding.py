@@ -4,6 +4,9 @@ import math
 
 import casadi as ca
 
+from servoctl.jets.branches import apply_code
+from servoctl.jets.lookup import lookup_at
+
 _OF_ONE = {ca.OP_ASSIGN: 1.0, ca.OP_NEG: -1.0, ca.OP_TWICE: 2.0}
 
 
@@ -33,6 +36,7 @@ def folded(f):
         elif operation == ca.OP_OUTPUT:
             outputs[target[1]] = _product(work[source[0]])
         else:
+            operation = lookup_at(f, k) if operation == ca.OP_CALL else operation
             work[target[0]] = _operation(operation, [work[i] for i in source])
     return ca.vertcat(*outputs)
 
@@ -67,4 +71,4 @@ def _operation(operation, terms):
         ratio = d / c
         return c, a + b if ratio == 1 else a - b if ratio == -1 else a + ratio * b
     operands = [_product(term) for term in terms]
-    return 1.0, (ca.SX.unary if len(operands) == 1 else ca.SX.binary)(operation, *operands)
+    return 1.0, apply_code(operation, *operands)

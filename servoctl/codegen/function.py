@@ -16,6 +16,7 @@ from servoctl.codegen import compiler, emit
 from servoctl.codegen.interpreted import Interpreter, restored, restored_grid
 from servoctl.codegen.loops import LOOPS
 from servoctl.codegen.native import Library, builtin
+from servoctl.codegen.tables import BOUND
 from servoctl.errors import SpecificationError, unknown
 
 GRID_POINTS = 2_500  # three longer grids take CasADi as long as writing and loading a library, 50 as compiling it
@@ -155,6 +156,8 @@ class Compiled:
         travels = self.loops and "_library" not in self.__dict__ and compiler.compiler() is not None
         state = {"_text": self.source() if travels else None}
         return Compiled, parts, state | ({"operations": self.operations} if self.loops else {})
+        text = self.source() if travels else ""
+        return Compiled, parts, {"_text": None if not text or BOUND in text else text}
 
     def __eq__(self, other):
         return self is other or (isinstance(other, Compiled) and self.source() == other.source())

@@ -5,8 +5,11 @@ of one s is looked up: the number of knots that s has reached is its row in a ta
 to the last bit.
 """
 
+import ctypes
+import functools
 import hashlib
 import math
+import re
 from collections import Counter, defaultdict
 from itertools import chain
 from typing import NamedTuple
@@ -15,6 +18,8 @@ import numpy as np
 
 from servoctl.jets.pieces import of_all_pieces, operand_values, piecewise_constant
 
+BOUND = "/* bound */"  # begins the C line of a table that `bind` leads to its numbers
+_bound = {}  # lookups by name
 MARGIN = 1e-6  # of a cell of a table: how far rounding may lead beyond its ends
 
 class Row(NamedTuple):
@@ -95,21 +100,81 @@ def _table(knots, rows):
     The name is that of the content, so that functions of one unit share a table.
     """
     name = f"table_{hashlib.sha256(knots.tobytes() + b'|' + rows.tobytes()).hexdigest()[:16]}"
+    return name, _once(name, f"{_knots(name, knots)}static const double {name}[{rows.size}] = {_array(rows)};\n")
+
+
+def _once(name, text):
+    """C text that a unit may contain several times."""
+    return f"\n#ifndef HAS_{name}\n#define HAS_{name}\n{text}#endif\n"
+
+
+def _knots(name, knots):
+    """C text of knots."""
+    n, numbers, cells = len(knots), f"{len(knots)}, {', '.join(map(literal, _scale(knots)))}", _cells(knots)
+    return (
+        f"static const double {name}_at[{n}] = {_array(knots)};\n"
+        f"static const int {name}_cells[{2 * n}] = {_array(cells)};\n"
+        f"static const Knots {name}_knots = {{{numbers}, {name}_at, {name}_cells}};\n"
+    )
+
+
+def _scale(knots):
+    """The first knot, and the number of cells per second."""
+    return float(knots[0]), float(len(knots) / (knots[-1] - knots[0]))
+
+
+def _cells(knots):
+    """The first and the last row that each of n cells of equal length may hold, (n, 2)."""
     n, offsets = len(knots), knots - knots[0]
     cell = offsets[-1] / n
     edges = cell * np.arange(n + 1)
     low = np.searchsorted(offsets, edges[:-1] - MARGIN * cell, "right")
     high = np.searchsorted(offsets, edges[1:] + MARGIN * cell, "right")
     low[0], high[-1] = 0, n
-    cells = np.array([low, high]).T
-    numbers = f"{n}, {literal(float(knots[0]))}, {literal(float(1 / cell))}"
-    return name, (
-        f"\n#ifndef HAS_{name}\n#define HAS_{name}\n"
-        f"static const double {name}_at[{n}] = {_array(knots)};\n"
-        f"static const int {name}_cells[{2 * n}] = {_array(cells)};\n"
-        f"static const Knots {name}_knots = {{{numbers}, {name}_at, {name}_cells}};\n"
-        f"static const double {name}[{rows.size}] = {_array(rows)};\n#endif\n"
-    )
+    return np.array([low, high]).T
+
+
+def lookup_operation(lookup):
+    """The operation in C of a lookup."""
+    return Row(lookup.name) if lookup.counts else Entry(lookup.name, 1, 0)
+
+
+def lookup_text(lookup, whole):
+    """C text that declares the numbers of a lookup; they are set by `bind`, or are part of the text as a whole."""
+    name = lookup.name
+    if whole:
+        numbers = lookup.numbers
+        entries = f"static const double {name}[{numbers.size}] = {_array(numbers)};\n"
+        return _once(name, _knots(name, numbers) if lookup.counts else entries)
+    _bound[name] = lookup
+    return _once(name, f"{BOUND} Knots {name}_knots;\n" if lookup.counts else f"{BOUND} const double *{name};\n")
+
+
+def bind(library, text):
+    """Lead the tables that a C text leaves open to their numbers, which live as long as the process."""
+    for name in re.findall(rf"^{re.escape(BOUND)} .*?((?:knots|entries)_\w+?)(?:_knots)?;$", text, re.MULTILINE):
+        lookup = _bound[name]
+        if not lookup.counts:
+            ctypes.c_void_p.in_dll(library, name).value = lookup.numbers.ctypes.data
+            continue
+        knots, cells = lookup.numbers, _lasting_cells(name)
+        place = _Knots.in_dll(library, f"{name}_knots")
+        place.start, place.cells_per_second = _scale(knots)
+        place.at, place.cells, place.n = knots.ctypes.data, cells.ctypes.data, len(knots)
+
+
+@functools.cache
+def _lasting_cells(name):
+    return np.ascontiguousarray(_cells(_bound[name].numbers), dtype=np.intc)
+
+
+class _Knots(ctypes.Structure):
+    """`Knots` of table.h."""
+
+    _fields_ = (
+        ("n", ctypes.c_int), ("start", ctypes.c_double), ("cells_per_second", ctypes.c_double),
+        ("at", ctypes.c_void_p), ("cells", ctypes.c_void_p),
+    )  # fmt: skip
 
 
 def _array(numbers):

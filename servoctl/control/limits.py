@@ -24,6 +24,7 @@ from servoctl.control.result import Closed
 from servoctl.control.sampling import discretised
 from servoctl.control.time_law import fastest
 from servoctl.errors import LimitExceeded, ServoError, SpecificationError, unknown
+from servoctl.jets.branches import cse
 from servoctl.plants.plant import Plant
 from servoctl.tolerances import TINY
 from servoctl.values import Value
@@ -75,7 +76,7 @@ class Effects:
         self.immediate = {name for i, name in enumerate(self.names) if slopes[i, :].nnz()}  # an input changes these
         still = ca.substitute(values, e.u, ca.SX.zeros(e.u.numel()))
         numbers = e.p[: e.p.numel() - e.u.numel() - e.q.n]
-        parts = ca.densify(ca.cse(ca.vertcat(still, ca.vec(ca.densify(slopes)))))
+        parts = ca.densify(cse(ca.vertcat(still, ca.vec(ca.densify(slopes)))))
         self.expression = ca.Function("effects", [e.q.t, e.state, numbers], [parts])
         self._function = compiled(self.expression, "effects")
 

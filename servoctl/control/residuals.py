@@ -7,6 +7,7 @@ import numpy as np
 
 from servoctl.codegen.function import compiled
 from servoctl.errors import SpecificationError, unknown
+from servoctl.jets.branches import cse
 
 
 class Residuals:
@@ -81,7 +82,7 @@ class Residuals:
         if key not in self._built:
             state = ca.vertcat(*self._q, *(s for k in range(self._order) for s in self._q.gamma(k + 1)))
             p = ca.vertcat(*self.symbols) if self.symbols else ca.SX(0, 1)
-            y = ca.densify(ca.cse(ca.vertcat(*outputs(state))))
+            y = ca.densify(cse(ca.vertcat(*outputs(state))))
             self._built[key] = compiled(ca.Function(key, [self._q.t, state, p], [y]), key)
         return self._built[key]
 

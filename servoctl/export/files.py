@@ -213,7 +213,7 @@ def _enum(name, array):
 
 
 def _source(name, contents):
-    functions = "".join(emit.function(f, key, emit.PORTABLE) for key, f in contents.functions.items())
+    functions = "".join(emit.function(f, key, emit.EXPORTED) for key, f in contents.functions.items())
     table = emit.include("table.h")
     inverse = any(emit.contains(f, ca.OP_ERFINV) for f in contents.functions.values())
     parts = [

@@ -10,6 +10,8 @@ from fractions import Fraction
 
 import casadi as ca
 
+from servoctl.jets.lookup import lookup_at
+
 MOST_OPERATIONS = 300  # of an expression that is expanded
 MOST_PRODUCTS = 20_000  # of terms of all polynomials in one expansion: some hundredths of a second
 
@@ -56,6 +58,7 @@ class _Expansion:
             elif op in operations:
                 work.append(operations[op](self, *(work[i] for i in operands)))
             else:
+                op = lookup_at(f, k) if op == ca.OP_CALL else op
                 work.append(self._factor(op, *(frozenset(work[i].items()) for i in operands)))
         return {}
 

@@ -39,7 +39,7 @@ OPERATIONS = VALUE | {
     "sqrt": lambda _, a: _power(0.5, a),
     "power": _power,
     "quad": lambda name, *args: (apply if name in TRUE else _substitute)(name, *args),
-    "constant": _substitute,
+    "constant": lambda name, *args: _substitute(str(name), *args),
     "fabs": lambda _, a: _substitute("fabs", a),
     "fmin": lambda _, a, b: _substitute("fmin", a, b),
     "fmax": lambda _, a, b: _substitute("fmax", a, b),

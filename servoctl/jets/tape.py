@@ -15,6 +15,7 @@ import casadi as ca
 import numpy as np
 
 from servoctl.errors import SpecificationError
+from servoctl.jets.lookup import Lookup, lookup_at
 from servoctl.tolerances import LAST_EXPONENT
 
 REAL = np.longdouble
@@ -193,6 +194,10 @@ class Tape:
                 work.append(next(symbols))
             elif op == ca.OP_CONST:
                 work.append(self._add("const", data=function.instruction_constant(k)))
+            elif op == ca.OP_CALL:
+                work.append(self._add("constant", *(work[i] for i in operands(k)), data=lookup_at(function, k)))
+            elif op == ca.OP_FLOOR and isinstance(nodes[work[operands(k)[0]]].data, Lookup):
+                work.append(work[operands(k)[0]])
             else:
                 work.append(self._operation(op, [work[i] for i in operands(k)]))
 

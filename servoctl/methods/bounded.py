@@ -23,6 +23,7 @@ from servoctl.errors import (
     SpecificationError,
     UnstableInternalDynamics,
 )
+from servoctl.jets.branches import cse
 from servoctl.methods.accuracy import component_sizes, state_levels
 from servoctl.methods.motion import DEFAULT_SAMPLES, Motion, breakpoints, margin_at
 from servoctl.methods.radau import basis, radau
@@ -609,7 +610,7 @@ def _equations(model):
     rates, slopes, invariants = (model.function(name).expression for name in ("ode", "ode_jacobian", "invariants"))
     t, x, p = (ca.SX.sym(name, rates.size1_in(i)) for i, name in enumerate("txp"))
     values = [rates(t, x, p)[: rates.size1_in(1)], slopes(t, x, p), invariants(t, x, p)]
-    f = ca.Function("bounded", [t, x, p], [ca.densify(ca.cse(ca.vertcat(*values)))])
+    f = ca.Function("bounded", [t, x, p], [ca.densify(cse(ca.vertcat(*values)))])
     return compiled(f, "bounded", ("rk",))  # which is called at many points, and therefore compiled
 
 

@@ -6,7 +6,7 @@ import casadi as ca
 import numpy as np
 
 from servoctl.errors import SpecificationError
-from servoctl.jets.branches import size_of_terms
+from servoctl.jets.branches import cse, size_of_terms
 from servoctl.model import saddle
 from servoctl.reduction.appell import plant_accelerations
 from servoctl.reduction.definite import Definite
@@ -60,7 +60,7 @@ class Invariants:
     def function(self, name, x, outputs, extra=None):
         """An SX function of (t, x, p) with one dense column."""
         p = self.parameters if extra is None else ca.vertcat(self.parameters, extra)
-        y = ca.densify(ca.cse(ca.vertcat(*outputs)))
+        y = ca.densify(cse(ca.vertcat(*outputs)))
         return ca.Function(name, [self.q.t, x, p], [y], ["t", "x", "p"], ["y"])
 
     @cached_property
@@ -266,7 +266,7 @@ class Equations(Invariants):
         return ca.Function(
             f"{f.name()}_jacobian",
             [self.q.t, self.state, p],
-            [ca.densify(ca.cse(ca.vec(ca.densify(ca.jacobian(rates, self.state)))))],
+            [ca.densify(cse(ca.vec(ca.densify(ca.jacobian(rates, self.state)))))],
         )
 
     def path(self):

@@ -384,7 +384,11 @@ class Model:
         return self._knots.times
 
     def require_smooth(self, span):
-        """Knots of the paths within a time span; SpecificationError if a path is not smooth enough there."""
+        """Knots of the paths within a time span; SpecificationError if a path is not smooth enough there.
+
+        Of a spline of many pieces they are those between the first and the last that are inspected; the others, at
+        which series end, are `ends_of_pieces`.
+        """
         r = self.reduction
         if r.timed and span not in self._knots_within:
 
@@ -395,6 +399,10 @@ class Model:
             stored = np.array_equal(self.parameters, r.context.values)
             self._knots_within[span] = self._store.recall(f"knots {span}", build) if stored else build()
         return self._knots_within.get(span, ())
+
+    def ends_of_pieces(self, span):
+        """Instants (N,) within a time span between which splines of many pieces are polynomials."""
+        return self.reduction.switches.ends_of_pieces(self.parameters, span)
 
     @property
     def raised(self):

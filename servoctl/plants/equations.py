@@ -10,7 +10,7 @@ import numpy as np
 from servoctl.codegen.folding import folded
 from servoctl.codegen.function import compiled
 from servoctl.errors import SpecificationError
-from servoctl.jets.branches import size_of_terms
+from servoctl.jets.branches import cse, size_of_terms
 from servoctl.model.equations import Invariants
 from servoctl.reduction.appell import plant_solution, require_inertia
 from servoctl.reduction.hidden import complete
@@ -72,8 +72,8 @@ class PlantEquations:
     def function(self, name, outputs, x=None, p=None):
         """An SX function of (t, x, p) with one dense column."""
         inputs = [self.q.t, self.state if x is None else x, self.p if p is None else p]
-        f = ca.Function(name, inputs, [ca.densify(ca.cse(ca.vertcat(*outputs)))])
-        return ca.Function(name, f.sx_in(), [ca.densify(ca.cse(folded(f)))], ["t", "x", "p"], ["y"])
+        f = ca.Function(name, inputs, [ca.densify(cse(ca.vertcat(*outputs)))])
+        return ca.Function(name, f.sx_in(), [ca.densify(cse(folded(f)))], ["t", "x", "p"], ["y"])
 
     @property
     def _material(self):
@@ -262,7 +262,7 @@ class PlantEquations:
         force = driven - ca.substitute(self.mechanism.balance, acceleration, zero)
         with noting_dropped() as entries:
             solution, pivots = plant_solution(self.mechanism, rows, force, -second, points)
-        return ca.cse(solution), pivots, entries
+        return cse(solution), pivots, entries
 
     @cached_property
     def state_rates(self):

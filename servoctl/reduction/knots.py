@@ -9,6 +9,7 @@ import casadi as ca
 import numpy as np
 
 from servoctl.errors import SpecificationError
+from servoctl.jets.lookup import Lookup
 from servoctl.jets.pieces import FEWEST, by_pieces
 from servoctl.jets.series import Series
 from servoctl.jets.tape import Tape
@@ -16,6 +17,8 @@ from servoctl.jets.tape import Tape
 MOST_BRANCHES = 24  # affine pieces that are followed through one operation
 SCAN = 801  # instants of a scan for switches that are not affine in t
 PARTS, DIVISIONS = 1024, 6  # of an interval of the scan, whose signs are evaluated at once: all digits of a double
+INSPECTED = 9  # knots of a table, with their neighbours, whose class is inspected: a spline has the same at each
+BISECTIONS = 60  # of an interval of the scan, for all knots of a table at once: more than a double has digits
 KNOWN = 8  # sets of numbers whose knots are remembered
 SAME_INSTANT = 1e-9  # switches closer than this fraction of the time from first to last are one
 NEAR_ZERO = 0.5  # of the values beside it: a parabola's least value below this is looked at closely
@@ -79,8 +82,9 @@ class Switches:
         if not self.timed:
             return []
         sides, reached = set(self.timed), []
-        for _, args, _ in self.tape.nodes:
-            switch = args and (args[0], args[1] if len(args) > 1 else None) in sides
+        for i, (_, args, data) in enumerate(self.tape.nodes):
+            other = i if isinstance(data, Lookup) else args[1] if len(args) > 1 else None
+            switch = args and (args[0], other) in sides
             reached.append(bool(switch) or any(reached[a] for a in args))
         return [name for name, node in zip(self.residuals, self.tape.outputs, strict=True) if reached[node]]
 
@@ -129,7 +133,9 @@ class Switches:
                 depends.append({"p" if place is None else "t" if place[0] == "t" else "jets"})
             else:
                 depends.append(set().union(*(depends[a] for a in node.args)) if node.args else set())
-        sides = ((a, b, depends[a] | (depends[b] if b is not None else set())) for a, b in self.tape.switches)
+        tables = ((node.args[0], i) for i, node in enumerate(self.tape.nodes) if _counts(node))
+        switches = [*self.tape.switches, *tables]
+        sides = ((a, b, depends[a] | (depends[b] if b is not None else set())) for a, b in switches)
         return [(a, b) for a, b, both in sides if "t" in both and "jets" not in both]
 
     def __bool__(self):
@@ -153,6 +159,9 @@ class Switches:
             pieces.append(self._pieces(node, pieces, values))
         instants, others = set(), []
         for a, b in self.timed:
+            if self._is_table(b) and pieces[a] is not None:
+                instants |= {*_of_affine(pieces[a], _some(self.tape.nodes[b].data.numbers)).tolist()}
+                continue
             first, second = pieces[a], pieces[b] if b is not None else ((0.0, 0.0),)
             if first is None or second is None:
                 others.append((a, b))
@@ -160,11 +169,47 @@ class Switches:
             instants |= {(d0 - c0) / (c1 - d1) for c0, c1 in first for d0, d1 in second if c1 != d1}
         return instants, others
 
+    def ends_of_pieces(self, values, span):
+        """Ascending instants within a span at which the coefficients from tables change, an array."""
+        tables = [(a, b) for a, b in self.timed if self._is_table(b)]
+        pieces, instants = [], [np.empty(0)]
+        for node in self.tape.nodes if tables else ():
+            pieces.append(self._pieces(node, pieces, values))
+        for a, b in tables:
+            knots, affine = self.tape.nodes[b].data.numbers, pieces[a] is not None
+            instants.append(_of_affine(pieces[a], knots) if affine else self._reached(values, a, knots, span))
+        instants = np.unique(np.concatenate(instants))
+        return instants[(instants >= span[0]) & (instants <= span[1])]
+
+    def _is_table(self, node):
+        return node is not None and _counts(self.tape.nodes[node])
+
+    def _reached(self, values, argument, knots, span):
+        """Instants in a span at which a node, an argument that is monotone between instants of a scan, is at knots."""
+
+        def at(t):
+            return np.broadcast_to(self._run(t, values, 1).c[argument][0], t.shape).astype(float)
+
+        grid = np.linspace(*span, SCAN)
+        ends = np.array([at(grid)[:-1], at(grid)[1:]])
+        first, last = np.searchsorted(knots, [ends.min(axis=0), ends.max(axis=0)], "right")
+        crossed = np.concatenate([np.arange(i, j) for i, j in zip(first, last, strict=True)]).astype(int)
+        within = np.repeat(np.arange(SCAN - 1), last - first)
+        low, high, rising = grid[within], grid[within + 1], (ends[1] > ends[0])[within]
+        for _ in range(BISECTIONS if crossed.size else 0):
+            middle = (low + high) / 2
+            before = (at(middle) < knots[crossed]) == rising
+            low, high = np.where(before, middle, low), np.where(before, high, middle)
+        return high
+
     def _times(self, values, instants, others, span):
         """Instants of all switches, ascending: affine ones, and others within these and a span."""
         window = [*instants, *(span or ())]
         if others and window and max(window) > min(window):
-            instants |= self._scan(values, min(window), max(window), others)
+            ends = min(window), max(window)
+            instants |= self._scan(values, *ends, [sides for sides in others if not self._is_table(sides[1])])
+            for a, b in (sides for sides in others if self._is_table(sides[1])):
+                instants |= {*self._reached(values, a, _some(self.tape.nodes[b].data.numbers), ends).tolist()}
         times = sorted(instants)
         width = max(times[-1] - times[0], SAME_INSTANT) if times else 1.0
         return [t for i, t in enumerate(times) if i == 0 or t - times[i - 1] > SAME_INSTANT * width]
@@ -180,7 +225,7 @@ class Switches:
         if node.kind == "const":
             return ((float(node.data), 0.0),)
         if node.kind == "constant":
-            return ((0.0, 0.0), (1.0, 0.0))
+            return None if isinstance(node.data, Lookup) else ((0.0, 0.0), (1.0, 0.0))
         if node.kind == "gate":
             taken = pieces[node.args[1]]
             return taken and tuple({(0.0, 0.0), *taken})
@@ -276,6 +321,22 @@ class Switches:
                 if rough.size and rough[0] <= needs.get(name, -1):
                     result.setdefault(name, []).append((when, int(rough[0]) - 1))
         return result
+
+
+def _counts(node):
+    """Whether a node counts the knots of a table."""
+    return isinstance(node.data, Lookup) and node.data.counts
+
+
+def _of_affine(pieces, knots):
+    """Instants at which an argument of affine pieces c0 + c1 t is at knots."""
+    return np.concatenate([np.empty(0), *((knots - c0) / c1 for c0, c1 in pieces if c1)])
+
+
+def _some(knots):
+    """The first and the last knots of a table and ones between, each with its neighbours: all are of the same kind."""
+    places = np.linspace(1, len(knots) - 2, INSPECTED).round().astype(int)
+    return knots[np.unique(np.concatenate([places - 1, places, places + 1]))]
 
 
 def _grazes(t, g):

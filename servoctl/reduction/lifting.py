@@ -7,6 +7,7 @@ each with the row that defines it, the system has about n entries, and eliminati
 
 import casadi as ca
 
+from servoctl.jets.branches import cse
 from servoctl.jets.series import Series
 from servoctl.jets.tape import Tape, add, divide, multiply
 
@@ -28,7 +29,7 @@ def lifted(expressions, unknowns):
         The rows of f - f(0) = P x + Q z, then those of R x + (S - 1) z = 0, which define the k shared sums z: S is
         strictly lower triangular. None where other operations are made of unknowns than sums and products with factors.
     """
-    expressions = ca.cse(expressions)
+    expressions = cse(expressions)
     tape = Tape(ca.symvar(expressions), expressions.elements())
     place = {s.element_hash(): k for k, s in enumerate(unknowns.elements())}
     free = [place.get(s.element_hash()) for s in tape.symbols]

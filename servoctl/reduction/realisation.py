@@ -14,6 +14,7 @@ import casadi as ca
 import numpy as np
 
 from servoctl.errors import NotRealisable, SingularProgram, SpecificationError, unknown
+from servoctl.jets.branches import cse
 from servoctl.reduction.appell import Realisation, plant_accelerations
 from servoctl.reduction.hidden import complete
 from servoctl.reduction.ranks import THRESHOLD, clean, decide_all, decide_each
@@ -169,7 +170,7 @@ def _determined_rows(mechanism, rows, material, points, k):
             rank=rank,
             determined=k,
         )
-    return ca.cse(P[chosen, :]), L[chosen, :]
+    return cse(P[chosen, :]), L[chosen, :]
 
 
 def _responses(mechanism, material, points):

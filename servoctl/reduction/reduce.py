@@ -9,6 +9,7 @@ import numpy as np
 
 from servoctl.checks import finite, mapping
 from servoctl.errors import NotRealisable, ServoError, SpecificationError, unknown
+from servoctl.jets.branches import cse
 from servoctl.jets.series import Flow
 from servoctl.reduction.appell import Realisation, require_inertia
 from servoctl.reduction.cascade import Cascade
@@ -172,8 +173,8 @@ class Reduction(Packed):
         k = len(self.program.residuals)
         multipliers = self.multipliers[:k] if k else ca.SX(0, 1)
         if self.program.by == "actuators":
-            return ca.cse(wished(self.mechanism, self.program) + self.realisation.actuation @ multipliers)
-        return ca.cse(self.realisation.B[:, :k] @ multipliers)
+            return cse(wished(self.mechanism, self.program) + self.realisation.actuation @ multipliers)
+        return cse(self.realisation.B[:, :k] @ multipliers)
 
 
 def needs(rows):

@@ -9,6 +9,7 @@ import numpy as np
 
 from servoctl.checks import column, mapping, require_kind
 from servoctl.errors import NameUnknown, SpecificationError, unknown
+from servoctl.jets.branches import as_text, cse
 from servoctl.jets.identity import spread, vanish
 from servoctl.jets.overflow import settled
 from servoctl.jets.tape import Tape, evaluate
@@ -132,7 +133,7 @@ class Mechanism:
             q.V, q.h, *q.invariants.values(), self.balance, self.energy, self.forces, self.E,
             *self.constraints.values(), *self.outputs.values(), *self.shapes.values(),
         ]  # fmt: skip
-        function = q.as_function([*expressions, *self.reported.values()], p.symbols).serialize()
+        function = as_text(q.as_function([*expressions, *self.reported.values()], p.symbols))
         facts = [names, list(self.outputs), list(self.shapes), self.inputs, list(self.reported)]
         facts += [p.defaults, self.left_out]
         return json.dumps(facts) + "\n" + function
@@ -256,7 +257,7 @@ class Mechanism:
             inertial = ca.gradient(self._gibbs, ca.vertcat(*self.q.gamma(2)))
         else:
             inertial = self._lagrange()
-        return ca.cse(inertial - self._applied + self.q.V.T @ ca.gradient(self.potential, ca.vertcat(*self.q)))
+        return cse(inertial - self._applied + self.q.V.T @ ca.gradient(self.potential, ca.vertcat(*self.q)))
 
     @cached_property
     def mass(self):
@@ -357,7 +358,7 @@ class Mechanism:
         """What a given balance is at rest, such as gravity, (n,) SX; the rest is inertia and has a kinetic energy."""
         motion = ca.vertcat(*self.q.gamma(1), *self.q.gamma(2))
         static = ca.substitute(self._inverse_dynamics, motion, ca.SX.zeros(motion.numel()))
-        return ca.SX.zeros(self.q.n) if vanish(spread(static.elements())).all() else ca.cse(static)
+        return ca.SX.zeros(self.q.n) if vanish(spread(static.elements())).all() else cse(static)
 
     def _refuse_nonholonomic_frame(self):
         """Refuse a kinetic energy in quasi-velocities if brackets of the columns of V lie outside their span."""

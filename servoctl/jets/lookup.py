@@ -1,0 +1,151 @@
+"""Tables in expressions: piecewise constant functions whose numbers are data, not operations.
+
+A spline of many pieces as sums over its pieces costs every step of a derivation in proportion to their number. Here an
+expression calls a function instead, which stays one operation: `Lookup`. Its values are whole numbers inside `floor`,
+whose derivative is zero, so that CasADi differentiates expressions of them as those of any piecewise constant function.
+"""
+
+import functools
+import hashlib
+import re
+
+import casadi as ca
+import numpy as np
+
+BITS = 80  # of the largest number of a column: smaller parts of the others are left out
+TABLE_NAME = re.compile(r"(?:knots|entries)_(\d+)_[0-9a-f]{16}")  # the name of a table, with how many numbers it has
+BEYOND = 1e300  # before and after all knots
+
+made = {}  # functions of this process by name, that of the content: CasADi shares calls of the same function only
+_contents = {}  # by the same name
+
+
+class Lookup:
+    """The number of knots that s has reached, or the entry of a list at a place.
+
+    Parameters
+    ----------
+    function : casadi.Function
+        Made by `of_knots` or `of_entries`.
+    """
+
+    def __init__(self, function):
+        self.name = function.name()
+        self.function = made.setdefault(self.name, function)
+
+    @classmethod
+    def of_knots(cls, knots):
+        """The lookup of the number of ascending knots (n,) that s has reached."""
+        knots, n = np.asarray(knots, dtype=float), len(knots)
+        name = _name("knots", knots)
+        if name not in made:
+            s = ca.MX.sym("s")
+            rows = _line([-BEYOND, *np.repeat(knots, 2), BEYOND], np.repeat(np.arange(n + 1.0), 2).tolist())
+            made[name], _contents[name] = _opaque(name, s, [ca.floor(rows(s) + 0.5), _list(knots)(s)]), knots
+        return cls(made[name])
+
+    @classmethod
+    def of_entries(cls, entries):
+        """The lookup of a list (n,) of whole numbers, as floats, by place."""
+        entries = np.asarray(entries, dtype=float)
+        name = _name("entries", entries)
+        if name not in made:
+            place = ca.MX.sym("place")
+            made[name], _contents[name] = _opaque(name, place, [_list(entries)(place)]), entries
+        return cls(made[name])
+
+    def __eq__(self, other):
+        return isinstance(other, Lookup) and self.name == other.name
+
+    def __hash__(self):
+        return hash(self.name)
+
+    def __str__(self):
+        return self.name
+
+    @property
+    def counts(self):
+        """Whether it counts knots."""
+        return self.name.startswith("knots")
+
+    @functools.cached_property
+    def numbers(self):
+        """The knots, or the entries."""
+        if self.name not in _contents:
+            places = np.arange(int(self.name.split("_")[1]))[None]
+            _contents[self.name] = np.array(self.function.call([ca.DM(places)])[-1]).ravel()
+        return _contents[self.name]
+
+    def __call__(self, s):
+        """The value at an SX scalar, or at an array of numbers."""
+        if isinstance(s, ca.SX):
+            return ca.floor(self.called(s))
+        if self.counts:
+            return 1.0 * np.searchsorted(self.numbers, np.asarray(s, dtype=float), "right")
+        return self.numbers[np.clip(np.nan_to_num(np.asarray(s, dtype=float)), 0, len(self.numbers) - 1).astype(int)]
+
+
+    def called(self, s):
+        """The value at an SX scalar, without the `floor` that has no derivative."""
+        return self.function.call([s])[0]
+
+
+def columns_at(s, knots, values):
+    """Entries of a table in the row whose number is that of the knots that s has reached.
+
+    Parameters
+    ----------
+    s : SX scalar
+    knots : (n,) array
+        Ascending.
+    values : (n + 1, m) array
+
+    Returns
+    -------
+    list of m SX scalars
+        To 2^-`BITS` of the largest of their column.
+    """
+    _, exponents = np.frexp(np.abs(values).max(axis=0))
+    entries = Lookup.of_entries(np.rint(np.ldexp(values, BITS - exponents)).ravel())
+    place = len(exponents) * Lookup.of_knots(knots)(s)
+    return [entries(place + j) * 2.0 ** (int(e) - BITS) for j, e in enumerate(exponents)]
+
+
+def lookup_at(f, k):
+    """The lookup that instruction k of an SX function calls."""
+    return Lookup(_instructions(f)[k].which_function())
+
+
+@functools.lru_cache(maxsize=2)
+def _instructions(f):
+    return f.instructions_sx()
+
+
+def lookups(f):
+    """The lookups that an SX function calls, each once, in their order."""
+    calls = (k for k in range(f.n_instructions()) if f.instruction_id(k) == ca.OP_CALL)
+    return list(dict.fromkeys(lookup_at(f, k) for k in calls))
+
+
+def _opaque(name, argument, values):
+    """A function that stays one operation, and that CasADi need not differentiate."""
+    outputs = [ca.MX.sym(f"y{i}") for i, _ in enumerate(values)]
+    slopes = ca.Function(f"jac_{name}", [argument, *outputs], [ca.MX(1, 1) for _ in values])
+    undifferentiated = {"enable_forward": False, "enable_reverse": False, "custom_jacobian": slopes}
+    return ca.Function(name, [argument], values, {"never_inline": True, **undifferentiated})
+
+
+def _name(kind, numbers):
+    return f"{kind}_{len(numbers)}_{hashlib.sha256(numbers.tobytes()).hexdigest()[:16]}"
+
+
+def _line(knots, values):
+    """The function of straight lines through values at knots; CasADi adds up values at the first and the last."""
+    before, after = knots[0] - abs(knots[0]) - 1, knots[-1] + abs(knots[-1]) + 1
+    outside = [before - abs(before), before, *knots, after, after + abs(after)]
+    return ca.Function.bspline("line", [outside], [values[0], *values, values[-1]], [1], 1, {})
+
+
+def _list(numbers):
+    """The function of a place that is an entry of a list at whole numbers."""
+    return _line(np.arange(len(numbers), dtype=float).tolist(), numbers.tolist())
