@@ -59,7 +59,7 @@ class Scene:
     t_span : (2,) tuple of float
         [s]
     units : dict of str to str
-        Unit of each coordinate, actuator and output, by name.
+        Units by name, beside those that the mechanism gives.
     """
 
     build: Callable
@@ -72,6 +72,15 @@ class Scene:
     guess: dict = field(default_factory=dict)
     t_span: tuple = (0.0, 1.0)
     units: dict = field(default_factory=dict)
+
+    def __post_init__(self):
+        object.__setattr__(self, "build", partial(_in_units, self.build, self.units))
+
+
+def _in_units(build, units):
+    mechanism, program = build()
+    mechanism.units = {**units, **mechanism.units}
+    return mechanism, program
 
 
 def _units(text):
@@ -98,7 +107,6 @@ _APPELL_HAMEL = {
     "start": {"x": 0.0, "y": 0.0, "phi": 0.0, "theta": 0.0, "dphi": 1.0, "dtheta": 2.0},
     "guess": {"dx": 0.5, "dy": 0.6},
     "t_span": (0.0, 2.0),
-    "units": _units("x y z [m] phi theta [rad] tension [N]"),
 }
 
 gallery = {
@@ -112,7 +120,6 @@ gallery = {
         number="The hoist holds at most 1044 N.",
         guess={"l": 4.0},
         t_span=(0.0, 8.0),
-        units=_units("x l X Z [m] theta [rad] trolley hoist tension [N]"),
     ),
     "winch-crane": Scene(
         partial(_built, "winch_crane"),
@@ -123,7 +130,6 @@ gallery = {
         number="The winch holds at most 102.2 N m.",
         guess={"beta": 40.0},
         t_span=(0.0, 6.0),
-        units=_units("x X Z [m] beta theta [rad] trolley [N] winch [N m] tension [N]"),
     ),
     "crane-3d": Scene(
         partial(_built, "crane_3d"),
@@ -134,7 +140,6 @@ gallery = {
         number="The rope's tension is at most 1070 N.",
         guess={"l": 5.0},
         t_span=(0.0, 6.0),
-        units=_units("x y l X Y Z [m] theta phi [rad] bridge trolley hoist tension [N]"),
     ),
     "two-cars": Scene(
         partial(_built, "cars"),
@@ -144,7 +149,6 @@ gallery = {
         source=SEIFRIED,
         number="The force is at most 316.2 N.",
         t_span=(0.0, 2.0),
-        units=_units("x1 x2 [m] force [N]"),
     ),
     "three-cars": Scene(
         partial(_built, "cars", 3),
@@ -154,7 +158,6 @@ gallery = {
         source=f"{SEIFRIED}, by one car more",
         number="The force is at most 11770 N.",
         t_span=(0.0, 2.0),
-        units=_units("x1 x2 x3 [m] force [N]"),
     ),
     "vtol": Scene(
         partial(_built, "vtol"),
@@ -164,7 +167,6 @@ gallery = {
         source="Martin, Devasia and Paden, Automatica 32 (1996) 101-107",
         number="The left thruster gives at most 295.5 N.",
         t_span=(0.0, 4.0),
-        units=_units("x z [m] theta [rad] u1 u2 [N]"),
     ),
     # --- material constraints
     "overhead-crane-redundant": Scene(
@@ -176,7 +178,6 @@ gallery = {
         number="The trolley's force is at most 138 N.",
         guess={"l": 4.0, "Z": 4.0},
         t_span=(0.0, 8.0),
-        units=_units("x l X Z [m] trolley hoist tension [N]"),
     ),
     "winch-crane-redundant": Scene(
         partial(_built, "winch_crane", "redundant"),
@@ -187,7 +188,6 @@ gallery = {
         number="The rope's tension is at most 1018 N.",
         guess={"beta": 40.0, "Z": 4.0},
         t_span=(0.0, 6.0),
-        units=_units("x [m] beta [rad] X Z [m] trolley [N] winch [N m] tension [N]"),
     ),
     "crane-3d-redundant": Scene(
         partial(_built, "crane_3d", "redundant"),
@@ -198,7 +198,6 @@ gallery = {
         number="The hoist holds at most 1074 N.",
         guess={"l": 5.0, "Z": 5.0},
         t_span=(0.0, 6.0),
-        units=_units("x y l X Y Z [m] bridge trolley hoist tension [N]"),
     ),
     "mass-on-car-absolute": Scene(
         partial(_built, "mass_on_car", coordinates="absolute"),
@@ -209,7 +208,6 @@ gallery = {
         number="The force is at most 12.31 N.",
         start={"x": 0.5, "dx": 0.0},
         t_span=(0.0, 6.0),
-        units=_units("x x_m y_m [m] force [N]"),
     ),
     # --- internal dynamics
     "mass-on-car": Scene(
@@ -221,7 +219,6 @@ gallery = {
         number="The internal dynamics decay with 0.5 1/s.",
         start={"s": 0.0, "ds": 0.0},
         t_span=(0.0, 6.0),
-        units=_units("x s [m] force [N]"),
     ),
     "passive-arm": Scene(
         partial(_built, "passive_arm"),
@@ -232,7 +229,6 @@ gallery = {
         number="The internal dynamics decay with 6 1/s where the arm is straight.",
         start={"q2": 0.0, "dq2": 0.0},
         t_span=(0.0, 3.0),
-        units=_units("q1 q2 [rad] torque [N m]"),
     ),
     "pendubot": Scene(
         partial(_built, "pendubot"),
@@ -243,7 +239,6 @@ gallery = {
         number="A small swing of the second link has the frequency 5.345 rad/s.",
         start={"q2": 0.0, "dq2": 0.0},
         t_span=(0.0, 3.0),
-        units=_units("q1 q2 [rad] shoulder [N m] X_end Y_end [m]"),
     ),
     "vtol-centre": Scene(
         partial(_built, "vtol", "centre"),
@@ -254,7 +249,6 @@ gallery = {
         number="Errors grow with 15.04 1/s in hover.",
         start={"theta": 0.0, "dtheta": 0.0},
         t_span=(0.0, 1.0),
-        units=_units("x z [m] theta [rad] u1 u2 [N]"),
     ),
     # --- arms and robots
     "two-link-arm": Scene(
@@ -266,7 +260,6 @@ gallery = {
         number="The elbow is bent by 1.721 rad at the start.",
         guess={"q1": -0.4, "q2": 1.5},
         t_span=(0.0, 2.0),
-        units=_units("q1 q2 [rad] shoulder elbow [N m] X_end Y_end [m]"),
     ),
     # --- ideal reactions
     "appell-hamel": Scene(
@@ -286,7 +279,6 @@ gallery = {
         number="The reaction is at most 6.852 N.",
         start={"x2": 0.0, "dx2": 0.0},
         t_span=(0.0, 2.0),
-        units=_units("x1 x2 [m] force [N]"),
     ),
     "constant-speed": Scene(
         partial(_built, "constant_speed"),
@@ -298,7 +290,6 @@ gallery = {
         start={"x": 0.0, "y": 0.0, "dy": 0.0},
         guess={"dx": 5.0},
         t_span=(0.0, 1.0),
-        units=_units("x y [m] thrust [N]"),
     ),
     # --- higher orders
     "spiral": Scene(
@@ -310,7 +301,6 @@ gallery = {
         number="After 2 s the particle is at y = 0.6205 m.",
         start={"x": 0.0, "y": 0.0, "dx": 1.0, "dy": 0.0, "d2y": 0.0},
         t_span=(0.0, 2.0),
-        units=_units("x y [m]"),
     ),
     # --- rolling machines
     "wheeled-robot": Scene(
@@ -323,7 +313,6 @@ gallery = {
         start={"x": 0.0, "y": 0.0, "psi": 0.0, "r": 0.0},
         guess={"v": 1.0},
         t_span=(0.0, 5.0),
-        units=_units("x y [m] psi [rad] drive [N] steer [N m] curvature [1/m]"),
     ),
     # --- singular programs
     "appell-hamel-squared": Scene(
@@ -344,6 +333,5 @@ gallery = {
         start={"x": 0.0, "y": 0.0, "dy": 0.0},
         guess={"dx": 5.0},
         t_span=(0.0, 1.0),
-        units=_units("x y [m] thrust [N]"),
     ),
 }

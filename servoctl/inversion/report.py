@@ -10,6 +10,7 @@ from servoctl.checks import interval, mapping
 from servoctl.errors import NotRealisable, SpecificationError, unknown
 from servoctl.figures.names import efforts
 from servoctl.inversion.verdict import UNREALISABLE, Verdict, endpoints, verdict
+from servoctl.markup import Shown
 from servoctl.model.model import SAMPLED, Model, derive
 from servoctl.model.report import WIDTH
 from servoctl.model.start import State
@@ -58,7 +59,7 @@ class Effort:
 
 
 @dataclass(frozen=True, eq=False)
-class Report:
+class Report(Shown):
     """What a program asks of its mechanism, and which inverse it has; made by `report`.
 
     Attributes

@@ -258,4 +258,5 @@ class _Many:
         for name in FAILURE:
             columns[name] = np.array([self.errors.get(i, {}).get(name, "") for i in which.tolist()], dtype=str)
         trace = dict(zip(names, self.samples[which].transpose(2, 1, 0), strict=True)) if len(times) else {}
-        return Motions(Study("many", columns, meta | {"machine": machine()}), times, trace)
+        meta = meta | {"machine": machine(), "units": self.model.reduction.mechanism.units}
+        return Motions(Study("many", columns, meta), times, trace)
