@@ -369,7 +369,8 @@ def _effort(run, name, limits):
     if limits is not None:
         room, limit_at, limit = min((low - limits[0], t_low, limits[0]), (limits[1] - high, t_high, limits[1]))
         nearest = {"limit": limit, "limit_at": limit_at, "room": room}
-    return Effort(peak, peak_at, _rms(run.t, run[name]), rate, rate_at, _rms(run.t, rates), **nearest, unit=run.unit(name))
+    mean, unit = _rms(run.t, run[name]), run.unit(name)
+    return Effort(peak, peak_at, mean, rate, rate_at, _rms(run.t, rates), **nearest, unit=unit)
 
 
 def extremes(run, name):
