@@ -4,6 +4,7 @@ import copy
 import csv
 import pickle
 import sys
+from pathlib import Path
 
 import casadi as ca
 import numpy as np
@@ -15,6 +16,7 @@ from servoctl.errors import NameUnknown, ServoError, SpecificationError
 from servoctl.gallery import gallery, overhead_crane, wheeled_robot
 from servoctl.units import rate_unit, unit_of, unit_of_column
 
+ROBOTS = Path(__file__).parents[1] / "examples" / "robots"
 CRANE_UNITS = {"x": "m", "l": "m", "theta": "rad", "trolley": "N", "hoist": "N", "tension": "N", "X": "m", "Z": "m"}
 
 
@@ -242,3 +244,18 @@ def test_what_a_notebook_shows_is_escaped():
     assert "<script>" not in shown and "&lt;script&gt;" in shown and "<th>&lt;b&gt;</th>" in shown
     assert "&lt;script&gt;" in sv.Study("<script>", {"a": [1]})._repr_html_()
     assert "<table>" not in sv.Study("empty", {})._repr_html_()
+
+
+# --- robots
+
+
+def test_a_robot_has_the_units_of_its_joints():
+    fixed = sv.urdf(ROBOTS / "scara.urdf").mechanism()
+    kinds = {unit for name, unit in fixed.units.items() if name in fixed.q.names}
+    assert kinds == {"rad", "m"} and {fixed.units[name] for name in fixed.actuators} == {"N", "N m"}
+    free = sv.urdf(ROBOTS / "six_axis_arm.urdf", base="free").mechanism()
+    units = [unit_of(name, free.units) for name in (*free.q.names, *free.q.velocity_names)]
+    assert units[:7] == ["m"] * 3 + ["1"] * 4 and units[13:19] == ["m/s"] * 3 + ["rad/s"] * 3
+    assert units[7:13] == ["rad"] * 6 and units[19:] == ["rad/s"] * 6
+    assert {free.units[name] for name in free.actuators} == {"N m"}
+    assert pickle.loads(pickle.dumps(free)).units == free.units

@@ -29,7 +29,7 @@ class Coordinates:
     t : SX
         The time [s].
     units : dict of str to str
-        Units of the coordinates, where they are given.
+        Units of coordinates and quasi-velocities, where they are given.
     """
 
     def __init__(self, names, units=None):
@@ -135,12 +135,12 @@ class Coordinates:
         Coordinates
         """
         other = Coordinates(tuple(self.names[i] for i in places))
-        other.units = {name: unit for name, unit in self.units.items() if name in other.names}
         other.t, other._q = self.t, tuple(self._q[i] for i in places)
         other._index = {self.t.element_hash(): ("t", 0, 0)}
         other._index |= {s.element_hash(): ("q", 0, i) for i, s in enumerate(other._q)}
         other.velocity_names = tuple(self.velocity_names[i] for i in velocities)
         other.V, other.h, other.plain = self.V[places, velocities], self.h[places], self.plain
+        other.units = {name: u for name, u in self.units.items() if name in (*other.names, *other.velocity_names)}
         known = {s.element_hash() for s in other._q}
         other.invariants = {
             name: value for name, value in self.invariants.items()

@@ -450,8 +450,8 @@ class Mechanism(Shown):
         for name in q.units:
             if given[name] != q.units[name]:
                 raise SpecificationError(
-                    f"The coordinate {name!r} has the units {q.units[name]!r} and {given[name]!r}.",
-                    "A coordinate has one unit.",
+                    f"{name!r} has the units {q.units[name]!r} and {given[name]!r}.",
+                    "A coordinate or a quasi-velocity has one unit.",
                     do="Give it in sv.coordinates(..., units=...) or in Mechanism(units=...).",
                     name=name,
                     units=(q.units[name], given[name]),
