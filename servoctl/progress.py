@@ -1,19 +1,54 @@
-"""Progress bars, which appear where work takes long."""
+"""What is being done and how far it is, on a terminal, where work takes long."""
 
 import inspect
 import sys
+import threading
 import time
+from contextlib import contextmanager
 
 from servoctl.errors import SpecificationError
 
-PATIENCE = 1.0  # s before a bar appears
+PATIENCE = 0.3  # s before a bar or the name of a stage appears
+REFRESH = 0.2  # s between two updates of the time that a stage has taken
+
+_stages = []  # those under way, the innermost last
 
 
 def progress_bar(name, wanted, total=None, **options):
-    """A bar of tqdm, with its options, that appears after a second; `wanted` None means on a terminal."""
+    """A bar of tqdm, with its options, that appears where work takes long; `wanted` None means on a terminal."""
     from tqdm import tqdm
 
     return tqdm(desc=name, total=total, disable=not _shown(wanted), **{"delay": PATIENCE, **options})
+
+
+@contextmanager
+def stage(name):
+    """Write on a terminal what is being done, and the time that it has taken, if that is long."""
+    if not _shown(None) or threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    ended, since = threading.Event(), time.monotonic()
+    writer = threading.Thread(target=_write_stage, args=(name, since, ended), name="servoctl-progress", daemon=True)
+    _stages.append(ended)
+    writer.start()
+    try:
+        yield
+    finally:
+        ended.set()
+        writer.join()
+        _stages.remove(ended)
+
+
+def _write_stage(name, since, ended):
+    written, wait = False, PATIENCE
+    while not ended.wait(wait):
+        if _stages[-1] is ended:  # an inner stage writes in its place
+            sys.stderr.write(f"\r\x1b[K{name} {time.monotonic() - since:.1f} s")
+            sys.stderr.flush()
+            written, wait = True, REFRESH
+    if written:
+        sys.stderr.write("\r\x1b[K")  # the line is erased
+        sys.stderr.flush()
 
 
 class Progress:

@@ -408,6 +408,14 @@ def test_the_figure_shows_percentiles_dependence_and_failures():
         sv.figures.sweep(study.take([0, 1]), [])
 
 
+def test_the_figure_shows_each_of_few_results():
+    study = sv.sweep(lambda a: {"r": a * a}, sv.grid(a=[2.0, 1.0, 3.0]))
+    results, scatter = sv.figures.sweep(study).axes
+    (points,) = results.get_lines()
+    assert points.get_xdata().tolist() == [1.0, 4.0, 9.0] and points.get_ydata().tolist() == [1, 2, 3]
+    assert not results.patches and "at most" in results.get_ylabel() and len(scatter.get_lines()[0].get_xdata()) == 3
+
+
 def test_a_sweep_of_functions_pickles_by_name():
     assert pickle.loads(pickle.dumps(halves)) is halves
 

@@ -251,8 +251,16 @@ def test_the_plot_draws_every_number(cost, study):
     drawn = [line for line in ax.lines if line.get_marker() not in ("None", "", None)]
     assert sum(len(line.get_xdata()) for line in drawn) == np.isfinite(study["error"]).sum()
     assert ax.get_xscale() == ax.get_yscale() == "log" and cost in ax.get_xlabel() and ax.get_title() == "trade"
-    texts = [text.get_text() for text in ax.get_legend().get_texts()]
-    assert {"Taylor", "DOP853", "RK4", "BDF", "projected", "poles at -1/(0.05 s)", "Pareto front"} <= set(texts)
+    keys = {key.get_text(): line.get_color() for key, line in zip(ax.get_legend().get_texts(), ax.get_legend().get_lines(), strict=True)}
+    assert {"projected", "poles at -1/(0.05 s)", "Pareto front"} <= set(keys)
+    best = set(study.pareto(cost)["method"].tolist())
+    (others,) = [text for text in keys if text.startswith("never best: ")]
+    assert {method for method in ("Taylor", "DOP853", "RK4", "BDF") if method in keys} == best & {"Taylor", "DOP853", "RK4", "BDF"}
+    assert set(others.removeprefix("never best: ").replace("\n", " ").split(", ")) == set(study["method"].tolist()) - best
+    grey = sum(len(line.get_xdata()) for line in drawn if line.get_color() == keys[others])
+    reaching = set(zip(study.pareto(cost)["method"].tolist(), study.pareto(cost)["drift"].tolist(), strict=True))
+    rows = zip(study["method"].tolist(), study["drift"].tolist(), np.isfinite(study["error"]).tolist(), strict=True)
+    assert grey == sum(good and (method, drift) not in reaching for method, drift, good in rows)
     with pytest.raises(NameUnknown):
         study.plot(cost="money")
 

@@ -24,6 +24,7 @@ from pathlib import Path
 
 from servoctl.codegen.cache import cache_directory, read_cached, replacing
 from servoctl.codegen.loops import SOURCES, digest
+from servoctl.progress import stage
 
 PATIENCE_WITH_COMPILER = 600.0  # s: one that takes longer waits for something, such as a licence
 USUAL = ("cc", "gcc", "clang")  # compilers that are looked for
@@ -140,6 +141,7 @@ def _scratch():
     return Path(directory.name)
 
 
+@stage("compiling")
 def _build(text, flags, file_name, command):
     """Compile into the cache, or into a temporary directory if that fails, as where the cache's disk is full."""
     import subprocess

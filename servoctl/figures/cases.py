@@ -8,6 +8,7 @@ from servoctl.figures import style
 from servoctl.units import as_units, unit_of_column
 
 MOST_RESULTS = 4  # results in one figure
+DRAWN_EACH = 20  # results below which each is drawn: percentiles say little of them
 SHARES = {5: "--", 50: "-", 95: ":"}  # percentiles
 
 
@@ -66,7 +67,14 @@ def sweep(study, names=None, against=None, units=None):
 
 
 def _histogram(ax, values, label):
+    """Draw how often results fall into bins, with percentiles; each result of few cases as a point."""
     values = values[np.isfinite(values)]
+    if len(values) < DRAWN_EACH:
+        ax.plot(np.sort(values), np.arange(1, len(values) + 1), "o", color=style.COLOURS[0])
+        ax.set(xlabel=label, ylabel="cases at most as large", ylim=(0, len(values) + 1))
+        ax.yaxis.get_major_locator().set_params(integer=True)
+        ax.grid(alpha=0.3)
+        return
     ax.hist(values, bins="auto" if len(values) < 5000 else 60, color=style.COLOURS[0], alpha=0.55)
     for share, line in SHARES.items():
         value = np.percentile(values, share)

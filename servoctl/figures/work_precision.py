@@ -1,5 +1,8 @@
 """Work-precision diagrams: of a trade-off, and of levels of modelling."""
 
+from itertools import product
+from textwrap import fill
+
 import numpy as np
 
 from servoctl.figures import style
@@ -18,25 +21,27 @@ OF = {
     "actuation": "error of the actuation",
     "in_loop": "error in the loop",
 }
-FRONT, UNRESOLVED, GREY = "#BBBBBB", "#EEEEEE", "#555555"
+FRONT, OTHER, UNRESOLVED, GREY = "#FFE08A", "#BBBBBB", "#EEEEEE", "#555555"
 
 
 def draw_tradeoff(study, ax, cost, title):
-    """Draw errors over a cost, with a line for each method and treatment, and the Pareto front."""
+    """Draw errors over a cost: a line for each method and treatment, in colour where it reaches the Pareto front."""
     ax = style.as_single_axes(ax, 5.0, width=8.0)
-    good = np.isfinite(study["error"]) & np.isfinite(study["seconds"])
+    good = np.isfinite(study["error"]) & np.isfinite(study[cost])
     methods, drifts = (list(dict.fromkeys(study[name][good].tolist())) for name in ("method", "drift"))
-    colours = {method: COLOURS[i % len(COLOURS)] for i, method in enumerate(methods)}
     error, low = np.maximum(study["error"], study.uncertainty), max(study.uncertainty, 1e-17)
-    for method, colour in colours.items():
-        for drift in drifts:
-            rows = good & (study["method"] == method) & (study["drift"] == drift)
-            line, mark, _ = _look(drift)
-            ax.plot(study[cost][rows], error[rows], line, marker=mark, color=colour, markersize=4, linewidth=1.1)
     front = study.pareto(cost)
-    best = np.maximum(front["error"], study.uncertainty)
-    ax.plot(front[cost], best, color=FRONT, linewidth=6, zorder=0, solid_capstyle="round")
-    ax.scatter(front[cost], best, s=60, color=FRONT, zorder=0)
+    best = set(zip(front["method"].tolist(), front["drift"].tolist(), strict=True))
+    reaching = [method for method in methods if any((method, drift) in best for drift in drifts)]
+    colours = {method: COLOURS[i % len(COLOURS)] for i, method in enumerate(reaching)}
+    for method, drift in product(methods, drifts):
+        rows, on = good & (study["method"] == method) & (study["drift"] == drift), (method, drift) in best
+        line, mark, _ = _look(drift)
+        look = {"color": colours[method] if on else OTHER, "linewidth": 1.4 if on else 0.8, "zorder": 3 if on else 2}
+        ax.plot(study[cost][rows], error[rows], line, marker=mark, markersize=4, **look)
+    reached = np.maximum(front["error"], study.uncertainty)
+    ax.plot(front[cost], reached, color=FRONT, linewidth=7, zorder=0, solid_capstyle="round")
+    ax.scatter(front[cost], reached, s=70, color=FRONT, zorder=0)
     ax.axhspan(low / 10, low, color=UNRESOLVED, zorder=-1)
     ax.set(xscale="log", yscale="log", xlabel=style.label(cost, "s" if cost == "seconds" else ""))
     ax.set(ylabel="error of the motion, relative", title=title)
@@ -45,7 +50,9 @@ def draw_tradeoff(study, ax, cost, title):
         ax.text(0.5, 0.5, "every run failed", transform=ax.transAxes, ha="center")
     ax.set_ylim(low / 10, min(3.0, max(10 * error[good].max(initial=low), 100 * low)))
     ax.grid(True, which="major", color="#DDDDDD", linewidth=0.6)
-    ax.legend(handles=_keys(colours, drifts), loc="center left", bbox_to_anchor=(1.01, 0.5), frameon=False, fontsize=8)
+    others = [method for method in methods if method not in colours]
+    keys = _keys(colours, others, drifts)
+    ax.legend(handles=keys, loc="center left", bbox_to_anchor=(1.01, 0.5), frameon=False, fontsize=8)
     return ax
 
 
@@ -59,9 +66,9 @@ def draw_levels(study, ax, cost, of, title):
         rows, best = study.take(np.flatnonzero(good & (study["level"] == level))), front.where(level=level)
         look = {"marker": MARKS[i % len(MARKS)], "linestyle": "", "markersize": 7}
         names = (None, level) if len(best) else (level, None)
-        ax.plot(rows[cost], np.maximum(rows[of], floor), **look, color=FRONT, markerfacecolor="none", label=names[0])
+        ax.plot(rows[cost], np.maximum(rows[of], floor), **look, color=OTHER, markerfacecolor="none", label=names[0])
         ax.plot(best[cost], np.maximum(best[of], floor), **look, color=COLOURS[i % len(COLOURS)], label=names[1])
-    ax.step(front[cost], np.maximum(front[of], floor), where="post", color=FRONT, linewidth=1.2, zorder=0)
+    ax.step(front[cost], np.maximum(front[of], floor), where="post", color=OTHER, linewidth=1.2, zorder=0)
     ax.axhspan(floor / 10, floor, color=UNRESOLVED, zorder=-1, label="not resolved")
     ax.set(xscale="log", yscale="log", xlabel=style.label(cost, "s" if cost == "seconds" else ""), title=title)
     ax.set(ylabel=f"{OF[of]}, relative", ylim=(floor / 10, max(3.0 * study[of][good].max(initial=floor), 100 * floor)))
@@ -77,10 +84,12 @@ def _look(drift):
     return LOOKS.get(drift, ("-.", "D", f"poles at -1/({drift} s)"))
 
 
-def _keys(colours, drifts):
+def _keys(colours, others, drifts):
     from matplotlib.lines import Line2D
 
     keys = [Line2D([], [], color=colour, label=method) for method, colour in colours.items()]
+    if others:
+        keys.append(Line2D([], [], color=OTHER, label=fill("never best: " + ", ".join(others), 22)))
     for drift in drifts:
         line, mark, words = _look(drift)
         keys.append(Line2D([], [], color=GREY, linestyle=line, marker=mark, markersize=4, label=words))

@@ -29,6 +29,7 @@ from servoctl.model.rest import started
 from servoctl.model.start import State
 from servoctl.model.store import Store, pack, unpack
 from servoctl.model.validity import affirmed
+from servoctl.progress import stage
 from servoctl.reduction.appell import require_positive
 from servoctl.reduction.definite import Definite, definite
 from servoctl.reduction.idle import names_of, needed
@@ -95,6 +96,7 @@ def derived(mechanism, program, guess=None):
     return _derived(mechanism, program, guess)
 
 
+@stage("deriving")
 def _derived(*specification):
     """The model of the arguments of `reduce`; its reduction is read from disk if another process has written it."""
     store = Store(*specification)

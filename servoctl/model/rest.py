@@ -10,6 +10,7 @@ import numpy as np
 
 from servoctl.errors import InconsistentStart, SingularProgram
 from servoctl.model.start import SPANNED, TOLERANCE, Aim, JetEquations, State, consistent, free_names, gauss_newton
+from servoctl.progress import stage
 from servoctl.reduction.ranks import equilibrate
 
 STANDS = 1e-9  # velocities below this, relative to the coordinates' size, are rest
@@ -58,6 +59,7 @@ class Standstill:
         )
 
 
+@stage("solving for the start")
 def started(model, t, held, guess, hold):
     """See `Model.start`: a consistent state, at a standstill the limit of the motion that follows."""
     state = failure = None

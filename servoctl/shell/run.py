@@ -12,6 +12,7 @@ from servoctl.inversion.verdict import HYPERBOLIC_ZEROS, verdict
 from servoctl.methods.bounded import Problem
 from servoctl.methods.choice import Bounded, as_drift, as_method, default_method
 from servoctl.methods.runge_kutta import ORDERS
+from servoctl.progress import stage
 from servoctl.shell import loop
 from servoctl.shell.folder import ANIMATION, FILES, LOOP_FILES, folder_of, jsonable, summary
 from servoctl.shell.motion import described
@@ -83,6 +84,7 @@ def _compute(args, name, scene, folder):
     return INCONCLUSIVE if verified == "inconclusive" else 0
 
 
+@stage("drawing")
 def _pictures_of(args, folder, name, run, closed):
     """Write the figures, and the animation if it is wanted; the mechanism moves as in the loop, else as planned."""
     moving = run if closed is None else closed

@@ -15,6 +15,7 @@ from servoctl.methods.taylor import series_loop
 from servoctl.model.model import Model
 from servoctl.model.store import fingerprint
 from servoctl.model.switching import switching
+from servoctl.progress import stage
 from servoctl.run import SAME_TIME, Run, on_side, require_model, sides
 from servoctl.verification.between import AGREES, ENOUGH_STEPS, FEW_STEPS, Flow, Integration, between
 from servoctl.verification.loop import verify_loop
@@ -47,6 +48,7 @@ MOST_OWN_PIVOTS = 3  # choices of pivots of its own, where those of the run vani
 MOST_ENTRIES = 2e6  # of matrices that are held at once
 
 
+@stage("verifying")
 def verify(model: Model | Closed, run: Run | None = None, segments: int = 20) -> Verification:
     """Check a run against the full mechanism, not the reduced model.
 
