@@ -7,7 +7,7 @@ from servoctl.errors import SpecificationError, unknown
 
 FORCES = {"m": "N", "rad": "N m", "m/s": "N", "rad/s": "N m"}  # unit of a position or a velocity: of its force
 OF_LOOP = ("command ", "input ", "measured ")  # how names of a loop's signals begin in a plain run
-OF_NUMBERS = ("_min", "_max", "_end")  # what a column of a study adds to the name of a signal
+OF_NUMBERS = re.compile(r"(?:final |rms )(.+)|max \|(.+)\||(.+)_(?:min|max|end)")  # columns of a study, of a signal
 
 
 def as_units(units):
@@ -73,9 +73,14 @@ def unit_of(name, units):
 
 
 def unit_of_column(name, units):
-    """Unit of a column of a study: of a signal, or of its least, greatest or last value."""
-    end = next((end for end in OF_NUMBERS if name.endswith(end)), "")
-    return unit_of(name, units) or unit_of(name.removeprefix("final ").removesuffix(end), units)
+    """Unit of a column of a study: of a signal, or of its least, greatest, mean or last value.
+
+    A study without units has none: its columns may be errors of signals.
+    """
+    if not units or name in units:
+        return units.get(name, "")
+    of = OF_NUMBERS.fullmatch(name)
+    return unit_of(next(filter(None, of.groups())) if of else name, units)
 
 
 def antiderivative(name, names):

@@ -54,8 +54,10 @@ def test_units_of_derived_signals():
         "y": "", "drift": "", "reaction_y": "",
     }  # fmt: skip
     assert {name: unit_of(name, units) for name in expected} == expected
-    columns = {"u_max": "N", "dx_end": "m/s", "final theta": "rad", "x": "m", "error": "", "worst": ""}
+    columns = {"u_max": "N", "dx_end": "m/s", "final theta": "rad", "x": "m", "error": "", "worst": "", "max |u|": "N"}
+    columns |= {"rms dx": "m/s", "max |residual x|": "", "residual x": ""}
     assert {name: unit_of_column(name, units) for name in columns} == columns
+    assert unit_of_column("energy", {}) == ""  # of a trade-off it is an error, relative
 
 
 def driven(displacement, units="m m rad", **given):
