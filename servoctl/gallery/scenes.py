@@ -74,11 +74,12 @@ class Scene:
     units: dict = field(default_factory=dict)
 
     def __post_init__(self):
-        object.__setattr__(self, "build", partial(_in_units, self.build, self.units))
+        if self.units:
+            object.__setattr__(self, "build", partial(_in_units, self.build, self.units))
 
 
-def _in_units(build, units):
-    mechanism, program = build()
+def _in_units(build, units, *arguments, **options):
+    mechanism, program = build(*arguments, **options)
     mechanism.units = {**units, **mechanism.units}
     return mechanism, program
 
