@@ -510,8 +510,10 @@ class _Residuals(Mapping):
             if name not in self._names():
                 raise unknown(name, self._names(), "residual")
             levels, values = self._run.signals("residuals")
-            for row in dict.fromkeys(level[0] for level in levels):
-                stored[row] = values[[i for i, level in enumerate(levels) if level[0] == row]]
+            rows, names = list(dict.fromkeys(level[0] for level in levels)), self._names()
+            # Near an instant other balances may take the places of the model's hidden ones, and have their names here.
+            for row, own in zip(rows, rows if set(rows) == set(names) else names, strict=True):
+                stored[own] = values[[i for i, level in enumerate(levels) if level[0] == row]]
         return stored[name]
 
 

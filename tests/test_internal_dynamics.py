@@ -351,7 +351,8 @@ def test_samples_that_resolve_nothing_are_inconclusive():
 # the bound that settles whether there is anything to warn of ----------------------------------------------------------
 
 
-QUIET = sorted(set(gallery) - {"vtol-centre", "appell-hamel-squared", "constant-speed-horizontal"})
+NEUTRAL = {"ball-on-turntable", "double-pendulum", "elastic-link", "rolling-disc"}  # oscillations; no bound of norms sees that they stay
+QUIET = sorted(set(gallery) - {"vtol-centre", "appell-hamel-squared", "constant-speed-horizontal"} - NEUTRAL)
 
 
 @pytest.mark.parametrize("name", QUIET)

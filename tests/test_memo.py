@@ -267,7 +267,7 @@ def as_text(reduction):
     matrices = [
         ("B", reduction.realisation.B),
         ("actuation", reduction.actuation),
-        ("multipliers", reduction.multipliers),
+        ("multipliers", ca.cse(reduction.multipliers)),  # what parts of them share is no part of the text
     ]
     rows = [(row.name, row.expression) for row in (*reduction.rows, *reduction.original.values())]
     return [(name, str(expression)) for name, expression in (*rows, *reduction.pivots, *matrices)]

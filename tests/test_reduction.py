@@ -73,6 +73,19 @@ GALLERY = {
     "two-link-arm": ([0, 0], {"X": 2, "Y": 2}),
     "pendubot": ([0, 2], {"angle": 2}),
     "wheeled-robot": ([1, 2], {"speed": 1, "clothoid": 0}),
+    "slung-load": ([0] * 4, {"across": 6, "up": 6}),
+    "slung-load-3d": ([0] * 8, {"load_x": 6, "load_y": 6, "load_z": 6, "heading": 2}),
+    "flexible-joint": ([0] * 2, {"angle": 4}),
+    "four-bar": ([0] * 3, {"turn": 2}),
+    "double-pendulum": ([0, 2, 2], {"cart": 2}),
+    "elastic-link": ([0, 2, 2, 2, 2], {"angle": 2}),
+    "six-axis-arm": ([0] * 6, {"tool_x": 2, "tool_y": 2, "tool_z": 2, "tool_rx": 2, "tool_ry": 2, "tool_rz": 2}),
+    "cable-robot": ([0] * 6, {"x": 2, "y": 2, "z": 2, "roll": 2, "pitch": 2, "yaw": 2}),
+    "reaction-wheels": ([0, 0, 0, 2, 2, 2], {"turn_rx": 2, "turn_ry": 2, "turn_rz": 2}),
+    "rolling-disc": ([0, 1, 1, 2, 2, 2], {"height": 2, "rolling_x": 1, "rolling_y": 1}),
+    "constant-jerk": ([3, 3], {"jerk": 0}),
+    "trailers": ([0, 1], {"curvature": 2, "speed": 2}),
+    "ball-on-turntable": ([0, 1, 1, 2, 2], {"rate": 2}),
 }
 
 

@@ -6,6 +6,7 @@ from math import pi
 
 import casadi as ca
 import closed_forms as cf
+import gallery_numbers
 import numpy as np
 import pytest
 from refusals import refused, warned
@@ -42,6 +43,15 @@ RESTING = {
 DRIFTING = (
     "appell-hamel", "appell-hamel-squared", "spiral", "constant-speed", "constant-speed-horizontal", "wheeled-robot",
 )  # fmt: skip
+# - double pendulum: two modes; elastic link: four damped ones.
+# - ball on a turntable: the circle at 2/7 of the table's rate; the rest drifts, as wheels of a satellite do.
+FLAT += ("slung-load", "slung-load-3d", "flexible-joint", "four-bar", "six-axis-arm")
+RESTING |= {
+    "double-pendulum": ("marginal", np.sqrt((2 + np.array([1, 1, -1, -1]) * np.sqrt(2)) * 9.81 / 0.8) * [1j, -1j, 1j, -1j]),
+    "elastic-link": ("minimum phase", gallery_numbers.link_poles()),
+}
+DRIFTING += ("constant-jerk", "rolling-disc", "trailers")
+CIRCLING = ("ball-on-turntable", "reaction-wheels")
 
 
 def scene_start(name, model):
@@ -63,7 +73,7 @@ def scene_run(name, model):
 
 
 def test_every_scene_has_a_verdict_by_hand():
-    assert {*FLAT, *RESTING, *DRIFTING} == {*gallery}
+    assert {*FLAT, *RESTING, *DRIFTING, *CIRCLING, "cable-robot"} == {*gallery}
 
 
 @pytest.mark.parametrize("name", FLAT)
@@ -78,7 +88,8 @@ def test_scenes_that_rest(name, gallery_model):
     found = verdict(gallery_model(name), scene_start(name, gallery_model(name)))
     assert found.word == word and {*found.rest} == {"start", "end"}
     for end in found.rest.values():
-        assert np.sort_complex(end.eigenvalues) == pytest.approx(np.sort_complex(expected), abs=1e-7)
+        there, here = (v[np.lexsort((v.imag, v.real.round(6)))] for v in (end.eigenvalues, expected))
+        assert there == pytest.approx(here, abs=1e-7)
 
 
 @pytest.mark.parametrize("name", DRIFTING)
@@ -88,6 +99,20 @@ def test_scenes_that_never_rest_are_judged_along_a_run(name, gallery_model):
     assert before.word == "inconclusive" and "run" in before.do and not before.rest
     found = verdict(model, scene_run(name, model))
     assert found.word == "marginal" and found.internal.verdict == "neutral"
+
+
+@pytest.mark.parametrize("name", CIRCLING)
+def test_scenes_whose_rests_go_on_are_marginal(name, gallery_model):
+    found = verdict(gallery_model(name), scene_run(name, gallery_model(name)))
+    circle = [2 / 7 * 3.0, 2 / 7 * 3.0] if name == "ball-on-turntable" else [0.0, 0.0]
+    assert found.word == "marginal" and found.internal.verdict == "neutral"
+    eigenvalues = found.rest["end"].eigenvalues
+    assert np.abs(np.sort_complex(eigenvalues)) == pytest.approx([circle[0], 0, 0, 0, 0, circle[1]], abs=1e-6)
+
+
+def test_ropes_beyond_what_a_program_determines_are_undetermined(gallery_model):
+    found = verdict(gallery_model("cable-robot"), scene_start("cable-robot", gallery_model("cable-robot")))
+    assert found.word == "undetermined" and "flat" in found.reason and "determines 6" in found.reason
 
 
 # traps ----------------------------------------------------------------------------------------------------------------
@@ -331,7 +356,7 @@ def test_rates_are_exact_where_the_run_has_the_jets(crane_plan):
     assert sampled.rate == pytest.approx(sv.report(model, finer).efforts["trolley"].rate, rel=1e-4)
 
 
-@pytest.mark.parametrize("name", gallery)
+@pytest.mark.parametrize("name", [name for name in gallery if name != "slung-load-3d"])  # its ranks take a minute
 def test_reports_are_short_and_serve_json(name, gallery_model):
     model = gallery_model(name)
     for motion in (None, scene_run(name, model)):

@@ -8,16 +8,29 @@ from importlib import import_module
 
 BUILDERS = {  # name of a function: its module in this package, imported when it is used
     "appell_hamel": "rolling",
+    "ball_on_turntable": "contacts",
+    "cable_robot": "chains",
     "cars": "springs",
+    "constant_jerk": "jerk",
     "constant_speed": "speed",
     "crane_3d": "cranes",
+    "double_pendulum": "hanging",
+    "elastic_link": "flexible",
+    "flexible_joint": "flexible",
+    "four_bar": "chains",
     "mass_on_car": "guides",
     "overhead_crane": "cranes",
     "passive_arm": "two_links",
     "pendubot": "two_links",
     "planar_arm": "links",
+    "reaction_wheels": "attitude",
+    "rolling_disc": "contacts",
+    "six_axis_arm": "six_axes",
+    "slung_load": "slung",
+    "slung_load_3d": "slung",
     "spatial_arm": "links",
     "spiral": "spirals",
+    "trailers": "hitched",
     "two_link_arm": "two_links",
     "vtol": "aircraft",
     "wheeled_robot": "wheels",
@@ -101,6 +114,7 @@ SINGULAR_PROGRAMS = "singular programs"
 BLAJER = "Blajer and Kołodziejczyk, Nonlinear Dynamics 50 (2007) 781-791"
 EMAMI = "Emami, Zohoor and Sohrabpour (docs/paper.md)"
 SEIFRIED = "Seifried and Blajer, Mechanical Sciences 4 (2013) 113-129"
+SREENATH = "Sreenath, Lee and Kumar, IEEE Conference on Decision and Control (2013) 2269-2274"
 FLIESS = "Fliess, Lévine, Martin and Rouchon, International Journal of Control 61 (1995) 1327-1361"
 
 _APPELL_HAMEL = {
@@ -109,6 +123,10 @@ _APPELL_HAMEL = {
     "guess": {"dx": 0.5, "dy": 0.6},
     "t_span": (0.0, 2.0),
 }
+
+_PRECESSION = {  # dphi by g tan λ = a Ω (3 s/2 + Ω sin(λ)/4), s = dphi - Ω sin λ
+    "x": 0.0, "y": 0.0, "psi": 0.0, "lean": 0.35, "phi": 0.0, "dpsi": 1.5, "dlean": 0.0, "dphi": 5.733703050854819,
+}  # fmt: skip
 
 gallery = {
     # --- flat machines
@@ -169,6 +187,36 @@ gallery = {
         number="The left thruster gives at most 295.5 N.",
         t_span=(0.0, 4.0),
     ),
+    "slung-load": Scene(
+        partial(_built, "slung_load"),
+        "A quadrotor in a vertical plane carries a load on a rope along a path.",
+        group=FLAT_MACHINES,
+        teaches="Thrust and moment follow from the load's path and its derivatives up to the sixth.",
+        source=SREENATH,
+        number="The thrust is at most 17.38 N.",
+        t_span=(0.0, 5.0),
+        units=_units("x z X Z [m] theta alpha [rad] thrust [N] moment [N m]"),
+    ),
+    "slung-load-3d": Scene(
+        partial(_built, "slung_load_3d"),
+        "A quadrotor in space carries a load on a rope up a quarter turn and keeps its heading.",
+        group=FLAT_MACHINES,
+        teaches="Eight coordinates and four inputs: the load's path and a heading determine all of them.",
+        source=SREENATH,
+        number="The thrust is at most 15.69 N.",
+        t_span=(0.0, 6.0),
+        units=_units("x y z X Y Z [m] alpha beta psi theta phi [rad] thrust [N] roll pitch yaw [N m]"),
+    ),
+    "flexible-joint": Scene(
+        partial(_built, "flexible_joint"),
+        "A link turns by 90 degrees, by a motor behind an elastic gear with friction.",
+        group=FLAT_MACHINES,
+        teaches="Elasticity and smooth friction are compensated exactly by the path's fourth derivative.",
+        source="Spong, Journal of Dynamic Systems, Measurement, and Control 109 (1987) 310-319; friction added",
+        number="The motor's torque is at most 35.59 N m.",
+        t_span=(0.0, 1.5),
+        units=_units("link motor [rad] torque [N m]"),
+    ),
     # --- material constraints
     "overhead-crane-redundant": Scene(
         partial(_built, "overhead_crane", coordinates="redundant"),
@@ -209,6 +257,17 @@ gallery = {
         number="The force is at most 12.31 N.",
         start={"x": 0.5, "dx": 0.0},
         t_span=(0.0, 6.0),
+    ),
+    "four-bar": Scene(
+        partial(_built, "four_bar"),
+        "The crank of a four-bar linkage makes a full turn from rest to rest.",
+        group=MATERIAL_CONSTRAINTS,
+        teaches="The loop is two material constraints; crank angle and branch determine the whole linkage.",
+        source="Freudenstein, Transactions of the ASME 77 (1955) 853-861; closed form by the law of cosines",
+        number="The rocker swings by 0.8981 rad.",
+        guess={"coupler": 1.0, "rocker": 1.7},
+        t_span=(0.0, 3.0),
+        units=_units("crank coupler rocker [rad] X Y [m] torque [N m]"),
     ),
     # --- internal dynamics
     "mass-on-car": Scene(
@@ -251,6 +310,28 @@ gallery = {
         start={"theta": 0.0, "dtheta": 0.0},
         t_span=(0.0, 1.0),
     ),
+    "double-pendulum": Scene(
+        partial(_built, "double_pendulum"),
+        "A cart with a double pendulum moves from rest to rest.",
+        group=INTERNAL_DYNAMICS,
+        teaches="What hangs from a programmed body is internal dynamics; without damping it swings on.",
+        source="closed form: the small oscillations of two equal pendulums",
+        number="The slower mode has 2.68 rad/s.",
+        start={"upper": 0.0, "lower": 0.0, "dupper": 0.0, "dlower": 0.0},
+        t_span=(0.0, 8.0),
+        units=_units("x X Y [m] upper lower [rad] force [N]"),
+    ),
+    "elastic-link": Scene(
+        partial(_built, "elastic_link"),
+        "The hub of an elastic link turns by 90 degrees; four segments vibrate.",
+        group=INTERNAL_DYNAMICS,
+        teaches="Eight internal states: the modes of a clamped beam, excited by the turn.",
+        source="closed form: the modes of four rods with springs",
+        number="The slowest mode has 10.81 rad/s.",
+        start={f"{d}bend{i}": 0.0 for d in ("", "d") for i in range(1, 5)},
+        t_span=(0.0, 2.0),
+        units=_units("hub bend1 bend2 bend3 bend4 [rad] X Y [m] torque [N m]"),
+    ),
     # --- arms and robots
     "two-link-arm": Scene(
         partial(_built, "two_link_arm"),
@@ -261,6 +342,42 @@ gallery = {
         number="The elbow is bent by 1.721 rad at the start.",
         guess={"q1": -0.4, "q2": 1.5},
         t_span=(0.0, 2.0),
+    ),
+    "six-axis-arm": Scene(
+        partial(_built, "six_axis_arm"),
+        "The tool of an arm with six axes moves along a line and turns.",
+        group=ARMS_AND_ROBOTS,
+        teaches="A pose is six residuals; torques follow from a robot's description by inverse dynamics.",
+        source="Luh, Walker and Paul, Journal of Dynamic Systems, Measurement, and Control 102 (1980) 69-76",
+        number="At rest the second motor holds 32.69 N m.",
+        guess={"pan": 0.3, "lift": 0.2, "elbow": 1.4, "roll": 0.2, "bend": 0.9, "turn": 0.4},
+        t_span=(0.0, 3.0),
+        units=_units(
+            "pan lift elbow roll bend turn [rad] "
+            "torque_pan torque_lift torque_elbow torque_roll torque_bend torque_turn [N m]"
+        ),
+    ),
+    "cable-robot": Scene(
+        partial(_built, "cable_robot"),
+        "Eight ropes move a platform; their tensions stay near a pretension.",
+        group=ARMS_AND_ROBOTS,
+        teaches="More actuators than residuals: of all tensions those nearest to a wish, which keeps every rope taut.",
+        source="Pott, Cable-Driven Parallel Robots, Springer (2018)",
+        number="The largest tension is 660.6 N.",
+        t_span=(0.0, 4.0),
+        units=_units("x y z [m] roll pitch yaw [rad] rope1 rope2 rope3 rope4 rope5 rope6 rope7 rope8 [N]"),
+    ),
+    "reaction-wheels": Scene(
+        partial(_built, "reaction_wheels"),
+        "Three reaction wheels turn a satellite by 120 degrees from rest to rest.",
+        group=ARMS_AND_ROBOTS,
+        teaches="Unit quaternion and body rates; the angular momentum of all bodies stays zero.",
+        source="closed form: conservation of angular momentum",
+        number="The third wheel reaches 65.45 rad/s.",
+        start={"a1": 0.0, "a2": 0.0, "a3": 0.0, "s1": 0.0, "s2": 0.0, "s3": 0.0},
+        guess={"e0": 1.0},
+        t_span=(0.0, 20.0),
+        units=_units("e0 e1 e2 e3 [1] a1 a2 a3 [rad] motor1 motor2 motor3 [N m]"),
     ),
     # --- ideal reactions
     "appell-hamel": Scene(
@@ -292,6 +409,17 @@ gallery = {
         guess={"dx": 5.0},
         t_span=(0.0, 1.0),
     ),
+    "rolling-disc": Scene(
+        partial(_built, "rolling_disc"),
+        "A thin disc rolls on the ground in steady precession.",
+        group=IDEAL_REACTIONS,
+        teaches="Rolling as a program: three residuals of orders 0, 1 and 1 whose reactions do no work.",
+        source="Appell, Rendiconti del Circolo Matematico di Palermo 14 (1900) 1-6; closed form",
+        number="The centre goes around a circle of 1.044 m radius.",
+        start=_PRECESSION,
+        t_span=(0.0, 4.2),
+        units=_units("x y z [m] psi lean phi [rad]"),
+    ),
     # --- higher orders
     "spiral": Scene(
         partial(_built, "spiral"),
@@ -302,6 +430,18 @@ gallery = {
         number="After 2 s the particle is at y = 0.6205 m.",
         start={"x": 0.0, "y": 0.0, "dx": 1.0, "dy": 0.0, "d2y": 0.0},
         t_span=(0.0, 2.0),
+    ),
+    "constant-jerk": Scene(
+        partial(_built, "constant_jerk"),
+        "A particle whose jerk keeps its magnitude, in gravity, by an ideal reaction.",
+        group=HIGHER_ORDERS,
+        teaches="Order 3, quadratic in the highest derivatives: a guess chooses one of two branches.",
+        source="closed form: a cubic path",
+        number="After 2 s it has gone 4.8 m sideways.",
+        start={"x": 0.0, "y": 0.0, "dx": 1.0, "dy": 0.0, "d2x": 0.6, "d2y": -9.01},
+        guess={"d3x": 1.2, "d3y": 1.6},
+        t_span=(0.0, 2.0),
+        units=_units("x y [m]"),
     ),
     # --- rolling machines
     "wheeled-robot": Scene(
@@ -314,6 +454,29 @@ gallery = {
         start={"x": 0.0, "y": 0.0, "psi": 0.0, "r": 0.0},
         guess={"v": 1.0},
         t_span=(0.0, 5.0),
+    ),
+    "trailers": Scene(
+        partial(_built, "trailers"),
+        "A wheeled robot pulls two trailers; the last one's curvature and speed are programmed.",
+        group=ROLLING_MACHINES,
+        teaches="Curvature of the last axle's path, a flat output, and its derivatives determine the steering.",
+        source="Rouchon, Fliess, Lévine and Martin, IEEE Conference on Decision and Control (1993) 2700-2705",
+        number="The robot comes to a circle of 2.298 m radius.",
+        start={"X": 0.0, "Y": 0.0, "theta1": 0.0, "theta2": 0.0},
+        guess={"v": 1.0},
+        t_span=(0.0, 10.0),
+        units=_units("X Y [m] theta0 theta1 theta2 [rad] drive [N] steer [N m]"),
+    ),
+    "ball-on-turntable": Scene(
+        partial(_built, "ball_on_turntable"),
+        "A motor turns a table at a constant rate; a ball rolls on it.",
+        group=ROLLING_MACHINES,
+        teaches="Rolling is two material constraints of order 1; the ball's circle has 2/7 of the table's rate.",
+        source="closed form, as in Milne, Vectorial Mechanics (1948)",
+        number="At 3 rad/s of the table the ball goes around at 0.8571 rad/s.",
+        start={"x": 0.5, "y": 0.0, "dx": 0.0, "dy": 0.3, "alpha": 0.0, "beta": 0.0},
+        t_span=(0.0, 8.0),
+        units=_units("x y [m] alpha beta table [rad] motor [N m]"),
     ),
     # --- singular programs
     "appell-hamel-squared": Scene(

@@ -205,6 +205,8 @@ class Tape:
             if op == ca.OP_FABS:
                 self.switches.append((a[0], None))
             return self._add(_UNARY[op], a[0])
+        if op == ca.OP_COPYSIGN and a[0] == a[1]:  # the sign of itself: by it conditions of branches stay in place
+            return a[0]
         if op in _CONSTANT:
             if op in (ca.OP_LT, ca.OP_LE, ca.OP_SIGN):
                 self._switch(a[0], a[1] if op != ca.OP_SIGN else None)

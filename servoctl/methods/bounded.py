@@ -246,7 +246,7 @@ class FreeEntries:
         """
         f, J, g, G = self._evaluated(t, x)
         J = J[:, self.free]
-        solved = np.linalg.solve(G[:, :, self.solved], np.concatenate([g[:, :, None], G[:, :, self.free]], axis=2))
+        solved = _solutions(G[:, :, self.solved], np.concatenate([g[:, :, None], G[:, :, self.free]], axis=2))
         step, tangent = np.zeros((len(t), self.n_x)), np.zeros((len(t), self.n_x, len(self.free)))
         step[:, self.solved], tangent[:, self.solved] = -solved[:, :, 0], -solved[:, :, 1:]
         tangent[:, self.free] = np.eye(len(self.free))
@@ -640,3 +640,13 @@ def basis_rates(c, theta):
     powers = np.arange(1, len(nodes))
     coefficients = np.linalg.inv(np.vander(nodes, increasing=True))[1:, 1:]
     return coefficients.T @ (powers[:, None] * theta ** (powers[:, None] - 1))
+
+
+def _solutions(matrices, right):
+    """X (N, m, k) of A X = B for each of N systems; nan where A is singular."""
+    try:
+        return np.linalg.solve(matrices, right)
+    except np.linalg.LinAlgError:
+        if len(matrices) == 1:
+            return np.full_like(right, np.nan)
+        return np.concatenate([_solutions(A[None], B[None]) for A, B in zip(matrices, right, strict=True)])

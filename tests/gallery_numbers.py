@@ -1,0 +1,178 @@
+"""Numbers of scenes: a pair for each run, as measured and by a closed form or a computation without servoctl."""
+
+from itertools import product
+from math import cos, pi, sin, sqrt
+
+import closed_forms
+import numpy as np
+from closed_forms import GRAVITY
+
+import servoctl as sv
+from servoctl.gallery.six_axes import AXES, HOME
+
+
+def _largest(run, name):
+    return max(abs(value) for _, value in run.extrema(name))
+
+
+def trailers(run):
+    """On circles about one centre, an axle lies at a right angle to the bar that pulls it: radii add up by squares."""
+    bends = np.cos(run["theta0"][-1] - run["theta1"][-1]) * np.cos(run["theta1"][-1] - run["theta2"][-1])
+    return run["v"][-1] / bends / run["r"][-1], sqrt(2.0**2 + 0.8**2 + 0.8**2)
+
+
+def rolling_disc(run):
+    """The centre's circle from the balance of moments about the centre, A = m a²/4 and C = m a²/2.
+
+    With u from the contact to the centre, e along the motion, n = u × e the axle and s the rate about it, the angular
+    momentum A Ω cos λ u + C s n turns at Ω about the vertical: -Ω cos λ (A Ω sin λ + C s) e. The contact's force
+    m (g up + Ω a s left) has the moment m a (Ω a s cos λ - g sin λ) e.
+    """
+    lean, turn, a = 0.35, 1.5, 0.3
+    s = (GRAVITY * sin(lean) - turn**2 * a * cos(lean) * sin(lean) / 4) / (1.5 * a * turn * cos(lean))
+    return np.ptp(run["y"]) / 2, a * s / turn
+
+
+def ball_on_turntable(run):
+    """m a' = F, 2/5 m a² ω' = -a up × F and rolling give v' = 2/7 Ω up × v."""
+    heading = np.unwrap(np.arctan2(run["dy"], run["dx"]))
+    return np.ptp(heading) / np.ptp(run.t), 2 / 7 * 3.0
+
+
+def _slung(load):
+    """Thrust from the load's path y(k), (d, N) arrays, height last: the rope carries the load, the rotors both."""
+    up = np.zeros((len(load(0)), 1))
+    up[-1] = GRAVITY
+    f, df, d2f = load(2) + up, load(3), load(4)
+    r = np.linalg.norm(f, axis=0)
+    n = f / r
+    dr = (n * df).sum(0)
+    dn = (df - dr * n) / r
+    d2r = (n * d2f).sum(0) + (dn * df).sum(0)
+    d2n = (d2f - d2r * n - 2 * dr * dn) / r
+    return np.linalg.norm(1.0 * (f + 1.2 * d2n) + 0.5 * f, axis=0)
+
+
+def slung_load(run):
+    def load(k):
+        return closed_forms.rest_to_rest(run.t, k, (0.0, -1.2), (4.0, 0.3), 4.0, 6)
+
+    return run["thrust"].max(), _slung(load).max()
+
+
+def slung_load_3d(run):
+    def load(k):
+        return closed_forms.quarter_turn(run.t, k, 2.0, -1.2, -0.2, 5.0, 6)
+
+    return run["thrust"].max(), _slung(load).max()
+
+
+def flexible_joint(run):
+    """motor = link + (I link'' + m g l cos link + c tanh(link'/w))/k, and so on for the torque."""
+    m, l, inertia, J, k, c, w = 5.0, 0.5, 1.7, 0.2, 500.0, 2.0, 0.1
+    a, da, d2a, d3a, d4a = (closed_forms.rest_to_rest(run.t, i, -pi / 2, 0.0, 1.0, 4) for i in range(5))
+    rubbing = np.tanh(da / w)
+    slope = (1 - rubbing**2) / w
+    twist = inertia * d2a + m * GRAVITY * l * np.cos(a) + c * rubbing
+    dtwist = inertia * d3a - m * GRAVITY * l * np.sin(a) * da + c * slope * d2a
+    d2twist = inertia * d4a - m * GRAVITY * l * (np.cos(a) * da**2 + np.sin(a) * d2a)
+    d2twist += c * (slope * d3a - 2 * rubbing * slope / w * d2a**2)
+    torque = J * (d2a + d2twist / k) + twist + c / 2 * np.tanh((da + dtwist / k) / w)
+    return run["torque"].max(), torque.max()
+
+
+def elastic_link(run):
+    return _slowest(run), np.abs(link_poles().imag).min()
+
+
+def link_poles():
+    """Eight poles of four rods with springs and dampers between them, for small angles [1/s]."""
+    n, m, l, tau = 4, 2.0 / 4, 1.0 / 4, 0.002
+    angles = np.tril(np.ones((n, n)))  # of the rods, by those of the springs
+    middles = [l * (angles[:i].sum(0) + angles[i] / 2) for i in range(n)]
+    mass = sum(m * (np.outer(y, y) + l**2 / 12 * np.outer(a, a)) for y, a in zip(middles, angles, strict=True))
+    spring = np.linalg.solve(mass, np.diag([160.0, 80.0, 80.0, 80.0]))
+    return np.linalg.eigvals(np.block([[np.zeros((n, n)), np.eye(n)], [-spring, -tau * spring]]))
+
+
+def double_pendulum(run):
+    return _slowest(run), sqrt((2 - sqrt(2)) * GRAVITY / 0.8)
+
+
+def _slowest(run):
+    """The slowest mode of the internal dynamics at the start [rad/s]."""
+    return np.abs(sv.internal_dynamics(run.model, run).eigenvalues[:, 0].imag).min()
+
+
+def four_bar(run):
+    """Crank a and coupler b in line, b + a and b - a from the crank's joint to the end of the rocker."""
+    a, b, c, d = 0.2, 0.6, 0.5, 0.6
+    folded, stretched = (np.arccos((d**2 + c**2 - r**2) / (2 * d * c)) for r in (b - a, b + a))
+    (_, low), (_, high) = run.extrema("rocker")
+    return high - low, stretched - folded
+
+
+def cable_robot(run):
+    """Of all tensions with W t = (m (a + g), J ω') those nearest to 500 N, along the motion."""
+    y = [closed_forms.rest_to_rest(run.t, k, (0.0,) * 4, (0.3, 0.2, 0.3, 0.1), 3.0, 2) for k in (0, 2)]
+    largest = 0.0
+    for (*place, yaw), (*acceleration, turned) in zip(*(values.T for values in y), strict=True):
+        wrench = np.array([*(20.0 * (np.array(acceleration) + [0, 0, GRAVITY])), 0.0, 0.0, 1.0 * turned])
+        W, wish = wrenches(place, yaw), np.full(8, 500.0)
+        largest = max(largest, (wish + np.linalg.pinv(W) @ (wrench - W @ wish)).max())
+    return max(run[f"rope{i}"].max() for i in range(1, 9)), largest
+
+
+def wrenches(place, yaw):
+    """Forces and moments about the centre of the platform by unit tensions of its ropes, (6, 8)."""
+    rotation = np.array([[cos(yaw), -sin(yaw), 0], [sin(yaw), cos(yaw), 0], [0, 0, 1]])
+    ropes = []
+    for up, side, front in product((1, -1), repeat=3):
+        arm = rotation @ [0.4 * front * up, 0.3 * side, -0.15 * up]
+        along = np.array([2.0 * front, 1.5 * side, 1.5 * up]) - place - arm
+        ropes.append([*along, *np.cross(arm, along)] / np.linalg.norm(along))
+    return np.array(ropes).T
+
+
+def reaction_wheels(run):
+    """J3 ω3 + J_w s3 = 0, and ω = (1, 2, 2)/3 times the rate of the turn, 15/8 of its mean at most."""
+    return _largest(run, "s3"), 50.0 * 2 / 3 * 15 / 8 * (2 * pi / 3) / 20.0 / 0.1
+
+
+def six_axis_arm(run):
+    """The gradient of the potential energy of the six bodies, by differences."""
+
+    def energy(lift):
+        rotation, place, total = np.eye(3), np.zeros(3), 0.0
+        for name, joint, axis, mass, centre, *_ in AXES:
+            place = place + rotation @ np.array(joint.split(), float)
+            angle = lift if name == "lift" else HOME[name]
+            c, s = cos(angle), sin(angle)
+            rotation = rotation @ ([[c, -s, 0], [s, c, 0], [0, 0, 1]] if axis == "0 0 1" else [[c, 0, s], [0, 1, 0], [-s, 0, c]])
+            total += mass * GRAVITY * (place + rotation @ np.array(centre.split(), float))[2]
+        return total
+
+    h = 1e-5
+    return -run["torque_lift"][0], -(energy(HOME["lift"] + h) - energy(HOME["lift"] - h)) / (2 * h)
+
+
+def constant_jerk(run):
+    """a - g = (1 + J t) e with e = (0.6, 0.8)."""
+    return run["x"][-1], 1.0 * 2.0 + 0.6 * (2.0**2 / 2 + 2.0 * 2.0**3 / 6)
+
+
+MORE = {
+    "trailers": trailers,
+    "rolling-disc": rolling_disc,
+    "ball-on-turntable": ball_on_turntable,
+    "slung-load": slung_load,
+    "slung-load-3d": slung_load_3d,
+    "flexible-joint": flexible_joint,
+    "elastic-link": elastic_link,
+    "double-pendulum": double_pendulum,
+    "four-bar": four_bar,
+    "cable-robot": cable_robot,
+    "reaction-wheels": reaction_wheels,
+    "six-axis-arm": six_axis_arm,
+    "constant-jerk": constant_jerk,
+}
