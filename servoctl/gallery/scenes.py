@@ -195,7 +195,6 @@ gallery = {
         source=SREENATH,
         number="The thrust is at most 17.38 N.",
         t_span=(0.0, 5.0),
-        units=_units("x z X Z [m] theta alpha [rad] thrust [N] moment [N m]"),
     ),
     "slung-load-3d": Scene(
         partial(_built, "slung_load_3d"),
@@ -205,7 +204,6 @@ gallery = {
         source=SREENATH,
         number="The thrust is at most 15.69 N.",
         t_span=(0.0, 6.0),
-        units=_units("x y z X Y Z [m] alpha beta psi theta phi [rad] thrust [N] roll pitch yaw [N m]"),
     ),
     "flexible-joint": Scene(
         partial(_built, "flexible_joint"),
@@ -215,7 +213,6 @@ gallery = {
         source="Spong, Journal of Dynamic Systems, Measurement, and Control 109 (1987) 310-319; friction added",
         number="The motor's torque is at most 35.59 N m.",
         t_span=(0.0, 1.5),
-        units=_units("link motor [rad] torque [N m]"),
     ),
     # --- material constraints
     "overhead-crane-redundant": Scene(
@@ -267,7 +264,6 @@ gallery = {
         number="The rocker swings by 0.8981 rad.",
         guess={"coupler": 1.0, "rocker": 1.7},
         t_span=(0.0, 3.0),
-        units=_units("crank coupler rocker [rad] X Y [m] torque [N m]"),
     ),
     # --- internal dynamics
     "mass-on-car": Scene(
@@ -319,7 +315,6 @@ gallery = {
         number="The slower mode has 2.68 rad/s.",
         start={"upper": 0.0, "lower": 0.0, "dupper": 0.0, "dlower": 0.0},
         t_span=(0.0, 8.0),
-        units=_units("x X Y [m] upper lower [rad] force [N]"),
     ),
     "elastic-link": Scene(
         partial(_built, "elastic_link"),
@@ -330,7 +325,6 @@ gallery = {
         number="The slowest mode has 10.81 rad/s.",
         start={f"{d}bend{i}": 0.0 for d in ("", "d") for i in range(1, 5)},
         t_span=(0.0, 2.0),
-        units=_units("hub bend1 bend2 bend3 bend4 [rad] X Y [m] torque [N m]"),
     ),
     # --- arms and robots
     "two-link-arm": Scene(
@@ -352,10 +346,6 @@ gallery = {
         number="At rest the second motor holds 32.69 N m.",
         guess={"pan": 0.3, "lift": 0.2, "elbow": 1.4, "roll": 0.2, "bend": 0.9, "turn": 0.4},
         t_span=(0.0, 3.0),
-        units=_units(
-            "pan lift elbow roll bend turn [rad] "
-            "torque_pan torque_lift torque_elbow torque_roll torque_bend torque_turn [N m]"
-        ),
     ),
     "cable-robot": Scene(
         partial(_built, "cable_robot"),
@@ -365,7 +355,6 @@ gallery = {
         source="Pott, Cable-Driven Parallel Robots, Springer (2018)",
         number="The largest tension is 660.6 N.",
         t_span=(0.0, 4.0),
-        units=_units("x y z [m] roll pitch yaw [rad] rope1 rope2 rope3 rope4 rope5 rope6 rope7 rope8 [N]"),
     ),
     "reaction-wheels": Scene(
         partial(_built, "reaction_wheels"),
@@ -377,7 +366,6 @@ gallery = {
         start={"a1": 0.0, "a2": 0.0, "a3": 0.0, "s1": 0.0, "s2": 0.0, "s3": 0.0},
         guess={"e0": 1.0},
         t_span=(0.0, 20.0),
-        units=_units("e0 e1 e2 e3 [1] a1 a2 a3 [rad] motor1 motor2 motor3 [N m]"),
     ),
     # --- ideal reactions
     "appell-hamel": Scene(
@@ -418,7 +406,6 @@ gallery = {
         number="The centre goes around a circle of 1.044 m radius.",
         start=_PRECESSION,
         t_span=(0.0, 4.2),
-        units=_units("x y z [m] psi lean phi [rad]"),
     ),
     # --- higher orders
     "spiral": Scene(
@@ -441,7 +428,6 @@ gallery = {
         start={"x": 0.0, "y": 0.0, "dx": 1.0, "dy": 0.0, "d2x": 0.6, "d2y": -9.01},
         guess={"d3x": 1.2, "d3y": 1.6},
         t_span=(0.0, 2.0),
-        units=_units("x y [m]"),
     ),
     # --- rolling machines
     "wheeled-robot": Scene(
@@ -465,7 +451,6 @@ gallery = {
         start={"X": 0.0, "Y": 0.0, "theta1": 0.0, "theta2": 0.0},
         guess={"v": 1.0},
         t_span=(0.0, 10.0),
-        units=_units("X Y [m] theta0 theta1 theta2 [rad] drive [N] steer [N m]"),
     ),
     "ball-on-turntable": Scene(
         partial(_built, "ball_on_turntable"),
@@ -476,7 +461,6 @@ gallery = {
         number="At 3 rad/s of the table the ball goes around at 0.8571 rad/s.",
         start={"x": 0.5, "y": 0.0, "dx": 0.0, "dy": 0.3, "alpha": 0.0, "beta": 0.0},
         t_span=(0.0, 8.0),
-        units=_units("x y [m] alpha beta table [rad] motor [N m]"),
     ),
     # --- singular programs
     "appell-hamel-squared": Scene(
