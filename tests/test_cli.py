@@ -19,7 +19,7 @@ from servoctl.errors import IntegrationStopped
 from servoctl.gallery import gallery
 from servoctl.methods.choice import METHODS as ALL_METHODS
 from servoctl.shell.folder import FILES, LOOP_FILES
-from servoctl.shell.listing import LINE, subjects
+from servoctl.shell.listing import COLUMNS_PRINTED, subjects
 from servoctl.shell.main import main
 
 FALL = '''"""A mass in a plane follows a path in x, and falls."""
@@ -485,7 +485,7 @@ def test_the_long_list_groups_scenes_by_what_they_teach(capsys):
     assert [name for members in groups.values() for name in members] == list(gallery)
     text = " ".join(printed.split())
     assert all(part in text for scene in gallery.values() for part in (scene.teaches, scene.number, scene.source))
-    assert max(map(len, printed.splitlines())) <= LINE
+    assert max(map(len, printed.splitlines())) <= COLUMNS_PRINTED
 
 
 def test_report_of_a_specification_simulates_nothing(here, fall, capsys, monkeypatch):

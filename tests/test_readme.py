@@ -98,17 +98,19 @@ def test_functions_named_in_the_table_of_equations_exist():
                 thing = getattr(thing, part)
 
 
-def test_the_gallery_table_is_what_the_models_say(gallery_model):
-    rows = table(PAGES[0], "name")
-    assert list(rows) == list(gallery)
-    for name, (what, orders, hidden, index, free) in rows.items():
-        model = gallery_model(name)
-        given = model.reduction.original.values()
-        kinds = [listed(row.order for row in given if row.kind == kind) for kind in ("program", "material")]
-        assert what == gallery[name].description.rstrip(".")
-        assert orders == " + ".join(filter(None, kinds))
-        assert (int(hidden), int(free)) == (len(model.reduction.hidden), model.free)
-        assert index == str(model.structure().index or "-")
+def test_the_page_of_the_gallery_is_what_the_scenes_and_models_say(gallery_model):
+    pages = runpy.run_path(str(ROOT / "docs" / "figures" / "gallery.py"))
+    assert pages["page"](gallery_model) == (ROOT / "docs" / "gallery.md").read_text(encoding="utf-8")
+    assert pages["facts"](gallery_model("crane-3d-redundant"), gallery["crane-3d-redundant"])[1:] == ["0, 0, 0 + 0", "2", "5", "0"]
+    assert pages["facts"](gallery_model("spiral"), gallery["spiral"])[1:] == ["3", "0", "-", "5"]
+
+
+def test_every_scene_of_the_gallery_has_a_small_picture(tmp_path):
+    drawing = runpy.run_path(str(ROOT / "docs" / "figures" / "gallery.py"))
+    pictures = {path.stem: path.stat().st_size for path in drawing["PICTURES"].glob("*.png")}
+    assert set(pictures) == set(gallery) and max(pictures.values()) < 25_000
+    drawing["draw"]("two-cars", tmp_path)
+    assert (tmp_path / "two-cars.png").stat().st_size == pytest.approx(pictures["two-cars"], rel=0.5)
 
 
 @pytest.mark.parametrize("name", SYSTEMS)

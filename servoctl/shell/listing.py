@@ -5,7 +5,7 @@ from textwrap import fill
 
 from servoctl.gallery import gallery
 
-LINE = 100  # characters of a line of the long list
+COLUMNS_PRINTED = 100  # characters of a line of the long list
 
 
 def add_list(listing):
@@ -39,4 +39,4 @@ def _of_subject(subject):
 
 def _details(scene):
     lines = (scene.description, scene.teaches, scene.number, f"Source: {scene.source}.")
-    return "\n".join(fill(line, LINE, initial_indent="    ", subsequent_indent="      ") for line in lines)
+    return "\n".join(fill(line, COLUMNS_PRINTED, initial_indent="    ", subsequent_indent="      ") for line in lines)
