@@ -13,7 +13,7 @@ from refusals import refused
 
 import servoctl as sv
 from servoctl.errors import NameUnknown, ServoError, SpecificationError
-from servoctl.gallery import gallery, overhead_crane, wheeled_robot
+from servoctl.gallery import Scene, gallery, overhead_crane, wheeled_robot
 from servoctl.units import rate_unit, unit_of, unit_of_column
 
 ROBOTS = Path(__file__).parents[1] / "examples" / "robots"
@@ -261,3 +261,9 @@ def test_a_robot_has_the_units_of_its_joints():
     assert units[7:13] == ["rad"] * 6 and units[19:] == ["rad/s"] * 6
     assert {free.units[name] for name in free.actuators} == {"N m"}
     assert pickle.loads(pickle.dumps(free)).units == free.units
+
+
+def test_a_scene_may_have_further_units():
+    scene = Scene(overhead_crane, "A crane.", units={"m_load": "kg", "trolley": "kN"})
+    assert scene.build()[0].units == CRANE_UNITS | {"m_load": "kg", "trolley": "kN"}
+    assert scene.build(coordinates="redundant")[0].q.names == ("x", "l", "X", "Z")

@@ -72,7 +72,7 @@ class Scene:
     t_span : (2,) tuple of float
         [s]
     units : dict of str to str
-        Units by name, beside those that the mechanism gives.
+        Units by name, beside those of the mechanism or instead of them.
     """
 
     build: Callable
@@ -93,7 +93,7 @@ class Scene:
 
 def _in_units(build, units, *arguments, **options):
     mechanism, program = build(*arguments, **options)
-    mechanism.units = {**units, **mechanism.units}
+    mechanism.units = mechanism.units | units
     return mechanism, program
 
 
