@@ -161,7 +161,84 @@ def constant_jerk(run):
     return run["x"][-1], 1.0 * 2.0 + 0.6 * (2.0**2 / 2 + 2.0 * 2.0**3 / 6)
 
 
+def rotary_crane(run):
+    """The load at (3 + s) exp(i π s/2), 5 - s below: the rope carries m (g - a)."""
+    s, ds, d2s = (closed_forms.rest_to_rest(run.t, k, 0.0, 1.0, 8.0, 6) for k in range(3))
+    turn, radius, w = np.exp(0.5j * pi * s), 3 + s, 0.5j * pi
+    across = turn * ((1 + w * radius) * d2s + (2 * w + w**2 * radius) * ds**2)
+    return run["tension"].max(), 100.0 * np.hypot(np.abs(across), GRAVITY + d2s).max()
+
+
+def beam_crane(run):
+    """Parallel ropes along g - a, from the height of the rail down to the beam."""
+    (_, Z), (across, down) = (closed_forms.rest_to_rest(run.t, k, (1.0, 4.0), (5.0, 3.0), 6.0, 4) for k in (0, 2))
+    return np.abs(run["x1"] - run["X"] + 1.0).max(), np.abs(Z * across / (GRAVITY - down)).max()
+
+
+def hopper(run):
+    """Angular momentum about the centre of mass, zero: it depends on the limbs' angles alone, and is integrated once."""
+    m, l = np.array([5.0, 1.5, 1.5]), np.array([0.4, 0.35, 0.35])
+    start, by = np.array([[-1.57], [2.6], [0.5]]), np.array([[1.2], [0.6], [0.6]])
+    nodes, weights = np.polynomial.legendre.leggauss(40)
+    t, weights = 0.25 * (nodes + 1), 0.25 * weights
+    angles = start + by * closed_forms.rest_to_rest(t, 0, 0.0, 1.0, 0.5, 4)
+    rates = by * closed_forms.rest_to_rest(t, 1, 0.0, 1.0, 0.5, 4)
+    common = np.cos(angles[:, None] - angles) * (m * l)[:, None, None] * (m * l)[:, None] / (20.0 + m.sum())
+    limbs = np.einsum("i,ik->k", m * l**2, rates) - np.einsum("ijk,jk->k", common, rates)
+    return -run["phi"][-1], weights @ (limbs / (0.6 + m @ l**2 - common.sum(axis=(0, 1))))
+
+
+def clothoid_arm(run):
+    """Speed 0.25 m/s and the heading 4 · 0.25 t²/2 from that at the start."""
+    nodes, weights = np.polynomial.legendre.leggauss(40)
+    chord = 0.25 * abs(weights @ np.exp(0.5j * (nodes + 1) ** 2))
+    return np.hypot(run["X"][-1] - run["X"][0], run["Y"][-1] - run["Y"][0]), chord
+
+
+def bicycle(run):
+    """The curvature of (8 sin w t, 4 sin 2 w t)."""
+    w, t = 2 * pi / 16.0, run.t
+    dx, dy = 8 * w * np.cos(w * t), 8 * w * np.cos(2 * w * t)
+    d2x, d2y = -8 * w**2 * np.sin(w * t), -16 * w**2 * np.sin(2 * w * t)
+    return np.abs(run["delta"]).max(), np.arctan(1.1 * np.abs(dx * d2y - dy * d2x) / np.hypot(dx, dy) ** 3).max()
+
+
+def acrobot(run):
+    """With p1 = k q2 and dp1/dt = -A q1 - B (q1 + q2) about the hanging pose; half of the trace decays."""
+    g1, g2 = GRAVITY * (4.0 * 0.3 + 3.0 * 0.6), GRAVITY * 3.0 * 0.25
+    m11, m12, k = 0.12 + 4.0 * 0.09 + 0.07 + 3.0 * 0.85**2, 0.07 + 3.0 * 0.25 * 0.85, -2.0
+    b = np.array([-(g1 + g2), -g2]) / k
+    matrix = np.array([np.array([0.0, k]) / m11 - m12 / m11 * b, b])
+    return _poles(run, -1).real.max(), np.linalg.eigvals(matrix).real.max()
+
+
+def _poles(run, sample):
+    """Eigenvalues of the internal dynamics at a sample."""
+    return sv.internal_dynamics(run.model, run).eigenvalues[:, sample]
+
+
+def furuta_pendulum(run):
+    """m l² θ'' + d θ' + m g l θ = 0 while the arm is at rest."""
+    inertia = 0.2 * 0.3**2
+    return _poles(run, 0).imag.max(), sqrt(GRAVITY / 0.3 - (0.005 / inertia / 2) ** 2)
+
+
+def steady_satellite(run):
+    return np.hypot(run["d2x"], run["d2y"])[-1], 3.986e14 / 7e6**2
+
+
 MORE = {
+    "rotary-crane": rotary_crane,
+    "beam-crane": beam_crane,
+    "hopper": hopper,
+    "clothoid-arm": clothoid_arm,
+    "bicycle": bicycle,
+    "acrobot": lambda run: tuple(-value for value in acrobot(run)),
+    "furuta-pendulum": furuta_pendulum,
+    "steady-satellite": steady_satellite,
+    "ball-and-beam": lambda run: (run["d2r"][-1], 5 / 7 * GRAVITY * sin(0.05)),
+    "cart-pole": lambda run: (_poles(run, 0).real.max(), sqrt(GRAVITY / 0.5)),
+    "fixed-rope-crane": lambda run: (_poles(run, 0).real.max(), sqrt(GRAVITY / (5.0 - 4.0))),
     "trailers": trailers,
     "rolling-disc": rolling_disc,
     "ball-on-turntable": ball_on_turntable,

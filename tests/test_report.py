@@ -10,6 +10,7 @@ import gallery_numbers
 import numpy as np
 import pytest
 from refusals import refused, warned
+from scenes import CERTIFIED
 
 import servoctl as sv
 from servoctl.gallery import gallery, mass_on_car
@@ -356,7 +357,7 @@ def test_rates_are_exact_where_the_run_has_the_jets(crane_plan):
     assert sampled.rate == pytest.approx(sv.report(model, finer).efforts["trolley"].rate, rel=1e-4)
 
 
-@pytest.mark.parametrize("name", [name for name in gallery if name != "slung-load-3d"])  # its ranks take a minute
+@pytest.mark.parametrize("name", [*CERTIFIED, "cable-robot", "constant-jerk", "trailers"])
 def test_reports_are_short_and_serve_json(name, gallery_model):
     model = gallery_model(name)
     for motion in (None, scene_run(name, model)):

@@ -7,11 +7,11 @@ python docs/figures/gallery.py NAME ...     the page and these pictures
 import io
 import sys
 import textwrap
-import warnings
 from pathlib import Path
 
 import servoctl as sv
 from servoctl.gallery import gallery
+from servoctl.inversion.verdict import HYPERBOLIC_ZEROS, verdict
 from servoctl.shell.listing import subjects
 
 PAGE = Path(__file__).parents[1] / "gallery.md"
@@ -60,12 +60,10 @@ def run_of(name):
     scene = gallery[name]
     model = sv.derive(*scene.build())
     start = model.start(**scene.start, guess=scene.guess)
+    unstable = verdict(model, start).dynamics == HYPERBOLIC_ZEROS
+    span = (scene.t_span[0], max(scene.t_span[1], *model.knots)) if unstable else scene.t_span
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("error", RuntimeWarning)
-            return sv.simulate(model, start, scene.t_span)
-    except RuntimeWarning:
-        return sv.inverse(*scene.build(), (scene.t_span[0], max(scene.t_span[1], *model.knots)))
+        return sv.simulate(model, start, span, "bounded" if unstable else None)
     except sv.SingularProgram as error:
         return error.run
 

@@ -59,6 +59,9 @@ class Local:
         return f"relative degrees {degrees}, zeros at infinity {zeros}{where}"
 
 
+UNDECIDED = Local((), 0, (), (), None, 0.0)
+
+
 @dataclass(frozen=True)
 class Structure(Shown):
     """Index and orders of a program realised by actuators (or by an ideal reaction) along a motion.
@@ -132,7 +135,7 @@ class Structure(Shown):
             lines.append(f"  it differs at {count}, first t = {t:.4g} s: {first.named(self.residuals)}")
         if self.start is not None and self.start[1].decided != typical:
             t, local = self.start
-            lost = local.zeros_at_infinity != self.zeros_at_infinity
+            lost = local.zeros_at_infinity and local.zeros_at_infinity != self.zeros_at_infinity
             lines.append(f"  at the start nearest zero, t = {t:.4g} s: {local.named(self.residuals)}")
             lines += ["    the motion's relative degrees are lost there: the program is singular"] if lost else []
         return lines
@@ -299,7 +302,7 @@ def _without_rounded(locals_, typical, pivots):
     kept = []
     for local, pivot in zip(locals_, pivots, strict=True):
         rounded = pivot > 0 and local.zeros_at_infinity != typical.zeros_at_infinity
-        kept.append(Local((), 0, (), (), None, local.margin, local.zero) if rounded else local)
+        kept.append(replace(UNDECIDED, margin=local.margin, zero=local.zero) if rounded else local)
     return kept
 
 
@@ -334,7 +337,7 @@ def _locals(reduction, points, states):
     Points are starts of the search for a motion, or `states` of one.
     """
     zero = _vanishing_jets(reduction, points)
-    result = [Local((), 0, (), (), None, 0.0, names) for names in zero]
+    result = [replace(UNDECIDED, zero=names) for names in zero]
     left = np.arange(len(points.t))
     enough = sum(depth < 2 * reduction.mechanism.q.n for depth in DEPTHS) + 1  # no order exceeds the plant's states
     for depth in DEPTHS[:enough]:
@@ -360,10 +363,13 @@ def _vanishing_jets(reduction, points):
 
 
 def _at_depth(reduction, points, depth, states):
-    """The structure at each point from J_N with N = depth, None where N is too small."""
+    """The structure at each point from J_N with N = depth, None where N is too small; a larger J_N contains it."""
     k = len(reduction.program.residuals)
     z = _jets(reduction, points, depth + 2, states)
-    return [_local(J, k, depth) for J in np.moveaxis(clean(*_input_jacobian(reduction, points, z, depth)), -1, 0)]
+    numbers, sizes = _input_jacobian(reduction, points, z, depth)
+    finite = np.isfinite(numbers).all(axis=(0, 1, 2, 3))
+    matrices = np.moveaxis(clean(numbers, sizes), -1, 0)
+    return [_local(J, k, depth) if known else UNDECIDED for J, known in zip(matrices, finite, strict=True)]
 
 
 def _jets(reduction, points, level, states):
