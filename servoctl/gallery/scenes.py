@@ -1,6 +1,5 @@
 """The table of scenes: what each is, what it teaches, where it comes from, and a number that it must give."""
 
-import re
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial
@@ -106,11 +105,6 @@ def _in_units(build, units, *arguments, **options):
     mechanism, program = build(*arguments, **options)
     mechanism.units = mechanism.units | units
     return mechanism, program
-
-
-def _units(text):
-    """Units by name, from names followed by their unit in brackets."""
-    return {name: unit for names, unit in re.findall(r"([^\[]+)\[([^]]+)\]", text) for name in names.split()}
 
 
 FLAT_MACHINES = "flat machines"
@@ -234,7 +228,6 @@ gallery = {
         number="The rope's tension is at most 1008 N.",
         guess={"r": 3.0, "l": 5.0},
         t_span=(0.0, 8.0),
-        units=_units("r l X Y Z [m] psi theta phi [rad] slew [N m] trolley hoist tension [N]"),
     ),
     # --- material constraints
     "overhead-crane-redundant": Scene(
@@ -296,7 +289,6 @@ gallery = {
         number="The trolleys are at most 0.4023 m beside the ends of the beam.",
         guess={"l1": 4.0, "l2": 4.0, "Z": 4.0},
         t_span=(0.0, 6.0),
-        units=_units("x1 x2 l1 l2 X Z [m] phi [rad] trolley1 trolley2 hoist1 hoist2 [N]"),
     ),
     # --- internal dynamics
     "mass-on-car": Scene(
@@ -368,7 +360,6 @@ gallery = {
         number="Errors grow with 4.429 1/s.",
         start={"theta": 0.0, "dtheta": 0.0},
         t_span=(0.0, 2.0),
-        units=_units("x [m] theta [rad] force [N]"),
     ),
     "fixed-rope-crane": Scene(
         partial(_built, "fixed_rope_crane"),
@@ -379,7 +370,6 @@ gallery = {
         number="Errors grow with 3.132 1/s.",
         start={"theta": 0.0, "dtheta": 0.0},
         t_span=(0.0, 4.0),
-        units=_units("x X_tool [m] theta [rad] cart [N]"),
     ),
     "furuta-pendulum": Scene(
         partial(_built, "furuta_pendulum"),
@@ -390,7 +380,6 @@ gallery = {
         number="The pendulum swings with 5.717 rad/s.",
         start={"theta": 0.0, "dtheta": 0.0},
         t_span=(0.0, 5.0),
-        units=_units("phi theta [rad] torque [N m]"),
     ),
     "ball-and-beam": Scene(
         partial(_built, "ball_and_beam"),
@@ -401,7 +390,6 @@ gallery = {
         number="The ball's acceleration settles at 0.3502 m/s².",
         start={"r": 0.0, "dr": 0.0},
         t_span=(0.0, 2.0),
-        units=_units("r [m] theta [rad] torque [N m]"),
     ),
     "acrobot": Scene(
         partial(_built, "acrobot"),
@@ -412,7 +400,6 @@ gallery = {
         number="The swing decays with 0.555 1/s.",
         start={"q1": -1.2, "q2": -0.2},
         t_span=(0.0, 16.0),
-        units=_units("q1 q2 [rad] hip [N m]"),
     ),
     "hopper": Scene(
         partial(_built, "hopper"),
@@ -423,7 +410,6 @@ gallery = {
         number="The trunk turns by 0.6328 rad.",
         start={"x": 0.0, "z": 0.0, "phi": 0.0, "dx": 2.0, "dz": 2.45, "dphi": 0.0},
         t_span=(0.0, 0.5),
-        units=_units("x z [m] phi leg left right [rad] hip left_shoulder right_shoulder [N m]"),
     ),
     # --- arms and robots
     "two-link-arm": Scene(
@@ -538,7 +524,6 @@ gallery = {
         start={"q1": -0.6, "q2": 1.5, "curvature": 0.0},
         guess={"dq1": -0.2, "dq2": 0.5},
         t_span=(0.0, 2.0),
-        units=_units("q1 q2 [rad] shoulder elbow [N m] X Y [m] curvature [1/m]"),
     ),
     "steady-satellite": Scene(
         partial(_built, "steady_satellite"),
@@ -550,7 +535,6 @@ gallery = {
         start={"x": 7e6, "y": 0.0, "dx": 0.0, "dy": 8266.372624, "d2y": 0.0},
         guess={"d2x": -8.134693877551021},
         t_span=(0.0, 8000.0),
-        units=_units("x y [m]"),
     ),
     # --- rolling machines
     "wheeled-robot": Scene(
@@ -595,7 +579,6 @@ gallery = {
         start={"x": 0.0, "y": 0.0, "psi": 0.7853981633974483},
         guess={"v": 4.44},
         t_span=(0.0, 16.0),
-        units=_units("x y [m] psi delta [rad] drive [N] steer [N m]"),
     ),
     # --- singular programs
     "appell-hamel-squared": Scene(
