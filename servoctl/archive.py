@@ -1,6 +1,7 @@
 """Files of results: npz archives without pickle, and the errors where one cannot be written or read."""
 
 import contextlib
+import csv
 import json
 from pathlib import Path
 
@@ -8,9 +9,11 @@ import numpy as np
 
 from servoctl.checks import as_path
 from servoctl.errors import ServoError
+from servoctl.units import with_unit
 
 FORMAT, SUFFIX = 1, ".npz"
 MOST_LETTERS = 200  # of another package's message
+FORMULA = ("=", "+", "-", "@", "\t", "\n")  # how texts begin that spreadsheets evaluate
 
 
 @contextlib.contextmanager
@@ -38,6 +41,47 @@ def save(path, what, facts, arrays):
     with writing(path, what):
         np.savez_compressed(path, meta=np.array(json.dumps({"format": FORMAT, **facts})), **arrays)
     return path
+
+
+def table(path, what, columns, units):
+    """Write columns by name as CSV: a line of names with their units [N], one line for each row; returns the path.
+
+    A text that spreadsheets would take for a formula, as it begins with =, +, - or @, has a ' before it.
+    """
+    rows = zip(*(values.tolist() for values in columns.values()), strict=True)
+    head = [with_unit(name, units.get(name, "")) for name in columns]
+    with writing(path, what) as path:
+        with open(path, "w", newline="", encoding="utf-8", errors="backslashreplace") as file:
+            lines = csv.writer(file, lineterminator="\n")
+            lines.writerows([_cell(value) for value in row] for row in (head, *rows))
+    return path
+
+
+def _cell(value):
+    if not isinstance(value, str):
+        return value
+    text = value.replace("\r\n", "\n").replace("\r", "\n")  # the csv module quotes no carriage return
+    return f"'{text}" if text.startswith(FORMULA) else text
+
+
+def frame(columns, units, index=None):
+    """A pandas.DataFrame of columns by name, with `attrs["units"]`. `ServoError` without pandas."""
+    try:
+        import pandas
+    except ImportError as error:
+        raise _missing("pandas", "to_xarray or csv") from error
+    table = pandas.DataFrame(columns)
+    table.attrs["units"] = {name: units[name] for name in columns if units.get(name)}
+    return table if index is None else table.set_index(index)
+
+
+def _missing(package, other):
+    return ServoError(
+        f"{package} is not installed.",
+        f"Tables of {package} need it; the extra servoctl[io] has it.",
+        do=f"Install {package}, or use {other}.",
+        package=package,
+    )
 
 
 def _suffixed(path):
@@ -93,6 +137,6 @@ def dataset(variables, coordinates, attributes):
     try:
         import xarray
     except ImportError as error:
-        raise ServoError("xarray is not installed.", do="Install xarray, or use save.", package="xarray") from error
+        raise _missing("xarray", "save or csv") from error
     attributes = {k: v if type(v) in (int, float, str) else json.dumps(v) for k, v in attributes.items()}
     return xarray.Dataset(variables, coords=coordinates, attrs=attributes)

@@ -120,14 +120,6 @@ def texts(value, what):
     return tuple(value)
 
 
-def as_units(units):
-    """Units by name, texts, from a dict or None."""
-    if not all(isinstance(unit, str) for unit in mapping(units, "The units").values()):
-        rule, do = "A unit is a text.", 'Write {"x": "m", "theta": "rad"}.'
-        raise SpecificationError(f"The units are {repr(units)[:150]}.", rule, do=do, units=units)
-    return units or {}
-
-
 def as_list(value):
     """A list from an iterable in order; None from anything else: text, symbols, dicts, sets."""
     if isinstance(value, (str, bytes, Mapping, Set)) or not isinstance(value, Iterable):

@@ -17,6 +17,7 @@ import numpy as np
 
 from servoctl.checks import positive
 from servoctl.errors import SpecificationError
+from servoctl.markup import Shown
 from servoctl.methods.flow import deviations
 from servoctl.methods.kinks import SMOOTHER, stays_on_kink
 from servoctl.methods.stability import stability_function
@@ -52,7 +53,7 @@ NEAR_ONE = 1e-3  # of a multiplier: within this of 1 it is neutral
 
 
 @dataclass(frozen=True, eq=False)
-class InternalDynamics:
+class InternalDynamics(Shown):
     """How errors in the internal dynamics of a program grow along a motion; made by `internal_dynamics`.
 
     Growth is measured in the states' norm after one scaling of each state, the one with the smallest propagators

@@ -11,8 +11,10 @@ import numpy as np
 from servoctl import archive
 from servoctl.checks import finite, whole
 from servoctl.errors import SpecificationError, unknown
+from servoctl.markup import EXTREMA, Shown, digits
 from servoctl.model.start import State
 from servoctl.model.switching import switching
+from servoctl.units import unit_of
 from servoctl.values import Value, read_only, same
 
 STENCIL = 9  # samples of the polynomial through which an extremum is refined: error of order h^9
@@ -21,7 +23,7 @@ SAME_TIME = 1e-12  # relative: rounding of an instant
 AGREES = 1e-6  # relative: difference of a signal in a file from that of a model, below which the run is of this model
 FACTS = {
     "method": str, "drift": str, "counters": dict, "success": bool, "status": int, "message": str, "knots": list,
-    "jet_names": list, "internal": dict,
+    "jet_names": list, "internal": dict, "units": dict,
 }  # of a saved run
 
 
@@ -42,8 +44,70 @@ class ByName:
         return name in self.names
 
 
+class Sampled(ByName, Shown):
+    """Signals by name at instants `t`, with the `units` of a mechanism, as tables."""
+
+    def unit(self, name: str) -> str:
+        """The unit of a signal, as the specification gives it or as it follows; "" if it is not known.
+
+        Parameters
+        ----------
+        name : str
+        """
+        return unit_of(name, self.units)
+
+    def _columns(self):
+        """Times and all signals by name, and their units."""
+        return {"t": self.t, **{name: self[name] for name in self.names}}, {"t": "s", **self._units_of_names()}
+
+    def _units_of_names(self):
+        return {name: self.unit(name) for name in self.names}
+
+    def csv(self, path):
+        """Write times and all signals as CSV: a line of names with units, then one line for each sample.
+
+        Parameters
+        ----------
+        path : str or Path
+
+        Returns
+        -------
+        Path
+
+        Raises
+        ------
+        ServoError
+            If the file cannot be written.
+        """
+        return archive.table(path, "table", *self._columns())
+
+    def to_pandas(self):
+        """All signals as a pandas.DataFrame over time; `attrs["units"]` has the known units by name.
+
+        Raises
+        ------
+        ServoError
+            If pandas is not installed.
+        """
+        return archive.frame(*self._columns(), index="t")
+
+    def to_xarray(self):
+        """All signals and residuals as an xarray.Dataset over time, with units; its `to_netcdf(path)` writes netCDF.
+
+        Raises
+        ------
+        ServoError
+            If xarray is not installed.
+        """
+        units = self._units_of_names()
+        data = {name: ("t", self[name], {"units": units[name]} if units[name] else {}) for name in self.names}
+        for name in self.residual:
+            data[f"residual_{name}"] = ((f"level_{name}", "t"), self.residual[name])
+        return archive.dataset(data, {"t": ("t", self.t, {"units": "s"})}, self._attributes())
+
+
 @dataclass(frozen=True, eq=False)
-class Run(ByName, Value):
+class Run(Sampled, Value):
     """A motion with its actuation and its residuals; made by `simulate`, `close` or `load`.
 
     `run["theta"]`, `run["dtheta"]`, `run["trolley"]` are (N,) arrays, SI. Time derivatives of an actuation, output or
@@ -92,6 +156,7 @@ class Run(ByName, Value):
     verdict: Mapping | Callable = field(default_factory=dict, compare=False, repr=False)
     start: State | None = None
     events: dict = field(default_factory=dict)
+    stored_units: dict = field(default_factory=dict, compare=False, repr=False)
 
     def __post_init__(self):
         for name in ("t", "jets"):
@@ -132,6 +197,11 @@ class Run(ByName, Value):
     def names(self) -> tuple[str, ...]:
         """Names of all signals."""
         return tuple(dict.fromkeys([*self.jet_names, *self._groups, *self.stored]))
+
+    @property
+    def units(self) -> dict[str, str]:
+        """Units by name, as the mechanism gives them."""
+        return self.stored_units if self.model is None else self.model.reduction.mechanism.units
 
     def __getitem__(self, name: str) -> np.ndarray:
         if not isinstance(name, str):
@@ -360,23 +430,30 @@ class Run(ByName, Value):
             arrays |= {f"event_{i}": at.t, f"event_jets_{i}": at.jets}
         return archive.save(path, "run", facts, arrays)
 
-    def to_xarray(self):
-        """The run as an xarray.Dataset over time, where xarray is installed.
-
-        Raises
-        ------
-        ServoError
-            If xarray is not installed.
-        """
-        data = {name: ("t", self[name]) for name in self.names}
-        for name in self.residual:
-            data[f"residual_{name}"] = ((f"level_{name}", "t"), self.residual[name])
-        attributes = {"method": self.method, "drift": self.drift, "message": self.message, **self.counters}
-        return archive.dataset(data, {"t": self.t}, attributes)
+    def _attributes(self):
+        return {"method": self.method, "drift": self.drift, "message": self.message, **self.counters}
 
     def __repr__(self):
+        lines = self._facts()
+        for name, low, t_low, high, t_high, unit in self._extremes():
+            lines.append(f"  {name}: {low:.6g}{unit} (t = {t_low:.4g} s) .. {high:.6g}{unit} (t = {t_high:.4g} s)")
+        return "\n".join(lines)
+
+    def _tables(self):
+        rows = [(name, *map(digits, numbers), unit.strip()) for name, *numbers, unit in self._extremes()]
+        return [(EXTREMA, rows)] if rows else [], self._facts()[1:]
+
+    def _extremes(self):
+        """(name, least value, its t, greatest value, its t, unit) of the first actuators and outputs."""
+        signals = (*self.model.actuators, *self.model.outputs) if self.model is not None and len(self.t) else ()
+        for name in [name for name in signals if name in self.names and np.isfinite(self[name]).any()][:7]:
+            (t_low, low), (t_high, high) = self.extrema(name)
+            yield name, low, t_low, high, t_high, f" {self.unit(name)}".rstrip()
+
+    def _facts(self):
+        """Lines that say how the run was computed."""
         if not len(self.t):
-            return f"Run: no samples; {self.message}"
+            return [f"Run: no samples; {self.message}"]
         worst = {name: float(np.abs(self.residual[name]).max(initial=0.0)) for name in self.residual}
         shown = sorted(worst, key=worst.get, reverse=True)[:4]
         lines = [
@@ -392,12 +469,7 @@ class Run(ByName, Value):
         if self.start is not None and self.model is not None and self.model.flat:
             q = (f"{name} = {self.start[name]:.4g}" for name in self.model.coordinate_names[:6])
             lines.insert(2, f"  branch of {', '.join(q)} at t = {self.start.t:g} s")
-        signals = (*self.model.actuators, *self.model.outputs) if self.model is not None else ()
-        signals = [name for name in signals if name in self.names and np.isfinite(self[name]).any()]
-        for name in signals[:7]:
-            (t_low, low), (t_high, high) = self.extrema(name)
-            lines.append(f"  {name}: {low:.6g} (t = {t_low:.4g} s) .. {high:.6g} (t = {t_high:.4g} s)")
-        return "\n".join(line for line in lines if line.strip())
+        return [line for line in lines if line.strip()]
 
 
 def _times_in_words(t):
@@ -498,16 +570,16 @@ def _from_archive(facts, arrays):
         values, lists = start["values"], {name: tuple(start[name]) for name in ("held", "free")}
         start = State(start["t"], np.array([*values.values()]), tuple(values), residual=start["residual"], **lists)
     own = {name: tuple(facts[name]) if kind is list else facts[name] for name, kind in FACTS.items()}
-    own["verdict"] = own.pop("internal")
-    events = {name: _event_at(arrays, i, own["jet_names"]) for i, name in enumerate(archive.named(facts["events"]))}
+    own["verdict"], own["stored_units"] = own.pop("internal"), own.pop("units")
+    events = {name: _event_at(arrays, i, own) for i, name in enumerate(archive.named(facts["events"]))}
     return Run(t, jets, stored=signals, stored_residual=residuals, start=start, events=events, **own), facts
 
 
-def _event_at(arrays, i, names):
+def _event_at(arrays, i, own):
     """The motion at the instants of the i-th event of an archive."""
     t = archive.numbers(arrays, f"event_{i}", None)
     jets = archive.numbers(arrays, f"event_jets_{i}", None, len(t))
-    return Run(t, jets, names[: len(jets)])
+    return Run(t, jets, own["jet_names"][: len(jets)], stored_units=own["stored_units"])
 
 
 def _of_model(run, facts, model):

@@ -156,7 +156,7 @@ def test_what_is_no_shape_is_refused(shapes, facts):
 
 
 def test_depth_is_drawn_downwards(gallery_model):
-    for name, axes in (("overhead-crane", ("X", "Z")), ("crane-3d", ("X", "Z"))):
+    for name, axes in (("overhead-crane", ("X [m]", "Z [m]")), ("crane-3d", ("X [m]", "Z [m]"))):
         model, scene = gallery_model(name), gallery[name]
         run = sv.simulate(model, model.start(guess=scene.guess), (0.0, 3.0), t_eval=[0.0, 1.5, 3.0])
         ax = sv.plots.path(run)

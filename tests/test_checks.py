@@ -6,6 +6,7 @@ import pytest
 
 import servoctl as sv
 from servoctl import checks
+from servoctl.units import as_units
 
 
 def error_of(check, *given, **options):
@@ -76,9 +77,9 @@ def test_kinds_texts_and_units():
         assert error_of(checks.texts, value, "The names").details["value"] == value
     for value in (None, 3, b"x", "\ud800"):
         assert error_of(checks.text, "title", value).details["value"] == value
-    assert checks.as_units(None) == {} and checks.as_units({"x": "m"}) == {"x": "m"}
+    assert as_units(None) == {} and as_units({"x": "m"}) == {"x": "m"}
     for units in ({"x": 1}, {1: "m"}, ["m"], "m"):
-        error_of(checks.as_units, units)
+        error_of(as_units, units)
 
 
 def test_expressions_hold_no_truth_values():

@@ -10,12 +10,8 @@ from scenes import CRANE
 
 import servoctl as sv
 from servoctl.figures.loop import LIMIT
-from servoctl.gallery import gallery
 from servoctl.shell.folder import FILES
 from servoctl.shell.main import main
-
-UNITS = gallery["overhead-crane"].units
-
 
 pytestmark = pytest.mark.usefixtures("here")
 
@@ -177,7 +173,7 @@ def curves(ax):
 def test_the_figure_of_a_loop_shows_errors_inputs_and_limits(plan):
     machine = sv.plant(CRANE, m_load=115.0, limits={"trolley": 140.0})
     run = sv.close(machine, sv.lqr(plan, sv.plant(CRANE)), plan.state(0.0), (0.0, 8.0))
-    axes = sv.figures.closed(run, units=UNITS)
+    axes = sv.figures.closed(run)
     labels = ["residuals, SI", "off the plan [m]", "off the plan [rad]", "trolley [N]", "hoist [N]"]
     assert [ax.get_ylabel() for ax in axes] == labels and axes[-1].get_xlabel() == "t [s]"
     assert list(curves(axes[0])) == ["X", "Z"] and list(curves(axes[1])) == ["x", "l"]
@@ -192,8 +188,8 @@ def test_the_figure_of_a_loop_shows_errors_inputs_and_limits(plan):
     assert axes[0].figure.get_figwidth() == 10.0
 
 
-def test_a_loop_without_plan_and_units_is_drawn_by_name():
+def test_a_loop_without_plan_is_drawn_by_name():
     x0 = {"x": 0.0, "l": 4.0, "theta": 0.1, "dx": 0.0, "dl": 0.0, "dtheta": 0.0}
     run = sv.close(sv.plant(CRANE), lambda t, y: [0.0, -981.0], x0, (0.0, 1.0), timing=sv.Timing(rate=50.0))
     axes = sv.figures.closed(run)
-    assert [ax.get_ylabel() for ax in axes] == ["trolley", "hoist"] and list(curves(axes[0])) == ["input"]
+    assert [ax.get_ylabel() for ax in axes] == ["trolley [N]", "hoist [N]"] and list(curves(axes[0])) == ["input"]

@@ -118,7 +118,7 @@ def test_a_run_is_no_sweep(run):
 
 def test_the_load_of_a_crane_is_drawn_on_its_path(gallery_model):
     model, scene = gallery_model("overhead-crane"), gallery["overhead-crane"]
-    ax = plots.path(servoctl.simulate(model, model.start(guess=scene.guess), scene.t_span), units=scene.units)
+    ax = plots.path(servoctl.simulate(model, model.start(guess=scene.guess), scene.t_span))
     curve = ax.get_lines()[0]
     assert (ax.get_xlabel(), ax.get_ylabel()) == ("X [m]", "Z [m]")
     assert np.allclose(curve.get_ydata(), 4.0 - 0.4 * curve.get_xdata(), rtol=0, atol=1e-12)

@@ -21,13 +21,13 @@ FILES = sorted(PACKAGE.rglob("*.py"))
 ENTRIES = ("__init__.py", "__main__.py")  # of the package itself: they gather the rest
 
 LAYERS = (
-    "version", "errors", "values", "tolerances", "checks", "archive", "progress", "jets", "spec", "robots", "programs", "reduction", "codegen",
+    "version", "errors", "values", "markup", "tolerances", "checks", "units", "archive", "progress", "jets", "spec", "robots", "programs", "reduction", "codegen",
     "model", "plants", "run", "methods", "growth", "simulation", "figures", "control", "verification",
     "sensitivities", "study", "inversion", "interop", "export", "gallery", "shell",
 )  # fmt: skip
 WITHOUT_CASADI = ("study", "figures", "interop", "shell")
 SWEEPS = ("concurrent.futures", "multiprocessing", "importlib.metadata")
-LATE = ("scipy", "matplotlib", "control", "tqdm", "xarray", "dask")
+LATE = ("scipy", "matplotlib", "control", "tqdm", "xarray", "pandas", "dask")
 MOST_IN_A_FUNCTION, MOST_PARAMETERS, MOST_MODULES_OF_A_NAME, MOST_IN_A_REPR = 40, 8, 2, 12
 SHEETS = ("Mechanism.__init__", "simulate")  # filled in by keyword
 

@@ -154,10 +154,9 @@ class Compiled:
         parts = (self.expression, self.name, self.loops, self._project, self.others, self.sizes)
         # Emitting takes longer than reading: the C text travels until the library is loaded, where it can be compiled.
         travels = self.loops and "_library" not in self.__dict__ and compiler.compiler() is not None
-        state = {"_text": self.source() if travels else None}
-        return Compiled, parts, state | ({"operations": self.operations} if self.loops else {})
         text = self.source() if travels else ""
-        return Compiled, parts, {"_text": None if not text or BOUND in text else text}
+        state = {"_text": None if not text or BOUND in text else text}
+        return Compiled, parts, state | ({"operations": self.operations} if self.loops else {})
 
     def __eq__(self, other):
         return self is other or (isinstance(other, Compiled) and self.source() == other.source())

@@ -10,12 +10,13 @@ from numpy.typing import ArrayLike
 from servoctl.checks import ON_SAMPLE, finite, positive, require_kind
 from servoctl.codegen.function import Compiled
 from servoctl.errors import SpecificationError, unknown
+from servoctl.markup import Shown
 from servoctl.run import Run
 from servoctl.values import Value
 
 
 @dataclass(frozen=True, eq=False)
-class Law(Value):
+class Law(Value, Shown):
     """A sampled law u = law(t, measurement); made by `feedforward`, `pd`, `lqr` and others.
 
     At the sampling instant t_k = t0 + k/rate, `step` maps t_k, [y; z] and column k of `schedule` to [u; z+; signals]:

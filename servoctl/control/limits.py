@@ -25,6 +25,7 @@ from servoctl.control.sampling import discretised
 from servoctl.control.time_law import fastest
 from servoctl.errors import LimitExceeded, ServoError, SpecificationError, unknown
 from servoctl.jets.branches import cse
+from servoctl.markup import Shown
 from servoctl.plants.plant import Plant
 from servoctl.tolerances import TINY
 from servoctl.values import Value
@@ -486,7 +487,7 @@ def _sizes(plan, plant, H):
 
 
 @dataclass(frozen=True)
-class LimitReport:
+class LimitReport(Shown):
     """The residuals that gave way in a closed loop; made by `limit_report`.
 
     Attributes

@@ -14,15 +14,16 @@ from servoctl.control.loop import Loop
 from servoctl.control.reference import resampled
 from servoctl.control.residuals import known_residuals
 from servoctl.errors import SpecificationError, unknown
+from servoctl.markup import digits
 from servoctl.plants.plant import Plant
-from servoctl.run import ByName, Run
+from servoctl.run import Run, Sampled
 from servoctl.values import Value
 
 NONE, LOWER, UPPER, FALLING, RISING = 0, -1, 1, -2, 2  # which limit an input has met
 
 
 @dataclass(frozen=True, eq=False)
-class Closed(ByName, Value):
+class Closed(Sampled, Value):
     """The motion of a plant under a law; made by `close`.
 
     `run["theta"]`, `run["dtheta"]`, `run["d2theta"]`, `run["trolley"]` are (N,) arrays at the samples, SI. The
@@ -79,6 +80,11 @@ class Closed(ByName, Value):
             "accelerations": mechanism.q.jet_names(2), "outputs": tuple(mechanism.outputs), "power": ("energy",),
             "multipliers": self.plant.equations.multiplier_names,
         }  # fmt: skip
+
+    @property
+    def units(self) -> dict[str, str]:
+        """Units by name, as the mechanism gives them."""
+        return self.plant.mechanism.units
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -239,6 +245,13 @@ class Closed(ByName, Value):
             )
         return self.states[:, k].copy()
 
+    @property
+    def _counters(self):
+        return {"samples": len(self.t), "substeps": self.loop.substeps, "delay": self.loop.delay}
+
+    def _attributes(self):
+        return {"law": self.law.name, "message": self.message, **self._counters}
+
     def to_run(self) -> Run:
         """The samples as a plain `Run`, with the further signals "command a", "input a", "measured x" and "law z"."""
         p = self.plant
@@ -246,10 +259,9 @@ class Closed(ByName, Value):
         kinds = {"command": self.command, "input": self.input, "measured": self.measured, "law": self.signal}
         for kind, values in kinds.items():
             stored |= {f"{kind} {name}": value for name, value in values.items()}
-        counters = {"samples": len(self.t), "substeps": self.loop.substeps, "delay": self.loop.delay}
         return Run(
-            self.t, self.states, p.state_names, None, f"closed loop: {self.law.name}", "", counters, self.success,
-            self.status, self.message, (), (), stored, dict(self.residual),
+            self.t, self.states, p.state_names, None, f"closed loop: {self.law.name}", "", self._counters, self.success,
+            self.status, self.message, (), (), stored, dict(self.residual), stored_units=self.units,
         )  # fmt: skip
 
     def save(self, path):
@@ -289,6 +301,28 @@ class Closed(ByName, Value):
         return Closed, tuple(getattr(self, f.name) for f in fields(self))
 
     def __repr__(self):
+        lines = self._facts()
+        if not len(self.t):
+            return "\n".join(lines)
+        for name, low, high, limited in self._exertion()[:5]:
+            unit = f" {self.unit(name)}".rstrip()
+            lines.append(f"  {name}: {low:.6g} .. {high:.6g}{unit}{f'; {limited}' if limited else ''}")
+        return "\n".join(lines[:12])
+
+    def _tables(self):
+        rows = [(n, digits(low), digits(high), self.unit(n), limited) for n, low, high, limited in self._exertion()]
+        return [(("input", "least", "greatest", "unit", ""), rows)], self._facts()[1:]
+
+    def _exertion(self):
+        """(name, least value, greatest value, how long it is limited) of each input."""
+        if not len(self.t):
+            return []
+        shares = {name: np.mean(active != NONE) for name, active in self.active.items()}
+        words = {name: f"limited during {100 * s:.3g} % of the samples" if s else "" for name, s in shares.items()}
+        return [(name, values.min(), values.max(), words[name]) for name, values in self.input.items()]
+
+    def _facts(self):
+        """Lines that say what the loop was, and its errors."""
         loop = self.loop
         lines = [
             f"Closed: {len(self.t)} samples at {1 / loop.period:g} Hz, t = {loop.t0:g} .. "
@@ -297,7 +331,7 @@ class Closed(ByName, Value):
             *self._exposure(),
         ]
         if not len(self.t):
-            return "\n".join(lines)
+            return lines
         sizes = {name: np.abs(values[0]) for name, values in self.residual.items()}
         if sizes:
             largest = sorted(sizes, key=lambda name: -sizes[name].max())[:3]
@@ -305,11 +339,7 @@ class Closed(ByName, Value):
             lines.append(f"  max / final residual: {shown}")
         if self.plan is not None and self.t[-1] > self.plan.t[-1] + ON_SAMPLE * loop.period:
             lines.append(f"  the plan ends at t = {self.plan.t[-1]:g} s; its last sample is held")
-        for name in self.plant.inputs[:5]:
-            share = np.mean(self.active[name] != NONE)
-            limited = f"; limited during {100 * share:.3g} % of the samples" if share else ""
-            lines.append(f"  {name}: {self.input[name].min():.6g} .. {self.input[name].max():.6g}{limited}")
-        return "\n".join(lines[:12])
+        return lines
 
     def _exposure(self):
         """A line of noise, quantisation, disturbances and delay, where there are any."""

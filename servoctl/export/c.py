@@ -187,11 +187,13 @@ def _of_model(model, start):
     require_outputs(model.reduction)
     outputs, output = model.signals("outputs")
     levels = [f"D{level} {row}" if level else row for row, level in places]
-    p = Array("p", "Parameters p, SI", model.reduction.mechanism.parameters.names)
-    x = Array("x", "State x = (q, w, ...), SI", model.state_names)
-    z = Array("z", "Jets z = (x, highest derivative), SI", model.jet_names)
-    u = Array("u", "Reaction u, SI" if model.ideal else "Actuation u, SI", actuation)
-    r, y = Array("r", "Residuals r, each with its time derivatives, SI", levels), Array("y", "Outputs y, SI", outputs)
+    units = model.reduction.mechanism.units
+    p = Array("p", "Parameters p, SI", model.reduction.mechanism.parameters.names, units)
+    x = Array("x", "State x = (q, w, ...), SI", model.state_names, units)
+    z = Array("z", "Jets z = (x, highest derivative), SI", model.jet_names, units)
+    u = Array("u", "Reaction u, SI" if model.ideal else "Actuation u, SI", actuation, units)
+    r = Array("r", "Residuals r, each with its time derivatives, SI", levels)
+    y = Array("y", "Outputs y, SI", outputs, units)
     at = (TIME, z.input(), p.input())
     functions = {"actuation": control.expression, "residuals": residual.expression}
     routines = [
@@ -260,8 +262,9 @@ def _thinning(law, thinned):
 
 def _of_law(law, thinned):
     allocation, table = getattr(law, "allocation", None), np.atleast_2d(np.asarray(law.schedule, dtype=float))
-    y = Array("y", "Measurement y, SI", law.measures)
-    u = Array("u", "Command u, SI", law.inputs)
+    units = getattr(getattr(law, "plan", None), "units", {})
+    y = Array("y", "Measurement y, SI", law.measures, units)
+    u = Array("u", "Command u, SI", law.inputs, units)
     z = Array("z", "Controller state z", law.state_names)
     about = (
         "One sample of the law: command u of the measurement y and the controller state z, which becomes the next one. "

@@ -12,6 +12,7 @@ import numpy as np
 from servoctl import archive
 from servoctl.codegen import emit
 from servoctl.codegen.loops import source
+from servoctl.units import unit_of
 
 WIDTH = 110  # longest line of a file
 FUNCTIONS = (  # of math.h, which has each for floats with the suffix f
@@ -33,11 +34,14 @@ class Array:
         Description in the header.
     names : sequence of str
         Names of the entries.
+    units : dict of str to str
+        Known units by name (`servoctl.units`), for comments.
     """
 
     key: str
     about: str
     names: tuple
+    units: dict = field(default_factory=dict)
 
     def length(self, prefix):
         """C constant with its length."""
@@ -207,7 +211,9 @@ def _enum(name, array):
         while unique in used:
             unique = f"{word}_{i}"
         used.add(unique)
-        comment = "" if unique == entry else f" /* {_harmless(entry)} */"
+        unit = unit_of(entry, array.units)
+        said = " ".join(["" if unique == entry else entry, f"[{unit}]" if unit else ""]).strip()
+        comment = f" /* {_harmless(said)} */" if said else ""
         lines.append(f"    {name.upper()}_{array.key.upper()}_{unique} = {i},{comment}\n")
     return f"enum {{\n{''.join(lines)}    {array.length(name)} = {len(array.names)}\n}};\n"
 

@@ -2,9 +2,10 @@
 
 import numpy as np
 
-from servoctl.checks import as_units, texts
+from servoctl.checks import texts
 from servoctl.errors import SpecificationError
 from servoctl.figures import style
+from servoctl.units import as_units, unit_of_column
 
 MOST_RESULTS = 4  # results in one figure
 DRAWN_EACH = 20  # results below which each is drawn: percentiles say little of them
@@ -52,14 +53,15 @@ def sweep(study, names=None, against=None, units=None):
         )
     if against is not None:
         study.column(against)
-    units = as_units(units)
+    units = study.units | as_units(units)
     figure, rows = style.figure(0.6 + 2.5 * len(names), rows=len(names), columns=2)
     for name, axes in zip(names, rows, strict=True):
         values = np.asarray(study[name], dtype=float)
-        _histogram(axes[0], values, style.label(name, units.get(name)))
+        _histogram(axes[0], values, style.label(name, unit_of_column(name, units)))
         by = against or _strongest(study, parameters, values)
         _scatter(axes[1], study[by], values, study["error"] != "")
-        axes[1].set(xlabel=style.label(by, units.get(by)), ylabel=style.label(name, units.get(name)))
+        x, y = (style.label(column, unit_of_column(column, units)) for column in (by, name))
+        axes[1].set(xlabel=x, ylabel=y)
     figure.suptitle(f"{study.meta['case']}: {study.meta['message']}", fontsize=11)
     return figure
 

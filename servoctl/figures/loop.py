@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from servoctl.checks import as_units
 from servoctl.errors import SpecificationError
+from servoctl.figures.names import units_in
 from servoctl.figures.style import BESIDE, COLOURS, label, look, panels
 
 LIMIT = "#A00000"
@@ -32,7 +32,7 @@ def closed(run, units=None):
         raise SpecificationError(f"A {kind} was given.", do="Give a closed loop from sv.close.", type=kind)
     if not len(run.t):
         raise SpecificationError("The loop ended before its first sample.", do="See run.message.", samples=0)
-    units = as_units(units)
+    units = units_in(run, units)
     errors = _errors(run, units)
     count = len(errors) + len(run.plant.inputs)
     axes = panels(count, 1.0 + 1.9 * count)

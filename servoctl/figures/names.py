@@ -5,6 +5,7 @@ import re
 from servoctl.checks import require_kind
 from servoctl.figures import style
 from servoctl.run import Run
+from servoctl.units import antiderivative, as_units, unit_of
 
 
 def efforts(run):
@@ -23,15 +24,9 @@ def coordinates(run):
     """Names of the run's coordinates; for a loaded run of those whose derivatives are stored."""
     if run.model is not None:
         return list(run.model.coordinate_names)
-    base = [name for name in run.jet_names if _antiderivative(name, run.jet_names) is None]
+    base = [name for name in run.jet_names if antiderivative(name, run.jet_names) is None]
     by_quasi_velocities = [name for name in base if f"d{name}" in run.stored]  # q' is then a signal, and no jet
     return by_quasi_velocities or base
-
-
-def _antiderivative(name, names):
-    """(q, k) of the k-th derivative of a signal, or None."""
-    match = re.fullmatch(r"d(\d*)(.+)", name)
-    return (match[2], int(match[1] or 1)) if match and match[2] in names else None
 
 
 def planes(run):
@@ -56,16 +51,9 @@ def along_one_axis(names):
     return len(names) == 1 or len(axes) == 1 and axes < set("xyzXYZ")
 
 
-def unit_of(name, units):
-    """Unit of a signal, of a derivative or of a component of the reaction; "" if unknown."""
-    if name in units:
-        return units[name]
-    if name == "energy":
-        return "J"
-    if name.startswith("reaction_"):
-        return {"m": "N", "rad": "N m"}.get(units.get(name.removeprefix("reaction_")), "")
-    base = _antiderivative(name, units)
-    return "" if base is None else units[base[0]] + ("/s" if base[1] == 1 else f"/s$^{{{base[1]}}}$")
+def units_in(run, units):
+    """Units by name: those of the run's mechanism, and those that are given."""
+    return {**run.units, **as_units(units)}
 
 
 def label_of(names, units):

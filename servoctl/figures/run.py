@@ -1,16 +1,16 @@
 """Figures of a run: path, signals, actuation and residuals, each returning matplotlib's Axes.
 
-In all functions `units` has the unit of each signal by name; those of derivatives follow. Without `ax` a figure is made
-outside pyplot, which leaves the user's backend unchanged: `ax.figure.savefig(...)`. For a window or a notebook give
-`ax=plt.subplots()[1]`.
+Units are those of the mechanism; `units` has others by name, and those of derivatives follow. Without `ax` a figure is
+made outside pyplot, which leaves the user's backend unchanged: `ax.figure.savefig(...)`. For a window or a notebook
+give `ax=plt.subplots()[1]`.
 """
 
 import numpy as np
 
 from servoctl.archive import writing
-from servoctl.checks import as_units, require_kind, text, texts
+from servoctl.checks import require_kind, text, texts
 from servoctl.errors import SpecificationError
-from servoctl.figures.names import along_one_axis, coordinates, efforts, label_of, planes, unit_of
+from servoctl.figures.names import along_one_axis, coordinates, efforts, label_of, planes, units_in
 from servoctl.figures.style import (
     BESIDE,
     COLOURS,
@@ -24,6 +24,7 @@ from servoctl.figures.style import (
 )
 from servoctl.run import Run
 from servoctl.spec.shapes import heights
+from servoctl.units import unit_of
 
 SOURCE = "sv.simulate(...) or sv.load(path)"
 LEAST = 1e-18  # residual drawn for exact zeros on the logarithmic scale
@@ -58,7 +59,7 @@ def path(run, x=None, y=None, ax=None, units=None):
         If there is no such signal.
     """
     require_kind(Run, "run", run, SOURCE)
-    groups, names, units = planes(run), coordinates(run), as_units(units)
+    groups, names, units = planes(run), coordinates(run), units_in(run, units)
     if x is None and y is None and not groups and along_one_axis(names):
         return signals(run, names, ax=as_single_axes(ax, 4.2), units=units)
     first, second, *_ = groups[0] if groups else dict.fromkeys([*names, *run.names])
@@ -127,7 +128,7 @@ def signals(run, *names, ax=None, units=None):
         If the number of Axes is not that of the panels.
     """
     require_kind(Run, "run", run, SOURCE)
-    units = as_units(units)
+    units = units_in(run, units)
     names = [name for given in names or coordinates(run) for name in texts(given, "The names of signals")]
     if not names:
         raise SpecificationError("No signal was named.", do="Leave names out for the coordinates.", names=names)
@@ -168,7 +169,7 @@ def actuation(run, ax=None, units=None, names=None):
     if not names:
         rule = "It needs a model, or stored signals."
         raise SpecificationError("The run has no actuation.", rule, do="Give names of signals.", names=run.names)
-    return _over_time(run, [[name] for name in names], ax, as_units(units), extrema=True)
+    return _over_time(run, [[name] for name in names], ax, units_in(run, units), extrema=True)
 
 
 def residuals(run, ax=None):

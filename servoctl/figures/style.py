@@ -1,8 +1,11 @@
 """Shared by all figures: colours, line styles, panels, legends, labels."""
 
+import re
+
 import numpy as np
 
 from servoctl.checks import as_list, require_kind
+from servoctl.units import with_unit
 
 SOURCE = "matplotlib.pyplot.subplots()"
 
@@ -63,5 +66,5 @@ def look(i):
 
 
 def label(text, unit):
-    """A text with its unit in brackets, if there is one."""
-    return f"{text} [{unit}]" if unit else text
+    """A text with its unit in brackets, if there is one; powers are raised."""
+    return with_unit(text, re.sub(r"\^(-?\d+)", r"$^{\1}$", unit))

@@ -37,7 +37,7 @@ def vtol(point="flat"):
     if point not in POINTS:
         raise unknown(point, POINTS, "point of the aircraft")
     p = sv.parameters(M=50.0, J=25.0, l=1.0, h=0.1, tilt=radians(5.0), g=9.81)  # kg, kg m^2, m, m, rad, m/s^2
-    q = sv.coordinates("x z theta")  # m, m (up), rad
+    q = sv.coordinates("x z theta", units="m m rad")  # z up
     x, z, theta = q
     across = ca.vertcat(ca.cos(theta), ca.sin(theta))
     along = ca.vertcat(-ca.sin(theta), ca.cos(theta))
@@ -54,6 +54,7 @@ def vtol(point="flat"):
             "u1": ca.vertcat(along + ca.sin(p.tilt) * across, arm),
             "u2": ca.vertcat(along - ca.sin(p.tilt) * across, -arm),
         },
+        units={"u1": "N", "u2": "N"},
         shapes={
             "wings": [ca.vertcat(x, z) + side * p.l * across + p.h * along for side in (-1, 0, 1)],
             "left thruster": _thruster(ca.vertcat(x, z) - p.l * across + p.h * along, along, across, p.tilt),

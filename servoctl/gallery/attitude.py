@@ -26,10 +26,10 @@ def reaction_wheels(turn=120.0, duration=20.0):
         Realised by the actuators "motor1", "motor2", "motor3" [N m], between the satellite and its wheels.
     """
     p = sv.parameters(J1=30.0, J2=40.0, J3=50.0, J_w=0.1)  # kg m^2: of the satellite and its wheels, of a wheel
-    plain = sv.coordinates("e0 e1 e2 e3 a1 a2 a3")  # unit quaternion, body to inertial axes; rad
+    plain = sv.coordinates("e0 e1 e2 e3 a1 a2 a3", units="1 1 1 1 rad rad rad")  # quaternion of the body, wheels
     e = ca.vertcat(*list(plain)[:4])
     V = ca.diagcat(quaternion_rates(e), ca.SX.eye(3))
-    q = plain.with_quasi_velocities("w1 w2 w3 s1 s2 s3", V, invariants={"unit": ca.sumsqr(e) - 1})  # rad/s
+    q = plain.with_quasi_velocities("w1 w2 w3 s1 s2 s3", V, invariants={"unit": ca.sumsqr(e) - 1})
     w, s = ca.vertcat(*q.w()[:3]), ca.vertcat(*q.w()[3:])
     dw, ds = ca.vertcat(*q.w(1)[:3]), ca.vertcat(*q.w(1)[3:])
     momentum = ca.vertcat(p.J1, p.J2, p.J3) * w + p.J_w * s  # N m s, along the body's axes
@@ -48,6 +48,7 @@ def reaction_wheels(turn=120.0, duration=20.0):
             for i, (axle, angle) in enumerate(zip(axles, list(plain)[4:], strict=True))
         }
         | {"pointer": [1.2 * axles[2]]},
+        units=dict.fromkeys(q.velocity_names, "rad/s"),
         parameters=p,
     )
     residuals = sv.programs.orientation("turn", axes, sv.rotations.turn(turned, AXIS))

@@ -23,11 +23,11 @@ def bicycle(width=8.0, lap=16.0):
         Realised by the actuators "drive" [N] and "steer" [N m].
     """
     p = sv.parameters(m=80.0, J=8.0, J_steer=0.2, base=1.1, ahead=0.5)  # kg, kg m^2, kg m^2, m, m
-    plain = sv.coordinates("x y psi delta")  # m, m, rad, rad
+    plain = sv.coordinates("x y psi delta", units="m m rad rad")
     x, y, psi, delta = plain
     ahead = ca.vertcat(ca.cos(psi), ca.sin(psi))
     turn = ca.tan(delta) / p.base  # 1/m
-    q = plain.with_quasi_velocities("v s", [[ahead[0], 0], [ahead[1], 0], [turn, 0], [0, 1]])  # m/s, rad/s
+    q = plain.with_quasi_velocities("v s", [[ahead[0], 0], [ahead[1], 0], [turn, 0], [0, 1]])
     v, s = q.w()
     rear = ca.vertcat(x, y)
     front, wheel = rear + p.base * ahead, 0.3 * ca.vertcat(ca.cos(psi + delta), ca.sin(psi + delta))
@@ -46,6 +46,7 @@ def bicycle(width=8.0, lap=16.0):
             "rear": [rear],
         },
         parameters=p,
+        units={"v": "m/s", "s": "rad/s"},
     )
     velocity, acceleration = q.dt(path, 1), q.dt(path, 2)
     speed = ca.norm_2(velocity)

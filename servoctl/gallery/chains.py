@@ -18,7 +18,7 @@ def four_bar():
         Realised by the actuator "torque" [N m] of the crank. Outputs "X", "Y" of the coupler's tracing point [m].
     """
     p = sv.parameters(a=0.2, b=0.6, c=0.5, d=0.6, density=5.0, g=9.81)  # m: crank, coupler, rocker, base; kg/m
-    q = sv.coordinates("crank coupler rocker")  # rad, from the horizontal
+    q = sv.coordinates("crank coupler rocker", units="rad rad rad")  # from the horizontal
     S, height, tips = 0, 0, []
     starts = (ca.SX.zeros(2), None, ca.vertcat(p.d, 0))
     for start, length, angle, rate in zip(starts, (p.a, p.b, p.c), q, q.d(1), strict=True):
@@ -38,6 +38,7 @@ def four_bar():
         actuators={"torque": q["crank"]},
         constraints={"loop_x": joint[0] - end[0], "loop_y": joint[1] - end[1]},
         outputs={"X": traced[0], "Y": traced[1]},
+        units={"X": "m", "Y": "m"},
         shapes={
             "base": [(0, 0), (p.d, 0)],
             "crank": [(0, 0), pin],
@@ -68,7 +69,7 @@ def cable_robot(pretension=500.0):
         Realised by the tensions "rope1" ... "rope8" [N], those of the upper corners first. z points up.
     """
     p = sv.parameters(m=20.0, Jx=0.6, Jy=0.8, Jz=1.0, g=9.81)  # kg, kg m^2, m/s^2
-    q = sv.coordinates("x y z roll pitch yaw")  # m, m, m, rad, rad, rad
+    q = sv.coordinates("x y z roll pitch yaw", units="m m m rad rad rad")
     x, y, z, roll, pitch, yaw = q
     centre = ca.vertcat(x, y, z)
     tilted = sv.rotations.turn(pitch, (0, 1, 0)) @ sv.rotations.turn(roll, (1, 0, 0))
@@ -84,6 +85,7 @@ def cable_robot(pretension=500.0):
         gibbs=sv.rigid_body(q, p.m, (p.Jx, p.Jy, p.Jz), position=centre, rotation=turned),
         potential=p.m * p.g * z,
         actuators={name: -ca.norm_2(corner - point) for name, (corner, point) in ropes.items()},
+        units=dict.fromkeys(ropes, "N"),
         shapes=ropes | {"platform": [ropes[f"rope{i}"][1] for i in (5, 6, 8, 7, 5)], "centre": [centre]},
         parameters=p,
     )

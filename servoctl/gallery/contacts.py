@@ -23,7 +23,7 @@ def rolling_disc(radius=0.3):
         the lean is the angle from it to the disc, positive to the left.
     """
     p = sv.parameters(m=1.0, a=radius, g=9.81)  # kg, m, m/s^2
-    q = sv.coordinates("x y z psi lean phi")  # m, m, m (up), rad, rad, rad
+    q = sv.coordinates("x y z psi lean phi", units="m m m rad rad rad")  # z up
     x, y, z, psi, lean, phi = q
     dx, dy, _, dpsi, dlean, dphi = q.d(1)
     along, left = ca.vertcat(ca.cos(psi), ca.sin(psi), 0), ca.vertcat(-ca.sin(psi), ca.cos(psi), 0)
@@ -63,7 +63,7 @@ def ball_on_turntable(rate=3.0):
         and beta are the integrals of the ball's angular velocity about the axes x and y.
     """
     p = sv.parameters(m=0.5, a=0.05, J=0.4)  # kg, m, kg m^2 of the table
-    q = sv.coordinates("x y alpha beta table")  # m, m, rad, rad, rad
+    q = sv.coordinates("x y alpha beta table", units="m m rad rad rad")
     x, y, _, _, table = q
     dx, dy, dalpha, dbeta, dtable = q.d(1)
     ball = sv.rigid_body(q, p.m, 2 / 5 * p.m * p.a**2 * ca.SX.ones(3), position=(x, y), rates=(dalpha, dbeta, 0))

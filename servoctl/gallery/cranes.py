@@ -37,11 +37,11 @@ def overhead_crane(duration=6.0, coordinates="relative"):
     """
     p = sv.parameters(m_trolley=10.0, m_hoist=5.0, m_load=100.0, g=9.81)  # kg, m/s^2
     if _relative(coordinates):
-        q = sv.coordinates("x l theta")  # m, m, rad
+        q = sv.coordinates("x l theta", units="m m rad")
         x, l, theta = q
         hung = _hanging(ca.vertcat(x, 0), l, ca.vertcat(ca.sin(theta), ca.cos(theta)))
     else:
-        q = sv.coordinates("x l X Z")  # m, m, m, m (down)
+        q = sv.coordinates("x l X Z", units="m m m m")  # Z down
         x, l, X, Z = q
         hung = _roped(ca.vertcat(x, 0), l, ca.vertcat(X, Z))
     machine = sv.particle(q, p.m_trolley, x) + sv.particle(q, p.m_hoist, l)
@@ -71,11 +71,11 @@ def winch_crane(coordinates="relative"):
     """
     p = sv.parameters(m_trolley=10.0, J=0.1, r=0.1, m_load=100.0, g=9.81)  # kg, kg m^2, m, kg, m/s^2
     if _relative(coordinates):
-        q = sv.coordinates("x beta theta")  # m, rad, rad
+        q = sv.coordinates("x beta theta", units="m rad rad")
         x, beta, theta = q
         hung = _hanging(ca.vertcat(x, 0), p.r * beta, ca.vertcat(ca.sin(theta), ca.cos(theta)))
     else:
-        q = sv.coordinates("x beta X Z")  # m, rad, m, m (down)
+        q = sv.coordinates("x beta X Z", units="m rad m m")  # Z down
         x, beta, X, Z = q
         hung = _roped(ca.vertcat(x, 0), p.r * beta, ca.vertcat(X, Z))
     machine = sv.particle(q, p.m_trolley, x) + sv.particle(q, p.J, beta)
@@ -106,12 +106,12 @@ def crane_3d(coordinates="relative"):
     """
     p = sv.parameters(m_bridge=20.0, m_trolley=10.0, m_hoist=5.0, m_load=100.0, g=9.81)  # kg, m/s^2
     if _relative(coordinates):
-        q = sv.coordinates("x y l theta phi")  # m, m, m, rad, rad
+        q = sv.coordinates("x y l theta phi", units="m m m rad rad")
         x, y, l, theta, phi = q
         rope = ca.vertcat(ca.sin(theta), ca.cos(theta) * ca.sin(phi), ca.cos(theta) * ca.cos(phi))
         hung = _hanging(ca.vertcat(x, y, 0), l, rope)
     else:
-        q = sv.coordinates("x y l X Y Z")  # m, m, m, m, m, m (down)
+        q = sv.coordinates("x y l X Y Z", units="m m m m m m")  # Z down
         x, y, l, X, Y, Z = q
         hung = _roped(ca.vertcat(x, y, 0), l, ca.vertcat(X, Y, Z))
     machine = sv.particle(q, p.m_bridge, x) + sv.particle(q, p.m_trolley, y) + sv.particle(q, p.m_hoist, l)
@@ -172,6 +172,7 @@ def _following(q, p, machine, hung, actuators, path, shapes):
         actuators=actuators,
         constraints=constraints,
         outputs={"tension": tension} | positions,
+        units={"tension": "N"} | dict.fromkeys(positions, "m"),
         shapes=shapes,
         parameters=p,
     )

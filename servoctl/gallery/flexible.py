@@ -25,7 +25,7 @@ def flexible_joint(friction=2.0):
         Realised by the actuator "torque" [N m] on the motor.
     """
     p = sv.parameters(m=5.0, l=0.5, I=1.7, J=0.2, k=500.0, c=friction, g=9.81)  # kg, m, kg m^2, kg m^2, N m/rad, N m
-    q = sv.coordinates("link motor")  # rad from the horizontal, rad behind the gear
+    q = sv.coordinates("link motor", units="rad rad")  # from the horizontal, behind the gear
     link, motor = q
     rubbing = ca.tanh(ca.vertcat(*q.d(1)) / 0.1)
     path = sv.paths.rest_to_rest(q.t, -ca.pi / 2, 0.0, duration=1.0, smoothness=4)
@@ -71,7 +71,8 @@ def elastic_link(n=4):
     if n < 1:
         raise SpecificationError(f"A link of {n} rods.", "It has one at least.", nearest="n = 1.", n=n)
     p = sv.parameters(J=0.2, m=2.0, l=1.0, EI=20.0, tau=0.002)  # kg m^2 of the hub, kg, m, N m^2, s
-    q = sv.coordinates(" ".join(["hub", *(f"bend{i}" for i in range(1, n + 1))]))  # rad, each from the one before
+    names = ["hub", *(f"bend{i}" for i in range(1, n + 1))]  # each from the one before
+    q = sv.coordinates(" ".join(names), units="rad " * (n + 1))
     hub, *bends = q
     mass, length = p.m / n, p.l / n
     springs = p.EI / length * ca.DM([2.0] + [1.0] * (n - 1))  # N m/rad: the first bends over half a rod
@@ -88,6 +89,7 @@ def elastic_link(n=4):
         forces=-p.tau * ca.vertcat(0, springs * ca.vertcat(*q.d(1)[1:])),
         actuators={"torque": hub},
         outputs={"X": joints[-1][0], "Y": joints[-1][1]},
+        units={"X": "m", "Y": "m"},
         shapes={"hub": sv.shapes.disc((0, 0), 0.08, hub), "link": joints, "tip": [joints[-1]]},
         parameters=p,
     )

@@ -15,8 +15,8 @@ def hopper():
     Mechanism, Program
         Realised by the actuators "hip", "left_shoulder", "right_shoulder" [N m]; z points up.
     """
-    p = sv.parameters(m=20.0, J=0.6, m_leg=5.0, l_leg=0.4, m_arm=1.5, l_arm=0.35, g=9.81)  # kg, m, m/s^2
-    q = sv.coordinates("x z phi leg left right")  # m, m, rad, rad, rad, rad (relative)
+    p = sv.parameters(m=20.0, J=0.6, m_leg=5.0, l_leg=0.4, m_arm=1.5, l_arm=0.35, g=9.81)  # kg, kg m^2, kg, m, ...
+    q = sv.coordinates("x z phi leg left right", units="m m rad rad rad rad")  # limbs relative
     x, z, phi, *limbs = q
     centre = ca.vertcat(x, z)
     masses, lengths = (p.m_leg, p.m_arm, p.m_arm), (p.l_leg, p.l_arm, p.l_arm)

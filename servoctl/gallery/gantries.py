@@ -17,7 +17,7 @@ def rotary_crane():
         (sin θ, cos θ sin φ, cos θ cos φ), a chart that is regular while |θ| < 90°.
     """
     p = sv.parameters(J=500.0, m_trolley=10.0, m_hoist=5.0, m_load=100.0, g=9.81)  # kg m^2, kg, kg, kg, m/s^2
-    q = sv.coordinates("psi r l theta phi")  # rad, m, m, rad, rad
+    q = sv.coordinates("psi r l theta phi", units="rad m m rad rad")
     psi, r, l, theta, phi = q
     trolley = r * ca.vertcat(ca.cos(psi), ca.sin(psi), 0)
     rope = ca.vertcat(ca.sin(theta), ca.cos(theta) * ca.sin(phi), ca.cos(theta) * ca.cos(phi))
@@ -42,6 +42,7 @@ def rotary_crane():
             "load": [above],
         },
         parameters=p,
+        units=dict.fromkeys("XYZ", "m") | {"tension": "N"},
     )
     return mechanism, sv.Program({name: load[i] - path[i] for i, name in enumerate("XYZ")}, by="actuators")
 
@@ -55,7 +56,7 @@ def beam_crane():
         Realised by the actuators "trolley1", "trolley2", "hoist1", "hoist2" [N]; the ropes are material constraints.
     """
     p = sv.parameters(m_trolley=10.0, m_hoist=5.0, m_beam=200.0, b=1.0, g=9.81)  # kg, kg, kg, half of the length [m]
-    q = sv.coordinates("x1 x2 l1 l2 X Z phi")  # m, six times; rad
+    q = sv.coordinates("x1 x2 l1 l2 X Z phi", units="m m m m m m rad")
     x1, x2, l1, l2, X, Z, phi = q
     half = p.b * ca.vertcat(ca.cos(phi), ca.sin(phi))
     ends = [ca.vertcat(X, Z) - half, ca.vertcat(X, Z) + half]
@@ -100,7 +101,7 @@ def fixed_rope_crane(tool=5.0):
         Realised by the actuator "cart" [N].
     """
     p = sv.parameters(m_cart=10.0, m_load=100.0, l=4.0, tool=tool, g=9.81)  # kg, kg, m, m, m/s^2
-    q = sv.coordinates("x theta")  # m, rad
+    q = sv.coordinates("x theta", units="m rad")
     x, theta = q
     along = ca.vertcat(ca.sin(theta), -ca.cos(theta))
     cart = ca.vertcat(x, 0)
@@ -111,6 +112,7 @@ def fixed_rope_crane(tool=5.0):
         potential=p.m_load * p.g * load[1],
         actuators={"cart": x},
         outputs={"X_tool": end[0]},
+        units={"X_tool": "m"},
         shapes={
             "rail": [(-1, 0), (3, 0)],
             "trolley": sv.shapes.box((x, 0), 0.6, 0.2),

@@ -35,12 +35,12 @@ def mass_on_car(alpha=pi / 4, damping=1.0, coordinates="relative"):
     p = sv.parameters(m_1=1.0, m_2=2.0, k=5.0, d=damping, alpha=alpha)  # kg, kg, N/m, N s/m, rad
     cosine, sine = ca.cos(p.alpha), ca.sin(p.alpha)
     if coordinates == "relative":
-        q = sv.coordinates("x s")  # m, m
+        q = sv.coordinates("x s", units="m m")
         x, s = q
         mass = ca.vertcat(x + s * cosine, s * sine)
         constraints = {}
     elif coordinates == "absolute":
-        q = sv.coordinates("x x_m y_m")  # m, m, m
+        q = sv.coordinates("x x_m y_m", units="m m m")
         x, x_m, y_m = q
         mass = ca.vertcat(x_m, y_m)
         s = (x_m - x) * cosine + y_m * sine

@@ -15,7 +15,7 @@ def double_pendulum():
         dynamics are the double pendulum's, of the frequencies sqrt((2 ± √2) g/l) about the hanging pose.
     """
     p = sv.parameters(M=5.0, m=1.0, l=0.8, g=9.81)  # kg, kg, m, m/s^2
-    q = sv.coordinates("x upper lower")  # m, rad, rad from the vertical
+    q = sv.coordinates("x upper lower", units="m rad rad")  # angles from the vertical
     x, upper, lower = q
     first = ca.vertcat(x + p.l * ca.sin(upper), -p.l * ca.cos(upper))
     second = first + p.l * ca.vertcat(ca.sin(lower), -ca.cos(lower))
@@ -26,6 +26,7 @@ def double_pendulum():
         potential=p.m * p.g * (first[1] + second[1]),
         actuators={"force": x},
         outputs={"X": second[0], "Y": second[1]},
+        units={"X": "m", "Y": "m"},
         shapes={
             "rail": [(-0.5, 0), (2.5, 0)],
             "cart": sv.shapes.box((x, 0), 0.5, 0.2),

@@ -21,7 +21,7 @@ def clothoid_arm(speed=0.25, growth=4.0):
         Realised by the actuators "shoulder" and "elbow" [N m], in a horizontal plane: orders 1 and 3.
     """
     p = sv.parameters(m=2.0, l=0.5, I=1 / 24, speed=speed, growth=growth)  # kg, m, kg m^2, m/s, 1/(m s)
-    q = sv.coordinates("q1 q2")  # rad, rad (relative)
+    q = sv.coordinates("q1 q2", units="rad rad")  # the second is relative
     q1, q2 = q
     first, second = (ca.vertcat(ca.cos(a), ca.sin(a)) for a in (q1, q1 + q2))
     elbow, end = p.l * first, p.l * (first + second)
@@ -34,6 +34,7 @@ def clothoid_arm(speed=0.25, growth=4.0):
         gibbs=S,
         actuators={"shoulder": q1, "elbow": q2},
         outputs={"X": end[0], "Y": end[1], "curvature": curvature},
+        units={"X": "m", "Y": "m", "curvature": "1/m"},
         shapes={"base": [(0, 0)], "first link": [(0, 0), elbow], "second link": [elbow, end], "end": [end]},
         parameters=p,
     )
@@ -51,7 +52,7 @@ def steady_satellite():
         Ideal realisation, of order 3: the acceleration is perpendicular to its rate.
     """
     p = sv.parameters(m=100.0, mu=3.986e14)  # kg, m^3/s^2
-    q = sv.coordinates("x y")  # m, m
+    q = sv.coordinates("x y", units="m m")
     place = ca.vertcat(*q)
     acceleration = q.dt(place, 2)
     mechanism = sv.Mechanism(

@@ -28,13 +28,13 @@ def trailers(radius=2.0, duration=4.0, speed=1.0):
         trailer, the yaw rate r of the robot.
     """
     p = sv.parameters(m=20.0, J=1.0, m_t=10.0, J_t=0.5, l1=0.8, l2=0.8)  # kg, kg m^2, kg, kg m^2, m, m
-    xy = sv.coordinates("X Y theta0 theta1 theta2")  # m, m of the last axle; rad, rad, rad
+    xy = sv.coordinates("X Y theta0 theta1 theta2", units="m m rad rad rad")  # X, Y of the last axle
     X, Y, *angles = xy
     ahead = [ca.vertcat(ca.cos(angle), ca.sin(angle)) for angle in angles]
     bend, last_bend = angles[0] - angles[1], angles[1] - angles[2]
     kappa = ca.tan(last_bend) / p.l2  # 1/m, of the last axle's path
     turns = [ca.tan(bend) / p.l1 / ca.cos(last_bend), kappa]  # 1/m, of the trailers
-    q = xy.with_quasi_velocities("v r", ca.horzcat(ca.vertcat(ahead[2], 0, *turns), ca.SX.eye(5)[:, 2]))  # m/s, rad/s
+    q = xy.with_quasi_velocities("v r", ca.horzcat(ca.vertcat(ahead[2], 0, *turns), ca.SX.eye(5)[:, 2]))
     v, r = q.w()
     last = ca.vertcat(X, Y)
     axles = [last + p.l2 * ahead[2] + p.l1 * ahead[1], last + p.l2 * ahead[2], last]
@@ -47,6 +47,7 @@ def trailers(radius=2.0, duration=4.0, speed=1.0):
         gibbs=S,
         actuators={"drive": (1 / (ca.cos(bend) * ca.cos(last_bend)), 0), "steer": (0, 1)},
         shapes=_boxes_on_axles(axles, angles),
+        units={"v": "m/s", "r": "rad/s", "drive": "N"},
         parameters=p,
     )
     curvature = sv.paths.rest_to_rest(q.t, 0.0, 1 / radius, duration=duration, smoothness=4)

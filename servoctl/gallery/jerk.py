@@ -22,7 +22,7 @@ def constant_jerk(magnitude=2.0):
         Residual "jerk" of order 3 [m/s^3].
     """
     p = sv.parameters(m=1.0, g=9.81, J=magnitude)  # kg, m/s^2, m/s^3
-    q = sv.coordinates("x y")  # m, m (up)
+    q = sv.coordinates("x y", units="m m")  # y up
     place = ca.vertcat(*q)
     mechanism = sv.Mechanism(
         q,

@@ -42,10 +42,10 @@ def planar_arm(n=3, coordinates="joints", acceleration=(0.0, 0.0)):
     _check(n, coordinates, 2)
     p = _parameters()
     if coordinates == "joints":
-        q = sv.coordinates(_names("theta", n))
+        q = sv.coordinates(_names("theta", n), units="rad " * n)
         inclinations, centres = list(accumulate(q)), None
     else:
-        q = sv.coordinates(_names("x y phi", n))
+        q = sv.coordinates(_names("x y phi", n), units="m m rad " * n)
         xs, ys, inclinations = (list(q)[i::3] for i in range(3))
         centres = [ca.vertcat(x, y) for x, y in zip(xs, ys, strict=True)]
     halves = [p.l / 2 * ca.vertcat(ca.cos(phi), ca.sin(phi)) for phi in inclinations]
@@ -69,6 +69,7 @@ def planar_arm(n=3, coordinates="joints", acceleration=(0.0, 0.0)):
         potential=p.m * p.g * height,
         constraints=constraints,
         outputs={"X": joint[0], "Y": joint[1]},
+        units={"X": "m", "Y": "m"},
         shapes={
             "base": [(0, 0)],
             "links": [centres[0] - halves[0], *(c + half for c, half in zip(centres, halves, strict=True))],
@@ -108,7 +109,8 @@ def spatial_arm(n=3, coordinates="joints"):
     _check(n, coordinates, 3)
     p = _parameters()
     joints = coordinates == "joints"
-    q = sv.coordinates(_names("theta", n) if joints else _names("theta a b c x y z", n))
+    names, units = ("theta", "rad ") if joints else ("theta a b c x y z", "rad rad rad rad m m m ")
+    q = sv.coordinates(_names(names, n), units=units * n)
     width = 1 if joints else 7
     angles, rates = list(q)[::width], q.d(1)
     rod = ca.vertcat(p.l, 0, 0)

@@ -16,7 +16,7 @@ def cart_pole():
         Realised by the actuator "force" [N] on the cart; theta is zero where the pole is upright.
     """
     p = sv.parameters(m_cart=1.0, m_pole=0.2, l=0.5, g=9.81)  # kg, kg, m, m/s^2
-    q = sv.coordinates("x theta")  # m, rad
+    q = sv.coordinates("x theta", units="m rad")
     x, theta = q
     tip = ca.vertcat(x + p.l * ca.sin(theta), p.l * ca.cos(theta))
     mechanism = sv.Mechanism(
@@ -49,7 +49,7 @@ def furuta_pendulum(damping=0.005):
         Realised by the actuator "torque" [N m] on the arm; the pendulum swings across the arm.
     """
     p = sv.parameters(J=0.02, m=0.2, arm=0.4, l=0.3, g=9.81, d=damping)  # kg m^2, kg, m, m, m/s^2, N m s/rad
-    q = sv.coordinates("phi theta")  # rad, rad (hanging at zero)
+    q = sv.coordinates("phi theta", units="rad rad")  # hanging at zero
     phi, theta = q
     along, across = ca.vertcat(ca.cos(phi), ca.sin(phi), 0), ca.vertcat(-ca.sin(phi), ca.cos(phi), 0)
     end = p.arm * along
@@ -81,7 +81,7 @@ def ball_and_beam(tilt=0.05):
         Realised by the actuator "torque" [N m] on the beam, which turns about its middle.
     """
     p = sv.parameters(m=0.1, radius=0.02, J_beam=0.05, g=9.81)  # kg, m, kg m^2, m/s^2
-    q = sv.coordinates("r theta")  # m along the beam, rad
+    q = sv.coordinates("r theta", units="m rad")  # r along the beam
     r, theta = q
     centre = r * ca.vertcat(ca.cos(theta), ca.sin(theta))
     spin = q.d(1)[1] - q.d(1)[0] / p.radius
@@ -116,7 +116,7 @@ def acrobot(gain=-2.0):
         Realised by the actuator "hip" [N m]; the bar's joint is passive, and y points up.
     """
     p = sv.parameters(m1=4.0, m2=3.0, l1=0.6, l2=0.5, I1=0.12, I2=0.07, g=9.81)  # kg, kg, m, m, kg m^2, kg m^2, m/s^2
-    q = sv.coordinates("q1 q2")  # rad from the horizontal, rad (relative)
+    q = sv.coordinates("q1 q2", units="rad rad")  # from the horizontal, relative
     q1, q2 = q
     first, second = (ca.vertcat(ca.cos(a), ca.sin(a)) for a in (q1, q1 + q2))
     hip, middle = p.l1 * first, p.l1 * first + p.l2 / 2 * second

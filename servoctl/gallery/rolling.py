@@ -31,7 +31,7 @@ def appell_hamel(form="linear"):
     (its coefficient is -I_x + 2 I_y + a² M, not the printed one).
     """
     p = sv.parameters(m=1.0, M=2.0, I_x=0.2, I_y=0.25, a=0.5, b=0.2, rho=0.3, g=9.81)  # kg, kg m^2, m, m/s^2
-    q = sv.coordinates("x y z phi theta")  # m, m, m (down), rad, rad
+    q = sv.coordinates("x y z phi theta", units="m m m rad rad")  # z down
     _, _, z, phi, theta = q
     dx, dy, _, dphi, dtheta = q.d(1)
     ddx, ddy, ddz, ddphi, ddtheta = q.d(2)
@@ -51,7 +51,7 @@ def appell_hamel(form="linear"):
 
     mechanism = sv.Mechanism(
         q, gibbs=S, potential=-p.m * p.g * z, outputs={"tension": p.m * (p.g - ddz)}, parameters=p,
-        shapes=_shapes(q, p),
+        shapes=_shapes(q, p), units={"tension": "N"},
     )  # fmt: skip
     return mechanism, sv.Program(rolling | {"string": z + p.b * phi}, by="ideal")  # (4.5)
 

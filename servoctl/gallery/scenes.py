@@ -1,6 +1,5 @@
 """The table of scenes: what each is, what it teaches, where it comes from, and a number that it must give."""
 
-import re
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial
@@ -83,7 +82,7 @@ class Scene:
     t_span : (2,) tuple of float
         [s]
     units : dict of str to str
-        Unit of each coordinate, actuator and output, by name.
+        Units by name, beside those of the mechanism or instead of them.
     """
 
     build: Callable
@@ -97,10 +96,15 @@ class Scene:
     t_span: tuple = (0.0, 1.0)
     units: dict = field(default_factory=dict)
 
+    def __post_init__(self):
+        if self.units:
+            object.__setattr__(self, "build", partial(_in_units, self.build, self.units))
 
-def _units(text):
-    """Units by name, from names followed by their unit in brackets."""
-    return {name: unit for names, unit in re.findall(r"([^\[]+)\[([^]]+)\]", text) for name in names.split()}
+
+def _in_units(build, units, *arguments, **options):
+    mechanism, program = build(*arguments, **options)
+    mechanism.units = mechanism.units | units
+    return mechanism, program
 
 
 FLAT_MACHINES = "flat machines"
@@ -123,7 +127,6 @@ _APPELL_HAMEL = {
     "start": {"x": 0.0, "y": 0.0, "phi": 0.0, "theta": 0.0, "dphi": 1.0, "dtheta": 2.0},
     "guess": {"dx": 0.5, "dy": 0.6},
     "t_span": (0.0, 2.0),
-    "units": _units("x y z [m] phi theta [rad] tension [N]"),
 }
 
 _PRECESSION = {  # dphi by g tan λ = a Ω (3 s/2 + Ω sin(λ)/4), s = dphi - Ω sin λ
@@ -141,7 +144,6 @@ gallery = {
         number="The hoist holds at most 1044 N.",
         guess={"l": 4.0},
         t_span=(0.0, 8.0),
-        units=_units("x l X Z [m] theta [rad] trolley hoist tension [N]"),
     ),
     "winch-crane": Scene(
         partial(_built, "winch_crane"),
@@ -152,7 +154,6 @@ gallery = {
         number="The winch holds at most 102.2 N m.",
         guess={"beta": 40.0},
         t_span=(0.0, 6.0),
-        units=_units("x X Z [m] beta theta [rad] trolley [N] winch [N m] tension [N]"),
     ),
     "crane-3d": Scene(
         partial(_built, "crane_3d"),
@@ -163,7 +164,6 @@ gallery = {
         number="The rope's tension is at most 1070 N.",
         guess={"l": 5.0},
         t_span=(0.0, 6.0),
-        units=_units("x y l X Y Z [m] theta phi [rad] bridge trolley hoist tension [N]"),
     ),
     "two-cars": Scene(
         partial(_built, "cars"),
@@ -173,7 +173,6 @@ gallery = {
         source=SEIFRIED,
         number="The force is at most 316.2 N.",
         t_span=(0.0, 2.0),
-        units=_units("x1 x2 [m] force [N]"),
     ),
     "three-cars": Scene(
         partial(_built, "cars", 3),
@@ -183,7 +182,6 @@ gallery = {
         source=f"{SEIFRIED}, by one car more",
         number="The force is at most 11770 N.",
         t_span=(0.0, 2.0),
-        units=_units("x1 x2 x3 [m] force [N]"),
     ),
     "vtol": Scene(
         partial(_built, "vtol"),
@@ -193,7 +191,6 @@ gallery = {
         source="Martin, Devasia and Paden, Automatica 32 (1996) 101-107",
         number="The left thruster gives at most 295.5 N.",
         t_span=(0.0, 4.0),
-        units=_units("x z [m] theta [rad] u1 u2 [N]"),
     ),
     "slung-load": Scene(
         partial(_built, "slung_load"),
@@ -203,7 +200,6 @@ gallery = {
         source=SREENATH,
         number="The thrust is at most 17.38 N.",
         t_span=(0.0, 5.0),
-        units=_units("x z X Z [m] theta alpha [rad] thrust [N] moment [N m]"),
     ),
     "slung-load-3d": Scene(
         partial(_built, "slung_load_3d"),
@@ -213,7 +209,6 @@ gallery = {
         source=SREENATH,
         number="The thrust is at most 15.69 N.",
         t_span=(0.0, 6.0),
-        units=_units("x y z X Y Z [m] alpha beta psi theta phi [rad] thrust [N] roll pitch yaw [N m]"),
     ),
     "flexible-joint": Scene(
         partial(_built, "flexible_joint"),
@@ -223,7 +218,6 @@ gallery = {
         source="Spong, Journal of Dynamic Systems, Measurement, and Control 109 (1987) 310-319; friction added",
         number="The motor's torque is at most 35.59 N m.",
         t_span=(0.0, 1.5),
-        units=_units("link motor [rad] torque [N m]"),
     ),
     "rotary-crane": Scene(
         partial(_built, "rotary_crane"),
@@ -234,7 +228,6 @@ gallery = {
         number="The rope's tension is at most 1008 N.",
         guess={"r": 3.0, "l": 5.0},
         t_span=(0.0, 8.0),
-        units=_units("r l X Y Z [m] psi theta phi [rad] slew [N m] trolley hoist tension [N]"),
     ),
     # --- material constraints
     "overhead-crane-redundant": Scene(
@@ -246,7 +239,6 @@ gallery = {
         number="The trolley's force is at most 138 N.",
         guess={"l": 4.0, "Z": 4.0},
         t_span=(0.0, 8.0),
-        units=_units("x l X Z [m] trolley hoist tension [N]"),
     ),
     "winch-crane-redundant": Scene(
         partial(_built, "winch_crane", "redundant"),
@@ -257,7 +249,6 @@ gallery = {
         number="The rope's tension is at most 1018 N.",
         guess={"beta": 40.0, "Z": 4.0},
         t_span=(0.0, 6.0),
-        units=_units("x [m] beta [rad] X Z [m] trolley [N] winch [N m] tension [N]"),
     ),
     "crane-3d-redundant": Scene(
         partial(_built, "crane_3d", "redundant"),
@@ -268,7 +259,6 @@ gallery = {
         number="The hoist holds at most 1074 N.",
         guess={"l": 5.0, "Z": 5.0},
         t_span=(0.0, 6.0),
-        units=_units("x y l X Y Z [m] bridge trolley hoist tension [N]"),
     ),
     "mass-on-car-absolute": Scene(
         partial(_built, "mass_on_car", coordinates="absolute"),
@@ -279,7 +269,6 @@ gallery = {
         number="The force is at most 12.31 N.",
         start={"x": 0.5, "dx": 0.0},
         t_span=(0.0, 6.0),
-        units=_units("x x_m y_m [m] force [N]"),
     ),
     "four-bar": Scene(
         partial(_built, "four_bar"),
@@ -290,7 +279,6 @@ gallery = {
         number="The rocker swings by 0.8981 rad.",
         guess={"coupler": 1.0, "rocker": 1.7},
         t_span=(0.0, 3.0),
-        units=_units("crank coupler rocker [rad] X Y [m] torque [N m]"),
     ),
     "beam-crane": Scene(
         partial(_built, "beam_crane"),
@@ -301,7 +289,6 @@ gallery = {
         number="The trolleys are at most 0.4023 m beside the ends of the beam.",
         guess={"l1": 4.0, "l2": 4.0, "Z": 4.0},
         t_span=(0.0, 6.0),
-        units=_units("x1 x2 l1 l2 X Z [m] phi [rad] trolley1 trolley2 hoist1 hoist2 [N]"),
     ),
     # --- internal dynamics
     "mass-on-car": Scene(
@@ -313,7 +300,6 @@ gallery = {
         number="The internal dynamics decay with 0.5 1/s.",
         start={"s": 0.0, "ds": 0.0},
         t_span=(0.0, 6.0),
-        units=_units("x s [m] force [N]"),
     ),
     "passive-arm": Scene(
         partial(_built, "passive_arm"),
@@ -324,7 +310,6 @@ gallery = {
         number="The internal dynamics decay with 6 1/s where the arm is straight.",
         start={"q2": 0.0, "dq2": 0.0},
         t_span=(0.0, 3.0),
-        units=_units("q1 q2 [rad] torque [N m]"),
     ),
     "pendubot": Scene(
         partial(_built, "pendubot"),
@@ -335,7 +320,6 @@ gallery = {
         number="A small swing of the second link has the frequency 5.345 rad/s.",
         start={"q2": 0.0, "dq2": 0.0},
         t_span=(0.0, 3.0),
-        units=_units("q1 q2 [rad] shoulder [N m] X_end Y_end [m]"),
     ),
     "vtol-centre": Scene(
         partial(_built, "vtol", "centre"),
@@ -346,7 +330,6 @@ gallery = {
         number="Errors grow with 15.04 1/s in hover.",
         start={"theta": 0.0, "dtheta": 0.0},
         t_span=(0.0, 1.0),
-        units=_units("x z [m] theta [rad] u1 u2 [N]"),
     ),
     "double-pendulum": Scene(
         partial(_built, "double_pendulum"),
@@ -357,7 +340,6 @@ gallery = {
         number="The slower mode has 2.68 rad/s.",
         start={"upper": 0.0, "lower": 0.0, "dupper": 0.0, "dlower": 0.0},
         t_span=(0.0, 8.0),
-        units=_units("x X Y [m] upper lower [rad] force [N]"),
     ),
     "elastic-link": Scene(
         partial(_built, "elastic_link"),
@@ -368,7 +350,6 @@ gallery = {
         number="The slowest mode has 10.81 rad/s.",
         start={f"{d}bend{i}": 0.0 for d in ("", "d") for i in range(1, 5)},
         t_span=(0.0, 2.0),
-        units=_units("hub bend1 bend2 bend3 bend4 [rad] X Y [m] torque [N m]"),
     ),
     "cart-pole": Scene(
         partial(_built, "cart_pole"),
@@ -379,7 +360,6 @@ gallery = {
         number="Errors grow with 4.429 1/s.",
         start={"theta": 0.0, "dtheta": 0.0},
         t_span=(0.0, 2.0),
-        units=_units("x [m] theta [rad] force [N]"),
     ),
     "fixed-rope-crane": Scene(
         partial(_built, "fixed_rope_crane"),
@@ -390,7 +370,6 @@ gallery = {
         number="Errors grow with 3.132 1/s.",
         start={"theta": 0.0, "dtheta": 0.0},
         t_span=(0.0, 4.0),
-        units=_units("x X_tool [m] theta [rad] cart [N]"),
     ),
     "furuta-pendulum": Scene(
         partial(_built, "furuta_pendulum"),
@@ -401,7 +380,6 @@ gallery = {
         number="The pendulum swings with 5.717 rad/s.",
         start={"theta": 0.0, "dtheta": 0.0},
         t_span=(0.0, 5.0),
-        units=_units("phi theta [rad] torque [N m]"),
     ),
     "ball-and-beam": Scene(
         partial(_built, "ball_and_beam"),
@@ -412,7 +390,6 @@ gallery = {
         number="The ball's acceleration settles at 0.3502 m/s².",
         start={"r": 0.0, "dr": 0.0},
         t_span=(0.0, 2.0),
-        units=_units("r [m] theta [rad] torque [N m]"),
     ),
     "acrobot": Scene(
         partial(_built, "acrobot"),
@@ -423,7 +400,6 @@ gallery = {
         number="The swing decays with 0.555 1/s.",
         start={"q1": -1.2, "q2": -0.2},
         t_span=(0.0, 16.0),
-        units=_units("q1 q2 [rad] hip [N m]"),
     ),
     "hopper": Scene(
         partial(_built, "hopper"),
@@ -434,7 +410,6 @@ gallery = {
         number="The trunk turns by 0.6328 rad.",
         start={"x": 0.0, "z": 0.0, "phi": 0.0, "dx": 2.0, "dz": 2.45, "dphi": 0.0},
         t_span=(0.0, 0.5),
-        units=_units("x z [m] phi leg left right [rad] hip left_shoulder right_shoulder [N m]"),
     ),
     # --- arms and robots
     "two-link-arm": Scene(
@@ -446,7 +421,6 @@ gallery = {
         number="The elbow is bent by 1.721 rad at the start.",
         guess={"q1": -0.4, "q2": 1.5},
         t_span=(0.0, 2.0),
-        units=_units("q1 q2 [rad] shoulder elbow [N m] X_end Y_end [m]"),
     ),
     "six-axis-arm": Scene(
         partial(_built, "six_axis_arm"),
@@ -457,10 +431,6 @@ gallery = {
         number="At rest the second motor holds 32.69 N m.",
         guess={"pan": 0.3, "lift": 0.2, "elbow": 1.4, "roll": 0.2, "bend": 0.9, "turn": 0.4},
         t_span=(0.0, 3.0),
-        units=_units(
-            "pan lift elbow roll bend turn [rad] "
-            "torque_pan torque_lift torque_elbow torque_roll torque_bend torque_turn [N m]"
-        ),
     ),
     "cable-robot": Scene(
         partial(_built, "cable_robot"),
@@ -470,7 +440,6 @@ gallery = {
         source="Pott, Cable-Driven Parallel Robots, Springer (2018)",
         number="The largest tension is 660.6 N.",
         t_span=(0.0, 4.0),
-        units=_units("x y z [m] roll pitch yaw [rad] rope1 rope2 rope3 rope4 rope5 rope6 rope7 rope8 [N]"),
     ),
     "reaction-wheels": Scene(
         partial(_built, "reaction_wheels"),
@@ -482,7 +451,6 @@ gallery = {
         start={"a1": 0.0, "a2": 0.0, "a3": 0.0, "s1": 0.0, "s2": 0.0, "s3": 0.0},
         guess={"e0": 1.0},
         t_span=(0.0, 20.0),
-        units=_units("e0 e1 e2 e3 [1] a1 a2 a3 [rad] motor1 motor2 motor3 [N m]"),
     ),
     # --- ideal reactions
     "appell-hamel": Scene(
@@ -502,7 +470,6 @@ gallery = {
         number="The reaction is at most 6.852 N.",
         start={"x2": 0.0, "dx2": 0.0},
         t_span=(0.0, 2.0),
-        units=_units("x1 x2 [m] force [N]"),
     ),
     "constant-speed": Scene(
         partial(_built, "constant_speed"),
@@ -514,7 +481,6 @@ gallery = {
         start={"x": 0.0, "y": 0.0, "dy": 0.0},
         guess={"dx": 5.0},
         t_span=(0.0, 1.0),
-        units=_units("x y [m] thrust [N]"),
     ),
     "rolling-disc": Scene(
         partial(_built, "rolling_disc"),
@@ -525,7 +491,6 @@ gallery = {
         number="The centre goes around a circle of 1.044 m radius.",
         start=_PRECESSION,
         t_span=(0.0, 4.2),
-        units=_units("x y z [m] psi lean phi [rad]"),
     ),
     # --- higher orders
     "spiral": Scene(
@@ -537,7 +502,6 @@ gallery = {
         number="After 2 s the particle is at y = 0.6205 m.",
         start={"x": 0.0, "y": 0.0, "dx": 1.0, "dy": 0.0, "d2y": 0.0},
         t_span=(0.0, 2.0),
-        units=_units("x y [m]"),
     ),
     "constant-jerk": Scene(
         partial(_built, "constant_jerk"),
@@ -549,7 +513,6 @@ gallery = {
         start={"x": 0.0, "y": 0.0, "dx": 1.0, "dy": 0.0, "d2x": 0.6, "d2y": -9.01},
         guess={"d3x": 1.2, "d3y": 1.6},
         t_span=(0.0, 2.0),
-        units=_units("x y [m]"),
     ),
     "clothoid-arm": Scene(
         partial(_built, "clothoid_arm"),
@@ -561,7 +524,6 @@ gallery = {
         start={"q1": -0.6, "q2": 1.5, "dq1": -0.2, "d2q1": 0.22677037187619453},  # curvature 0
         guess={"dq2": 0.673, "d2q2": -0.283},
         t_span=(0.0, 2.0),
-        units=_units("q1 q2 [rad] shoulder elbow [N m] X Y [m] curvature [1/m]"),
     ),
     "steady-satellite": Scene(
         partial(_built, "steady_satellite"),
@@ -573,7 +535,6 @@ gallery = {
         start={"x": 7e6, "y": 0.0, "dx": 0.0, "dy": 8266.372624, "d2y": 0.0},
         guess={"d2x": -8.134693877551021},
         t_span=(0.0, 8000.0),
-        units=_units("x y [m]"),
     ),
     # --- rolling machines
     "wheeled-robot": Scene(
@@ -586,7 +547,6 @@ gallery = {
         start={"x": 0.0, "y": 0.0, "psi": 0.0, "r": 0.0},
         guess={"v": 1.0},
         t_span=(0.0, 5.0),
-        units=_units("x y [m] psi [rad] drive [N] steer [N m] curvature [1/m]"),
     ),
     "trailers": Scene(
         partial(_built, "trailers"),
@@ -598,7 +558,6 @@ gallery = {
         start={"X": 0.0, "Y": 0.0, "theta1": 0.0, "theta2": 0.0},
         guess={"v": 1.0},
         t_span=(0.0, 10.0),
-        units=_units("X Y [m] theta0 theta1 theta2 [rad] drive [N] steer [N m]"),
     ),
     "ball-on-turntable": Scene(
         partial(_built, "ball_on_turntable"),
@@ -609,7 +568,6 @@ gallery = {
         number="At 3 rad/s of the table the ball goes around at 0.8571 rad/s.",
         start={"x": 0.5, "y": 0.0, "dx": 0.0, "dy": 0.3, "alpha": 0.0, "beta": 0.0},
         t_span=(0.0, 8.0),
-        units=_units("x y [m] alpha beta table [rad] motor [N m]"),
     ),
     "bicycle": Scene(
         partial(_built, "bicycle"),
@@ -621,7 +579,6 @@ gallery = {
         start={"x": 0.0, "y": 0.0, "psi": 0.7853981633974483},
         guess={"v": 4.44},
         t_span=(0.0, 16.0),
-        units=_units("x y [m] psi delta [rad] drive [N] steer [N m]"),
     ),
     # --- singular programs
     "appell-hamel-squared": Scene(
@@ -642,6 +599,5 @@ gallery = {
         start={"x": 0.0, "y": 0.0, "dy": 0.0},
         guess={"dx": 5.0},
         t_span=(0.0, 1.0),
-        units=_units("x y [m] thrust [N]"),
     ),
 }

@@ -17,7 +17,7 @@ def slung_load():
         Realised by the actuators "thrust" [N] and "moment" [N m]. Outputs "X", "Z" of the load [m], Z up.
     """
     p = sv.parameters(m=1.0, J=0.02, m_load=0.5, L=1.2, g=9.81)  # kg, kg m^2, kg, m, m/s^2
-    q = sv.coordinates("x z theta alpha")  # m, m (up), rad, rad of the rope from the vertical
+    q = sv.coordinates("x z theta alpha", units="m m rad rad")  # z up, alpha of the rope from the vertical
     x, z, theta, alpha = q
     load = ca.vertcat(x + p.L * ca.sin(alpha), z - p.L * ca.cos(alpha))
     S = sv.rigid_body(q, p.m, (0, 0, p.J), position=(x, z), rates=(0, 0, q.d(1)[2])) + sv.particle(q, p.m_load, load)
@@ -27,6 +27,7 @@ def slung_load():
         potential=p.g * (p.m * z + p.m_load * load[1]),
         actuators={"thrust": ca.vertcat(-ca.sin(theta), ca.cos(theta), 0, 0), "moment": theta},
         outputs={"X": load[0], "Z": load[1]},
+        units={"X": "m", "Z": "m", "thrust": "N"},
         shapes={"body": sv.shapes.box((x, z), 0.8, 0.1, theta), "rope": [(x, z), load], "load": [load]},
         parameters=p,
     )
@@ -45,7 +46,7 @@ def slung_load_3d():
         (sin α, -cos α sin β, -cos α cos β). Outputs "X", "Y", "Z" of the load [m], Z up.
     """
     p = sv.parameters(m=1.0, J=0.02, J_z=0.04, m_load=0.5, L=1.2, g=9.81)  # kg, kg m^2, kg m^2, kg, m, m/s^2
-    q = sv.coordinates("x y z alpha beta psi theta phi")  # m, m, m (up), rad each
+    q = sv.coordinates("x y z alpha beta psi theta phi", units="m m m rad rad rad rad rad")  # z up
     x, y, z, alpha, beta, *angles = q
     body = ca.vertcat(x, y, z)
     rope = ca.vertcat(ca.sin(alpha), -ca.cos(alpha) * ca.sin(beta), -ca.cos(alpha) * ca.cos(beta))
@@ -66,6 +67,7 @@ def slung_load_3d():
         actuators={"thrust": ca.vertcat(axes[:, 2], ca.SX(5, 1))}
         | dict(zip(("roll", "pitch", "yaw"), ca.horzsplit(turning), strict=True)),
         outputs=dict(zip("XYZ", load.elements(), strict=True)),
+        units=dict.fromkeys("XYZ", "m") | {"thrust": "N"} | dict.fromkeys(("roll", "pitch", "yaw"), "N m"),
         shapes={f"arm {i + 1}": [body - 0.4 * axes[:, i], body + 0.4 * axes[:, i]] for i in (0, 1)}
         | {"rope": [body, load], "load": [load]},
         parameters=p,

@@ -29,7 +29,7 @@ def constant_speed(realisation="ideal"):
     if realisation not in ("ideal", "horizontal"):
         raise unknown(realisation, ("ideal", "horizontal"), "realisation")
     p = sv.parameters(m=1.0, g=9.81, v=5.0)  # kg, m/s^2, m/s
-    q = sv.coordinates("x y")  # m, m (up)
+    q = sv.coordinates("x y", units="m m")  # y up
     x, y = q
     dx, dy = q.d(1)
     mechanism = sv.Mechanism(

@@ -36,7 +36,7 @@ def spiral(order=3, c=None):
         )
     n = order - 2
     p = sv.parameters(m=1.0, c=factorial(n + 1) / 2 ** (n + 1) if c is None else c)  # kg, 1/(m s^n)
-    q = sv.coordinates("x y")  # m, m
+    q = sv.coordinates("x y", units="m m")
     x, y = q
     dx, dy = q.d(1)
     ddx, ddy = q.d(2)

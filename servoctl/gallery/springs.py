@@ -42,7 +42,7 @@ def cars(N=2, masses=None, stiffnesses=None, gaps=None, by="actuators"):
         **_numbered("k", "stiffnesses", stiffnesses, [1.0] * (N - 1)),  # N/m
         **_numbered("gap", "gaps", gaps, [0.5] * (N - 1)),  # m
     )
-    q = sv.coordinates(" ".join(f"x{i}" for i in range(1, N + 1)))  # m, each
+    q = sv.coordinates(" ".join(f"x{i}" for i in range(1, N + 1)), units="m " * N)
     x, m, k, gap = tuple(q), p.symbols[:N], p.symbols[N : 2 * N - 1], p.symbols[2 * N - 1 :]
     stretch = ca.vertcat(*(x[i] - x[i + 1] - gap[i] for i in range(N - 1)))
     path = sv.paths.rest_to_rest(q.t, 0.5, 2.5, duration=2.0, smoothness=max(6, 2 * N))

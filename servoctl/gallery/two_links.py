@@ -16,7 +16,7 @@ def two_link_arm():
         Realised by the actuators "shoulder" and "elbow" [N m]; y points up.
     """
     p = sv.parameters(m1=4.0, m2=3.0, l1=0.6, l2=0.5, I1=0.12, I2=0.07, g=9.81)  # kg, kg, m, m, kg m^2, kg m^2, m/s^2
-    q = sv.coordinates("q1 q2")  # rad from the horizontal, rad (relative)
+    q = sv.coordinates("q1 q2", units="rad rad")  # from the horizontal, relative
     end, S, height, shapes = _links(q, (p.m1, p.m2), (p.l1, p.l2), (p.I1, p.I2))
     path = sv.paths.rest_to_rest(q.t, start=(0.6, 0.4), end=(0.2, 0.9), duration=2.0, smoothness=2)
     mechanism = sv.Mechanism(
@@ -25,6 +25,7 @@ def two_link_arm():
         potential=p.g * height,
         actuators=dict(zip(("shoulder", "elbow"), q, strict=True)),
         outputs={"X_end": end[0], "Y_end": end[1]},
+        units={"X_end": "m", "Y_end": "m"},
         shapes=shapes,
         parameters=p,
     )
@@ -52,7 +53,7 @@ def pendubot(start=-90.0, end=0.0, duration=3.0, damping=0.05):
         Realised by the actuator "shoulder" [N m]; y points up.
     """
     p = sv.parameters(m1=4.0, m2=3.0, l1=0.6, l2=0.5, I1=0.12, I2=0.07, g=9.81, d=damping)
-    q = sv.coordinates("q1 q2")  # rad from the horizontal, rad (relative)
+    q = sv.coordinates("q1 q2", units="rad rad")  # from the horizontal, relative
     q1, _ = q
     end_point, S, height, shapes = _links(q, (p.m1, p.m2), (p.l1, p.l2), (p.I1, p.I2))
     degree = ca.pi / 180
@@ -64,6 +65,7 @@ def pendubot(start=-90.0, end=0.0, duration=3.0, damping=0.05):
         forces={"q2": -p.d * q.d(1)[1]},
         actuators={"shoulder": q1},
         outputs={"X_end": end_point[0], "Y_end": end_point[1]},
+        units={"X_end": "m", "Y_end": "m"},
         shapes=shapes,
         parameters=p,
     )
@@ -87,7 +89,7 @@ def passive_arm(Gamma=0.3):
         Realised by the actuator "torque" [N m] on q1.
     """
     p = sv.parameters(m=1.0, l=1.0, I=1 / 12, c=10.0, d=1.0, Gamma=Gamma)  # kg, m, kg m^2, N m/rad, N m s/rad, 1
-    q = sv.coordinates("q1 q2")  # rad, rad (relative)
+    q = sv.coordinates("q1 q2", units="rad rad")  # the second is relative
     q1, q2 = q
     _, S, _, shapes = _links(q, (p.m, p.m), (p.l, p.l), (p.I, p.I))
     path = sv.paths.rest_to_rest(q.t, 0.0, pi / 2, duration=2.0, smoothness=4)

@@ -26,9 +26,9 @@ def wheeled_robot(turn=90.0, speed=1.0, duration=4.0):
         Realised by the actuators "drive" [N] and "steer" [N m].
     """
     p = sv.parameters(m=20.0, J=1.5, speed=speed)  # kg, kg m^2, m/s
-    xy = sv.coordinates("x y psi")  # m, m, rad
+    xy = sv.coordinates("x y psi", units="m m rad")
     psi = list(xy)[2]
-    q = xy.with_quasi_velocities("v r", [[ca.cos(psi), 0], [ca.sin(psi), 0], [0, 1]])  # m/s, rad/s
+    q = xy.with_quasi_velocities("v r", [[ca.cos(psi), 0], [ca.sin(psi), 0], [0, 1]])
     x, y, _ = q
     centre, ahead, side = ca.vertcat(x, y), ca.vertcat(ca.cos(psi), ca.sin(psi)), ca.vertcat(-ca.sin(psi), ca.cos(psi))
     v, r = q.w()
@@ -40,6 +40,7 @@ def wheeled_robot(turn=90.0, speed=1.0, duration=4.0):
         gibbs=sv.rigid_body(q, p.m, (0, 0, p.J), position=(x, y), rates=(0, 0, r)),
         actuators={"drive": (1, 0), "steer": (0, 1)},
         outputs={"curvature": r / v},
+        units={"v": "m/s", "r": "rad/s", "curvature": "1/m"},
         shapes={
             "axle": [centre - 0.25 * side, centre + 0.25 * side],
             "body": sv.shapes.box(centre + 0.2 * ahead, 0.6, 0.35, psi),

@@ -23,6 +23,7 @@ from servoctl.errors import LimitExceeded, ServoError, SpecificationError, Unsta
 from servoctl.growth import internal_dynamics
 from servoctl.inversion.report import extremes
 from servoctl.inversion.verdict import HYPERBOLIC_ZEROS, verdict
+from servoctl.markup import Shown
 from servoctl.methods.choice import Bounded
 from servoctl.model.model import Model
 from servoctl.progress import progress_bar
@@ -47,7 +48,7 @@ STATIONARY = 1e-4  # of the cost: largest first-order gain across the ranges at 
 
 
 @dataclass(frozen=True, eq=False)
-class Design:
+class Design(Shown):
     """Parameters of least actuation or time, and the motion with them; made by `design`.
 
     Attributes

@@ -10,6 +10,7 @@ from servoctl.checks import interval, mapping
 from servoctl.errors import NotRealisable, SpecificationError, unknown
 from servoctl.figures.names import efforts
 from servoctl.inversion.verdict import UNREALISABLE, Verdict, endpoints, verdict
+from servoctl.markup import Shown
 from servoctl.model.model import SAMPLED, Model, derive
 from servoctl.model.report import WIDTH
 from servoctl.model.start import State
@@ -18,6 +19,7 @@ from servoctl.reduction.structure import Directions, Local, directions, margins
 from servoctl.run import Run, require_model
 from servoctl.spec.mechanism import Mechanism
 from servoctl.spec.program import Program
+from servoctl.units import rate_unit
 
 MOST_LINES = 12  # of a printed report
 FEWEST_OF_A_SPLINE = 4  # samples between two knots through which a spline of order 3 is laid
@@ -37,6 +39,8 @@ class Effort:
     limit, limit_at, room : float or None
         The nearest limit, the instant [s] at which the actuator is nearest to it, and how far it is then from it:
         negative beyond it. None without a limit.
+    unit : str
+        Of the values, where it is known.
     """
 
     peak: float
@@ -48,17 +52,20 @@ class Effort:
     limit: float | None = None
     limit_at: float | None = None
     room: float | None = None
+    unit: str = ""
 
     def __str__(self):
-        text = f"peak {self.peak:.6g} (t = {self.peak_at:.4g} s), rms {self.rms:.4g}; "
-        text += f"rate {self.rate:.4g} 1/s (t = {self.rate_at:.4g} s), rms {self.rate_rms:.4g}"
+        unit, rate = f" {self.unit}".rstrip(), rate_unit(self.unit or "1")
+        text = f"peak {self.peak:.6g}{unit} (t = {self.peak_at:.4g} s), rms {self.rms:.4g}{unit}; "
+        text += f"rate {self.rate:.4g} {rate} (t = {self.rate_at:.4g} s), rms {self.rate_rms:.4g}"
         if self.room is not None:
-            text += f"; {abs(self.room):.4g} {'within' if self.room >= 0 else 'beyond'} the limit {self.limit:g}"
+            side = "within" if self.room >= 0 else "beyond"
+            text += f"; {abs(self.room):.4g}{unit} {side} the limit {self.limit:g}{unit}"
         return text
 
 
 @dataclass(frozen=True, eq=False)
-class Report:
+class Report(Shown):
     """What a program asks of its mechanism, and which inverse it has; made by `report`.
 
     Attributes
@@ -362,7 +369,8 @@ def _effort(run, name, limits):
     if limits is not None:
         room, limit_at, limit = min((low - limits[0], t_low, limits[0]), (limits[1] - high, t_high, limits[1]))
         nearest = {"limit": limit, "limit_at": limit_at, "room": room}
-    return Effort(peak, peak_at, _rms(run.t, run[name]), rate, rate_at, _rms(run.t, rates), **nearest)
+    mean, unit = _rms(run.t, run[name]), run.unit(name)
+    return Effort(peak, peak_at, mean, rate, rate_at, _rms(run.t, rates), **nearest, unit=unit)
 
 
 def extremes(run, name):

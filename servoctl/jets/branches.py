@@ -106,10 +106,9 @@ class Branches:
         """
         if not expressions:
             return []
-        merged = ca.densify(ca.cse(ca.vertcat(*expressions)))
+        merged = ca.densify(cse(ca.vertcat(*expressions)))
         if not has_switches(merged):
             return merged.elements()
-        merged = ca.densify(cse(ca.vertcat(*expressions)))
         work, original, moves = [], [], []  # smooth values, the same with their decisions, whether these may change
 
         def value(op, operands):

@@ -13,6 +13,7 @@ from servoctl.codegen.function import compiled
 from servoctl.errors import ServoError, SpecificationError, unknown
 from servoctl.jets.series import Flow
 from servoctl.jets.tape import REAL
+from servoctl.markup import Shown
 from servoctl.model import saddle
 from servoctl.model.equations import (
     EQUATIONS,
@@ -102,7 +103,7 @@ def _derived(*specification):
     return Model(store.reduction(reduce), store)
 
 
-class Model:
+class Model(Shown):
     """Reduced dynamics and required actuation of a program; made by `derive`.
 
     Functions are derived, or read from disk, at their first use. A model is a value: models of the same specification

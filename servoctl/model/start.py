@@ -9,6 +9,7 @@ import numpy as np
 
 from servoctl.checks import column, finite, mapping
 from servoctl.errors import InconsistentStart, ServoError, SpecificationError, unknown
+from servoctl.markup import Shown
 from servoctl.model.equations import Invariants
 from servoctl.spec.mechanism import require_known
 from servoctl.values import Value
@@ -32,7 +33,7 @@ SHOWN = 3  # values by which a printed state tells branches apart
 
 
 @dataclass(frozen=True, eq=False)
-class State(Value):
+class State(Value, Shown):
     """A consistent state of a model at an instant.
 
     Attributes

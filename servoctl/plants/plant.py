@@ -19,6 +19,7 @@ from servoctl.checks import (
 from servoctl.codegen.function import compiled
 from servoctl.errors import SpecificationError, unknown
 from servoctl.jets.overflow import settled
+from servoctl.markup import Shown
 from servoctl.plants.equations import PlantEquations, equations_at, plant_equations
 from servoctl.spec.mechanism import Mechanism, require_known
 from servoctl.values import Value
@@ -122,7 +123,7 @@ def part_of(whole, mechanism):
 
 
 @dataclass(frozen=True, eq=False)
-class Plant(Value):
+class Plant(Value, Shown):
     """The full mechanism under actuator inputs and disturbances, material constraints held; made by `plant`.
 
     Attributes

@@ -13,6 +13,7 @@ import casadi as ca
 import numpy as np
 
 from servoctl.jets.series import Flow
+from servoctl.markup import Shown
 from servoctl.reduction.appell import Realisation
 from servoctl.reduction.manifold import solve
 from servoctl.reduction.ranks import clean, decide, decide_all, decide_each, solve_clean
@@ -62,7 +63,7 @@ UNDECIDED = Local((), 0, (), (), None, 0.0)
 
 
 @dataclass(frozen=True)
-class Structure:
+class Structure(Shown):
     """Index and orders of a program realised by actuators (or by an ideal reaction) along a motion.
 
     Attributes

@@ -10,10 +10,12 @@ import numpy as np
 from servoctl.errors import SpecificationError
 from servoctl.robots.dynamics import Axis, quaternion_rotation
 from servoctl.spec.coordinates import coordinates
+from servoctl.units import rate_unit
 
 PLACE = ("x", "y", "z", "qx", "qy", "qz", "qw")  # position and quaternion of a free body
 TWIST = ("vx", "vy", "vz", "wx", "wy", "wz")  # its velocities in its own axes
 ARGUMENTS = ("t", "guess", "hold")  # names that no coordinate has
+UNITS = {"turn": ["rad"], "slide": ["m"], "free": ["m"] * 3 + ["1"] * 4}  # of coordinates by motion
 
 
 def axes_of(description, tree, taken):
@@ -42,7 +44,8 @@ def axes_of(description, tree, taken):
             "A mechanism has at least one degree of freedom.",
             do='Release a joint, or pass base="free".',
         )
-    q = coordinates(" ".join(name for names in places.values() for name in names))
+    units = (unit for i in places for unit in UNITS[tree.bodies[i].motion])
+    q = coordinates(" ".join(name for names in places.values() for name in names), " ".join(units))
     if free:
         q = _with_twists(q, tree, places)
     rates, accelerations = q.gamma(1), q.gamma(2)
@@ -96,16 +99,18 @@ def unit_quaternions(q, posture):
 
 def _with_twists(q, tree, places):
     """Coordinates of which free bodies have the velocities of their own axes, and joints their rates."""
-    symbols, names, columns, invariants = dict(zip(q.names, q, strict=True)), [], [], {}
+    symbols, names, units, columns, invariants = dict(zip(q.names, q, strict=True)), [], [], [], {}
     for i, own in places.items():
         body = tree.bodies[i]
         if body.motion != "free":
             names.append(f"{own[0]}_rate")
             columns.append({own[0]: 1.0})
+            units.append(rate_unit(q.units[own[0]]))
             continue
         base = own[0].removesuffix("_x")
         x, y, z, w = (symbols[name] for name in own[3:])
         names += [f"{base}_{part}" for part in TWIST]
+        units += ["m/s"] * 3 + ["rad/s"] * 3
         turned = quaternion_rotation(x, y, z, w)
         columns += [dict(zip(own, e.elements(), strict=False)) for e in ca.horzsplit(turned)]
         rates = ((w, z, -y, -x), (-z, w, x, -y), (y, -x, w, -z))
@@ -115,7 +120,9 @@ def _with_twists(q, tree, places):
     for j, entries in enumerate(columns):
         for name, value in entries.items():
             V[q.names.index(name), j] = value
-    return q.with_quasi_velocities(" ".join(names), V, invariants=invariants)
+    moved = q.with_quasi_velocities(" ".join(names), V, invariants=invariants)
+    moved.units = q.units | dict(zip(names, units, strict=True))
+    return moved
 
 
 def identifier(name, taken=(), names_of=lambda name: (name,)):

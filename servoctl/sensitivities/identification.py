@@ -16,6 +16,7 @@ import numpy as np
 from servoctl.checks import named, numbers_by_name, require_kind, texts
 from servoctl.control.result import Closed
 from servoctl.errors import IntegrationStopped, SpecificationError, unknown
+from servoctl.markup import Shown
 from servoctl.plants.equations import equations_at
 from servoctl.plants.plant import Plant
 from servoctl.run import ByName
@@ -35,7 +36,7 @@ MISFIT = 1.25  # times the noise: larger residuals than these say that plant or 
 
 
 @dataclass(frozen=True, eq=False)
-class Identification(ByName, Value):
+class Identification(ByName, Value, Shown):
     """Parameters of a plant from measured runs; made by `identify`.
 
     `found["m_load"]` is a value, SI.

@@ -8,6 +8,7 @@ import numpy as np
 
 from servoctl.checks import named, texts
 from servoctl.errors import IntegrationStopped, SpecificationError, unknown
+from servoctl.markup import Shown
 from servoctl.methods.choice import Bounded
 from servoctl.methods.motion import breakpoints
 from servoctl.methods.sizes import motion_sizes
@@ -27,7 +28,7 @@ SHIFT = 1e-4  # of a parameter, by which the instants of knots are differentiate
 
 
 @dataclass(frozen=True, eq=False)
-class Sensitivity(ByName, Value):
+class Sensitivity(ByName, Value, Shown):
     """Derivatives of signals along a run by parameters and initial values; made by `sensitivity`.
 
     `s["trolley", "m_load"]` is ∂trolley/∂m_load at the samples, (N,), SI. `list`, `len` and `in` go by these pairs.

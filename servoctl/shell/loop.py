@@ -130,8 +130,8 @@ def facts(closed):
     }
 
 
-def save_figure(closed, folder, units, title):
+def save_figure(closed, folder, title):
     """Write closed_loop.png."""
-    figure = sv.figures.closed(closed, units=units)[0].figure
+    figure = sv.figures.closed(closed)[0].figure
     figure.suptitle(f"{title}: closed loop, {closed.law.name}, {closed.law.rate:g} Hz")
     write_png(figure, folder / "closed_loop.png")

@@ -4,11 +4,12 @@ import base64
 import shlex
 from html import escape
 
-from servoctl.verification.result import WORDS
+from servoctl.markup import EXTREMA, digits, rows_of
+from servoctl.units import unit_of
+from servoctl.verification.result import CHECK
 
 NAME = "index.html"
 VERSIONS = ("", "version")
-EXTREMA = ("signal", "least", "at t [s]", "greatest", "at t [s]", "unit")
 PICTURES = {  # file: what it shows
     "motion.png": "The mechanism at instants from the start (light) to the end (dark), over the programmed path.",
     "path.png": "The path.",
@@ -46,12 +47,12 @@ def write_page(folder, facts, units, verification, report, motion):
         f'<p class="verdict">{escape(_outcome(facts, verification))}</p>',
         motion,
         *_pictures(folder),
-        _chapter("What was computed", _rows_of(("", "value"), _asked(facts))),
-        _chapter("Extrema", _rows_of(EXTREMA, _ends(facts, units))),
+        _chapter("What was computed", rows_of(("", "value"), _asked(facts, units))),
+        _chapter("Extrema", rows_of(EXTREMA, _ends(facts, units))),
         *_of_loop(facts, units),
         *_checks(verification),
         _chapter("Report", f"<pre>{escape(report)}</pre>"),
-        _chapter("To repeat it", f"<pre>{escape(command)}</pre>" + _rows_of(VERSIONS, facts["versions"].items())),
+        _chapter("To repeat it", f"<pre>{escape(command)}</pre>" + rows_of(VERSIONS, facts["versions"].items())),
     ]
     body, title = "\n".join(parts), escape(scene["name"])
     head = f'<meta charset="utf-8"><meta name="viewport" content="width=device-width"><title>{title}</title>'
@@ -74,10 +75,13 @@ def _pictures(folder):
         yield f'<figure><img alt="{name}" src="{source}"><figcaption>{escape(words)}</figcaption></figure>'
 
 
-def _asked(facts):
-    start = ", ".join(f"{name} = {_digits(value)}" for name, value in facts["start"]["values"].items())
-    yield "time span [s]", " to ".join(map(_digits, facts["t_span"]))
-    yield "parameters, SI", ", ".join(f"{name} = {_digits(value)}" for name, value in facts["parameters"].items())
+def _asked(facts, units):
+    parameters, start = (
+        ", ".join(f"{name} = {digits(value)} {unit_of(name, units)}".strip() for name, value in values.items())
+        for values in (facts["parameters"], facts["start"]["values"])
+    )
+    yield "time span [s]", " to ".join(map(digits, facts["t_span"]))
+    yield "parameters, SI", parameters
     yield "start, SI", start
     yield "method", facts["method"] + (f", drift: {facts['drift']}" if facts["drift"] else "")
     yield "samples", str(facts["samples"])
@@ -87,65 +91,31 @@ def _asked(facts):
 def _ends(facts, units):
     for name, ends in facts["extrema"].items():
         low, high = ends["min"], ends["max"]
-        yield name, *map(_digits, (low["value"], low["t"], high["value"], high["t"])), units.get(name, "SI")
+        yield name, *map(digits, (low["value"], low["t"], high["value"], high["t"])), unit_of(name, units) or "SI"
 
 
 def _of_loop(facts, units):
     loop = facts["closed_loop"]
     if loop is None:
         return
-    other = [f"{n} = {_digits(v)}" for n, v in loop["machine"].items() if facts["parameters"].get(n) != v]
-    noise = [f"{n} {_digits(v)}" for n, v in (loop["noise"] or {}).items()]
-    said = [f"{loop['law']} at {_digits(loop['rate'])} Hz", loop["message"]]
+    other = [f"{n} = {digits(v)}" for n, v in loop["machine"].items() if facts["parameters"].get(n) != v]
+    noise = [f"{n} {digits(v)}" for n, v in (loop["noise"] or {}).items()]
+    said = [f"{loop['law']} at {digits(loop['rate'])} Hz", loop["message"]]
     said += [f"on a machine with {', '.join(other)}"] * bool(other) + [f"noise {', '.join(noise)}"] * bool(noise)
-    errors = ((name, _digits(e["worst"]), _digits(e["end"])) for name, e in loop["residuals"].items())
-    inputs = ((n, _digits(v["min"]), _digits(v["max"]), units.get(n, "SI")) for n, v in loop["inputs"].items())
-    content = f"<p>{escape('; '.join(said))}.</p>" + _rows_of(("residual, SI", "worst", "at the end"), errors)
-    yield _chapter("Closed loop", content + _rows_of(("input", "least", "greatest", "unit"), inputs))
+    errors = ((name, digits(e["worst"]), digits(e["end"])) for name, e in loop["residuals"].items())
+    inputs = ((n, digits(v["min"]), digits(v["max"]), unit_of(n, units) or "SI") for n, v in loop["inputs"].items())
+    content = f"<p>{escape('; '.join(said))}.</p>" + rows_of(("residual, SI", "worst", "at the end"), errors)
+    yield _chapter("Closed loop", content + rows_of(("input", "least", "greatest", "unit"), inputs))
 
 
 def _checks(verification):
     """Each number of the verification with its limit, and what was not checked."""
     if verification is None:
         return
-    limits = {name: verification.limits.get(name) for name in verification.numbers}
-    rows = [
-        (name, _digits(value), _digits(limits[name]), _within(value, limits[name]), WORDS.get(name, ""))
-        for name, value in verification.numbers.items()
-    ]
     notes = "".join(f"<p>{escape(note)}</p>" for note in (*verification.doubts, *verification.notes))
-    content = _rows_of(("check, relative", "value", "limit", "", ""), rows) + notes
+    content = rows_of(CHECK, verification.rows()) + notes
     yield _chapter(f"Verification: {verification.verdict}", content)
-
-
-def _within(number, limit):
-    return "" if limit is None else "within" if number <= limit else "beyond"
 
 
 def _chapter(title, content):
     return f"<h2>{escape(title)}</h2>\n{content}"
-
-
-def _rows_of(head, rows):
-    rows = [tuple(map(str, row)) for row in rows]
-    if not rows:
-        return "<p>none</p>"
-    numeric = [all(_is_number(row[i]) for row in rows) for i in range(len(head))]
-
-    def line(tag, cells):
-        marked = (f'<{tag}{" class=n" * n}>{escape(c)}</{tag}>' for c, n in zip(cells, numeric, strict=True))
-        return f"<tr>{''.join(marked)}</tr>"
-
-    return f"<table>{line('th', head)}{''.join(line('td', row) for row in rows)}</table>"
-
-
-def _is_number(text):
-    try:
-        float(text)
-    except ValueError:
-        return text == "–"
-    return True
-
-
-def _digits(value):
-    return "–" if value is None else f"{value:.6g}"

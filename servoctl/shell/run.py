@@ -70,8 +70,8 @@ def _compute(args, name, scene, folder):
     facts["closed_loop"] = loop.facts(closed)
     folder.write_json("summary.json", facts)
     folder.write_text("report.txt", report.text)
-    motion = _pictures_of(args, folder, scene, name, run, closed)
-    folder.write(lambda path: write_page(path, jsonable(facts), scene.units, verification, report.text, motion))
+    motion = _pictures_of(args, folder, name, run, closed)
+    folder.write(lambda path: write_page(path, jsonable(facts), run.units, verification, report.text, motion))
     print(f"{', '.join(f for f in (*FILES, *LOOP_FILES, ANIMATION) if (folder.path / f).exists())} in {folder.path}")
     if not run.success:
         complain(f"The motion ended early, at t = {run.t[-1]:.6g} s; what was computed is kept.")
@@ -85,14 +85,14 @@ def _compute(args, name, scene, folder):
 
 
 @stage("drawing")
-def _pictures_of(args, folder, scene, name, run, closed):
+def _pictures_of(args, folder, name, run, closed):
     """Write the figures, and the GIF if it is wanted; returns the motion as HTML: in the loop if there is one."""
     moving = run if closed is None else closed
     shown, left_out = shows_mechanism(moving), ("path",) if run.model.reduction.mechanism.shapes else ()
     if not args.no_figures:
-        folder.write(lambda path: write_figures(run, path, scene.units, name, left_out))
+        folder.write(lambda path: write_figures(run, path, None, name, left_out))
         if closed is not None:
-            folder.write(lambda path: loop.save_figure(closed, path, scene.units, name))
+            folder.write(lambda path: loop.save_figure(closed, path, name))
     if not shown:
         if args.animate:
             complain("There is no animation: the mechanism has no shapes=, and no outputs or coordinates like X and Z.")

@@ -3,6 +3,7 @@
 import functools
 import inspect
 import os
+from dataclasses import replace
 from pathlib import Path
 
 import servoctl as sv
@@ -187,13 +188,13 @@ def own_random_case(given, /, rng, **values):
 
 
 def _units(given):
-    """Units of the columns that hold states and numbers of signals."""
-    known = find_scene(given)[1].units if given and own_case(given) is None else {}
-    return {f"{name}{end}": unit for name, unit in known.items() for end in ("", "_min", "_max", "_end")}
+    """Units of states, signals and parameters of a scene whose cases are its motions."""
+    return _model(given).reduction.mechanism.units if given and own_case(given) is None else {}
 
 
 def _leave(study, folder, stem, units):
     """Print, save and draw a study; returns the exit code."""
+    study = replace(study, meta=study.meta | ({"units": units} if units else {}))
     report = Report()
     report.say(study)
     failures = study.take([i for i, error in enumerate(study["error"].tolist()) if error])
@@ -205,7 +206,7 @@ def _leave(study, folder, stem, units):
     folder.write_json(f"{stem}.json", study.meta)
     written = [f"{stem}{suffix}" for suffix in (".npz", ".csv", ".json")]
     try:
-        figure = sv.figures.sweep(study, units=units)
+        figure = sv.figures.sweep(study)
         figure.suptitle(f"{folder.name}: {study.meta['message']}", fontsize=11)
     except SpecificationError as error:
         complain(f"There is no figure: {error}")

@@ -1,7 +1,7 @@
 """Generalised coordinates, quasi-velocities and their jets, and the total derivative (3.1)."""
 
 import threading
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from math import factorial
 
 import casadi as ca
@@ -10,6 +10,7 @@ from servoctl.checks import as_list, column, is_whole, mapping, matrix, require_
 from servoctl.errors import SpecificationError, unknown
 from servoctl.jets.series import Motion, Series, is_zero
 from servoctl.jets.tape import Tape, divide, multiply
+from servoctl.units import units_by_name
 
 _lock = threading.Lock()
 
@@ -27,10 +28,12 @@ class Coordinates:
         The coordinates' names.
     t : SX
         The time [s].
+    units : dict of str to str
+        Units of coordinates and quasi-velocities, where they are given.
     """
 
-    def __init__(self, names):
-        self.names = names
+    def __init__(self, names, units=None):
+        self.names, self.units = names, units or {}
         self.nq = len(names)
         self.t = ca.SX.sym("t")
         self._q = tuple(ca.SX.sym(name) for name in names)
@@ -101,7 +104,7 @@ class Coordinates:
                 f"({self.nq}, {len(names)}).",
                 shape=V.shape,
             )
-        other = Coordinates(self.names)
+        other = Coordinates(self.names, self.units)
         other.t, other._q, other.plain = self.t, self._q, False
         other._index = {key: value for key, value in self._index.items() if value[0] != "w"}
         other.V = V
@@ -137,6 +140,7 @@ class Coordinates:
         other._index |= {s.element_hash(): ("q", 0, i) for i, s in enumerate(other._q)}
         other.velocity_names = tuple(self.velocity_names[i] for i in velocities)
         other.V, other.h, other.plain = self.V[places, velocities], self.h[places], self.plain
+        other.units = {name: u for name, u in self.units.items() if name in (*other.names, *other.velocity_names)}
         known = {s.element_hash() for s in other._q}
         other.invariants = {
             name: value for name, value in self.invariants.items()
@@ -272,9 +276,9 @@ class Coordinates:
 
     def __reduce__(self):
         if self.plain:
-            return Coordinates, (self.names,)
+            return Coordinates, (self.names, self.units)
         frame = self.as_function([self.V, self.h, *self.invariants.values()])
-        return _moved, (self.names, self.velocity_names, frame, tuple(self.invariants))
+        return _moved, (self.names, self.units, self.velocity_names, frame, tuple(self.invariants))
 
     def _series(self, expressions, k):
         """Coefficients 0 to k of expressions, followed by those of q' = V w + h if these contain q and q' is not w."""
@@ -322,9 +326,9 @@ def symbols_in(expression):
     return [expression] if expression.is_scalar() and expression.is_symbolic() else ca.symvar(expression)
 
 
-def _moved(names, velocity_names, frame, invariants):
+def _moved(names, units, velocity_names, frame, invariants):
     """Coordinates with quasi-velocities, unpickled."""
-    q = Coordinates(names)
+    q = Coordinates(names, units)
     V, h, *values = q.from_function(frame)
     return q.with_quasi_velocities(" ".join(velocity_names), V, h, dict(zip(invariants, values, strict=True)))
 
@@ -388,13 +392,16 @@ def _refuse_clash(names):
             )
 
 
-def coordinates(names: str | Iterable[str]) -> Coordinates:
+def coordinates(names: str | Iterable[str], units: str | Mapping[str, str] | None = None) -> Coordinates:
     """Generalised coordinates by name, with jets of any order on demand.
 
     Parameters
     ----------
     names : str
         Names separated by blanks, e.g. "x l theta".
+    units : str or dict of str to str, optional
+        The unit of each, separated by blanks ("m m rad"), or of some by name. Figures, tables, reports and exported C
+        show them, and those of rates and actuators that follow; numbers are in SI and radians whatever they are.
 
     Returns
     -------
@@ -404,6 +411,9 @@ def coordinates(names: str | Iterable[str]) -> Coordinates:
     Raises
     ------
     SpecificationError
-        If a name is no identifier, is `t`, repeats, or is also a derivative's name.
+        If a name is no identifier, is `t`, repeats, or is also a derivative's name; if there are not as many units.
+    NameUnknown
+        For the unit of a name that is no coordinate.
     """
-    return Coordinates(_identifiers(names, "coordinates"))
+    names = _identifiers(names, "coordinates")
+    return Coordinates(names, units_by_name(units, names, "coordinate"))

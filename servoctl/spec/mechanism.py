@@ -13,12 +13,14 @@ from servoctl.jets.branches import as_text, cse
 from servoctl.jets.identity import spread, vanish
 from servoctl.jets.overflow import settled
 from servoctl.jets.tape import Tape, evaluate
+from servoctl.markup import Shown
 from servoctl.spec.coordinates import Coordinates, jet_name, symbols_in
 from servoctl.spec.packing import packed, unpacked
 from servoctl.spec.parameters import Parameters
 from servoctl.spec.shapes import as_shapes
 from servoctl.spec.sums import summands, without
 from servoctl.tolerances import ENTRY
+from servoctl.units import FORCES, rate_unit, units_by_name
 from servoctl.values import Identity
 
 IDENTITY_SEED = 20021  # of the random points at which identities are tested
@@ -26,7 +28,7 @@ RANDOM = (0.3, 1.3)  # range of these, with parameters in units of their default
 INTEGRABLE = 1e-9  # part of the brackets of V's columns outside their span, relative to the largest bracket
 
 
-class Mechanism:
+class Mechanism(Shown):
     """A mechanism with forces, actuators and material constraints.
 
     Main arguments
@@ -62,15 +64,19 @@ class Mechanism:
     shapes : dict of str to sequence of points, optional
         Lines and bodies by which figures show the mechanism (`servoctl.spec.shapes`): points (x, y) or (x, y, z) [m],
         the last axis up, expressions of t, q and the parameters.
+    units : dict of str to str, optional
+        Units of coordinates, quasi-velocities, actuators, outputs, parameters and "multiplier_NAME" by name, as
+        figures, tables, reports and exported C show them. Those of coordinates may be given there; those of rates
+        follow, and those of actuators on coordinates, N or N m.
 
     Raises
     ------
     SpecificationError
         If an expression names a symbol that is no coordinate, parameter or t; if S is not quadratic in γ''; if S
         and T disagree; if there is nothing to take the balance from; if the mass matrix of `balance` is not symmetric,
-        or not `mass`.
+        or not `mass`; if a coordinate has two units.
     NameUnknown
-        If a force names no coordinate.
+        If a force names no coordinate, or a unit nothing of the mechanism.
     """
 
     def __init__(
@@ -88,6 +94,7 @@ class Mechanism:
         constraints=None,
         outputs=None,
         shapes=None,
+        units=None,
     ):
         self.left_out, self.whole = {}, None
         self.q = require_kind(Coordinates, "q", q, 'sv.coordinates("x y")')
@@ -107,6 +114,7 @@ class Mechanism:
         self.inputs, self.reported = (), {}
         self._refuse_orders()
         self._refuse_names()
+        self.units = self._units(units)
         self._check_balance()
         if self._inverse_dynamics is not None:
             self.forces = self._applied - self._static_forces()
@@ -135,7 +143,7 @@ class Mechanism:
         ]  # fmt: skip
         function = as_text(q.as_function([*expressions, *self.reported.values()], p.symbols))
         facts = [names, list(self.outputs), list(self.shapes), self.inputs, list(self.reported)]
-        facts += [p.defaults, self.left_out]
+        facts += [p.defaults, self.left_out, self.units]
         return json.dumps(facts) + "\n" + function
 
     def __eq__(self, other):
@@ -246,6 +254,7 @@ class Mechanism:
             shapes={name: ca.horzsplit(points) for name, points in self.shapes.items()},
         )  # fmt: skip
         driven.inputs, driven.reported = tuple(inputs), driven._named(reported, "residual")
+        driven.units = self.units
         return driven
 
     @cached_property
@@ -433,6 +442,25 @@ class Mechanism:
             total[names.index(name)] += self._known(value, f"the force on {name!r}")
         return total
 
+    def _units(self, units):
+        """Units by name: those that are given, and those of actuators that follow from their displacements."""
+        q = self.q
+        names = [*q.names, *(() if q.plain else q.velocity_names), *self.actuators, *self.outputs]
+        names += [*self.parameters.names, *(f"multiplier_{name}" for name in self.constraints)]
+        given = q.units | units_by_name(units, names, "signal or parameter")
+        for name in q.units:
+            if given[name] != q.units[name]:
+                raise SpecificationError(
+                    f"{name!r} has the units {q.units[name]!r} and {given[name]!r}.",
+                    "A coordinate or a quasi-velocity has one unit.",
+                    do="Give it in sv.coordinates(..., units=...) or in Mechanism(units=...).",
+                    name=name,
+                    units=(q.units[name], given[name]),
+                )
+        rates = [rate_unit(given.get(name, "")) if q.plain else given.get(name, "") for name in q.force_names]
+        efforts = {name: _unit_along(self.E[:, i], rates) for i, name in enumerate(self.actuators)}
+        return {name: unit for name, unit in efforts.items() if unit} | given
+
     def _directions(self, actuators):
         columns = []
         for name, value in actuators.items():
@@ -535,6 +563,7 @@ def _part(identity, places):
     part.constraints = {name: e for name, e in whole.constraints.items() if whole.places(e) <= places}
     part.outputs, part.inputs, part.reported = whole.outputs, whole.inputs, whole.reported
     part.shapes = {name: e for name, e in whole.shapes.items() if whole.places(e) <= places}
+    part.units = whole.units
     groups = {
         "coordinate": (q.names, part.q.names),
         "quasi-velocity": ((), ()) if q.plain else (q.velocity_names, part.q.velocity_names),
@@ -544,6 +573,15 @@ def _part(identity, places):
     part.whole = whole
     part.left_out = {what: tuple(n for n in names if n not in kept) for what, (names, kept) in groups.items()}
     return part
+
+
+def _unit_along(direction, rates):
+    """Unit of an actuator along a direction, "" unless that adds or subtracts velocities of one unit."""
+    entries = [(rate, entry) for rate, entry in zip(rates, direction.elements(), strict=True) if not entry.is_zero()]
+    if not all(entry.is_constant() and abs(float(entry)) == 1 for _, entry in entries):
+        return ""
+    along = {rate for rate, _ in entries}
+    return FORCES.get(along.pop(), "") if len(along) == 1 else ""
 
 
 def _restored(q, parameters, content):

@@ -111,7 +111,7 @@ def close_many(
         gathered = _one_by_one(run, derived, loop, numbers, seeds, traced, every)
     meta = {
         "t_span": [loop.t0, loop.t0 + loop.samples * loop.period], "law": run.law.name, "rate": run.law.rate,
-        "substeps": loop.substeps, "delay": loop.delay, "machine": machine(),
+        "substeps": loop.substeps, "delay": loop.delay, "machine": machine(), "units": run.units,
     }  # fmt: skip
     reasons = _reasons(run, loop, numbers, seeds, gathered) if run.law.allocation else {}
     study, gathered = _study(columns, seeds, derived.names, gathered, meta, reasons)

@@ -8,6 +8,7 @@ import numpy as np
 
 from servoctl.checks import as_span, mapping, named, numbers_by_name, text
 from servoctl.errors import LimitExceeded, SpecificationError, unknown
+from servoctl.markup import Shown
 from servoctl.progress import progress_bar
 from servoctl.study.cases import as_cases
 from servoctl.study.modelling import Levelled, add_likeness
@@ -297,6 +298,9 @@ class Levels(Study):
             limit=limit,
             uncertainty=self._floor(of),
         )
+
+    def _tables(self):
+        return Shown._tables(self)
 
     def __repr__(self):
         t0, t1 = self.meta["t_span"]

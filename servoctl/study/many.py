@@ -312,4 +312,5 @@ class _Many:
             texts = [self.errors.get(i, {}).get(name, "") for i in which.tolist()] if self.errors else [""] * len(which)
             columns[name] = np.array(texts, dtype=str)
         trace = dict(zip(names, self.samples[which].transpose(2, 1, 0), strict=True)) if len(times) else {}
-        return Motions(Study("many", columns, meta | {"machine": machine()}), times, trace)
+        meta = meta | {"machine": machine(), "units": self.model.reduction.mechanism.units}
+        return Motions(Study("many", columns, meta), times, trace)

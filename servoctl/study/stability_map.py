@@ -14,6 +14,7 @@ import numpy as np
 from servoctl.checks import named, positives, require_kind
 from servoctl.errors import SpecificationError
 from servoctl.growth import linearised
+from servoctl.markup import Shown
 from servoctl.methods.choice import Poles, as_drift
 from servoctl.methods.runge_kutta import ORDERS
 from servoctl.methods.stability import STEP_MAPS, amplification, stability_function
@@ -28,7 +29,7 @@ PER_DECADE, DECADES = 30, 7  # steps tried, below the length of the plan
 
 
 @dataclass(frozen=True, eq=False)
-class StabilityMap:
+class StabilityMap(Shown):
     """The stable steps along a plan; made by `stability`.
 
     In all methods, `method` is "RK1" to "RK8", "RK23", "RK45", "DOP853", "Taylor", "RadauIIA" or "Radau", `drift` is a

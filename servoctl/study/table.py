@@ -1,6 +1,5 @@
 """A study: a table by column names, failures among its rows, with its inputs and the machine that computed it."""
 
-import csv
 import functools
 import os
 import platform
@@ -14,14 +13,15 @@ from servoctl import archive
 from servoctl.checks import as_numbers, is_number, mapping, named, require_kind, text
 from servoctl.codegen.compiler import compiler
 from servoctl.errors import SpecificationError
+from servoctl.markup import Shown
+from servoctl.units import unit_of_column, with_unit
 from servoctl.version import __version__
 
-_FORMULA = ("=", "+", "-", "@", "\t", "\n")  # how texts begin that spreadsheets evaluate
 SHOWN, MOST_COLUMNS = 7, 12  # rows of a table in a repr, and columns
 
 
 @dataclass(frozen=True, eq=False)
-class Study:
+class Study(Shown):
     """A table of results; made by `tradeoff`, `levels`, `stability`, `sweep` or `load_study`.
 
     `study["seconds"]` is a column, `study.rows()` a list of dicts, `len(study)` the number of rows.
@@ -33,7 +33,8 @@ class Study:
     columns : dict of str to (N,) array
         Numbers or texts by name. A missing number is NaN, a missing text is empty.
     meta : dict
-        The inputs, and the machine with its versions: texts, numbers, and lists and dicts of them.
+        The inputs, and the machine with its versions: texts, numbers, and lists and dicts of them. Its entry "units"
+        has the units of signals and parameters by name.
     """
 
     kind: str
@@ -90,7 +91,7 @@ class Study:
         return replace(self, columns={name: values[index.astype(int)] for name, values in self.columns.items()})
 
     def csv(self, path):
-        """Write the table as CSV: a line of names, then one line for each row; a missing number is NaN.
+        """Write the table as CSV: a line of names with units, then one line for each row; a missing number is NaN.
 
         A text that spreadsheets would take for a formula, as it begins with =, +, - or @, has a ' before it.
 
@@ -107,12 +108,35 @@ class Study:
         ServoError
             If the file cannot be written.
         """
-        rows = zip(*(values.tolist() for values in self.columns.values()), strict=True)
-        with archive.writing(path, "study") as path:
-            with open(path, "w", newline="", encoding="utf-8", errors="backslashreplace") as file:
-                lines = csv.writer(file, lineterminator="\n")
-                lines.writerows([_cell(value) for value in row] for row in (self.columns, *rows))
-        return path
+        return archive.table(path, "study", self.columns, self._units_of_names())
+
+    @property
+    def units(self) -> dict[str, str]:
+        """Units of signals and parameters by name, where they are known."""
+        return self.meta.get("units", {})
+
+    def unit(self, name: str) -> str:
+        """The unit of a column, "" if it is not known.
+
+        Parameters
+        ----------
+        name : str
+            Of a parameter, a signal, or a signal's least, greatest or last value: "trolley_max".
+        """
+        return unit_of_column(name, self.units)
+
+    def _units_of_names(self):
+        return {name: self.unit(name) for name in self.columns}
+
+    def to_pandas(self):
+        """The study as a pandas.DataFrame; `attrs["units"]` has the known units by name.
+
+        Raises
+        ------
+        ServoError
+            If pandas is not installed.
+        """
+        return archive.frame(self.columns, self._units_of_names())
 
     def save(self, path):
         """Save the study as npz, without pickle; `load_study` reads it.
@@ -147,20 +171,21 @@ class Study:
         ServoError
             If xarray is not installed.
         """
-        columns = {name: ("row", values) for name, values in self.columns.items()}
+        units = self._units_of_names()
+        columns = {name: ("row", v, {"units": units[name]} if units[name] else {}) for name, v in self.columns.items()}
         return archive.dataset(columns, {}, {"kind": self.kind, **self.meta})
+
+    def _tables(self):
+        names = list(self.columns)[:MOST_COLUMNS]
+        columns = ([_short(value) for value in self[name][:SHOWN].tolist()] for name in names)
+        lines = [line for line in repr(self).splitlines()[1:] if line.startswith("  ... ")]
+        head = [with_unit(name, self.unit(name)) for name in names]
+        return [(head, zip(*columns, strict=True))] if names else [], lines
 
     def __repr__(self):
         lines = [f"Study: {self.kind}, {len(self)} rows", "  " + ", ".join(self.columns)]
         lines += [f"  {self.meta['message']}"] if self.meta.get("message") else []
         return "\n".join([*map(_clipped, lines), *table(self, list(self.columns)[:MOST_COLUMNS])])
-
-
-def _cell(value):
-    if not isinstance(value, str):
-        return value
-    text = value.replace("\r\n", "\n").replace("\r", "\n")  # the csv module quotes no carriage return
-    return f"'{text}" if text.startswith(_FORMULA) else text
 
 
 def table(study, names, most=SHOWN):
@@ -189,7 +214,7 @@ def machine():
 
 
 @dataclass(frozen=True, eq=False)
-class Traced:
+class Traced(Shown):
     """A table with a row per case, and traces of signals at common instants.
 
     Attributes

@@ -11,6 +11,7 @@ import numpy as np
 from servoctl.checks import as_span, is_number, mapping, named, positive, positives, require_kind, text
 from servoctl.control.reference import resampled
 from servoctl.errors import LimitExceeded, ServoError, SpecificationError, unknown
+from servoctl.markup import Shown
 from servoctl.methods.accuracy import motion_error, relative_error
 from servoctl.methods.choice import (
     METHODS,
@@ -196,6 +197,9 @@ class TradeOff(Study):
     def _errors(self):
         """Errors, at least the uncertainty of the reference."""
         return np.maximum(self["error"], self.uncertainty)
+
+    def _tables(self):
+        return Shown._tables(self)
 
     def __repr__(self):
         t0, t1 = self.meta["t_span"]

@@ -4,8 +4,11 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from servoctl.markup import Shown, digits
+
 PASSED, FAILED, INCONCLUSIVE = "passed", "failed", "inconclusive"
 MOST_LINES = 12  # of a printed verification
+CHECK = ("check, relative", "value", "limit", "", "")
 WORDS = {
     "samples": "samples that are not finite or out of order",
     "signals": "stored signals against those of the samples",
@@ -25,8 +28,13 @@ WORDS = {
 }
 
 
+def within(value, limit):
+    """Whether a number is "within" its limit or "beyond" it; "" without a limit."""
+    return "" if limit is None else "within" if value <= limit else "beyond"
+
+
 @dataclass(frozen=True)
-class Verification:
+class Verification(Shown):
     """Errors of a run against the full mechanism, all of them relative.
 
     Attributes
@@ -67,6 +75,17 @@ class Verification:
     def passed(self):
         """Whether everything was checked and is within its limit."""
         return self.verdict == PASSED
+
+    def _tables(self):
+        return [(CHECK, self.rows())], (*self.doubts, *self.notes)
+
+    def rows(self):
+        """For each number its name, value, limit, whether it is "within" or "beyond" that, and what it is: texts."""
+        return [
+            (name, digits(value), digits(limit), within(value, limit), WORDS.get(name, ""))
+            for name, value in self.numbers.items()
+            for limit in [self.limits.get(name)]
+        ]
 
     def __repr__(self):
         residuals = {k: v for k, v in self.numbers.items() if k.startswith("residual ")}

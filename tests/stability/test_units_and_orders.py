@@ -168,7 +168,7 @@ def test_every_scene_moves_alike_in_any_unit(name):
 
     def moved(length, mass, time):
         guess, span = scaled(scene.guess, length, time), tuple(time * s for s in scene.t_span)
-        changed = sv.derive(*in_units(mechanism, program, scene.units, length, mass, time), guess=guess)
+        changed = sv.derive(*in_units(mechanism, program, mechanism.units, length, mass, time), guess=guess)
         start = changed.start(span[0], guess=guess, **scaled(scene.start, length, time))
         return sv.simulate(changed, start, span, t_eval=np.linspace(*span, 51))
 
@@ -179,7 +179,7 @@ def test_every_scene_moves_alike_in_any_unit(name):
             return error.run
 
     def scaled(values, length, time):
-        return {key: value * scale(key, q, scene.units, length, time) for key, value in values.items()}
+        return {key: value * scale(key, q, mechanism.units, length, time) for key, value in values.items()}
 
     reference = ended(1.0, 1.0, 1.0)
     for length, mass, time in SCALES:
@@ -192,7 +192,7 @@ def test_every_scene_moves_alike_in_any_unit(name):
         count = min(len(run.t), len(reference.t)) - (not reference.success)  # the last sample is next to the stop
         for key in q.names:
             expected = reference[key][:count]
-            found = run[key][:count] / scale(key, q, scene.units, length, time)
+            found = run[key][:count] / scale(key, q, mechanism.units, length, time)
             limit = 1e-6 * max(np.abs(expected).max(), 1e-3)
             assert found == pytest.approx(expected, abs=limit), (key, length, mass, time)
 
@@ -203,7 +203,7 @@ def test_sizes_of_jets_are_found_from_the_specification(length, time):
     scene = gallery["overhead-crane"]
     mechanism, program = scene.build()
     assert sv.derive(mechanism, program, guess={"l": 4.0}).reduction.context.scales is None
-    other = in_units(mechanism, program, scene.units, length, 1.0, time)
+    other = in_units(mechanism, program, mechanism.units, length, 1.0, time)
     found = sv.derive(*other, guess={"l": 4.0 * length}).reduction.context.scales
     expected = np.array([length, length, 1.0, time])
     assert np.abs(np.log10([*found.coordinates, found.time] / expected)).max() < 2
