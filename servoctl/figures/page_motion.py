@@ -54,10 +54,10 @@ def moving_drawing(picture, low, high, kinds):
     every = _thinned(picture)
     moving = {name: frames(picture.shapes[name]) for kind in DRAWN_AS for name in kinds if kinds[name] == kind}
     trails = [placed(points[:, ::every]).split(" ") for points in picture.trails.values()]
-    lines = [_line(GROUND, frames(points)[0]) for name, points in picture.shapes.items() if kinds[name] == "ground"]
-    lines += [_line(PROGRAMMED, placed(points)) for points in picture.programmed.values()]
-    lines += [_line(TRAIL, "") for _ in trails]
-    lines += [_line(f'class="moving" {DRAWN_AS[kinds[name]]}', frames[0]) for name, frames in moving.items()]
+    lines = [_drawn(GROUND, frames(points)[0]) for name, points in picture.shapes.items() if kinds[name] == "ground"]
+    lines += [_drawn(PROGRAMMED, placed(points)) for points in picture.programmed.values()]
+    lines += [_drawn(TRAIL, "") for _ in trails]
+    lines += [_drawn(f'class="moving" {DRAWN_AS[kinds[name]]}', frames[0]) for name, frames in moving.items()]
     lines += [] if picture.space else _scale_bar(across, up, scale)
     t = np.round(picture.t[::every], 6).tolist()
     data = {"t": t, "fps": picture.fps / every, "pace": picture.pace}
@@ -85,7 +85,7 @@ def _thinned(picture):
     return -(-points // MOST_POINTS)
 
 
-def _line(look, points):
+def _drawn(look, points):
     return f'<polyline {look} points="{points}"/>'
 
 
@@ -96,4 +96,4 @@ def _scale_bar(across, up, scale):
     length = max(step * power for step in (1, 2, 5) if step * power <= longest)
     x, y = 10 * FINE, up - 8 * FINE
     text = f'<text x="{x}" y="{y - 6 * FINE}" font-size="{13 * FINE}" fill="#555555">{escape(f"{length:g} m")}</text>'
-    return [_line(GROUND, f"{x},{y} {x + length * scale:.0f},{y}"), text]
+    return [_drawn(GROUND, f"{x},{y} {x + length * scale:.0f},{y}"), text]
