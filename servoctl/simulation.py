@@ -539,7 +539,7 @@ def _default_times(t0, t1, knots):
     times, (_, *inside, _) = np.linspace(t0, t1, DEFAULT_SAMPLES), breakpoints((t0, t1), knots)
     for k in inside:
         nearest = round((k - t0) / (t1 - t0) * (DEFAULT_SAMPLES - 1))
-        if abs(times[nearest] - k) <= margin_at(k):
+        if abs(times[nearest] - k) <= margin_at(k, (t0, t1)):
             times[nearest] = k
     return np.array(sorted({*times.tolist(), *map(float, inside)}))  # np.union1d imports np.ma
 

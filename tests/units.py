@@ -6,14 +6,13 @@ import casadi as ca
 
 import servoctl as sv
 
-VELOCITIES = {"v": 1, "r": 0}  # powers of length of the gallery's quasi-velocities
 _NAME = re.compile(r"d(\d*)(.+)")
 
 
 def powers_of_length(q, units):
     """The power of length of each coordinate, and of each component of γ'."""
     of_q = {name: int(units[name] == "m") for name in q.names}
-    return of_q, dict(of_q) if q.plain else {name: VELOCITIES[name] for name in q.velocity_names}
+    return of_q, dict(of_q) if q.plain else {name: int(units[name] == "m/s") for name in q.velocity_names}
 
 
 def in_units(mechanism, program, units, length=1.0, mass=1.0, time=1.0):

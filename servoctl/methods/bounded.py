@@ -118,7 +118,7 @@ def bounded(model, span, guess, method, instants, progress, events=None):
 def _require_within(window, times):
     """Refuse samples (N,) or None outside the window, but for rounding."""
     low, high = window
-    if times is not None and (times[0] < low - margin_at(low) or times[-1] > high + margin_at(high)):
+    if times is not None and (times[0] < low - margin_at(low, window) or times[-1] > high + margin_at(high, window)):
         raise SpecificationError(
             f"t_eval covers {times[0]:g} to {times[-1]:g} s.",
             f"Samples of the bounded motion lie within its window, {low:.9g} to {high:.9g} s.",

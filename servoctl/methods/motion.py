@@ -136,16 +136,16 @@ def without_interruption():
         signal.signal(signal.SIGINT, before)
 
 
-def margin_at(t):
-    """Distance from an instant [s] within which another is the same."""
-    return SAME_INSTANT * max(1.0, abs(t))
+def margin_at(t, span):
+    """Distance from an instant [s] of a motion over a span within which another is the same."""
+    return SAME_INSTANT * max(min(1.0, abs(span[1] - span[0])), abs(t))
 
 
 def breakpoints(span, knots):
     """The span cut at the knots inside it, in the direction of integration."""
     t0, t1 = span
     low, high = min(span), max(span)
-    inside = [k for k in knots if low + margin_at(low) < k < high - margin_at(high)]
+    inside = [k for k in knots if low + margin_at(low, span) < k < high - margin_at(high, span)]
     return [t0, *(inside if t1 >= t0 else reversed(inside)), t1]
 
 
@@ -236,9 +236,10 @@ class Stepping:
         Motion
         """
         with interruptible(self.motion):
+            self.span = t0, t1
             self._watch(t0, x0, t1)
-            t, x, cuts = t0, x0, breakpoints((t0, t1), knots)
-            self.knots = {c for c in cuts if any(abs(c - k) <= margin_at(c) for k in knots)}
+            t, x, cuts = t0, x0, breakpoints(self.span, knots)
+            self.knots = {c for c in cuts if any(abs(c - k) <= margin_at(c, self.span) for k in knots)}
             self._start(t, x, cuts[1])
             self.motion.room = self._samples(cuts, t_eval)
             for b in cuts[1:]:
@@ -254,7 +255,8 @@ class Stepping:
     def _beside(self, a, b):
         """The ends of a piece, moved inwards where they are knots: on a knot a jump has the value beyond, or before."""
         forward = np.copysign(BESIDE_KNOTS, b - a)
-        return a + forward * margin_at(a) * (a in self.knots), b - forward * margin_at(b) * (b in self.knots)
+        first, last = (forward * margin_at(c, self.span) * (c in self.knots) for c in (a, b))
+        return a + first, b - last
 
     def _watch(self, t, x, t1):
         """Watch for the ends of smooth pieces, from the start on."""
