@@ -71,6 +71,13 @@ def test_long_expansions_are_not_decided(monkeypatch):
     assert not cancels(power)
 
 
+def test_a_thousand_squares_are_substituted():
+    """Of which each had taken a call within that of the one before."""
+    many = ca.sum1(ca.SX.sym("n", 11)) ** 2
+    assert cancels((S * many) * (S * many) - many * many + (C * many) * (C * many))
+    assert not cancels((S * many) * (S * many) - many * many + C * many)
+
+
 @pytest.mark.parametrize("name", [name for name in gallery if name != "spatial-arm"])
 def test_plants_of_the_gallery_watch_nothing(name):
     """So that their loops pay nothing."""

@@ -659,3 +659,18 @@ def test_dry_friction_does_not_act_where_a_flat_program_rests(samples):
     direction = np.where((run.t > 1) & (run.t < 3), 1.0, np.where((run.t > 4) & (run.t < 6), -1.0, 0.0))
     assert run["u"] - 2 * run["d2x"] == pytest.approx(0.3 * direction, abs=1e-12)
     assert sv.verify(model, run).passed
+
+
+def test_a_bead_on_a_spline_of_its_position_has_its_energy():
+    """Of 29 switches more have another side at the start than first assumed than one alone could take in turn."""
+    q = sv.coordinates("x y")
+    x, y = q
+    places = np.linspace(-1.0, 5.0, 31)
+    wire = sv.paths.spline(x, places, 0.3 * np.sin(1.3 * places), 3, "natural")
+    mechanism = sv.Mechanism(q, gibbs=sv.particle(q, 2.0, (x, y)), potential=2.0 * 9.81 * y)
+    model = sv.derive(mechanism, sv.Program({"wire": y - wire}, by="ideal"))
+    for place in (-0.5, 2.0, 4.5):
+        run = sv.simulate(model, model.start(x=place, dx=2.0), (0.0, 0.2))
+        energy = (run["dx"] ** 2 + run["dy"] ** 2) / 2 + 9.81 * run["y"]
+        np.testing.assert_allclose(energy, energy[0], atol=1e-9)
+        assert sv.verify(model, run).passed

@@ -84,6 +84,20 @@ class _Expansion:
 
     def product(self, a, b):
         """a b, with squares substituted."""
+        result, left = defaultdict(Fraction), self._expanded(a, b)
+        while left:
+            monomial, coefficient = left.popitem()
+            factor = next((i for i, exponent in monomial if exponent > 1 and i in self._squares), None)
+            if factor is None:
+                result[monomial] += coefficient
+                continue
+            rest = tuple((i, n - 2 * (i == factor)) for i, n in monomial if (i, n) != (factor, 2))
+            for other, c in self._expanded({rest: coefficient}, self._squares[factor]).items():
+                left[other] = left.get(other, 0) + c
+        return {monomial: coefficient for monomial, coefficient in result.items() if coefficient}
+
+    def _expanded(self, a, b):
+        """The terms of a b."""
         self._products += len(a) * len(b)
         if self._products > MOST_PRODUCTS:
             raise _Undecided
@@ -94,18 +108,7 @@ class _Expansion:
                 for factor, exponent in other:
                     exponents[factor] += exponent
                 result[tuple(sorted((i, n) for i, n in exponents.items() if n))] += c * d
-        result = {monomial: coefficient for monomial, coefficient in result.items() if coefficient}
-        return self._without_squares(result)
-
-    def _without_squares(self, polynomial):
-        for monomial in polynomial:
-            for factor, exponent in monomial:
-                if exponent > 1 and factor in self._squares:
-                    rest = tuple((i, n - 2 * (i == factor)) for i, n in monomial if (i, n) != (factor, 2))
-                    others = {m: c for m, c in polynomial.items() if m != monomial}
-                    squared = self.product({rest: polynomial[monomial]}, self._squares[factor])
-                    return self._without_squares(self.sum(others, squared))
-        return polynomial
+        return result
 
     def quotient(self, a, b):
         """a / b: by a monomial with negative exponents, by a sum with its reciprocal as a factor."""

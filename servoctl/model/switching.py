@@ -12,7 +12,7 @@ from servoctl.model.model import Model, derived
 from servoctl.spec.mechanism import Mechanism
 from servoctl.spec.parameters import Parameters
 
-LARGEST_CHAIN = 16  # branches that may follow from each other at one state
+MOST_TURNS = 16  # of a switch at one state, while those inside its switching function are settled
 
 
 class Switching:
@@ -89,7 +89,7 @@ class Switching:
             Branches nearby, which are kept where a switching function is zero.
         """
         result = list(known or (float(not s.angle) for s in self.switches))
-        for _ in range(LARGEST_CHAIN):  # branches inside the switching functions of others are settled first
+        for _ in range(MOST_TURNS * len(result)):  # branches inside the switching functions of others are settled first
             functions, _, others = self.values(tuple(result), np.array([t]), x[:, None])
             wrong = np.flatnonzero(functions[:, 0] < 0)
             if not len(wrong):
