@@ -223,6 +223,18 @@ def test_run_of_a_users_file(here, fall, capsys):
     assert servoctl.load(folder / "run.npz")["y"][-1] == pytest.approx(1.5 - 9.81 / 2, abs=1e-9)
 
 
+def test_a_start_may_hold_outputs(here):
+    """In START and in --hold, as model.start does: the distance of the mass from (0, -1), and its speed."""
+    outputs = 'outputs={"distance": (x**2 + (y + 1) ** 2) ** 0.5, "speed": q.dt(y)}, parameters=p)'
+    text = FALL.replace("parameters=p)", outputs).replace('START = {"y": 0.0, "dy": 0.0}', 'START = {"distance": 3.0}')
+    (here / "far.py").write_text(text + '\nGUESS = {"y": 1.0}\n')
+    for command in ("run far.py --no-verify --no-figures --no-loop", "sweep far.py --vary m=1:2:2"):
+        assert main([*command.split(), "--hold", "speed=0.5"] if "run" in command else command.split()) == 0, command
+    start = summary(here / "servoctl-runs" / "far")["start"]
+    assert start["held"] == ["distance", "speed"]
+    assert start["values"]["y"] == pytest.approx(2.0, abs=1e-12) and start["values"]["dy"] == pytest.approx(0.5)
+
+
 def test_a_guess_frees_what_the_scene_holds(here, fall):
     assert main(["run", fall, "--guess", "y=0.5", "--no-figures", "--no-verify"]) == 0
     start = summary(here / "servoctl-runs" / "fall")["start"]

@@ -10,12 +10,14 @@ from copy import copy
 import casadi as ca
 import numpy as np
 import pytest
+from refusals import refused
 from scipy.interpolate import make_interp_spline
 
 import servoctl as sv
 from servoctl.codegen import compiler, emit
 from servoctl.codegen import function as functions
 from servoctl.codegen.function import compiled
+from servoctl.export import c as export
 from servoctl.jets import lookup
 from servoctl.jets.pieces import by_pieces
 from servoctl.jets.series import Series
@@ -307,3 +309,17 @@ def test_an_exported_plan_holds_its_tables_of_data(monkeypatch, tmp_path, c_comp
     for real in ("double", "float"):
         (tmp_path / real).mkdir()
         test_an_exported_plan_has_the_tables(real, tmp_path / real, c_compiler)
+
+
+def test_floats_count_the_places_of_a_table(monkeypatch, tmp_path):
+    assert int(np.float32(export.COUNTED - 1)) == export.COUNTED - 1
+    assert int(np.float32(export.COUNTED + 1)) != export.COUNTED + 1
+    monkeypatch.setattr(paths, "MOST_SUMMED", 8)
+    model = pendulum_cart(lambda t: sv.paths.spline(t, EVEN, np.sin(EVEN), 5))
+    most = max(len(table.numbers) for table in lookup.lookups(model.signals("residuals")[1].expression))
+    monkeypatch.setattr(export, "COUNTED", most)
+    sv.export_c(model, tmp_path, real="float")
+    monkeypatch.setattr(export, "COUNTED", most - 1)
+    sv.export_c(model, tmp_path)
+    with refused(sv.SpecificationError, numbers=most, most=most - 1):
+        sv.export_c(model, tmp_path, real="float")

@@ -191,7 +191,20 @@ def test_parts_of_a_model_say_how_they_pickle(gallery_model):
     for part in (model.reduction, model.reduction.program):
         with refused(sv.SpecificationError, "sv.derive(mechanism, program)", type=type(part).__name__):
             pickle.dumps(part)
-    assert pickle.loads(pickle.dumps(model)) == model
+    other = pickle.loads(pickle.dumps(model))
+    assert other == model and other.reduction.program == model.reduction.program
+
+
+def test_programs_are_equal_by_names_choices_and_expressions():
+    def program(name="A", symbol="x", factor=2.0, **choices):
+        return sv.Program({name: factor * sv.coordinates(symbol)[symbol] - 1.0}, **choices)
+
+    assert program() == program() and hash(program()) == hash(program())
+    weighted = program(by="actuators", weights={"u": 2.0})
+    others = [program("B"), program(symbol="y"), program(factor=3.0), program(by="actuators"), weighted]
+    others += [program(by="actuators", weights={"u": 3.0}), program(by="actuators", toward={"u": 2.0})]
+    assert all(a != b for i, a in enumerate([program(by="ideal"), *others]) for b in others[i:])
+    assert program() != "A"
 
 
 def test_a_copy_of_a_mechanism_has_its_symbols():

@@ -17,6 +17,7 @@ from servoctl.control.law import Law
 from servoctl.errors import SpecificationError
 from servoctl.export.files import Array, Constant, Contents, Routine, Scalar, identifier, write
 from servoctl.inversion.verdict import GROWS, HYPERBOLIC_ZEROS, verdict
+from servoctl.jets.lookup import lookups
 from servoctl.model.model import Model
 from servoctl.model.start import State
 from servoctl.reduction.reduce import require_outputs
@@ -26,6 +27,7 @@ IN_FLOATS = {  # corrections that end it, at once and where they no longer fall;
     "TOLERANCE": 1e-6, "STALLED": 1e-3, "QP_MET": 1e-5, "QP_DEPENDENT": 1e-3, "QP_TINY": 1e-30, "MET": 1e-4,
     "GIVEN_WAY": 1e-4,
 }  # fmt: skip
+COUNTED = 2**24  # whole numbers up to it are floats
 LARGEST_CONDITION = 1e5  # of the metric of an allocation in floats, which have seven digits
 TIME = Scalar("t")
 FINITE = "Returns 0, or -1 if a time is no finite number: nothing is then changed."
@@ -76,6 +78,7 @@ def export_c(
     ------
     SpecificationError
         If the name is no C identifier, the source has no expressions, a law has a start, or a model is thinned.
+        In floats also if costs of an allocation differ too much, or a spline has more data than floats count.
     NameUnknown
         If `real` is another type.
     ServoError
@@ -113,6 +116,7 @@ def export_c(
     contents = _of_law(source, thinned) if law else _of_model(source, start)
     if real == "float":
         _require_condition(source)
+        _require_counted(contents)
         contents.sizes.update({key: value for key, value in IN_FLOATS.items() if key in contents.sizes})
     return write(folder, name, contents, real)
 
@@ -178,6 +182,20 @@ def _require_condition(source):
             do='Export it with real="double", or pass weights nearer to each other in place of a priority.',
             law=source.name,
             condition=condition,
+        )
+
+
+def _require_counted(contents):
+    """Refuse tables of spline data with more places than floats count."""
+    tables = {table for f in contents.functions.values() for table in lookups(f)}
+    most = max((len(table.numbers) for table in tables), default=0)
+    if most > COUNTED:
+        raise SpecificationError(
+            f"A spline of the program has a table of {most} numbers.",
+            f"A float counts the places of at most {COUNTED} numbers: beyond it leaves some out.",
+            do='Export it with real="double", or thin out the knots of the spline.',
+            numbers=most,
+            most=COUNTED,
         )
 
 

@@ -51,7 +51,9 @@ def _start(model, scene, t0, hold, guess):
             names=both,
         )
     held = {name: value for name, value in scene.start.items() if name not in guess} | hold
+    outputs = model.reduction.mechanism.outputs
+    known = (*model.state_names, *outputs)
     for name in held:
-        if name not in model.state_names:
-            raise unknown(name, model.state_names, "state")
+        if name not in known:
+            raise unknown(name, known, "state or output" if outputs else "state")
     return model.start(t=t0, guess={**scene.guess, **guess}, **held)

@@ -5,7 +5,7 @@ import numpy as np
 
 from servoctl.checks import column, mapping, require_kind
 from servoctl.errors import SpecificationError, unknown
-from servoctl.jets.branches import without_turns
+from servoctl.jets.branches import as_text, without_turns
 from servoctl.jets.overflow import settled
 from servoctl.spec.coordinates import Coordinates
 from servoctl.spec.packing import Packed
@@ -78,6 +78,23 @@ class Program(Packed):
         weights = None if self.metric == "inertia" else weights
         self.weights = {name: _weight(name, value) for name, value in mapping(weights, "The weights").items()}
         self.toward = {name: _wish(name, value) for name, value in mapping(toward, "The wishes").items()}
+
+    def __eq__(self, other):
+        """Whether names, choices and expressions in symbols of the same names are the same."""
+        if type(other) is not type(self):
+            return NotImplemented
+        return self is other or self._facts() == other._facts()
+
+    def __hash__(self):
+        return hash((self.names, self.by, self.metric))
+
+    def _facts(self):
+        """Names, choices, symbols' names and expressions as text."""
+        parts = (self.with_turns, self.weights, self.toward)
+        expressions = [ca.SX(value) for part in parts for value in part.values()]
+        symbols = ca.symvar(ca.vertcat(*expressions))
+        text = as_text(ca.Function("program", symbols, expressions))
+        return [[*part] for part in parts], self.by, self.metric, [s.name() for s in symbols], text
 
     @property
     def names(self):
