@@ -39,6 +39,7 @@ JITTER, GOLDEN = 0.5, 0.6180339887498949  # of their distance by which instants 
 TURNED = 0.75  # squared sines of the angles between tangent spaces at an end of a segment and at its middle, summed
 DENSE = 3  # samples for each instant, with which instants are samples
 DEFECT = 1e-3  # of the sizes of the states: largest error, over an interval of samples, of states between them
+PARTS = 4  # halvings of a run that nothing resolves, whose first part may be unstable
 BLOCKS = 32  # instants between which growth is measured, as all pairs of them
 MODERATE = 1e8  # ‖P‖ ‖P⁻¹‖ of propagators P from the start, below which those between all instants follow from them
 SQUARINGS = 6  # of a matrix, from which its largest eigenvalue follows within a part of 2^-SQUARINGS of its logarithm
@@ -67,7 +68,8 @@ class InternalDynamics(Shown):
         "none" for flat programs. Over the time of the run, and no longer: "unstable" if an error grows more than
         tenfold and exponentially or faster than a power of time can, or 1e4-fold, "stable" if none does and all errors
         of the start have shrunk at its end, "neutral" otherwise, as where phases drift apart. With a period, which says
-        something of all times, by the multipliers. "inconclusive" if the samples do not resolve it.
+        something of all times, by the multipliers. "inconclusive" if the samples do not resolve it, unless
+        its first half, quarter, ... is unstable; the numbers are then those of that part.
     growth : float
         max ‖Φ(t, s)‖, s <= t: the largest growth of an error from any instant of the run to any later one.
     left : float
@@ -230,7 +232,7 @@ def internal_dynamics(model: Model, run: Run, period: float | None = None) -> In
         return replace(_inconclusive(model, run), cause=cause)
     resolved = _resolved(model, run)
     if resolved is None:
-        return _inconclusive(model, run)
+        return _unstable_at_first(model, run) or _inconclusive(model, run)
     judged = _judged(*resolved)
     return judged if period is None else _with_multipliers(model, run, positive("period", period), judged)
 
@@ -737,6 +739,19 @@ def _judged(tangents, steps, propagators):
     unstable = _unstable(corners, steps, ends, logs, scale)
     verdict = "unstable" if unstable else "stable" if left < SHRUNK else "neutral"
     return InternalDynamics(tangents, verdict, growth, left, until)
+
+
+def _unstable_at_first(model, run):
+    """The verdict on the first half, quarter, ... of a run that nothing resolves, if it is unstable; None otherwise."""
+    for part in 2.0 ** -np.arange(1, PARTS + 1):
+        n = int(np.searchsorted(np.abs(run.t - run.t[0]), part * np.abs(run.t[-1] - run.t[0]), side="right"))
+        variants = tuple((a, min(b, n), variant) for a, b, variant in run.variants if a < n)
+        first = replace(run, t=run.t[:n], jets=_states(model, run)[:, :n], variants=variants)
+        resolved = _resolved(model, first) if n > 1 else None
+        if resolved is not None:
+            judged = _judged(*resolved)
+            return judged if judged.verdict == "unstable" else None
+    return None
 
 
 def _inconclusive(model, run):

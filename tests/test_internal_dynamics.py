@@ -216,6 +216,18 @@ def test_a_pendulum_that_is_driven_by_its_speed_is_unstable(length):
     assert found.verdict == "unstable" and found.growth > 50
 
 
+@pytest.mark.parametrize("most", [64, 128, 256])
+def test_what_is_unstable_before_nothing_resolves_it_is_unstable(most, monkeypatch):
+    """In the end it turns faster than few instants resolve."""
+    monkeypatch.setattr(growth, "MOST", most)
+    model = passive(lambda x, v, t: v + 10 * ca.sin(x))
+    with warned("unstable"):
+        run = sv.simulate(model, model.start(x=0.1, dx=0.0), (0.0, 6.0))
+    assert growth._resolved(model, run) is None
+    found = sv.internal_dynamics(model, run)
+    assert found.verdict == "unstable" and found.length < 6.0 and 10 < found.growth < 1e3
+
+
 def test_the_plan_of_a_parametric_resonance_is_refused_by_inverse_dynamics():
     model = passive(mathieu(0.6))
     run, found = moved(model, 120.0)
