@@ -39,6 +39,7 @@ JITTER, GOLDEN = 0.5, 0.6180339887498949  # of their distance by which instants 
 TURNED = 0.75  # squared sines of the angles between tangent spaces at an end of a segment and at its middle, summed
 DENSE = 3  # samples for each instant, with which instants are samples
 DEFECT = 1e-3  # of the sizes of the states: largest error, over an interval of samples, of states between them
+PARTS = 4  # halvings of a run that nothing resolves, whose first part may be unstable
 BLOCKS = 32  # instants between which growth is measured, as all pairs of them
 MODERATE = 1e8  # ‖P‖ ‖P⁻¹‖ of propagators P from the start, below which those between all instants follow from them
 SQUARINGS = 6  # of a matrix, from which its largest eigenvalue follows within a part of 2^-SQUARINGS of its logarithm
@@ -65,9 +66,10 @@ class InternalDynamics(Shown):
         The linearisation.
     verdict : {"none", "stable", "neutral", "unstable", "inconclusive"}
         "none" for flat programs. Over the time of the run, and no longer: "unstable" if an error grows more than
-        tenfold and exponentially, or 1e4-fold, "stable" if none does and all errors of the start have shrunk at its
-        end, "neutral" otherwise, as where phases drift apart. With a period, which says something of all times, by
-        the multipliers. "inconclusive" if the samples do not resolve it.
+        tenfold and exponentially or faster than a power of time can, or 1e4-fold, "stable" if none does and all errors
+        of the start have shrunk at its end, "neutral" otherwise, as where phases drift apart. With a period, which says
+        something of all times, by the multipliers. "inconclusive" if the samples do not resolve it, unless
+        its first half, quarter, ... is unstable; the numbers are then those of that part.
     growth : float
         max ‖Φ(t, s)‖, s <= t: the largest growth of an error from any instant of the run to any later one.
     left : float
@@ -230,7 +232,7 @@ def internal_dynamics(model: Model, run: Run, period: float | None = None) -> In
         return replace(_inconclusive(model, run), cause=cause)
     resolved = _resolved(model, run)
     if resolved is None:
-        return _inconclusive(model, run)
+        return _unstable_at_first(model, run) or _inconclusive(model, run)
     judged = _judged(*resolved)
     return judged if period is None else _with_multipliers(model, run, positive("period", period), judged)
 
@@ -667,45 +669,42 @@ def _growth(corners, propagators, scale=None):
     least = np.maximum(columns.max(axis=1), rows.max(axis=1))
     for bound, square in ((logs, least), (most, columns.sum(axis=1))):
         bound[later] = log + np.log(np.maximum(square, TINY**2)) / 2
-    matter = _may_be_largest(corners.t[ends], logs, most)[later]
+    matter = _may_be_largest(logs, most)[later]
     norms = np.linalg.eigvalsh(scaled[matter].swapaxes(1, 2) @ scaled[matter])[:, -1]
     logs[s[matter], t[matter]] = log[matter] + np.log(np.maximum(norms, TINY**2)) / 2
     return ends, logs, scale
 
 
-def _may_be_largest(t, least, most):
+def _may_be_largest(least, most):
     """Of which pairs of instants (n, n) the growth may be the largest over a time, or up to an instant.
 
     Its logarithm lies between `least`, of the largest row or column of a propagator, and `most`, of all its entries.
     """
+    blocks = np.arange(len(least))
     matter = most >= np.maximum.accumulate(least.max(axis=0))
-    for inside in _windows(t):
-        matter |= inside & (most >= least[inside].max())
+    matter |= most >= _within(least)[np.maximum(blocks - blocks[:, None], 0)]
     matter[0, -1] = True
     return matter
 
 
-def _windows(t):
-    """Which pairs of instants t (n,) lie at most the whole time apart, at most half of it, and so on; neighbours.
-
-    Times that differ by half of the least distance between instants, which are those of steps, are the same.
-    """
-    ago = np.abs(t - t[:, None])
-    halves = ago.max() / 2.0 ** np.arange(int(np.log2(len(t)))) + np.abs(np.diff(t)).min() / 2
-    return [*(ago <= halves[:, None, None]), np.eye(len(t), k=1, dtype=bool)]
+def _within(logs):
+    """The largest of logs (n, n) between instants that are at most 0, 1, ..., n - 1 blocks apart."""
+    return np.maximum.accumulate([np.diag(logs, blocks).max() for blocks in range(len(logs))])
 
 
 def _unstable(corners, steps, ends, logs, scale):
-    """Whether errors grow more than tenfold and exponentially, not as a power of time like phases that drift apart.
+    """Whether errors grow more than tenfold, and not as a power of time like phases that drift apart.
 
-    Growth over a time is compared with that over half of it, and where a block has most of it, in that block.
+    Growth over each number of blocks is compared with that over half as many, and where a block has most of it, in
+    that block. Errors in f states grow no faster than t^(f - 1) where a constant linearisation has no positive mode.
     """
-    limit = np.log(UNSTABLE)
-    within = np.array([logs[inside].max() for inside in _windows(corners.t[ends])])
-    whole, half = within[:-1], within[1:]
-    exponential = (whole > limit) & (whole - half > np.log(FASTER)) & (whole > EXPONENTIAL * half)
-    exponential &= within.max() < EXPONENTIAL * whole  # most of the growth is that over this time
-    if exponential.any() or logs.max() > np.log(GREAT):
+    limit, power = np.log(UNSTABLE), np.log(2.0) * max(corners.N.shape[2] - 2, 0)
+    within = _within(logs)
+    whole = within[2::2]
+    half = within[1 : 1 + len(whole)]
+    exponential = (whole > EXPONENTIAL * half) & (within.max() < EXPONENTIAL * whole)  # most growth is over this time
+    exponential |= whole - half > np.log(FASTER) + power
+    if (exponential & (whole > limit) & (whole - half > np.log(FASTER))).any() or logs.max() > np.log(GREAT):
         return True
     j = int(np.argmax(np.diag(logs, 1)))
     first, end = ends[j], ends[j + 1]
@@ -740,6 +739,19 @@ def _judged(tangents, steps, propagators):
     unstable = _unstable(corners, steps, ends, logs, scale)
     verdict = "unstable" if unstable else "stable" if left < SHRUNK else "neutral"
     return InternalDynamics(tangents, verdict, growth, left, until)
+
+
+def _unstable_at_first(model, run):
+    """The verdict on the first half, quarter, ... of a run that nothing resolves, if it is unstable; None otherwise."""
+    for part in 2.0 ** -np.arange(1, PARTS + 1):
+        n = int(np.searchsorted(np.abs(run.t - run.t[0]), part * np.abs(run.t[-1] - run.t[0]), side="right"))
+        variants = tuple((a, min(b, n), variant) for a, b, variant in run.variants if a < n)
+        first = replace(run, t=run.t[:n], jets=_states(model, run)[:, :n], variants=variants)
+        resolved = _resolved(model, first) if n > 1 else None
+        if resolved is not None:
+            judged = _judged(*resolved)
+            return judged if judged.verdict == "unstable" else None
+    return None
 
 
 def _inconclusive(model, run):
