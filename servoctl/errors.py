@@ -96,9 +96,12 @@ def unknown(name, valid, what):
 
 def _next_derivative(name, valid):
     """Of the valid names of derivatives of the same quantity, that of the nearest order; None if there is none."""
+    repeated = re.fullmatch(r"(dd+)(.+)", name)
+    if repeated and repeated[2] in valid:  # ddx
+        name = f"d{len(repeated[1])}{repeated[2]}"
     found = DERIVATIVE.fullmatch(name)
-    if not found:
-        return None
+    if name in valid or not found:
+        return name if name in valid else None
     order, base = int(found[1] or 1), found[2]
     orders = {base: 0, f"d{base}": 1} | {f"d{k}{base}": k for k in range(2, order)}
     return min((other for other in valid if other in orders), key=lambda other: order - orders[other], default=None)

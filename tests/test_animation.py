@@ -226,6 +226,7 @@ def test_a_long_motion_is_shown_faster(crane):
     shown = sv.plots.animate(run, fps=fps)
     assert len(shown.t) == MOST_FRAMES and shown.pace == pytest.approx(40 * fps / (MOST_FRAMES - 1))
     assert "times as fast" in repr(shown)
+    assert next(shown._frames()).shape[-1] == 3  # the clock of a frame says so as well
 
 
 def drawn_by_its_script(page, frame):

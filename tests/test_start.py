@@ -179,6 +179,8 @@ def test_names_with_commas_are_refused_with_the_names_as_they_should_be(names):
     [
         ("d3q1", ("q1", "dq1", "d2q1", "d2q2"), "d2q1"),
         ("d2q1", ("q1", "dq1", "dq2"), "dq1"),
+        ("ddq1", ("q1", "dq1", "d2q1", "d2q2"), "d2q1"),
+        ("ddq1", ("q1", "dq1", "dq2"), "dq1"),
         ("dq1", ("q1", "q2"), "q1"),
         ("delta", ("beta", "deltas"), "deltas"),
     ],

@@ -305,6 +305,25 @@ def test_the_structure_has_the_margin_of_the_reduction(alpha):
     assert model.structure().margin <= model.reduction.rank.kept == pytest.approx(alpha**2, rel=0.1)
 
 
+@pytest.mark.parametrize("chart", ["a b", "b a"])
+def test_a_load_is_judged_where_its_angles_are_regular(chart):
+    q = sv.coordinates("x y z a b")
+    x, y, z, a, b = q
+    load = ca.vertcat(x, y, z)  # one angle loses its inertia where the other is a right angle
+    if chart == "a b":
+        load += ca.vertcat(ca.sin(a), ca.cos(a) * ca.sin(b), -ca.cos(a) * ca.cos(b))
+    else:
+        load += ca.vertcat(ca.cos(b) * ca.sin(a), ca.sin(b), -ca.cos(a) * ca.cos(b))
+    S = sv.particle(q, 1.0, ca.vertcat(x, y, z)) + sv.particle(q, 0.4, load)
+    vehicle = sv.Mechanism(q, S, 9.81 * (z + 0.4 * load[2]), {"Fx": x, "Fy": y, "Fz": z})
+    path = sv.paths.rest_to_rest(q.t, (0.0, 0.0, 0.0), (3.0, 2.0, 1.0), duration=4.0)
+    model = sv.derive(vehicle, sv.Program({name: load[i] - path[i] for i, name in enumerate("XYZ")}))
+    structure = model.structure()
+    assert structure.zeros_at_infinity == (2, 4, 4) and "differs" not in str(structure)
+    plan = sv.simulate(model, model.start(), (0.0, 4.0), t_eval=np.linspace(0.0, 4.0, 101))
+    assert sv.verify(model, plan).passed
+
+
 def test_a_structure_without_all_zeros_at_infinity_says_so(monkeypatch):
     monkeypatch.setattr("servoctl.reduction.structure.DEPTHS", (2, 3))
     model = sv.derive(*gallery["two-cars"].build())

@@ -261,7 +261,10 @@ def _beyond_inputs(error, mode, alone, plant, varying):
     return ServoError(
         f"A mode in {', '.join(mode)} that does not decay is out of reach of {', '.join(plant.inputs)}.",
         "The inputs must reach each unstable or marginal mode that has a weight (Riccati).",
-        do=do if alone else "Choose other actuators, or integrate fewer residuals than there are inputs.",
+        do=do
+        if alone
+        else "Choose other actuators, or integrate fewer residuals than there are inputs. If the mode only drifts, "
+        "weigh only states that it does not move, with 0 for all others.",
         **error.details | {"mode": mode, "unweighted": alone},
     )
 

@@ -157,7 +157,8 @@ class Animation(Value):
         for artist in changing:
             artist.set_animated(True)
         canvas.draw()
-        background, pace = canvas.copy_from_bbox(ax.figure.bbox), f", {self.pace:.3g} times as fast" * (self.pace > 1)
+        background = canvas.copy_from_bbox(ax.figure.bbox)
+        pace = f", {self.pace:.3g} times as fast" if self.pace > 1 else ""
         for i, t in enumerate(self.t):
             canvas.restore_region(background)
             for trail, points in zip(trails, self.trails.values(), strict=True):

@@ -83,7 +83,7 @@ class Realisation:
         return eliminate(self.B[rows, :], balance[rows], self.numbers[:, rows].swapaxes(0, 1))[0]
 
 
-def _saddle(mechanism, material):
+def saddle(mechanism, material):
     """[M G_mᵀ; G_m 0]."""
     n, k = mechanism.q.n, len(material)
     G = ca.vertcat(*(row.gradient(mechanism.q) for row in material)) if material else ca.SX(0, n)
@@ -98,7 +98,7 @@ def plant_accelerations(mechanism, material, forces, second, points):
 
 def plant_solution(mechanism, material, forces, second, points):
     """[γ''; -λ] of [M G_mᵀ; G_m 0] [γ''; -λ] = [forces; second], (n + k, columns) SX; the pivots."""
-    matrix = _saddle(mechanism, material)
+    matrix = saddle(mechanism, material)
     numbers = clean(*points.matrix(matrix))
     return eliminate(matrix, ca.vertcat(forces, second), numbers)
 
@@ -113,7 +113,7 @@ def require_inertia(mechanism, material, points):
     """
     require_positive(mechanism, points)
     q, n = mechanism.q, mechanism.q.n
-    values, sizes = points.matrix(_saddle(mechanism, material))
+    values, sizes = points.matrix(saddle(mechanism, material))
     rank, best = decide_all(values, sizes)
     if rank.rank < len(values):
         cleaned = clean(values, sizes)[:, :, best].astype(float)

@@ -13,6 +13,7 @@ import numpy as np
 
 from servoctl.jets.series import Flow
 from servoctl.jets.tape import REAL, Book
+from servoctl.reduction.ranks import clean, decide_each
 from servoctl.tolerances import CUTOFF
 
 ROUNDED = 8 * float(np.finfo(REAL).eps)  # a scaled residual below this is a rounding error
@@ -333,11 +334,27 @@ def sample(q, rows, level, context, starts=None, flow=None):
         q, t, z.astype(REAL), context.parameters, context.values, np.zeros(len(t)), context.book, context.scales
     )
     flow = flow.at(starting) if flow else Flow(q, rows, level, starting)
-    points = _solved(starting, flow, slice(POINTS))
+    first = _solved(starting, flow, slice(POINTS))
+    points = _with_inertia(first, context.saddle)
     if len(points.t) == POINTS:
         return points
-    points = points.joined(_solved(starting, flow, slice(POINTS, None))).take(slice(POINTS))
+    others = _solved(starting, flow, slice(POINTS, None))
+    points = points.joined(_with_inertia(others, context.saddle)).take(slice(POINTS))
+    if not len(points.t):  # as where every solution is in such a place
+        points = first.joined(others).take(slice(POINTS))
     return points if len(points.t) else _solved(starting, flow, slice(POINTS), natural=True)
+
+
+def _with_inertia(points, saddle):
+    """The points where every allowed direction has inertia; all of them without a matrix [M G_mᵀ; G_m 0].
+
+    Where coordinates are singular, as longitude is at a pole, a balance vanishes with the inertia of its coordinate:
+    such places solve the equations, and are no motions.
+    """
+    if saddle is None or not len(points.t):
+        return points
+    ranks = decide_each(clean(*points.matrix(saddle)))
+    return points.take([i for i, r in enumerate(ranks) if r.rank == saddle.shape[0]])
 
 
 def anywhere(q, level, context):
@@ -389,6 +406,8 @@ class Context:
         Usual sizes of jets, by which jets without a guess are spread; default 1 each.
     book : Book
         Tapes of the scalars that were evaluated.
+    saddle : SX, optional
+        [M G_mᵀ; G_m 0]: points where it is singular are left out, where there are others.
     """
 
     parameters: tuple
@@ -399,3 +418,4 @@ class Context:
     sizes: dict = field(default_factory=dict)
     scales: object = None
     book: Book = field(default_factory=Book, repr=False, compare=False)
+    saddle: object = None

@@ -11,7 +11,7 @@ from servoctl.checks import finite, mapping
 from servoctl.errors import NotRealisable, ServoError, SpecificationError, unknown
 from servoctl.jets.branches import cse
 from servoctl.jets.series import Flow
-from servoctl.reduction.appell import Realisation, require_inertia
+from servoctl.reduction.appell import Realisation, require_inertia, saddle
 from servoctl.reduction.cascade import Cascade
 from servoctl.reduction.hidden import complete
 from servoctl.reduction.knots import Knots, Switches, require_smooth
@@ -261,7 +261,8 @@ def _by_points(mechanism, program, switches, balance, context):
     _require_motion(dynamics, program)
     rows = [*(realised.settled or constraints), *dynamics]
     solve = complete if realised.settled else completed
-    rows, rank, points, of_rows, *cascade = solve(q, rows, context, points)
+    inertial = replace(context, saddle=saddle(mechanism, [row for row in constraints if row.kind == "material"]))
+    rows, rank, points, of_rows, *cascade = solve(q, rows, inertial, points)
     knots = require_smooth(switches, context.values, smoothness(switches, rows))
     of_split = [(f"choice of dependent coordinates {i}", pivot) for i, pivot in enumerate(of_split, 1)]
     pivots = (*of_constraints, *of_sharing, *of_split, *of_rows)
