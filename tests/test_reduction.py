@@ -2,6 +2,7 @@
 
 import warnings
 from functools import partial
+from types import SimpleNamespace
 
 import casadi as ca
 import numpy as np
@@ -14,6 +15,7 @@ from servoctl.errors import InconsistentStart, NotRealisable, SingularProgram, S
 from servoctl.gallery import cars, gallery, mass_on_car, overhead_crane, passive_arm, spiral
 from servoctl.methods.choice import Adaptive
 from servoctl.model.model import derive
+from servoctl.reduction import hidden
 from servoctl.simulation import simulate
 from servoctl.tolerances import EXTENDED
 from servoctl.verification import verify
@@ -782,3 +784,9 @@ def test_a_rolling_machine_of_few_velocities_is_programmed_by_rates():
     run = simulate(model, model.start(x=0.0, y=0.0, guess={"v": 1.0}), (0.0, 2.0))
     assert run["x"] == pytest.approx(run.t, abs=1e-9) and run["y"] == pytest.approx(0.1 * run.t**2, abs=1e-9)
     assert run["v"] == pytest.approx(np.hypot(1, 0.2 * run.t), abs=1e-9) and verify(model, run).passed
+
+
+def test_rows_that_depend_at_a_point_are_no_rows_to_combine_by():
+    rows = [SimpleNamespace(name=name) for name in "abc"]
+    with refused(SingularProgram, rows=["a", "b"]):
+        hidden._combine(None, rows, 2, [0, 1], 2, np.ones((3, 3, 2)))

@@ -27,7 +27,7 @@ IN_FLOATS = {  # corrections that end it, at once and where they no longer fall;
     "TOLERANCE": 1e-6, "STALLED": 1e-3, "QP_MET": 1e-5, "QP_DEPENDENT": 1e-3, "QP_TINY": 1e-30, "MET": 1e-4,
     "GIVEN_WAY": 1e-4,
 }  # fmt: skip
-COUNTED = 2**24  # whole numbers up to it are floats
+COUNTED = 16777216  # 2^24: whole numbers up to it are floats
 LARGEST_CONDITION = 1e5  # of the metric of an allocation in floats, which have seven digits
 TIME = Scalar("t")
 FINITE = "Returns 0, or -1 if a time is no finite number: nothing is then changed."

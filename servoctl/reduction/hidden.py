@@ -244,7 +244,10 @@ def _combine(q, rows, b, others, top, numbers):
     """The terms of χ = ψ_b + Σ w_a D^(top - o_a) ψ_a with the w that cancels the leading gradient of row b."""
     if not others:
         return [rows[b].expression], []
-    columns = sorted(decide(numbers[others, :, 0]).columns)
+    rank = decide(numbers[others, :, 0])
+    if rank.rank < len(others):  # rows that depend on each other at some points only
+        raise _ill_conditioned([rows[a] for a in others], rank)
+    columns = sorted(rank.columns)
     matrix = ca.vertcat(*(rows[a].gradient(q) for a in others))[:, columns].T
     target = -rows[b].gradient(q)[:, columns].T
     w, pivots = eliminate(matrix, target, numbers[others][:, columns].swapaxes(0, 1))
