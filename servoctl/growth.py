@@ -40,7 +40,7 @@ JITTER, GOLDEN = 0.5, 0.6180339887498949  # of their distance by which instants 
 TURNED = 0.75  # squared sines of the angles between tangent spaces at an end of a segment and at its middle, summed
 DENSE = 3  # samples for each instant, with which instants are samples
 DEFECT = 1e-3  # of the sizes of the states: largest error, over an interval of samples, of states between them
-PARTS = 4  # halvings of a run that nothing resolves, whose first part may be unstable
+FIRST_PARTS = 4  # of a run that nothing resolves, whose first part may be unstable
 BLOCKS = 32  # instants between which growth is measured, as all pairs of them
 MODERATE = 1e8  # ‖P‖ ‖P⁻¹‖ of propagators P from the start, below which those between all instants follow from them
 SQUARINGS = 6  # of a matrix, from which its largest eigenvalue follows within a part of 2^-SQUARINGS of its logarithm
@@ -744,7 +744,7 @@ def _judged(tangents, steps, propagators):
 
 def _unstable_at_first(model, run):
     """The verdict on the first half, quarter, ... of a run that nothing resolves, if it is unstable; None otherwise."""
-    for part in 2.0 ** -np.arange(1, PARTS + 1):
+    for part in 2.0 ** -np.arange(1, FIRST_PARTS + 1):
         n = int(np.searchsorted(np.abs(run.t - run.t[0]), part * np.abs(run.t[-1] - run.t[0]), side="right"))
         variants = tuple((a, min(b, n), variant) for a, b, variant in run.variants if a < n)
         first = replace(run, t=run.t[:n], jets=_states(model, run)[:, :n], variants=variants)
