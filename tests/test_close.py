@@ -529,3 +529,13 @@ def test_a_loop_that_starts_mid_plan_waits_with_the_plans_present_actuation(cran
     own = sv.close(nominal, law.start(), crane_plan.state(3.0), (3.0, 3.5), timing=timing, plan=crane_plan)
     for loop in (run, own):
         assert loop["trolley"][:4] == pytest.approx(np.full(4, crane_plan["trolley"][k]), rel=1e-9)
+
+
+def test_a_loop_says_which_residuals_it_does_not_evaluate():
+    q = sv.coordinates("x y")
+    x, y = q
+    body = sv.Mechanism(q, sv.particle(q, 1.0, (x, y)), actuators={"fx": x, "fy": y})
+    model = sv.derive(body, sv.Program({"jerk": q.d(3)[0] - 1.0, "level": y}))
+    plan = sv.simulate(model, model.start(), (0.0, 0.5), t_eval=np.linspace(0.0, 0.5, 51))
+    loop = sv.close(sv.plant(body), sv.lqr(plan, sv.plant(body)), plan.state(0.0), (0.0, 0.5))
+    assert list(loop.residual) == ["level"] and "order 3 or more: jerk" in repr(loop)

@@ -337,6 +337,9 @@ class Closed(Sampled, Value):
             largest = sorted(sizes, key=lambda name: -sizes[name].max())[:3]
             shown = "; ".join(f"{name} {sizes[name].max():.3g} / {sizes[name][-1]:.3g}" for name in largest)
             lines.append(f"  max / final residual: {shown}")
+        program = self.plan.model.reduction.program.names if self.plan is not None and self.plan.model else ()
+        if left_out := [name for name in program if name not in sizes]:
+            lines.append(f"  not evaluated, as of order 3 or more: {', '.join(left_out)}"[:118])
         if self.plan is not None and self.t[-1] > self.plan.t[-1] + ON_SAMPLE * loop.period:
             lines.append(f"  the plan ends at t = {self.plan.t[-1]:g} s; its last sample is held")
         return lines
