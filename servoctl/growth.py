@@ -30,7 +30,7 @@ AT_ZERO = 1e-9  # size of a state relative to the largest, below which it is the
 UNSTABLE = 10.0  # growth of an error along a motion above which the internal dynamics are unstable over it
 FASTER = 3.0  # growth over a time, relative to that over half of it, that is no drift of phases, which gives 2
 EXPONENTIAL = 1.6  # its logarithm, relative to that over half of it: 2 for e^λt, less for powers of t
-MOST_GROWTH = 0.75  # of the logarithm of all growth: what is exponential has it, not a swing past which errors only drift
+MOST_GROWTH = 0.8  # of the logarithm of all growth: what is exponential has it, not a swing past which errors only drift
 GREAT = 1e4  # growth that is unstable even if it is a power of time
 SHRUNK = 0.95  # of the errors of the start: with less than this left at the end, they are stable
 FEWEST, MOST = 32, 2**14  # instants of the linearisation, first and last try
@@ -703,8 +703,8 @@ def _unstable(corners, steps, ends, logs, scale):
     within = _within(logs)
     whole = within[2::2]
     half = within[1 : 1 + len(whole)]
-    exponential = (whole > EXPONENTIAL * half) & (whole > MOST_GROWTH * within.max())
-    exponential |= whole - half > np.log(FASTER) + power
+    exponential = (whole > EXPONENTIAL * half) | (whole - half > np.log(FASTER) + power)
+    exponential &= whole > MOST_GROWTH * within.max()
     if (exponential & (whole > limit) & (whole - half > np.log(FASTER))).any() or logs.max() > np.log(GREAT):
         return True
     j = int(np.argmax(np.diag(logs, 1)))
