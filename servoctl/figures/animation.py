@@ -24,6 +24,7 @@ PATH_POINTS = 400  # of a drawn path
 STILL = 1e-9  # change of a shape over the motion below which it is the ground, relative to the picture
 BORDER = 0.06  # around the motion, of the picture's larger side
 ACROSS, UP = 6.4, 5.6  # inches, of the picture's plane
+TRIAD, ARROW = (0.32, 0.15), 0.33  # place and length of the directions of space [inches]
 SLIM = 0.12  # ratio of the sides below which poses would hide each other
 SLIMMEST = 0.3  # least ratio of its sides
 VIEW = np.array([[0.866, -0.5, 0.0], [0.25, 0.433, 0.866]])  # parallel projection of space, from 30° above
@@ -434,12 +435,14 @@ def _axes(picture, ax, title=""):
 
 def _triad(ax):
     """The directions of space in a corner, instead of scales that a projection does not have."""
+    from matplotlib.transforms import ScaledTranslation
+
     ax.set_axis_off()
+    inches = ax.figure.dpi_scale_trans + ScaledTranslation(0, 0, ax.transAxes)  # from the lower left corner
     for direction, name in zip(VIEW.T, "xyz", strict=True):
-        start, end = np.array([0.07, 0.05]), np.array([0.07, 0.05]) + 0.06 * direction
-        arrow = {"arrowstyle": "->", "color": GREY}
-        ax.annotate("", end, start, "axes fraction", "axes fraction", arrowprops=arrow)
-        ax.text(*(start + 1.35 * (end - start)), name, transform=ax.transAxes, color=LINE, ha="center", va="center")
+        start, end = np.array(TRIAD), np.array(TRIAD) + ARROW * direction
+        ax.annotate("", end, start, inches, inches, arrowprops={"arrowstyle": "->", "color": GREY})
+        ax.text(*(start + 1.35 * (end - start)), name, transform=inches, color=LINE, ha="center", va="center")
 
 
 class _Moving:
