@@ -390,3 +390,8 @@ def test_every_room_is_in_the_documents():
 @own_files
 def test_nothing_is_left_open(path):
     assert not re.search(r"\b(TODO|FIXME|XXX|NotImplementedError)\b", path.read_text())
+
+
+def test_the_linter_finds_nothing():
+    found = subprocess.run([sys.executable, "-m", "ruff", "check", Path(__file__).parent.parent], capture_output=True, text=True)
+    assert found.returncode == 0, found.stdout + found.stderr
