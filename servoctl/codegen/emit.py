@@ -84,7 +84,7 @@ class Dialect:
     whole : bool
         Whether the text holds the numbers of large tables; otherwise they are set when its library is loaded.
     chained : bool
-        Whether each evaluation waits for the one before, so that the operations of one chunk are those of `short_chains`.
+        Whether each evaluation waits for the one before: the statements of one chunk are those of `short_chains`.
     """
 
     number: str = "double"
