@@ -1,6 +1,7 @@
 """Short chains of operations: the same values as the given statements, of which the last follows sooner."""
 
 import ctypes
+import re
 
 import casadi as ca
 import numpy as np
@@ -141,3 +142,12 @@ def test_the_text_of_a_loop_is_always_the_same():
     f = sv.plant(gallery.crane_3d()[0]).function("ode").expression
     assert emit.emit(f, "f", ("closed",)) == emit.emit(f, "f", ("closed",))
     assert short_chains(statements(f, chained=False)) == short_chains(statements(f, chained=False))
+
+
+def test_vectors_of_a_block_compute_alike():
+    """Statements of several vectors alternate: those of one are those of the others, in the same order."""
+    f = sv.plant(gallery.crane_3d()[0]).function("ode").expression
+    text = emit.function_of_several(f, "rates", emit.LANES_INLINE, ("", "1"))
+    lines = [line.strip() for line in text[text.index("{\n") :].splitlines()[2:-1]]
+    one, other = lines[::2], [re.sub(r"\b([xpya])1(_?)(?=[\[\d])", r"\1\2", line) for line in lines[1::2]]
+    assert len(one) == len(statements(f)) and one == other

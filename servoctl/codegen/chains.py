@@ -1,4 +1,4 @@
-"""Short chains of dependent operations, for a loop whose every evaluation waits for the one before.
+"""Short chains of dependent operations, for loops in which each evaluation waits for the one before.
 
 A stage of a closed loop needs the velocities of the stage before, so that a step takes as long as its longest chain of
 operations. Factors of a product and terms of a sum are combined in the order in which they become known, as in

@@ -137,7 +137,7 @@ PORTABLE = Dialect(forms=_FORMS_OF_ONE, linkage="static ")
 EXPORTED = replace(PORTABLE, whole=True)
 WIDE_LANES = Dialect("W", "ALL({})", "w_")
 LANES = Dialect("W", "ALL({})", "w_", linkage="static ")
-LANES_INLINE = Dialect("W", "ALL({})", "w_", linkage="INLINE ")
+LANES_INLINE = Dialect("W", "ALL({})", "w_", linkage="INLINE ", chained=True)
 LANES_COMMON = Dialect("W", "ALL({})", "w_", common=True, linkage="static ")
 
 
