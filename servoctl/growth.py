@@ -690,7 +690,11 @@ def _may_be_largest(least, most):
 
 def _within(logs):
     """The largest of logs (n, n) between instants that are at most 0, 1, ..., n - 1 blocks apart."""
-    return np.maximum.accumulate([np.diag(logs, blocks).max() for blocks in range(len(logs))])
+    n = len(logs)
+    beside = np.full((n, 2 * n), -np.inf)
+    beside[:, :n] = logs
+    diagonals = np.lib.stride_tricks.as_strided(beside, (n, n), (beside.strides[0] + beside.itemsize, beside.itemsize))
+    return np.maximum.accumulate(diagonals.max(axis=0))
 
 
 def _unstable(corners, steps, ends, logs, scale):

@@ -4,6 +4,7 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from functools import partial
+from weakref import WeakKeyDictionary
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -41,7 +42,7 @@ from servoctl.methods.runge_kutta import ORDERS, RungeKuttaSteps
 from servoctl.methods.scipy_methods import ScipySteps
 from servoctl.methods.stability import run_checked, warn_drifted, warn_many_steps, warn_unstable
 from servoctl.methods.sundials import SundialsSteps
-from servoctl.methods.taylor import TaylorSteps, Unsuited, last_index
+from servoctl.methods.taylor import TaylorSteps, Unsuited, last_index, series_loop
 from servoctl.model.model import Model
 from servoctl.model.start import State
 from servoctl.model.switching import switching
@@ -54,6 +55,7 @@ from servoctl.run import SAME_TIME, Run
 STEPS_IN_SPAN = 2000  # steps of fixed length in a span if the method has no step
 MOST_STEPS = 10**8  # of fixed length: more would fill the memory with samples
 DRIFTED = 1e-2  # the same at the end of a motion that deserves a warning
+_TOLD = WeakKeyDictionary()  # model -> what told that errors along its last motion do not grow
 OFF = 1e-5  # residual relative to its gradient times the state, above which a start is inconsistent
 
 
@@ -277,9 +279,7 @@ def judged(run, tolerance=STEP_ERROR, again=None, by_series=None):
     """
     known = replace(run, verdict=partial(_verdict, tolerance=tolerance))
     try:
-        if not run.success or growth_bound(run.model, run) <= UNSTABLE:
-            return known
-        if by_series is not None and quiet_by_series(run.model, run, by_series):
+        if not run.success or _quiet(run, by_series):
             return known
         run = run if again is None else again()
         internal = internal_dynamics(run.model, run) if run.success else None
@@ -290,6 +290,21 @@ def judged(run, tolerance=STEP_ERROR, again=None, by_series=None):
     if internal.verdict == "unstable":
         warn_unstable(internal.sentence(tolerance))
     return replace(run, verdict=internal.facts(tolerance))
+
+
+def _quiet(run, by_series):
+    """Whether the bound of the growth, or the series, tell that it deserves no warning.
+
+    What told it of the last motion of a model comes first.
+    """
+    ways = {"bound": lambda: growth_bound(run.model, run) <= UNSTABLE}
+    if by_series is not None:
+        ways["series"] = lambda: quiet_by_series(run.model, run, by_series)
+    last = _TOLD.get(run.model)
+    told = next((way for way in sorted(ways, key=lambda way: way != last) if ways[way]()), None)
+    if told is not None and told != last:
+        _TOLD[run.model] = told
+    return told is not None
 
 
 def _verdict(run, _=None, *, tolerance):

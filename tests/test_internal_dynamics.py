@@ -549,6 +549,27 @@ def test_neutral_growth_above_ten_takes_no_linearisation(span, t_eval, gallery_m
     assert not calls and 30 < sv.internal_dynamics(model, run).growth < 52
 
 
+def test_what_told_that_growth_is_harmless_comes_first_next_time(gallery_model, monkeypatch):
+    """The bound is silent on 10 s of the wheel, the series on a run whose series are too coarse."""
+    model, tried = gallery_model("appell-hamel").with_parameters(I_x=0.1126, I_y=0.225), []
+    start = model.start(x=0.0, y=0.0, phi=0.0, theta=0.0, dphi=1.0, dtheta=0.5)
+    for name in ("growth_bound", "quiet_by_series"):
+        real = getattr(simulation, name)
+        monkeypatch.setattr(simulation, name, lambda *a, name=name, real=real: tried.append(name) or real(*a))
+
+    def judged_by(end, method):
+        tried.clear()
+        verdict = sv.simulate(model, start, (0.0, end), method).internal["verdict"]
+        return verdict, tuple(tried)
+
+    bound, series = "growth_bound", "quiet_by_series"
+    assert judged_by(10.0, "Taylor") == ("neutral", (bound, series))
+    assert judged_by(10.0, "Taylor") == ("neutral", (series,))
+    assert judged_by(10.0, "DOP853") == ("neutral", (bound,))
+    assert judged_by(0.5, sv.Taylor(2, rtol=1e-6)) == ("neutral", (series, bound))
+    assert judged_by(0.5, "Taylor") == ("neutral", (bound,))
+
+
 @pytest.mark.parametrize("length", [9.0, 20.0])
 @pytest.mark.parametrize("samples", [41, 201, 1001, 4001])
 def test_blocks_of_unequal_times_do_not_make_growth_exponential(length, samples, gallery_model):
