@@ -42,7 +42,7 @@ from servoctl.methods.runge_kutta import ORDERS, RungeKuttaSteps
 from servoctl.methods.scipy_methods import ScipySteps
 from servoctl.methods.stability import run_checked, warn_drifted, warn_many_steps, warn_unstable
 from servoctl.methods.sundials import SundialsSteps
-from servoctl.methods.taylor import TaylorSteps, Unsuited, last_index, series_loop
+from servoctl.methods.taylor import TaylorSteps, Unsuited, last_index
 from servoctl.model.model import Model
 from servoctl.model.start import State
 from servoctl.model.switching import switching
