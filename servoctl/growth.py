@@ -412,7 +412,9 @@ def _states(model, run):
 def _sizes(model, run):
     """Largest magnitude of each state along a run (n_x,), 1 where it stays at zero."""
     x = _states(model, run)
-    size = np.abs(x).max(axis=1, where=np.isfinite(x), initial=0.0)
+    size = np.maximum(x.max(axis=1, initial=0.0), -x.min(axis=1, initial=0.0))
+    if not np.isfinite(size).all():
+        size = np.abs(x).max(axis=1, where=np.isfinite(x), initial=0.0)
     return np.where(size > AT_ZERO * size.max(), size, 1.0)
 
 

@@ -445,7 +445,7 @@ def _run(model, motion, settings, start, t1):
 def _set_at_knots(t, jets, variants, knots):
     """Derivatives at knots by the equations at that instant: those of a series are of the side that it comes from."""
     knots = np.asarray(knots, dtype=float)
-    for first, end, model in variants:
+    for first, end, model in variants if len(knots) else ():
         near = np.abs(t[first:end, None] - knots) <= SAME_TIME * np.maximum(1.0, np.abs(knots))
         at = first + np.flatnonzero(near.any(axis=1))
         if len(at):
