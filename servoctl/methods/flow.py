@@ -1,7 +1,7 @@
 """How deviations from a motion move, by the series of the Taylor method at states beside it.
 
 A series is exact for every state, not for one motion alone: the propagator over a step is the derivative of its series
-by the state at its start, here by differences, without a Jacobian. With orthonormal deviations Q_k at the end
+by the state at its start, here by central differences, without a Jacobian. With orthonormal deviations Q_k at the end
 of step k, those that the step takes from Q_(k-1) are Q_k R_k, so that propagators between ends of steps are products
 of the triangular R (Dieci, Russell and Van Vleck 1997). Deviations within the tangent space of the constraints stay
 there.
@@ -19,7 +19,7 @@ from servoctl.methods.motion import breakpoints
 from servoctl.methods.taylor import series_loop
 
 RTOL = 1e-7  # of the steps along which deviations are moved, and of the least size of a level of the state
-NEARBY = 1e-7  # of the size of a state: distance of the states from which deviations are taken
+NEARBY = 1e-6  # of the size of a state: distance of the states from which deviations are taken
 LEFT_OUT = 1e-3  # of a propagator over a step: its last terms, which bound those that are left out
 MOST_ALONG = 2_000  # of a motion: more of them take longer than propagators by the linearisation
 

@@ -30,28 +30,28 @@ COLD void terms(const double *y, const double *c, double h, int64_t k, double po
     for (int64_t i = 0; i < NQ; i++) result[i] = y[(k - 1) * NQ + i] * power;
 }
 
-/* Where F deviations of unit size, the rows of Q (F, NX), are a time h later: the difference of the states from x, with
-   these times `nearby` added, from `end`, that from x with the coefficients y. The last terms of the series are `left_out`
-   of this at most, else 0. */
-COLD int moved(double t, const double *x, const double *y, const double *end, const double *p, double h, int64_t F,
-               const double *sizes, double nearby, double left_out, double *Q)
+/* Where F deviations of unit size, the rows of Q (F, NX), are a time h later: half the difference of the states from x
+   with these times `nearby` added and subtracted. The last terms of the series are `left_out` of this at most, else 0. */
+COLD int moved(double t, const double *x, const double *p, double h, int64_t F, const double *sizes, double nearby,
+                 double left_out, double *Q)
 {
     const double powers[2] = {pow(h, LAST - TOP + 1), pow(h, LAST - TOP)};
-    const int64_t gamma = PLAIN ? 0 : NQ * LAST;
-    double largest = 0, last = 0, beside[NX + 1], y_beside[NY + 1], end_beside[NX + 1], last_terms[2][2][NX + 1];
-    for (int64_t k = 0; k < 2; k++) terms(y, y + gamma, h, LAST - k, powers[k], last_terms[k][0]);
+    double largest = 0, last = 0, beside[NX + 1], y[NY + 1], ends[2][NX + 1], last_terms[2][2][NX + 1];
     for (int64_t j = 0; j < F; j++) {
         double *v = Q + j * NX;
-        for (int64_t i = 0; i < NX; i++) beside[i] = x[i] + nearby * sizes[i] * v[i];
-        NAME(t, beside, p, y_beside);
-        reached(beside, y_beside, y_beside + gamma, h, end_beside);
-        for (int64_t k = 0; k < 2; k++) terms(y_beside, y_beside + gamma, h, LAST - k, powers[k], last_terms[k][1]);
+        for (int64_t side = 0; side < 2; side++) {
+            for (int64_t i = 0; i < NX; i++) beside[i] = x[i] + (side ? -nearby : nearby) * sizes[i] * v[i];
+            NAME(t, beside, p, y);
+            const double *c = y + (PLAIN ? 0 : NQ * LAST);
+            reached(beside, y, c, h, ends[side]);
+            for (int64_t k = 0; k < 2; k++) terms(y, c, h, LAST - k, powers[k], last_terms[k][side]);
+        }
         for (int64_t i = 0; i < NX; i++) {
-            const double unit = 1 / (nearby * sizes[i]);
-            v[i] = (end_beside[i] - end[i]) * unit;
+            const double unit = 1 / (2 * nearby * sizes[i]);
+            v[i] = (ends[0][i] - ends[1][i]) * unit;
             largest = fmax(largest, fabs(v[i]));
             for (int64_t k = 0; k < 2; k++) {
-                last = fmax(last, fabs((last_terms[k][1][i] - last_terms[k][0][i]) * unit));
+                last = fmax(last, fabs((last_terms[k][0][i] - last_terms[k][1][i]) * unit));
             }
         }
     }
@@ -79,7 +79,7 @@ __attribute__((cold)) int64_t FN(deviations)(int64_t count, const double *cuts, 
             const double *c = y + (PLAIN ? 0 : NQ * LAST);
             reached(x, y, c, signed_h, x_next);
             for (int64_t i = 0; i < NX; i++) if (!isfinite(x_next[i])) return -1;
-            if (!moved(t, x, y, x_next, p, signed_h, F, sizes, settings[2], settings[3], Q)) return -1;
+            if (!moved(t, x, p, signed_h, F, sizes, settings[2], settings[3], Q)) return -1;
             if (!orthonormal(F, NX, Q, log + 1 + F * NX)) return -1;
             t = ends ? cuts[cut] : t + signed_h;
             for (int64_t i = 0; i < NX; i++) x[i] = x_next[i];
