@@ -123,11 +123,13 @@ class Interpreter:
     def grid(self, t, x, p, y):
         """Fill y (n_y, N) with the outputs at t (N,) and the columns of x, and of p if that is a matrix."""
         left, self._points = t.size % BLOCK, self._points + t.size
-        blocks = t.size - left * (2 * left < BLOCK)  # a block that is half full is faster than its points
-        if t.size < BLOCK and not {"_blocks", "_lanes"} & vars(self).keys():  # making them takes longer; same bits
+        lanes = self._lanes if self._points >= MANY_POINTS else None
+        least = BLOCK // 8 if lanes else BLOCK // 2  # a block with as many points is faster than these one by one
+        blocks = t.size - left * (left < least)
+        if t.size < BLOCK and not lanes and "_blocks" not in vars(self):  # making them takes longer; same bits
             blocks = 0
         if blocks:
-            parts, run = ((self._points >= MANY_POINTS and self._lanes) or self._blocks).parts
+            parts, run = (lanes or self._blocks).parts
             parts[2][:] = 0.0 if p.ndim == 2 else p[:, None]
         for k in range(0, blocks, BLOCK):
             here, size = slice(k, k + BLOCK), min(BLOCK, t.size - k)
